@@ -67,7 +67,7 @@ def matched(arguments: argparse.Namespace) -> list[Pair]:
     front = Pipeline(*stages, lambda c, seed=0: None)
     pairs = []
     for pair in track(sorted((p for s in sets for p in s), key=lambda p: p.identity), "matching", console=console):
-        c = front.match([pair])[0].correspondences
+        c = front.correspondences([pair])[0].correspondences
         if c is not None and int(c.count()) >= arguments.least:
             distance = sampson(torch.from_numpy(pair.F)[None], c.x0.double(), c.x1.double())[0]
             scene = pair.scene if pair.family in families else pair.family  # a rendered scene has but a few pairs

@@ -45,7 +45,7 @@ def pairs_of_families(*families: str) -> list[ImagePair]:
 def qualities(pipeline: Pipeline, pairs: list[ImagePair]) -> list[torch.Tensor]:
     """The qualities of the matches that are left of each pair."""
     ratios = []
-    for outcome in pipeline.match(pairs):
+    for outcome in pipeline.correspondences(pairs):
         c = outcome.correspondences
         assert c is not None
         assert c.quality is not None

@@ -21,12 +21,11 @@ from fmtorch.core.stages import ImageMatcher
 from fmtorch.data.pairs import GivenMatches, ImagePair, ImageSource
 from fmtorch.evaluation.pair_cameras import PairCameras, WithPairCameras
 from fmtorch.evaluation.rows import evaluate
-from fmtorch.io.collected import CollectedMatches
-from fmtorch.io.match_store import MatchStore
+from fmtorch.io.match_store import MatchRecords, MatchStore
 from fmtorch.jobs.execution import Execution
 from fmtorch.jobs.pool import WorkerPool
 from fmtorch.jobs.runner import Factory, Local, Source, TaskRunner
-from fmtorch.pipeline.exporting import keep_outcomes
+from fmtorch.pipeline.exporting import match_records
 from fmtorch.pipeline.pipeline import Outcome, Pipeline, examined
 from fmtorch.runs import PairRow
 from fmtorch.runs.feature_cache import CachedFeatures
@@ -39,14 +38,14 @@ Build = Callable[[], Pipeline]
 class Batch:
     """Pairs to evaluate.
 
-    cameras: of their keys, for a pipeline that was built without them. journal: an empty one, where keypoints, matches
-    and F are to be exported. counted: whether the worker counts the images that it computed. signed: of `pose_errors`.
+    cameras: of their keys, for a pipeline that was built without them. export: whether keypoints, matches and F are to
+    be exported. counted: whether the worker counts the images that it computed. signed: of `pose_errors`.
     """
 
     pairs: list[ImagePair]
     seed: int
     cameras: Mapping[int, PairCameras] | None = None
-    journal: CollectedMatches | None = None
+    export: bool = False
     counted: bool = False
     signed: bool = False
 
@@ -61,7 +60,7 @@ class Work:
     rows: list[PairRow]
     computed: int = 0
     from_cache: int = 0
-    journal: CollectedMatches | None = None
+    records: MatchRecords | None = None
 
 
 def evaluate_batch(pipeline: Pipeline, batch: Batch) -> Work:
@@ -74,14 +73,13 @@ def evaluate_batch(pipeline: Pipeline, batch: Batch) -> Work:
     compile_with([*pipeline.pruners.values(), pipeline.estimator])
     knowledge = pipeline.estimator.given if isinstance(pipeline.estimator, WithPairCameras) else None
     outcomes = examined(pipeline, pipeline.run(batch.pairs, batch.seed), batch.seed, knowledge)
-    if batch.journal is not None:
-        keep_outcomes(batch.journal, pipeline, outcomes)
+    records = match_records(pipeline, outcomes) if batch.export else None
     rows = evaluate(outcomes, batch.seed, batch.signed)
     if batch.cameras is not None and isinstance(pipeline.estimator, WithPairCameras):
         for key in batch.cameras:
             pipeline.estimator.cameras.pop(key, None)
     counts = (cache.computed - computed, cache.found - from_cache) if cache else (0, 0)
-    return Work(rows, *counts, batch.journal)
+    return Work(rows, *counts, records)
 
 
 def divided(batch: Batch) -> list[Batch]:
@@ -185,12 +183,11 @@ def evaluate_pairs(
     def given(members: Sequence[ImagePair]) -> Batch:
         own = None if cameras is None or source.shared else {p.key: cameras[p.key] for p in members if p.key in cameras}
         sent = batch_contents(list(members)) if execution.send_images and not source.shared else list(members)
-        kept = None if journal is None else CollectedMatches.of(journal)
-        return Batch(sent, seed, own, kept, not source.shared, signed)
+        return Batch(sent, seed, own, journal is not None, not source.shared, signed)
 
     def keep(done: Batch, work: Work) -> None:
-        if journal is not None and work.journal is not None:
-            work.journal.write(journal)
+        if journal is not None and work.records is not None:
+            journal.add(work.records)
         store(work.rows)
         if isinstance(pipeline.extractor, CachedFeatures):
             pipeline.extractor.computed += work.computed

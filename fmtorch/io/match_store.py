@@ -107,6 +107,13 @@ class StoredPair:
     configuration: str = ""
 
 
+class MatchRecords(NamedTuple):
+    """Images and pairs by the paths of images; names within are no matter, since a store names by its root."""
+
+    images: dict[Path, StoredImage]
+    pairs: dict[tuple[Path, Path], StoredPair]
+
+
 @dataclasses.dataclass(frozen=True)
 class MatchStore:
     """The folder of what was computed; names of images are paths below `root`. Any number of processes may add."""
@@ -117,6 +124,15 @@ class MatchStore:
     def name(self, image: Path) -> str:
         """Under what name an image is exported."""
         return image.absolute().relative_to(self.root.absolute()).as_posix()
+
+    def add(self, records: MatchRecords) -> None:
+        """Add what it does not have; a pair after its images."""
+        for image, value in records.images.items():
+            if not self.has_image(image):
+                self.add_image(image, value)
+        for ends, pair in records.pairs.items():
+            if not self.has_pair(*ends):
+                self.add_pair(*ends, pair)
 
     def has_image(self, image: Path) -> bool:
         return self._image(image).exists()

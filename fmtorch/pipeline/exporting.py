@@ -14,7 +14,7 @@ from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.data.pairs import ImagePair, ImageSource
 from fmtorch.geometry.cameras import cross_matrix
 from fmtorch.geometry.pose import pose_from_fundamental
-from fmtorch.io.match_store import MatchStore, PairGeometry, StoredImage, StoredPair, indices
+from fmtorch.io.match_store import MatchRecords, PairGeometry, StoredImage, StoredPair, indices
 from fmtorch.pipeline.photograph_cameras import PhotographCamera
 from fmtorch.pipeline.pipeline import Outcome, Pipeline
 from fmtorch.pipeline.two_images import Described, MatchResult, pair_geometries
@@ -23,23 +23,26 @@ from fmtorch.two_view.pair_type import Configuration
 EXACT = (1.0, 0.0)  # px, relative deviation; K stands for the pixels
 
 
-def keep_outcomes(journal: MatchStore, pipeline: Pipeline, outcomes: Sequence[Outcome]) -> None:
-    """Add the outcomes' images and pairs to a journal; pairs that cannot be used, and what it has, are left out."""
+def match_records(pipeline: Pipeline, outcomes: Sequence[Outcome]) -> MatchRecords:
+    """The outcomes' images and pairs for a `MatchStore`, by the paths of images; pairs of no use are left out."""
+    records = MatchRecords({}, {})
     for outcome in outcomes:
         pair, c, estimate = outcome.pair, outcome.correspondences, outcome.estimate
-        ends = pair.image0.path, pair.image1.path
-        if not exportable(pair) or c is None or estimate is None or journal.has_pair(*ends):
+        if not exportable(pair) or c is None or estimate is None:
             continue
+        ends = pair.image0.path, pair.image1.path
         for image, K in ((pair.image0, pair.K0), (pair.image1, pair.K1)):
-            _keep_image(journal, pipeline, image, K)
+            if image.path not in records.images:
+                records.images[image.path] = _stored_image(pipeline, image, K)
         F = estimate.F[0] if outcome.solved else torch.zeros(3, 3)
-        names = journal.name(ends[0]), journal.name(ends[1])
-        points = journal.image(ends[0]).points, journal.image(ends[1]).points
+        points = records.images[ends[0]].points, records.images[ends[1]].points
         matched = c if outcome.keypoints is None else outcome.keypoints
+        names = str(ends[0]), str(ends[1])
         kept = _pair(names, points, matched, F, estimate.inliers[0], bool(estimate.related[0]))
         if outcome.configuration is not None:
             kept = dataclasses.replace(kept, geometry=_geometry(kept.matches, c, estimate, outcome.configuration))
-        journal.add_pair(*ends, kept)
+        records.pairs[ends] = kept
+    return records
 
 
 def _geometry(
@@ -94,13 +97,11 @@ def _points(described: Described) -> NDArray[np.float32]:
     return described.points.detach().cpu().float().numpy()
 
 
-def _keep_image(journal: MatchStore, pipeline: Pipeline, image: ImageSource, K: NDArray[np.float64] | None) -> None:
-    if journal.has_image(image.path):
-        return
+def _stored_image(pipeline: Pipeline, image: ImageSource, K: NDArray[np.float64] | None) -> StoredImage:
     features, _ = pipeline.features(image)
     h, w = (int(n) for n in features.image_size)
     points, scores = (value.detach().cpu().float().numpy() for value in (features.keypoints, features.scores))
-    journal.add_image(image.path, StoredImage(journal.name(image.path), points, scores, (h, w), K))
+    return StoredImage(str(image.path), points, scores, (h, w), K)
 
 
 def _pair(

@@ -211,17 +211,17 @@ class Pipeline:
         synchronise(self.device)
         return features, time.perf_counter() - start
 
-    def match(self, pairs: Sequence[ImagePair]) -> list[Outcome]:
+    def correspondences(self, pairs: Sequence[ImagePair]) -> list[Outcome]:
         """Take pairs through the stages before estimation; a pair that fails has a reason and harms no other."""
         return self._batched("pruning", self._prune, [self._match(pair) for pair in pairs])
 
     def estimate(self, outcomes: Sequence[Outcome], seed: int = 0) -> list[Outcome]:
-        """The last stage, for outcomes of `match`."""
+        """The last stage, for outcomes of `correspondences`."""
         return self._batched("estimation", functools.partial(self._estimate, seed=seed), outcomes)
 
     def run(self, pairs: Sequence[ImagePair], seed: int = 0) -> list[Outcome]:
         """Take a batch of pairs through all four stages."""
-        return self.estimate(self.match(pairs), seed)
+        return self.estimate(self.correspondences(pairs), seed)
 
     def _batched(
         self, stage: str, function: Callable[[list[Outcome]], list[Outcome]], outcomes: Sequence[Outcome]

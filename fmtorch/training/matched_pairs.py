@@ -234,7 +234,7 @@ def compute_shards(
 
 def matched_rows(how: Matching, job: Job) -> list[dict[str, Any]]:
     """The rows of a shard."""
-    return [_row(how.dataset, how.pipeline.match([pair])[0], how.most) for pair in job.pairs]
+    return [_row(how.dataset, how.pipeline.correspondences([pair])[0], how.most) for pair in job.pairs]
 
 
 def _row(dataset: PairDataset, outcome: Outcome, most: int) -> dict[str, Any]:

@@ -89,7 +89,7 @@ def items(pairs: Iterable[ImagePair], front: Pipeline) -> list[Item]:
 
 
 def _match(front: Pipeline, pair: ImagePair) -> Outcome:
-    return front.match([pair])[0]
+    return front.correspondences([pair])[0]
 
 
 def no_estimator(c: Correspondences, seed: int = 0) -> Estimate:

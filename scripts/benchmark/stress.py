@@ -99,7 +99,7 @@ def items_of(arguments: argparse.Namespace) -> Iterator[Item]:
 
 def _case(front: Pipeline, pair: ImagePair) -> Case | None:
     """None where there are too few right matches."""
-    c = front.match([pair])[0].correspondences
+    c = front.correspondences([pair])[0].correspondences
     case = None if c is None else case_of(pair, c)
     return None if case is None or int(case.right.sum()) < MIN_RIGHT else case
 

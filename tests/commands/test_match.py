@@ -91,7 +91,7 @@ def test_equal_to_the_pipeline_on_files(pipeline: fmtorch.pipeline.pipeline.Pipe
     by_array = fmtorch.match(*images, pipeline=pipeline)
     assert torch.equal(by_path.F, by_array.F)
     source = [fmtorch.data.ImageSource(f"{i}", tmp_path / f"{i}.png") for i in (0, 1)]
-    outcome = pipeline.match([fmtorch.data.ImagePair("p", "f", "s", *source, ROWS)])[0]
+    outcome = pipeline.correspondences([fmtorch.data.ImagePair("p", "f", "s", *source, ROWS)])[0]
     assert outcome.correspondences is not None
     # Correspondences do not depend on the pair's key, which the pipeline hashes from its identity.
     assert torch.equal(outcome.correspondences.x0, by_path.correspondences.x0)

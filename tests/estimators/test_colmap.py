@@ -32,7 +32,7 @@ class Matched(NamedTuple):
 def matched(name: str, index: int = 0) -> Matched:
     """A real pair and its matches, which are also given as COLMAP takes them."""
     pair = data.load("fmbench", root=shared_path(f"data/{name}"))[index]
-    c = load_pipeline("sift_ratio").match([pair])[0].correspondences
+    c = load_pipeline("sift_ratio").correspondences([pair])[0].correspondences
     assert c is not None
     x0, x1 = (np.ascontiguousarray(x[0][c.mask[0]].double().numpy()) for x in (c.x0, c.x1))
     return Matched(pair, c, x0, x1)

@@ -413,7 +413,7 @@ def castle() -> list[tuple[ImagePair, Correspondences]]:
     }
     front = Pipeline(presets.build("features", "sift"), presets.build("matcher", "nearest"), pruners, quick("msac"))
     chosen = sorted((pairs[i] for i in range(len(pairs))), key=lambda pair: pair.identity)[::10]
-    return [(pair, c) for pair in chosen if (c := front.match([pair])[0].correspondences) is not None]
+    return [(pair, c) for pair in chosen if (c := front.correspondences([pair])[0].correspondences) is not None]
 
 
 def test_real_pairs_keep_the_order_of_knowledge() -> None:

@@ -19,7 +19,7 @@ from fmtorch.geometry import sampson
 from fmtorch.io.match_store import MatchStore
 from fmtorch.pipeline import pipeline as module
 from fmtorch.pipeline.build import load_pipeline
-from fmtorch.pipeline.exporting import keep_outcomes
+from fmtorch.pipeline.exporting import match_records
 from fmtorch.pipeline.folder import FolderMatches
 from fmtorch.pipeline.pipeline import Pipeline
 from tests.conftest import shared_path
@@ -54,11 +54,11 @@ def test_files_are_read_once_and_matches_are_refined(reads: collections.Counter[
     for _ in range(2):  # the second run finds its features in the cache
         reads.clear()
         pipeline = built(str(tmp_path))
-        outcomes = pipeline.match(pairs)
+        outcomes = pipeline.correspondences(pairs)
         assert set(reads.values()) == {1}
         assert all(outcome.images is None for outcome in outcomes)
     plain = load_pipeline("sift_fmtorch", overrides=[f"cache={tmp_path}", "features.max_features=1500"])
-    before = plain.match(pairs)
+    before = plain.correspondences(pairs)
     gains = []
     for old, new in zip(before, outcomes, strict=True):
         F = torch.from_numpy(new.pair.F)[None]
@@ -74,7 +74,7 @@ def test_files_are_read_once_and_matches_are_refined(reads: collections.Counter[
     given = dataclasses.replace(pairs[0], matches=lambda: GivenMatches(c, (1500, 1500)))
     reads.clear()
     fresh = Pipeline(pipeline.extractor, pipeline.matcher, {"refine": refiner()}, pipeline.estimator)
-    refined = fresh.match([given])[0].correspondences
+    refined = fresh.correspondences([given])[0].correspondences
     expected = outcomes[0].correspondences
     assert reads == {pairs[0].image0.path: 1, pairs[0].image1.path: 1}
     assert refined is not None
@@ -110,7 +110,7 @@ def test_refined_matches_are_exported_as_matches_of_keypoints(tmp_path: Path) ->
             MatchStore(tmp_path / f"run{i}", ends[0].parent),
             MatchStore(tmp_path / f"folder{i}", ends[0].parent),
         )
-        keep_outcomes(run, pipeline, pipeline.run([pair]))
+        run.add(match_records(pipeline, pipeline.run([pair])))
         for _ in FolderMatches(pipeline, folder, 4000, True, 0).each([ends]):
             pass
         journals += [run, folder]

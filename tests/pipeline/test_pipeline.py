@@ -98,7 +98,7 @@ def test_batches_change_nothing(pairs: list[ImagePair]) -> None:
 
 
 def test_match_stops_before_estimation(pairs: list[ImagePair]) -> None:
-    outcome = pipeline().match(pairs[:1])[0]
+    outcome = pipeline().correspondences(pairs[:1])[0]
     assert outcome.estimate is None
     assert outcome.correspondences is not None
     assert int(outcome.correspondences.count()) > 50

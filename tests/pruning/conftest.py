@@ -22,7 +22,7 @@ def real_matches() -> list[tuple[Correspondences, Tensor]]:
     front = Pipeline(sift, presets.build("matcher", "nearest"), pruners, presets.build("estimator", "ransac"))
     matches = []
     for i in range(0, 60, 12):
-        c = front.match([dataset[i]])[0].correspondences
+        c = front.correspondences([dataset[i]])[0].correspondences
         assert c is not None
         F = torch.from_numpy(dataset[i].F)[None]
         matches.append((c, sampson(F, c.x0.double(), c.x1.double()) < 2))

@@ -37,10 +37,10 @@ def matched(rendered: RenderedPairs, tmp_path_factory: pytest.TempPathFactory) -
     return MatchedPairs(rendered, **SIFT, root=tmp_path_factory.mktemp("matched"), workers=1)
 
 
-def exact(seed: int = 0, n: int = 200, share: float = 0.5, pairs: int = 1) -> LabelledMatches:
+def exact(seed: int = 0, n: int = 200, share: float = 0.5, pairs: int = 1, *, ignored: float = 0.05) -> LabelledMatches:
     """Matches of which `share` are true to machine precision (float64), in images of different cameras."""
     rng = np.random.default_rng(seed)
-    rows = [_exact_pair(rng, n, share) for _ in range(pairs)]
+    rows = [_exact_pair(rng, n, share, ignored) for _ in range(pairs)]
     stacked = {name: torch.from_numpy(np.stack([row[name] for row in rows])) for name in rows[0]}
     label, F = stacked.pop("label"), stacked.pop("F")
     key = torch.tensor([pair_key(f"{seed}/{i}") for i in range(pairs)])
@@ -48,7 +48,12 @@ def exact(seed: int = 0, n: int = 200, share: float = 0.5, pairs: int = 1) -> La
     return LabelledMatches(Correspondences(mask=mask, key=key, **stacked), label, F)
 
 
-def _exact_pair(rng: np.random.Generator, n: int, share: float) -> dict[str, np.ndarray]:
+def labelled_pair(number: int, matches: int = 60, outliers: float = 0.4) -> LabelledMatches:
+    """A pair to train on, a function of its number: every match is labelled."""
+    return exact(number, matches, 1 - outliers, ignored=0.0)
+
+
+def _exact_pair(rng: np.random.Generator, n: int, share: float, ignored: float) -> dict[str, np.ndarray]:
     sizes = [(480, 640), (300, 500)]
     K0, K1 = (
         calibration(rng.uniform(300, 900), s, (s[1] * rng.uniform(0.4, 0.6), s[0] * rng.uniform(0.4, 0.6)))
@@ -66,7 +71,7 @@ def _exact_pair(rng: np.random.Generator, n: int, share: float) -> dict[str, np.
     projected = (X @ R.T + t) @ K1.T
     x1 = projected[:, :2] / projected[:, 2:]
     label = (rng.random(n) < share).astype(np.int8)
-    label[rng.random(n) < 0.05] = -1
+    label[rng.random(n) < ignored] = -1
     x1 = np.where(label[:, None] == 0, rng.uniform(0, [499, 299], (n, 2)), x1)
     cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
     F = np.linalg.inv(K1).T @ cross @ R @ np.linalg.inv(K0)

@@ -209,7 +209,7 @@ def test_a_damaged_entry_is_named_and_harms_no_other(
 
 
 def outcomes(dataset: H5Pairs) -> list[Outcome]:
-    return pipeline().match(list(dataset))
+    return pipeline().correspondences(list(dataset))
 
 
 @pytest.mark.parametrize("layout", writers.WRITERS)

@@ -1,15 +1,17 @@
-"""`MatchedPairs`: computed once, resumed, never stale, never damaged, readable from any process."""
+"""`MatchedPairs`: computed once, resumed, never stale, never damaged, readable from any process; its files."""
 
 from __future__ import annotations
 
 import dataclasses
 import hashlib
 import pickle
-from collections.abc import Iterator
+import re
+import runpy
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pytest
 import torch
 from torch.utils.data import DataLoader
@@ -20,6 +22,7 @@ from fmtorch.geometry.epipolar import symmetric_max
 from fmtorch.pipeline.build import load_pipeline
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.scenes import RenderedPairs
+from fmtorch.scenes import dataset as rendered_dataset
 from fmtorch.scenes.generate import FAMILIES, PLANS, Task
 from fmtorch.training import (
     Augmentation,
@@ -29,36 +32,27 @@ from fmtorch.training import (
     StoredMatches,
     collate,
     collate_trimmed,
+    labelled,
+    matched_pairs,
     split_scenes,
 )
-from fmtorch.training import labelled as labels_module
-from fmtorch.training import matched_pairs as compute_module
 from fmtorch.training.labelled import label
 from fmtorch.training.matched_pairs import SHARD, partition
+from fmtorch.training.stored_matches import SCHEMA, Shard, ShardError, write_shard
 from tests.conftest import shared_path
-from tests.training.conftest import SIFT
+from tests.training.conftest import FAMILY, SIFT, TINY
+
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "guides" / "training.md"
 
 
 def contents(folder: Path) -> dict[str, str]:
     return {f.name: hashlib.sha256(f.read_bytes()).hexdigest() for f in folder.glob("shard-*")}
 
 
-class Some:
+class Some(list[ImagePair]):
     """Some pairs of a data set, changed in part; without depth."""
 
     name, digest = "some", "1"
-
-    def __init__(self, pairs: list[ImagePair]) -> None:
-        self.pairs = pairs
-
-    def __len__(self) -> int:
-        return len(self.pairs)
-
-    def __getitem__(self, index: int) -> ImagePair:
-        return self.pairs[index]
-
-    def __iter__(self) -> Iterator[ImagePair]:
-        return iter(self.pairs)
 
 
 def test_items_are_the_pipelines_matches_with_labels(rendered: RenderedPairs, matched: MatchedPairs) -> None:
@@ -68,7 +62,7 @@ def test_items_are_the_pipelines_matches_with_labels(rendered: RenderedPairs, ma
     by_identity = {pair.identity: pair for pair in rendered}
     for index in range(0, len(matched), 2):
         pair = by_identity[matched.pairs[index]["identity"]]
-        expected = pipeline.match([pair])[0].correspondences
+        expected = pipeline.correspondences([pair])[0].correspondences
         item = matched[index]
         c = item.correspondences
         for name in ("x0", "x1", "quality", "mutual", "lafs0", "lafs1", "size0", "size1", "K0", "K1", "key", "mask"):
@@ -99,33 +93,29 @@ def test_computed_once_by_any_number_of_workers(rendered: RenderedPairs, matched
 
 
 def test_an_interrupted_computation_goes_on(
-    rendered: RenderedPairs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    rendered: RenderedPairs, matched: MatchedPairs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(compute_module, "SHARD", 1)
-    uninterrupted = MatchedPairs(rendered, **SIFT, root=tmp_path / "whole", workers=1)
     written: list[Path] = []
-    original = compute_module.write_shard
+    original = matched_pairs.write_shard
 
     def interrupted(path: Path, rows: Any) -> None:
-        if len(written) == 2:
+        if len(written) == 1:
             raise KeyboardInterrupt
         written.append(path)
         original(path, rows)
 
-    monkeypatch.setattr(compute_module, "write_shard", interrupted)
+    monkeypatch.setattr(matched_pairs, "write_shard", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        MatchedPairs(rendered, **SIFT, root=tmp_path / "parts", workers=1)
-    folder = tmp_path / "parts" / uninterrupted.folder.name
+        MatchedPairs(rendered, **SIFT, root=tmp_path, workers=1)
+    folder = tmp_path / matched.folder.name
     assert set(contents(folder)) == {path.name for path in written}
-    assert len(contents(uninterrupted.folder)) > 2
-    first = set(written)
-    monkeypatch.setattr(compute_module, "write_shard", lambda path, rows: (written.append(path), original(path, rows)))
+    assert len(contents(matched.folder)) > 1
+    monkeypatch.setattr(matched_pairs, "write_shard", lambda path, rows: (written.append(path), original(path, rows)))
     calls: list[tuple[int, int]] = []
-    MatchedPairs(rendered, **SIFT, root=tmp_path / "parts", workers=1, progress=lambda *c: calls.append(c))
-    assert calls[0] == (2, len(rendered))
-    assert len(written) == len(set(written)) == len(contents(uninterrupted.folder))
-    assert first < set(written)
-    assert contents(folder) == contents(uninterrupted.folder)
+    MatchedPairs(rendered, **SIFT, root=tmp_path, workers=1, progress=lambda *c: calls.append(c))
+    assert 0 < calls[0][0] < len(rendered) == calls[-1][0]
+    assert len(written) == len(set(written)) == len(contents(matched.folder))
+    assert contents(folder) == contents(matched.folder)
 
 
 @pytest.mark.parametrize("damage", ["changed", "cut", "fewer pairs"])
@@ -142,7 +132,7 @@ def test_a_damaged_file_is_computed_anew(
         data[len(data) // 2] ^= 1
     victim.write_bytes(data[:-100] if damage == "cut" else data)
     if damage == "fewer pairs":
-        compute_module.write_shard(victim, [])
+        matched_pairs.write_shard(victim, [])
     with pytest.warns(UserWarning, match=r"shard-00001\.arrow.* computed anew"):
         MatchedPairs(rendered, **SIFT, root=tmp_path, workers=1)
     assert contents(folder) == contents(matched.folder)
@@ -156,7 +146,7 @@ def test_what_would_change_the_matches_has_a_folder_of_its_own(
     names.add(MatchedPairs(pairs, **SIFT, root=tmp_path, most=50).folder.name)
     names.add(MatchedPairs(pairs, "sift_ratio", root=tmp_path).folder.name)
     names.add(MatchedPairs(pairs, "sift_ratio", overrides=["features.max_features=200"], root=tmp_path).folder.name)
-    monkeypatch.setattr(labels_module, "VERSION", 99)
+    monkeypatch.setattr(labelled, "VERSION", 99)
     names.add(MatchedPairs(pairs, **SIFT, root=tmp_path).folder.name)
     pairs.digest = "2"
     names.add(MatchedPairs(pairs, **SIFT, root=tmp_path).folder.name)
@@ -281,3 +271,117 @@ def test_training_has_no_scene_of_the_test_split(matched: MatchedPairs) -> None:
     assert training
     assert not training & test
     assert all(f"rendered/{about['scene']}/" in about["identity"] for about in matched.pairs)
+
+
+def rows(n: int = 5) -> list[dict[str, Any]]:
+    rng = np.random.default_rng(0)
+    drawn = []
+    for i in range(n):
+        count = int(rng.integers(1, 50))
+        arrays = {
+            "x0": (count, 2), "x1": (count, 2), "quality": (count,), "lafs0": (count, 2, 3), "lafs1": (count, 2, 3)
+        }  # fmt: skip
+        drawn.append(
+            {
+                "key": int(rng.integers(-(2**62), 2**62)), "identity": f"set/scene/{i}", "family": "set", "scene": "s",
+                "reason": "", "matches": count, "inliers": 1, "outliers": count - 1,
+                "label": rng.integers(-1, 2, count).astype(np.int8),
+                "mutual": rng.integers(0, 2, count).astype(np.uint8),
+                "F": rng.normal(size=9), "size0": np.array([480, 640]), "size1": np.array([300, 500]),
+                **{name: rng.normal(size=shape).astype(np.float32).ravel() for name, shape in arrays.items()},
+            }
+        )  # fmt: skip
+    drawn.append({
+        "key": 7, "identity": "set/scene/failed", "family": "set", "scene": "s", "reason": "no keypoints in image 0",
+        "matches": 0, "inliers": 0, "outliers": 0,
+    })  # fmt: skip
+    return drawn
+
+
+def test_what_is_written_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "shard.arrow"
+    written = rows()
+    write_shard(path, written)
+    shard = Shard(path, verify=True)
+    assert len(shard) == len(written)
+    index = shard.index()
+    for number, row in enumerate(written):
+        for name, values in index.items():
+            assert values[number] == row[name]
+        arrays = shard.read(number)
+        expected = {name: value for name, value in row.items() if isinstance(value, np.ndarray)}
+        assert set(arrays) == set(expected)
+        for name, value in expected.items():
+            assert arrays[name].dtype == value.dtype
+            np.testing.assert_array_equal(arrays[name].ravel(), value)
+    first = shard.read(0, ("x0", "lafs1", "F", "K0"))
+    n = written[0]["matches"]
+    assert {name: value.shape for name, value in first.items()} == {"x0": (n, 2), "lafs1": (n, 2, 3), "F": (3, 3)}
+    assert not first["x0"].flags.owndata  # a view of the file
+    assert [file.name for file in tmp_path.iterdir()] == ["shard.arrow"]
+    table = pa.ipc.open_file(path).read_all()  # as any library of data frames does
+    assert table.schema.names == SCHEMA.names
+    assert table.column("matches").to_pylist()[-1] == 0
+    write_shard(tmp_path / "again.arrow", rows())
+    assert (tmp_path / "again.arrow").read_bytes() == path.read_bytes()
+
+
+def test_any_changed_byte_of_the_values_is_noticed(tmp_path: Path) -> None:
+    path = tmp_path / "shard.arrow"
+    write_shard(path, rows())
+    intact = path.read_bytes()
+    values = np.random.default_rng(0).choice(len(intact), 60, replace=False)
+    noticed = 0
+    for position in values:
+        changed = bytearray(intact)
+        changed[position] ^= 0x10
+        path.write_bytes(changed)
+        try:
+            shard = Shard(path, verify=True)
+        except ShardError:
+            noticed += 1
+        else:  # padding between buffers, or a number in the headers that no reader looks at
+            path.write_bytes(intact)
+            for row in range(len(shard)):
+                for name, value in Shard(path).read(row).items():
+                    np.testing.assert_array_equal(shard.read(row)[name], value)
+    assert noticed > 20
+
+
+@pytest.mark.parametrize("content", ["missing", "empty", "truncated", "pickle", "other schema"])
+def test_what_is_no_such_file_is_refused(tmp_path: Path, content: str) -> None:
+    path = tmp_path / "shard.arrow"
+    write_shard(path, rows())
+    intact = path.read_bytes()
+    if content == "missing":
+        path.unlink()
+    elif content == "other schema":
+        batch = pa.record_batch({"a": [1]})
+        with pa.ipc.new_file(str(path), batch.schema) as writer:
+            writer.write_batch(batch)
+    else:
+        path.write_bytes({"empty": b"", "truncated": intact[: len(intact) // 2], "pickle": pickle.dumps([1])}[content])
+    with pytest.raises(ShardError, match=r"shard\.arrow"):
+        Shard(path)
+
+
+@pytest.mark.skipif(not PAGE.is_file(), reason="the documentation is in a checkout only")
+def test_the_training_loop_of_the_page_runs(
+    rendered: RenderedPairs, cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    section = PAGE.read_text(encoding="utf-8").split("## Labelled matches")[1]
+    code = re.search(r"```python\n(.*?)```", section, re.DOTALL)[1]
+    loop = code.partition("\n\n")[2].strip().splitlines()
+    assert len(loop) == 15
+    assert 'load("rendered", split="train")' in code
+    monkeypatch.setenv("FMTORCH_CACHE", str(cache))
+    monkeypatch.setattr(rendered_dataset, "PLANS", {("small", "train"): TINY})  # what `rendered` has drawn
+    monkeypatch.setattr(rendered_dataset, "FAMILIES", {FAMILY: None})
+    (tmp_path / "loop.py").write_text(code)
+    torch.manual_seed(0)
+    names = runpy.run_path(str(tmp_path / "loop.py"))
+    assert torch.isfinite(names["loss"])
+    assert len(names["matches"]) == len(rendered)
+    assert any((cache / "matched").iterdir())
+    first = next(iter(names["loader"]))
+    assert first.label.shape == first.correspondences.mask.shape

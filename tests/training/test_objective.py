@@ -1,4 +1,4 @@
-"""Losses of learned pruners: known answers, scalar references, gradients, degenerate pairs, a training through them."""
+"""The losses of pruners and their objective: known answers, scalar references, gradients, degenerate pairs."""
 
 from __future__ import annotations
 
@@ -13,15 +13,27 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from fmtorch.core.types import Correspondences, collate
+from fmtorch.core import types
+from fmtorch.core.types import Correspondences
 from fmtorch.geometry import eight_point, fundamental_from_calibration, irls, refine, reweighted_fits
 from fmtorch.jit.random import Stream, uniform
-from fmtorch.training import objective as virtual
-from fmtorch.training.objective import LIMIT_E, LIMIT_F, classification_loss, geometric_loss, nsgd_loss, virtual_points
+from fmtorch.pruning.networks import LC
+from fmtorch.pruning.networks.learned import Prediction, predict
+from fmtorch.training import (
+    LabelledMatches,
+    Objective,
+    classification_loss,
+    collate,
+    geometric_loss,
+    nsgd_loss,
+    virtual_points,
+)
+from fmtorch.training.objective import LIMIT_E, LIMIT_F, TRIES, fits
 from tests import laws
 from tests.metrics.test_nsgd import random_pairs, rows_shifted
 from tests.reference import metrics as metric_reference
 from tests.reference import pruner_losses as reference
+from tests.training.conftest import labelled_pair
 
 VGA = torch.tensor([480, 640])
 Fit = Callable[[Correspondences, Tensor], tuple[Tensor, Tensor]]
@@ -108,7 +120,7 @@ def test_virtual_points_match_scalar_reference() -> None:
     size0, size1 = sizes(4)
     key = torch.arange(4)
     x0, x1, mask = virtual_points(F, size0, size1, count=20, seed=5, key=key)
-    uniforms = uniform(5, key, Stream.TRAINING, 0, virtual.TRIES * 20, 3).numpy()
+    uniforms = uniform(5, key, Stream.TRAINING, 0, TRIES * 20, 3).numpy()
     for i in range(4):
         points = reference.virtual_points(F[i].numpy(), size0[i].numpy(), size1[i].numpy(), uniforms[i], 20)
         assert int(mask[i].sum()) == len(points)
@@ -149,7 +161,7 @@ def test_geometric_loss_matches_scalar_reference(calibrated: bool) -> None:
     limit = LIMIT_E if calibrated else LIMIT_F
     K0 = K.expand(3, 3, 3) if calibrated else None
     found = geometric_loss(torch.stack([F_est, F_true]), F_true, size0, size1, K0=K0, K1=K0, points=25, seed=4)
-    uniforms = uniform(4, torch.zeros(1, dtype=torch.int64), Stream.TRAINING, 0, virtual.TRIES * 25, 3)[0].numpy()
+    uniforms = uniform(4, torch.zeros(1, dtype=torch.int64), Stream.TRAINING, 0, TRIES * 25, 3)[0].numpy()
     values, clamped = [], 0
     for i in range(3):
         s0, s1 = size0[i].numpy(), size1[i].numpy()
@@ -250,7 +262,7 @@ def test_training_goes_through_degenerate_scenes(fit: Fit) -> None:
 
     Losses: classification, and the geometry of a fit with its weights, in both forms.
     """
-    c = collate([laws.scene(1), laws.scene(2), *laws.degenerate().values()])
+    c = types.collate([laws.scene(1), laws.scene(2), *laws.degenerate().values()])
     c = c.replace(x0=c.x0.double(), x1=c.x1.double())
     assert c.size0 is not None
     assert c.size1 is not None
@@ -263,7 +275,7 @@ def test_training_goes_through_degenerate_scenes(fit: Fit) -> None:
     network = torch.nn.Sequential(torch.nn.Linear(1, 8), torch.nn.Tanh(), torch.nn.Linear(8, 1)).double()
     optimiser = torch.optim.Adam(network.parameters(), lr=2e-2)
     losses = []
-    for step in range(8):
+    for step in range(5):
         logit = network(torch.where(c.mask, c.quality, 0.0).nan_to_num(0.0)[..., None].double())[..., 0]
         F, valid = fit(c, torch.where(c.mask, torch.sigmoid(logit), 0.0))
         options = {"valid": valid, "seed": step, "key": c.key}
@@ -281,3 +293,65 @@ def test_training_goes_through_degenerate_scenes(fit: Fit) -> None:
         optimiser.step()
         losses.append(judged.item())
     assert losses[-1] < losses[0]
+
+
+def prediction(batch: LabelledMatches) -> Prediction:
+    torch.manual_seed(0)
+    return predict(LC(channels=8, blocks=1), batch.correspondences)
+
+
+def test_geometric_terms_come_in_after_classification_alone() -> None:
+    batch = collate([labelled_pair(i) for i in range(3)])
+    objective = Objective(geometric=0.5, nsgd=0.25, classification_steps=10)
+    made = prediction(batch)
+    before, after = objective(made, batch, 9), objective(made, batch, 10)
+    assert set(before) == {"classification", "loss"}
+    assert torch.equal(before["loss"], before["classification"])
+    total = after["classification"] + 0.5 * after["geometric"] + 0.25 * after["nsgd"]
+    assert after["loss"].item() == pytest.approx(total.item(), rel=1e-6)
+
+
+def test_terms_are_the_losses_of_the_weighted_fit() -> None:
+    batch = collate([labelled_pair(i) for i in range(2)])
+    c, made = batch.correspondences, prediction(batch)
+    F, valid = fits(made, batch)
+    own, _ = eight_point(c.x0.double(), c.x1.double(), made.weight[0].double(), c.mask)
+    assert torch.equal(F[0], own)
+    terms = Objective(classification_steps=0)(made, batch, 7)
+    assert c.size0 is not None
+    assert c.size1 is not None
+    expected = geometric_loss(F, batch.F, c.size0, c.size1, valid=valid, points=100, seed=7, key=c.keys)
+    assert float(terms["geometric"].detach()) == pytest.approx(float(expected.detach()))
+    classification = classification_loss(made.logit, batch.label)
+    assert float(terms["classification"].detach()) == pytest.approx(float(classification.detach()))
+
+
+def test_a_pair_that_cannot_be_judged_adds_nothing() -> None:
+    """Coincident points, unlabelled: the loss and gradients of the others are what they are without it."""
+    good = labelled_pair(0)
+    same = good.correspondences.replace(x0=torch.full_like(good.correspondences.x0, 9.0),
+                                        x1=torch.full_like(good.correspondences.x1, 9.0))  # fmt: skip
+    bad = LabelledMatches(same, torch.full_like(good.label, -1), torch.zeros_like(good.F))
+    objective = Objective(nsgd=1.0, classification_steps=0)
+    logits = [torch.zeros(1, n, good.label.shape[1], requires_grad=True) for n in (1, 2)]
+    for logit, batch in zip(logits, (good, collate([good, bad])), strict=True):
+        weight = torch.where(batch.correspondences.mask, torch.sigmoid(logit[0]), 0)[None]
+        loss = objective(Prediction(logit, weight), batch, 0)["loss"]
+        loss.backward()
+    alone, together = (logit.grad for logit in logits)
+    assert alone is not None
+    assert together is not None
+    assert bool(torch.isfinite(together).all())
+    assert torch.allclose(together[:, :1], alone, rtol=1e-9)
+    assert not bool(together[:, 1].any())
+
+
+def test_options_that_cannot_be_are_refused() -> None:
+    with pytest.raises(ValueError, match="must be one of: size, K"):
+        Objective(coordinates="pixels")
+    with pytest.raises(ValueError, match="at least one of"):
+        Objective(classification=0.0, geometric=0.0)
+    batch = labelled_pair(0)
+    without = LabelledMatches(batch.correspondences.replace(K0=None, K1=None), batch.label, batch.F)
+    with pytest.raises(ValueError, match="needs calibration matrices"):
+        Objective(coordinates="K", classification_steps=0)(prediction(without), without, 0)

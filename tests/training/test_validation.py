@@ -1,4 +1,4 @@
-"""Temperature and reliability: the least of the loss, known answers, the scalar reference, degenerate validation."""
+"""Validation of pruners: figures of known networks; temperature and reliability against the scalar reference."""
 
 from __future__ import annotations
 
@@ -8,10 +8,55 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from torch import nn
 
-from fmtorch.training.validation import MAX_TEMPERATURE, reliability, temperature
+from fmtorch import presets
+from fmtorch.core.types import Correspondences
+from fmtorch.pruning.networks import LC
+from fmtorch.training import Use, Validation, reliability, temperature
+from fmtorch.training.validation import MAX_TEMPERATURE
 from tests.reference import pruner_losses as reference
-from tests.training.test_pruner_losses import generator, labels
+from tests.training.conftest import labelled_pair
+from tests.training.test_objective import generator, labels
+
+
+class Known(nn.Module):
+    """Gives back log-odds that are known for each pair by its key."""
+
+    def __init__(self, logit: dict[int, torch.Tensor]) -> None:
+        super().__init__()
+        self.logit = logit
+
+    def forward(self, c: Correspondences) -> torch.Tensor:
+        return self.logit[int(c.keys[0])]
+
+
+def test_validation_tells_a_network_that_knows_from_one_that_does_not() -> None:
+    pairs = [labelled_pair(i, outliers=0.7) for i in range(5)]
+    uses = {"hard": Use(presets.build("estimator", "irls", kernel="huber"), 0.5)}
+    validation = Validation(pairs, uses, ["a", "a", "b", "b", "b"])
+    right = {int(pair.correspondences.keys[0]): 8.0 * (2 * pair.label.float() - 1) for pair in pairs}
+    wrong = {i: torch.full_like(value, 0.1) for i, value in right.items()}
+    knows, not_ = (validation(Known(value)) for value in (right, wrong))
+    assert knows.figures["hard/AUC@0.05"] > 0.9
+    assert knows.figures["hard/AUC@0.05"] > not_.figures["hard/AUC@0.05"]
+    assert knows.figures["match_precision"] == knows.figures["match_recall"] == 1.0
+    assert not_.figures["match_recall"] == 1.0
+    share = sum(float((pair.label == 1).sum()) for pair in pairs) / sum(pair.label.numel() for pair in pairs)
+    assert not_.figures["match_precision"] == pytest.approx(share)
+    assert {"hard/AUC@0.05/a", "hard/AUC@0.05/b", "log_loss", "calibration_error"} <= set(knows.figures)
+    assert knows.figures["log_loss"] == pytest.approx(float(torch.nn.functional.softplus(torch.tensor(-8.0))), rel=1e-3)
+    assert len(knows.label) == sum(pair.label.numel() for pair in pairs)
+
+
+def test_validation_leaves_the_network_in_its_mode() -> None:
+    network = LC(channels=8, blocks=1).train()
+    before = {key: value.clone() for key, value in network.state_dict().items()}
+    Validation([labelled_pair(0)], {})(network)
+    assert network.training
+    assert all(torch.equal(value, before[key]) for key, value in network.state_dict().items())
+    with pytest.raises(ValueError, match="at least one pair"):
+        Validation([], {})
 
 
 @settings(max_examples=20, deadline=None)
