@@ -269,7 +269,7 @@ def test_warm_up_compiles_what_is_registered(
     warm_up.main()
     assert f"{len(compiled)} kernels for " in capsys.readouterr().out
     rooms = {name.split(".")[1] for name in compiled}
-    assert {"estimators", "geometry", "pruning", "data", "metrics"} <= rooms
+    assert {"estimators", "geometry", "pruning", "scenes"} <= rooms
     monkeypatch.setenv("FMTORCH_KERNELS", "off")
     with pytest.raises(SystemExit, match="kernels are switched off"):
         warm_up.main()

@@ -151,14 +151,13 @@ def test_the_pool_is_refined_on_matches_near_one_of_its_models() -> None:
 
 WAY = (
     "estimators.search",  # all in a row
-    "estimators.parts.sampling",  # drawn
-    "estimators.families.fundamental",  # to its solver, and in the end refined
-    "geometry.seven_point_kernels",  # solved
-    "estimators.parts.preselection",  # here without options: hands all models on
-    "estimators.parts.scores",  # scored
-    "estimators.parts.scored_matches",  # on these matches
-    "estimators.parts.refinement",  # hands the best on
-    "geometry.refine_kernels",
+    "estimators.sampling",  # drawn
+    "estimators.models.fundamental",  # to its solver, and in the end refined
+    "geometry.seven_point",  # solved
+    "estimators.preselection",  # here without options: hands all models on
+    "estimators.scores",  # scored
+    "estimators.refinement",  # hands the best on
+    "geometry.refine",
 )
 
 

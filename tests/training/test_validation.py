@@ -33,7 +33,7 @@ class Known(nn.Module):
 
 def test_validation_tells_a_network_that_knows_from_one_that_does_not() -> None:
     pairs = [labelled_pair(i, outliers=0.7) for i in range(5)]
-    uses = {"hard": Use(presets.build("estimator", "irls", kernel="huber"), 0.5)}
+    uses = {"hard": Use(presets.build("estimator", "irls", loss="huber"), 0.5)}
     validation = Validation(pairs, uses, ["a", "a", "b", "b", "b"])
     right = {int(pair.correspondences.keys[0]): 8.0 * (2 * pair.label.float() - 1) for pair in pairs}
     wrong = {i: torch.full_like(value, 0.1) for i, value in right.items()}
