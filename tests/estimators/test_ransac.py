@@ -100,8 +100,8 @@ def test_too_few_matches_have_a_reason() -> None:
     [
         ({"score": "psac"}, "score is 'psac'; it must be one of: inlier_count"),
         ({"solver": "five_point"}, "solver is 'five_point'"),
-        ({"hypotheses": 0}, "hypotheses is 0; it must be at least 1"),
-        ({"confidence": 1.5}, "a probability between 0 and 1"),
+        ({"hypotheses": 0}, "hypotheses=0; it must be a whole number of at least 1"),
+        ({"confidence": 1.5}, "confidence=1.5; it must be a number between 0 and 1 or null"),
     ],
 )
 def test_bad_options_are_told(options: dict[str, object], message: str) -> None:
