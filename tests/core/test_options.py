@@ -140,7 +140,10 @@ def test_a_wrong_option_is_refused_before_anything_within_is_built() -> None:
 
 def test_fields_of_a_base_in_another_module_are_checked() -> None:
     """Their annotations are names of the module where the base is."""
-    from fmtorch.commands.match import Fields
+    from fmtorch.commands.options import MatchOptions
+
+    class Fields(MatchOptions):
+        pass
 
     expect_options(Fields, {"camera": "shared", "longest_side": 800}, "")
     with pytest.raises(ValueError, match="camera=mine; it must be one of: per_image, shared"):
