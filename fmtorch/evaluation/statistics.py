@@ -83,10 +83,6 @@ MERITS: dict[str, Callable[[Values], Values]] = {
 """The figures of merit, by the names that rows, summaries and JSON files have for them: NSGD -> values of pairs."""
 
 
-SHARES = ("recall_05", "recall_01")
-"""Those of them that are shares of pairs."""
-
-
 def _per_pair(values: torch.Tensor) -> Values:
     array: Values = values.double().numpy()
     return array.mean(0) if array.ndim > 1 else array
