@@ -93,18 +93,17 @@ class Starter:
         errors: Path | None = None,
         environment: Mapping[str, str] | None = None,
     ) -> Command:
-        """``python -m fmtorch.<name> arguments`` in a folder; before: Python code that runs first.
+        """``python -m fmtorch <name> arguments`` in a folder; before: Python code that runs first.
 
-        name: of a command, or a module of `scripts` or `tests`, or ``-c``, before code to run.
+        name: of a command, or of a module, or ``-c``, before code to run.
         log, errors: files for standard output and standard error, which go into one in the folder if not given.
         """
         self._count += 1
         log = log or cwd / f"{name}-{self._count}.log"
         own = {"FMTORCH_CACHE": str(own_cache(cwd)), "PYTHONPATH": str(SOURCE), **(environment or {})}
+        start = [name] if name.startswith(("scripts.", "tests.", "fmtorch.", "-c")) else ["fmtorch", name]
         job = {
-            "start": [name if name.startswith(("scripts.", "tests.", "-c")) else f"fmtorch.{name}", *arguments],
-            "cwd": str(cwd),
-            "log": str(log), "errors": str(errors or log), "environment": own, "before": before,
+            "start": [*start, *arguments], "cwd": str(cwd), "log": str(log), "errors": str(errors or log), "environment": own, "before": before,
         }  # fmt: skip
         return Command(self, self.ask(job), log)
 
@@ -132,7 +131,7 @@ def starter() -> Starter:
 def run_command(
     name: str, *arguments: str, cwd: Path, environment: Mapping[str, str] | None = None, patience: float = 300.0
 ) -> subprocess.CompletedProcess[str]:
-    """``python -m fmtorch.<name> arguments`` as a user runs it in a folder, to its end (names as of `Starter.start`).
+    """``python -m fmtorch <name> arguments`` as a user runs it in a folder, to its end (names as of `Starter.start`).
 
     The process is forked from one that has imported the libraries, which saves seconds, and has a cache of its own.
     Raises TimeoutError.

@@ -1,4 +1,4 @@
-"""What `python -m fmtorch.match` is told of cameras: ``cameras=exif``, ``cameras=FILE``, ``K=fx,fy,cx,cy``."""
+"""What `fmtorch match` is told of cameras: ``cameras=exif``, ``cameras=FILE``, ``K=fx,fy,cx,cy``."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def pose_line(result: MatchResult) -> str:
     return f"rotation {angle:.2f}°, translation ({direction}), focal lengths {focals} px"
 
 
-# `python -m fmtorch.match image0=a.jpg image1=b.jpg`: the fundamental matrix of two photographs, with pictures
+# `fmtorch match image0=a.jpg image1=b.jpg`: the fundamental matrix of two photographs, with pictures
 
 
 MAX_RANK3 = 0.01  # third singular value of a true F over the second one: its numbers may be rounded

@@ -1,4 +1,4 @@
-"""`python -m fmtorch.match images=FOLDER export=h5,colmap`: the pairs of a folder of images, for other programs."""
+"""`fmtorch match images=FOLDER export=h5,colmap`: the pairs of a folder of images, for other programs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`python -m fmtorch.pairs dataset=kitti dataset.root=DIR output=KITTI`: a set of the pairs that can be matched."""
+"""`fmtorch pairs dataset=kitti dataset.root=DIR output=KITTI`: a set of the pairs that can be matched."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`python -m fmtorch.report runs=[runs]`: runs of `fmtorch.eval` side by side on one HTML page."""
+"""`fmtorch report runs=[runs]`: runs of `fmtorch.eval` side by side on one HTML page."""
 
 from __future__ import annotations
 

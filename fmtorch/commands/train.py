@@ -1,4 +1,4 @@
-"""`python -m fmtorch.train pruner=lc`: train a learned pruner on the labelled matches of a data set."""
+"""`fmtorch train pruner=lc`: train a learned pruner on the labelled matches of a data set."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`python -m fmtorch.verify DATABASE`: two-view geometries of the matches in a COLMAP database."""
+"""`fmtorch verify DATABASE`: two-view geometries of the matches in a COLMAP database."""
 
 from __future__ import annotations
 

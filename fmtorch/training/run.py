@@ -1,4 +1,4 @@
-"""`python -m fmtorch.train`: a composed config -> labelled matches, a trained network, its files and its card."""
+"""`fmtorch train`: a composed config -> labelled matches, a trained network, its files and its card."""
 
 from __future__ import annotations
 

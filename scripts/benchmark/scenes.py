@@ -110,7 +110,7 @@ def _match_by_ours(scene: Scene, path: Path, work: Path) -> None:
 
     output, camera = work / f"{scene.name}-match", "shared" if scene.single else "per_image"
     words = [f"images={scene.images}", "export=colmap", f"camera={camera}", f"output={output}"]
-    if subprocess.run([sys.executable, "-m", "fmtorch.match", *words], check=False).returncode:
+    if subprocess.run([sys.executable, "-m", "fmtorch", "match", *words], check=False).returncode:
         raise SystemExit(f"{scene.images} could not be matched; see above")
     shutil.copy(output / "database.db", path)
     with pycolmap.Database.open(path) as database:

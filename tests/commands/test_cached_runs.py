@@ -156,7 +156,7 @@ def test_two_photographs(root: Path, tmp_path: Path) -> None:
 
 def test_the_command_for_two_photographs_tells(root: Path, tmp_path: Path) -> None:
     images = [f"image{i}={root}/scene/Images/{i:08d}.png" for i in (0, 1)]
-    command = "fmtorch.match", "pipeline=sift_gms", *images
+    command = "fmtorch", "match", "pipeline=sift_gms", *images
     assert counted(run_python("-m", *command, cwd=tmp_path).stdout) == (2, 0)
     assert len(list(tmp_path.glob("cache/features/*/*.npz"))) == 2
 

@@ -211,7 +211,7 @@ def test_mistakes_in_a_users_own_pruner_are_told(root: Path, tmp_path: Path) -> 
         "pruner=empty": "pruner.empty: a preset is a mapping with a `_target_`",
         "pruner=elsewhere": "must be `# @package pruner.<name>`, or be left out",
         "pruner=typo": "pruner.typo: no option threshhold; there are: threshold",
-        "pruner=lc pruner.lc.file=runs/absent": "absent.safetensors does not exist: python -m fmtorch.train pruner=lc",
+        "pruner=lc pruner.lc.file=runs/absent": "absent.safetensors does not exist: fmtorch train pruner=lc",
     }
     for options, message in messages.items():
         run = evaluate(

@@ -286,9 +286,8 @@ def test_overrides_and_a_callers_own_hydra() -> None:
 
 def run_python(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
     """Run a command as a user does, or other arguments of Python."""
-    if arguments[0] == "-m":
-        name = arguments[1].removeprefix("fmtorch.")
-        return run_command(name, *arguments[2:], cwd=cwd, environment={"CUDA_VISIBLE_DEVICES": ""})
+    if arguments[:2] == ("-m", "fmtorch"):
+        return run_command(*arguments[2:], cwd=cwd, environment={"CUDA_VISIBLE_DEVICES": ""})
     source = str(Path(__file__).resolve().parents[2])
     own = {"COLUMNS": "200", "CUDA_VISIBLE_DEVICES": "", "OMP_NUM_THREADS": "1", "FMTORCH_CACHE": str(own_cache(cwd))}
     env = {**os.environ, "PYTHONPATH": source, **own}
@@ -301,7 +300,7 @@ def test_the_command(tmp_path: Path) -> None:
     Image.fromarray(image0).save(tmp_path / "a.png")
     Image.fromarray(image1).save(tmp_path / "b.webp", quality=95)
     (tmp_path / "F.txt").write_text("0 0 0\n0 0 -2\n0, 2, 0\n")
-    done = run_python("-m", "fmtorch.match", "image0=a.png", "image1=b.webp", "truth=F.txt", cwd=tmp_path)
+    done = run_python("-m", "fmtorch", "match", "image0=a.png", "image1=b.webp", "truth=F.txt", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "RuntimeWarning" not in done.stderr
     for text in ("hesaffnet_fast_fmtorch", "one_to_one", "inliers", "seconds", "NSGD", "matches/a-b"):
@@ -331,7 +330,7 @@ def test_the_command(tmp_path: Path) -> None:
     # Without F, into the same folder: a picture, the reason, status 0, and nothing left of the earlier pair.
     cv2.imwrite(str(tmp_path / "flat.png"), np.full((300, 20), 90, np.uint8))
     other = ("image1=flat.png", f"output={folder}", "pipeline=sift_gms", "pruner=[ratio]")
-    done = run_python("-m", "fmtorch.match", "image0=a.png", *other, cwd=tmp_path)
+    done = run_python("-m", "fmtorch", "match", "image0=a.png", *other, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "sift_gms pruner=[ratio]: a.png, flat.png" in done.stdout
     assert "no keypoints in image1" in done.stderr
@@ -346,7 +345,7 @@ def test_the_command(tmp_path: Path) -> None:
     # With F, of photographs that show nothing in common.
     Image.fromarray(stereo(240, 320, seed=1)[0]).save(tmp_path / "other.png")
     other = ("image1=other.png", f"output={folder}", "pipeline=sift_ratio", *LMEDS, "pruner.ratio.threshold=0.95")
-    done = run_python("-m", "fmtorch.match", "image0=a.png", *other, cwd=tmp_path)
+    done = run_python("-m", "fmtorch", "match", "image0=a.png", *other, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "probably not the same scene" in done.stderr
     report = json.loads((folder / "result.json").read_text())
@@ -357,7 +356,7 @@ def test_the_command(tmp_path: Path) -> None:
     assert done.stderr.count("nothing in common") == 0  # which is said already
 
     # One photograph twice: the table and a warning say it.
-    done = run_python("-m", "fmtorch.match", "image0=a.png", "image1=a.png", "output=same", cwd=tmp_path)
+    done = run_python("-m", "fmtorch", "match", "image0=a.png", "image1=a.png", "output=same", cwd=tmp_path)
     assert "identical" in done.stdout
     assert "no motion" in done.stderr
     report = json.loads((tmp_path / "same" / "result.json").read_text())
@@ -377,7 +376,7 @@ def test_the_command(tmp_path: Path) -> None:
 def test_what_cannot_be_done_is_told(arguments: list[str], message: str, tmp_path: Path) -> None:
     Image.fromarray(stereo()[0]).save(tmp_path / "a.png")
     (tmp_path / "F.txt").write_text("1 2 3\n")
-    done = run_python("-m", "fmtorch.match", *arguments, cwd=tmp_path)
+    done = run_python("-m", "fmtorch", "match", *arguments, cwd=tmp_path)
     assert done.returncode == 1
     assert message in done.stderr
     assert "Traceback" not in done.stderr

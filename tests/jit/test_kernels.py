@@ -452,7 +452,7 @@ def test_the_storage_command_lists_and_clears_them(module: types.ModuleType, cac
 
     def listing(*options: str) -> str:
         environment = {"FMTORCH_CACHE": str(cache.parent)}
-        done = run_command("runs", *options, cwd=tmp_path / "here", environment=environment)
+        done = run_command("fmtorch.runs", *options, cwd=tmp_path / "here", environment=environment)
         assert done.returncode == 0, done.stderr
         return done.stdout
 

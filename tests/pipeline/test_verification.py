@@ -459,8 +459,8 @@ def test_the_command(tmp_path: Path) -> None:
 
 def test_without_pycolmap_an_extra_is_named(tmp_path: Path) -> None:
     write(tmp_path / "database.db", scene(2))
-    code = "import sys; sys.modules['pycolmap'] = None; sys.argv[1:] = ['database.db']; import runpy; "
-    done = run_command("-c", code + "runpy.run_module('fmtorch.verify', run_name='__main__')", cwd=tmp_path)
+    code = "import sys; sys.modules['pycolmap'] = None; sys.argv[1:] = ['verify', 'database.db']; import runpy; "
+    done = run_command("-c", code + "runpy.run_module('fmtorch', run_name='__main__')", cwd=tmp_path)
     assert done.stderr == "error: pycolmap is not installed; pip install 'fmtorch[colmap]' brings it\n"
 
 

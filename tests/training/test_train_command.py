@@ -1,4 +1,4 @@
-"""`python -m fmtorch.train`, as a user runs it: from another directory, with a network of one's own."""
+"""`fmtorch train`, as a user runs it: from another directory, with a network of one's own."""
 
 from __future__ import annotations
 

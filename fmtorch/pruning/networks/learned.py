@@ -72,7 +72,7 @@ def predict(network: nn.Module, c: Correspondences) -> Prediction:
 
 
 RUNTIMES = ("auto", *SUFFIXES)
-COMMAND = "python -m fmtorch.train pruner=NAME makes it, with the name of the preset"
+COMMAND = "fmtorch train pruner=NAME makes it, with the name of the preset"
 
 
 class LearnedPruner:

@@ -1,1 +1,0 @@
-"""The exchangeable parts of the engine: one class a file, its kernels beside it."""
