@@ -103,7 +103,8 @@ class Starter:
         own = {"FMTORCH_CACHE": str(own_cache(cwd)), "PYTHONPATH": str(SOURCE), **(environment or {})}
         start = [name] if name.startswith(("scripts.", "tests.", "fmtorch.", "-c")) else ["fmtorch", name]
         job = {
-            "start": [*start, *arguments], "cwd": str(cwd), "log": str(log), "errors": str(errors or log), "environment": own, "before": before,
+            "start": [*start, *arguments], "cwd": str(cwd), "log": str(log), "errors": str(errors or log),
+            "environment": own, "before": before,
         }  # fmt: skip
         return Command(self, self.ask(job), log)
 

@@ -95,7 +95,7 @@ def test_unpacked_wheel_finds_its_folders_from_any_directory(wheel: Path, tmp_pa
     elsewhere = tmp_path / "elsewhere"
     (elsewhere / "conf").mkdir(parents=True)  # a user's own folder of that name must not be taken
     code = (
-        "import fmtorch; from fmtorch.core import resources as r; print(fmtorch.__file__, r.conf_dir(), r.models_dir())"
+        "import fmtorch; from fmtorch.core import files; print(fmtorch.__file__, files.conf_dir(), files.models_dir())"
     )
     done = subprocess.run(
         [sys.executable, "-c", code], cwd=elsewhere, env={**os.environ, "PYTHONPATH": str(root)},

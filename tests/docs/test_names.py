@@ -21,7 +21,9 @@ VARIABLES = {"F", "c", "config", "e", "estimate", "lens", "pose", "result"}  # o
 FOREIGN = {"CompileResult", "Dataset", "Path", "TwoViewGeometry"}  # classes of other libraries
 SETS = {"Fgt", "Strecha_train", "TanksLike"}
 DOTTED = re.compile(r"([A-Za-z_]\w*(?:\.[A-Za-z_]\w*)+)(?:\(.*)?")
-FILE = re.compile(r"[\w.]+\.(bin|csv|db|h5|html|json|md|npz|onnx|out|partial|png|py|sh|shards|svg|txt|verification)")
+FILE = re.compile(
+    r"[\w.]+\.(bin|csv|db|h5|html|json|md|npz|onnx|out|partial|parts|png|py|sh|shards|svg|txt|verification)"
+)
 
 
 def docstrings(path: Path) -> Iterator[str]:

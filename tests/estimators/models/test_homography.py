@@ -11,9 +11,9 @@ import pytest
 import torch
 
 import fmtorch
-from fmtorch import presets
+from fmtorch import Correspondences, presets
 from fmtorch.estimators import Ransac
-from fmtorch.two_view.arguments import correspondences
+from fmtorch.pipeline.build import load_pipeline
 from tests.conftest import shared_path
 from tests.reference import homography_family as reference
 
@@ -242,7 +242,10 @@ def test_any_unit_of_pixels(scale: float) -> None:
     """Thresholds are pixels: all matches are inliers of points within a pixel, only exact ones of huge images."""
     m = matches(10, noise=0, wrong=0.3)
     # Behind the door, which refuses points within a pixel.
-    estimate = presets.build("estimator", "homography")(correspondences(scale * m.x0, scale * m.x1))
+    points = [scale * torch.from_numpy(x)[None] for x in (m.x0, m.x1)]
+    estimate = presets.build("estimator", "homography")(
+        Correspondences(*points, torch.ones(1, len(m.x0), dtype=torch.bool))
+    )
     assert estimate.ok.tolist() == [True]
     assert estimate.H.isfinite().all()
     if scale > 1:
@@ -293,4 +296,4 @@ def test_parts_for_fundamental_matrices_are_refused(options: dict[str, object]) 
 
 def test_a_pipeline_needs_fundamental_matrices() -> None:
     with pytest.raises(ValueError, match="the estimator gives homography matrices; a pipeline needs fundamental"):
-        fmtorch.load_pipeline("sift_gms", overrides=["estimator=homography"])
+        load_pipeline("sift_gms", overrides=["estimator=homography"])
