@@ -17,7 +17,7 @@ from fmtorch.runs.feature_cache import ArrayCache, CachedFeatures
 from tests.commands.test_eval import OPTIONS, evaluate, rows
 from tests.commands.test_match import run_python
 from tests.conftest import shared_path
-from tests.pipeline.test_pipeline import draw
+from tests.helpers import draw
 from tests.processes import Command, starter
 
 IMAGES = 24

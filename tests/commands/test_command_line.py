@@ -18,7 +18,7 @@ from fmtorch.commands.config import hydra_arguments
 from fmtorch.commands.options import COMMANDS
 from fmtorch.presets import available
 from tests.conftest import own_cache
-from tests.pipeline.test_pipeline import draw
+from tests.helpers import draw
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 

@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from tests.conftest import shared_path
-from tests.pipeline.test_pipeline import draw
+from tests.helpers import draw
 from tests.processes import run_command
 
 OPTIONS = ["features.max_features=500", "estimator=lmeds", "estimator.hypotheses=200"]

@@ -26,7 +26,7 @@ from fmtorch.io.dataset import H5Pairs
 from fmtorch.pipeline.pipeline import Outcome, Pipeline, examined
 from fmtorch.runs import PairRow, to_table
 from tests.geometry.kinds import K, batch, draw
-from tests.storage.exchange import writers
+from tests.io import writers
 
 
 def unused(*_: object) -> None:

@@ -14,20 +14,9 @@ import torch
 from fmtorch import presets
 from fmtorch.core.types import Correspondences, Estimate, Features
 from fmtorch.data import ImagePair, ImageSource
-from fmtorch.pipeline.pipeline import Memo, Pipeline
-
-
-def draw(path: Path, seed: int, shift: int = 0) -> ImageSource:
-    """A blurred random picture that SIFT finds plenty in, shifted to the left by some pixels."""
-    noise = np.random.default_rng(seed).uniform(0, 255, (60, 100))
-    picture = cv2.resize(noise, (800, 480), interpolation=cv2.INTER_CUBIC)[:240, shift : shift + 320]
-    cv2.imwrite(str(path), np.clip(picture, 0, 255).astype(np.uint8))
-    return ImageSource(path.name, path)
-
-
-def pair(name: str, image0: ImageSource, image1: ImageSource, problem: str | None = None) -> ImagePair:
-    F = np.array([[0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]]) / np.sqrt(2)  # a sideways camera: epipolar lines are rows
-    return ImagePair(name, "family", "scene", image0, image1, F, problem=problem)
+from fmtorch.pipeline.pipeline import Memo
+from tests.helpers import draw, pair
+from tests.helpers import small_pipeline as pipeline
 
 
 @pytest.fixture
@@ -46,16 +35,6 @@ def pairs(tmp_path: Path) -> list[ImagePair]:
         pair("absent", a, ImageSource("absent", tmp_path / "absent.png")),
         pair("known", a, b, problem="pairs.txt, line 3: F is NaN"),
     ]
-
-
-def pipeline(**parts: object) -> Pipeline:
-    stages = {
-        "features": presets.build("features", "sift", max_features=500),
-        "matcher": presets.build("matcher", "nearest"),
-        "pruners": {name: presets.build("pruner", name) for name in ("ratio", "one_to_one")},
-        "estimator": presets.build("estimator", "lmeds", hypotheses=200),
-    }
-    return Pipeline(**{**stages, **parts})  # type: ignore[arg-type]
 
 
 def test_failures_are_outcomes_with_reasons(pairs: list[ImagePair]) -> None:
@@ -89,8 +68,8 @@ def test_an_estimator_that_says_nothing_of_significance_is_judged(pairs: list[Im
 
 def test_batches_change_nothing(pairs: list[ImagePair]) -> None:
     together = pipeline().run(pairs, seed=3)
-    for pair, outcome in zip(pairs, together, strict=True):
-        (alone,) = pipeline().run([pair], seed=3)
+    for each, outcome in zip(pairs, together, strict=True):
+        (alone,) = pipeline().run([each], seed=3)
         assert alone.reason == outcome.reason
         if alone.estimate is not None and outcome.estimate is not None:
             assert torch.equal(alone.estimate.F, outcome.estimate.F)

@@ -17,7 +17,7 @@ from scripts.benchmark import verify
 from scripts.benchmark.runner import Kept
 from scripts.benchmark.scenes import Scene, Truth, calibrate, read_scene, triangulate
 from scripts.benchmark.verify import accuracy, centre_errors, sheets
-from tests.pipeline import databases
+from tests.verification import databases
 
 K = np.array([[700.0, 0, 310], [0, 701, 250], [0, 0, 1]])
 AREAS = [f"{name}{limit}" for name in ("auc", "centre") for limit in (1, 5, 10)]

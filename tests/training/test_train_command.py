@@ -15,8 +15,7 @@ pytest.importorskip("lightning", reason="training needs the extra `train`")
 
 from fmtorch.training.run import run
 from tests.conftest import own_cache
-from tests.helpers import compose
-from tests.pipeline.test_pipeline import draw
+from tests.helpers import compose, draw
 from tests.processes import run_command
 
 SHORT = [

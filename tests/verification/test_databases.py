@@ -20,9 +20,9 @@ from fmtorch.data.lenses import MODELS
 from fmtorch.io.colmap import EXIF_DEVIATION, MatchDatabase, database_image
 from fmtorch.verification import run
 from tests.conftest import shared_path
-from tests.pipeline import databases
-from tests.pipeline.databases import SIZE, plain, read, scene, write
 from tests.processes import run_command, starter
+from tests.verification import databases
+from tests.verification.databases import SIZE, plain, read, scene, write
 
 Configuration = pycolmap.TwoViewGeometryConfiguration
 BACK = np.array([[1.0, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])

@@ -24,8 +24,7 @@ from fmtorch.pipeline import folder
 from fmtorch.pipeline.folder import chosen_pairs, images_below, open_folder
 from fmtorch.pipeline.two_images import Described
 from fmtorch.runs import RunFolder
-from tests.helpers import compose
-from tests.pipeline.test_pipeline import draw
+from tests.helpers import compose, draw
 
 OPTIONS = ("features.max_features=400", "estimator=lmeds", "estimator.hypotheses=100", "cache=off")
 

@@ -10,9 +10,9 @@ import pytest
 import fmtorch
 from fmtorch.jobs.execution import Execution
 from fmtorch.verification import run
-from tests.pipeline import test_verification_hloc as hloc
-from tests.pipeline import test_verification_matches as alone
-from tests.pipeline.databases import plain, read, scene, write
+from tests.verification import test_hloc as hloc
+from tests.verification import test_matches as alone
+from tests.verification.databases import plain, read, scene, write
 
 
 @pytest.fixture(autouse=True)

@@ -12,8 +12,8 @@ import pytest
 
 import fmtorch
 from fmtorch.core.types import pair_key
-from tests.pipeline.databases import SIZE, Scene, matches, scene
 from tests.processes import run_command, starter
+from tests.verification.databases import SIZE, Scene, matches, scene
 
 K = np.array([[600.0, 0, 319.5], [0, 600, 239.5], [0, 0, 1]])
 FILES = ("features=features.h5", "matches=matches.h5", "output=verified.h5")

@@ -24,7 +24,7 @@ from fmtorch.io.dataset import H5Pairs
 from fmtorch.pipeline.build import load_pipeline
 from fmtorch.pipeline.pipeline import Outcome, Pipeline
 from fmtorch.pruning import ratio_test
-from tests.storage.exchange import writers
+from tests.io import writers
 
 NEEDS_TRUTH = ("hloc", "glue_factory", "vismatch")
 WITH_RATIOS = ("ransac_tutorial", "oanet")
