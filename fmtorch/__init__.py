@@ -6,9 +6,11 @@ from fmtorch.core.lazy import lazy_exports
 from fmtorch.core.version import __version__
 
 if TYPE_CHECKING:
-    from fmtorch.core.types import Correspondences, Estimate, Features
+    from fmtorch.core.types import Correspondences, Estimate, Features, PoseEstimate
+    from fmtorch.pipeline.match_result import MatchResult
+    from fmtorch.pipeline.pictures import draw_epipolar_lines, draw_matches
     from fmtorch.pipeline.pipeline import Pipeline
-    from fmtorch.pipeline.two_images import MatchResult, match
+    from fmtorch.pipeline.two_images import match
     from fmtorch.two_view.find import find_essential, find_fundamental, find_homography
     from fmtorch.verification.run import Verification
     from fmtorch.verification.verify import verify
@@ -19,8 +21,11 @@ __all__ = [
     "Features",
     "MatchResult",
     "Pipeline",
+    "PoseEstimate",
     "Verification",
     "__version__",
+    "draw_epipolar_lines",
+    "draw_matches",
     "find_essential",
     "find_fundamental",
     "find_homography",

@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -22,20 +21,19 @@ from fmtorch import presets
 from fmtorch.commands.config import chosen_pipeline, job, run_command
 from fmtorch.commands.match_folder import match_folder
 from fmtorch.commands.options import MATCH, MatchOptions
-from fmtorch.core.files import expect_writable, replacing
+from fmtorch.core.files import expect_writable
 from fmtorch.core.terminal import console, errors
 from fmtorch.core.types import RELATED
 from fmtorch.core.version import __version__
 from fmtorch.data.images import read_image
-from fmtorch.data.lenses import undistorted
-from fmtorch.evaluation.pictures import draw_epipolar_lines, draw_matches
 from fmtorch.metrics import nsgd
 from fmtorch.pipeline.build import build_pipeline
 from fmtorch.pipeline.folder import EXHAUSTIVE
+from fmtorch.pipeline.match_result import MatchResult
 from fmtorch.pipeline.photograph_cameras import PhotographCameras
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.pipeline.reduced_images import Image
-from fmtorch.pipeline.two_images import MatchResult, match
+from fmtorch.pipeline.two_images import match
 from fmtorch.presets.fields import read_fields
 from fmtorch.runs.feature_cache import CachedFeatures
 
@@ -47,14 +45,6 @@ class Photographs:
     images: tuple[Image, Image]
     knowledge: dict[str, Any]
     notes: tuple[str, ...] = ()
-
-    @property
-    def pinholes(self) -> tuple[Image, Image]:
-        """The photographs without the distortion of their lenses."""
-        lenses = [self.knowledge.get(f"lens{i}") for i in (0, 1)]
-        bent = zip(self.images, lenses, strict=True)
-        image0, image1 = (image if lens is None else undistorted(image, lens) for image, lens in bent)
-        return image0, image1
 
 
 def photographs(
@@ -78,16 +68,6 @@ def photographs(
     camera0, camera1 = (known.of(path, (image.shape[0], image.shape[1])) for path, image in ends)
     notes = tuple(filter(None, (camera0.note, camera1.note)))
     return Photographs((image0, image1), known.knowledge(camera0, camera1), notes)
-
-
-def pose_report(result: MatchResult) -> dict[str, Any]:
-    """R, t and focal lengths of result.json; None where they are not determined, nothing where nobody asked."""
-    if result.R is None or result.t is None or result.focals is None:
-        return {}
-    determined = result.ok and bool(torch.isfinite(result.R).all())
-    focals = [focal if math.isfinite(focal) else None for focal in result.focals.tolist()]
-    R, t = (value.tolist() if determined else None for value in (result.R, result.t))
-    return {"R": R, "t": t, "focals": focals}
 
 
 def pose_line(result: MatchResult) -> str:
@@ -132,20 +112,17 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
     result = match(
         image0, image1, pipeline=pipeline, longest_side=fields.longest_side, seed=fields.seed, **given.knowledge
     )
-    report = {
-        "version": __version__, "pipeline": pipeline_name, "overrides": list(overrides), "seed": fields.seed,
-        "image0": str(paths[0]), "image1": str(paths[1]),
-        **_report(result, image0, image1, truth), **pose_report(result),
-    }  # fmt: skip
-    with replacing(folder / "result.json") as path:
-        path.write_text(json.dumps(report) + "\n")
-    written = ["result.json", *_draw(folder, result, given, truth)]
+    error = None if truth is None or not result.ok else _nsgd(result, truth)
+    written = result.save(
+        folder, truth=truth, version=__version__, pipeline=pipeline_name, overrides=list(overrides), seed=fields.seed,
+        image0=str(paths[0]), image1=str(paths[1]), **({} if error is None else {"nsgd": error}),
+    )  # fmt: skip
     heading = f"{' '.join([pipeline_name, *overrides])}: {paths[0].name}, {paths[1].name}"
     console.print(heading, style="italic", markup=False, highlight=False)
     extractor = pipeline.extractor
     console.print(_table(result, isinstance(extractor, CachedFeatures) and not extractor.computed))
-    if "nsgd" in report:
-        console.print(f"NSGD to the true F: {report['nsgd']:.4f}", highlight=False)
+    if error is not None:
+        console.print(f"NSGD to the true F: {error:.4f}", highlight=False)
     if line := pose_line(result):
         console.print(line, highlight=False)
     for trouble in (*given.notes, *_troubles(result)):
@@ -192,59 +169,10 @@ def _default_output(paths: Sequence[Path]) -> Path:
     return folder
 
 
-def _report(result: MatchResult, image0: Image, image1: Image, truth: NDArray[np.float64] | None) -> dict[str, Any]:
-    """What result.json holds of a result; points in pixels of the images."""
+def _nsgd(result: MatchResult, truth: NDArray[np.float64]) -> float:
     c = result.correspondences
-    report: dict[str, Any] = {
-        "size0": image0.shape[:2], "size1": image1.shape[:2],
-        "F": result.F.tolist() if result.ok else None, "reason": result.reason, "warning": result.warning,
-        "configuration": result.configuration or None,
-        "homography": None if result.homography is None else result.homography.tolist(),
-        "related": result.related, "significance": result.significance if math.isfinite(result.significance) else None,
-        "features": [len(result.keypoints0), len(result.keypoints1)],
-        "matches": result.counts, "seconds": result.seconds,
-        "x0": c.x0[0].tolist(), "x1": c.x1[0].tolist(), "inliers": result.inliers.tolist(),
-        "ratio": None if c.quality is None else c.quality[0].tolist(),
-    }  # fmt: skip
-    if (pinhole := result.undistorted) is not None:
-        report |= {"undistorted_x0": pinhole.x0[0].tolist(), "undistorted_x1": pinhole.x1[0].tolist()}
-    if truth is not None and result.ok:
-        sizes = (torch.tensor([image.shape[:2]]) for image in (image0, image1))
-        report["nsgd"] = float(nsgd(torch.from_numpy(truth)[None], result.F.cpu()[None], *sizes)[0])
-    return report
-
-
-def _draw(folder: Path, result: MatchResult, given: Photographs, truth: NDArray[np.float64] | None) -> list[str]:
-    """Draw the pictures into the folder, matches in the photographs and epipolar lines in pinholes; their names."""
-    image0, image1 = given.images
-    x0, x1 = (x[0].cpu().numpy().astype(np.float64) for x in (result.putative.x0, result.putative.x1))
-    kept = result.kept.cpu().numpy()
-    good = kept.copy()
-    if result.ok:
-        good[good] = result.inliers.cpu().numpy()
-    names = (
-        ("inliers of F", "others, dropped by pruning or estimation") if result.ok else ("kept", "dropped by pruning")
-    )
-    pictures = {"matches.png": draw_matches(image0, image1, x0, x1, good, names=names)}
-    pruners = [step for step in result.counts if step not in ("matching", "estimation")]
-    if pruners:
-        names = (f"kept by pruning ({', '.join(pruners)})", "dropped")
-        pictures["pruning.png"] = draw_matches(image0, image1, x0, x1, kept, names=names)
-    F = result.F.cpu().numpy() if result.ok else truth
-    if F is not None:
-        dashed = truth if result.ok else None
-        if (c := result.undistorted) is None:
-            ends = x0[good], x1[good]
-        else:
-            seen = (result.inliers if result.ok else c.mask[0]).cpu()
-            ends = c.x0[0].cpu()[seen].double().numpy(), c.x1[0].cpu()[seen].double().numpy()
-        pictures["epipolar.png"] = draw_epipolar_lines(*given.pinholes, *ends, F, truth=dashed)
-    for name, picture in pictures.items():
-        with replacing(folder / name) as path:
-            path.write_bytes(cv2.imencode(".png", picture[..., ::-1])[1].tobytes())
-    for name in {"pruning.png", "epipolar.png"} - pictures.keys():  # of an earlier run
-        (folder / name).unlink(missing_ok=True)
-    return list(pictures)
+    sizes = (torch.as_tensor(size).cpu() for size in (c.size0, c.size1))
+    return float(nsgd(torch.from_numpy(truth)[None], result.F.cpu()[None], *sizes)[0])
 
 
 def _troubles(result: MatchResult) -> list[str]:

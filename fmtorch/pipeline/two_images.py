@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import math
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -19,7 +17,7 @@ from fmtorch import presets
 from fmtorch.core.grey_pyramid import GreyPyramid, grey_pyramid
 from fmtorch.core.no_features import NoFeatures
 from fmtorch.core.stages import ImageMatcher, PairImages, pruned
-from fmtorch.core.types import RELATED, Correspondences, Estimate, Features
+from fmtorch.core.types import Correspondences, Estimate, Features
 from fmtorch.data.images import to_grey
 from fmtorch.data.lenses import Lens
 from fmtorch.geometry.pair_type import GENERAL, IDENTICAL, PLANAR, ROTATION
@@ -27,8 +25,10 @@ from fmtorch.geometry.significance import judged
 from fmtorch.io.match_store import Kind, PairGeometry
 from fmtorch.jobs.threads import mapped, one_thread
 from fmtorch.pipeline.build import load_pipeline
+from fmtorch.pipeline.match_result import Lenses, MatchResult
 from fmtorch.pipeline.pipeline import Clock, Pipeline
 from fmtorch.pipeline.reduced_images import (
+    GivenImage,
     Image,
     evenly_reduced,
     frames_to_original,
@@ -73,66 +73,6 @@ def describe(pipeline: Pipeline, image: Image, longest_side: int) -> Described:
     features, seconds = (NoFeatures()(reduced), 0.0) if itself else pipeline.extract(reduced)
     pyramid = grey_pyramid(to_grey(reduced)) if pipeline.looks_at_images else None
     return Described(features, scale, (image.shape[0], image.shape[1]), seconds, pyramid, reduced if itself else None)
-
-
-# What is found of two photographs
-
-
-FLAT = ("planar", "rotation", "identical")  # configurations of which a homography explains all matches
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class MatchResult:
-    """The matches of two photographs and their fundamental matrix, ``x1^T F x0 = 0``, in pixels of the photographs.
-
-    keypoints0, keypoints1: all that were detected, (N0, 2) and (N1, 2).
-    putative: the matcher's matches, a batch of one. kept: which of them the pruners kept, (M,).
-    correspondences: the kept ones, a batch of one. inliers: which of those agree with F, (K,).
-    F: (3, 3) float64 of unit Frobenius norm; zero where there is none, and `reason` then says why.
-    significance: how far the support of F is beyond chance (`fmtorch.geometry.significance`); -inf where there is no F.
-    warning: why F, though found, means little; mostly empty. counts: matches after each step, in order. seconds: of
-    each step, cached features with those they took when they were computed.
-    R (3, 3), t (3,), focals (2,): X1 = R X0 + t with a t of unit length, and focal lengths in pixels of the
-    photographs, where cameras were asked for; NaN where not determined.
-    configuration: one of `CONFIGURATIONS`; empty where nothing could be matched. geometry: the two-view geometry for
-    COLMAP, whose inliers are indices of the kept matches, twice. undistorted: where a lens distorts, the kept matches
-    as pinholes would have them, which F and homography relate; points are otherwise those of the photographs.
-    """
-
-    keypoints0: Float[Tensor, "n0 2"]
-    keypoints1: Float[Tensor, "n1 2"]
-    putative: Correspondences
-    kept: Bool[Tensor, " m"]
-    correspondences: Correspondences
-    inliers: Bool[Tensor, " k"]
-    F: Float[Tensor, "3 3"]
-    reason: str = ""
-    warning: str = ""
-    counts: dict[str, int] = dataclasses.field(default_factory=dict)
-    seconds: dict[str, float] = dataclasses.field(default_factory=dict)
-    significance: float = -math.inf
-    R: Float[Tensor, "3 3"] | None = None
-    t: Float[Tensor, " 3"] | None = None
-    focals: Float[Tensor, " 2"] | None = None
-    configuration: str = ""
-    geometry: PairGeometry | None = None
-    undistorted: Correspondences | None = None
-
-    @property
-    def homography(self) -> Float[Tensor, "3 3"] | None:
-        """Of planes, rotations and copies: ``x1 ~ H x0`` in pixels of the photographs; else None."""
-        H = None if self.geometry is None or self.configuration not in FLAT else self.geometry.H
-        return None if H is None else torch.from_numpy(H)
-
-    @property
-    def related(self) -> bool:
-        """Whether the photographs are taken to show one scene: F was found, and its support is beyond chance."""
-        return self.ok and self.significance >= RELATED
-
-    @property
-    def ok(self) -> bool:
-        """Whether a fundamental matrix was found."""
-        return not self.reason
 
 
 # Estimates of pairs and their configurations as the two-view geometries of COLMAP's databases
@@ -214,12 +154,11 @@ def _conflicting(c: Correspondences, estimate: Estimate) -> Tensor:
 
 NOTHING_KNOWN: Mapping[str, Tensor] = {}
 NO_CAMERAS: Mapping[str, None] = dict.fromkeys(("K0", "K1", "focal", "shared_focal"))  # of the reduced images
-Lenses = tuple[Lens | None, Lens | None]
 
 
 def match(
-    image0: Path | str | Image,
-    image1: Path | str | Image,
+    image0: GivenImage,
+    image1: GivenImage,
     *,
     pipeline: str | Pipeline = "hesaffnet_fast_fmtorch",
     device: torch.device | str | None = None,
@@ -234,7 +173,8 @@ def match(
     """Match two photographs and estimate their fundamental matrix.
 
     Args:
-        image0, image1: files, turned as their EXIF orientation says, or uint8 arrays, (H, W) or RGB (H, W, 3).
+        image0, image1: files, turned as their EXIF orientation says, images of Pillow as they are, or uint8 arrays,
+            (H, W) or RGB (H, W, 3).
         pipeline: a preset of conf/pipeline, or a `Pipeline` (``load_pipeline("sift_gms", overrides=[...])``).
         device: of a pipeline given by name; None: a GPU where there is one.
         longest_side: larger images are reduced to it for matching, and thresholds are in pixels of the reduced images;
@@ -275,7 +215,8 @@ def match(
     describing = functools.partial(describe, pipeline, longest_side=longest_side)
     at_once = functools.partial(mapped, share=True) if pipeline.device.type == "cpu" else map
     described0, described1 = at_once(describing, images)
-    return relate(pipeline, described0, described1, seed, cameras, (lens0, lens1))
+    result = relate(pipeline, described0, described1, seed, cameras, (lens0, lens1))
+    return dataclasses.replace(result, photographs=(image0, image1), lenses=(lens0, lens1))
 
 
 def relate(

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fmtorch.evaluation.pictures import (
+from fmtorch.pipeline.pictures import (
     BAD,
     COLOURS,
     GOOD,
