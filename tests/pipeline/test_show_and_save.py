@@ -92,7 +92,7 @@ def test_a_record_is_the_same_after_its_file(tmp_path: Path) -> None:
         assert all(
             torch.equal(value, getattr(again, name)) for name, value in vars(estimate).items() if torch.is_tensor(value)
         )
-    with pytest.raises(ValueError, match="holds PoseEstimate; Correspondences.load reads Correspondences"):
+    with pytest.raises(ValueError, match=r"holds PoseEstimate; Correspondences\.load reads Correspondences"):
         fmtorch.Correspondences.load(path)
 
 
