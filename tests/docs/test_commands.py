@@ -4,8 +4,6 @@ A command runs as it stands there, but for the words that `smaller` exchanges; a
 that take long run with ``-m slow``.
 """
 
-from __future__ import annotations
-
 import contextlib
 import importlib.util
 import os

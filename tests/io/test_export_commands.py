@@ -1,7 +1,5 @@
 """The commands that export: a folder of images and an evaluation, resumed, refused, and read back as a data set."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import re

@@ -1,7 +1,5 @@
 """Folders of photographs with what is known of their cameras: intrinsics and two-view geometries of the exports."""
 
-from __future__ import annotations
-
 import json
 import math
 import shutil
@@ -35,7 +33,6 @@ class Scene:
     def __init__(self, folder: Path, coefficients: tuple[float, ...] = (), equivalent: int | None = None) -> None:
         self.folder = folder
         self.pair = load("fmbench", root=shared_path("data/Strecha_train"))[0]
-        assert self.pair.K0 is not None
         half = np.array([[0.5, 0, -0.25], [0, 0.5, -0.25], [0, 0, 1]])
         self.K = half @ self.pair.K0
         fx, fy, cx, cy = self.K[[0, 1, 0, 1], [0, 1, 2, 2]]

@@ -1,7 +1,5 @@
 """Each layout of others, written from its description, read back; what is damaged is named and harms nothing else."""
 
-from __future__ import annotations
-
 import pickle
 import shutil
 import sys
@@ -60,7 +58,6 @@ def test_what_was_written_is_read(layout: str, tmp_path: Path) -> None:
     assert len(dataset) == writers.PAIRS
     for pair, s in zip(dataset, writers.scenes(), strict=True):
         assert pair.problem is None
-        assert pair.matches is not None
         sign = np.sign((pair.F * s.F.numpy()).sum())
         np.testing.assert_allclose(sign * pair.F, s.F.numpy(), atol=1e-9)
         for got, expected in ((pair.K0, s.K0), (pair.K1, s.K1), (pair.R, s.R), (pair.t, s.t)):
@@ -113,7 +110,6 @@ def test_hloc_pairs_in_the_other_order(tmp_path: Path) -> None:
 
 
 def given(pair: ImagePair) -> Any:
-    assert pair.matches is not None
     return pair.matches()
 
 
@@ -331,13 +327,11 @@ def test_a_report_finds_it(layout: str, roots: list[str], tmp_path: Path) -> Non
 def test_the_pipeline_of_given_matches_estimates_as_the_function_does(tmp_path: Path) -> None:
     """With the prior that `find_fundamental` derives from the same points."""
     pair = load("oanet", tmp_path)[0]
-    assert pair.matches is not None
     c, _ = pair.matches()
     (outcome,) = load_pipeline("given_fmtorch").run([pair], seed=3)
     alone = fmtorch.find_fundamental(
         c.x0, c.x1, mask=c.mask, quality=c.quality, size0=c.size0, size1=c.size1, key=pair.key, seed=3
     )
-    assert outcome.estimate is not None
     assert torch.equal(outcome.estimate.F, alone.F)
 
 

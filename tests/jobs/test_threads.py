@@ -1,7 +1,5 @@
 """Stages of many small operations compute with one thread, whatever torch may use, and leave that as it was."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path

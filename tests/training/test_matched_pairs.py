@@ -1,7 +1,5 @@
 """`MatchedPairs`: computed once, resumed, never stale, never damaged, readable from any process; its files."""
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import pickle

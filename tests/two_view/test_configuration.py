@@ -1,7 +1,5 @@
 """Configurations of estimated pairs: synthetic ones of each kind, known and unknown cameras, the laws, arguments."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 
@@ -40,8 +38,6 @@ def test_a_focal_length_that_is_not_known_is_that_of_no_calibration() -> None:
     """Rotations with K whose focal lengths are three times too long, and with measured ones but no K."""
     pairs = [pair("rotation", seed) for seed in range(10)]
     c = collate(pairs)
-    assert c.K0 is not None
-    assert c.K1 is not None
     long = torch.tensor([3.0, 3.0, 1.0])
     wrong, estimate = c.replace(K0=c.K0 * long, K1=c.K1 * long), estimated(c)
     assert classify(wrong, estimate).names.count("rotation") <= 2

@@ -1,7 +1,5 @@
 """Points that are obviously not in pixels are refused, with what to do; what may be in pixels is not."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
