@@ -185,7 +185,7 @@ def by_colmap(threshold: float, c: Correspondences) -> str:
         assert size is not None
         ends.append(colmap.Camera(K[0].double().numpy(), number=number, size=(int(size[0, 0]), int(size[0, 1]))))
     given = colmap.two_view_options(threshold, 0)
-    return COLMAP[colmap.two_view_geometry(*points(c), (ends[0], ends[1]), given).pair_type]
+    return COLMAP[colmap.two_view_geometry(*points(c), (ends[0], ends[1]), given).configuration]
 
 
 def kinds_sheet(items: Sequence[Item], verdicts: dict[str, list[str]]) -> Sheet:
