@@ -14,7 +14,7 @@ from fmtorch import presets
 from fmtorch.core.types import Features
 from fmtorch.matching.lightglue import LightGlue
 from fmtorch.pipeline.pipeline import Pipeline
-from tests.pipeline.test_pipeline import draw, pair
+from tests.helpers import draw, pair
 
 
 def matcher(threshold: float = -1.0) -> LightGlue:

@@ -18,8 +18,8 @@ from fmtorch.matching.vismatch import VisMatch
 from fmtorch.pipeline.build import load_pipeline
 from fmtorch.pipeline.pipeline import Pipeline
 from tests.data import lists
+from tests.helpers import compose, draw, pair
 from tests.matching import stand_in
-from tests.pipeline.test_pipeline import draw, pair
 
 
 @pytest.fixture(autouse=True)
@@ -156,7 +156,6 @@ def test_what_cannot_be_loaded_is_one_line(monkeypatch: pytest.MonkeyPatch) -> N
 
 def test_the_command_evaluates_it(tmp_path: Path) -> None:
     from fmtorch.commands.eval import run
-    from tests.helpers import compose
 
     file = lists.write(tmp_path / "list.txt", [lists.superglue(1, 5), lists.superglue(0, 2)])
     words = (
@@ -173,7 +172,6 @@ def test_the_command_evaluates_it(tmp_path: Path) -> None:
 
 def test_a_folder_is_refused(tmp_path: Path) -> None:
     from fmtorch.commands.match import run
-    from tests.helpers import compose
 
     for i in (0, 1):
         draw(tmp_path / f"{i}.png", i)
