@@ -1,7 +1,5 @@
 """`fmtorch.cv2` takes the calls of OpenCV's documentation and returns what OpenCV returns."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import cv2 as opencv

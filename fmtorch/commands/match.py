@@ -177,7 +177,7 @@ def _nsgd(result: MatchResult, truth: NDArray[np.float64]) -> float:
 
 def _troubles(result: MatchResult) -> list[str]:
     """What is said of a result that is not to be relied on."""
-    warning = result.warning if result.related or result.configuration != "unrelated" else ""  # which is said already
+    warning = result.warning if result.related or result.pair_type != "unrelated" else ""  # which is said already
     if not result.ok:
         return list(filter(None, (f"no F: {result.reason}", warning)))
     chance = (
@@ -200,7 +200,7 @@ def _table(result: MatchResult, cached: bool) -> Table:
         unit = {"features": "keypoints", "estimation": "inliers"}.get(step, "matches")
         left = f"{' + '.join(f'{count:,}' for count in counts)} {unit}"
         table.add_row(
-            step, result.configuration if step == "configuration" else left,
+            step, result.pair_type if step == "pair_type" else left,
             "cached" if cached and step == "features" else f"{seconds:.3f}",
         )  # fmt: skip
     return table

@@ -23,7 +23,7 @@ from fmtorch.pipeline.pictures import draw_epipolar_lines, draw_matches
 from fmtorch.pipeline.reduced_images import GivenImage, Image, given_image
 from fmtorch.two_view.arguments import Arrays
 
-FLAT = ("planar", "rotation", "identical")  # configurations of which a homography explains all matches
+FLAT = ("planar", "rotation", "identical")  # pair types of which a homography explains all matches
 Picture = Literal["matches", "pruning", "epipolar"]
 Lenses = tuple[Lens | None, Lens | None]
 
@@ -41,7 +41,7 @@ class MatchResult:
     each step, cached features with those they took when they were computed.
     R (3, 3), t (3,), focals (2,): X1 = R X0 + t with a t of unit length, and focal lengths in pixels of the
     photographs, where cameras were asked for; NaN where not determined.
-    configuration: one of `CONFIGURATIONS`; empty where nothing could be matched. geometry: the two-view geometry for
+    pair_type: one of `PAIR_TYPES`; empty where nothing could be matched. geometry: the two-view geometry for
     COLMAP, whose inliers are indices of the kept matches, twice. undistorted: where a lens distorts, the kept matches
     as pinholes would have them, which F and homography relate; points are otherwise those of the photographs.
     photographs, lenses: as they were given, for pictures.
@@ -62,7 +62,7 @@ class MatchResult:
     R: Float[Tensor, "3 3"] | None = None
     t: Float[Tensor, " 3"] | None = None
     focals: Float[Tensor, " 2"] | None = None
-    configuration: str = ""
+    pair_type: str = ""
     geometry: PairGeometry | None = None
     undistorted: Correspondences | None = None
     photographs: tuple[GivenImage, GivenImage] | None = None
@@ -71,7 +71,7 @@ class MatchResult:
     @property
     def homography(self) -> Float[Tensor, "3 3"] | None:
         """Of planes, rotations and copies: ``x1 ~ H x0`` in pixels of the photographs; else None."""
-        H = None if self.geometry is None or self.configuration not in FLAT else self.geometry.H
+        H = None if self.geometry is None or self.pair_type not in FLAT else self.geometry.H
         return None if H is None else torch.from_numpy(H)
 
     @property
@@ -142,11 +142,11 @@ class MatchResult:
         report: dict[str, Any] = {
             "size0": _plain(c.size0), "size1": _plain(c.size1),
             "F": self.F.tolist() if self.ok else None, "reason": self.reason, "warning": self.warning,
-            "configuration": self.configuration or None, "homography": None if H is None else H.tolist(),
+            "pair_type": self.pair_type or None, "homography": None if H is None else H.tolist(),
             "related": self.related, "significance": self.significance if math.isfinite(self.significance) else None,
             "features": [len(self.keypoints0), len(self.keypoints1)], "matches": self.counts, "seconds": self.seconds,
             "x0": c.x0[0].tolist(), "x1": c.x1[0].tolist(), "inliers": self.inliers.tolist(),
-            "ratio": _plain(c.quality),
+            "ratio": _plain(c.ratio), "score": _plain(c.score),
         }  # fmt: skip
         if (pinhole := self.undistorted) is not None:
             report |= {"undistorted_x0": pinhole.x0[0].tolist(), "undistorted_x1": pinhole.x1[0].tolist()}
@@ -162,7 +162,7 @@ class MatchResult:
         if self.ok:
             verdict = "related" if self.related else "not related"
             found += [f"{int(self.inliers.sum())} inliers", f"significance {self.significance:.1f}", verdict]
-            found += [self.configuration] if self.configuration not in ("", "unrelated") else []
+            found += [self.pair_type] if self.pair_type not in ("", "unrelated") else []
         else:
             found.append(f"no F: {self.reason}")
         return f"MatchResult({', '.join(found)})"
@@ -190,10 +190,10 @@ class MatchResult:
         seen = self.correspondences if self.undistorted is None else self.undistorted
         good = self.inliers if self.ok else seen.mask[0]
         bent = zip(self._images(), self.lenses, strict=True)
-        images = [image if lens is None else undistorted(image, lens) for image, lens in bent]
+        image0, image1 = (image if lens is None else undistorted(image, lens) for image, lens in bent)
         F = self.F if self.ok or truth is None else truth
         dashed = truth if self.ok else None
-        return draw_epipolar_lines(*images, seen.x0[0][good], seen.x1[0][good], F, truth=dashed)
+        return draw_epipolar_lines(image0, image1, seen.x0[0][good], seen.x1[0][good], F, truth=dashed)
 
 
 def _plain(value: Tensor | None) -> Any:

@@ -1,7 +1,5 @@
 """The doors of the commands: one name each in `python -m`, in the console script and in Python."""
 
-from __future__ import annotations
-
 import importlib
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """The command that compares runs on one page: figures as computed by hand, pictures, nothing taken on trust."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import re

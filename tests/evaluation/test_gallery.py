@@ -1,7 +1,5 @@
 """Pictures of runs whose pipeline, images or code are not at hand."""
 
-from __future__ import annotations
-
 import re
 import runpy
 import sys

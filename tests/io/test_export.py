@@ -1,7 +1,5 @@
 """Export: pycolmap reads the database, verifies the same matches and finds the cameras; hloc's files come back."""
 
-from __future__ import annotations
-
 import dataclasses
 import sqlite3
 import sys

@@ -1,7 +1,5 @@
 """Folders of photographs with what is known of their cameras: intrinsics and two-view geometries of the exports."""
 
-from __future__ import annotations
-
 import json
 import math
 import shutil
@@ -35,7 +33,6 @@ class Scene:
     def __init__(self, folder: Path, coefficients: tuple[float, ...] = (), equivalent: int | None = None) -> None:
         self.folder = folder
         self.pair = load("fmbench", root=shared_path("data/Strecha_train"))[0]
-        assert self.pair.K0 is not None
         half = np.array([[0.5, 0, -0.25], [0, 0.5, -0.25], [0, 0, 1]])
         self.K = half @ self.pair.K0
         fx, fy, cx, cy = self.K[[0, 1, 0, 1], [0, 1, 2, 2]]
@@ -47,7 +44,7 @@ class Scene:
         for name, source in (("a.jpg", self.pair.image0), ("b.jpg", self.pair.image1)):
             image = cv2.resize(read_image(source), (768, 512), interpolation=cv2.INTER_AREA)
             image = photographed(image, self.lens) if coefficients else image
-            Image.fromarray(image).save(folder / name, quality=97, exif=exif)
+            Image.fromarray(image).save(folder / name, ratio=97, exif=exif)
 
     def match(self, output: Path, *words: str) -> Path:
         given = (f"images={self.folder}", f"output={output}", f"longest_side={SIDE}", "cache=off", *words)
@@ -83,7 +80,7 @@ def test_a_calibration_of_all_gives_what_verify_gives(tmp_path: Path) -> None:
     with h5py.File(output / MATCHES) as file:
         attributes = dict(file["a.jpg/b.jpg"].attrs)
     np.testing.assert_allclose(attributes["R"], pose.rotation.matrix(), atol=1e-9)
-    assert attributes["configuration"] == "calibrated"
+    assert attributes["pair_type"] == "calibrated"
     assert attributes["E"].shape == (3, 3)
 
     # The same matches by `verify`, which reads the cameras of the database.
@@ -144,6 +141,21 @@ def test_focal_lengths_by_exif_and_shared_ones(tmp_path: Path) -> None:
     assert not camera.has_prior_focal_length
     assert kind(geometry) == "UNCALIBRATED"
     assert np.linalg.norm(geometry.F) > 0
+
+
+def test_what_colmap_makes_of_turned_photographs_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene = Scene(tmp_path / "photos")
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = 6
+    with Image.open(scene.folder / "b.jpg") as image:
+        image.save(scene.folder / "b.jpg", exif=exif)
+    for orient, height in (("true", 768), ("false", 512)):
+        output = scene.match(tmp_path / orient, "export=colmap", f"orient={orient}")
+        said = " ".join(capsys.readouterr().out.split())
+        assert ("turned by their orientation tags: b.jpg" in said) == (orient == "true")
+        assert ("COLMAP reads files as they are stored" in said) == (orient == "true")
+        with pycolmap.Database.open(output / DATABASE) as file:
+            assert [camera.height for camera in file.read_all_cameras()] == [512, height]
 
 
 def test_one_photograph_of_a_file_is_missing(tmp_path: Path) -> None:

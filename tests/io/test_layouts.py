@@ -1,7 +1,5 @@
 """Each layout of others, written from its description, read back; what is damaged is named and harms nothing else."""
 
-from __future__ import annotations
-
 import pickle
 import shutil
 import sys
@@ -60,7 +58,6 @@ def test_what_was_written_is_read(layout: str, tmp_path: Path) -> None:
     assert len(dataset) == writers.PAIRS
     for pair, s in zip(dataset, writers.scenes(), strict=True):
         assert pair.problem is None
-        assert pair.matches is not None
         sign = np.sign((pair.F * s.F.numpy()).sum())
         np.testing.assert_allclose(sign * pair.F, s.F.numpy(), atol=1e-9)
         for got, expected in ((pair.K0, s.K0), (pair.K1, s.K1), (pair.R, s.R), (pair.t, s.t)):
@@ -73,11 +70,11 @@ def test_what_was_written_is_read(layout: str, tmp_path: Path) -> None:
         assert c.mask.all()
         assert counts[0] == len(s.x0) + (2 if layout in NEEDS_TRUTH else 0)
         if layout in WITH_RATIOS:
-            np.testing.assert_allclose(c.quality[0], writers.ratios(len(s.x0)), rtol=1e-6)
+            np.testing.assert_allclose(c.ratio[0], writers.ratios(len(s.x0)), rtol=1e-6)
         elif layout in NEEDS_TRUTH:
-            assert torch.allclose(c.quality, torch.tensor(0.25))  # one less the score: smaller is better
+            assert torch.allclose(c.score, torch.tensor(0.75))
         else:
-            assert c.quality is None
+            assert c.ambiguity is None
         if layout == "ransac_tutorial" or layout == "oanet":  # no sizes: twice the principal point
             assert c.size0.tolist() == [[801, 1001]]
         else:
@@ -92,7 +89,7 @@ def test_estimators_pruners_and_metrics_work_on_it(layout: str, tmp_path: Path) 
     if layout != "posebench":  # which says nothing of how good a match is
         pruner["one_to_one"] = presets.build("pruner", "one_to_one")
     if layout in WITH_RATIOS:
-        pruner["ratio"] = lambda c: c.keep(ratio_test(c.quality, 0.8))
+        pruner["ratio"] = lambda c: c.keep(ratio_test(c.ambiguity, 0.8))
     for row in evaluate(pipeline(**pruner).run(list(dataset))):
         assert row.ok, row.reason
         assert row.nsgd < 0.02
@@ -113,7 +110,6 @@ def test_hloc_pairs_in_the_other_order(tmp_path: Path) -> None:
 
 
 def given(pair: ImagePair) -> Any:
-    assert pair.matches is not None
     return pair.matches()
 
 
@@ -331,13 +327,11 @@ def test_a_report_finds_it(layout: str, roots: list[str], tmp_path: Path) -> Non
 def test_the_pipeline_of_given_matches_estimates_as_the_function_does(tmp_path: Path) -> None:
     """With the prior that `find_fundamental` derives from the same points."""
     pair = load("oanet", tmp_path)[0]
-    assert pair.matches is not None
     c, _ = pair.matches()
     (outcome,) = load_pipeline("given_fmtorch").run([pair], seed=3)
     alone = fmtorch.find_fundamental(
-        c.x0, c.x1, mask=c.mask, quality=c.quality, size0=c.size0, size1=c.size1, key=pair.key, seed=3
+        c.x0, c.x1, mask=c.mask, ratio=c.ratio, score=c.score, size0=c.size0, size1=c.size1, key=pair.key, seed=3
     )
-    assert outcome.estimate is not None
     assert torch.equal(outcome.estimate.F, alone.F)
 
 

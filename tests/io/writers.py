@@ -4,8 +4,6 @@ hloc: hloc/extract_features.py, match_features.py. RANSAC tutorial: parse_EF_dat
 OANet: dump_match/datasets.py and core/data.py. glue-factory: utils/export_predictions.py. vismatch: base_matcher.py.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The four stages in a row: outcomes, failures as data, shared features, independence of batches."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -43,7 +41,6 @@ def test_failures_are_outcomes_with_reasons(pairs: list[ImagePair]) -> None:
     assert [o.pair.identity for o in outcomes] == [p.identity for p in pairs]
     for name in ("good", "good too"):
         estimate = by_name[name].estimate
-        assert estimate is not None
         assert bool(estimate.ok[0])
         assert by_name[name].reason == ""
         assert set(by_name[name].seconds) == {"features", "matching", "pruning", "estimation"}
@@ -79,7 +76,6 @@ def test_batches_change_nothing(pairs: list[ImagePair]) -> None:
 def test_match_stops_before_estimation(pairs: list[ImagePair]) -> None:
     outcome = pipeline().correspondences(pairs[:1])[0]
     assert outcome.estimate is None
-    assert outcome.correspondences is not None
     assert int(outcome.correspondences.count()) > 50
     assert int(outcome.correspondences.keys[0]) == pairs[0].key
 

@@ -83,7 +83,7 @@ def test_estimates_are_one_line_and_a_table_of_pairs() -> None:
 def test_a_record_is_the_same_after_its_file(tmp_path: Path) -> None:
     c = scene(0, 60)
     K = torch.tensor([[800.0, 0, 480], [0, 800, 320], [0, 0, 1]])
-    estimate = fmtorch.find_essential(c.x0, c.x1, K, K, covariance=True, configuration=True)
+    estimate = fmtorch.find_essential(c.x0, c.x1, K, K, covariance=True, pair_type=True)
     path = tmp_path / "estimate.safetensors"
     estimate.save(path)
     for kind in (fmtorch.Estimate, fmtorch.PoseEstimate):

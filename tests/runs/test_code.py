@@ -1,7 +1,5 @@
 """The code that makes a result: commits, changed sources, the modules of a user's own parts and what they import."""
 
-from __future__ import annotations
-
 import importlib
 import shutil
 import subprocess

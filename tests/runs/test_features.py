@@ -1,7 +1,5 @@
 """The feature cache: bit-equal, by content and configuration, shared detection, honest seconds."""
 
-from __future__ import annotations
-
 import dataclasses
 import importlib
 import os

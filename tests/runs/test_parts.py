@@ -1,7 +1,5 @@
 """Parts of a run that are merged as they grow in number, by several writers, with readers beside them."""
 
-from __future__ import annotations
-
 import threading
 from pathlib import Path
 

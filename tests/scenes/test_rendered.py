@@ -1,7 +1,5 @@
 """The data set of rendered scenes: reproducible, resumable, its splits apart, its pairs worth matching."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import hashlib

@@ -1,7 +1,5 @@
 """How far away the points of a rendered photograph are."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

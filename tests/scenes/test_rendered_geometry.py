@@ -1,7 +1,5 @@
 """The ray-caster draws surfaces where the cameras say they are."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

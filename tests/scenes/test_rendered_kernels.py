@@ -1,7 +1,5 @@
 """The ray-caster and light draw the same pictures as their definitions in NumPy, to the last bit."""
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 

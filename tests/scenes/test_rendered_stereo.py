@@ -1,7 +1,5 @@
 """The real stereo pair: its disparity agrees with its pictures and with its F."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

@@ -1,7 +1,5 @@
 """Pairs and rows for the tests of benchmarks, and the benchmarks as commands."""
 
-from __future__ import annotations
-
 import json
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """PoseBench by its protocol, on samples of its layout from real matches, beside a run written from its definitions."""
 
-from __future__ import annotations
-
 import functools
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`fmtorch train`, as a user runs it: from another directory, with a network of one's own."""
 
-from __future__ import annotations
-
 import json
 import re
 import subprocess

@@ -1,7 +1,5 @@
 """What `find_fundamental` and `find_essential` are told of cameras."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

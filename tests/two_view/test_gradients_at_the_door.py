@@ -1,7 +1,5 @@
 """Estimators that would drop a gradient in silence are refused where somebody asks for it."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,7 +1,5 @@
 """COLMAP databases of cameras before random points, written by pycolmap."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path

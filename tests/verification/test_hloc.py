@@ -1,7 +1,5 @@
 """hloc's files verified: inliers of the public function, whatever happens on the way."""
 
-from __future__ import annotations
-
 import os
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Matches alone verified: what the public function finds, of one pair and of many, in npz and HDF5 files."""
 
-from __future__ import annotations
-
 import os
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Databases of rigs: what COLMAP stores of cameras, frames, keypoints and matches stays as it is."""
 
-from __future__ import annotations
-
 import sqlite3
 from pathlib import Path
 from typing import Any

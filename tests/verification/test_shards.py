@@ -1,7 +1,5 @@
 """Verification by processes and in shards: what one process alone writes."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 
