@@ -7,6 +7,15 @@ from fmtorch.core.version import __version__
 
 if TYPE_CHECKING:
     from fmtorch.core.types import Correspondences, Estimate, Features, PoseEstimate
+    from fmtorch.io.exchange import (
+        from_colmap,
+        from_kornia,
+        from_lightglue,
+        from_opencv,
+        from_poselib,
+        to_colmap,
+        to_poselib,
+    )
     from fmtorch.pipeline.match_result import MatchResult
     from fmtorch.pipeline.pictures import draw_epipolar_lines, draw_matches
     from fmtorch.pipeline.pipeline import Pipeline
@@ -29,7 +38,14 @@ __all__ = [
     "find_essential",
     "find_fundamental",
     "find_homography",
+    "from_colmap",
+    "from_kornia",
+    "from_lightglue",
+    "from_opencv",
+    "from_poselib",
     "match",
+    "to_colmap",
+    "to_poselib",
     "verify",
 ]
 

@@ -101,7 +101,8 @@ class Record:
         kinds = {kind.__name__ for kind in (cls, *cls.__subclasses__())}
         if told.get("record") not in kinds:
             raise ValueError(f"{path} holds {told.get('record', 'no record')}; {cls.__name__}.load reads {min(kinds)}")
-        return cls(**tensors, **json.loads(told["fields"]))
+        plain = json.loads(told["fields"])
+        return cls(**tensors, **{name: tuple(v) if isinstance(v, list) else v for name, v in plain.items()})
 
     def __repr__(self) -> str:
         """Shapes and types of the tensors, in one line."""

@@ -16,9 +16,10 @@ from fmtorch.geometry.cameras import cross_matrix
 from fmtorch.geometry.pose import pose_from_fundamental
 from fmtorch.io.match_store import MatchRecords, PairGeometry, StoredImage, StoredPair, indices
 from fmtorch.pipeline.match_result import MatchResult
+from fmtorch.pipeline.pair_geometries import pair_geometries
 from fmtorch.pipeline.photograph_cameras import PhotographCamera
 from fmtorch.pipeline.pipeline import Outcome, Pipeline
-from fmtorch.pipeline.two_images import Described, pair_geometries
+from fmtorch.pipeline.two_images import Described
 from fmtorch.two_view.pair_type import PairTypes
 
 EXACT = (1.0, 0.0)  # px, relative deviation; K stands for the pixels

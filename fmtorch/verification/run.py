@@ -23,7 +23,7 @@ from fmtorch.io.match_store import Kind, PairGeometry
 from fmtorch.jobs.execution import Execution, Shard
 from fmtorch.jobs.pool import WorkerPool
 from fmtorch.jobs.runner import Factory, Local, Source, TaskRunner
-from fmtorch.pipeline.two_images import pair_geometries
+from fmtorch.pipeline.pair_geometries import pair_geometries
 from fmtorch.two_view.arguments import UNKNOWN
 from fmtorch.two_view.estimation import estimated_by
 from fmtorch.two_view.pair_type import classify
