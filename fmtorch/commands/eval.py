@@ -88,14 +88,12 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
 def _open_folder(
     config: DictConfig, fields: EvalOptions, pipeline_name: str, pipeline: Pipeline, dataset: PairDataset
 ) -> RunFolder:
-    """The folder of the run with this identity, its `run_dir` if given, new or to be continued."""
     identity = run_identity(config, pipeline_name, pipeline, dataset.digest, fields.cameras, fields.pose.signed)
     name = f"{pipeline_name.replace('/', '-')}-{identity_digest(identity)[:8]}"
     return RunFolder.open(fields.run_dir or Path(f"runs/{dataset.name}/{name}"), identity)
 
 
 def _missing(pairs: Sequence[ImagePair], folder: RunFolder, journal: MatchStore | None) -> list[ImagePair]:
-    """The pairs that have no row yet, or whose matches are to be exported and not in the journal."""
     done = folder.done()
     return [p for p in pairs if p.key not in done or (journal is not None and _to_export(journal, p))]
 
@@ -104,7 +102,6 @@ def _evaluated(
     config: DictConfig, fields: EvalOptions, pipeline: Pipeline, pairs: Sequence[ImagePair], folder: RunFolder,
     journal: MatchStore | None,
 ) -> Iterator[int]:  # fmt: skip
-    """Evaluates pairs into the folder and the journal; yields how many were done since."""
     parallel = len(pairs) >= MIN_PAIRS_FOR_PROCESSES and pipeline.device.type == "cpu"
     execution = execution_of(config, fields.workers, fields.processes).decided(parallel)
     if execution.shared and execution.workers is None and pipeline.device.type != "cpu":

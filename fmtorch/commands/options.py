@@ -205,12 +205,10 @@ class Command:
 
     @property
     def defaults(self) -> dict[str, Any]:
-        """The default of each option, as plain values."""
         return defaults_of(self.options)
 
     @property
     def names(self) -> list[str]:
-        """All that may stand before ``=``: options and groups."""
         return [*self.defaults, *self.groups]
 
 

@@ -105,7 +105,6 @@ def _merged(held: Sequence[tuple[RunFolder, pa.Table]]) -> list[tuple[RunFolder,
 
 
 def _order(order: str | None, paths: Sequence[Path]) -> str:
-    """`given` or `recall`; unless one is asked for, by recall where runs were looked for in folders."""
     if order not in (None, "given", "recall"):
         raise ValueError(f"order={order} must be given or recall")
     return order or ("given" if all((path / "run.json").exists() for path in paths) else "recall")

@@ -62,7 +62,6 @@ def _begun_by_reports(description: str) -> Iterator[Callable[[int, int], None]]:
 
 
 def _table(result: Verification) -> Table:
-    """Counts of pairs, and how long they took."""
     table = Table()
     table.add_column("pairs")
     table.add_column("", justify="right")

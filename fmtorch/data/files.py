@@ -147,7 +147,6 @@ class _DType:
         self.order = state[1]
 
     def value(self) -> np.dtype[Any]:
-        """The dtype itself."""
         if not _CODE.fullmatch(self.code) or self.order not in ("<", ">", "=", "|"):
             raise ValueError(f"dtype {self.order}{self.code}")
         return np.dtype(object) if self.code[0] == "O" else np.dtype(f"{self.order}{self.code}")
@@ -170,7 +169,6 @@ class _Array:
         return array
 
     def value(self) -> NDArray[Any]:
-        """The array itself."""
         dtype = self.dtype.value()
         if dtype.kind == "O":
             flat = np.empty(len(self.content), object)

@@ -313,7 +313,6 @@ class ScenePairs(PairDataset):
 
     @property
     def candidates(self) -> int:
-        """How many candidates the scenes have."""
         return self._starts[-1]
 
     def candidate(self, rank: int) -> tuple[int, int, int]:

@@ -83,7 +83,6 @@ def run_identity(
 
 
 def _learned(stages: Mapping[str, Any], pipeline: Pipeline) -> dict[str, list[str]]:
-    """Digests of the learned files and networks of each stage that has some."""
     extractor = pipeline.extractor
     parts: dict[str, list[object]] = {
         "features": [extractor.extractor if isinstance(extractor, CachedFeatures) else extractor],
@@ -113,7 +112,6 @@ def _files(config: object, option: str = "") -> Iterator[str]:
 
 
 def _code(config: object) -> dict[str, str]:
-    """Digests of the sources that define the parts of the user's own, by the names of these."""
     digests = {}
     for target, module in presets.own_modules(config).items():
         try:
@@ -182,16 +180,13 @@ class WithPairCameras:
         self._estimator, self.cameras = KnownCameras(estimator), dict(cameras)
 
     def __call__(self, c: Correspondences, seed: int = 0) -> Estimate:
-        """Estimate F, focal lengths and pose of each pair."""
         return self._estimator(self.given(c), seed)
 
     @property
     def kernels(self) -> Sequence[object]:
-        """Those of the estimator worth compiling together."""
         return getattr(self._estimator.estimator, "kernels", ())
 
     def given(self, c: Correspondences) -> Correspondences:
-        """The matches with what is known of their cameras."""
         own = [self.cameras[key] for key in c.keys.tolist()]
         K0, K1 = (_stacked(K, c.mask.device) for K in ([each.K0 for each in own], [each.K1 for each in own]))
         focal = torch.stack([each.focal for each in own]).to(c.mask.device)

@@ -59,7 +59,6 @@ class Interval:
     over: str
 
     def scaled(self, scale: float) -> Interval:
-        """The same in another unit."""
         return Interval(scale * self.value, scale * self.low, scale * self.high, self.over)
 
     def __format__(self, form: str) -> str:
@@ -222,7 +221,6 @@ def unit(scenes: Sequence[str]) -> str:
 
 
 def _clusters(scenes: Sequence[str]) -> NDArray[np.int64]:
-    """The number of each pair's unit."""
     if unit(scenes) == "pair":
         return np.arange(len(scenes))
     numbers: NDArray[np.int64] = np.unique(np.asarray(scenes), return_inverse=True)[1]
@@ -397,13 +395,11 @@ def _group(table: pa.Table, signed: bool) -> Group:
 
 
 def _column(table: pa.Table, name: str) -> NDArray[np.float64]:
-    """A column as float64, null as NaN."""
     values: NDArray[np.float64] = table[name].cast(pa.float64()).to_numpy().astype(np.float64)
     return values
 
 
 def _mean(values: NDArray[np.float64]) -> float | None:
-    """The mean of what is not NaN."""
     known = values[~np.isnan(values)]
     return float(known.mean()) if len(known) else None
 

@@ -297,7 +297,6 @@ def report_tables(runs: Mapping[str, pa.Table], summaries: Summaries) -> list[Ta
 
 
 def _merit(overall: Mapping[str, Group]) -> Table:
-    """All figures over all pairs; counts stand last, since recall is what is looked for."""
     known = known_columns(COLUMNS, overall)
     counts = ("Pairs", "Scenes")
     columns = {h: c for h, c in known.items() if h not in counts} | {h: COLUMNS[h] for h in counts}
@@ -325,7 +324,6 @@ def _of_runs(part: Part, names: Iterable[str]) -> Table:
 
 
 def _families(summaries: Summaries) -> Table | None:
-    """Recall with its interval, and AUC@0.05, by family; None where there is but one."""
     names = list(dict.fromkeys(family for summary in summaries.values() for family in summary if family != ALL))
     if len(names) < 2 or any(group["recall"] is None for summary in summaries.values() for group in summary.values()):
         return None
@@ -344,7 +342,6 @@ def _families(summaries: Summaries) -> Table | None:
 
 
 def _differences(runs: Mapping[str, pa.Table]) -> Table | None:
-    """The first run minus each other one, on the pairs that the two share; None of a single run."""
     if len(runs) < 2:
         return None
     axis = axis_of(runs)
@@ -391,7 +388,6 @@ def _ahead(
 
 
 def _area(errors: NDArray[np.float64], threshold: float) -> NDArray[np.float64]:
-    """The share of thresholds up to one that are above a pair's corner error; NaN is a miss."""
     area: NDArray[np.float64] = np.clip(1 - np.nan_to_num(errors, nan=np.inf) / threshold, 0, 1)
     return area
 
@@ -404,7 +400,6 @@ def _around_zero(i: Interval | None, widest: float) -> Bar | None:
 
 
 def _seconds(overall: Mapping[str, Group]) -> Table:
-    """Median seconds a pair of each stage, and the commonest failures."""
     columns = {stage: _number(stage, "{:.3f}") for stage in (*STAGES, "total")}
     known = {name: group["seconds"] for name, group in overall.items()}
     table = _of_runs(Part("Seconds a pair, median", "", columns, known), overall)
@@ -436,7 +431,6 @@ def common(runs: Mapping[str, pa.Table], column: str) -> list[NDArray[np.float64
 
 
 def _share(group: Group) -> Bar | None:
-    """The interval of recall."""
     if group["recall"] is None:
         return None
     low, high = group["recall_interval"]
@@ -444,6 +438,5 @@ def _share(group: Group) -> Bar | None:
 
 
 def _best(values: Mapping[str, float | None]) -> set[str]:
-    """Whose is the largest; nobody's of a single value."""
     known = [value for value in values.values() if value is not None]
     return {name for name, value in values.items() if value == max(known)} if len(known) > 1 else set()

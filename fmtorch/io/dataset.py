@@ -46,7 +46,6 @@ class TutorialMatches:
     sizes: tuple[Size, Size]
 
     def __call__(self) -> GivenMatches:
-        """Read them. Raises DataError naming file and key."""
         with h5.opened(self.folder / MATCHES) as file:
             points = h5.numbers(file, self.key, None, 4)
         ratios = None
@@ -196,7 +195,6 @@ class PoseBenchMatches:
     sizes: tuple[Size | None, Size | None]
 
     def __call__(self) -> GivenMatches:
-        """Read them. Raises DataError naming file and key."""
         with h5.opened(self.path) as file:
             x0, x1 = (h5.numbers(file, f"{self.key}/{name}", None, 2) for name in ("x1", "x2"))
         if len(x0) != len(x1):
@@ -232,7 +230,6 @@ def _posebench_pair(file: Any, path: Path, family: str, key: str, images: Path |
 
 
 def _camera(file: Any, path: Path, key: str, source: ImageSource) -> tuple[Array, Size | None]:
-    """Calibration matrix, and size where the file or the image tells it."""
     model = h5.text(file, f"{key}/model")
     parameters = h5.numbers(file, f"{key}/params").reshape(-1)
     count = FOCAL_LENGTHS.get(model)
@@ -272,7 +269,6 @@ class OANetMatches:
     sizes: tuple[Size, Size]
 
     def __call__(self) -> GivenMatches:
-        """Read them, in pixels. Raises DataError naming file and key."""
         with h5.opened(self.path) as file:
             rays = h5.numbers(file, f"xs/{self.key}", 1, None, 4)[0]
             ratios, mutuals = (self._side(file, name, len(rays)) for name in ("ratios", "mutuals"))
@@ -419,7 +415,6 @@ def _truth(layout: str, truth: str | Path | None) -> PairDataset:
 
 
 def _expect_distinct(pairs: list[ImagePair], folder: Path) -> None:
-    """Raises DataError where one file would stand for images of two scenes."""
     seen: dict[Path, str] = {}
     for pair in pairs:
         for path in (pair.image0.path, pair.image1.path):

@@ -48,23 +48,18 @@ class HlocMatches:
         self.image = functools.lru_cache(maxsize=MEMORY)(self._image)
 
     def __enter__(self) -> HlocMatches:
-        """The files themselves, closed on leaving."""
         return self
 
     def __exit__(self, *error: object) -> None:
-        """Close the files."""
         self._open.close()
 
     def pairs(self) -> list[Names]:
-        """The pairs of the file of matches, by the names of their images."""
         return sorted(self._keys)
 
     def identity(self) -> dict[str, Any]:
-        """What the files hold."""
         return {"files": h5.digest_of(*self.files)}
 
     def has_geometry(self, pair: Names) -> bool:
-        """Whether a pair has a geometry: none has."""
         return False
 
     def matches(self, pair: Names) -> NDArray[np.int64]:
@@ -79,7 +74,6 @@ class HlocMatches:
         return np.stack([first, second[first]], -1)
 
     def write(self, geometries: Iterable[tuple[Names, PairGeometry]]) -> None:
-        """Write the file: `matches0` of inliers alone, their scores, and the matrices as attributes."""
         h5py = h5.imported()
         with replacing(self._output) as temporary, h5py.File(temporary, "w") as file:
             for pair, geometry in geometries:
@@ -93,7 +87,6 @@ class HlocMatches:
                 write_geometry(group, geometry)
 
     def name(self, image_id: str) -> str:
-        """The name itself."""
         return image_id
 
     def _named(self, key: str) -> Names:
@@ -128,7 +121,6 @@ def write_geometry(group: Any, geometry: PairGeometry) -> None:
 
 
 def _below(file: Any, last: str) -> list[str]:
-    """The paths of the groups that hold an array of that name, at any depth."""
     groups: list[str] = []
 
     def visit(name: str) -> None:
@@ -188,23 +180,18 @@ class MatchFile:
         self.image = functools.lru_cache(maxsize=MEMORY)(self._image)
 
     def __enter__(self) -> MatchFile:
-        """The file itself, closed on leaving."""
         return self
 
     def __exit__(self, *error: object) -> None:
-        """Close the file."""
         self._open.close()
 
     def pairs(self) -> list[Ids]:
-        """Both images of each pair."""
         return [(f"{pair}x0", f"{pair}x1") for pair in self._pairs]
 
     def identity(self) -> dict[str, Any]:
-        """What the file holds."""
         return {"files": h5.digest_of(self._path)}
 
     def has_geometry(self, pair: Ids) -> bool:
-        """Whether a pair has a geometry: none has."""
         return False
 
     def matches(self, pair: Ids) -> NDArray[np.int64]:
@@ -215,13 +202,11 @@ class MatchFile:
         return np.repeat(np.arange(counts[0])[:, None], 2, 1)
 
     def write(self, geometries: Iterable[tuple[Ids, PairGeometry]]) -> None:
-        """Write the file: which matches are inliers, configuration and matrices."""
         with replacing(self._output) as temporary:
             entries = (self._entries(*pair) for pair in geometries)
             (_write_npz if self._output.suffix == NPZ else _write_h5)(temporary, entries)
 
     def _entries(self, ids: Ids, geometry: PairGeometry) -> dict[str, NDArray[Any]]:
-        """What is written of a pair, by keys."""
         pair = ids[0].removesuffix("x0")
         inliers = np.zeros(len(self.image(ids[0]).points), bool)
         inliers[geometry.inliers[:, 0]] = True
@@ -230,7 +215,6 @@ class MatchFile:
         return {f"{pair}inliers": inliers, f"{pair}configuration": np.array(geometry.kind), **matrices}
 
     def name(self, image_id: str) -> str:
-        """The key of the points."""
         return image_id
 
     def _image(self, image_id: str) -> DatabaseImage:

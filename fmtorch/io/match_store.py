@@ -122,7 +122,6 @@ class MatchStore:
     root: Path
 
     def name(self, image: Path) -> str:
-        """Under what name an image is exported."""
         return image.absolute().relative_to(self.root.absolute()).as_posix()
 
     def add(self, records: MatchRecords) -> None:

@@ -47,7 +47,6 @@ class Execution:
 
     @property
     def shared(self) -> bool:
-        """Whether workers are threads of this process."""
         return self.make is None and self.kind == "threads"
 
     def decided(self, processes: bool) -> Execution:

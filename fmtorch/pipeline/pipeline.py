@@ -124,7 +124,6 @@ class Outcome:
 
     @property
     def solved(self) -> bool:
-        """Whether there is an F."""
         return self.estimate is not None and bool(self.estimate.ok[0])
 
 
@@ -223,11 +222,9 @@ class Pipeline:
         return self._batched("pruning", self._prune, [self._match(pair) for pair in pairs])
 
     def estimate(self, outcomes: Sequence[Outcome], seed: int = 0) -> list[Outcome]:
-        """The last stage, for outcomes of `correspondences`."""
         return self._batched("estimation", functools.partial(self._estimate, seed=seed), outcomes)
 
     def run(self, pairs: Sequence[ImagePair], seed: int = 0) -> list[Outcome]:
-        """Take a batch of pairs through all four stages."""
         return self.estimate(self.correspondences(pairs), seed)
 
     def _batched(
@@ -290,7 +287,6 @@ class Pipeline:
         return Outcome(pair, (count, count), self._with_calibrations(pair, c), None, seconds, images=pyramids)
 
     def _given(self, pair: ImagePair, matches: Callable[[], GivenMatches]) -> Outcome:
-        """The matches that come with a pair, in place of the first two stages."""
         try:
             c, counts = matches()
         except Exception as error:  # a pair that cannot be read becomes a row with this reason
@@ -298,7 +294,6 @@ class Pipeline:
         return Outcome(pair, counts, self._with_calibrations(pair, c.to(self.device)))
 
     def _with_calibrations(self, pair: ImagePair, c: Correspondences) -> Correspondences:
-        """The matches with the pair's key and calibrations."""
         K0, K1 = (
             None if K is None else torch.from_numpy(K).to(self.device, torch.float64)[None] for K in (pair.K0, pair.K1)
         )

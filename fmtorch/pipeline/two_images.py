@@ -61,7 +61,6 @@ class Described:
 
     @property
     def points(self) -> Float[Tensor, "n 2"]:
-        """The keypoints in pixels of the photograph."""
         return to_original(self.features.keypoints, self.scale.to(self.features.keypoints))
 
 
@@ -130,7 +129,6 @@ class MatchResult:
 
     @property
     def ok(self) -> bool:
-        """Whether a fundamental matrix was found."""
         return not self.reason
 
 
@@ -187,7 +185,6 @@ def _calibrated(c: Correspondences, estimate: Estimate) -> Tensor:
 
 
 def _with_lines(kind: Kind, inliers: NDArray[np.integer[Any]], estimate: Estimate, i: int, H: Any) -> PairGeometry:
-    """A geometry with F, and the pose where there is one."""
     E, R, t = (
         None if value is None else _known(value[i], value[i].isfinite().all())
         for value in (estimate.E, estimate.R, estimate.t)
@@ -339,7 +336,6 @@ def _matched(pipeline: Pipeline, described: Sequence[Described], clock: Clock) -
 
 
 def _of_images(pipeline: Pipeline, described: Sequence[Described]) -> Correspondences | None:
-    """The matches of a matcher that takes the images themselves; None for any other."""
     image0, image1 = (each.image for each in described)
     if not isinstance(pipeline.matcher, ImageMatcher) or image0 is None or image1 is None:
         return None

@@ -89,7 +89,6 @@ def target_of(config: Mapping[str, Any], where: str) -> Callable[..., Any]:
 
 
 def _located(name: str) -> Any:
-    """What a dotted name names; modules on the way to it are imported."""
     parts = name.split(".")
     value: Any = importlib.import_module(parts[0])
     for i, part in enumerate(parts[1:], start=2):

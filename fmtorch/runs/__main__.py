@@ -40,7 +40,6 @@ def main() -> None:
 
 
 def _below(folder: Path) -> list[int]:
-    """Sizes of the files of a folder, at any depth."""
     return [file.stat().st_size for file in folder.rglob("*") if file.is_file()]
 
 

@@ -104,7 +104,6 @@ class _Import(NamedTuple):
 
 @functools.cache  # parts of a pipeline share most of what they import
 def _imports(source: bytes) -> tuple[_Import, ...]:
-    """The import statements of a file, wherever in it; none where it does not compile."""
     try:
         nodes = _statements(ast.parse(source))
     except (SyntaxError, ValueError):

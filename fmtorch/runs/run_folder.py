@@ -132,7 +132,6 @@ class PairRow:
 
 
 def _expect_homography(row: PairRow) -> None:
-    """Raises ValueError for a row of a pair of a known homography that contradicts itself."""
     error, H = row.corner_error, row.H
     if error is None or not error >= 0.0 or not math.isnan(row.nsgd) or row.F is not None:
         raise ValueError(
@@ -319,17 +318,14 @@ class RunFolder:
 
     @property
     def identity(self) -> str:
-        """The digest of what defines the results."""
         return identity_digest(self.config)
 
     def append(self, rows: Sequence[PairRow]) -> None:
-        """Add results, as a new part that is either whole or absent; parts are merged. Safe with several processes."""
         if not rows:
             return
         self._writer.add(to_table(rows))
 
     def done(self) -> set[int]:
-        """The keys of the pairs that have a result."""
         return {int(key) for part in self._parts(["key"]) for key in part["key"].to_numpy()}
 
     def read(self, keys: Collection[int] | None = None, without: Collection[str] = ()) -> pa.Table:

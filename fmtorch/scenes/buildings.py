@@ -222,7 +222,6 @@ def front(
 
 
 def _grid(width: Real, height: Real, style: Style) -> tuple[int, int]:
-    """How many bays and storeys a front has."""
     return max(1, int(width / style.bay)), max(1, int(height / style.storey))
 
 
@@ -264,7 +263,6 @@ def _paint_openings(
 
 
 def _paste(picture: Floats, part: Floats, x: Real, z: Real, density: Real) -> None:
-    """Pastes a part with its lower left corner at (x, z) metres."""
     h, w = part.shape[:2]
     y0, x0 = len(picture) - int(z * density) - h, int(x * density)
     y1 = max(y0, 0)

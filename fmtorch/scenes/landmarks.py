@@ -127,7 +127,6 @@ def _boards_and_rocks(surfaces: Surfaces, rng: Rng, split: str, reach: Real, bac
 
 
 def _mound(surfaces: Surfaces, rng: Rng, texture: int, at: tuple[Real, Real], side: Real, tall: Real) -> None:
-    """A flower bed or heap: a height field over a square."""
     n = 12
     rim = np.sin(np.linspace(0, np.pi, n))
     z = tall * heights(rng, n, n, 6) * np.outer(rim, rim)
@@ -278,7 +277,6 @@ def collection_scene(rng: Rng, split: str, shots: int, scale: Real) -> DrawnScen
 
 
 def _surroundings(surfaces: Surfaces, rng: Rng, split: str, width: Real) -> None:
-    """Ground, houses, trees and lamp posts beside a landmark of this width."""
     ground(surfaces, rng, split, 36)
     leaf, bark = foliage(surfaces, rng)
     for side in (-1, 1):

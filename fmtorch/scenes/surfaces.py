@@ -70,7 +70,6 @@ class Texture:
             y += level8.shape[0]
 
     def level(self, lod: float) -> int:
-        """The pyramid level at which opacity is looked up."""
         return min(max(int(lod), 0), self.levels - 1)
 
 
@@ -167,7 +166,6 @@ class Surfaces:
         self._flags: list[tuple[bool, bool]] = []
 
     def texture(self, picture: Pixels) -> int:
-        """Adds a picture and returns its number."""
         self.textures.append(Texture(picture))
         return len(self.textures) - 1
 

@@ -88,7 +88,6 @@ def _row_of_houses(surfaces: Surfaces, rng: Rng, split: str, length: float, wall
 
 
 def _roadside(surfaces: Surfaces, rng: Rng, length: float, half: float, side: int) -> None:
-    """Parked cars, trees, lamp posts and people along one side."""
     leaf, bark = foliage(surfaces, rng)
     metal = surfaces.texture(to_pixels(np.full((32, 32, 3), 0.35, dtype=np.float32)))
     x = rng.uniform(0, 8)
@@ -196,7 +195,6 @@ def _turn(base: Vector, degrees: Real) -> tuple[Vector, Vector, Vector]:
 
 
 def _desk(surfaces: Surfaces, rng: Rng, split: str, centre: Vector) -> None:
-    """A table with books, boxes, a screen, a figure."""
     top = surfaces.texture(to_pixels(wood(rng, 256, 512, 4, colour(rng, (0.05, 0.1), (0.3, 0.6), (0.4, 0.7)))))
     facing = rng.uniform(-25, 25)
     _, right, back = _turn(centre, facing)

@@ -55,16 +55,13 @@ class LabelledMatches(Record):
 
     @property
     def labelled(self) -> Bool[Tensor, "b n"]:
-        """True for the matches that a loss may look at: real ones that are inliers or outliers."""
         return self.label >= 0
 
     @property
     def inlier(self) -> Bool[Tensor, "b n"]:
-        """True for the matches that are right."""
         return self.label == INLIER
 
     def __len__(self) -> int:
-        """Number of pairs."""
         return len(self.correspondences)
 
     def __getitem__(self, index: Index) -> LabelledMatches:
@@ -73,7 +70,6 @@ class LabelledMatches(Record):
         return self._map(lambda value: value[i])
 
     def keep(self, mask: Bool[Tensor, "b n"]) -> LabelledMatches:
-        """The same matches, of which only those also in `mask` survive."""
         return self.replace(correspondences=self.correspondences.keep(mask))
 
     def compact(self, multiple: int = 1) -> LabelledMatches:
@@ -95,7 +91,6 @@ class LabelledMatches(Record):
         return LabelledMatches(self.correspondences.replace(**moved), gathered(self.label, order), self.F)
 
     def first(self, count: int) -> LabelledMatches:
-        """The first `count` slots of each pair."""
         cut = {name: value[:, :count] for name, value in slotted(self.correspondences).items()}
         return LabelledMatches(self.correspondences.replace(**cut), self.label[:, :count], self.F)
 
@@ -112,7 +107,6 @@ def collate(items: Sequence[LabelledMatches]) -> LabelledMatches:
 
 
 def _padded(label: Tensor, n: int) -> Tensor:
-    """Labels of `n` slots, ignored beyond the given ones."""
     missing = max(n - label.shape[1], 0)
     return torch.nn.functional.pad(label, (0, missing), value=IGNORED)[:, :n]
 

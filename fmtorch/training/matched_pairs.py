@@ -119,7 +119,6 @@ class MatchedPairs(StoredMatches):
 
 
 def _identity(dataset: PairDataset, stages: Pipeline, most: int) -> dict[str, Any]:
-    """What defines the matches and their labels, as plain values."""
     extractor = stages.extractor
     if isinstance(extractor, CachedFeatures):
         extractor = extractor.extractor
@@ -138,7 +137,6 @@ def _identity(dataset: PairDataset, stages: Pipeline, most: int) -> dict[str, An
 
 
 def _sound(path: Path, pairs: int) -> bool:
-    """Whether a file is there and whole, with so many pairs; of a damaged one a warning tells."""
     if not path.exists():
         return False
     try:

@@ -99,7 +99,6 @@ class GeometryParts:
                 self.done.update(map(_ids, part["pairs"].tolist()))
 
     def write(self, geometries: Iterable[tuple[_GeometryIds, PairGeometry]]) -> None:
-        """Keep geometries of pairs, all of them or none."""
         arrays: dict[str, Any] = {}
         pairs, kinds = [], []
         for i, (ids, geometry) in enumerate(geometries):
@@ -112,7 +111,6 @@ class GeometryParts:
         self.done.update(pairs)
 
     def read(self) -> Iterator[tuple[_GeometryIds, PairGeometry]]:
-        """The geometries, each pair's once."""
         seen: set[_GeometryIds] = set()
         for path in self._files():
             with np.load(path) as part:
@@ -122,7 +120,6 @@ class GeometryParts:
                         yield ids, _geometry(part, i, str(kind))
 
     def remove(self) -> None:
-        """Remove the folder."""
         shutil.rmtree(self.folder)
 
     def _files(self) -> list[Path]:
@@ -289,7 +286,6 @@ class VerificationRun:
                     report(done, len(todo))
 
     def write(self) -> None:
-        """Write what is kept into the store."""
         self.configurations.clear()
         self.store.write(self._counted(self.parts.read()))
 
