@@ -13,31 +13,15 @@ from rich import box
 from rich.table import Table as TerminalTable
 
 from fmtorch.core.types import PAIR_TYPES
+from fmtorch.evaluation import statistics
 from fmtorch.evaluation.curves import NSGD, axis_of
-from fmtorch.evaluation.statistics import (
-    ALL,
-    CORNER_THRESHOLDS,
-    FINE_THRESHOLD,
-    FOCAL_THRESHOLDS,
-    LEVEL,
-    MIN_UNITS,
-    PERCENT,
-    POSE_THRESHOLDS,
-    STAGES,
-    THRESHOLD,
-    Group,
-    Interval,
-    areas,
-    difference,
-    recalled,
-    scene_names,
-)
+from fmtorch.evaluation.statistics import ALL, LEVEL, MIN_UNITS, STAGES, THRESHOLD, Group, Interval
 
 Columns = Mapping[str, Callable[[Group], str]]  # what stands below a heading, of the figures of a row
 Summaries = Mapping[str, Mapping[str, Group]]  # of `summarize`, by the runs' names
 DASH = "–"
 RECALL = "%Recall [interval]"  # the column that has an interval
-_OF_RECALL = ("%Recall", RECALL, f"at {FINE_THRESHOLD}", "AUC@0.05", "%Recall (released NSGD)")
+_OF_RECALL = ("%Recall", RECALL, f"at {statistics.FINE_THRESHOLD}", "AUC@0.05", "%Recall (released NSGD)")
 
 
 def _text(value: float | int | None, form: str) -> str:
@@ -79,7 +63,7 @@ COLUMNS: Columns = {
     "Pairs": _number("pairs"),
     "Scenes": _number("scenes"),
     RECALL: _recall,
-    f"at {FINE_THRESHOLD}": _percent("recall_fine"),
+    f"at {statistics.FINE_THRESHOLD}": _percent("recall_fine"),
     "AUC@0.05": _percent("auc_05"),
     "%Recall (released NSGD)": _percent("recall_released"),
     "%Inlier": _percent("inlier_rate"),
@@ -147,7 +131,7 @@ HOMOGRAPHY = (
 )
 HOMOGRAPHY_COLUMNS: Columns = {
     "Pairs": _number("pairs"),
-    **{f"AUC@{t} px": _percent(f"auc_{t}px") for t in CORNER_THRESHOLDS},
+    **{f"AUC@{t} px": _percent(f"auc_{t}px") for t in statistics.CORNER_THRESHOLDS},
     "corner error": _number("corner_error", "{:.2f} px"),
 }
 FOCALS = (
@@ -158,7 +142,7 @@ FOCAL_COLUMNS: Columns = {
     "Images": _number("images"),
     "error": _percent("error", "{:.1f} %"),
     "f / true f": _number("ratio", "{:.3f}"),
-    **{f"%within {p} %": _percent(f"within_{p}") for p in FOCAL_THRESHOLDS},
+    **{f"%within {p} %": _percent(f"within_{p}") for p in statistics.FOCAL_THRESHOLDS},
 }
 KINDS = (
     "Number of pairs by what their matches show. Those of one plane, of a camera that only turns, or of one photograph "
@@ -187,15 +171,15 @@ def _poses(rows: Mapping[str, Group], binned: bool) -> Part:
     said = [(signed, names) for signed, names in by_sign.items() if names]
     suffix = "" if len(said) != 1 else ", signed" if said[0][0] else ", folded"
     note = " ".join(POSE[signed] if len(said) == 1 else f"{', '.join(names)}: {POSE[signed]}" for signed, names in said)
-    areas = {f"AUC@{t}°": f"auc_{t}" for t in POSE_THRESHOLDS} | {"mAA(10°)": "maa_10"}
+    of_area = {f"AUC@{t}°": f"auc_{t}" for t in statistics.POSE_THRESHOLDS} | {"mAA(10°)": "maa_10"}
     columns: Columns = {
         "Pairs": _number("pairs"),
-        **{heading: _percent(field) for heading, field in areas.items()},
-        **{f"mAP@{t}°": _percent(f"map_{t}") for t in POSE_THRESHOLDS if binned},
+        **{heading: _percent(field) for heading, field in of_area.items()},
+        **{f"mAP@{t}°": _percent(f"map_{t}") for t in statistics.POSE_THRESHOLDS if binned},
         "R error": _number("rotation", "{:.2f}°"),
         f"t error{suffix}": _number("translation", "{:.2f}°"),
     }
-    return Part("Relative pose", note + BINNED * binned, columns, rows, areas)
+    return Part("Relative pose", note + BINNED * binned, columns, rows, of_area)
 
 
 def _parts_of_run(summary: Mapping[str, Group], binned: bool) -> list[Part]:
@@ -300,7 +284,7 @@ def _merit(overall: Mapping[str, Group]) -> Table:
     known = known_columns(COLUMNS, overall)
     counts = ("Pairs", "Scenes")
     columns = {h: c for h, c in known.items() if h not in counts} | {h: COLUMNS[h] for h in counts}
-    ranked = {RECALL: "recall", f"at {FINE_THRESHOLD}": "recall_fine", "AUC@0.05": "auc_05"}
+    ranked = {RECALL: "recall", f"at {statistics.FINE_THRESHOLD}": "recall_fine", "AUC@0.05": "auc_05"}
     table = _of_runs(Part("Figures of merit", "", columns, overall, ranked), overall)
     if RECALL not in columns:
         return table
@@ -347,7 +331,7 @@ def _differences(runs: Mapping[str, pa.Table]) -> Table | None:
     axis = axis_of(runs)
     first, *others = runs
     keys, families, scenes = (runs[first][name].to_pylist() for name in ("key", "family", "scene"))
-    scene = dict(zip(keys, scene_names(families, scenes), strict=True))
+    scene = dict(zip(keys, statistics.scene_names(families, scenes), strict=True))
     counts, compared = [], []
     for other in others:
         two = {first: runs[first], other: runs[other]}
@@ -360,8 +344,12 @@ def _differences(runs: Mapping[str, pa.Table]) -> Table | None:
         name: [Cell(f"{count:,}"), *(Cell(text, bar=_around_zero(i, widest)) for text, i in cells)]
         for name, count, cells in zip(others, counts, compared, strict=True)
     }
-    figures = [f"recall at {THRESHOLD}", f"at {FINE_THRESHOLD}", "AUC@0.05"]
-    head = ["run", "shared pairs", *(figures if axis is NSGD else [f"AUC@{t} px" for t in CORNER_THRESHOLDS])]
+    figures = [f"recall at {THRESHOLD}", f"at {statistics.FINE_THRESHOLD}", "AUC@0.05"]
+    head = [
+        "run",
+        "shared pairs",
+        *(figures if axis is NSGD else [f"AUC@{t} px" for t in statistics.CORNER_THRESHOLDS]),
+    ]
     note = (
         f"In points; positive where {first} is ahead of the row's run. In brackets the paired {LEVEL:.0%} interval "
         f"(Bonett and Price's for recall, a bootstrap for AUC@0.05 from {MIN_UNITS} scenes or pairs on): a difference "
@@ -375,14 +363,16 @@ def _ahead(
 ) -> list[tuple[str, Interval | None]]:
     """Differences of recall at both thresholds and of AUC@0.05, or of areas below corner errors, of the same pairs."""
     if of_nsgd:
-        values = [(recalled(a, t), recalled(b, t), True) for t in (THRESHOLD, FINE_THRESHOLD)]
-        values.append((areas(a), areas(b), False))
+        values = [
+            (statistics.recalled(a, t), statistics.recalled(b, t), True) for t in (THRESHOLD, statistics.FINE_THRESHOLD)
+        ]
+        values.append((statistics.areas(a), statistics.areas(b), False))
     else:
-        values = [(_area(a, t), _area(b, t), False) for t in CORNER_THRESHOLDS]
+        values = [(_area(a, t), _area(b, t), False) for t in statistics.CORNER_THRESHOLDS]
     cells: list[tuple[str, Interval | None]] = []
     for own, other, share in values:
-        interval = difference(own, other, scenes, PERCENT, share=share) if len(a) else None
-        few = f"{PERCENT * float((own - other).mean()):+.1f} (n too small)" if len(a) else DASH
+        interval = statistics.difference(own, other, scenes, statistics.PERCENT, share=share) if len(a) else None
+        few = f"{statistics.PERCENT * float((own - other).mean()):+.1f} (n too small)" if len(a) else DASH
         cells.append((few if interval is None else f"{interval:+.1f}", interval))
     return cells
 
