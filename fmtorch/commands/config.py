@@ -1,7 +1,5 @@
 """How a command runs: Hydra composes its config, and a user's mistake ends it with one line and status 1."""
 
-from __future__ import annotations
-
 import functools
 import re
 import sys

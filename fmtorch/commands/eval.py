@@ -1,7 +1,5 @@
 """`python -m fmtorch.eval pipeline=sift_ratio`: run a pipeline over a data set of image pairs and evaluate it."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import os

@@ -1,7 +1,5 @@
 """`fmtorch match`: the fundamental matrix of two photographs, with pictures; or the pairs of a folder of images."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import functools

@@ -4,8 +4,6 @@ The one declaration of both: the config that Hydra composes, the checks of its v
 Nothing here imports a library, for which ``--help`` would wait.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`fmtorch pairs dataset=kitti dataset.root=DIR output=KITTI`: a set of the pairs that can be matched."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import itertools

@@ -1,7 +1,5 @@
 """`fmtorch report runs=[runs]`: runs of `fmtorch.eval` side by side on one HTML page."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Iterable, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`fmtorch verify DATABASE`: two-view geometries of the matches in a COLMAP database."""
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import re

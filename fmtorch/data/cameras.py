@@ -1,7 +1,5 @@
 """Pinhole cameras, what two of them say about an image pair, and lenses that distort their images."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Which pairs of images with known cameras make a data set: the paper's rule, or how much of the scene both show."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import json
@@ -33,7 +31,7 @@ Place = tuple[int, int, int]
 """Number of the scene, and of its two views."""
 
 
-def overlap_of(dataset: ScenePairs) -> DepthOverlap | PointOverlap:
+def overlap_of(dataset: ScenePairs) -> "DepthOverlap | PointOverlap":
     """Overlaps by depth where the data set knows it, else by points. Raises ValueError where it has neither."""
     if isinstance(dataset, DepthDataset):
         return DepthOverlap(dataset)

@@ -1,7 +1,5 @@
 """Files of data sets, read so that whatever is wrong names file and line, or file and array."""
 
-from __future__ import annotations
-
 import pickle
 import re
 import zipfile
@@ -162,7 +160,7 @@ class _Array:
         _, self.shape, self.dtype, self.fortran, self.content = state
 
     @classmethod
-    def of_buffer(cls, content: bytes | bytearray, dtype: _DType, shape: tuple[int, ...], order: str) -> _Array:
+    def of_buffer(cls, content: bytes | bytearray, dtype: _DType, shape: tuple[int, ...], order: str) -> "_Array":
         """As ``numpy._core.numeric._frombuffer``."""
         array = cls()
         array.__setstate__((1, shape, dtype, order == "F", bytes(content)))

@@ -1,7 +1,5 @@
 """Photographs with a ``Camera.txt`` beside them: the cameras of the FM-Bench layout, before there are pairs."""
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import os

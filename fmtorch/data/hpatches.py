@@ -1,7 +1,5 @@
 """HPatches' image sequences (Balntas et al., CVPR 2017): photographs of planes with known homographies."""
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """The cameras of photographs: of COLMAP models, of JSON files, and by what a camera wrote into its files (EXIF)."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import json

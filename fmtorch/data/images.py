@@ -1,7 +1,5 @@
 """Images from disk: never a half-decoded one, turned only on demand, and their sizes from headers alone."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import re

@@ -5,8 +5,6 @@ counterclockwise, K0, K1 row by row, and the pose, a matrix (4, 4) that takes po
 are those of the images before they are turned. glue-factory: names, K0, K1, and either R and t or the matrix.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import re

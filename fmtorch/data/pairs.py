@@ -1,7 +1,5 @@
 """The item of every data set: an image pair with its ground truth, and how its images are resized when read."""
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 from collections.abc import Callable, Iterator, Sequence

@@ -1,7 +1,5 @@
 """Scenes reconstructed by COLMAP (Tanks and Temples, CPC) and by Bundler (1DSfM), as pairs of their images."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Sequence
 from pathlib import Path

@@ -2,8 +2,6 @@
 that see the same points of its reconstruction.
 """
 
-from __future__ import annotations
-
 import bisect
 import dataclasses
 import functools

@@ -1,7 +1,5 @@
 """The pairs that a report shows: images from wherever they lie, each run's matches again, or what it stored."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The report of several runs: tables, paired differences, curves and pictures on one HTML page."""
 
-from __future__ import annotations
-
 import base64
 import dataclasses
 import hashlib

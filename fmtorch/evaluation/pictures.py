@@ -1,7 +1,5 @@
 """Two images on one canvas: where each stands, its lines and points in pixels of the canvas, a caption below."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 

@@ -3,8 +3,6 @@
 Metrics are float64 and computed on the CPU: so little work needs no GPU.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 import time

@@ -5,8 +5,6 @@ where detectors, networks and OpenCV do the work. Processes use all cores for es
 hundred megabytes each. Rows and exports come back to the caller, who alone writes.
 """
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import functools

@@ -9,8 +9,6 @@ Science 2001), of the effective number of pairs (Korn and Graubard, "Confidence 
 expected number of positive counts estimated from survey data", Survey Methodology 1998).
 """
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import math
@@ -58,7 +56,7 @@ class Interval:
     high: float
     over: str
 
-    def scaled(self, scale: float) -> Interval:
+    def scaled(self, scale: float) -> "Interval":
         return Interval(scale * self.value, scale * self.low, scale * self.high, self.over)
 
     def __format__(self, form: str) -> str:

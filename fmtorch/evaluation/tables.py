@@ -1,7 +1,5 @@
 """Summaries as tables: of one run on a terminal and in Markdown, of several runs as cells of a report."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import NamedTuple

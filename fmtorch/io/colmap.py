@@ -1,7 +1,5 @@
 """A COLMAP database of keypoints, matches and two-view geometries, written through pycolmap."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import functools
@@ -233,7 +231,7 @@ class MatchDatabase:
                 self.close()
                 raise ValueError(f"{path} holds no {what}; {step} first")
 
-    def __enter__(self) -> MatchDatabase:
+    def __enter__(self) -> "MatchDatabase":
         return self
 
     def __exit__(self, *error: object) -> None:

@@ -1,7 +1,5 @@
 """The data set `h5`: pairs whose matches somebody else computed, in the layouts that the field exchanges."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import hashlib

@@ -1,7 +1,5 @@
 """Files of matches to verify: hloc's features and matches, or x0, x1 alone; and files of what was verified."""
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import zipfile
@@ -47,7 +45,7 @@ class HlocMatches:
             self._open = stack.pop_all()
         self.image = functools.lru_cache(maxsize=MEMORY)(self._image)
 
-    def __enter__(self) -> HlocMatches:
+    def __enter__(self) -> "HlocMatches":
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -179,7 +177,7 @@ class MatchFile:
             self._open = stack.pop_all()
         self.image = functools.lru_cache(maxsize=MEMORY)(self._image)
 
-    def __enter__(self) -> MatchFile:
+    def __enter__(self) -> "MatchFile":
         return self
 
     def __exit__(self, *error: object) -> None:

@@ -7,8 +7,6 @@
                           geometry for COLMAP; the digest is of the two images' digests
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import hashlib

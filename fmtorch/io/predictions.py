@@ -1,7 +1,5 @@
 """Matches that other programs stored for the pairs of a data set: hloc's, glue-factory's and vismatch's files."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path

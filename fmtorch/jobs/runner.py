@@ -5,8 +5,6 @@ of anybody's executor, has no start of its own in which to make it: each task na
 says nothing to the worker, the task is sent again with how to make it.
 """
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import hashlib
@@ -69,7 +67,7 @@ class WorkerPool:
         self._executor: Executor | None = None
         self._cluster: _Cluster | None = None
 
-    def __enter__(self) -> WorkerPool:
+    def __enter__(self) -> "WorkerPool":
         return self
 
     def __exit__(self, *error: object) -> None:

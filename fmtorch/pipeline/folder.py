@@ -1,7 +1,5 @@
 """A folder of images: its pairs, the work on them by any workers, which can be resumed, and where results go."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import hashlib

@@ -1,7 +1,5 @@
 """Photographs for a pipeline: what is known of their cameras, and how they are reduced for matching."""
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Mapping, Sequence

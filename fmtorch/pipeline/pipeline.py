@@ -1,7 +1,5 @@
 """The four stages in a row: features, matching, pruning, estimation; batching, timing, failures as data."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import threading

@@ -1,7 +1,5 @@
 """Photographs described for matching: features of each as it was reduced, and what leads back to it."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import math

@@ -1,7 +1,5 @@
 """Configs composed by Hydra from groups of presets, and what is read of them: stages, pruners, executor, options."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import threading

@@ -1,7 +1,5 @@
 """Preset files, ``conf/<group>/<name>.yaml``: which there are, what they say and what they name."""
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import re

@@ -1,7 +1,5 @@
 """From configs to objects: a mapping with a `_target_` becomes what the target makes of its other entries."""
 
-from __future__ import annotations
-
 import importlib
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`python -m fmtorch.runs [DIR]`: what the cache folder holds of features, compiled kernels, scenes and matches."""
 
-from __future__ import annotations
-
 import argparse
 import shutil
 import time

@@ -1,7 +1,5 @@
 """Arrays kept on disk by name, one NumPy file each, in a folder of bounded size that several processes may share."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import hashlib
@@ -198,7 +196,7 @@ class CachedFeatures:
         self.cache.describe(section, identity)
         return section
 
-    def _kept(self, section: str, digest: str, compute: Callable[[], Mapping[str, Tensor]]) -> _Step:
+    def _kept(self, section: str, digest: str, compute: Callable[[], Mapping[str, Tensor]]) -> "_Step":
         """One step's result, from the cache or computed and kept."""
         arrays = self.cache.read(section, digest)
         if arrays is not None:

@@ -1,7 +1,5 @@
 """The code that makes a result: the version of fmtorch, in a checkout its commit, and the sources of a user's parts."""
 
-from __future__ import annotations
-
 import ast
 import contextlib
 import dataclasses

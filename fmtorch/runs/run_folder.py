@@ -1,7 +1,5 @@
 """The result of one image pair, as one row of a table."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import hashlib
@@ -264,7 +262,7 @@ class RunFolder:
     config: dict[str, Any]  # what defines the results, see `identity_digest`
 
     @classmethod
-    def open(cls, path: Path | str, config: Mapping[str, Any]) -> RunFolder:
+    def open(cls, path: Path | str, config: Mapping[str, Any]) -> "RunFolder":
         """Start a run in `path`, or continue it there when the folder holds a run of the same identity.
 
         Several processes may open the same folder at once. Raises RunFolderError, touching nothing, where the folder
@@ -294,7 +292,7 @@ class RunFolder:
         return folder
 
     @classmethod
-    def load(cls, path: Path | str) -> RunFolder:
+    def load(cls, path: Path | str) -> "RunFolder":
         """The existing run in `path`, whatever its identity. Raises RunFolderError where there is none."""
         file = Path(path) / "run.json"
         try:

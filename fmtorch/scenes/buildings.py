@@ -3,8 +3,6 @@
 A front is one painted picture; windows are set back from it, sills, cornices and signs set off.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Literal, NamedTuple
 

@@ -4,8 +4,6 @@ Every scene is a function of (version, seed, split, family, number) alone and is
 renamed when complete, so that an interrupted generation goes on where it stopped and two processes never clash.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import hashlib
@@ -364,7 +362,7 @@ class RenderedPairs(Dataset[ImagePair]):
         scene, _, number = image.identity.rpartition("/")
         return depth_at(self._tasks[scene], int(number), points)
 
-    def scene_pairs(self) -> RenderedScenePairs:
+    def scene_pairs(self) -> "RenderedScenePairs":
         """All pairs of the photographs of each scene, as candidates to select from."""
         scenes = []
         for name, views in self._views.items():

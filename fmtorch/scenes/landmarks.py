@@ -1,7 +1,5 @@
 """The families of landmarks: a walk round a structure after Tanks and Temples, and photographs of a place after CPC."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The families of videos: driving along a street after KITTI, and hand-held video of a room after TUM RGB-D."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

@@ -6,8 +6,6 @@ becomes one of the camera, so that K stays upper triangular) and the fundamental
 the matcher's figures stay as they are. Matches that fall away are masked; `LabelledMatches.compact` takes them out.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 
@@ -35,7 +33,7 @@ class Augmentation(AugmentationOptions):
     """
 
     @classmethod
-    def none(cls) -> Augmentation:
+    def none(cls) -> "Augmentation":
         return cls(swap=0, quarter_turn=0, turn=0, crop=0, ratio=None, thin=0, noise=None, matches=None)
 
     def __call__(

@@ -8,8 +8,6 @@ lines decides with the same two thresholds; it takes a wrong match that is near 
 band of 6 px in an image 500 px high: about one in eighty).
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 
@@ -64,15 +62,15 @@ class LabelledMatches(Record):
     def __len__(self) -> int:
         return len(self.correspondences)
 
-    def __getitem__(self, index: Index) -> LabelledMatches:
+    def __getitem__(self, index: Index) -> "LabelledMatches":
         """The selected pairs, always as a batch."""
         i = as_index(index, len(self))
         return self._map(lambda value: value[i])
 
-    def keep(self, mask: Bool[Tensor, "b n"]) -> LabelledMatches:
+    def keep(self, mask: Bool[Tensor, "b n"]) -> "LabelledMatches":
         return self.replace(correspondences=self.correspondences.keep(mask))
 
-    def compact(self, multiple: int = 1) -> LabelledMatches:
+    def compact(self, multiple: int = 1) -> "LabelledMatches":
         """Matches moved to the front in their order, padding cut to the longest pair (rounded up to `multiple`)."""
         mask = self.correspondences.mask
         order = torch.argsort(mask.logical_not().to(torch.uint8), dim=-1, stable=True)
@@ -85,12 +83,12 @@ class LabelledMatches(Record):
             moved, correspondences=moved.correspondences.compact(multiple), label=_padded(moved.label, n)
         )
 
-    def reorder(self, order: Int[Tensor, "b m"]) -> LabelledMatches:
+    def reorder(self, order: Int[Tensor, "b m"]) -> "LabelledMatches":
         """The matches in the slots `order` of each pair, in that order."""
         moved = {name: gathered(value, order) for name, value in slotted(self.correspondences).items()}
         return LabelledMatches(self.correspondences.replace(**moved), gathered(self.label, order), self.F)
 
-    def first(self, count: int) -> LabelledMatches:
+    def first(self, count: int) -> "LabelledMatches":
         cut = {name: value[:, :count] for name, value in slotted(self.correspondences).items()}
         return LabelledMatches(self.correspondences.replace(**cut), self.label[:, :count], self.F)
 

@@ -3,8 +3,6 @@
 What is already done is taken up again, whatever ended the last attempt.
 """
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import re

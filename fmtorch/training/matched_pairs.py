@@ -1,7 +1,5 @@
 """`MatchedPairs`: a data set of image pairs seen through a pipeline's first stages, with labels, kept on disk."""
 
-from __future__ import annotations
-
 import functools
 import warnings
 from collections.abc import Callable, Iterator, Sequence

@@ -1,7 +1,5 @@
 """Pairs of a COLMAP database as correspondences."""
 
-from __future__ import annotations
-
 import dataclasses
 import shutil
 import uuid
