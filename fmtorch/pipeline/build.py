@@ -35,6 +35,7 @@ def build_pipeline(
         device=device,
         families=for_families,
         model=model,
+        debug=bool(config.get("debug")),
     )
 
 
