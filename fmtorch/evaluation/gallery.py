@@ -19,8 +19,7 @@ from fmtorch.evaluation.page import Picture, Shown, ShownPair, differing_pairs
 from fmtorch.evaluation.pictures import Image, draw_epipolar_lines, draw_epipolar_lines_of_corners, draw_matches
 from fmtorch.io.dataset import WITHOUT_GEOMETRY, H5Pairs
 from fmtorch.metrics import corner_error, nsgd
-from fmtorch.pipeline.build import build_pipeline
-from fmtorch.pipeline.pipeline import Outcome, Pipeline
+from fmtorch.pipeline.pipeline import Outcome, Pipeline, build_pipeline
 from fmtorch.runs import RunFolder
 from fmtorch.scenes import RenderedPairs
 
@@ -240,6 +239,6 @@ def shown_pair(pair: ImagePair, runs: Sequence[Run], pipelines: Mapping[str, Pip
             pictures = drawn(pair, images, stored, outcome, r.name)
         pictures = pictures or from_stored(pair, images, stored, r.name)
         nsgd = float(stored["nsgd"]) if stored["ok"] else None
-        kind = stored["configuration"] or ""
+        kind = stored["pair_type"] or ""
         seen.append(Shown(r.name, nsgd, str(stored["reason"]), pictures, kind, stored["corner_error"]))
     return ShownPair(pair.identity, seen, notes)

@@ -13,7 +13,7 @@ import numpy as np
 
 from fmtorch.core.files import replacing
 from fmtorch.io import colmap, h5
-from fmtorch.io.hloc import write_geometry
+from fmtorch.io.match_file import write_geometry
 from fmtorch.io.match_store import MatchStore, StoredImage, StoredPair
 from fmtorch.io.predictions import pair_key_of
 
@@ -112,7 +112,7 @@ class Edge:
     inliers: int
     significance: float | None
     related: bool
-    configuration: str
+    pair_type: str
 
 
 @dataclasses.dataclass(frozen=True)
@@ -149,7 +149,7 @@ def view_graph(journal: MatchStore, images: Sequence[Path], pairs: Sequence[tupl
             pair = journal.pair(*ends)
             significance = pair.significance if math.isfinite(pair.significance) else None
             counts = len(pair.matches), int(pair.inliers.sum())
-            edges.append(Edge(pair.name0, pair.name1, *counts, significance, pair.related, pair.configuration))
+            edges.append(Edge(pair.name0, pair.name1, *counts, significance, pair.related, pair.pair_type))
     return ViewGraph(tuple(journal.name(image) for image in images), tuple(edges))
 
 

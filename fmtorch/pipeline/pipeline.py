@@ -1,4 +1,4 @@
-"""Results kept for those who ask for the same again."""
+"""The four stages in a row: features, matching, pruning, estimation; batching, timing, failures as data."""
 
 from __future__ import annotations
 
@@ -9,11 +9,14 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from concurrent.futures import Future
+from pathlib import Path
 from typing import Generic, TypeVar
 
 import numpy as np
 import torch
+from hydra.errors import HydraException
 from numpy.typing import NDArray
+from omegaconf import DictConfig
 
 from fmtorch.core.failures import own_traceback, place_of
 from fmtorch.core.grey_pyramid import GreyPyramid, grey_pyramid
@@ -34,8 +37,12 @@ from fmtorch.core.types import Correspondences, Estimate, Features, collate
 from fmtorch.data.images import read_image, to_grey
 from fmtorch.data.pairs import GivenMatches, ImagePair, ImageSource
 from fmtorch.geometry.significance import judged
-from fmtorch.jobs.threads import one_thread
-from fmtorch.two_view.pair_type import Configuration, classify
+from fmtorch.jobs.execution import one_thread
+from fmtorch.presets.composition import PIPELINES, build_pruners, compose, plain
+from fmtorch.presets.files import available, unknown
+from fmtorch.presets.objects import instantiate, open_files
+from fmtorch.runs.feature_cache import cached
+from fmtorch.two_view.pair_type import PairTypes, classify
 
 Key = TypeVar("Key")
 Value = TypeVar("Value")
@@ -101,7 +108,7 @@ class Outcome:
     correspondences, estimate: batches of one; None where the pair failed before that stage.
     features: how many each image has. seconds: per stage; a batched stage is shared out evenly, and features count in
     full for each pair that uses them, cached ones with the seconds they took when they were computed.
-    reason: why the pair failed, empty where it did not. configuration, not_examined: of this pair alone, or why there
+    reason: why the pair failed, empty where it did not. pair_type, not_examined: of this pair alone, or why there
     is none, where it was asked for (`fmtorch.pipeline.pipeline`). images: for pruners that look at them. keypoints:
     the correspondences as the matcher left them, where pruners that look at images may have moved their points.
     """
@@ -112,7 +119,7 @@ class Outcome:
     estimate: Estimate | None = None
     seconds: dict[str, float] = dataclasses.field(default_factory=dict)
     reason: str = ""
-    configuration: Configuration | None = None
+    pair_type: PairTypes | None = None
     not_examined: str = ""
     images: PairImages | None = None
     keypoints: Correspondences | None = None
@@ -333,7 +340,7 @@ class Pipeline:
             if own:
                 family_outcomes = [outcomes[i] for i in own]
                 c = collated(family_outcomes)
-                keypoints = Correspondences(c.x0, c.x1, c.mask, quality=c.quality)
+                keypoints = Correspondences(c.x0, c.x1, c.mask, ratio=c.ratio, score=c.score)
 
                 def images(i: int, family_outcomes: list[Outcome] = family_outcomes) -> PairImages:
                     return family_outcomes[i].images or self.images(family_outcomes[i].pair)
@@ -374,7 +381,7 @@ class Pipeline:
         return reason
 
 
-# Which configurations the pairs of a run are in, by the matches and what the estimator was given of the cameras
+# Which pair types the pairs of a run are in, by the matches and what the estimator was given of the cameras
 
 
 Knowledge = Callable[[Correspondences], Correspondences]
@@ -383,7 +390,7 @@ Knowledge = Callable[[Correspondences], Correspondences]
 def examined(
     pipeline: Pipeline, outcomes: Sequence[Outcome], seed: int = 0, knowledge: Knowledge | None = None
 ) -> list[Outcome]:
-    """The outcomes of a run with their configurations; a pair that cannot be examined has none and harms no other.
+    """The outcomes of a run with their pair types; a pair that cannot be examined has none and harms no other.
 
     knowledge: gives correspondences what the estimator was given of their cameras; None: nothing, and their K counts
     for nothing here. Matches of the results have what it gives. Of homographies nothing is asked.
@@ -406,12 +413,12 @@ def _examined(outcomes: Sequence[Outcome], seed: int, knowledge: Knowledge | Non
     c = collate([o.correspondences for o in outcomes if o.correspondences is not None])
     estimate = collate([o.estimate for o in outcomes if o.estimate is not None])
     if knowledge is None:
-        configuration = classify(c.derived(K0=None, K1=None), estimate, seed=seed)
+        pair_type = classify(c.derived(K0=None, K1=None), estimate, seed=seed)
     else:
         c = knowledge(c)
-        configuration = classify(c, estimate, seed=seed)
+        pair_type = classify(c, estimate, seed=seed)
     return [
-        dataclasses.replace(outcome, correspondences=c[i], configuration=configuration.of_pair(i))
+        dataclasses.replace(outcome, correspondences=c[i], pair_type=pair_type.of_pair(i))
         for i, outcome in enumerate(outcomes)
     ]
 
@@ -422,3 +429,61 @@ def _pair_alone(outcome: Outcome, seed: int, knowledge: Knowledge | None) -> Out
     except Exception as error:  # what it is in stays unknown, and the row says why
         reason = f"not examined: {type(error).__name__}: {error}".splitlines()[0]
         return dataclasses.replace(outcome, not_examined=reason)
+
+
+# Pipelines of presets and of composed configs
+
+
+def build_pipeline(
+    config: DictConfig, device: torch.device | str = "cpu", model: str | None = "fundamental"
+) -> Pipeline:
+    """The `Pipeline` that features (with cache), matcher, pruner and estimator of a composed config describe.
+
+    model: what the estimator must give, "fundamental" or "homography"; None: either.
+    """
+    extractor = cached(instantiate(plain(config.features), "features"), config.cache, config.cache_limit)
+    pruners, for_families = build_pruners(config)
+    open_files([extractor, pruners, for_families], torch.device(device))  # a damaged one is no failure of each pair
+    return Pipeline(
+        extractor,
+        instantiate(plain(config.matcher), "matcher"),
+        pruners,
+        instantiate(plain(config.estimator), "estimator"),
+        device=device,
+        families=for_families,
+        model=model,
+        debug=bool(config.get("debug")),
+    )
+
+
+def load_pipeline(
+    name: str,
+    device: torch.device | str = "cpu",
+    overrides: Sequence[str] = (),
+    config_dir: Path | str | None = None,
+) -> Pipeline:
+    """The `Pipeline` of ``conf/pipeline/<name>.yaml``, changed by `overrides` as on the command line.
+
+    E.g. ``load_pipeline("sift_gms", overrides=["estimator=lmeds", "pruner.gms.with_scale=true"])``. Unlike the
+    commands it keeps no features on disk unless asked to (``overrides=["cache=null"]``, or a folder).
+
+    Args:
+        name: a preset of conf/pipeline, or of `config_dir`.
+        device: where features are described and everything behind them is computed.
+        overrides: as words of a command.
+        config_dir: a folder with presets of your own, as the commands take it by `--config-dir`.
+
+    Raises:
+        ValueError: for an unknown pipeline, naming those there are, for an override that does not apply, and where
+            `config_dir` is no folder.
+    """
+    if config_dir is not None and not Path(config_dir).is_dir():
+        raise ValueError(f"config_dir={config_dir} is no folder")
+    if name not in available("pipeline", config_dir):
+        raise ValueError(unknown("pipeline", name, config_dir))
+    words = (f"pipeline={name}", "cache=off", *overrides)
+    try:
+        config = compose(PIPELINES, words, None if config_dir is None else Path(config_dir))
+    except HydraException as error:
+        raise ValueError(f"pipeline={name} with {', '.join(overrides)}: {error}") from error
+    return build_pipeline(config, device)

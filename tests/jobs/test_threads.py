@@ -13,8 +13,7 @@ from fmtorch.core.types import collate
 from fmtorch.data import read_image
 from fmtorch.estimators import batch
 from fmtorch.evaluation.run import evaluate_pairs
-from fmtorch.jobs.execution import Execution
-from fmtorch.jobs.threads import available, mapped, one_thread
+from fmtorch.jobs.execution import Execution, available, mapped, one_thread
 from fmtorch.matching import nearest
 from fmtorch.pruning import position_consistency as consistency
 from tests.helpers import draw, pair
@@ -138,7 +137,7 @@ def test_a_batch_in_threads_has_the_bits_of_one_thread(threads: int, graph: bool
             e.F.square()[:, 0, 1].sum().backward()
         results.append((e, x0.grad))
     (threaded, gradient), (single, expected) = results
-    for name in ("F", "inliers", "ok", "draws", "significance"):
+    for name in ("F", "inliers", "ok", "samples", "significance"):
         assert torch.equal(getattr(threaded, name), getattr(single, name)), name
     assert threaded.reason == single.reason
     if graph:

@@ -15,8 +15,7 @@ import fmtorch
 from fmtorch.data import read_image
 from fmtorch.matching.matcher import MAX_RATIO, relative_noise
 from fmtorch.matching.vismatch import VisMatch
-from fmtorch.pipeline.build import load_pipeline
-from fmtorch.pipeline.pipeline import Pipeline
+from fmtorch.pipeline.pipeline import Pipeline, load_pipeline
 from tests.data import lists
 from tests.helpers import compose, draw, pair
 from tests.matching import stand_in
@@ -40,8 +39,8 @@ def test_points_and_confidences_are_the_matchers(tmp_path: Path) -> None:
     for x, known in zip((c.x0, c.x1), keypoints, strict=True):
         assert {tuple(point) for point in x[0].tolist()} <= {tuple(np.float32(p).tolist()) for p in known}
     assert ((c.x0 - c.x1)[0, :, 0] - 12).abs().median() < 0.5
-    assert c.quality is not None
-    assert ((c.quality >= 0) & (c.quality < 0.75)).all()  # the ratio that the stand-in calls 1 - confidence
+    assert c.score is not None
+    assert ((c.score > 0.25) & (c.score <= 1)).all()  # the ratio that the stand-in calls 1 - confidence
     assert c.size0 is not None
     assert c.size0.tolist() == [[240, 320]]
     assert c.noise is None
