@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import os
 import statistics
 import subprocess
@@ -56,11 +57,20 @@ def inner_modules(paths: Iterable[Path]) -> set[str]:
     """The modules within rooms of the package, as fmtorch.geometry.epipolar, that files import."""
     names: set[str] = set()
     for node in nodes(paths, ast.Import, ast.ImportFrom):
-        module, members = getattr(node, "module", None), [alias.name for alias in node.names]
+        module = getattr(node, "module", None)
+        members = [alias.name for alias in node.names if alias.name not in exported(module or "")]
         names |= {module, *(f"{module}.{member}" for member in members)} if module else set(members)
     files = {path.with_suffix("") for path in (ROOT / "fmtorch").rglob("*.py")}
     inner = {name: ROOT.joinpath(*name.split(".")) for name in names if name.count(".") > 1}
     return {name for name, path in inner.items() if {path, path / "__init__"} & files}
+
+
+@functools.cache
+def exported(package: str) -> tuple[str, ...]:
+    """The names that a room lists as its own, some of which a module within it has, too: a function `seven_point`."""
+    file = ROOT.joinpath(*package.split("."), "__init__.py")
+    assignments = nodes([file], ast.Assign) if file.exists() else []
+    return next((ast.literal_eval(node.value) for node in assignments if node.targets[0].id == "__all__"), ())
 
 
 def words() -> dict[str, int]:

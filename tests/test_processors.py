@@ -4,8 +4,6 @@ The other process compiles kernels for Haswell, into a cache of its own, and has
 for AVX2. docs/concepts/conventions.md says what is promised.
 """
 
-from __future__ import annotations
-
 import os
 import platform
 import subprocess
@@ -69,7 +67,7 @@ def results(given: dict[str, Any]) -> dict[str, np.ndarray]:
     for what, c in given["pairs"].items():
         for name in ESTIMATORS:
             estimate = built("estimator", name)(c, 1)
-            for field in ("F", "inliers", "ok", "draws", "significance"):
+            for field in ("F", "inliers", "ok", "samples", "significance"):
                 arrays[f"{name} of {what}: {field}"] = getattr(estimate, field)
     for name in PRUNERS:
         c = built("pruner", name)(given["many"])

@@ -34,15 +34,15 @@ def logistic(z: Any) -> Any:
 
 
 @kernel
-def calibrated(evidence: F4x1, quality: F4x1, mask: B1x1, numbers: F4x1, out: F4x1) -> None:
+def calibrated(evidence: F4x1, ratio: F4x1, mask: B1x1, numbers: F4x1, out: F4x1) -> None:
     """P(inlier) of `Calibration` from evidence and ratio (n,) -> out (n,); zero where masked.
 
-    quality: empty where unknown. numbers: constant, weights of evidence and ratio.
+    ratio: empty where unknown. numbers: constant, weights of evidence and ratio.
     """
     for i in range(len(mask)):
         z = numbers[0] + numbers[1] * evidence[i]
-        if len(quality):
-            z += numbers[2] * (np.float32(1) if np.isnan(quality[i]) else quality[i])
+        if len(ratio):
+            z += numbers[2] * (np.float32(1) if np.isnan(ratio[i]) else ratio[i])
         out[i] = logistic(min(max(np.float64(z), -_LARGEST), _LARGEST)) if mask[i] else 0.0
 
 
@@ -50,7 +50,7 @@ def calibrated(evidence: F4x1, quality: F4x1, mask: B1x1, numbers: F4x1, out: F4
 class Calibration:
     """``P(inlier) = logistic(constant + evidence e + ratio q)`` of the evidence e and the distance ratio q.
 
-    with_ratio: {constant, evidence, ratio}, where matches have a `quality`. alone: {constant, evidence}, where they
+    with_ratio: {constant, evidence, ratio}, where matches have a `ratio`. alone: {constant, evidence}, where they
     have none; without it their prior stays as it is. `scripts/calibrate_priors.py` fits these numbers.
     """
 
@@ -59,17 +59,19 @@ class Calibration:
 
     def __call__(self, c: Correspondences, evidence: Float[Tensor, "b n"]) -> Correspondences:
         """The same matches with ``prior``, zero where masked. A ratio that is NaN counts as 1. Computed in float32."""
-        fitted = self.alone if c.quality is None else self.with_ratio
+        ratio = c.ambiguity
+        fitted = self.alone if ratio is None else self.with_ratio
         if fitted is None:
             return c
         numbers = np.array([fitted["constant"], fitted["evidence"], fitted.get("ratio", 0.0)], np.float32)
         out = torch.empty(c.mask.shape, dtype=torch.float32)
-        prior = for_each_pair(calibrated, (evidence, c.quality, c.mask), numbers, out=out)
-        if gradient_wanted(evidence, c.quality):
+        prior = for_each_pair(calibrated, (evidence, ratio, c.mask), numbers, out=out)
+        if gradient_wanted(evidence, ratio):
             z = fitted["constant"] + fitted["evidence"] * torch.where(c.mask, evidence, 0)
-            if c.quality is not None:
-                z = z + fitted["ratio"] * torch.where(c.mask, c.quality, 0).nan_to_num(nan=1.0)
-            slope = torch.where(z.abs() < _LARGEST, prior * (1 - prior) / (1 + z / 2**_SQUARINGS), 0).detach()
+            if ratio is not None:
+                z = z + fitted["ratio"] * torch.where(c.mask, ratio, 0).nan_to_num(nan=1.0)
+            z = z.clamp(-_LARGEST, _LARGEST)
+            slope = prior * (1 - prior) / (1 + z.detach() / 2**_SQUARINGS)
             prior = prior + slope * (z - z.detach())  # adds zeros
         return c.derived(prior=prior.to(c.x0.dtype))
 
@@ -86,7 +88,7 @@ def calibration_of(
 
 
 class RatioPrior:
-    """Supplies ``prior``: P(inlier) from the distance ratio alone. Without `quality` the prior stays as it is."""
+    """Supplies ``prior``: P(inlier) from the distance ratio alone. Without `ratio` the prior stays as it is."""
 
     def __init__(self, *, calibration: Mapping[str, Mapping[str, float]]) -> None:
         self.calibration = Calibration(**calibration)

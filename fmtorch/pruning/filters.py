@@ -19,27 +19,30 @@ from fmtorch.jit.random import mix
 
 
 def ratio_test(
-    quality: Float[Tensor, "b n"], threshold: float = 0.8, mask: Bool[Tensor, "b n"] | None = None
+    ratio: Float[Tensor, "b n"], threshold: float = 0.8, mask: Bool[Tensor, "b n"] | None = None
 ) -> Bool[Tensor, "b n"]:
     """True where the ratio of the distances to the nearest and second nearest descriptor is below `threshold`.
 
     The ratio is of Euclidean, not squared, distances; a ratio that is NaN fails. Lowe, IJCV 2004, section 7.1.
     """
-    kept = quality < threshold
+    kept = ratio < threshold
     return kept if mask is None else kept & mask
 
 
 @dataclasses.dataclass(frozen=True)
 class RatioTest:
-    """`ratio_test` as a stage. Raises ValueError for correspondences without `quality`."""
+    """`ratio_test` of the ratios, or of 1 - score, as a stage. Raises ValueError where matches have neither."""
 
     threshold: Annotated[float, Within(0)] = 0.8
 
     def __call__(self, correspondences: Correspondences) -> Correspondences:
         """The same matches, of which only distinctive ones survive."""
-        if correspondences.quality is None:
-            raise ValueError("the ratio test needs `quality`: the nearest-neighbour distance ratio of each match")
-        return correspondences.keep(ratio_test(correspondences.quality, self.threshold))
+        ambiguity = correspondences.ambiguity
+        if ambiguity is None:
+            raise ValueError(
+                "the ratio test needs `ratio`, the nearest-neighbour distance ratio of each match, or `score`"
+            )
+        return correspondences.keep(ratio_test(ambiguity, self.threshold))
 
 
 # The mutual-nearest-neighbour check: on index lists, and as a stage
@@ -77,29 +80,29 @@ class MutualCheck:
 def one_to_one(
     x0: Float[Tensor, "b n 2"],
     x1: Float[Tensor, "b n 2"],
-    quality: Float[Tensor, "b n"],
+    ambiguity: Float[Tensor, "b n"],
     mask: Bool[Tensor, "b n"] | None = None,
 ) -> Bool[Tensor, "b n"]:
     """True for a match that is the best one at its location in image 0 and the best one at its location in image 1.
 
-    The best has the lowest `quality` (NaN is worst), ties by lowest index. Locations are the same when the coordinates
+    The best has the lowest `ambiguity` (NaN is worst), ties by lowest index. Locations are the same when coordinates
     are exactly equal, as those of one keypoint with several orientations are. The rule is symmetric in the images and
     independent of the order of the matches, ties apart. Matches with a non-finite coordinate are dropped. O(N).
     """
     mask = torch.ones_like(x0[..., 0], dtype=torch.bool) if mask is None else mask
     out = torch.empty(mask.shape, dtype=torch.bool)
-    return for_each_pair(one_to_one_kernel, (x0, x1, quality, mask), out=out, kind=torch.float64)
+    return for_each_pair(one_to_one_kernel, (x0, x1, ambiguity, mask), out=out, kind=torch.float64)
 
 
 @kernel
-def one_to_one_kernel(x0: F8x2, x1: F8x2, quality: F8x1, mask: B1x1, out: B1x1) -> None:
-    """`one_to_one` of x0, x1 (n, 2), quality, mask (n,) -> out (n,)."""
+def one_to_one_kernel(x0: F8x2, x1: F8x2, ambiguity: F8x1, mask: B1x1, out: B1x1) -> None:
+    """`one_to_one` of x0, x1 (n, 2), ambiguity, mask (n,) -> out (n,)."""
     n = len(mask)
     valid, rank = np.empty(n, np.bool_), vector(n)
     for i in range(n):
         finite = math.isfinite(x0[i, 0]) and math.isfinite(x0[i, 1])
         valid[i] = mask[i] and finite and math.isfinite(x1[i, 0]) and math.isfinite(x1[i, 1])
-        rank[i] = math.inf if math.isnan(quality[i]) else quality[i]
+        rank[i] = math.inf if math.isnan(ambiguity[i]) else ambiguity[i]
         out[i] = valid[i]
     _drop_all_but_the_best(x0, rank, valid, out)
     _drop_all_but_the_best(x1, rank, valid, out)
@@ -131,14 +134,15 @@ def _drop_all_but_the_best(x: Array, rank: Array, valid: Array, out: Array) -> N
 
 @dataclasses.dataclass(frozen=True)
 class OneToOne:
-    """`one_to_one` as a stage. Raises ValueError for correspondences without `quality`."""
+    """`one_to_one` as a stage. Raises ValueError for correspondences with neither `ratio` nor `score`."""
 
     def __call__(self, correspondences: Correspondences) -> Correspondences:
         """The same matches, of which at most one survives at each location of each image."""
         c = correspondences
-        if c.quality is None:
-            raise ValueError("one-to-one needs `quality`: the figure by which the best match of a location is chosen")
-        return c.keep(one_to_one(c.x0, c.x1, c.quality, c.mask))
+        ambiguity = c.ambiguity
+        if ambiguity is None:
+            raise ValueError("one-to-one needs `ratio` or `score`, by which the best match of a location is chosen")
+        return c.keep(one_to_one(c.x0, c.x1, ambiguity, c.mask))
 
 
 # Keeping the matches that are likely to be right

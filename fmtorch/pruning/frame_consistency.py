@@ -44,21 +44,21 @@ from fmtorch.pruning.neighbors import (
 class FramedMatches(NamedTuple):
     """The matches of one pair: points x0, x1 (n, 2), frames lafs0, lafs1 (n, 2, 3), pixels; which are real, mask (n,).
 
-    quality: (n,), empty where unknown.
+    ratio: (n,), empty where unknown.
     """
 
     x0: F4x2
     x1: F4x2
     lafs0: F4x3
     lafs1: F4x3
-    quality: F4x1
+    ratio: F4x1
     mask: B1x1
 
 
 @kernel
 def frame_agreement_kernel(matches: FramedMatches, out: F4x1) -> None:
     """`frame_consistency.frame_agreement` of n matches -> out (n,)."""
-    x0, x1, lafs0, lafs1, quality, mask = matches
+    x0, x1, lafs0, lafs1, ratio, mask = matches
     n, zero = len(mask), x0.dtype.type(0)
     rows, match = np.empty((10, n), x0.dtype), np.empty(n, np.int64)
     m = 0
@@ -72,8 +72,8 @@ def frame_agreement_kernel(matches: FramedMatches, out: F4x1) -> None:
         rows[6, m] = (lafs1[i, 1, 0] * d + lafs1[i, 1, 1] * -c) / determinant
         rows[7, m] = (lafs1[i, 1, 0] * -b + lafs1[i, 1, 1] * a) / determinant
         rows[8, m] = math.sqrt(abs(rows[4, m] * rows[7, m] - rows[5, m] * rows[6, m]))
-        rows[9, m] = max(WORST_RATIO32 - quality[i], MIN_VOTE32) if len(quality) else x0.dtype.type(1)
-        valid = mask[i] and not (len(quality) and math.isnan(quality[i]))
+        rows[9, m] = max(WORST_RATIO32 - ratio[i], MIN_VOTE32) if len(ratio) else x0.dtype.type(1)
+        valid = mask[i] and not (len(ratio) and math.isnan(ratio[i]))
         for k in range(10):
             valid = valid and math.isfinite(rows[k, m])
         match[m] = i
@@ -140,9 +140,9 @@ def frame_prior_kernel(matches: FramedMatches, numbers: F4x1, out: F4x1) -> None
     odds, floor, slope = numbers[0], numbers[1], numbers[2]
     frame_agreement_kernel(matches, out)
     for i in range(len(out)):
-        w, divisor = out[i] + floor, ONE32 + slope * matches.quality[i]
+        w, divisor = out[i] + floor, ONE32 + slope * matches.ratio[i]
         o = odds * w * w * w / (divisor * divisor)
-        out[i] = o / (ONE32 + o) if matches.mask[i] and math.isfinite(matches.quality[i]) else ONE32 - ONE32
+        out[i] = o / (ONE32 + o) if matches.mask[i] and math.isfinite(matches.ratio[i]) else ONE32 - ONE32
 
 
 def frame_agreement(
@@ -150,7 +150,7 @@ def frame_agreement(
     x1: Float[Tensor, "b n 2"],
     lafs0: Float[Tensor, "b n 2 3"],
     lafs1: Float[Tensor, "b n 2 3"],
-    quality: Float[Tensor, "b n"] | None,
+    ratio: Float[Tensor, "b n"] | None,
     mask: Bool[Tensor, "b n"],
 ) -> Float[Tensor, "b n"]:
     """The share of its neighbours' votes that agree with each match, in [0, 1]; zero where masked.
@@ -159,12 +159,12 @@ def frame_agreement(
     with s the scale change of S; the agreement is the mean of ``(1 + (e / TOLERANCE)^2 / 8)^-8`` over the neighbours in
     both images, weighted by votes. Computed in float32, on the CPU; differentiable in all but the mask.
     """
-    tensors, out = (x0, x1, lafs0, lafs1, quality, mask), torch.empty(mask.shape, dtype=torch.float32)
+    tensors, out = (x0, x1, lafs0, lafs1, ratio, mask), torch.empty(mask.shape, dtype=torch.float32)
     agreement = for_each_pair(frame_agreement_kernel, tensors, out=out, group=FramedMatches).to(x0.dtype)
-    if not gradient_wanted(x0, x1, lafs0, lafs1, quality):
+    if not gradient_wanted(x0, x1, lafs0, lafs1, ratio):
         return agreement
     maps, usable = usable_frame_maps(lafs0, lafs1, mask)
-    return with_gradient(agreement, x0, x1, maps, votes_of(quality, x0[..., 0]), usable)
+    return with_gradient(agreement, x0, x1, maps, votes_of(ratio, x0[..., 0]), usable)
 
 
 def frame_map(lafs0: Float[Tensor, "b n 2 3"], lafs1: Float[Tensor, "b n 2 3"]) -> Float[Tensor, "b n 2 2"]:
@@ -192,7 +192,7 @@ class FrameConsistency:
     """Supplies ``prior``: P(inlier) from the agreement of local affine frames and the ratio.
 
     The odds are ``odds (w + floor)^3 / (1 + slope ratio)^2`` with the agreement w: arithmetic alone, and a better fit
-    on the tuning scenes than a logistic model of ln(w) and the ratio. Where matches have no frames or no quality the
+    on the tuning scenes than a logistic model of ln(w) and the ratio. Where matches have no frames or no ratio the
     prior is left as it is. Linear memory: about 700 bytes a match.
     kernels: worth compiling together with those of an estimator.
     """
@@ -204,15 +204,16 @@ class FrameConsistency:
 
     def __call__(self, c: Correspondences) -> Correspondences:
         """The same matches with a prior; zero for one whose ratio is not finite."""
-        if c.lafs0 is None or c.lafs1 is None or c.quality is None:
+        ratio = c.ambiguity
+        if c.lafs0 is None or c.lafs1 is None or ratio is None:
             return c
-        matches = c.x0, c.x1, c.lafs0, c.lafs1, c.quality, c.mask
+        matches = c.x0, c.x1, c.lafs0, c.lafs1, ratio, c.mask
         numbers = np.array((self.odds, self.floor, self.slope), np.float32)
         out = torch.empty(c.mask.shape, dtype=torch.float32)
         prior = for_each_pair(frame_prior_kernel, matches, numbers, out=out, group=FramedMatches)
         if gradient_wanted(*matches):
-            w, known = frame_agreement(*matches), c.mask & torch.isfinite(c.quality)
-            ratio = torch.where(known, c.quality, 1)
+            w, known = frame_agreement(*matches), c.mask & torch.isfinite(ratio)
+            ratio = torch.where(known, ratio, 1)
             log_odds = 3 * w / (w + self.floor).detach() - 2 * ratio * (self.slope / (1 + self.slope * ratio)).detach()
             prior = prior + prior * (1 - prior) * (log_odds - log_odds.detach())  # adds zeros
         return c.derived(prior=prior.to(c.x0.dtype))

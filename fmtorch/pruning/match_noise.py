@@ -15,7 +15,7 @@ from fmtorch.core.types import Correspondences
 from fmtorch.geometry.arithmetic import sqrt
 from fmtorch.geometry.optimum import gradient_wanted
 from fmtorch.jit.batches import for_each_pair
-from fmtorch.jit.kernel import Array, B1x1, F4x1, F4x3, F8x1, F8x3, inner, kernel
+from fmtorch.jit.kernel import Array, F4x1, F4x3, F8x1, F8x3, inner, kernel
 
 MIN_AREA = 1e-12  # square pixels: keeps the gradient of the scale finite
 MIN_PRIOR = 0.02  # matches less likely than that are not taken for noisier
@@ -24,7 +24,7 @@ MIN_PRIOR = 0.02  # matches less likely than that are not taken for noisier
 def match_noise(
     lafs0: Float[Tensor, "b n 2 3"],
     lafs1: Float[Tensor, "b n 2 3"],
-    quality: Float[Tensor, "b n"] | None = None,
+    ratio: Float[Tensor, "b n"] | None = None,
     prior: Float[Tensor, "b n"] | None = None,
     mask: Bool[Tensor, "b n"] | None = None,
     *,
@@ -38,14 +38,16 @@ def match_noise(
     keypoint is located to a share of its size, and matches that are hard to tell apart, or that their neighbours
     contradict somewhat, are less exact. One where masked, and where a number is not finite. On the CPU.
     """
-    mask = torch.ones_like(lafs0[..., 0, 0], dtype=torch.bool) if mask is None else mask
     single = lafs0.dtype == torch.float32
     numbers = np.array((usual, radius, slope, MIN_AREA, MIN_PRIOR), np.float32 if single else np.float64)
-    tensors, out = (lafs0, lafs1, quality, prior, mask), torch.empty(mask.shape, dtype=lafs0.dtype)
+    tensors, out = (lafs0, lafs1, ratio, prior), torch.empty(lafs0.shape[:2], dtype=lafs0.dtype)
     noise = for_each_pair(_match_noise32 if single else _match_noise64, tensors, numbers, out=out, kind=out.dtype)
-    if not gradient_wanted(lafs0, lafs1, quality, prior):
+    if mask is not None:
+        noise = torch.where(mask, noise, 1)
+    if not gradient_wanted(lafs0, lafs1, ratio, prior):
         return noise
-    for x in (lafs0.flatten(2), lafs1.flatten(2), quality, prior):
+    mask = torch.ones_like(noise, dtype=torch.bool) if mask is None else mask
+    for x in (lafs0, lafs1, ratio, prior):
         mask = mask if x is None else mask & torch.isfinite(x.reshape(*mask.shape, -1)).all(-1)
     (a, b, _, c, d, _), (e, f, _, g, h, _) = (
         torch.where(mask[..., None], lafs.flatten(2), 0).unbind(-1) for lafs in (lafs0, lafs1)
@@ -53,8 +55,8 @@ def match_noise(
     area = torch.maximum((a * d - b * c).abs(), (e * h - f * g).abs()).clamp_min(MIN_AREA)
     size = sqrt(area.detach())
     logarithm = area / (2 * size * (radius + size))  # its derivative, as those that follow: of the noise's logarithm
-    if quality is not None:
-        ratio = torch.where(mask, quality, 1)
+    if ratio is not None:
+        ratio = torch.where(mask, ratio, 1)
         logarithm = logarithm + 2 * ratio * (slope / (1 + slope * ratio)).detach()
     if prior is not None:
         P = torch.where(mask, prior, 1).clamp_min(MIN_PRIOR)
@@ -63,32 +65,30 @@ def match_noise(
 
 
 @kernel
-def _match_noise32(lafs0: F4x3, lafs1: F4x3, quality: F4x1, prior: F4x1, mask: B1x1, numbers: F4x1, out: F4x1) -> None:
-    _noise_of_each(lafs0, lafs1, quality, prior, mask, numbers, out)
+def _match_noise32(lafs0: F4x3, lafs1: F4x3, ratio: F4x1, prior: F4x1, numbers: F4x1, out: F4x1) -> None:
+    _noise_of_each(lafs0, lafs1, ratio, prior, numbers, out)
 
 
 @kernel
-def _match_noise64(lafs0: F8x3, lafs1: F8x3, quality: F8x1, prior: F8x1, mask: B1x1, numbers: F8x1, out: F8x1) -> None:
-    _noise_of_each(lafs0, lafs1, quality, prior, mask, numbers, out)
+def _match_noise64(lafs0: F8x3, lafs1: F8x3, ratio: F8x1, prior: F8x1, numbers: F8x1, out: F8x1) -> None:
+    _noise_of_each(lafs0, lafs1, ratio, prior, numbers, out)
 
 
 @inner
-def _noise_of_each(
-    lafs0: Array, lafs1: Array, quality: Array, prior: Array, mask: Array, numbers: Array, out: Array
-) -> None:
-    """`match_noise` of n matches -> out (n,). quality, prior: (n,), empty where unknown.
+def _noise_of_each(lafs0: Array, lafs1: Array, ratio: Array, prior: Array, numbers: Array, out: Array) -> None:
+    """`match_noise` of n matches -> out (n,). ratio, prior: (n,), empty where unknown.
 
     numbers: usual, radius in pixels, slope, least area in square pixels, least prior.
     """
     usual, radius, slope, min_area, min_prior = numbers[0], numbers[1], numbers[2], numbers[3], numbers[4]
     whole = out.dtype.type(1)
-    for i in range(len(mask)):
+    for i in range(len(out)):
         size = max(_scale(lafs0, i, min_area), _scale(lafs1, i, min_area))
         noise = (whole + size / radius) / usual
-        valid = mask[i] and _finite(lafs0, i) and _finite(lafs1, i)
-        if len(quality):
-            valid = valid and math.isfinite(quality[i])
-            factor = whole + slope * quality[i]
+        valid = _finite(lafs0, i) and _finite(lafs1, i)
+        if len(ratio):
+            valid = valid and math.isfinite(ratio[i])
+            factor = whole + slope * ratio[i]
             noise *= factor * factor
         if len(prior):
             valid = valid and math.isfinite(prior[i])
@@ -131,4 +131,4 @@ class MatchNoise:
         if lafs0 is None or lafs1 is None:
             return c
         numbers = {"usual": self.usual, "radius": self.radius, "slope": self.slope}
-        return c.derived(noise=match_noise(lafs0, lafs1, c.quality, c.prior, c.mask, **numbers))
+        return c.derived(noise=match_noise(lafs0, lafs1, c.ambiguity, c.prior, c.mask, **numbers))

@@ -1,7 +1,5 @@
 """Rows, summaries and reports with configurations, warnings and the errors of focal lengths."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable
@@ -13,7 +11,7 @@ import torch
 from rich.console import Console
 
 from fmtorch import presets
-from fmtorch.core.types import CONFIGURATIONS, WARNINGS, Correspondences
+from fmtorch.core.types import PAIR_TYPES, WARNINGS, Correspondences
 from fmtorch.data import ImagePair, ImageSource
 from fmtorch.data.pairs import GivenMatches
 from fmtorch.evaluation import tables
@@ -26,7 +24,7 @@ from fmtorch.io.dataset import H5Pairs
 from fmtorch.pipeline.pipeline import Outcome, Pipeline, examined
 from fmtorch.runs import PairRow, to_table
 from tests.geometry.kinds import K, batch, draw
-from tests.storage.exchange import writers
+from tests.io import writers
 
 
 def unused(*_: object) -> None:
@@ -59,28 +57,26 @@ def rows(pairs: list[ImagePair], word: str | None) -> list[PairRow]:
 
 @pytest.mark.parametrize("word", [None, "known", "unknown"])
 def test_rows_say_which_configuration_and_neighbours_change_nothing(word: str | None) -> None:
-    pairs = [pair(kind, 150 + 10 * i) for i, kind in enumerate(CONFIGURATIONS)]
+    pairs = [pair(kind, 150 + 10 * i) for i, kind in enumerate(PAIR_TYPES)]
     lost = dataclasses.replace(pairs[0], identity="lost", problem="no image")
     together = rows([*pairs, lost], word)
-    assert [row.configuration for row in together] == [*CONFIGURATIONS, None]
-    assert [row.warning for row in together] == [*(WARNINGS[kind] for kind in CONFIGURATIONS), None]
+    assert [row.pair_type for row in together] == [*PAIR_TYPES, None]
+    assert [row.warning for row in together] == [*(WARNINGS[kind] for kind in PAIR_TYPES), None]
     for each, row in zip(pairs, together, strict=False):
         (alone,) = rows([each], word)
-        assert (alone.F, alone.configuration) == (row.F, row.configuration)
+        assert (alone.F, alone.pair_type) == (row.F, row.pair_type)
         assert alone.focal_log_ratio0 == row.focal_log_ratio0
 
 
 def test_a_pair_that_cannot_be_examined_harms_no_other() -> None:
     built = pipeline()
     outcomes = built.run([pair("general"), pair("planar")])
-    assert outcomes[0].estimate is not None
     broken = dataclasses.replace(outcomes[0], estimate=outcomes[0].estimate.replace(model="homography"))
     results = examined(built, [broken, outcomes[1]])
-    assert [o.configuration is None for o in results] == [True, False]
+    assert [o.pair_type is None for o in results] == [True, False]
     first, second = evaluate([dataclasses.replace(results[0], estimate=outcomes[0].estimate), results[1]])
-    assert first.warning is not None
     assert first.warning.startswith("not examined: ValueError: estimate is of homography matrices")
-    assert second.configuration == "planar"
+    assert second.pair_type == "planar"
 
 
 def test_calibrations_count_only_where_the_estimator_was_given_them() -> None:
@@ -88,7 +84,6 @@ def test_calibrations_count_only_where_the_estimator_was_given_them() -> None:
     long = np.diag([8.0, 8.0, 1.0]) @ K
     long[:2, 2] = K[:2, 2]
     turned = pair("rotation")
-    assert turned.matches is not None
     c, _ = turned.matches()
     angle = 0.05
     R = np.array([[math.cos(angle), 0, math.sin(angle)], [0, 1, 0], [-math.sin(angle), 0, math.cos(angle)]])
@@ -97,14 +92,13 @@ def test_calibrations_count_only_where_the_estimator_was_given_them() -> None:
     x = torch.cat([c.x0.double(), torch.ones(1, c.mask.shape[1], 1, dtype=torch.float64)], -1) @ H.T
     x1 = (x[..., :2] / x[..., 2:] + torch.randn(x[..., :2].shape, generator=torch.Generator().manual_seed(0))).to(c.x1)
     turned = dataclasses.replace(turned, K0=long, K1=long, matches=given(c.replace(x1=x1)))
-    assert rows([turned], "known")[0].configuration == "rotation"
-    assert rows([turned], None)[0].configuration in ("planar", "rotation")  # by the usual focal lengths alone
+    assert rows([turned], "known")[0].pair_type == "rotation"
+    assert rows([turned], None)[0].pair_type in ("planar", "rotation")  # by the usual focal lengths alone
 
 
 def estimated(c: Correspondences, focals: list[float], true: tuple[np.ndarray | None, np.ndarray | None]) -> Outcome:
     source = pair("general")
     outcome = pipeline().run([source])[0]
-    assert outcome.estimate is not None
     estimate = outcome.estimate.replace(focals=torch.tensor([focals], dtype=torch.float64))
     return dataclasses.replace(
         outcome, pair=dataclasses.replace(source, K0=true[0], K1=true[1]), correspondences=c, estimate=estimate
@@ -114,7 +108,6 @@ def estimated(c: Correspondences, focals: list[float], true: tuple[np.ndarray | 
 def test_errors_of_focal_lengths() -> None:
     """Known answers: 10 % too long, not determined, given exactly, without truth, of pixels that are not square."""
     source = pair("general")
-    assert source.matches is not None
     c, _ = source.matches()
     asked = c.replace(focal=torch.tensor([[[1.0, torch.inf], [1.0, torch.inf]]], dtype=torch.float64))
     focals = focal_errors(estimated(asked, [1.1 * 768, math.nan], (K, K)))
@@ -133,7 +126,6 @@ def test_figures_of_focal_lengths() -> None:
     errors = np.array([[0.02, 0.08], [0.3, np.inf], [np.nan, np.nan], [np.nan, np.nan]])
     ratios = np.log(np.array([[1.02, 0.92], [1.3, np.nan], [np.nan, np.nan], [np.nan, np.nan]]))
     figures = focal_figures(errors, ratios, np.array([True, True, True, False]))
-    assert figures is not None
     assert figures["images"] == 6  # two of a failed pair
     assert figures["error"] is None  # more than half are misses
     assert (figures["within_5"], figures["within_10"]) == (1 / 6, 2 / 6)
@@ -145,7 +137,7 @@ def test_summaries_and_reports_show_them() -> None:
     pairs = [pair(kind) for kind in ("general", "planar")]
     table = to_table(rows(pairs, "unknown"))
     summary = summarize(table)
-    assert summary["all"]["configurations"] == {**dict.fromkeys(CONFIGURATIONS, 0), "general": 1, "planar": 1}
+    assert summary["all"]["pair_types"] == {**dict.fromkeys(PAIR_TYPES, 0), "general": 1, "planar": 1}
     assert summary["all"]["focals"]["images"] == 4
     console = Console(width=80, record=True)
     for each in terminal_tables(summary, "t")[1:]:
@@ -157,10 +149,10 @@ def test_summaries_and_reports_show_them() -> None:
     assert "| family | 1 | 1 | 0 | 0 | 0 |" in page
     assert "folded" in page
     of_report = {each.heading: each for each in tables.report_tables({"run": table}, {"run": summary})}
-    assert [cell.text for cell in of_report["Configurations"].rows["run"]] == ["1", "1", "0", "0", "0"]
+    assert [cell.text for cell in of_report["Pair types"].rows["run"]] == ["1", "1", "0", "0", "0"]
     assert of_report["Focal lengths"].rows["run"][0].text == "4"
-    nobody = to_table([dataclasses.replace(row, configuration=None) for row in rows(pairs[:1], None)])
-    assert "Configurations" not in {part.heading for part in tables.parts(summarize(nobody))}
+    nobody = to_table([dataclasses.replace(row, pair_type=None) for row in rows(pairs[:1], None)])
+    assert "Pair types" not in {part.heading for part in tables.parts(summarize(nobody))}
     alone = terminal_tables(summarize(to_table(rows(pairs[:1], None))), "t")
     assert [each.title for each in alone] == ["t", "Relative pose"]  # all general: nothing to say
 
@@ -177,7 +169,7 @@ def test_layouts_with_cameras_give_them_to_the_estimator(layout: str, tmp_path: 
         assert row.pose_reason is None
         assert row.rotation_error is not None
         assert row.rotation_error < 1
-        assert row.configuration == "general"
+        assert row.pair_type == "general"
         assert row.focal_error0 is row.focal_error1 is None  # which were given exactly
         F, true = np.array(row.F), each.F.ravel()
         assert min(np.abs(F - true).max(), np.abs(F + true).max()) < 0.05

@@ -1,7 +1,5 @@
 """Stages of many small operations compute with one thread, whatever torch may use, and leave that as it was."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -19,8 +17,9 @@ from fmtorch.jobs.execution import Execution
 from fmtorch.jobs.threads import available, mapped, one_thread
 from fmtorch.matching import nearest
 from fmtorch.pruning import position_consistency as consistency
+from tests.helpers import draw, pair
+from tests.helpers import small_pipeline as pipeline
 from tests.laws import degenerate, scene
-from tests.pipeline.test_pipeline import draw, pair, pipeline
 
 
 @pytest.fixture
@@ -139,7 +138,7 @@ def test_a_batch_in_threads_has_the_bits_of_one_thread(threads: int, graph: bool
             e.F.square()[:, 0, 1].sum().backward()
         results.append((e, x0.grad))
     (threaded, gradient), (single, expected) = results
-    for name in ("F", "inliers", "ok", "draws", "significance"):
+    for name in ("F", "inliers", "ok", "samples", "significance"):
         assert torch.equal(getattr(threaded, name), getattr(single, name)), name
     assert threaded.reason == single.reason
     if graph:

@@ -14,7 +14,7 @@ from fmtorch import presets
 from fmtorch.core.types import Features
 from fmtorch.matching.lightglue import LightGlue
 from fmtorch.pipeline.pipeline import Pipeline
-from tests.pipeline.test_pipeline import draw, pair
+from tests.helpers import draw, pair
 
 
 def matcher(threshold: float = -1.0) -> LightGlue:
@@ -46,8 +46,7 @@ def test_equals_kornias_matcher() -> None:
     assert c.prior is not None
     assert torch.equal(c.prior[0], scores[:, 0])
     assert ((c.prior >= 0) & (c.prior <= 1)).all()
-    assert c.quality is not None
-    assert torch.equal(c.quality, 1 - c.prior)
+    assert torch.equal(c.score, c.prior)
     assert c.mask.all()
     assert c.size0 is not None
     assert c.size0.tolist() == [[100, 400]]

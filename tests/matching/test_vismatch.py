@@ -18,8 +18,8 @@ from fmtorch.matching.vismatch import VisMatch
 from fmtorch.pipeline.build import load_pipeline
 from fmtorch.pipeline.pipeline import Pipeline
 from tests.data import lists
+from tests.helpers import compose, draw, pair
 from tests.matching import stand_in
-from tests.pipeline.test_pipeline import draw, pair
 
 
 @pytest.fixture(autouse=True)
@@ -40,8 +40,8 @@ def test_points_and_confidences_are_the_matchers(tmp_path: Path) -> None:
     for x, known in zip((c.x0, c.x1), keypoints, strict=True):
         assert {tuple(point) for point in x[0].tolist()} <= {tuple(np.float32(p).tolist()) for p in known}
     assert ((c.x0 - c.x1)[0, :, 0] - 12).abs().median() < 0.5
-    assert c.quality is not None
-    assert ((c.quality >= 0) & (c.quality < 0.75)).all()  # the ratio that the stand-in calls 1 - confidence
+    assert c.score is not None
+    assert ((c.score > 0.25) & (c.score <= 1)).all()  # the ratio that the stand-in calls 1 - confidence
     assert c.size0 is not None
     assert c.size0.tolist() == [[240, 320]]
     assert c.noise is None
@@ -156,7 +156,6 @@ def test_what_cannot_be_loaded_is_one_line(monkeypatch: pytest.MonkeyPatch) -> N
 
 def test_the_command_evaluates_it(tmp_path: Path) -> None:
     from fmtorch.commands.eval import run
-    from tests.helpers import compose
 
     file = lists.write(tmp_path / "list.txt", [lists.superglue(1, 5), lists.superglue(0, 2)])
     words = (
@@ -173,7 +172,6 @@ def test_the_command_evaluates_it(tmp_path: Path) -> None:
 
 def test_a_folder_is_refused(tmp_path: Path) -> None:
     from fmtorch.commands.match import run
-    from tests.helpers import compose
 
     for i in (0, 1):
         draw(tmp_path / f"{i}.png", i)

@@ -1,7 +1,5 @@
 """`LabelledMatches`: shapes, masks, collation; labels against a scalar reference, and known answers on a plane."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 
@@ -63,7 +61,7 @@ class Wall:
 
 def test_masked_slots_have_no_label_and_labels_move_with_their_matches() -> None:
     m = exact(pairs=3)
-    kept = m.keep(m.correspondences.quality < 0.6)
+    kept = m.keep(m.correspondences.ratio < 0.6)
     outside = ~kept.correspondences.mask
     assert (kept.label[outside] == -1).all()
     assert not kept.inlier[outside].any()
