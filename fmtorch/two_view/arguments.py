@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from torch import Tensor
 
+from fmtorch.core.annotations import Rule
 from fmtorch.core.checks import MIN_MATCHES, as_tensor, expect_inside, widened
 from fmtorch.core.options import nearest
 from fmtorch.core.types import Correspondences, collate
@@ -30,6 +31,11 @@ PER_MATCH = {name: len(Correspondences.declared[name].shape) - 1 for name in Cor
 """The dimensions of what has an entry for each match, of one pair."""
 FORMS = "None, 'unknown', 'shared', (px, deviation) or ((px, deviation), (px, deviation))"
 FORMS_WITH_K = "None, 'unknown', 'shared', or the relative deviations of the focal lengths of K: one, two, or (B, 2)"
+RATIO = Rule(
+    lambda ratio: ~((ratio < 0) | (ratio > 1 + 1e-6)),
+    "it is the distance of the nearest descriptor over that of the second nearest, within [0, 1]. Of raw distances, such "
+    "as DMatch.distance, give none, or `ratio` their quotients; `score` is a confidence in [0, 1], larger is better",
+)
 UNKNOWN = (1.0, math.inf)  # px, relative deviation
 MIN_PIXELS = 10.0  # a photograph's points reach farther from its first pixel
 FOCAL_NAMES = ("shared", "unknown")
@@ -69,7 +75,7 @@ def expect_plausible(c: Correspondences, plane: bool = False) -> None:
     plane: x0 may be in the unit of a plane.
     """
     _expect_calibrations(c)
-    expect_values(c)
+    expect_values(c, ratio=RATIO)
     _expect_pixels(c, plane)
 
 
@@ -186,9 +192,12 @@ def _one_of_list(i: int, x0: Any, x1: Any, fields: Mapping[str, Any]) -> Corresp
         raise type(error)(f"pair {i}: {error}") from error
 
 
-def expect_values(c: Correspondences) -> None:
-    """Raises ValueError naming the first wrong value of the real matches of a batch; a GPU is asked but once."""
-    rules = {name: field.bounds for name, field in c.declared.items() if field.bounds}
+def expect_values(c: Correspondences, **more: Rule) -> None:
+    """Raises ValueError naming the first wrong value of the real matches of a batch; a GPU is asked but once.
+
+    more: rules beside those of the fields.
+    """
+    rules = {name: field.bounds for name, field in c.declared.items() if field.bounds} | more
     wrong = {
         name: ~rule.holds(value.detach()) & (c.mask if name in PER_MATCH else True)
         for name, rule in rules.items()

@@ -105,6 +105,18 @@ def test_masked_complex_and_boolean_points_are_refused() -> None:
         fmtorch.find_fundamental(x0 > 0, x1)
 
 
+def test_raw_distances_are_no_ratios() -> None:
+    """They were taken for ratios, and an easy pair had a wrong F or none; a score beyond 1 is refused by its name."""
+    distances = np.where(SCENE.right, 120.0, 310.0)
+    with pytest.raises(
+        ValueError, match=r"^ratio of match 0 of pair 0 is .*within \[0, 1\]\. Of raw distances.*`score`"
+    ):
+        fmtorch.find_fundamental(SCENE.x0, SCENE.x1, ratio=distances)
+    with pytest.raises(ValueError, match="^score of match 0 of pair 0 is 310"):
+        fmtorch.find_fundamental(SCENE.x0, SCENE.x1, score=np.flip(np.sort(distances)))
+    assert bool(fmtorch.find_fundamental(SCENE.x0, SCENE.x1, ratio=distances / 310, **EASY).ok)
+
+
 def test_a_list_of_single_points_is_one_pair() -> None:
     """As `list(points)` of OpenCV's (n, 1, 2) is; the other points may come in another form."""
     listed = [list(x[:, None]) for x in (SCENE.x0, SCENE.x1)]
