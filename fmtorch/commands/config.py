@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import functools
+import pdb
 import re
 import sys
+import traceback
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
@@ -21,9 +23,10 @@ from omegaconf import DictConfig
 from omegaconf.errors import GrammarParseError, OmegaConfBaseException
 
 from fmtorch.commands.options import COMMANDS, Command
+from fmtorch.core.failures import own_traceback
 from fmtorch.core.files import STAGES, conf_dir
 from fmtorch.core.options import nearest
-from fmtorch.core.terminal import MISTAKES, error_line, exits_with_message
+from fmtorch.core.terminal import MISTAKES, error_line, errors, exits_with_message
 from fmtorch.presets import available
 from fmtorch.presets.composition import path_fields, with_explicit
 from fmtorch.presets.files import groups
@@ -58,12 +61,26 @@ def job(task: Task) -> Task:
         try:
             _expect_known(HydraConfig.get().overrides.task)
             task(with_explicit(config, HydraConfig.get().overrides.task))
-        except MISTAKES as error:
+        except Exception as error:
+            if config.get("debug"):
+                _debugged(error, config.debug == "pdb")
+            if trace := own_traceback(error):
+                errors.print(trace, markup=False, highlight=False, soft_wrap=True)
+            if not (trace or isinstance(error, MISTAKES)):
+                raise
             if HydraConfig.get().mode == RunMode.MULTIRUN:
                 raise Mistake(error_line(error)) from None
             sys.exit(f"error: {error_line(error)}")
 
     return wrapped
+
+
+def _debugged(error: Exception, interactive: bool) -> None:
+    """Show all of a traceback, and what it leads to in the debugger if wanted; ends the command."""
+    traceback.print_exception(error)
+    if interactive:
+        pdb.post_mortem(error.__traceback__)
+    sys.exit(1)
 
 
 def chosen_pipeline() -> tuple[str, list[str]]:

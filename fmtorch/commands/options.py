@@ -18,6 +18,8 @@ from fmtorch.training.options import TrainOptions
 CACHE = "folder of features computed before; null: features in $FMTORCH_CACHE or ~/.cache/fmtorch; off: none"
 CACHE_LIMIT = "GB, beyond which the least recently used features go; null: no bound"
 DEVICE = "auto | cpu | cuda | cuda:1 | mps"
+DEBUG = "true: stop at the first error of a part and show all of its traceback; pdb: and look at it in the debugger"
+Debug = bool | Literal["pdb"]
 REPLACED = "Groups are replaced by name (estimator=lmeds), values by path (estimator.threshold=0.5)."
 
 
@@ -67,6 +69,7 @@ class EvalOptions:
         None,
         "h5, colmap or both, with a comma: hloc's files, a COLMAP database, in the run folder (docs/exchange.md)",
     )
+    debug: Debug = option(False, f"{DEBUG}. One worker")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -110,6 +113,7 @@ class MatchOptions:
     device: Device = option("auto", DEVICE)
     cache: Cache = option(None, CACHE)
     cache_limit: Gigabytes | None = option(20, CACHE_LIMIT)
+    debug: Debug = option(False, DEBUG)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -238,13 +238,15 @@ class Batch:
 class Work:
     """The rows of a batch.
 
-    computed, from_cache: images whose features a process computed or took from the cache for it.
+    computed, from_cache: images whose features a process computed or took from the cache for it. tracebacks: of
+    `Pipeline.tracebacks`.
     """
 
     rows: list[PairRow]
     computed: int = 0
     from_cache: int = 0
     records: MatchRecords | None = None
+    tracebacks: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
 
 def evaluate_batch(pipeline: Pipeline, batch: Batch) -> Work:
@@ -263,7 +265,7 @@ def evaluate_batch(pipeline: Pipeline, batch: Batch) -> Work:
         for key in batch.cameras:
             pipeline.estimator.cameras.pop(key, None)
     counts = (cache.computed - computed, cache.found - from_cache) if cache else (0, 0)
-    return Work(rows, *counts, records)
+    return Work(rows, *counts, records, dict(pipeline.tracebacks))
 
 
 def divided(batch: Batch) -> list[Batch]:
@@ -373,6 +375,7 @@ def evaluate_pairs(
         if journal is not None and work.records is not None:
             journal.add(work.records)
         store(work.rows)
+        pipeline.tracebacks |= work.tracebacks
         if isinstance(pipeline.extractor, CachedFeatures):
             pipeline.extractor.computed += work.computed
             pipeline.extractor.found += work.from_cache

@@ -18,12 +18,11 @@ from torch import Tensor
 from fmtorch import presets
 from fmtorch.core.grey_pyramid import GreyPyramid, grey_pyramid
 from fmtorch.core.no_features import NoFeatures
-from fmtorch.core.stages import ImageMatcher, PairImages, pruned
+from fmtorch.core.stages import ImageMatcher, PairImages, output_of, pruned
 from fmtorch.core.types import RELATED, Correspondences, Estimate, Features
 from fmtorch.data.cameras import Lens
 from fmtorch.data.images import to_grey
 from fmtorch.geometry.pair_type import GENERAL, IDENTICAL, PLANAR, ROTATION
-from fmtorch.geometry.significance import judged
 from fmtorch.io.match_store import Kind, PairGeometry
 from fmtorch.jobs.execution import mapped, one_thread
 from fmtorch.pipeline.photographs import (
@@ -331,7 +330,7 @@ def _matched(pipeline: Pipeline, described: Sequence[Described], clock: Clock) -
         reason = reason if putative is None else "the matcher finds no matches"
         return dataclasses.replace(nothing_found, reason=reason, seconds=clock.seconds)
     if putative is None:
-        putative = pipeline.matcher(features0, features1)
+        putative = pipeline.matched(features0, features1)
     c = putative
     clock("matching")
     counts = {"matching": int(c.count())}
@@ -351,7 +350,8 @@ def _of_images(pipeline: Pipeline, described: Sequence[Described]) -> Correspond
     image0, image1 = (each.image for each in described)
     if not isinstance(pipeline.matcher, ImageMatcher) or image0 is None or image1 is None:
         return None
-    return pipeline.matcher.match_images(image0, image1).to(pipeline.device)
+    matches = pipeline.matcher.match_images(image0, image1)
+    return output_of(pipeline.matcher, matches, Correspondences).to(pipeline.device)
 
 
 def _estimated(
@@ -359,7 +359,7 @@ def _estimated(
 ) -> MatchResult:
     """The result with an estimate. c: the matches as pinholes have them, with what is known of the cameras."""
     estimator = KnownCameras(pipeline.estimator) if c.asks_for_cameras else pipeline.estimator
-    estimate: Estimate = judged(estimator(c, seed).detach(), c)
+    estimate = pipeline.estimated(c, seed, estimator)
     clock("estimation")
     even, F, even_scales = evenly_reduced(c, estimate.F, scales)
     pair_type = classify(even, estimate.derived(F=F), seed=seed)

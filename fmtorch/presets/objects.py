@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 
 import torch
 
+from fmtorch.core.failures import own_traceback
 from fmtorch.core.options import expect_options
 from fmtorch.presets.files import load, targets_of
 
@@ -69,7 +70,12 @@ def _constructed(make: Callable[..., T], config: Mapping[str, Any], where: str, 
         str(key): _constructed(target_of(value, place), value, place, {}) if _is_object(value) else value
         for key, value, place in ((key, value, f"{where}.{key}") for key, value in config.items() if key != "_target_")
     }
-    return make(**built, **extra)
+    try:
+        return make(**built, **extra)
+    except Exception as error:
+        if own_traceback(error) and not isinstance(error, ValueError | TypeError | OSError | ImportError):
+            raise ValueError(f"{where}: {type(error).__name__}: {error}") from error
+        raise
 
 
 def _is_object(value: object) -> bool:

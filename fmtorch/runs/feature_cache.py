@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from fmtorch.core.files import cache_dir, replacing
-from fmtorch.core.stages import FeatureExtractor, TwoStepExtractor
+from fmtorch.core.stages import FeatureExtractor, TwoStepExtractor, output_of
 from fmtorch.core.types import Features
 from fmtorch.runs.fingerprint import configuration, environment
 from fmtorch.runs.run_folder import identity_digest
@@ -182,7 +182,10 @@ class CachedFeatures:
             steps = [frames, described]
             size = {"image_size": torch.tensor(image.shape[:2], dtype=torch.int64)}
         else:
-            steps, size = [self._kept(self._extraction, digest, lambda: _fields(extractor(image)))], {}
+            whole = self._kept(
+                self._extraction, digest, lambda: _fields(output_of(extractor, extractor(image), Features))
+            )
+            steps, size = [whole], {}
         with self._lock:
             computed = any(step.computed for step in steps)
             self.computed, self.found = self.computed + computed, self.found + (not computed)

@@ -20,12 +20,12 @@ from typing import Any, NamedTuple
 import cv2
 import torch
 
+from fmtorch.core.failures import INSTALLED
+from fmtorch.core.files import PACKAGE
 from fmtorch.core.version import __version__
 
-PACKAGE = Path(__file__).resolve().parents[1]
 DIGITS = 12  # of a commit or digest that a version shows
 GIT_SECONDS = 10  # after which git is taken for absent
-INSTALLED = ("site-packages", "dist-packages")  # folders of other people's code: its imports are not followed
 
 
 @functools.cache
