@@ -33,8 +33,8 @@ FORMS = "None, 'unknown', 'shared', (px, deviation) or ((px, deviation), (px, de
 FORMS_WITH_K = "None, 'unknown', 'shared', or the relative deviations of the focal lengths of K: one, two, or (B, 2)"
 RATIO = Rule(
     lambda ratio: ~((ratio < 0) | (ratio > 1 + 1e-6)),
-    "it is the distance of the nearest descriptor over that of the second nearest, within [0, 1]. Of raw distances, such "
-    "as DMatch.distance, give none, or `ratio` their quotients; `score` is a confidence in [0, 1], larger is better",
+    "it is the distance of the nearest descriptor over that of the second nearest, within [0, 1]. Of raw distances, "
+    "such as DMatch.distance, give none, or as `ratio` quotients; `score` is a confidence in [0, 1], larger is better",
 )
 UNKNOWN = (1.0, math.inf)  # px, relative deviation
 MIN_PIXELS = 10.0  # a photograph's points reach farther from its first pixel

@@ -112,7 +112,7 @@ def test_raw_distances_are_no_ratios() -> None:
         ValueError, match=r"^ratio of match 0 of pair 0 is .*within \[0, 1\]\. Of raw distances.*`score`"
     ):
         fmtorch.find_fundamental(SCENE.x0, SCENE.x1, ratio=distances)
-    with pytest.raises(ValueError, match="^score of match 0 of pair 0 is 310"):
+    with pytest.raises(ValueError, match=r"^score of match 0 of pair 0 is 310"):
         fmtorch.find_fundamental(SCENE.x0, SCENE.x1, score=np.flip(np.sort(distances)))
     assert bool(fmtorch.find_fundamental(SCENE.x0, SCENE.x1, ratio=distances / 310, **EASY).ok)
 
