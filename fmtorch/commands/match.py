@@ -70,6 +70,8 @@ def match_folder(
     folder = fields.images
     assert folder is not None
     kinds = export_kinds(fields.export)
+    if fields.camera == "shared" and "colmap" not in kinds:
+        raise ValueError("camera=shared needs export=colmap; cameras=shared is what is known of the photographs")
     images = images_below(folder)
     similar = count_of(fields.pairs, SIMILAR)
     pairs = [] if similar else chosen_pairs(folder, images, fields.pairs)
@@ -237,6 +239,10 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
         if fields.image0 is not None or fields.image1 is not None or fields.truth is not None:
             raise ValueError("images takes a folder; image0, image1 and truth are of a single pair")
         return match_folder(config, fields, PhotographCameras(fields.cameras, fields.K), pipeline_name, overrides)
+    if fields.camera != "per_image":
+        raise ValueError(
+            f"camera is of a folder's database; cameras={fields.camera} is what is known of two photographs"
+        )
     if fields.export is not None or str(fields.pairs or EXHAUSTIVE) != EXHAUSTIVE:
         raise ValueError("export and pairs are of a folder of images: give images=FOLDER")
     paths = [_given(fields.image0, "image0"), _given(fields.image1, "image1")]

@@ -40,6 +40,13 @@ def run(config: DictConfig, estimator: str) -> Verification:
         errors.print(problem, style="bold", markup=False, highlight=False, soft_wrap=True)
     if len(result.problems) > MAX_PROBLEMS:
         errors.print(f"and {len(result.problems) - MAX_PROBLEMS} more", highlight=False)
+    for warning in result.warnings[:MAX_PROBLEMS]:
+        errors.print(f"warning: {warning}", markup=False, highlight=False, soft_wrap=True)
+    if result.kept == result.pairs and not result.configurations:
+        said = (
+            f"nothing to do: {result.path} has a geometry of each of {result.pairs:,} pairs; force=true replaces them"
+        )
+        console.print(said, markup=False, highlight=False, soft_wrap=True)
     console.print(_table(result))
     console.print(str(result.path), style="dim", highlight=False)
     return result

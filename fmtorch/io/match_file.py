@@ -8,16 +8,13 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from fmtorch.core.files import replacing
 from fmtorch.data.files import DataError
-from fmtorch.geometry.cameras import calibration_problems
 from fmtorch.io import h5
 from fmtorch.io.colmap import DatabaseImage
-from fmtorch.io.match_store import PairGeometry
-from fmtorch.io.predictions import size_by_centre
+from fmtorch.io.match_store import PairGeometry, geometry_texts
 
 MEMORY = 256  # images whose keypoints are kept
 NO_MATCH = -1
@@ -60,6 +57,11 @@ class HlocMatches:
     def has_geometry(self, pair: Names) -> bool:
         return False
 
+    def finished(self) -> int:
+        """How many pairs the output has, if it has all of them; else 0."""
+        with h5.opened(self._output) as written:
+            return len(self._keys) if all(h5.holds(written, key) for key in self._keys.values()) else 0
+
     def matches(self, pair: Names) -> NDArray[np.int64]:
         """The matches of a pair, keypoints (n, 2). Raises DataError where there are no such keypoints."""
         second = self._second(pair)
@@ -90,6 +92,9 @@ class HlocMatches:
     def _named(self, key: str) -> Names:
         """The names of a pair's images; of an image without features that in the key."""
         first, _, second = key.rpartition("/")
+        if not first:  # an older hloc joins names by _, which may also stand in them
+            ends = ((key[:i], key[i + 1 :]) for i, sign in enumerate(key) if sign == "_")
+            first, second = next((both for both in ends if self._stored.keys() >= set(both)), (first, second))
         return self._stored.get(first, first), self._stored.get(second, second)
 
     def _second(self, pair: Names) -> NDArray[np.int64]:
@@ -110,8 +115,8 @@ class HlocMatches:
 
 
 def write_geometry(group: Any, geometry: PairGeometry) -> None:
-    """The configuration and the matrices of a pair as attributes of its group."""
-    group.attrs["configuration"] = geometry.kind
+    """Words and matrices of a pair as attributes of its group."""
+    group.attrs.update(geometry_texts(geometry))
     for name in ("F", "E", "H", "R", "t"):
         value = getattr(geometry, name)
         if value is not None:
@@ -192,6 +197,12 @@ class MatchFile:
     def has_geometry(self, pair: Ids) -> bool:
         return False
 
+    def finished(self) -> int:
+        """How many pairs the output has, if it has all of them; else 0."""
+        with _arrays(self._output) as written:
+            keys = set(written.keys())
+        return len(self._pairs) if all(f"{pair}inliers" in keys for pair in self._pairs) else 0
+
     def matches(self, pair: Ids) -> NDArray[np.int64]:
         """Point i with point i. Raises DataError where x0 and x1 have different lengths."""
         counts = [len(self.image(side).points) for side in pair]
@@ -200,6 +211,7 @@ class MatchFile:
         return np.repeat(np.arange(counts[0])[:, None], 2, 1)
 
     def write(self, geometries: Iterable[tuple[Ids, PairGeometry]]) -> None:
+        """Write the file: which matches are inliers, configuration, reason, warning and matrices."""
         with replacing(self._output) as temporary:
             entries = (self._entries(*pair) for pair in geometries)
             (_write_npz if self._output.suffix == NPZ else _write_h5)(temporary, entries)
@@ -210,7 +222,8 @@ class MatchFile:
         inliers[geometry.inliers[:, 0]] = True
         values = ((name, getattr(geometry, name)) for name in MATRICES)
         matrices = {f"{pair}{name}": value for name, value in values if value is not None}
-        return {f"{pair}inliers": inliers, f"{pair}configuration": np.array(geometry.kind), **matrices}
+        texts = {f"{pair}{name}": np.array(value) for name, value in geometry_texts(geometry).items()}
+        return {f"{pair}inliers": inliers, **texts, **matrices}
 
     def name(self, image_id: str) -> str:
         return image_id
@@ -222,9 +235,7 @@ class MatchFile:
             self._numbers(f"{pair}{key}", shape) if f"{pair}{key}" in self._keys else None
             for key, shape in ((f"K{i}", (3, 3)), (f"size{i}", (2,)))
         )
-        if K is not None and (problem := calibration_problems(torch.from_numpy(K)[None], None, f"K{i}")[0]):
-            raise DataError(problem)
-        known = size_by_centre(K) if size is None and K is not None else None
+        known = None
         if size is not None:
             if not (np.isfinite(size).all() and (size >= 1).all()):
                 raise DataError(f"size{i} is {size.tolist()}; it must be the height and width of the image")
@@ -315,4 +326,4 @@ def _write_h5(path: Path, pairs: Iterable[Mapping[str, NDArray[Any]]]) -> None:
                 if name == "inliers":
                     group[name] = value
                 else:
-                    group.attrs[name] = str(value) if name == "configuration" else value
+                    group.attrs[name] = value if name in MATRICES else str(value)

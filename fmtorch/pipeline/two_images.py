@@ -28,7 +28,14 @@ from fmtorch.pipeline.photographs import Image, frames_to_original, to_original
 from fmtorch.pipeline.pipeline import Clock, Pipeline, load_pipeline
 from fmtorch.two_view.arguments import Arrays, Focal, camera_fields
 from fmtorch.two_view.known_cameras import KnownCameras
-from fmtorch.two_view.pair_type import FOCAL_DEVIATION, PairTypes, classify, compile_with, still_warning
+from fmtorch.two_view.pair_type import (
+    FOCAL_DEVIATION,
+    PairTypes,
+    classify,
+    compile_with,
+    still_warning,
+    warnings_of,
+)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -142,6 +149,7 @@ def pair_geometries(
         pair_type: of `classify`.
     """
     calibrated = _calibrated(c, estimate)
+    said = [*zip(estimate.reason, warnings_of(estimate, pair_type), strict=True)]
     kind, homography = pair_type.kind, pair_type.homography
     kinds = torch.where(kind != GENERAL, kind, torch.where(estimate.related, GENERAL, -1)).tolist()
     results = []
@@ -160,7 +168,7 @@ def pair_geometries(
             results.append(PairGeometry("panoramic", inliers, H=H, R=R, t=np.zeros(3)))
         else:
             results.append(PairGeometry(KINDS[what], inliers, H=H))
-    return results
+    return [geometry._replace(reason=why, warning=but) for geometry, (why, but) in zip(results, said, strict=True)]
 
 
 def _calibrated(c: Correspondences, estimate: Estimate) -> Tensor:
@@ -346,7 +354,7 @@ def _estimated(
     R, t, focals = (None if value is None else value[0] for value in (estimate.R, estimate.t, estimate.focals))
     return dataclasses.replace(
         matched, inliers=inliers, F=estimate.F[0].to(torch.float64), reason=estimate.reason[0],
-        warning=still_warning(matched.correspondences, inliers) or pair_type.warnings[0],
+        warning=still_warning(matched.correspondences, inliers) or warnings_of(estimate, pair_type)[0],
         counts={**matched.counts, "estimation": int(inliers.sum())}, seconds=clock.seconds,
         significance=float(cast(Tensor, estimate.significance)[0]), R=R, t=t, focals=focals,
         pair_type=pair_type.names[0], geometry=photographs.geometry_to_original(geometry, *even_scales), undistorted=c,
