@@ -2,8 +2,6 @@
 that see the same points of its reconstruction.
 """
 
-from __future__ import annotations
-
 import bisect
 import dataclasses
 import functools
@@ -19,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fmtorch.data.cameras import Matrix, fundamental, relative_pose, share_centre
+from fmtorch.data.files import DataError
 from fmtorch.data.images import ImageError
 from fmtorch.data.pairs import ImagePair, ImageSource, PairDataset
-from fmtorch.data.text_files import DataError
 
 if TYPE_CHECKING:
     import scipy.sparse
@@ -317,7 +315,6 @@ class ScenePairs(PairDataset):
 
     @property
     def candidates(self) -> int:
-        """How many candidates the scenes have."""
         return self._starts[-1]
 
     def candidate(self, rank: int) -> tuple[int, int, int]:

@@ -1,7 +1,5 @@
 """What a pipeline made of pairs, kept for export: keypoints of images, matches, F and inliers of pairs."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 
@@ -17,7 +15,7 @@ from fmtorch.geometry.pose import pose_from_fundamental
 from fmtorch.io.match_store import MatchRecords, PairGeometry, StoredImage, StoredPair, indices
 from fmtorch.pipeline.match_result import MatchResult
 from fmtorch.pipeline.pair_geometries import pair_geometries
-from fmtorch.pipeline.photograph_cameras import PhotographCamera
+from fmtorch.pipeline.photographs import PhotographCamera
 from fmtorch.pipeline.pipeline import Outcome, Pipeline
 from fmtorch.pipeline.two_images import Described
 from fmtorch.two_view.pair_type import PairTypes

@@ -17,10 +17,10 @@ from torch import Tensor
 from fmtorch.core.display import picture_html
 from fmtorch.core.files import replacing
 from fmtorch.core.types import RELATED, Correspondences
-from fmtorch.data.lenses import Lens, undistorted
+from fmtorch.data.cameras import Lens, undistorted
 from fmtorch.io.match_store import PairGeometry
+from fmtorch.pipeline.photographs import GivenImage, Image, given_image
 from fmtorch.pipeline.pictures import draw_epipolar_lines, draw_matches
-from fmtorch.pipeline.reduced_images import GivenImage, Image, given_image
 from fmtorch.two_view.arguments import Arrays
 
 FLAT = ("planar", "rotation", "identical")  # pair types of which a homography explains all matches

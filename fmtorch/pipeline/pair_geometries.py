@@ -1,7 +1,5 @@
 """Estimates of pairs and their pair types as the two-view geometries of COLMAP's databases."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 
@@ -13,7 +11,7 @@ from torch import Tensor
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.geometry.pair_type import GENERAL, IDENTICAL, PLANAR, ROTATION
 from fmtorch.io.match_store import Kind, PairGeometry
-from fmtorch.two_view.pair_type import FOCAL_DEVIATION, PairTypes
+from fmtorch.two_view.pair_type import FOCAL_DEVIATION, PairTypes, warnings_of
 
 KINDS: dict[int, Kind] = {PLANAR: "planar", ROTATION: "panoramic", IDENTICAL: "planar_or_panoramic"}
 MAX_CONFLICT = 3.0  # deviations, of an estimated focal length from that of a camera that counts as calibrated
@@ -35,6 +33,7 @@ def pair_geometries(
         pair_type: of `classify`.
     """
     calibrated = _calibrated(c, estimate)
+    said = [*zip(estimate.reason, warnings_of(estimate, pair_type), strict=True)]
     kind, homography = pair_type.kind, pair_type.homography
     kinds = torch.where(kind != GENERAL, kind, torch.where(estimate.related, GENERAL, -1)).tolist()
     results = []
@@ -53,7 +52,7 @@ def pair_geometries(
             results.append(PairGeometry("panoramic", inliers, H=H, R=R, t=np.zeros(3)))
         else:
             results.append(PairGeometry(KINDS[what], inliers, H=H))
-    return results
+    return [geometry._replace(reason=why, warning=but) for geometry, (why, but) in zip(results, said, strict=True)]
 
 
 def _calibrated(c: Correspondences, estimate: Estimate) -> Tensor:
@@ -65,7 +64,6 @@ def _calibrated(c: Correspondences, estimate: Estimate) -> Tensor:
 
 
 def _with_lines(kind: Kind, inliers: NDArray[np.integer[Any]], estimate: Estimate, i: int, H: Any) -> PairGeometry:
-    """A geometry with F, and the pose where there is one."""
     E, R, t = (
         None if value is None else _known(value[i], value[i].isfinite().all())
         for value in (estimate.E, estimate.R, estimate.t)

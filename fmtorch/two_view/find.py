@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import functools
 import sys
+import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar, cast
 
-from fmtorch.core.types import Estimate, PoseEstimate
-from fmtorch.jobs.threads import one_thread
+from fmtorch.core.types import CONTRADICTED, Estimate, PoseEstimate
+from fmtorch.jobs.execution import one_thread
 from fmtorch.two_view.arguments import Arrays, Focal, correspondences
 from fmtorch.two_view.estimation import estimated
 from fmtorch.two_view.pair_type import with_pair_type
@@ -134,6 +135,9 @@ def find_fundamental(
     if isinstance(focal, Mapping):
         options["focal"] = focal
     estimate = estimated(c, "fundamental", estimator, config_dir, seed, options, covariance)
+    if estimate.contradicted is not None and bool(estimate.contradicted.any()):
+        pairs = estimate.contradicted.nonzero()[:, 0].tolist()
+        warnings.warn(f"pair {', '.join(map(str, pairs))}: {CONTRADICTED}", stacklevel=2)
     return with_pair_type(estimate, c, seed) if pair_type else estimate
 
 
