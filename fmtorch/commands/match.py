@@ -305,7 +305,7 @@ def _troubles(result: MatchResult) -> list[str]:
     if not result.ok:
         return list(filter(None, (f"no F: {result.reason}", warning)))
     chance = (
-        "probably not the same scene: so much support is no surprise by chance alone "
+        "probably not the same scene: unrelated photographs have as much support by chance "
         f"(significance {result.significance:.1f}; related from {RELATED:g} on)"
     )
     return list(filter(None, ("" if result.related else chance, warning)))

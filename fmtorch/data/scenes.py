@@ -100,7 +100,7 @@ def sharing_points(points: Sequence[NDArray[np.int64]], minimum: int = MIN_SHARE
     return ListedPairs(np.concatenate([*blocks, np.zeros((0, 2), np.int64)]))
 
 
-def incidence(points: Sequence[Indices]) -> scipy.sparse.csr_array:
+def incidence(points: Sequence[Indices]) -> "scipy.sparse.csr_array":
     """Which image sees which point, (images, points) of ones; points: of each image the numbers it sees."""
     import scipy.sparse  # which takes longer to import than a small database to verify
 

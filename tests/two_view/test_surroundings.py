@@ -6,6 +6,7 @@ import subprocess
 import sys
 import typing
 
+import cv2
 import pytest
 import torch
 from torch import Tensor
@@ -62,3 +63,25 @@ def test_an_editor_knows_that_a_pose_is_there() -> None:
     estimate = fmtorch.find_essential(c.x0, c.x1, K, K)
     assert isinstance(estimate[0].to("cpu"), fmtorch.PoseEstimate)
     assert isinstance(fmtorch.find_essential([], [], K, K), fmtorch.PoseEstimate)
+
+
+def test_keypoints_of_opencv_and_arrays_that_are_shared_are_points() -> None:
+    class Shared:
+        """An array of another library: DLPack alone."""
+
+        def __init__(self, value: Tensor) -> None:
+            self.value = value
+
+        def __dlpack__(self, **options: object) -> object:
+            return self.value.__dlpack__(**options)  # type: ignore[arg-type]
+
+        def __dlpack_device__(self) -> object:
+            return self.value.__dlpack_device__()
+
+    c = scene(0, 60)
+    ends = c.x0[0].float(), c.x1[0].float()
+    expected = fmtorch.find_fundamental(*ends).F
+    keypoints = [[cv2.KeyPoint(float(x), float(y), 3.0) for x, y in points] for points in ends]
+    assert torch.equal(fmtorch.find_fundamental(*keypoints).F, expected)
+    assert torch.equal(fmtorch.find_fundamental([keypoints[0]] * 2, [keypoints[1]] * 2).F[1:], expected)
+    assert torch.equal(fmtorch.find_fundamental(*map(Shared, ends)).F, expected)
