@@ -23,15 +23,9 @@ _ZERO = np.zeros((3, 3))  # where there is no F
 
 
 def given(
-    x0: Array,
-    x1: Array,
-    sizes: tuple[Size, Size],
-    features: tuple[int, int],
-    *,
-    ratio: Array | None = None,
-    score: Array | None = None,
-    mutual: NDArray[np.bool_] | None = None,
-) -> GivenMatches:
+    x0: Array, x1: Array, sizes: tuple[Size, Size], features: tuple[int, int], *, ratio: Array | None = None,
+    score: Array | None = None, mutual: NDArray[np.bool_] | None = None,
+) -> GivenMatches:  # fmt: skip
     """Matches of one pair, (n, 2) in pixels each; those that are not finite do not count.
 
     ratio, score, mutual: (n,), as of `Correspondences`. features: how many keypoints each image has.
@@ -212,12 +206,9 @@ class HLocMatches:
         index = (j, i) if self.swapped else (i, j)
         score = None if scores is None else scores[i]
         return given(
-            points[0][index[0]],
-            points[1][index[1]],
-            (sizes[0], sizes[1]),
-            (len(points[0]), len(points[1])),
+            points[0][index[0]], points[1][index[1]], (sizes[0], sizes[1]), (len(points[0]), len(points[1])),
             score=score,
-        )
+        )  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)
