@@ -288,7 +288,9 @@ def hloc_pairs(truth: PairDataset, features: Path, matches: Path, origin: float)
 def predicted_pairs(truth: PairDataset, path: Path, origin: float) -> Iterator[ImagePair]:
     """The pairs of a data set with predictions for them; a pair without has a problem."""
     with h5.opened(path) as file:
-        stored = set(_groups(file))
+        stored = set(h5.groups_with(file, "matches0", "matched_kpts0"))
+        if not stored:
+            raise DataError(f"{path}: holds no group with matches0 or matched_kpts0")
     for pair in truth:
         images = pair.image0, pair.image1
         for key, swapped in (*pair_keys(pair), (pair.identity, False)):
@@ -311,23 +313,6 @@ def _expect_distinct(names: dict[str, str | None], path: Path) -> None:
                 f"{path}: {name!r} could be image {seen[name]} or {identity}; names must tell images apart, "
                 "such as by their folder"
             )
-
-
-def _groups(file: Any) -> list[str]:
-    groups: list[str] = []
-
-    def visit(name: str) -> None:
-        head, _, last = name.rpartition("/")
-        if last in ("matches0", "matched_kpts0") and head:
-            groups.append(head)
-
-    try:
-        file.visit(visit)
-    except (OSError, RuntimeError) as error:
-        raise DataError(f"{file.filename}: its keys cannot be read ({str(error).splitlines()[0]})") from error
-    if not groups:
-        raise DataError(f"{file.filename}: holds no group with matches0 or matched_kpts0")
-    return groups
 
 
 def _read_indices(file: Any, path: Path, key: str) -> tuple[NDArray[np.int64], Array | None]:
