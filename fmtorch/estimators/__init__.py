@@ -8,6 +8,7 @@ if TYPE_CHECKING:
     from fmtorch.estimators.coarse_to_fine import CoarseToFine
     from fmtorch.estimators.external.authors import degensac_cpp, gc_ransac_cpp, magsac_cpp, superansac_cpp
     from fmtorch.estimators.external.colmap import colmap
+    from fmtorch.estimators.external.fastpose import fastpose
     from fmtorch.estimators.external.kornia import kornia_ransac
     from fmtorch.estimators.external.opencv import opencv
     from fmtorch.estimators.external.pairwise import PairwiseEstimator
@@ -33,6 +34,7 @@ __all__ = [
     "SummedGains",
     "colmap",
     "degensac_cpp",
+    "fastpose",
     "gc_ransac_cpp",
     "kernel",
     "kornia_ransac",
