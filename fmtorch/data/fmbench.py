@@ -1,7 +1,5 @@
 """Photographs with a ``Camera.txt`` beside them: the cameras of the FM-Bench layout, before there are pairs."""
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import os
@@ -13,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fmtorch.data.cameras import Camera, relative_pose
+from fmtorch.data.files import DataError, given_root, numbered, read_lines, read_numbers, to_finite
 from fmtorch.data.pairs import ImagePair, ImageSource, PairDataset
 from fmtorch.data.scenes import WINDOW, AllPairs, Candidates, Scene, ScenePairs, View, folders, following
-from fmtorch.data.text_files import DataError, given_root, numbered, read_lines, read_numbers, to_finite
 
 CAMERAS, IMAGES, SUFFIXES = "Camera.txt", "Images", (".jpg", ".png")
 COLUMNS = "K (9 numbers, row by row), R (9), t (3)"
@@ -236,7 +234,6 @@ def _listed(names: Sequence[str] | set[str] | dict[str, Path]) -> str:
 
 
 def _images(folder: Path, scene: str) -> dict[str, Path]:
-    """The image files of a subset by their stem."""
     images = folder / scene / "Images"
     if not images.is_dir():
         raise DataError(f"{folder / _SUBSETS} names {scene}/, but there is no folder {images}")

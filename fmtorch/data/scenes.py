@@ -2,8 +2,6 @@
 that see the same points of its reconstruction.
 """
 
-from __future__ import annotations
-
 import bisect
 import dataclasses
 import functools
@@ -20,9 +18,9 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from fmtorch.data.cameras import Matrix, fundamental, relative_pose, share_centre
+from fmtorch.data.files import DataError
 from fmtorch.data.images import ImageError
 from fmtorch.data.pairs import ImagePair, ImageSource, PairDataset
-from fmtorch.data.text_files import DataError
 
 Indices = NDArray[np.int64]
 
@@ -313,7 +311,6 @@ class ScenePairs(PairDataset):
 
     @property
     def candidates(self) -> int:
-        """How many candidates the scenes have."""
         return self._starts[-1]
 
     def candidate(self, rank: int) -> tuple[int, int, int]:

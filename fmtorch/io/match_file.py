@@ -1,6 +1,4 @@
-"""Matches alone: x0, x1 of one pair or of many in an npz or HDF5 file, and their geometries in another."""
-
-from __future__ import annotations
+"""Files of matches to verify: hloc's features and matches, or x0, x1 alone; and files of what was verified."""
 
 import contextlib
 import functools
@@ -10,21 +8,142 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from fmtorch.core.files import replacing
-from fmtorch.data.text_files import DataError
-from fmtorch.geometry.cameras import calibration_problems
+from fmtorch.data.files import DataError
 from fmtorch.io import h5
 from fmtorch.io.colmap import DatabaseImage
-from fmtorch.io.given import size_by_centre
-from fmtorch.io.match_store import PairGeometry
+from fmtorch.io.match_store import PairGeometry, geometry_texts
+
+MEMORY = 256  # images whose keypoints are kept
+NO_MATCH = -1
+Names = tuple[str, str]
+
+
+class HlocMatches:
+    """The pairs of two files; output: the file of matches that is written.
+
+    Raises DataError where one of the files is no HDF5 file, or holds no keypoints or no matches.
+    """
+
+    def __init__(self, features: Path, matches: Path, output: Path) -> None:
+        self._output, self._open = output, contextlib.ExitStack()
+        self.files = (features, matches)
+        with contextlib.ExitStack() as stack:
+            self._features, self._matches = (stack.enter_context(h5.opened(path)) for path in (features, matches))
+            images = _below(self._features, "keypoints")
+            if not images:
+                raise DataError(f"{features} holds no keypoints; give hloc's file of features")
+            self._stored = {name.replace("/", "-"): name for name in images}
+            self._keys = {self._named(key): key for key in _below(self._matches, "matches0")}
+            if not self._keys:
+                raise DataError(f"{matches} holds no matches0; give hloc's file of matches")
+            self._open = stack.pop_all()
+        self.image = functools.lru_cache(maxsize=MEMORY)(self._image)
+
+    def __enter__(self) -> "HlocMatches":
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._open.close()
+
+    def pairs(self) -> list[Names]:
+        return sorted(self._keys)
+
+    def identity(self) -> dict[str, Any]:
+        return {"files": h5.digest_of(*self.files)}
+
+    def has_geometry(self, pair: Names) -> bool:
+        return False
+
+    def finished(self) -> int:
+        """How many pairs the output has, if it has all of them; else 0."""
+        with h5.opened(self._output) as written:
+            return len(self._keys) if all(h5.holds(written, key) for key in self._keys.values()) else 0
+
+    def matches(self, pair: Names) -> NDArray[np.int64]:
+        """The matches of a pair, keypoints (n, 2). Raises DataError where there are no such keypoints."""
+        second = self._second(pair)
+        counts = [len(self.image(name).points) for name in pair]
+        if len(second) != counts[0]:
+            raise DataError(f"matches0 has {len(second)} entries, but {pair[0]} has {counts[0]} keypoints")
+        if len(second) and not NO_MATCH <= second.min() <= second.max() < counts[1]:
+            raise DataError(f"matches0 holds {second.min()} to {second.max()}, but {pair[1]} has {counts[1]} keypoints")
+        first = np.flatnonzero(second != NO_MATCH)
+        return np.stack([first, second[first]], -1)
+
+    def write(self, geometries: Iterable[tuple[Names, PairGeometry]]) -> None:
+        h5py = h5.imported()
+        with replacing(self._output) as temporary, h5py.File(temporary, "w") as file:
+            for pair, geometry in geometries:
+                group = file.create_group(self._keys[pair])
+                second = np.full(len(self._second(pair)), NO_MATCH, np.int32)
+                second[geometry.inliers[:, 0]] = geometry.inliers[:, 1]
+                group["matches0"] = second
+                scores = self._scores(pair)
+                if scores is not None:
+                    group["matching_scores0"] = np.where(second == NO_MATCH, 0, scores).astype(np.float32)
+                write_geometry(group, geometry)
+
+    def name(self, image_id: str) -> str:
+        return image_id
+
+    def _named(self, key: str) -> Names:
+        """The names of a pair's images; of an image without features that in the key."""
+        first, _, second = key.rpartition("/")
+        if not first:  # an older hloc joins names by _, which may also stand in them
+            ends = ((key[:i], key[i + 1 :]) for i, sign in enumerate(key) if sign == "_")
+            first, second = next((both for both in ends if self._stored.keys() >= set(both)), (first, second))
+        return self._stored.get(first, first), self._stored.get(second, second)
+
+    def _second(self, pair: Names) -> NDArray[np.int64]:
+        values = h5.array(self._matches, f"{self._keys[pair]}/matches0", None)
+        if values.dtype.kind not in "iu":
+            raise DataError(f"matches0 is of {values.dtype}; it must hold whole numbers")
+        return values.astype(np.int64)
+
+    def _scores(self, pair: Names) -> NDArray[np.float64] | None:
+        key = f"{self._keys[pair]}/matching_scores0"
+        return h5.numbers(self._matches, key, None) if h5.holds(self._matches, key) else None
+
+    def _image(self, name: str) -> DatabaseImage:
+        points = h5.numbers(self._features, f"{name}/keypoints", None, 2).astype(np.float32)
+        width, height = h5.reshaped(self._features, f"{name}/image_size", 2)
+        size = int(height), int(width)
+        return DatabaseImage(name, -1, size, np.eye(3), np.inf, points, points)
+
+
+def write_geometry(group: Any, geometry: PairGeometry) -> None:
+    """Words and matrices of a pair as attributes of its group."""
+    group.attrs.update(geometry_texts(geometry))
+    for name in ("F", "E", "H", "R", "t"):
+        value = getattr(geometry, name)
+        if value is not None:
+            group.attrs[name] = value
+
+
+def _below(file: Any, last: str) -> list[str]:
+    groups: list[str] = []
+
+    def visit(name: str) -> None:
+        head, _, end = name.rpartition("/")
+        if end == last and head:
+            groups.append(head)
+
+    try:
+        file.visit(visit)
+    except (OSError, RuntimeError) as error:
+        raise DataError(f"{file.filename}: its keys cannot be read ({str(error).splitlines()[0]})") from error
+    return groups
+
+
+# Matches alone: x0, x1 of one pair or of many in an npz or HDF5 file, and their geometries in another
+
 
 NPZ = ".npz"
 SUFFIXES = (NPZ, *h5.SUFFIXES)
 MATRICES = ("F", "E", "H", "R", "t")
-MEMORY = 256  # images whose points are kept
 
 Ids = tuple[str, str]  # keys of the points of both images, which end in x0 and x1
 
@@ -63,25 +182,26 @@ class MatchFile:
             self._open = stack.pop_all()
         self.image = functools.lru_cache(maxsize=MEMORY)(self._image)
 
-    def __enter__(self) -> MatchFile:
-        """The file itself, closed on leaving."""
+    def __enter__(self) -> "MatchFile":
         return self
 
     def __exit__(self, *error: object) -> None:
-        """Close the file."""
         self._open.close()
 
     def pairs(self) -> list[Ids]:
-        """Both images of each pair."""
         return [(f"{pair}x0", f"{pair}x1") for pair in self._pairs]
 
     def identity(self) -> dict[str, Any]:
-        """What the file holds."""
         return {"files": h5.digest_of(self._path)}
 
     def has_geometry(self, pair: Ids) -> bool:
-        """Whether a pair has a geometry: none has."""
         return False
+
+    def finished(self) -> int:
+        """How many pairs the output has, if it has all of them; else 0."""
+        with _arrays(self._output) as written:
+            keys = set(written.keys())
+        return len(self._pairs) if all(f"{pair}inliers" in keys for pair in self._pairs) else 0
 
     def matches(self, pair: Ids) -> NDArray[np.int64]:
         """Point i with point i. Raises DataError where x0 and x1 have different lengths."""
@@ -91,22 +211,21 @@ class MatchFile:
         return np.repeat(np.arange(counts[0])[:, None], 2, 1)
 
     def write(self, geometries: Iterable[tuple[Ids, PairGeometry]]) -> None:
-        """Write the file: which matches are inliers, configuration and matrices."""
+        """Write the file: which matches are inliers, configuration, reason, warning and matrices."""
         with replacing(self._output) as temporary:
             entries = (self._entries(*pair) for pair in geometries)
             (_write_npz if self._output.suffix == NPZ else _write_h5)(temporary, entries)
 
     def _entries(self, ids: Ids, geometry: PairGeometry) -> dict[str, NDArray[Any]]:
-        """What is written of a pair, by keys."""
         pair = ids[0].removesuffix("x0")
         inliers = np.zeros(len(self.image(ids[0]).points), bool)
         inliers[geometry.inliers[:, 0]] = True
         values = ((name, getattr(geometry, name)) for name in MATRICES)
         matrices = {f"{pair}{name}": value for name, value in values if value is not None}
-        return {f"{pair}inliers": inliers, f"{pair}configuration": np.array(geometry.kind), **matrices}
+        texts = {f"{pair}{name}": np.array(value) for name, value in geometry_texts(geometry).items()}
+        return {f"{pair}inliers": inliers, **texts, **matrices}
 
     def name(self, image_id: str) -> str:
-        """The key of the points."""
         return image_id
 
     def _image(self, image_id: str) -> DatabaseImage:
@@ -116,9 +235,7 @@ class MatchFile:
             self._numbers(f"{pair}{key}", shape) if f"{pair}{key}" in self._keys else None
             for key, shape in ((f"K{i}", (3, 3)), (f"size{i}", (2,)))
         )
-        if K is not None and (problem := calibration_problems(torch.from_numpy(K)[None], None, f"K{i}")[0]):
-            raise DataError(problem)
-        known = size_by_centre(K) if size is None and K is not None else None
+        known = None
         if size is not None:
             if not (np.isfinite(size).all() and (size >= 1).all()):
                 raise DataError(f"size{i} is {size.tolist()}; it must be the height and width of the image")
@@ -209,4 +326,4 @@ def _write_h5(path: Path, pairs: Iterable[Mapping[str, NDArray[Any]]]) -> None:
                 if name == "inliers":
                     group[name] = value
                 else:
-                    group.attrs[name] = str(value) if name == "configuration" else value
+                    group.attrs[name] = value if name in MATRICES else str(value)

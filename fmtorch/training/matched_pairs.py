@@ -1,7 +1,5 @@
 """`MatchedPairs`: a data set of image pairs seen through a pipeline's first stages, with labels, kept on disk."""
 
-from __future__ import annotations
-
 import functools
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -16,12 +14,9 @@ from fmtorch.core.files import cache_dir
 from fmtorch.core.settings import claim
 from fmtorch.core.types import Correspondences
 from fmtorch.data.pairs import DepthDataset, ImagePair, PairDataset
-from fmtorch.jobs.execution import Execution
-from fmtorch.jobs.pool import WorkerPool
-from fmtorch.jobs.runner import Factory, Local, Source, TaskRunner
-from fmtorch.jobs.threads import use_one_thread
-from fmtorch.pipeline.build import load_pipeline
-from fmtorch.pipeline.pipeline import Outcome, Pipeline
+from fmtorch.jobs.execution import Execution, use_one_thread
+from fmtorch.jobs.runner import Factory, Local, Source, TaskRunner, WorkerPool
+from fmtorch.pipeline.pipeline import Outcome, Pipeline, load_pipeline
 from fmtorch.runs.feature_cache import CachedFeatures
 from fmtorch.runs.fingerprint import configuration, environment
 from fmtorch.runs.run_folder import identity_digest
@@ -122,7 +117,6 @@ class MatchedPairs(StoredMatches):
 
 
 def _identity(dataset: PairDataset, stages: Pipeline, most: int) -> dict[str, Any]:
-    """What defines the matches and their labels, as plain values."""
     extractor = stages.extractor
     if isinstance(extractor, CachedFeatures):
         extractor = extractor.extractor
@@ -141,7 +135,6 @@ def _identity(dataset: PairDataset, stages: Pipeline, most: int) -> dict[str, An
 
 
 def _sound(path: Path, pairs: int) -> bool:
-    """Whether a file is there and whole, with so many pairs; of a damaged one a warning tells."""
     if not path.exists():
         return False
     try:

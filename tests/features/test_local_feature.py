@@ -21,7 +21,7 @@ from fmtorch.features import (
     local_feature,
 )
 from fmtorch.matching import NearestNeighborMatcher
-from fmtorch.pipeline.build import load_pipeline
+from fmtorch.pipeline.pipeline import load_pipeline
 from fmtorch.runs.feature_cache import ArrayCache, CachedFeatures
 from tests.features.scenes import texture
 

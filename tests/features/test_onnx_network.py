@@ -15,7 +15,7 @@ from fmtorch.core.files import models_dir
 from fmtorch.core.onnx_network import NetworkFileError
 from fmtorch.features.networks import ARCHITECTURES, build, load_weights
 from fmtorch.features.onnx_network import PatchNetwork, network_file
-from fmtorch.training.onnx_export import export, quantize
+from scripts.patch_networks.onnx_export import export, quantize
 from tests.conftest import oracle, shared_path
 from tests.features.test_networks import randomized
 

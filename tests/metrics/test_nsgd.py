@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import sys
 
 import numpy as np
 import pytest
@@ -15,7 +14,7 @@ from torch import Tensor
 from fmtorch.geometry import cross_matrix, unit_frobenius
 from fmtorch.jit.random import Stream, uniform
 from fmtorch.metrics import nsgd, nsgd_released, sgd
-from fmtorch.metrics.nsgd import COLUMNS, Draws, Pairs, draw_distances
+from fmtorch.metrics.nsgd import COLUMNS, Comparison, plain_draw
 from tests.conftest import oracle
 from tests.reference import metrics as reference
 
@@ -233,15 +232,12 @@ def test_ignores_scale_and_sign_and_is_zero_for_the_truth(seed: int, exponent: f
 @settings(max_examples=20, deadline=None)
 @given(seed=st.integers(0, 1000))
 def test_exchanging_the_matrices_exchanges_the_halves(seed: int) -> None:
-    F_gt, F_est = random_pairs(seed, 2)
-    sizes = [size.double().expand(2, 2) for size in (VGA, HD)]
-    key = torch.arange(2)
-    both = Draws.of(seed, key, 0, 40)
-    forward = draw_distances(Pairs(F_gt, F_est, *sizes, key), both)
-    exchanged = Draws(*(numbers.flip(0) for numbers in both))
-    backward = draw_distances(Pairs(F_est, F_gt, *sizes, key), exchanged)
-    for a, b in zip(forward, backward, strict=True):
-        assert torch.equal(a, b)
+    F_gt, F_est = (F.numpy() for F in random_pairs(seed))
+    sizes = [size.double().numpy() for size in (VGA, HD)]
+    unit, key = np.ones(2), np.zeros(1, np.int64)
+    for u in uniform(seed, torch.zeros(1, dtype=torch.int64), Stream.METRIC, 0, 40, COLUMNS)[0].numpy():
+        forward = plain_draw(Comparison(F_gt, F_est, *sizes, unit, key), u)
+        assert plain_draw(Comparison(F_est, F_gt, *sizes, unit, key), np.roll(u, 3)) == forward
 
 
 def test_any_leading_shape_and_dtype() -> None:
@@ -261,8 +257,8 @@ def test_any_leading_shape_and_dtype() -> None:
 
 
 @pytest.mark.parametrize("function", [nsgd, nsgd_released, sgd])
-def test_neighbours_batch_and_tile_are_invisible(function: object, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Bit-equal alone, in any batch, beside failed estimates, and for any tile."""
+def test_neighbours_and_batch_are_invisible(function: object) -> None:
+    """Bit-equal alone, in any batch, and beside failed estimates."""
     assert callable(function)
     F_gt, F_est = random_pairs(7, 9, spread=0.5)
     F_est[2], F_est[4], F_est[6, 0, 0], F_est[8] = torch.nan, 0.0, torch.inf, rows_shifted(1e4)
@@ -275,8 +271,6 @@ def test_neighbours_batch_and_tile_are_invisible(function: object, monkeypatch: 
     order = torch.tensor([8, 3, 5, 0])
     part = function(F_gt[order], F_est[order], *sizes[:, order], key=key[order], samples=50)
     assert torch.equal(part, together[order])
-    monkeypatch.setattr(sys.modules["fmtorch.metrics.nsgd"], "TILE", 100)
-    assert torch.equal(function(F_gt, F_est, *sizes, key=key, samples=50), together)
 
 
 def test_gradcheck() -> None:

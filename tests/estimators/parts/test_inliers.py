@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 
+import fmtorch
 from fmtorch.estimators.inliers import (
     BetterHalf,
     InlierRule,
@@ -18,6 +19,7 @@ from fmtorch.estimators.inliers import (
 from fmtorch.estimators.sampling import PriorWeighted, Prosac, Sampler, Uniform
 from tests.estimators.pairs import FEW, SCALES, models, named
 from tests.estimators.residuals import residuals
+from tests.reference import known_cameras
 from tests.reference import ransac as reference
 
 
@@ -46,11 +48,20 @@ def test_rules_are_those_of_the_definitions(count: int) -> None:
         sigma = 1.4826 * (1 + 5 / max(count - 7, 1)) * math.sqrt(median)
         rules: list[tuple[InlierRule, list[bool]]] = [
             (WithinThreshold(1.5), [x <= 1.5**2 for x in r**2]),
-            (BetterHalf(), [x <= median for x in r**2]),
-            (RobustDeviations(), [x <= (2.5 * sigma) ** 2 for x in r**2]),
+            (BetterHalf(), [x <= max(median, 1e-6) for x in r**2]),
+            (RobustDeviations(), [x <= max(2.5 * sigma, 1e-3) ** 2 for x in r**2]),
         ]
         for rule, expected in rules:
             assert rule(r**2, pair).tolist() == expected
+
+
+@pytest.mark.parametrize("name", ["lmeds", "cf_ransac", "paper/lmeds"])
+def test_all_exact_matches_are_inliers(name: str) -> None:
+    """Whose deviations are rounding, of which a half is larger than the median."""
+    s = known_cameras.scene(5, 150)
+    inliers = fmtorch.find_fundamental(s.x0, s.x1, estimator=name).inliers[0].numpy()
+    assert inliers[s.right].all()
+    assert not inliers[~s.right].any()
 
 
 @pytest.mark.parametrize("count", [7, 8, 9, 20, 151])
