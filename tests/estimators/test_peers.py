@@ -235,8 +235,6 @@ def test_fastpose_estimates_what_is_asked_for() -> None:
     assert unknown.focals is not None
     expected = [float(s.K0[0, 0]), float(s.K1[0, 0])]
     assert unknown.focals[0].numpy() == pytest.approx(expected, rel=0.15)  # by its solver alone, without a prior
-        [float(s.K0[0, 0]), float(s.K1[0, 0])], rel=0.15
-    )  # by its solver alone, without a prior
     x0 = np.random.default_rng(0).uniform(0, 800, (60, 2))
     H = np.array([[0.9, 0.1, 20], [-0.05, 1.1, -10], [1e-5, 2e-5, 1]])
     x1 = np.c_[x0, np.ones(60)] @ H.T
