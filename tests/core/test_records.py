@@ -1,7 +1,5 @@
 """What the annotations of a record say, and what is told of fields that do not fit them."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Parts as somebody else writes them."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Pairs of many kinds as parts of estimators see them, and models of theirs."""
 
-from __future__ import annotations
-
 import functools
 
 import numpy as np
@@ -31,7 +29,6 @@ def normalized(c: Correspondences, seed: int = 0, minimal: int = 7, i: int = 0) 
 def pair_of(c: Correspondences, seed: int = 0, i: int = 0) -> Pair:
     """A pair of a batch, which can be estimated."""
     pair = normalized(c, seed, i=i)
-    assert pair is not None
     return pair
 
 

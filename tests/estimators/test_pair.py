@@ -1,7 +1,5 @@
 """From a batch to one pair: which matches are usable, in which units; and a model back in pixels."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 
@@ -82,40 +80,22 @@ def test_the_unit_is_the_next_power_of_two() -> None:
             assert result[0].pixels_per_unit == expected
 
 
-@pytest.mark.parametrize(
-    ("count", "size"),
-    [(0, 128), (1, 128), (128, 128), (129, 192), (192, 192), (193, 256), (760, 768), (769, 1024), (100_000, 131_072)],
-)
-def test_buckets(count: int, size: int) -> None:
-    assert bucket(count) == size
+WRONG = {
+    "prior": ((1.5, -0.1, math.nan), "prior of 1 match is wrong: it is P(inlier), within [0, 1]"),
+    "noise": ((0.0, -1.0, math.nan), "noise of 1 match is wrong: it is a standard deviation, positive"),
+    "size0": ((0.0, -3.0, math.nan, math.inf), "size0 is wrong: image sizes (h, w) are positive"),
+}
 
 
-@pytest.mark.parametrize("value", [1.5, -0.1, math.nan])
-def test_wrong_priors_are_told(value: float) -> None:
-    c = known(20)
-    assert c.prior is not None
-    prior = c.prior.clone()
-    prior[0, 3] = value
-    wrong = "prior of 1 match is wrong: it is P(inlier), within [0, 1]"
-    assert normalized(c.replace(prior=prior)) == wrong
-    hidden = c.replace(prior=prior, mask=torch.arange(20)[None] != 3)
-    assert not isinstance(normalized(hidden), str)
-
-
-@pytest.mark.parametrize("value", [0.0, -1.0, math.nan])
-def test_wrong_noise_is_told(value: float) -> None:
-    c = known(20)
-    assert c.noise is not None
-    noise = c.noise.clone()
-    noise[0, 3] = value
-    assert normalized(c.replace(noise=noise)) == "noise of 1 match is wrong: it is a standard deviation, positive"
-
-
-@pytest.mark.parametrize("value", [0.0, -3.0, math.nan, math.inf])
-def test_wrong_sizes_are_told(value: float) -> None:
-    c = known(20)
-    wrong = "size0 is wrong: image sizes (h, w) are positive"
-    assert normalized(c.replace(size0=torch.tensor([[640.0, value]]))) == wrong
+@pytest.mark.parametrize("name", WRONG)
+def test_wrong_values_are_a_reason_unless_they_are_masked(name: str) -> None:
+    c, (values, reason) = known(20), WRONG[name]
+    for value in values:
+        wrong = getattr(c, name).float().clone()
+        wrong[0, wrong.shape[1] // 2] = value
+        assert normalized(c.replace(**{name: wrong})) == reason
+        hidden = c.replace(**{name: wrong}, mask=torch.arange(20)[None] != 10)
+        assert isinstance(normalized(hidden), str) == (name == "size0")
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, 1e100, -1e300])

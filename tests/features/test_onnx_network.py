@@ -1,8 +1,5 @@
 """Patch networks through ONNX Runtime: they agree with torch, neighbours are invisible, bad files are named."""
 
-from __future__ import annotations
-
-import pickle
 from pathlib import Path
 
 import onnx
@@ -14,7 +11,7 @@ from torch import Tensor
 from fmtorch.core.files import models_dir
 from fmtorch.core.onnx_network import NetworkFileError
 from fmtorch.features.networks import ARCHITECTURES, build, load_weights
-from fmtorch.features.onnx_network import PatchNetwork, network_file
+from fmtorch.features.onnx_network import PatchNetwork
 from fmtorch.training.onnx_export import export, quantize
 from tests.conftest import oracle, shared_path
 from tests.features.test_networks import randomized
@@ -69,19 +66,6 @@ def test_neighbours_and_batch_size_are_invisible(hardnet: Path, patches: Tensor)
     torch.testing.assert_close(PatchNetwork(hardnet)(garbage)[:6], expected[:6], atol=0, rtol=0)
 
 
-def test_no_patches(hardnet: Path) -> None:
-    assert PatchNetwork(hardnet)(torch.zeros(0, 1, 32, 32)).shape == (0, 128)
-    assert PatchNetwork(hardnet).outputs == 128
-
-
-def test_a_network_can_be_pickled_after_use(hardnet: Path, patches: Tensor) -> None:
-    network = PatchNetwork(hardnet, threads=1, batch=32)
-    expected = network(patches)
-    again = pickle.loads(pickle.dumps(network))
-    assert (again.path, again.threads, again.batch) == (hardnet, 1, 32)
-    torch.testing.assert_close(again(patches), expected, atol=0, rtol=0)
-
-
 def test_other_shapes_of_patches_are_refused(hardnet: Path) -> None:
     for shape in ((2, 1, 64, 64), (2, 3, 32, 32)):
         with pytest.raises(Exception, match=r"\(N, 1, 32, 32\)|jaxtyping|Type-check"):
@@ -131,14 +115,6 @@ def test_int8_keeps_descriptors_close_and_the_file_small(hardnet: Path, tmp_path
     assert (tmp_path / "hardnet.int8.onnx").stat().st_size < 0.3 * hardnet.stat().st_size
     nodes = {node.op_type for node in onnx.load(tmp_path / "hardnet.int8.onnx").graph.node}
     assert {"QuantizeLinear", "DequantizeLinear"} <= nodes
-
-
-def test_names_of_files() -> None:
-    assert network_file("hardnet") == models_dir() / "hardnet.onnx"
-    assert network_file("hardnet", "int8") == models_dir() / "hardnet.int8.onnx"
-    assert network_file("/data/mine.onnx", "int8") == Path("/data/mine.onnx")
-    with pytest.raises(ValueError, match="precision=fp16; there are: fp32, int8"):
-        network_file("hardnet", "fp16")
 
 
 def test_files_tell_nothing_of_where_they_were_made(hardnet: Path) -> None:

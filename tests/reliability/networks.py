@@ -3,8 +3,6 @@
 ``python -m tests.reliability.networks file folder count``
 """
 
-from __future__ import annotations
-
 import sys
 from collections import Counter
 from pathlib import Path

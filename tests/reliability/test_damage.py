@@ -1,7 +1,5 @@
 """Damaged files: told, computed anew, or of no consequence; never another result, never a crash."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Learned files: others' checkpoints converted, refusals."""
 
-from __future__ import annotations
-
 import runpy
 import sys
 from pathlib import Path

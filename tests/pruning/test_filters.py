@@ -1,7 +1,5 @@
 """Ratio, mutual, one-to-one."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -92,27 +90,6 @@ def test_one_to_one_is_symmetric_and_independent_of_order(dtype: torch.dtype) ->
     assert torch.equal(kept[:, order], one_to_one(x0[:, order], x1[:, order], quality[:, order]))
     for x in (x0, x1):
         assert len(torch.unique(x[kept], dim=0)) == kept.sum()
-
-
-def test_one_to_one_tells_apart_the_closest_floats() -> None:
-    x0 = torch.tensor([[[1.0, 2.0], [math.nextafter(1.0, 2.0), 2.0]]], dtype=torch.float64)
-    x1 = torch.tensor([[[1.0, 2.0], [5.0, 2.0]]], dtype=torch.float64)
-    assert one_to_one(x0, x1, torch.zeros(1, 2).double()).all()
-
-
-def test_one_to_one_does_not_see_padding_or_neighbours() -> None:
-    sizes = [50, 0, 1, 31]
-    items = [duplicated(i, n) for i, n in enumerate(sizes)]
-    x0, x1 = torch.full((4, 60, 2), math.nan), torch.zeros(4, 60, 2)
-    quality, mask = torch.full((4, 60), -math.inf), torch.zeros(4, 60, dtype=torch.bool)
-    for b, (a0, a1, q) in enumerate(items):
-        slots = torch.arange(len(q)) + 5
-        x1[b] = a1[0] if len(a1) else 0.0  # padding that lies where real matches lie, with the best quality
-        x0[b, slots], x1[b, slots], quality[b, slots], mask[b, slots] = a0, a1, q, True
-    together = one_to_one(x0, x1, quality, mask)
-    assert not together[~mask].any()
-    for b, (a0, a1, q) in enumerate(items):
-        assert torch.equal(together[b, 5 : 5 + len(q)], one_to_one(a0[None], a1[None], q[None])[0])
 
 
 def test_one_to_one_drops_what_has_no_location_and_ranks_nan_quality_last() -> None:

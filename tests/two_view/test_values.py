@@ -1,7 +1,5 @@
 """Wrong values are named: to who gives them as an argument, and as the reason of the pair that has them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
@@ -68,13 +66,6 @@ def test_sizes_of_one_image_and_points_as_opencv_stores_them_are_refused() -> No
     batch = fmtorch.find_fundamental(*opencv, mask=np.ones((60, 1), bool), estimator="msac")
     assert not bool(batch.ok.any())
     assert set(batch.reason) == {"1 matches; at least 7 are needed"}
-
-
-def test_whole_numbers_are_points_too() -> None:
-    c = scene(0, 60)
-    x0, x1 = (x[0].round().numpy() for x in (c.x0, c.x1))
-    integral, floating = (fmtorch.find_fundamental(x0.astype(kind), x1.astype(kind)) for kind in (np.int32, np.float64))
-    assert torch.equal(integral.F, floating.F)
 
 
 @pytest.mark.parametrize("metric", ["sgd", "nsgd", "nsgd_released", "inlier_rate"])
