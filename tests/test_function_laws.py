@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from fmtorch import geometry, metrics
-from fmtorch.geometry.pair_type import configuration_evidence
+from fmtorch.geometry.pair_type import pair_evidence
 from tests.geometry.scenes import scene
 
 SLOTS = 40
@@ -73,7 +73,7 @@ def covariance(p: Pairs) -> Any:
 def evidence(p: Pairs) -> Any:
     precision = torch.diag_embed(torch.full((len(p.F), 2), 2500.0, dtype=torch.float64))
     cameras = {"K0": p.K0, "K1": p.K1, "focal_precision": precision}
-    return configuration_evidence(p.F, p.H, p.x0, p.x1, p.mask, noise=p.noise, prior=p.weight, **sizes(p), **cameras)
+    return pair_evidence(p.F, p.H, p.x0, p.x1, p.mask, noise=p.noise, prior=p.weight, **sizes(p), **cameras)
 
 
 def sampled(name: str) -> Callable[[Pairs], Any]:
@@ -99,7 +99,7 @@ FUNCTIONS: dict[str, Callable[[Pairs], Any]] = {
     "attached_step": lambda p: geometry.attached_step(p.F, p.x0, p.x1, p.weight, p.mask, scale=2.0),
     "canonical": lambda p: geometry.canonical(p.F),
     "closest_pose_error": lambda p: metrics.closest_pose_error(p.F, p.K0, p.K1, p.R, p.t),
-    "configuration_evidence": evidence,
+    "pair_evidence": evidence,
     "corner_error": lambda p: metrics.corner_error(p.H, p.H.detach() + 1e-6, sizes(p)["size0"]),
     "eight_point": lambda p: geometry.eight_point(p.x0, p.x1, p.weight, p.mask),
     "fundamental_from_calibration": lambda p: geometry.fundamental_from_calibration(p.K0, p.K1, p.R, p.t),

@@ -71,7 +71,7 @@ def test_matches_and_fundamental_matrix_of_arrays(pipeline: fmtorch.pipeline.pip
     assert torch.equal(result.putative.x0[:, result.kept], c.x0)
     assert torch.equal(result.putative.x1[:, result.kept], c.x1)
     assert list(result.counts) == ["matching", "ratio", "one_to_one", "gms", "estimation"]
-    steps = ["features", "matching", "ratio", "one_to_one", "gms", "estimation", "configuration"]
+    steps = ["features", "matching", "ratio", "one_to_one", "gms", "estimation", "pair_type"]
     assert list(result.seconds) == steps
     assert result.counts["estimation"] == int(result.inliers.sum()) > 100
     assert sorted(result.counts.values(), reverse=True) == list(result.counts.values())
@@ -103,7 +103,7 @@ def test_equal_to_the_pipeline_on_files(pipeline: fmtorch.pipeline.pipeline.Pipe
 def test_formats(suffix: str, pipeline: fmtorch.pipeline.pipeline.Pipeline, tmp_path: Path) -> None:
     images = stereo()
     for i in (0, 1):
-        Image.fromarray(images[i]).save(tmp_path / f"{i}.{suffix}", quality=95)
+        Image.fromarray(images[i]).save(tmp_path / f"{i}.{suffix}", ratio=95)
     result = fmtorch.match(tmp_path / f"0.{suffix}", tmp_path / f"1.{suffix}", pipeline=pipeline)
     assert result.ok
     assert distance(result.F, images[0].shape) < 0.01
@@ -125,7 +125,7 @@ def test_exif_orientation(orientation: int, pipeline: fmtorch.pipeline.pipeline.
     exif = Image.Exif()
     exif[0x0112] = orientation
     stored = Image.fromarray(np.ascontiguousarray(STORED[orientation](image1)))
-    stored.save(tmp_path / "1.jpg", exif=exif, quality=95)
+    stored.save(tmp_path / "1.jpg", exif=exif, ratio=95)
     assert read_image(tmp_path / "1.jpg", orient=True).shape == image1.shape
     result = fmtorch.match(image0, tmp_path / "1.jpg", pipeline=pipeline)
     assert torch.equal(result.correspondences.size1, torch.tensor([image1.shape[:2]]))
@@ -212,7 +212,7 @@ def test_photographs_that_determine_no_f(pipeline: fmtorch.pipeline.pipeline.Pip
         ("identical", np.ascontiguousarray(image[60:, 100:]), crop), ("identical", copy, np.eye(3)),
     ):  # fmt: skip
         result = fmtorch.match(image, second, pipeline=pipeline, longest_side=800)
-        assert result.configuration == kind
+        assert result.pair_type == kind
         assert result.warning == WARNINGS[kind] or "no motion" in result.warning
         assert result.homography is not None
         corners = torch.tensor([[0.0, 0], [w, 0], [w, h], [0, h]], dtype=torch.float64)
@@ -220,7 +220,7 @@ def test_photographs_that_determine_no_f(pipeline: fmtorch.pipeline.pipeline.Pip
         assert off.abs().max() < 6  # px of 1536 x 1024
     other = read_image(shared_path("data/Strecha/fountain-P11/Images/00000004.jpg"))
     general = fmtorch.match(image, other, pipeline=pipeline, longest_side=800)
-    assert (general.configuration, general.warning, general.homography) == ("general", "", None)
+    assert (general.pair_type, general.warning, general.homography) == ("general", "", None)
 
 
 LMEDS = ("estimator=lmeds_eight_point",)
@@ -235,7 +235,7 @@ def test_an_f_of_photographs_with_nothing_in_common() -> None:
     assert result.ok
     assert not result.related
     assert result.significance < RELATED
-    assert (result.configuration, result.homography) == ("unrelated", None)
+    assert (result.pair_type, result.homography) == ("unrelated", None)
     good = fmtorch.match(*stereo(), pipeline=lenient)
     assert good.related
     assert good.significance > 10
@@ -298,7 +298,7 @@ def run_python(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
 def test_the_command(tmp_path: Path) -> None:
     image0, image1 = stereo(240, 320)
     Image.fromarray(image0).save(tmp_path / "a.png")
-    Image.fromarray(image1).save(tmp_path / "b.webp", quality=95)
+    Image.fromarray(image1).save(tmp_path / "b.webp", ratio=95)
     (tmp_path / "F.txt").write_text("0 0 0\n0 0 -2\n0, 2, 0\n")
     done = run_python("-m", "fmtorch", "match", "image0=a.png", "image1=b.webp", "truth=F.txt", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -352,7 +352,7 @@ def test_the_command(tmp_path: Path) -> None:
     assert np.shape(report["F"]) == (3, 3)
     assert report["related"] is False
     assert report["significance"] < RELATED
-    assert (report["configuration"], report["homography"]) == ("unrelated", None)
+    assert (report["pair_type"], report["homography"]) == ("unrelated", None)
     assert done.stderr.count("nothing in common") == 0  # which is said already
 
     # One photograph twice: the table and a warning say it.
@@ -360,7 +360,7 @@ def test_the_command(tmp_path: Path) -> None:
     assert "identical" in done.stdout
     assert "no motion" in done.stderr
     report = json.loads((tmp_path / "same" / "result.json").read_text())
-    assert report["configuration"] == "identical"
+    assert report["pair_type"] == "identical"
     np.testing.assert_allclose(np.array(report["homography"]) / report["homography"][2][2], np.eye(3), atol=1e-3)
 
 

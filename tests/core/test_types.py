@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from fmtorch.core.types import Correspondences, Estimate, Features, collate, pair_key
 
-PER_MATCH = ("x0", "x1", "mask", "quality", "prior", "lafs0", "lafs1", "mutual", "noise")
+PER_MATCH = ("x0", "x1", "mask", "ratio", "prior", "lafs0", "lafs1", "mutual", "noise")
 
 
 def features(n: int = 5, d: int = 3, seed: int = 0) -> Features:
@@ -29,7 +29,7 @@ def matches(b: int = 4, n: int = 6, seed: int = 0) -> Correspondences:
         x0=torch.rand(b, n, 2, generator=g),
         x1=torch.rand(b, n, 2, generator=g),
         mask=torch.rand(b, n, generator=g) < 0.6,
-        quality=torch.rand(b, n, generator=g),
+        ratio=torch.rand(b, n, generator=g),
         prior=torch.rand(b, n, generator=g),
         lafs0=torch.rand(b, n, 2, 3, generator=g),
         lafs1=torch.rand(b, n, 2, 3, generator=g),
@@ -53,7 +53,7 @@ def estimate(b: int = 4, n: int = 6, seed: int = 0) -> Estimate:
         inliers=torch.rand(b, n, generator=g) < 0.5,
         ok=ok,
         reason=tuple("" if good else f"reason {i}" for i, good in enumerate(ok.tolist())),
-        draws=torch.arange(b) + seed,
+        samples=torch.arange(b) + seed,
         significance=torch.where(ok, torch.rand(b, generator=g, dtype=torch.float64), -torch.inf),
         E=torch.rand(b, 3, 3, generator=g),
         R=torch.rand(b, 3, 3, generator=g),
@@ -64,7 +64,7 @@ def estimate(b: int = 4, n: int = 6, seed: int = 0) -> Estimate:
         covariance=torch.rand(b, 7, 7, generator=g),
         tangents=torch.rand(b, 3, 2, generator=g),
         covariance_F=torch.rand(b, 9, 9, generator=g),
-        configuration_index=torch.arange(b) % 5,
+        pair_type_index=torch.arange(b) % 5,
         homography=torch.rand(b, 3, 3, generator=g),
         other_R=torch.rand(b, 3, 3, generator=g),
         other_t=torch.rand(b, 3, generator=g),
@@ -200,7 +200,7 @@ def test_correspondences_defaults() -> None:
     assert c.keys.tolist() == [0, 0]
     assert c.keys.dtype == torch.int64
     assert c.count().tolist() == [3, 3]
-    assert all(getattr(c, f) is None for f in ("quality", "prior", "lafs0", "lafs1", "size0", "size1", "K0", "K1"))
+    assert all(getattr(c, f) is None for f in ("ratio", "prior", "lafs0", "lafs1", "size0", "size1", "K0", "K1"))
     assert same(c[0].to("cpu").compact(), c[:1])
 
 
@@ -214,13 +214,13 @@ def test_keep_only_ever_removes() -> None:
 def test_compact_known_answer() -> None:
     x = torch.arange(8.0).reshape(2, 4, 1).expand(-1, -1, 2)
     mask = torch.tensor([[False, True, False, True], [False, False, True, False]])
-    c = Correspondences(x, -x, mask, quality=x[..., 0]).compact()
+    c = Correspondences(x, -x, mask, ratio=x[..., 0]).compact()
     assert c.x0.shape == (2, 2, 2)
     assert c.mask.tolist() == [[True, True], [True, False]]
     assert c.x0[0, :, 0].tolist() == [1, 3]
     assert c.x0[1, 0].tolist() == [6, 6]
     assert c.x1[0, :, 1].tolist() == [-1, -3]
-    assert c.quality[0].tolist() == [1, 3]
+    assert c.ratio[0].tolist() == [1, 3]
 
 
 def _survivors(c: Correspondences) -> list[dict[str, torch.Tensor]]:

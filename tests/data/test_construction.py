@@ -141,7 +141,7 @@ def test_a_finished_set_is_not_made_again_and_another_is_refused(
     [
         (["output=null"], "output is missing; it names the folder of the set that is made"),
         (["count=0"], "count=0; it must be a whole number of at least 1 or null"),
-        (["quality=101"], "quality=101; it must be a whole number from 1 to 100"),
+        (["ratio=101"], "ratio=101; it must be a whole number from 1 to 100"),
         (
             ["dataset=stereo", "dataset.root=null"],
             "dataset=stereo has no candidates to judge; it must be one of tum, kitti, colmap",
@@ -208,7 +208,7 @@ def test_undistorted_images_are_written_as_they_are_seen(tmp_path: Path, monkeyp
 
     monkeypatch.setattr("fmtorch.data.construction.matchable", lambda *_: True)
     dataset = load("colmap", root=write_colmap(tmp_path / "Source/scene"), pairs=None)
-    construction = Construction(dataset, tmp_path / "Made", quality=100)  # type: ignore[arg-type]
+    construction = Construction(dataset, tmp_path / "Made", ratio=100)  # type: ignore[arg-type]
     construction.begin()
     for number, ranks in blocks(construction.order()):
         construction.judge(number, ranks)

@@ -16,7 +16,7 @@ def test_is_a_minimum_of_the_weighted_loss(loss: str) -> None:
     c = collate([scene(i, 150, outliers=0.05) for i in range(3)])
     estimate = IterativelyReweighted(loss=loss, threshold=2.0, refine_iterations=60)(c)
     assert bool(estimate.ok.all())
-    assert bool((estimate.draws == 0).all())
+    assert bool((estimate.samples == 0).all())
     prior = c.prior
 
     def cost(F: torch.Tensor, i: int) -> float:
@@ -29,7 +29,7 @@ def test_is_a_minimum_of_the_weighted_loss(loss: str) -> None:
 
 
 def test_an_annealed_loss_is_not_caught_where_a_narrow_one_is() -> None:
-    pairs = collate([scene(i, 150, outliers=0.3) for i in range(40)]).replace(prior=None, quality=None)
+    pairs = collate([scene(i, 150, outliers=0.3) for i in range(40)]).replace(prior=None, ratio=None)
     near = []
     for options in ({}, {"start_scale": 1e-9}):
         estimate = IterativelyReweighted(loss="truncated", threshold=1.0, **options)(pairs)
@@ -43,12 +43,12 @@ def test_the_prior_and_the_quality_decide_where_there_are_more_outliers_than_inl
         name: int(IterativelyReweighted(loss="geman_mcclure", threshold=1.0)(c).inliers.sum())
         for name, c in {
             "prior": pairs,
-            "quality": pairs.replace(prior=None),
-            "nothing": pairs.replace(prior=None, quality=None),
+            "ratio": pairs.replace(prior=None),
+            "nothing": pairs.replace(prior=None, ratio=None),
         }.items()
     }
     assert inliers["prior"] > 1.2 * inliers["nothing"]
-    assert inliers["quality"] > 1.2 * inliers["nothing"]
+    assert inliers["ratio"] > 1.2 * inliers["nothing"]
 
 
 @pytest.mark.parametrize(

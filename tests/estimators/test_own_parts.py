@@ -87,7 +87,9 @@ def test_parts_that_do_as_the_built_in_ones_give_the_same_bits(parts: dict[str, 
         presets.build("estimator", "msac")(scenes(), 3),
     )
     assert bool(builtin.ok.all())
-    assert_same(*({name: getattr(e, name) for name in ("F", "inliers", "ok", "draws")} for e in (own, builtin)), "msac")
+    assert_same(
+        *({name: getattr(e, name) for name in ("F", "inliers", "ok", "samples")} for e in (own, builtin)), "msac"
+    )
 
 
 def test_parts_are_named_as_targets() -> None:
@@ -165,7 +167,7 @@ def compared(preset: str) -> None:
     threshold = {} if preset == "msac" else {"threshold": None}
     own = presets.build("estimator", preset, score=score, sampler=AllAlike(), inliers=Within2Px(), **threshold)
     estimators = own, presets.build("estimator", preset)
-    draws, fastest = [int(estimator(c).draws) for estimator in estimators], [math.inf, math.inf]
+    draws, fastest = [int(estimator(c).samples) for estimator in estimators], [math.inf, math.inf]
     for _ in range(20):
         for k, estimator in enumerate(estimators):
             start = time.process_time()

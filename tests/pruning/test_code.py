@@ -42,14 +42,14 @@ def warped(seed: int, n: int, outliers: float, noise: float = 0.5) -> tuple[Corr
         return torch.from_numpy(value.astype(np.float32))[None]
 
     c = Correspondences(
-        tensor(x0), tensor(x1), torch.ones(1, n, dtype=torch.bool), quality=tensor(ratio),
+        tensor(x0), tensor(x1), torch.ones(1, n, dtype=torch.bool), ratio=tensor(ratio),
         lafs0=tensor(frames(x0, S0)), lafs1=tensor(frames(x1, S1)),
     )  # fmt: skip
     return c, torch.from_numpy(~wrong)
 
 
 def run(c: Correspondences) -> Tensor:
-    return code(c.x0, c.x1, mask=c.mask, quality=c.quality, lafs0=c.lafs0, lafs1=c.lafs1)[0]
+    return code(c.x0, c.x1, mask=c.mask, ratio=c.ratio, lafs0=c.lafs0, lafs1=c.lafs1)[0]
 
 
 def domain_of(c: Correspondences) -> tuple:

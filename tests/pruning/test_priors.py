@@ -32,13 +32,13 @@ def test_calibration_uses_the_ratio_where_there_is_one() -> None:
     c = scene(0, 30).replace(prior=None)
     evidence = torch.rand(1, 30, generator=torch.Generator().manual_seed(0))
     both = Calibration({"constant": -1.0, "evidence": 3.0, "ratio": -2.0}, {"constant": -2.0, "evidence": 4.0})
-    with_ratio, alone = both(c, evidence).prior, both(c.replace(quality=None), evidence).prior
-    assert torch.equal(with_ratio, logistic(-1 + 3 * evidence - 2 * c.quality))
+    with_ratio, alone = both(c, evidence).prior, both(c.replace(ratio=None), evidence).prior
+    assert torch.equal(with_ratio, logistic(-1 + 3 * evidence - 2 * c.ratio))
     assert torch.equal(alone, logistic(-2 + 4 * evidence))
-    unknown = c.quality.clone()
+    unknown = c.ratio.clone()
     unknown[0, 3] = torch.nan
-    assert both(c.replace(quality=unknown), evidence).prior[0, 3] == logistic(-3 + 3 * evidence[0, 3])
-    assert Calibration(both.with_ratio)(c.replace(quality=None), evidence).prior is None
+    assert both(c.replace(ratio=unknown), evidence).prior[0, 3] == logistic(-3 + 3 * evidence[0, 3])
+    assert Calibration(both.with_ratio)(c.replace(ratio=None), evidence).prior is None
 
 
 @pytest.mark.parametrize(("angle", "scale"), [(0.0, 1.0), (np.pi / 2, 0.5)])
@@ -67,7 +67,7 @@ def test_priors_follow_the_right_matches_of_a_common_motion() -> None:
     x0, x1 = (x[None].float() for x in moving(0, 1000, outliers=0.5))
     turn = torch.tensor([[0.95, 0.2], [-0.2, 0.95]])
     right = (x1 - x0 @ turn - torch.tensor([30.0, 10.0])).norm(dim=-1)[0] < 3
-    c = scene(0, 1000).replace(x0=x0, x1=x1, quality=None, lafs0=None, lafs1=None, prior=None)
+    c = scene(0, 1000).replace(x0=x0, x1=x1, ratio=None, lafs0=None, lafs1=None, prior=None)
     for name in ("gms:soft=true", "lpm:soft=true", "position_consistency", "code:soft=true"):
         prior = built("pruner", name)(c).prior[0]
         area = (prior[right][:, None] > prior[~right][None]).double().mean()
@@ -121,14 +121,14 @@ def test_gradients_are_finite_beside_padding_and_what_is_no_frame(name: str) -> 
         assert bool((value.grad != 0).any())
 
 
-@pytest.mark.parametrize("given", [("quality", "lafs0", "lafs1"), ("quality",), ()])
+@pytest.mark.parametrize("given", [("ratio", "lafs0", "lafs1"), ("ratio",), ()])
 def test_find_fundamental_derives_the_prior(given: tuple[str, ...]) -> None:
     c, name = scene(2, 120), "frame_consistency" if "lafs0" in given else "position_consistency"
     fields = {field: getattr(c, field) for field in given}
     prior = presets.build("pruner", name)(Correspondences(c.x0, c.x1, c.mask, **fields)).prior
     own = fmtorch.find_fundamental(c.x0, c.x1, **fields)
-    quality = {"quality": c.quality} if given else {}
-    assert torch.equal(own.F, fmtorch.find_fundamental(c.x0, c.x1, prior=prior, **quality).F)
+    ratio = {"ratio": c.ratio} if given else {}
+    assert torch.equal(own.F, fmtorch.find_fundamental(c.x0, c.x1, prior=prior, **ratio).F)
 
 
 @pytest.mark.parametrize(("name", "area"), [("frame_consistency", 0.9), ("position_consistency", 0.88)])

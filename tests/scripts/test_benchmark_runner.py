@@ -119,7 +119,7 @@ def test_what_is_withheld_does_not_reach_the_estimator(monkeypatch: pytest.Monke
     given = item(pair("orbit/0/0"), scene(0, 60))
     specs = ["ransac", "ransac@sizeless", "ransac@ratioless+sizeless"]
     rows = measure([methods.method(spec) for spec in specs], [given], 1, Kept(None))
-    assert [(c.quality is None, c.size0 is None) for c in seen[1::2]] == [(False, False), (False, True), (True, True)]
+    assert [(c.ratio is None, c.size0 is None) for c in seen[1::2]] == [(False, False), (False, True), (True, True)]
     assert len({row["nsgd"] for row in rows}) == 1  # judged with the sizes all the same
 
 

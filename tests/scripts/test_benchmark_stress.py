@@ -53,7 +53,7 @@ def test_right_and_wrong_are_told_by_the_true_matrix() -> None:
     assert base.right[:200].float().mean() > 0.95  # of the right ones those inside image 1 or not: all keep their lines
     assert base.right[210:].float().mean() < 0.05
     assert not (base.right & base.wrong).any()
-    assert (base.spare.quality > 0.8).all()
+    assert (base.spare.ratio > 0.8).all()
     flat = stress_changes.on_plane(base)
     assert flat[150:210].float().mean() > 0.95
     assert flat[:150].float().mean() < 0.5

@@ -207,7 +207,7 @@ def test_without_cameras_nothing_changes() -> None:
     nothing = torch.full((len(c), 2, 2), torch.inf)
     asked = quick("fmtorch")(c.replace(focal=nothing), seed=5)
     for other in (calibrations, asked):
-        for field in ("F", "inliers", "ok", "draws", "significance"):
+        for field in ("F", "inliers", "ok", "samples", "significance"):
             assert torch.equal(getattr(plain, field), getattr(other, field))
     assert plain.focals is None
     assert bool(asked.focals.isfinite().any())
@@ -289,7 +289,7 @@ def test_real_pairs_keep_the_order_of_knowledge() -> None:
     """Exact calibration, 6 % of focal lengths, nothing."""
     errors: dict[str, list[float]] = {"exact": [], "rough": [], "unknown": []}
     for pair, c in castle():
-        given = {name: getattr(c, name) for name in ("mask", "quality", "prior", "noise", "size0", "size1", "key")}
+        given = {name: getattr(c, name) for name in ("mask", "ratio", "prior", "noise", "size0", "size1", "key")}
         K = {"K0": pair.K0, "K1": pair.K1}
         knowledge: dict[str, Any] = {"exact": K, "rough": K | {"focal": 0.06}, "unknown": {"focal": "unknown"}}
         for name, known in knowledge.items():

@@ -185,7 +185,7 @@ def test_a_photographed_wall() -> None:
     text = ElementTree.parse(folder / "H1to3p.xml").getroot().findtext(".//data")
     truth = np.array(str(text).split(), float).reshape(3, 3)
     c = fmtorch.match(a, b, pipeline="sift_fmtorch").correspondences
-    estimate = fmtorch.find_homography(c.x0, c.x1, mask=c.mask, quality=c.quality, prior=c.prior, noise=c.noise)
+    estimate = fmtorch.find_homography(c.x0, c.x1, mask=c.mask, ratio=c.ratio, prior=c.prior, noise=c.noise)
     assert bool(estimate.ok)
     assert corner_error(estimate.H[0], truth) < 5
 
