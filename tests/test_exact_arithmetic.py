@@ -5,8 +5,6 @@ processors; a sum differs where BLAS or LAPACK chooses its order. `fmtorch.geome
 stand for them.
 """
 
-from __future__ import annotations
-
 import ast
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Pruners that take other options for pairs of some families: of one pipeline, in one batch."""
 
-from __future__ import annotations
-
 import functools
 from pathlib import Path
 
@@ -47,8 +45,6 @@ def ratios(pipeline: Pipeline, pairs: list[ImagePair]) -> list[torch.Tensor]:
     ratios = []
     for outcome in pipeline.correspondences(pairs):
         c = outcome.correspondences
-        assert c is not None
-        assert c.ratio is not None
         ratios.append(c.ratio[c.mask])
     return ratios
 
@@ -60,7 +56,6 @@ def test_each_pair_of_a_batch_gets_the_options_of_its_family() -> None:
     limits = (0.5, 0.7, 0.9, 0.5, 0.7)
     for pair, kept, limit in zip(pairs, ratios(pipeline, pairs), limits, strict=True):
         given = matches(int(pair.identity)).correspondences.ratio
-        assert given is not None
         assert torch.equal(kept, given[given < limit])
         assert torch.equal(kept, ratios(pipeline, [pair])[0])
 

@@ -1,7 +1,5 @@
 """Files and functions that fit in the head, in rooms that can be counted."""
 
-from __future__ import annotations
-
 import ast
 from pathlib import Path
 

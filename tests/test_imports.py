@@ -1,7 +1,5 @@
 """Which room may import which, read from the syntax tree of every file, wherever in it an import stands."""
 
-from __future__ import annotations
-
 import ast
 import functools
 import graphlib

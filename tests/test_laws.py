@@ -1,7 +1,5 @@
 """The three laws over every registered pruner, prior and estimator."""
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What is built and installed: the wheel's contents, where it finds its folders, the pinned versions."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

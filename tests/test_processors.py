@@ -4,8 +4,6 @@ The other process compiles kernels for Haswell, into a cache of its own, and has
 for AVX2. docs/concepts/conventions.md says what is promised.
 """
 
-from __future__ import annotations
-
 import os
 import platform
 import subprocess

@@ -1,7 +1,5 @@
 """The road of a pair: few files from `find_fundamental` to the solver, and little else in the process."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

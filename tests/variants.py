@@ -1,7 +1,5 @@
 """Presets, and other methods that an option makes of them, by one word each: ``irls``, ``irls:loss=huber``."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from fmtorch import presets

@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fmtorch.data.images import stored_size
 from fmtorch.data.pairs import GivenMatches, ImagePair, ImageSource, PairDataset
 from fmtorch.data.text_files import DataError
 from fmtorch.io import h5
-from fmtorch.io.given import Array, Size, given, size_of
+from fmtorch.io.given import Array, Size, given
 
 DEPTH = 4  # parts of a path that a name may hold
 
@@ -93,9 +94,13 @@ class HLocMatches:
         order = (1, 0) if self.swapped else (0, 1)
         i, j = _indices(chosen, [len(points[k]) for k in order], f"{self.matches}: {self.key + '/matches0'!r}")
         index = (j, i) if self.swapped else (i, j)
-        ratio = None if scores is None else 1 - scores[i]
+        score = None if scores is None else scores[i]
         return given(
-            points[0][index[0]], points[1][index[1]], (sizes[0], sizes[1]), (len(points[0]), len(points[1])), ratio
+            points[0][index[0]],
+            points[1][index[1]],
+            (sizes[0], sizes[1]),
+            (len(points[0]), len(points[1])),
+            score=score,
         )
 
 
@@ -118,21 +123,21 @@ class PairPrediction:
         with h5.opened(self.path) as file:
             group = file[self.key]
             if h5.holds(group, "matches0"):
-                x, counts, ratio = self._indexed(group)
+                x, counts, score = self._indexed(group)
             else:
-                x, counts, ratio = self._matched(group)
+                x, counts, score = self._matched(group)
             suffixes = ("1", "0") if self.swapped else ("0", "1")
             sizes = [_size(group, f"image_size{s}", image) for s, image in zip(suffixes, self.images, strict=True)]
         order = (1, 0) if self.swapped else (0, 1)
         x0, x1 = (x[k] - self.origin for k in order)
-        return given(x0, x1, (sizes[0], sizes[1]), (counts[order[0]], counts[order[1]]), ratio)
+        return given(x0, x1, (sizes[0], sizes[1]), (counts[order[0]], counts[order[1]]), score=score)
 
     def _indexed(self, group: Any) -> tuple[list[Array], list[int], Array | None]:
         points = [h5.numbers(group, f"keypoints{k}", None, 2) for k in (0, 1)]
         chosen, scores = _read_indices(group, self.path, "")
         counts = [len(p) for p in points]
         i, j = _indices(chosen, counts, f"{self.path}: {self.key + '/matches0'!r}")
-        return [points[0][i], points[1][j]], counts, None if scores is None else 1 - scores[i]
+        return [points[0][i], points[1][j]], counts, None if scores is None else scores[i]
 
     def _matched(self, group: Any) -> tuple[list[Array], list[int], Array | None]:
         x = [h5.numbers(group, f"matched_kpts{k}", None, 2) for k in (0, 1)]
@@ -140,14 +145,14 @@ class PairPrediction:
             raise DataError(
                 f"{self.path}: {self.key!r} has {len(x[0])} points in matched_kpts0 and {len(x[1])} in matched_kpts1"
             )
-        ratio = None
+        score = None
         if h5.holds(group, "matched_confidences"):
-            ratio = 1 - h5.numbers(group, "matched_confidences", len(x[0]))
+            score = h5.numbers(group, "matched_confidences", len(x[0]))
         counts = [len(p) for p in x]
         for k in (0, 1):
             if h5.holds(group, f"all_kpts{k}"):
                 counts[k] = len(h5.array(group, f"all_kpts{k}", None, 2))
-        return x, counts, ratio
+        return x, counts, score
 
 
 def hloc_pairs(truth: PairDataset, features: Path, matches: Path, origin: float) -> Iterator[ImagePair]:
@@ -258,7 +263,7 @@ def _size(file: Any, key: str, image: ImageSource) -> Size:
     if h5.holds(file, key):
         width, height = h5.reshaped(file, key, 2)
         return int(height), int(width)
-    size = size_of(image)
+    size = stored_size(image.path)
     if size is None:
         raise DataError(f"{file.file.filename}: {key!r} is missing, and image {image.path} cannot be read either")
     return size

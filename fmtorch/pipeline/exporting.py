@@ -106,7 +106,7 @@ def _pair(
 ) -> StoredPair:  # fmt: skip
     """The surviving matches of one pair, as the matcher left them, as indices of the images' points.
 
-    Scores are one less the matcher's figure, a ratio, and 1 where there is none. Raises ValueError for matches that are
+    Scores are the matcher's, or 1 - ratio, and 1 where there is neither. Raises ValueError for matches that are
     at no keypoint.
     """
     mask = c.mask[0].cpu()
@@ -114,8 +114,8 @@ def _pair(
         indices(keypoints, x[0].detach().cpu().float()[mask].numpy())
         for keypoints, x in zip(points, (c.x0, c.x1), strict=True)
     ]
-    ratio = torch.zeros(len(mask)) if c.ambiguity is None else c.ambiguity[0].detach().cpu().float()
-    scores = (1 - ratio[mask]).nan_to_num(0.0).clamp(0.0, 1.0)
+    ambiguity = torch.zeros(len(mask)) if c.ambiguity is None else c.ambiguity[0].detach().cpu().float()
+    scores = (1 - ambiguity[mask]).nan_to_num(0.0).clamp(0.0, 1.0)
     return StoredPair(
         *names, np.stack(index, -1).astype(np.int32), scores.numpy(), inliers.cpu()[mask].numpy(),
         F.detach().cpu().double().numpy(), related,

@@ -1,7 +1,5 @@
 """The doors of the commands: one name each in `python -m`, in the console script and in Python."""
 
-from __future__ import annotations
-
 import importlib
 import os
 import subprocess
@@ -18,7 +16,7 @@ from fmtorch.commands.config import hydra_arguments
 from fmtorch.commands.options import COMMANDS
 from fmtorch.presets import available
 from tests.conftest import own_cache
-from tests.pipeline.test_pipeline import draw
+from tests.helpers import draw
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 

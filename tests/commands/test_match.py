@@ -1,7 +1,5 @@
 """Two photographs: the function, the command, and the name `fmtorch.match` that both have."""
 
-from __future__ import annotations
-
 import json
 import math
 import os
@@ -92,7 +90,6 @@ def test_equal_to_the_pipeline_on_files(pipeline: fmtorch.pipeline.pipeline.Pipe
     assert torch.equal(by_path.F, by_array.F)
     source = [fmtorch.data.ImageSource(f"{i}", tmp_path / f"{i}.png") for i in (0, 1)]
     outcome = pipeline.correspondences([fmtorch.data.ImagePair("p", "f", "s", *source, ROWS)])[0]
-    assert outcome.correspondences is not None
     # Correspondences do not depend on the pair's key, which the pipeline hashes from its identity.
     assert torch.equal(outcome.correspondences.x0, by_path.correspondences.x0)
     grey = fmtorch.match(*(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in images), pipeline=pipeline)
@@ -214,7 +211,6 @@ def test_photographs_that_determine_no_f(pipeline: fmtorch.pipeline.pipeline.Pip
         result = fmtorch.match(image, second, pipeline=pipeline, longest_side=800)
         assert result.pair_type == kind
         assert result.warning == WARNINGS[kind] or "no motion" in result.warning
-        assert result.homography is not None
         corners = torch.tensor([[0.0, 0], [w, 0], [w, h], [0, h]], dtype=torch.float64)
         off = homography_points(result.homography, corners) - homography_points(torch.from_numpy(H), corners)
         assert off.abs().max() < 6  # px of 1536 x 1024

@@ -1,7 +1,5 @@
 """`fmtorch.match` and its command with what is known of the cameras: poses of real photographs."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path
@@ -42,19 +40,15 @@ def matched(pair: ImagePair, pipeline: Pipeline, **cameras: object) -> fmtorch.M
 
 def error(result: fmtorch.MatchResult, pair: ImagePair) -> float:
     """The larger angle of the pose error, with the sign of t, in degrees."""
-    assert result.R is not None
-    assert result.t is not None
     R, t = (torch.from_numpy(np.array(value)) for value in (pair.R, pair.t))
     return float(pose_error(result.R.double(), result.t.double(), R, t, up_to_sign=False).worst)
 
 
 def test_the_pose_of_reduced_photographs_by_what_is_known(pair: ImagePair, pipeline: Pipeline) -> None:
-    assert pair.K0 is not None
     focal = math.sqrt(pair.K0[0, 0] * pair.K0[1, 1])
     plain = matched(pair, pipeline)
     assert plain.R is plain.t is plain.focals is None
     known = matched(pair, pipeline, K0=pair.K0, K1=pair.K1)
-    assert known.R is not None
     assert error(known, pair) < 0.5
     assert known.focals.tolist() == pytest.approx([focal, focal], rel=1e-6)  # in pixels of the photographs
     assert known.R.double() @ known.R.double().T == pytest.approx(np.eye(3), abs=1e-6)
@@ -71,8 +65,6 @@ def test_the_pose_of_reduced_photographs_by_what_is_known(pair: ImagePair, pipel
 
 def test_calibrations_follow_the_reduction(pair: ImagePair, pipeline: Pipeline) -> None:
     """Reduced by hand, with K scaled by hand, everything is the same."""
-    assert pair.K0 is not None
-    assert pair.K1 is not None
     images = [fmtorch.data.read_image(image) for image in (pair.image0, pair.image1)]
     small = [cv2.resize(image, (768, 512), interpolation=cv2.INTER_AREA) for image in images]
     half = np.array([[0.5, 0, -0.25], [0, 0.5, -0.25], [0, 0, 1]])
@@ -107,8 +99,6 @@ def photographed(image: np.ndarray, lens: Lens) -> np.ndarray:
 def test_a_lens_bends_points_and_not_images(pair: ImagePair, pipeline: Pipeline) -> None:
     """Photographs through a lens that distorts: F and the pose are those of pinholes, points those of photographs."""
     K0, K1 = pair.K0, pair.K1
-    assert K0 is not None
-    assert K1 is not None
     lenses = [Lens(K[0, 0], K[1, 1], K[0, 2], K[1, 2], "OPENCV", BENT) for K in (K0, K1)]
     plain = [fmtorch.data.read_image(image) for image in (pair.image0, pair.image1)]
     bent = [photographed(image, lens) for image, lens in zip(plain, lenses, strict=True)]
@@ -120,7 +110,6 @@ def test_a_lens_bends_points_and_not_images(pair: ImagePair, pipeline: Pipeline)
     assert torch.equal(result.correspondences.x0, ignored.correspondences.x0)
     assert ignored.undistorted is None
     assert error(result, pair) < 0.5 < error(ignored, pair)
-    assert result.undistorted is not None
     x0, x1 = (x[0][result.inliers].double() for x in (result.undistorted.x0, result.undistorted.x1))
     expected = undistorted_points(lens0, result.correspondences.x0[0][result.inliers].numpy())
     np.testing.assert_allclose(x0.numpy(), expected, atol=1e-3)
@@ -195,7 +184,6 @@ def test_a_pose_that_is_not_determined_is_said(pair: ImagePair, pipeline: Pipeli
     assert pose_report(nothing) == {}
     known = matched(pair, pipeline, K0=pair.K0, K1=pair.K1)
     assert pose_report(known)["R"] == known.R.tolist()
-    assert pair.R is not None
     angle = math.degrees(math.acos((np.trace(pair.R) - 1) / 2))
     shown = pose_line(known)
     assert float(shown.split()[1].rstrip("°,")) == pytest.approx(angle, abs=0.5)
@@ -203,7 +191,6 @@ def test_a_pose_that_is_not_determined_is_said(pair: ImagePair, pipeline: Pipeli
 
 
 def test_the_command(pair: ImagePair, tmp_path: Path) -> None:
-    assert pair.K0 is not None
     fx, fy, cx, cy = pair.K0[[0, 1, 0, 1], [0, 1, 2, 2]]
     arguments = (str(pair.image0.path), str(pair.image1.path), "pipeline=sift_fmtorch", f"longest_side={SIDE}")
     K = f"K={fx},{fy},{cx},{cy}"

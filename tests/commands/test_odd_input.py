@@ -1,7 +1,5 @@
 """Commands given what they cannot use: one line that names it, before any work is done."""
 
-from __future__ import annotations
-
 import os
 import shlex
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The command that compares runs on one page: figures as computed by hand, pictures, nothing taken on trust."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import re
@@ -25,8 +23,7 @@ from fmtorch.evaluation.summary import summarize
 from fmtorch.pipeline.build import build_pipeline
 from fmtorch.pipeline.pipeline import Outcome
 from fmtorch.runs import PairRow, RunFolder, RunFolderError, to_table
-from tests.helpers import compose
-from tests.pipeline.test_pipeline import draw, pair
+from tests.helpers import compose, draw, pair
 from tests.processes import run_command
 
 OPTIONS = {

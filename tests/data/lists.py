@@ -1,7 +1,5 @@
 """Lists of pairs in others' layouts, of a scene of shared photographs with known cameras."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

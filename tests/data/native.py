@@ -1,7 +1,5 @@
 """Small native data sets for the tests: cameras on a path, images of noise, files as the sources describe them."""
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 

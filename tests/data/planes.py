@@ -1,7 +1,5 @@
 """A small HPatches: shared photographs seen as planes, in the layout of the released sequences."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The reader of Bundler files, on one written from the manual, and on damaged ones."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 
@@ -35,7 +33,6 @@ def test_points_are_where_the_manual_puts_them(tmp_path: Path) -> None:
         ideal = X @ view.K.T
         ideal = ideal[:, :2] / ideal[:, 2:]
         np.testing.assert_allclose(ideal, manuals_pixels(camera, h, w, distorted=False), atol=1e-9)
-        assert view.image.lens is not None
         np.testing.assert_allclose(
             view.image.lens.distort(ideal), manuals_pixels(camera, h, w, distorted=True), atol=1e-9
         )

@@ -1,7 +1,5 @@
 """Which pairs are looked at, against slow counting."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

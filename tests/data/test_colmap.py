@@ -1,7 +1,5 @@
 """The readers of COLMAP models: on a real scene, against pycolmap, text against binary, and on damaged files."""
 
-from __future__ import annotations
-
 import dataclasses
 import struct
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Focal lengths from EXIF data: the conventions, what is refused, and files that are damaged."""
 
-from __future__ import annotations
-
 import math
 import struct
 from pathlib import Path

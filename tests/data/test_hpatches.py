@@ -1,7 +1,5 @@
 """HPatches' sequences: true homographies of images as they are read, and what one bad pair becomes."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2
@@ -23,7 +21,6 @@ def test_pairs_are_image_1_with_the_others(tmp_path: Path) -> None:
     assert HPatchesPairs.model == "homography"
     for k, pair in enumerate(list(dataset)[5:], start=2):
         H = planes.view(k) / np.linalg.norm(planes.view(k))
-        assert pair.H is not None
         np.testing.assert_allclose(pair.H, H, atol=1e-8)
         assert not pair.F.any()
         assert read_image(pair.image0).shape == (*planes.SIZE, 3)
@@ -35,7 +32,6 @@ def test_homographies_are_of_the_images_as_they_are_read(tmp_path: Path) -> None
     for pair in dataset:
         a, b = (read_image(image) for image in (pair.image0, pair.image1))
         assert a.shape[:2] == b.shape[:2] == (200, 300)
-        assert pair.H is not None
         warped = cv2.warpPerspective(a, pair.H, (300, 200)).astype(float)
         seen = (
             cv2.erode(cv2.warpPerspective(np.full((200, 300), 255, np.uint8), pair.H, (300, 200)), np.ones((9, 9))) > 0

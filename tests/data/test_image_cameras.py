@@ -1,7 +1,5 @@
 """Cameras of photographs by name: COLMAP's models and JSON files."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -23,7 +21,6 @@ def test_a_model_by_its_folder_and_by_its_file(binary: bool, tmp_path: Path) -> 
         cameras = ImageCameras(path)
         assert cameras.of(images / "00.png") == (Lens(40.0, 40.0, 15.5, 11.5, "SIMPLE_PINHOLE"), SIZE)
         lens, _ = cameras.of(images / "02.png")
-        assert lens is not None
         assert (lens.model, lens.bends) == ("OPENCV", True)
         assert cameras.of(images / "night walk" / "01.png").lens == Lens(40.0, 41.0, 15.5, 11.5, "PINHOLE")
         with pytest.raises(DataError, match=r"no camera of .*x01.png; it has those of 3 images: 00.png"):

@@ -1,7 +1,5 @@
 """The reader of KITTI odometry: against the FM-Bench copy of the same frames, and on damaged files."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Lens models against their definitions, OpenCV and COLMAP; undistorted images against what a pinhole sees."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Arrays of pickled objects, read without running what the pickle names."""
 
-from __future__ import annotations
-
 import os
 import pickle
 import zipfile

@@ -1,7 +1,5 @@
 """Overlap by depth and by points, against slow counting; pairs selected by it."""
 
-from __future__ import annotations
-
 import functools
 import itertools
 import json
@@ -54,8 +52,6 @@ def one_by_one(dataset: RenderedScenePairs, scene: int, i: int, j: int) -> float
 
     shares = []
     for first, second in ((a, b), (b, a)):
-        assert first.image.size is not None
-        assert second.image.size is not None
         R = second.R @ first.R.T
         shares.append(
             reference.share(
@@ -88,8 +84,6 @@ def test_a_grid_of_pixels_stands_for_all_of_them(rendered: RenderedScenePairs) -
     overlaps = DepthOverlap(rendered)
     a, b = (overlaps._seen(rendered.scenes[scene].views[k]) for k in (i, j))
     pair = rendered[0]
-    assert pair.R is not None
-    assert pair.t is not None
     # A share of n pixels has a standard error of at most 0.5 / sqrt(n) where they are drawn; a grid's is smaller.
     error = 0.5 / np.sqrt(a.size[0] * a.size[1] / STEP**2)
     assert abs(seen_share(a, b, pair.R, pair.t) - seen_share(a, b, pair.R, pair.t, step=1)) < 2 * error

@@ -1,7 +1,5 @@
 """Lists of pairs of others: true F, K and pose of each form, what is refused, and what one bad pair becomes."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -51,10 +49,6 @@ def test_cameras_are_those_of_the_list(form: str, tmp_path: Path) -> None:
     for pair, (i, j) in zip(dataset, PAIRS, strict=True):
         K0, K1, T = lists.cameras()[i][0], lists.cameras()[j][0], lists.motion(lists.cameras()[i], lists.cameras()[j])
         assert pair.problem is None
-        assert pair.K0 is not None
-        assert pair.K1 is not None
-        assert pair.R is not None
-        assert pair.t is not None
         np.testing.assert_allclose(pair.K0, K0, atol=1e-9)
         np.testing.assert_allclose(pair.K1, K1, atol=1e-9)
         np.testing.assert_allclose(pair.R, T[:3, :3], atol=1e-6)  # the cameras' own rotations are rounded
@@ -109,8 +103,6 @@ def test_resizing_by_one_number_and_by_two(tmp_path: Path) -> None:
     assert max(read_image(small[0].image1).shape) == 320
     h, w = read_image(stored[0].image0).shape[:2]
     K, K_fixed = stored[0].K0, fixed[0].K0
-    assert K is not None
-    assert K_fixed is not None
     np.testing.assert_allclose(K_fixed[0, 0] / K[0, 0], 160 / w)
     np.testing.assert_allclose((K_fixed[1, 2] + 0.5) / (K[1, 2] + 0.5), 120 / h)
 
@@ -118,7 +110,6 @@ def test_resizing_by_one_number_and_by_two(tmp_path: Path) -> None:
 def test_origin_moves_the_principal_point(tmp_path: Path) -> None:
     file = lists.write(tmp_path / "list.txt", [lists.glue_factory(0, 1, corner=0.0)])
     (pair,) = load("pair_list", root=lists.images(), file=file, origin=0.0)
-    assert pair.K0 is not None
     np.testing.assert_allclose(pair.K0, lists.cameras()[0][0])
 
 
@@ -149,24 +140,18 @@ def test_scannet_by_numbers(tmp_path: Path, with_motion: bool) -> None:
     root, file = scannet(tmp_path, with_motion, with_intrinsics=True)
     (pair,) = load("pair_list", root=root, file=file)
     T = lists.motion(*lists.cameras()[:2])
-    assert pair.R is not None
-    assert pair.t is not None
-    assert pair.K0 is not None
     np.testing.assert_allclose(pair.R, T[:3, :3], atol=1e-6)
     np.testing.assert_allclose(pair.t, T[:3, 3], atol=1e-6)
     assert read_image(pair.image0).shape[:2] == (480, 640)  # to which K belongs
     assert pair.K0[0, 0] == 577
     assert pair.scene == "test"
     (larger,) = load("pair_list", root=root, file=file, resize=[1280, 960])
-    assert larger.K0 is not None
     assert larger.K0[0, 0] == pytest.approx(2 * 577)
 
 
 def test_scannet_by_the_scenes_own_calibration(tmp_path: Path) -> None:
     root, file = scannet(tmp_path, True, with_intrinsics=False)
     (stored,), (small,) = (load("pair_list", root=root, file=file, resize=size) for size in (None, [648, 484]))
-    assert stored.K0 is not None
-    assert small.K0 is not None
     assert read_image(stored.image0).shape[:2] == (968, 1296)
     assert stored.K0[0, 0] == 1170
     assert small.K0[0, 0] == pytest.approx(585)
@@ -213,7 +198,6 @@ def test_one_bad_pair_has_a_problem(line: Callable[[], str], problem: str, tmp_p
     assert first.problem is None
     assert third.problem is None
     assert third.identity.startswith(f"{first.identity}#")
-    assert second.problem is not None
     assert re.search(problem, second.problem), second.problem
 
 
@@ -265,5 +249,4 @@ def test_pairs_of_megadepth_that_do_not_fit_are_named(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"a\.npz, pair 0: images 1 and 100; there are 11"):
         load("pair_list", root=lists.images(), file=file)
     (pair,) = load("pair_list", root=lists.images(), file=lists.loftr(tmp_path / "b.npz", [(0, -1)]))
-    assert pair.problem is not None
     assert pair.problem.startswith(f"{tmp_path / 'b.npz'}, pair 0: no image")

@@ -1,7 +1,5 @@
 """Images resized and turned: where pixels go, and what becomes of the camera."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

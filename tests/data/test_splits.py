@@ -1,7 +1,5 @@
 """The paper's splits: no sequence in both, and the files of conf/dataset take the same options as the readers."""
 
-from __future__ import annotations
-
 import inspect
 
 import pytest

@@ -1,7 +1,5 @@
 """Some pairs of a data set, as a data set of their own."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The reader of TUM RGB-D: on real frames, on a known path, and on damaged files."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 
@@ -61,9 +59,7 @@ def test_poses_are_interpolated_to_the_time_of_the_frame(tmp_path: Path) -> None
         np.testing.assert_allclose(-view.R.T @ view.t, [time, 0.5, 1], atol=1e-4)  # poses are written to 0.1 mm
         np.testing.assert_allclose(view.R.T, turned(time), atol=1e-5)
     pair = dataset[0]
-    assert pair.K0 is not None
     np.testing.assert_array_equal(pair.K0, [[517.3, 0, 318.6], [0, 516.5, 255.3], [0, 0, 1]])
-    assert pair.R is not None
     np.testing.assert_allclose(pair.R, turned(-0.1), atol=1e-5)
     # a world point, seen by both
     X = np.array([0.3, 0.1, 4.0])
@@ -86,7 +82,6 @@ def test_the_camera_is_told_by_the_name(tmp_path: Path) -> None:
     )
     assert two.image0.lens == CALIBRATIONS["freiburg2"]
     assert three.image0.lens is None  # published undistorted
-    assert three.K0 is not None
     assert three.K0[0, 0] == 535.4
     with pytest.raises(DataError, match=r"mine: its name tells no camera; dataset\.camera must be one of freiburg1"):
         load("tum", root=tmp_path, sequences=["mine"])

@@ -1,7 +1,5 @@
 """Points without distortion: the inverse of each lens model, beside COLMAP's, and frames by its derivatives."""
 
-from __future__ import annotations
-
 import functools
 
 import numpy as np

@@ -1,7 +1,5 @@
 """docs/architecture.md tells the rules of the rooms as they are; tests/test_road.py holds its road of a pair."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

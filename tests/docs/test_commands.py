@@ -4,8 +4,6 @@ A command runs as it stands there, but for the words that `smaller` exchanges; a
 that take long run with ``-m slow``.
 """
 
-from __future__ import annotations
-
 import contextlib
 import importlib.util
 import os
@@ -26,9 +24,9 @@ from hydra.core.global_hydra import GlobalHydra
 from fmtorch import data
 from fmtorch.data import read_image
 from tests.conftest import own_cache
-from tests.pipeline import databases, test_verification_hloc, test_verification_matches
+from tests.io import writers
 from tests.processes import run_command
-from tests.storage.exchange import writers
+from tests.verification import databases, test_hloc, test_matches
 
 SOURCE = Path(__file__).resolve().parents[2]
 PAGES = [
@@ -197,8 +195,8 @@ def workplace(tmp_path_factory: pytest.TempPathFactory) -> Path:
         writers.WRITERS[layout](folder / "FILES" / layout)
     writers.truth(folder / "SET")
     databases.write(folder / "database.db", databases.scene(3))
-    test_verification_hloc.write(folder, databases.scene(3))
-    np.savez(folder / "matches.npz", **dict(zip(("x0", "x1"), test_verification_matches.points()[0], strict=True)))
+    test_hloc.write(folder, databases.scene(3))
+    np.savez(folder / "matches.npz", **dict(zip(("x0", "x1"), test_matches.points()[0], strict=True)))
     (folder / "my_conf" / "estimator").mkdir(parents=True)
     yaml = re.findall(
         r"```yaml\n# my_conf/estimator/mine.yaml\n(.*?)```", (SOURCE / "README.md").read_text(), re.DOTALL

@@ -1,7 +1,5 @@
 """Names between backquotes in docstrings and pages exist: modules, functions, classes, options of presets, files."""
 
-from __future__ import annotations
-
 import ast
 import builtins
 import functools

@@ -1,7 +1,5 @@
 """The notebooks run, cell after cell, on small rendered scenes, and their results are sound."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The parts of docs/guides/own_parts.md, saved in an empty folder, are evaluated by its command, together and alone."""
 
-from __future__ import annotations
-
 import json
 import re
 import shlex

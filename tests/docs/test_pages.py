@@ -1,7 +1,5 @@
 """Pages: examples give what they say, links lead somewhere, pages are short, generated ones are current."""
 
-from __future__ import annotations
-
 import csv
 import doctest
 import importlib

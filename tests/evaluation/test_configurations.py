@@ -1,7 +1,5 @@
 """Rows, summaries and reports with configurations, warnings and the errors of focal lengths."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable
@@ -26,7 +24,7 @@ from fmtorch.io.dataset import H5Pairs
 from fmtorch.pipeline.pipeline import Outcome, Pipeline, examined
 from fmtorch.runs import PairRow, to_table
 from tests.geometry.kinds import K, batch, draw
-from tests.storage.exchange import writers
+from tests.io import writers
 
 
 def unused(*_: object) -> None:
@@ -73,12 +71,10 @@ def test_rows_say_which_configuration_and_neighbours_change_nothing(word: str | 
 def test_a_pair_that_cannot_be_examined_harms_no_other() -> None:
     built = pipeline()
     outcomes = built.run([pair("general"), pair("planar")])
-    assert outcomes[0].estimate is not None
     broken = dataclasses.replace(outcomes[0], estimate=outcomes[0].estimate.replace(model="homography"))
     results = examined(built, [broken, outcomes[1]])
     assert [o.pair_type is None for o in results] == [True, False]
     first, second = evaluate([dataclasses.replace(results[0], estimate=outcomes[0].estimate), results[1]])
-    assert first.warning is not None
     assert first.warning.startswith("not examined: ValueError: estimate is of homography matrices")
     assert second.pair_type == "planar"
 
@@ -88,7 +84,6 @@ def test_calibrations_count_only_where_the_estimator_was_given_them() -> None:
     long = np.diag([8.0, 8.0, 1.0]) @ K
     long[:2, 2] = K[:2, 2]
     turned = pair("rotation")
-    assert turned.matches is not None
     c, _ = turned.matches()
     angle = 0.05
     R = np.array([[math.cos(angle), 0, math.sin(angle)], [0, 1, 0], [-math.sin(angle), 0, math.cos(angle)]])
@@ -104,7 +99,6 @@ def test_calibrations_count_only_where_the_estimator_was_given_them() -> None:
 def estimated(c: Correspondences, focals: list[float], true: tuple[np.ndarray | None, np.ndarray | None]) -> Outcome:
     source = pair("general")
     outcome = pipeline().run([source])[0]
-    assert outcome.estimate is not None
     estimate = outcome.estimate.replace(focals=torch.tensor([focals], dtype=torch.float64))
     return dataclasses.replace(
         outcome, pair=dataclasses.replace(source, K0=true[0], K1=true[1]), correspondences=c, estimate=estimate
@@ -114,7 +108,6 @@ def estimated(c: Correspondences, focals: list[float], true: tuple[np.ndarray | 
 def test_errors_of_focal_lengths() -> None:
     """Known answers: 10 % too long, not determined, given exactly, without truth, of pixels that are not square."""
     source = pair("general")
-    assert source.matches is not None
     c, _ = source.matches()
     asked = c.replace(focal=torch.tensor([[[1.0, torch.inf], [1.0, torch.inf]]], dtype=torch.float64))
     focals = focal_errors(estimated(asked, [1.1 * 768, math.nan], (K, K)))
@@ -133,7 +126,6 @@ def test_figures_of_focal_lengths() -> None:
     errors = np.array([[0.02, 0.08], [0.3, np.inf], [np.nan, np.nan], [np.nan, np.nan]])
     ratios = np.log(np.array([[1.02, 0.92], [1.3, np.nan], [np.nan, np.nan], [np.nan, np.nan]]))
     figures = focal_figures(errors, ratios, np.array([True, True, True, False]))
-    assert figures is not None
     assert figures["images"] == 6  # two of a failed pair
     assert figures["error"] is None  # more than half are misses
     assert (figures["within_5"], figures["within_10"]) == (1 / 6, 2 / 6)

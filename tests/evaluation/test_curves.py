@@ -1,7 +1,5 @@
 """Recall curves: what they show, of which pairs, in a page and in a file of their own."""
 
-from __future__ import annotations
-
 import re
 from xml.etree import ElementTree
 

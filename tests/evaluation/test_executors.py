@@ -1,7 +1,5 @@
 """Runs by threads, processes, a cluster of dask and anybody's executor: the same rows, whatever dies meanwhile."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import functools

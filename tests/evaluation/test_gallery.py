@@ -1,7 +1,5 @@
 """Pictures of runs whose pipeline, images or code are not at hand."""
 
-from __future__ import annotations
-
 import re
 import runpy
 import sys
@@ -19,8 +17,7 @@ from fmtorch.evaluation.gallery import Options, Run, find_dataset, gallery
 from fmtorch.evaluation.page import Section, ShownPair, render
 from fmtorch.runs import PairRow, RunFolder, to_table
 from tests.data import lists
-from tests.helpers import compose
-from tests.pipeline.test_pipeline import draw
+from tests.helpers import compose, draw
 
 DOCS = Path(__file__).resolve().parents[2] / "docs" / "guides" / "reports.md"
 F = np.array([0, 0, 0, 0, 0, -1, 0, 1, 0]) / np.sqrt(2)

@@ -1,7 +1,5 @@
 """What defines a run: everything that decides a result is in its identity, nothing that does not."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

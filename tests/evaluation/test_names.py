@@ -1,7 +1,5 @@
 """Names of runs: short, unlike one another, and about what differs."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from fmtorch import presets

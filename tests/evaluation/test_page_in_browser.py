@@ -1,7 +1,5 @@
 """The page in a browser: no errors and no requests, light and dark, wide and narrow, with and without its script."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -23,7 +21,6 @@ VISIBLE = "[...document.querySelectorAll('tbody tr, .key li')].filter(e => e.off
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
-    assert CHROMIUM is not None
     with Page(CHROMIUM, tmp_path_factory.mktemp("profile")) as opened:
         yield opened
 

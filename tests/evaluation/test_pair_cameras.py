@@ -1,7 +1,5 @@
 """Runs with cameras: what the estimator is given, poses of estimated cameras, and the identity of a run."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import math

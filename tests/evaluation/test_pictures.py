@@ -1,7 +1,5 @@
 """Pictures: any two sizes fit, what is drawn stands where it should, lines end at the border."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,7 +1,5 @@
 """Figures of merit equal the metrics' and their definition, over seeds; intervals: published answers and coverage."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -65,7 +63,6 @@ def test_intervals_are_of_what_is_defined() -> None:
     expected = bootstrap_mean(a[kept], [scenes[i] for i in kept])
     assert interval(incomplete, scenes) == expected
     percent = interval(incomplete, scenes, PERCENT)
-    assert percent is not None
     assert (percent.value, percent.low, percent.high) == tuple(
         PERCENT * end for end in (expected.value, expected.low, expected.high)
     )
@@ -89,7 +86,6 @@ def test_shares_have_the_intervals_of_shares_over_several_seeds_too() -> None:
     assert interval(twice, scenes, share=True) == interval(a, scenes, share=True)
     both = recalled(nsgd)
     gain = difference(both, b, scenes, share=True)
-    assert gain is not None
     assert gain.value == pytest.approx((a.mean() - b.mean()) / 2)
     assert gain.low < gain.value < gain.high
 
@@ -177,9 +173,6 @@ def test_a_difference_of_the_same_pairs_is_sharper_than_apart() -> None:
     rng = np.random.default_rng(1)
     better = np.maximum(base, rng.random(len(base)) < 0.1).astype(np.float64)  # a tenth of the misses become hits
     result, flipped, same = (difference(a, b, names) for a, b in ((better, base), (base, better), (base, base)))
-    assert result is not None
-    assert flipped is not None
-    assert same is not None
     assert result.value == pytest.approx(better.mean() - base.mean(), abs=1e-12)
     assert result.low > 0
     assert result.high - result.low < bootstrap_mean(base, names).high - bootstrap_mean(base, names).low
@@ -282,7 +275,6 @@ def test_means_of_few_pairs_have_no_interval() -> None:
     a, b = rng.random(MIN_UNITS), rng.random(MIN_UNITS)
     assert difference(a[1:], b[1:], one_scene(MIN_UNITS - 1)) is None
     interval = difference(a, b, one_scene(MIN_UNITS))
-    assert interval is not None
     assert interval.low < interval.value < interval.high
     six = [f"s{i % 6}" for i in range(9 * MIN_UNITS)]
     assert difference(np.tile(a, 9), np.tile(b, 9), six) is None

@@ -1,7 +1,5 @@
 """Workers that evaluate batches of pairs: threads that share features, and processes."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -57,7 +55,6 @@ time.sleep(300)
 
 def test_a_worker_ends_with_the_process_that_was_killed() -> None:
     parent = subprocess.Popen([sys.executable, "-c", WORKER], stdout=subprocess.PIPE, text=True)
-    assert parent.stdout is not None
     worker = int(parent.stdout.readline())
     parent.kill()
     parent.wait()

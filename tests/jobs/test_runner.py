@@ -1,7 +1,5 @@
 """Tasks of workers that share what they need or make it, and of which some die."""
 
-from __future__ import annotations
-
 import functools
 import os
 import signal

@@ -1,7 +1,5 @@
 """Stages of many small operations compute with one thread, whatever torch may use, and leave that as it was."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -19,8 +17,9 @@ from fmtorch.jobs.execution import Execution
 from fmtorch.jobs.threads import available, mapped, one_thread
 from fmtorch.matching import nearest
 from fmtorch.pruning import position_consistency as consistency
+from tests.helpers import draw, pair
+from tests.helpers import small_pipeline as pipeline
 from tests.laws import degenerate, scene
-from tests.pipeline.test_pipeline import draw, pair, pipeline
 
 
 @pytest.fixture

@@ -43,7 +43,7 @@ def test_equals_kornias_matcher() -> None:
     assert torch.equal(c.x1[0], b.keypoints[index[:, 1]])
     assert torch.equal(c.prior[0], scores[:, 0])
     assert ((c.prior >= 0) & (c.prior <= 1)).all()
-    assert torch.equal(c.ratio, 1 - c.prior)
+    assert torch.equal(c.score, c.prior)
     assert c.mask.all()
     assert c.size0.tolist() == [[100, 400]]
 

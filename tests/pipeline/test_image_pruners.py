@@ -1,7 +1,5 @@
 """Pruners that look at images: what pipelines hand them, and how often files are read for it."""
 
-from __future__ import annotations
-
 import collections
 import dataclasses
 from pathlib import Path
@@ -62,8 +60,6 @@ def test_files_are_read_once_and_matches_are_refined(reads: collections.Counter[
     gains = []
     for old, new in zip(before, outcomes, strict=True):
         F = torch.from_numpy(new.pair.F)[None]
-        assert old.correspondences is not None
-        assert new.correspondences is not None
         first, second = (
             sampson(F, c.x0.double(), c.x1.double()).abs()[0] for c in (old.correspondences, new.correspondences)
         )
@@ -77,8 +73,6 @@ def test_files_are_read_once_and_matches_are_refined(reads: collections.Counter[
     refined = fresh.correspondences([given])[0].correspondences
     expected = outcomes[0].correspondences
     assert reads == {pairs[0].image0.path: 1, pairs[0].image1.path: 1}
-    assert refined is not None
-    assert expected is not None
     assert bool((refined.x1 == expected.x1).all())
 
 

@@ -1,7 +1,5 @@
 """The four stages in a row: outcomes, failures as data, shared features, independence of batches."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -14,20 +12,9 @@ import torch
 from fmtorch import presets
 from fmtorch.core.types import Correspondences, Estimate, Features
 from fmtorch.data import ImagePair, ImageSource
-from fmtorch.pipeline.pipeline import Memo, Pipeline
-
-
-def draw(path: Path, seed: int, shift: int = 0) -> ImageSource:
-    """A blurred random picture that SIFT finds plenty in, shifted to the left by some pixels."""
-    noise = np.random.default_rng(seed).uniform(0, 255, (60, 100))
-    picture = cv2.resize(noise, (800, 480), interpolation=cv2.INTER_CUBIC)[:240, shift : shift + 320]
-    cv2.imwrite(str(path), np.clip(picture, 0, 255).astype(np.uint8))
-    return ImageSource(path.name, path)
-
-
-def pair(name: str, image0: ImageSource, image1: ImageSource, problem: str | None = None) -> ImagePair:
-    F = np.array([[0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]]) / np.sqrt(2)  # a sideways camera: epipolar lines are rows
-    return ImagePair(name, "family", "scene", image0, image1, F, problem=problem)
+from fmtorch.pipeline.pipeline import Memo
+from tests.helpers import draw, pair
+from tests.helpers import small_pipeline as pipeline
 
 
 @pytest.fixture
@@ -48,23 +35,12 @@ def pairs(tmp_path: Path) -> list[ImagePair]:
     ]
 
 
-def pipeline(**parts: object) -> Pipeline:
-    stages = {
-        "features": presets.build("features", "sift", max_features=500),
-        "matcher": presets.build("matcher", "nearest"),
-        "pruners": {name: presets.build("pruner", name) for name in ("ratio", "one_to_one")},
-        "estimator": presets.build("estimator", "lmeds", hypotheses=200),
-    }
-    return Pipeline(**{**stages, **parts})  # type: ignore[arg-type]
-
-
 def test_failures_are_outcomes_with_reasons(pairs: list[ImagePair]) -> None:
     outcomes = pipeline().run(pairs)
     by_name = {o.pair.identity: o for o in outcomes}
     assert [o.pair.identity for o in outcomes] == [p.identity for p in pairs]
     for name in ("good", "good too"):
         estimate = by_name[name].estimate
-        assert estimate is not None
         assert bool(estimate.ok[0])
         assert by_name[name].reason == ""
         assert set(by_name[name].seconds) == {"features", "matching", "pruning", "estimation"}
@@ -89,8 +65,8 @@ def test_an_estimator_that_says_nothing_of_significance_is_judged(pairs: list[Im
 
 def test_batches_change_nothing(pairs: list[ImagePair]) -> None:
     together = pipeline().run(pairs, seed=3)
-    for pair, outcome in zip(pairs, together, strict=True):
-        (alone,) = pipeline().run([pair], seed=3)
+    for each, outcome in zip(pairs, together, strict=True):
+        (alone,) = pipeline().run([each], seed=3)
         assert alone.reason == outcome.reason
         if alone.estimate is not None and outcome.estimate is not None:
             assert torch.equal(alone.estimate.F, outcome.estimate.F)
@@ -100,7 +76,6 @@ def test_batches_change_nothing(pairs: list[ImagePair]) -> None:
 def test_match_stops_before_estimation(pairs: list[ImagePair]) -> None:
     outcome = pipeline().correspondences(pairs[:1])[0]
     assert outcome.estimate is None
-    assert outcome.correspondences is not None
     assert int(outcome.correspondences.count()) > 50
     assert int(outcome.correspondences.keys[0]) == pairs[0].key
 

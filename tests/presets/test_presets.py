@@ -1,7 +1,5 @@
 """Preset files: where they are, how they are read, what they build."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

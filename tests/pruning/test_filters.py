@@ -92,14 +92,14 @@ def test_one_to_one_is_symmetric_and_independent_of_order(dtype: torch.dtype) ->
         assert len(torch.unique(x[kept], dim=0)) == kept.sum()
 
 
-def test_one_to_one_drops_what_has_no_location_and_ranks_nan_quality_last() -> None:
+def test_one_to_one_drops_what_has_no_location_and_ranks_nan_ratio_last() -> None:
     x0 = torch.tensor([[[math.nan, 0.0], [math.inf, 0.0], [1.0, 1.0], [1.0, 1.0]]])
     x1 = torch.arange(8.0).reshape(1, 4, 2)
     ratio = torch.tensor([[0.0, 0.0, math.nan, 0.9]])
     assert one_to_one(x0, x1, ratio).tolist() == [[False, False, False, True]]
 
 
-def test_stages_need_a_quality_and_keep_the_rest() -> None:
+def test_stages_need_a_ratio_and_keep_the_rest() -> None:
     x0, x1, ratio = (a[None] for a in duplicated(0, 20))
     mask = torch.ones(1, 20, dtype=torch.bool)
     for stage, expected in (

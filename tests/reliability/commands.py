@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from fmtorch.runs import RunFolder
-from tests.pipeline.test_pipeline import draw
+from tests.helpers import draw
 
 EVAL = ["features.max_features=400", "estimator=lmeds", "estimator.hypotheses=200", "batch=1", "workers=1"]
 SIDEWAYS = "0 0 0 0 0 -1 0 1 0"

@@ -1,7 +1,5 @@
 """Pairs and rows for the tests of benchmarks, and the benchmarks as commands."""
 
-from __future__ import annotations
-
 import json
 import sys
 from pathlib import Path
@@ -15,7 +13,7 @@ from fmtorch.data import ImagePair, ImageSource
 from fmtorch.pipeline.pipeline import Outcome
 from scripts.benchmark import __main__
 from scripts.benchmark.runner import Item, Row
-from tests.pipeline.test_pipeline import draw
+from tests.helpers import draw
 
 PIXEL_SHIFT = "0 0 0 0 0 -1 0 1 0"  # F of two images of which one is moved along x
 

@@ -1,7 +1,5 @@
 """The benchmark of cameras: what each level tells, peers, judgement, the table and the command."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

@@ -1,7 +1,5 @@
 """Benchmarks that are pages of settings: commands that resume, tables beside the paper's, pairs that its rule takes."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Pairs made of photographs: homographies and kinds of pairs, and their commands."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2
@@ -33,8 +31,6 @@ def test_pairs_are_of_their_kinds(folder: Path) -> None:
     verdict = planes.Ours(known=True)
     assert [verdict(item.matches) for item in items] == truths
     c = items[1].matches
-    assert c.K0 is not None
-    assert c.K1 is not None
     R = classify(c, verdict.estimator(c, 0), focal_deviation=0).evidence.R
     near = homography_transfer(c.K1 @ R @ torch.linalg.inv(c.K0), c.x0.double(), c.x1.double())[1][c.mask] < 2
     assert float(near.double().mean()) > 0.5
@@ -48,7 +44,7 @@ def cells(printed: str) -> list[list[str]]:
 def test_the_commands(folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("pycolmap")
     arguments = ["--photographs", folder, "--limit", 2]
-    printed = run(capsys, monkeypatch, "pair_type", *arguments, "--colmap", 4)
+    printed = run(capsys, monkeypatch, "pair_types", *arguments, "--colmap", 4)
     lines = [
         [cell.strip() for cell in line.split("|")] for line in printed.splitlines() if line.startswith("| fmtorch")
     ]

@@ -1,7 +1,5 @@
 """PoseBench by its protocol, on samples of its layout from real matches, beside a run written from its definitions."""
 
-from __future__ import annotations
-
 import functools
 import sys
 from pathlib import Path
@@ -19,10 +17,10 @@ from scripts.benchmark.methods import pipeline_of
 from scripts.benchmark.posebench import Protocol
 from scripts.benchmark.tables import Results
 from tests.conftest import shared_path
+from tests.io.writers import posebench_group
 from tests.reference import metrics as reference
 from tests.reference import solvers
 from tests.scripts.samples import read, row, run
-from tests.storage.exchange.writers import posebench_group
 
 SET, THRESHOLD = "imc_london_bridge", 0.75
 PAIRS = 6

@@ -1,7 +1,5 @@
 """`python -m scripts.benchmark related`: unrelated pairs, tables, ROC curves, and the command."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from xml.etree import ElementTree

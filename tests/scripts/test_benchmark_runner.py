@@ -1,7 +1,5 @@
 """What benchmarks share: rows that are kept and resumed, what they depend on, methods in one word, memory."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Tables of benchmarks: their intervals, groups, CSV files, curves with knees, figures."""
 
-from __future__ import annotations
-
 import csv
 from pathlib import Path
 from xml.etree import ElementTree

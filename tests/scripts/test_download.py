@@ -1,7 +1,5 @@
 """scripts/download.py: what is fetched is whole and verified, or is not kept; data sets resume and unpack safely."""
 
-from __future__ import annotations
-
 import functools
 import hashlib
 import http.server

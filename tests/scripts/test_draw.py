@@ -1,7 +1,5 @@
 """The pictures of docs/gallery.md are drawn, here of smaller scenes, and the page shows those that there are."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

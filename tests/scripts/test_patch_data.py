@@ -1,7 +1,5 @@
 """Training patches: warps, keypoints, rendered scenes and planes, and the correspondences that they give."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path
@@ -143,7 +141,6 @@ def test_a_store_of_planes_and_scenes_keeps_their_geometry(tmp_path: Path) -> No
     cutting = Cutting(PLANES, 60, longest_side=300)
     options: dict[str, Any] = {"seed": 0, "scenes": [task, task]}
     one, two = (build_store(tmp_path / name, package_photographs()[:1], cutting, **options) for name in ("a", "b"))
-    assert one.tracks is not None
     for a, b in zip(one.tracks, two.tracks, strict=True):
         np.testing.assert_array_equal(a, b)
     assert len(one.tracks.view) == len(one.patches) == one.first[-1]

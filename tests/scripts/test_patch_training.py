@@ -1,7 +1,5 @@
 """Losses, figures, objectives, match sets, the loop and the command of patch networks."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Callable
@@ -106,7 +104,6 @@ def geodesc_of_one_set(a: Tensor, b: Tensor) -> Tensor:
 def test_coincident_descriptors_have_finite_gradients(loss: Callable[[Tensor, Tensor], Tensor]) -> None:
     a = nn.functional.normalize(torch.ones(4, 3), dim=1).requires_grad_()
     loss(a, a).backward()
-    assert a.grad is not None
     assert torch.isfinite(a.grad).all()
 
 

@@ -1,7 +1,5 @@
 """Small data for labelled matches: rendered scenes at a quarter of their size, and pairs with exact geometry."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Changes of labelled matches: the truth stays true, the same draw gives the same matches, ranges are kept."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 

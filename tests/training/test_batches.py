@@ -1,7 +1,5 @@
 """Batches: every pair once an epoch, similar lengths, little padding, the same after a restart, shared out to ranks."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

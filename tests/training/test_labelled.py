@@ -1,7 +1,5 @@
 """`LabelledMatches`: shapes, masks, collation; labels against a scalar reference, and known answers on a plane."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The loop of a pruner's training: it goes on to the same weights, chooses the best ones, and skips no step."""
 
-from __future__ import annotations
-
 import itertools
 import signal
 from collections.abc import Iterator

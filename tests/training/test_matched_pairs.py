@@ -1,7 +1,5 @@
 """`MatchedPairs`: computed once, resumed, never stale, never damaged, readable from any process; its files."""
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import pickle
@@ -263,7 +261,7 @@ def test_validation_scenes_are_the_last_of_each_family(matched: MatchedPairs) ->
 
 
 def test_training_has_no_scene_of_the_test_split(matched: MatchedPairs) -> None:
-    """What the scenes are made of is compared in tests/data/test_rendered.py."""
+    """What the scenes are made of is compared in tests/scenes/test_rendered.py."""
     plans = {plan for (_, split), plan in PLANS.items() if split == "test"}
     test = {Task(family, "test", n, 0, plan).name for plan in plans for family in FAMILIES for n in range(plan.scenes)}
     training = {about["scene"] for about in matched.pairs}

@@ -1,7 +1,5 @@
 """The losses of pruners and their objective: known answers, scalar references, gradients, degenerate pairs."""
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Callable
@@ -264,8 +262,6 @@ def test_training_goes_through_degenerate_scenes(fit: Fit) -> None:
     """
     c = types.collate([laws.scene(1), laws.scene(2), *laws.degenerate().values()])
     c = c.replace(x0=c.x0.double(), x1=c.x1.double())
-    assert c.size0 is not None
-    assert c.size1 is not None
     E = fundamental_from_calibration(
         K[None], K[None], torch.eye(3, dtype=torch.float64)[None], torch.tensor([[1.0, 0.0, 0.2]]).double()
     )
@@ -286,7 +282,6 @@ def test_training_goes_through_degenerate_scenes(fit: Fit) -> None:
             optimiser.zero_grad()
             loss.backward(retain_graph=True)
             for parameter in network.parameters():
-                assert parameter.grad is not None
                 assert bool(parameter.grad.isfinite().all())
                 assert bool((parameter.grad != 0).any())
         torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
@@ -318,8 +313,6 @@ def test_terms_are_the_losses_of_the_weighted_fit() -> None:
     own, _ = eight_point(c.x0.double(), c.x1.double(), made.weight[0].double(), c.mask)
     assert torch.equal(F[0], own)
     terms = Objective(classification_steps=0)(made, batch, 7)
-    assert c.size0 is not None
-    assert c.size1 is not None
     expected = geometric_loss(F, batch.F, c.size0, c.size1, valid=valid, points=100, seed=7, key=c.keys)
     assert float(terms["geometric"].detach()) == pytest.approx(float(expected.detach()))
     classification = classification_loss(made.logit, batch.label)
@@ -339,8 +332,6 @@ def test_a_pair_that_cannot_be_judged_adds_nothing() -> None:
         loss = objective(Prediction(logit, weight), batch, 0)["loss"]
         loss.backward()
     alone, together = (logit.grad for logit in logits)
-    assert alone is not None
-    assert together is not None
     assert bool(torch.isfinite(together).all())
     assert torch.allclose(together[:, :1], alone, rtol=1e-9)
     assert not bool(together[:, 1].any())

@@ -1,7 +1,5 @@
 """Networks in the layout that ONNX Runtime runs fastest: the same outputs."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Photographs as planes: the views show what their cameras see, and matches of them are judged by that."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

@@ -1,7 +1,5 @@
 """`fmtorch train`, as a user runs it: from another directory, with a network of one's own."""
 
-from __future__ import annotations
-
 import json
 import re
 import subprocess
@@ -15,8 +13,7 @@ pytest.importorskip("lightning", reason="training needs the extra `train`")
 
 from fmtorch.training.run import run
 from tests.conftest import own_cache
-from tests.helpers import compose
-from tests.pipeline.test_pipeline import draw
+from tests.helpers import compose, draw
 from tests.processes import run_command
 
 SHORT = [

@@ -1,7 +1,5 @@
 """Validation of pruners: figures of known networks; temperature and reliability against the scalar reference."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

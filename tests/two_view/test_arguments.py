@@ -13,8 +13,9 @@ from fmtorch.data import ImageSource
 from fmtorch.evaluation.rows import evaluate
 from fmtorch.pipeline.build import load_pipeline
 from tests.commands.test_match import run_python
+from tests.helpers import draw, pair
+from tests.helpers import small_pipeline as pipeline
 from tests.laws import quick, scene, shown
-from tests.pipeline.test_pipeline import draw, pair, pipeline
 from tests.variants import OTHER_LIBRARIES, built, keywords, variants
 
 EVERY = [n for n in variants("estimator") if not n.startswith(OTHER_LIBRARIES[1:])]

@@ -1,0 +1,281 @@
+"""Export: pycolmap reads the database, verifies the same matches and finds the cameras; hloc's files come back."""
+
+import dataclasses
+import sqlite3
+import sys
+from pathlib import Path
+from typing import Any
+
+import cv2
+import h5py
+import numpy as np
+import pycolmap
+import pytest
+from scipy.spatial.transform import Rotation
+
+from fmtorch.io.colmap import ORIGIN, write_database
+from fmtorch.io.export import DATABASE, export_kinds, write_exports
+from fmtorch.io.match_store import MatchStore, StoredImage, StoredPair, indices
+from fmtorch.pipeline.build import load_pipeline
+from fmtorch.pipeline.folder import FolderMatches, chosen_pairs, images_below
+from tests.conftest import shared_path
+
+K = np.array([[1000.0, 0, 480], [0, 1000, 410], [0, 0, 1]])
+SIZE, POINTS, IMAGES, WRONG = (800, 1000), 250, 6, 25
+
+
+class Circle:
+    """Cameras on an arc around points; each pair's matches hold some that are wrong, and are no inliers of F."""
+
+    def __init__(self, known: bool = True) -> None:
+        rng = np.random.default_rng(0)
+        X = rng.uniform(-2, 2, (POINTS, 3))
+        self.R = [Rotation.from_euler("y", 12 * i, degrees=True).as_matrix() for i in range(IMAGES)]
+        self.t = [np.array([0.0, 0.2 * i, 8.0]) for i in range(IMAGES)]
+        self.images, self.pairs = [], []
+        for i, (R, t) in enumerate(zip(self.R, self.t, strict=True)):
+            x = (X @ R.T + t) @ K.T
+            x = x[:, :2] / x[:, 2:] + 0.3 * rng.normal(size=(POINTS, 2))
+            lonely = rng.uniform(0, 800, (i, 2))  # so that the same point has another index in each image
+            points = np.concatenate([lonely, x]).astype(np.float32)
+            scores = np.ones(len(points), np.float32)
+            self.images.append(StoredImage(f"{i}.png", points, scores, SIZE, K if known else None))
+        for i in range(IMAGES):
+            for j in range(i + 1, IMAGES):
+                partner = np.arange(POINTS)
+                partner[:WRONG] = rng.permutation(WRONG)
+                right = partner == np.arange(POINTS)
+                matches = np.stack([np.arange(POINTS) + i, partner + j], 1).astype(np.int32)
+                scores = rng.uniform(0.1, 1, POINTS).astype(np.float32)
+                self.pairs.append(StoredPair(f"{i}.png", f"{j}.png", matches, scores, right, self.F(i, j)))
+
+    def F(self, i: int, j: int) -> np.ndarray:
+        R = self.R[j] @ self.R[i].T
+        t = self.t[j] - R @ self.t[i]
+        cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
+        F = np.linalg.inv(K).T @ cross @ R @ np.linalg.inv(K)
+        return F / np.linalg.norm(F)
+
+
+def errors(model: Any, names: list[str], R: list[np.ndarray], centres: np.ndarray) -> tuple[float, float]:
+    """Largest error of rotations, in degrees, and of centres, as a share of their spread, after the best similarity."""
+    images = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
+    index = [names.index(image.name) for image in images]
+    C, true = np.array([image.projection_center() for image in images]), centres[index]
+    a, b = C - C.mean(0), true - true.mean(0)
+    U, S, Vt = np.linalg.svd(b.T @ a)  # Umeyama (1991)
+    sign = np.diag([1, 1, np.sign(np.linalg.det(U @ Vt))])
+    Q = U @ sign @ Vt
+    scale = (S * sign.diagonal()).sum() / (a**2).sum()
+    spread = np.linalg.norm(true[:, None] - true, axis=-1).max()
+    turns = [Rotation.from_matrix(image.cam_from_world().rotation.matrix() @ Q.T @ R[i].T).magnitude()
+             for image, i in zip(images, index, strict=True)]  # fmt: skip
+    return float(np.rad2deg(max(turns))), float(np.linalg.norm(scale * a @ Q.T - b, axis=1).max() / spread)
+
+
+def mapped(database: Path, folder: Path, **options: Any) -> Any:
+    """COLMAP's largest model from a database."""
+    pycolmap.set_random_seed(0)
+    config = pycolmap.IncrementalPipelineOptions(
+        extract_colors=False, min_model_size=3, random_seed=0, num_threads=1, **options
+    )
+    models = pycolmap.incremental_mapping(database, folder, folder, config)
+    return max(models.values(), key=lambda model: model.num_reg_images())
+
+
+def geometries(database: Path) -> dict[int, Any]:
+    with pycolmap.Database.open(database) as file:
+        return {key: g for key, g in zip(*file.read_two_view_geometries(), strict=True) if len(g.inlier_matches)}
+
+
+def verified(database: Path) -> dict[int, Any]:
+    """COLMAP's own geometric verification of the database's matches, in place of ours."""
+    with pycolmap.Database.open(database) as file:
+        file.clear_two_view_geometries()
+    options = pycolmap.TwoViewGeometryOptions()
+    options.ransac.random_seed = 0
+    pycolmap.geometric_verification(database, two_view_geometry_options=options)
+    return geometries(database)
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_pycolmap_reads_verifies_and_reconstructs(known: bool, tmp_path: Path) -> None:
+    circle = Circle(known)
+    write_database(tmp_path / DATABASE, circle.images, circle.pairs, shared_camera=True)
+    with pycolmap.Database.open(tmp_path / DATABASE) as file:
+        assert (file.num_images(), file.num_cameras(), file.num_rigs(), file.num_frames()) == (IMAGES, 1, 1, IMAGES)
+        image = file.read_image_with_name("3.png")
+        np.testing.assert_array_equal(file.read_keypoints(image.image_id)[:, :2], circle.images[3].points + 0.5)
+        camera = file.read_camera(image.camera_id)
+        assert camera.has_prior_focal_length == known
+        if known:
+            np.testing.assert_allclose(camera.calibration_matrix()[:2, 2], K[:2, 2] + ORIGIN)
+        two = file.read_two_view_geometry(2, 5)
+    pair = next(p for p in circle.pairs if (p.name0, p.name1) == ("1.png", "4.png"))
+    assert set(map(tuple, two.inlier_matches.tolist())) == set(map(tuple, pair.matches[pair.inliers].tolist()))
+    x0, x1 = (circle.images[k].points[two.inlier_matches[:, i]] + 0.5 for i, k in ((0, 1), (1, 4)))
+    ends = [np.column_stack([x, np.ones(len(x))]) for x in (x0, x1)]
+    lines = ends[0] @ two.F.T
+    distance = np.abs((ends[1] * lines).sum(1)) / np.linalg.norm(lines[:, :2], axis=1)
+    assert distance.max() < 5 * 0.3 * np.sqrt(2)  # five standard deviations of the noise of both ends
+    # The same matches by COLMAP's own RANSAC, whose threshold is 4 px: all of ours, and of the wrong ones few.
+    model = mapped(tmp_path / DATABASE, tmp_path, ba_refine_focal_length=not known)
+    ours, theirs = geometries(tmp_path / DATABASE), verified(tmp_path / DATABASE)
+    assert ours.keys() == theirs.keys()
+    for key, geometry in ours.items():
+        a, b = (set(map(tuple, g.inlier_matches.tolist())) for g in (geometry, theirs[key]))
+        assert len(a - b) <= 0.02 * len(a)
+        assert len(b - a) <= WRONG
+    centres = np.array([-R.T @ t for R, t in zip(circle.R, circle.t, strict=True)])
+    turn, shift = errors(model, [image.name for image in circle.images], circle.R, centres)
+    assert model.num_reg_images() == IMAGES
+    # With K given, as exact as some hundred points at 0.3 px of f = 1000 px allow; else the principal point is off by
+    # 20 px, which turns the cameras by 20 / 1000.
+    assert turn < (0.1 if known else 1.5)
+    assert shift < (0.005 if known else 0.05)
+
+
+def test_matches_that_share_a_keypoint_are_sorted_out_for_tracks(tmp_path: Path) -> None:
+    image = [StoredImage(f"{i}.png", np.eye(4, 2, dtype=np.float32), np.ones(4, np.float32), SIZE) for i in (0, 1)]
+    matches = np.array([[0, 0], [0, 1], [1, 1], [2, 2]], np.int32)
+    scores = np.array([0.2, 0.9, 0.5, 0.5], np.float32)
+    inliers = np.array([True, False, False, True])
+    pair = StoredPair("0.png", "1.png", matches, scores, inliers, np.eye(3))
+    write_database(tmp_path / DATABASE, image, [pair])
+    with pycolmap.Database.open(tmp_path / DATABASE) as file:
+        assert sorted(file.read_matches(1, 2).tolist()) == [[0, 0], [1, 1], [2, 2]]  # an inlier before a better score
+        assert file.read_two_view_geometry(1, 2).inlier_matches.tolist() == [[0, 0], [2, 2]]
+
+
+def test_pairs_of_different_scenes_are_not_verified(tmp_path: Path) -> None:
+    circle = Circle()
+    chance = dataclasses.replace(circle.pairs[0], related=False)
+    write_database(tmp_path / DATABASE, circle.images, [chance])
+    with pycolmap.Database.open(tmp_path / DATABASE) as file:
+        assert file.num_matched_image_pairs() == 1
+        assert file.num_verified_image_pairs() == 0
+
+
+def test_keypoints_are_found_again() -> None:
+    points = np.array([[1, 2], [3, 4], [1, 2], [5, 6]], np.float32)
+    assert indices(points, points[[3, 2, 0]]).tolist() == [3, 0, 0]  # of several at one place the first
+    assert indices(points, points[:0]).shape == (0,)
+    with pytest.raises(ValueError, match=r"the match at \(1.5, 2.0\) is at no keypoint"):
+        indices(points, np.array([[1.5, 2.0]], np.float32))
+    with pytest.raises(ValueError, match=r"the match at \(1.0, 2.0\) is at no keypoint"):
+        indices(points[:0], points[:1])
+
+
+def test_keypoints_are_found_as_a_dictionary_finds_them() -> None:
+    rng = np.random.default_rng(0)
+    points = rng.choice(np.array([-1.5, -0.0, 0.0, 0.25, 7], np.float32), (60, 2))
+    x = points[rng.integers(0, 60, 200)] * np.float32([1, -1]) * np.float32([1, -1])
+    place = {tuple(point): i for i, point in reversed(list(enumerate(points.tolist())))}
+    assert indices(points, x).tolist() == [place[tuple(point)] for point in x.tolist()]
+
+
+def journal(folder: Path, circle: Circle) -> tuple[MatchStore, list[tuple[Path, Path]]]:
+    (folder / "images").mkdir(parents=True)
+    paths = [folder / "images" / image.name for image in circle.images]
+    for i, path in enumerate(paths):
+        cv2.imwrite(str(path), np.full((8, 10), i, np.uint8))
+    kept = MatchStore(folder / "export", folder / "images")
+    for path, image in zip(paths, circle.images, strict=True):
+        kept.add_image(path, image)
+    ends = []
+    for pair in circle.pairs:
+        ends.append((folder / "images" / pair.name0, folder / "images" / pair.name1))
+        kept.add_pair(*ends[-1], pair)
+    return kept, ends
+
+
+def test_what_a_journal_keeps_comes_back_and_is_of_the_image_it_was_made_of(tmp_path: Path) -> None:
+    circle = Circle()
+    kept, ends = journal(tmp_path, circle)
+    again = kept.pair(*ends[4])
+    for name in ("name0", "name1", "related"):
+        assert getattr(again, name) == getattr(circle.pairs[4], name)
+    for name in ("matches", "scores", "inliers", "F"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(circle.pairs[4], name))
+    image = kept.image(ends[0][0])
+    assert (image.name, image.size) == ("0.png", SIZE)
+    np.testing.assert_array_equal(image.K, K)
+    cv2.imwrite(str(ends[0][0]), np.full((8, 11), 77, np.uint8))  # another image of the same name
+    assert not kept.has_image(ends[0][0])
+    assert not kept.has_pair(*ends[0])
+    assert kept.has_pair(*ends[-1])
+
+
+def test_hloc_files(tmp_path: Path) -> None:
+    circle = Circle()
+    kept, ends = journal(tmp_path, circle)
+    assert write_exports(kept, ends, export_kinds("h5,colmap"), tmp_path) == ["features.h5", "matches.h5", DATABASE]
+    pair = circle.pairs[4]
+    with h5py.File(tmp_path / "features.h5") as features, h5py.File(tmp_path / "matches.h5") as matches:
+        assert features["0.png/keypoints"].dtype == np.float32
+        np.testing.assert_array_equal(features["0.png/keypoints"], circle.images[0].points)
+        assert features["0.png/image_size"][:].tolist() == [1000, 800]
+        group = matches[f"{pair.name0}/{pair.name1}"]
+        assert group["matches0"].dtype == np.int32
+        # What hloc's own reader makes of it: the index, and the entry where that is not -1.
+        first = np.flatnonzero(group["matches0"][:] != -1)
+        np.testing.assert_array_equal(np.stack([first, group["matches0"][:][first]], 1), pair.matches)
+        np.testing.assert_array_equal(group["matching_scores0"][:][first], pair.scores)
+        np.testing.assert_array_equal(group["inliers0"][:][first], pair.inliers)
+        np.testing.assert_array_equal(group.attrs["F"], pair.F)
+    with sqlite3.connect(tmp_path / DATABASE) as file:
+        assert file.execute("SELECT COUNT(*) FROM two_view_geometries").fetchone() == (len(circle.pairs),)
+
+
+def test_indices_beyond_16_bits(tmp_path: Path) -> None:
+    points = np.random.default_rng(0).uniform(0, 800, (40_000, 2)).astype(np.float32)
+    circle = Circle()
+    circle.images = [StoredImage(f"{i}.png", points, points[:, 0], SIZE) for i in (0, 1)]
+    matches = np.array([[39_999, 39_998]], np.int32)
+    circle.pairs = [StoredPair("0.png", "1.png", matches, np.ones(1, np.float32), np.ones(1, bool), np.eye(3))]
+    kept, ends = journal(tmp_path, circle)
+    write_exports(kept, ends, ("h5",), tmp_path)
+    with h5py.File(tmp_path / "matches.h5") as file:
+        assert file["0.png/1.png/matches0"][39_999] == 39_998
+
+
+def test_kinds() -> None:
+    assert export_kinds(None) == ()
+    assert export_kinds("colmap, h5") == ("colmap", "h5")
+    assert export_kinds(["h5"]) == ("h5",)
+    with pytest.raises(ValueError, match=r"export=h5,bundler: 'bundler' is none of h5, colmap"):
+        export_kinds("h5,bundler")
+
+
+@pytest.mark.parametrize(("library", "kind"), [("h5py", "h5"), ("pycolmap", "colmap")])
+def test_says_which_extra_is_missing(library: str, kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, library, None)
+    with pytest.raises(ImportError, match=rf"pip install 'fmtorch\[{kind}\]'"):
+        export_kinds(kind)
+
+
+def test_a_real_scene_is_reconstructed(tmp_path: Path) -> None:
+    """Six images of fountain-P11: photographs -> matches and F -> COLMAP's cameras, against the laser scan's."""
+    source = shared_path("data/Strecha/fountain-P11")
+    images = tmp_path / "images"
+    images.mkdir()
+    for path in sorted((source / "Images").iterdir())[2:8]:
+        (images / path.name).symlink_to(path)
+    options = ["features.max_features=2500", "estimator=lmeds", "estimator.hypotheses=300"]
+    pipeline = load_pipeline("sift_ratio", overrides=options)
+    kept = MatchStore(tmp_path / "export", images)
+    pairs = chosen_pairs(images, images_below(images), None)
+    work = FolderMatches(pipeline, kept, 1600, True, 0)
+    assert len(list(work.each(pairs))) == len(pairs)
+    assert not work.troubles
+    write_exports(kept, pairs, ("colmap",), tmp_path, shared_camera=True)
+    model = mapped(tmp_path / DATABASE, tmp_path)
+    cameras = np.loadtxt(source / "Camera.txt")
+    names = [f"{i:08d}.jpg" for i in range(len(cameras))]
+    R, t = cameras[:, 9:18].reshape(-1, 3, 3), cameras[:, 18:]
+    turn, shift = errors(model, names, list(R), np.einsum("nji,nj->ni", -R, t))
+    assert model.num_reg_images() == 6
+    (camera,) = model.cameras.values()
+    assert camera.focal_length == pytest.approx((cameras[0, 0] + cameras[0, 4]) / 2, rel=0.02)
+    assert shift < 0.01
+    assert turn < 1.5  # the principal point, which stays in the middle, is off by 10 px of 1380

@@ -1,0 +1,250 @@
+"""The commands that export: a folder of images and an evaluation, resumed, refused, and read back as a data set."""
+
+import itertools
+import json
+import re
+import threading
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pycolmap
+import pytest
+import torch
+from omegaconf import DictConfig
+
+from fmtorch import data
+from fmtorch.commands import eval as eval_command
+from fmtorch.commands import match as match_command
+from fmtorch.io.export import DATABASE, FEATURES, MATCHES
+from fmtorch.pipeline import folder
+from fmtorch.pipeline.folder import chosen_pairs, images_below, open_folder
+from fmtorch.pipeline.two_images import Described
+from fmtorch.runs import RunFolder
+from tests.helpers import compose, draw
+
+OPTIONS = ("features.max_features=400", "estimator=lmeds", "estimator.hypotheses=100", "cache=off")
+
+
+def config(command: str, *words: str) -> DictConfig:
+    return compose(command, ("pipeline=sift_ratio", *OPTIONS, *words))
+
+
+@pytest.fixture
+def images(tmp_path: Path) -> Path:
+    """Three views of one picture, one in a folder of its own, and another picture."""
+    (tmp_path / "images" / "more").mkdir(parents=True)
+    for i, name in enumerate(("a.png", "b.png", "more/c.png")):
+        draw(tmp_path / "images" / name, seed=0, shift=12 * i)
+    draw(tmp_path / "images" / "other.png", seed=1)
+    (tmp_path / "images" / "notes.txt").write_text("no image")
+    return tmp_path / "images"
+
+
+def match(images: Path, output: Path, *words: str) -> Path:
+    return match_command.run(config("match", f"images={images}", f"output={output}", *words), "sift_ratio")
+
+
+def test_a_folder_of_images(images: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    output = match(images, tmp_path / "out", "export='h5,colmap'")
+    said = capsys.readouterr().out
+    assert "3 of 6 pairs show one scene" in said
+    assert "taken from" not in said
+    with h5py.File(output / FEATURES) as features, h5py.File(output / MATCHES) as matches:
+        points = {name: features[f"{name}/keypoints"][:] for name in ("a.png", "more/c.png")}
+        group = matches["a.png/more-c.png"]
+        i = np.flatnonzero(group["inliers0"])
+        moved = points["more/c.png"][group["matches0"][:][i]] - points["a.png"][i]
+        assert len(i) > 50
+        np.testing.assert_allclose(np.median(moved, axis=0), [-24, 0], atol=0.1)
+    with pycolmap.Database.open(output / DATABASE) as file:
+        assert (file.num_images(), file.num_cameras()) == (4, 4)
+        assert file.num_verified_image_pairs() == 3
+
+    graph = json.loads((output / "graph.json").read_text())
+    assert graph["components"] == [["a.png", "b.png", "more/c.png"], ["other.png"]]
+    assert sum(pair["related"] for pair in graph["pairs"]) == 3
+    assert "connected images: 3; 1 images are in no related pair" in said
+    assert len((output / "graph.csv").read_text().splitlines()) == 7
+    assert (output / "graph.svg").read_text().count("<line") == 3
+
+    # Again: nothing is computed, the files are the same.
+    before = (output / MATCHES).read_bytes()
+    match(images, tmp_path / "out", "export=h5")
+    assert "6 of 6 pairs taken from an earlier run" in capsys.readouterr().out
+    assert (output / MATCHES).read_bytes() == before
+
+    # Interrupted: what is missing is computed. Another image of a name: its pairs are computed anew.
+    next((output / "export" / "pairs").iterdir()).unlink()
+    draw(images / "other.png", seed=0, shift=30)
+    match(images, tmp_path / "out", "export=h5")
+    said = capsys.readouterr().out
+    assert re.search(r"[23] of 6 pairs taken from an earlier run", said)
+    assert "6 of 6 pairs show one scene" in said
+
+    with pytest.raises(ValueError, match=r"holds matches of other settings; .*: seed: 0 -> 3\. Choose another output"):
+        match(images, tmp_path / "out", "seed=3")
+
+
+def test_one_bad_image_does_not_end_the_work(images: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (images / "bad.png").write_bytes(b"\x89PNG and no more")
+    output = match(images, tmp_path / "out", "export=h5")
+    assert len(re.findall("bad.png", capsys.readouterr().err)) == 1
+    with h5py.File(output / FEATURES) as file:
+        assert sorted(file) == ["a.png", "b.png", "more", "other.png"]
+    for path in images.rglob("*.png"):
+        path.write_bytes(b"\x89PNG and no more")
+    with pytest.raises(ValueError, match="no pair could be matched, the first because: ImageError"):
+        match(images, tmp_path / "out2", "export=h5")
+
+
+def test_pairs_that_look_alike(images: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (images / "bad.png").write_bytes(b"\x89PNG and no more")
+    output = match(images, tmp_path / "out", "pairs=similar:2")
+    names = [(pair["image0"], pair["image1"]) for pair in json.loads((output / "graph.json").read_text())["pairs"]]
+    assert set(itertools.combinations(["a.png", "b.png", "more/c.png"], 2)) < set(names)
+    assert not any("bad.png" in pair for pair in names)
+    assert len(re.findall("bad.png", capsys.readouterr().err)) == 1
+    match(images, tmp_path / "out", "pairs=sequential:1")  # of the same matches
+    assert re.search("[234] of 4 pairs taken from an earlier run", capsys.readouterr().out)
+
+
+def test_images_are_described_by_several_threads(
+    images: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (images / "bad.png").write_bytes(b"\x89PNG and no more")
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    match(images, tmp_path / "one", "export=h5")
+    expected = capsys.readouterr()
+    both, described = threading.Barrier(2, timeout=60), folder.describe
+
+    def together(*arguments: Any) -> Described:
+        both.wait()  # raises where the other does not come
+        return described(*arguments)
+
+    monkeypatch.setattr(folder, "describe", together)  # of four sound images
+    torch.set_num_threads(2)
+    match(images, tmp_path / "two", "export=h5")
+    torch.set_num_threads(threads)
+    captured = capsys.readouterr()
+    times = re.compile(r"\d+:\d\d:\d\d")  # of the progress bar
+    assert times.sub("", captured.err) == times.sub("", expected.err)
+    assert "3 of 10 pairs show one scene" in captured.out
+    for name in (FEATURES, MATCHES):
+        with h5py.File(tmp_path / "one" / name) as first, h5py.File(tmp_path / "two" / name) as second:
+            compared = []
+
+            def compare(at: str, item: object, other: h5py.File = second, seen: list[str] = compared) -> None:
+                if isinstance(item, h5py.Dataset):
+                    np.testing.assert_array_equal(item[:], other[at][:])
+                    seen.append(at)
+
+            first.visititems(compare)
+            assert len(compared) >= 4
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("a.png\n", "line 1: 'a.png'; it must be the names of two images"),
+        ("# two\n\na.png a.png\n", "line 3: 'a.png a.png'; it must be"),
+        ("a.png nowhere.png\n", "line 1: no image nowhere.png in "),
+        ("\n", "names no pair"),
+    ],
+)
+def test_lists_of_pairs_that_are_none(text: str, said: str, images: Path, tmp_path: Path) -> None:
+    (tmp_path / "pairs.txt").write_text(text)
+    with pytest.raises(ValueError, match=said):
+        chosen_pairs(images, images_below(images), tmp_path / "pairs.txt")
+
+
+def test_lists_of_pairs(images: Path, tmp_path: Path) -> None:
+    paths = images_below(images)
+    assert [path.relative_to(images).as_posix() for path in paths] == ["a.png", "b.png", "more/c.png", "other.png"]
+    assert len(chosen_pairs(images, paths, Path("exhaustive"))) == 6
+    (tmp_path / "pairs.txt").write_text("b.png a.png\n# again\na.png b.png\na.png other.png\n")
+    chosen = chosen_pairs(images, paths, tmp_path / "pairs.txt")
+    assert [(a.name, b.name) for a, b in chosen] == [("b.png", "a.png"), ("a.png", "other.png")]
+    with pytest.raises(
+        ValueError, match=r"list\.txt: no such file; it must be exhaustive, sequential:N, .*, or a file"
+    ):
+        chosen_pairs(images, paths, tmp_path / "list.txt")
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["images=nowhere"], "images=nowhere is no folder"),
+        (["images=.", "image0=a.png"], "images takes a folder; image0, image1 and truth are of a single pair"),
+        (["image0=a.png", "image1=b.png", "export=h5"], "export and pairs are of a folder of images"),
+        (["images=.", "pairs=similar:0"], "pairs=similar:0; it must be similar:N with a whole number N"),
+        (["images=.", "pairs=similar:2", "features=l2net"], "no codebook for the descriptors l2net"),
+        (["images=.", "export=bundler"], "'bundler' is none of h5, colmap"),
+        (["images=.", "camera=mine"], "camera=mine; it must be one of: per_image, shared"),
+    ],
+)
+def test_mistakes_are_told(words: list[str], said: str, images: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(images)
+    with pytest.raises(ValueError, match=said):
+        match_command.run(config("match", *words), "sift_ratio")
+
+
+def test_settings_that_cannot_be_read(tmp_path: Path) -> None:
+    (tmp_path / "export.json").write_text("{")
+    with pytest.raises(ValueError, match=r"export\.json is not valid JSON .* delete"):
+        open_folder(tmp_path, {"seed": 0})
+
+
+def test_an_evaluation_and_its_way_back(tmp_path: Path) -> None:
+    """What an evaluation exports, also after it has ended, and what that is as a data set."""
+    folder = tmp_path / "Set" / "scene" / "Images"
+    folder.mkdir(parents=True)
+    for i in range(3):
+        draw(folder / f"{i:08d}.png", seed=0, shift=9 * i)
+    camera = np.concatenate([[300, 0, 160, 0, 300, 120, 0, 0, 1], np.eye(3).ravel()])
+    np.savetxt(folder.parent / "Camera.txt", [np.concatenate([camera, [-i, 0, 0]]) for i in range(3)])
+    F = "0 0 0 0 0 -1 0 1 0"
+    (tmp_path / "Set" / "pairs_with_gt.txt").write_text(f"0 1 {F}\n0 2 {F}\n1 2 {F}\n2 0 nan{F[1:]}\n")
+    (tmp_path / "Set" / "pairs_which_dataset.txt").write_text("scene/\n" * 4)
+
+    def run(run_dir: str, *words: str) -> tuple[Path, dict[str, list[Any]]]:
+        path = eval_command.run(config("eval", f"run_dir={tmp_path / run_dir}", *words), "sift_ratio")
+        return path, RunFolder.load(path).read().sort_by("pair").to_pydict()
+
+    ours = ("dataset=fmbench", f"dataset.root={tmp_path / 'Set'}")
+    _, plain = run("run", *ours)
+    path, rows = run("run", *ours, "export='h5,colmap'")  # its pairs are done, but were not kept
+    assert rows == plain
+    with pycolmap.Database.open(path / DATABASE) as file:
+        assert (file.num_images(), file.num_cameras(), file.num_matched_image_pairs()) == (3, 1, 3)
+        assert file.read_camera(1).has_prior_focal_length
+        geometry = file.read_two_view_geometry(1, 2)
+    assert geometry.config == int(
+        pycolmap.TwoViewGeometryConfiguration.PLANAR_OR_PANORAMIC
+    )  # pictures that are shifted
+    np.testing.assert_allclose(geometry.H / geometry.H[2, 2], [[1, 0, -9], [0, 1, 0], [0, 0, 1]], atol=0.2)
+    with h5py.File(path / MATCHES) as file:
+        group = file["00000000.png/00000001.png"]
+        assert group.attrs["pair_type"] == "planar_or_panoramic"
+        np.testing.assert_allclose(
+            group.attrs["H"] / group.attrs["H"][2, 2], [[1, 0, -9], [0, 1, 0], [0, 0, 1]], atol=0.2
+        )
+    kept = sorted((path / "export").rglob("*.npz"))
+    assert len(kept) == 6
+    changed = [file.stat().st_mtime_ns for file in kept]
+    run("run", *ours, "export=h5")  # and now there is nothing to do
+    assert [file.stat().st_mtime_ns for file in kept] == changed
+
+    known = {"layout": "hloc", "truth": str(tmp_path / "Set")}
+    dataset = data.load("h5", root=path, **known)
+    assert [pair.problem is None for pair in dataset] == [True, True, True, False]
+    words = ["dataset=h5", f"dataset.root={path}", *(f"dataset.{key}={value}" for key, value in known.items())]
+    _, theirs = run("theirs", *words, "pruner=[]")
+    for column in ("pair", "ok", "corrs_before", "inlier_rate_before"):
+        assert theirs[column] == plain[column]
+    assert theirs["features0"][:3] == plain["features0"][:3]
+    assert all(np.isnan(seconds or np.nan) for seconds in theirs["seconds_features"])
+    with pytest.raises(ValueError, match="no pair has images in which a pipeline finds keypoints"):
+        run("none", *words, "pruner=[]", "export=h5")

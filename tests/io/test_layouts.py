@@ -1,0 +1,368 @@
+"""Each layout of others, written from its description, read back; what is damaged is named and harms nothing else."""
+
+import pickle
+import shutil
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import h5py
+import numpy as np
+import pytest
+import torch
+
+import fmtorch
+from fmtorch import data, presets
+from fmtorch.data import DataError, ImagePair
+from fmtorch.evaluation.gallery import Options, find_dataset
+from fmtorch.evaluation.rows import evaluate
+from fmtorch.io.dataset import H5Pairs
+from fmtorch.pipeline.build import load_pipeline
+from fmtorch.pipeline.pipeline import Outcome, Pipeline
+from fmtorch.pruning import ratio_test
+from tests.io import writers
+
+NEEDS_TRUTH = ("hloc", "glue_factory", "vismatch")
+WITH_RATIOS = ("ransac_tutorial", "oanet")
+
+
+def load(layout: str, tmp_path: Path, write: Callable[[Path], Path] | None = None) -> H5Pairs:
+    root = (write or writers.WRITERS[layout])(tmp_path / layout)
+    return reload(layout, root)
+
+
+def reload(layout: str, root: Path, **options: Any) -> H5Pairs:
+    if layout in NEEDS_TRUTH:
+        options["truth"] = root.parent / "Truth"
+        if not options["truth"].exists():
+            writers.truth(options["truth"])
+    dataset = data.load("h5", root=root, layout=layout, **options)
+    assert isinstance(dataset, H5Pairs)
+    return dataset
+
+
+def unused(*_: object) -> Any:
+    raise AssertionError("features and matcher have nothing to do")
+
+
+def pipeline(**pruners: Any) -> Pipeline:
+    estimator = presets.build("estimator", "lmeds", hypotheses=200)
+    return Pipeline(unused, unused, pruners, estimator)
+
+
+@pytest.mark.parametrize("layout", writers.WRITERS)
+def test_what_was_written_is_read(layout: str, tmp_path: Path) -> None:
+    dataset = load(layout, tmp_path)
+    assert len(dataset) == writers.PAIRS
+    for pair, s in zip(dataset, writers.scenes(), strict=True):
+        assert pair.problem is None
+        sign = np.sign((pair.F * s.F.numpy()).sum())
+        np.testing.assert_allclose(sign * pair.F, s.F.numpy(), atol=1e-9)
+        for got, expected in ((pair.K0, s.K0), (pair.K1, s.K1), (pair.R, s.R), (pair.t, s.t)):
+            np.testing.assert_allclose(got, expected.numpy(), atol=1e-12)
+        c, counts = pickle.loads(pickle.dumps(pair.matches))()
+        order = torch.arange(len(s.x0))
+        tolerance = 1e-4 if layout != "oanet" else 1e-3  # float32 at 1000 px; from calibrated coordinates and back
+        torch.testing.assert_close(c.x0[0], s.x0[order].float(), rtol=0, atol=tolerance)
+        torch.testing.assert_close(c.x1[0], s.x1[order].float(), rtol=0, atol=tolerance)
+        assert c.mask.all()
+        assert counts[0] == len(s.x0) + (2 if layout in NEEDS_TRUTH else 0)
+        if layout in WITH_RATIOS:
+            np.testing.assert_allclose(c.ratio[0], writers.ratios(len(s.x0)), rtol=1e-6)
+        elif layout in NEEDS_TRUTH:
+            assert torch.allclose(c.score, torch.tensor(0.75))
+        else:
+            assert c.ambiguity is None
+        if layout == "ransac_tutorial" or layout == "oanet":  # no sizes: twice the principal point
+            assert c.size0.tolist() == [[801, 1001]]
+        else:
+            assert c.size0.tolist() == [list(writers.SIZE)]
+    assert (c.mutual is not None) == (layout == "oanet")
+
+
+@pytest.mark.parametrize("layout", writers.WRITERS)
+def test_estimators_pruners_and_metrics_work_on_it(layout: str, tmp_path: Path) -> None:
+    dataset = load(layout, tmp_path)
+    pruner: dict[str, Any] = {}
+    if layout != "posebench":  # which says nothing of how good a match is
+        pruner["one_to_one"] = presets.build("pruner", "one_to_one")
+    if layout in WITH_RATIOS:
+        pruner["ratio"] = lambda c: c.keep(ratio_test(c.ambiguity, 0.8))
+    for row in evaluate(pipeline(**pruner).run(list(dataset))):
+        assert row.ok, row.reason
+        assert row.nsgd < 0.02
+        assert row.rotation_error is not None
+        assert row.rotation_error < 2
+        assert row.corrs_before <= writers.N + 10
+        assert (row.seconds_features is None) or np.isnan(row.seconds_features)
+
+
+def test_hloc_pairs_in_the_other_order(tmp_path: Path) -> None:
+    dataset = load("hloc", tmp_path, lambda folder: writers.write_hloc(folder, swapped=True))
+    for pair, s in zip(dataset, writers.scenes(), strict=True):
+        c, _ = given(pair)
+        order = torch.argsort(c.x0[0, :, 0])
+        expected = torch.argsort(s.x0[:, 0])
+        torch.testing.assert_close(c.x0[0][order], s.x0[expected].float(), rtol=0, atol=1e-4)
+        torch.testing.assert_close(c.x1[0][order], s.x1[expected].float(), rtol=0, atol=1e-4)
+
+
+def given(pair: ImagePair) -> Any:
+    return pair.matches()
+
+
+def test_the_origin_can_be_told(tmp_path: Path) -> None:
+    root = writers.write_glue_factory(tmp_path / "glue_factory")
+    usual, other = reload("glue_factory", root), reload("glue_factory", root, origin=0.0)
+    torch.testing.assert_close(given(other[0])[0].x0, given(usual[0])[0].x0 + 0.5)
+    assert usual.digest != other.digest
+
+
+def test_the_test_split_of_the_tutorial_has_no_cameras(tmp_path: Path) -> None:
+    root = writers.write_tutorial(tmp_path / "ransac_tutorial")
+    for name in ("R", "T"):
+        (root / "church" / f"{name}.h5").unlink()
+    with h5py.File(root / "church" / "matches.h5", "a") as file:
+        file.move("img_0a-img_0b-1", "img_0a-img_0b")  # now that nothing tells the names apart
+    with h5py.File(root / "church" / "Fgt.h5", "a") as file:
+        file.move("img_0a-img_0b-1", "img_0a-img_0b")
+    with h5py.File(root / "church" / "K1_K2.h5", "a") as file:
+        file.move("img_0a-img_0b-1", "img_0a-img_0b")
+    first, second, _ = reload("ransac_tutorial", root)
+    np.testing.assert_allclose(first.F, writers.scenes()[0].F.numpy(), atol=1e-12)
+    assert first.R is None
+    assert "does not name two images" in str(second.problem)
+    (root / "church" / "Fgt.h5").unlink()
+    assert "no ground truth" in str(reload("ransac_tutorial", root)[0].problem)
+
+
+def edit(root: Path, name: str, key: str, change: Callable[[np.ndarray], Any] | None) -> None:
+    """Change an entry, or take it away."""
+    with h5py.File(root / name, "a") as file:
+        value = file[key][()]
+        del file[key]
+        if change is not None:
+            file[key] = change(value)
+
+
+HLOC, GLUE, POSE, OANET = "feats-sift_matches-NN.h5", "predictions.h5", "imc_church.h5", "yfcc-sift-2000-test.hdf5"
+PAIR = "s1-Images-00000000.png/s1-Images-00000001.png"
+FIRST = "s1/Images/00000000.png/keypoints"
+VISMATCH = "s1-Images-00000000_s1-Images-00000001"
+TUTORIAL = "img_1a-img_1b-1"
+DAMAGE: list[tuple[str, str, str, Callable[[np.ndarray], Any] | None, str]] = [
+    ("hloc", "feats-sift.h5", "s1/Images/00000001.png/keypoints", None, "no keypoints of image Truth/s1/00000001"),
+    ("hloc", "feats-sift.h5", "s1/Images/00000001.png/keypoints", lambda v: v[:, 0], r"keypoints' has shape \(65,\)"),
+    ("hloc", "feats-sift.h5", FIRST, lambda v: v[:, :1], r"keypoints' has shape \(67, 1\); it must be"),
+    ("ransac_tutorial", "church/K1_K2.h5", TUTORIAL, lambda v: 0 * v, "K1_K2.h5: .*: a calibration matrix is singular"),
+    ("hloc", HLOC, f"{PAIR}/matches0", None, "no matches0 of the pair s1/Images"),
+    ("hloc", HLOC, f"{PAIR}/matches0", lambda v: v[:-3], r"matching_scores0' has shape \(67,\); it must be \(64\)"),
+    ("hloc", "feats-sift.h5", FIRST, lambda v: v[:9], "67 entries, but the first image has 9"),
+    ("hloc", HLOC, f"{PAIR}/matches0", lambda v: v + 40000 * (v > 5), "names keypoint 40064"),
+    ("hloc", HLOC, f"{PAIR}/matches0", lambda v: (v + 40000 * (v > 5)).astype(np.int16), "overflow as 16-bit"),
+    ("hloc", HLOC, f"{PAIR}/matches0", lambda v: v.astype(float), "it must hold whole numbers"),
+    ("hloc", HLOC, f"{PAIR}/matching_scores0", lambda v: v[1:], r"matching_scores0' has shape \(66,\)"),
+    ("glue_factory", GLUE, f"{PAIR}/keypoints1", None, f"{PAIR}/keypoints1' is missing"),
+    ("glue_factory", GLUE, f"{PAIR}/matches0", None, "no prediction for the pair Truth/s1/0-1"),
+    ("vismatch", "vismatch.h5", f"{VISMATCH}/matched_kpts1", lambda v: v[2:], "63 in matched"),
+    ("ransac_tutorial", "church/matches.h5", TUTORIAL, lambda v: v[:, :3], r"\(65, 3\); it must be \(any, 4\)"),
+    ("ransac_tutorial", "church/match_conf.h5", TUTORIAL, lambda v: v[:7], "has 7 entries, but matches.h5 has 65"),
+    ("ransac_tutorial", "church/match_conf.h5", TUTORIAL, None, "match_conf.h5: 'img_1a-img_1b-1' is missing"),
+    ("ransac_tutorial", "church/K1_K2.h5", TUTORIAL, lambda v: v[:, :1], "it must hold 18 numbers"),
+    ("ransac_tutorial", "church/K1_K2.h5", TUTORIAL, lambda v: v * np.nan, "K1_K2.h5: .* not finite"),
+    ("ransac_tutorial", "church/R.h5", "img_1a", None, "names no two images of R.h5 and T.h5"),
+    ("ransac_tutorial", "church/T.h5", "img_1a", lambda v: v[:2], "T.h5: 'img_1a' has shape"),
+    ("posebench", POSE, "pair1/x2", lambda v: v[:4], "has 65 points in x1 and 4 in x2"),
+    ("posebench", POSE, "pair1/x2", None, "'pair1/x2' is missing"),
+    ("posebench", POSE, "pair1/R", lambda v: 2 * v, "R is no rotation"),
+    ("posebench", POSE, "pair1/t", lambda v: 0 * v, "did not move apart"),
+    ("posebench", POSE, "pair1/camera2/model", lambda v: ["OPENCV_FISHEYE"], "is OPENCV_FISHEYE; it must be one of"),
+    ("posebench", POSE, "pair1/camera1/params", lambda v: v[:3], "are no parameters of PINHOLE"),
+    ("posebench", POSE, "pair1/camera1/params", lambda v: [*v, 0.1], "has distortion"),
+    ("oanet", OANET, "xs/1", lambda v: v[0], r"'xs/1' has shape \(65, 4\)"),
+    ("oanet", OANET, "ratios/1", lambda v: v[:9], "'ratios/1' has 9 entries, but 'xs/1' has 65"),
+    ("oanet", OANET, "f2s/1", lambda v: v[0, :1], "'f2s/1' has shape"),
+    ("oanet", OANET, "Rs/1", None, "'Rs/1' is missing"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("layout", "name", "key", "change", "said"), DAMAGE)
+def test_a_damaged_entry_is_named_and_harms_no_other(
+    layout: str, name: str, key: str, change: Callable[[np.ndarray], Any] | None, said: str, tmp_path: Path
+) -> None:
+    root = writers.WRITERS[layout](tmp_path / layout)
+    edit(root, name, key, change)
+    first, second, third = outcomes(reload(layout, root))
+    assert second.correspondences is None
+    assert second.reason
+    with pytest.raises(AssertionError, match=said):
+        raise AssertionError(second.reason)
+    assert ".h5" in second.reason or ".hdf5" in second.reason or "no rotation" in said or "move apart" in said
+    assert first.correspondences is not None
+    assert third.correspondences is not None
+
+
+def outcomes(dataset: H5Pairs) -> list[Outcome]:
+    return pipeline().correspondences(list(dataset))
+
+
+@pytest.mark.parametrize("layout", writers.WRITERS)
+def test_a_truncated_file_is_named(layout: str, tmp_path: Path) -> None:
+    root = writers.WRITERS[layout](tmp_path / layout)
+    for path in sorted(root.rglob("*.h*5")):
+        path.write_bytes(path.read_bytes()[:100])
+    with pytest.raises(DataError, match=r"\.h(df)?5: is not a valid HDF5 file"):
+        reload(layout, root)
+
+
+def test_points_that_are_not_finite_do_not_count(tmp_path: Path) -> None:
+    root = writers.write_posebench(tmp_path / "posebench")
+    edit(root, POSE, "pair1/x2", lambda v: np.where(np.arange(len(v))[:, None] < 5, np.nan, v))
+    c, _ = given(reload("posebench", root)[1])
+    assert c.mask.sum() == 60
+    assert c.x1.isfinite().all()
+
+
+@pytest.mark.parametrize("missing", ["zero", "negative", "absent"])
+def test_a_camera_without_a_size_has_that_of_its_image_or_of_principal_point_and_points(
+    missing: str, tmp_path: Path
+) -> None:
+    root = writers.write_posebench(tmp_path / "posebench")
+    change = {"zero": lambda v: 0 * v, "negative": lambda v: 0 * v - 1, "absent": None}[missing]
+    for camera in ("camera1", "camera2"):
+        edit(root, POSE, f"pair1/{camera}/width", change)
+    edit(root, POSE, "pair1/x2", lambda v: np.where(np.arange(len(v))[:, None] == 0, [1200.25, 3], v))
+    s = writers.scenes()[1]
+    centre = [tuple(round(2 * float(v) + 1) for v in K[[1, 0], 2]) for K in (s.K0, s.K1)]
+    known, unknown = given(reload("posebench", root)[0])[0], given(reload("posebench", root)[1])[0]
+    assert tuple(known.size0[0].tolist()) == writers.SIZE
+    farthest = [int(np.ceil(bound)) + 1 for bound in s.x0.max(0).values.tolist()[::-1]]
+    assert unknown.size0[0].tolist() == [max(sides) for sides in zip(centre[0], farthest, strict=True)]
+    assert unknown.size1[0, 1].item() == 1202  # the point farthest out lies in the image
+    images = tmp_path / "images" / "imc_church" / "pair1"
+    images.mkdir(parents=True)
+    cv2.imwrite(str(images / "1.png"), np.zeros((810, 1010), np.uint8))
+    shown = images / "1"
+    (images / "1.png").rename(shown)
+    beside = given(reload("posebench", root, images=tmp_path / "images")[1])[0]
+    assert tuple(beside.size0[0].tolist()) == (810, 1010)
+    assert torch.equal(beside.size1, unknown.size1)
+    cv2.imwrite(str(images / "1.png"), np.zeros((81, 101), np.uint8))
+    (images / "1.png").rename(shown)
+    reduced = reload("posebench", root, images=tmp_path / "images")[1]
+    assert reduced.problem is not None
+    assert "101 x 81 px, but its camera's principal point" in reduced.problem
+
+
+def test_names_must_tell_images_apart(tmp_path: Path) -> None:
+    root = tmp_path / "hloc"
+    root.mkdir()
+    with h5py.File(root / "feats.h5", "w") as f, h5py.File(root / "matches.h5", "w") as m:
+        for name in ("00000000.png", "00000001.png"):
+            f[f"{name}/keypoints"] = np.zeros((3, 2))
+        m["00000000.png/00000001.png/matches0"] = np.array([-1, 0, 1])
+    with pytest.raises(DataError, match=r"'00000000\.png' could be image Truth/s0/00000000 or Truth/s1"):
+        reload("hloc", root)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"layout": "colmap"}, "no layout 'colmap'; it must be one of hloc, "),
+        ({"layout": "hloc"}, "holds no geometry: give dataset.truth"),
+        ({"layout": "posebench", "truth": "x"}, "layout posebench takes no truth"),
+        ({"layout": "hloc", "truth": "Truth", "features": "no.h5"}, "no such file; dataset.features must be"),
+        ({"layout": "oanet"}, "'xs' is missing; it is no file of OANet's layout"),
+        ({"layout": "ransac_tutorial"}, "neither matches.h5 nor a sub-folder"),
+        ({"layout": "posebench", "root": "nowhere"}, "nowhere: no such file or folder"),
+        ({"layout": "posebench", "root": None}, "h5 needs root"),
+    ],
+)  # fmt: skip
+def test_mistakes_are_told(options: dict[str, Any], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    writers.truth(tmp_path / "Truth")
+    writers.write_hloc(tmp_path / "mine")
+    with pytest.raises(DataError, match=said):
+        data.load("h5", **{"root": "mine", **options})
+
+
+def test_the_digest_is_of_the_contents(tmp_path: Path) -> None:
+    a, b = (writers.write_posebench(tmp_path / name / "posebench") for name in "ab")
+    assert reload("posebench", a).digest == reload("posebench", b).digest
+    edit(b, POSE, "pair1/x2", lambda v: v + 1e-9)
+    assert reload("posebench", a).digest != reload("posebench", b).digest
+
+
+@pytest.mark.parametrize("layout", ["ransac_tutorial", "oanet", "posebench"])
+def test_the_name_of_the_folder_decides_nothing(layout: str, tmp_path: Path) -> None:
+    """Draws follow from a pair's key."""
+    roots = [writers.WRITERS[layout](tmp_path / name) for name in ("first", "second")]
+    if layout == "ransac_tutorial":  # its scene alone, under another name
+        roots = [root / "church" for root in roots]
+        roots[1] = roots[1].rename(tmp_path / "chapel")
+    keys = [[pair.key for pair in reload(layout, root)] for root in roots]
+    assert len(set(keys[0])) == writers.PAIRS
+    assert keys[0] == keys[1]
+
+
+def test_says_which_extra_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    root = writers.write_posebench(tmp_path / "posebench")
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    with pytest.raises(ImportError, match=r"pip install 'fmtorch\[h5\]'"):
+        reload("posebench", root)
+
+
+@pytest.mark.parametrize(("layout", "roots"), [("hloc", ["Truth", "hloc"]), ("posebench", ["posebench"])])
+def test_a_report_finds_it(layout: str, roots: list[str], tmp_path: Path) -> None:
+    dataset = load(layout, tmp_path)
+    stored = {**presets.load("dataset", "h5"), "layout": layout}
+    options = Options(1, [tmp_path / root for root in roots])
+    assert find_dataset({**stored, "digest": dataset.digest}, options).digest == dataset.digest
+    with pytest.raises(DataError, match="has changed since the run"):
+        find_dataset({**stored, "digest": "another"}, options)
+
+
+def test_the_pipeline_of_given_matches_estimates_as_the_function_does(tmp_path: Path) -> None:
+    """With the prior that `find_fundamental` derives from the same points."""
+    pair = load("oanet", tmp_path)[0]
+    c, _ = pair.matches()
+    (outcome,) = load_pipeline("given_fmtorch").run([pair], seed=3)
+    alone = fmtorch.find_fundamental(
+        c.x0, c.x1, mask=c.mask, ratio=c.ratio, score=c.score, size0=c.size0, size1=c.size1, key=pair.key, seed=3
+    )
+    assert torch.equal(outcome.estimate.F, alone.F)
+
+
+def tutorial_with_images(tmp_path: Path, shape: tuple[int, ...], *, flat: bool) -> tuple[Path, Path]:
+    """A data set of two scenes with the same names of images, and a folder of images of all names."""
+    root, images = writers.WRITERS["ransac_tutorial"](tmp_path / "ransac_tutorial"), tmp_path / "images"
+    shutil.copytree(root / "church", root / "temple")
+    names = {image.path.name for pair in reload("ransac_tutorial", root) for image in (pair.image0, pair.image1)}
+    for folder in (images,) if flat else (images / "church", images / "temple"):
+        folder.mkdir(parents=True)
+        for name in names:
+            cv2.imwrite(str(folder / f"{name}.png"), np.zeros(shape, np.uint8))
+            (folder / f"{name}.png").rename(folder / name)
+    return root, images
+
+
+def test_images_are_checked_against_their_cameras(tmp_path: Path) -> None:
+    root, images = tutorial_with_images(tmp_path, writers.SIZE, flat=False)
+    sound = reload("ransac_tutorial", root, images=images)
+    assert all(pair.problem is None for pair in sound)
+    assert {pair.image0.path.parent.name for pair in sound} == {"church", "temple"}
+    for path in images.rglob("*img*"):
+        cv2.imwrite(str(path.with_suffix(".png")), np.zeros((400, 500), np.uint8))
+        path.with_suffix(".png").rename(path)
+    for pair in reload("ransac_tutorial", root, images=images):
+        assert "500 x 400 px, but its camera's principal point is" in str(pair.problem)
+
+
+def test_one_file_is_no_image_of_two_scenes(tmp_path: Path) -> None:
+    root, images = tutorial_with_images(tmp_path, writers.SIZE, flat=True)
+    with pytest.raises(DataError, match="would stand for images of the scenes church and temple: give each a folder"):
+        reload("ransac_tutorial", root, images=images)
+    with pytest.raises(DataError, match=r"images=.*nowhere: no such folder"):
+        reload("ransac_tutorial", root, images=images / "nowhere")

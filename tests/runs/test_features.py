@@ -1,0 +1,370 @@
+"""The feature cache: bit-equal, by content and configuration, shared detection, honest seconds."""
+
+import dataclasses
+import importlib
+import os
+import re
+import subprocess
+import sys
+import threading
+import types
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from jaxtyping import Float
+from numpy.typing import NDArray
+from torch import Tensor
+
+from fmtorch import presets
+from fmtorch.core.stages import TimedExtractor, TwoStepExtractor
+from fmtorch.core.types import Features
+from fmtorch.features import RootSIFTPCA
+from fmtorch.pipeline.build import load_pipeline
+from fmtorch.runs import fingerprint as configuration_module
+from fmtorch.runs.feature_cache import ArrayCache, CachedFeatures, cached, image_digest
+from fmtorch.runs.fingerprint import configuration, learned
+from tests.conftest import shared_path
+
+
+def picture(seed: int = 0, shape: tuple[int, ...] = (120, 160)) -> NDArray[np.uint8]:
+    noise = np.random.default_rng(seed).uniform(0, 255, (shape[0] // 8, shape[1] // 8, *shape[2:]))
+    return np.kron(noise, np.ones((8, 8, *(1 for _ in shape[2:])))).astype(np.uint8)
+
+
+def equal(a: Features, b: Features) -> bool:
+    return all(
+        getattr(a, f.name).dtype == getattr(b, f.name).dtype and torch.equal(getattr(a, f.name), getattr(b, f.name))
+        for f in dataclasses.fields(a)
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class Detector:
+    step: int = 8
+    threads: int = dataclasses.field(default=1, compare=False)
+
+
+@dataclasses.dataclass(frozen=True)
+class TwoSteps:
+    """Frames on a grid, described by the grey levels at their centres; says what it does."""
+
+    detector: Detector = Detector()
+    gain: float = 0.5
+    log: list[str] = dataclasses.field(default_factory=list, compare=False)
+
+    @property
+    def detection(self) -> object:
+        return self.detector
+
+    def detect(self, image: NDArray[np.uint8]) -> tuple[Float[Tensor, "n 2 3"], Float[Tensor, " n"]]:
+        self.log.append("detect")
+        y, x = np.mgrid[0 : image.shape[0] : self.detector.step, 0 : image.shape[1] : self.detector.step].reshape(2, -1)
+        lafs = torch.zeros(len(x), 2, 3)
+        lafs[:, 0, 0] = lafs[:, 1, 1] = 4
+        lafs[:, :, 2] = torch.from_numpy(np.stack([x, y], 1)).float()
+        return lafs, torch.from_numpy(image[y, x]).float() / 255
+
+    def describe(self, image: NDArray[np.uint8], lafs: Float[Tensor, "n 2 3"]) -> Float[Tensor, "n d"]:
+        self.log.append("describe")
+        x, y = lafs[..., 2].long().T.numpy()
+        return self.gain * torch.from_numpy(image[y, x]).float()[:, None].repeat(1, 4)
+
+    def __call__(self, image: NDArray[np.uint8]) -> Features:
+        lafs, scores = self.detect(image)
+        return Features(lafs, scores, self.describe(image, lafs), torch.tensor(image.shape[:2]))
+
+
+@pytest.mark.parametrize("root", [False, True])
+@pytest.mark.parametrize("shape", [(240, 320), (240, 320, 3), (8, 8)])
+def test_bit_equal_with_and_without(tmp_path: Path, shape: tuple[int, ...], root: bool) -> None:
+    sift = presets.build("features", "sift", max_features=300, root=root)
+    image = picture(shape=shape)
+    first, second = (CachedFeatures(sift, ArrayCache(tmp_path)) for _ in range(2))
+    truth = sift(image)
+    assert shape == (8, 8) or len(truth) > 50
+    assert equal(first(image), truth)
+    assert equal(second(image), truth)
+    assert (first.computed, first.found) == (1, 0)
+    assert (second.computed, second.found) == (0, 1)
+
+
+def test_bit_equal_on_a_real_photograph(tmp_path: Path) -> None:
+    from fmtorch.data import read_image
+
+    path = next(shared_path("data/Strecha_train").rglob("*.jpg"))
+    sift = presets.build("features", "sift", max_features=2000)
+    image = read_image(path)
+    kept = CachedFeatures(sift, ArrayCache(tmp_path))
+    assert equal(kept(image), sift(image))
+    assert equal(kept(image), sift(image))
+    assert kept.found == 1
+    ((_, status),) = kept.cache.files()
+    assert status.st_size < 2000 * (128 + 24 + 4 + 1) + 4000  # SIFT's descriptors are bytes
+
+
+def test_every_float_survives(tmp_path: Path) -> None:
+    @dataclasses.dataclass(frozen=True)
+    class Odd:
+        descriptors: Tensor
+
+        def __call__(self, image: NDArray[np.uint8]) -> Features:
+            n = len(self.descriptors)
+            return Features(torch.zeros(n, 2, 3), torch.zeros(n), self.descriptors, torch.tensor([1, 1]))
+
+    integral = torch.arange(256.0)[:, None]
+    special = torch.tensor([[-0.0], [256.0], [-1.0], [0.5], [torch.nan], [torch.inf], [1e30], [3.0]])
+    for descriptors in (integral, special, special.double(), special.half(), integral[:0], integral.double()):
+        kept = CachedFeatures(Odd(descriptors), ArrayCache(tmp_path))
+        for _ in range(2):
+            read = kept(picture()).descriptors
+            assert read.dtype == descriptors.dtype
+            assert read.numpy().tobytes() == descriptors.numpy().tobytes()
+        assert kept.found == 1
+
+
+def test_extractors_with_the_same_detection_share_it(tmp_path: Path) -> None:
+    cache, image = ArrayCache(tmp_path), picture()
+    half_gain, double_gain, coarse = TwoSteps(gain=0.5), TwoSteps(gain=2.0), TwoSteps(Detector(step=16))
+    assert isinstance(half_gain, TwoStepExtractor)
+    for extractor, expected in (
+        (half_gain, ["detect", "describe"]),
+        (double_gain, ["describe"]),
+        (coarse, ["detect", "describe"]),
+    ):
+        truth = dataclasses.replace(extractor, log=[])(image)
+        for _ in range(2):
+            assert equal(CachedFeatures(extractor, cache)(image), truth)
+        assert extractor.log == expected
+    assert len(list(cache.files())) == 5
+
+
+def test_options_that_change_nothing_are_left_out(tmp_path: Path) -> None:
+    cache = ArrayCache(tmp_path)
+    CachedFeatures(TwoSteps(Detector(threads=1)), cache)(picture())
+    again = CachedFeatures(TwoSteps(Detector(threads=2)), cache)
+    again(picture())
+    assert again.found == 1
+
+
+def test_another_option_image_or_shape_is_another_file(tmp_path: Path) -> None:
+    cache = ArrayCache(tmp_path)
+    sift = CachedFeatures(presets.build("features", "sift"), cache)
+    images = [picture(0), picture(1), picture(0).reshape(160, 120), picture(0)[:, ::-1]]
+    assert len({image_digest(image) for image in images}) == len(images)
+    assert image_digest(images[3]) == image_digest(np.ascontiguousarray(images[3]))
+    for image in images:
+        sift(image)
+    assert sift.computed == 4
+    other = CachedFeatures(presets.build("features", "sift", edge_threshold=9.0), cache)
+    other(images[0])
+    assert other.computed == 1
+
+
+def test_seconds_are_those_of_the_computation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    sift = presets.build("features", "sift")
+    first, second = (CachedFeatures(sift, ArrayCache(tmp_path)) for _ in range(2))
+    assert isinstance(first, TimedExtractor)
+    seconds = first.timed(picture())[1]
+    assert seconds > 0
+    assert second.timed(picture())[1] == seconds
+    assert "of 1 taken" in second.report()
+    assert "1 files" in second.report()
+
+
+def test_a_failure_is_not_kept(tmp_path: Path) -> None:
+    kept = CachedFeatures(presets.build("features", "sift"), ArrayCache(tmp_path))
+    for _ in range(2):
+        with pytest.raises(ValueError, match="non-empty"):
+            kept(np.zeros((0, 4), np.uint8))
+    assert not list(kept.cache.files())
+
+
+def test_a_damaged_file_is_computed_anew(tmp_path: Path) -> None:
+    sift = presets.build("features", "sift")
+    kept = CachedFeatures(sift, ArrayCache(tmp_path))
+    truth = kept(picture())
+    ((path, status),) = kept.cache.files()
+    path.write_bytes(path.read_bytes()[: status.st_size // 2])
+    with pytest.warns(UserWarning, match="damaged"):
+        assert equal(kept(picture()), truth)
+    assert kept.computed == 2
+    assert equal(kept(picture()), truth)
+    assert kept.found == 1
+
+
+def test_threads(tmp_path: Path) -> None:
+    sift = presets.build("features", "sift")
+    kept = CachedFeatures(sift, ArrayCache(tmp_path))
+    truths = [sift(picture(seed)) for seed in range(3)]
+    wrong: list[int] = []
+
+    def work() -> None:
+        wrong.extend(seed for seed in [0, 1, 2] * 4 if not equal(kept(picture(seed)), truths[seed]))
+
+    threads = [threading.Thread(target=work) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert wrong == []
+    assert kept.found + kept.computed == 48
+    assert kept.found >= 48 - 3 * 4
+
+
+def test_off_and_where(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FMTORCH_CACHE", str(tmp_path / "home"))
+    sift = presets.build("features", "sift")
+    assert cached(sift, "off") is sift
+    assert cached(sift, False) is sift
+    default, own = cached(sift, None, 1.5), cached(sift, str(tmp_path / "own"))
+    assert isinstance(default, CachedFeatures)
+    assert isinstance(own, CachedFeatures)
+    assert (default.cache.folder, default.cache.limit) == (tmp_path / "home" / "features", 1_500_000_000)
+    assert (own.cache.folder, own.cache.limit) == (tmp_path / "own", None)
+    assert load_pipeline("sift_gms").extractor == sift  # a library call leaves nothing on disk
+    kept = load_pipeline("sift_gms", overrides=[f"cache={tmp_path}/there", "cache_limit=1"]).extractor
+    assert isinstance(kept, CachedFeatures)
+    assert kept.cache.folder == tmp_path / "there"
+
+
+def test_an_extractor_that_does_not_say_what_it_is_stays_uncached(tmp_path: Path) -> None:
+    class Mine:
+        def __call__(self, image: NDArray[np.uint8]) -> Features:
+            raise NotImplementedError
+
+    mine = Mine()
+    with pytest.warns(UserWarning, match=r"not cached: .*Mine does not say what defines its results"):
+        assert cached(mine, tmp_path) is mine
+
+
+def test_an_extractor_whose_file_is_absent_stays_uncached(tmp_path: Path) -> None:
+    @dataclasses.dataclass(frozen=True)
+    class Network:
+        file: Path
+
+        def __call__(self, image: NDArray[np.uint8]) -> Features:
+            raise FileNotFoundError("a message of its own")
+
+    network = Network(tmp_path / "absent.onnx")
+    with pytest.warns(UserWarning, match=r"not cached: .*absent\.onnx"):
+        assert cached(network, tmp_path / "cache") is network
+
+
+def test_configuration_of_files_tensors_networks_and_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    @dataclasses.dataclass(frozen=True)
+    class Part:
+        value: object
+
+    class Named:
+        identity = ("hardnet", 3)
+
+    def of(value: object) -> str:
+        return str(configuration(Part(value)))
+
+    file, copy = tmp_path / "a.onnx", tmp_path / "b.onnx"
+    file.write_bytes(b"one")
+    copy.write_bytes(b"one")
+    before = of(file)
+    assert before == of(copy)
+    file.write_bytes(b"two")
+    os.utime(file, (1, 1))
+    assert of(file) != before
+    with pytest.raises(FileNotFoundError):
+        of(tmp_path / "absent")
+    assert of(torch.zeros(3)) == of(torch.zeros(3)) != of(torch.zeros(3, 1))
+    assert of(torch.zeros(3)) != of(torch.ones(3))
+    network = torch.nn.Linear(2, 2)
+    before = of(network)
+    with torch.no_grad():
+        network.weight[0, 0] += 1
+    assert of(network) != before
+    assert "hardnet" in of(Named())
+    assert of({"a": [1, None]}) != of({"a": [1, 0]})
+    with pytest.raises(TypeError, match="function does not say"):
+        of(lambda: None)
+
+    sift = presets.build("features", "sift")
+    code = configuration(sift)["code"]
+    source = tmp_path / "package"
+    source.mkdir()
+    (source / "sift.py").write_text("edited")
+    monkeypatch.setattr(sys.modules["fmtorch.features.sift"], "__file__", str(source / "sift.py"))
+    configuration_module.code_digest.cache_clear()
+    assert configuration(sift)["code"] != code
+    configuration_module.code_digest.cache_clear()
+
+
+def test_code_is_what_a_module_imports_from_its_own_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    package = tmp_path / "somebody"
+    (package / "parts").mkdir(parents=True)
+    sources = {
+        "__init__.py": "", "parts/__init__.py": "", "unused.py": "", "deep.py": "", "parts/beside.py": "",
+        "used.py": "def helper():\n    from somebody import deep\n    return deep\n",
+        "parts/detector.py": "import dataclasses\nfrom somebody.used import helper\n\n"
+        "@dataclasses.dataclass(frozen=True)\nclass Detector:\n    step: int = 8\n",
+    }  # fmt: skip
+    for name, text in sources.items():
+        (package / name).write_text(text)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    detector = importlib.import_module("somebody.parts.detector").Detector()
+
+    def code() -> str:
+        configuration_module.code_digest.cache_clear()
+        return str(configuration(detector)["code"])
+
+    before = code()
+    for name, matters in {
+        "unused.py": False, "parts/beside.py": True, "deep.py": True, "used.py": True, "__init__.py": True,
+        "parts/detector.py": True,
+    }.items():  # fmt: skip
+        (package / name).write_text(sources[name] + "\nchanged = True\n")
+        assert (code() != before) == matters, name
+        (package / name).write_text(sources[name])
+    assert code() == before
+    for name in [name for name in sys.modules if name.partition(".")[0] == "somebody"]:
+        monkeypatch.delitem(sys.modules, name)
+
+
+class Typed(torch.nn.Linear):
+    """A network as if typed in where no file holds it."""
+
+
+def test_learned_files_are_digests(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = tmp_path / "a.npz"
+    file.write_bytes(b"one")
+    before = learned(presets.build("features", "rootsiftpca", descriptor={"name": "rootsiftpca", "model": str(file)}))
+    assert len(before) == 1
+    file.write_bytes(b"two")
+    os.utime(file, (1, 1))
+    after = learned({"a": [RootSIFTPCA(file), RootSIFTPCA(file)]})
+    assert len(after) == 1
+    assert after != before
+    network = torch.nn.Linear(2, 2)
+    (before,) = learned(network)
+    with torch.no_grad():
+        network.weight[0, 0] += 1
+    assert learned(network) != [before]
+    monkeypatch.setitem(sys.modules, "typed_in", types.ModuleType("typed_in"))
+    monkeypatch.setattr(Typed, "__module__", "typed_in")
+    assert len(learned(Typed(2, 2))) == 1
+    assert learned(presets.build("features", "sift")) == []
+    assert learned(lambda: None) == []
+    assert learned(RootSIFTPCA(tmp_path / "absent.npz")) == []
+
+
+def test_the_command_tells_what_is_there(tmp_path: Path) -> None:
+    CachedFeatures(TwoSteps(), ArrayCache(tmp_path / "features"))(picture())
+    source = str(Path(__file__).resolve().parents[2])
+    env = {**os.environ, "PYTHONPATH": source, "FMTORCH_CACHE": str(tmp_path), "COLUMNS": "200"}
+    command = [sys.executable, "-W", "error", "-m", "fmtorch.runs"]
+    output = subprocess.run(command, env=env, capture_output=True, text=True, timeout=120, check=True).stdout
+    assert "2 files" in output
+    assert "scenes drawn" not in output
+    (tmp_path / "rendered" / "orbit").mkdir(parents=True)
+    (tmp_path / "rendered" / "orbit" / "00.jpg").write_bytes(bytes(1_500_000))
+    again = subprocess.run(command, env=env, capture_output=True, text=True, timeout=120, check=True).stdout
+    assert re.search(r"rendered: scenes drawn\s+│\s+1 │ 1\.5 MB", again)
+    assert "detection-" in output
+    assert "TwoSteps-" in output

@@ -1,0 +1,364 @@
+import dataclasses
+import errno
+import json
+import multiprocessing
+import os
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from fmtorch.core.types import pair_key
+from fmtorch.runs import PAIR_SCHEMA, PairRow, RunFolder, RunFolderError, identity_digest, replacing, to_table
+from fmtorch.runs.run_folder import content_digest
+
+CONFIG = {
+    "pipeline": {"name": "sift_ratio", "estimator": {"threshold": 0.5, "samples": 2000}, "stages": ["a", "b"]},
+    "dataset": {"name": "rendered", "digest": "ab12"},
+    "seed": 0,
+    "files": {},
+    "version": "0.1.0",
+}
+F = (0.0, -0.5, 0.1, 0.5, 0.0, -0.1, 0.2, 0.3, 0.59)
+
+
+def row(name: str, **changes: object) -> PairRow:
+    return dataclasses.replace(
+        PairRow(pair=name, key=pair_key(name), family="indoor", scene="s", ok=True, nsgd=0.01, F=F), **changes
+    )
+
+
+def failed(name: str) -> PairRow:
+    return PairRow(
+        pair=name, key=pair_key(name), family="indoor", scene="s", ok=False, reason="too few matches: 5, needs 8"
+    )
+
+
+# identity
+
+
+def test_identity_ignores_order_and_container_types() -> None:
+    swapped = {key: CONFIG[key] for key in reversed(CONFIG)}
+    swapped["pipeline"] = {**CONFIG["pipeline"], "stages": ("a", "b")}
+    assert identity_digest(swapped) == identity_digest(CONFIG)
+
+
+def test_identity_is_the_same_in_every_version() -> None:
+    # blake2b of the canonical text, computed apart; run folders of old must stay valid.
+    assert identity_digest({"b": 0.1, "a": [1, None, True, "ü"]}) == "2087b63ed2736b65dc1c72eed6e2b183"
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"seed": 1},
+        {"version": "0.1.1"},
+        {"pipeline": {**CONFIG["pipeline"], "estimator": {"threshold": 0.5 + 2**-53, "samples": 2000}}},
+        {"extra": None},
+    ],
+)
+def test_identity_changes_with_any_field(change: dict[str, object]) -> None:
+    assert identity_digest({**CONFIG, **change}) != identity_digest(CONFIG)
+
+
+def test_identity_refuses_what_json_cannot_say() -> None:
+    with pytest.raises(TypeError):
+        identity_digest({"path": Path("x")})
+
+
+# opening
+
+
+def test_open_writes_the_identity_and_continues(tmp_path: Path) -> None:
+    path = tmp_path / "runs" / "rendered" / "sift"
+    run = RunFolder.open(path, CONFIG)
+    stored = json.loads((path / "run.json").read_text())
+    assert stored["config"] == CONFIG
+    assert stored["identity"] == identity_digest(CONFIG) == run.identity
+    before = (path / "run.json").read_bytes(), (path / "run.json").stat().st_mtime_ns
+    run.append([row("a")])
+    assert RunFolder.open(path, CONFIG).done() == {pair_key("a")}
+    assert ((path / "run.json").read_bytes(), (path / "run.json").stat().st_mtime_ns) == before
+
+
+def test_open_accepts_an_empty_folder_and_one_left_by_a_crash(tmp_path: Path) -> None:
+    (tmp_path / "run.json.0123.tmp").write_text("{")
+    assert RunFolder.open(str(tmp_path), CONFIG).done() == set()
+
+
+def test_open_refuses_another_identity_and_says_what_differs(tmp_path: Path) -> None:
+    RunFolder.open(tmp_path, CONFIG)
+    content = (tmp_path / "run.json").read_bytes()
+    other = {**CONFIG, "seed": 7, "pipeline": {**CONFIG["pipeline"], "estimator": {"threshold": 1.5, "method": "x"}}}
+    with pytest.raises(RunFolderError) as caught:
+        RunFolder.open(tmp_path, other)
+    message = str(caught.value)
+    for part in (
+        str(tmp_path),
+        "seed: 0 -> 7",
+        "pipeline.estimator.threshold: 0.5 -> 1.5",
+        'pipeline.estimator.method: (absent) -> "x"',
+        "pipeline.estimator.samples: 2000 -> (absent)",
+        "run_dir",
+        "delete",
+    ):
+        assert part in message
+    assert "dataset" not in message
+    assert (tmp_path / "run.json").read_bytes() == content
+
+
+def test_open_shows_only_the_first_differences(tmp_path: Path) -> None:
+    RunFolder.open(tmp_path, {f"f{i}": 0 for i in range(9)})
+    with pytest.raises(RunFolderError, match=r"f4: 0 -> 1; and 4 more"):
+        RunFolder.open(tmp_path, {f"f{i}": 1 for i in range(9)})
+
+
+def test_open_refuses_foreign_content(tmp_path: Path) -> None:
+    (tmp_path / "thesis.tex").write_text("precious")
+    with pytest.raises(RunFolderError, match=r"not empty.*thesis\.tex"):
+        RunFolder.open(tmp_path, CONFIG)
+    assert [p.name for p in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+def test_open_refuses_a_file(tmp_path: Path) -> None:
+    (tmp_path / "x").write_text("")
+    with pytest.raises(RunFolderError, match="is a file"):
+        RunFolder.open(tmp_path / "x", CONFIG)
+
+
+@pytest.mark.parametrize("content", ["{", "[]", '{"config": 3}', '{"config": {}, "format": 99}'])
+def test_a_broken_run_json_is_named(tmp_path: Path, content: str) -> None:
+    (tmp_path / "run.json").write_text(content)
+    with pytest.raises(RunFolderError, match=r"run\.json"):
+        RunFolder.open(tmp_path, CONFIG)
+
+
+def test_a_part_of_other_columns_is_named(tmp_path: Path) -> None:
+    run = RunFolder.open(tmp_path, CONFIG)
+    run.append([row("a")])
+    (part,) = (tmp_path / "pairs").iterdir()
+    sink = pa.BufferOutputStream()
+    pq.write_table(pq.read_table(part).drop_columns(["H", "corner_error"]), sink)
+    data = sink.getvalue().to_pybytes()
+    other = part.with_name(f"part-0-0-{content_digest(data)}.parquet")
+    other.write_bytes(data)
+    part.unlink()
+    with pytest.raises(RunFolderError, match=rf"{other.name} cannot be read \(its columns are not those"):
+        run.read()
+
+
+def test_the_order_of_a_list_of_names_is_part_of_the_identity(tmp_path: Path) -> None:
+    stages = [{"ratio": {"threshold": 0.8}}, {"gms": {"with_scale": True}}]
+    RunFolder.open(tmp_path, {"pruner": stages})
+    with pytest.raises(RunFolderError, match=r"differs \(there -> now\): pruner: \[ratio, gms\] -> \[gms, ratio\]\. "):
+        RunFolder.open(tmp_path, {"pruner": stages[::-1]})
+    with pytest.raises(RunFolderError, match=r"\): pruner\.ratio\.threshold: 0\.8 -> 0\.9\. "):
+        RunFolder.open(tmp_path, {"pruner": [{"ratio": {"threshold": 0.9}}, stages[1]]})
+
+
+def test_load_reads_whatever_the_identity(tmp_path: Path) -> None:
+    RunFolder.open(tmp_path, CONFIG).append([row("a")])
+    run = RunFolder.load(tmp_path)
+    assert run.config == CONFIG
+    assert run.read().num_rows == 1
+    with pytest.raises(RunFolderError, match=r"no run\.json"):
+        RunFolder.load(tmp_path / "absent")
+
+
+def test_a_file_system_without_hard_links(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def link(source: object, target: object) -> None:
+        raise PermissionError("no hard links here")
+
+    monkeypatch.setattr(os, "link", link)
+    assert RunFolder.open(tmp_path, CONFIG).config == CONFIG
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["pairs", "run.json"]
+
+
+# rows
+
+
+def test_rows_come_back_as_they_went(tmp_path: Path) -> None:
+    full = row(
+        "a/b c/ü", scene="t", nsgd=0.25, nsgd_released=0.3, inlier_rate=0.5, inlier_rate_before=0.25, corrs=3,
+        corrs_before=9, features0=100, features1=8000, samples=2000, seconds_features=0.5, seconds_matching=0.25,
+        seconds_pruning=0.0, seconds_estimation=1e-3, seconds_metrics=2.0, rotation_error=1.5, translation_error=89.0,
+        pose_reason=None,
+    )  # fmt: skip
+    run = RunFolder.open(tmp_path, CONFIG)
+    run.append([full, failed("b")])
+    run.append([row("c", inlier_rate=float("nan"))])
+    run.append([])
+    table = run.read()
+    assert table.schema == PAIR_SCHEMA
+    first, second, third = table.to_pylist()
+    assert first["key"] == pair_key("a/b c/ü")
+    assert first == {**dataclasses.asdict(full), "F": list(F)}
+    assert (second["ok"], second["nsgd"], second["F"]) == (False, 1.0, None)
+    assert second["reason"].startswith("too few")
+    assert third["inlier_rate"] is None
+    assert len(list((tmp_path / "pairs").iterdir())) == 2
+
+
+def test_only_an_estimate_can_be_of_related_images() -> None:
+    assert row("a", related=True, significance=3.5).related
+    assert not row("a").related
+    with pytest.raises(ValueError, match="called related"):
+        dataclasses.replace(failed("b"), related=True)
+
+
+def test_every_column_has_a_field() -> None:
+    fields = {field.name for field in dataclasses.fields(PairRow)}
+    assert fields == set(PAIR_SCHEMA.names)
+    assert to_table([]).schema == PAIR_SCHEMA
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"corner_error": 1.0, "F": None}, "needs a corner error of at least 0, NSGD NaN and no F"),
+        ({"corner_error": 1.0, "nsgd": float("nan")}, "NSGD NaN and no F"),
+        ({"corner_error": -1.0, "nsgd": float("nan"), "F": None, "H": F}, "a corner error of at least 0"),
+        ({"corner_error": 1.0, "nsgd": float("nan"), "F": None}, "nine finite numbers of H"),
+        (
+            {"corner_error": 1.0, "nsgd": float("nan"), "F": None, "H": F, "ok": False, "reason": "x"},
+            "an infinite corner",
+        ),
+        ({"nsgd": float("nan")}, "nsgd"),
+        ({"nsgd": 1.5}, "nsgd"),
+        ({"reason": "x"}, "has a reason"),
+        ({"rotation_error": 3.0}, "both must be angles"),
+        ({"rotation_error": 3.0, "translation_error": float("nan")}, "both must be angles"),
+        ({"rotation_error": 190.0, "translation_error": 0.0}, "both must be angles"),
+        ({"F": None}, "nine finite"),
+        ({"F": F[:8]}, "nine finite"),
+        ({"F": (float("nan"), *F[1:])}, "nine finite"),
+        ({"ok": False}, "needs a reason"),
+        ({"ok": False, "reason": "x", "F": None}, "nsgd 1"),
+        ({"ok": False, "reason": "x", "nsgd": 1.0}, "no F"),
+    ],
+)
+def test_a_row_cannot_contradict_itself(changes: dict[str, object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        row("a", **changes)
+
+
+# parts
+
+
+def test_an_empty_run_reads_as_an_empty_table(tmp_path: Path) -> None:
+    table = RunFolder.open(tmp_path, CONFIG).read()
+    assert table.num_rows == 0
+    assert table.schema == PAIR_SCHEMA
+
+
+def test_of_duplicates_the_first_written_counts_and_order_is_kept(tmp_path: Path) -> None:
+    run = RunFolder.open(tmp_path, CONFIG)
+    run.append([row("z", corrs=1), row("y", corrs=2), row("z", corrs=3)])
+    run.append([row("y", corrs=4), row("a", corrs=5)])
+    assert run.read()["corrs"].to_pylist() == [1, 2, 5]
+    assert run.done() == {pair_key(name) for name in "zya"}
+    assert run.read({pair_key("a"), pair_key("z"), 5})["corrs"].to_pylist() == [1, 5]
+    assert run.read(set()).num_rows == 0
+
+
+def test_temporary_leftovers_are_ignored(tmp_path: Path) -> None:
+    run = RunFolder.open(tmp_path, CONFIG)
+    run.append([row("a")])
+    (tmp_path / "pairs" / "part-0.parquet.00ff.tmp").write_bytes(b"PAR1 half a fil")
+    assert run.read().num_rows == 1
+
+
+@pytest.mark.parametrize("damage", ["truncated", "empty", "columns"])
+def test_a_broken_part_is_named_and_the_remedy_works(tmp_path: Path, damage: str) -> None:
+    run = RunFolder.open(tmp_path, CONFIG)
+    run.append([row("a")])
+    run.append([row("b")])
+    part = sorted((tmp_path / "pairs").iterdir())[0]
+    if damage == "columns":
+        pq.write_table(pq.read_table(part).drop_columns(["scene"]), part)
+    else:
+        part.write_bytes(part.read_bytes()[: 100 if damage == "truncated" else 0])
+    for use in (run.read, run.done):
+        with pytest.raises(RunFolderError, match=rf"{part.name}.*delete it"):
+            use()
+    part.unlink()
+    assert run.done() == {pair_key("b")}
+
+
+def test_an_error_while_writing_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = RunFolder.open(tmp_path, CONFIG)
+
+    write = Path.write_bytes
+
+    def full_disk(path: Path, data: bytes) -> None:
+        write(path, data[: len(data) // 2])
+        raise OSError(errno.ENOSPC, "No space left on device")  # as the system says it: of no file
+
+    monkeypatch.setattr(Path, "write_bytes", full_disk)
+    with pytest.raises(OSError, match=f"No space left on device: '{tmp_path}/pairs/part-.*parquet'"):
+        run.append([row("a")])
+    assert list((tmp_path / "pairs").iterdir()) == []
+
+
+def _worker(path: Path, number: int, config: dict[str, object]) -> None:
+    run = RunFolder.open(path, config)
+    for i in range(10):
+        run.append([row(f"{number}-{i}"), row(f"shared-{i}", corrs=number)])
+
+
+def test_several_processes_write_one_folder(tmp_path: Path) -> None:
+    context = multiprocessing.get_context("fork")
+    workers = [context.Process(target=_worker, args=(tmp_path / "run", n, CONFIG)) for n in range(3)]
+    for worker in workers:
+        worker.start()
+    for worker in workers:
+        worker.join()
+    assert [worker.exitcode for worker in workers] == [0, 0, 0]
+    run = RunFolder.load(tmp_path / "run")
+    assert run.read().num_rows == 3 * 10 + 10
+    assert len(run.done()) == 40
+    assert list(tmp_path.rglob("*.tmp")) == []
+
+
+def test_of_processes_with_different_identities_one_wins(tmp_path: Path) -> None:
+    context = multiprocessing.get_context("fork")
+    workers = [context.Process(target=_worker, args=(tmp_path / "run", n, {"seed": n})) for n in range(3)]
+    for worker in workers:
+        worker.start()
+    for worker in workers:
+        worker.join()
+    assert sorted(worker.exitcode != 0 for worker in workers) == [False, True, True]
+    run = RunFolder.load(tmp_path / "run")
+    corrs = np.unique(run.read()["corrs"].to_numpy()[1::2])
+    assert corrs.tolist() == [run.config["seed"]]
+
+
+# summaries
+
+
+def test_summary_files(tmp_path: Path) -> None:
+    run = RunFolder.open(tmp_path, CONFIG)
+    run.write_summary({"recall": 0.5, "none": None}, "| é |\n")
+    run.write_summary({"recall": 0.75}, "| ü |\n")
+    assert json.loads((tmp_path / "summary.json").read_text(encoding="utf-8")) == {"recall": 0.75}
+    assert (tmp_path / "summary.md").read_text(encoding="utf-8") == "| ü |\n"
+    with pytest.raises(ValueError, match="JSON"):
+        run.write_summary({"recall": float("nan")}, "")
+    assert list(tmp_path.rglob("*.tmp")) == []
+
+
+def test_replacing_keeps_the_old_file_on_error(tmp_path: Path) -> None:
+    file = tmp_path / "a.txt"
+    file.write_text("old")
+
+    def interrupted() -> None:
+        with replacing(file) as temporary:
+            temporary.write_text("new")
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert file.read_text() == "old"
+    assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]

@@ -1,0 +1,182 @@
+"""`fmtorch.cv2` takes the calls of OpenCV's documentation and returns what OpenCV returns."""
+
+from typing import Any
+
+import cv2 as opencv
+import numpy as np
+import pytest
+
+from fmtorch import cv2
+from tests.reference.known_cameras import K0, SIZE, angle, scene
+
+SCENE = scene(3, 200, noise=0.3, cameras=(K0, K0))
+PTS1, PTS2 = SCENE.x0, SCENE.x1
+EPIPOLAR_FLAGS = ("FM_RANSAC", "FM_LMEDS", "USAC_DEFAULT", "USAC_FAST", "USAC_ACCURATE", "USAC_PROSAC", "USAC_MAGSAC")
+
+
+def both(name: str, *arguments: Any, **named: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+    """What OpenCV and this project return of one call."""
+    return getattr(opencv, name)(*arguments, **named), getattr(cv2, name)(*arguments, **named)
+
+
+def expect_same_kind(theirs: tuple[Any, ...], ours: tuple[Any, ...]) -> None:
+    """Same number of values, of the same types and shapes."""
+    assert len(theirs) == len(ours)
+    for a, b in zip(theirs, ours, strict=True):
+        assert type(a) is type(b)
+        if isinstance(a, np.ndarray):
+            assert (a.dtype, a.shape) == (b.dtype, b.shape)
+
+
+def homography_points(wrong: float = 0.3) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points of a plane, seen twice, and the map."""
+    rng = np.random.default_rng(5)
+    H = np.array([[0.9, -0.1, 40], [0.08, 0.95, -10], [1e-4, -5e-5, 1]])
+    x = rng.uniform([0, 0], SIZE[::-1], (120, 2))
+    y = np.c_[x, np.ones(120)] @ H.T
+    y = y[:, :2] / y[:, 2:]
+    bad = rng.random(120) < wrong
+    y[bad] = rng.uniform([0, 0], SIZE[::-1], (int(bad.sum()), 2))
+    return x, y, H
+
+
+def test_epipolar_geometry_tutorial() -> None:
+    """py_epipolar_geometry: whole numbers, F and a mask that selects points by `mask.ravel() == 1`."""
+    pts1, pts2 = np.int32(PTS1), np.int32(PTS2)
+    theirs, (F, mask) = both("findFundamentalMat", pts1, pts2, cv2.FM_LMEDS)
+    expect_same_kind(theirs, (F, mask))
+    pts1, pts2 = pts1[mask.ravel() == 1], pts2[mask.ravel() == 1]
+    assert 0.5 * SCENE.right.sum() < len(pts1) < 1.2 * SCENE.right.sum()
+    lines1 = cv2.computeCorrespondEpilines(pts2.reshape(-1, 1, 2), 2, F)  # OpenCV's own, by the same module
+    assert lines1.reshape(-1, 3).shape == (len(pts1), 3)
+
+
+def test_ransac_with_threshold_and_confidence() -> None:
+    """The call of the reference, `findFundamentalMat(points1, points2, FM_RANSAC, 3, 0.99)`, and its other forms."""
+    theirs, ours = both("findFundamentalMat", PTS1, PTS2, cv2.FM_RANSAC, 3, 0.99)
+    expect_same_kind(theirs, ours)
+    F, mask = ours
+    assert F[2, 2] == 1
+    assert float((mask.ravel() == SCENE.right).mean()) > 0.9
+    for form in (PTS1[:, None], PTS1[None], PTS1.tolist(), np.asfortranarray(PTS1)):
+        np.testing.assert_array_equal(cv2.findFundamentalMat(form, PTS2, cv2.FM_RANSAC, 3, 0.99)[0], F)
+    out = np.zeros((200, 1), np.uint8)
+    cv2.findFundamentalMat(PTS1, PTS2, cv2.FM_RANSAC, 3, 0.99, out)
+    np.testing.assert_array_equal(out, mask)
+    expect_same_kind(*both("findFundamentalMat", PTS1, PTS2, cv2.FM_RANSAC, 3, 0.99, 500))
+    by_name = {"method": cv2.USAC_MAGSAC, "ransacReprojThreshold": 1.0, "confidence": 0.999, "maxIters": 500}
+    expect_same_kind(*both("findFundamentalMat", PTS1, PTS2, **by_name))
+    few = cv2.findFundamentalMat(PTS1, PTS2, cv2.FM_RANSAC, 0.2)[1]
+    assert few.sum() < 0.7 * mask.sum()
+
+
+@pytest.mark.parametrize("flag", EPIPOLAR_FLAGS)
+def test_every_flag_gives_the_right_geometry(flag: str) -> None:
+    F, mask = cv2.findFundamentalMat(PTS1, PTS2, getattr(cv2, flag))
+    lines = np.c_[PTS1, np.ones(200)] @ F.T
+    distance = np.abs((np.c_[PTS2, np.ones(200)] * lines).sum(1)) / np.linalg.norm(lines[:, :2], axis=1)
+    assert np.median(distance[SCENE.right]) < 0.5
+    assert float(mask.ravel()[SCENE.right].mean()) > 0.8
+    E, inliers = cv2.findEssentialMat(PTS1, PTS2, K0, getattr(cv2, flag))
+    R = cv2.recoverPose(E, PTS1, PTS2, K0, mask=inliers)[1]
+    assert angle(R, SCENE.R) < 1.5
+
+
+def test_methods_of_all_points_are_opencvs() -> None:
+    for points, method in ((7, cv2.FM_7POINT), (60, cv2.FM_8POINT)):
+        theirs, ours = both("findFundamentalMat", PTS1[:points], PTS2[:points], method)
+        np.testing.assert_array_equal(theirs[0], ours[0])
+    x, y, _ = homography_points(wrong=0.0)
+    theirs, ours = both("findHomography", x, y)
+    np.testing.assert_array_equal(theirs[0], ours[0])
+
+
+def test_nothing_where_opencv_has_nothing() -> None:
+    assert both("findFundamentalMat", PTS1[:5], PTS2[:5], cv2.FM_RANSAC) == ((None, None), (None, None))
+    assert both("findEssentialMat", PTS1[:3], PTS2[:3], K0)[1] == (None, None)
+    same = np.ones((30, 2)) * 50
+    assert cv2.findFundamentalMat(same, same) == (None, None)
+    (H, _), (own, mask) = both("findHomography", same, same, cv2.RANSAC, 5.0)
+    assert (H, own) == (None, None)
+    assert (mask.dtype, mask.shape, int(mask.sum())) == (np.uint8, (30, 1), 0)
+
+
+def test_feature_homography_tutorial() -> None:
+    """py_feature_homography: float32 (n, 1, 2), `M, mask = cv.findHomography(src_pts, dst_pts, cv.RANSAC, 5.0)`."""
+    x, y, H = homography_points()
+    src_pts, dst_pts = np.float32(x).reshape(-1, 1, 2), np.float32(y).reshape(-1, 1, 2)
+    theirs, ours = both("findHomography", src_pts, dst_pts, cv2.RANSAC, 5.0)
+    expect_same_kind(theirs, ours)
+    matches_mask = ours[1].ravel().tolist()
+    assert matches_mask == theirs[1].ravel().tolist()
+    np.testing.assert_allclose(ours[0], H, rtol=1e-3, atol=1e-5)
+    corners = np.float32([[0, 0], [0, 479], [639, 479], [639, 0]]).reshape(-1, 1, 2)
+    assert np.abs(cv2.perspectiveTransform(corners, ours[0]) - cv2.perspectiveTransform(corners, H)).max() < 0.05
+    for method in (cv2.LMEDS, cv2.RHO, cv2.USAC_MAGSAC):
+        np.testing.assert_allclose(cv2.findHomography(x, y, method)[0], H, rtol=1e-3, atol=1e-5)
+
+
+def test_a_plane_in_metres() -> None:
+    """Homographies map boards in metres to pixels, too; the threshold is in pixels."""
+    x, y, H = homography_points()
+    D = np.diag([1000, 1000, 1])
+    homography, mask = cv2.findHomography(x / 1000, y, cv2.RANSAC, 3.0)
+    expected = H @ D
+    np.testing.assert_allclose(homography, expected / expected[2, 2], rtol=1e-3, atol=1e-4)
+    assert mask.ravel().tolist() == cv2.findHomography(x, y, cv2.RANSAC, 3.0)[1].ravel().tolist()
+
+
+def test_essential_matrices_in_all_forms() -> None:
+    """`findEssentialMat(points1, points2, cameraMatrix, RANSAC, 0.999, 1.0)` of the reference, and its overloads."""
+    theirs, ours = both("findEssentialMat", PTS1, PTS2, K0, cv2.RANSAC, 0.999, 1.0)
+    expect_same_kind(theirs, ours)
+    number, R, t, mask = cv2.recoverPose(ours[0], PTS1, PTS2, K0, mask=ours[1].copy())
+    assert angle(R, SCENE.R) < 0.5
+    assert float(t[:, 0] @ SCENE.t) > 0.999
+    assert number == np.count_nonzero(mask)
+    none = np.zeros(5)
+    by_two = cv2.findEssentialMat(PTS1, PTS2, K0, none, K0, none, cv2.RANSAC, 0.999, 1.0)
+    np.testing.assert_allclose(by_two[0], ours[0], rtol=0, atol=1e-12)
+    square = cv2.findEssentialMat(PTS1, PTS2, focal=510.0, pp=(310, 250), method=cv2.RANSAC, prob=0.999, threshold=3.0)
+    assert angle(cv2.recoverPose(square[0], PTS1, PTS2, K0)[1], SCENE.R) < 5
+    theirs, ours = both("recoverPose", PTS1, PTS2, K0, none, K0, none)
+    expect_same_kind(theirs, ours)
+    assert angle(ours[2], SCENE.R) < 0.5
+
+
+def test_normalized_points_with_the_identity() -> None:
+    """As the reference says of two cameras: `undistortPoints`, then the identity and a threshold in its unit."""
+    n1, n2 = (cv2.undistortPoints(x[:, None], K0, None) for x in (PTS1, PTS2))
+    E, mask = cv2.findEssentialMat(n1, n2, np.eye(3), cv2.RANSAC, 0.999, 1.0 / 510)
+    assert angle(cv2.recoverPose(E, n1, n2, np.eye(3))[1], SCENE.R) < 0.5
+    assert float((mask.ravel() == SCENE.right).mean()) > 0.9
+
+
+def test_distortion_is_taken_out() -> None:
+    bend = np.array([-0.2, 0.05, 0, 0])
+    n1, n2 = (cv2.undistortPoints(x[:, None], K0, None)[:, 0] for x in (PTS1, PTS2))
+    straight = [np.c_[n, np.ones(200)] for n in (n1, n2)]
+    x1, x2 = (cv2.projectPoints(X, np.zeros(3), np.zeros(3), K0, bend)[0][:, 0] for X in straight)
+    E, _ = cv2.findEssentialMat(x1, x2, K0, bend, K0, bend)
+    assert angle(cv2.recoverPose(E, n1, n2, np.eye(3))[1], SCENE.R) < 0.5
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (lambda: cv2.findFundamentalMat(PTS1, PTS2, 3), "method is 3; it must be one of"),
+        (lambda: cv2.findFundamentalMat(PTS1.ravel(), PTS2), r"points1 has shape \(400,\)"),
+        (lambda: cv2.findFundamentalMat(PTS1 / 1000, PTS2 / 1000), "no pixels"),
+        (lambda: cv2.findFundamentalMat(PTS1, PTS2[:50]), "must be equal"),
+    ],
+)
+def test_wrong_arguments_are_named(call: Any, said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        call()
+
+
+def test_parameters_of_another_search_are_refused() -> None:
+    with pytest.raises(TypeError, match="UsacParams are of OpenCV's own search"):
+        cv2.findFundamentalMat(PTS1, PTS2, opencv.UsacParams())
+    with pytest.raises(TypeError, match="findEssentialMat takes points1, points2, cameraMatrix, method"):
+        cv2.findEssentialMat(PTS1, PTS2, K0, focal=3)

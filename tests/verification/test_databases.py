@@ -1,0 +1,507 @@
+"""Databases of COLMAP verified: the geometry is that of the public functions, and nothing is lost on the way."""
+
+import hashlib
+import os
+import re
+import shutil
+import sqlite3
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+import pytest
+
+import fmtorch
+from fmtorch.core.types import pair_key
+from fmtorch.data.lenses import MODELS
+from fmtorch.io.colmap import EXIF_DEVIATION, MatchDatabase, database_image
+from fmtorch.verification import run
+from tests.conftest import shared_path
+from tests.processes import run_command, starter
+from tests.verification import databases
+from tests.verification.databases import SIZE, plain, read, scene, write
+
+Configuration = pycolmap.TwoViewGeometryConfiguration
+BACK = np.array([[1.0, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])
+
+
+def angle(R: np.ndarray) -> float:
+    """Degrees."""
+    return float(np.degrees(np.arccos(np.clip((np.trace(R) - 1) / 2, -1, 1))))
+
+
+def digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def given(path: Path, pair: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+    """Matched points, matches and key of a pair, as a user of `find_fundamental` has them."""
+    with pycolmap.Database.open(path) as database:
+        matches = database.read_matches(*pair).astype(int)
+        x0, x1 = (database.read_keypoints(i)[:, :2] - np.float32(0.5) for i in pair)
+        key = pair_key(" ".join(database.read_image(i).name for i in pair))
+    return x0[matches[:, 0]], x1[matches[:, 1]], matches, {"key": key, "size0": SIZE, "size1": SIZE}
+
+
+K = np.array([[600.0, 0, 309.5], [0, 612, 249.5], [0, 0, 1]])
+
+
+@pytest.mark.parametrize(
+    ("cameras", "prior", "known"),
+    [
+        ("stored", True, {"K0": K, "K1": K}),
+        ("shared", True, {"focal": "shared"}),
+        ("unknown", True, {"focal": "unknown"}),
+    ],
+)
+def test_geometries_are_those_of_find_fundamental(
+    cameras: Any, prior: bool, known: dict[str, Any], tmp_path: Path
+) -> None:
+    """Bit by bit, whatever the batch."""
+    path = tmp_path / "database.db"
+    write(path, scene(4), prior=prior)
+    result = fmtorch.verify(path, cameras=cameras)
+    kind = "calibrated" if known.get("K0") is not None else "uncalibrated"
+    assert (result.pairs, result.kept, result.configurations, result.problems) == (6, 0, {kind: 6}, ())
+    for pair, geometry in read(path).items():
+        x0, x1, matches, fields = given(path, pair)
+        estimate = fmtorch.find_fundamental(x0, x1, **fields, **known)
+        np.testing.assert_array_equal(geometry.F, BACK.T @ estimate.F[0].double().numpy() @ BACK)
+        np.testing.assert_array_equal(geometry.inlier_matches, matches[estimate.inliers[0].numpy()])
+        assert geometry.config == Configuration.__members__[kind.upper()]
+        R, t = geometry.cam2_from_cam1.rotation.matrix(), geometry.cam2_from_cam1.translation
+        np.testing.assert_allclose(R, estimate.R[0], atol=1e-12)  # by way of a quaternion
+        np.testing.assert_array_equal(t, estimate.t[0])
+
+
+def test_calibrated_poses_are_the_true_ones(tmp_path: Path) -> None:
+    """With E that has them, and F that vanishes at COLMAP's own pixels."""
+    path, cameras = tmp_path / "database.db", scene(3)
+    ids = write(path, cameras, noise=0.0)
+    fmtorch.verify(path)
+    for (first, second), geometry in read(path).items():
+        R, t = cameras.relative(ids.index(first), ids.index(second))
+        assert angle(R.T @ geometry.cam2_from_cam1.rotation.matrix()) < 0.01
+        assert geometry.cam2_from_cam1.translation @ t > np.cos(np.radians(0.05))
+        with pycolmap.Database.open(path) as database:
+            camera = database.read_camera(1)
+            x0, x1 = (np.c_[database.read_keypoints(i)[:, :2], np.ones(150)] for i in (first, second))
+        good = geometry.inlier_matches[geometry.inlier_matches[:, 0] == geometry.inlier_matches[:, 1]]
+        lines = x0[good[:, 0]] @ geometry.F.T
+        distance = np.abs((x1[good[:, 1]] * lines).sum(1)) / np.hypot(lines[:, 0], lines[:, 1])
+        assert distance.max() < 0.01
+        K = camera.calibration_matrix()
+        E = K.T @ geometry.F @ K
+        np.testing.assert_allclose(E / np.linalg.norm(E), geometry.E * np.sign((E * geometry.E).sum()), atol=1e-6)
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_points_are_undistorted_by_every_lens(model: str, tmp_path: Path) -> None:
+    path, cameras = tmp_path / "database.db", scene(2)
+    write(path, cameras, model, noise=0.05)
+    assert fmtorch.verify(path).configurations == {"calibrated": 1}
+    (geometry,) = read(path).values()
+    R, t = cameras.relative(0, 1)
+    assert angle(R.T @ geometry.cam2_from_cam1.rotation.matrix()) < 0.2
+    assert geometry.cam2_from_cam1.translation @ t > np.cos(np.radians(2))
+    right = np.arange(150) % 5 != 0
+    assert set(np.flatnonzero(right)) <= set(geometry.inlier_matches[:, 0].tolist())
+
+
+@pytest.mark.parametrize("columns", [4, 6])
+def test_scales_and_shapes_of_keypoints_change_nothing(columns: int, tmp_path: Path) -> None:
+    path, points = tmp_path / "frames.db", tmp_path / "points.db"
+    ids = write(path, scene(2), columns=columns)
+    shutil.copy(path, points)
+    with pycolmap.Database.open(points) as database:
+        for image in ids:
+            database.update_keypoints(image, np.ascontiguousarray(database.read_keypoints(image)[:, :2]))
+    for each in (path, points):
+        fmtorch.verify(each)
+    assert plain(read(path)) == plain(read(points))
+
+
+@pytest.mark.parametrize("columns", [1, 3, 5])
+def test_keypoints_of_other_columns(columns: int) -> None:
+    camera = pycolmap.Camera(model="PINHOLE", width=640, height=480, params=databases.PARAMS["PINHOLE"])
+    with pytest.raises(ValueError, match=f"the keypoints of a have {columns} columns; they must have 2, 4 or 6"):
+        database_image("a", camera, np.zeros((3, columns), np.float32))
+
+
+def test_what_a_camera_is_known_for() -> None:
+    """A calibration exactly, a focal length of EXIF within 5 %, COLMAP's guess not at all."""
+    keypoints = np.zeros((1, 2), np.float32)
+    cases = {
+        ("SIMPLE_RADIAL", (768, 320, 240, 0), False): np.inf,
+        ("SIMPLE_RADIAL", (700, 320, 240, 0), True): EXIF_DEVIATION,
+        ("SIMPLE_RADIAL", (700, 320, 240, 0.1), True): 0.0,
+        ("PINHOLE", (700, 701, 320, 240), True): 0.0,
+        ("PINHOLE", (700, 700, 321, 240), True): 0.0,
+    }
+    for (model, params, prior), deviation in cases.items():
+        camera = pycolmap.Camera(model=model, width=640, height=480, params=params)
+        camera.has_prior_focal_length = prior
+        assert database_image("a", camera, keypoints).deviation == deviation, (model, params, prior)
+
+
+@pytest.mark.parametrize(("kind", "name"), [("planar", "planar"), ("rotation", "panoramic")])
+def test_configurations_of_special_pairs(kind: str, name: str, tmp_path: Path) -> None:
+    path, cameras = tmp_path / "database.db", scene(2, kind=kind)
+    write(path, cameras)
+    assert fmtorch.verify(path).configurations == {name: 1}
+    (geometry,) = read(path).values()
+    assert geometry.config == Configuration.__members__[name.upper()]
+    assert len(geometry.inlier_matches) >= 115
+    R, t = cameras.relative(0, 1)
+    assert angle(R.T @ geometry.cam2_from_cam1.rotation.matrix()) < 0.5
+    if kind == "rotation":
+        assert not geometry.cam2_from_cam1.translation.any()
+        with pycolmap.Database.open(path) as database:
+            x0, x1 = (np.c_[database.read_keypoints(i)[:, :2], np.ones(150)] for i in (1, 2))
+        there = x0[1] @ geometry.H.T
+        np.testing.assert_allclose(there[:2] / there[2], x1[1, :2], atol=2)  # px
+    else:
+        assert geometry.cam2_from_cam1.translation @ t > np.cos(np.radians(5))
+
+
+def test_one_photograph_twice_and_two_of_different_places(tmp_path: Path) -> None:
+    path, cameras = tmp_path / "database.db", scene(2)
+    cameras.R[1], cameras.t[1] = cameras.R[0], cameras.t[0]
+    write(path, cameras)
+    assert fmtorch.verify(path).configurations == {"planar_or_panoramic": 1}
+    rng = np.random.default_rng(0)
+    with pycolmap.Database.open(path) as database:
+        database.update_keypoints(2, rng.uniform(0, 480, (150, 2)).astype(np.float32))
+    result = fmtorch.verify(path, force=True)
+    assert (result.configurations, result.verified) == ({"degenerate": 1}, 0)
+    (geometry,) = read(path).values()
+    assert geometry.config == Configuration.DEGENERATE
+    assert not len(geometry.inlier_matches)
+    assert geometry.F is None
+
+
+def test_a_focal_length_that_the_matches_contradict_is_no_calibration(tmp_path: Path) -> None:
+    """EXIF of another lens: the pose is that of the focal length that the matches show."""
+    path, cameras = tmp_path / "database.db", scene(2, count=400)
+    write(path, cameras, "SIMPLE_PINHOLE", noise=0.1)
+    assert fmtorch.verify(path).configurations == {"calibrated": 1}
+    with pycolmap.Database.open(path) as database:
+        camera = database.read_camera(1)
+        camera.params = [1500, 320, 240]
+        database.update_camera(camera)
+    assert fmtorch.verify(path, force=True).configurations == {"uncalibrated": 1}
+    (geometry,) = read(path).values()
+    assert angle(cameras.relative(0, 1)[0].T @ geometry.cam2_from_cam1.rotation.matrix()) < 1
+
+
+def test_geometries_are_kept_unless_forced(tmp_path: Path) -> None:
+    path = tmp_path / "database.db"
+    write(path, scene(3))
+    marked = pycolmap.TwoViewGeometry()
+    marked.config = Configuration.WATERMARK
+    with pycolmap.Database.open(path) as database:
+        database.write_two_view_geometry(1, 3, marked)
+    result = fmtorch.verify(path)
+    assert (result.pairs, result.kept, result.verified) == (3, 1, 2)
+    first = read(path)
+    assert first[1, 3].config == Configuration.WATERMARK
+    assert fmtorch.verify(path).kept == 3
+    assert plain(read(path)) == plain(first)
+    result = fmtorch.verify(path, force=True)
+    assert (result.kept, result.configurations) == (0, {"calibrated": 3})
+    forced = read(path)
+    assert forced[1, 3].config == Configuration.CALIBRATED
+    assert plain(forced)[1, 2] == plain(first)[1, 2]
+    assert os.listdir(tmp_path) == ["database.db"]
+
+
+def test_a_copy_leaves_the_database_as_it_is(tmp_path: Path) -> None:
+    path, copy = tmp_path / "database.db", tmp_path / "verified.db"
+    write(path, scene(3))
+    before = digest(path)
+    result = fmtorch.verify(path, output=copy)
+    assert (result.path, result.verified) == (copy, 3)
+    assert digest(path) == before
+    assert len(read(copy)) == 3
+    with pytest.raises(ValueError, match=re.escape(f"output={copy} exists; name another file, or replace it")):
+        fmtorch.verify(path, output=copy)
+    with pytest.raises(ValueError, match="is the database itself"):
+        fmtorch.verify(path, output=path, force=True)
+    copy.write_bytes(b"anything")
+    assert fmtorch.verify(path, output=copy, force=True).verified == 3
+    assert sorted(os.listdir(tmp_path)) == ["database.db", "verified.db"]
+
+
+def test_a_copy_has_what_another_process_wrote_last(tmp_path: Path) -> None:
+    """And which SQLite keeps in a file of its own until that process ends."""
+    path, copy = tmp_path / "database.db", tmp_path / "verified.db"
+    write(path, scene(3), pairs=[(0, 1)])
+    with pycolmap.Database.open(path) as database:
+        database.write_matches(1, 3, database.read_matches(1, 2))
+        assert path.with_name("database.db-wal").exists()
+        assert fmtorch.verify(path, output=copy).pairs == 2
+
+
+def test_a_copy_is_whole_while_somebody_reads_it(tmp_path: Path) -> None:
+    """SQLite then leaves what was written last in a file of its own."""
+    path, copy = tmp_path / "database.db", tmp_path / "verified.db"
+    write(path, scene(3))
+    readers: list[sqlite3.Connection] = []
+
+    def read_once(done: int, total: int) -> None:
+        if not readers:
+            readers.append(sqlite3.connect(tmp_path / "verified.db.partial"))
+            readers[0].execute("SELECT COUNT(*) FROM matches").fetchone()
+
+    fmtorch.verify(path, output=copy, report=read_once)
+    readers[0].close()
+    assert len(read(copy)) == 3
+    assert sorted(os.listdir(tmp_path)) == ["database.db", "verified.db"]
+
+
+def test_broken_pairs_are_lines_with_reasons(tmp_path: Path) -> None:
+    path = tmp_path / "database.db"
+    write(path, scene(5), pairs=[(0, 1), (0, 2), (1, 3), (0, 4), (1, 2)], shared=False)
+    with sqlite3.connect(path) as connection:
+        connection.execute("DELETE FROM keypoints WHERE image_id = 3")
+        sides = np.array([640.0, 320.0]).tobytes()
+        connection.execute("UPDATE cameras SET model = 17, params = ? WHERE camera_id = 5", (sides,))
+    with pycolmap.Database.open(path) as database:
+        database.update_keypoints(4, np.zeros((7, 2), np.float32))
+    result = fmtorch.verify(path)
+    assert (result.pairs, result.verified) == (5, 1)
+    assert sorted(result.problems)[:3] == [
+        "000.jpg, 002.jpg: 002.jpg has no keypoints",
+        "000.jpg, 004.jpg: camera 5 of 004.jpg is EQUIRECTANGULAR, which is no pinhole behind a lens",
+        "001.jpg, 002.jpg: 002.jpg has no keypoints",
+    ]
+    assert "001.jpg, 003.jpg: a match is of keypoint 149, 003.jpg has 7 of them" in result.problems
+    assert list(read(path)) == [(1, 2)]
+    assert fmtorch.verify(path).kept == 1
+
+
+def test_pairs_of_few_matches_are_degenerate(tmp_path: Path) -> None:
+    path = tmp_path / "database.db"
+    write(path, scene(2, count=6))
+    assert fmtorch.verify(path).configurations == {"degenerate": 1}
+
+
+def _nothing(path: Path) -> None:
+    path.unlink()
+
+
+def _text(path: Path) -> None:
+    path.write_text("matches\n" * 20)
+
+
+def _folder(path: Path) -> None:
+    path.unlink()
+    path.mkdir()
+
+
+def _newer(path: Path) -> None:
+    with sqlite3.connect(path) as connection:
+        connection.execute("PRAGMA user_version = 99000000")
+
+
+def _other(path: Path) -> None:
+    path.unlink()
+    with sqlite3.connect(path) as connection:
+        connection.execute("CREATE TABLE songs (name TEXT)")
+
+
+def _no_matches(path: Path) -> None:
+    with pycolmap.Database.open(path) as database:
+        database.clear_matches()
+
+
+def _no_keypoints(path: Path) -> None:
+    with pycolmap.Database.open(path) as database:
+        database.clear_keypoints()
+
+
+def _truncated(path: Path) -> None:
+    os.truncate(path, 5000)
+
+
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [
+        (_nothing, "there is no file {}; give the database of a COLMAP project: database.db"),
+        (_text, "{} is not a COLMAP database; give the database.db of a COLMAP project"),
+        (_folder, "{} is a folder; give the database file in it: {}/database.db"),
+        (_newer, "{} was written by a newer COLMAP"),
+        (_other, "{} is a database, but none of COLMAP's: it has no table cameras, images, keypoints, matches"),
+        (_no_matches, "{} holds no matches; match the images (colmap exhaustive_matcher) first"),
+        (_no_keypoints, "{} holds no keypoints; extract features (colmap feature_extractor) first"),
+        (_truncated, "{} cannot be read as a COLMAP database: "),
+    ],
+)
+def test_what_is_no_database_to_verify(damage: Any, said: str, tmp_path: Path) -> None:
+    path = tmp_path / "database.db"
+    write(path, scene(2))
+    damage(path)
+    with pytest.raises((ValueError, FileNotFoundError), match="^" + re.escape(said.format(path, path))):
+        fmtorch.verify(path)
+
+
+def test_a_database_that_another_process_writes_to(tmp_path: Path) -> None:
+    path = tmp_path / "database.db"
+    write(path, scene(2))
+    code = f"import sqlite3, time\nc = sqlite3.connect({str(path)!r})\nc.execute('BEGIN IMMEDIATE')\n"
+    held = "open('held', 'w').close()\ntime.sleep(60)"
+    command = starter().start(tmp_path, "-c", code + held)
+    while not (tmp_path / "held").exists():
+        assert command.runs(), command.said()
+    with pytest.raises(OSError, match=re.escape(f"{path} cannot be written: ")):
+        fmtorch.verify(path)
+    assert command.kill()
+    assert fmtorch.verify(path).verified == 1
+
+
+def test_wrong_arguments(tmp_path: Path) -> None:
+    path = tmp_path / "database.db"
+    write(path, scene(2))
+    with pytest.raises(ValueError, match="cameras is 'known'; it must be one of stored, shared, unknown"):
+        fmtorch.verify(path, cameras="known")
+    with pytest.raises(ValueError, match="gives homography matrices; verify needs one that gives fundamental"):
+        fmtorch.verify(path, estimator="homography")
+    with pytest.raises(ValueError, match="no preset 'ransack' in conf/estimator"):
+        fmtorch.verify(path, estimator="ransack")
+    with pytest.raises(FileNotFoundError, match="there is no folder"):
+        fmtorch.verify(path, output=tmp_path / "no" / "copy.db")
+    assert read(path) == {}
+
+
+def test_a_database_of_colmap_3(tmp_path: Path) -> None:
+    """Without rigs and frames, which pycolmap adds when it opens one."""
+    path = tmp_path / "database.db"
+    write(path, scene(3))
+    with sqlite3.connect(path) as connection:
+        for table in ("frame_data", "frames", "rig_sensors", "rigs"):
+            connection.execute(f"DROP TABLE {table}")
+        connection.execute("DROP TABLE two_view_geometries")
+        connection.execute(
+            "CREATE TABLE two_view_geometries (pair_id INTEGER PRIMARY KEY NOT NULL, rows INTEGER NOT NULL, "
+            "cols INTEGER NOT NULL, data BLOB, config INTEGER NOT NULL, F BLOB, E BLOB, H BLOB)"
+        )
+        connection.execute("PRAGMA user_version = 3600")
+    assert fmtorch.verify(path).configurations == {"calibrated": 3}
+    assert all(geometry.cam2_from_cam1 is not None for geometry in read(path).values())
+
+
+def test_keypoints_are_read_for_many_images_in_blocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Batches and the images that are kept change nothing."""
+    path, other = tmp_path / "database.db", tmp_path / "other.db"
+    write(path, scene(6))
+    write(other, scene(6))
+    fmtorch.verify(path)
+    monkeypatch.setattr(run, "BATCH", 2)
+    monkeypatch.setattr("fmtorch.io.colmap.BLOCK", 2)
+    monkeypatch.setattr("fmtorch.io.colmap.MEMORY", 3)
+    with MatchDatabase(other) as database:
+        pairs = database.pairs()
+    assert pairs[5:12] == [(2, 3), (2, 4), (2, 5), (3, 4), (3, 5), (2, 6), (3, 6)]
+    fmtorch.verify(other)
+    assert plain(read(other)) == plain(read(path))
+
+
+SLOWLY = "import time, fmtorch.verification.run as v\nv.BATCH = 2\n"
+
+
+@pytest.mark.parametrize("way", ["in place", "copy", "forced", "forced copy"])
+def test_a_killed_verification_continues(way: str, tmp_path: Path) -> None:
+    """kill -9 after some batches: the database can be read, and the same command ends with the same geometries."""
+    source, truth = tmp_path / "database.db", tmp_path / "truth.db"
+    write(source, scene(8))
+    fmtorch.verify(source, output=truth)
+    extra = {"in place": [], "copy": ["output=copy.db"], "forced": ["force=true"]}
+    arguments = extra.get(way, ["output=copy.db", "force=true"])
+    if "forced" in way:
+        old = pycolmap.TwoViewGeometry()
+        old.config = Configuration.WATERMARK
+        with pycolmap.Database.open(source) as database:
+            for pair in read(truth):
+                database.write_two_view_geometry(*pair, old)
+    before = plain(read(source))
+    end = tmp_path / ("copy.db" if "copy" in way else "database.db")
+    parts = end.with_name(f"{end.name}.parts")
+    started = starter()
+    command = started.start(tmp_path, "verify", "database.db", *arguments, before=SLOWLY)
+    assert command.kill_when(lambda: len(list(parts.glob("*.npz"))) > 2), command.said()
+    assert plain(read(source)) == before
+    if "copy" in way:
+        assert not end.exists()
+    command = started.run(tmp_path, "verify", "database.db", *arguments, before=SLOWLY)
+    assert command.wait() == 0, command.said()
+    assert re.search(r"had a geometry\W+\d+", command.said())
+    assert plain(read(end)) == plain(read(truth))
+    assert not {name for name in os.listdir(tmp_path) if name.endswith((".partial", ".parts", "-wal", ".tmp"))}
+
+
+def test_the_command(tmp_path: Path) -> None:
+    write(tmp_path / "database.db", scene(3))
+    done = run_command("verify", "database.db", "output=copy.db", "cameras=shared", "estimator=msac", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert re.search(r"verified\W+3\W", done.stdout)
+    assert "uncalibrated" in done.stdout
+    done = run_command("verify", "nothing.db", cwd=tmp_path)
+    assert (done.returncode, done.stderr.count("\n")) == (1, 1)
+    assert done.stderr.startswith("error: there is no file nothing.db; give the database of a COLMAP project")
+    done = run_command("verify", "database.db", "cameras=known", cwd=tmp_path)
+    assert (done.returncode, done.stderr.count("\n")) == (1, 1)
+    assert "cameras=known" in done.stderr
+
+
+def test_without_pycolmap_an_extra_is_named(tmp_path: Path) -> None:
+    write(tmp_path / "database.db", scene(2))
+    code = "import sys; sys.modules['pycolmap'] = None; sys.argv[1:] = ['verify', 'database.db']; import runpy; "
+    done = run_command("-c", code + "runpy.run_module('fmtorch', run_name='__main__')", cwd=tmp_path)
+    assert done.stderr == "error: pycolmap is not installed; pip install 'fmtorch[colmap]' brings it\n"
+
+
+@pytest.mark.slow
+def test_the_incremental_mapper_registers_all_images(tmp_path: Path) -> None:
+    """With calibrated cameras, and to poses that are the true ones after a similarity."""
+    path, cameras = tmp_path / "database.db", scene(6, count=400)
+    write(path, cameras)
+    fmtorch.verify(path)
+    options = pycolmap.IncrementalPipelineOptions(min_model_size=3, extract_colors=False)
+    models = pycolmap.incremental_mapping(path, tmp_path, tmp_path / "model", options)
+    assert [model.num_reg_images() for model in models.values()] == [6]
+    (model,) = models.values()
+    poses = {image.name: image.cam_from_world().rotation.matrix() for image in model.images.values()}
+    for i in range(1, 6):
+        R = poses[f"{i:03d}.jpg"] @ poses["000.jpg"].T
+        assert angle(R.T @ cameras.relative(0, i)[0]) < 0.2
+
+
+@pytest.mark.slow
+def test_photographs_by_colmap_from_features_to_poses(tmp_path: Path) -> None:
+    """COLMAP's SIFT and matches of castle-P19, our geometries, COLMAP's mapper: all images, at the true rotations."""
+    folder = shared_path("data/Strecha_train/castle-P19")
+    names = [f"{i:08d}.jpg" for i in range(5)]
+    path, cpu = tmp_path / "database.db", pycolmap.Device.cpu
+    extraction = pycolmap.FeatureExtractionOptions(num_threads=1)
+    extraction.sift.max_num_features = 2000
+    pycolmap.extract_features(
+        path, folder / "Images", names, pycolmap.CameraMode.SINGLE, extraction_options=extraction, device=cpu
+    )
+    matching = pycolmap.FeatureMatchingOptions(num_threads=1, skip_geometric_verification=True)
+    pycolmap.match_exhaustive(path, matching_options=matching, device=cpu)
+    result = fmtorch.verify(path)
+    assert (result.pairs, result.problems) == (10, ())
+    assert result.verified >= 8
+    true = [line.reshape(-1)[9:18].reshape(3, 3) for line in np.loadtxt(folder / "Camera.txt")[:5]]
+    for (first, second), geometry in read(path).items():
+        if geometry.config == Configuration.UNCALIBRATED and len(geometry.inlier_matches) > 100:
+            R = geometry.cam2_from_cam1.rotation.matrix()
+            assert angle((true[second - 1] @ true[first - 1].T).T @ R) < 3
+    options = pycolmap.IncrementalPipelineOptions(min_model_size=3, extract_colors=False)
+    models = pycolmap.incremental_mapping(path, folder / "Images", tmp_path / "model", options)
+    (model,) = models.values()
+    assert model.num_reg_images() == 5
+    poses = {image.name: image.cam_from_world().rotation.matrix() for image in model.images.values()}
+    for name, R in zip(names, true, strict=True):
+        assert angle((R @ true[0].T).T @ poses[name] @ poses[names[0]].T) < 1

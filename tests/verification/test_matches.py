@@ -1,0 +1,182 @@
+"""Matches alone verified: what the public function finds, of one pair and of many, in npz and HDF5 files."""
+
+import os
+import re
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+
+import fmtorch
+from fmtorch.core.types import pair_key
+from tests.processes import run_command, starter
+from tests.verification.databases import SIZE, matches, scene
+
+K = np.array([[600.0, 0, 319.5], [0, 600, 239.5], [0, 0, 1]])
+MATRICES = ("F", "E", "H", "R", "t")
+SIZES = {"size0": np.array(SIZE), "size1": np.array(SIZE)}
+CALIBRATIONS = {"K0": K, "K1": K}
+SLOWLY = "import fmtorch.verification.run as v\nv.BATCH = 2\n"
+
+
+def points(count: int = 2, kind: str = "general") -> list[tuple[np.ndarray, np.ndarray]]:
+    """x0 and x1 of all pairs of a scene."""
+    rng, cameras = np.random.default_rng(0), scene(count, kind=kind)
+    images = []
+    for R, t in zip(cameras.R, cameras.t, strict=True):
+        X = (cameras.X @ R.T + t) @ K.T
+        images.append(X[:, :2] / X[:, 2:] + rng.normal(0, 0.3, (len(X), 2)))
+    pairs = [(i, j) for i in range(count) for j in range(i + 1, count)]
+    matched = [(matches(len(cameras.X), rng).astype(int), *pair) for pair in pairs]
+    return [(images[i][m[:, 0]], images[j][m[:, 1]]) for m, i, j in matched]
+
+
+def save(path: Path, arrays: dict[str, Any]) -> Path:
+    """By numpy or h5py."""
+    if path.suffix == ".npz":
+        np.savez(path, **arrays)
+    else:
+        with h5py.File(path, "w") as file:
+            for key, value in arrays.items():
+                file[key] = value
+    return path
+
+
+def load(path: Path) -> dict[str, Any]:
+    """All arrays of a file; attributes of HDF5 groups as arrays of them."""
+    if path.suffix == ".npz":
+        with np.load(path) as file:
+            return {key: value.tolist() for key, value in file.items()}
+    entries: dict[str, Any] = {}
+
+    def visit(name: str, entry: h5py.HLObject) -> None:
+        start = f"{name}/" if name else ""
+        entries.update({f"{start}{key}": np.asarray(value).tolist() for key, value in entry.attrs.items()})
+        if isinstance(entry, h5py.Dataset):
+            entries[name] = entry[()].tolist()
+
+    with h5py.File(path) as file:
+        visit("", file)
+        file.visititems(visit)
+    return entries
+
+
+@pytest.mark.parametrize("known", [{}, SIZES, CALIBRATIONS, {**SIZES, **CALIBRATIONS}, {**SIZES, "K0": K}])
+@pytest.mark.parametrize("endings", [(".npz", ".npz"), (".h5", ".h5"), (".npz", ".hdf5")])
+def test_one_pair_is_that_of_find_fundamental(known: dict[str, Any], endings: tuple[str, str], tmp_path: Path) -> None:
+    """By what is known: without sizes F and H alone, with sizes a pose too, with K a calibrated one."""
+    (x0, x1), output = points()[0], tmp_path / f"verified{endings[1]}"
+    path = save(tmp_path / f"matches{endings[0]}", {"x0": x0, "x1": x1, **known})
+    kind = "calibrated" if "K1" in known else "uncalibrated"
+    result = fmtorch.verify(matches=path, output=output)
+    assert (result.path, result.pairs, result.configurations, result.problems) == (output, 1, {kind: 1}, ())
+    cameras = dict(known)
+    if "K1" in known:
+        cameras |= SIZES
+    elif known:
+        cameras["focal"] = None if "K0" in known else "unknown"
+    x0, x1 = x0.astype(np.float32), x1.astype(np.float32)
+    estimate = fmtorch.find_fundamental(x0, x1, key=pair_key("x0 x1"), **cameras)
+    verified = load(output)
+    assert verified["configuration"] == kind
+    assert verified["inliers"] == estimate.inliers[0].tolist()
+    np.testing.assert_array_equal(verified["F"], estimate.F[0].double())
+    assert set(verified) == {"configuration", "inliers", "H", "F"} | ({"E", "R", "t"} if known else set())
+    if known:
+        np.testing.assert_array_equal(verified["R"], estimate.R[0])
+        np.testing.assert_array_equal(verified["t"], estimate.t[0])
+    assert sorted(os.listdir(tmp_path)) == sorted([path.name, output.name])
+
+
+@pytest.mark.parametrize("ending", [".npz", ".h5"])
+def test_pairs_of_different_knowledge_do_not_meet(ending: str, tmp_path: Path) -> None:
+    """Each is as it would be in a file of its own; a pair that turned is panoramic."""
+    knowledge: list[dict[str, Any]] = [{}, SIZES, CALIBRATIONS, {**SIZES, "K1": K}, SIZES, {}]
+    arrays: dict[str, Any] = {}
+    for i, ((x0, x1), known) in enumerate(zip(points(4), knowledge, strict=True)):
+        arrays |= {f"walk/{i}/{key}": value for key, value in {"x0": x0, "x1": x1, **known}.items()}
+    ((x0, x1),) = points(2, "rotation")
+    arrays |= {"turn/x0": x0, "turn/x1": x1, **{f"turn/{key}": value for key, value in CALIBRATIONS.items()}}
+    path, output = save(tmp_path / f"matches{ending}", arrays), tmp_path / f"verified{ending}"
+    result = fmtorch.verify(matches=path, output=output)
+    assert result.configurations == {"uncalibrated": 5, "calibrated": 1, "panoramic": 1}
+    together = load(output)
+    for pair in [f"walk/{i}" for i in range(6)] + ["turn"]:
+        alone = {key: value for key, value in arrays.items() if key.startswith(f"{pair}/")}
+        fmtorch.verify(matches=save(path, alone), output=output, force=True)
+        for key, value in load(output).items():
+            assert together[key] == value, key
+    assert "turn/F" not in together
+    assert together["turn/t"] == [0, 0, 0]
+
+
+def test_broken_pairs_are_lines_and_stay_out(tmp_path: Path) -> None:
+    x0, x1 = points()[0]
+    good = {"x0": x0, "x1": x1, **SIZES}
+    broken: dict[str, dict[str, Any]] = {
+        "a": good, "b": {**good, "x1": x1[:-1]}, "c": {**good, "x0": x0[:, :1]}, "d": {**good, "K0": K[:2]},
+        "e": {**good, "size1": np.array([0, 640])}, "f": {**good, "x0": x0 > 0}, "g": {"x0": x0, "x1": x1, "K0": K},
+        "h": {**good, "K0": 0 * K}, "i": {**good, "x0": np.array([None])},
+    }  # fmt: skip
+    arrays = {f"{pair}/{key}": value for pair, entries in broken.items() for key, value in entries.items()}
+    result = fmtorch.verify(matches=save(tmp_path / "matches.npz", arrays), output=tmp_path / "verified.npz")
+    assert (result.pairs, result.verified) == (9, 1)
+    said = sorted(result.problems)
+    assert said[0] == f"b/x0, b/x1: x0 has {len(x0)} points and x1 has {len(x1) - 1}; they must have as many"
+    assert said[1] == f"c/x0, c/x1: c/x0 has shape ({len(x0)}, 1); it must be (n, 2)"
+    assert said[2] == "d/x0, d/x1: d/K0 has shape (2, 3); it must be (3, 3)"
+    assert said[3] == "e/x0, e/x1: size1 is [0.0, 640.0]; it must be the height and width of the image"
+    assert said[4] == "f/x0, f/x1: f/x0 is of bool; it must hold real numbers"
+    assert "give the sizes of both images" in said[5]
+    assert said[6].startswith("h/x0, h/x1: K0")
+    assert said[7].startswith("i/x0, i/x1: i/x0 cannot be read")
+    assert {key.partition("/")[0] for key in load(tmp_path / "verified.npz")} == {"a"}
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["matches=matches.npz"], "matches alone need an output: matches=FILE.npz output=VERIFIED.npz"),
+        (["matches=no.npz", "output=v.npz"], "there is no file no.npz; give matches alone: matches=FILE.npz"),
+        (["matches=text.npz", "output=v.npz"], "text.npz: is not a valid npz file"),
+        (["matches=array.npz", "output=v.npz"], "array.npz: is a single array; write x0 and x1 by numpy.savez"),
+        (["matches=text.h5", "output=v.npz"], "text.h5: is not a valid HDF5 file"),
+        (["matches=matches.txt", "output=v.npz"], "matches=matches.txt must end in .npz, .h5, .hdf5"),
+        (["matches=matches.npz", "output=v.txt"], "output=v.txt must end in .npz, .h5, .hdf5"),
+        (["matches=matches.npz", "output=matches.npz"], "output=matches.npz is one of the files that are read"),
+        (["matches=other.npz", "output=v.npz"], "other.npz holds no x0 and x1; give matches x0, x1 (n, 2)"),
+        (["a.db", "matches=matches.npz", "output=v.npz"], "hloc's files need"),
+    ],
+)
+def test_what_is_no_file_of_matches(words: list[str], said: str, tmp_path: Path) -> None:
+    x0, x1 = points()[0]
+    save(tmp_path / "matches.npz", {"x0": x0, "x1": x1})
+    save(tmp_path / "other.npz", {"x0": x0})
+    with (tmp_path / "array.npz").open("wb") as file:
+        np.save(file, x0)
+    for name in ("text.npz", "text.h5", "matches.txt"):
+        (tmp_path / name).write_text("matches")
+    done = run_command("verify", *words, cwd=tmp_path)
+    assert (done.returncode, done.stderr.count("\n")) == (1, 1), done.stderr
+    assert done.stderr.startswith("error: ")
+    assert said in done.stderr
+    assert not list(tmp_path.glob("v.*"))
+
+
+@pytest.mark.parametrize("ending", [".npz", ".h5"])
+def test_a_killed_verification_of_matches_continues(ending: str, tmp_path: Path) -> None:
+    arrays = {f"{i}/{key}": x for i, pair in enumerate(points(7)) for key, x in zip(("x0", "x1"), pair, strict=True)}
+    save(tmp_path / f"matches{ending}", arrays)
+    words = [f"matches=matches{ending}", f"output=verified{ending}"]
+    command = starter().start(tmp_path, "verify", *words, before=SLOWLY)
+    parts = tmp_path / f"verified{ending}.parts"
+    assert command.kill_when(lambda: len(list(parts.glob("*.npz"))) > 2), command.said()
+    assert not (tmp_path / f"verified{ending}").exists()
+    command = starter().run(tmp_path, "verify", *words, before=SLOWLY)
+    assert command.wait() == 0, command.said()
+    assert re.search(r"had a geometry\W+\d+", command.said())
+    fmtorch.verify(matches=tmp_path / f"matches{ending}", output=tmp_path / f"truth{ending}")
+    assert load(tmp_path / f"verified{ending}") == load(tmp_path / f"truth{ending}")
+    assert not [name for name in os.listdir(tmp_path) if name.endswith((".parts", ".tmp"))]
