@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import pytest
@@ -32,8 +32,8 @@ class Pairs(NamedTuple):
     t: Tensor
     key: Tensor
 
-    def map(self, function: Callable[[Tensor], Tensor]) -> Pairs:
-        return Pairs(*map(function, self))
+    def map(self, function: Callable[[Tensor], Tensor]) -> Self:
+        return self._make(map(function, self))
 
 
 PER_MATCH = ("x0", "x1", "weight", "noise", "mask")
