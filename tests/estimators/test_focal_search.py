@@ -10,8 +10,8 @@ from fmtorch import presets
 from fmtorch.core.types import collate
 from fmtorch.estimators import Ransac, focal_search
 from fmtorch.estimators.focal_search import FocalSearch, PlausibleCandidates
-from fmtorch.estimators.models.posterior import Cameras, no_cameras
-from fmtorch.estimators.models.with_focals import FundamentalWithFocals, Refined
+from fmtorch.estimators.models.posterior import no_cameras
+from fmtorch.estimators.models.with_focals import FundamentalWithFocals
 from fmtorch.estimators.options import Focal
 from fmtorch.estimators.pair import Pair
 from fmtorch.estimators.refinement import Candidates, Refinement
@@ -131,24 +131,6 @@ def test_the_prior_is_asked_only_where_good_candidates_differ(monkeypatch: pytes
     selection = search.select(free(different, pair), pair, None)
     assert np.array_equal(selection.F, right)
     assert selection.cameras is None
-
-
-def test_support_behind_a_camera_does_not_count(monkeypatch: pytest.MonkeyPatch) -> None:
-    pair, right, other = models(5e-4)  # half a pixel
-    both, search, family = np.stack([right, other]), searching(iterations=0), FundamentalWithFocals()
-    cameras, refined = family.refine(both, pair, 0)
-    assert refined.share[0] > 0.9  # the scene is before both cameras; some wrong matches agree by chance
-    for name, value in (("RIVAL_GAIN_SHARE", 0.0), ("SAME_MODEL", 0.0), ("MIN_GAIN_SHARE", 0.0)):
-        monkeypatch.setattr(focal_search, name, value)  # all are good ones, and different
-    for share, best in ((1.0, 0), (0.01, 1)):
-
-        def refine(
-            self: FundamentalWithFocals, F: np.ndarray, pair: Pair, iterations: int, share: float = share
-        ) -> tuple[Cameras, Refined]:
-            return cameras, refined._replace(share=np.array([share, 1.0]))
-
-        monkeypatch.setattr(FundamentalWithFocals, "refine", refine)
-        assert np.array_equal(search.select(free(both, pair), pair, None).F, refined.models[best])
 
 
 def test_a_crop_keeps_the_model_without_prior() -> None:

@@ -12,7 +12,6 @@ from fmtorch.estimators.graph_cut import (
     MAX_NEIGHBOURS,
     SWEEPS,
     UNIT,
-    WINDOW,
     Graph,
     GraphCut,
     _gaussian,
@@ -26,7 +25,7 @@ from fmtorch.estimators.selection import scores_of
 from fmtorch.jit.kernel import F4x1, F8x1, F8x2, kernel
 from fmtorch.jit.random import Stream
 from tests.conftest import oracle
-from tests.estimators.pairs import FEW, REAL, SCALES, models, named, to_units
+from tests.estimators.pairs import FEW, REAL, models, named, to_units
 from tests.reference import graph_cut as reference
 from tests.reference.random import number
 from tests.reference.solvers import eight_point, normalised_equations, unit
@@ -144,22 +143,6 @@ def test_neighbours_are_within_the_radius_and_nearly_all_of_those(name: str) -> 
     edges, apart = edges_of(neighbor_graph(pair, RADIUS)), distances(pair)
     assert all(apart[p, q] <= RADIUS * (1 + 1e-12) for p, q in edges)
     assert len(edges) > 0.95 * np.count_nonzero(np.triu(apart <= RADIUS, 1))  # SHIFTS: the two curves find 97 %
-
-
-@pytest.mark.parametrize("scale", SCALES)
-@pytest.mark.parametrize("name", FEW)
-def test_neighbours_of_few_matches(name: str, scale: float) -> None:
-    """All of them where each is in every other's window along the curves."""
-    pair = named(name, scale)
-    for radius in (20.0 * scale, 300.0 * scale, 1e4 * scale):
-        graph = neighbor_graph(pair, radius)
-        assert graph.degree.max() <= MAX_NEIGHBOURS
-        apart = distances(pair)
-        clear = np.abs(apart / radius - 1) > 1e-9
-        within = {(p, q) for p, q in zip(*np.nonzero(np.triu((apart <= radius) & clear, 1)), strict=True)}
-        edges = set(edges_of(graph))
-        assert all(apart[p, q] <= radius * (1 + 1e-9) for p, q in edges)
-        assert pair.count > WINDOW + 1 or within <= edges
 
 
 def test_the_kernel_is_the_gaussian() -> None:

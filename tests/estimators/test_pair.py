@@ -9,11 +9,10 @@ import torch
 
 from fmtorch.core.types import Correspondences, collate
 from fmtorch.estimators.batch import Batch, relative_rounding
-from fmtorch.estimators.pair import MAX_NOISE, MIN_NOISE, Pair, bucket, to_pixels
+from fmtorch.estimators.pair import MAX_NOISE, MIN_NOISE, Pair, bucket
 from tests.estimators.pairs import SCALES, known, named, pair_of, real
 from tests.laws import degenerate, scene, small, with_padding
 from tests.reference.random import number
-from tests.reference.solvers import unit as of_unit_norm
 
 
 def normalized(c: Correspondences, i: int = 0, minimal: int = 7) -> tuple[Pair, Any] | str:
@@ -154,30 +153,6 @@ def test_numbers_of_a_pair_are_those_of_its_seed_key_and_draw() -> None:
     pair = pair_of(scene(0, 20), seed=5)
     expected = [[(number(5, pair.key, 1, d, j, 4) >> 10) / 2**53 for j in range(4)] for d in range(100, 130)]
     assert pair.uniform(100, 30, 4).tolist() == expected
-
-
-@pytest.mark.parametrize("scale", [2.0**-30, 1.0, 2.0**30])
-def test_models_in_pixels(scale: float) -> None:
-    rng = np.random.default_rng(0)
-    centre, unit = scale * rng.uniform(-1000, 1000, 4), scale * 512
-    T0, T1 = (
-        np.array([[1 / unit, 0, -x / unit], [0, 1 / unit, -y / unit], [0, 0, 1]]) for x, y in (centre[:2], centre[2:])
-    )
-    for _ in range(50):
-        F, out = rng.normal(size=(3, 3)), np.empty((3, 3))
-        assert to_pixels(F.ravel(), centre, unit, out)
-        # Two products of three terms, a norm, and a division; entries of one column may cancel.
-        size = np.abs(T1).T @ np.abs(F) @ np.abs(T0)
-        norm = np.linalg.norm(T1.T @ F @ T0)
-        np.testing.assert_array_less(np.abs(out - of_unit_norm(T1.T @ F @ T0)), 40 * 2.0**-53 * (size.max() / norm + 1))
-        assert out.flat[np.abs(out).argmax()] > 0
-
-
-def test_models_that_are_not_finite_in_pixels_are_told() -> None:
-    out = np.empty((3, 3))
-    for F in (np.full(9, np.nan), np.full(9, np.inf)):
-        assert not to_pixels(F, np.zeros(4), 1.0, out)
-    assert not to_pixels(np.ones(9), np.full(4, 1e200), 1e-200, out)
 
 
 def test_the_rounding_of_coordinates() -> None:

@@ -10,7 +10,6 @@ from torch import Tensor, nn
 
 from fmtorch import presets
 from fmtorch.features.kornia_features import ALIKED, DISK
-from fmtorch.runs.feature_cache import ArrayCache, CachedFeatures
 from tests.features.scenes import same, texture
 
 SIZE = (90, 131)  # no multiple of 16
@@ -103,20 +102,6 @@ def test_nothing_found() -> None:
 def test_images_that_cannot_be(name: str, shape: tuple[int, ...]) -> None:
     with pytest.raises(ValueError, match="at least 32 x 32"):
         untrained(name)(np.zeros(shape, np.uint8))
-
-
-@both
-def test_cached_by_weights(name: str, tmp_path: Path) -> None:
-    image, cache = texture(2, *SIZE), ArrayCache(tmp_path)
-    first, again = CachedFeatures(untrained(name), cache), CachedFeatures(untrained(name), cache)
-    assert same(first(image), again(image))
-    assert again.found == 1
-    other = untrained(name)
-    with torch.no_grad():
-        next(other.network.parameters()).add_(0.1)
-    changed = CachedFeatures(other, cache)
-    changed(image)
-    assert changed.computed == 1
 
 
 @both

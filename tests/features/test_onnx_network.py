@@ -10,10 +10,10 @@ from torch import Tensor
 
 from fmtorch.core.files import models_dir
 from fmtorch.core.onnx_network import NetworkFileError
-from fmtorch.features.networks import ARCHITECTURES, build, load_weights
+from fmtorch.features.networks import ARCHITECTURES, build
 from fmtorch.features.onnx_network import PatchNetwork
 from fmtorch.training.onnx_export import export, quantize
-from tests.conftest import oracle, shared_path
+from tests.conftest import oracle
 from tests.features.test_networks import randomized
 
 NEIGHBOURS = 1e-5  # what design allows a descriptor to change with its batch
@@ -41,17 +41,6 @@ def test_onnx_agrees_with_torch_on_real_patches(name: str, tmp_path: Path, patch
     assert found.shape == (64, network.outputs)
     torch.testing.assert_close(found, network(patches).detach(), atol=1e-4, rtol=0)
     assert [f.name for f in tmp_path.iterdir()] == ["network.onnx"]  # one file, weights inside
-
-
-@pytest.mark.parametrize(("name", "file", "field"), [
-    ("affnet", "AffNet.pth", "affnet_features"), ("orinet", "OriNet.pth", "orinet_features"),
-])  # fmt: skip
-def test_the_authors_weights_as_onnx(name: str, file: str, field: str, tmp_path: Path, patches: Tensor) -> None:
-    network = build(name)
-    load_weights(network, shared_path(f"weights/{file}"))
-    export(network, tmp_path / "network.onnx")
-    expected = torch.from_numpy(oracle("affnet_orinet.npz")[field])
-    torch.testing.assert_close(PatchNetwork(tmp_path / "network.onnx")(patches), expected, atol=1e-4, rtol=0)
 
 
 def test_neighbours_and_batch_size_are_invisible(hardnet: Path, patches: Tensor) -> None:

@@ -108,19 +108,6 @@ def test_points_reach_from_about_minus_one_to_one_in_units_of_a_power_of_two() -
     torch.testing.assert_close(back, PIXELS, rtol=0, atol=4e5 * 2**-52)
 
 
-def test_coincident_points_and_none_have_a_unit_of_one_pixel() -> None:
-    same = PIXELS[:, :1].expand(-1, 50, -1)
-    none = torch.zeros(3, 50, dtype=torch.bool)
-    for frame in (
-        PixelFrame.around(same, ~none),
-        PixelFrame.around(PIXELS, none),
-        PixelFrame.around(PIXELS[:, :0], none[:, :0]),
-    ):
-        assert not bool(frame.spread.any())
-        assert frame.pixels_per_unit.tolist() == [1, 1, 1]
-        assert bool(frame.centre.isfinite().all())
-
-
 def test_matrices_follow_the_points() -> None:
     frame = PixelFrame.around(PIXELS, torch.ones(3, 50, dtype=torch.bool))
     F = torch.randn(3, 2, 3, 3, generator=GENERATOR, dtype=torch.float64)

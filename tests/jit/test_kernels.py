@@ -1,9 +1,7 @@
 """Compiled functions: made when first called, kept by version, refused where they do not fit, dispensable."""
 
-import copy
 import importlib.util
 import os
-import pickle
 import subprocess
 import sys
 import threading
@@ -19,7 +17,7 @@ from fmtorch.jit import cache as files
 from fmtorch.jit import kernel as messages
 from fmtorch.jit import kernel as switch
 from fmtorch.jit import together
-from fmtorch.jit.kernel import Inner, Kernel, inner, kernel
+from fmtorch.jit.kernel import Kernel, kernel
 from fmtorch.jit.lanes import fused
 from tests.processes import run_command
 
@@ -149,18 +147,6 @@ def test_what_was_compiled_is_kept_and_told_once(
     assert result(load(tmp_path)) == EXPECTED
     assert capsys.readouterr().err == ""
     assert {path: path.stat().st_ino for path in cache.rglob("*.bin")} == files
-
-
-def test_a_log_gets_one_line_and_a_terminal_a_passing_one(
-    module: types.ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    for each in (module.rows, module.scaled_squares):
-        each.compiled()
-    assert len(capsys.readouterr().err.splitlines()) == 1
-    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
-    messages.begun("rows", "for this machine", "3 of 40: ")
-    messages.ended()
-    assert capsys.readouterr().err == "\r\x1b[K3 of 40: compiling rows for this machine\r\x1b[K"
 
 
 @pytest.mark.parametrize("importable", [True, False])
@@ -378,29 +364,6 @@ def test_kernels_can_be_switched_off(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(switch.SWITCH, "no")
     with pytest.raises(ValueError, match="FMTORCH_KERNELS=no; it must be on or off"):
         switch.available()
-
-
-def test_they_are_pickled_and_copied_by_name(module: types.ModuleType) -> None:
-    for function in (module.rows, module.square):
-        assert pickle.loads(pickle.dumps(function)) is function
-        assert copy.deepcopy(function) is function
-
-
-def test_decorators_take_checked_functions() -> None:
-    """The tests' import hook wraps every function of the package; what is compiled is what was written."""
-
-    def written(x: float) -> float:
-        return x
-
-    def checked(x: float) -> float:
-        return written(x)
-
-    checked.__wrapped__ = written  # type: ignore[attr-defined]
-    for decorator in (kernel, kernel(holds_gil=True)):
-        assert isinstance(decorator(checked), Kernel)
-        assert decorator(checked).function is written
-    assert isinstance(inner(inline=True)(checked), Inner)
-    assert inner(checked).function is written
 
 
 def test_the_storage_command_lists_and_clears_them(module: types.ModuleType, cache: Path, tmp_path: Path) -> None:

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 
-import fmtorch
 from fmtorch.data import read_image
 from fmtorch.matching.matcher import MAX_RATIO, relative_noise
 from fmtorch.matching.vismatch import VisMatch
@@ -117,15 +116,6 @@ def test_in_a_pipeline_failures_are_reasons(tmp_path: Path) -> None:
     assert "0 matches" in silent.reason
 
 
-def test_two_photographs(tmp_path: Path) -> None:
-    a, b = (lists.images() / lists.name(i) for i in (1, 5))
-    result = fmtorch.match(a, b, pipeline=pipeline("sift-nn"), longest_side=800)
-    assert result.ok and result.related  # noqa: PT018
-    assert result.keypoints0.shape == result.keypoints1.shape
-    nothing = fmtorch.match(a, b, pipeline=pipeline("silent"))
-    assert nothing.reason == "the matcher finds no matches"
-
-
 def test_what_cannot_be_loaded_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ValueError, match=r"matcher\.name=sift_nn: vismatch has no such matcher; there are: .*sift-nn"):
         VisMatch("sift_nn")
@@ -151,13 +141,3 @@ def test_the_command_evaluates_it(tmp_path: Path) -> None:
     summary = json.loads((folder / "summary.json").read_text())["all"]
     assert (summary["pairs"], summary["failures"], summary["pose"]["pairs"]) == (2, 0, 2)
     assert summary["seconds"]["features"] is None
-
-
-def test_a_folder_is_refused(tmp_path: Path) -> None:
-    from fmtorch.commands.match import run
-    from tests.helpers import compose
-
-    for i in (0, 1):
-        draw(tmp_path / f"{i}.png", i)
-    with pytest.raises(ValueError, match="a folder is matched by keypoints of each image; this matcher takes pairs"):
-        run(compose("match", ("pipeline=vismatch", "matcher.name=sift-nn", f"images={tmp_path}")), "vismatch")

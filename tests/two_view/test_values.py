@@ -5,12 +5,10 @@ import pytest
 import torch
 
 import fmtorch
-from fmtorch import metrics, presets
+from fmtorch import metrics
 from fmtorch.core.types import Correspondences, collate
-from tests.laws import quick, scene
-from tests.variants import OTHER_LIBRARIES, variants
+from tests.laws import scene
 
-OWN = [n for n in variants("estimator") if not n.startswith(OTHER_LIBRARIES)]
 WRONG = [
     ("prior", 1.5, r"prior of match 3 of pair 1 is 1\.5; it is P\(inlier\), within \[0, 1\]"),
     ("prior", -0.1, "prior of match 3 of pair 1 is -0.1"),
@@ -42,17 +40,6 @@ def test_wrong_values_are_named_to_who_gives_them(name: str, value: float, messa
         mask[1, 3] = False
         masked = fmtorch.find_fundamental(c.x0, c.x1, mask=mask, estimator="msac", hypotheses=50, **given)
         assert bool(masked.ok.all())
-
-
-@pytest.mark.parametrize(("name", "value", "message"), WRONG)
-@pytest.mark.parametrize("estimator", ["msac", "irls:loss=truncated", "cf_ransac", "opencv"])
-def test_wrong_values_of_one_pair_are_its_reason(estimator: str, name: str, value: float, message: str) -> None:
-    built = quick(estimator) if estimator in OWN else presets.build("estimator", estimator)
-    estimate = built(with_wrong(name, value), 0)
-    assert estimate.ok.tolist() == [True, False]
-    assert f"{name}{' of 1 match' if name in ('prior', 'noise') else ''} is wrong: " in estimate.reason[1]
-    alone = built(with_wrong(name, value)[0], 0)
-    assert torch.equal(alone.F[0], estimate.F[0])
 
 
 def test_sizes_of_one_image_and_points_as_opencv_stores_them_are_refused() -> None:
