@@ -16,8 +16,7 @@ from fmtorch.core.files import conf_dir
 from fmtorch.core.types import Correspondences
 from fmtorch.data import ImagePair, ImageSource
 from fmtorch.data.pairs import GivenMatches
-from fmtorch.pipeline.build import build_pipeline, load_pipeline
-from fmtorch.pipeline.pipeline import Pipeline
+from fmtorch.pipeline.pipeline import Pipeline, build_pipeline, load_pipeline
 from tests.helpers import compose
 
 RATIO = "pruner.ratio.families"

@@ -25,9 +25,8 @@ from fmtorch.core.files import STAGES, conf_dir
 from fmtorch.core.options import nearest
 from fmtorch.core.terminal import MISTAKES, error_line, exits_with_message
 from fmtorch.presets import available
-from fmtorch.presets.fields import path_fields
+from fmtorch.presets.composition import path_fields, with_explicit
 from fmtorch.presets.files import groups
-from fmtorch.presets.pruners import with_explicit
 
 Task = Callable[[DictConfig], None]
 SUBMITTED = "jobs run in other processes; what each prints: .submitit/JOB/JOB_0_log.out below hydra.sweep.dir (runs)"

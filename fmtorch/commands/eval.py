@@ -18,20 +18,16 @@ from fmtorch.core.files import replacing
 from fmtorch.core.terminal import console, progress_bars, reporter
 from fmtorch.data import ImagePair, PairDataset
 from fmtorch.evaluation.curves import picture
-from fmtorch.evaluation.identity import run_identity
-from fmtorch.evaluation.pair_cameras import built_with, cameras_of
-from fmtorch.evaluation.run import evaluate_pairs, select
-from fmtorch.evaluation.summary import ALL, Group, summarize
+from fmtorch.evaluation.run import built_with, cameras_of, evaluate_pairs, run_identity, select
+from fmtorch.evaluation.statistics import ALL, Group, summarize
 from fmtorch.evaluation.tables import summary_markdown, terminal_tables
 from fmtorch.io.export import export_kinds, write_exports
 from fmtorch.io.match_store import MatchStore
 from fmtorch.jobs.execution import MIN_PAIRS_FOR_PROCESSES, shard_of
-from fmtorch.pipeline.build import build_pipeline
 from fmtorch.pipeline.exporting import exportable
-from fmtorch.pipeline.pipeline import Pipeline
+from fmtorch.pipeline.pipeline import Pipeline, build_pipeline
 from fmtorch.presets import plain
-from fmtorch.presets.executors import execution_of
-from fmtorch.presets.fields import read_fields
+from fmtorch.presets.composition import execution_of, read_fields
 from fmtorch.runs import RunFolder, identity_digest
 from fmtorch.runs.feature_cache import CachedFeatures
 

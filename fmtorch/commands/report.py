@@ -19,7 +19,7 @@ from fmtorch.core.terminal import console
 from fmtorch.evaluation.curves import axis_of
 from fmtorch.evaluation.gallery import Options, Run, gallery
 from fmtorch.evaluation.page import Section, render, run_names, shared_settings
-from fmtorch.presets.fields import read_fields
+from fmtorch.presets.composition import read_fields
 from fmtorch.runs import RunFolder, RunFolderError
 
 

@@ -13,11 +13,11 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from fmtorch import presets
+from fmtorch.data.files import DataError
 from fmtorch.data.fmbench import FMBenchPairs
 from fmtorch.data.image_cameras import ExifFocal, exif_focal
 from fmtorch.data.images import ImageError, read_image, to_grey
 from fmtorch.data.pairs import DepthDataset, ImagePair, ImageSource, PairDataset
-from fmtorch.data.text_files import DataError
 
 __all__ = [
     "DataError",

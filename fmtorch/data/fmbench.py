@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fmtorch.data.cameras import Camera, relative_pose
+from fmtorch.data.files import DataError, given_root, numbered, read_lines, read_numbers, to_finite
 from fmtorch.data.pairs import ImagePair, ImageSource, PairDataset
 from fmtorch.data.scenes import WINDOW, AllPairs, Candidates, Scene, ScenePairs, View, folders, following
-from fmtorch.data.text_files import DataError, given_root, numbered, read_lines, read_numbers, to_finite
 
 CAMERAS, IMAGES, SUFFIXES = "Camera.txt", "Images", (".jpg", ".png")
 COLUMNS = "K (9 numbers, row by row), R (9), t (3)"

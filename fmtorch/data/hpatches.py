@@ -12,9 +12,9 @@ import numpy as np
 
 from fmtorch.core.options import Within
 from fmtorch.data.cameras import Matrix
+from fmtorch.data.files import DataError, given_root, read_numbers
 from fmtorch.data.images import stored_size
 from fmtorch.data.pairs import ImagePair, ImageSource, PairDataset, Resampling, shorter_side
-from fmtorch.data.text_files import DataError, given_root, read_numbers
 
 FAMILIES = {"i": "illumination", "v": "viewpoint"}  # by the first letter of a sequence's name
 LARGE = (

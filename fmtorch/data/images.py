@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import ExifTags, Image, TiffImagePlugin
 
-from fmtorch.data.lenses import undistorted
+from fmtorch.data.cameras import undistorted
 from fmtorch.data.pairs import ImageSource
 
 _JPEG, _PNG = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"

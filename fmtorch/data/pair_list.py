@@ -18,10 +18,9 @@ from typing import Any
 import numpy as np
 
 from fmtorch.data.cameras import Camera, Matrix, fundamental, nearest_rotation, relative_pose
+from fmtorch.data.files import DataError, NpzArrays, given_root, numbered, read_numbers, to_numbers, to_whole
 from fmtorch.data.images import stored_size
-from fmtorch.data.npz_arrays import NpzArrays
 from fmtorch.data.pairs import ImagePair, ImageSource, PairDataset, Resampling, Size, longer_side
-from fmtorch.data.text_files import DataError, given_root, numbered, read_numbers, to_numbers, to_whole
 
 SUPERGLUE, GLUE_FACTORY, GLUE_FACTORY_4X4 = 38, 32, 36  # columns of a line
 LAYOUTS = {

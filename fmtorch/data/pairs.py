@@ -1,4 +1,4 @@
-"""Images resized and turned when they are read, as evaluation protocols ask, and cameras of what is read."""
+"""The item of every data set: an image pair with its ground truth, and how its images are resized when read."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fmtorch.core.types import Correspondences, pair_key
-from fmtorch.data.lenses import Lens
+from fmtorch.data.cameras import Lens
 
 Matrix = NDArray[np.float64]
 Size = tuple[int, int]  # (h, w), px

@@ -20,9 +20,9 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from fmtorch.data.cameras import Matrix, fundamental, relative_pose, share_centre
+from fmtorch.data.files import DataError
 from fmtorch.data.images import ImageError
 from fmtorch.data.pairs import ImagePair, ImageSource, PairDataset
-from fmtorch.data.text_files import DataError
 
 Indices = NDArray[np.int64]
 

@@ -18,8 +18,7 @@ from fmtorch import presets
 from fmtorch.core.settings import leaves
 from fmtorch.evaluation import curves, tables
 from fmtorch.evaluation.pictures import Image
-from fmtorch.evaluation.statistics import THRESHOLD
-from fmtorch.evaluation.summary import summarize
+from fmtorch.evaluation.statistics import THRESHOLD, summarize
 
 QUALITY, WIDTH = 80, 1280  # of JPEG pictures; px
 DISAGREEMENT = 0.1  # NSGD beyond which a result is as bad as any

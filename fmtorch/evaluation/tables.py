@@ -15,6 +15,7 @@ from rich.table import Table as TerminalTable
 from fmtorch.core.types import PAIR_TYPES
 from fmtorch.evaluation.curves import NSGD, axis_of
 from fmtorch.evaluation.statistics import (
+    ALL,
     CORNER_THRESHOLDS,
     FINE_THRESHOLD,
     FOCAL_THRESHOLDS,
@@ -22,14 +23,15 @@ from fmtorch.evaluation.statistics import (
     MIN_UNITS,
     PERCENT,
     POSE_THRESHOLDS,
+    STAGES,
     THRESHOLD,
+    Group,
     Interval,
     areas,
     difference,
     recalled,
     scene_names,
 )
-from fmtorch.evaluation.summary import ALL, STAGES, Group
 
 Columns = Mapping[str, Callable[[Group], str]]  # what stands below a heading, of the figures of a row
 Summaries = Mapping[str, Mapping[str, Group]]  # of `summarize`, by the runs' names

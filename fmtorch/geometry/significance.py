@@ -21,7 +21,7 @@ from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.geometry.arithmetic import LOG10, logarithm, logarithm_kernel, smallest_but
 from fmtorch.jit.batches import for_each_pair
 from fmtorch.jit.kernel import Array, B1x1, F8x1, F8x2, inner, kernel, matrix, vector
-from fmtorch.jobs.threads import one_thread
+from fmtorch.jobs.execution import one_thread
 
 # `significance` for the matches of one pair, in float64
 

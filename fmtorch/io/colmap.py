@@ -19,7 +19,7 @@ import torch
 from numpy.typing import NDArray
 
 from fmtorch.core.files import replacing
-from fmtorch.data.lenses import MODELS, Lens
+from fmtorch.data.cameras import MODELS, Lens
 from fmtorch.geometry.cameras import calibration_problems
 from fmtorch.io.match_store import ORIGIN, PairGeometry, StoredImage, StoredPair, two_view_geometry
 

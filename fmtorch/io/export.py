@@ -13,7 +13,7 @@ import numpy as np
 
 from fmtorch.core.files import replacing
 from fmtorch.io import colmap, h5
-from fmtorch.io.hloc import write_geometry
+from fmtorch.io.match_file import write_geometry
 from fmtorch.io.match_store import MatchStore, StoredImage, StoredPair
 from fmtorch.io.predictions import pair_key_of
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fmtorch.data.text_files import DataError
+from fmtorch.data.files import DataError
 
 HASHED_WHOLE = 1 << 30  # bytes up to which a file is hashed as a whole
 _BLOCKS, _BLOCK = 4096, 1 << 16  # of larger files: how many blocks of how many bytes

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fmtorch.core.files import replacing
-from fmtorch.data.lenses import Lens
+from fmtorch.data.cameras import Lens
 
 # The geometry of a pair as COLMAP's databases hold it
 

@@ -19,16 +19,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from fmtorch.core.settings import claim
+from fmtorch.data.files import DataError
 from fmtorch.data.images import read_image
 from fmtorch.data.pairs import ImageSource
-from fmtorch.data.text_files import DataError
 from fmtorch.io.match_store import MatchStore, StoredPair
-from fmtorch.jobs.execution import Execution
-from fmtorch.jobs.pool import SHARED_BY, WorkerPool
-from fmtorch.jobs.runner import Factory, Local, Source, TaskRunner, in_order
-from fmtorch.jobs.threads import available, one_thread
+from fmtorch.jobs.execution import Execution, available, one_thread
+from fmtorch.jobs.runner import SHARED_BY, Factory, Local, Source, TaskRunner, WorkerPool, in_order
 from fmtorch.pipeline.exporting import exported_image, exported_match
-from fmtorch.pipeline.photograph_cameras import PhotographCameras
+from fmtorch.pipeline.photographs import PhotographCameras
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.pipeline.two_images import Described, describe, relate
 

@@ -1,4 +1,4 @@
-"""Results kept for those who ask for the same again."""
+"""The four stages in a row: features, matching, pruning, estimation; batching, timing, failures as data."""
 
 from __future__ import annotations
 
@@ -9,11 +9,14 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from concurrent.futures import Future
+from pathlib import Path
 from typing import Generic, TypeVar
 
 import numpy as np
 import torch
+from hydra.errors import HydraException
 from numpy.typing import NDArray
+from omegaconf import DictConfig
 
 from fmtorch.core.grey_pyramid import GreyPyramid, grey_pyramid
 from fmtorch.core.stages import (
@@ -32,7 +35,11 @@ from fmtorch.core.types import Correspondences, Estimate, Features, collate
 from fmtorch.data.images import read_image, to_grey
 from fmtorch.data.pairs import GivenMatches, ImagePair, ImageSource
 from fmtorch.geometry.significance import judged
-from fmtorch.jobs.threads import one_thread
+from fmtorch.jobs.execution import one_thread
+from fmtorch.presets.composition import PIPELINES, build_pruners, compose, plain
+from fmtorch.presets.files import available, unknown
+from fmtorch.presets.objects import instantiate, open_files
+from fmtorch.runs.feature_cache import cached
 from fmtorch.two_view.pair_type import PairTypes, classify
 
 Key = TypeVar("Key")
@@ -389,3 +396,60 @@ def _pair_alone(outcome: Outcome, seed: int, knowledge: Knowledge | None) -> Out
     except Exception as error:  # what it is in stays unknown, and the row says why
         reason = f"not examined: {type(error).__name__}: {error}".splitlines()[0]
         return dataclasses.replace(outcome, not_examined=reason)
+
+
+# Pipelines of presets and of composed configs
+
+
+def build_pipeline(
+    config: DictConfig, device: torch.device | str = "cpu", model: str | None = "fundamental"
+) -> Pipeline:
+    """The `Pipeline` that features (with cache), matcher, pruner and estimator of a composed config describe.
+
+    model: what the estimator must give, "fundamental" or "homography"; None: either.
+    """
+    extractor = cached(instantiate(plain(config.features), "features"), config.cache, config.cache_limit)
+    pruners, for_families = build_pruners(config)
+    open_files([extractor, pruners, for_families], torch.device(device))  # a damaged one is no failure of each pair
+    return Pipeline(
+        extractor,
+        instantiate(plain(config.matcher), "matcher"),
+        pruners,
+        instantiate(plain(config.estimator), "estimator"),
+        device=device,
+        families=for_families,
+        model=model,
+    )
+
+
+def load_pipeline(
+    name: str,
+    device: torch.device | str = "cpu",
+    overrides: Sequence[str] = (),
+    config_dir: Path | str | None = None,
+) -> Pipeline:
+    """The `Pipeline` of ``conf/pipeline/<name>.yaml``, changed by `overrides` as on the command line.
+
+    E.g. ``load_pipeline("sift_gms", overrides=["estimator=lmeds", "pruner.gms.with_scale=true"])``. Unlike the
+    commands it keeps no features on disk unless asked to (``overrides=["cache=null"]``, or a folder).
+
+    Args:
+        name: a preset of conf/pipeline, or of `config_dir`.
+        device: where features are described and everything behind them is computed.
+        overrides: as words of a command.
+        config_dir: a folder with presets of your own, as the commands take it by `--config-dir`.
+
+    Raises:
+        ValueError: for an unknown pipeline, naming those there are, for an override that does not apply, and where
+            `config_dir` is no folder.
+    """
+    if config_dir is not None and not Path(config_dir).is_dir():
+        raise ValueError(f"config_dir={config_dir} is no folder")
+    if name not in available("pipeline", config_dir):
+        raise ValueError(unknown("pipeline", name, config_dir))
+    words = (f"pipeline={name}", "cache=off", *overrides)
+    try:
+        config = compose(PIPELINES, words, None if config_dir is None else Path(config_dir))
+    except HydraException as error:
+        raise ValueError(f"pipeline={name} with {', '.join(overrides)}: {error}") from error
+    return build_pipeline(config, device)

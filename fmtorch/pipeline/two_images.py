@@ -20,15 +20,13 @@ from fmtorch.core.grey_pyramid import GreyPyramid, grey_pyramid
 from fmtorch.core.no_features import NoFeatures
 from fmtorch.core.stages import ImageMatcher, PairImages, pruned
 from fmtorch.core.types import RELATED, Correspondences, Estimate, Features
+from fmtorch.data.cameras import Lens
 from fmtorch.data.images import to_grey
-from fmtorch.data.lenses import Lens
 from fmtorch.geometry.pair_type import GENERAL, IDENTICAL, PLANAR, ROTATION
 from fmtorch.geometry.significance import judged
 from fmtorch.io.match_store import Kind, PairGeometry
-from fmtorch.jobs.threads import mapped, one_thread
-from fmtorch.pipeline.build import load_pipeline
-from fmtorch.pipeline.pipeline import Clock, Pipeline
-from fmtorch.pipeline.reduced_images import (
+from fmtorch.jobs.execution import mapped, one_thread
+from fmtorch.pipeline.photographs import (
     Image,
     evenly_reduced,
     frames_to_original,
@@ -40,6 +38,7 @@ from fmtorch.pipeline.reduced_images import (
     to_original,
     undistorted_matches,
 )
+from fmtorch.pipeline.pipeline import Clock, Pipeline, load_pipeline
 from fmtorch.two_view.arguments import Arrays, Focal, camera_fields
 from fmtorch.two_view.known_cameras import KnownCameras
 from fmtorch.two_view.pair_type import FOCAL_DEVIATION, PairTypes, classify, compile_with, still_warning

@@ -28,8 +28,7 @@ from fmtorch.scenes.patterns import (
     window,
     wood,
 )
-from fmtorch.scenes.surfaces import Surfaces, Vector, vec
-from fmtorch.scenes.textures import Floats, Real, material
+from fmtorch.scenes.surfaces import Floats, Real, Surfaces, Vector, material, vec
 
 
 def direction(degrees: Real) -> Vector:

@@ -16,12 +16,9 @@ from fmtorch.core.files import cache_dir
 from fmtorch.core.settings import claim
 from fmtorch.core.types import Correspondences
 from fmtorch.data.pairs import DepthDataset, ImagePair, PairDataset
-from fmtorch.jobs.execution import Execution
-from fmtorch.jobs.pool import WorkerPool
-from fmtorch.jobs.runner import Factory, Local, Source, TaskRunner
-from fmtorch.jobs.threads import use_one_thread
-from fmtorch.pipeline.build import load_pipeline
-from fmtorch.pipeline.pipeline import Outcome, Pipeline
+from fmtorch.jobs.execution import Execution, use_one_thread
+from fmtorch.jobs.runner import Factory, Local, Source, TaskRunner, WorkerPool
+from fmtorch.pipeline.pipeline import Outcome, Pipeline, load_pipeline
 from fmtorch.runs.feature_cache import CachedFeatures
 from fmtorch.runs.fingerprint import configuration, environment
 from fmtorch.runs.run_folder import identity_digest

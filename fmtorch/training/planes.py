@@ -25,7 +25,7 @@ from fmtorch.core.files import cache_dir, replacing
 from fmtorch.data.cameras import relative_pose
 from fmtorch.data.images import read_image
 from fmtorch.data.pairs import ImagePair, ImageSource
-from fmtorch.scenes.camera import Camera, calibration
+from fmtorch.scenes.raycast import Camera, calibration
 from fmtorch.training.options import PlaneViews as PlaneViews
 
 SUFFIXES = {".jpg", ".jpeg", ".png", ".ppm", ".tif", ".tiff"}

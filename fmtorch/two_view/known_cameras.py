@@ -19,7 +19,7 @@ from fmtorch.geometry.normalize import canonical
 from fmtorch.geometry.pose import pose, pose_from_fundamental
 from fmtorch.geometry.significance import judged
 from fmtorch.jit.batches import for_each_pair
-from fmtorch.jobs.threads import one_thread
+from fmtorch.jobs.execution import one_thread
 
 
 class KnownCameras:

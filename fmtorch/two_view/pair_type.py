@@ -26,7 +26,7 @@ from fmtorch.geometry.pair_type import (
 )
 from fmtorch.jit import kernel
 from fmtorch.jit.together import compile_together
-from fmtorch.jobs.threads import one_thread
+from fmtorch.jobs.execution import one_thread
 from fmtorch.two_view.arguments import expect_values
 from fmtorch.two_view.estimation import estimated, estimator_of
 

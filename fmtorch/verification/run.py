@@ -21,8 +21,7 @@ from fmtorch.core.types import Correspondences, collate, pair_key
 from fmtorch.io.colmap import DatabaseImage
 from fmtorch.io.match_store import Kind, PairGeometry
 from fmtorch.jobs.execution import Execution, Shard
-from fmtorch.jobs.pool import WorkerPool
-from fmtorch.jobs.runner import Factory, Local, Source, TaskRunner
+from fmtorch.jobs.runner import Factory, Local, Source, TaskRunner, WorkerPool
 from fmtorch.pipeline.two_images import pair_geometries
 from fmtorch.two_view.arguments import UNKNOWN
 from fmtorch.two_view.estimation import estimated_by

@@ -24,8 +24,7 @@ from fmtorch.io.colmap import (
     move_database,
     remove_database,
 )
-from fmtorch.io.hloc import HlocMatches
-from fmtorch.io.match_file import MatchFile, expect_suffix
+from fmtorch.io.match_file import HlocMatches, MatchFile, expect_suffix
 from fmtorch.jobs.execution import Execution, Shard, shard_of
 from fmtorch.verification.run import Cameras, Estimation, GeometryParts, PairStore, Verification, VerificationRun
 

@@ -10,7 +10,7 @@ import torch
 from fmtorch import MatchResult, match
 from fmtorch.core.stages import FeatureExtractor
 from fmtorch.data import load
-from fmtorch.pipeline.build import load_pipeline
+from fmtorch.pipeline.pipeline import load_pipeline
 from fmtorch.runs.feature_cache import ArrayCache, CachedFeatures
 from tests.commands.test_eval import OPTIONS, evaluate, rows
 from tests.commands.test_match import run_python

@@ -24,7 +24,7 @@ from fmtorch.core.types import RELATED, WARNINGS
 from fmtorch.data import ImageError, read_image
 from fmtorch.geometry import homography_points, sampson
 from fmtorch.metrics import nsgd
-from fmtorch.pipeline.build import load_pipeline
+from fmtorch.pipeline.pipeline import load_pipeline
 from tests.conftest import own_cache, shared_path
 from tests.matching import stand_in
 from tests.processes import run_command

@@ -19,9 +19,8 @@ from fmtorch.evaluation import tables
 from fmtorch.evaluation.gallery import Options, difference, rebuilt, shown_pair
 from fmtorch.evaluation.page import Section, differing_pairs, render
 from fmtorch.evaluation.rows import evaluate
-from fmtorch.evaluation.summary import summarize
-from fmtorch.pipeline.build import build_pipeline
-from fmtorch.pipeline.pipeline import Outcome
+from fmtorch.evaluation.statistics import summarize
+from fmtorch.pipeline.pipeline import Outcome, build_pipeline
 from fmtorch.runs import PairRow, RunFolder, RunFolderError, to_table
 from tests.helpers import compose, draw, pair
 from tests.processes import run_command

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from fmtorch.data import DataError, load
-from fmtorch.data.kitti import KittiPairs
+from fmtorch.data.videos import KittiPairs
 from fmtorch.geometry import fundamental_from_projections
 from tests.conftest import shared_path
 from tests.data.native import write_kitti

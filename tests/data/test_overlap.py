@@ -13,10 +13,10 @@ from hydra.core.global_hydra import GlobalHydra
 
 from fmtorch.commands import pairs as command
 from fmtorch.data import load
-from fmtorch.data.construction import Construction
-from fmtorch.data.overlap import (
+from fmtorch.data.construction import (
     STEP,
     TOLERANCE,
+    Construction,
     DepthOverlap,
     PointOverlap,
     Seen,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fmtorch.data import DataError, DepthDataset, ImageError, load, read_image, to_grey
-from fmtorch.data.tum import CALIBRATIONS, read_trajectory
+from fmtorch.data.videos import CALIBRATIONS, read_trajectory
 from tests.conftest import shared_path
 from tests.data.native import turned, write_tum
 

@@ -15,10 +15,9 @@ from fmtorch.core.types import PAIR_TYPES, WARNINGS, Correspondences
 from fmtorch.data import ImagePair, ImageSource
 from fmtorch.data.pairs import GivenMatches
 from fmtorch.evaluation import tables
-from fmtorch.evaluation.pair_cameras import WithPairCameras, built_with, cameras_of
 from fmtorch.evaluation.rows import evaluate, focal_errors
-from fmtorch.evaluation.statistics import focal_figures
-from fmtorch.evaluation.summary import summarize
+from fmtorch.evaluation.run import WithPairCameras, built_with, cameras_of
+from fmtorch.evaluation.statistics import focal_figures, summarize
 from fmtorch.evaluation.tables import summary_markdown, terminal_tables
 from fmtorch.io.dataset import H5Pairs
 from fmtorch.pipeline.pipeline import Outcome, Pipeline, examined

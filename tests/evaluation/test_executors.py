@@ -20,9 +20,8 @@ import pytest
 from fmtorch.data.pairs import ImagePair
 from fmtorch.evaluation.run import evaluate_pairs
 from fmtorch.jobs.execution import Execution
-from fmtorch.jobs.pool import WorkersLost
-from fmtorch.pipeline.build import load_pipeline
-from fmtorch.pipeline.pipeline import Pipeline
+from fmtorch.jobs.runner import WorkersLost
+from fmtorch.pipeline.pipeline import Pipeline, load_pipeline
 from fmtorch.runs import PairRow
 from scripts.benchmark.pairs import synthetic_pair
 
@@ -211,7 +210,7 @@ def test_a_scheduler_that_is_lost(cluster: Cluster, pairs: list[ImagePair], expe
 
 def test_an_address_that_nobody_answers(pairs: list[ImagePair], monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("distributed", reason="dask.distributed is not installed")
-    monkeypatch.setattr("fmtorch.jobs.pool.SECONDS_TO_CONNECT", 1.0)
+    monkeypatch.setattr("fmtorch.jobs.runner.SECONDS_TO_CONNECT", 1.0)
     with pytest.raises(ValueError, match=r"executor\.address=tcp://127\.0\.0\.1:9: no scheduler answers"):
         evaluated(pairs, Execution("dask", address="tcp://127.0.0.1:9"))
 

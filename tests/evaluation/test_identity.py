@@ -10,10 +10,9 @@ from omegaconf import OmegaConf
 from fmtorch import presets
 from fmtorch.core.stages import Pruner
 from fmtorch.core.types import Correspondences, Estimate
-from fmtorch.evaluation import identity as identity_module
-from fmtorch.evaluation.identity import run_identity
-from fmtorch.pipeline.build import build_pipeline, load_pipeline
-from fmtorch.pipeline.pipeline import Pipeline
+from fmtorch.evaluation import run as identity_module
+from fmtorch.evaluation.run import run_identity
+from fmtorch.pipeline.pipeline import Pipeline, build_pipeline, load_pipeline
 from fmtorch.runs import identity_digest
 from fmtorch.runs.fingerprint import libraries
 from tests.helpers import compose

@@ -10,7 +10,7 @@ from rich.console import Console
 
 from fmtorch import metrics
 from fmtorch.core.types import pair_key
-from fmtorch.evaluation.summary import summarize
+from fmtorch.evaluation.statistics import summarize
 from fmtorch.evaluation.tables import summary_markdown, terminal_tables
 from fmtorch.runs import PairRow, to_table
 

@@ -16,9 +16,8 @@ from fmtorch.core.types import Correspondences, Estimate, Features
 from fmtorch.data.pairs import ImagePair, ImageSource
 from fmtorch.evaluation.run import _shared_out, evaluate_pairs
 from fmtorch.jobs.execution import Execution
-from fmtorch.jobs.pool import WorkersLost
-from fmtorch.pipeline.build import load_pipeline
-from fmtorch.pipeline.pipeline import Pipeline
+from fmtorch.jobs.runner import WorkersLost
+from fmtorch.pipeline.pipeline import Pipeline, load_pipeline
 from fmtorch.runs import PairRow
 
 ONE, TWO = (Execution("threads", count) for count in (1, 2))
@@ -43,7 +42,7 @@ def test_a_process_that_ends_is_told() -> None:
 
 WORKER = """
 import multiprocessing, time
-from fmtorch.jobs.pool import end_with_parent
+from fmtorch.jobs.runner import end_with_parent
 def work():
     end_with_parent()
     print(multiprocessing.current_process().pid, flush=True)

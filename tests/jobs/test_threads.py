@@ -13,8 +13,7 @@ from fmtorch.core.types import collate
 from fmtorch.data import read_image
 from fmtorch.estimators import batch
 from fmtorch.evaluation.run import evaluate_pairs
-from fmtorch.jobs.execution import Execution
-from fmtorch.jobs.threads import available, mapped, one_thread
+from fmtorch.jobs.execution import Execution, available, mapped, one_thread
 from fmtorch.matching import nearest
 from fmtorch.pruning import position_consistency as consistency
 from tests.helpers import draw, pair

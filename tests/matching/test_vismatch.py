@@ -12,8 +12,7 @@ import torch
 from fmtorch.data import read_image
 from fmtorch.matching.matcher import MAX_RATIO, relative_noise
 from fmtorch.matching.vismatch import VisMatch
-from fmtorch.pipeline.build import load_pipeline
-from fmtorch.pipeline.pipeline import Pipeline
+from fmtorch.pipeline.pipeline import Pipeline, load_pipeline
 from tests.data import lists
 from tests.matching import stand_in
 from tests.pipeline.test_pipeline import draw, pair

@@ -16,10 +16,9 @@ from fmtorch.data.pairs import GivenMatches
 from fmtorch.geometry import sampson
 from fmtorch.io.match_store import MatchStore
 from fmtorch.pipeline import pipeline as module
-from fmtorch.pipeline.build import load_pipeline
 from fmtorch.pipeline.exporting import match_records
 from fmtorch.pipeline.folder import FolderMatches
-from fmtorch.pipeline.pipeline import Pipeline
+from fmtorch.pipeline.pipeline import Pipeline, load_pipeline
 from tests.conftest import shared_path
 
 PRUNERS = "pruner=[ratio,one_to_one,frame_consistency,match_noise,refine_matches]"

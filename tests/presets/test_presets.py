@@ -8,7 +8,7 @@ import fmtorch
 from fmtorch import presets
 from fmtorch.commands.list import HEADINGS, listed
 from fmtorch.core.files import conf_dir
-from fmtorch.pipeline.build import load_pipeline
+from fmtorch.pipeline.pipeline import load_pipeline
 from fmtorch.presets.composition import compose
 from tests.laws import scene
 

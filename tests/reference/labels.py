@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from fmtorch.scenes.camera import Camera
+from fmtorch.scenes.raycast import Camera
 from fmtorch.scenes.surfaces import Surfaces
 
 

@@ -36,7 +36,7 @@ import fmtorch
 from fmtorch import geometry, matching, metrics, pruning
 from fmtorch.core.annotations import arguments_of, arrays_of
 from fmtorch.core.types import Correspondences, Estimate, Features, collate
-from fmtorch.pipeline.build import load_pipeline
+from fmtorch.pipeline.pipeline import load_pipeline
 from fmtorch.presets.objects import merged
 from tests.laws import PEERS, calibrated, few, quick_pruner
 from tests.reliability.arguments import KINDS, MISTAKES, NUMBERS, SEQUENCES, Scene, batches, scenes

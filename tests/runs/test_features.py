@@ -21,7 +21,7 @@ from fmtorch import presets
 from fmtorch.core.stages import TimedExtractor, TwoStepExtractor
 from fmtorch.core.types import Features
 from fmtorch.features import RootSIFTPCA
-from fmtorch.pipeline.build import load_pipeline
+from fmtorch.pipeline.pipeline import load_pipeline
 from fmtorch.runs import fingerprint as configuration_module
 from fmtorch.runs.feature_cache import ArrayCache, CachedFeatures, cached, image_digest
 from fmtorch.runs.fingerprint import configuration, learned

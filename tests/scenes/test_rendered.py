@@ -14,11 +14,11 @@ import pytest
 
 from fmtorch.data.construction import Keypoints, keypoints, matchable
 from fmtorch.scenes import Plan, RenderedPairs
-from fmtorch.scenes import generate as generation
-from fmtorch.scenes.camera import fundamental
-from fmtorch.scenes.generate import FAMILIES, PLANS, Task, build, generate, read, recorded_pairs, seeds
-from fmtorch.scenes.scene import Scene
-from fmtorch.scenes.textures import MATERIALS, PICTURES
+from fmtorch.scenes import dataset as generation
+from fmtorch.scenes.dataset import FAMILIES, PLANS, Task, build, generate, read, recorded_pairs, seeds
+from fmtorch.scenes.light import DrawnScene
+from fmtorch.scenes.raycast import fundamental
+from fmtorch.scenes.surfaces import MATERIALS, PICTURES
 
 TINY = Plan(scenes=1, shots=3, pairs=2, scale=0.25)
 
@@ -39,7 +39,7 @@ def tiny(root: Path) -> RenderedPairs:
 
 
 @functools.cache
-def built(family: str, split: str, number: int = 0) -> Scene:
+def built(family: str, split: str, number: int = 0) -> DrawnScene:
     """A scene at full scale, not drawn."""
     return build(Task(family, split, number, 0, Plan(1, 6, 1)))
 

@@ -8,11 +8,9 @@ import pytest
 from fmtorch.data import DepthDataset, load
 from fmtorch.scenes import Plan, RenderedPairs
 from fmtorch.scenes import dataset as depth_module
-from fmtorch.scenes.camera import Camera, calibration, look_at
-from fmtorch.scenes.dataset import depth_at
-from fmtorch.scenes.generate import Task, build
-from fmtorch.scenes.light import Lens, Light
-from fmtorch.scenes.scene import Scene, Shot
+from fmtorch.scenes.dataset import Task, build, depth_at
+from fmtorch.scenes.light import DrawnScene, Lens, Light, Shot
+from fmtorch.scenes.raycast import Camera, calibration, look_at
 from fmtorch.scenes.surfaces import Surfaces, vec
 from tests.reference.labels import first_hit
 
@@ -38,7 +36,7 @@ def staged(monkeypatch: pytest.MonkeyPatch) -> tuple[Task, Camera]:
     shots = [Shot(camera, Lens(), light=k) for k in range(2)]
     light = Light((0.0, 0.0, 1.0))
     sky = np.zeros((8, 8, 3), np.uint8)
-    scene = Scene([wall_and_screen(False), wall_and_screen(True)], [light] * 2, sky, shots, [(0, 1)])
+    scene = DrawnScene([wall_and_screen(False), wall_and_screen(True)], [light] * 2, sky, shots, [(0, 1)])
     recent = depth_module._Recent()
     recent.scene = lambda task: scene  # type: ignore[assignment]
     monkeypatch.setattr(depth_module, "_recent", recent)

@@ -4,12 +4,10 @@ import cv2
 import numpy as np
 import pytest
 
-from fmtorch.scenes.camera import Camera, calibration, fundamental, look_at, relative_pose
-from fmtorch.scenes.generate import FAMILIES, Plan, Task, build
+from fmtorch.scenes.dataset import FAMILIES, Plan, Task, build
 from fmtorch.scenes.light import Light, Stage
-from fmtorch.scenes.raycast import Geometry
-from fmtorch.scenes.surfaces import Surfaces, vec
-from fmtorch.scenes.textures import TO_LINEAR, Texture, to_srgb
+from fmtorch.scenes.raycast import Camera, Geometry, calibration, fundamental, look_at, relative_pose
+from fmtorch.scenes.surfaces import TO_LINEAR, Surfaces, Texture, to_srgb, vec
 from tests.reference.rendering import colour
 
 SIZE = (120, 160)

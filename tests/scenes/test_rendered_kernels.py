@@ -7,11 +7,9 @@ import numpy as np
 import pytest
 
 from fmtorch.scenes import raycast
-from fmtorch.scenes.camera import Camera, calibration, look_at
-from fmtorch.scenes.dataset import depth_at
-from fmtorch.scenes.generate import FAMILIES, Plan, Task, build
+from fmtorch.scenes.dataset import FAMILIES, Plan, Task, build, depth_at
 from fmtorch.scenes.light import Lens, Light, Stage, expose
-from fmtorch.scenes.raycast import Geometry
+from fmtorch.scenes.raycast import Camera, Geometry, calibration, look_at
 from fmtorch.scenes.surfaces import Surfaces, vec
 from tests.reference import rendering as reference
 

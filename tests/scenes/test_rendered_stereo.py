@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from fmtorch.scenes import StereoPair
-from fmtorch.scenes.textures import skimage_file
+from fmtorch.scenes.surfaces import skimage_file
 
 
 def test_one_pair_with_the_protocol() -> None:

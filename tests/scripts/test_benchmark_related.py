@@ -9,9 +9,8 @@ import pytest
 
 from fmtorch.core.types import RELATED
 from fmtorch.data import ImagePair, ImageSource
-from fmtorch.scenes.dataset import RenderedPairs
-from fmtorch.scenes.generate import Plan
-from fmtorch.scenes.textures import PICTURES
+from fmtorch.scenes.dataset import Plan, RenderedPairs
+from fmtorch.scenes.surfaces import PICTURES
 from scripts.benchmark import pairs, related
 from scripts.benchmark.runner import Row
 from tests.scripts.samples import drawn_set, read, run

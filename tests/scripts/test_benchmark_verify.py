@@ -9,7 +9,7 @@ import pycolmap
 import pytest
 
 from fmtorch.data import load, read_image
-from fmtorch.data.overlap import overlap_of
+from fmtorch.data.construction import overlap_of
 from fmtorch.data.scenes import ScenePairs
 from scripts.benchmark import verify
 from scripts.benchmark.runner import Kept

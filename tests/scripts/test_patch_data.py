@@ -11,9 +11,9 @@ import pytest
 import torch
 from PIL import Image
 
-from fmtorch.scenes.camera import Camera, calibration, fundamental, look_at
-from fmtorch.scenes.generate import Plan, Task
-from fmtorch.scenes.textures import photograph
+from fmtorch.scenes.dataset import Plan, Task
+from fmtorch.scenes.raycast import Camera, calibration, fundamental, look_at
+from fmtorch.scenes.surfaces import photograph
 from fmtorch.training.planes import Photograph, PlaneViews, list_photographs, local_affine, warp
 from scripts.patch_networks.patches import (
     CONTEXT_SIZE,

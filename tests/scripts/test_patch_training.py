@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from fmtorch.core.files import conf_dir
 from fmtorch.features.networks import AffNet, AffNetFast, GeoDesc, HardNet, build, load_weights
 from fmtorch.features.onnx_network import PatchNetwork
-from fmtorch.scenes.textures import photograph
+from fmtorch.scenes.surfaces import photograph
 from fmtorch.training.export import sha256
 from fmtorch.training.planes import PlaneViews
 from scripts.patch_networks.evaluate import DEFAULTS, figures, times

@@ -8,7 +8,7 @@ import torch
 
 from fmtorch.core.types import Correspondences, pair_key
 from fmtorch.scenes import Plan, RenderedPairs
-from fmtorch.scenes.camera import calibration
+from fmtorch.scenes.raycast import calibration
 from fmtorch.training import LabelledMatches, MatchedPairs
 from tests.conftest import own_cache
 

@@ -14,7 +14,7 @@ from fmtorch.training import (
     collate,
     collate_trimmed,
 )
-from fmtorch.training.batches import MAX_PADDING, longest
+from fmtorch.training.stored_matches import MAX_PADDING, longest
 from tests.training.conftest import exact
 
 

@@ -17,11 +17,10 @@ from torch.utils.data import DataLoader
 from fmtorch.data import load
 from fmtorch.data.pairs import ImagePair, ImageSource
 from fmtorch.geometry.epipolar import symmetric_max
-from fmtorch.pipeline.build import load_pipeline
-from fmtorch.pipeline.pipeline import Pipeline
+from fmtorch.pipeline.pipeline import Pipeline, load_pipeline
 from fmtorch.scenes import RenderedPairs
 from fmtorch.scenes import dataset as rendered_dataset
-from fmtorch.scenes.generate import FAMILIES, PLANS, Task
+from fmtorch.scenes.dataset import FAMILIES, PLANS, Task
 from fmtorch.training import (
     Augmentation,
     Draw,

@@ -9,8 +9,8 @@ import torch
 
 from fmtorch.data import DepthDataset, ImagePair
 from fmtorch.data.images import ImageError
-from fmtorch.scenes.camera import Camera
-from fmtorch.scenes.textures import skimage_file
+from fmtorch.scenes.raycast import Camera
+from fmtorch.scenes.surfaces import skimage_file
 from fmtorch.training import MatchedPairs, collate
 from fmtorch.training.planes import (
     Photograph,

@@ -11,7 +11,7 @@ from fmtorch import metrics
 from fmtorch.core.types import Correspondences, Estimate, collate
 from fmtorch.data import ImageSource
 from fmtorch.evaluation.rows import evaluate
-from fmtorch.pipeline.build import load_pipeline
+from fmtorch.pipeline.pipeline import load_pipeline
 from tests.commands.test_match import run_python
 from tests.helpers import draw, pair
 from tests.helpers import small_pipeline as pipeline

@@ -14,7 +14,7 @@ import pytest
 
 import fmtorch
 from fmtorch.core.types import pair_key
-from fmtorch.data.lenses import MODELS
+from fmtorch.data.cameras import MODELS
 from fmtorch.io.colmap import EXIF_DEVIATION, MatchDatabase, database_image
 from fmtorch.verification import run
 from tests.conftest import shared_path

@@ -1,4 +1,4 @@
-"""TUM RGB-D (Sturm et al., IROS 2012): hand-held Kinect videos with poses of a motion-capture system."""
+"""Videos with known poses: KITTI odometry (Geiger et al., CVPR 2012) and TUM RGB-D (Sturm et al., IROS 2012)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-from fmtorch.data.lenses import Lens
+from fmtorch.data.cameras import Lens, Matrix, from_projection, nearest_rotation
+from fmtorch.data.files import DataError, given_root, numbered, to_finite
 from fmtorch.data.pairs import ImageSource
 from fmtorch.data.scenes import (
     WINDOW,
@@ -23,7 +24,100 @@ from fmtorch.data.scenes import (
     following,
     read_grey,
 )
-from fmtorch.data.text_files import DataError, given_root, numbered, to_finite
+
+_SUFFIXES = (".png", ".jpg")
+_LAYOUT = "the layout is sequences/NN/calib.txt, times.txt, image_0/ and poses/NN.txt"
+_POSE = "3 x 4 numbers of [R | t], row by row, from camera 0 to the world"
+_PROJECTION = "P0: to P3: with 3 x 4 numbers each, row by row"
+
+
+class KittiPairs(ScenePairs):
+    """Pairs of frames at most `window` seconds apart of the odometry sequences.
+
+    root: the folder with ``sequences`` and ``poses``. split: test (06-10) or train (00-05), as in the paper.
+    sequences: names to take instead of those of the split. camera: 0 to 3, whose images ``image_N`` are taken.
+    pairs, seed: as in `ScenePairs`.
+
+    The images are rectified: nothing is undistorted. Cameras are ``P_N [R | t]^-1``. Raises DataError, naming file and
+    line, for files that are missing, truncated or contradict one another.
+    """
+
+    def __init__(
+        self,
+        root: str | Path | None = None,
+        split: str = "test",
+        sequences: Sequence[str] | None = None,
+        camera: int = 0,
+        window: int | float = WINDOW,
+        pairs: int | None = 1000,
+        seed: int = 0,
+    ) -> None:
+        home = given_root(root, "kitti", "the folder with sequences/ and poses/ of KITTI odometry")
+        there = sorted(f.name for f in (home / "sequences").iterdir()) if (home / "sequences").is_dir() else []
+        sequence_folders = folders(
+            home / "sequences", chosen("kitti", split, sequences, there), "a folder for each sequence"
+        )
+        scenes = [_kitti_scene(home, folder, camera, window) for folder in sequence_folders]
+        files = [(f.name, f / name) for f in sequence_folders for name in ("calib.txt", "times.txt")]
+        poses = [(f.name, home / "poses" / f"{f.name}.txt") for f in sequence_folders]
+        super().__init__("kitti", scenes, [*files, *poses], (camera, window), pairs, seed)
+
+
+def read_projections(path: Path) -> dict[str, Matrix]:
+    """The matrices (3, 4) of a ``calib.txt`` by their names, P0 to P3; others, such as Tr, too."""
+    projections = {}
+    for number, line in numbered(path, _LAYOUT):
+        name, _, rest = line.partition(":")
+        projections[name.strip()] = to_finite(path, number, rest.split(), _PROJECTION, 12).reshape(3, 4)
+    return projections
+
+
+def read_times(path: Path) -> NDArray[np.float64]:
+    """The seconds (n,) of a ``times.txt``; they must ascend."""
+    times: list[float] = []
+    for number, line in numbered(path, _LAYOUT):
+        (time,) = to_finite(path, number, line.split(), "seconds", 1)
+        if times and time <= times[-1]:
+            raise DataError(f"{path}, line {number}: {time:g} s does not come after {times[-1]:g} s; times must ascend")
+        times.append(float(time))
+    return np.array(times)
+
+
+def _kitti_scene(home: Path, folder: Path, camera: int, window: int | float) -> Scene:
+    name, images = folder.name, folder / f"image_{camera}"
+    projections = read_projections(folder / "calib.txt")
+    if f"P{camera}" not in projections:
+        raise DataError(f"{folder / 'calib.txt'}: no line P{camera}; it must hold {_PROJECTION}")
+    times = read_times(folder / "times.txt")
+    poses = home / "poses" / f"{name}.txt"
+    lines = list(numbered(poses, _LAYOUT))
+    if len(lines) != len(times):
+        raise DataError(
+            f"{poses} ends at line {len(lines)} and {folder / 'times.txt'} at line {len(times)}; each must have one "
+            "line a frame: is one of them truncated?"
+        )
+    if not images.is_dir():
+        raise DataError(f"{images}: no such folder; {_LAYOUT}")
+    there = {file.stem: file for file in sorted(images.iterdir(), reverse=True) if file.suffix in _SUFFIXES}
+    if len(there) > len(lines):
+        raise DataError(
+            f"{poses} ends at line {len(lines)} and {images} has {len(there)} images; each must have its line: is the "
+            "file truncated?"
+        )
+    views = []
+    for frame, (number, line) in enumerate(lines):
+        place = f"{poses}, line {number}"
+        pose = to_finite(poses, number, line.split(), _POSE, 12).reshape(3, 4)
+        R = nearest_rotation(pose[:, :3].T, place)
+        c = from_projection(projections[f"P{camera}"], R, -R @ pose[:, 3])
+        stem = f"{frame:06d}"
+        path = there.get(stem, images / f"{stem}{_SUFFIXES[0]}")
+        views.append(View(ImageSource(f"KITTI/{name}/image_{camera}/{stem}", path), c.K, c.R, c.t, place))
+    return Scene(name, "KITTI", views, following(times, window))
+
+
+# TUM RGB-D (Sturm et al., IROS 2012): hand-held Kinect videos with poses of a motion-capture system
+
 
 SIZE = (480, 640)  # h, w of all images
 CALIBRATIONS = {
@@ -35,9 +129,9 @@ CALIBRATIONS = {
 TOLERANCE = 0.02  # s between a frame and the poses around it, or its depth image: that of the set's own tools
 DEPTH_SCALE = 5000.0  # of a depth image, per metre
 
-_LAYOUT = "a sequence holds rgb.txt, groundtruth.txt and rgb/"
+_TUM_LAYOUT = "a sequence holds rgb.txt, groundtruth.txt and rgb/"
 _LISTED = "timestamp filename"
-_POSE = "timestamp tx ty tz qx qy qz qw"
+_TUM_POSE = "timestamp tx ty tz qx qy qz qw"
 
 
 def tum_pairs(
@@ -68,7 +162,7 @@ def tum_pairs(
     home = given_root(root, "tum", "the folder of the sequences' folders of TUM RGB-D")
     there = sorted(f.parent.name for f in home.glob("*/groundtruth.txt") if (f.parent / "rgb.txt").is_file())
     sequence_folders = folders(home, chosen("tum", split, sequences, there), "a folder for each sequence")
-    scenes = [_scene(folder, _lens(folder, camera), window) for folder in sequence_folders]
+    scenes = [_tum_scene(folder, _lens(folder, camera), window) for folder in sequence_folders]
     files = [(folder.name, folder / name) for folder in sequence_folders for name in ("rgb.txt", "groundtruth.txt")]
     if not depth or not all((folder / "depth.txt").is_file() for folder in sequence_folders):
         return ScenePairs("tum", scenes, files, (window,), pairs, seed)
@@ -83,7 +177,7 @@ def tum_pairs(
 def read_listed(path: Path) -> tuple[NDArray[np.float64], list[str], list[int]]:
     """Time stamps (n,) in seconds, file names and line numbers of an ``rgb.txt`` or ``depth.txt``."""
     times, names, lines = list[float](), list[str](), list[int]()
-    for number, line in numbered(path, _LAYOUT):
+    for number, line in numbered(path, _TUM_LAYOUT):
         words = line.split(maxsplit=1)
         if len(words) != 2:
             raise DataError(f"{path}, line {number}: {len(words)} columns; it must hold {_LISTED}")
@@ -98,17 +192,17 @@ def read_listed(path: Path) -> tuple[NDArray[np.float64], list[str], list[int]]:
 def read_trajectory(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64], Rotation]:
     """Times (n,) in seconds, positions (n, 3) and orientations of a ``groundtruth.txt``, camera to world."""
     times, poses = list[float](), list[NDArray[np.float64]]()
-    for number, line in numbered(path, _LAYOUT):
+    for number, line in numbered(path, _TUM_LAYOUT):
         words = line.split()
-        values = to_finite(path, number, words, _POSE, 8)
+        values = to_finite(path, number, words, _TUM_POSE, 8)
         if not values[4:].any():
             raise DataError(f"{path}, line {number}: the quaternion is zero; it must be a rotation")
-        time = _time(path, number, words[0], times, _POSE)
+        time = _time(path, number, words[0], times, _TUM_POSE)
         if not times or time > times[-1]:  # a repeated stamp adds nothing
             times.append(time)
             poses.append(values[1:])
     if len(times) < 2:
-        raise DataError(f"{path}: {len(times)} poses; it must hold lines of {_POSE}")
+        raise DataError(f"{path}: {len(times)} poses; it must hold lines of {_TUM_POSE}")
     table = np.array(poses)
     return np.array(times), table[:, :3], Rotation.from_quat(table[:, 3:])
 
@@ -141,7 +235,7 @@ def _lens(folder: Path, camera: str | None) -> Lens:
     return CALIBRATIONS[names[0]]
 
 
-def _scene(folder: Path, lens: Lens, window: int | float) -> Scene:
+def _tum_scene(folder: Path, lens: Lens, window: int | float) -> Scene:
     listed = folder / "rgb.txt"
     times, names, lines = read_listed(listed)
     has, rotations, positions = interpolated(folder / "groundtruth.txt", times)
