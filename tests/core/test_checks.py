@@ -11,9 +11,9 @@ from jaxtyping import Bool, Float, Int, Real
 from torch import Tensor
 
 from fmtorch import geometry, matching, metrics, pruning
+from fmtorch.core import Correspondences
 from fmtorch.core.annotations import Expected, Rule, arrays_of, expectation
 from fmtorch.core.checks import checked
-from fmtorch.core.types import Correspondences
 
 X = torch.rand(5, 2)
 F = torch.rand(3, 3)
@@ -124,7 +124,7 @@ def test_annotations_are_read() -> None:
     assert expectation(float | Tensor) == Expected("number or array", dtype="Float")
     assert expectation(Any).kind == expectation(int | str).kind == ""
     assert {name for name, field in arrays_of(Correspondences).items() if field.bounds} == {
-        "prior", "noise", "size0", "size1", "focal",
+        "score", "prior", "noise", "size0", "size1", "focal",
     }  # fmt: skip
 
 

@@ -8,9 +8,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fmtorch.core.types import Correspondences, Estimate, Features, collate, pair_key
+from fmtorch.core import Correspondences, Estimate, Features, collate, pair_key
 
-PER_MATCH = ("x0", "x1", "mask", "ratio", "prior", "lafs0", "lafs1", "mutual", "noise")
+PER_MATCH = ("x0", "x1", "mask", "ratio", "score", "prior", "lafs0", "lafs1", "mutual", "noise")
 
 
 def features(n: int = 5, d: int = 3, seed: int = 0) -> Features:
@@ -30,6 +30,7 @@ def matches(b: int = 4, n: int = 6, seed: int = 0) -> Correspondences:
         x1=torch.rand(b, n, 2, generator=g),
         mask=torch.rand(b, n, generator=g) < 0.6,
         ratio=torch.rand(b, n, generator=g),
+        score=torch.rand(b, n, generator=g),
         prior=torch.rand(b, n, generator=g),
         lafs0=torch.rand(b, n, 2, 3, generator=g),
         lafs1=torch.rand(b, n, 2, 3, generator=g),

@@ -4,8 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from fmtorch.estimators import F4x2, Pair, SummedGains, kernel
-from fmtorch.estimators.sampling import Uniform
+from fmtorch.estimators import F4x2, Pair, SummedGains, Uniform, kernel
 
 Array = np.ndarray[Any, Any]
 

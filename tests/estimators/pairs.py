@@ -5,9 +5,9 @@ import functools
 import numpy as np
 import torch
 
-from fmtorch.core.types import Correspondences
+from fmtorch.core import Correspondences
+from fmtorch.estimators import Pair
 from fmtorch.estimators.batch import Batch
-from fmtorch.estimators.pair import Pair
 from fmtorch.geometry.eight_point import weighted_eight_point
 from tests.conftest import oracle
 from tests.laws import scene, small

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fmtorch.estimators.pair import Pair
+from fmtorch.estimators import Pair
 from fmtorch.jit.kernel import Array
 from tests.reference.epipolar import sampson
 

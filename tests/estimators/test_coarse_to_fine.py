@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from fmtorch import presets
-from fmtorch.core.types import Correspondences, Estimate, collate
+from fmtorch.core import Correspondences, Estimate, collate
 from fmtorch.estimators import CoarseToFine, Ransac
 from tests.laws import scene
 

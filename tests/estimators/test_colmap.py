@@ -8,7 +8,7 @@ import pytest
 
 import fmtorch
 from fmtorch import data, presets
-from fmtorch.core.types import Correspondences, Estimate
+from fmtorch.core import Correspondences, Estimate
 from fmtorch.data import ImagePair
 from fmtorch.pipeline.pipeline import load_pipeline
 from tests.conftest import shared_path

@@ -7,23 +7,20 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from fmtorch.core.types import Correspondences, collate
-from fmtorch.estimators import Ransac
+from fmtorch.core import Correspondences, collate
+from fmtorch.estimators import Degensac, Msac, Pair, Ransac
 from fmtorch.estimators.degensac import (
     FITS,
     KEPT,
     PARALLAX_DRAWS,
     PLANE_THRESHOLD_PX,
-    Degensac,
     fit_plane,
     parallax,
     plane_of_sample,
 )
 from fmtorch.estimators.models.model import Hypotheses
-from fmtorch.estimators.pair import Pair
 from fmtorch.estimators.preselection import Preselection
 from fmtorch.estimators.sampling import largest_weight
-from fmtorch.estimators.scores import Msac
 from fmtorch.estimators.search import Verified
 from fmtorch.jit.random import Stream
 from tests.estimators.pairs import named, pair_of, to_units

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from fmtorch import presets
-from fmtorch.core.types import Correspondences, collate
+from fmtorch.core import Correspondences, collate
 from tests.laws import quick, scene, scenes
 from tests.variants import OTHER_LIBRARIES
 

@@ -7,15 +7,12 @@ import pytest
 import torch
 
 from fmtorch import presets
-from fmtorch.core.types import collate
-from fmtorch.estimators import Ransac, focal_search
+from fmtorch.core import collate
+from fmtorch.estimators import Focal, Pair, Ransac, SaturatedGains, focal_search
 from fmtorch.estimators.focal_search import FocalSearch, PlausibleCandidates
 from fmtorch.estimators.models.posterior import no_cameras
 from fmtorch.estimators.models.with_focals import FundamentalWithFocals
-from fmtorch.estimators.options import Focal
-from fmtorch.estimators.pair import Pair
 from fmtorch.estimators.refinement import Candidates, Refinement
-from fmtorch.estimators.scores import SaturatedGains
 from tests.estimators.models.photographs import TALL, WIDE, photographs
 from tests.estimators.pairs import pair_of, to_units
 from tests.laws import scene

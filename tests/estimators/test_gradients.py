@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from fmtorch.core.types import Correspondences, collate
+from fmtorch.core import Correspondences, collate
 from fmtorch.estimators import IterativelyReweighted, Ransac, final_fits
 from fmtorch.geometry import LOSSES
 from tests.estimators.models.photographs import TALL, WIDE, photographs

@@ -5,7 +5,7 @@ import functools
 import numpy as np
 import pytest
 
-from fmtorch.estimators import Ransac
+from fmtorch.estimators import GraphCut, Msac, Pair, Ransac
 from fmtorch.estimators.graph_cut import (
     FIRST_DRAW,
     HALVINGS,
@@ -13,14 +13,11 @@ from fmtorch.estimators.graph_cut import (
     SWEEPS,
     UNIT,
     Graph,
-    GraphCut,
     _gaussian,
     label,
     neighbor_graph,
 )
 from fmtorch.estimators.inliers import residuals_squared_px
-from fmtorch.estimators.pair import Pair
-from fmtorch.estimators.scores import Msac
 from fmtorch.estimators.selection import scores_of
 from fmtorch.jit.kernel import F4x1, F8x1, F8x2, kernel
 from fmtorch.jit.random import Stream

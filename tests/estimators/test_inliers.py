@@ -5,15 +5,18 @@ import math
 import numpy as np
 import pytest
 
-from fmtorch.estimators.inliers import (
+from fmtorch.estimators import (
     BetterHalf,
     InlierRule,
+    PriorWeighted,
+    Prosac,
     RobustDeviations,
+    Sampler,
     StoppingRule,
+    Uniform,
     WithinThreshold,
-    residuals_squared_px,
 )
-from fmtorch.estimators.sampling import PriorWeighted, Prosac, Sampler, Uniform
+from fmtorch.estimators.inliers import residuals_squared_px
 from tests.estimators.pairs import FEW, SCALES, models, named
 from tests.estimators.residuals import residuals
 from tests.reference import ransac as reference

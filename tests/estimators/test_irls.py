@@ -3,10 +3,9 @@
 import pytest
 import torch
 
-from fmtorch.core.types import collate
+from fmtorch.core import collate
 from fmtorch.estimators import IterativelyReweighted
-from fmtorch.geometry import LOSSES
-from fmtorch.geometry.refine import refine
+from fmtorch.geometry import LOSSES, refine
 from tests.laws import scene
 from tests.reference import refine as reference
 

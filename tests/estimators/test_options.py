@@ -6,10 +6,8 @@ import pytest
 import torch
 
 from fmtorch import find_fundamental, presets
-from fmtorch.estimators import Ransac
-from fmtorch.estimators.options import Preselect, Refine
+from fmtorch.estimators import InlierCount, Msac, Preselect, Ransac, Refine
 from fmtorch.estimators.registry import PARTS, part
-from fmtorch.estimators.scores import InlierCount, Msac
 from fmtorch.geometry.levenberg_marquardt import LOSS_CODES
 from tests.laws import scene
 

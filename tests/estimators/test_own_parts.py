@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from fmtorch import presets
-from fmtorch.core.types import collate
+from fmtorch.core import collate
 from fmtorch.estimators import SummedGains
 from fmtorch.geometry import sampson
 from tests.estimators.own_parts import (

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from fmtorch.core.types import Correspondences, collate
+from fmtorch.core import Correspondences, collate
+from fmtorch.estimators import Pair
 from fmtorch.estimators.batch import Batch, relative_rounding
-from fmtorch.estimators.pair import MAX_NOISE, MIN_NOISE, Pair, bucket
+from fmtorch.estimators.pair import MAX_NOISE, MIN_NOISE, bucket
 from tests.estimators.pairs import SCALES, known, named, pair_of, real
 from tests.laws import degenerate, scene, small, with_padding
 from tests.reference.random import number

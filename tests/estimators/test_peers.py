@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from fmtorch import find_essential, geometry, presets
-from fmtorch.core.types import Correspondences, collate
+from fmtorch.core import Correspondences, collate
 from fmtorch.estimators import PairwiseEstimator
 from fmtorch.estimators.external.pairwise import Pair, Solution
 from fmtorch.two_view.known_cameras import KnownCameras

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from fmtorch.core.types import Correspondences
-from fmtorch.estimators.options import Preselect
-from fmtorch.estimators.pair import Pair
+from fmtorch.core import Correspondences
+from fmtorch.estimators import InlierCount, Magsac, Msac, Pair, Preselect, SaturatedGains
 from fmtorch.estimators.preselection import (
     FIRST_LOOK,
     Preselection,
@@ -18,7 +17,6 @@ from fmtorch.estimators.preselection import (
     drawn_by_prior,
     shuffled_first,
 )
-from fmtorch.estimators.scores import InlierCount, Magsac, Msac, SaturatedGains
 from fmtorch.jit.random import Stream
 from tests.estimators.pairs import FEW, SCALES, models, named, pair_of
 from tests.reference import sampling as reference

@@ -7,7 +7,7 @@ import torch
 
 import fmtorch
 from fmtorch import presets
-from fmtorch.core.types import collate
+from fmtorch.core import collate
 from fmtorch.estimators import Ransac
 from fmtorch.jit.kernel import Kernel
 from tests.laws import quick, scene, scenes

@@ -3,12 +3,8 @@
 import numpy as np
 import pytest
 
-from fmtorch.estimators import Ransac
-from fmtorch.estimators.models.fundamental import SevenPoint
-from fmtorch.estimators.options import Refine
-from fmtorch.estimators.pair import Pair
+from fmtorch.estimators import Msac, Pair, Ransac, Refine, SevenPoint
 from fmtorch.estimators.refinement import Candidates, Refinement
-from fmtorch.estimators.scores import Msac
 from fmtorch.estimators.search import Pool
 from fmtorch.estimators.selection import BestOfSearch, BestScore, scores_of
 from fmtorch.jit.random import Stream

@@ -7,8 +7,7 @@ import pytest
 import torch
 
 import fmtorch
-from fmtorch.core.stages import Estimator
-from fmtorch.core.types import Correspondences, Estimate, collate
+from fmtorch.core import Correspondences, Estimate, Estimator, collate
 from fmtorch.geometry import significance
 from fmtorch.geometry.significance import judged
 from tests.laws import quick, scene

@@ -7,9 +7,9 @@ import pytest
 import torch
 from scipy import stats
 
-from fmtorch.core.types import Correspondences, collate
-from fmtorch.estimators.pair import Pair
-from fmtorch.estimators.sampling import PriorWeighted, Prosac, Sampler, Uniform, largest_weight
+from fmtorch.core import Correspondences, collate
+from fmtorch.estimators import Pair, PriorWeighted, Prosac, Sampler, Uniform
+from fmtorch.estimators.sampling import largest_weight
 from fmtorch.jit.random import Stream
 from tests.estimators.pairs import known, pair_of
 from tests.laws import scene, with_padding

@@ -6,20 +6,8 @@ import numpy as np
 import pytest
 from scipy import integrate
 
-from fmtorch.estimators.pair import Pair
-from fmtorch.estimators.scores import (
-    GRID,
-    GemanMcClure,
-    InlierCount,
-    Magsac,
-    Median,
-    Msac,
-    SaturatedGains,
-    Score,
-    SummedGains,
-    fractional_bits,
-    saturated_cells,
-)
+from fmtorch.estimators import GemanMcClure, InlierCount, Magsac, Median, Msac, Pair, SaturatedGains, Score, SummedGains
+from fmtorch.estimators.scores import GRID, fractional_bits, saturated_cells
 from fmtorch.geometry.epipolar import HOMOGRAPHY, SAMPSON
 from fmtorch.geometry.robust_losses import ENTRIES, QUANTILE
 from tests.estimators.pairs import FEW, REAL, SCALES, known, models, named, pair_of

@@ -7,14 +7,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fmtorch.estimators.inliers import StoppingRule
-from fmtorch.estimators.models.fundamental import EightPoint, SevenPoint
+from fmtorch.estimators import (
+    EightPoint,
+    Msac,
+    Pair,
+    Preselect,
+    PriorWeighted,
+    Prosac,
+    Sampler,
+    SevenPoint,
+    StoppingRule,
+    Uniform,
+)
 from fmtorch.estimators.models.model import Hypotheses
-from fmtorch.estimators.options import Preselect
-from fmtorch.estimators.pair import Pair
 from fmtorch.estimators.preselection import Preselection
-from fmtorch.estimators.sampling import PriorWeighted, Prosac, Sampler, Uniform
-from fmtorch.estimators.scores import Msac
 from fmtorch.estimators.search import Pool, Search, Verified, merge
 from tests.estimators.pairs import named, pair_of
 from tests.laws import scene

@@ -9,12 +9,9 @@ import pytest
 import torch
 
 from fmtorch import find_fundamental
-from fmtorch.core.types import Correspondences, Estimate, collate
-from fmtorch.estimators import degensac
-from fmtorch.estimators.graph_cut import GraphCut
+from fmtorch.core import Correspondences, Estimate, collate
+from fmtorch.estimators import Fundamental, GraphCut, Homography, degensac
 from fmtorch.estimators.models import with_focals
-from fmtorch.estimators.models.fundamental import Fundamental
-from fmtorch.estimators.models.homography import Homography
 from fmtorch.estimators.models.model import FitScale
 from fmtorch.presets.objects import merged
 from tests.laws import PEERS, degenerate, few, quick, scene, small

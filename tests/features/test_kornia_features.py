@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from fmtorch import presets
-from fmtorch.features.kornia_features import ALIKED, DISK
+from fmtorch.features import ALIKED, DISK
 from tests.features.scenes import same, texture
 
 SIZE = (90, 131)  # no multiple of 16

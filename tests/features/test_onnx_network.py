@@ -8,10 +8,9 @@ import torch
 from onnx import TensorProto, helper
 from torch import Tensor
 
-from fmtorch.core.files import models_dir
-from fmtorch.core.onnx_network import NetworkFileError
+from fmtorch.core import NetworkFileError, models_dir
+from fmtorch.features import PatchNetwork
 from fmtorch.features.networks import ARCHITECTURES, build
-from fmtorch.features.onnx_network import PatchNetwork
 from fmtorch.training.onnx_export import export, quantize
 from tests.conftest import oracle
 from tests.features.test_networks import randomized

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from fmtorch import presets
-from fmtorch.core.files import models_dir
+from fmtorch.core import models_dir
 from fmtorch.features.vlad import (
     Codebook,
     codebook,

@@ -7,7 +7,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from fmtorch.core.types import PAIR_TYPES
+from fmtorch.core import PAIR_TYPES
 from tests.reference.solvers import skew
 
 K = np.array([[768.0, 0, 319.5], [0, 768, 239.5], [0, 0, 1]])

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from fmtorch.geometry import LOSSES
 from fmtorch.geometry.epipolar import HOMOGRAPHY
 from fmtorch.geometry.homography_refine import (
     evaluate_homographies,
@@ -15,7 +16,6 @@ from fmtorch.geometry.homography_refine import (
     refine_homographies,
 )
 from fmtorch.geometry.levenberg_marquardt import LOSS_CODES, NO_TABLE, Schedule, Weighted
-from fmtorch.geometry.robust_losses import LOSSES
 from tests.reference import homography_family as reference
 
 EPS = 2.0**-52

@@ -3,7 +3,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from fmtorch.core.types import collate
+from fmtorch.core import collate
 from fmtorch.geometry import LOSSES, irls, reweighted_fits
 from fmtorch.geometry.robust_losses import named_loss
 from tests import laws

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from fmtorch.core.types import PAIR_TYPES
+from fmtorch.core import PAIR_TYPES
 from fmtorch.geometry.pair_type import classified, pair_evidence
 from tests.geometry.kinds import SIZE, K, batch, draw
 from tests.reference import configuration as reference

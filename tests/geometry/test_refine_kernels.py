@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import torch
 
+from fmtorch.geometry import LOSSES
 from fmtorch.geometry.irls import reweighted, reweighted_kernel
 from fmtorch.geometry.levenberg_marquardt import FIRST_DAMPING, LOSS_CODES, Schedule, Weighted, evaluate, loss_table
 from fmtorch.geometry.rank2_manifold import SQUARINGS
 from fmtorch.geometry.refine import refine_kernel
-from fmtorch.geometry.robust_losses import LOSSES
 from tests.estimators.pairs import apart
 from tests.reference import refine as reference
 from tests.reference.solvers import skew

@@ -5,7 +5,8 @@ import pytest
 import torch
 from scipy.special import gamma, gammainc
 
-from fmtorch.geometry.robust_losses import ENTRIES, GAIN_TABLE, LOSS_TABLE, LOSSES, QUANTILE, named_loss
+from fmtorch.geometry import LOSSES
+from fmtorch.geometry.robust_losses import ENTRIES, GAIN_TABLE, LOSS_TABLE, QUANTILE, named_loss
 
 S2 = torch.tensor(4.0, dtype=torch.float64)
 

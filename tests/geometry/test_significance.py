@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from fmtorch.core.types import RELATED
+from fmtorch.core import RELATED
 from fmtorch.geometry import significance
 from fmtorch.jit import kernel
 from tests.conftest import oracle

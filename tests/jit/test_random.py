@@ -3,7 +3,7 @@ import pytest
 import torch
 from scipy import stats
 
-from fmtorch.core.types import pair_key
+from fmtorch.core import pair_key
 from fmtorch.jit.random import Stream, bits, uniform
 from tests.reference import random as reference
 

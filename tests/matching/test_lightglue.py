@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from fmtorch import presets
-from fmtorch.core.types import Features
-from fmtorch.matching.lightglue import LightGlue
+from fmtorch.core import Features
+from fmtorch.matching import LightGlue
 from fmtorch.pipeline.pipeline import Pipeline
 from tests.pipeline.test_pipeline import draw, pair
 

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from fmtorch.core.types import Features, collate
+from fmtorch.core import Features, collate
 from fmtorch.matching import NearestNeighborMatcher, nearest_neighbors
 
 

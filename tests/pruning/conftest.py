@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from fmtorch import data, presets
-from fmtorch.core.types import Correspondences
+from fmtorch.core import Correspondences
 from fmtorch.geometry import sampson
 from fmtorch.pipeline.pipeline import Pipeline
 from tests.conftest import shared_path

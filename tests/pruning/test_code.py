@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from fmtorch.core.types import Correspondences
+from fmtorch.core import Correspondences
 from fmtorch.pruning import LikelihoodField, code
 from fmtorch.pruning.code import huber_regression, match_domain, predictive_gaussians, spread_centres
 from tests.reference import code as reference

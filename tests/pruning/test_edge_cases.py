@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from fmtorch.core.types import Correspondences
+from fmtorch.core import Correspondences
 from tests.laws import calibrated, quick_pruner, scene
 from tests.variants import built, variants
 

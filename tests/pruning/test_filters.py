@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from torch import Tensor
 
-from fmtorch.core.types import Correspondences, Features
+from fmtorch.core import Correspondences, Features
 from fmtorch.matching import NearestNeighborMatcher, nearest_neighbors
 from fmtorch.pruning import MutualCheck, OneToOne, RatioTest, mutual, one_to_one, ratio_test
 from tests.reference import matching as matching_reference

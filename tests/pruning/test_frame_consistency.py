@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from fmtorch import presets
-from fmtorch.core.types import Correspondences
+from fmtorch.core import Correspondences
 from fmtorch.pruning import frame_agreement
 from fmtorch.pruning.neighbors import CURVES, MIN_VOTE, NOISE, TOLERANCE, WINDOW, WORST_RATIO
 from tests.laws import scene

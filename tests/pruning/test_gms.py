@@ -3,7 +3,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from fmtorch.core.types import Correspondences
+from fmtorch.core import Correspondences
 from fmtorch.pruning import GMS, gms
 from tests.conftest import oracle
 from tests.reference.gms import gms as reference

@@ -9,10 +9,8 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from fmtorch.core.onnx_network import NetworkFileError
-from fmtorch.core.types import Correspondences, collate
-from fmtorch.pruning import LearnedPruner
-from fmtorch.pruning.networks import DFE, LC
+from fmtorch.core import Correspondences, NetworkFileError, collate
+from fmtorch.pruning import DFE, LC, LearnedPruner
 from fmtorch.pruning.networks.files import learned_file
 from fmtorch.runs.fingerprint import configuration, learned
 from fmtorch.training.export import export_onnx, save_weights

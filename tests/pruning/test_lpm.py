@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from fmtorch.core.types import Correspondences
+from fmtorch.core import Correspondences
 from fmtorch.jit.kernel import F8x2, I8x2, kernel
 from fmtorch.pruning import LPM, lpm
 from fmtorch.pruning import neighbors as knn_kernels

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from fmtorch.core.types import Correspondences
+from fmtorch.core import Correspondences
 from fmtorch.pruning import position_agreement
 from fmtorch.pruning.neighbors import CURVES, MIN_VOTE, NOISE, TOLERANCE, WINDOW, WORST_RATIO
 from fmtorch.pruning.position_consistency import SCALES, TURNS

@@ -8,9 +8,7 @@ import pytest
 import torch
 
 from fmtorch import presets
-from fmtorch.core.grey_pyramid import GreyPyramid, grey_pyramid
-from fmtorch.core.stages import ImagePruner
-from fmtorch.core.types import Correspondences
+from fmtorch.core import Correspondences, GreyPyramid, ImagePruner, grey_pyramid
 from fmtorch.pruning import refine_matches as compiled
 from fmtorch.pruning.neighbors import neighbour_maps
 from fmtorch.pruning.windows import Pyramid

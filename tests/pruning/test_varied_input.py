@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from fmtorch.core.types import Correspondences
+from fmtorch.core import Correspondences
 from fmtorch.pruning import frame_agreement, gms, lpm, lpm_cost, one_to_one, position_agreement
 from fmtorch.pruning.neighbors import CURVES, MIN_VOTE, NOISE, TOLERANCE, WINDOW, WORST_RATIO
 from fmtorch.pruning.position_consistency import SCALES, TURNS

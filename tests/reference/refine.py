@@ -6,7 +6,7 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 from scipy.special import gamma, gammainc, gammaincc
 
-from fmtorch.geometry.robust_losses import LOSSES
+from fmtorch.geometry import LOSSES
 
 
 def sampson(F: np.ndarray, x0: np.ndarray, x1: np.ndarray) -> np.ndarray:

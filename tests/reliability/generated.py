@@ -34,8 +34,8 @@ from torch import Tensor
 
 import fmtorch
 from fmtorch import geometry, matching, metrics, pruning
+from fmtorch.core import Correspondences, Estimate, Features, collate
 from fmtorch.core.annotations import arguments_of, arrays_of
-from fmtorch.core.types import Correspondences, Estimate, Features, collate
 from fmtorch.pipeline.pipeline import load_pipeline
 from fmtorch.presets.objects import merged
 from tests.laws import PEERS, calibrated, few, quick_pruner

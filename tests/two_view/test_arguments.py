@@ -8,7 +8,7 @@ import torch
 
 import fmtorch
 from fmtorch import metrics
-from fmtorch.core.types import Correspondences, Estimate, collate
+from fmtorch.core import Correspondences, Estimate, collate
 from fmtorch.data import ImageSource
 from fmtorch.evaluation.rows import evaluate
 from fmtorch.pipeline.pipeline import load_pipeline

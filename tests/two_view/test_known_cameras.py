@@ -10,7 +10,7 @@ from torch import Tensor
 
 import fmtorch
 from fmtorch import presets
-from fmtorch.core.types import Correspondences, Estimate, collate
+from fmtorch.core import Correspondences, Estimate, collate
 from fmtorch.data import ImagePair, load
 from fmtorch.estimators import final_fits
 from fmtorch.geometry import cameras as square_pixels

@@ -6,7 +6,7 @@ import torch
 
 import fmtorch
 from fmtorch import metrics
-from fmtorch.core.types import Correspondences, collate
+from fmtorch.core import Correspondences, collate
 from tests.laws import scene
 
 WRONG = [

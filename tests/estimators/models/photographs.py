@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from fmtorch.core.types import Correspondences
+from fmtorch.core import Correspondences
 from tests.reference import focal as reference
 from tests.reference.solvers import skew
 

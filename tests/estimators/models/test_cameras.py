@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from fmtorch.estimators import Pair
 from fmtorch.estimators.models.focal_prior import LOG_USUAL
 from fmtorch.estimators.models.posterior import (
     Cameras,
@@ -16,7 +17,6 @@ from fmtorch.estimators.models.posterior import (
     tangents_of,
     translate,
 )
-from fmtorch.estimators.pair import Pair
 from tests.estimators.models.photographs import TALL, WIDE, photographs
 from tests.estimators.pairs import apart, frames, in_pixels, pair_of, to_units
 from tests.reference import focal as reference

@@ -7,8 +7,8 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from fmtorch.estimators import Pair, SevenPoint
 from fmtorch.estimators.final_fits import PRIOR_CONFLICT_GAIN
-from fmtorch.estimators.models.fundamental import SevenPoint
 from fmtorch.estimators.models.model import Loss, Steps
 from fmtorch.estimators.models.posterior import (
     Cameras,
@@ -22,7 +22,6 @@ from fmtorch.estimators.models.posterior import (
     no_optimum,
 )
 from fmtorch.estimators.models.with_focals import LOSS_SCALE_PX, FundamentalWithFocals, Refined
-from fmtorch.estimators.pair import Pair
 from fmtorch.geometry.levenberg_marquardt import LOSS_CODES, NO_TABLE, Weighted
 from tests.estimators.models.photographs import TALL, WIDE, Sizes, photographs, with_prior
 from tests.estimators.pairs import apart, in_pixels, pair_of, to_units

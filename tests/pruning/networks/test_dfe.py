@@ -4,9 +4,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from fmtorch.core.types import Correspondences, collate
+from fmtorch.core import Correspondences, collate
 from fmtorch.geometry import eight_point, sampson
-from fmtorch.pruning.networks import DFE
+from fmtorch.pruning import DFE
 from fmtorch.pruning.networks.dfe import masked_softmax
 from fmtorch.pruning.networks.layers import Slots
 from tests.laws import scene

@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
-from fmtorch.core.types import Correspondences
-from fmtorch.pruning.networks import MatchInputs
+from fmtorch.core import Correspondences
+from fmtorch.pruning import MatchInputs
 from tests.laws import scene
 
 SIDE = ("ratio", "mutual", "scale", "rotation", "agreement")

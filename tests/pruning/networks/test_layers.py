@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from fmtorch.core.types import collate
-from fmtorch.pruning.networks import DFE, LC
+from fmtorch.core import collate
+from fmtorch.pruning import DFE, LC
 from fmtorch.pruning.networks.layers import ContextBatchNormReLU, ResidualBlock, Slots
 from tests.laws import scene
 from tests.reference.networks import context_batch_norm_relu

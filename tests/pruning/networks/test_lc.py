@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from fmtorch.core.types import Correspondences, collate
-from fmtorch.pruning.networks import DFE, LC
+from fmtorch.core import Correspondences, collate
+from fmtorch.pruning import DFE, LC
 from fmtorch.pruning.networks.layers import Slots
 from scripts.make_models import ngransac_state
 from tests.conftest import oracle
