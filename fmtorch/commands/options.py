@@ -4,8 +4,6 @@ The one declaration of both: the config that Hydra composes, the checks of its v
 Nothing here imports a library, for which ``--help`` would wait.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
@@ -18,6 +16,8 @@ from fmtorch.training.options import TrainOptions
 CACHE = "folder of features computed before; null: features in $FMTORCH_CACHE or ~/.cache/fmtorch; off: none"
 CACHE_LIMIT = "GB, beyond which the least recently used features go; null: no bound"
 DEVICE = "auto | cpu | cuda | cuda:1 | mps"
+DEBUG = "true: stop at the first error of a part and show all of its traceback; pdb: and look at it in the debugger"
+Debug = bool | Literal["pdb"]
 REPLACED = "Groups are replaced by name (estimator=lmeds), values by path (estimator.threshold=0.5)."
 
 
@@ -67,6 +67,7 @@ class EvalOptions:
         None,
         "h5, colmap or both, with a comma: hloc's files, a COLMAP database, in the run folder (docs/exchange.md)",
     )
+    debug: Debug = option(False, f"{DEBUG}. One worker")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -110,6 +111,7 @@ class MatchOptions:
     device: Device = option("auto", DEVICE)
     cache: Cache = option(None, CACHE)
     cache_limit: Gigabytes | None = option(20, CACHE_LIMIT)
+    debug: Debug = option(False, DEBUG)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -205,12 +207,10 @@ class Command:
 
     @property
     def defaults(self) -> dict[str, Any]:
-        """The default of each option, as plain values."""
         return defaults_of(self.options)
 
     @property
     def names(self) -> list[str]:
-        """All that may stand before ``=``: options and groups."""
         return [*self.defaults, *self.groups]
 
 

@@ -1,7 +1,5 @@
 """`fmtorch verify DATABASE`: two-view geometries of the matches in a COLMAP database."""
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import re
@@ -42,6 +40,13 @@ def run(config: DictConfig, estimator: str) -> Verification:
         errors.print(problem, style="bold", markup=False, highlight=False, soft_wrap=True)
     if len(result.problems) > MAX_PROBLEMS:
         errors.print(f"and {len(result.problems) - MAX_PROBLEMS} more", highlight=False)
+    for warning in result.warnings[:MAX_PROBLEMS]:
+        errors.print(f"warning: {warning}", markup=False, highlight=False, soft_wrap=True)
+    if result.kept == result.pairs and not result.configurations:
+        said = (
+            f"nothing to do: {result.path} has a geometry of each of {result.pairs:,} pairs; force=true replaces them"
+        )
+        console.print(said, markup=False, highlight=False, soft_wrap=True)
     console.print(_table(result))
     console.print(str(result.path), style="dim", highlight=False)
     return result
@@ -62,7 +67,6 @@ def _begun_by_reports(description: str) -> Iterator[Callable[[int, int], None]]:
 
 
 def _table(result: Verification) -> Table:
-    """Counts of pairs, and how long they took."""
     table = Table()
     table.add_column("pairs")
     table.add_column("", justify="right")

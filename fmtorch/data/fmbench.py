@@ -1,7 +1,5 @@
 """Photographs with a ``Camera.txt`` beside them: the cameras of the FM-Bench layout, before there are pairs."""
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import os
@@ -236,7 +234,6 @@ def _listed(names: Sequence[str] | set[str] | dict[str, Path]) -> str:
 
 
 def _images(folder: Path, scene: str) -> dict[str, Path]:
-    """The image files of a subset by their stem."""
     images = folder / scene / "Images"
     if not images.is_dir():
         raise DataError(f"{folder / _SUBSETS} names {scene}/, but there is no folder {images}")

@@ -2,8 +2,6 @@
 that see the same points of its reconstruction.
 """
 
-from __future__ import annotations
-
 import bisect
 import dataclasses
 import functools
@@ -313,7 +311,6 @@ class ScenePairs(PairDataset):
 
     @property
     def candidates(self) -> int:
-        """How many candidates the scenes have."""
         return self._starts[-1]
 
     def candidate(self, rank: int) -> tuple[int, int, int]:

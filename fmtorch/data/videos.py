@@ -1,7 +1,5 @@
 """Videos with known poses: KITTI odometry (Geiger et al., CVPR 2012) and TUM RGB-D (Sturm et al., IROS 2012)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

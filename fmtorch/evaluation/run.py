@@ -5,8 +5,6 @@ where detectors, networks and OpenCV do the work. Processes use all cores for es
 hundred megabytes each. Rows and exports come back to the caller, who alone writes.
 """
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import functools
@@ -83,7 +81,6 @@ def run_identity(
 
 
 def _learned(stages: Mapping[str, Any], pipeline: Pipeline) -> dict[str, list[str]]:
-    """Digests of the learned files and networks of each stage that has some."""
     extractor = pipeline.extractor
     parts: dict[str, list[object]] = {
         "features": [extractor.extractor if isinstance(extractor, CachedFeatures) else extractor],
@@ -113,7 +110,6 @@ def _files(config: object, option: str = "") -> Iterator[str]:
 
 
 def _code(config: object) -> dict[str, str]:
-    """Digests of the sources that define the parts of the user's own, by the names of these."""
     digests = {}
     for target, module in presets.own_modules(config).items():
         try:
@@ -182,16 +178,13 @@ class WithPairCameras:
         self._estimator, self.cameras = KnownCameras(estimator), dict(cameras)
 
     def __call__(self, c: Correspondences, seed: int = 0) -> Estimate:
-        """Estimate F, focal lengths and pose of each pair."""
         return self._estimator(self.given(c), seed)
 
     @property
     def kernels(self) -> Sequence[object]:
-        """Those of the estimator worth compiling together."""
         return getattr(self._estimator.estimator, "kernels", ())
 
     def given(self, c: Correspondences) -> Correspondences:
-        """The matches with what is known of their cameras."""
         own = [self.cameras[key] for key in c.keys.tolist()]
         K0, K1 = (_stacked(K, c.mask.device) for K in ([each.K0 for each in own], [each.K1 for each in own]))
         focal = torch.stack([each.focal for each in own]).to(c.mask.device)
@@ -238,13 +231,15 @@ class Batch:
 class Work:
     """The rows of a batch.
 
-    computed, from_cache: images whose features a process computed or took from the cache for it.
+    computed, from_cache: images whose features a process computed or took from the cache for it. tracebacks: of
+    `Pipeline.tracebacks`.
     """
 
     rows: list[PairRow]
     computed: int = 0
     from_cache: int = 0
     records: MatchRecords | None = None
+    tracebacks: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
 
 def evaluate_batch(pipeline: Pipeline, batch: Batch) -> Work:
@@ -263,7 +258,7 @@ def evaluate_batch(pipeline: Pipeline, batch: Batch) -> Work:
         for key in batch.cameras:
             pipeline.estimator.cameras.pop(key, None)
     counts = (cache.computed - computed, cache.found - from_cache) if cache else (0, 0)
-    return Work(rows, *counts, records)
+    return Work(rows, *counts, records, dict(pipeline.tracebacks))
 
 
 def divided(batch: Batch) -> list[Batch]:
@@ -373,6 +368,7 @@ def evaluate_pairs(
         if journal is not None and work.records is not None:
             journal.add(work.records)
         store(work.rows)
+        pipeline.tracebacks |= work.tracebacks
         if isinstance(pipeline.extractor, CachedFeatures):
             pipeline.extractor.computed += work.computed
             pipeline.extractor.found += work.from_cache

@@ -1,7 +1,5 @@
 """A journal's images and pairs as hloc's two files, and as a COLMAP database."""
 
-from __future__ import annotations
-
 import csv
 import dataclasses
 import json

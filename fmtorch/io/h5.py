@@ -1,7 +1,5 @@
 """HDF5 files of others, read with errors that name file and key."""
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import math

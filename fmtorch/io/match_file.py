@@ -1,7 +1,5 @@
 """Files of matches to verify: hloc's features and matches, or x0, x1 alone; and files of what was verified."""
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import zipfile
@@ -10,16 +8,13 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from fmtorch.core.files import replacing
 from fmtorch.data.files import DataError
-from fmtorch.geometry.cameras import calibration_problems
 from fmtorch.io import h5
 from fmtorch.io.colmap import DatabaseImage
-from fmtorch.io.match_store import PairGeometry
-from fmtorch.io.predictions import size_by_centre
+from fmtorch.io.match_store import PairGeometry, geometry_texts
 
 MEMORY = 256  # images whose keypoints are kept
 NO_MATCH = -1
@@ -47,25 +42,25 @@ class HlocMatches:
             self._open = stack.pop_all()
         self.image = functools.lru_cache(maxsize=MEMORY)(self._image)
 
-    def __enter__(self) -> HlocMatches:
-        """The files themselves, closed on leaving."""
+    def __enter__(self) -> "HlocMatches":
         return self
 
     def __exit__(self, *error: object) -> None:
-        """Close the files."""
         self._open.close()
 
     def pairs(self) -> list[Names]:
-        """The pairs of the file of matches, by the names of their images."""
         return sorted(self._keys)
 
     def identity(self) -> dict[str, Any]:
-        """What the files hold."""
         return {"files": h5.digest_of(*self.files)}
 
     def has_geometry(self, pair: Names) -> bool:
-        """Whether a pair has a geometry: none has."""
         return False
+
+    def finished(self) -> int:
+        """How many pairs the output has, if it has all of them; else 0."""
+        with h5.opened(self._output) as written:
+            return len(self._keys) if all(h5.holds(written, key) for key in self._keys.values()) else 0
 
     def matches(self, pair: Names) -> NDArray[np.int64]:
         """The matches of a pair, keypoints (n, 2). Raises DataError where there are no such keypoints."""
@@ -79,7 +74,6 @@ class HlocMatches:
         return np.stack([first, second[first]], -1)
 
     def write(self, geometries: Iterable[tuple[Names, PairGeometry]]) -> None:
-        """Write the file: `matches0` of inliers alone, their scores, and the matrices as attributes."""
         h5py = h5.imported()
         with replacing(self._output) as temporary, h5py.File(temporary, "w") as file:
             for pair, geometry in geometries:
@@ -93,12 +87,14 @@ class HlocMatches:
                 write_geometry(group, geometry)
 
     def name(self, image_id: str) -> str:
-        """The name itself."""
         return image_id
 
     def _named(self, key: str) -> Names:
         """The names of a pair's images; of an image without features that in the key."""
         first, _, second = key.rpartition("/")
+        if not first:  # an older hloc joins names by _, which may also stand in them
+            ends = ((key[:i], key[i + 1 :]) for i, sign in enumerate(key) if sign == "_")
+            first, second = next((both for both in ends if self._stored.keys() >= set(both)), (first, second))
         return self._stored.get(first, first), self._stored.get(second, second)
 
     def _second(self, pair: Names) -> NDArray[np.int64]:
@@ -119,8 +115,8 @@ class HlocMatches:
 
 
 def write_geometry(group: Any, geometry: PairGeometry) -> None:
-    """The configuration and the matrices of a pair as attributes of its group."""
-    group.attrs["configuration"] = geometry.kind
+    """Words and matrices of a pair as attributes of its group."""
+    group.attrs.update(geometry_texts(geometry))
     for name in ("F", "E", "H", "R", "t"):
         value = getattr(geometry, name)
         if value is not None:
@@ -128,7 +124,6 @@ def write_geometry(group: Any, geometry: PairGeometry) -> None:
 
 
 def _below(file: Any, last: str) -> list[str]:
-    """The paths of the groups that hold an array of that name, at any depth."""
     groups: list[str] = []
 
     def visit(name: str) -> None:
@@ -187,25 +182,26 @@ class MatchFile:
             self._open = stack.pop_all()
         self.image = functools.lru_cache(maxsize=MEMORY)(self._image)
 
-    def __enter__(self) -> MatchFile:
-        """The file itself, closed on leaving."""
+    def __enter__(self) -> "MatchFile":
         return self
 
     def __exit__(self, *error: object) -> None:
-        """Close the file."""
         self._open.close()
 
     def pairs(self) -> list[Ids]:
-        """Both images of each pair."""
         return [(f"{pair}x0", f"{pair}x1") for pair in self._pairs]
 
     def identity(self) -> dict[str, Any]:
-        """What the file holds."""
         return {"files": h5.digest_of(self._path)}
 
     def has_geometry(self, pair: Ids) -> bool:
-        """Whether a pair has a geometry: none has."""
         return False
+
+    def finished(self) -> int:
+        """How many pairs the output has, if it has all of them; else 0."""
+        with _arrays(self._output) as written:
+            keys = set(written.keys())
+        return len(self._pairs) if all(f"{pair}inliers" in keys for pair in self._pairs) else 0
 
     def matches(self, pair: Ids) -> NDArray[np.int64]:
         """Point i with point i. Raises DataError where x0 and x1 have different lengths."""
@@ -215,22 +211,21 @@ class MatchFile:
         return np.repeat(np.arange(counts[0])[:, None], 2, 1)
 
     def write(self, geometries: Iterable[tuple[Ids, PairGeometry]]) -> None:
-        """Write the file: which matches are inliers, configuration and matrices."""
+        """Write the file: which matches are inliers, configuration, reason, warning and matrices."""
         with replacing(self._output) as temporary:
             entries = (self._entries(*pair) for pair in geometries)
             (_write_npz if self._output.suffix == NPZ else _write_h5)(temporary, entries)
 
     def _entries(self, ids: Ids, geometry: PairGeometry) -> dict[str, NDArray[Any]]:
-        """What is written of a pair, by keys."""
         pair = ids[0].removesuffix("x0")
         inliers = np.zeros(len(self.image(ids[0]).points), bool)
         inliers[geometry.inliers[:, 0]] = True
         values = ((name, getattr(geometry, name)) for name in MATRICES)
         matrices = {f"{pair}{name}": value for name, value in values if value is not None}
-        return {f"{pair}inliers": inliers, f"{pair}configuration": np.array(geometry.kind), **matrices}
+        texts = {f"{pair}{name}": np.array(value) for name, value in geometry_texts(geometry).items()}
+        return {f"{pair}inliers": inliers, **texts, **matrices}
 
     def name(self, image_id: str) -> str:
-        """The key of the points."""
         return image_id
 
     def _image(self, image_id: str) -> DatabaseImage:
@@ -240,9 +235,7 @@ class MatchFile:
             self._numbers(f"{pair}{key}", shape) if f"{pair}{key}" in self._keys else None
             for key, shape in ((f"K{i}", (3, 3)), (f"size{i}", (2,)))
         )
-        if K is not None and (problem := calibration_problems(torch.from_numpy(K)[None], None, f"K{i}")[0]):
-            raise DataError(problem)
-        known = size_by_centre(K) if size is None and K is not None else None
+        known = None
         if size is not None:
             if not (np.isfinite(size).all() and (size >= 1).all()):
                 raise DataError(f"size{i} is {size.tolist()}; it must be the height and width of the image")
@@ -333,4 +326,4 @@ def _write_h5(path: Path, pairs: Iterable[Mapping[str, NDArray[Any]]]) -> None:
                 if name == "inliers":
                     group[name] = value
                 else:
-                    group.attrs[name] = str(value) if name == "configuration" else value
+                    group.attrs[name] = value if name in MATRICES else str(value)

@@ -7,8 +7,6 @@
                           geometry for COLMAP; the digest is of the two images' digests
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import hashlib
@@ -36,7 +34,7 @@ class PairGeometry(NamedTuple):
     """The geometry of one pair, in pixels with (0, 0) at the centre of the first one.
 
     inliers: keypoints of both images, (n, 2). F, E, H: (3, 3), None where the pair has none; ``x1^T F x0 = 0``,
-    ``x1 ~ H x0``. R, t: X1 = R X0 + t.
+    ``x1 ~ H x0``. R, t: X1 = R X0 + t. reason: why there is no F. warning: what the matches leave open or contradict.
     """
 
     kind: Kind
@@ -46,6 +44,14 @@ class PairGeometry(NamedTuple):
     H: Matrix = None
     R: Matrix = None
     t: Matrix = None
+    reason: str = ""
+    warning: str = ""
+
+
+def geometry_texts(pair: PairGeometry) -> dict[str, str]:
+    """What files say of a pair in words: its configuration, and reason and warning where there are any."""
+    texts = {"pair_type": pair.kind, "reason": pair.reason, "warning": pair.warning}
+    return {name: text for name, text in texts.items() if text}
 
 
 def two_view_geometry(pycolmap: Any, pair: PairGeometry) -> Any:
@@ -122,7 +128,6 @@ class MatchStore:
     root: Path
 
     def name(self, image: Path) -> str:
-        """Under what name an image is exported."""
         return image.absolute().relative_to(self.root.absolute()).as_posix()
 
     def add(self, records: MatchRecords) -> None:

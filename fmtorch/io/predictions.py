@@ -1,7 +1,5 @@
 """Matches that other programs stored for the pairs of a data set: hloc's, glue-factory's and vismatch's files."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -202,7 +200,6 @@ class HLocMatches:
     origin: float
 
     def __call__(self) -> GivenMatches:
-        """Read them. Raises DataError naming file and key."""
         with h5.opened(self.features) as file:
             points = [_keypoints(file, self.features, name) - self.origin for name in self.names]
             sizes = tuple(
@@ -238,7 +235,6 @@ class PairPrediction:
     origin: float
 
     def __call__(self) -> GivenMatches:
-        """Read them. Raises DataError naming file and key."""
         with h5.opened(self.path) as file:
             group = file[self.key]
             if h5.holds(group, "matches0"):
@@ -317,7 +313,6 @@ def _without(pair: ImagePair, problem: str) -> ImagePair:
 
 
 def _expect_distinct(names: dict[str, str | None], path: Path) -> None:
-    """Raises DataError where one stored image would stand for two of the data set."""
     seen: dict[str, str] = {}
     for identity, name in names.items():
         if name is not None and seen.setdefault(name, identity) != identity:
@@ -328,7 +323,6 @@ def _expect_distinct(names: dict[str, str | None], path: Path) -> None:
 
 
 def _groups(file: Any) -> list[str]:
-    """The paths of the groups that hold a prediction."""
     groups: list[str] = []
 
     def visit(name: str) -> None:
@@ -346,7 +340,6 @@ def _groups(file: Any) -> list[str]:
 
 
 def _read_indices(file: Any, path: Path, key: str) -> tuple[NDArray[np.int64], Array | None]:
-    """``matches0`` and, where there are any, ``matching_scores0`` of a group."""
     prefix = f"{key}/" if key else ""
     chosen = h5.array(file, f"{prefix}matches0", None)
     if chosen.dtype.kind not in "iu":
@@ -370,7 +363,6 @@ def _indices(chosen: NDArray[np.int64], counts: list[int], where: str) -> tuple[
 
 
 def _keypoints(file: Any, path: Path, name: str) -> Array:
-    """x and y of an image's keypoints, which may come with scales. Raises DataError for fewer columns."""
     points = h5.numbers(file, f"{name}/keypoints", None, None)
     if points.shape[1] < 2:
         raise DataError(f"{path}: {name + '/keypoints'!r} has shape {points.shape}; it must be (n, 2) or wider")

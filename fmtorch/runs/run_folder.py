@@ -1,7 +1,5 @@
 """The result of one image pair, as one row of a table."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import hashlib
@@ -132,7 +130,6 @@ class PairRow:
 
 
 def _expect_homography(row: PairRow) -> None:
-    """Raises ValueError for a row of a pair of a known homography that contradicts itself."""
     error, H = row.corner_error, row.H
     if error is None or not error >= 0.0 or not math.isnan(row.nsgd) or row.F is not None:
         raise ValueError(
@@ -265,7 +262,7 @@ class RunFolder:
     config: dict[str, Any]  # what defines the results, see `identity_digest`
 
     @classmethod
-    def open(cls, path: Path | str, config: Mapping[str, Any]) -> RunFolder:
+    def open(cls, path: Path | str, config: Mapping[str, Any]) -> "RunFolder":
         """Start a run in `path`, or continue it there when the folder holds a run of the same identity.
 
         Several processes may open the same folder at once. Raises RunFolderError, touching nothing, where the folder
@@ -295,7 +292,7 @@ class RunFolder:
         return folder
 
     @classmethod
-    def load(cls, path: Path | str) -> RunFolder:
+    def load(cls, path: Path | str) -> "RunFolder":
         """The existing run in `path`, whatever its identity. Raises RunFolderError where there is none."""
         file = Path(path) / "run.json"
         try:
@@ -319,17 +316,14 @@ class RunFolder:
 
     @property
     def identity(self) -> str:
-        """The digest of what defines the results."""
         return identity_digest(self.config)
 
     def append(self, rows: Sequence[PairRow]) -> None:
-        """Add results, as a new part that is either whole or absent; parts are merged. Safe with several processes."""
         if not rows:
             return
         self._writer.add(to_table(rows))
 
     def done(self) -> set[int]:
-        """The keys of the pairs that have a result."""
         return {int(key) for part in self._parts(["key"]) for key in part["key"].to_numpy()}
 
     def read(self, keys: Collection[int] | None = None, without: Collection[str] = ()) -> pa.Table:

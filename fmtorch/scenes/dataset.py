@@ -4,8 +4,6 @@ Every scene is a function of (version, seed, split, family, number) alone and is
 renamed when complete, so that an interrupted generation goes on where it stopped and two processes never clash.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import hashlib
@@ -84,7 +82,6 @@ class Task:
 
     @property
     def name(self) -> str:
-        """The scene's name and its folder's."""
         return f"{self.family}-{self.split}-{self.number:03d}"
 
 
@@ -190,7 +187,6 @@ def generate(task: Task, folder: Path) -> Path:
 
 
 def _write(folder: Path, scene: DrawnScene, images: Iterable[Pixels], plan: Plan) -> None:
-    """Photographs and pairs of a scene; takes from `images` no more than the plan's pairs need."""
     features: list[Keypoints] = []
     cameras: list[dict[str, Any]] = []
     waiting, kept = list(scene.pairs), list[tuple[int, int]]()
@@ -214,7 +210,6 @@ def _write(folder: Path, scene: DrawnScene, images: Iterable[Pixels], plan: Plan
 
 
 def _saved(folder: Path, number: int, shot: Shot, image: Pixels) -> dict[str, Any]:
-    """Writes a photograph and returns what is recorded of it."""
     path = folder / f"{number:02d}.jpg"
     picture = image if image.ndim == 2 else np.ascontiguousarray(image[..., ::-1])
     if not cv2.imwrite(str(path), picture, [cv2.IMWRITE_JPEG_QUALITY, shot.jpeg]):
@@ -367,7 +362,7 @@ class RenderedPairs(Dataset[ImagePair]):
         scene, _, number = image.identity.rpartition("/")
         return depth_at(self._tasks[scene], int(number), points)
 
-    def scene_pairs(self) -> RenderedScenePairs:
+    def scene_pairs(self) -> "RenderedScenePairs":
         """All pairs of the photographs of each scene, as candidates to select from."""
         scenes = []
         for name, views in self._views.items():
@@ -390,7 +385,6 @@ class RenderedScenePairs(ScenePairs):
         self.drawn = drawn
 
     def depth(self, image: ImageSource, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """As `RenderedPairs.depth`."""
         return self.drawn.depth(image, points)
 
 

@@ -1,7 +1,5 @@
 """`MatchedPairs`: a data set of image pairs seen through a pipeline's first stages, with labels, kept on disk."""
 
-from __future__ import annotations
-
 import functools
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -119,7 +117,6 @@ class MatchedPairs(StoredMatches):
 
 
 def _identity(dataset: PairDataset, stages: Pipeline, most: int) -> dict[str, Any]:
-    """What defines the matches and their labels, as plain values."""
     extractor = stages.extractor
     if isinstance(extractor, CachedFeatures):
         extractor = extractor.extractor
@@ -138,7 +135,6 @@ def _identity(dataset: PairDataset, stages: Pipeline, most: int) -> dict[str, An
 
 
 def _sound(path: Path, pairs: int) -> bool:
-    """Whether a file is there and whole, with so many pairs; of a damaged one a warning tells."""
     if not path.exists():
         return False
     try:

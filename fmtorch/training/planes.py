@@ -5,8 +5,6 @@ depth of every point of its views is known; but the matches of one plane determi
 Zisserman, section 11.9), so that these pairs train the classification of matches alone.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import itertools

@@ -1,7 +1,5 @@
 """Labelled matches on disk, the torch Dataset that reads them, and batches of pairs with similar numbers of matches."""
 
-from __future__ import annotations
-
 import copy
 import itertools
 import warnings
@@ -211,7 +209,7 @@ class StoredMatches(Dataset[LabelledMatches]):
             for about, (ratio, label) in zip(self.pairs, map(self._figures, self._rows), strict=True)
         ]
 
-    def select(self, indices: Iterable[int]) -> StoredMatches:
+    def select(self, indices: Iterable[int]) -> "StoredMatches":
         """The same data set with these pairs only."""
         chosen = list(indices)
         other = copy.copy(self)
@@ -219,7 +217,7 @@ class StoredMatches(Dataset[LabelledMatches]):
         other.pairs = [self.pairs[i] for i in chosen]
         return other
 
-    def joined(self, other: StoredMatches) -> StoredMatches:
+    def joined(self, other: "StoredMatches") -> "StoredMatches":
         """The pairs of both data sets, this one's first, with this one's random changes and folder."""
         both = copy.copy(self)
         both._paths, both._open = [*self._paths, *other._paths], {}
@@ -227,7 +225,7 @@ class StoredMatches(Dataset[LabelledMatches]):
         both.pairs, both.failures = [*self.pairs, *other.pairs], [*self.failures, *other.failures]
         return both
 
-    def augmented(self, augmentation: Augmentation | None, seed: int = 0) -> StoredMatches:
+    def augmented(self, augmentation: Augmentation | None, seed: int = 0) -> "StoredMatches":
         """The same data set with other random changes."""
         other = copy.copy(self)
         other.augmentation, other.seed = augmentation, seed

@@ -1,7 +1,5 @@
 """How good a pruner is: through real estimators on whole pairs, not by its loss alone."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from fmtorch.core.types import Estimate
+from fmtorch.core.types import CONTRADICTED, Estimate
 from fmtorch.two_view.arguments import Arrays, Focal, correspondences
 from fmtorch.two_view.estimation import estimated
 from fmtorch.two_view.pair_type import with_pair_type
@@ -110,6 +111,9 @@ def find_fundamental(
     if isinstance(focal, Mapping):
         options["focal"] = focal
     estimate = estimated(c, "fundamental", estimator, config_dir, seed, options, covariance)
+    if estimate.contradicted is not None and bool(estimate.contradicted.any()):
+        pairs = estimate.contradicted.nonzero()[:, 0].tolist()
+        warnings.warn(f"pair {', '.join(map(str, pairs))}: {CONTRADICTED}", stacklevel=2)
     return with_pair_type(estimate, c, seed) if pair_type else estimate
 
 

@@ -69,6 +69,7 @@ def estimate(b: int = 4, n: int = 6, seed: int = 0) -> Estimate:
         homography=torch.rand(b, 3, 3, generator=g),
         other_R=torch.rand(b, 3, 3, generator=g),
         other_t=torch.rand(b, 3, generator=g),
+        contradicted=torch.rand(b, generator=g) < 0.5,
     )
 
 

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+import fmtorch
 from fmtorch.estimators import (
     BetterHalf,
     InlierRule,
@@ -19,6 +20,7 @@ from fmtorch.estimators import (
 from fmtorch.estimators.inliers import residuals_squared_px
 from tests.estimators.pairs import FEW, SCALES, models, named
 from tests.estimators.residuals import residuals
+from tests.reference import known_cameras
 from tests.reference import ransac as reference
 
 
@@ -52,6 +54,15 @@ def test_rules_are_those_of_the_definitions(count: int) -> None:
         ]
         for rule, expected in rules:
             assert rule(r**2, pair).tolist() == expected
+
+
+@pytest.mark.parametrize("name", ["lmeds", "cf_ransac", "paper/lmeds"])
+def test_all_exact_matches_are_inliers(name: str) -> None:
+    """Whose deviations are rounding, of which a half is larger than the median."""
+    s = known_cameras.scene(5, 150)
+    inliers = fmtorch.find_fundamental(s.x0, s.x1, estimator=name).inliers[0].numpy()
+    assert inliers[s.right].all()
+    assert not inliers[~s.right].any()
 
 
 def test_limits_belong_to_the_inliers_and_are_none_beyond_the_range_of_numbers() -> None:

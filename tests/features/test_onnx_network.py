@@ -11,7 +11,7 @@ from torch import Tensor
 from fmtorch.core import NetworkFileError, models_dir
 from fmtorch.features import PatchNetwork
 from fmtorch.features.networks import ARCHITECTURES, build
-from fmtorch.training.onnx_export import export, quantize
+from scripts.patch_networks.onnx_export import export, quantize
 from tests.conftest import oracle
 from tests.features.test_networks import randomized
 

@@ -87,3 +87,10 @@ def test_stage_needs_sizes() -> None:
     assert torch.equal(GMS(threshold_factor=4.0, with_scale=True)(c).mask, expected)
     with pytest.raises(ValueError, match="size0"):
         GMS()(Correspondences(x0, x1, mask))
+
+
+def test_sizes_that_are_width_and_height_are_refused() -> None:
+    x0, x1 = (x[None].clamp(0, 299) for x in moving(3, 200))
+    x0[0, :40, 0] += 300
+    with pytest.raises(ValueError, match=r"size0 is \(640, 480\), but .* it looks like \(w, h\)"):
+        gms(x0, x1, size0=torch.tensor([SIZE0[::-1]]), size1=torch.tensor([SIZE1]))

@@ -25,6 +25,8 @@ def test_is_its_formula() -> None:
             r, P = float(ratio[b, i]), max(float(prior[b, i]), 0.02)
             expected = (1 + max(scales) / 15) * (1 + 0.65 * r) ** 2 * P**-0.25 / 4.06
             assert float(noise[b, i]) == pytest.approx(expected, rel=1e-9)
+    inputs = [x[:1, :8].clone().requires_grad_() for x in (lafs0, lafs1, ratio, prior)]
+    assert torch.autograd.gradcheck(lambda *x: match_noise(*x, **NUMBERS), inputs)
 
 
 def test_matches_without_frames_are_left_as_they_are_and_what_cannot_be_told_is_usual() -> None:
