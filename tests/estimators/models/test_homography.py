@@ -74,7 +74,7 @@ def test_noise_and_wrong_matches() -> None:
         assert estimate.ok.tolist() == [True]
         assert estimate.reason == ("",)
         assert estimate.model == "homography"
-        assert estimate.significance.isnan().all()
+        assert bool(estimate.related.all())
         assert torch.linalg.norm(estimate.H[0]) == pytest.approx(1, abs=1e-14)
         assert (torch.from_numpy(np.c_[m.x0, np.ones(200)][m.right]) @ estimate.H[0, 2] > 0).all()
         # Were all of it in one direction, a normal error would exceed 4 deviations (3.6 of a fit with an efficiency of
@@ -131,14 +131,10 @@ def broken(kind: str) -> tuple[np.ndarray, np.ndarray]:
         x0[:] = np.nan
     elif kind == "infinite":
         x1[:] = np.inf
-    elif kind == "mirrored":
-        x1[:, 0] *= -1
     return x0, x1
 
 
-BROKEN = [
-    "none", "three", "collinear", "collinear in image 1", "coincident", "two places", "NaN", "infinite", "mirrored",
-]  # fmt: skip
+BROKEN = ["none", "three", "collinear", "collinear in image 1", "coincident", "two places", "NaN", "infinite"]
 
 
 @pytest.mark.parametrize("kind", BROKEN)
