@@ -43,13 +43,9 @@ PLACES = ("root", "file", "truth", "images")
 
 
 def run_identity(
-    config: DictConfig,
-    pipeline_name: str,
-    pipeline: Pipeline,
-    dataset_digest: str,
-    cameras: str | None = None,
+    config: DictConfig, pipeline_name: str, pipeline: Pipeline, dataset_digest: str, cameras: str | None = None,
     signed: bool = False,
-) -> dict[str, Any]:
+) -> dict[str, Any]:  # fmt: skip
     """The identity of a run, as plain values.
 
     Args:
@@ -335,18 +331,10 @@ def select(pairs: Sequence[ImagePair], limit: int | None) -> list[ImagePair]:
 
 
 def evaluate_pairs(
-    pipeline: Pipeline,
-    pairs: Sequence[ImagePair],
-    *,
-    seed: int,
-    batch: int,
-    execution: Execution,
-    store: Callable[[list[PairRow]], None],
-    build: Build | None = None,
-    cameras: Mapping[int, PairCameras] | None = None,
-    journal: MatchStore | None = None,
-    signed: bool = False,
-) -> Iterator[int]:
+    pipeline: Pipeline, pairs: Sequence[ImagePair], *, seed: int, batch: int, execution: Execution,
+    store: Callable[[list[PairRow]], None], build: Build | None = None,
+    cameras: Mapping[int, PairCameras] | None = None, journal: MatchStore | None = None, signed: bool = False,
+) -> Iterator[int]:  # fmt: skip
     """Run and evaluate the pairs, hand each batch's rows to `store`, and yield how many pairs it held.
 
     execution: by which workers. build: makes the same pipeline in another process, where these are no threads.

@@ -117,17 +117,10 @@ def load_best(folder: Path, module: PrunerTraining) -> int:
 
 
 def train(
-    module: PrunerTraining,
-    batches: Callable[[int, int, int], DataLoader[Any]],
-    folder: Path,
-    trainer: Mapping[str, Any],
-    *,
-    every: int,
-    checkpoint_every: int,
-    patience: int | None,
-    monitor: str,
+    module: PrunerTraining, batches: Callable[[int, int, int], DataLoader[Any]], folder: Path,
+    trainer: Mapping[str, Any], *, every: int, checkpoint_every: int, patience: int | None, monitor: str,
     callbacks: tuple[Callback, ...] = (),
-) -> tuple[int, float]:
+) -> tuple[int, float]:  # fmt: skip
     """Train in `folder`, going on from its last checkpoint; returns the steps and seconds made in all.
 
     Args:

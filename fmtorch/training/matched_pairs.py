@@ -69,20 +69,11 @@ class MatchedPairs(StoredMatches):
     """
 
     def __init__(
-        self,
-        dataset: PairDataset,
-        pipeline: Pipeline | str,
-        *,
-        overrides: Sequence[str] = (),
-        root: str | Path | None = None,
-        workers: int | None = None,
-        progress: Progress | None = None,
-        most: int = MAX_MATCHES,
-        augmentation: Augmentation | None = None,
-        seed: int = 0,
-        execution: Execution | None = None,
-        build: Callable[[], Pipeline] | None = None,
-    ) -> None:
+        self, dataset: PairDataset, pipeline: Pipeline | str, *, overrides: Sequence[str] = (),
+        root: str | Path | None = None, workers: int | None = None, progress: Progress | None = None,
+        most: int = MAX_MATCHES, augmentation: Augmentation | None = None, seed: int = 0,
+        execution: Execution | None = None, build: Callable[[], Pipeline] | None = None,
+    ) -> None:  # fmt: skip
         if most < 1:
             raise ValueError(f"most is {most}; at least 1 match of a pair must be kept")
         if not len(dataset):
@@ -192,14 +183,9 @@ def _matching_in_process(dataset: PairDataset, build: Callable[[], Pipeline], mo
 
 
 def compute_shards(
-    dataset: PairDataset,
-    stages: Pipeline,
-    build: Callable[[], Pipeline] | None,
-    jobs: Sequence[Job],
-    *,
-    most: int,
+    dataset: PairDataset, stages: Pipeline, build: Callable[[], Pipeline] | None, jobs: Sequence[Job], *, most: int,
     execution: Execution,
-) -> Iterator[int]:
+) -> Iterator[int]:  # fmt: skip
     """Write each job's shard; yields the number of its pairs when it is written.
 
     Args:

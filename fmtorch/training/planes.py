@@ -95,15 +95,9 @@ class PlanePairs(Dataset[ImagePair]):
     name = "planes"
 
     def __init__(
-        self,
-        photographs: Sequence[Photograph],
-        views: PlaneViews | None = None,
-        seed: int = 0,
-        root: str | Path | None = None,
-        *,
-        workers: int = 1,
-        progress: Callable[[int, int], None] | None = None,
-    ) -> None:
+        self, photographs: Sequence[Photograph], views: PlaneViews | None = None, seed: int = 0,
+        root: str | Path | None = None, *, workers: int = 1, progress: Callable[[int, int], None] | None = None,
+    ) -> None:  # fmt: skip
         if not photographs:
             raise ValueError("no photographs to look at")
         self.views = views or PlaneViews()
