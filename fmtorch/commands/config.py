@@ -1,7 +1,5 @@
 """How a command runs: Hydra composes its config, and a user's mistake ends it with one line and status 1."""
 
-from __future__ import annotations
-
 import functools
 import pdb
 import re
@@ -42,7 +40,6 @@ class Mistake(ValueError):
 
 
 def _register(command: Command) -> None:
-    """Have Hydra know the config of a command by its name."""
     quiet = [{f"override hydra/{part}_logging": "none"} for part in ("hydra", "job")]
     own = {"output_subdir": None, "run": {"dir": "."}, "sweep": {"dir": command.sweeps, "subdir": "."}}
     defaults = [*({group: name} for group, name in command.groups.items()), "_self_", *quiet]
@@ -174,7 +171,6 @@ def hydra_arguments(words: Sequence[str], paths: Sequence[str], positional: Sequ
 
 
 def _split(words: Sequence[str]) -> tuple[list[str], list[str]]:
-    """The flags with their values, and all others."""
     takes_value = {name for action in get_args_parser()._actions if action.nargs != 0 for name in action.option_strings}
     flags: list[str] = []
     others: list[str] = []
@@ -197,7 +193,6 @@ def _is_positional(word: str) -> bool:
 
 
 def _named(placed: list[str], positional: Sequence[str]) -> Iterator[str]:
-    """Positional arguments with the names of their fields."""
     if not placed:
         return
     names = ", ".join(name.removesuffix("...") for name in positional)

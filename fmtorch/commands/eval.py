@@ -1,7 +1,5 @@
 """`python -m fmtorch.eval pipeline=sift_ratio`: run a pipeline over a data set of image pairs and evaluate it."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import os
@@ -91,7 +89,6 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
 def _open_folder(
     config: DictConfig, fields: EvalOptions, pipeline_name: str, pipeline: Pipeline, dataset: PairDataset
 ) -> RunFolder:
-    """The folder of the run with this identity, its `run_dir` if given, new or to be continued."""
     identity = run_identity(config, pipeline_name, pipeline, dataset.digest, fields.cameras, fields.pose.signed)
     name = f"{pipeline_name.replace('/', '-')}-{identity_digest(identity)[:8]}"
     return RunFolder.open(fields.run_dir or Path(f"runs/{dataset.name}/{name}"), identity)
@@ -110,7 +107,6 @@ def _evaluated(
     config: DictConfig, fields: EvalOptions, pipeline: Pipeline, pairs: Sequence[ImagePair], folder: RunFolder,
     journal: MatchStore | None,
 ) -> Iterator[int]:  # fmt: skip
-    """Evaluates pairs into the folder and the journal; yields how many were done since."""
     parallel = len(pairs) >= MIN_PAIRS_FOR_PROCESSES and pipeline.device.type == "cpu"
     execution = execution_of(config, fields.workers, fields.processes).decided(parallel)
     if fields.debug:

@@ -1,7 +1,5 @@
 """`fmtorch pairs dataset=kitti dataset.root=DIR output=KITTI`: a set of the pairs that can be matched."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import itertools
@@ -73,7 +71,6 @@ def _execution(config: DictConfig, fields: PairsOptions, many: bool) -> Executio
 
 
 def _load(config: DictConfig) -> ScenePairs:
-    """The data set of a config, all of whose candidates are asked for."""
     options = plain(config)
     presets.expect_buildable(options, "dataset")
     with progress_bars() as progress:
@@ -133,7 +130,6 @@ def _call(construction: Construction, task: tuple[str, tuple[object, ...]]) -> A
 
 
 def _print_summary(construction: Construction, summary: dict[str, int], problems: list[str], seconds: float) -> None:
-    """What was made, on the console."""
     judged = f"{summary['judged']} of {summary['candidates']} candidates were judged in {seconds:.0f} s"
     console.print(f"{summary['kept']} pairs of {summary['images']} images; {judged}", highlight=False)
     if construction.count is not None and summary["kept"] < construction.count:

@@ -1,7 +1,5 @@
 """`fmtorch verify DATABASE`: two-view geometries of the matches in a COLMAP database."""
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import re
@@ -69,7 +67,6 @@ def _begun_by_reports(description: str) -> Iterator[Callable[[int, int], None]]:
 
 
 def _table(result: Verification) -> Table:
-    """Counts of pairs, and how long they took."""
     table = Table()
     table.add_column("pairs")
     table.add_column("", justify="right")

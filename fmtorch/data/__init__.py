@@ -1,7 +1,5 @@
 """Data sets of image pairs."""
 
-from __future__ import annotations
-
 import dataclasses
 import inspect
 from collections.abc import Callable, Mapping, Sequence

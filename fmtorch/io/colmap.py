@@ -1,7 +1,5 @@
 """A COLMAP database of keypoints, matches and two-view geometries, written through pycolmap."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import functools
@@ -72,7 +70,6 @@ def write_database(
 
 
 def _camera(pycolmap: Any, database: Any, cameras: dict[object, int], image: StoredImage, shared: bool) -> int:
-    """The image's camera, with a rig of its own."""
     model, parameters, prior = _parameters(image)
     key: object = image.name
     if image.K is not None or image.lens is not None or shared:
@@ -89,7 +86,6 @@ def _camera(pycolmap: Any, database: Any, cameras: dict[object, int], image: Sto
 
 
 def _parameters(image: StoredImage) -> tuple[str, list[float], bool]:
-    """The model of an image's camera, its parameters, and whether its focal length is known."""
     h, w = image.size
     if (lens := image.lens) is not None:
         focals = [lens.fx] if MODELS[lens.model].focals == 1 else [lens.fx, lens.fy]
@@ -242,16 +238,13 @@ class MatchDatabase:
                 self.close()
                 raise ValueError(f"{path} holds no {what}; {step} first")
 
-    def __enter__(self) -> MatchDatabase:
-        """The database itself, closed on leaving."""
+    def __enter__(self) -> "MatchDatabase":
         return self
 
     def __exit__(self, *error: object) -> None:
-        """Close the database."""
         self.close()
 
     def close(self) -> None:
-        """Close the database; SQLite then leaves one file."""
         self._database.close()
 
     def pairs(self) -> list[Ids]:
@@ -265,7 +258,6 @@ class MatchDatabase:
         return {"keypoints": self._database.num_keypoints(), "matches": self._database.num_matches()}
 
     def has_geometry(self, pair: Ids) -> bool:
-        """Whether a pair has a two-view geometry, of a failure too."""
         return bool(self._database.exists_two_view_geometry(*pair))
 
     def matches(self, pair: Ids) -> NDArray[np.int64]:
@@ -410,7 +402,6 @@ def _reading(path: Path) -> Iterator[sqlite3.Connection]:
 
 @functools.cache
 def _newest_version() -> int:
-    """The version that pycolmap writes into databases."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "empty.db"
         opened: Any = imported().Database.open(path)

@@ -1,7 +1,5 @@
 """A folder of images: its pairs, the work on them by any workers, which can be resumed, and where results go."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import hashlib
@@ -335,7 +333,6 @@ class FolderMatches:
         return Photograph(image, source, self.longest_side, self.orient)
 
     def _described_pair(self, pair: Pair) -> DescribedPair | None:
-        """A pair to match; None where it cannot be."""
         end0, end1 = (self._described[image] for image in pair)
         if end0 is None or end1 is None:
             self._failed += 1
@@ -349,7 +346,6 @@ class FolderMatches:
         return DescribedPair(pair, (end0, end1), names, self.seed, known)
 
     def _keep(self, task: Photograph | DescribedPair, result: Any) -> None:
-        """Store an image or a pair, or tell what went wrong with it."""
         if isinstance(task, Photograph):
             self._described[task.path] = self._keep_image(task.path, result)
             return

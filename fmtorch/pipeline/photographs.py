@@ -1,7 +1,5 @@
 """Photographs for a pipeline: what is known of their cameras, and how they are reduced for matching."""
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Mapping, Sequence
@@ -84,7 +82,6 @@ class PhotographCameras:
         return ImageSource(path.name, path, None if self._stored is None else self._stored.of(path).size)
 
     def of(self, path: Path, size: tuple[int, int]) -> PhotographCamera:
-        """The camera of a photograph of that size (h, w)."""
         if (path, size) not in self._known:
             self._known[path, size] = self._of(path, size)
         return self._known[path, size]
@@ -132,7 +129,6 @@ class PhotographCameras:
 
 
 def _pinhole(K: str | Sequence[float | int]) -> Lens:
-    """Of fx, fy, cx, cy. Raises ValueError for anything else."""
     words = K.replace(",", " ").replace("[", " ").replace("]", " ").split() if isinstance(K, str) else K
     try:
         numbers = [float(word) for word in words]

@@ -1,7 +1,5 @@
 """Photographs described for matching: features of each as it was reduced, and what leads back to it."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import math
@@ -25,18 +23,8 @@ from fmtorch.data.images import to_grey
 from fmtorch.geometry.pair_type import GENERAL, IDENTICAL, PLANAR, ROTATION
 from fmtorch.io.match_store import Kind, PairGeometry
 from fmtorch.jobs.execution import mapped, one_thread
-from fmtorch.pipeline.photographs import (
-    Image,
-    evenly_reduced,
-    frames_to_original,
-    fundamental_to_original,
-    geometry_to_original,
-    given_image,
-    reduced_cameras,
-    reduced_image,
-    to_original,
-    undistorted_matches,
-)
+from fmtorch.pipeline import photographs
+from fmtorch.pipeline.photographs import Image, frames_to_original, to_original
 from fmtorch.pipeline.pipeline import Clock, Pipeline, load_pipeline
 from fmtorch.two_view.arguments import Arrays, Focal, camera_fields
 from fmtorch.two_view.known_cameras import KnownCameras
@@ -67,13 +55,12 @@ class Described:
 
     @property
     def points(self) -> Float[Tensor, "n 2"]:
-        """The keypoints in pixels of the photograph."""
         return to_original(self.features.keypoints, self.scale.to(self.features.keypoints))
 
 
 def describe(pipeline: Pipeline, image: Image, longest_side: int) -> Described:
     """The features of a photograph, for `relate`; see `match`."""
-    reduced, scale = reduced_image(image, longest_side)
+    reduced, scale = photographs.reduced_image(image, longest_side)
     itself = isinstance(pipeline.matcher, ImageMatcher)
     features, seconds = (NoFeatures()(reduced), 0.0) if itself else pipeline.extract(reduced)
     pyramid = grey_pyramid(to_grey(reduced)) if pipeline.looks_at_images else None
@@ -136,7 +123,6 @@ class MatchResult:
 
     @property
     def ok(self) -> bool:
-        """Whether a fundamental matrix was found."""
         return not self.reason
 
 
@@ -194,7 +180,6 @@ def _calibrated(c: Correspondences, estimate: Estimate) -> Tensor:
 
 
 def _with_lines(kind: Kind, inliers: NDArray[np.integer[Any]], estimate: Estimate, i: int, H: Any) -> PairGeometry:
-    """A geometry with F, and the pose where there is one."""
     E, R, t = (
         None if value is None else _known(value[i], value[i].isfinite().all())
         for value in (estimate.E, estimate.R, estimate.t)
@@ -275,7 +260,7 @@ def match(
         raise TypeError(f"pipeline is a {type(pipeline).__name__}; it must be the name of a preset or a Pipeline")
     elif device is not None and torch.device(device) != pipeline.device:
         raise ValueError(f"device={device}, but the pipeline was built for {pipeline.device}; leave one of them out")
-    images = [given_image(image, name) for image, name in ((image0, "image0"), (image1, "image1"))]
+    images = [photographs.given_image(image, name) for image, name in ((image0, "image0"), (image1, "image1"))]
     K0, K1 = (K if lens is None else lens.K for K, lens in ((K0, lens0), (K1, lens1)))
     cameras = camera_fields(K0, K1, focal, sizes_known=True)
     describing = functools.partial(describe, pipeline, longest_side=longest_side)
@@ -293,12 +278,12 @@ def relate(
     clock = Clock(pipeline.device)
     clock("features", described0.seconds + described1.seconds)
     scales = [described0.scale, described1.scale]
-    known = reduced_cameras(cameras, scales, [described0.size, described1.size])
+    known = photographs.reduced_cameras(cameras, scales, [described0.size, described1.size])
     known = {name: value.to(pipeline.device) for name, value in known.items()}
     result = _matched(pipeline, (described0, described1), clock)
     if not result.reason:
         c = result.correspondences
-        c = undistorted_matches(c, lenses, scales).replace(**known)
+        c = photographs.undistorted_matches(c, lenses, scales).replace(**known)
         result = _estimated(pipeline, result, c, scales, seed, clock)
     if not any(lens is not None and lens.bends for lens in lenses):
         result = dataclasses.replace(result, undistorted=None)
@@ -346,7 +331,6 @@ def _matched(pipeline: Pipeline, described: Sequence[Described], clock: Clock) -
 
 
 def _of_images(pipeline: Pipeline, described: Sequence[Described]) -> Correspondences | None:
-    """The matches of a matcher that takes the images themselves; None for any other."""
     image0, image1 = (each.image for each in described)
     if not isinstance(pipeline.matcher, ImageMatcher) or image0 is None or image1 is None:
         return None
@@ -361,7 +345,7 @@ def _estimated(
     estimator = KnownCameras(pipeline.estimator) if c.asks_for_cameras else pipeline.estimator
     estimate = pipeline.estimated(c, seed, estimator)
     clock("estimation")
-    even, F, even_scales = evenly_reduced(c, estimate.F, scales)
+    even, F, even_scales = photographs.evenly_reduced(c, estimate.F, scales)
     pair_type = classify(even, estimate.derived(F=F), seed=seed)
     clock("pair_type")
     index = np.arange(c.mask.shape[1]).repeat(2).reshape(-1, 2)
@@ -373,7 +357,7 @@ def _estimated(
         warning=still_warning(matched.correspondences, inliers) or warnings_of(estimate, pair_type)[0],
         counts={**matched.counts, "estimation": int(inliers.sum())}, seconds=clock.seconds,
         significance=float(cast(Tensor, estimate.significance)[0]), R=R, t=t, focals=focals,
-        pair_type=pair_type.names[0], geometry=geometry_to_original(geometry, *even_scales), undistorted=c,
+        pair_type=pair_type.names[0], geometry=photographs.geometry_to_original(geometry, *even_scales), undistorted=c,
     )  # fmt: skip
 
 
@@ -393,6 +377,6 @@ def _restored(result: MatchResult, scales: list[Tensor], sizes: list[Tensor]) ->
         result,
         keypoints0=to_original(result.keypoints0, s0), keypoints1=to_original(result.keypoints1, s1),
         putative=matches(result.putative), correspondences=matches(result.correspondences), undistorted=undistorted,
-        F=fundamental_to_original(result.F, *scales),
+        F=photographs.fundamental_to_original(result.F, *scales),
         focals=None if result.focals is None else result.focals / torch.stack(scales).prod(1).sqrt().to(result.focals),
     )  # fmt: skip

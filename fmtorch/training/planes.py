@@ -5,8 +5,6 @@ depth of every point of its views is known; but the matches of one plane determi
 Zisserman, section 11.9), so that these pairs train the classification of matches alone.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import itertools
@@ -97,15 +95,9 @@ class PlanePairs(Dataset[ImagePair]):
     name = "planes"
 
     def __init__(
-        self,
-        photographs: Sequence[Photograph],
-        views: PlaneViews | None = None,
-        seed: int = 0,
-        root: str | Path | None = None,
-        *,
-        workers: int = 1,
-        progress: Callable[[int, int], None] | None = None,
-    ) -> None:
+        self, photographs: Sequence[Photograph], views: PlaneViews | None = None, seed: int = 0,
+        root: str | Path | None = None, *, workers: int = 1, progress: Callable[[int, int], None] | None = None,
+    ) -> None:  # fmt: skip
         if not photographs:
             raise ValueError("no photographs to look at")
         self.views = views or PlaneViews()

@@ -1,7 +1,5 @@
 """`fmtorch train`: a composed config -> labelled matches, a trained network, its files and its card."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import hashlib

@@ -1,7 +1,5 @@
 """Pairs of a COLMAP database as correspondences."""
 
-from __future__ import annotations
-
 import dataclasses
 import shutil
 import uuid
@@ -19,7 +17,7 @@ from fmtorch.core.settings import claim
 from fmtorch.core.stages import Estimator
 from fmtorch.core.types import CONTRADICTED, Correspondences, collate, pair_key
 from fmtorch.io.colmap import DatabaseImage
-from fmtorch.io.match_store import Kind, PairGeometry
+from fmtorch.io.match_store import MATRICES, Kind, PairGeometry
 from fmtorch.jobs.execution import Execution, Shard
 from fmtorch.jobs.runner import Factory, Local, Source, TaskRunner, WorkerPool
 from fmtorch.pipeline.two_images import pair_geometries
@@ -79,7 +77,6 @@ def _shared(image0: DatabaseImage, image1: DatabaseImage, cameras: Cameras) -> b
 
 
 SETTINGS = "settings.json"
-_MATRICES = ("F", "E", "H", "R", "t")
 
 _GeometryIds = tuple[Any, Any]
 
@@ -99,21 +96,19 @@ class GeometryParts:
                 self.done.update(map(_ids, part["pairs"].tolist()))
 
     def write(self, geometries: Iterable[tuple[_GeometryIds, PairGeometry]]) -> None:
-        """Keep geometries of pairs, all of them or none."""
         arrays: dict[str, Any] = {}
         pairs, kinds, texts = [], [], []
         for i, (ids, geometry) in enumerate(geometries):
             pairs.append(ids)
             kinds.append(geometry.kind)
             texts.append((geometry.reason, geometry.warning))
-            values = {name: getattr(geometry, name) for name in ("inliers", *_MATRICES)}
-            arrays |= {f"{name}-{i}": value for name, value in values.items() if value is not None}
+            values = {"inliers": geometry.inliers, **geometry.matrices}
+            arrays |= {f"{name}-{i}": value for name, value in values.items()}
         with replacing(self.folder / f"{uuid.uuid4().hex}.npz") as temporary, temporary.open("wb") as file:
             np.savez(file, pairs=np.array(pairs), kinds=np.array(kinds), texts=np.array(texts), **arrays)
         self.done.update(pairs)
 
     def read(self) -> Iterator[tuple[_GeometryIds, PairGeometry]]:
-        """The geometries, each pair's once."""
         seen: set[_GeometryIds] = set()
         for path in self._files():
             with np.load(path) as part:
@@ -123,7 +118,6 @@ class GeometryParts:
                         yield ids, _geometry(part, i, str(kind))
 
     def remove(self) -> None:
-        """Remove the folder."""
         shutil.rmtree(self.folder)
 
     def _files(self) -> list[Path]:
@@ -136,7 +130,7 @@ def _ids(ids: list[Any]) -> _GeometryIds:
 
 
 def _geometry(part: Any, i: int, kind: str) -> PairGeometry:
-    matrices = (part.get(f"{name}-{i}") for name in _MATRICES)
+    matrices = (part.get(f"{name}-{i}") for name in MATRICES)
     return PairGeometry(cast(Kind, kind), part[f"inliers-{i}"], *matrices, *part["texts"][i].tolist())
 
 
@@ -292,7 +286,6 @@ class VerificationRun:
                     report(done, len(todo))
 
     def write(self) -> None:
-        """Write what is kept into the store."""
         self.configurations.clear()
         self.store.write(self._counted(self.parts.read()))
 

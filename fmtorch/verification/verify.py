@@ -1,7 +1,5 @@
 """Two-view geometries of a COLMAP database, of hloc's files, or of matches alone, whoever made them."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import functools
