@@ -40,8 +40,8 @@ __all__ = [
     "GemanMcClure", "GraphCut", "Homography", "I8x1", "I8x2", "InlierCount", "InlierRule", "IterativelyReweighted",
     "Magsac", "Median", "Msac", "Pair", "PairwiseEstimator", "Preselect", "PriorWeighted", "Prosac", "Ransac", "Refine",
     "RobustDeviations", "Sampler", "SaturatedGains", "Score", "Select", "SevenPoint", "StoppingRule", "SummedGains",
-    "Uniform", "WithinThreshold", "colmap", "degensac_cpp", "fastpose", "gc_ransac_cpp", "kernel", "kornia_ransac", "magsac_cpp",
-    "opencv", "poselib", "superansac_cpp",
+    "Uniform", "WithinThreshold", "colmap", "degensac_cpp", "fastpose", "gc_ransac_cpp", "kernel", "kornia_ransac",
+    "magsac_cpp", "opencv", "poselib", "superansac_cpp",
 ]  # fmt: skip
 
 lazy_exports(__name__)
