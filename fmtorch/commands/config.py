@@ -1,7 +1,5 @@
 """How a command runs: Hydra composes its config, and a user's mistake ends it with one line and status 1."""
 
-from __future__ import annotations
-
 import functools
 import pdb
 import re
@@ -42,7 +40,6 @@ class Mistake(ValueError):
 
 
 def _register(command: Command) -> None:
-    """Have Hydra know the config of a command by its name."""
     quiet = [{f"override hydra/{part}_logging": "none"} for part in ("hydra", "job")]
     own = {"output_subdir": None, "run": {"dir": "."}, "sweep": {"dir": command.sweeps, "subdir": "."}}
     defaults = [*({group: name} for group, name in command.groups.items()), "_self_", *quiet]
@@ -205,7 +202,6 @@ def _is_positional(word: str) -> bool:
 
 
 def _named(placed: list[str], positional: Sequence[str]) -> Iterator[str]:
-    """Positional arguments with the names of their fields."""
     if not placed:
         return
     names = ", ".join(name.removesuffix("...") for name in positional)

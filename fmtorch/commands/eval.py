@@ -1,7 +1,5 @@
 """`python -m fmtorch.eval pipeline=sift_ratio`: run a pipeline over a data set of image pairs and evaluate it."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import os
@@ -29,10 +27,8 @@ from fmtorch.io.match_store import MatchStore
 from fmtorch.jobs.execution import MIN_PAIRS_FOR_PROCESSES, Execution, shard_of
 from fmtorch.pipeline.exporting import exportable
 from fmtorch.pipeline.pipeline import Pipeline, build_pipeline
-from fmtorch.presets import plain
-from fmtorch.presets.composition import execution_of, read_fields
-from fmtorch.runs import RunFolder, identity_digest
-from fmtorch.runs.feature_cache import CachedFeatures
+from fmtorch.presets.composition import execution_of, plain, read_fields
+from fmtorch.runs import CachedFeatures, RunFolder, identity_digest
 
 SWEPT = "FMTORCH_SWEPT"  # names the file in which the jobs of a sweep note their run folders
 
@@ -100,7 +96,6 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
 def _open_folder(
     config: DictConfig, fields: EvalOptions, pipeline_name: str, pipeline: Pipeline, dataset: PairDataset
 ) -> RunFolder:
-    """The folder of the run with this identity, its `output` if given, new or to be continued."""
     identity = run_identity(config, pipeline_name, pipeline, dataset.digest, fields.cameras, fields.pose.signed)
     name = f"{pipeline_name.replace('/', '-')}-{identity_digest(identity)[:8]}"
     return RunFolder.open(fields.output or Path(f"runs/{dataset.name}/{name}"), identity)
@@ -119,7 +114,6 @@ def _evaluated(
     config: DictConfig, fields: EvalOptions, pipeline: Pipeline, pairs: Sequence[ImagePair], folder: RunFolder,
     journal: MatchStore | None,
 ) -> Iterator[int]:  # fmt: skip
-    """Evaluates pairs into the folder and the journal; yields how many were done since."""
     parallel = len(pairs) >= MIN_PAIRS_FOR_PROCESSES and pipeline.device.type == "cpu"
     execution = execution_of(config, fields.workers, fields.processes).decided(parallel)
     if fields.debug:

@@ -1,7 +1,5 @@
 """Pictures as SVG: recall curves, within a page or of their own, and view graphs."""
 
-from __future__ import annotations
-
 import base64
 import dataclasses
 import html

@@ -1,7 +1,5 @@
 """The four stages in a row: features, matching, pruning, estimation; batching, timing, failures as data."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import threading
@@ -34,8 +32,7 @@ from fmtorch.core.stages import (
     pruned,
 )
 from fmtorch.core.types import Correspondences, Estimate, Features, collate
-from fmtorch.data.images import read_image, to_grey
-from fmtorch.data.pairs import GivenMatches, ImagePair, ImageSource
+from fmtorch.data import GivenMatches, ImagePair, ImageSource, read_image, to_grey
 from fmtorch.geometry.significance import judged
 from fmtorch.jobs.execution import one_thread
 from fmtorch.presets.composition import PIPELINES, build_pruners, compose, plain
@@ -126,7 +123,6 @@ class Outcome:
 
     @property
     def solved(self) -> bool:
-        """Whether there is an F."""
         return self.estimate is not None and bool(self.estimate.ok[0])
 
 
@@ -173,18 +169,11 @@ class Pipeline:
     """
 
     def __init__(
-        self,
-        features: FeatureExtractor,
-        matcher: Matcher,
-        pruners: Mapping[str, Pruner],
-        estimator: Estimator,
-        *,
-        device: torch.device | str = "cpu",
-        memory: int = 64,
-        families: Mapping[str, Mapping[str, Pruner]] | None = None,
-        model: str | None = "fundamental",
+        self, features: FeatureExtractor, matcher: Matcher, pruners: Mapping[str, Pruner], estimator: Estimator, *,
+        device: torch.device | str = "cpu", memory: int = 64,
+        families: Mapping[str, Mapping[str, Pruner]] | None = None, model: str | None = "fundamental",
         debug: bool = False,
-    ) -> None:
+    ) -> None:  # fmt: skip
         if model is not None and (gives := model_of(estimator)) != model:
             hint = ": estimator=homography" if model == "homography" else ""
             raise ValueError(f"the estimator gives {gives} matrices; a pipeline needs {model} matrices here{hint}")
@@ -231,7 +220,6 @@ class Pipeline:
         return self._batched("pruning", self._prune, [self._match(pair) for pair in pairs])
 
     def estimate(self, outcomes: Sequence[Outcome], seed: int = 0) -> list[Outcome]:
-        """The last stage, for outcomes of `correspondences`."""
         return self._batched("estimation", functools.partial(self._estimate, seed=seed), outcomes)
 
     def matched(self, features0: Features, features1: Features) -> Correspondences:
@@ -245,7 +233,6 @@ class Pipeline:
         return judged(expect_finite(output_of(used, used(c, seed), Estimate, c).detach()), c)
 
     def run(self, pairs: Sequence[ImagePair], seed: int = 0) -> list[Outcome]:
-        """Take a batch of pairs through all four stages."""
         return self.estimate(self.correspondences(pairs), seed)
 
     def _batched(
@@ -314,7 +301,6 @@ class Pipeline:
         return Outcome(pair, (count, count), self._with_calibrations(pair, c), None, seconds, images=pyramids)
 
     def _given(self, pair: ImagePair, matches: Callable[[], GivenMatches]) -> Outcome:
-        """The matches that come with a pair, in place of the first two stages."""
         try:
             c, counts = matches()
         except Exception as error:  # a pair that cannot be read becomes a row with this reason
@@ -322,7 +308,6 @@ class Pipeline:
         return Outcome(pair, counts, self._with_calibrations(pair, c.to(self.device)))
 
     def _with_calibrations(self, pair: ImagePair, c: Correspondences) -> Correspondences:
-        """The matches with the pair's key and calibrations."""
         K0, K1 = (
             None if K is None else torch.from_numpy(K).to(self.device, torch.float64)[None] for K in (pair.K0, pair.K1)
         )
@@ -445,15 +430,10 @@ def build_pipeline(
     pruners, for_families = build_pruners(config)
     open_files([extractor, pruners, for_families], torch.device(device))  # a damaged one is no failure of each pair
     return Pipeline(
-        extractor,
-        instantiate(plain(config.matcher), "matcher"),
-        pruners,
-        instantiate(plain(config.estimator), "estimator"),
-        device=device,
-        families=for_families,
-        model=model,
+        extractor, instantiate(plain(config.matcher), "matcher"), pruners,
+        instantiate(plain(config.estimator), "estimator"), device=device, families=for_families, model=model,
         debug=bool(config.get("debug")),
-    )
+    )  # fmt: skip
 
 
 def load_pipeline(

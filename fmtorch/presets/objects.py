@@ -1,7 +1,5 @@
 """From configs to objects: a mapping with a `_target_` becomes what the target makes of its other entries."""
 
-from __future__ import annotations
-
 import importlib
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
@@ -95,7 +93,6 @@ def target_of(config: Mapping[str, Any], where: str) -> Callable[..., Any]:
 
 
 def _located(name: str) -> Any:
-    """What a dotted name names; modules on the way to it are imported."""
     parts = name.split(".")
     value: Any = importlib.import_module(parts[0])
     for i, part in enumerate(parts[1:], start=2):

@@ -1,7 +1,5 @@
 """The code that makes a result: the version of fmtorch, in a checkout its commit, and the sources of a user's parts."""
 
-from __future__ import annotations
-
 import ast
 import contextlib
 import dataclasses
@@ -104,7 +102,6 @@ class _Import(NamedTuple):
 
 @functools.cache  # parts of a pipeline share most of what they import
 def _imports(source: bytes) -> tuple[_Import, ...]:
-    """The import statements of a file, wherever in it; none where it does not compile."""
     try:
         nodes = _statements(ast.parse(source))
     except (SyntaxError, ValueError):

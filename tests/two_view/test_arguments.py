@@ -1,7 +1,5 @@
 """What users hand over: lists of pairs, sizes for all, NumPy everywhere, presets of their own, empty batches."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +8,7 @@ import torch
 
 import fmtorch
 from fmtorch import metrics
-from fmtorch.core.types import Correspondences, Estimate, collate
+from fmtorch.core import Correspondences, Estimate, collate
 from fmtorch.data import ImageSource
 from fmtorch.evaluation.rows import evaluate
 from fmtorch.pipeline.pipeline import load_pipeline
@@ -18,6 +16,7 @@ from tests.commands.test_match import run_python
 from tests.helpers import draw, pair
 from tests.helpers import small_pipeline as pipeline
 from tests.laws import quick, scene, shown
+from tests.reference import known_cameras
 from tests.variants import OTHER_LIBRARIES, built, keywords, variants
 
 EVERY = [n for n in variants("estimator") if not n.startswith(OTHER_LIBRARIES[1:])]
@@ -72,6 +71,58 @@ def test_what_does_not_fit_is_named(x0: object, x1: object, options: dict[str, o
         fmtorch.find_fundamental(x0, x1, **options)  # type: ignore[arg-type]
 
 
+SCENE = known_cameras.scene(7, 200, noise=0.2)
+EASY = {"estimator": "msac", "hypotheses": 300}
+
+
+@pytest.mark.parametrize("kind", [torch.float16, torch.bfloat16, torch.uint8, torch.int16, torch.uint16, torch.int64])
+def test_numbers_of_any_type_are_those_of_float64(kind: torch.dtype) -> None:
+    """Points, priors and calibrations of mixed precision or of whole numbers: what they are, not how they are held."""
+    x0, x1 = ((torch.from_numpy(x) / 3).to(kind) for x in (SCENE.x0, SCENE.x1))
+    K0, K1 = (torch.from_numpy(K).to(torch.float16).to(torch.float64) for K in (known_cameras.K0, known_cameras.K1))
+    prior = torch.from_numpy(np.where(SCENE.right, 0.75, 0.25))
+    wide = (x0.double(), x1.double(), K0, K1)
+    given = fmtorch.find_essential(x0, x1, K0.half(), K1.half(), prior=prior.half(), **EASY)
+    expected = fmtorch.find_essential(*wide, prior=prior, **EASY)
+    assert torch.equal(given.inliers, expected.inliers)
+    torch.testing.assert_close(given.F.double(), expected.F.double(), rtol=0, atol=1e-6)
+    if kind == torch.uint16:
+        assert torch.equal(fmtorch.find_essential(x0.numpy(), x1.numpy(), K0, K1, prior=prior, **EASY).F, expected.F)
+
+
+def test_masked_complex_and_boolean_points_are_refused() -> None:
+    x0, x1 = SCENE.x0, SCENE.x1
+    masked = np.ma.masked_array(x0, mask=np.zeros_like(x0, bool))
+    assert bool(fmtorch.find_fundamental(masked, x1, **EASY).ok)
+    masked[3] = np.ma.masked
+    with pytest.raises(ValueError, match="x0 is a masked array; give its data, and what counts in `mask`"):
+        fmtorch.find_fundamental(masked, x1)
+    with pytest.raises(TypeError, match=r"x1 is a tensor of torch\.complex128; it must hold real numbers"):
+        fmtorch.find_fundamental(x0, torch.from_numpy(x1 + 0j))
+    with pytest.raises(TypeError, match="x0 holds booleans"):
+        fmtorch.find_fundamental(x0 > 0, x1)
+
+
+def test_raw_distances_are_no_ratios() -> None:
+    """They were taken for ratios, and an easy pair had a wrong F or none; a score beyond 1 is refused by its name."""
+    distances = np.where(SCENE.right, 120.0, 310.0)
+    with pytest.raises(
+        ValueError, match=r"^ratio of match 0 of pair 0 is .*within \[0, 1\]\. Of raw distances.*`score`"
+    ):
+        fmtorch.find_fundamental(SCENE.x0, SCENE.x1, ratio=distances)
+    with pytest.raises(ValueError, match=r"^score of match 0 of pair 0 is 310"):
+        fmtorch.find_fundamental(SCENE.x0, SCENE.x1, score=np.flip(np.sort(distances)))
+    assert bool(fmtorch.find_fundamental(SCENE.x0, SCENE.x1, ratio=distances / 310, **EASY).ok)
+
+
+def test_a_list_of_single_points_is_one_pair() -> None:
+    """As `list(points)` of OpenCV's (n, 1, 2) is; the other points may come in another form."""
+    listed = [list(x[:, None]) for x in (SCENE.x0, SCENE.x1)]
+    expected = fmtorch.find_fundamental(SCENE.x0, SCENE.x1, **EASY)
+    for x0, x1 in (listed, (SCENE.x0, listed[1]), (listed[0], [torch.from_numpy(x) for x in listed[1]])):
+        assert torch.equal(fmtorch.find_fundamental(x0, x1, **EASY).F, expected.F)
+
+
 # Wrong types are tried in a process of their own: the tests' import hook would refuse them before we do.
 WRONG_TYPES = """
 import numpy as np, torch, fmtorch
@@ -110,13 +161,6 @@ TypeError: pipeline is a NoneType; it must be the name of a preset or a Pipeline
 def test_wrong_types_are_named(tmp_path: Path) -> None:
     done = run_python("-c", WRONG_TYPES, cwd=tmp_path)
     assert done.stdout == TOLD, done.stderr
-
-
-def test_numbers_of_numpy_are_options() -> None:
-    x0, x1 = PAIRS[0].x0[0], PAIRS[0].x1[0]
-    plain = fmtorch.find_fundamental(x0, x1, estimator="msac", threshold=0.5, hypotheses=100)
-    numpy = fmtorch.find_fundamental(x0, x1, estimator="msac", threshold=np.float32(0.5), hypotheses=np.int64(100))
-    assert torch.equal(plain.F, numpy.F)
 
 
 def test_presets_of_ones_own(tmp_path: Path) -> None:
