@@ -40,12 +40,9 @@ class HPatchesPairs(PairDataset):
     model = "homography"
 
     def __init__(
-        self,
-        root: str | Path | None = None,
-        sequences: Sequence[str] | None = None,
-        large: bool = False,
+        self, root: str | Path | None = None, sequences: Sequence[str] | None = None, large: bool = False,
         short_side: Annotated[int, Within(1)] | None = 480,
-    ) -> None:
+    ) -> None:  # fmt: skip
         home = given_root(root, "hpatches", "the folder of the sequences, i_* and v_*")
         there = sorted(folder.name for kind in FAMILIES for folder in home.glob(f"{kind}_*") if folder.is_dir())
         if not there:

@@ -230,12 +230,9 @@ class PairList(PairDataset):
     name = "pair_list"
 
     def __init__(
-        self,
-        root: str | Path | None = None,
-        file: str | Path | None = None,
-        resize: int | Sequence[int] | None = None,
-        origin: float | None = None,
-    ) -> None:
+        self, root: str | Path | None = None, file: str | Path | None = None,
+        resize: int | Sequence[int] | None = None, origin: float | None = None,
+    ) -> None:  # fmt: skip
         home = given_root(root, "pair_list", "the folder of the images of dataset.file, the list")
         if file is None:
             raise DataError("pair_list needs file: dataset.file=FILE, the list of pairs, .txt or .npz")

@@ -9,10 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from fmtorch.data.files import DataError, given_root
-from fmtorch.data.fmbench import FMBenchPairs
-from fmtorch.data.images import stored_size
-from fmtorch.data.pairs import GivenMatches, ImagePair, ImageSource, PairDataset
+from fmtorch.data import DataError, FMBenchPairs, GivenMatches, ImagePair, ImageSource, PairDataset, stored_size
+from fmtorch.data.files import given_root
 from fmtorch.io import h5, predictions
 from fmtorch.io.predictions import Array, Size
 
@@ -258,13 +256,9 @@ class OANetMatches:
             ratios, mutuals = (self._side(file, name, len(rays)) for name in ("ratios", "mutuals"))
         x0, x1 = (x * K.diagonal()[:2] + K[:2, 2] for x, K in zip((rays[:, :2], rays[:, 2:]), self.K, strict=True))
         return predictions.given(
-            x0,
-            x1,
-            self.sizes,
-            (len(rays), len(rays)),
-            ratio=ratios,
+            x0, x1, self.sizes, (len(rays), len(rays)), ratio=ratios,
             mutual=None if mutuals is None else mutuals.astype(bool),
-        )
+        )  # fmt: skip
 
     def _side(self, file: Any, name: str, count: int) -> Array | None:
         if not h5.holds(file, name):
@@ -339,15 +333,10 @@ class H5Pairs(PairDataset):
     name = "h5"
 
     def __init__(
-        self,
-        root: str | Path | None = None,
-        layout: str = "hloc",
-        truth: str | Path | None = None,
-        images: str | Path | None = None,
-        features: str | None = None,
-        matches: str | None = None,
+        self, root: str | Path | None = None, layout: str = "hloc", truth: str | Path | None = None,
+        images: str | Path | None = None, features: str | None = None, matches: str | None = None,
         origin: float | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         if layout not in LAYOUTS:
             raise DataError(f"no layout {layout!r}; it must be one of {', '.join(LAYOUTS)}")
         folder = given_root(root, "h5", "the file, or the folder of the files, that hold the matches")

@@ -299,13 +299,9 @@ def _lines(place: Place, matrices: Sequence[Points], points: Points) -> list[lis
 
 
 def _lines_and_points(
-    canvas: Image,
-    place: Place,
-    lines: Sequence[Sequence[NDArray[np.float64]]],
-    points: Points,
-    colour: int,
+    canvas: Image, place: Place, lines: Sequence[Sequence[NDArray[np.float64]]], points: Points, colour: int,
     line_colour: int | None = None,
-) -> None:
+) -> None:  # fmt: skip
     """Draw in one image lines and, dashed and white, true lines if `lines` has them; then points on top.
 
     colour, line_colour: the colours' numbers of the first point and, if it is another, the first line.

@@ -15,8 +15,7 @@ from fmtorch.core.grey_pyramid import GreyPyramid, grey_pyramid
 from fmtorch.core.no_features import NoFeatures
 from fmtorch.core.stages import ImageMatcher, PairImages, output_of, pruned
 from fmtorch.core.types import Correspondences, Features
-from fmtorch.data.cameras import Lens
-from fmtorch.data.images import to_grey
+from fmtorch.data import Lens, to_grey
 from fmtorch.jobs.execution import mapped, one_thread
 from fmtorch.pipeline import photographs
 from fmtorch.pipeline.match_result import Lenses, MatchResult

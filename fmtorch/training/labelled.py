@@ -150,14 +150,9 @@ def depths(dataset: DepthDataset, image: ImageSource, x: Points) -> NDArray[np.f
 
 
 def transfer_error(
-    x: Points,
-    depth: NDArray[np.float64],
-    partner: Points,
-    K: NDArray[np.float64],
-    K_other: NDArray[np.float64],
-    R: NDArray[np.float64],
-    t: NDArray[np.float64],
-) -> NDArray[np.float64]:
+    x: Points, depth: NDArray[np.float64], partner: Points, K: NDArray[np.float64], K_other: NDArray[np.float64],
+    R: NDArray[np.float64], t: NDArray[np.float64],
+) -> NDArray[np.float64]:  # fmt: skip
     """How far (n,), in pixels, points are carried past their partners in the other image, at the kindest of k depths.
 
     Args:

@@ -332,15 +332,9 @@ class SimilarLengthBatches(Sampler[list[Draw]]):
     """
 
     def __init__(
-        self,
-        dataset: Lengths,
-        batch: int = 32,
-        *,
-        seed: int = 0,
-        matches: Sequence[int] | None = (50, 4000),
-        rank: int = 0,
-        world_size: int = 1,
-    ) -> None:
+        self, dataset: Lengths, batch: int = 32, *, seed: int = 0, matches: Sequence[int] | None = (50, 4000),
+        rank: int = 0, world_size: int = 1,
+    ) -> None:  # fmt: skip
         if batch < 1:
             raise ValueError(f"batch is {batch}; it must be at least 1")
         if not 0 <= rank < world_size:

@@ -14,6 +14,7 @@ from fmtorch.jobs.execution import one_thread
 from fmtorch.two_view.arguments import Arrays, Focal, correspondences
 from fmtorch.two_view.estimation import estimated
 from fmtorch.two_view.pair_type import with_pair_type
+from fmtorch.two_view.planes import homographies
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -236,14 +237,17 @@ def find_homography(
     """Robustly estimate homographies from matched points, ``x1 ~ H x0``: of a plane, or of a camera that turns.
 
     Args:
-        x0, x1: matched points in pixels, as of `find_fundamental`. Gradients reach them through the final fit.
+        x0, x1: matched points in pixels, as of `find_fundamental`. x0 may be in the unit of a plane with y up or down:
+            where its extent is another one, it is scaled to that of x1, in whose pixels thresholds are. Gradients reach
+            the points through the final fit.
         estimator: a preset of conf/estimator whose solver is `four_point`.
         mask, ratio, score, prior, lafs0, lafs1, noise, key, seed, config_dir: as of `find_fundamental`.
         options: replace values of the preset (``inlier_threshold=1.5``).
 
     Returns:
         An `Estimate` whose `H` (B, 3, 3) has unit Frobenius norm and maps points that are seen to positive third
-        coordinates; inliers, ok, reason. Its significance is NaN where `ok`: that is a test of fundamental matrices.
+        coordinates; inliers, ok, reason, significance. Mirrored planes and photographs have theirs, too. Where as many
+        inliers are to be expected by chance, `ok` is False.
 
     Raises:
         ValueError, TypeError: as `find_fundamental`.
@@ -259,6 +263,7 @@ def find_homography(
         (True, 40, (1, 3, 3))
     """
     c = correspondences(
-        x0, x1, mask=mask, ratio=ratio, score=score, prior=prior, lafs0=lafs0, lafs1=lafs1, noise=noise, key=key
-    )
-    return estimated(c, "homography", estimator, config_dir, seed, options)
+        x0, x1, plane=True, mask=mask, ratio=ratio, score=score, prior=prior, lafs0=lafs0, lafs1=lafs1, noise=noise,
+        key=key,
+    )  # fmt: skip
+    return homographies(c, lambda c: estimated(c, "homography", estimator, config_dir, seed, options))

@@ -1,7 +1,5 @@
 """What users hand over: lists of pairs, sizes for all, NumPy everywhere, presets of their own, empty batches."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +8,7 @@ import torch
 
 import fmtorch
 from fmtorch import metrics
-from fmtorch.core.types import Correspondences, Estimate, collate
+from fmtorch.core import Correspondences, Estimate, collate
 from fmtorch.data import ImageSource
 from fmtorch.evaluation.rows import evaluate
 from fmtorch.pipeline.pipeline import load_pipeline
@@ -163,13 +161,6 @@ TypeError: pipeline is a NoneType; it must be the name of a preset or a Pipeline
 def test_wrong_types_are_named(tmp_path: Path) -> None:
     done = run_python("-c", WRONG_TYPES, cwd=tmp_path)
     assert done.stdout == TOLD, done.stderr
-
-
-def test_numbers_of_numpy_are_options() -> None:
-    x0, x1 = PAIRS[0].x0[0], PAIRS[0].x1[0]
-    plain = fmtorch.find_fundamental(x0, x1, estimator="msac", threshold=0.5, hypotheses=100)
-    numpy = fmtorch.find_fundamental(x0, x1, estimator="msac", threshold=np.float32(0.5), hypotheses=np.int64(100))
-    assert torch.equal(plain.F, numpy.F)
 
 
 def test_presets_of_ones_own(tmp_path: Path) -> None:

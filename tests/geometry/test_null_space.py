@@ -1,7 +1,5 @@
 """The null space of wide matrices, by the kernels' function interpreted."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.linalg import null_space as scipy_null_space

@@ -1,19 +1,16 @@
 """Which matches a pool is refined on, and its models afterwards."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
-from fmtorch.estimators import Ransac
-from fmtorch.estimators.models.fundamental import SevenPoint
-from fmtorch.estimators.options import Refine
-from fmtorch.estimators.pair import Pair
-from fmtorch.estimators.refinement import Refinement
+from fmtorch.estimators import Msac, Pair, Ransac, Refine, SevenPoint
+from fmtorch.estimators.refinement import Candidates, Refinement
 from fmtorch.estimators.search import Pool
+from fmtorch.estimators.selection import BestOfSearch, BestScore, scores_of
 from fmtorch.jit.random import Stream
-from tests.estimators.pairs import FEW, SCALES, models, named
+from tests.estimators.pairs import FEW, SCALES, models, named, pair_of
 from tests.estimators.residuals import residuals
+from tests.laws import scene
 from tests.reference import refine as reference
 from tests.reference.random import number
 from tests.reference.sampling import shuffled
@@ -76,3 +73,18 @@ def test_local_optimisation_comes_first() -> None:
     np.testing.assert_array_equal(refined.F, F.astype(np.float32).astype(np.float64) + 1)
     plain = Refinement(None)(Pool.empty(3), pair, SevenPoint())
     assert plain.valid.tolist() == [False]
+
+
+def test_the_first_of_the_pool_or_the_best_score_of_what_is_valid() -> None:
+    pair = pair_of(scene(1, 100))
+    F = np.random.default_rng(0).normal(size=(6, 9))
+    scores = scores_of(Msac(50.0), F, pair)
+    best = int(np.argmax(scores))
+    assert best > 0
+    everything = Candidates(F, np.ones(6, np.bool_), pair)
+    np.testing.assert_array_equal(BestOfSearch()(everything, pair).F, F[0])
+    np.testing.assert_array_equal(BestScore(Msac(50.0))(everything, pair).F, F[best])
+    valid = np.arange(6) != best
+    second = int(np.argmax(np.where(valid, scores, -np.inf)))
+    np.testing.assert_array_equal(BestScore(Msac(50.0))(Candidates(F, valid, pair), pair).F, F[second])
+    assert not BestScore(Msac(50.0))(Candidates(F, np.zeros(6, np.bool_), pair), pair).valid

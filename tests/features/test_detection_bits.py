@@ -1,7 +1,5 @@
 """The detector's and the orientation's arithmetic, written for speed: bit for bit that of the plain formulas."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
