@@ -243,10 +243,8 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
         image0, image1, pipeline=pipeline, longest_side=fields.longest_side, seed=fields.seed, **given.knowledge
     )
     error = None if truth is None or not result.ok else _nsgd(result, truth)
-    written = result.save(
-        folder, truth=truth, version=__version__, **settings, image0=str(paths[0]), image1=str(paths[1]),
-        **({} if error is None else {"nsgd": error}),
-    )  # fmt: skip
+    report = {"version": __version__, **settings, "image0": str(paths[0]), "image1": str(paths[1])}
+    written = result.save(folder, truth=truth, report=report | ({} if error is None else {"nsgd": error}))
     heading = f"{' '.join([pipeline_name, *overrides])}: {paths[0].name}, {paths[1].name}"
     console.print(heading, style="italic", markup=False, highlight=False)
     extractor = pipeline.extractor

@@ -6,6 +6,7 @@ import dataclasses
 import html
 import json
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -107,7 +108,9 @@ class MatchResult:
             names = ("inliers of F", "others, dropped by pruning or estimation")
         return draw_matches(*self._images(), self.putative.x0[0], self.putative.x1[0], good, names=names)
 
-    def save(self, folder: Path | str, *, truth: Arrays | None = None, **report: Any) -> list[str]:
+    def save(
+        self, folder: Path | str, *, truth: Arrays | None = None, report: Mapping[str, Any] | None = None
+    ) -> list[str]:
         """Write `result.json` and the pictures into a folder, as `fmtorch match` does.
 
         Args:
@@ -126,7 +129,7 @@ class MatchResult:
         if self.ok or truth is not None:
             names.append("epipolar")
         with replacing(folder / "result.json") as path:
-            path.write_text(json.dumps(report | self.report()) + "\n")
+            path.write_text(json.dumps({**(report or {}), **self.report()}) + "\n")
         for name in get_args(Picture):
             path = folder / f"{name}.png"
             if name not in names:  # of an earlier run

@@ -101,7 +101,7 @@ def test_dictionaries_of_kornia(points: tuple[Tensor, Tensor]) -> None:
 def test_a_geometry_of_colmap_and_back(points: tuple[Tensor, Tensor], pose: fmtorch.PoseEstimate) -> None:
     geometry = fmtorch.to_colmap(pose)
     assert geometry.config == pycolmap.TwoViewGeometryConfiguration.CALIBRATED
-    shifted = sampson(torch.from_numpy(geometry.F)[None], points[0] + 0.5, points[1] + 0.5)
+    shifted = sampson(torch.tensor(geometry.F)[None], points[0] + 0.5, points[1] + 0.5)
     torch.testing.assert_close(shifted, sampson(pose.F, *points), atol=1e-4, rtol=1e-4)
     again = fmtorch.from_colmap(geometry, len(points[0]))
     torch.testing.assert_close(sampson(again.F, *points), sampson(pose.F, *points), atol=1e-4, rtol=1e-4)

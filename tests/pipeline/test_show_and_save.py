@@ -37,7 +37,7 @@ def test_a_result_draws_itself(result: fmtorch.MatchResult) -> None:
 
 
 def test_a_result_is_saved_as_the_command_saves_it(result: fmtorch.MatchResult, tmp_path: Path) -> None:
-    names = result.save(tmp_path / "out", note="mine")
+    names = result.save(tmp_path / "out", report={"note": "mine"})
     assert sorted(names) == sorted(path.name for path in (tmp_path / "out").iterdir())
     stored = json.loads((tmp_path / "out" / "result.json").read_text())
     assert np.array_equal(stored["F"], result.F)
