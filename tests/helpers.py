@@ -73,6 +73,12 @@ def apart(F: np.ndarray, G: np.ndarray) -> float:
     return float(min(np.abs(F - G).max(), np.abs(F + G).max()))
 
 
+def cross_matrix(t: np.ndarray) -> np.ndarray:
+    """[t]x, whose product with x is t x x."""
+    x, y, z = t
+    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+
+
 def edit_lines(path: Path, change: Callable[[list[str]], list[str]]) -> None:
     """Change the lines of a text file."""
     path.write_text("\n".join(change(path.read_text().splitlines())) + "\n")

@@ -16,7 +16,7 @@ from fmtorch.commands.config import hydra_arguments
 from fmtorch.commands.options import COMMANDS
 from fmtorch.presets import available
 from tests.conftest import own_cache
-from tests.helpers import draw
+from tests.helpers import draw, draw_set
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 
@@ -86,16 +86,12 @@ COUNT = "it must be a whole number of at least 1"
     ("words", "message"),
     [
         ("eval limit=-3", f"limit=-3; {COUNT} or null"),
-        ("eval limit=0", f"limit=0; {COUNT} or null"),
-        ("eval limit=three", f"limit=three; {COUNT} or null"),
         ("eval limit=2.5", f"limit=2.5; {COUNT} or null"),
         ("eval batch=0", f"batch=0; {COUNT}"),
-        ("eval batch=true", f"batch=true; {COUNT}"),
         ("eval workers=-2", f"workers=-2; {COUNT} or null"),
         ("eval executor=mpi", "no preset 'mpi' in executor; there are: "),
         ("eval executor=dask processes=true", "processes=true and executor=dask differ; give one of them"),
         ("eval executor.workers=2 workers=3", "workers=3 and executor.workers=2 differ; give one of them"),
-        ("eval executor=dask executor.workers=0", f"executor.workers=0; {COUNT} or null"),
         ("eval shard=0/2", "shard=0/2; it must be i/n with i from 1 to n: shard=2/8"),
         ("eval processes=maybe", "processes=maybe; it must be true or false or null"),
         ("eval device=gpu", "device=gpu; it must be text that names a device: auto, cpu, cuda, cuda:1 or mps"),
@@ -103,12 +99,8 @@ COUNT = "it must be a whole number of at least 1"
         ("eval cache_limit=-1", "cache_limit=-1; it must be a number of at least 0 or null"),
         ("eval pruner.ratio.threshold=high", "pruner.ratio.threshold=high; it must be a number"),
         ("eval estimator.hypotheses=1.5", "estimator.hypotheses=1.5; it must be a whole number"),
-        (
-            "eval estimator=cf_ransac estimator.fine.hypotheses=many",
-            "estimator.fine.hypotheses=many; it must be",
-        ),
+        ("eval estimator=cf_ransac estimator.fine.hypotheses=many", "estimator.fine.hypotheses=many; it must be"),
         ("eval +estimator.treshold=2", "estimator: no option treshold; there are: threshold"),
-        ("eval dataset.seed=x", "dataset.seed=x; it must be a whole number"),
         ("eval dataset.families=indoor", "dataset.families=indoor; it must be a list"),
         ("eval +dataset.sise=full", "dataset: no option sise; there are: size"),
         ("eval estimator._target_=fmtorch.estimators.Magic", "estimator: _target_=fmtorch.estimators.Magic cannot be"),
@@ -122,11 +114,9 @@ COUNT = "it must be a whole number of at least 1"
         ("eval limit=(1", "limit=(1 cannot be read; a value with special characters stands in quotes"),
         ("eval sift_gms", "sift_gms is not of the form NAME=VALUE"),
         ("match longest_side=big", f"longest_side=big; {COUNT}"),
-        ("match longest_side=0", f"longest_side=0; {COUNT}"),
         ("match orient=up", "orient=up; it must be true or false"),
         ("match a.png", "image1 is missing; give two image files: fmtorch match a.jpg b.jpg"),
         ("match a.png b.png c.png", "c.png: only image0, image1 may stand without NAME="),
-        ("match a.png b.png truth=F.txt", "F.txt: No such file or directory"),
         ("report pictures=-1", "pictures=-1; it must be a whole number of at least 0"),
         ("report nowhere", "nowhere holds no run"),
         ("verify", "database is missing; give the database of a COLMAP project: fmtorch verify database.db"),
@@ -134,11 +124,8 @@ COUNT = "it must be a whole number of at least 1"
         ("verify no.db cameras=known", "cameras=known; it must be"),
         ("verify no.db force=2", "force=2; it must be true or false"),
         ("verify no.db more.db", "more.db: only database may stand without NAME="),
-        ("verify no.db estimator.hypotheses=few", "estimator.hypotheses=few; it must be a whole number"),
         ("train batch=0", f"batch=0; {COUNT}"),
-        ("train limit=three", f"limit=three; {COUNT} or null"),
         ("train optimisation.steps=some", "optimisation.steps=some; it must be a whole number"),
-        ("train validation.every=0", f"validation.every=0; {COUNT}"),
         ("train trainer.devices={}", "trainer.devices={}; it must be"),
         ("train augmentation.crop=often", "augmentation.crop=often; it must be a number"),
     ],
@@ -199,13 +186,7 @@ SMALL = ["dataset=fmbench", "dataset.root=Set", "features.max_features=300", "es
 @pytest.fixture
 def data_set(tmp_path: Path) -> Path:
     """A folder with a data set of one pair, ``Set``."""
-    images = tmp_path / "Set" / "scene" / "Images"
-    images.mkdir(parents=True)
-    for i in range(2):
-        draw(images / f"{i:08d}.png", seed=0, shift=9 * i)
-    (tmp_path / "Set" / "pairs_with_gt.txt").write_text("0 1 0 0 0 0 0 -1 0 1 0\n")
-    (tmp_path / "Set" / "pairs_which_dataset.txt").write_text("scene/\n")
-    return tmp_path
+    return draw_set(tmp_path / "Set", images=2).parent
 
 
 def test_a_sweep_runs_all_jobs_and_tells_the_first_mistake(

@@ -14,10 +14,10 @@ from fmtorch.core.types import Correspondences, Estimate, collate
 from fmtorch.data import ImageSource
 from fmtorch.evaluation.rows import evaluate
 from fmtorch.pipeline.build import load_pipeline
-from tests.commands.test_match import run_python
 from tests.helpers import draw, pair
 from tests.helpers import small_pipeline as pipeline
 from tests.laws import quick, scene, shown
+from tests.processes import run_command
 from tests.variants import OTHER_LIBRARIES, built, keywords, variants
 
 EVERY = [n for n in variants("estimator") if not n.startswith(OTHER_LIBRARIES[1:])]
@@ -108,7 +108,7 @@ TypeError: pipeline is a NoneType; it must be the name of a preset or a Pipeline
 
 
 def test_wrong_types_are_named(tmp_path: Path) -> None:
-    done = run_python("-c", WRONG_TYPES, cwd=tmp_path)
+    done = run_command("-c", WRONG_TYPES, cwd=tmp_path)
     assert done.stdout == TOLD, done.stderr
 
 

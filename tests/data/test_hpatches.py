@@ -48,15 +48,6 @@ def test_large_images_are_left_out_unless_asked_for(tmp_path: Path) -> None:
     assert {pair.scene for pair in load("hpatches", root=tmp_path, sequences=["v_talent"])} == {"v_talent"}
 
 
-def test_other_formats_and_digests(tmp_path: Path) -> None:
-    planes.write_sequence(tmp_path / "v_view", "0000.jpg", light=False, suffix=".png")
-    stored, small = (load("hpatches", root=tmp_path, short_side=side) for side in (None, 100))
-    assert stored[0].problem is None
-    assert stored.digest != small.digest
-    (tmp_path / "v_view/H_1_3").write_text("1 0 0\n0 1 0\n0 0 1\n")
-    assert load("hpatches", root=tmp_path, short_side=100).digest != small.digest
-
-
 @pytest.mark.parametrize(
     ("damage", "problem"),
     [

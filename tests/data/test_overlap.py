@@ -29,7 +29,7 @@ from fmtorch.data.scenes import ScenePairs, incidence
 from fmtorch.scenes import Plan, RenderedPairs
 from fmtorch.scenes.dataset import RenderedScenePairs
 from tests.conftest import shared_path
-from tests.data.native import write_bundler, write_colmap, write_kitti
+from tests.data.native import write_colmap, write_kitti
 from tests.reference import overlap as reference
 
 PLAN = Plan(scenes=1, shots=4, pairs=4, scale=0.15)
@@ -37,9 +37,9 @@ PLAN = Plan(scenes=1, shots=4, pairs=4, scale=0.15)
 
 @pytest.fixture(scope="module")
 def rendered(tmp_path_factory: pytest.TempPathFactory) -> RenderedScenePairs:
-    """All pairs of four photographs each of three families; cameras of the collection have other sizes."""
+    """All pairs of four photographs each of two families; cameras of the collection have other sizes."""
     root = tmp_path_factory.mktemp("rendered")
-    families = ["indoor", "orbit", "collection"]
+    families = ["indoor", "collection"]
     return RenderedPairs(families=families, root=root, plan=PLAN, workers=1).scene_pairs()
 
 
@@ -73,20 +73,10 @@ def test_overlap_of_rendered_pairs_is_that_counted_pixel_by_pixel(rendered: Rend
     overlaps = overlap_of(rendered)
     assert isinstance(overlaps, DepthOverlap)
     places = [rendered.candidate(rank) for rank in range(rendered.candidates)]
-    assert len(places) == 3 * 6
+    assert len(places) == 2 * 6
     shares = [overlaps.of(place) for place in places]
     assert shares == [one_by_one(rendered, *place) for place in places]
     assert min(shares) < 0.4 < 0.6 < max(shares)
-
-
-def test_a_grid_of_pixels_stands_for_all_of_them(rendered: RenderedScenePairs) -> None:
-    scene, i, j = rendered.candidate(0)
-    overlaps = DepthOverlap(rendered)
-    a, b = (overlaps._seen(rendered.scenes[scene].views[k]) for k in (i, j))
-    pair = rendered[0]
-    # A share of n pixels has a standard error of at most 0.5 / sqrt(n) where they are drawn; a grid's is smaller.
-    error = 0.5 / np.sqrt(a.size[0] * a.size[1] / STEP**2)
-    assert abs(seen_share(a, b, pair.R, pair.t) - seen_share(a, b, pair.R, pair.t, step=1)) < 2 * error
 
 
 @pytest.mark.parametrize(
@@ -137,16 +127,6 @@ def test_overlap_by_the_points_of_a_real_model() -> None:
         assert overlaps.of((scene, i, j)) == pytest.approx(
             reference.by_points(seen[views[i]], seen[views[j]]), abs=1e-15
         )
-
-
-def test_a_bundler_file_knows_the_points_of_registered_cameras(tmp_path: Path) -> None:
-    """Cameras 0, 1, 2 see 12, 9 and 6 points, of which they share those of the later one; camera 4 sees none."""
-    folder, _ = write_bundler(tmp_path / "Set/a")
-    dataset = load("bundler", root=folder, pairs=None)
-    assert isinstance(dataset, ScenePairs)
-    overlaps = overlap_of(dataset)
-    shares = {(i, j): overlaps.of((0, i, j)) for i, j in itertools.combinations(range(4), 2)}
-    assert shares == {(0, 1): 9 / 12, (0, 2): 6 / 12, (1, 2): 6 / 9, (0, 3): 0, (1, 3): 0, (2, 3): 0}
 
 
 def run(folder: Path, monkeypatch: pytest.MonkeyPatch, *words: str) -> None:

@@ -68,12 +68,6 @@ def test_poses_are_interpolated_to_the_time_of_the_frame(tmp_path: Path) -> None
     assert abs(x1 @ pair.F @ x0) / np.linalg.norm(x0) / np.linalg.norm(x1) < 1e-12
 
 
-def test_frames_are_paired_with_those_of_the_following_second(tmp_path: Path) -> None:
-    write_tum(tmp_path)
-    pairs = [p.identity.rpartition("/")[2] for p in load("tum", root=tmp_path, sequences=[NAME], pairs=None)]
-    assert pairs == [f"{i}-{j}" for i in range(12) for j in range(i + 1, 12) if j - i <= 10]
-
-
 def test_the_camera_is_told_by_the_name(tmp_path: Path) -> None:
     for name in ("rgbd_dataset_freiburg2_x", "rgbd_dataset_freiburg3_y", "mine"):
         write_tum(tmp_path, name, frames=2)
@@ -198,16 +192,6 @@ def test_damaged_files_are_named_with_their_lines(damage: str, tmp_path: Path) -
     with pytest.raises(DataError, match=message) as raised:
         load("tum", root=tmp_path, sequences=[NAME])
     assert "\n" not in str(raised.value)
-
-
-def test_a_missing_image_is_a_problem_of_its_pairs_alone(tmp_path: Path) -> None:
-    folder = write_tum(tmp_path)
-    gone = sorted((folder / "rgb").iterdir())[2]
-    gone.unlink()
-    dataset = load("tum", root=tmp_path, sequences=[NAME], pairs=None)
-    problems = {p.identity.rpartition("/")[2]: p.problem for p in dataset}
-    assert problems["0-1"] is None
-    assert str(problems["1-2"]).endswith(f"rgb.txt, line 4: no image {gone}")
 
 
 def test_a_repeated_pose_counts_once(tmp_path: Path) -> None:

@@ -62,7 +62,7 @@ def test_depth_is_the_reference_ray_casters() -> None:
     surfaces = scene.surfaces[shot.light]
     assert all(texture.opaque for texture in surfaces.textures)
     h, w = shot.camera.size
-    points = np.random.default_rng(0).uniform(-0.5, [w - 0.5, h - 0.5], (60, 2))
+    points = np.random.default_rng(0).uniform(-0.5, [w - 0.5, h - 0.5], (25, 2))
     computed = depth_at(task, 0, points)
     direct = []
     for (x, y), depth in zip(points, computed, strict=True):

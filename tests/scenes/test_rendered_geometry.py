@@ -172,13 +172,6 @@ def test_textures_keep_their_mean_when_they_shrink_and_do_not_alias() -> None:
     assert far.std() < 0.01
 
 
-def test_textures_repeat() -> None:
-    texture = Texture(smooth_texture())
-    u, v = np.random.default_rng(0).random((2, 100)).astype(np.float32)
-    lod = np.full(100, 1.3, np.float32)
-    np.testing.assert_allclose(colour(texture, u, v, lod), colour(texture, u + 3, v - 2, lod), atol=2e-3)
-
-
 def test_transfer_curve_and_its_inverse() -> None:
     np.testing.assert_allclose(to_srgb(TO_LINEAR) * 255, np.arange(256), atol=1e-3)
 

@@ -62,7 +62,7 @@ def view(stage: Stage, camera: Camera) -> tuple[np.ndarray, ...]:
 
 @pytest.mark.parametrize("family", FAMILIES)
 def test_forms_draw_the_same_scenes(family: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    scene = build(Task(family, "train", 1, 5, Plan(1, 3, 2, 0.3)))
+    scene = build(Task(family, "train", 1, 5, Plan(1, 3, 2, 0.15)))
     shots = [scene.shots[0], scene.shots[-1]]
     for light in {shot.light for shot in shots}:
         pair = stages(scene.surfaces[light], scene.lights[light], scene.sky, monkeypatch)
@@ -89,13 +89,13 @@ def random_world(rng: np.random.Generator) -> Surfaces:
     return surfaces
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_forms_draw_the_same_random_worlds(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(seed)
     sky = rng.integers(0, 256, (16, 32, 3), dtype=np.uint8)
     light = Light((0.3, -0.5, 0.8), through_walls=bool(seed % 2))
     pair = stages(random_world(rng), light, sky, monkeypatch)
-    for _ in range(4):
+    for _ in range(3):
         eye, target = rng.normal(0, 3, (2, 3))
         assert_equal_views(pair, look_at(calibration(80.0, SIZE), SIZE, eye.tolist(), target.tolist()), monkeypatch)
 

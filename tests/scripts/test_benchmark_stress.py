@@ -10,9 +10,9 @@ import torch
 from fmtorch.core.types import Correspondences
 from fmtorch.data import ImagePair
 from fmtorch.geometry import fundamental_from_calibration
-from scripts.benchmark import stress, stress_changes
+from scripts.benchmark import stress_changes
 from scripts.benchmark.stress_changes import CONDITIONED, COUNTS, INLIER_RATIOS, RIGHT_PX, SWEEPS, ZOOM, Case
-from tests.scripts.samples import drawn_set, pair, read, row, run
+from tests.scripts.samples import drawn_set, pair, read, run
 
 FOCAL, SIZE = 900.0, (600, 800)  # px, (h, w)
 CONDITIONS = SWEEPS[CONDITIONED]
@@ -92,21 +92,6 @@ def test_sweeps_vary_one_quantity() -> None:
     assert stress_changes.match_count(base, COUNTS[-1]) is None
     still, moved = (stress_changes.noise(base, sigma) for sigma in (0.0, 2.0))
     assert (moved.c.x0 - still.c.x0).std().item() == pytest.approx(2.0, rel=0.1)
-
-
-def test_tables_are_of_pairs_that_all_estimators_have_and_tell_planes_from_rotations() -> None:
-    facts = {"sweep": CONDITIONED, "level": "as they are", "side": 800.0, "matches": 9}
-    kinds = {"a": (0.9, 99.0), "b": (0.9, 1.0), "c": (0.1, 1.0)}
-    rows = [row(m, f"Strecha/{name}/0", plane=plane, parallax=moved, **facts)
-            for m in ("x:threshold=1@gms", "y@sizeless") for name, (plane, moved) in kinds.items()
-            if (m, name) != ("y@sizeless", "c")]  # fmt: skip
-    lines = stress.accuracy_sheet(rows).records
-    assert [(line["level"], line["estimator"], line["pairs"]) for line in lines] == [
-        (level, estimator, count) for level, count in (("as they are", 2), *((name, 1) for name in stress.NATURAL))
-        for estimator in ("x", "y, no sizes")
-    ]  # fmt: skip
-    assert {line["set"] for line in lines} == {"real, wide"}
-    assert stress.time_sheet(rows).records[0]["matches"] == "9"
 
 
 def test_the_command_goes_on_and_draws(

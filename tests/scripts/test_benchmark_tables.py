@@ -9,7 +9,7 @@ import pytest
 
 from fmtorch import presets
 from fmtorch.evaluation.statistics import bootstrap_mean, share_difference
-from scripts.benchmark import estimators, figures
+from scripts.benchmark import estimators
 from scripts.benchmark.estimators import Curve
 from scripts.benchmark.methods import options, read_specs, split, stages_of
 from scripts.benchmark.tables import BASELINES, Results, Sheet, Span, show
@@ -71,14 +71,6 @@ def test_figures_that_are_not_defined_do_not_count() -> None:
     assert own.cell("a", ["orbit/s/0"], "failed") == "0.5"
 
 
-def test_groups_are_sets_baselines_and_all() -> None:
-    own = results(families=("driving", "orbit", "KITTI"), pairs=2)
-    groups = own.groups(own.pairs())
-    assert list(groups) == ["orbit", "KITTI", "driving", *BASELINES, "all"]
-    assert [len(members) for members in groups.values()] == [2, 2, 2, 2, 4, 6]
-    assert list(results().groups(results().pairs())) == ["orbit"]
-
-
 def test_a_table_is_markdown_here_and_one_value_a_cell_in_its_file(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -126,10 +118,3 @@ def test_the_knee_is_the_cheapest_point_near_the_best(tmp_path: Path) -> None:
     estimators.draw_curves([curve], own, knees, tmp_path / "curves.svg")
     texts = [element.text for element in ElementTree.parse(tmp_path / "curves.svg").iter() if element.text]
     assert {"<mine>", *BASELINES, "AUC@0.05 [%]"} <= set(texts)
-
-
-def test_a_figure_is_drawn_the_same_every_time(tmp_path: Path) -> None:
-    panels = {"one": {"a": figures.Line([0.1, 50], [1, 2], 1)}, "two": {"b": figures.Line([1, 2], [2, 1])}}
-    for name in ("a.svg", "b.svg"):
-        figures.draw(tmp_path / name, panels, "x", "y", shares=True)
-    assert (tmp_path / "a.svg").read_text() == (tmp_path / "b.svg").read_text()

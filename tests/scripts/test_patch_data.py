@@ -1,11 +1,9 @@
 """Training patches: warps, keypoints, rendered scenes and planes, and the correspondences that they give."""
 
 import json
-import math
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 import torch
@@ -14,23 +12,18 @@ from PIL import Image
 from fmtorch.scenes.camera import Camera, calibration, fundamental, look_at
 from fmtorch.scenes.generate import Plan, Task
 from fmtorch.scenes.textures import photograph
-from fmtorch.training.planes import Photograph, PlaneViews, list_photographs, local_affine, warp
+from fmtorch.training.planes import Photograph, PlaneViews, list_photographs, local_affine
 from scripts.patch_networks.patches import (
-    CONTEXT_SIZE,
     Tolerance,
     View,
     Warps,
     apply,
-    cut,
-    detect,
     linked,
     near,
     patch_similarity,
-    patches_of_warps,
     random_homography,
     rays_and_incidence,
     tracks_of_views,
-    training_scenes,
     transferred,
     views_of_plane,
 )
@@ -40,11 +33,6 @@ from tests.reference import geodesc as reference
 SIZE = (240, 320)
 WALL, SCREEN = 4.0, 2.5  # metres in front of the first camera: the wall everywhere, the screen left of its middle
 PLANES = PlaneViews(views=4, tilt=15.0, scale=(0.5, 0.6))
-
-
-@pytest.fixture(scope="module")
-def grey() -> np.ndarray:
-    return cv2.cvtColor(photograph("chelsea.png"), cv2.COLOR_RGB2GRAY)
 
 
 def correlations(patches: np.ndarray, point: np.ndarray) -> tuple[float, float]:
@@ -65,51 +53,6 @@ def test_a_view_contains_the_image_and_its_derivative_is_the_differences() -> No
         x, step = np.array([[120.0, 80.0]]), 1e-4
         numeric = np.stack([(apply(H, x + d) - apply(H, x - d))[0] / (2 * step) for d in step * np.eye(2)], -1)
         np.testing.assert_allclose(local_affine(H, x)[0], numeric, atol=1e-6)
-
-
-def test_a_warped_view_shows_what_the_homography_says(grey: np.ndarray) -> None:
-    smooth = cv2.GaussianBlur(grey, (0, 0), 4)
-    H, size = random_homography(np.random.default_rng(3), smooth.shape, Warps())
-    view = warp(smooth, H, size)
-    points = np.random.default_rng(0).uniform([40, 40], [smooth.shape[1] - 40, smooth.shape[0] - 40], (200, 2))
-    there = apply(H, points)
-    seen = cv2.remap(view, *there.astype(np.float32).T.reshape(2, -1, 1), cv2.INTER_LINEAR)[:, 0]
-    truth = cv2.remap(smooth, *points.astype(np.float32).T.reshape(2, -1, 1), cv2.INTER_LINEAR)[:, 0]
-    assert np.abs(seen.astype(float) - truth).mean() < 3  # grey levels; blur by reduction, rounding
-
-
-def test_keypoints_turn_with_the_image(grey: np.ndarray) -> None:
-    grey = np.ascontiguousarray(grey[:257, :385])  # so that halving keeps the same pixels after the turn
-    before, after = detect(grey, 300), detect(np.ascontiguousarray(np.rot90(grey, -1)), 300)
-    assert 300 < len(before) <= 600
-    # clockwise: (x, y) -> (h - 1 - y, x), angles (x towards y) grow by 90 degrees
-    moved = np.c_[grey.shape[0] - 1 - before[:, 1], before[:, 0]]
-    apart = np.hypot(*(moved[:, None] - after[None, :, :2]).transpose(2, 0, 1))
-    turn = (after[None, :, 3] - before[:, None, 3] - math.pi / 2 + math.pi) % (2 * math.pi) - math.pi
-    same = (apart < 1.0) & (np.abs(np.log(after[None, :, 2] / before[:, None, 2])) < 0.1) & (np.abs(turn) < 0.1)
-    assert same.any(1).mean() > 0.8
-
-
-def test_patches_of_a_turned_image_are_the_same(grey: np.ndarray) -> None:
-    grey = np.ascontiguousarray(grey[:257, :385])
-    points = np.array([[200.0, 150, 3, 0.4], [260, 120, 9, -2]])
-    turned = np.c_[grey.shape[0] - 1 - points[:, 1], points[:, 0], points[:, 2], points[:, 3] + math.pi / 2]
-    a, b = cut(grey, points), cut(np.ascontiguousarray(np.rot90(grey, -1)), turned)
-    assert a.shape == (2, CONTEXT_SIZE, CONTEXT_SIZE)
-    assert np.abs(a.astype(int) - b).mean() < 2
-    assert a.std() > 10
-
-
-def test_every_point_has_patches_that_resemble_one_another() -> None:
-    image, rng = photograph("chelsea.png"), np.random.default_rng(0)
-    patches, point, _ = patches_of_warps(image, rng, Warps(views=6), 150, Tolerance())
-    counts = np.bincount(point)
-    assert counts.min() >= 2
-    assert counts.max() <= 6
-    assert (np.diff(point) >= 0).all()
-    assert patches.shape == (len(point), CONTEXT_SIZE, CONTEXT_SIZE)
-    same, other = correlations(patches, point)
-    assert same > 0.6 > 0.3 > other
 
 
 def test_a_store_is_complete_deterministic_and_gives_two_different_views(tmp_path: Path) -> None:
@@ -223,28 +166,6 @@ def test_points_are_where_the_surfaces_put_them() -> None:
     assert seen[free].all()
 
 
-def test_scale_and_orientation_are_those_of_the_derivative() -> None:
-    a, b = view(0.0), view(0.6, -0.15)
-    there, seen = transferred(a.keypoints, a, b)
-    for axis, shift in enumerate(0.01 * np.eye(2)):
-        moved, still = a.keypoints.copy(), a.keypoints.copy()
-        moved[:, :2] += shift
-        moved[:, 3] = still[:, 3] = axis * np.pi / 2
-        beside, also = transferred(moved, a, b)
-        turned = transferred(still, a, b)[0]
-        both = seen & also
-        d = (beside - there)[both, :2]
-        error = (np.arctan2(d[:, 1], d[:, 0]) - turned[both, 3] + np.pi) % (2 * np.pi) - np.pi
-        assert np.abs(error).max() < 1e-2
-    # The same plane seen straight from twice as far is half as large.
-    far = Camera(a.camera.K, a.camera.R, a.camera.t + np.array([0.0, 0.0, WALL]), SIZE)
-    wall = View(a.image, a.camera, np.full(SIZE, 1 / WALL), a.keypoints)
-    halved, seen = transferred(wall.keypoints, wall, View(a.image, far, np.full(SIZE, 0.5 / WALL), a.keypoints))
-    assert seen.any()
-    np.testing.assert_allclose(halved[seen, 2], 1.0)
-    np.testing.assert_allclose(halved[seen, 3], a.keypoints[seen, 3])
-
-
 def test_points_are_linked_once_and_are_not_near_each_other() -> None:
     rng = np.random.default_rng(0)
     first, views = view(0.0), []
@@ -302,9 +223,3 @@ def test_tracks_of_a_plane_show_the_same_point_under_its_angles() -> None:
     # The plane is z = 0, seen from z < 0: its normal is (0, 0, -1).
     angles = np.degrees(np.arccos(-columns["rays"][:, 2]))
     np.testing.assert_allclose(columns["incidence"], angles, atol=0.02)  # float32 rays: eps / sin
-
-
-def test_training_scenes_are_of_the_training_side() -> None:
-    tasks = training_scenes(2, 5, 1)
-    assert len({task.name for task in tasks}) == len(tasks) == 8
-    assert all(task.split == "train" and task.plan.shots == 5 for task in tasks)

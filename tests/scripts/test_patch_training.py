@@ -1,7 +1,6 @@
 """Losses, figures, objectives, match sets, the loop and the command of patch networks."""
 
 import itertools
-import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ from omegaconf import DictConfig
 from torch import Tensor, nn
 
 from fmtorch.core.files import conf_dir
-from fmtorch.features.networks import AffNet, AffNetFast, GeoDesc, HardNet, build, load_weights
+from fmtorch.features.networks import AffNet, GeoDesc, HardNet, build, load_weights
 from fmtorch.features.onnx_network import PatchNetwork
 from fmtorch.scenes.textures import photograph
 from fmtorch.training.export import sha256
@@ -71,14 +70,13 @@ def store() -> PatchStore:
     return PatchStore(patches, first, {**about, "limits": {}}, Tracks(first, **columns))
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_losses_are_their_definitions(seed: int) -> None:
-    a, b = unit(12, 4, seed)
+def test_losses_are_their_definitions() -> None:
+    a, b = unit(12, 4, 0)
     b[3] = a[7]  # the same patch twice is no negative
     for squared in (False, True):
         expected = reference.hardest_triplet(a.tolist(), b.tolist(), 1.0, squared)
         assert float(hardest_triplet(a, b, squared=squared)) == pytest.approx(expected, abs=1e-9)
-    a, b = unit(10, 5, seed)
+    a, b = unit(10, 5, 0)
     expected = reference.relative_distance(a.tolist(), b.tolist(), 0.7)
     assert float(relative_distance(a, b, compactness=0.7)) == pytest.approx(expected, abs=1e-6)
 
@@ -107,9 +105,8 @@ def test_coincident_descriptors_have_finite_gradients(loss: Callable[[Tensor, Te
     assert torch.isfinite(a.grad).all()
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_the_loss_of_match_sets_is_its_definition(seed: int) -> None:
-    a, b, similarity = sets_of(3, 9, 4, seed)
+def test_the_loss_of_match_sets_is_its_definition() -> None:
+    a, b, similarity = sets_of(3, 9, 4, 0)
     sets = list(zip(a.tolist(), b.tolist(), similarity.tolist(), strict=True))
     first = sum(geodesc_reference.structured(x, y, 0.3) for x, y, _ in sets) / 3
     second = sum(geodesc_reference.geometric(x, y, s) for x, y, s in sets) / 3
@@ -119,7 +116,7 @@ def test_the_loss_of_match_sets_is_its_definition(seed: int) -> None:
     assert float(geodesc(a, b, similarity, ratio=0.3, geometric_weight=0.2)) == pytest.approx(first + 0.2 * second)
     alone = [float(geodesc(a[i : i + 1], b[i : i + 1], similarity[i : i + 1])) for i in range(3)]
     assert float(geodesc(a, b, similarity)) == pytest.approx(sum(alone) / 3)  # sets do not see each other
-    a, b, similarity = sets_of(2, 5, 3, seed)
+    a, b, similarity = sets_of(2, 5, 3, 0)
     assert torch.autograd.gradcheck(lambda x, y: geodesc(x, y, similarity), (a.requires_grad_(), b.requires_grad_()))
 
 
@@ -133,9 +130,8 @@ def test_the_margins_of_match_sets_are_those_of_the_paper() -> None:
         assert float(found) == pytest.approx(expected, abs=1e-6)
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_figures_are_their_definitions(seed: int) -> None:
-    a, b = unit(40, 3, seed, noise=0.5)
+def test_figures_are_their_definitions() -> None:
+    a, b = unit(40, 3, 0, noise=0.5)
     found = patch_quality(a, b)
     positive = [reference.distance(x, y) for x, y in zip(a.tolist(), b.tolist(), strict=True)]
     negative = [reference.distance(x, y) for x, y in zip(a.tolist(), b.roll(1, 0).tolist(), strict=True)]
@@ -162,14 +158,6 @@ def set_training(store: PatchStore, batch: int = 32) -> MatchSetTraining:
     options = TrainingOptions(batch=batch, steps=20, learning_rate=3e-4, bf16=False, checkpoint_steps=1000)
     description = {"architecture": "geodesc", "loss": {"name": "geodesc"}, "match_sets": {"matches": 16}}
     return MatchSetTraining(GeoDesc(), geodesc, store, options, description, matches=16, max_similarity=1.0)
-
-
-def test_the_loss_falls(store: PatchStore) -> None:
-    run = training(store)
-    run.run()
-    assert run.step == 30
-    assert sum(run.losses[-5:]) < 0.9 * sum(run.losses[:5])
-    assert run.optimizer.param_groups[0]["lr"] == pytest.approx(3e-3 / 30)  # linearly to zero
 
 
 @pytest.mark.parametrize("make", [training, set_training])
@@ -204,16 +192,6 @@ def test_a_checkpoint_of_other_options_is_refused(store: PatchStore, tmp_path: P
         set_training(store, batch=40)
     with pytest.raises(ValueError, match="batch=3200 is more than 16 matches of the"):
         set_training(store, batch=3200)
-
-
-def test_minutes_end_a_run_and_divergence_does(store: PatchStore) -> None:
-    run = training(store, minutes=1e-9, optimizer="sgd")
-    run.run()
-    assert run.step == 1
-    run.objective = DescriptorObjective(lambda a, b: (a - b).sum() / 0.0)
-    run.seconds = 0.0
-    with pytest.raises(FloatingPointError, match="lower the learning rate"):
-        run.run()
 
 
 def test_a_checkpoint_gives_the_network_its_card_and_its_figures(store: PatchStore, tmp_path: Path) -> None:
@@ -255,24 +233,6 @@ def test_a_teacher_adds_the_distance_to_its_descriptors(store: PatchStore) -> No
     torch.testing.assert_close(taught, plain + 2 * apart)
 
 
-def test_a_teacher_adds_the_departure_from_its_shapes(store: PatchStore) -> None:
-    torch.manual_seed(0)
-    network, draws = AffNetFast(dropout=0.0).eval(), torch.rand(12, DRAWS)
-    pairs = validation_pairs(store, 12)
-    plain = CovarianceObjective().loss(network, pairs, draws)
-    itself = CovarianceObjective(teacher=network, weight=2.0).loss(network, pairs, draws)
-    torch.testing.assert_close(itself, plain, atol=1e-6, rtol=0)
-
-    def stretching(patches: Tensor) -> Tensor:
-        """The network's shapes, stretched by 1.2 in x and by 1 / 1.2 in y."""
-        x = network(patches)
-        return torch.stack([1.2 * (1 + x[:, 0]) - 1, x[:, 1] / 1.2, (1 + x[:, 2]) / 1.2 - 1], 1)
-
-    taught = CovarianceObjective(teacher=stretching, weight=2.0).loss(network, pairs, draws)
-    # (S A)^-1 A with S the stretch: at least S's own singular values are left
-    assert float((taught - plain).detach()) > 2 * math.log((1.44 + 1 / 1.44) / 2) - 1e-5
-
-
 def test_sampling_through_the_identity_is_the_middle_and_a_turn_is_a_turn(store: PatchStore) -> None:
     patches = validation_pairs(store, 20)[0]
     seen, turned = (
@@ -289,21 +249,6 @@ def test_shapes_have_determinant_one_and_zero_is_a_circle() -> None:
     torch.testing.assert_close(torch.linalg.det(matrix), torch.ones(50), atol=1e-5, rtol=0)
     assert (matrix[:, 0, 1] == 0).all()
     torch.testing.assert_close(shape_matrix(torch.zeros(1, 3))[0], torch.eye(2))
-
-
-def test_a_shape_that_undoes_the_stretch_lowers_the_loss(store: PatchStore) -> None:
-    objective, n, stretch = ShapeObjective(HardNet().eval(), tilt=2.0), 40, 2**0.5
-    pairs = validation_pairs(store, n)[:1].expand(2, -1, -1, -1, -1)  # the same patch twice, stretched apart
-    draws = torch.zeros(n, DRAWS)
-    draws[:, 1] = 1.0  # the first is stretched twofold along x, the second not at all
-    shapes = torch.tensor([[1 / stretch - 1, 0, stretch - 1]]).repeat(n, 1)
-    known = lambda answer: lambda patches: answer  # noqa: E731
-    undone = objective.loss(known(torch.cat([shapes, torch.zeros(n, 3)])), pairs, draws).detach()
-    circles = objective.loss(known(torch.zeros(2 * n, 3)), pairs, draws).detach()
-    with torch.no_grad():
-        a, b = objective.described(None, pairs, draws)
-    assert float((a - b).norm(dim=1).mean()) > 0.1
-    assert float(undone) < float(circles) - 0.05
 
 
 def test_shape_training_moves_the_network_and_not_the_descriptor(store: PatchStore) -> None:
@@ -375,9 +320,8 @@ def random_tracks(seed: int) -> tuple[Tracks, dict[tuple[int, int], float]]:
     return Tracks(np.array(first), np.array(views), rays, incidence), similarity
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_match_sets_are_their_definition(seed: int) -> None:
-    tracks, similarity = random_tracks(seed)
+def test_match_sets_are_their_definition() -> None:
+    tracks, similarity = random_tracks(0)
     names = 1000 * tracks.view + np.repeat(np.arange(60), np.diff(tracks.first))
     everything = match_sets(tracks, 2, 1.0)
     assert len(everything) == 10
