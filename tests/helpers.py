@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 from hydra.core.global_hydra import GlobalHydra
 
-import fmtorch.commands.config  # noqa: F401  the commands' configs, by their names
+import fmtorch.__main__
+import fmtorch.commands.config  # the commands' configs, by their names
 from fmtorch import presets
 from fmtorch.data import ImagePair, ImageSource
 from fmtorch.pipeline.pipeline import Pipeline
@@ -103,11 +104,12 @@ def in_threads(count: int, work: Callable[[int], object]) -> None:
         raise errors[0]
 
 
-def call_main(main: Callable[[], object], monkeypatch: pytest.MonkeyPatch, folder: Path, *words: str) -> None:
-    """A command's `main` with these words, in a folder, within this process."""
+def call_command(monkeypatch: pytest.MonkeyPatch, folder: Path, *words: str) -> None:
+    """``fmtorch <words>`` in a folder, within this process."""
     monkeypatch.chdir(folder)
     monkeypatch.setattr(sys, "argv", ["fmtorch", *words])
+    monkeypatch.setattr(sys, "path", [str(folder), *sys.path])
     try:
-        main()
+        fmtorch.__main__.main()
     finally:
         GlobalHydra.instance().clear()

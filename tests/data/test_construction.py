@@ -1,22 +1,20 @@
 """Pairs by the paper's rule, as a set in the FM-Bench layout: on real scenes, on made ones, and interrupted."""
 
 import json
-import sys
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from hydra.core.global_hydra import GlobalHydra
 
-from fmtorch.commands import pairs as command
 from fmtorch.data import construction as rule
 from fmtorch.data import load, read_image
 from fmtorch.data.cameras import Camera, fundamental
 from fmtorch.data.construction import Construction, blocks
 from fmtorch.data.images import to_grey
 from tests.conftest import shared_path
-from tests.data.native import write_image
+from tests.data.native import write_colmap, write_image
+from tests.helpers import apart, call_command
 
 SELECTED = {
     "PhotoTourism/sacre_coeur": 34,
@@ -81,12 +79,7 @@ def scenes(tmp_path: Path) -> Path:
 
 
 def run(folder: Path, monkeypatch: pytest.MonkeyPatch, *words: str) -> None:
-    monkeypatch.chdir(folder)
-    monkeypatch.setattr(sys, "argv", ["pairs", "dataset=cameras", "dataset.root=Set", "output=Made", *words])
-    try:
-        command.main()
-    finally:
-        GlobalHydra.instance().clear()
+    call_command(monkeypatch, folder, "pairs", "dataset=cameras", "dataset.root=Set", "output=Made", *words)
 
 
 def test_the_command_makes_a_set_of_the_pairs_that_can_be_matched(
@@ -101,7 +94,7 @@ def test_the_command_makes_a_set_of_the_pairs_that_can_be_matched(
     source = {p.identity.removeprefix("Set"): p for p in load("cameras", root=scenes)}
     for pair in pairs:
         expected = source[pair.identity.removeprefix("Made")]
-        assert min(np.abs(pair.F - expected.F).max(), np.abs(pair.F + expected.F).max()) < 1e-12
+        assert apart(pair.F, expected.F) < 1e-12
         for name in ("K0", "K1", "R", "t"):
             np.testing.assert_allclose(getattr(pair, name), getattr(expected, name), rtol=0, atol=1e-12)
         assert pair.image0.path.read_bytes() == expected.image0.path.read_bytes()
@@ -202,8 +195,6 @@ def test_processes_make_the_same_set(scenes: Path, tmp_path: Path, monkeypatch: 
 
 
 def test_undistorted_images_are_written_as_they_are_seen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from tests.data.native import write_colmap
-
     monkeypatch.setattr("fmtorch.data.construction.matchable", lambda *_: True)
     dataset = load("colmap", root=write_colmap(tmp_path / "Source/scene"), pairs=None)
     construction = Construction(dataset, tmp_path / "Made", quality=100)  # type: ignore[arg-type]

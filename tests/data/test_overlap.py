@@ -4,14 +4,11 @@ import functools
 import itertools
 import json
 import pickle
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hydra.core.global_hydra import GlobalHydra
 
-from fmtorch.commands import pairs as command
 from fmtorch.data import load
 from fmtorch.data.construction import Construction
 from fmtorch.data.overlap import (
@@ -130,12 +127,7 @@ def test_overlap_by_the_points_of_a_real_model() -> None:
 
 
 def run(folder: Path, monkeypatch: pytest.MonkeyPatch, *words: str) -> None:
-    monkeypatch.chdir(folder)
-    monkeypatch.setattr(sys, "argv", ["pairs", "output=Made", "count=null", "workers=1", *words])
-    try:
-        command.main()
-    finally:
-        GlobalHydra.instance().clear()
+    call_command(monkeypatch, folder, "pairs", "output=Made", "count=null", "workers=1", *words)
 
 
 def test_the_command_selects_by_overlap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -169,7 +161,7 @@ def test_the_command_selects_from_rendered_scenes(
         (source,) = (
             rendered[rank] for rank, (s, i, j) in enumerate(places) if pair.identity == f"Made/{names[s]}/{i}-{j}"
         )
-        assert min(np.abs(pair.F - source.F).max(), np.abs(pair.F + source.F).max()) < 1e-12
+        assert apart(pair.F, source.F) < 1e-12
 
 
 def test_other_processes_judge_the_same(rendered: RenderedScenePairs, tmp_path: Path) -> None:

@@ -166,14 +166,6 @@ def test_keypoints_are_found_again() -> None:
         indices(points[:0], points[:1])
 
 
-def test_keypoints_are_found_as_a_dictionary_finds_them() -> None:
-    rng = np.random.default_rng(0)
-    points = rng.choice(np.array([-1.5, -0.0, 0.0, 0.25, 7], np.float32), (60, 2))
-    x = points[rng.integers(0, 60, 200)] * np.float32([1, -1]) * np.float32([1, -1])
-    place = {tuple(point): i for i, point in reversed(list(enumerate(points.tolist())))}
-    assert indices(points, x).tolist() == [place[tuple(point)] for point in x.tolist()]
-
-
 def journal(folder: Path, circle: Circle) -> tuple[MatchStore, list[tuple[Path, Path]]]:
     (folder / "images").mkdir(parents=True)
     paths = [folder / "images" / image.name for image in circle.images]

@@ -3,7 +3,6 @@
 import itertools
 import json
 import re
-import threading
 from pathlib import Path
 from typing import Any
 
@@ -11,16 +10,13 @@ import h5py
 import numpy as np
 import pycolmap
 import pytest
-import torch
 from omegaconf import DictConfig
 
 from fmtorch import data
 from fmtorch.commands import eval as eval_command
 from fmtorch.commands import match as match_command
 from fmtorch.io.export import DATABASE, FEATURES, MATCHES
-from fmtorch.pipeline import folder
 from fmtorch.pipeline.folder import chosen_pairs, images_below, open_folder
-from fmtorch.pipeline.two_images import Described
 from fmtorch.runs import RunFolder
 from tests.helpers import compose, draw
 
@@ -108,41 +104,6 @@ def test_pairs_that_look_alike(images: Path, tmp_path: Path, capsys: pytest.Capt
     assert len(re.findall("bad.png", capsys.readouterr().err)) == 1
     match(images, tmp_path / "out", "pairs=sequential:1")  # of the same matches
     assert re.search("[234] of 4 pairs taken from an earlier run", capsys.readouterr().out)
-
-
-def test_images_are_described_by_several_threads(
-    images: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (images / "bad.png").write_bytes(b"\x89PNG and no more")
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    match(images, tmp_path / "one", "export=h5")
-    expected = capsys.readouterr()
-    both, described = threading.Barrier(2, timeout=60), folder.describe
-
-    def together(*arguments: Any) -> Described:
-        both.wait()  # raises where the other does not come
-        return described(*arguments)
-
-    monkeypatch.setattr(folder, "describe", together)  # of four sound images
-    torch.set_num_threads(2)
-    match(images, tmp_path / "two", "export=h5")
-    torch.set_num_threads(threads)
-    captured = capsys.readouterr()
-    times = re.compile(r"\d+:\d\d:\d\d")  # of the progress bar
-    assert times.sub("", captured.err) == times.sub("", expected.err)
-    assert "3 of 10 pairs show one scene" in captured.out
-    for name in (FEATURES, MATCHES):
-        with h5py.File(tmp_path / "one" / name) as first, h5py.File(tmp_path / "two" / name) as second:
-            compared = []
-
-            def compare(at: str, item: object, other: h5py.File = second, seen: list[str] = compared) -> None:
-                if isinstance(item, h5py.Dataset):
-                    np.testing.assert_array_equal(item[:], other[at][:])
-                    seen.append(at)
-
-            first.visititems(compare)
-            assert len(compared) >= 4
 
 
 @pytest.mark.parametrize(

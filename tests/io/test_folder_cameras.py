@@ -1,6 +1,5 @@
 """Folders of photographs with what is known of their cameras: intrinsics and two-view geometries of the exports."""
 
-import json
 import math
 import shutil
 from pathlib import Path
@@ -141,10 +140,3 @@ def test_focal_lengths_by_exif_and_shared_ones(tmp_path: Path) -> None:
     assert not camera.has_prior_focal_length
     assert kind(geometry) == "UNCALIBRATED"
     assert np.linalg.norm(geometry.F) > 0
-
-
-def test_one_photograph_of_a_file_is_missing(tmp_path: Path) -> None:
-    scene = Scene(tmp_path / "photos")
-    (tmp_path / "k.json").write_text(json.dumps({"a.jpg": [690, 690, 384, 256]}))
-    with pytest.raises(ValueError, match=r"k\.json: no camera of .*b\.jpg"):
-        scene.match(tmp_path / "out", f"cameras={tmp_path / 'k.json'}")

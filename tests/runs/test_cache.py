@@ -1,13 +1,12 @@
 """Arrays on disk: whole or absent, bounded, shared by processes, and never trusted."""
 
+import multiprocessing
 import os
 import pickle
 import signal
-import subprocess
-import sys
-import threading
 import time
 import warnings
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 import numpy as np
@@ -15,25 +14,24 @@ import pytest
 
 from fmtorch.runs import feature_cache as module
 from fmtorch.runs.feature_cache import ABANDONED, SLACK, ArrayCache
-
-WRITER = """
-import sys
-from pathlib import Path
-import numpy as np
-from fmtorch.runs.feature_cache import ArrayCache
-cache = ArrayCache(Path(sys.argv[1]), int(sys.argv[2]) or None)
-for i in range(int(sys.argv[3])):
-    cache.write("some", f"{i % 50}", {"a": np.full(50_000, i % 50)})
-    found = cache.read("some", f"{(i * 7) % 50}")
-    assert found is None or (found["a"] == (i * 7) % 50).all()
-"""
+from tests.helpers import in_threads
 
 
-def writer(folder: Path, limit: int = 0, count: int = 1_000_000) -> subprocess.Popen[str]:
-    """A process that writes files of 400 kB in a row, and reads others back."""
-    env = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[2])}
-    command = [sys.executable, "-W", "error", "-c", WRITER, str(folder), str(limit), str(count)]
-    return subprocess.Popen(command, env=env, stderr=subprocess.PIPE, text=True)
+def write_many(folder: Path, limit: int, count: int) -> None:
+    """Write files of 400 kB in a row, and read others back."""
+    warnings.simplefilter("error")
+    cache = ArrayCache(folder, limit or None)
+    for i in range(count):
+        cache.write("some", f"{i % 50}", {"a": np.full(50_000, i % 50)})
+        found = cache.read("some", f"{(i * 7) % 50}")
+        assert found is None or (found["a"] == (i * 7) % 50).all()
+
+
+def writer(folder: Path, limit: int = 0, count: int = 1_000_000) -> BaseProcess:
+    """A process that does so."""
+    process = multiprocessing.get_context("fork").Process(target=write_many, args=(folder, limit, count))
+    process.start()
+    return process
 
 
 def test_what_is_written_is_read(tmp_path: Path) -> None:
@@ -49,7 +47,7 @@ def test_what_is_written_is_read(tmp_path: Path) -> None:
     assert [path.name for path, _ in cache.files()] == ["name.npz"]
 
 
-@pytest.mark.parametrize("keep", [0.0, 0.3, 0.97, 0.999])
+@pytest.mark.parametrize("keep", [0.0, 0.3, 0.999])
 def test_a_truncated_file_counts_as_absent(tmp_path: Path, keep: float) -> None:
     cache = ArrayCache(tmp_path)
     cache.write("some", "name", {"a": np.arange(1000)})
@@ -130,9 +128,9 @@ def test_a_killed_writer_leaves_no_broken_file(tmp_path: Path) -> None:
         deadline = time.monotonic() + 60
         while len(list(tmp_path.glob("some/*.npz"))) < 3 + kill and time.monotonic() < deadline:
             time.sleep(0.002)
-        process.send_signal(signal.SIGKILL)
-        _, errors = process.communicate(timeout=60)
-        assert process.returncode == -signal.SIGKILL, errors
+        process.kill()
+        process.join(60)
+        assert process.exitcode == -signal.SIGKILL
     cache = ArrayCache(tmp_path)
     names = [path.stem for path, _ in cache.files()]
     assert len(names) >= 3
@@ -147,8 +145,8 @@ def test_a_killed_writer_leaves_no_broken_file(tmp_path: Path) -> None:
 def test_processes_share_a_cache(tmp_path: Path, limit: int) -> None:
     processes = [writer(tmp_path, limit, 55) for _ in range(2)]
     for process in processes:
-        _, errors = process.communicate(timeout=120)
-        assert process.returncode == 0, errors
+        process.join(120)
+        assert process.exitcode == 0
     cache = ArrayCache(tmp_path)
     files = list(cache.files())
     for path, _ in files:
@@ -161,23 +159,14 @@ def test_processes_share_a_cache(tmp_path: Path, limit: int) -> None:
 
 def test_threads_share_a_cache(tmp_path: Path) -> None:
     cache = ArrayCache(tmp_path, limit=30 * 8000)
-    errors: list[BaseException] = []
 
     def work(start: int) -> None:
-        try:
-            for i in range(start, start + 60):
-                cache.write("some", f"{i % 40}", {"a": np.full(1000, i % 40)})
-                cached = cache.read("some", f"{(i * 3) % 40}")
-                assert cached is None or (cached["a"] == (i * 3) % 40).all()
-        except BaseException as error:
-            errors.append(error)
+        for i in range(start, start + 60):
+            cache.write("some", f"{i % 40}", {"a": np.full(1000, i % 40)})
+            cached = cache.read("some", f"{(i * 3) % 40}")
+            assert cached is None or (cached["a"] == (i * 3) % 40).all()
 
-    threads = [threading.Thread(target=work, args=(k,)) for k in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert errors == []
+    in_threads(4, work)
 
 
 def test_what_cannot_be_written_is_told_and_harms_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
