@@ -14,9 +14,10 @@ from omegaconf import DictConfig
 from fmtorch import presets
 from fmtorch.commands.options import MatchOptions
 from fmtorch.core.files import replacing
+from fmtorch.core.settings import head
 from fmtorch.core.stages import ImageMatcher
 from fmtorch.core.terminal import console, errors, progress_bars
-from fmtorch.data.images import read_image
+from fmtorch.data.images import read_image, stored_orientation
 from fmtorch.evaluation.view_graph_picture import view_graph_svg
 from fmtorch.features.vlad import descriptor_kind, image_vector
 from fmtorch.io.export import ViewGraph, export_kinds, view_graph, write_exports, write_view_graph
@@ -94,6 +95,8 @@ def match_folder(
     written += [*write_view_graph(graph, output), _draw(graph, folder, fields.orient, output)]
     _say(work, graph, len(pairs))
     console.print(f"{output}: {', '.join(written)}", style="dim", markup=False, highlight=False)
+    if "colmap" in kinds and fields.orient:
+        _say_turned(images, folder)
     if isinstance(pipeline.extractor, CachedFeatures) and pipeline.extractor.cache.folder != scratch:
         console.print(pipeline.extractor.report(), style="dim", markup=False, highlight=False)
     return output
@@ -116,6 +119,18 @@ def _say(work: FolderMatches, graph: ViewGraph, pairs: int) -> None:
     if sizes:
         others = f"; {apart} images are in no related pair" if apart else ""
         console.print(f"connected images: {', '.join(map(str, sizes))}{others}", highlight=False)
+
+
+def _say_turned(images: Sequence[Path], folder: Path) -> None:
+    """Say what COLMAP makes of photographs that were turned."""
+    turned = [image.relative_to(folder).as_posix() for image in images if stored_orientation(image) != 1]
+    if turned:
+        console.print(
+            f"turned by their orientation tags: {head(turned)}. Keypoints and cameras in database.db are those of the "
+            "turned images, from which COLMAP's mapper works; but COLMAP reads files as they are stored, so that its "
+            "colours, undistorted images and dense reconstruction will not fit. Turn the files, or use orient=false",
+            highlight=False,
+        )
 
 
 def _draw(graph: ViewGraph, folder: Path, orient: bool, output: Path) -> str:

@@ -73,7 +73,7 @@ class EvalOptions:
 class MatchOptions:
     """What `fmtorch match` takes beside stages."""
 
-    image0: Path | None = option(None, "an image file: JPEG, PNG, TIFF, WebP and what else OpenCV reads")
+    image0: Path | None = option(None, "an image file: JPEG, PNG, TIFF, WebP, AVIF, BMP, ...; HEIC with pillow-heif")
     image1: Path | None = option(None, "the other one")
     images: Path | None = option(None, "instead of the two: a folder of images, whose pairs are matched")
     pairs: Path | None = option(
@@ -99,7 +99,7 @@ class MatchOptions:
         None, "a text file with the nine numbers of the true F, row by row, in pixels of the images as they are shown"
     )
     output: Path | None = option(None, "null: matches/<image0>-<image1>")
-    orient: bool = option(True, "turn the images as their EXIF orientation says")
+    orient: bool = option(True, "turn the images as their EXIF orientation or TIFF tag says")
     longest_side: Count = option(
         1600, "px; larger images are reduced to it. F and points are always in pixels of the images as they are"
     )

@@ -12,9 +12,9 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from fmtorch.data.cameras import nearest_rotation
+from fmtorch.data.images import stored_size
 from fmtorch.data.lenses import Lens
 from fmtorch.data.pairs import ImageSource
 from fmtorch.data.scenes import (
@@ -136,20 +136,11 @@ def _view(file: Path, lines: list[str], i: int, source: ImageSource) -> View | N
     place = f"{file}, line {first + 1}"
     if focal < 0:
         raise DataError(f"{place}: focal length {focal:g}; it must be positive")
-    h, w = _size(source.path)
+    h, w = stored_size(source.path) or (1, 1)  # reading an image without a header tells
     lens = Lens(focal, focal, (w - 1) / 2, (h - 1) / 2, "RADIAL", (k1, k2))
     R = _FLIP @ nearest_rotation(np.stack(rows[1:4]), place)
     image = ImageSource(source.identity, source.path, (h, w), lens if lens.bends else None)
     return View(image, lens.K, R, _FLIP @ rows[4], place)
-
-
-def _size(path: Path) -> tuple[int, int]:
-    """(h, w) of an image from its header; (1, 1) where it has none, which reading it will tell."""
-    try:
-        with Image.open(path) as image:
-            return image.height, image.width
-    except (OSError, ValueError, Image.DecompressionBombError):
-        return 1, 1
 
 
 def _seen(file: Path, lines: list[str], cameras: int, points: int, numbers: dict[int, int]) -> list[NDArray[np.int64]]:

@@ -1,34 +1,23 @@
-"""Sizes of images from their headers alone."""
+"""Images from disk: never a half-decoded one, turned only on demand, and their sizes from headers alone."""
 
 from __future__ import annotations
 
+import contextlib
 import io
 import re
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import kornia_rs
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import ExifTags, Image, TiffImagePlugin
 
 from fmtorch.data.lenses import undistorted
 from fmtorch.data.pairs import ImageSource
-
-
-def stored_size(path: Path) -> tuple[int, int] | None:
-    """(h, w) of an image file, in pixels as stored; None where there is none, or no header that tells."""
-    try:
-        with Image.open(path) as image:
-            return image.height, image.width
-    except (OSError, ValueError, Image.DecompressionBombError):
-        return None
-
-
-# Images from disk, exactly as OpenCV decodes them, and never a half-decoded one
-
 
 _JPEG, _PNG = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
 _JPEG_MARKER = re.compile(rb"\xff+([^\x00\xff\xd0-\xd7])", re.DOTALL)
@@ -46,15 +35,26 @@ class ImageError(ValueError):
     """An image file that cannot be used; the message names the file and what would be right."""
 
 
+FORMATS = "JPEG, PNG, TIFF, WebP, AVIF, BMP, GIF, JPEG 2000, PNM, PFM, Radiance HDR, or HEIC with pillow-heif"
+"""What `read_image` reads."""
+
+
 def read_image(source: ImageSource | Path | str, *, orient: bool = False) -> NDArray[np.uint8]:
     """The image at `source` as uint8, (H, W) when the file is grey and RGB (H, W, 3) when it has colour.
 
-    Any format OpenCV decodes; 16 bits are reduced to 8, transparency is dropped.
+    Any of `FORMATS`, of an animation the first frame. Values of more than 8 bits and floats are scaled so that the
+    image's own range becomes 0 to 255, not finite ones become 0; transparency is dropped.
     An `ImageSource` with a lens gives the undistorted image (`undistorted`), one with a resampling that of it.
-    orient: turn the image as its EXIF orientation says. Off by default: ground truth is given for the pixels as stored.
-    Raises ImageError for a file that is missing, empty, truncated, corrupt, no image, of more than `MAX_PIXELS`, or of
-    another size than its source says: OpenCV alone makes up what is missing or damaged and says nothing, or but a line
-    on the standard error output.
+
+    Args:
+        source: the file.
+        orient: turn the image as its EXIF orientation, TIFF tag or AVIF's rotation says. Off by default: ground truth
+            is given for the pixels as stored. HEIC is always upright, as its standard demands.
+
+    Raises:
+        ImageError: for a file that is missing, empty, truncated, corrupt, no image, of more than `MAX_PIXELS`, or of
+            another size than its source says: OpenCV alone makes up what is missing or damaged and says nothing, or but
+            a line on the standard error output.
     """
     if not isinstance(source, ImageSource):
         return _decoded(Path(source), orient)
@@ -67,6 +67,38 @@ def read_image(source: ImageSource | Path | str, *, orient: bool = False) -> NDA
         )
     image = image if source.lens is None else undistorted(image, source.lens)
     return image if source.resampling is None else source.resampling(image)
+
+
+def stored_size(path: Path) -> tuple[int, int] | None:
+    """(h, w) of an image file, in pixels as stored; None where there is none, or no header that tells."""
+    try:
+        with Image.open(path) as image:
+            if isinstance(image, TiffImagePlugin.TiffImageFile):  # its width and height are those after turning
+                return int(image.tag_v2[TiffImagePlugin.IMAGELENGTH]), int(image.tag_v2[TiffImagePlugin.IMAGEWIDTH])
+            return image.height, image.width
+    except (OSError, ValueError, KeyError, Image.DecompressionBombError):
+        return None
+
+
+def stored_orientation(file: Path | io.BytesIO) -> int:
+    """How an image file is to be turned to be upright, 1 (not at all) to 8 as in EXIF; 1 where it does not tell."""
+    with contextlib.suppress(Exception), Image.open(file) as image:  # damaged tags raise nearly anything
+        value = image.getexif().get(ExifTags.Base.Orientation, 1)
+        return value if value in _TURNS else 1
+    return 1
+
+
+_TURNS: dict[int, Callable[[NDArray[np.uint8]], NDArray[np.uint8]]] = {
+    1: lambda image: image,
+    2: lambda image: image[:, ::-1],
+    3: lambda image: image[::-1, ::-1],
+    4: lambda image: image[::-1],
+    5: lambda image: image.swapaxes(0, 1),
+    6: lambda image: image[::-1].swapaxes(0, 1),
+    7: lambda image: image[::-1, ::-1].swapaxes(0, 1),
+    8: lambda image: image[:, ::-1].swapaxes(0, 1),
+}
+"""By the values of EXIF's Orientation (JEITA CP-3451, 4.6.4): what makes an image upright."""
 
 
 def _decoded(path: Path, orient: bool, data: bytes | None = None) -> NDArray[np.uint8]:
@@ -82,16 +114,73 @@ def _decoded(path: Path, orient: bool, data: bytes | None = None) -> NDArray[np.
         raise ImageError(f"{path}: the file is empty; it must be a complete image")
     _expect_complete(path, data)
     _expect_moderate(path, data)
-    flags = cv2.IMREAD_ANYCOLOR | (0 if orient else cv2.IMREAD_IGNORE_ORIENTATION)
+    image = _eight_bits(path, _heic(path, data) if _is_heic(data) else _by_opencv(path, data))
+    if data.startswith(_JPEG) and not _jpeg_decodes(data):
+        raise ImageError(f"{path}: corrupt JPEG, its compressed data are damaged; copy it again")
+    turn = _TURNS[stored_orientation(io.BytesIO(data)) if orient and not _is_heic(data) else 1]
+    return np.ascontiguousarray(turn(image))
+
+
+def _by_opencv(path: Path, data: bytes) -> NDArray[np.generic]:
+    """The pixels as stored, of any depth, grey or RGB."""
+    deep = 0 if data[4:8] == b"ftyp" else cv2.IMREAD_ANYDEPTH  # 10 bits of an AVIF are a photograph's
+    flags = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION | deep
     try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+        image = cv2.imdecode(np.frombuffer(_upright_tiff(data), np.uint8), flags)
     except cv2.error as error:
         raise ImageError(f"{path}: OpenCV refuses it ({error}); it must be a sound image") from error
     if image is None:
-        raise ImageError(f"{path}: no image that OpenCV can decode; it must be JPEG, PNG, TIFF or WebP")
-    if data.startswith(_JPEG) and not _jpeg_decodes(data):
-        raise ImageError(f"{path}: corrupt JPEG, its compressed data are damaged; copy it again")
-    return image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)  # type: ignore[return-value]
+        raise ImageError(f"{path}: no image that can be decoded; it must be {FORMATS}")
+    return image if image.ndim == 2 else image[..., ::-1]
+
+
+def _upright_tiff(data: bytes) -> bytes:
+    """A TIFF file without the orientation of its first image, by which OpenCV turns it in any case (TIFF 6.0, 2)."""
+    order: Literal["little", "big"] = "little" if data[:2] == b"II" else "big"
+    version = int.from_bytes(data[2:4], order) if data[:2] in (b"II", b"MM") else 0
+    if version not in (42, 43):
+        return data
+    counter, word = (2, 4) if version == 42 else (8, 8)  # 43: BigTIFF
+    at = int.from_bytes(data[word : 2 * word], order)
+    entries = min(int.from_bytes(data[at : at + counter], order), len(data) // 12)
+    size = 4 + 2 * word  # an entry: tag, type, count, value
+    for start in range(at + counter, at + counter + entries * size, size):
+        if int.from_bytes(data[start : start + 2], order) == ExifTags.Base.Orientation:
+            one = [(3).to_bytes(2, order), (1).to_bytes(word, order), (1).to_bytes(2, order)]  # a SHORT that is 1
+            return b"".join([data[: start + 2], *one, data[start + 2 + sum(map(len, one)) :]])
+    return data
+
+
+def _is_heic(data: bytes) -> bool:
+    """Whether the brands of a file's first box are those of HEVC images (ISO/IEC 23008-12)."""
+    brands = data[8 : int.from_bytes(data[:4], "big")] if data[4:8] == b"ftyp" else b""
+    return any(brands[i : i + 4] in (b"heic", b"heix", b"heim", b"heis", b"hevc") for i in range(0, len(brands), 4))
+
+
+def _heic(path: Path, data: bytes) -> NDArray[np.generic]:
+    """The pixels of a HEIC file, upright."""
+    try:
+        import pillow_heif
+    except ImportError as error:
+        raise ImageError(f"{path}: a HEIC image; pip install pillow-heif reads it, or convert it to JPEG") from error
+    try:
+        image = pillow_heif.open_heif(io.BytesIO(data)).to_pillow()
+    except Exception as error:  # of libheif
+        raise ImageError(f"{path}: pillow-heif refuses it ({error}); it must be a sound image") from error
+    return np.asarray(image if image.mode == "L" else image.convert("RGB"))
+
+
+def _eight_bits(path: Path, image: NDArray[np.generic]) -> NDArray[np.uint8]:
+    """An image of any depth with its own range as 0 to 255."""
+    if image.dtype == np.uint8:
+        return image  # type: ignore[return-value]
+    values = image.astype(np.float64)
+    known = np.isfinite(values)
+    if not known.any():
+        raise ImageError(f"{path}: none of its values is a finite number; it must be an image")
+    low, high = values[known].min(), values[known].max()
+    scaled = np.where(known, (values - low) * (255 / max(high - low, np.finfo(np.float64).tiny)), 0)
+    return np.rint(scaled).astype(np.uint8)
 
 
 def to_grey(image: NDArray[np.uint8]) -> NDArray[np.uint8]:

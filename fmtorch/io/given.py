@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from PIL import Image
 
 from fmtorch.core.types import Correspondences
 from fmtorch.data.pairs import GivenMatches, ImagePair, ImageSource
@@ -97,15 +96,6 @@ def image(family: str, scene: str, name: str, folder: Path | None) -> ImageSourc
     if folder is not None:
         path = folder / scene / name if (folder / scene).is_dir() else folder / name
     return ImageSource(f"{family}/{scene}/{name}", path)
-
-
-def size_of(source: ImageSource) -> Size | None:
-    """(h, w) from an image's header, None where there is no image."""
-    try:
-        with Image.open(source.path) as picture:
-            return picture.height, picture.width
-    except OSError:
-        return None
 
 
 def expect_size(source: ImageSource, size: Size, K: Array) -> None:

@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fmtorch.data.images import stored_size
 from fmtorch.data.pairs import GivenMatches, ImagePair, ImageSource, PairDataset
 from fmtorch.data.text_files import DataError
 from fmtorch.io import h5
-from fmtorch.io.given import Array, Size, given, size_of
+from fmtorch.io.given import Array, Size, given
 
 DEPTH = 4  # parts of a path that a name may hold
 
@@ -258,7 +259,7 @@ def _size(file: Any, key: str, image: ImageSource) -> Size:
     if h5.holds(file, key):
         width, height = h5.reshaped(file, key, 2)
         return int(height), int(width)
-    size = size_of(image)
+    size = stored_size(image.path)
     if size is None:
         raise DataError(f"{file.file.filename}: {key!r} is missing, and image {image.path} cannot be read either")
     return size

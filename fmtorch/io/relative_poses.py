@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from fmtorch.data.images import stored_size
 from fmtorch.data.pairs import GivenMatches, ImagePair, ImageSource
 from fmtorch.data.text_files import DataError
 from fmtorch.io import h5
@@ -30,7 +31,6 @@ from fmtorch.io.given import (
     posed,
     size_by_centre,
     size_by_points,
-    size_of,
     with_fundamentals,
 )
 
@@ -147,7 +147,7 @@ class _Cameras:
 
 def _size(source: ImageSource, K: Array, images: Path | None) -> Size:
     """(h, w) of an image, by its principal point where there is no file. Raises DataError where the two disagree."""
-    by_centre, size = size_by_centre(K), size_of(source) if images else None
+    by_centre, size = size_by_centre(K), stored_size(source.path) if images else None
     if size is not None:
         expect_size(source, size, K)
     return size or by_centre
@@ -250,7 +250,7 @@ def _camera(file: Any, path: Path, key: str, source: ImageSource) -> tuple[Array
     sides = [_side(file, f"{key}/{name}") for name in ("height", "width")]
     if all(sides):
         return K, (sides[0], sides[1])
-    size = size_of(source)
+    size = stored_size(source.path)
     if size is not None:
         expect_size(source, size, K)
     return K, size

@@ -1,11 +1,16 @@
+import sys
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
-from PIL import ExifTags, Image
+import tifffile
+from PIL import Image, ImageOps
 
 from fmtorch.data import ImageError, ImageSource, read_image, to_grey
+from fmtorch.data.images import stored_orientation, stored_size
 
 COLOUR = np.random.default_rng(0).integers(0, 256, (37, 53, 3), dtype=np.uint8)
 
@@ -125,23 +130,79 @@ def test_what_is_no_image_is_named(tmp_path: Path, content: bytes | None, messag
         read_image(tmp_path)
 
 
-STORED = {  # how an image is stored for each value of the orientation
-    1: lambda image: image,
-    2: lambda image: image[:, ::-1],
-    3: lambda image: np.rot90(image, 2),
-    6: lambda image: np.rot90(image, 1),  # shown after a quarter turn clockwise
-    8: lambda image: np.rot90(image, -1),
-}
+BLOCKS = np.repeat(
+    np.repeat(np.array([[[250, 20, 20], [20, 250, 20]], [[20, 20, 250], [250, 250, 250]]], np.uint8), 24, 0), 40, 1
+)
 
 
-@pytest.mark.parametrize("orientation", STORED)
-def test_exif_orientation_only_on_demand(orientation: int, tmp_path: Path) -> None:
-    exif, smooth = Image.Exif(), cv2.resize(COLOUR, (320, 240), interpolation=cv2.INTER_CUBIC)
-    exif[ExifTags.Base.Orientation] = orientation
-    stored = np.ascontiguousarray(STORED[orientation](smooth))
-    Image.fromarray(stored).save(tmp_path / "a.jpg", exif=exif, quality=95)
-    for image, expected in (
-        (read_image(tmp_path / "a.jpg"), stored),
-        (read_image(tmp_path / "a.jpg", orient=True), smooth),
-    ):
-        assert np.abs(image.astype(int) - expected).mean() < 5  # grey levels, of JPEG
+@pytest.mark.parametrize("tag", range(1, 9))
+@pytest.mark.parametrize("suffix", ["jpg", "png", "webp", "tif", "avif"])
+def test_orientation_tags_turn_on_demand_alone(tmp_path: Path, suffix: str, tag: int) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = tag
+    path = tmp_path / f"a.{suffix}"
+    Image.fromarray(BLOCKS).save(path, exif=exif)
+    with Image.open(path) as image:
+        upright = np.asarray(ImageOps.exif_transpose(image).convert("RGB"))
+    for orient, right in ((False, BLOCKS), (True, upright)):
+        read = read_image(path, orient=orient)
+        assert read.shape == right.shape
+        assert np.abs(read.astype(int) - right).mean() < 8  # coding with losses; a turned image is beyond 60
+    assert stored_size(path) == BLOCKS.shape[:2]
+    assert stored_orientation(path) == tag
+
+
+@pytest.mark.parametrize(
+    "options", [{"bigtiff": True}, {"byteorder": ">"}, {"dtype": np.uint16}, {"dtype": np.float32}]
+)
+def test_tiff_of_any_kind_is_read_as_stored(tmp_path: Path, options: dict[str, Any]) -> None:
+    image = BLOCKS[..., 0].astype(options.pop("dtype", np.uint8))
+    tifffile.imwrite(tmp_path / "a.tif", image, extratags=[(274, "H", 1, 6, True)], **options)
+    stored = read_image(tmp_path / "a.tif")
+    np.testing.assert_array_equal(stored > 128, tifffile.imread(tmp_path / "a.tif") > 128)
+    np.testing.assert_array_equal(read_image(tmp_path / "a.tif", orient=True), np.rot90(stored, -1))
+
+
+@pytest.mark.parametrize(
+    ("dtype", "low", "high"), [(np.uint16, 29_300, 30_200), (np.int16, -40, 210), (np.float32, -1.5, 2.25)]
+)
+def test_deep_images_are_scaled_by_their_range(tmp_path: Path, dtype: type, low: float, high: float) -> None:
+    """A thermal camera's counts fill a small part of 16 bits: their upper byte has four levels."""
+    shape = np.random.default_rng(1).uniform(size=(40, 60))
+    shape[0, :2] = 0, 1
+    values = (low + shape * (high - low)).astype(dtype)
+    tifffile.imwrite(tmp_path / "a.tif", values)
+    exact = (values.astype(float) - low) / (high - low) * 255
+    assert np.abs(read_image(tmp_path / "a.tif") - exact).max() <= 0.5 + 1e-9
+
+
+def test_values_that_are_no_numbers_are_dark(tmp_path: Path) -> None:
+    values = np.array([[np.nan, 1.0], [np.inf, 3.0]], np.float32)
+    tifffile.imwrite(tmp_path / "a.tif", values)
+    np.testing.assert_array_equal(read_image(tmp_path / "a.tif"), [[0, 0], [0, 255]])
+    tifffile.imwrite(tmp_path / "a.tif", values * np.nan)
+    with pytest.raises(ImageError, match=r"a\.tif: none of its values is a finite number"):
+        read_image(tmp_path / "a.tif")
+
+
+def test_the_formats_of_the_message_are_read(tmp_path: Path) -> None:
+    (tmp_path / "a.xyz").write_bytes(b"no picture")
+    with pytest.raises(ImageError) as refusal:
+        read_image(tmp_path / "a.xyz")
+    suffixes = {"JPEG": "jpg", "TIFF": "tif", "JPEG 2000": "jp2", "PNM": "ppm", "Radiance HDR": "hdr"}
+    named = str(refusal.value).partition("must be ")[2].replace(" or ", " ").split(", ")
+    for name in (name.strip() for name in named if "HEIC" not in name):
+        kind = np.float32 if name == "PFM" else np.uint8
+        read = read_image(written(tmp_path / f"a.{suffixes.get(name, name.lower())}", BLOCKS.astype(kind)))
+        assert read.shape == BLOCKS.shape, name
+
+
+def test_heic_is_read_by_pillow_heif_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "a.heic"
+    path.write_bytes(bytes([0, 0, 0, 20]) + b"ftypmif1" + bytes(4) + b"heic" + bytes(40))
+    monkeypatch.setitem(sys.modules, "pillow_heif", None)
+    with pytest.raises(ImageError, match="pip install pillow-heif"):
+        read_image(path)
+    opened = SimpleNamespace(to_pillow=lambda: Image.fromarray(BLOCKS).convert("RGBA"))
+    monkeypatch.setitem(sys.modules, "pillow_heif", SimpleNamespace(open_heif=lambda file: opened))
+    np.testing.assert_array_equal(read_image(path, orient=True), BLOCKS)

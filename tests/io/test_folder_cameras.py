@@ -140,3 +140,18 @@ def test_focal_lengths_by_exif_and_shared_ones(tmp_path: Path) -> None:
     assert not camera.has_prior_focal_length
     assert kind(geometry) == "UNCALIBRATED"
     assert np.linalg.norm(geometry.F) > 0
+
+
+def test_what_colmap_makes_of_turned_photographs_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene = Scene(tmp_path / "photos")
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = 6
+    with Image.open(scene.folder / "b.jpg") as image:
+        image.save(scene.folder / "b.jpg", exif=exif)
+    for orient, height in (("true", 768), ("false", 512)):
+        output = scene.match(tmp_path / orient, "export=colmap", f"orient={orient}")
+        said = " ".join(capsys.readouterr().out.split())
+        assert ("turned by their orientation tags: b.jpg" in said) == (orient == "true")
+        assert ("COLMAP reads files as they are stored" in said) == (orient == "true")
+        with pycolmap.Database.open(output / DATABASE) as file:
+            assert [camera.height for camera in file.read_all_cameras()] == [512, height]
