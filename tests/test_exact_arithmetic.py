@@ -137,6 +137,3 @@ def test_kernels_are_found_by_their_decorators(line: str) -> None:
     assert not kernels(ast.parse("@functools.cache\ndef f(x): ..."))
 
 
-def test_what_is_allowed_is_there() -> None:
-    for name, what in ALLOWED:
-        assert what in {each for _, each in inexact(ast.parse((PACKAGE / name).read_text(encoding="utf-8")))}

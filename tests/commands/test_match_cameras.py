@@ -74,18 +74,6 @@ def test_calibrations_follow_the_reduction(pair: ImagePair, pipeline: fmtorch.Pi
     assert (2 * by_hand.focals).tolist() == pytest.approx(reduced.focals.tolist(), rel=1e-9)
 
 
-@pytest.mark.parametrize(("cameras", "message"), [
-    ({"K0": np.eye(3)}, r"K0 has a focal length of 1 for an image of 1536 x 1024 pixels; it must be in pixels"),
-    ({"K0": np.diag([1500, 1500, 1.0])[None]}, r"K0 has shape \(1, 3, 3\); it must be \(3, 3\)"),
-    ({"focal": "some"}, "focal is 'some'"), ({"focal": np.ones((1, 2, 2))}, r"focal has shape \(1, 2, 2\)"),
-])  # fmt: skip
-def test_what_no_camera_is(
-    cameras: dict[str, object], message: str, pair: ImagePair, pipeline: fmtorch.Pipeline
-) -> None:
-    with pytest.raises(ValueError, match=message):
-        matched(pair, pipeline, **cameras)
-
-
 BENT = (-0.25, 0.06, 1e-3, -1e-3)  # OPENCV's coefficients: corners of these photographs move by some 50 px
 
 

@@ -72,24 +72,6 @@ def test_poses_are_shown_where_a_run_has_them() -> None:
     assert "Relative pose" not in render("None", [Section("set", {"without": runs["without"]})], [])
 
 
-def test_signed_translations_are_said_and_told_apart_from_folded_ones() -> None:
-    posed = [dataclasses.replace(r, rotation_error=2.0, translation_error=170.0) for r in results([0.01] * 4)]
-    folded = [dataclasses.replace(r, rotation_error=2.0, translation_error=10.0) for r in results([0.01] * 4)]
-    runs = {"a": to_table(posed), "b": to_table(folded)}
-    summaries = {name: summarize(rows, name == "a") for name, rows in runs.items()}
-    overall = {name: summary["all"] for name, summary in summaries.items()}
-    (alone,), (both,) = tables.parts({"a": overall["a"]}), tables.parts(overall)
-    assert list(alone.columns)[-1] == "t error, signed"
-    assert "whose sign counts" in alone.note
-    assert "folded" not in alone.note
-    assert list(both.columns)[-1] == "t error"
-    assert "b: Of the pairs" in both.note
-    assert "a: Of the pairs" in both.note
-    page = render("Poses", [Section("set", runs, signed=["a"])], [])
-    assert "pose.signed=true" in page
-    assert "pose.signed=true" not in render("Poses", [Section("set", {"b": runs["b"]})], [])
-
-
 def test_pairs_shown_are_those_where_runs_differ() -> None:
     first = to_table(results([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.05, 0.0]))
     second = to_table(results([0.0, 0.9, 0.06, 0.0, 0.0, 0.0, 0.0, 0.8]))

@@ -47,13 +47,3 @@ def test_images_that_share_points_are_those_counted_one_by_one(minimum: int) -> 
     assert [tuple(p) for p in pairs.pairs.tolist()] == expected
     assert len(expected) > 50
     assert len(sharing_points([])) == 0
-
-
-def test_a_draw_is_without_repetition_and_of_the_seed() -> None:
-    assert list(drawn(5, None, 0)) == list(drawn(5, 7, 0)) == [0, 1, 2, 3, 4]
-    first, again, other = (np.asarray(drawn(10**6, 500, seed)) for seed in (0, 0, 1))
-    np.testing.assert_array_equal(first, again)
-    assert not np.array_equal(first, other)
-    assert len(set(first.tolist())) == 500
-    assert (np.diff(first) > 0).all()
-    assert abs(first.mean() - 5e5) < 4 * 1e6 / np.sqrt(12 * 500)

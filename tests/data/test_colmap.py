@@ -149,15 +149,6 @@ def test_damaged_text_is_named_with_its_line(damage: str, tmp_path: Path) -> Non
     assert "\n" not in str(raised.value)
 
 
-def test_an_image_without_points_has_an_empty_line(tmp_path: Path) -> None:
-    folder = write_colmap(tmp_path / "scene")
-    path = folder / "sparse/0/images.txt"
-    lines = path.read_text().splitlines()
-    path.write_text("\n".join([*lines[:3], "", *lines[4:-1], ""]) + "\n")
-    model = read_model(folder / "sparse/0")
-    assert [len(image.points) for image in model.images] == [0, 0, 5]
-
-
 def test_binary_files_cut_anywhere_are_refused(tmp_path: Path) -> None:
     """Every shorter file is refused with its record, and so is every longer one; none makes a traceback."""
     sparse = write_colmap(tmp_path / "scene") / "sparse/0"

@@ -13,15 +13,9 @@ from fmtorch.data.cameras import Camera, fundamental
 from fmtorch.data.construction import Construction, blocks
 from fmtorch.data.images import to_grey
 from tests.conftest import shared_path
-from tests.data.native import write_colmap, write_image
+from tests.data.native import write_image
 from tests.helpers import apart, call_command
 
-SELECTED = {
-    "PhotoTourism/sacre_coeur": 34,
-    "Strecha/Herz-Jesus-P8": 26,
-    "Strecha/fountain-P11": 53,
-    "Strecha_train/castle-P19": 85,
-}
 """The column `selected` of the README of the shared data, for the scenes of which all pairs were candidates."""
 
 
@@ -46,14 +40,6 @@ def test_kept_pairs_of_a_real_scene_are_selected_again() -> None:
     assert {pair for pair, verified in kept.items() if verified} <= passed
     assert passed <= kept.keys()  # of this scene every selected pair was kept
     assert len(passed) == 4  # of six
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("scene", SELECTED)
-def test_real_scenes_give_the_pairs_that_the_shared_data_kept(scene: str) -> None:
-    passed, kept = judged(scene, images=100)
-    assert {pair for pair, verified in kept.items() if verified} <= passed
-    assert abs(len(passed) - SELECTED[scene]) <= 0.1 * SELECTED[scene]
 
 
 @pytest.fixture
@@ -184,28 +170,3 @@ def test_a_draw_is_the_same_however_it_is_interrupted(
     assert [p.identity for p in load("fmbench", root=tmp_path / "Made")] == [
         f"Made/{'ab'[scene]}/{i}-{j}" for scene, i, j in places
     ]
-
-
-@pytest.mark.slow
-def test_processes_make_the_same_set(scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    run(tmp_path, monkeypatch, "count=3", "workers=1")
-    alone = (tmp_path / "Made/pairs_with_gt.txt").read_bytes()
-    run(tmp_path, monkeypatch, "count=3", "workers=2", "output=Other")
-    assert (tmp_path / "Other/pairs_with_gt.txt").read_bytes() == alone
-
-
-def test_undistorted_images_are_written_as_they_are_seen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fmtorch.data.construction.matchable", lambda *_: True)
-    dataset = load("colmap", root=write_colmap(tmp_path / "Source/scene"), pairs=None)
-    construction = Construction(dataset, tmp_path / "Made", quality=100)  # type: ignore[arg-type]
-    construction.begin()
-    for number, ranks in blocks(construction.order()):
-        construction.judge(number, ranks)
-    for scene, number in construction.used(range(3)):
-        construction.write_image(scene, number)
-    construction.finish(range(3), {})
-    for ours, theirs in zip(load("fmbench", root=tmp_path / "Made"), dataset, strict=True):
-        for image in ("image0", "image1"):
-            a, b = (read_image(getattr(pair, image)).astype(int) for pair in (ours, theirs))
-            assert np.abs(a - b).max() <= 3
-        np.testing.assert_array_equal(ours.K1, theirs.K1)

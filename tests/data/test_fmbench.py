@@ -50,22 +50,6 @@ def test_a_folder_of_sets(tmp_path: Path) -> None:
         load("fmbench", root=tmp_path, subset=["a", "c"])
 
 
-def test_a_repeated_pair_has_an_identity_of_its_own(tmp_path: Path) -> None:
-    root = write_set(tmp_path / "S", [LINE] * 3, ["a/"] * 3, {"a": ["00000000.jpg", "00000001.jpg"]})
-    pairs = list(FMBenchPairs(root))
-    assert [p.identity for p in pairs] == ["S/a/0-1", "S/a/0-1#2", "S/a/0-1#3"]
-    assert len({p.key for p in pairs}) == 3
-
-
-def test_digest_is_of_the_contents_not_of_the_place(tmp_path: Path) -> None:
-    first, second = FMBenchPairs(small_set(tmp_path / "x/S")), FMBenchPairs(small_set(tmp_path / "y/S"))
-    assert first.digest == second.digest
-    assert FMBenchPairs(tmp_path / "x/S", subset="a").digest != first.digest
-    (tmp_path / "y/S/a/Camera.txt").write_text(" ".join("1" * 21) + "\n" + " ".join("1" * 21))
-    assert FMBenchPairs(tmp_path / "y/S").digest != first.digest
-    assert FMBenchPairs(tmp_path / "y/S", cameras=False).digest == first.digest
-
-
 @pytest.mark.parametrize(
     ("line", "reason"),
     [

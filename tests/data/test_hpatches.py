@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from fmtorch.data import DataError, load, read_image
-from fmtorch.data.hpatches import LARGE, HPatchesPairs
+from fmtorch.data.hpatches import HPatchesPairs
 from tests.data import planes
 
 
@@ -37,15 +37,6 @@ def test_homographies_are_of_the_images_as_they_are_read(tmp_path: Path) -> None
             cv2.erode(cv2.warpPerspective(np.full((200, 300), 255, np.uint8), pair.H, (300, 200)), np.ones((9, 9))) > 0
         )
         assert np.abs(warped - b)[seen].mean() < 6  # of 255; a shift by one pixel makes it more than 10
-
-
-def test_large_images_are_left_out_unless_asked_for(tmp_path: Path) -> None:
-    for name in ("v_talent", "v_view"):
-        planes.write_sequence(tmp_path / name, "0000.jpg", light=False)
-    assert "v_talent" in LARGE
-    assert {pair.scene for pair in load("hpatches", root=tmp_path)} == {"v_view"}
-    assert {pair.scene for pair in load("hpatches", root=tmp_path, large=True)} == {"v_talent", "v_view"}
-    assert {pair.scene for pair in load("hpatches", root=tmp_path, sequences=["v_talent"])} == {"v_talent"}
 
 
 @pytest.mark.parametrize(

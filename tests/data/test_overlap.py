@@ -15,17 +15,15 @@ from fmtorch.data.overlap import (
     STEP,
     TOLERANCE,
     DepthOverlap,
-    PointOverlap,
     Seen,
     overlap_of,
     seen_share,
     shared_points,
 )
 from fmtorch.data.pairs import ImageSource
-from fmtorch.data.scenes import ScenePairs, incidence
+from fmtorch.data.scenes import incidence
 from fmtorch.scenes import Plan, RenderedPairs
 from fmtorch.scenes.dataset import RenderedScenePairs
-from tests.conftest import shared_path
 from tests.data.native import write_colmap, write_kitti
 from tests.reference import overlap as reference
 
@@ -101,29 +99,6 @@ def test_overlap_by_points_is_that_counted_point_by_point() -> None:
     expected = [reference.by_points(points[i].tolist(), points[j].tolist()) for i, j in pairs]
     np.testing.assert_allclose(shared_points(incidence(points), pairs), expected, rtol=0, atol=1e-15)
     assert len(shared_points(incidence(points), pairs[:0])) == 0
-
-
-def test_overlap_by_the_points_of_a_real_model() -> None:
-    dataset = load("colmap", root=shared_path("data/native/colmap_sacre_coeur"), pairs=None)
-    assert isinstance(dataset, ScenePairs)
-    overlaps = overlap_of(dataset)
-    assert isinstance(overlaps, PointOverlap)
-    lines = [
-        line
-        for line in shared_path("data/native/colmap_sacre_coeur/sparse/images.txt").read_text().splitlines()
-        if not line.startswith("#")
-    ]
-    names = [line.split()[9] for line in lines[::2]]
-    seen = {
-        name: [int(p) for p in line.split()[2::3] if p != "-1"] for name, line in zip(names, lines[1::2], strict=True)
-    }
-    views = [view.image.path.name for view in dataset.scenes[0].views]
-    places = [dataset.candidate(rank) for rank in range(dataset.candidates)]
-    assert len(places) == 45
-    for scene, i, j in places:
-        assert overlaps.of((scene, i, j)) == pytest.approx(
-            reference.by_points(seen[views[i]], seen[views[j]]), abs=1e-15
-        )
 
 
 def run(folder: Path, monkeypatch: pytest.MonkeyPatch, *words: str) -> None:

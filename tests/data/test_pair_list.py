@@ -68,20 +68,6 @@ def test_f_relates_the_images_as_they_are_read(turns: tuple[int, int], tmp_path:
     assert apart(pair.F, unit(np.linalg.inv(A1).T @ plain.F @ np.linalg.inv(A0))) < 1e-9
 
 
-def test_resizing_by_one_number_and_by_two(tmp_path: Path) -> None:
-    file = lists.write(tmp_path / "list.txt", [lists.glue_factory(0, 1)])
-    stored, small, fixed = (
-        load("pair_list", root=lists.images(), file=file, resize=resize) for resize in (None, 320, [160, 120])
-    )
-    assert len({stored.digest, small.digest, fixed.digest}) == 3
-    assert read_image(fixed[0].image0).shape[:2] == read_image(fixed[0].image1).shape[:2] == (120, 160)
-    assert max(read_image(small[0].image1).shape) == 320
-    h, w = read_image(stored[0].image0).shape[:2]
-    K, K_fixed = stored[0].K0, fixed[0].K0
-    np.testing.assert_allclose(K_fixed[0, 0] / K[0, 0], 160 / w)
-    np.testing.assert_allclose((K_fixed[1, 2] + 0.5) / (K[1, 2] + 0.5), 120 / h)
-
-
 def scannet(folder: Path, with_motion: bool, with_intrinsics: bool) -> tuple[Path, Path]:
     """ScanNet in LoFTR's layout, of two images of the shared scene: the images' folder and the list."""
     root, (a, b) = folder / "scans", lists.cameras()[:2]

@@ -219,18 +219,6 @@ def test_hloc_files(tmp_path: Path) -> None:
         assert file.execute("SELECT COUNT(*) FROM two_view_geometries").fetchone() == (len(circle.pairs),)
 
 
-def test_indices_beyond_16_bits(tmp_path: Path) -> None:
-    points = np.random.default_rng(0).uniform(0, 800, (40_000, 2)).astype(np.float32)
-    circle = Circle()
-    circle.images = [StoredImage(f"{i}.png", points, points[:, 0], SIZE) for i in (0, 1)]
-    matches = np.array([[39_999, 39_998]], np.int32)
-    circle.pairs = [StoredPair("0.png", "1.png", matches, np.ones(1, np.float32), np.ones(1, bool), np.eye(3))]
-    kept, ends = journal(tmp_path, circle)
-    write_exports(kept, ends, ("h5",), tmp_path)
-    with h5py.File(tmp_path / "matches.h5") as file:
-        assert file["0.png/1.png/matches0"][39_999] == 39_998
-
-
 def test_kinds() -> None:
     assert export_kinds(None) == ()
     assert export_kinds("colmap, h5") == ("colmap", "h5")

@@ -18,7 +18,7 @@ from fmtorch.commands import match as match_command
 from fmtorch.io.export import DATABASE, FEATURES, MATCHES
 from fmtorch.pipeline.folder import chosen_pairs, images_below, open_folder
 from fmtorch.runs import RunFolder
-from tests.helpers import compose, draw
+from tests.helpers import compose, draw, draw_set
 
 OPTIONS = ("features.max_features=400", "estimator=lmeds", "estimator.hypotheses=100", "cache=off")
 
@@ -30,7 +30,6 @@ def config(command: str, *words: str) -> DictConfig:
 @pytest.fixture
 def images(tmp_path: Path) -> Path:
     """Three views of one picture, one in a folder of its own, and another picture."""
-    (tmp_path / "images" / "more").mkdir(parents=True)
     for i, name in enumerate(("a.png", "b.png", "more/c.png")):
         draw(tmp_path / "images" / name, seed=0, shift=12 * i)
     draw(tmp_path / "images" / "other.png", seed=1)
@@ -160,15 +159,12 @@ def test_settings_that_cannot_be_read(tmp_path: Path) -> None:
 
 def test_an_evaluation_and_its_way_back(tmp_path: Path) -> None:
     """What an evaluation exports, also after it has ended, and what that is as a data set."""
-    folder = tmp_path / "Set" / "scene" / "Images"
-    folder.mkdir(parents=True)
-    for i in range(3):
-        draw(folder / f"{i:08d}.png", seed=0, shift=9 * i)
+    root = draw_set(tmp_path / "Set", pairs=[(0, 1), (0, 2), (1, 2)])
     camera = np.concatenate([[300, 0, 160, 0, 300, 120, 0, 0, 1], np.eye(3).ravel()])
-    np.savetxt(folder.parent / "Camera.txt", [np.concatenate([camera, [-i, 0, 0]]) for i in range(3)])
-    F = "0 0 0 0 0 -1 0 1 0"
-    (tmp_path / "Set" / "pairs_with_gt.txt").write_text(f"0 1 {F}\n0 2 {F}\n1 2 {F}\n2 0 nan{F[1:]}\n")
-    (tmp_path / "Set" / "pairs_which_dataset.txt").write_text("scene/\n" * 4)
+    np.savetxt(root / "scene" / "Camera.txt", [np.concatenate([camera, [-i, 0, 0]]) for i in range(3)])
+    for name, line in (("gt", "2 0 nan 0 0 0 0 -1 0 1 0"), ("which_dataset", "scene/")):
+        path = next(root.glob(f"pairs_*{name}.txt"))
+        path.write_text(f"{path.read_text()}{line}\n")
 
     def run(run_dir: str, *words: str) -> tuple[Path, dict[str, list[Any]]]:
         path = eval_command.run(config("eval", f"run_dir={tmp_path / run_dir}", *words), "sift_ratio")

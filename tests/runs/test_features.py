@@ -5,7 +5,6 @@ import os
 import re
 import runpy
 import sys
-import types
 from pathlib import Path
 
 import numpy as np
@@ -19,11 +18,10 @@ from fmtorch import presets
 from fmtorch.core.stages import TimedExtractor, TwoStepExtractor
 from fmtorch.core.types import Features
 from fmtorch.data import read_image
-from fmtorch.features import RootSIFTPCA
 from fmtorch.pipeline.build import load_pipeline
 from fmtorch.runs import fingerprint as configuration_module
 from fmtorch.runs.feature_cache import ArrayCache, CachedFeatures, cached, image_digest
-from fmtorch.runs.fingerprint import configuration, learned
+from fmtorch.runs.fingerprint import configuration
 from tests.conftest import shared_path
 from tests.helpers import in_threads
 
@@ -285,33 +283,6 @@ def test_configuration_of_files_tensors_networks_and_code(tmp_path: Path, monkey
     configuration_module.code_digest.cache_clear()
     assert configuration(sift)["code"] != code
     configuration_module.code_digest.cache_clear()
-
-
-class Typed(torch.nn.Linear):
-    """A network as if typed in where no file holds it."""
-
-
-def test_learned_files_are_digests(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    file = tmp_path / "a.npz"
-    file.write_bytes(b"one")
-    before = learned(presets.build("features", "rootsiftpca", descriptor={"name": "rootsiftpca", "model": str(file)}))
-    assert len(before) == 1
-    file.write_bytes(b"two")
-    os.utime(file, (1, 1))
-    after = learned({"a": [RootSIFTPCA(file), RootSIFTPCA(file)]})
-    assert len(after) == 1
-    assert after != before
-    network = torch.nn.Linear(2, 2)
-    (before,) = learned(network)
-    with torch.no_grad():
-        network.weight[0, 0] += 1
-    assert learned(network) != [before]
-    monkeypatch.setitem(sys.modules, "typed_in", types.ModuleType("typed_in"))
-    monkeypatch.setattr(Typed, "__module__", "typed_in")
-    assert len(learned(Typed(2, 2))) == 1
-    assert learned(presets.build("features", "sift")) == []
-    assert learned(lambda: None) == []
-    assert learned(RootSIFTPCA(tmp_path / "absent.npz")) == []
 
 
 def test_the_command_tells_what_is_there(

@@ -59,18 +59,6 @@ def test_a_method_has_its_own_pairs_and_of_equal_rows_the_last_counts() -> None:
     assert own.get("b", ["orbit/s/0"])("nsgd").shape == (2, 1)
 
 
-def test_figures_that_are_not_defined_do_not_count() -> None:
-    of_pair = [
-        row("a", "orbit/s/0", 1.0, 0, ok=False, inlier_rate=None),
-        row("a", "orbit/s/0", 0.0, 1, inlier_rate=0.8),
-        row("a", "orbit/s/1", 1.0, 0, ok=False, inlier_rate=None),
-    ]
-    own = Results(of_pair)
-    assert own.cell("a", ["orbit/s/0"], "%Inlier") == "80.0"
-    assert own.cell("a", ["orbit/s/1"], "%Inlier") == own.cell("a", [], "R.05") == ""
-    assert own.cell("a", ["orbit/s/0"], "failed") == "0.5"
-
-
 def test_a_table_is_markdown_here_and_one_value_a_cell_in_its_file(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

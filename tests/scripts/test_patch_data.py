@@ -2,7 +2,6 @@
 
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,8 +17,6 @@ from scripts.patch_networks.patches import (
     View,
     Warps,
     apply,
-    linked,
-    near,
     patch_similarity,
     random_homography,
     rays_and_incidence,
@@ -77,20 +74,6 @@ def test_a_store_is_complete_deterministic_and_gives_two_different_views(tmp_pat
         assert torch.equal(mine[shown[0]], a[0])
         assert torch.equal(mine[shown[1]], b[0])
         assert shown[0] != shown[1]
-
-
-def test_a_store_of_planes_and_scenes_keeps_their_geometry(tmp_path: Path) -> None:
-    task = Task("indoor", "train", 0, 3, Plan(1, 3, 0, scale=0.4))
-    cutting = Cutting(PLANES, 60, longest_side=300)
-    options: dict[str, Any] = {"seed": 0, "scenes": [task, task]}
-    one, two = (build_store(tmp_path / name, package_photographs()[:1], cutting, **options) for name in ("a", "b"))
-    for a, b in zip(one.tracks, two.tracks, strict=True):
-        np.testing.assert_array_equal(a, b)
-    assert len(one.tracks.view) == len(one.patches) == one.first[-1]
-    of_point = [set(one.tracks.view[a:b]) for a, b in zip(one.first[:-1], one.first[1:], strict=True)]
-    assert all(len(views) >= 2 for views in of_point)
-    last = {view for views in of_point[-5:] for view in views}
-    assert min(last) > max(of_point[0])  # views are numbered through
 
 
 def test_an_unreadable_photograph_leaves_no_store(tmp_path: Path) -> None:
@@ -164,30 +147,6 @@ def test_points_are_where_the_surfaces_put_them() -> None:
     free = ~behind & inside & away & (np.abs(b.camera.centre[0] + SCREEN * from_b[:, 0]) > 0.05)
     assert free.sum() > 300
     assert seen[free].all()
-
-
-def test_points_are_linked_once_and_are_not_near_each_other() -> None:
-    rng = np.random.default_rng(0)
-    first, views = view(0.0), []
-    for x, turn in ((0.0, 0.0), (0.4, -0.1), (0.8, -0.2)):
-        v = view(x, turn)
-        there, seen = transferred(first.keypoints, first, v)
-        found = there[seen] + rng.normal(0, 0.1, (seen.sum(), 4)) * [1, 1, 0.1, 0.1]
-        extra = np.c_[rng.uniform(20, 200, (40, 2)), np.full(40, 3.0), rng.uniform(-3, 3, 40)]
-        views.append(View(v.image, v.camera, v.inverse_depth, np.concatenate([found, extra])))
-    owners = linked(views, Tolerance())
-    for owner in owners:
-        shown = owner[owner >= 0]
-        assert len(np.unique(shown)) == len(shown)
-    counts = np.bincount(np.concatenate(owners)[np.concatenate(owners) >= 0])
-    assert (counts == 3).sum() > 300
-    for a, mine in zip(views, owners, strict=True):
-        for b, theirs in zip(views, owners, strict=True):
-            there, seen = transferred(a.keypoints, a, b)
-            i, j, _ = near(there[seen], b.keypoints, Tolerance())
-            one, other = mine[seen][i], theirs[j]
-            # What is as near as one point can be is one point, but for what chance put between two of them.
-            assert (one == other)[(one >= 0) & (other >= 0)].mean() > 0.97
 
 
 def test_angles_and_similarity_are_their_definitions() -> None:

@@ -14,7 +14,6 @@ from torch import Tensor, nn
 
 from fmtorch.core.files import conf_dir
 from fmtorch.features.networks import AffNet, GeoDesc, HardNet, build, load_weights
-from fmtorch.features.onnx_network import PatchNetwork
 from fmtorch.scenes.textures import photograph
 from fmtorch.training.export import sha256
 from fmtorch.training.planes import PlaneViews
@@ -33,13 +32,11 @@ from scripts.patch_networks.objectives import (
     middle,
     patch_quality,
     relative_distance,
-    sample,
-    shape_matrix,
     structured,
 )
 from scripts.patch_networks.patches import Tolerance, patch_similarity, tracks_of_views, views_of_plane
 from scripts.patch_networks.stores import PatchStore, Tracks, build_store, package_photographs, validation_pairs
-from scripts.patch_networks.train import cutting_of, objective_of, training_of
+from scripts.patch_networks.train import cutting_of, training_of
 from scripts.patch_networks.training import MatchSetTraining, PatchTraining, TrainingOptions, match_sets
 from tests.reference import geodesc as geodesc_reference
 from tests.reference import patch_losses as reference
@@ -79,19 +76,6 @@ def test_losses_are_their_definitions() -> None:
     a, b = unit(10, 5, 0)
     expected = reference.relative_distance(a.tolist(), b.tolist(), 0.7)
     assert float(relative_distance(a, b, compactness=0.7)) == pytest.approx(expected, abs=1e-6)
-
-
-def test_the_negative_of_the_shape_loss_is_a_constant() -> None:
-    a, b = unit(8, 4, 0, noise=1.0)
-    a.requires_grad_()
-    loss = hard_negative_constant(a, b)
-    assert float(loss.detach()) == pytest.approx(float(hardest_triplet(a, b).detach()))
-    active = ((1 + (a - b).norm(dim=1)) > 0).double()
-    (gradient,) = torch.autograd.grad(loss, a)
-    direction = (a - b) / (a - b).norm(dim=1, keepdim=True) * active[:, None] / 8
-    tangent = direction - a * (direction * a).sum(1, keepdim=True)
-    mine = gradient - a * (gradient * a).sum(1, keepdim=True)  # the loss knows unit vectors only
-    torch.testing.assert_close(mine, tangent.detach(), atol=1e-6, rtol=0)
 
 
 def geodesc_of_one_set(a: Tensor, b: Tensor) -> Tensor:
@@ -233,24 +217,6 @@ def test_a_teacher_adds_the_distance_to_its_descriptors(store: PatchStore) -> No
     torch.testing.assert_close(taught, plain + 2 * apart)
 
 
-def test_sampling_through_the_identity_is_the_middle_and_a_turn_is_a_turn(store: PatchStore) -> None:
-    patches = validation_pairs(store, 20)[0]
-    seen, turned = (
-        sample(patches, torch.tensor(matrix).expand(len(patches), 2, 2))
-        for matrix in ([[1.0, 0], [0, 1]], [[0.0, -1], [1, 0]])  # the patch's x axis shows what was y
-    )
-    torch.testing.assert_close(seen, middle(patches), atol=1e-5, rtol=0)
-    torch.testing.assert_close(turned, middle(patches).rot90(1, (2, 3)), atol=1e-4, rtol=0)
-
-
-def test_shapes_have_determinant_one_and_zero_is_a_circle() -> None:
-    x = torch.rand(50, 3, generator=torch.Generator().manual_seed(0)) * 1.6 - 0.8
-    matrix = shape_matrix(x)
-    torch.testing.assert_close(torch.linalg.det(matrix), torch.ones(50), atol=1e-5, rtol=0)
-    assert (matrix[:, 0, 1] == 0).all()
-    torch.testing.assert_close(shape_matrix(torch.zeros(1, 3))[0], torch.eye(2))
-
-
 def test_shape_training_moves_the_network_and_not_the_descriptor(store: PatchStore) -> None:
     descriptor = HardNet().eval().requires_grad_(False)
     before = {k: v.clone() for k, v in descriptor.state_dict().items()}
@@ -339,41 +305,9 @@ def test_match_sets_are_their_definition() -> None:
         match_sets(tracks, 500)
 
 
-def test_draws_are_different_matches_of_their_sets() -> None:
-    sets = match_sets(random_tracks(0)[0], 15, 1.0)
-    chosen, numbers = [3, 0], torch.rand(2, 12, generator=torch.Generator().manual_seed(0))
-    patches, similarity = sets.draw(chosen, 12, numbers)
-    assert patches.shape == (2, 2, 12)
-    for row, i in enumerate(chosen):
-        members = sets.patches[:, sets.first[i] : sets.first[i + 1]].T.tolist()
-        drawn = patches[:, row].T.tolist()
-        assert all(pair in members for pair in drawn)
-        assert len({tuple(pair) for pair in drawn}) == 12
-        values = sets.similarity[sets.first[i] : sets.first[i + 1]]
-        assert similarity[row].tolist() == [values[members.index(pair)] for pair in drawn]
-
-
-def test_training_on_match_sets_lowers_the_loss(store: PatchStore) -> None:
-    run = set_training(store)
-    before = run.objective.evaluate(run.network.eval(), validation_pairs(store, 100))
-    run.run()
-    assert sum(run.losses[-4:]) < 0.7 * sum(run.losses[:4])
-    assert run.objective.evaluate(run.network.eval(), validation_pairs(store, 100))["map"] > before["map"]
-
-
 def config(*overrides: str) -> DictConfig:
     with initialize_config_dir(str(conf_dir()), version_base=None):
         return compose("train_patch_network", overrides=["training=geodesc", "images=.", *overrides])
-
-
-@pytest.mark.parametrize(("name", "teacher"), [("hardnet_fast", "hardnet.int8.onnx"), ("affnet_fast", "affnet.onnx")])
-def test_fast_networks_have_teachers(name: str, teacher: str) -> None:
-    objective = objective_of(config(f"training={name}"), torch.device("cpu"))
-    assert isinstance(objective, DescriptorObjective | CovarianceObjective)
-    assert isinstance(objective.teacher, PatchNetwork)
-    assert objective.teacher.path.name == teacher
-    with_none = objective_of(config(f"training={name}", "~training.teacher"), torch.device("cpu"))
-    assert with_none.teacher is None  # type: ignore[attr-defined]
 
 
 def test_photographs_become_tracks_and_a_step_of_training(tmp_path: Path) -> None:

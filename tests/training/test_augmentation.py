@@ -18,7 +18,6 @@ from fmtorch.training.augmentation import (
     keep_ratio,
     move,
     rotate,
-    subset_size,
     swap,
     thinned_counts,
     transform,
@@ -28,12 +27,9 @@ from tests.training.conftest import exact
 CHANGES: dict[str, Callable[[LabelledMatches], LabelledMatches]] = {
     "swap": swap,
     "quarter turn": lambda m: rotate(m, 0, 90),
-    "half turn": lambda m: rotate(m, 1, 180),
     "three quarters": lambda m: rotate(m, 1, -90),
     "turn": lambda m: rotate(m, 0, 33.3),
-    "turn back": lambda m: rotate(m, 1, -128.0),
     "crop": lambda m: crop(m, 0, (100, 37, 640, 400)),
-    "crop 1": lambda m: crop(m, 1, (0, 20, 300, 300)),
     "ratio": lambda m: keep_ratio(m, 0.8),
     "all": lambda m: swap(rotate(crop(rotate(m, 0, 50), 0, (80, 80, 600, 500)), 1, 90)),
 }
@@ -160,7 +156,7 @@ def test_ratio_noise_and_two_swaps() -> None:
     assert same(swap(swap(m)), m)
 
 
-@pytest.mark.parametrize("epoch", range(12))
+@pytest.mark.parametrize("epoch", range(4))
 def test_the_truth_stays_true_after_any_draw(epoch: int) -> None:
     before = exact(n=400)
     after = dataclasses.replace(NOISELESS, turn=0.4, quarter_turn=0.4, crop=0.7)(before, seed=0, epoch=epoch)
@@ -229,31 +225,6 @@ def test_ranges_are_kept() -> None:
 )
 def test_thinning_reaches_its_share(inliers: int, outliers: int, share: float, expected: tuple[int, int]) -> None:
     assert thinned_counts(inliers, outliers, share) == expected
-
-
-def test_no_pair_loses_its_inliers_to_a_crop() -> None:
-    m, none_right = exact(n=40, share=0.5), exact(n=40, share=0.0, ignored=0.0)
-    hard = dataclasses.replace(ONLY, crop=1, crop_side=(0.05, 0.1), ratio=(0.01, 0.02))
-    for epoch in range(20):
-        assert int(hard(m, seed=0, epoch=epoch).inlier.sum()) >= min(MIN_INLIERS, int(m.inlier.sum()))
-        assert Augmentation()(none_right, seed=0, epoch=epoch).label.shape[1] > 0
-
-
-def test_the_subset_size_is_uniform_in_its_logarithm() -> None:
-    sizes = np.array([subset_size((50, 4000), u) for u in np.linspace(0, 1, 10000, endpoint=False)])
-    assert (subset_size((50, 4000), 0.0), subset_size((50, 4000), 1 - 2.0**-53)) == (50, 4000)
-    assert subset_size((7, 7), 0.5) == 7
-    assert np.median(sizes) == pytest.approx(np.sqrt(50 * 4001), rel=0.01)
-
-
-def test_the_expected_length_is_the_length_but_for_crops() -> None:
-    m = exact(n=500)
-    key = int(m.correspondences.keys[0])
-    for epoch in range(20):
-        for crop_probability, slack in ((0.0, 1), (1.0, 500)):
-            a = dataclasses.replace(Augmentation(), crop=crop_probability, matches=None)
-            expected = a.expected(m.correspondences.quality[0], m.label[0], key=key, seed=1, epoch=epoch)
-            assert expected == pytest.approx(a(m, seed=1, epoch=epoch).label.shape[1], abs=slack)
 
 
 def test_mistakes_are_named() -> None:

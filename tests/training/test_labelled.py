@@ -94,17 +94,6 @@ def test_collate_pads_and_indexing_takes_apart() -> None:
         collate([])
 
 
-def test_moves_and_gradients_reach_all_tensors() -> None:
-    m = exact().to("meta")
-    assert m.label.device.type == m.F.device.type == m.correspondences.x0.device.type == "meta"
-    leaf = exact()
-    x0 = leaf.correspondences.x0.clone().requires_grad_()
-    leaf = leaf.replace(correspondences=leaf.correspondences.replace(x0=x0))
-    assert leaf.requires_grad
-    assert not leaf.detach().requires_grad
-    assert leaf.replace(F=leaf.F.clone().requires_grad_()).detach().F.grad_fn is None
-
-
 def test_shapes_are_checked() -> None:
     x = torch.zeros(2, 3, 2)
     c = Correspondences(x, x, torch.ones(2, 3, dtype=torch.bool))
@@ -182,9 +171,8 @@ def test_a_point_that_would_be_behind_the_other_camera_is_wrong() -> None:
     assert by_transfer(forward, np.array([np.nan]), np.zeros(1)).tolist() == [0]
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_transfer_equals_the_scalar_reference_on_random_input(seed: int) -> None:
-    rng = np.random.default_rng(seed)
+def test_transfer_equals_the_scalar_reference_on_random_input() -> None:
+    rng = np.random.default_rng(0)
     n, k = 60, 4
     K0, K1 = (calibration(rng.uniform(50, 300), SIZE, (rng.uniform(0, 300), rng.uniform(0, 200))) for _ in range(2))
     R, _ = np.linalg.qr(rng.normal(size=(3, 3)))

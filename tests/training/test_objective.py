@@ -1,7 +1,6 @@
 """The losses of pruners and their objective: known answers, scalar references, gradients, degenerate pairs."""
 
 import functools
-import math
 from collections.abc import Callable
 
 import numpy as np
@@ -26,7 +25,7 @@ from fmtorch.training import (
     nsgd_loss,
     virtual_points,
 )
-from fmtorch.training.objective import LIMIT_E, LIMIT_F, TRIES, fits
+from fmtorch.training.objective import LIMIT_E, LIMIT_F, TRIES
 from tests import laws
 from tests.metrics.test_nsgd import random_pairs, rows_shifted
 from tests.reference import metrics as metric_reference
@@ -65,15 +64,6 @@ def test_classification_matches_scalar_reference(balanced: bool) -> None:
     assert found.item() == pytest.approx(sum(stages) / 2, rel=1e-12)
     first = classification_loss(logit[0], label, balanced=balanced)
     assert first.item() == pytest.approx(stages[0], rel=1e-12)
-
-
-@pytest.mark.parametrize("balanced", [False, True])
-def test_classification_is_least_at_the_share_of_inliers(balanced: bool) -> None:
-    """Matches that look alike share one logit, whose best value is the log-odds of their share of inliers."""
-    label = torch.tensor([[1] * 30 + [0] * 90 + [-1] * 7], dtype=torch.int8)
-    z = torch.tensor(math.log(30 / 90), dtype=torch.float64, requires_grad=True)
-    (gradient,) = torch.autograd.grad(classification_loss(z.expand(1, 127), label, balanced=balanced), z)
-    assert abs(gradient.item()) < 1e-15
 
 
 @settings(max_examples=20, deadline=None)
@@ -304,19 +294,6 @@ def test_geometric_terms_come_in_after_classification_alone() -> None:
     assert torch.equal(before["loss"], before["classification"])
     total = after["classification"] + 0.5 * after["geometric"] + 0.25 * after["nsgd"]
     assert after["loss"].item() == pytest.approx(total.item(), rel=1e-6)
-
-
-def test_terms_are_the_losses_of_the_weighted_fit() -> None:
-    batch = collate([labelled_pair(i) for i in range(2)])
-    c, made = batch.correspondences, prediction(batch)
-    F, valid = fits(made, batch)
-    own, _ = eight_point(c.x0.double(), c.x1.double(), made.weight[0].double(), c.mask)
-    assert torch.equal(F[0], own)
-    terms = Objective(classification_steps=0)(made, batch, 7)
-    expected = geometric_loss(F, batch.F, c.size0, c.size1, valid=valid, points=100, seed=7, key=c.keys)
-    assert float(terms["geometric"].detach()) == pytest.approx(float(expected.detach()))
-    classification = classification_loss(made.logit, batch.label)
-    assert float(terms["classification"].detach()) == pytest.approx(float(classification.detach()))
 
 
 def test_a_pair_that_cannot_be_judged_adds_nothing() -> None:

@@ -18,7 +18,6 @@ from fmtorch.core.types import pair_key
 from fmtorch.data.lenses import MODELS
 from fmtorch.io.colmap import EXIF_DEVIATION, MatchDatabase, database_image
 from fmtorch.verification import run
-from tests.conftest import shared_path
 from tests.processes import run_command, starter
 from tests.verification import databases
 from tests.verification.databases import SIZE, killed_and_continued, plain, read, scene, write
@@ -433,33 +432,3 @@ def test_the_incremental_mapper_registers_all_images(tmp_path: Path) -> None:
     for i in range(1, 6):
         R = poses[f"{i:03d}.jpg"] @ poses["000.jpg"].T
         assert angle(R.T @ cameras.relative(0, i)[0]) < 0.2
-
-
-@pytest.mark.slow
-def test_photographs_by_colmap_from_features_to_poses(tmp_path: Path) -> None:
-    """COLMAP's SIFT and matches of castle-P19, our geometries, COLMAP's mapper: all images, at the true rotations."""
-    folder = shared_path("data/Strecha_train/castle-P19")
-    names = [f"{i:08d}.jpg" for i in range(5)]
-    path, cpu = tmp_path / "database.db", pycolmap.Device.cpu
-    extraction = pycolmap.FeatureExtractionOptions(num_threads=1)
-    extraction.sift.max_num_features = 2000
-    pycolmap.extract_features(
-        path, folder / "Images", names, pycolmap.CameraMode.SINGLE, extraction_options=extraction, device=cpu
-    )
-    matching = pycolmap.FeatureMatchingOptions(num_threads=1, skip_geometric_verification=True)
-    pycolmap.match_exhaustive(path, matching_options=matching, device=cpu)
-    result = fmtorch.verify(path)
-    assert (result.pairs, result.problems) == (10, ())
-    assert result.verified >= 8
-    true = [line.reshape(-1)[9:18].reshape(3, 3) for line in np.loadtxt(folder / "Camera.txt")[:5]]
-    for (first, second), geometry in read(path).items():
-        if geometry.config == Configuration.UNCALIBRATED and len(geometry.inlier_matches) > 100:
-            R = geometry.cam2_from_cam1.rotation.matrix()
-            assert angle((true[second - 1] @ true[first - 1].T).T @ R) < 3
-    options = pycolmap.IncrementalPipelineOptions(min_model_size=3, extract_colors=False)
-    models = pycolmap.incremental_mapping(path, folder / "Images", tmp_path / "model", options)
-    (model,) = models.values()
-    assert model.num_reg_images() == 5
-    poses = {image.name: image.cam_from_world().rotation.matrix() for image in model.images.values()}
-    for name, R in zip(names, true, strict=True):
-        assert angle((R @ true[0].T).T @ poses[name] @ poses[names[0]].T) < 1
