@@ -3,14 +3,12 @@
 import functools
 import itertools
 import json
-import pickle
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from fmtorch.data import load
-from fmtorch.data.construction import Construction
 from fmtorch.data.overlap import (
     STEP,
     TOLERANCE,
@@ -118,33 +116,6 @@ def test_the_command_selects_by_overlap(tmp_path: Path, monkeypatch: pytest.Monk
         run(tmp_path, monkeypatch, *words, "overlap=[0.6,0.9]")
     run(tmp_path, monkeypatch, *words, "overlap=[0.6,0.6]", "output=Other")
     assert [pair.identity for pair in load("fmbench", root=tmp_path / "Other")] == ["Other/a/0-1"]
-
-
-def test_the_command_selects_from_rendered_scenes(
-    rendered: RenderedScenePairs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("fmtorch.data.build", lambda *_: rendered.drawn)
-    run(tmp_path, monkeypatch, "dataset=rendered", "overlap=[0.1,0.6]")
-    monkeypatch.undo()
-    overlaps = overlap_of(rendered)
-    places = [rendered.candidate(rank) for rank in range(rendered.candidates)]
-    expected = [(s, i, j) for s, i, j in places if 0.1 <= overlaps.of((s, i, j)) <= 0.6]
-    selected = load("fmbench", root=tmp_path / "Made")
-    names = [scene.name for scene in rendered.scenes]
-    assert sorted(pair.identity for pair in selected) == sorted(f"Made/{names[s]}/{i}-{j}" for s, i, j in expected)
-    for pair in selected:
-        (source,) = (
-            rendered[rank] for rank, (s, i, j) in enumerate(places) if pair.identity == f"Made/{names[s]}/{i}-{j}"
-        )
-        assert apart(pair.F, source.F) < 1e-12
-
-
-def test_other_processes_judge_the_same(rendered: RenderedScenePairs, tmp_path: Path) -> None:
-    here = Construction(rendered, tmp_path / "Made", overlap=(0.1, 0.6))
-    assert here.identity["rule"] == {"overlap": [0.1, 0.6], "by": "depth", "step_px": STEP, "tolerance": TOLERANCE}
-    there: Construction = pickle.loads(pickle.dumps(here))
-    places = [rendered.candidate(rank) for rank in range(4)]
-    assert [there.overlaps.of(place) for place in places] == [here.overlaps.of(place) for place in places]
 
 
 @pytest.mark.parametrize(

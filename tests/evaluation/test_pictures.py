@@ -65,18 +65,6 @@ def test_matches_are_drawn_between_their_points() -> None:
     assert xs.max() < offset + 320
 
 
-def test_no_more_lines_than_asked_for_and_none_of_points_that_are_not_finite() -> None:
-    x = np.column_stack([np.zeros(50), np.linspace(5, 95, 50)])
-    good = np.ones(50, bool)
-    picture = draw_matches(grey(100, 100), grey(100, 100), x, x, good, height=900, most=4)
-    column = near(picture, GOOD)[:, 450]
-    assert np.count_nonzero(np.diff(column.astype(int)) == 1) == 4
-    x[:] = np.nan
-    assert np.array_equal(
-        draw_matches(grey(100, 100), grey(100, 100), x, x, good), draw_matches(grey(100, 100), grey(100, 100), *NONE)
-    )
-
-
 def test_epipolar_lines_run_through_the_points_and_the_truth_is_white() -> None:
     x0, x1 = np.array([[20.0, 30], [70, 60]]), np.array([[40.0, 30], [50, 60]])
     images = np.zeros((90, 100, 3), np.uint8), np.zeros((90, 100, 3), np.uint8)

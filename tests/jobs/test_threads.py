@@ -15,8 +15,6 @@ from fmtorch.estimators import batch
 from fmtorch.evaluation.run import evaluate_pairs
 from fmtorch.jobs.execution import Execution
 from fmtorch.jobs.threads import available, mapped, one_thread
-from fmtorch.matching import nearest
-from fmtorch.pruning import position_consistency as consistency
 from tests.helpers import draw, pair
 from tests.helpers import small_pipeline as pipeline
 from tests.laws import degenerate, scene
@@ -52,29 +50,6 @@ def test_pruners_and_estimators_of_a_pipeline_have_one_thread(threads: int, tmp_
     assert torch.get_num_threads() == threads
 
 
-def test_matching_and_the_prior_of_find_fundamental_have_one_thread(
-    threads: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    seen = []
-
-    def watch(module: object, name: str) -> None:
-        function = getattr(module, name)
-
-        def watched(*arguments: object) -> object:
-            seen.append(torch.get_num_threads())
-            return function(*arguments)
-
-        monkeypatch.setattr(module, name, watched)
-
-    for module, name in ((nearest, "_finite"), (nearest, "_match_one_pair"), (consistency, "position_agreement")):
-        watch(module, name)
-    nearest.nearest_neighbors(torch.rand(30, 8), torch.rand(20, 8))
-    c = scene(0, 60)
-    assert bool(fmtorch.find_fundamental(c.x0, c.x1).ok)
-    assert seen == [1] * 4
-    assert torch.get_num_threads() == threads
-
-
 def test_an_error_leaves_threads_as_they_were(threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
     def fails(*_: object) -> None:
         raise RuntimeError("no")
@@ -84,16 +59,6 @@ def test_an_error_leaves_threads_as_they_were(threads: int, monkeypatch: pytest.
     with pytest.raises(RuntimeError, match="no"):
         built(collate([scene(0, 60), scene(1, 60)]))
     assert torch.get_num_threads() == threads
-
-
-def test_threads_that_torch_may_use_stay_known(threads: int) -> None:
-    with one_thread("cpu"):
-        with one_thread("cpu"):
-            assert (torch.get_num_threads(), available()) == (1, threads)
-        assert available() == threads
-    torch.set_num_threads(1)
-    with one_thread("cpu"):
-        assert available() == 1
 
 
 def test_items_are_mapped_in_order_by_threads_that_share_no_more(threads: int) -> None:

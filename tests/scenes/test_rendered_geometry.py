@@ -1,6 +1,5 @@
 """The ray-caster draws surfaces where the cameras say they are."""
 
-import cv2
 import numpy as np
 import pytest
 
@@ -19,23 +18,6 @@ def camera(
     x: float, y: float, z: float, target: tuple[float, float, float] = (0.0, 0.0, 1.0), focal: float = 150.0
 ) -> Camera:
     return look_at(calibration(focal, SIZE), SIZE, (x, y, z), target, roll=0.1 * x)
-
-
-def block_world(texture: np.ndarray) -> Surfaces:
-    """A wall, a floor and a box before them."""
-    surfaces = Surfaces()
-    number = surfaces.texture(texture)
-    surfaces.quad(vec(-6, 2, 5), vec(12, 0, 0), vec(0, 0, -5), number)
-    surfaces.quad(vec(-6, 2, 0), vec(12, 0, 0), vec(0, -8, 0), number)
-    surfaces.box(vec(-0.5, 0, 0), vec(1.2, 0.1, 0), vec(-0.1, 1, 0), 1.5, [number] * 5)
-    return surfaces
-
-
-def smooth_texture(seed: int = 0) -> np.ndarray:
-    noise = np.random.default_rng(seed).random((256, 256, 3)).astype(np.float32)
-    noise = cv2.GaussianBlur(noise, (0, 0), 8, borderType=cv2.BORDER_REFLECT)
-    noise = (noise - noise.min()) / np.ptp(noise)
-    return (noise * 255).astype(np.uint8)
 
 
 def points_seen(geometry: Geometry, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
@@ -76,23 +58,6 @@ def line_distance(F: np.ndarray, x0: np.ndarray, x1: np.ndarray) -> np.ndarray:
     l1, l0 = h0 @ F.T, h1 @ F
     error = np.abs((h1 * l1).sum(1))
     return np.maximum(error / np.hypot(l1[:, 0], l1[:, 1]), error / np.hypot(l0[:, 0], l0[:, 1]))
-
-
-def test_rays_meet_the_planes_that_a_scalar_intersection_finds() -> None:
-    geometry = Geometry(block_world(smooth_texture()))
-    c = camera(1.2, -3.0, 1.4)
-    hits, depth = geometry.look(c), geometry.depth_map(c)
-    for x, y in np.random.default_rng(1).integers(0, [SIZE[1], SIZE[0]], (150, 2)):
-        ray = c.R.T @ np.linalg.inv(c.K) @ [x, y, 1.0]
-        best, piece = np.inf, -1
-        for i in range(len(geometry.O)):
-            M = np.column_stack([geometry.U[i], geometry.V[i], -ray])
-            s, t, z = np.linalg.solve(M, c.centre - geometry.O[i])
-            front = (c.centre - geometry.O[i]) @ geometry.normal[i] > 0
-            if 0 <= s <= 1 and 0 <= t <= 1 and 0.05 < z < best and front:
-                best, piece = z, i
-        assert hits.piece[y, x] == piece
-        assert depth[y, x] == pytest.approx(best, rel=1e-9)
 
 
 @pytest.mark.parametrize("family", FAMILIES)

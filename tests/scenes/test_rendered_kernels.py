@@ -1,6 +1,5 @@
 """The ray-caster and light draw the same pictures as their definitions in NumPy, to the last bit."""
 
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -8,7 +7,6 @@ import pytest
 
 from fmtorch.scenes import raycast
 from fmtorch.scenes.camera import Camera, calibration, look_at
-from fmtorch.scenes.dataset import depth_at
 from fmtorch.scenes.generate import FAMILIES, Plan, Task, build
 from fmtorch.scenes.light import Lens, Light, Stage, expose
 from fmtorch.scenes.raycast import Geometry
@@ -106,21 +104,6 @@ def test_forms_draw_an_empty_view(monkeypatch: pytest.MonkeyPatch) -> None:
     pair = stages(surfaces, Light((0.3, -0.5, 0.8)), np.full((8, 16, 3), 90, np.uint8), monkeypatch)
     camera = look_at(calibration(80.0, SIZE), SIZE, (0.0, 0.0, 5.0), (0.0, 1.0, 9.0))
     assert (assert_equal_views(pair, camera, monkeypatch) == -1).all()
-
-
-def test_forms_give_the_same_depth(monkeypatch: pytest.MonkeyPatch) -> None:
-    task = Task("orbit", "train", 0, 3, Plan(1, 3, 2, 0.2))
-    points = np.random.default_rng(0).uniform(0, 100, (500, 2))
-
-    def depth() -> np.ndarray:
-        with ThreadPoolExecutor(1) as thread:  # each thread remembers its own views
-            return thread.submit(depth_at, task, 1, points).result()
-
-    depths = [depth()]
-    take_reference(monkeypatch)
-    depths.append(depth())
-    np.testing.assert_array_equal(*depths)
-    assert np.isfinite(depths[0]).any()
 
 
 def test_textures_too_small_to_shrink_are_refused() -> None:

@@ -159,21 +159,6 @@ def test_the_protocol_gives_each_estimator_its_options() -> None:
             Protocol.of(wrong)
 
 
-def test_the_published_figures_are_those_of_the_twenty_pinhole_sets() -> None:
-    thresholds, figures = posebench.read_published()
-    assert len(thresholds) == 20
-    assert {name.partition("_")[0]: px for name, px in thresholds.items() if "scannet" not in name} == {
-        "megadepth1500": 1.0, "imc": 0.75,
-    }  # fmt: skip
-    means = {m: [round(float(np.mean([each[h] for each in of.values()])), 1) for h in next(iter(of.values()))]
-             for m, of in figures.items()}  # fmt: skip
-    assert means == {
-        "E:poselib": [49.1, 63.5, 74.7], "E:colmap": [42.3, 58.6, 71.7], "F:poselib": [34.0, 47.9, 60.5],
-        "F:colmap": [29.4, 43.1, 56.5],
-    }  # fmt: skip
-    assert all(set(sets) == set(thresholds) for sets in figures.values())
-
-
 def test_what_is_not_posebenchs_is_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -1,8 +1,6 @@
 """`python -m scripts.benchmark related`: unrelated pairs, tables, ROC curves, and the command."""
 
-import math
 from pathlib import Path
-from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -52,22 +50,6 @@ def test_rendered_scenes_that_show_one_photograph_are_not_paired(
     unrelated = pairs.unrelated_pairs([*(pair(scene, 0, 1) for scene in "abcd"), pair("real", 0, 1)], [[]], 100)
     crossed = {p.scene.replace("family/", "") for p in unrelated}
     assert crossed == {"a | c", "a | d", "b | d", "c | d"}  # neither a | b, b | c, nor a drawn and a real one
-
-
-def test_area_counts_ties_half() -> None:
-    right, unrelated = [row(True, 0, s, 9) for s in (1.0, 2.0)], [row(False, 1, s, 9) for s in (0.0, 1.0, -math.inf)]
-    assert related.area(right, unrelated, related.significance) == pytest.approx(5.5 / 6)
-    assert related.area(right, unrelated, related.inliers) == 0.5
-
-
-def test_roc_goes_from_all_to_none(tmp_path: Path) -> None:
-    rows = [row(False, 1, s, 9) for s in (-math.inf, 0.0, 1.0)] + [row(True, 0, s, 9) for s in (1.0, 2.0)]
-    accepted, rejected = related.roc([*rows, row(True, 0.9, 3.0, 9)], related.significance)
-    assert accepted.tolist() == pytest.approx([1, 2 / 3, 1 / 3, 0, 0])  # at -inf, 0, 1, 2 and above all
-    assert rejected.tolist() == [0, 0, 0, 0.5, 1]
-    related.draw({"sift_a": rows, "sift_b": rows[:1] + rows[4:], "none": rows[:3]}, tmp_path / "a.svg")
-    texts = {element.text for element in ElementTree.parse(tmp_path / "a.svg").iter() if element.text}
-    assert {"sift_a", "sift_b (along the axes)", "unrelated pairs accepted, %"} <= texts
 
 
 def test_the_command_tells_pairs_apart(

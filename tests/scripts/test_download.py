@@ -92,14 +92,6 @@ def test_a_file_without_a_pinned_hash_needs_a_word(server: tuple[type[Ranges], s
     assert path.name == "HardNet++.pth"
 
 
-def test_unknown_weights_are_answered_with_those_there_are() -> None:
-    with pytest.raises(ValueError, match=r"there are: affnet, orinet, .*hardnet\+\+"):
-        SCRIPT["fetch"](config(weights="superpoint"))
-    for entry in SCRIPT["TABLE"].values():
-        assert entry.url.startswith("https://")
-        assert entry.sha256 is None or re.fullmatch("[0-9a-f]{64}", entry.sha256)
-
-
 def archive(path: Path, members: dict[str, bytes], link: str | None = None) -> bytes:
     """A gzipped tar of these files; link: a symbolic link to write besides."""
     with tarfile.open(path, "w:gz") as tar:

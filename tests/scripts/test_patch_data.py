@@ -11,21 +11,16 @@ from PIL import Image
 from fmtorch.scenes.camera import Camera, calibration, fundamental, look_at
 from fmtorch.scenes.generate import Plan, Task
 from fmtorch.scenes.textures import photograph
-from fmtorch.training.planes import Photograph, PlaneViews, list_photographs, local_affine
+from fmtorch.training.planes import Photograph, PlaneViews, list_photographs
 from scripts.patch_networks.patches import (
     Tolerance,
     View,
     Warps,
-    apply,
-    patch_similarity,
-    random_homography,
-    rays_and_incidence,
     tracks_of_views,
     transferred,
     views_of_plane,
 )
 from scripts.patch_networks.stores import Cutting, PatchStore, build_store, package_photographs, split
-from tests.reference import geodesc as reference
 
 SIZE = (240, 320)
 WALL, SCREEN = 4.0, 2.5  # metres in front of the first camera: the wall everywhere, the screen left of its middle
@@ -39,17 +34,6 @@ def correlations(patches: np.ndarray, point: np.ndarray) -> tuple[float, float]:
     first = np.searchsorted(point, np.arange(point.max() + 1))
     a, b = flat[first], flat[first + 1]
     return float(np.median((a * b).mean(1))), float(np.median((a * np.roll(b, 1, 0)).mean(1)))
-
-
-def test_a_view_contains_the_image_and_its_derivative_is_the_differences() -> None:
-    for seed in range(20):
-        H, (h, w) = random_homography(np.random.default_rng(seed), (300, 400), Warps())
-        corners = apply(H, np.array([[0, 0], [399, 0], [0, 299], [399, 299.0]]))
-        assert corners.min() > -1
-        assert (corners.max(0) < np.array([w, h]) + 1).all()
-        x, step = np.array([[120.0, 80.0]]), 1e-4
-        numeric = np.stack([(apply(H, x + d) - apply(H, x - d))[0] / (2 * step) for d in step * np.eye(2)], -1)
-        np.testing.assert_allclose(local_affine(H, x)[0], numeric, atol=1e-6)
 
 
 def test_a_store_is_complete_deterministic_and_gives_two_different_views(tmp_path: Path) -> None:
@@ -147,31 +131,6 @@ def test_points_are_where_the_surfaces_put_them() -> None:
     free = ~behind & inside & away & (np.abs(b.camera.centre[0] + SCREEN * from_b[:, 0]) > 0.05)
     assert free.sum() > 300
     assert seen[free].all()
-
-
-def test_angles_and_similarity_are_their_definitions() -> None:
-    a, b = view(0.0), view(1.2, -0.25)
-    points = world_points(a)
-    pixels, _ = b.camera.project(points)
-    b = View(b.image, b.camera, b.inverse_depth, np.c_[pixels, a.keypoints[:, 2:]])
-    found = [rays_and_incidence(v.keypoints, v) for v in (a, b)]
-    on_edge = np.abs(a.keypoints[:, 0] - (SIZE[1] - 1) / 2) < 1.5
-    assert np.isnan(found[0][1][on_edge]).all()
-    assert np.isfinite(found[0][1][~on_edge]).mean() > 0.9
-    seen = np.isfinite(found[0][1]) & np.isfinite(found[1][1]) & (np.abs(world_points(b) - points) < 1e-6).all(1)
-    assert seen.sum() > 300
-    similarity = patch_similarity(found[0][0], found[1][0], found[0][1], found[1][1])
-    normal = (0.0, -1.0, 0.0)  # of both surfaces, towards the cameras
-    for i in np.flatnonzero(seen)[::7]:
-        point = points[i].tolist()
-        for v, (rays, incidence) in zip((a, b), found, strict=True):
-            towards = v.camera.centre - points[i]
-            np.testing.assert_allclose(rays[i], towards / np.linalg.norm(towards), atol=1e-9)
-            assert incidence[i] == pytest.approx(reference.angle(towards.tolist(), normal), abs=1e-6)
-        centres = a.camera.centre.tolist(), b.camera.centre.tolist()
-        assert similarity[i] == pytest.approx(reference.patch_similarity(point, normal, *centres), abs=1e-6)
-    assert similarity[seen].max() - similarity[seen].min() > 0.1
-    np.testing.assert_allclose(patch_similarity(found[0][0], found[0][0], found[0][1], found[0][1])[seen], 1.0)
 
 
 def test_tracks_of_a_plane_show_the_same_point_under_its_angles() -> None:

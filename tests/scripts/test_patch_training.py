@@ -13,23 +13,16 @@ from omegaconf import DictConfig
 from torch import Tensor, nn
 
 from fmtorch.core.files import conf_dir
-from fmtorch.features.networks import AffNet, GeoDesc, HardNet, build, load_weights
+from fmtorch.features.networks import AffNet, GeoDesc, HardNet, build
 from fmtorch.scenes.textures import photograph
-from fmtorch.training.export import sha256
 from fmtorch.training.planes import PlaneViews
-from scripts.patch_networks.evaluate import DEFAULTS, figures, times
-from scripts.patch_networks.export import model_card
 from scripts.patch_networks.objectives import (
-    DRAWS,
-    CovarianceObjective,
     DescriptorObjective,
     ShapeObjective,
     fpr_at_recall,
     geodesc,
     geometric,
-    hard_negative_constant,
     hardest_triplet,
-    middle,
     patch_quality,
     relative_distance,
     structured,
@@ -76,17 +69,6 @@ def test_losses_are_their_definitions() -> None:
     a, b = unit(10, 5, 0)
     expected = reference.relative_distance(a.tolist(), b.tolist(), 0.7)
     assert float(relative_distance(a, b, compactness=0.7)) == pytest.approx(expected, abs=1e-6)
-
-
-def geodesc_of_one_set(a: Tensor, b: Tensor) -> Tensor:
-    return geodesc(a[None], b[None], torch.full((1, len(a)), 0.5))
-
-
-@pytest.mark.parametrize("loss", [hardest_triplet, hard_negative_constant, relative_distance, geodesc_of_one_set])
-def test_coincident_descriptors_have_finite_gradients(loss: Callable[[Tensor, Tensor], Tensor]) -> None:
-    a = nn.functional.normalize(torch.ones(4, 3), dim=1).requires_grad_()
-    loss(a, a).backward()
-    assert torch.isfinite(a.grad).all()
 
 
 def test_the_loss_of_match_sets_is_its_definition() -> None:
@@ -178,45 +160,6 @@ def test_a_checkpoint_of_other_options_is_refused(store: PatchStore, tmp_path: P
         set_training(store, batch=3200)
 
 
-def test_a_checkpoint_gives_the_network_its_card_and_its_figures(store: PatchStore, tmp_path: Path) -> None:
-    run = training(store)
-    run.run(until=2)
-    row = {"fpr95": 0.0123, "map": 0.91, "accuracy": 0.89}
-    run.save(tmp_path / "hardnet.pt", validation={"untrained": row, "trained": row})
-    network = build("hardnet").eval()
-    content = load_weights(network, tmp_path / "hardnet.pt")
-    x = middle(validation_pairs(store, 10)[0])
-    torch.testing.assert_close(network(x), run.network.eval()(x))
-    (tmp_path / "hardnet.onnx").write_bytes(b"as if")
-    card = model_card(tmp_path / "hardnet.onnx", "hardnet", "fp32", content, row)
-    digest = sha256(tmp_path / "hardnet.onnx")
-    for part in (digest, "2 steps of 24 points", "1 of scikit-image", "| trained | 1.23 | 91.00", "| this file | 1.23"):
-        assert part in card
-    other = model_card(tmp_path / "hardnet.onnx", "affnet", "int8", {**content, "loss": {"name": "affine_covariance"}})
-    assert "own, not AffNet's" in other
-    assert "own, not" not in card
-    config = DictConfig({**DEFAULTS, "networks": [str(tmp_path / "hardnet.pt")], "pairs": 20, "repeats": 1})
-    assert all(seconds > 0 for (repeat,) in times(config).values() for seconds in repeat)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(PatchStore, "open", lambda folder: store)
-        found = figures(config)
-    assert {"SIFT", "RootSIFT-PCA", "geodesc, untrained", "hardnet.pt"} <= found.keys()
-    assert found["SIFT"]["map"] > 0.5
-
-
-def test_a_teacher_adds_the_distance_to_its_descriptors(store: PatchStore) -> None:
-    torch.manual_seed(0)
-    network, teacher = HardNet(dropout=0.0).eval(), HardNet().eval().requires_grad_(False)
-    pairs, draws = validation_pairs(store, 12), torch.full((12, DRAWS), 0.9)  # neither mirrored nor turned
-    plain = DescriptorObjective(hardest_triplet).loss(network, pairs, draws)
-    itself = DescriptorObjective(hardest_triplet, network, weight=2.0).loss(network, pairs, draws)
-    torch.testing.assert_close(itself, plain)
-    taught = DescriptorObjective(hardest_triplet, teacher, weight=2.0).loss(network, pairs, draws)
-    patches = middle(pairs).flatten(0, 1)
-    apart = (network(patches) - teacher(patches)).square().sum(1).mean()
-    torch.testing.assert_close(taught, plain + 2 * apart)
-
-
 def test_shape_training_moves_the_network_and_not_the_descriptor(store: PatchStore) -> None:
     descriptor = HardNet().eval().requires_grad_(False)
     before = {k: v.clone() for k, v in descriptor.state_dict().items()}
@@ -228,40 +171,6 @@ def test_shape_training_moves_the_network_and_not_the_descriptor(store: PatchSto
     assert all(torch.equal(v, before[k]) for k, v in descriptor.state_dict().items())
     assert all(not torch.equal(v, start[k]) for k, v in network.named_parameters())
     assert set(run.objective.evaluate(network.eval(), validation_pairs(store, 30))) >= {"map", "circle_map"}
-
-
-class SecondMoment(nn.Module):
-    """Shapes from the second moments of a white disc that was stretched: covariant by construction."""
-
-    def forward(self, patches: Tensor) -> Tensor:
-        u = (torch.arange(32) + 0.5) / 16 - 1
-        grid = torch.stack(torch.meshgrid(u, u, indexing="xy"), -1).flatten(0, 1)
-        weight = patches.flatten(1)
-        moment = torch.einsum("np,pi,pj->nij", weight / weight.sum(1, keepdim=True), grid, grid)
-        A = torch.linalg.cholesky(moment)  # lower triangular, A A^T is the moment
-        A = A / torch.linalg.det(A).sqrt()[:, None, None]
-        return torch.stack([A[:, 0, 0] - 1, A[:, 1, 0], A[:, 1, 1] - 1], -1)
-
-
-class Circle(nn.Module):
-    def forward(self, patches: Tensor) -> Tensor:
-        return torch.zeros(len(patches), 3)
-
-
-def test_covariant_shapes_have_no_loss_and_constant_ones_do() -> None:
-    u = (torch.arange(64) + 0.5) / 16 - 2
-    disc = (u[:, None] ** 2 + u[None] ** 2 < 0.35**2).float()
-    pairs = disc.expand(2, 30, 1, 64, 64)
-    draws = torch.rand(30, DRAWS, generator=torch.Generator().manual_seed(0))
-    objective = CovarianceObjective(tilt=1.8)
-    covariant, constant = (float(objective.loss(f, pairs, draws)) for f in (SecondMoment(), Circle()))
-    assert covariant < constant / 5
-    found = objective.evaluate(SecondMoment(), pairs)
-    assert found["residual_tilt"] < 1.1 < found["circle_residual_tilt"]
-    draws = torch.zeros(1, DRAWS)
-    draws[0, 1] = 1.0  # T1 stretches 1.8 times, T2 not at all
-    loss = float(objective.loss(Circle(), pairs[:, :1], draws))
-    assert loss == pytest.approx(np.log((1.8 + 1 / 1.8) / 2), abs=1e-5)
 
 
 def random_tracks(seed: int) -> tuple[Tracks, dict[tuple[int, int], float]]:

@@ -28,7 +28,6 @@ from fmtorch.training import (
 from fmtorch.training.objective import LIMIT_E, LIMIT_F, TRIES
 from tests import laws
 from tests.metrics.test_nsgd import random_pairs, rows_shifted
-from tests.reference import metrics as metric_reference
 from tests.reference import pruner_losses as reference
 from tests.training.conftest import labelled_pair
 
@@ -115,28 +114,6 @@ def test_virtual_points_match_scalar_reference() -> None:
         for j, (m0, m1) in enumerate(points):
             np.testing.assert_allclose(x0[i, j], m0, rtol=1e-12)
             np.testing.assert_allclose(x1[i, j], m1, rtol=1e-9, atol=1e-9)  # as in the tests of NSGD
-
-
-@settings(max_examples=20, deadline=None)
-@given(seed=st.integers(0, 1000), scale=st.floats(-9, 9))
-def test_virtual_points_are_exact_and_inside(seed: int, scale: float) -> None:
-    F, _ = random_pairs(seed, 3)
-    F[2] = torch.tensor([torch.nan, 0.0, 1.0])[seed % 3]
-    size0, size1 = sizes(3)
-    x0, x1, mask = virtual_points(F * 10**scale, size0, size1, count=30, seed=seed)
-    assert not bool(mask[2].any()) or seed % 3 == 2
-    assert bool((x0[~mask] == 0).all())
-    for x, size in ((x0, size0), (x1, size1)):
-        limit = size.flip(-1)[:, None] - 0.5
-        assert bool(((x >= -0.5 - 1e-9) & (x <= limit + 1e-9))[mask].all())
-    for i in range(2):
-        for m0, m1 in zip(x0[i, mask[i]].numpy(), x1[i, mask[i]].numpy(), strict=True):
-            line = F[i].numpy() @ metric_reference.homogeneous(m0)
-            assert metric_reference.distance(m1, line) < 1e-8
-    alone = virtual_points(F[1:2], size0[1:2], size1[1:2], count=30, seed=seed)
-    torch.testing.assert_close(alone.x1[0], x1[1], rtol=1e-9, atol=1e-9)
-    with pytest.raises(ValueError, match="count is 0"):
-        virtual_points(F, size0, size1, count=0)
 
 
 K = torch.tensor([[500.0, 1.0, 310.0], [0.0, 520.0, 250.0], [0.0, 0.0, 1.0]], dtype=torch.float64)

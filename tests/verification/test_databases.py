@@ -416,19 +416,3 @@ def test_without_pycolmap_an_extra_is_named(tmp_path: Path) -> None:
     code = "import sys; sys.modules['pycolmap'] = None; sys.argv[1:] = ['verify', 'database.db']; import runpy; "
     done = run_command("-c", code + "runpy.run_module('fmtorch', run_name='__main__')", cwd=tmp_path)
     assert done.stderr == "error: pycolmap is not installed; pip install 'fmtorch[colmap]' brings it\n"
-
-
-@pytest.mark.slow
-def test_the_incremental_mapper_registers_all_images(tmp_path: Path) -> None:
-    """With calibrated cameras, and to poses that are the true ones after a similarity."""
-    path, cameras = tmp_path / "database.db", scene(6, count=400)
-    write(path, cameras)
-    fmtorch.verify(path)
-    options = pycolmap.IncrementalPipelineOptions(min_model_size=3, extract_colors=False)
-    models = pycolmap.incremental_mapping(path, tmp_path, tmp_path / "model", options)
-    assert [model.num_reg_images() for model in models.values()] == [6]
-    (model,) = models.values()
-    poses = {image.name: image.cam_from_world().rotation.matrix() for image in model.images.values()}
-    for i in range(1, 6):
-        R = poses[f"{i:03d}.jpg"] @ poses["000.jpg"].T
-        assert angle(R.T @ cameras.relative(0, i)[0]) < 0.2

@@ -14,7 +14,6 @@ from fmtorch.core.types import pair_key
 from tests.verification.databases import SIZE, killed_and_continued, matches, scene
 
 K = np.array([[600.0, 0, 319.5], [0, 600, 239.5], [0, 0, 1]])
-MATRICES = ("F", "E", "H", "R", "t")
 SIZES = {"size0": np.array(SIZE), "size1": np.array(SIZE)}
 CALIBRATIONS = {"K0": K, "K1": K}
 
