@@ -198,13 +198,13 @@ def _report(result: MatchResult, image0: Image, image1: Image, truth: NDArray[np
     report: dict[str, Any] = {
         "size0": image0.shape[:2], "size1": image1.shape[:2],
         "F": result.F.tolist() if result.ok else None, "reason": result.reason, "warning": result.warning,
-        "configuration": result.configuration or None,
+        "pair_type": result.pair_type or None,
         "homography": None if result.homography is None else result.homography.tolist(),
         "related": result.related, "significance": result.significance if math.isfinite(result.significance) else None,
         "features": [len(result.keypoints0), len(result.keypoints1)],
         "matches": result.counts, "seconds": result.seconds,
         "x0": c.x0[0].tolist(), "x1": c.x1[0].tolist(), "inliers": result.inliers.tolist(),
-        "ratio": None if c.quality is None else c.quality[0].tolist(),
+        "ratio": None if c.ambiguity is None else c.ambiguity[0].tolist(),
     }  # fmt: skip
     if (pinhole := result.undistorted) is not None:
         report |= {"undistorted_x0": pinhole.x0[0].tolist(), "undistorted_x1": pinhole.x1[0].tolist()}
@@ -249,7 +249,7 @@ def _draw(folder: Path, result: MatchResult, given: Photographs, truth: NDArray[
 
 def _troubles(result: MatchResult) -> list[str]:
     """What is said of a result that is not to be relied on."""
-    warning = result.warning if result.related or result.configuration != "unrelated" else ""  # which is said already
+    warning = result.warning if result.related or result.pair_type != "unrelated" else ""  # which is said already
     if not result.ok:
         return list(filter(None, (f"no F: {result.reason}", warning)))
     chance = (
@@ -272,7 +272,7 @@ def _table(result: MatchResult, cached: bool) -> Table:
         unit = {"features": "keypoints", "estimation": "inliers"}.get(step, "matches")
         left = f"{' + '.join(f'{count:,}' for count in counts)} {unit}"
         table.add_row(
-            step, result.configuration if step == "configuration" else left,
+            step, result.pair_type if step == "pair_type" else left,
             "cached" if cached and step == "features" else f"{seconds:.3f}",
         )  # fmt: skip
     return table

@@ -32,7 +32,7 @@ FOCAL = Rule(
 RELATED = 1.0
 """The significance from which on two images are called related; chosen on tuning pairs (docs/concepts/related.md)."""
 
-CONFIGURATIONS = ("general", "planar", "rotation", "identical", "unrelated")
+PAIR_TYPES = ("general", "planar", "rotation", "identical", "unrelated")
 WARNINGS = {
     "general": "",
     "planar": "one plane: matches do not determine F or focal lengths, and leave two poses of known cameras",
@@ -95,7 +95,7 @@ class Correspondences(Record):
     """A batch of B image pairs with their putative matches, padded to N slots.
 
     x0, x1: matched points (B, N, 2) in pixels. mask: (B, N).
-    quality: the matcher's own figure (B, N), for nearest neighbours the distance ratio; smaller is better.
+    ratio: the matcher's own figure (B, N), for nearest neighbours the distance ratio; smaller is better.
     prior: P(inlier) in [0, 1], (B, N), where something supplies it. noise: standard deviation of each match's distance
     to its epipolar line, relative to that of a usual match, (B, N), where something supplies it.
     lafs0, lafs1: local affine frames (B, N, 2, 3) where known. size0, size1: image sizes (B, 2) as (h, w).
@@ -109,7 +109,7 @@ class Correspondences(Record):
     x0: Float[Tensor, "b n 2"]
     x1: Float[Tensor, "b n 2"]
     mask: Bool[Tensor, "b n"]
-    quality: Float[Tensor, "b n"] | None = None
+    ratio: Float[Tensor, "b n"] | None = None
     prior: Annotated[Float[Tensor, "b n"], PROBABILITY] | None = None
     lafs0: Float[Tensor, "b n 2 3"] | None = None
     lafs1: Float[Tensor, "b n 2 3"] | None = None
@@ -171,7 +171,7 @@ class Estimate(Record):
     """Fundamental matrices of B pairs.
 
     F: (B, 3, 3) with unit Frobenius norm, zero where `ok` is False. inliers: (B, N), within the mask; none where `ok`
-    is False. ok: (B,). reason: why a pair failed, empty where it did not. draws: minimal samples drawn, (B,).
+    is False. ok: (B,). reason: why a pair failed, empty where it did not. samples: minimal samples drawn, (B,).
     significance: (B,), how far the support of F is beyond chance, see `fmtorch.geometry.significance`: -log10 of the
     number of models with as much support that are expected among images that show nothing in common; -inf where `ok`
     is False, NaN where nobody has computed it; never None. model: what `F` is, "fundamental", or "homography" for
@@ -186,7 +186,7 @@ class Estimate(Record):
     log f0, log f1), radians and logarithms, where t moves to ``t + tangents tau``; tangents (B, 3, 2);
     covariance_F (B, 9, 9), of F row by row. See `fmtorch.geometry.covariance`.
 
-    Where the configuration is asked for: configuration_index (B,), into `CONFIGURATIONS`; homography (B, 3, 3), of the
+    Where the configuration is asked for: pair_type_index (B,), into `PAIR_TYPES`; homography (B, 3, 3), of the
     plane, the rotation or the copy, zero where there is none; other_R, other_t, the second pose that explains a plane,
     NaN where there is none.
     """
@@ -195,7 +195,7 @@ class Estimate(Record):
     inliers: Bool[Tensor, "b n"]
     ok: Bool[Tensor, " b"]
     reason: tuple[str, ...]
-    draws: Int[Tensor, " b"]
+    samples: Int[Tensor, " b"]
     significance: Float[Tensor, " b"] | None = None
     model: str = "fundamental"
     E: Float[Tensor, "b 3 3"] | None = None
@@ -207,7 +207,7 @@ class Estimate(Record):
     covariance: Float[Tensor, "b 7 7"] | None = None
     tangents: Float[Tensor, "b 3 2"] | None = None
     covariance_F: Float[Tensor, "b 9 9"] | None = None
-    configuration_index: Int[Tensor, " b"] | None = None
+    pair_type_index: Int[Tensor, " b"] | None = None
     homography: Float[Tensor, "b 3 3"] | None = None
     other_R: Float[Tensor, "b 3 3"] | None = None
     other_t: Float[Tensor, "b 3"] | None = None
@@ -241,15 +241,15 @@ class Estimate(Record):
 
     @property
     def configuration(self) -> tuple[str, ...]:
-        """The name in `CONFIGURATIONS` of each pair. Raises AttributeError where it was not asked for."""
-        if self.configuration_index is None:
-            raise AttributeError("the configuration is not known; find_fundamental(..., configuration=True) tells it")
-        return tuple(CONFIGURATIONS[i] for i in self.configuration_index.tolist())
+        """The name in `PAIR_TYPES` of each pair. Raises AttributeError where it was not asked for."""
+        if self.pair_type_index is None:
+            raise AttributeError("the configuration is not known; find_fundamental(..., pair_type=True) tells it")
+        return tuple(PAIR_TYPES[i] for i in self.pair_type_index.tolist())
 
     @property
     def warning(self) -> tuple[str, ...]:
         """What the configuration of each pair leaves open, empty where nothing. Raises as `configuration`."""
-        return tuple(WARNINGS[name] for name in self.configuration)
+        return tuple(WARNINGS[name] for name in self.pair_type)
 
     @property
     def deviation_degrees(self) -> Float[Tensor, "b 2"]:

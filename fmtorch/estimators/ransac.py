@@ -188,7 +188,7 @@ class Ransac:
         """The selected model, and the samples drawn: among plausible cameras first where the image sizes are known."""
         if self.focal is None or not pair.sizes_known:
             pool = self.search(pair)
-            return self.select(self.refine(pool, pair, self.family), pair), pool.draws
+            return self.select(self.refine(pool, pair, self.family), pair), pool.samples
         plausible: PlausibleCandidates | None = None
         draws = 0
         if self.focal.search is not None:
@@ -199,7 +199,7 @@ class Ransac:
         pool = self.search(pair)
         selection = self.focal.select(self.refine(pool, pair, self.family), pair, plausible)
         valid = selection.valid or (plausible is not None and plausible.valid)
-        return selection._replace(valid=valid), draws + pool.draws
+        return selection._replace(valid=valid), draws + pool.samples
 
     def inliers(self, F: Array, pair: Pair) -> Array:
         """The inliers (n,) of a model (9,)."""

@@ -240,6 +240,6 @@ def shown_pair(pair: ImagePair, runs: Sequence[Run], pipelines: Mapping[str, Pip
             pictures = drawn(pair, images, stored, outcome, r.name)
         pictures = pictures or from_stored(pair, images, stored, r.name)
         nsgd = float(stored["nsgd"]) if stored["ok"] else None
-        kind = stored["configuration"] or ""
+        kind = stored["pair_type"] or ""
         seen.append(Shown(r.name, nsgd, str(stored["reason"]), pictures, kind, stored["corner_error"]))
     return ShownPair(pair.identity, seen, notes)

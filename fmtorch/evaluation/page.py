@@ -55,7 +55,7 @@ class Shown:
     nsgd: float | None
     reason: str = ""
     pictures: Sequence[Picture] = ()
-    configuration: str = ""
+    pair_type: str = ""
     corner_error: float | None = None
 
     @property
@@ -71,7 +71,7 @@ class Shown:
         if self.corner_error is not None:
             return f"failed: {self.reason}" if self.reason else f"corner error {self.corner_error:.2f} px"
         result = f"failed: {self.reason}" if self.nsgd is None else f"NSGD {self.nsgd:.4f}"
-        return f"{result}, {self.configuration}" if self.configuration not in ("", "general") else result
+        return f"{result}, {self.pair_type}" if self.pair_type not in ("", "general") else result
 
 
 @dataclasses.dataclass(frozen=True)

@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from fmtorch.core.types import CONFIGURATIONS
+from fmtorch.core.types import PAIR_TYPES
 from fmtorch.evaluation.statistics import (
     MERITS,
     THRESHOLD,
@@ -54,7 +54,7 @@ def summarize(table: pa.Table, signed: bool = False) -> dict[str, Group]:
     - homography: of the pairs whose true homography is known, which have no NSGD and no recall, see
       `homography_figures`; None where there are none.
     - pose: of the pairs whose cameras are known, see `pose_figures`; None where there are none.
-    - configurations: how many pairs are in each of `CONFIGURATIONS`; None where none is known.
+    - pair_types: how many pairs are in each of `PAIR_TYPES`; None where none is known.
     - focals: of the focal lengths that were estimated, see `focal_figures`; None where there are none.
     - seconds: median per pair for each stage, and ``total``.
     """
@@ -89,8 +89,8 @@ def _group(table: pa.Table, signed: bool) -> Group:
 
     group["pose"] = pose_figures(_column(table, "rotation_error"), _column(table, "translation_error"), signed)
     group["homography"] = homography_figures(_column(table, "corner_error"))
-    kinds = Counter(kind for kind in table["configuration"].to_pylist() if kind is not None)
-    group["configurations"] = {name: kinds[name] for name in CONFIGURATIONS} if kinds else None
+    kinds = Counter(kind for kind in table["pair_type"].to_pylist() if kind is not None)
+    group["pair_types"] = {name: kinds[name] for name in PAIR_TYPES} if kinds else None
     columns = ("focal_error0", "focal_error1"), ("focal_log_ratio0", "focal_log_ratio1")
     errors, ratios = (np.stack([_column(table, name) for name in names], 1) for names in columns)
     group["focals"] = focal_figures(errors, ratios, ok)

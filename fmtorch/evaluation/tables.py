@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rich import box
 from rich.table import Table as TerminalTable
 
-from fmtorch.core.types import CONFIGURATIONS
+from fmtorch.core.types import PAIR_TYPES
 from fmtorch.evaluation.curves import NSGD, axis_of
 from fmtorch.evaluation.statistics import (
     CORNER_THRESHOLDS,
@@ -174,7 +174,7 @@ def parts(groups: Mapping[str, Group], binned: bool = True) -> list[Part]:
         _poses(known("pose"), binned),
         Part("Homography", HOMOGRAPHY, HOMOGRAPHY_COLUMNS, known("homography")),
         Part("Focal lengths", FOCALS, FOCAL_COLUMNS, known("focals")),
-        Part("Configurations", KINDS, {name: _number(name) for name in CONFIGURATIONS}, known("configurations")),
+        Part("Pair types", KINDS, {name: _number(name) for name in PAIR_TYPES}, known("pair_types")),
     ]
     return [table for table in tables if table.rows]
 
@@ -198,9 +198,9 @@ def _poses(rows: Mapping[str, Group], binned: bool) -> Part:
 
 def _parts_of_run(summary: Mapping[str, Group], binned: bool) -> list[Part]:
     """Configurations only where a pair is not general."""
-    kinds = [group["configurations"] or {} for group in summary.values()]
+    kinds = [group["pair_types"] or {} for group in summary.values()]
     general = not any(count for counts in kinds for kind, count in counts.items() if kind != "general")
-    return [part for part in parts(_groups(summary), binned) if part.heading != "Configurations" or not general]
+    return [part for part in parts(_groups(summary), binned) if part.heading != "Pair types" or not general]
 
 
 def terminal_tables(summary: Mapping[str, Group], title: str) -> list[TerminalTable]:

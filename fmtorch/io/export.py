@@ -112,7 +112,7 @@ class Edge:
     inliers: int
     significance: float | None
     related: bool
-    configuration: str
+    pair_type: str
 
 
 @dataclasses.dataclass(frozen=True)
@@ -149,7 +149,7 @@ def view_graph(journal: MatchStore, images: Sequence[Path], pairs: Sequence[tupl
             pair = journal.pair(*ends)
             significance = pair.significance if math.isfinite(pair.significance) else None
             counts = len(pair.matches), int(pair.inliers.sum())
-            edges.append(Edge(pair.name0, pair.name1, *counts, significance, pair.related, pair.configuration))
+            edges.append(Edge(pair.name0, pair.name1, *counts, significance, pair.related, pair.pair_type))
     return ViewGraph(tuple(journal.name(image) for image in images), tuple(edges))
 
 

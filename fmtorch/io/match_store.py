@@ -66,7 +66,7 @@ def two_view_geometry(pycolmap: Any, pair: PairGeometry) -> Any:
 
 
 Array = NDArray[np.float64]
-_PAIR = ("matches", "scores", "inliers", "F", "related", "significance", "configuration")
+_PAIR = ("matches", "scores", "inliers", "F", "related", "significance", "pair_type")
 _GEOMETRY = ("F", "E", "H", "R", "t")  # matrices of a geometry, of those that there are
 
 
@@ -104,7 +104,7 @@ class StoredPair:
     related: bool = True
     geometry: PairGeometry | None = None
     significance: float = math.nan
-    configuration: str = ""
+    pair_type: str = ""
 
 
 class MatchRecords(NamedTuple):
@@ -176,7 +176,7 @@ class MatchStore:
             if "kind" in stored:
                 matrices = [stored.get(f"geometry_{name}") for name in _GEOMETRY]
                 geometry = PairGeometry(cast(Kind, str(stored["kind"])), stored["geometry_inliers"], *matrices)
-        values |= {name: values[name].item() for name in ("related", "significance", "configuration")}
+        values |= {name: values[name].item() for name in ("related", "significance", "pair_type")}
         return StoredPair(self.name(image0), self.name(image1), geometry=geometry, **values)
 
     def _image(self, image: Path) -> Path:

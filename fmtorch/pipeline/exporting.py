@@ -18,7 +18,7 @@ from fmtorch.io.match_store import MatchRecords, PairGeometry, StoredImage, Stor
 from fmtorch.pipeline.photograph_cameras import PhotographCamera
 from fmtorch.pipeline.pipeline import Outcome, Pipeline
 from fmtorch.pipeline.two_images import Described, MatchResult, pair_geometries
-from fmtorch.two_view.pair_type import Configuration
+from fmtorch.two_view.pair_type import PairTypes
 
 EXACT = (1.0, 0.0)  # px, relative deviation; K stands for the pixels
 
@@ -39,20 +39,20 @@ def match_records(pipeline: Pipeline, outcomes: Sequence[Outcome]) -> MatchRecor
         matched = c if outcome.keypoints is None else outcome.keypoints
         names = str(ends[0]), str(ends[1])
         kept = _pair(names, points, matched, F, estimate.inliers[0], bool(estimate.related[0]))
-        if outcome.configuration is not None:
-            kept = dataclasses.replace(kept, geometry=_geometry(kept.matches, c, estimate, outcome.configuration))
+        if outcome.pair_type is not None:
+            kept = dataclasses.replace(kept, geometry=_geometry(kept.matches, c, estimate, outcome.pair_type))
         records.pairs[ends] = kept
     return records
 
 
 def _geometry(
-    matches: NDArray[np.int32], c: Correspondences, estimate: Estimate, configuration: Configuration
+    matches: NDArray[np.int32], c: Correspondences, estimate: Estimate, pair_type: PairTypes
 ) -> PairGeometry:
     """The geometry of one pair for COLMAP, whose surviving matches are these keypoints, (m, 2).
 
     Where the estimator was given nothing of cameras that are known, and F is determined, the pose is that of F.
     """
-    if not c.asks_for_cameras and c.K0 is not None and c.K1 is not None and bool(configuration.determined[0]):
+    if not c.asks_for_cameras and c.K0 is not None and c.K1 is not None and bool(pair_type.determined[0]):
         ends = estimate.F.double(), c.K0.double(), c.K1.double(), c.x0.double(), c.x1.double()
         pose = pose_from_fundamental(*ends, estimate.inliers & c.mask)
         E = cross_matrix(pose.t) @ pose.R
@@ -60,7 +60,7 @@ def _geometry(
         c = c.derived(focal=torch.tensor([[EXACT, EXACT]], dtype=torch.float64, device=c.mask.device))
     index = np.zeros((c.mask.shape[1], 2), np.int32)
     index[c.mask[0].cpu().numpy()] = matches
-    (geometry,) = pair_geometries([index], c, estimate, configuration)
+    (geometry,) = pair_geometries([index], c, estimate, pair_type)
     return geometry
 
 
@@ -89,7 +89,7 @@ def exported_match(names: tuple[str, str], described: tuple[Described, Described
     if (geometry := result.geometry) is not None:
         geometry = geometry._replace(inliers=pair.matches[geometry.inliers[:, 0]])
     return dataclasses.replace(
-        pair, geometry=geometry, significance=result.significance, configuration=result.configuration
+        pair, geometry=geometry, significance=result.significance, pair_type=result.pair_type
     )
 
 
@@ -118,8 +118,8 @@ def _pair(
         indices(keypoints, x[0].detach().cpu().float()[mask].numpy())
         for keypoints, x in zip(points, (c.x0, c.x1), strict=True)
     ]
-    quality = torch.zeros(len(mask)) if c.quality is None else c.quality[0].detach().cpu().float()
-    scores = (1 - quality[mask]).nan_to_num(0.0).clamp(0.0, 1.0)
+    ratio = torch.zeros(len(mask)) if c.ambiguity is None else c.ambiguity[0].detach().cpu().float()
+    scores = (1 - ratio[mask]).nan_to_num(0.0).clamp(0.0, 1.0)
     return StoredPair(
         *names, np.stack(index, -1).astype(np.int32), scores.numpy(), inliers.cpu()[mask].numpy(),
         F.detach().cpu().double().numpy(), related,

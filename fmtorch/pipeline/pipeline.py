@@ -33,7 +33,7 @@ from fmtorch.data.images import read_image, to_grey
 from fmtorch.data.pairs import GivenMatches, ImagePair, ImageSource
 from fmtorch.geometry.significance import judged
 from fmtorch.jobs.threads import one_thread
-from fmtorch.two_view.pair_type import Configuration, classify
+from fmtorch.two_view.pair_type import PairTypes, classify
 
 Key = TypeVar("Key")
 Value = TypeVar("Value")
@@ -99,7 +99,7 @@ class Outcome:
     correspondences, estimate: batches of one; None where the pair failed before that stage.
     features: how many each image has. seconds: per stage; a batched stage is shared out evenly, and features count in
     full for each pair that uses them, cached ones with the seconds they took when they were computed.
-    reason: why the pair failed, empty where it did not. configuration, not_examined: of this pair alone, or why there
+    reason: why the pair failed, empty where it did not. pair_type, not_examined: of this pair alone, or why there
     is none, where it was asked for (`fmtorch.pipeline.pipeline`). images: for pruners that look at them. keypoints:
     the correspondences as the matcher left them, where pruners that look at images may have moved their points.
     """
@@ -110,7 +110,7 @@ class Outcome:
     estimate: Estimate | None = None
     seconds: dict[str, float] = dataclasses.field(default_factory=dict)
     reason: str = ""
-    configuration: Configuration | None = None
+    pair_type: PairTypes | None = None
     not_examined: str = ""
     images: PairImages | None = None
     keypoints: Correspondences | None = None
@@ -309,7 +309,7 @@ class Pipeline:
             if own:
                 family_outcomes = [outcomes[i] for i in own]
                 c = collated(family_outcomes)
-                keypoints = Correspondences(c.x0, c.x1, c.mask, quality=c.quality)
+                keypoints = Correspondences(c.x0, c.x1, c.mask, ratio=c.ambiguity)
 
                 def images(i: int, family_outcomes: list[Outcome] = family_outcomes) -> PairImages:
                     return family_outcomes[i].images or self.images(family_outcomes[i].pair)
@@ -341,7 +341,7 @@ def _alone(stage: str, function: Callable[[list[Outcome]], list[Outcome]], outco
         return dataclasses.replace(outcome, correspondences=None, images=None, reason=described(stage, error))
 
 
-# Which configurations the pairs of a run are in, by the matches and what the estimator was given of the cameras
+# Which pair types the pairs of a run are in, by the matches and what the estimator was given of the cameras
 
 
 Knowledge = Callable[[Correspondences], Correspondences]
@@ -350,7 +350,7 @@ Knowledge = Callable[[Correspondences], Correspondences]
 def examined(
     pipeline: Pipeline, outcomes: Sequence[Outcome], seed: int = 0, knowledge: Knowledge | None = None
 ) -> list[Outcome]:
-    """The outcomes of a run with their configurations; a pair that cannot be examined has none and harms no other.
+    """The outcomes of a run with their pair types; a pair that cannot be examined has none and harms no other.
 
     knowledge: gives correspondences what the estimator was given of their cameras; None: nothing, and their K counts
     for nothing here. Matches of the results have what it gives. Of homographies nothing is asked.
@@ -373,12 +373,12 @@ def _examined(outcomes: Sequence[Outcome], seed: int, knowledge: Knowledge | Non
     c = collate([o.correspondences for o in outcomes if o.correspondences is not None])
     estimate = collate([o.estimate for o in outcomes if o.estimate is not None])
     if knowledge is None:
-        configuration = classify(c.derived(K0=None, K1=None), estimate, seed=seed)
+        pair_type = classify(c.derived(K0=None, K1=None), estimate, seed=seed)
     else:
         c = knowledge(c)
-        configuration = classify(c, estimate, seed=seed)
+        pair_type = classify(c, estimate, seed=seed)
     return [
-        dataclasses.replace(outcome, correspondences=c[i], configuration=configuration.of_pair(i))
+        dataclasses.replace(outcome, correspondences=c[i], pair_type=pair_type.of_pair(i))
         for i, outcome in enumerate(outcomes)
     ]
 

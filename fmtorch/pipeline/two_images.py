@@ -42,7 +42,7 @@ from fmtorch.pipeline.reduced_images import (
 )
 from fmtorch.two_view.arguments import Arrays, Focal, camera_fields
 from fmtorch.two_view.known_cameras import KnownCameras
-from fmtorch.two_view.pair_type import FOCAL_DEVIATION, Configuration, classify, compile_with, still_warning
+from fmtorch.two_view.pair_type import FOCAL_DEVIATION, PairTypes, classify, compile_with, still_warning
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -78,7 +78,7 @@ def describe(pipeline: Pipeline, image: Image, longest_side: int) -> Described:
 # What is found of two photographs
 
 
-FLAT = ("planar", "rotation", "identical")  # configurations of which a homography explains all matches
+FLAT = ("planar", "rotation", "identical")  # pair types of which a homography explains all matches
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -94,7 +94,7 @@ class MatchResult:
     each step, cached features with those they took when they were computed.
     R (3, 3), t (3,), focals (2,): X1 = R X0 + t with a t of unit length, and focal lengths in pixels of the
     photographs, where cameras were asked for; NaN where not determined.
-    configuration: one of `CONFIGURATIONS`; empty where nothing could be matched. geometry: the two-view geometry for
+    pair_type: one of `PAIR_TYPES`; empty where nothing could be matched. geometry: the two-view geometry for
     COLMAP, whose inliers are indices of the kept matches, twice. undistorted: where a lens distorts, the kept matches
     as pinholes would have them, which F and homography relate; points are otherwise those of the photographs.
     """
@@ -114,14 +114,14 @@ class MatchResult:
     R: Float[Tensor, "3 3"] | None = None
     t: Float[Tensor, " 3"] | None = None
     focals: Float[Tensor, " 2"] | None = None
-    configuration: str = ""
+    pair_type: str = ""
     geometry: PairGeometry | None = None
     undistorted: Correspondences | None = None
 
     @property
     def homography(self) -> Float[Tensor, "3 3"] | None:
         """Of planes, rotations and copies: ``x1 ~ H x0`` in pixels of the photographs; else None."""
-        H = None if self.geometry is None or self.configuration not in FLAT else self.geometry.H
+        H = None if self.geometry is None or self.pair_type not in FLAT else self.geometry.H
         return None if H is None else torch.from_numpy(H)
 
     @property
@@ -135,7 +135,7 @@ class MatchResult:
         return not self.reason
 
 
-# Estimates of pairs and their configurations as the two-view geometries of COLMAP's databases
+# Estimates of pairs and their pair types as the two-view geometries of COLMAP's databases
 
 
 KINDS: dict[int, Kind] = {PLANAR: "planar", ROTATION: "panoramic", IDENTICAL: "planar_or_panoramic"}
@@ -143,7 +143,7 @@ MAX_CONFLICT = 3.0  # deviations, of an estimated focal length from that of a ca
 
 
 def pair_geometries(
-    matches: Sequence[NDArray[np.integer[Any]]], c: Correspondences, estimate: Estimate, configuration: Configuration
+    matches: Sequence[NDArray[np.integer[Any]]], c: Correspondences, estimate: Estimate, pair_type: PairTypes
 ) -> list[PairGeometry]:
     """The geometries of a batch of pairs.
 
@@ -155,10 +155,10 @@ def pair_geometries(
         matches: keypoints of both images, (n, 2), of each pair.
         c: the same matches, with what the estimator was given of their cameras.
         estimate: their estimates.
-        configuration: of `classify`.
+        pair_type: of `classify`.
     """
     calibrated = _calibrated(c, estimate)
-    kind, homography = configuration.kind, configuration.homography
+    kind, homography = pair_type.kind, pair_type.homography
     kinds = torch.where(kind != GENERAL, kind, torch.where(estimate.related, GENERAL, -1)).tolist()
     results = []
     for i, (index, what) in enumerate(zip(matches, kinds, strict=True)):
@@ -172,7 +172,7 @@ def pair_geometries(
         elif what not in KINDS:
             results.append(PairGeometry("degenerate", index[:0]))
         elif what == ROTATION:
-            R = configuration.evidence.R[i].cpu().numpy()
+            R = pair_type.evidence.R[i].cpu().numpy()
             results.append(PairGeometry("panoramic", inliers, H=H, R=R, t=np.zeros(3)))
         else:
             results.append(PairGeometry(KINDS[what], inliers, H=H))
@@ -355,18 +355,18 @@ def _estimated(
     estimate: Estimate = judged(estimator(c, seed).detach(), c)
     clock("estimation")
     even, F, even_scales = evenly_reduced(c, estimate.F, scales)
-    configuration = classify(even, estimate.derived(F=F), seed=seed)
-    clock("configuration")
+    pair_type = classify(even, estimate.derived(F=F), seed=seed)
+    clock("pair_type")
     index = np.arange(c.mask.shape[1]).repeat(2).reshape(-1, 2)
-    (geometry,) = pair_geometries([index], even, estimate.derived(F=F), configuration)
+    (geometry,) = pair_geometries([index], even, estimate.derived(F=F), pair_type)
     inliers = estimate.inliers[0]
     R, t, focals = (None if value is None else value[0] for value in (estimate.R, estimate.t, estimate.focals))
     return dataclasses.replace(
         matched, inliers=inliers, F=estimate.F[0].to(torch.float64), reason=estimate.reason[0],
-        warning=still_warning(matched.correspondences, inliers) or configuration.warnings[0],
+        warning=still_warning(matched.correspondences, inliers) or pair_type.warnings[0],
         counts={**matched.counts, "estimation": int(inliers.sum())}, seconds=clock.seconds,
         significance=float(cast(Tensor, estimate.significance)[0]), R=R, t=t, focals=focals,
-        configuration=configuration.names[0], geometry=geometry_to_original(geometry, *even_scales), undistorted=c,
+        pair_type=pair_type.names[0], geometry=geometry_to_original(geometry, *even_scales), undistorted=c,
     )  # fmt: skip
 
 

@@ -31,7 +31,7 @@ def logistic(z: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
 class Calibration:
     """``P(inlier) = logistic(constant + evidence e + ratio q)`` of the evidence e and the distance ratio q.
 
-    with_ratio: {constant, evidence, ratio}, where matches have a `quality`. alone: {constant, evidence}, where they
+    with_ratio: {constant, evidence, ratio}, where matches have a `ratio`. alone: {constant, evidence}, where they
     have none; without it their prior stays as it is. `scripts/calibrate_priors.py` fits these numbers.
     """
 
@@ -40,12 +40,12 @@ class Calibration:
 
     def __call__(self, c: Correspondences, evidence: Float[Tensor, "b n"]) -> Correspondences:
         """The same matches with ``prior``, zero where masked. A ratio that is NaN counts as 1. Log-odds are float32."""
-        fitted = self.alone if c.quality is None else self.with_ratio
+        fitted = self.alone if c.ambiguity is None else self.with_ratio
         if fitted is None:
             return c
         log_odds = fitted["constant"] + fitted["evidence"] * torch.where(c.mask, evidence.float(), 0)
-        if c.quality is not None:
-            log_odds = log_odds + fitted["ratio"] * torch.where(c.mask, c.quality.float(), 0).nan_to_num(nan=1.0)
+        if c.ambiguity is not None:
+            log_odds = log_odds + fitted["ratio"] * torch.where(c.mask, c.ambiguity.float(), 0).nan_to_num(nan=1.0)
         return c.derived(prior=torch.where(c.mask, logistic(log_odds), 0).to(c.x0.dtype))
 
 
@@ -61,7 +61,7 @@ def calibration_of(
 
 
 class RatioPrior:
-    """Supplies ``prior``: P(inlier) from the distance ratio alone. Without `quality` the prior stays as it is."""
+    """Supplies ``prior``: P(inlier) from the distance ratio alone. Without `ratio` the prior stays as it is."""
 
     def __init__(self, *, calibration: Mapping[str, Mapping[str, float]]) -> None:
         self.calibration = Calibration(**calibration)

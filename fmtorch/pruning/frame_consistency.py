@@ -45,21 +45,21 @@ from fmtorch.pruning.neighbors import (
 class FramedMatches(NamedTuple):
     """The matches of one pair: points x0, x1 (n, 2), frames lafs0, lafs1 (n, 2, 3), pixels; which are real, mask (n,).
 
-    quality: (n,), empty where unknown.
+    ratio: (n,), empty where unknown.
     """
 
     x0: F4x2
     x1: F4x2
     lafs0: F4x3
     lafs1: F4x3
-    quality: F4x1
+    ratio: F4x1
     mask: B1x1
 
 
 @kernel
 def frame_agreement_kernel(matches: FramedMatches, out: F4x1) -> None:
     """`frame_consistency.frame_agreement` of n matches -> out (n,)."""
-    x0, x1, lafs0, lafs1, quality, mask = matches
+    x0, x1, lafs0, lafs1, ratio, mask = matches
     n, zero = len(mask), x0.dtype.type(0)
     rows, match = np.empty((10, n), x0.dtype), np.empty(n, np.int64)
     m = 0
@@ -73,8 +73,8 @@ def frame_agreement_kernel(matches: FramedMatches, out: F4x1) -> None:
         rows[6, m] = (lafs1[i, 1, 0] * d + lafs1[i, 1, 1] * -c) / determinant
         rows[7, m] = (lafs1[i, 1, 0] * -b + lafs1[i, 1, 1] * a) / determinant
         rows[8, m] = math.sqrt(abs(rows[4, m] * rows[7, m] - rows[5, m] * rows[6, m]))
-        rows[9, m] = max(WORST_RATIO32 - quality[i], MIN_VOTE32) if len(quality) else x0.dtype.type(1)
-        valid = mask[i] and not (len(quality) and math.isnan(quality[i]))
+        rows[9, m] = max(WORST_RATIO32 - ratio[i], MIN_VOTE32) if len(ratio) else x0.dtype.type(1)
+        valid = mask[i] and not (len(ratio) and math.isnan(ratio[i]))
         for k in range(10):
             valid = valid and math.isfinite(rows[k, m])
         match[m] = i
@@ -140,7 +140,7 @@ def frame_agreement(
     x1: Float[Tensor, "b n 2"],
     lafs0: Float[Tensor, "b n 2 3"],
     lafs1: Float[Tensor, "b n 2 3"],
-    quality: Float[Tensor, "b n"] | None,
+    ratio: Float[Tensor, "b n"] | None,
     mask: Bool[Tensor, "b n"],
 ) -> Float[Tensor, "b n"]:
     """The share of its neighbours' votes that agree with each match, in [0, 1]; zero where masked.
@@ -149,12 +149,12 @@ def frame_agreement(
     with s the scale change of S; the agreement is the mean of ``(1 + (e / TOLERANCE)^2 / 8)^-8`` over the neighbours in
     both images, weighted by votes. Computed in float32, on the CPU; differentiable in all but the mask.
     """
-    tensors, out = (x0, x1, lafs0, lafs1, quality, mask), torch.empty(mask.shape, dtype=torch.float32)
+    tensors, out = (x0, x1, lafs0, lafs1, ratio, mask), torch.empty(mask.shape, dtype=torch.float32)
     agreement = for_each_pair(frame_agreement_kernel, tensors, out=out, group=FramedMatches).to(x0.dtype)
-    if not gradient_wanted(x0, x1, lafs0, lafs1, quality):
+    if not gradient_wanted(x0, x1, lafs0, lafs1, ratio):
         return agreement
     maps, usable = usable_frame_maps(lafs0, lafs1, mask)
-    return with_gradient(agreement, x0, x1, maps, votes_of(quality, x0[..., 0]), usable)
+    return with_gradient(agreement, x0, x1, maps, votes_of(ratio, x0[..., 0]), usable)
 
 
 def frame_map(lafs0: Float[Tensor, "b n 2 3"], lafs1: Float[Tensor, "b n 2 3"]) -> Float[Tensor, "b n 2 2"]:
@@ -182,7 +182,7 @@ class FrameConsistency:
     """Supplies ``prior``: P(inlier) from the agreement of local affine frames and the ratio.
 
     The odds are ``odds (w + floor)^3 / (1 + slope ratio)^2`` with the agreement w: arithmetic alone, and a better fit
-    on the tuning scenes than a logistic model of ln(w) and the ratio. Where matches have no frames or no quality the
+    on the tuning scenes than a logistic model of ln(w) and the ratio. Where matches have no frames or no ratio the
     prior is left as it is. Linear memory: about 700 bytes a match.
     kernels: worth compiling together with those of an estimator.
     """
@@ -194,14 +194,14 @@ class FrameConsistency:
 
     def __call__(self, c: Correspondences) -> Correspondences:
         """The same matches with a prior; zero for one whose ratio is not finite."""
-        if c.lafs0 is None or c.lafs1 is None or c.quality is None:
+        if c.lafs0 is None or c.lafs1 is None or c.ambiguity is None:
             return c
-        lafs0, lafs1, ratio = c.lafs0, c.lafs1, c.quality
+        lafs0, lafs1, ratio = c.lafs0, c.lafs1, c.ambiguity
         return ungraphed(c, lambda: self._with_prior(c, lafs0, lafs1, ratio))
 
     def _with_prior(self, c: Correspondences, lafs0: Tensor, lafs1: Tensor, ratio: Tensor) -> Correspondences:
         w = frame_agreement(c.x0, c.x1, lafs0, lafs1, ratio, c.mask).float() + self.floor
         known = c.mask & torch.isfinite(ratio)
-        quality = torch.where(known, ratio, 1).float()
-        odds = self.odds * w * w * w / (1 + self.slope * quality).square()
+        ratio = torch.where(known, ratio, 1).float()
+        odds = self.odds * w * w * w / (1 + self.slope * ratio).square()
         return c.derived(prior=torch.where(known, odds / (1 + odds), 0).to(c.x0.dtype))

@@ -19,7 +19,7 @@ MIN_PRIOR = 0.02  # matches less likely than that are not taken for noisier
 def match_noise(
     lafs0: Float[Tensor, "b n 2 3"],
     lafs1: Float[Tensor, "b n 2 3"],
-    quality: Float[Tensor, "b n"] | None = None,
+    ratio: Float[Tensor, "b n"] | None = None,
     prior: Float[Tensor, "b n"] | None = None,
     *,
     usual: float,
@@ -34,8 +34,8 @@ def match_noise(
     """
     size = torch.maximum(_scale(lafs0), _scale(lafs1))
     noise = (1 + size / radius) / usual
-    if quality is not None:
-        noise = noise * (1 + slope * quality).square()
+    if ratio is not None:
+        noise = noise * (1 + slope * ratio).square()
     if prior is not None:
         noise = noise / sqrt(sqrt(prior.clamp_min(MIN_PRIOR)))
     return noise
@@ -69,12 +69,12 @@ class MatchNoise:
 
     def _with_noise(self, c: Correspondences, lafs0: Tensor, lafs1: Tensor) -> Correspondences:
         mask = c.mask & torch.isfinite(lafs0).flatten(2).all(2) & torch.isfinite(lafs1).flatten(2).all(2)
-        for known in (c.quality, c.prior):
+        for known in (c.ambiguity, c.prior):
             mask = mask if known is None else mask & torch.isfinite(known)
         inside = mask[..., None, None]
-        quality, prior = (None if known is None else torch.where(mask, known, 1) for known in (c.quality, c.prior))
+        ratio, prior = (None if known is None else torch.where(mask, known, 1) for known in (c.ambiguity, c.prior))
         noise = match_noise(
-            torch.where(inside, lafs0, 0), torch.where(inside, lafs1, 0), quality, prior,
+            torch.where(inside, lafs0, 0), torch.where(inside, lafs1, 0), ratio, prior,
             usual=self.usual, radius=self.radius, slope=self.slope,
         )  # fmt: skip
         return c.derived(noise=torch.where(mask, noise, 1))

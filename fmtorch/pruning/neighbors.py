@@ -272,9 +272,9 @@ def slots_along_curves(x0: F4x2, x1: F4x2, mask: B1x1, out: I8x2) -> None:
             out[o, k] = slot[orders[o, k]]
 
 
-def votes_of(quality: Float[Tensor, "b n"] | None, like: Float[Tensor, "b n"]) -> Float[Tensor, "b n"]:
+def votes_of(ratio: Float[Tensor, "b n"] | None, like: Float[Tensor, "b n"]) -> Float[Tensor, "b n"]:
     """What the vote of each match counts."""
-    return torch.ones_like(like) if quality is None else (WORST_RATIO - quality).clamp_min(MIN_VOTE)
+    return torch.ones_like(like) if ratio is None else (WORST_RATIO - ratio).clamp_min(MIN_VOTE)
 
 
 def with_gradient(

@@ -57,18 +57,18 @@ TWO_TANGENT32 = np.float32(math.tan(math.pi / 8))
 
 
 @kernel
-def position_agreement_kernel(x0: F4x2, x1: F4x2, quality: F4x1, mask: B1x1, out: F4x1) -> None:
+def position_agreement_kernel(x0: F4x2, x1: F4x2, ratio: F4x1, mask: B1x1, out: F4x1) -> None:
     """`position_consistency.position_agreement` of x0, x1 (n, 2), mask (n,), and its a, b and s -> out (n + 3,).
 
-    quality: (n,), empty where unknown.
+    ratio: (n,), empty where unknown.
     """
     n, m = len(mask), 0
     out[:] = 0
     rows, match = np.empty((5, n), x0.dtype), np.empty(n, np.int64)
     for i in range(n):
         rows[0, m], rows[1, m], rows[2, m], rows[3, m] = x0[i, 0], x0[i, 1], x1[i, 0], x1[i, 1]
-        rows[4, m] = max(WORST_RATIO32 - quality[i], MIN_VOTE32) if len(quality) else x0.dtype.type(1)
-        valid = mask[i] and not (len(quality) and math.isnan(quality[i]))
+        rows[4, m] = max(WORST_RATIO32 - ratio[i], MIN_VOTE32) if len(ratio) else x0.dtype.type(1)
+        valid = mask[i] and not (len(ratio) and math.isnan(ratio[i]))
         for k in range(5):
             valid = valid and abs(rows[k, m]) < FARTHEST32
         match[m] = i
@@ -180,7 +180,7 @@ def _positions_agree(along: Array, k: int, similarity: Array, agree: Array) -> N
 def position_agreement(
     x0: Float[Tensor, "b n 2"],
     x1: Float[Tensor, "b n 2"],
-    quality: Float[Tensor, "b n"] | None,
+    ratio: Float[Tensor, "b n"] | None,
     mask: Bool[Tensor, "b n"],
 ) -> Float[Tensor, "b n"]:
     """The share of its neighbours' votes that agree with each match, in [0, 1]; zero where masked.
@@ -188,21 +188,21 @@ def position_agreement(
     For neighbours with differences dx0, dx1 and the common similarity S of the pair, of scale s,
     ``e = |S dx0 - dx1| / (s |dx0| + |dx1| + NOISE)``; the agreement is the mean of ``(1 + (e / TOLERANCE)^2 / 8)^-8``
     over the neighbours in both images, weighted by votes (`frame_agreement` has the same constants and votes). Computed
-    in float32, on the CPU; differentiable in points and quality, S being a constant.
+    in float32, on the CPU; differentiable in points and ratio, S being a constant.
     """
     out = torch.empty(len(mask), mask.shape[1] + 3, dtype=torch.float32)
-    out = for_each_pair(position_agreement_kernel, (x0, x1, quality, mask), out=out).to(x0.dtype)
+    out = for_each_pair(position_agreement_kernel, (x0, x1, ratio, mask), out=out).to(x0.dtype)
     agreement, (a, b, _) = out[:, :-3], out[:, -3:].unbind(1)
-    if not gradient_wanted(x0, x1, quality):
+    if not gradient_wanted(x0, x1, ratio):
         return agreement
     S = torch.stack([a, -b, b, a], -1).reshape(-1, 1, 2, 2).expand(*mask.shape, 2, 2)
-    return with_gradient(agreement, x0, x1, S, votes_of(quality, x0[..., 0]), mask)
+    return with_gradient(agreement, x0, x1, S, votes_of(ratio, x0[..., 0]), mask)
 
 
 class PositionConsistency:
     """Supplies ``prior``: P(inlier) from the agreement of neighbours' motion and, where known, the ratio.
 
-    Needs no frames, no sizes and no quality. Linear memory: about 600 bytes a match.
+    Needs no frames, no sizes and no ratio. Linear memory: about 600 bytes a match.
     kernels: worth compiling together with those of an estimator.
     """
 
@@ -217,4 +217,4 @@ class PositionConsistency:
 
     def evidence(self, c: Correspondences) -> Float[Tensor, "b n"]:
         """What the prior is calibrated from."""
-        return position_agreement(c.x0, c.x1, c.quality, c.mask)
+        return position_agreement(c.x0, c.x1, c.ambiguity, c.mask)

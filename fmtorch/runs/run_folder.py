@@ -36,7 +36,7 @@ PAIR_SCHEMA = pa.schema(
         pa.field("corrs_before", pa.int64(), nullable=False),
         pa.field("features0", pa.int64(), nullable=False),
         pa.field("features1", pa.int64(), nullable=False),
-        pa.field("draws", pa.int64(), nullable=False),
+        pa.field("samples", pa.int64(), nullable=False),
         pa.field("seconds_features", pa.float64()),
         pa.field("seconds_matching", pa.float64()),
         pa.field("seconds_pruning", pa.float64()),
@@ -48,7 +48,7 @@ PAIR_SCHEMA = pa.schema(
         pa.field("rotation_error", pa.float64()),
         pa.field("translation_error", pa.float64()),
         pa.field("pose_reason", pa.string()),
-        pa.field("configuration", pa.string()),
+        pa.field("pair_type", pa.string()),
         pa.field("warning", pa.string()),
         pa.field("focal_error0", pa.float64()),
         pa.field("focal_error1", pa.float64()),
@@ -84,7 +84,7 @@ class PairRow:
     corrs_before: int = 0  # the matches given to the estimator
     features0: int = 0  # features of image 0
     features1: int = 0  # features of image 1
-    draws: int = 0  # minimal samples drawn
+    samples: int = 0  # minimal samples drawn
     seconds_features: float | None = None  # seconds of wall-clock time spent on this pair, stage by stage;
     seconds_matching: float | None = None  # a batch's time is shared equally among its pairs
     seconds_pruning: float | None = None
@@ -96,7 +96,7 @@ class PairRow:
     rotation_error: float | None = None  # degrees, in [0, 180]; 180 where the pair failed; None without a true pose
     translation_error: float | None = None  # of directions up to sign, in [0, 90], 90 where it failed; signed: to 180
     pose_reason: str | None = None  # why there is no pose error, or no pose; None where there is
-    configuration: str | None = None  # of `CONFIGURATIONS`; None where there are no matches to tell it by
+    pair_type: str | None = None  # of `PAIR_TYPES`; None where there are no matches to tell it by
     warning: str | None = None  # what the configuration leaves open, empty where nothing
     focal_error0: float | None = None  # |f - f_true| / f_true of image 0 where f is estimated; infinite where it is
     focal_error1: float | None = None  # not determined; None where it is given exactly, or the true one is unknown

@@ -77,16 +77,16 @@ class Augmentation(AugmentationOptions):
         return out if wanted is None else out.first(wanted)
 
     def expected(
-        self, quality: Float[Tensor, " n"] | None, label: Int[Tensor, " n"], *, key: int, seed: int, epoch: int
+        self, ratio: Float[Tensor, " n"] | None, label: Int[Tensor, " n"], *, key: int, seed: int, epoch: int
     ) -> float:
         """About how many matches of a pair are left, for batches of similar length; the effect of crops is a guess.
 
         Args:
-            quality, label: of its matches. key, seed, epoch: as of the call. The size of the random subset is left out.
+            ratio, label: of its matches. key, seed, epoch: as of the call. The size of the random subset is left out.
         """
         draw = _Draw(self, bits(seed, torch.tensor([key]), Stream.AUGMENTATION, epoch, 1, _COLUMNS)[0, 0])
-        if draw.ratio is not None and quality is not None:
-            kept = quality < draw.ratio
+        if draw.ratio is not None and ratio is not None:
+            kept = ratio < draw.ratio
             if int((label[kept] == 1).sum()) >= min(MIN_INLIERS, int((label == 1).sum())):
                 label = label[kept]
         inliers, outliers = int((label == 1).sum()), int((label == 0).sum())
@@ -197,7 +197,7 @@ def _order(seed: int, key: int, n: int) -> Int[Tensor, " n"]:
 
 
 def swap(matches: LabelledMatches) -> LabelledMatches:
-    """The same matches from image 1 to image 0. `quality` and `mutual` stay those of the direction that was matched."""
+    """The same matches from image 1 to image 0. `ratio` and `mutual` stay those of the direction that was matched."""
     c = matches.correspondences
     pairs = (("x0", "x1"), ("lafs0", "lafs1"), ("size0", "size1"), ("K0", "K1"))
     swapped = {name: getattr(c, other) for a, b in pairs for name, other in ((a, b), (b, a))}
@@ -248,14 +248,14 @@ def crop(matches: LabelledMatches, image: int, box: tuple[int, int, int, int]) -
 
 
 def keep_ratio(matches: LabelledMatches, threshold: float | int) -> LabelledMatches:
-    """The matches whose `quality`, the ratio of the distances to the two nearest descriptors, is below `threshold`.
+    """The matches whose `ratio`, the ratio of the distances to the two nearest descriptors, is below `threshold`.
 
-    A threshold of 1 keeps all. Raises ValueError for matches without `quality`.
+    A threshold of 1 keeps all. Raises ValueError for matches without `ratio`.
     """
-    quality = matches.correspondences.quality
-    if quality is None:
-        raise ValueError("a ratio threshold needs `quality`: the nearest-neighbour distance ratio of each match")
-    return matches if threshold >= 1 else matches.keep(quality < threshold)
+    ratio = matches.correspondences.ratio
+    if ratio is None:
+        raise ValueError("a ratio threshold needs `ratio`: the nearest-neighbour distance ratio of each match")
+    return matches if threshold >= 1 else matches.keep(ratio < threshold)
 
 
 def move(matches: LabelledMatches, step0: Float[Tensor, "b n 2"], step1: Float[Tensor, "b n 2"]) -> LabelledMatches:

@@ -28,7 +28,7 @@ FORMAT = 1  # of the files; raised when the schema changes
 
 _PER_MATCH = {
     **dict.fromkeys(("x0", "x1"), ("float32", (-1, 2))), "label": ("int8", (-1,)),
-    **dict.fromkeys(("quality", "prior", "noise"), ("float32", (-1,))), "mutual": ("uint8", (-1,)),
+    **dict.fromkeys(("ratio", "prior", "noise"), ("float32", (-1,))), "mutual": ("uint8", (-1,)),
     **dict.fromkeys(("lafs0", "lafs1"), ("float32", (-1, 2, 3))),
 }  # fmt: skip
 _PER_PAIR = {
@@ -208,8 +208,8 @@ class StoredMatches(Dataset[LabelledMatches]):
         if self.augmentation is None:
             return [float(about["matches"]) for about in self.pairs]
         return [
-            self.augmentation.expected(quality, label, key=about["key"], seed=self.seed, epoch=epoch)
-            for about, (quality, label) in zip(self.pairs, map(self._figures, self._rows), strict=True)
+            self.augmentation.expected(ratio, label, key=about["key"], seed=self.seed, epoch=epoch)
+            for about, (ratio, label) in zip(self.pairs, map(self._figures, self._rows), strict=True)
         ]
 
     def select(self, indices: Iterable[int]) -> StoredMatches:
@@ -236,9 +236,9 @@ class StoredMatches(Dataset[LabelledMatches]):
 
     def _figures(self, where: tuple[int, int]) -> tuple[torch.Tensor | None, torch.Tensor]:
         number, row = where
-        arrays = self._shard(number).read(row, ("quality", "label"))
-        quality = torch.from_numpy(arrays["quality"].copy()) if "quality" in arrays else None
-        return quality, torch.from_numpy(arrays["label"].copy())
+        arrays = self._shard(number).read(row, ("ratio", "label"))
+        ratio = torch.from_numpy(arrays["ratio"].copy()) if "ratio" in arrays else None
+        return ratio, torch.from_numpy(arrays["label"].copy())
 
     def _shard(self, number: int) -> Shard:
         if number not in self._open:

@@ -9,7 +9,7 @@ from typing import Any
 from fmtorch.core.types import Estimate
 from fmtorch.two_view.arguments import Arrays, Focal, correspondences
 from fmtorch.two_view.estimation import estimated
-from fmtorch.two_view.pair_type import with_configuration
+from fmtorch.two_view.pair_type import with_pair_type
 
 
 def find_fundamental(
@@ -18,7 +18,7 @@ def find_fundamental(
     *,
     estimator: str = "fmtorch",
     mask: Arrays | None = None,
-    quality: Arrays | None = None,
+    ratio: Arrays | None = None,
     prior: Arrays | None = None,
     lafs0: Arrays | None = None,
     lafs1: Arrays | None = None,
@@ -29,7 +29,7 @@ def find_fundamental(
     K1: Arrays | None = None,
     focal: Focal = None,
     covariance: bool = False,
-    configuration: bool = False,
+    pair_type: bool = False,
     key: Arrays | int | None = None,
     seed: int = 0,
     config_dir: Path | str | None = None,
@@ -43,9 +43,9 @@ def find_fundamental(
         estimator: a preset of conf/estimator.
         mask: (B, N), True for real matches; all when not given. Like all that is told of matches it may come without
             the leading B for one pair, and comes as a list where the points do.
-        quality: (B, N), the matcher's figure, smaller is better (a distance ratio).
+        ratio: (B, N), the matcher's figure, smaller is better (a distance ratio).
         prior: (B, N), P(inlier) in [0, 1]. Where an estimator uses a prior and none is given, it is derived from the
-            frames and the quality, if both are given, otherwise from the points and, if given, the quality.
+            frames and the ratio, if both are given, otherwise from the points and, if given, the ratio.
         lafs0, lafs1: (B, N, 2, 3) local affine frames.
         noise: (B, N), each match's standard deviation relative to a usual one's (`fmtorch.pruning.MatchNoise` derives
             it from frames).
@@ -102,13 +102,13 @@ def find_fundamental(
     if covariance and K0 is None and K1 is None and focal is None:
         focal = "unknown"
     c = correspondences(
-        x0, x1, mask=mask, quality=quality, prior=prior, lafs0=lafs0, lafs1=lafs1, noise=noise, size0=size0,
+        x0, x1, mask=mask, ratio=ratio, prior=prior, lafs0=lafs0, lafs1=lafs1, noise=noise, size0=size0,
         size1=size1, K0=K0, K1=K1, focal=focal, key=key,
     )  # fmt: skip
     if isinstance(focal, Mapping):
         options["focal"] = focal
     estimate = estimated(c, "fundamental", estimator, config_dir, seed, options, covariance)
-    return with_configuration(estimate, c, seed) if configuration else estimate
+    return with_pair_type(estimate, c, seed) if configuration else estimate
 
 
 def find_essential(
@@ -120,7 +120,7 @@ def find_essential(
     focal: Focal = None,
     estimator: str = "fmtorch",
     mask: Arrays | None = None,
-    quality: Arrays | None = None,
+    ratio: Arrays | None = None,
     prior: Arrays | None = None,
     lafs0: Arrays | None = None,
     lafs1: Arrays | None = None,
@@ -128,7 +128,7 @@ def find_essential(
     size0: Arrays | None = None,
     size1: Arrays | None = None,
     covariance: bool = False,
-    configuration: bool = False,
+    pair_type: bool = False,
     key: Arrays | int | None = None,
     seed: int = 0,
     config_dir: Path | str | None = None,
@@ -145,7 +145,7 @@ def find_essential(
             deviation, one number, (s0, s1) or (B, 2); 0.05 suits EXIF; "shared" or "unknown" where K tells principal
             points and the shape of pixels alone. What is not exact is estimated.
         size0, size1: image sizes (h, w), one for all pairs or (B, 2). Twice the principal point when not given.
-        estimator, mask, quality, prior, lafs0, lafs1, noise, covariance, configuration, key, seed, config_dir: as of
+        estimator, mask, ratio, prior, lafs0, lafs1, noise, covariance, configuration, key, seed, config_dir: as of
             `find_fundamental`.
         options: replace values of the preset (``inlier_threshold=1.0``).
 
@@ -175,8 +175,8 @@ def find_essential(
         if K is None:
             raise ValueError(f"{name} is None; find_fundamental estimates pairs of which one camera or none is known")
     return find_fundamental(
-        x0, x1, estimator=estimator, mask=mask, quality=quality, prior=prior, lafs0=lafs0, lafs1=lafs1, noise=noise,
-        size0=size0, size1=size1, K0=K0, K1=K1, focal=focal, covariance=covariance, configuration=configuration,
+        x0, x1, estimator=estimator, mask=mask, ratio=ratio, prior=prior, lafs0=lafs0, lafs1=lafs1, noise=noise,
+        size0=size0, size1=size1, K0=K0, K1=K1, focal=focal, covariance=covariance, pair_type=configuration,
         key=key, seed=seed, config_dir=config_dir, **options,
     )  # fmt: skip
 
@@ -187,7 +187,7 @@ def find_homography(
     *,
     estimator: str = "homography",
     mask: Arrays | None = None,
-    quality: Arrays | None = None,
+    ratio: Arrays | None = None,
     prior: Arrays | None = None,
     lafs0: Arrays | None = None,
     lafs1: Arrays | None = None,
@@ -202,7 +202,7 @@ def find_homography(
     Args:
         x0, x1: matched points in pixels, as of `find_fundamental`. Gradients reach them through the final fit.
         estimator: a preset of conf/estimator whose solver is `four_point`.
-        mask, quality, prior, lafs0, lafs1, noise, key, seed, config_dir: as of `find_fundamental`.
+        mask, ratio, prior, lafs0, lafs1, noise, key, seed, config_dir: as of `find_fundamental`.
         options: replace values of the preset (``inlier_threshold=1.5``).
 
     Returns:
@@ -222,5 +222,5 @@ def find_homography(
         >>> bool(estimate.ok[0]), int(estimate.inliers[0, 20:].sum()), tuple(estimate.H.shape)
         (True, 40, (1, 3, 3))
     """
-    c = correspondences(x0, x1, mask=mask, quality=quality, prior=prior, lafs0=lafs0, lafs1=lafs1, noise=noise, key=key)
+    c = correspondences(x0, x1, mask=mask, ratio=ratio, prior=prior, lafs0=lafs0, lafs1=lafs1, noise=noise, key=key)
     return estimated(c, "homography", estimator, config_dir, seed, options)

@@ -147,7 +147,7 @@ def sizeless(c: Correspondences) -> Correspondences:
 
 def ratioless(c: Correspondences) -> Correspondences:
     """The matches without their distance ratios."""
-    return c.replace(quality=None)
+    return c.replace(ratio=None)
 
 
 WITHHELD: dict[str, Pruner] = {"sizeless": sizeless, "ratioless": ratioless}

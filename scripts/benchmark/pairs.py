@@ -122,7 +122,7 @@ def synthetic_pair(index: int, matches: int, spread: float = 0.5) -> ImagePair:
     F = fundamental_from_calibration(*(torch.from_numpy(each) for each in (K, K, R, t))).numpy()
     pair = ImagePair(f"synthetic/{index}", "synthetic", f"{index}", image, image, F, K, K, R, t)
     c = Correspondences(
-        _tensor(x0), _tensor(x1), torch.ones(1, n, dtype=torch.bool), quality=_tensor(ratio),
+        _tensor(x0), _tensor(x1), torch.ones(1, n, dtype=torch.bool), ratio=_tensor(ratio),
         lafs0=_tensor(_frames(x0, size, np.zeros(n))), lafs1=_tensor(_frames(x1, size * scale, angle)),
         size0=torch.tensor([SIZE]), size1=torch.tensor([SIZE]), key=torch.tensor([pair.key]),
     )  # fmt: skip

@@ -16,7 +16,7 @@ OWN_PRUNER = """import torch
 
 class Mine(torch.nn.Module):
     def forward(self, c):
-        return 4 - 8 * c.quality
+        return 4 - 8 * c.ratio
 """
 OWN_PRESET = """_target_: fmtorch.pruning.LearnedPruner
 network: {_target_: own_pruner.Mine}

@@ -66,7 +66,7 @@ def test_matches_and_fundamental_matrix_of_arrays(pipeline: fmtorch.Pipeline) ->
     assert torch.equal(result.putative.x0[:, result.kept], c.x0)
     assert torch.equal(result.putative.x1[:, result.kept], c.x1)
     assert list(result.counts) == ["matching", "ratio", "one_to_one", "gms", "estimation"]
-    steps = ["features", "matching", "ratio", "one_to_one", "gms", "estimation", "configuration"]
+    steps = ["features", "matching", "ratio", "one_to_one", "gms", "estimation", "pair_type"]
     assert list(result.seconds) == steps
     assert result.counts["estimation"] == int(result.inliers.sum()) > 100
     assert sorted(result.counts.values(), reverse=True) == list(result.counts.values())
@@ -154,14 +154,14 @@ def test_photographs_that_determine_no_f(pipeline: fmtorch.Pipeline) -> None:
         ("identical", np.ascontiguousarray(image[60:, 100:]), crop), ("identical", copy, np.eye(3)),
     ):  # fmt: skip
         result = fmtorch.match(image, second, pipeline=pipeline, longest_side=800)
-        assert result.configuration == kind
+        assert result.pair_type == kind
         assert result.warning == WARNINGS[kind] or "no motion" in result.warning
         corners = torch.tensor([[0.0, 0], [w, 0], [w, h], [0, h]], dtype=torch.float64)
         off = homography_points(result.homography, corners) - homography_points(torch.from_numpy(H), corners)
         assert off.abs().max() < 6  # px of 1536 x 1024
     other = read_image(shared_path("data/Strecha/fountain-P11/Images/00000004.jpg"))
     general = fmtorch.match(image, other, pipeline=pipeline, longest_side=800)
-    assert (general.configuration, general.warning, general.homography) == ("general", "", None)
+    assert (general.pair_type, general.warning, general.homography) == ("general", "", None)
 
 
 LMEDS = ("estimator=lmeds_eight_point",)
@@ -176,7 +176,7 @@ def test_an_f_of_photographs_with_nothing_in_common() -> None:
     assert result.ok
     assert not result.related
     assert result.significance < RELATED
-    assert (result.configuration, result.homography) == ("unrelated", None)
+    assert (result.pair_type, result.homography) == ("unrelated", None)
     good = fmtorch.match(*stereo(), pipeline=lenient)
     assert good.related
     assert good.significance > 10
@@ -228,7 +228,7 @@ def test_overrides_and_a_callers_own_hydra() -> None:
 def test_the_command(command: Callable[..., str], tmp_path: Path) -> None:
     image0, image1 = stereo(240, 320)
     Image.fromarray(image0).save(tmp_path / "a.png")
-    Image.fromarray(image1).save(tmp_path / "b.webp", quality=95)
+    Image.fromarray(image1).save(tmp_path / "b.webp", ratio=95)
     (tmp_path / "F.txt").write_text("0 0 0\n0 0 -2\n0, 2, 0\n")
     said = command("match", "image0=a.png", "image1=b.webp", "truth=F.txt", cwd=tmp_path)
     for text in ("hesaffnet_fast_fmtorch", "one_to_one", "inliers", "seconds", "NSGD", "matches/a-b"):
@@ -272,7 +272,7 @@ def test_the_command(command: Callable[..., str], tmp_path: Path) -> None:
     assert "probably not the same scene" in said
     assert "nothing in common" not in said  # which is said already
     report = json.loads((folder / "result.json").read_text())
-    assert (report["configuration"], report["homography"]) == ("unrelated", None)
+    assert (report["pair_type"], report["homography"]) == ("unrelated", None)
     said = command("match", "image0=a.png", "image1=a.png", "output=same", "pipeline=sift_gms", cwd=tmp_path)
     assert "identical" in said
     assert "no motion" in said

@@ -28,11 +28,11 @@ FAST = {"estimator": "msac", "hypotheses": 100}
 def test_a_list_of_pairs_is_a_padded_batch() -> None:
     batch = collate(PAIRS)
     batched = fmtorch.find_fundamental(
-        batch.x0, batch.x1, mask=batch.mask, quality=batch.quality, lafs0=batch.lafs0, lafs1=batch.lafs1,
+        batch.x0, batch.x1, mask=batch.mask, ratio=batch.ratio, lafs0=batch.lafs0, lafs1=batch.lafs1,
         size0=batch.size0, size1=batch.size1, key=batch.key,
     )  # fmt: skip
     listed = fmtorch.find_fundamental(
-        [c.x0[0].numpy() for c in PAIRS], [c.x1[0] for c in PAIRS], quality=[c.quality[0].numpy() for c in PAIRS],
+        [c.x0[0].numpy() for c in PAIRS], [c.x1[0] for c in PAIRS], ratio=[c.ratio[0].numpy() for c in PAIRS],
         lafs0=[c.lafs0[0] for c in PAIRS], lafs1=[c.lafs1[0] for c in PAIRS], size0=(640, 960), size1=[640, 960],
         key=[1, 2, 3],
     )  # fmt: skip
@@ -80,7 +80,7 @@ for call in (
     lambda: fmtorch.find_fundamental(None, None),
     lambda: fmtorch.find_fundamental("ab", "ab"),
     lambda: fmtorch.find_fundamental([[1, 2], [3]], [[1, 2], [3]]),
-    lambda: fmtorch.find_fundamental(x, x, quality=object()),
+    lambda: fmtorch.find_fundamental(x, x, ratio=object()),
     lambda: fmtorch.find_fundamental([x], [x], prior=0.5),
     lambda: fmtorch.match(None, image),
     lambda: fmtorch.match(image, [1, 2]),
@@ -97,7 +97,7 @@ TOLD = """\
 TypeError: x0 is a NoneType of object; it must be an array or tensor of numbers
 TypeError: x0 is a str of <U2; it must be an array or tensor of numbers
 TypeError: x0 is a list of uneven rows; it must be an array or a tensor
-TypeError: quality is a object of object; it must be an array or tensor of numbers
+TypeError: ratio is a object of object; it must be an array or tensor of numbers
 ValueError: prior must be a list of 1 arrays, one for each pair of x0
 TypeError: image0 is a NoneType; it must be a file's path or a uint8 array of NumPy
 TypeError: image1 is a list; it must be a file's path or a uint8 array of NumPy
@@ -149,7 +149,7 @@ def test_an_empty_batch_gives_an_empty_result(shape: tuple[int, int]) -> None:
     numbers, frames, sizes = torch.zeros(b, n), torch.zeros(b, n, 2, 3), torch.ones(b, 2, dtype=torch.int64)
     yes = torch.ones(b, n, dtype=torch.bool)
     c = Correspondences(
-        torch.zeros(b, n, 2), torch.zeros(b, n, 2), yes, quality=numbers, prior=numbers, lafs0=frames, lafs1=frames,
+        torch.zeros(b, n, 2), torch.zeros(b, n, 2), yes, ratio=numbers, prior=numbers, lafs0=frames, lafs1=frames,
         size0=sizes, size1=sizes, mutual=yes, noise=numbers,
     )  # fmt: skip
     for name in EVERY:

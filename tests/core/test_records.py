@@ -37,7 +37,7 @@ Sheet.__init_subclass__.__func__(Sheet)  # type: ignore[attr-defined]  # read th
     ("kind", "fields"),
     [
         (Features, ("lafs", "scores", "descriptors", "mask")),
-        (Correspondences, ("x0", "x1", "mask", "quality", "prior", "lafs0", "lafs1", "mutual", "noise")),
+        (Correspondences, ("x0", "x1", "mask", "ratio", "prior", "lafs0", "lafs1", "mutual", "noise")),
         (Estimate, ("inliers",)),
         (LabelledMatches, ("label",)),
     ],

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from fmtorch.core.types import Correspondences, Estimate, Features, collate, pair_key
 
 NAN = float("nan")
-PER_MATCH = ("x0", "x1", "mask", "quality", "prior", "lafs0", "lafs1", "mutual", "noise")
+PER_MATCH = ("x0", "x1", "mask", "ratio", "prior", "lafs0", "lafs1", "mutual", "noise")
 
 
 def features(n: int = 5, d: int = 3, seed: int = 0) -> Features:
@@ -32,7 +32,7 @@ def matches(b: int = 4, n: int = 6, seed: int = 0) -> Correspondences:
         x0=torch.rand(b, n, 2, generator=g),
         x1=torch.rand(b, n, 2, generator=g),
         mask=torch.rand(b, n, generator=g) < 0.6,
-        quality=torch.rand(b, n, generator=g),
+        ratio=torch.rand(b, n, generator=g),
         prior=torch.rand(b, n, generator=g),
         lafs0=torch.rand(b, n, 2, 3, generator=g),
         lafs1=torch.rand(b, n, 2, 3, generator=g),
@@ -56,7 +56,7 @@ def estimate(b: int = 4, n: int = 6, seed: int = 0) -> Estimate:
         inliers=torch.rand(b, n, generator=g) < 0.5,
         ok=ok,
         reason=tuple("" if good else f"reason {i}" for i, good in enumerate(ok.tolist())),
-        draws=torch.arange(b) + seed,
+        samples=torch.arange(b) + seed,
         significance=torch.where(ok, torch.rand(b, generator=g, dtype=torch.float64), -torch.inf),
         E=torch.rand(b, 3, 3, generator=g),
         R=torch.rand(b, 3, 3, generator=g),
@@ -67,7 +67,7 @@ def estimate(b: int = 4, n: int = 6, seed: int = 0) -> Estimate:
         covariance=torch.rand(b, 7, 7, generator=g),
         tangents=torch.rand(b, 3, 2, generator=g),
         covariance_F=torch.rand(b, 9, 9, generator=g),
-        configuration_index=torch.arange(b) % 5,
+        pair_type_index=torch.arange(b) % 5,
         homography=torch.rand(b, 3, 3, generator=g),
         other_R=torch.rand(b, 3, 3, generator=g),
         other_t=torch.rand(b, 3, generator=g),
@@ -242,7 +242,7 @@ def test_correspondences_defaults() -> None:
     assert c.keys.tolist() == [0, 0]
     assert c.keys.dtype == torch.int64
     assert c.count().tolist() == [3, 3]
-    assert all(getattr(c, f) is None for f in ("quality", "prior", "lafs0", "lafs1", "size0", "size1", "K0", "K1"))
+    assert all(getattr(c, f) is None for f in ("ratio", "prior", "lafs0", "lafs1", "size0", "size1", "K0", "K1"))
     assert same(c[0].to("cpu").compact(), c[:1])
 
 
@@ -265,14 +265,14 @@ def test_keep_only_ever_removes() -> None:
 def test_compact_known_answer() -> None:
     x = torch.arange(8.0).reshape(2, 4, 1).expand(-1, -1, 2)
     mask = torch.tensor([[False, True, False, True], [False, False, True, False]])
-    c = Correspondences(x, -x, mask, quality=x[..., 0]).compact()
+    c = Correspondences(x, -x, mask, ratio=x[..., 0]).compact()
     assert c.x0.shape == (2, 2, 2)
     assert c.mask.tolist() == [[True, True], [True, False]]
     assert c.x0[0, :, 0].tolist() == [1, 3]
     assert c.x0[1, 0].tolist() == [6, 6]
     assert c.x1[0, :, 1].tolist() == [-1, -3]
-    assert c.quality is not None
-    assert c.quality[0].tolist() == [1, 3]
+    assert c.ratio is not None
+    assert c.ratio[0].tolist() == [1, 3]
 
 
 def _survivors(c: Correspondences) -> list[dict[str, torch.Tensor]]:
@@ -325,7 +325,7 @@ def test_estimate_needs_a_reason_slot_for_each_pair() -> None:
         e.replace(reason=("",))
 
 
-@pytest.mark.parametrize("field", ["F", "inliers", "ok", "draws"])
+@pytest.mark.parametrize("field", ["F", "inliers", "ok", "samples"])
 def test_estimates_of_unequal_length_are_refused(field: str) -> None:
     e = estimate()
     with pytest.raises(Exception, match=r"shape|type"):
@@ -378,7 +378,7 @@ def test_collate_drops_a_field_that_some_item_lacks() -> None:
     joined = collate([matches(), matches().replace(prior=None, K1=None)])
     assert joined.prior is None
     assert joined.K1 is None
-    assert joined.quality is not None
+    assert joined.ratio is not None
 
 
 def test_collate_joins_estimates_with_their_reasons() -> None:
@@ -386,7 +386,7 @@ def test_collate_joins_estimates_with_their_reasons() -> None:
     joined = collate([a, b])
     assert joined.inliers.shape == (5, 5)
     assert joined.reason == a.reason + b.reason
-    assert joined.draws.tolist() == a.draws.tolist() + b.draws.tolist()
+    assert joined.samples.tolist() == a.samples.tolist() + b.samples.tolist()
     assert not joined.inliers[:2, 3:].any()
 
 

@@ -70,6 +70,6 @@ def test_a_score_a_sampler_and_a_rule(score: str, folder: Path, monkeypatch: pyt
     preset = folder / "my_conf" / "estimator" / "robust.yaml"
     preset.write_text(preset.read_text().replace("my_robust.Welsch", f"my_robust.{score}"))
     c = scene(1, 300, outliers=0.3)
-    estimate = find_fundamental(c.x0, c.x1, quality=c.quality, estimator="robust", config_dir=folder / "my_conf")
+    estimate = find_fundamental(c.x0, c.x1, ratio=c.ratio, estimator="robust", config_dir=folder / "my_conf")
     assert bool(estimate.ok[0])
     assert int(estimate.inliers.sum()) > 180  # of 210

@@ -70,7 +70,7 @@ class BestHalf:
     uses_prior = False
 
     def draw(self, pair: Pair, start: int, count: int, size: int) -> Array:
-        best = np.argsort(pair.quality, kind="stable")[: max(size, pair.count // 2)]
+        best = np.argsort(pair.ambiguity, kind="stable")[: max(size, pair.count // 2)]
         return best[different(pair, start, count, size, len(best))]
 
 

@@ -43,9 +43,9 @@ def named(name: str, scale: float = 1.0, seed: int = 0) -> Pair:
 
 
 def known(count: int, kind: str = "all") -> Correspondences:
-    """A scene of so many matches with prior, noise and quality, or with nothing."""
+    """A scene of so many matches with prior, noise and ratio, or with nothing."""
     c = scene(count, count).replace(noise=torch.linspace(0.2, 5, count)[None])
-    return c.replace(prior=None, quality=None, noise=None) if kind == "nothing" else c
+    return c.replace(prior=None, ratio=None, noise=None) if kind == "nothing" else c
 
 
 @functools.cache

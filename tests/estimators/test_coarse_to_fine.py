@@ -23,7 +23,7 @@ def test_equals_the_two_by_hand() -> None:
     assert torch.equal(both.F, fine.F)
     assert torch.equal(both.inliers, fine.inliers)
     assert bool((both.inliers <= coarse.inliers).all())
-    assert torch.equal(both.draws, coarse.draws + fine.draws)
+    assert torch.equal(both.samples, coarse.samples + fine.samples)
 
 
 def test_each_stage_names_its_own_failure() -> None:

@@ -71,9 +71,9 @@ def test_rounds_end_when_enough_of_them_confirm_the_best(
         search = searching(rounds=ROUNDS, min_rounds=min_rounds, confirmations=confirmations)
         object.__setattr__(search, "stop", lambda F, draws, pair, size, i=i: bool(content[i, draws // 10 - 1]))
         result = search(pair)
-        assert result.draws == 10 * expected(i)
+        assert result.samples == 10 * expected(i)
         assert result.settled == content[i, expected(i) - 1]  # the images have one size
-        draw_counts.add(result.draws)
+        draw_counts.add(result.samples)
     assert len(draw_counts) > 2
 
 
@@ -117,7 +117,7 @@ def test_rounds_without_candidates_settle_nothing(monkeypatch: pytest.MonkeyPatc
     search = searching(rounds=3, min_rounds=1)
     object.__setattr__(search, "stop", lambda F, draws, pair, size: True)
     result = search(pair_of(scene(0)))  # of images of one size
-    assert (result.settled, result.draws) == (False, 30)
+    assert (result.settled, result.samples) == (False, 30)
 
 
 def test_one_model_is_one_up_to_the_angle_between_them() -> None:
@@ -191,17 +191,17 @@ def test_rounds_go_on_where_the_search_is_not_settled() -> None:
     """An easy pair has one round, random matches have all, and the other search besides; in a batch as alone."""
     estimator = Ransac(**FOCAL, focal={"samples": 40, "rounds": 3, "pool": 4}, hypotheses=20)  # type: ignore[arg-type]
     pairs = [scene(1, 200, outliers=0.0), scene(2, 200, outliers=1.0)]
-    assert estimator(collate(pairs), seed=1).draws.tolist() == [40, 3 * 40 + 20]
-    assert [int(estimator(pair, seed=1).draws) for pair in pairs] == [40, 3 * 40 + 20]
+    assert estimator(collate(pairs), seed=1).samples.tolist() == [40, 3 * 40 + 20]
+    assert [int(estimator(pair, seed=1).samples) for pair in pairs] == [40, 3 * 40 + 20]
     patient = Ransac(**FOCAL, focal={"samples": 40, "rounds": 3, "min_rounds": 2})  # type: ignore[arg-type]
-    assert int(patient(pairs[0], seed=1).draws) == 2 * 40
+    assert int(patient(pairs[0], seed=1).samples) == 2 * 40
 
 
 def test_images_of_two_sizes_are_searched_without_assumptions_too() -> None:
     easy = photographs(1, (WIDE, WIDE), (1.0, 1.0), 300, 0.5, 0.05).c
-    assert int(presets.build("estimator", "fmtorch")(easy, 0).draws) == 3 * 250
+    assert int(presets.build("estimator", "fmtorch")(easy, 0).samples) == 3 * 250
     two = photographs(1, (WIDE, TALL), (1.0, 1.0), 300, 0.5, 0.05).c
-    assert int(presets.build("estimator", "fmtorch")(two, 0).draws) > 3 * 250
+    assert int(presets.build("estimator", "fmtorch")(two, 0).samples) > 3 * 250
 
 
 def test_unknown_sizes_give_the_selection_without_prior() -> None:

@@ -29,7 +29,7 @@ def test_is_a_minimum_of_the_weighted_loss(loss: str) -> None:
     c = collate([scene(i, 150, outliers=0.05) for i in range(3)])
     estimate = IterativelyReweighted(loss=loss, threshold=2.0, refine_iterations=60)(c)
     assert bool(estimate.ok.all())
-    assert bool((estimate.draws == 0).all())
+    assert bool((estimate.samples == 0).all())
     prior = c.prior
     assert prior is not None
 
@@ -43,7 +43,7 @@ def test_is_a_minimum_of_the_weighted_loss(loss: str) -> None:
 
 
 def test_an_annealed_loss_is_not_caught_where_a_narrow_one_is() -> None:
-    pairs = collate([scene(i, 150, outliers=0.3) for i in range(40)]).replace(prior=None, quality=None)
+    pairs = collate([scene(i, 150, outliers=0.3) for i in range(40)]).replace(prior=None, ratio=None)
     near = []
     for options in ({}, {"start_scale": 1e-9}):
         estimate = IterativelyReweighted(loss="truncated", threshold=1.0, **options)(pairs)
@@ -57,25 +57,25 @@ def test_the_prior_and_the_quality_decide_where_there_are_more_outliers_than_inl
         name: int(IterativelyReweighted(loss="geman_mcclure", threshold=1.0)(c).inliers.sum())
         for name, c in {
             "prior": pairs,
-            "quality": pairs.replace(prior=None),
-            "nothing": pairs.replace(prior=None, quality=None),
+            "ratio": pairs.replace(prior=None),
+            "nothing": pairs.replace(prior=None, ratio=None),
         }.items()
     }
     assert inliers["prior"] > 1.2 * inliers["nothing"]
-    assert inliers["quality"] > 1.2 * inliers["nothing"]
+    assert inliers["ratio"] > 1.2 * inliers["nothing"]
 
 
-@pytest.mark.parametrize("known", ["prior", "quality", "neither"])
+@pytest.mark.parametrize("known", ["prior", "ratio", "neither"])
 def test_weights_of_matches(known: str) -> None:
     c = scene(1)
     assert c.prior is not None
-    assert c.quality is not None
+    assert c.ratio is not None
     if known == "prior":
         expected = c.prior[0].numpy().astype(np.float64)
     else:
-        c = c.replace(prior=None, quality=c.quality if known == "quality" else None)
-        rank = np.argsort(np.argsort(scene(1).quality[0].numpy()))  # type: ignore[index]
-        expected = 1 - rank / 150 if known == "quality" else np.ones(150)
+        c = c.replace(prior=None, ratio=c.ratio if known == "ratio" else None)
+        rank = np.argsort(np.argsort(scene(1).ratio[0].numpy()))  # type: ignore[index]
+        expected = 1 - rank / 150 if known == "ratio" else np.ones(150)
     np.testing.assert_allclose(_weight(pair_of(c)), expected, rtol=0, atol=2.0**-24)  # ranks are float32
 
 

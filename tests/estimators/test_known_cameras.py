@@ -249,7 +249,7 @@ def known(c: Correspondences, name: str) -> Correspondences:
 
 def run(c: Correspondences, name: str, estimator: str = "fmtorch") -> Result:
     e = _quick(estimator)(known(c, name), seed=5)
-    fields = {"F": e.F, "inliers": e.inliers, "ok": e.ok, "draws": e.draws, "significance": e.significance}
+    fields = {"F": e.F, "inliers": e.inliers, "ok": e.ok, "samples": e.samples, "significance": e.significance}
     return {**fields, "E": e.E, "R": e.R, "t": e.t, "focals": e.focals}  # type: ignore[dict-item]
 
 
@@ -328,7 +328,7 @@ def test_without_cameras_nothing_changes() -> None:
     nothing = torch.full((len(c), 2, 2), torch.inf)
     asked = quick("fmtorch")(c.replace(focal=nothing), seed=5)
     for other in (calibrations, asked):
-        for field in ("F", "inliers", "ok", "draws", "significance"):
+        for field in ("F", "inliers", "ok", "samples", "significance"):
             assert torch.equal(getattr(plain, field), getattr(other, field))
     assert plain.focals is None
     assert asked.focals is not None
@@ -420,7 +420,7 @@ def test_real_pairs_keep_the_order_of_knowledge() -> None:
     """Exact calibration, 6 % of focal lengths, nothing."""
     errors: dict[str, list[float]] = {"exact": [], "rough": [], "unknown": []}
     for pair, c in castle():
-        given = {name: getattr(c, name) for name in ("mask", "quality", "prior", "noise", "size0", "size1", "key")}
+        given = {name: getattr(c, name) for name in ("mask", "ratio", "prior", "noise", "size0", "size1", "key")}
         K = {"K0": pair.K0, "K1": pair.K1}
         knowledge: dict[str, Any] = {"exact": K, "rough": K | {"focal": 0.06}, "unknown": {"focal": "unknown"}}
         for name, known in knowledge.items():

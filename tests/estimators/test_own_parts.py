@@ -91,7 +91,7 @@ def test_parts_that_do_as_the_built_in_ones_give_the_same_bits(parts: dict[str, 
         presets.build("estimator", "msac")(scenes(), 3),
     )
     assert bool(builtin.ok.all())
-    assert_same(*({name: getattr(e, name) for name in ("F", "inliers", "ok", "draws")} for e in (own, builtin)), "msac")
+    assert_same(*({name: getattr(e, name) for name in ("F", "inliers", "ok", "samples")} for e in (own, builtin)), "msac")
 
 
 def test_parts_are_named_as_targets() -> None:
@@ -195,7 +195,7 @@ def compared(preset: str) -> None:
     threshold = {} if preset == "msac" else {"threshold": None}
     own = presets.build("estimator", preset, score=score, sampler=AllAlike(), inliers=Within2Px(), **threshold)
     estimators = own, presets.build("estimator", preset)
-    draws, fastest = [int(estimator(c).draws) for estimator in estimators], [math.inf, math.inf]
+    draws, fastest = [int(estimator(c).samples) for estimator in estimators], [math.inf, math.inf]
     for _ in range(20):
         for k, estimator in enumerate(estimators):
             start = time.process_time()
@@ -219,8 +219,8 @@ def test_parts_in_numpy_take_at_most_three_times_as_long(preset: str, tmp_path: 
 def test_samples_of_ones_own_are_distinct_and_from_the_better_half() -> None:
     pair = pair_of(scene(1, 41))
     sample = BestHalf().draw(pair, 3, 500, 7)
-    assert pair.quality is not None
-    better = np.argsort(pair.quality, kind="stable")[:20]
+    assert pair.ambiguity is not None
+    better = np.argsort(pair.ambiguity, kind="stable")[:20]
     assert all(len(set(column)) == 7 for column in sample.T)
     assert set(sample.ravel()) == set(better)
     counts = np.bincount(AllAlike().draw(pair, 0, 5000, 7)[6], minlength=41)

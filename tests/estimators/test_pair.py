@@ -35,7 +35,7 @@ def padded_pairs() -> Correspondences:
 @pytest.mark.parametrize("kind", ["all", "nothing", "real"])
 def test_a_pair_holds_its_usable_matches_in_order(kind: str, scale: float) -> None:
     c = real(7) if kind == "real" else padded_pairs()
-    c = c if kind == "all" else c.replace(prior=None, noise=None, quality=None, size0=None, size1=None)
+    c = c if kind == "all" else c.replace(prior=None, noise=None, ratio=None, size0=None, size1=None)
     c = c.replace(x0=scale * c.x0.double(), x1=scale * c.x1.double())
     for i in range(len(c)):
         result = normalized(c, i)
@@ -51,7 +51,7 @@ def test_a_pair_holds_its_usable_matches_in_order(kind: str, scale: float) -> No
         assert pair.pixels_per_unit / 2 < half <= pair.pixels_per_unit
         np.testing.assert_array_equal(pair.points, (pixels - pair.centre[:, None]) / pair.pixels_per_unit)
         assert (pair.count, pair.key, pair.bucket) == (mask.sum(), int(c.keys[i]), bucket(int(mask.sum())))
-        values = {name: getattr(c, name) for name in ("prior", "noise", "quality")}
+        values = {name: getattr(c, name) for name in ("prior", "noise", "ratio")}
         for name, value in values.items():
             assert (getattr(pair, name) is None) == (value is None) == (kind != "all")
         prior, noise, _ = (
@@ -162,7 +162,7 @@ def test_a_part_of_a_pair_keeps_its_frame() -> None:
     index = np.array([7, 3, 30])
     part = pair.take(index)
     np.testing.assert_array_equal(part.table, pair.table[:, index])
-    assert part.quality is not None
+    assert part.ratio is not None
     for name in ("bucket", "pixels_per_unit", "key", "seed", "centre", "sizes", "residual", "images"):
         assert getattr(part, name) is getattr(pair, name), name
     assert pair.cached("sum", lambda pair: float(pair.points.sum())) == pair.points.sum()

@@ -48,8 +48,8 @@ def test_recovers_the_geometry(name: str) -> None:
 
 def test_confidence_stops_early_and_null_never() -> None:
     easy = scene(0, 200, outliers=0.0, noise=0.1)
-    assert int(Ransac(hypotheses=1000, round=100)(easy).draws) == 100
-    assert int(Ransac(hypotheses=1000, round=100, confidence=None)(easy).draws) == 1000
+    assert int(Ransac(hypotheses=1000, round=100)(easy).samples) == 100
+    assert int(Ransac(hypotheses=1000, round=100, confidence=None)(easy).samples) == 1000
 
 
 def test_gradients_reach_the_points() -> None:
@@ -200,7 +200,7 @@ def test_the_kernels_that_are_compiled_together_are_those_that_are_called(monkey
     assert with_callees(called) == set(estimator.kernels)
     for framed, name in ((False, "position_consistency"), (True, "frame_consistency")):
         c = scene(0, 300)
-        frames = {"lafs0": c.lafs0, "lafs1": c.lafs1, "quality": c.quality} if framed else {}
+        frames = {"lafs0": c.lafs0, "lafs1": c.lafs1, "ratio": c.ratio} if framed else {}
         called.clear()
         fmtorch.find_fundamental(c.x0, c.x1, size0=c.size0, size1=c.size1, **frames)
         pruner = presets.build("pruner", name)

@@ -119,7 +119,7 @@ def test_a_search_keeps_the_best_models_of_all_rounds(preselect: Preselect | Non
     best = np.argsort(-np.concatenate(score), kind="stable")[:4]
     np.testing.assert_array_equal(pool.F, np.concatenate(F)[best])
     np.testing.assert_array_equal(pool.score, np.concatenate(score)[best])
-    assert (pool.filled, pool.draws) == (4, 180)
+    assert (pool.filled, pool.samples) == (4, 180)
 
 
 def test_rounds_change_nothing_without_preselection() -> None:
@@ -133,10 +133,10 @@ def test_rounds_change_nothing_without_preselection() -> None:
 def test_a_search_ends_when_the_stopping_rule_says_so() -> None:
     pair = named("scene 300")
     never, second = Told(lambda draws: False), Told(lambda draws: draws >= 100)
-    assert search(stop=never)(pair).draws == 150
+    assert search(stop=never)(pair).samples == 150
     assert never.asked == [50, 100]  # after the last round there is nothing to decide
-    assert search(stop=second)(pair).draws == 100
-    assert search(round=500, stop=Told(lambda draws: True))(pair).draws == 150
+    assert search(stop=second)(pair).samples == 100
+    assert search(round=500, stop=Told(lambda draws: True))(pair).samples == 150
 
 
 def test_a_search_goes_on_while_no_sample_gave_a_model() -> None:
@@ -144,7 +144,7 @@ def test_a_search_goes_on_while_no_sample_gave_a_model() -> None:
     pair = pair_of(scene(0, 100, outliers=0.0, noise=0.0))
     pool = search(Late(), stop=StoppingRule(0.9999, 1.0, Uniform()), hypotheses=400)(pair)
     assert pool.filled
-    assert pool.draws == 150
+    assert pool.samples == 150
 
 
 @pytest.mark.parametrize("name", FEW)
@@ -153,7 +153,7 @@ def test_any_matches_are_searched(name: str, scale: float) -> None:
     pool = search(stop=StoppingRule(0.99, 1.0, Uniform()))(named(name, scale))
     assert np.isfinite(pool.F).all()
     assert np.isfinite(pool.score[: pool.filled]).all()
-    assert 50 <= pool.draws <= 150
+    assert 50 <= pool.samples <= 150
 
 
 def test_a_score_may_be_an_object() -> None:

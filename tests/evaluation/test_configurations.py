@@ -11,7 +11,7 @@ import torch
 from rich.console import Console
 
 from fmtorch import presets
-from fmtorch.core.types import CONFIGURATIONS, WARNINGS, Correspondences
+from fmtorch.core.types import PAIR_TYPES, WARNINGS, Correspondences
 from fmtorch.data import ImagePair, ImageSource
 from fmtorch.data.pairs import GivenMatches
 from fmtorch.evaluation import tables
@@ -51,14 +51,14 @@ def rows(pairs: list[ImagePair], word: str | None) -> list[PairRow]:
 
 @pytest.mark.parametrize("word", [None, "known", "unknown"])
 def test_rows_say_which_configuration_and_neighbours_change_nothing(word: str | None) -> None:
-    pairs = [pair(kind, 150 + 10 * i) for i, kind in enumerate(CONFIGURATIONS)]
+    pairs = [pair(kind, 150 + 10 * i) for i, kind in enumerate(PAIR_TYPES)]
     lost = dataclasses.replace(pairs[0], identity="lost", problem="no image")
     together = rows([*pairs, lost], word)
-    assert [row.configuration for row in together] == [*CONFIGURATIONS, None]
-    assert [row.warning for row in together] == [*(WARNINGS[kind] for kind in CONFIGURATIONS), None]
+    assert [row.pair_type for row in together] == [*PAIR_TYPES, None]
+    assert [row.warning for row in together] == [*(WARNINGS[kind] for kind in PAIR_TYPES), None]
     for each, row in zip(pairs, together, strict=False):
         (alone,) = rows([each], word)
-        assert (alone.F, alone.configuration) == (row.F, row.configuration)
+        assert (alone.F, alone.pair_type) == (row.F, row.pair_type)
         assert alone.focal_log_ratio0 == row.focal_log_ratio0
 
 
@@ -67,10 +67,10 @@ def test_a_pair_that_cannot_be_examined_harms_no_other() -> None:
     outcomes = built.run([pair("general"), pair("planar")])
     broken = dataclasses.replace(outcomes[0], estimate=outcomes[0].estimate.replace(model="homography"))
     results = examined(built, [broken, outcomes[1]])
-    assert [o.configuration is None for o in results] == [True, False]
+    assert [o.pair_type is None for o in results] == [True, False]
     first, second = evaluate([dataclasses.replace(results[0], estimate=outcomes[0].estimate), results[1]])
     assert first.warning.startswith("not examined: ValueError: estimate is of homography matrices")
-    assert second.configuration == "planar"
+    assert second.pair_type == "planar"
 
 
 def estimated(c: Correspondences, focals: list[float], true: tuple[np.ndarray | None, np.ndarray | None]) -> Outcome:
@@ -103,7 +103,7 @@ def test_summaries_and_reports_show_them() -> None:
     pairs = [pair(kind) for kind in ("general", "planar")]
     table = to_table(rows(pairs, "unknown"))
     summary = summarize(table)
-    assert summary["all"]["configurations"] == {**dict.fromkeys(CONFIGURATIONS, 0), "general": 1, "planar": 1}
+    assert summary["all"]["pair_types"] == {**dict.fromkeys(PAIR_TYPES, 0), "general": 1, "planar": 1}
     assert summary["all"]["focals"]["images"] == 4
     console = Console(width=80, record=True)
     for each in terminal_tables(summary, "t")[1:]:
@@ -115,9 +115,9 @@ def test_summaries_and_reports_show_them() -> None:
     assert "| family | 1 | 1 | 0 | 0 | 0 |" in page
     assert "folded" in page
     of_report = {each.heading: each for each in tables.report_tables({"run": table}, {"run": summary})}
-    assert [cell.text for cell in of_report["Configurations"].rows["run"]] == ["1", "1", "0", "0", "0"]
+    assert [cell.text for cell in of_report["Pair types"].rows["run"]] == ["1", "1", "0", "0", "0"]
     assert of_report["Focal lengths"].rows["run"][0].text == "4"
-    nobody = to_table([dataclasses.replace(row, configuration=None) for row in rows(pairs[:1], None)])
-    assert "Configurations" not in {part.heading for part in tables.parts(summarize(nobody))}
+    nobody = to_table([dataclasses.replace(row, pair_type=None) for row in rows(pairs[:1], None)])
+    assert "Pair types" not in {part.heading for part in tables.parts(summarize(nobody))}
     alone = terminal_tables(summarize(to_table(rows(pairs[:1], None))), "t")
     assert [each.title for each in alone] == ["t", "Relative pose"]  # all general: nothing to say

@@ -9,7 +9,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from fmtorch.core.types import CONFIGURATIONS
+from fmtorch.core.types import PAIR_TYPES
 
 K = np.array([[768.0, 0, 319.5], [0, 768, 239.5], [0, 0, 1]])
 SIZE = (480, 640)
@@ -32,7 +32,7 @@ def cross_matrix(t: np.ndarray) -> np.ndarray:
 
 def draw(kind: str, seed: int, n: int = 200, wrong: float = 0.3, noise: float = 0.5, off_plane: int = 0) -> Drawn:
     """A pair of a kind; off_plane: matches of a planar one that are not on the plane."""
-    rng = np.random.default_rng([seed, CONFIGURATIONS.index(kind)])
+    rng = np.random.default_rng([seed, PAIR_TYPES.index(kind)])
     X = np.c_[rng.uniform(-2, 2, (n, 2)), rng.uniform(4, 8, n)]
     R = Rotation.from_rotvec(rng.normal(size=3) * 0.1).as_matrix()
     t = np.array([0.6, 0.1, 0.1])
@@ -61,7 +61,7 @@ def draw(kind: str, seed: int, n: int = 200, wrong: float = 0.3, noise: float = 
 
 
 def batch(drawn: list[Drawn]) -> dict[str, Tensor]:
-    """The arguments of `configuration_evidence`, padded by what is not a number."""
+    """The arguments of `pair_evidence`, padded by what is not a number."""
     longest = max(len(d.x0) for d in drawn)
     points = np.full((2, len(drawn), longest, 2), np.nan)
     for i, d in enumerate(drawn):

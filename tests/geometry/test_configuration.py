@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from fmtorch.core.types import CONFIGURATIONS
-from fmtorch.geometry.pair_type import Evidence, classified, configuration_evidence
+from fmtorch.core.types import PAIR_TYPES
+from fmtorch.geometry.pair_type import Evidence, classified, pair_evidence
 from tests.geometry.kinds import SIZE, K, batch, draw
 from tests.reference import configuration as reference
 from tests.reference.epipolar import sampson
@@ -15,7 +15,7 @@ from tests.reference.epipolar import sampson
 SIDE = float(np.sqrt(SIZE[0] * SIZE[1]))
 
 
-@pytest.mark.parametrize("kind", CONFIGURATIONS)
+@pytest.mark.parametrize("kind", PAIR_TYPES)
 @pytest.mark.parametrize("known", [False, True])
 def test_against_the_definitions(kind: str, known: bool) -> None:
     drawn = draw(kind, 0, 80)
@@ -27,7 +27,7 @@ def test_against_the_definitions(kind: str, known: bool) -> None:
         "prior": torch.from_numpy(P)[None],
         "focal_precision": torch.from_numpy(precision)[None],
     }
-    evidence = configuration_evidence(**given)
+    evidence = pair_evidence(**given)
     line = np.array([sampson(drawn.F, p, q) for p, q in zip(drawn.x0, drawn.x1, strict=True)]) / n
     plane = reference.plane_distances(drawn.H, drawn.x0, drawn.x1) / n
     s = min(reference.noise(P, line, 1, SIDE), reference.noise(P, plane, 2, SIDE))
@@ -54,34 +54,34 @@ def test_against_the_definitions(kind: str, known: bool) -> None:
         assert known == bool((evidence.log_focal == 0).all())
 
 
-@pytest.mark.parametrize("kind", CONFIGURATIONS)
+@pytest.mark.parametrize("kind", PAIR_TYPES)
 def test_kinds_of_synthetic_pairs(kind: str) -> None:
     """Of perfect models, at three levels of noise and of wrong matches, 40 pairs each."""
     for noise in (0.2, 0.5, 1.5):
         for wrong in (0.0, 0.3, 0.6):
             pairs = batch([draw(kind, seed, 150, wrong, noise) for seed in range(40)])
-            kinds = classified(configuration_evidence(**pairs))
-            right = int((kinds == CONFIGURATIONS.index(kind)).sum())
-            assert right >= 39, (noise, wrong, [CONFIGURATIONS[i] for i in kinds.tolist()])
+            kinds = classified(pair_evidence(**pairs))
+            right = int((kinds == PAIR_TYPES.index(kind)).sum())
+            assert right >= 39, (noise, wrong, [PAIR_TYPES[i] for i in kinds.tolist()])
 
 
 def test_some_matches_off_the_plane_make_a_pair_general() -> None:
-    planar = classified(configuration_evidence(**batch([draw("planar", seed) for seed in range(30)])))
-    general = classified(configuration_evidence(**batch([draw("planar", seed, off_plane=30) for seed in range(30)])))
-    assert [CONFIGURATIONS[i] for i in planar.tolist()].count("planar") >= 29
-    assert [CONFIGURATIONS[i] for i in general.tolist()].count("general") >= 29
+    planar = classified(pair_evidence(**batch([draw("planar", seed) for seed in range(30)])))
+    general = classified(pair_evidence(**batch([draw("planar", seed, off_plane=30) for seed in range(30)])))
+    assert [PAIR_TYPES[i] for i in planar.tolist()].count("planar") >= 29
+    assert [PAIR_TYPES[i] for i in general.tolist()].count("general") >= 29
 
 
 def test_without_cameras_a_rotation_is_planar() -> None:
     pairs = batch([draw("rotation", seed) for seed in range(10)])
-    evidence = configuration_evidence(**{k: v for k, v in pairs.items() if k not in ("K0", "K1", "focal_precision")})
+    evidence = pair_evidence(**{k: v for k, v in pairs.items() if k not in ("K0", "K1", "focal_precision")})
     assert bool((evidence.rotation == -torch.inf).all())
-    assert classified(evidence).tolist() == [CONFIGURATIONS.index("planar")] * 10
+    assert classified(evidence).tolist() == [PAIR_TYPES.index("planar")] * 10
 
 
 def test_no_unit_is_special() -> None:
     """Images twice as large, noise and all, are of the same kinds by the same evidence."""
-    pairs = batch([draw(kind, 3, noise=0.5) for kind in CONFIGURATIONS if kind != "unrelated"])
+    pairs = batch([draw(kind, 3, noise=0.5) for kind in PAIR_TYPES if kind != "unrelated"])
     twice = dict(pairs)
     grow = torch.diag(torch.tensor([2.0, 2, 1], dtype=torch.float64))
     shrink = torch.linalg.inv(grow)
@@ -89,7 +89,7 @@ def test_no_unit_is_special() -> None:
         twice[name] = 2 * pairs[name]
     twice |= {"F": shrink @ pairs["F"] @ shrink, "H": grow @ pairs["H"] @ shrink}
     twice |= {"K0": grow @ pairs["K0"], "K1": grow @ pairs["K1"]}
-    single, doubled = configuration_evidence(**pairs), configuration_evidence(**twice)
+    single, doubled = pair_evidence(**pairs), pair_evidence(**twice)
     for name in ("line", "plane", "both", "copy"):
         torch.testing.assert_close(getattr(single, name), getattr(doubled, name), rtol=1e-9, atol=1e-6)
     torch.testing.assert_close(2 * single.noise, doubled.noise)
@@ -99,13 +99,13 @@ def test_no_unit_is_special() -> None:
 @pytest.mark.parametrize("factor", [1e-9, 1e9])
 def test_points_of_any_scale_are_weighed(factor: float) -> None:
     """Without sizes, as large as their boxes; nothing overflows."""
-    pairs = batch([draw(kind, 3) for kind in CONFIGURATIONS])
+    pairs = batch([draw(kind, 3) for kind in PAIR_TYPES])
     given = {name: pairs[name] for name in ("F", "H", "x0", "x1", "mask")}
     grow = torch.diag(torch.tensor([factor, factor, 1], dtype=torch.float64))
     shrink = torch.linalg.inv(grow)
     given |= {"x0": factor * given["x0"], "x1": factor * given["x1"]}
     given |= {"F": shrink @ given["F"] @ shrink, "H": grow @ given["H"] @ shrink}
-    evidence = configuration_evidence(**given)
+    evidence = pair_evidence(**given)
     for name in ("line", "plane", "both", "copy", "noise"):
         assert bool(getattr(evidence, name).isfinite().all()), name
     if factor > 1:
@@ -118,34 +118,34 @@ def assert_same(a: Evidence, b: Evidence) -> None:
 
 
 def test_padding_and_neighbours_are_invisible() -> None:
-    drawn = [draw(kind, i, 40 + 37 * i) for i, kind in enumerate(CONFIGURATIONS)]
-    together = configuration_evidence(**batch(drawn))
+    drawn = [draw(kind, i, 40 + 37 * i) for i, kind in enumerate(PAIR_TYPES)]
+    together = pair_evidence(**batch(drawn))
     for i, drawn_pair in enumerate(drawn):
-        assert_same(configuration_evidence(**batch([drawn_pair])), Evidence(*(v[i : i + 1] for v in together)))
-    many = [draw(CONFIGURATIONS[i % 5], i, 60) for i in range(40)]
+        assert_same(pair_evidence(**batch([drawn_pair])), Evidence(*(v[i : i + 1] for v in together)))
+    many = [draw(PAIR_TYPES[i % 5], i, 60) for i in range(40)]
     threads = torch.get_num_threads()
     torch.set_num_threads(3)
     try:
-        parallel = configuration_evidence(**batch(many))
+        parallel = pair_evidence(**batch(many))
     finally:
         torch.set_num_threads(threads)
-    assert_same(parallel, configuration_evidence(**batch(many)))
+    assert_same(parallel, pair_evidence(**batch(many)))
 
 
 def test_no_pair_takes_its_batch_down() -> None:
     pairs = batch([draw("general", i, 60) for i in range(9)])
-    good = configuration_evidence(**pairs)
+    good = pair_evidence(**pairs)
     bad = {k: v.clone() for k, v in pairs.items()}
     bad["F"][0], bad["H"][1], bad["mask"][2] = 0, 0, False
     bad["F"][3, 0, 0], bad["H"][4, 0, 0], bad["K0"][5, 0, 0] = torch.nan, torch.inf, torch.nan
     bad["x0"][6], bad["x1"][6] = 5.0, 7.0
     bad["K1"][7] = torch.tensor([[1.0, 2, 3], [2, 4, 6], [0, 0, 1]])
-    evidence = configuration_evidence(**bad)
+    evidence = pair_evidence(**bad)
     assert_same(Evidence(*(v[8:] for v in evidence)), Evidence(*(v[8:] for v in good)))
     for value in evidence:
         assert not bool(value.isnan().any())
-    kinds = [CONFIGURATIONS[i] for i in classified(evidence).tolist()]
+    kinds = [PAIR_TYPES[i] for i in classified(evidence).tolist()]
     assert kinds[2] == "unrelated"
     assert kinds[1] == kinds[4] == kinds[5] == kinds[7] == kinds[8] == "general"
-    none = configuration_evidence(**{k: v[:0] for k, v in pairs.items()})
+    none = pair_evidence(**{k: v[:0] for k, v in pairs.items()})
     assert classified(none).shape == (0,)

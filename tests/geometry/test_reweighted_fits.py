@@ -41,22 +41,22 @@ def test_weights_of_a_loss_make_it_irls(loss: str) -> None:
 def test_a_network_learns_through_the_fits() -> None:
     """Weights of side information and residuals fed back: gradients reach every parameter; descending them helps."""
     c = collate([laws.scene(1), laws.scene(2, 60)])
-    assert c.quality is not None
+    assert c.ratio is not None
     truth = torch.stack(
         [
             eight_point(p.x0.double(), p.x1.double())[0][0]
             for p in (laws.scene(i, n, 0.0, 0.0) for i, n in ((1, 150), (2, 60)))
         ]
     )
-    quality = torch.where(c.mask, c.quality, 0).double()
+    ratio = torch.where(c.mask, c.ratio, 0).double()
     torch.manual_seed(0)
     network = torch.nn.Sequential(torch.nn.Linear(2, 8), torch.nn.Tanh(), torch.nn.Linear(8, 1)).double()
 
     def weigh(F: Tensor | None, residual: Tensor | None) -> Tensor:
         assert (F is None) == (residual is None)
-        distance = torch.zeros_like(quality) if residual is None else residual
-        assert distance.shape == quality.shape
-        return torch.sigmoid(network(torch.stack([quality, torch.log1p(distance)], -1))[..., 0])
+        distance = torch.zeros_like(ratio) if residual is None else residual
+        assert distance.shape == ratio.shape
+        return torch.sigmoid(network(torch.stack([ratio, torch.log1p(distance)], -1))[..., 0])
 
     optimiser = torch.optim.Adam(network.parameters(), lr=0.1)
     losses = []

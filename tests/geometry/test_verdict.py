@@ -70,7 +70,7 @@ def test_coarse_to_fine_is_judged_by_all_matches() -> None:
 def silent(c: Correspondences, seed: int = 0) -> Estimate:
     """An estimator of a user's own, which knows nothing of significance."""
     known = quick("ransac", 200, 100)(c, seed)
-    return Estimate(known.F, known.inliers, known.ok, known.reason, known.draws)
+    return Estimate(known.F, known.inliers, known.ok, known.reason, known.samples)
 
 
 def test_what_an_estimator_does_not_say_is_said_by_the_caller() -> None:
@@ -87,7 +87,7 @@ def test_what_an_estimator_does_not_say_is_said_by_the_caller() -> None:
 
 def test_find_fundamental_tells() -> None:
     c = collate([scene(1, 100, 0.3), scene(2, 40, 1.0)])
-    estimate = fmtorch.find_fundamental(c.x0, c.x1, mask=c.mask, quality=c.quality, size0=(640, 960), size1=(640, 960))
+    estimate = fmtorch.find_fundamental(c.x0, c.x1, mask=c.mask, ratio=c.ratio, size0=(640, 960), size1=(640, 960))
     assert estimate.ok[0]
     assert estimate.related.tolist() == [True, False]
     assert estimate[1:].significance.tolist() == estimate.significance[1:].tolist()

@@ -43,7 +43,7 @@ class Scene:
         for name, source in (("a.jpg", self.pair.image0), ("b.jpg", self.pair.image1)):
             image = cv2.resize(read_image(source), (768, 512), interpolation=cv2.INTER_AREA)
             image = photographed(image, self.lens) if coefficients else image
-            Image.fromarray(image).save(folder / name, quality=97, exif=exif)
+            Image.fromarray(image).save(folder / name, ratio=97, exif=exif)
 
     def match(self, output: Path, *words: str) -> Path:
         given = (f"images={self.folder}", f"output={output}", f"longest_side={SIDE}", "cache=off", *words)
@@ -79,7 +79,7 @@ def test_a_calibration_of_all_gives_what_verify_gives(tmp_path: Path) -> None:
     with h5py.File(output / MATCHES) as file:
         attributes = dict(file["a.jpg/b.jpg"].attrs)
     np.testing.assert_allclose(attributes["R"], pose.rotation.matrix(), atol=1e-9)
-    assert attributes["configuration"] == "calibrated"
+    assert attributes["pair_type"] == "calibrated"
     assert attributes["E"].shape == (3, 3)
 
     # The same matches by `verify`, which reads the cameras of the database.

@@ -25,7 +25,7 @@ def test_of_a_journal(tmp_path: Path) -> None:
         image.write_text(image.name)
     journal = MatchStore(tmp_path / "export", tmp_path)
     matches, scores, inliers = np.zeros((3, 2), np.int32), np.ones(3, np.float32), np.array([True, True, False])
-    verdict = {"significance": 12.5, "configuration": "planar"}
+    verdict = {"significance": 12.5, "pair_type": "planar"}
     given = StoredPair("a.png", "b.png", matches, scores, inliers, np.eye(3), **verdict)
     journal.add_pair(*images[:2], given)
     journal.add_pair(images[0], images[2], StoredPair(
@@ -39,7 +39,7 @@ def test_of_a_journal(tmp_path: Path) -> None:
     assert write_view_graph(graph, tmp_path) == ["graph.json", "graph.csv"]
     content = json.loads((tmp_path / "graph.json").read_text())
     assert content["components"] == [["a.png", "b.png"], ["c.png"]]
-    assert content["pairs"][0]["configuration"] == "planar"
+    assert content["pairs"][0]["pair_type"] == "planar"
     with (tmp_path / "graph.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [(row["image1"], row["inliers"], row["significance"]) for row in rows] == [

@@ -103,7 +103,7 @@ def test_a_batch_in_threads_has_the_bits_of_one_thread(threads: int, graph: bool
             e.F.square()[:, 0, 1].sum().backward()
         results.append((e, x0.grad))
     (threaded, gradient), (single, expected) = results
-    for name in ("F", "inliers", "ok", "draws", "significance"):
+    for name in ("F", "inliers", "ok", "samples", "significance"):
         assert torch.equal(getattr(threaded, name), getattr(single, name)), name
     assert threaded.reason == single.reason
     if graph:

@@ -24,7 +24,7 @@ def test_slots_are_the_features_of_image_0() -> None:
     assert torch.equal(matches.x0[0], f0.keypoints)
     assert torch.equal(matches.x1[0], f1.keypoints[neighbors.nearest])
     assert torch.equal(matches.lafs1[0], f1.lafs[neighbors.nearest])
-    assert torch.equal(matches.quality[0], neighbors.ratio)
+    assert torch.equal(matches.ratio[0], neighbors.ratio)
     assert matches.mask.all()
     assert matches.size0.tolist() == [[101, 200]]
     assert matches.size1.tolist() == [[102, 200]]
@@ -46,7 +46,7 @@ def test_neighbours_and_padding_are_invisible(mutual: bool) -> None:
         n = len(f0)
         assert torch.equal(row.mask[:, :n], alone.mask)
         assert not row.mask[:, n:].any()
-        for name in ("x0", "x1", "quality", "lafs0", "lafs1"):
+        for name in ("x0", "x1", "ratio", "lafs0", "lafs1"):
             assert torch.equal(getattr(row, name)[:, :n], getattr(alone, name))
     assert together.mask.any(-1).tolist() == [True, False, False]
 

@@ -45,14 +45,14 @@ def warped(seed: int, n: int, outliers: float, noise: float = 0.5) -> tuple[Corr
         return torch.from_numpy(value.astype(np.float32))[None]
 
     c = Correspondences(
-        tensor(x0), tensor(x1), torch.ones(1, n, dtype=torch.bool), quality=tensor(ratio),
+        tensor(x0), tensor(x1), torch.ones(1, n, dtype=torch.bool), ratio=tensor(ratio),
         lafs0=tensor(frames(x0, S0)), lafs1=tensor(frames(x1, S1)),
     )  # fmt: skip
     return c, torch.from_numpy(~wrong)
 
 
 def run(c: Correspondences) -> Tensor:
-    return code(c.x0, c.x1, mask=c.mask, quality=c.quality, lafs0=c.lafs0, lafs1=c.lafs1)[0]
+    return code(c.x0, c.x1, mask=c.mask, ratio=c.ratio, lafs0=c.lafs0, lafs1=c.lafs1)[0]
 
 
 def domain_of(c: Correspondences) -> tuple:
@@ -139,7 +139,7 @@ def test_two_surfaces_may_move_differently() -> None:
     shift = torch.tensor([160.0, 90.0])
     shifted = torch.cat([b.lafs1[..., :2], (b.lafs1[..., 2] + shift)[..., None]], -1)
     b = b.replace(x1=b.x1 + shift, lafs1=shifted)
-    fields = ("x0", "x1", "mask", "quality", "lafs0", "lafs1")
+    fields = ("x0", "x1", "mask", "ratio", "lafs0", "lafs1")
     both = Correspondences(**{f: torch.cat([getattr(a, f), getattr(b, f)], 1) for f in fields})
     kept, right = run(both), torch.cat([right_a, right_b]) & both.mask[0]
     assert (kept & right).sum() > 0.8 * right.sum()
@@ -149,7 +149,7 @@ def test_two_surfaces_may_move_differently() -> None:
 @pytest.mark.parametrize("n", [0, 1, 2, 7, 30])
 def test_few_matches(n: int) -> None:
     c, _ = warped(8, max(n, 1), 0.0)
-    result = coherence(c.x0[:, :n], c.x1[:, :n], quality=c.quality[:, :n])
+    result = coherence(c.x0[:, :n], c.x1[:, :n], ratio=c.ratio[:, :n])
     assert torch.isfinite(result.likelihood).all()
     assert not torch.isnan(result.residual).any()
     if n < 7:
@@ -167,11 +167,11 @@ def test_degenerate_places(kind: str) -> None:
         "line": (c.x0 * torch.tensor([1.0, 0.0]), c.x1 * torch.tensor([1.0, 0.0])),
     }[kind]
     for lafs in ((None, None), (c.lafs0, c.lafs1)):
-        result = coherence(x0, x1, quality=c.quality, lafs0=lafs[0], lafs1=lafs[1])
+        result = coherence(x0, x1, ratio=c.ratio, lafs0=lafs[0], lafs1=lafs[1])
         assert torch.isfinite(result.likelihood).all()
         assert not torch.isnan(result.residual).any()
     if kind == "still":  # without frames a motion like any other
-        assert code(x0, x1, quality=c.quality).float().mean() > 0.9
+        assert code(x0, x1, ratio=c.ratio).float().mean() > 0.9
 
 
 def test_scale_and_place_mean_nothing() -> None:
@@ -189,7 +189,7 @@ def test_padding_and_neighbours_are_invisible() -> None:
         fields = {}
         slots = torch.randperm(1000, generator=torch.Generator().manual_seed(0))
         here = [slots[:n].sort().values for n in counts]
-        for f in ("x0", "x1", "quality", "lafs0", "lafs1"):
+        for f in ("x0", "x1", "ratio", "lafs0", "lafs1"):
             values = [getattr(p, f)[0] for p in pairs]
             fields[f] = torch.full((4, 1000, *values[0].shape[1:]), garbage)
             for b, value in enumerate(values):

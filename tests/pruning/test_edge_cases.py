@@ -14,7 +14,7 @@ from tests.laws import calibrated, quick_pruner, scene
 from tests.variants import built, variants
 
 PRUNERS = variants("pruner")
-PER_MATCH = ("x0", "x1", "quality", "prior", "lafs0", "lafs1", "mutual")
+PER_MATCH = ("x0", "x1", "ratio", "prior", "lafs0", "lafs1", "mutual")
 H, W = 640, 960
 
 
@@ -57,7 +57,7 @@ def test_edge_case(name: str, case: str) -> None:
 
 @pytest.mark.parametrize("name", ["gms", "lpm", "gms:soft=true", "lpm:soft=true", "position_consistency"])
 def test_matches_that_all_move_alike_in_one_cell_are_kept(name: str) -> None:
-    c = edge_cases()["one cell"].replace(quality=None, lafs0=None, lafs1=None, prior=None)
+    c = edge_cases()["one cell"].replace(ratio=None, lafs0=None, lafs1=None, prior=None)
     pruned = built("pruner", name)(c)
     assert pruned.mask.all()
     if name not in ("gms", "lpm"):

@@ -29,7 +29,7 @@ def common_motion(count: int = 80) -> Correspondences:
 def agree(c: Correspondences) -> torch.Tensor:
     assert c.lafs0 is not None
     assert c.lafs1 is not None
-    return frame_agreement(c.x0, c.x1, c.lafs0, c.lafs1, c.quality, c.mask)
+    return frame_agreement(c.x0, c.x1, c.lafs0, c.lafs1, c.ratio, c.mask)
 
 
 @pytest.mark.parametrize("count", [2, 5, 60])
@@ -37,9 +37,9 @@ def test_equals_the_definition(count: int) -> None:
     c = scene(1, count)
     assert c.lafs0 is not None
     assert c.lafs1 is not None
-    assert c.quality is not None
+    assert c.ratio is not None
     A0, A1 = c.lafs0[0, :, :, :2].double().numpy(), c.lafs1[0, :, :, :2].double().numpy()
-    vote = np.maximum(WORST_RATIO - c.quality[0].double().numpy(), MIN_VOTE)
+    vote = np.maximum(WORST_RATIO - c.ratio[0].double().numpy(), MIN_VOTE)
     expected = reference.agreement(
         c.x0[0].double().numpy(),
         c.x1[0].double().numpy(),
@@ -70,11 +70,11 @@ def test_a_wrong_match_disagrees_and_is_told_from_the_right_ones() -> None:
 
 def test_gradients_are_those_of_the_definition() -> None:
     c = scene(2, 30)
-    fields = {name: getattr(c, name).double().requires_grad_() for name in ("x0", "x1", "lafs0", "lafs1", "quality")}
+    fields = {name: getattr(c, name).double().requires_grad_() for name in ("x0", "x1", "lafs0", "lafs1", "ratio")}
     weight = torch.linspace(-1, 1, 30, dtype=torch.float64)
 
-    def defined(x0: np.ndarray, x1: np.ndarray, lafs0: np.ndarray, lafs1: np.ndarray, quality: np.ndarray) -> float:
-        S, vote = lafs1[0, :, :, :2] @ np.linalg.inv(lafs0[0, :, :, :2]), np.maximum(WORST_RATIO - quality[0], MIN_VOTE)
+    def defined(x0: np.ndarray, x1: np.ndarray, lafs0: np.ndarray, lafs1: np.ndarray, ratio: np.ndarray) -> float:
+        S, vote = lafs1[0, :, :, :2] @ np.linalg.inv(lafs0[0, :, :, :2]), np.maximum(WORST_RATIO - ratio[0], MIN_VOTE)
         agreement = reference.agreement(x0[0], x1[0], S, vote, CURVES, WINDOW, TOLERANCE, NOISE)
         return float(weight.numpy() @ agreement)
 
@@ -104,14 +104,14 @@ def test_without_frames_or_quality_the_prior_is_left_alone() -> None:
     pruner = presets.build("pruner", "frame_consistency")
     c = scene(2, 50)
     assert pruner(c.replace(lafs0=None)).prior is c.prior
-    assert pruner(c.replace(quality=None)).prior is c.prior
+    assert pruner(c.replace(ratio=None)).prior is c.prior
 
 
 def test_find_fundamental_derives_the_prior_from_the_frames() -> None:
     c = scene(2, 120)
     given = presets.build("pruner", "frame_consistency")(c.replace(prior=None)).prior
-    own = fmtorch.find_fundamental(c.x0, c.x1, quality=c.quality, lafs0=c.lafs0, lafs1=c.lafs1)
-    with_prior = fmtorch.find_fundamental(c.x0, c.x1, quality=c.quality, prior=given)
+    own = fmtorch.find_fundamental(c.x0, c.x1, ratio=c.ratio, lafs0=c.lafs0, lafs1=c.lafs1)
+    with_prior = fmtorch.find_fundamental(c.x0, c.x1, ratio=c.ratio, prior=given)
     assert torch.equal(own.F, with_prior.F)
 
 

@@ -49,8 +49,8 @@ class Ratio(nn.Module):
     """The least that a user's own network is."""
 
     def forward(self, c: Correspondences) -> Tensor:
-        assert c.quality is not None
-        return 4 - 8 * c.quality
+        assert c.ratio is not None
+        return 4 - 8 * c.ratio
 
 
 @pytest.fixture(scope="module", params=VARIANTS)
@@ -83,7 +83,7 @@ def test_padding_and_neighbours_are_invisible(files: tuple[nn.Module, Path], run
     alone = [pruner.probability(c) for c in pairs_of_several_lengths()]
     batch = collate(pairs_of_several_lengths())
     nan = {"x0": torch.where(batch.mask[..., None], batch.x0, torch.nan),
-           "quality": torch.where(batch.mask, batch.quality, torch.nan)}  # fmt: skip
+           "ratio": torch.where(batch.mask, batch.ratio, torch.nan)}  # fmt: skip
     for c, order in ((batch, range(6)), (batch[[5, 2, 0]], (5, 2, 0)), (batch.replace(**nan), range(6))):
         together = pruner.probability(c)
         for row, i in enumerate(order):
@@ -113,8 +113,8 @@ def test_bits_do_not_depend_on_threads() -> None:
 
 def test_prior_and_threshold() -> None:
     c = scene(0)
-    assert c.quality is not None
-    p = torch.sigmoid(4 - 8 * c.quality)
+    assert c.ratio is not None
+    p = torch.sigmoid(4 - 8 * c.ratio)
     soft = LearnedPruner(Ratio())(c)
     torch.testing.assert_close(soft.prior, p)
     assert torch.equal(soft.mask, c.mask)
@@ -125,7 +125,7 @@ def test_prior_and_threshold() -> None:
     assert torch.equal(both.mask, hard.mask)
     assert both.prior is not None
     cold = LearnedPruner(Ratio(), temperature=2.0).probability(c)
-    torch.testing.assert_close(cold, torch.sigmoid((4 - 8 * c.quality) / 2))
+    torch.testing.assert_close(cold, torch.sigmoid((4 - 8 * c.ratio) / 2))
 
 
 def test_a_match_that_is_not_finite_has_no_chance() -> None:

@@ -40,7 +40,7 @@ def test_matches_without_frames_are_left_as_they_are_and_what_cannot_be_told_is_
     noise = stage(c.replace(lafs0=lafs)).noise
     assert float(noise[0, 3]) == 1
     assert bool(torch.isfinite(noise).all())
-    alone = stage(c.replace(quality=None, prior=None)).noise
+    alone = stage(c.replace(ratio=None, prior=None)).noise
     assert bool((alone[c.mask] > 0).all())
 
 

@@ -20,7 +20,7 @@ from tests.reference import position_consistency as reference
 
 
 def agree(c: Correspondences) -> torch.Tensor:
-    return position_agreement(c.x0, c.x1, c.quality, c.mask)
+    return position_agreement(c.x0, c.x1, c.ratio, c.mask)
 
 
 def turned(c: Correspondences, angle: float, scale: float) -> Correspondences:
@@ -34,10 +34,10 @@ def turned(c: Correspondences, angle: float, scale: float) -> Correspondences:
 @pytest.mark.parametrize("count", [1, 2, 5, 60])
 def test_equals_the_definition(count: int, angle: float, scale: float, ratios: bool) -> None:
     c = turned(scene(1, count), angle, scale)
-    c = c if ratios else c.replace(quality=None)
+    c = c if ratios else c.replace(ratio=None)
     x0, x1 = c.x0[0].double().numpy(), c.x1[0].double().numpy()
     S = reference.similarity(x0, x1, CURVES, TURNS, SCALES)
-    vote = np.ones(count) if c.quality is None else np.maximum(WORST_RATIO - c.quality[0].double().numpy(), MIN_VOTE)
+    vote = np.ones(count) if c.ratio is None else np.maximum(WORST_RATIO - c.ratio[0].double().numpy(), MIN_VOTE)
     expected = reference.agreement(x0, x1, S, vote, CURVES, WINDOW, TOLERANCE, NOISE)
     # float32: coordinates of 1e3 px are rounded to 6e-5 px, against lengths of at least 4 px
     np.testing.assert_allclose(agree(c)[0].numpy(), expected, rtol=1e-3, atol=1e-5)
@@ -64,13 +64,13 @@ def test_pairs_of_a_batch_have_their_own_turns() -> None:
 
 def test_gradients_are_those_of_the_definition() -> None:
     c = scene(2, 30)
-    assert c.quality is not None
-    fields = {name: getattr(c, name).double().requires_grad_() for name in ("x0", "x1", "quality")}
+    assert c.ratio is not None
+    fields = {name: getattr(c, name).double().requires_grad_() for name in ("x0", "x1", "ratio")}
     weight = torch.linspace(-1, 1, 30, dtype=torch.float64)
 
-    def defined(x0: np.ndarray, x1: np.ndarray, quality: np.ndarray) -> float:
+    def defined(x0: np.ndarray, x1: np.ndarray, ratio: np.ndarray) -> float:
         S = reference.similarity(x0[0], x1[0], CURVES, TURNS, SCALES)
-        vote = np.maximum(WORST_RATIO - quality[0], MIN_VOTE)
+        vote = np.maximum(WORST_RATIO - ratio[0], MIN_VOTE)
         agreement = reference.agreement(x0[0], x1[0], S, vote, CURVES, WINDOW, TOLERANCE, NOISE)
         return float(weight.numpy() @ agreement)
 
@@ -90,10 +90,10 @@ def test_gradients_are_finite() -> None:
 @pytest.mark.parametrize("ratios", [True, False])
 def test_find_fundamental_derives_the_prior_without_frames(ratios: bool) -> None:
     c = scene(2, 120).replace(prior=None)
-    c = c if ratios else c.replace(quality=None)
+    c = c if ratios else c.replace(ratio=None)
     given = presets.build("pruner", "position_consistency")(c).prior
-    own = fmtorch.find_fundamental(c.x0, c.x1, quality=c.quality)
-    with_prior = fmtorch.find_fundamental(c.x0, c.x1, quality=c.quality, prior=given)
+    own = fmtorch.find_fundamental(c.x0, c.x1, ratio=c.ratio)
+    with_prior = fmtorch.find_fundamental(c.x0, c.x1, ratio=c.ratio, prior=given)
     assert torch.equal(own.F, with_prior.F)
 
 

@@ -32,16 +32,16 @@ def test_logistic() -> None:
 
 def test_calibration_uses_the_ratio_where_there_is_one() -> None:
     c = scene(0, 30).replace(prior=None)
-    assert c.quality is not None
+    assert c.ratio is not None
     evidence = torch.rand(1, 30, generator=torch.Generator().manual_seed(0))
     both = Calibration({"constant": -1.0, "evidence": 3.0, "ratio": -2.0}, {"constant": -2.0, "evidence": 4.0})
-    with_ratio, alone = both(c, evidence).prior, both(c.replace(quality=None), evidence).prior
-    assert torch.equal(with_ratio, logistic(-1 + 3 * evidence - 2 * c.quality))
+    with_ratio, alone = both(c, evidence).prior, both(c.replace(ratio=None), evidence).prior
+    assert torch.equal(with_ratio, logistic(-1 + 3 * evidence - 2 * c.ratio))
     assert torch.equal(alone, logistic(-2 + 4 * evidence))
-    unknown = c.quality.clone()
+    unknown = c.ratio.clone()
     unknown[0, 3] = torch.nan
-    assert both(c.replace(quality=unknown), evidence).prior[0, 3] == logistic(-3 + 3 * evidence[0, 3])
-    assert Calibration(both.with_ratio)(c.replace(quality=None), evidence).prior is None
+    assert both(c.replace(ratio=unknown), evidence).prior[0, 3] == logistic(-3 + 3 * evidence[0, 3])
+    assert Calibration(both.with_ratio)(c.replace(ratio=None), evidence).prior is None
 
 
 @pytest.mark.parametrize(("angle", "scale"), [(0.0, 1.0), (np.pi / 2, 0.5)])
@@ -90,7 +90,7 @@ def test_priors_follow_the_right_matches_of_a_common_motion() -> None:
     x0, x1 = (x[None].float() for x in moving(0, 1000, outliers=0.5))
     turn = torch.tensor([[0.95, 0.2], [-0.2, 0.95]])
     right = (x1 - x0 @ turn - torch.tensor([30.0, 10.0])).norm(dim=-1)[0] < 3
-    c = scene(0, 1000).replace(x0=x0, x1=x1, quality=None, lafs0=None, lafs1=None, prior=None)
+    c = scene(0, 1000).replace(x0=x0, x1=x1, ratio=None, lafs0=None, lafs1=None, prior=None)
     for name in ("gms:soft=true", "lpm:soft=true", "position_consistency", "code:soft=true"):
         prior = built("pruner", name)(c).prior[0]
         area = (prior[right][:, None] > prior[~right][None]).double().mean()

@@ -20,9 +20,9 @@ from tests.reference.matching import one_to_one as one_to_one_reference
 
 
 def test_ratio_is_strict_and_refuses_nan() -> None:
-    quality = torch.tensor([[0.0, 0.79, 0.8, 1.0, math.nan]])
-    assert ratio_test(quality, 0.8).tolist() == [[True, True, False, False, False]]
-    assert ratio_test(quality, 0.8, torch.tensor([[False, True, True, True, True]])).sum() == 1
+    ratio = torch.tensor([[0.0, 0.79, 0.8, 1.0, math.nan]])
+    assert ratio_test(ratio, 0.8).tolist() == [[True, True, False, False, False]]
+    assert ratio_test(ratio, 0.8, torch.tensor([[False, True, True, True, True]])).sum() == 1
 
 
 def test_mutual_agrees_with_the_matcher() -> None:
@@ -68,28 +68,28 @@ def grid_points(n: int) -> st.SearchStrategy[np.ndarray]:
 @given(st.data(), st.integers(0, 12))
 def test_one_to_one_equals_the_definition(data: st.DataObject, n: int) -> None:
     x0, x1 = data.draw(grid_points(n)), data.draw(grid_points(n))
-    quality = data.draw(arrays(np.float32, (n,), elements=st.sampled_from([0.25, 0.5, math.inf])))
-    mask = one_to_one(*(torch.from_numpy(a)[None] for a in (x0, x1, quality)))
-    np.testing.assert_array_equal(mask[0], one_to_one_reference(x0, x1, quality))
+    ratio = data.draw(arrays(np.float32, (n,), elements=st.sampled_from([0.25, 0.5, math.inf])))
+    mask = one_to_one(*(torch.from_numpy(a)[None] for a in (x0, x1, ratio)))
+    np.testing.assert_array_equal(mask[0], one_to_one_reference(x0, x1, ratio))
 
 
 def duplicated(seed: int, n: int, dtype: torch.dtype = torch.float32) -> tuple[Tensor, Tensor, Tensor]:
-    """Points drawn from few locations, so that most locations repeat; no two qualities are equal."""
+    """Points drawn from few locations, so that most locations repeat; no two ratios are equal."""
     generator = torch.Generator().manual_seed(seed)
     places = 100 * torch.rand(2, max(n // 3, 1), 2, generator=generator, dtype=dtype)
     pick = torch.randint(0, places.shape[1], (2, n), generator=generator)
-    quality = torch.randperm(n, generator=generator).to(dtype) / max(n, 1)
-    return places[0, pick[0]], places[1, pick[1]], quality
+    ratio = torch.randperm(n, generator=generator).to(dtype) / max(n, 1)
+    return places[0, pick[0]], places[1, pick[1]], ratio
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_one_to_one_is_symmetric_and_independent_of_order(dtype: torch.dtype) -> None:
-    x0, x1, quality = (a[None] for a in duplicated(0, 200, dtype))
-    kept = one_to_one(x0, x1, quality)
+    x0, x1, ratio = (a[None] for a in duplicated(0, 200, dtype))
+    kept = one_to_one(x0, x1, ratio)
     assert 0 < kept.sum() < 200
-    assert torch.equal(kept, one_to_one(x1, x0, quality))
+    assert torch.equal(kept, one_to_one(x1, x0, ratio))
     order = torch.randperm(200, generator=torch.Generator().manual_seed(1))
-    assert torch.equal(kept[:, order], one_to_one(x0[:, order], x1[:, order], quality[:, order]))
+    assert torch.equal(kept[:, order], one_to_one(x0[:, order], x1[:, order], ratio[:, order]))
     for x in (x0, x1):
         assert len(torch.unique(x[kept], dim=0)) == kept.sum()
 
@@ -104,12 +104,12 @@ def test_one_to_one_does_not_see_padding_or_neighbours() -> None:
     sizes = [50, 0, 1, 31]
     items = [duplicated(i, n) for i, n in enumerate(sizes)]
     x0, x1 = torch.full((4, 60, 2), math.nan), torch.zeros(4, 60, 2)
-    quality, mask = torch.full((4, 60), -math.inf), torch.zeros(4, 60, dtype=torch.bool)
+    ratio, mask = torch.full((4, 60), -math.inf), torch.zeros(4, 60, dtype=torch.bool)
     for b, (a0, a1, q) in enumerate(items):
         slots = torch.arange(len(q)) + 5
-        x1[b] = a1[0] if len(a1) else 0.0  # padding that lies where real matches lie, with the best quality
-        x0[b, slots], x1[b, slots], quality[b, slots], mask[b, slots] = a0, a1, q, True
-    together = one_to_one(x0, x1, quality, mask)
+        x1[b] = a1[0] if len(a1) else 0.0  # padding that lies where real matches lie, with the best ratio
+        x0[b, slots], x1[b, slots], ratio[b, slots], mask[b, slots] = a0, a1, q, True
+    together = one_to_one(x0, x1, ratio, mask)
     assert not together[~mask].any()
     for b, (a0, a1, q) in enumerate(items):
         assert torch.equal(together[b, 5 : 5 + len(q)], one_to_one(a0[None], a1[None], q[None])[0])
@@ -118,19 +118,19 @@ def test_one_to_one_does_not_see_padding_or_neighbours() -> None:
 def test_one_to_one_drops_what_has_no_location_and_ranks_nan_quality_last() -> None:
     x0 = torch.tensor([[[math.nan, 0.0], [math.inf, 0.0], [1.0, 1.0], [1.0, 1.0]]])
     x1 = torch.arange(8.0).reshape(1, 4, 2)
-    quality = torch.tensor([[0.0, 0.0, math.nan, 0.9]])
-    assert one_to_one(x0, x1, quality).tolist() == [[False, False, False, True]]
+    ratio = torch.tensor([[0.0, 0.0, math.nan, 0.9]])
+    assert one_to_one(x0, x1, ratio).tolist() == [[False, False, False, True]]
 
 
 def test_stages_need_a_quality_and_keep_the_rest() -> None:
-    x0, x1, quality = (a[None] for a in duplicated(0, 20))
+    x0, x1, ratio = (a[None] for a in duplicated(0, 20))
     mask = torch.ones(1, 20, dtype=torch.bool)
     for stage, expected in (
-        (RatioTest(0.5), ratio_test(quality, 0.5)),
-        (OneToOne(), one_to_one(x0, x1, quality)),
+        (RatioTest(0.5), ratio_test(ratio, 0.5)),
+        (OneToOne(), one_to_one(x0, x1, ratio)),
     ):
-        out = stage(Correspondences(x0, x1, mask, quality))
+        out = stage(Correspondences(x0, x1, mask, ratio))
         assert torch.equal(out.mask, expected)
         assert torch.equal(out.x0, x0)
-        with pytest.raises(ValueError, match="quality"):
+        with pytest.raises(ValueError, match="ratio"):
             stage(Correspondences(x0, x1, mask))

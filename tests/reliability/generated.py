@@ -160,7 +160,7 @@ def functions(module: ModuleType) -> dict[str, Callable[..., Any]]:
 
 FIELDS: Mapping[str, tuple[str, tuple[str, ...]]] = {
     "x0": ("Float", ("b", "n", "2")), "x1": ("Float", ("b", "n", "2")), "mask": ("Bool", ("b", "n")),
-    "quality": ("Float", ("b", "n")), "prior": ("Float", ("b", "n")), "noise": ("Float", ("b", "n")),
+    "ratio": ("Float", ("b", "n")), "prior": ("Float", ("b", "n")), "noise": ("Float", ("b", "n")),
     "lafs0": ("Float", ("b", "n", "2", "3")), "lafs1": ("Float", ("b", "n", "2", "3")),
     "size0": ("Real", ("b", "2")), "size1": ("Real", ("b", "2")), "key": ("Int", ("b",)),
 }  # fmt: skip

@@ -157,7 +157,7 @@ def test_a_file_system_without_hard_links(tmp_path: Path, monkeypatch: pytest.Mo
 def test_rows_come_back_as_they_went(tmp_path: Path) -> None:
     full = row(
         "a/b c/ü", scene="t", nsgd=0.25, nsgd_released=0.3, inlier_rate=0.5, inlier_rate_before=0.25, corrs=3,
-        corrs_before=9, features0=100, features1=8000, draws=2000, seconds_features=0.5, seconds_matching=0.25,
+        corrs_before=9, features0=100, features1=8000, samples=2000, seconds_features=0.5, seconds_matching=0.25,
         seconds_pruning=0.0, seconds_estimation=1e-3, seconds_metrics=2.0, rotation_error=1.5, translation_error=89.0,
         pose_reason=None,
     )  # fmt: skip

@@ -35,7 +35,7 @@ def item(K0: np.ndarray = K, name: str = "orbit/s/0") -> Item:
     points = [torch.from_numpy(x)[None].float() for x in (x0, x1)]
     lafs0, lafs1 = (torch.cat([frame, x[..., None]], -1) for x in points)
     matches = Correspondences(
-        *points, torch.ones(1, 250, dtype=torch.bool), quality=ratio, lafs0=lafs0, lafs1=lafs1, size0=sizes[:1],
+        *points, torch.ones(1, 250, dtype=torch.bool), ratio=ratio, lafs0=lafs0, lafs1=lafs1, size0=sizes[:1],
         size1=sizes[1:], key=torch.tensor([of.key]),
     )  # fmt: skip
     return plain_item(of, matches)

@@ -71,7 +71,7 @@ def test_the_truth_stays_true_after_each_change(name: str) -> None:
     c, old = after.correspondences, before.correspondences
     assert ((after.label != 0) & c.mask).sum() > 20
     assert torch.equal(after.label[c.mask], before.label[c.mask])
-    assert torch.equal(c.quality, old.quality)
+    assert torch.equal(c.ratio, old.ratio)
     assert torch.equal(c.keys, old.keys)
     if name not in ("swap", "all"):  # points lie in their images
         for x, size, x_old, size_old in ((c.x0, c.size0, old.x0, old.size0), (c.x1, c.size1, old.x1, old.size1)):
@@ -133,11 +133,11 @@ def test_a_crop_masks_what_is_outside_and_moves_the_principal_point() -> None:
 def test_ratio_noise_and_two_swaps() -> None:
     m = exact()
     c = m.correspondences
-    assert torch.equal(keep_ratio(m, 0.6).correspondences.mask, c.quality < 0.6)
-    at_one = m.replace(correspondences=c.replace(quality=torch.ones_like(c.quality)))
+    assert torch.equal(keep_ratio(m, 0.6).correspondences.mask, c.ratio < 0.6)
+    at_one = m.replace(correspondences=c.replace(ratio=torch.ones_like(c.ratio)))
     assert keep_ratio(at_one, 1.0).correspondences.mask.all()
-    with pytest.raises(ValueError, match="quality"):
-        keep_ratio(m.replace(correspondences=c.replace(quality=None)), 0.8)
+    with pytest.raises(ValueError, match="ratio"):
+        keep_ratio(m.replace(correspondences=c.replace(ratio=None)), 0.8)
     step0, step1 = torch.full_like(c.x0, 0.5), torch.full_like(c.x1, -2.0)
     moved = move(m, step0, step1).correspondences
     torch.testing.assert_close(moved.x0 - c.x0, step0)
@@ -152,9 +152,9 @@ def test_the_truth_stays_true_after_any_draw(epoch: int) -> None:
     after = dataclasses.replace(NOISELESS, turn=0.4, quarter_turn=0.4, crop=0.7)(before, seed=0, epoch=epoch)
     expect_truth(after)
     assert after.correspondences.mask.all()
-    # Every match is one of before, with its label: the quality says which.
-    old = {float(q): int(v) for q, v in zip(before.correspondences.quality[0], before.label[0], strict=True)}
-    assert [old[float(q)] for q in after.correspondences.quality[0]] == after.label[0].tolist()
+    # Every match is one of before, with its label: the ratio says which.
+    old = {float(q): int(v) for q, v in zip(before.correspondences.ratio[0], before.label[0], strict=True)}
+    assert [old[float(q)] for q in after.correspondences.ratio[0]] == after.label[0].tolist()
 
 
 def test_the_same_draw_gives_the_same_matches_and_another_one_others() -> None:
@@ -172,9 +172,9 @@ def test_ranges_are_kept() -> None:
     for epoch in range(10):
         subset = dataclasses.replace(ONLY, matches=(50, 300))(m, seed=0, epoch=epoch)
         assert 50 <= subset.label.shape[1] <= 300
-        ratio = dataclasses.replace(ONLY, ratio=(0.8, 0.9))(m, seed=0, epoch=epoch).correspondences.quality
+        ratio = dataclasses.replace(ONLY, ratio=(0.8, 0.9))(m, seed=0, epoch=epoch).correspondences.ratio
         assert 0.75 < ratio.max() < 0.9
-        assert ratio.shape[1] >= (m.correspondences.quality < 0.8).sum()
+        assert ratio.shape[1] >= (m.correspondences.ratio < 0.8).sum()
         thinned = dataclasses.replace(ONLY, thin=1, inlier_share=(0.3, 0.4))(m, seed=0, epoch=epoch)
         assert 0.29 < float((thinned.label == 1).sum() / (thinned.label >= 0).sum()) < 0.41
         noisy = dataclasses.replace(ONLY, noise=(0.5, 0.5))(m, seed=0, epoch=epoch).correspondences

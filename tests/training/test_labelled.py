@@ -61,7 +61,7 @@ class Wall:
 
 def test_masked_slots_have_no_label_and_labels_move_with_their_matches() -> None:
     m = exact(pairs=3)
-    kept = m.keep(m.correspondences.quality < 0.6)
+    kept = m.keep(m.correspondences.ratio < 0.6)
     outside = ~kept.correspondences.mask
     assert (kept.label[outside] == -1).all()
     assert not kept.inlier[outside].any()

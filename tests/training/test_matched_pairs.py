@@ -57,7 +57,7 @@ def test_items_are_the_pipelines_matches_with_labels(rendered: RenderedPairs, ma
         expected = pipeline.correspondences([pair])[0].correspondences
         item = matched[index]
         c = item.correspondences
-        for name in ("x0", "x1", "quality", "mutual", "lafs0", "lafs1", "size0", "size1", "K0", "K1", "key", "mask"):
+        for name in ("x0", "x1", "ratio", "mutual", "lafs0", "lafs1", "size0", "size1", "K0", "K1", "key", "mask"):
             assert torch.equal(getattr(c, name), getattr(expected, name)), name
             assert getattr(c, name).dtype == getattr(expected, name).dtype
         np.testing.assert_allclose(item.F[0].numpy(), pair.F, atol=1e-15)
@@ -217,7 +217,7 @@ def rows(n: int = 5) -> list[dict[str, Any]]:
     for i in range(n):
         count = int(rng.integers(1, 50))
         arrays = {
-            "x0": (count, 2), "x1": (count, 2), "quality": (count,), "lafs0": (count, 2, 3), "lafs1": (count, 2, 3)
+            "x0": (count, 2), "x1": (count, 2), "ratio": (count,), "lafs0": (count, 2, 3), "lafs1": (count, 2, 3)
         }  # fmt: skip
         drawn.append(
             {

@@ -233,13 +233,13 @@ def test_training_goes_through_degenerate_scenes(fit: Fit) -> None:
         K[None], K[None], torch.eye(3, dtype=torch.float64)[None], torch.tensor([[1.0, 0.0, 0.2]]).double()
     )
     shared = (E.expand(len(c.mask), 3, 3), c.size0, c.size1)
-    label = torch.where(c.mask, (c.quality < 0.6).to(torch.int8), -1)
+    label = torch.where(c.mask, (c.ratio < 0.6).to(torch.int8), -1)
     torch.manual_seed(0)
     network = torch.nn.Sequential(torch.nn.Linear(1, 8), torch.nn.Tanh(), torch.nn.Linear(8, 1)).double()
     optimiser = torch.optim.Adam(network.parameters(), lr=2e-2)
     losses = []
     for step in range(5):
-        logit = network(torch.where(c.mask, c.quality, 0.0).nan_to_num(0.0)[..., None].double())[..., 0]
+        logit = network(torch.where(c.mask, c.ratio, 0.0).nan_to_num(0.0)[..., None].double())[..., 0]
         F, valid = fit(c, torch.where(c.mask, torch.sigmoid(logit), 0.0))
         options = {"valid": valid, "seed": step, "key": c.key}
         judged = classification_loss(logit, label)

@@ -36,8 +36,8 @@ def test_normalized_points_have_the_identity_for_their_camera() -> None:
     estimate = fmtorch.find_essential(x0, x1, np.eye(3), np.eye(3))
     assert bool(estimate.ok)
     assert int(estimate.inliers.sum()) < 0.8 * len(x0)
-    with_configuration = fmtorch.find_essential(x0, x1, np.eye(3), np.eye(3), configuration=True)
-    assert with_configuration.configuration == ("general",)
+    with_pair_type = fmtorch.find_essential(x0, x1, np.eye(3), np.eye(3), pair_type=True)
+    assert with_pair_type.pair_type == ("general",)
     with pytest.raises(
         ValueError, match=r"x0 runs from .*, as normalised points do, but K0 is in pixels; give points in"
     ):

@@ -271,7 +271,7 @@ def test_a_warped_photograph() -> None:
     image = cv2.imread(str(shared_path("data/planar/graf/graf1.png")))
     h, w = image.shape[:2]
     c = fmtorch.match(image, cv2.warpPerspective(image, TRUTH, (w, h)), pipeline="sift_fmtorch").correspondences
-    estimate = fmtorch.find_homography(c.x0, c.x1, mask=c.mask, quality=c.quality, prior=c.prior, noise=c.noise)
+    estimate = fmtorch.find_homography(c.x0, c.x1, mask=c.mask, ratio=c.ratio, prior=c.prior, noise=c.noise)
     assert bool(estimate.ok)
     assert corner_error(estimate.H[0]) < 0.5
 
@@ -283,7 +283,7 @@ def test_a_photographed_wall() -> None:
     text = ElementTree.parse(folder / "H1to3p.xml").getroot().findtext(".//data")
     truth = np.array(str(text).split(), float).reshape(3, 3)
     c = fmtorch.match(a, b, pipeline="sift_fmtorch").correspondences
-    estimate = fmtorch.find_homography(c.x0, c.x1, mask=c.mask, quality=c.quality, prior=c.prior, noise=c.noise)
+    estimate = fmtorch.find_homography(c.x0, c.x1, mask=c.mask, ratio=c.ratio, prior=c.prior, noise=c.noise)
     assert bool(estimate.ok)
     assert corner_error(estimate.H[0], truth) < 5
 

@@ -272,7 +272,7 @@ def test_laws() -> None:
     ]
 
     def values(e: Estimate) -> dict[str, torch.Tensor]:
-        return {"F": e.F, "inliers": e.inliers, "ok": e.ok, "draws": e.draws}
+        return {"F": e.F, "inliers": e.inliers, "ok": e.ok, "samples": e.samples}
 
     together = estimator(collate([*degenerate, *pairs]))
     assert not bool(torch.isnan(together.F).any())

@@ -39,7 +39,7 @@ def test_a_checkpoint_of_neural_guided_ransac_becomes_a_pruner(tmp_path: Path) -
         torch.from_numpy(data[f"001.{name}"])[None] for name in ("X1", "X2", "ratio", "size1", "size2")
     )
     mask = torch.ones(x0.shape[:2], dtype=torch.bool)
-    c = Correspondences(x0, x1, mask, quality=ratio.double(), size0=size0, size1=size1)
+    c = Correspondences(x0, x1, mask, ratio=ratio.double(), size0=size0, size1=size1)
     p = LearnedPruner(LC(side=["ratio"]), file=tmp_path / "net.safetensors").probability(c)[0].double()
     expected = data["001.logprob_F_r1.00"].astype(np.float64)
     computed = (p / p.sum()).log().numpy()

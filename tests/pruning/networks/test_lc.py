@@ -24,7 +24,7 @@ def test_outputs_of_neural_guided_ransac(model: str) -> None:
     for case in cases:
         x0, x1, ratio, size0, size1 = (data[f"{case}.{name}"][None] for name in ("X1", "X2", "ratio", "size1", "size2"))
         mask = torch.ones(x0.shape[:2], dtype=torch.bool)
-        x, _ = network.inputs(Correspondences(x0, x1, mask, quality=ratio, size0=size0, size1=size1))
+        x, _ = network.inputs(Correspondences(x0, x1, mask, ratio=ratio, size0=size0, size1=size1))
         torch.testing.assert_close(x[0].mT, data[f"{case}.inp"], rtol=0, atol=1e-6)  # another order of rounding
         with torch.no_grad():
             logit = network.backbone(x.double(), Slots.of(mask, torch.float64))[0, 0]
