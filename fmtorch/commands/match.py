@@ -204,7 +204,8 @@ def _report(result: MatchResult, image0: Image, image1: Image, truth: NDArray[np
         "features": [len(result.keypoints0), len(result.keypoints1)],
         "matches": result.counts, "seconds": result.seconds,
         "x0": c.x0[0].tolist(), "x1": c.x1[0].tolist(), "inliers": result.inliers.tolist(),
-        "ratio": None if c.ambiguity is None else c.ambiguity[0].tolist(),
+        "ratio": None if c.ratio is None else c.ratio[0].tolist(),
+        "score": None if c.score is None else c.score[0].tolist(),
     }  # fmt: skip
     if (pinhole := result.undistorted) is not None:
         report |= {"undistorted_x0": pinhole.x0[0].tolist(), "undistorted_x1": pinhole.x1[0].tolist()}

@@ -40,7 +40,7 @@ WARNINGS = {
     "identical": "one photograph twice: matches determine neither F nor a pose",
     "unrelated": "the images show nothing in common",
 }
-"""What each configuration leaves open."""
+"""What each pair type leaves open."""
 
 
 def pair_key(identity: str) -> int:
@@ -95,7 +95,8 @@ class Correspondences(Record):
     """A batch of B image pairs with their putative matches, padded to N slots.
 
     x0, x1: matched points (B, N, 2) in pixels. mask: (B, N).
-    ratio: the matcher's own figure (B, N), for nearest neighbours the distance ratio; smaller is better.
+    ratio: the distance of the nearest descriptor over that of the second nearest, in [0, 1], (B, N); smaller is better.
+    score: the matcher's own confidence in [0, 1], (B, N); larger is better.
     prior: P(inlier) in [0, 1], (B, N), where something supplies it. noise: standard deviation of each match's distance
     to its epipolar line, relative to that of a usual match, (B, N), where something supplies it.
     lafs0, lafs1: local affine frames (B, N, 2, 3) where known. size0, size1: image sizes (B, 2) as (h, w).
@@ -122,6 +123,7 @@ class Correspondences(Record):
     noise: Annotated[Float[Tensor, "b n"], DEVIATION] | None = None
     focal: Annotated[Float[Tensor, "b 2 2"], FOCAL] | None = None
     shared_focal: Bool[Tensor, " b"] | None = None
+    score: Annotated[Float[Tensor, "b n"], PROBABILITY] | None = None
 
     def __post_init__(self) -> None:
         expect_fields(self)
@@ -135,6 +137,11 @@ class Correspondences(Record):
     def keys(self) -> Int[Tensor, " b"]:
         """The pairs' keys, never None."""
         return cast(Tensor, self.key)
+
+    @property
+    def ambiguity(self) -> Float[Tensor, "b n"] | None:
+        """What ranks matches, (B, N), smaller is better: the ratio, or 1 - score, or None where neither is known."""
+        return self.ratio if self.ratio is not None or self.score is None else 1 - self.score
 
     @property
     def asks_for_cameras(self) -> bool:
@@ -186,7 +193,7 @@ class Estimate(Record):
     log f0, log f1), radians and logarithms, where t moves to ``t + tangents tau``; tangents (B, 3, 2);
     covariance_F (B, 9, 9), of F row by row. See `fmtorch.geometry.covariance`.
 
-    Where the configuration is asked for: pair_type_index (B,), into `PAIR_TYPES`; homography (B, 3, 3), of the
+    Where the pair type is asked for: pair_type_index (B,), into `PAIR_TYPES`; homography (B, 3, 3), of the
     plane, the rotation or the copy, zero where there is none; other_R, other_t, the second pose that explains a plane,
     NaN where there is none.
     """
@@ -240,15 +247,15 @@ class Estimate(Record):
         return self.ok & (cast(Tensor, self.significance) >= RELATED)
 
     @property
-    def configuration(self) -> tuple[str, ...]:
+    def pair_type(self) -> tuple[str, ...]:
         """The name in `PAIR_TYPES` of each pair. Raises AttributeError where it was not asked for."""
         if self.pair_type_index is None:
-            raise AttributeError("the configuration is not known; find_fundamental(..., pair_type=True) tells it")
+            raise AttributeError("the pair type is not known; find_fundamental(..., pair_type=True) gives it")
         return tuple(PAIR_TYPES[i] for i in self.pair_type_index.tolist())
 
     @property
     def warning(self) -> tuple[str, ...]:
-        """What the configuration of each pair leaves open, empty where nothing. Raises as `configuration`."""
+        """What the type of each pair leaves open, empty where nothing. Raises as `pair_type`."""
         return tuple(WARNINGS[name] for name in self.pair_type)
 
     @property

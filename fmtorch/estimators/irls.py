@@ -35,10 +35,10 @@ NOT_DETERMINED = "the matches do not determine a model"
 class IterativelyReweighted:
     """The least ``sum_i w_i rho(r_i^2)``, r the Sampson distance, from the weighted 8-point algorithm on all matches.
 
-    w is the prior P(inlier); where there is none, the rank by ambiguity (1 for the best match, falling to 0); where there
-    is neither, 1. Each power of w in `starts` gives a first model. From there the scale of the loss shrinks from the
-    residuals' own to the threshold, one reweighted fit at each scale (graduated non-convexity, Blake & Zisserman 1987,
-    with the 8-point weights of Torr & Murray 1997), so that a redescending loss is not caught in the nearest minimum.
+    w is the prior P(inlier); without one, the rank by ambiguity (1 for the best, falling to 0); without either, 1.
+    Each power of w in `starts` gives a first model. From there the scale of the loss shrinks from the residuals'
+    own to the threshold, one reweighted fit at each scale (graduated non-convexity, Blake & Zisserman 1987, with
+    the 8-point weights of Torr & Murray 1997), so that a redescending loss is not caught in the nearest minimum.
     Of the refined models the one of least cost is the estimate.
 
     Gradients reach the points and the prior through one attached Gauss-Newton step: those of the optimum.

@@ -46,7 +46,7 @@ class Picture:
 
 @dataclasses.dataclass(frozen=True)
 class Shown:
-    """A pair as one run sees it. nsgd: None where it failed, with the reason. configuration: empty where unknown.
+    """A pair as one run sees it. nsgd: None where it failed, with the reason. pair_type: empty where unknown.
 
     corner_error: px, in place of NSGD where the pair has a homography.
     """

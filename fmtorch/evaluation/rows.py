@@ -101,7 +101,7 @@ def _of_homographies(outcomes: Sequence[Outcome]) -> list[Figures]:
 
 def _row(outcome: Outcome, figures: Figures, planar: bool, seconds: float) -> PairRow:
     pair, c, estimate = outcome.pair, outcome.correspondences, outcome.estimate
-    ok, configuration, focals = outcome.solved, outcome.pair_type, focal_errors(outcome)
+    ok, pair_type, focals = outcome.solved, outcome.pair_type, focal_errors(outcome)
     matrix = estimate.F[0].flatten().tolist() if estimate is not None and ok else None
     figures = figures | {f"seconds_{stage}": outcome.seconds.get(stage, math.nan) for stage in STAGES}
     return PairRow(
@@ -113,8 +113,8 @@ def _row(outcome: Outcome, figures: Figures, planar: bool, seconds: float) -> Pa
         seconds_metrics=seconds, F=None if planar else matrix, H=matrix if planar else None, **figures,
         significance=float(cast(Tensor, estimate.significance)[0]) if estimate is not None and ok else None,
         related=bool(estimate.related[0]) if estimate is not None else False,
-        pair_type=None if configuration is None else configuration.names[0],
-        warning=outcome.not_examined or None if configuration is None else configuration.warnings[0],
+        pair_type=None if pair_type is None else pair_type.names[0],
+        warning=outcome.not_examined or None if pair_type is None else pair_type.warnings[0],
         focal_error0=focals.error[0], focal_error1=focals.error[1],
         focal_log_ratio0=focals.log_ratio[0], focal_log_ratio1=focals.log_ratio[1],
     )  # fmt: skip

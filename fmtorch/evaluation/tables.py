@@ -165,7 +165,7 @@ KINDS = (
 
 
 def parts(groups: Mapping[str, Group], binned: bool = True) -> list[Part]:
-    """Poses, homographies, focal lengths and configurations, of the groups that have some. binned: with mAP."""
+    """Poses, homographies, focal lengths and pair types, of the groups that have some. binned: with mAP."""
 
     def known(field: str) -> dict[str, Group]:
         return {name: group[field] for name, group in groups.items() if group[field] is not None}
@@ -197,7 +197,7 @@ def _poses(rows: Mapping[str, Group], binned: bool) -> Part:
 
 
 def _parts_of_run(summary: Mapping[str, Group], binned: bool) -> list[Part]:
-    """Configurations only where a pair is not general."""
+    """Pair types only where a pair is not general."""
     kinds = [group["pair_types"] or {} for group in summary.values()]
     general = not any(count for counts in kinds for kind, count in counts.items() if kind != "general")
     return [part for part in parts(_groups(summary), binned) if part.heading != "Pair types" or not general]

@@ -1,4 +1,4 @@
-"""Which configuration a pair of images is in: general, planar, a rotation, one photograph twice, or unrelated."""
+"""Of which type a pair of images is: general, planar, a rotation, one photograph twice, or unrelated."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from fmtorch.geometry.rotation import Cameras, fit_rotation
 from fmtorch.jit.batches import for_each_pair
 from fmtorch.jit.kernel import Array, B1x1, F8x1, F8x2, inner, kernel, matrix, vector
 
-# Evidence for the kinds of an image pair, compiled; see `configuration`. Matches are those of one pair, in pixels
+# Evidence for the kinds of an image pair, compiled; see `pair_type`. Matches are those of one pair, in pixels
 
 
 FREEDOM = 3.0  # degrees, of Student's law: keypoints err by more than the normal one says

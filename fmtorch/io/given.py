@@ -26,24 +26,30 @@ def given(
     x1: Array,
     sizes: tuple[Size, Size],
     features: tuple[int, int],
+    *,
     ratio: Array | None = None,
+    score: Array | None = None,
     mutual: NDArray[np.bool_] | None = None,
 ) -> GivenMatches:
     """Matches of one pair, (n, 2) in pixels each; those that are not finite do not count.
 
-    ratio: (n,), smaller is better. mutual: (n,). features: how many keypoints each image has.
+    ratio, score, mutual: (n,), as of `Correspondences`. features: how many keypoints each image has.
     """
     p0, p1 = (torch.from_numpy(np.ascontiguousarray(x, np.float32))[None] for x in (x0, x1))
     mask = torch.from_numpy(np.isfinite(x0).all(-1) & np.isfinite(x1).all(-1))[None]
     return GivenMatches(
         Correspondences(
             torch.where(mask[..., None], p0, 0.0), torch.where(mask[..., None], p1, 0.0), mask,
-            ratio=None if ratio is None else torch.from_numpy(ratio.astype(np.float32))[None],
+            ratio=_figure(ratio), score=_figure(score),
             mutual=None if mutual is None else torch.from_numpy(mutual)[None] & mask,
             size0=torch.tensor([sizes[0]]), size1=torch.tensor([sizes[1]]),
         ),
         features,
     )  # fmt: skip
+
+
+def _figure(values: Array | None) -> torch.Tensor | None:
+    return None if values is None else torch.from_numpy(values.astype(np.float32))[None]
 
 
 def calibrated(

@@ -94,9 +94,13 @@ class HLocMatches:
         order = (1, 0) if self.swapped else (0, 1)
         i, j = _indices(chosen, [len(points[k]) for k in order], f"{self.matches}: {self.key + '/matches0'!r}")
         index = (j, i) if self.swapped else (i, j)
-        ratio = None if scores is None else 1 - scores[i]
+        score = None if scores is None else scores[i]
         return given(
-            points[0][index[0]], points[1][index[1]], (sizes[0], sizes[1]), (len(points[0]), len(points[1])), ratio
+            points[0][index[0]],
+            points[1][index[1]],
+            (sizes[0], sizes[1]),
+            (len(points[0]), len(points[1])),
+            score=score,
         )
 
 
@@ -119,21 +123,21 @@ class PairPrediction:
         with h5.opened(self.path) as file:
             group = file[self.key]
             if h5.holds(group, "matches0"):
-                x, counts, ratio = self._indexed(group)
+                x, counts, score = self._indexed(group)
             else:
-                x, counts, ratio = self._matched(group)
+                x, counts, score = self._matched(group)
             suffixes = ("1", "0") if self.swapped else ("0", "1")
             sizes = [_size(group, f"image_size{s}", image) for s, image in zip(suffixes, self.images, strict=True)]
         order = (1, 0) if self.swapped else (0, 1)
         x0, x1 = (x[k] - self.origin for k in order)
-        return given(x0, x1, (sizes[0], sizes[1]), (counts[order[0]], counts[order[1]]), ratio)
+        return given(x0, x1, (sizes[0], sizes[1]), (counts[order[0]], counts[order[1]]), score=score)
 
     def _indexed(self, group: Any) -> tuple[list[Array], list[int], Array | None]:
         points = [h5.numbers(group, f"keypoints{k}", None, 2) for k in (0, 1)]
         chosen, scores = _read_indices(group, self.path, "")
         counts = [len(p) for p in points]
         i, j = _indices(chosen, counts, f"{self.path}: {self.key + '/matches0'!r}")
-        return [points[0][i], points[1][j]], counts, None if scores is None else 1 - scores[i]
+        return [points[0][i], points[1][j]], counts, None if scores is None else scores[i]
 
     def _matched(self, group: Any) -> tuple[list[Array], list[int], Array | None]:
         x = [h5.numbers(group, f"matched_kpts{k}", None, 2) for k in (0, 1)]
@@ -141,14 +145,14 @@ class PairPrediction:
             raise DataError(
                 f"{self.path}: {self.key!r} has {len(x[0])} points in matched_kpts0 and {len(x[1])} in matched_kpts1"
             )
-        ratio = None
+        score = None
         if h5.holds(group, "matched_confidences"):
-            ratio = 1 - h5.numbers(group, "matched_confidences", len(x[0]))
+            score = h5.numbers(group, "matched_confidences", len(x[0]))
         counts = [len(p) for p in x]
         for k in (0, 1):
             if h5.holds(group, f"all_kpts{k}"):
                 counts[k] = len(h5.array(group, f"all_kpts{k}", None, 2))
-        return x, counts, ratio
+        return x, counts, score
 
 
 def hloc_pairs(truth: PairDataset, features: Path, matches: Path, origin: float) -> Iterator[ImagePair]:

@@ -60,7 +60,7 @@ class TutorialMatches:
                     f"{self.folder / RATIOS}: {self.key!r} has {len(ratios)} entries, "
                     f"but {MATCHES} has {len(points)} matches of that pair"
                 )
-        return given(points[:, :2], points[:, 2:], self.sizes, (len(points), len(points)), ratios)
+        return given(points[:, :2], points[:, 2:], self.sizes, (len(points), len(points)), ratio=ratios)
 
 
 def tutorial_files(root: Path) -> list[Path]:
@@ -280,7 +280,12 @@ class OANetMatches:
             ratios, mutuals = (self._side(file, name, len(rays)) for name in ("ratios", "mutuals"))
         x0, x1 = (x * K.diagonal()[:2] + K[:2, 2] for x, K in zip((rays[:, :2], rays[:, 2:]), self.K, strict=True))
         return given(
-            x0, x1, self.sizes, (len(rays), len(rays)), ratios, None if mutuals is None else mutuals.astype(bool)
+            x0,
+            x1,
+            self.sizes,
+            (len(rays), len(rays)),
+            ratio=ratios,
+            mutual=None if mutuals is None else mutuals.astype(bool),
         )
 
     def _side(self, file: Any, name: str, count: int) -> Array | None:

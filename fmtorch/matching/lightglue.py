@@ -15,7 +15,7 @@ FEATURES = ("aliked", "disk")  # those that need no more than positions and desc
 class LightGlue:
     """Matches the features of two images by a transformer; the slots of the result are the matches found.
 
-    ratio: 1 - score, prior: the network's score, its P(match). Frames are not handed on: the features that it is
+    score and prior: the network's score, its P(match). Frames are not handed on: the features that it is
     for have none. features: `aliked` or `disk`, what the weights were trained for; threshold: least score.
     device: auto, cpu, cuda. network: in place of the released one. For any number of threads.
 
@@ -54,7 +54,7 @@ class LightGlue:
             x0=features0.keypoints[pairs[:, 0]][None],
             x1=features1.keypoints[pairs[:, 1]][None],
             mask=torch.ones_like(score, dtype=torch.bool)[None],
-            ratio=1 - score[None],
+            score=score[None],
             prior=score[None],
             size0=features0.image_size[None],
             size1=features1.image_size[None],

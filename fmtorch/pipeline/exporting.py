@@ -45,9 +45,7 @@ def match_records(pipeline: Pipeline, outcomes: Sequence[Outcome]) -> MatchRecor
     return records
 
 
-def _geometry(
-    matches: NDArray[np.int32], c: Correspondences, estimate: Estimate, pair_type: PairTypes
-) -> PairGeometry:
+def _geometry(matches: NDArray[np.int32], c: Correspondences, estimate: Estimate, pair_type: PairTypes) -> PairGeometry:
     """The geometry of one pair for COLMAP, whose surviving matches are these keypoints, (m, 2).
 
     Where the estimator was given nothing of cameras that are known, and F is determined, the pose is that of F.
@@ -88,9 +86,7 @@ def exported_match(names: tuple[str, str], described: tuple[Described, Described
     pair = _pair(names, points, keypoints, result.F, result.inliers, result.related)
     if (geometry := result.geometry) is not None:
         geometry = geometry._replace(inliers=pair.matches[geometry.inliers[:, 0]])
-    return dataclasses.replace(
-        pair, geometry=geometry, significance=result.significance, pair_type=result.pair_type
-    )
+    return dataclasses.replace(pair, geometry=geometry, significance=result.significance, pair_type=result.pair_type)
 
 
 def _points(described: Described) -> NDArray[np.float32]:
@@ -110,7 +106,7 @@ def _pair(
 ) -> StoredPair:  # fmt: skip
     """The surviving matches of one pair, as the matcher left them, as indices of the images' points.
 
-    Scores are one less the matcher's figure, a ratio, and 1 where there is none. Raises ValueError for matches that are
+    Scores are the matcher's, or 1 - ratio, and 1 where there is neither. Raises ValueError for matches that are
     at no keypoint.
     """
     mask = c.mask[0].cpu()
@@ -118,8 +114,8 @@ def _pair(
         indices(keypoints, x[0].detach().cpu().float()[mask].numpy())
         for keypoints, x in zip(points, (c.x0, c.x1), strict=True)
     ]
-    ratio = torch.zeros(len(mask)) if c.ambiguity is None else c.ambiguity[0].detach().cpu().float()
-    scores = (1 - ratio[mask]).nan_to_num(0.0).clamp(0.0, 1.0)
+    ambiguity = torch.zeros(len(mask)) if c.ambiguity is None else c.ambiguity[0].detach().cpu().float()
+    scores = (1 - ambiguity[mask]).nan_to_num(0.0).clamp(0.0, 1.0)
     return StoredPair(
         *names, np.stack(index, -1).astype(np.int32), scores.numpy(), inliers.cpu()[mask].numpy(),
         F.detach().cpu().double().numpy(), related,

@@ -309,7 +309,7 @@ class Pipeline:
             if own:
                 family_outcomes = [outcomes[i] for i in own]
                 c = collated(family_outcomes)
-                keypoints = Correspondences(c.x0, c.x1, c.mask, ratio=c.ambiguity)
+                keypoints = Correspondences(c.x0, c.x1, c.mask, ratio=c.ratio, score=c.score)
 
                 def images(i: int, family_outcomes: list[Outcome] = family_outcomes) -> PairImages:
                     return family_outcomes[i].images or self.images(family_outcomes[i].pair)

@@ -26,15 +26,18 @@ def ratio_test(
 
 @dataclasses.dataclass(frozen=True)
 class RatioTest:
-    """`ratio_test` as a stage. Raises ValueError for correspondences without `ratio`."""
+    """`ratio_test` of the ratios, or of 1 - score, as a stage. Raises ValueError where matches have neither."""
 
     threshold: Annotated[float, Within(0)] = 0.8
 
     def __call__(self, correspondences: Correspondences) -> Correspondences:
         """The same matches, of which only distinctive ones survive."""
-        if correspondences.ratio is None:
-            raise ValueError("the ratio test needs `ratio`: the nearest-neighbour distance ratio of each match")
-        return correspondences.keep(ratio_test(correspondences.ratio, self.threshold))
+        ambiguity = correspondences.ambiguity
+        if ambiguity is None:
+            raise ValueError(
+                "the ratio test needs `ratio`, the nearest-neighbour distance ratio of each match, or `score`"
+            )
+        return correspondences.keep(ratio_test(ambiguity, self.threshold))
 
 
 # The mutual-nearest-neighbour check: on index lists, and as a stage
@@ -72,18 +75,18 @@ class MutualCheck:
 def one_to_one(
     x0: Float[Tensor, "b n 2"],
     x1: Float[Tensor, "b n 2"],
-    ratio: Float[Tensor, "b n"],
+    ambiguity: Float[Tensor, "b n"],
     mask: Bool[Tensor, "b n"] | None = None,
 ) -> Bool[Tensor, "b n"]:
     """True for a match that is the best one at its location in image 0 and the best one at its location in image 1.
 
-    The best has the lowest `ratio` (NaN is worst), ties by lowest index. Locations are the same when the coordinates
+    The best has the lowest `ambiguity` (NaN is worst), ties by lowest index. Locations are the same when coordinates
     are exactly equal, as those of one keypoint with several orientations are. The rule is symmetric in the images and
     independent of the order of the matches, ties apart. Matches with a non-finite coordinate are dropped. O(N log N).
     """
     finite = torch.isfinite(x0).all(-1) & torch.isfinite(x1).all(-1)
     mask = finite if mask is None else finite & mask
-    rank = torch.where(mask & ~ratio.isnan(), ratio, torch.inf)
+    rank = torch.where(mask & ~ambiguity.isnan(), ambiguity, torch.inf)
     order = torch.argsort(rank, dim=-1, stable=True)
     return mask & _first_at_location(x0, order, mask) & _first_at_location(x1, order, mask)
 
@@ -101,14 +104,15 @@ def _first_at_location(x: Tensor, order: Tensor, mask: Tensor) -> Tensor:
 
 @dataclasses.dataclass(frozen=True)
 class OneToOne:
-    """`one_to_one` as a stage. Raises ValueError for correspondences without `ratio`."""
+    """`one_to_one` as a stage. Raises ValueError for correspondences with neither `ratio` nor `score`."""
 
     def __call__(self, correspondences: Correspondences) -> Correspondences:
         """The same matches, of which at most one survives at each location of each image."""
         c = correspondences
-        if c.ratio is None:
-            raise ValueError("one-to-one needs `ratio`: the figure by which the best match of a location is chosen")
-        return c.keep(one_to_one(c.x0, c.x1, c.ratio, c.mask))
+        ambiguity = c.ambiguity
+        if ambiguity is None:
+            raise ValueError("one-to-one needs `ratio` or `score`, by which the best match of a location is chosen")
+        return c.keep(one_to_one(c.x0, c.x1, ambiguity, c.mask))
 
 
 # Keeping the matches that are likely to be right

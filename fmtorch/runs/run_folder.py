@@ -97,7 +97,7 @@ class PairRow:
     translation_error: float | None = None  # of directions up to sign, in [0, 90], 90 where it failed; signed: to 180
     pose_reason: str | None = None  # why there is no pose error, or no pose; None where there is
     pair_type: str | None = None  # of `PAIR_TYPES`; None where there are no matches to tell it by
-    warning: str | None = None  # what the configuration leaves open, empty where nothing
+    warning: str | None = None  # what the pair type leaves open, empty where nothing
     focal_error0: float | None = None  # |f - f_true| / f_true of image 0 where f is estimated; infinite where it is
     focal_error1: float | None = None  # not determined; None where it is given exactly, or the true one is unknown
     focal_log_ratio0: float | None = None  # log(f / f_true); None where it is not determined, too

@@ -35,7 +35,8 @@ SHARD = 32  # pairs in a file, all of one scene: what an interruption can cost; 
 PRELOADED = (__name__,)  # by the process that workers are forked of
 _IMAGES = 64  # whose features each worker may need again
 _STORED = {
-    **dict.fromkeys(("x0", "x1", "ratio", "prior", "noise", "lafs0", "lafs1"), torch.float32), "mutual": torch.uint8,
+    **dict.fromkeys(("x0", "x1", "ratio", "score", "prior", "noise", "lafs0", "lafs1"), torch.float32),
+    "mutual": torch.uint8,
     **dict.fromkeys(("K0", "K1"), torch.float64), **dict.fromkeys(("size0", "size1"), torch.int64),
 }  # fmt: skip
 
@@ -55,7 +56,7 @@ class MatchedPairs(StoredMatches):
         overrides: changes of a named pipeline, as on the command line, e.g. ``["pruner=[one_to_one]"]``.
         root: the folder of such folders, by default ``matched`` in the cache folder.
         workers: threads, by default one a core. progress: called with (pairs done, pairs in all).
-        most: matches kept of a pair, the best by ratio.
+        most: matches kept of a pair, the least ambiguous.
         augmentation, seed: as of `StoredMatches`.
         execution: other workers than these threads. build: makes the pipeline in other processes, where it is given as
             an object; pickled, as is the data set.
@@ -261,11 +262,11 @@ def _row(dataset: PairDataset, outcome: Outcome, most: int) -> dict[str, Any]:
 
 
 def _best(c: Correspondences, most: int) -> Correspondences:
-    """The `most` matches of the lowest quality of a single pair, in their order (the first ones without a ratio)."""
+    """The `most` least ambiguous matches of a single pair, in their order (the first ones where nothing ranks them)."""
     n = c.x0.shape[1]
     if n <= most:
         return c
-    rank = torch.arange(n) if c.ratio is None else torch.argsort(c.ratio[0], stable=True)
+    rank = torch.arange(n) if c.ambiguity is None else torch.argsort(c.ambiguity[0], stable=True)
     kept = torch.zeros_like(c.mask)
     kept[0, rank[:most]] = True
     return c.keep(kept).compact()

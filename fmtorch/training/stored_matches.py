@@ -28,7 +28,7 @@ FORMAT = 1  # of the files; raised when the schema changes
 
 _PER_MATCH = {
     **dict.fromkeys(("x0", "x1"), ("float32", (-1, 2))), "label": ("int8", (-1,)),
-    **dict.fromkeys(("ratio", "prior", "noise"), ("float32", (-1,))), "mutual": ("uint8", (-1,)),
+    **dict.fromkeys(("ratio", "score", "prior", "noise"), ("float32", (-1,))), "mutual": ("uint8", (-1,)),
     **dict.fromkeys(("lafs0", "lafs1"), ("float32", (-1, 2, 3))),
 }  # fmt: skip
 _PER_PAIR = {

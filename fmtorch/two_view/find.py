@@ -19,6 +19,7 @@ def find_fundamental(
     estimator: str = "fmtorch",
     mask: Arrays | None = None,
     ratio: Arrays | None = None,
+    score: Arrays | None = None,
     prior: Arrays | None = None,
     lafs0: Arrays | None = None,
     lafs1: Arrays | None = None,
@@ -43,9 +44,10 @@ def find_fundamental(
         estimator: a preset of conf/estimator.
         mask: (B, N), True for real matches; all when not given. Like all that is told of matches it may come without
             the leading B for one pair, and comes as a list where the points do.
-        ratio: (B, N), the matcher's figure, smaller is better (a distance ratio).
+        ratio: (B, N), the distance of the nearest descriptor over that of the second nearest, smaller is better.
+        score: (B, N), the matcher's confidence in [0, 1], larger is better; used where there is no ratio.
         prior: (B, N), P(inlier) in [0, 1]. Where an estimator uses a prior and none is given, it is derived from the
-            frames and the ratio, if both are given, otherwise from the points and, if given, the ratio.
+            frames and the ratio or score, if known, otherwise from the points and the ratio or score, if known.
         lafs0, lafs1: (B, N, 2, 3) local affine frames.
         noise: (B, N), each match's standard deviation relative to a usual one's (`fmtorch.pruning.MatchNoise` derives
             it from frames).
@@ -69,7 +71,7 @@ def find_fundamental(
             wrong altogether. A mapping says nothing of cameras: it holds options of the preset's stage of that name.
         covariance: whether the estimate has its covariance, which needs K0 and K1 or the image sizes. Where nothing is
             said of the cameras these are as of ``focal="unknown"``.
-        configuration: whether it has the configuration of each pair: general, planar, rotation, identical, unrelated.
+        pair_type: whether it has the type of each pair: general, planar, rotation, identical, unrelated.
         key: (B,) int64, selects each pair's random numbers.
         seed: of the random numbers.
         config_dir: a folder with presets of your own, ``<config_dir>/estimator/<name>.yaml``, which come first.
@@ -80,7 +82,7 @@ def find_fundamental(
         norm, inliers, ok, reason, significance. A pair that cannot be solved is ``ok=False``, never an exception. An F
         that is ok may be of images that show nothing in common: `related` tells. With K0, K1 or `focal` also focals,
         E, R and t, NaN where they are not determined; `deviation_degrees` says how far these may be off and `warning`
-        what the configuration leaves open.
+        what the pair type leaves open.
 
     Raises:
         ValueError: for points of another shape, points that are no pixels or outside images of these sizes, a prior
@@ -102,13 +104,13 @@ def find_fundamental(
     if covariance and K0 is None and K1 is None and focal is None:
         focal = "unknown"
     c = correspondences(
-        x0, x1, mask=mask, ratio=ratio, prior=prior, lafs0=lafs0, lafs1=lafs1, noise=noise, size0=size0,
+        x0, x1, mask=mask, ratio=ratio, score=score, prior=prior, lafs0=lafs0, lafs1=lafs1, noise=noise, size0=size0,
         size1=size1, K0=K0, K1=K1, focal=focal, key=key,
     )  # fmt: skip
     if isinstance(focal, Mapping):
         options["focal"] = focal
     estimate = estimated(c, "fundamental", estimator, config_dir, seed, options, covariance)
-    return with_pair_type(estimate, c, seed) if configuration else estimate
+    return with_pair_type(estimate, c, seed) if pair_type else estimate
 
 
 def find_essential(
@@ -121,6 +123,7 @@ def find_essential(
     estimator: str = "fmtorch",
     mask: Arrays | None = None,
     ratio: Arrays | None = None,
+    score: Arrays | None = None,
     prior: Arrays | None = None,
     lafs0: Arrays | None = None,
     lafs1: Arrays | None = None,
@@ -145,7 +148,7 @@ def find_essential(
             deviation, one number, (s0, s1) or (B, 2); 0.05 suits EXIF; "shared" or "unknown" where K tells principal
             points and the shape of pixels alone. What is not exact is estimated.
         size0, size1: image sizes (h, w), one for all pairs or (B, 2). Twice the principal point when not given.
-        estimator, mask, ratio, prior, lafs0, lafs1, noise, covariance, configuration, key, seed, config_dir: as of
+        estimator, mask, ratio, score, prior, lafs0, lafs1, noise, covariance, pair_type, key, seed, config_dir: as of
             `find_fundamental`.
         options: replace values of the preset (``inlier_threshold=1.0``).
 
@@ -175,8 +178,8 @@ def find_essential(
         if K is None:
             raise ValueError(f"{name} is None; find_fundamental estimates pairs of which one camera or none is known")
     return find_fundamental(
-        x0, x1, estimator=estimator, mask=mask, ratio=ratio, prior=prior, lafs0=lafs0, lafs1=lafs1, noise=noise,
-        size0=size0, size1=size1, K0=K0, K1=K1, focal=focal, covariance=covariance, pair_type=configuration,
+        x0, x1, estimator=estimator, mask=mask, ratio=ratio, score=score, prior=prior, lafs0=lafs0, lafs1=lafs1,
+        noise=noise, size0=size0, size1=size1, K0=K0, K1=K1, focal=focal, covariance=covariance, pair_type=pair_type,
         key=key, seed=seed, config_dir=config_dir, **options,
     )  # fmt: skip
 
@@ -188,6 +191,7 @@ def find_homography(
     estimator: str = "homography",
     mask: Arrays | None = None,
     ratio: Arrays | None = None,
+    score: Arrays | None = None,
     prior: Arrays | None = None,
     lafs0: Arrays | None = None,
     lafs1: Arrays | None = None,
@@ -202,7 +206,7 @@ def find_homography(
     Args:
         x0, x1: matched points in pixels, as of `find_fundamental`. Gradients reach them through the final fit.
         estimator: a preset of conf/estimator whose solver is `four_point`.
-        mask, ratio, prior, lafs0, lafs1, noise, key, seed, config_dir: as of `find_fundamental`.
+        mask, ratio, score, prior, lafs0, lafs1, noise, key, seed, config_dir: as of `find_fundamental`.
         options: replace values of the preset (``inlier_threshold=1.5``).
 
     Returns:
@@ -222,5 +226,7 @@ def find_homography(
         >>> bool(estimate.ok[0]), int(estimate.inliers[0, 20:].sum()), tuple(estimate.H.shape)
         (True, 40, (1, 3, 3))
     """
-    c = correspondences(x0, x1, mask=mask, ratio=ratio, prior=prior, lafs0=lafs0, lafs1=lafs1, noise=noise, key=key)
+    c = correspondences(
+        x0, x1, mask=mask, ratio=ratio, score=score, prior=prior, lafs0=lafs0, lafs1=lafs1, noise=noise, key=key
+    )
     return estimated(c, "homography", estimator, config_dir, seed, options)

@@ -1,4 +1,4 @@
-"""Which pair_type each pair of an estimate is in: what its fundamental matrix is worth."""
+"""Of which type each pair of an estimate is: what its fundamental matrix is worth."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ OTHER_CAMERA = 0.5  # deviation of the logarithm of the ratio of both focal leng
 
 
 class PairTypes(NamedTuple):
-    """Configurations of B pairs.
+    """Types of B pairs.
 
     kind: indices into `fmtorch.core.types.PAIR_TYPES`. evidence: for the kinds. homography: of the plane, or of
     the rotation.
@@ -90,7 +90,7 @@ def classify(
     seed: int = 0,
     **options: Any,
 ) -> PairTypes:
-    """The pair_type of each pair, by the evidence of its F, of a homography, a rotation and a copy.
+    """The type of each pair, by the evidence of its F, of a homography, a rotation and a copy.
 
     No threshold is in pixels: likelihoods are compared at the noise that the pair itself shows. Calibrations
     and measured focal lengths decide on rotations, else image sizes, by the prior on usual focal lengths; without any a

@@ -64,7 +64,7 @@ def add_arguments(commands: Any) -> None:
     parser.add_argument("--kinds", nargs="+", default=["warped", "hard", "views"], choices=["warped", "hard", "views"])
     parser.add_argument("--warps", type=int, default=1, help="pairs of each kind and photograph")
     parser.add_argument("--limit", type=int, help="photographs at most")
-    parser = add_command(commands, "pair_type", run_pair_types, CONFIGURATION)
+    parser = add_command(commands, "pair_types", run_pair_types, CONFIGURATION)
     add_options(parser, required=False)
     pairs.add_match_options(parser)
     parser.add_argument("--colmap", nargs="*", type=float, default=[4.0, 1.0], help="COLMAP's thresholds, px")

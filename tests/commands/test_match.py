@@ -228,7 +228,7 @@ def test_overrides_and_a_callers_own_hydra() -> None:
 def test_the_command(command: Callable[..., str], tmp_path: Path) -> None:
     image0, image1 = stereo(240, 320)
     Image.fromarray(image0).save(tmp_path / "a.png")
-    Image.fromarray(image1).save(tmp_path / "b.webp", ratio=95)
+    Image.fromarray(image1).save(tmp_path / "b.webp", quality=95)
     (tmp_path / "F.txt").write_text("0 0 0\n0 0 -2\n0, 2, 0\n")
     said = command("match", "image0=a.png", "image1=b.webp", "truth=F.txt", cwd=tmp_path)
     for text in ("hesaffnet_fast_fmtorch", "one_to_one", "inliers", "seconds", "NSGD", "matches/a-b"):

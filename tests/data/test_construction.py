@@ -118,7 +118,7 @@ def test_a_finished_set_is_not_made_again_and_another_is_refused(
     [
         (["output=null"], "output is missing; it names the folder of the set that is made"),
         (["count=0"], "count=0; it must be a whole number of at least 1 or null"),
-        (["ratio=101"], "ratio=101; it must be a whole number from 1 to 100"),
+        (["quality=101"], "quality=101; it must be a whole number from 1 to 100"),
         (
             ["dataset=stereo", "dataset.root=null"],
             "dataset=stereo has no candidates to judge; it must be one of tum, kitti, colmap",

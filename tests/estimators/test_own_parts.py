@@ -91,7 +91,9 @@ def test_parts_that_do_as_the_built_in_ones_give_the_same_bits(parts: dict[str, 
         presets.build("estimator", "msac")(scenes(), 3),
     )
     assert bool(builtin.ok.all())
-    assert_same(*({name: getattr(e, name) for name in ("F", "inliers", "ok", "samples")} for e in (own, builtin)), "msac")
+    assert_same(
+        *({name: getattr(e, name) for name in ("F", "inliers", "ok", "samples")} for e in (own, builtin)), "msac"
+    )
 
 
 def test_parts_are_named_as_targets() -> None:

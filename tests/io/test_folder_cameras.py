@@ -43,7 +43,7 @@ class Scene:
         for name, source in (("a.jpg", self.pair.image0), ("b.jpg", self.pair.image1)):
             image = cv2.resize(read_image(source), (768, 512), interpolation=cv2.INTER_AREA)
             image = photographed(image, self.lens) if coefficients else image
-            Image.fromarray(image).save(folder / name, ratio=97, exif=exif)
+            Image.fromarray(image).save(folder / name, quality=97, exif=exif)
 
     def match(self, output: Path, *words: str) -> Path:
         given = (f"images={self.folder}", f"output={output}", f"longest_side={SIDE}", "cache=off", *words)

@@ -68,9 +68,9 @@ def test_what_was_written_is_read(layout: str, tmp_path: Path) -> None:
         if layout in WITH_RATIOS:
             np.testing.assert_allclose(c.ratio[0], writers.ratios(len(s.x0)), rtol=1e-6)
         elif layout in NEEDS_TRUTH:
-            assert torch.allclose(c.ratio, torch.tensor(0.25))  # one less the score: smaller is better
+            assert torch.allclose(c.score, torch.tensor(0.75))
         else:
-            assert c.ratio is None
+            assert c.ambiguity is None
         if layout == "ransac_tutorial" or layout == "oanet":  # no sizes: twice the principal point
             assert c.size0.tolist() == [[801, 1001]]
         else:
@@ -85,7 +85,7 @@ def test_estimators_pruners_and_metrics_work_on_it(layout: str, tmp_path: Path) 
     if layout != "posebench":  # which says nothing of how good a match is
         pruner["one_to_one"] = presets.build("pruner", "one_to_one")
     if layout in WITH_RATIOS:
-        pruner["ratio"] = lambda c: c.keep(ratio_test(c.ratio, 0.8))
+        pruner["ratio"] = lambda c: c.keep(ratio_test(c.ambiguity, 0.8))
     for row in evaluate(pipeline(**pruner).run(list(dataset))):
         assert row.ok, row.reason
         assert row.nsgd < 0.02
@@ -303,7 +303,7 @@ def test_the_pipeline_of_given_matches_estimates_as_the_function_does(tmp_path: 
     c, _ = pair.matches()
     (outcome,) = load_pipeline("given_fmtorch").run([pair], seed=3)
     alone = fmtorch.find_fundamental(
-        c.x0, c.x1, mask=c.mask, ratio=c.ratio, size0=c.size0, size1=c.size1, key=pair.key, seed=3
+        c.x0, c.x1, mask=c.mask, ratio=c.ratio, score=c.score, size0=c.size0, size1=c.size1, key=pair.key, seed=3
     )
     assert torch.equal(outcome.estimate.F, alone.F)
 

@@ -46,8 +46,7 @@ def test_equals_kornias_matcher() -> None:
     assert c.prior is not None
     assert torch.equal(c.prior[0], scores[:, 0])
     assert ((c.prior >= 0) & (c.prior <= 1)).all()
-    assert c.ratio is not None
-    assert torch.equal(c.ratio, 1 - c.prior)
+    assert torch.equal(c.score, c.prior)
     assert c.mask.all()
     assert c.size0 is not None
     assert c.size0.tolist() == [[100, 400]]

@@ -40,8 +40,8 @@ def test_points_and_confidences_are_the_matchers(tmp_path: Path) -> None:
     for x, known in zip((c.x0, c.x1), keypoints, strict=True):
         assert {tuple(point) for point in x[0].tolist()} <= {tuple(np.float32(p).tolist()) for p in known}
     assert ((c.x0 - c.x1)[0, :, 0] - 12).abs().median() < 0.5
-    assert c.ratio is not None
-    assert ((c.ratio >= 0) & (c.ratio < 0.75)).all()  # the ratio that the stand-in calls 1 - confidence
+    assert c.score is not None
+    assert ((c.score > 0.25) & (c.score <= 1)).all()  # the ratio that the stand-in calls 1 - confidence
     assert c.size0 is not None
     assert c.size0.tolist() == [[240, 320]]
     assert c.noise is None

@@ -42,7 +42,7 @@ def cells(printed: str) -> list[list[str]]:
 def test_the_commands(folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("pycolmap")
     arguments = ["--photographs", folder, "--limit", 2]
-    printed = run(capsys, monkeypatch, "pair_type", *arguments, "--colmap", 4)
+    printed = run(capsys, monkeypatch, "pair_types", *arguments, "--colmap", 4)
     lines = [
         [cell.strip() for cell in line.split("|")] for line in printed.splitlines() if line.startswith("| fmtorch")
     ]
