@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from fmtorch import presets
-from fmtorch.core.types import Correspondences, Estimate, collate
+from fmtorch.core import Correspondences, Estimate, collate
 from tests.laws import (
     Result,
     Subject,

@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from fmtorch import MatchResult, match
-from fmtorch.pipeline.build import load_pipeline
-from fmtorch.runs.feature_cache import ArrayCache
+from fmtorch.pipeline import load_pipeline
+from fmtorch.runs import ArrayCache
 from tests.commands.test_eval import OPTIONS, rows
 from tests.helpers import draw_set
 from tests.processes import Command, run_command, starter

@@ -9,9 +9,6 @@ from pathlib import Path
 import pytest
 
 import fmtorch.__main__
-from fmtorch.commands import list as list_presets
-from fmtorch.commands import main as commands
-from fmtorch.commands import warm_up
 from fmtorch.commands.config import hydra_arguments
 from fmtorch.commands.options import COMMANDS
 from fmtorch.presets import available
@@ -221,13 +218,13 @@ def test_a_sweep_runs_in_processes_of_a_launcher(
 @pytest.mark.parametrize("command", ["eval", "match", "pairs", "report", "train", "verify"])
 def test_help_is_ours_and_fits_a_page(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     """A command's own options with a line each come first; Hydra's page is at --hydra-help."""
-    commands.main([command, "--help"])
+    fmtorch.__main__.main([command, "--help"])
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith(f"usage: fmtorch {command}")
     assert len(lines) < 60
     told = {line.split("=")[0].strip().removesuffix(".NAME") for line in lines if "=" in line}
     assert told >= set(COMMANDS[command].names)
-    commands.main([command, "--version"])
+    fmtorch.__main__.main([command, "--version"])
     assert capsys.readouterr().out.strip() == fmtorch.__version__
 
 
@@ -235,28 +232,24 @@ def test_warm_up_compiles_what_is_registered(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     compiled: list[str] = []
-    monkeypatch.setattr(
-        warm_up, "compile_together", lambda kernels: compiled.extend(kernel.__module__ for kernel in kernels)
-    )
-    monkeypatch.setattr(sys, "argv", ["fmtorch warm-up"])
-    warm_up.main()
+    compile_together = "fmtorch.commands.warm_up.compile_together"
+    monkeypatch.setattr(compile_together, lambda kernels: compiled.extend(kernel.__module__ for kernel in kernels))
+    fmtorch.__main__.main(["warm-up"])
     assert f"{len(compiled)} kernels for " in capsys.readouterr().out
     rooms = {name.split(".")[1] for name in compiled}
     assert {"estimators", "geometry", "pruning", "scenes"} <= rooms
     monkeypatch.setenv("FMTORCH_KERNELS", "off")
     with pytest.raises(SystemExit, match="kernels are switched off"):
-        warm_up.main()
+        fmtorch.__main__.main(["warm-up"])
 
 
 def test_list_names_every_preset_with_what_it_is(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(sys, "argv", ["fmtorch list", "estimator", "pruner"])
-    list_presets.main()
+    fmtorch.__main__.main(["list", "estimator", "pruner"])
     lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("  ")]
-    names = [line.split()[0] for line in lines if not line.endswith(f"{list_presets.HEADINGS['paper']}:")]
+    names = [line.split()[0] for line in lines if not line.endswith("as in FM-Bench's paper:")]
     assert names == [*available("estimator"), *available("pruner")]
     assert all(len(line.split()) > 2 for line in lines)
-    monkeypatch.setattr(sys, "argv", ["fmtorch list", "estimators"])
     with pytest.raises(SystemExit, match="error: no group 'estimators'; there are: estimator"):
-        list_presets.main()
+        fmtorch.__main__.main(["list", "estimators"])

@@ -17,12 +17,11 @@ from PIL import Image
 import fmtorch
 from fmtorch import presets
 from fmtorch.commands import match as match_command
-from fmtorch.core.files import conf_dir
-from fmtorch.core.types import RELATED, WARNINGS
+from fmtorch.core import RELATED, WARNINGS, conf_dir
 from fmtorch.data import ImageError, read_image
 from fmtorch.geometry import homography_points, sampson
 from fmtorch.metrics import nsgd
-from fmtorch.pipeline.build import load_pipeline
+from fmtorch.pipeline import load_pipeline
 from tests.conftest import shared_path
 from tests.helpers import ROWS
 from tests.matching import stand_in

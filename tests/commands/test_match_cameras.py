@@ -17,7 +17,7 @@ from fmtorch.data import ImageError, ImagePair, load
 from fmtorch.data.lenses import Lens, undistorted_points
 from fmtorch.geometry import sampson
 from fmtorch.metrics import nsgd, pose_error
-from fmtorch.pipeline.build import load_pipeline
+from fmtorch.pipeline import load_pipeline
 from tests.conftest import shared_path
 
 SIDE = 768  # px, to which photographs are reduced for matching

@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import pytest
 
-from fmtorch.core.files import models_dir
+from fmtorch.core import models_dir
 from fmtorch.runs import RunFolder
 from tests.commands.test_command_line import ended
 from tests.commands.test_match import stereo

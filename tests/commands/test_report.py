@@ -12,15 +12,12 @@ from omegaconf import OmegaConf
 
 from fmtorch import presets
 from fmtorch.commands import report
-from fmtorch.core.types import Estimate
+from fmtorch.core import Estimate
 from fmtorch.data import read_image
-from fmtorch.evaluation import tables
+from fmtorch.evaluation import evaluate, summarize, tables
 from fmtorch.evaluation.gallery import Options, difference, rebuilt, shown_pair
 from fmtorch.evaluation.page import Section, differing_pairs, render
-from fmtorch.evaluation.rows import evaluate
-from fmtorch.evaluation.summary import summarize
-from fmtorch.pipeline.build import build_pipeline
-from fmtorch.pipeline.pipeline import Outcome
+from fmtorch.pipeline import Outcome, build_pipeline
 from fmtorch.runs import PairRow, RunFolder, RunFolderError, to_table
 from tests.helpers import compose, draw, draw_set, pair
 from tests.processes import run_command

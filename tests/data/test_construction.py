@@ -8,10 +8,8 @@ import numpy as np
 import pytest
 
 from fmtorch.data import construction as rule
-from fmtorch.data import load, read_image
-from fmtorch.data.cameras import Camera, fundamental
+from fmtorch.data import load, read_image, to_grey
 from fmtorch.data.construction import Construction, blocks
-from fmtorch.data.images import to_grey
 from tests.conftest import shared_path
 from tests.data.native import write_image
 from tests.helpers import apart, call_command
@@ -19,24 +17,16 @@ from tests.helpers import apart, call_command
 """The column `selected` of the README of the shared data, for the scenes of which all pairs were candidates."""
 
 
-def judged(scene: str, images: int) -> tuple[set[tuple[int, int]], dict[tuple[int, int], bool]]:
-    """Which pairs of the first images pass, and of the kept pairs in the shared data whether each is verified."""
-    root = shared_path(f"data/{scene}")
-    cameras = [Camera(r[:9].reshape(3, 3), r[9:18].reshape(3, 3), r[18:]) for r in np.loadtxt(root / "Camera.txt")]
-    images = min(images, len(cameras))
-    features = [rule.keypoints(to_grey(read_image(root / f"Images/{i:08d}.jpg"))) for i in range(images)]
-    passed = {
-        (i, j)
-        for i in range(images)
-        for j in range(i + 1, images)
-        if rule.matchable(features[i], features[j], fundamental(cameras[i], cameras[j]))
-    }
-    kept = {(int(row[0]), int(row[1])): bool(row[-1]) for row in np.loadtxt(root / "gt_check.txt")}
-    return passed, {pair: verified for pair, verified in kept.items() if max(pair) < images}
-
-
 def test_kept_pairs_of_a_real_scene_are_selected_again() -> None:
-    passed, kept = judged("PhotoTourism/sacre_coeur", images=4)
+    root = shared_path("data/PhotoTourism/sacre_coeur")
+    dataset = load("cameras", root=root.parent, sequences=[root.name], pairs=None)
+    features = {i: rule.keypoints(to_grey(read_image(root / f"Images/{i:08d}.jpg"))) for i in range(4)}
+    passed = set()
+    for pair in dataset:
+        i, j = map(int, pair.identity.rpartition("/")[2].split("-"))
+        if j < 4 and rule.matchable(features[i], features[j], pair.F):
+            passed.add((i, j))
+    kept = {(int(row[0]), int(row[1])): bool(row[-1]) for row in np.loadtxt(root / "gt_check.txt") if row[1] < 4}
     assert {pair for pair, verified in kept.items() if verified} <= passed
     assert passed <= kept.keys()  # of this scene every selected pair was kept
     assert len(passed) == 4  # of six

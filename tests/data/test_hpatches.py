@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from fmtorch.data import DataError, load, read_image
-from fmtorch.data.hpatches import HPatchesPairs
 from tests.data import planes
 
 
@@ -18,7 +17,7 @@ def test_pairs_are_image_1_with_the_others(tmp_path: Path) -> None:
         ("illumination", "i_light"), ("viewpoint", "v_view"),
     ]  # fmt: skip
     assert len(dataset) == 10
-    assert HPatchesPairs.model == "homography"
+    assert dataset.model == "homography"
     for k, pair in enumerate(list(dataset)[5:], start=2):
         H = planes.view(k) / np.linalg.norm(planes.view(k))
         np.testing.assert_allclose(pair.H, H, atol=1e-8)

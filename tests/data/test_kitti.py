@@ -9,7 +9,6 @@ import pytest
 import torch
 
 from fmtorch.data import DataError, load
-from fmtorch.data.kitti import KittiPairs
 from fmtorch.geometry import fundamental_from_projections
 from tests.conftest import shared_path
 from tests.data.native import write_kitti
@@ -122,7 +121,7 @@ def test_damaged_files_are_named_with_their_lines(damage: str, tmp_path: Path) -
     change, message = DAMAGE[damage]
     change(root)
     with pytest.raises(DataError, match=message) as raised:
-        KittiPairs(root, sequences=["06"])
+        load("kitti", root=root, sequences=["06"])
     assert "\n" not in str(raised.value)
 
 

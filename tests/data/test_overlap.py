@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fmtorch.data import load
+from fmtorch.data import ImageSource, load
 from fmtorch.data.overlap import (
     STEP,
     TOLERANCE,
@@ -18,10 +18,8 @@ from fmtorch.data.overlap import (
     seen_share,
     shared_points,
 )
-from fmtorch.data.pairs import ImageSource
 from fmtorch.data.scenes import incidence
-from fmtorch.scenes import Plan, RenderedPairs
-from fmtorch.scenes.dataset import RenderedScenePairs
+from fmtorch.scenes import Plan, RenderedPairs, RenderedScenePairs
 from tests.data.native import write_colmap, write_kitti
 from tests.reference import overlap as reference
 

@@ -11,15 +11,21 @@ import torch
 from rich.console import Console
 
 from fmtorch import presets
-from fmtorch.core.types import PAIR_TYPES, WARNINGS, Correspondences
+from fmtorch.core import PAIR_TYPES, WARNINGS, Correspondences
 from fmtorch.data import ImagePair, ImageSource
 from fmtorch.data.pairs import GivenMatches
-from fmtorch.evaluation import tables
-from fmtorch.evaluation.pair_cameras import WithPairCameras, built_with, cameras_of
-from fmtorch.evaluation.rows import evaluate, focal_errors
-from fmtorch.evaluation.summary import summarize
-from fmtorch.evaluation.tables import summary_markdown, terminal_tables
-from fmtorch.pipeline.pipeline import Outcome, Pipeline, examined
+from fmtorch.evaluation import (
+    WithPairCameras,
+    built_with,
+    cameras_of,
+    evaluate,
+    focal_errors,
+    summarize,
+    summary_markdown,
+    tables,
+    terminal_tables,
+)
+from fmtorch.pipeline import Outcome, Pipeline, examined
 from fmtorch.runs import PairRow, to_table
 from tests.geometry.kinds import K, batch, draw
 from tests.helpers import unused

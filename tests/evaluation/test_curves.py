@@ -7,7 +7,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from fmtorch.core.types import pair_key
+from fmtorch.core import pair_key
 from fmtorch.evaluation.curves import picture, svg
 from fmtorch.runs import PairRow, to_table
 

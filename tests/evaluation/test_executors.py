@@ -17,12 +17,10 @@ from typing import Any
 
 import pytest
 
-from fmtorch.data.pairs import ImagePair
-from fmtorch.evaluation.run import evaluate_pairs
-from fmtorch.jobs.execution import Execution
-from fmtorch.jobs.pool import WorkersLost
-from fmtorch.pipeline.build import load_pipeline
-from fmtorch.pipeline.pipeline import Pipeline
+from fmtorch.data import ImagePair
+from fmtorch.evaluation import evaluate_pairs
+from fmtorch.jobs import Execution, WorkersLost
+from fmtorch.pipeline import Pipeline, load_pipeline
 from fmtorch.runs import PairRow
 from scripts.benchmark.pairs import synthetic_pair
 

@@ -12,11 +12,10 @@ import torch
 from PIL import ExifTags, Image
 
 from fmtorch import presets
-from fmtorch.core.types import collate
+from fmtorch.core import collate
 from fmtorch.data import ImageSource
-from fmtorch.evaluation.pair_cameras import WithPairCameras, cameras_of
-from fmtorch.evaluation.rows import evaluate
-from fmtorch.pipeline.pipeline import Outcome
+from fmtorch.evaluation import WithPairCameras, cameras_of, evaluate
+from fmtorch.pipeline import Outcome
 from tests.conftest import shared_path
 from tests.evaluation.test_poses import outcome
 

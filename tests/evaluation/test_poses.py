@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from fmtorch.core.types import Correspondences, Estimate
+from fmtorch.core import Correspondences, Estimate
 from fmtorch.data import ImagePair, ImageSource
-from fmtorch.evaluation.rows import evaluate
-from fmtorch.pipeline.pipeline import Outcome
+from fmtorch.evaluation import evaluate
+from fmtorch.pipeline import Outcome
 from tests.geometry.scenes import scene
 from tests.reference import metrics as reference
 from tests.reference import solvers

@@ -8,9 +8,8 @@ import torch
 from rich.console import Console
 
 from fmtorch import metrics
-from fmtorch.core.types import pair_key
-from fmtorch.evaluation.summary import summarize
-from fmtorch.evaluation.tables import summary_markdown, terminal_tables
+from fmtorch.core import pair_key
+from fmtorch.evaluation import summarize, summary_markdown, terminal_tables
 from fmtorch.runs import PairRow, to_table
 
 F = (0.0, -0.5, 0.1, 0.5, 0.0, -0.1, 0.2, 0.3, 0.59)

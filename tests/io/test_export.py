@@ -13,11 +13,9 @@ import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 
+from fmtorch.io import DATABASE, MatchStore, StoredImage, StoredPair, export_kinds, indices, write_exports
 from fmtorch.io.colmap import ORIGIN, write_database
-from fmtorch.io.export import DATABASE, export_kinds, write_exports
-from fmtorch.io.match_store import MatchStore, StoredImage, StoredPair, indices
-from fmtorch.pipeline.build import load_pipeline
-from fmtorch.pipeline.folder import FolderMatches, chosen_pairs, images_below
+from fmtorch.pipeline import FolderMatches, chosen_pairs, images_below, load_pipeline
 from tests.conftest import shared_path
 
 K = np.array([[1000.0, 0, 480], [0, 1000, 410], [0, 0, 1]])

@@ -13,12 +13,11 @@ import pytest
 from omegaconf import DictConfig
 
 from fmtorch import data
-from fmtorch.commands import eval as eval_command
 from fmtorch.commands import match as match_command
-from fmtorch.io.export import DATABASE, FEATURES, MATCHES
-from fmtorch.pipeline.folder import chosen_pairs, images_below, open_folder
+from fmtorch.io import DATABASE, FEATURES, MATCHES
+from fmtorch.pipeline import chosen_pairs, images_below, open_folder
 from fmtorch.runs import RunFolder
-from tests.helpers import compose, draw, draw_set
+from tests.helpers import call_command, compose, draw, draw_set
 
 OPTIONS = ("features.max_features=400", "estimator=lmeds", "estimator.hypotheses=100", "cache=off")
 
@@ -42,7 +41,7 @@ def match(images: Path, output: Path, *words: str) -> Path:
 
 
 def test_a_folder_of_images(images: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    output = match(images, tmp_path / "out", "export='h5,colmap'")
+    output = match(images, tmp_path / "out", "export=h5,colmap")
     said = capsys.readouterr().out
     assert "3 of 6 pairs show one scene" in said
     assert "taken from" not in said
@@ -157,7 +156,7 @@ def test_settings_that_cannot_be_read(tmp_path: Path) -> None:
         open_folder(tmp_path, {"seed": 0})
 
 
-def test_an_evaluation_and_its_way_back(tmp_path: Path) -> None:
+def test_an_evaluation_and_its_way_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What an evaluation exports, also after it has ended, and what that is as a data set."""
     root = draw_set(tmp_path / "Set", pairs=[(0, 1), (0, 2), (1, 2)])
     camera = np.concatenate([[300, 0, 160, 0, 300, 120, 0, 0, 1], np.eye(3).ravel()])
@@ -167,12 +166,13 @@ def test_an_evaluation_and_its_way_back(tmp_path: Path) -> None:
         path.write_text(f"{path.read_text()}{line}\n")
 
     def run(run_dir: str, *words: str) -> tuple[Path, dict[str, list[Any]]]:
-        path = eval_command.run(config("eval", f"run_dir={tmp_path / run_dir}", *words), "sift_ratio")
+        call_command(monkeypatch, tmp_path, "eval", "pipeline=sift_ratio", *OPTIONS, f"run_dir={run_dir}", *words)
+        path = tmp_path / run_dir
         return path, RunFolder.load(path).read().sort_by("pair").to_pydict()
 
     ours = ("dataset=fmbench", f"dataset.root={tmp_path / 'Set'}")
     _, plain = run("run", *ours)
-    path, rows = run("run", *ours, "export='h5,colmap'")  # its pairs are done, but were not kept
+    path, rows = run("run", *ours, "export=h5,colmap")  # its pairs are done, but were not kept
     assert rows == plain
     with pycolmap.Database.open(path / DATABASE) as file:
         assert (file.num_images(), file.num_cameras(), file.num_matched_image_pairs()) == (3, 1, 3)
@@ -203,5 +203,5 @@ def test_an_evaluation_and_its_way_back(tmp_path: Path) -> None:
         assert theirs[column] == plain[column]
     assert theirs["features0"][:3] == plain["features0"][:3]
     assert all(np.isnan(seconds or np.nan) for seconds in theirs["seconds_features"])
-    with pytest.raises(ValueError, match="no pair has images in which a pipeline finds keypoints"):
+    with pytest.raises(SystemExit, match="no pair has images in which a pipeline finds keypoints"):
         run("none", *words, "pruner=[]", "export=h5")

@@ -17,7 +17,7 @@ import fmtorch
 from fmtorch.commands import match as match_command
 from fmtorch.data import load, read_image
 from fmtorch.data.lenses import Lens
-from fmtorch.io.export import DATABASE, MATCHES
+from fmtorch.io import DATABASE, MATCHES
 from fmtorch.metrics import pose_error
 from tests.commands.test_match_cameras import BENT, photographed
 from tests.conftest import shared_path

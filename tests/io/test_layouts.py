@@ -15,11 +15,10 @@ import torch
 import fmtorch
 from fmtorch import data, presets
 from fmtorch.data import DataError, ImagePair
+from fmtorch.evaluation import evaluate
 from fmtorch.evaluation.gallery import Options, find_dataset
-from fmtorch.evaluation.rows import evaluate
-from fmtorch.io.dataset import H5Pairs
-from fmtorch.pipeline.build import load_pipeline
-from fmtorch.pipeline.pipeline import Outcome, Pipeline
+from fmtorch.io import H5Pairs
+from fmtorch.pipeline import Outcome, Pipeline, load_pipeline
 from fmtorch.pruning import ratio_test
 from tests.helpers import unused
 from tests.io import writers

@@ -9,12 +9,10 @@ import torch
 
 import fmtorch
 from fmtorch import presets
-from fmtorch.core.types import collate
+from fmtorch.core import collate
 from fmtorch.data import read_image
-from fmtorch.estimators import batch
-from fmtorch.evaluation.run import evaluate_pairs
-from fmtorch.jobs.execution import Execution
-from fmtorch.jobs.threads import available, mapped, one_thread
+from fmtorch.evaluation import evaluate_pairs
+from fmtorch.jobs import Execution, available, mapped, one_thread
 from tests.helpers import draw, pair
 from tests.helpers import small_pipeline as pipeline
 from tests.laws import degenerate, scene
@@ -54,7 +52,7 @@ def test_an_error_leaves_threads_as_they_were(threads: int, monkeypatch: pytest.
     def fails(*_: object) -> None:
         raise RuntimeError("no")
 
-    monkeypatch.setattr(batch, "normalize_pair", fails)
+    monkeypatch.setattr("fmtorch.estimators.batch.normalize_pair", fails)
     built = presets.build("estimator", "msac", hypotheses=10)
     with pytest.raises(RuntimeError, match="no"):
         built(collate([scene(0, 60), scene(1, 60)]))

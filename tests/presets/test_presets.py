@@ -6,8 +6,8 @@ import pytest
 
 import fmtorch
 from fmtorch import presets
-from fmtorch.core.files import conf_dir
-from fmtorch.pipeline.build import load_pipeline
+from fmtorch.core import conf_dir
+from fmtorch.pipeline import load_pipeline
 from fmtorch.presets.composition import compose
 from tests.laws import scene
 

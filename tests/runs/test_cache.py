@@ -12,8 +12,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fmtorch.runs import ArrayCache
 from fmtorch.runs import feature_cache as module
-from fmtorch.runs.feature_cache import ABANDONED, SLACK, ArrayCache
+from fmtorch.runs.feature_cache import ABANDONED, SLACK
 from tests.helpers import in_threads
 
 

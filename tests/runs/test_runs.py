@@ -10,7 +10,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from fmtorch.core.types import pair_key
+from fmtorch.core import pair_key
 from fmtorch.runs import PAIR_SCHEMA, PairRow, RunFolder, RunFolderError, identity_digest, replacing
 from fmtorch.runs.run_folder import content_digest
 

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from fmtorch.data.construction import Keypoints
-from fmtorch.scenes import Plan, RenderedPairs
+from fmtorch.scenes import FAMILIES, PICTURES, PLANS, Plan, RenderedPairs, Task, build
 from fmtorch.scenes import generate as generation
-from fmtorch.scenes.generate import FAMILIES, PLANS, Task, build, generate, read, recorded_pairs, seeds
+from fmtorch.scenes.generate import generate, read, recorded_pairs, seeds
 from fmtorch.scenes.scene import Scene
-from fmtorch.scenes.textures import MATERIALS, PICTURES
+from fmtorch.scenes.textures import MATERIALS
 from tests.helpers import cross_matrix, in_threads
 
 TINY = Plan(scenes=1, shots=3, pairs=2, scale=0.25)

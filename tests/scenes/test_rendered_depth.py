@@ -5,12 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fmtorch import scenes
 from fmtorch.data import DepthDataset, load
-from fmtorch.scenes import Plan, RenderedPairs
-from fmtorch.scenes import dataset as depth_module
-from fmtorch.scenes.camera import Camera, calibration, look_at
-from fmtorch.scenes.dataset import depth_at
-from fmtorch.scenes.generate import Task, build
+from fmtorch.scenes import Camera, Plan, RenderedPairs, Task, build, calibration, depth_at, look_at
 from fmtorch.scenes.light import Lens, Light
 from fmtorch.scenes.scene import Scene, Shot
 from fmtorch.scenes.surfaces import Surfaces, vec
@@ -39,9 +36,9 @@ def staged(monkeypatch: pytest.MonkeyPatch) -> tuple[Task, Camera]:
     light = Light((0.0, 0.0, 1.0))
     sky = np.zeros((8, 8, 3), np.uint8)
     scene = Scene([wall_and_screen(False), wall_and_screen(True)], [light] * 2, sky, shots, [(0, 1)])
-    recent = depth_module._Recent()
+    recent = scenes.dataset._Recent()
     recent.scene = lambda task: scene  # type: ignore[assignment]
-    monkeypatch.setattr(depth_module, "_recent", recent)
+    monkeypatch.setattr("fmtorch.scenes.dataset._recent", recent)
     return Task("indoor", "test", 0, 0, SMALL), camera
 
 

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from fmtorch.scenes.camera import Camera, calibration, fundamental, look_at, relative_pose
-from fmtorch.scenes.generate import FAMILIES, Plan, Task, build
+from fmtorch.scenes import FAMILIES, Camera, Plan, Task, build, calibration, fundamental, look_at, relative_pose
 from fmtorch.scenes.light import Light, Stage
 from fmtorch.scenes.raycast import Geometry
 from fmtorch.scenes.surfaces import Surfaces, vec

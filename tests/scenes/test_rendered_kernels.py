@@ -5,9 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fmtorch.scenes import raycast
-from fmtorch.scenes.camera import Camera, calibration, look_at
-from fmtorch.scenes.generate import FAMILIES, Plan, Task, build
+from fmtorch.scenes import FAMILIES, Camera, Plan, Task, build, calibration, look_at, raycast
 from fmtorch.scenes.light import Lens, Light, Stage, expose
 from fmtorch.scenes.raycast import Geometry
 from fmtorch.scenes.surfaces import Surfaces, vec

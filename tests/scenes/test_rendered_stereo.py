@@ -5,8 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fmtorch.scenes import StereoPair
-from fmtorch.scenes.textures import skimage_file
+from fmtorch.scenes import StereoPair, skimage_file
 
 
 def test_one_pair_with_the_protocol() -> None:

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from fmtorch.core.types import Correspondences
+from fmtorch.core import Correspondences
 from fmtorch.data import ImagePair, ImageSource
-from fmtorch.pipeline.pipeline import Outcome
+from fmtorch.pipeline import Outcome
 from scripts.benchmark import __main__
 from scripts.benchmark.runner import Item, Row
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fmtorch import data, presets
-from fmtorch.core.types import Correspondences
+from fmtorch.core import Correspondences
 from fmtorch.data import ImagePair
 from scripts.benchmark import posebench
 from scripts.benchmark.methods import pipeline_of

@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 
 from fmtorch.data import ImagePair, ImageSource
-from fmtorch.scenes.dataset import RenderedPairs
-from fmtorch.scenes.generate import Plan
-from fmtorch.scenes.textures import PICTURES
+from fmtorch.scenes import PICTURES, Plan, RenderedPairs
 from scripts.benchmark import pairs, related
 from scripts.benchmark.runner import Row
 from tests.helpers import draw_set

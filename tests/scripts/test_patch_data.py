@@ -8,9 +8,7 @@ import pytest
 import torch
 from PIL import Image
 
-from fmtorch.scenes.camera import Camera, calibration, fundamental, look_at
-from fmtorch.scenes.generate import Plan, Task
-from fmtorch.scenes.textures import photograph
+from fmtorch.scenes import Camera, Plan, Task, calibration, fundamental, look_at, photograph
 from fmtorch.training.planes import Photograph, PlaneViews, list_photographs
 from scripts.patch_networks.patches import (
     Tolerance,

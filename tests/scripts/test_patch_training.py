@@ -12,9 +12,9 @@ from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 from torch import Tensor, nn
 
-from fmtorch.core.files import conf_dir
+from fmtorch.core import conf_dir
 from fmtorch.features.networks import AffNet, GeoDesc, HardNet, build
-from fmtorch.scenes.textures import photograph
+from fmtorch.scenes import photograph
 from fmtorch.training.planes import PlaneViews
 from scripts.patch_networks.objectives import (
     DescriptorObjective,

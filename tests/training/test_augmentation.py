@@ -9,7 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fmtorch.geometry.epipolar import symmetric_max
+from fmtorch.geometry import symmetric_max
 from fmtorch.training import Augmentation, LabelledMatches
 from fmtorch.training.augmentation import (
     MIN_INLIERS,

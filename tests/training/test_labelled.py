@@ -8,10 +8,9 @@ import pytest
 import torch
 from jaxtyping import TypeCheckError
 
-from fmtorch.core.types import Correspondences
-from fmtorch.data.pairs import ImagePair, ImageSource
-from fmtorch.scenes import RenderedPairs
-from fmtorch.scenes.camera import calibration, fundamental, look_at, relative_pose
+from fmtorch.core import Correspondences
+from fmtorch.data import ImagePair, ImageSource
+from fmtorch.scenes import RenderedPairs, calibration, fundamental, look_at, relative_pose
 from fmtorch.training import LabelledMatches, collate
 from fmtorch.training.labelled import EDGE_PX, by_line, by_transfer, depths, label, line_distance, transfer_error
 from tests.reference import labels as reference

@@ -14,20 +14,15 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
-from fmtorch.data.pairs import ImagePair, ImageSource
-from fmtorch.pipeline.build import load_pipeline
-from fmtorch.pipeline.pipeline import Pipeline
-from fmtorch.scenes import RenderedPairs
-from fmtorch.scenes import dataset as rendered_dataset
-from fmtorch.scenes.generate import FAMILIES, PLANS, Task
+from fmtorch.data import ImagePair, ImageSource
+from fmtorch.pipeline import Pipeline, load_pipeline
+from fmtorch.scenes import FAMILIES, PLANS, RenderedPairs, Task
 from fmtorch.training import (
     Augmentation,
     MatchedPairs,
     SimilarLengthBatches,
     StoredMatches,
     collate_trimmed,
-    labelled,
-    matched_pairs,
     split_scenes,
 )
 from fmtorch.training.labelled import label
@@ -88,21 +83,22 @@ def test_an_interrupted_computation_goes_on(
     rendered: RenderedPairs, matched: MatchedPairs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     written: list[Path] = []
-    original = matched_pairs.write_shard
 
     def interrupted(path: Path, rows: Any) -> None:
         if len(written) == 1:
             raise KeyboardInterrupt
         written.append(path)
-        original(path, rows)
+        write_shard(path, rows)
 
-    monkeypatch.setattr(matched_pairs, "write_shard", interrupted)
+    monkeypatch.setattr("fmtorch.training.matched_pairs.write_shard", interrupted)
     with pytest.raises(KeyboardInterrupt):
         MatchedPairs(rendered, **SIFT, root=tmp_path, workers=1)
     folder = tmp_path / matched.folder.name
     assert set(contents(folder)) == {path.name for path in written}
     assert len(contents(matched.folder)) > 1
-    monkeypatch.setattr(matched_pairs, "write_shard", lambda path, rows: (written.append(path), original(path, rows)))
+    monkeypatch.setattr(
+        "fmtorch.training.matched_pairs.write_shard", lambda path, rows: (written.append(path), write_shard(path, rows))
+    )
     calls: list[tuple[int, int]] = []
     MatchedPairs(rendered, **SIFT, root=tmp_path, workers=1, progress=lambda *c: calls.append(c))
     assert 0 < calls[0][0] < len(rendered) == calls[-1][0]
@@ -124,7 +120,7 @@ def test_a_damaged_file_is_computed_anew(
         data[len(data) // 2] ^= 1
     victim.write_bytes(data[:-100] if damage == "cut" else data)
     if damage == "fewer pairs":
-        matched_pairs.write_shard(victim, [])
+        write_shard(victim, [])
     with pytest.warns(UserWarning, match=r"shard-00001\.arrow.* computed anew"):
         MatchedPairs(rendered, **SIFT, root=tmp_path, workers=1)
     assert contents(folder) == contents(matched.folder)
@@ -138,7 +134,7 @@ def test_what_would_change_the_matches_has_a_folder_of_its_own(
     names.add(MatchedPairs(pairs, **SIFT, root=tmp_path, most=50).folder.name)
     names.add(MatchedPairs(pairs, "sift_ratio", root=tmp_path).folder.name)
     names.add(MatchedPairs(pairs, "sift_ratio", overrides=["features.max_features=200"], root=tmp_path).folder.name)
-    monkeypatch.setattr(labelled, "VERSION", 99)
+    monkeypatch.setattr("fmtorch.training.labelled.VERSION", 99)
     names.add(MatchedPairs(pairs, **SIFT, root=tmp_path).folder.name)
     pairs.digest = "2"
     names.add(MatchedPairs(pairs, **SIFT, root=tmp_path).folder.name)
@@ -313,8 +309,8 @@ def test_the_training_loop_of_the_page_runs(
     assert len(loop) == 15
     assert 'load("rendered", split="train")' in code
     monkeypatch.setenv("FMTORCH_CACHE", str(cache))
-    monkeypatch.setattr(rendered_dataset, "PLANS", {("small", "train"): TINY})  # what `rendered` has drawn
-    monkeypatch.setattr(rendered_dataset, "FAMILIES", {FAMILY: None})
+    monkeypatch.setattr("fmtorch.scenes.dataset.PLANS", {("small", "train"): TINY})  # what `rendered` has drawn
+    monkeypatch.setattr("fmtorch.scenes.dataset.FAMILIES", {FAMILY: None})
     (tmp_path / "loop.py").write_text(code)
     torch.manual_seed(0)
     names = runpy.run_path(str(tmp_path / "loop.py"))

@@ -10,8 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from fmtorch.core import types
-from fmtorch.core.types import Correspondences
+from fmtorch.core import Correspondences
 from fmtorch.geometry import eight_point, fundamental_from_calibration, irls, refine, reweighted_fits
 from fmtorch.jit.random import Stream, uniform
 from fmtorch.pruning.networks import LC
@@ -227,7 +226,7 @@ def test_training_goes_through_degenerate_scenes(fit: Fit) -> None:
 
     Losses: classification, and the geometry of a fit with its weights, in both forms.
     """
-    c = types.collate([laws.scene(1), laws.scene(2), *laws.degenerate().values()])
+    c = core.collate([laws.scene(1), laws.scene(2), *laws.degenerate().values()])
     c = c.replace(x0=c.x0.double(), x1=c.x1.double())
     E = fundamental_from_calibration(
         K[None], K[None], torch.eye(3, dtype=torch.float64)[None], torch.tensor([[1.0, 0.0, 0.2]]).double()

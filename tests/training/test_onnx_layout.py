@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from fmtorch.core.files import models_dir
+from fmtorch.core import models_dir
 from fmtorch.features.networks import ARCHITECTURES, build
 from fmtorch.features.onnx_network import PatchNetwork
 from fmtorch.training.onnx_export import export, laid_out, quantize

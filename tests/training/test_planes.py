@@ -7,10 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from fmtorch.data import DepthDataset, ImagePair
-from fmtorch.data.images import ImageError
-from fmtorch.scenes.camera import Camera
-from fmtorch.scenes.textures import skimage_file
+from fmtorch.data import DepthDataset, ImageError, ImagePair
+from fmtorch.scenes import Camera, skimage_file
 from fmtorch.training import MatchedPairs, collate
 from fmtorch.training.planes import (
     Photograph,

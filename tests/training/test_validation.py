@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from torch import nn
 
 from fmtorch import presets
-from fmtorch.core.types import Correspondences
+from fmtorch.core import Correspondences
 from fmtorch.pruning.networks import LC
 from fmtorch.training import Use, Validation, reliability, temperature
 from fmtorch.training.validation import MAX_TEMPERATURE

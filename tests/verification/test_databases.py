@@ -14,10 +14,9 @@ import pycolmap
 import pytest
 
 import fmtorch
-from fmtorch.core.types import pair_key
+from fmtorch.core import pair_key
 from fmtorch.data.lenses import MODELS
 from fmtorch.io.colmap import EXIF_DEVIATION, MatchDatabase, database_image
-from fmtorch.verification import run
 from tests.processes import run_command, starter
 from tests.verification import databases
 from tests.verification.databases import SIZE, killed_and_continued, plain, read, scene, write
@@ -375,7 +374,7 @@ def test_keypoints_are_read_for_many_images_in_blocks(tmp_path: Path, monkeypatc
     write(path, scene(6))
     write(other, scene(6))
     fmtorch.verify(path)
-    monkeypatch.setattr(run, "BATCH", 2)
+    monkeypatch.setattr("fmtorch.verification.run.BATCH", 2)
     monkeypatch.setattr("fmtorch.io.colmap.BLOCK", 2)
     monkeypatch.setattr("fmtorch.io.colmap.MEMORY", 3)
     with MatchDatabase(other) as database:

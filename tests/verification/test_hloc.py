@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import fmtorch
-from fmtorch.core.types import pair_key
+from fmtorch.core import pair_key
 from tests.verification.databases import SIZE, Scene, killed_and_continued, matches, scene
 
 K = np.array([[600.0, 0, 319.5], [0, 600, 239.5], [0, 0, 1]])

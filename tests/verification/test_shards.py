@@ -6,8 +6,7 @@ from pathlib import Path
 import pytest
 
 import fmtorch
-from fmtorch.jobs.execution import Execution
-from fmtorch.verification import run
+from fmtorch.jobs import Execution
 from tests.verification import test_hloc as hloc
 from tests.verification import test_matches as alone
 from tests.verification.databases import plain, read, scene, write
@@ -15,7 +14,7 @@ from tests.verification.databases import plain, read, scene, write
 
 @pytest.fixture(autouse=True)
 def _small_batches(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(run, "BATCH", 2)
+    monkeypatch.setattr("fmtorch.verification.run.BATCH", 2)
 
 
 def test_processes_find_what_threads_find(tmp_path: Path) -> None:
