@@ -14,9 +14,9 @@ from torch import Tensor
 
 from fmtorch import presets
 from fmtorch.data.fmbench import FMBenchPairs
-from fmtorch.data.image_cameras import ExifFocal, exif_focal
+from fmtorch.data.image_cameras import ExifFocal, ImageCameras, exif_focal
 from fmtorch.data.images import ImageError, read_image, to_grey
-from fmtorch.data.pairs import DepthDataset, ImagePair, ImageSource, PairDataset
+from fmtorch.data.pairs import DepthDataset, GivenMatches, ImagePair, ImageSource, PairDataset, subset
 from fmtorch.data.text_files import DataError
 
 __all__ = [
@@ -24,6 +24,8 @@ __all__ = [
     "DepthDataset",
     "ExifFocal",
     "FMBenchPairs",
+    "GivenMatches",
+    "ImageCameras",
     "ImageError",
     "ImagePair",
     "ImageSource",
@@ -34,6 +36,7 @@ __all__ = [
     "exif_focal",
     "load",
     "read_image",
+    "subset",
     "to_grey",
 ]
 

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from fmtorch.training.labelled import LabelledMatches, collate
     from fmtorch.training.matched_pairs import MatchedPairs
     from fmtorch.training.objective import Objective, classification_loss, geometric_loss, nsgd_loss, virtual_points
+    from fmtorch.training.planes import Photograph, PlanePairs, PlaneViews
     from fmtorch.training.stored_matches import Draw, StoredMatches, split_scenes
     from fmtorch.training.validation import Use, Validation, reliability, temperature
 
@@ -22,6 +23,9 @@ __all__ = [
     "LabelledMatches",
     "MatchedPairs",
     "Objective",
+    "Photograph",
+    "PlanePairs",
+    "PlaneViews",
     "SimilarLengthBatches",
     "StoredMatches",
     "Use",

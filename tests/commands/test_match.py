@@ -17,7 +17,7 @@ from PIL import Image
 import fmtorch
 from fmtorch import presets
 from fmtorch.commands import match as match_command
-from fmtorch.core import RELATED, WARNINGS, conf_dir
+from fmtorch.core import WARNINGS, conf_dir
 from fmtorch.data import ImageError, read_image
 from fmtorch.geometry import homography_points, sampson
 from fmtorch.metrics import nsgd
@@ -75,21 +75,6 @@ def test_matches_and_fundamental_matrix_of_arrays(pipeline: fmtorch.Pipeline) ->
     on_lines = sampson(result.F[None], c.x0[:, result.inliers].double(), c.x1[:, result.inliers].double())
     assert on_lines.max() <= 1.001  # the threshold, scored in float32
     assert torch.equal(c.size0, torch.tensor([[480, 640]]))
-
-
-def test_equal_to_the_pipeline_on_files(pipeline: fmtorch.Pipeline, tmp_path: Path) -> None:
-    images = stereo()
-    for i in (0, 1):
-        cv2.imwrite(str(tmp_path / f"{i}.png"), images[i][..., ::-1])
-    by_path = fmtorch.match(str(tmp_path / "0.png"), tmp_path / "1.png", pipeline=pipeline)
-    by_array = fmtorch.match(*images, pipeline=pipeline)
-    assert torch.equal(by_path.F, by_array.F)
-    source = [fmtorch.data.ImageSource(f"{i}", tmp_path / f"{i}.png") for i in (0, 1)]
-    outcome = pipeline.correspondences([fmtorch.data.ImagePair("p", "f", "s", *source, ROWS)])[0]
-    # Correspondences do not depend on the pair's key, which the pipeline hashes from its identity.
-    assert torch.equal(outcome.correspondences.x0, by_path.correspondences.x0)
-    grey = fmtorch.match(*(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in images), pipeline=pipeline)
-    assert torch.equal(grey.F, by_array.F)
 
 
 def test_reduction_gives_pixels_of_the_originals(pipeline: fmtorch.Pipeline) -> None:
@@ -164,24 +149,6 @@ def test_photographs_that_determine_no_f(pipeline: fmtorch.Pipeline) -> None:
 
 
 LMEDS = ("estimator=lmeds_eight_point",)
-
-
-def test_an_f_of_photographs_with_nothing_in_common() -> None:
-    """Some F is found, and the verdict tells that it means nothing."""
-    overrides = [*LMEDS, "features.max_features=1500", "pruner.ratio.threshold=0.95"]
-    lenient = load_pipeline("sift_ratio", overrides=overrides)
-    images = stereo()[0], stereo(seed=1)[0]
-    result = fmtorch.match(*images, pipeline=lenient)
-    assert result.ok
-    assert not result.related
-    assert result.significance < RELATED
-    assert (result.pair_type, result.homography) == ("unrelated", None)
-    good = fmtorch.match(*stereo(), pipeline=lenient)
-    assert good.related
-    assert good.significance > 10
-    # In other pixels the same; here of images reduced by half.
-    halved = fmtorch.match(*stereo(), pipeline=lenient, longest_side=320)
-    assert halved.related
 
 
 @pytest.mark.parametrize(

@@ -4,8 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fmtorch.data import DepthDataset, PairDataset, load
-from fmtorch.data.pairs import subset
+from fmtorch.data import DepthDataset, PairDataset, load, subset
 from tests.data.native import write_tum
 
 

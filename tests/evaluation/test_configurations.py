@@ -12,8 +12,7 @@ from rich.console import Console
 
 from fmtorch import presets
 from fmtorch.core import PAIR_TYPES, WARNINGS, Correspondences
-from fmtorch.data import ImagePair, ImageSource
-from fmtorch.data.pairs import GivenMatches
+from fmtorch.data import GivenMatches, ImagePair, ImageSource
 from fmtorch.evaluation import (
     WithPairCameras,
     built_with,

@@ -10,38 +10,14 @@ from hypothesis import strategies as st
 from fmtorch.evaluation.statistics import (
     MIN_SCENES,
     MIN_UNITS,
-    PERCENT,
     RESAMPLES,
     bootstrap_mean,
     difference,
     effective_pairs,
-    interval,
     share_difference,
     share_interval,
 )
 from tests.reference.bootstrap import bootstrap_interval
-
-
-def test_intervals_are_of_what_is_defined() -> None:
-    rng = np.random.default_rng(1)
-    a, b = rng.random((2, 30))
-    scenes = [f"s{i % 13}" for i in range(30)]
-    incomplete = a.copy()
-    incomplete[::4] = math.nan
-    kept = [i for i in range(30) if i % 4]
-    expected = bootstrap_mean(a[kept], [scenes[i] for i in kept])
-    assert interval(incomplete, scenes) == expected
-    percent = interval(incomplete, scenes, PERCENT)
-    assert (percent.value, percent.low, percent.high) == tuple(
-        PERCENT * end for end in (expected.value, expected.low, expected.high)
-    )
-    gain = bootstrap_mean(a[kept] - b[kept], [scenes[i] for i in kept])
-    assert difference(incomplete, b, scenes) == gain
-    assert difference(b, incomplete, scenes) == bootstrap_mean(b[kept] - a[kept], [scenes[i] for i in kept])
-    nothing = np.full(30, math.nan)
-    assert interval(nothing, scenes) is None
-    assert difference(nothing, b, scenes) is None
-    assert f"{expected:.1f}" == f"{expected.value:.1f} [{expected.low:.1f}, {expected.high:.1f}]"
 
 
 def correlated(scenes: int, pairs: int, seed: int = 0) -> tuple[np.ndarray, list[str]]:

@@ -11,8 +11,7 @@ import torch
 
 from fmtorch import data, match, presets
 from fmtorch.core import ImagePruner
-from fmtorch.data import read_image
-from fmtorch.data.pairs import GivenMatches
+from fmtorch.data import GivenMatches, read_image
 from fmtorch.geometry import sampson
 from fmtorch.io import MatchStore
 from fmtorch.pipeline import FolderMatches, Pipeline, load_pipeline, match_records

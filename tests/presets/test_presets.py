@@ -8,7 +8,7 @@ import fmtorch
 from fmtorch import presets
 from fmtorch.core import conf_dir
 from fmtorch.pipeline import load_pipeline
-from fmtorch.presets.composition import compose
+from fmtorch.presets import compose
 from tests.laws import scene
 
 

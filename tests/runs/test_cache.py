@@ -13,8 +13,6 @@ import numpy as np
 import pytest
 
 from fmtorch.runs import ArrayCache
-from fmtorch.runs import feature_cache as module
-from fmtorch.runs.feature_cache import ABANDONED, SLACK
 from tests.helpers import in_threads
 
 
@@ -102,7 +100,7 @@ def test_the_least_recently_used_files_go(tmp_path: Path) -> None:
     for i in range(12, 40):
         cache.write("other", f"{i}", {"a": np.full(1000, i)})
         time.sleep(0.002)  # file systems' clocks tick in milliseconds
-        assert sum(status.st_size for _, status in cache.files()) <= (1 + SLACK) * 20 * size
+        assert sum(status.st_size for _, status in cache.files()) <= 1.05 * 20 * size
         if i == 24:
             assert cache.read("some", "0") is not None
             assert cache.read("some", "1") is None
@@ -116,7 +114,7 @@ def test_dead_writers_leftovers_are_removed_and_live_ones_kept(tmp_path: Path) -
     dead, live = tmp_path / "some" / "a.npz.1.tmp", tmp_path / "some" / "b.npz.2.tmp"
     for path in (dead, live):
         path.write_bytes(b"half")
-    before = time.time() - 2 * ABANDONED
+    before = time.time() - 7200
     os.utime(dead, (before, before))
     ArrayCache(tmp_path).write("some", "c", {"a": np.zeros(1)})
     assert not dead.exists()
@@ -154,7 +152,7 @@ def test_processes_share_a_cache(tmp_path: Path, limit: int) -> None:
         cached = cache.read("some", path.stem)
         assert (cached["a"] == int(path.stem)).all()
     total = sum(status.st_size for _, status in files)
-    assert len(files) == 50 if limit == 0 else total <= (1 + 2 * SLACK) * limit + 2 * 400_500
+    assert len(files) == 50 if limit == 0 else total <= 1.1 * limit + 2 * 400_500
     assert not list(tmp_path.glob("some/*.tmp"))
 
 
@@ -174,7 +172,7 @@ def test_what_cannot_be_written_is_told_and_harms_nothing(tmp_path: Path, monkey
     def full(*_: object, **__: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(module.np, "savez", full)
+    monkeypatch.setattr("numpy.savez", full)
     cache = ArrayCache(tmp_path)
     with pytest.warns(UserWarning, match="No space left on device"):
         cache.write("some", "name", {"a": np.zeros(1)})

@@ -16,11 +16,9 @@ from torch import Tensor
 
 from fmtorch import presets
 from fmtorch.core import Features
-from fmtorch.data import read_image
 from fmtorch.pipeline import load_pipeline
 from fmtorch.runs import ArrayCache, CachedFeatures, cached, configuration, image_digest
 from fmtorch.runs import fingerprint as configuration_module
-from tests.conftest import shared_path
 from tests.helpers import in_threads
 
 
@@ -83,18 +81,6 @@ def test_bit_equal_with_and_without(tmp_path: Path, shape: tuple[int, ...], root
     assert equal(second(image), truth)
     assert (first.computed, first.found) == (1, 0)
     assert (second.computed, second.found) == (0, 1)
-
-
-def test_bit_equal_on_a_real_photograph(tmp_path: Path) -> None:
-    path = next(shared_path("data/Strecha_train").rglob("*.jpg"))
-    sift = presets.build("features", "sift", max_features=2000)
-    image = read_image(path)
-    kept = CachedFeatures(sift, ArrayCache(tmp_path))
-    assert equal(kept(image), sift(image))
-    assert equal(kept(image), sift(image))
-    assert kept.found == 1
-    ((_, status),) = kept.cache.files()
-    assert status.st_size < 2000 * (128 + 24 + 4 + 1) + 4000  # SIFT's descriptors are bytes
 
 
 def test_every_float_survives(tmp_path: Path) -> None:

@@ -9,7 +9,8 @@ import torch
 from PIL import Image
 
 from fmtorch.scenes import Camera, Plan, Task, calibration, fundamental, look_at, photograph
-from fmtorch.training.planes import Photograph, PlaneViews, list_photographs
+from fmtorch.training import Photograph, PlaneViews
+from fmtorch.training.planes import list_photographs
 from scripts.patch_networks.patches import (
     Tolerance,
     View,

@@ -12,14 +12,11 @@ from hypothesis import strategies as st
 from fmtorch.geometry import symmetric_max
 from fmtorch.training import Augmentation, LabelledMatches
 from fmtorch.training.augmentation import (
-    MIN_INLIERS,
-    MIN_MATCHES,
     crop,
     keep_ratio,
     move,
     rotate,
     swap,
-    thinned_counts,
 )
 from tests.training.conftest import exact
 
@@ -184,23 +181,6 @@ def test_ranges_are_kept() -> None:
         assert abs(float(steps.mean())) < 4 * 0.5 / np.sqrt(len(steps))
     assert ONLY(m, seed=0, count=70).label.shape[1] == 70
     assert ONLY(m, seed=0, count=7000).label.shape[1] == 600
-
-
-@pytest.mark.parametrize(
-    ("inliers", "outliers", "share", "expected"),
-    [
-        (500, 500, 0.05, (26, 500)),
-        (500, 500, 0.5, (500, 500)),
-        (500, 500, 0.95, (500, 26)),
-        (10, 1000, 0.5, (10, MIN_MATCHES - 10)),  # not fewer than 50 matches are left
-        (1000, 10, 0.05, (MIN_INLIERS, 10)),  # nor fewer than 16 inliers
-        (5, 10, 0.05, (5, 10)),
-        (5, 10, 0.0, (5, 10)),
-        (10, 5, 1.0, (10, 5)),
-    ],
-)
-def test_thinning_reaches_its_share(inliers: int, outliers: int, share: float, expected: tuple[int, int]) -> None:
-    assert thinned_counts(inliers, outliers, share) == expected
 
 
 def test_mistakes_are_named() -> None:

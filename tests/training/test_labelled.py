@@ -170,29 +170,6 @@ def test_a_point_that_would_be_behind_the_other_camera_is_wrong() -> None:
     assert by_transfer(forward, np.array([np.nan]), np.zeros(1)).tolist() == [0]
 
 
-def test_transfer_equals_the_scalar_reference_on_random_input() -> None:
-    rng = np.random.default_rng(0)
-    n, k = 60, 4
-    K0, K1 = (calibration(rng.uniform(50, 300), SIZE, (rng.uniform(0, 300), rng.uniform(0, 200))) for _ in range(2))
-    R, _ = np.linalg.qr(rng.normal(size=(3, 3)))
-    R *= np.linalg.det(R)
-    t = rng.normal(size=3)
-    x, partner = (rng.uniform(0, 200, (n, 2)) for _ in range(2))
-    depth = np.where(rng.random((k, n)) < 0.6, np.nan, rng.uniform(0.1, 5, (k, n)))
-    error = transfer_error(x, depth, partner, K0, K1, R, t)
-    expected = [reference.transfer_error(x[i], depth[:, i], partner[i], K0, K1, R, t) for i in range(n)]
-    np.testing.assert_allclose(error, expected, rtol=1e-9)
-    assert 0 < np.isnan(error).sum() < n
-
-
-def test_rules_equal_the_scalar_reference() -> None:
-    values = [np.nan, 0.0, 2.9, 3.0, 3.1, 6.0, 6.1, np.inf]
-    grid = np.array([(f, b, line) for f in values for b in values for line in values[1:]])
-    labels = by_transfer(*grid.T)
-    assert labels.dtype == np.int8
-    assert labels.tolist() == [reference.label(*row) for row in grid]
-
-
 def test_rendered_labels_equal_the_scalar_reference(rendered: RenderedPairs) -> None:
     """Random and near-true matches of rendered pairs; depths are those of `depth_at`, which has a test of its own."""
     rng = np.random.default_rng(1)

@@ -5,18 +5,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import torch
 
 from fmtorch.data import DepthDataset, ImageError, ImagePair
 from fmtorch.scenes import Camera, skimage_file
-from fmtorch.training import MatchedPairs, collate
-from fmtorch.training.planes import (
-    Photograph,
-    PlanePairs,
-    PlaneViews,
-    plane_homography,
-    random_camera,
-)
+from fmtorch.training import MatchedPairs, Photograph, PlanePairs, PlaneViews
+from fmtorch.training.planes import plane_homography, random_camera
 from tests.training.conftest import SIFT
 
 SIZE = (300, 400)
@@ -78,26 +71,6 @@ def between_views(planes: PlanePairs, pair: ImagePair) -> np.ndarray:
     X = planes.depth(pair.image0, x)[:, None] * np.column_stack([x, np.ones(4)]) @ np.linalg.inv(pair.K0).T
     there = (X @ pair.R.T + pair.t) @ pair.K1.T
     return cv2.getPerspectiveTransform(x.astype(np.float32), (there[:, :2] / there[:, 2:]).astype(np.float32))
-
-
-def test_pairs_of_planes_train_the_classification_alone(planes: PlanePairs, tmp_path: Path) -> None:
-    pytest.importorskip("lightning", reason="training needs the extra `train`")
-    from fmtorch.pruning.networks import LC
-    from fmtorch.pruning.networks.learned import predict
-    from fmtorch.training.objective import Objective
-
-    matched = MatchedPairs(planes, **SIFT, root=tmp_path, workers=1)
-    batch = collate([matched[i] for i in range(3)])
-    torch.manual_seed(0)
-    network = LC(channels=8, blocks=1)
-    terms = Objective(geometric=1.0, nsgd=1.0, classification_steps=0)(
-        predict(network, batch.correspondences), batch, 0
-    )
-    assert terms["geometric"].item() == 0
-    assert terms["nsgd"].item() == 0
-    assert terms["loss"].item() == pytest.approx(terms["classification"].item())
-    terms["loss"].backward()
-    assert all(bool(torch.isfinite(p.grad).all()) for p in network.parameters() if p.grad is not None)
 
 
 def test_views_are_drawn_once_and_depend_on_what_defines_them(photographs: list[Photograph], tmp_path: Path) -> None:
