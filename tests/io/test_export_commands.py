@@ -184,7 +184,7 @@ def test_an_evaluation_and_its_way_back(tmp_path: Path, monkeypatch: pytest.Monk
     np.testing.assert_allclose(geometry.H / geometry.H[2, 2], [[1, 0, -9], [0, 1, 0], [0, 0, 1]], atol=0.2)
     with h5py.File(path / MATCHES) as file:
         group = file["00000000.png/00000001.png"]
-        assert group.attrs["pair_type"] == "planar_or_panoramic"
+        assert group.attrs["configuration"] == "planar_or_panoramic"
         np.testing.assert_allclose(
             group.attrs["H"] / group.attrs["H"][2, 2], [[1, 0, -9], [0, 1, 0], [0, 0, 1]], atol=0.2
         )

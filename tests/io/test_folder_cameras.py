@@ -79,7 +79,7 @@ def test_a_calibration_of_all_gives_what_verify_gives(tmp_path: Path) -> None:
     with h5py.File(output / MATCHES) as file:
         attributes = dict(file["a.jpg/b.jpg"].attrs)
     np.testing.assert_allclose(attributes["R"], pose.rotation.matrix(), atol=1e-9)
-    assert attributes["pair_type"] == "calibrated"
+    assert attributes["configuration"] == "calibrated"
     assert attributes["E"].shape == (3, 3)
 
     # The same matches by `verify`, which reads the cameras of the database.
