@@ -89,6 +89,19 @@ def calibrated(c: Correspondences) -> Correspondences:
     return c.replace(K0=K, K1=K)
 
 
+KNOWLEDGE: dict[str, Any] = {"exact": (0.0, 0.0), "rough": (0.05, 0.05), "one": (0.0, float("inf")), "shared": None}
+"""Deviations of the two focal lengths, as parts of them; None: unknown and equal."""
+
+
+def with_knowledge(c: Correspondences, known: str) -> Correspondences:
+    """The same pairs with the calibration of `scene` as far as it is known."""
+    if known == "shared":
+        return c.replace(shared_focal=torch.ones(len(c), dtype=torch.bool))
+    focal = torch.tensor([[[1.0, s] for s in KNOWLEDGE[known]]]).expand(len(c), 2, 2)
+    c = calibrated(c).replace(focal=focal)
+    return c.replace(K1=None) if known == "one" else c
+
+
 def scene(index: int, count: int = 150, outliers: float = 0.4, noise: float = 0.3) -> Correspondences:
     """One synthetic pair: a cloud of points before two cameras, with noise, outliers, ratios, frames and a key."""
     rng = np.random.default_rng(index)

@@ -1,12 +1,12 @@
-"""What `fmtorch match` is told of cameras: ``cameras=exif``, ``cameras=FILE``, ``K=fx,fy,cx,cy``."""
-
-from __future__ import annotations
+"""`fmtorch match`: the fundamental matrix of two photographs, with pictures; or the pairs of a folder of images."""
 
 import contextlib
 import dataclasses
+import functools
 import hashlib
 import json
 import math
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -20,24 +20,145 @@ from rich.table import Table
 
 from fmtorch import presets
 from fmtorch.commands.config import chosen_pipeline, job, run_command
-from fmtorch.commands.match_folder import match_folder
 from fmtorch.commands.options import MATCH, MatchOptions
 from fmtorch.core.files import expect_writable, replacing
-from fmtorch.core.terminal import console, errors
+from fmtorch.core.settings import head
+from fmtorch.core.stages import ImageMatcher
+from fmtorch.core.terminal import console, errors, progress_bars
 from fmtorch.core.types import RELATED
 from fmtorch.core.version import __version__
-from fmtorch.data.images import read_image
-from fmtorch.data.lenses import undistorted
+from fmtorch.data.cameras import undistorted
+from fmtorch.data.images import read_image, stored_orientation
+from fmtorch.evaluation.curves import view_graph_svg
 from fmtorch.evaluation.pictures import draw_epipolar_lines, draw_matches
+from fmtorch.features.vlad import descriptor_kind, image_vector
+from fmtorch.io.export import ViewGraph, export_kinds, view_graph, write_exports, write_view_graph
+from fmtorch.io.match_store import MatchStore
+from fmtorch.jobs.execution import MIN_PAIRS_FOR_PROCESSES
 from fmtorch.metrics import nsgd
-from fmtorch.pipeline.build import build_pipeline
-from fmtorch.pipeline.folder import EXHAUSTIVE
-from fmtorch.pipeline.photograph_cameras import PhotographCameras
-from fmtorch.pipeline.pipeline import Pipeline
-from fmtorch.pipeline.reduced_images import Image
+from fmtorch.pipeline.folder import (
+    EXHAUSTIVE,
+    MEMORY,
+    SIMILAR,
+    FolderMatches,
+    chosen_pairs,
+    count_of,
+    default_output,
+    folder_workers,
+    images_below,
+    open_folder,
+    similar_pairs,
+    vectors_of,
+)
+from fmtorch.pipeline.photographs import Image, PhotographCameras
+from fmtorch.pipeline.pipeline import Pipeline, build_pipeline
 from fmtorch.pipeline.two_images import MatchResult, match
-from fmtorch.presets.fields import read_fields
-from fmtorch.runs.feature_cache import CachedFeatures
+from fmtorch.presets.composition import execution_of, read_fields
+from fmtorch.runs.feature_cache import CachedFeatures, cached
+from fmtorch.runs.fingerprint import fmtorch_version
+
+# `fmtorch match images=FOLDER export=h5,colmap`: the pairs of a folder of images, for other programs
+
+
+def match_folder(
+    config: DictConfig, fields: MatchOptions, cameras: PhotographCameras, pipeline_name: str, overrides: Sequence[str]
+) -> Path:
+    """Match the pairs of a folder of images, write what is to be exported and return the folder with it.
+
+    Raises ValueError for what the options cannot mean, and where no pair could be matched.
+    """
+    folder = fields.images
+    assert folder is not None
+    kinds = export_kinds(fields.export)
+    if fields.camera == "shared" and "colmap" not in kinds:
+        raise ValueError("camera=shared needs export=colmap; cameras=shared is what is known of the photographs")
+    images = images_below(folder)
+    similar = count_of(fields.pairs, SIMILAR)
+    pairs = [] if similar else chosen_pairs(folder, images, fields.pairs)
+    presets.expect_stages(config)
+    stages = presets.stages(config)
+    vector = functools.partial(image_vector, kind=descriptor_kind(stages["features"])) if similar else None
+    pipeline: Pipeline = build_pipeline(config, presets.resolve_device(fields.device))
+    if isinstance(pipeline.matcher, ImageMatcher):
+        raise ValueError("images: a folder is matched by keypoints of each image; this matcher takes pairs of images")
+    output = fields.output or default_output(folder)
+    identity = {
+        "version": fmtorch_version(), "images": str(folder.absolute()), **stages, "seed": fields.seed,
+        "orient": fields.orient, "longest_side": fields.longest_side, **cameras.identity,
+    }  # fmt: skip
+    journal = MatchStore(open_folder(output, identity), folder)
+    scratch = journal.folder / "features"
+    if len(images) > MEMORY and not isinstance(pipeline.extractor, CachedFeatures):  # none is computed twice
+        pipeline.extractor = cached(pipeline.extractor, scratch)
+    console.print(f"{' '.join([pipeline_name, *overrides])}: {folder}", style="italic", markup=False, highlight=False)
+    count = len(images) * similar if similar else len(pairs)
+    many = count >= MIN_PAIRS_FOR_PROCESSES and pipeline.device.type == "cpu"
+    execution = execution_of(config, fields.workers).decided(many)
+    build = None if execution.shared else functools.partial(build_pipeline, config, pipeline.device)
+    with folder_workers(pipeline, execution) as workers, progress_bars() as progress:
+        work = FolderMatches(
+            pipeline, journal, fields.longest_side, fields.orient, fields.seed,
+            workers=workers, build=build, cameras=cameras,
+        )  # fmt: skip
+        if similar and vector is not None:
+            seen = progress.track(work.images(images), len(images), description="images")
+            pairs = similar_pairs(images, vectors_of(seen, vector), similar)
+        for _ in progress.track(work.each(pairs), len(pairs), description=pipeline_name):
+            pass
+    shutil.rmtree(scratch, ignore_errors=True)
+    _expect_some(work, len(pairs))
+    graph = view_graph(journal, images, pairs)
+    shared = fields.camera == "shared" or cameras.word == "shared"
+    written = ["export.json", *write_exports(journal, pairs, kinds, output, shared)]
+    written += [*write_view_graph(graph, output), _draw_graph(graph, folder, fields.orient, output)]
+    _say(work, graph, len(pairs))
+    console.print(f"{output}: {', '.join(written)}", style="dim", markup=False, highlight=False)
+    if "colmap" in kinds and fields.orient:
+        _say_turned(images, folder)
+    if isinstance(pipeline.extractor, CachedFeatures) and pipeline.extractor.cache.folder != scratch:
+        console.print(pipeline.extractor.report(), style="dim", markup=False, highlight=False)
+    return output
+
+
+def _expect_some(work: FolderMatches, pairs: int) -> None:
+    for trouble in work.troubles:
+        errors.print(trouble, style="bold", markup=False, highlight=False, soft_wrap=True)
+    if work.taken:
+        console.print(f"{work.taken} of {pairs} pairs taken from an earlier run", highlight=False)
+    if work.troubles and not work.done + work.taken:
+        raise ValueError(f"no pair could be matched, the first because: {work.troubles[0]}")
+
+
+def _say(work: FolderMatches, graph: ViewGraph, pairs: int) -> None:
+    sizes = [len(part) for part in graph.components() if len(part) > 1]
+    apart = len(graph.images) - sum(sizes)
+    console.print(f"{work.related} of {pairs} pairs show one scene", highlight=False)
+    if sizes:
+        others = f"; {apart} images are in no related pair" if apart else ""
+        console.print(f"connected images: {', '.join(map(str, sizes))}{others}", highlight=False)
+
+
+def _say_turned(images: Sequence[Path], folder: Path) -> None:
+    turned = [image.relative_to(folder).as_posix() for image in images if stored_orientation(image) != 1]
+    if turned:
+        console.print(
+            f"turned by their orientation tags: {head(turned)}. Keypoints and cameras in database.db are those of the "
+            "turned images, from which COLMAP's mapper works; but COLMAP reads files as they are stored, so that its "
+            "colours, undistorted images and dense reconstruction will not fit. Turn the files, or use orient=false",
+            highlight=False,
+        )
+
+
+def _draw_graph(graph: ViewGraph, folder: Path, orient: bool, output: Path) -> str:
+    def read(name: str) -> NDArray[np.uint8] | None:
+        try:
+            return read_image(folder / name, orient=orient)
+        except (OSError, ValueError):
+            return None
+
+    with replacing(output / "graph.svg") as path:
+        path.write_text(view_graph_svg(graph, read), encoding="utf-8")
+    return "graph.svg"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -50,7 +171,6 @@ class Photographs:
 
     @property
     def pinholes(self) -> tuple[Image, Image]:
-        """The photographs without the distortion of their lenses."""
         lenses = [self.knowledge.get(f"lens{i}") for i in (0, 1)]
         bent = zip(self.images, lenses, strict=True)
         image0, image1 = (image if lens is None else undistorted(image, lens) for image, lens in bent)
@@ -119,6 +239,10 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
         if fields.image0 is not None or fields.image1 is not None or fields.truth is not None:
             raise ValueError("images takes a folder; image0, image1 and truth are of a single pair")
         return match_folder(config, fields, PhotographCameras(fields.cameras, fields.K), pipeline_name, overrides)
+    if fields.camera != "per_image":
+        raise ValueError(
+            f"camera is of a folder's database; cameras={fields.camera} is what is known of two photographs"
+        )
     if fields.export is not None or str(fields.pairs or EXHAUSTIVE) != EXHAUSTIVE:
         raise ValueError("export and pairs are of a folder of images: give images=FOLDER")
     paths = [_given(fields.image0, "image0"), _given(fields.image1, "image1")]
@@ -193,7 +317,6 @@ def _default_output(paths: Sequence[Path]) -> Path:
 
 
 def _report(result: MatchResult, image0: Image, image1: Image, truth: NDArray[np.float64] | None) -> dict[str, Any]:
-    """What result.json holds of a result; points in pixels of the images."""
     c = result.correspondences
     report: dict[str, Any] = {
         "size0": image0.shape[:2], "size1": image1.shape[:2],
@@ -249,7 +372,6 @@ def _draw(folder: Path, result: MatchResult, given: Photographs, truth: NDArray[
 
 
 def _troubles(result: MatchResult) -> list[str]:
-    """What is said of a result that is not to be relied on."""
     warning = result.warning if result.related or result.pair_type != "unrelated" else ""  # which is said already
     if not result.ok:
         return list(filter(None, (f"no F: {result.reason}", warning)))

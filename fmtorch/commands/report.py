@@ -1,7 +1,5 @@
 """`fmtorch report runs=[runs]`: runs of `fmtorch.eval` side by side on one HTML page."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -19,7 +17,7 @@ from fmtorch.core.terminal import console
 from fmtorch.evaluation.curves import axis_of
 from fmtorch.evaluation.gallery import Options, Run, gallery
 from fmtorch.evaluation.page import Section, render, run_names, shared_settings
-from fmtorch.presets.fields import read_fields
+from fmtorch.presets.composition import read_fields
 from fmtorch.runs import RunFolder, RunFolderError
 
 
@@ -105,7 +103,6 @@ def _merged(held: Sequence[tuple[RunFolder, pa.Table]]) -> list[tuple[RunFolder,
 
 
 def _order(order: str | None, paths: Sequence[Path]) -> str:
-    """`given` or `recall`; unless one is asked for, by recall where runs were looked for in folders."""
     if order not in (None, "given", "recall"):
         raise ValueError(f"order={order} must be given or recall")
     return order or ("given" if all((path / "run.json").exists() for path in paths) else "recall")

@@ -1,9 +1,5 @@
 """`fmtorch train pruner=lc`: train a learned pruner on the labelled matches of a data set."""
 
-from __future__ import annotations
-
-import sys
-
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
@@ -20,8 +16,6 @@ def task(config: DictConfig) -> None:
         if (error.name or "").split(".")[0] not in ("lightning", "tensorboard"):
             raise
         raise ImportError(f"training needs {error.name}: pip install 'fmtorch[train]'") from error
-    if sys.argv[1:2] != ["train"]:
-        sys.argv.insert(1, "train")  # processes that Lightning starts are of this command line
     run(config, str(HydraConfig.get().runtime.choices["pruner"]))
 
 

@@ -5,15 +5,16 @@ from typing import TYPE_CHECKING
 from fmtorch.core.lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from fmtorch.core.files import conf_dir, models_dir, replacing
-    from fmtorch.core.grey_pyramid import grey_pyramid
+    from fmtorch.core.files import conf_dir, models_dir
+    from fmtorch.core.grey_pyramid import GreyPyramid, grey_pyramid
+    from fmtorch.core.onnx_network import NetworkFileError
     from fmtorch.core.stages import Estimator, FeatureExtractor, ImagePruner, Matcher, PairImages, Pruner
     from fmtorch.core.types import PAIR_TYPES, RELATED, WARNINGS, Correspondences, Estimate, Features, collate, pair_key
 
 __all__ = [
     "PAIR_TYPES", "RELATED", "WARNINGS", "Correspondences", "Estimate", "Estimator", "FeatureExtractor", "Features",
-    "ImagePruner", "Matcher", "PairImages", "Pruner", "collate", "conf_dir", "grey_pyramid", "models_dir",
-    "pair_key", "replacing",
+    "GreyPyramid", "ImagePruner", "Matcher", "NetworkFileError", "PairImages", "Pruner", "collate", "conf_dir",
+    "grey_pyramid", "models_dir", "pair_key",
 ]  # fmt: skip
 
 lazy_exports(__name__)

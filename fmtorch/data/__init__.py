@@ -1,7 +1,5 @@
 """Data sets of image pairs."""
 
-from __future__ import annotations
-
 import dataclasses
 import inspect
 from collections.abc import Callable, Mapping, Sequence
@@ -13,11 +11,11 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from fmtorch import presets
+from fmtorch.data.files import DataError
 from fmtorch.data.fmbench import FMBenchPairs
 from fmtorch.data.image_cameras import ExifFocal, ImageCameras, exif_focal
 from fmtorch.data.images import ImageError, read_image, to_grey
 from fmtorch.data.pairs import DepthDataset, GivenMatches, ImagePair, ImageSource, PairDataset, subset
-from fmtorch.data.text_files import DataError
 
 __all__ = [
     "DataError",

@@ -25,7 +25,7 @@ from fmtorch.geometry.epipolar import SAMPSON, Residual
 from fmtorch.geometry.significance import of_one_pair
 from fmtorch.jit.batches import as_array
 from fmtorch.jit.kernel import Array
-from fmtorch.jobs.threads import available
+from fmtorch.jobs.execution import available
 
 PARTS_OF_A_THREAD = 4  # so that no thread is long alone at the end
 MIN_WORK = 500  # matches: a pair of fewer takes as long as one of these

@@ -25,7 +25,7 @@ from fmtorch.geometry.rank2_manifold import SQUARINGS
 from fmtorch.geometry.refine import refine_kernel
 from fmtorch.geometry.robust_losses import named_loss
 from fmtorch.jit.kernel import Array
-from fmtorch.jobs.threads import mapped
+from fmtorch.jobs.execution import mapped
 
 DECAY = 0.65  # of the loss's scale, from one iteration to the next, down to the threshold
 FIRST_DAMPING = 1e-4  # of Levenberg-Marquardt

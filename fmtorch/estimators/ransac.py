@@ -34,7 +34,7 @@ from fmtorch.estimators.search import Search
 from fmtorch.estimators.selection import BestOfSearch, BestScore, Selection, Selector
 from fmtorch.jit.kernel import Array, Kernel
 from fmtorch.jit.together import compile_together
-from fmtorch.jobs.threads import mapped
+from fmtorch.jobs.execution import mapped
 
 FOCAL_ROUND = 500  # samples of five matches at a time
 CALIBRATED_MATCHES = 6  # that a pair of calibrated cameras needs: five of them have up to ten solutions

@@ -5,11 +5,9 @@ from typing import TYPE_CHECKING
 from fmtorch.core.lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from fmtorch.evaluation.identity import run_identity
-    from fmtorch.evaluation.pair_cameras import WithPairCameras, built_with, cameras_of
     from fmtorch.evaluation.rows import evaluate, focal_errors
-    from fmtorch.evaluation.run import evaluate_pairs
-    from fmtorch.evaluation.summary import common_reasons, summarize
+    from fmtorch.evaluation.run import WithPairCameras, built_with, cameras_of, evaluate_pairs, run_identity
+    from fmtorch.evaluation.statistics import common_reasons, summarize
     from fmtorch.evaluation.tables import summary_markdown, terminal_tables
 
 __all__ = [

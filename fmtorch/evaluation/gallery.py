@@ -1,7 +1,5 @@
 """The pairs that a report shows: images from wherever they lie, each run's matches again, or what it stored."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -19,8 +17,7 @@ from fmtorch.evaluation.page import Picture, Shown, ShownPair, differing_pairs
 from fmtorch.evaluation.pictures import Image, draw_epipolar_lines, draw_epipolar_lines_of_corners, draw_matches
 from fmtorch.io.dataset import WITHOUT_GEOMETRY, H5Pairs
 from fmtorch.metrics import corner_error, nsgd
-from fmtorch.pipeline.build import build_pipeline
-from fmtorch.pipeline.pipeline import Outcome, Pipeline
+from fmtorch.pipeline.pipeline import Outcome, Pipeline, build_pipeline
 from fmtorch.runs import RunFolder
 from fmtorch.scenes import RenderedPairs
 
@@ -62,7 +59,6 @@ def difference(pair: ImagePair, images: Sequence[Image], stored: Mapping[str, An
 def _difference_of_homographies(
     pair: ImagePair, images: Sequence[Image], stored: Mapping[str, Any], outcome: Outcome
 ) -> str:
-    """The same of a homography, by its corner error."""
     again = outcome.estimate
     if again is None or not bool(again.ok[0]) or not stored["ok"]:
         has_homography = again is not None and bool(again.ok[0])

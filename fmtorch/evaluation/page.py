@@ -1,7 +1,5 @@
 """The report of several runs: tables, paired differences, curves and pictures on one HTML page."""
 
-from __future__ import annotations
-
 import base64
 import dataclasses
 import hashlib
@@ -18,8 +16,7 @@ from fmtorch import presets
 from fmtorch.core.settings import leaves
 from fmtorch.evaluation import curves, tables
 from fmtorch.evaluation.pictures import Image
-from fmtorch.evaluation.statistics import THRESHOLD
-from fmtorch.evaluation.summary import summarize
+from fmtorch.evaluation.statistics import THRESHOLD, summarize
 
 QUALITY, WIDTH = 80, 1280  # of JPEG pictures; px
 DISAGREEMENT = 0.1  # NSGD beyond which a result is as bad as any
@@ -60,14 +57,12 @@ class Shown:
 
     @property
     def good(self) -> bool:
-        """Whether its error is below the threshold that is marked in the curves."""
         if self.corner_error is not None:
             return self.corner_error < curves.CORNERS.mark
         return self.nsgd is not None and self.nsgd < THRESHOLD
 
     @property
     def result(self) -> str:
-        """What is said of it."""
         if self.corner_error is not None:
             return f"failed: {self.reason}" if self.reason else f"corner error {self.corner_error:.2f} px"
         result = f"failed: {self.reason}" if self.nsgd is None else f"NSGD {self.nsgd:.4f}"

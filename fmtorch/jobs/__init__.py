@@ -5,10 +5,8 @@ from typing import TYPE_CHECKING
 from fmtorch.core.lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from fmtorch.jobs.execution import Execution
-    from fmtorch.jobs.pool import WorkerPool, WorkersLost
-    from fmtorch.jobs.runner import DEATH, Factory, Local, TaskRunner, in_order
-    from fmtorch.jobs.threads import available, mapped, one_thread
+    from fmtorch.jobs.execution import Execution, available, mapped, one_thread
+    from fmtorch.jobs.runner import DEATH, Factory, Local, TaskRunner, WorkerPool, WorkersLost, in_order
 
 __all__ = [
     "DEATH", "Execution", "Factory", "Local", "TaskRunner", "WorkerPool", "WorkersLost", "available", "in_order",

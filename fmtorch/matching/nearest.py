@@ -17,7 +17,7 @@ from torch import Tensor
 
 from fmtorch.geometry.arithmetic import sqrt, stable_sum
 from fmtorch.jit.kernel import Array, F8x1, I1x2, I4x1, I4x2, I8x1, available, inner, kernel
-from fmtorch.jobs.threads import one_thread
+from fmtorch.jobs.execution import one_thread
 
 # Two nearest neighbours, compiled: products of 8-bit integers leave few candidates, whose distances are exact
 

@@ -11,8 +11,7 @@ from fmtorch.core.lazy import lazy_exports
 if TYPE_CHECKING:
     from fmtorch.metrics.homography import corner_error, right_of_homography
     from fmtorch.metrics.inlier_rate import InlierRate, ground_truth_inliers, inlier_rate
-    from fmtorch.metrics.nsgd import nsgd, sgd
-    from fmtorch.metrics.nsgd_released import nsgd_released
+    from fmtorch.metrics.nsgd import nsgd, nsgd_released, sgd
     from fmtorch.metrics.pose import (
         PoseError,
         closest_pose_error,

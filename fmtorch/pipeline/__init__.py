@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING
 from fmtorch.core.lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from fmtorch.pipeline.build import build_pipeline, load_pipeline
     from fmtorch.pipeline.exporting import match_records
     from fmtorch.pipeline.folder import (
         FolderMatches,
@@ -16,8 +15,8 @@ if TYPE_CHECKING:
         similar_pairs,
         vectors_of,
     )
-    from fmtorch.pipeline.photograph_cameras import PhotographCameras
-    from fmtorch.pipeline.pipeline import Memo, Outcome, Pipeline, examined
+    from fmtorch.pipeline.photographs import PhotographCameras
+    from fmtorch.pipeline.pipeline import Memo, Outcome, Pipeline, build_pipeline, examined, load_pipeline
     from fmtorch.pipeline.two_images import Described, MatchResult, describe, match
 
 __all__ = [

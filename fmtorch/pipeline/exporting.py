@@ -1,7 +1,5 @@
 """What a pipeline made of pairs, kept for export: keypoints of images, matches, F and inliers of pairs."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 
@@ -15,7 +13,7 @@ from fmtorch.data.pairs import ImagePair, ImageSource
 from fmtorch.geometry.cameras import cross_matrix
 from fmtorch.geometry.pose import pose_from_fundamental
 from fmtorch.io.match_store import MatchRecords, PairGeometry, StoredImage, StoredPair, indices
-from fmtorch.pipeline.photograph_cameras import PhotographCamera
+from fmtorch.pipeline.photographs import PhotographCamera
 from fmtorch.pipeline.pipeline import Outcome, Pipeline
 from fmtorch.pipeline.two_images import Described, MatchResult, pair_geometries
 from fmtorch.two_view.pair_type import PairTypes

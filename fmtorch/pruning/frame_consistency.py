@@ -17,7 +17,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from fmtorch.core.records import ungraphed
 from fmtorch.core.types import Correspondences
 from fmtorch.geometry.optimum import gradient_wanted
 from fmtorch.jit.batches import for_each_pair
@@ -135,6 +134,17 @@ def _add_votes(vote: Array, ahead: Array, behind: Array, order: Array, agreement
         votes[order[i]] += all_votes[i]
 
 
+@kernel
+def frame_prior_kernel(matches: FramedMatches, numbers: F4x1, out: F4x1) -> None:
+    """P(inlier) of `FrameConsistency` of n matches -> out (n,). numbers: odds, floor, slope."""
+    odds, floor, slope = numbers[0], numbers[1], numbers[2]
+    frame_agreement_kernel(matches, out)
+    for i in range(len(out)):
+        w, divisor = out[i] + floor, ONE32 + slope * matches.ratio[i]
+        o = odds * w * w * w / (divisor * divisor)
+        out[i] = o / (ONE32 + o) if matches.mask[i] and math.isfinite(matches.ratio[i]) else ONE32 - ONE32
+
+
 def frame_agreement(
     x0: Float[Tensor, "b n 2"],
     x1: Float[Tensor, "b n 2"],
@@ -187,21 +197,23 @@ class FrameConsistency:
     kernels: worth compiling together with those of an estimator.
     """
 
-    kernels: ClassVar = (frame_agreement_kernel,)
+    kernels: ClassVar = (frame_prior_kernel,)
 
     def __init__(self, *, odds: float, floor: float, slope: float) -> None:
         self.odds, self.floor, self.slope = odds, floor, slope
 
     def __call__(self, c: Correspondences) -> Correspondences:
         """The same matches with a prior; zero for one whose ratio is not finite."""
-        if c.lafs0 is None or c.lafs1 is None or c.ambiguity is None:
+        ratio = c.ambiguity
+        if c.lafs0 is None or c.lafs1 is None or ratio is None:
             return c
-        lafs0, lafs1, ratio = c.lafs0, c.lafs1, c.ambiguity
-        return ungraphed(c, lambda: self._with_prior(c, lafs0, lafs1, ratio))
-
-    def _with_prior(self, c: Correspondences, lafs0: Tensor, lafs1: Tensor, ratio: Tensor) -> Correspondences:
-        w = frame_agreement(c.x0, c.x1, lafs0, lafs1, ratio, c.mask).float() + self.floor
-        known = c.mask & torch.isfinite(ratio)
-        ratio = torch.where(known, ratio, 1).float()
-        odds = self.odds * w * w * w / (1 + self.slope * ratio).square()
-        return c.derived(prior=torch.where(known, odds / (1 + odds), 0).to(c.x0.dtype))
+        matches = c.x0, c.x1, c.lafs0, c.lafs1, ratio, c.mask
+        numbers = np.array((self.odds, self.floor, self.slope), np.float32)
+        out = torch.empty(c.mask.shape, dtype=torch.float32)
+        prior = for_each_pair(frame_prior_kernel, matches, numbers, out=out, group=FramedMatches)
+        if gradient_wanted(*matches):
+            w, known = frame_agreement(*matches), c.mask & torch.isfinite(ratio)
+            ratio = torch.where(known, ratio, 1)
+            log_odds = 3 * w / (w + self.floor).detach() - 2 * ratio * (self.slope / (1 + self.slope * ratio)).detach()
+            prior = prior + prior * (1 - prior) * (log_odds - log_odds.detach())  # adds zeros
+        return c.derived(prior=prior.to(c.x0.dtype))

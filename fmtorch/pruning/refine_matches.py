@@ -16,7 +16,7 @@ from fmtorch.core.stages import PairImages
 from fmtorch.core.types import Correspondences
 from fmtorch.geometry.arithmetic import sqrt
 from fmtorch.jit.kernel import Array, B1x1, F8x1, F8x2, F8x3, kernel, matrix, vector
-from fmtorch.jobs.threads import mapped
+from fmtorch.jobs.execution import mapped
 from fmtorch.pruning.neighbors import neighbour_maps
 from fmtorch.pruning.windows import (
     PARAMETERS,

@@ -5,14 +5,13 @@ from typing import TYPE_CHECKING
 from fmtorch.core.lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from fmtorch.scenes.camera import Camera, calibration, fundamental, look_at, relative_pose
-    from fmtorch.scenes.dataset import RenderedPairs, RenderedScenePairs, StereoPair, depth_at
-    from fmtorch.scenes.generate import FAMILIES, PLANS, Plan, Task, build
-    from fmtorch.scenes.textures import PICTURES, photograph, skimage_file
+    from fmtorch.scenes.dataset import FAMILIES, PLANS, Plan, RenderedPairs, StereoPair, Task, build, depth_at
+    from fmtorch.scenes.raycast import Camera, calibration, fundamental, look_at, relative_pose
+    from fmtorch.scenes.surfaces import PICTURES, photograph, skimage_file
 
 __all__ = [
-    "FAMILIES", "PICTURES", "PLANS", "Camera", "Plan", "RenderedPairs", "RenderedScenePairs", "StereoPair", "Task",
-    "build", "calibration", "depth_at", "fundamental", "look_at", "photograph", "relative_pose", "skimage_file",
+    "FAMILIES", "PICTURES", "PLANS", "Camera", "Plan", "RenderedPairs", "StereoPair", "Task", "build", "calibration",
+    "depth_at", "fundamental", "look_at", "photograph", "relative_pose", "skimage_file",
 ]  # fmt: skip
 
 lazy_exports(__name__)

@@ -1,7 +1,5 @@
 """`fmtorch train`: a composed config -> labelled matches, a trained network, its files and its card."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import hashlib
@@ -31,13 +29,11 @@ from fmtorch.data.pairs import subset
 from fmtorch.evaluation.run import select
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.presets import plain
-from fmtorch.presets.executors import execution_of
-from fmtorch.presets.fields import read_fields
+from fmtorch.presets.composition import execution_of, read_fields
 from fmtorch.runs.feature_cache import cached
 from fmtorch.runs.run_folder import identity_digest
 from fmtorch.scenes import RenderedPairs
 from fmtorch.training.augmentation import Augmentation, keep_ratio
-from fmtorch.training.batches import training_batches
 from fmtorch.training.export import Result, write_result
 from fmtorch.training.labelled import LabelledMatches
 from fmtorch.training.loop import PrunerTraining, ValidationPictures, load_best, train
@@ -45,7 +41,7 @@ from fmtorch.training.matched_pairs import MatchedPairs
 from fmtorch.training.objective import Objective
 from fmtorch.training.options import TrainOptions
 from fmtorch.training.planes import Photograph, PlanePairs, list_photographs
-from fmtorch.training.stored_matches import StoredMatches, last_scenes
+from fmtorch.training.stored_matches import StoredMatches, last_scenes, training_batches
 from fmtorch.training.validation import Use, Validation
 
 PICTURES = 4  # validation pairs that are drawn into the log

@@ -18,7 +18,7 @@ from fmtorch.estimators.ransac import Ransac
 from fmtorch.geometry.significance import judged
 from fmtorch.jit import kernel
 from fmtorch.jit.together import compile_together
-from fmtorch.jobs.threads import one_thread
+from fmtorch.jobs.execution import one_thread
 from fmtorch.presets.files import load
 from fmtorch.presets.objects import construct, instantiate, merged
 from fmtorch.pruning.frame_consistency import FrameConsistency

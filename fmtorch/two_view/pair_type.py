@@ -26,7 +26,7 @@ from fmtorch.geometry.pair_type import (
 )
 from fmtorch.jit import kernel
 from fmtorch.jit.together import compile_together
-from fmtorch.jobs.threads import one_thread
+from fmtorch.jobs.execution import one_thread
 from fmtorch.two_view.arguments import expect_values
 from fmtorch.two_view.estimation import estimated, estimator_of
 
@@ -193,6 +193,11 @@ def with_pair_type(estimate: Estimate, c: Correspondences, seed: int, **options:
             poses = poses_from_homography(H.F, c.K0, c.K1, c.x0, c.x1, H.inliers)
             fields |= _other_pose(estimate.R, poses, flat & (kind == PLANAR))
     return estimate.derived(**fields)
+
+
+def warnings_of(estimate: Estimate, pair_type: PairTypes) -> tuple[str, ...]:
+    """What each pair leaves open or contradicts, as `Estimate.warning` has it."""
+    return estimate.derived(pair_type_index=pair_type.kind).warning
 
 
 def _other_pose(R: Float[Tensor, "b 3 3"], poses: PlanePoses, flat: Tensor) -> dict[str, Tensor]:

@@ -14,7 +14,7 @@ from PIL import ExifTags, Image
 import fmtorch
 from fmtorch.commands.match import photographs, pose_line, pose_report
 from fmtorch.data import ImageError, ImagePair, load
-from fmtorch.data.lenses import Lens, undistorted_points
+from fmtorch.data.cameras import Lens, undistorted_points
 from fmtorch.geometry import sampson
 from fmtorch.metrics import nsgd, pose_error
 from fmtorch.pipeline import load_pipeline

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from fmtorch.data import DataError, DepthDataset, ImageError, load, read_image
-from fmtorch.data.colmap_model import read_model
-from fmtorch.data.lenses import Lens
+from fmtorch.data.cameras import Lens
+from fmtorch.data.image_cameras import read_model
 from tests.conftest import shared_path
 from tests.data.native import SIZE, to_binary, write_colmap, write_image
 from tests.helpers import apart

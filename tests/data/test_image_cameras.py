@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from fmtorch.data import DataError, ImageCameras
-from fmtorch.data.lenses import Lens
+from fmtorch.data.cameras import Lens
 from tests.data.native import SIZE, to_binary, write_colmap
 
 

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from fmtorch.data.lenses import MODELS, Lens, undistorted
+from fmtorch.data.cameras import MODELS, Lens, undistorted
 from tests.reference import lenses as reference
 
 SIZE = (120, 160)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from fmtorch.data import DataError
-from fmtorch.data.npz_arrays import NpzArrays
+from fmtorch.data.files import NpzArrays
 
 
 def objects() -> np.ndarray:

@@ -9,17 +9,10 @@ import numpy as np
 import pytest
 
 from fmtorch.data import ImageSource, load
-from fmtorch.data.overlap import (
-    STEP,
-    TOLERANCE,
-    DepthOverlap,
-    Seen,
-    overlap_of,
-    seen_share,
-    shared_points,
-)
-from fmtorch.data.scenes import incidence
-from fmtorch.scenes import Plan, RenderedPairs, RenderedScenePairs
+from fmtorch.data.cameras import STEP, TOLERANCE
+from fmtorch.data.construction import DepthOverlap, Seen, overlap_of, seen_share, shared_points
+from fmtorch.data.scenes import DepthScenePairs, incidence
+from fmtorch.scenes import Plan, RenderedPairs
 from tests.data.native import write_colmap, write_kitti
 from tests.reference import overlap as reference
 
@@ -27,14 +20,14 @@ PLAN = Plan(scenes=1, shots=4, pairs=4, scale=0.15)
 
 
 @pytest.fixture(scope="module")
-def rendered(tmp_path_factory: pytest.TempPathFactory) -> RenderedScenePairs:
+def rendered(tmp_path_factory: pytest.TempPathFactory) -> DepthScenePairs:
     """All pairs of four photographs each of two families; cameras of the collection have other sizes."""
     root = tmp_path_factory.mktemp("rendered")
     families = ["indoor", "collection"]
     return RenderedPairs(families=families, root=root, plan=PLAN, workers=1).scene_pairs()
 
 
-def one_by_one(dataset: RenderedScenePairs, scene: int, i: int, j: int) -> float:
+def one_by_one(dataset: DepthScenePairs, scene: int, i: int, j: int) -> float:
     """The overlap of a pair by the reference."""
     a, b = (dataset.scenes[scene].views[k] for k in (i, j))
 
@@ -60,7 +53,7 @@ def one_by_one(dataset: RenderedScenePairs, scene: int, i: int, j: int) -> float
     return min(shares)
 
 
-def test_overlap_of_rendered_pairs_is_that_counted_pixel_by_pixel(rendered: RenderedScenePairs) -> None:
+def test_overlap_of_rendered_pairs_is_that_counted_pixel_by_pixel(rendered: DepthScenePairs) -> None:
     overlaps = overlap_of(rendered)
     assert isinstance(overlaps, DepthOverlap)
     places = [rendered.candidate(rank) for rank in range(rendered.candidates)]

@@ -189,7 +189,7 @@ def test_a_scheduler_that_is_lost(cluster: Cluster, pairs: list[ImagePair], expe
 
 def test_an_address_that_nobody_answers(pairs: list[ImagePair], monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("distributed", reason="dask.distributed is not installed")
-    monkeypatch.setattr("fmtorch.jobs.pool.SECONDS_TO_CONNECT", 1.0)
+    monkeypatch.setattr("fmtorch.jobs.runner.SECONDS_TO_CONNECT", 1.0)
     with pytest.raises(ValueError, match=r"executor\.address=tcp://127\.0\.0\.1:9: no scheduler answers"):
         evaluated(pairs, Execution("dask", address="tcp://127.0.0.1:9"))
 

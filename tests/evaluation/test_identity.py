@@ -121,7 +121,7 @@ def test_code_of_a_users_own_stage_is_part_of_it(group: str, monkeypatch: pytest
     changed = {group: {"mine": own} if group == "pruner" else own}
     first = identity(pipeline=parts, **changed)
     assert list(first["code"]) == [f"{__name__}.Learned"]  # type: ignore[call-overload]
-    monkeypatch.setattr("fmtorch.evaluation.identity.code_digest", lambda module: f"edited {module}")
+    monkeypatch.setattr("fmtorch.evaluation.run.code_digest", lambda module: f"edited {module}")
     second = identity(pipeline=parts, **changed)
     assert second["code"] == {f"{__name__}.Learned": f"edited {__name__}"}
     assert identity_digest(first) != identity_digest(second)

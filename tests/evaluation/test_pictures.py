@@ -9,14 +9,14 @@ from fmtorch.evaluation.pictures import (
     BAD,
     COLOURS,
     GOOD,
-    HEIGHT,
-    WIDTH,
     Place,
     draw_epipolar_lines,
     draw_epipolar_lines_of_corners,
     draw_matches,
     spread,
 )
+from fmtorch.geometry.eight_point import WIDTH
+from fmtorch.scenes.videos import HEIGHT
 
 ROWS = np.array([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # a sideways camera: epipolar lines are rows
 NONE = np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, bool)

@@ -41,7 +41,7 @@ def test_a_process_that_ends_is_told() -> None:
 
 WORKER = """
 import multiprocessing, time
-from fmtorch.jobs.pool import end_with_parent
+from fmtorch.jobs.runner import end_with_parent
 def work():
     end_with_parent()
     print(multiprocessing.current_process().pid, flush=True)

@@ -16,7 +16,7 @@ from PIL import ExifTags, Image
 import fmtorch
 from fmtorch.commands import match as match_command
 from fmtorch.data import load, read_image
-from fmtorch.data.lenses import Lens
+from fmtorch.data.cameras import Lens
 from fmtorch.io import DATABASE, MATCHES
 from fmtorch.metrics import pose_error
 from tests.commands.test_match_cameras import BENT, photographed

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fmtorch.evaluation.view_graph_picture import MAX_THUMBNAILS, spectral_order, view_graph_svg
+from fmtorch.evaluation.curves import MAX_THUMBNAILS, spectral_order, view_graph_svg
 from fmtorch.io import Edge, MatchStore, StoredPair, ViewGraph, view_graph, write_view_graph
 
 SVG = "{http://www.w3.org/2000/svg}"

@@ -162,7 +162,7 @@ def test_a_job_that_needs_the_result_of_another_waits_for_it() -> None:
 
 SCRIPT = """
 from fmtorch.jobs.execution import Execution
-from fmtorch.jobs.pool import WorkerPool
+from fmtorch.jobs.runner import WorkerPool
 with WorkerPool(Execution("processes", 2), needs_main=False) as pool:
     print(sorted(pool.executor.map(abs, range(-4, 0))))
 """

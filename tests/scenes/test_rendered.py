@@ -12,10 +12,10 @@ import pytest
 
 from fmtorch.data.construction import Keypoints
 from fmtorch.scenes import FAMILIES, PICTURES, PLANS, Plan, RenderedPairs, Task, build
-from fmtorch.scenes import generate as generation
-from fmtorch.scenes.generate import generate, read, recorded_pairs, seeds
-from fmtorch.scenes.scene import Scene
-from fmtorch.scenes.textures import MATERIALS
+from fmtorch.scenes import dataset as generation
+from fmtorch.scenes.dataset import generate, read, recorded_pairs, seeds
+from fmtorch.scenes.light import DrawnScene
+from fmtorch.scenes.surfaces import MATERIALS
 from tests.helpers import cross_matrix, in_threads
 
 TINY = Plan(scenes=1, shots=3, pairs=2, scale=0.25)
@@ -37,7 +37,7 @@ def tiny(root: Path) -> RenderedPairs:
 
 
 @functools.cache
-def built(family: str, split: str, number: int = 0) -> Scene:
+def built(family: str, split: str, number: int = 0) -> DrawnScene:
     """A scene at full scale, not drawn."""
     return build(Task(family, split, number, 0, Plan(1, 6, 1)))
 

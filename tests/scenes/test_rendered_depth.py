@@ -8,8 +8,7 @@ import pytest
 from fmtorch import scenes
 from fmtorch.data import DepthDataset, load
 from fmtorch.scenes import Camera, Plan, RenderedPairs, Task, build, calibration, depth_at, look_at
-from fmtorch.scenes.light import Lens, Light
-from fmtorch.scenes.scene import Scene, Shot
+from fmtorch.scenes.light import DrawnScene, Lens, Light, Shot
 from fmtorch.scenes.surfaces import Surfaces, vec
 from tests.reference.labels import first_hit
 
@@ -35,7 +34,7 @@ def staged(monkeypatch: pytest.MonkeyPatch) -> tuple[Task, Camera]:
     shots = [Shot(camera, Lens(), light=k) for k in range(2)]
     light = Light((0.0, 0.0, 1.0))
     sky = np.zeros((8, 8, 3), np.uint8)
-    scene = Scene([wall_and_screen(False), wall_and_screen(True)], [light] * 2, sky, shots, [(0, 1)])
+    scene = DrawnScene([wall_and_screen(False), wall_and_screen(True)], [light] * 2, sky, shots, [(0, 1)])
     recent = scenes.dataset._Recent()
     recent.scene = lambda task: scene  # type: ignore[assignment]
     monkeypatch.setattr("fmtorch.scenes.dataset._recent", recent)

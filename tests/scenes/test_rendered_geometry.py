@@ -6,8 +6,7 @@ import pytest
 from fmtorch.scenes import FAMILIES, Camera, Plan, Task, build, calibration, fundamental, look_at, relative_pose
 from fmtorch.scenes.light import Light, Stage
 from fmtorch.scenes.raycast import Geometry
-from fmtorch.scenes.surfaces import Surfaces, vec
-from fmtorch.scenes.textures import Texture
+from fmtorch.scenes.surfaces import Surfaces, Texture, vec
 from tests.reference.rendering import colour
 
 SIZE = (120, 160)

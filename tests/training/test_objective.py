@@ -13,7 +13,7 @@ from torch import Tensor
 from fmtorch.core import Correspondences
 from fmtorch.geometry import eight_point, fundamental_from_calibration, irls, refine, reweighted_fits
 from fmtorch.jit.random import Stream, uniform
-from fmtorch.pruning.networks import LC
+from fmtorch.pruning import LC
 from fmtorch.pruning.networks.learned import Prediction, predict
 from fmtorch.training import (
     LabelledMatches,

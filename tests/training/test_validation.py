@@ -10,7 +10,7 @@ from torch import nn
 
 from fmtorch import presets
 from fmtorch.core import Correspondences
-from fmtorch.pruning.networks import LC
+from fmtorch.pruning import LC
 from fmtorch.training import Use, Validation, reliability, temperature
 from tests.reference import pruner_losses as reference
 from tests.training.conftest import labelled_pair

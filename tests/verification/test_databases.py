@@ -15,7 +15,7 @@ import pytest
 
 import fmtorch
 from fmtorch.core import pair_key
-from fmtorch.data.lenses import MODELS
+from fmtorch.data.cameras import MODELS
 from fmtorch.io.colmap import EXIF_DEVIATION, MatchDatabase, database_image
 from tests.processes import run_command, starter
 from tests.verification import databases
@@ -222,6 +222,9 @@ def test_a_copy_leaves_the_database_as_it_is(tmp_path: Path) -> None:
     assert (result.path, result.verified) == (copy, 3)
     assert digest(path) == before
     assert len(read(copy)) == 3
+    assert fmtorch.verify(path, output=copy).kept == 3
+    with pycolmap.Database.open(copy) as database:
+        database.delete_two_view_geometry(1, 2)
     with pytest.raises(ValueError, match=re.escape(f"output={copy} exists; name another file, or replace it")):
         fmtorch.verify(path, output=copy)
     with pytest.raises(ValueError, match="is the database itself"):
@@ -415,3 +418,27 @@ def test_without_pycolmap_an_extra_is_named(tmp_path: Path) -> None:
     code = "import sys; sys.modules['pycolmap'] = None; sys.argv[1:] = ['verify', 'database.db']; import runpy; "
     done = run_command("-c", code + "runpy.run_module('fmtorch', run_name='__main__')", cwd=tmp_path)
     assert done.stderr == "error: pycolmap is not installed; pip install 'fmtorch[colmap]' brings it\n"
+
+
+@pytest.mark.parametrize("focal", [10.0, 0.0, -600.0, np.inf])
+def test_an_absurd_focal_length_counts_as_unknown(focal: float, tmp_path: Path) -> None:
+    path, cameras = tmp_path / "database.db", scene(2, count=400)
+    write(path, cameras, "SIMPLE_PINHOLE", noise=0.1)
+    with pycolmap.Database.open(path) as database:
+        camera = database.read_camera(1)
+        camera.params = [focal, 320, 240]
+        database.update_camera(camera)
+    result = fmtorch.verify(path)
+    assert (result.configurations, result.problems) == ({"uncalibrated": 1}, ())
+    assert f"a focal length of {focal:g} px for 640 x 480 pixels counts as unknown" in result.warnings[0]
+    (geometry,) = read(path).values()
+    assert angle(cameras.relative(0, 1)[0].T @ geometry.cam2_from_cam1.rotation.matrix()) < 1
+
+
+def test_a_crop_of_a_database_is_calibrated(tmp_path: Path) -> None:
+    path, cameras = tmp_path / "database.db", scene(2, count=400)
+    cameras.X[:, 0] += 4
+    write(path, cameras, "PINHOLE", params=[600, 600, -20, 240])
+    assert fmtorch.verify(path).configurations == {"calibrated": 1}
+    (geometry,) = read(path).values()
+    assert angle(cameras.relative(0, 1)[0].T @ geometry.cam2_from_cam1.rotation.matrix()) < 0.5
