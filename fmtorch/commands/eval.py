@@ -24,10 +24,8 @@ from fmtorch.io.match_store import MatchStore
 from fmtorch.jobs.execution import MIN_PAIRS_FOR_PROCESSES, Execution, shard_of
 from fmtorch.pipeline.exporting import exportable
 from fmtorch.pipeline.pipeline import Pipeline, build_pipeline
-from fmtorch.presets import plain
-from fmtorch.presets.composition import execution_of, read_fields
-from fmtorch.runs import RunFolder, identity_digest
-from fmtorch.runs.feature_cache import CachedFeatures
+from fmtorch.presets.composition import execution_of, plain, read_fields
+from fmtorch.runs import CachedFeatures, RunFolder, identity_digest
 
 
 def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -> Path:

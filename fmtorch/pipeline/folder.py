@@ -17,9 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from fmtorch.core.settings import claim
-from fmtorch.data.files import DataError
-from fmtorch.data.images import read_image
-from fmtorch.data.pairs import ImageSource
+from fmtorch.data import DataError, ImageSource, read_image
 from fmtorch.io.match_store import MatchStore, StoredPair
 from fmtorch.jobs.execution import Execution, available, one_thread
 from fmtorch.jobs.runner import SHARED_BY, Factory, Local, Source, TaskRunner, WorkerPool, in_order

@@ -13,8 +13,8 @@ from PIL import ExifTags, Image
 
 import fmtorch
 from fmtorch.commands.match import photographs, pose_line, pose_report
-from fmtorch.data import ImageError, ImagePair, load
-from fmtorch.data.cameras import Lens, undistorted_points
+from fmtorch.data import ImageError, ImagePair, Lens, load
+from fmtorch.data.cameras import undistorted_points
 from fmtorch.geometry import sampson
 from fmtorch.metrics import nsgd, pose_error
 from fmtorch.pipeline import load_pipeline

@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fmtorch.data import DataError, DepthDataset, ImageError, load, read_image
-from fmtorch.data.cameras import Lens
+from fmtorch.data import DataError, DepthDataset, ImageError, Lens, load, read_image
 from fmtorch.data.image_cameras import read_model
 from tests.conftest import shared_path
 from tests.data.native import SIZE, to_binary, write_colmap, write_image

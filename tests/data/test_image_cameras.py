@@ -5,8 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from fmtorch.data import DataError, ImageCameras
-from fmtorch.data.cameras import Lens
+from fmtorch.data import DataError, ImageCameras, Lens
 from tests.data.native import SIZE, to_binary, write_colmap
 
 

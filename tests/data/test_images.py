@@ -9,8 +9,8 @@ import pytest
 import tifffile
 from PIL import Image, ImageOps
 
-from fmtorch.data import ImageError, ImageSource, read_image, to_grey
-from fmtorch.data.images import stored_orientation, stored_size
+from fmtorch.data import ImageError, ImageSource, read_image, stored_size, to_grey
+from fmtorch.data.images import stored_orientation
 
 COLOUR = np.random.default_rng(0).integers(0, 256, (37, 53, 3), dtype=np.uint8)
 

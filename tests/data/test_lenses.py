@@ -4,7 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from fmtorch.data.cameras import MODELS, Lens, undistorted
+from fmtorch.data import Lens
+from fmtorch.data.cameras import MODELS, undistorted
 from tests.reference import lenses as reference
 
 SIZE = (120, 160)

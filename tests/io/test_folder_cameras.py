@@ -15,8 +15,7 @@ from PIL import ExifTags, Image
 
 import fmtorch
 from fmtorch.commands import match as match_command
-from fmtorch.data import load, read_image
-from fmtorch.data.cameras import Lens
+from fmtorch.data import Lens, load, read_image
 from fmtorch.io import DATABASE, MATCHES
 from fmtorch.metrics import pose_error
 from tests.commands.test_match_cameras import BENT, photographed

@@ -11,7 +11,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from fmtorch.core import pair_key
-from fmtorch.runs import PAIR_SCHEMA, PairRow, RunFolder, RunFolderError, identity_digest, replacing
+from fmtorch.core.files import replacing
+from fmtorch.runs import PAIR_SCHEMA, PairRow, RunFolder, RunFolderError, identity_digest
 from fmtorch.runs.run_folder import content_digest
 
 CONFIG = {

@@ -9,8 +9,8 @@ import torch
 from PIL import Image
 
 from fmtorch.scenes import Camera, Plan, Task, calibration, fundamental, look_at, photograph
-from fmtorch.training import Photograph, PlaneViews
-from fmtorch.training.planes import list_photographs
+from fmtorch.training.options import PlaneViews
+from fmtorch.training.planes import Photograph, list_photographs
 from scripts.patch_networks.patches import (
     Tolerance,
     View,

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from fmtorch.core import conf_dir
 from fmtorch.features.networks import AffNet, GeoDesc, HardNet, build
 from fmtorch.scenes import photograph
-from fmtorch.training import PlaneViews
+from fmtorch.training.options import PlaneViews
 from scripts.patch_networks.objectives import (
     DescriptorObjective,
     ShapeObjective,

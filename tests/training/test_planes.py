@@ -8,8 +8,9 @@ import pytest
 
 from fmtorch.data import DepthDataset, ImageError, ImagePair
 from fmtorch.scenes import Camera, skimage_file
-from fmtorch.training import MatchedPairs, Photograph, PlanePairs, PlaneViews
-from fmtorch.training.planes import plane_homography, random_camera
+from fmtorch.training import MatchedPairs
+from fmtorch.training.options import PlaneViews
+from fmtorch.training.planes import Photograph, PlanePairs, plane_homography, random_camera
 from tests.training.conftest import SIFT
 
 SIZE = (300, 400)
