@@ -9,10 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from fmtorch.data.files import DataError, given_root
-from fmtorch.data.fmbench import FMBenchPairs
-from fmtorch.data.images import stored_size
-from fmtorch.data.pairs import GivenMatches, ImagePair, ImageSource, PairDataset
+from fmtorch.data import DataError, FMBenchPairs, GivenMatches, ImagePair, ImageSource, PairDataset, stored_size
+from fmtorch.data.files import given_root
 from fmtorch.io import h5, predictions
 from fmtorch.io.predictions import Array, Size
 

@@ -10,9 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from fmtorch.core.types import Correspondences
-from fmtorch.data.files import DataError
-from fmtorch.data.images import stored_size
-from fmtorch.data.pairs import GivenMatches, ImagePair, ImageSource, PairDataset
+from fmtorch.data import DataError, GivenMatches, ImagePair, ImageSource, PairDataset, stored_size
 from fmtorch.geometry.cameras import fundamental_from_projections
 from fmtorch.io import h5
 

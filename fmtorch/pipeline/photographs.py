@@ -14,10 +14,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from fmtorch.core.types import Correspondences
-from fmtorch.data.cameras import Lens, undistorted_frames, undistorted_points
-from fmtorch.data.image_cameras import ImageCameras, exif_focal
-from fmtorch.data.images import read_image
-from fmtorch.data.pairs import ImageSource
+from fmtorch.data import ImageCameras, ImageSource, Lens, exif_focal, read_image
+from fmtorch.data.cameras import undistorted_frames, undistorted_points
 from fmtorch.geometry.cameras import calibration_problems
 from fmtorch.geometry.epipolar import unit_frobenius
 from fmtorch.io.match_store import PairGeometry

@@ -18,8 +18,7 @@ from fmtorch.core.grey_pyramid import GreyPyramid, grey_pyramid
 from fmtorch.core.no_features import NoFeatures
 from fmtorch.core.stages import ImageMatcher, PairImages, output_of, pruned
 from fmtorch.core.types import RELATED, Correspondences, Estimate, Features
-from fmtorch.data.cameras import Lens
-from fmtorch.data.images import to_grey
+from fmtorch.data import Lens, to_grey
 from fmtorch.geometry.pair_type import GENERAL, IDENTICAL, PLANAR, ROTATION
 from fmtorch.io.match_store import Kind, PairGeometry
 from fmtorch.jobs.execution import mapped, one_thread

@@ -17,9 +17,8 @@ from fmtorch.data.pairs import DepthDataset, ImagePair, PairDataset
 from fmtorch.jobs.execution import Execution, use_one_thread
 from fmtorch.jobs.runner import Factory, Local, Source, TaskRunner, WorkerPool
 from fmtorch.pipeline.pipeline import Outcome, Pipeline, load_pipeline
-from fmtorch.runs.feature_cache import CachedFeatures
+from fmtorch.runs import CachedFeatures, identity_digest
 from fmtorch.runs.fingerprint import configuration, environment
-from fmtorch.runs.run_folder import identity_digest
 from fmtorch.training import labelled
 from fmtorch.training.augmentation import Augmentation
 from fmtorch.training.stored_matches import FORMAT, Shard, ShardError, StoredMatches, write_shard

@@ -20,9 +20,8 @@ from numpy.typing import NDArray
 from torch.utils.data import Dataset
 
 from fmtorch.core.files import cache_dir, replacing
+from fmtorch.data import ImagePair, ImageSource, read_image
 from fmtorch.data.cameras import relative_pose
-from fmtorch.data.images import read_image
-from fmtorch.data.pairs import ImagePair, ImageSource
 from fmtorch.scenes.raycast import Camera, calibration
 from fmtorch.training.options import PlaneViews as PlaneViews
 

@@ -10,8 +10,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from fmtorch.core.files import replacing
 from fmtorch.core.types import pair_key
-from fmtorch.runs import PAIR_SCHEMA, PairRow, RunFolder, RunFolderError, identity_digest, replacing, to_table
+from fmtorch.runs import PAIR_SCHEMA, PairRow, RunFolder, RunFolderError, identity_digest, to_table
 from fmtorch.runs.run_folder import content_digest
 
 CONFIG = {
@@ -101,7 +102,7 @@ def test_open_refuses_another_identity_and_says_what_differs(tmp_path: Path) -> 
         "pipeline.estimator.threshold: 0.5 -> 1.5",
         'pipeline.estimator.method: (absent) -> "x"',
         "pipeline.estimator.samples: 2000 -> (absent)",
-        "run_dir",
+        "output",
         "delete",
     ):
         assert part in message
