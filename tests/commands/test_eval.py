@@ -49,7 +49,7 @@ def own(folder: Path, group: str, text: str, name: str = "mine") -> list[str]:
 
 
 def test_a_run_from_start_to_end(data: list[str], command: Command, tmp_path: Path) -> None:
-    words, run_dir = [*data, "run_dir=run", "batch=2"], tmp_path / "run"
+    words, run_dir = [*data, "output=run", "batch=2"], tmp_path / "run"
     first = command("eval", *words, "limit=2", cwd=tmp_path)
     assert len(rows(run_dir)) == 2
     parts = {part: part.stat().st_mtime_ns for part in (run_dir / "pairs").glob("*.parquet")}
@@ -83,11 +83,11 @@ def test_a_run_from_start_to_end(data: list[str], command: Command, tmp_path: Pa
 
 
 def test_shards_are_one_run(data: list[str], command: Command, tmp_path: Path) -> None:
-    command("eval", *data, "run_dir=whole", cwd=tmp_path)
+    command("eval", *data, "output=whole", cwd=tmp_path)
     assert "2 of 5 pairs have rows; other shards have the rest" in command(
-        "eval", *data, "run_dir=run", "shard=1/2", cwd=tmp_path
+        "eval", *data, "output=run", "shard=1/2", cwd=tmp_path
     )
-    assert "other shards" not in command("eval", *data, "run_dir=run", "shard=2/2", cwd=tmp_path)
+    assert "other shards" not in command("eval", *data, "output=run", "shard=2/2", cwd=tmp_path)
     unsharded, merged = (json.loads((tmp_path / name / "summary.json").read_text()) for name in ("whole", "run"))
     for group in (*unsharded.values(), *merged.values()):
         del group["seconds"]
@@ -96,7 +96,7 @@ def test_shards_are_one_run(data: list[str], command: Command, tmp_path: Path) -
 
 def test_an_executor_of_ones_own_by_config_dir(data: list[str], command: Command, tmp_path: Path) -> None:
     words = own(tmp_path, "executor", "_target_: concurrent.futures.ThreadPoolExecutor\nmax_workers: 2\n")
-    command("eval", *words, *data, "executor=mine", "run_dir=run", cwd=tmp_path)
+    command("eval", *words, *data, "executor=mine", "output=run", cwd=tmp_path)
     assert len(rows(tmp_path / "run")) == 5
     wrong = command("eval", *words, *data, "executor=mine", "executor.max_workers=two", cwd=tmp_path)
     assert "ended: error: executor: it cannot be made (TypeError: " in wrong
@@ -115,7 +115,7 @@ def test_a_users_own_pruner_by_config_dir(header: str, data: list[str], command:
     (tmp_path / "own_pruner.py").write_text(OWN_PRUNER)
     sys.modules.pop("own_pruner", None)
     pruners = ["pruner=[one_to_one,mine,likely]", "pruner.mine.prior=true"]
-    command("eval", *words, *pruners, *data, "run_dir=run", "limit=2", cwd=tmp_path)
+    command("eval", *words, *pruners, *data, "output=run", "limit=2", cwd=tmp_path)
     config = json.loads((tmp_path / "run" / "run.json").read_text())["config"]
     assert [list(entry) for entry in config["pruner"]] == [["one_to_one"], ["mine"], ["likely"]]
     assert config["pruner"][1]["mine"]["prior"] is True
@@ -142,7 +142,7 @@ def test_what_cannot_be_run_is_told(
     own(tmp_path, "pruner", "threshold: 0.5\n", "empty")
     own(tmp_path, "pruner", "# @package _global_\npruner: {_target_: fmtorch.pruning.OneToOne}\n", "elsewhere")
     folder = own(tmp_path, "pruner", "_target_: fmtorch.pruning.RatioTest\nthreshhold: 0.5\n", "typo")
-    end = command("eval", *folder, *data, "run_dir=run", "limit=1", *words.split(), cwd=tmp_path)
+    end = command("eval", *folder, *data, "output=run", "limit=1", *words.split(), cwd=tmp_path)
     assert "ended: error: " in end
     assert message in end
     assert not (tmp_path / "run").exists()
@@ -151,5 +151,5 @@ def test_what_cannot_be_run_is_told(
 def test_a_run_in_which_nothing_succeeds_is_told(data: list[str], command: Command, tmp_path: Path) -> None:
     for image in (tmp_path / "Set" / "scene" / "Images").iterdir():
         image.write_bytes(b"no picture")
-    assert "every pair failed" in command("eval", *data, "run_dir=run", cwd=tmp_path)
+    assert "every pair failed" in command("eval", *data, "output=run", cwd=tmp_path)
     assert len(rows(tmp_path / "run")) == 5

@@ -19,7 +19,7 @@ from tests.helpers import call_command
 
 def run(folder: Path, name: str, *words: str) -> None:
     """An evaluation of the set in a folder."""
-    fixed = ("dataset=hpatches", "dataset.root=hpatches", "dataset.short_side=200", "cache=off", f"run_dir={name}")
+    fixed = ("dataset=hpatches", "dataset.root=hpatches", "dataset.short_side=200", "cache=off", f"output={name}")
     with pytest.MonkeyPatch.context() as patch:
         call_command(patch, folder, "eval", "pipeline=sift_ratio", "estimator=homography", *fixed, *words)
 

@@ -86,7 +86,7 @@ def test_a_run_with_cameras_is_another_run(command: Callable[..., str], tmp_path
     words += ["limit=2", "workers=1"]
 
     def run(name: str, *more: str) -> tuple[str, dict[str, Any], dict[str, Any]]:
-        said = command(*words, *more, f"run_dir={name}", cwd=tmp_path)
+        said = command(*words, *more, f"output={name}", cwd=tmp_path)
         run, summary = (json.loads((tmp_path / name / f"{file}.json").read_text()) for file in ("run", "summary"))
         return said, run["config"], summary["all"]["pose"]
 
@@ -101,5 +101,5 @@ def test_a_run_with_cameras_is_another_run(command: Callable[..., str], tmp_path
         assert "t error, signed" in text
         assert "whose sign counts" in " ".join(text.split())
     assert "ended: error: pose.signed=2; it must be true or false" in command(*words, "pose.signed=2", cwd=tmp_path)
-    assert "holds another run" in command(*words, "cameras=shared", "run_dir=known", cwd=tmp_path)
+    assert "holds another run" in command(*words, "cameras=shared", "output=known", cwd=tmp_path)
     assert "ended: error: cameras=some" in command(*words, "cameras=some", cwd=tmp_path)

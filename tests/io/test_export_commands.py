@@ -166,7 +166,7 @@ def test_an_evaluation_and_its_way_back(tmp_path: Path, monkeypatch: pytest.Monk
         path.write_text(f"{path.read_text()}{line}\n")
 
     def run(run_dir: str, *words: str) -> tuple[Path, dict[str, list[Any]]]:
-        call_command(monkeypatch, tmp_path, "eval", "pipeline=sift_ratio", *OPTIONS, f"run_dir={run_dir}", *words)
+        call_command(monkeypatch, tmp_path, "eval", "pipeline=sift_ratio", *OPTIONS, f"output={run_dir}", *words)
         path = tmp_path / run_dir
         return path, RunFolder.load(path).read().sort_by("pair").to_pydict()
 
