@@ -7,7 +7,7 @@ import hashlib
 import json
 import math
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from fmtorch import presets
 from fmtorch.commands.config import chosen_pipeline, job, run_command
 from fmtorch.commands.options import MATCH, MatchOptions
 from fmtorch.core.files import expect_writable, replacing
-from fmtorch.core.settings import head
+from fmtorch.core.settings import canonical, head
 from fmtorch.core.stages import ImageMatcher
 from fmtorch.core.terminal import console, errors, progress_bars
 from fmtorch.core.types import RELATED
@@ -245,20 +245,24 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
         )
     if fields.export is not None or str(fields.pairs or EXHAUSTIVE) != EXHAUSTIVE:
         raise ValueError("export and pairs are of a folder of images: give images=FOLDER")
-    paths = [_given(fields.image0, "image0"), _given(fields.image1, "image1")]
+    paths = _given(fields.image0, fields.image1)
     presets.expect_stages(config)
     truth = None if fields.truth is None else read_matrix(fields.truth)
     given = photographs(paths, fields.cameras, fields.K, fields.orient)
     image0, image1 = given.images
-    folder = fields.output or _default_output(paths)
+    settings = {
+        "pipeline": pipeline_name, "overrides": list(overrides), "seed": fields.seed, "orient": fields.orient,
+        "longest_side": fields.longest_side, "truth": None if fields.truth is None else str(fields.truth),
+        "cameras": PhotographCameras(fields.cameras, fields.K).identity.get("cameras"),
+    }  # fmt: skip
+    folder = fields.output or _default_output(paths, settings)
     expect_writable(folder)
     pipeline: Pipeline = build_pipeline(config, presets.resolve_device(fields.device))
     result = match(
         image0, image1, pipeline=pipeline, longest_side=fields.longest_side, seed=fields.seed, **given.knowledge
     )
     report = {
-        "version": __version__, "pipeline": pipeline_name, "overrides": list(overrides), "seed": fields.seed,
-        "image0": str(paths[0]), "image1": str(paths[1]),
+        "version": __version__, **settings, "image0": str(paths[0]), "image1": str(paths[1]),
         **_report(result, image0, image1, truth), **pose_report(result),
     }  # fmt: skip
     with replacing(folder / "result.json") as path:
@@ -268,6 +272,8 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
     console.print(heading, style="italic", markup=False, highlight=False)
     extractor = pipeline.extractor
     console.print(_table(result, isinstance(extractor, CachedFeatures) and not extractor.computed))
+    if result.related:
+        console.print(_verdict(result), style="bold", highlight=False, soft_wrap=True)
     if "nsgd" in report:
         console.print(f"NSGD to the true F: {report['nsgd']:.4f}", highlight=False)
     if line := pose_line(result):
@@ -299,19 +305,28 @@ def read_matrix(path: Path) -> NDArray[np.float64]:
     return F
 
 
-def _given(path: Path | None, name: str) -> Path:
-    if path is None:
-        raise ValueError(f"{name} is missing; give two image files: fmtorch match a.jpg b.jpg")
-    return path
+def _given(*images: Path | None) -> list[Path]:
+    """The two photographs. Raises ValueError where one is missing, or a folder stands for it."""
+    for path in filter(None, images):
+        if path.is_dir():
+            raise ValueError(f"{path} is a folder; fmtorch match images={path} matches its images with one another")
+    paths = []
+    for name, image in zip(("image0", "image1"), images, strict=True):
+        if image is None:
+            raise ValueError(f"{name} is missing; give two image files: fmtorch match a.jpg b.jpg")
+        paths.append(image)
+    return paths
 
 
-def _default_output(paths: Sequence[Path]) -> Path:
-    """``matches/NAME0-NAME1``, with some digits behind where that holds what was found of others of these names."""
+def _default_output(paths: Sequence[Path], settings: Mapping[str, Any]) -> Path:
+    """``matches/NAME0-NAME1``, with some digits behind where that holds other images of these names or settings."""
     folder = Path(f"matches/{paths[0].stem}-{paths[1].stem}")
     with contextlib.suppress(OSError, ValueError, KeyError):
         earlier = json.loads((folder / "result.json").read_text())
-        if [Path(earlier[name]).absolute() for name in ("image0", "image1")] != [path.absolute() for path in paths]:
-            identity = "\0".join(str(path.absolute()) for path in paths)
+        images = [str(path.absolute()) for path in paths]
+        same = [str(Path(earlier[name]).absolute()) for name in ("image0", "image1")] == images
+        if not same or any(earlier.get(name) != value for name, value in settings.items()):
+            identity = canonical({"images": images, **settings})
             return folder.with_name(f"{folder.name}-{hashlib.blake2b(identity.encode(), digest_size=4).hexdigest()}")
     return folder
 
@@ -369,6 +384,13 @@ def _draw(folder: Path, result: MatchResult, given: Photographs, truth: NDArray[
     for name in {"pruning.png", "epipolar.png"} - pictures.keys():  # of an earlier run
         (folder / name).unlink(missing_ok=True)
     return list(pictures)
+
+
+def _verdict(result: MatchResult) -> str:
+    """What is said of photographs that are related."""
+    inliers, matches = int(result.inliers.sum()), result.correspondences.mask.shape[1]
+    support = f"related: {inliers:,} of {matches:,} matches are inliers of F"
+    return f"{support}, significance {result.significance:.0f}, pair type {result.pair_type}"
 
 
 def _troubles(result: MatchResult) -> list[str]:

@@ -23,7 +23,7 @@ from fmtorch.presets.composition import execution_of, plain, read_fields
 from fmtorch.scenes import RenderedPairs
 
 MIN_CANDIDATES_FOR_PROCESSES = 4 * BLOCK + 1  # below which processes are not worth their start
-PRELOADED = ("fmtorch.data.construction",)  # by the process that workers are forked of
+PRELOADED = (Construction.__module__,)  # by the process that workers are forked of
 
 
 def run(config: DictConfig) -> Path:

@@ -151,7 +151,7 @@ def differing_pairs(runs: Mapping[str, pa.Table], count: int) -> list[str]:
 
 
 def _resource(name: str) -> str:
-    return resources.files("fmtorch.evaluation").joinpath(name).read_text(encoding="utf-8")
+    return resources.files(__package__).joinpath(name).read_text(encoding="utf-8")
 
 
 def _context(section: Section, names: Sequence[str]) -> dict[str, Any]:

@@ -311,7 +311,7 @@ def batch_contents(pairs: list[ImagePair]) -> list[ImagePair]:
 
 
 BATCHES_OF_A_WORKER = 4  # at least, where there are pairs enough
-PRELOADED = ("fmtorch.evaluation.run",)  # by the process that workers are forked of
+PRELOADED = (__name__,)  # by the process that workers are forked of
 
 
 def select(pairs: Sequence[ImagePair], limit: int | None) -> list[ImagePair]:

@@ -179,7 +179,7 @@ def similar_pairs(images: Sequence[Path], vectors: Float[Tensor, "n d"], count: 
 MEMORY = 64  # images whose features are kept for pairs to come
 AHEAD = 4  # pairs a worker whose images are described before the first of them is matched
 MAX_WORKERS = 8  # by default: each holds an image and its scale space
-PRELOADED = ("fmtorch.pipeline.folder",)  # by the process that workers are forked of
+PRELOADED = (__name__,)  # by the process that workers are forked of
 
 
 class Photograph(NamedTuple):

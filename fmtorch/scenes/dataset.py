@@ -144,7 +144,7 @@ def generate_all(
     if count > 1:
         compile_together(KERNELS)  # once, rather than in each of them
     execution = Execution("processes" if count > 1 else "threads", max(count, 1))
-    with WorkerPool(execution, ("fmtorch.scenes.dataset",), needs_main=False) as pool:
+    with WorkerPool(execution, (__name__,), needs_main=False) as pool:
         for _ in TaskRunner(pool, Local(None), _generated, lambda scene, path: None).each(missing):
             done += 1
             report(done, len(scenes))

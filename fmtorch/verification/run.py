@@ -138,7 +138,7 @@ def _geometry(part: Any, i: int, kind: str) -> PairGeometry:
 
 
 BATCH = 64  # pairs that are read, and kept, at a time
-PRELOADED = ("fmtorch.verification.run",)  # by the process that workers are forked of
+PRELOADED = (__name__,)  # by the process that workers are forked of
 
 _PairIds = tuple[Any, Any]
 

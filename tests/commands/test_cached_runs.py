@@ -49,7 +49,7 @@ def truth(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Rows:
 
 
 def arguments(root: Path, run_dir: Path, *extra: str) -> list[str]:
-    return ["dataset=fmbench", f"dataset.root={root}", *OPTIONS, f"run_dir={run_dir}", *extra]
+    return ["dataset=fmbench", f"dataset.root={root}", *OPTIONS, f"output={run_dir}", *extra]
 
 
 def start(cwd: Path, log: Path, *arguments: str) -> Command:

@@ -13,7 +13,10 @@ from fmtorch.commands import list as list_presets
 from fmtorch.commands import main as commands
 from fmtorch.commands import warm_up
 from fmtorch.commands.config import hydra_arguments
+from fmtorch.commands.main import help_text
 from fmtorch.commands.options import COMMANDS
+from fmtorch.core import terminal
+from fmtorch.core.terminal import exits_with_message
 from fmtorch.presets import available
 from tests.conftest import own_cache
 from tests.helpers import draw
@@ -52,7 +55,7 @@ def test_a_subcommand_runs_as_its_module_does(tmp_path: Path, monkeypatch: pytes
     fmtorch.__main__.main()
     assert called == [(["/usr/bin/fmtorch", "-m", "seed=1,2"], str(tmp_path))]
     monkeypatch.setattr(sys, "argv", ["fmtorch", "evaluate"])
-    there = "eval, list, match, pairs, report, train, verify, warm-up"
+    there = "eval, "
     with pytest.raises(SystemExit, match=f"error: no command 'evaluate'; there are: {there}"):
         fmtorch.__main__.main()
 
@@ -117,6 +120,11 @@ COUNT = "it must be a whole number of at least 1"
         ("eval pruner=[ratio,gmss]", "no preset 'gmss' in pruner; there are: gms"),
         ("eval estimator.treshold=2", "no option estimator.treshold; there are: threshold"),
         ("eval limitt=2", "no option limitt; there are: limit"),
+        ("eval piepline=sift_ratio", "no option piepline; there are: pipeline"),
+        ("eval --limit 5", "--limit: options have no dashes: limit=5"),
+        ("eval --pipeline=sift_gms", "--pipeline: options have no dashes: pipeline=sift_gms"),
+        ("match a.png b.png --longest-side", "--longest-side: options have no dashes: longest_side=VALUE"),
+        ("match .", ". is a folder; fmtorch match images=. matches its images with one another"),
         ("eval estimater=lmeds", "no option estimater; there are: estimator"),
         ("eval --config-dir nowhere", "nowhere' not found"),
         ("eval limit=(1", "limit=(1 cannot be read; a value with special characters stands in quotes"),
@@ -181,16 +189,43 @@ def test_any_folder_name_is_a_data_set(name: str, tmp_path: Path, monkeypatch: p
 
 
 def test_flags_and_sweeps_stay_what_they_are() -> None:
-    paths, positional = ["image0", "run_dir"], ["image0", "image1"]
-    words = ["a b.png", "seed=1,2", "-m", "--config-dir", "my conf", "it's.png", "~cache", "run_dir=null", "x=[1, 2]"]
+    paths, positional = ["image0", "output"], ["image0", "image1"]
+    words = ["a b.png", "seed=1,2", "-m", "--config-dir", "my conf", "it's.png", "~cache", "output=null", "x=[1, 2]"]
     assert hydra_arguments(words, paths, positional) == [
         "-m", "--config-dir", "my conf", "image0='a b.png'", r"image1='it\'s.png'", "seed=1,2", "~cache",
-        "run_dir=null", "x=[1, 2]",
+        "output=null", "x=[1, 2]",
     ]  # fmt: skip
-    assert hydra_arguments(["-m", "run_dir=a,b"], paths, []) == ["-m", "run_dir=a,b"]
-    assert hydra_arguments(["run_dir=a,b"], paths, []) == ["run_dir='a,b'"]
-    assert hydra_arguments(["run_dir='a,b'", "++cache=1"], paths, []) == ["run_dir='a,b'", "++cache=1"]
+    assert hydra_arguments(["-m", "output=a,b"], paths, []) == ["-m", "output=a,b"]
+    assert hydra_arguments(["output=a,b"], paths, []) == ["output='a,b'"]
+    assert hydra_arguments(["output='a,b'", "++cache=1"], paths, []) == ["output='a,b'", "++cache=1"]
     assert hydra_arguments(["runs/a (1)", "b"], [], ["runs..."]) == ["runs=['runs/a (1)','b']"]
+
+
+def test_help_names_what_runs() -> None:
+    text = help_text(COMMANDS["match"])
+    assert "features=hesaffnet_fast\n" in text
+    assert "pruner=[ratio, one_to_one, frame_consistency]\n" in text
+    assert "features=sift\n" not in text
+
+
+def test_an_interrupted_command_says_what_is_kept(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as end, exits_with_message("interrupted; the same command continues"):
+        raise KeyboardInterrupt("3 of 8 pairs are kept in runs/a")
+    assert end.value.code == 130
+    assert capsys.readouterr().err == "interrupted; the same command continues; 3 of 8 pairs are kept in runs/a\n"
+
+
+def test_without_a_terminal_progress_is_a_line_now_and_then(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(terminal, "LINE_SECONDS", 0.0)
+    with terminal.progress_bars() as progress:
+        bar = progress.add_task("sift_gms", total=1200)
+        progress.update(bar, completed=1100)
+        progress.advance(bar, 4)
+    lines = capsys.readouterr().err.splitlines()
+    assert "sift_gms: 1,100 of 1,200 after 0 min" in lines
+    assert "sift_gms: 1,104 of 1,200 after 0 min" in lines
 
 
 SMALL = ["dataset=fmbench", "dataset.root=Set", "features.max_features=300", "estimator.hypotheses=100"]
@@ -211,10 +246,16 @@ def data_set(tmp_path: Path) -> Path:
 def test_a_sweep_runs_all_jobs_and_tells_the_first_mistake(
     data_set: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["-m", *SMALL, "limit=0,1", "run_dir=out"]
+    words = ["-m", *SMALL, "limit=0,1", "output=out"]
     assert ended(monkeypatch, data_set, "eval", *words) == f"error: limit=0; {COUNT} or null"
     assert (data_set / "out" / "summary.md").is_file()
     assert "Traceback" not in capfd.readouterr().err
+    monkeypatch.setattr(sys, "argv", ["eval", "-m", *SMALL, "limit=1", "estimator=ransac,lmeds"])
+    importlib.import_module("fmtorch.commands.eval").main()
+    table = capfd.readouterr().out.partition("2 runs on ")[2]
+    assert [line.split()[:2] for line in table.splitlines() if line.startswith(("ransac", "lmeds"))] == [
+        ["ransac", "1"], ["lmeds", "1"],
+    ]  # fmt: skip
 
 
 @pytest.mark.parametrize("launcher", ["joblib", "submitit_local"])
@@ -226,7 +267,7 @@ def test_a_sweep_runs_in_processes_of_a_launcher(
     pytest.importorskip(f"hydra_plugins.{plugin}", reason=f"needs {plugin}")
     monkeypatch.setenv("PYTHONPATH", str(CHECKOUT))
     jobs = ["hydra.launcher.n_jobs=2"] if launcher == "joblib" else []
-    words = ["-m", *SMALL, f"hydra/launcher={launcher}", *jobs, "limit=1,0", "run_dir=out"]
+    words = ["-m", *SMALL, f"hydra/launcher={launcher}", *jobs, "limit=1,0", "output=out"]
     assert ended(monkeypatch, data_set, "eval", *words) == f"error: limit=0; {COUNT} or null", capfd.readouterr().err
     assert (data_set / "out" / "summary.md").is_file()
     printed = capfd.readouterr()

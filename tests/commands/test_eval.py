@@ -41,7 +41,7 @@ def rows(run_dir: Path) -> list[dict[str, object]]:
 
 
 def test_a_run_from_start_to_end(root: Path, tmp_path: Path) -> None:
-    arguments = ["dataset=fmbench", f"dataset.root={root}", *OPTIONS, f"run_dir={tmp_path / 'run'}", "batch=2"]
+    arguments = ["dataset=fmbench", f"dataset.root={root}", *OPTIONS, f"output={tmp_path / 'run'}", "batch=2"]
     first = evaluate(*arguments, "limit=2", cwd=tmp_path)
     assert first.returncode == 0, first.stderr
     run_dir = tmp_path / "run"
@@ -93,7 +93,7 @@ def test_batch_and_workers_change_no_row(root: Path, tmp_path: Path) -> None:
     }
     for name, extra in variants.items():
         run = evaluate(
-            "dataset=fmbench", f"dataset.root={root}", *OPTIONS, f"run_dir={tmp_path / name}", *extra, cwd=tmp_path
+            "dataset=fmbench", f"dataset.root={root}", *OPTIONS, f"output={tmp_path / name}", *extra, cwd=tmp_path
         )
         assert run.returncode == 0, run.stderr
         plain = [{k: v for k, v in row.items() if not k.startswith("seconds")} for row in rows(tmp_path / name)]
@@ -106,11 +106,11 @@ def test_batch_and_workers_change_no_row(root: Path, tmp_path: Path) -> None:
 
 def test_shards_are_one_run(root: Path, tmp_path: Path) -> None:
     arguments = ["dataset=fmbench", f"dataset.root={root}", *OPTIONS, "workers=1"]
-    assert evaluate(*arguments, f"run_dir={tmp_path / 'whole'}", cwd=tmp_path).returncode == 0
-    first = evaluate(*arguments, f"run_dir={tmp_path / 'run'}", "shard=1/2", cwd=tmp_path)
+    assert evaluate(*arguments, f"output={tmp_path / 'whole'}", cwd=tmp_path).returncode == 0
+    first = evaluate(*arguments, f"output={tmp_path / 'run'}", "shard=1/2", cwd=tmp_path)
     assert first.returncode == 0, first.stderr
     assert "2 of 5 pairs have rows; other shards have the rest" in first.stdout
-    second = evaluate(*arguments, f"run_dir={tmp_path / 'run'}", "shard=2/2", cwd=tmp_path)
+    second = evaluate(*arguments, f"output={tmp_path / 'run'}", "shard=2/2", cwd=tmp_path)
     assert "other shards" not in second.stdout
     unsharded, merged = (json.loads((tmp_path / name / "summary.json").read_text()) for name in ("whole", "run"))
     for group in (*unsharded.values(), *merged.values()):
@@ -125,7 +125,7 @@ def test_an_executor_of_ones_own_by_config_dir(root: Path, tmp_path: Path) -> No
     own.mkdir(parents=True)
     (own / "mine.yaml").write_text("_target_: concurrent.futures.ThreadPoolExecutor\nmax_workers: 2\n")
     arguments = ["--config-dir", str(tmp_path / "my_conf"), "dataset=fmbench", f"dataset.root={root}", *OPTIONS]
-    run = evaluate(*arguments, "executor=mine", f"run_dir={tmp_path / 'run'}", cwd=tmp_path)
+    run = evaluate(*arguments, "executor=mine", f"output={tmp_path / 'run'}", cwd=tmp_path)
     assert run.returncode == 0, run.stderr
     assert len(rows(tmp_path / "run")) == 5
     wrong = evaluate(*arguments, "executor=mine", "executor.max_workers=two", cwd=tmp_path)
@@ -135,7 +135,7 @@ def test_an_executor_of_ones_own_by_config_dir(root: Path, tmp_path: Path) -> No
 
 
 def test_the_order_of_pruners_is_part_of_the_run(root: Path, tmp_path: Path) -> None:
-    arguments = ["dataset=fmbench", f"dataset.root={root}", *OPTIONS, f"run_dir={tmp_path / 'run'}", "limit=1"]
+    arguments = ["dataset=fmbench", f"dataset.root={root}", *OPTIONS, f"output={tmp_path / 'run'}", "limit=1"]
     first = evaluate(*arguments, "pruner=[one_to_one,ratio]", cwd=tmp_path)
     assert first.returncode == 0, first.stderr
     stored = json.loads((tmp_path / "run" / "run.json").read_text())["config"]["pruner"]
@@ -160,7 +160,7 @@ def test_a_users_own_estimator_by_config_dir(root: Path, tmp_path: Path) -> None
     (own / "mine.yaml").write_text("_target_: fmtorch.estimators.opencv\nmethod: FM_LMEDS\n")
     run = evaluate(
         "--config-dir", str(tmp_path / "my_conf"), "estimator=mine", "dataset=fmbench", f"dataset.root={root}",
-        "features.max_features=500", f"run_dir={tmp_path / 'run'}", "limit=1", cwd=tmp_path,
+        "features.max_features=500", f"output={tmp_path / 'run'}", "limit=1", cwd=tmp_path,
     )  # fmt: skip
     assert run.returncode == 0, run.stderr
     assert json.loads((tmp_path / "run" / "run.json").read_text())["config"]["estimator"]["method"] == "FM_LMEDS"
@@ -188,7 +188,7 @@ def test_a_users_own_pruner_by_config_dir(root: Path, tmp_path: Path, header: st
     (here / "mine.py").write_text(OWN_PRUNER)
     run = evaluate(
         "--config-dir", "my_conf", "pruner=[one_to_one,mine,likely]", "pruner.mine.prior=true", "dataset=fmbench",
-        f"dataset.root={root}", *OPTIONS, "run_dir=run", "limit=2", cwd=here,
+        f"dataset.root={root}", *OPTIONS, "output=run", "limit=2", cwd=here,
     )  # fmt: skip
     assert run.returncode == 0, run.stderr
     config = json.loads((here / "run" / "run.json").read_text())["config"]
@@ -213,7 +213,7 @@ def test_mistakes_in_a_users_own_pruner_are_told(root: Path, tmp_path: Path) -> 
     for options, message in messages.items():
         run = evaluate(
             "--config-dir", str(tmp_path / "my_conf"), *options.split(), "dataset=fmbench", f"dataset.root={root}",
-            *OPTIONS, f"run_dir={tmp_path / 'run'}", "limit=1", cwd=tmp_path,
+            *OPTIONS, f"output={tmp_path / 'run'}", "limit=1", cwd=tmp_path,
         )  # fmt: skip
         assert run.returncode == 1, options
         assert message in run.stderr
@@ -232,7 +232,7 @@ def test_mistakes_in_a_users_own_pruner_are_told(root: Path, tmp_path: Path) -> 
     ],
 )
 def test_what_cannot_be_run_is_told(root: Path, tmp_path: Path, damage: str, message: str) -> None:
-    arguments = ["dataset=fmbench", f"dataset.root={root}", *OPTIONS, f"run_dir={tmp_path / 'run'}"]
+    arguments = ["dataset=fmbench", f"dataset.root={root}", *OPTIONS, f"output={tmp_path / 'run'}"]
     environment = {"CUDA_VISIBLE_DEVICES": ""}
     if damage == "no root":
         arguments[1] = f"dataset.root={tmp_path / 'nowhere'}"
@@ -258,7 +258,7 @@ def test_a_learned_file_is_part_of_the_run(root: Path, tmp_path: Path) -> None:
     np.savez(model, mean=np.zeros(128, np.float32), basis=basis)
     pipeline = ["pipeline=rootsiftpca_ratio", f"features.descriptor.model={model}"]
     data = ["dataset=fmbench", f"dataset.root={root}", "limit=2"]
-    arguments = [*pipeline, *data, *OPTIONS, f"run_dir={tmp_path / 'run'}"]
+    arguments = [*pipeline, *data, *OPTIONS, f"output={tmp_path / 'run'}"]
     first = evaluate(*arguments, cwd=tmp_path)
     assert first.returncode == 0, first.stderr
     np.savez(model, mean=np.zeros(128, np.float32), basis=-basis)
@@ -278,7 +278,7 @@ def test_the_code_of_a_users_own_stage_is_part_of_the_run(root: Path, tmp_path: 
     )
     (tmp_path / "my_constants.py").write_text("METHOD = 'FM_LMEDS'\n")
     data = ["dataset=fmbench", f"dataset.root={root}", "features.max_features=500", "limit=1"]
-    arguments = ["--config-dir", str(tmp_path / "my_conf"), "estimator=mine", *data, f"run_dir={tmp_path / 'run'}"]
+    arguments = ["--config-dir", str(tmp_path / "my_conf"), "estimator=mine", *data, f"output={tmp_path / 'run'}"]
     first = evaluate(*arguments, cwd=tmp_path)
     assert first.returncode == 0, first.stderr
     (tmp_path / "my_constants.py").write_text("METHOD = 'FM_RANSAC'\n")
@@ -290,7 +290,7 @@ def test_the_code_of_a_users_own_stage_is_part_of_the_run(root: Path, tmp_path: 
 def test_a_run_in_which_nothing_succeeds_is_told(root: Path, tmp_path: Path) -> None:
     for image in (root / "scene" / "Images").iterdir():
         image.write_bytes(b"no picture")
-    run = evaluate("dataset=fmbench", f"dataset.root={root}", *OPTIONS, f"run_dir={tmp_path / 'run'}", cwd=tmp_path)
+    run = evaluate("dataset=fmbench", f"dataset.root={root}", *OPTIONS, f"output={tmp_path / 'run'}", cwd=tmp_path)
     assert run.returncode == 1
     assert "every pair failed" in run.stderr
     assert len(rows(tmp_path / "run")) == 5
@@ -298,7 +298,7 @@ def test_a_run_in_which_nothing_succeeds_is_told(root: Path, tmp_path: Path) -> 
 
 def test_on_real_pairs(tmp_path: Path) -> None:
     root = shared_path("data/Strecha")
-    run = evaluate("dataset=fmbench", f"dataset.root={root}", "limit=4", f"run_dir={tmp_path / 'run'}", cwd=tmp_path)
+    run = evaluate("dataset=fmbench", f"dataset.root={root}", "limit=4", f"output={tmp_path / 'run'}", cwd=tmp_path)
     assert run.returncode == 0, run.stderr
     table = rows(tmp_path / "run")
     assert len(table) == 4

@@ -398,12 +398,17 @@ def test_others_of_the_same_names_overwrite_nothing(tmp_path: Path, monkeypatch:
     monkeypatch.chdir(tmp_path)
     paths = [Path("x/a.jpg"), Path("x/b.jpg")]
     others = [Path("y/a.jpg"), Path("y/b.jpg")]
-    folder = match_command._default_output(paths)
+    settings = {"pipeline": "sift_gms", "seed": 0, "cameras": None}
+    folder = match_command._default_output(paths, settings)
     assert folder == Path("matches/a-b")
     folder.mkdir(parents=True)
-    (folder / "result.json").write_text(json.dumps({"image0": "x/a.jpg", "image1": "x/b.jpg"}))
-    assert match_command._default_output(paths) == folder
-    assert match_command._default_output([path.absolute() for path in paths]) == folder
-    elsewhere = match_command._default_output(others)
+    (folder / "result.json").write_text(json.dumps({"image0": "x/a.jpg", "image1": "x/b.jpg", **settings}))
+    assert match_command._default_output(paths, settings) == folder
+    assert match_command._default_output([path.absolute() for path in paths], settings) == folder
+    elsewhere = match_command._default_output(others, settings)
     assert re.fullmatch(r"a-b-[0-9a-f]{8}", elsewhere.name)
-    assert match_command._default_output(others) == elsewhere
+    assert match_command._default_output(others, settings) == elsewhere
+    for changed in ({"seed": 1}, {"pipeline": "sift_lpm"}, {"cameras": "unknown"}):
+        other = match_command._default_output(paths, settings | changed)
+        assert other not in (folder, elsewhere)
+        assert other == match_command._default_output(paths, settings | changed)

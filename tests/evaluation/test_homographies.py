@@ -20,7 +20,7 @@ from tests.helpers import compose
 
 
 def run(root: Path, folder: Path, *words: str, pipeline: str = "sift_ratio") -> Path:
-    fixed = ("dataset=hpatches", f"dataset.root={root}", "dataset.short_side=200", "cache=off", f"run_dir={folder}")
+    fixed = ("dataset=hpatches", f"dataset.root={root}", "dataset.short_side=200", "cache=off", f"output={folder}")
     config = compose("eval", (f"pipeline={pipeline}", "estimator=homography", *fixed, *words))
     return eval_command.run(config, pipeline, ["estimator=homography"])
 

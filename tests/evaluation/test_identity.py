@@ -58,7 +58,7 @@ def identity(*overrides: str, pipeline: Pipeline | None = None, **own: dict[str,
 
 def test_what_changes_speed_alone_is_no_part_of_it() -> None:
     plain = identity()
-    for change in ("limit=3", "batch=1", "workers=7", "processes=true", "device=cuda", "run_dir=x", "cache_limit=1"):
+    for change in ("limit=3", "batch=1", "workers=7", "processes=true", "device=cuda", "output=x", "cache_limit=1"):
         assert identity(change) == plain, change
     for change in ("seed=1", "pruner.ratio.threshold=0.9", "pruner=[one_to_one,ratio]", "dataset.size=full"):
         assert identity_digest(identity(change)) != identity_digest(plain), change

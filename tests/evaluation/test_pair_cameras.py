@@ -87,14 +87,14 @@ def test_a_run_with_cameras_is_another_run(tmp_path: Path) -> None:
     arguments += ["limit=2", "workers=1"]
     errors = {}
     for word, name in (("null", "without"), ("known", "known")):
-        done = run_command("eval", *arguments, f"cameras={word}", f"run_dir={name}", cwd=tmp_path)
+        done = run_command("eval", *arguments, f"cameras={word}", f"output={name}", cwd=tmp_path)
         assert done.returncode == 0, done.stderr
         identity = json.loads((tmp_path / name / "run.json").read_text())["config"]
         assert identity.get("cameras") == (None if word == "null" else word)
         summary = json.loads((tmp_path / name / "summary.json").read_text())
         errors[word] = max(summary["all"]["pose"]["rotation"], summary["all"]["pose"]["translation"])
     assert errors["known"] < 0.5
-    done = run_command("eval", *arguments, "cameras=known", "pose.signed=true", "run_dir=signed", cwd=tmp_path)
+    done = run_command("eval", *arguments, "cameras=known", "pose.signed=true", "output=signed", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert json.loads((tmp_path / "signed" / "run.json").read_text())["config"]["pose"] == {"signed": True}
     assert json.loads((tmp_path / "signed" / "summary.json").read_text())["all"]["pose"]["signed"] is True
@@ -104,7 +104,7 @@ def test_a_run_with_cameras_is_another_run(tmp_path: Path) -> None:
     odd = run_command("eval", *arguments, "pose.signed=2", cwd=tmp_path)
     assert odd.returncode == 1
     assert "pose.signed=2; it must be true or false" in odd.stderr
-    refused = run_command("eval", *arguments, "cameras=shared", "run_dir=known", cwd=tmp_path)
+    refused = run_command("eval", *arguments, "cameras=shared", "output=known", cwd=tmp_path)
     assert "cameras: 'known' -> 'shared'" in refused.stderr.replace('"', "'") or "holds another run" in refused.stderr
     wrong = run_command("eval", *arguments, "cameras=some", cwd=tmp_path)
     assert wrong.returncode == 1

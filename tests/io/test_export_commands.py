@@ -210,7 +210,7 @@ def test_an_evaluation_and_its_way_back(tmp_path: Path) -> None:
     (tmp_path / "Set" / "pairs_which_dataset.txt").write_text("scene/\n" * 4)
 
     def run(run_dir: str, *words: str) -> tuple[Path, dict[str, list[Any]]]:
-        path = eval_command.run(config("eval", f"run_dir={tmp_path / run_dir}", *words), "sift_ratio")
+        path = eval_command.run(config("eval", f"output={tmp_path / run_dir}", *words), "sift_ratio")
         return path, RunFolder.load(path).read().sort_by("pair").to_pydict()
 
     ours = ("dataset=fmbench", f"dataset.root={tmp_path / 'Set'}")

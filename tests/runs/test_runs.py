@@ -102,7 +102,7 @@ def test_open_refuses_another_identity_and_says_what_differs(tmp_path: Path) -> 
         "pipeline.estimator.threshold: 0.5 -> 1.5",
         'pipeline.estimator.method: (absent) -> "x"',
         "pipeline.estimator.samples: 2000 -> (absent)",
-        "run_dir",
+        "output",
         "delete",
     ):
         assert part in message

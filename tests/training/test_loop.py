@@ -102,6 +102,18 @@ class Ended(Exception):
     """What a kill would do."""
 
 
+def test_interrupted_it_says_what_is_kept(tmp_path: Path) -> None:
+    stopped = module()
+
+    def stop(*_: object) -> None:
+        if stopped.global_step == 7:
+            raise KeyboardInterrupt
+
+    stopped.on_train_batch_start = stop
+    with pytest.raises(KeyboardInterrupt, match=rf"step 6 of {STEPS} is kept in {tmp_path}"):
+        train(stopped, tmp_path, every=5, checkpoint_every=3, monitor="hard/AUC@0.05")
+
+
 def test_ended_before_a_validation_it_is_made_again(tmp_path: Path) -> None:
     """Checkpoints are at the steps of validation; the best weights are those of an undisturbed training."""
 

@@ -73,7 +73,7 @@ def test_a_network_of_ones_own_is_trained_and_used(root: Path, tmp_path: Path) -
     assert 0 <= figures["prior/AUC@0.05"] <= 1
     used = [w.strip("'") for w in evaluate if not w.startswith(("dataset", "pruner.mine.file"))]
     evaluated = command(
-        *used, *data, "pruner.mine.file=out/mine.safetensors", "run_dir=run", "features.max_features=300", cwd=here
+        *used, *data, "pruner.mine.file=out/mine.safetensors", "output=run", "features.max_features=300", cwd=here
     )
     assert evaluated.returncode == 0, evaluated.stderr
     identity = (here / "run" / "run.json").read_text()
