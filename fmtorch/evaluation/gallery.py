@@ -37,7 +37,7 @@ def difference(pair: ImagePair, images: Sequence[Image], stored: Mapping[str, An
     if again is None or not bool(again.ok[0]):
         return f"gives no F when it is drawn again ({reason}), unlike in its run" if stored["ok"] else ""
     run = torch.tensor(stored["F"], dtype=torch.float64) if stored["ok"] else None
-    if run is not None and torch.allclose(run, again.F[0].cpu().flatten(), rtol=0, atol=SAME_F):
+    if run is not None and torch.allclose(run, again.F[0].cpu().double().flatten(), rtol=0, atol=SAME_F):
         return ""
     sizes = [torch.tensor([image.shape[:2]]) for image in images]
 
