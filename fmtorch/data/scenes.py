@@ -120,11 +120,7 @@ def drawn(total: int, count: int | None, seed: int) -> Sequence[int] | Indices:
 
 SPLITS: dict[str, dict[str, tuple[str, ...]]] = {
     "tum": {
-        "test": (
-            "rgbd_dataset_freiburg3_teddy",
-            "rgbd_dataset_freiburg3_large_cabinet",
-            "rgbd_dataset_freiburg3_long_office_household",
-        ),
+        "test": tuple(f"rgbd_dataset_freiburg3_{name}" for name in ("teddy", "large_cabinet", "long_office_household")),
     },
     "kitti": {
         "test": ("06", "07", "08", "09", "10"),

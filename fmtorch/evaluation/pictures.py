@@ -142,14 +142,8 @@ def fixed(points: Points) -> list[tuple[int, int]]:
 
 # RGB; told apart by all kinds of colour vision (Okabe & Ito), lightened.
 COLOURS = (
-    (0, 158, 235),
-    (240, 228, 66),
-    (230, 100, 10),
-    (20, 190, 130),
-    (225, 130, 185),
-    (110, 205, 250),
-    (245, 170, 0),
-)
+    (0, 158, 235), (240, 228, 66), (230, 100, 10), (20, 190, 130), (225, 130, 185), (110, 205, 250), (245, 170, 0),
+)  # fmt: skip
 _CORNERS = 200  # among which to choose
 _RIM = 0.06  # share of an image at either side without corners
 
