@@ -5,7 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fmtorch.evaluation.pictures import (
+from fmtorch.geometry.eight_point import WIDTH
+from fmtorch.pipeline.pictures import (
     BAD,
     COLOURS,
     GOOD,
@@ -15,7 +16,6 @@ from fmtorch.evaluation.pictures import (
     draw_matches,
     spread,
 )
-from fmtorch.geometry.eight_point import WIDTH
 from fmtorch.scenes.videos import HEIGHT
 
 ROWS = np.array([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # a sideways camera: epipolar lines are rows

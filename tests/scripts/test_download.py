@@ -137,7 +137,18 @@ def test_a_data_set_that_broke_off_is_continued(
     assert len(handler.asked) == 2
 
 
-@pytest.mark.parametrize("members", [{"../outside.txt": b"x"}, {"a/../../outside.txt": b"x"}, {}])
+@pytest.fixture(params=[True, False], ids=["new", "3.11.2"])
+def python(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """This Python, and one whose tarfile cannot check what it unpacks, as that of Debian 12."""
+    if not request.param:
+        monkeypatch.delattr(tarfile, "data_filter", raising=False)
+
+
+EVIL = [{"../outside.txt": b"x"}, {"a/../../outside.txt": b"x"}, {"/outside.txt": b"x"}, {"C:outside.txt": b"x"}, {}]
+
+
+@pytest.mark.usefixtures("python")
+@pytest.mark.parametrize("members", EVIL)
 def test_archives_cannot_write_elsewhere(members: dict[str, bytes], tmp_path: Path) -> None:
     path = tmp_path / "evil.tgz"
     archive(path, members, link=None if members else "/etc/passwd")
@@ -145,6 +156,15 @@ def test_archives_cannot_write_elsewhere(members: dict[str, bytes], tmp_path: Pa
     with pytest.raises(ValueError, match=r"evil\.tgz: cannot be unpacked"):
         SCRIPT["unpack"](path, tmp_path / "in/side")
     assert sorted(p.name for p in tmp_path.rglob("*")) == ["evil.tgz", "in", "side"]
+
+
+@pytest.mark.usefixtures("python")
+def test_archives_are_unpacked(tmp_path: Path) -> None:
+    path, folder = tmp_path / "a.tgz", tmp_path / "folder"
+    archive(path, {"one/deep/a": b"1", "two": b"2"})
+    folder.mkdir()
+    assert SCRIPT["unpack"](path, folder) == [folder / "one", folder / "two"]
+    assert (folder / "one/deep/a").read_bytes() == b"1"
 
 
 def test_damaged_archives_and_folders_that_are_there_are_told(tmp_path: Path) -> None:
