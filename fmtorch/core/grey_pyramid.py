@@ -1,7 +1,5 @@
 """A grey image at ever coarser scales, made once for all pairs that show it."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

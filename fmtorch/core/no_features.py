@@ -1,7 +1,5 @@
 """No features, for matchers that take the images themselves."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """ONNX files opened for inference on a CPU."""
 
-from __future__ import annotations
-
 import functools
 import warnings
 from collections.abc import Callable

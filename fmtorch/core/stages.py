@@ -1,7 +1,5 @@
 """The protocols of the four stages: what anything must look like to take its place in a pipeline."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Protocol, TypeAlias, runtime_checkable
 

@@ -1,7 +1,5 @@
 """Local affine frames (N, 2, 3) in kornia's convention: column 2 the centre, columns 0 and 1 the patch's half axes."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import math

@@ -1,7 +1,5 @@
 """Blobs: maxima of the determinant of the Hessian over position and scale (Lindeberg, IJCV 1998)."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from typing import Annotated, NamedTuple, Protocol, runtime_checkable

@@ -1,7 +1,5 @@
 """What the patch networks share: the trunk of convolutions and the normalisation of patches."""
 
-from __future__ import annotations
-
 import math
 import pickle
 import warnings

@@ -8,8 +8,6 @@ Matrices come in two layouts: with the entries last, (*batch, 3, 3), as users ha
 or (9, *s) row by row, over which an operation on one entry runs over all matrices at once.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any, cast
 

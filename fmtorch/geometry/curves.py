@@ -1,7 +1,5 @@
 """`curves` for the points of one pair, compiled."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -6,8 +6,6 @@ all correctly rounded, so a result is bit-equal whatever stands beside it in the
 the epipole its line is undefined: its normal is then zero, and distances and gradients to it are 0, never NaN.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple
 

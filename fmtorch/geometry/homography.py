@@ -4,8 +4,6 @@ Points are (..., N, 2) in pixels, matrices (..., 3, 3) of any scale and sign; le
 Zisserman (2004), Multiple View Geometry, chapter 4.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

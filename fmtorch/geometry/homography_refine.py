@@ -4,8 +4,6 @@ Minimises ``sum_i w_i rho(r_i^2)`` over the sphere of the nine entries, by kerne
 graph of points and weights. A model is refined to the same bits in any batch.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Iteratively reweighted least squares for fundamental matrices, differentiable, with weights of any origin."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import NamedTuple
 

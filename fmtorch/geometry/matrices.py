@@ -1,7 +1,5 @@
 """The nearest matrix of rank two: the step that makes a linear estimate a fundamental matrix."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

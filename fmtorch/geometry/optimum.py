@@ -1,7 +1,5 @@
 """Gradients of the least robust Sampson error: those of the optimum."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import torch

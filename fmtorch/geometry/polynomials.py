@@ -1,7 +1,5 @@
 """Real roots of a cubic in closed form, without transcendental functions, polished by Newton's method."""
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple
 

@@ -1,7 +1,5 @@
 """The relative pose of two calibrated cameras from their fundamental matrix."""
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple
 

@@ -5,8 +5,6 @@ and unit norm (see `rank2_manifold`), by kernels, and attaches the optimum to th
 is refined to the same bits in any batch.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

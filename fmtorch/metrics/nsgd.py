@@ -11,8 +11,6 @@ A draw is accepted when both lines meet image 1; the figure is the mean of the f
 It is not symmetric under exchanging the images.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple
 

@@ -1,7 +1,5 @@
 """Errors of a relative pose in degrees."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

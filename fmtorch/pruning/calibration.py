@@ -1,7 +1,5 @@
 """From a pruner's evidence to P(inlier)."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping
 from typing import Any

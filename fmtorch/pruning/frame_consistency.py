@@ -7,8 +7,6 @@ eighth of the time, and the same area under the ROC curve (measured on castle-P1
 0.954 and 0.924 for the 24 nearest).
 """
 
-from __future__ import annotations
-
 import math
 from typing import ClassVar, NamedTuple
 

@@ -1,7 +1,5 @@
 """How exact is each match? Noise from the keypoint's size, the distance ratio and the prior."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from typing import Any

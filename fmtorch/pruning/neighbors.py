@@ -1,7 +1,5 @@
 """Exact nearest neighbours in the plane, compiled: a balanced k-d tree whose nodes are known by arithmetic."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -5,8 +5,6 @@ match is compared with its neighbours along space-filling curves. Without frames
 consistency is with them: `scripts/calibrate_priors.py` has the figures.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from typing import Any, ClassVar

@@ -1,7 +1,5 @@
 """Matches refined by what the images show around them, and how exact each then is."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable

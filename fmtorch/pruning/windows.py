@@ -5,8 +5,6 @@ in the inverse compositional form (Baker and Matthews, IJCV 2004, section 3.2): 
 made once, and every step samples image 1.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple
 

@@ -1,7 +1,5 @@
 """MAGSAC++, GC-RANSAC, DEGENSAC and SupeRANSAC as their authors published them (extra `peers`)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import TypeVar
 

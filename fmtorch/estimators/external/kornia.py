@@ -1,7 +1,5 @@
 """kornia's RANSAC."""
 
-from __future__ import annotations
-
 import kornia
 import numpy as np
 import torch

@@ -1,7 +1,5 @@
 """OpenCV's robust estimators of fundamental matrices."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

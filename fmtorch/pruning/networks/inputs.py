@@ -1,7 +1,5 @@
 """Correspondences as the input of a network: normalised coordinates and side information, one column a match."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 
