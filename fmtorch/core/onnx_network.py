@@ -48,7 +48,6 @@ def _opened(path: str, modified: int, threads: int) -> Any:
 
 # Networks that other libraries fetch
 
-
 Network = TypeVar("Network")
 
 

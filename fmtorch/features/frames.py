@@ -56,7 +56,6 @@ def make_upright(lafs: Float[Tensor, "*n 2 3"]) -> Float[Tensor, "*n 2 3"]:
 
 # Orientation of local affine frames from their patches: the angle by which the frame's axes turn
 
-
 PatchFunction = Callable[[Tensor], Tensor]
 """Patches (N, 1, 32, 32) float32, grey in [0, 1] -> (N, D); see `PatchNetwork`."""
 
@@ -152,7 +151,6 @@ def _window(size: int, device: torch.device) -> Float[Tensor, "p p"]:
 
 
 # Affine shape of local frames by AffNet (Mishkin, Radenovic, Matas, ECCV 2018)
-
 
 LONGEST = 6.0  # largest ratio of a region's axes; Perdoch et al., CVPR 2009, give up on longer ones
 

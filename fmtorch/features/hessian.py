@@ -144,7 +144,6 @@ def _first_of_each(key: Tensor) -> Tensor:
 
 # The image filters of the detectors twice: by OpenCV for one image on a CPU, by torch for a batch on any device
 
-
 KERNEL_SIGMAS = 3.0  # half the length of a sampled Gaussian
 STRIP = 128  # rows worked on together: the few strips of a 1536 px image then fit a core's cache
 

@@ -109,7 +109,6 @@ class LocalFeature:
 
 # Local features from the names of their parts, as presets give them
 
-
 Part = TypeVar("Part")
 Options = Mapping[str, Any]
 Choice = str | Options

@@ -190,7 +190,6 @@ def unit_largest(matrix: Tensor) -> Tensor:
 
 # Sampson distances component by component, with derivatives for fits
 
-
 TINY = 1e-30  # squared slope of the epipolar constraint below which it is taken for this, in fits
 
 
@@ -225,7 +224,6 @@ def linearise(
 
 
 # Squared residuals of matches under a model, as scores take them of many models, and fits of one
-
 
 SINGLES = 16  # float32 numbers of a row
 load, fill = lanes(SINGLES)

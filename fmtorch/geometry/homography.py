@@ -167,7 +167,6 @@ def _inverse_similarity(T: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch
 
 # Homographies of four matches each, compiled: the samples of one pair, LANES at a time, float64, models in float32
 
-
 ROUNDING = 16 * EPS  # of the area of three points on a line, relative to their coordinates and distances
 SIZE = 4
 

@@ -123,7 +123,6 @@ def homography_curvature(
 
 # The Sampson error of homographies, and its Levenberg-Marquardt on the sphere of their nine entries
 
-
 BEHIND = 1e4  # squared distance of a match behind the horizon in the units of the points, which extend to about one
 SUMS = 52  # over the matches, of the normal equations
 

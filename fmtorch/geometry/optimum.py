@@ -112,7 +112,6 @@ def _hessian(
 
 # Gradients of the fixed point of an iteration over fundamental matrices, by the implicit function theorem
 
-
 CONTRACTION_GAP = 1e-6  # singular values of I - J below it, of an iteration that does not contract, are held off zero
 
 

@@ -100,7 +100,6 @@ def _cube_root(x: float) -> Any:
 
 # Real roots of polynomials of degree ten, LANES samples at a time, compiled: signs on a grid, then Newton
 
-
 KNOTS, POLISHING_STEPS = 33, 4  # of the grid in each of two charts; of Newton's method, from the secant
 DEGREE = 10
 

@@ -191,7 +191,6 @@ def _inverse(K: Tensor) -> tuple[Tensor, Tensor]:
 
 # `pose` for one pair of cameras with square pixels, compiled; and the essential matrix nearest to a model
 
-
 WEIGHT_BITS = 20  # fractional, of weights, so that their sums are exact
 RANK_2 = 1e-10  # share of the squared norm that the product of the singular values must exceed
 

@@ -160,7 +160,6 @@ def _sum_of_squares(u: Tensor) -> Tensor:
 
 # Recall of pose errors: the exact area under its curve, and the means over bins that stand for it in older papers
 
-
 THRESHOLDS = (5, 10, 20)  # degrees, as SuperGlue (Sarlin et al., CVPR 2020)
 MAA_MAXIMUM = 10  # degrees, as the Image Matching Challenge
 BIN = 5  # degrees, as Yi et al. (CVPR 2018) and OANet (Zhang et al., ICCV 2019)

@@ -150,7 +150,6 @@ def _boxes(points: Array, order: Array, depth: int) -> tuple[Array, Array]:
 
 # The map between the surroundings of a match where there are no frames: a similarity that its neighbours agree on
 
-
 NEIGHBOURS = 16
 MIN_AGREEING = 3  # neighbours, without which there is no map
 TOLERANCE_OF_KERNEL, NOISE_PX = (
@@ -204,7 +203,6 @@ def neighbour_maps(x0: F8x2, x1: F8x2, out: F8x3) -> None:
 
 
 # When two neighbouring matches agree: what `frame_consistency` and `position_consistency` have in common
-
 
 WINDOW = 8  # neighbours before and after each match along each curve
 CURVES = ((0.0, 0.0), (0.5, math.pi / 4))  # shift of the grid (in thirds of the extent) and rotation of each curve
