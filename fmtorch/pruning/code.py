@@ -13,7 +13,7 @@ from torch import Tensor
 
 from fmtorch.core.types import Correspondences
 from fmtorch.geometry.robust_losses import huber_weight
-from fmtorch.pruning.frame_consistency import frame_map
+from fmtorch.pruning.consistency import frame_map
 
 BLOCK = 4096  # matches whose basis functions exist at a time
 LARGEST_CHANGE = 100.0  # of a frame's size between images of a common scale: what is beyond is no match

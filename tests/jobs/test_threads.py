@@ -15,7 +15,7 @@ from fmtorch.estimators import batch
 from fmtorch.evaluation.run import evaluate_pairs
 from fmtorch.jobs.execution import Execution, available, mapped, one_thread
 from fmtorch.matching import nearest
-from fmtorch.pruning import position_consistency as consistency
+from fmtorch.pruning import consistency
 from tests.helpers import draw, pair
 from tests.helpers import small_pipeline as pipeline
 from tests.laws import degenerate, scene

@@ -10,7 +10,7 @@ import fmtorch
 from fmtorch import presets
 from fmtorch.core.types import Correspondences
 from fmtorch.pruning import frame_agreement
-from fmtorch.pruning.neighbors import CURVES, MIN_VOTE, NOISE, TOLERANCE, WINDOW, WORST_RATIO
+from fmtorch.pruning.consistency import CURVES, MIN_VOTE, NOISE, TOLERANCE, WINDOW, WORST_RATIO
 from tests.laws import scene
 from tests.pruning.gradients import expect_gradients
 from tests.reference import frame_consistency as reference

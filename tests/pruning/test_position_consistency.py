@@ -12,8 +12,7 @@ import fmtorch
 from fmtorch import presets
 from fmtorch.core.types import Correspondences, collate
 from fmtorch.pruning import position_agreement
-from fmtorch.pruning.neighbors import CURVES, MIN_VOTE, NOISE, TOLERANCE, WINDOW, WORST_RATIO
-from fmtorch.pruning.position_consistency import SCALES, TURNS
+from fmtorch.pruning.consistency import CURVES, MIN_VOTE, NOISE, SCALES, TOLERANCE, TURNS, WINDOW, WORST_RATIO
 from tests.laws import scene
 from tests.pruning.gradients import expect_gradients
 from tests.reference import position_consistency as reference

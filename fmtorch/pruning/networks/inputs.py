@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from fmtorch.core.types import Correspondences
-from fmtorch.pruning.frame_consistency import frame_agreement, usable_frame_maps
+from fmtorch.pruning.consistency import frame_agreement, usable_frame_maps
 
 COORDINATES = ("size", "K")
 MIN_AREA_RATIO = 1e-12  # of two frames; keeps the gradient of the logarithm finite
