@@ -17,8 +17,7 @@ import torch
 from torch import Tensor
 
 from fmtorch import presets
-from fmtorch.core.grey_pyramid import grey_pyramid
-from fmtorch.core.stages import Estimator, ImagePruner, PairImages, Pruner
+from fmtorch.core.stages import Estimator, ImagePruner, PairImages, Pruner, grey_pyramid
 from fmtorch.core.types import Correspondences, collate
 from tests.variants import built, loaded, variants
 

@@ -62,6 +62,11 @@ def twice_atanh(z: Any) -> Any:
     return 2 * z * series
 
 
+def gradient_wanted(*inputs: object) -> bool:
+    """Whether a graph is being recorded and one of the inputs is on it."""
+    return torch.is_grad_enabled() and any(isinstance(x, Tensor) and x.requires_grad for x in inputs)
+
+
 def stable_sum(x: Tensor, dim: int = -1) -> Tensor:
     """The sum over `dim` in a balanced binary tree that trailing zeros do not change.
 

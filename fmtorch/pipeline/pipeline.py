@@ -18,16 +18,17 @@ from hydra.errors import HydraException
 from numpy.typing import NDArray
 from omegaconf import DictConfig
 
-from fmtorch.core.grey_pyramid import GreyPyramid, grey_pyramid
 from fmtorch.core.stages import (
     Estimator,
     FeatureExtractor,
+    GreyPyramid,
     ImageMatcher,
     ImagePruner,
     Matcher,
     PairImages,
     Pruner,
     TimedExtractor,
+    grey_pyramid,
     model_of,
     pruned,
 )

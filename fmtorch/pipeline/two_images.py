@@ -16,9 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from fmtorch import presets
-from fmtorch.core.grey_pyramid import GreyPyramid, grey_pyramid
-from fmtorch.core.no_features import NoFeatures
-from fmtorch.core.stages import ImageMatcher, PairImages, pruned
+from fmtorch.core.stages import GreyPyramid, ImageMatcher, NoFeatures, PairImages, grey_pyramid, pruned
 from fmtorch.core.types import RELATED, Correspondences, Estimate, Features
 from fmtorch.data.cameras import Lens
 from fmtorch.data.images import to_grey

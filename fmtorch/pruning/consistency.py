@@ -20,8 +20,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from fmtorch.core.types import Correspondences
-from fmtorch.geometry.arithmetic import component_sum, sqrt
-from fmtorch.geometry.optimum import gradient_wanted
+from fmtorch.geometry.arithmetic import component_sum, gradient_wanted, sqrt
 from fmtorch.jit.batches import for_each_pair
 from fmtorch.jit.kernel import Array, B1x1, F4x1, F4x2, F4x3, inner, kernel
 from fmtorch.pruning.calibration import Calibration

@@ -10,12 +10,11 @@ import pytest
 import torch
 
 from fmtorch import presets
-from fmtorch.core.grey_pyramid import GreyPyramid, grey_pyramid
-from fmtorch.core.stages import ImagePruner
+from fmtorch.core.stages import GreyPyramid, ImagePruner, grey_pyramid
 from fmtorch.core.types import Correspondences, collate
 from fmtorch.pruning import refine_matches as compiled
 from fmtorch.pruning.neighbors import neighbour_maps
-from fmtorch.pruning.windows import Pyramid
+from fmtorch.pruning.refine_matches import Pyramid
 from tests.reference import refine_matches as reference
 
 MAP = np.array([[1.1, -0.2], [0.15, 0.95]])
