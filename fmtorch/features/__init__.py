@@ -32,31 +32,10 @@ if TYPE_CHECKING:
     )
 
 __all__ = [
-    "ASIFT",
-    "FRAME_SIGMAS",
-    "SIFT",
-    "DominantGradient",
-    "HessianDetector",
-    "ImagePyramid",
-    "LocalFeature",
-    "NetworkDescriptor",
-    "NetworkOrientation",
-    "NetworkShape",
-    "PatchSIFT",
-    "RootSIFTPCA",
-    "VLFeatSIFT",
-    "dominant_gradient",
-    "frame_scale",
-    "keypoints_to_lafs",
-    "learn_projection",
-    "local_feature",
-    "make_upright",
-    "root_sift",
-    "rotate_frames",
-    "sift_of_patches",
-    "simulate_view",
-    "simulated_views",
-    "upright_frames",
-]
+    "ASIFT", "FRAME_SIGMAS", "SIFT", "DominantGradient", "HessianDetector", "ImagePyramid", "LocalFeature",
+    "NetworkDescriptor", "NetworkOrientation", "NetworkShape", "PatchSIFT", "RootSIFTPCA", "VLFeatSIFT",
+    "dominant_gradient", "frame_scale", "keypoints_to_lafs", "learn_projection", "local_feature", "make_upright",
+    "root_sift", "rotate_frames", "sift_of_patches", "simulate_view", "simulated_views", "upright_frames",
+]  # fmt: skip
 
 lazy_exports(__name__)
