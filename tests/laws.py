@@ -17,8 +17,7 @@ import torch
 from torch import Tensor
 
 from fmtorch import presets
-from fmtorch.core.stages import Estimator, ImagePruner, PairImages, Pruner, grey_pyramid
-from fmtorch.core.types import Correspondences, collate
+from fmtorch.core import Correspondences, Estimator, ImagePruner, PairImages, Pruner, collate, grey_pyramid
 from tests.variants import built, loaded, variants
 
 PEERS = {
@@ -88,6 +87,19 @@ def calibrated(c: Correspondences) -> Correspondences:
     """The same pairs with the calibration matrices of `scene`, which some learned pruners need."""
     K = torch.tensor([[800.0, 0, 480], [0, 800, 320], [0, 0, 1]]).expand(len(c), 3, 3)
     return c.replace(K0=K, K1=K)
+
+
+KNOWLEDGE: dict[str, Any] = {"exact": (0.0, 0.0), "rough": (0.05, 0.05), "one": (0.0, float("inf")), "shared": None}
+"""Deviations of the two focal lengths, as parts of them; None: unknown and equal."""
+
+
+def with_knowledge(c: Correspondences, known: str) -> Correspondences:
+    """The same pairs with the calibration of `scene` as far as it is known."""
+    if known == "shared":
+        return c.replace(shared_focal=torch.ones(len(c), dtype=torch.bool))
+    focal = torch.tensor([[[1.0, s] for s in KNOWLEDGE[known]]]).expand(len(c), 2, 2)
+    c = calibrated(c).replace(focal=focal)
+    return c.replace(K1=None) if known == "one" else c
 
 
 def scene(index: int, count: int = 150, outliers: float = 0.4, noise: float = 0.3) -> Correspondences:

@@ -1,10 +1,10 @@
 """How a command runs: Hydra composes its config, and a user's mistake ends it with one line and status 1."""
 
-from __future__ import annotations
-
 import functools
+import pdb
 import re
 import sys
+import traceback
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
@@ -21,9 +21,10 @@ from omegaconf import DictConfig
 from omegaconf.errors import GrammarParseError, OmegaConfBaseException
 
 from fmtorch.commands.options import COMMANDS, Command
+from fmtorch.core.failures import own_traceback
 from fmtorch.core.files import STAGES, conf_dir
 from fmtorch.core.options import nearest
-from fmtorch.core.terminal import MISTAKES, error_line, exits_with_message
+from fmtorch.core.terminal import MISTAKES, error_line, errors, exits_with_message
 from fmtorch.presets import available
 from fmtorch.presets.composition import path_fields, with_explicit
 from fmtorch.presets.files import groups
@@ -39,7 +40,6 @@ class Mistake(ValueError):
 
 
 def _register(command: Command) -> None:
-    """Have Hydra know the config of a command by its name."""
     quiet = [{f"override hydra/{part}_logging": "none"} for part in ("hydra", "job")]
     own = {"output_subdir": None, "run": {"dir": "."}, "sweep": {"dir": command.sweeps, "subdir": "."}}
     defaults = [*({group: name} for group, name in command.groups.items()), "_self_", *quiet]
@@ -58,12 +58,26 @@ def job(task: Task) -> Task:
         try:
             _expect_known(HydraConfig.get().overrides.task)
             task(with_explicit(config, HydraConfig.get().overrides.task))
-        except MISTAKES as error:
+        except Exception as error:
+            if config.get("debug"):
+                _debugged(error, config.debug == "pdb")
+            if trace := own_traceback(error):
+                errors.print(trace, markup=False, highlight=False, soft_wrap=True)
+            if not (trace or isinstance(error, MISTAKES)):
+                raise
             if HydraConfig.get().mode == RunMode.MULTIRUN:
                 raise Mistake(error_line(error)) from None
             sys.exit(f"error: {error_line(error)}")
 
     return wrapped
+
+
+def _debugged(error: Exception, interactive: bool) -> None:
+    """Show all of a traceback, and what it leads to in the debugger if wanted; ends the command."""
+    traceback.print_exception(error)
+    if interactive:
+        pdb.post_mortem(error.__traceback__)
+    sys.exit(1)
 
 
 def chosen_pipeline() -> tuple[str, list[str]]:
@@ -157,7 +171,6 @@ def hydra_arguments(words: Sequence[str], paths: Sequence[str], positional: Sequ
 
 
 def _split(words: Sequence[str]) -> tuple[list[str], list[str]]:
-    """The flags with their values, and all others."""
     takes_value = {name for action in get_args_parser()._actions if action.nargs != 0 for name in action.option_strings}
     flags: list[str] = []
     others: list[str] = []
@@ -180,7 +193,6 @@ def _is_positional(word: str) -> bool:
 
 
 def _named(placed: list[str], positional: Sequence[str]) -> Iterator[str]:
-    """Positional arguments with the names of their fields."""
     if not placed:
         return
     names = ", ".join(name.removesuffix("...") for name in positional)

@@ -1,7 +1,5 @@
 """`python -m fmtorch.eval pipeline=sift_ratio`: run a pipeline over a data set of image pairs and evaluate it."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import os
@@ -15,7 +13,7 @@ from fmtorch import data, presets
 from fmtorch.commands.config import chosen_pipeline, job, run_command
 from fmtorch.commands.options import EVAL, EvalOptions
 from fmtorch.core.files import replacing
-from fmtorch.core.terminal import console, progress_bars, reporter
+from fmtorch.core.terminal import console, errors, progress_bars, reporter
 from fmtorch.data import ImagePair, PairDataset
 from fmtorch.evaluation.curves import picture
 from fmtorch.evaluation.run import built_with, cameras_of, evaluate_pairs, run_identity, select
@@ -23,13 +21,11 @@ from fmtorch.evaluation.statistics import ALL, Group, summarize
 from fmtorch.evaluation.tables import summary_markdown, terminal_tables
 from fmtorch.io.export import export_kinds, write_exports
 from fmtorch.io.match_store import MatchStore
-from fmtorch.jobs.execution import MIN_PAIRS_FOR_PROCESSES, shard_of
+from fmtorch.jobs.execution import MIN_PAIRS_FOR_PROCESSES, Execution, shard_of
 from fmtorch.pipeline.exporting import exportable
 from fmtorch.pipeline.pipeline import Pipeline, build_pipeline
-from fmtorch.presets import plain
-from fmtorch.presets.composition import execution_of, read_fields
-from fmtorch.runs import RunFolder, identity_digest
-from fmtorch.runs.feature_cache import CachedFeatures
+from fmtorch.presets.composition import execution_of, plain, read_fields
+from fmtorch.runs import CachedFeatures, RunFolder, identity_digest
 
 
 def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -> Path:
@@ -57,7 +53,7 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
         pairs = select([dataset[i] for i in range(len(dataset))], fields.limit)
         journal = _journal(folder.path, pairs) if exports else None
         own = pairs if shard is None else shard.of(pairs)
-        todo = _missing(own, folder, journal)
+        todo = _missing(own, folder, journal, again=bool(fields.debug))
         bar = progress.add_task(pipeline_name, total=len(own), completed=len(own) - len(todo))
         for count in _evaluated(config, fields, pipeline, todo, folder, journal):
             progress.advance(bar, count)
@@ -77,26 +73,31 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
         console.print(f"{folder.path}: {', '.join(written)}; names of images are below {journal.root}", style="dim")
     if isinstance(pipeline.extractor, CachedFeatures):
         console.print(pipeline.extractor.report(), style="dim")
+    for reason, trace in pipeline.tracebacks.items():
+        errors.print(f"{reason}\n{trace}".strip(), markup=False, highlight=False, soft_wrap=True)
     if pairs and summary[ALL]["failures"] == len(pairs):
         reason = next(iter(table["reason"].to_pylist()))
-        raise ValueError(
-            f"every pair failed, the first because: {reason}. Once that is mended, delete {folder.path} to run again"
-        )
+        again = f"once that is mended, delete {folder.path} to run again"
+        if folder.config.get("code"):
+            again = f"an edit of your parts makes a new run; mended otherwise, delete {folder.path} to run again"
+        raise ValueError(f"every pair failed, the first because: {reason}; {again}")
     return folder.path
 
 
 def _open_folder(
     config: DictConfig, fields: EvalOptions, pipeline_name: str, pipeline: Pipeline, dataset: PairDataset
 ) -> RunFolder:
-    """The folder of the run with this identity, its `run_dir` if given, new or to be continued."""
     identity = run_identity(config, pipeline_name, pipeline, dataset.digest, fields.cameras, fields.pose.signed)
     name = f"{pipeline_name.replace('/', '-')}-{identity_digest(identity)[:8]}"
     return RunFolder.open(fields.run_dir or Path(f"runs/{dataset.name}/{name}"), identity)
 
 
-def _missing(pairs: Sequence[ImagePair], folder: RunFolder, journal: MatchStore | None) -> list[ImagePair]:
-    """The pairs that have no row yet, or whose matches are to be exported and not in the journal."""
+def _missing(pairs: Sequence[ImagePair], folder: RunFolder, journal: MatchStore | None, again: bool) -> list[ImagePair]:
+    """The pairs that have no row yet, or whose matches are to be exported and not in the journal; again: or failed."""
     done = folder.done()
+    if again and done:
+        table = folder.read(done, without=("pair", "F"))
+        done = set(table["key"].filter(table["ok"]).to_pylist())
     return [p for p in pairs if p.key not in done or (journal is not None and _to_export(journal, p))]
 
 
@@ -104,9 +105,10 @@ def _evaluated(
     config: DictConfig, fields: EvalOptions, pipeline: Pipeline, pairs: Sequence[ImagePair], folder: RunFolder,
     journal: MatchStore | None,
 ) -> Iterator[int]:  # fmt: skip
-    """Evaluates pairs into the folder and the journal; yields how many were done since."""
     parallel = len(pairs) >= MIN_PAIRS_FOR_PROCESSES and pipeline.device.type == "cpu"
     execution = execution_of(config, fields.workers, fields.processes).decided(parallel)
+    if fields.debug:
+        execution = Execution(workers=1)
     if execution.shared and execution.workers is None and pipeline.device.type != "cpu":
         execution = dataclasses.replace(execution, workers=1)
     build = None if execution.shared else functools.partial(build_pipeline, config, pipeline.device, None)

@@ -59,7 +59,6 @@ def main(words: Sequence[str] | None = None) -> None:
 
 
 def _command(name: str) -> Callable[[], None]:
-    """What runs a command; with it come the libraries that it needs."""
     if name == "eval":
         from fmtorch.commands.eval import main
     elif name == "list":

@@ -1,7 +1,5 @@
 """`fmtorch match`: the fundamental matrix of two photographs, with pictures; or the pairs of a folder of images."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import functools
@@ -72,6 +70,8 @@ def match_folder(
     folder = fields.images
     assert folder is not None
     kinds = export_kinds(fields.export)
+    if fields.camera == "shared" and "colmap" not in kinds:
+        raise ValueError("camera=shared needs export=colmap; cameras=shared is what is known of the photographs")
     images = images_below(folder)
     similar = count_of(fields.pairs, SIMILAR)
     pairs = [] if similar else chosen_pairs(folder, images, fields.pairs)
@@ -121,7 +121,6 @@ def match_folder(
 
 
 def _expect_some(work: FolderMatches, pairs: int) -> None:
-    """Say what went wrong with images and pairs, and raise ValueError where no pair could be matched."""
     for trouble in work.troubles:
         errors.print(trouble, style="bold", markup=False, highlight=False, soft_wrap=True)
     if work.taken:
@@ -140,7 +139,6 @@ def _say(work: FolderMatches, graph: ViewGraph, pairs: int) -> None:
 
 
 def _say_turned(images: Sequence[Path], folder: Path) -> None:
-    """Say what COLMAP makes of photographs that were turned."""
     turned = [image.relative_to(folder).as_posix() for image in images if stored_orientation(image) != 1]
     if turned:
         console.print(
@@ -152,8 +150,6 @@ def _say_turned(images: Sequence[Path], folder: Path) -> None:
 
 
 def _draw_graph(graph: ViewGraph, folder: Path, orient: bool, output: Path) -> str:
-    """Draw the graph; the name of the picture."""
-
     def read(name: str) -> NDArray[np.uint8] | None:
         try:
             return read_image(folder / name, orient=orient)
@@ -175,7 +171,6 @@ class Photographs:
 
     @property
     def pinholes(self) -> tuple[Image, Image]:
-        """The photographs without the distortion of their lenses."""
         lenses = [self.knowledge.get(f"lens{i}") for i in (0, 1)]
         bent = zip(self.images, lenses, strict=True)
         image0, image1 = (image if lens is None else undistorted(image, lens) for image, lens in bent)
@@ -244,6 +239,10 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
         if fields.image0 is not None or fields.image1 is not None or fields.truth is not None:
             raise ValueError("images takes a folder; image0, image1 and truth are of a single pair")
         return match_folder(config, fields, PhotographCameras(fields.cameras, fields.K), pipeline_name, overrides)
+    if fields.camera != "per_image":
+        raise ValueError(
+            f"camera is of a folder's database; cameras={fields.camera} is what is known of two photographs"
+        )
     if fields.export is not None or str(fields.pairs or EXHAUSTIVE) != EXHAUSTIVE:
         raise ValueError("export and pairs are of a folder of images: give images=FOLDER")
     paths = [_given(fields.image0, "image0"), _given(fields.image1, "image1")]
@@ -318,7 +317,6 @@ def _default_output(paths: Sequence[Path]) -> Path:
 
 
 def _report(result: MatchResult, image0: Image, image1: Image, truth: NDArray[np.float64] | None) -> dict[str, Any]:
-    """What result.json holds of a result; points in pixels of the images."""
     c = result.correspondences
     report: dict[str, Any] = {
         "size0": image0.shape[:2], "size1": image1.shape[:2],
@@ -374,7 +372,6 @@ def _draw(folder: Path, result: MatchResult, given: Photographs, truth: NDArray[
 
 
 def _troubles(result: MatchResult) -> list[str]:
-    """What is said of a result that is not to be relied on."""
     warning = result.warning if result.related or result.pair_type != "unrelated" else ""  # which is said already
     if not result.ok:
         return list(filter(None, (f"no F: {result.reason}", warning)))

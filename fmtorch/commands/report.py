@@ -1,7 +1,5 @@
 """`fmtorch report runs=[runs]`: runs of `fmtorch.eval` side by side on one HTML page."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -105,7 +103,6 @@ def _merged(held: Sequence[tuple[RunFolder, pa.Table]]) -> list[tuple[RunFolder,
 
 
 def _order(order: str | None, paths: Sequence[Path]) -> str:
-    """`given` or `recall`; unless one is asked for, by recall where runs were looked for in folders."""
     if order not in (None, "given", "recall"):
         raise ValueError(f"order={order} must be given or recall")
     return order or ("given" if all((path / "run.json").exists() for path in paths) else "recall")

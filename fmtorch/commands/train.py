@@ -1,7 +1,5 @@
 """`fmtorch train pruner=lc`: train a learned pruner on the labelled matches of a data set."""
 
-from __future__ import annotations
-
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 

@@ -15,6 +15,8 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from fmtorch.core.failures import place_of
+
 console = Console(markup=False)  # paths and names may hold brackets; styles are given by style=...
 errors = Console(stderr=True, markup=False)
 MISTAKES = (ValueError, OSError, ImportError)  # what a user can put right
@@ -45,12 +47,15 @@ def reporter(progress: Progress, description: str) -> Callable[[int, int], None]
 
 
 def error_line(error: BaseException) -> str:
-    """An error in one line, with the path that an OSError is about."""
+    """An error in one line, with the path that an OSError is about, and where a user's own code raised it."""
     text = str(error)
+    if not isinstance(error, MISTAKES):
+        text = f"{type(error).__name__}: {text}"
     if isinstance(error, OSError) and error.strerror and error.errno is not None:
         paths = [str(path) for path in (error.filename, error.filename2) if path is not None]
         text = f"{' -> '.join(paths)}: {error.strerror}" if paths else error.strerror
-    return " ".join(text.split())
+    place = place_of(error)
+    return " ".join(text.split()) + (f" ({place})" if place and place not in text else "")
 
 
 @contextlib.contextmanager

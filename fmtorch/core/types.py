@@ -41,6 +41,9 @@ WARNINGS = {
     "unrelated": "the images show nothing in common",
 }
 """What each pair type leaves open."""
+CONTRADICTED = (
+    "far more matches agree without the calibration matrices: they are of other images or of another resolution"
+)
 
 
 def pair_key(identity: str) -> int:
@@ -196,6 +199,8 @@ class Estimate(Record):
     Where the pair type is asked for: pair_type_index (B,), into `PAIR_TYPES`; homography (B, 3, 3), of the
     plane, the rotation or the copy, zero where there is none; other_R, other_t, the second pose that explains a plane,
     NaN where there is none.
+
+    Where calibration matrices are known: contradicted (B,), whether far more matches agree without them.
     """
 
     F: Float[Tensor, "b 3 3"]
@@ -218,6 +223,7 @@ class Estimate(Record):
     homography: Float[Tensor, "b 3 3"] | None = None
     other_R: Float[Tensor, "b 3 3"] | None = None
     other_t: Float[Tensor, "b 3"] | None = None
+    contradicted: Bool[Tensor, " b"] | None = None
 
     def __post_init__(self) -> None:
         expect_fields(self)
@@ -255,8 +261,17 @@ class Estimate(Record):
 
     @property
     def warning(self) -> tuple[str, ...]:
-        """What the type of each pair leaves open, empty where nothing. Raises as `pair_type`."""
-        return tuple(WARNINGS[name] for name in self.pair_type)
+        """What the type of each pair leaves open, and whether its matches contradict its calibration matrices.
+
+        Empty where there is nothing to say. Raises as `pair_type` where neither was looked at.
+        """
+        if self.pair_type_index is None and self.contradicted is not None:
+            opens = [""] * len(self)
+        else:
+            opens = [WARNINGS[name] for name in self.pair_type]
+        contradicted = [False] * len(self) if self.contradicted is None else self.contradicted.tolist()
+        said = ((CONTRADICTED if wrong else "", left) for wrong, left in zip(contradicted, opens, strict=True))
+        return tuple("; ".join(filter(None, each)) for each in said)
 
     @property
     def deviation_degrees(self) -> Float[Tensor, "b 2"]:

@@ -1,7 +1,5 @@
 """Pinhole cameras, what two of them say about an image pair, and lenses that distort their images."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from collections.abc import Callable
@@ -242,7 +240,6 @@ def _decentred(u: Array, v: Array, r2: Array, p1: float, p2: float) -> tuple[Arr
 
 
 def _polynomial(x: Array, k: tuple[float, ...]) -> Array:
-    """1 + k[0] x + k[1] x^2 + ..."""
     total = np.zeros_like(x)
     for coefficient in reversed(k):
         total = (total + coefficient) * x
@@ -340,12 +337,10 @@ def _inverted(lens: Lens, target: Array) -> Array:
 
 
 def _jacobian(distort: Callable[[Array], Array], x: Array) -> Array:
-    """The derivatives (n, 2, 2) of the distorted point, by columns."""
     return np.stack([(distort(x + step) - distort(x - step)) / (2 * STEP) for step in STEP * np.eye(2)], -1)
 
 
 def _solved(J: Array, b: Array) -> Array:
-    """J^-1 b of matrices (n, 2, 2) and vectors (n, 2)."""
     det = J[:, 0, 0] * J[:, 1, 1] - J[:, 0, 1] * J[:, 1, 0]
     x = J[:, 1, 1] * b[:, 0] - J[:, 0, 1] * b[:, 1]
     y = J[:, 0, 0] * b[:, 1] - J[:, 1, 0] * b[:, 0]

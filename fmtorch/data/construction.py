@@ -1,7 +1,5 @@
 """Which pairs of images with known cameras make a data set: the paper's rule, or how much of the scene both show."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import json
@@ -33,7 +31,7 @@ Place = tuple[int, int, int]
 """Number of the scene, and of its two views."""
 
 
-def overlap_of(dataset: ScenePairs) -> DepthOverlap | PointOverlap:
+def overlap_of(dataset: ScenePairs) -> "DepthOverlap | PointOverlap":
     """Overlaps by depth where the data set knows it, else by points. Raises ValueError where it has neither."""
     if isinstance(dataset, DepthDataset):
         return DepthOverlap(dataset)
@@ -54,7 +52,6 @@ class PointOverlap:
 
     @property
     def record(self) -> dict[str, Any]:
-        """How overlaps are defined."""
         return {"by": "points"}
 
     def of(self, place: Place) -> float:
@@ -95,7 +92,6 @@ class DepthOverlap:
 
     @property
     def record(self) -> dict[str, Any]:
-        """How overlaps are defined."""
         return {"by": "depth", "step_px": STEP, "tolerance": TOLERANCE}
 
     def of(self, place: Place) -> float:
@@ -144,7 +140,6 @@ def seen_share(image: Seen, other: Seen, R: Matrix, t: Matrix, step: int = STEP)
 
 
 def _size(image: ImageSource) -> tuple[int, int]:
-    """(h, w) of an image, which is read where the data set does not say it."""
     if image.size is not None:
         return image.size
     h, w = read_image(image).shape[:2]
@@ -193,7 +188,6 @@ def matchable(a: Keypoints, b: Keypoints, F: NDArray[np.float64]) -> bool:
 
 
 def _near_lines(x0: NDArray[np.float64], x1: NDArray[np.float64], F: NDArray[np.float64]) -> int:
-    """How many matches (n, 2), (n, 2) lie within `NEAR_LINE` pixels of the true lines in both images."""
     h0, h1 = np.column_stack([x0, np.ones(len(x0))]), np.column_stack([x1, np.ones(len(x1))])
     l1, l0 = h0 @ F.T, h1 @ F
     error = np.abs((h1 * l1).sum(1))
@@ -238,17 +232,14 @@ class Construction:
 
     @functools.cached_property
     def overlaps(self) -> DepthOverlap | PointOverlap:
-        """The overlaps of the data set's pairs."""
         return overlap_of(self.dataset)
 
     @property
     def rule(self) -> dict[str, Any]:
-        """What makes a candidate a pair."""
         return RULE if self.overlap is None else {"overlap": list(self.overlap), **self.overlaps.record}
 
     @property
     def identity(self) -> dict[str, Any]:
-        """What defines the pairs and the images."""
         return {
             "version": _VERSION, "opencv": ".".join(cv2.__version__.split(".")[:2]), "dataset": self.dataset.name,
             "cameras": self.dataset.cameras_digest, "rule": self.rule, "count": self.count, "seed": self.seed,
@@ -262,7 +253,6 @@ class Construction:
 
     @property
     def complete(self) -> bool:
-        """Whether the set is there."""
         return (self.folder / "pairs_with_gt.txt").is_file()
 
     def begin(self) -> None:
@@ -271,7 +261,6 @@ class Construction:
         self.work.mkdir(exist_ok=True)
 
     def order(self) -> Sequence[int] | NDArray[np.int64]:
-        """The candidates in the order in which they are judged."""
         total, rng = self.dataset.candidates, np.random.default_rng(self.seed)
         if self.count is None:
             return range(total)
@@ -377,7 +366,6 @@ class Construction:
 
 
 def _as_it_is(source: ImageSource) -> bool:
-    """Whether the layout can take the file itself."""
     return source.lens is None and source.path.suffix in SUFFIXES
 
 

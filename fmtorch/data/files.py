@@ -1,7 +1,5 @@
 """Files of data sets, read so that whatever is wrong names file and line, or file and array."""
 
-from __future__ import annotations
-
 import pickle
 import re
 import zipfile
@@ -147,7 +145,6 @@ class _DType:
         self.order = state[1]
 
     def value(self) -> np.dtype[Any]:
-        """The dtype itself."""
         if not _CODE.fullmatch(self.code) or self.order not in ("<", ">", "=", "|"):
             raise ValueError(f"dtype {self.order}{self.code}")
         return np.dtype(object) if self.code[0] == "O" else np.dtype(f"{self.order}{self.code}")
@@ -163,14 +160,13 @@ class _Array:
         _, self.shape, self.dtype, self.fortran, self.content = state
 
     @classmethod
-    def of_buffer(cls, content: bytes | bytearray, dtype: _DType, shape: tuple[int, ...], order: str) -> _Array:
+    def of_buffer(cls, content: bytes | bytearray, dtype: _DType, shape: tuple[int, ...], order: str) -> "_Array":
         """As ``numpy._core.numeric._frombuffer``."""
         array = cls()
         array.__setstate__((1, shape, dtype, order == "F", bytes(content)))
         return array
 
     def value(self) -> NDArray[Any]:
-        """The array itself."""
         dtype = self.dtype.value()
         if dtype.kind == "O":
             flat = np.empty(len(self.content), object)

@@ -1,7 +1,5 @@
 """Photographs with a ``Camera.txt`` beside them: the cameras of the FM-Bench layout, before there are pairs."""
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import os
@@ -30,15 +28,9 @@ class CameraFilePairs(ScenePairs):
     """
 
     def __init__(
-        self,
-        root: str | Path | None = None,
-        split: str = "test",
-        sequences: Sequence[str] | None = None,
-        fps: int | float | None = None,
-        window: int | float = WINDOW,
-        pairs: int | None = None,
-        seed: int = 0,
-    ) -> None:
+        self, root: str | Path | None = None, split: str = "test", sequences: Sequence[str] | None = None,
+        fps: int | float | None = None, window: int | float = WINDOW, pairs: int | None = None, seed: int = 0,
+    ) -> None:  # fmt: skip
         if split != "test":
             raise DataError(f"split {split!r}: cameras has only 'test'; choose scenes by root or sequences")
         if fps is not None and fps <= 0:
@@ -101,13 +93,9 @@ class FMBenchPairs(PairDataset):
     name = "fmbench"
 
     def __init__(
-        self,
-        root: str | Path | None = None,
-        split: str = "test",
-        subset: str | Sequence[str] | None = None,
-        sets: Sequence[str] | None = None,
-        cameras: bool = True,
-    ) -> None:
+        self, root: str | Path | None = None, split: str = "test", subset: str | Sequence[str] | None = None,
+        sets: Sequence[str] | None = None, cameras: bool = True,
+    ) -> None:  # fmt: skip
         if split != "test":
             raise DataError(f"split {split!r}: the FM-Bench distribution has only 'test'; choose pairs by root or sets")
         self._subsets = None if subset is None else {subset} if isinstance(subset, str) else set(subset)
@@ -163,14 +151,9 @@ class FMBenchPairs(PairDataset):
             self._hash.update(f"{name}/{path.name}:{len(content)}:".encode() + content)
 
     def _pair(
-        self,
-        line: str,
-        folder: Path,
-        scene: str,
-        numbers: NDArray[np.float64],
-        images: dict[str, Path],
+        self, line: str, folder: Path, scene: str, numbers: NDArray[np.float64], images: dict[str, Path],
         cameras: list[Camera] | None,
-    ) -> ImagePair:
+    ) -> ImagePair:  # fmt: skip
         left, right = (_image_number(line, value) for value in numbers[:2])
         F, problems = _normalized(numbers[2:].reshape(3, 3))
         sources = []
@@ -184,14 +167,9 @@ class FMBenchPairs(PairDataset):
         if self._seen[identity] > 1:  # the same pair on a second line is a second pair
             identity += f"#{self._seen[identity]}"
         pair = ImagePair(
-            identity=identity,
-            family=folder.name,
-            scene=scene,
-            image0=sources[0],
-            image1=sources[1],
-            F=F,
+            identity=identity, family=folder.name, scene=scene, image0=sources[0], image1=sources[1], F=F,
             problem=f"{line}: {'; '.join(problems)}" if problems else None,
-        )
+        )  # fmt: skip
         if cameras is None:
             return pair
         if max(left, right) >= len(cameras):
@@ -236,7 +214,6 @@ def _listed(names: Sequence[str] | set[str] | dict[str, Path]) -> str:
 
 
 def _images(folder: Path, scene: str) -> dict[str, Path]:
-    """The image files of a subset by their stem."""
     images = folder / scene / "Images"
     if not images.is_dir():
         raise DataError(f"{folder / _SUBSETS} names {scene}/, but there is no folder {images}")

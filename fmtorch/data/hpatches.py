@@ -1,7 +1,5 @@
 """HPatches' image sequences (Balntas et al., CVPR 2017): photographs of planes with known homographies."""
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 from collections.abc import Sequence
@@ -42,12 +40,9 @@ class HPatchesPairs(PairDataset):
     model = "homography"
 
     def __init__(
-        self,
-        root: str | Path | None = None,
-        sequences: Sequence[str] | None = None,
-        large: bool = False,
+        self, root: str | Path | None = None, sequences: Sequence[str] | None = None, large: bool = False,
         short_side: Annotated[int, Within(1)] | None = 480,
-    ) -> None:
+    ) -> None:  # fmt: skip
         home = given_root(root, "hpatches", "the folder of the sequences, i_* and v_*")
         there = sorted(folder.name for kind in FAMILIES for folder in home.glob(f"{kind}_*") if folder.is_dir())
         if not there:
@@ -103,7 +98,6 @@ def _image(folder: Path, number: int, short_side: int | None) -> ImageSource:
 
 
 def _homography(path: Path) -> Matrix:
-    """The homography of a file, three lines of three numbers. Raises DataError, naming it, where there is none."""
     rows = read_numbers(path, "three numbers of H", 3)
     H = np.stack(rows) if len(rows) == 3 else np.full((3, 3), np.nan)
     if not np.isfinite(H).all() or np.linalg.det(H) == 0:

@@ -1,7 +1,5 @@
 """The cameras of photographs: of COLMAP models, of JSON files, and by what a camera wrote into its files (EXIF)."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import json
@@ -174,7 +172,6 @@ def _expect_announced(path: Path, what: str, count: int) -> None:
 
 
 def _seen(path: Path, number: int, line: str) -> NDArray[np.int64]:
-    """The numbers of the 3-D points of a line of points."""
     words = line.split()
     if len(words) % 3:
         raise DataError(f"{path}, line {number}: {len(words)} columns; it must be {_POINTS}: is the file truncated?")
@@ -207,7 +204,6 @@ class _Records:
             raise DataError(f"{self.path}: damaged, {left} bytes are left after {self.record}; copy it again")
 
     def take(self, count: int) -> bytes:
-        """The next `count` bytes."""
         if count > len(self.data) - self.at:
             raise DataError(
                 f"{self.path}: damaged or truncated, its {len(self.data)} bytes end within {self.record}; copy it again"
@@ -279,7 +275,6 @@ class ExifFocal(NamedTuple):
 
     @property
     def known(self) -> bool:
-        """Whether there is a focal length."""
         return math.isfinite(self.focal)
 
 
@@ -345,7 +340,6 @@ def _unknown(reason: str) -> ExifFocal:
 
 
 def _number(tags: Tags, tag: int) -> float | None:
-    """The positive, finite number of a tag; None where there is none."""
     try:
         value = float(tags[tag])
     except (KeyError, TypeError, ValueError, ArithmeticError):
@@ -433,7 +427,6 @@ def _of_json(path: Path) -> dict[str, ImageCamera]:
 
 
 def _lens(value: object, place: str) -> Lens:
-    """The camera of fx, fy, cx, cy."""
     numbers = value if isinstance(value, list) else []
     plain = len(numbers) == 4 and all(isinstance(number, int | float) for number in numbers)
     if not plain or not np.isfinite(numbers).all() or min(numbers[:2]) <= 0:

@@ -5,8 +5,6 @@ counterclockwise, K0, K1 row by row, and the pose, a matrix (4, 4) that takes po
 are those of the images before they are turned. glue-factory: names, K0, K1, and either R and t or the matrix.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import re
@@ -85,7 +83,6 @@ def _turns(path: Path, number: int, word: str) -> int:
 
 
 def _pose(values: Matrix) -> tuple[Matrix, Matrix]:
-    """R and t of twelve numbers, R before t, or of sixteen, a matrix row by row."""
     if len(values) == 12:
         return values[:9].reshape(3, 3), values[9:]
     matrix = values.reshape(4, 4)
@@ -147,7 +144,6 @@ def _megadepth(arrays: NpzArrays) -> Iterator[ListedPair]:
 
 
 def _matrix(value: Any, size: int) -> Matrix:
-    """A matrix (size, size) of an array of objects; NaN where there is none."""
     try:
         return np.asarray(value, np.float64).reshape(size, size)
     except (TypeError, ValueError):
@@ -234,12 +230,9 @@ class PairList(PairDataset):
     name = "pair_list"
 
     def __init__(
-        self,
-        root: str | Path | None = None,
-        file: str | Path | None = None,
-        resize: int | Sequence[int] | None = None,
-        origin: float | None = None,
-    ) -> None:
+        self, root: str | Path | None = None, file: str | Path | None = None,
+        resize: int | Sequence[int] | None = None, origin: float | None = None,
+    ) -> None:  # fmt: skip
         home = given_root(root, "pair_list", "the folder of the images of dataset.file, the list")
         if file is None:
             raise DataError("pair_list needs file: dataset.file=FILE, the list of pairs, .txt or .npz")
@@ -329,7 +322,6 @@ def _motion(listed: ListedPair) -> tuple[Matrix, Matrix]:
 
 
 def _listed(path: Path, home: Path) -> tuple[list[ListedPair], list[tuple[str, Path]]]:
-    """The pairs of a list, and the files that define them, by their names."""
     if path.suffix == NPZ:
         return list(npz_pairs(path, home)), [(path.name, path), *camera_files(path, home)]
     if path.suffix not in TEXT_SUFFIXES:
@@ -348,7 +340,6 @@ def _listed(path: Path, home: Path) -> tuple[list[ListedPair], list[tuple[str, P
 
 
 def _resize(resize: int | Sequence[int] | None) -> int | Size | None:
-    """Checked, [width, height] as (h, w)."""
     values = [resize] if isinstance(resize, int) else list(resize or [])
     if resize is None or (len(values) in (1, 2) and all(isinstance(v, int) and v > 0 for v in values)):
         return None if resize is None else values[0] if len(values) == 1 else (values[1], values[0])

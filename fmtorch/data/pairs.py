@@ -1,7 +1,5 @@
 """The item of every data set: an image pair with its ground truth, and how its images are resized when read."""
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 from collections.abc import Callable, Iterator, Sequence
@@ -31,7 +29,6 @@ class Resampling:
     quarter_turns: int = 0
 
     def __call__(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The image (H, W) or (H, W, 3) resized and turned."""
         if self.size is not None and image.shape[:2] != self.size:
             shrinks = self.size[0] <= image.shape[0] and self.size[1] <= image.shape[1]
             kind = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
@@ -140,7 +137,6 @@ class ImagePair:
 
     @property
     def key(self) -> int:
-        """The pair's stable 64-bit key."""
         return pair_key(self.identity)
 
 
@@ -168,9 +164,7 @@ class PairDataset(Protocol):
 class DepthDataset(PairDataset, Protocol):
     """A data set that knows how far away the points of its images are, in the unit of the pairs' t."""
 
-    def depth(self, image: ImageSource, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Depth (n,) along the optical axis at points (n, 2) in pixels; NaN where it is unknown."""
-        ...
+    def depth(self, image: ImageSource, points: NDArray[np.float64]) -> NDArray[np.float64]: ...
 
 
 # Some of a data set's pairs, as a data set
@@ -195,7 +189,6 @@ class _DepthSubset(PairSubset):
     dataset: DepthDataset
 
     def depth(self, image: ImageSource, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """As of the whole data set."""
         return self.dataset.depth(image, points)
 
 

@@ -1,7 +1,5 @@
 """Scenes reconstructed by COLMAP (Tanks and Temples, CPC) and by Bundler (1DSfM), as pairs of their images."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Sequence
 from pathlib import Path
@@ -35,18 +33,10 @@ _FILES = ("cameras.bin", "cameras.txt")
 
 
 def colmap_pairs(
-    root: str | Path | None = None,
-    split: str = "test",
-    sequences: Sequence[str] | None = None,
-    model: str | None = None,
-    images: str = "images",
-    candidates: Literal["all", "points"] = "all",
-    shared: int = MIN_SHARED,
-    pairs: int | None = 1000,
-    seed: int = 0,
-    family: str | None = None,
-    depth: bool = True,
-) -> ScenePairs:
+    root: str | Path | None = None, split: str = "test", sequences: Sequence[str] | None = None,
+    model: str | None = None, images: str = "images", candidates: Literal["all", "points"] = "all",
+    shared: int = MIN_SHARED, pairs: int | None = 1000, seed: int = 0, family: str | None = None, depth: bool = True,
+) -> ScenePairs:  # fmt: skip
     """Pairs of the images of COLMAP models, text or binary, one folder a scene.
 
     Args:
@@ -87,7 +77,6 @@ def colmap_pairs(
 
 
 def _depth_folder(images: Path) -> Path:
-    """Where COLMAP's dense reconstruction keeps the depth maps of a folder of images."""
     return images.parent / "stereo" / "depth_maps"
 
 
@@ -105,7 +94,6 @@ def _depth_paths(images: Path, scene: Scene) -> dict[str, Path]:
 
 
 def _points(folder: Path) -> list[NDArray[np.int64]]:
-    """The points that each image of a model sees."""
     return [image.points for image in read_model(folder).images]
 
 
@@ -170,16 +158,10 @@ class BundlerPairs(ScenePairs):
     """
 
     def __init__(
-        self,
-        root: str | Path | None = None,
-        split: str = "test",
-        sequences: Sequence[str] | None = None,
-        candidates: Literal["all", "points"] = "all",
-        shared: int = MIN_SHARED,
-        pairs: int | None = 1000,
-        seed: int = 0,
-        family: str | None = None,
-    ) -> None:
+        self, root: str | Path | None = None, split: str = "test", sequences: Sequence[str] | None = None,
+        candidates: Literal["all", "points"] = "all", shared: int = MIN_SHARED, pairs: int | None = 1000,
+        seed: int = 0, family: str | None = None,
+    ) -> None:  # fmt: skip
         home = given_root(
             root, "bundler", "a folder of scenes with list.txt and a Bundler file each, or one such scene"
         ).absolute()
@@ -265,7 +247,6 @@ def _view(file: Path, lines: list[str], i: int, source: ImageSource) -> View | N
 
 
 def _seen(file: Path, lines: list[str], cameras: int, points: int, numbers: dict[int, int]) -> list[NDArray[np.int64]]:
-    """The points that each view sees."""
     seen: list[list[int]] = [[] for _ in numbers]
     for point in range(points):
         number = 2 + _LINES * cameras + 3 * point + 3  # of the line, from 1

@@ -2,8 +2,6 @@
 that see the same points of its reconstruction.
 """
 
-from __future__ import annotations
-
 import bisect
 import dataclasses
 import functools
@@ -290,14 +288,9 @@ class ScenePairs(PairDataset):
     points: Sequence[Callable[[], Sequence[NDArray[np.int64]]]] | None = None
 
     def __init__(
-        self,
-        name: str,
-        scenes: Sequence[Scene],
-        sources: Iterable[tuple[str, Path]],
-        options: Sequence[object] = (),
-        pairs: int | None = None,
-        seed: int = 0,
-    ) -> None:
+        self, name: str, scenes: Sequence[Scene], sources: Iterable[tuple[str, Path]], options: Sequence[object] = (),
+        pairs: int | None = None, seed: int = 0,
+    ) -> None:  # fmt: skip
         self.name, self.scenes = name, list(scenes)
         self._starts = [0, *itertools.accumulate(len(scene.candidates) for scene in self.scenes)]
         self._ranks = drawn(self._starts[-1], pairs, seed)
@@ -313,7 +306,6 @@ class ScenePairs(PairDataset):
 
     @property
     def candidates(self) -> int:
-        """How many candidates the scenes have."""
         return self._starts[-1]
 
     def candidate(self, rank: int) -> tuple[int, int, int]:
@@ -344,18 +336,9 @@ def image_pair(scene: Scene, i: int, j: int) -> ImagePair:
         F = fundamental(a, b)
     R, t = relative_pose(a, b)
     return ImagePair(
-        identity=f"{scene.family}/{scene.name}/{i}-{j}",
-        family=scene.family,
-        scene=scene.name,
-        image0=a.image,
-        image1=b.image,
-        F=F,
-        K0=a.K,
-        K1=b.K,
-        R=R,
-        t=t,
-        problem="; ".join(problems) or None,
-    )
+        identity=f"{scene.family}/{scene.name}/{i}-{j}", family=scene.family, scene=scene.name, image0=a.image,
+        image1=b.image, F=F, K0=a.K, K1=b.K, R=R, t=t, problem="; ".join(problems) or None,
+    )  # fmt: skip
 
 
 def folders(root: Path, wanted: Sequence[str], what: str) -> list[Path]:

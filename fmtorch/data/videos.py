@@ -1,7 +1,5 @@
 """Videos with known poses: KITTI odometry (Geiger et al., CVPR 2012) and TUM RGB-D (Sturm et al., IROS 2012)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -43,15 +41,9 @@ class KittiPairs(ScenePairs):
     """
 
     def __init__(
-        self,
-        root: str | Path | None = None,
-        split: str = "test",
-        sequences: Sequence[str] | None = None,
-        camera: int = 0,
-        window: int | float = WINDOW,
-        pairs: int | None = 1000,
-        seed: int = 0,
-    ) -> None:
+        self, root: str | Path | None = None, split: str = "test", sequences: Sequence[str] | None = None,
+        camera: int = 0, window: int | float = WINDOW, pairs: int | None = 1000, seed: int = 0,
+    ) -> None:  # fmt: skip
         home = given_root(root, "kitti", "the folder with sequences/ and poses/ of KITTI odometry")
         there = sorted(f.name for f in (home / "sequences").iterdir()) if (home / "sequences").is_dir() else []
         sequence_folders = folders(
@@ -135,15 +127,10 @@ _TUM_POSE = "timestamp tx ty tz qx qy qz qw"
 
 
 def tum_pairs(
-    root: str | Path | None = None,
-    split: str = "test",
-    sequences: Sequence[str] | None = None,
-    camera: str | None = None,
-    window: int | float = WINDOW,
-    pairs: int | None = 1000,
-    seed: int = 0,
+    root: str | Path | None = None, split: str = "test", sequences: Sequence[str] | None = None,
+    camera: str | None = None, window: int | float = WINDOW, pairs: int | None = 1000, seed: int = 0,
     depth: bool = True,
-) -> ScenePairs:
+) -> ScenePairs:  # fmt: skip
     """Pairs of frames at most `window` seconds apart.
 
     Args:

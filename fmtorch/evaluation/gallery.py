@@ -1,7 +1,5 @@
 """The pairs that a report shows: images from wherever they lie, each run's matches again, or what it stored."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -61,7 +59,6 @@ def difference(pair: ImagePair, images: Sequence[Image], stored: Mapping[str, An
 def _difference_of_homographies(
     pair: ImagePair, images: Sequence[Image], stored: Mapping[str, Any], outcome: Outcome
 ) -> str:
-    """The same of a homography, by its corner error."""
     again = outcome.estimate
     if again is None or not bool(again.ok[0]) or not stored["ok"]:
         has_homography = again is not None and bool(again.ok[0])

@@ -1,7 +1,5 @@
 """The report of several runs: tables, paired differences, curves and pictures on one HTML page."""
 
-from __future__ import annotations
-
 import base64
 import dataclasses
 import hashlib
@@ -59,14 +57,12 @@ class Shown:
 
     @property
     def good(self) -> bool:
-        """Whether its error is below the threshold that is marked in the curves."""
         if self.corner_error is not None:
             return self.corner_error < curves.CORNERS.mark
         return self.nsgd is not None and self.nsgd < THRESHOLD
 
     @property
     def result(self) -> str:
-        """What is said of it."""
         if self.corner_error is not None:
             return f"failed: {self.reason}" if self.reason else f"corner error {self.corner_error:.2f} px"
         result = f"failed: {self.reason}" if self.nsgd is None else f"NSGD {self.nsgd:.4f}"
@@ -155,7 +151,7 @@ def differing_pairs(runs: Mapping[str, pa.Table], count: int) -> list[str]:
 
 
 def _resource(name: str) -> str:
-    return resources.files("fmtorch.evaluation").joinpath(name).read_text(encoding="utf-8")
+    return resources.files(__package__).joinpath(name).read_text(encoding="utf-8")
 
 
 def _context(section: Section, names: Sequence[str]) -> dict[str, Any]:

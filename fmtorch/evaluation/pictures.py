@@ -1,7 +1,5 @@
 """Two images on one canvas: where each stands, its lines and points in pixels of the canvas, a caption below."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 
@@ -37,7 +35,6 @@ class Place:
         return np.asarray((x + 0.5) * scale - 0.5 + self.origin, np.float64)
 
     def view(self, canvas: Image) -> Image:
-        """The image's part of the canvas."""
         return canvas[self.origin[1] : self.origin[1] + self.size[1], self.origin[0] : self.origin[0] + self.size[0]]
 
     def clip(self, line: Points) -> NDArray[np.float64]:
@@ -86,7 +83,6 @@ def placed(image0: Image, image1: Image, height: int | None) -> tuple[Image, Pla
 
 
 def _faded(image: Image, size: tuple[int, int]) -> Image:
-    """The image in another size (w, h) and paler colours."""
     shrinks = size[0] < image.shape[1]
     image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC), np.uint8)
     if image.ndim == 2:
@@ -248,13 +244,9 @@ def _lines(place: Place, matrices: Sequence[Points], points: Points) -> list[lis
 
 
 def _lines_and_points(
-    canvas: Image,
-    place: Place,
-    lines: Sequence[Sequence[NDArray[np.float64]]],
-    points: Points,
-    colour: int,
+    canvas: Image, place: Place, lines: Sequence[Sequence[NDArray[np.float64]]], points: Points, colour: int,
     line_colour: int | None = None,
-) -> None:
+) -> None:  # fmt: skip
     """Draw in one image lines and, dashed and white, true lines if `lines` has them; then points on top.
 
     colour, line_colour: the colours' numbers of the first point and, if it is another, the first line.

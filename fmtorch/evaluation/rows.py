@@ -3,8 +3,6 @@
 Metrics are float64 and computed on the CPU: so little work needs no GPU.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 import time
@@ -151,7 +149,6 @@ def pose_errors(outcomes: Sequence[Outcome], signed: bool = False) -> list[PairP
 
 
 def _without_estimate(outcome: Outcome, signed: bool) -> PairPose:
-    """What is known before F is looked at."""
     if (missing := _unknown(outcome.pair)) is not None:
         return PairPose(None, None, missing)
     if not outcome.solved:
@@ -160,7 +157,6 @@ def _without_estimate(outcome: Outcome, signed: bool) -> PairPose:
 
 
 def _unknown(pair: ImagePair) -> str | None:
-    """Why the true pose of a pair is not known; None where it is."""
     values = {"K0": pair.K0, "K1": pair.K1, "R": pair.R, "t": pair.t}
     if missing := [name for name, value in values.items() if value is None]:
         return f"{', '.join(missing)} unknown"
@@ -169,7 +165,6 @@ def _unknown(pair: ImagePair) -> str | None:
 
 
 def _has_pose(outcome: Outcome) -> bool:
-    """Whether the estimator gives a pose, which may not be determined."""
     return outcome.estimate is not None and outcome.estimate.R is not None
 
 

@@ -5,8 +5,6 @@ where detectors, networks and OpenCV do the work. Processes use all cores for es
 hundred megabytes each. Rows and exports come back to the caller, who alone writes.
 """
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import functools
@@ -24,8 +22,7 @@ from torch import Tensor
 from fmtorch import presets
 from fmtorch.core.stages import Estimator, ImageMatcher
 from fmtorch.core.types import Correspondences, Estimate
-from fmtorch.data.image_cameras import exif_focal
-from fmtorch.data.pairs import GivenMatches, ImagePair, ImageSource
+from fmtorch.data import GivenMatches, ImagePair, ImageSource, exif_focal
 from fmtorch.evaluation.rows import evaluate
 from fmtorch.io.match_store import MatchRecords, MatchStore
 from fmtorch.jit import kernel
@@ -34,8 +31,7 @@ from fmtorch.jobs.runner import Factory, Local, Source, TaskRunner, WorkerPool
 from fmtorch.pipeline.exporting import match_records
 from fmtorch.pipeline.pipeline import Outcome, Pipeline, examined
 from fmtorch.presets import plain
-from fmtorch.runs import PairRow
-from fmtorch.runs.feature_cache import CachedFeatures
+from fmtorch.runs import CachedFeatures, PairRow
 from fmtorch.runs.fingerprint import code_digest, file_digest, fmtorch_version, learned, libraries
 from fmtorch.two_view.known_cameras import KnownCameras
 from fmtorch.two_view.pair_type import compile_with
@@ -45,13 +41,9 @@ PLACES = ("root", "file", "truth", "images")
 
 
 def run_identity(
-    config: DictConfig,
-    pipeline_name: str,
-    pipeline: Pipeline,
-    dataset_digest: str,
-    cameras: str | None = None,
+    config: DictConfig, pipeline_name: str, pipeline: Pipeline, dataset_digest: str, cameras: str | None = None,
     signed: bool = False,
-) -> dict[str, Any]:
+) -> dict[str, Any]:  # fmt: skip
     """The identity of a run, as plain values.
 
     Args:
@@ -83,7 +75,6 @@ def run_identity(
 
 
 def _learned(stages: Mapping[str, Any], pipeline: Pipeline) -> dict[str, list[str]]:
-    """Digests of the learned files and networks of each stage that has some."""
     extractor = pipeline.extractor
     parts: dict[str, list[object]] = {
         "features": [extractor.extractor if isinstance(extractor, CachedFeatures) else extractor],
@@ -113,7 +104,6 @@ def _files(config: object, option: str = "") -> Iterator[str]:
 
 
 def _code(config: object) -> dict[str, str]:
-    """Digests of the sources that define the parts of the user's own, by the names of these."""
     digests = {}
     for target, module in presets.own_modules(config).items():
         try:
@@ -182,16 +172,13 @@ class WithPairCameras:
         self._estimator, self.cameras = KnownCameras(estimator), dict(cameras)
 
     def __call__(self, c: Correspondences, seed: int = 0) -> Estimate:
-        """Estimate F, focal lengths and pose of each pair."""
         return self._estimator(self.given(c), seed)
 
     @property
     def kernels(self) -> Sequence[object]:
-        """Those of the estimator worth compiling together."""
         return getattr(self._estimator.estimator, "kernels", ())
 
     def given(self, c: Correspondences) -> Correspondences:
-        """The matches with what is known of their cameras."""
         own = [self.cameras[key] for key in c.keys.tolist()]
         K0, K1 = (_stacked(K, c.mask.device) for K in ([each.K0 for each in own], [each.K1 for each in own]))
         focal = torch.stack([each.focal for each in own]).to(c.mask.device)
@@ -238,13 +225,15 @@ class Batch:
 class Work:
     """The rows of a batch.
 
-    computed, from_cache: images whose features a process computed or took from the cache for it.
+    computed, from_cache: images whose features a process computed or took from the cache for it. tracebacks: of
+    `Pipeline.tracebacks`.
     """
 
     rows: list[PairRow]
     computed: int = 0
     from_cache: int = 0
     records: MatchRecords | None = None
+    tracebacks: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
 
 def evaluate_batch(pipeline: Pipeline, batch: Batch) -> Work:
@@ -263,7 +252,7 @@ def evaluate_batch(pipeline: Pipeline, batch: Batch) -> Work:
         for key in batch.cameras:
             pipeline.estimator.cameras.pop(key, None)
     counts = (cache.computed - computed, cache.found - from_cache) if cache else (0, 0)
-    return Work(rows, *counts, records)
+    return Work(rows, *counts, records, dict(pipeline.tracebacks))
 
 
 def divided(batch: Batch) -> list[Batch]:
@@ -322,7 +311,7 @@ def batch_contents(pairs: list[ImagePair]) -> list[ImagePair]:
 
 
 BATCHES_OF_A_WORKER = 4  # at least, where there are pairs enough
-PRELOADED = ("fmtorch.evaluation.run",)  # by the process that workers are forked of
+PRELOADED = (__name__,)  # by the process that workers are forked of
 
 
 def select(pairs: Sequence[ImagePair], limit: int | None) -> list[ImagePair]:
@@ -340,18 +329,10 @@ def select(pairs: Sequence[ImagePair], limit: int | None) -> list[ImagePair]:
 
 
 def evaluate_pairs(
-    pipeline: Pipeline,
-    pairs: Sequence[ImagePair],
-    *,
-    seed: int,
-    batch: int,
-    execution: Execution,
-    store: Callable[[list[PairRow]], None],
-    build: Build | None = None,
-    cameras: Mapping[int, PairCameras] | None = None,
-    journal: MatchStore | None = None,
-    signed: bool = False,
-) -> Iterator[int]:
+    pipeline: Pipeline, pairs: Sequence[ImagePair], *, seed: int, batch: int, execution: Execution,
+    store: Callable[[list[PairRow]], None], build: Build | None = None,
+    cameras: Mapping[int, PairCameras] | None = None, journal: MatchStore | None = None, signed: bool = False,
+) -> Iterator[int]:  # fmt: skip
     """Run and evaluate the pairs, hand each batch's rows to `store`, and yield how many pairs it held.
 
     execution: by which workers. build: makes the same pipeline in another process, where these are no threads.
@@ -373,6 +354,7 @@ def evaluate_pairs(
         if journal is not None and work.records is not None:
             journal.add(work.records)
         store(work.rows)
+        pipeline.tracebacks |= work.tracebacks
         if isinstance(pipeline.extractor, CachedFeatures):
             pipeline.extractor.computed += work.computed
             pipeline.extractor.found += work.from_cache

@@ -9,8 +9,6 @@ Science 2001), of the effective number of pairs (Korn and Graubard, "Confidence 
 expected number of positive counts estimated from survey data", Survey Methodology 1998).
 """
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import math
@@ -58,8 +56,7 @@ class Interval:
     high: float
     over: str
 
-    def scaled(self, scale: float) -> Interval:
-        """The same in another unit."""
+    def scaled(self, scale: float) -> "Interval":
         return Interval(scale * self.value, scale * self.low, scale * self.high, self.over)
 
     def __format__(self, form: str) -> str:
@@ -222,7 +219,6 @@ def unit(scenes: Sequence[str]) -> str:
 
 
 def _clusters(scenes: Sequence[str]) -> NDArray[np.int64]:
-    """The number of each pair's unit."""
     if unit(scenes) == "pair":
         return np.arange(len(scenes))
     numbers: NDArray[np.int64] = np.unique(np.asarray(scenes), return_inverse=True)[1]
@@ -397,13 +393,11 @@ def _group(table: pa.Table, signed: bool) -> Group:
 
 
 def _column(table: pa.Table, name: str) -> NDArray[np.float64]:
-    """A column as float64, null as NaN."""
     values: NDArray[np.float64] = table[name].cast(pa.float64()).to_numpy().astype(np.float64)
     return values
 
 
 def _mean(values: NDArray[np.float64]) -> float | None:
-    """The mean of what is not NaN."""
     known = values[~np.isnan(values)]
     return float(known.mean()) if len(known) else None
 

@@ -1,7 +1,5 @@
 """The data set `h5`: pairs whose matches somebody else computed, in the layouts that the field exchanges."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import hashlib
@@ -11,26 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from fmtorch.data.files import DataError, given_root
-from fmtorch.data.fmbench import FMBenchPairs
-from fmtorch.data.images import stored_size
-from fmtorch.data.pairs import GivenMatches, ImagePair, ImageSource, PairDataset
-from fmtorch.io import h5
-from fmtorch.io.predictions import (
-    Array,
-    Size,
-    broken,
-    calibrated,
-    expect_size,
-    given,
-    hloc_pairs,
-    image,
-    posed,
-    predicted_pairs,
-    size_by_centre,
-    size_by_points,
-    with_fundamentals,
-)
+from fmtorch.data import DataError, FMBenchPairs, GivenMatches, ImagePair, ImageSource, PairDataset, stored_size
+from fmtorch.data.files import given_root
+from fmtorch.io import h5, predictions
+from fmtorch.io.predictions import Array, Size
 
 MATCHES, RATIOS, CALIBRATIONS, ROTATIONS, TRANSLATIONS, TRUTH = (
     f"{name}.h5" for name in ("matches", "match_conf", "K1_K2", "R", "T", "Fgt")
@@ -46,7 +28,6 @@ class TutorialMatches:
     sizes: tuple[Size, Size]
 
     def __call__(self) -> GivenMatches:
-        """Read them. Raises DataError naming file and key."""
         with h5.opened(self.folder / MATCHES) as file:
             points = h5.numbers(file, self.key, None, 4)
         ratios = None
@@ -58,7 +39,7 @@ class TutorialMatches:
                     f"{self.folder / RATIOS}: {self.key!r} has {len(ratios)} entries, "
                     f"but {MATCHES} has {len(points)} matches of that pair"
                 )
-        return given(points[:, :2], points[:, 2:], self.sizes, (len(points), len(points)), ratio=ratios)
+        return predictions.given(points[:, :2], points[:, 2:], self.sizes, (len(points), len(points)), ratio=ratios)
 
 
 def tutorial_files(root: Path) -> list[Path]:
@@ -75,7 +56,7 @@ def tutorial_pairs(root: Path, images: Path | None) -> Iterator[ImagePair]:
         with contextlib.ExitStack() as files:
             cameras = _Cameras(folder, files)
             pairs = [_pair(root, folder, key, cameras, images) for key in names]
-        yield from with_fundamentals(pairs) if cameras.by_image else pairs
+        yield from predictions.with_fundamentals(pairs) if cameras.by_image else pairs
 
 
 def scenes(root: Path) -> list[Path]:
@@ -108,7 +89,7 @@ class _Cameras:
     def image(self, family: str, name: str, images: Path | None) -> ImageSource:
         """An image of the scene, the same object for all pairs that show it."""
         if name not in self._images:
-            self._images[name] = image(family, self.folder.name, name, images)
+            self._images[name] = predictions.image(family, self.folder.name, name, images)
         return self._images[name]
 
     def split(self, key: str) -> tuple[str, str]:
@@ -145,9 +126,9 @@ class _Cameras:
 
 def _size(source: ImageSource, K: Array, images: Path | None) -> Size:
     """(h, w) of an image, by its principal point where there is no file. Raises DataError where the two disagree."""
-    by_centre, size = size_by_centre(K), stored_size(source.path) if images else None
+    by_centre, size = predictions.size_by_centre(K), stored_size(source.path) if images else None
     if size is not None:
-        expect_size(source, size, K)
+        predictions.expect_size(source, size, K)
     return size or by_centre
 
 
@@ -167,14 +148,14 @@ def _pair(root: Path, folder: Path, key: str, cameras: _Cameras, images: Path | 
             (R0, t0), (R1, t1) = cameras.by_image[name0], cameras.by_image[name1]
             R = R1 @ R0.T
             matches = TutorialMatches(folder, key, sizes)
-            return posed(identity, family, scene, sources, (K0, K1), R, t1 - R @ t0, matches)
+            return predictions.posed(identity, family, scene, sources, (K0, K1), R, t1 - R @ t0, matches)
         F = cameras.truth(key)
         norm = float(np.linalg.norm(F))
         problem = None if norm else f"{folder / TRUTH}: {key!r} is zero"
         pair = ImagePair(identity, family, scene, *sources, F / (norm or 1.0), K0, K1, problem=problem)
     except DataError as error:
-        unnamed = image(family, scene, key, images)
-        return broken(identity, family, scene, sources or (unnamed, unnamed), str(error))
+        unnamed = predictions.image(family, scene, key, images)
+        return predictions.broken(identity, family, scene, sources or (unnamed, unnamed), str(error))
     return dataclasses.replace(pair, matches=TutorialMatches(folder, key, sizes))
 
 
@@ -196,16 +177,15 @@ class PoseBenchMatches:
     sizes: tuple[Size | None, Size | None]
 
     def __call__(self) -> GivenMatches:
-        """Read them. Raises DataError naming file and key."""
         with h5.opened(self.path) as file:
             x0, x1 = (h5.numbers(file, f"{self.key}/{name}", None, 2) for name in ("x1", "x2"))
         if len(x0) != len(x1):
             raise DataError(f"{self.path}: {self.key!r} has {len(x0)} points in x1 and {len(x1)} in x2")
         size0, size1 = (
-            size_by_points(K, x) if size is None else size
+            predictions.size_by_points(K, x) if size is None else size
             for size, K, x in zip(self.sizes, self.K, (x0, x1), strict=True)
         )
-        return given(x0, x1, (size0, size1), (len(x0), len(x1)))
+        return predictions.given(x0, x1, (size0, size1), (len(x0), len(x1)))
 
 
 def posebench_pairs(root: Path, images: Path | None) -> Iterator[ImagePair]:
@@ -218,7 +198,7 @@ def posebench_pairs(root: Path, images: Path | None) -> Iterator[ImagePair]:
 
 def _posebench_pair(file: Any, path: Path, family: str, key: str, images: Path | None) -> ImagePair:
     scene, identity = path.stem, f"{path.stem}/{key}"
-    sources = image(family, scene, f"{key}/1", images), image(family, scene, f"{key}/2", images)
+    sources = predictions.image(family, scene, f"{key}/1", images), predictions.image(family, scene, f"{key}/2", images)
     try:
         (K0, size0), (K1, size1) = (
             _camera(file, path, f"{key}/{name}", source)
@@ -226,13 +206,12 @@ def _posebench_pair(file: Any, path: Path, family: str, key: str, images: Path |
         )
         R, t = h5.reshaped(file, f"{key}/R", 3, 3), h5.reshaped(file, f"{key}/t", 3)
     except DataError as error:
-        return broken(identity, family, scene, sources, str(error))
-    pair = calibrated(identity, family, scene, sources, (K0, K1), R, t)
+        return predictions.broken(identity, family, scene, sources, str(error))
+    pair = predictions.calibrated(identity, family, scene, sources, (K0, K1), R, t)
     return dataclasses.replace(pair, matches=PoseBenchMatches(path, key, (K0, K1), (size0, size1)))
 
 
 def _camera(file: Any, path: Path, key: str, source: ImageSource) -> tuple[Array, Size | None]:
-    """Calibration matrix, and size where the file or the image tells it."""
     model = h5.text(file, f"{key}/model")
     parameters = h5.numbers(file, f"{key}/params").reshape(-1)
     count = FOCAL_LENGTHS.get(model)
@@ -250,7 +229,7 @@ def _camera(file: Any, path: Path, key: str, source: ImageSource) -> tuple[Array
         return K, (sides[0], sides[1])
     size = stored_size(source.path)
     if size is not None:
-        expect_size(source, size, K)
+        predictions.expect_size(source, size, K)
     return K, size
 
 
@@ -272,19 +251,14 @@ class OANetMatches:
     sizes: tuple[Size, Size]
 
     def __call__(self) -> GivenMatches:
-        """Read them, in pixels. Raises DataError naming file and key."""
         with h5.opened(self.path) as file:
             rays = h5.numbers(file, f"xs/{self.key}", 1, None, 4)[0]
             ratios, mutuals = (self._side(file, name, len(rays)) for name in ("ratios", "mutuals"))
         x0, x1 = (x * K.diagonal()[:2] + K[:2, 2] for x, K in zip((rays[:, :2], rays[:, 2:]), self.K, strict=True))
-        return given(
-            x0,
-            x1,
-            self.sizes,
-            (len(rays), len(rays)),
-            ratio=ratios,
+        return predictions.given(
+            x0, x1, self.sizes, (len(rays), len(rays)), ratio=ratios,
             mutual=None if mutuals is None else mutuals.astype(bool),
-        )
+        )  # fmt: skip
 
     def _side(self, file: Any, name: str, count: int) -> Array | None:
         if not h5.holds(file, name):
@@ -310,14 +284,14 @@ def oanet_pairs(root: Path, images: Path | None) -> Iterator[ImagePair]:
 
 def _oanet_pair(file: Any, path: Path, family: str, key: str, images: Path | None) -> ImagePair:
     scene, identity = path.stem, f"{path.stem}/{key}"
-    sources = image(family, scene, f"{key}/1", images), image(family, scene, f"{key}/2", images)
+    sources = predictions.image(family, scene, f"{key}/1", images), predictions.image(family, scene, f"{key}/2", images)
     try:
         K = _calibration(file, key, 1), _calibration(file, key, 2)
         R, t = h5.reshaped(file, f"Rs/{key}", 3, 3), h5.reshaped(file, f"ts/{key}", 3)
-        sizes = size_by_centre(K[0]), size_by_centre(K[1])
+        sizes = predictions.size_by_centre(K[0]), predictions.size_by_centre(K[1])
     except DataError as error:
-        return broken(identity, family, scene, sources, str(error))
-    pair = calibrated(identity, family, scene, sources, K, R, t)
+        return predictions.broken(identity, family, scene, sources, str(error))
+    pair = predictions.calibrated(identity, family, scene, sources, K, R, t)
     return dataclasses.replace(pair, matches=OANetMatches(path, key, K, sizes))
 
 
@@ -359,15 +333,10 @@ class H5Pairs(PairDataset):
     name = "h5"
 
     def __init__(
-        self,
-        root: str | Path | None = None,
-        layout: str = "hloc",
-        truth: str | Path | None = None,
-        images: str | Path | None = None,
-        features: str | None = None,
-        matches: str | None = None,
+        self, root: str | Path | None = None, layout: str = "hloc", truth: str | Path | None = None,
+        images: str | Path | None = None, features: str | None = None, matches: str | None = None,
         origin: float | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         if layout not in LAYOUTS:
             raise DataError(f"no layout {layout!r}; it must be one of {', '.join(LAYOUTS)}")
         folder = given_root(root, "h5", "the file, or the folder of the files, that hold the matches")
@@ -392,11 +361,11 @@ class H5Pairs(PairDataset):
             offset = WITHOUT_GEOMETRY[layout] if origin is None else origin
             if layout == "hloc":
                 files = [_file_of_kind(folder, features, "features"), _file_of_kind(folder, matches, "matches")]
-                self._pairs = list(hloc_pairs(known, files[0], files[1], offset))
+                self._pairs = list(predictions.hloc_pairs(known, files[0], files[1], offset))
             else:
                 _expect_unset(layout, features=features)
                 files = [_file_of_kind(folder, matches, "matches") if matches else _only(folder)]
-                self._pairs = list(predicted_pairs(known, files[0], offset))
+                self._pairs = list(predictions.predicted_pairs(known, files[0], offset))
         for path in files:
             h5.add_to_digest(digest, path)
         if not self._pairs:
@@ -419,7 +388,6 @@ def _truth(layout: str, truth: str | Path | None) -> PairDataset:
 
 
 def _expect_distinct(pairs: list[ImagePair], folder: Path) -> None:
-    """Raises DataError where one file would stand for images of two scenes."""
     seen: dict[Path, str] = {}
     for pair in pairs:
         for path in (pair.image0.path, pair.image1.path):
@@ -431,9 +399,8 @@ def _expect_distinct(pairs: list[ImagePair], folder: Path) -> None:
 
 
 def _expect_unset(layout: str, **options: Any) -> None:
-    given = [name for name, value in options.items() if value is not None]
-    if given:
-        raise DataError(f"layout {layout} takes no {' or '.join(given)}")
+    if unwanted := [name for name, value in options.items() if value is not None]:
+        raise DataError(f"layout {layout} takes no {' or '.join(unwanted)}")
 
 
 def _file_of_kind(folder: Path, name: str | None, kind: str) -> Path:

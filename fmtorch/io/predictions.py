@@ -1,7 +1,5 @@
 """Matches that other programs stored for the pairs of a data set: hloc's, glue-factory's and vismatch's files."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -12,9 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from fmtorch.core.types import Correspondences
-from fmtorch.data.files import DataError
-from fmtorch.data.images import stored_size
-from fmtorch.data.pairs import GivenMatches, ImagePair, ImageSource, PairDataset
+from fmtorch.data import DataError, GivenMatches, ImagePair, ImageSource, PairDataset, stored_size
 from fmtorch.geometry.cameras import fundamental_from_projections
 from fmtorch.io import h5
 
@@ -25,15 +21,9 @@ _ZERO = np.zeros((3, 3))  # where there is no F
 
 
 def given(
-    x0: Array,
-    x1: Array,
-    sizes: tuple[Size, Size],
-    features: tuple[int, int],
-    *,
-    ratio: Array | None = None,
-    score: Array | None = None,
-    mutual: NDArray[np.bool_] | None = None,
-) -> GivenMatches:
+    x0: Array, x1: Array, sizes: tuple[Size, Size], features: tuple[int, int], *, ratio: Array | None = None,
+    score: Array | None = None, mutual: NDArray[np.bool_] | None = None,
+) -> GivenMatches:  # fmt: skip
     """Matches of one pair, (n, 2) in pixels each; those that are not finite do not count.
 
     ratio, score, mutual: (n,), as of `Correspondences`. features: how many keypoints each image has.
@@ -202,7 +192,6 @@ class HLocMatches:
     origin: float
 
     def __call__(self) -> GivenMatches:
-        """Read them. Raises DataError naming file and key."""
         with h5.opened(self.features) as file:
             points = [_keypoints(file, self.features, name) - self.origin for name in self.names]
             sizes = tuple(
@@ -215,12 +204,9 @@ class HLocMatches:
         index = (j, i) if self.swapped else (i, j)
         score = None if scores is None else scores[i]
         return given(
-            points[0][index[0]],
-            points[1][index[1]],
-            (sizes[0], sizes[1]),
-            (len(points[0]), len(points[1])),
+            points[0][index[0]], points[1][index[1]], (sizes[0], sizes[1]), (len(points[0]), len(points[1])),
             score=score,
-        )
+        )  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)
@@ -238,7 +224,6 @@ class PairPrediction:
     origin: float
 
     def __call__(self) -> GivenMatches:
-        """Read them. Raises DataError naming file and key."""
         with h5.opened(self.path) as file:
             group = file[self.key]
             if h5.holds(group, "matches0"):
@@ -301,7 +286,9 @@ def hloc_pairs(truth: PairDataset, features: Path, matches: Path, origin: float)
 def predicted_pairs(truth: PairDataset, path: Path, origin: float) -> Iterator[ImagePair]:
     """The pairs of a data set with predictions for them; a pair without has a problem."""
     with h5.opened(path) as file:
-        stored = set(_groups(file))
+        stored = set(h5.groups_with(file, "matches0", "matched_kpts0"))
+        if not stored:
+            raise DataError(f"{path}: holds no group with matches0 or matched_kpts0")
     for pair in truth:
         images = pair.image0, pair.image1
         for key, swapped in (*pair_keys(pair), (pair.identity, False)):
@@ -317,7 +304,6 @@ def _without(pair: ImagePair, problem: str) -> ImagePair:
 
 
 def _expect_distinct(names: dict[str, str | None], path: Path) -> None:
-    """Raises DataError where one stored image would stand for two of the data set."""
     seen: dict[str, str] = {}
     for identity, name in names.items():
         if name is not None and seen.setdefault(name, identity) != identity:
@@ -327,26 +313,7 @@ def _expect_distinct(names: dict[str, str | None], path: Path) -> None:
             )
 
 
-def _groups(file: Any) -> list[str]:
-    """The paths of the groups that hold a prediction."""
-    groups: list[str] = []
-
-    def visit(name: str) -> None:
-        head, _, last = name.rpartition("/")
-        if last in ("matches0", "matched_kpts0") and head:
-            groups.append(head)
-
-    try:
-        file.visit(visit)
-    except (OSError, RuntimeError) as error:
-        raise DataError(f"{file.filename}: its keys cannot be read ({str(error).splitlines()[0]})") from error
-    if not groups:
-        raise DataError(f"{file.filename}: holds no group with matches0 or matched_kpts0")
-    return groups
-
-
 def _read_indices(file: Any, path: Path, key: str) -> tuple[NDArray[np.int64], Array | None]:
-    """``matches0`` and, where there are any, ``matching_scores0`` of a group."""
     prefix = f"{key}/" if key else ""
     chosen = h5.array(file, f"{prefix}matches0", None)
     if chosen.dtype.kind not in "iu":
@@ -370,7 +337,6 @@ def _indices(chosen: NDArray[np.int64], counts: list[int], where: str) -> tuple[
 
 
 def _keypoints(file: Any, path: Path, name: str) -> Array:
-    """x and y of an image's keypoints, which may come with scales. Raises DataError for fewer columns."""
     points = h5.numbers(file, f"{name}/keypoints", None, None)
     if points.shape[1] < 2:
         raise DataError(f"{path}: {name + '/keypoints'!r} has shape {points.shape}; it must be (n, 2) or wider")

@@ -1,7 +1,5 @@
 """How many threads a stage, a worker or a loop over pairs computes with, and how a caller asks for workers."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import os
@@ -47,10 +45,9 @@ class Execution:
 
     @property
     def shared(self) -> bool:
-        """Whether workers are threads of this process."""
         return self.make is None and self.kind == "threads"
 
-    def decided(self, processes: bool) -> Execution:
+    def decided(self, processes: bool) -> "Execution":
         """The same with "auto" as processes, or as threads: one worker is a thread in any case."""
         several = (self.workers or cores()) > 1
         kind = "processes" if processes and several else "threads"

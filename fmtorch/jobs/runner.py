@@ -5,8 +5,6 @@ of anybody's executor, has no start of its own in which to make it: each task na
 says nothing to the worker, the task is sent again with how to make it.
 """
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import hashlib
@@ -60,7 +58,7 @@ class WorkerPool:
     """
 
     def __init__(
-        self, execution: Execution, preload: Sequence[str] = ("fmtorch.jobs.runner",), limit: int | None = None,
+        self, execution: Execution, preload: Sequence[str] = (__name__,), limit: int | None = None,
         needs_main: bool = True,
     ) -> None:  # fmt: skip
         self.execution, self.preload, self.needs_main = execution, preload, needs_main
@@ -69,7 +67,7 @@ class WorkerPool:
         self._executor: Executor | None = None
         self._cluster: _Cluster | None = None
 
-    def __enter__(self) -> WorkerPool:
+    def __enter__(self) -> "WorkerPool":
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -77,7 +75,6 @@ class WorkerPool:
 
     @property
     def executor(self) -> Executor:
-        """The executor that works now."""
         if self._executor is None:
             self._executor = self._started()
         return self._executor
@@ -94,7 +91,6 @@ class WorkerPool:
             self._executor = None
 
     def close(self) -> None:
-        """Wait for what is under way; what has not begun must have been cancelled."""
         if self._cluster is not None:
             self._cluster.close()
         elif self._executor is not None:
@@ -140,7 +136,6 @@ class _WithoutMain(ProcessPoolExecutor):
     """Processes that do not import this one's main module: they start within `submit`, as if it were empty."""
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """As of the base class."""
         main = sys.modules["__main__"]
         sys.modules["__main__"] = types.ModuleType("__main__")
         try:
@@ -207,7 +202,6 @@ class _Cluster:
         self._threads, self._counted = 1, 0.0
 
     def threads(self) -> int:
-        """How many tasks the workers do at a time, counted now and then: workers join and leave."""
         if time.monotonic() - self._counted > SECONDS_BETWEEN_COUNTS:
             try:
                 self._threads = max(1, sum(self.client.nthreads().values()))
@@ -221,7 +215,6 @@ class _Cluster:
         return isinstance(error, CancelledError) or self.client.status != "running"
 
     def close(self) -> None:
-        """Leave the cluster, and end one of this machine."""
         self.client.close(timeout=SECONDS_TO_CONNECT)
         if self._local is not None:
             self._local.close(timeout=SECONDS_TO_CONNECT)
@@ -397,7 +390,6 @@ class TaskRunner(Generic[Task]):
             yield from self._alone(suspects.pop(0), suspects)
 
     def _done(self, task: Task, result: Any) -> bool:
-        """Keep a result; False where the worker first needs the factory, with which the task is sent again."""
         if isinstance(result, NeedsFactory):
             self._submit(task, with_factory=True)
             return False

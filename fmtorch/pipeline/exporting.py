@@ -1,7 +1,5 @@
 """What a pipeline made of pairs, kept for export: keypoints of images, matches, F and inliers of pairs."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """Photographs for a pipeline: what is known of their cameras, and how they are reduced for matching."""
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Mapping, Sequence
@@ -16,10 +14,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from fmtorch.core.types import Correspondences
-from fmtorch.data.cameras import Lens, undistorted_frames, undistorted_points
-from fmtorch.data.image_cameras import ImageCameras, exif_focal
-from fmtorch.data.images import read_image
-from fmtorch.data.pairs import ImageSource
+from fmtorch.data import ImageCameras, ImageSource, Lens, exif_focal, read_image
+from fmtorch.data.cameras import undistorted_frames, undistorted_points
 from fmtorch.geometry.cameras import calibration_problems
 from fmtorch.geometry.epipolar import unit_frobenius
 from fmtorch.io.match_store import PairGeometry
@@ -84,7 +80,6 @@ class PhotographCameras:
         return ImageSource(path.name, path, None if self._stored is None else self._stored.of(path).size)
 
     def of(self, path: Path, size: tuple[int, int]) -> PhotographCamera:
-        """The camera of a photograph of that size (h, w)."""
         if (path, size) not in self._known:
             self._known[path, size] = self._of(path, size)
         return self._known[path, size]
@@ -132,7 +127,6 @@ class PhotographCameras:
 
 
 def _pinhole(K: str | Sequence[float | int]) -> Lens:
-    """Of fx, fy, cx, cy. Raises ValueError for anything else."""
     words = K.replace(",", " ").replace("[", " ").replace("]", " ").split() if isinstance(K, str) else K
     try:
         numbers = [float(word) for word in words]

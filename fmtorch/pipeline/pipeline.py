@@ -1,7 +1,5 @@
 """The four stages in a row: features, matching, pruning, estimation; batching, timing, failures as data."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import threading
@@ -18,6 +16,7 @@ from hydra.errors import HydraException
 from numpy.typing import NDArray
 from omegaconf import DictConfig
 
+from fmtorch.core.failures import own_traceback, place_of
 from fmtorch.core.stages import (
     Estimator,
     FeatureExtractor,
@@ -30,11 +29,11 @@ from fmtorch.core.stages import (
     TimedExtractor,
     grey_pyramid,
     model_of,
+    output_of,
     pruned,
 )
 from fmtorch.core.types import Correspondences, Estimate, Features, collate
-from fmtorch.data.images import read_image, to_grey
-from fmtorch.data.pairs import GivenMatches, ImagePair, ImageSource
+from fmtorch.data import GivenMatches, ImagePair, ImageSource, read_image, to_grey
 from fmtorch.geometry.significance import judged
 from fmtorch.jobs.execution import one_thread
 from fmtorch.presets.composition import PIPELINES, build_pruners, compose, plain
@@ -125,7 +124,6 @@ class Outcome:
 
     @property
     def solved(self) -> bool:
-        """Whether there is an F."""
         return self.estimate is not None and bool(self.estimate.ok[0])
 
 
@@ -148,14 +146,16 @@ def collated(outcomes: Sequence[Outcome]) -> Correspondences:
 
 
 def described(stage: str, error: Exception) -> str:
-    """What a stage raised, as a reason of one line."""
-    return f"{stage}: {type(error).__name__}: {error}".splitlines()[0]
+    """What a stage raised, as a reason of one line, with the line of a user's own code that did."""
+    place = place_of(error)
+    return f"{stage}: {type(error).__name__}: {error}".splitlines()[0] + (f" ({place})" if place else "")
 
 
 # The four stages in a row: features, matching, pruning, estimation; batching, timing, failures as data
 
 
 STAGES = ("features", "matching", "pruning", "estimation")
+MAX_TRACEBACKS = 3  # of different failures of a user's own code that are kept
 
 
 class Pipeline:
@@ -165,20 +165,16 @@ class Pipeline:
     grey levels where a pruner looks at them.
     families: by family, pruners that its pairs get in place of those of the same names.
     model: what the estimator must give, "fundamental" or "homography" (`Estimate.model`); None: either.
+    debug: raise what a stage raises, which otherwise becomes the reason for its pair's failure.
+    tracebacks: of stages that are a user's own code and raised something, by what is said of it.
     """
 
     def __init__(
-        self,
-        features: FeatureExtractor,
-        matcher: Matcher,
-        pruners: Mapping[str, Pruner],
-        estimator: Estimator,
-        *,
-        device: torch.device | str = "cpu",
-        memory: int = 64,
-        families: Mapping[str, Mapping[str, Pruner]] | None = None,
-        model: str | None = "fundamental",
-    ) -> None:
+        self, features: FeatureExtractor, matcher: Matcher, pruners: Mapping[str, Pruner], estimator: Estimator, *,
+        device: torch.device | str = "cpu", memory: int = 64,
+        families: Mapping[str, Mapping[str, Pruner]] | None = None, model: str | None = "fundamental",
+        debug: bool = False,
+    ) -> None:  # fmt: skip
         if model is not None and (gives := model_of(estimator)) != model:
             hint = ": estimator=homography" if model == "homography" else ""
             raise ValueError(f"the estimator gives {gives} matrices; a pipeline needs {model} matrices here{hint}")
@@ -186,6 +182,7 @@ class Pipeline:
         self.families = dict(families or {})
         self.memory = memory
         self.device = torch.device(device)
+        self.debug, self.tracebacks = debug, dict[str, str]()
         self._memo: Memo[Hashable, tuple[Features, float]] = Memo(memory)
         self._pyramids: Memo[Hashable, GreyPyramid] = Memo(memory)
         every = [self.pruners, *self.families.values()]
@@ -215,7 +212,7 @@ class Pipeline:
             features, seconds = self.extractor.timed(image)
             return features.to(self.device), seconds
         start = time.perf_counter()
-        features = self.extractor(image).to(self.device)
+        features = output_of(self.extractor, self.extractor(image), Features).to(self.device)
         synchronise(self.device)
         return features, time.perf_counter() - start
 
@@ -224,11 +221,19 @@ class Pipeline:
         return self._batched("pruning", self._prune, [self._match(pair) for pair in pairs])
 
     def estimate(self, outcomes: Sequence[Outcome], seed: int = 0) -> list[Outcome]:
-        """The last stage, for outcomes of `correspondences`."""
         return self._batched("estimation", functools.partial(self._estimate, seed=seed), outcomes)
 
+    def matched(self, features0: Features, features1: Features) -> Correspondences:
+        """The matcher's matches of two images."""
+        c = self.matcher(features0, features1)
+        return output_of(self.matcher, c, Correspondences, like=features0.lafs)
+
+    def estimated(self, c: Correspondences, seed: int = 0, estimator: Estimator | None = None) -> Estimate:
+        """The estimate of a batch with its significance; estimator: another one than the pipeline's."""
+        used = estimator or self.estimator
+        return judged(expect_finite(output_of(used, used(c, seed), Estimate, c).detach()), c)
+
     def run(self, pairs: Sequence[ImagePair], seed: int = 0) -> list[Outcome]:
-        """Take a batch of pairs through all four stages."""
         return self.estimate(self.correspondences(pairs), seed)
 
     def _batched(
@@ -240,8 +245,14 @@ class Pipeline:
         with one_thread(self.device):
             try:
                 results = function([outcomes[i] for i in matched]) if matched else []
-            except Exception:  # whose fault it is shows pair by pair
-                results = [_alone(stage, function, outcomes[i]) for i in matched]
+            except Exception as error:  # whose fault it is shows pair by pair
+                if self.debug:
+                    raise
+                results = [self._alone(stage, function, outcomes[i]) for i in matched]
+                if all(result.correspondences is not None for result in results):
+                    reason = described(stage, error)
+                    said = f"of a batch of {len(matched)} pairs, though of each alone it does not: {reason}"
+                    self.tracebacks.setdefault(said, own_traceback(error))
         synchronise(self.device)
         share = (time.perf_counter() - start) / max(len(matched), 1)
         result = list(outcomes)
@@ -259,7 +270,7 @@ class Pipeline:
         try:
             (features0, seconds0), (features1, seconds1) = self.features(pair.image0), self.features(pair.image1)
         except Exception as error:  # a pair that fails becomes a row with this reason
-            return Outcome(pair, reason=described("features", error))
+            return Outcome(pair, reason=self._failure("features", error))
         seconds = {"features": seconds0 + seconds1}
         counts = (len(features0), len(features1))
         if min(counts) == 0:
@@ -267,9 +278,9 @@ class Pipeline:
             return Outcome(pair, counts, seconds=seconds, reason=f"no keypoints in {which}")
         start = time.perf_counter()
         try:
-            c = self.matcher(features0, features1)
+            c = self.matched(features0, features1)
         except Exception as error:
-            return Outcome(pair, counts, seconds=seconds, reason=described("matching", error))
+            return Outcome(pair, counts, seconds=seconds, reason=self._failure("matching", error))
         seconds["matching"] = time.perf_counter() - start
         images = self.images(pair) if self.looks_at_images else None
         return Outcome(pair, counts, self._with_calibrations(pair, c), None, seconds, images=images)
@@ -279,27 +290,25 @@ class Pipeline:
         try:
             images = read_image(pair.image0), read_image(pair.image1)
         except Exception as error:
-            return Outcome(pair, reason=described("images", error))
+            return Outcome(pair, reason=self._failure("images", error))
         start = time.perf_counter()
         try:
-            c = matcher.match_images(*images).to(self.device)
+            c = output_of(matcher, matcher.match_images(*images), Correspondences).to(self.device)
         except Exception as error:
-            return Outcome(pair, reason=described("matching", error))
+            return Outcome(pair, reason=self._failure("matching", error))
         seconds = {"matching": time.perf_counter() - start}
         count = int(c.count())
         pyramids = self.images(pair) if self.looks_at_images else None
         return Outcome(pair, (count, count), self._with_calibrations(pair, c), None, seconds, images=pyramids)
 
     def _given(self, pair: ImagePair, matches: Callable[[], GivenMatches]) -> Outcome:
-        """The matches that come with a pair, in place of the first two stages."""
         try:
             c, counts = matches()
         except Exception as error:  # a pair that cannot be read becomes a row with this reason
-            return Outcome(pair, reason=described("matches", error))
+            return Outcome(pair, reason=self._failure("matches", error))
         return Outcome(pair, counts, self._with_calibrations(pair, c.to(self.device)))
 
     def _with_calibrations(self, pair: ImagePair, c: Correspondences) -> Correspondences:
-        """The matches with the pair's key and calibrations."""
         K0, K1 = (
             None if K is None else torch.from_numpy(K).to(self.device, torch.float64)[None] for K in (pair.K0, pair.K1)
         )
@@ -334,19 +343,28 @@ class Pipeline:
 
     def _estimate(self, outcomes: list[Outcome], seed: int) -> list[Outcome]:
         c = collated(outcomes)
-        estimate = judged(expect_finite(self.estimator(c, seed).detach()), c)
+        estimate = self.estimated(c, seed)
         return [
             dataclasses.replace(outcome, estimate=estimate[i], reason=estimate.reason[i])
             for i, outcome in enumerate(outcomes)
         ]
 
+    def _alone(self, stage: str, function: Callable[[list[Outcome]], list[Outcome]], outcome: Outcome) -> Outcome:
+        """A stage on a single pair; what it raises becomes the reason for that pair's failure."""
+        try:
+            return function([outcome])[0]
+        except Exception as error:
+            reason = self._failure(stage, error)
+            return dataclasses.replace(outcome, correspondences=None, images=None, reason=reason)
 
-def _alone(stage: str, function: Callable[[list[Outcome]], list[Outcome]], outcome: Outcome) -> Outcome:
-    """A stage on a single pair; what it raises becomes the reason for that pair's failure."""
-    try:
-        return function([outcome])[0]
-    except Exception as error:
-        return dataclasses.replace(outcome, correspondences=None, images=None, reason=described(stage, error))
+    def _failure(self, stage: str, error: Exception) -> str:
+        """What a stage raised, as a reason, its traceback kept if it is of a user's own code; raised for `debug`."""
+        if self.debug:
+            raise error
+        reason = described(stage, error)
+        if len(self.tracebacks) < MAX_TRACEBACKS and (text := own_traceback(error)):
+            self.tracebacks.setdefault(reason, text)
+        return reason
 
 
 # Which pair types the pairs of a run are in, by the matches and what the estimator was given of the cameras
@@ -413,14 +431,10 @@ def build_pipeline(
     pruners, for_families = build_pruners(config)
     open_files([extractor, pruners, for_families], torch.device(device))  # a damaged one is no failure of each pair
     return Pipeline(
-        extractor,
-        instantiate(plain(config.matcher), "matcher"),
-        pruners,
-        instantiate(plain(config.estimator), "estimator"),
-        device=device,
-        families=for_families,
-        model=model,
-    )
+        extractor, instantiate(plain(config.matcher), "matcher"), pruners,
+        instantiate(plain(config.estimator), "estimator"), device=device, families=for_families, model=model,
+        debug=bool(config.get("debug")),
+    )  # fmt: skip
 
 
 def load_pipeline(

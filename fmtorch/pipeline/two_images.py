@@ -1,7 +1,5 @@
 """Photographs described for matching: features of each as it was reduced, and what leads back to it."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import math
@@ -16,30 +14,25 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from fmtorch import presets
-from fmtorch.core.stages import GreyPyramid, ImageMatcher, NoFeatures, PairImages, grey_pyramid, pruned
+from fmtorch.core.stages import GreyPyramid, ImageMatcher, NoFeatures, PairImages, grey_pyramid, output_of, pruned
 from fmtorch.core.types import RELATED, Correspondences, Estimate, Features
-from fmtorch.data.cameras import Lens
-from fmtorch.data.images import to_grey
+from fmtorch.data import Lens, to_grey
 from fmtorch.geometry.pair_type import GENERAL, IDENTICAL, PLANAR, ROTATION
-from fmtorch.geometry.significance import judged
 from fmtorch.io.match_store import Kind, PairGeometry
 from fmtorch.jobs.execution import mapped, one_thread
-from fmtorch.pipeline.photographs import (
-    Image,
-    evenly_reduced,
-    frames_to_original,
-    fundamental_to_original,
-    geometry_to_original,
-    given_image,
-    reduced_cameras,
-    reduced_image,
-    to_original,
-    undistorted_matches,
-)
+from fmtorch.pipeline import photographs
+from fmtorch.pipeline.photographs import Image, frames_to_original, to_original
 from fmtorch.pipeline.pipeline import Clock, Pipeline, load_pipeline
 from fmtorch.two_view.arguments import Arrays, Focal, camera_fields
 from fmtorch.two_view.known_cameras import KnownCameras
-from fmtorch.two_view.pair_type import FOCAL_DEVIATION, PairTypes, classify, compile_with, still_warning
+from fmtorch.two_view.pair_type import (
+    FOCAL_DEVIATION,
+    PairTypes,
+    classify,
+    compile_with,
+    still_warning,
+    warnings_of,
+)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -59,13 +52,12 @@ class Described:
 
     @property
     def points(self) -> Float[Tensor, "n 2"]:
-        """The keypoints in pixels of the photograph."""
         return to_original(self.features.keypoints, self.scale.to(self.features.keypoints))
 
 
 def describe(pipeline: Pipeline, image: Image, longest_side: int) -> Described:
     """The features of a photograph, for `relate`; see `match`."""
-    reduced, scale = reduced_image(image, longest_side)
+    reduced, scale = photographs.reduced_image(image, longest_side)
     itself = isinstance(pipeline.matcher, ImageMatcher)
     features, seconds = (NoFeatures()(reduced), 0.0) if itself else pipeline.extract(reduced)
     pyramid = grey_pyramid(to_grey(reduced)) if pipeline.looks_at_images else None
@@ -128,7 +120,6 @@ class MatchResult:
 
     @property
     def ok(self) -> bool:
-        """Whether a fundamental matrix was found."""
         return not self.reason
 
 
@@ -155,6 +146,7 @@ def pair_geometries(
         pair_type: of `classify`.
     """
     calibrated = _calibrated(c, estimate)
+    said = [*zip(estimate.reason, warnings_of(estimate, pair_type), strict=True)]
     kind, homography = pair_type.kind, pair_type.homography
     kinds = torch.where(kind != GENERAL, kind, torch.where(estimate.related, GENERAL, -1)).tolist()
     results = []
@@ -173,7 +165,7 @@ def pair_geometries(
             results.append(PairGeometry("panoramic", inliers, H=H, R=R, t=np.zeros(3)))
         else:
             results.append(PairGeometry(KINDS[what], inliers, H=H))
-    return results
+    return [geometry._replace(reason=why, warning=but) for geometry, (why, but) in zip(results, said, strict=True)]
 
 
 def _calibrated(c: Correspondences, estimate: Estimate) -> Tensor:
@@ -185,7 +177,6 @@ def _calibrated(c: Correspondences, estimate: Estimate) -> Tensor:
 
 
 def _with_lines(kind: Kind, inliers: NDArray[np.integer[Any]], estimate: Estimate, i: int, H: Any) -> PairGeometry:
-    """A geometry with F, and the pose where there is one."""
     E, R, t = (
         None if value is None else _known(value[i], value[i].isfinite().all())
         for value in (estimate.E, estimate.R, estimate.t)
@@ -266,7 +257,7 @@ def match(
         raise TypeError(f"pipeline is a {type(pipeline).__name__}; it must be the name of a preset or a Pipeline")
     elif device is not None and torch.device(device) != pipeline.device:
         raise ValueError(f"device={device}, but the pipeline was built for {pipeline.device}; leave one of them out")
-    images = [given_image(image, name) for image, name in ((image0, "image0"), (image1, "image1"))]
+    images = [photographs.given_image(image, name) for image, name in ((image0, "image0"), (image1, "image1"))]
     K0, K1 = (K if lens is None else lens.K for K, lens in ((K0, lens0), (K1, lens1)))
     cameras = camera_fields(K0, K1, focal, sizes_known=True)
     describing = functools.partial(describe, pipeline, longest_side=longest_side)
@@ -284,12 +275,12 @@ def relate(
     clock = Clock(pipeline.device)
     clock("features", described0.seconds + described1.seconds)
     scales = [described0.scale, described1.scale]
-    known = reduced_cameras(cameras, scales, [described0.size, described1.size])
+    known = photographs.reduced_cameras(cameras, scales, [described0.size, described1.size])
     known = {name: value.to(pipeline.device) for name, value in known.items()}
     result = _matched(pipeline, (described0, described1), clock)
     if not result.reason:
         c = result.correspondences
-        c = undistorted_matches(c, lenses, scales).replace(**known)
+        c = photographs.undistorted_matches(c, lenses, scales).replace(**known)
         result = _estimated(pipeline, result, c, scales, seed, clock)
     if not any(lens is not None and lens.bends for lens in lenses):
         result = dataclasses.replace(result, undistorted=None)
@@ -321,7 +312,7 @@ def _matched(pipeline: Pipeline, described: Sequence[Described], clock: Clock) -
         reason = reason if putative is None else "the matcher finds no matches"
         return dataclasses.replace(nothing_found, reason=reason, seconds=clock.seconds)
     if putative is None:
-        putative = pipeline.matcher(features0, features1)
+        putative = pipeline.matched(features0, features1)
     c = putative
     clock("matching")
     counts = {"matching": int(c.count())}
@@ -337,11 +328,11 @@ def _matched(pipeline: Pipeline, described: Sequence[Described], clock: Clock) -
 
 
 def _of_images(pipeline: Pipeline, described: Sequence[Described]) -> Correspondences | None:
-    """The matches of a matcher that takes the images themselves; None for any other."""
     image0, image1 = (each.image for each in described)
     if not isinstance(pipeline.matcher, ImageMatcher) or image0 is None or image1 is None:
         return None
-    return pipeline.matcher.match_images(image0, image1).to(pipeline.device)
+    matches = pipeline.matcher.match_images(image0, image1)
+    return output_of(pipeline.matcher, matches, Correspondences).to(pipeline.device)
 
 
 def _estimated(
@@ -349,9 +340,9 @@ def _estimated(
 ) -> MatchResult:
     """The result with an estimate. c: the matches as pinholes have them, with what is known of the cameras."""
     estimator = KnownCameras(pipeline.estimator) if c.asks_for_cameras else pipeline.estimator
-    estimate: Estimate = judged(estimator(c, seed).detach(), c)
+    estimate = pipeline.estimated(c, seed, estimator)
     clock("estimation")
-    even, F, even_scales = evenly_reduced(c, estimate.F, scales)
+    even, F, even_scales = photographs.evenly_reduced(c, estimate.F, scales)
     pair_type = classify(even, estimate.derived(F=F), seed=seed)
     clock("pair_type")
     index = np.arange(c.mask.shape[1]).repeat(2).reshape(-1, 2)
@@ -360,10 +351,10 @@ def _estimated(
     R, t, focals = (None if value is None else value[0] for value in (estimate.R, estimate.t, estimate.focals))
     return dataclasses.replace(
         matched, inliers=inliers, F=estimate.F[0].to(torch.float64), reason=estimate.reason[0],
-        warning=still_warning(matched.correspondences, inliers) or pair_type.warnings[0],
+        warning=still_warning(matched.correspondences, inliers) or warnings_of(estimate, pair_type)[0],
         counts={**matched.counts, "estimation": int(inliers.sum())}, seconds=clock.seconds,
         significance=float(cast(Tensor, estimate.significance)[0]), R=R, t=t, focals=focals,
-        pair_type=pair_type.names[0], geometry=geometry_to_original(geometry, *even_scales), undistorted=c,
+        pair_type=pair_type.names[0], geometry=photographs.geometry_to_original(geometry, *even_scales), undistorted=c,
     )  # fmt: skip
 
 
@@ -383,6 +374,6 @@ def _restored(result: MatchResult, scales: list[Tensor], sizes: list[Tensor]) ->
         result,
         keypoints0=to_original(result.keypoints0, s0), keypoints1=to_original(result.keypoints1, s1),
         putative=matches(result.putative), correspondences=matches(result.correspondences), undistorted=undistorted,
-        F=fundamental_to_original(result.F, *scales),
+        F=photographs.fundamental_to_original(result.F, *scales),
         focals=None if result.focals is None else result.focals / torch.stack(scales).prod(1).sqrt().to(result.focals),
     )  # fmt: skip

@@ -9,20 +9,8 @@ from fmtorch.core.lazy import lazy_exports
 
 if TYPE_CHECKING:
     from fmtorch.core.files import STAGES
-    from fmtorch.presets.composition import (
-        composed,
-        expect_stages,
-        pipeline_stages,
-        plain,
-        stages,
-    )
-    from fmtorch.presets.files import (
-        available,
-        closest,
-        known_targets,
-        load,
-        targets_of,
-    )
+    from fmtorch.presets.composition import composed, expect_stages, pipeline_stages, plain, stages
+    from fmtorch.presets.files import available, closest, known_targets, load, targets_of
     from fmtorch.presets.objects import (
         build,
         expect_buildable,

@@ -1,7 +1,5 @@
 """Configs composed by Hydra from groups of presets, and what is read of them: stages, pruners, executor, options."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import threading
@@ -42,7 +40,6 @@ class FileConfigSource(file_config_source.FileConfigSource):
     """
 
     def load_config(self, config_path: str) -> ConfigResult:
-        """A file and its header."""
         with naming_file(Path(self.path) / self._normalize_file_name(config_path)):
             result = super().load_config(config_path)
         path = PurePosixPath(config_path)
@@ -272,7 +269,6 @@ def read_fields(fields: type[Fields], config: DictConfig, where: str = "") -> Fi
 
 
 def _built(fields: type[Fields], values: Mapping[str, Any]) -> Fields:
-    """The dataclass of values that fit it."""
     hints = get_type_hints(fields)
     return fields(**{name: _as(hints[name], value) for name, value in values.items()})
 

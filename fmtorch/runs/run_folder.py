@@ -1,7 +1,5 @@
 """The result of one image pair, as one row of a table."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import hashlib
@@ -11,7 +9,8 @@ import time
 import uuid
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from types import UnionType
+from typing import Any, get_args
 
 import numpy as np
 import pyarrow as pa
@@ -19,45 +18,6 @@ import pyarrow.parquet as pq
 
 from fmtorch.core.files import replacing
 from fmtorch.core.settings import canonical, create, differences, head
-
-PAIR_SCHEMA = pa.schema(
-    [
-        pa.field("pair", pa.string(), nullable=False),
-        pa.field("key", pa.int64(), nullable=False),
-        pa.field("family", pa.string(), nullable=False),
-        pa.field("scene", pa.string(), nullable=False),
-        pa.field("ok", pa.bool_(), nullable=False),
-        pa.field("reason", pa.string(), nullable=False),
-        pa.field("nsgd", pa.float64(), nullable=False),
-        pa.field("nsgd_released", pa.float64()),
-        pa.field("inlier_rate", pa.float64()),
-        pa.field("inlier_rate_before", pa.float64()),
-        pa.field("corrs", pa.int64(), nullable=False),
-        pa.field("corrs_before", pa.int64(), nullable=False),
-        pa.field("features0", pa.int64(), nullable=False),
-        pa.field("features1", pa.int64(), nullable=False),
-        pa.field("samples", pa.int64(), nullable=False),
-        pa.field("seconds_features", pa.float64()),
-        pa.field("seconds_matching", pa.float64()),
-        pa.field("seconds_pruning", pa.float64()),
-        pa.field("seconds_estimation", pa.float64()),
-        pa.field("seconds_metrics", pa.float64()),
-        pa.field("F", pa.list_(pa.float64(), 9)),
-        pa.field("significance", pa.float64()),
-        pa.field("related", pa.bool_(), nullable=False),
-        pa.field("rotation_error", pa.float64()),
-        pa.field("translation_error", pa.float64()),
-        pa.field("pose_reason", pa.string()),
-        pa.field("pair_type", pa.string()),
-        pa.field("warning", pa.string()),
-        pa.field("focal_error0", pa.float64()),
-        pa.field("focal_error1", pa.float64()),
-        pa.field("focal_log_ratio0", pa.float64()),
-        pa.field("focal_log_ratio1", pa.float64()),
-        pa.field("H", pa.list_(pa.float64(), 9)),
-        pa.field("corner_error", pa.float64()),
-    ]
-)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -132,7 +92,6 @@ class PairRow:
 
 
 def _expect_homography(row: PairRow) -> None:
-    """Raises ValueError for a row of a pair of a known homography that contradicts itself."""
     error, H = row.corner_error, row.H
     if error is None or not error >= 0.0 or not math.isnan(row.nsgd) or row.F is not None:
         raise ValueError(
@@ -145,6 +104,20 @@ def _expect_homography(row: PairRow) -> None:
             f"pair {row.pair!r} has a homography: it needs nine finite numbers of H and no reason, or a reason, no H "
             f"and an infinite corner error, but has H={H}, reason={row.reason!r}, corner_error={error}"
         )
+
+
+_ARROW: dict[Any, pa.DataType] = {
+    str: pa.string(), int: pa.int64(), bool: pa.bool_(), float: pa.float64(),
+    Sequence[float]: pa.list_(pa.float64(), 9),
+}  # fmt: skip
+
+
+def _field(name: str, hint: Any) -> pa.Field:
+    kinds = get_args(hint) if isinstance(hint, UnionType) else (hint,)
+    return pa.field(name, _ARROW[kinds[0]], nullable=type(None) in kinds)
+
+
+PAIR_SCHEMA = pa.schema([_field(field.name, field.type) for field in dataclasses.fields(PairRow)])
 
 
 def to_table(rows: Sequence[PairRow]) -> pa.Table:
@@ -265,7 +238,7 @@ class RunFolder:
     config: dict[str, Any]  # what defines the results, see `identity_digest`
 
     @classmethod
-    def open(cls, path: Path | str, config: Mapping[str, Any]) -> RunFolder:
+    def open(cls, path: Path | str, config: Mapping[str, Any]) -> "RunFolder":
         """Start a run in `path`, or continue it there when the folder holds a run of the same identity.
 
         Several processes may open the same folder at once. Raises RunFolderError, touching nothing, where the folder
@@ -295,7 +268,7 @@ class RunFolder:
         return folder
 
     @classmethod
-    def load(cls, path: Path | str) -> RunFolder:
+    def load(cls, path: Path | str) -> "RunFolder":
         """The existing run in `path`, whatever its identity. Raises RunFolderError where there is none."""
         file = Path(path) / "run.json"
         try:
@@ -319,17 +292,14 @@ class RunFolder:
 
     @property
     def identity(self) -> str:
-        """The digest of what defines the results."""
         return identity_digest(self.config)
 
     def append(self, rows: Sequence[PairRow]) -> None:
-        """Add results, as a new part that is either whole or absent; parts are merged. Safe with several processes."""
         if not rows:
             return
         self._writer.add(to_table(rows))
 
     def done(self) -> set[int]:
-        """The keys of the pairs that have a result."""
         return {int(key) for part in self._parts(["key"]) for key in part["key"].to_numpy()}
 
     def read(self, keys: Collection[int] | None = None, without: Collection[str] = ()) -> pa.Table:

@@ -4,8 +4,6 @@ Every scene is a function of (version, seed, split, family, number) alone and is
 renamed when complete, so that an interrupted generation goes on where it stopped and two processes never clash.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import hashlib
@@ -84,7 +82,6 @@ class Task:
 
     @property
     def name(self) -> str:
-        """The scene's name and its folder's."""
         return f"{self.family}-{self.split}-{self.number:03d}"
 
 
@@ -148,7 +145,7 @@ def generate_all(
     if count > 1:
         compile_together(KERNELS)  # once, rather than in each of them
     execution = Execution("processes" if count > 1 else "threads", max(count, 1))
-    with WorkerPool(execution, ("fmtorch.scenes.dataset",), needs_main=False) as pool:
+    with WorkerPool(execution, (__name__,), needs_main=False) as pool:
         for _ in TaskRunner(pool, Local(None), _generated, lambda scene, path: None).each(missing):
             done += 1
             report(done, len(scenes))
@@ -190,7 +187,6 @@ def generate(task: Task, folder: Path) -> Path:
 
 
 def _write(folder: Path, scene: DrawnScene, images: Iterable[Pixels], plan: Plan) -> None:
-    """Photographs and pairs of a scene; takes from `images` no more than the plan's pairs need."""
     features: list[Keypoints] = []
     cameras: list[dict[str, Any]] = []
     waiting, kept = list(scene.pairs), list[tuple[int, int]]()
@@ -214,7 +210,6 @@ def _write(folder: Path, scene: DrawnScene, images: Iterable[Pixels], plan: Plan
 
 
 def _saved(folder: Path, number: int, shot: Shot, image: Pixels) -> dict[str, Any]:
-    """Writes a photograph and returns what is recorded of it."""
     path = folder / f"{number:02d}.jpg"
     picture = image if image.ndim == 2 else np.ascontiguousarray(image[..., ::-1])
     if not cv2.imwrite(str(path), picture, [cv2.IMWRITE_JPEG_QUALITY, shot.jpeg]):
@@ -303,17 +298,10 @@ class RenderedPairs(Dataset[ImagePair]):
     name = "rendered"
 
     def __init__(
-        self,
-        split: str = "test",
-        size: str = "small",
-        families: Sequence[str] | None = None,
-        seed: int = 0,
-        root: str | Path | None = None,
-        *,
-        progress: Progress | None = None,
-        workers: int | None = None,
+        self, split: str = "test", size: str = "small", families: Sequence[str] | None = None, seed: int = 0,
+        root: str | Path | None = None, *, progress: Progress | None = None, workers: int | None = None,
         plan: Plan | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         if (size, split) not in PLANS:
             raise ValueError(f"no split {split!r} in size {size!r}; there are test and train, in small and full")
         chosen = list(FAMILIES) if families is None else list(families)
@@ -346,17 +334,10 @@ class RenderedPairs(Dataset[ImagePair]):
         (path0, camera0), (path1, camera1) = self._views[task.name][i], self._views[task.name][j]
         R, t = relative_pose(camera0, camera1)
         return ImagePair(
-            identity=f"{self.name}/{task.name}/{i}-{j}",
-            family=task.family,
-            scene=task.name,
-            image0=ImageSource(f"{task.name}/{i}", path0),
-            image1=ImageSource(f"{task.name}/{j}", path1),
-            F=fundamental(camera0, camera1),
-            K0=camera0.K,
-            K1=camera1.K,
-            R=R,
-            t=t,
-        )
+            identity=f"{self.name}/{task.name}/{i}-{j}", family=task.family, scene=task.name,
+            image0=ImageSource(f"{task.name}/{i}", path0), image1=ImageSource(f"{task.name}/{j}", path1),
+            F=fundamental(camera0, camera1), K0=camera0.K, K1=camera1.K, R=R, t=t,
+        )  # fmt: skip
 
     def depth(self, image: ImageSource, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Depth (n,) in metres along the optical axis at points (n, 2) of an image; NaN for the sky and outside.
@@ -367,7 +348,7 @@ class RenderedPairs(Dataset[ImagePair]):
         scene, _, number = image.identity.rpartition("/")
         return depth_at(self._tasks[scene], int(number), points)
 
-    def scene_pairs(self) -> RenderedScenePairs:
+    def scene_pairs(self) -> "RenderedScenePairs":
         """All pairs of the photographs of each scene, as candidates to select from."""
         scenes = []
         for name, views in self._views.items():
@@ -390,7 +371,6 @@ class RenderedScenePairs(ScenePairs):
         self.drawn = drawn
 
     def depth(self, image: ImageSource, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """As `RenderedPairs.depth`."""
         return self.drawn.depth(image, points)
 
 
@@ -420,17 +400,11 @@ class StereoPair(Dataset[ImagePair]):
         right = Camera(calibration(_FOCAL, _SIZE, (x + _SHIFT, y)), np.eye(3), np.array([-_BASELINE, 0.0, 0.0]), _SIZE)
         R, t = relative_pose(left, right)
         self._pair = ImagePair(
-            identity=f"{self.name}/motorcycle/left-right",
-            family=self.name,
-            scene="motorcycle",
+            identity=f"{self.name}/motorcycle/left-right", family=self.name, scene="motorcycle",
             image0=ImageSource("motorcycle/left", self._paths[0]),
-            image1=ImageSource("motorcycle/right", self._paths[1]),
-            F=fundamental(left, right),
-            K0=left.K,
-            K1=right.K,
-            R=R,
-            t=t,
-        )
+            image1=ImageSource("motorcycle/right", self._paths[1]), F=fundamental(left, right), K0=left.K, K1=right.K,
+            R=R, t=t,
+        )  # fmt: skip
 
     def __len__(self) -> int:
         return 1

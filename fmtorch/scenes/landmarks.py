@@ -1,27 +1,11 @@
 """The families of landmarks: a walk round a structure after Tanks and Temples, and photographs of a place after CPC."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 import numpy as np
 
-from fmtorch.scenes.buildings import (
-    Style,
-    ashlar,
-    column,
-    direction,
-    foliage,
-    front,
-    house,
-    marble,
-    post,
-    rock,
-    statue,
-    tree,
-    walker,
-    wall_picture,
-)
+from fmtorch.scenes import buildings
+from fmtorch.scenes.buildings import Style, direction
 from fmtorch.scenes.light import DrawnScene, Lens, Light, Shot, sun
 from fmtorch.scenes.patterns import Rng, cells, colour, heaven, heights, masonry, meadow, poster, sign, to_pixels
 from fmtorch.scenes.raycast import calibration, look_at
@@ -56,7 +40,7 @@ def ground(surfaces: Surfaces, rng: Rng, split: str, reach: Real) -> None:
 
 def _structure(surfaces: Surfaces, rng: Rng, split: str) -> float:
     """The thing in the middle; returns its height."""
-    stone, block = marble(surfaces, rng), ashlar(surfaces, rng)
+    stone, block = buildings.marble(surfaces, rng), buildings.ashlar(surfaces, rng)
     width, depth = rng.uniform(4.0, 6.0), rng.uniform(3.5, 6.0)
     sides: Literal["same", "twin"] = "twin"
     if rng.random() < SYMMETRIC:
@@ -74,21 +58,21 @@ def _structure(surfaces: Surfaces, rng: Rng, split: str) -> float:
     height = rng.uniform(2.8, 4.6)
     if kind < 0.45:  # a pavilion with columns round a core
         inner = 0.62
-        house(
+        buildings.house(
             surfaces, rng, split, vec(-width * inner / 2, -depth * inner / 2, base), vec(1, 0, 0),
             (width * inner, depth * inner, height), Style(density=110, storey=2.4, bay=1.7, depth=0.2), sides=sides,
         )  # fmt: skip
         for x in np.linspace(-width / 2 + 0.3, width / 2 - 0.3, 4):
             for y in np.linspace(-depth / 2 + 0.3, depth / 2 - 0.3, 4):
                 if max(abs(x) / width, abs(y) / depth) > 0.4:
-                    column(surfaces, vec(x, y, base), height, 0.17, stone, sides=8)
+                    buildings.column(surfaces, vec(x, y, base), height, 0.17, stone, sides=8)
     else:
-        house(
+        buildings.house(
             surfaces, rng, split, vec(-width / 2, -depth / 2, base), vec(1, 0, 0), (width, depth, height),
             Style(density=110, storey=1.5, bay=1.1, depth=0.22, pilasters=kind < 0.75, same_windows=0.8), sides=sides,
         )  # fmt: skip
     base += height
-    frieze = surfaces.texture(to_pixels(wall_picture(rng, split, 256, 1024, 60)))
+    frieze = surfaces.texture(to_pixels(buildings.wall_picture(rng, split, 256, 1024, 60)))
     surfaces.box(
         vec(-width / 2 - 0.3, -depth / 2 - 0.3, base), vec(width + 0.6, 0, 0), vec(0, depth + 0.6, 0), 0.6,
         [frieze, frieze, frieze, frieze, stone], ((0, 0, 1, 0.6),) * 5,
@@ -101,7 +85,7 @@ def _structure(surfaces: Surfaces, rng: Rng, split: str) -> float:
         ]
         surfaces.lathe(vec(0, 0, base), profile, block, sides=16, repeat=(2, 1))
     else:
-        statue(surfaces, rng, vec(0, 0, base), 2.2, stone)
+        buildings.statue(surfaces, rng, vec(0, 0, base), 2.2, stone)
     _boards_and_rocks(surfaces, rng, split, 0.5 * np.hypot(width, depth), block)
     return base
 
@@ -119,15 +103,14 @@ def _boards_and_rocks(surfaces: Surfaces, rng: Rng, split: str, reach: Real, bac
         top = foot - right * wide / 2 + vec(0, 0, tall + 0.35)
         surfaces.quad(top, right * wide, vec(0, 0, -tall), number)
         surfaces.quad(top + right * wide, -right * wide, vec(0, 0, -tall), back)
-    relief = surfaces.texture(to_pixels(wall_picture(rng, split, 256, 256, 90)))
+    relief = surfaces.texture(to_pixels(buildings.wall_picture(rng, split, 256, 256, 90)))
     for _ in range(6):
         angle = rng.uniform(0, 360)
         foot = direction(angle) * (reach + rng.uniform(0.5, 2.5))
-        rock(surfaces, rng, foot, rng.uniform(0.25, 0.7), relief, detail=9)
+        buildings.rock(surfaces, rng, foot, rng.uniform(0.25, 0.7), relief, detail=9)
 
 
 def _mound(surfaces: Surfaces, rng: Rng, texture: int, at: tuple[Real, Real], side: Real, tall: Real) -> None:
-    """A flower bed or heap: a height field over a square."""
     n = 12
     rim = np.sin(np.linspace(0, np.pi, n))
     z = tall * heights(rng, n, n, 6) * np.outer(rim, rim)
@@ -139,7 +122,7 @@ def _mound(surfaces: Surfaces, rng: Rng, texture: int, at: tuple[Real, Real], si
 
 def surroundings(surfaces: Surfaces, rng: Rng, split: str, near: Real, far: Real, houses: int) -> None:
     """Houses, trees and lamp posts in a ring."""
-    leaf, bark = foliage(surfaces, rng)
+    leaf, bark = buildings.foliage(surfaces, rng)
     for k in range(houses):
         angle = 360 / houses * k + rng.uniform(-8, 8)
         outward = direction(angle)
@@ -147,13 +130,13 @@ def surroundings(surfaces: Surfaces, rng: Rng, split: str, near: Real, far: Real
         right = np.cross(vec(0, 0, 1), -outward)
         foot = outward * rng.uniform(0.7 * far, far) - right * width / 2
         style = Style(density=30, storey=3.0, bay=2.8, depth=0.25, same_windows=0.8)
-        house(surfaces, rng, split, foot, right, (width, 7.0, rng.uniform(6, 11)), style, sides="plain")
+        buildings.house(surfaces, rng, split, foot, right, (width, 7.0, rng.uniform(6, 11)), style, sides="plain")
     for _ in range(9):
         at = direction(rng.uniform(0, 360)) * rng.uniform(near, far * 0.8)
-        tree(surfaces, rng, at, rng.uniform(4, 8), leaf, bark)
+        buildings.tree(surfaces, rng, at, rng.uniform(4, 8), leaf, bark)
     metal = surfaces.texture(to_pixels(np.full((32, 32, 3), 0.3, dtype=np.float32)))
     for _ in range(4):
-        post(surfaces, direction(rng.uniform(0, 360)) * near, 4.2, metal)
+        buildings.post(surfaces, direction(rng.uniform(0, 360)) * near, 4.2, metal)
 
 
 def orbit_scene(rng: Rng, split: str, shots: int, scale: Real) -> DrawnScene:
@@ -166,11 +149,13 @@ def orbit_scene(rng: Rng, split: str, shots: int, scale: Real) -> DrawnScene:
     for _ in range(3):
         a = np.radians(rng.uniform(0, 360))
         _mound(surfaces, rng, leaf_bed, (float(6.5 * np.cos(a)), float(6.5 * np.sin(a))), 2.4, 0.7)
-    leaf, bark = foliage(surfaces, rng)
+    leaf, bark = buildings.foliage(surfaces, rng)
     for _ in range(5):
-        tree(surfaces, rng, direction(rng.uniform(0, 360)) * rng.uniform(6.0, 8.5), rng.uniform(2.2, 3.6), leaf, bark)
+        buildings.tree(
+            surfaces, rng, direction(rng.uniform(0, 360)) * rng.uniform(6.0, 8.5), rng.uniform(2.2, 3.6), leaf, bark
+        )
     for _ in range(6):
-        walker(surfaces, rng, direction(rng.uniform(0, 360)) * rng.uniform(5, 8), rng.uniform(0, 360))
+        buildings.walker(surfaces, rng, direction(rng.uniform(0, 360)) * rng.uniform(5, 8), rng.uniform(0, 360))
     size = (round(SIZE[0] * scale), round(SIZE[1] * scale))
     K = calibration(FOCAL * scale, size)
     arc = min(360.0, 20.0 * shots)
@@ -219,16 +204,16 @@ def _gable(surfaces: Surfaces, x: Real, y: Real, z: Real, width: Real, height: R
 def _landmark(surfaces: Surfaces, rng: Rng, split: str) -> float:
     """A long front with many equal windows, a portico, perhaps towers; returns its width."""
     width, height = rng.uniform(24, 36), rng.uniform(9, 13)
-    stone, block = marble(surfaces, rng), ashlar(surfaces, rng)
+    stone, block = buildings.marble(surfaces, rng), buildings.ashlar(surfaces, rng)
     style = Style(
         density=52, storey=rng.uniform(3.2, 4.4), bay=rng.uniform(2.6, 3.4), depth=0.4, pilasters=rng.random() < 0.5,
         same_windows=0.85,
     )  # fmt: skip
-    front(surfaces, rng, split, vec(-width / 2, 0, 0), vec(1, 0, 0), width, height, style)
+    buildings.front(surfaces, rng, split, vec(-width / 2, 0, 0), vec(1, 0, 0), width, height, style)
     end = vec(0, 14, 0)
     for x, along in ((-width / 2, -1), (width / 2, 1)):
         foot = vec(x, 0, 0) + (end if along < 0 else 0)
-        front(surfaces, rng, split, foot, vec(0, along, 0), 14, height, Style(density=36, depth=0.3))
+        buildings.front(surfaces, rng, split, foot, vec(0, along, 0), 14, height, Style(density=36, depth=0.3))
     portico = rng.uniform(8, 12)
     tall, out = min(height - 1.5, rng.uniform(6, 8)), rng.uniform(1.6, 2.8)
     for i in range(4):
@@ -239,7 +224,7 @@ def _landmark(surfaces: Surfaces, rng: Rng, split: str) -> float:
             ((0, 0, 2, 0.05),) * 4 + ((0, 0, 2, 1),),
         )  # fmt: skip
     for x in np.linspace(-portico / 2 + 0.5, portico / 2 - 0.5, int(rng.integers(4, 7))):
-        column(surfaces, vec(float(x), -out + 0.5, 0.64), tall - 0.64, 0.42, stone)
+        buildings.column(surfaces, vec(float(x), -out + 0.5, 0.64), tall - 0.64, 0.42, stone)
     banner = surfaces.texture(to_pixels(sign(rng, 96, 1024)))
     surfaces.box(
         vec(-portico / 2, -out, tall), vec(portico, 0, 0), vec(0, out, 0), 1.0, [banner, block, block, block, stone],
@@ -248,14 +233,14 @@ def _landmark(surfaces: Surfaces, rng: Rng, split: str) -> float:
     _gable(surfaces, -portico / 2 - 0.3, -out - 0.1, tall + 1.0, portico + 0.6, rng.uniform(1.5, 2.6), out, block)
     if rng.random() < 0.6:
         for x in (-width / 2 - 1.0, width / 2 - 4.0):
-            house(surfaces, rng, split, vec(x, -1.2, 0), vec(1, 0, 0), (5.0, 5.0, height + rng.uniform(3, 6)),
+            buildings.house(surfaces, rng, split, vec(x, -1.2, 0), vec(1, 0, 0), (5.0, 5.0, height + rng.uniform(3, 6)),
                   Style(density=52, storey=4.0, bay=2.5, depth=0.35))  # fmt: skip
     for x in np.linspace(-width / 2 + 2, width / 2 - 2, 6):
         if abs(x) > portico / 2 + 1.5:
             surfaces.box(
                 vec(x - 0.7, -3.6, 0), vec(1.4, 0, 0), vec(0, 1.4, 0), 1.6, [block] * 5, ((0, 0, 0.25, 0.4),) * 5
             )
-            statue(surfaces, rng, vec(x, -2.9, 1.6), 2.6, stone, detail=12)
+            buildings.statue(surfaces, rng, vec(x, -2.9, 1.6), 2.6, stone, detail=12)
     for picture in pictures(split, rng, 2):
         x = rng.uniform(-width / 2 + 1, width / 2 - 4)
         wide = 2.4
@@ -278,20 +263,19 @@ def collection_scene(rng: Rng, split: str, shots: int, scale: Real) -> DrawnScen
 
 
 def _surroundings(surfaces: Surfaces, rng: Rng, split: str, width: Real) -> None:
-    """Ground, houses, trees and lamp posts beside a landmark of this width."""
     ground(surfaces, rng, split, 36)
-    leaf, bark = foliage(surfaces, rng)
+    leaf, bark = buildings.foliage(surfaces, rng)
     for side in (-1, 1):
         right = vec(1, 0, 0)
         foot = vec(side * (width / 2 + 3) - (12 if side < 0 else 0), 4, 0)
         size = (12, 8, rng.uniform(7, 11))
-        house(surfaces, rng, split, foot, right, size, Style(density=30, same_windows=0.8), sides="plain")
+        buildings.house(surfaces, rng, split, foot, right, size, Style(density=30, same_windows=0.8), sides="plain")
         for _ in range(3):
             at = vec(side * rng.uniform(width / 2 - 3, width / 2 + 8), -rng.uniform(2, 10), 0)
-            tree(surfaces, rng, at, rng.uniform(4, 7), leaf, bark)
+            buildings.tree(surfaces, rng, at, rng.uniform(4, 7), leaf, bark)
     metal = surfaces.texture(np.full((16, 16, 3), 70, dtype=np.uint8))
     for x in np.linspace(-width / 2, width / 2, 4):
-        post(surfaces, vec(x, -8, 0), 4.5, metal)
+        buildings.post(surfaces, vec(x, -8, 0), 4.5, metal)
 
 
 def _times_of_day(fixed: Surfaces, rng: Rng, width: Real) -> tuple[list[Light], list[Surfaces]]:
@@ -309,7 +293,7 @@ def _times_of_day(fixed: Surfaces, rng: Rng, width: Real) -> tuple[list[Light], 
         crowd = fixed.copy()
         for _ in range(22):
             at = vec(rng.normal(0, width / 3), -rng.uniform(3, 22), 0)
-            walker(crowd, rng, at, rng.uniform(225, 315))
+            buildings.walker(crowd, rng, at, rng.uniform(225, 315))
         surfaces.append(crowd)
     return lights, surfaces
 

@@ -263,7 +263,6 @@ class Stage:
         affine(Seen(*hits.flat(), self.table), 4, self.shadow.reshape(-1))
 
     def radiance(self, camera: Camera, offset: tuple[Real, Real]) -> Floats:
-        """Linear colour (h, w, 3) along the rays `offset` away from the pixel centres."""
         hits = self.geometry.look(camera, offset)
         out = np.empty((*camera.size, 3), dtype=np.float32)
         beyond = np.flatnonzero(hits.piece.reshape(-1) < 0)

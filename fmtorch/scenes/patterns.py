@@ -3,8 +3,6 @@
 Painted are windows, doors, signs, posters, books, cars and people.
 """
 
-from __future__ import annotations
-
 import colorsys
 import string
 

@@ -39,7 +39,6 @@ class Camera:
 
     @property
     def centre(self) -> Matrix:
-        """The centre of projection in the world, (3,)."""
         return -self.R.T @ self.t
 
     @property
@@ -179,7 +178,6 @@ def cast_pieces(pieces: Pieces, cutouts: Cutouts, bounds: Bounds, met: Met) -> N
 
 @inner
 def _any_beyond(buffer: Floats, depth: Number) -> bool:
-    """Whether a pixel's depth is `depth` or more."""
     for y in range(buffer.shape[0]):
         beyond = 0
         for x in range(buffer.shape[1]):
@@ -222,7 +220,6 @@ class Hits:
     inverse: Matrix
 
     def flat(self) -> tuple[NDArray[np.int32], Floats, Floats]:
-        """The piece, s and t of all pixels in a row."""
         return self.piece.reshape(-1), self.s.reshape(-1), self.t.reshape(-1)
 
 
@@ -241,13 +238,9 @@ class Geometry:
         self.corners = np.stack([self.O, self.O + self.U, self.O + self.U + self.V, self.O + self.V], axis=1)
 
     def cast(
-        self,
-        P: Matrix,
-        depth: Matrix,
-        size: tuple[int, int],
-        centre: Matrix | None,
+        self, P: Matrix, depth: Matrix, size: tuple[int, int], centre: Matrix | None,
         skip: NDArray[np.bool_] | None = None,
-    ) -> Hits:
+    ) -> Hits:  # fmt: skip
         """Rays of all pixels of a projection P (3, 4), perspective or (last row 0 0 0 1) orthographic.
 
         depth: (4,), the affine function of the world by which the nearer of two pieces is known.
@@ -302,7 +295,6 @@ class Geometry:
         return Cutouts(place, window, self._opacity[0])
 
     def look(self, camera: Camera, offset: tuple[float, float] = (0.0, 0.0)) -> Hits:
-        """The rays through the points `offset` (x, y) away from the pixel centres of a camera."""
         shift = np.array([[1.0, 0.0, -offset[0]], [0.0, 1.0, -offset[1]], [0.0, 0.0, 1.0]])
         depth = np.append(camera.R[2], camera.t[2])
         return self.cast(shift @ camera.P, depth, camera.size, camera.centre)

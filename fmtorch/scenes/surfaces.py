@@ -1,7 +1,5 @@
 """What a scene is made of: prefiltered textures on parallelograms and triangles, and the shapes built from them."""
 
-from __future__ import annotations
-
 import importlib.util
 from collections.abc import Sequence
 from pathlib import Path
@@ -70,7 +68,6 @@ class Texture:
             y += level8.shape[0]
 
     def level(self, lod: float) -> int:
-        """The pyramid level at which opacity is looked up."""
         return min(max(int(lod), 0), self.levels - 1)
 
 
@@ -167,7 +164,6 @@ class Surfaces:
         self._flags: list[tuple[bool, bool]] = []
 
     def texture(self, picture: Pixels) -> int:
-        """Adds a picture and returns its number."""
         self.textures.append(Texture(picture))
         return len(self.textures) - 1
 
@@ -242,7 +238,7 @@ class Surfaces:
         points[..., 2] = steps[:, :1]
         self.grid(points + base, texture, repeat)
 
-    def copy(self) -> Surfaces:
+    def copy(self) -> "Surfaces":
         """A list of its own with the same pieces and textures, to which more can be added."""
         other = Surfaces()
         other.textures, other._rows = list(self.textures), list(self._rows)

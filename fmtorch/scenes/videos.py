@@ -1,31 +1,12 @@
 """The families of videos: driving along a street after KITTI, and hand-held video of a room after TUM RGB-D."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 
+from fmtorch.scenes import patterns
 from fmtorch.scenes.buildings import Style, car, direction, foliage, front, post, statue, tree, walker
 from fmtorch.scenes.light import DrawnScene, Lens, Light, Shot, sun
-from fmtorch.scenes.patterns import (
-    Rng,
-    asphalt,
-    books,
-    cells,
-    cloth,
-    colour,
-    door,
-    fractal,
-    heaven,
-    masonry,
-    meadow,
-    plaster,
-    poster,
-    rgb,
-    to_pixels,
-    window,
-    wood,
-)
+from fmtorch.scenes.patterns import Rng, colour, to_pixels
 from fmtorch.scenes.raycast import Camera, calibration, look_at
 from fmtorch.scenes.surfaces import Real, Surfaces, Vector, pictures, vec
 
@@ -39,17 +20,21 @@ DRIVING_WINDOW = 10  # a frame is paired with the frames of the following second
 
 def _road(surfaces: Surfaces, rng: Rng, length: float, half: float, walk: float) -> None:
     """Asphalt with markings, pavements with kerbs, a meadow around."""
-    road = asphalt(rng, 512, 1024)
+    road = patterns.asphalt(rng, 512, 1024)
     for x in range(64, 1024, 341):
         cv2.rectangle(road, (x, 250), (x + 150, 261), (0.82, 0.82, 0.78), -1)
     for y in (16, 490):
         cv2.line(road, (0, y), (1024, y), (0.75, 0.75, 0.7), 6)
-    worn = (0.65 * road + 0.3 * asphalt(rng, 512, 1024)).astype(np.float32)
+    worn = (0.65 * road + 0.3 * patterns.asphalt(rng, 512, 1024)).astype(np.float32)
     asphalts = [surfaces.texture(to_pixels(road)), surfaces.texture(to_pixels(worn))]
-    tiles = masonry(rng, 256, 512, 6, 10, colour(rng, (0.05, 0.12), (0.02, 0.15), (0.45, 0.7)), joint=0.04, vary=0.08)
-    cobbles = cells(rng, 256, 512, 20, rgb(0.5, 0.48, 0.46))
+    tiles = patterns.masonry(
+        rng, 256, 512, 6, 10, colour(rng, (0.05, 0.12), (0.02, 0.15), (0.45, 0.7)), joint=0.04, vary=0.08
+    )
+    cobbles = patterns.cells(rng, 256, 512, 20, patterns.rgb(0.5, 0.48, 0.46))
     stones = surfaces.texture(to_pixels(tiles if rng.random() < 0.6 else cobbles))
-    green = surfaces.texture(to_pixels(meadow(rng, 512, 512, colour(rng, (0.2, 0.3), (0.4, 0.6), (0.35, 0.5)))))
+    green = surfaces.texture(
+        to_pixels(patterns.meadow(rng, 512, 512, colour(rng, (0.2, 0.3), (0.4, 0.6), (0.35, 0.5))))
+    )
     for i in range(-1, int(np.ceil(length / STRETCH)) + 6):
         along, start = vec(STRETCH, 0, 0), i * STRETCH
         surfaces.quad(vec(start, half, 0), along, vec(0, -2 * half, 0), asphalts[int(rng.integers(2))])
@@ -88,7 +73,6 @@ def _row_of_houses(surfaces: Surfaces, rng: Rng, split: str, length: float, wall
 
 
 def _roadside(surfaces: Surfaces, rng: Rng, length: float, half: float, side: int) -> None:
-    """Parked cars, trees, lamp posts and people along one side."""
     leaf, bark = foliage(surfaces, rng)
     metal = surfaces.texture(to_pixels(np.full((32, 32, 3), 0.35, dtype=np.float32)))
     x = rng.uniform(0, 8)
@@ -142,7 +126,7 @@ def driving_scene(rng: Rng, split: str, shots: int, scale: Real) -> DrawnScene:
             foot = vec(2.0 + start + i * pace, lane, 0)
             car(view, np.random.default_rng(model), foot, vec(1.0 if lane < 0 else -1.0, 0, 0))
         views.append(view)
-    sky = heaven(rng, rng.uniform(-0.3, 0.8))
+    sky = patterns.heaven(rng, rng.uniform(-0.3, 0.8))
     pairs = [(i, j) for i in range(shots) for j in range(i + 1, shots) if frames[j] - frames[i] <= DRIVING_WINDOW]
     return DrawnScene(views, [light] * shots, sky, taken, [pairs[k] for k in rng.permutation(len(pairs))])
 
@@ -159,22 +143,26 @@ SUBFRAMES = 6
 
 
 def _flat(surfaces: Surfaces, rng: Rng, tint: tuple[Real, Real] = (0.05, 0.15)) -> int:
-    return surfaces.texture(to_pixels(plaster(rng, 256, 256, colour(rng, tint, (0.05, 0.4), (0.3, 0.85)), 0.6)))
+    return surfaces.texture(
+        to_pixels(patterns.plaster(rng, 256, 256, colour(rng, tint, (0.05, 0.4), (0.3, 0.85)), 0.6))
+    )
 
 
 def _room(surfaces: Surfaces, rng: Rng, half: Real, height: Real) -> None:
     tint = colour(rng, (0.08, 0.65), (0.02, 0.15), (0.7, 0.9))
     floor = to_pixels(
-        wood(rng, 1024, 1024, 22, colour(rng, (0.05, 0.1), (0.35, 0.6), (0.4, 0.65))) if rng.random() < 0.6
-        else masonry(rng, 1024, 1024, 14, 14, colour(rng, (0.05, 0.6), (0.03, 0.2), (0.5, 0.8)), bond=0.0, vary=0.04)
+        patterns.wood(rng, 1024, 1024, 22, colour(rng, (0.05, 0.1), (0.35, 0.6), (0.4, 0.65))) if rng.random() < 0.6
+        else patterns.masonry(
+            rng, 1024, 1024, 14, 14, colour(rng, (0.05, 0.6), (0.03, 0.2), (0.5, 0.8)), bond=0.0, vary=0.04
+        )
     )  # fmt: skip
     number = surfaces.texture(floor)
     surfaces.quad(vec(-half, half, 0), vec(2 * half, 0, 0), vec(0, -2 * half, 0), number)
-    ceiling = surfaces.texture(to_pixels(plaster(rng, 256, 256, rgb(0.85, 0.85, 0.83), 0.3)))
+    ceiling = surfaces.texture(to_pixels(patterns.plaster(rng, 256, 256, patterns.rgb(0.85, 0.85, 0.83), 0.3)))
     surfaces.quad(vec(-half, -half, height), vec(2 * half, 0, 0), vec(0, 2 * half, 0), ceiling)
     for k in range(4):
         inward, right = -direction(90 * k), direction(90 * k - 90)
-        wall = plaster(rng, 512, 1024, tint, 0.5)
+        wall = patterns.plaster(rng, 512, 1024, tint, 0.5)
         wall[478:] = tint * 0.6
         number = surfaces.texture(to_pixels(wall))
         surfaces.quad(-inward * half - right * half + vec(0, 0, height), right * 2 * half, vec(0, 0, -height), number)
@@ -196,8 +184,7 @@ def _turn(base: Vector, degrees: Real) -> tuple[Vector, Vector, Vector]:
 
 
 def _desk(surfaces: Surfaces, rng: Rng, split: str, centre: Vector) -> None:
-    """A table with books, boxes, a screen, a figure."""
-    top = surfaces.texture(to_pixels(wood(rng, 256, 512, 4, colour(rng, (0.05, 0.1), (0.3, 0.6), (0.4, 0.7)))))
+    top = surfaces.texture(to_pixels(patterns.wood(rng, 256, 512, 4, colour(rng, (0.05, 0.1), (0.3, 0.6), (0.4, 0.7)))))
     facing = rng.uniform(-25, 25)
     _, right, back = _turn(centre, facing)
     wide, deep, tall = 1.7, 0.85, 0.74
@@ -224,15 +211,15 @@ def _desk(surfaces: Surfaces, rng: Rng, split: str, centre: Vector) -> None:
         elif k == 1:
             fur = (
                 colour(rng, (0.04, 0.1), (0.4, 0.7), (0.4, 0.7))
-                * (1 + 0.3 * fractal(rng, 256, 256, 16, 1, 0.8))[..., None]
+                * (1 + 0.3 * patterns.fractal(rng, 256, 256, 16, 1, 0.8))[..., None]
             )
             statue(surfaces, rng, base, 0.42, surfaces.texture(to_pixels(fur.astype(np.float32))), detail=12)
         elif k < 5:
-            number = surfaces.texture(to_pixels(books(rng, 160, 256)))
+            number = surfaces.texture(to_pixels(patterns.books(rng, 160, 256)))
             plain = _flat(surfaces, rng, (0, 1))
             surfaces.box(base, r * rng.uniform(0.2, 0.34), b * 0.17, 0.23, [number, plain, plain, plain, plain])
         else:
-            label = surfaces.texture(photos[k % 3] if rng.random() < 0.3 else to_pixels(poster(rng, 160, 160)))
+            label = surfaces.texture(photos[k % 3] if rng.random() < 0.3 else to_pixels(patterns.poster(rng, 160, 160)))
             plain = _flat(surfaces, rng, (0, 1))
             surfaces.box(base, r * rng.uniform(0.08, 0.2), b * rng.uniform(0.08, 0.2), rng.uniform(0.06, 0.25),
                          [label, plain, label, plain, plain])  # fmt: skip
@@ -240,10 +227,10 @@ def _desk(surfaces: Surfaces, rng: Rng, split: str, centre: Vector) -> None:
 
 def _cabinet(surfaces: Surfaces, rng: Rng, base: Vector, degrees: Real) -> None:
     _, right, back = _turn(base, degrees)
-    front = door(rng, 512, 300)
-    sides = surfaces.texture(to_pixels(front * 0 + plaster(rng, 512, 300, front[4, 4], 0.7)))
+    front = patterns.door(rng, 512, 300)
+    sides = surfaces.texture(to_pixels(front * 0 + patterns.plaster(rng, 512, 300, front[4, 4], 0.7)))
     surfaces.box(base, right * 0.9, back * 0.45, 1.3, [surfaces.texture(to_pixels(front)), sides, sides, sides, sides])
-    shelf = surfaces.texture(to_pixels(books(rng, 192, 512)))
+    shelf = surfaces.texture(to_pixels(patterns.books(rng, 192, 512)))
     surfaces.box(
         base + right * 0.05 + vec(0, 0, 1.3), right * 0.8, back * 0.2, 0.26, [shelf, sides, sides, sides, sides]
     )
@@ -264,7 +251,7 @@ def indoor_scene(rng: Rng, split: str, shots: int, scale: Real) -> DrawnScene:
     _room(surfaces, rng, half, height)
     desk = vec(rng.uniform(-0.4, 0.4), half - rng.uniform(0.6, 1.0), 0)
     _desk(surfaces, rng, split, desk)
-    photos = pictures(split, rng, 2) + [to_pixels(poster(rng, 360, 270)) for _ in range(3)]
+    photos = pictures(split, rng, 2) + [to_pixels(patterns.poster(rng, 360, 270)) for _ in range(3)]
     _on_wall(surfaces, photos[0], 1, half, rng.uniform(0.9, 1.4), 1.55, 0.6)
     if rng.random() < 0.8:
         _on_wall(surfaces, photos[2], 1, half, rng.uniform(-1.4, -0.9), 1.5, 0.5)
@@ -272,9 +259,10 @@ def indoor_scene(rng: Rng, split: str, shots: int, scale: Real) -> DrawnScene:
     _on_wall(surfaces, photos[3], 2, half, rng.uniform(-0.5, 1), 1.5, 0.6)
     style = np.random.SeedSequence(int(rng.integers(2**31)))
     _on_wall(
-        surfaces, to_pixels(window(rng, 512, 420, style) * 2.2 + 0.1), 2 * int(rng.integers(2)), half, -1.2, 1.6, 1.1
-    )
-    shelf = surfaces.texture(to_pixels(books(rng, 192, 768)))
+        surfaces, to_pixels(patterns.window(rng, 512, 420, style) * 2.2 + 0.1), 2 * int(rng.integers(2)), half, -1.2,
+        1.6, 1.1,
+    )  # fmt: skip
+    shelf = surfaces.texture(to_pixels(patterns.books(rng, 192, 768)))
     board = _flat(surfaces, rng)
     x = rng.uniform(-0.6, 0.4)
     for z in (1.25, 1.62)[: int(rng.integers(1, 3))]:
@@ -282,7 +270,7 @@ def indoor_scene(rng: Rng, split: str, shots: int, scale: Real) -> DrawnScene:
         surfaces.box(vec(x + 0.05, half - 0.2, z + 0.03), vec(0.9, 0, 0), vec(0, 0.2, 0), 0.22,
                      [shelf, board, board, board, board])  # fmt: skip
     _cabinet(surfaces, rng, vec(half - 1.2, half - 0.55, 0), rng.uniform(-6, 6))
-    rug = surfaces.texture(to_pixels(cloth(rng, 384, 512)))
+    rug = surfaces.texture(to_pixels(patterns.cloth(rng, 384, 512)))
     surfaces.quad(vec(-1.1, half - 1.3, 0.01), vec(2.2, 0, 0), vec(0, -1.6, 0), rug)
     size = (round(SIZE[0] * scale), round(SIZE[1] * scale))
     K = calibration(FOCAL * scale, size)

@@ -6,8 +6,6 @@ becomes one of the camera, so that K stays upper triangular) and the fundamental
 the matcher's figures stay as they are. Matches that fall away are masked; `LabelledMatches.compact` takes them out.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 
@@ -35,8 +33,7 @@ class Augmentation(AugmentationOptions):
     """
 
     @classmethod
-    def none(cls) -> Augmentation:
-        """Nothing but a random order."""
+    def none(cls) -> "Augmentation":
         return cls(swap=0, quarter_turn=0, turn=0, crop=0, ratio=None, thin=0, noise=None, matches=None)
 
     def __call__(
@@ -156,7 +153,6 @@ def _within(range_: Range, u: float) -> float:
 
 
 def _box(size: list[int], width: float, height: float, x: float, y: float) -> tuple[int, int, int, int]:
-    """A crop of an image of `size` (h, w) as left, top, right, bottom in pixels, at least one pixel large."""
     h, w = size
     wide, high = max(round(width * w), 1), max(round(height * h), 1)
     left, top = round(x * (w - wide)), round(y * (h - high))
@@ -171,7 +167,6 @@ def _unless_poor(changed: LabelledMatches, before: LabelledMatches) -> LabelledM
 
 
 def _thinned(matches: LabelledMatches, share: float, order: Int[Tensor, " n"]) -> Bool[Tensor, "1 n"]:
-    """Which matches stay: random ones of those that are in excess; ignored ones in the same share as inliers."""
     label = matches.label[0]
     counts = {value: int((label == value).sum()) for value in (1, 0, -1)}
     if not counts[1] or not counts[0]:
@@ -186,13 +181,11 @@ def _thinned(matches: LabelledMatches, share: float, order: Int[Tensor, " n"]) -
 
 
 def _numbers(seed: int, key: int, n: int, columns: int) -> Float[Tensor, "n columns"]:
-    """Random numbers in (0, 1) for each match."""
     drawn = uniform(seed, torch.tensor([key]), Stream.AUGMENTATION, 0, n, columns)[0]
     return drawn.clamp(min=2.0**-53)
 
 
 def _order(seed: int, key: int, n: int) -> Int[Tensor, " n"]:
-    """A random order of n matches."""
     return torch.argsort(_numbers(seed, key, n, 1)[:, 0])
 
 

@@ -8,8 +8,6 @@ lines decides with the same two thresholds; it takes a wrong match that is near 
 band of 6 px in an image 500 px high: about one in eighty).
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 
@@ -55,28 +53,24 @@ class LabelledMatches(Record):
 
     @property
     def labelled(self) -> Bool[Tensor, "b n"]:
-        """True for the matches that a loss may look at: real ones that are inliers or outliers."""
         return self.label >= 0
 
     @property
     def inlier(self) -> Bool[Tensor, "b n"]:
-        """True for the matches that are right."""
         return self.label == INLIER
 
     def __len__(self) -> int:
-        """Number of pairs."""
         return len(self.correspondences)
 
-    def __getitem__(self, index: Index) -> LabelledMatches:
+    def __getitem__(self, index: Index) -> "LabelledMatches":
         """The selected pairs, always as a batch."""
         i = as_index(index, len(self))
         return self._map(lambda value: value[i])
 
-    def keep(self, mask: Bool[Tensor, "b n"]) -> LabelledMatches:
-        """The same matches, of which only those also in `mask` survive."""
+    def keep(self, mask: Bool[Tensor, "b n"]) -> "LabelledMatches":
         return self.replace(correspondences=self.correspondences.keep(mask))
 
-    def compact(self, multiple: int = 1) -> LabelledMatches:
+    def compact(self, multiple: int = 1) -> "LabelledMatches":
         """Matches moved to the front in their order, padding cut to the longest pair (rounded up to `multiple`)."""
         mask = self.correspondences.mask
         order = torch.argsort(mask.logical_not().to(torch.uint8), dim=-1, stable=True)
@@ -89,13 +83,12 @@ class LabelledMatches(Record):
             moved, correspondences=moved.correspondences.compact(multiple), label=_padded(moved.label, n)
         )
 
-    def reorder(self, order: Int[Tensor, "b m"]) -> LabelledMatches:
+    def reorder(self, order: Int[Tensor, "b m"]) -> "LabelledMatches":
         """The matches in the slots `order` of each pair, in that order."""
         moved = {name: gathered(value, order) for name, value in slotted(self.correspondences).items()}
         return LabelledMatches(self.correspondences.replace(**moved), gathered(self.label, order), self.F)
 
-    def first(self, count: int) -> LabelledMatches:
-        """The first `count` slots of each pair."""
+    def first(self, count: int) -> "LabelledMatches":
         cut = {name: value[:, :count] for name, value in slotted(self.correspondences).items()}
         return LabelledMatches(self.correspondences.replace(**cut), self.label[:, :count], self.F)
 
@@ -112,7 +105,6 @@ def collate(items: Sequence[LabelledMatches]) -> LabelledMatches:
 
 
 def _padded(label: Tensor, n: int) -> Tensor:
-    """Labels of `n` slots, ignored beyond the given ones."""
     missing = max(n - label.shape[1], 0)
     return torch.nn.functional.pad(label, (0, missing), value=IGNORED)[:, :n]
 
@@ -158,14 +150,9 @@ def depths(dataset: DepthDataset, image: ImageSource, x: Points) -> NDArray[np.f
 
 
 def transfer_error(
-    x: Points,
-    depth: NDArray[np.float64],
-    partner: Points,
-    K: NDArray[np.float64],
-    K_other: NDArray[np.float64],
-    R: NDArray[np.float64],
-    t: NDArray[np.float64],
-) -> NDArray[np.float64]:
+    x: Points, depth: NDArray[np.float64], partner: Points, K: NDArray[np.float64], K_other: NDArray[np.float64],
+    R: NDArray[np.float64], t: NDArray[np.float64],
+) -> NDArray[np.float64]:  # fmt: skip
     """How far (n,), in pixels, points are carried past their partners in the other image, at the kindest of k depths.
 
     Args:

@@ -5,8 +5,6 @@ no true geometry) adds zero to loss and gradient; where that holds for all pairs
 the graph. So no training step needs to be skipped.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

@@ -3,8 +3,6 @@
 Nothing here imports a library, for which ``--help`` would wait.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence

@@ -5,8 +5,6 @@ depth of every point of its views is known; but the matches of one plane determi
 Zisserman, section 11.9), so that these pairs train the classification of matches alone.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import itertools
@@ -22,9 +20,8 @@ from numpy.typing import NDArray
 from torch.utils.data import Dataset
 
 from fmtorch.core.files import cache_dir, replacing
+from fmtorch.data import ImagePair, ImageSource, read_image
 from fmtorch.data.cameras import relative_pose
-from fmtorch.data.images import read_image
-from fmtorch.data.pairs import ImagePair, ImageSource
 from fmtorch.scenes.raycast import Camera, calibration
 from fmtorch.training.options import PlaneViews as PlaneViews
 
@@ -97,15 +94,9 @@ class PlanePairs(Dataset[ImagePair]):
     name = "planes"
 
     def __init__(
-        self,
-        photographs: Sequence[Photograph],
-        views: PlaneViews | None = None,
-        seed: int = 0,
-        root: str | Path | None = None,
-        *,
-        workers: int = 1,
-        progress: Callable[[int, int], None] | None = None,
-    ) -> None:
+        self, photographs: Sequence[Photograph], views: PlaneViews | None = None, seed: int = 0,
+        root: str | Path | None = None, *, workers: int = 1, progress: Callable[[int, int], None] | None = None,
+    ) -> None:  # fmt: skip
         if not photographs:
             raise ValueError("no photographs to look at")
         self.views = views or PlaneViews()

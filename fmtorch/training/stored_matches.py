@@ -1,7 +1,5 @@
 """Labelled matches on disk, the torch Dataset that reads them, and batches of pairs with similar numbers of matches."""
 
-from __future__ import annotations
-
 import copy
 import itertools
 import warnings
@@ -211,7 +209,7 @@ class StoredMatches(Dataset[LabelledMatches]):
             for about, (ratio, label) in zip(self.pairs, map(self._figures, self._rows), strict=True)
         ]
 
-    def select(self, indices: Iterable[int]) -> StoredMatches:
+    def select(self, indices: Iterable[int]) -> "StoredMatches":
         """The same data set with these pairs only."""
         chosen = list(indices)
         other = copy.copy(self)
@@ -219,7 +217,7 @@ class StoredMatches(Dataset[LabelledMatches]):
         other.pairs = [self.pairs[i] for i in chosen]
         return other
 
-    def joined(self, other: StoredMatches) -> StoredMatches:
+    def joined(self, other: "StoredMatches") -> "StoredMatches":
         """The pairs of both data sets, this one's first, with this one's random changes and folder."""
         both = copy.copy(self)
         both._paths, both._open = [*self._paths, *other._paths], {}
@@ -227,7 +225,7 @@ class StoredMatches(Dataset[LabelledMatches]):
         both.pairs, both.failures = [*self.pairs, *other.pairs], [*self.failures, *other.failures]
         return both
 
-    def augmented(self, augmentation: Augmentation | None, seed: int = 0) -> StoredMatches:
+    def augmented(self, augmentation: Augmentation | None, seed: int = 0) -> "StoredMatches":
         """The same data set with other random changes."""
         other = copy.copy(self)
         other.augmentation, other.seed = augmentation, seed
@@ -334,15 +332,9 @@ class SimilarLengthBatches(Sampler[list[Draw]]):
     """
 
     def __init__(
-        self,
-        dataset: Lengths,
-        batch: int = 32,
-        *,
-        seed: int = 0,
-        matches: Sequence[int] | None = (50, 4000),
-        rank: int = 0,
-        world_size: int = 1,
-    ) -> None:
+        self, dataset: Lengths, batch: int = 32, *, seed: int = 0, matches: Sequence[int] | None = (50, 4000),
+        rank: int = 0, world_size: int = 1,
+    ) -> None:  # fmt: skip
         if batch < 1:
             raise ValueError(f"batch is {batch}; it must be at least 1")
         if not 0 <= rank < world_size:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from fmtorch.core.types import Estimate
+from fmtorch.core.types import CONTRADICTED, Estimate
 from fmtorch.two_view.arguments import Arrays, Focal, correspondences
 from fmtorch.two_view.estimation import estimated
 from fmtorch.two_view.pair_type import with_pair_type
+from fmtorch.two_view.planes import homographies
 
 
 def find_fundamental(
@@ -110,6 +112,9 @@ def find_fundamental(
     if isinstance(focal, Mapping):
         options["focal"] = focal
     estimate = estimated(c, "fundamental", estimator, config_dir, seed, options, covariance)
+    if estimate.contradicted is not None and bool(estimate.contradicted.any()):
+        pairs = estimate.contradicted.nonzero()[:, 0].tolist()
+        warnings.warn(f"pair {', '.join(map(str, pairs))}: {CONTRADICTED}", stacklevel=2)
     return with_pair_type(estimate, c, seed) if pair_type else estimate
 
 
@@ -204,14 +209,17 @@ def find_homography(
     """Robustly estimate homographies from matched points, ``x1 ~ H x0``: of a plane, or of a camera that turns.
 
     Args:
-        x0, x1: matched points in pixels, as of `find_fundamental`. Gradients reach them through the final fit.
+        x0, x1: matched points in pixels, as of `find_fundamental`. x0 may be in the unit of a plane with y up or down:
+            where its extent is another one, it is scaled to that of x1, in whose pixels thresholds are. Gradients reach
+            the points through the final fit.
         estimator: a preset of conf/estimator whose solver is `four_point`.
         mask, ratio, score, prior, lafs0, lafs1, noise, key, seed, config_dir: as of `find_fundamental`.
         options: replace values of the preset (``inlier_threshold=1.5``).
 
     Returns:
         An `Estimate` whose `H` (B, 3, 3) has unit Frobenius norm and maps points that are seen to positive third
-        coordinates; inliers, ok, reason. Its significance is NaN where `ok`: that is a test of fundamental matrices.
+        coordinates; inliers, ok, reason, significance. Mirrored planes and photographs have theirs, too. Where as many
+        inliers are to be expected by chance, `ok` is False.
 
     Raises:
         ValueError, TypeError: as `find_fundamental`.
@@ -227,6 +235,7 @@ def find_homography(
         (True, 40, (1, 3, 3))
     """
     c = correspondences(
-        x0, x1, mask=mask, ratio=ratio, score=score, prior=prior, lafs0=lafs0, lafs1=lafs1, noise=noise, key=key
-    )
-    return estimated(c, "homography", estimator, config_dir, seed, options)
+        x0, x1, plane=True, mask=mask, ratio=ratio, score=score, prior=prior, lafs0=lafs0, lafs1=lafs1, noise=noise,
+        key=key,
+    )  # fmt: skip
+    return homographies(c, lambda c: estimated(c, "homography", estimator, config_dir, seed, options))

@@ -195,6 +195,11 @@ def with_pair_type(estimate: Estimate, c: Correspondences, seed: int, **options:
     return estimate.derived(**fields)
 
 
+def warnings_of(estimate: Estimate, pair_type: PairTypes) -> tuple[str, ...]:
+    """What each pair leaves open or contradicts, as `Estimate.warning` has it."""
+    return estimate.derived(pair_type_index=pair_type.kind).warning
+
+
 def _other_pose(R: Float[Tensor, "b 3 3"], poses: PlanePoses, flat: Tensor) -> dict[str, Tensor]:
     """The pose of a plane that is farther from R, as fields; NaN where both are one or the pair is not flat."""
     trace = component_sum((poses.R * R[:, None].to(poses.R)).flatten(2), -1)

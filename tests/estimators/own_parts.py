@@ -1,13 +1,10 @@
 """Parts as somebody else writes them."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
 
-from fmtorch.estimators import F4x2, Pair, SummedGains, kernel
-from fmtorch.estimators.sampling import Uniform
+from fmtorch.estimators import F4x2, Pair, SummedGains, Uniform, kernel
 
 Array = np.ndarray[Any, Any]
 

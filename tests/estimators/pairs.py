@@ -1,15 +1,13 @@
 """Pairs of many kinds as parts of estimators see them, and models of theirs."""
 
-from __future__ import annotations
-
 import functools
 
 import numpy as np
 import torch
 
-from fmtorch.core.types import Correspondences
+from fmtorch.core import Correspondences
+from fmtorch.estimators import Pair
 from fmtorch.estimators.batch import Batch
-from fmtorch.estimators.pair import Pair
 from fmtorch.geometry.eight_point import weighted_eight_point
 from tests.conftest import oracle
 from tests.laws import scene, small
@@ -31,7 +29,6 @@ def normalized(c: Correspondences, seed: int = 0, minimal: int = 7, i: int = 0) 
 def pair_of(c: Correspondences, seed: int = 0, i: int = 0) -> Pair:
     """A pair of a batch, which can be estimated."""
     pair = normalized(c, seed, i=i)
-    assert pair is not None
     return pair
 
 

@@ -1,7 +1,5 @@
 """Real pairs with outliers: our estimators against what ten other implementations reached on the same matches."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """The search: models belong to their draws, the best are kept, the earlier of equals, and rounds end when told."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 from typing import Any
@@ -9,17 +7,22 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fmtorch.estimators import Ransac
-from fmtorch.estimators.inliers import StoppingRule
-from fmtorch.estimators.models.fundamental import EightPoint, SevenPoint
+from fmtorch.estimators import (
+    EightPoint,
+    Msac,
+    Pair,
+    Preselect,
+    PriorWeighted,
+    Prosac,
+    Sampler,
+    SevenPoint,
+    StoppingRule,
+    Uniform,
+)
 from fmtorch.estimators.models.model import Hypotheses
-from fmtorch.estimators.options import Preselect
-from fmtorch.estimators.pair import Pair
 from fmtorch.estimators.preselection import Preselection
-from fmtorch.estimators.sampling import PriorWeighted, Prosac, Sampler, Uniform
-from fmtorch.estimators.scores import InlierCount, Msac
 from fmtorch.estimators.search import Pool, Search, Verified, merge
-from tests.estimators.pairs import FEW, SCALES, named, pair_of
+from tests.estimators.pairs import named, pair_of
 from tests.laws import scene
 from tests.reference import solvers as reference
 
@@ -145,18 +148,3 @@ def test_a_search_goes_on_while_no_sample_gave_a_model() -> None:
     pool = search(Late(), stop=StoppingRule(0.9999, 1.0, Uniform()), hypotheses=400)(pair)
     assert pool.filled
     assert pool.samples == 150
-
-
-@pytest.mark.parametrize("name", FEW)
-@pytest.mark.parametrize("scale", SCALES)
-def test_any_matches_are_searched(name: str, scale: float) -> None:
-    pool = search(stop=StoppingRule(0.99, 1.0, Uniform()))(named(name, scale))
-    assert np.isfinite(pool.F).all()
-    assert np.isfinite(pool.score[: pool.filled]).all()
-    assert 50 <= pool.samples <= 150
-
-
-def test_a_score_may_be_an_object() -> None:
-    c = scene(3)
-    named_part, built = Ransac(score="inlier_count"), Ransac(score=InlierCount(1.0))
-    np.testing.assert_array_equal(named_part(c).F, built(c).F)

@@ -1,9 +1,7 @@
-from __future__ import annotations
-
 import pytest
 import torch
 
-from fmtorch.core.types import Features, collate
+from fmtorch.core import Features, collate
 from fmtorch.matching import NearestNeighborMatcher, nearest_neighbors
 
 
@@ -34,21 +32,6 @@ def test_mutual_masks_one_sided_matches() -> None:
     f0, f1 = features(1, 30), features(2, 20)
     neighbors = nearest_neighbors(f0.descriptors, f1.descriptors)
     assert torch.equal(NearestNeighborMatcher(mutual=True)(f0, f1).mask[0], neighbors.mutual)
-
-
-@pytest.mark.parametrize("mutual", [False, True])
-def test_neighbours_and_padding_are_invisible(mutual: bool) -> None:
-    pairs = [(features(1, 9), features(2, 7)), (features(3, 0), features(4, 4)), (features(5, 6), features(6, 0))]
-    matcher = NearestNeighborMatcher(mutual=mutual)
-    together = matcher(collate([f0 for f0, _ in pairs]), collate([f1 for _, f1 in pairs]))
-    for b, (f0, f1) in enumerate(pairs):
-        alone, row = matcher(f0, f1), together[b]
-        n = len(f0)
-        assert torch.equal(row.mask[:, :n], alone.mask)
-        assert not row.mask[:, n:].any()
-        for name in ("x0", "x1", "ratio", "lafs0", "lafs1"):
-            assert torch.equal(getattr(row, name)[:, :n], getattr(alone, name))
-    assert together.mask.any(-1).tolist() == [True, False, False]
 
 
 def test_what_does_not_fit_is_refused() -> None:

@@ -1,16 +1,12 @@
 """Position consistency: equal to its definition, blind to rotation and zoom, and telling on real pairs."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
 import pytest
 import torch
 
-import fmtorch
-from fmtorch import presets
-from fmtorch.core.types import Correspondences, collate
+from fmtorch.core import Correspondences
 from fmtorch.pruning import position_agreement
 from fmtorch.pruning.consistency import CURVES, MIN_VOTE, NOISE, SCALES, TOLERANCE, TURNS, WINDOW, WORST_RATIO
 from tests.laws import scene
@@ -54,13 +50,6 @@ def test_a_common_motion_agrees_and_a_wrong_match_does_not(angle: float, scale: 
     assert float(agree(c.replace(x1=x1))[0, 7]) < 0.1
 
 
-def test_pairs_of_a_batch_have_their_own_turns() -> None:
-    pairs = [turned(scene(i, 60 + i), angle, 1.0) for i, angle in enumerate((0.0, 1.5, 3.0))]
-    together = agree(collate(pairs))
-    for i, pair in enumerate(pairs):
-        assert torch.equal(together[i, : 60 + i], agree(pair)[0])
-
-
 def test_gradients_are_those_of_the_definition() -> None:
     c = scene(2, 30)
     assert c.ratio is not None
@@ -75,33 +64,3 @@ def test_gradients_are_those_of_the_definition() -> None:
 
     (position_agreement(**fields, mask=c.mask)[0] * weight).sum().backward()
     expect_gradients(fields, defined)
-
-
-def test_gradients_are_finite() -> None:
-    c = scene(2, 50)
-    x0 = c.x0.clone().requires_grad_()
-    presets.build("pruner", "position_consistency")(c.replace(x0=x0)).prior.sum().backward()
-    assert x0.grad is not None
-    assert bool(torch.isfinite(x0.grad).all())
-    assert bool((x0.grad != 0).any())
-
-
-@pytest.mark.parametrize("ratios", [True, False])
-def test_find_fundamental_derives_the_prior_without_frames(ratios: bool) -> None:
-    c = scene(2, 120).replace(prior=None)
-    c = c if ratios else c.replace(ratio=None)
-    given = presets.build("pruner", "position_consistency")(c).prior
-    own = fmtorch.find_fundamental(c.x0, c.x1, ratio=c.ratio)
-    with_prior = fmtorch.find_fundamental(c.x0, c.x1, ratio=c.ratio, prior=given)
-    assert torch.equal(own.F, with_prior.F)
-
-
-def test_tells_inliers_on_real_pairs(real_matches: list[tuple[Correspondences, Tensor]]) -> None:
-    areas = []
-    for c, right in real_matches:
-        prior = presets.build("pruner", "position_consistency")(c).prior
-        assert prior is not None
-        good, bad = prior[c.mask & right].numpy(), prior[c.mask & ~right].numpy()
-        areas.append((good[:, None] > bad[None]).mean())
-    # Area under the ROC curve; 0.95 over all pairs of this scene, where the ratio alone reaches 0.78.
-    assert np.mean(areas) > 0.88

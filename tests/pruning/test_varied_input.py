@@ -1,7 +1,5 @@
 """Pruners on random, degenerate, small, tied and real input against their definitions, one pair and batches."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np
@@ -9,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from fmtorch.core.types import Correspondences
+from fmtorch.core import Correspondences
 from fmtorch.pruning import frame_agreement, gms, lpm, lpm_cost, one_to_one, position_agreement
 from fmtorch.pruning.consistency import CURVES, MIN_VOTE, NOISE, SCALES, TOLERANCE, TURNS, WINDOW, WORST_RATIO
 from tests.laws import degenerate, scene, scenes, small, with_padding
@@ -28,7 +26,6 @@ def inputs() -> Iterator[tuple[str, Correspondences]]:
     yield from small().items()
     c = scene(6, 400)  # duplicates and integers: ties everywhere
     points = [(x / 90).round() * 90 for x in (c.x0, c.x1)]
-    assert c.ratio is not None
     yield "ties", c.replace(x0=points[0], x1=points[1], ratio=(c.ratio * 10).round() / 10)
     signs = torch.rand(c.x0.shape, generator=torch.Generator().manual_seed(0)) < 0.5
     yield "negative zero", c.replace(x0=torch.where(signs, -0.0, 0.0))
@@ -75,7 +72,6 @@ def test_lpm(real_matches: list[tuple[Correspondences, Tensor]]) -> None:
 
 def test_one_to_one(real_matches: list[tuple[Correspondences, Tensor]]) -> None:
     for what, c, i, slots, x0, x1 in pairs(real_matches):
-        assert c.ratio is not None
         ratio = c.ratio[i].numpy()[slots]
         expected = one_to_one_reference(x0, x1, np.where(np.isnan(ratio), np.inf, ratio))
         expect_mask(one_to_one(c.x0, c.x1, c.ratio, c.mask)[i], slots, expected, what)
@@ -84,9 +80,6 @@ def test_one_to_one(real_matches: list[tuple[Correspondences, Tensor]]) -> None:
 @pytest.mark.parametrize("ratios", [True, False])
 def test_agreement_of_few_matches(ratios: bool) -> None:
     for what, c in small().items():
-        assert c.lafs0 is not None
-        assert c.lafs1 is not None
-        assert c.ratio is not None
         ratio = c.ratio if ratios else None
         vote = np.maximum(WORST_RATIO - c.ratio[0].double().numpy(), MIN_VOTE) if ratios else np.ones(len(c.mask[0]))
         x0, x1, A0, A1 = (t[0].double().numpy() for t in (c.x0, c.x1, c.lafs0[..., :2], c.lafs1[..., :2]))

@@ -1,7 +1,5 @@
 """Labels of matches, point by point from the definitions."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

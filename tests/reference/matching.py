@@ -1,7 +1,5 @@
 """Nearest neighbours and one match per location, one match at a time, from their definitions."""
 
-from __future__ import annotations
-
 import numpy as np
 
 

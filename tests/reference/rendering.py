@@ -1,7 +1,5 @@
 """Ray-casting and light in NumPy: piece by piece, and all pixels at once."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from fmtorch.scenes.light import SHADOW_MAP, Stage

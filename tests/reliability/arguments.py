@@ -1,7 +1,5 @@
 """Arguments for generated calls: sound ones by what an annotation asks for, and what users hand over by mistake."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The commands as a user runs them, on small data sets, killed at a chosen moment."""
 
-from __future__ import annotations
-
 import contextlib
 import subprocess
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """What the trials share: the process that starts commands, a data set, the runs that nothing disturbs."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -5,8 +5,6 @@ with one of the names. It is a program of its own since the test suite checks th
 do not have. The calls are the same every time.
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import faulthandler
@@ -36,8 +34,8 @@ from torch import Tensor
 
 import fmtorch
 from fmtorch import geometry, matching, metrics, pruning
+from fmtorch.core import Correspondences, Estimate, Features, collate
 from fmtorch.core.annotations import arguments_of, arrays_of
-from fmtorch.core.types import Correspondences, Estimate, Features, collate
 from fmtorch.pipeline.pipeline import load_pipeline
 from fmtorch.presets.objects import merged
 from tests.laws import PEERS, calibrated, few, quick_pruner
@@ -403,7 +401,6 @@ def _expect_clear(error: Exception, names: set[str]) -> None:
     trace = error.__traceback__
     while trace is not None and trace.tb_next is not None:
         trace = trace.tb_next
-    assert trace is not None
     file, line = trace.tb_frame.f_code.co_filename, trace.tb_lineno
     ours = file.startswith(HOME) and linecache.getline(file, line).strip().startswith("raise ")
     named = any(re.search(rf"\b{name}\b", str(error)) for name in names)

@@ -1,7 +1,5 @@
 """Damaged files: told, computed anew, or of no consequence; never another result, never a crash."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -12,12 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fmtorch.core.files import models_dir
-from fmtorch.core.types import pair_key
-from fmtorch.data.images import ImageError, read_image
-from fmtorch.runs import PairRow, RunFolder
+from fmtorch.core import models_dir, pair_key
+from fmtorch.data import ImageError, read_image
+from fmtorch.runs import PairRow, RunFolder, RunFolderError
 from fmtorch.runs.feature_cache import ArrayCache
-from fmtorch.runs.run_folder import RunFolderError
 from tests.processes import ONE_THREAD
 from tests.reliability.images import NO_IMAGES, SOUND
 

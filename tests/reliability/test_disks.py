@@ -4,8 +4,6 @@ Rights do not bind an administrator, as whom tests often run; so folders that ca
 read-only, and files that stand in the place of folders. Where nothing may be mounted those tests are skipped.
 """
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from collections.abc import Callable

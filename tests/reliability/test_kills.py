@@ -1,7 +1,5 @@
 """kill -9 when some results are already on disk: the same command goes on, and ends as if nothing had happened."""
 
-from __future__ import annotations
-
 import json
 import os
 import time

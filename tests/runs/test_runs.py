@@ -10,8 +10,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from fmtorch.core.files import replacing
 from fmtorch.core.types import pair_key
-from fmtorch.runs import PAIR_SCHEMA, PairRow, RunFolder, RunFolderError, identity_digest, replacing, to_table
+from fmtorch.runs import PAIR_SCHEMA, PairRow, RunFolder, RunFolderError, identity_digest, to_table
 from fmtorch.runs.run_folder import content_digest
 
 CONFIG = {

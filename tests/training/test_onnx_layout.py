@@ -13,7 +13,7 @@ from torch import Tensor
 from fmtorch.core.files import models_dir
 from fmtorch.features.networks import ARCHITECTURES, build
 from fmtorch.features.onnx_network import PatchNetwork
-from fmtorch.training.onnx_export import export, laid_out, quantize
+from scripts.patch_networks.onnx_export import export, laid_out, quantize
 from tests.features.test_networks import randomized
 
 SHIPPED = [
@@ -52,7 +52,7 @@ def exported(name: str, folder: Path, patches: Tensor) -> tuple[Path, Path]:
     fp32, int8 = folder / "fp32.onnx", folder / "int8.onnx"
     export(randomized(build(name)), fp32)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("fmtorch.training.onnx_export.lay_out", lambda path: None)
+        patch.setattr("scripts.patch_networks.onnx_export.lay_out", lambda path: None)
         quantize(fp32, int8, patches)
     return fp32, int8
 

@@ -5,7 +5,7 @@ import torch
 
 import fmtorch
 from fmtorch import presets
-from fmtorch.core.types import PAIR_TYPES, Correspondences, Estimate, collate
+from fmtorch.core import PAIR_TYPES, Correspondences, Estimate, collate
 from fmtorch.two_view.pair_type import classify
 from tests.geometry.kinds import batch, draw
 

@@ -9,7 +9,8 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 import fmtorch
-from fmtorch.core.types import PAIR_TYPES, WARNINGS, Estimate
+from fmtorch.core import PAIR_TYPES, Estimate
+from fmtorch.core.types import WARNINGS
 from tests.geometry.kinds import batch, draw
 from tests.reference import known_cameras as reference
 

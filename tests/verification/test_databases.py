@@ -195,6 +195,30 @@ def test_a_focal_length_that_the_matches_contradict_is_no_calibration(tmp_path: 
     assert angle(cameras.relative(0, 1)[0].T @ geometry.cam2_from_cam1.rotation.matrix()) < 1
 
 
+@pytest.mark.parametrize("focal", [10.0, 0.0, -600.0, np.inf])
+def test_an_absurd_focal_length_counts_as_unknown(focal: float, tmp_path: Path) -> None:
+    path, cameras = tmp_path / "database.db", scene(2, count=400)
+    write(path, cameras, "SIMPLE_PINHOLE", noise=0.1)
+    with pycolmap.Database.open(path) as database:
+        camera = database.read_camera(1)
+        camera.params = [focal, 320, 240]
+        database.update_camera(camera)
+    result = fmtorch.verify(path)
+    assert (result.configurations, result.problems) == ({"uncalibrated": 1}, ())
+    assert f"a focal length of {focal:g} px for 640 x 480 pixels counts as unknown" in result.warnings[0]
+    (geometry,) = read(path).values()
+    assert angle(cameras.relative(0, 1)[0].T @ geometry.cam2_from_cam1.rotation.matrix()) < 1
+
+
+def test_a_crop_of_a_database_is_calibrated(tmp_path: Path) -> None:
+    path, cameras = tmp_path / "database.db", scene(2, count=400)
+    cameras.X[:, 0] += 4
+    write(path, cameras, "PINHOLE", params=[600, 600, -20, 240])
+    assert fmtorch.verify(path).configurations == {"calibrated": 1}
+    (geometry,) = read(path).values()
+    assert angle(cameras.relative(0, 1)[0].T @ geometry.cam2_from_cam1.rotation.matrix()) < 0.5
+
+
 def test_geometries_are_kept_unless_forced(tmp_path: Path) -> None:
     path = tmp_path / "database.db"
     write(path, scene(3))
@@ -224,6 +248,9 @@ def test_a_copy_leaves_the_database_as_it_is(tmp_path: Path) -> None:
     assert (result.path, result.verified) == (copy, 3)
     assert digest(path) == before
     assert len(read(copy)) == 3
+    assert fmtorch.verify(path, output=copy).kept == 3
+    with pycolmap.Database.open(copy) as database:
+        database.delete_two_view_geometry(1, 2)
     with pytest.raises(ValueError, match=re.escape(f"output={copy} exists; name another file, or replace it")):
         fmtorch.verify(path, output=copy)
     with pytest.raises(ValueError, match="is the database itself"):

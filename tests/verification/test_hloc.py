@@ -76,6 +76,21 @@ def test_inliers_and_matrices_are_those_of_find_fundamental(tmp_path: Path) -> N
     assert sorted(os.listdir(tmp_path)) == ["features.h5", "matches.h5", "verified.h5"]
 
 
+def test_keys_of_an_older_hloc_are_read(tmp_path: Path) -> None:
+    """Names joined by _, which they may hold themselves."""
+    write(tmp_path, scene(2))
+    with h5py.File(tmp_path / "features.h5", "a") as file:
+        file.move("mapping/000.jpg", "map_1/000_a.jpg")
+    with h5py.File(tmp_path / "matches.h5", "a") as file:
+        file.move("mapping-000.jpg/mapping-001.jpg", "map_1-000_a.jpg_mapping-001.jpg")
+    paths = {f"{name}": tmp_path / f"{name}.h5" for name in ("features", "matches")}
+    result = fmtorch.verify(**paths, output=tmp_path / "verified.h5")
+    assert (result.configurations, result.problems) == ({"uncalibrated": 1}, ())
+    with h5py.File(tmp_path / "verified.h5") as file:
+        assert list(file) == ["map_1-000_a.jpg_mapping-001.jpg"]
+    assert fmtorch.verify(**paths, output=tmp_path / "verified.h5").kept == 1
+
+
 def test_broken_pairs_are_lines_and_stay_out(tmp_path: Path) -> None:
     pairs = write(tmp_path, scene(4))
     with h5py.File(tmp_path / "features.h5", "a") as file:

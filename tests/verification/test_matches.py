@@ -129,10 +129,58 @@ def test_broken_pairs_are_lines_and_stay_out(tmp_path: Path) -> None:
     assert said[2] == "d/x0, d/x1: d/K0 has shape (2, 3); it must be (3, 3)"
     assert said[3] == "e/x0, e/x1: size1 is [0.0, 640.0]; it must be the height and width of the image"
     assert said[4] == "f/x0, f/x1: f/x0 is of bool; it must hold real numbers"
-    assert "give the sizes of both images" in said[5]
+    assert "K0 alone needs the image sizes" in said[5]
     assert said[6].startswith("h/x0, h/x1: K0")
     assert said[7].startswith("i/x0, i/x1: i/x0 cannot be read")
     assert {key.partition("/")[0] for key in load(tmp_path / "verified.npz")} == {"a"}
+
+
+def test_the_checks_are_those_of_the_functions(tmp_path: Path) -> None:
+    """Crops are taken; normalised points, with K in pixels too, and sizes as (w, h) are lines, not geometries."""
+    x0, x1 = points()[0]
+    n0, n1 = (((x - K[:2, 2]) / 600).astype(np.float16) for x in (x0, x1))
+    crop = K - [[0, 0, 330], [0, 0, 0], [0, 0, 0]]
+    inside = (x0[:, 0] >= 0) & (x0[:, 0] < 310) & (x1[:, 0] >= 330)
+    y0, y1 = x0[inside], x1[inside] - [330, 0]
+    given: dict[str, dict[str, Any]] = {
+        "crop": {"x0": y0, "x1": y1, "K0": K, "K1": crop, "size0": np.array([480, 310]), "size1": np.array([480, 500])},
+        "normalised": {"x0": n0, "x1": n1}, "units": {"x0": n0, "x1": n1, **CALIBRATIONS},
+        "sizes": {"x0": x0, "x1": x1, "size0": np.array(SIZE[::-1]), "size1": np.array(SIZE[::-1])},
+        "few": {"x0": x0[:5], "x1": x1[:5]},
+        "resolution": {"x0": x0, "x1": x1, **SIZES, "K0": K / [[4], [4], [1]], "K1": K / [[4], [4], [1]]},
+    }  # fmt: skip
+    arrays = {f"{pair}/{key}": value for pair, entries in given.items() for key, value in entries.items()}
+    path, output = save(tmp_path / "matches.npz", arrays), tmp_path / "verified.npz"
+    result = fmtorch.verify(matches=path, output=output)
+    said = sorted(result.problems)
+    assert [line.partition("/")[0] for line in said] == ["normalised", "sizes", "units"]
+    for line, expected in zip(said, ("no pixels", "sizes are (h, w)", "K0 is in pixels"), strict=True):
+        assert expected in line
+    (warning,) = result.warnings
+    assert warning.startswith("resolution/x0, resolution/x1: far more matches agree without the calibration")
+    verified = load(output)
+    pose = fmtorch.find_essential(y0, y1, K, crop)
+    np.testing.assert_allclose(verified["crop/R"], pose.R[0], atol=2e-3)
+    assert verified["few/reason"] == "5 matches; at least 7 are needed"
+    assert "another resolution" in verified["resolution/warning"]
+
+
+@pytest.mark.parametrize("ending", [".npz", ".h5"])
+def test_a_complete_output_is_left_as_it_is(ending: str, tmp_path: Path) -> None:
+    path, output = tmp_path / f"matches{ending}", tmp_path / f"verified{ending}"
+    x0, x1 = points()[0]
+    save(path, {"a/x0": x0, "a/x1": x1})
+    fmtorch.verify(matches=path, output=output)
+    before = output.read_bytes()
+    again = fmtorch.verify(matches=path, output=output)
+    assert (again.path, again.pairs, again.kept, dict(again.configurations)) == (output, 1, 1, {})
+    assert output.read_bytes() == before
+    done = run_command("verify", f"matches={path.name}", f"output={output.name}", cwd=tmp_path)
+    assert done.returncode == 0
+    assert f"nothing to do: {output.name} has a geometry of each of 1 pairs" in done.stdout
+    save(path, {"a/x0": x0, "a/x1": x1, "b/x0": x0, "b/x1": x1})
+    with pytest.raises(ValueError, match="exists; name another file"):
+        fmtorch.verify(matches=path, output=output)
 
 
 @pytest.mark.parametrize(

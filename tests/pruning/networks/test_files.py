@@ -1,7 +1,5 @@
 """Learned files: others' checkpoints converted, refusals."""
 
-from __future__ import annotations
-
 import runpy
 import sys
 from pathlib import Path
@@ -10,9 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from fmtorch.core.types import Correspondences
-from fmtorch.pruning import LearnedPruner
-from fmtorch.pruning.networks import LC
+from fmtorch.core import Correspondences
+from fmtorch.pruning import LC, LearnedPruner
 from scripts.make_models import ngransac_state
 from tests.conftest import oracle, shared_path
 
