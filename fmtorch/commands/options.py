@@ -58,9 +58,9 @@ class EvalOptions:
     workers: Count | None = option(None, "short for executor.workers")
     processes: bool | None = option(None, "short for executor=processes (true) and executor=threads (false)")
     shard: str | None = option(
-        None, "i/n: only the i-th of n parts of the pairs, for machines that share run_dir; the last one sums up all"
+        None, "i/n: only the i-th of n parts of the pairs, for machines that share output; the last one sums up all"
     )
-    run_dir: Path | None = option(None, "null: runs/<data set>/<pipeline>-<first digits of the identity>")
+    output: Path | None = option(None, "null: runs/<data set>/<pipeline>-<first digits of the identity>")
     cache: Cache = option(None, CACHE)
     cache_limit: Gigabytes | None = option(20, CACHE_LIMIT)
     export: str | list[str] | None = option(

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from fmtorch.core.lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from fmtorch.core.files import models_dir
+    from fmtorch.core.files import conf_dir, models_dir
     from fmtorch.core.onnx_network import NetworkFileError
     from fmtorch.core.stages import (
         Estimator,
@@ -17,12 +17,12 @@ if TYPE_CHECKING:
         Pruner,
         grey_pyramid,
     )
-    from fmtorch.core.types import PAIR_TYPES, RELATED, Correspondences, Estimate, Features, collate, pair_key
+    from fmtorch.core.types import PAIR_TYPES, RELATED, WARNINGS, Correspondences, Estimate, Features, collate, pair_key
 
 __all__ = [
-    "PAIR_TYPES", "RELATED", "Correspondences", "Estimate", "Estimator", "FeatureExtractor", "Features", "GreyPyramid",
-    "ImagePruner", "Matcher", "NetworkFileError", "PairImages", "Pruner", "collate", "grey_pyramid", "models_dir",
-    "pair_key",
+    "PAIR_TYPES", "RELATED", "WARNINGS", "Correspondences", "Estimate", "Estimator", "FeatureExtractor", "Features",
+    "GreyPyramid", "ImagePruner", "Matcher", "NetworkFileError", "PairImages", "Pruner", "collate", "conf_dir",
+    "grey_pyramid", "models_dir", "pair_key",
 ]  # fmt: skip
 
 lazy_exports(__name__)

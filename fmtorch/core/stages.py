@@ -140,7 +140,7 @@ def model_of(estimator: Estimator) -> str:
 
 @dataclasses.dataclass(frozen=True)
 class NoFeatures:
-    """An extractor that finds nothing, for matchers that take the images themselves. keep: nothing of it is worth a place in a cache."""
+    """Finds nothing: an extractor for matchers that take images. keep: nothing of it is worth a place in a cache."""
 
     keep = False
 

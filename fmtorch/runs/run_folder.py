@@ -247,14 +247,14 @@ class RunFolder:
         path = Path(path)
         wanted: dict[str, Any] = json.loads(canonical(config))
         if path.exists() and not path.is_dir():
-            raise RunFolderError(f"{path} is a file; run_dir must name a folder")
+            raise RunFolderError(f"{path} is a file; output must name a folder")
         path.mkdir(parents=True, exist_ok=True)
         foreign = sorted(entry.name for entry in path.iterdir() if entry.suffix != ".tmp")
         if not (path / "run.json").exists():
             if foreign:
                 raise RunFolderError(
                     f"{path} is not empty and has no run.json, so it is no run folder (it holds {head(foreign)}); "
-                    "choose another run_dir"
+                    "choose another output"
                 )
             stored = {"format": FORMAT, "identity": identity_digest(wanted), "config": wanted}
             create(path / "run.json", json.dumps(stored, indent=2) + "\n")
@@ -262,7 +262,7 @@ class RunFolder:
         if folder.identity != identity_digest(wanted):
             raise RunFolderError(
                 f"{path} holds another run; what differs (there -> now): {differences(folder.config, wanted)}. "
-                "Choose another run_dir, or delete the folder"
+                "Choose another output, or delete the folder"
             )
         (path / "pairs").mkdir(exist_ok=True)
         return folder
@@ -281,7 +281,7 @@ class RunFolder:
             raise RunFolderError(f"{file} was not written by this program: it has no 'config'")
         if stored.get("format") != FORMAT:
             raise RunFolderError(
-                f"{file} has format {stored.get('format')}, this version reads {FORMAT}; choose another run_dir"
+                f"{file} has format {stored.get('format')}, this version reads {FORMAT}; choose another output"
             )
         if stored.get("identity") != identity_digest(stored["config"]):
             raise RunFolderError(

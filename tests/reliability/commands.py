@@ -32,7 +32,7 @@ def data_set(folder: Path, scenes: int, images: int) -> Path:
 
 def evaluation(root: Path, run_dir: Path, *extra: str) -> list[str]:
     """Arguments of an evaluation."""
-    return ["dataset=fmbench", f"dataset.root={root}", *EVAL, f"run_dir={run_dir}", *extra]
+    return ["dataset=fmbench", f"dataset.root={root}", *EVAL, f"output={run_dir}", *extra]
 
 
 def results(run_dir: Path) -> list[dict[str, object]]:
