@@ -19,7 +19,7 @@ from fmtorch.io.match_store import MATRICES, PairGeometry
 MEMORY = 256  # images whose keypoints are kept
 NO_MATCH = -1
 Names = tuple[str, str]
-Opened = TypeVar("Opened", bound="_OpenFiles")
+OpenFiles = TypeVar("OpenFiles", bound="_OpenFiles")
 
 
 class _OpenFiles:
@@ -29,7 +29,7 @@ class _OpenFiles:
         self.files, self._output, self._open = files, output, contextlib.ExitStack()
         self.image = functools.lru_cache(maxsize=MEMORY)(self._image)
 
-    def __enter__(self: Opened) -> Opened:
+    def __enter__(self: OpenFiles) -> OpenFiles:
         return self
 
     def __exit__(self, *error: object) -> None:
