@@ -5,7 +5,7 @@ import functools
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,9 +27,6 @@ class _OpenFiles:
     def __init__(self, files: Sequence[Path], output: Path) -> None:
         self.files, self._output, self._open = files, output, contextlib.ExitStack()
         self.image = functools.lru_cache(maxsize=MEMORY)(self._image)
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *error: object) -> None:
         self._open.close()
@@ -65,6 +62,9 @@ class HlocMatches(_OpenFiles):
             if not self._keys:
                 raise DataError(f"{matches} holds no matches0; give hloc's file of matches")
             self._open = stack.pop_all()
+
+    def __enter__(self) -> "HlocMatches":
+        return self
 
     def pairs(self) -> list[Names]:
         return sorted(self._keys)
@@ -166,6 +166,9 @@ class MatchFile(_OpenFiles):
                     "or hloc's features=F.h5 as well"
                 )
             self._open = stack.pop_all()
+
+    def __enter__(self) -> "MatchFile":
+        return self
 
     def pairs(self) -> list[Ids]:
         return [(f"{pair}x0", f"{pair}x1") for pair in self._pairs]
