@@ -124,13 +124,14 @@ def explained(error: HydraException | OmegaConfBaseException, command: str) -> s
     cause = error
     while isinstance(cause.__cause__, HydraException | OmegaConfBaseException):
         cause = cause.__cause__
-    parent = getattr(cause, "parent_node", None)
+    parent, options = getattr(cause, "parent_node", None), COMMANDS[command].names
     if isinstance(cause, GrammarParseError):
         return f"{cause.full_key}: {_line(str(cause.msg))}"
     if isinstance(cause, OmegaConfBaseException) and cause.full_key:
         names = [str(key) for key in parent] if isinstance(parent, DictConfig) else []
         if parent is not None and cause.key is not None and str(cause.key) not in names:
-            names = [name for name in names if name != "hydra"]
+            names = [name for name in names if not name.startswith(("hydra", "_"))]
+            names = names if "." in cause.full_key else options
             return f"no option {cause.full_key}; there are: {nearest(str(cause.key), names) or 'none'}"
         return f"{cause.full_key}: {_line(str(cause.msg or cause))}"
     unknown = re.search(r"[Cc]ould not override '([^']+)'", str(error))
@@ -171,7 +172,10 @@ def hydra_arguments(words: Sequence[str], paths: Sequence[str], positional: Sequ
 
 
 def _split(words: Sequence[str]) -> tuple[list[str], list[str]]:
-    takes_value = {name for action in get_args_parser()._actions if action.nargs != 0 for name in action.option_strings}
+    """The flags with their values, and all others. Raises ValueError for an option with dashes (``--limit 5``)."""
+    actions = get_args_parser()._actions
+    takes_value = {name for action in actions if action.nargs != 0 for name in action.option_strings}
+    known = tuple(name for action in actions for name in action.option_strings)
     flags: list[str] = []
     others: list[str] = []
     rest = list(words)
@@ -182,6 +186,11 @@ def _split(words: Sequence[str]) -> tuple[list[str], list[str]]:
         if not word.startswith("-"):
             others.append(word)
             continue
+        name, given, value = word.partition("=")
+        if name.startswith("--") and not any(flag.startswith(name) for flag in known):
+            option = name.lstrip("-").replace("-", "_")
+            value = value if given else rest[0] if rest and not rest[0].startswith("-") else "VALUE"
+            raise ValueError(f"{name}: options have no dashes: {option}={value}")
         flags.append(word)
         if word in takes_value and rest and not (word in ("-i", "--info") and "=" in rest[0]):
             flags.append(rest.pop(0))

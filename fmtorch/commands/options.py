@@ -58,9 +58,9 @@ class EvalOptions:
     workers: Count | None = option(None, "short for executor.workers")
     processes: bool | None = option(None, "short for executor=processes (true) and executor=threads (false)")
     shard: str | None = option(
-        None, "i/n: only the i-th of n parts of the pairs, for machines that share run_dir; the last one sums up all"
+        None, "i/n: only the i-th of n parts of the pairs, for machines that share output; the last one sums up all"
     )
-    run_dir: Path | None = option(None, "null: runs/<data set>/<pipeline>-<first digits of the identity>")
+    output: Path | None = option(None, "null: runs/<data set>/<pipeline>-<first digits of the identity>")
     cache: Cache = option(None, CACHE)
     cache_limit: Gigabytes | None = option(20, CACHE_LIMIT)
     export: str | list[str] | None = option(
@@ -215,22 +215,14 @@ class Command:
 
 
 EVAL = Command(
-    "eval",
-    REPLACED,
-    EvalOptions,
-    {**STAGES, "dataset": "rendered", "executor": "auto", "pipeline": "sift_ratio"},
+    "eval", REPLACED, EvalOptions, {**STAGES, "dataset": "rendered", "executor": "auto", "pipeline": "sift_ratio"},
     texts=("dataset.root", "dataset.file", "dataset.truth", "dataset.images", "export"),
-    interrupted="interrupted; the same command continues the run",
-    sweeps="runs",
-)
+    interrupted="interrupted; the same command continues the run", sweeps="runs",
+)  # fmt: skip
 MATCH = Command(
-    "match",
-    REPLACED,
-    MatchOptions,
-    {**STAGES, "executor": "auto", "pipeline": "hesaffnet_fast_fmtorch"},
-    positional=("image0", "image1"),
-    texts=("export", "K"),
-)
+    "match", REPLACED, MatchOptions, {**STAGES, "executor": "auto", "pipeline": "hesaffnet_fast_fmtorch"},
+    positional=("image0", "image1"), texts=("export", "K"),
+)  # fmt: skip
 PAIRS = Command(
     "pairs",
     """The set has the layout of FM-Bench, for dataset=fmbench. The rule is the paper's: more than 20 SIFT matches
@@ -242,12 +234,8 @@ whatever features find. Which pairs are looked at, the data set says (window, ca
     interrupted="interrupted; the same command goes on from there",
 )
 REPORT = Command(
-    "report",
-    "It has tables, curves and pictures.",
-    ReportOptions,
-    {},
-    positional=("runs...",),
-)
+    "report", "It has tables, curves and pictures.", ReportOptions, {}, positional=("runs...",),
+)  # fmt: skip
 TRAIN = Command(
     "train",
     """The data set has ground truth: fmtorch train pruner=lc.

@@ -19,12 +19,11 @@ from fmtorch.data.construction import BLOCK, Construction, blocks
 from fmtorch.data.scenes import ScenePairs
 from fmtorch.jobs.execution import Execution
 from fmtorch.jobs.runner import Factory, Local, Source, WorkerPool, in_order
-from fmtorch.presets import plain
-from fmtorch.presets.composition import execution_of, read_fields
+from fmtorch.presets.composition import execution_of, plain, read_fields
 from fmtorch.scenes import RenderedPairs
 
 MIN_CANDIDATES_FOR_PROCESSES = 4 * BLOCK + 1  # below which processes are not worth their start
-PRELOADED = ("fmtorch.data.construction",)  # by the process that workers are forked of
+PRELOADED = (Construction.__module__,)  # by the process that workers are forked of
 
 
 def run(config: DictConfig) -> Path:

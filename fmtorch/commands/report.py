@@ -37,8 +37,8 @@ def run(config: DictConfig) -> Path:
     expect_writable(output.parent)
     if output.is_dir():
         raise ValueError(f"output={output} is a folder; it must name a file")
-    sections, by_dataset = [], _by_dataset(runs)
-    for heading, group in by_dataset.items():
+    sections, groups = [], by_dataset(runs)
+    for heading, group in groups.items():
         bar = functools.partial(track, description="drawing pairs", console=console, transient=True)
         pairs, notes = gallery(group, options, bar)
         signed = [r.name for r in group if r.folder.config.get("pose") is not None]
@@ -46,7 +46,7 @@ def run(config: DictConfig) -> Path:
     rows = [
         [r.name, heading, r.folder.identity[:8], *(str(r.folder.config.get(k)) for k in ("version", "seed")),
          str(r.folder.path)]
-        for heading, group in by_dataset.items() for r in group
+        for heading, group in groups.items() for r in group
     ]  # fmt: skip
     page = render(str(config.title), sections, rows, shared_settings([r.folder.config for r in runs]))
     with replacing(output) as temporary:
@@ -108,7 +108,7 @@ def _order(order: str | None, paths: Sequence[Path]) -> str:
     return order or ("given" if all((path / "run.json").exists() for path in paths) else "recall")
 
 
-def _by_dataset(runs: Sequence[Run]) -> dict[str, list[Run]]:
+def by_dataset(runs: Sequence[Run]) -> dict[str, list[Run]]:
     """The runs of each data set, under a heading that says which: its options and families."""
     groups: dict[str, list[Run]] = {}
     for r in runs:

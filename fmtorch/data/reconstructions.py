@@ -33,18 +33,10 @@ _FILES = ("cameras.bin", "cameras.txt")
 
 
 def colmap_pairs(
-    root: str | Path | None = None,
-    split: str = "test",
-    sequences: Sequence[str] | None = None,
-    model: str | None = None,
-    images: str = "images",
-    candidates: Literal["all", "points"] = "all",
-    shared: int = MIN_SHARED,
-    pairs: int | None = 1000,
-    seed: int = 0,
-    family: str | None = None,
-    depth: bool = True,
-) -> ScenePairs:
+    root: str | Path | None = None, split: str = "test", sequences: Sequence[str] | None = None,
+    model: str | None = None, images: str = "images", candidates: Literal["all", "points"] = "all",
+    shared: int = MIN_SHARED, pairs: int | None = 1000, seed: int = 0, family: str | None = None, depth: bool = True,
+) -> ScenePairs:  # fmt: skip
     """Pairs of the images of COLMAP models, text or binary, one folder a scene.
 
     Args:
@@ -166,16 +158,10 @@ class BundlerPairs(ScenePairs):
     """
 
     def __init__(
-        self,
-        root: str | Path | None = None,
-        split: str = "test",
-        sequences: Sequence[str] | None = None,
-        candidates: Literal["all", "points"] = "all",
-        shared: int = MIN_SHARED,
-        pairs: int | None = 1000,
-        seed: int = 0,
-        family: str | None = None,
-    ) -> None:
+        self, root: str | Path | None = None, split: str = "test", sequences: Sequence[str] | None = None,
+        candidates: Literal["all", "points"] = "all", shared: int = MIN_SHARED, pairs: int | None = 1000,
+        seed: int = 0, family: str | None = None,
+    ) -> None:  # fmt: skip
         home = given_root(
             root, "bundler", "a folder of scenes with list.txt and a Bundler file each, or one such scene"
         ).absolute()

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from fmtorch.data.cameras import Lens, Matrix, from_projection, nearest_rotation
-from fmtorch.data.files import DataError, given_root, numbered, to_finite
+from fmtorch.data.files import DataError, given_root, images_by_stem, numbered, to_finite
 from fmtorch.data.pairs import ImageSource
 from fmtorch.data.scenes import (
     WINDOW,
@@ -41,15 +41,9 @@ class KittiPairs(ScenePairs):
     """
 
     def __init__(
-        self,
-        root: str | Path | None = None,
-        split: str = "test",
-        sequences: Sequence[str] | None = None,
-        camera: int = 0,
-        window: int | float = WINDOW,
-        pairs: int | None = 1000,
-        seed: int = 0,
-    ) -> None:
+        self, root: str | Path | None = None, split: str = "test", sequences: Sequence[str] | None = None,
+        camera: int = 0, window: int | float = WINDOW, pairs: int | None = 1000, seed: int = 0,
+    ) -> None:  # fmt: skip
         home = given_root(root, "kitti", "the folder with sequences/ and poses/ of KITTI odometry")
         there = sorted(f.name for f in (home / "sequences").iterdir()) if (home / "sequences").is_dir() else []
         sequence_folders = folders(
@@ -96,7 +90,7 @@ def _kitti_scene(home: Path, folder: Path, camera: int, window: int | float) -> 
         )
     if not images.is_dir():
         raise DataError(f"{images}: no such folder; {_LAYOUT}")
-    there = {file.stem: file for file in sorted(images.iterdir(), reverse=True) if file.suffix in _SUFFIXES}
+    there = images_by_stem(images, _SUFFIXES)
     if len(there) > len(lines):
         raise DataError(
             f"{poses} ends at line {len(lines)} and {images} has {len(there)} images; each must have its line: is the "
@@ -133,15 +127,10 @@ _TUM_POSE = "timestamp tx ty tz qx qy qz qw"
 
 
 def tum_pairs(
-    root: str | Path | None = None,
-    split: str = "test",
-    sequences: Sequence[str] | None = None,
-    camera: str | None = None,
-    window: int | float = WINDOW,
-    pairs: int | None = 1000,
-    seed: int = 0,
+    root: str | Path | None = None, split: str = "test", sequences: Sequence[str] | None = None,
+    camera: str | None = None, window: int | float = WINDOW, pairs: int | None = 1000, seed: int = 0,
     depth: bool = True,
-) -> ScenePairs:
+) -> ScenePairs:  # fmt: skip
     """Pairs of frames at most `window` seconds apart.
 
     Args:

@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from fmtorch.estimators.degensac import Degensac
     from fmtorch.estimators.external.authors import degensac_cpp, gc_ransac_cpp, magsac_cpp, superansac_cpp
     from fmtorch.estimators.external.colmap import colmap
+    from fmtorch.estimators.external.fastpose import fastpose
     from fmtorch.estimators.external.kornia import kornia_ransac
     from fmtorch.estimators.external.opencv import opencv
     from fmtorch.estimators.external.pairwise import PairwiseEstimator
@@ -39,8 +40,8 @@ __all__ = [
     "GemanMcClure", "GraphCut", "Homography", "I8x1", "I8x2", "InlierCount", "InlierRule", "IterativelyReweighted",
     "Magsac", "Median", "Msac", "Pair", "PairwiseEstimator", "Preselect", "PriorWeighted", "Prosac", "Ransac", "Refine",
     "RobustDeviations", "Sampler", "SaturatedGains", "Score", "Select", "SevenPoint", "StoppingRule", "SummedGains",
-    "Uniform", "WithinThreshold", "colmap", "degensac_cpp", "gc_ransac_cpp", "kernel", "kornia_ransac", "magsac_cpp",
-    "opencv", "poselib", "superansac_cpp",
+    "Uniform", "WithinThreshold", "colmap", "degensac_cpp", "fastpose", "gc_ransac_cpp", "kernel", "kornia_ransac",
+    "magsac_cpp", "opencv", "poselib", "superansac_cpp",
 ]  # fmt: skip
 
 lazy_exports(__name__)

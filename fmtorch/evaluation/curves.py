@@ -86,7 +86,7 @@ def swatch(number: int) -> str:
 
 def style_sheet() -> str:
     """The colours and lines of curves."""
-    return resources.files("fmtorch.evaluation").joinpath("curves.css").read_text(encoding="utf-8")
+    return resources.files(__package__).joinpath("curves.css").read_text(encoding="utf-8")
 
 
 def picture(name: str, table: pa.Table) -> str:

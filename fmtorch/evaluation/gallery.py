@@ -14,9 +14,10 @@ from fmtorch import data, presets
 from fmtorch.data import DataError, ImageError, ImagePair, PairDataset, read_image
 from fmtorch.data.pair_list import PairList
 from fmtorch.evaluation.page import Picture, Shown, ShownPair, differing_pairs
-from fmtorch.evaluation.pictures import Image, draw_epipolar_lines, draw_epipolar_lines_of_corners, draw_matches
 from fmtorch.io.dataset import WITHOUT_GEOMETRY, H5Pairs
 from fmtorch.metrics import corner_error, nsgd
+from fmtorch.pipeline.photographs import Image
+from fmtorch.pipeline.pictures import draw_epipolar_lines, draw_epipolar_lines_of_corners, draw_matches
 from fmtorch.pipeline.pipeline import Outcome, Pipeline, build_pipeline
 from fmtorch.runs import RunFolder
 from fmtorch.scenes import RenderedPairs

@@ -22,8 +22,7 @@ from torch import Tensor
 from fmtorch import presets
 from fmtorch.core.stages import Estimator, ImageMatcher
 from fmtorch.core.types import Correspondences, Estimate
-from fmtorch.data.image_cameras import exif_focal
-from fmtorch.data.pairs import GivenMatches, ImagePair, ImageSource
+from fmtorch.data import GivenMatches, ImagePair, ImageSource, exif_focal
 from fmtorch.evaluation.rows import evaluate
 from fmtorch.io.match_store import MatchRecords, MatchStore
 from fmtorch.jit import kernel
@@ -32,8 +31,7 @@ from fmtorch.jobs.runner import Factory, Local, Source, TaskRunner, WorkerPool
 from fmtorch.pipeline.exporting import match_records
 from fmtorch.pipeline.pipeline import Outcome, Pipeline, examined
 from fmtorch.presets import plain
-from fmtorch.runs import PairRow
-from fmtorch.runs.feature_cache import CachedFeatures
+from fmtorch.runs import CachedFeatures, PairRow
 from fmtorch.runs.fingerprint import code_digest, file_digest, fmtorch_version, learned, libraries
 from fmtorch.two_view.known_cameras import KnownCameras
 from fmtorch.two_view.pair_type import compile_with
@@ -43,13 +41,9 @@ PLACES = ("root", "file", "truth", "images")
 
 
 def run_identity(
-    config: DictConfig,
-    pipeline_name: str,
-    pipeline: Pipeline,
-    dataset_digest: str,
-    cameras: str | None = None,
+    config: DictConfig, pipeline_name: str, pipeline: Pipeline, dataset_digest: str, cameras: str | None = None,
     signed: bool = False,
-) -> dict[str, Any]:
+) -> dict[str, Any]:  # fmt: skip
     """The identity of a run, as plain values.
 
     Args:
@@ -317,7 +311,7 @@ def batch_contents(pairs: list[ImagePair]) -> list[ImagePair]:
 
 
 BATCHES_OF_A_WORKER = 4  # at least, where there are pairs enough
-PRELOADED = ("fmtorch.evaluation.run",)  # by the process that workers are forked of
+PRELOADED = (__name__,)  # by the process that workers are forked of
 
 
 def select(pairs: Sequence[ImagePair], limit: int | None) -> list[ImagePair]:
@@ -335,18 +329,10 @@ def select(pairs: Sequence[ImagePair], limit: int | None) -> list[ImagePair]:
 
 
 def evaluate_pairs(
-    pipeline: Pipeline,
-    pairs: Sequence[ImagePair],
-    *,
-    seed: int,
-    batch: int,
-    execution: Execution,
-    store: Callable[[list[PairRow]], None],
-    build: Build | None = None,
-    cameras: Mapping[int, PairCameras] | None = None,
-    journal: MatchStore | None = None,
-    signed: bool = False,
-) -> Iterator[int]:
+    pipeline: Pipeline, pairs: Sequence[ImagePair], *, seed: int, batch: int, execution: Execution,
+    store: Callable[[list[PairRow]], None], build: Build | None = None,
+    cameras: Mapping[int, PairCameras] | None = None, journal: MatchStore | None = None, signed: bool = False,
+) -> Iterator[int]:  # fmt: skip
     """Run and evaluate the pairs, hand each batch's rows to `store`, and yield how many pairs it held.
 
     execution: by which workers. build: makes the same pipeline in another process, where these are no threads.

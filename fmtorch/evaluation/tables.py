@@ -8,6 +8,8 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 from rich import box
+from rich.console import Console
+from rich.measure import Measurement
 from rich.table import Table as TerminalTable
 
 from fmtorch.core.types import PAIR_TYPES
@@ -49,6 +51,7 @@ def _failures(group: Group) -> str:
     return f"{group['failures']} ({_text(group['failure_share'], '{:.1%}')})" if group["failures"] else "0"
 
 
+LEAST_IMPORTANT = ("#Corrs (-m)", "%Inlier (-m)", "Failed")  # where a terminal has no room for all
 TERMINAL_COLUMNS: Columns = {
     "Pairs": _number("pairs"),
     "%Recall": _recall,
@@ -187,11 +190,27 @@ def _parts_of_run(summary: Mapping[str, Group], binned: bool) -> list[Part]:
     return [part for part in parts(_groups(summary), binned) if part.heading != "Pair types" or not general]
 
 
-def terminal_tables(summary: Mapping[str, Group], title: str) -> list[TerminalTable]:
-    """The main figures of a run, for a terminal of 80 columns."""
+def terminal_tables(summary: Mapping[str, Group], title: str, width: int = 80) -> list[TerminalTable]:
+    """The main figures of a run, or of several by their names, for a terminal of so many columns.
+
+    Columns for which there is no room are left out, and the note says so, rather than words and numbers broken.
+    """
     columns = known_columns(TERMINAL_COLUMNS, summary)
     first = Part(title, caption(summary), columns, _groups(summary))
-    return [_on_terminal(part) for part in (first, *_parts_of_run(summary, binned=False))]
+    return [_fitted(part, width) for part in (first, *_parts_of_run(summary, binned=False))]
+
+
+def _fitted(part: Part, width: int) -> TerminalTable:
+    """The table with as many columns as there is room for: the least important go first, else the last."""
+    wide, columns = Console(width=1000), dict(part.columns)
+    while True:
+        dropped = [heading for heading in part.columns if heading not in columns]
+        note = f"{part.note} No room for {', '.join(dropped)}: summary.md has all." if dropped else part.note
+        table = _on_terminal(part._replace(columns=columns, note=note))
+        bare = _on_terminal(part._replace(columns=columns, note="", heading=""))
+        if len(columns) < 3 or Measurement.get(wide, wide.options, bare).minimum <= width:
+            return table
+        columns.pop(next((heading for heading in LEAST_IMPORTANT if heading in columns), list(columns)[-1]))
 
 
 def _on_terminal(part: Part) -> TerminalTable:
@@ -199,7 +218,8 @@ def _on_terminal(part: Part) -> TerminalTable:
         title=part.heading, title_style="bold", caption=part.note, caption_justify="left", caption_style="dim",
         box=box.SIMPLE_HEAD, pad_edge=False, collapse_padding=True,
     )  # fmt: skip
-    table.add_column("", overflow="fold")
+    words = [word for name in part.rows for word in name.split()]
+    table.add_column("", overflow="fold", min_width=max(map(len, words), default=1))
     for heading in part.columns:
         table.add_column(heading, justify="right", no_wrap=True, overflow="fold")
     for name, group in part.rows.items():

@@ -9,10 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from fmtorch.data.files import DataError, given_root
-from fmtorch.data.fmbench import FMBenchPairs
-from fmtorch.data.images import stored_size
-from fmtorch.data.pairs import GivenMatches, ImagePair, ImageSource, PairDataset
+from fmtorch.data import DataError, FMBenchPairs, GivenMatches, ImagePair, ImageSource, PairDataset, stored_size
+from fmtorch.data.files import given_root
+from fmtorch.data.pairs import HeldPairs
 from fmtorch.io import h5, predictions
 from fmtorch.io.predictions import Array, Size
 
@@ -258,13 +257,9 @@ class OANetMatches:
             ratios, mutuals = (self._side(file, name, len(rays)) for name in ("ratios", "mutuals"))
         x0, x1 = (x * K.diagonal()[:2] + K[:2, 2] for x, K in zip((rays[:, :2], rays[:, 2:]), self.K, strict=True))
         return predictions.given(
-            x0,
-            x1,
-            self.sizes,
-            (len(rays), len(rays)),
-            ratio=ratios,
+            x0, x1, self.sizes, (len(rays), len(rays)), ratio=ratios,
             mutual=None if mutuals is None else mutuals.astype(bool),
-        )
+        )  # fmt: skip
 
     def _side(self, file: Any, name: str, count: int) -> Array | None:
         if not h5.holds(file, name):
@@ -321,7 +316,7 @@ WITHOUT_GEOMETRY = {"hloc": 0.0, "glue_factory": CORNER, "vismatch": 0.0}
 LAYOUTS = (*WITHOUT_GEOMETRY, *WITH_GEOMETRY)
 
 
-class H5Pairs(PairDataset):
+class H5Pairs(HeldPairs):
     """Pairs with given matches, which take the place of features and matcher.
 
     Args:
@@ -339,15 +334,10 @@ class H5Pairs(PairDataset):
     name = "h5"
 
     def __init__(
-        self,
-        root: str | Path | None = None,
-        layout: str = "hloc",
-        truth: str | Path | None = None,
-        images: str | Path | None = None,
-        features: str | None = None,
-        matches: str | None = None,
+        self, root: str | Path | None = None, layout: str = "hloc", truth: str | Path | None = None,
+        images: str | Path | None = None, features: str | None = None, matches: str | None = None,
         origin: float | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         if layout not in LAYOUTS:
             raise DataError(f"no layout {layout!r}; it must be one of {', '.join(LAYOUTS)}")
         folder = given_root(root, "h5", "the file, or the folder of the files, that hold the matches")
@@ -382,12 +372,6 @@ class H5Pairs(PairDataset):
         if not self._pairs:
             raise DataError(f"{folder}: holds no pairs")
         self.digest = digest.hexdigest()
-
-    def __len__(self) -> int:
-        return len(self._pairs)
-
-    def __getitem__(self, index: int) -> ImagePair:
-        return self._pairs[index]
 
 
 def _truth(layout: str, truth: str | Path | None) -> PairDataset:

@@ -33,12 +33,9 @@ def export_kinds(value: str | Sequence[str] | None) -> tuple[str, ...]:
 
 
 def write_exports(
-    journal: MatchStore,
-    pairs: Sequence[tuple[Path, Path]],
-    kinds: Iterable[str],
-    folder: Path,
+    journal: MatchStore, pairs: Sequence[tuple[Path, Path]], kinds: Iterable[str], folder: Path,
     shared_camera: bool = False,
-) -> list[str]:
+) -> list[str]:  # fmt: skip
     """Write the files for the images of these pairs into a folder, whole or not at all; their names.
 
     shared_camera: in COLMAP's database, one camera for all images of one size whose calibration is unknown.

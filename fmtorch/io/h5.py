@@ -50,6 +50,22 @@ def keys(file: Any) -> list[str]:
         raise DataError(f"{_where(file)}: its keys cannot be read ({_first_line(error)})") from error
 
 
+def paths(file: Any) -> list[str]:
+    """The names below a file or group, at any depth. Raises DataError where they cannot be read."""
+    names: list[str] = []
+    try:
+        file.visit(names.append)
+    except (OSError, RuntimeError) as error:
+        raise DataError(f"{_where(file)}: its keys cannot be read ({_first_line(error)})") from error
+    return names
+
+
+def groups_with(file: Any, *names: str) -> list[str]:
+    """The paths of the groups that hold an array of one of these names, at any depth."""
+    ends = (path.rpartition("/") for path in paths(file))
+    return [group for group, _, name in ends if name in names and group]
+
+
 def holds(file: Any, key: str) -> bool:
     """Whether a file or group has the key, at any depth."""
     try:

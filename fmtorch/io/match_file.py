@@ -3,9 +3,9 @@
 import contextlib
 import functools
 import zipfile
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,48 +14,60 @@ from fmtorch.core.files import replacing
 from fmtorch.data.files import DataError
 from fmtorch.io import h5
 from fmtorch.io.colmap import DatabaseImage
-from fmtorch.io.match_store import PairGeometry, geometry_texts
+from fmtorch.io.match_store import MATRICES, PairGeometry
 
 MEMORY = 256  # images whose keypoints are kept
 NO_MATCH = -1
 Names = tuple[str, str]
 
 
-class HlocMatches:
-    """The pairs of two files; output: the file of matches that is written.
+class _OpenFiles:
+    """Files of matches that are read, closed on leaving, and know no geometry; images are read when asked for."""
 
-    Raises DataError where one of the files is no HDF5 file, or holds no keypoints or no matches.
-    """
-
-    def __init__(self, features: Path, matches: Path, output: Path) -> None:
-        self._output, self._open = output, contextlib.ExitStack()
-        self.files = (features, matches)
-        with contextlib.ExitStack() as stack:
-            self._features, self._matches = (stack.enter_context(h5.opened(path)) for path in (features, matches))
-            images = _below(self._features, "keypoints")
-            if not images:
-                raise DataError(f"{features} holds no keypoints; give hloc's file of features")
-            self._stored = {name.replace("/", "-"): name for name in images}
-            self._keys = {self._named(key): key for key in _below(self._matches, "matches0")}
-            if not self._keys:
-                raise DataError(f"{matches} holds no matches0; give hloc's file of matches")
-            self._open = stack.pop_all()
+    def __init__(self, files: Sequence[Path], output: Path) -> None:
+        self.files, self._output, self._open = files, output, contextlib.ExitStack()
         self.image = functools.lru_cache(maxsize=MEMORY)(self._image)
 
-    def __enter__(self) -> "HlocMatches":
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *error: object) -> None:
         self._open.close()
-
-    def pairs(self) -> list[Names]:
-        return sorted(self._keys)
 
     def identity(self) -> dict[str, Any]:
         return {"files": h5.digest_of(*self.files)}
 
     def has_geometry(self, pair: Names) -> bool:
         return False
+
+    def name(self, image_id: str) -> str:
+        return image_id
+
+    def _image(self, image_id: str) -> DatabaseImage:
+        raise NotImplementedError
+
+
+class HlocMatches(_OpenFiles):
+    """The pairs of two files; output: the file of matches that is written.
+
+    Raises DataError where one of the files is no HDF5 file, or holds no keypoints or no matches.
+    """
+
+    def __init__(self, features: Path, matches: Path, output: Path) -> None:
+        super().__init__((features, matches), output)
+        with contextlib.ExitStack() as stack:
+            self._features, self._matches = (stack.enter_context(h5.opened(path)) for path in (features, matches))
+            images = h5.groups_with(self._features, "keypoints")
+            if not images:
+                raise DataError(f"{features} holds no keypoints; give hloc's file of features")
+            self._stored = {name.replace("/", "-"): name for name in images}
+            self._keys = {self._named(key): key for key in h5.groups_with(self._matches, "matches0")}
+            if not self._keys:
+                raise DataError(f"{matches} holds no matches0; give hloc's file of matches")
+            self._open = stack.pop_all()
+
+    def pairs(self) -> list[Names]:
+        return sorted(self._keys)
 
     def finished(self) -> int:
         """How many pairs the output has, if it has all of them; else 0."""
@@ -86,9 +98,6 @@ class HlocMatches:
                     group["matching_scores0"] = np.where(second == NO_MATCH, 0, scores).astype(np.float32)
                 write_geometry(group, geometry)
 
-    def name(self, image_id: str) -> str:
-        return image_id
-
     def _named(self, key: str) -> Names:
         """The names of a pair's images; of an image without features that in the key."""
         first, _, second = key.rpartition("/")
@@ -116,26 +125,7 @@ class HlocMatches:
 
 def write_geometry(group: Any, geometry: PairGeometry) -> None:
     """Words and matrices of a pair as attributes of its group."""
-    group.attrs.update(geometry_texts(geometry))
-    for name in ("F", "E", "H", "R", "t"):
-        value = getattr(geometry, name)
-        if value is not None:
-            group.attrs[name] = value
-
-
-def _below(file: Any, last: str) -> list[str]:
-    groups: list[str] = []
-
-    def visit(name: str) -> None:
-        head, _, end = name.rpartition("/")
-        if end == last and head:
-            groups.append(head)
-
-    try:
-        file.visit(visit)
-    except (OSError, RuntimeError) as error:
-        raise DataError(f"{file.filename}: its keys cannot be read ({str(error).splitlines()[0]})") from error
-    return groups
+    group.attrs.update({**geometry.texts, **geometry.matrices})
 
 
 # Matches alone: x0, x1 of one pair or of many in an npz or HDF5 file, and their geometries in another
@@ -143,22 +133,18 @@ def _below(file: Any, last: str) -> list[str]:
 
 NPZ = ".npz"
 SUFFIXES = (NPZ, *h5.SUFFIXES)
-MATRICES = ("F", "E", "H", "R", "t")
 
 Ids = tuple[str, str]  # keys of the points of both images, which end in x0 and x1
 
 
-class ArrayFile(Protocol):
-    """Arrays by keys such as ``a/x0``."""
+class ArrayFile(NamedTuple):
+    """The keys of a file's arrays, such as ``a/x0``, and what reads one, or raises DataError."""
 
-    def keys(self) -> Iterable[str]:
-        """All of them."""
-
-    def read(self, key: str) -> NDArray[Any]:
-        """One array; raises DataError where it cannot be read."""
+    keys: list[str]
+    read: Callable[[str], NDArray[Any]]
 
 
-class MatchFile:
+class MatchFile(_OpenFiles):
     """The pairs of one file; each has matches of its own. output: the file of geometries that is written.
 
     A file holds ``x0, x1`` (n, 2), pixels with (0, 0) at the centre of the first one, and perhaps ``K0, K1`` (3, 3) and
@@ -168,10 +154,10 @@ class MatchFile:
     """
 
     def __init__(self, path: Path, output: Path) -> None:
-        self._path, self._output, self._open = path, output, contextlib.ExitStack()
+        super().__init__((path,), output)
         with contextlib.ExitStack() as stack:
             self._file = stack.enter_context(_arrays(path))
-            self._keys = set(self._file.keys())
+            self._keys = set(self._file.keys)
             ends = [key.removesuffix("x0") for key in self._keys if key.rpartition("/")[2] == "x0"]
             self._pairs = sorted(end for end in ends if f"{end}x1" in self._keys)
             if not self._pairs:
@@ -180,27 +166,14 @@ class MatchFile:
                     "or hloc's features=F.h5 as well"
                 )
             self._open = stack.pop_all()
-        self.image = functools.lru_cache(maxsize=MEMORY)(self._image)
-
-    def __enter__(self) -> "MatchFile":
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._open.close()
 
     def pairs(self) -> list[Ids]:
         return [(f"{pair}x0", f"{pair}x1") for pair in self._pairs]
 
-    def identity(self) -> dict[str, Any]:
-        return {"files": h5.digest_of(self._path)}
-
-    def has_geometry(self, pair: Ids) -> bool:
-        return False
-
     def finished(self) -> int:
         """How many pairs the output has, if it has all of them; else 0."""
         with _arrays(self._output) as written:
-            keys = set(written.keys())
+            keys = set(written.keys)
         return len(self._pairs) if all(f"{pair}inliers" in keys for pair in self._pairs) else 0
 
     def matches(self, pair: Ids) -> NDArray[np.int64]:
@@ -220,13 +193,9 @@ class MatchFile:
         pair = ids[0].removesuffix("x0")
         inliers = np.zeros(len(self.image(ids[0]).points), bool)
         inliers[geometry.inliers[:, 0]] = True
-        values = ((name, getattr(geometry, name)) for name in MATRICES)
-        matrices = {f"{pair}{name}": value for name, value in values if value is not None}
-        texts = {f"{pair}{name}": np.array(value) for name, value in geometry_texts(geometry).items()}
+        matrices = {f"{pair}{name}": value for name, value in geometry.matrices.items()}
+        texts = {f"{pair}{name}": np.array(value) for name, value in geometry.texts.items()}
         return {f"{pair}inliers": inliers, **texts, **matrices}
-
-    def name(self, image_id: str) -> str:
-        return image_id
 
     def _image(self, image_id: str) -> DatabaseImage:
         pair, i = image_id[:-2], int(image_id[-1])
@@ -264,7 +233,7 @@ def expect_suffix(name: str, path: Path) -> None:
 def _arrays(path: Path) -> Iterator[ArrayFile]:
     if path.suffix != NPZ:
         with h5.opened(path) as file:
-            yield _H5(file)
+            yield ArrayFile(h5.paths(file), functools.partial(h5.array, file))
         return
     try:
         npz = np.load(path)
@@ -272,38 +241,15 @@ def _arrays(path: Path) -> Iterator[ArrayFile]:
         raise DataError(f"{path}: is not a valid npz file; write it by numpy.savez") from error
     if not isinstance(npz, np.lib.npyio.NpzFile):
         raise DataError(f"{path}: is a single array; write x0 and x1 by numpy.savez")
-    with npz:
-        yield _Npz(npz)
 
-
-class _Npz:
-    def __init__(self, file: Any) -> None:
-        self._file = file
-
-    def keys(self) -> list[str]:
-        return list(self._file.files)
-
-    def read(self, key: str) -> NDArray[Any]:
+    def read(key: str) -> NDArray[Any]:
         try:
-            return np.asarray(self._file[key])
+            return np.asarray(npz[key])
         except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
             raise DataError(f"{key} cannot be read ({str(error).partition(chr(10))[0]})") from error
 
-
-class _H5:
-    def __init__(self, file: Any) -> None:
-        self._file = file
-
-    def keys(self) -> list[str]:
-        names: list[str] = []
-        try:
-            self._file.visit(names.append)
-        except (OSError, RuntimeError) as error:
-            raise DataError(f"{self._file.filename}: its keys cannot be read") from error
-        return names
-
-    def read(self, key: str) -> NDArray[Any]:
-        return h5.array(self._file, key)
+    with npz:
+        yield ArrayFile(list(npz.files), read)
 
 
 def _write_npz(path: Path, pairs: Iterable[Mapping[str, NDArray[Any]]]) -> None:

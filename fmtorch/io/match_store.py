@@ -28,6 +28,7 @@ ORIGIN = 0.5  # px: COLMAP's coordinates of the first pixel's centre
 Kind = Literal["calibrated", "uncalibrated", "planar", "panoramic", "planar_or_panoramic", "degenerate"]
 """COLMAP's configurations: of a general pair by whether both focal lengths are known, of others by what they show."""
 Matrix = NDArray[np.float64] | None
+MATRICES = ("F", "E", "H", "R", "t")
 
 
 class PairGeometry(NamedTuple):
@@ -47,11 +48,16 @@ class PairGeometry(NamedTuple):
     reason: str = ""
     warning: str = ""
 
+    @property
+    def matrices(self) -> dict[str, NDArray[np.float64]]:
+        """Those of `MATRICES` that the pair has."""
+        return {name: value for name in MATRICES if (value := getattr(self, name)) is not None}
 
-def geometry_texts(pair: PairGeometry) -> dict[str, str]:
-    """What files say of a pair in words: its configuration, and reason and warning where there are any."""
-    texts = {"pair_type": pair.kind, "reason": pair.reason, "warning": pair.warning}
-    return {name: text for name, text in texts.items() if text}
+    @property
+    def texts(self) -> dict[str, str]:
+        """What files say of the pair in words: its configuration, and reason and warning where there are any."""
+        texts = {"pair_type": self.kind, "reason": self.reason, "warning": self.warning}
+        return {name: text for name, text in texts.items() if text}
 
 
 def two_view_geometry(pycolmap: Any, pair: PairGeometry) -> Any:
@@ -73,7 +79,6 @@ def two_view_geometry(pycolmap: Any, pair: PairGeometry) -> Any:
 
 Array = NDArray[np.float64]
 _PAIR = ("matches", "scores", "inliers", "F", "related", "significance", "pair_type")
-_GEOMETRY = ("F", "E", "H", "R", "t")  # matrices of a geometry, of those that there are
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -160,8 +165,7 @@ class MatchStore:
         arrays: dict[str, NDArray[Any]] = {name: np.asarray(getattr(value, name)) for name in _PAIR}
         if (geometry := value.geometry) is not None:
             arrays |= {"kind": np.array(geometry.kind), "geometry_inliers": np.asarray(geometry.inliers)}
-            matrices = {f"geometry_{name}": getattr(geometry, name) for name in _GEOMETRY}
-            arrays |= {name: matrix for name, matrix in matrices.items() if matrix is not None}
+            arrays |= {f"geometry_{name}": matrix for name, matrix in geometry.matrices.items()}
         _write(self._pair(image0, image1), arrays)
 
     def image(self, image: Path) -> StoredImage:
@@ -179,7 +183,7 @@ class MatchStore:
             values = {name: stored[name] for name in _PAIR}
             geometry = None
             if "kind" in stored:
-                matrices = [stored.get(f"geometry_{name}") for name in _GEOMETRY]
+                matrices = [stored.get(f"geometry_{name}") for name in MATRICES]
                 geometry = PairGeometry(cast(Kind, str(stored["kind"])), stored["geometry_inliers"], *matrices)
         values |= {name: values[name].item() for name in ("related", "significance", "pair_type")}
         return StoredPair(self.name(image0), self.name(image1), geometry=geometry, **values)

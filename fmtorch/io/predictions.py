@@ -10,9 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from fmtorch.core.types import Correspondences
-from fmtorch.data.files import DataError
-from fmtorch.data.images import stored_size
-from fmtorch.data.pairs import GivenMatches, ImagePair, ImageSource, PairDataset
+from fmtorch.data import DataError, GivenMatches, ImagePair, ImageSource, PairDataset, stored_size
 from fmtorch.geometry.cameras import fundamental_from_projections
 from fmtorch.io import h5
 
@@ -23,15 +21,9 @@ _ZERO = np.zeros((3, 3))  # where there is no F
 
 
 def given(
-    x0: Array,
-    x1: Array,
-    sizes: tuple[Size, Size],
-    features: tuple[int, int],
-    *,
-    ratio: Array | None = None,
-    score: Array | None = None,
-    mutual: NDArray[np.bool_] | None = None,
-) -> GivenMatches:
+    x0: Array, x1: Array, sizes: tuple[Size, Size], features: tuple[int, int], *, ratio: Array | None = None,
+    score: Array | None = None, mutual: NDArray[np.bool_] | None = None,
+) -> GivenMatches:  # fmt: skip
     """Matches of one pair, (n, 2) in pixels each; those that are not finite do not count.
 
     ratio, score, mutual: (n,), as of `Correspondences`. features: how many keypoints each image has.
@@ -212,12 +204,9 @@ class HLocMatches:
         index = (j, i) if self.swapped else (i, j)
         score = None if scores is None else scores[i]
         return given(
-            points[0][index[0]],
-            points[1][index[1]],
-            (sizes[0], sizes[1]),
-            (len(points[0]), len(points[1])),
+            points[0][index[0]], points[1][index[1]], (sizes[0], sizes[1]), (len(points[0]), len(points[1])),
             score=score,
-        )
+        )  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)
@@ -297,7 +286,9 @@ def hloc_pairs(truth: PairDataset, features: Path, matches: Path, origin: float)
 def predicted_pairs(truth: PairDataset, path: Path, origin: float) -> Iterator[ImagePair]:
     """The pairs of a data set with predictions for them; a pair without has a problem."""
     with h5.opened(path) as file:
-        stored = set(_groups(file))
+        stored = set(h5.groups_with(file, "matches0", "matched_kpts0"))
+        if not stored:
+            raise DataError(f"{path}: holds no group with matches0 or matched_kpts0")
     for pair in truth:
         images = pair.image0, pair.image1
         for key, swapped in (*pair_keys(pair), (pair.identity, False)):
@@ -320,23 +311,6 @@ def _expect_distinct(names: dict[str, str | None], path: Path) -> None:
                 f"{path}: {name!r} could be image {seen[name]} or {identity}; names must tell images apart, "
                 "such as by their folder"
             )
-
-
-def _groups(file: Any) -> list[str]:
-    groups: list[str] = []
-
-    def visit(name: str) -> None:
-        head, _, last = name.rpartition("/")
-        if last in ("matches0", "matched_kpts0") and head:
-            groups.append(head)
-
-    try:
-        file.visit(visit)
-    except (OSError, RuntimeError) as error:
-        raise DataError(f"{file.filename}: its keys cannot be read ({str(error).splitlines()[0]})") from error
-    if not groups:
-        raise DataError(f"{file.filename}: holds no group with matches0 or matched_kpts0")
-    return groups
 
 
 def _read_indices(file: Any, path: Path, key: str) -> tuple[NDArray[np.int64], Array | None]:

@@ -58,7 +58,7 @@ class WorkerPool:
     """
 
     def __init__(
-        self, execution: Execution, preload: Sequence[str] = ("fmtorch.jobs.runner",), limit: int | None = None,
+        self, execution: Execution, preload: Sequence[str] = (__name__,), limit: int | None = None,
         needs_main: bool = True,
     ) -> None:  # fmt: skip
         self.execution, self.preload, self.needs_main = execution, preload, needs_main

@@ -12,6 +12,12 @@ from fmtorch.core.types import Correspondences, Features
 FEATURES = ("aliked", "disk")  # those that need no more than positions and descriptors, and that this project reads
 
 
+def weight_file(features: str) -> str:
+    """The file that kornia's loader looks for in torch's folder of checkpoints; it replaces every dot of the name."""
+    network = kornia.feature.LightGlue
+    return f"{network.features[features]['weights']}_{network.version}.pth".replace(".", "-")
+
+
 class LightGlue:
     """Matches the features of two images by a transformer; the slots of the result are the matches found.
 
@@ -35,7 +41,7 @@ class LightGlue:
         self.device = torch.device(automatic if device == "auto" else device)
         network = network or pretrained(
             lambda: kornia.feature.LightGlue(features, filter_threshold=threshold), f"LightGlue ({features})",
-            "github.com/cvg/LightGlue or huggingface.co/kornia", f"{features}_lightglue_v0-1_arxiv.pth",
+            "github.com/cvg/LightGlue or huggingface.co/kornia", f"{features}_lightglue.pth", weight_file(features),
         )  # fmt: skip
         self.network = network.eval().to(self.device)
         self._length = int(kornia.feature.LightGlue.features[features]["input_dim"])

@@ -17,9 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from fmtorch.core.settings import claim
-from fmtorch.data.files import DataError
-from fmtorch.data.images import read_image
-from fmtorch.data.pairs import ImageSource
+from fmtorch.data import DataError, ImageSource, read_image
 from fmtorch.io.match_store import MatchStore, StoredPair
 from fmtorch.jobs.execution import Execution, available, one_thread
 from fmtorch.jobs.runner import SHARED_BY, Factory, Local, Source, TaskRunner, WorkerPool, in_order
@@ -181,7 +179,7 @@ def similar_pairs(images: Sequence[Path], vectors: Float[Tensor, "n d"], count: 
 MEMORY = 64  # images whose features are kept for pairs to come
 AHEAD = 4  # pairs a worker whose images are described before the first of them is matched
 MAX_WORKERS = 8  # by default: each holds an image and its scale space
-PRELOADED = ("fmtorch.pipeline.folder",)  # by the process that workers are forked of
+PRELOADED = (__name__,)  # by the process that workers are forked of
 
 
 class Photograph(NamedTuple):

@@ -32,8 +32,7 @@ from fmtorch.core.stages import (
     pruned,
 )
 from fmtorch.core.types import Correspondences, Estimate, Features, collate
-from fmtorch.data.images import read_image, to_grey
-from fmtorch.data.pairs import GivenMatches, ImagePair, ImageSource
+from fmtorch.data import GivenMatches, ImagePair, ImageSource, read_image, to_grey
 from fmtorch.geometry.significance import judged
 from fmtorch.jobs.execution import one_thread
 from fmtorch.presets.composition import PIPELINES, build_pruners, compose, plain
@@ -170,18 +169,11 @@ class Pipeline:
     """
 
     def __init__(
-        self,
-        features: FeatureExtractor,
-        matcher: Matcher,
-        pruners: Mapping[str, Pruner],
-        estimator: Estimator,
-        *,
-        device: torch.device | str = "cpu",
-        memory: int = 64,
-        families: Mapping[str, Mapping[str, Pruner]] | None = None,
-        model: str | None = "fundamental",
+        self, features: FeatureExtractor, matcher: Matcher, pruners: Mapping[str, Pruner], estimator: Estimator, *,
+        device: torch.device | str = "cpu", memory: int = 64,
+        families: Mapping[str, Mapping[str, Pruner]] | None = None, model: str | None = "fundamental",
         debug: bool = False,
-    ) -> None:
+    ) -> None:  # fmt: skip
         if model is not None and (gives := model_of(estimator)) != model:
             hint = ": estimator=homography" if model == "homography" else ""
             raise ValueError(f"the estimator gives {gives} matrices; a pipeline needs {model} matrices here{hint}")
@@ -438,15 +430,10 @@ def build_pipeline(
     pruners, for_families = build_pruners(config)
     open_files([extractor, pruners, for_families], torch.device(device))  # a damaged one is no failure of each pair
     return Pipeline(
-        extractor,
-        instantiate(plain(config.matcher), "matcher"),
-        pruners,
-        instantiate(plain(config.estimator), "estimator"),
-        device=device,
-        families=for_families,
-        model=model,
+        extractor, instantiate(plain(config.matcher), "matcher"), pruners,
+        instantiate(plain(config.estimator), "estimator"), device=device, families=for_families, model=model,
         debug=bool(config.get("debug")),
-    )
+    )  # fmt: skip
 
 
 def load_pipeline(

@@ -9,7 +9,8 @@ import time
 import uuid
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from types import UnionType
+from typing import Any, get_args
 
 import numpy as np
 import pyarrow as pa
@@ -17,45 +18,6 @@ import pyarrow.parquet as pq
 
 from fmtorch.core.files import replacing
 from fmtorch.core.settings import canonical, create, differences, head
-
-PAIR_SCHEMA = pa.schema(
-    [
-        pa.field("pair", pa.string(), nullable=False),
-        pa.field("key", pa.int64(), nullable=False),
-        pa.field("family", pa.string(), nullable=False),
-        pa.field("scene", pa.string(), nullable=False),
-        pa.field("ok", pa.bool_(), nullable=False),
-        pa.field("reason", pa.string(), nullable=False),
-        pa.field("nsgd", pa.float64(), nullable=False),
-        pa.field("nsgd_released", pa.float64()),
-        pa.field("inlier_rate", pa.float64()),
-        pa.field("inlier_rate_before", pa.float64()),
-        pa.field("corrs", pa.int64(), nullable=False),
-        pa.field("corrs_before", pa.int64(), nullable=False),
-        pa.field("features0", pa.int64(), nullable=False),
-        pa.field("features1", pa.int64(), nullable=False),
-        pa.field("samples", pa.int64(), nullable=False),
-        pa.field("seconds_features", pa.float64()),
-        pa.field("seconds_matching", pa.float64()),
-        pa.field("seconds_pruning", pa.float64()),
-        pa.field("seconds_estimation", pa.float64()),
-        pa.field("seconds_metrics", pa.float64()),
-        pa.field("F", pa.list_(pa.float64(), 9)),
-        pa.field("significance", pa.float64()),
-        pa.field("related", pa.bool_(), nullable=False),
-        pa.field("rotation_error", pa.float64()),
-        pa.field("translation_error", pa.float64()),
-        pa.field("pose_reason", pa.string()),
-        pa.field("pair_type", pa.string()),
-        pa.field("warning", pa.string()),
-        pa.field("focal_error0", pa.float64()),
-        pa.field("focal_error1", pa.float64()),
-        pa.field("focal_log_ratio0", pa.float64()),
-        pa.field("focal_log_ratio1", pa.float64()),
-        pa.field("H", pa.list_(pa.float64(), 9)),
-        pa.field("corner_error", pa.float64()),
-    ]
-)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -142,6 +104,20 @@ def _expect_homography(row: PairRow) -> None:
             f"pair {row.pair!r} has a homography: it needs nine finite numbers of H and no reason, or a reason, no H "
             f"and an infinite corner error, but has H={H}, reason={row.reason!r}, corner_error={error}"
         )
+
+
+_ARROW: dict[Any, pa.DataType] = {
+    str: pa.string(), int: pa.int64(), bool: pa.bool_(), float: pa.float64(),
+    Sequence[float]: pa.list_(pa.float64(), 9),
+}  # fmt: skip
+
+
+def _field(name: str, hint: Any) -> pa.Field:
+    kinds = get_args(hint) if isinstance(hint, UnionType) else (hint,)
+    return pa.field(name, _ARROW[kinds[0]], nullable=type(None) in kinds)
+
+
+PAIR_SCHEMA = pa.schema([_field(field.name, field.type) for field in dataclasses.fields(PairRow)])
 
 
 def to_table(rows: Sequence[PairRow]) -> pa.Table:
@@ -271,14 +247,14 @@ class RunFolder:
         path = Path(path)
         wanted: dict[str, Any] = json.loads(canonical(config))
         if path.exists() and not path.is_dir():
-            raise RunFolderError(f"{path} is a file; run_dir must name a folder")
+            raise RunFolderError(f"{path} is a file; output must name a folder")
         path.mkdir(parents=True, exist_ok=True)
         foreign = sorted(entry.name for entry in path.iterdir() if entry.suffix != ".tmp")
         if not (path / "run.json").exists():
             if foreign:
                 raise RunFolderError(
                     f"{path} is not empty and has no run.json, so it is no run folder (it holds {head(foreign)}); "
-                    "choose another run_dir"
+                    "choose another output"
                 )
             stored = {"format": FORMAT, "identity": identity_digest(wanted), "config": wanted}
             create(path / "run.json", json.dumps(stored, indent=2) + "\n")
@@ -286,7 +262,7 @@ class RunFolder:
         if folder.identity != identity_digest(wanted):
             raise RunFolderError(
                 f"{path} holds another run; what differs (there -> now): {differences(folder.config, wanted)}. "
-                "Choose another run_dir, or delete the folder"
+                "Choose another output, or delete the folder"
             )
         (path / "pairs").mkdir(exist_ok=True)
         return folder
@@ -305,7 +281,7 @@ class RunFolder:
             raise RunFolderError(f"{file} was not written by this program: it has no 'config'")
         if stored.get("format") != FORMAT:
             raise RunFolderError(
-                f"{file} has format {stored.get('format')}, this version reads {FORMAT}; choose another run_dir"
+                f"{file} has format {stored.get('format')}, this version reads {FORMAT}; choose another output"
             )
         if stored.get("identity") != identity_digest(stored["config"]):
             raise RunFolderError(

@@ -239,12 +239,9 @@ def _paint_openings(
             if row == 0 and (bay == entrance or style.shop):
                 pane = np.random.SeedSequence(seed + bay)
                 _paste(
-                    picture,
-                    patterns.door(rng, *size) if bay == entrance else patterns.window(rng, *size, pane),
-                    x0,
-                    low,
-                    d,
-                )
+                    picture, patterns.door(rng, *size) if bay == entrance else patterns.window(rng, *size, pane), x0,
+                    low, d,
+                )  # fmt: skip
             elif rng.random() < style.same_windows:
                 _paste(picture, cv2.resize(glass, size[::-1]).astype(np.float32), x0, low, d)
             else:

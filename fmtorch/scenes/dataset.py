@@ -20,11 +20,10 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from torch.utils.data import Dataset
 
 from fmtorch.core.files import cache_dir
 from fmtorch.data.construction import Keypoints, keypoints, matchable
-from fmtorch.data.pairs import ImagePair, ImageSource
+from fmtorch.data.pairs import HeldPairs, ImagePair, ImageSource, PairDataset
 from fmtorch.data.scenes import AllPairs, Scene, ScenePairs, View
 from fmtorch.jit.together import compile_together
 from fmtorch.jobs.execution import Execution, cores
@@ -145,7 +144,7 @@ def generate_all(
     if count > 1:
         compile_together(KERNELS)  # once, rather than in each of them
     execution = Execution("processes" if count > 1 else "threads", max(count, 1))
-    with WorkerPool(execution, ("fmtorch.scenes.dataset",), needs_main=False) as pool:
+    with WorkerPool(execution, (__name__,), needs_main=False) as pool:
         for _ in TaskRunner(pool, Local(None), _generated, lambda scene, path: None).each(missing):
             done += 1
             report(done, len(scenes))
@@ -282,7 +281,7 @@ _recent = _Recent()
 # `RenderedPairs`: the embedded data set, drawn on first use from known cameras
 
 
-class RenderedPairs(Dataset[ImagePair]):
+class RenderedPairs(PairDataset):
     """Image pairs of textured 3-D scenes with exact ground truth, in four families after the paper's four sets.
 
     split: "test" or "train"; they share no scene and no texture. size: "small" (about 20 pairs a family) or "full".
@@ -298,17 +297,10 @@ class RenderedPairs(Dataset[ImagePair]):
     name = "rendered"
 
     def __init__(
-        self,
-        split: str = "test",
-        size: str = "small",
-        families: Sequence[str] | None = None,
-        seed: int = 0,
-        root: str | Path | None = None,
-        *,
-        progress: Progress | None = None,
-        workers: int | None = None,
+        self, split: str = "test", size: str = "small", families: Sequence[str] | None = None, seed: int = 0,
+        root: str | Path | None = None, *, progress: Progress | None = None, workers: int | None = None,
         plan: Plan | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         if (size, split) not in PLANS:
             raise ValueError(f"no split {split!r} in size {size!r}; there are test and train, in small and full")
         chosen = list(FAMILIES) if families is None else list(families)
@@ -341,17 +333,10 @@ class RenderedPairs(Dataset[ImagePair]):
         (path0, camera0), (path1, camera1) = self._views[task.name][i], self._views[task.name][j]
         R, t = relative_pose(camera0, camera1)
         return ImagePair(
-            identity=f"{self.name}/{task.name}/{i}-{j}",
-            family=task.family,
-            scene=task.name,
-            image0=ImageSource(f"{task.name}/{i}", path0),
-            image1=ImageSource(f"{task.name}/{j}", path1),
-            F=fundamental(camera0, camera1),
-            K0=camera0.K,
-            K1=camera1.K,
-            R=R,
-            t=t,
-        )
+            identity=f"{self.name}/{task.name}/{i}-{j}", family=task.family, scene=task.name,
+            image0=ImageSource(f"{task.name}/{i}", path0), image1=ImageSource(f"{task.name}/{j}", path1),
+            F=fundamental(camera0, camera1), K0=camera0.K, K1=camera1.K, R=R, t=t,
+        )  # fmt: skip
 
     def depth(self, image: ImageSource, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Depth (n,) in metres along the optical axis at points (n, 2) of an image; NaN for the sky and outside.
@@ -373,9 +358,6 @@ class RenderedPairs(Dataset[ImagePair]):
             scenes.append(Scene(name, self._tasks[name].family, drawn, AllPairs(len(drawn))))
         return RenderedScenePairs(self, scenes)
 
-    def __iter__(self) -> Iterator[ImagePair]:
-        return (self[index] for index in range(len(self)))
-
 
 class RenderedScenePairs(ScenePairs):
     """All pairs of the photographs of rendered scenes; drawn: these scenes as a data set, which knows the depth."""
@@ -393,7 +375,7 @@ _FILES = ("motorcycle_left.png", "motorcycle_right.png", "motorcycle_disp.npz")
 _FOCAL, _CENTRE, _SHIFT, _BASELINE, _SIZE = 994.978, (311.193, 254.877), 31.086, 0.193001, (500, 741)
 
 
-class StereoPair(Dataset[ImagePair]):
+class StereoPair(HeldPairs):
     """One rectified pair with dense ground truth: a point (x, y) on the left is (x - disparity, y) on the right.
 
     The three files lie inside scikit-image's wheel, so that nothing is downloaded; FileNotFoundError names the one
@@ -413,29 +395,12 @@ class StereoPair(Dataset[ImagePair]):
         left = Camera(calibration(_FOCAL, _SIZE, (x, y)), np.eye(3), np.zeros(3), _SIZE)
         right = Camera(calibration(_FOCAL, _SIZE, (x + _SHIFT, y)), np.eye(3), np.array([-_BASELINE, 0.0, 0.0]), _SIZE)
         R, t = relative_pose(left, right)
-        self._pair = ImagePair(
-            identity=f"{self.name}/motorcycle/left-right",
-            family=self.name,
-            scene="motorcycle",
+        self._pairs = [ImagePair(
+            identity=f"{self.name}/motorcycle/left-right", family=self.name, scene="motorcycle",
             image0=ImageSource("motorcycle/left", self._paths[0]),
-            image1=ImageSource("motorcycle/right", self._paths[1]),
-            F=fundamental(left, right),
-            K0=left.K,
-            K1=right.K,
-            R=R,
-            t=t,
-        )
-
-    def __len__(self) -> int:
-        return 1
-
-    def __getitem__(self, index: int) -> ImagePair:
-        if index not in (0, -1):
-            raise IndexError(f"pair {index} of a data set of one pair")
-        return self._pair
-
-    def __iter__(self) -> Iterator[ImagePair]:
-        yield self._pair
+            image1=ImageSource("motorcycle/right", self._paths[1]), F=fundamental(left, right), K0=left.K, K1=right.K,
+            R=R, t=t,
+        )]  # fmt: skip
 
     def matches(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Points (n, 2) on the left and where they are on the right, for every pixel with a measured disparity."""

@@ -238,13 +238,9 @@ class Geometry:
         self.corners = np.stack([self.O, self.O + self.U, self.O + self.U + self.V, self.O + self.V], axis=1)
 
     def cast(
-        self,
-        P: Matrix,
-        depth: Matrix,
-        size: tuple[int, int],
-        centre: Matrix | None,
+        self, P: Matrix, depth: Matrix, size: tuple[int, int], centre: Matrix | None,
         skip: NDArray[np.bool_] | None = None,
-    ) -> Hits:
+    ) -> Hits:  # fmt: skip
         """Rays of all pixels of a projection P (3, 4), perspective or (last row 0 0 0 1) orthographic.
 
         depth: (4,), the affine function of the world by which the nearer of two pieces is known.

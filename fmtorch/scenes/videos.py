@@ -259,14 +259,9 @@ def indoor_scene(rng: Rng, split: str, shots: int, scale: Real) -> DrawnScene:
     _on_wall(surfaces, photos[3], 2, half, rng.uniform(-0.5, 1), 1.5, 0.6)
     style = np.random.SeedSequence(int(rng.integers(2**31)))
     _on_wall(
-        surfaces,
-        to_pixels(patterns.window(rng, 512, 420, style) * 2.2 + 0.1),
-        2 * int(rng.integers(2)),
-        half,
-        -1.2,
-        1.6,
-        1.1,
-    )
+        surfaces, to_pixels(patterns.window(rng, 512, 420, style) * 2.2 + 0.1), 2 * int(rng.integers(2)), half, -1.2,
+        1.6, 1.1,
+    )  # fmt: skip
     shelf = surfaces.texture(to_pixels(patterns.books(rng, 192, 768)))
     board = _flat(surfaces, rng)
     x = rng.uniform(-0.6, 0.4)

@@ -16,24 +16,9 @@ if TYPE_CHECKING:
     from fmtorch.training.validation import Use, Validation, reliability, temperature
 
 __all__ = [
-    "Augmentation",
-    "Draw",
-    "LabelledMatches",
-    "MatchedPairs",
-    "Objective",
-    "SimilarLengthBatches",
-    "StoredMatches",
-    "Use",
-    "Validation",
-    "classification_loss",
-    "collate",
-    "collate_trimmed",
-    "geometric_loss",
-    "nsgd_loss",
-    "reliability",
-    "split_scenes",
-    "temperature",
-    "virtual_points",
-]
+    "Augmentation", "Draw", "LabelledMatches", "MatchedPairs", "Objective", "SimilarLengthBatches", "StoredMatches",
+    "Use", "Validation", "classification_loss", "collate", "collate_trimmed", "geometric_loss", "nsgd_loss",
+    "reliability", "split_scenes", "temperature", "virtual_points",
+]  # fmt: skip
 
 lazy_exports(__name__)

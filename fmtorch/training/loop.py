@@ -24,7 +24,7 @@ from torch.utils.data import DataLoader, Dataset
 
 from fmtorch.core.terminal import progress_bars
 from fmtorch.data import ImagePair, read_image
-from fmtorch.evaluation.pictures import draw_matches
+from fmtorch.pipeline.pictures import draw_matches
 from fmtorch.pruning.networks.learned import predict
 from fmtorch.training.labelled import LabelledMatches
 from fmtorch.training.objective import Objective
@@ -117,17 +117,10 @@ def load_best(folder: Path, module: PrunerTraining) -> int:
 
 
 def train(
-    module: PrunerTraining,
-    batches: Callable[[int, int, int], DataLoader[Any]],
-    folder: Path,
-    trainer: Mapping[str, Any],
-    *,
-    every: int,
-    checkpoint_every: int,
-    patience: int | None,
-    monitor: str,
+    module: PrunerTraining, batches: Callable[[int, int, int], DataLoader[Any]], folder: Path,
+    trainer: Mapping[str, Any], *, every: int, checkpoint_every: int, patience: int | None, monitor: str,
     callbacks: tuple[Callback, ...] = (),
-) -> tuple[int, float]:
+) -> tuple[int, float]:  # fmt: skip
     """Train in `folder`, going on from its last checkpoint; returns the steps and seconds made in all.
 
     Args:
@@ -161,7 +154,12 @@ def train(
         )  # fmt: skip
         if step < total:
             own = batches(step, lightning_trainer.global_rank, lightning_trainer.world_size)
-            lightning_trainer.fit(module, own, DataLoader(_Once(), batch_size=None), ckpt_path=path, weights_only=True)
+            validation: DataLoader[Any] = DataLoader(_Once(), batch_size=None)
+            try:
+                lightning_trainer.fit(module, own, validation, ckpt_path=path, weights_only=True)
+            except SystemExit:  # which Lightning makes of Ctrl-C
+                kept = f"step {latest_checkpoint(folder)[1]} of {total} is kept in {folder}"
+                raise KeyboardInterrupt(kept) from None
             step = lightning_trainer.global_step
     return step, module.seconds
 

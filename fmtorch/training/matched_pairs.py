@@ -17,9 +17,8 @@ from fmtorch.data.pairs import DepthDataset, ImagePair, PairDataset
 from fmtorch.jobs.execution import Execution, use_one_thread
 from fmtorch.jobs.runner import Factory, Local, Source, TaskRunner, WorkerPool
 from fmtorch.pipeline.pipeline import Outcome, Pipeline, load_pipeline
-from fmtorch.runs.feature_cache import CachedFeatures
+from fmtorch.runs import CachedFeatures, identity_digest
 from fmtorch.runs.fingerprint import configuration, environment
-from fmtorch.runs.run_folder import identity_digest
 from fmtorch.training import labelled
 from fmtorch.training.augmentation import Augmentation
 from fmtorch.training.stored_matches import FORMAT, Shard, ShardError, StoredMatches, write_shard
@@ -69,20 +68,11 @@ class MatchedPairs(StoredMatches):
     """
 
     def __init__(
-        self,
-        dataset: PairDataset,
-        pipeline: Pipeline | str,
-        *,
-        overrides: Sequence[str] = (),
-        root: str | Path | None = None,
-        workers: int | None = None,
-        progress: Progress | None = None,
-        most: int = MAX_MATCHES,
-        augmentation: Augmentation | None = None,
-        seed: int = 0,
-        execution: Execution | None = None,
-        build: Callable[[], Pipeline] | None = None,
-    ) -> None:
+        self, dataset: PairDataset, pipeline: Pipeline | str, *, overrides: Sequence[str] = (),
+        root: str | Path | None = None, workers: int | None = None, progress: Progress | None = None,
+        most: int = MAX_MATCHES, augmentation: Augmentation | None = None, seed: int = 0,
+        execution: Execution | None = None, build: Callable[[], Pipeline] | None = None,
+    ) -> None:  # fmt: skip
         if most < 1:
             raise ValueError(f"most is {most}; at least 1 match of a pair must be kept")
         if not len(dataset):
@@ -192,14 +182,9 @@ def _matching_in_process(dataset: PairDataset, build: Callable[[], Pipeline], mo
 
 
 def compute_shards(
-    dataset: PairDataset,
-    stages: Pipeline,
-    build: Callable[[], Pipeline] | None,
-    jobs: Sequence[Job],
-    *,
-    most: int,
+    dataset: PairDataset, stages: Pipeline, build: Callable[[], Pipeline] | None, jobs: Sequence[Job], *, most: int,
     execution: Execution,
-) -> Iterator[int]:
+) -> Iterator[int]:  # fmt: skip
     """Write each job's shard; yields the number of its pairs when it is written.
 
     Args:

@@ -23,15 +23,12 @@ from fmtorch.core.options import expect_options
 from fmtorch.core.settings import claim
 from fmtorch.core.terminal import console, progress_bars, reporter
 from fmtorch.core.version import __version__
-from fmtorch.data import ImagePair, PairDataset
+from fmtorch.data import ImagePair, PairDataset, subset
 from fmtorch.data.construction import ENOUGH
-from fmtorch.data.pairs import subset
 from fmtorch.evaluation.run import select
 from fmtorch.pipeline.pipeline import Pipeline
-from fmtorch.presets import plain
-from fmtorch.presets.composition import execution_of, read_fields
-from fmtorch.runs.feature_cache import cached
-from fmtorch.runs.run_folder import identity_digest
+from fmtorch.presets.composition import execution_of, plain, read_fields
+from fmtorch.runs import cached, identity_digest
 from fmtorch.scenes import RenderedPairs
 from fmtorch.training.augmentation import Augmentation, keep_ratio
 from fmtorch.training.export import Result, write_result

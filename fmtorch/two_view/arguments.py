@@ -48,6 +48,7 @@ def correspondences(
     K0: Arrays | None = None,
     K1: Arrays | None = None,
     focal: Focal = None,
+    plane: bool = False,
     **fields: Arrays | int | None,
 ) -> Correspondences:
     """The batch that points and what is known of them and of the cameras describe.
@@ -56,6 +57,7 @@ def correspondences(
         x0, x1: (N, 2) of one pair, (B, N, 2) of a padded batch, or a list of (N, 2) of different N, in pixels. Whole
             numbers become float64, half precision float32; x0 decides the device.
         K0, K1, focal: as of `fmtorch.find_fundamental`.
+        plane: x0 may be in the unit of a plane.
         fields: of `Correspondences`, or None. Per-match fields come in the form of the points. A size is one for all
             pairs, (2,), or one each, (B, 2), and so is a key.
 
@@ -65,7 +67,7 @@ def correspondences(
     """
     cameras = camera_fields(K0, K1, focal, fields.get("size0") is not None)
     c = _batch(x0, x1, {**fields, **cameras})
-    expect_plausible(c)
+    expect_plausible(c, plane)
     return c
 
 
@@ -120,7 +122,7 @@ def _one_pair(points: Any) -> Any:
 def _depth(value: object) -> int:
     """How deeply lists are nested."""
     if not isinstance(value, list | tuple):
-        return 0
+        return int(hasattr(value, "pt"))  # a keypoint of OpenCV
     return 1 + (_depth(value[0]) if value else 0)
 
 

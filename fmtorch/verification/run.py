@@ -17,10 +17,10 @@ from fmtorch.core.settings import claim
 from fmtorch.core.stages import Estimator
 from fmtorch.core.types import CONTRADICTED, Correspondences, collate, pair_key
 from fmtorch.io.colmap import DatabaseImage
-from fmtorch.io.match_store import Kind, PairGeometry
+from fmtorch.io.match_store import MATRICES, Kind, PairGeometry
 from fmtorch.jobs.execution import Execution, Shard
 from fmtorch.jobs.runner import Factory, Local, Source, TaskRunner, WorkerPool
-from fmtorch.pipeline.two_images import pair_geometries
+from fmtorch.pipeline.pair_geometries import pair_geometries
 from fmtorch.two_view.arguments import correspondences
 from fmtorch.two_view.estimation import estimated_by
 from fmtorch.two_view.pair_type import classify
@@ -77,7 +77,6 @@ def _shared(image0: DatabaseImage, image1: DatabaseImage, cameras: Cameras) -> b
 
 
 SETTINGS = "settings.json"
-_MATRICES = ("F", "E", "H", "R", "t")
 
 _GeometryIds = tuple[Any, Any]
 
@@ -103,8 +102,8 @@ class GeometryParts:
             pairs.append(ids)
             kinds.append(geometry.kind)
             texts.append((geometry.reason, geometry.warning))
-            values = {name: getattr(geometry, name) for name in ("inliers", *_MATRICES)}
-            arrays |= {f"{name}-{i}": value for name, value in values.items() if value is not None}
+            values = {"inliers": geometry.inliers, **geometry.matrices}
+            arrays |= {f"{name}-{i}": value for name, value in values.items()}
         with replacing(self.folder / f"{uuid.uuid4().hex}.npz") as temporary, temporary.open("wb") as file:
             np.savez(file, pairs=np.array(pairs), kinds=np.array(kinds), texts=np.array(texts), **arrays)
         self.done.update(pairs)
@@ -131,7 +130,7 @@ def _ids(ids: list[Any]) -> _GeometryIds:
 
 
 def _geometry(part: Any, i: int, kind: str) -> PairGeometry:
-    matrices = (part.get(f"{name}-{i}") for name in _MATRICES)
+    matrices = (part.get(f"{name}-{i}") for name in MATRICES)
     return PairGeometry(cast(Kind, kind), part[f"inliers-{i}"], *matrices, *part["texts"][i].tolist())
 
 
@@ -139,7 +138,7 @@ def _geometry(part: Any, i: int, kind: str) -> PairGeometry:
 
 
 BATCH = 64  # pairs that are read, and kept, at a time
-PRELOADED = ("fmtorch.verification.run",)  # by the process that workers are forked of
+PRELOADED = (__name__,)  # by the process that workers are forked of
 
 _PairIds = tuple[Any, Any]
 

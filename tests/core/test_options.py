@@ -1,6 +1,6 @@
 """Options are compared with the signature of what takes them, whatever it is."""
 
-from __future__ import annotations  # some annotations are of a type checker alone
+from __future__ import annotations
 
 import dataclasses
 import enum

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+import fmtorch
 from fmtorch import find_essential, geometry, presets
 from fmtorch.core import Correspondences, collate
 from fmtorch.estimators import PairwiseEstimator
@@ -209,3 +210,29 @@ def test_a_binding_gets_whole_numbers_that_it_takes(name: str) -> None:
         assert estimate.reason[1] == "" or "pybind" not in estimate.reason[1]
     with pytest.raises(ValueError, match="must be a whole number from 1 to 2147483647"):
         built("estimator", name, iterations=2**31)
+
+
+@pytest.mark.slow  # its kernels are compiled for minutes
+def test_fastpose_estimates_what_is_asked_for() -> None:
+    """Poses of exactly known cameras, one or two unknown focal lengths, and homographies."""
+    pytest.importorskip("fastpose")
+    s = matched_scene(300, 1, noise=0.1)
+    posed = find_essential(s.x0, s.x1, s.K0, s.K1, estimator="fastpose", seed=3)
+    assert posed.R is not None
+    assert posed.t is not None
+    assert posed.R[0].numpy() == pytest.approx(s.R.numpy(), abs=2e-3)
+    assert posed.t[0].numpy() == pytest.approx(s.t.numpy() / np.linalg.norm(s.t.numpy()), abs=2e-2)
+    sizes = [torch.tensor([round(2 * float(k[1, 2]) + 1), round(2 * float(k[0, 2]) + 1)]) for k in (s.K0, s.K1)]
+    unknown = fmtorch.find_fundamental(
+        s.x0, s.x1, size0=sizes[0], size1=sizes[1], focal="unknown", estimator="fastpose", seed=3
+    )
+    assert unknown.focals is not None
+    expected = [float(s.K0[0, 0]), float(s.K1[0, 0])]
+    assert unknown.focals[0].numpy() == pytest.approx(expected, rel=0.15)  # by its solver alone, without a prior
+    x0 = np.random.default_rng(0).uniform(0, 800, (60, 2))
+    H = np.array([[0.9, 0.1, 20], [-0.05, 1.1, -10], [1e-5, 2e-5, 1]])
+    x1 = np.c_[x0, np.ones(60)] @ H.T
+    plane = fmtorch.find_homography(x0, x1[:, :2] / x1[:, 2:], estimator="fastpose", model="homography")
+    assert (plane.H[0] / plane.H[0, 2, 2]).numpy() == pytest.approx(H, abs=1e-6)
+    with pytest.raises(ValueError, match="focal=shared is of fundamental matrices"):
+        presets.build("estimator", "fastpose", model="homography", focal="shared")

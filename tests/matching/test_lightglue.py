@@ -1,5 +1,9 @@
 """LightGlue behind the project's conventions, with an untrained network."""
 
+from __future__ import annotations
+
+import re
+import urllib.request
 from pathlib import Path
 
 import kornia
@@ -69,8 +73,20 @@ def test_weights_that_cannot_be_fetched(tmp_path: Path, monkeypatch: pytest.Monk
         raise RuntimeError("Name or service not known")
 
     monkeypatch.setattr(kornia.feature, "LightGlue", type("L", (kornia.feature.LightGlue,), {"__init__": offline}))
-    with pytest.raises(ConnectionError, match=r"LightGlue \(disk\).*Name or service.*github\.com/cvg/LightGlue"):
+    with pytest.raises(
+        ConnectionError, match=r"LightGlue \(disk\).*Name or service.*github\.com/cvg/LightGlue"
+    ) as error:
         presets.build("matcher", "lightglue", features="disk")
+    place = re.search(r"copy its disk_lightglue\.pth to (\S+)", str(error.value))
+    assert place is not None
+    monkeypatch.undo()
+    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
+    monkeypatch.setattr(urllib.request, "urlopen", offline)
+    Path(place[1]).parent.mkdir()
+    network = kornia.feature.LightGlue(None, input_dim=128)
+    torch.save(network.state_dict(), place[1])
+    loaded = LightGlue("disk", device="cpu").network
+    assert torch.equal(next(loaded.parameters()), next(network.parameters()))
 
 
 def test_unknown_features_are_told() -> None:

@@ -132,7 +132,7 @@ def test_the_command_evaluates_it(tmp_path: Path) -> None:
     file = lists.write(tmp_path / "list.txt", [lists.superglue(1, 5), lists.superglue(0, 2)])
     words = (
         "pipeline=vismatch", "matcher.name=romav2", "dataset=pair_list", f"dataset.root={lists.images()}",
-        f"dataset.file={file}", "dataset.resize=640", f"run_dir={tmp_path / 'run'}", "cache=off",
+        f"dataset.file={file}", "dataset.resize=640", f"output={tmp_path / 'run'}", "cache=off",
     )  # fmt: skip
     folder = run(compose("eval", words), "vismatch")
     config = json.loads((folder / "run.json").read_text())["config"]

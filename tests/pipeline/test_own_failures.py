@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 import torch
 
+from fmtorch.core import Correspondences, Estimate, Features
 from fmtorch.core.failures import own_traceback, place_of
-from fmtorch.core.types import Correspondences, Estimate, Features
 from fmtorch.presets import build, instantiate
 from tests.helpers import draw, pair, small_pipeline
 from tests.processes import run_command
@@ -112,7 +112,7 @@ def test_eval_shows_the_line_and_says_how_to_go_on(tmp_path: Path) -> None:
     (tmp_path / "failing_part.py").write_text(PART)
     (tmp_path / "conf" / "estimator").mkdir(parents=True)
     (tmp_path / "conf" / "estimator" / "mine.yaml").write_text("_target_: failing_part.Part\nbroken: false\n")
-    words = ("--config-dir", "conf", "pipeline=sift_ratio", "estimator=mine", "dataset=stereo", "run_dir=run")
+    words = ("--config-dir", "conf", "pipeline=sift_ratio", "estimator=mine", "dataset=stereo", "output=run")
     ended = run_command("eval", *words, cwd=tmp_path)
     assert ended.returncode == 1
     assert 'failing_part.py", line 12, in helper' in ended.stderr

@@ -14,7 +14,7 @@ EVAL = ["features.max_features=400", "estimator=lmeds", "estimator.hypotheses=20
 
 def evaluation(root: Path, run_dir: Path, *extra: str) -> list[str]:
     """Arguments of an evaluation."""
-    return ["dataset=fmbench", f"dataset.root={root}", *EVAL, f"run_dir={run_dir}", *extra]
+    return ["dataset=fmbench", f"dataset.root={root}", *EVAL, f"output={run_dir}", *extra]
 
 
 def results(run_dir: Path) -> list[dict[str, object]]:
