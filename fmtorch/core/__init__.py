@@ -6,9 +6,17 @@ from fmtorch.core.lazy import lazy_exports
 
 if TYPE_CHECKING:
     from fmtorch.core.files import conf_dir, models_dir
-    from fmtorch.core.grey_pyramid import GreyPyramid, grey_pyramid
     from fmtorch.core.onnx_network import NetworkFileError
-    from fmtorch.core.stages import Estimator, FeatureExtractor, ImagePruner, Matcher, PairImages, Pruner
+    from fmtorch.core.stages import (
+        Estimator,
+        FeatureExtractor,
+        GreyPyramid,
+        ImagePruner,
+        Matcher,
+        PairImages,
+        Pruner,
+        grey_pyramid,
+    )
     from fmtorch.core.types import PAIR_TYPES, RELATED, WARNINGS, Correspondences, Estimate, Features, collate, pair_key
 
 __all__ = [

@@ -3,8 +3,6 @@
 Annotations are the source: ``Float[Tensor, "*batch n 2"]`` is both what a reader sees and what is asked for.
 """
 
-from __future__ import annotations
-
 import functools
 import inspect
 import math

@@ -4,8 +4,6 @@ The annotation of a field is what is known of it: ``Float[Tensor, "b n 2"]`` is 
 is made, the numbers that it holds, and, by the dimension ``n``, that it has an entry for each slot.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from collections.abc import Callable, Mapping, Sequence

@@ -11,9 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from fmtorch import presets
-from fmtorch.core.grey_pyramid import GreyPyramid, grey_pyramid
-from fmtorch.core.no_features import NoFeatures
-from fmtorch.core.stages import ImageMatcher, PairImages, output_of, pruned
+from fmtorch.core.stages import GreyPyramid, ImageMatcher, NoFeatures, PairImages, grey_pyramid, output_of, pruned
 from fmtorch.core.types import Correspondences, Features
 from fmtorch.data import Lens, to_grey
 from fmtorch.jobs.execution import mapped, one_thread

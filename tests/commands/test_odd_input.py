@@ -7,10 +7,13 @@ from pathlib import Path
 import cv2
 import pytest
 
+from fmtorch import presets
 from fmtorch.core import models_dir
+from fmtorch.pipeline.pipeline import build_pipeline
 from fmtorch.runs import RunFolder
 from tests.commands.test_command_line import ended
 from tests.commands.test_match import stereo
+from tests.helpers import compose
 from tests.processes import run_command
 
 SIFT = ("pipeline=sift_ratio", "features.max_features=800", "estimator.hypotheses=100")
@@ -117,5 +120,17 @@ def test_a_training_says_how_its_file_is_used(words: tuple[str, ...]) -> None:
     said = use_line("mine", Path("runs/a b.onnx"), ["pruner=mine", *words])
     assert shlex.split(said) == [
         "python", "-m", "fmtorch.eval", "--config-dir", "my conf", "pipeline=sift_ratio", "estimator=fmtorch",
-        "pruner=[ratio,one_to_one,mine]", "pruner.mine.file=runs/a b.onnx", "pruner.mine.threshold=null",
+        "pruner=[ratio,one_to_one,mine]", "++pruner.mine.file=runs/a b.onnx", "++pruner.mine.soft=true",
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["lc", "lc_e", "lc_side", "dfe"])
+def test_the_line_that_a_training_ends_with_builds_a_pipeline(name: str) -> None:
+    pytest.importorskip("lightning")
+    from fmtorch.training.run import use_line
+
+    file = models_dir() / f"{presets.load('pruner', name)['file']}.safetensors"
+    said = shlex.split(use_line(name, file, [f"pruner={name}"]))
+    pruners = build_pipeline(compose("eval", [*said[3:], "cache=off"])).pruners
+    assert list(pruners) == ["ratio", "one_to_one", name]
+    assert (pruners[name].threshold, pruners[name].prior) == (None, True)
