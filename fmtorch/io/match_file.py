@@ -5,7 +5,7 @@ import functools
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,7 @@ from fmtorch.io.match_store import MATRICES, PairGeometry
 MEMORY = 256  # images whose keypoints are kept
 NO_MATCH = -1
 Names = tuple[str, str]
+OpenFiles = TypeVar("OpenFiles", bound="_OpenFiles")
 
 
 class _OpenFiles:
@@ -27,6 +28,9 @@ class _OpenFiles:
     def __init__(self, files: Sequence[Path], output: Path) -> None:
         self.files, self._output, self._open = files, output, contextlib.ExitStack()
         self.image = functools.lru_cache(maxsize=MEMORY)(self._image)
+
+    def __enter__(self: OpenFiles) -> OpenFiles:
+        return self
 
     def __exit__(self, *error: object) -> None:
         self._open.close()
@@ -62,9 +66,6 @@ class HlocMatches(_OpenFiles):
             if not self._keys:
                 raise DataError(f"{matches} holds no matches0; give hloc's file of matches")
             self._open = stack.pop_all()
-
-    def __enter__(self) -> "HlocMatches":
-        return self
 
     def pairs(self) -> list[Names]:
         return sorted(self._keys)
@@ -166,9 +167,6 @@ class MatchFile(_OpenFiles):
                     "or hloc's features=F.h5 as well"
                 )
             self._open = stack.pop_all()
-
-    def __enter__(self) -> "MatchFile":
-        return self
 
     def pairs(self) -> list[Ids]:
         return [(f"{pair}x0", f"{pair}x1") for pair in self._pairs]

@@ -285,16 +285,27 @@ def split_scenes(matches: StoredMatches, last: int = 4) -> tuple[StoredMatches, 
     )
 
 
-def last_scenes(scenes: Iterable[tuple[str, str]], last: int) -> set[tuple[str, str]]:
-    """Of scenes (family, name), each given any number of times, the last of each family by name; never its first."""
+HELD_OUT = 4  # scenes of a family
+QUARTER = 4  # of a family of fewer scenes one in so many
+
+
+def last_scenes(scenes: Iterable[tuple[str, str]], last: int | None) -> set[tuple[str, str]]:
+    """Of scenes (family, name), each given any number of times, the last of each family by name; never its first.
+
+    last: how many; None: `HELD_OUT`, or a quarter of a family that has few.
+    """
     names: dict[str, set[str]] = {}
     for family, name in scenes:
         names.setdefault(family, set()).add(name)
     return {
         (family, name)
         for family, of_family in names.items()
-        for name in sorted(of_family)[max(1, len(of_family) - last) :]
+        for name in sorted(of_family)[max(1, len(of_family) - (last or _few(len(of_family)))) :]
     }
+
+
+def _few(scenes: int) -> int:
+    return min(HELD_OUT, max(1, scenes // QUARTER))
 
 
 # Batches of pairs with similar numbers of matches, drawn by seed and epoch, and collated with little padding
