@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 import fmtorch
 from fmtorch import Correspondences, Estimate, data, metrics, presets
 from fmtorch.data import ImagePair, read_image
-from fmtorch.evaluation.pictures import draw_epipolar_lines, draw_matches
+from fmtorch.pipeline.pictures import draw_epipolar_lines, draw_matches
 from fmtorch.pipeline.pipeline import load_pipeline
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"

@@ -12,11 +12,9 @@ from omegaconf import DictConfig
 
 from fmtorch import presets
 from fmtorch.commands.config import job
-from fmtorch.core.files import conf_dir
-from fmtorch.core.types import Correspondences
-from fmtorch.data import ImagePair, ImageSource
-from fmtorch.data.pairs import GivenMatches
-from fmtorch.pipeline.pipeline import Pipeline, build_pipeline, load_pipeline
+from fmtorch.core import Correspondences, conf_dir
+from fmtorch.data import GivenMatches, ImagePair, ImageSource
+from fmtorch.pipeline import Pipeline, build_pipeline, load_pipeline
 from tests.helpers import compose
 
 RATIO = "pruner.ratio.families"

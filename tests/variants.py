@@ -3,7 +3,7 @@
 from typing import Any
 
 from fmtorch import presets
-from fmtorch.presets.objects import instantiate, merged
+from fmtorch.presets import instantiate, merged
 from scripts.benchmark.methods import options
 
 OTHER_LIBRARIES = (

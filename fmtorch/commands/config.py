@@ -84,7 +84,11 @@ def chosen_pipeline() -> tuple[str, list[str]]:
     """The name of the pipeline's preset that runs, and what the command line changes of its stages."""
     config = HydraConfig.get()
     changed = [word for word in config.overrides.task if word.lstrip("+~").startswith(tuple(STAGES))]
-    return str(config.runtime.choices["pipeline"]), changed
+    groups = dict(word.split("=", 1) for word in changed if word.partition("=")[0] in STAGES)
+    if len(groups) < len(STAGES):
+        return str(config.runtime.choices["pipeline"]), changed
+    names = [name for group in STAGES for name in groups[group].strip("[]").split(",")]  # nothing is the pipeline's
+    return "-".join(dict.fromkeys(names)), [word for word in changed if word.partition("=")[0] not in STAGES]
 
 
 def run_command(command: Command, task: Task) -> None:

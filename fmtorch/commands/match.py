@@ -11,7 +11,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -27,10 +26,8 @@ from fmtorch.core.stages import ImageMatcher
 from fmtorch.core.terminal import console, errors, progress_bars
 from fmtorch.core.types import RELATED
 from fmtorch.core.version import __version__
-from fmtorch.data.cameras import undistorted
 from fmtorch.data.images import read_image, stored_orientation
 from fmtorch.evaluation.curves import view_graph_svg
-from fmtorch.evaluation.pictures import draw_epipolar_lines, draw_matches
 from fmtorch.features.vlad import descriptor_kind, image_vector
 from fmtorch.io.export import ViewGraph, export_kinds, view_graph, write_exports, write_view_graph
 from fmtorch.io.match_store import MatchStore
@@ -50,9 +47,10 @@ from fmtorch.pipeline.folder import (
     similar_pairs,
     vectors_of,
 )
+from fmtorch.pipeline.match_result import MatchResult
 from fmtorch.pipeline.photographs import Image, PhotographCameras
 from fmtorch.pipeline.pipeline import Pipeline, build_pipeline
-from fmtorch.pipeline.two_images import MatchResult, match
+from fmtorch.pipeline.two_images import match
 from fmtorch.presets.composition import execution_of, read_fields
 from fmtorch.runs.feature_cache import CachedFeatures, cached
 from fmtorch.runs.fingerprint import fmtorch_version
@@ -169,13 +167,6 @@ class Photographs:
     knowledge: dict[str, Any]
     notes: tuple[str, ...] = ()
 
-    @property
-    def pinholes(self) -> tuple[Image, Image]:
-        lenses = [self.knowledge.get(f"lens{i}") for i in (0, 1)]
-        bent = zip(self.images, lenses, strict=True)
-        image0, image1 = (image if lens is None else undistorted(image, lens) for image, lens in bent)
-        return image0, image1
-
 
 def photographs(
     paths: Sequence[Path], cameras: Path | None, K: str | list[float | int] | None, orient: bool
@@ -198,16 +189,6 @@ def photographs(
     camera0, camera1 = (known.of(path, (image.shape[0], image.shape[1])) for path, image in ends)
     notes = tuple(filter(None, (camera0.note, camera1.note)))
     return Photographs((image0, image1), known.knowledge(camera0, camera1), notes)
-
-
-def pose_report(result: MatchResult) -> dict[str, Any]:
-    """R, t and focal lengths of result.json; None where they are not determined, nothing where nobody asked."""
-    if result.R is None or result.t is None or result.focals is None:
-        return {}
-    determined = result.ok and bool(torch.isfinite(result.R).all())
-    focals = [focal if math.isfinite(focal) else None for focal in result.focals.tolist()]
-    R, t = (value.tolist() if determined else None for value in (result.R, result.t))
-    return {"R": R, "t": t, "focals": focals}
 
 
 def pose_line(result: MatchResult) -> str:
@@ -261,21 +242,17 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
     result = match(
         image0, image1, pipeline=pipeline, longest_side=fields.longest_side, seed=fields.seed, **given.knowledge
     )
-    report = {
-        "version": __version__, **settings, "image0": str(paths[0]), "image1": str(paths[1]),
-        **_report(result, image0, image1, truth), **pose_report(result),
-    }  # fmt: skip
-    with replacing(folder / "result.json") as path:
-        path.write_text(json.dumps(report) + "\n")
-    written = ["result.json", *_draw(folder, result, given, truth)]
+    error = None if truth is None or not result.ok else _nsgd(result, truth)
+    report = {"version": __version__, **settings, "image0": str(paths[0]), "image1": str(paths[1])}
+    written = result.save(folder, truth=truth, report=report | ({} if error is None else {"nsgd": error}))
     heading = f"{' '.join([pipeline_name, *overrides])}: {paths[0].name}, {paths[1].name}"
     console.print(heading, style="italic", markup=False, highlight=False)
     extractor = pipeline.extractor
     console.print(_table(result, isinstance(extractor, CachedFeatures) and not extractor.computed))
     if result.related:
         console.print(_verdict(result), style="bold", highlight=False, soft_wrap=True)
-    if "nsgd" in report:
-        console.print(f"NSGD to the true F: {report['nsgd']:.4f}", highlight=False)
+    if error is not None:
+        console.print(f"NSGD to the true F: {error:.4f}", highlight=False)
     if line := pose_line(result):
         console.print(line, highlight=False)
     for trouble in (*given.notes, *_troubles(result)):
@@ -331,59 +308,10 @@ def _default_output(paths: Sequence[Path], settings: Mapping[str, Any]) -> Path:
     return folder
 
 
-def _report(result: MatchResult, image0: Image, image1: Image, truth: NDArray[np.float64] | None) -> dict[str, Any]:
+def _nsgd(result: MatchResult, truth: NDArray[np.float64]) -> float:
     c = result.correspondences
-    report: dict[str, Any] = {
-        "size0": image0.shape[:2], "size1": image1.shape[:2],
-        "F": result.F.tolist() if result.ok else None, "reason": result.reason, "warning": result.warning,
-        "pair_type": result.pair_type or None,
-        "homography": None if result.homography is None else result.homography.tolist(),
-        "related": result.related, "significance": result.significance if math.isfinite(result.significance) else None,
-        "features": [len(result.keypoints0), len(result.keypoints1)],
-        "matches": result.counts, "seconds": result.seconds,
-        "x0": c.x0[0].tolist(), "x1": c.x1[0].tolist(), "inliers": result.inliers.tolist(),
-        "ratio": None if c.ratio is None else c.ratio[0].tolist(),
-        "score": None if c.score is None else c.score[0].tolist(),
-    }  # fmt: skip
-    if (pinhole := result.undistorted) is not None:
-        report |= {"undistorted_x0": pinhole.x0[0].tolist(), "undistorted_x1": pinhole.x1[0].tolist()}
-    if truth is not None and result.ok:
-        sizes = (torch.tensor([image.shape[:2]]) for image in (image0, image1))
-        report["nsgd"] = float(nsgd(torch.from_numpy(truth)[None], result.F.cpu()[None], *sizes)[0])
-    return report
-
-
-def _draw(folder: Path, result: MatchResult, given: Photographs, truth: NDArray[np.float64] | None) -> list[str]:
-    """Draw the pictures into the folder, matches in the photographs and epipolar lines in pinholes; their names."""
-    image0, image1 = given.images
-    x0, x1 = (x[0].cpu().numpy().astype(np.float64) for x in (result.putative.x0, result.putative.x1))
-    kept = result.kept.cpu().numpy()
-    good = kept.copy()
-    if result.ok:
-        good[good] = result.inliers.cpu().numpy()
-    names = (
-        ("inliers of F", "others, dropped by pruning or estimation") if result.ok else ("kept", "dropped by pruning")
-    )
-    pictures = {"matches.png": draw_matches(image0, image1, x0, x1, good, names=names)}
-    pruners = [step for step in result.counts if step not in ("matching", "estimation")]
-    if pruners:
-        names = (f"kept by pruning ({', '.join(pruners)})", "dropped")
-        pictures["pruning.png"] = draw_matches(image0, image1, x0, x1, kept, names=names)
-    F = result.F.cpu().numpy() if result.ok else truth
-    if F is not None:
-        dashed = truth if result.ok else None
-        if (c := result.undistorted) is None:
-            ends = x0[good], x1[good]
-        else:
-            seen = (result.inliers if result.ok else c.mask[0]).cpu()
-            ends = c.x0[0].cpu()[seen].double().numpy(), c.x1[0].cpu()[seen].double().numpy()
-        pictures["epipolar.png"] = draw_epipolar_lines(*given.pinholes, *ends, F, truth=dashed)
-    for name, picture in pictures.items():
-        with replacing(folder / name) as path:
-            path.write_bytes(cv2.imencode(".png", picture[..., ::-1])[1].tobytes())
-    for name in {"pruning.png", "epipolar.png"} - pictures.keys():  # of an earlier run
-        (folder / name).unlink(missing_ok=True)
-    return list(pictures)
+    sizes = (torch.as_tensor(size).cpu() for size in (c.size0, c.size1))
+    return float(nsgd(torch.from_numpy(truth)[None], result.F.cpu()[None], *sizes)[0])
 
 
 def _verdict(result: MatchResult) -> str:
@@ -398,7 +326,7 @@ def _troubles(result: MatchResult) -> list[str]:
     if not result.ok:
         return list(filter(None, (f"no F: {result.reason}", warning)))
     chance = (
-        "probably not the same scene: so much support is no surprise by chance alone "
+        "probably not the same scene: unrelated photographs have as much support by chance "
         f"(significance {result.significance:.1f}; related from {RELATED:g} on)"
     )
     return list(filter(None, ("" if result.related else chance, warning)))

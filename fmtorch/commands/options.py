@@ -139,7 +139,7 @@ class ReportOptions:
     """What `fmtorch report` takes."""
 
     runs: str | list[str] = option(["runs"], "run folders, or folders that hold some, at any depth")
-    output: Path = option(Path("report.html"), "the page")
+    output: Path | None = option(None, "the page; null: report.html beside the runs, in the first of their folders")
     title: str = option("Fundamental matrices", "of the page")
     pictures: Annotated[int, Within(0)] = option(
         6, "pairs of each data set that are shown, where the runs differ most; 0: none"

@@ -33,7 +33,8 @@ def run(config: DictConfig) -> Path:
         fields.pictures, [Path(root) for root in roots], fields.own_code, presets.resolve_device(fields.device),
         config.cache, fields.cache_limit,
     )  # fmt: skip
-    output = fields.output
+    beside = paths[0].parent if (paths[0] / "run.json").exists() else paths[0]
+    output = fields.output or beside / "report.html"
     expect_writable(output.parent)
     if output.is_dir():
         raise ValueError(f"output={output} is a folder; it must name a file")

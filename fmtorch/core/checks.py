@@ -3,8 +3,6 @@
 Annotations are the source: ``Float[Tensor, "*batch n 2"]`` is both what a reader sees and what is asked for.
 """
 
-from __future__ import annotations
-
 import functools
 import inspect
 import math
@@ -60,7 +58,7 @@ def checked(function: Callable[P, R], *, common_type: bool = False) -> Callable[
 
 
 def as_tensor(value: Any, name: str) -> Tensor:
-    """A tensor of real numbers, of an array without copying.
+    """A tensor of real numbers, of an array or what DLPack shares without copying; points (N, 2) of OpenCV's keypoints.
 
     Raises TypeError, naming the argument, for anything else, and ValueError for a masked array that masks something.
     """
@@ -68,6 +66,10 @@ def as_tensor(value: Any, name: str) -> Tensor:
         return _real(value, name)
     if isinstance(value, list | tuple) and value and all(isinstance(entry, Tensor) for entry in value):
         return _real(torch.stack(list(value)), name)
+    if isinstance(value, list | tuple) and value and hasattr(value[0], "pt"):
+        value = np.array([keypoint.pt for keypoint in value], np.float32)
+    elif hasattr(value, "__dlpack__") and not isinstance(value, np.ndarray | np.generic):  # of CuPy, JAX, ...
+        return _real(torch.from_dlpack(value), name)
     if np.ma.is_masked(value):
         raise ValueError(f"{name} is a masked array; give its data, and what counts in `mask` (True for a real match)")
     try:

@@ -1,7 +1,5 @@
 """Where a user's own code failed: its file, line and traceback, apart from the frames of libraries."""
 
-from __future__ import annotations
-
 import functools
 import sysconfig
 import traceback

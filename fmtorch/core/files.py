@@ -1,7 +1,5 @@
 """Files that are either whole or absent, and the folders of configuration, networks and caches."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import uuid

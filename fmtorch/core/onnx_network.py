@@ -1,7 +1,5 @@
 """ONNX files opened for inference on a CPU."""
 
-from __future__ import annotations
-
 import functools
 import warnings
 from collections.abc import Callable
@@ -49,7 +47,6 @@ def _opened(path: str, modified: int, threads: int) -> Any:
 
 
 # Networks that other libraries fetch
-
 
 Network = TypeVar("Network")
 

@@ -1,9 +1,11 @@
-"""The protocols of the four stages: what anything must look like to take its place in a pipeline."""
+"""The protocols of the four stages: what anything must look like to take its place in a pipeline.
 
-from __future__ import annotations
+Beside them the grey images that pruners look at, and the extractor of matchers that take the images themselves.
+"""
 
+import dataclasses
 from collections.abc import Callable
-from typing import Protocol, TypeAlias, TypeVar, runtime_checkable
+from typing import Any, NamedTuple, Protocol, TypeAlias, TypeVar, runtime_checkable
 
 import numpy as np
 import torch
@@ -11,8 +13,38 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from fmtorch.core.grey_pyramid import GreyPyramid
 from fmtorch.core.types import Correspondences, Estimate, Features
+
+LEVELS = 5  # at most
+MIN_SIDE = 32  # px, of a level that has a coarser one
+SMOOTHING = 0.5  # px, of every level: contrast between pixels is then lowered nearly as much as on them
+
+
+class GreyPyramid(NamedTuple):
+    """Levels of an image, each of half the samples of the one before: point x of the image is at x / 2^l of level l.
+
+    pixels: (sum,) uint8, the grey levels of all, row by row. levels: (l, 3) int64, of each its height, its width and
+    where it begins in `pixels`. Four thirds of a byte for each pixel of the image.
+    """
+
+    pixels: NDArray[np.uint8]
+    levels: NDArray[np.int64]
+
+
+def grey_pyramid(image: NDArray[np.uint8]) -> GreyPyramid:
+    """The pyramid of a grey image (H, W): Burt and Adelson, The Laplacian Pyramid as a Compact Image Code, 1983.
+
+    Every other sample is taken of an image smoothed by a binomial filter; what is kept of each is smoothed slightly.
+    """
+    import cv2  # not before an image is there: protocols of matches alone name this file
+
+    images: list[Any] = [image]
+    while len(images) < LEVELS and min(images[-1].shape) >= MIN_SIDE:
+        images.append(cv2.pyrDown(images[-1]))
+    begins = np.cumsum([0, *(level.size for level in images[:-1])])
+    levels = np.array([(*level.shape, begin) for level, begin in zip(images, begins, strict=True)], np.int64)
+    return GreyPyramid(np.concatenate([cv2.GaussianBlur(level, (3, 3), SMOOTHING).ravel() for level in images]), levels)
+
 
 PairImages: TypeAlias = tuple[GreyPyramid, GreyPyramid]
 Output = TypeVar("Output", Features, Correspondences, Estimate)
@@ -104,6 +136,18 @@ def model_of(estimator: Estimator) -> str:
     """What an estimator's matrices are, `Estimate.model`: fundamental, unless it says otherwise."""
     model: str = getattr(estimator, "model", "fundamental")
     return model
+
+
+@dataclasses.dataclass(frozen=True)
+class NoFeatures:
+    """Finds nothing: an extractor for matchers that take images. keep: nothing of it is worth a place in a cache."""
+
+    keep = False
+
+    def __call__(self, image: NDArray[np.uint8]) -> Features:
+        """No features of an image."""
+        size = torch.tensor(image.shape[:2], dtype=torch.int64)
+        return Features(torch.zeros(0, 2, 3), torch.zeros(0), torch.zeros(0, 0), size)
 
 
 def output_of(

@@ -1,7 +1,5 @@
 """What the commands share: the console, progress bars, and how errors end a command."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 import sys

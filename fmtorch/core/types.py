@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import math
 from collections.abc import Sequence
 from typing import Annotated, Any, TypeVar, cast
 
@@ -17,6 +18,7 @@ from jaxtyping import Bool, Float, Int, Real
 from torch import Tensor
 
 from fmtorch.core.annotations import Rule
+from fmtorch.core.display import table_html
 from fmtorch.core.records import Index, Record, as_index, expect_fields, gathered, padded, slotted
 
 PROBABILITY = Rule(lambda prior: (prior >= 0) & (prior <= 1), "it is P(inlier), within [0, 1]")
@@ -51,7 +53,7 @@ def pair_key(identity: str) -> int:
     return int.from_bytes(hashlib.blake2b(identity.encode(), digest_size=8).digest(), "big", signed=True)
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Features(Record):
     """The local features of one image, or of a padded batch of images (a leading dimension on every field).
 
@@ -93,7 +95,7 @@ class Features(Record):
         return Features(self.lafs[i], self.scores[i], self.descriptors[i], size, self.valid[i])
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Correspondences(Record):
     """A batch of B image pairs with their putative matches, padded to N slots.
 
@@ -176,7 +178,7 @@ class Correspondences(Record):
         return self.derived(**{name: padded(gathered(v, order), 1, n) for name, v in slotted(self).items()})
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Estimate(Record):
     """Fundamental matrices of B pairs.
 
@@ -291,6 +293,43 @@ class Estimate(Record):
         i = as_index(index, len(self))
         picked = torch.arange(len(self), device=self.ok.device)[i].tolist()
         return self._map(lambda value: value[i], reason=tuple(self.reason[j] for j in picked))
+
+    def __repr__(self) -> str:
+        """One line: what was found of a pair, or of how many."""
+        if len(self) == 1:
+            return f"{type(self).__name__}({', '.join(filter(None, self._row(0)[1:]))})"
+        inliers = self.inliers.sum(-1).tolist()
+        spread = f", {min(inliers)} to {max(inliers)} inliers" if inliers else ""
+        ok, related = int(self.ok.sum()), int(self.related.sum())
+        return f"{type(self).__name__}({len(self)} pairs: {ok} ok, {related} related{spread})"
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows: a line for each pair."""
+        header = ("pair", "found", "inliers", "support")
+        return table_html(header, [self._row(i) for i in range(len(self))], repr(self))
+
+    def _row(self, i: int) -> tuple[str, str, str, str]:
+        """A pair's number, what was found, its inliers and its significance."""
+        if not self.ok[i]:
+            return str(i), f"no {self.model} matrix: {self.reason[i]}", "", ""
+        found = self.model
+        if self.R is not None and bool(self.R[i].isfinite().all()):
+            found += " and pose"
+        if self.pair_type_index is not None:
+            found += f", {self.pair_type[i]}"
+        value = float(cast(Tensor, self.significance)[i])
+        support = "" if math.isnan(value) else f"significance {value:.1f}, {'' if self.related[i] else 'not '}related"
+        return str(i), found, f"{int(self.inliers[i].sum())} inliers", support
+
+
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class PoseEstimate(Estimate):
+    """An `Estimate` that has the relative pose and focal lengths of each pair, NaN where they are not determined."""
+
+    E: Float[Tensor, "b 3 3"] = dataclasses.field(kw_only=True)
+    R: Float[Tensor, "b 3 3"] = dataclasses.field(kw_only=True)
+    t: Float[Tensor, "b 3"] = dataclasses.field(kw_only=True)
+    focals: Float[Tensor, "b 2"] = dataclasses.field(kw_only=True)
 
 
 Item = TypeVar("Item", Features, Correspondences, Estimate)

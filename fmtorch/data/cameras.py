@@ -63,6 +63,15 @@ def share_centre(camera0: Pinhole, camera1: Pinhole) -> bool:
     return bool(np.linalg.norm(centres[0] - centres[1]) <= SAME_CENTRE * max(map(np.linalg.norm, centres)))
 
 
+def line_distance(F: Matrix, x0: Matrix, x1: Matrix) -> Matrix:
+    """The larger distance (n,), px, of two matched points (n, 2) to their epipolar lines; infinite on an epipole."""
+    h0, h1 = (np.column_stack([x, np.ones(len(x))]) for x in (x0, x1))
+    line1, line0 = h0 @ F.T, h1 @ F
+    shorter = np.minimum(np.hypot(line0[:, 0], line0[:, 1]), np.hypot(line1[:, 0], line1[:, 1]))
+    residual = np.abs((h1 * line1).sum(1))
+    return np.where(shorter > 0, residual / np.where(shorter > 0, shorter, 1.0), np.inf)
+
+
 def from_projection(P: Matrix, R: Matrix, t: Matrix) -> Camera:
     """The camera ``P [R | t; 0 1]``, of a projection (3, 4) of an already rectified camera: ``P = K [I | K^-1 p4]``."""
     K = P[:, :3]

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from fmtorch.core.files import replacing
 from fmtorch.core.settings import claim
+from fmtorch.data.cameras import line_distance
 from fmtorch.data.fmbench import CAMERAS, IMAGES, SUFFIXES
 from fmtorch.data.images import ImageError, read_image, to_grey
 from fmtorch.data.pairs import DepthDataset, ImageSource
@@ -181,19 +182,10 @@ def matchable(a: Keypoints, b: Keypoints, F: NDArray[np.float64]) -> bool:
     near = 0
     for begin in range(0, len(a[0]), _AT_ONCE):
         block = a[0][begin : begin + _AT_ONCE], a[1][begin : begin + _AT_ONCE]
-        near += _near_lines(*ratio_matches(block, b), F)
+        near += int((line_distance(F, *ratio_matches(block, b)) < NEAR_LINE).sum())
         if near > ENOUGH:
             return True
     return False
-
-
-def _near_lines(x0: NDArray[np.float64], x1: NDArray[np.float64], F: NDArray[np.float64]) -> int:
-    h0, h1 = np.column_stack([x0, np.ones(len(x0))]), np.column_stack([x1, np.ones(len(x1))])
-    l1, l0 = h0 @ F.T, h1 @ F
-    error = np.abs((h1 * l1).sum(1))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        worst = error / np.minimum(np.hypot(l0[:, 0], l0[:, 1]), np.hypot(l1[:, 0], l1[:, 1]))
-    return int((worst < NEAR_LINE).sum())
 
 
 # Which candidates of a data set make pairs, by the paper's rule or by overlap, and FM-Bench's layout of these pairs

@@ -3,7 +3,7 @@
 import pickle
 import re
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,11 @@ def given_root(root: str | Path | None, name: str, what: str) -> Path:
     if root is None:
         raise DataError(f"{name} needs root: {what}")
     return Path(root).expanduser()
+
+
+def images_by_stem(folder: Path, suffixes: Sequence[str]) -> dict[str, Path]:
+    """The image files of a folder by their stems; of two with one stem that of the first suffix by name."""
+    return {file.stem: file for file in sorted(folder.iterdir(), reverse=True) if file.suffix in suffixes}
 
 
 def read_lines(path: Path, hint: str = "") -> list[str]:

@@ -12,7 +12,7 @@ from fmtorch.core.options import Within
 from fmtorch.data.cameras import Matrix
 from fmtorch.data.files import DataError, given_root, read_numbers
 from fmtorch.data.images import stored_size
-from fmtorch.data.pairs import ImagePair, ImageSource, PairDataset, Resampling, shorter_side
+from fmtorch.data.pairs import HeldPairs, ImagePair, ImageSource, Resampling, shorter_side
 
 FAMILIES = {"i": "illumination", "v": "viewpoint"}  # by the first letter of a sequence's name
 LARGE = (
@@ -23,7 +23,7 @@ SUFFIXES = (".ppm", ".png", ".jpg")
 OTHERS = range(2, 7)  # images of a sequence that image 1 is paired with
 
 
-class HPatchesPairs(PairDataset):
+class HPatchesPairs(HeldPairs):
     """Image 1 of each sequence with images 2 to 6, and the homographies ``H_1_2`` to ``H_1_6``.
 
     Args:
@@ -62,12 +62,6 @@ class HPatchesPairs(PairDataset):
                 digest.update(f"{sequence}/{file.name}:{len(content)}:".encode() + content)
                 self._pairs.append(_pair(home / sequence, other, short_side))
         self.digest = digest.hexdigest()
-
-    def __len__(self) -> int:
-        return len(self._pairs)
-
-    def __getitem__(self, index: int) -> ImagePair:
-        return self._pairs[index]
 
 
 def _pair(folder: Path, other: int, short_side: int | None) -> ImagePair:

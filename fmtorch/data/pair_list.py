@@ -18,7 +18,7 @@ import numpy as np
 from fmtorch.data.cameras import Camera, Matrix, fundamental, nearest_rotation, relative_pose
 from fmtorch.data.files import DataError, NpzArrays, given_root, numbered, read_numbers, to_numbers, to_whole
 from fmtorch.data.images import stored_size
-from fmtorch.data.pairs import ImagePair, ImageSource, PairDataset, Resampling, Size, longer_side
+from fmtorch.data.pairs import HeldPairs, ImagePair, ImageSource, Resampling, Size, longer_side
 
 SUPERGLUE, GLUE_FACTORY, GLUE_FACTORY_4X4 = 38, 32, 36  # columns of a line
 LAYOUTS = {
@@ -210,7 +210,7 @@ TEXT_SUFFIXES, NPZ = (".txt", ".csv", ".list", ""), ".npz"
 _FRAME = re.compile(r"(.+?)_frame\W")  # scene0711_00_frame-001680.jpg
 
 
-class PairList(PairDataset):
+class PairList(HeldPairs):
     """The pairs of a list, whose images lie in a folder.
 
     Args:
@@ -255,12 +255,6 @@ class PairList(PairDataset):
             content = each.read_bytes()
             digest.update(f"{name}:{len(content)}:".encode() + content)
         self.digest = digest.hexdigest()
-
-    def __len__(self) -> int:
-        return len(self._pairs)
-
-    def __getitem__(self, index: int) -> ImagePair:
-        return self._pairs[index]
 
     def _pair(self, listed: ListedPair, scene: str) -> ImagePair:
         identity = f"{self.name}/{listed.names[0]}-{listed.names[1]}"  # draws do not follow the name of the list

@@ -160,6 +160,18 @@ class PairDataset(Protocol):
         return (self[index] for index in range(len(self)))
 
 
+class HeldPairs(PairDataset):
+    """Pairs that a data set holds in memory."""
+
+    _pairs: list[ImagePair]
+
+    def __len__(self) -> int:
+        return len(self._pairs)
+
+    def __getitem__(self, index: int) -> ImagePair:
+        return self._pairs[index]
+
+
 @runtime_checkable
 class DepthDataset(PairDataset, Protocol):
     """A data set that knows how far away the points of its images are, in the unit of the pairs' t."""

@@ -10,17 +10,19 @@ import itertools
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import cv2
 import numpy as np
-import scipy.sparse
 from numpy.typing import NDArray
 
 from fmtorch.data.cameras import Matrix, fundamental, relative_pose, share_centre
 from fmtorch.data.files import DataError
 from fmtorch.data.images import ImageError
 from fmtorch.data.pairs import ImagePair, ImageSource, PairDataset
+
+if TYPE_CHECKING:
+    import scipy.sparse
 
 Indices = NDArray[np.int64]
 
@@ -98,8 +100,10 @@ def sharing_points(points: Sequence[NDArray[np.int64]], minimum: int = MIN_SHARE
     return ListedPairs(np.concatenate([*blocks, np.zeros((0, 2), np.int64)]))
 
 
-def incidence(points: Sequence[Indices]) -> scipy.sparse.csr_array:
+def incidence(points: Sequence[Indices]) -> "scipy.sparse.csr_array":
     """Which image sees which point, (images, points) of ones; points: of each image the numbers it sees."""
+    import scipy.sparse  # which takes longer to import than a small database to verify
+
     seen = [np.unique(p) for p in points]
     _, columns = np.unique(np.concatenate([*seen, np.zeros(0, np.int64)]), return_inverse=True)
     return scipy.sparse.csr_array(
@@ -120,11 +124,7 @@ def drawn(total: int, count: int | None, seed: int) -> Sequence[int] | Indices:
 
 SPLITS: dict[str, dict[str, tuple[str, ...]]] = {
     "tum": {
-        "test": (
-            "rgbd_dataset_freiburg3_teddy",
-            "rgbd_dataset_freiburg3_large_cabinet",
-            "rgbd_dataset_freiburg3_long_office_household",
-        ),
+        "test": tuple(f"rgbd_dataset_freiburg3_{name}" for name in ("teddy", "large_cabinet", "long_office_household")),
     },
     "kitti": {
         "test": ("06", "07", "08", "09", "10"),

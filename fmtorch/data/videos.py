@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from fmtorch.data.cameras import Lens, Matrix, from_projection, nearest_rotation
-from fmtorch.data.files import DataError, given_root, numbered, to_finite
+from fmtorch.data.files import DataError, given_root, images_by_stem, numbered, to_finite
 from fmtorch.data.pairs import ImageSource
 from fmtorch.data.scenes import (
     WINDOW,
@@ -90,7 +90,7 @@ def _kitti_scene(home: Path, folder: Path, camera: int, window: int | float) -> 
         )
     if not images.is_dir():
         raise DataError(f"{images}: no such folder; {_LAYOUT}")
-    there = {file.stem: file for file in sorted(images.iterdir(), reverse=True) if file.suffix in _SUFFIXES}
+    there = images_by_stem(images, _SUFFIXES)
     if len(there) > len(lines):
         raise DataError(
             f"{poses} ends at line {len(lines)} and {images} has {len(there)} images; each must have its line: is the "

@@ -7,11 +7,16 @@ from fmtorch.core.lazy import lazy_exports
 if TYPE_CHECKING:
     from fmtorch.estimators.coarse_to_fine import CoarseToFine
     from fmtorch.estimators.degensac import Degensac
-    from fmtorch.estimators.external.authors import degensac_cpp, gc_ransac_cpp, magsac_cpp, superansac_cpp
     from fmtorch.estimators.external.colmap import colmap
     from fmtorch.estimators.external.fastpose import fastpose
-    from fmtorch.estimators.external.kornia import kornia_ransac
-    from fmtorch.estimators.external.opencv import opencv
+    from fmtorch.estimators.external.libraries import (
+        degensac_cpp,
+        gc_ransac_cpp,
+        kornia_ransac,
+        magsac_cpp,
+        opencv,
+        superansac_cpp,
+    )
     from fmtorch.estimators.external.pairwise import PairwiseEstimator
     from fmtorch.estimators.external.poselib import poselib
     from fmtorch.estimators.graph_cut import GraphCut

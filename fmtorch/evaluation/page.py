@@ -15,8 +15,8 @@ import pyarrow as pa
 from fmtorch import presets
 from fmtorch.core.settings import leaves
 from fmtorch.evaluation import curves, tables
-from fmtorch.evaluation.pictures import Image
 from fmtorch.evaluation.statistics import THRESHOLD, summarize
+from fmtorch.pipeline.photographs import Image
 
 QUALITY, WIDTH = 80, 1280  # of JPEG pictures; px
 DISAGREEMENT = 0.1  # NSGD beyond which a result is as bad as any

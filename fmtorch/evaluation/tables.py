@@ -146,8 +146,9 @@ FOCAL_COLUMNS: Columns = {
     **{f"%within {p} %": _percent(f"within_{p}") for p in statistics.FOCAL_THRESHOLDS},
 }
 KINDS = (
-    "Number of pairs by what their matches show. Those of one plane, of a camera that only turns, or of one photograph "
-    "twice do not determine F: recall of such pairs is luck."
+    "Number of pairs by what their matches show, beginning from the estimate of each run: another estimator may see "
+    "another plane. Those of one plane, of a camera that only turns, or of one photograph twice do not determine F: "
+    "recall of such pairs is luck."
 )
 
 

@@ -105,7 +105,6 @@ def _determinant(line0: list[Tensor], line1: list[Tensor]) -> Tensor:
 
 # Images of known calibration as those of a camera with square pixels and a central principal point
 
-
 MIN_FOCAL, MAX_FOCAL = 0.1, 10.0  # in units of the longer side; K of other focal lengths is of another unit or image
 MAX_OFF = 1000.0  # in units of the longer side; the principal point of a crop may lie outside it, if not so far
 MIN_SIDE_PX, MAX_SIDE_PX = 16.0, 1e6  # longer sides, or focal lengths, of coordinates that are pixels

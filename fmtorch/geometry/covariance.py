@@ -21,8 +21,6 @@ Weights that are no inverse variances, such as P(inlier), count by ``sum w / sum
 is assumed; on real pairs neighbours err alike, and deviations come out too small.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

@@ -1,7 +1,5 @@
 """Of which type a pair of images is: general, planar, a rotation, one photograph twice, or unrelated."""
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple
 

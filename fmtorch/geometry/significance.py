@@ -6,8 +6,6 @@ independent and their points anywhere. The number of false alarms of a model is 
 are to be expected then, in all that a search could have tried.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 from typing import Any, NamedTuple, cast

@@ -11,6 +11,7 @@ import numpy as np
 
 from fmtorch.data import DataError, FMBenchPairs, GivenMatches, ImagePair, ImageSource, PairDataset, stored_size
 from fmtorch.data.files import given_root
+from fmtorch.data.pairs import HeldPairs
 from fmtorch.io import h5, predictions
 from fmtorch.io.predictions import Array, Size
 
@@ -315,7 +316,7 @@ WITHOUT_GEOMETRY = {"hloc": 0.0, "glue_factory": CORNER, "vismatch": 0.0}
 LAYOUTS = (*WITHOUT_GEOMETRY, *WITH_GEOMETRY)
 
 
-class H5Pairs(PairDataset):
+class H5Pairs(HeldPairs):
     """Pairs with given matches, which take the place of features and matcher.
 
     Args:
@@ -371,12 +372,6 @@ class H5Pairs(PairDataset):
         if not self._pairs:
             raise DataError(f"{folder}: holds no pairs")
         self.digest = digest.hexdigest()
-
-    def __len__(self) -> int:
-        return len(self._pairs)
-
-    def __getitem__(self, index: int) -> ImagePair:
-        return self._pairs[index]
 
 
 def _truth(layout: str, truth: str | Path | None) -> PairDataset:

@@ -1,7 +1,5 @@
 """LightGlue, the learned matcher (Lindenberger, Sarlin, Pollefeys, ICCV 2023), through kornia, for comparison."""
 
-from __future__ import annotations
-
 import kornia
 import torch
 from torch import Tensor, nn

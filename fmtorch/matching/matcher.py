@@ -76,7 +76,6 @@ def _take(lafs: Tensor, index: Int[Tensor, "b n0"]) -> Tensor:
 
 # How exact each match is, from the precision matrices that RoMa v2 gives with it
 
-
 Array = NDArray[np.float64]
 MAX_RATIO = 4.0  # of the noise of a match to the pair's usual one, either way: as far as frames tell (`match_noise`)
 

@@ -24,24 +24,9 @@ if TYPE_CHECKING:
     from fmtorch.metrics.recall import mean_recall, recall, recall_curve
 
 __all__ = [
-    "InlierRate",
-    "PoseError",
-    "closest_pose_error",
-    "corner_error",
-    "fundamental_pose_error",
-    "ground_truth_inliers",
-    "inlier_rate",
-    "mean_recall",
-    "nsgd",
-    "nsgd_released",
-    "pose_auc",
-    "pose_error",
-    "pose_maa",
-    "pose_map",
-    "recall",
-    "recall_curve",
-    "right_of_homography",
-    "sgd",
-]
+    "InlierRate", "PoseError", "closest_pose_error", "corner_error", "fundamental_pose_error", "ground_truth_inliers",
+    "inlier_rate", "mean_recall", "nsgd", "nsgd_released", "pose_auc", "pose_error", "pose_maa", "pose_map", "recall",
+    "recall_curve", "right_of_homography", "sgd",
+]  # fmt: skip
 
 lazy_exports(__name__)

@@ -11,8 +11,6 @@ A draw is accepted when both lines meet image 1; the figure is the mean of the f
 It is not symmetric under exchanging the images.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple
 
@@ -205,7 +203,7 @@ def _flattened(
         raise ValueError(f"samples is {samples}; it must be at least 1")
     key = torch.zeros((), dtype=torch.int64, device=F_est.device) if key is None else key
     shapes = (F_gt.shape[:-2], F_est.shape[:-2], size0.shape[:-1], size1.shape[:-1], key.shape)
-    shape = torch.broadcast_shapes(*shapes)
+    shape = torch.Size(torch.broadcast_shapes(*shapes))  # type: ignore[no-untyped-call]
 
     def flat(value: Tensor, *tail: int) -> Tensor:
         return value.to(torch.float64).expand(*shape, *tail).reshape(-1, *tail)

@@ -13,9 +13,11 @@ from fmtorch.data.pairs import ImagePair, ImageSource
 from fmtorch.geometry.cameras import cross_matrix
 from fmtorch.geometry.pose import pose_from_fundamental
 from fmtorch.io.match_store import MatchRecords, PairGeometry, StoredImage, StoredPair, indices
+from fmtorch.pipeline.match_result import MatchResult
+from fmtorch.pipeline.pair_geometries import pair_geometries
 from fmtorch.pipeline.photographs import PhotographCamera
 from fmtorch.pipeline.pipeline import Outcome, Pipeline
-from fmtorch.pipeline.two_images import Described, MatchResult, pair_geometries
+from fmtorch.pipeline.two_images import Described
 from fmtorch.two_view.pair_type import PairTypes
 
 EXACT = (1.0, 0.0)  # px, relative deviation; K stands for the pixels

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
+import PIL.Image
 import torch
 from jaxtyping import Float
 from numpy.typing import NDArray
@@ -142,15 +143,26 @@ def _pinhole(K: str | Sequence[float | int]) -> Lens:
 
 
 Image = NDArray[np.uint8]
+GivenImage = Path | str | Image | Any  # or one of Pillow's, which is imported by who has one
 Array = NDArray[np.float64]
 
 
-def given_image(image: Path | str | Image, name: str) -> Image:
-    """The pixels of a file, turned as its EXIF orientation says, or of an array; see `fmtorch.match`."""
+def given_image(image: GivenImage, name: str) -> Image:
+    """The pixels of a file, turned as its EXIF orientation says, of Pillow's image, or of an array.
+
+    Raises ImageError for a file that is no sound image, TypeError or ValueError, naming it, for what is no image.
+    """
     if isinstance(image, Path | str):
         return read_image(image, orient=True)
+    if isinstance(image, PIL.Image.Image):
+        grey = image.mode in ("1", "L", "LA")
+        if not grey and image.mode not in ("RGB", "RGBA", "P", "CMYK", "YCbCr", "HSV", "LAB"):
+            raise ValueError(f"{name} is a Pillow image of mode {image.mode}; it must be of 8 bits: L or RGB")
+        return np.asarray(image.convert("L" if grey else "RGB"))
     if not isinstance(image, np.ndarray):
-        raise TypeError(f"{name} is a {type(image).__name__}; it must be a file's path or a uint8 array of NumPy")
+        raise TypeError(
+            f"{name} is a {type(image).__name__}; it must be a file's path, a Pillow image or a uint8 array of NumPy"
+        )
     colour = image.ndim == 3 and image.shape[2] == 3
     if image.dtype != np.uint8 or image.size == 0 or not (image.ndim == 2 or colour):
         raise ValueError(f"{name} is {image.dtype} {image.shape}; it must be non-empty uint8, (H, W) or RGB (H, W, 3)")

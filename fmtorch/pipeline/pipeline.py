@@ -17,16 +17,17 @@ from numpy.typing import NDArray
 from omegaconf import DictConfig
 
 from fmtorch.core.failures import own_traceback, place_of
-from fmtorch.core.grey_pyramid import GreyPyramid, grey_pyramid
 from fmtorch.core.stages import (
     Estimator,
     FeatureExtractor,
+    GreyPyramid,
     ImageMatcher,
     ImagePruner,
     Matcher,
     PairImages,
     Pruner,
     TimedExtractor,
+    grey_pyramid,
     model_of,
     output_of,
     pruned,

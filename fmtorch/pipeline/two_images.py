@@ -2,34 +2,27 @@
 
 import dataclasses
 import functools
-import math
 from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
-from numpy.typing import NDArray
+from jaxtyping import Float
 from torch import Tensor
 
 from fmtorch import presets
-from fmtorch.core.grey_pyramid import GreyPyramid, grey_pyramid
-from fmtorch.core.no_features import NoFeatures
-from fmtorch.core.stages import ImageMatcher, PairImages, output_of, pruned
-from fmtorch.core.types import RELATED, Correspondences, Estimate, Features
+from fmtorch.core.stages import GreyPyramid, ImageMatcher, NoFeatures, PairImages, grey_pyramid, output_of, pruned
+from fmtorch.core.types import Correspondences, Features
 from fmtorch.data import Lens, to_grey
-from fmtorch.geometry.pair_type import GENERAL, IDENTICAL, PLANAR, ROTATION
-from fmtorch.io.match_store import Kind, PairGeometry
 from fmtorch.jobs.execution import mapped, one_thread
 from fmtorch.pipeline import photographs
-from fmtorch.pipeline.photographs import Image, frames_to_original, to_original
+from fmtorch.pipeline.match_result import Lenses, MatchResult
+from fmtorch.pipeline.pair_geometries import pair_geometries
+from fmtorch.pipeline.photographs import GivenImage, Image, frames_to_original, to_original
 from fmtorch.pipeline.pipeline import Clock, Pipeline, load_pipeline
 from fmtorch.two_view.arguments import Arrays, Focal, camera_fields
 from fmtorch.two_view.known_cameras import KnownCameras
 from fmtorch.two_view.pair_type import (
-    FOCAL_DEVIATION,
-    PairTypes,
     classify,
     compile_with,
     still_warning,
@@ -66,150 +59,16 @@ def describe(pipeline: Pipeline, image: Image, longest_side: int) -> Described:
     return Described(features, scale, (image.shape[0], image.shape[1]), seconds, pyramid, reduced if itself else None)
 
 
-# What is found of two photographs
-
-
-FLAT = ("planar", "rotation", "identical")  # pair types of which a homography explains all matches
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class MatchResult:
-    """The matches of two photographs and their fundamental matrix, ``x1^T F x0 = 0``, in pixels of the photographs.
-
-    keypoints0, keypoints1: all that were detected, (N0, 2) and (N1, 2).
-    putative: the matcher's matches, a batch of one. kept: which of them the pruners kept, (M,).
-    correspondences: the kept ones, a batch of one. inliers: which of those agree with F, (K,).
-    F: (3, 3) float64 of unit Frobenius norm; zero where there is none, and `reason` then says why.
-    significance: how far the support of F is beyond chance (`fmtorch.geometry.significance`); -inf where there is no F.
-    warning: why F, though found, means little; mostly empty. counts: matches after each step, in order. seconds: of
-    each step, cached features with those they took when they were computed.
-    R (3, 3), t (3,), focals (2,): X1 = R X0 + t with a t of unit length, and focal lengths in pixels of the
-    photographs, where cameras were asked for; NaN where not determined.
-    pair_type: one of `PAIR_TYPES`; empty where nothing could be matched. geometry: the two-view geometry for
-    COLMAP, whose inliers are indices of the kept matches, twice. undistorted: where a lens distorts, the kept matches
-    as pinholes would have them, which F and homography relate; points are otherwise those of the photographs.
-    """
-
-    keypoints0: Float[Tensor, "n0 2"]
-    keypoints1: Float[Tensor, "n1 2"]
-    putative: Correspondences
-    kept: Bool[Tensor, " m"]
-    correspondences: Correspondences
-    inliers: Bool[Tensor, " k"]
-    F: Float[Tensor, "3 3"]
-    reason: str = ""
-    warning: str = ""
-    counts: dict[str, int] = dataclasses.field(default_factory=dict)
-    seconds: dict[str, float] = dataclasses.field(default_factory=dict)
-    significance: float = -math.inf
-    R: Float[Tensor, "3 3"] | None = None
-    t: Float[Tensor, " 3"] | None = None
-    focals: Float[Tensor, " 2"] | None = None
-    pair_type: str = ""
-    geometry: PairGeometry | None = None
-    undistorted: Correspondences | None = None
-
-    @property
-    def homography(self) -> Float[Tensor, "3 3"] | None:
-        """Of planes, rotations and copies: ``x1 ~ H x0`` in pixels of the photographs; else None."""
-        H = None if self.geometry is None or self.pair_type not in FLAT else self.geometry.H
-        return None if H is None else torch.from_numpy(H)
-
-    @property
-    def related(self) -> bool:
-        """Whether the photographs are taken to show one scene: F was found, and its support is beyond chance."""
-        return self.ok and self.significance >= RELATED
-
-    @property
-    def ok(self) -> bool:
-        return not self.reason
-
-
-# Estimates of pairs and their pair types as the two-view geometries of COLMAP's databases
-
-
-KINDS: dict[int, Kind] = {PLANAR: "planar", ROTATION: "panoramic", IDENTICAL: "planar_or_panoramic"}
-MAX_CONFLICT = 3.0  # deviations, of an estimated focal length from that of a camera that counts as calibrated
-
-
-def pair_geometries(
-    matches: Sequence[NDArray[np.integer[Any]]], c: Correspondences, estimate: Estimate, pair_type: PairTypes
-) -> list[PairGeometry]:
-    """The geometries of a batch of pairs.
-
-    Of general pairs F, its inliers, and E and the pose where there is one; of others the homography and its inliers,
-    and the pose where the cameras are known or only turn. A pair is calibrated where both focal lengths are known and
-    the matches agree; one whose support is not beyond chance is degenerate.
-
-    Args:
-        matches: keypoints of both images, (n, 2), of each pair.
-        c: the same matches, with what the estimator was given of their cameras.
-        estimate: their estimates.
-        pair_type: of `classify`.
-    """
-    calibrated = _calibrated(c, estimate)
-    said = [*zip(estimate.reason, warnings_of(estimate, pair_type), strict=True)]
-    kind, homography = pair_type.kind, pair_type.homography
-    kinds = torch.where(kind != GENERAL, kind, torch.where(estimate.related, GENERAL, -1)).tolist()
-    results = []
-    for i, (index, what) in enumerate(zip(matches, kinds, strict=True)):
-        of_lines = what == GENERAL or (what == PLANAR and bool(calibrated[i]))
-        inliers = index[(estimate if of_lines else homography).inliers[i, : len(index)].cpu().numpy()]
-        H = _known(homography.F[i], homography.ok[i])
-        if what == GENERAL:
-            results.append(_with_lines("calibrated" if calibrated[i] else "uncalibrated", inliers, estimate, i, H))
-        elif of_lines:
-            results.append(_with_lines("planar", inliers, estimate, i, H))
-        elif what not in KINDS:
-            results.append(PairGeometry("degenerate", index[:0]))
-        elif what == ROTATION:
-            R = pair_type.evidence.R[i].cpu().numpy()
-            results.append(PairGeometry("panoramic", inliers, H=H, R=R, t=np.zeros(3)))
-        else:
-            results.append(PairGeometry(KINDS[what], inliers, H=H))
-    return [geometry._replace(reason=why, warning=but) for geometry, (why, but) in zip(results, said, strict=True)]
-
-
-def _calibrated(c: Correspondences, estimate: Estimate) -> Tensor:
-    """Whether both focal lengths of a pair are known, and the pose with them: (b,)."""
-    if c.focal is None or estimate.R is None:
-        return torch.zeros_like(estimate.ok)
-    known = c.focal[..., 1].isfinite().all(1)
-    return known & estimate.R.isfinite().flatten(1).all(1) & ~_conflicting(c, estimate)
-
-
-def _with_lines(kind: Kind, inliers: NDArray[np.integer[Any]], estimate: Estimate, i: int, H: Any) -> PairGeometry:
-    E, R, t = (
-        None if value is None else _known(value[i], value[i].isfinite().all())
-        for value in (estimate.E, estimate.R, estimate.t)
-    )
-    return PairGeometry(kind, inliers, estimate.F[i].detach().cpu().double().numpy(), E, H, R, t)
-
-
-def _known(value: Tensor, known: Tensor) -> NDArray[np.float64] | None:
-    return value.detach().cpu().double().numpy() if known else None
-
-
-def _conflicting(c: Correspondences, estimate: Estimate) -> Tensor:
-    """Whether an estimated focal length contradicts the known one of K: (b,)."""
-    if c.K0 is None or c.K1 is None or c.focal is None or estimate.focals is None:
-        return torch.zeros_like(estimate.ok)
-    stored = torch.stack([torch.sqrt(K[:, 0, 0] * K[:, 1, 1]) for K in (c.K0, c.K1)], 1)
-    apart = (estimate.focals / stored).log().abs()
-    return (apart > MAX_CONFLICT * c.focal[..., 1].clamp_min(FOCAL_DEVIATION)).any(1)
-
-
 # Two photographs of any size through a pipeline: their matches and fundamental matrix in their own pixels
 
 
 NOTHING_KNOWN: Mapping[str, Tensor] = {}
 NO_CAMERAS: Mapping[str, None] = dict.fromkeys(("K0", "K1", "focal", "shared_focal"))  # of the reduced images
-Lenses = tuple[Lens | None, Lens | None]
 
 
 def match(
-    image0: Path | str | Image,
-    image1: Path | str | Image,
+    image0: GivenImage,
+    image1: GivenImage,
     *,
     pipeline: str | Pipeline = "hesaffnet_fast_fmtorch",
     device: torch.device | str | None = None,
@@ -224,7 +83,8 @@ def match(
     """Match two photographs and estimate their fundamental matrix.
 
     Args:
-        image0, image1: files, turned as their EXIF orientation says, or uint8 arrays, (H, W) or RGB (H, W, 3).
+        image0, image1: files, turned as their EXIF orientation says, images of Pillow as they are, or uint8 arrays,
+            (H, W) or RGB (H, W, 3).
         pipeline: a preset of conf/pipeline, or a `Pipeline` (``load_pipeline("sift_gms", overrides=[...])``).
         device: of a pipeline given by name; None: a GPU where there is one.
         longest_side: larger images are reduced to it for matching, and thresholds are in pixels of the reduced images;
@@ -265,7 +125,8 @@ def match(
     describing = functools.partial(describe, pipeline, longest_side=longest_side)
     at_once = functools.partial(mapped, share=True) if pipeline.device.type == "cpu" else map
     described0, described1 = at_once(describing, images)
-    return relate(pipeline, described0, described1, seed, cameras, (lens0, lens1))
+    result = relate(pipeline, described0, described1, seed, cameras, (lens0, lens1))
+    return dataclasses.replace(result, photographs=(image0, image1), lenses=(lens0, lens1))
 
 
 def relate(

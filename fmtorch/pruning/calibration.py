@@ -1,7 +1,5 @@
 """From a pruner's evidence to P(inlier)."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping
 from typing import Any
@@ -12,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from fmtorch.core.types import Correspondences
-from fmtorch.geometry.optimum import gradient_wanted
+from fmtorch.geometry.arithmetic import gradient_wanted
 from fmtorch.jit.batches import for_each_pair
 from fmtorch.jit.kernel import B1x1, F4x1, inner, kernel
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from fmtorch.core.types import Correspondences
 from fmtorch.geometry.robust_losses import huber_weight
-from fmtorch.pruning.frame_consistency import frame_map
+from fmtorch.pruning.consistency import frame_map
 
 BLOCK = 4096  # matches whose basis functions exist at a time
 LARGEST_CHANGE = 100.0  # of a frame's size between images of a common scale: what is beyond is no match
@@ -242,7 +242,6 @@ class LikelihoodField:
 
 # The second regression: a smooth affine motion through the likely matches
 
-
 _FREE = 1e-3  # the common affine motion's share of the ridge
 MIN_MATCHES = 8  # likely matches without which there is no motion
 
@@ -302,7 +301,6 @@ class SmoothMotion:
 
 
 # CODE: coherence-based decision boundaries (Lin et al., TPAMI 2018)
-
 
 MIN_LIKELIHOOD, LARGEST_RESIDUAL = 0.5, 0.06
 
@@ -415,7 +413,6 @@ class CODE:
 
 
 # CODE: two robust regressions over the match domain decide which matches are coherent
-
 
 __all__ = [
     "CODE",

@@ -1,7 +1,5 @@
 """Filters by what is known of each match: its ratio, mutuality, location or prior."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from typing import Annotated

@@ -1,7 +1,5 @@
 """Grid-based motion statistics: GMS (Bian et al., CVPR 2017)."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from typing import Any, Literal, NamedTuple

@@ -1,7 +1,5 @@
 """How exact is each match? Noise from the keypoint's size, the distance ratio and the prior."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from typing import Any
@@ -12,8 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from fmtorch.core.types import Correspondences
-from fmtorch.geometry.arithmetic import sqrt
-from fmtorch.geometry.optimum import gradient_wanted
+from fmtorch.geometry.arithmetic import gradient_wanted, sqrt
 from fmtorch.jit.batches import for_each_pair
 from fmtorch.jit.kernel import Array, F4x1, F4x3, F8x1, F8x3, inner, kernel
 

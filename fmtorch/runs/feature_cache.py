@@ -188,10 +188,11 @@ class CachedFeatures:
     def report(self) -> str:
         """One line: what was computed and found so far, and the size of the cache."""
         sizes = [status.st_size for _, status in self.cache.files()]
-        return (
-            f"features of {self.computed} images computed, of {self.found} taken from the cache; "
-            f"{self.cache.folder}: {len(sizes)} files, {sum(sizes) / 1e6:.1f} MB"
-        )
+        kept = f"{self.cache.folder}: {len(sizes)} files, {sum(sizes) / 1e6:.1f} MB"
+        if not self.computed + self.found:  # nothing was to be done, or workers elsewhere did it
+            return f"features are kept in {kept}"
+        taken = f", of {self.found} taken from the cache with the seconds they took then" if self.found else ""
+        return f"features of {self.computed} images computed{taken}; {kept}"
 
     def _section(self, name: str, part: object) -> str:
         identity = {"configuration": configuration(part), "environment": environment()}

@@ -20,11 +20,10 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from torch.utils.data import Dataset
 
 from fmtorch.core.files import cache_dir
 from fmtorch.data.construction import Keypoints, keypoints, matchable
-from fmtorch.data.pairs import ImagePair, ImageSource
+from fmtorch.data.pairs import HeldPairs, ImagePair, ImageSource, PairDataset
 from fmtorch.data.scenes import AllPairs, Scene, ScenePairs, View
 from fmtorch.jit.together import compile_together
 from fmtorch.jobs.execution import Execution, cores
@@ -282,7 +281,7 @@ _recent = _Recent()
 # `RenderedPairs`: the embedded data set, drawn on first use from known cameras
 
 
-class RenderedPairs(Dataset[ImagePair]):
+class RenderedPairs(PairDataset):
     """Image pairs of textured 3-D scenes with exact ground truth, in four families after the paper's four sets.
 
     split: "test" or "train"; they share no scene and no texture. size: "small" (about 20 pairs a family) or "full".
@@ -359,9 +358,6 @@ class RenderedPairs(Dataset[ImagePair]):
             scenes.append(Scene(name, self._tasks[name].family, drawn, AllPairs(len(drawn))))
         return RenderedScenePairs(self, scenes)
 
-    def __iter__(self) -> Iterator[ImagePair]:
-        return (self[index] for index in range(len(self)))
-
 
 class RenderedScenePairs(ScenePairs):
     """All pairs of the photographs of rendered scenes; drawn: these scenes as a data set, which knows the depth."""
@@ -379,7 +375,7 @@ _FILES = ("motorcycle_left.png", "motorcycle_right.png", "motorcycle_disp.npz")
 _FOCAL, _CENTRE, _SHIFT, _BASELINE, _SIZE = 994.978, (311.193, 254.877), 31.086, 0.193001, (500, 741)
 
 
-class StereoPair(Dataset[ImagePair]):
+class StereoPair(HeldPairs):
     """One rectified pair with dense ground truth: a point (x, y) on the left is (x - disparity, y) on the right.
 
     The three files lie inside scikit-image's wheel, so that nothing is downloaded; FileNotFoundError names the one
@@ -399,23 +395,12 @@ class StereoPair(Dataset[ImagePair]):
         left = Camera(calibration(_FOCAL, _SIZE, (x, y)), np.eye(3), np.zeros(3), _SIZE)
         right = Camera(calibration(_FOCAL, _SIZE, (x + _SHIFT, y)), np.eye(3), np.array([-_BASELINE, 0.0, 0.0]), _SIZE)
         R, t = relative_pose(left, right)
-        self._pair = ImagePair(
+        self._pairs = [ImagePair(
             identity=f"{self.name}/motorcycle/left-right", family=self.name, scene="motorcycle",
             image0=ImageSource("motorcycle/left", self._paths[0]),
             image1=ImageSource("motorcycle/right", self._paths[1]), F=fundamental(left, right), K0=left.K, K1=right.K,
             R=R, t=t,
-        )  # fmt: skip
-
-    def __len__(self) -> int:
-        return 1
-
-    def __getitem__(self, index: int) -> ImagePair:
-        if index not in (0, -1):
-            raise IndexError(f"pair {index} of a data set of one pair")
-        return self._pair
-
-    def __iter__(self) -> Iterator[ImagePair]:
-        yield self._pair
+        )]  # fmt: skip
 
     def matches(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Points (n, 2) on the left and where they are on the right, for every pixel with a measured disparity."""

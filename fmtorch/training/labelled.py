@@ -20,6 +20,7 @@ from torch import Tensor
 from fmtorch.core import types
 from fmtorch.core.records import Index, Record, as_index, expect_fields, gathered, slotted
 from fmtorch.core.types import Correspondences
+from fmtorch.data.cameras import line_distance
 from fmtorch.data.pairs import DepthDataset, ImagePair, ImageSource, PairDataset
 
 INLIER, OUTLIER, IGNORED = 1, 0, -1
@@ -168,12 +169,3 @@ def transfer_error(
     error = np.where(ahead, np.hypot(*np.moveaxis(at - partner, -1, 0)), np.inf)
     kindest = np.where(np.isnan(depth), np.inf, error).min(0)
     return np.where(np.isnan(depth).all(0), np.nan, kindest)
-
-
-def line_distance(F: NDArray[np.float64], x0: Points, x1: Points) -> NDArray[np.float64]:
-    """The larger distance (n,) in pixels of two matched points to their epipolar lines; infinite on an epipole."""
-    h0, h1 = (np.column_stack([x, np.ones(len(x))]) for x in (x0, x1))
-    line1, line0 = h0 @ F.T, h1 @ F
-    shorter = np.minimum(np.hypot(line0[:, 0], line0[:, 1]), np.hypot(line1[:, 0], line1[:, 1]))
-    residual = np.abs((h1 * line1).sum(1))
-    return np.where(shorter > 0, residual / np.where(shorter > 0, shorter, 1.0), np.inf)

@@ -24,7 +24,7 @@ from torch.utils.data import DataLoader, Dataset
 
 from fmtorch.core.terminal import progress_bars
 from fmtorch.data import ImagePair, read_image
-from fmtorch.evaluation.pictures import draw_matches
+from fmtorch.pipeline.pictures import draw_matches
 from fmtorch.pruning.networks.learned import predict
 from fmtorch.training.labelled import LabelledMatches
 from fmtorch.training.objective import Objective

@@ -10,17 +10,16 @@ import hashlib
 import itertools
 import json
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from torch.utils.data import Dataset
 
 from fmtorch.core.files import cache_dir, replacing
-from fmtorch.data import ImagePair, ImageSource, read_image
+from fmtorch.data import ImagePair, ImageSource, PairDataset, read_image
 from fmtorch.data.cameras import relative_pose
 from fmtorch.scenes.raycast import Camera, calibration
 from fmtorch.training.options import PlaneViews as PlaneViews
@@ -76,7 +75,7 @@ def list_photographs(
     return kept
 
 
-class PlanePairs(Dataset[ImagePair]):
+class PlanePairs(PairDataset):
     """Pairs of views of photographs, each photograph a plane; a `DepthDataset`. F is zero: none is determined.
 
     The plane goes on past the photograph's edges as its mirror image. Light, focus, noise and compression of each view
@@ -135,9 +134,6 @@ class PlanePairs(Dataset[ImagePair]):
             identity=f"{self.name}/{scene}/{i}-{j}", family=self.name, scene=scene, image0=images[0], image1=images[1],
             F=np.zeros((3, 3)), K0=camera0.K, K1=camera1.K, R=R, t=t,
         )  # fmt: skip
-
-    def __iter__(self) -> Iterator[ImagePair]:
-        return (self[index] for index in range(len(self)))
 
     def depth(self, image: ImageSource, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Depth (n,), in longest sides of the photograph, at points (n, 2) of a view; NaN outside of it."""

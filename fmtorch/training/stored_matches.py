@@ -6,7 +6,7 @@ import warnings
 import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -285,16 +285,27 @@ def split_scenes(matches: StoredMatches, last: int = 4) -> tuple[StoredMatches, 
     )
 
 
-def last_scenes(scenes: Iterable[tuple[str, str]], last: int) -> set[tuple[str, str]]:
-    """Of scenes (family, name), each given any number of times, the last of each family by name; never its first."""
+HELD_OUT = 4  # scenes of a family
+QUARTER = 4  # of a family of fewer scenes one in so many
+
+
+def last_scenes(scenes: Iterable[tuple[str, str]], last: int | None) -> set[tuple[str, str]]:
+    """Of scenes (family, name), each given any number of times, the last of each family by name; never its first.
+
+    last: how many; None: `HELD_OUT`, or a quarter of a family that has few.
+    """
     names: dict[str, set[str]] = {}
     for family, name in scenes:
         names.setdefault(family, set()).add(name)
     return {
         (family, name)
         for family, of_family in names.items()
-        for name in sorted(of_family)[max(1, len(of_family) - last) :]
+        for name in sorted(of_family)[max(1, len(of_family) - (last or _few(len(of_family)))) :]
     }
+
+
+def _few(scenes: int) -> int:
+    return min(HELD_OUT, max(1, scenes // QUARTER))
 
 
 # Batches of pairs with similar numbers of matches, drawn by seed and epoch, and collated with little padding
@@ -302,15 +313,6 @@ def last_scenes(scenes: Iterable[tuple[str, str]], last: int) -> set[tuple[str, 
 
 MAX_PADDING = 0.2  # share of a batch's slots
 _POOL = 8  # batches that are sorted by length together: more make lengths more similar and batches less random
-
-
-@runtime_checkable
-class Lengths(Protocol):
-    """What a data set must tell of itself: its size, and about how many matches each pair will have in an epoch."""
-
-    def __len__(self) -> int: ...
-
-    def lengths(self, epoch: int) -> Sequence[float]: ...
 
 
 class SimilarLengthBatches(Sampler[list[Draw]]):
@@ -332,7 +334,7 @@ class SimilarLengthBatches(Sampler[list[Draw]]):
     """
 
     def __init__(
-        self, dataset: Lengths, batch: int = 32, *, seed: int = 0, matches: Sequence[int] | None = (50, 4000),
+        self, dataset: StoredMatches, batch: int = 32, *, seed: int = 0, matches: Sequence[int] | None = (50, 4000),
         rank: int = 0, world_size: int = 1,
     ) -> None:  # fmt: skip
         if batch < 1:

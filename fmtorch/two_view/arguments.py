@@ -122,7 +122,7 @@ def _one_pair(points: Any) -> Any:
 def _depth(value: object) -> int:
     """How deeply lists are nested."""
     if not isinstance(value, list | tuple):
-        return 0
+        return int(hasattr(value, "pt"))  # a keypoint of OpenCV
     return 1 + (_depth(value[0]) if value else 0)
 
 

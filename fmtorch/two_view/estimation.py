@@ -21,8 +21,7 @@ from fmtorch.jit.together import compile_together
 from fmtorch.jobs.execution import one_thread
 from fmtorch.presets.files import load
 from fmtorch.presets.objects import construct, instantiate, merged
-from fmtorch.pruning.frame_consistency import FrameConsistency
-from fmtorch.pruning.position_consistency import PositionConsistency
+from fmtorch.pruning.consistency import FrameConsistency, PositionConsistency
 from fmtorch.two_view.known_cameras import KnownCameras
 
 RANSAC = f"fmtorch.estimators.{Ransac.__name__}"  # the `_target_` of presets of this project's own engine

@@ -2,18 +2,42 @@
 
 from __future__ import annotations
 
+import functools
+import sys
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, ParamSpec, TypeVar, cast
 
-from fmtorch.core.types import CONTRADICTED, Estimate
+from fmtorch.core.types import CONTRADICTED, Estimate, PoseEstimate
+from fmtorch.jobs.execution import one_thread
 from fmtorch.two_view.arguments import Arrays, Focal, correspondences
 from fmtorch.two_view.estimation import estimated
 from fmtorch.two_view.pair_type import with_pair_type
 from fmtorch.two_view.planes import homographies
 
+P = ParamSpec("P")
+R = TypeVar("R")
 
+
+def eager(function: Callable[P, R]) -> Callable[P, R]:
+    """The function, which `torch.compile` calls instead of tracing it: gradients pass, the graph ends before it.
+
+    `torch.compiler.disable` would import the compiler, for a second and more, into programs that have no use for it.
+    """
+
+    @functools.wraps(function)
+    def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        dynamo = sys.modules.get("torch._dynamo")
+        run = function if dynamo is None else cast(Callable[P, R], dynamo.disable(function))
+        return run(*args, **kwargs)
+
+    call._torchdynamo_disable = True  # type: ignore[attr-defined]
+    return call
+
+
+@eager
+@one_thread("cpu")
 def find_fundamental(
     x0: Arrays,
     x1: Arrays,
@@ -118,6 +142,7 @@ def find_fundamental(
     return with_pair_type(estimate, c, seed) if pair_type else estimate
 
 
+@eager
 def find_essential(
     x0: Arrays,
     x1: Arrays,
@@ -141,7 +166,7 @@ def find_essential(
     seed: int = 0,
     config_dir: Path | str | None = None,
     **options: Any,
-) -> Estimate:
+) -> PoseEstimate:
     """Robustly estimate the relative pose of two calibrated cameras: ``X1 = R X0 + t`` and ``E = [t]_x R``.
 
     Args:
@@ -158,13 +183,13 @@ def find_essential(
         options: replace values of the preset (``inlier_threshold=1.0``).
 
     Returns:
-        An `Estimate` with R (B, 3, 3), t (B, 3) of unit length with the inliers in front of both cameras, E (B, 3, 3),
-        focals (B, 2) and F. NaN where there is no pose. Gradients of all reach the points, prior, noise, K0 and K1.
-        Six matches are enough where K0 and K1 are exact, otherwise seven.
+        A `PoseEstimate` with R (B, 3, 3), t (B, 3) of unit length with the inliers in front of both cameras,
+        E (B, 3, 3), focals (B, 2) and F. NaN where there is no pose. Gradients of all reach the points, prior, noise,
+        K0 and K1. Six matches are enough where K0 and K1 are exact, otherwise seven.
 
     Raises:
-        ValueError: as `find_fundamental`; for a K0 or K1 of a single pair that is singular, not in pixels, or whose
-            principal point lies outside an image of known size. In a batch that pair is ``ok=False`` with a reason.
+        ValueError: as `find_fundamental`; for a K0 or K1 of a single pair that is singular or not in pixels. In a batch
+            that pair is ``ok=False`` with a reason.
         TypeError: for what is no array of numbers.
 
     Example:
@@ -182,13 +207,16 @@ def find_essential(
     for name, K in (("K0", K0), ("K1", K1)):
         if K is None:
             raise ValueError(f"{name} is None; find_fundamental estimates pairs of which one camera or none is known")
-    return find_fundamental(
+    estimate = find_fundamental(
         x0, x1, estimator=estimator, mask=mask, ratio=ratio, score=score, prior=prior, lafs0=lafs0, lafs1=lafs1,
         noise=noise, size0=size0, size1=size1, K0=K0, K1=K1, focal=focal, covariance=covariance, pair_type=pair_type,
         key=key, seed=seed, config_dir=config_dir, **options,
     )  # fmt: skip
+    return PoseEstimate.unchecked(**vars(estimate))
 
 
+@eager
+@one_thread("cpu")
 def find_homography(
     x0: Arrays,
     x1: Arrays,

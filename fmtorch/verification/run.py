@@ -20,7 +20,7 @@ from fmtorch.io.colmap import DatabaseImage
 from fmtorch.io.match_store import MATRICES, Kind, PairGeometry
 from fmtorch.jobs.execution import Execution, Shard
 from fmtorch.jobs.runner import Factory, Local, Source, TaskRunner, WorkerPool
-from fmtorch.pipeline.two_images import pair_geometries
+from fmtorch.pipeline.pair_geometries import pair_geometries
 from fmtorch.two_view.arguments import correspondences
 from fmtorch.two_view.estimation import estimated_by
 from fmtorch.two_view.pair_type import classify

@@ -9,9 +9,6 @@ from pathlib import Path
 import pytest
 
 import fmtorch.__main__
-from fmtorch.commands import list as list_presets
-from fmtorch.commands import main as commands
-from fmtorch.commands import warm_up
 from fmtorch.commands.config import hydra_arguments
 from fmtorch.commands.main import help_text
 from fmtorch.commands.options import COMMANDS
@@ -19,7 +16,7 @@ from fmtorch.core import terminal
 from fmtorch.core.terminal import exits_with_message
 from fmtorch.presets import available
 from tests.conftest import own_cache
-from tests.helpers import draw
+from tests.helpers import draw, draw_set
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 
@@ -89,16 +86,12 @@ COUNT = "it must be a whole number of at least 1"
     ("words", "message"),
     [
         ("eval limit=-3", f"limit=-3; {COUNT} or null"),
-        ("eval limit=0", f"limit=0; {COUNT} or null"),
-        ("eval limit=three", f"limit=three; {COUNT} or null"),
         ("eval limit=2.5", f"limit=2.5; {COUNT} or null"),
         ("eval batch=0", f"batch=0; {COUNT}"),
-        ("eval batch=true", f"batch=true; {COUNT}"),
         ("eval workers=-2", f"workers=-2; {COUNT} or null"),
         ("eval executor=mpi", "no preset 'mpi' in executor; there are: "),
         ("eval executor=dask processes=true", "processes=true and executor=dask differ; give one of them"),
         ("eval executor.workers=2 workers=3", "workers=3 and executor.workers=2 differ; give one of them"),
-        ("eval executor=dask executor.workers=0", f"executor.workers=0; {COUNT} or null"),
         ("eval shard=0/2", "shard=0/2; it must be i/n with i from 1 to n: shard=2/8"),
         ("eval processes=maybe", "processes=maybe; it must be true or false or null"),
         ("eval device=gpu", "device=gpu; it must be text that names a device: auto, cpu, cuda, cuda:1 or mps"),
@@ -106,12 +99,8 @@ COUNT = "it must be a whole number of at least 1"
         ("eval cache_limit=-1", "cache_limit=-1; it must be a number of at least 0 or null"),
         ("eval pruner.ratio.threshold=high", "pruner.ratio.threshold=high; it must be a number"),
         ("eval estimator.hypotheses=1.5", "estimator.hypotheses=1.5; it must be a whole number"),
-        (
-            "eval estimator=cf_ransac estimator.fine.hypotheses=many",
-            "estimator.fine.hypotheses=many; it must be",
-        ),
+        ("eval estimator=cf_ransac estimator.fine.hypotheses=many", "estimator.fine.hypotheses=many; it must be"),
         ("eval +estimator.treshold=2", "estimator: no option treshold; there are: threshold"),
-        ("eval dataset.seed=x", "dataset.seed=x; it must be a whole number"),
         ("eval dataset.families=indoor", "dataset.families=indoor; it must be a list"),
         ("eval +dataset.sise=full", "dataset: no option sise; there are: size"),
         ("eval estimator._target_=fmtorch.estimators.Magic", "estimator: _target_=fmtorch.estimators.Magic cannot be"),
@@ -130,11 +119,9 @@ COUNT = "it must be a whole number of at least 1"
         ("eval limit=(1", "limit=(1 cannot be read; a value with special characters stands in quotes"),
         ("eval sift_gms", "sift_gms is not of the form NAME=VALUE"),
         ("match longest_side=big", f"longest_side=big; {COUNT}"),
-        ("match longest_side=0", f"longest_side=0; {COUNT}"),
         ("match orient=up", "orient=up; it must be true or false"),
         ("match a.png", "image1 is missing; give two image files: fmtorch match a.jpg b.jpg"),
         ("match a.png b.png c.png", "c.png: only image0, image1 may stand without NAME="),
-        ("match a.png b.png truth=F.txt", "F.txt: No such file or directory"),
         ("report pictures=-1", "pictures=-1; it must be a whole number of at least 0"),
         ("report nowhere", "nowhere holds no run"),
         ("verify", "database is missing; give the database of a COLMAP project: fmtorch verify database.db"),
@@ -142,11 +129,8 @@ COUNT = "it must be a whole number of at least 1"
         ("verify no.db cameras=known", "cameras=known; it must be"),
         ("verify no.db force=2", "force=2; it must be true or false"),
         ("verify no.db more.db", "more.db: only database may stand without NAME="),
-        ("verify no.db estimator.hypotheses=few", "estimator.hypotheses=few; it must be a whole number"),
         ("train batch=0", f"batch=0; {COUNT}"),
-        ("train limit=three", f"limit=three; {COUNT} or null"),
         ("train optimisation.steps=some", "optimisation.steps=some; it must be a whole number"),
-        ("train validation.every=0", f"validation.every=0; {COUNT}"),
         ("train trainer.devices={}", "trainer.devices={}; it must be"),
         ("train augmentation.crop=often", "augmentation.crop=often; it must be a number"),
     ],
@@ -234,13 +218,7 @@ SMALL = ["dataset=fmbench", "dataset.root=Set", "features.max_features=300", "es
 @pytest.fixture
 def data_set(tmp_path: Path) -> Path:
     """A folder with a data set of one pair, ``Set``."""
-    images = tmp_path / "Set" / "scene" / "Images"
-    images.mkdir(parents=True)
-    for i in range(2):
-        draw(images / f"{i:08d}.png", seed=0, shift=9 * i)
-    (tmp_path / "Set" / "pairs_with_gt.txt").write_text("0 1 0 0 0 0 0 -1 0 1 0\n")
-    (tmp_path / "Set" / "pairs_which_dataset.txt").write_text("scene/\n")
-    return tmp_path
+    return draw_set(tmp_path / "Set", images=2).parent
 
 
 def test_a_sweep_runs_all_jobs_and_tells_the_first_mistake(
@@ -281,13 +259,13 @@ def test_a_sweep_runs_in_processes_of_a_launcher(
 @pytest.mark.parametrize("command", ["eval", "match", "pairs", "report", "train", "verify"])
 def test_help_is_ours_and_fits_a_page(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     """A command's own options with a line each come first; Hydra's page is at --hydra-help."""
-    commands.main([command, "--help"])
+    fmtorch.__main__.main([command, "--help"])
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith(f"usage: fmtorch {command}")
     assert len(lines) < 60
     told = {line.split("=")[0].strip().removesuffix(".NAME") for line in lines if "=" in line}
     assert told >= set(COMMANDS[command].names)
-    commands.main([command, "--version"])
+    fmtorch.__main__.main([command, "--version"])
     assert capsys.readouterr().out.strip() == fmtorch.__version__
 
 
@@ -295,28 +273,24 @@ def test_warm_up_compiles_what_is_registered(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     compiled: list[str] = []
-    monkeypatch.setattr(
-        warm_up, "compile_together", lambda kernels: compiled.extend(kernel.__module__ for kernel in kernels)
-    )
-    monkeypatch.setattr(sys, "argv", ["fmtorch warm-up"])
-    warm_up.main()
+    compile_together = "fmtorch.commands.warm_up.compile_together"
+    monkeypatch.setattr(compile_together, lambda kernels: compiled.extend(kernel.__module__ for kernel in kernels))
+    fmtorch.__main__.main(["warm-up"])
     assert f"{len(compiled)} kernels for " in capsys.readouterr().out
     rooms = {name.split(".")[1] for name in compiled}
     assert {"estimators", "geometry", "pruning", "scenes"} <= rooms
     monkeypatch.setenv("FMTORCH_KERNELS", "off")
     with pytest.raises(SystemExit, match="kernels are switched off"):
-        warm_up.main()
+        fmtorch.__main__.main(["warm-up"])
 
 
 def test_list_names_every_preset_with_what_it_is(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(sys, "argv", ["fmtorch list", "estimator", "pruner"])
-    list_presets.main()
+    fmtorch.__main__.main(["list", "estimator", "pruner"])
     lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("  ")]
-    names = [line.split()[0] for line in lines if not line.endswith(f"{list_presets.HEADINGS['paper']}:")]
+    names = [line.split()[0] for line in lines if not line.endswith("as in FM-Bench's paper:")]
     assert names == [*available("estimator"), *available("pruner")]
     assert all(len(line.split()) > 2 for line in lines)
-    monkeypatch.setattr(sys, "argv", ["fmtorch list", "estimators"])
     with pytest.raises(SystemExit, match="error: no group 'estimators'; there are: estimator"):
-        list_presets.main()
+        fmtorch.__main__.main(["list", "estimators"])

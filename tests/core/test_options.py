@@ -1,5 +1,7 @@
 """Options are compared with the signature of what takes them, whatever it is."""
 
+from __future__ import annotations
+
 import dataclasses
 import enum
 from collections.abc import Callable, Mapping, Sequence

@@ -10,7 +10,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from fmtorch import data
-from fmtorch.core.stages import Estimator, FeatureExtractor, Matcher, Pruner
+from fmtorch.core import Estimator, FeatureExtractor, Matcher, Pruner
 from tests.laws import scene
 from tests.processes import run_command
 

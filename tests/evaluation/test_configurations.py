@@ -11,27 +11,27 @@ import torch
 from rich.console import Console
 
 from fmtorch import presets
-from fmtorch.core.types import PAIR_TYPES, WARNINGS, Correspondences
-from fmtorch.data import ImagePair, ImageSource
-from fmtorch.data.pairs import GivenMatches
-from fmtorch.evaluation import tables
-from fmtorch.evaluation.rows import evaluate, focal_errors
-from fmtorch.evaluation.run import WithPairCameras, built_with, cameras_of
-from fmtorch.evaluation.statistics import focal_figures, summarize
-from fmtorch.evaluation.tables import summary_markdown, terminal_tables
-from fmtorch.io.dataset import H5Pairs
-from fmtorch.pipeline.pipeline import Outcome, Pipeline, examined
+from fmtorch.core import PAIR_TYPES, WARNINGS, Correspondences
+from fmtorch.data import GivenMatches, ImagePair, ImageSource
+from fmtorch.evaluation import (
+    WithPairCameras,
+    built_with,
+    cameras_of,
+    evaluate,
+    focal_errors,
+    summarize,
+    summary_markdown,
+    tables,
+    terminal_tables,
+)
+from fmtorch.pipeline import Outcome, Pipeline, examined
 from fmtorch.runs import PairRow, to_table
 from tests.geometry.kinds import K, batch, draw
-from tests.io import writers
-
-
-def unused(*_: object) -> None:
-    raise AssertionError("features and matcher have nothing to do")
+from tests.helpers import unused
 
 
 def pipeline() -> Pipeline:
-    return Pipeline(unused, unused, {}, presets.build("estimator", "fmtorch"))  # type: ignore[arg-type]
+    return Pipeline(unused, unused, {}, presets.build("estimator", "fmtorch"))
 
 
 def given(c: Correspondences) -> Callable[[], GivenMatches]:
@@ -78,23 +78,6 @@ def test_a_pair_that_cannot_be_examined_harms_no_other() -> None:
     assert second.pair_type == "planar"
 
 
-def test_calibrations_count_only_where_the_estimator_was_given_them() -> None:
-    """A camera whose true focal length is far from a usual one: by image sizes its rotation is not seen to be one."""
-    long = np.diag([8.0, 8.0, 1.0]) @ K
-    long[:2, 2] = K[:2, 2]
-    turned = pair("rotation")
-    c, _ = turned.matches()
-    angle = 0.05
-    R = np.array([[math.cos(angle), 0, math.sin(angle)], [0, 1, 0], [-math.sin(angle), 0, math.cos(angle)]])
-    R = R @ np.array([[math.cos(0.4), -math.sin(0.4), 0], [math.sin(0.4), math.cos(0.4), 0], [0, 0, 1]])
-    H = torch.from_numpy(long @ R @ np.linalg.inv(long))
-    x = torch.cat([c.x0.double(), torch.ones(1, c.mask.shape[1], 1, dtype=torch.float64)], -1) @ H.T
-    x1 = (x[..., :2] / x[..., 2:] + torch.randn(x[..., :2].shape, generator=torch.Generator().manual_seed(0))).to(c.x1)
-    turned = dataclasses.replace(turned, K0=long, K1=long, matches=given(c.replace(x1=x1)))
-    assert rows([turned], "known")[0].pair_type == "rotation"
-    assert rows([turned], None)[0].pair_type in ("planar", "rotation")  # by the usual focal lengths alone
-
-
 def estimated(c: Correspondences, focals: list[float], true: tuple[np.ndarray | None, np.ndarray | None]) -> Outcome:
     source = pair("general")
     outcome = pipeline().run([source])[0]
@@ -121,17 +104,6 @@ def test_errors_of_focal_lengths() -> None:
     assert focal_errors(estimated(c, [768.0, 768.0], (K, K))).error == (None, None)  # nobody asked
 
 
-def test_figures_of_focal_lengths() -> None:
-    errors = np.array([[0.02, 0.08], [0.3, np.inf], [np.nan, np.nan], [np.nan, np.nan]])
-    ratios = np.log(np.array([[1.02, 0.92], [1.3, np.nan], [np.nan, np.nan], [np.nan, np.nan]]))
-    figures = focal_figures(errors, ratios, np.array([True, True, True, False]))
-    assert figures["images"] == 6  # two of a failed pair
-    assert figures["error"] is None  # more than half are misses
-    assert (figures["within_5"], figures["within_10"]) == (1 / 6, 2 / 6)
-    assert figures["ratio"] == pytest.approx(1.02)
-    assert focal_figures(np.full((2, 2), np.nan), ratios[:2], np.array([True, False])) is None
-
-
 def test_summaries_and_reports_show_them() -> None:
     pairs = [pair(kind) for kind in ("general", "planar")]
     table = to_table(rows(pairs, "unknown"))
@@ -154,23 +126,3 @@ def test_summaries_and_reports_show_them() -> None:
     assert "Pair types" not in {part.heading for part in tables.parts(summarize(nobody))}
     alone = terminal_tables(summarize(to_table(rows(pairs[:1], None))), "t")
     assert [each.title for each in alone] == ["t", "Relative pose"]  # all general: nothing to say
-
-
-@pytest.mark.parametrize("layout", writers.WRITERS)
-def test_layouts_with_cameras_give_them_to_the_estimator(layout: str, tmp_path: Path) -> None:
-    """Others' matches by `cameras=known`: with their calibrations, the pose is that of an essential matrix."""
-    root = writers.WRITERS[layout](tmp_path / layout)
-    needs = layout in ("hloc", "glue_factory", "vismatch")
-    options = {"truth": writers.truth(tmp_path / "Truth")} if needs else {}
-    pairs = list(H5Pairs(root, layout, **options))
-    for row, each in zip(rows(pairs, "known"), pairs, strict=True):
-        assert row.ok, row.reason
-        assert row.pose_reason is None
-        assert row.rotation_error is not None
-        assert row.rotation_error < 1
-        assert row.pair_type == "general"
-        assert row.focal_error0 is row.focal_error1 is None  # which were given exactly
-        F, true = np.array(row.F), each.F.ravel()
-        assert min(np.abs(F - true).max(), np.abs(F + true).max()) < 0.05
-    unknown = rows(pairs, "unknown")
-    assert all(row.focal_error0 is not None for row in unknown)

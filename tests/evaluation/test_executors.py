@@ -17,11 +17,10 @@ from typing import Any
 
 import pytest
 
-from fmtorch.data.pairs import ImagePair
-from fmtorch.evaluation.run import evaluate_pairs
-from fmtorch.jobs.execution import Execution
-from fmtorch.jobs.runner import WorkersLost
-from fmtorch.pipeline.pipeline import Pipeline, load_pipeline
+from fmtorch.data import ImagePair
+from fmtorch.evaluation import evaluate_pairs
+from fmtorch.jobs import Execution, WorkersLost
+from fmtorch.pipeline import Pipeline, load_pipeline
 from fmtorch.runs import PairRow
 from scripts.benchmark.pairs import synthetic_pair
 
@@ -170,26 +169,6 @@ def test_two_of_four_workers_are_killed(cluster: Cluster, pairs: list[ImagePair]
     killer.join()
     assert len(set(killed)) == 2
     assert rows == expected
-
-
-def test_a_worker_that_joins_late_works_too(
-    cluster: Cluster, pairs: list[ImagePair], expected: dict[int, PairRow]
-) -> None:
-    cluster.add_workers(1)
-    late = threading.Timer(2.0, cluster.add_workers, [1])
-    late.start()
-    rows: list[PairRow] = []
-    execution = Execution("dask", address=cluster.address)
-    counts = evaluate_pairs(
-        build(), pairs, seed=0, batch=1, execution=execution, store=rows.extend, build=build_slow
-    )  # fmt: skip
-    workers: set[str] = set()
-    with cluster.client() as client:
-        for _ in counts:
-            workers |= {worker for worker, calls in client.processing().items() if calls}
-    late.join()
-    assert len(workers) == 2
-    assert timeless(rows) == expected
 
 
 def test_a_scheduler_that_is_lost(cluster: Cluster, pairs: list[ImagePair], expected: dict[int, PairRow]) -> None:

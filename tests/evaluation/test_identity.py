@@ -8,13 +8,10 @@ import torch
 from omegaconf import OmegaConf
 
 from fmtorch import presets
-from fmtorch.core.stages import Pruner
-from fmtorch.core.types import Correspondences, Estimate
-from fmtorch.evaluation import run as identity_module
-from fmtorch.evaluation.run import run_identity
-from fmtorch.pipeline.pipeline import Pipeline, build_pipeline, load_pipeline
-from fmtorch.runs import identity_digest
-from fmtorch.runs.fingerprint import libraries
+from fmtorch.core import Correspondences, Estimate, Pruner
+from fmtorch.evaluation import run_identity
+from fmtorch.pipeline import Pipeline, build_pipeline, load_pipeline
+from fmtorch.runs import identity_digest, libraries
 from tests.helpers import compose
 
 GROUPS = ("features", "matcher", "pruner", "estimator", "dataset")
@@ -124,7 +121,7 @@ def test_code_of_a_users_own_stage_is_part_of_it(group: str, monkeypatch: pytest
     changed = {group: {"mine": own} if group == "pruner" else own}
     first = identity(pipeline=parts, **changed)
     assert list(first["code"]) == [f"{__name__}.Learned"]  # type: ignore[call-overload]
-    monkeypatch.setattr(identity_module, "code_digest", lambda module: f"edited {module}")
+    monkeypatch.setattr("fmtorch.evaluation.run.code_digest", lambda module: f"edited {module}")
     second = identity(pipeline=parts, **changed)
     assert second["code"] == {f"{__name__}.Learned": f"edited {__name__}"}
     assert identity_digest(first) != identity_digest(second)

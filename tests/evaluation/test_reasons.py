@@ -1,6 +1,6 @@
 import pytest
 
-from fmtorch.evaluation.statistics import common_reasons
+from fmtorch.evaluation import common_reasons
 
 
 @pytest.mark.parametrize(

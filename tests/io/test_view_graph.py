@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from fmtorch.evaluation.curves import MAX_THUMBNAILS, spectral_order, view_graph_svg
-from fmtorch.io.export import Edge, ViewGraph, view_graph, write_view_graph
-from fmtorch.io.match_store import MatchStore, StoredPair
+from fmtorch.io import Edge, MatchStore, StoredPair, ViewGraph, view_graph, write_view_graph
 
 SVG = "{http://www.w3.org/2000/svg}"
 

@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 import torch
 
+from fmtorch.core import Correspondences, Estimate, Features
 from fmtorch.core.failures import own_traceback, place_of
-from fmtorch.core.types import Correspondences, Estimate, Features
 from fmtorch.presets import build, instantiate
 from tests.helpers import draw, pair, small_pipeline
 from tests.processes import run_command

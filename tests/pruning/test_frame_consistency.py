@@ -7,7 +7,7 @@ import torch
 from fmtorch import presets
 from fmtorch.core import Correspondences
 from fmtorch.pruning import frame_agreement
-from fmtorch.pruning.neighbors import CURVES, MIN_VOTE, NOISE, TOLERANCE, WINDOW, WORST_RATIO
+from fmtorch.pruning.consistency import CURVES, MIN_VOTE, NOISE, TOLERANCE, WINDOW, WORST_RATIO
 from tests.laws import scene
 from tests.pruning.gradients import expect_gradients
 from tests.reference import frame_consistency as reference

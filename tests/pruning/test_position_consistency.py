@@ -8,8 +8,7 @@ import torch
 
 from fmtorch.core import Correspondences
 from fmtorch.pruning import position_agreement
-from fmtorch.pruning.neighbors import CURVES, MIN_VOTE, NOISE, TOLERANCE, WINDOW, WORST_RATIO
-from fmtorch.pruning.position_consistency import SCALES, TURNS
+from fmtorch.pruning.consistency import CURVES, MIN_VOTE, NOISE, SCALES, TOLERANCE, TURNS, WINDOW, WORST_RATIO
 from tests.laws import scene
 from tests.pruning.gradients import expect_gradients
 from tests.reference import position_consistency as reference

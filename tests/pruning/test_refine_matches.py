@@ -11,7 +11,7 @@ from fmtorch import presets
 from fmtorch.core import Correspondences, GreyPyramid, ImagePruner, grey_pyramid
 from fmtorch.pruning import refine_matches as compiled
 from fmtorch.pruning.neighbors import neighbour_maps
-from fmtorch.pruning.windows import Pyramid
+from fmtorch.pruning.refine_matches import Pyramid
 from tests.reference import refine_matches as reference
 
 MAP = np.array([[1.1, -0.2], [0.15, 0.95]])

@@ -9,8 +9,7 @@ from torch import Tensor
 
 from fmtorch.core import Correspondences
 from fmtorch.pruning import frame_agreement, gms, lpm, lpm_cost, one_to_one, position_agreement
-from fmtorch.pruning.neighbors import CURVES, MIN_VOTE, NOISE, TOLERANCE, WINDOW, WORST_RATIO
-from fmtorch.pruning.position_consistency import SCALES, TURNS
+from fmtorch.pruning.consistency import CURVES, MIN_VOTE, NOISE, SCALES, TOLERANCE, TURNS, WINDOW, WORST_RATIO
 from tests.laws import degenerate, scene, scenes, small, with_padding
 from tests.reference import frame_consistency, position_consistency
 from tests.reference.gms import gms as gms_reference

@@ -57,7 +57,7 @@ def bomb(side: int) -> bytes:
 GREY = SOFT[..., 0]
 SOUND: Mapping[str, Callable[[], bytes]] = {
     "cmyk.jpg": lambda: saved(Image.fromarray(SOFT).convert("CMYK"), "JPEG"),
-    "ycck.jpg": lambda: saved(Image.fromarray(SOFT).convert("CMYK"), "JPEG", ratio=100),
+    "ycck.jpg": lambda: saved(Image.fromarray(SOFT).convert("CMYK"), "JPEG", quality=100),
     "progressive.jpg": lambda: saved(SOFT, "JPEG", progressive=True),
     "grey.jpg": lambda: saved(GREY, "JPEG"),
     "16 bit.png": lambda: bytes(cv2.imencode(".png", SOFT.astype(np.uint16) * 257)[1]),

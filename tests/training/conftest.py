@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from fmtorch.core.types import Correspondences, pair_key
-from fmtorch.scenes import Plan, RenderedPairs
-from fmtorch.scenes.raycast import calibration
+from fmtorch.core import Correspondences, pair_key
+from fmtorch.scenes import Plan, RenderedPairs, calibration
 from fmtorch.training import LabelledMatches, MatchedPairs
 from tests.conftest import own_cache
 

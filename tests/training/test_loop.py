@@ -12,7 +12,7 @@ from torch.utils.data import DataLoader
 pytest.importorskip("lightning", reason="training needs the extra `train`")
 
 from fmtorch import presets
-from fmtorch.pruning.networks import LC
+from fmtorch.pruning import LC
 from fmtorch.training import LabelledMatches, Objective, Use, Validation, collate, loop
 from fmtorch.training.loop import Optimisation, PrunerTraining, latest_checkpoint
 from tests.processes import run_command

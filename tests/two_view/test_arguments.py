@@ -10,12 +10,12 @@ import fmtorch
 from fmtorch import metrics
 from fmtorch.core import Correspondences, Estimate, collate
 from fmtorch.data import ImageSource
-from fmtorch.evaluation.rows import evaluate
-from fmtorch.pipeline.pipeline import load_pipeline
-from tests.commands.test_match import run_python
+from fmtorch.evaluation import evaluate
+from fmtorch.pipeline import load_pipeline
 from tests.helpers import draw, pair
 from tests.helpers import small_pipeline as pipeline
 from tests.laws import quick, scene, shown
+from tests.processes import run_command
 from tests.reference import known_cameras
 from tests.variants import OTHER_LIBRARIES, built, keywords, variants
 
@@ -159,7 +159,7 @@ TypeError: pipeline is a NoneType; it must be the name of a preset or a Pipeline
 
 
 def test_wrong_types_are_named(tmp_path: Path) -> None:
-    done = run_python("-c", WRONG_TYPES, cwd=tmp_path)
+    done = run_command("-c", WRONG_TYPES, cwd=tmp_path)
     assert done.stdout == TOLD, done.stderr
 
 

@@ -9,8 +9,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 import fmtorch
-from fmtorch.core import PAIR_TYPES, Estimate
-from fmtorch.core.types import WARNINGS
+from fmtorch.core import Estimate
 from tests.geometry.kinds import batch, draw
 from tests.reference import known_cameras as reference
 
@@ -111,17 +110,6 @@ def test_laws(given: dict[str, Any]) -> None:
     assert bool(together.covariance[2].isnan().all())
     assert not together.covariance[[0, 1, 3]].isnan().any()
     assert together.pair_type[2] == "unrelated"
-
-
-@pytest.mark.parametrize("kind", PAIR_TYPES)
-def test_configurations(kind: str) -> None:
-    drawn = batch([draw(kind, 1, 150)])  # type: ignore[arg-type]
-    given = {name: drawn[name] for name in ("mask", "size0", "size1", "K0", "K1")}
-    e = fmtorch.find_essential(drawn["x0"], drawn["x1"], **given, pair_type=True)
-    assert e.pair_type == (kind,)
-    assert e.warning == (WARNINGS[kind],)
-    assert bool(e.homography.any()) == (kind in ("planar", "rotation", "identical"))
-    assert bool(e.other_R.isfinite().all()) == (kind == "planar")
 
 
 @pytest.mark.parametrize("count", [60, 300])

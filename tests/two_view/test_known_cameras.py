@@ -16,7 +16,7 @@ from fmtorch.estimators import final_fits
 from fmtorch.geometry import cameras as square_pixels
 from fmtorch.geometry import fundamental_from_calibration
 from fmtorch.metrics import pose_error
-from fmtorch.pipeline.pipeline import Pipeline
+from fmtorch.pipeline import Pipeline
 from fmtorch.two_view.known_cameras import KnownCameras
 from tests.conftest import shared_path
 from tests.laws import calibrated, degenerate, quick, scene, scenes, small, with_knowledge

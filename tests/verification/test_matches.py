@@ -1,7 +1,7 @@
 """Matches alone verified: what the public function finds, of one pair and of many, in npz and HDF5 files."""
 
 import os
-import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,15 +10,12 @@ import numpy as np
 import pytest
 
 import fmtorch
-from fmtorch.core.types import pair_key
-from tests.processes import run_command, starter
-from tests.verification.databases import SIZE, matches, scene
+from fmtorch.core import pair_key
+from tests.verification.databases import SIZE, killed_and_continued, matches, scene
 
 K = np.array([[600.0, 0, 319.5], [0, 600, 239.5], [0, 0, 1]])
-MATRICES = ("F", "E", "H", "R", "t")
 SIZES = {"size0": np.array(SIZE), "size1": np.array(SIZE)}
 CALIBRATIONS = {"K0": K, "K1": K}
-SLOWLY = "import fmtorch.verification.run as v\nv.BATCH = 2\n"
 
 
 def points(count: int = 2, kind: str = "general") -> list[tuple[np.ndarray, np.ndarray]]:
@@ -63,8 +60,13 @@ def load(path: Path) -> dict[str, Any]:
     return entries
 
 
-@pytest.mark.parametrize("known", [{}, SIZES, CALIBRATIONS, {**SIZES, **CALIBRATIONS}, {**SIZES, "K0": K}])
-@pytest.mark.parametrize("endings", [(".npz", ".npz"), (".h5", ".h5"), (".npz", ".hdf5")])
+@pytest.mark.parametrize(
+    ("known", "endings"),
+    [
+        ({}, (".npz", ".npz")), (SIZES, (".h5", ".h5")), (CALIBRATIONS, (".npz", ".hdf5")),
+        ({**SIZES, **CALIBRATIONS}, (".npz", ".npz")), ({**SIZES, "K0": K}, (".h5", ".h5")),
+    ],
+)  # fmt: skip
 def test_one_pair_is_that_of_find_fundamental(known: dict[str, Any], endings: tuple[str, str], tmp_path: Path) -> None:
     """By what is known: without sizes F and H alone, with sizes a pose too, with K a calibrated one."""
     (x0, x1), output = points()[0], tmp_path / f"verified{endings[1]}"
@@ -198,7 +200,7 @@ def test_a_complete_output_is_left_as_it_is(ending: str, tmp_path: Path) -> None
         (["a.db", "matches=matches.npz", "output=v.npz"], "hloc's files need"),
     ],
 )
-def test_what_is_no_file_of_matches(words: list[str], said: str, tmp_path: Path) -> None:
+def test_what_is_no_file_of_matches(words: list[str], said: str, command: Callable[..., str], tmp_path: Path) -> None:
     x0, x1 = points()[0]
     save(tmp_path / "matches.npz", {"x0": x0, "x1": x1})
     save(tmp_path / "other.npz", {"x0": x0})
@@ -206,10 +208,10 @@ def test_what_is_no_file_of_matches(words: list[str], said: str, tmp_path: Path)
         np.save(file, x0)
     for name in ("text.npz", "text.h5", "matches.txt"):
         (tmp_path / name).write_text("matches")
-    done = run_command("verify", *words, cwd=tmp_path)
-    assert (done.returncode, done.stderr.count("\n")) == (1, 1), done.stderr
-    assert done.stderr.startswith("error: ")
-    assert said in done.stderr
+    end = command("verify", *words, cwd=tmp_path)
+    assert end.startswith("ended: error: ")
+    assert said in end
+    assert "\n" not in end
     assert not list(tmp_path.glob("v.*"))
 
 
@@ -218,13 +220,6 @@ def test_a_killed_verification_of_matches_continues(ending: str, tmp_path: Path)
     arrays = {f"{i}/{key}": x for i, pair in enumerate(points(7)) for key, x in zip(("x0", "x1"), pair, strict=True)}
     save(tmp_path / f"matches{ending}", arrays)
     words = [f"matches=matches{ending}", f"output=verified{ending}"]
-    command = starter().start(tmp_path, "verify", *words, before=SLOWLY)
-    parts = tmp_path / f"verified{ending}.parts"
-    assert command.kill_when(lambda: len(list(parts.glob("*.npz"))) > 2), command.said()
-    assert not (tmp_path / f"verified{ending}").exists()
-    command = starter().run(tmp_path, "verify", *words, before=SLOWLY)
-    assert command.wait() == 0, command.said()
-    assert re.search(r"had a geometry\W+\d+", command.said())
+    killed_and_continued(tmp_path, tmp_path / f"verified{ending}", *words)
     fmtorch.verify(matches=tmp_path / f"matches{ending}", output=tmp_path / f"truth{ending}")
     assert load(tmp_path / f"verified{ending}") == load(tmp_path / f"truth{ending}")
-    assert not [name for name in os.listdir(tmp_path) if name.endswith((".parts", ".tmp"))]

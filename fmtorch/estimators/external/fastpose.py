@@ -1,7 +1,5 @@
 """fastpose's LO-RANSAC, compiled by numba: fundamental matrices, homographies, poses, focal lengths (extra `peers`)."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Any function of one pair's matches as an estimator of batches, and what the functions of this folder share."""
 
-from __future__ import annotations
-
 import dataclasses
 import importlib
 import math

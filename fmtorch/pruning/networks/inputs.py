@@ -1,7 +1,5 @@
 """Correspondences as the input of a network: normalised coordinates and side information, one column a match."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 
@@ -10,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from fmtorch.core.types import Correspondences
-from fmtorch.pruning.frame_consistency import frame_agreement, usable_frame_maps
+from fmtorch.pruning.consistency import frame_agreement, usable_frame_maps
 
 COORDINATES = ("size", "K")
 MIN_AREA_RATIO = 1e-12  # of two frames; keeps the gradient of the logarithm finite

@@ -7,7 +7,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Image = NDArray[np.uint8]
+from fmtorch.core.checks import as_tensor
+from fmtorch.pipeline.photographs import GivenImage, Image, given_image
+from fmtorch.two_view.arguments import Arrays
+
 Points = NDArray[np.floating]
 # RGB; told apart by all kinds of colour vision, and in grey (Okabe & Ito, "Color Universal Design", 2008), lightened.
 GOOD, BAD = (20, 205, 140), (225, 75, 20)
@@ -142,30 +145,38 @@ def fixed(points: Points) -> list[tuple[int, int]]:
 
 # RGB; told apart by all kinds of colour vision (Okabe & Ito), lightened.
 COLOURS = (
-    (0, 158, 235),
-    (240, 228, 66),
-    (230, 100, 10),
-    (20, 190, 130),
-    (225, 130, 185),
-    (110, 205, 250),
-    (245, 170, 0),
-)
+    (0, 158, 235), (240, 228, 66), (230, 100, 10), (20, 190, 130), (225, 130, 185), (110, 205, 250), (245, 170, 0),
+)  # fmt: skip
 _CORNERS = 200  # among which to choose
 _RIM = 0.06  # share of an image at either side without corners
 
 
 def draw_matches(
-    image0: Image, image1: Image, x0: Points, x1: Points, good: NDArray[np.bool_],
+    image0: GivenImage, image1: GivenImage, x0: Arrays, x1: Arrays, inliers: Arrays | None = None,
     *, height: int | None = None, most: int = 90, most_bad: int = 50, names: tuple[str, str] | None = None,
 ) -> Image:  # fmt: skip
-    """Two images side by side with their matches as lines, green where good, thin and red elsewhere; RGB (H, W, 3).
+    """Two images side by side with their matches as lines, inliers green, others thin and red.
 
-    Wide images stand one above the other. x0, x1: (N, 2) pixels. height: side by side in this height; None: as fits
-    `WIDTH` x `HEIGHT`. most, most_bad: lines of each kind at most; where there are more matches, every part of image 0
-    shows its share of them. names: what good and other matches are called in a line below the images, which also says
-    how many there are and how many are drawn; None: no such line.
+    Args:
+        image0, image1: files, images of Pillow, or uint8 arrays. Wide ones stand one above the other.
+        x0, x1: matched points (N, 2), pixels.
+        inliers: which of them are, (N,); all when not given.
+        height: of the picture, px; None: as fits `WIDTH` x `HEIGHT`.
+        most, most_bad: lines of each kind at most; where there are more, every part of image 0 shows its fraction.
+        names: what inliers and others are called in a line below, which also counts them; None: no such line.
+
+    Returns:
+        The picture, RGB (H, W, 3) of uint8.
+
+    Raises:
+        ValueError, TypeError: for what is no image, and points or inliers of another shape.
     """
-    canvas, place0, place1 = placed(image0, image1, height)
+    x0, x1 = _points(x0, "x0"), _points(x1, "x1")
+    good = np.ones(len(x0), bool) if inliers is None else _array(inliers, "inliers").astype(bool)
+    if not len(x0) == len(x1) == good.size:
+        raise ValueError(f"x0, x1 and inliers have {len(x0)}, {len(x1)} and {good.size} entries; they must be equal")
+    good = good.reshape(-1)
+    canvas, place0, place1 = placed(given_image(image0, "image0"), given_image(image1, "image1"), height)
     ends0, ends1 = place0(x0), place1(x1)
     unit = fine_line(canvas)
     styles = ((BAD, ~good, most_bad, 0.6 * unit, 0.6), (GOOD, good, most, 1.1 * unit, 0.85))
@@ -185,20 +196,58 @@ def draw_matches(
 
 
 def draw_epipolar_lines(
-    image0: Image, image1: Image, x0: Points, x1: Points, F: Points, *, truth: Points | None = None, most: int = 14
-) -> Image:
-    """Two images with some of their matches as points and the matches' epipolar lines, ``x1^T F x0 = 0``; RGB.
+    image0: GivenImage, image1: GivenImage, x0: Arrays, x1: Arrays, F: Arrays,
+    *, truth: Arrays | None = None, most: int = 14,
+) -> Image:  # fmt: skip
+    """Two images with some of their matches as points and the matches' epipolar lines, ``x1^T F x0 = 0``.
 
-    A match has one colour: its point and the line of its partner in each image. truth: the true F, whose lines are
-    dashed and white. x0, x1: (N, 2) pixels, of which `most` are drawn at most, spread over both images.
+    A match has one colour: its point and the line of its partner in each image.
+
+    Args:
+        image0, image1: files, images of Pillow, or uint8 arrays.
+        x0, x1: matched points (N, 2), pixels; give inliers.
+        F: (3, 3).
+        truth: the true F, whose lines are dashed and white.
+        most: matches at most, spread over both images.
+
+    Returns:
+        The picture, RGB (H, W, 3) of uint8.
+
+    Raises:
+        ValueError, TypeError: for what is no image, no points (N, 2) and no matrix (3, 3).
     """
-    canvas, place0, place1 = placed(image0, image1, None)
+    x0, x1, F = _points(x0, "x0"), _points(x1, "x1"), _matrix(F, "F")
+    if len(x0) != len(x1):
+        raise ValueError(f"x0 has {len(x0)} points and x1 {len(x1)}; they must be equal")
+    truth = None if truth is None else _matrix(truth, "truth")
+    canvas, place0, place1 = placed(given_image(image0, "image0"), given_image(image1, "image1"), None)
     finite = np.flatnonzero(np.isfinite(x0).all(1) & np.isfinite(x1).all(1))
     index = finite[spread(np.hstack([place0(x0), place1(x1)])[finite], most)]
     for place, own, other, transpose in ((place0, x0, x1, True), (place1, x1, x0, False)):
         matrices = [(matrix.T if transpose else matrix) for matrix in (F, truth) if matrix is not None]
         _lines_and_points(canvas, place, _lines(place, matrices, other[index]), own[index], 0)
     return canvas
+
+
+def _array(values: Arrays, name: str) -> NDArray[np.float64]:
+    return np.asarray(as_tensor(values, name).detach().cpu().double().numpy())
+
+
+def _points(x: Arrays, name: str) -> NDArray[np.float64]:
+    """Points (N, 2) of an array, a tensor, or a batch of one. Raises ValueError for another shape."""
+    points = _array(x, name)
+    points = points[0] if points.ndim == 3 and len(points) == 1 else points
+    if points.ndim != 2 or points.shape[1] != 2:
+        raise ValueError(f"{name} has shape {points.shape}; it must be (N, 2)")
+    return points
+
+
+def _matrix(F: Arrays, name: str) -> NDArray[np.float64]:
+    """The matrix (3, 3) of an array, a tensor, or a batch of one. Raises ValueError for another shape."""
+    matrix = _array(F, name)
+    if matrix.size != 9:
+        raise ValueError(f"{name} has shape {matrix.shape}; it must be (3, 3), of one pair")
+    return matrix.reshape(3, 3)
 
 
 def draw_epipolar_lines_of_corners(

@@ -1,11 +1,11 @@
-"""MAGSAC++, GC-RANSAC, DEGENSAC and SupeRANSAC as their authors published them (extra `peers`)."""
-
-from __future__ import annotations
+"""OpenCV's, kornia's and the authors' own robust estimators (the latter in the extra `peers`)."""
 
 from collections.abc import Mapping
 from typing import TypeVar
 
+import cv2
 import numpy as np
+import torch
 
 from fmtorch.estimators.external.pairwise import (
     Confidence,
@@ -18,6 +18,82 @@ from fmtorch.estimators.external.pairwise import (
     solution,
     within,
 )
+
+
+def opencv(
+    *, method: str, threshold: float = 1.0, confidence: Confidence = 0.999, iterations: Iterations = 2000
+) -> PairwiseEstimator:
+    """`cv2.findFundamentalMat` with one of its robust methods.
+
+    USAC_PROSAC gets the matches best first, as it expects.
+
+    Args:
+        method: name of OpenCV's constant in any case, ransac, lmeds or usac_*; FM_RANSAC and FM_LMEDS as well.
+        threshold: pixels, point to epipolar line (ransac) or Sampson distance (usac_*).
+        confidence: of having drawn a sample without an outlier, at which the search ends.
+        iterations: samples at most.
+
+    Returns:
+        The estimator.
+
+    Raises:
+        ValueError: for a name that is no such constant.
+    """
+    name = method.upper()
+    name = f"FM_{name}" if name in ("RANSAC", "LMEDS") else name
+    code = getattr(cv2, name, None)
+    if code is None or not name.startswith(("FM_", "USAC_")):
+        raise ValueError(f"method is {method!r}; it must be ransac, lmeds, or one of cv2's constants USAC_* or FM_*")
+
+    def solve(pair: Pair) -> Solution:
+        F, mask = cv2.findFundamentalMat(pair.x0, pair.x1, int(code), threshold, confidence, iterations)
+        if F is None or mask is None:  # a minimal set may also give several solutions, stacked
+            return None, np.zeros(len(pair.x0), dtype=np.bool_)
+        return F.astype(np.float64), mask.ravel().astype(np.bool_)
+
+    return PairwiseEstimator(f"OpenCV {name}", solve, best_first=name == "USAC_PROSAC")
+
+
+# kornia's RANSAC
+
+
+def kornia_ransac(
+    *,
+    threshold: float = 1.0,
+    confidence: Confidence = 0.9999,
+    batch_size: int = 2048,
+    rounds: int = 10,
+    prosac: bool = True,
+) -> PairwiseEstimator:
+    """`kornia.geometry.RANSAC` with MSAC scores.
+
+    Args:
+        threshold: pixels.
+        confidence: of having drawn a sample without an outlier, at which the search ends.
+        batch_size: samples that are drawn together.
+        rounds: batches at most.
+        prosac: draw samples from the best matches first.
+
+    Returns:
+        The estimator.
+    """
+
+    import kornia  # nobody else's estimator waits for it
+
+    def solve(pair: Pair) -> Solution:
+        estimator = kornia.geometry.RANSAC(
+            "fundamental", inl_th=threshold, batch_size=batch_size, max_iter=rounds, confidence=confidence,
+            prosac_sampling=prosac, seed=pair.seed,
+        )  # fmt: skip
+        x0, x1, weights = (torch.from_numpy(a).to(torch.float32) for a in (pair.x0, pair.x1, pair.likelihood))
+        F, mask = estimator(x0, x1, weights)
+        return F.to(torch.float64).numpy(), mask.numpy().astype(np.bool_)
+
+    return PairwiseEstimator("kornia", solve, best_first=prosac)
+
+
+# MAGSAC++, GC-RANSAC, DEGENSAC and SupeRANSAC as their authors published them (extra `peers`)
+
 
 Part = TypeVar("Part", int, str)
 

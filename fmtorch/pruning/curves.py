@@ -1,22 +1,23 @@
-"""`curves` for the points of one pair, compiled."""
+"""Orders of matches along space-filling (Morton) curves, in which neighbours in an image mostly stand together."""
 
-from __future__ import annotations
-
+import math
 from typing import Any
 
 import numpy as np
 
-from fmtorch.jit.kernel import Array, inner
+from fmtorch.jit.kernel import Array, B1x1, F4x2, I8x2, inner, kernel
 
 _BITS = 15  # of each coordinate: a code of 30 bits
 _CELLS = (1 << _BITS) - 1
 _DIGIT = 10  # bits sorted by at a time
 _PLACES = 1 << _DIGIT
+CURVES = ((0.0, 0.0), (0.5, math.pi / 4))  # shift of the grid (in thirds of the extent) and rotation of each curve
+CURVES32 = np.array([(shift, math.cos(angle), math.sin(angle)) for shift, angle in CURVES], np.float32)
 
 
 @inner
 def curve_order(x: Array, y: Array, shift: float, cosine: float, sine: float, order: Array) -> None:
-    """`curves.curve_order` of the turned points x, y (n,) -> order (n,) i8: the same numbers.
+    """The order of points x, y (n,) along a curve -> order (n,) i8.
 
     shift, cosine, sine: of the grid and of the rotation, in the type of the points.
     """
@@ -68,3 +69,43 @@ def _sort_by_digit(key: Array, out: Array, low: Any) -> None:
         digit = (key[i] >> low) & np.uint64(_PLACES - 1)
         out[place[digit]] = key[i]
         place[digit] += 1
+
+
+@inner
+def curve_orders(rows: Array, orders: Array) -> None:
+    """The order of matches (x0, y0, x1, y1, ...) along each curve, first of image 0, then of image 1 -> (c, m)."""
+    m = orders.shape[1]
+    for o in range(len(orders)):
+        image, curve = o // len(CURVES32), o % len(CURVES32)
+        curve_order(
+            rows[2 * image, :m], rows[2 * image + 1, :m], CURVES32[curve, 0], CURVES32[curve, 1], CURVES32[curve, 2],
+            orders[o],
+        )  # fmt: skip
+
+
+@inner
+def put_in_order(rows: Array, order: Array, along: Array) -> None:
+    """Columns of rows (d, n) in the order (m,) -> along (d, m)."""
+    for k in range(len(rows)):
+        for i in range(len(order)):
+            along[k, i] = rows[k, order[i]]
+
+
+@kernel
+def slots_along_curves(x0: F4x2, x1: F4x2, mask: B1x1, out: I8x2) -> None:
+    """The slots of the matches in the mask along each curve, those of the others last -> out (c, n)."""
+    n, m, last = len(mask), 0, len(mask)
+    rows, slot = np.empty((4, n), x0.dtype), np.empty(n, np.int64)
+    for i in range(n):
+        if mask[i]:
+            rows[0, m], rows[1, m], rows[2, m], rows[3, m], slot[m] = x0[i, 0], x0[i, 1], x1[i, 0], x1[i, 1], i
+            m += 1
+        else:
+            last -= 1
+            for o in range(len(out)):
+                out[o, last] = i
+    orders = np.empty((len(out), m), np.int64)
+    curve_orders(rows, orders)
+    for o in range(len(out)):
+        for k in range(m):
+            out[o, k] = slot[orders[o, k]]
