@@ -99,7 +99,7 @@ def counted_plane_chances(H: F8x2, matches: Matches, out: F8x1) -> int:
 
 
 @inner
-def _transfer(H: Array, u: float, v: float, x: float, y: float) -> float:
+def _transfer(H: Array, u: float, v: float, x: float, y: float) -> Any:
     """The squared distance of (x, y) from where H maps (u, v)."""
     depth = H[6] * u + H[7] * v + H[8]
     if depth == 0:
@@ -109,7 +109,7 @@ def _transfer(H: Array, u: float, v: float, x: float, y: float) -> float:
 
 
 @inner
-def _area(x: Array, y: Array, size: Array) -> float:
+def _area(x: Array, y: Array, size: Array) -> Any:
     """Of an image, or of the box of its points; not zero."""
     area = size[0] * size[1] if len(size) else (x.max() - x.min()) * (y.max() - y.min())
     return max(area, TINY)

@@ -21,7 +21,7 @@ from fmtorch.core.types import RELATED, Correspondences
 from fmtorch.data.cameras import Lens, undistorted
 from fmtorch.io.match_store import PairGeometry
 from fmtorch.pipeline.photographs import GivenImage, Image, given_image
-from fmtorch.pipeline.pictures import draw_epipolar_lines, draw_matches
+from fmtorch.pipeline.pictures import draw_epipolar_lines, draw_matches, headed
 from fmtorch.two_view.arguments import Arrays
 
 FLAT = ("planar", "rotation", "identical")  # pair types of which a homography explains all matches
@@ -98,7 +98,7 @@ class MatchResult:
         if what not in get_args(Picture):
             raise ValueError(f"what is {what!r}; it must be one of {', '.join(get_args(Picture))}")
         if what == "epipolar":
-            return self._epipolar(truth)
+            return self._epipolar(truth, None)
         kept = self.kept.cpu().numpy()
         good, names = kept.copy(), ("kept", "dropped by pruning")
         if what == "pruning":
@@ -106,7 +106,8 @@ class MatchResult:
         elif self.ok:
             good[good] = self.inliers.cpu().numpy()
             names = ("inliers of F", "others, dropped by pruning or estimation")
-        return draw_matches(*self._images(), self.putative.x0[0], self.putative.x1[0], good, names=names)
+        picture = draw_matches(*self._images(), self.putative.x0[0], self.putative.x1[0], good, names=names)
+        return headed(picture, *self._verdict)
 
     def save(
         self, folder: Path | str, *, truth: Arrays | None = None, report: Mapping[str, Any] | None = None
@@ -136,7 +137,9 @@ class MatchResult:
                 path.unlink(missing_ok=True)
                 continue
             with replacing(path) as temporary:
-                temporary.write_bytes(_encoded(self.draw(name, truth=truth), "png"))
+                nsgd = (report or {}).get("nsgd")
+                picture = self._epipolar(truth, nsgd) if name == "epipolar" else self.draw(name)
+                temporary.write_bytes(_encoded(picture, "png"))
         return ["result.json", *(f"{name}.png" for name in names)]
 
     def report(self) -> dict[str, Any]:
@@ -187,7 +190,18 @@ class MatchResult:
         image0, image1 = (given_image(image, f"image{i}") for i, image in enumerate(self.photographs))
         return image0, image1
 
-    def _epipolar(self, truth: Arrays | None) -> Image:
+    @property
+    def _verdict(self) -> tuple[str, bool]:
+        """What pictures say of the pair, and whether it is not to be relied on."""
+        if not self.ok:
+            return f"no F: {self.reason}", True
+        if self.pair_type in FLAT:
+            return f"{self.pair_type}: these matches do not determine F", True
+        if not self.related:
+            return f"not related: so many inliers agree by chance (significance {self.significance:.1f})", True
+        return f"related, {self.pair_type or 'general'}", False
+
+    def _epipolar(self, truth: Arrays | None, nsgd: float | None) -> Image:
         if not self.ok and truth is None:
             raise ValueError(f"there are no epipolar lines without F: {self.reason}")
         seen = self.correspondences if self.undistorted is None else self.undistorted
@@ -196,7 +210,11 @@ class MatchResult:
         image0, image1 = (image if lens is None else undistorted(image, lens) for image, lens in bent)
         F = self.F if self.ok or truth is None else truth
         dashed = truth if self.ok else None
-        return draw_epipolar_lines(image0, image1, seen.x0[0][good], seen.x1[0][good], F, truth=dashed)
+        picture = draw_epipolar_lines(image0, image1, seen.x0[0][good], seen.x1[0][good], F, truth=dashed)
+        said, doubtful = self._verdict
+        said += "; a point and the line of its partner have one colour"
+        said += "" if dashed is None else "; dashed white: true lines"
+        return headed(picture, said + ("" if nsgd is None else f"; NSGD {nsgd:.4f}"), doubtful)
 
 
 def _plain(value: Tensor | None) -> Any:

@@ -108,6 +108,17 @@ def captioned(canvas: Image, names: tuple[str, str], counts: tuple[int, int], dr
     return np.concatenate([canvas, line])
 
 
+def headed(picture: Image, text: str, doubtful: bool) -> Image:
+    """The picture with a line above it, red where it is not to be relied on."""
+    size = max(0.45, 0.62 * picture.shape[1] / WIDTH)
+    while size > 0.2 and cv2.getTextSize(text, _FONT, size, 1)[0][0] > picture.shape[1] - 22 * size:
+        size *= 0.9
+    line = np.full((round(44 * size), picture.shape[1], 3), 255, np.uint8)
+    colour = (190, 20, 20) if doubtful else (0, 0, 0)
+    cv2.putText(line, text, (round(11 * size), round(30 * size)), _FONT, size, colour, line_width(size), cv2.LINE_AA)
+    return np.concatenate([line, picture])
+
+
 def fine_line(canvas: Image) -> float:
     """The width of a fine line: 1 px for a picture of WIDTH x 640."""
     return float(np.sqrt(canvas.shape[0] * canvas.shape[1] / (WIDTH * 640)))

@@ -6,7 +6,7 @@ import warnings
 import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import pyarrow as pa
@@ -315,6 +315,15 @@ MAX_PADDING = 0.2  # share of a batch's slots
 _POOL = 8  # batches that are sorted by length together: more make lengths more similar and batches less random
 
 
+@runtime_checkable
+class Lengths(Protocol):
+    """What a data set must tell of itself: its size, and about how many matches each pair will have in an epoch."""
+
+    def __len__(self) -> int: ...
+
+    def lengths(self, epoch: int) -> Sequence[float]: ...
+
+
 class SimilarLengthBatches(Sampler[list[Draw]]):
     """Each pair once an epoch, in random batches of similar lengths: a ``batch_sampler`` for torch's DataLoader.
 
@@ -334,7 +343,7 @@ class SimilarLengthBatches(Sampler[list[Draw]]):
     """
 
     def __init__(
-        self, dataset: StoredMatches, batch: int = 32, *, seed: int = 0, matches: Sequence[int] | None = (50, 4000),
+        self, dataset: Lengths, batch: int = 32, *, seed: int = 0, matches: Sequence[int] | None = (50, 4000),
         rank: int = 0, world_size: int = 1,
     ) -> None:  # fmt: skip
         if batch < 1:

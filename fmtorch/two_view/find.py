@@ -188,8 +188,8 @@ def find_essential(
         K0 and K1. Six matches are enough where K0 and K1 are exact, otherwise seven.
 
     Raises:
-        ValueError: as `find_fundamental`; for a K0 or K1 of a single pair that is singular, not in pixels, or whose
-            principal point lies outside an image of known size. In a batch that pair is ``ok=False`` with a reason.
+        ValueError: as `find_fundamental`; for a K0 or K1 of a single pair that is singular or not in pixels. In a batch
+            that pair is ``ok=False`` with a reason.
         TypeError: for what is no array of numbers.
 
     Example:

@@ -90,18 +90,6 @@ def with_noise(c: Correspondences) -> Correspondences:
     return c.replace(x0=c.x0.double(), x1=c.x1.double(), noise=noise)
 
 
-@pytest.mark.parametrize("name", ["least_squares", "irls cauchy"])
-@pytest.mark.parametrize("kind", ["empty", "seven matches", "all points equal"])
-def test_a_batch_that_fails_can_be_differentiated(name: str, kind: str) -> None:
-    """So that no batch stops a training."""
-    c = with_noise(degenerate()[kind])
-    x0 = c.x0.clone().requires_grad_()
-    estimate = estimator(name)(c.replace(x0=x0))
-    assert not bool(estimate.ok)
-    (gradient,) = torch.autograd.grad(estimate.F.sum(), x0)
-    assert not bool(gradient.any())
-
-
 @pytest.mark.parametrize("name", [*FITS, "irls cauchy", "irls magsac"])
 def test_failed_pairs_have_none_and_change_no_other(name: str) -> None:
     """Among degenerate pairs, as alone."""

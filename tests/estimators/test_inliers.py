@@ -49,8 +49,8 @@ def test_rules_are_those_of_the_definitions(count: int) -> None:
         sigma = 1.4826 * (1 + 5 / max(count - 7, 1)) * math.sqrt(median)
         rules: list[tuple[InlierRule, list[bool]]] = [
             (WithinThreshold(1.5), [x <= 1.5**2 for x in r**2]),
-            (BetterHalf(), [x <= median for x in r**2]),
-            (RobustDeviations(), [x <= (2.5 * sigma) ** 2 for x in r**2]),
+            (BetterHalf(), [x <= max(median, 1e-6) for x in r**2]),
+            (RobustDeviations(), [x <= max(2.5 * sigma, 1e-3) ** 2 for x in r**2]),
         ]
         for rule, expected in rules:
             assert rule(r**2, pair).tolist() == expected

@@ -13,7 +13,7 @@ from tests.features.scenes import same, texture
 DOWNLOADED = ("aliked", "disk")  # their weights are not in models/; see test_kornia_features.py
 NAMES = [name for name in presets.available("features") if name not in (*DOWNLOADED, "none")]
 every = pytest.mark.parametrize("name", NAMES)
-SHAPES = [(1, 1), (1, 300), (300, 1), (2, 2), (20, 31), (40, 45), (60, 80, 3)]
+SHAPES = [(1, 1), (1, 300), (300, 1), (20, 31), (60, 80, 3)]
 
 
 def build(name: str, **options: object):
@@ -26,12 +26,13 @@ def build(name: str, **options: object):
 @every
 def test_small_and_constant_images(name: str) -> None:
     extract = build(name)
+    length = extract(texture(0, 60, 80)).descriptors.shape[1]
     for shape in SHAPES:
         flat, noise = np.full(shape, 77, np.uint8), np.random.default_rng(0).integers(0, 256, shape).astype(np.uint8)
         for image in (flat, noise):
             found = extract(image)
             assert found.image_size.tolist() == list(shape[:2])
-            assert found.descriptors.shape == (len(found), extract(flat).descriptors.shape[1])
+            assert found.descriptors.shape == (len(found), length)
             for value in (found.lafs, found.scores, found.descriptors):
                 assert bool(torch.isfinite(value).all())
             assert len(found) == 0 or image is noise
@@ -39,11 +40,11 @@ def test_small_and_constant_images(name: str) -> None:
 
 @every
 def test_threads_and_colour_change_nothing_and_only_images_are_taken(name: str) -> None:
-    extract, images = build(name), [texture(i) for i in range(4)]
+    extract, images = build(name), [texture(i, 80, 100) for i in range(3)]
     alone = [extract(image) for image in images]
-    with ThreadPoolExecutor(4) as pool:
+    with ThreadPoolExecutor(3) as pool:
         assert all(map(same, alone, pool.map(extract, images)))
-    colour = np.stack(images[:3], -1)
+    colour = np.stack(images, -1)
     assert same(extract(colour), extract(cv2.cvtColor(colour, cv2.COLOR_RGB2GRAY)))
     for wrong in (np.zeros((0, 5), np.uint8), np.zeros((5, 5, 4), np.uint8), np.zeros(5, np.uint8)):
         with pytest.raises(ValueError, match="uint8"):

@@ -6,17 +6,13 @@ import re
 import urllib.request
 from pathlib import Path
 
-import cv2
 import kornia
-import numpy as np
 import pytest
 import torch
 
 from fmtorch import presets
 from fmtorch.core import Features
 from fmtorch.matching import LightGlue
-from fmtorch.pipeline.pipeline import Pipeline
-from tests.pipeline.test_pipeline import draw, pair
 
 
 def matcher(threshold: float = -1.0) -> LightGlue:
@@ -68,29 +64,6 @@ def test_too_few_features_give_no_match(counts: tuple[int, int]) -> None:
 def test_descriptors_of_another_length_are_told() -> None:
     with pytest.raises(ValueError, match=r"descriptors are \(5, 64\).*\(N, 128\)"):
         matcher()(features(0, 5), features(1, 5, length=64))
-
-
-@pytest.mark.parametrize("threshold", [-1.0, 2.0])
-def test_in_a_pipeline(tmp_path: Path, threshold: float) -> None:
-    def extractor(image: np.ndarray) -> Features:
-        return features(int(image.sum()), 300 if image.any() else 1, image.shape[:2])
-
-    estimator = presets.build("estimator", "fmtorch", hypotheses=200, round=100)
-    pruners = {"one_to_one": presets.build("pruner", "one_to_one")}
-    a, b = draw(tmp_path / "a.png", 0), draw(tmp_path / "b.png", 0, shift=12)
-    small = draw(tmp_path / "small.png", 1)
-    cv2.imwrite(str(small.path), np.zeros((20, 20), np.uint8))
-    outcomes = Pipeline(extractor, matcher(threshold), pruners, estimator).run([pair("a", a, b), pair("b", a, small)])
-    assert outcomes[0].features == (300, 300)
-    counts = [0 if outcome.correspondences is None else int(outcome.correspondences.count()) for outcome in outcomes]
-    assert counts[1] == 0
-    assert "0 matches" in outcomes[1].reason
-    if threshold < 0:
-        assert counts[0] > 8
-        assert outcomes[0].estimate.F.isfinite().all()
-    else:
-        assert counts[0] == 0
-        assert outcomes[0].reason == outcomes[1].reason
 
 
 def test_weights_that_cannot_be_fetched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -51,7 +51,7 @@ def test_matches_that_all_move_alike_in_one_cell_are_kept(name: str) -> None:
         assert pruned.prior.min() > 0.5
 
 
-MOST = [name for name in PRUNERS if name != "code"]  # its soft form does the same work; test_code.py does the rest
+MOST = [name for name in PRUNERS if name != "code"]  # its soft form does the same work
 MANY = """
 import sys, torch
 from tests.laws import calibrated, quick_pruner, scene

@@ -112,6 +112,24 @@ def test_laws(given: dict[str, Any]) -> None:
     assert together.pair_type[2] == "unrelated"
 
 
+@pytest.mark.parametrize("count", [60, 300])
+def test_a_camera_that_only_turns_knows_no_translation(count: int) -> None:
+    """Its t is drawn by noise: far from known. A short baseline that matches do tell is known to some degrees."""
+    K, size = np.array([[700.0, 0, 319.5], [0, 700, 239.5], [0, 0, 1]]), (480, 640)
+    claimed: dict[float, list[float]] = {0.0: [], 0.3: []}
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        X = np.c_[rng.uniform(-1.8, 1.8, (count, 2)), rng.uniform(5, 9, count)]
+        R = Rotation.from_rotvec(rng.uniform(-0.1, 0.1, 3)).as_matrix()
+        for step, deviations in claimed.items():
+            x0, x1 = ((Y / Y[:, 2:] @ K.T)[:, :2] for Y in (X, X @ R.T + step * np.array([0.8, 0.6, 0])))
+            x0, x1 = (x + 0.4 * rng.normal(size=x.shape) for x in (x0, x1))
+            e = fmtorch.find_essential(x0, x1, K, K, size0=size, size1=size, covariance=True)
+            deviations.append(float(e.deviation_degrees[0, 1]))
+    assert np.median(claimed[0.0]) > 90
+    assert max(claimed[0.3]) < 10
+
+
 def test_both_poses_of_a_plane_explain_it() -> None:
     drawn = batch([draw("planar", 2, 150)])
     given = {name: drawn[name] for name in ("mask", "size0", "size1", "K0", "K1")}
