@@ -85,8 +85,8 @@ def findFundamentalMat(  # OpenCV's name, as all of this module
     if method in OF_ALL_POINTS:
         if method == opencv.FM_8POINT and _deficient(x1, x2):
             return None, _written(None, mask)
-        F, found = opencv.findFundamentalMat(x1, x2, method)
-        return F, _written(found, mask)  # type: ignore[arg-type]
+        of_all: Any = opencv.findFundamentalMat(x1, x2, method)
+        return of_all[0], _written(of_all[1], mask)
     scale = _scale_to_pixels([x1, x2], ransacReprojThreshold)
     name, options = _preset(method, scale * ransacReprojThreshold, confidence, maxIters)
     estimate = find_fundamental(scale * x1, scale * x2, estimator=name, **options)
@@ -116,8 +116,8 @@ def findHomography(
     """
     src, dst = _points_of(srcPoints, "srcPoints"), _points_of(dstPoints, "dstPoints")
     if method == 0 or len(src) < MIN_H:
-        H, found = opencv.findHomography(src, dst, method)
-        return H, _written(found, mask)  # type: ignore[arg-type]
+        of_all: Any = opencv.findHomography(src, dst, method)
+        return of_all[0], _written(of_all[1], mask)
     scale = _scale_to_pixels([dst], ransacReprojThreshold, src)
     method = opencv.RANSAC if method == opencv.RHO else method
     _, options = _preset(method, scale * ransacReprojThreshold, confidence, maxIters)

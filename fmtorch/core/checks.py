@@ -69,7 +69,7 @@ def as_tensor(value: Any, name: str) -> Tensor:
     if isinstance(value, list | tuple) and value and hasattr(value[0], "pt"):
         value = np.array([keypoint.pt for keypoint in value], np.float32)
     elif hasattr(value, "__dlpack__") and not isinstance(value, np.ndarray | np.generic):  # of CuPy, JAX, ...
-        return _real(torch.from_dlpack(value), name)
+        return _real(torch.utils.dlpack.from_dlpack(value), name)
     if np.ma.is_masked(value):
         raise ValueError(f"{name} is a masked array; give its data, and what counts in `mask` (True for a real match)")
     try:

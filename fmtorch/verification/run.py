@@ -56,7 +56,7 @@ def as_correspondences(pair: DatabasePair, cameras: Cameras) -> Correspondences:
     focal: Any = [image.deviation for image in images] if with_K else "unknown" if sized else None
     key = pair_key(f"{images[0].name} {images[1].name}")
     points = [image.points[pair.matches[:, i]] for i, image in enumerate(images)]
-    mask = np.isfinite(points[0]).all(-1) & np.isfinite(points[1]).all(-1)
+    mask: Any = np.isfinite(points[0]).all(-1) & np.isfinite(points[1]).all(-1)
     c = correspondences(*points, mask=mask, focal=focal, key=key, **known)
     if sized or with_K:
         c = c.derived(shared_focal=torch.tensor([_shared(*images, cameras)]))
