@@ -19,6 +19,7 @@ from torch import Tensor
 from fmtorch.core.annotations import Rule
 from fmtorch.core.records import Index, Record, as_index, expect_fields, gathered, padded, slotted
 
+MIN_LENS, MAX_LENS = -0.45, 0.2  # of lenses that leave an image unfolded and its corners in front of the camera
 PROBABILITY = Rule(lambda prior: (prior >= 0) & (prior <= 1), "it is P(inlier), within [0, 1]")
 DEVIATION = Rule(lambda noise: noise > 0, "it is a standard deviation, positive")
 SIZE = Rule(lambda size: (size > 0) & (size < torch.inf), "image sizes (h, w) are positive")
@@ -27,6 +28,13 @@ FOCAL = Rule(
         (focal[..., 1] == torch.inf) | ((focal[..., 1] >= 0) & (focal[..., 0] > 0) & (focal[..., 0] < torch.inf))
     ),
     "it is a positive focal length in pixels and a relative deviation, 0 if exact, infinite if unknown",
+)
+LENS = Rule(
+    lambda lens: (
+        (lens[..., 1] == torch.inf)
+        | ((lens[..., 1] >= 0) & (lens[..., 0] >= MIN_LENS) & (lens[..., 0] <= MAX_LENS) & (lens[..., 1] < torch.inf))
+    ),
+    "it is lambda in half diagonals, from -0.45, below which images fold, to 0.2, and its deviation",
 )
 
 RELATED = 1.0
@@ -104,6 +112,8 @@ class Correspondences(Record):
     focal: what estimators may take for known of the focal lengths of both images, (B, 2, 2): px and relative standard
     deviation (0 exact, infinite unknown), for square pixels and central principal points. shared_focal: (B,), whether
     both are one in units of the longer sides. Without these estimates are of F alone, whatever K0 and K1 are.
+    lens: what is known of the lenses of both images, (B, 2, 2): lambda of the division model and its standard deviation
+    (0 exact, infinite unknown), see `fmtorch.find_fundamental`. shared_lens: (B,), whether both are one.
     """
 
     x0: Float[Tensor, "b n 2"]
@@ -122,6 +132,8 @@ class Correspondences(Record):
     noise: Annotated[Float[Tensor, "b n"], DEVIATION] | None = None
     focal: Annotated[Float[Tensor, "b 2 2"], FOCAL] | None = None
     shared_focal: Bool[Tensor, " b"] | None = None
+    lens: Annotated[Float[Tensor, "b 2 2"], LENS] | None = None
+    shared_lens: Bool[Tensor, " b"] | None = None
 
     def __post_init__(self) -> None:
         expect_fields(self)
@@ -189,6 +201,11 @@ class Estimate(Record):
     Where the configuration is asked for: configuration_index (B,), into `CONFIGURATIONS`; homography (B, 3, 3), of the
     plane, the rotation or the copy, zero where there is none; other_R, other_t, the second pose that explains a plane,
     NaN where there is none.
+
+    Where image sizes are not given and may be assumed: sizes (B, 2, 2), (h, w) of both images as the points tell them,
+    NaN where these tell none; sizes_doubtful (B,), whether images of one size and of two were both likely.
+
+    Where lenses are estimated: lens (B, 2), lambda of both, NaN where they are not determined.
     """
 
     F: Float[Tensor, "b 3 3"]
@@ -211,6 +228,9 @@ class Estimate(Record):
     homography: Float[Tensor, "b 3 3"] | None = None
     other_R: Float[Tensor, "b 3 3"] | None = None
     other_t: Float[Tensor, "b 3"] | None = None
+    sizes: Float[Tensor, "b 2 2"] | None = None
+    sizes_doubtful: Bool[Tensor, " b"] | None = None
+    lens: Float[Tensor, "b 2"] | None = None
 
     def __post_init__(self) -> None:
         expect_fields(self)
@@ -248,8 +268,19 @@ class Estimate(Record):
 
     @property
     def warning(self) -> tuple[str, ...]:
-        """What the configuration of each pair leaves open, empty where nothing. Raises as `configuration`."""
-        return tuple(WARNINGS[name] for name in self.configuration)
+        """What the configuration of each pair leaves open, and which sizes were doubtful; empty where nothing.
+
+        Raises AttributeError where neither was looked at.
+        """
+        if self.sizes_doubtful is None or self.sizes is None:
+            return tuple(WARNINGS[name] for name in self.configuration)
+        known = self.configuration_index is not None
+        warnings = [WARNINGS[name] for name in self.configuration] if known else [""] * len(self)
+        for i in self.sizes_doubtful.nonzero()[:, 0].tolist():
+            sizes = " and ".join(f"({h:.0f}, {w:.0f})" for h, w in self.sizes[i].tolist())
+            assumed = f"image sizes are not given, and {sizes} is assumed: give size0 and size1, or 'unknown'"
+            warnings[i] = "; ".join(filter(None, (warnings[i], assumed)))
+        return tuple(warnings)
 
     @property
     def deviation_degrees(self) -> Float[Tensor, "b 2"]:
