@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from fmtorch.core.types import Estimate
 from fmtorch.two_view.arguments import MIN_PIXELS
 from fmtorch.two_view.find import find_essential, find_fundamental, find_homography
+from fmtorch.two_view.planes import COMPARABLE
 
 Matrix = NDArray[np.float64]
 Mask = NDArray[np.uint8]
@@ -39,6 +40,11 @@ PRESETS = {
 """The presets of fundamental and essential matrices by OpenCV's flags (FM_RANSAC is RANSAC, FM_LMEDS is LMEDS)."""
 OF_ALL_POINTS = (opencv.FM_7POINT, opencv.FM_8POINT)
 UNIT_FOCAL = 1000.0  # px, of the camera that normalised points are scaled to
+REACH_PX = 1000.0  # of points in another unit, as they are scaled
+SUBPIXEL, USUAL_THRESHOLD = 0.5, 3.0  # px: below which a threshold may be of a larger unit; OpenCV's usual one
+RANK = 1e-6  # of the eighth singular value, in the first, below which equations determine no F
+FARTHEST = 1e9  # baselines
+TO_THE_END = (opencv.TERM_CRITERIA_COUNT + opencv.TERM_CRITERIA_EPS, 100, 1e-12)
 MIN_H = 4  # matches of a homography
 
 
@@ -49,12 +55,14 @@ def findFundamentalMat(  # OpenCV's name, as all of this module
     """The fundamental matrix of matched points, ``p2^T F p1 = 0``, as `cv2.findFundamentalMat` returns it.
 
     Args:
-        points1, points2: (N, 2), (N, 1, 2) or (1, N, 2), in pixels.
-        method: FM_RANSAC, FM_LMEDS or USAC_*, see `PRESETS`; FM_7POINT and FM_8POINT are OpenCV's own.
+        points1, points2: (N, 2), (N, 1, 2) or (1, N, 2), or homogeneous with 3 in place of 2; in pixels, or in another
+            unit, as of a focal length of 1, with a threshold in it.
+        method: FM_RANSAC, FM_LMEDS or USAC_*, see `PRESETS`; FM_7POINT and FM_8POINT are OpenCV's own, None where the
+            points leave more than one F.
         ransacReprojThreshold: largest Sampson distance of an inlier, px; LMedS takes none.
         confidence: of having drawn a sample without an outlier, at which the search ends; None: the preset's.
         maxIters: samples at most; None: the preset's. A mask may stand here, as in OpenCV's shorter form.
-        mask: written to, if given.
+        mask: written to, if given; zeros where there is no F.
 
     Returns:
         F (3, 3), of which the last entry is 1, and the mask (N, 1) of inliers, uint8; (None, None) where there is no F.
@@ -72,15 +80,19 @@ def findFundamentalMat(  # OpenCV's name, as all of this module
         >>> F.shape, mask.shape, int(mask.sum())
         ((3, 3), (80, 1), 80)
     """
-    if method in OF_ALL_POINTS:
-        return opencv.findFundamentalMat(points1, points2, method)
     if isinstance(maxIters, np.ndarray):
         maxIters, mask = None, maxIters
-    name, options = _preset(method, ransacReprojThreshold, confidence, maxIters)
-    estimate = find_fundamental(
-        _points_of(points1, "points1"), _points_of(points2, "points2"), estimator=name, **options
-    )
-    return _result(estimate, estimate.F, mask)
+    x1, x2 = _points_of(points1, "points1"), _points_of(points2, "points2")
+    if method in OF_ALL_POINTS:
+        if method == opencv.FM_8POINT and _deficient(x1, x2):
+            return None, _written(None, mask)
+        F, found = opencv.findFundamentalMat(x1, x2, method)
+        return F, _written(found, mask)  # type: ignore[arg-type]
+    scale = _scale_to_pixels([x1, x2], ransacReprojThreshold)
+    name, options = _preset(method, scale * ransacReprojThreshold, confidence, maxIters)
+    estimate = find_fundamental(scale * x1, scale * x2, estimator=name, **options)
+    S = np.diag([scale, scale, 1.0])
+    return _result(estimate, S @ estimate.F[0].cpu().numpy() @ S, mask)
 
 
 def findHomography(
@@ -91,7 +103,7 @@ def findHomography(
 
     Args:
         srcPoints: (N, 2), (N, 1, 2) or (1, N, 2), in pixels or in the unit of a plane.
-        dstPoints: the same number, in pixels.
+        dstPoints: the same number, in pixels, or in another unit with a threshold in it.
         method: RANSAC, LMEDS, RHO or USAC_*: the preset `homography`; 0, of all points, is OpenCV's own.
         ransacReprojThreshold: largest Sampson distance of an inlier, px.
         mask, maxIters, confidence: as of `findFundamentalMat`.
@@ -105,12 +117,14 @@ def findHomography(
     """
     src, dst = _points_of(srcPoints, "srcPoints"), _points_of(dstPoints, "dstPoints")
     if method == 0 or len(src) < MIN_H:
-        return opencv.findHomography(src, dst, method)  # type: ignore[return-value]
-    _, options = _preset(opencv.RANSAC if method == opencv.RHO else method, ransacReprojThreshold, confidence, maxIters)
-    options["inlier_threshold"] = ransacReprojThreshold
-    S = _similarity(src, dst)
-    estimate = find_homography(src * S[0, 0] + S[:2, 2], dst, **options)
-    H, inliers = _result(estimate, estimate.F.cpu().numpy() @ S, mask)
+        H, found = opencv.findHomography(src, dst, method)
+        return H, _written(found, mask)  # type: ignore[arg-type]
+    scale = _scale_to_pixels([dst], ransacReprojThreshold, src)
+    method = opencv.RANSAC if method == opencv.RHO else method
+    _, options = _preset(method, scale * ransacReprojThreshold, confidence, maxIters)
+    options["inlier_threshold"] = scale * ransacReprojThreshold
+    estimate = find_homography(src, scale * dst, **options)
+    H, inliers = _result(estimate, np.diag([1 / scale, 1 / scale, 1.0]) @ estimate.F[0].cpu().numpy(), mask)
     return H, np.zeros((len(src), 1), np.uint8) if inliers is None else inliers
 
 
@@ -141,23 +155,29 @@ def findEssentialMat(points1: Any, points2: Any, *arguments: Any, **named: Any) 
     estimate = find_essential(scale * x1, scale * x2, S @ K1, S @ K2, estimator=name, **options)
     valid = bool(estimate.ok[0]) and estimate.E is not None and bool(estimate.E.isfinite().all())
     if not valid or estimate.E is None:
-        return None, None
+        return None, _written(None, rest.get("mask"))
     return estimate.E[0].cpu().numpy(), _mask(estimate, rest.get("mask"))
 
 
 def recoverPose(*arguments: Any, **named: Any) -> Any:
-    """The pose of an essential matrix, by OpenCV's own function, as `cv2.recoverPose` returns it.
+    """The pose of an essential matrix in OpenCV's forms, as `cv2.recoverPose` returns it.
+
+    ``(E, points1, points2, cameraMatrix[, R[, t[, mask]]])`` and ``(E, points1, points2[, R[, t[, focal[, pp[,
+    mask]]]]])`` choose between the four poses of E by all points, however far they are; OpenCV by those within 50
+    baselines, among which there are none where the camera hardly moves. With ``distanceThresh`` it is OpenCV's own.
 
     In the form ``(points1, points2, cameraMatrix1, distCoeffs1, cameraMatrix2, distCoeffs2, ...)``, without a matrix,
     that is of `findEssentialMat` above: ``retval, E, R, t, mask``. Raises ValueError where there is none.
     """
-    if "cameraMatrix2" not in named and np.shape(arguments[0]) == (3, 3) and np.shape(arguments[1]) != (3, 3):
-        return opencv.recoverPose(*arguments, **named)
+    cameras = len(arguments) > 4 and np.shape(arguments[2]) == np.shape(arguments[4]) == (3, 3)
+    if "cameraMatrix2" not in named and (not cameras or np.shape(arguments[0]) == (3, 3)):
+        return _pose_of_matrix(arguments, named)
     names = ("points1", "points2", "cameraMatrix1", "distCoeffs1", "cameraMatrix2", "distCoeffs2", "E", "R", "t")
     given = {**dict(zip((*names, "method", "prob", "threshold", "mask"), arguments, strict=False)), **named}
     kept = {name: given[name] for name in ("method", "prob", "threshold") if given.get(name) is not None}
     E, inliers = findEssentialMat(*(given[name] for name in names[:6]), **kept)
     if E is None or inliers is None:
+        _written(None, given.get("mask"))
         raise ValueError("no essential matrix agrees with the points")
     x1, x2, *_ = _calibrated(
         _points_of(given["points1"], "points1"), _points_of(given["points2"], "points2"),
@@ -167,8 +187,29 @@ def recoverPose(*arguments: Any, **named: Any) -> Any:
         opencv.undistortPoints(x[:, None], np.asarray(given[f"cameraMatrix{i}"], float), None)
         for i, x in ((1, x1), (2, x2))
     )
-    retval, R, t, mask = opencv.recoverPose(E, y1, y2, np.eye(3), mask=inliers)
+    retval, R, t, mask, _ = opencv.recoverPose(E, y1, y2, np.eye(3), distanceThresh=FARTHEST, mask=inliers)
+    for name, value in (("E", E), ("R", R), ("t", t), ("mask", mask)):
+        _put(value, given.get(name))
     return retval, E, R, t, mask
+
+
+def _pose_of_matrix(arguments: tuple[Any, ...], named: dict[str, Any]) -> Any:
+    """The pose of a given E."""
+    rest = arguments[3:]
+    if "distanceThresh" in named or (len(rest) > 1 and isinstance(rest[1], int | float)):
+        return opencv.recoverPose(*arguments, **named)
+    by_matrix = "cameraMatrix" in named or (rest and np.shape(rest[0]) == (3, 3))
+    names = ("cameraMatrix", "R", "t", "mask") if by_matrix else ("R", "t", "focal", "pp", "mask")
+    given = {**dict(zip(("E", "points1", "points2", *names), arguments, strict=False)), **named}
+    if missing := [name for name in ("E", "points1", "points2") if name not in given]:
+        raise TypeError(f"recoverPose needs {', '.join(missing)}")
+    (cx, cy), f = given.get("pp", (0.0, 0.0)), float(given.get("focal", 1.0))
+    K = np.asarray(given.get("cameraMatrix", [[f, 0, cx], [0, f, cy], [0, 0, 1]]), np.float64)
+    x1, x2 = (_points_of(given[name], name) for name in ("points1", "points2"))
+    retval, R, t, mask, _ = opencv.recoverPose(given["E"], x1, x2, K, distanceThresh=FARTHEST, mask=given.get("mask"))
+    _put(R, given.get("R"))
+    _put(t, given.get("t"))
+    return retval, R, t, mask
 
 
 def _preset(
@@ -190,21 +231,35 @@ def _preset(
     return PRESETS[method], options
 
 
-def _similarity(src: Matrix, dst: Matrix) -> Matrix:
-    """The map of points in the unit of a plane to about the pixels that they are seen at; of pixels the identity."""
-    finite = src[np.isfinite(src).all(1)]
-    reach = float(np.abs(finite).max()) if len(finite) else 0.0
-    if reach >= MIN_PIXELS or reach == 0:
-        return np.eye(3)
-    seen = dst[np.isfinite(dst).all(1)]
-    scale = float(np.ptp(seen, axis=0).max() / max(np.ptp(finite, axis=0).max(), 1e-300)) if len(seen) else 1.0
-    return np.diag([scale or 1.0, scale or 1.0, 1.0])
+def _scale_to_pixels(points: list[Matrix], threshold: float | int, src: Matrix | None = None) -> float:
+    """What makes pixels, in which presets search, of points in another unit, as of a camera of a focal length of 1.
+
+    1 for pixels, and where the threshold is so wide that it is not of this unit. src: the other points of a homography,
+    beside which a threshold below a pixel shows that the unit is a larger one.
+    """
+    finite = [x[np.isfinite(x).all(1)] for x in points]
+    reach = max((float(np.abs(x).max()) for x in finite if len(x)), default=0.0)
+    if 0 < reach < MIN_PIXELS:
+        return REACH_PX / reach if threshold < reach / 10 else 1.0
+    if src is None or not 0 < threshold < SUBPIXEL or len(src) < 2:
+        return 1.0
+    extents = [float(np.ptp(x[np.isfinite(x).all(1)], axis=0).max(initial=0.0)) for x in (src, points[0])]
+    comparable = extents[0] < COMPARABLE * extents[1] and extents[1] < COMPARABLE * extents[0]
+    return 1.0 if comparable else USUAL_THRESHOLD / threshold
+
+
+def _deficient(x1: Matrix, x2: Matrix) -> bool:
+    """Whether points (n, 2) leave more than one F: the rank of their equations is below eight."""
+    a, b = ((x - x.mean(0)) / max(float(np.std(x)), 1e-300) for x in (x1, x2))
+    h0, h1 = (np.c_[x, np.ones(len(x))] for x in (a, b))
+    singular = np.linalg.svd((h1[:, :, None] * h0[:, None]).reshape(len(a), 9), compute_uv=False)
+    return len(singular) < 8 or not singular[7] > RANK * singular[0]
 
 
 def _result(estimate: Estimate, matrix: Any, mask: Mask | None) -> tuple[Matrix | None, Mask | None]:
     """A matrix whose last entry is 1, if it is not 0, and the mask."""
     if not bool(estimate.ok[0]):
-        return None, None
+        return None, _written(None, mask)
     M = np.asarray(matrix, np.float64).reshape(3, 3)
     last = M[2, 2] if abs(M[2, 2]) > np.finfo(float).eps * np.abs(M).max() else 1.0
     return M / last, _mask(estimate, mask)
@@ -213,9 +268,20 @@ def _result(estimate: Estimate, matrix: Any, mask: Mask | None) -> tuple[Matrix 
 def _mask(estimate: Estimate, out: Mask | None) -> Mask:
     """The inliers (N, 1), also written to what the caller gave."""
     mask = estimate.inliers[0].cpu().numpy().astype(np.uint8)[:, None]
-    if isinstance(out, np.ndarray) and out.size == mask.size:
-        out[...] = mask.reshape(out.shape)
+    _put(mask, out)
     return mask
+
+
+def _written(mask: Mask | None, out: Mask | None) -> Mask | None:
+    """The mask, also written to what the caller gave: zeros where there is none."""
+    _put(np.zeros(0, np.uint8) if mask is None else mask, out)
+    return mask
+
+
+def _put(value: Any, out: Any) -> None:
+    """Write to an array that the caller gave: a value of its size, or zeros for an empty one."""
+    if isinstance(out, np.ndarray) and (value.size == 0 or out.size == value.size):
+        out[...] = value.reshape(out.shape) if value.size else 0
 
 
 def __getattr__(name: str) -> Any:
@@ -252,8 +318,15 @@ def _calibrated(
     for i, x in enumerate((x1, x2), start=1):
         bent = given.get(f"distCoeffs{i}")
         if bent is not None and np.any(bent):
-            x[:] = opencv.undistortPoints(x[:, None], Ks[i - 1], np.asarray(bent, np.float64), P=Ks[i - 1])[:, 0]
+            x[:] = _undistorted(x[:, None], Ks[i - 1], np.asarray(bent, np.float64))[:, 0]
     return x1, x2, Ks[0], Ks[1], given
+
+
+def _undistorted(x: Any, K: Matrix, bent: Matrix) -> Any:
+    """Points (n, 1, 2) without distortion, iterated to the end and not for OpenCV's five steps."""
+    if hasattr(opencv, "undistortPointsIter"):  # before OpenCV 5
+        return opencv.undistortPointsIter(x, K, bent, None, K, TO_THE_END)
+    return opencv.undistortPoints(x, K, bent, None, None, K, TO_THE_END)
 
 
 def _points_of(points: Any, name: str) -> Matrix:
@@ -261,6 +334,6 @@ def _points_of(points: Any, name: str) -> Matrix:
     array = np.array(points, np.float64)
     if array.ndim == 3 and 1 in array.shape[:2]:
         array = array.reshape(-1, array.shape[2])
-    if array.ndim != 2 or array.shape[1] != 2:
-        raise ValueError(f"{name} has shape {array.shape}; it must be (N, 2), (N, 1, 2) or (1, N, 2)")
-    return array
+    if array.ndim != 2 or array.shape[1] not in (2, 3):
+        raise ValueError(f"{name} has shape {array.shape}; it must be (N, 2), (N, 1, 2) or (1, N, 2), or homogeneous")
+    return array if array.shape[1] == 2 else array[:, :2] / array[:, 2:]

@@ -111,10 +111,10 @@ def report(name: str, stage: Any, pairs: list[Pair]) -> None:
 
 def features(stage: Any, pair: Pair, kind: str) -> Array:
     """Columns: one, the evidence (which `ratio_prior` does not have: it is zero) and, unless alone, the ratio."""
-    c = pair.c if kind == "with_ratio" else pair.c.replace(quality=None)
+    c = pair.c if kind == "with_ratio" else pair.c.replace(ratio=None)
     evidence = stage.evidence(c)[0].double().numpy()
     columns = [np.ones_like(evidence), *([evidence] if evidence.any() or kind == "with_ratio" else [])]
-    return np.stack([*columns, *([c.quality[0].double().numpy()] if c.quality is not None else [])], 1)
+    return np.stack([*columns, *([c.ratio[0].double().numpy()] if c.ratio is not None else [])], 1)
 
 
 def fit(columns: list[Array], pairs: list[Pair]) -> Array:

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 import fmtorch
 from fmtorch import Correspondences, Estimate, data, metrics, presets
 from fmtorch.data import ImagePair, read_image
-from fmtorch.evaluation.pictures import draw_epipolar_lines, draw_matches
-from fmtorch.pipeline.build import load_pipeline
+from fmtorch.pipeline.pictures import draw_epipolar_lines, draw_matches
+from fmtorch.pipeline.pipeline import load_pipeline
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 GALLERY_WIDTH, OVERVIEW_WIDTH, HEIGHT, GAP = 1200, 1600, 400, 8  # px

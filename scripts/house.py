@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import functools
 import os
+import re
 import statistics
 import subprocess
 import sys
@@ -47,10 +48,10 @@ def span(node: Any) -> int:
 
 
 def imports_by_string(paths: Iterable[Path]) -> int:
-    """Modules imported by name, and targets of presets that stand in code rather than in YAML."""
-    calls = [getattr(node.func, "attr", getattr(node.func, "id", "")) for node in nodes(paths, ast.Call)]
-    keys = [getattr(key, "value", "") for node in nodes(paths, ast.Dict) for key in node.keys]
-    return sum(name in ("import_module", "__import__") for name in calls) + keys.count("_target_")
+    """Strings that name a module of the package, as code that imports it by name has."""
+    values = [node.value for node in nodes(paths, ast.Constant) if isinstance(node.value, str)]
+    places = [ROOT.joinpath(*value.split(".")) for value in values if re.fullmatch(r"fmtorch(\.\w+)+", value)]
+    return sum(place.with_suffix(".py").exists() or (place / "__init__.py").exists() for place in places)
 
 
 def inner_modules(paths: Iterable[Path]) -> set[str]:
@@ -94,7 +95,8 @@ def loaded() -> list[str]:
 def road() -> list[str]:
     """The files of the package from `find_fundamental` to the seven-point solver, with kernels interpreted."""
     passed = printed(WATCH + ESTIMATE, FMTORCH_KERNELS="off")
-    return list(dict.fromkeys(name.removeprefix(f"{ROOT}/") for name in passed if name.startswith(f"{ROOT}/fmtorch/")))
+    files = dict.fromkeys(name.removeprefix(f"{ROOT}/") for name in passed if name.startswith(f"{ROOT}/fmtorch/"))
+    return [name for name in files if name != "fmtorch/jit/kernel.py"]  # passed by interpreted kernels alone
 
 
 def figures() -> dict[str, float]:

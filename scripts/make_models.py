@@ -33,9 +33,9 @@ from fmtorch.core.terminal import console, exits_with_message
 from fmtorch.data import read_image
 from fmtorch.features import learn_projection, local_feature
 from fmtorch.features.vlad import Codebook, Kind, local_descriptors
-from fmtorch.pipeline.build import load_pipeline
+from fmtorch.pipeline.pipeline import load_pipeline
 from fmtorch.pruning.networks import LC
-from fmtorch.scenes.textures import PICTURES, photograph
+from fmtorch.scenes.surfaces import PICTURES, photograph
 from fmtorch.training.export import save_weights
 from fmtorch.training.planes import list_photographs
 

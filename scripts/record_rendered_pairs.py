@@ -11,7 +11,7 @@ import argparse
 import json
 from pathlib import Path
 
-from fmtorch.scenes.generate import FAMILIES, PLANS, RECORD, SPLITS, digest, recorded_pairs
+from fmtorch.scenes.dataset import FAMILIES, PLANS, RECORD, SPLITS, digest, recorded_pairs
 
 
 def main() -> None:

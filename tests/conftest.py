@@ -6,6 +6,7 @@ import contextlib
 import importlib
 import os
 import pkgutil
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -81,3 +82,22 @@ def oracle(name: str) -> dict[str, np.ndarray]:
     """The arrays of one reference file, e.g. oracle("gms.npz")."""
     with np.load(shared_path(f"oracles/{name}")) as file:
         return {key: file[key] for key in file.files}
+
+
+@pytest.fixture
+def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+    """Runs a command in a folder, in this process; returns what it prints and, after a mistake, what it ends with."""
+    from tests.helpers import call_command  # not before the import hook of the type checker
+
+    def run(*words: str, cwd: Path) -> str:
+        monkeypatch.setenv("FMTORCH_CACHE", str(own_cache(cwd)))
+        monkeypatch.setenv("COLUMNS", "200")
+        end = ""
+        try:
+            call_command(monkeypatch, cwd, *words)
+        except SystemExit as error:
+            end = f"ended: {error.code}"
+        printed = capsys.readouterr()
+        return printed.out + printed.err + end
+
+    return run

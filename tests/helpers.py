@@ -13,11 +13,12 @@ import numpy as np
 import pytest
 from hydra.core.global_hydra import GlobalHydra
 
-import fmtorch.commands.config  # noqa: F401  the commands' configs, by their names
+import fmtorch.__main__
+import fmtorch.commands.config  # the commands' configs, by their names
 from fmtorch import presets
 from fmtorch.data import ImagePair, ImageSource
-from fmtorch.pipeline.pipeline import Pipeline
-from fmtorch.presets.composition import compose as compose
+from fmtorch.pipeline import Pipeline
+from fmtorch.presets import compose as compose
 
 ROWS = np.array([[0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])  # F of a sideways camera: epipolar lines are rows
 
@@ -73,6 +74,12 @@ def apart(F: np.ndarray, G: np.ndarray) -> float:
     return float(min(np.abs(F - G).max(), np.abs(F + G).max()))
 
 
+def cross_matrix(t: np.ndarray) -> np.ndarray:
+    """[t]x, whose product with x is t x x."""
+    x, y, z = t
+    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+
+
 def edit_lines(path: Path, change: Callable[[list[str]], list[str]]) -> None:
     """Change the lines of a text file."""
     path.write_text("\n".join(change(path.read_text().splitlines())) + "\n")
@@ -97,11 +104,12 @@ def in_threads(count: int, work: Callable[[int], object]) -> None:
         raise errors[0]
 
 
-def call_main(main: Callable[[], object], monkeypatch: pytest.MonkeyPatch, folder: Path, *words: str) -> None:
-    """A command's `main` with these words, in a folder, within this process."""
+def call_command(monkeypatch: pytest.MonkeyPatch, folder: Path, *words: str) -> None:
+    """``fmtorch <words>`` in a folder, within this process."""
     monkeypatch.chdir(folder)
     monkeypatch.setattr(sys, "argv", ["fmtorch", *words])
+    monkeypatch.setattr(sys, "path", [str(folder), *sys.path])
     try:
-        main()
+        fmtorch.__main__.main()
     finally:
         GlobalHydra.instance().clear()

@@ -17,9 +17,7 @@ import torch
 from torch import Tensor
 
 from fmtorch import presets
-from fmtorch.core.grey_pyramid import grey_pyramid
-from fmtorch.core.stages import Estimator, ImagePruner, PairImages, Pruner
-from fmtorch.core.types import Correspondences, collate
+from fmtorch.core import Correspondences, Estimator, ImagePruner, PairImages, Pruner, collate, grey_pyramid
 from tests.variants import built, loaded, variants
 
 PEERS = {
@@ -91,6 +89,19 @@ def calibrated(c: Correspondences) -> Correspondences:
     return c.replace(K0=K, K1=K)
 
 
+KNOWLEDGE: dict[str, Any] = {"exact": (0.0, 0.0), "rough": (0.05, 0.05), "one": (0.0, float("inf")), "shared": None}
+"""Deviations of the two focal lengths, as parts of them; None: unknown and equal."""
+
+
+def with_knowledge(c: Correspondences, known: str) -> Correspondences:
+    """The same pairs with the calibration of `scene` as far as it is known."""
+    if known == "shared":
+        return c.replace(shared_focal=torch.ones(len(c), dtype=torch.bool))
+    focal = torch.tensor([[[1.0, s] for s in KNOWLEDGE[known]]]).expand(len(c), 2, 2)
+    c = calibrated(c).replace(focal=focal)
+    return c.replace(K1=None) if known == "one" else c
+
+
 def scene(index: int, count: int = 150, outliers: float = 0.4, noise: float = 0.3) -> Correspondences:
     """One synthetic pair: a cloud of points before two cameras, with noise, outliers, ratios, frames and a key."""
     rng = np.random.default_rng(index)
@@ -116,7 +127,7 @@ def scene(index: int, count: int = 150, outliers: float = 0.4, noise: float = 0.
 
     size = torch.tensor([[640, 960]])
     return Correspondences(
-        tensor(x0), tensor(x1), torch.ones(1, count, dtype=torch.bool), quality=tensor(ratio),
+        tensor(x0), tensor(x1), torch.ones(1, count, dtype=torch.bool), ratio=tensor(ratio),
         prior=tensor(np.clip(1.2 - ratio, 0, 1)), lafs0=tensor(frames[0]), lafs1=tensor(frames[1]),
         size0=size, size1=size, key=torch.tensor([index + 1]), mutual=tensor(ratio) < 0.7,
     )  # fmt: skip
@@ -139,7 +150,7 @@ def with_padding(c: Correspondences, rng: np.random.Generator, garbage: float) -
         index = where.reshape(b, n, *[1] * (value.dim() - 2)).expand(b, n, *value.shape[2:])
         return out.scatter(1, index, value)
 
-    fields = ("x0", "x1", "mask", "quality", "prior", "lafs0", "lafs1", "mutual", "noise")
+    fields = ("x0", "x1", "mask", "ratio", "prior", "lafs0", "lafs1", "mutual", "noise")
     return c.replace(**{f: spread(getattr(c, f)) for f in fields if getattr(c, f) is not None})
 
 
@@ -154,8 +165,8 @@ def live_values(result: Result, c: Correspondences) -> Result:
 def degenerate() -> dict[str, Correspondences]:
     """Pairs that no estimator can solve, or only by luck."""
     good = scene(3)
-    quality = good.quality
-    assert quality is not None
+    ratio = good.ratio
+    assert ratio is not None
     n = good.x0.shape[1]
     line = torch.linspace(0, 600, n)
     collinear = torch.stack([line, 0.5 * line + 20], -1)[None]
@@ -171,7 +182,7 @@ def degenerate() -> dict[str, Correspondences]:
         "all outliers": scene(4, outliers=1.0),
         "NaN": good.replace(x0=torch.full_like(good.x0, torch.nan)),
         "some NaN": good.replace(x1=torch.where(torch.arange(n)[None, :, None] % 3 == 0, torch.nan, good.x1)),
-        "NaN ratio": good.replace(quality=torch.where(torch.arange(n)[None] % 3 == 0, torch.nan, quality)),
+        "NaN ratio": good.replace(ratio=torch.where(torch.arange(n)[None] % 3 == 0, torch.nan, ratio)),
         "infinite": good.replace(x1=torch.full_like(good.x1, torch.inf)),
         "huge": good.replace(x0=good.x0 * 1e6, x1=good.x1 * 1e6),
         "tiny": good.replace(x0=good.x0 * 1e-6, x1=good.x1 * 1e-6),

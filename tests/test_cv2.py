@@ -180,3 +180,120 @@ def test_parameters_of_another_search_are_refused() -> None:
         cv2.findFundamentalMat(PTS1, PTS2, opencv.UsacParams())
     with pytest.raises(TypeError, match="findEssentialMat takes points1, points2, cameraMatrix, method"):
         cv2.findEssentialMat(PTS1, PTS2, K0, focal=3)
+
+
+def straight(n: np.ndarray) -> np.ndarray:
+    return np.c_[n, np.ones(len(n))]
+
+
+def test_points_in_another_unit_with_a_threshold_in_it() -> None:
+    """Of a focal length of one, as VIO programs give them: matches are told apart as in pixels."""
+    n1, n2 = ((straight(x) @ np.linalg.inv(K0).T)[:, :2] for x in (PTS1, PTS2))
+    F, mask = cv2.findFundamentalMat(n1, n2, cv2.FM_RANSAC, 1.5 / 510, 0.999)
+    assert float((mask.ravel() == SCENE.right).mean()) > 0.9
+    E = F / np.linalg.norm(F)
+    t = SCENE.t
+    expected = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]]) @ SCENE.R
+    expected /= np.linalg.norm(expected)
+    assert min(np.linalg.norm(E - expected), np.linalg.norm(E + expected)) < 0.05
+    x, y, H = homography_points()
+    for unit in (1.0, 1e-3):
+        u, v = x / 500 * unit, y / 500 * unit
+        D = np.diag([unit / 500, unit / 500, 1])
+        found, inliers = cv2.findHomography(u, v, cv2.RANSAC, 3 / 500 * unit)
+        expected = D @ H @ np.linalg.inv(D)
+        corners = np.array([[0, 0], [640, 0], [640, 480], [0, 480.0]])
+        a, b = (straight(corners * unit / 500) @ M.T for M in (found, expected))
+        assert np.abs(a[:, :2] / a[:, 2:] - b[:, :2] / b[:, 2:]).max() < 0.05 * unit / 500
+        assert inliers.ravel().tolist() == cv2.findHomography(x, y, cv2.RANSAC, 3.0)[1].ravel().tolist()
+    metres, _ = cv2.findHomography(x, y / 40, cv2.RANSAC, 0.1)  # a photograph to a court
+    a = straight(corners) @ metres.T
+    b = straight(corners) @ H.T
+    assert np.abs(40 * a[:, :2] / a[:, 2:] - b[:, :2] / b[:, 2:]).max() < 0.05
+
+
+def test_homogeneous_points() -> None:
+    F, _ = cv2.findFundamentalMat(PTS1, PTS2)
+    np.testing.assert_allclose(cv2.findFundamentalMat(2 * straight(PTS1), straight(PTS2)[:, None])[0], F, rtol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["findFundamentalMat", "findHomography", "findEssentialMat"])
+def test_the_mask_is_zeroed_where_there_is_no_model(name: str) -> None:
+    same, mask = np.tile([[40.0, 90.0]], (15, 1)), np.ones((15, 1), np.uint8)
+    given = {"findEssentialMat": (K0,)}.get(name, ())
+    assert getattr(cv2, name)(same, same + 7, *given, method=cv2.RANSAC, mask=mask)[0] is None
+    assert not mask.any()
+
+
+def test_eight_points_that_determine_no_matrix_have_none() -> None:
+    """Of a plane, exactly: OpenCV returns one of the many."""
+    x, y, _ = homography_points(wrong=0.0)
+    assert opencv.findFundamentalMat(x, y, cv2.FM_8POINT)[0] is not None
+    mask = np.ones((120, 1), np.uint8)
+    assert cv2.findFundamentalMat(x, y, cv2.FM_8POINT, mask=mask) == (None, None)
+    assert not mask.any()
+
+
+@pytest.mark.parametrize("baseline", [0.004, 0.04])
+def test_poses_of_small_baselines(baseline: float) -> None:
+    """Points beyond 50 baselines vote, too."""
+    rng = np.random.default_rng(1)
+    X = np.c_[rng.uniform(-2, 2, (120, 2)), rng.uniform(3, 9, 120)]
+    t = np.array([0.8, 0.1, 0.59])
+    x1, x2 = ((Y / Y[:, 2:] @ K0.T)[:, :2] for Y in (X, X + baseline * t))
+    E, mask = cv2.findEssentialMat(x1, x2, K0)
+    R, out = np.zeros((3, 3)), np.zeros((3, 1))
+    number, rotation, direction, _ = cv2.recoverPose(E, x1, x2, K0, R, out, mask.copy())
+    assert number == 120
+    assert angle(rotation, np.eye(3)) < 0.01
+    assert float(direction[:, 0] @ t / np.linalg.norm(t)) > 0.999
+    np.testing.assert_array_equal(R, rotation)
+    assert cv2.recoverPose(E=E, points1=x1, points2=x2, cameraMatrix=K0)[0] == 120
+    assert cv2.recoverPose(E, *((straight(x) @ np.linalg.inv(K0).T)[:, :2] for x in (x1, x2)))[0] == 120
+    assert cv2.recoverPose(x1, x2, K0, None, K0, None)[0] == 120
+
+
+def test_undistortion_runs_to_its_end() -> None:
+    """A wide lens, exact matches: OpenCV's five steps leave 0.1 degrees."""
+    rng = np.random.default_rng(3)
+    bend, K = np.array([-0.33, 0.13, 0.001, 0, -0.02]), np.array([[400, 0, 319.5], [0, 400, 239.5], [0, 0, 1.0]])
+    X = np.c_[rng.uniform(-3, 3, (200, 2)), rng.uniform(3, 6, 200)]
+    X = X[np.hypot(X[:, 0], X[:, 1]) / X[:, 2] < 1]
+    Y = X @ SCENE.R.T + [0.4, 0.1, 0.2]
+    x1, x2 = (opencv.projectPoints(Z, np.zeros(3), np.zeros(3), K, bend)[0][:, 0] for Z in (X, Y))
+    R = cv2.recoverPose(x1, x2, K, bend, K, bend)[2]
+    assert angle(R, SCENE.R) < 0.005
+
+
+FORMS = (np.float32, np.float64, np.int32, lambda x: x[:, None], lambda x: x[None], np.ndarray.tolist)
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("name", ["findFundamentalMat", "findHomography", "findEssentialMat"])
+def test_generated_calls_return_what_opencv_returns(name: str, seed: int) -> None:
+    """Kinds, shapes and types of values for any form, count and arrangement; the differences are in the guide."""
+    rng = np.random.default_rng(seed)
+    for kind in ("sound", "few", "minimal", "collinear", "coincident"):
+        count = {"few": 3, "minimal": 8}.get(kind, 60)
+        at = rng.permutation(200)[:count]
+        x1, x2 = PTS1[at], PTS2[at]
+        if kind == "collinear":
+            x1, x2 = (np.outer(np.arange(60), [7.0, 3]) + shift for shift in ([5, 9], [30, 2]))
+        if kind == "coincident":
+            x1, x2 = (np.tile(x[:1], (60, 1)) for x in (x1, x2))
+        form = FORMS[rng.integers(len(FORMS) - (name == "findEssentialMat"))]
+        a, b = form(x1), form(x2)
+        given = (a, b, K0) if name == "findEssentialMat" else (a, b)
+        method = int(rng.choice([cv2.RANSAC, cv2.LMEDS, cv2.USAC_MAGSAC]))
+        try:
+            theirs = getattr(opencv, name)(*given, method=method)
+        except (opencv.error, TypeError):
+            theirs = None
+        ours = getattr(cv2, name)(*given, method=method) if theirs is not None else None
+        if theirs is None or ours is None or ours[0] is None:
+            assert kind != "sound" or theirs is None
+            continue
+        assert ours[0].shape == (3, 3)
+        assert (ours[1].dtype, ours[1].shape) == (np.uint8, (count, 1))
+        if kind == "sound" and theirs[0] is not None:
+            expect_same_kind(theirs, ours)

@@ -135,8 +135,3 @@ def test_what_is_not_refused(line: str) -> None:
 def test_kernels_are_found_by_their_decorators(line: str) -> None:
     assert kernels(ast.parse(f"{line}\ndef f(x): ..."))
     assert not kernels(ast.parse("@functools.cache\ndef f(x): ..."))
-
-
-def test_what_is_allowed_is_there() -> None:
-    for name, what in ALLOWED:
-        assert what in {each for _, each in inexact(ast.parse((PACKAGE / name).read_text(encoding="utf-8")))}

@@ -12,24 +12,21 @@ from omegaconf import DictConfig
 
 from fmtorch import presets
 from fmtorch.commands.config import job
-from fmtorch.core.files import conf_dir
-from fmtorch.core.types import Correspondences
-from fmtorch.data import ImagePair, ImageSource
-from fmtorch.data.pairs import GivenMatches
-from fmtorch.pipeline.build import build_pipeline, load_pipeline
-from fmtorch.pipeline.pipeline import Pipeline
+from fmtorch.core import Correspondences, conf_dir
+from fmtorch.data import GivenMatches, ImagePair, ImageSource
+from fmtorch.pipeline import Pipeline, build_pipeline, load_pipeline
 from tests.helpers import compose
 
 RATIO = "pruner.ratio.families"
 
 
 def matches(seed: int) -> GivenMatches:
-    """Forty matches whose qualities lie between 0 and 1."""
+    """Forty matches whose ratios lie between 0 and 1."""
     generator = torch.Generator().manual_seed(seed)
-    x0, x1, quality = (torch.rand(1, 40, *size, generator=generator) for size in ((2,), (2,), ()))
+    x0, x1, ratio = (torch.rand(1, 40, *size, generator=generator) for size in ((2,), (2,), ()))
     size = torch.tensor([[480, 640]])
     mask = torch.ones(1, 40, dtype=torch.bool)
-    return GivenMatches(Correspondences(600 * x0, 600 * x1, mask, size0=size, size1=size, quality=quality), (40, 40))
+    return GivenMatches(Correspondences(600 * x0, 600 * x1, mask, size0=size, size1=size, ratio=ratio), (40, 40))
 
 
 def pairs_of_families(*families: str) -> list[ImagePair]:
@@ -40,12 +37,12 @@ def pairs_of_families(*families: str) -> list[ImagePair]:
     ]
 
 
-def qualities(pipeline: Pipeline, pairs: list[ImagePair]) -> list[torch.Tensor]:
-    """The qualities of the matches that are left of each pair."""
+def ratios(pipeline: Pipeline, pairs: list[ImagePair]) -> list[torch.Tensor]:
+    """The ratios of the matches that are left of each pair."""
     ratios = []
     for outcome in pipeline.correspondences(pairs):
         c = outcome.correspondences
-        ratios.append(c.quality[c.mask])
+        ratios.append(c.ratio[c.mask])
     return ratios
 
 
@@ -54,10 +51,10 @@ def test_each_pair_of_a_batch_gets_the_options_of_its_family() -> None:
     pipeline = load_pipeline("paper/sift_ratio", overrides=options)
     pairs = pairs_of_families("KITTI", "orbit", "CPC", "mine", "Strecha")
     limits = (0.5, 0.7, 0.9, 0.5, 0.7)
-    for pair, kept, limit in zip(pairs, qualities(pipeline, pairs), limits, strict=True):
-        given = matches(int(pair.identity)).correspondences.quality
+    for pair, kept, limit in zip(pairs, ratios(pipeline, pairs), limits, strict=True):
+        given = matches(int(pair.identity)).correspondences.ratio
         assert torch.equal(kept, given[given < limit])
-        assert torch.equal(kept, qualities(pipeline, [pair])[0])
+        assert torch.equal(kept, ratios(pipeline, [pair])[0])
 
 
 def test_gms_tries_scales_on_wide_baselines_alone() -> None:

@@ -79,7 +79,7 @@ def test_version_is_stated_once_more_and_the_same() -> None:
 def test_source_distribution_builds_the_same_wheel(wheel: Path, tmp_path: Path) -> None:
     archive = _build(CHECKOUT, "sdist", tmp_path / "sdist")
     with tarfile.open(archive) as file:
-        file.extractall(tmp_path / "source", filter="data")
+        file.extractall(tmp_path / "source", **({"filter": "data"} if hasattr(tarfile, "data_filter") else {}))
     (source,) = (tmp_path / "source").iterdir()
     assert (source / "constraints.txt").is_file()
     assert (source / "tests" / "conftest.py").is_file()
@@ -125,3 +125,80 @@ def test_constraints_pin_every_declared_dependency_within_its_range() -> None:
         requirement = Requirement(text)
         if requirement.name != "fmtorch":
             assert pins[canonicalize_name(requirement.name)] in requirement.specifier, text
+
+
+PYTHONS = [f"python3.{minor}" for minor in range(11, 15)]
+
+
+def _interpreters(name: str) -> list[str]:
+    """Interpreters of this version on this machine that have pip and venv, each of a release once."""
+    roots = [Path(folder) for folder in os.environ.get("PATH", "").split(os.pathsep)]
+    roots += [path / "bin" for path in Path.home().glob(".pyenv/versions/*")]
+    found = {}
+    for root in roots:
+        if (root / name).is_file() and os.access(root / name, os.X_OK):
+            command = [str(root / name), "-c", "import sys, venv, ensurepip; print(sys.version_info[:3])"]
+            done = subprocess.run(command, capture_output=True, text=True, check=False)
+            if done.returncode == 0 and done.stdout.startswith(f"(3, {name.partition('.')[2]},"):
+                found.setdefault(done.stdout, command[0])
+    return list(found.values())
+
+
+@pytest.mark.parametrize("python", PYTHONS)
+def test_the_wheel_is_installed_on_every_python_that_is_here(wheel: Path, python: str, tmp_path: Path) -> None:
+    """Without dependencies, which some versions have no wheels of: every file compiles, the command answers."""
+    interpreters = _interpreters(python)
+    if not interpreters:
+        pytest.skip(f"there is no {python} with venv and pip")
+    for i, interpreter in enumerate(interpreters):
+        folder = tmp_path / str(i)
+        subprocess.run([interpreter, "-m", "venv", str(folder)], check=True)
+        install = [folder / "bin/pip", "install", "-q", "--no-deps", "--no-index", "--disable-pip-version-check", wheel]
+        subprocess.run(install, check=True)  # compiles every file
+        for words in (["--version"], ["--help"], ["verify", "--help"]):
+            done = subprocess.run(
+                [folder / "bin/fmtorch", *words], cwd=tmp_path, capture_output=True, text=True, check=False
+            )
+            assert (done.returncode, done.stderr) == (0, ""), words
+        assert len(list(folder.glob("lib/*/site-packages/fmtorch/**/*.pyc"))) > 200
+
+
+RELEASED = ("pyproject.toml", "fmtorch/core/version.py", "CITATION.cff", "CHANGELOG.md", "scripts/release")
+
+
+@pytest.fixture
+def release(tmp_path: Path) -> Path:
+    """A repository of what the release script looks at, the changelog dated."""
+    for name in RELEASED:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        text = (CHECKOUT / name).read_text().replace(" (unreleased)", " (2030-01-01)")
+        (tmp_path / name).write_text(text)
+    (tmp_path / "scripts/release").chmod(0o755)
+    for words in (["init", "-q"], ["add", "-A"], ["-c", "user.name=a", "-c", "user.email=a@b", "commit", "-qm", "x"]):
+        subprocess.run(["git", *words], cwd=tmp_path, check=True)
+    return tmp_path
+
+
+def _refused(folder: Path, *words: str) -> str:
+    done = subprocess.run(["scripts/release", *words], cwd=folder, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    return done.stderr
+
+
+def test_a_release_is_refused_before_anything_is_built(release: Path) -> None:
+    assert "pyproject.toml does not state 9.9.9" in _refused(release, "9.9.9")
+    version = str(_project()["version"])
+    subprocess.run(["git", "tag", f"v{version}"], cwd=release, check=True)
+    assert "is tagged already" in _refused(release, version)
+    (release / "CHANGELOG.md").write_text("")
+    assert "not committed" in _refused(release, version)
+    assert not (release / "dist").exists()
+
+
+def test_the_image_holds_what_the_wheel_is_built_of() -> None:
+    lines = (CHECKOUT / "Dockerfile").read_text().splitlines()
+    copied = {word for line in lines if line.startswith("COPY ") for word in line.split()[1:-1]}
+    allowed = {line[1:] for line in (CHECKOUT / ".dockerignore").read_text().splitlines() if line.startswith("!")}
+    assert copied == allowed
+    assert all((CHECKOUT / name).exists() for name in copied)
+    assert any("fmtorch warm-up" in line for line in lines)

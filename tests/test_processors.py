@@ -67,7 +67,7 @@ def results(given: dict[str, Any]) -> dict[str, np.ndarray]:
     for what, c in given["pairs"].items():
         for name in ESTIMATORS:
             estimate = built("estimator", name)(c, 1)
-            for field in ("F", "inliers", "ok", "draws", "significance"):
+            for field in ("F", "inliers", "ok", "samples", "significance"):
                 arrays[f"{name} of {what}: {field}"] = getattr(estimate, field)
     for name in PRUNERS:
         c = built("pruner", name)(given["many"])

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 import fmtorch
-from fmtorch.estimators.models.fundamental import SevenPoint
+from fmtorch.estimators import SevenPoint
 from tests.laws import scene
 
 PACKAGE = Path(fmtorch.__file__).parent

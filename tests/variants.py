@@ -3,11 +3,12 @@
 from typing import Any
 
 from fmtorch import presets
-from fmtorch.presets.objects import instantiate, merged
+from fmtorch.presets import instantiate, merged
 from scripts.benchmark.methods import options
 
 OTHER_LIBRARIES = (
-    "opencv", "poselib", "colmap", "kornia_ransac", "magsac_cpp", "gc_ransac_cpp", "degensac_cpp", "superansac_cpp",
+    "opencv", "poselib", "colmap", "fastpose", "kornia_ransac", "magsac_cpp", "gc_ransac_cpp", "degensac_cpp",
+    "superansac_cpp",
 )  # fmt: skip
 """Prefixes of the presets that call other libraries' estimators; of these only OpenCV's keep the laws."""
 METHODS = ("lmeds", "usac_default", "usac_fast", "usac_accurate", "usac_prosac", "usac_magsac")

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
+from pathlib import Path
 from typing import Any
 
 import fmtorch
@@ -18,7 +20,10 @@ myst_heading_anchors = 3
 myst_enable_extensions = ["colon_fence"]
 suppress_warnings = ["myst.header"]
 
-autodoc_typehints = "none"  # shapes stand in the docstrings
+autodoc_typehints = "signature"
+autodoc_typehints_format = "short"
+python_maximum_signature_line_length = 88
+autodoc_preserve_defaults = True
 autodoc_member_order = "bysource"
 napoleon_google_docstring = True
 napoleon_numpy_docstring = False
@@ -26,6 +31,13 @@ napoleon_numpy_docstring = False
 html_theme = "furo"
 html_title = "fmtorch"
 html_copy_source = False
+html_static_path = ["static"]
+html_css_files = ["site.css"]
+html_js_files = ["copy.js"]
+
+FRONT = """<!doctype html><meta charset="utf-8"><title>fmtorch</title>
+<meta http-equiv="refresh" content="0; url=docs/index.html"><a href="docs/index.html">fmtorch</a>
+"""
 
 
 def _plain_text(app: object, what: str, name: str, obj: object, options: object, lines: list[str]) -> None:
@@ -41,6 +53,45 @@ def _plain_text(app: object, what: str, name: str, obj: object, options: object,
         lines[i] = "".join(code_and_text)
 
 
+def _fields(app: object, what: str, name: str, obj: Any, options: object, lines: list[str]) -> None:
+    """What a record's docstring says of its fields, ``name, name: text.``, as a list with types and defaults."""
+    if what != "class" or not dataclasses.is_dataclass(obj):
+        return
+    fields = {field.name: field for field in dataclasses.fields(obj)}
+    listed = "|".join(fields)
+    text = " ".join(line.strip() or "\0" for line in lines)
+    said = re.split(rf"(?<!\S)((?:{listed})(?:, (?:{listed}))*(?: \([^()]*\))?): ", text)
+    about = {}
+    for names, words in zip(said[1::2], said[2::2], strict=True):
+        about[names] = words.partition("\0")[0].strip()
+    rest = [said[0], *(words.partition("\0")[2] for words in said[2::2])]
+    paragraphs = [part.strip() for each in rest for part in each.split("\0") if part.strip()]
+    entries = []
+    for names, words in about.items():
+        first = re.split(r"[ ,]", names)[0]
+        entries += [f"- **{names}** : ``{_type(fields[first].type)}``", f"  -- {words}"]
+    named = {name for names in about for name in re.findall(r"\w+", names)}
+    entries += [f"- **{key}** : ``{_type(field.type)}``" for key, field in fields.items() if key not in named]
+    lines[:] = [line for part in paragraphs for line in (part, "")] + entries + [""]
+
+
+def _type(annotation: Any) -> str:
+    """``Float (b, n, 2)`` of ``Float[Tensor, "b n 2"]``."""
+    text = annotation if isinstance(annotation, str) else getattr(annotation, "__name__", str(annotation))
+    text = re.sub(r"Annotated\[(.*), \w+\]", r"\1", text)
+    return re.sub(
+        r"(\w+)\[Tensor, ['\"]([^'\"]*)['\"]\]", lambda match: f"{match[1]} ({', '.join(match[2].split())})", text
+    )
+
+
+def _front(app: Any, error: Exception | None) -> None:
+    """The site's own index.html, which leads to the first page."""
+    if error is None and app.builder.format == "html":
+        (Path(app.outdir) / "index.html").write_text(FRONT, encoding="utf-8")
+
+
 def setup(app: Any) -> None:
     """Called by Sphinx."""
+    app.connect("autodoc-process-docstring", _fields, priority=100)
+    app.connect("build-finished", _front)
     app.connect("autodoc-process-docstring", _plain_text, priority=1000)

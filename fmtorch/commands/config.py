@@ -1,10 +1,10 @@
 """How a command runs: Hydra composes its config, and a user's mistake ends it with one line and status 1."""
 
-from __future__ import annotations
-
 import functools
+import pdb
 import re
 import sys
+import traceback
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
@@ -21,13 +21,13 @@ from omegaconf import DictConfig
 from omegaconf.errors import GrammarParseError, OmegaConfBaseException
 
 from fmtorch.commands.options import COMMANDS, Command
+from fmtorch.core.failures import own_traceback
 from fmtorch.core.files import STAGES, conf_dir
 from fmtorch.core.options import nearest
-from fmtorch.core.terminal import MISTAKES, error_line, exits_with_message
+from fmtorch.core.terminal import MISTAKES, error_line, errors, exits_with_message
 from fmtorch.presets import available
-from fmtorch.presets.fields import path_fields
+from fmtorch.presets.composition import path_fields, with_explicit
 from fmtorch.presets.files import groups
-from fmtorch.presets.pruners import with_explicit
 
 Task = Callable[[DictConfig], None]
 SUBMITTED = "jobs run in other processes; what each prints: .submitit/JOB/JOB_0_log.out below hydra.sweep.dir (runs)"
@@ -40,7 +40,6 @@ class Mistake(ValueError):
 
 
 def _register(command: Command) -> None:
-    """Have Hydra know the config of a command by its name."""
     quiet = [{f"override hydra/{part}_logging": "none"} for part in ("hydra", "job")]
     own = {"output_subdir": None, "run": {"dir": "."}, "sweep": {"dir": command.sweeps, "subdir": "."}}
     defaults = [*({group: name} for group, name in command.groups.items()), "_self_", *quiet]
@@ -59,7 +58,13 @@ def job(task: Task) -> Task:
         try:
             _expect_known(HydraConfig.get().overrides.task)
             task(with_explicit(config, HydraConfig.get().overrides.task))
-        except MISTAKES as error:
+        except Exception as error:
+            if config.get("debug"):
+                _debugged(error, config.debug == "pdb")
+            if trace := own_traceback(error):
+                errors.print(trace, markup=False, highlight=False, soft_wrap=True)
+            if not (trace or isinstance(error, MISTAKES)):
+                raise
             if HydraConfig.get().mode == RunMode.MULTIRUN:
                 raise Mistake(error_line(error)) from None
             sys.exit(f"error: {error_line(error)}")
@@ -67,11 +72,23 @@ def job(task: Task) -> Task:
     return wrapped
 
 
+def _debugged(error: Exception, interactive: bool) -> None:
+    """Show all of a traceback, and what it leads to in the debugger if wanted; ends the command."""
+    traceback.print_exception(error)
+    if interactive:
+        pdb.post_mortem(error.__traceback__)
+    sys.exit(1)
+
+
 def chosen_pipeline() -> tuple[str, list[str]]:
     """The name of the pipeline's preset that runs, and what the command line changes of its stages."""
     config = HydraConfig.get()
     changed = [word for word in config.overrides.task if word.lstrip("+~").startswith(tuple(STAGES))]
-    return str(config.runtime.choices["pipeline"]), changed
+    groups = dict(word.split("=", 1) for word in changed if word.partition("=")[0] in STAGES)
+    if len(groups) < len(STAGES):
+        return str(config.runtime.choices["pipeline"]), changed
+    names = [name for group in STAGES for name in groups[group].strip("[]").split(",")]  # nothing is the pipeline's
+    return "-".join(dict.fromkeys(names)), [word for word in changed if word.partition("=")[0] not in STAGES]
 
 
 def run_command(command: Command, task: Task) -> None:
@@ -111,13 +128,14 @@ def explained(error: HydraException | OmegaConfBaseException, command: str) -> s
     cause = error
     while isinstance(cause.__cause__, HydraException | OmegaConfBaseException):
         cause = cause.__cause__
-    parent = getattr(cause, "parent_node", None)
+    parent, options = getattr(cause, "parent_node", None), COMMANDS[command].names
     if isinstance(cause, GrammarParseError):
         return f"{cause.full_key}: {_line(str(cause.msg))}"
     if isinstance(cause, OmegaConfBaseException) and cause.full_key:
         names = [str(key) for key in parent] if isinstance(parent, DictConfig) else []
         if parent is not None and cause.key is not None and str(cause.key) not in names:
-            names = [name for name in names if name != "hydra"]
+            names = [name for name in names if not name.startswith(("hydra", "_"))]
+            names = names if "." in cause.full_key else options
             return f"no option {cause.full_key}; there are: {nearest(str(cause.key), names) or 'none'}"
         return f"{cause.full_key}: {_line(str(cause.msg or cause))}"
     unknown = re.search(r"[Cc]ould not override '([^']+)'", str(error))
@@ -158,8 +176,10 @@ def hydra_arguments(words: Sequence[str], paths: Sequence[str], positional: Sequ
 
 
 def _split(words: Sequence[str]) -> tuple[list[str], list[str]]:
-    """The flags with their values, and all others."""
-    takes_value = {name for action in get_args_parser()._actions if action.nargs != 0 for name in action.option_strings}
+    """The flags with their values, and all others. Raises ValueError for an option with dashes (``--limit 5``)."""
+    actions = get_args_parser()._actions
+    takes_value = {name for action in actions if action.nargs != 0 for name in action.option_strings}
+    known = tuple(name for action in actions for name in action.option_strings)
     flags: list[str] = []
     others: list[str] = []
     rest = list(words)
@@ -170,6 +190,11 @@ def _split(words: Sequence[str]) -> tuple[list[str], list[str]]:
         if not word.startswith("-"):
             others.append(word)
             continue
+        name, given, value = word.partition("=")
+        if name.startswith("--") and not any(flag.startswith(name) for flag in known):
+            option = name.lstrip("-").replace("-", "_")
+            value = value if given else rest[0] if rest and not rest[0].startswith("-") else "VALUE"
+            raise ValueError(f"{name}: options have no dashes: {option}={value}")
         flags.append(word)
         if word in takes_value and rest and not (word in ("-i", "--info") and "=" in rest[0]):
             flags.append(rest.pop(0))
@@ -181,7 +206,6 @@ def _is_positional(word: str) -> bool:
 
 
 def _named(placed: list[str], positional: Sequence[str]) -> Iterator[str]:
-    """Positional arguments with the names of their fields."""
     if not placed:
         return
     names = ", ".join(name.removesuffix("...") for name in positional)

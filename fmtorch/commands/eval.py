@@ -1,10 +1,10 @@
 """`python -m fmtorch.eval pipeline=sift_ratio`: run a pipeline over a data set of image pairs and evaluate it."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import os
+import sys
+import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -14,26 +14,23 @@ from omegaconf import DictConfig
 from fmtorch import data, presets
 from fmtorch.commands.config import chosen_pipeline, job, run_command
 from fmtorch.commands.options import EVAL, EvalOptions
+from fmtorch.commands.report import by_dataset, named
 from fmtorch.core.files import replacing
-from fmtorch.core.terminal import console, progress_bars, reporter
+from fmtorch.core.terminal import console, errors, progress_bars, reporter
 from fmtorch.data import ImagePair, PairDataset
 from fmtorch.evaluation.curves import picture
-from fmtorch.evaluation.identity import run_identity
-from fmtorch.evaluation.pair_cameras import built_with, cameras_of
-from fmtorch.evaluation.run import evaluate_pairs, select
-from fmtorch.evaluation.summary import ALL, Group, summarize
+from fmtorch.evaluation.run import built_with, cameras_of, evaluate_pairs, run_identity, select
+from fmtorch.evaluation.statistics import ALL, Group, summarize
 from fmtorch.evaluation.tables import summary_markdown, terminal_tables
 from fmtorch.io.export import export_kinds, write_exports
 from fmtorch.io.match_store import MatchStore
-from fmtorch.jobs.execution import MIN_PAIRS_FOR_PROCESSES, shard_of
-from fmtorch.pipeline.build import build_pipeline
+from fmtorch.jobs.execution import MIN_PAIRS_FOR_PROCESSES, Execution, shard_of
 from fmtorch.pipeline.exporting import exportable
-from fmtorch.pipeline.pipeline import Pipeline
-from fmtorch.presets import plain
-from fmtorch.presets.executors import execution_of
-from fmtorch.presets.fields import read_fields
-from fmtorch.runs import RunFolder, identity_digest
-from fmtorch.runs.feature_cache import CachedFeatures
+from fmtorch.pipeline.pipeline import Pipeline, build_pipeline
+from fmtorch.presets.composition import execution_of, plain, read_fields
+from fmtorch.runs import CachedFeatures, RunFolder, identity_digest
+
+SWEPT = "FMTORCH_SWEPT"  # names the file in which the jobs of a sweep note their run folders
 
 
 def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -> Path:
@@ -61,10 +58,14 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
         pairs = select([dataset[i] for i in range(len(dataset))], fields.limit)
         journal = _journal(folder.path, pairs) if exports else None
         own = pairs if shard is None else shard.of(pairs)
-        todo = _missing(own, folder, journal)
+        todo = _missing(own, folder, journal, again=bool(fields.debug))
         bar = progress.add_task(pipeline_name, total=len(own), completed=len(own) - len(todo))
-        for count in _evaluated(config, fields, pipeline, todo, folder, journal):
-            progress.advance(bar, count)
+        try:
+            for count in _evaluated(config, fields, pipeline, todo, folder, journal):
+                progress.advance(bar, count)
+        except KeyboardInterrupt:
+            kept = len({pair.key for pair in own} & folder.done())
+            raise KeyboardInterrupt(f"{kept} of {len(own)} pairs are kept in {folder.path}") from None
     if len(todo) < len(own):
         earlier = f"{len(own) - len(todo)} of {len(own)} pairs taken from an earlier run in {folder.path}"
         console.print(earlier, markup=False, highlight=False)
@@ -81,26 +82,31 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
         console.print(f"{folder.path}: {', '.join(written)}; names of images are below {journal.root}", style="dim")
     if isinstance(pipeline.extractor, CachedFeatures):
         console.print(pipeline.extractor.report(), style="dim")
+    for reason, trace in pipeline.tracebacks.items():
+        errors.print(f"{reason}\n{trace}".strip(), markup=False, highlight=False, soft_wrap=True)
     if pairs and summary[ALL]["failures"] == len(pairs):
         reason = next(iter(table["reason"].to_pylist()))
-        raise ValueError(
-            f"every pair failed, the first because: {reason}. Once that is mended, delete {folder.path} to run again"
-        )
+        again = f"once that is mended, delete {folder.path} to run again"
+        if folder.config.get("code"):
+            again = f"an edit of your parts makes a new run; mended otherwise, delete {folder.path} to run again"
+        raise ValueError(f"every pair failed, the first because: {reason}; {again}")
     return folder.path
 
 
 def _open_folder(
     config: DictConfig, fields: EvalOptions, pipeline_name: str, pipeline: Pipeline, dataset: PairDataset
 ) -> RunFolder:
-    """The folder of the run with this identity, its `run_dir` if given, new or to be continued."""
     identity = run_identity(config, pipeline_name, pipeline, dataset.digest, fields.cameras, fields.pose.signed)
     name = f"{pipeline_name.replace('/', '-')}-{identity_digest(identity)[:8]}"
-    return RunFolder.open(fields.run_dir or Path(f"runs/{dataset.name}/{name}"), identity)
+    return RunFolder.open(fields.output or Path(f"runs/{dataset.name}/{name}"), identity)
 
 
-def _missing(pairs: Sequence[ImagePair], folder: RunFolder, journal: MatchStore | None) -> list[ImagePair]:
-    """The pairs that have no row yet, or whose matches are to be exported and not in the journal."""
+def _missing(pairs: Sequence[ImagePair], folder: RunFolder, journal: MatchStore | None, again: bool) -> list[ImagePair]:
+    """The pairs that have no row yet, or whose matches are to be exported and not in the journal; again: or failed."""
     done = folder.done()
+    if again and done:
+        table = folder.read(done, without=("pair", "F"))
+        done = set(table["key"].filter(table["ok"]).to_pylist())
     return [p for p in pairs if p.key not in done or (journal is not None and _to_export(journal, p))]
 
 
@@ -108,9 +114,10 @@ def _evaluated(
     config: DictConfig, fields: EvalOptions, pipeline: Pipeline, pairs: Sequence[ImagePair], folder: RunFolder,
     journal: MatchStore | None,
 ) -> Iterator[int]:  # fmt: skip
-    """Evaluates pairs into the folder and the journal; yields how many were done since."""
     parallel = len(pairs) >= MIN_PAIRS_FOR_PROCESSES and pipeline.device.type == "cpu"
     execution = execution_of(config, fields.workers, fields.processes).decided(parallel)
+    if fields.debug:
+        execution = Execution(workers=1)
     if execution.shared and execution.workers is None and pipeline.device.type != "cpu":
         execution = dataclasses.replace(execution, workers=1)
     build = None if execution.shared else functools.partial(build_pipeline, config, pipeline.device, None)
@@ -134,10 +141,14 @@ def _summarize(table: pa.Table, folder: RunFolder, title: str, signed: bool) -> 
     with replacing(folder.path / "recall.svg") as path:
         path.write_text(picture(title.partition(" ")[0], run_table), encoding="utf-8")
     part = "" if len(run_table) == len(table) else f", {len(table)} of the {len(run_table)} pairs of the run"
-    for each in terminal_tables(summary, f"{title}{part}"):
+    for each in terminal_tables(summary, f"{title}{part}", console.width):
         console.print(each)
     about = f"; of all {len(run_table)} pairs" if part else ""
-    console.print(f"{folder.path}: pairs/, summary.json, summary.md, recall.svg{about}", style="dim")
+    written = f"{folder.path}: pairs/, summary.json, summary.md, recall.svg{about}"
+    console.print(written, style="dim", highlight=False, soft_wrap=True)
+    if file := os.environ.get(SWEPT):
+        with open(file, "a", encoding="utf-8") as swept:
+            swept.write(f"{folder.path.absolute()}\n")
     return summary
 
 
@@ -162,5 +173,24 @@ def task(config: DictConfig) -> None:
 
 
 def main() -> None:
-    """The command."""
-    run_command(EVAL, task)
+    """The command; a sweep ends with one table of all its runs."""
+    if not {"-m", "--multirun"} & set(sys.argv[1:]):
+        run_command(EVAL, task)
+        return
+    with tempfile.NamedTemporaryFile("r", suffix=".txt", encoding="utf-8") as swept:
+        os.environ[SWEPT] = swept.name  # which jobs in other processes have as well
+        try:
+            run_command(EVAL, task)
+        finally:
+            del os.environ[SWEPT]
+            _print_sweep(swept.read().splitlines())
+
+
+def _print_sweep(folders: Sequence[str]) -> None:
+    """A table of runs for each data set."""
+    paths = list(dict.fromkeys(folders))
+    runs = named([RunFolder.load(path) for path in paths]) if len(paths) > 1 else []
+    for heading, group in by_dataset(runs).items():
+        figures = {r.name: summarize(r.table, r.folder.config.get("pose") is not None)[ALL] for r in group}
+        for table in terminal_tables(figures, f"{len(group)} runs on {heading}", console.width):
+            console.print(table)

@@ -1,7 +1,5 @@
 """`fmtorch list [GROUP ...]`: the presets that there are, with what each is."""
 
-from __future__ import annotations
-
 import sys
 
 from fmtorch.core.files import conf_dir

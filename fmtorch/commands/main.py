@@ -46,7 +46,9 @@ def main(words: Sequence[str] | None = None) -> None:
     elif name == "--version" or ("--version" in rest and not own_help):
         print(__version__)
     elif name not in SUMMARIES:
-        sys.exit(f"error: no command {name!r}; there are: {', '.join(SUMMARIES)}")
+        from fmtorch.core.options import nearest
+
+        sys.exit(f"error: no command {name!r}; there are: {nearest(name, SUMMARIES)}")
     elif {"--help", "-h"} & set(rest) and not own_help:
         from fmtorch.commands.options import COMMANDS
 
@@ -59,7 +61,6 @@ def main(words: Sequence[str] | None = None) -> None:
 
 
 def _command(name: str) -> Callable[[], None]:
-    """What runs a command; with it come the libraries that it needs."""
     if name == "eval":
         from fmtorch.commands.eval import main
     elif name == "list":
@@ -86,7 +87,8 @@ def help_text(command: Command) -> str:
     places = "".join(f" [{name.removesuffix('...').upper()}]" for name in command.positional)
     summary = SUMMARIES[command.name]
     about = f"{summary[0].upper()}{summary[1:]}.\n{command.about}"
-    groups = [_line(name, value, command.group_help.get(name, "")) for name, value in command.groups.items()]
+    presets = {**command.groups, **_replaced(str(command.groups.get("pipeline", "")))}
+    groups = [_line(name, value, command.group_help.get(name, "")) for name, value in presets.items()]
     options = [
         _line(field.name, command.defaults[field.name], str(field.metadata["about"]))
         for field in dataclasses.fields(command.options)
@@ -99,6 +101,18 @@ def help_text(command: Command) -> str:
         FOOTER,
     ]
     return "\n\n".join(filter(None, parts))
+
+
+def _replaced(pipeline: str) -> dict[str, str]:
+    """The presets that a pipeline's file puts in place of those of each stage; of no name nothing."""
+    import re
+
+    from fmtorch.core.files import conf_dir
+
+    if not pipeline:
+        return {}
+    text = (conf_dir() / "pipeline" / f"{pipeline}.yaml").read_text(encoding="utf-8")
+    return dict(re.findall(r"override /(\w+): (.+)", text))
 
 
 def _line(name: str, value: Any, about: str) -> str:

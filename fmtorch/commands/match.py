@@ -1,17 +1,16 @@
-"""What `fmtorch match` is told of cameras: ``cameras=exif``, ``cameras=FILE``, ``K=fx,fy,cx,cy``."""
-
-from __future__ import annotations
+"""`fmtorch match`: the fundamental matrix of two photographs, with pictures; or the pairs of a folder of images."""
 
 import contextlib
 import dataclasses
+import functools
 import hashlib
 import json
 import math
-from collections.abc import Sequence
+import shutil
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -20,24 +19,144 @@ from rich.table import Table
 
 from fmtorch import presets
 from fmtorch.commands.config import chosen_pipeline, job, run_command
-from fmtorch.commands.match_folder import match_folder
 from fmtorch.commands.options import MATCH, MatchOptions
 from fmtorch.core.files import expect_writable, replacing
-from fmtorch.core.terminal import console, errors
+from fmtorch.core.settings import canonical, head
+from fmtorch.core.stages import ImageMatcher
+from fmtorch.core.terminal import console, errors, progress_bars
 from fmtorch.core.types import RELATED
 from fmtorch.core.version import __version__
-from fmtorch.data.images import read_image
-from fmtorch.data.lenses import undistorted
-from fmtorch.evaluation.pictures import draw_epipolar_lines, draw_matches
+from fmtorch.data.images import read_image, stored_orientation
+from fmtorch.evaluation.curves import view_graph_svg
+from fmtorch.features.vlad import descriptor_kind, image_vector
+from fmtorch.io.export import ViewGraph, export_kinds, view_graph, write_exports, write_view_graph
+from fmtorch.io.match_store import MatchStore
+from fmtorch.jobs.execution import MIN_PAIRS_FOR_PROCESSES
 from fmtorch.metrics import nsgd
-from fmtorch.pipeline.build import build_pipeline
-from fmtorch.pipeline.folder import EXHAUSTIVE
-from fmtorch.pipeline.photograph_cameras import PhotographCameras
-from fmtorch.pipeline.pipeline import Pipeline
-from fmtorch.pipeline.reduced_images import Image
-from fmtorch.pipeline.two_images import MatchResult, match
-from fmtorch.presets.fields import read_fields
-from fmtorch.runs.feature_cache import CachedFeatures
+from fmtorch.pipeline.folder import (
+    EXHAUSTIVE,
+    MEMORY,
+    SIMILAR,
+    FolderMatches,
+    chosen_pairs,
+    count_of,
+    default_output,
+    folder_workers,
+    images_below,
+    open_folder,
+    similar_pairs,
+    vectors_of,
+)
+from fmtorch.pipeline.match_result import MatchResult
+from fmtorch.pipeline.photographs import Image, PhotographCameras
+from fmtorch.pipeline.pipeline import Pipeline, build_pipeline
+from fmtorch.pipeline.two_images import match
+from fmtorch.presets.composition import execution_of, read_fields
+from fmtorch.runs.feature_cache import CachedFeatures, cached
+from fmtorch.runs.fingerprint import fmtorch_version
+
+# `fmtorch match images=FOLDER export=h5,colmap`: the pairs of a folder of images, for other programs
+
+
+def match_folder(
+    config: DictConfig, fields: MatchOptions, cameras: PhotographCameras, pipeline_name: str, overrides: Sequence[str]
+) -> Path:
+    """Match the pairs of a folder of images, write what is to be exported and return the folder with it.
+
+    Raises ValueError for what the options cannot mean, and where no pair could be matched.
+    """
+    folder = fields.images
+    assert folder is not None
+    kinds = export_kinds(fields.export)
+    if fields.camera == "shared" and "colmap" not in kinds:
+        raise ValueError("camera=shared needs export=colmap; cameras=shared is what is known of the photographs")
+    images = images_below(folder)
+    similar = count_of(fields.pairs, SIMILAR)
+    pairs = [] if similar else chosen_pairs(folder, images, fields.pairs)
+    presets.expect_stages(config)
+    stages = presets.stages(config)
+    vector = functools.partial(image_vector, kind=descriptor_kind(stages["features"])) if similar else None
+    pipeline: Pipeline = build_pipeline(config, presets.resolve_device(fields.device))
+    if isinstance(pipeline.matcher, ImageMatcher):
+        raise ValueError("images: a folder is matched by keypoints of each image; this matcher takes pairs of images")
+    output = fields.output or default_output(folder)
+    identity = {
+        "version": fmtorch_version(), "images": str(folder.absolute()), **stages, "seed": fields.seed,
+        "orient": fields.orient, "longest_side": fields.longest_side, **cameras.identity,
+    }  # fmt: skip
+    journal = MatchStore(open_folder(output, identity), folder)
+    scratch = journal.folder / "features"
+    if len(images) > MEMORY and not isinstance(pipeline.extractor, CachedFeatures):  # none is computed twice
+        pipeline.extractor = cached(pipeline.extractor, scratch)
+    console.print(f"{' '.join([pipeline_name, *overrides])}: {folder}", style="italic", markup=False, highlight=False)
+    count = len(images) * similar if similar else len(pairs)
+    many = count >= MIN_PAIRS_FOR_PROCESSES and pipeline.device.type == "cpu"
+    execution = execution_of(config, fields.workers).decided(many)
+    build = None if execution.shared else functools.partial(build_pipeline, config, pipeline.device)
+    with folder_workers(pipeline, execution) as workers, progress_bars() as progress:
+        work = FolderMatches(
+            pipeline, journal, fields.longest_side, fields.orient, fields.seed,
+            workers=workers, build=build, cameras=cameras,
+        )  # fmt: skip
+        if similar and vector is not None:
+            seen = progress.track(work.images(images), len(images), description="images")
+            pairs = similar_pairs(images, vectors_of(seen, vector), similar)
+        for _ in progress.track(work.each(pairs), len(pairs), description=pipeline_name):
+            pass
+    shutil.rmtree(scratch, ignore_errors=True)
+    _expect_some(work, len(pairs))
+    graph = view_graph(journal, images, pairs)
+    shared = fields.camera == "shared" or cameras.word == "shared"
+    written = ["export.json", *write_exports(journal, pairs, kinds, output, shared)]
+    written += [*write_view_graph(graph, output), _draw_graph(graph, folder, fields.orient, output)]
+    _say(work, graph, len(pairs))
+    console.print(f"{output}: {', '.join(written)}", style="dim", markup=False, highlight=False)
+    if "colmap" in kinds and fields.orient:
+        _say_turned(images, folder)
+    if isinstance(pipeline.extractor, CachedFeatures) and pipeline.extractor.cache.folder != scratch:
+        console.print(pipeline.extractor.report(), style="dim", markup=False, highlight=False)
+    return output
+
+
+def _expect_some(work: FolderMatches, pairs: int) -> None:
+    for trouble in work.troubles:
+        errors.print(trouble, style="bold", markup=False, highlight=False, soft_wrap=True)
+    if work.taken:
+        console.print(f"{work.taken} of {pairs} pairs taken from an earlier run", highlight=False)
+    if work.troubles and not work.done + work.taken:
+        raise ValueError(f"no pair could be matched, the first because: {work.troubles[0]}")
+
+
+def _say(work: FolderMatches, graph: ViewGraph, pairs: int) -> None:
+    sizes = [len(part) for part in graph.components() if len(part) > 1]
+    apart = len(graph.images) - sum(sizes)
+    console.print(f"{work.related} of {pairs} pairs show one scene", highlight=False)
+    if sizes:
+        others = f"; {apart} images are in no related pair" if apart else ""
+        console.print(f"connected images: {', '.join(map(str, sizes))}{others}", highlight=False)
+
+
+def _say_turned(images: Sequence[Path], folder: Path) -> None:
+    turned = [image.relative_to(folder).as_posix() for image in images if stored_orientation(image) != 1]
+    if turned:
+        console.print(
+            f"turned by their orientation tags: {head(turned)}. Keypoints and cameras in database.db are those of the "
+            "turned images, from which COLMAP's mapper works; but COLMAP reads files as they are stored, so that its "
+            "colours, undistorted images and dense reconstruction will not fit. Turn the files, or use orient=false",
+            highlight=False,
+        )
+
+
+def _draw_graph(graph: ViewGraph, folder: Path, orient: bool, output: Path) -> str:
+    def read(name: str) -> NDArray[np.uint8] | None:
+        try:
+            return read_image(folder / name, orient=orient)
+        except (OSError, ValueError):
+            return None
+
+    with replacing(output / "graph.svg") as path:
+        path.write_text(view_graph_svg(graph, read), encoding="utf-8")
+    return "graph.svg"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -47,14 +166,6 @@ class Photographs:
     images: tuple[Image, Image]
     knowledge: dict[str, Any]
     notes: tuple[str, ...] = ()
-
-    @property
-    def pinholes(self) -> tuple[Image, Image]:
-        """The photographs without the distortion of their lenses."""
-        lenses = [self.knowledge.get(f"lens{i}") for i in (0, 1)]
-        bent = zip(self.images, lenses, strict=True)
-        image0, image1 = (image if lens is None else undistorted(image, lens) for image, lens in bent)
-        return image0, image1
 
 
 def photographs(
@@ -78,16 +189,6 @@ def photographs(
     camera0, camera1 = (known.of(path, (image.shape[0], image.shape[1])) for path, image in ends)
     notes = tuple(filter(None, (camera0.note, camera1.note)))
     return Photographs((image0, image1), known.knowledge(camera0, camera1), notes)
-
-
-def pose_report(result: MatchResult) -> dict[str, Any]:
-    """R, t and focal lengths of result.json; None where they are not determined, nothing where nobody asked."""
-    if result.R is None or result.t is None or result.focals is None:
-        return {}
-    determined = result.ok and bool(torch.isfinite(result.R).all())
-    focals = [focal if math.isfinite(focal) else None for focal in result.focals.tolist()]
-    R, t = (value.tolist() if determined else None for value in (result.R, result.t))
-    return {"R": R, "t": t, "focals": focals}
 
 
 def pose_line(result: MatchResult) -> str:
@@ -119,33 +220,39 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
         if fields.image0 is not None or fields.image1 is not None or fields.truth is not None:
             raise ValueError("images takes a folder; image0, image1 and truth are of a single pair")
         return match_folder(config, fields, PhotographCameras(fields.cameras, fields.K), pipeline_name, overrides)
+    if fields.camera != "per_image":
+        raise ValueError(
+            f"camera is of a folder's database; cameras={fields.camera} is what is known of two photographs"
+        )
     if fields.export is not None or str(fields.pairs or EXHAUSTIVE) != EXHAUSTIVE:
         raise ValueError("export and pairs are of a folder of images: give images=FOLDER")
-    paths = [_given(fields.image0, "image0"), _given(fields.image1, "image1")]
+    paths = _given(fields.image0, fields.image1)
     presets.expect_stages(config)
     truth = None if fields.truth is None else read_matrix(fields.truth)
     given = photographs(paths, fields.cameras, fields.K, fields.orient)
     image0, image1 = given.images
-    folder = fields.output or _default_output(paths)
+    settings = {
+        "pipeline": pipeline_name, "overrides": list(overrides), "seed": fields.seed, "orient": fields.orient,
+        "longest_side": fields.longest_side, "truth": None if fields.truth is None else str(fields.truth),
+        "cameras": PhotographCameras(fields.cameras, fields.K).identity.get("cameras"),
+    }  # fmt: skip
+    folder = fields.output or _default_output(paths, settings)
     expect_writable(folder)
     pipeline: Pipeline = build_pipeline(config, presets.resolve_device(fields.device))
     result = match(
         image0, image1, pipeline=pipeline, longest_side=fields.longest_side, seed=fields.seed, **given.knowledge
     )
-    report = {
-        "version": __version__, "pipeline": pipeline_name, "overrides": list(overrides), "seed": fields.seed,
-        "image0": str(paths[0]), "image1": str(paths[1]),
-        **_report(result, image0, image1, truth), **pose_report(result),
-    }  # fmt: skip
-    with replacing(folder / "result.json") as path:
-        path.write_text(json.dumps(report) + "\n")
-    written = ["result.json", *_draw(folder, result, given, truth)]
+    error = None if truth is None or not result.ok else _nsgd(result, truth)
+    report = {"version": __version__, **settings, "image0": str(paths[0]), "image1": str(paths[1])}
+    written = result.save(folder, truth=truth, report=report | ({} if error is None else {"nsgd": error}))
     heading = f"{' '.join([pipeline_name, *overrides])}: {paths[0].name}, {paths[1].name}"
     console.print(heading, style="italic", markup=False, highlight=False)
     extractor = pipeline.extractor
     console.print(_table(result, isinstance(extractor, CachedFeatures) and not extractor.computed))
-    if "nsgd" in report:
-        console.print(f"NSGD to the true F: {report['nsgd']:.4f}", highlight=False)
+    if result.related:
+        console.print(_verdict(result), style="bold", highlight=False, soft_wrap=True)
+    if error is not None:
+        console.print(f"NSGD to the true F: {error:.4f}", highlight=False)
     if line := pose_line(result):
         console.print(line, highlight=False)
     for trouble in (*given.notes, *_troubles(result)):
@@ -175,85 +282,51 @@ def read_matrix(path: Path) -> NDArray[np.float64]:
     return F
 
 
-def _given(path: Path | None, name: str) -> Path:
-    if path is None:
-        raise ValueError(f"{name} is missing; give two image files: fmtorch match a.jpg b.jpg")
-    return path
+def _given(*images: Path | None) -> list[Path]:
+    """The two photographs. Raises ValueError where one is missing, or a folder stands for it."""
+    for path in filter(None, images):
+        if path.is_dir():
+            raise ValueError(f"{path} is a folder; fmtorch match images={path} matches its images with one another")
+    paths = []
+    for name, image in zip(("image0", "image1"), images, strict=True):
+        if image is None:
+            raise ValueError(f"{name} is missing; give two image files: fmtorch match a.jpg b.jpg")
+        paths.append(image)
+    return paths
 
 
-def _default_output(paths: Sequence[Path]) -> Path:
-    """``matches/NAME0-NAME1``, with some digits behind where that holds what was found of others of these names."""
+def _default_output(paths: Sequence[Path], settings: Mapping[str, Any]) -> Path:
+    """``matches/NAME0-NAME1``, with some digits behind where that holds other images of these names or settings."""
     folder = Path(f"matches/{paths[0].stem}-{paths[1].stem}")
     with contextlib.suppress(OSError, ValueError, KeyError):
         earlier = json.loads((folder / "result.json").read_text())
-        if [Path(earlier[name]).absolute() for name in ("image0", "image1")] != [path.absolute() for path in paths]:
-            identity = "\0".join(str(path.absolute()) for path in paths)
+        images = [str(path.absolute()) for path in paths]
+        same = [str(Path(earlier[name]).absolute()) for name in ("image0", "image1")] == images
+        if not same or any(earlier.get(name) != value for name, value in settings.items()):
+            identity = canonical({"images": images, **settings})
             return folder.with_name(f"{folder.name}-{hashlib.blake2b(identity.encode(), digest_size=4).hexdigest()}")
     return folder
 
 
-def _report(result: MatchResult, image0: Image, image1: Image, truth: NDArray[np.float64] | None) -> dict[str, Any]:
-    """What result.json holds of a result; points in pixels of the images."""
+def _nsgd(result: MatchResult, truth: NDArray[np.float64]) -> float:
     c = result.correspondences
-    report: dict[str, Any] = {
-        "size0": image0.shape[:2], "size1": image1.shape[:2],
-        "F": result.F.tolist() if result.ok else None, "reason": result.reason, "warning": result.warning,
-        "configuration": result.configuration or None,
-        "homography": None if result.homography is None else result.homography.tolist(),
-        "related": result.related, "significance": result.significance if math.isfinite(result.significance) else None,
-        "features": [len(result.keypoints0), len(result.keypoints1)],
-        "matches": result.counts, "seconds": result.seconds,
-        "x0": c.x0[0].tolist(), "x1": c.x1[0].tolist(), "inliers": result.inliers.tolist(),
-        "ratio": None if c.quality is None else c.quality[0].tolist(),
-    }  # fmt: skip
-    if (pinhole := result.undistorted) is not None:
-        report |= {"undistorted_x0": pinhole.x0[0].tolist(), "undistorted_x1": pinhole.x1[0].tolist()}
-    if truth is not None and result.ok:
-        sizes = (torch.tensor([image.shape[:2]]) for image in (image0, image1))
-        report["nsgd"] = float(nsgd(torch.from_numpy(truth)[None], result.F.cpu()[None], *sizes)[0])
-    return report
+    sizes = (torch.as_tensor(size).cpu() for size in (c.size0, c.size1))
+    return float(nsgd(torch.from_numpy(truth)[None], result.F.cpu()[None], *sizes)[0])
 
 
-def _draw(folder: Path, result: MatchResult, given: Photographs, truth: NDArray[np.float64] | None) -> list[str]:
-    """Draw the pictures into the folder, matches in the photographs and epipolar lines in pinholes; their names."""
-    image0, image1 = given.images
-    x0, x1 = (x[0].cpu().numpy().astype(np.float64) for x in (result.putative.x0, result.putative.x1))
-    kept = result.kept.cpu().numpy()
-    good = kept.copy()
-    if result.ok:
-        good[good] = result.inliers.cpu().numpy()
-    names = (
-        ("inliers of F", "others, dropped by pruning or estimation") if result.ok else ("kept", "dropped by pruning")
-    )
-    pictures = {"matches.png": draw_matches(image0, image1, x0, x1, good, names=names)}
-    pruners = [step for step in result.counts if step not in ("matching", "estimation")]
-    if pruners:
-        names = (f"kept by pruning ({', '.join(pruners)})", "dropped")
-        pictures["pruning.png"] = draw_matches(image0, image1, x0, x1, kept, names=names)
-    F = result.F.cpu().numpy() if result.ok else truth
-    if F is not None:
-        dashed = truth if result.ok else None
-        if (c := result.undistorted) is None:
-            ends = x0[good], x1[good]
-        else:
-            seen = (result.inliers if result.ok else c.mask[0]).cpu()
-            ends = c.x0[0].cpu()[seen].double().numpy(), c.x1[0].cpu()[seen].double().numpy()
-        pictures["epipolar.png"] = draw_epipolar_lines(*given.pinholes, *ends, F, truth=dashed)
-    for name, picture in pictures.items():
-        with replacing(folder / name) as path:
-            path.write_bytes(cv2.imencode(".png", picture[..., ::-1])[1].tobytes())
-    for name in {"pruning.png", "epipolar.png"} - pictures.keys():  # of an earlier run
-        (folder / name).unlink(missing_ok=True)
-    return list(pictures)
+def _verdict(result: MatchResult) -> str:
+    """What is said of photographs that are related."""
+    inliers, matches = int(result.inliers.sum()), result.correspondences.mask.shape[1]
+    support = f"related: {inliers:,} of {matches:,} matches are inliers of F"
+    return f"{support}, significance {result.significance:.0f}, pair type {result.pair_type}"
 
 
 def _troubles(result: MatchResult) -> list[str]:
-    """What is said of a result that is not to be relied on."""
-    warning = result.warning if result.related or result.configuration != "unrelated" else ""  # which is said already
+    warning = result.warning if result.related or result.pair_type != "unrelated" else ""  # which is said already
     if not result.ok:
         return list(filter(None, (f"no F: {result.reason}", warning)))
     chance = (
-        "probably not the same scene: so much support is no surprise by chance alone "
+        "probably not the same scene: unrelated photographs have as much support by chance "
         f"(significance {result.significance:.1f}; related from {RELATED:g} on)"
     )
     return list(filter(None, ("" if result.related else chance, warning)))
@@ -272,7 +345,7 @@ def _table(result: MatchResult, cached: bool) -> Table:
         unit = {"features": "keypoints", "estimation": "inliers"}.get(step, "matches")
         left = f"{' + '.join(f'{count:,}' for count in counts)} {unit}"
         table.add_row(
-            step, result.configuration if step == "configuration" else left,
+            step, result.pair_type if step == "pair_type" else left,
             "cached" if cached and step == "features" else f"{seconds:.3f}",
         )  # fmt: skip
     return table

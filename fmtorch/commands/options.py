@@ -4,8 +4,6 @@ The one declaration of both: the config that Hydra composes, the checks of its v
 Nothing here imports a library, for which ``--help`` would wait.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
@@ -18,6 +16,8 @@ from fmtorch.training.options import TrainOptions
 CACHE = "folder of features computed before; null: features in $FMTORCH_CACHE or ~/.cache/fmtorch; off: none"
 CACHE_LIMIT = "GB, beyond which the least recently used features go; null: no bound"
 DEVICE = "auto | cpu | cuda | cuda:1 | mps"
+DEBUG = "true: stop at the first error of a part and show all of its traceback; pdb: and look at it in the debugger"
+Debug = bool | Literal["pdb"]
 REPLACED = "Groups are replaced by name (estimator=lmeds), values by path (estimator.threshold=0.5)."
 
 
@@ -58,15 +58,16 @@ class EvalOptions:
     workers: Count | None = option(None, "short for executor.workers")
     processes: bool | None = option(None, "short for executor=processes (true) and executor=threads (false)")
     shard: str | None = option(
-        None, "i/n: only the i-th of n parts of the pairs, for machines that share run_dir; the last one sums up all"
+        None, "i/n: only the i-th of n parts of the pairs, for machines that share output; the last one sums up all"
     )
-    run_dir: Path | None = option(None, "null: runs/<data set>/<pipeline>-<first digits of the identity>")
+    output: Path | None = option(None, "null: runs/<data set>/<pipeline>-<first digits of the identity>")
     cache: Cache = option(None, CACHE)
     cache_limit: Gigabytes | None = option(20, CACHE_LIMIT)
     export: str | list[str] | None = option(
         None,
         "h5, colmap or both, with a comma: hloc's files, a COLMAP database, in the run folder (docs/exchange.md)",
     )
+    debug: Debug = option(False, f"{DEBUG}. One worker")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -110,6 +111,7 @@ class MatchOptions:
     device: Device = option("auto", DEVICE)
     cache: Cache = option(None, CACHE)
     cache_limit: Gigabytes | None = option(20, CACHE_LIMIT)
+    debug: Debug = option(False, DEBUG)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -137,7 +139,7 @@ class ReportOptions:
     """What `fmtorch report` takes."""
 
     runs: str | list[str] = option(["runs"], "run folders, or folders that hold some, at any depth")
-    output: Path = option(Path("report.html"), "the page")
+    output: Path | None = option(None, "the page; null: report.html beside the runs, in the first of their folders")
     title: str = option("Fundamental matrices", "of the page")
     pictures: Annotated[int, Within(0)] = option(
         6, "pairs of each data set that are shown, where the runs differ most; 0: none"
@@ -205,32 +207,22 @@ class Command:
 
     @property
     def defaults(self) -> dict[str, Any]:
-        """The default of each option, as plain values."""
         return defaults_of(self.options)
 
     @property
     def names(self) -> list[str]:
-        """All that may stand before ``=``: options and groups."""
         return [*self.defaults, *self.groups]
 
 
 EVAL = Command(
-    "eval",
-    REPLACED,
-    EvalOptions,
-    {**STAGES, "dataset": "rendered", "executor": "auto", "pipeline": "sift_ratio"},
+    "eval", REPLACED, EvalOptions, {**STAGES, "dataset": "rendered", "executor": "auto", "pipeline": "sift_ratio"},
     texts=("dataset.root", "dataset.file", "dataset.truth", "dataset.images", "export"),
-    interrupted="interrupted; the same command continues the run",
-    sweeps="runs",
-)
+    interrupted="interrupted; the same command continues the run", sweeps="runs",
+)  # fmt: skip
 MATCH = Command(
-    "match",
-    REPLACED,
-    MatchOptions,
-    {**STAGES, "executor": "auto", "pipeline": "hesaffnet_fast_fmtorch"},
-    positional=("image0", "image1"),
-    texts=("export", "K"),
-)
+    "match", REPLACED, MatchOptions, {**STAGES, "executor": "auto", "pipeline": "hesaffnet_fast_fmtorch"},
+    positional=("image0", "image1"), texts=("export", "K"),
+)  # fmt: skip
 PAIRS = Command(
     "pairs",
     """The set has the layout of FM-Bench, for dataset=fmbench. The rule is the paper's: more than 20 SIFT matches
@@ -242,12 +234,8 @@ whatever features find. Which pairs are looked at, the data set says (window, ca
     interrupted="interrupted; the same command goes on from there",
 )
 REPORT = Command(
-    "report",
-    "It has tables, curves and pictures.",
-    ReportOptions,
-    {},
-    positional=("runs...",),
-)
+    "report", "It has tables, curves and pictures.", ReportOptions, {}, positional=("runs...",),
+)  # fmt: skip
 TRAIN = Command(
     "train",
     """The data set has ground truth: fmtorch train pruner=lc.

@@ -1,7 +1,5 @@
 """`fmtorch pairs dataset=kitti dataset.root=DIR output=KITTI`: a set of the pairs that can be matched."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import itertools
@@ -20,15 +18,12 @@ from fmtorch.core.terminal import console, progress_bars, reporter
 from fmtorch.data.construction import BLOCK, Construction, blocks
 from fmtorch.data.scenes import ScenePairs
 from fmtorch.jobs.execution import Execution
-from fmtorch.jobs.pool import WorkerPool
-from fmtorch.jobs.runner import Factory, Local, Source, in_order
-from fmtorch.presets import plain
-from fmtorch.presets.executors import execution_of
-from fmtorch.presets.fields import read_fields
+from fmtorch.jobs.runner import Factory, Local, Source, WorkerPool, in_order
+from fmtorch.presets.composition import execution_of, plain, read_fields
 from fmtorch.scenes import RenderedPairs
 
 MIN_CANDIDATES_FOR_PROCESSES = 4 * BLOCK + 1  # below which processes are not worth their start
-PRELOADED = ("fmtorch.data.construction",)  # by the process that workers are forked of
+PRELOADED = (Construction.__module__,)  # by the process that workers are forked of
 
 
 def run(config: DictConfig) -> Path:
@@ -75,7 +70,6 @@ def _execution(config: DictConfig, fields: PairsOptions, many: bool) -> Executio
 
 
 def _load(config: DictConfig) -> ScenePairs:
-    """The data set of a config, all of whose candidates are asked for."""
     options = plain(config)
     presets.expect_buildable(options, "dataset")
     with progress_bars() as progress:
@@ -135,7 +129,6 @@ def _call(construction: Construction, task: tuple[str, tuple[object, ...]]) -> A
 
 
 def _print_summary(construction: Construction, summary: dict[str, int], problems: list[str], seconds: float) -> None:
-    """What was made, on the console."""
     judged = f"{summary['judged']} of {summary['candidates']} candidates were judged in {seconds:.0f} s"
     console.print(f"{summary['kept']} pairs of {summary['images']} images; {judged}", highlight=False)
     if construction.count is not None and summary["kept"] < construction.count:

@@ -1,7 +1,5 @@
 """`fmtorch report runs=[runs]`: runs of `fmtorch.eval` side by side on one HTML page."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -19,7 +17,7 @@ from fmtorch.core.terminal import console
 from fmtorch.evaluation.curves import axis_of
 from fmtorch.evaluation.gallery import Options, Run, gallery
 from fmtorch.evaluation.page import Section, render, run_names, shared_settings
-from fmtorch.presets.fields import read_fields
+from fmtorch.presets.composition import read_fields
 from fmtorch.runs import RunFolder, RunFolderError
 
 
@@ -35,12 +33,13 @@ def run(config: DictConfig) -> Path:
         fields.pictures, [Path(root) for root in roots], fields.own_code, presets.resolve_device(fields.device),
         config.cache, fields.cache_limit,
     )  # fmt: skip
-    output = fields.output
+    beside = paths[0].parent if (paths[0] / "run.json").exists() else paths[0]
+    output = fields.output or beside / "report.html"
     expect_writable(output.parent)
     if output.is_dir():
         raise ValueError(f"output={output} is a folder; it must name a file")
-    sections, by_dataset = [], _by_dataset(runs)
-    for heading, group in by_dataset.items():
+    sections, groups = [], by_dataset(runs)
+    for heading, group in groups.items():
         bar = functools.partial(track, description="drawing pairs", console=console, transient=True)
         pairs, notes = gallery(group, options, bar)
         signed = [r.name for r in group if r.folder.config.get("pose") is not None]
@@ -48,7 +47,7 @@ def run(config: DictConfig) -> Path:
     rows = [
         [r.name, heading, r.folder.identity[:8], *(str(r.folder.config.get(k)) for k in ("version", "seed")),
          str(r.folder.path)]
-        for heading, group in by_dataset.items() for r in group
+        for heading, group in groups.items() for r in group
     ]  # fmt: skip
     page = render(str(config.title), sections, rows, shared_settings([r.folder.config for r in runs]))
     with replacing(output) as temporary:
@@ -105,13 +104,12 @@ def _merged(held: Sequence[tuple[RunFolder, pa.Table]]) -> list[tuple[RunFolder,
 
 
 def _order(order: str | None, paths: Sequence[Path]) -> str:
-    """`given` or `recall`; unless one is asked for, by recall where runs were looked for in folders."""
     if order not in (None, "given", "recall"):
         raise ValueError(f"order={order} must be given or recall")
     return order or ("given" if all((path / "run.json").exists() for path in paths) else "recall")
 
 
-def _by_dataset(runs: Sequence[Run]) -> dict[str, list[Run]]:
+def by_dataset(runs: Sequence[Run]) -> dict[str, list[Run]]:
     """The runs of each data set, under a heading that says which: its options and families."""
     groups: dict[str, list[Run]] = {}
     for r in runs:

@@ -1,12 +1,11 @@
 """`fmtorch train pruner=lc`: train a learned pruner on the labelled matches of a data set."""
 
-from __future__ import annotations
-
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from fmtorch.commands.config import job, run_command
 from fmtorch.commands.options import TRAIN
+from fmtorch.core.terminal import console
 
 
 @job
@@ -18,7 +17,10 @@ def task(config: DictConfig) -> None:
         if (error.name or "").split(".")[0] not in ("lightning", "tensorboard"):
             raise
         raise ImportError(f"training needs {error.name}: pip install 'fmtorch[train]'") from error
-    run(config, str(HydraConfig.get().runtime.choices["pruner"]))
+    name = str(HydraConfig.get().runtime.choices["pruner"])
+    if not any(word.startswith("pruner=") for word in HydraConfig.get().overrides.task):
+        console.print(f"no pruner= is given: {name} is trained, the network of Yi et al. (CVPR 2018)", highlight=False)
+    run(config, name)
 
 
 def main() -> None:

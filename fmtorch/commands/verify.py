@@ -1,7 +1,5 @@
 """`fmtorch verify DATABASE`: two-view geometries of the matches in a COLMAP database."""
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import re
@@ -17,9 +15,7 @@ from fmtorch.commands.config import job, run_command
 from fmtorch.commands.options import VERIFY, VerifyOptions
 from fmtorch.core.terminal import console, errors, progress_bars, reporter
 from fmtorch.jobs.execution import shard_of
-from fmtorch.presets import plain
-from fmtorch.presets.executors import execution_of
-from fmtorch.presets.fields import read_fields
+from fmtorch.presets.composition import execution_of, plain, read_fields
 from fmtorch.verification.run import Verification
 from fmtorch.verification.verify import ONE_THREAD, VerifyMode, VerifyPaths, verify_by
 
@@ -43,6 +39,13 @@ def run(config: DictConfig, estimator: str) -> Verification:
         errors.print(problem, style="bold", markup=False, highlight=False, soft_wrap=True)
     if len(result.problems) > MAX_PROBLEMS:
         errors.print(f"and {len(result.problems) - MAX_PROBLEMS} more", highlight=False)
+    for warning in result.warnings[:MAX_PROBLEMS]:
+        errors.print(f"warning: {warning}", markup=False, highlight=False, soft_wrap=True)
+    if result.kept == result.pairs and not result.configurations:
+        said = (
+            f"nothing to do: {result.path} has a geometry of each of {result.pairs:,} pairs; force=true replaces them"
+        )
+        console.print(said, markup=False, highlight=False, soft_wrap=True)
     console.print(_table(result))
     console.print(str(result.path), style="dim", highlight=False)
     return result
@@ -63,7 +66,6 @@ def _begun_by_reports(description: str) -> Iterator[Callable[[int, int], None]]:
 
 
 def _table(result: Verification) -> Table:
-    """Counts of pairs, and how long they took."""
     table = Table()
     table.add_column("pairs")
     table.add_column("", justify="right")

@@ -1,7 +1,5 @@
 """`fmtorch warm-up`: compile all kernels now, for machines and containers on which no first call shall wait."""
 
-from __future__ import annotations
-
 import importlib
 import pkgutil
 import sys

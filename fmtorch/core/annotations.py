@@ -3,8 +3,6 @@
 ``Float[Tensor, "*batch n 2"]`` is what a reader sees of a function's argument or a record's field, and what is checked.
 """
 
-from __future__ import annotations
-
 import inspect
 import typing
 from collections.abc import Callable, Sequence

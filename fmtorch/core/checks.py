@@ -3,8 +3,6 @@
 Annotations are the source: ``Float[Tensor, "*batch n 2"]`` is both what a reader sees and what is asked for.
 """
 
-from __future__ import annotations
-
 import functools
 import inspect
 import math
@@ -60,17 +58,28 @@ def checked(function: Callable[P, R], *, common_type: bool = False) -> Callable[
 
 
 def as_tensor(value: Any, name: str) -> Tensor:
-    """A tensor of numbers, of an array without copying. Raises TypeError, naming the argument, for anything else."""
+    """A tensor of real numbers, of an array or what DLPack shares without copying; points (N, 2) of OpenCV's keypoints.
+
+    Raises TypeError, naming the argument, for anything else, and ValueError for a masked array that masks something.
+    """
     if isinstance(value, Tensor):
-        return value
+        return _real(value, name)
     if isinstance(value, list | tuple) and value and all(isinstance(entry, Tensor) for entry in value):
-        return torch.stack(list(value))
+        return _real(torch.stack(list(value)), name)
+    if isinstance(value, list | tuple) and value and hasattr(value[0], "pt"):
+        value = np.array([keypoint.pt for keypoint in value], np.float32)
+    elif hasattr(value, "__dlpack__") and not isinstance(value, np.ndarray | np.generic):  # of CuPy, JAX, ...
+        return _real(torch.from_dlpack(value), name)
+    if np.ma.is_masked(value):
+        raise ValueError(f"{name} is a masked array; give its data, and what counts in `mask` (True for a real match)")
     try:
         array = np.asarray(value)
     except ValueError as error:
         raise TypeError(
             f"{name} is a {type(value).__name__} of uneven rows; it must be an array or a tensor"
         ) from error
+    if array.dtype.name == "bfloat16":  # of ml_dtypes, as JAX has it
+        array = array.astype(np.float32)
     if array.dtype.kind not in "biuf":
         raise TypeError(
             f"{name} is a {type(value).__name__} of {array.dtype}; it must be an array or tensor of numbers"
@@ -81,6 +90,19 @@ def as_tensor(value: Any, name: str) -> Tensor:
         array = array.astype(np.int64)
     array = np.ascontiguousarray(array, array.dtype.newbyteorder("="))
     return torch.from_numpy(array if array.flags.writeable else array.copy())
+
+
+def _real(tensor: Tensor, name: str) -> Tensor:
+    if tensor.is_complex() or tensor.is_quantized:
+        raise TypeError(f"{name} is a tensor of {tensor.dtype}; it must hold real numbers")
+    return tensor
+
+
+def widened(tensor: Tensor) -> Tensor:
+    """In a type that estimators compute in: whole numbers as float64, half precision as float32."""
+    if not tensor.is_floating_point():
+        return tensor.to(torch.float64)
+    return tensor.to(torch.float32) if tensor.dtype in WIDENED else tensor
 
 
 def number(name: str, value: Any, integer: bool) -> Any:
@@ -140,11 +162,11 @@ def _numbers(name: str, tensor: Tensor, want: Expected) -> Tensor:
     """The tensor, with elements of the kind asked for. Raises ValueError naming the argument for others."""
     integer = numbers_of(tensor.dtype) == WHOLE and not tensor.is_quantized
     if want.dtype == "Float" and integer:
-        return tensor.to(torch.float64)
+        return widened(tensor)
     if want.dtype == "Bool" and integer:
         return tensor != 0
     if tensor.dtype in WIDENED and want.dtype in ("Float", "Real"):
-        return tensor.to(torch.float32)
+        return widened(tensor)
     if tensor.is_quantized or not want.holds(tensor.dtype):
         raise ValueError(f"{name} is of {tensor.dtype}; it must hold {want.numbers}")
     return tensor
@@ -219,3 +241,38 @@ def expect_sizes(**sizes: Tensor | None) -> None:
         rows = size.detach().reshape(-1, size.shape[-1])
         for row in rows[~SIZE.holds(rows).all(-1)].tolist():
             raise ValueError(f"{name} is {tuple(row)}; {SIZE.text}")
+
+
+MIN_MATCHES = 8  # fewer say nothing of their unit and image
+MAX_OUTSIDE = 0.5  # fraction of points outside an image of the given size: some are undistorted far beyond its border
+SWAPPED = 0.05  # fraction outside from which on a size is taken for (w, h), if all points are inside then
+
+
+def expect_inside(x: Tensor, mask: Tensor, size: Tensor, name: str, size_name: str) -> None:
+    """Raise ValueError where the points (b, n, 2) of all pairs contradict the image's size (b, 2), h and w.
+
+    Points that reach beyond opposite borders are no pixels of another image or unit: a wide lens was undistorted. Fewer
+    than MIN_MATCHES say nothing.
+    """
+    mask = mask & x.isfinite().all(-1)
+    enough = mask.sum(1) >= MIN_MATCHES
+    if not bool(enough.any()):
+        return
+    x, mask, size = x.detach()[enough], mask[enough], size.detach().to(x.device)[enough]
+    limit = size.flip(-1)[:, None]
+    far, turned = _fraction_outside(x, mask, limit), _fraction_outside(x, mask, limit.flip(-1))
+    swapped = (far > SWAPPED) & (turned == 0)
+    undistorted = (((x < -1) & mask[..., None]).any(1) & ((x > limit) & mask[..., None]).any(1)).any(-1)
+    if not bool((((far > MAX_OUTSIDE) & ~undistorted) | swapped).all()):
+        return
+    h, w = size[0].tolist()
+    hint = "sizes are (h, w), and it looks like (w, h)" if bool(swapped[0]) else "sizes are (h, w) in pixels"
+    raise ValueError(
+        f"{size_name} is ({h:g}, {w:g}), but {100 * float(far[0]):.0f} % of {name} lie outside such an image; {hint}"
+    )
+
+
+def _fraction_outside(x: Tensor, mask: Tensor, limit: Tensor) -> Tensor:
+    """The fraction (b,) of points beyond the border, of the first pixel's centre and of the last one's, by a pixel."""
+    beyond = ((x < -1) | (x > limit)).any(-1) & mask
+    return beyond.sum(1) / mask.sum(1)

@@ -1,7 +1,5 @@
 """Files that are either whole or absent, and the folders of configuration, networks and caches."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import uuid
@@ -63,7 +61,7 @@ def sync(path: Path) -> None:
         os.close(descriptor)
 
 
-_PACKAGE = Path(__file__).resolve().parents[1]
+PACKAGE = Path(__file__).resolve().parents[1]
 STAGES: dict[str, str | list[str]] = {
     "features": "sift", "matcher": "nearest", "pruner": ["ratio", "one_to_one"], "estimator": "ransac",
 }  # fmt: skip
@@ -71,11 +69,11 @@ STAGES: dict[str, str | list[str]] = {
 
 
 def _folder(name: str) -> Path:
-    checkout = _PACKAGE.parent if (_PACKAGE.parent / "pyproject.toml").is_file() else _PACKAGE
-    for folder in (_PACKAGE / name, checkout / name):
+    checkout = PACKAGE.parent if (PACKAGE.parent / "pyproject.toml").is_file() else PACKAGE
+    for folder in (PACKAGE / name, checkout / name):
         if folder.is_dir():
             return folder
-    raise FileNotFoundError(f"no folder {name!r} in {_PACKAGE} or beside it: the installation is incomplete")
+    raise FileNotFoundError(f"no folder {name!r} in {PACKAGE} or beside it: the installation is incomplete")
 
 
 def conf_dir() -> Path:

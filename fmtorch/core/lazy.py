@@ -1,7 +1,5 @@
 """Packages whose public names are imported when they are first used."""
 
-from __future__ import annotations
-
 import ast
 import functools
 import importlib

@@ -1,7 +1,5 @@
 """ONNX files opened for inference on a CPU."""
 
-from __future__ import annotations
-
 import functools
 import warnings
 from collections.abc import Callable
@@ -50,12 +48,13 @@ def _opened(path: str, modified: int, threads: int) -> Any:
 
 # Networks that other libraries fetch
 
-
 Network = TypeVar("Network")
 
 
-def pretrained(load: Callable[[], Network], name: str, publisher: str, file: str) -> Network:
+def pretrained(load: Callable[[], Network], name: str, publisher: str, file: str, kept_as: str = "") -> Network:
     """The network that a library's own loader fetches once and keeps in torch's hub folder.
+
+    file: of the publisher. kept_as: where the loader looks for it, where that is another name.
 
     Raises ConnectionError, saying what to put where, where it cannot be fetched.
     """
@@ -67,6 +66,7 @@ def pretrained(load: Callable[[], Network], name: str, publisher: str, file: str
         cause = str(error.__cause__ or error).splitlines()[0]
         raise ConnectionError(
             f"the weights of {name} cannot be loaded ({cause}). They are not part of this project: run once with "
-            f"access to {publisher}, or copy its {file} to {Path(torch.hub.get_dir()) / 'checkpoints' / file}"
+            f"access to {publisher}, or copy its {file} to "
+            f"{Path(torch.hub.get_dir()) / 'checkpoints' / (kept_as or file)}"
         ) from error
     return network

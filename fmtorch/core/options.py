@@ -3,8 +3,6 @@
 Nothing here imports more than Python's own library, so that a command's ``--help`` waits for nothing.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import difflib
 import enum

@@ -4,17 +4,20 @@ The annotation of a field is what is known of it: ``Float[Tensor, "b n 2"]`` is 
 is made, the numbers that it holds, and, by the dimension ``n``, that it has an entry for each slot.
 """
 
-from __future__ import annotations
-
 import dataclasses
+import json
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any, ClassVar, TypeVar, cast
 
 import torch
 from jaxtyping import Int
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
 from torch import Tensor
 
 from fmtorch.core.annotations import Expected, arrays_of
+from fmtorch.core.files import replacing
 
 Index = int | slice | Sequence[int] | Sequence[bool] | Tensor
 AnyRecord = TypeVar("AnyRecord", bound="Record")
@@ -71,6 +74,42 @@ class Record:
         record = object.__new__(type(self))
         vars(record).update(vars(self), **changes)
         return record
+
+    def save(self, path: Path | str) -> None:
+        """Write the record to a file in the format of safetensors, which holds numbers and text, never code."""
+        values = vars(self)
+        tensors = {name: value.detach().cpu().clone() for name, value in values.items() if isinstance(value, Tensor)}
+        plain = {name: value for name, value in values.items() if not isinstance(value, Tensor | None)}
+        told = {"record": type(self).__name__, "fields": json.dumps(plain)}
+        with replacing(Path(path)) as temporary:
+            save_file({name: value.contiguous() for name, value in tensors.items()}, temporary, told)
+
+    @classmethod
+    def load(cls: type[AnyRecord], path: Path | str) -> AnyRecord:
+        """The record that `save` wrote, on the CPU, checked again.
+
+        Raises FileNotFoundError, or ValueError for another file.
+        """
+        try:
+            with safe_open(path, "pt") as file:
+                told = file.metadata() or {}
+                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        except SafetensorError as error:
+            raise ValueError(f"{path} is no file that save() wrote: {error}") from error
+        kinds = {kind.__name__ for kind in (cls, *cls.__subclasses__())}
+        if told.get("record") not in kinds:
+            raise ValueError(f"{path} holds {told.get('record', 'no record')}; {cls.__name__}.load reads {min(kinds)}")
+        plain = json.loads(told["fields"])
+        return cls(**tensors, **{name: tuple(v) if isinstance(v, list) else v for name, v in plain.items()})
+
+    def __repr__(self) -> str:
+        """Shapes and types of the tensors, in one line."""
+        shapes = (
+            f"{name}: {tuple(value.shape)} {str(value.dtype).removeprefix('torch.')}"
+            for name, value in vars(self).items()
+            if isinstance(value, Tensor)
+        )
+        return f"{type(self).__name__}({', '.join(shapes)})"
 
     def _map(self: AnyRecord, function: Any, **changes: Any) -> AnyRecord:
         return self.replace(**_mapped(self, function, Record._map), **changes)

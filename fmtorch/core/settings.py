@@ -1,7 +1,5 @@
 """Settings as plain values: their one JSON text, what differs between two, and folders that are of one alone."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Iterator, Mapping, Sequence

@@ -1,19 +1,53 @@
-"""The protocols of the four stages: what anything must look like to take its place in a pipeline."""
+"""The protocols of the four stages: what anything must look like to take its place in a pipeline.
 
-from __future__ import annotations
+Beside them the grey images that pruners look at, and the extractor of matchers that take the images themselves.
+"""
 
+import dataclasses
 from collections.abc import Callable
-from typing import Protocol, TypeAlias, runtime_checkable
+from typing import Any, NamedTuple, Protocol, TypeAlias, TypeVar, runtime_checkable
 
 import numpy as np
+import torch
 from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from fmtorch.core.grey_pyramid import GreyPyramid
 from fmtorch.core.types import Correspondences, Estimate, Features
 
+LEVELS = 5  # at most
+MIN_SIDE = 32  # px, of a level that has a coarser one
+SMOOTHING = 0.5  # px, of every level: contrast between pixels is then lowered nearly as much as on them
+
+
+class GreyPyramid(NamedTuple):
+    """Levels of an image, each of half the samples of the one before: point x of the image is at x / 2^l of level l.
+
+    pixels: (sum,) uint8, the grey levels of all, row by row. levels: (l, 3) int64, of each its height, its width and
+    where it begins in `pixels`. Four thirds of a byte for each pixel of the image.
+    """
+
+    pixels: NDArray[np.uint8]
+    levels: NDArray[np.int64]
+
+
+def grey_pyramid(image: NDArray[np.uint8]) -> GreyPyramid:
+    """The pyramid of a grey image (H, W): Burt and Adelson, The Laplacian Pyramid as a Compact Image Code, 1983.
+
+    Every other sample is taken of an image smoothed by a binomial filter; what is kept of each is smoothed slightly.
+    """
+    import cv2  # not before an image is there: protocols of matches alone name this file
+
+    images: list[Any] = [image]
+    while len(images) < LEVELS and min(images[-1].shape) >= MIN_SIDE:
+        images.append(cv2.pyrDown(images[-1]))
+    begins = np.cumsum([0, *(level.size for level in images[:-1])])
+    levels = np.array([(*level.shape, begin) for level, begin in zip(images, begins, strict=True)], np.int64)
+    return GreyPyramid(np.concatenate([cv2.GaussianBlur(level, (3, 3), SMOOTHING).ravel() for level in images]), levels)
+
+
 PairImages: TypeAlias = tuple[GreyPyramid, GreyPyramid]
+Output = TypeVar("Output", Features, Correspondences, Estimate)
 
 
 @runtime_checkable
@@ -87,7 +121,8 @@ class ImagePruner(Pruner, Protocol):
 
 def pruned(pruner: Pruner, c: Correspondences, images: Callable[[int], PairImages]) -> Correspondences:
     """What a pruner makes of correspondences, with the images where it looks at them."""
-    return pruner.with_images(c, images) if isinstance(pruner, ImagePruner) else pruner(c)
+    result = pruner.with_images(c, images) if isinstance(pruner, ImagePruner) else pruner(c)
+    return output_of(pruner, result, Correspondences, c)
 
 
 @runtime_checkable
@@ -101,3 +136,59 @@ def model_of(estimator: Estimator) -> str:
     """What an estimator's matrices are, `Estimate.model`: fundamental, unless it says otherwise."""
     model: str = getattr(estimator, "model", "fundamental")
     return model
+
+
+@dataclasses.dataclass(frozen=True)
+class NoFeatures:
+    """Finds nothing: an extractor for matchers that take images. keep: nothing of it is worth a place in a cache."""
+
+    keep = False
+
+    def __call__(self, image: NDArray[np.uint8]) -> Features:
+        """No features of an image."""
+        size = torch.tensor(image.shape[:2], dtype=torch.int64)
+        return Features(torch.zeros(0, 2, 3), torch.zeros(0), torch.zeros(0, 0), size)
+
+
+def output_of(
+    part: object, value: object, kind: type[Output], given: Correspondences | None = None, like: Tensor | None = None
+) -> Output:
+    """What a stage returned, which may be anybody's code.
+
+    Args:
+        part: that returned it.
+        value: what it returned.
+        kind: what it must be.
+        given: the matches that it was given, whose pairs and device are those of the result.
+        like: a tensor on the device that the result must be on, where no matches were given.
+
+    Raises:
+        TypeError: for something else; ValueError: for another number of pairs or matches, another device, half
+            precision, or pairs that are not those given. The message begins with the part's name.
+    """
+    named = part if isinstance(part, type) or hasattr(part, "__qualname__") else type(part)
+    name = f"{named.__module__}.{named.__qualname__}"  # type: ignore[attr-defined]
+    if not isinstance(value, kind):
+        what = "None" if value is None else f"a {type(value).__name__}"
+        raise TypeError(f"{name} returned {what}; it must return {kind.__name__}")
+    first = value.lafs if isinstance(value, Features) else value.x0 if isinstance(value, Correspondences) else value.F
+    if first.dtype not in (torch.float32, torch.float64):
+        raise ValueError(f"{name} returned {kind.__name__} of {first.dtype}; they must be of float32 or float64")
+    if isinstance(value, Features):
+        if value.lafs.dim() != 3:
+            raise ValueError(f"{name} returned features of a batch of images; they must be of one, lafs (N, 2, 3)")
+        return value
+    like = like if given is None else given.x0
+    if like is not None and first.device != like.device:
+        raise ValueError(f"{name} returned {kind.__name__} on {first.device}; they must be on {like.device}")
+    pairs = 1 if given is None else len(given)
+    if len(value) != pairs:
+        raise ValueError(f"{name} returned {kind.__name__} of {len(value)} pairs; they must be of {pairs}")
+    if given is None:
+        return value
+    if isinstance(value, Estimate) and value.inliers.shape != given.mask.shape:
+        shape, wanted = tuple(value.inliers.shape), tuple(given.mask.shape)
+        raise ValueError(f"{name} returned inliers of shape {shape}; it must be that of the mask, {wanted}")
+    if isinstance(value, Correspondences) and not torch.equal(value.keys, given.keys):
+        raise ValueError(f"{name} returned matches without their pairs' keys; use c.keep(mask) or c.replace(prior=...)")
+    return value

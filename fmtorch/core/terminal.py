@@ -1,10 +1,11 @@
 """What the commands share: the console, progress bars, and how errors end a command."""
 
-from __future__ import annotations
-
 import contextlib
+import math
 import sys
+import time
 from collections.abc import Callable, Iterator
+from typing import Any
 
 from rich.console import Console
 from rich.progress import (
@@ -17,9 +18,42 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from fmtorch.core.failures import place_of
+
 console = Console(markup=False)  # paths and names may hold brackets; styles are given by style=...
 errors = Console(stderr=True, markup=False)
+LINE_SECONDS = 60.0  # between two lines of progress where there is no terminal
 MISTAKES = (ValueError, OSError, ImportError)  # what a user can put right
+
+
+class _Bars(Progress):
+    """Bars on a terminal; where there is none, as in a log, a line every `LINE_SECONDS`."""
+
+    _said = math.inf
+
+    def start(self) -> None:
+        """Begin."""
+        self._said = time.monotonic()
+        super().start()
+
+    def update(self, task_id: TaskID, **changes: Any) -> None:
+        """As of `Progress`."""
+        super().update(task_id, **changes)
+        self._say(task_id)
+
+    def advance(self, task_id: TaskID, advance: float = 1) -> None:
+        """As of `Progress`."""
+        super().advance(task_id, advance)
+        self._say(task_id)
+
+    def _say(self, task_id: TaskID) -> None:
+        if self.console.is_terminal or time.monotonic() - self._said < LINE_SECONDS:
+            return
+        self._said = time.monotonic()
+        task = self._tasks[task_id]
+        total = "" if task.total is None else f" of {task.total:,.0f}"
+        line = f"{task.description}: {task.completed:,.0f}{total} after {(task.elapsed or 0) / 60:.0f} min"
+        print(line, file=sys.stderr, flush=True)
 
 
 def progress_bars() -> Progress:
@@ -31,7 +65,7 @@ def progress_bars() -> Progress:
         TimeElapsedColumn(),
         TimeRemainingColumn(),
     )
-    return Progress(*columns, console=errors)
+    return _Bars(*columns, console=errors)
 
 
 def reporter(progress: Progress, description: str) -> Callable[[int, int], None]:
@@ -47,20 +81,27 @@ def reporter(progress: Progress, description: str) -> Callable[[int, int], None]
 
 
 def error_line(error: BaseException) -> str:
-    """An error in one line, with the path that an OSError is about."""
+    """An error in one line, with the path that an OSError is about, and where a user's own code raised it."""
     text = str(error)
+    if not isinstance(error, MISTAKES):
+        text = f"{type(error).__name__}: {text}"
     if isinstance(error, OSError) and error.strerror and error.errno is not None:
         paths = [str(path) for path in (error.filename, error.filename2) if path is not None]
         text = f"{' -> '.join(paths)}: {error.strerror}" if paths else error.strerror
-    return " ".join(text.split())
+    place = place_of(error)
+    return " ".join(text.split()) + (f" ({place})" if place and place not in text else "")
 
 
 @contextlib.contextmanager
 def exits_with_message(interrupted: str = "interrupted") -> Iterator[None]:
-    """Ends the process with status 1 and one line for what a user can put right, rather than with a traceback."""
+    """Ends the process with status 1 and one line for what a user can put right, rather than with a traceback.
+
+    Interrupted, with status 130 and a line: `interrupted`, and what the KeyboardInterrupt says was kept.
+    """
     try:
         yield
-    except KeyboardInterrupt:
-        sys.exit(interrupted)
+    except KeyboardInterrupt as stop:
+        print(f"{interrupted}; {stop}" if str(stop) else interrupted, file=sys.stderr)
+        sys.exit(130)
     except MISTAKES as error:
         sys.exit(f"error: {error_line(error)}")

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import math
 from collections.abc import Sequence
 from typing import Annotated, Any, TypeVar, cast
 
@@ -17,6 +18,7 @@ from jaxtyping import Bool, Float, Int, Real
 from torch import Tensor
 
 from fmtorch.core.annotations import Rule
+from fmtorch.core.display import table_html
 from fmtorch.core.records import Index, Record, as_index, expect_fields, gathered, padded, slotted
 
 MIN_LENS, MAX_LENS = -0.45, 0.2  # of lenses that leave an image unfolded and its corners in front of the camera
@@ -40,7 +42,7 @@ LENS = Rule(
 RELATED = 1.0
 """The significance from which on two images are called related; chosen on tuning pairs (docs/concepts/related.md)."""
 
-CONFIGURATIONS = ("general", "planar", "rotation", "identical", "unrelated")
+PAIR_TYPES = ("general", "planar", "rotation", "identical", "unrelated")
 WARNINGS = {
     "general": "",
     "planar": "one plane: matches do not determine F or focal lengths, and leave two poses of known cameras",
@@ -48,7 +50,10 @@ WARNINGS = {
     "identical": "one photograph twice: matches determine neither F nor a pose",
     "unrelated": "the images show nothing in common",
 }
-"""What each configuration leaves open."""
+"""What each pair type leaves open."""
+CONTRADICTED = (
+    "far more matches agree without the calibration matrices: they are of other images or of another resolution"
+)
 
 
 def pair_key(identity: str) -> int:
@@ -56,7 +61,7 @@ def pair_key(identity: str) -> int:
     return int.from_bytes(hashlib.blake2b(identity.encode(), digest_size=8).digest(), "big", signed=True)
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Features(Record):
     """The local features of one image, or of a padded batch of images (a leading dimension on every field).
 
@@ -98,12 +103,13 @@ class Features(Record):
         return Features(self.lafs[i], self.scores[i], self.descriptors[i], size, self.valid[i])
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Correspondences(Record):
     """A batch of B image pairs with their putative matches, padded to N slots.
 
     x0, x1: matched points (B, N, 2) in pixels. mask: (B, N).
-    quality: the matcher's own figure (B, N), for nearest neighbours the distance ratio; smaller is better.
+    ratio: the distance of the nearest descriptor over that of the second nearest, in [0, 1], (B, N); smaller is better.
+    score: the matcher's own confidence in [0, 1], (B, N); larger is better.
     prior: P(inlier) in [0, 1], (B, N), where something supplies it. noise: standard deviation of each match's distance
     to its epipolar line, relative to that of a usual match, (B, N), where something supplies it.
     lafs0, lafs1: local affine frames (B, N, 2, 3) where known. size0, size1: image sizes (B, 2) as (h, w).
@@ -119,7 +125,7 @@ class Correspondences(Record):
     x0: Float[Tensor, "b n 2"]
     x1: Float[Tensor, "b n 2"]
     mask: Bool[Tensor, "b n"]
-    quality: Float[Tensor, "b n"] | None = None
+    ratio: Float[Tensor, "b n"] | None = None
     prior: Annotated[Float[Tensor, "b n"], PROBABILITY] | None = None
     lafs0: Float[Tensor, "b n 2 3"] | None = None
     lafs1: Float[Tensor, "b n 2 3"] | None = None
@@ -134,6 +140,7 @@ class Correspondences(Record):
     shared_focal: Bool[Tensor, " b"] | None = None
     lens: Annotated[Float[Tensor, "b 2 2"], LENS] | None = None
     shared_lens: Bool[Tensor, " b"] | None = None
+    score: Annotated[Float[Tensor, "b n"], PROBABILITY] | None = None
 
     def __post_init__(self) -> None:
         expect_fields(self)
@@ -147,6 +154,11 @@ class Correspondences(Record):
     def keys(self) -> Int[Tensor, " b"]:
         """The pairs' keys, never None."""
         return cast(Tensor, self.key)
+
+    @property
+    def ambiguity(self) -> Float[Tensor, "b n"] | None:
+        """What ranks matches, (B, N), smaller is better: the ratio, or 1 - score, or None where neither is known."""
+        return self.ratio if self.ratio is not None or self.score is None else 1 - self.score
 
     @property
     def asks_for_cameras(self) -> bool:
@@ -178,12 +190,12 @@ class Correspondences(Record):
         return self.derived(**{name: padded(gathered(v, order), 1, n) for name, v in slotted(self).items()})
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Estimate(Record):
     """Fundamental matrices of B pairs.
 
     F: (B, 3, 3) with unit Frobenius norm, zero where `ok` is False. inliers: (B, N), within the mask; none where `ok`
-    is False. ok: (B,). reason: why a pair failed, empty where it did not. draws: minimal samples drawn, (B,).
+    is False. ok: (B,). reason: why a pair failed, empty where it did not. samples: minimal samples drawn, (B,).
     significance: (B,), how far the support of F is beyond chance, see `fmtorch.geometry.significance`: -log10 of the
     number of models with as much support that are expected among images that show nothing in common; -inf where `ok`
     is False, NaN where nobody has computed it; never None. model: what `F` is, "fundamental", or "homography" for
@@ -198,7 +210,7 @@ class Estimate(Record):
     log f0, log f1), radians and logarithms, where t moves to ``t + tangents tau``; tangents (B, 3, 2);
     covariance_F (B, 9, 9), of F row by row. See `fmtorch.geometry.covariance`.
 
-    Where the configuration is asked for: configuration_index (B,), into `CONFIGURATIONS`; homography (B, 3, 3), of the
+    Where the pair type is asked for: pair_type_index (B,), into `PAIR_TYPES`; homography (B, 3, 3), of the
     plane, the rotation or the copy, zero where there is none; other_R, other_t, the second pose that explains a plane,
     NaN where there is none.
 
@@ -206,13 +218,14 @@ class Estimate(Record):
     NaN where these tell none; sizes_doubtful (B,), whether images of one size and of two were both likely.
 
     Where lenses are estimated: lens (B, 2), lambda of both, NaN where they are not determined.
+    Where calibration matrices are known: contradicted (B,), whether far more matches agree without them.
     """
 
     F: Float[Tensor, "b 3 3"]
     inliers: Bool[Tensor, "b n"]
     ok: Bool[Tensor, " b"]
     reason: tuple[str, ...]
-    draws: Int[Tensor, " b"]
+    samples: Int[Tensor, " b"]
     significance: Float[Tensor, " b"] | None = None
     model: str = "fundamental"
     E: Float[Tensor, "b 3 3"] | None = None
@@ -224,13 +237,14 @@ class Estimate(Record):
     covariance: Float[Tensor, "b 7 7"] | None = None
     tangents: Float[Tensor, "b 3 2"] | None = None
     covariance_F: Float[Tensor, "b 9 9"] | None = None
-    configuration_index: Int[Tensor, " b"] | None = None
+    pair_type_index: Int[Tensor, " b"] | None = None
     homography: Float[Tensor, "b 3 3"] | None = None
     other_R: Float[Tensor, "b 3 3"] | None = None
     other_t: Float[Tensor, "b 3"] | None = None
     sizes: Float[Tensor, "b 2 2"] | None = None
     sizes_doubtful: Bool[Tensor, " b"] | None = None
     lens: Float[Tensor, "b 2"] | None = None
+    contradicted: Bool[Tensor, " b"] | None = None
 
     def __post_init__(self) -> None:
         expect_fields(self)
@@ -260,27 +274,31 @@ class Estimate(Record):
         return self.ok & (cast(Tensor, self.significance) >= RELATED)
 
     @property
-    def configuration(self) -> tuple[str, ...]:
-        """The name in `CONFIGURATIONS` of each pair. Raises AttributeError where it was not asked for."""
-        if self.configuration_index is None:
-            raise AttributeError("the configuration is not known; find_fundamental(..., configuration=True) tells it")
-        return tuple(CONFIGURATIONS[i] for i in self.configuration_index.tolist())
+    def pair_type(self) -> tuple[str, ...]:
+        """The name in `PAIR_TYPES` of each pair. Raises AttributeError where it was not asked for."""
+        if self.pair_type_index is None:
+            raise AttributeError("the pair type is not known; find_fundamental(..., pair_type=True) gives it")
+        return tuple(PAIR_TYPES[i] for i in self.pair_type_index.tolist())
 
     @property
     def warning(self) -> tuple[str, ...]:
-        """What the configuration of each pair leaves open, and which sizes were doubtful; empty where nothing.
+        """What the type of each pair leaves open, whether its matches contradict its calibration matrices, and which
+        sizes were doubtful.
 
-        Raises AttributeError where neither was looked at.
+        Empty where there is nothing to say. Raises as `pair_type` where none of these was looked at.
         """
-        if self.sizes_doubtful is None or self.sizes is None:
-            return tuple(WARNINGS[name] for name in self.configuration)
-        known = self.configuration_index is not None
-        warnings = [WARNINGS[name] for name in self.configuration] if known else [""] * len(self)
-        for i in self.sizes_doubtful.nonzero()[:, 0].tolist():
-            sizes = " and ".join(f"({h:.0f}, {w:.0f})" for h, w in self.sizes[i].tolist())
-            assumed = f"image sizes are not given, and {sizes} is assumed: give size0 and size1, or 'unknown'"
-            warnings[i] = "; ".join(filter(None, (warnings[i], assumed)))
-        return tuple(warnings)
+        looked = self.contradicted is not None or self.sizes_doubtful is not None
+        if self.pair_type_index is None and looked:
+            opens = [""] * len(self)
+        else:
+            opens = [WARNINGS[name] for name in self.pair_type]
+        contradicted = [False] * len(self) if self.contradicted is None else self.contradicted.tolist()
+        said = [[CONTRADICTED if wrong else "", left] for wrong, left in zip(contradicted, opens, strict=True)]
+        if self.sizes is not None and self.sizes_doubtful is not None:
+            for i in self.sizes_doubtful.nonzero()[:, 0].tolist():
+                sizes = " and ".join(f"({h:.0f}, {w:.0f})" for h, w in self.sizes[i].tolist())
+                said[i].append(f"image sizes are not given, and {sizes} is assumed: give size0 and size1, or 'unknown'")
+        return tuple("; ".join(filter(None, each)) for each in said)
 
     @property
     def deviation_degrees(self) -> Float[Tensor, "b 2"]:
@@ -300,6 +318,43 @@ class Estimate(Record):
         i = as_index(index, len(self))
         picked = torch.arange(len(self), device=self.ok.device)[i].tolist()
         return self._map(lambda value: value[i], reason=tuple(self.reason[j] for j in picked))
+
+    def __repr__(self) -> str:
+        """One line: what was found of a pair, or of how many."""
+        if len(self) == 1:
+            return f"{type(self).__name__}({', '.join(filter(None, self._row(0)[1:]))})"
+        inliers = self.inliers.sum(-1).tolist()
+        spread = f", {min(inliers)} to {max(inliers)} inliers" if inliers else ""
+        ok, related = int(self.ok.sum()), int(self.related.sum())
+        return f"{type(self).__name__}({len(self)} pairs: {ok} ok, {related} related{spread})"
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows: a line for each pair."""
+        header = ("pair", "found", "inliers", "support")
+        return table_html(header, [self._row(i) for i in range(len(self))], repr(self))
+
+    def _row(self, i: int) -> tuple[str, str, str, str]:
+        """A pair's number, what was found, its inliers and its significance."""
+        if not self.ok[i]:
+            return str(i), f"no {self.model} matrix: {self.reason[i]}", "", ""
+        found = self.model
+        if self.R is not None and bool(self.R[i].isfinite().all()):
+            found += " and pose"
+        if self.pair_type_index is not None:
+            found += f", {self.pair_type[i]}"
+        value = float(cast(Tensor, self.significance)[i])
+        support = "" if math.isnan(value) else f"significance {value:.1f}, {'' if self.related[i] else 'not '}related"
+        return str(i), found, f"{int(self.inliers[i].sum())} inliers", support
+
+
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class PoseEstimate(Estimate):
+    """An `Estimate` that has the relative pose and focal lengths of each pair, NaN where they are not determined."""
+
+    E: Float[Tensor, "b 3 3"] = dataclasses.field(kw_only=True)
+    R: Float[Tensor, "b 3 3"] = dataclasses.field(kw_only=True)
+    t: Float[Tensor, "b 3"] = dataclasses.field(kw_only=True)
+    focals: Float[Tensor, "b 2"] = dataclasses.field(kw_only=True)
 
 
 Item = TypeVar("Item", Features, Correspondences, Estimate)

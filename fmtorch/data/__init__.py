@@ -1,7 +1,5 @@
 """Data sets of image pairs."""
 
-from __future__ import annotations
-
 import dataclasses
 import inspect
 from collections.abc import Callable, Mapping, Sequence
@@ -13,29 +11,18 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from fmtorch import presets
+from fmtorch.data.cameras import Lens
+from fmtorch.data.files import DataError
 from fmtorch.data.fmbench import FMBenchPairs
-from fmtorch.data.image_cameras import ExifFocal, exif_focal
-from fmtorch.data.images import ImageError, read_image, to_grey
-from fmtorch.data.pairs import DepthDataset, ImagePair, ImageSource, PairDataset
-from fmtorch.data.text_files import DataError
+from fmtorch.data.image_cameras import ExifFocal, ImageCameras, exif_focal
+from fmtorch.data.images import ImageError, read_image, stored_size, to_grey
+from fmtorch.data.pairs import DepthDataset, GivenMatches, ImagePair, ImageSource, PairDataset, subset
 
 __all__ = [
-    "DataError",
-    "DepthDataset",
-    "ExifFocal",
-    "FMBenchPairs",
-    "ImageError",
-    "ImagePair",
-    "ImageSource",
-    "PairBatch",
-    "PairDataset",
-    "build",
-    "collate",
-    "exif_focal",
-    "load",
-    "read_image",
-    "to_grey",
-]
+    "DataError", "DepthDataset", "ExifFocal", "FMBenchPairs", "GivenMatches", "ImageCameras", "ImageError",
+    "ImagePair", "ImageSource", "Lens", "PairBatch", "PairDataset", "build", "collate", "exif_focal", "load",
+    "read_image", "stored_size", "subset", "to_grey",
+]  # fmt: skip
 
 Progress = Callable[[int, int], None]
 

@@ -1,29 +1,151 @@
-"""The paper's rule for a pair: more than 20 SIFT matches within 1 px of the true epipolar lines in both images.
-
-Bian et al., BMVC 2019, Section 4; SIFT is OpenCV's, matches pass the ratio test from the first image to the second.
-"""
-
-from __future__ import annotations
+"""Which pairs of images with known cameras make a data set: the paper's rule, or how much of the scene both show."""
 
 import dataclasses
 import functools
 import json
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
+import scipy.sparse
 from numpy.typing import NDArray
 
 from fmtorch.core.files import replacing
 from fmtorch.core.settings import claim
+from fmtorch.data.cameras import line_distance
 from fmtorch.data.fmbench import CAMERAS, IMAGES, SUFFIXES
 from fmtorch.data.images import ImageError, read_image, to_grey
-from fmtorch.data.overlap import DepthOverlap, PointOverlap, overlap_of
-from fmtorch.data.pairs import ImageSource
-from fmtorch.data.scenes import ScenePairs, image_pair
+from fmtorch.data.pairs import DepthDataset, ImageSource
+from fmtorch.data.scenes import Indices, ScenePairs, View, image_pair, incidence
+
+# How much of what one image of a pair shows the other shows too, whatever features find: by depth, or by points
+
+
+STEP = 4  # px between the pixels of which depth is asked, along rows and columns
+TOLERANCE = 0.05  # by which depths may differ, relative to the one seen, for the same surface
+
+Matrix = NDArray[np.float64]
+Place = tuple[int, int, int]
+"""Number of the scene, and of its two views."""
+
+
+def overlap_of(dataset: ScenePairs) -> "DepthOverlap | PointOverlap":
+    """Overlaps by depth where the data set knows it, else by points. Raises ValueError where it has neither."""
+    if isinstance(dataset, DepthDataset):
+        return DepthOverlap(dataset)
+    if dataset.points is not None:
+        return PointOverlap(dataset.points)
+    raise ValueError(
+        f"overlap needs depth or the points of a reconstruction and dataset={dataset.name} has neither; it must be "
+        "rendered, colmap, bundler, or tum with depth images"
+    )
+
+
+class PointOverlap:
+    """By the points of reconstructions; points: of each scene a function that reads which points each view sees."""
+
+    def __init__(self, points: Sequence[Callable[[], Sequence[Indices]]]) -> None:
+        self.points = points
+        self._last: tuple[int, scipy.sparse.csr_array] | None = None  # a scene, and which of its views sees what
+
+    @property
+    def record(self) -> dict[str, Any]:
+        return {"by": "points"}
+
+    def of(self, place: Place) -> float:
+        """The overlap of a pair, from 0 to 1: points that both views see, over those of the view that sees more."""
+        scene, i, j = place
+        last = self._last
+        if last is None or last[0] != scene:
+            last = self._last = scene, incidence(self.points[scene]())
+        return float(shared_points(last[1], np.array([[i, j]]))[0])
+
+
+def shared_points(sees: scipy.sparse.csr_array, pairs: Indices) -> Matrix:
+    """Overlaps (n,) of pairs (n, 2) of images: points that both see, over those of the image that sees more of them.
+
+    sees: which image sees which point, as `incidence` gives it. Zero where an image sees none.
+    """
+    counts = np.diff(sees.indptr)[pairs]
+    shared = sees[pairs[:, 0]].multiply(sees[pairs[:, 1]]).sum(1)
+    larger = counts.max(1, initial=0)
+    overlaps: Matrix = np.divide(shared, larger, out=np.zeros(len(pairs)), where=larger > 0)
+    return overlaps
+
+
+class Seen(NamedTuple):
+    """An image as a share of its pixels needs it: K (3, 3), size (h, w), and depth (n,) at points (n, 2)."""
+
+    K: Matrix
+    size: tuple[int, int]
+    depth: Callable[[Matrix], Matrix]
+
+
+class DepthOverlap:
+    """By the depth of pixels; dataset: a `ScenePairs` with depth."""
+
+    def __init__(self, dataset: ScenePairs) -> None:
+        assert isinstance(dataset, DepthDataset)
+        self.dataset, self._depth = dataset, dataset.depth
+
+    @property
+    def record(self) -> dict[str, Any]:
+        return {"by": "depth", "step_px": STEP, "tolerance": TOLERANCE}
+
+    def of(self, place: Place) -> float:
+        """The overlap of a pair, from 0 to 1. Raises ImageError where a depth image cannot be read."""
+        scene, i, j = place
+        views = self.dataset.scenes[scene].views
+        pair = image_pair(self.dataset.scenes[scene], i, j)
+        assert pair.R is not None
+        assert pair.t is not None
+        a, b = self._seen(views[i]), self._seen(views[j])
+        return min(seen_share(a, b, pair.R, pair.t), seen_share(b, a, pair.R.T, -pair.R.T @ pair.t))
+
+    def _seen(self, view: View) -> Seen:
+        return Seen(view.K, _size(view.image), functools.partial(self._depth, view.image))
+
+
+def seen_share(image: Seen, other: Seen, R: Matrix, t: Matrix, step: int = STEP) -> float:
+    """The share of an image's pixels with depth that another image sees.
+
+    A pixel is seen where its point X, which is ``R X + t`` to the other camera, lies within the other image and has the
+    depth that is known there, to `TOLERANCE`. Pixels for which no depth is known there are left out.
+
+    Args:
+        image, other: calibration, size and depth; both depths in the unit of t.
+        R, t: (3, 3) and (3,), from the camera of the image to the other's.
+        step: px between the pixels that are looked at.
+
+    Returns:
+        The share, 0 where no pixel counts.
+    """
+    h, w = image.size
+    rows, columns = np.mgrid[step // 2 : h : step, step // 2 : w : step].reshape(2, -1).astype(np.float64)
+    depth = image.depth(np.stack([columns, rows], 1))
+    has = np.isfinite(depth)
+    rays = np.stack([columns, rows, np.ones_like(rows)], 1)[has] @ np.linalg.inv(image.K).T
+    X = (rays * depth[has, None]) @ R.T + t
+    ahead = X[X[:, 2] > 0]
+    x = ahead @ other.K.T
+    x = x[:, :2] / x[:, 2:]
+    within = ((x >= -0.5) & (x < np.array(other.size[::-1]) - 0.5)).all(1)
+    known = other.depth(x[within])
+    unknown = np.isnan(known)
+    same = np.abs(known - ahead[within, 2]) <= TOLERANCE * known
+    count = len(X) - unknown.sum()
+    return float(same.sum() / count) if count else 0.0
+
+
+def _size(image: ImageSource) -> tuple[int, int]:
+    if image.size is not None:
+        return image.size
+    h, w = read_image(image).shape[:2]
+    return h, w
+
 
 SIFT_FEATURES, RATIO, NEAR_LINE, ENOUGH = 8000, 0.8, 1.0, 20
 _AT_ONCE = 512  # keypoints that are matched together
@@ -60,20 +182,10 @@ def matchable(a: Keypoints, b: Keypoints, F: NDArray[np.float64]) -> bool:
     near = 0
     for begin in range(0, len(a[0]), _AT_ONCE):
         block = a[0][begin : begin + _AT_ONCE], a[1][begin : begin + _AT_ONCE]
-        near += _near_lines(*ratio_matches(block, b), F)
+        near += int((line_distance(F, *ratio_matches(block, b)) < NEAR_LINE).sum())
         if near > ENOUGH:
             return True
     return False
-
-
-def _near_lines(x0: NDArray[np.float64], x1: NDArray[np.float64], F: NDArray[np.float64]) -> int:
-    """How many matches (n, 2), (n, 2) lie within `NEAR_LINE` pixels of the true lines in both images."""
-    h0, h1 = np.column_stack([x0, np.ones(len(x0))]), np.column_stack([x1, np.ones(len(x1))])
-    l1, l0 = h0 @ F.T, h1 @ F
-    error = np.abs((h1 * l1).sum(1))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        worst = error / np.minimum(np.hypot(l0[:, 0], l0[:, 1]), np.hypot(l1[:, 0], l1[:, 1]))
-    return int((worst < NEAR_LINE).sum())
 
 
 # Which candidates of a data set make pairs, by the paper's rule or by overlap, and FM-Bench's layout of these pairs
@@ -99,7 +211,7 @@ class Construction:
 
     dataset: with the candidates. folder: of the set that is made; its name is the set's. count: how many pairs, drawn
     at random by `seed`; None: all. quality: of JPEG images that are written because they were undistorted.
-    overlap: the least and the greatest overlap of pairs (`fmtorch.data.overlap`); None: the paper's rule. Raises
+    overlap: the least and the greatest overlap of pairs (`fmtorch.data.construction`); None: the paper's rule. Raises
     ValueError, when its `rule` is first asked for, where the data set's overlaps are not known.
     """
 
@@ -112,17 +224,14 @@ class Construction:
 
     @functools.cached_property
     def overlaps(self) -> DepthOverlap | PointOverlap:
-        """The overlaps of the data set's pairs."""
         return overlap_of(self.dataset)
 
     @property
     def rule(self) -> dict[str, Any]:
-        """What makes a candidate a pair."""
         return RULE if self.overlap is None else {"overlap": list(self.overlap), **self.overlaps.record}
 
     @property
     def identity(self) -> dict[str, Any]:
-        """What defines the pairs and the images."""
         return {
             "version": _VERSION, "opencv": ".".join(cv2.__version__.split(".")[:2]), "dataset": self.dataset.name,
             "cameras": self.dataset.cameras_digest, "rule": self.rule, "count": self.count, "seed": self.seed,
@@ -136,7 +245,6 @@ class Construction:
 
     @property
     def complete(self) -> bool:
-        """Whether the set is there."""
         return (self.folder / "pairs_with_gt.txt").is_file()
 
     def begin(self) -> None:
@@ -145,7 +253,6 @@ class Construction:
         self.work.mkdir(exist_ok=True)
 
     def order(self) -> Sequence[int] | NDArray[np.int64]:
-        """The candidates in the order in which they are judged."""
         total, rng = self.dataset.candidates, np.random.default_rng(self.seed)
         if self.count is None:
             return range(total)
@@ -251,7 +358,6 @@ class Construction:
 
 
 def _as_it_is(source: ImageSource) -> bool:
-    """Whether the layout can take the file itself."""
     return source.lens is None and source.path.suffix in SUFFIXES
 
 

@@ -1,7 +1,5 @@
 """Photographs with a ``Camera.txt`` beside them: the cameras of the FM-Bench layout, before there are pairs."""
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import os
@@ -13,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fmtorch.data.cameras import Camera, relative_pose
-from fmtorch.data.pairs import ImagePair, ImageSource, PairDataset
+from fmtorch.data.files import DataError, given_root, images_by_stem, numbered, read_lines, read_numbers, to_finite
+from fmtorch.data.pairs import HeldPairs, ImagePair, ImageSource
 from fmtorch.data.scenes import WINDOW, AllPairs, Candidates, Scene, ScenePairs, View, folders, following
-from fmtorch.data.text_files import DataError, given_root, numbered, read_lines, read_numbers, to_finite
 
 CAMERAS, IMAGES, SUFFIXES = "Camera.txt", "Images", (".jpg", ".png")
 COLUMNS = "K (9 numbers, row by row), R (9), t (3)"
@@ -30,15 +28,9 @@ class CameraFilePairs(ScenePairs):
     """
 
     def __init__(
-        self,
-        root: str | Path | None = None,
-        split: str = "test",
-        sequences: Sequence[str] | None = None,
-        fps: int | float | None = None,
-        window: int | float = WINDOW,
-        pairs: int | None = None,
-        seed: int = 0,
-    ) -> None:
+        self, root: str | Path | None = None, split: str = "test", sequences: Sequence[str] | None = None,
+        fps: int | float | None = None, window: int | float = WINDOW, pairs: int | None = None, seed: int = 0,
+    ) -> None:  # fmt: skip
         if split != "test":
             raise DataError(f"split {split!r}: cameras has only 'test'; choose scenes by root or sequences")
         if fps is not None and fps <= 0:
@@ -61,7 +53,7 @@ def _scene(folder: Path, fps: int | float | None, window: int | float) -> Scene:
     images = folder / IMAGES
     if not images.is_dir():
         raise DataError(f"{images}: no such folder; it must hold the images of {folder / CAMERAS}")
-    there = {file.stem: file for file in sorted(images.iterdir(), reverse=True) if file.suffix in SUFFIXES}
+    there = images_by_stem(images, SUFFIXES)
     views = list[View]()
     for number, line in numbered(folder / CAMERAS):
         stem, values = f"{len(views):08d}", to_finite(folder / CAMERAS, number, line.split(), COLUMNS, 21)
@@ -77,13 +69,12 @@ def _scene(folder: Path, fps: int | float | None, window: int | float) -> Scene:
 # Image pairs in the layout of the FM-Bench distribution (Bian et al., BMVC 2019)
 
 
-_PAIRS, _SUBSETS, _CAMERAS = "pairs_with_gt.txt", "pairs_which_dataset.txt", "Camera.txt"
-_SUFFIXES = (".jpg", ".png")
+_PAIRS, _SUBSETS = "pairs_with_gt.txt", "pairs_which_dataset.txt"
 _PAIR_COLUMNS = "l r F11 F12 F13 F21 F22 F23 F31 F32 F33"
 _LAYOUT = f"the layout is <set>/{_PAIRS} and <set>/{_SUBSETS}"
 
 
-class FMBenchPairs(PairDataset):
+class FMBenchPairs(HeldPairs):
     """The pairs of one or several sets in the authors' distribution layout.
 
     root: one set's folder, which holds ``pairs_with_gt.txt``, or a folder of such sets.
@@ -101,13 +92,9 @@ class FMBenchPairs(PairDataset):
     name = "fmbench"
 
     def __init__(
-        self,
-        root: str | Path | None = None,
-        split: str = "test",
-        subset: str | Sequence[str] | None = None,
-        sets: Sequence[str] | None = None,
-        cameras: bool = True,
-    ) -> None:
+        self, root: str | Path | None = None, split: str = "test", subset: str | Sequence[str] | None = None,
+        sets: Sequence[str] | None = None, cameras: bool = True,
+    ) -> None:  # fmt: skip
         if split != "test":
             raise DataError(f"split {split!r}: the FM-Bench distribution has only 'test'; choose pairs by root or sets")
         self._subsets = None if subset is None else {subset} if isinstance(subset, str) else set(subset)
@@ -123,12 +110,6 @@ class FMBenchPairs(PairDataset):
         for missing in sorted((self._subsets or set()) - self._present):
             raise DataError(f"{root}: no pairs of subset {missing!r}; it has {_listed(self._present) or 'no pairs'}")
         self.digest = self._hash.hexdigest()
-
-    def __len__(self) -> int:
-        return len(self._pairs)
-
-    def __getitem__(self, index: int) -> ImagePair:
-        return self._pairs[index]
 
     def _read_set(self, folder: Path) -> None:
         table = read_numbers(folder / _PAIRS, _PAIR_COLUMNS, 11, _LAYOUT)
@@ -150,7 +131,7 @@ class FMBenchPairs(PairDataset):
                 self._pairs.append(self._pair(line, folder, scene, numbers, images[scene], cameras[scene]))
 
     def _read_cameras(self, folder: Path, scene: str) -> list[Camera] | None:
-        path = folder / scene / _CAMERAS
+        path = folder / scene / CAMERAS
         if not self._cameras or not path.is_file():
             return None
         self._add_to_digest(f"{folder.name}/{scene}", path)
@@ -163,40 +144,30 @@ class FMBenchPairs(PairDataset):
             self._hash.update(f"{name}/{path.name}:{len(content)}:".encode() + content)
 
     def _pair(
-        self,
-        line: str,
-        folder: Path,
-        scene: str,
-        numbers: NDArray[np.float64],
-        images: dict[str, Path],
+        self, line: str, folder: Path, scene: str, numbers: NDArray[np.float64], images: dict[str, Path],
         cameras: list[Camera] | None,
-    ) -> ImagePair:
+    ) -> ImagePair:  # fmt: skip
         left, right = (_image_number(line, value) for value in numbers[:2])
         F, problems = _normalized(numbers[2:].reshape(3, 3))
         sources = []
         for stem in (f"{left:08d}", f"{right:08d}"):
-            path = images.get(stem, folder / scene / "Images" / f"{stem}{_SUFFIXES[0]}")
+            path = images.get(stem, folder / scene / IMAGES / f"{stem}{SUFFIXES[0]}")
             sources.append(ImageSource(f"{folder.name}/{scene}/{stem}", path))
             if stem not in images:
-                problems.append(f"no image {path} (or {_SUFFIXES[1]})")
+                problems.append(f"no image {path} (or {SUFFIXES[1]})")
         identity = f"{folder.name}/{scene}/{left}-{right}"
         self._seen[identity] += 1
         if self._seen[identity] > 1:  # the same pair on a second line is a second pair
             identity += f"#{self._seen[identity]}"
         pair = ImagePair(
-            identity=identity,
-            family=folder.name,
-            scene=scene,
-            image0=sources[0],
-            image1=sources[1],
-            F=F,
+            identity=identity, family=folder.name, scene=scene, image0=sources[0], image1=sources[1], F=F,
             problem=f"{line}: {'; '.join(problems)}" if problems else None,
-        )
+        )  # fmt: skip
         if cameras is None:
             return pair
         if max(left, right) >= len(cameras):
             raise DataError(
-                f"{folder / scene / _CAMERAS} has {len(cameras)} lines, but {line} names image {max(left, right)}; "
+                f"{folder / scene / CAMERAS} has {len(cameras)} lines, but {line} names image {max(left, right)}; "
                 "line i + 1 must be the camera of image i"
             )
         c0, c1 = cameras[left], cameras[right]
@@ -236,12 +207,10 @@ def _listed(names: Sequence[str] | set[str] | dict[str, Path]) -> str:
 
 
 def _images(folder: Path, scene: str) -> dict[str, Path]:
-    """The image files of a subset by their stem."""
-    images = folder / scene / "Images"
+    images = folder / scene / IMAGES
     if not images.is_dir():
         raise DataError(f"{folder / _SUBSETS} names {scene}/, but there is no folder {images}")
-    files = sorted(images.iterdir(), reverse=True)  # .jpg comes last and wins over .png
-    return {file.stem: file for file in files if file.suffix in _SUFFIXES}
+    return images_by_stem(images, SUFFIXES)
 
 
 def _image_number(line: str, value: float) -> int:

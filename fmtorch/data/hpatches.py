@@ -1,7 +1,5 @@
 """HPatches' image sequences (Balntas et al., CVPR 2017): photographs of planes with known homographies."""
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 from collections.abc import Sequence
@@ -12,9 +10,9 @@ import numpy as np
 
 from fmtorch.core.options import Within
 from fmtorch.data.cameras import Matrix
+from fmtorch.data.files import DataError, given_root, read_numbers
 from fmtorch.data.images import stored_size
-from fmtorch.data.pairs import ImagePair, ImageSource, PairDataset, Resampling, shorter_side
-from fmtorch.data.text_files import DataError, given_root, read_numbers
+from fmtorch.data.pairs import HeldPairs, ImagePair, ImageSource, Resampling, shorter_side
 
 FAMILIES = {"i": "illumination", "v": "viewpoint"}  # by the first letter of a sequence's name
 LARGE = (
@@ -25,7 +23,7 @@ SUFFIXES = (".ppm", ".png", ".jpg")
 OTHERS = range(2, 7)  # images of a sequence that image 1 is paired with
 
 
-class HPatchesPairs(PairDataset):
+class HPatchesPairs(HeldPairs):
     """Image 1 of each sequence with images 2 to 6, and the homographies ``H_1_2`` to ``H_1_6``.
 
     Args:
@@ -42,12 +40,9 @@ class HPatchesPairs(PairDataset):
     model = "homography"
 
     def __init__(
-        self,
-        root: str | Path | None = None,
-        sequences: Sequence[str] | None = None,
-        large: bool = False,
+        self, root: str | Path | None = None, sequences: Sequence[str] | None = None, large: bool = False,
         short_side: Annotated[int, Within(1)] | None = 480,
-    ) -> None:
+    ) -> None:  # fmt: skip
         home = given_root(root, "hpatches", "the folder of the sequences, i_* and v_*")
         there = sorted(folder.name for kind in FAMILIES for folder in home.glob(f"{kind}_*") if folder.is_dir())
         if not there:
@@ -67,12 +62,6 @@ class HPatchesPairs(PairDataset):
                 digest.update(f"{sequence}/{file.name}:{len(content)}:".encode() + content)
                 self._pairs.append(_pair(home / sequence, other, short_side))
         self.digest = digest.hexdigest()
-
-    def __len__(self) -> int:
-        return len(self._pairs)
-
-    def __getitem__(self, index: int) -> ImagePair:
-        return self._pairs[index]
 
 
 def _pair(folder: Path, other: int, short_side: int | None) -> ImagePair:
@@ -103,7 +92,6 @@ def _image(folder: Path, number: int, short_side: int | None) -> ImageSource:
 
 
 def _homography(path: Path) -> Matrix:
-    """The homography of a file, three lines of three numbers. Raises DataError, naming it, where there is none."""
     rows = read_numbers(path, "three numbers of H", 3)
     H = np.stack(rows) if len(rows) == 3 else np.full((3, 3), np.nan)
     if not np.isfinite(H).all() or np.linalg.det(H) == 0:

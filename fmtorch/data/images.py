@@ -1,7 +1,5 @@
 """Images from disk: never a half-decoded one, turned only on demand, and their sizes from headers alone."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import re
@@ -16,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import ExifTags, Image, TiffImagePlugin
 
-from fmtorch.data.lenses import undistorted
+from fmtorch.data.cameras import undistorted
 from fmtorch.data.pairs import ImageSource
 
 _JPEG, _PNG = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
@@ -152,13 +150,11 @@ def _upright_tiff(data: bytes) -> bytes:
 
 
 def _is_heic(data: bytes) -> bool:
-    """Whether the brands of a file's first box are those of HEVC images (ISO/IEC 23008-12)."""
     brands = data[8 : int.from_bytes(data[:4], "big")] if data[4:8] == b"ftyp" else b""
     return any(brands[i : i + 4] in (b"heic", b"heix", b"heim", b"heis", b"hevc") for i in range(0, len(brands), 4))
 
 
 def _heic(path: Path, data: bytes) -> NDArray[np.generic]:
-    """The pixels of a HEIC file, upright."""
     try:
         import pillow_heif
     except ImportError as error:
@@ -224,7 +220,6 @@ def _expect_moderate_rarity(path: Path, data: bytes) -> None:
 
 
 def _jpeg_ends(data: bytes) -> bool:
-    """Whether the markers of a JPEG lead to its end-of-image marker."""
     return any(marker == _END_OF_IMAGE for marker, _ in _jpeg_segments(data))
 
 

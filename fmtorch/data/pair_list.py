@@ -5,8 +5,6 @@ counterclockwise, K0, K1 row by row, and the pose, a matrix (4, 4) that takes po
 are those of the images before they are turned. glue-factory: names, K0, K1, and either R and t or the matrix.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import re
@@ -18,10 +16,9 @@ from typing import Any
 import numpy as np
 
 from fmtorch.data.cameras import Camera, Matrix, fundamental, nearest_rotation, relative_pose
+from fmtorch.data.files import DataError, NpzArrays, given_root, numbered, read_numbers, to_numbers, to_whole
 from fmtorch.data.images import stored_size
-from fmtorch.data.npz_arrays import NpzArrays
-from fmtorch.data.pairs import ImagePair, ImageSource, PairDataset, Resampling, Size, longer_side
-from fmtorch.data.text_files import DataError, given_root, numbered, read_numbers, to_numbers, to_whole
+from fmtorch.data.pairs import HeldPairs, ImagePair, ImageSource, Resampling, Size, longer_side
 
 SUPERGLUE, GLUE_FACTORY, GLUE_FACTORY_4X4 = 38, 32, 36  # columns of a line
 LAYOUTS = {
@@ -86,7 +83,6 @@ def _turns(path: Path, number: int, word: str) -> int:
 
 
 def _pose(values: Matrix) -> tuple[Matrix, Matrix]:
-    """R and t of twelve numbers, R before t, or of sixteen, a matrix row by row."""
     if len(values) == 12:
         return values[:9].reshape(3, 3), values[9:]
     matrix = values.reshape(4, 4)
@@ -148,7 +144,6 @@ def _megadepth(arrays: NpzArrays) -> Iterator[ListedPair]:
 
 
 def _matrix(value: Any, size: int) -> Matrix:
-    """A matrix (size, size) of an array of objects; NaN where there is none."""
     try:
         return np.asarray(value, np.float64).reshape(size, size)
     except (TypeError, ValueError):
@@ -215,7 +210,7 @@ TEXT_SUFFIXES, NPZ = (".txt", ".csv", ".list", ""), ".npz"
 _FRAME = re.compile(r"(.+?)_frame\W")  # scene0711_00_frame-001680.jpg
 
 
-class PairList(PairDataset):
+class PairList(HeldPairs):
     """The pairs of a list, whose images lie in a folder.
 
     Args:
@@ -235,12 +230,9 @@ class PairList(PairDataset):
     name = "pair_list"
 
     def __init__(
-        self,
-        root: str | Path | None = None,
-        file: str | Path | None = None,
-        resize: int | Sequence[int] | None = None,
-        origin: float | None = None,
-    ) -> None:
+        self, root: str | Path | None = None, file: str | Path | None = None,
+        resize: int | Sequence[int] | None = None, origin: float | None = None,
+    ) -> None:  # fmt: skip
         home = given_root(root, "pair_list", "the folder of the images of dataset.file, the list")
         if file is None:
             raise DataError("pair_list needs file: dataset.file=FILE, the list of pairs, .txt or .npz")
@@ -263,12 +255,6 @@ class PairList(PairDataset):
             content = each.read_bytes()
             digest.update(f"{name}:{len(content)}:".encode() + content)
         self.digest = digest.hexdigest()
-
-    def __len__(self) -> int:
-        return len(self._pairs)
-
-    def __getitem__(self, index: int) -> ImagePair:
-        return self._pairs[index]
 
     def _pair(self, listed: ListedPair, scene: str) -> ImagePair:
         identity = f"{self.name}/{listed.names[0]}-{listed.names[1]}"  # draws do not follow the name of the list
@@ -330,7 +316,6 @@ def _motion(listed: ListedPair) -> tuple[Matrix, Matrix]:
 
 
 def _listed(path: Path, home: Path) -> tuple[list[ListedPair], list[tuple[str, Path]]]:
-    """The pairs of a list, and the files that define them, by their names."""
     if path.suffix == NPZ:
         return list(npz_pairs(path, home)), [(path.name, path), *camera_files(path, home)]
     if path.suffix not in TEXT_SUFFIXES:
@@ -349,7 +334,6 @@ def _listed(path: Path, home: Path) -> tuple[list[ListedPair], list[tuple[str, P
 
 
 def _resize(resize: int | Sequence[int] | None) -> int | Size | None:
-    """Checked, [width, height] as (h, w)."""
     values = [resize] if isinstance(resize, int) else list(resize or [])
     if resize is None or (len(values) in (1, 2) and all(isinstance(v, int) and v > 0 for v in values)):
         return None if resize is None else values[0] if len(values) == 1 else (values[1], values[0])

@@ -1,6 +1,4 @@
-"""Images resized and turned when they are read, as evaluation protocols ask, and cameras of what is read."""
-
-from __future__ import annotations
+"""The item of every data set: an image pair with its ground truth, and how its images are resized when read."""
 
 import dataclasses
 import hashlib
@@ -13,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fmtorch.core.types import Correspondences, pair_key
-from fmtorch.data.lenses import Lens
+from fmtorch.data.cameras import Lens
 
 Matrix = NDArray[np.float64]
 Size = tuple[int, int]  # (h, w), px
@@ -31,7 +29,6 @@ class Resampling:
     quarter_turns: int = 0
 
     def __call__(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The image (H, W) or (H, W, 3) resized and turned."""
         if self.size is not None and image.shape[:2] != self.size:
             shrinks = self.size[0] <= image.shape[0] and self.size[1] <= image.shape[1]
             kind = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
@@ -140,7 +137,6 @@ class ImagePair:
 
     @property
     def key(self) -> int:
-        """The pair's stable 64-bit key."""
         return pair_key(self.identity)
 
 
@@ -164,13 +160,23 @@ class PairDataset(Protocol):
         return (self[index] for index in range(len(self)))
 
 
+class HeldPairs(PairDataset):
+    """Pairs that a data set holds in memory."""
+
+    _pairs: list[ImagePair]
+
+    def __len__(self) -> int:
+        return len(self._pairs)
+
+    def __getitem__(self, index: int) -> ImagePair:
+        return self._pairs[index]
+
+
 @runtime_checkable
 class DepthDataset(PairDataset, Protocol):
     """A data set that knows how far away the points of its images are, in the unit of the pairs' t."""
 
-    def depth(self, image: ImageSource, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Depth (n,) along the optical axis at points (n, 2) in pixels; NaN where it is unknown."""
-        ...
+    def depth(self, image: ImageSource, points: NDArray[np.float64]) -> NDArray[np.float64]: ...
 
 
 # Some of a data set's pairs, as a data set
@@ -195,7 +201,6 @@ class _DepthSubset(PairSubset):
     dataset: DepthDataset
 
     def depth(self, image: ImageSource, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """As of the whole data set."""
         return self.dataset.depth(image, points)
 
 

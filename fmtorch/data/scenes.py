@@ -2,8 +2,6 @@
 that see the same points of its reconstruction.
 """
 
-from __future__ import annotations
-
 import bisect
 import dataclasses
 import functools
@@ -12,17 +10,19 @@ import itertools
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import cv2
 import numpy as np
-import scipy.sparse
 from numpy.typing import NDArray
 
 from fmtorch.data.cameras import Matrix, fundamental, relative_pose, share_centre
+from fmtorch.data.files import DataError
 from fmtorch.data.images import ImageError
 from fmtorch.data.pairs import ImagePair, ImageSource, PairDataset
-from fmtorch.data.text_files import DataError
+
+if TYPE_CHECKING:
+    import scipy.sparse
 
 Indices = NDArray[np.int64]
 
@@ -100,8 +100,10 @@ def sharing_points(points: Sequence[NDArray[np.int64]], minimum: int = MIN_SHARE
     return ListedPairs(np.concatenate([*blocks, np.zeros((0, 2), np.int64)]))
 
 
-def incidence(points: Sequence[Indices]) -> scipy.sparse.csr_array:
+def incidence(points: Sequence[Indices]) -> "scipy.sparse.csr_array":
     """Which image sees which point, (images, points) of ones; points: of each image the numbers it sees."""
+    import scipy.sparse  # which takes longer to import than a small database to verify
+
     seen = [np.unique(p) for p in points]
     _, columns = np.unique(np.concatenate([*seen, np.zeros(0, np.int64)]), return_inverse=True)
     return scipy.sparse.csr_array(
@@ -122,11 +124,7 @@ def drawn(total: int, count: int | None, seed: int) -> Sequence[int] | Indices:
 
 SPLITS: dict[str, dict[str, tuple[str, ...]]] = {
     "tum": {
-        "test": (
-            "rgbd_dataset_freiburg3_teddy",
-            "rgbd_dataset_freiburg3_large_cabinet",
-            "rgbd_dataset_freiburg3_long_office_household",
-        ),
+        "test": tuple(f"rgbd_dataset_freiburg3_{name}" for name in ("teddy", "large_cabinet", "long_office_household")),
     },
     "kitti": {
         "test": ("06", "07", "08", "09", "10"),
@@ -290,14 +288,9 @@ class ScenePairs(PairDataset):
     points: Sequence[Callable[[], Sequence[NDArray[np.int64]]]] | None = None
 
     def __init__(
-        self,
-        name: str,
-        scenes: Sequence[Scene],
-        sources: Iterable[tuple[str, Path]],
-        options: Sequence[object] = (),
-        pairs: int | None = None,
-        seed: int = 0,
-    ) -> None:
+        self, name: str, scenes: Sequence[Scene], sources: Iterable[tuple[str, Path]], options: Sequence[object] = (),
+        pairs: int | None = None, seed: int = 0,
+    ) -> None:  # fmt: skip
         self.name, self.scenes = name, list(scenes)
         self._starts = [0, *itertools.accumulate(len(scene.candidates) for scene in self.scenes)]
         self._ranks = drawn(self._starts[-1], pairs, seed)
@@ -313,7 +306,6 @@ class ScenePairs(PairDataset):
 
     @property
     def candidates(self) -> int:
-        """How many candidates the scenes have."""
         return self._starts[-1]
 
     def candidate(self, rank: int) -> tuple[int, int, int]:
@@ -344,18 +336,9 @@ def image_pair(scene: Scene, i: int, j: int) -> ImagePair:
         F = fundamental(a, b)
     R, t = relative_pose(a, b)
     return ImagePair(
-        identity=f"{scene.family}/{scene.name}/{i}-{j}",
-        family=scene.family,
-        scene=scene.name,
-        image0=a.image,
-        image1=b.image,
-        F=F,
-        K0=a.K,
-        K1=b.K,
-        R=R,
-        t=t,
-        problem="; ".join(problems) or None,
-    )
+        identity=f"{scene.family}/{scene.name}/{i}-{j}", family=scene.family, scene=scene.name, image0=a.image,
+        image1=b.image, F=F, K0=a.K, K1=b.K, R=R, t=t, problem="; ".join(problems) or None,
+    )  # fmt: skip
 
 
 def folders(root: Path, wanted: Sequence[str], what: str) -> list[Path]:

@@ -26,7 +26,7 @@ from fmtorch.geometry.epipolar import SAMPSON, Residual
 from fmtorch.geometry.significance import of_one_pair
 from fmtorch.jit.batches import as_array
 from fmtorch.jit.kernel import Array
-from fmtorch.jobs.threads import available
+from fmtorch.jobs.execution import available
 
 PARTS_OF_A_THREAD = 4  # so that no thread is long alone at the end
 MIN_WORK = 500  # matches: a pair of fewer takes as long as one of these
@@ -41,7 +41,7 @@ class Solution(NamedTuple):
     lenses (2,) and their standard deviations (2,), None where they are not estimated."""
 
     fit: Fit | None
-    draws: int
+    samples: int
     inliers: Array | None = None
     reason: str = ""
     lens: Array | None = None
@@ -92,7 +92,7 @@ class Estimation:
         self.parts = [part.tolist() for part in shared_out(host)] if b > 1 and available() > 1 else [range(b)]
         """The rows, shared out among threads."""
         self.F, self.inliers, self.ok = np.zeros((b, 3, 3)), np.zeros((b, n), np.bool_), np.zeros(b, np.bool_)
-        self.draws, self.significance, self.reasons = np.zeros(b, np.int64), np.full(b, -np.inf), [""] * b
+        self.samples, self.significance, self.reasons = np.zeros(b, np.int64), np.full(b, -np.inf), [""] * b
         self.cameras = CameraRows(np.full((b, 2), np.nan), np.full(b, np.nan), np.full((b, 2, 2), np.nan))
         self.lens = np.full((b, 2), np.nan)
         self.asked_for_cameras = family.model == "fundamental" and c.asks_for_cameras
@@ -113,7 +113,7 @@ class Estimation:
     def put(self, row: Row, solution: Solution) -> None:
         """The solution of a pair as its estimate, or the reason why there is none."""
         i, pair = row.place, row.pair
-        self.draws[i] = solution.draws
+        self.samples[i] = solution.samples
         if solution.fit is None or solution.inliers is None:
             self.reasons[i] = solution.reason
         elif degenerate := degenerate_support(pair, solution.inliers, row.needed, relative_rounding(self.c)):
@@ -136,7 +136,7 @@ class Estimation:
 
     def estimates(self, attach: Attach) -> Estimate:
         """What has become of the pairs."""
-        arrays = {"F": self.F, "inliers": self.inliers, "ok": self.ok, "draws": self.draws}
+        arrays = {"F": self.F, "inliers": self.inliers, "ok": self.ok, "samples": self.samples}
         arrays["significance"] = self.significance
         if self.asked_for_cameras:
             arrays |= self.cameras._asdict()
@@ -193,7 +193,7 @@ class Batch(NamedTuple):
     mask: Array
     prior: Array | None
     noise: Array | None
-    quality: Array | None
+    ambiguity: Array | None
     sizes: Array
     keys: list[int]
     focal: Array | None
@@ -204,7 +204,7 @@ class Batch(NamedTuple):
     @staticmethod
     def of(c: Correspondences) -> Batch:
         """Views where the tensors are of float32 or float64."""
-        prior, noise, quality = [None if t is None else _array(t) for t in (c.prior, c.noise, c.quality)]
+        prior, noise, ambiguity = [None if t is None else _array(t) for t in (c.prior, c.noise, c.ambiguity)]
         keys: list[int] = c.keys.tolist()
         sizes = np.empty((len(keys), 0 if c.size0 is None else 4))
         if c.size0 is not None and c.size1 is not None:
@@ -216,13 +216,13 @@ class Batch(NamedTuple):
         lens = None if c.lens is None else np.asarray(_array(c.lens), np.float64)
         one_lens = np.zeros(len(keys), np.bool_) if c.shared_lens is None else c.shared_lens.numpy()
         matches = _array(c.x0), _array(c.x1), c.mask.numpy()
-        return Batch(*matches, prior, noise, quality, sizes, keys, focal, shared, lens, one_lens)
+        return Batch(*matches, prior, noise, ambiguity, sizes, keys, focal, shared, lens, one_lens)
 
     def pair(self, i: int) -> PixelMatches:
         """One row, in float64."""
         return PixelMatches(
             _row(self.x0, i), _row(self.x1, i), np.ascontiguousarray(self.mask[i]), _row(self.prior, i),
-            _row(self.noise, i), _row(self.quality, i), self.sizes[i],
+            _row(self.noise, i), _row(self.ambiguity, i), self.sizes[i],
         )  # fmt: skip
 
     def calibrated(self, i: int) -> bool:
@@ -236,7 +236,7 @@ class Batch(NamedTuple):
         """The pair of a row, and where its matches (n,) stood; or why it cannot be estimated."""
         n, frame = len(matches.mask), np.empty(6)
         slots, flat = np.empty(n, np.int64), np.empty(9 * n)
-        known = self.prior is not None, self.noise is not None, self.quality is not None
+        known = self.prior is not None, self.noise is not None, self.ambiguity is not None
         count = normalize_pair(matches, slots, flat, frame)
         slot, table, (unit, right) = slots[:count], flat[: 9 * count].reshape(9, count), frame[4:].tolist()
         if count < minimal:

@@ -41,5 +41,5 @@ class CoarseToFine:
             f"coarse: {first}" if first else f"fine: {second}" if second else ""
             for first, second in zip(coarse.reason, fine.reason, strict=True)
         )
-        combined = fine.replace(reason=reasons, draws=coarse.draws + fine.draws, significance=None)
+        combined = fine.replace(reason=reasons, samples=coarse.samples + fine.samples, significance=None)
         return judged(combined, c)

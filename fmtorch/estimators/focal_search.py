@@ -66,7 +66,7 @@ class SearchResult(NamedTuple):
 
     candidates: PlausibleCandidates
     settled: bool
-    draws: int
+    samples: int
 
 
 @dataclasses.dataclass(frozen=True)
@@ -109,7 +109,7 @@ class FocalSearch:
         """The candidates of a round, and the samples drawn until then."""
         assert self.search is not None
         pool = self.search(pair, turn * self.options.samples)
-        return self.refined(pool.models, pool.valid, pair, self.refinement.near(pool, pair)), pool.draws
+        return self.refined(pool.models, pool.valid, pair, self.refinement.near(pool, pair)), pool.samples
 
     def refined(self, F: Array, valid: Array, pair: Pair, near: Pair) -> PlausibleCandidates:
         """Candidates near models (k, 9), refined on some matches and judged on all."""

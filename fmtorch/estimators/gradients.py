@@ -32,7 +32,7 @@ from fmtorch.geometry import canonical, eight_point, unit_frobenius
 from fmtorch.geometry.cameras import PixelFrame
 from fmtorch.geometry.homography_refine import homography_at_optimum
 from fmtorch.geometry.levenberg_marquardt import LOSS_CODES, NO_TABLE, Weighted
-from fmtorch.geometry.optimum import STEP_DAMPING, gradient_of_cost
+from fmtorch.geometry.refine import STEP_DAMPING, gradient_of_cost
 from fmtorch.geometry.robust_losses import LOSSES
 from fmtorch.jit.kernel import Array
 from fmtorch.jit.lanes import LANES

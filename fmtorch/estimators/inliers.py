@@ -36,12 +36,15 @@ class WithinThreshold:
         return inside
 
 
+FLOOR = 1e-3  # px, of robust deviations, as OpenCV's: those of exact matches are rounding
+
+
 class BetterHalf:
-    """Inliers are the matches at or below the median residual, as MATLAB's LMedS reports them."""
+    """Inliers are the matches at or below the median residual, as MATLAB's LMedS reports them, and the exact ones."""
 
     def __call__(self, squared_px: Array, pair: Pair) -> Array:
         """As `InlierRule`."""
-        better: Array = squared_px <= lower_median(squared_px)
+        better: Array = squared_px <= max(lower_median(squared_px), squared(FLOOR))
         return better
 
 
@@ -54,7 +57,7 @@ class RobustDeviations:
         """As `InlierRule`."""
         spare = max(pair.count - self.PARAMETERS, 1)
         sigma = 1.4826 * (1 + 5 / spare) * math.sqrt(lower_median(squared_px))
-        inside: Array = squared_px <= squared(2.5 * sigma)
+        inside: Array = squared_px <= squared(max(2.5 * sigma, FLOOR))
         return inside
 
 

@@ -25,7 +25,7 @@ from fmtorch.geometry.rank2_manifold import SQUARINGS
 from fmtorch.geometry.refine import refine_kernel
 from fmtorch.geometry.robust_losses import named_loss
 from fmtorch.jit.kernel import Array
-from fmtorch.jobs.threads import mapped
+from fmtorch.jobs.execution import mapped
 
 DECAY = 0.65  # of the loss's scale, from one iteration to the next, down to the threshold
 FIRST_DAMPING = 1e-4  # of Levenberg-Marquardt
@@ -35,10 +35,10 @@ NOT_DETERMINED = "the matches do not determine a model"
 class IterativelyReweighted:
     """The least ``sum_i w_i rho(r_i^2)``, r the Sampson distance, from the weighted 8-point algorithm on all matches.
 
-    w is the prior P(inlier); where there is none, the rank by quality (1 for the best match, falling to 0); where there
-    is neither, 1. Each power of w in `starts` gives a first model. From there the scale of the loss shrinks from the
-    residuals' own to the threshold, one reweighted fit at each scale (graduated non-convexity, Blake & Zisserman 1987,
-    with the 8-point weights of Torr & Murray 1997), so that a redescending loss is not caught in the nearest minimum.
+    w is the prior P(inlier); without one, the rank by ambiguity (1 for the best, falling to 0); without either, 1.
+    Each power of w in `starts` gives a first model. From there the scale of the loss shrinks from the residuals'
+    own to the threshold, one reweighted fit at each scale (graduated non-convexity, Blake & Zisserman 1987, with
+    the 8-point weights of Torr & Murray 1997), so that a redescending loss is not caught in the nearest minimum.
     Of the refined models the one of least cost is the estimate.
 
     Gradients reach the points and the prior through one attached Gauss-Newton step: those of the optimum.
@@ -144,13 +144,13 @@ class IterativelyReweighted:
 
 
 def _weight(pair: Pair) -> Array:
-    """The prior, or the rank by quality, or 1: (n,)."""
+    """The prior, or the rank by ambiguity, or 1: (n,)."""
     if pair.prior is not None:
         return pair.prior
-    if pair.quality is None:
+    if pair.ambiguity is None:
         return np.ones(pair.count)
     rank = np.empty(pair.count, np.float32)  # as torch divides integers
-    rank[np.argsort(pair.quality, kind="stable")] = np.arange(pair.count)
+    rank[np.argsort(pair.ambiguity, kind="stable")] = np.arange(pair.count)
     return (np.float32(1) - rank / np.float32(pair.count)).astype(np.float64)
 
 

@@ -68,9 +68,9 @@ class Pair:
     """The matches of one pair. Arrays are float64 and C-contiguous.
 
     table: (9, n), a row each of x0, y0, x1, y1 in normalised units, weight, pixels per noise, match weight, noise,
-    quality. points: the first four: ``x = centre + pixels_per_unit * point``. weight: what each match counts in a
+    ambiguity. points: the first four: ``x = centre + pixels_per_unit * point``. weight: what each match counts in a
     fit, its prior divided by the square of its noise. pixels_per_noise: pixels in one normalised unit, divided by
-    the noise. match_weight: what it counts in a score, the prior, or one. prior, noise, quality: (n,), None where
+    the noise. match_weight: what it counts in a score, the prior, or one. prior, noise, ambiguity: (n,), None where
     the caller has none; noise is between MIN_NOISE and MAX_NOISE. bucket: of the number of matches of the whole
     pair, which decides how priors are quantised and whether models are preselected. pixels_per_unit: a power of
     two. centre: (4,), of the points, pixels. sizes: (4,), of the images as h, w, h, w, pixels; empty where unknown.
@@ -84,7 +84,7 @@ class Pair:
         centre: Array, sizes: Array, residual: Residual = SAMPSON, calibration: Calibration | None = None,
         images: dict[Hashable, Any] | None = None, lens: Lens | None = None,
     ) -> None:  # fmt: skip
-        """known: whether the caller has given a prior, noise, quality."""
+        """known: whether the caller has given a prior, noise, ambiguity."""
         self.table, self.known, self.bucket, self.pixels_per_unit = table, known, bucket, pixels_per_unit
         self.key, self.seed, self.centre, self.sizes, self.residual = key, seed, centre, sizes, residual
         self.calibration, self.lens = calibration, lens
@@ -93,7 +93,7 @@ class Pair:
         self.pixels_per_noise, self.match_weight = table[5], table[6]
         self.prior: Array | None = self.match_weight if known[0] else None
         self.noise: Array | None = table[7] if known[1] else None
-        self.quality: Array | None = table[8] if known[2] else None
+        self.ambiguity: Array | None = table[8] if known[2] else None
         self.images: dict[Hashable, Any] = {} if images is None else images
         self._cache: dict[Hashable, Any] = {}
 
@@ -158,7 +158,7 @@ class PixelMatches(NamedTuple):
     mask: B1x1
     prior: F8x1
     noise: F8x1
-    quality: F8x1
+    ambiguity: F8x1
     sizes: F8x1
 
 
@@ -180,7 +180,7 @@ def normalize_pair(matches: PixelMatches, slot: I8x1, table: F8x1, frame: F8x1) 
     table: (9 n,), the rows of `Pair` one after the other. frame: (6,), the middle of the box around the points of each
     image; the unit in pixels, 0 where all coincide; and 1 where all priors, noises and sizes are right, otherwise 0.
     """
-    x0, x1, mask, prior, noise, quality, sizes = matches
+    x0, x1, mask, prior, noise, ambiguity, sizes = matches
     count, half, end, right = 0, 0.0, MAX_COORDINATE_PX, True
     for i in range(len(mask)):
         if mask[i] and abs(x0[i, 0]) < end and abs(x0[i, 1]) < end and abs(x1[i, 0]) < end and abs(x1[i, 1]) < end:
@@ -204,7 +204,7 @@ def normalize_pair(matches: PixelMatches, slot: I8x1, table: F8x1, frame: F8x1) 
         s = min(max(s, MIN_NOISE), MAX_NOISE)
         table[4 * count + i], table[5 * count + i] = p / (s * s), unit / s
         table[6 * count + i], table[7 * count + i] = p, s
-        table[8 * count + i] = quality[k] if len(quality) else 0.0
+        table[8 * count + i] = ambiguity[k] if len(ambiguity) else 0.0
     for side in sizes:
         right = right and 0 < side < math.inf
     frame[4], frame[5] = unit, 1.0 if right else 0.0

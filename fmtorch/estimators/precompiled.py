@@ -29,7 +29,7 @@ from fmtorch.geometry import five_point, homography_refine, levenberg_marquardt
 from fmtorch.geometry.homography import four_point
 from fmtorch.geometry.refine import refine_kernel
 from fmtorch.geometry.seven_point import seven_point_kernel
-from fmtorch.geometry.significance import counted_chances, most_significant
+from fmtorch.geometry.significance import counted_chances, counted_plane_chances, most_significant
 from fmtorch.jit.kernel import Kernel
 
 WITH_FOCALS: tuple[Kernel[..., Any], ...] = (
@@ -77,5 +77,6 @@ OF_HOMOGRAPHIES: tuple[Kernel[..., Any], ...] = (
     refinement.near_homography,
     scores.score_gains_homography,
     saturated.score_saturated_homography,
+    counted_plane_chances,
 )
 """Of an estimator of homographies, beside those that the former has too."""

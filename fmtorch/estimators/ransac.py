@@ -36,7 +36,7 @@ from fmtorch.estimators.search import Search
 from fmtorch.estimators.selection import BestOfSearch, BestScore, Selection, Selector
 from fmtorch.jit.kernel import Array, Kernel
 from fmtorch.jit.together import compile_together
-from fmtorch.jobs.threads import mapped
+from fmtorch.jobs.execution import mapped
 
 FOCAL_ROUND = 500  # samples of five matches at a time
 CALIBRATED_MATCHES = 6  # that a pair of calibrated cameras needs: five of them have up to ten solutions
@@ -209,13 +209,13 @@ class Ransac:
             return solution._replace(lens=lens)
         inliers = self.inlier_rule(squared_px(refined.F, refined.lens, pair), pair)
         own = fit._replace(F=refined.F, at=refined.F, cameras=refined.cameras)
-        return Solution(own, solution.draws, inliers, lens=refined.lens, deviation=refined.deviation)
+        return Solution(own, solution.samples, inliers, lens=refined.lens, deviation=refined.deviation)
 
     def selected(self, pair: Pair) -> tuple[Selection, int]:
         """The selected model, and the samples drawn: among plausible cameras first where the image sizes are known."""
         if self.focal is None or not pair.sizes_known:
             pool = self.search(pair)
-            return self.select(self.refine(pool, pair, self.family), pair), pool.draws
+            return self.select(self.refine(pool, pair, self.family), pair), pool.samples
         plausible: PlausibleCandidates | None = None
         draws = 0
         if self.focal.search is not None:
@@ -226,7 +226,7 @@ class Ransac:
         pool = self.search(pair)
         selection = self.focal.select(self.refine(pool, pair, self.family), pair, plausible)
         valid = selection.valid or (plausible is not None and plausible.valid)
-        return selection._replace(valid=valid), draws + pool.draws
+        return selection._replace(valid=valid), draws + pool.samples
 
     def inliers(self, F: Array, pair: Pair) -> Array:
         """The inliers (n,) of a model (9,)."""

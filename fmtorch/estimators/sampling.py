@@ -57,7 +57,7 @@ class Uniform:
 class Prosac(Uniform):
     """PROSAC (Chum & Matas, CVPR 2005): samples from the best matches first, from all of them in the end.
 
-    Matches are ranked by quality, smaller first, or by prior where there is no quality; without either all sets are
+    Matches are ranked by ambiguity, smaller first, or by prior where there is no ambiguity; without either all sets are
     equally likely, since the order of matches means nothing. Draw t takes the n(t)-th match and the others from those
     before it, n(t) growing as the paper's equation 3 says for T_N draws; after these all sets are equally likely.
     """
@@ -66,7 +66,7 @@ class Prosac(Uniform):
 
     def draw(self, pair: Pair, start: int, count: int, size: int) -> Array:
         """As `Sampler.draw`."""
-        if pair.quality is None and pair.prior is None:
+        if pair.ambiguity is None and pair.prior is None:
             return super().draw(pair, start, count, size)
         table = pair.cached(("growth", size), lambda pair: self.growth(pair.count, size))
         ranked = min(max(int(table[-1]) - start, 0), count)
@@ -142,9 +142,9 @@ def _quantised(pair: Pair) -> tuple[Array, Array]:
 
 
 def _best_first(pair: Pair) -> Array:
-    """The matches in ascending order of quality, or in descending order of prior."""
-    if pair.quality is not None:
-        return np.argsort(pair.quality, kind="stable")
+    """The matches in ascending order of ambiguity, or in descending order of prior."""
+    if pair.ambiguity is not None:
+        return np.argsort(pair.ambiguity, kind="stable")
     assert pair.prior is not None
     return np.argsort(-pair.prior, kind="stable")
 

@@ -24,13 +24,13 @@ Stop = Callable[[Array, int, Pair, int], bool]
 class Pool:
     """The best models of a pair, F (k, 9) float32 with descending scores (k,), of which `filled` are there.
 
-    draws: minimal samples drawn.
+    samples: minimal samples drawn.
     """
 
     F: Array
     score: Array
     filled: int = 0
-    draws: int = 0
+    samples: int = 0
 
     @staticmethod
     def empty(size: int) -> Pool:
@@ -98,7 +98,7 @@ class Search:
                 models = self.degeneracy(hypotheses, models, float(pool.score[0]), pair)
             start += count
             pool.merge(models)
-            pool.draws = start
+            pool.samples = start
             if self.stop is None or not pool.filled or start == end:
                 continue
             if self.stop(pool.F[0], start, pair, self.family.size):

@@ -1,8 +1,7 @@
 """The pairs that a report shows: images from wherever they lie, each run's matches again, or what it stored."""
 
-from __future__ import annotations
-
 import dataclasses
+import inspect
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,11 +15,12 @@ from fmtorch import data, presets
 from fmtorch.data import DataError, ImageError, ImagePair, PairDataset, read_image
 from fmtorch.data.pair_list import PairList
 from fmtorch.evaluation.page import Picture, Shown, ShownPair, differing_pairs
-from fmtorch.evaluation.pictures import Image, draw_epipolar_lines, draw_epipolar_lines_of_corners, draw_matches
+from fmtorch.evaluation.run import PLACES
 from fmtorch.io.dataset import WITHOUT_GEOMETRY, H5Pairs
 from fmtorch.metrics import corner_error, nsgd
-from fmtorch.pipeline.build import build_pipeline
-from fmtorch.pipeline.pipeline import Outcome, Pipeline
+from fmtorch.pipeline.photographs import Image
+from fmtorch.pipeline.pictures import draw_epipolar_lines, draw_epipolar_lines_of_corners, draw_matches
+from fmtorch.pipeline.pipeline import Outcome, Pipeline, build_pipeline
 from fmtorch.runs import RunFolder
 from fmtorch.scenes import RenderedPairs
 
@@ -40,7 +40,7 @@ def difference(pair: ImagePair, images: Sequence[Image], stored: Mapping[str, An
     if again is None or not bool(again.ok[0]):
         return f"gives no F when it is drawn again ({reason}), unlike in its run" if stored["ok"] else ""
     run = torch.tensor(stored["F"], dtype=torch.float64) if stored["ok"] else None
-    if run is not None and torch.allclose(run, again.F[0].cpu().flatten(), rtol=0, atol=SAME_F):
+    if run is not None and torch.allclose(run, again.F[0].cpu().double().flatten(), rtol=0, atol=SAME_F):
         return ""
     sizes = [torch.tensor([image.shape[:2]]) for image in images]
 
@@ -62,7 +62,6 @@ def difference(pair: ImagePair, images: Sequence[Image], stored: Mapping[str, An
 def _difference_of_homographies(
     pair: ImagePair, images: Sequence[Image], stored: Mapping[str, Any], outcome: Outcome
 ) -> str:
-    """The same of a homography, by its corner error."""
     again = outcome.estimate
     if again is None or not bool(again.ok[0]) or not stored["ok"]:
         has_homography = again is not None and bool(again.ok[0])
@@ -187,8 +186,9 @@ def find_dataset(stored: Mapping[str, Any], options: Options) -> PairDataset:
 
 def _places(known: Mapping[str, Any], roots: Sequence[Path]) -> list[dict[str, Any]]:
     """The options that say where a data set, and what it needs beside itself, may lie."""
-    places: list[dict[str, Any]] = [{"root": root} for root in roots]
     target = presets.target_of(known, "dataset")
+    taken = [name for name in PLACES if name in inspect.signature(target).parameters] or ["root"]
+    places: list[dict[str, Any]] = [{taken[0]: root} for root in roots]
     if target is PairList:
         places = [{"root": r, "file": f} for r in roots if r.is_dir() for f in roots if f.is_file()]
     elif target is H5Pairs:
@@ -240,6 +240,6 @@ def shown_pair(pair: ImagePair, runs: Sequence[Run], pipelines: Mapping[str, Pip
             pictures = drawn(pair, images, stored, outcome, r.name)
         pictures = pictures or from_stored(pair, images, stored, r.name)
         nsgd = float(stored["nsgd"]) if stored["ok"] else None
-        kind = stored["configuration"] or ""
+        kind = stored["pair_type"] or ""
         seen.append(Shown(r.name, nsgd, str(stored["reason"]), pictures, kind, stored["corner_error"]))
     return ShownPair(pair.identity, seen, notes)

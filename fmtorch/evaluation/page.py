@@ -1,7 +1,5 @@
 """The report of several runs: tables, paired differences, curves and pictures on one HTML page."""
 
-from __future__ import annotations
-
 import base64
 import dataclasses
 import hashlib
@@ -17,9 +15,8 @@ import pyarrow as pa
 from fmtorch import presets
 from fmtorch.core.settings import leaves
 from fmtorch.evaluation import curves, tables
-from fmtorch.evaluation.pictures import Image
-from fmtorch.evaluation.statistics import THRESHOLD
-from fmtorch.evaluation.summary import summarize
+from fmtorch.evaluation.statistics import THRESHOLD, summarize
+from fmtorch.pipeline.photographs import Image
 
 QUALITY, WIDTH = 80, 1280  # of JPEG pictures; px
 DISAGREEMENT = 0.1  # NSGD beyond which a result is as bad as any
@@ -46,7 +43,7 @@ class Picture:
 
 @dataclasses.dataclass(frozen=True)
 class Shown:
-    """A pair as one run sees it. nsgd: None where it failed, with the reason. configuration: empty where unknown.
+    """A pair as one run sees it. nsgd: None where it failed, with the reason. pair_type: empty where unknown.
 
     corner_error: px, in place of NSGD where the pair has a homography.
     """
@@ -55,23 +52,21 @@ class Shown:
     nsgd: float | None
     reason: str = ""
     pictures: Sequence[Picture] = ()
-    configuration: str = ""
+    pair_type: str = ""
     corner_error: float | None = None
 
     @property
     def good(self) -> bool:
-        """Whether its error is below the threshold that is marked in the curves."""
         if self.corner_error is not None:
             return self.corner_error < curves.CORNERS.mark
         return self.nsgd is not None and self.nsgd < THRESHOLD
 
     @property
     def result(self) -> str:
-        """What is said of it."""
         if self.corner_error is not None:
             return f"failed: {self.reason}" if self.reason else f"corner error {self.corner_error:.2f} px"
         result = f"failed: {self.reason}" if self.nsgd is None else f"NSGD {self.nsgd:.4f}"
-        return f"{result}, {self.configuration}" if self.configuration not in ("", "general") else result
+        return f"{result}, {self.pair_type}" if self.pair_type not in ("", "general") else result
 
 
 @dataclasses.dataclass(frozen=True)
@@ -156,7 +151,7 @@ def differing_pairs(runs: Mapping[str, pa.Table], count: int) -> list[str]:
 
 
 def _resource(name: str) -> str:
-    return resources.files("fmtorch.evaluation").joinpath(name).read_text(encoding="utf-8")
+    return resources.files(__package__).joinpath(name).read_text(encoding="utf-8")
 
 
 def _context(section: Section, names: Sequence[str]) -> dict[str, Any]:

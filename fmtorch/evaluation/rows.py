@@ -3,8 +3,6 @@
 Metrics are float64 and computed on the CPU: so little work needs no GPU.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 import time
@@ -101,7 +99,7 @@ def _of_homographies(outcomes: Sequence[Outcome]) -> list[Figures]:
 
 def _row(outcome: Outcome, figures: Figures, planar: bool, seconds: float) -> PairRow:
     pair, c, estimate = outcome.pair, outcome.correspondences, outcome.estimate
-    ok, configuration, focals = outcome.solved, outcome.configuration, focal_errors(outcome)
+    ok, pair_type, focals = outcome.solved, outcome.pair_type, focal_errors(outcome)
     matrix = estimate.F[0].flatten().tolist() if estimate is not None and ok else None
     figures = figures | {f"seconds_{stage}": outcome.seconds.get(stage, math.nan) for stage in STAGES}
     return PairRow(
@@ -109,12 +107,12 @@ def _row(outcome: Outcome, figures: Figures, planar: bool, seconds: float) -> Pa
         corrs=int(estimate.inliers.sum()) if estimate is not None else 0,
         corrs_before=int(c.mask.sum()) if c is not None else 0,
         features0=outcome.features[0], features1=outcome.features[1],
-        draws=int(estimate.draws[0]) if estimate is not None else 0,
+        samples=int(estimate.samples[0]) if estimate is not None else 0,
         seconds_metrics=seconds, F=None if planar else matrix, H=matrix if planar else None, **figures,
         significance=float(cast(Tensor, estimate.significance)[0]) if estimate is not None and ok else None,
         related=bool(estimate.related[0]) if estimate is not None else False,
-        configuration=None if configuration is None else configuration.names[0],
-        warning=outcome.not_examined or None if configuration is None else configuration.warnings[0],
+        pair_type=None if pair_type is None else pair_type.names[0],
+        warning=outcome.not_examined or None if pair_type is None else pair_type.warnings[0],
         focal_error0=focals.error[0], focal_error1=focals.error[1],
         focal_log_ratio0=focals.log_ratio[0], focal_log_ratio1=focals.log_ratio[1],
     )  # fmt: skip
@@ -151,7 +149,6 @@ def pose_errors(outcomes: Sequence[Outcome], signed: bool = False) -> list[PairP
 
 
 def _without_estimate(outcome: Outcome, signed: bool) -> PairPose:
-    """What is known before F is looked at."""
     if (missing := _unknown(outcome.pair)) is not None:
         return PairPose(None, None, missing)
     if not outcome.solved:
@@ -160,7 +157,6 @@ def _without_estimate(outcome: Outcome, signed: bool) -> PairPose:
 
 
 def _unknown(pair: ImagePair) -> str | None:
-    """Why the true pose of a pair is not known; None where it is."""
     values = {"K0": pair.K0, "K1": pair.K1, "R": pair.R, "t": pair.t}
     if missing := [name for name, value in values.items() if value is None]:
         return f"{', '.join(missing)} unknown"
@@ -169,7 +165,6 @@ def _unknown(pair: ImagePair) -> str | None:
 
 
 def _has_pose(outcome: Outcome) -> bool:
-    """Whether the estimator gives a pose, which may not be determined."""
     return outcome.estimate is not None and outcome.estimate.R is not None
 
 

@@ -1,35 +1,206 @@
-"""What a worker does with a batch of pairs: it runs a pipeline and evaluates its outcomes.
+"""The loop that makes a run: batches of pairs through a pipeline by several workers, rows stored as they come.
 
 Threads share features and networks and start at once, but only one of them issues torch operations at a time: enough
 where detectors, networks and OpenCV do the work. Processes use all cores for estimators too, at some seconds and some
 hundred megabytes each. Rows and exports come back to the caller, who alone writes.
 """
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
+import functools
 import itertools
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
 import torch
+from omegaconf import DictConfig
+from torch import Tensor
 
-from fmtorch.core.stages import ImageMatcher
-from fmtorch.data.pairs import GivenMatches, ImagePair, ImageSource
-from fmtorch.evaluation.pair_cameras import PairCameras, WithPairCameras
+from fmtorch import presets
+from fmtorch.core.stages import Estimator, ImageMatcher
+from fmtorch.core.types import Correspondences, Estimate
+from fmtorch.data import GivenMatches, ImagePair, ImageSource, exif_focal
 from fmtorch.evaluation.rows import evaluate
 from fmtorch.io.match_store import MatchRecords, MatchStore
+from fmtorch.jit import kernel
 from fmtorch.jobs.execution import Execution
-from fmtorch.jobs.pool import WorkerPool
-from fmtorch.jobs.runner import Factory, Local, Source, TaskRunner
+from fmtorch.jobs.runner import Factory, Local, Source, TaskRunner, WorkerPool
 from fmtorch.pipeline.exporting import match_records
 from fmtorch.pipeline.pipeline import Outcome, Pipeline, examined
-from fmtorch.runs import PairRow
-from fmtorch.runs.feature_cache import CachedFeatures
+from fmtorch.presets import plain
+from fmtorch.runs import CachedFeatures, PairRow
+from fmtorch.runs.fingerprint import code_digest, file_digest, fmtorch_version, learned, libraries
+from fmtorch.two_view.known_cameras import KnownCameras
 from fmtorch.two_view.pair_type import compile_with
+
+PLACES = ("root", "file", "truth", "images")
+"""Options of data sets that say where things lie; the digest says what they are."""
+
+
+def run_identity(
+    config: DictConfig, pipeline_name: str, pipeline: Pipeline, dataset_digest: str, cameras: str | None = None,
+    signed: bool = False,
+) -> dict[str, Any]:  # fmt: skip
+    """The identity of a run, as plain values.
+
+    Args:
+        config: a composed config: stages, data set, seed.
+        pipeline_name: the preset that it began with.
+        pipeline: what was built of the config.
+        dataset_digest: of the contents of the data set.
+        cameras: what the estimator is given of the cameras; None: nothing.
+        signed: whether the sign of a translation counts.
+
+    Returns:
+        `pipeline`, each stage's config (pruners as a list), `seed`; `version` of fmtorch, in a checkout its commit;
+        `libraries`: their versions; `kernels`: by which numba, or off; `learned`: digests of each stage's learned
+        files; `code`: digests of the sources of parts of the user's own; `dataset`: its config, without where it lies,
+        and its digest; `cameras`, where they are given; `pose`, where translations are signed.
+    """
+    stages = presets.stages(config)
+    dataset = {
+        **{key: value for key, value in plain(config.dataset).items() if key not in PLACES},
+        "digest": dataset_digest,
+    }
+    return {
+        "pipeline": pipeline_name, **stages, "seed": config.seed, "version": fmtorch_version(),
+        "libraries": libraries(presets.peer_packages(stages)), "kernels": kernel.identity(),
+        "learned": _learned(stages, pipeline),
+        "code": _code({"stages": stages, "dataset": dataset}), "dataset": dataset,
+        **({} if cameras is None else {"cameras": cameras}), **({"pose": {"signed": True}} if signed else {}),
+    }  # fmt: skip
+
+
+def _learned(stages: Mapping[str, Any], pipeline: Pipeline) -> dict[str, list[str]]:
+    extractor = pipeline.extractor
+    parts: dict[str, list[object]] = {
+        "features": [extractor.extractor if isinstance(extractor, CachedFeatures) else extractor],
+        "matcher": [pipeline.matcher], "estimator": [pipeline.estimator],
+        "pruner": [p for pruners in (pipeline.pruners, *pipeline.families.values()) for p in pruners.values()],
+    }  # fmt: skip
+    digests = {
+        group: {*(digest for part in parts[group] for digest in learned(part)), *_files(stages.get(group))}
+        for group in presets.STAGES
+    }
+    return {group: sorted(digests_of_group) for group, digests_of_group in digests.items() if digests_of_group}
+
+
+def _files(config: object, option: str = "") -> Iterator[str]:
+    """Digests of the files that options name: a part that does not say what defines it may well read them."""
+    if isinstance(config, Mapping):
+        for key, value in config.items():
+            yield from _files(value, str(key))
+    elif isinstance(config, list):
+        for value in config:
+            yield from _files(value, option)
+    elif isinstance(config, str) and option != "_target_" and Path(config).suffix:
+        path = Path(config).expanduser()
+        with contextlib.suppress(OSError, ValueError):
+            if path.is_file():
+                yield file_digest(path)
+
+
+def _code(config: object) -> dict[str, str]:
+    digests = {}
+    for target, module in presets.own_modules(config).items():
+        try:
+            digests[target] = code_digest(module)
+        except (TypeError, KeyError, OSError):
+            digests[target] = "in no file"
+    return digests
+
+
+# Runs whose estimator is given what is known of each pair's cameras: ``cameras=known``, ``shared``, ``exif``
+
+
+Cameras = Literal["known", "shared", "exif", "unknown"]
+UNKNOWN, EXACT = (1.0, math.inf), (1.0, 0.0)  # px, relative deviation; K stands for the pixels of an exact one
+
+
+class PairCameras(NamedTuple):
+    """What an estimator is given of a pair, fields of `Correspondences`: K0, K1 (3, 3), focal (2, 2), shared_focal."""
+
+    K0: Tensor | None
+    K1: Tensor | None
+    focal: Tensor
+    shared_focal: bool
+
+
+def cameras_of(pairs: Sequence[ImagePair], cameras: Cameras) -> dict[int, PairCameras]:
+    """What is known of the cameras of pairs, by their keys.
+
+    known: their calibrations. exif: the focal lengths in the files of their images, unknown where there are none.
+    shared: that both images of a pair are of one camera. unknown: nothing.
+    Raises ValueError for `known` where a pair has no calibration.
+    """
+    if cameras == "known":
+        return {pair.key: _calibrated(pair) for pair in pairs if pair.problem is None}
+    if cameras == "exif":
+        measured = functools.cache(_measured)
+        ends = ((pair.key, [measured(image.path) for image in (pair.image0, pair.image1)]) for pair in pairs)
+        return {key: PairCameras(None, None, _two(*focals), False) for key, focals in ends}
+    nothing = PairCameras(None, None, _two(UNKNOWN, UNKNOWN), cameras == "shared")
+    return {pair.key: nothing for pair in pairs}
+
+
+def _calibrated(pair: ImagePair) -> PairCameras:
+    if pair.K0 is None or pair.K1 is None:
+        raise ValueError(f"cameras=known, but the data set has no calibration of pair {pair.identity}; give another")
+    K0, K1 = (torch.from_numpy(K).to(torch.float64) for K in (pair.K0, pair.K1))
+    return PairCameras(K0, K1, _two(EXACT, EXACT), False)
+
+
+def _measured(path: Path) -> tuple[float, float]:
+    exif = exif_focal(path)
+    return (exif.focal, exif.deviation) if exif.known else UNKNOWN
+
+
+def _two(first: tuple[float, float], second: tuple[float, float]) -> Tensor:
+    return torch.tensor([first, second], dtype=torch.float64)
+
+
+class WithPairCameras:
+    """An estimator that is given the cameras of each pair, which it finds by the pairs' keys."""
+
+    model = "fundamental"
+
+    def __init__(self, estimator: Estimator, cameras: Mapping[int, PairCameras]) -> None:
+        """cameras: of `cameras_of`, of all pairs that will come; or they are added before their pairs come."""
+        self._estimator, self.cameras = KnownCameras(estimator), dict(cameras)
+
+    def __call__(self, c: Correspondences, seed: int = 0) -> Estimate:
+        return self._estimator(self.given(c), seed)
+
+    @property
+    def kernels(self) -> Sequence[object]:
+        return getattr(self._estimator.estimator, "kernels", ())
+
+    def given(self, c: Correspondences) -> Correspondences:
+        own = [self.cameras[key] for key in c.keys.tolist()]
+        K0, K1 = (_stacked(K, c.mask.device) for K in ([each.K0 for each in own], [each.K1 for each in own]))
+        focal = torch.stack([each.focal for each in own]).to(c.mask.device)
+        shared = torch.tensor([each.shared_focal for each in own], device=c.mask.device)
+        return c.derived(K0=K0, K1=K1, focal=focal, shared_focal=shared)
+
+
+def _stacked(K: Sequence[Tensor | None], device: torch.device) -> Tensor | None:
+    """The calibrations (B, 3, 3) of a run, of whose pairs all have one, or none."""
+    given = [each for each in K if each is not None]
+    return torch.stack(given).to(device) if given else None
+
+
+def built_with(build: Callable[[], Pipeline], cameras: Mapping[int, PairCameras]) -> Pipeline:
+    """A pipeline whose estimator is given the cameras of each pair."""
+    pipeline = build()
+    pipeline.estimator = WithPairCameras(pipeline.estimator, cameras)
+    return pipeline
+
+
+# What a worker does with a batch of pairs: it runs a pipeline and evaluates its outcomes
+
 
 Build = Callable[[], Pipeline]
 
@@ -54,13 +225,15 @@ class Batch:
 class Work:
     """The rows of a batch.
 
-    computed, from_cache: images whose features a process computed or took from the cache for it.
+    computed, from_cache: images whose features a process computed or took from the cache for it. tracebacks: of
+    `Pipeline.tracebacks`.
     """
 
     rows: list[PairRow]
     computed: int = 0
     from_cache: int = 0
     records: MatchRecords | None = None
+    tracebacks: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
 
 def evaluate_batch(pipeline: Pipeline, batch: Batch) -> Work:
@@ -79,7 +252,7 @@ def evaluate_batch(pipeline: Pipeline, batch: Batch) -> Work:
         for key in batch.cameras:
             pipeline.estimator.cameras.pop(key, None)
     counts = (cache.computed - computed, cache.found - from_cache) if cache else (0, 0)
-    return Work(rows, *counts, records)
+    return Work(rows, *counts, records, dict(pipeline.tracebacks))
 
 
 def divided(batch: Batch) -> list[Batch]:
@@ -138,7 +311,7 @@ def batch_contents(pairs: list[ImagePair]) -> list[ImagePair]:
 
 
 BATCHES_OF_A_WORKER = 4  # at least, where there are pairs enough
-PRELOADED = ("fmtorch.evaluation.run",)  # by the process that workers are forked of
+PRELOADED = (__name__,)  # by the process that workers are forked of
 
 
 def select(pairs: Sequence[ImagePair], limit: int | None) -> list[ImagePair]:
@@ -156,18 +329,10 @@ def select(pairs: Sequence[ImagePair], limit: int | None) -> list[ImagePair]:
 
 
 def evaluate_pairs(
-    pipeline: Pipeline,
-    pairs: Sequence[ImagePair],
-    *,
-    seed: int,
-    batch: int,
-    execution: Execution,
-    store: Callable[[list[PairRow]], None],
-    build: Build | None = None,
-    cameras: Mapping[int, PairCameras] | None = None,
-    journal: MatchStore | None = None,
-    signed: bool = False,
-) -> Iterator[int]:
+    pipeline: Pipeline, pairs: Sequence[ImagePair], *, seed: int, batch: int, execution: Execution,
+    store: Callable[[list[PairRow]], None], build: Build | None = None,
+    cameras: Mapping[int, PairCameras] | None = None, journal: MatchStore | None = None, signed: bool = False,
+) -> Iterator[int]:  # fmt: skip
     """Run and evaluate the pairs, hand each batch's rows to `store`, and yield how many pairs it held.
 
     execution: by which workers. build: makes the same pipeline in another process, where these are no threads.
@@ -189,6 +354,7 @@ def evaluate_pairs(
         if journal is not None and work.records is not None:
             journal.add(work.records)
         store(work.rows)
+        pipeline.tracebacks |= work.tracebacks
         if isinstance(pipeline.extractor, CachedFeatures):
             pipeline.extractor.computed += work.computed
             pipeline.extractor.found += work.from_cache

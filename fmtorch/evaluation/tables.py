@@ -1,7 +1,5 @@
 """Summaries as tables: of one run on a terminal and in Markdown, of several runs as cells of a report."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import NamedTuple
@@ -10,32 +8,20 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 from rich import box
+from rich.console import Console
+from rich.measure import Measurement
 from rich.table import Table as TerminalTable
 
-from fmtorch.core.types import CONFIGURATIONS
+from fmtorch.core.types import PAIR_TYPES
+from fmtorch.evaluation import statistics
 from fmtorch.evaluation.curves import NSGD, axis_of
-from fmtorch.evaluation.statistics import (
-    CORNER_THRESHOLDS,
-    FINE_THRESHOLD,
-    FOCAL_THRESHOLDS,
-    LEVEL,
-    MIN_UNITS,
-    PERCENT,
-    POSE_THRESHOLDS,
-    THRESHOLD,
-    Interval,
-    areas,
-    difference,
-    recalled,
-    scene_names,
-)
-from fmtorch.evaluation.summary import ALL, STAGES, Group
+from fmtorch.evaluation.statistics import ALL, LEVEL, MIN_UNITS, STAGES, THRESHOLD, Group, Interval
 
 Columns = Mapping[str, Callable[[Group], str]]  # what stands below a heading, of the figures of a row
 Summaries = Mapping[str, Mapping[str, Group]]  # of `summarize`, by the runs' names
 DASH = "–"
 RECALL = "%Recall [interval]"  # the column that has an interval
-_OF_RECALL = ("%Recall", RECALL, f"at {FINE_THRESHOLD}", "AUC@0.05", "%Recall (released NSGD)")
+_OF_RECALL = ("%Recall", RECALL, f"at {statistics.FINE_THRESHOLD}", "AUC@0.05", "%Recall (released NSGD)")
 
 
 def _text(value: float | int | None, form: str) -> str:
@@ -65,6 +51,7 @@ def _failures(group: Group) -> str:
     return f"{group['failures']} ({_text(group['failure_share'], '{:.1%}')})" if group["failures"] else "0"
 
 
+LEAST_IMPORTANT = ("#Corrs (-m)", "%Inlier (-m)", "Failed")  # where a terminal has no room for all
 TERMINAL_COLUMNS: Columns = {
     "Pairs": _number("pairs"),
     "%Recall": _recall,
@@ -77,7 +64,7 @@ COLUMNS: Columns = {
     "Pairs": _number("pairs"),
     "Scenes": _number("scenes"),
     RECALL: _recall,
-    f"at {FINE_THRESHOLD}": _percent("recall_fine"),
+    f"at {statistics.FINE_THRESHOLD}": _percent("recall_fine"),
     "AUC@0.05": _percent("auc_05"),
     "%Recall (released NSGD)": _percent("recall_released"),
     "%Inlier": _percent("inlier_rate"),
@@ -145,7 +132,7 @@ HOMOGRAPHY = (
 )
 HOMOGRAPHY_COLUMNS: Columns = {
     "Pairs": _number("pairs"),
-    **{f"AUC@{t} px": _percent(f"auc_{t}px") for t in CORNER_THRESHOLDS},
+    **{f"AUC@{t} px": _percent(f"auc_{t}px") for t in statistics.CORNER_THRESHOLDS},
     "corner error": _number("corner_error", "{:.2f} px"),
 }
 FOCALS = (
@@ -156,16 +143,17 @@ FOCAL_COLUMNS: Columns = {
     "Images": _number("images"),
     "error": _percent("error", "{:.1f} %"),
     "f / true f": _number("ratio", "{:.3f}"),
-    **{f"%within {p} %": _percent(f"within_{p}") for p in FOCAL_THRESHOLDS},
+    **{f"%within {p} %": _percent(f"within_{p}") for p in statistics.FOCAL_THRESHOLDS},
 }
 KINDS = (
-    "Number of pairs by what their matches show. Those of one plane, of a camera that only turns, or of one photograph "
-    "twice do not determine F: recall of such pairs is luck."
+    "Number of pairs by what their matches show, beginning from the estimate of each run: another estimator may see "
+    "another plane. Those of one plane, of a camera that only turns, or of one photograph twice do not determine F: "
+    "recall of such pairs is luck."
 )
 
 
 def parts(groups: Mapping[str, Group], binned: bool = True) -> list[Part]:
-    """Poses, homographies, focal lengths and configurations, of the groups that have some. binned: with mAP."""
+    """Poses, homographies, focal lengths and pair types, of the groups that have some. binned: with mAP."""
 
     def known(field: str) -> dict[str, Group]:
         return {name: group[field] for name, group in groups.items() if group[field] is not None}
@@ -174,7 +162,7 @@ def parts(groups: Mapping[str, Group], binned: bool = True) -> list[Part]:
         _poses(known("pose"), binned),
         Part("Homography", HOMOGRAPHY, HOMOGRAPHY_COLUMNS, known("homography")),
         Part("Focal lengths", FOCALS, FOCAL_COLUMNS, known("focals")),
-        Part("Configurations", KINDS, {name: _number(name) for name in CONFIGURATIONS}, known("configurations")),
+        Part("Pair types", KINDS, {name: _number(name) for name in PAIR_TYPES}, known("pair_types")),
     ]
     return [table for table in tables if table.rows]
 
@@ -185,29 +173,45 @@ def _poses(rows: Mapping[str, Group], binned: bool) -> Part:
     said = [(signed, names) for signed, names in by_sign.items() if names]
     suffix = "" if len(said) != 1 else ", signed" if said[0][0] else ", folded"
     note = " ".join(POSE[signed] if len(said) == 1 else f"{', '.join(names)}: {POSE[signed]}" for signed, names in said)
-    areas = {f"AUC@{t}°": f"auc_{t}" for t in POSE_THRESHOLDS} | {"mAA(10°)": "maa_10"}
+    of_area = {f"AUC@{t}°": f"auc_{t}" for t in statistics.POSE_THRESHOLDS} | {"mAA(10°)": "maa_10"}
     columns: Columns = {
         "Pairs": _number("pairs"),
-        **{heading: _percent(field) for heading, field in areas.items()},
-        **{f"mAP@{t}°": _percent(f"map_{t}") for t in POSE_THRESHOLDS if binned},
+        **{heading: _percent(field) for heading, field in of_area.items()},
+        **{f"mAP@{t}°": _percent(f"map_{t}") for t in statistics.POSE_THRESHOLDS if binned},
         "R error": _number("rotation", "{:.2f}°"),
         f"t error{suffix}": _number("translation", "{:.2f}°"),
     }
-    return Part("Relative pose", note + BINNED * binned, columns, rows, areas)
+    return Part("Relative pose", note + BINNED * binned, columns, rows, of_area)
 
 
 def _parts_of_run(summary: Mapping[str, Group], binned: bool) -> list[Part]:
-    """Configurations only where a pair is not general."""
-    kinds = [group["configurations"] or {} for group in summary.values()]
+    """Pair types only where a pair is not general."""
+    kinds = [group["pair_types"] or {} for group in summary.values()]
     general = not any(count for counts in kinds for kind, count in counts.items() if kind != "general")
-    return [part for part in parts(_groups(summary), binned) if part.heading != "Configurations" or not general]
+    return [part for part in parts(_groups(summary), binned) if part.heading != "Pair types" or not general]
 
 
-def terminal_tables(summary: Mapping[str, Group], title: str) -> list[TerminalTable]:
-    """The main figures of a run, for a terminal of 80 columns."""
+def terminal_tables(summary: Mapping[str, Group], title: str, width: int = 80) -> list[TerminalTable]:
+    """The main figures of a run, or of several by their names, for a terminal of so many columns.
+
+    Columns for which there is no room are left out, and the note says so, rather than words and numbers broken.
+    """
     columns = known_columns(TERMINAL_COLUMNS, summary)
     first = Part(title, caption(summary), columns, _groups(summary))
-    return [_on_terminal(part) for part in (first, *_parts_of_run(summary, binned=False))]
+    return [_fitted(part, width) for part in (first, *_parts_of_run(summary, binned=False))]
+
+
+def _fitted(part: Part, width: int) -> TerminalTable:
+    """The table with as many columns as there is room for: the least important go first, else the last."""
+    wide, columns = Console(width=1000), dict(part.columns)
+    while True:
+        dropped = [heading for heading in part.columns if heading not in columns]
+        note = f"{part.note} No room for {', '.join(dropped)}: summary.md has all." if dropped else part.note
+        table = _on_terminal(part._replace(columns=columns, note=note))
+        bare = _on_terminal(part._replace(columns=columns, note="", heading=""))
+        if len(columns) < 3 or Measurement.get(wide, wide.options, bare).minimum <= width:
+            return table
+        columns.pop(next((heading for heading in LEAST_IMPORTANT if heading in columns), list(columns)[-1]))
 
 
 def _on_terminal(part: Part) -> TerminalTable:
@@ -215,7 +219,8 @@ def _on_terminal(part: Part) -> TerminalTable:
         title=part.heading, title_style="bold", caption=part.note, caption_justify="left", caption_style="dim",
         box=box.SIMPLE_HEAD, pad_edge=False, collapse_padding=True,
     )  # fmt: skip
-    table.add_column("", overflow="fold")
+    words = [word for name in part.rows for word in name.split()]
+    table.add_column("", overflow="fold", min_width=max(map(len, words), default=1))
     for heading in part.columns:
         table.add_column(heading, justify="right", no_wrap=True, overflow="fold")
     for name, group in part.rows.items():
@@ -295,11 +300,10 @@ def report_tables(runs: Mapping[str, pa.Table], summaries: Summaries) -> list[Ta
 
 
 def _merit(overall: Mapping[str, Group]) -> Table:
-    """All figures over all pairs; counts stand last, since recall is what is looked for."""
     known = known_columns(COLUMNS, overall)
     counts = ("Pairs", "Scenes")
     columns = {h: c for h, c in known.items() if h not in counts} | {h: COLUMNS[h] for h in counts}
-    ranked = {RECALL: "recall", f"at {FINE_THRESHOLD}": "recall_fine", "AUC@0.05": "auc_05"}
+    ranked = {RECALL: "recall", f"at {statistics.FINE_THRESHOLD}": "recall_fine", "AUC@0.05": "auc_05"}
     table = _of_runs(Part("Figures of merit", "", columns, overall, ranked), overall)
     if RECALL not in columns:
         return table
@@ -323,7 +327,6 @@ def _of_runs(part: Part, names: Iterable[str]) -> Table:
 
 
 def _families(summaries: Summaries) -> Table | None:
-    """Recall with its interval, and AUC@0.05, by family; None where there is but one."""
     names = list(dict.fromkeys(family for summary in summaries.values() for family in summary if family != ALL))
     if len(names) < 2 or any(group["recall"] is None for summary in summaries.values() for group in summary.values()):
         return None
@@ -342,13 +345,12 @@ def _families(summaries: Summaries) -> Table | None:
 
 
 def _differences(runs: Mapping[str, pa.Table]) -> Table | None:
-    """The first run minus each other one, on the pairs that the two share; None of a single run."""
     if len(runs) < 2:
         return None
     axis = axis_of(runs)
     first, *others = runs
     keys, families, scenes = (runs[first][name].to_pylist() for name in ("key", "family", "scene"))
-    scene = dict(zip(keys, scene_names(families, scenes), strict=True))
+    scene = dict(zip(keys, statistics.scene_names(families, scenes), strict=True))
     counts, compared = [], []
     for other in others:
         two = {first: runs[first], other: runs[other]}
@@ -361,8 +363,12 @@ def _differences(runs: Mapping[str, pa.Table]) -> Table | None:
         name: [Cell(f"{count:,}"), *(Cell(text, bar=_around_zero(i, widest)) for text, i in cells)]
         for name, count, cells in zip(others, counts, compared, strict=True)
     }
-    figures = [f"recall at {THRESHOLD}", f"at {FINE_THRESHOLD}", "AUC@0.05"]
-    head = ["run", "shared pairs", *(figures if axis is NSGD else [f"AUC@{t} px" for t in CORNER_THRESHOLDS])]
+    figures = [f"recall at {THRESHOLD}", f"at {statistics.FINE_THRESHOLD}", "AUC@0.05"]
+    head = [
+        "run",
+        "shared pairs",
+        *(figures if axis is NSGD else [f"AUC@{t} px" for t in statistics.CORNER_THRESHOLDS]),
+    ]
     note = (
         f"In points; positive where {first} is ahead of the row's run. In brackets the paired {LEVEL:.0%} interval "
         f"(Bonett and Price's for recall, a bootstrap for AUC@0.05 from {MIN_UNITS} scenes or pairs on): a difference "
@@ -376,20 +382,21 @@ def _ahead(
 ) -> list[tuple[str, Interval | None]]:
     """Differences of recall at both thresholds and of AUC@0.05, or of areas below corner errors, of the same pairs."""
     if of_nsgd:
-        values = [(recalled(a, t), recalled(b, t), True) for t in (THRESHOLD, FINE_THRESHOLD)]
-        values.append((areas(a), areas(b), False))
+        values = [
+            (statistics.recalled(a, t), statistics.recalled(b, t), True) for t in (THRESHOLD, statistics.FINE_THRESHOLD)
+        ]
+        values.append((statistics.areas(a), statistics.areas(b), False))
     else:
-        values = [(_area(a, t), _area(b, t), False) for t in CORNER_THRESHOLDS]
+        values = [(_area(a, t), _area(b, t), False) for t in statistics.CORNER_THRESHOLDS]
     cells: list[tuple[str, Interval | None]] = []
     for own, other, share in values:
-        interval = difference(own, other, scenes, PERCENT, share=share) if len(a) else None
-        few = f"{PERCENT * float((own - other).mean()):+.1f} (n too small)" if len(a) else DASH
+        interval = statistics.difference(own, other, scenes, statistics.PERCENT, share=share) if len(a) else None
+        few = f"{statistics.PERCENT * float((own - other).mean()):+.1f} (n too small)" if len(a) else DASH
         cells.append((few if interval is None else f"{interval:+.1f}", interval))
     return cells
 
 
 def _area(errors: NDArray[np.float64], threshold: float) -> NDArray[np.float64]:
-    """The share of thresholds up to one that are above a pair's corner error; NaN is a miss."""
     area: NDArray[np.float64] = np.clip(1 - np.nan_to_num(errors, nan=np.inf) / threshold, 0, 1)
     return area
 
@@ -402,7 +409,6 @@ def _around_zero(i: Interval | None, widest: float) -> Bar | None:
 
 
 def _seconds(overall: Mapping[str, Group]) -> Table:
-    """Median seconds a pair of each stage, and the commonest failures."""
     columns = {stage: _number(stage, "{:.3f}") for stage in (*STAGES, "total")}
     known = {name: group["seconds"] for name, group in overall.items()}
     table = _of_runs(Part("Seconds a pair, median", "", columns, known), overall)
@@ -434,7 +440,6 @@ def common(runs: Mapping[str, pa.Table], column: str) -> list[NDArray[np.float64
 
 
 def _share(group: Group) -> Bar | None:
-    """The interval of recall."""
     if group["recall"] is None:
         return None
     low, high = group["recall_interval"]
@@ -442,6 +447,5 @@ def _share(group: Group) -> Bar | None:
 
 
 def _best(values: Mapping[str, float | None]) -> set[str]:
-    """Whose is the largest; nobody's of a single value."""
     known = [value for value in values.values() if value is not None]
     return {name for name, value in values.items() if value == max(known)} if len(known) > 1 else set()

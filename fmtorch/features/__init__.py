@@ -18,7 +18,9 @@ if TYPE_CHECKING:
         upright_frames,
     )
     from fmtorch.features.hessian import HessianDetector
+    from fmtorch.features.kornia_features import ALIKED, DISK
     from fmtorch.features.local_feature import LocalFeature, NetworkDescriptor, local_feature
+    from fmtorch.features.onnx_network import PatchNetwork
     from fmtorch.features.patches import ImagePyramid
     from fmtorch.features.sift import (
         SIFT,
@@ -32,31 +34,11 @@ if TYPE_CHECKING:
     )
 
 __all__ = [
-    "ASIFT",
-    "FRAME_SIGMAS",
-    "SIFT",
-    "DominantGradient",
-    "HessianDetector",
-    "ImagePyramid",
-    "LocalFeature",
-    "NetworkDescriptor",
-    "NetworkOrientation",
-    "NetworkShape",
-    "PatchSIFT",
-    "RootSIFTPCA",
-    "VLFeatSIFT",
-    "dominant_gradient",
-    "frame_scale",
-    "keypoints_to_lafs",
-    "learn_projection",
-    "local_feature",
-    "make_upright",
-    "root_sift",
-    "rotate_frames",
-    "sift_of_patches",
-    "simulate_view",
-    "simulated_views",
-    "upright_frames",
-]
+    "ALIKED", "ASIFT", "DISK", "FRAME_SIGMAS", "SIFT", "DominantGradient", "HessianDetector", "ImagePyramid",
+    "LocalFeature", "NetworkDescriptor", "NetworkOrientation", "NetworkShape", "PatchNetwork", "PatchSIFT",
+    "RootSIFTPCA", "VLFeatSIFT", "dominant_gradient", "frame_scale", "keypoints_to_lafs", "learn_projection",
+    "local_feature", "make_upright", "root_sift", "rotate_frames", "sift_of_patches", "simulate_view",
+    "simulated_views", "upright_frames",
+]  # fmt: skip
 
 lazy_exports(__name__)

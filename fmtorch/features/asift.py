@@ -1,7 +1,5 @@
 """Affine-simulated SIFT: keypoints of many tilted and rotated views of one image (Morel and Yu, SIIMS 2009)."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from typing import Annotated

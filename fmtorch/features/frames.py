@@ -1,7 +1,5 @@
 """Local affine frames (N, 2, 3) in kornia's convention: column 2 the centre, columns 0 and 1 the patch's half axes."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import math
@@ -57,7 +55,6 @@ def make_upright(lafs: Float[Tensor, "*n 2 3"]) -> Float[Tensor, "*n 2 3"]:
 
 
 # Orientation of local affine frames from their patches: the angle by which the frame's axes turn
-
 
 PatchFunction = Callable[[Tensor], Tensor]
 """Patches (N, 1, 32, 32) float32, grey in [0, 1] -> (N, D); see `PatchNetwork`."""
@@ -154,7 +151,6 @@ def _window(size: int, device: torch.device) -> Float[Tensor, "p p"]:
 
 
 # Affine shape of local frames by AffNet (Mishkin, Radenovic, Matas, ECCV 2018)
-
 
 LONGEST = 6.0  # largest ratio of a region's axes; Perdoch et al., CVPR 2009, give up on longer ones
 

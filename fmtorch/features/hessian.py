@@ -1,7 +1,5 @@
 """Blobs: maxima of the determinant of the Hessian over position and scale (Lindeberg, IJCV 1998)."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from typing import Annotated, NamedTuple, Protocol, runtime_checkable
@@ -145,7 +143,6 @@ def _first_of_each(key: Tensor) -> Tensor:
 
 
 # The image filters of the detectors twice: by OpenCV for one image on a CPU, by torch for a batch on any device
-
 
 KERNEL_SIGMAS = 3.0  # half the length of a sampled Gaussian
 STRIP = 128  # rows worked on together: the few strips of a 1536 px image then fit a core's cache

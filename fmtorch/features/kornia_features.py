@@ -1,7 +1,5 @@
 """Learned detectors and descriptors of others, through kornia: DISK and ALIKED, for comparison."""
 
-from __future__ import annotations
-
 from typing import Annotated, Any
 
 import kornia

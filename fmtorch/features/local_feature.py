@@ -1,7 +1,5 @@
 """Local features of exchangeable parts: detector x affine shape x orientation x descriptor."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from collections.abc import Callable, Mapping
@@ -110,7 +108,6 @@ class LocalFeature:
 
 
 # Local features from the names of their parts, as presets give them
-
 
 Part = TypeVar("Part")
 Options = Mapping[str, Any]

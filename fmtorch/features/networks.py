@@ -1,7 +1,5 @@
 """What the patch networks share: the trunk of convolutions and the normalisation of patches."""
 
-from __future__ import annotations
-
 import math
 import pickle
 import warnings
@@ -213,7 +211,6 @@ class OriNet(nn.Module):
 
 # Weights of patch networks from files: own checkpoints, kornia's and the authors' state_dicts, TorchScript
 
-
 ARCHITECTURES: dict[str, type[nn.Module]] = {
     "hardnet": HardNet, "hardnet_fast": HardNetFast, "l2net": L2Net, "geodesc": GeoDesc,
     "affnet": AffNet, "affnet_fast": AffNetFast, "orinet": OriNet,
@@ -326,7 +323,6 @@ def _with_dropout(state: dict[str, Tensor]) -> dict[str, Tensor]:
 
 
 # Patch networks as torch modules: (N, 1, 32, 32) grey patches to descriptors, affine shapes or orientations
-
 
 __all__ = [
     "ARCHITECTURES", "DESCRIPTORS", "AffNet", "AffNetFast", "GeoDesc", "HardNet", "HardNetFast", "L2Net", "OriNet",

@@ -1,7 +1,5 @@
 """Patch networks run by ONNX Runtime on CPU."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

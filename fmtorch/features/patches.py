@@ -1,7 +1,5 @@
 """Square patches cut from an image along local affine frames, without aliasing, batched."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -139,7 +139,6 @@ def as_grey(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 # VLFeat's difference-of-Gaussians keypoints with SIFT descriptors, through pycolmap (extra `colmap`)
 
-
 ORIENTATIONS = 4  # of one location at most, as VLFeat
 SMALLEST = 16  # px, the shorter side: the smallest octave has 8, and VLFeat takes no smaller image
 
@@ -218,7 +217,6 @@ def _library() -> ModuleType:
 
 
 # SIFT of patches, plain, as RootSIFT, and pooled over domain sizes; batched (Lowe, IJCV 2004, section 6)
-
 
 CELLS, DIRECTIONS = 4, 8  # a grid of 4 x 4 histograms of 8 directions
 CELL_SIGMAS = 3.0  # side of a cell in keypoint sigmas: vl_sift's magnification
@@ -306,7 +304,6 @@ def _matrices(device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
 
 
 # RootSIFT-PCA: RootSIFT projected on its principal components (Bursuc, Tolias and Jégou, ICMR 2015)
-
 
 DIMENSIONS = 80  # of the paper's RootSIFT-PCA
 

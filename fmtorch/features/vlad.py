@@ -3,8 +3,6 @@
 SIFT of any kind is taken as RootSIFT-PCA, so that two codebooks serve: one for it, and one for HardNet.
 """
 
-from __future__ import annotations
-
 import functools
 import zipfile
 from collections.abc import Mapping

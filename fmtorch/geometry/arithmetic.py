@@ -8,8 +8,6 @@ Matrices come in two layouts: with the entries last, (*batch, 3, 3), as users ha
 or (9, *s) row by row, over which an operation on one entry runs over all matrices at once.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any, cast
 
@@ -62,6 +60,11 @@ def twice_atanh(z: Any) -> Any:
     for k in range(15, 0, -2):
         series = series * z2 + 1 / k
     return 2 * z * series
+
+
+def gradient_wanted(*inputs: object) -> bool:
+    """Whether a graph is being recorded and one of the inputs is on it."""
+    return torch.is_grad_enabled() and any(isinstance(x, Tensor) and x.requires_grad for x in inputs)
 
 
 def stable_sum(x: Tensor, dim: int = -1) -> Tensor:

@@ -12,15 +12,14 @@ distance (Hartley & Zisserman 2004, 11.4.3), with three corrections:
    is biased by its own limits and by the parameters that were fitted.
 3. The derivatives by t hold noise, as if it were parallax; its expected share of their squares is taken from the
    information about the direction of translation. Without that a camera that only turns seems to have one, known to
-   some ten degrees. (The bias of matrices of moments: Kanatani 1996, Statistical Optimization for Geometric
-   Computation, chapter 9. The noise itself is not subtracted: where other parameters leave little, the difference of
-   two estimates says that nothing is known where errors are a few degrees.)
+   some ten degrees. Where a rotation explains the matches up to their noise, nothing is left. (The bias of matrices
+   of moments: Kanatani 1996, Statistical Optimization for Geometric Computation, chapter 9. The noise itself is not
+   subtracted: where other parameters leave little, the difference of two estimates says that nothing is known where
+   errors are a few degrees.)
 
 Weights that are no inverse variances, such as P(inlier), count by ``sum w / sum w^2`` (Kish 1965). Independent noise
 is assumed; on real pairs neighbours err alike, and deviations come out too small.
 """
-
-from __future__ import annotations
 
 from typing import NamedTuple
 
@@ -28,7 +27,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from fmtorch.geometry.arithmetic import component_sum, sqrt, stable_sum
+from fmtorch.geometry.arithmetic import cofactors, component_sum, determinant, sqrt, stable_sum
 from fmtorch.geometry.epipolar import inverse_root
 from fmtorch.geometry.matrices import complement
 
@@ -41,6 +40,9 @@ WINDOW_SHARE = 0.911256360935392  # `kept_share` of WINDOW
 ITERATIONS = 8  # of the noise; each leaves a quarter of the error (by the slope of `kept_share` at WINDOW)
 MIN_NOISE_PX = 1e-3  # float32 coordinates of large images are no finer
 MIN_SPARE_MATCHES = 3  # beyond the parameters, from which on the noise is estimated
+ROTATION_STEPS, ROTATION_SCALE = 6, 9.0  # of the fit of a rotation, and of its loss (Cauchy's), in variances
+CHI_MEDIAN, MEDIAN_DEVIATION = 1.3862943611198906, 1.4426950408889634  # of chi squared of two degrees, ln 4; relative,
+MEDIAN_DEVIATIONS = 4.0  # of the median of n, times sqrt(n)
 TERMS, WIDEST = 64, 6.0  # of the series of `kept_share`, and from where on it is one to 1e-7
 
 
@@ -88,6 +90,41 @@ def residual_slopes(F: Tensor, slopes: Tensor, a0: Tensor, a1: Tensor) -> tuple[
     corrected = component_sum(normal[:, None] * by_point)
     noise = component_sum(by_point[:, :, None] * by_point[:, None]) - corrected[:, None] * corrected[None]
     return r, J, noise
+
+
+def explained_by_rotation(a0: Tensor, a1: Tensor, R: Tensor, f: Tensor, s: Tensor, near: Tensor) -> Tensor:
+    """Whether points (2, b, n) move as a rotation near R (3, 3, b) says, up to their noise s (b, n): (b,).
+
+    The rotation is fitted to the matches `near` (b, n), robustly; then half of its squared distances, in units of their
+    variance 2 s^2, are below the median of chi squared of two degrees, ln 4, as far as so many tell it.
+    """
+    ones, count = torch.ones_like(a0[:1]), near.sum(-1)
+    rays = torch.cat([a0 / f[0, :, None], ones])
+    target = a1 / f[1, :, None]
+    scale = (s / f[1, :, None]).clamp_min(1e-300)
+    weight = near.to(a0.dtype)
+    turned = component_sum(R[:, :, :, None] * rays[None], 1)
+    squared = torch.zeros_like(scale)
+    for step in range(ROTATION_STEPS):
+        x, y, z = turned
+        u, v = x / z, y / z
+        e0, e1 = target[0] - u, target[1] - v
+        squared = (e0 * e0 + e1 * e1) / (2 * scale * scale)
+        if step == ROTATION_STEPS - 1:
+            break
+        # of the projections of a ray that is turned by omega
+        J0, J1 = torch.stack([-u * v, 1 + u * u, -v]), torch.stack([-(1 + v * v), u * v, u])
+        by = torch.where(near, weight / (1 + squared / ROTATION_SCALE), 0.0)
+        A = stable_sum((J0[:, None] * J0[None] + J1[:, None] * J1[None]) * by)
+        b = stable_sum((J0 * e0 + J1 * e1) * by)
+        determinant_ = determinant(A)
+        omega = component_sum(cofactors(A) * b[:, None], 0) / torch.where(determinant_ == 0, 1.0, determinant_)
+        turned = turned + torch.linalg.cross(omega[..., None].expand_as(turned), turned, dim=0)
+    ordered = torch.where(near, squared, torch.inf).sort(-1).values
+    middle = ((count - 1).clamp_min(0) // 2)[:, None]
+    median = ordered.gather(-1, middle)[:, 0] if ordered.shape[-1] else torch.full_like(f[0], torch.inf)
+    limit = CHI_MEDIAN * (1 + MEDIAN_DEVIATIONS * MEDIAN_DEVIATION / sqrt(count.to(f).clamp_min(1)))
+    return (count > PARAMETERS) & (median < limit)
 
 
 def kept_share(c: Tensor) -> Tensor:
@@ -236,6 +273,9 @@ def two_view_covariance(
     information, from_noise = information_of(r, J, in_slopes, w, T, s)
     by_direction = information[3, 3] + information[4, 4]
     share = (from_noise[0, 0] + from_noise[1, 1]) / torch.where(by_direction > 0, by_direction, 1.0)
+    near = (w > 0) & (r < torch.minimum(T, WINDOW * s)[:, None])
+    still = explained_by_rotation(a0.to(kind), a1.to(kind), R.movedim(0, -1), f.movedim(0, -1), n * s[:, None], near)
+    share = torch.where(still, 1.0, share)
     C = _without(_covariance(information, Pi.movedim(0, -1), used), share.clamp(0, 1))
     V = _of_fundamental(C, F, slopes, p0.movedim(0, -1), p1.movedim(0, -1))
     return TwoViewCovariance(C.movedim(-1, 0), basis.movedim(-1, 0), V.movedim(-1, 0), s, valid)

@@ -4,8 +4,6 @@
 last bits in different batch positions. This one does not.
 """
 
-from __future__ import annotations
-
 from typing import Any, cast
 
 import torch

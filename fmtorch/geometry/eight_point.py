@@ -142,7 +142,6 @@ def finite_matches(
 
 # The eight-point algorithm on the samples of one pair, and weighted on its matches, compiled; float64
 
-
 WIDTH = 32  # partial sums over the matches: part of the last bits of a weighted fit
 SHIFT, RANK_TOLERANCE, SQUARINGS = 1e-14, 1e-12, 14  # as in `eigenvector`
 

@@ -6,8 +6,6 @@ all correctly rounded, so a result is bit-equal whatever stands beside it in the
 the epipole its line is undefined: its normal is then zero, and distances and gradients to it are 0, never NaN.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple
 
@@ -192,7 +190,6 @@ def unit_largest(matrix: Tensor) -> Tensor:
 
 # Sampson distances component by component, with derivatives for fits
 
-
 TINY = 1e-30  # squared slope of the epipolar constraint below which it is taken for this, in fits
 
 
@@ -227,7 +224,6 @@ def linearise(
 
 
 # Squared residuals of matches under a model, as scores take them of many models, and fits of one
-
 
 SINGLES = 16  # float32 numbers of a row
 load, fill = lanes(SINGLES)

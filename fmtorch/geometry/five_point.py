@@ -6,8 +6,6 @@ one a sample.
 E = x X + y Y + z Z + W; a monomial is a sorted triple of 0 to 3 for x, y, z, 1, in the order of the paper.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from typing import Any

@@ -4,8 +4,6 @@ Points are (..., N, 2) in pixels, matrices (..., 3, 3) of any scale and sign; le
 Zisserman (2004), Multiple View Geometry, chapter 4.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 
@@ -168,7 +166,6 @@ def _inverse_similarity(T: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch
 
 
 # Homographies of four matches each, compiled: the samples of one pair, LANES at a time, float64, models in float32
-
 
 ROUNDING = 16 * EPS  # of the area of three points on a line, relative to their coordinates and distances
 SIZE = 4

@@ -1,7 +1,5 @@
 """Two calibrated cameras from a homography: the two poses before a plane, and the rotation of a camera that turns."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

@@ -4,8 +4,6 @@ Minimises ``sum_i w_i rho(r_i^2)`` over the sphere of the nine entries, by kerne
 graph of points and weights. A model is refined to the same bits in any batch.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from fmtorch.geometry.arithmetic import component_sum, stable_sum
+from fmtorch.geometry.arithmetic import component_sum, gradient_wanted, stable_sum
 from fmtorch.geometry.levenberg_marquardt import (
     FIRST_DAMPING,
     MATCH,
@@ -28,8 +26,8 @@ from fmtorch.geometry.levenberg_marquardt import (
 )
 from fmtorch.geometry.matrices import assign, assign_rows, unit_kernel
 from fmtorch.geometry.normalize import NormalizedMatches, fitted_by
-from fmtorch.geometry.optimum import gradient_wanted, inverse_hessian
 from fmtorch.geometry.rank2_manifold import eliminate
+from fmtorch.geometry.refine import inverse_hessian
 from fmtorch.geometry.robust_losses import RobustLoss, named_loss
 from fmtorch.jit.kernel import Array, F8x1, F8x2, F8x3, inner, kernel, matrix, vector
 from fmtorch.jit.lanes import LANES, added, fill, load, store, where
@@ -124,7 +122,6 @@ def homography_curvature(
 
 
 # The Sampson error of homographies, and its Levenberg-Marquardt on the sphere of their nine entries
-
 
 BEHIND = 1e4  # squared distance of a match behind the horizon in the units of the points, which extend to about one
 SUMS = 52  # over the matches, of the normal equations
@@ -389,7 +386,7 @@ def homography_at_optimum(
 ) -> Float[Tensor, "9 p k"]:
     """H, optima of unit norm on no graph, attached to the graph of points and weights by the implicit function theorem.
 
-    s2: squared scales of the loss, one a pair or a match. As `optimum.at_optimum`: the optimum moves by minus the
+    s2: squared scales of the loss, one a pair or a match. As `refine.at_optimum`: the optimum moves by minus the
     inverse Hessian, across H, times the change of the gradient.
     """
     valid = torch.isfinite(H).all(0) & (H != 0).any(0)

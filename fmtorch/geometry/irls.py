@@ -1,7 +1,5 @@
 """Iteratively reweighted least squares for fundamental matrices, differentiable, with weights of any origin."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -9,16 +7,18 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from fmtorch.geometry.arithmetic import component_sum, gradient_wanted, unit
 from fmtorch.geometry.eight_point import linear_fundamental, weighted_eight_point
 from fmtorch.geometry.epipolar import homogeneous, linearise, sampson
 from fmtorch.geometry.levenberg_marquardt import MATCH, Weighted, in_rows, linearise_kernel, robust
 from fmtorch.geometry.matrices import assign, nearest_rank2
 from fmtorch.geometry.normalize import NormalizedMatches, canonical, denormalize_fundamental, normalize_points
-from fmtorch.geometry.optimum import at_fixed_point, gradient_wanted
 from fmtorch.geometry.rank2_manifold import RANK_TWO, constant
 from fmtorch.geometry.robust_losses import RobustLoss, named_loss
 from fmtorch.jit.kernel import F8x2, kernel, matrix, vector
 from fmtorch.jit.lanes import LANES, load, store
+
+CONTRACTION_GAP = 1e-6  # singular values of I - J below it, of an iteration that does not contract, are held off zero
 
 Weigh = Callable[[Tensor | None, Tensor | None], Tensor]
 
@@ -184,6 +184,46 @@ def weighted_fit(
     fitted = denormalize_fundamental(nearest_rank2(linear), T0, T1).flatten(2).movedim(-1, 0)
     determined = determined & valid[..., 0] & torch.isfinite(fitted).all(0) & (fitted != 0).any(0)
     return fitted, determined
+
+
+def at_fixed_point(F: Float[Tensor, "9 p k"], step: Callable[[Tensor], Tensor]) -> Float[Tensor, "9 p k"]:
+    """F, a fixed point of `step` up to scale and sign, attached to the graph of everything else that `step` reads.
+
+    With G(F, theta) the step, scaled to unit norm, and J its Jacobian with respect to F, the fixed point moves by
+    ``dF = (I - J)^-1 dG/dtheta dtheta`` (Bai et al., NeurIPS 2019, theorem 1). G maps to the manifold of rank 2 and
+    unit norm, so J and dG map to its 7-dimensional tangent space, and dF lies in it. Where the iteration does not
+    contract, singular values s of I - J are inverted as ``s / (s^2 + CONTRACTION_GAP^2)``, which bounds the gradient.
+
+    Args:
+        F: k models for each of p pairs, entries row by row, on no graph; of rank 2. One that is zero or not finite has
+            a gradient of zero.
+        step: one iteration of all models, each for itself; a model that it leaves as it is has a gradient of zero.
+
+    Returns:
+        The same values.
+    """
+    valid = torch.isfinite(F).all(0) & (F != 0).any(0)
+    fixed = unit(torch.where(valid, F, constant(F, RANK_TWO)))
+
+    def mapped(start: Tensor) -> Tensor:
+        G = unit(step(start))
+        along = component_sum(G.detach() * fixed)
+        return torch.where(along < 0, -G, G)
+
+    with torch.enable_grad():
+        start = fixed.detach().clone().requires_grad_()
+        end = mapped(start)
+        rows = [torch.autograd.grad(end[i].sum(), start, retain_graph=True)[0] for i in range(9)]
+        attached = mapped(fixed)
+    J = torch.stack(rows).movedim((0, 1), (-2, -1))
+    known = valid & torch.isfinite(J).flatten(-2).all(-1)
+    difference = torch.eye(9, dtype=J.dtype, device=J.device) - torch.where(known[..., None, None], J, 0.0)
+    U, s, Vh = torch.linalg.svd(difference)
+    inverse = (Vh.mT * (s / (s * s + CONTRACTION_GAP**2))[..., None, :]) @ U.mT
+    inverse = torch.where(known[..., None, None], inverse, 0.0).movedim((-2, -1), (0, 1))
+    size = torch.where(valid, component_sum(F * fixed), 0.0)
+    moved = component_sum(inverse * (attached - attached.detach()), 1) * size
+    return F + torch.where(valid, moved, 0.0)  # keeps the gradient of what is not finite out
 
 
 # `irls` for the matches of one pair, compiled; float64

@@ -5,8 +5,6 @@ Damped Gauss-Newton steps; each model takes its own where that lowers its cost, 
 call, between whose steps nothing waits for Python.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """The nearest matrix of rank two: the step that makes a linear estimate a fundamental matrix."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 
@@ -142,7 +140,6 @@ def complement(v: Tensor) -> tuple[Tensor, Tensor]:
 
 
 # `rank2` for one matrix, compiled: matrices are (9,), row by row
-
 
 EPS = float(np.finfo(np.float64).eps)
 
@@ -294,7 +291,6 @@ def _largest_eigenvector_kernel(K: Array, v: Array) -> None:
 
 
 # 3 x 3 matrices (9,), row by row, compiled: products, inverses, orthogonal factors
-
 
 POLAR_STEPS = 10  # quadratic once near; scaled, so that few are needed before
 

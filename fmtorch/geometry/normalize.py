@@ -1,7 +1,5 @@
 """Normalisation of image points before linear estimation, and of fundamental matrices after it."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

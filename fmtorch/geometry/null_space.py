@@ -3,8 +3,6 @@
 Buffers are rows of LANES numbers, one a sample.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

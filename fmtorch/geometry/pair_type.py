@@ -1,6 +1,4 @@
-"""Which configuration a pair of images is in: general, planar, a rotation, one photograph twice, or unrelated."""
-
-from __future__ import annotations
+"""Of which type a pair of images is: general, planar, a rotation, one photograph twice, or unrelated."""
 
 import math
 from typing import Any, NamedTuple
@@ -11,14 +9,14 @@ from jaxtyping import Bool, Float, Int, Real
 from numpy.typing import NDArray
 from torch import Tensor
 
-from fmtorch.core.types import CONFIGURATIONS
+from fmtorch.core.types import PAIR_TYPES
 from fmtorch.geometry.arithmetic import logarithm, logarithm_kernel
 from fmtorch.geometry.epipolar import HOMOGRAPHY, SAMPSON
 from fmtorch.geometry.rotation import Cameras, fit_rotation
 from fmtorch.jit.batches import for_each_pair
 from fmtorch.jit.kernel import Array, B1x1, F8x1, F8x2, inner, kernel, matrix, vector
 
-# Evidence for the kinds of an image pair, compiled; see `configuration`. Matches are those of one pair, in pixels
+# Evidence for the kinds of an image pair, compiled; see `pair_type`. Matches are those of one pair, in pixels
 
 
 FREEDOM = 3.0  # degrees, of Student's law: keypoints err by more than the normal one says
@@ -254,7 +252,7 @@ def _fit_copy(points: Array, noise: Array, plane: Array, s: float, H: Array) -> 
 
 _Array = NDArray[Any]
 
-GENERAL, PLANAR, ROTATION, IDENTICAL, UNRELATED = range(len(CONFIGURATIONS))
+GENERAL, PLANAR, ROTATION, IDENTICAL, UNRELATED = range(len(PAIR_TYPES))
 MIN_EVIDENCE = 80.0  # nats; of the tuning pairs, unrelated ones reach 50 and related ones have 176 or more
 MIN_PARALLAX = 12.0  # nats; of the tuning pairs, planes reach 6, and wide scenes have 70
 MIN_TRANSLATION = 50.0  # nats; rotations reach 25 and copies 39: wrong matches may choose the translation they lack
@@ -286,7 +284,7 @@ class Evidence(NamedTuple):
 
 
 @torch.no_grad()
-def configuration_evidence(
+def pair_evidence(
     F: Float[Tensor, "b 3 3"],
     H: Float[Tensor, "b 3 3"],
     x0: Float[Tensor, "b n 2"],
@@ -345,7 +343,7 @@ def _into(x0: _Array, x1: _Array, mask: _Array, prior: _Array, noise: _Array, *k
 
 
 def classified(evidence: Evidence, focal_known: Bool[Tensor, " b"] | None = None) -> Int[Tensor, " b"]:
-    """The kind of each pair, an index into `CONFIGURATIONS`.
+    """The kind of each pair, an index into `PAIR_TYPES`.
 
     1. unrelated: neither F nor H explains more than `MIN_EVIDENCE` nats.
     2. general: matches off the plane support F, ``both - plane - log n > MIN_PARALLAX``: by the Bayesian information
@@ -356,7 +354,7 @@ def classified(evidence: Evidence, focal_known: Bool[Tensor, " b"] | None = None
     4. planar.
 
     Args:
-        evidence: of `configuration_evidence`.
+        evidence: of `pair_evidence`.
         focal_known: whether both focal lengths are known exactly; they are not by default.
     """
     log_n = logarithm(evidence.matches.clamp_min(2.0))

@@ -1,7 +1,5 @@
 """Real roots of a cubic in closed form, without transcendental functions, polished by Newton's method."""
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple
 
@@ -101,7 +99,6 @@ def _cube_root(x: float) -> Any:
 
 
 # Real roots of polynomials of degree ten, LANES samples at a time, compiled: signs on a grid, then Newton
-
 
 KNOTS, POLISHING_STEPS = 33, 4  # of the grid in each of two charts; of Newton's method, from the secant
 DEGREE = 10

@@ -1,7 +1,5 @@
 """The relative pose of two calibrated cameras from their fundamental matrix."""
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple
 
@@ -192,7 +190,6 @@ def _inverse(K: Tensor) -> tuple[Tensor, Tensor]:
 
 
 # `pose` for one pair of cameras with square pixels, compiled; and the essential matrix nearest to a model
-
 
 WEIGHT_BITS = 20  # fractional, of weights, so that their sums are exact
 RANK_2 = 1e-10  # share of the squared norm that the product of the singular values must exceed

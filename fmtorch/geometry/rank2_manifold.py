@@ -5,8 +5,6 @@ The tangent space at F is what is orthogonal, in R^9, to F (scale) and to ``e1 e
 its rotations, and without its defect where the singular values coincide.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from jaxtyping import Float

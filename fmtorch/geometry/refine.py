@@ -5,8 +5,6 @@ and unit norm (see `rank2_manifold`), by kernels, and attaches the optimum to th
 is refined to the same bits in any batch.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +12,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from fmtorch.geometry.arithmetic import component_sum
+from fmtorch.geometry.arithmetic import as_rows, cofactors, component_sum, gradient_wanted, sqrt, stable_sum, unit
+from fmtorch.geometry.epipolar import homogeneous, linearise
 from fmtorch.geometry.levenberg_marquardt import (
     FIRST_DAMPING,
     Problem,
@@ -26,7 +25,6 @@ from fmtorch.geometry.levenberg_marquardt import (
 )
 from fmtorch.geometry.matrices import assign, assign_rows
 from fmtorch.geometry.normalize import NormalizedMatches, fitted_by
-from fmtorch.geometry.optimum import STEP_DAMPING, at_optimum, curvature_of_cost, gradient_of_cost, gradient_wanted
 from fmtorch.geometry.rank2_manifold import (
     RANK_TWO,
     RANK_TWO_EPIPOLE,
@@ -38,7 +36,7 @@ from fmtorch.geometry.rank2_manifold import (
     start_one,
     steps,
 )
-from fmtorch.geometry.robust_losses import named_loss
+from fmtorch.geometry.robust_losses import RobustLoss, named_loss
 from fmtorch.jit.kernel import Array, F8x1, F8x2, inner, kernel, matrix, vector
 
 # Levenberg-Marquardt of the robust Sampson error on the manifold of rank 2 and unit norm, for the models of a pair
@@ -206,3 +204,104 @@ def attached_step(
     step = -component_sum((inverse * gradient).transpose(0, 1))
     moved, _, _ = retract(model, step, e0, e1)
     return matches.to_pixels(torch.where(valid, moved, matches.models)).reshape(F.shape)
+
+
+# Gradients of the least robust Sampson error: those of the optimum
+
+STEP_DAMPING = 1e-10  # of the attached step: bounds its gradient where the points leave a direction open
+
+
+def gradient_of_cost(
+    F: Float[Tensor, "9 p k"],
+    points: Float[Tensor, "4 p n"],
+    weight: Float[Tensor, "p n"],
+    robust: RobustLoss,
+    scale: Float[Tensor, " p"],
+) -> Float[Tensor, "9 p k"]:
+    """Half the gradient of the cost with respect to F, ``sum_i w_i rho'(r_i^2) r_i dr_i``; attached to all inputs."""
+    J, e, inverse, r2 = linearise(F, homogeneous(points[:, None, :, None]))
+    influence = weight[:, None] * robust.weight(r2, scale.square()[:, None, None]) * inverse * e
+    return stable_sum(J.flatten(0, 1) * influence)[:, 0]
+
+
+def curvature_of_cost(
+    F: Float[Tensor, "9 p k"],
+    points: Float[Tensor, "4 p n"],
+    weight: Float[Tensor, "p n"],
+    robust: RobustLoss,
+    scale: Float[Tensor, " p"],
+) -> Float[Tensor, "9 9 p k"]:
+    """The Gauss-Newton matrix ``J^T W J`` with Newton's weights, those of the loss's curvature, not those of IRLS."""
+    J, _, inverse, r2 = linearise(F, homogeneous(points[:, None, :, None]))
+    J = J.flatten(0, 1)[:, 0]
+    weighted = J * (weight[:, None] * robust.curvature(r2, scale.square()[:, None, None]) * inverse)[0]
+    return torch.stack([stable_sum(weighted * column) for column in J], 1)
+
+
+def at_optimum(
+    F: Float[Tensor, "9 p k"],
+    points: Float[Tensor, "4 p n"],
+    weight: Float[Tensor, "p n"],
+    robust: RobustLoss,
+    scale: Float[Tensor, " p"],
+) -> Float[Tensor, "9 p k"]:
+    """F, optima of rank 2 and unit norm, attached to the graph of points and weights by the implicit function theorem.
+
+    The optimum moves by ``dF = -H^-1 d(gradient)`` in the tangent space of the manifold. H is the Hessian of the cost
+    on it, exact: with the curvature of the residuals, and with that of the constraint ``det F = 0`` by its Lagrange
+    multiplier. Where it is not positive definite, at what is no strict minimum, Gauss and Newton's takes its place.
+    Directions that the points leave open are damped; what is not finite or zero has a gradient of zero.
+
+    Arguments as of `gradient_of_cost`; F on no graph. Returns the same values.
+    """
+    with torch.no_grad():
+        valid = torch.isfinite(F).all(0) & (F != 0).any(0)
+        model = unit(torch.where(valid, F, constant(F, RANK_TWO)))
+        C = cofactors(as_rows(model)).flatten(0, 1)
+        size = component_sum(C * C)
+        valid = valid & (size > 0)
+        normal = C / sqrt(torch.where(size > 0, size, 1))
+        gauss_newton = curvature_of_cost(model, points, weight, robust, scale).movedim((0, 1), (-2, -1))
+        frame = torch.stack([model, normal], -1).movedim(0, -2)
+    exact = _hessian(model, C, size, points.detach(), weight.detach(), robust, scale.detach())
+    inverse = inverse_hessian(exact, gauss_newton, frame)
+    gradient = gradient_of_cost(model, points, weight, robust, scale)
+    moved = component_sum(inverse * (gradient - gradient.detach()), 1)
+    return F - torch.where(valid, moved, 0)  # keeps the gradient of what is not finite out
+
+
+@torch.no_grad()
+def inverse_hessian(
+    exact: Float[Tensor, "p k 9 9"], gauss_newton: Float[Tensor, "p k 9 9"], frame: Float[Tensor, "p k 9 normals"]
+) -> Float[Tensor, "9 9 p k"]:
+    """The inverse of the exact Hessian across the orthonormal normals of a manifold, 0 along these.
+
+    Where it is not finite or not positive definite, at what is no strict minimum, Gauss and Newton's takes its place.
+    Directions that the points leave open are damped.
+    """
+    across = torch.eye(9, dtype=exact.dtype, device=exact.device) - frame @ frame.mT
+    largest = gauss_newton.diagonal(dim1=-2, dim2=-1).amax(-1)[..., None, None]
+    blocked = largest * (frame @ frame.mT)  # so that these directions do not look open
+    finite = torch.isfinite(exact).flatten(-2).all(-1)[..., None, None]
+    tangent = across @ torch.where(finite, exact, gauss_newton) @ across + blocked
+    strict = finite[..., 0, 0] & (torch.linalg.eigvalsh(tangent)[..., 0] > STEP_DAMPING * largest[..., 0, 0])
+    tangent = torch.where(strict[..., None, None], tangent, across @ gauss_newton @ across + blocked)
+    values, vectors = torch.linalg.eigh(tangent)
+    open_below = STEP_DAMPING * torch.where(largest > 0, largest, 1)[..., 0]
+    inverse = (vectors * (values / (values * values + open_below * open_below))[..., None, :]) @ vectors.mT
+    projected: Tensor = across @ inverse @ across
+    return projected.movedim((-2, -1), (0, 1))
+
+
+def _hessian(
+    F: Tensor, C: Tensor, size: Tensor, points: Tensor, weight: Tensor, robust: RobustLoss, scale: Tensor
+) -> Float[Tensor, "p k 9 9"]:
+    """Half the second derivative of the Lagrangian ``cost + 2 multiplier det F``; C are F's cofactors, size |C|^2."""
+    with torch.enable_grad():
+        model = F.detach().clone().requires_grad_()
+        gradient = gradient_of_cost(model, points, weight, robust, scale)
+        multiplier = -component_sum(gradient.detach() * C) / torch.where(size > 0, size, 1)
+        total = gradient + multiplier * cofactors(as_rows(model)).flatten(0, 1)
+        rows = [torch.autograd.grad(total[i].sum(), model, retain_graph=True)[0] for i in range(9)]
+    H = torch.stack(rows).movedim((0, 1), (-2, -1))
+    return (H + H.mT) / 2

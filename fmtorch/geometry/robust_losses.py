@@ -7,8 +7,6 @@ Zhang (1997), "Parameter estimation techniques", table 1; Torr & Zisserman (2000
 Barath et al. (2020) for that of MAGSAC++, whose scale is k sigma_max, the distance from which on nothing counts.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """The homography of a camera that turns, ``H = K1 R K0^-1``, fitted to the matches of one pair, compiled."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -6,8 +6,6 @@ independent and their points anywhere. The number of false alarms of a model is 
 are to be expected then, in all that a search could have tried.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 from typing import Any, NamedTuple, cast
@@ -19,15 +17,19 @@ from torch import Tensor
 
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.geometry.arithmetic import LOG10, logarithm, logarithm_kernel, smallest_but
+from fmtorch.geometry.homography import adjugate
 from fmtorch.jit.batches import for_each_pair
 from fmtorch.jit.kernel import Array, B1x1, F8x1, F8x2, inner, kernel, matrix, vector
-from fmtorch.jobs.threads import one_thread
+from fmtorch.jobs.execution import one_thread
 
 # `significance` for the matches of one pair, in float64
 
 
 SAMPLE = 7  # matches that determine a model
+PLANE_SAMPLE = 4  # of a homography
+LOG_PLANE_MODELS = math.log(2.0)  # of both orientations
 LOG_MODELS = 1.0986122886681098  # of 3, the models of a minimal sample at most
+TINY = 1e-300
 CELLS = 64  # of a grid to the diagonal of an image: matches that join the same two cells are one
 LEAST_CHANCE = 2.0**-13  # that a point is near a line: some 0.05 px, beyond which no keypoint is exact
 MOST_CELLS = 1 << 15  # of a row or column: a match's four cells make one number of 60 bits
@@ -55,27 +57,13 @@ def counted_chances(F: F8x2, matches: Matches, out: F8x1) -> int:
 
     Without a model m is 0.
     """
-    x0, x1, mask, size0, size1 = matches
-    n = len(mask)
-    peak = 0.0
-    for i in range(9):
-        value = F[i // 3, i % 3]
-        if not math.isfinite(value):
-            return 0
-        peak = max(peak, abs(value))
-    if peak == 0:
-        return 0
-    point, count = matrix(4, n), 0
-    for i in range(n):
-        a, b, c, d = x0[i, 0], x0[i, 1], x1[i, 0], x1[i, 1]
-        if mask[i] and abs(a) < FARTHEST and abs(b) < FARTHEST and abs(c) < FARTHEST and abs(d) < FARTHEST:
-            point[0, count], point[1, count], point[2, count], point[3, count] = a, b, c, d
-            count += 1
+    point, peak = matrix(4, len(matches.mask)), _peak(F)
+    count = _real(matches, point) if peak > 0 else 0
     if count <= SAMPLE:
         return 0
     chance, place = np.zeros(count), np.zeros(count, np.int64)
-    strip0 = _placed(point[0], point[1], size0, place)
-    strip1 = _placed(point[2], point[3], size1, place)
+    strip0 = _placed(point[0], point[1], matches.size0, place)
+    strip1 = _placed(point[2], point[3], matches.size1, place)
     f0, f1, f2 = F[0, 0] / peak, F[0, 1] / peak, F[0, 2] / peak
     f3, f4, f5 = F[1, 0] / peak, F[1, 1] / peak, F[1, 2] / peak
     f6, f7, f8 = F[2, 0] / peak, F[2, 1] / peak, F[2, 2] / peak
@@ -86,6 +74,70 @@ def counted_chances(F: F8x2, matches: Matches, out: F8x1) -> int:
         e = abs(a1 * x + b1 * y + c1)
         chance[i] = max(_chance(e, a0 * a0 + b0 * b0, strip0), _chance(e, a1 * a1 + b1 * b1, strip1))
     return _median_of_places(chance, place, out)
+
+
+@kernel
+def counted_plane_chances(H: F8x2, matches: Matches, out: F8x1) -> int:
+    """The same of a homography H (3, 3), whose chances are of discs in place of strips."""
+    point, peak, A = matrix(4, len(matches.mask)), _peak(H), vector(9)
+    count = _real(matches, point) if peak > 0 else 0
+    if count <= PLANE_SAMPLE:
+        return 0
+    chance, place = np.zeros(count), np.zeros(count, np.int64)
+    _placed(point[0], point[1], matches.size0, place)
+    _placed(point[2], point[3], matches.size1, place)
+    disc0 = math.pi / _area(point[0, :count], point[1, :count], matches.size0)
+    disc1 = math.pi / _area(point[2, :count], point[3, :count], matches.size1)
+    h = H.ravel() / peak
+    adjugate(h, A)
+    for i in range(count):
+        u, v, x, y = point[0, i], point[1, i], point[2, i], point[3, i]
+        in0, in1 = _transfer(A, x, y, u, v) * disc0, _transfer(h, u, v, x, y) * disc1
+        larger = max(in0, in1) if in0 < 1 and in1 < 1 else 1.0  # NaN, too
+        chance[i] = max(larger, LEAST_CHANCE * LEAST_CHANCE)
+    return _median_of_places(chance, place, out)
+
+
+@inner
+def _transfer(H: Array, u: float, v: float, x: float, y: float) -> Any:
+    """The squared distance of (x, y) from where H maps (u, v)."""
+    depth = H[6] * u + H[7] * v + H[8]
+    if depth == 0:
+        return math.inf
+    dx, dy = (H[0] * u + H[1] * v + H[2]) / depth - x, (H[3] * u + H[4] * v + H[5]) / depth - y
+    return dx * dx + dy * dy
+
+
+@inner
+def _area(x: Array, y: Array, size: Array) -> Any:
+    """Of an image, or of the box of its points; not zero."""
+    area = size[0] * size[1] if len(size) else (x.max() - x.min()) * (y.max() - y.min())
+    return max(area, TINY)
+
+
+@inner
+def _peak(F: Array) -> float:
+    """The largest magnitude of a matrix, 0 of one that is not finite."""
+    peak = 0.0
+    for i in range(9):
+        value = F[i // 3, i % 3]
+        if not math.isfinite(value):
+            return 0.0
+        peak = max(peak, abs(value))
+    return peak
+
+
+@inner
+def _real(matches: Matches, point: Array) -> int:
+    """The coordinates of the matches that are real and not beyond all measure -> point (4, n); how many there are."""
+    x0, x1, mask, _, _ = matches
+    count = 0
+    for i in range(len(mask)):
+        a, b, c, d = x0[i, 0], x0[i, 1], x1[i, 0], x1[i, 1]
+        if mask[i] and abs(a) < FARTHEST and abs(b) < FARTHEST and abs(c) < FARTHEST and abs(d) < FARTHEST:
+            point[0, count], point[1, count], point[2, count], point[3, count] = a, b, c, d
+            count += 1
+    return count
 
 
 @inner
@@ -148,14 +200,17 @@ def _median_of_places(chance: Array, place: Array, out: Array) -> int:
 
 
 @kernel(holds_gil=True)
-def most_significant(chance: F8x1, factorial: F8x1) -> float:
-    """-log10 of the least number of false alarms over k, of ascending chances; factorial: log i!, for i to n."""
+def most_significant(chance: F8x1, factorial: F8x1, sample: int, log_models: float) -> float:
+    """-log10 of the least number of false alarms over k, of ascending chances; factorial: log i!, for i to n.
+
+    sample: matches that determine a model, of which there are log_models, a logarithm.
+    """
     n, best = len(chance), -math.inf
-    for k in range(SAMPLE + 1, n + 1):
+    for k in range(sample + 1, n + 1):
         subsets = factorial[n] - factorial[k] - factorial[n - k]
-        samples = factorial[k] - factorial[k - SAMPLE] - factorial[SAMPLE]
-        tests = factorial[n - SAMPLE] - factorial[n - SAMPLE - 1] + subsets + samples + LOG_MODELS
-        best = max(best, -(tests + (k - SAMPLE) * logarithm_kernel(chance[k - 1])))
+        samples = factorial[k] - factorial[k - sample] - factorial[sample]
+        tests = factorial[n - sample] - factorial[n - sample - 1] + subsets + samples + log_models
+        best = max(best, -(tests + (k - sample) * logarithm_kernel(chance[k - 1])))
     return best / LOG10
 
 
@@ -167,6 +222,8 @@ def significance(
     mask: Bool[Tensor, "b n"] | None = None,
     size0: Real[Tensor, "b 2"] | None = None,
     size1: Real[Tensor, "b 2"] | None = None,
+    *,
+    model: str = "fundamental",
 ) -> Float[Tensor, " b"]:
     """-log10 of the number of false alarms of a model: above 0, so much support is not to be expected by chance.
 
@@ -184,18 +241,21 @@ def significance(
         mask: which are real; all when not given.
         size0, size1: image sizes (h, w), in pixels. Without them points are taken to lie anywhere in the box of the
             matches.
+        model: "homography" for F that are homographies, ``x1 ~ F x0``: p_k is then the chance that a point anywhere is
+            as near to where its match is mapped, a sample has 4 matches and 2 models, those of both orientations.
 
     Returns:
         float64, without gradient, computed on the CPU. Minus infinity for fewer than 8 different matches, and for an F
         that is zero or not finite. A pair gets the same bits in any batch and padding; coordinates and sizes scaled or
         shifted together change nothing but by rounding.
     """
-    if x0.shape[1] <= SAMPLE:
+    if x0.shape[1] <= (PLANE_SAMPLE if model == "homography" else SAMPLE):
         return torch.full((len(F),), -torch.inf, dtype=torch.float64, device=F.device)
     mask = torch.ones(x0.shape[:2], dtype=torch.bool, device=x0.device) if mask is None else mask
     sizes = (None if size is None else size.to(torch.float64) for size in (size0, size1))
     out = torch.empty(len(F), 1, dtype=torch.float64)
-    return for_each_pair(_into, (F, x0, x1, mask, *sizes), out=out, kind=torch.float64)[:, 0]
+    into = _plane_into if model == "homography" else _into
+    return for_each_pair(into, (F, x0, x1, mask, *sizes), out=out, kind=torch.float64)[:, 0]
 
 
 def of_one_pair(F: Array, x0: Array, x1: Array, mask: Array, size0: Array, size1: Array) -> float:
@@ -203,11 +263,20 @@ def of_one_pair(F: Array, x0: Array, x1: Array, mask: Array, size0: Array, size1
     chance = np.empty(len(mask))
     chance = chance[: counted_chances(F, Matches(x0, x1, mask, size0, size1), chance)]
     chance.sort()
-    return most_significant(chance, _log_factorials(1 << max(len(mask), SAMPLE + 1).bit_length()))
+    factorials = _log_factorials(1 << max(len(mask), SAMPLE + 1).bit_length())
+    return most_significant(chance, factorials, SAMPLE, LOG_MODELS)
 
 
 def _into(F: Array, x0: Array, x1: Array, mask: Array, size0: Array, size1: Array, out: Array) -> None:
     out[0] = of_one_pair(F, x0, x1, mask, size0, size1)
+
+
+def _plane_into(H: Array, x0: Array, x1: Array, mask: Array, size0: Array, size1: Array, out: Array) -> None:
+    chance = np.empty(len(mask))
+    chance = chance[: counted_plane_chances(H, Matches(x0, x1, mask, size0, size1), chance)]
+    chance.sort()
+    factorials = _log_factorials(1 << max(len(mask), SAMPLE + 1).bit_length())
+    out[0] = most_significant(chance, factorials, PLANE_SAMPLE, LOG_PLANE_MODELS)
 
 
 @functools.lru_cache(maxsize=8)
@@ -235,9 +304,10 @@ def judged(estimate: Estimate, c: Correspondences) -> Estimate:
     """
     given = cast(Tensor, estimate.significance)
     unknown = given.isnan()
-    if estimate.model != "fundamental" or not bool(unknown.any()):
+    if not bool(unknown.any()):
         return estimate
     with one_thread(c.mask.device):
-        computed = significance(estimate.F.detach(), c.x0.detach(), c.x1.detach(), c.mask, c.size0, c.size1)
+        F, x0, x1 = estimate.F.detach(), c.x0.detach(), c.x1.detach()
+        computed = significance(F, x0, x1, c.mask, c.size0, c.size1, model=estimate.model)
     computed = torch.where(estimate.ok, computed, -torch.inf)
     return estimate.derived(significance=torch.where(unknown, computed, given))

@@ -1,1 +1,27 @@
 """Others' files: matches that other programs computed, read as data sets (docs/exchange.md)."""
+
+from typing import TYPE_CHECKING
+
+from fmtorch.core.lazy import lazy_exports
+
+if TYPE_CHECKING:
+    from fmtorch.io.dataset import H5Pairs
+    from fmtorch.io.export import (
+        DATABASE,
+        FEATURES,
+        MATCHES,
+        Edge,
+        ViewGraph,
+        export_kinds,
+        view_graph,
+        write_exports,
+        write_view_graph,
+    )
+    from fmtorch.io.match_store import MatchStore, StoredImage, StoredPair, indices
+
+__all__ = [
+    "DATABASE", "FEATURES", "MATCHES", "Edge", "H5Pairs", "MatchStore", "StoredImage", "StoredPair", "ViewGraph",
+    "export_kinds", "indices", "view_graph", "write_exports", "write_view_graph",
+]  # fmt: skip
+
+lazy_exports(__name__)

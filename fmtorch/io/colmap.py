@@ -1,7 +1,5 @@
 """A COLMAP database of keypoints, matches and two-view geometries, written through pycolmap."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import functools
@@ -19,8 +17,8 @@ import torch
 from numpy.typing import NDArray
 
 from fmtorch.core.files import replacing
-from fmtorch.data.lenses import MODELS, Lens
-from fmtorch.geometry.cameras import calibration_problems
+from fmtorch.data.cameras import MODELS, Lens
+from fmtorch.geometry.cameras import MIN_FOCAL, USUAL_FOCAL, calibration_problems
 from fmtorch.io.match_store import ORIGIN, PairGeometry, StoredImage, StoredPair, two_view_geometry
 
 FOCAL_LENGTH = 1.2  # of the longer side, where it is unknown: COLMAP's own default
@@ -72,7 +70,6 @@ def write_database(
 
 
 def _camera(pycolmap: Any, database: Any, cameras: dict[object, int], image: StoredImage, shared: bool) -> int:
-    """The image's camera, with a rig of its own."""
     model, parameters, prior = _parameters(image)
     key: object = image.name
     if image.K is not None or image.lens is not None or shared:
@@ -89,7 +86,6 @@ def _camera(pycolmap: Any, database: Any, cameras: dict[object, int], image: Sto
 
 
 def _parameters(image: StoredImage) -> tuple[str, list[float], bool]:
-    """The model of an image's camera, its parameters, and whether its focal length is known."""
     h, w = image.size
     if (lens := image.lens) is not None:
         focals = [lens.fx] if MODELS[lens.model].focals == 1 else [lens.fx, lens.fy]
@@ -150,7 +146,8 @@ class DatabaseImage:
 
     size: (h, w), and K, None where unknown. points: (n, 2) as stored; pinhole: (n, 2), where a pinhole of calibration K
     would have put them, NaN where it sees nothing. deviation: relative, of the focal length of K: 0 where it was
-    calibrated, infinite where it is COLMAP's guess. problem: what is wrong with the camera.
+    calibrated, infinite where it is COLMAP's guess. problem: what is wrong with the camera. warning: what of it is not
+    taken for known.
 
     Scales, orientations and affine shapes of keypoints are not used: docs/verify.md says what they were worth.
     """
@@ -163,6 +160,7 @@ class DatabaseImage:
     points: NDArray[np.float32]
     pinhole: NDArray[np.float32]
     problem: str = ""
+    warning: str = ""
 
 
 def database_image(name: str, camera: Any, keypoints: NDArray[np.float32]) -> DatabaseImage:
@@ -172,19 +170,24 @@ def database_image(name: str, camera: Any, keypoints: NDArray[np.float32]) -> Da
         raise ValueError(f"the keypoints of {name} have {columns} columns; they must have 2, 4 or 6")
     points = keypoints[:, :2] - np.float32(ORIGIN)
     model = str(camera.model_name)
-    problem, K, deviation = "", np.eye(3), math.inf
     if model not in MODELS:
         problem = f"camera {camera.camera_id} of {name} is {model}, which is no pinhole behind a lens"
-    else:
-        lens = MODELS[model].lens(model, np.asarray(camera.params, np.float64))
-        K = lens.K - np.array([[0, 0, ORIGIN], [0, 0, ORIGIN], [0, 0, 0]])
-        wrong = calibration_problems(torch.from_numpy(K)[None], torch.tensor([size]), "its calibration")[0]
-        problem = f"camera {camera.camera_id} of {name}: {wrong}" if wrong else ""
-        deviation = _deviation(camera, lens, K)
-    if problem or not lens.bends:
-        return DatabaseImage(name, camera.camera_id, size, K, deviation, points, points, problem)
-    pinhole = _undistorted(camera, K, keypoints[:, :2])
-    return DatabaseImage(name, camera.camera_id, size, K, deviation, points, pinhole.astype(np.float32), problem)
+        return DatabaseImage(name, camera.camera_id, size, np.eye(3), math.inf, points, points, problem)
+    lens = MODELS[model].lens(model, np.asarray(camera.params, np.float64))
+    K = lens.K - np.array([[0, 0, ORIGIN], [0, 0, ORIGIN], [0, 0, 0]])
+    deviation, whose, warning = _deviation(camera, lens, K), f"camera {camera.camera_id} of {name}", ""
+    longest = max(size)
+    absurd = not (MIN_FOCAL * longest <= min(lens.fx, lens.fy) < math.inf and max(lens.fx, lens.fy) < math.inf)
+    if absurd:
+        warning = f"{whose}: a focal length of {lens.fx:g} px for {size[1]} x {size[0]} pixels counts as unknown"
+        K[0, 0] = K[1, 1] = USUAL_FOCAL * longest
+        deviation = math.inf
+    wrong = calibration_problems(torch.from_numpy(K)[None], torch.tensor([size]), "its calibration")[0]
+    pinhole = points
+    if lens.bends and not (absurd or wrong):
+        pinhole = _undistorted(camera, K, keypoints[:, :2]).astype(np.float32)
+    problem = f"{whose}: {wrong}" if wrong else ""
+    return DatabaseImage(name, camera.camera_id, size, K, deviation, points, pinhole, problem, warning)
 
 
 def _deviation(camera: Any, lens: Lens, K: Array) -> float:
@@ -235,16 +238,13 @@ class MatchDatabase:
                 self.close()
                 raise ValueError(f"{path} holds no {what}; {step} first")
 
-    def __enter__(self) -> MatchDatabase:
-        """The database itself, closed on leaving."""
+    def __enter__(self) -> "MatchDatabase":
         return self
 
     def __exit__(self, *error: object) -> None:
-        """Close the database."""
         self.close()
 
     def close(self) -> None:
-        """Close the database; SQLite then leaves one file."""
         self._database.close()
 
     def pairs(self) -> list[Ids]:
@@ -258,7 +258,6 @@ class MatchDatabase:
         return {"keypoints": self._database.num_keypoints(), "matches": self._database.num_matches()}
 
     def has_geometry(self, pair: Ids) -> bool:
-        """Whether a pair has a two-view geometry, of a failure too."""
         return bool(self._database.exists_two_view_geometry(*pair))
 
     def matches(self, pair: Ids) -> NDArray[np.int64]:
@@ -333,6 +332,14 @@ def expect_database(path: Path) -> None:
         )
 
 
+def finished_pairs(path: Path, output: Path) -> int:
+    """How many pairs of a database have matches, if in the output all of these have a geometry; else 0."""
+    with _reading(path) as source, _reading(output) as target:
+        pairs = {pair for (pair,) in source.execute("SELECT pair_id FROM matches WHERE rows > 0")}
+        done = {pair for (pair,) in target.execute("SELECT pair_id FROM two_view_geometries")}
+    return len(pairs) if pairs <= done else 0
+
+
 def expect_writable(path: Path) -> None:
     """Raises OSError where a database cannot be written to, or another process does: before the work, not after."""
     try:
@@ -395,7 +402,6 @@ def _reading(path: Path) -> Iterator[sqlite3.Connection]:
 
 @functools.cache
 def _newest_version() -> int:
-    """The version that pycolmap writes into databases."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "empty.db"
         opened: Any = imported().Database.open(path)

@@ -1,18 +1,311 @@
 """The data set `h5`: pairs whose matches somebody else computed, in the layouts that the field exchanges."""
 
-from __future__ import annotations
-
+import contextlib
+import dataclasses
 import hashlib
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from fmtorch.data.fmbench import FMBenchPairs
-from fmtorch.data.pairs import ImagePair, PairDataset
-from fmtorch.data.text_files import DataError, given_root
-from fmtorch.io import h5
-from fmtorch.io.predictions import hloc_pairs, predicted_pairs
-from fmtorch.io.relative_poses import oanet_pairs, posebench_pairs, tutorial_files, tutorial_pairs
+import numpy as np
+
+from fmtorch.data import DataError, FMBenchPairs, GivenMatches, ImagePair, ImageSource, PairDataset, stored_size
+from fmtorch.data.files import given_root
+from fmtorch.data.pairs import HeldPairs
+from fmtorch.io import h5, predictions
+from fmtorch.io.predictions import Array, Size
+
+MATCHES, RATIOS, CALIBRATIONS, ROTATIONS, TRANSLATIONS, TRUTH = (
+    f"{name}.h5" for name in ("matches", "match_conf", "K1_K2", "R", "T", "Fgt")
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class TutorialMatches:
+    """The matches of one pair."""
+
+    folder: Path
+    key: str
+    sizes: tuple[Size, Size]
+
+    def __call__(self) -> GivenMatches:
+        with h5.opened(self.folder / MATCHES) as file:
+            points = h5.numbers(file, self.key, None, 4)
+        ratios = None
+        if (self.folder / RATIOS).exists():
+            with h5.opened(self.folder / RATIOS) as file:
+                ratios = h5.numbers(file, self.key).reshape(-1)
+            if len(ratios) != len(points):
+                raise DataError(
+                    f"{self.folder / RATIOS}: {self.key!r} has {len(ratios)} entries, "
+                    f"but {MATCHES} has {len(points)} matches of that pair"
+                )
+        return predictions.given(points[:, :2], points[:, 2:], self.sizes, (len(points), len(points)), ratio=ratios)
+
+
+def tutorial_files(root: Path) -> list[Path]:
+    """All that defines the data set."""
+    names = (MATCHES, RATIOS, CALIBRATIONS, ROTATIONS, TRANSLATIONS, TRUTH)
+    return [path for folder in scenes(root) for name in names if (path := folder / name).exists()]
+
+
+def tutorial_pairs(root: Path, images: Path | None) -> Iterator[ImagePair]:
+    """The pairs of every scene; of each file one opening, and one computation of F."""
+    for folder in scenes(root):
+        with h5.opened(folder / MATCHES) as file:
+            names = h5.keys(file)
+        with contextlib.ExitStack() as files:
+            cameras = _Cameras(folder, files)
+            pairs = [_pair(root, folder, key, cameras, images) for key in names]
+        yield from predictions.with_fundamentals(pairs) if cameras.by_image else pairs
+
+
+def scenes(root: Path) -> list[Path]:
+    """The folders that hold matches: root itself, or those below it."""
+    folders = [root] if (root / MATCHES).is_file() else sorted(path.parent for path in root.glob(f"*/{MATCHES}"))
+    if not folders:
+        raise DataError(f"{root}: neither {MATCHES} nor a sub-folder that holds one")
+    return folders
+
+
+class _Cameras:
+    """What a scene's files say of its cameras; files: closes those that are read pair by pair."""
+
+    def __init__(self, folder: Path, files: contextlib.ExitStack) -> None:
+        self.folder = folder
+        self._files, self._open = files, dict[str, Any]()
+        self._images: dict[str, ImageSource] = {}
+        self.by_image: dict[str, tuple[Array, Array]] = {}
+        self.problems: dict[str, str] = {}
+        rotations, translations = folder / ROTATIONS, folder / TRANSLATIONS
+        if rotations.exists() and translations.exists():
+            with h5.opened(rotations) as R, h5.opened(translations) as T:
+                for name in h5.keys(R):
+                    try:
+                        self.by_image[name] = h5.reshaped(R, name, 3, 3), h5.reshaped(T, name, 3)
+                    except DataError as error:
+                        self.problems[name] = str(error)
+        self._known = {*self.by_image, *self.problems}
+
+    def image(self, family: str, name: str, images: Path | None) -> ImageSource:
+        """An image of the scene, the same object for all pairs that show it."""
+        if name not in self._images:
+            self._images[name] = predictions.image(family, self.folder.name, name, images)
+        return self._images[name]
+
+    def split(self, key: str) -> tuple[str, str]:
+        """The two images of a pair; their names may hold hyphens too."""
+        parts = key.split("-")
+        ways = [("-".join(parts[:i]), "-".join(parts[i:])) for i in range(1, len(parts))]
+        for a, b in ways:
+            if a in self._known and b in self._known:
+                return a, b
+        if len(ways) == 1 and not self._known:
+            return ways[0]
+        lack = f"names no two images of {ROTATIONS} and {TRANSLATIONS}" if self._known else "does not name two images"
+        raise DataError(f"{self.folder / MATCHES}: {key!r} {lack}")
+
+    def calibration(self, key: str) -> tuple[Array, Array]:
+        K = h5.reshaped(self._file(CALIBRATIONS), key, 2, 3, 3)
+        if not np.linalg.det(K).all():
+            raise DataError(f"{self.folder / CALIBRATIONS}: {key!r}: a calibration matrix is singular")
+        return K[0], K[1]
+
+    def truth(self, key: str) -> Array:
+        if not (self.folder / TRUTH).exists():
+            raise DataError(
+                f"{self.folder}: neither {ROTATIONS} and {TRANSLATIONS} nor {TRUTH}: the test split has no ground truth"
+            )
+        return h5.reshaped(self._file(TRUTH), key, 3, 3)
+
+    def _file(self, name: str) -> Any:
+        """A file of the scene, opened once: opening takes longer than reading a pair, and grows with the file."""
+        if name not in self._open:
+            self._open[name] = self._files.enter_context(h5.opened(self.folder / name))
+        return self._open[name]
+
+
+def _size(source: ImageSource, K: Array, images: Path | None) -> Size:
+    """(h, w) of an image, by its principal point where there is no file. Raises DataError where the two disagree."""
+    by_centre, size = predictions.size_by_centre(K), stored_size(source.path) if images else None
+    if size is not None:
+        predictions.expect_size(source, size, K)
+    return size or by_centre
+
+
+def _pair(root: Path, folder: Path, key: str, cameras: _Cameras, images: Path | None) -> ImagePair:
+    family, scene = root.name, folder.name
+    identity = key if folder == root else f"{scene}/{key}"  # whatever the folder is called: draws follow from it
+    sources: tuple[ImageSource, ImageSource] | None = None
+    try:
+        name0, name1 = cameras.split(key)
+        sources = cameras.image(family, name0, images), cameras.image(family, name1, images)
+        for name in (name0, name1):
+            if name in cameras.problems:
+                raise DataError(cameras.problems[name])
+        K0, K1 = cameras.calibration(key)
+        sizes = _size(sources[0], K0, images), _size(sources[1], K1, images)
+        if cameras.by_image:
+            (R0, t0), (R1, t1) = cameras.by_image[name0], cameras.by_image[name1]
+            R = R1 @ R0.T
+            matches = TutorialMatches(folder, key, sizes)
+            return predictions.posed(identity, family, scene, sources, (K0, K1), R, t1 - R @ t0, matches)
+        F = cameras.truth(key)
+        norm = float(np.linalg.norm(F))
+        problem = None if norm else f"{folder / TRUTH}: {key!r} is zero"
+        pair = ImagePair(identity, family, scene, *sources, F / (norm or 1.0), K0, K1, problem=problem)
+    except DataError as error:
+        unnamed = predictions.image(family, scene, key, images)
+        return predictions.broken(identity, family, scene, sources or (unnamed, unnamed), str(error))
+    return dataclasses.replace(pair, matches=TutorialMatches(folder, key, sizes))
+
+
+# PoseBench's files of relative poses: a group for each pair, with ``x1``, ``x2`` (n, 2), ``camera1``, ``camera2``
+# (``model``, ``width``, ``height``, ``params``), ``R`` (3, 3) and ``t`` (3,), X2 = R X1 + t
+
+
+FOCAL_LENGTHS = {"SIMPLE_PINHOLE": 1, "PINHOLE": 2, "SIMPLE_RADIAL": 1, "RADIAL": 1, "OPENCV": 2, "FULL_OPENCV": 2}
+"""Camera models that are pinholes where their distortion is zero, and how many focal lengths begin their parameters."""
+
+
+@dataclasses.dataclass(frozen=True)
+class PoseBenchMatches:
+    """The matches of one pair. K: of both cameras. sizes: None where neither file nor image tells."""
+
+    path: Path
+    key: str
+    K: tuple[Array, Array]
+    sizes: tuple[Size | None, Size | None]
+
+    def __call__(self) -> GivenMatches:
+        with h5.opened(self.path) as file:
+            x0, x1 = (h5.numbers(file, f"{self.key}/{name}", None, 2) for name in ("x1", "x2"))
+        if len(x0) != len(x1):
+            raise DataError(f"{self.path}: {self.key!r} has {len(x0)} points in x1 and {len(x1)} in x2")
+        size0, size1 = (
+            predictions.size_by_points(K, x) if size is None else size
+            for size, K, x in zip(self.sizes, self.K, (x0, x1), strict=True)
+        )
+        return predictions.given(x0, x1, (size0, size1), (len(x0), len(x1)))
+
+
+def posebench_pairs(root: Path, images: Path | None) -> Iterator[ImagePair]:
+    """The pairs of a file, or of all files of a folder."""
+    for path in h5.files(root):
+        with h5.opened(path) as file:
+            for key in h5.keys(file):
+                yield _posebench_pair(file, path, root.stem, key, images)
+
+
+def _posebench_pair(file: Any, path: Path, family: str, key: str, images: Path | None) -> ImagePair:
+    scene, identity = path.stem, f"{path.stem}/{key}"
+    sources = predictions.image(family, scene, f"{key}/1", images), predictions.image(family, scene, f"{key}/2", images)
+    try:
+        (K0, size0), (K1, size1) = (
+            _camera(file, path, f"{key}/{name}", source)
+            for name, source in zip(("camera1", "camera2"), sources, strict=True)
+        )
+        R, t = h5.reshaped(file, f"{key}/R", 3, 3), h5.reshaped(file, f"{key}/t", 3)
+    except DataError as error:
+        return predictions.broken(identity, family, scene, sources, str(error))
+    pair = predictions.calibrated(identity, family, scene, sources, (K0, K1), R, t)
+    return dataclasses.replace(pair, matches=PoseBenchMatches(path, key, (K0, K1), (size0, size1)))
+
+
+def _camera(file: Any, path: Path, key: str, source: ImageSource) -> tuple[Array, Size | None]:
+    model = h5.text(file, f"{key}/model")
+    parameters = h5.numbers(file, f"{key}/params").reshape(-1)
+    count = FOCAL_LENGTHS.get(model)
+    if count is None:
+        raise DataError(f"{path}: {key + '/model'!r} is {model}; it must be one of {', '.join(FOCAL_LENGTHS)}")
+    if len(parameters) < count + 2 or not np.isfinite(parameters).all():
+        raise DataError(f"{path}: {key + '/params'!r} holds {parameters}, which are no parameters of {model}")
+    if parameters[count + 2 :].any():
+        raise DataError(f"{path}: {key + '/params'!r} of {model} has distortion; F needs undistorted points")
+    fx, fy = (parameters[0], parameters[count - 1])
+    cx, cy = parameters[count : count + 2]
+    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+    sides = [_side(file, f"{key}/{name}") for name in ("height", "width")]
+    if all(sides):
+        return K, (sides[0], sides[1])
+    size = stored_size(source.path)
+    if size is not None:
+        predictions.expect_size(source, size, K)
+    return K, size
+
+
+def _side(file: Any, key: str) -> int:
+    """A side of an image in pixels, 0 where it is not known: some of PoseBench's cameras have none."""
+    return max(0, int(h5.reshaped(file, key, 1)[0])) if h5.holds(file, key) else 0
+
+
+# The files that OANet trains and tests on (Zhang et al., ICCV 2019), of one entry for each pair ``0``, ``1``, ...:
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class OANetMatches:
+    """The matches of one pair; K: its calibrations."""
+
+    path: Path
+    key: str
+    K: tuple[Array, Array]
+    sizes: tuple[Size, Size]
+
+    def __call__(self) -> GivenMatches:
+        with h5.opened(self.path) as file:
+            rays = h5.numbers(file, f"xs/{self.key}", 1, None, 4)[0]
+            ratios, mutuals = (self._side(file, name, len(rays)) for name in ("ratios", "mutuals"))
+        x0, x1 = (x * K.diagonal()[:2] + K[:2, 2] for x, K in zip((rays[:, :2], rays[:, 2:]), self.K, strict=True))
+        return predictions.given(
+            x0, x1, self.sizes, (len(rays), len(rays)), ratio=ratios,
+            mutual=None if mutuals is None else mutuals.astype(bool),
+        )  # fmt: skip
+
+    def _side(self, file: Any, name: str, count: int) -> Array | None:
+        if not h5.holds(file, name):
+            return None
+        values = h5.numbers(file, f"{name}/{self.key}").reshape(-1)
+        if len(values) != count:
+            raise DataError(
+                f"{self.path}: {f'{name}/{self.key}'!r} has {len(values)} entries, "
+                f"but {f'xs/{self.key}'!r} has {count} matches"
+            )
+        return values
+
+
+def oanet_pairs(root: Path, images: Path | None) -> Iterator[ImagePair]:
+    """The pairs of a file, or of all files of a folder."""
+    for path in h5.files(root):
+        with h5.opened(path) as file:
+            if not h5.holds(file, "xs"):
+                raise DataError(f"{path}: 'xs' is missing; it is no file of OANet's layout")
+            for key in sorted(h5.keys(file["xs"]), key=lambda key: (len(key), key)):
+                yield _oanet_pair(file, path, root.stem, key, images)
+
+
+def _oanet_pair(file: Any, path: Path, family: str, key: str, images: Path | None) -> ImagePair:
+    scene, identity = path.stem, f"{path.stem}/{key}"
+    sources = predictions.image(family, scene, f"{key}/1", images), predictions.image(family, scene, f"{key}/2", images)
+    try:
+        K = _calibration(file, key, 1), _calibration(file, key, 2)
+        R, t = h5.reshaped(file, f"Rs/{key}", 3, 3), h5.reshaped(file, f"ts/{key}", 3)
+        sizes = predictions.size_by_centre(K[0]), predictions.size_by_centre(K[1])
+    except DataError as error:
+        return predictions.broken(identity, family, scene, sources, str(error))
+    pair = predictions.calibrated(identity, family, scene, sources, K, R, t)
+    return dataclasses.replace(pair, matches=OANetMatches(path, key, K, sizes))
+
+
+def _calibration(file: Any, key: str, which: int) -> Array:
+    cx, cy = (h5.reshaped(file, f"{name}{which}s/{key}", 1)[0] for name in ("cx", "cy"))
+    fx, fy = h5.reshaped(file, f"f{which}s/{key}", 2)
+    if fx == 0 or fy == 0:
+        raise DataError(f"{file.filename}: 'f{which}s/{key}' holds a focal length of zero")
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+
+
+# The data set `h5`: pairs whose matches somebody else computed, in the layouts that the field exchanges
+
 
 CORNER = 0.5  # where glue-factory puts the centre of the first pixel
 WITH_GEOMETRY: Mapping[str, Callable[[Path, Path | None], Iterator[ImagePair]]] = {
@@ -23,7 +316,7 @@ WITHOUT_GEOMETRY = {"hloc": 0.0, "glue_factory": CORNER, "vismatch": 0.0}
 LAYOUTS = (*WITHOUT_GEOMETRY, *WITH_GEOMETRY)
 
 
-class H5Pairs(PairDataset):
+class H5Pairs(HeldPairs):
     """Pairs with given matches, which take the place of features and matcher.
 
     Args:
@@ -41,15 +334,10 @@ class H5Pairs(PairDataset):
     name = "h5"
 
     def __init__(
-        self,
-        root: str | Path | None = None,
-        layout: str = "hloc",
-        truth: str | Path | None = None,
-        images: str | Path | None = None,
-        features: str | None = None,
-        matches: str | None = None,
+        self, root: str | Path | None = None, layout: str = "hloc", truth: str | Path | None = None,
+        images: str | Path | None = None, features: str | None = None, matches: str | None = None,
         origin: float | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         if layout not in LAYOUTS:
             raise DataError(f"no layout {layout!r}; it must be one of {', '.join(LAYOUTS)}")
         folder = given_root(root, "h5", "the file, or the folder of the files, that hold the matches")
@@ -74,22 +362,16 @@ class H5Pairs(PairDataset):
             offset = WITHOUT_GEOMETRY[layout] if origin is None else origin
             if layout == "hloc":
                 files = [_file_of_kind(folder, features, "features"), _file_of_kind(folder, matches, "matches")]
-                self._pairs = list(hloc_pairs(known, files[0], files[1], offset))
+                self._pairs = list(predictions.hloc_pairs(known, files[0], files[1], offset))
             else:
                 _expect_unset(layout, features=features)
                 files = [_file_of_kind(folder, matches, "matches") if matches else _only(folder)]
-                self._pairs = list(predicted_pairs(known, files[0], offset))
+                self._pairs = list(predictions.predicted_pairs(known, files[0], offset))
         for path in files:
             h5.add_to_digest(digest, path)
         if not self._pairs:
             raise DataError(f"{folder}: holds no pairs")
         self.digest = digest.hexdigest()
-
-    def __len__(self) -> int:
-        return len(self._pairs)
-
-    def __getitem__(self, index: int) -> ImagePair:
-        return self._pairs[index]
 
 
 def _truth(layout: str, truth: str | Path | None) -> PairDataset:
@@ -101,21 +383,19 @@ def _truth(layout: str, truth: str | Path | None) -> PairDataset:
 
 
 def _expect_distinct(pairs: list[ImagePair], folder: Path) -> None:
-    """Raises DataError where one file would stand for images of two scenes."""
     seen: dict[Path, str] = {}
     for pair in pairs:
-        for image in (pair.image0, pair.image1):
-            if image.path.exists() and seen.setdefault(image.path, pair.scene) != pair.scene:
+        for path in (pair.image0.path, pair.image1.path):
+            if path.exists() and seen.setdefault(path, pair.scene) != pair.scene:
                 raise DataError(
-                    f"{image.path} would stand for images of the scenes {seen[image.path]} and {pair.scene}: give each "
-                    f"a folder, {folder / seen[image.path]} and {folder / pair.scene}"
+                    f"{path} would stand for images of the scenes {seen[path]} and {pair.scene}: give each "
+                    f"a folder, {folder / seen[path]} and {folder / pair.scene}"
                 )
 
 
 def _expect_unset(layout: str, **options: Any) -> None:
-    given = [name for name, value in options.items() if value is not None]
-    if given:
-        raise DataError(f"layout {layout} takes no {' or '.join(given)}")
+    if unwanted := [name for name, value in options.items() if value is not None]:
+        raise DataError(f"layout {layout} takes no {' or '.join(unwanted)}")
 
 
 def _file_of_kind(folder: Path, name: str | None, kind: str) -> Path:

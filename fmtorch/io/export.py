@@ -1,7 +1,5 @@
 """A journal's images and pairs as hloc's two files, and as a COLMAP database."""
 
-from __future__ import annotations
-
 import csv
 import dataclasses
 import json
@@ -13,7 +11,7 @@ import numpy as np
 
 from fmtorch.core.files import replacing
 from fmtorch.io import colmap, h5
-from fmtorch.io.hloc import write_geometry
+from fmtorch.io.match_file import write_geometry
 from fmtorch.io.match_store import MatchStore, StoredImage, StoredPair
 from fmtorch.io.predictions import pair_key_of
 
@@ -35,12 +33,9 @@ def export_kinds(value: str | Sequence[str] | None) -> tuple[str, ...]:
 
 
 def write_exports(
-    journal: MatchStore,
-    pairs: Sequence[tuple[Path, Path]],
-    kinds: Iterable[str],
-    folder: Path,
+    journal: MatchStore, pairs: Sequence[tuple[Path, Path]], kinds: Iterable[str], folder: Path,
     shared_camera: bool = False,
-) -> list[str]:
+) -> list[str]:  # fmt: skip
     """Write the files for the images of these pairs into a folder, whole or not at all; their names.
 
     shared_camera: in COLMAP's database, one camera for all images of one size whose calibration is unknown.
@@ -112,7 +107,7 @@ class Edge:
     inliers: int
     significance: float | None
     related: bool
-    configuration: str
+    pair_type: str
 
 
 @dataclasses.dataclass(frozen=True)
@@ -149,7 +144,7 @@ def view_graph(journal: MatchStore, images: Sequence[Path], pairs: Sequence[tupl
             pair = journal.pair(*ends)
             significance = pair.significance if math.isfinite(pair.significance) else None
             counts = len(pair.matches), int(pair.inliers.sum())
-            edges.append(Edge(pair.name0, pair.name1, *counts, significance, pair.related, pair.configuration))
+            edges.append(Edge(pair.name0, pair.name1, *counts, significance, pair.related, pair.pair_type))
     return ViewGraph(tuple(journal.name(image) for image in images), tuple(edges))
 
 

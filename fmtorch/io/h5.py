@@ -1,7 +1,5 @@
 """HDF5 files of others, read with errors that name file and key."""
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import math
@@ -13,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fmtorch.data.text_files import DataError
+from fmtorch.data.files import DataError
 
 HASHED_WHOLE = 1 << 30  # bytes up to which a file is hashed as a whole
 _BLOCKS, _BLOCK = 4096, 1 << 16  # of larger files: how many blocks of how many bytes
@@ -50,6 +48,22 @@ def keys(file: Any) -> list[str]:
         return [str(name) for name in file]
     except (OSError, RuntimeError) as error:
         raise DataError(f"{_where(file)}: its keys cannot be read ({_first_line(error)})") from error
+
+
+def paths(file: Any) -> list[str]:
+    """The names below a file or group, at any depth. Raises DataError where they cannot be read."""
+    names: list[str] = []
+    try:
+        file.visit(names.append)
+    except (OSError, RuntimeError) as error:
+        raise DataError(f"{_where(file)}: its keys cannot be read ({_first_line(error)})") from error
+    return names
+
+
+def groups_with(file: Any, *names: str) -> list[str]:
+    """The paths of the groups that hold an array of one of these names, at any depth."""
+    ends = (path.rpartition("/") for path in paths(file))
+    return [group for group, _, name in ends if name in names and group]
 
 
 def holds(file: Any, key: str) -> bool:

@@ -1,45 +1,151 @@
-"""Matches alone: x0, x1 of one pair or of many in an npz or HDF5 file, and their geometries in another."""
-
-from __future__ import annotations
+"""Files of matches to verify: hloc's features and matches, or x0, x1 alone; and files of what was verified."""
 
 import contextlib
 import functools
 import zipfile
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from fmtorch.core.files import replacing
-from fmtorch.data.text_files import DataError
-from fmtorch.geometry.cameras import calibration_problems
+from fmtorch.data.files import DataError
 from fmtorch.io import h5
 from fmtorch.io.colmap import DatabaseImage
-from fmtorch.io.given import size_by_centre
-from fmtorch.io.match_store import PairGeometry
+from fmtorch.io.match_store import MATRICES, PairGeometry
+
+MEMORY = 256  # images whose keypoints are kept
+NO_MATCH = -1
+Names = tuple[str, str]
+OpenFiles = TypeVar("OpenFiles", bound="_OpenFiles")
+
+
+class _OpenFiles:
+    """Files of matches that are read, closed on leaving, and know no geometry; images are read when asked for."""
+
+    def __init__(self, files: Sequence[Path], output: Path) -> None:
+        self.files, self._output, self._open = files, output, contextlib.ExitStack()
+        self.image = functools.lru_cache(maxsize=MEMORY)(self._image)
+
+    def __enter__(self: OpenFiles) -> OpenFiles:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._open.close()
+
+    def identity(self) -> dict[str, Any]:
+        return {"files": h5.digest_of(*self.files)}
+
+    def has_geometry(self, pair: Names) -> bool:
+        return False
+
+    def name(self, image_id: str) -> str:
+        return image_id
+
+    def _image(self, image_id: str) -> DatabaseImage:
+        raise NotImplementedError
+
+
+class HlocMatches(_OpenFiles):
+    """The pairs of two files; output: the file of matches that is written.
+
+    Raises DataError where one of the files is no HDF5 file, or holds no keypoints or no matches.
+    """
+
+    def __init__(self, features: Path, matches: Path, output: Path) -> None:
+        super().__init__((features, matches), output)
+        with contextlib.ExitStack() as stack:
+            self._features, self._matches = (stack.enter_context(h5.opened(path)) for path in (features, matches))
+            images = h5.groups_with(self._features, "keypoints")
+            if not images:
+                raise DataError(f"{features} holds no keypoints; give hloc's file of features")
+            self._stored = {name.replace("/", "-"): name for name in images}
+            self._keys = {self._named(key): key for key in h5.groups_with(self._matches, "matches0")}
+            if not self._keys:
+                raise DataError(f"{matches} holds no matches0; give hloc's file of matches")
+            self._open = stack.pop_all()
+
+    def pairs(self) -> list[Names]:
+        return sorted(self._keys)
+
+    def finished(self) -> int:
+        """How many pairs the output has, if it has all of them; else 0."""
+        with h5.opened(self._output) as written:
+            return len(self._keys) if all(h5.holds(written, key) for key in self._keys.values()) else 0
+
+    def matches(self, pair: Names) -> NDArray[np.int64]:
+        """The matches of a pair, keypoints (n, 2). Raises DataError where there are no such keypoints."""
+        second = self._second(pair)
+        counts = [len(self.image(name).points) for name in pair]
+        if len(second) != counts[0]:
+            raise DataError(f"matches0 has {len(second)} entries, but {pair[0]} has {counts[0]} keypoints")
+        if len(second) and not NO_MATCH <= second.min() <= second.max() < counts[1]:
+            raise DataError(f"matches0 holds {second.min()} to {second.max()}, but {pair[1]} has {counts[1]} keypoints")
+        first = np.flatnonzero(second != NO_MATCH)
+        return np.stack([first, second[first]], -1)
+
+    def write(self, geometries: Iterable[tuple[Names, PairGeometry]]) -> None:
+        h5py = h5.imported()
+        with replacing(self._output) as temporary, h5py.File(temporary, "w") as file:
+            for pair, geometry in geometries:
+                group = file.create_group(self._keys[pair])
+                second = np.full(len(self._second(pair)), NO_MATCH, np.int32)
+                second[geometry.inliers[:, 0]] = geometry.inliers[:, 1]
+                group["matches0"] = second
+                scores = self._scores(pair)
+                if scores is not None:
+                    group["matching_scores0"] = np.where(second == NO_MATCH, 0, scores).astype(np.float32)
+                write_geometry(group, geometry)
+
+    def _named(self, key: str) -> Names:
+        """The names of a pair's images; of an image without features that in the key."""
+        first, _, second = key.rpartition("/")
+        if not first:  # an older hloc joins names by _, which may also stand in them
+            ends = ((key[:i], key[i + 1 :]) for i, sign in enumerate(key) if sign == "_")
+            first, second = next((both for both in ends if self._stored.keys() >= set(both)), (first, second))
+        return self._stored.get(first, first), self._stored.get(second, second)
+
+    def _second(self, pair: Names) -> NDArray[np.int64]:
+        values = h5.array(self._matches, f"{self._keys[pair]}/matches0", None)
+        if values.dtype.kind not in "iu":
+            raise DataError(f"matches0 is of {values.dtype}; it must hold whole numbers")
+        return values.astype(np.int64)
+
+    def _scores(self, pair: Names) -> NDArray[np.float64] | None:
+        key = f"{self._keys[pair]}/matching_scores0"
+        return h5.numbers(self._matches, key, None) if h5.holds(self._matches, key) else None
+
+    def _image(self, name: str) -> DatabaseImage:
+        points = h5.numbers(self._features, f"{name}/keypoints", None, 2).astype(np.float32)
+        width, height = h5.reshaped(self._features, f"{name}/image_size", 2)
+        size = int(height), int(width)
+        return DatabaseImage(name, -1, size, np.eye(3), np.inf, points, points)
+
+
+def write_geometry(group: Any, geometry: PairGeometry) -> None:
+    """Words and matrices of a pair as attributes of its group."""
+    group.attrs.update({**geometry.texts, **geometry.matrices})
+
+
+# Matches alone: x0, x1 of one pair or of many in an npz or HDF5 file, and their geometries in another
+
 
 NPZ = ".npz"
 SUFFIXES = (NPZ, *h5.SUFFIXES)
-MATRICES = ("F", "E", "H", "R", "t")
-MEMORY = 256  # images whose points are kept
 
 Ids = tuple[str, str]  # keys of the points of both images, which end in x0 and x1
 
 
-class ArrayFile(Protocol):
-    """Arrays by keys such as ``a/x0``."""
+class ArrayFile(NamedTuple):
+    """The keys of a file's arrays, such as ``a/x0``, and what reads one, or raises DataError."""
 
-    def keys(self) -> Iterable[str]:
-        """All of them."""
-
-    def read(self, key: str) -> NDArray[Any]:
-        """One array; raises DataError where it cannot be read."""
+    keys: list[str]
+    read: Callable[[str], NDArray[Any]]
 
 
-class MatchFile:
+class MatchFile(_OpenFiles):
     """The pairs of one file; each has matches of its own. output: the file of geometries that is written.
 
     A file holds ``x0, x1`` (n, 2), pixels with (0, 0) at the centre of the first one, and perhaps ``K0, K1`` (3, 3) and
@@ -49,10 +155,10 @@ class MatchFile:
     """
 
     def __init__(self, path: Path, output: Path) -> None:
-        self._path, self._output, self._open = path, output, contextlib.ExitStack()
+        super().__init__((path,), output)
         with contextlib.ExitStack() as stack:
             self._file = stack.enter_context(_arrays(path))
-            self._keys = set(self._file.keys())
+            self._keys = set(self._file.keys)
             ends = [key.removesuffix("x0") for key in self._keys if key.rpartition("/")[2] == "x0"]
             self._pairs = sorted(end for end in ends if f"{end}x1" in self._keys)
             if not self._pairs:
@@ -61,27 +167,15 @@ class MatchFile:
                     "or hloc's features=F.h5 as well"
                 )
             self._open = stack.pop_all()
-        self.image = functools.lru_cache(maxsize=MEMORY)(self._image)
-
-    def __enter__(self) -> MatchFile:
-        """The file itself, closed on leaving."""
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        """Close the file."""
-        self._open.close()
 
     def pairs(self) -> list[Ids]:
-        """Both images of each pair."""
         return [(f"{pair}x0", f"{pair}x1") for pair in self._pairs]
 
-    def identity(self) -> dict[str, Any]:
-        """What the file holds."""
-        return {"files": h5.digest_of(self._path)}
-
-    def has_geometry(self, pair: Ids) -> bool:
-        """Whether a pair has a geometry: none has."""
-        return False
+    def finished(self) -> int:
+        """How many pairs the output has, if it has all of them; else 0."""
+        with _arrays(self._output) as written:
+            keys = set(written.keys)
+        return len(self._pairs) if all(f"{pair}inliers" in keys for pair in self._pairs) else 0
 
     def matches(self, pair: Ids) -> NDArray[np.int64]:
         """Point i with point i. Raises DataError where x0 and x1 have different lengths."""
@@ -91,23 +185,18 @@ class MatchFile:
         return np.repeat(np.arange(counts[0])[:, None], 2, 1)
 
     def write(self, geometries: Iterable[tuple[Ids, PairGeometry]]) -> None:
-        """Write the file: which matches are inliers, configuration and matrices."""
+        """Write the file: which matches are inliers, configuration, reason, warning and matrices."""
         with replacing(self._output) as temporary:
             entries = (self._entries(*pair) for pair in geometries)
             (_write_npz if self._output.suffix == NPZ else _write_h5)(temporary, entries)
 
     def _entries(self, ids: Ids, geometry: PairGeometry) -> dict[str, NDArray[Any]]:
-        """What is written of a pair, by keys."""
         pair = ids[0].removesuffix("x0")
         inliers = np.zeros(len(self.image(ids[0]).points), bool)
         inliers[geometry.inliers[:, 0]] = True
-        values = ((name, getattr(geometry, name)) for name in MATRICES)
-        matrices = {f"{pair}{name}": value for name, value in values if value is not None}
-        return {f"{pair}inliers": inliers, f"{pair}configuration": np.array(geometry.kind), **matrices}
-
-    def name(self, image_id: str) -> str:
-        """The key of the points."""
-        return image_id
+        matrices = {f"{pair}{name}": value for name, value in geometry.matrices.items()}
+        texts = {f"{pair}{name}": np.array(value) for name, value in geometry.texts.items()}
+        return {f"{pair}inliers": inliers, **texts, **matrices}
 
     def _image(self, image_id: str) -> DatabaseImage:
         pair, i = image_id[:-2], int(image_id[-1])
@@ -116,9 +205,7 @@ class MatchFile:
             self._numbers(f"{pair}{key}", shape) if f"{pair}{key}" in self._keys else None
             for key, shape in ((f"K{i}", (3, 3)), (f"size{i}", (2,)))
         )
-        if K is not None and (problem := calibration_problems(torch.from_numpy(K)[None], None, f"K{i}")[0]):
-            raise DataError(problem)
-        known = size_by_centre(K) if size is None and K is not None else None
+        known = None
         if size is not None:
             if not (np.isfinite(size).all() and (size >= 1).all()):
                 raise DataError(f"size{i} is {size.tolist()}; it must be the height and width of the image")
@@ -147,7 +234,7 @@ def expect_suffix(name: str, path: Path) -> None:
 def _arrays(path: Path) -> Iterator[ArrayFile]:
     if path.suffix != NPZ:
         with h5.opened(path) as file:
-            yield _H5(file)
+            yield ArrayFile(h5.paths(file), functools.partial(h5.array, file))
         return
     try:
         npz = np.load(path)
@@ -155,38 +242,15 @@ def _arrays(path: Path) -> Iterator[ArrayFile]:
         raise DataError(f"{path}: is not a valid npz file; write it by numpy.savez") from error
     if not isinstance(npz, np.lib.npyio.NpzFile):
         raise DataError(f"{path}: is a single array; write x0 and x1 by numpy.savez")
-    with npz:
-        yield _Npz(npz)
 
-
-class _Npz:
-    def __init__(self, file: Any) -> None:
-        self._file = file
-
-    def keys(self) -> list[str]:
-        return list(self._file.files)
-
-    def read(self, key: str) -> NDArray[Any]:
+    def read(key: str) -> NDArray[Any]:
         try:
-            return np.asarray(self._file[key])
+            return np.asarray(npz[key])
         except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
             raise DataError(f"{key} cannot be read ({str(error).partition(chr(10))[0]})") from error
 
-
-class _H5:
-    def __init__(self, file: Any) -> None:
-        self._file = file
-
-    def keys(self) -> list[str]:
-        names: list[str] = []
-        try:
-            self._file.visit(names.append)
-        except (OSError, RuntimeError) as error:
-            raise DataError(f"{self._file.filename}: its keys cannot be read") from error
-        return names
-
-    def read(self, key: str) -> NDArray[Any]:
-        return h5.array(self._file, key)
+    with npz:
+        yield ArrayFile(list(npz.files), read)
 
 
 def _write_npz(path: Path, pairs: Iterable[Mapping[str, NDArray[Any]]]) -> None:
@@ -209,4 +273,4 @@ def _write_h5(path: Path, pairs: Iterable[Mapping[str, NDArray[Any]]]) -> None:
                 if name == "inliers":
                     group[name] = value
                 else:
-                    group.attrs[name] = str(value) if name == "configuration" else value
+                    group.attrs[name] = value if name in MATRICES else str(value)

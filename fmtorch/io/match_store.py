@@ -7,8 +7,6 @@
                           geometry for COLMAP; the digest is of the two images' digests
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import hashlib
@@ -20,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fmtorch.core.files import replacing
-from fmtorch.data.lenses import Lens
+from fmtorch.data.cameras import Lens
 
 # The geometry of a pair as COLMAP's databases hold it
 
@@ -30,13 +28,14 @@ ORIGIN = 0.5  # px: COLMAP's coordinates of the first pixel's centre
 Kind = Literal["calibrated", "uncalibrated", "planar", "panoramic", "planar_or_panoramic", "degenerate"]
 """COLMAP's configurations: of a general pair by whether both focal lengths are known, of others by what they show."""
 Matrix = NDArray[np.float64] | None
+MATRICES = ("F", "E", "H", "R", "t")
 
 
 class PairGeometry(NamedTuple):
     """The geometry of one pair, in pixels with (0, 0) at the centre of the first one.
 
     inliers: keypoints of both images, (n, 2). F, E, H: (3, 3), None where the pair has none; ``x1^T F x0 = 0``,
-    ``x1 ~ H x0``. R, t: X1 = R X0 + t.
+    ``x1 ~ H x0``. R, t: X1 = R X0 + t. reason: why there is no F. warning: what the matches leave open or contradict.
     """
 
     kind: Kind
@@ -46,6 +45,19 @@ class PairGeometry(NamedTuple):
     H: Matrix = None
     R: Matrix = None
     t: Matrix = None
+    reason: str = ""
+    warning: str = ""
+
+    @property
+    def matrices(self) -> dict[str, NDArray[np.float64]]:
+        """Those of `MATRICES` that the pair has."""
+        return {name: value for name in MATRICES if (value := getattr(self, name)) is not None}
+
+    @property
+    def texts(self) -> dict[str, str]:
+        """What files say of the pair in words: its configuration, and reason and warning where there are any."""
+        texts = {"pair_type": self.kind, "reason": self.reason, "warning": self.warning}
+        return {name: text for name, text in texts.items() if text}
 
 
 def two_view_geometry(pycolmap: Any, pair: PairGeometry) -> Any:
@@ -66,8 +78,7 @@ def two_view_geometry(pycolmap: Any, pair: PairGeometry) -> Any:
 
 
 Array = NDArray[np.float64]
-_PAIR = ("matches", "scores", "inliers", "F", "related", "significance", "configuration")
-_GEOMETRY = ("F", "E", "H", "R", "t")  # matrices of a geometry, of those that there are
+_PAIR = ("matches", "scores", "inliers", "F", "related", "significance", "pair_type")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -91,7 +102,7 @@ class StoredPair:
     """The matches given to the estimator, (m, 2) indices of points; scores (m,) in [0, 1]; inliers (m,) of F (3, 3).
 
     F is zero where there is none. related: whether its support is beyond chance. significance: how far, -inf without F
-    and NaN where it was not computed. configuration: of the cameras and the scene; empty where it is not known, and
+    and NaN where it was not computed. pair_type: of the cameras and the scene; empty where it is not known, and
     geometry, for COLMAP, None.
     """
 
@@ -104,7 +115,7 @@ class StoredPair:
     related: bool = True
     geometry: PairGeometry | None = None
     significance: float = math.nan
-    configuration: str = ""
+    pair_type: str = ""
 
 
 class MatchRecords(NamedTuple):
@@ -122,7 +133,6 @@ class MatchStore:
     root: Path
 
     def name(self, image: Path) -> str:
-        """Under what name an image is exported."""
         return image.absolute().relative_to(self.root.absolute()).as_posix()
 
     def add(self, records: MatchRecords) -> None:
@@ -155,8 +165,7 @@ class MatchStore:
         arrays: dict[str, NDArray[Any]] = {name: np.asarray(getattr(value, name)) for name in _PAIR}
         if (geometry := value.geometry) is not None:
             arrays |= {"kind": np.array(geometry.kind), "geometry_inliers": np.asarray(geometry.inliers)}
-            matrices = {f"geometry_{name}": getattr(geometry, name) for name in _GEOMETRY}
-            arrays |= {name: matrix for name, matrix in matrices.items() if matrix is not None}
+            arrays |= {f"geometry_{name}": matrix for name, matrix in geometry.matrices.items()}
         _write(self._pair(image0, image1), arrays)
 
     def image(self, image: Path) -> StoredImage:
@@ -174,9 +183,9 @@ class MatchStore:
             values = {name: stored[name] for name in _PAIR}
             geometry = None
             if "kind" in stored:
-                matrices = [stored.get(f"geometry_{name}") for name in _GEOMETRY]
+                matrices = [stored.get(f"geometry_{name}") for name in MATRICES]
                 geometry = PairGeometry(cast(Kind, str(stored["kind"])), stored["geometry_inliers"], *matrices)
-        values |= {name: values[name].item() for name in ("related", "significance", "configuration")}
+        values |= {name: values[name].item() for name in ("related", "significance", "pair_type")}
         return StoredPair(self.name(image0), self.name(image1), geometry=geometry, **values)
 
     def _image(self, image: Path) -> Path:

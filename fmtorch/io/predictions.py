@@ -1,20 +1,129 @@
-"""Which stored image or pair is which of a data set: others name images by their path, or by its end."""
-
-from __future__ import annotations
+"""Matches that other programs stored for the pairs of a data set: hloc's, glue-factory's and vismatch's files."""
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
-from fmtorch.data.images import stored_size
-from fmtorch.data.pairs import GivenMatches, ImagePair, ImageSource, PairDataset
-from fmtorch.data.text_files import DataError
+from fmtorch.core.types import Correspondences
+from fmtorch.data import DataError, GivenMatches, ImagePair, ImageSource, PairDataset, stored_size
+from fmtorch.geometry.cameras import fundamental_from_projections
 from fmtorch.io import h5
-from fmtorch.io.given import Array, Size, given
+
+Array = NDArray[np.float64]
+Size = tuple[int, int]  # (h, w)
+MAX_OFF_CENTRE = 0.1  # of a principal point, in units of the side: those of reduced images are farther off
+_ZERO = np.zeros((3, 3))  # where there is no F
+
+
+def given(
+    x0: Array, x1: Array, sizes: tuple[Size, Size], features: tuple[int, int], *, ratio: Array | None = None,
+    score: Array | None = None, mutual: NDArray[np.bool_] | None = None,
+) -> GivenMatches:  # fmt: skip
+    """Matches of one pair, (n, 2) in pixels each; those that are not finite do not count.
+
+    ratio, score, mutual: (n,), as of `Correspondences`. features: how many keypoints each image has.
+    """
+    p0, p1 = (torch.from_numpy(np.ascontiguousarray(x, np.float32))[None] for x in (x0, x1))
+    mask = torch.from_numpy(np.isfinite(x0).all(-1) & np.isfinite(x1).all(-1))[None]
+    return GivenMatches(
+        Correspondences(
+            torch.where(mask[..., None], p0, 0.0), torch.where(mask[..., None], p1, 0.0), mask,
+            ratio=_figure(ratio), score=_figure(score),
+            mutual=None if mutual is None else torch.from_numpy(mutual)[None] & mask,
+            size0=torch.tensor([sizes[0]]), size1=torch.tensor([sizes[1]]),
+        ),
+        features,
+    )  # fmt: skip
+
+
+def _figure(values: Array | None) -> torch.Tensor | None:
+    return None if values is None else torch.from_numpy(values.astype(np.float32))[None]
+
+
+def calibrated(
+    identity: str, family: str, scene: str, images: tuple[ImageSource, ImageSource], K: tuple[Array, Array],
+    R: Array, t: Array,
+) -> ImagePair:  # fmt: skip
+    """A pair of cameras with X1 = R X0 + t, and the F of these; a problem where they define none."""
+    return with_fundamentals([posed(identity, family, scene, images, K, R, t)])[0]
+
+
+def posed(
+    identity: str, family: str, scene: str, images: tuple[ImageSource, ImageSource], K: tuple[Array, Array],
+    R: Array, t: Array, matches: Callable[[], GivenMatches] | None = None,
+) -> ImagePair:  # fmt: skip
+    """The same, of which `with_fundamentals` finds F or the problem."""
+    return ImagePair(identity, family, scene, *images, _ZERO, *K, R, t, None, matches)
+
+
+def with_fundamentals(pairs: Sequence[ImagePair]) -> list[ImagePair]:
+    """The pairs with the F of their cameras, all at once; those with a problem, or without a pose, as they are."""
+    result = list(pairs)
+    places = [i for i, p in enumerate(pairs) if p.problem is None and p.R is not None]
+    if not places:
+        return result
+    K0, K1, R, t = (np.stack([getattr(pairs[i], name) for i in places]) for name in ("K0", "K1", "R", "t"))
+    wrong = {
+        "the cameras did not move apart (t is zero), which leaves no F": ~t.any(1),
+        "R is no rotation": np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max((1, 2)) > 1e-2,
+        "a calibration matrix is singular": (np.linalg.det(K0) == 0) | (np.linalg.det(K1) == 0),
+    }
+    problems: list[str | None] = [None] * len(places)
+    for problem, where in wrong.items():  # the last that holds counts
+        for i in np.flatnonzero(where):
+            problems[i] = problem
+    P0, P1 = K0 @ np.eye(3, 4), K1 @ np.concatenate([R, t[..., None]], -1)
+    F = fundamental_from_projections(torch.from_numpy(P0), torch.from_numpy(P1)).numpy()
+    for place, own, wrongly in zip(places, F, problems, strict=True):
+        result[place] = dataclasses.replace(pairs[place], F=own if wrongly is None else _ZERO, problem=wrongly)
+    return result
+
+
+def broken(identity: str, family: str, scene: str, images: tuple[ImageSource, ImageSource], problem: str) -> ImagePair:
+    """A pair that cannot be used, which becomes a row with this reason."""
+    return ImagePair(identity, family, scene, *images, np.zeros((3, 3)), problem=problem)
+
+
+def image(family: str, scene: str, name: str, folder: Path | None) -> ImageSource:
+    """An image of which only the name is known, in a folder, or its sub-folder of the scene, where one is given."""
+    path = Path(name)
+    if folder is not None:
+        path = folder / scene / name if (folder / scene).is_dir() else folder / name
+    return ImageSource(f"{family}/{scene}/{name}", path)
+
+
+def expect_size(source: ImageSource, size: Size, K: Array) -> None:
+    """Raises DataError where an image's size (h, w) contradicts its camera: a copy that was reduced or cropped."""
+    h, w = size
+    if max(abs(K[0, 2] / w - 0.5), abs(K[1, 2] / h - 0.5)) > MAX_OFF_CENTRE:
+        raise DataError(
+            f"{source.path}: {w} x {h} px, but its camera's principal point is ({K[0, 2]:g}, {K[1, 2]:g}); it must be "
+            "the image as it was when its camera was determined"
+        )
+
+
+def size_by_points(K: Array, x: Array) -> Size:
+    """(h, w) of an image of unknown size: its principal point is the centre, and it holds all of the points (n, 2)."""
+    bound = x[np.isfinite(x).all(-1)].max(0, initial=0.0)
+    width, height = (max(2 * float(c) + 1, np.ceil(b) + 1) for c, b in zip(K[:2, 2], bound, strict=True))
+    return round(height), round(width)
+
+
+def size_by_centre(K: Array) -> Size:
+    """(h, w) of an image whose principal point is its centre: the best guess where nothing else tells it."""
+    width, height = 2 * K[0, 2] + 1, 2 * K[1, 2] + 1
+    if not (np.isfinite(width) and np.isfinite(height) and width >= 2 and height >= 2):
+        raise DataError("the image sizes are unknown, and the principal point is no centre of an image; give images")
+    return round(height), round(width)
+
+
+# Which stored image or pair is which of a data set: others name images by their path, or by its end
+
 
 DEPTH = 4  # parts of a path that a name may hold
 
@@ -83,7 +192,6 @@ class HLocMatches:
     origin: float
 
     def __call__(self) -> GivenMatches:
-        """Read them. Raises DataError naming file and key."""
         with h5.opened(self.features) as file:
             points = [_keypoints(file, self.features, name) - self.origin for name in self.names]
             sizes = tuple(
@@ -94,10 +202,11 @@ class HLocMatches:
         order = (1, 0) if self.swapped else (0, 1)
         i, j = _indices(chosen, [len(points[k]) for k in order], f"{self.matches}: {self.key + '/matches0'!r}")
         index = (j, i) if self.swapped else (i, j)
-        quality = None if scores is None else 1 - scores[i]
+        score = None if scores is None else scores[i]
         return given(
-            points[0][index[0]], points[1][index[1]], (sizes[0], sizes[1]), (len(points[0]), len(points[1])), quality
-        )
+            points[0][index[0]], points[1][index[1]], (sizes[0], sizes[1]), (len(points[0]), len(points[1])),
+            score=score,
+        )  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)
@@ -115,25 +224,24 @@ class PairPrediction:
     origin: float
 
     def __call__(self) -> GivenMatches:
-        """Read them. Raises DataError naming file and key."""
         with h5.opened(self.path) as file:
             group = file[self.key]
             if h5.holds(group, "matches0"):
-                x, counts, quality = self._indexed(group)
+                x, counts, score = self._indexed(group)
             else:
-                x, counts, quality = self._matched(group)
+                x, counts, score = self._matched(group)
             suffixes = ("1", "0") if self.swapped else ("0", "1")
             sizes = [_size(group, f"image_size{s}", image) for s, image in zip(suffixes, self.images, strict=True)]
         order = (1, 0) if self.swapped else (0, 1)
         x0, x1 = (x[k] - self.origin for k in order)
-        return given(x0, x1, (sizes[0], sizes[1]), (counts[order[0]], counts[order[1]]), quality)
+        return given(x0, x1, (sizes[0], sizes[1]), (counts[order[0]], counts[order[1]]), score=score)
 
     def _indexed(self, group: Any) -> tuple[list[Array], list[int], Array | None]:
         points = [h5.numbers(group, f"keypoints{k}", None, 2) for k in (0, 1)]
         chosen, scores = _read_indices(group, self.path, "")
         counts = [len(p) for p in points]
         i, j = _indices(chosen, counts, f"{self.path}: {self.key + '/matches0'!r}")
-        return [points[0][i], points[1][j]], counts, None if scores is None else 1 - scores[i]
+        return [points[0][i], points[1][j]], counts, None if scores is None else scores[i]
 
     def _matched(self, group: Any) -> tuple[list[Array], list[int], Array | None]:
         x = [h5.numbers(group, f"matched_kpts{k}", None, 2) for k in (0, 1)]
@@ -141,14 +249,14 @@ class PairPrediction:
             raise DataError(
                 f"{self.path}: {self.key!r} has {len(x[0])} points in matched_kpts0 and {len(x[1])} in matched_kpts1"
             )
-        quality = None
+        score = None
         if h5.holds(group, "matched_confidences"):
-            quality = 1 - h5.numbers(group, "matched_confidences", len(x[0]))
+            score = h5.numbers(group, "matched_confidences", len(x[0]))
         counts = [len(p) for p in x]
         for k in (0, 1):
             if h5.holds(group, f"all_kpts{k}"):
                 counts[k] = len(h5.array(group, f"all_kpts{k}", None, 2))
-        return x, counts, quality
+        return x, counts, score
 
 
 def hloc_pairs(truth: PairDataset, features: Path, matches: Path, origin: float) -> Iterator[ImagePair]:
@@ -178,7 +286,9 @@ def hloc_pairs(truth: PairDataset, features: Path, matches: Path, origin: float)
 def predicted_pairs(truth: PairDataset, path: Path, origin: float) -> Iterator[ImagePair]:
     """The pairs of a data set with predictions for them; a pair without has a problem."""
     with h5.opened(path) as file:
-        stored = set(_groups(file))
+        stored = set(h5.groups_with(file, "matches0", "matched_kpts0"))
+        if not stored:
+            raise DataError(f"{path}: holds no group with matches0 or matched_kpts0")
     for pair in truth:
         images = pair.image0, pair.image1
         for key, swapped in (*pair_keys(pair), (pair.identity, False)):
@@ -194,7 +304,6 @@ def _without(pair: ImagePair, problem: str) -> ImagePair:
 
 
 def _expect_distinct(names: dict[str, str | None], path: Path) -> None:
-    """Raises DataError where one stored image would stand for two of the data set."""
     seen: dict[str, str] = {}
     for identity, name in names.items():
         if name is not None and seen.setdefault(name, identity) != identity:
@@ -204,26 +313,7 @@ def _expect_distinct(names: dict[str, str | None], path: Path) -> None:
             )
 
 
-def _groups(file: Any) -> list[str]:
-    """The paths of the groups that hold a prediction."""
-    groups: list[str] = []
-
-    def visit(name: str) -> None:
-        head, _, last = name.rpartition("/")
-        if last in ("matches0", "matched_kpts0") and head:
-            groups.append(head)
-
-    try:
-        file.visit(visit)
-    except (OSError, RuntimeError) as error:
-        raise DataError(f"{file.filename}: its keys cannot be read ({str(error).splitlines()[0]})") from error
-    if not groups:
-        raise DataError(f"{file.filename}: holds no group with matches0 or matched_kpts0")
-    return groups
-
-
 def _read_indices(file: Any, path: Path, key: str) -> tuple[NDArray[np.int64], Array | None]:
-    """``matches0`` and, where there are any, ``matching_scores0`` of a group."""
     prefix = f"{key}/" if key else ""
     chosen = h5.array(file, f"{prefix}matches0", None)
     if chosen.dtype.kind not in "iu":
@@ -247,7 +337,6 @@ def _indices(chosen: NDArray[np.int64], counts: list[int], where: str) -> tuple[
 
 
 def _keypoints(file: Any, path: Path, name: str) -> Array:
-    """x and y of an image's keypoints, which may come with scales. Raises DataError for fewer columns."""
     points = h5.numbers(file, f"{name}/keypoints", None, None)
     if points.shape[1] < 2:
         raise DataError(f"{path}: {name + '/keypoints'!r} has shape {points.shape}; it must be (n, 2) or wider")

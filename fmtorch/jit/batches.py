@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from fmtorch.jobs.threads import available, mapped
+from fmtorch.jobs.execution import available, mapped
 
 PAIRS_OF_A_THREAD = 8  # at least; a thread takes as long to begin as a kernel for a pair
 

@@ -5,11 +5,13 @@ from typing import TYPE_CHECKING
 from fmtorch.core.lazy import lazy_exports
 
 if TYPE_CHECKING:
+    from fmtorch.matching.lightglue import LightGlue
     from fmtorch.matching.matcher import NearestNeighborMatcher
     from fmtorch.matching.nearest import Neighbors, nearest_neighbors
+    from fmtorch.matching.vismatch import VisMatch
 
 __all__ = [
-    "NearestNeighborMatcher", "Neighbors", "nearest_neighbors",
+    "LightGlue", "NearestNeighborMatcher", "Neighbors", "VisMatch", "nearest_neighbors",
 ]  # fmt: skip
 
 lazy_exports(__name__, checked=True)

@@ -1,7 +1,5 @@
 """LightGlue, the learned matcher (Lindenberger, Sarlin, Pollefeys, ICCV 2023), through kornia, for comparison."""
 
-from __future__ import annotations
-
 import kornia
 import torch
 from torch import Tensor, nn
@@ -12,10 +10,16 @@ from fmtorch.core.types import Correspondences, Features
 FEATURES = ("aliked", "disk")  # those that need no more than positions and descriptors, and that this project reads
 
 
+def weight_file(features: str) -> str:
+    """The file that kornia's loader looks for in torch's folder of checkpoints; it replaces every dot of the name."""
+    network = kornia.feature.LightGlue
+    return f"{network.features[features]['weights']}_{network.version}.pth".replace(".", "-")
+
+
 class LightGlue:
     """Matches the features of two images by a transformer; the slots of the result are the matches found.
 
-    quality: 1 - score, prior: the network's score, its P(match). Frames are not handed on: the features that it is
+    score and prior: the network's score, its P(match). Frames are not handed on: the features that it is
     for have none. features: `aliked` or `disk`, what the weights were trained for; threshold: least score.
     device: auto, cpu, cuda. network: in place of the released one. For any number of threads.
 
@@ -35,7 +39,7 @@ class LightGlue:
         self.device = torch.device(automatic if device == "auto" else device)
         network = network or pretrained(
             lambda: kornia.feature.LightGlue(features, filter_threshold=threshold), f"LightGlue ({features})",
-            "github.com/cvg/LightGlue or huggingface.co/kornia", f"{features}_lightglue_v0-1_arxiv.pth",
+            "github.com/cvg/LightGlue or huggingface.co/kornia", f"{features}_lightglue.pth", weight_file(features),
         )  # fmt: skip
         self.network = network.eval().to(self.device)
         self._length = int(kornia.feature.LightGlue.features[features]["input_dim"])
@@ -54,7 +58,7 @@ class LightGlue:
             x0=features0.keypoints[pairs[:, 0]][None],
             x1=features1.keypoints[pairs[:, 1]][None],
             mask=torch.ones_like(score, dtype=torch.bool)[None],
-            quality=1 - score[None],
+            score=score[None],
             prior=score[None],
             size0=features0.image_size[None],
             size1=features1.image_size[None],

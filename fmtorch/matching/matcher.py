@@ -21,7 +21,7 @@ class NearestNeighborMatcher:
     """Matches every feature of image 0 with the feature of image 1 whose descriptor is nearest (Euclidean).
 
     The slots of the result are the features of image 0, in their order; `mask` is True for those that found a
-    partner. `quality` is the ratio of the distances to the nearest and the second nearest descriptor, in [0, 1], and
+    partner. `ratio` is the ratio of the distances to the nearest and the second nearest descriptor, in [0, 1], and
     1 where it means nothing (a single candidate, two identical candidates).
 
     mutual: keep only matches whose partner's own nearest neighbour is the feature itself. It costs nothing, both
@@ -53,7 +53,7 @@ class NearestNeighborMatcher:
             x0=features0.keypoints,
             x1=lafs1[..., 2],
             mask=mask & neighbors.mutual if self.mutual else mask,
-            quality=neighbors.ratio.to(features0.lafs.dtype),
+            ratio=neighbors.ratio.to(features0.lafs.dtype),
             lafs0=features0.lafs,
             lafs1=lafs1,
             size0=features0.image_size,
@@ -75,7 +75,6 @@ def _take(lafs: Tensor, index: Int[Tensor, "b n0"]) -> Tensor:
 
 
 # How exact each match is, from the precision matrices that RoMa v2 gives with it
-
 
 Array = NDArray[np.float64]
 MAX_RATIO = 4.0  # of the noise of a match to the pair's usual one, either way: as far as frames tell (`match_noise`)

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from fmtorch.geometry.arithmetic import sqrt, stable_sum
 from fmtorch.jit.kernel import Array, F8x1, I1x2, I4x1, I4x2, I8x1, available, inner, kernel
-from fmtorch.jobs.threads import one_thread
+from fmtorch.jobs.execution import one_thread
 
 # Two nearest neighbours, compiled: products of 8-bit integers leave few candidates, whose distances are exact
 
@@ -168,7 +168,6 @@ def _squared_distance(a: Array, b: Array) -> float:
 
 # Two nearest neighbours on a CPU: products of 8-bit integers first, then exact distances of those that may be
 # nearest
-
 
 BLOCK = 128  # rows whose products with all columns exist at a time: 4 MB at 8,000 columns
 MAX_COMPUTED = 256  # exact distances a descriptor, beyond which rounding does not help: nearly equal ones

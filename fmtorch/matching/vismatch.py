@@ -33,7 +33,7 @@ Size = tuple[int, int]  # (h, w), px
 class VisMatch:
     """The matches of two images by a matcher of vismatch.
 
-    quality: 1 - confidence, where the matcher gives one. noise: where it gives a precision matrix for each match, as
+    score: the confidence, where the matcher gives one. noise: where it gives a precision matrix for each match, as
     RoMa v2 does, see `relative_noise`. Matches outside of an image are masked. Calls take turns, each with torch's
     random numbers from the same seed: a pair's matches do not depend on the pairs before it.
 
@@ -130,10 +130,10 @@ def _correspondences(matches: _Matches, origin: float, sizes: Sequence[Size]) ->
         with np.errstate(invalid="ignore"):  # NaN is in no image
             mask &= ((points >= -EDGE) & (points <= np.array([w, h]) - EDGE)).all(1)
     x0, x1 = (_batch(np.where(mask[:, None], points, 0)) for points in x)
-    quality = None if matches.confidence is None else 1 - np.clip(np.nan_to_num(matches.confidence), 0, 1)
+    score = None if matches.confidence is None else np.clip(np.nan_to_num(matches.confidence), 0, 1)
     size0, size1 = (torch.tensor([size]) for size in sizes)
     return Correspondences(
-        x0, x1, torch.from_numpy(mask)[None], quality=_batch(quality), noise=_batch(matches.noise),
+        x0, x1, torch.from_numpy(mask)[None], score=_batch(score), noise=_batch(matches.noise),
         size0=size0, size1=size1,
     )  # fmt: skip
 

@@ -11,8 +11,7 @@ from fmtorch.core.lazy import lazy_exports
 if TYPE_CHECKING:
     from fmtorch.metrics.homography import corner_error, right_of_homography
     from fmtorch.metrics.inlier_rate import InlierRate, ground_truth_inliers, inlier_rate
-    from fmtorch.metrics.nsgd import nsgd, sgd
-    from fmtorch.metrics.nsgd_released import nsgd_released
+    from fmtorch.metrics.nsgd import nsgd, nsgd_released, sgd
     from fmtorch.metrics.pose import (
         PoseError,
         closest_pose_error,
@@ -25,24 +24,9 @@ if TYPE_CHECKING:
     from fmtorch.metrics.recall import mean_recall, recall, recall_curve
 
 __all__ = [
-    "InlierRate",
-    "PoseError",
-    "closest_pose_error",
-    "corner_error",
-    "fundamental_pose_error",
-    "ground_truth_inliers",
-    "inlier_rate",
-    "mean_recall",
-    "nsgd",
-    "nsgd_released",
-    "pose_auc",
-    "pose_error",
-    "pose_maa",
-    "pose_map",
-    "recall",
-    "recall_curve",
-    "right_of_homography",
-    "sgd",
-]
+    "InlierRate", "PoseError", "closest_pose_error", "corner_error", "fundamental_pose_error", "ground_truth_inliers",
+    "inlier_rate", "mean_recall", "nsgd", "nsgd_released", "pose_auc", "pose_error", "pose_maa", "pose_map", "recall",
+    "recall_curve", "right_of_homography", "sgd",
+]  # fmt: skip
 
 lazy_exports(__name__)

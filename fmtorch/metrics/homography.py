@@ -1,7 +1,5 @@
 """Errors of homographies ``x1 ~ H x0`` whose truth is known, as HPatches is evaluated."""
 
-from __future__ import annotations
-
 import torch
 from jaxtyping import Bool, Float, Real
 from torch import Tensor

@@ -1,7 +1,5 @@
 """Share of matches that agree with the ground truth, before and after estimation."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

@@ -11,181 +11,42 @@ A draw is accepted when both lines meet image 1; the figure is the mean of the f
 It is not symmetric under exchanging the images.
 """
 
-from __future__ import annotations
-
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import NamedTuple
+import math
+from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int, Real
+from jaxtyping import Float, Int, Real
 from torch import Tensor
 
 from fmtorch.core.checks import checked, expect_sizes
-from fmtorch.geometry.arithmetic import component_sum, sqrt, stable_sum
+from fmtorch.geometry.arithmetic import sqrt
 from fmtorch.geometry.epipolar import unit_largest
-from fmtorch.jit.random import Stream, uniform
-
-# Monte-Carlo means over virtual points: the part of a line inside an image, and draws until enough are accepted
-
+from fmtorch.jit.batches import for_each_pair
+from fmtorch.jit.kernel import Array, F8x1, F8x2, F8x3, I8x1, inner, kernel, vector
+from fmtorch.jit.random import Stream, mixed_seed, stream_state, uniform_kernel
 
 COLUMNS = 6  # random numbers of a draw: for each of its two halves a point (x, y) and a place on its line
 BLOCK = 128  # draws summed together
 TRIES = 10  # draws made at most, per accepted draw wanted
-TILE = 1 << 14  # draws computed at a time, which fits a processor's cache
-PARALLEL = 1e-12  # sine of the least angle between a line and a border: 1e-8 px over 10,000 px
-NO_NORMAL = 1e-60  # squared length of a normal, for F of unit size, that is none
-
-
-@dataclass(frozen=True)
-class Pairs:
-    """Pairs with their leading dimensions flattened to one, in float64; sizes are (h, w)."""
-
-    F_gt: Float[Tensor, "b 3 3"]
-    F_est: Float[Tensor, "b 3 3"]
-    size0: Float[Tensor, "b 2"]
-    size1: Float[Tensor, "b 2"]
-    key: Int[Tensor, " b"]
-
-    @staticmethod
-    def flatten(
-        F_gt: Float[Tensor, "*#batch 3 3"],
-        F_est: Float[Tensor, "*#batch 3 3"],
-        size0: Real[Tensor, "*#batch 2"],
-        size1: Real[Tensor, "*#batch 2"],
-        key: Int[Tensor, "*#batch"] | None,
-    ) -> tuple[Pairs, torch.Size]:
-        """The pairs and their common leading shape; without keys every key is 0. Raises ValueError for wrong sizes."""
-        expect_sizes(size0=size0, size1=size1)
-        if key is None:
-            key = torch.zeros((), dtype=torch.int64, device=F_est.device)
-        shape = (F_gt[..., 0, 0] + F_est[..., 0, 0] + size0[..., 0] + size1[..., 0] + key).shape
-
-        def flat(value: Tensor, *tail: int) -> Tensor:
-            return value.to(torch.float64).expand(*shape, *tail).reshape(-1, *tail)
-
-        pairs = Pairs(
-            flat(F_gt, 3, 3), flat(F_est, 3, 3), flat(size0, 2), flat(size1, 2), key.expand(shape).reshape(-1)
-        )
-        return pairs, shape
-
-    def take(self, index: Int[Tensor, " picked"] | slice) -> Pairs:
-        """The selected pairs."""
-        return Pairs(self.F_gt[index], self.F_est[index], self.size0[index], self.size1[index], self.key[index])
-
-
-def diagonal(size: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch"]:
-    """Length of the image diagonal, in pixels."""
-    h, w = size.unbind(-1)
-    return sqrt(h * h + w * w)
-
-
-class Draws(NamedTuple):
-    """Uniform numbers in [0, 1) of N draws of each pair, (2, B, N): of the first half of each draw and of the second.
-
-    x, y: of a point in image 0. share: of a place on its line in image 1.
-    """
-
-    x: Tensor
-    y: Tensor
-    share: Tensor
-
-    @classmethod
-    def of(cls, seed: int, key: Int[Tensor, " b"], start: int, count: int) -> Draws:
-        """Those of the draws start .. start + count - 1."""
-        numbers = uniform(seed, key, Stream.METRIC, start, count, COLUMNS)
-        return cls(*numbers.reshape(*numbers.shape[:2], 2, 3).permute(3, 2, 0, 1).contiguous().unbind(0))
-
-
-Draw = Callable[[Pairs, Draws], tuple[Tensor, Tensor]]
-
-
-def sum_of_draws(pairs: Pairs, draw: Draw, *, samples: int, seed: int) -> tuple[Float[Tensor, " b"], Int[Tensor, " b"]]:
-    """Sum of the first `samples` accepted draws of each pair, and how many there are among 10 x `samples` tries.
-
-    `draw` maps pairs and their draws to values and accepted flags, both (b, draws). As many draws as samples are made
-    first, then, of pairs that need more, half as many, and each further time twice as many. Raises ValueError unless
-    there is at least one sample.
-    """
-    if samples < 1:
-        raise ValueError(f"samples is {samples}; it must be at least 1")
-    total, count = torch.zeros_like(pairs.size0[:, 0]), torch.zeros_like(pairs.key)
-    active = torch.arange(len(count), device=count.device)
-    start, tries = 0, TRIES * samples
-    more = first = -(-samples // BLOCK) * BLOCK
-    while start == 0 or (start < tries and len(active)):
-        draws = min(more, tries - start)
-        for tile in torch.split(active, max(1, TILE // draws)):
-            current = pairs.take(tile)
-            value, accepted = draw(current, Draws.of(seed, current.key, start, draws))
-            taken = accepted & (count[tile, None] + accepted.cumsum(-1) <= samples)
-            value = torch.nn.functional.pad(torch.where(taken, value, 0.0), (0, -draws % BLOCK))
-            blocks = stable_sum(value.reshape(len(tile), value.shape[1] // BLOCK, BLOCK))
-            total = total.index_put((tile,), component_sum(torch.cat([total[tile, None], blocks], 1), 1))
-            count = count.index_add(0, tile, taken.sum(-1))
-        active = active[count[active] < samples]
-        more = 2 * more if start else -(-first // (2 * BLOCK)) * BLOCK
-        start += draws
-    return total, count
-
-
-def from_centre(F: Float[Tensor, "*#batch 3 3"], size1: Float[Tensor, "*#batch 2"], origin: float) -> Tensor:
-    """Matrices whose lines are in coordinates from the centre of image 1, the rectangle (origin, origin + size)."""
-    y, x = (size1 / 2 + origin)[..., None].unbind(-2)
-    return torch.cat([F[..., :2, :], (F[..., 2, :] + F[..., 0, :] * x + F[..., 1, :] * y)[..., None, :]], -2)
-
-
-def lines(
-    F: Float[Tensor, "*batch rows 3"], x: Float[Tensor, "*batch n"], y: Float[Tensor, "*batch n"]
-) -> list[Tensor]:
-    """The components of F (x, y, 1)."""
-    return [torch.addcmul(x * row[..., 0, None] + row[..., 2, None], y, row[..., 1, None]) for row in F.unbind(-2)]
-
-
-class Chord(NamedTuple):
-    """The part of each line inside an image: of the points (x + t b, y - t a) those with t from low to high.
-
-    hits: whether there is one; where there is none the others are finite all the same.
-    """
-
-    x: Tensor
-    y: Tensor
-    a: Tensor
-    b: Tensor
-    low: Tensor
-    high: Tensor
-    hits: Tensor
-
-    @classmethod
-    def of(cls, line: list[Tensor], size: Float[Tensor, "*#batch 2"]) -> Chord:
-        """Those of lines a, b, c of any scale, sign and direction, in coordinates from the centre of the image."""
-        a, b, c = line
-        half_h, half_w = (size / 2)[..., None, :].unbind(-1)
-        squared = torch.addcmul(a * a, b, b)
-        # The sign makes t run from left to right, on a vertical line downwards.
-        scale = torch.copysign(squared.clamp_min(NO_NORMAL).rsqrt(), b - PARALLEL * a)
-        a, b, c = a * scale, b * scale, c * scale
-        x, y = -a * c, -b * c
-        middle_x, reach_x = _interval(-x, b, half_w)
-        middle_y, reach_y = _interval(y, a, half_h)
-        low = torch.maximum(middle_x - reach_x, middle_y - reach_y)
-        high = torch.minimum(middle_x + reach_x, middle_y + reach_y)
-        return cls(x, y, a, b, low, high, (low < high) & (squared > NO_NORMAL))
-
-    def at(self, share: Tensor) -> tuple[Tensor, Tensor]:
-        """x and y at a share of the way from the left end, or the upper one of a vertical line."""
-        t = torch.addcmul(self.low, share, self.high - self.low)
-        return torch.addcmul(self.x, t, self.b), torch.addcmul(self.y, t, self.a, value=-1)
-
-
-def _interval(offset: Tensor, direction: Tensor, half: Tensor) -> tuple[Tensor, Tensor]:
-    """Middle and half-length of the interval where |t direction - offset| <= half."""
-    size = direction.abs().clamp_min(PARALLEL)
-    return offset / torch.copysign(size, direction), half / size
-
-
+PARALLEL = 1e-12  # sine of the angle below which a line does not cross a border: 1e-8 px over 10,000 px
 BORDER = -0.5  # left and top edge of the first pixel
 NORMAL_FLOOR = 1e-12  # length of a normal, for F of unit size, that is as good as none: its line is at infinity
+RELEASED_BORDER, NORMAL_OFFSET = 0.5, 1e-10  # of `nsgd_released`: pixels count from 1; added to the length of a normal
+
+
+class Comparison(NamedTuple):
+    """Two models of each pair, or of one, F_gt, F_est (3, 3), for `nsgd` scaled to a largest element of 1.
+
+    size0, size1: (h, w) of the images, pixels. unit: (2,), pixels by which distances in image 0 and 1 are divided.
+    key: (1,), selects the draws.
+    """
+
+    F_gt: F8x2
+    F_est: F8x2
+    size0: F8x1
+    size1: F8x1
+    unit: F8x1
+    key: I8x1
 
 
 @checked
@@ -215,7 +76,7 @@ def sgd(
     Returns:
         (...).
     """
-    return _mean_distance(torch.ones_like, F_gt, F_est, size0, size1, samples, seed, key, cap)
+    return _mean_distance(False, F_gt, F_est, size0, size1, samples, seed, key, cap)
 
 
 @checked
@@ -258,31 +119,11 @@ def nsgd(
         >>> round(nsgd(rows, 5 * rows, size, size).item(), 6), bool(nsgd(rows, columns, size, size) > 0.05)
         (0.0, True)
     """
-    return _mean_distance(torch.clone, F_gt, F_est, size0, size1, samples, seed, key, cap)
-
-
-def draw_distances(
-    pairs: Pairs, draws: Draws
-) -> tuple[Float[Tensor, "b n"], Float[Tensor, "b n"], Bool[Tensor, "b n"]]:
-    """Of each draw the mean distances in pixels in images 0 and 1 over its two halves, and whether it counts.
-
-    A half is steps 1 and 2: a match (m, m') exact for one matrix, and its distances from the lines of the other.
-    """
-    F = from_centre(torch.stack([pairs.F_gt, pairs.F_est]), pairs.size1, BORDER)
-    h, w = pairs.size0[..., None].unbind(-2)
-    x, y, z = F.unbind(-1)
-    of_shares = torch.stack([x * w, y * h, z + BORDER * (x + y)], -1)  # of shares of the sides of image 0
-    chord = Chord.of(lines(of_shares, draws.x, draws.y), pairs.size1)
-    x1, y1 = chord.at(draws.share)
-    a1, b1, c1 = lines(of_shares.flip(0), draws.x, draws.y)
-    a0, b0 = lines(F.flip(0).mT[..., :2, :], x1, y1)
-    e = torch.addcmul(torch.addcmul(c1, a1, x1), b1, y1).abs()
-    d0, d1 = (e * (torch.addcmul(a * a, b, b) + NORMAL_FLOOR**2).rsqrt() for a, b in ((a0, b0), (a1, b1)))
-    return (d0[0] + d0[1]) / 2, (d1[0] + d1[1]) / 2, chord.hits.all(0)
+    return _mean_distance(True, F_gt, F_est, size0, size1, samples, seed, key, cap)
 
 
 def _mean_distance(
-    unit: Callable[[Tensor], Tensor],
+    normalised: bool,
     F_gt: Tensor,
     F_est: Tensor,
     size0: Tensor,
@@ -292,19 +133,276 @@ def _mean_distance(
     key: Tensor | None,
     cap: bool,
 ) -> Tensor:
-    """Mean over accepted draws; `unit` makes of an image's diagonal the length its distances are divided by."""
-    pairs, shape = Pairs.flatten(F_gt, F_est, size0, size1, key)
-    valid = pairs.F_gt.isfinite().all(-1).all(-1) & pairs.F_est.isfinite().all(-1).all(-1)
-    scaled = [unit_largest(torch.where(valid[:, None, None], F, 0.0)) for F in (pairs.F_gt, pairs.F_est)]
-    pairs = replace(pairs, F_gt=scaled[0], F_est=scaled[1])
-
-    def draw(tile: Pairs, draws: Draws) -> tuple[Tensor, Tensor]:
-        d0, d1, accepted = draw_distances(tile, draws)
-        unit0, unit1 = unit(diagonal(tile.size0)), unit(diagonal(tile.size1))
-        return (d0 / unit0[:, None] + d1 / unit1[:, None]) / 2, accepted
-
-    total, count = sum_of_draws(pairs, draw, samples=samples, seed=seed)
-    diagonal0, diagonal1 = diagonal(pairs.size0), diagonal(pairs.size1)
-    worst = (diagonal0 / unit(diagonal0) + diagonal1 / unit(diagonal1)) / 2
+    """Mean over accepted draws of the distances in pixels, or `normalised`, in diagonals of the images."""
+    pairs, shape = _flattened(F_gt, F_est, size0, size1, samples, key)
+    F = torch.stack(pairs[:2], 1)
+    valid = F.detach().isfinite().flatten(1).all(1)
+    F = unit_largest(torch.where(valid[:, None, None, None], F, 0.0))
+    diagonals = torch.stack([diagonal(size) for size in pairs[2:4]], 1)
+    units = diagonals if normalised else torch.ones_like(diagonals)
+    tensors = (*F.unbind(1), *pairs[2:4], units, pairs[4])
+    constants = mixed_seed(seed, Stream.METRIC), samples
+    out = torch.empty(len(F), 2, dtype=torch.float64)
+    sums = for_each_pair(sum_of_draws, tensors, *constants, False, out=out, kind=torch.float64, group=Comparison)
+    total, count = sums.unbind(1)
+    if F.requires_grad:
+        out = torch.empty(F.shape, dtype=torch.float64)
+        slope = for_each_pair(gradient_of_draws, tensors, *constants, out=out, kind=torch.float64, group=Comparison)
+        total = total + (slope * (F - F.detach())).sum((1, 2, 3))  # adds zeros
+    worst = (diagonals / units).sum(1) / 2
     value = torch.where(count > 0, total / count.clamp(min=1), worst)
     return (torch.minimum(value, worst) if cap else value).reshape(shape).to(F_est.dtype)
+
+
+@checked
+@torch.no_grad()
+def nsgd_released(
+    F_gt: Float[Tensor, "*#batch 3 3"],
+    F_est: Float[Tensor, "*#batch 3 3"],
+    size0: Real[Tensor, "*#batch 2"],
+    size1: Real[Tensor, "*#batch 2"],
+    *,
+    samples: int = 1000,
+    seed: int = 0,
+    key: Int[Tensor, "*#batch"] | None = None,
+) -> Float[Tensor, "*#batch"]:
+    """NSGD exactly as the released FM-Bench evaluator computes it, faults included; arguments as `nsgd`.
+
+    What differs from `nsgd` (github.com/JiawangBian/FM-Bench, ComputeNormlizedSGD.m):
+
+    - the sum over accepted draws is divided by `samples`, however few were accepted among ten times as many tries: an
+      estimate whose lines never meet the image gets 0, perfect;
+    - the second half exchanges the image sizes together with the matrices, without transposing them;
+    - the point on a line is y = -(a x + c) / b: one exactly vertical line among the draws makes the figure 1;
+    - virtual points are rounded to whole pixels 0 .. w, 0 .. h, and image borders lie at 0.5 and size + 0.5;
+    - 1e-10 is added to the length of a line's normal, so the figure depends on the scale of very small matrices.
+
+    The matrices are used as they are given, in pixels from 0 or from 1. A failed estimate, zero or not finite, gets 1:
+    the evaluator never measures those and counts them as misses. Not differentiable; `nsgd` is.
+    """
+    pairs, shape = _flattened(F_gt, F_est, size0, size1, samples, key)
+    F_gt, F_est, size0, size1, key = pairs
+    tensors = (F_gt, F_est, size0, size1, torch.stack([diagonal(size) for size in (size0, size1)], 1), key)
+    constants = mixed_seed(seed, Stream.METRIC), samples, True
+    out = torch.empty(len(F_est), 2, dtype=torch.float64)
+    sums = for_each_pair(sum_of_draws, tensors, *constants, out=out, kind=torch.float64, group=Comparison)
+    value = (sums[:, 0] / samples).clamp(max=1.0)
+    failed = ~F_est.isfinite().flatten(1).all(1) | (F_est == 0).flatten(1).all(1)
+    return torch.where(failed | value.isnan(), 1.0, value).reshape(shape).to(F_est.dtype)
+
+
+def _flattened(
+    F_gt: Tensor, F_est: Tensor, size0: Tensor, size1: Tensor, samples: int, key: Tensor | None
+) -> tuple[tuple[Tensor, Tensor, Tensor, Tensor, Tensor], torch.Size]:
+    """Matrices, sizes (b, 2) and keys (b, 1) with the leading dimensions flattened to one, in float64; their shape.
+
+    Without keys every key is 0. Raises ValueError for wrong sizes, and for less than one sample.
+    """
+    expect_sizes(size0=size0, size1=size1)
+    if samples < 1:
+        raise ValueError(f"samples is {samples}; it must be at least 1")
+    key = torch.zeros((), dtype=torch.int64, device=F_est.device) if key is None else key
+    shapes = (F_gt.shape[:-2], F_est.shape[:-2], size0.shape[:-1], size1.shape[:-1], key.shape)
+    shape = torch.Size(torch.broadcast_shapes(*shapes))  # type: ignore[no-untyped-call]
+
+    def flat(value: Tensor, *tail: int) -> Tensor:
+        return value.to(torch.float64).expand(*shape, *tail).reshape(-1, *tail)
+
+    pairs = flat(F_gt, 3, 3), flat(F_est, 3, 3), flat(size0, 2), flat(size1, 2), key.expand(shape).reshape(-1, 1)
+    return pairs, shape
+
+
+def diagonal(size: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch"]:
+    """Length of the image diagonal, in pixels."""
+    h, w = size.unbind(-1)
+    return sqrt(h * h + w * w)
+
+
+# The draws of one pair, compiled
+
+
+@kernel
+def sum_of_draws(pair: Comparison, mixed_seed: int, samples: int, released: bool, out: F8x1) -> None:
+    """The sum of the first accepted draws of a pair, and their number -> out (2,).
+
+    mixed_seed: of the seed and the stream. samples: draws to accept, of 10 x `samples` tries. released: they are those
+    of `nsgd_released`.
+    """
+    state, u, values = stream_state(mixed_seed, pair.key[0]), vector(COLUMNS), vector(BLOCK)
+    total, count = 0.0, 0
+    for start in range(0, TRIES * samples, BLOCK):
+        draws = min(BLOCK, TRIES * samples - start)
+        for draw in range(draws):
+            _uniform_numbers(state, start + draw, u)
+            value, hits = released_draw(pair, u) if released else plain_draw(pair, u)
+            taken = hits and count < samples
+            values[draw] = value if taken else 0.0
+            count += taken
+        total += _tree_sum(values, draws)
+        if count >= samples:
+            break
+    out[0], out[1] = total, count
+
+
+@kernel
+def gradient_of_draws(pair: Comparison, mixed_seed: int, samples: int, out: F8x3) -> None:
+    """The gradient of the sum of `sum_of_draws` with respect to F_gt and F_est -> out (2, 3, 3); not `released`."""
+    state, u, count = stream_state(mixed_seed, pair.key[0]), vector(COLUMNS), 0
+    out[:] = 0
+    for draw in range(TRIES * samples):
+        _uniform_numbers(state, draw, u)
+        if plain_draw(pair, u)[1]:
+            _add_gradient(pair.F_gt, pair.F_est, pair, u[:3], out[0], out[1])
+            _add_gradient(pair.F_est, pair.F_gt, pair, u[3:], out[1], out[0])
+            count += 1
+        if count == samples:
+            break
+
+
+@inner
+def _uniform_numbers(state: Any, draw: int, u: Array) -> None:
+    """The random numbers of a draw."""
+    for column in range(len(u)):
+        u[column] = uniform_kernel(state, draw * len(u) + column)
+
+
+@inner
+def plain_draw(pair: Comparison, u: Array) -> tuple[float, bool]:
+    """The value of a draw, and whether it counts."""
+    unit = pair.unit
+    a0, a1, hits_a = _half_draw(pair.F_gt, pair.F_est, pair.size0, pair.size1, u[:3])
+    b0, b1, hits_b = _half_draw(pair.F_est, pair.F_gt, pair.size0, pair.size1, u[3:])
+    return ((a0 + b0) / 2 / unit[0] + (a1 + b1) / 2 / unit[1]) / 2, hits_a and hits_b
+
+
+@inner
+def _half_draw(F: Array, other: Array, size0: Array, size1: Array, u: Array) -> tuple[float, float, bool]:
+    """Steps 1 and 2: d0 and d1 of a match exact for F from the lines of the other matrix, and whether it counts."""
+    x0, y0 = u[0] * size0[1] + BORDER, u[1] * size0[0] + BORDER
+    a, b, c = line_of(F, x0, y0)
+    left, top, right, bottom, hits = segment_in_image(a, b, c, size1, BORDER)
+    x1, y1 = left + u[2] * (right - left), top + u[2] * (bottom - top)
+    e, a0, b0, a1, b1 = _residual(other, x0, y0, x1, y1)
+    floor = NORMAL_FLOOR * NORMAL_FLOOR
+    return abs(e) / math.sqrt(a0 * a0 + b0 * b0 + floor), abs(e) / math.sqrt(a1 * a1 + b1 * b1 + floor), hits
+
+
+@inner
+def _residual(F: Array, x0: float, y0: float, x1: float, y1: float) -> tuple[float, float, float, float, float]:
+    """``x1^T F x0``, and the normals of the lines in images 0 and 1."""
+    a0, b0, _ = line_of(F.T, x1, y1)
+    a1, b1, c1 = line_of(F, x0, y0)
+    return a1 * x1 + b1 * y1 + c1, a0, b0, a1, b1
+
+
+@inner
+def _add_gradient(F: Array, other: Array, pair: Comparison, u: Array, of_F: Array, of_other: Array) -> None:
+    """Adds to two gradients that of a half's part of the value, ``(d0 / unit0 + d1 / unit1) / 4``."""
+    size0, size1 = pair.size0, pair.size1
+    x0, y0 = u[0] * size0[1] + BORDER, u[1] * size0[0] + BORDER
+    a, b, c = line_of(F, x0, y0)
+    left, top, right, bottom, _ = segment_in_image(a, b, c, size1, BORDER)
+    x1, y1 = left + u[2] * (right - left), top + u[2] * (bottom - top)
+    e, a0, b0, a1, b1 = _residual(other, x0, y0, x1, y1)
+    floor = NORMAL_FLOOR * NORMAL_FLOOR
+    squared0, squared1 = a0 * a0 + b0 * b0 + floor, a1 * a1 + b1 * b1 + floor
+    weight0, weight1 = 0.25 / (math.sqrt(squared0) * pair.unit[0]), 0.25 / (math.sqrt(squared1) * pair.unit[1])
+    of_e = math.copysign(weight0 + weight1, e)
+    of_normal0, of_normal1 = -abs(e) * weight0 / squared0, -abs(e) * weight1 / squared1
+    m0, m1 = (x0, y0, 1.0), (x1, y1, 1.0)
+    for i in range(3):
+        for j in range(3):
+            of_other[i, j] += of_e * m1[i] * m0[j]
+        of_other[i, 0] += of_normal0 * a0 * m1[i]
+        of_other[i, 1] += of_normal0 * b0 * m1[i]
+        of_other[0, i] += of_normal1 * a1 * m0[i]
+        of_other[1, i] += of_normal1 * b1 * m0[i]
+    of_x = of_e * a1 + of_normal0 * (a0 * other[0, 0] + b0 * other[0, 1])
+    of_y = of_e * b1 + of_normal0 * (a0 * other[1, 0] + b0 * other[1, 1])
+    for x, y, share in ((left, top, 1 - u[2]), (right, bottom, u[2])):
+        # With the line an end moves along its border: one on the left or right border up and down, another sideways.
+        to_side = abs(abs(x - size1[1] / 2 - BORDER) - size1[1] / 2)
+        to_top = abs(abs(y - size1[0] / 2 - BORDER) - size1[0] / 2)
+        step = share * (of_y / b if to_side < to_top else of_x / a)
+        for j in range(3):
+            of_F[0, j] -= step * x * m0[j]
+            of_F[1, j] -= step * y * m0[j]
+            of_F[2, j] -= step * m0[j]
+
+
+@inner
+def released_draw(pair: Comparison, u: Array) -> tuple[float, bool]:
+    """`plain_draw` as the released evaluator has it: NaN or infinite on vertical lines."""
+    unit = pair.unit
+    a0, a1, hits_a = _released_half(pair.F_gt, pair.F_est, pair.size0, pair.size1, u[:3])
+    b1, b0, hits_b = _released_half(pair.F_est, pair.F_gt, pair.size1, pair.size0, u[3:])
+    return ((a0 / unit[0] + a1 / unit[1]) / 2 + (b1 / unit[1] + b0 / unit[0]) / 2) / 2, hits_a and hits_b
+
+
+@inner
+def _released_half(F: Array, other: Array, size0: Array, size1: Array, u: Array) -> tuple[float, float, bool]:
+    """`_half_draw` as the released evaluator has it."""
+    x0, y0 = float(round(u[0] * size0[1])), float(round(u[1] * size0[0]))
+    a, b, c = line_of(F, x0, y0)
+    left, _, right, _, hits = segment_in_image(a, b, c, size1, RELEASED_BORDER)
+    x1 = left + u[2] * (right - left)
+    y1 = -(a * x1 + c) / b
+    a1, b1, c1 = line_of(other, x0, y0)
+    a0, b0, c0 = line_of(other.T, x1, y1)
+    d0 = abs(a0 * x0 + b0 * y0 + c0) / (math.sqrt(a0 * a0 + b0 * b0) + NORMAL_OFFSET)
+    return d0, abs(a1 * x1 + b1 * y1 + c1) / (math.sqrt(a1 * a1 + b1 * b1) + NORMAL_OFFSET), hits
+
+
+@inner
+def line_of(F: Array, x: float, y: float) -> tuple[float, float, float]:
+    """F (x, y, 1)."""
+    a, b = F[0, 0] * x + F[0, 1] * y + F[0, 2], F[1, 0] * x + F[1, 1] * y + F[1, 2]
+    return a, b, F[2, 0] * x + F[2, 1] * y + F[2, 2]
+
+
+@inner
+def segment_in_image(
+    a: float, b: float, c: float, size: Array, border: float
+) -> tuple[float, float, float, float, bool]:
+    """x and y of the ends of the part of a line inside the rectangle (border, border + size); whether there is one.
+
+    The line may have any scale, sign and direction. The first end is the left one, or the upper one of a vertical line.
+    """
+    half_h, half_w = size[0] / 2, size[1] / 2
+    centre_x, centre_y = half_w + border, half_h + border
+    squared = a * a + b * b
+    scale = 1 / math.sqrt(squared) if squared != 0 else 0.0
+    if a > 0 if abs(b * scale) < PARALLEL else b < 0:
+        scale = -scale  # t runs from left to right
+    a, b = a * scale, b * scale
+    c = c * scale + a * centre_x + b * centre_y
+    # Seen from the centre the line is (-a c, -b c) + t (b, -a); each pair of borders cuts an interval of t out of it.
+    middle_x, reach_x, misses_x = _interval(a * c, b, half_w)
+    middle_y, reach_y, misses_y = _interval(-b * c, a, half_h)
+    low, high = max(middle_x - reach_x, middle_y - reach_y), min(middle_x + reach_x, middle_y + reach_y)
+    hits = low < high and not misses_x and not misses_y and scale != 0
+    if not hits:
+        low, high = 0.0, 0.0
+    x, y = centre_x - a * c, centre_y - b * c
+    return x + low * b, y - low * a, x + high * b, y - high * a, hits
+
+
+@inner
+def _interval(offset: float, direction: float, half: float) -> tuple[float, float, bool]:
+    """Middle and half-length of the interval where |t direction - offset| <= half, and whether it is empty."""
+    if abs(direction) < PARALLEL:
+        return 0.0, math.inf, abs(offset) > half
+    return offset / direction, half / abs(direction), False
+
+
+@inner
+def _tree_sum(values: Array, n: int) -> Any:
+    """The sum of the first n values by halves, in place: the order depends on n alone."""
+    while n > 1:
+        half = n // 2
+        for i in range(half):
+            values[i] += values[half + i]
+        if n % 2:
+            values[half] = values[n - 1]
+        n = half + n % 2
+    return values[0]

@@ -1,7 +1,5 @@
 """Errors of a relative pose in degrees."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -161,7 +159,6 @@ def _sum_of_squares(u: Tensor) -> Tensor:
 
 
 # Recall of pose errors: the exact area under its curve, and the means over bins that stand for it in older papers
-
 
 THRESHOLDS = (5, 10, 20)  # degrees, as SuperGlue (Sarlin et al., CVPR 2020)
 MAA_MAXIMUM = 10  # degrees, as the Image Matching Challenge

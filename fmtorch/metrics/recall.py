@@ -1,7 +1,5 @@
 """Recall over a set of pairs at a limit on their NSGD, its curve, and its mean up to a limit."""
 
-from __future__ import annotations
-
 import torch
 from jaxtyping import Float
 from torch import Tensor

@@ -3,8 +3,6 @@
 Needs the extra `metrics`: ``pip install 'fmtorch[metrics]'``.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """What a pipeline made of pairs, kept for export: keypoints of images, matches, F and inliers of pairs."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 
@@ -15,10 +13,12 @@ from fmtorch.data.pairs import ImagePair, ImageSource
 from fmtorch.geometry.cameras import cross_matrix
 from fmtorch.geometry.pose import pose_from_fundamental
 from fmtorch.io.match_store import MatchRecords, PairGeometry, StoredImage, StoredPair, indices
-from fmtorch.pipeline.photograph_cameras import PhotographCamera
+from fmtorch.pipeline.match_result import MatchResult
+from fmtorch.pipeline.pair_geometries import pair_geometries
+from fmtorch.pipeline.photographs import PhotographCamera
 from fmtorch.pipeline.pipeline import Outcome, Pipeline
-from fmtorch.pipeline.two_images import Described, MatchResult, pair_geometries
-from fmtorch.two_view.pair_type import Configuration
+from fmtorch.pipeline.two_images import Described
+from fmtorch.two_view.pair_type import PairTypes
 
 EXACT = (1.0, 0.0)  # px, relative deviation; K stands for the pixels
 
@@ -39,20 +39,18 @@ def match_records(pipeline: Pipeline, outcomes: Sequence[Outcome]) -> MatchRecor
         matched = c if outcome.keypoints is None else outcome.keypoints
         names = str(ends[0]), str(ends[1])
         kept = _pair(names, points, matched, F, estimate.inliers[0], bool(estimate.related[0]))
-        if outcome.configuration is not None:
-            kept = dataclasses.replace(kept, geometry=_geometry(kept.matches, c, estimate, outcome.configuration))
+        if outcome.pair_type is not None:
+            kept = dataclasses.replace(kept, geometry=_geometry(kept.matches, c, estimate, outcome.pair_type))
         records.pairs[ends] = kept
     return records
 
 
-def _geometry(
-    matches: NDArray[np.int32], c: Correspondences, estimate: Estimate, configuration: Configuration
-) -> PairGeometry:
+def _geometry(matches: NDArray[np.int32], c: Correspondences, estimate: Estimate, pair_type: PairTypes) -> PairGeometry:
     """The geometry of one pair for COLMAP, whose surviving matches are these keypoints, (m, 2).
 
     Where the estimator was given nothing of cameras that are known, and F is determined, the pose is that of F.
     """
-    if not c.asks_for_cameras and c.K0 is not None and c.K1 is not None and bool(configuration.determined[0]):
+    if not c.asks_for_cameras and c.K0 is not None and c.K1 is not None and bool(pair_type.determined[0]):
         ends = estimate.F.double(), c.K0.double(), c.K1.double(), c.x0.double(), c.x1.double()
         pose = pose_from_fundamental(*ends, estimate.inliers & c.mask)
         E = cross_matrix(pose.t) @ pose.R
@@ -60,7 +58,7 @@ def _geometry(
         c = c.derived(focal=torch.tensor([[EXACT, EXACT]], dtype=torch.float64, device=c.mask.device))
     index = np.zeros((c.mask.shape[1], 2), np.int32)
     index[c.mask[0].cpu().numpy()] = matches
-    (geometry,) = pair_geometries([index], c, estimate, configuration)
+    (geometry,) = pair_geometries([index], c, estimate, pair_type)
     return geometry
 
 
@@ -88,9 +86,7 @@ def exported_match(names: tuple[str, str], described: tuple[Described, Described
     pair = _pair(names, points, keypoints, result.F, result.inliers, result.related)
     if (geometry := result.geometry) is not None:
         geometry = geometry._replace(inliers=pair.matches[geometry.inliers[:, 0]])
-    return dataclasses.replace(
-        pair, geometry=geometry, significance=result.significance, configuration=result.configuration
-    )
+    return dataclasses.replace(pair, geometry=geometry, significance=result.significance, pair_type=result.pair_type)
 
 
 def _points(described: Described) -> NDArray[np.float32]:
@@ -110,7 +106,7 @@ def _pair(
 ) -> StoredPair:  # fmt: skip
     """The surviving matches of one pair, as the matcher left them, as indices of the images' points.
 
-    Scores are one less the matcher's figure, a ratio, and 1 where there is none. Raises ValueError for matches that are
+    Scores are the matcher's, or 1 - ratio, and 1 where there is neither. Raises ValueError for matches that are
     at no keypoint.
     """
     mask = c.mask[0].cpu()
@@ -118,8 +114,8 @@ def _pair(
         indices(keypoints, x[0].detach().cpu().float()[mask].numpy())
         for keypoints, x in zip(points, (c.x0, c.x1), strict=True)
     ]
-    quality = torch.zeros(len(mask)) if c.quality is None else c.quality[0].detach().cpu().float()
-    scores = (1 - quality[mask]).nan_to_num(0.0).clamp(0.0, 1.0)
+    ambiguity = torch.zeros(len(mask)) if c.ambiguity is None else c.ambiguity[0].detach().cpu().float()
+    scores = (1 - ambiguity[mask]).nan_to_num(0.0).clamp(0.0, 1.0)
     return StoredPair(
         *names, np.stack(index, -1).astype(np.int32), scores.numpy(), inliers.cpu()[mask].numpy(),
         F.detach().cpu().double().numpy(), related,

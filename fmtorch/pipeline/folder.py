@@ -1,7 +1,5 @@
 """A folder of images: its pairs, the work on them by any workers, which can be resumed, and where results go."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import hashlib
@@ -19,16 +17,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from fmtorch.core.settings import claim
-from fmtorch.data.images import read_image
-from fmtorch.data.pairs import ImageSource
-from fmtorch.data.text_files import DataError
+from fmtorch.data import DataError, ImageSource, read_image
 from fmtorch.io.match_store import MatchStore, StoredPair
-from fmtorch.jobs.execution import Execution
-from fmtorch.jobs.pool import SHARED_BY, WorkerPool
-from fmtorch.jobs.runner import Factory, Local, Source, TaskRunner, in_order
-from fmtorch.jobs.threads import available, one_thread
+from fmtorch.jobs.execution import Execution, available, one_thread
+from fmtorch.jobs.runner import SHARED_BY, Factory, Local, Source, TaskRunner, WorkerPool, in_order
 from fmtorch.pipeline.exporting import exported_image, exported_match
-from fmtorch.pipeline.photograph_cameras import PhotographCameras
+from fmtorch.pipeline.photographs import PhotographCameras
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.pipeline.two_images import Described, describe, relate
 
@@ -185,7 +179,7 @@ def similar_pairs(images: Sequence[Path], vectors: Float[Tensor, "n d"], count: 
 MEMORY = 64  # images whose features are kept for pairs to come
 AHEAD = 4  # pairs a worker whose images are described before the first of them is matched
 MAX_WORKERS = 8  # by default: each holds an image and its scale space
-PRELOADED = ("fmtorch.pipeline.folder",)  # by the process that workers are forked of
+PRELOADED = (__name__,)  # by the process that workers are forked of
 
 
 class Photograph(NamedTuple):
@@ -337,7 +331,6 @@ class FolderMatches:
         return Photograph(image, source, self.longest_side, self.orient)
 
     def _described_pair(self, pair: Pair) -> DescribedPair | None:
-        """A pair to match; None where it cannot be."""
         end0, end1 = (self._described[image] for image in pair)
         if end0 is None or end1 is None:
             self._failed += 1
@@ -351,7 +344,6 @@ class FolderMatches:
         return DescribedPair(pair, (end0, end1), names, self.seed, known)
 
     def _keep(self, task: Photograph | DescribedPair, result: Any) -> None:
-        """Store an image or a pair, or tell what went wrong with it."""
         if isinstance(task, Photograph):
             self._described[task.path] = self._keep_image(task.path, result)
             return

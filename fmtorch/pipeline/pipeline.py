@@ -1,6 +1,4 @@
-"""Results kept for those who ask for the same again."""
-
-from __future__ import annotations
+"""The four stages in a row: features, matching, pruning, estimation; batching, timing, failures as data."""
 
 import dataclasses
 import functools
@@ -9,31 +7,40 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from concurrent.futures import Future
+from pathlib import Path
 from typing import Generic, TypeVar
 
 import numpy as np
 import torch
+from hydra.errors import HydraException
 from numpy.typing import NDArray
+from omegaconf import DictConfig
 
-from fmtorch.core.grey_pyramid import GreyPyramid, grey_pyramid
+from fmtorch.core.failures import own_traceback, place_of
 from fmtorch.core.stages import (
     Estimator,
     FeatureExtractor,
+    GreyPyramid,
     ImageMatcher,
     ImagePruner,
     Matcher,
     PairImages,
     Pruner,
     TimedExtractor,
+    grey_pyramid,
     model_of,
+    output_of,
     pruned,
 )
 from fmtorch.core.types import Correspondences, Estimate, Features, collate
-from fmtorch.data.images import read_image, to_grey
-from fmtorch.data.pairs import GivenMatches, ImagePair, ImageSource
+from fmtorch.data import GivenMatches, ImagePair, ImageSource, read_image, to_grey
 from fmtorch.geometry.significance import judged
-from fmtorch.jobs.threads import one_thread
-from fmtorch.two_view.pair_type import Configuration, classify
+from fmtorch.jobs.execution import one_thread
+from fmtorch.presets.composition import PIPELINES, build_pruners, compose, plain
+from fmtorch.presets.files import available, unknown
+from fmtorch.presets.objects import instantiate, open_files
+from fmtorch.runs.feature_cache import cached
+from fmtorch.two_view.pair_type import PairTypes, classify
 
 Key = TypeVar("Key")
 Value = TypeVar("Value")
@@ -99,7 +106,7 @@ class Outcome:
     correspondences, estimate: batches of one; None where the pair failed before that stage.
     features: how many each image has. seconds: per stage; a batched stage is shared out evenly, and features count in
     full for each pair that uses them, cached ones with the seconds they took when they were computed.
-    reason: why the pair failed, empty where it did not. configuration, not_examined: of this pair alone, or why there
+    reason: why the pair failed, empty where it did not. pair_type, not_examined: of this pair alone, or why there
     is none, where it was asked for (`fmtorch.pipeline.pipeline`). images: for pruners that look at them. keypoints:
     the correspondences as the matcher left them, where pruners that look at images may have moved their points.
     """
@@ -110,14 +117,13 @@ class Outcome:
     estimate: Estimate | None = None
     seconds: dict[str, float] = dataclasses.field(default_factory=dict)
     reason: str = ""
-    configuration: Configuration | None = None
+    pair_type: PairTypes | None = None
     not_examined: str = ""
     images: PairImages | None = None
     keypoints: Correspondences | None = None
 
     @property
     def solved(self) -> bool:
-        """Whether there is an F."""
         return self.estimate is not None and bool(self.estimate.ok[0])
 
 
@@ -140,14 +146,16 @@ def collated(outcomes: Sequence[Outcome]) -> Correspondences:
 
 
 def described(stage: str, error: Exception) -> str:
-    """What a stage raised, as a reason of one line."""
-    return f"{stage}: {type(error).__name__}: {error}".splitlines()[0]
+    """What a stage raised, as a reason of one line, with the line of a user's own code that did."""
+    place = place_of(error)
+    return f"{stage}: {type(error).__name__}: {error}".splitlines()[0] + (f" ({place})" if place else "")
 
 
 # The four stages in a row: features, matching, pruning, estimation; batching, timing, failures as data
 
 
 STAGES = ("features", "matching", "pruning", "estimation")
+MAX_TRACEBACKS = 3  # of different failures of a user's own code that are kept
 
 
 class Pipeline:
@@ -157,20 +165,16 @@ class Pipeline:
     grey levels where a pruner looks at them.
     families: by family, pruners that its pairs get in place of those of the same names.
     model: what the estimator must give, "fundamental" or "homography" (`Estimate.model`); None: either.
+    debug: raise what a stage raises, which otherwise becomes the reason for its pair's failure.
+    tracebacks: of stages that are a user's own code and raised something, by what is said of it.
     """
 
     def __init__(
-        self,
-        features: FeatureExtractor,
-        matcher: Matcher,
-        pruners: Mapping[str, Pruner],
-        estimator: Estimator,
-        *,
-        device: torch.device | str = "cpu",
-        memory: int = 64,
-        families: Mapping[str, Mapping[str, Pruner]] | None = None,
-        model: str | None = "fundamental",
-    ) -> None:
+        self, features: FeatureExtractor, matcher: Matcher, pruners: Mapping[str, Pruner], estimator: Estimator, *,
+        device: torch.device | str = "cpu", memory: int = 64,
+        families: Mapping[str, Mapping[str, Pruner]] | None = None, model: str | None = "fundamental",
+        debug: bool = False,
+    ) -> None:  # fmt: skip
         if model is not None and (gives := model_of(estimator)) != model:
             hint = ": estimator=homography" if model == "homography" else ""
             raise ValueError(f"the estimator gives {gives} matrices; a pipeline needs {model} matrices here{hint}")
@@ -178,6 +182,7 @@ class Pipeline:
         self.families = dict(families or {})
         self.memory = memory
         self.device = torch.device(device)
+        self.debug, self.tracebacks = debug, dict[str, str]()
         self._memo: Memo[Hashable, tuple[Features, float]] = Memo(memory)
         self._pyramids: Memo[Hashable, GreyPyramid] = Memo(memory)
         every = [self.pruners, *self.families.values()]
@@ -207,7 +212,7 @@ class Pipeline:
             features, seconds = self.extractor.timed(image)
             return features.to(self.device), seconds
         start = time.perf_counter()
-        features = self.extractor(image).to(self.device)
+        features = output_of(self.extractor, self.extractor(image), Features).to(self.device)
         synchronise(self.device)
         return features, time.perf_counter() - start
 
@@ -216,11 +221,19 @@ class Pipeline:
         return self._batched("pruning", self._prune, [self._match(pair) for pair in pairs])
 
     def estimate(self, outcomes: Sequence[Outcome], seed: int = 0) -> list[Outcome]:
-        """The last stage, for outcomes of `correspondences`."""
         return self._batched("estimation", functools.partial(self._estimate, seed=seed), outcomes)
 
+    def matched(self, features0: Features, features1: Features) -> Correspondences:
+        """The matcher's matches of two images."""
+        c = self.matcher(features0, features1)
+        return output_of(self.matcher, c, Correspondences, like=features0.lafs)
+
+    def estimated(self, c: Correspondences, seed: int = 0, estimator: Estimator | None = None) -> Estimate:
+        """The estimate of a batch with its significance; estimator: another one than the pipeline's."""
+        used = estimator or self.estimator
+        return judged(expect_finite(output_of(used, used(c, seed), Estimate, c).detach()), c)
+
     def run(self, pairs: Sequence[ImagePair], seed: int = 0) -> list[Outcome]:
-        """Take a batch of pairs through all four stages."""
         return self.estimate(self.correspondences(pairs), seed)
 
     def _batched(
@@ -232,8 +245,14 @@ class Pipeline:
         with one_thread(self.device):
             try:
                 results = function([outcomes[i] for i in matched]) if matched else []
-            except Exception:  # whose fault it is shows pair by pair
-                results = [_alone(stage, function, outcomes[i]) for i in matched]
+            except Exception as error:  # whose fault it is shows pair by pair
+                if self.debug:
+                    raise
+                results = [self._alone(stage, function, outcomes[i]) for i in matched]
+                if all(result.correspondences is not None for result in results):
+                    reason = described(stage, error)
+                    said = f"of a batch of {len(matched)} pairs, though of each alone it does not: {reason}"
+                    self.tracebacks.setdefault(said, own_traceback(error))
         synchronise(self.device)
         share = (time.perf_counter() - start) / max(len(matched), 1)
         result = list(outcomes)
@@ -251,7 +270,7 @@ class Pipeline:
         try:
             (features0, seconds0), (features1, seconds1) = self.features(pair.image0), self.features(pair.image1)
         except Exception as error:  # a pair that fails becomes a row with this reason
-            return Outcome(pair, reason=described("features", error))
+            return Outcome(pair, reason=self._failure("features", error))
         seconds = {"features": seconds0 + seconds1}
         counts = (len(features0), len(features1))
         if min(counts) == 0:
@@ -259,9 +278,9 @@ class Pipeline:
             return Outcome(pair, counts, seconds=seconds, reason=f"no keypoints in {which}")
         start = time.perf_counter()
         try:
-            c = self.matcher(features0, features1)
+            c = self.matched(features0, features1)
         except Exception as error:
-            return Outcome(pair, counts, seconds=seconds, reason=described("matching", error))
+            return Outcome(pair, counts, seconds=seconds, reason=self._failure("matching", error))
         seconds["matching"] = time.perf_counter() - start
         images = self.images(pair) if self.looks_at_images else None
         return Outcome(pair, counts, self._with_calibrations(pair, c), None, seconds, images=images)
@@ -271,27 +290,25 @@ class Pipeline:
         try:
             images = read_image(pair.image0), read_image(pair.image1)
         except Exception as error:
-            return Outcome(pair, reason=described("images", error))
+            return Outcome(pair, reason=self._failure("images", error))
         start = time.perf_counter()
         try:
-            c = matcher.match_images(*images).to(self.device)
+            c = output_of(matcher, matcher.match_images(*images), Correspondences).to(self.device)
         except Exception as error:
-            return Outcome(pair, reason=described("matching", error))
+            return Outcome(pair, reason=self._failure("matching", error))
         seconds = {"matching": time.perf_counter() - start}
         count = int(c.count())
         pyramids = self.images(pair) if self.looks_at_images else None
         return Outcome(pair, (count, count), self._with_calibrations(pair, c), None, seconds, images=pyramids)
 
     def _given(self, pair: ImagePair, matches: Callable[[], GivenMatches]) -> Outcome:
-        """The matches that come with a pair, in place of the first two stages."""
         try:
             c, counts = matches()
         except Exception as error:  # a pair that cannot be read becomes a row with this reason
-            return Outcome(pair, reason=described("matches", error))
+            return Outcome(pair, reason=self._failure("matches", error))
         return Outcome(pair, counts, self._with_calibrations(pair, c.to(self.device)))
 
     def _with_calibrations(self, pair: ImagePair, c: Correspondences) -> Correspondences:
-        """The matches with the pair's key and calibrations."""
         K0, K1 = (
             None if K is None else torch.from_numpy(K).to(self.device, torch.float64)[None] for K in (pair.K0, pair.K1)
         )
@@ -309,7 +326,7 @@ class Pipeline:
             if own:
                 family_outcomes = [outcomes[i] for i in own]
                 c = collated(family_outcomes)
-                keypoints = Correspondences(c.x0, c.x1, c.mask, quality=c.quality)
+                keypoints = Correspondences(c.x0, c.x1, c.mask, ratio=c.ratio, score=c.score)
 
                 def images(i: int, family_outcomes: list[Outcome] = family_outcomes) -> PairImages:
                     return family_outcomes[i].images or self.images(family_outcomes[i].pair)
@@ -326,22 +343,31 @@ class Pipeline:
 
     def _estimate(self, outcomes: list[Outcome], seed: int) -> list[Outcome]:
         c = collated(outcomes)
-        estimate = judged(expect_finite(self.estimator(c, seed).detach()), c)
+        estimate = self.estimated(c, seed)
         return [
             dataclasses.replace(outcome, estimate=estimate[i], reason=estimate.reason[i])
             for i, outcome in enumerate(outcomes)
         ]
 
+    def _alone(self, stage: str, function: Callable[[list[Outcome]], list[Outcome]], outcome: Outcome) -> Outcome:
+        """A stage on a single pair; what it raises becomes the reason for that pair's failure."""
+        try:
+            return function([outcome])[0]
+        except Exception as error:
+            reason = self._failure(stage, error)
+            return dataclasses.replace(outcome, correspondences=None, images=None, reason=reason)
 
-def _alone(stage: str, function: Callable[[list[Outcome]], list[Outcome]], outcome: Outcome) -> Outcome:
-    """A stage on a single pair; what it raises becomes the reason for that pair's failure."""
-    try:
-        return function([outcome])[0]
-    except Exception as error:
-        return dataclasses.replace(outcome, correspondences=None, images=None, reason=described(stage, error))
+    def _failure(self, stage: str, error: Exception) -> str:
+        """What a stage raised, as a reason, its traceback kept if it is of a user's own code; raised for `debug`."""
+        if self.debug:
+            raise error
+        reason = described(stage, error)
+        if len(self.tracebacks) < MAX_TRACEBACKS and (text := own_traceback(error)):
+            self.tracebacks.setdefault(reason, text)
+        return reason
 
 
-# Which configurations the pairs of a run are in, by the matches and what the estimator was given of the cameras
+# Which pair types the pairs of a run are in, by the matches and what the estimator was given of the cameras
 
 
 Knowledge = Callable[[Correspondences], Correspondences]
@@ -350,7 +376,7 @@ Knowledge = Callable[[Correspondences], Correspondences]
 def examined(
     pipeline: Pipeline, outcomes: Sequence[Outcome], seed: int = 0, knowledge: Knowledge | None = None
 ) -> list[Outcome]:
-    """The outcomes of a run with their configurations; a pair that cannot be examined has none and harms no other.
+    """The outcomes of a run with their pair types; a pair that cannot be examined has none and harms no other.
 
     knowledge: gives correspondences what the estimator was given of their cameras; None: nothing, and their K counts
     for nothing here. Matches of the results have what it gives. Of homographies nothing is asked.
@@ -373,12 +399,12 @@ def _examined(outcomes: Sequence[Outcome], seed: int, knowledge: Knowledge | Non
     c = collate([o.correspondences for o in outcomes if o.correspondences is not None])
     estimate = collate([o.estimate for o in outcomes if o.estimate is not None])
     if knowledge is None:
-        configuration = classify(c.derived(K0=None, K1=None), estimate, seed=seed)
+        pair_type = classify(c.derived(K0=None, K1=None), estimate, seed=seed)
     else:
         c = knowledge(c)
-        configuration = classify(c, estimate, seed=seed)
+        pair_type = classify(c, estimate, seed=seed)
     return [
-        dataclasses.replace(outcome, correspondences=c[i], configuration=configuration.of_pair(i))
+        dataclasses.replace(outcome, correspondences=c[i], pair_type=pair_type.of_pair(i))
         for i, outcome in enumerate(outcomes)
     ]
 
@@ -389,3 +415,56 @@ def _pair_alone(outcome: Outcome, seed: int, knowledge: Knowledge | None) -> Out
     except Exception as error:  # what it is in stays unknown, and the row says why
         reason = f"not examined: {type(error).__name__}: {error}".splitlines()[0]
         return dataclasses.replace(outcome, not_examined=reason)
+
+
+# Pipelines of presets and of composed configs
+
+
+def build_pipeline(
+    config: DictConfig, device: torch.device | str = "cpu", model: str | None = "fundamental"
+) -> Pipeline:
+    """The `Pipeline` that features (with cache), matcher, pruner and estimator of a composed config describe.
+
+    model: what the estimator must give, "fundamental" or "homography"; None: either.
+    """
+    extractor = cached(instantiate(plain(config.features), "features"), config.cache, config.cache_limit)
+    pruners, for_families = build_pruners(config)
+    open_files([extractor, pruners, for_families], torch.device(device))  # a damaged one is no failure of each pair
+    return Pipeline(
+        extractor, instantiate(plain(config.matcher), "matcher"), pruners,
+        instantiate(plain(config.estimator), "estimator"), device=device, families=for_families, model=model,
+        debug=bool(config.get("debug")),
+    )  # fmt: skip
+
+
+def load_pipeline(
+    name: str,
+    device: torch.device | str = "cpu",
+    overrides: Sequence[str] = (),
+    config_dir: Path | str | None = None,
+) -> Pipeline:
+    """The `Pipeline` of ``conf/pipeline/<name>.yaml``, changed by `overrides` as on the command line.
+
+    E.g. ``load_pipeline("sift_gms", overrides=["estimator=lmeds", "pruner.gms.with_scale=true"])``. Unlike the
+    commands it keeps no features on disk unless asked to (``overrides=["cache=null"]``, or a folder).
+
+    Args:
+        name: a preset of conf/pipeline, or of `config_dir`.
+        device: where features are described and everything behind them is computed.
+        overrides: as words of a command.
+        config_dir: a folder with presets of your own, as the commands take it by `--config-dir`.
+
+    Raises:
+        ValueError: for an unknown pipeline, naming those there are, for an override that does not apply, and where
+            `config_dir` is no folder.
+    """
+    if config_dir is not None and not Path(config_dir).is_dir():
+        raise ValueError(f"config_dir={config_dir} is no folder")
+    if name not in available("pipeline", config_dir):
+        raise ValueError(unknown("pipeline", name, config_dir))
+    words = (f"pipeline={name}", "cache=off", *overrides)
+    try:
+        config = compose(PIPELINES, words, None if config_dir is None else Path(config_dir))
+    except HydraException as error:
+        raise ValueError(f"pipeline={name} with {', '.join(overrides)}: {error}") from error
+    return build_pipeline(config, device)

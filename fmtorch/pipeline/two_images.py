@@ -1,48 +1,33 @@
 """Photographs described for matching: features of each as it was reduced, and what leads back to it."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
-import math
 from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
-from numpy.typing import NDArray
+from jaxtyping import Float
 from torch import Tensor
 
 from fmtorch import presets
-from fmtorch.core.grey_pyramid import GreyPyramid, grey_pyramid
-from fmtorch.core.no_features import NoFeatures
-from fmtorch.core.stages import ImageMatcher, PairImages, pruned
-from fmtorch.core.types import RELATED, Correspondences, Estimate, Features
-from fmtorch.data.images import to_grey
-from fmtorch.data.lenses import Lens
-from fmtorch.geometry.pair_type import GENERAL, IDENTICAL, PLANAR, ROTATION
-from fmtorch.geometry.significance import judged
-from fmtorch.io.match_store import Kind, PairGeometry
-from fmtorch.jobs.threads import mapped, one_thread
-from fmtorch.pipeline.build import load_pipeline
-from fmtorch.pipeline.pipeline import Clock, Pipeline
-from fmtorch.pipeline.reduced_images import (
-    Image,
-    evenly_reduced,
-    frames_to_original,
-    fundamental_to_original,
-    geometry_to_original,
-    given_image,
-    reduced_cameras,
-    reduced_image,
-    to_original,
-    undistorted_matches,
-)
+from fmtorch.core.stages import GreyPyramid, ImageMatcher, NoFeatures, PairImages, grey_pyramid, output_of, pruned
+from fmtorch.core.types import Correspondences, Features
+from fmtorch.data import Lens, to_grey
+from fmtorch.jobs.execution import mapped, one_thread
+from fmtorch.pipeline import photographs
+from fmtorch.pipeline.match_result import Lenses, MatchResult
+from fmtorch.pipeline.pair_geometries import pair_geometries
+from fmtorch.pipeline.photographs import GivenImage, Image, frames_to_original, to_original
+from fmtorch.pipeline.pipeline import Clock, Pipeline, load_pipeline
 from fmtorch.two_view.arguments import Arrays, Focal, camera_fields
 from fmtorch.two_view.known_cameras import KnownCameras
-from fmtorch.two_view.pair_type import FOCAL_DEVIATION, Configuration, classify, compile_with, still_warning
+from fmtorch.two_view.pair_type import (
+    classify,
+    compile_with,
+    still_warning,
+    warnings_of,
+)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -62,151 +47,16 @@ class Described:
 
     @property
     def points(self) -> Float[Tensor, "n 2"]:
-        """The keypoints in pixels of the photograph."""
         return to_original(self.features.keypoints, self.scale.to(self.features.keypoints))
 
 
 def describe(pipeline: Pipeline, image: Image, longest_side: int) -> Described:
     """The features of a photograph, for `relate`; see `match`."""
-    reduced, scale = reduced_image(image, longest_side)
+    reduced, scale = photographs.reduced_image(image, longest_side)
     itself = isinstance(pipeline.matcher, ImageMatcher)
     features, seconds = (NoFeatures()(reduced), 0.0) if itself else pipeline.extract(reduced)
     pyramid = grey_pyramid(to_grey(reduced)) if pipeline.looks_at_images else None
     return Described(features, scale, (image.shape[0], image.shape[1]), seconds, pyramid, reduced if itself else None)
-
-
-# What is found of two photographs
-
-
-FLAT = ("planar", "rotation", "identical")  # configurations of which a homography explains all matches
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class MatchResult:
-    """The matches of two photographs and their fundamental matrix, ``x1^T F x0 = 0``, in pixels of the photographs.
-
-    keypoints0, keypoints1: all that were detected, (N0, 2) and (N1, 2).
-    putative: the matcher's matches, a batch of one. kept: which of them the pruners kept, (M,).
-    correspondences: the kept ones, a batch of one. inliers: which of those agree with F, (K,).
-    F: (3, 3) float64 of unit Frobenius norm; zero where there is none, and `reason` then says why.
-    significance: how far the support of F is beyond chance (`fmtorch.geometry.significance`); -inf where there is no F.
-    warning: why F, though found, means little; mostly empty. counts: matches after each step, in order. seconds: of
-    each step, cached features with those they took when they were computed.
-    R (3, 3), t (3,), focals (2,): X1 = R X0 + t with a t of unit length, and focal lengths in pixels of the
-    photographs, where cameras were asked for; NaN where not determined.
-    configuration: one of `CONFIGURATIONS`; empty where nothing could be matched. geometry: the two-view geometry for
-    COLMAP, whose inliers are indices of the kept matches, twice. undistorted: where a lens distorts, the kept matches
-    as pinholes would have them, which F and homography relate; points are otherwise those of the photographs.
-    """
-
-    keypoints0: Float[Tensor, "n0 2"]
-    keypoints1: Float[Tensor, "n1 2"]
-    putative: Correspondences
-    kept: Bool[Tensor, " m"]
-    correspondences: Correspondences
-    inliers: Bool[Tensor, " k"]
-    F: Float[Tensor, "3 3"]
-    reason: str = ""
-    warning: str = ""
-    counts: dict[str, int] = dataclasses.field(default_factory=dict)
-    seconds: dict[str, float] = dataclasses.field(default_factory=dict)
-    significance: float = -math.inf
-    R: Float[Tensor, "3 3"] | None = None
-    t: Float[Tensor, " 3"] | None = None
-    focals: Float[Tensor, " 2"] | None = None
-    configuration: str = ""
-    geometry: PairGeometry | None = None
-    undistorted: Correspondences | None = None
-
-    @property
-    def homography(self) -> Float[Tensor, "3 3"] | None:
-        """Of planes, rotations and copies: ``x1 ~ H x0`` in pixels of the photographs; else None."""
-        H = None if self.geometry is None or self.configuration not in FLAT else self.geometry.H
-        return None if H is None else torch.from_numpy(H)
-
-    @property
-    def related(self) -> bool:
-        """Whether the photographs are taken to show one scene: F was found, and its support is beyond chance."""
-        return self.ok and self.significance >= RELATED
-
-    @property
-    def ok(self) -> bool:
-        """Whether a fundamental matrix was found."""
-        return not self.reason
-
-
-# Estimates of pairs and their configurations as the two-view geometries of COLMAP's databases
-
-
-KINDS: dict[int, Kind] = {PLANAR: "planar", ROTATION: "panoramic", IDENTICAL: "planar_or_panoramic"}
-MAX_CONFLICT = 3.0  # deviations, of an estimated focal length from that of a camera that counts as calibrated
-
-
-def pair_geometries(
-    matches: Sequence[NDArray[np.integer[Any]]], c: Correspondences, estimate: Estimate, configuration: Configuration
-) -> list[PairGeometry]:
-    """The geometries of a batch of pairs.
-
-    Of general pairs F, its inliers, and E and the pose where there is one; of others the homography and its inliers,
-    and the pose where the cameras are known or only turn. A pair is calibrated where both focal lengths are known and
-    the matches agree; one whose support is not beyond chance is degenerate.
-
-    Args:
-        matches: keypoints of both images, (n, 2), of each pair.
-        c: the same matches, with what the estimator was given of their cameras.
-        estimate: their estimates.
-        configuration: of `classify`.
-    """
-    calibrated = _calibrated(c, estimate)
-    kind, homography = configuration.kind, configuration.homography
-    kinds = torch.where(kind != GENERAL, kind, torch.where(estimate.related, GENERAL, -1)).tolist()
-    results = []
-    for i, (index, what) in enumerate(zip(matches, kinds, strict=True)):
-        of_lines = what == GENERAL or (what == PLANAR and bool(calibrated[i]))
-        inliers = index[(estimate if of_lines else homography).inliers[i, : len(index)].cpu().numpy()]
-        H = _known(homography.F[i], homography.ok[i])
-        if what == GENERAL:
-            results.append(_with_lines("calibrated" if calibrated[i] else "uncalibrated", inliers, estimate, i, H))
-        elif of_lines:
-            results.append(_with_lines("planar", inliers, estimate, i, H))
-        elif what not in KINDS:
-            results.append(PairGeometry("degenerate", index[:0]))
-        elif what == ROTATION:
-            R = configuration.evidence.R[i].cpu().numpy()
-            results.append(PairGeometry("panoramic", inliers, H=H, R=R, t=np.zeros(3)))
-        else:
-            results.append(PairGeometry(KINDS[what], inliers, H=H))
-    return results
-
-
-def _calibrated(c: Correspondences, estimate: Estimate) -> Tensor:
-    """Whether both focal lengths of a pair are known, and the pose with them: (b,)."""
-    if c.focal is None or estimate.R is None:
-        return torch.zeros_like(estimate.ok)
-    known = c.focal[..., 1].isfinite().all(1)
-    return known & estimate.R.isfinite().flatten(1).all(1) & ~_conflicting(c, estimate)
-
-
-def _with_lines(kind: Kind, inliers: NDArray[np.integer[Any]], estimate: Estimate, i: int, H: Any) -> PairGeometry:
-    """A geometry with F, and the pose where there is one."""
-    E, R, t = (
-        None if value is None else _known(value[i], value[i].isfinite().all())
-        for value in (estimate.E, estimate.R, estimate.t)
-    )
-    return PairGeometry(kind, inliers, estimate.F[i].detach().cpu().double().numpy(), E, H, R, t)
-
-
-def _known(value: Tensor, known: Tensor) -> NDArray[np.float64] | None:
-    return value.detach().cpu().double().numpy() if known else None
-
-
-def _conflicting(c: Correspondences, estimate: Estimate) -> Tensor:
-    """Whether an estimated focal length contradicts the known one of K: (b,)."""
-    if c.K0 is None or c.K1 is None or c.focal is None or estimate.focals is None:
-        return torch.zeros_like(estimate.ok)
-    stored = torch.stack([torch.sqrt(K[:, 0, 0] * K[:, 1, 1]) for K in (c.K0, c.K1)], 1)
-    apart = (estimate.focals / stored).log().abs()
-    return (apart > MAX_CONFLICT * c.focal[..., 1].clamp_min(FOCAL_DEVIATION)).any(1)
 
 
 # Two photographs of any size through a pipeline: their matches and fundamental matrix in their own pixels
@@ -214,12 +64,11 @@ def _conflicting(c: Correspondences, estimate: Estimate) -> Tensor:
 
 NOTHING_KNOWN: Mapping[str, Tensor] = {}
 NO_CAMERAS: Mapping[str, None] = dict.fromkeys(("K0", "K1", "focal", "shared_focal"))  # of the reduced images
-Lenses = tuple[Lens | None, Lens | None]
 
 
 def match(
-    image0: Path | str | Image,
-    image1: Path | str | Image,
+    image0: GivenImage,
+    image1: GivenImage,
     *,
     pipeline: str | Pipeline = "hesaffnet_fast_fmtorch",
     device: torch.device | str | None = None,
@@ -234,7 +83,8 @@ def match(
     """Match two photographs and estimate their fundamental matrix.
 
     Args:
-        image0, image1: files, turned as their EXIF orientation says, or uint8 arrays, (H, W) or RGB (H, W, 3).
+        image0, image1: files, turned as their EXIF orientation says, images of Pillow as they are, or uint8 arrays,
+            (H, W) or RGB (H, W, 3).
         pipeline: a preset of conf/pipeline, or a `Pipeline` (``load_pipeline("sift_gms", overrides=[...])``).
         device: of a pipeline given by name; None: a GPU where there is one.
         longest_side: larger images are reduced to it for matching, and thresholds are in pixels of the reduced images;
@@ -269,13 +119,14 @@ def match(
         raise TypeError(f"pipeline is a {type(pipeline).__name__}; it must be the name of a preset or a Pipeline")
     elif device is not None and torch.device(device) != pipeline.device:
         raise ValueError(f"device={device}, but the pipeline was built for {pipeline.device}; leave one of them out")
-    images = [given_image(image, name) for image, name in ((image0, "image0"), (image1, "image1"))]
+    images = [photographs.given_image(image, name) for image, name in ((image0, "image0"), (image1, "image1"))]
     K0, K1 = (K if lens is None else lens.K for K, lens in ((K0, lens0), (K1, lens1)))
     cameras = camera_fields(K0, K1, focal, sizes_known=True)
     describing = functools.partial(describe, pipeline, longest_side=longest_side)
     at_once = functools.partial(mapped, share=True) if pipeline.device.type == "cpu" else map
     described0, described1 = at_once(describing, images)
-    return relate(pipeline, described0, described1, seed, cameras, (lens0, lens1))
+    result = relate(pipeline, described0, described1, seed, cameras, (lens0, lens1))
+    return dataclasses.replace(result, photographs=(image0, image1), lenses=(lens0, lens1))
 
 
 def relate(
@@ -287,12 +138,12 @@ def relate(
     clock = Clock(pipeline.device)
     clock("features", described0.seconds + described1.seconds)
     scales = [described0.scale, described1.scale]
-    known = reduced_cameras(cameras, scales, [described0.size, described1.size])
+    known = photographs.reduced_cameras(cameras, scales, [described0.size, described1.size])
     known = {name: value.to(pipeline.device) for name, value in known.items()}
     result = _matched(pipeline, (described0, described1), clock)
     if not result.reason:
         c = result.correspondences
-        c = undistorted_matches(c, lenses, scales).replace(**known)
+        c = photographs.undistorted_matches(c, lenses, scales).replace(**known)
         result = _estimated(pipeline, result, c, scales, seed, clock)
     if not any(lens is not None and lens.bends for lens in lenses):
         result = dataclasses.replace(result, undistorted=None)
@@ -324,7 +175,7 @@ def _matched(pipeline: Pipeline, described: Sequence[Described], clock: Clock) -
         reason = reason if putative is None else "the matcher finds no matches"
         return dataclasses.replace(nothing_found, reason=reason, seconds=clock.seconds)
     if putative is None:
-        putative = pipeline.matcher(features0, features1)
+        putative = pipeline.matched(features0, features1)
     c = putative
     clock("matching")
     counts = {"matching": int(c.count())}
@@ -340,11 +191,11 @@ def _matched(pipeline: Pipeline, described: Sequence[Described], clock: Clock) -
 
 
 def _of_images(pipeline: Pipeline, described: Sequence[Described]) -> Correspondences | None:
-    """The matches of a matcher that takes the images themselves; None for any other."""
     image0, image1 = (each.image for each in described)
     if not isinstance(pipeline.matcher, ImageMatcher) or image0 is None or image1 is None:
         return None
-    return pipeline.matcher.match_images(image0, image1).to(pipeline.device)
+    matches = pipeline.matcher.match_images(image0, image1)
+    return output_of(pipeline.matcher, matches, Correspondences).to(pipeline.device)
 
 
 def _estimated(
@@ -352,21 +203,21 @@ def _estimated(
 ) -> MatchResult:
     """The result with an estimate. c: the matches as pinholes have them, with what is known of the cameras."""
     estimator = KnownCameras(pipeline.estimator) if c.asks_for_cameras else pipeline.estimator
-    estimate: Estimate = judged(estimator(c, seed).detach(), c)
+    estimate = pipeline.estimated(c, seed, estimator)
     clock("estimation")
-    even, F, even_scales = evenly_reduced(c, estimate.F, scales)
-    configuration = classify(even, estimate.derived(F=F), seed=seed)
-    clock("configuration")
+    even, F, even_scales = photographs.evenly_reduced(c, estimate.F, scales)
+    pair_type = classify(even, estimate.derived(F=F), seed=seed)
+    clock("pair_type")
     index = np.arange(c.mask.shape[1]).repeat(2).reshape(-1, 2)
-    (geometry,) = pair_geometries([index], even, estimate.derived(F=F), configuration)
+    (geometry,) = pair_geometries([index], even, estimate.derived(F=F), pair_type)
     inliers = estimate.inliers[0]
     R, t, focals = (None if value is None else value[0] for value in (estimate.R, estimate.t, estimate.focals))
     return dataclasses.replace(
         matched, inliers=inliers, F=estimate.F[0].to(torch.float64), reason=estimate.reason[0],
-        warning=still_warning(matched.correspondences, inliers) or configuration.warnings[0],
+        warning=still_warning(matched.correspondences, inliers) or warnings_of(estimate, pair_type)[0],
         counts={**matched.counts, "estimation": int(inliers.sum())}, seconds=clock.seconds,
         significance=float(cast(Tensor, estimate.significance)[0]), R=R, t=t, focals=focals,
-        configuration=configuration.names[0], geometry=geometry_to_original(geometry, *even_scales), undistorted=c,
+        pair_type=pair_type.names[0], geometry=photographs.geometry_to_original(geometry, *even_scales), undistorted=c,
     )  # fmt: skip
 
 
@@ -386,6 +237,6 @@ def _restored(result: MatchResult, scales: list[Tensor], sizes: list[Tensor]) ->
         result,
         keypoints0=to_original(result.keypoints0, s0), keypoints1=to_original(result.keypoints1, s1),
         putative=matches(result.putative), correspondences=matches(result.correspondences), undistorted=undistorted,
-        F=fundamental_to_original(result.F, *scales),
+        F=photographs.fundamental_to_original(result.F, *scales),
         focals=None if result.focals is None else result.focals / torch.stack(scales).prod(1).sqrt().to(result.focals),
     )  # fmt: skip

@@ -9,24 +9,13 @@ from fmtorch.core.lazy import lazy_exports
 
 if TYPE_CHECKING:
     from fmtorch.core.files import STAGES
-    from fmtorch.presets.composition import (
-        composed,
-        expect_stages,
-        pipeline_stages,
-        plain,
-        stages,
-    )
-    from fmtorch.presets.files import (
-        available,
-        closest,
-        known_targets,
-        load,
-        targets_of,
-    )
+    from fmtorch.presets.composition import compose, composed, expect_stages, pipeline_stages, plain, stages
+    from fmtorch.presets.files import available, closest, known_targets, load, targets_of
     from fmtorch.presets.objects import (
         build,
         expect_buildable,
         instantiate,
+        merged,
         own_modules,
         peer_packages,
         resolve_device,
@@ -34,9 +23,9 @@ if TYPE_CHECKING:
     )
 
 __all__ = [
-    "STAGES", "available", "build", "closest", "composed", "expect_buildable", "expect_stages", "instantiate",
-    "known_targets", "load", "own_modules", "peer_packages", "pipeline_stages", "plain", "resolve_device", "stages",
-    "target_of", "targets_of",
+    "STAGES", "available", "build", "closest", "compose", "composed", "expect_buildable", "expect_stages",
+    "instantiate", "known_targets", "load", "merged", "own_modules", "peer_packages", "pipeline_stages", "plain",
+    "resolve_device", "stages", "target_of", "targets_of",
 ]  # fmt: skip
 
 lazy_exports(__name__)

@@ -1,26 +1,185 @@
-"""Configs composed from groups of presets, as the commands compose them, and the pipelines that they describe."""
+"""Configs composed by Hydra from groups of presets, and what is read of them: stages, pruners, executor, options."""
 
-from __future__ import annotations
-
+import dataclasses
 import functools
 import threading
-from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import Any
+import typing
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Executor
+from pathlib import Path, PurePosixPath
+from typing import Any, TypeVar, cast, get_args, get_type_hints
 
 import hydra
+from hydra._internal.core_plugins import file_config_source
+from hydra._internal.sources_registry import SourcesRegistry
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
-from omegaconf import DictConfig, OmegaConf
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.plugins import Plugins
+from hydra.plugins.config_source import ConfigResult
+from omegaconf import DictConfig, OmegaConf, open_dict
 
 from fmtorch.core.files import STAGES, conf_dir
-from fmtorch.presets import hydra_source
-from fmtorch.presets.files import available
-from fmtorch.presets.objects import expect_buildable
-from fmtorch.presets.pruners import expect_pruners, pruner_configs, with_explicit
+from fmtorch.core.options import Count, dataclass_in, expect_options
+from fmtorch.core.stages import Pruner
+from fmtorch.jobs.execution import Execution
+from fmtorch.presets.files import available, naming_file
+from fmtorch.presets.objects import expect_buildable, instantiate
+
+# Presets of pruners need no `# @package` line: several are chosen at once, and each goes under its own name
+
+
+SEVERAL = ("pruner",)  # groups of which several presets are chosen at once
+
+
+class FileConfigSource(file_config_source.FileConfigSource):
+    """Hydra's reader of config folders, which gives presets of such groups the package of their name.
+
+    It has the name of the reader that it replaces: a launcher's processes register Hydra's own once more, which Hydra
+    skips where one of the same name is there and refuses where it is of another.
+    """
+
+    def load_config(self, config_path: str) -> ConfigResult:
+        with naming_file(Path(self.path) / self._normalize_file_name(config_path)):
+            result = super().load_config(config_path)
+        path = PurePosixPath(config_path)
+        group = str(path.parent)
+        if group in SEVERAL and result.header.get("package") in (None, "_group_", group):
+            result.header["package"] = f"{group}.{path.name.removesuffix('.yaml')}"
+        return result
+
+
+def register() -> None:
+    """Have Hydra read folders by this reader; once is enough for a process."""
+    Plugins.instance()  # registers Hydra's own readers, of which this replaces one
+    SourcesRegistry.instance().types[FileConfigSource.scheme()] = FileConfigSource
+
+
+# Pruners of a composed config, and those that take other options for pairs of some families
+
+
+FAMILIES = "families"  # among a pruner's options: family -> options that its pairs get instead
+OF_PIPELINES = frozenset({FAMILIES, "soft"})  # options that pipelines' presets set, of pruners that may be replaced
+WIDE_FAMILIES = "wide"  # stands there for every family of wide baselines
+WIDE = (
+    "Tanks_and_Temples", "CPC",  # of FM-Bench
+    "Strecha", "Strecha_train", "PhotoTourism", "TanksLike",  # further photographs of unordered scenes
+    "orbit", "collection",  # rendered
+)  # fmt: skip
+"""Families of wide baselines by name. The others are taken for videos, whose baselines are short."""
+
+
+def pruner_configs(config: DictConfig) -> dict[str, Any]:
+    """The pruners' configs by name, in the order in which they run.
+
+    Raises ValueError where one pruner's options stand in the place of the names.
+    """
+    if not config.get("pruner"):
+        return {}
+    plain = OmegaConf.to_container(config.pruner, resolve=True)
+    assert isinstance(plain, dict)
+    if "_target_" in plain:
+        raise ValueError(
+            "pruner: a `_target_` stands where the names of pruners belong; the `# @package` line of a preset of yours "
+            "must be `# @package pruner.<name>`, or be left out"
+        )
+    return {str(name): value for name, value in plain.items() if not _left_over(value)}
+
+
+def _left_over(value: Any) -> bool:
+    """Whether a pipeline's preset says this of a pruner that others have taken the place of."""
+    return isinstance(value, Mapping) and bool(value) and OF_PIPELINES.issuperset(value)
+
+
+def expect_pruners(config: DictConfig) -> None:
+    """Raises ValueError, naming the option, where a pruner cannot be built with its options, for any family."""
+    for name, value in pruner_configs(config).items():
+        for where, options, _ in _versions(name, value):
+            expect_buildable(options, where)
+
+
+def build_pruners(config: DictConfig) -> tuple[dict[str, Pruner], dict[str, dict[str, Pruner]]]:
+    """The pruners by name, and by family those that pairs of this family get in their places."""
+    usual: dict[str, Pruner] = {}
+    for_families: dict[str, dict[str, Pruner]] = {}
+    for name, value in pruner_configs(config).items():
+        for where, options, families in _versions(name, value):
+            pruner = instantiate(options, where)
+            if not families:
+                usual[name] = pruner
+            for family in families:
+                for_families.setdefault(family, {})[name] = pruner
+    return usual, for_families
+
+
+def with_explicit(config: DictConfig, overrides: Sequence[str]) -> DictConfig:
+    """A composed config in which an option of a pruner that was given explicitly holds for all families.
+
+    A preset's options of families give way to it; those of a family that were given explicitly themselves stay.
+
+    Args:
+        config: what Hydra composed; it is not changed.
+        overrides: the words that it was composed with, e.g. ``pruner.gms.with_scale=false``.
+    """
+    words = [word for word in overrides if word.lstrip("+~").startswith("pruner.")]
+    given = {path[1:] for word in words for path in _given(word)}
+    changed = config
+    for name, value in (config.get("pruner") or {}).items():
+        families = value.get(FAMILIES) if isinstance(value, DictConfig) else None
+        own = {path[1:] for path in given if path[0] == name}
+        for family, options in families.items() if isinstance(families, DictConfig) else ():
+            for option in options if isinstance(options, DictConfig) else ():
+                explicit = (FAMILIES, str(family), str(option))
+                stays = any(path == explicit[: len(path)] or path[:3] == explicit for path in own)
+                if not stays and any(path[0] == option for path in own):
+                    changed = changed.copy() if changed is config else changed
+                    with open_dict(changed):
+                        del changed.pruner[name][FAMILIES][family][option]
+    return changed
+
+
+def _given(override: str) -> Iterator[tuple[str, ...]]:
+    """The paths of the options that an override gives: one, or those within a mapping."""
+    parsed = OverridesParser.create().parse_override(override)
+
+    def within(path: tuple[str, ...], value: Any) -> Iterator[tuple[str, ...]]:
+        if isinstance(value, Mapping) and value:
+            for key, inner in value.items():
+                yield from within((*path, str(key)), inner)
+        else:
+            yield path
+
+    yield from within(tuple(parsed.key_or_group.split(".")), parsed.value())
+
+
+def _versions(name: str, config: Any) -> Iterator[tuple[str, Any, tuple[str, ...]]]:
+    """Where the options of a pruner stand, the options, and the families that they are for: none, the usual ones first.
+
+    Those of a family that is named come after those of all wide baselines, which they add to.
+    """
+    where = f"pruner.{name}"
+    if not isinstance(config, Mapping) or FAMILIES not in config:
+        yield where, config, ()
+        return
+    usual = {key: value for key, value in config.items() if key != FAMILIES}
+    yield where, usual, ()
+    families = config[FAMILIES] or {}
+    if not isinstance(families, Mapping) or not all(isinstance(options, Mapping) for options in families.values()):
+        raise ValueError(
+            f"{where}.{FAMILIES}={families}; it must be a mapping of families to options, e.g. "
+            "{wide: {with_scale: true}}"
+        )
+    wide = families.get(WIDE_FAMILIES, {})
+    if WIDE_FAMILIES in families:
+        yield f"{where}.{FAMILIES}.{WIDE_FAMILIES}", {**usual, **wide}, WIDE
+    for family, options in families.items():
+        if family != WIDE_FAMILIES:
+            below = wide if family in WIDE else {}
+            yield f"{where}.{FAMILIES}.{family}", {**usual, **below, **options}, (str(family),)
+
 
 _composing = threading.Lock()  # Hydra composes through a global
-hydra_source.register()
+register()
 PIPELINES = "pipelines"  # the config that a pipeline alone is composed from
 _DEFAULTS = [*({group: name} for group, name in STAGES.items()), {"pipeline": "sift_ratio"}, "_self_"]
 ConfigStore.instance().store(PIPELINES, {"defaults": _DEFAULTS, "cache": None, "cache_limit": 20})
@@ -85,3 +244,87 @@ def _composed(config_name: str, overrides: Sequence[str], config_dir: Path | Non
                 return with_explicit(hydra.compose(config_name, [*own, *overrides]), overrides)
         finally:
             GlobalHydra.instance().hydra = hydra_of_caller
+
+
+# The options of a command, checked, from the config that Hydra composed of them
+
+
+Fields = TypeVar("Fields")
+
+
+def read_fields(fields: type[Fields], config: DictConfig, where: str = "") -> Fields:
+    """The fields of a dataclass from a config that may hold more.
+
+    Raises ValueError naming the first that is wrong, as ``limit=-3; it must be a whole number of at least 1 or null``.
+    """
+    names = [field.name for field in dataclasses.fields(fields) if field.name in config]  # type: ignore[arg-type]
+    values: dict[str, Any] = {
+        name: OmegaConf.to_container(config[name], resolve=True) if OmegaConf.is_config(config[name]) else config[name]
+        for name in names
+    }
+    paths = set(path_fields(fields))
+    values = {name: str(v) if name in paths and type(v) in (int, float) else v for name, v in values.items()}
+    expect_options(fields, values, where)
+    return _built(fields, values)
+
+
+def _built(fields: type[Fields], values: Mapping[str, Any]) -> Fields:
+    hints = get_type_hints(fields)
+    return fields(**{name: _as(hints[name], value) for name, value in values.items()})
+
+
+def _as(hint: Any, value: Any) -> Any:
+    """A value of a config as its type has it: texts as paths, lists as tuples, mappings as dataclasses."""
+    if isinstance(value, str) and _is_path(hint):
+        return Path(value)
+    if isinstance(value, list) and typing.get_origin(hint) is tuple:
+        return tuple(value)
+    kind = dataclass_in(hint)
+    return _built(kind, value) if isinstance(value, Mapping) and kind is not None else value
+
+
+def path_fields(fields: type) -> list[str]:
+    """The names of a dataclass's fields that are paths."""
+    return [name for name, hint in get_type_hints(fields).items() if _is_path(hint)]
+
+
+def _is_path(hint: Any) -> bool:
+    return hint is Path or Path in get_args(hint)
+
+
+# The executor of a command's config: the group `executor`, and its short forms `workers` and `processes`
+
+
+@dataclasses.dataclass(frozen=True)
+class ExecutorFields:
+    """What ``conf/executor`` holds; its files say what each is."""
+
+    name: str = "auto"
+    workers: Count | None = None
+    address: str | None = None
+    send_images: bool = False
+
+
+def execution_of(config: DictConfig, workers: int | None = None, processes: bool | None = None) -> Execution:
+    """The execution that a composed config asks for.
+
+    workers: in place of ``executor.workers``. processes: true or false in place of the executors of these kinds.
+    Raises ValueError for what is wrong or contradicts itself.
+    """
+    options = plain(config.executor)
+    fields = read_fields(ExecutorFields, config.executor, "executor")
+    if workers is not None and fields.workers not in (None, workers):
+        raise ValueError(f"workers={workers} and executor.workers={fields.workers} differ; give one of them")
+    count = workers or fields.workers
+    if "_target_" in options:
+        target = {key: value for key, value in options.items() if key not in ExecutorFields.__dataclass_fields__}
+        expect_buildable(target, "executor")
+        make = functools.partial(instantiate, target, "executor")
+        return Execution("threads", count, None, fields.send_images, cast("functools.partial[Executor]", make))
+    kind = fields.name
+    if processes is not None:
+        wanted = "processes" if processes else "threads"
+        if kind not in ("auto", wanted):
+            raise ValueError(f"processes={str(processes).lower()} and executor={kind} differ; give one of them")
+        kind = wanted
+    return Execution(kind, count, fields.address, fields.send_images)

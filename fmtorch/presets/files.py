@@ -1,7 +1,5 @@
 """Preset files, ``conf/<group>/<name>.yaml``: which there are, what they say and what they name."""
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import re
@@ -78,7 +76,6 @@ class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[mi
     """YAML as OmegaConf reads it: 1e-3 is a number, a date is text, and a mapping has no key twice."""
 
     def construct_mapping(self, node: Any, deep: bool = False) -> Any:
-        """Raises ConstructorError where a key stands twice."""
         keys = [key.value for key, _ in node.value]
         for i, (key, _) in enumerate(node.value):
             if key.value in keys[:i]:
@@ -130,7 +127,6 @@ def closest(group: str, config: Mapping[str, Any]) -> tuple[str, dict[str, Any]]
 
 @functools.cache
 def _shipped(group: str) -> dict[str, dict[str, Any]]:
-    """The project's own presets of a group, by name."""
     return {name: load(group, name) for name in available(group)}
 
 

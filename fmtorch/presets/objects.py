@@ -1,7 +1,5 @@
 """From configs to objects: a mapping with a `_target_` becomes what the target makes of its other entries."""
 
-from __future__ import annotations
-
 import importlib
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
@@ -10,6 +8,7 @@ from typing import Any, TypeVar
 
 import torch
 
+from fmtorch.core.failures import own_traceback
 from fmtorch.core.options import expect_options
 from fmtorch.presets.files import load, targets_of
 
@@ -69,7 +68,12 @@ def _constructed(make: Callable[..., T], config: Mapping[str, Any], where: str, 
         str(key): _constructed(target_of(value, place), value, place, {}) if _is_object(value) else value
         for key, value, place in ((key, value, f"{where}.{key}") for key, value in config.items() if key != "_target_")
     }
-    return make(**built, **extra)
+    try:
+        return make(**built, **extra)
+    except Exception as error:
+        if own_traceback(error) and not isinstance(error, ValueError | TypeError | OSError | ImportError):
+            raise ValueError(f"{where}: {type(error).__name__}: {error}") from error
+        raise
 
 
 def _is_object(value: object) -> bool:
@@ -89,7 +93,6 @@ def target_of(config: Mapping[str, Any], where: str) -> Callable[..., Any]:
 
 
 def _located(name: str) -> Any:
-    """What a dotted name names; modules on the way to it are imported."""
     parts = name.split(".")
     value: Any = importlib.import_module(parts[0])
     for i, part in enumerate(parts[1:], start=2):

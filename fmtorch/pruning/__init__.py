@@ -7,20 +7,20 @@ from fmtorch.core.lazy import lazy_exports
 if TYPE_CHECKING:
     from fmtorch.pruning.calibration import Calibration, RatioPrior
     from fmtorch.pruning.code import CODE, Coherence, LikelihoodField, SmoothMotion, code, coherence
+    from fmtorch.pruning.consistency import FrameConsistency, PositionConsistency, frame_agreement, position_agreement
     from fmtorch.pruning.filters import Likely, MutualCheck, OneToOne, RatioTest, mutual, one_to_one, ratio_test
-    from fmtorch.pruning.frame_consistency import FrameConsistency, frame_agreement
     from fmtorch.pruning.gms import GMS, gms, gms_support
     from fmtorch.pruning.lpm import LPM, lpm, lpm_cost
     from fmtorch.pruning.match_noise import MatchNoise, match_noise
+    from fmtorch.pruning.networks import DFE, LC, MatchInputs
     from fmtorch.pruning.networks.learned import LearnedPruner
-    from fmtorch.pruning.position_consistency import PositionConsistency, position_agreement
     from fmtorch.pruning.refine_matches import RefineMatches
 
 __all__ = [
-    "CODE", "GMS", "LPM", "Calibration", "Coherence", "FrameConsistency", "LearnedPruner", "LikelihoodField",
-    "Likely", "MatchNoise", "MutualCheck", "OneToOne", "PositionConsistency", "RatioPrior", "RatioTest",
-    "RefineMatches", "SmoothMotion", "code", "coherence", "frame_agreement", "gms", "gms_support", "lpm", "lpm_cost",
-    "match_noise", "mutual", "one_to_one", "position_agreement", "ratio_test",
+    "CODE", "DFE", "GMS", "LC", "LPM", "Calibration", "Coherence", "FrameConsistency", "LearnedPruner",
+    "LikelihoodField", "Likely", "MatchInputs", "MatchNoise", "MutualCheck", "OneToOne", "PositionConsistency",
+    "RatioPrior", "RatioTest", "RefineMatches", "SmoothMotion", "code", "coherence", "frame_agreement", "gms",
+    "gms_support", "lpm", "lpm_cost", "match_noise", "mutual", "one_to_one", "position_agreement", "ratio_test",
 ]  # fmt: skip
 
 lazy_exports(__name__, checked=True)

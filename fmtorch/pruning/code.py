@@ -13,7 +13,7 @@ from torch import Tensor
 
 from fmtorch.core.types import Correspondences
 from fmtorch.geometry.robust_losses import huber_weight
-from fmtorch.pruning.frame_consistency import frame_map
+from fmtorch.pruning.consistency import frame_map
 
 BLOCK = 4096  # matches whose basis functions exist at a time
 LARGEST_CHANGE = 100.0  # of a frame's size between images of a common scale: what is beyond is no match
@@ -204,10 +204,10 @@ class LikelihoodField:
     iterations: int = 6
 
     def __call__(
-        self, matches: MatchDomain, quality: Float[Tensor, " n"] | None, *, framed: bool = True
+        self, matches: MatchDomain, ratio: Float[Tensor, " n"] | None, *, framed: bool = True
     ) -> Float[Tensor, " n"]:
-        """The likelihood of every match; without `quality` every match is distinctive. framed: S is known."""
-        seeds = evenly(self.distinctive(matches, quality), self.most_seeds)
+        """The likelihood of every match; without `ratio` every match is distinctive. framed: S is known."""
+        seeds = evenly(self.distinctive(matches, ratio), self.most_seeds)
         candidates = matches.take(evenly(seeds, self.candidates))
         centres = candidates.take(spread_centres(self._basis(candidates, candidates, framed), self.centres))
         basis = self._basis(matches.take(seeds), centres, framed)
@@ -220,14 +220,14 @@ class LikelihoodField:
         )
         return torch.cat([self._basis(block, centres, framed) @ weights for block in matches.blocks()])[:, 0]
 
-    def distinctive(self, matches: MatchDomain, quality: Float[Tensor, " n"] | None) -> Int[Tensor, " s"]:
+    def distinctive(self, matches: MatchDomain, ratio: Float[Tensor, " n"] | None) -> Int[Tensor, " s"]:
         """Indices of the distinctive matches, in order; NaN is not distinctive unless nothing is."""
-        if quality is None:
+        if ratio is None:
             return torch.arange(len(matches.p0), device=matches.p0.device)
-        seeds = (quality < self.ratio).nonzero()[:, 0]
+        seeds = (ratio < self.ratio).nonzero()[:, 0]
         if len(seeds) >= self.least_seeds:
             return seeds
-        return quality.argsort(stable=True)[: self.least_seeds].sort().values
+        return ratio.argsort(stable=True)[: self.least_seeds].sort().values
 
     def _basis(self, matches: MatchDomain, centres: MatchDomain, framed: bool) -> Float[Tensor, "n m"]:
         return predictive_gaussians(
@@ -241,7 +241,6 @@ class LikelihoodField:
 
 
 # The second regression: a smooth affine motion through the likely matches
-
 
 _FREE = 1e-3  # the common affine motion's share of the ridge
 MIN_MATCHES = 8  # likely matches without which there is no motion
@@ -303,7 +302,6 @@ class SmoothMotion:
 
 # CODE: coherence-based decision boundaries (Lin et al., TPAMI 2018)
 
-
 MIN_LIKELIHOOD, LARGEST_RESIDUAL = 0.5, 0.06
 
 
@@ -324,7 +322,7 @@ def code(
     x1: Float[Tensor, "b n 2"],
     *,
     mask: Bool[Tensor, "b n"] | None = None,
-    quality: Float[Tensor, "b n"] | None = None,
+    ratio: Float[Tensor, "b n"] | None = None,
     lafs0: Float[Tensor, "b n 2 3"] | None = None,
     lafs1: Float[Tensor, "b n 2 3"] | None = None,
     least_likelihood: float = MIN_LIKELIHOOD,
@@ -334,7 +332,7 @@ def code(
 ) -> Bool[Tensor, "b n"]:
     """True for matches that are likely and follow the smooth motion of the likely ones; see `coherence`."""
     result = coherence(
-        x0, x1, mask=mask, quality=quality, lafs0=lafs0, lafs1=lafs1,
+        x0, x1, mask=mask, ratio=ratio, lafs0=lafs0, lafs1=lafs1,
         least_likelihood=least_likelihood, likelihood=likelihood, motion=motion,
     )  # fmt: skip
     return (result.likelihood > least_likelihood) & (result.residual < largest_residual)
@@ -346,7 +344,7 @@ def coherence(
     x1: Float[Tensor, "b n 2"],
     *,
     mask: Bool[Tensor, "b n"] | None = None,
-    quality: Float[Tensor, "b n"] | None = None,
+    ratio: Float[Tensor, "b n"] | None = None,
     lafs0: Float[Tensor, "b n 2 3"] | None = None,
     lafs1: Float[Tensor, "b n 2 3"] | None = None,
     least_likelihood: float = MIN_LIKELIHOOD,
@@ -357,7 +355,7 @@ def coherence(
 
     Two robust regressions on radial basis functions, as in CODE; our form differs from the authors' in that the
     centres are chosen where distinctive matches crowd, and that each predicts its neighbours' displacement by its
-    frame. Points in pixels or any unit; `quality` is the distance ratio. Matches that are not finite or have a
+    frame. Points in pixels or any unit; `ratio` is the distance ratio. Matches that are not finite or have a
     degenerate frame are none. Every pair is computed from its own matches alone; memory is linear in their number.
     Not differentiable.
     """
@@ -368,7 +366,7 @@ def coherence(
     for pair, here in enumerate(mask):
         if not bool(here.any()):
             continue
-        ratios, frames0, frames1 = (None if v is None else v[pair][here] for v in (quality, lafs0, lafs1))
+        ratios, frames0, frames1 = (None if v is None else v[pair][here] for v in (ratio, lafs0, lafs1))
         matches = match_domain(x0[pair][here], x1[pair][here], frames0, frames1)
         result.likelihood[pair, here] = f = likelihood(
             matches, ratios, framed=frames0 is not None and frames1 is not None
@@ -403,7 +401,7 @@ class CODE:
     def __call__(self, c: Correspondences) -> Correspondences:
         """The same matches, of which only the coherent ones survive, with a prior."""
         result = coherence(
-            c.x0, c.x1, mask=c.mask, quality=c.quality, lafs0=c.lafs0, lafs1=c.lafs1,
+            c.x0, c.x1, mask=c.mask, ratio=c.ambiguity, lafs0=c.lafs0, lafs1=c.lafs1,
             least_likelihood=self.least_likelihood, likelihood=self.likelihood, motion=self.motion,
         )  # fmt: skip
         evidence = result.likelihood.clamp_min(0) + self.floor
@@ -415,7 +413,6 @@ class CODE:
 
 
 # CODE: two robust regressions over the match domain decide which matches are coherent
-
 
 __all__ = [
     "CODE",

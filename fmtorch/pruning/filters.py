@@ -1,40 +1,46 @@
-"""Lowe's ratio test."""
-
-from __future__ import annotations
+"""Filters by what is known of each match: its ratio, mutuality, location or prior."""
 
 import dataclasses
+import math
 from typing import Annotated
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from fmtorch.core.options import Within
 from fmtorch.core.types import Correspondences
+from fmtorch.jit.batches import for_each_pair
+from fmtorch.jit.kernel import Array, B1x1, F8x1, F8x2, inner, kernel, vector
+from fmtorch.jit.random import mix
 
 
 def ratio_test(
-    quality: Float[Tensor, "b n"], threshold: float = 0.8, mask: Bool[Tensor, "b n"] | None = None
+    ratio: Float[Tensor, "b n"], threshold: float = 0.8, mask: Bool[Tensor, "b n"] | None = None
 ) -> Bool[Tensor, "b n"]:
     """True where the ratio of the distances to the nearest and second nearest descriptor is below `threshold`.
 
     The ratio is of Euclidean, not squared, distances; a ratio that is NaN fails. Lowe, IJCV 2004, section 7.1.
     """
-    kept = quality < threshold
+    kept = ratio < threshold
     return kept if mask is None else kept & mask
 
 
 @dataclasses.dataclass(frozen=True)
 class RatioTest:
-    """`ratio_test` as a stage. Raises ValueError for correspondences without `quality`."""
+    """`ratio_test` of the ratios, or of 1 - score, as a stage. Raises ValueError where matches have neither."""
 
     threshold: Annotated[float, Within(0)] = 0.8
 
     def __call__(self, correspondences: Correspondences) -> Correspondences:
         """The same matches, of which only distinctive ones survive."""
-        if correspondences.quality is None:
-            raise ValueError("the ratio test needs `quality`: the nearest-neighbour distance ratio of each match")
-        return correspondences.keep(ratio_test(correspondences.quality, self.threshold))
+        ambiguity = correspondences.ambiguity
+        if ambiguity is None:
+            raise ValueError(
+                "the ratio test needs `ratio`, the nearest-neighbour distance ratio of each match, or `score`"
+            )
+        return correspondences.keep(ratio_test(ambiguity, self.threshold))
 
 
 # The mutual-nearest-neighbour check: on index lists, and as a stage
@@ -72,43 +78,69 @@ class MutualCheck:
 def one_to_one(
     x0: Float[Tensor, "b n 2"],
     x1: Float[Tensor, "b n 2"],
-    quality: Float[Tensor, "b n"],
+    ambiguity: Float[Tensor, "b n"],
     mask: Bool[Tensor, "b n"] | None = None,
 ) -> Bool[Tensor, "b n"]:
     """True for a match that is the best one at its location in image 0 and the best one at its location in image 1.
 
-    The best has the lowest `quality` (NaN is worst), ties by lowest index. Locations are the same when the coordinates
+    The best has the lowest `ambiguity` (NaN is worst), ties by lowest index. Locations are the same when coordinates
     are exactly equal, as those of one keypoint with several orientations are. The rule is symmetric in the images and
-    independent of the order of the matches, ties apart. Matches with a non-finite coordinate are dropped. O(N log N).
+    independent of the order of the matches, ties apart. Matches with a non-finite coordinate are dropped. O(N).
     """
-    finite = torch.isfinite(x0).all(-1) & torch.isfinite(x1).all(-1)
-    mask = finite if mask is None else finite & mask
-    rank = torch.where(mask & ~quality.isnan(), quality, torch.inf)
-    order = torch.argsort(rank, dim=-1, stable=True)
-    return mask & _first_at_location(x0, order, mask) & _first_at_location(x1, order, mask)
+    mask = torch.ones_like(x0[..., 0], dtype=torch.bool) if mask is None else mask
+    out = torch.empty(mask.shape, dtype=torch.bool)
+    return for_each_pair(one_to_one_kernel, (x0, x1, ambiguity, mask), out=out, kind=torch.float64)
 
 
-def _first_at_location(x: Tensor, order: Tensor, mask: Tensor) -> Tensor:
-    """True for the match of every location that comes first in an order."""
-    x = torch.where(mask[..., None], x, torch.inf)
-    for column in (x[..., 1], x[..., 0]):
-        order = order.gather(-1, torch.argsort(column.gather(-1, order), dim=-1, stable=True))
-    location = x.gather(1, order[..., None].expand(-1, -1, 2))
-    first = torch.ones_like(mask)
-    first[:, 1:] = (location[:, 1:] != location[:, :-1]).any(-1)
-    return torch.zeros_like(mask).scatter(-1, order, first)
+@kernel
+def one_to_one_kernel(x0: F8x2, x1: F8x2, ambiguity: F8x1, mask: B1x1, out: B1x1) -> None:
+    """`one_to_one` of x0, x1 (n, 2), ambiguity, mask (n,) -> out (n,)."""
+    n = len(mask)
+    valid, rank = np.empty(n, np.bool_), vector(n)
+    for i in range(n):
+        finite = math.isfinite(x0[i, 0]) and math.isfinite(x0[i, 1])
+        valid[i] = mask[i] and finite and math.isfinite(x1[i, 0]) and math.isfinite(x1[i, 1])
+        rank[i] = math.inf if math.isnan(ambiguity[i]) else ambiguity[i]
+        out[i] = valid[i]
+    _drop_all_but_the_best(x0, rank, valid, out)
+    _drop_all_but_the_best(x1, rank, valid, out)
+
+
+@inner
+def _drop_all_but_the_best(x: Array, rank: Array, valid: Array, out: Array) -> None:
+    """Sets out[i] to False where another valid match at the same location has a lower (rank, index): a hash table."""
+    n = len(valid)
+    size = 4
+    while size < 2 * n:
+        size *= 2
+    place, best = np.empty(n, np.int64), np.full(size, -1, np.int64)
+    at = x + 0.0  # -0 becomes 0
+    bits = at.view(np.uint64)
+    for i in range(n):
+        if not valid[i]:
+            continue
+        slot = np.int64(mix(bits[i, 0] + np.uint64(0x9E3779B97F4A7C15) * mix(bits[i, 1])) & np.uint64(size - 1))
+        while best[slot] >= 0 and (at[best[slot], 0] != at[i, 0] or at[best[slot], 1] != at[i, 1]):
+            slot = (slot + 1) & (size - 1)
+        place[i] = slot
+        if best[slot] < 0 or rank[i] < rank[best[slot]]:
+            best[slot] = i
+    for i in range(n):
+        if valid[i] and best[place[i]] != i:
+            out[i] = False
 
 
 @dataclasses.dataclass(frozen=True)
 class OneToOne:
-    """`one_to_one` as a stage. Raises ValueError for correspondences without `quality`."""
+    """`one_to_one` as a stage. Raises ValueError for correspondences with neither `ratio` nor `score`."""
 
     def __call__(self, correspondences: Correspondences) -> Correspondences:
         """The same matches, of which at most one survives at each location of each image."""
         c = correspondences
-        if c.quality is None:
-            raise ValueError("one-to-one needs `quality`: the figure by which the best match of a location is chosen")
-        return c.keep(one_to_one(c.x0, c.x1, c.quality, c.mask))
+        ambiguity = c.ambiguity
+        if ambiguity is None:
+            raise ValueError("one-to-one needs `ratio` or `score`, by which the best match of a location is chosen")
+        return c.keep(one_to_one(c.x0, c.x1, ambiguity, c.mask))
 
 
 # Keeping the matches that are likely to be right

@@ -1,7 +1,5 @@
 """Grid-based motion statistics: GMS (Bian et al., CVPR 2017)."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from typing import Any, Literal, NamedTuple
@@ -11,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from fmtorch.core.checks import expect_inside
 from fmtorch.core.types import Correspondences
 from fmtorch.jit.batches import for_each_pair
 from fmtorch.jit.kernel import Array, B1x1, F8x1, F8x2, I8x1, inner, kernel
@@ -218,7 +217,7 @@ def gms(
     x0, x1 in pixels, size0, size1 as (h, w). Matches outside their images' grids are dropped. Masks equal those of
     OpenCV's matchGMS; border="authors" gives those of the authors' code, which drops points in the left and top half
     cells of shifted grids. Time and memory are linear in the number of matches, besides a table of cell pairs. Computed
-    on the CPU.
+    on the CPU. Raises ValueError for sizes that contradict the points of all pairs, such as (w, h).
     """
     tensors, options = _given(x0, x1, size0, size1, mask), _options(with_rotation, with_scale, threshold_factor, border)
     out = torch.empty(x0.shape[:2], dtype=torch.bool)
@@ -254,6 +253,8 @@ def gms_support(
 def _given(x0: Tensor, x1: Tensor, size0: Tensor, size1: Tensor, mask: Tensor | None) -> tuple[Tensor, ...]:
     """What the kernels are given of each pair."""
     mask = torch.ones_like(x0[..., 0], dtype=torch.bool) if mask is None else mask
+    for i, (x, size) in enumerate(((x0, size0), (x1, size1))):
+        expect_inside(x, mask, size, f"x{i}", f"size{i}")
     return x0, x1, size0.float(), size1.float(), mask
 
 

@@ -1,7 +1,5 @@
 """Locality preserving matching: LPM (Ma et al., IJCV 2019)."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple

@@ -1,6 +1,17 @@
 """What is kept on disk: results and features."""
 
-from fmtorch.core.files import replacing
-from fmtorch.runs.run_folder import PAIR_SCHEMA, PairRow, RunFolder, RunFolderError, identity_digest, to_table
+from typing import TYPE_CHECKING
 
-__all__ = ["PAIR_SCHEMA", "PairRow", "RunFolder", "RunFolderError", "identity_digest", "replacing", "to_table"]
+from fmtorch.core.lazy import lazy_exports
+
+if TYPE_CHECKING:
+    from fmtorch.runs.feature_cache import ArrayCache, CachedFeatures, cached, image_digest
+    from fmtorch.runs.fingerprint import code_digest, configuration, fmtorch_version, libraries
+    from fmtorch.runs.run_folder import PAIR_SCHEMA, PairRow, RunFolder, RunFolderError, identity_digest, to_table
+
+__all__ = [
+    "PAIR_SCHEMA", "ArrayCache", "CachedFeatures", "PairRow", "RunFolder", "RunFolderError", "cached",
+    "code_digest", "configuration", "fmtorch_version", "identity_digest", "image_digest", "libraries", "to_table",
+]  # fmt: skip
+
+lazy_exports(__name__)

@@ -1,7 +1,5 @@
 """`python -m fmtorch.runs [DIR]`: what the cache folder holds of features, compiled kernels, scenes and matches."""
 
-from __future__ import annotations
-
 import argparse
 import shutil
 import time
@@ -40,7 +38,6 @@ def main() -> None:
 
 
 def _below(folder: Path) -> list[int]:
-    """Sizes of the files of a folder, at any depth."""
     return [file.stat().st_size for file in folder.rglob("*") if file.is_file()]
 
 

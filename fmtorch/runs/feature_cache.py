@@ -1,7 +1,5 @@
 """Arrays kept on disk by name, one NumPy file each, in a folder of bounded size that several processes may share."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import hashlib
@@ -20,7 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from fmtorch.core.files import cache_dir, replacing
-from fmtorch.core.stages import FeatureExtractor, TwoStepExtractor
+from fmtorch.core.stages import FeatureExtractor, TwoStepExtractor, output_of
 from fmtorch.core.types import Features
 from fmtorch.runs.fingerprint import configuration, environment
 from fmtorch.runs.run_folder import identity_digest
@@ -50,7 +48,6 @@ class ArrayCache:
         self._unseen: float = np.inf  # bytes written since the folder was last listed
 
     def describe(self, section: str, about: Mapping[str, Any]) -> None:
-        """Say, for a human reader, what a section's files are."""
         file = self.folder / section / "about.json"
         if not file.exists():
             with self._excused(file):
@@ -75,7 +72,6 @@ class ArrayCache:
         return arrays
 
     def write(self, section: str, name: str, arrays: Arrays) -> None:
-        """Keep arrays of numbers under that name, in place of what is there."""
         path = self._path(section, name)
         with self._excused(path):
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -85,7 +81,6 @@ class ArrayCache:
             self._grown(sum(array.nbytes for array in arrays.values()))
 
     def files(self) -> Iterator[tuple[Path, os.stat_result]]:
-        """The files that are kept."""
         yield from _listed(self.folder.glob("*/*.npz"))
 
     def trim(self) -> None:
@@ -134,7 +129,6 @@ class ArrayCache:
 
 
 def _listed(paths: Iterator[Path]) -> Iterator[tuple[Path, os.stat_result]]:
-    """Those that are still there, with what is known of them."""
     for path in paths:
         with contextlib.suppress(FileNotFoundError):
             yield path, path.stat()
@@ -168,7 +162,6 @@ class CachedFeatures:
         self.found = self.computed = 0
 
     def __call__(self, image: NDArray[np.uint8]) -> Features:
-        """The features of an image, from the cache where they are there."""
         return self.timed(image)[0]
 
     def timed(self, image: NDArray[np.uint8]) -> tuple[Features, float]:
@@ -182,7 +175,10 @@ class CachedFeatures:
             steps = [frames, described]
             size = {"image_size": torch.tensor(image.shape[:2], dtype=torch.int64)}
         else:
-            steps, size = [self._kept(self._extraction, digest, lambda: _fields(extractor(image)))], {}
+            whole = self._kept(
+                self._extraction, digest, lambda: _fields(output_of(extractor, extractor(image), Features))
+            )
+            steps, size = [whole], {}
         with self._lock:
             computed = any(step.computed for step in steps)
             self.computed, self.found = self.computed + computed, self.found + (not computed)
@@ -192,10 +188,11 @@ class CachedFeatures:
     def report(self) -> str:
         """One line: what was computed and found so far, and the size of the cache."""
         sizes = [status.st_size for _, status in self.cache.files()]
-        return (
-            f"features of {self.computed} images computed, of {self.found} taken from the cache; "
-            f"{self.cache.folder}: {len(sizes)} files, {sum(sizes) / 1e6:.1f} MB"
-        )
+        kept = f"{self.cache.folder}: {len(sizes)} files, {sum(sizes) / 1e6:.1f} MB"
+        if not self.computed + self.found:  # nothing was to be done, or workers elsewhere did it
+            return f"features are kept in {kept}"
+        taken = f", of {self.found} taken from the cache with the seconds they took then" if self.found else ""
+        return f"features of {self.computed} images computed{taken}; {kept}"
 
     def _section(self, name: str, part: object) -> str:
         identity = {"configuration": configuration(part), "environment": environment()}
@@ -203,7 +200,7 @@ class CachedFeatures:
         self.cache.describe(section, identity)
         return section
 
-    def _kept(self, section: str, digest: str, compute: Callable[[], Mapping[str, Tensor]]) -> _Step:
+    def _kept(self, section: str, digest: str, compute: Callable[[], Mapping[str, Tensor]]) -> "_Step":
         """One step's result, from the cache or computed and kept."""
         arrays = self.cache.read(section, digest)
         if arrays is not None:

@@ -1,7 +1,5 @@
 """The code that makes a result: the version of fmtorch, in a checkout its commit, and the sources of a user's parts."""
 
-from __future__ import annotations
-
 import ast
 import contextlib
 import dataclasses
@@ -20,12 +18,12 @@ from typing import Any, NamedTuple
 import cv2
 import torch
 
+from fmtorch.core.failures import INSTALLED
+from fmtorch.core.files import PACKAGE
 from fmtorch.core.version import __version__
 
-PACKAGE = Path(__file__).resolve().parents[1]
 DIGITS = 12  # of a commit or digest that a version shows
 GIT_SECONDS = 10  # after which git is taken for absent
-INSTALLED = ("site-packages", "dist-packages")  # folders of other people's code: its imports are not followed
 
 
 @functools.cache
@@ -104,7 +102,6 @@ class _Import(NamedTuple):
 
 @functools.cache  # parts of a pipeline share most of what they import
 def _imports(source: bytes) -> tuple[_Import, ...]:
-    """The import statements of a file, wherever in it; none where it does not compile."""
     try:
         nodes = _statements(ast.parse(source))
     except (SyntaxError, ValueError):

@@ -1,7 +1,5 @@
 """The result of one image pair, as one row of a table."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import hashlib
@@ -11,7 +9,8 @@ import time
 import uuid
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from types import UnionType
+from typing import Any, get_args
 
 import numpy as np
 import pyarrow as pa
@@ -19,45 +18,6 @@ import pyarrow.parquet as pq
 
 from fmtorch.core.files import replacing
 from fmtorch.core.settings import canonical, create, differences, head
-
-PAIR_SCHEMA = pa.schema(
-    [
-        pa.field("pair", pa.string(), nullable=False),
-        pa.field("key", pa.int64(), nullable=False),
-        pa.field("family", pa.string(), nullable=False),
-        pa.field("scene", pa.string(), nullable=False),
-        pa.field("ok", pa.bool_(), nullable=False),
-        pa.field("reason", pa.string(), nullable=False),
-        pa.field("nsgd", pa.float64(), nullable=False),
-        pa.field("nsgd_released", pa.float64()),
-        pa.field("inlier_rate", pa.float64()),
-        pa.field("inlier_rate_before", pa.float64()),
-        pa.field("corrs", pa.int64(), nullable=False),
-        pa.field("corrs_before", pa.int64(), nullable=False),
-        pa.field("features0", pa.int64(), nullable=False),
-        pa.field("features1", pa.int64(), nullable=False),
-        pa.field("draws", pa.int64(), nullable=False),
-        pa.field("seconds_features", pa.float64()),
-        pa.field("seconds_matching", pa.float64()),
-        pa.field("seconds_pruning", pa.float64()),
-        pa.field("seconds_estimation", pa.float64()),
-        pa.field("seconds_metrics", pa.float64()),
-        pa.field("F", pa.list_(pa.float64(), 9)),
-        pa.field("significance", pa.float64()),
-        pa.field("related", pa.bool_(), nullable=False),
-        pa.field("rotation_error", pa.float64()),
-        pa.field("translation_error", pa.float64()),
-        pa.field("pose_reason", pa.string()),
-        pa.field("configuration", pa.string()),
-        pa.field("warning", pa.string()),
-        pa.field("focal_error0", pa.float64()),
-        pa.field("focal_error1", pa.float64()),
-        pa.field("focal_log_ratio0", pa.float64()),
-        pa.field("focal_log_ratio1", pa.float64()),
-        pa.field("H", pa.list_(pa.float64(), 9)),
-        pa.field("corner_error", pa.float64()),
-    ]
-)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,7 +44,7 @@ class PairRow:
     corrs_before: int = 0  # the matches given to the estimator
     features0: int = 0  # features of image 0
     features1: int = 0  # features of image 1
-    draws: int = 0  # minimal samples drawn
+    samples: int = 0  # minimal samples drawn
     seconds_features: float | None = None  # seconds of wall-clock time spent on this pair, stage by stage;
     seconds_matching: float | None = None  # a batch's time is shared equally among its pairs
     seconds_pruning: float | None = None
@@ -96,8 +56,8 @@ class PairRow:
     rotation_error: float | None = None  # degrees, in [0, 180]; 180 where the pair failed; None without a true pose
     translation_error: float | None = None  # of directions up to sign, in [0, 90], 90 where it failed; signed: to 180
     pose_reason: str | None = None  # why there is no pose error, or no pose; None where there is
-    configuration: str | None = None  # of `CONFIGURATIONS`; None where there are no matches to tell it by
-    warning: str | None = None  # what the configuration leaves open, empty where nothing
+    pair_type: str | None = None  # of `PAIR_TYPES`; None where there are no matches to tell it by
+    warning: str | None = None  # what the pair type leaves open, empty where nothing
     focal_error0: float | None = None  # |f - f_true| / f_true of image 0 where f is estimated; infinite where it is
     focal_error1: float | None = None  # not determined; None where it is given exactly, or the true one is unknown
     focal_log_ratio0: float | None = None  # log(f / f_true); None where it is not determined, too
@@ -132,7 +92,6 @@ class PairRow:
 
 
 def _expect_homography(row: PairRow) -> None:
-    """Raises ValueError for a row of a pair of a known homography that contradicts itself."""
     error, H = row.corner_error, row.H
     if error is None or not error >= 0.0 or not math.isnan(row.nsgd) or row.F is not None:
         raise ValueError(
@@ -145,6 +104,20 @@ def _expect_homography(row: PairRow) -> None:
             f"pair {row.pair!r} has a homography: it needs nine finite numbers of H and no reason, or a reason, no H "
             f"and an infinite corner error, but has H={H}, reason={row.reason!r}, corner_error={error}"
         )
+
+
+_ARROW: dict[Any, pa.DataType] = {
+    str: pa.string(), int: pa.int64(), bool: pa.bool_(), float: pa.float64(),
+    Sequence[float]: pa.list_(pa.float64(), 9),
+}  # fmt: skip
+
+
+def _field(name: str, hint: Any) -> pa.Field:
+    kinds = get_args(hint) if isinstance(hint, UnionType) else (hint,)
+    return pa.field(name, _ARROW[kinds[0]], nullable=type(None) in kinds)
+
+
+PAIR_SCHEMA = pa.schema([_field(field.name, field.type) for field in dataclasses.fields(PairRow)])
 
 
 def to_table(rows: Sequence[PairRow]) -> pa.Table:
@@ -265,7 +238,7 @@ class RunFolder:
     config: dict[str, Any]  # what defines the results, see `identity_digest`
 
     @classmethod
-    def open(cls, path: Path | str, config: Mapping[str, Any]) -> RunFolder:
+    def open(cls, path: Path | str, config: Mapping[str, Any]) -> "RunFolder":
         """Start a run in `path`, or continue it there when the folder holds a run of the same identity.
 
         Several processes may open the same folder at once. Raises RunFolderError, touching nothing, where the folder
@@ -274,14 +247,14 @@ class RunFolder:
         path = Path(path)
         wanted: dict[str, Any] = json.loads(canonical(config))
         if path.exists() and not path.is_dir():
-            raise RunFolderError(f"{path} is a file; run_dir must name a folder")
+            raise RunFolderError(f"{path} is a file; output must name a folder")
         path.mkdir(parents=True, exist_ok=True)
         foreign = sorted(entry.name for entry in path.iterdir() if entry.suffix != ".tmp")
         if not (path / "run.json").exists():
             if foreign:
                 raise RunFolderError(
                     f"{path} is not empty and has no run.json, so it is no run folder (it holds {head(foreign)}); "
-                    "choose another run_dir"
+                    "choose another output"
                 )
             stored = {"format": FORMAT, "identity": identity_digest(wanted), "config": wanted}
             create(path / "run.json", json.dumps(stored, indent=2) + "\n")
@@ -289,13 +262,13 @@ class RunFolder:
         if folder.identity != identity_digest(wanted):
             raise RunFolderError(
                 f"{path} holds another run; what differs (there -> now): {differences(folder.config, wanted)}. "
-                "Choose another run_dir, or delete the folder"
+                "Choose another output, or delete the folder"
             )
         (path / "pairs").mkdir(exist_ok=True)
         return folder
 
     @classmethod
-    def load(cls, path: Path | str) -> RunFolder:
+    def load(cls, path: Path | str) -> "RunFolder":
         """The existing run in `path`, whatever its identity. Raises RunFolderError where there is none."""
         file = Path(path) / "run.json"
         try:
@@ -308,7 +281,7 @@ class RunFolder:
             raise RunFolderError(f"{file} was not written by this program: it has no 'config'")
         if stored.get("format") != FORMAT:
             raise RunFolderError(
-                f"{file} has format {stored.get('format')}, this version reads {FORMAT}; choose another run_dir"
+                f"{file} has format {stored.get('format')}, this version reads {FORMAT}; choose another output"
             )
         if stored.get("identity") != identity_digest(stored["config"]):
             raise RunFolderError(
@@ -319,17 +292,14 @@ class RunFolder:
 
     @property
     def identity(self) -> str:
-        """The digest of what defines the results."""
         return identity_digest(self.config)
 
     def append(self, rows: Sequence[PairRow]) -> None:
-        """Add results, as a new part that is either whole or absent; parts are merged. Safe with several processes."""
         if not rows:
             return
         self._writer.add(to_table(rows))
 
     def done(self) -> set[int]:
-        """The keys of the pairs that have a result."""
         return {int(key) for part in self._parts(["key"]) for key in part["key"].to_numpy()}
 
     def read(self, keys: Collection[int] | None = None, without: Collection[str] = ()) -> pa.Table:

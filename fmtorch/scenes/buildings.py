@@ -3,33 +3,15 @@
 A front is one painted picture; windows are set back from it, sills, cornices and signs set off.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Literal, NamedTuple
 
 import cv2
 import numpy as np
 
-from fmtorch.scenes.patterns import (
-    Rng,
-    car_end,
-    car_side,
-    colour,
-    door,
-    fractal,
-    heights,
-    leaves,
-    masonry,
-    person,
-    plaster,
-    sign,
-    to_pixels,
-    window,
-    wood,
-)
-from fmtorch.scenes.surfaces import Surfaces, Vector, vec
-from fmtorch.scenes.textures import Floats, Real, material
+from fmtorch.scenes import patterns
+from fmtorch.scenes.patterns import Rng, colour, to_pixels
+from fmtorch.scenes.surfaces import Floats, Real, Surfaces, Vector, material, vec
 
 
 def direction(degrees: Real) -> Vector:
@@ -59,8 +41,8 @@ def tree(surfaces: Surfaces, rng: Rng, foot: Vector, height: Real, leaf: int, ba
 
 def foliage(surfaces: Surfaces, rng: Rng, size: int = 256) -> tuple[int, int]:
     """Textures of leaves and bark."""
-    leaf = surfaces.texture(leaves(rng, size, colour(rng, (0.18, 0.34), (0.4, 0.7), (0.35, 0.65))))
-    bark = wood(rng, 128, 128, 3, colour(rng, (0.06, 0.1), (0.3, 0.5), (0.25, 0.45)))
+    leaf = surfaces.texture(patterns.leaves(rng, size, colour(rng, (0.18, 0.34), (0.4, 0.7), (0.35, 0.65))))
+    bark = patterns.wood(rng, 128, 128, 3, colour(rng, (0.06, 0.1), (0.3, 0.5), (0.25, 0.45)))
     return leaf, surfaces.texture(to_pixels(np.ascontiguousarray(bark.transpose(1, 0, 2))))
 
 
@@ -73,8 +55,8 @@ def post(surfaces: Surfaces, foot: Vector, height: Real, texture: int) -> None:
 def car(surfaces: Surfaces, rng: Rng, foot: Vector, ahead: Vector) -> None:
     """A car centred on `foot`: a bonnet and a cabin as boxes, painted sides that stand a little off."""
     tone = colour(rng, (0, 1), (0, 0.8), (0.15, 0.95))
-    side, end = surfaces.texture(car_side(rng, tone)), surfaces.texture(to_pixels(car_end(rng, tone)))
-    metal = surfaces.texture(to_pixels(plaster(rng, 64, 64, tone, 0.5)))
+    side, end = surfaces.texture(patterns.car_side(rng, tone)), surfaces.texture(to_pixels(patterns.car_end(rng, tone)))
+    metal = surfaces.texture(to_pixels(patterns.plaster(rng, 64, 64, tone, 0.5)))
     left = np.cross(vec(0, 0, 1), ahead)
     length, width = rng.uniform(3.9, 4.7), rng.uniform(1.7, 1.85)
     rear = foot - ahead * (length / 2) + left * (width / 2)
@@ -89,14 +71,14 @@ def car(surfaces: Surfaces, rng: Rng, foot: Vector, ahead: Vector) -> None:
 
 def walker(surfaces: Surfaces, rng: Rng, foot: Vector, facing: Real) -> None:
     """Somebody, as a picture that faces the camera's side."""
-    card(surfaces, foot, facing, 0.66, rng.uniform(1.55, 1.9), surfaces.texture(person(rng)))
+    card(surfaces, foot, facing, 0.66, rng.uniform(1.55, 1.9), surfaces.texture(patterns.person(rng)))
 
 
 def rock(surfaces: Surfaces, rng: Rng, foot: Vector, radius: Real, texture: int, detail: int = 12) -> None:
     """A boulder: a sphere with relief."""
     angle = np.linspace(-0.35 * np.pi, 0.5 * np.pi, detail)
     profile = [(float(radius * np.sin(a)), float(radius * np.cos(a)) + 1e-4) for a in angle]
-    bumps = 0.7 * (heights(rng, detail, detail + 4, 6) - 0.5)
+    bumps = 0.7 * (patterns.heights(rng, detail, detail + 4, 6) - 0.5)
     surfaces.lathe(foot, profile, texture, sides=detail + 4, repeat=(2, 1), bumps=bumps)
 
 
@@ -108,7 +90,7 @@ def statue(surfaces: Surfaces, rng: Rng, foot: Vector, height: Real, texture: in
     body[steps > 0.86] = 0.105
     body[-1] = 0.02
     profile = [(float(s * height), float(b * height)) for s, b in zip(steps, body, strict=True)]
-    bumps = 0.55 * (heights(rng, detail, 14, 5) - 0.5)
+    bumps = 0.55 * (patterns.heights(rng, detail, 14, 5) - 0.5)
     surfaces.lathe(foot, profile, texture, sides=14, repeat=(1, 1), bumps=bumps)
 
 
@@ -124,14 +106,19 @@ def column(surfaces: Surfaces, foot: Vector, height: Real, radius: Real, texture
 def marble(surfaces: Surfaces, rng: Rng, h: int = 512, w: int = 512) -> int:
     """A weathered stone texture."""
     tint = colour(rng, (0.06, 0.14), (0.05, 0.35), (0.5, 0.85))
-    out = tint * (1 + 0.16 * fractal(rng, h, w, 128, 1, 0.72) + 0.08 * fractal(rng, h, w, 8, 1, 0.9))[..., None]
+    out = (
+        tint
+        * (1 + 0.16 * patterns.fractal(rng, h, w, 128, 1, 0.72) + 0.08 * patterns.fractal(rng, h, w, 8, 1, 0.9))[
+            ..., None
+        ]
+    )
     return surfaces.texture(to_pixels(out.astype(np.float32)))
 
 
 def ashlar(surfaces: Surfaces, rng: Rng, rows: int = 6, cols: int = 8, h: int = 512, w: int = 1024) -> int:
     """A texture of large dressed stones."""
     tint = colour(rng, (0.05, 0.13), (0.1, 0.4), (0.5, 0.85))
-    return surfaces.texture(to_pixels(masonry(rng, h, w, rows, cols, tint, joint=0.03)))
+    return surfaces.texture(to_pixels(patterns.masonry(rng, h, w, rows, cols, tint, joint=0.03)))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -153,19 +140,23 @@ def wall_picture(rng: Rng, split: str, h: int, w: int, density: Real) -> Floats:
     tint = colour(rng, (0.02, 0.14), (0.1, 0.5), (0.45, 0.9))
     metres_h, metres_w = h / density, w / density
     if kind < 0.3:
-        out = plaster(rng, h, w, tint, 1.6)
+        out = patterns.plaster(rng, h, w, tint, 1.6)
     elif kind < 0.55:
         tint = colour(rng, (0.0, 0.06), (0.35, 0.65), (0.4, 0.7))
-        out = masonry(rng, h, w, max(4, round(metres_h / 0.14)), max(4, round(metres_w / 0.32)), tint, vary=0.16)
+        out = patterns.masonry(
+            rng, h, w, max(4, round(metres_h / 0.14)), max(4, round(metres_w / 0.32)), tint, vary=0.16
+        )
     elif kind < 0.8:
-        out = masonry(rng, h, w, max(3, round(metres_h / 0.45)), max(3, round(metres_w / 0.9)), tint, joint=0.04)
+        out = patterns.masonry(
+            rng, h, w, max(3, round(metres_h / 0.45)), max(3, round(metres_w / 0.9)), tint, joint=0.04
+        )
     else:
         stone = material(split, "stone")
         assert stone is not None
         side = int(density * 3.0)
         tile = cv2.resize(stone, (side, side), interpolation=cv2.INTER_AREA).astype(np.float32) / 255
         out = np.tile(tile, (h // side + 1, w // side + 1, 1))[:h, :w] * (0.5 + tint)
-    stains = 1 + 0.08 * fractal(rng, h, w, 512, 8) + 0.04 * fractal(rng, h, w, 16, 1, 0.8)
+    stains = 1 + 0.08 * patterns.fractal(rng, h, w, 512, 8) + 0.04 * patterns.fractal(rng, h, w, 16, 1, 0.8)
     return np.ascontiguousarray(out * stains[..., None], dtype=np.float32)
 
 
@@ -223,7 +214,6 @@ def front(
 
 
 def _grid(width: Real, height: Real, style: Style) -> tuple[int, int]:
-    """How many bays and storeys a front has."""
     return max(1, int(width / style.bay)), max(1, int(height / style.storey))
 
 
@@ -235,7 +225,7 @@ def _paint_openings(
     step_x, step_z = width / bays, height / storeys
     seed = int(rng.integers(2**31))
     win_w, win_h = step_x * rng.uniform(0.36, 0.55), step_z * rng.uniform(0.45, 0.62)
-    glass = window(rng, int(win_h * d), int(win_w * d), np.random.SeedSequence(seed))
+    glass = patterns.window(rng, int(win_h * d), int(win_w * d), np.random.SeedSequence(seed))
     entrance = int(rng.integers(bays))
     openings: list[list[Rectangle]] = []
     boards: list[Rectangle] = []
@@ -248,16 +238,19 @@ def _paint_openings(
             size = (max(8, int((high - low) * d)), max(8, int(win_w * d)))
             if row == 0 and (bay == entrance or style.shop):
                 pane = np.random.SeedSequence(seed + bay)
-                _paste(picture, door(rng, *size) if bay == entrance else window(rng, *size, pane), x0, low, d)
+                _paste(
+                    picture, patterns.door(rng, *size) if bay == entrance else patterns.window(rng, *size, pane), x0,
+                    low, d,
+                )  # fmt: skip
             elif rng.random() < style.same_windows:
                 _paste(picture, cv2.resize(glass, size[::-1]).astype(np.float32), x0, low, d)
             else:
-                glass = window(rng, *size, np.random.SeedSequence(seed))
+                glass = patterns.window(rng, *size, np.random.SeedSequence(seed))
                 _paste(picture, glass, x0, low, d)
             line.append((x0, low, x0 + win_w, high))
             if row == 0 and style.shop and rng.random() < 0.6:
                 board = (bay * step_x + 0.1 * step_x, high + 0.05, bay * step_x + 0.9 * step_x, high + 0.22 * step_z)
-                letters = sign(rng, int((board[3] - board[1]) * d), int((board[2] - board[0]) * d))
+                letters = patterns.sign(rng, int((board[3] - board[1]) * d), int((board[2] - board[0]) * d))
                 _paste(picture, letters, board[0], board[1], d)
                 boards.append(board)
         openings.append(line)
@@ -265,7 +258,6 @@ def _paint_openings(
 
 
 def _paste(picture: Floats, part: Floats, x: Real, z: Real, density: Real) -> None:
-    """Pastes a part with its lower left corner at (x, z) metres."""
     h, w = part.shape[:2]
     y0, x0 = len(picture) - int(z * density) - h, int(x * density)
     y1 = max(y0, 0)

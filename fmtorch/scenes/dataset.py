@@ -1,24 +1,242 @@
-"""The embedded data sets: `RenderedPairs`, drawn on first use from known cameras, and `StereoPair`, a real pair."""
+"""The embedded data sets: `RenderedPairs`, drawn on first use from known cameras, and `StereoPair`, a real pair.
 
-from __future__ import annotations
+Every scene is a function of (version, seed, split, family, number) alone and is written to a temporary folder that is
+renamed when complete, so that an interrupted generation goes on where it stopped and two processes never clash.
+"""
 
+import dataclasses
 import functools
 import hashlib
+import itertools
+import json
+import os
+import shutil
 import threading
-from collections.abc import Iterator, Sequence
+import uuid
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
-from torch.utils.data import Dataset
 
 from fmtorch.core.files import cache_dir
-from fmtorch.data.pairs import ImagePair, ImageSource
+from fmtorch.data.construction import Keypoints, keypoints, matchable
+from fmtorch.data.pairs import HeldPairs, ImagePair, ImageSource, PairDataset
 from fmtorch.data.scenes import AllPairs, Scene, ScenePairs, View
-from fmtorch.scenes.camera import Camera, calibration, fundamental, relative_pose
-from fmtorch.scenes.generate import FAMILIES, PLANS, Plan, Progress, Task, build, digest, generate_all, read
-from fmtorch.scenes.raycast import Geometry, Matrix
-from fmtorch.scenes.textures import skimage_file
+from fmtorch.jit.together import compile_together
+from fmtorch.jobs.execution import Execution, cores
+from fmtorch.jobs.runner import MAX_PROCESSES, Local, TaskRunner, WorkerPool
+from fmtorch.scenes import landmarks, videos
+from fmtorch.scenes.light import DrawnScene, Shot, Stage, affine, expose, footprints, group_by_texture, shade
+from fmtorch.scenes.raycast import Camera, Geometry, Matrix, calibration, cast_pieces, fundamental, relative_pose
+from fmtorch.scenes.surfaces import Pixels, skimage_file
+
+VERSION = 3  # of the generator: raised by every change that changes a picture or a pair
+FAMILIES = {
+    "indoor": videos.indoor_scene,
+    "driving": videos.driving_scene,
+    "orbit": landmarks.orbit_scene,
+    "collection": landmarks.collection_scene,
+}
+SPLITS = ("test", "train")
+RECORD = Path(__file__).with_name("pairs.json")
+Progress = Callable[[int, int], None]
+
+KERNELS = (cast_pieces, shade, footprints, affine, group_by_texture)  # that drawing calls, slowest first
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """How much of a family is drawn: scenes, photographs a scene, pairs a scene, and the images' scale.
+
+    spare: photographs that are drawn too, one at a time, as long as a scene has fewer matchable pairs than wanted.
+    """
+
+    scenes: int
+    shots: int
+    pairs: int
+    scale: float = 1.0
+    spare: int = 0
+
+
+PLANS = {
+    ("small", "test"): Plan(5, 4, 4, spare=6),
+    ("small", "train"): Plan(5, 4, 4, spare=6),
+    ("full", "test"): Plan(8, 14, 25, spare=6),
+    ("full", "train"): Plan(32, 14, 25, spare=6),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Task:
+    """One scene to draw."""
+
+    family: str
+    split: str
+    number: int
+    seed: int
+    plan: Plan
+
+    @property
+    def name(self) -> str:
+        return f"{self.family}-{self.split}-{self.number:03d}"
+
+
+def digest(family: str, split: str, seed: int, plan: Plan) -> str:
+    """What defines a family's pictures and pairs, as 64 hex digits.
+
+    OpenCV's release is part of it, since it draws the letters on signs and finds the keypoints that choose the pairs.
+    """
+    release = ".".join(cv2.__version__.split(".")[:2])
+    parts = [VERSION, release, family, split, seed, dataclasses.asdict(plan)]
+    return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
+
+
+@functools.cache
+def recorded_pairs() -> dict[str, dict[str, dict[str, Any]]]:
+    """What the rule for pairs has decided: by digest and scene the number of photographs and the pairs.
+
+    Drawn and judged once by ``scripts/record_rendered_pairs.py``; with other versions of the generator or of OpenCV,
+    whose digests are not here, it is judged anew.
+    """
+    record: dict[str, dict[str, dict[str, Any]]] = json.loads(RECORD.read_text(encoding="utf-8"))
+    return record
+
+
+def seeds(task: Task) -> np.random.SeedSequence:
+    """The random stream of one scene; no two scenes, families or splits share one."""
+    place = [VERSION, task.seed, SPLITS.index(task.split), list(FAMILIES).index(task.family), task.number]
+    return np.random.SeedSequence(place)
+
+
+def build(task: Task) -> DrawnScene:
+    """A scene's surfaces, lights and shots, before anything is drawn."""
+    rng = np.random.default_rng(seeds(task))
+    return FAMILIES[task.family](rng, task.split, task.plan.shots + task.plan.spare, task.plan.scale)
+
+
+def draw(scene: DrawnScene, seed: np.random.SeedSequence) -> Iterator[Pixels]:
+    """The photographs of a scene, RGB or grey, each drawn when it is asked for."""
+    stages: dict[int, Stage] = {}
+    for shot, noise in zip(scene.shots, seed.spawn(len(scene.shots)), strict=True):
+        if shot.light not in stages:
+            surfaces = scene.surfaces[shot.light]
+            stages[shot.light] = Stage(Geometry(surfaces), scene.lights[shot.light], scene.sky)
+        cameras = shot.moments or [shot.camera]
+        yield expose(stages[shot.light], cameras, shot.lens, np.random.default_rng(noise))
+
+
+def generate_all(
+    scenes: Sequence[tuple[Task, Path]], workers: int | None = None, progress: Progress | None = None
+) -> None:
+    """Draws every scene (task, folder) that is missing; `progress` gets (done, total) as scenes are completed.
+
+    workers: processes; by default one for each core that this process may use; 1 draws here. Interrupted, it completes
+    the scenes that are being drawn. Raises WorkersLost where workers die.
+    """
+    missing = [scene for scene in scenes if not (scene[1] / scene[0].name).is_dir()]
+    report = progress or (lambda done, total: None)
+    done = len(scenes) - len(missing)
+    report(done, len(scenes))
+    count = min(workers or min(cores(), MAX_PROCESSES), len(missing))
+    if count > 1:
+        compile_together(KERNELS)  # once, rather than in each of them
+    execution = Execution("processes" if count > 1 else "threads", max(count, 1))
+    with WorkerPool(execution, (__name__,), needs_main=False) as pool:
+        for _ in TaskRunner(pool, Local(None), _generated, lambda scene, path: None).each(missing):
+            done += 1
+            report(done, len(scenes))
+
+
+def _generated(_: None, scene: tuple[Task, Path]) -> Path:
+    return generate(*scene)
+
+
+def generate(task: Task, folder: Path) -> Path:
+    """Draws one scene into ``folder/<name>`` unless it stands there complete, and returns that path."""
+    final = folder / task.name
+    if final.is_dir():
+        return final
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        scene = build(task)
+        temporary = folder / f".{task.name}-{os.getpid()}-{uuid.uuid4().hex[:8]}.tmp"
+        temporary.mkdir(parents=True)
+        try:
+            decided = recorded_pairs().get(digest(task.family, task.split, task.seed, task.plan), {}).get(task.name)
+            photographs = draw(scene, seeds(task))
+            if decided is None:
+                _write(temporary, scene, photographs, task.plan)
+            else:
+                taken = list(itertools.islice(zip(scene.shots, photographs, strict=True), decided["photographs"]))
+                cameras = [_saved(temporary, i, shot, image) for i, (shot, image) in enumerate(taken)]
+                _record(temporary, cameras, decided["pairs"])
+            os.replace(temporary, final)
+        except OSError:
+            if not final.is_dir():  # otherwise another process was faster, with the same bytes
+                raise
+        finally:
+            shutil.rmtree(temporary, ignore_errors=True)
+    finally:
+        cv2.setNumThreads(threads)
+    return final
+
+
+def _write(folder: Path, scene: DrawnScene, images: Iterable[Pixels], plan: Plan) -> None:
+    features: list[Keypoints] = []
+    cameras: list[dict[str, Any]] = []
+    waiting, kept = list(scene.pairs), list[tuple[int, int]]()
+    for i, (shot, image) in enumerate(zip(scene.shots, images, strict=True)):
+        cameras.append(_saved(folder, i, shot, image))
+        grey = cv2.imread(str(folder / cameras[-1]["image"]), cv2.IMREAD_GRAYSCALE)
+        assert grey is not None
+        features.append(keypoints(grey.astype(np.uint8, copy=False)))
+        if len(features) < plan.shots:
+            continue
+        possible = [pair for pair in waiting if max(pair) <= i]
+        waiting = [pair for pair in waiting if max(pair) > i]
+        for a, b in possible:
+            if len(kept) == plan.pairs:
+                break
+            if matchable(features[a], features[b], fundamental(scene.shots[a].camera, scene.shots[b].camera)):
+                kept.append((a, b))
+        if len(kept) == plan.pairs:
+            break
+    _record(folder, cameras, sorted(kept))
+
+
+def _saved(folder: Path, number: int, shot: Shot, image: Pixels) -> dict[str, Any]:
+    path = folder / f"{number:02d}.jpg"
+    picture = image if image.ndim == 2 else np.ascontiguousarray(image[..., ::-1])
+    if not cv2.imwrite(str(path), picture, [cv2.IMWRITE_JPEG_QUALITY, shot.jpeg]):
+        raise OSError(f"{path} could not be written")
+    camera = shot.camera
+    return {
+        "image": path.name, "size": list(camera.size),
+        "K": camera.K.tolist(), "R": camera.R.tolist(), "t": camera.t.tolist(),
+    }  # fmt: skip
+
+
+def _record(folder: Path, cameras: list[dict[str, Any]], pairs: Sequence[Sequence[int]]) -> None:
+    record = {"cameras": cameras, "pairs": pairs}
+    (folder / "scene.json").write_text(json.dumps(record, indent=1), encoding="utf-8")
+
+
+def read(folder: Path) -> tuple[list[tuple[Path, Camera]], list[tuple[int, int]]]:
+    """Image paths with their cameras, and the pairs, of a scene drawn before."""
+    record = json.loads((folder / "scene.json").read_text(encoding="utf-8"))
+    views = []
+    for c in record["cameras"]:
+        K, R, t = (np.array(c[k], dtype=np.float64) for k in ("K", "R", "t"))
+        views.append((folder / c["image"], Camera(K, R, t, (c["size"][0], c["size"][1]))))
+    return views, [(i, j) for i, j in record["pairs"]]
+
+
+# The embedded data sets: `RenderedPairs`, drawn on first use from known cameras, and `StereoPair`, a real pair
+
 
 _SCENES = 2  # that each thread keeps, some 100 MB each: pairs of one scene follow one another
 _PHOTOGRAPHS = 48  # whose visible pieces each thread keeps, some 2 MB each
@@ -63,7 +281,7 @@ _recent = _Recent()
 # `RenderedPairs`: the embedded data set, drawn on first use from known cameras
 
 
-class RenderedPairs(Dataset[ImagePair]):
+class RenderedPairs(PairDataset):
     """Image pairs of textured 3-D scenes with exact ground truth, in four families after the paper's four sets.
 
     split: "test" or "train"; they share no scene and no texture. size: "small" (about 20 pairs a family) or "full".
@@ -79,17 +297,10 @@ class RenderedPairs(Dataset[ImagePair]):
     name = "rendered"
 
     def __init__(
-        self,
-        split: str = "test",
-        size: str = "small",
-        families: Sequence[str] | None = None,
-        seed: int = 0,
-        root: str | Path | None = None,
-        *,
-        progress: Progress | None = None,
-        workers: int | None = None,
+        self, split: str = "test", size: str = "small", families: Sequence[str] | None = None, seed: int = 0,
+        root: str | Path | None = None, *, progress: Progress | None = None, workers: int | None = None,
         plan: Plan | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         if (size, split) not in PLANS:
             raise ValueError(f"no split {split!r} in size {size!r}; there are test and train, in small and full")
         chosen = list(FAMILIES) if families is None else list(families)
@@ -122,17 +333,10 @@ class RenderedPairs(Dataset[ImagePair]):
         (path0, camera0), (path1, camera1) = self._views[task.name][i], self._views[task.name][j]
         R, t = relative_pose(camera0, camera1)
         return ImagePair(
-            identity=f"{self.name}/{task.name}/{i}-{j}",
-            family=task.family,
-            scene=task.name,
-            image0=ImageSource(f"{task.name}/{i}", path0),
-            image1=ImageSource(f"{task.name}/{j}", path1),
-            F=fundamental(camera0, camera1),
-            K0=camera0.K,
-            K1=camera1.K,
-            R=R,
-            t=t,
-        )
+            identity=f"{self.name}/{task.name}/{i}-{j}", family=task.family, scene=task.name,
+            image0=ImageSource(f"{task.name}/{i}", path0), image1=ImageSource(f"{task.name}/{j}", path1),
+            F=fundamental(camera0, camera1), K0=camera0.K, K1=camera1.K, R=R, t=t,
+        )  # fmt: skip
 
     def depth(self, image: ImageSource, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Depth (n,) in metres along the optical axis at points (n, 2) of an image; NaN for the sky and outside.
@@ -143,7 +347,7 @@ class RenderedPairs(Dataset[ImagePair]):
         scene, _, number = image.identity.rpartition("/")
         return depth_at(self._tasks[scene], int(number), points)
 
-    def scene_pairs(self) -> RenderedScenePairs:
+    def scene_pairs(self) -> "RenderedScenePairs":
         """All pairs of the photographs of each scene, as candidates to select from."""
         scenes = []
         for name, views in self._views.items():
@@ -154,9 +358,6 @@ class RenderedPairs(Dataset[ImagePair]):
             scenes.append(Scene(name, self._tasks[name].family, drawn, AllPairs(len(drawn))))
         return RenderedScenePairs(self, scenes)
 
-    def __iter__(self) -> Iterator[ImagePair]:
-        return (self[index] for index in range(len(self)))
-
 
 class RenderedScenePairs(ScenePairs):
     """All pairs of the photographs of rendered scenes; drawn: these scenes as a data set, which knows the depth."""
@@ -166,7 +367,6 @@ class RenderedScenePairs(ScenePairs):
         self.drawn = drawn
 
     def depth(self, image: ImageSource, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """As `RenderedPairs.depth`."""
         return self.drawn.depth(image, points)
 
 
@@ -175,7 +375,7 @@ _FILES = ("motorcycle_left.png", "motorcycle_right.png", "motorcycle_disp.npz")
 _FOCAL, _CENTRE, _SHIFT, _BASELINE, _SIZE = 994.978, (311.193, 254.877), 31.086, 0.193001, (500, 741)
 
 
-class StereoPair(Dataset[ImagePair]):
+class StereoPair(HeldPairs):
     """One rectified pair with dense ground truth: a point (x, y) on the left is (x - disparity, y) on the right.
 
     The three files lie inside scikit-image's wheel, so that nothing is downloaded; FileNotFoundError names the one
@@ -195,29 +395,12 @@ class StereoPair(Dataset[ImagePair]):
         left = Camera(calibration(_FOCAL, _SIZE, (x, y)), np.eye(3), np.zeros(3), _SIZE)
         right = Camera(calibration(_FOCAL, _SIZE, (x + _SHIFT, y)), np.eye(3), np.array([-_BASELINE, 0.0, 0.0]), _SIZE)
         R, t = relative_pose(left, right)
-        self._pair = ImagePair(
-            identity=f"{self.name}/motorcycle/left-right",
-            family=self.name,
-            scene="motorcycle",
+        self._pairs = [ImagePair(
+            identity=f"{self.name}/motorcycle/left-right", family=self.name, scene="motorcycle",
             image0=ImageSource("motorcycle/left", self._paths[0]),
-            image1=ImageSource("motorcycle/right", self._paths[1]),
-            F=fundamental(left, right),
-            K0=left.K,
-            K1=right.K,
-            R=R,
-            t=t,
-        )
-
-    def __len__(self) -> int:
-        return 1
-
-    def __getitem__(self, index: int) -> ImagePair:
-        if index not in (0, -1):
-            raise IndexError(f"pair {index} of a data set of one pair")
-        return self._pair
-
-    def __iter__(self) -> Iterator[ImagePair]:
-        yield self._pair
+            image1=ImageSource("motorcycle/right", self._paths[1]), F=fundamental(left, right), K0=left.K, K1=right.K,
+            R=R, t=t,
+        )]  # fmt: skip
 
     def matches(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Points (n, 2) on the left and where they are on the right, for every pixel with a measured disparity."""

@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 
 from fmtorch.jit.kernel import F4x1, F4x2, F4x3, I4x1, I8x1, U1x1, inner, kernel
 from fmtorch.jit.lanes import fused
-from fmtorch.scenes.camera import Camera
-from fmtorch.scenes.raycast import Geometry, Hits, Index, Number
-from fmtorch.scenes.textures import TO_LINEAR, Floats, Pixels, Real, Texture, bilinear, to_srgb
+from fmtorch.scenes.raycast import Camera, Geometry, Hits, Index, Number
+from fmtorch.scenes.surfaces import TO_LINEAR, Floats, Pixels, Real, Surfaces, Texture, bilinear, to_srgb
 
 _ZERO, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
 # The four rays of a pixel share a footprint's long side, so that each filters only a quarter of it.
@@ -264,7 +263,6 @@ class Stage:
         affine(Seen(*hits.flat(), self.table), 4, self.shadow.reshape(-1))
 
     def radiance(self, camera: Camera, offset: tuple[Real, Real]) -> Floats:
-        """Linear colour (h, w, 3) along the rays `offset` away from the pixel centres."""
         hits = self.geometry.look(camera, offset)
         out = np.empty((*camera.size, 3), dtype=np.float32)
         beyond = np.flatnonzero(hits.piece.reshape(-1) < 0)
@@ -355,3 +353,31 @@ def sun(azimuth: Real, elevation: Real) -> tuple[float, float, float]:
     """The unit direction at an azimuth and elevation in degrees."""
     a, e = np.radians(azimuth), np.radians(elevation)
     return float(np.cos(a) * np.cos(e)), float(np.sin(a) * np.cos(e)), float(np.sin(e))
+
+
+# What a family makes: geometry, lights and shots; the generator draws them and keeps the matchable pairs
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Shot:
+    """One photograph to take. `camera` is the ground truth; `moments` the cameras during a long exposure."""
+
+    camera: Camera
+    lens: Lens
+    light: int = 0
+    moments: Sequence[Camera] = ()
+    jpeg: int = 95  # quality
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class DrawnScene:
+    """Surfaces (one list for each light: what moves is not in all of them), lights, a sky, shots, candidate pairs.
+
+    pairs: the pairs to try, most wanted first.
+    """
+
+    surfaces: Sequence[Surfaces]
+    lights: Sequence[Light]
+    sky: Pixels
+    shots: Sequence[Shot]
+    pairs: Sequence[tuple[int, int]]

@@ -3,8 +3,6 @@
 Painted are windows, doors, signs, posters, books, cars and people.
 """
 
-from __future__ import annotations
-
 import colorsys
 import string
 
@@ -12,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fmtorch.scenes.textures import Floats, Pixels, Real
+from fmtorch.scenes.surfaces import Floats, Pixels, Real
 
 Rng = np.random.Generator
 _BORDER = 2  # points of a grid of noise beyond each side

@@ -1,4 +1,4 @@
-"""Which surface each pixel's ray meets first: exact ray-plane intersection, batched over pixels, with a depth buffer.
+"""Exact pinhole cameras, and which surface each pixel's ray meets first: ray-plane intersection with a depth buffer.
 
 A piece ``X = O + s U + t V`` is seen by a camera P through the homography ``G = P [U V O; 0 0 1]``. Hence the ray of
 pixel x meets its plane at ``(s, t, 1) = z G^-1 (x, y, 1)``: three linear forms and one division for each pixel, and the
@@ -9,16 +9,73 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Sequence
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fmtorch.data.cameras import fundamental, relative_pose
 from fmtorch.jit.kernel import B1x1, F4x1, F4x2, F4x3, I4x2, I8x1, I8x2, U1x1, inner, kernel
 from fmtorch.jit.lanes import fused
-from fmtorch.scenes.camera import Camera
-from fmtorch.scenes.surfaces import Surfaces
-from fmtorch.scenes.textures import Floats, Pixels
+from fmtorch.scenes.surfaces import Floats, Pixels, Real, Surfaces
+
+__all__ = ["Camera", "Matrix", "calibration", "fundamental", "look_at", "relative_pose"]
+
+Matrix = NDArray[np.float64]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Camera:
+    """A pinhole: ``x ~ K (R X + t)``, pixels (x, y) with (0, 0) at the centre of the first pixel; size (h, w).
+
+    World units are metres with z upwards; camera axes are OpenCV's (x right, y down, z forward).
+    """
+
+    K: Matrix
+    R: Matrix
+    t: Matrix
+    size: tuple[int, int]
+
+    @property
+    def centre(self) -> Matrix:
+        return -self.R.T @ self.t
+
+    @property
+    def P(self) -> Matrix:
+        """The projection matrix K [R | t], (3, 4)."""
+        return self.K @ np.column_stack([self.R, self.t])
+
+    def project(self, X: Matrix) -> tuple[Matrix, Matrix]:
+        """World points (n, 3) to pixels (n, 2) and depths (n,)."""
+        x = (X @ self.R.T + self.t) @ self.K.T
+        return x[:, :2] / x[:, 2:], x[:, 2]
+
+
+def calibration(focal: Real, size: tuple[int, int], centre: tuple[float, float] | None = None) -> Matrix:
+    """K of square pixels: focal length in pixels, principal point (x, y), by default the middle of the image."""
+    h, w = size
+    cx, cy = centre if centre is not None else ((w - 1) / 2, (h - 1) / 2)
+    return np.array([[focal, 0.0, cx], [0.0, focal, cy], [0.0, 0.0, 1.0]])
+
+
+def look_at(
+    K: Matrix, size: tuple[int, int], centre: Sequence[Real], target: Sequence[Real], roll: Real = 0.0
+) -> Camera:
+    """A camera at `centre` that looks at `target`, upright but for a roll about its axis in radians."""
+    c = np.asarray(centre, dtype=np.float64)
+    forward = np.asarray(target, dtype=np.float64) - c
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    down = np.cross(forward, right)
+    cos, sin = np.cos(roll), np.sin(roll)
+    R = np.stack([cos * right + sin * down, cos * down - sin * right, forward])
+    return Camera(K, R, -R @ c, size)
+
+
+# Which surface each pixel's ray meets first: exact ray-plane intersection, batched over pixels, with a depth buffer
+
 
 Booleans = NDArray[np.bool_]
 Number: TypeAlias = Any  # a number of Python's or NumPy's; in a compiled function each has one type
@@ -121,7 +178,6 @@ def cast_pieces(pieces: Pieces, cutouts: Cutouts, bounds: Bounds, met: Met) -> N
 
 @inner
 def _any_beyond(buffer: Floats, depth: Number) -> bool:
-    """Whether a pixel's depth is `depth` or more."""
     for y in range(buffer.shape[0]):
         beyond = 0
         for x in range(buffer.shape[1]):
@@ -150,8 +206,6 @@ def _open_holes(
             hit[x] = np.rint(fused(above, at_y - top, below - above)) >= _OPAQUE_FROM
 
 
-Matrix = NDArray[np.float64]
-
 NEAR = 0.05  # metres
 SEAM = 1e-4  # pieces reach this much (of their own extent) beyond their edges, so that neighbours leave no gap
 
@@ -166,7 +220,6 @@ class Hits:
     inverse: Matrix
 
     def flat(self) -> tuple[NDArray[np.int32], Floats, Floats]:
-        """The piece, s and t of all pixels in a row."""
         return self.piece.reshape(-1), self.s.reshape(-1), self.t.reshape(-1)
 
 
@@ -185,13 +238,9 @@ class Geometry:
         self.corners = np.stack([self.O, self.O + self.U, self.O + self.U + self.V, self.O + self.V], axis=1)
 
     def cast(
-        self,
-        P: Matrix,
-        depth: Matrix,
-        size: tuple[int, int],
-        centre: Matrix | None,
+        self, P: Matrix, depth: Matrix, size: tuple[int, int], centre: Matrix | None,
         skip: NDArray[np.bool_] | None = None,
-    ) -> Hits:
+    ) -> Hits:  # fmt: skip
         """Rays of all pixels of a projection P (3, 4), perspective or (last row 0 0 0 1) orthographic.
 
         depth: (4,), the affine function of the world by which the nearer of two pieces is known.
@@ -246,7 +295,6 @@ class Geometry:
         return Cutouts(place, window, self._opacity[0])
 
     def look(self, camera: Camera, offset: tuple[float, float] = (0.0, 0.0)) -> Hits:
-        """The rays through the points `offset` (x, y) away from the pixel centres of a camera."""
         shift = np.array([[1.0, 0.0, -offset[0]], [0.0, 1.0, -offset[1]], [0.0, 0.0, 1.0]])
         depth = np.append(camera.R[2], camera.t[2])
         return self.cast(shift @ camera.P, depth, camera.size, camera.centre)

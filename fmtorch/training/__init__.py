@@ -9,32 +9,16 @@ from fmtorch.core.lazy import lazy_exports
 
 if TYPE_CHECKING:
     from fmtorch.training.augmentation import Augmentation
-    from fmtorch.training.batches import SimilarLengthBatches, collate_trimmed
     from fmtorch.training.labelled import LabelledMatches, collate
     from fmtorch.training.matched_pairs import MatchedPairs
     from fmtorch.training.objective import Objective, classification_loss, geometric_loss, nsgd_loss, virtual_points
-    from fmtorch.training.stored_matches import Draw, StoredMatches, split_scenes
+    from fmtorch.training.stored_matches import Draw, SimilarLengthBatches, StoredMatches, collate_trimmed, split_scenes
     from fmtorch.training.validation import Use, Validation, reliability, temperature
 
 __all__ = [
-    "Augmentation",
-    "Draw",
-    "LabelledMatches",
-    "MatchedPairs",
-    "Objective",
-    "SimilarLengthBatches",
-    "StoredMatches",
-    "Use",
-    "Validation",
-    "classification_loss",
-    "collate",
-    "collate_trimmed",
-    "geometric_loss",
-    "nsgd_loss",
-    "reliability",
-    "split_scenes",
-    "temperature",
-    "virtual_points",
-]
+    "Augmentation", "Draw", "LabelledMatches", "MatchedPairs", "Objective", "SimilarLengthBatches", "StoredMatches",
+    "Use", "Validation", "classification_loss", "collate", "collate_trimmed", "geometric_loss", "nsgd_loss",
+    "reliability", "split_scenes", "temperature", "virtual_points",
+]  # fmt: skip
 
 lazy_exports(__name__)

@@ -6,8 +6,6 @@ becomes one of the camera, so that K stays upper triangular) and the fundamental
 the matcher's figures stay as they are. Matches that fall away are masked; `LabelledMatches.compact` takes them out.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 
@@ -35,8 +33,7 @@ class Augmentation(AugmentationOptions):
     """
 
     @classmethod
-    def none(cls) -> Augmentation:
-        """Nothing but a random order."""
+    def none(cls) -> "Augmentation":
         return cls(swap=0, quarter_turn=0, turn=0, crop=0, ratio=None, thin=0, noise=None, matches=None)
 
     def __call__(
@@ -77,16 +74,16 @@ class Augmentation(AugmentationOptions):
         return out if wanted is None else out.first(wanted)
 
     def expected(
-        self, quality: Float[Tensor, " n"] | None, label: Int[Tensor, " n"], *, key: int, seed: int, epoch: int
+        self, ratio: Float[Tensor, " n"] | None, label: Int[Tensor, " n"], *, key: int, seed: int, epoch: int
     ) -> float:
         """About how many matches of a pair are left, for batches of similar length; the effect of crops is a guess.
 
         Args:
-            quality, label: of its matches. key, seed, epoch: as of the call. The size of the random subset is left out.
+            ratio, label: of its matches. key, seed, epoch: as of the call. The size of the random subset is left out.
         """
         draw = _Draw(self, bits(seed, torch.tensor([key]), Stream.AUGMENTATION, epoch, 1, _COLUMNS)[0, 0])
-        if draw.ratio is not None and quality is not None:
-            kept = quality < draw.ratio
+        if draw.ratio is not None and ratio is not None:
+            kept = ratio < draw.ratio
             if int((label[kept] == 1).sum()) >= min(MIN_INLIERS, int((label == 1).sum())):
                 label = label[kept]
         inliers, outliers = int((label == 1).sum()), int((label == 0).sum())
@@ -156,7 +153,6 @@ def _within(range_: Range, u: float) -> float:
 
 
 def _box(size: list[int], width: float, height: float, x: float, y: float) -> tuple[int, int, int, int]:
-    """A crop of an image of `size` (h, w) as left, top, right, bottom in pixels, at least one pixel large."""
     h, w = size
     wide, high = max(round(width * w), 1), max(round(height * h), 1)
     left, top = round(x * (w - wide)), round(y * (h - high))
@@ -171,7 +167,6 @@ def _unless_poor(changed: LabelledMatches, before: LabelledMatches) -> LabelledM
 
 
 def _thinned(matches: LabelledMatches, share: float, order: Int[Tensor, " n"]) -> Bool[Tensor, "1 n"]:
-    """Which matches stay: random ones of those that are in excess; ignored ones in the same share as inliers."""
     label = matches.label[0]
     counts = {value: int((label == value).sum()) for value in (1, 0, -1)}
     if not counts[1] or not counts[0]:
@@ -186,18 +181,16 @@ def _thinned(matches: LabelledMatches, share: float, order: Int[Tensor, " n"]) -
 
 
 def _numbers(seed: int, key: int, n: int, columns: int) -> Float[Tensor, "n columns"]:
-    """Random numbers in (0, 1) for each match."""
     drawn = uniform(seed, torch.tensor([key]), Stream.AUGMENTATION, 0, n, columns)[0]
     return drawn.clamp(min=2.0**-53)
 
 
 def _order(seed: int, key: int, n: int) -> Int[Tensor, " n"]:
-    """A random order of n matches."""
     return torch.argsort(_numbers(seed, key, n, 1)[:, 0])
 
 
 def swap(matches: LabelledMatches) -> LabelledMatches:
-    """The same matches from image 1 to image 0. `quality` and `mutual` stay those of the direction that was matched."""
+    """The same matches from image 1 to image 0. `ratio` and `mutual` stay those of the direction that was matched."""
     c = matches.correspondences
     pairs = (("x0", "x1"), ("lafs0", "lafs1"), ("size0", "size1"), ("K0", "K1"))
     swapped = {name: getattr(c, other) for a, b in pairs for name, other in ((a, b), (b, a))}
@@ -248,14 +241,14 @@ def crop(matches: LabelledMatches, image: int, box: tuple[int, int, int, int]) -
 
 
 def keep_ratio(matches: LabelledMatches, threshold: float | int) -> LabelledMatches:
-    """The matches whose `quality`, the ratio of the distances to the two nearest descriptors, is below `threshold`.
+    """The matches whose `ratio`, the ratio of the distances to the two nearest descriptors, is below `threshold`.
 
-    A threshold of 1 keeps all. Raises ValueError for matches without `quality`.
+    A threshold of 1 keeps all. Raises ValueError for matches without `ratio`.
     """
-    quality = matches.correspondences.quality
-    if quality is None:
-        raise ValueError("a ratio threshold needs `quality`: the nearest-neighbour distance ratio of each match")
-    return matches if threshold >= 1 else matches.keep(quality < threshold)
+    ratio = matches.correspondences.ratio
+    if ratio is None:
+        raise ValueError("a ratio threshold needs `ratio`: the nearest-neighbour distance ratio of each match")
+    return matches if threshold >= 1 else matches.keep(ratio < threshold)
 
 
 def move(matches: LabelledMatches, step0: Float[Tensor, "b n 2"], step1: Float[Tensor, "b n 2"]) -> LabelledMatches:

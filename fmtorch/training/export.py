@@ -3,8 +3,6 @@
 Both files state the network that they belong to. The card says how good it is.
 """
 
-from __future__ import annotations
-
 import contextlib
 import copy
 import dataclasses

@@ -8,8 +8,6 @@ lines decides with the same two thresholds; it takes a wrong match that is near 
 band of 6 px in an image 500 px high: about one in eighty).
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 
@@ -22,6 +20,7 @@ from torch import Tensor
 from fmtorch.core import types
 from fmtorch.core.records import Index, Record, as_index, expect_fields, gathered, slotted
 from fmtorch.core.types import Correspondences
+from fmtorch.data.cameras import line_distance
 from fmtorch.data.pairs import DepthDataset, ImagePair, ImageSource, PairDataset
 
 INLIER, OUTLIER, IGNORED = 1, 0, -1
@@ -55,28 +54,24 @@ class LabelledMatches(Record):
 
     @property
     def labelled(self) -> Bool[Tensor, "b n"]:
-        """True for the matches that a loss may look at: real ones that are inliers or outliers."""
         return self.label >= 0
 
     @property
     def inlier(self) -> Bool[Tensor, "b n"]:
-        """True for the matches that are right."""
         return self.label == INLIER
 
     def __len__(self) -> int:
-        """Number of pairs."""
         return len(self.correspondences)
 
-    def __getitem__(self, index: Index) -> LabelledMatches:
+    def __getitem__(self, index: Index) -> "LabelledMatches":
         """The selected pairs, always as a batch."""
         i = as_index(index, len(self))
         return self._map(lambda value: value[i])
 
-    def keep(self, mask: Bool[Tensor, "b n"]) -> LabelledMatches:
-        """The same matches, of which only those also in `mask` survive."""
+    def keep(self, mask: Bool[Tensor, "b n"]) -> "LabelledMatches":
         return self.replace(correspondences=self.correspondences.keep(mask))
 
-    def compact(self, multiple: int = 1) -> LabelledMatches:
+    def compact(self, multiple: int = 1) -> "LabelledMatches":
         """Matches moved to the front in their order, padding cut to the longest pair (rounded up to `multiple`)."""
         mask = self.correspondences.mask
         order = torch.argsort(mask.logical_not().to(torch.uint8), dim=-1, stable=True)
@@ -89,13 +84,12 @@ class LabelledMatches(Record):
             moved, correspondences=moved.correspondences.compact(multiple), label=_padded(moved.label, n)
         )
 
-    def reorder(self, order: Int[Tensor, "b m"]) -> LabelledMatches:
+    def reorder(self, order: Int[Tensor, "b m"]) -> "LabelledMatches":
         """The matches in the slots `order` of each pair, in that order."""
         moved = {name: gathered(value, order) for name, value in slotted(self.correspondences).items()}
         return LabelledMatches(self.correspondences.replace(**moved), gathered(self.label, order), self.F)
 
-    def first(self, count: int) -> LabelledMatches:
-        """The first `count` slots of each pair."""
+    def first(self, count: int) -> "LabelledMatches":
         cut = {name: value[:, :count] for name, value in slotted(self.correspondences).items()}
         return LabelledMatches(self.correspondences.replace(**cut), self.label[:, :count], self.F)
 
@@ -112,7 +106,6 @@ def collate(items: Sequence[LabelledMatches]) -> LabelledMatches:
 
 
 def _padded(label: Tensor, n: int) -> Tensor:
-    """Labels of `n` slots, ignored beyond the given ones."""
     missing = max(n - label.shape[1], 0)
     return torch.nn.functional.pad(label, (0, missing), value=IGNORED)[:, :n]
 
@@ -158,14 +151,9 @@ def depths(dataset: DepthDataset, image: ImageSource, x: Points) -> NDArray[np.f
 
 
 def transfer_error(
-    x: Points,
-    depth: NDArray[np.float64],
-    partner: Points,
-    K: NDArray[np.float64],
-    K_other: NDArray[np.float64],
-    R: NDArray[np.float64],
-    t: NDArray[np.float64],
-) -> NDArray[np.float64]:
+    x: Points, depth: NDArray[np.float64], partner: Points, K: NDArray[np.float64], K_other: NDArray[np.float64],
+    R: NDArray[np.float64], t: NDArray[np.float64],
+) -> NDArray[np.float64]:  # fmt: skip
     """How far (n,), in pixels, points are carried past their partners in the other image, at the kindest of k depths.
 
     Args:
@@ -181,12 +169,3 @@ def transfer_error(
     error = np.where(ahead, np.hypot(*np.moveaxis(at - partner, -1, 0)), np.inf)
     kindest = np.where(np.isnan(depth), np.inf, error).min(0)
     return np.where(np.isnan(depth).all(0), np.nan, kindest)
-
-
-def line_distance(F: NDArray[np.float64], x0: Points, x1: Points) -> NDArray[np.float64]:
-    """The larger distance (n,) in pixels of two matched points to their epipolar lines; infinite on an epipole."""
-    h0, h1 = (np.column_stack([x, np.ones(len(x))]) for x in (x0, x1))
-    line1, line0 = h0 @ F.T, h1 @ F
-    shorter = np.minimum(np.hypot(line0[:, 0], line0[:, 1]), np.hypot(line1[:, 0], line1[:, 1]))
-    residual = np.abs((h1 * line1).sum(1))
-    return np.where(shorter > 0, residual / np.where(shorter > 0, shorter, 1.0), np.inf)

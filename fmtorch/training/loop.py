@@ -3,8 +3,6 @@
 What is already done is taken up again, whatever ended the last attempt.
 """
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import re
@@ -26,7 +24,7 @@ from torch.utils.data import DataLoader, Dataset
 
 from fmtorch.core.terminal import progress_bars
 from fmtorch.data import ImagePair, read_image
-from fmtorch.evaluation.pictures import draw_matches
+from fmtorch.pipeline.pictures import draw_matches
 from fmtorch.pruning.networks.learned import predict
 from fmtorch.training.labelled import LabelledMatches
 from fmtorch.training.objective import Objective
@@ -56,11 +54,9 @@ class PrunerTraining(lightning.LightningModule):
         return self._seconds + time.perf_counter() - self._started
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Keeps the seconds."""
         checkpoint["seconds"] = self.seconds
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Goes on counting seconds."""
         self._seconds, self._started = float(checkpoint.get("seconds", 0.0)), time.perf_counter()
 
     def training_step(self, batch: LabelledMatches, index: int) -> Tensor:
@@ -74,7 +70,6 @@ class PrunerTraining(lightning.LightningModule):
         return terms["loss"]
 
     def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
-        """Refuses gradients that are not finite."""
         norms = [p.grad.norm() for p in self.network.parameters() if p.grad is not None]
         total = torch.stack(norms).norm() if norms else torch.zeros(())
         if not bool(torch.isfinite(total)) and not self._scales_gradients():
@@ -91,7 +86,6 @@ class PrunerTraining(lightning.LightningModule):
         self.log_dict({f"validation/{k}": v for k, v in self.evaluation.figures.items()}, batch_size=1, sync_dist=True)
 
     def configure_optimizers(self) -> Any:
-        """Adam and its schedule."""
         o = self.optimisation
         adam = torch.optim.Adam(self.network.parameters(), lr=o.learning_rate, weight_decay=o.weight_decay)
         schedule = torch.optim.lr_scheduler.LambdaLR(adam, lambda step: o.factor(step))
@@ -123,17 +117,10 @@ def load_best(folder: Path, module: PrunerTraining) -> int:
 
 
 def train(
-    module: PrunerTraining,
-    batches: Callable[[int, int, int], DataLoader[Any]],
-    folder: Path,
-    trainer: Mapping[str, Any],
-    *,
-    every: int,
-    checkpoint_every: int,
-    patience: int | None,
-    monitor: str,
+    module: PrunerTraining, batches: Callable[[int, int, int], DataLoader[Any]], folder: Path,
+    trainer: Mapping[str, Any], *, every: int, checkpoint_every: int, patience: int | None, monitor: str,
     callbacks: tuple[Callback, ...] = (),
-) -> tuple[int, float]:
+) -> tuple[int, float]:  # fmt: skip
     """Train in `folder`, going on from its last checkpoint; returns the steps and seconds made in all.
 
     Args:
@@ -167,7 +154,12 @@ def train(
         )  # fmt: skip
         if step < total:
             own = batches(step, lightning_trainer.global_rank, lightning_trainer.world_size)
-            lightning_trainer.fit(module, own, DataLoader(_Once(), batch_size=None), ckpt_path=path, weights_only=True)
+            validation: DataLoader[Any] = DataLoader(_Once(), batch_size=None)
+            try:
+                lightning_trainer.fit(module, own, validation, ckpt_path=path, weights_only=True)
+            except SystemExit:  # which Lightning makes of Ctrl-C
+                kept = f"step {latest_checkpoint(folder)[1]} of {total} is kept in {folder}"
+                raise KeyboardInterrupt(kept) from None
             step = lightning_trainer.global_step
     return step, module.seconds
 
@@ -183,7 +175,6 @@ class _ResumableCheckpoint(ModelCheckpoint):
         self.validated_every = validated_every
 
     def on_train_batch_end(self, trainer: lightning.Trainer, *_: Any) -> None:
-        """Save after a step that no validation follows."""
         if trainer.global_step % self.validated_every:
             super().on_train_batch_end(trainer, trainer.lightning_module, {}, None, 0)
 
@@ -236,7 +227,6 @@ class _TrainingBar(Callback):
         self._figure = ""
 
     def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
-        """Opens the bar, on rank zero."""
         if trainer.is_global_zero:
             self._progress = progress_bars()
             self._progress.start()
@@ -245,7 +235,6 @@ class _TrainingBar(Callback):
     def on_train_batch_end(
         self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        """Moves the bar."""
         if self._progress is not None and self._bar is not None:
             loss = outputs["loss"] if isinstance(outputs, dict) else outputs
             text = f"training: loss {float(loss):.3f}{self._figure}"
@@ -258,7 +247,6 @@ class _TrainingBar(Callback):
             self._figure = f", {self.monitor} {float(value):.3f}"
 
     def teardown(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, stage: str) -> None:
-        """Closes the bar, however the training ended."""
         if self._progress is not None:
             self._progress.stop()
             self._progress = None

@@ -1,7 +1,5 @@
 """`MatchedPairs`: a data set of image pairs seen through a pipeline's first stages, with labels, kept on disk."""
 
-from __future__ import annotations
-
 import functools
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -16,15 +14,11 @@ from fmtorch.core.files import cache_dir
 from fmtorch.core.settings import claim
 from fmtorch.core.types import Correspondences
 from fmtorch.data.pairs import DepthDataset, ImagePair, PairDataset
-from fmtorch.jobs.execution import Execution
-from fmtorch.jobs.pool import WorkerPool
-from fmtorch.jobs.runner import Factory, Local, Source, TaskRunner
-from fmtorch.jobs.threads import use_one_thread
-from fmtorch.pipeline.build import load_pipeline
-from fmtorch.pipeline.pipeline import Outcome, Pipeline
-from fmtorch.runs.feature_cache import CachedFeatures
+from fmtorch.jobs.execution import Execution, use_one_thread
+from fmtorch.jobs.runner import Factory, Local, Source, TaskRunner, WorkerPool
+from fmtorch.pipeline.pipeline import Outcome, Pipeline, load_pipeline
+from fmtorch.runs import CachedFeatures, identity_digest
 from fmtorch.runs.fingerprint import configuration, environment
-from fmtorch.runs.run_folder import identity_digest
 from fmtorch.training import labelled
 from fmtorch.training.augmentation import Augmentation
 from fmtorch.training.stored_matches import FORMAT, Shard, ShardError, StoredMatches, write_shard
@@ -35,7 +29,8 @@ SHARD = 32  # pairs in a file, all of one scene: what an interruption can cost; 
 PRELOADED = (__name__,)  # by the process that workers are forked of
 _IMAGES = 64  # whose features each worker may need again
 _STORED = {
-    **dict.fromkeys(("x0", "x1", "quality", "prior", "noise", "lafs0", "lafs1"), torch.float32), "mutual": torch.uint8,
+    **dict.fromkeys(("x0", "x1", "ratio", "score", "prior", "noise", "lafs0", "lafs1"), torch.float32),
+    "mutual": torch.uint8,
     **dict.fromkeys(("K0", "K1"), torch.float64), **dict.fromkeys(("size0", "size1"), torch.int64),
 }  # fmt: skip
 
@@ -55,7 +50,7 @@ class MatchedPairs(StoredMatches):
         overrides: changes of a named pipeline, as on the command line, e.g. ``["pruner=[one_to_one]"]``.
         root: the folder of such folders, by default ``matched`` in the cache folder.
         workers: threads, by default one a core. progress: called with (pairs done, pairs in all).
-        most: matches kept of a pair, the best by quality.
+        most: matches kept of a pair, the least ambiguous.
         augmentation, seed: as of `StoredMatches`.
         execution: other workers than these threads. build: makes the pipeline in other processes, where it is given as
             an object; pickled, as is the data set.
@@ -73,20 +68,11 @@ class MatchedPairs(StoredMatches):
     """
 
     def __init__(
-        self,
-        dataset: PairDataset,
-        pipeline: Pipeline | str,
-        *,
-        overrides: Sequence[str] = (),
-        root: str | Path | None = None,
-        workers: int | None = None,
-        progress: Progress | None = None,
-        most: int = MAX_MATCHES,
-        augmentation: Augmentation | None = None,
-        seed: int = 0,
-        execution: Execution | None = None,
-        build: Callable[[], Pipeline] | None = None,
-    ) -> None:
+        self, dataset: PairDataset, pipeline: Pipeline | str, *, overrides: Sequence[str] = (),
+        root: str | Path | None = None, workers: int | None = None, progress: Progress | None = None,
+        most: int = MAX_MATCHES, augmentation: Augmentation | None = None, seed: int = 0,
+        execution: Execution | None = None, build: Callable[[], Pipeline] | None = None,
+    ) -> None:  # fmt: skip
         if most < 1:
             raise ValueError(f"most is {most}; at least 1 match of a pair must be kept")
         if not len(dataset):
@@ -121,7 +107,6 @@ class MatchedPairs(StoredMatches):
 
 
 def _identity(dataset: PairDataset, stages: Pipeline, most: int) -> dict[str, Any]:
-    """What defines the matches and their labels, as plain values."""
     extractor = stages.extractor
     if isinstance(extractor, CachedFeatures):
         extractor = extractor.extractor
@@ -140,7 +125,6 @@ def _identity(dataset: PairDataset, stages: Pipeline, most: int) -> dict[str, An
 
 
 def _sound(path: Path, pairs: int) -> bool:
-    """Whether a file is there and whole, with so many pairs; of a damaged one a warning tells."""
     if not path.exists():
         return False
     try:
@@ -169,7 +153,7 @@ class Matching(NamedTuple):
     """What pairs are matched and labelled by.
 
     dataset: where they are from. pipeline: its stages before estimation are run. most: matches kept of a pair, the best
-    by quality.
+    by ratio.
     """
 
     dataset: PairDataset
@@ -198,14 +182,9 @@ def _matching_in_process(dataset: PairDataset, build: Callable[[], Pipeline], mo
 
 
 def compute_shards(
-    dataset: PairDataset,
-    stages: Pipeline,
-    build: Callable[[], Pipeline] | None,
-    jobs: Sequence[Job],
-    *,
-    most: int,
+    dataset: PairDataset, stages: Pipeline, build: Callable[[], Pipeline] | None, jobs: Sequence[Job], *, most: int,
     execution: Execution,
-) -> Iterator[int]:
+) -> Iterator[int]:  # fmt: skip
     """Write each job's shard; yields the number of its pairs when it is written.
 
     Args:
@@ -261,11 +240,11 @@ def _row(dataset: PairDataset, outcome: Outcome, most: int) -> dict[str, Any]:
 
 
 def _best(c: Correspondences, most: int) -> Correspondences:
-    """The `most` matches of the lowest quality of a single pair, in their order (the first ones without a quality)."""
+    """The `most` least ambiguous matches of a single pair, in their order (the first ones where nothing ranks them)."""
     n = c.x0.shape[1]
     if n <= most:
         return c
-    rank = torch.arange(n) if c.quality is None else torch.argsort(c.quality[0], stable=True)
+    rank = torch.arange(n) if c.ambiguity is None else torch.argsort(c.ambiguity[0], stable=True)
     kept = torch.zeros_like(c.mask)
     kept[0, rank[:most]] = True
     return c.keep(kept).compact()

@@ -5,8 +5,6 @@ no true geometry) adds zero to loss and gradient; where that holds for all pairs
 the graph. So no training step needs to be skipped.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch
@@ -16,9 +14,11 @@ from torch import Tensor
 from fmtorch.geometry.arithmetic import matmul3, stable_sum
 from fmtorch.geometry.eight_point import eight_point
 from fmtorch.geometry.epipolar import residual_and_normals, unit_largest
-from fmtorch.jit.random import Stream, uniform
+from fmtorch.jit.batches import for_each_pair
+from fmtorch.jit.kernel import F8x1, F8x2, I8x1, kernel
+from fmtorch.jit.random import Stream, mixed_seed, stream_state, uniform_kernel
 from fmtorch.metrics import nsgd
-from fmtorch.metrics.nsgd import BORDER, Chord, from_centre, lines
+from fmtorch.metrics.nsgd import BORDER, line_of, segment_in_image
 from fmtorch.pruning.networks.learned import Prediction
 from fmtorch.training.labelled import LabelledMatches
 from fmtorch.training.options import ObjectiveWeights
@@ -257,20 +257,35 @@ def virtual_points(
     """
     if count < 1:
         raise ValueError(f"count is {count}; it must be at least 1")
-    with torch.no_grad():
-        F = F.to(torch.float64)
-        valid = F.isfinite().all(-1).all(-1)
-        F = unit_largest(torch.where(valid[:, None, None], F, 0.0))
-        height0, width0 = size0.to(torch.float64)[:, None].unbind(-1)
-        key = torch.zeros(len(F), dtype=torch.int64, device=F.device) if key is None else key
-        u, v, along = uniform(seed, key, Stream.TRAINING, 0, TRIES * count, 3).unbind(-1)
-        x0, size1 = torch.stack([u * width0, v * height0], -1) + BORDER, size1.to(torch.float64)
-        chord = Chord.of(lines(from_centre(F, size1, BORDER), *x0.unbind(-1)), size1)
-        x1 = torch.stack(chord.at(along), -1) + (size1.flip(-1) / 2 + BORDER)[:, None]
-        order = torch.argsort((~chord.hits).to(torch.uint8), dim=1, stable=True)[:, :count]
-        mask = chord.hits.gather(1, order)
-        x0, x1 = (torch.where(mask[..., None], x.gather(1, order[..., None].expand(-1, -1, 2)), 0.0) for x in (x0, x1))
-    return VirtualPoints(x0, x1, mask)
+    F = F.detach().to(torch.float64)
+    valid = F.isfinite().all(-1).all(-1)
+    F = unit_largest(torch.where(valid[:, None, None], F, 0.0))
+    key = torch.zeros(len(F), dtype=torch.int64) if key is None else key
+    tensors, out = (F, size0.double(), size1.double(), key[:, None]), torch.empty(len(F), count, 5, dtype=torch.float64)
+    points = for_each_pair(points_on_lines, tensors, mixed_seed(seed, Stream.TRAINING), out=out, kind=torch.float64)
+    return VirtualPoints(points[..., :2], points[..., 2:4], points[..., 4] > 0)
+
+
+@kernel
+def points_on_lines(F: F8x2, size0: F8x1, size1: F8x1, key: I8x1, mixed_seed: int, out: F8x2) -> None:
+    """The `virtual_points` of a pair, x0, y0, x1, y1, 1 -> out (count, 5); 0 past the last.
+
+    mixed_seed: of the seed and the stream.
+    """
+    state, count = stream_state(mixed_seed, key[0]), 0
+    out[:] = 0
+    for draw in range(TRIES * len(out)):
+        if count == len(out):
+            break
+        x0 = uniform_kernel(state, 3 * draw) * size0[1] + BORDER
+        y0 = uniform_kernel(state, 3 * draw + 1) * size0[0] + BORDER
+        share = uniform_kernel(state, 3 * draw + 2)
+        a, b, c = line_of(F, x0, y0)
+        left, top, right, bottom, hits = segment_in_image(a, b, c, size1, BORDER)
+        if hits:
+            out[count, 0], out[count, 1], out[count, 4] = x0, y0, 1
+            out[count, 2], out[count, 3] = left + share * (right - left), top + share * (bottom - top)
+            count += 1
 
 
 def _mean_over_pairs(value: Float[Tensor, "*stages b"], counted: Bool[Tensor, "*#stages b"]) -> Float[Tensor, ""]:

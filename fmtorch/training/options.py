@@ -3,8 +3,6 @@
 Nothing here imports a library, for which ``--help`` would wait.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
@@ -144,7 +142,10 @@ class ValidationOptions:
     """How a training is validated."""
 
     every: Count = option(250, "steps")
-    scenes: Count = option(4, "the last training scenes of each family, which are not trained on")
+    scenes: Count | None = option(
+        None,
+        "the last training scenes of each family, not trained on; null: 4, a quarter where it has fewer than 16",
+    )
     roots: list[str] = option([], "further folders in the layout of fmbench")
     pairs: Count = option(25, "of each family at most")
     ratio: float = option(0.8, "threshold of the ratio test")

@@ -5,27 +5,23 @@ depth of every point of its views is known; but the matches of one plane determi
 Zisserman, section 11.9), so that these pairs train the classification of matches alone.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import itertools
 import json
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from torch.utils.data import Dataset
 
 from fmtorch.core.files import cache_dir, replacing
+from fmtorch.data import ImagePair, ImageSource, PairDataset, read_image
 from fmtorch.data.cameras import relative_pose
-from fmtorch.data.images import read_image
-from fmtorch.data.pairs import ImagePair, ImageSource
-from fmtorch.scenes.camera import Camera, calibration
+from fmtorch.scenes.raycast import Camera, calibration
 from fmtorch.training.options import PlaneViews as PlaneViews
 
 SUFFIXES = {".jpg", ".jpeg", ".png", ".ppm", ".tif", ".tiff"}
@@ -79,7 +75,7 @@ def list_photographs(
     return kept
 
 
-class PlanePairs(Dataset[ImagePair]):
+class PlanePairs(PairDataset):
     """Pairs of views of photographs, each photograph a plane; a `DepthDataset`. F is zero: none is determined.
 
     The plane goes on past the photograph's edges as its mirror image. Light, focus, noise and compression of each view
@@ -97,15 +93,9 @@ class PlanePairs(Dataset[ImagePair]):
     name = "planes"
 
     def __init__(
-        self,
-        photographs: Sequence[Photograph],
-        views: PlaneViews | None = None,
-        seed: int = 0,
-        root: str | Path | None = None,
-        *,
-        workers: int = 1,
-        progress: Callable[[int, int], None] | None = None,
-    ) -> None:
+        self, photographs: Sequence[Photograph], views: PlaneViews | None = None, seed: int = 0,
+        root: str | Path | None = None, *, workers: int = 1, progress: Callable[[int, int], None] | None = None,
+    ) -> None:  # fmt: skip
         if not photographs:
             raise ValueError("no photographs to look at")
         self.views = views or PlaneViews()
@@ -144,9 +134,6 @@ class PlanePairs(Dataset[ImagePair]):
             identity=f"{self.name}/{scene}/{i}-{j}", family=self.name, scene=scene, image0=images[0], image1=images[1],
             F=np.zeros((3, 3)), K0=camera0.K, K1=camera1.K, R=R, t=t,
         )  # fmt: skip
-
-    def __iter__(self) -> Iterator[ImagePair]:
-        return (self[index] for index in range(len(self)))
 
     def depth(self, image: ImageSource, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Depth (n,), in longest sides of the photograph, at points (n, 2) of a view; NaN outside of it."""

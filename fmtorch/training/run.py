@@ -1,7 +1,5 @@
 """`fmtorch train`: a composed config -> labelled matches, a trained network, its files and its card."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import hashlib
@@ -25,19 +23,14 @@ from fmtorch.core.options import expect_options
 from fmtorch.core.settings import claim
 from fmtorch.core.terminal import console, progress_bars, reporter
 from fmtorch.core.version import __version__
-from fmtorch.data import ImagePair, PairDataset
+from fmtorch.data import ImagePair, PairDataset, subset
 from fmtorch.data.construction import ENOUGH
-from fmtorch.data.pairs import subset
 from fmtorch.evaluation.run import select
 from fmtorch.pipeline.pipeline import Pipeline
-from fmtorch.presets import plain
-from fmtorch.presets.executors import execution_of
-from fmtorch.presets.fields import read_fields
-from fmtorch.runs.feature_cache import cached
-from fmtorch.runs.run_folder import identity_digest
+from fmtorch.presets.composition import execution_of, plain, read_fields
+from fmtorch.runs import cached, identity_digest
 from fmtorch.scenes import RenderedPairs
 from fmtorch.training.augmentation import Augmentation, keep_ratio
-from fmtorch.training.batches import training_batches
 from fmtorch.training.export import Result, write_result
 from fmtorch.training.labelled import LabelledMatches
 from fmtorch.training.loop import PrunerTraining, ValidationPictures, load_best, train
@@ -45,9 +38,11 @@ from fmtorch.training.matched_pairs import MatchedPairs
 from fmtorch.training.objective import Objective
 from fmtorch.training.options import TrainOptions
 from fmtorch.training.planes import Photograph, PlanePairs, list_photographs
-from fmtorch.training.stored_matches import StoredMatches, last_scenes
+from fmtorch.training.stored_matches import StoredMatches, last_scenes, training_batches
 from fmtorch.training.validation import Use, Validation
 
+FEW = 500  # pairs to train on, below which no useful network is to be expected
+MORE = "dataset.size=full renders 3,200 pairs, dataset=fmbench dataset.root=FOLDER are your own"
 PICTURES = 4  # validation pairs that are drawn into the log
 
 
@@ -82,7 +77,9 @@ def run(config: DictConfig, name: str) -> Path:
     first = int(os.environ.get("LOCAL_RANK", "0")) == 0  # of several processes the one that reports
     if first:
         about = f"{len(matches.training)} pairs to train on, {len(matches.validation)} to validate on"
-        console.print(f"{about}; {folder}", highlight=False, markup=False)
+        console.print(f"{about}; {folder}", highlight=False, markup=False, soft_wrap=True)
+        if len(matches.training) < FEW:
+            console.print(f"so few pairs show that it runs, and teach little; {MORE}", highlight=False, soft_wrap=True)
     shown = matches.validation[:: max(1, len(matches.validation) // PICTURES)][:PICTURES]
     steps, seconds = train(
         module,
@@ -115,12 +112,16 @@ def report(result: Result, name: str) -> None:
 
 
 def use_line(name: str, file: Path, words: Sequence[str]) -> str:
-    """The command that uses a learned file as a prior, by which it serves best. words: of the training's command."""
+    """The command that uses a learned file as a prior, by which it serves best. words: of the training's command.
+
+    Options are given with ``++``, since a preset of a user's own need not have them.
+    """
     folders = [shlex.quote(b) for a, b in itertools.pairwise(words) if a in ("--config-dir", "-cd")]
     folders += [shlex.quote(word.partition("=")[2]) for word in words if word.startswith("--config-dir=")]
-    stages = f"'pruner=[ratio,one_to_one,{name}]' pruner.{name}.file={shlex.quote(str(file))}"
+    network = [shlex.quote(word) for word in words if word.lstrip("+").startswith(f"pruner.{name}.network.")]
+    values = [f"++pruner.{name}.file={shlex.quote(str(file))}", *network, f"++pruner.{name}.soft=true"]
     start = " ".join(["python -m fmtorch.eval", *(f"--config-dir {folder}" for folder in folders)])
-    return f"{start} pipeline=sift_ratio estimator=fmtorch {stages} pruner.{name}.threshold=null"
+    return f"{start} pipeline=sift_ratio estimator=fmtorch 'pruner=[ratio,one_to_one,{name}]' {' '.join(values)}"
 
 
 def network_of(config: DictConfig, name: str) -> dict[str, Any]:
@@ -165,7 +166,7 @@ def labelled_matches(config: DictConfig, options: TrainOptions, progress: Progre
     chosen, held_out = _split(dataset, validated.scenes)
     chosen = _limited(dataset, chosen, config.limit)
     if not chosen:
-        raise ValueError(f"no pairs to train on: {validated.scenes} scenes of each family are for validation")
+        raise ValueError("no pairs to train on: the scenes are for validation; give a smaller validation.scenes")
     front = _front(config)
 
     def matched(source: PairDataset, indices: Sequence[int], what: str) -> StoredMatches:
@@ -195,8 +196,7 @@ def labelled_matches(config: DictConfig, options: TrainOptions, progress: Progre
     description = {
         "training": f"{len(training)} pairs of {_scenes(training)} scenes of {dataset.name}",
         "validation": ", ".join(f"{count} pairs of {family}" for family, count in families.items())
-        + f" (of {dataset.name} the last {validated.scenes} scenes of each family, which share photographs "
-        "with the training scenes)",
+        + f" (of {dataset.name} the last scenes of each family, which may share photographs with the training scenes)",
     }
     if photographs:
         workers, report = config.workers or os.cpu_count() or 1, reporter(progress, "views of photographs")
@@ -218,7 +218,7 @@ def _dataset(config: DictConfig, progress: Progress) -> PairDataset:
     return data.build(options, reporter(progress, "drawing scenes"))
 
 
-def _split(dataset: PairDataset, last: int) -> tuple[list[int], list[int]]:
+def _split(dataset: PairDataset, last: int | None) -> tuple[list[int], list[int]]:
     """Indices of the pairs to train on, and of those in the last scenes of each family."""
     pairs = [dataset[i] for i in range(len(dataset))]
     held = last_scenes(((pair.family, pair.scene) for pair in pairs), last)

@@ -1,7 +1,5 @@
 """How good a pruner is: through real estimators on whole pairs, not by its loss alone."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
@@ -57,12 +55,9 @@ class Validation:
     """
 
     def __init__(
-        self,
-        pairs: Sequence[LabelledMatches],
-        uses: Mapping[str, Use],
-        families: Sequence[str] | None = None,
+        self, pairs: Sequence[LabelledMatches], uses: Mapping[str, Use], families: Sequence[str] | None = None,
         seed: int = 0,
-    ) -> None:
+    ) -> None:  # fmt: skip
         if not pairs:
             raise ValueError("validation needs at least one pair; see validation.scenes and validation.roots")
         self.pairs, self.uses, self.seed = list(pairs), dict(uses), seed

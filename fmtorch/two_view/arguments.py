@@ -16,7 +16,9 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from fmtorch.core.checks import as_tensor
+from fmtorch.core.annotations import Rule
+from fmtorch.core.checks import MIN_MATCHES, as_tensor, expect_inside, widened
+from fmtorch.core.options import nearest
 from fmtorch.core.types import Correspondences, collate
 from fmtorch.geometry.cameras import calibration_problems
 
@@ -30,13 +32,16 @@ PER_MATCH = {name: len(Correspondences.declared[name].shape) - 1 for name in Cor
 """The dimensions of what has an entry for each match, of one pair."""
 FORMS = "None, 'unknown', 'shared', (px, deviation) or ((px, deviation), (px, deviation))"
 FORMS_WITH_K = "None, 'unknown', 'shared', or the relative deviations of the focal lengths of K: one, two, or (B, 2)"
+RATIO = Rule(
+    lambda ratio: ~((ratio < 0) | (ratio > 1 + 1e-6)),
+    "it is the distance of the nearest descriptor over that of the second nearest, within [0, 1]. Of raw distances, "
+    "such as DMatch.distance, give none, or as `ratio` quotients; `score` is a confidence in [0, 1], larger is better",
+)
 UNKNOWN = (1.0, math.inf)  # px, relative deviation
 LENS_FORMS = "None, 'unknown', 'shared', lambda, (lambda, deviation) or ((lambda, deviation), (lambda, deviation))"
 UNKNOWN_LENS = (0.0, math.inf)  # lambda, deviation
 MIN_PIXELS = 10.0  # a photograph's points reach farther from its first pixel
-MIN_MATCHES = 8  # fewer say nothing of their unit
-MAX_OUTSIDE = 0.5  # fraction of points outside an image of the given size: some are undistorted far beyond its border
-SWAPPED = 0.05  # fraction outside from which on a size is taken for (w, h), if all points are inside then
+FOCAL_NAMES = ("shared", "unknown")
 
 
 def correspondences(
@@ -47,14 +52,16 @@ def correspondences(
     K1: Arrays | None = None,
     focal: Focal = None,
     lens: Lens = None,
+    plane: bool = False,
     **fields: Arrays | int | None,
 ) -> Correspondences:
     """The batch that points and what is known of them and of the cameras describe.
 
     Args:
         x0, x1: (N, 2) of one pair, (B, N, 2) of a padded batch, or a list of (N, 2) of different N, in pixels. Whole
-            numbers become float64; x0 decides the device.
+            numbers become float64, half precision float32; x0 decides the device.
         K0, K1, focal, lens: as of `fmtorch.find_fundamental`.
+        plane: x0 may be in the unit of a plane.
         fields: of `Correspondences`, or None. Per-match fields come in the form of the points. A size is one for all
             pairs, (2,), or one each, (B, 2), and so is a key.
 
@@ -64,14 +71,24 @@ def correspondences(
     """
     cameras = camera_fields(K0, K1, focal, fields.get("size0") is not None)
     c = _batch(x0, x1, {**fields, **cameras, **lens_fields(lens)})
-    _expect_calibrations(c)
-    expect_values(c)
-    _expect_pixels(c)
+    expect_plausible(c, plane)
     return c
+
+
+def expect_plausible(c: Correspondences, plane: bool = False) -> None:
+    """Raise ValueError naming the first value that cannot be, or where points contradict their unit, K or size.
+
+    plane: x0 may be in the unit of a plane.
+    """
+    _expect_calibrations(c)
+    expect_values(c, ratio=RATIO)
+    _expect_pixels(c, plane)
 
 
 def _batch(x0: Arrays, x1: Arrays, fields: Mapping[str, Any]) -> Correspondences:
     """Points and what is known of them as tensors of a batch."""
+    if fields.get("mask") is None:
+        x0, x1 = _one_pair(x0), _one_pair(x1)
     ragged = [name for name, value in (("x0", x0), ("x1", x1)) if _is_list_of_pairs(value)]
     if len(ragged) == 1:
         raise ValueError(f"{ragged[0]} is a list of pairs and the other is not; both must be, or neither")
@@ -99,10 +116,17 @@ def _is_list_of_pairs(value: object) -> bool:
     return isinstance(value, list | tuple) and (not value or getattr(value[0], "ndim", _depth(value[0])) >= 2)
 
 
+def _one_pair(points: Any) -> Any:
+    """A list of (1, 2), as a loop over OpenCV's points makes it, as (N, 2); anything else as it is."""
+    if not isinstance(points, list | tuple) or len(points) < 2 or any(np.shape(each) != (1, 2) for each in points):
+        return points
+    return [each[0] for each in points]
+
+
 def _depth(value: object) -> int:
     """How deeply lists are nested."""
     if not isinstance(value, list | tuple):
-        return 0
+        return int(hasattr(value, "pt"))  # a keypoint of OpenCV
     return 1 + (_depth(value[0]) if value else 0)
 
 
@@ -110,7 +134,9 @@ def _points(value: object, name: str) -> Tensor:
     points = as_tensor(value, name)
     if points.dim() not in (2, 3) or points.shape[-1] != 2:
         raise ValueError(f"{name} has shape {tuple(points.shape)}; it must be (N, 2) or (B, N, 2)")
-    return points if points.is_floating_point() else points.to(torch.float64)
+    if points.dtype == torch.bool:
+        raise TypeError(f"{name} holds booleans; it must hold coordinates in pixels")
+    return widened(points)
 
 
 def _field(name: str, value: object, single: bool, points: Tensor) -> Tensor:
@@ -118,10 +144,14 @@ def _field(name: str, value: object, single: bool, points: Tensor) -> Tensor:
     tensor = as_tensor(value, name).to(points.device)
     if name == "key" and tensor.is_floating_point():
         raise ValueError(f"key is of {tensor.dtype}; it must be whole numbers (`pair_key` makes them)")
-    tensor = tensor.to(torch.int64) if name == "key" else tensor
+    declared = Correspondences.declared[name]
+    if name == "key":
+        tensor = tensor.to(torch.int64)
+    elif not declared.holds(tensor.dtype) or tensor.is_floating_point():
+        tensor = tensor.to(torch.bool) if name in ("mask", "mutual") else widened(tensor)
     if name in PER_MATCH:
         return tensor[None] if single and tensor.dim() == PER_MATCH[name] else tensor
-    shape = tuple(map(int, Correspondences.declared[name].shape[1:]))
+    shape = tuple(map(int, declared.shape[1:]))
     if tuple(tensor.shape) in (shape, (1, *shape)):
         return tensor.expand(len(points), *shape)
     if tuple(tensor.shape) != (len(points), *shape):
@@ -168,9 +198,12 @@ def _one_of_list(i: int, x0: Any, x1: Any, fields: Mapping[str, Any]) -> Corresp
         raise type(error)(f"pair {i}: {error}") from error
 
 
-def expect_values(c: Correspondences) -> None:
-    """Raises ValueError naming the first wrong value of the real matches of a batch; a GPU is asked but once."""
-    rules = {name: field.bounds for name, field in c.declared.items() if field.bounds}
+def expect_values(c: Correspondences, **more: Rule) -> None:
+    """Raises ValueError naming the first wrong value of the real matches of a batch; a GPU is asked but once.
+
+    more: rules beside those of the fields.
+    """
+    rules = {name: field.bounds for name, field in c.declared.items() if field.bounds} | more
     wrong = {
         name: ~rule.holds(value.detach()) & (c.mask if name in PER_MATCH else True)
         for name, rule in rules.items()
@@ -193,6 +226,9 @@ def camera_fields(K0: Arrays | None, K1: Arrays | None, focal: Focal, sizes_know
 
     Raises ValueError or TypeError, naming the argument.
     """
+    if isinstance(focal, str) and focal not in FOCAL_NAMES:
+        near = nearest(focal, FOCAL_NAMES).split(", ")[0]
+        raise ValueError(f"focal is {focal!r}; it must be {FORMS}; did you mean {near!r}?")
     if K0 is None and K1 is None and (focal is None or isinstance(focal, Mapping)):
         return {}
     if not sizes_known and (K0 is None or K1 is None):
@@ -234,8 +270,6 @@ def _expect_calibrations(c: Correspondences) -> None:
 
 def _named(focal: str) -> dict[str, Any]:
     """Fields where no focal length is known."""
-    if focal not in ("shared", "unknown"):
-        raise ValueError(f"focal is {focal!r}; it must be {FORMS}")
     nothing = torch.tensor([UNKNOWN, UNKNOWN], dtype=torch.float64)
     return {"focal": nothing} if focal == "unknown" else {"focal": nothing, "shared_focal": torch.tensor(True)}
 
@@ -266,26 +300,32 @@ def _deviations(focal: Any, known0: bool, known1: bool) -> Tensor:
 
 
 def _floating(value: Any, name: str) -> Tensor:
-    tensor = as_tensor(value, name)
-    return tensor if tensor.is_floating_point() else tensor.to(torch.float64)
+    return widened(as_tensor(value, name))
 
 
-def _expect_pixels(c: Correspondences) -> None:
+def _expect_pixels(c: Correspondences, plane: bool) -> None:
     """Raise ValueError where the points of all pairs are obviously not in pixels, or contradict the image sizes.
 
     Of a batch in which some pairs are sound none is refused: no pair can take its batch down. Points of an image with a
-    calibration matrix may be in its unit, whatever that is.
+    calibration matrix may be in its unit, whatever that is, and those of a plane, too, if the others are in pixels.
     """
+    images = []
     for i, (x, K, size) in enumerate(((c.x0, c.K0, c.size0), (c.x1, c.K1, c.size1))):
         x = x.detach()
         mask = c.mask & torch.isfinite(x).all(-1)
         enough = mask.sum(1) >= MIN_MATCHES
-        if not bool(enough.any()):
-            continue
-        if bool(_normalized(x, mask, K)[enough].all()):
+        if bool(enough.any()):
+            images.append(
+                (i, x[enough], mask[enough], None if K is None else K[enough], None if size is None else size[enough])
+            )
+    strange = [bool(_normalized(x, mask, K).all()) for _, x, mask, K, _ in images]
+    if plane and strange == [True, False]:
+        return
+    for (i, x, mask, K, size), normalized in zip(images, strange, strict=True):
+        if normalized:
             _refuse(x, mask, i, K is not None)
         if size is not None:
-            _expect_inside(x[enough], mask[enough], size.detach()[enough], i)
+            expect_inside(x, mask, size, f"x{i}", f"size{i}")
 
 
 def _normalized(x: Float[Tensor, "b n 2"], mask: Bool[Tensor, "b n"], K: Tensor | None) -> Bool[Tensor, " b"]:
@@ -311,23 +351,3 @@ def _refuse(x: Tensor, mask: Tensor, i: int, calibrated: bool) -> None:
         f"x{i} runs {span}: no pixels, in which thresholds are, so that every match would be an inlier. Give points in "
         "pixels (times the focal length), or normalised ones to find_essential with K0 and K1 the identity"
     )
-
-
-def _expect_inside(x: Float[Tensor, "b n 2"], mask: Bool[Tensor, "b n"], size: Tensor, i: int) -> None:
-    """Raise ValueError where the points of all pairs contradict the image's size (b, 2), h and w."""
-    far = _outside(x, mask, size.flip(-1))
-    swapped = (far > SWAPPED) & (_outside(x, mask, size) == 0)
-    if not bool(((far > MAX_OUTSIDE) | swapped).all()):
-        return
-    h, w = size[0].tolist()
-    hint = "; sizes are (h, w), and it looks like (w, h)" if bool(swapped[0]) else "; sizes are (h, w) in pixels"
-    raise ValueError(
-        f"size{i} is ({h:g}, {w:g}), but {100 * float(far[0]):.0f} % of x{i} lie outside such an image{hint}"
-    )
-
-
-def _outside(x: Float[Tensor, "b n 2"], mask: Bool[Tensor, "b n"], width_height: Tensor) -> Float[Tensor, " b"]:
-    """The share of points beyond the border, of the first pixel's centre and of the last one's, by a pixel."""
-    limit = width_height.to(x.device)[:, None]
-    beyond = ((x < -1) | (x > limit)).any(-1) & mask
-    return beyond.sum(1) / mask.sum(1)

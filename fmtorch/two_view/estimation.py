@@ -18,11 +18,10 @@ from fmtorch.estimators.ransac import Ransac
 from fmtorch.geometry.significance import judged
 from fmtorch.jit import kernel
 from fmtorch.jit.together import compile_together
-from fmtorch.jobs.threads import one_thread
+from fmtorch.jobs.execution import one_thread
 from fmtorch.presets.files import load
 from fmtorch.presets.objects import construct, instantiate, merged
-from fmtorch.pruning.frame_consistency import FrameConsistency
-from fmtorch.pruning.position_consistency import PositionConsistency
+from fmtorch.pruning.consistency import FrameConsistency, PositionConsistency
 from fmtorch.two_view.assumed_sizes import attempts_of, better_of
 from fmtorch.two_view.known_cameras import KnownCameras
 
@@ -88,7 +87,7 @@ def _expect_lenses(c: Correspondences, estimator: Estimator, name: str) -> None:
 def _with_prior(c: Correspondences, estimator: Estimator) -> Correspondences:
     """The matches with a prior of their consistency where the estimator uses one and none is given."""
     if c.prior is None and getattr(estimator, "uses_prior", False):
-        framed = c.lafs0 is not None and c.lafs1 is not None and c.quality is not None
+        framed = c.lafs0 is not None and c.lafs1 is not None and c.ambiguity is not None
         pruner = _consistency(framed)
         if kernel.available():
             compile_together([*getattr(pruner, "kernels", ()), *getattr(estimator, "kernels", ())])

@@ -2,24 +2,51 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import functools
+import sys
+import warnings
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, ParamSpec, TypeVar, cast
 
-from fmtorch.core.types import Estimate
+from fmtorch.core.types import CONTRADICTED, Estimate, PoseEstimate
+from fmtorch.jobs.execution import one_thread
 from fmtorch.two_view.arguments import Arrays, Focal, Lens, correspondences
 from fmtorch.two_view.assumed_sizes import Size, given_sizes
 from fmtorch.two_view.estimation import estimated
-from fmtorch.two_view.pair_type import with_configuration
+from fmtorch.two_view.pair_type import with_pair_type
+from fmtorch.two_view.planes import homographies
+
+P = ParamSpec("P")
+R = TypeVar("R")
 
 
+def eager(function: Callable[P, R]) -> Callable[P, R]:
+    """The function, which `torch.compile` calls instead of tracing it: gradients pass, the graph ends before it.
+
+    `torch.compiler.disable` would import the compiler, for a second and more, into programs that have no use for it.
+    """
+
+    @functools.wraps(function)
+    def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        dynamo = sys.modules.get("torch._dynamo")
+        run = function if dynamo is None else cast(Callable[P, R], dynamo.disable(function))
+        return run(*args, **kwargs)
+
+    call._torchdynamo_disable = True  # type: ignore[attr-defined]
+    return call
+
+
+@eager
+@one_thread("cpu")
 def find_fundamental(
     x0: Arrays,
     x1: Arrays,
     *,
     estimator: str = "fmtorch",
     mask: Arrays | None = None,
-    quality: Arrays | None = None,
+    ratio: Arrays | None = None,
+    score: Arrays | None = None,
     prior: Arrays | None = None,
     lafs0: Arrays | None = None,
     lafs1: Arrays | None = None,
@@ -31,7 +58,7 @@ def find_fundamental(
     focal: Focal = None,
     lens: Lens = None,
     covariance: bool = False,
-    configuration: bool = False,
+    pair_type: bool = False,
     key: Arrays | int | None = None,
     seed: int = 0,
     config_dir: Path | str | None = None,
@@ -45,9 +72,10 @@ def find_fundamental(
         estimator: a preset of conf/estimator.
         mask: (B, N), True for real matches; all when not given. Like all that is told of matches it may come without
             the leading B for one pair, and comes as a list where the points do.
-        quality: (B, N), the matcher's figure, smaller is better (a distance ratio).
+        ratio: (B, N), the distance of the nearest descriptor over that of the second nearest, smaller is better.
+        score: (B, N), the matcher's confidence in [0, 1], larger is better; used where there is no ratio.
         prior: (B, N), P(inlier) in [0, 1]. Where an estimator uses a prior and none is given, it is derived from the
-            frames and the quality, if both are given, otherwise from the points and, if given, the quality.
+            frames and the ratio or score, if known, otherwise from the points and the ratio or score, if known.
         lafs0, lafs1: (B, N, 2, 3) local affine frames.
         noise: (B, N), each match's standard deviation relative to a usual one's (`fmtorch.pruning.MatchNoise` derives
             it from frames).
@@ -75,10 +103,10 @@ def find_fundamental(
             at all; "shared": one unknown lambda, "unknown": one for each image; lambda, exactly; (lambda, s) up to a
             standard deviation s; ((lambda0, s0), (lambda1, s1)) or (B, 2, 2) for each image, None in place of an
             unknown one. Points and inliers are of the photographs, F, E and the pose of the pixels of pinholes. With
-            K0 or K1 it needs the image sizes. There are no gradients, covariance or configuration then.
+            K0 or K1 it needs the image sizes. There are no gradients, covariance or pair type then.
         covariance: whether the estimate has its covariance, which needs K0 and K1 or the image sizes. Where nothing is
             said of the cameras these are as of ``focal="unknown"``.
-        configuration: whether it has the configuration of each pair: general, planar, rotation, identical, unrelated.
+        pair_type: whether it has the type of each pair: general, planar, rotation, identical, unrelated.
         key: (B,) int64, selects each pair's random numbers.
         seed: of the random numbers.
         config_dir: a folder with presets of your own, ``<config_dir>/estimator/<name>.yaml``, which come first.
@@ -90,7 +118,7 @@ def find_fundamental(
         that is ok may be of images that show nothing in common: `related` tells. `sizes` are those that were assumed,
         and `warning` says where they are doubtful; `lens` (B, 2), lambdas where these are estimated. With K0, K1 or
         `focal` also focals, E, R and t, NaN where they are not determined; `deviation_degrees` says how far these may
-        be off and `warning` what the configuration leaves open.
+        be off and `warning` what the pair type leaves open.
 
     Raises:
         ValueError: for points of another shape, points that are no pixels or outside images of these sizes, a prior
@@ -112,26 +140,30 @@ def find_fundamental(
     if covariance and K0 is None and K1 is None and focal is None:
         focal = "unknown"
     if lens is not None:
-        _expect_lens(size0, K0 is not None or K1 is not None, covariance or configuration)
+        _expect_lens(size0, K0 is not None or K1 is not None, covariance or pair_type)
     h0w0, h1w1, assume_sizes = given_sizes(size0, size1)
     c = correspondences(
-        x0, x1, mask=mask, quality=quality, prior=prior, lafs0=lafs0, lafs1=lafs1, noise=noise, size0=h0w0,
+        x0, x1, mask=mask, ratio=ratio, score=score, prior=prior, lafs0=lafs0, lafs1=lafs1, noise=noise, size0=h0w0,
         size1=h1w1, K0=K0, K1=K1, focal=focal, lens=lens, key=key,
     )  # fmt: skip
     if isinstance(focal, Mapping):
         options["focal"] = focal
     estimate = estimated(c, "fundamental", estimator, config_dir, seed, options, covariance, assume_sizes)
-    return with_configuration(estimate, c, seed) if configuration else estimate
+    if estimate.contradicted is not None and bool(estimate.contradicted.any()):
+        pairs = estimate.contradicted.nonzero()[:, 0].tolist()
+        warnings.warn(f"pair {', '.join(map(str, pairs))}: {CONTRADICTED}", stacklevel=2)
+    return with_pair_type(estimate, c, seed) if pair_type else estimate
 
 
 def _expect_lens(size: Size, calibrated: bool, more: bool) -> None:
     """Raise ValueError where a lens has no place."""
     if more:
-        raise ValueError("lens is given: covariance and configuration are of pinholes; undistort the points for them")
+        raise ValueError("lens is given: covariance and pair_type are of pinholes; undistort the points for them")
     if isinstance(size, str) or (calibrated and size is None):
         raise ValueError("lens needs the image sizes, in whose half diagonals it is: give size0 and size1")
 
 
+@eager
 def find_essential(
     x0: Arrays,
     x1: Arrays,
@@ -142,7 +174,8 @@ def find_essential(
     lens: Lens = None,
     estimator: str = "fmtorch",
     mask: Arrays | None = None,
-    quality: Arrays | None = None,
+    ratio: Arrays | None = None,
+    score: Arrays | None = None,
     prior: Arrays | None = None,
     lafs0: Arrays | None = None,
     lafs1: Arrays | None = None,
@@ -150,12 +183,12 @@ def find_essential(
     size0: Size = None,
     size1: Size = None,
     covariance: bool = False,
-    configuration: bool = False,
+    pair_type: bool = False,
     key: Arrays | int | None = None,
     seed: int = 0,
     config_dir: Path | str | None = None,
     **options: Any,
-) -> Estimate:
+) -> PoseEstimate:
     """Robustly estimate the relative pose of two calibrated cameras: ``X1 = R X0 + t`` and ``E = [t]_x R``.
 
     Args:
@@ -168,18 +201,18 @@ def find_essential(
             points and the shape of pixels alone. What is not exact is estimated.
         lens: as of `find_fundamental`.
         size0, size1: image sizes (h, w), one for all pairs or (B, 2). Twice the principal point when not given.
-        estimator, mask, quality, prior, lafs0, lafs1, noise, covariance, configuration, key, seed, config_dir: as of
+        estimator, mask, ratio, score, prior, lafs0, lafs1, noise, covariance, pair_type, key, seed, config_dir: as of
             `find_fundamental`.
         options: replace values of the preset (``inlier_threshold=1.0``).
 
     Returns:
-        An `Estimate` with R (B, 3, 3), t (B, 3) of unit length with the inliers in front of both cameras, E (B, 3, 3),
-        focals (B, 2) and F. NaN where there is no pose. Gradients of all reach the points, prior, noise, K0 and K1.
-        Six matches are enough where K0 and K1 are exact, otherwise seven.
+        A `PoseEstimate` with R (B, 3, 3), t (B, 3) of unit length with the inliers in front of both cameras,
+        E (B, 3, 3), focals (B, 2) and F. NaN where there is no pose. Gradients of all reach the points, prior, noise,
+        K0 and K1. Six matches are enough where K0 and K1 are exact, otherwise seven.
 
     Raises:
-        ValueError: as `find_fundamental`; for a K0 or K1 of a single pair that is singular, not in pixels, or whose
-            principal point lies outside an image of known size. In a batch that pair is ``ok=False`` with a reason.
+        ValueError: as `find_fundamental`; for a K0 or K1 of a single pair that is singular or not in pixels. In a batch
+            that pair is ``ok=False`` with a reason.
         TypeError: for what is no array of numbers.
 
     Example:
@@ -197,20 +230,24 @@ def find_essential(
     for name, K in (("K0", K0), ("K1", K1)):
         if K is None:
             raise ValueError(f"{name} is None; find_fundamental estimates pairs of which one camera or none is known")
-    return find_fundamental(
-        x0, x1, estimator=estimator, mask=mask, quality=quality, prior=prior, lafs0=lafs0, lafs1=lafs1, noise=noise,
-        size0=size0, size1=size1, K0=K0, K1=K1, focal=focal, lens=lens, covariance=covariance,
-        configuration=configuration, key=key, seed=seed, config_dir=config_dir, **options,
+    estimate = find_fundamental(
+        x0, x1, estimator=estimator, mask=mask, ratio=ratio, score=score, prior=prior, lafs0=lafs0, lafs1=lafs1,
+        noise=noise, size0=size0, size1=size1, K0=K0, K1=K1, focal=focal, lens=lens, covariance=covariance,
+        pair_type=pair_type, key=key, seed=seed, config_dir=config_dir, **options,
     )  # fmt: skip
+    return PoseEstimate.unchecked(**vars(estimate))
 
 
+@eager
+@one_thread("cpu")
 def find_homography(
     x0: Arrays,
     x1: Arrays,
     *,
     estimator: str = "homography",
     mask: Arrays | None = None,
-    quality: Arrays | None = None,
+    ratio: Arrays | None = None,
+    score: Arrays | None = None,
     prior: Arrays | None = None,
     lafs0: Arrays | None = None,
     lafs1: Arrays | None = None,
@@ -223,14 +260,17 @@ def find_homography(
     """Robustly estimate homographies from matched points, ``x1 ~ H x0``: of a plane, or of a camera that turns.
 
     Args:
-        x0, x1: matched points in pixels, as of `find_fundamental`. Gradients reach them through the final fit.
+        x0, x1: matched points in pixels, as of `find_fundamental`. x0 may be in the unit of a plane with y up or down:
+            where its extent is another one, it is scaled to that of x1, in whose pixels thresholds are. Gradients reach
+            the points through the final fit.
         estimator: a preset of conf/estimator whose solver is `four_point`.
-        mask, quality, prior, lafs0, lafs1, noise, key, seed, config_dir: as of `find_fundamental`.
+        mask, ratio, score, prior, lafs0, lafs1, noise, key, seed, config_dir: as of `find_fundamental`.
         options: replace values of the preset (``inlier_threshold=1.5``).
 
     Returns:
         An `Estimate` whose `H` (B, 3, 3) has unit Frobenius norm and maps points that are seen to positive third
-        coordinates; inliers, ok, reason. Its significance is NaN where `ok`: that is a test of fundamental matrices.
+        coordinates; inliers, ok, reason, significance. Mirrored planes and photographs have theirs, too. Where as many
+        inliers are to be expected by chance, `ok` is False.
 
     Raises:
         ValueError, TypeError: as `find_fundamental`.
@@ -245,5 +285,8 @@ def find_homography(
         >>> bool(estimate.ok[0]), int(estimate.inliers[0, 20:].sum()), tuple(estimate.H.shape)
         (True, 40, (1, 3, 3))
     """
-    c = correspondences(x0, x1, mask=mask, quality=quality, prior=prior, lafs0=lafs0, lafs1=lafs1, noise=noise, key=key)
-    return estimated(c, "homography", estimator, config_dir, seed, options)
+    c = correspondences(
+        x0, x1, plane=True, mask=mask, ratio=ratio, score=score, prior=prior, lafs0=lafs0, lafs1=lafs1, noise=noise,
+        key=key,
+    )  # fmt: skip
+    return homographies(c, lambda c: estimated(c, "homography", estimator, config_dir, seed, options))

@@ -5,21 +5,24 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from fmtorch.core.records import ungraphed
 from fmtorch.core.stages import Estimator, Pruner
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.geometry.arithmetic import cofactors, component_sum, determinant, matmul3, sqrt
-from fmtorch.geometry.cameras import calibration_problems, cross_matrix, mapped, square_pixels
+from fmtorch.geometry.cameras import MIN_SIDE_PX, calibration_problems, cross_matrix, mapped, square_pixels
 from fmtorch.geometry.covariance import two_view_covariance
 from fmtorch.geometry.epipolar import inverse_root
 from fmtorch.geometry.normalize import canonical
 from fmtorch.geometry.pose import pose, pose_from_fundamental
 from fmtorch.geometry.significance import judged
 from fmtorch.jit.batches import for_each_pair
-from fmtorch.jobs.threads import one_thread
+from fmtorch.jobs.execution import one_thread
+
+OFF_CENTRE = 0.1  # of a principal point, in units of the side, or beyond twice it a point: K may be of another image
+MORE, MORE_MATCHES = 1.1, 8  # inliers without K, times those with it and beyond, from which on it is contradicted
 
 
 class KnownCameras:
@@ -51,7 +54,20 @@ class KnownCameras:
         square = square if self.pruner is None else self.pruner(square)
         estimate = judged(self.estimator(square, seed), square)
         with one_thread(c.mask.device):
-            return _with_cameras(estimate, square, images, self.covariance)
+            known = _with_cameras(estimate, square, images, self.covariance)
+        return known if images.map is None else known.derived(contradicted=self._contradicted(c, known, seed))
+
+    @torch.no_grad()
+    def _contradicted(self, c: Correspondences, estimate: Estimate, seed: int) -> Bool[Tensor, " b"]:
+        """Of the pairs whose principal points may be those of other images, which have far more inliers without K."""
+        rows = _off_centre(c).nonzero()[:, 0]
+        wrong = torch.zeros_like(estimate.ok)
+        if len(rows):
+            alone = c.detach()[rows].derived(K0=None, K1=None, focal=None, shared_focal=None)
+            alone = alone if self.pruner is None else self.pruner(alone)
+            without = self.estimator(alone, seed).inliers.sum(1)
+            wrong[rows] = without > MORE * estimate.inliers[rows].sum(1) + MORE_MATCHES
+        return wrong
 
 
 class Images(NamedTuple):
@@ -85,6 +101,23 @@ def _images(c: Correspondences) -> Images:
     A, focal, size, unit = (each.reshape(len(c), 2, *each.shape[1:]) for each in square)
     deviation = torch.zeros_like(focal) if c.focal is None else c.focal[..., 1].detach().double()
     return Images(A, torch.stack([focal, deviation], -1), size, unit, problems)
+
+
+def _off_centre(c: Correspondences) -> Bool[Tensor, " b"]:
+    """Whether a principal point of a pair is far from its image's centre, or without a size from its points."""
+    off = torch.zeros(len(c), dtype=torch.bool, device=c.mask.device)
+    for K, x, size in ((c.K0, c.x0, c.size0), (c.K1, c.x1, c.size1)):
+        if K is None or not len(off) or not x.shape[1]:
+            continue
+        centre = (K[:, :2, 2] / K[:, 2:, 2]).detach().double()
+        if size is not None:
+            off |= (((centre + 0.5) / size.flip(-1) - 0.5).abs() > OFF_CENTRE).any(1)
+            continue
+        real = (c.mask & x.isfinite().all(-1))[..., None]
+        low, high = torch.where(real, x.detach(), torch.inf).amin(1), torch.where(real, x.detach(), -torch.inf).amax(1)
+        beyond = (centre < low) | (centre > high) | (high > (1 + OFF_CENTRE) * (2 * centre + 1))
+        off |= beyond.any(1) & (K[:, 0, 0].detach() >= MIN_SIDE_PX * K[:, 2, 2].detach())
+    return off
 
 
 def _completed(c: Correspondences) -> Correspondences:

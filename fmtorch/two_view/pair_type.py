@@ -1,4 +1,4 @@
-"""Which configuration each pair of an estimate is in: what its fundamental matrix is worth."""
+"""Of which type each pair of an estimate is: what its fundamental matrix is worth."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from fmtorch.core.types import CONFIGURATIONS, WARNINGS, Correspondences, Estimate
+from fmtorch.core.types import PAIR_TYPES, WARNINGS, Correspondences, Estimate
 from fmtorch.geometry.arithmetic import component_sum, sqrt
 from fmtorch.geometry.epipolar import inverse_root
 from fmtorch.geometry.homography_pose import PlanePoses, poses_from_homography
@@ -21,12 +21,12 @@ from fmtorch.geometry.pair_type import (
     UNRELATED,
     Evidence,
     classified,
-    configuration_evidence,
+    pair_evidence,
     weigh,
 )
 from fmtorch.jit import kernel
 from fmtorch.jit.together import compile_together
-from fmtorch.jobs.threads import one_thread
+from fmtorch.jobs.execution import one_thread
 from fmtorch.two_view.arguments import expect_values
 from fmtorch.two_view.estimation import estimated, estimator_of
 
@@ -38,10 +38,10 @@ SAME_POSE = 1e-3  # radians: two poses of a plane that differ less in rotation a
 OTHER_CAMERA = 0.5  # deviation of the logarithm of the ratio of both focal lengths (likewise)
 
 
-class Configuration(NamedTuple):
-    """Configurations of B pairs.
+class PairTypes(NamedTuple):
+    """Types of B pairs.
 
-    kind: indices into `fmtorch.core.types.CONFIGURATIONS`. evidence: for the kinds. homography: of the plane, or of
+    kind: indices into `fmtorch.core.types.PAIR_TYPES`. evidence: for the kinds. homography: of the plane, or of
     the rotation.
     """
 
@@ -52,7 +52,7 @@ class Configuration(NamedTuple):
     @property
     def names(self) -> tuple[str, ...]:
         """The kinds in words: general, planar, rotation, identical or unrelated."""
-        return tuple(CONFIGURATIONS[i] for i in self.kind.tolist())
+        return tuple(PAIR_TYPES[i] for i in self.kind.tolist())
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -65,9 +65,9 @@ class Configuration(NamedTuple):
         flat = (self.kind == PLANAR) | (self.kind == ROTATION) | (self.kind == IDENTICAL)
         return self.homography.ok & flat
 
-    def of_pair(self, i: int) -> Configuration:
+    def of_pair(self, i: int) -> PairTypes:
         """That of the i-th pair alone."""
-        return Configuration(self.kind[i : i + 1], Evidence(*(v[i : i + 1] for v in self.evidence)), self.homography[i])
+        return PairTypes(self.kind[i : i + 1], Evidence(*(v[i : i + 1] for v in self.evidence)), self.homography[i])
 
     @property
     def determined(self) -> Bool[Tensor, " b"]:
@@ -89,8 +89,8 @@ def classify(
     focal_deviation: float | int = FOCAL_DEVIATION,
     seed: int = 0,
     **options: Any,
-) -> Configuration:
-    """The configuration of each pair, by the evidence of its F, of a homography, a rotation and a copy.
+) -> PairTypes:
+    """The type of each pair, by the evidence of its F, of a homography, a rotation and a copy.
 
     No threshold is in pixels: likelihoods are compared at the noise that the pair itself shows. Calibrations
     and measured focal lengths decide on rotations, else image sizes, by the prior on usual focal lengths; without any a
@@ -105,7 +105,7 @@ def classify(
         options: of `find_homography`.
 
     Returns:
-        A `Configuration`. A pair without F and without H is unrelated.
+        A `PairTypes`. A pair without F and without H is unrelated.
 
     Raises:
         ValueError: for an estimate of another model or of other pairs, or a negative deviation.
@@ -133,12 +133,12 @@ def classify(
     H = estimated(matches, "homography", "homography", None, seed, options)
     K0, K1, precision = _cameras(c, focal_deviation)
     with one_thread(c.mask.device):
-        evidence = configuration_evidence(
+        evidence = pair_evidence(
             estimate.F, H.F, c.x0, c.x1, c.mask, c.prior, c.noise, c.size0, c.size1, K0, K1, precision
         )
     exact = None if precision is None else precision.diagonal(dim1=-2, dim2=-1).isinf().all(-1)
     kind = classified(evidence, exact)
-    return Configuration(torch.where(estimate.ok | H.ok, kind, UNRELATED), evidence, H)
+    return PairTypes(torch.where(estimate.ok | H.ok, kind, UNRELATED), evidence, H)
 
 
 def _cameras(c: Correspondences, deviation: float | int) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
@@ -183,16 +183,21 @@ def _usual(size: Tensor) -> Tensor:
     return K
 
 
-def with_configuration(estimate: Estimate, c: Correspondences, seed: int, **options: Any) -> Estimate:
-    """The estimate with the fields `configuration_index`, `homography`, `other_R`, `other_t`; c: all its matches."""
+def with_pair_type(estimate: Estimate, c: Correspondences, seed: int, **options: Any) -> Estimate:
+    """The estimate with the fields `pair_type_index`, `homography`, `other_R`, `other_t`; c: all its matches."""
     judged = classify(c.detach(), estimate.detach(), seed=seed, **options)
     H, kind, flat = judged.homography, judged.kind, judged.flat
-    fields = {"configuration_index": kind, "homography": torch.where(flat[:, None, None], H.F, 0)}
+    fields = {"pair_type_index": kind, "homography": torch.where(flat[:, None, None], H.F, 0)}
     if c.K0 is not None and c.K1 is not None and estimate.R is not None:
         with one_thread(c.mask.device):
             poses = poses_from_homography(H.F, c.K0, c.K1, c.x0, c.x1, H.inliers)
             fields |= _other_pose(estimate.R, poses, flat & (kind == PLANAR))
     return estimate.derived(**fields)
+
+
+def warnings_of(estimate: Estimate, pair_type: PairTypes) -> tuple[str, ...]:
+    """What each pair leaves open or contradicts, as `Estimate.warning` has it."""
+    return estimate.derived(pair_type_index=pair_type.kind).warning
 
 
 def _other_pose(R: Float[Tensor, "b 3 3"], poses: PlanePoses, flat: Tensor) -> dict[str, Tensor]:

@@ -1,7 +1,5 @@
 """Pairs of a COLMAP database as correspondences."""
 
-from __future__ import annotations
-
 import dataclasses
 import shutil
 import uuid
@@ -17,14 +15,13 @@ from numpy.typing import NDArray
 from fmtorch.core.files import replacing
 from fmtorch.core.settings import claim
 from fmtorch.core.stages import Estimator
-from fmtorch.core.types import Correspondences, collate, pair_key
+from fmtorch.core.types import CONTRADICTED, Correspondences, collate, pair_key
 from fmtorch.io.colmap import DatabaseImage
-from fmtorch.io.match_store import Kind, PairGeometry
+from fmtorch.io.match_store import MATRICES, Kind, PairGeometry
 from fmtorch.jobs.execution import Execution, Shard
-from fmtorch.jobs.pool import WorkerPool
-from fmtorch.jobs.runner import Factory, Local, Source, TaskRunner
-from fmtorch.pipeline.two_images import pair_geometries
-from fmtorch.two_view.arguments import UNKNOWN
+from fmtorch.jobs.runner import Factory, Local, Source, TaskRunner, WorkerPool
+from fmtorch.pipeline.pair_geometries import pair_geometries
+from fmtorch.two_view.arguments import correspondences
 from fmtorch.two_view.estimation import estimated_by
 from fmtorch.two_view.pair_type import classify
 
@@ -43,30 +40,30 @@ class DatabasePair(NamedTuple):
 def as_correspondences(pair: DatabasePair, cameras: Cameras) -> Correspondences:
     """The pair as a batch of one, with what is known of its cameras; of pinholes where these are those stored.
 
-    Without image sizes nothing is asked of cameras. Raises ValueError where a stored camera is none that there can be,
-    or where the size of one image alone is known.
+    Without image sizes and K nothing is asked of cameras. Raises ValueError where a stored camera is none that there
+    can be, and as `fmtorch.find_fundamental` for values, sizes and points that contradict each other.
     """
     images, stored = (pair.image0, pair.image1), cameras == "stored"
     problem = next((image.problem for image in images if image.problem), "") if stored else ""
     if problem:
         raise ValueError(problem)
-    fields: dict[str, Any] = {}
-    for i, image in enumerate(images):
-        points = (image.pinhole if stored else image.points)[pair.matches[:, i]]
-        fields[f"x{i}"] = torch.from_numpy(points)[None]
-        if image.size is not None:
-            fields[f"size{i}"] = torch.tensor([image.size])
-        if stored and image.K is not None:
-            fields[f"K{i}"] = torch.from_numpy(image.K)[None]
-    mask = torch.isfinite(fields["x0"]).all(-1) & torch.isfinite(fields["x1"]).all(-1)
-    if any(image.size is not None for image in images):
-        focal = [(1.0, image.deviation) for image in images] if stored else [UNKNOWN, UNKNOWN]
-        fields["focal"] = torch.tensor([focal], dtype=torch.float64)
-        fields["shared_focal"] = torch.tensor([_shared(*images, cameras)])
-    elif cameras == "shared":
-        raise ValueError("cameras=shared needs the image sizes: size0 and size1, or K0 and K1")
-    key = torch.tensor([pair_key(f"{images[0].name} {images[1].name}")])
-    return Correspondences(mask=mask, key=key, **fields)
+    known: dict[str, Any] = {f"size{i}": image.size for i, image in enumerate(images)}
+    if stored:
+        known |= {f"K{i}": image.K for i, image in enumerate(images)}
+    sized, with_K = any(image.size is not None for image in images), stored and any(i.K is not None for i in images)
+    if cameras == "shared" and not sized:
+        raise ValueError("cameras=shared needs the image sizes: size0 and size1")
+    focal: Any = [image.deviation for image in images] if with_K else "unknown" if sized else None
+    key = pair_key(f"{images[0].name} {images[1].name}")
+    points = [image.points[pair.matches[:, i]] for i, image in enumerate(images)]
+    mask = np.isfinite(points[0]).all(-1) & np.isfinite(points[1]).all(-1)
+    c = correspondences(*points, mask=mask, focal=focal, key=key, **known)
+    if sized or with_K:
+        c = c.derived(shared_focal=torch.tensor([_shared(*images, cameras)]))
+    if not stored or all(image.pinhole is image.points for image in images):
+        return c
+    x0, x1 = (torch.from_numpy(image.pinhole[pair.matches[:, i]])[None] for i, image in enumerate(images))
+    return c.derived(x0=x0, x1=x1, mask=torch.isfinite(x0).all(-1) & torch.isfinite(x1).all(-1))
 
 
 def _shared(image0: DatabaseImage, image1: DatabaseImage, cameras: Cameras) -> bool:
@@ -80,7 +77,6 @@ def _shared(image0: DatabaseImage, image1: DatabaseImage, cameras: Cameras) -> b
 
 
 SETTINGS = "settings.json"
-_MATRICES = ("F", "E", "H", "R", "t")
 
 _GeometryIds = tuple[Any, Any]
 
@@ -100,20 +96,19 @@ class GeometryParts:
                 self.done.update(map(_ids, part["pairs"].tolist()))
 
     def write(self, geometries: Iterable[tuple[_GeometryIds, PairGeometry]]) -> None:
-        """Keep geometries of pairs, all of them or none."""
         arrays: dict[str, Any] = {}
-        pairs, kinds = [], []
+        pairs, kinds, texts = [], [], []
         for i, (ids, geometry) in enumerate(geometries):
             pairs.append(ids)
             kinds.append(geometry.kind)
-            values = {name: getattr(geometry, name) for name in ("inliers", *_MATRICES)}
-            arrays |= {f"{name}-{i}": value for name, value in values.items() if value is not None}
+            texts.append((geometry.reason, geometry.warning))
+            values = {"inliers": geometry.inliers, **geometry.matrices}
+            arrays |= {f"{name}-{i}": value for name, value in values.items()}
         with replacing(self.folder / f"{uuid.uuid4().hex}.npz") as temporary, temporary.open("wb") as file:
-            np.savez(file, pairs=np.array(pairs), kinds=np.array(kinds), **arrays)
+            np.savez(file, pairs=np.array(pairs), kinds=np.array(kinds), texts=np.array(texts), **arrays)
         self.done.update(pairs)
 
     def read(self) -> Iterator[tuple[_GeometryIds, PairGeometry]]:
-        """The geometries, each pair's once."""
         seen: set[_GeometryIds] = set()
         for path in self._files():
             with np.load(path) as part:
@@ -123,7 +118,6 @@ class GeometryParts:
                         yield ids, _geometry(part, i, str(kind))
 
     def remove(self) -> None:
-        """Remove the folder."""
         shutil.rmtree(self.folder)
 
     def _files(self) -> list[Path]:
@@ -136,15 +130,15 @@ def _ids(ids: list[Any]) -> _GeometryIds:
 
 
 def _geometry(part: Any, i: int, kind: str) -> PairGeometry:
-    matrices = (part.get(f"{name}-{i}") for name in _MATRICES)
-    return PairGeometry(cast(Kind, kind), part[f"inliers-{i}"], *matrices)
+    matrices = (part.get(f"{name}-{i}") for name in MATRICES)
+    return PairGeometry(cast(Kind, kind), part[f"inliers-{i}"], *matrices, *part["texts"][i].tolist())
 
 
 # Pairs of stored matches, estimated batch by batch; their geometries are kept until all are there
 
 
 BATCH = 64  # pairs that are read, and kept, at a time
-PRELOADED = ("fmtorch.verification.run",)  # by the process that workers are forked of
+PRELOADED = (__name__,)  # by the process that workers are forked of
 
 _PairIds = tuple[Any, Any]
 
@@ -182,7 +176,7 @@ class Verification:
     path: of the database with the geometries; of a shard, the folder that keeps them. pairs: that have matches. kept:
     of these, that had a geometry before, or were finished by an interrupted run or a shard. configurations: how many
     of each of COLMAP's kinds were written. problems: why pairs could not be read, a line each; the next run tries them
-    again. seconds: of the whole.
+    again. warnings: what of a camera was not believed, a line each. seconds: of the whole.
     """
 
     path: Path
@@ -191,6 +185,7 @@ class Verification:
     configurations: Mapping[str, int]
     problems: tuple[str, ...]
     seconds: float
+    warnings: tuple[str, ...] = ()
 
     @property
     def verified(self) -> int:
@@ -272,6 +267,7 @@ class VerificationRun:
         self.todo = [p for p in self.pairs if p not in parts.done and (force or not store.has_geometry(p))]
         self.configurations: Counter[str] = Counter()
         self.problems: list[str] = []
+        self.warnings: dict[str, None] = {}  # in order
 
     def each_batch(
         self, make: Callable[[], Estimation], execution: Execution, report: Callable[[int, int], None] | None
@@ -290,18 +286,19 @@ class VerificationRun:
                     report(done, len(todo))
 
     def write(self) -> None:
-        """Write what is kept into the store."""
         self.configurations.clear()
         self.store.write(self._counted(self.parts.read()))
 
     def result(self, path: Path, seconds: float) -> Verification:
         """The summary."""
         kept, counts = len(self.pairs) - len(self.todo), dict(self.configurations)
-        return Verification(path, len(self.pairs), kept, counts, tuple(self.problems), seconds)
+        return Verification(path, len(self.pairs), kept, counts, tuple(self.problems), seconds, tuple(self.warnings))
 
     def _counted(self, geometries: Iterable[tuple[_PairIds, PairGeometry]]) -> Iterator[tuple[_PairIds, PairGeometry]]:
         for ids, geometry in geometries:
             self.configurations[geometry.kind] += 1
+            if CONTRADICTED in geometry.warning:
+                self.warnings[f"{self._names(ids)}: {CONTRADICTED}"] = None
             yield ids, geometry
 
     def _read(self, pairs: Sequence[_PairIds]) -> Batch:
@@ -309,7 +306,9 @@ class VerificationRun:
         for pair in pairs:
             try:
                 matches = self.store.matches(pair)
-                batch.pairs.append(DatabasePair(self.store.image(pair[0]), self.store.image(pair[1]), matches))
+                images = [self.store.image(image) for image in pair]
+                self.warnings.update((image.warning, None) for image in images if image.warning)
+                batch.pairs.append(DatabasePair(images[0], images[1], matches))
                 batch.ids.append(pair)
             except Exception as error:  # one pair does not end the work on the others
                 batch.problems.append((pair, _first_line(error)))
@@ -325,7 +324,10 @@ class VerificationRun:
 
     def _note(self, problems: Iterable[tuple[_PairIds, str]]) -> None:
         for pair, problem in problems:
-            self.problems.append(f"{', '.join(self.store.name(image) for image in pair)}: {problem}")
+            self.problems.append(f"{self._names(pair)}: {problem}")
+
+    def _names(self, pair: _PairIds) -> str:
+        return ", ".join(self.store.name(image) for image in pair)
 
 
 def _first_line(error: Exception) -> str:

@@ -1,10 +1,9 @@
 """Two-view geometries of a COLMAP database, of hloc's files, or of matches alone, whoever made them."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import functools
+import sqlite3
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -20,12 +19,12 @@ from fmtorch.io.colmap import (
     copy_database,
     expect_database,
     expect_writable,
+    finished_pairs,
     imported,
     move_database,
     remove_database,
 )
-from fmtorch.io.hloc import HlocMatches
-from fmtorch.io.match_file import MatchFile, expect_suffix
+from fmtorch.io.match_file import HlocMatches, MatchFile, expect_suffix
 from fmtorch.jobs.execution import Execution, Shard, shard_of
 from fmtorch.verification.run import Cameras, Estimation, GeometryParts, PairStore, Verification, VerificationRun
 
@@ -64,9 +63,10 @@ def verify(
         features, matches: hloc's two files in place of a database. They know no cameras; "stored" is "unknown" then.
             matches alone: an npz or HDF5 file of x0, x1 (n, 2), pixels, and perhaps K0, K1 (3, 3), size0, size1 (h, w),
             of one pair or of each pair below its name (``a/x0``). Without K and sizes a pair has F and H, but no pose.
-        output: a new database to write to instead; it gets this name once it is complete. Of hloc's files a new file of
-            matches, those that are inliers, with the matrices as attributes. Of matches alone an npz or HDF5 file of
-            each pair's `configuration`, `inliers` (n,), and F, E, H, R, t as far as it has them.
+        output: a new database to write to instead; it gets this name once it is complete, and is left as it is where it
+            has all pairs. Of hloc's files a new file of matches, those that are inliers, with the matrices as
+            attributes. Of matches alone an npz or HDF5 file of each pair's `configuration`, `inliers` (n,), and F, E,
+            H, R, t, `reason` and `warning` as far as it has them.
         cameras: "stored": points are undistorted, focal lengths are exact where the camera was calibrated, known within
             5 % where they have a prior and nothing else is known of the camera (EXIF), and unknown where they are
             COLMAP's guess; images of one camera share theirs. "shared": all images have one unknown focal length in
@@ -87,7 +87,7 @@ def verify(
     Raises:
         FileNotFoundError: where there is no database.
         ValueError: for another file, a database of a newer COLMAP, without keypoints or without matches; for an
-            `output` that exists, an unknown preset, option or kind of cameras.
+            `output` that exists and lacks pairs, an unknown preset, option or kind of cameras.
         ImportError: without pycolmap.
 
     Example:
@@ -137,6 +137,8 @@ def verify_by(
     seed = int(number("seed", mode.seed, integer=True))
     if mode.cameras not in get_args(Cameras):
         raise ValueError(f"cameras is {mode.cameras!r}; it must be one of {', '.join(get_args(Cameras))}")
+    if mode.shard is None and not mode.force and (count := _finished(paths)):
+        return Verification(paths.output or Path(), count, count, {}, (), time.perf_counter() - begin)
     estimator = make()
     if (gives := model_of(estimator)) != "fundamental":
         raise ValueError(f"estimator gives {gives} matrices; verify needs one that gives fundamental matrices")
@@ -154,6 +156,22 @@ def verify_by(
     if whole:
         parts.remove()
     return run.result(end if whole else parts.folder, time.perf_counter() - begin)
+
+
+def _finished(paths: VerifyPaths) -> int:
+    """How many pairs an output has in which none is missing; 0 where there is no such output."""
+    database, features, matches, output = paths
+    if output is None or not output.exists():
+        return 0
+    with contextlib.suppress(ValueError, OSError, sqlite3.Error):
+        if any(output.samefile(path) for path in paths[:3] if path is not None):
+            return 0
+        if database is not None:
+            return finished_pairs(database, output)
+        if matches is not None:
+            with MatchFile(matches, output) if features is None else HlocMatches(features, matches, output) as files:
+                return files.finished()
+    return 0
 
 
 def _same(estimator: Estimator) -> Estimator:

@@ -231,8 +231,8 @@ def _with_cameras(estimator: Any, c: Correspondences, given: Knowledge, seed: in
 
 def _best_first(solve: Solve, c: Correspondences, given: Knowledge, seed: int) -> Estimate:
     """By another library, which gets the matches in ascending order of their ratios."""
-    assert c.quality is not None
-    order = c.quality[0].argsort(stable=True)
+    assert c.ratio is not None
+    order = c.ratio[0].argsort(stable=True)
     slots = {name: getattr(c, name)[:, order] for name in c.per_slot if getattr(c, name) is not None}
     estimate = solve(c.replace(**slots), given, seed)
     return estimate.replace(inliers=estimate.inliers[:, order.argsort()])

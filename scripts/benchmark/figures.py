@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from fmtorch.runs import replacing
+from fmtorch.core.files import replacing
 
 INK = "#808080"  # legible on white and on black
 COLOURS = ("#D55E00", "#E69F00", "#009E73", "#56B4E9", "#2F8FD0", "#CC79A7", "#9A9A9A", "#B8A800")

@@ -25,7 +25,7 @@ from fmtorch.features.vlad import codebook, descriptor_kind, load_codebook, loca
 from fmtorch.pipeline.folder import similar_pairs
 from fmtorch.pipeline.pipeline import STAGES, Pipeline
 from fmtorch.pipeline.two_images import describe
-from fmtorch.scenes.textures import photograph
+from fmtorch.scenes.surfaces import photograph
 from scripts.benchmark import pairs
 from scripts.benchmark.methods import pipeline_of
 from scripts.benchmark.runner import add_command, console

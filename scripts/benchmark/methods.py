@@ -19,8 +19,7 @@ from fmtorch.core.stages import Estimator, Pruner
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.data import ImagePair
 from fmtorch.geometry import refine
-from fmtorch.pipeline.build import build_pipeline, load_pipeline
-from fmtorch.pipeline.pipeline import Pipeline
+from fmtorch.pipeline.pipeline import Pipeline, build_pipeline, load_pipeline
 from fmtorch.presets.composition import PIPELINES, compose
 from scripts.benchmark.runner import Method, identity
 
@@ -147,7 +146,7 @@ def sizeless(c: Correspondences) -> Correspondences:
 
 def ratioless(c: Correspondences) -> Correspondences:
     """The matches without their distance ratios."""
-    return c.replace(quality=None)
+    return c.replace(ratio=None)
 
 
 WITHHELD: dict[str, Pruner] = {"sizeless": sizeless, "ratioless": ratioless}

@@ -22,7 +22,8 @@ from fmtorch.evaluation.run import select
 from fmtorch.geometry import fundamental_from_calibration
 from fmtorch.pipeline.pipeline import Outcome, Pipeline
 from fmtorch.runs.feature_cache import cached
-from fmtorch.scenes import RenderedPairs, generate, textures
+from fmtorch.scenes import RenderedPairs, surfaces
+from fmtorch.scenes import dataset as generate
 from scripts.benchmark import methods
 from scripts.benchmark.runner import Item, Stages, identity
 
@@ -122,7 +123,7 @@ def synthetic_pair(index: int, matches: int, spread: float = 0.5) -> ImagePair:
     F = fundamental_from_calibration(*(torch.from_numpy(each) for each in (K, K, R, t))).numpy()
     pair = ImagePair(f"synthetic/{index}", "synthetic", f"{index}", image, image, F, K, K, R, t)
     c = Correspondences(
-        _tensor(x0), _tensor(x1), torch.ones(1, n, dtype=torch.bool), quality=_tensor(ratio),
+        _tensor(x0), _tensor(x1), torch.ones(1, n, dtype=torch.bool), ratio=_tensor(ratio),
         lafs0=_tensor(_frames(x0, size, np.zeros(n))), lafs1=_tensor(_frames(x1, size * scale, angle)),
         size0=torch.tensor([SIZE]), size1=torch.tensor([SIZE]), key=torch.tensor([pair.key]),
     )  # fmt: skip
@@ -201,7 +202,7 @@ def photographs_shown(dataset: RenderedPairs) -> dict[str, frozenset[str]]:
     """The names of the photographs that each rendered scene is built with, whether they can be seen or not."""
     shown = {}
     for name, task in dataset._tasks.items():
-        with mock.patch.object(textures, "photograph", wraps=textures.photograph) as taken:
+        with mock.patch.object(surfaces, "photograph", wraps=surfaces.photograph) as taken:
             generate.build(task)
         shown[name] = frozenset(str(call.args[0]) for call in taken.call_args_list)
     return shown

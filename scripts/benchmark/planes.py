@@ -27,7 +27,7 @@ import torch
 from rich.progress import track
 
 from fmtorch import find_homography, metrics, presets
-from fmtorch.core.types import CONFIGURATIONS, Correspondences, collate
+from fmtorch.core.types import PAIR_TYPES, Correspondences, collate
 from fmtorch.estimators.external import colmap
 from fmtorch.geometry import poses_from_homography
 from fmtorch.two_view.known_cameras import KnownCameras
@@ -46,11 +46,11 @@ Photographs: each as a plane, looked around in, copied, cropped, and beside anot
 tuning (--tuning), the others for the claim. Real and rendered pairs: --root, --rendered. SIFT, ratio 0.8, one match a
 location, P(inlier) from frame consistency, noise of matches.
 
-python -m scripts.benchmark configuration --photographs DATA/photos --root DATA/Strecha
+python -m scripts.benchmark pair_types --photographs DATA/photos --root DATA/Strecha
 """
 # Scenes, and rendered families, whose depth and baseline every pair sees.
 GENERAL = {"castle-P19", "fountain-P11", "Herz-Jesus-P8", "sacre_coeur", "00", "driving", "orbit"}
-TIMED_FIELDS = ("x0", "x1", "mask", "quality", "prior", "noise", "key", "size0", "size1", "K0", "K1")
+TIMED_FIELDS = ("x0", "x1", "mask", "ratio", "prior", "noise", "key", "size0", "size1", "K0", "K1")
 COLMAP = {
     "CALIBRATED": "general", "UNCALIBRATED": "general", "PLANAR": "planar", "PANORAMIC": "rotation",
     "PLANAR_OR_PANORAMIC": "planar", "WATERMARK": "identical", "DEGENERATE": "unrelated", "UNDEFINED": "unrelated",
@@ -64,7 +64,7 @@ def add_arguments(commands: Any) -> None:
     parser.add_argument("--kinds", nargs="+", default=["warped", "hard", "views"], choices=["warped", "hard", "views"])
     parser.add_argument("--warps", type=int, default=1, help="pairs of each kind and photograph")
     parser.add_argument("--limit", type=int, help="photographs at most")
-    parser = add_command(commands, "configuration", run_configuration, CONFIGURATION)
+    parser = add_command(commands, "pair_types", run_pair_types, CONFIGURATION)
     add_options(parser, required=False)
     pairs.add_match_options(parser)
     parser.add_argument("--colmap", nargs="*", type=float, default=[4.0, 1.0], help="COLMAP's thresholds, px")
@@ -116,7 +116,7 @@ class Homography(Measured):
 
 
 def _ours(changed: dict[str, Any], c: Correspondences, seed: int) -> Array | None:
-    given: dict[str, Any] = {"mask": c.mask, "quality": c.quality, "prior": c.prior, "noise": c.noise, "key": c.key}
+    given: dict[str, Any] = {"mask": c.mask, "ratio": c.ratio, "prior": c.prior, "noise": c.noise, "key": c.key}
     estimate = find_homography(c.x0, c.x1, seed=seed, **given, **changed)
     return estimate.H[0].numpy() if bool(estimate.ok[0]) else None
 
@@ -137,7 +137,7 @@ def _opencv(method: int, threshold: float, c: Correspondences, seed: int) -> Arr
     return None if H is None else np.asarray(H)
 
 
-def run_configuration(arguments: argparse.Namespace) -> None:
+def run_pair_types(arguments: argparse.Namespace) -> None:
     items: list[Item] = []
     if arguments.photographs:
         items += track(list(kinds(paths_of(arguments))), "warping", console=console)
@@ -199,7 +199,7 @@ def kinds_sheet(items: Sequence[Item], verdicts: dict[str, list[str]]) -> Sheet:
             ).append(kind)
         for (group, truth), own in groups.items():
             line: Record = {"method": name, "pairs of": group, "truth": truth, "pairs": len(own)}
-            line |= {kind: own.count(kind) for kind in CONFIGURATIONS}
+            line |= {kind: own.count(kind) for kind in PAIR_TYPES}
             records.append(line | {"right, %": f"{100 * own.count(truth) / len(own):.1f}" if truth else ""})
     return Sheet("kinds", "Kinds of pairs", records)
 
@@ -229,7 +229,7 @@ def pose_errors(c: Correspondences, R: torch.Tensor, t: torch.Tensor) -> Array:
     assert c.K1 is not None
     estimate = presets.build("estimator", "fmtorch")(c, 0)
     from_F = metrics.fundamental_pose_error(estimate.F, c.K0, c.K1, c.x0, c.x1, R[None], t[None], estimate.inliers)
-    given: dict[str, Any] = {"mask": c.mask, "quality": c.quality, "prior": c.prior, "noise": c.noise, "key": c.key}
+    given: dict[str, Any] = {"mask": c.mask, "ratio": c.ratio, "prior": c.prior, "noise": c.noise, "key": c.key}
     H = find_homography(c.x0, c.x1, **given)
     poses = poses_from_homography(H.F, c.K0, c.K1, c.x0.double(), c.x1.double(), H.inliers)
     seen = torch.where(poses.valid[..., None, None], poses.R, torch.nan)

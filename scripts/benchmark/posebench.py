@@ -178,6 +178,7 @@ class Protocol(Measured):
             given: dict[str, Any] = {"mask": c.mask, "size0": c.size0, "size1": c.size1, "key": pair.key, "seed": seed}
             given |= {"estimator": self.preset, **self.options(item.facts["threshold"])}
             try:
+                estimate: fmtorch.Estimate
                 if self.kind == "E":
                     estimate = fmtorch.find_essential(c.x0, c.x1, pair.K0, pair.K1, **given)  # type: ignore[arg-type]
                 else:

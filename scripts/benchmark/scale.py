@@ -15,10 +15,9 @@ from typing import Any
 
 from fmtorch.data import ImagePair
 from fmtorch.evaluation.run import evaluate_pairs, select
-from fmtorch.evaluation.summary import summarize
+from fmtorch.evaluation.statistics import summarize
 from fmtorch.jobs.execution import Execution
-from fmtorch.jobs.pool import WorkerPool
-from fmtorch.jobs.runner import Factory, Local, TaskRunner
+from fmtorch.jobs.runner import Factory, Local, TaskRunner, WorkerPool
 from fmtorch.runs import PairRow, RunFolder
 from fmtorch.scenes import RenderedPairs
 from scripts.benchmark.methods import pipeline_of

@@ -22,8 +22,8 @@ import numpy as np
 from fmtorch.data import ImagePair
 from fmtorch.evaluation.run import select
 from fmtorch.pipeline.pipeline import Outcome, Pipeline
-from fmtorch.presets.pruners import WIDE
-from fmtorch.scenes.generate import FAMILIES
+from fmtorch.presets.composition import WIDE
+from fmtorch.scenes.dataset import FAMILIES
 from scripts.benchmark import figures, pairs
 from scripts.benchmark.methods import method, read_specs
 from scripts.benchmark.runner import Item, Kept, Method, Row, add_command, measure

@@ -68,10 +68,10 @@ class Case:
 
 def case_of(pair: ImagePair, c: Correspondences) -> Case:
     """A case of all nearest neighbours of a pair, a batch of one."""
-    assert c.quality is not None
-    passed = c.mask & (c.quality < RATIO)
-    kept = one_to_one(c.x0, c.x1, c.quality, passed)
-    spare = one_to_one(c.x0, c.x1, c.quality, c.mask & ~passed)
+    assert c.ratio is not None
+    passed = c.mask & (c.ratio < RATIO)
+    kept = one_to_one(c.x0, c.x1, c.ratio, passed)
+    spare = one_to_one(c.x0, c.x1, c.ratio, c.mask & ~passed)
     distance = distances(pair.F, c)
     matches, apart = taken(c, kept[0]), distance[kept[0]]
     return Case(pair, matches, apart < RIGHT_PX, apart > WRONG_PX, taken(c, spare[0] & (distance > WRONG_PX)))
@@ -124,9 +124,9 @@ def inlier_ratio(case: Case, ratio: float) -> Case | None:
     count = round(len(right) * (1 - ratio) / ratio)
     own, added = wrong[:count], spare[: max(0, count - len(wrong))]
     kept = case.subset(torch.from_numpy(np.concatenate([right, own])))
-    assert case.c.quality is not None
-    drawn = case.c.quality[:, torch.from_numpy(rng.choice(wrong, len(added)))]
-    more = taken(case.spare, torch.from_numpy(added)).replace(quality=drawn)
+    assert case.c.ratio is not None
+    drawn = case.c.ratio[:, torch.from_numpy(rng.choice(wrong, len(added)))]
+    more = taken(case.spare, torch.from_numpy(added)).replace(ratio=drawn)
     away = torch.zeros(len(added), dtype=torch.bool)
     joined = _joined(kept.c, more)
     return dataclasses.replace(

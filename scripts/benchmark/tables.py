@@ -24,7 +24,7 @@ from fmtorch.evaluation.statistics import (
     scene_names,
 )
 from fmtorch.metrics.recall import FINE_THRESHOLD
-from fmtorch.presets.pruners import WIDE
+from fmtorch.presets.composition import WIDE
 from scripts.benchmark.runner import Row
 
 BASELINES = ("wide baselines", "short baselines")

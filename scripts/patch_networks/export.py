@@ -24,8 +24,8 @@ from fmtorch.core.terminal import console, exits_with_message
 from fmtorch.features.networks import DESCRIPTORS, build, load_weights, read_checkpoint
 from fmtorch.features.onnx_network import PatchNetwork, network_file
 from fmtorch.training.export import OWN_LICENCE, listed, markdown_table, sha256
-from fmtorch.training.onnx_export import export, lay_out, quantize
 from scripts.patch_networks.objectives import evaluate_descriptor, middle
+from scripts.patch_networks.onnx_export import export, lay_out, quantize
 from scripts.patch_networks.stores import PatchStore, validation_pairs
 
 DEFAULTS = {

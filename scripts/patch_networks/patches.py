@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 
 from fmtorch.features import SIFT, DominantGradient, HessianDetector, ImagePyramid
 from fmtorch.features.frames import FRAME_SIGMAS
-from fmtorch.scenes.camera import Camera
-from fmtorch.scenes.generate import FAMILIES, Plan, Task, build, draw, seeds
-from fmtorch.scenes.raycast import Geometry
+from fmtorch.scenes.dataset import FAMILIES, Plan, Task, build, draw, seeds
+from fmtorch.scenes.raycast import Camera, Geometry
 from fmtorch.training import planes
 from fmtorch.training.planes import Grey, Matrix, PlaneViews, warp
 

@@ -22,8 +22,8 @@ from torch import Tensor
 from fmtorch.data.images import read_image
 from fmtorch.jit import random
 from fmtorch.jit.random import Stream
-from fmtorch.scenes.generate import Task
-from fmtorch.scenes.textures import PICTURES, skimage_file
+from fmtorch.scenes.dataset import Task
+from fmtorch.scenes.surfaces import PICTURES, skimage_file
 from fmtorch.training.planes import Photograph, PlaneViews
 from scripts.patch_networks import patches as patches_module
 from scripts.patch_networks.patches import CONTEXT_SIZE, Part, Tolerance, Warps

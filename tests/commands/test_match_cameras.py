@@ -2,6 +2,7 @@
 
 import json
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -11,15 +12,13 @@ import torch
 from PIL import ExifTags, Image
 
 import fmtorch
-from fmtorch.commands.match import photographs, pose_line, pose_report
-from fmtorch.data import ImageError, ImagePair, load
-from fmtorch.data.lenses import Lens, undistorted_points
+from fmtorch.commands.match import photographs, pose_line
+from fmtorch.data import ImageError, ImagePair, Lens, load
+from fmtorch.data.cameras import undistorted_points
 from fmtorch.geometry import sampson
 from fmtorch.metrics import nsgd, pose_error
-from fmtorch.pipeline.build import load_pipeline
-from fmtorch.pipeline.pipeline import Pipeline
+from fmtorch.pipeline import load_pipeline
 from tests.conftest import shared_path
-from tests.processes import run_command
 
 SIDE = 768  # px, to which photographs are reduced for matching
 
@@ -30,11 +29,11 @@ def pair() -> ImagePair:
 
 
 @pytest.fixture(scope="module")
-def pipeline() -> Pipeline:
+def pipeline() -> fmtorch.Pipeline:
     return load_pipeline("sift_fmtorch")
 
 
-def matched(pair: ImagePair, pipeline: Pipeline, **cameras: object) -> fmtorch.MatchResult:
+def matched(pair: ImagePair, pipeline: fmtorch.Pipeline, **cameras: object) -> fmtorch.MatchResult:
     return fmtorch.match(pair.image0.path, pair.image1.path, pipeline=pipeline, longest_side=SIDE, **cameras)
 
 
@@ -44,7 +43,7 @@ def error(result: fmtorch.MatchResult, pair: ImagePair) -> float:
     return float(pose_error(result.R.double(), result.t.double(), R, t, up_to_sign=False).worst)
 
 
-def test_the_pose_of_reduced_photographs_by_what_is_known(pair: ImagePair, pipeline: Pipeline) -> None:
+def test_the_pose_of_reduced_photographs_by_what_is_known(pair: ImagePair, pipeline: fmtorch.Pipeline) -> None:
     focal = math.sqrt(pair.K0[0, 0] * pair.K0[1, 1])
     plain = matched(pair, pipeline)
     assert plain.R is plain.t is plain.focals is None
@@ -63,7 +62,7 @@ def test_the_pose_of_reduced_photographs_by_what_is_known(pair: ImagePair, pipel
     assert torch.equal(unknown.F, plain.F)
 
 
-def test_calibrations_follow_the_reduction(pair: ImagePair, pipeline: Pipeline) -> None:
+def test_calibrations_follow_the_reduction(pair: ImagePair, pipeline: fmtorch.Pipeline) -> None:
     """Reduced by hand, with K scaled by hand, everything is the same."""
     images = [fmtorch.data.read_image(image) for image in (pair.image0, pair.image1)]
     small = [cv2.resize(image, (768, 512), interpolation=cv2.INTER_AREA) for image in images]
@@ -73,16 +72,6 @@ def test_calibrations_follow_the_reduction(pair: ImagePair, pipeline: Pipeline) 
     assert torch.equal(by_hand.R, reduced.R)
     assert torch.equal(by_hand.t, reduced.t)
     assert (2 * by_hand.focals).tolist() == pytest.approx(reduced.focals.tolist(), rel=1e-9)
-
-
-@pytest.mark.parametrize(("cameras", "message"), [
-    ({"K0": np.eye(3)}, r"K0 has a focal length of 1 for an image of 1536 x 1024 pixels; it must be in pixels"),
-    ({"K0": np.diag([1500, 1500, 1.0])[None]}, r"K0 has shape \(1, 3, 3\); it must be \(3, 3\)"),
-    ({"focal": "some"}, "focal is 'some'"), ({"focal": np.ones((1, 2, 2))}, r"focal has shape \(1, 2, 2\)"),
-])  # fmt: skip
-def test_what_no_camera_is(cameras: dict[str, object], message: str, pair: ImagePair, pipeline: Pipeline) -> None:
-    with pytest.raises(ValueError, match=message):
-        matched(pair, pipeline, **cameras)
 
 
 BENT = (-0.25, 0.06, 1e-3, -1e-3)  # OPENCV's coefficients: corners of these photographs move by some 50 px
@@ -96,7 +85,7 @@ def photographed(image: np.ndarray, lens: Lens) -> np.ndarray:
     return cv2.remap(image, x[..., 0], x[..., 1], cv2.INTER_CUBIC)
 
 
-def test_a_lens_bends_points_and_not_images(pair: ImagePair, pipeline: Pipeline) -> None:
+def test_a_lens_bends_points_and_not_images(pair: ImagePair, pipeline: fmtorch.Pipeline) -> None:
     """Photographs through a lens that distorts: F and the pose are those of pinholes, points those of photographs."""
     K0, K1 = pair.K0, pair.K1
     lenses = [Lens(K[0, 0], K[1, 1], K[0, 2], K[1, 2], "OPENCV", BENT) for K in (K0, K1)]
@@ -167,7 +156,7 @@ def test_distortion_is_taken_out_and_sizes_must_fit(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("cameras", "K", "message"), [
     (Path("none.json"), None, "cameras=none.json: no such file; it must be unknown, shared, exif"),
     (Path("exif"), "1,2,3,4", "cameras and K are given"), (None, "1,2,3", "K=1,2,3; it must be fx,fy,cx,cy"),
-    (None, "0,1,2,3", "it must be fx"), (None, "a,b,c,d", "it must be fx"), (None, [1.0, 2.0, 3.0], "it must be fx"),
+    (None, "0,1,2,3", "it must be fx"), (None, "a,b,c,d", "it must be fx"),
 ])  # fmt: skip
 def test_what_is_no_camera_of_a_command(cameras: Path | None, K: object, message: str, tmp_path: Path) -> None:
     path = with_exif(tmp_path, "a.jpg")
@@ -175,34 +164,29 @@ def test_what_is_no_camera_of_a_command(cameras: Path | None, K: object, message
         photographs([path, path], cameras, K, True)  # type: ignore[arg-type]
 
 
-def test_a_pose_that_is_not_determined_is_said(pair: ImagePair, pipeline: Pipeline) -> None:
+def test_a_pose_that_is_not_determined_is_said(pair: ImagePair, pipeline: fmtorch.Pipeline) -> None:
     image = np.random.default_rng(0).integers(0, 255, (300, 400, 3)).astype(np.uint8)
     K = np.array([[400.0, 0, 199.5], [0, 400, 149.5], [0, 0, 1]])
     nothing = fmtorch.match(image, np.full((300, 400, 3), 9, np.uint8), pipeline=pipeline, K0=K, K1=K)
     assert not nothing.ok
     assert pose_line(nothing) == ""
-    assert pose_report(nothing) == {}
+    assert "R" not in nothing.report()
     known = matched(pair, pipeline, K0=pair.K0, K1=pair.K1)
-    assert pose_report(known)["R"] == known.R.tolist()
+    assert known.report()["R"] == known.R.tolist()
     angle = math.degrees(math.acos((np.trace(pair.R) - 1) / 2))
     shown = pose_line(known)
     assert float(shown.split()[1].rstrip("°,")) == pytest.approx(angle, abs=0.5)
     assert "focal lengths 1381, 1381 px" in shown
 
 
-def test_the_command(pair: ImagePair, tmp_path: Path) -> None:
+def test_the_command(pair: ImagePair, command: Callable[..., str], tmp_path: Path) -> None:
     fx, fy, cx, cy = pair.K0[[0, 1, 0, 1], [0, 1, 2, 2]]
-    arguments = (str(pair.image0.path), str(pair.image1.path), "pipeline=sift_fmtorch", f"longest_side={SIDE}")
-    K = f"K={fx},{fy},{cx},{cy}"
-    done = run_command("match", *arguments, K, "output=out", cwd=tmp_path, environment={"CUDA_VISIBLE_DEVICES": ""})
-    assert done.returncode == 0, done.stderr
-    assert "rotation " in done.stdout
-    assert "translation (" in done.stdout
+    words = (str(pair.image0.path), str(pair.image1.path), "pipeline=sift_fmtorch", f"longest_side={SIDE}")
+    said = command("match", *words, f"K={fx},{fy},{cx},{cy}", "output=out", cwd=tmp_path)
+    assert "rotation " in said
+    assert "translation (" in said
     report = json.loads((tmp_path / "out" / "result.json").read_text())
     assert report["focals"] == pytest.approx([math.sqrt(fx * fy)] * 2)
     assert np.shape(report["R"]) == (3, 3)
     assert np.linalg.norm(report["t"]) == pytest.approx(1)
-    refused = run_command("match", "images=.", "K=1,2,3", cwd=tmp_path, environment={"CUDA_VISIBLE_DEVICES": ""})
-    assert refused.returncode == 1
-    assert "K=1,2,3; it must be fx,fy,cx,cy" in refused.stderr
-    assert "Traceback" not in refused.stderr
+    assert "K=1,2,3; it must be fx,fy,cx,cy" in command("match", "images=.", "K=1,2,3", cwd=tmp_path)

@@ -7,10 +7,13 @@ from pathlib import Path
 import cv2
 import pytest
 
-from fmtorch.core.files import models_dir
+from fmtorch import presets
+from fmtorch.core import models_dir
+from fmtorch.pipeline.pipeline import build_pipeline
 from fmtorch.runs import RunFolder
 from tests.commands.test_command_line import ended
 from tests.commands.test_match import stereo
+from tests.helpers import compose
 from tests.processes import run_command
 
 SIFT = ("pipeline=sift_ratio", "features.max_features=800", "estimator.hypotheses=100")
@@ -37,12 +40,6 @@ def test_paths_with_brackets_are_printed_as_they_are(photographs: Path) -> None:
     assert (photographs / "m[/x] [red]" / "result.json").is_file()
 
 
-def test_no_command_prints_markup() -> None:
-    """Styles are given by `style=`: printed texts hold paths."""
-    root = Path(__file__).resolve().parents[2] / "fmtorch"
-    assert not [path for path in root.rglob("*.py") if "[/dim]" in path.read_text() or "[/bold]" in path.read_text()]
-
-
 @pytest.mark.parametrize(
     ("content", "said"),
     [
@@ -67,6 +64,7 @@ def test_a_broken_preset_is_named(
         ("pruner.ratio.threshold=-1", "pruner.ratio.threshold=-1; it must be a number of at least 0"),
         ("features.max_features=-5", "features.max_features=-5; it must be a whole number of at least 1"),
         ("+foo=1", "no option foo; there are: "),
+        ("truth=F.txt", "F.txt: holds 3 numbers"),
         ("truth=I.txt", "I.txt: a matrix of rank three (its determinant is not 0); F has rank two"),
         ("output=a.png", "a.png: File exists"),
         ("pruner=[ratio,lc] pruner.lc.file=bad.onnx", "bad.onnx is no ONNX network that can be run"),
@@ -78,6 +76,7 @@ def test_a_broken_preset_is_named(
 )
 def test_before_any_work(monkeypatch: pytest.MonkeyPatch, photographs: Path, words: str, said: str) -> None:
     (photographs / "I.txt").write_text("1 0 0  0 1 0  0 0 1")
+    (photographs / "F.txt").write_text("1 2 3")
     (photographs / "bad.onnx").write_bytes((models_dir() / "lc_f.onnx").read_bytes()[:5000])
     monkeypatch.setattr("fmtorch.commands.match.match", lambda *_, **__: pytest.fail("the work was begun"))
     end = refused(monkeypatch, photographs, *words.split())
@@ -121,5 +120,17 @@ def test_a_training_says_how_its_file_is_used(words: tuple[str, ...]) -> None:
     said = use_line("mine", Path("runs/a b.onnx"), ["pruner=mine", *words])
     assert shlex.split(said) == [
         "python", "-m", "fmtorch.eval", "--config-dir", "my conf", "pipeline=sift_ratio", "estimator=fmtorch",
-        "pruner=[ratio,one_to_one,mine]", "pruner.mine.file=runs/a b.onnx", "pruner.mine.threshold=null",
+        "pruner=[ratio,one_to_one,mine]", "++pruner.mine.file=runs/a b.onnx", "++pruner.mine.soft=true",
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["lc", "lc_e", "lc_side", "dfe"])
+def test_the_line_that_a_training_ends_with_builds_a_pipeline(name: str) -> None:
+    pytest.importorskip("lightning")
+    from fmtorch.training.run import use_line
+
+    file = models_dir() / f"{presets.load('pruner', name)['file']}.safetensors"
+    said = shlex.split(use_line(name, file, [f"pruner={name}"]))
+    pruners = build_pipeline(compose("eval", [*said[3:], "cache=off"])).pruners
+    assert list(pruners) == ["ratio", "one_to_one", name]
+    assert (pruners[name].threshold, pruners[name].prior) == (None, True)

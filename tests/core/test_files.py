@@ -1,12 +1,11 @@
 """Files that are whole or absent, and errors that name them."""
 
-from __future__ import annotations
-
 import errno
 from pathlib import Path
 
 import pytest
 
+from fmtorch.core import files
 from fmtorch.core.files import replacing
 from fmtorch.core.terminal import error_line
 
@@ -55,3 +54,37 @@ def test_a_device_that_is_full(tmp_path: Path) -> None:
     ):
         file.write(b"x" * 100_000)
     assert error_line(caught.value) == f"{tmp_path / 'out.json'}: No space left on device"
+
+
+def _installation(root: Path, monkeypatch: pytest.MonkeyPatch, *folders: str) -> Path:
+    package = root / "site-packages" / "fmtorch"
+    package.mkdir(parents=True)
+    for folder in folders:
+        (root / "site-packages" / folder).mkdir(parents=True)
+    monkeypatch.setattr(files, "_PACKAGE", package)
+    return package
+
+
+def test_an_installed_wheel_uses_its_own_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    package = _installation(tmp_path, monkeypatch, "fmtorch/conf", "fmtorch/models", "conf", "models")
+    assert files.conf_dir() == package / "conf"
+    assert files.models_dir() == package / "models"
+
+
+def test_an_incomplete_installation_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    package = _installation(tmp_path, monkeypatch)
+    with pytest.raises(FileNotFoundError, match=f"'conf' in {package}"):
+        files.conf_dir()
+
+
+def test_cache_dir(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", "/home/someone")
+    monkeypatch.setenv("XDG_CACHE_HOME", "/scratch/cache")
+    monkeypatch.setenv("FMTORCH_CACHE", "/data/fmtorch")
+    assert files.cache_dir() == Path("/data/fmtorch")
+    monkeypatch.setenv("FMTORCH_CACHE", "~/here")
+    assert files.cache_dir() == Path("/home/someone/here")
+    monkeypatch.setenv("FMTORCH_CACHE", "")
+    assert files.cache_dir() == Path("/scratch/cache/fmtorch")
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    assert files.cache_dir() == Path("/home/someone/.cache/fmtorch")

@@ -1,7 +1,5 @@
 """What the annotations of a record say, and what is told of fields that do not fit them."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 
@@ -10,9 +8,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from fmtorch.core import Correspondences, Estimate, Features
 from fmtorch.core.records import Record, expect_fields, slotted
-from fmtorch.core.types import Correspondences, Estimate, Features
-from fmtorch.training.labelled import LabelledMatches
+from fmtorch.training import LabelledMatches
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -37,7 +35,7 @@ Sheet.__init_subclass__.__func__(Sheet)  # type: ignore[attr-defined]  # read th
     ("kind", "fields"),
     [
         (Features, ("lafs", "scores", "descriptors", "mask")),
-        (Correspondences, ("x0", "x1", "mask", "quality", "prior", "lafs0", "lafs1", "mutual", "noise")),
+        (Correspondences, ("x0", "x1", "mask", "ratio", "score", "prior", "lafs0", "lafs1", "mutual", "noise")),
         (Estimate, ("inliers",)),
         (LabelledMatches, ("label",)),
     ],

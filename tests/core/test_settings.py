@@ -1,7 +1,5 @@
 """Folders that are of one settings alone."""
 
-from __future__ import annotations
-
 import json
 import threading
 from pathlib import Path

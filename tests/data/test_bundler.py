@@ -39,26 +39,6 @@ def test_points_are_where_the_manual_puts_them(tmp_path: Path) -> None:
     assert views[3].image.size == (SIZE[0] + 8, SIZE[1])
 
 
-def test_true_matches_lie_on_the_lines_of_f(tmp_path: Path) -> None:
-    _, truth = write_bundler(tmp_path / "Set/scene")
-    dataset = load("bundler", root=tmp_path / "Set", sequences=["scene"], pairs=None)
-    assert [p.identity for p in dataset][:2] == ["Set/scene/0-1", "Set/scene/0-2"]
-    assert len(dataset) == 6
-    pair = dataset[0]
-    x0, x1 = (manuals_pixels(truth[i], SIZE[0] + 2 * i, SIZE[1], distorted=False) for i in (0, 1))
-    for a, b in zip(x0, x1, strict=True):
-        line = pair.F @ [*a, 1]
-        assert abs(line @ [*b, 1]) / np.hypot(*line[:2]) < 1e-9
-
-
-def test_candidates_share_points(tmp_path: Path) -> None:
-    """Cameras 0, 1, 2 see 12, 9 and 6 points, camera 4 none."""
-    folder, _ = write_bundler(tmp_path / "scene")
-    counts = {n: load("bundler", root=folder, candidates="points", shared=n, pairs=None) for n in (6, 7, 9, 10)}
-    places = {n: [p.identity.rpartition("/")[2] for p in dataset] for n, dataset in counts.items()}
-    assert places == {6: ["0-1", "0-2", "1-2"], 7: ["0-1"], 9: ["0-1"], 10: []}
-
-
 def edit(line: int, change: Callable[[str], str]) -> Callable[[Path], None]:
     def apply(folder: Path) -> None:
         lines = (folder / "gt_bundle.out").read_text().splitlines()

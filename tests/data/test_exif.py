@@ -9,7 +9,7 @@ import pytest
 from PIL import ExifTags, Image
 from PIL.TiffImagePlugin import IFDRational
 
-from fmtorch.data.image_cameras import ExifFocal, exif_focal
+from fmtorch.data import ExifFocal, exif_focal
 
 Tag = ExifTags.Base
 PLANE = {"FocalLength": IFDRational(35), "FocalPlaneXResolution": IFDRational(2540)}  # 100 px/mm

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from fmtorch.data import DataError, load, read_image
-from fmtorch.data.hpatches import LARGE, HPatchesPairs
 from tests.data import planes
 
 
@@ -18,7 +17,7 @@ def test_pairs_are_image_1_with_the_others(tmp_path: Path) -> None:
         ("illumination", "i_light"), ("viewpoint", "v_view"),
     ]  # fmt: skip
     assert len(dataset) == 10
-    assert HPatchesPairs.model == "homography"
+    assert dataset.model == "homography"
     for k, pair in enumerate(list(dataset)[5:], start=2):
         H = planes.view(k) / np.linalg.norm(planes.view(k))
         np.testing.assert_allclose(pair.H, H, atol=1e-8)
@@ -37,24 +36,6 @@ def test_homographies_are_of_the_images_as_they_are_read(tmp_path: Path) -> None
             cv2.erode(cv2.warpPerspective(np.full((200, 300), 255, np.uint8), pair.H, (300, 200)), np.ones((9, 9))) > 0
         )
         assert np.abs(warped - b)[seen].mean() < 6  # of 255; a shift by one pixel makes it more than 10
-
-
-def test_large_images_are_left_out_unless_asked_for(tmp_path: Path) -> None:
-    for name in ("v_talent", "v_view"):
-        planes.write_sequence(tmp_path / name, "0000.jpg", light=False)
-    assert "v_talent" in LARGE
-    assert {pair.scene for pair in load("hpatches", root=tmp_path)} == {"v_view"}
-    assert {pair.scene for pair in load("hpatches", root=tmp_path, large=True)} == {"v_talent", "v_view"}
-    assert {pair.scene for pair in load("hpatches", root=tmp_path, sequences=["v_talent"])} == {"v_talent"}
-
-
-def test_other_formats_and_digests(tmp_path: Path) -> None:
-    planes.write_sequence(tmp_path / "v_view", "0000.jpg", light=False, suffix=".png")
-    stored, small = (load("hpatches", root=tmp_path, short_side=side) for side in (None, 100))
-    assert stored[0].problem is None
-    assert stored.digest != small.digest
-    (tmp_path / "v_view/H_1_3").write_text("1 0 0\n0 1 0\n0 0 1\n")
-    assert load("hpatches", root=tmp_path, short_side=100).digest != small.digest
 
 
 @pytest.mark.parametrize(

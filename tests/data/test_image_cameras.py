@@ -5,9 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from fmtorch.data import DataError
-from fmtorch.data.image_cameras import ImageCameras
-from fmtorch.data.lenses import Lens
+from fmtorch.data import DataError, ImageCameras, Lens
 from tests.data.native import SIZE, to_binary, write_colmap
 
 

@@ -9,16 +9,12 @@ import pytest
 import torch
 
 from fmtorch.data import DataError, load
-from fmtorch.data.kitti import KittiPairs
 from fmtorch.geometry import fundamental_from_projections
 from tests.conftest import shared_path
 from tests.data.native import write_kitti
+from tests.helpers import apart, edit_lines
 
 FIRST = 40  # frame of the sequence with which the FM-Bench copy and the native piece begin
-
-
-def same_up_to_sign(F: np.ndarray, G: np.ndarray) -> float:
-    return float(min(np.abs(F - G).max(), np.abs(F + G).max()))
 
 
 def test_real_frames_have_the_f_of_the_fmbench_file() -> None:
@@ -33,11 +29,11 @@ def test_real_frames_have_the_f_of_the_fmbench_file() -> None:
     for pair in native:
         i, j = map(int, pair.identity.rpartition("/")[2].split("-"))
         F = fundamental_from_projections(torch.from_numpy(P[i]), torch.from_numpy(P[j])).numpy()
-        assert same_up_to_sign(pair.F, F) < 1e-6
+        assert apart(pair.F, F) < 1e-6
         assert pair.problem is None
         if pair.identity in listed:
             shared += 1
-            assert same_up_to_sign(pair.F, listed[pair.identity]) < 1e-6
+            assert apart(pair.F, listed[pair.identity]) < 1e-6
     assert shared == 3
 
 
@@ -50,16 +46,8 @@ def test_f_is_that_of_the_projection_matrices_of_each_camera(tmp_path: Path) -> 
         P1 = np.array([[40, 0, 15.5, -21.5], [0, 40, 11.5, 0], [0, 0, 1, 0]])
         i, j = map(int, pair.identity.rpartition("/")[2].split("-"))
         P = [torch.from_numpy(P1 @ np.linalg.inv(np.vstack([poses[k], [0, 0, 0, 1]]))) for k in (i, j)]
-        assert same_up_to_sign(pair.F, fundamental_from_projections(*P).numpy()) < 1e-6
+        assert apart(pair.F, fundamental_from_projections(*P).numpy()) < 1e-6
         assert np.linalg.norm(pair.F) == pytest.approx(1)
-
-
-def test_frames_are_paired_with_those_of_the_following_second(tmp_path: Path) -> None:
-    root = write_kitti(tmp_path, frames=14)
-    dataset = load("kitti", root=root, sequences=["06"], pairs=None)
-    pairs = [tuple(map(int, p.identity.rpartition("/")[2].split("-"))) for p in dataset]
-    assert pairs == [(i, j) for i in range(14) for j in range(i + 1, 14) if j - i <= 10]
-    assert len(load("kitti", root=root, sequences=["06"], pairs=None, window=0.2)) == 12 * 2 + 1
 
 
 def test_a_draw_is_of_the_seed_and_part_of_the_digest(tmp_path: Path) -> None:
@@ -72,20 +60,8 @@ def test_a_draw_is_of_the_seed_and_part_of_the_digest(tmp_path: Path) -> None:
     assert {p.scene for p in first} == {"06", "07"}
 
 
-def test_the_digest_is_of_the_contents_not_of_the_place(tmp_path: Path) -> None:
-    roots = [write_kitti(tmp_path / name) for name in "abc"]
-    (roots[2] / "sequences/06/times.txt").write_text("".join(f"{0.2 * i:e}\n" for i in range(14)))
-    a, b, c = (load("kitti", root=root, sequences=["06"]).digest for root in roots)
-    assert a == b != c
-    assert load("kitti", root=roots[0], sequences=["06"], window=0.5).digest != a
-
-
 def rewrite(name: str, change: Callable[[list[str]], list[str]]) -> Callable[[Path], None]:
-    def apply(root: Path) -> None:
-        lines = (root / name).read_text().splitlines()
-        (root / name).write_text("\n".join(change(lines)) + "\n")
-
-    return apply
+    return lambda root: edit_lines(root / name, change)
 
 
 def words(line: int, change: Callable[[list[str]], list[str]]) -> Callable[[list[str]], list[str]]:
@@ -145,7 +121,7 @@ def test_damaged_files_are_named_with_their_lines(damage: str, tmp_path: Path) -
     change, message = DAMAGE[damage]
     change(root)
     with pytest.raises(DataError, match=message) as raised:
-        KittiPairs(root, sequences=["06"])
+        load("kitti", root=root, sequences=["06"])
     assert "\n" not in str(raised.value)
 
 

@@ -3,47 +3,31 @@
 import functools
 import itertools
 import json
-import pickle
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hydra.core.global_hydra import GlobalHydra
 
-from fmtorch.commands import pairs as command
-from fmtorch.data import load
-from fmtorch.data.construction import Construction
-from fmtorch.data.overlap import (
-    STEP,
-    TOLERANCE,
-    DepthOverlap,
-    PointOverlap,
-    Seen,
-    overlap_of,
-    seen_share,
-    shared_points,
-)
-from fmtorch.data.pairs import ImageSource
-from fmtorch.data.scenes import ScenePairs, incidence
+from fmtorch.data import ImageSource, load
+from fmtorch.data.cameras import STEP, TOLERANCE
+from fmtorch.data.construction import DepthOverlap, Seen, overlap_of, seen_share, shared_points
+from fmtorch.data.scenes import DepthScenePairs, incidence
 from fmtorch.scenes import Plan, RenderedPairs
-from fmtorch.scenes.dataset import RenderedScenePairs
-from tests.conftest import shared_path
-from tests.data.native import write_bundler, write_colmap, write_kitti
+from tests.data.native import write_colmap, write_kitti
 from tests.reference import overlap as reference
 
 PLAN = Plan(scenes=1, shots=4, pairs=4, scale=0.15)
 
 
 @pytest.fixture(scope="module")
-def rendered(tmp_path_factory: pytest.TempPathFactory) -> RenderedScenePairs:
-    """All pairs of four photographs each of three families; cameras of the collection have other sizes."""
+def rendered(tmp_path_factory: pytest.TempPathFactory) -> DepthScenePairs:
+    """All pairs of four photographs each of two families; cameras of the collection have other sizes."""
     root = tmp_path_factory.mktemp("rendered")
-    families = ["indoor", "orbit", "collection"]
+    families = ["indoor", "collection"]
     return RenderedPairs(families=families, root=root, plan=PLAN, workers=1).scene_pairs()
 
 
-def one_by_one(dataset: RenderedScenePairs, scene: int, i: int, j: int) -> float:
+def one_by_one(dataset: DepthScenePairs, scene: int, i: int, j: int) -> float:
     """The overlap of a pair by the reference."""
     a, b = (dataset.scenes[scene].views[k] for k in (i, j))
 
@@ -69,24 +53,14 @@ def one_by_one(dataset: RenderedScenePairs, scene: int, i: int, j: int) -> float
     return min(shares)
 
 
-def test_overlap_of_rendered_pairs_is_that_counted_pixel_by_pixel(rendered: RenderedScenePairs) -> None:
+def test_overlap_of_rendered_pairs_is_that_counted_pixel_by_pixel(rendered: DepthScenePairs) -> None:
     overlaps = overlap_of(rendered)
     assert isinstance(overlaps, DepthOverlap)
     places = [rendered.candidate(rank) for rank in range(rendered.candidates)]
-    assert len(places) == 3 * 6
+    assert len(places) == 2 * 6
     shares = [overlaps.of(place) for place in places]
     assert shares == [one_by_one(rendered, *place) for place in places]
     assert min(shares) < 0.4 < 0.6 < max(shares)
-
-
-def test_a_grid_of_pixels_stands_for_all_of_them(rendered: RenderedScenePairs) -> None:
-    scene, i, j = rendered.candidate(0)
-    overlaps = DepthOverlap(rendered)
-    a, b = (overlaps._seen(rendered.scenes[scene].views[k]) for k in (i, j))
-    pair = rendered[0]
-    # A share of n pixels has a standard error of at most 0.5 / sqrt(n) where they are drawn; a grid's is smaller.
-    error = 0.5 / np.sqrt(a.size[0] * a.size[1] / STEP**2)
-    assert abs(seen_share(a, b, pair.R, pair.t) - seen_share(a, b, pair.R, pair.t, step=1)) < 2 * error
 
 
 @pytest.mark.parametrize(
@@ -116,46 +90,8 @@ def test_overlap_by_points_is_that_counted_point_by_point() -> None:
     assert len(shared_points(incidence(points), pairs[:0])) == 0
 
 
-def test_overlap_by_the_points_of_a_real_model() -> None:
-    dataset = load("colmap", root=shared_path("data/native/colmap_sacre_coeur"), pairs=None)
-    assert isinstance(dataset, ScenePairs)
-    overlaps = overlap_of(dataset)
-    assert isinstance(overlaps, PointOverlap)
-    lines = [
-        line
-        for line in shared_path("data/native/colmap_sacre_coeur/sparse/images.txt").read_text().splitlines()
-        if not line.startswith("#")
-    ]
-    names = [line.split()[9] for line in lines[::2]]
-    seen = {
-        name: [int(p) for p in line.split()[2::3] if p != "-1"] for name, line in zip(names, lines[1::2], strict=True)
-    }
-    views = [view.image.path.name for view in dataset.scenes[0].views]
-    places = [dataset.candidate(rank) for rank in range(dataset.candidates)]
-    assert len(places) == 45
-    for scene, i, j in places:
-        assert overlaps.of((scene, i, j)) == pytest.approx(
-            reference.by_points(seen[views[i]], seen[views[j]]), abs=1e-15
-        )
-
-
-def test_a_bundler_file_knows_the_points_of_registered_cameras(tmp_path: Path) -> None:
-    """Cameras 0, 1, 2 see 12, 9 and 6 points, of which they share those of the later one; camera 4 sees none."""
-    folder, _ = write_bundler(tmp_path / "Set/a")
-    dataset = load("bundler", root=folder, pairs=None)
-    assert isinstance(dataset, ScenePairs)
-    overlaps = overlap_of(dataset)
-    shares = {(i, j): overlaps.of((0, i, j)) for i, j in itertools.combinations(range(4), 2)}
-    assert shares == {(0, 1): 9 / 12, (0, 2): 6 / 12, (1, 2): 6 / 9, (0, 3): 0, (1, 3): 0, (2, 3): 0}
-
-
 def run(folder: Path, monkeypatch: pytest.MonkeyPatch, *words: str) -> None:
-    monkeypatch.chdir(folder)
-    monkeypatch.setattr(sys, "argv", ["pairs", "output=Made", "count=null", "workers=1", *words])
-    try:
-        command.main()
-    finally:
-        GlobalHydra.instance().clear()
+    call_command(monkeypatch, folder, "pairs", "output=Made", "count=null", "workers=1", *words)
 
 
 def test_the_command_selects_by_overlap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -171,33 +107,6 @@ def test_the_command_selects_by_overlap(tmp_path: Path, monkeypatch: pytest.Monk
         run(tmp_path, monkeypatch, *words, "overlap=[0.6,0.9]")
     run(tmp_path, monkeypatch, *words, "overlap=[0.6,0.6]", "output=Other")
     assert [pair.identity for pair in load("fmbench", root=tmp_path / "Other")] == ["Other/a/0-1"]
-
-
-def test_the_command_selects_from_rendered_scenes(
-    rendered: RenderedScenePairs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("fmtorch.data.build", lambda *_: rendered.drawn)
-    run(tmp_path, monkeypatch, "dataset=rendered", "overlap=[0.1,0.6]")
-    monkeypatch.undo()
-    overlaps = overlap_of(rendered)
-    places = [rendered.candidate(rank) for rank in range(rendered.candidates)]
-    expected = [(s, i, j) for s, i, j in places if 0.1 <= overlaps.of((s, i, j)) <= 0.6]
-    selected = load("fmbench", root=tmp_path / "Made")
-    names = [scene.name for scene in rendered.scenes]
-    assert sorted(pair.identity for pair in selected) == sorted(f"Made/{names[s]}/{i}-{j}" for s, i, j in expected)
-    for pair in selected:
-        (source,) = (
-            rendered[rank] for rank, (s, i, j) in enumerate(places) if pair.identity == f"Made/{names[s]}/{i}-{j}"
-        )
-        assert min(np.abs(pair.F - source.F).max(), np.abs(pair.F + source.F).max()) < 1e-12
-
-
-def test_other_processes_judge_the_same(rendered: RenderedScenePairs, tmp_path: Path) -> None:
-    here = Construction(rendered, tmp_path / "Made", overlap=(0.1, 0.6))
-    assert here.identity["rule"] == {"overlap": [0.1, 0.6], "by": "depth", "step_px": STEP, "tolerance": TOLERANCE}
-    there: Construction = pickle.loads(pickle.dumps(here))
-    places = [rendered.candidate(rank) for rank in range(4)]
-    assert [there.overlaps.of(place) for place in places] == [here.overlaps.of(place) for place in places]
 
 
 @pytest.mark.parametrize(

@@ -10,23 +10,13 @@ import pytest
 
 from fmtorch.data import DataError, load, read_image
 from tests.data import lists
+from tests.helpers import apart, cross_matrix
 
 PAIRS = ((0, 1), (2, 3), (1, 5))
 
 
-def true_f(i: int, j: int) -> np.ndarray:
-    """Of the scene's cameras, by the formula."""
-    (K0, _, _), (K1, _, _) = lists.cameras()[i], lists.cameras()[j]
-    T = lists.motion(lists.cameras()[i], lists.cameras()[j])
-    x, y, z = T[:3, 3]
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    F = np.linalg.inv(K1).T @ cross @ T[:3, :3] @ np.linalg.inv(K0)
+def unit(F: np.ndarray) -> np.ndarray:
     return F / np.linalg.norm(F)
-
-
-def expect_same(F: np.ndarray, expected: np.ndarray, atol: float = 1e-9) -> None:
-    expected = expected / np.linalg.norm(expected)
-    np.testing.assert_allclose(F * np.sign((F * expected).sum()), expected, atol=atol)
 
 
 FORMS: dict[str, Callable[[Path], Path]] = {
@@ -53,12 +43,12 @@ def test_cameras_are_those_of_the_list(form: str, tmp_path: Path) -> None:
         np.testing.assert_allclose(pair.K1, K1, atol=1e-9)
         np.testing.assert_allclose(pair.R, T[:3, :3], atol=1e-6)  # the cameras' own rotations are rounded
         np.testing.assert_allclose(pair.t, T[:3, 3], atol=1e-9)
-        expect_same(pair.F, true_f(i, j), atol=1e-6)
+        assert apart(pair.F, unit(np.linalg.inv(K1).T @ cross_matrix(T[:3, 3]) @ T[:3, :3] @ np.linalg.inv(K0))) < 1e-6
         assert (pair.family, pair.scene) == ("list", "list")
         assert read_image(pair.image0).shape[:2] == cv2.imread(str(lists.images() / lists.name(i))).shape[:2]
 
 
-@pytest.mark.parametrize("turns", [(1, 0), (2, 3), (3, 1)])
+@pytest.mark.parametrize("turns", [(1, 0), (2, 3)])
 def test_f_relates_the_images_as_they_are_read(turns: tuple[int, int], tmp_path: Path) -> None:
     """Resized and turned: F is that of the originals seen through both maps, and is that of K, R and t."""
     file = lists.write(tmp_path / "list.txt", [lists.superglue(0, 1, turns)])
@@ -75,42 +65,7 @@ def test_f_relates_the_images_as_they_are_read(turns: tuple[int, int], tmp_path:
         if image.resampling is not None
     )
     (plain,) = load("pair_list", root=lists.images(), file=lists.write(tmp_path / "plain.txt", [lists.superglue(0, 1)]))
-    expect_same(pair.F, np.linalg.inv(A1).T @ plain.F @ np.linalg.inv(A0))
-
-
-def test_matches_of_the_turned_images_obey_f(tmp_path: Path) -> None:
-    """SIFT does not care how an image is turned; its matches of what is read are near the lines of F."""
-    file = lists.write(tmp_path / "list.txt", [lists.superglue(1, 5, (1, 2))])
-    (pair,) = load("pair_list", root=lists.images(), file=file, resize=800)
-    sift = cv2.SIFT_create(4000)
-    (k0, d0), (k1, d1) = (sift.detectAndCompute(read_image(image), None) for image in (pair.image0, pair.image1))
-    good = [m for m, n in cv2.BFMatcher().knnMatch(d0, d1, k=2) if m.distance < 0.8 * n.distance]
-    x0 = np.array([[*k0[m.queryIdx].pt, 1] for m in good])
-    x1 = np.array([[*k1[m.trainIdx].pt, 1] for m in good])
-    lines = x0 @ pair.F.T
-    distance = np.abs((x1 * lines).sum(1)) / np.hypot(lines[:, 0], lines[:, 1])
-    assert (distance < 2).mean() > 0.3
-    assert len(good) > 50
-
-
-def test_resizing_by_one_number_and_by_two(tmp_path: Path) -> None:
-    file = lists.write(tmp_path / "list.txt", [lists.glue_factory(0, 1)])
-    stored, small, fixed = (
-        load("pair_list", root=lists.images(), file=file, resize=resize) for resize in (None, 320, [160, 120])
-    )
-    assert len({stored.digest, small.digest, fixed.digest}) == 3
-    assert read_image(fixed[0].image0).shape[:2] == read_image(fixed[0].image1).shape[:2] == (120, 160)
-    assert max(read_image(small[0].image1).shape) == 320
-    h, w = read_image(stored[0].image0).shape[:2]
-    K, K_fixed = stored[0].K0, fixed[0].K0
-    np.testing.assert_allclose(K_fixed[0, 0] / K[0, 0], 160 / w)
-    np.testing.assert_allclose((K_fixed[1, 2] + 0.5) / (K[1, 2] + 0.5), 120 / h)
-
-
-def test_origin_moves_the_principal_point(tmp_path: Path) -> None:
-    file = lists.write(tmp_path / "list.txt", [lists.glue_factory(0, 1, corner=0.0)])
-    (pair,) = load("pair_list", root=lists.images(), file=file, origin=0.0)
-    np.testing.assert_allclose(pair.K0, lists.cameras()[0][0])
+    assert apart(pair.F, unit(np.linalg.inv(A1).T @ plain.F @ np.linalg.inv(A0))) < 1e-9
 
 
 def scannet(folder: Path, with_motion: bool, with_intrinsics: bool) -> tuple[Path, Path]:

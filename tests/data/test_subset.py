@@ -4,25 +4,18 @@ from pathlib import Path
 
 import numpy as np
 
-from fmtorch.data import DepthDataset, PairDataset, load
-from fmtorch.data.pairs import subset
-from fmtorch.scenes import Plan, RenderedPairs
-from tests.conftest import shared_path
+from fmtorch.data import DepthDataset, PairDataset, load, subset
+from tests.data.native import write_tum
 
 
 def test_pairs_digest_and_depth(tmp_path: Path) -> None:
-    dataset = RenderedPairs(root=tmp_path, plan=Plan(1, 3, 2, scale=0.2), families=["indoor"], workers=1)
+    name = write_tum(tmp_path, depth=True).name
+    dataset, plain = (load("tum", root=tmp_path, sequences=[name], depth=depth) for depth in (True, False))
     part = subset(dataset, [len(dataset) - 1])
     assert isinstance(part, PairDataset)
     assert isinstance(part, DepthDataset)
     assert [pair.identity for pair in part] == [dataset[len(dataset) - 1].identity]
-    assert part.digest != dataset.digest
-    assert part.digest != subset(dataset, [0]).digest or len(dataset) == 1
+    assert len({part.digest, dataset.digest, subset(dataset, [0]).digest}) == 3
     x = np.array([[40.0, 30.0], [10.0, 70.0]])
     assert np.array_equal(part.depth(part[0].image0, x), dataset.depth(part[0].image0, x), equal_nan=True)
-
-
-def test_a_data_set_without_depth_stays_one() -> None:
-    part = subset(load("fmbench", root=shared_path("data/TanksLike")), [3, 1])
-    assert not isinstance(part, DepthDataset)
-    assert len(part) == 2
+    assert not isinstance(subset(plain, [3, 1]), DepthDataset)

@@ -6,7 +6,8 @@ import numpy as np
 import pycolmap
 import pytest
 
-from fmtorch.data.lenses import MODELS, Lens, undistorted_frames, undistorted_points
+from fmtorch.data import Lens
+from fmtorch.data.cameras import MODELS, undistorted_frames, undistorted_points
 
 SIZE, FOCAL = (480, 640), 400.0
 COEFFICIENTS = {

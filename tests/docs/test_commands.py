@@ -41,7 +41,7 @@ ELSEWHERE = {
     r"python -m pytest|ruff check|^\.ci/": "what continuous integration does",
     r"scripts/download": "tests/test_download.py runs it against a server of its own",
     r"benchmark homography": "needs a folder of photographs; tests/estimators/models/test_homography.py warps one",
-    r"benchmark configuration": "needs photographs; tests/scripts/test_benchmark_planes.py runs it on some",
+    r"benchmark pair_types": "needs photographs; tests/scripts/test_benchmark_planes.py runs it on some",
     r"\bdask (scheduler|worker)\b": "tests/evaluation/test_executors.py runs a cluster",
     r"--config-dir my_conf (pruner|pipeline)=": "tests/training/test_train_command.py runs these files and commands",
     r"dataset=(tum|kitti|colmap|bundler|fmbench dataset\.root=KITTI)": "tests/data runs these on data of their layout",

@@ -11,7 +11,6 @@ import pytest
 import torch
 
 from fmtorch.scenes import Plan
-from fmtorch.scenes import dataset as rendered_dataset
 from tests.conftest import own_cache
 
 NOTEBOOKS = Path(__file__).resolve().parents[2] / "docs" / "notebooks"
@@ -28,7 +27,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     """Runs a notebook as one program; returns its variables."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("FMTORCH_CACHE", str(own_cache(tmp_path)))
-    monkeypatch.setattr(rendered_dataset, "PLANS", dict.fromkeys((("small", "test"), ("small", "train")), SMALL))
+    monkeypatch.setattr("fmtorch.scenes.dataset.PLANS", dict.fromkeys((("small", "test"), ("small", "train")), SMALL))
     monkeypatch.setattr(plt, "show", lambda: plt.close("all"))
     monkeypatch.setitem(mpl.rcParams, "backend", "agg")
 

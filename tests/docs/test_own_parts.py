@@ -10,7 +10,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from fmtorch import data
-from fmtorch.core.stages import Estimator, FeatureExtractor, Matcher, Pruner
+from fmtorch.core import Estimator, FeatureExtractor, Matcher, Pruner
 from tests.laws import scene
 from tests.processes import run_command
 
@@ -37,7 +37,7 @@ def test_every_part_is_evaluated(folder: Path) -> None:
     (command,) = re.findall(r"```bash\n(.*?)```", PAGE, flags=re.DOTALL)
     words = shlex.split(command)
     assert words[:2] == ["fmtorch", "eval"]
-    ended = run_command("eval", *words[2:], "run_dir=run", cwd=folder)
+    ended = run_command("eval", *words[2:], "output=run", cwd=folder)
     assert ended.returncode == 0, ended.stderr
     rows = [row for part in (folder / "run" / "pairs").glob("*.parquet") for row in pq.read_table(part).to_pylist()]
     assert sorted(row["pair"] for row in rows) == ["left.png right.png", "right.png left.png"]
@@ -70,6 +70,6 @@ def test_a_score_a_sampler_and_a_rule(score: str, folder: Path, monkeypatch: pyt
     preset = folder / "my_conf" / "estimator" / "robust.yaml"
     preset.write_text(preset.read_text().replace("my_robust.Welsch", f"my_robust.{score}"))
     c = scene(1, 300, outliers=0.3)
-    estimate = find_fundamental(c.x0, c.x1, quality=c.quality, estimator="robust", config_dir=folder / "my_conf")
+    estimate = find_fundamental(c.x0, c.x1, ratio=c.ratio, estimator="robust", config_dir=folder / "my_conf")
     assert bool(estimate.ok[0])
     assert int(estimate.inliers.sum()) > 180  # of 210

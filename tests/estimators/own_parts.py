@@ -1,13 +1,10 @@
 """Parts as somebody else writes them."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
 
-from fmtorch.estimators import F4x2, Pair, SummedGains, kernel
-from fmtorch.estimators.sampling import Uniform
+from fmtorch.estimators import F4x2, Pair, SummedGains, Uniform, kernel
 
 Array = np.ndarray[Any, Any]
 
@@ -70,7 +67,7 @@ class BestHalf:
     uses_prior = False
 
     def draw(self, pair: Pair, start: int, count: int, size: int) -> Array:
-        best = np.argsort(pair.quality, kind="stable")[: max(size, pair.count // 2)]
+        best = np.argsort(pair.ambiguity, kind="stable")[: max(size, pair.count // 2)]
         return best[different(pair, start, count, size, len(best))]
 
 

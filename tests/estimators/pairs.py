@@ -1,15 +1,13 @@
 """Pairs of many kinds as parts of estimators see them, and models of theirs."""
 
-from __future__ import annotations
-
 import functools
 
 import numpy as np
 import torch
 
-from fmtorch.core.types import Correspondences
+from fmtorch.core import Correspondences
+from fmtorch.estimators import Pair
 from fmtorch.estimators.batch import Batch
-from fmtorch.estimators.pair import Pair
 from fmtorch.geometry.eight_point import weighted_eight_point
 from tests.conftest import oracle
 from tests.laws import scene, small
@@ -31,7 +29,6 @@ def normalized(c: Correspondences, seed: int = 0, minimal: int = 7, i: int = 0) 
 def pair_of(c: Correspondences, seed: int = 0, i: int = 0) -> Pair:
     """A pair of a batch, which can be estimated."""
     pair = normalized(c, seed, i=i)
-    assert pair is not None
     return pair
 
 
@@ -43,9 +40,9 @@ def named(name: str, scale: float = 1.0, seed: int = 0) -> Pair:
 
 
 def known(count: int, kind: str = "all") -> Correspondences:
-    """A scene of so many matches with prior, noise and quality, or with nothing."""
+    """A scene of so many matches with prior, noise and ratio, or with nothing."""
     c = scene(count, count).replace(noise=torch.linspace(0.2, 5, count)[None])
-    return c.replace(prior=None, quality=None, noise=None) if kind == "nothing" else c
+    return c.replace(prior=None, ratio=None, noise=None) if kind == "nothing" else c
 
 
 @functools.cache

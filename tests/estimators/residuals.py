@@ -1,14 +1,12 @@
 """Sampson distances with bounds: between which they are when computed in float32, or in float64."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
 
-from fmtorch.estimators.pair import Pair
+from fmtorch.estimators import Pair
 from fmtorch.jit.kernel import Array
-from tests.reference.ransac import sampson
+from tests.reference.epipolar import sampson
 
 SUMS, ROW, LAST = 8, 3, 16
 """Roundings of a term of x1' F x0; of one of F x0 or F' x1; of squares, their sum, a quotient and a product."""

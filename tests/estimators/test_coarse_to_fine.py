@@ -1,12 +1,10 @@
 """Two estimators in a row: the second sees the first one's inliers, and each is answerable for its own failures."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 
 from fmtorch import presets
-from fmtorch.core.types import Correspondences, Estimate, collate
+from fmtorch.core import Correspondences, Estimate, collate
 from fmtorch.estimators import CoarseToFine, Ransac
 from tests.laws import scene
 
@@ -23,7 +21,7 @@ def test_equals_the_two_by_hand() -> None:
     assert torch.equal(both.F, fine.F)
     assert torch.equal(both.inliers, fine.inliers)
     assert bool((both.inliers <= coarse.inliers).all())
-    assert torch.equal(both.draws, coarse.draws + fine.draws)
+    assert torch.equal(both.samples, coarse.samples + fine.samples)
 
 
 def test_each_stage_names_its_own_failure() -> None:
@@ -49,19 +47,3 @@ def test_a_stage_s_options_are_replaced_by_name() -> None:
     assert estimator.coarse.inlier_rule.threshold == 3.5
     with pytest.raises(ValueError, match=r"estimator=cf_ransac\.fine: no option treshold; there are: "):
         presets.build("estimator", "cf_ransac", fine={"treshold": 1.0})
-
-
-@pytest.mark.parametrize("sampler", ["uniform", "prior"])
-def test_uses_the_prior_if_a_stage_does(sampler: str) -> None:
-    coarse = Ransac(sampler=sampler)
-    assert CoarseToFine(coarse=coarse, fine=FINE).uses_prior == (sampler == "prior")
-
-
-def test_gradients_are_the_fine_stage_s() -> None:
-    c = scene(2, 200)
-    x0 = c.x0.double().requires_grad_()
-    estimate = CoarseToFine(coarse=COARSE, fine=FINE)(c.replace(x0=x0, x1=c.x1.double()))
-    estimate.F.square()[:, 0, 1].sum().backward()
-    assert x0.grad is not None
-    assert bool(torch.isfinite(x0.grad).all())
-    assert bool((x0.grad != 0).any())

@@ -1,7 +1,5 @@
 """The least-squares fits of the presets: weighted by the prior, with gradients to it, or all inliers alike."""
 
-from __future__ import annotations
-
 import functools
 
 import pytest
@@ -9,7 +7,7 @@ import torch
 from torch import Tensor
 
 from fmtorch import presets
-from fmtorch.core.types import Correspondences, collate
+from fmtorch.core import Correspondences, collate
 from tests.laws import quick, scene, scenes
 from tests.variants import OTHER_LIBRARIES
 
@@ -23,7 +21,6 @@ def names(final: str) -> list[str]:
 
 
 def attached_to_prior(c: Correspondences) -> tuple[Correspondences, Tensor]:
-    assert c.prior is not None
     prior = c.prior.double().requires_grad_()
     return c.replace(x0=c.x0.double(), x1=c.x1.double(), prior=prior), prior
 
@@ -62,7 +59,6 @@ def test_gradients_reach_the_prior(name: str) -> None:
 @pytest.mark.parametrize("name", names("least_squares"))
 def test_a_constant_prior_is_as_good_as_none(name: str) -> None:
     c = scenes()
-    assert c.prior is not None
     estimator = quick(name)
     without = estimator(c.replace(prior=None), seed=5)
     assert torch.equal(estimator(c.replace(prior=torch.full_like(c.prior, 0.5)), seed=5).F, without.F)

@@ -1,7 +1,5 @@
 """FMTORCH_KERNELS=off: estimators and pruners run as plain Python, for debugging, and find the same."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

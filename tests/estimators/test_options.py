@@ -1,34 +1,17 @@
 """Options as configs write them: groups, parts by name, by mapping and by object, and what is refused."""
 
-from __future__ import annotations
-
 import typing
-from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 
 from fmtorch import find_fundamental, presets
-from fmtorch.estimators import Ransac
-from fmtorch.estimators.options import Focal, Preselect, Refine, Select, stage
-from fmtorch.estimators.pair import Pair
+from fmtorch.estimators import InlierCount, Msac, Preselect, Ransac, Refine
 from fmtorch.estimators.registry import PARTS, part
-from fmtorch.estimators.scores import InlierCount, Msac, scored_matches, squared_residuals_of
 from fmtorch.geometry.levenberg_marquardt import LOSS_CODES
 from tests.laws import scene
 
 MEDIAN = {"score": "median", "inliers": "lmeds", "confidence": None}
-
-
-def test_groups_are_made_of_mappings() -> None:
-    assert stage({"survivors": 64}, Preselect) == Preselect(128, 64)
-    assert stage({"loss": "cauchy", "scale": 0.5}, Refine) == Refine("cauchy", 0.5)
-    assert stage(None, Focal) is None
-    select = Select(scale=0.3)
-    assert stage(select, Select) is select
-    with pytest.raises(ValueError, match="estimator=ransac: refine=truncated; it must be a mapping of: loss, scale"):
-        presets.build("estimator", "ransac", refine="truncated")
 
 
 def test_losses_that_refine_names_are_those_there_are() -> None:
@@ -108,7 +91,6 @@ def test_every_part_can_be_made(role: str) -> None:
 
 def test_flat_and_nested_options_replace_those_of_a_preset() -> None:
     c = scene(0, 200)
-    assert c.size0 is not None
     estimate = find_fundamental(
         c.x0, c.x1, prior=c.prior, size0=c.size0, size1=c.size1, hypotheses=500, preselect={"survivors": 30},
         focal={"samples": 100},
@@ -118,33 +100,6 @@ def test_flat_and_nested_options_replace_those_of_a_preset() -> None:
     assert built.search.preselection.options == Preselect(64, 30)
     assert built.focal.search.hypotheses == 100
     assert built.focal.search.pool == 24
-    assert torch.equal(estimate.F, built(c.replace(key=None, quality=None)).F)
+    assert torch.equal(estimate.F, built(c.replace(key=None, ratio=None)).F)
     without = presets.build("estimator", "fmtorch", focal=None)
     assert without.focal is None
-
-
-class Nearest:
-    """A score of somebody else's: minus the squared distance of the `rank`-th nearest match."""
-
-    prior_weighted = False
-
-    def __init__(self, rank: int) -> None:
-        self.rank = rank
-
-    def __call__(self, F: np.ndarray, which: np.ndarray, pair: Pair) -> np.ndarray:
-        squared = np.empty((len(which), pair.count), np.float32)
-        squared_residuals_of(pair.residual)(F, which, scored_matches(pair, 1.0, False), squared)
-        return -np.partition(squared, self.rank, 1)[:, self.rank].astype(np.float64)
-
-
-def test_a_score_of_ones_own_in_a_preset_of_ones_own(tmp_path: Path) -> None:
-    (tmp_path / "estimator").mkdir()
-    (tmp_path / "estimator" / "nearest.yaml").write_text(
-        "_target_: fmtorch.estimators.Ransac\n"
-        "score:\n  _target_: tests.estimators.test_options.Nearest\n  rank: 60\n"
-        "hypotheses: 300\nconfidence: null\ninliers: threshold\nthreshold: 1.0\n"
-    )
-    c = scene(1, 150)
-    estimate = find_fundamental(c.x0, c.x1, estimator="nearest", config_dir=tmp_path)
-    assert bool(estimate.ok[0])
-    assert int(estimate.inliers.sum()) > 60

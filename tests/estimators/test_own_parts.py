@@ -1,7 +1,5 @@
 """A score, a sampler and a rule of one's own: as good as built-in ones, nearly as fast, and refused where wrong."""
 
-from __future__ import annotations
-
 import math
 import time
 from pathlib import Path
@@ -10,10 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from scipy import stats
 
 from fmtorch import presets
-from fmtorch.core.types import collate
+from fmtorch.core import collate
 from fmtorch.estimators import SummedGains
 from fmtorch.geometry import sampson
 from tests.estimators.own_parts import (
@@ -29,7 +26,6 @@ from tests.estimators.own_parts import (
     Welsch,
     Within2Px,
 )
-from tests.estimators.pairs import pair_of
 from tests.laws import assert_same, few, scene, scenes
 from tests.processes import run_command
 
@@ -91,7 +87,9 @@ def test_parts_that_do_as_the_built_in_ones_give_the_same_bits(parts: dict[str, 
         presets.build("estimator", "msac")(scenes(), 3),
     )
     assert bool(builtin.ok.all())
-    assert_same(*({name: getattr(e, name) for name in ("F", "inliers", "ok", "draws")} for e in (own, builtin)), "msac")
+    assert_same(
+        *({name: getattr(e, name) for name in ("F", "inliers", "ok", "samples")} for e in (own, builtin)), "msac"
+    )
 
 
 def test_parts_are_named_as_targets() -> None:
@@ -109,33 +107,48 @@ def test_a_rule_decides_the_inliers() -> None:
     assert torch.equal(estimate.inliers[clear], (distance <= 2)[clear])
 
 
-@pytest.mark.parametrize(
-    ("sample", "complaint"),
-    [
-        (lambda count, size: np.zeros((count, size), np.int64), r"returns int64 \(100, 7\); .* int64 \(7, 100\)"),
-        (lambda count, size: np.zeros((size, count)), r"returns float64 \(7, 100\); it must be an array of int64"),
-        (lambda count, size: np.full((size, count), 150), "indices from 150 to 150; they must be from 0 to 149"),
-        (lambda count, size: np.full((size, count), -1), "indices from -1 to -1"),
-        (None, "returns NoneType; it must be an array of int64"),
-    ],
-)
-def test_wrong_samples_are_refused_by_name(sample: Any, complaint: str) -> None:
-    with pytest.raises(ValueError, match=f"Sampled.draw returns .*{complaint.removeprefix('returns ')}"):
-        built("msac", {"sampler": Sampled(sample)})(scene(1, 150))
+class Gain(SummedGains):
+    def __init__(self, gain: Any) -> None:
+        super().__init__(1.0)
+        self.gain = gain
 
 
-@pytest.mark.parametrize(
-    ("scores", "complaint"),
-    [
-        (lambda which: np.zeros(len(which) + 1), r"Scored returns float64 \(\d+,\); it must be an array of float64"),
-        (lambda which: np.zeros(len(which), np.float32), "Scored returns float32"),
-        (lambda which: 1.0, "Scored returns float; it must be"),
-    ],
-)
-def test_wrong_scores_are_refused_by_name(scores: Any, complaint: str) -> None:
-    for count in (60, 600):  # without and with preselection
+SAMPLES, GAINS = r"Sampled.draw returns .*", r"; it must be the shape of its argument, \(\d+, 60\): .* of numbers"
+WRONG: list[tuple[dict[str, Any], str]] = [
+    ({"sampler": Sampled(lambda m, size: np.zeros((m, size), np.int64))}, rf"{SAMPLES}int64 \(100, 7\); .* \(7, 100\)"),
+    ({"sampler": Sampled(lambda m, size: np.zeros((size, m)))}, rf"{SAMPLES}float64 \(7, 100\); it must be an array"),
+    ({"sampler": Sampled(lambda m, size: np.full((size, m), 60))}, f"{SAMPLES}indices from 60 to 60; .* from 0 to 59"),
+    ({"sampler": Sampled(lambda m, size: np.full((size, m), -1))}, f"{SAMPLES}indices from -1 to -1"),
+    ({"sampler": Sampled(None)}, f"{SAMPLES}NoneType; it must be an array of int64"),
+    (
+        {"score": Scored(lambda which: np.zeros(len(which) + 1))},
+        r"Scored returns float64 \(\d+,\); it must be an array",
+    ),
+    ({"score": Scored(lambda which: np.zeros(len(which), np.float32))}, "Scored returns float32"),
+    ({"score": Scored(lambda which: 1.0)}, "Scored returns float; it must be"),
+    ({"score": Gain(lambda squared: squared[:, :3])}, rf"Gain.gain returns shape \(\d+, 3\) of float32{GAINS}"),
+    ({"score": Gain(lambda squared: squared.sum(1))}, rf"Gain.gain returns shape \(\d+,\) of float32{GAINS}"),
+    ({"score": Gain(lambda squared: 1.0)}, rf"shape \(\) of float64{GAINS}"),
+    ({"score": Gain(lambda squared: squared + 0j)}, rf"shape \(\d+, 60\) of complex64{GAINS}"),
+    ({"score": Gain(lambda squared: [["one"] * 60] * len(squared))}, rf"shape \(\d+, 60\) of <U3{GAINS}"),
+    ({"inliers": lambda r2, pair: r2}, r"function returns float64 \(60,\); it must be an array of bool \(60,\)"),
+    ({"inliers": lambda r2, pair: (r2 <= 1)[:9]}, r"function returns bool \(9,\)"),
+    ({"inliers": lambda r2, pair: [True] * len(r2)}, "function returns list"),
+]
+
+
+@pytest.mark.parametrize(("parts", "complaint"), WRONG)
+def test_what_parts_return_wrongly_is_refused_by_name(parts: dict[str, Any], complaint: str) -> None:
+    with pytest.raises(ValueError, match=complaint):
+        built("msac", parts)(scene(1, 60))
+    if isinstance(parts.get("score"), Scored):  # with preselection, too
         with pytest.raises(ValueError, match=complaint):
-            built("msac", {"score": Scored(scores)})(scene(1, count))
+            built("msac", parts)(scene(1, 600))
+
+
+def test_a_score_without_a_gain_is_refused_by_name() -> None:
+    with pytest.raises(NotImplementedError, match="SummedGains must override `gain` or name a `gain_kernel`"):
+        built("msac", {"score": SummedGains(1.0)})(scene(1, 60))
 
 
 def test_scores_may_be_a_column() -> None:
@@ -146,47 +159,6 @@ def test_scores_may_be_a_column() -> None:
     )
 
 
-@pytest.mark.parametrize(
-    ("gain", "complaint"),
-    [
-        (lambda squared: squared[:, :3], r"shape \(\d+, 3\) of float32"),
-        (lambda squared: squared.sum(1), r"shape \(\d+,\) of float32"),
-        (lambda squared: 1.0, r"shape \(\) of float64"),
-        (lambda squared: squared + 0j, r"shape \(\d+, 60\) of complex64"),
-        (lambda squared: [["one"] * 60] * len(squared), r"shape \(\d+, 60\) of <U3"),
-    ],
-)
-def test_wrong_gains_are_refused_by_name(gain: Any, complaint: str) -> None:
-    class Mine(SummedGains):
-        def gain(self, squared: Any) -> Any:
-            return gain(squared)
-
-    message = rf"Mine.gain returns {complaint}; it must be the shape of its argument, \(\d+, 60\): .* of numbers"
-    with pytest.raises(ValueError, match=message):
-        built("msac", {"score": Mine(1.0)})(scene(1, 60))
-
-
-def test_a_score_without_a_gain_is_refused_by_name() -> None:
-    class Bare(SummedGains):
-        pass
-
-    with pytest.raises(NotImplementedError, match="Bare must override `gain` or name a `gain_kernel`"):
-        built("msac", {"score": Bare(1.0)})(scene(1, 60))
-
-
-@pytest.mark.parametrize(
-    ("rule", "complaint"),
-    [
-        (lambda r2, pair: r2, r"returns float64 \(150,\); it must be an array of bool \(150,\)"),
-        (lambda r2, pair: (r2 <= 1)[:9], r"returns bool \(9,\)"),
-        (lambda r2, pair: [True] * len(r2), "returns list"),
-    ],
-)
-def test_wrong_inliers_are_refused_by_name(rule: Any, complaint: str) -> None:
-    with pytest.raises(ValueError, match=f"function {complaint}"):
-        built("msac", {"inliers": rule})(scene(1, 150))
-
-
 def compared(preset: str) -> None:
     """Prints the draws of a preset and of its like with parts in NumPy, and the CPU times: each the least of some."""
     c = scene(1, 600, outliers=0.5)
@@ -195,7 +167,7 @@ def compared(preset: str) -> None:
     threshold = {} if preset == "msac" else {"threshold": None}
     own = presets.build("estimator", preset, score=score, sampler=AllAlike(), inliers=Within2Px(), **threshold)
     estimators = own, presets.build("estimator", preset)
-    draws, fastest = [int(estimator(c).draws) for estimator in estimators], [math.inf, math.inf]
+    draws, fastest = [int(estimator(c).samples) for estimator in estimators], [math.inf, math.inf]
     for _ in range(20):
         for k, estimator in enumerate(estimators):
             start = time.process_time()
@@ -214,14 +186,3 @@ def test_parts_in_numpy_take_at_most_three_times_as_long(preset: str, tmp_path: 
     print(f"{preset}: {1000 * builtin:.2f} ms, with parts in NumPy {1000 * seconds:.2f} ms")
     assert draws == builtin_draws
     assert seconds < 3 * builtin
-
-
-def test_samples_of_ones_own_are_distinct_and_from_the_better_half() -> None:
-    pair = pair_of(scene(1, 41))
-    sample = BestHalf().draw(pair, 3, 500, 7)
-    assert pair.quality is not None
-    better = np.argsort(pair.quality, kind="stable")[:20]
-    assert all(len(set(column)) == 7 for column in sample.T)
-    assert set(sample.ravel()) == set(better)
-    counts = np.bincount(AllAlike().draw(pair, 0, 5000, 7)[6], minlength=41)
-    assert stats.chisquare(counts).pvalue > 1e-4

@@ -1,7 +1,5 @@
 """From a batch to one pair: which matches are usable, in which units; and a model back in pixels."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 
@@ -9,13 +7,13 @@ import numpy as np
 import pytest
 import torch
 
-from fmtorch.core.types import Correspondences, collate
+from fmtorch.core import Correspondences, collate
+from fmtorch.estimators import Pair
 from fmtorch.estimators.batch import Batch, relative_rounding
-from fmtorch.estimators.pair import MAX_NOISE, MIN_NOISE, Pair, bucket, to_pixels
+from fmtorch.estimators.pair import MAX_NOISE, MIN_NOISE, bucket
 from tests.estimators.pairs import SCALES, known, named, pair_of, real
 from tests.laws import degenerate, scene, small, with_padding
 from tests.reference.random import number
-from tests.reference.solvers import unit as of_unit_norm
 
 
 def normalized(c: Correspondences, i: int = 0, minimal: int = 7) -> tuple[Pair, Any] | str:
@@ -35,7 +33,7 @@ def padded_pairs() -> Correspondences:
 @pytest.mark.parametrize("kind", ["all", "nothing", "real"])
 def test_a_pair_holds_its_usable_matches_in_order(kind: str, scale: float) -> None:
     c = real(7) if kind == "real" else padded_pairs()
-    c = c if kind == "all" else c.replace(prior=None, noise=None, quality=None, size0=None, size1=None)
+    c = c if kind == "all" else c.replace(prior=None, noise=None, ratio=None, size0=None, size1=None)
     c = c.replace(x0=scale * c.x0.double(), x1=scale * c.x1.double())
     for i in range(len(c)):
         result = normalized(c, i)
@@ -51,7 +49,7 @@ def test_a_pair_holds_its_usable_matches_in_order(kind: str, scale: float) -> No
         assert pair.pixels_per_unit / 2 < half <= pair.pixels_per_unit
         np.testing.assert_array_equal(pair.points, (pixels - pair.centre[:, None]) / pair.pixels_per_unit)
         assert (pair.count, pair.key, pair.bucket) == (mask.sum(), int(c.keys[i]), bucket(int(mask.sum())))
-        values = {name: getattr(c, name) for name in ("prior", "noise", "quality")}
+        values = {name: getattr(c, name) for name in ("prior", "noise", "ratio")}
         for name, value in values.items():
             assert (getattr(pair, name) is None) == (value is None) == (kind != "all")
         prior, noise, _ = (
@@ -82,40 +80,22 @@ def test_the_unit_is_the_next_power_of_two() -> None:
             assert result[0].pixels_per_unit == expected
 
 
-@pytest.mark.parametrize(
-    ("count", "size"),
-    [(0, 128), (1, 128), (128, 128), (129, 192), (192, 192), (193, 256), (760, 768), (769, 1024), (100_000, 131_072)],
-)
-def test_buckets(count: int, size: int) -> None:
-    assert bucket(count) == size
+WRONG = {
+    "prior": ((1.5, -0.1, math.nan), "prior of 1 match is wrong: it is P(inlier), within [0, 1]"),
+    "noise": ((0.0, -1.0, math.nan), "noise of 1 match is wrong: it is a standard deviation, positive"),
+    "size0": ((0.0, -3.0, math.nan, math.inf), "size0 is wrong: image sizes (h, w) are positive"),
+}
 
 
-@pytest.mark.parametrize("value", [1.5, -0.1, math.nan])
-def test_wrong_priors_are_told(value: float) -> None:
-    c = known(20)
-    assert c.prior is not None
-    prior = c.prior.clone()
-    prior[0, 3] = value
-    wrong = "prior of 1 match is wrong: it is P(inlier), within [0, 1]"
-    assert normalized(c.replace(prior=prior)) == wrong
-    hidden = c.replace(prior=prior, mask=torch.arange(20)[None] != 3)
-    assert not isinstance(normalized(hidden), str)
-
-
-@pytest.mark.parametrize("value", [0.0, -1.0, math.nan])
-def test_wrong_noise_is_told(value: float) -> None:
-    c = known(20)
-    assert c.noise is not None
-    noise = c.noise.clone()
-    noise[0, 3] = value
-    assert normalized(c.replace(noise=noise)) == "noise of 1 match is wrong: it is a standard deviation, positive"
-
-
-@pytest.mark.parametrize("value", [0.0, -3.0, math.nan, math.inf])
-def test_wrong_sizes_are_told(value: float) -> None:
-    c = known(20)
-    wrong = "size0 is wrong: image sizes (h, w) are positive"
-    assert normalized(c.replace(size0=torch.tensor([[640.0, value]]))) == wrong
+@pytest.mark.parametrize("name", WRONG)
+def test_wrong_values_are_a_reason_unless_they_are_masked(name: str) -> None:
+    c, (values, reason) = known(20), WRONG[name]
+    for value in values:
+        wrong = getattr(c, name).float().clone()
+        wrong[0, wrong.shape[1] // 2] = value
+        assert normalized(c.replace(**{name: wrong})) == reason
+        hidden = c.replace(**{name: wrong}, mask=torch.arange(20)[None] != 10)
+        assert isinstance(normalized(hidden), str) == (name == "size0")
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, 1e100, -1e300])
@@ -162,7 +142,7 @@ def test_a_part_of_a_pair_keeps_its_frame() -> None:
     index = np.array([7, 3, 30])
     part = pair.take(index)
     np.testing.assert_array_equal(part.table, pair.table[:, index])
-    assert part.quality is not None
+    assert part.ratio is not None
     for name in ("bucket", "pixels_per_unit", "key", "seed", "centre", "sizes", "residual", "images"):
         assert getattr(part, name) is getattr(pair, name), name
     assert pair.cached("sum", lambda pair: float(pair.points.sum())) == pair.points.sum()
@@ -174,30 +154,6 @@ def test_numbers_of_a_pair_are_those_of_its_seed_key_and_draw() -> None:
     pair = pair_of(scene(0, 20), seed=5)
     expected = [[(number(5, pair.key, 1, d, j, 4) >> 10) / 2**53 for j in range(4)] for d in range(100, 130)]
     assert pair.uniform(100, 30, 4).tolist() == expected
-
-
-@pytest.mark.parametrize("scale", [2.0**-30, 1.0, 2.0**30])
-def test_models_in_pixels(scale: float) -> None:
-    rng = np.random.default_rng(0)
-    centre, unit = scale * rng.uniform(-1000, 1000, 4), scale * 512
-    T0, T1 = (
-        np.array([[1 / unit, 0, -x / unit], [0, 1 / unit, -y / unit], [0, 0, 1]]) for x, y in (centre[:2], centre[2:])
-    )
-    for _ in range(50):
-        F, out = rng.normal(size=(3, 3)), np.empty((3, 3))
-        assert to_pixels(F.ravel(), centre, unit, out)
-        # Two products of three terms, a norm, and a division; entries of one column may cancel.
-        size = np.abs(T1).T @ np.abs(F) @ np.abs(T0)
-        norm = np.linalg.norm(T1.T @ F @ T0)
-        np.testing.assert_array_less(np.abs(out - of_unit_norm(T1.T @ F @ T0)), 40 * 2.0**-53 * (size.max() / norm + 1))
-        assert out.flat[np.abs(out).argmax()] > 0
-
-
-def test_models_that_are_not_finite_in_pixels_are_told() -> None:
-    out = np.empty((3, 3))
-    for F in (np.full(9, np.nan), np.full(9, np.inf)):
-        assert not to_pixels(F, np.zeros(4), 1.0, out)
-    assert not to_pixels(np.ones(9), np.full(4, 1e200), 1e-200, out)
 
 
 def test_the_rounding_of_coordinates() -> None:

@@ -1,7 +1,5 @@
 """Other libraries behind our call: their results in our conventions, failures as data, a prior that orders matches."""
 
-from __future__ import annotations
-
 import sys
 import types
 
@@ -10,8 +8,9 @@ import numpy as np
 import pytest
 import torch
 
+import fmtorch
 from fmtorch import find_essential, geometry, presets
-from fmtorch.core.types import Correspondences, collate
+from fmtorch.core import Correspondences, collate
 from fmtorch.estimators import PairwiseEstimator
 from fmtorch.estimators.external.pairwise import Pair, Solution
 from fmtorch.two_view.known_cameras import KnownCameras
@@ -83,13 +82,6 @@ def test_poselib_gets_the_options_that_are_named(name: str, monkeypatch: pytest.
             built("estimator", name, real_focal_check=True)
 
 
-def test_the_check_of_focal_lengths_leaves_pixels_as_they_are() -> None:
-    pytest.importorskip("poselib")
-    c, clean = scene(0, 200, outliers=0.2, noise=0.1), scene(0, 200, outliers=0.0, noise=0.0)
-    estimate = presets.build("estimator", "poselib", real_focal_check=True)(c)
-    assert float(geometry.sampson(estimate.F, clean.x0.double(), clean.x1.double()).median()) < 0.5
-
-
 def test_poselib_estimates_the_pose_of_exactly_known_cameras() -> None:
     """Its own pose, sign included; roughly known focal lengths leave a fundamental matrix."""
     poselib = pytest.importorskip("poselib")
@@ -103,8 +95,6 @@ def test_poselib_estimates_the_pose_of_exactly_known_cameras() -> None:
     options = {"max_epipolar_error": 1.0, "max_iterations": 10000, "min_iterations": 1000, "success_prob": 0.9999}
     pose, info = poselib.estimate_relative_pose(s.x0.numpy(), s.x1.numpy(), *cameras, {**options, "seed": 3}, {})
     estimate = find_essential(s.x0, s.x1, s.K0, s.K1, estimator="poselib", seed=3)
-    assert estimate.R is not None
-    assert estimate.t is not None
     # pixels are mapped to those of a central principal point: 1e-13 px, times the condition of the fit
     assert estimate.R[0].numpy() == pytest.approx(pose.R, abs=1e-6)
     assert estimate.t[0].numpy() == pytest.approx(pose.t / np.linalg.norm(pose.t), abs=1e-6)
@@ -123,7 +113,6 @@ def test_roughly_known_cameras_are_not_exact_for_peers() -> None:
     for deviation in (0.0, 0.05, np.inf):
         find(c.replace(focal=torch.tensor([[[1.0, deviation], [1.0, deviation]]], dtype=torch.float64)), 3)
     exact, rough, unknown = given
-    assert exact.exact is not None
     f = [float(torch.sqrt(K[0, 0] * K[1, 1])) for K in (s.K0, s.K1)]
     assert [K[0, 0] for K in exact.exact] == pytest.approx(f)
     assert rough.exact is None
@@ -141,17 +130,24 @@ def test_superansac_does_the_same_at_every_call() -> None:
     assert all(torch.equal(first, other) for other in others)
 
 
-def test_unknown_parts_of_superansac_are_refused_with_the_choices() -> None:
-    with pytest.raises(ValueError, match="sampler is 'napsac'; it must be one of: uniform, prosac, importance"):
-        presets.build("estimator", "superansac_cpp", sampler="napsac")
-    with pytest.raises(ValueError, match="score is 'lmeds'; it must be one of: ransac, msac, magsac"):
-        presets.build("estimator", "superansac_cpp", score="lmeds")
-
-
-@pytest.mark.parametrize("name", ["magsac_cpp", "gc_ransac_cpp"])
-def test_an_unknown_sampler_is_refused_with_the_choices(name: str) -> None:
-    with pytest.raises(ValueError, match="sampler is 'napsac'; it must be one of: uniform, prosac, progressive_napsac"):
-        built("estimator", name, sampler="napsac")
+@pytest.mark.parametrize(
+    ("name", "options", "message"),
+    [
+        (
+            "superansac_cpp",
+            {"sampler": "napsac"},
+            "sampler is 'napsac'; it must be one of: uniform, prosac, importance",
+        ),
+        ("superansac_cpp", {"score": "lmeds"}, "score is 'lmeds'; it must be one of: ransac, msac, magsac"),
+        *(
+            (name, {"sampler": "napsac"}, "sampler is 'napsac'; it must be one of: uniform, prosac, progressive_napsac")
+            for name in ("magsac_cpp", "gc_ransac_cpp")
+        ),
+    ],
+)
+def test_unknown_parts_are_refused_with_the_choices(name: str, options: dict[str, str], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        built("estimator", name, **options)
 
 
 @pytest.mark.parametrize("flags", [0, 1])
@@ -179,7 +175,6 @@ def test_the_prior_orders_matches_before_the_quality() -> None:
         return None, torch.zeros(len(pair.x0), dtype=torch.bool).numpy()
 
     c = scene(0, 40)
-    assert c.prior is not None
     estimator = PairwiseEstimator("probe", solve, best_first=True)
     estimate = estimator(c)
     estimator(c.replace(prior=None))
@@ -215,3 +210,29 @@ def test_a_binding_gets_whole_numbers_that_it_takes(name: str) -> None:
         assert estimate.reason[1] == "" or "pybind" not in estimate.reason[1]
     with pytest.raises(ValueError, match="must be a whole number from 1 to 2147483647"):
         built("estimator", name, iterations=2**31)
+
+
+@pytest.mark.slow  # its kernels are compiled for minutes
+def test_fastpose_estimates_what_is_asked_for() -> None:
+    """Poses of exactly known cameras, one or two unknown focal lengths, and homographies."""
+    pytest.importorskip("fastpose")
+    s = matched_scene(300, 1, noise=0.1)
+    posed = find_essential(s.x0, s.x1, s.K0, s.K1, estimator="fastpose", seed=3)
+    assert posed.R is not None
+    assert posed.t is not None
+    assert posed.R[0].numpy() == pytest.approx(s.R.numpy(), abs=2e-3)
+    assert posed.t[0].numpy() == pytest.approx(s.t.numpy() / np.linalg.norm(s.t.numpy()), abs=2e-2)
+    sizes = [torch.tensor([round(2 * float(k[1, 2]) + 1), round(2 * float(k[0, 2]) + 1)]) for k in (s.K0, s.K1)]
+    unknown = fmtorch.find_fundamental(
+        s.x0, s.x1, size0=sizes[0], size1=sizes[1], focal="unknown", estimator="fastpose", seed=3
+    )
+    assert unknown.focals is not None
+    expected = [float(s.K0[0, 0]), float(s.K1[0, 0])]
+    assert unknown.focals[0].numpy() == pytest.approx(expected, rel=0.15)  # by its solver alone, without a prior
+    x0 = np.random.default_rng(0).uniform(0, 800, (60, 2))
+    H = np.array([[0.9, 0.1, 20], [-0.05, 1.1, -10], [1e-5, 2e-5, 1]])
+    x1 = np.c_[x0, np.ones(60)] @ H.T
+    plane = fmtorch.find_homography(x0, x1[:, :2] / x1[:, 2:], estimator="fastpose", model="homography")
+    assert (plane.H[0] / plane.H[0, 2, 2]).numpy() == pytest.approx(H, abs=1e-6)
+    with pytest.raises(ValueError, match="focal=shared is of fundamental matrices"):
+        presets.build("estimator", "fastpose", model="homography", focal="shared")

@@ -1,7 +1,5 @@
 """Real pairs with outliers: our estimators against what ten other implementations reached on the same matches."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
@@ -32,12 +30,12 @@ def batch(file: dict[str, np.ndarray]) -> dict[str, torch.Tensor]:
     count = len(file["names"])
     n = max(len(file[f"{i:03d}.X1"]) for i in range(count))
     x0, x1 = np.zeros((2, count, n, 2))
-    mask, quality = np.zeros((count, n), bool), np.zeros((count, n))
+    mask, ratio = np.zeros((count, n), bool), np.zeros((count, n))
     for i in range(count):
         live = slice(len(file[f"{i:03d}.X1"]))
         x0[i, live], x1[i, live] = file[f"{i:03d}.X1"], file[f"{i:03d}.X2"]
-        mask[i, live], quality[i, live] = True, file[f"{i:03d}.score"]
-    return {k: torch.from_numpy(v) for k, v in {"x0": x0, "x1": x1, "mask": mask, "quality": quality}.items()}
+        mask[i, live], ratio[i, live] = True, file[f"{i:03d}.score"]
+    return {k: torch.from_numpy(v) for k, v in {"x0": x0, "x1": x1, "mask": mask, "ratio": ratio}.items()}
 
 
 @pytest.mark.parametrize("name", NAMESAKES)

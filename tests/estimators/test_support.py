@@ -1,7 +1,5 @@
 """No estimate without support: enough different inliers, not on one line, at any scale of the coordinates."""
 
-from __future__ import annotations
-
 import importlib.util
 from collections.abc import Mapping
 from typing import Any
@@ -11,15 +9,12 @@ import pytest
 import torch
 
 from fmtorch import find_fundamental
-from fmtorch.core.types import Correspondences, Estimate, collate
-from fmtorch.estimators import degensac
-from fmtorch.estimators.graph_cut import GraphCut
+from fmtorch.core import Correspondences, Estimate, collate
+from fmtorch.estimators import Fundamental, GraphCut, Homography, degensac
 from fmtorch.estimators.models import with_focals
-from fmtorch.estimators.models.fundamental import Fundamental
-from fmtorch.estimators.models.homography import Homography
 from fmtorch.estimators.models.model import FitScale
 from fmtorch.presets.objects import merged
-from tests.laws import PEERS, few, quick, scene, small
+from tests.laws import PEERS, degenerate, few, quick, scene, small
 from tests.variants import OTHER_LIBRARIES, built, loaded, variants
 
 EVERY = variants("estimator")
@@ -54,22 +49,25 @@ def assert_supported(estimate: Estimate, c: Correspondences, what: str) -> None:
         assert float(estimate.F[i].norm()) == pytest.approx(1), f"{what}, pair {i}"
 
 
-@pytest.mark.parametrize("name", EVERY)
-def test_few_and_degenerate_matches_give_no_unsupported_model(name: str) -> None:
-    pairs = list(small().values())
-    pairs += [scene(100 + i, 20, outliers=1.0) for i in range(8)]
-    c = collate(pairs)
-    assert_supported(estimator(name)(c, 2), c, name)
+HOPELESS = ("empty", "one match", "all points equal", "NaN", "infinite")
+RANK_TWO = (*small(), "one plane", "identity", "all outliers", "all points equal")
+"""Pairs of usual coordinates, of which an F of unit norm in pixels has rank two to rounding."""
 
 
-@pytest.mark.parametrize("name", EVERY)
-def test_coordinates_scaled_alone_give_a_sound_result_or_none(name: str) -> None:
-    c = scene(1, 60, outliers=0.3, noise=0.1)
-    c = c.replace(x0=c.x0.double(), x1=c.x1.double())
-    scales = torch.tensor([1e-300, 1e-150, 1e-12, 1e-6, 1e-3, 1e3, 1e6, 1e12, 1e150, 1e300], dtype=torch.float64)
-    many = collate([c] * len(scales))
-    many = many.replace(x0=many.x0 * scales[:, None, None], x1=many.x1 * scales[:, None, None])
-    assert_supported(estimator(name)(many, 0), many, name)
+@pytest.mark.parametrize(
+    ("name", "factor"), [*((name, 1.0) for name in EVERY), *((name, factor) for name in OWN for factor in (1e-9, 1e9))]
+)
+def test_few_and_degenerate_matches_of_any_scale_give_a_supported_model_or_a_reason(name: str, factor: float) -> None:
+    """Sizes are scaled alike."""
+    kinds = small() | degenerate() | {str(i): scene(100 + i, 20, outliers=1.0) for i in range(8)}
+    fields = ("x0", "x1", "size0", "size1")
+    c = collate([p.replace(**{f: getattr(p, f).double() * factor for f in fields}) for p in kinds.values()])
+    estimate = estimator(name)(c, 2)
+    assert_supported(estimate, c, name)
+    assert not any(bool(estimate.ok[list(kinds).index(kind)]) for kind in HOPELESS)
+    if name in OWN and estimate.model == "fundamental":
+        usual = torch.tensor([kind in RANK_TWO for kind in kinds])
+        assert float(torch.linalg.det(estimate.F[usual]).abs().max()) < 1e-12
 
 
 def test_the_default_has_no_support_at_thresholds_far_below_rounding() -> None:

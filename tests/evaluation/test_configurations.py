@@ -11,28 +11,27 @@ import torch
 from rich.console import Console
 
 from fmtorch import presets
-from fmtorch.core.types import CONFIGURATIONS, WARNINGS, Correspondences
-from fmtorch.data import ImagePair, ImageSource
-from fmtorch.data.pairs import GivenMatches
-from fmtorch.evaluation import tables
-from fmtorch.evaluation.pair_cameras import WithPairCameras, built_with, cameras_of
-from fmtorch.evaluation.rows import evaluate, focal_errors
-from fmtorch.evaluation.statistics import focal_figures
-from fmtorch.evaluation.summary import summarize
-from fmtorch.evaluation.tables import summary_markdown, terminal_tables
-from fmtorch.io.dataset import H5Pairs
-from fmtorch.pipeline.pipeline import Outcome, Pipeline, examined
+from fmtorch.core import PAIR_TYPES, WARNINGS, Correspondences
+from fmtorch.data import GivenMatches, ImagePair, ImageSource
+from fmtorch.evaluation import (
+    WithPairCameras,
+    built_with,
+    cameras_of,
+    evaluate,
+    focal_errors,
+    summarize,
+    summary_markdown,
+    tables,
+    terminal_tables,
+)
+from fmtorch.pipeline import Outcome, Pipeline, examined
 from fmtorch.runs import PairRow, to_table
 from tests.geometry.kinds import K, batch, draw
-from tests.io import writers
-
-
-def unused(*_: object) -> None:
-    raise AssertionError("features and matcher have nothing to do")
+from tests.helpers import unused
 
 
 def pipeline() -> Pipeline:
-    return Pipeline(unused, unused, {}, presets.build("estimator", "fmtorch"))  # type: ignore[arg-type]
+    return Pipeline(unused, unused, {}, presets.build("estimator", "fmtorch"))
 
 
 def given(c: Correspondences) -> Callable[[], GivenMatches]:
@@ -57,14 +56,14 @@ def rows(pairs: list[ImagePair], word: str | None) -> list[PairRow]:
 
 @pytest.mark.parametrize("word", [None, "known", "unknown"])
 def test_rows_say_which_configuration_and_neighbours_change_nothing(word: str | None) -> None:
-    pairs = [pair(kind, 150 + 10 * i) for i, kind in enumerate(CONFIGURATIONS)]
+    pairs = [pair(kind, 150 + 10 * i) for i, kind in enumerate(PAIR_TYPES)]
     lost = dataclasses.replace(pairs[0], identity="lost", problem="no image")
     together = rows([*pairs, lost], word)
-    assert [row.configuration for row in together] == [*CONFIGURATIONS, None]
-    assert [row.warning for row in together] == [*(WARNINGS[kind] for kind in CONFIGURATIONS), None]
+    assert [row.pair_type for row in together] == [*PAIR_TYPES, None]
+    assert [row.warning for row in together] == [*(WARNINGS[kind] for kind in PAIR_TYPES), None]
     for each, row in zip(pairs, together, strict=False):
         (alone,) = rows([each], word)
-        assert (alone.F, alone.configuration) == (row.F, row.configuration)
+        assert (alone.F, alone.pair_type) == (row.F, row.pair_type)
         assert alone.focal_log_ratio0 == row.focal_log_ratio0
 
 
@@ -73,27 +72,10 @@ def test_a_pair_that_cannot_be_examined_harms_no_other() -> None:
     outcomes = built.run([pair("general"), pair("planar")])
     broken = dataclasses.replace(outcomes[0], estimate=outcomes[0].estimate.replace(model="homography"))
     results = examined(built, [broken, outcomes[1]])
-    assert [o.configuration is None for o in results] == [True, False]
+    assert [o.pair_type is None for o in results] == [True, False]
     first, second = evaluate([dataclasses.replace(results[0], estimate=outcomes[0].estimate), results[1]])
     assert first.warning.startswith("not examined: ValueError: estimate is of homography matrices")
-    assert second.configuration == "planar"
-
-
-def test_calibrations_count_only_where_the_estimator_was_given_them() -> None:
-    """A camera whose true focal length is far from a usual one: by image sizes its rotation is not seen to be one."""
-    long = np.diag([8.0, 8.0, 1.0]) @ K
-    long[:2, 2] = K[:2, 2]
-    turned = pair("rotation")
-    c, _ = turned.matches()
-    angle = 0.05
-    R = np.array([[math.cos(angle), 0, math.sin(angle)], [0, 1, 0], [-math.sin(angle), 0, math.cos(angle)]])
-    R = R @ np.array([[math.cos(0.4), -math.sin(0.4), 0], [math.sin(0.4), math.cos(0.4), 0], [0, 0, 1]])
-    H = torch.from_numpy(long @ R @ np.linalg.inv(long))
-    x = torch.cat([c.x0.double(), torch.ones(1, c.mask.shape[1], 1, dtype=torch.float64)], -1) @ H.T
-    x1 = (x[..., :2] / x[..., 2:] + torch.randn(x[..., :2].shape, generator=torch.Generator().manual_seed(0))).to(c.x1)
-    turned = dataclasses.replace(turned, K0=long, K1=long, matches=given(c.replace(x1=x1)))
-    assert rows([turned], "known")[0].configuration == "rotation"
-    assert rows([turned], None)[0].configuration in ("planar", "rotation")  # by the usual focal lengths alone
+    assert second.pair_type == "planar"
 
 
 def estimated(c: Correspondences, focals: list[float], true: tuple[np.ndarray | None, np.ndarray | None]) -> Outcome:
@@ -122,22 +104,11 @@ def test_errors_of_focal_lengths() -> None:
     assert focal_errors(estimated(c, [768.0, 768.0], (K, K))).error == (None, None)  # nobody asked
 
 
-def test_figures_of_focal_lengths() -> None:
-    errors = np.array([[0.02, 0.08], [0.3, np.inf], [np.nan, np.nan], [np.nan, np.nan]])
-    ratios = np.log(np.array([[1.02, 0.92], [1.3, np.nan], [np.nan, np.nan], [np.nan, np.nan]]))
-    figures = focal_figures(errors, ratios, np.array([True, True, True, False]))
-    assert figures["images"] == 6  # two of a failed pair
-    assert figures["error"] is None  # more than half are misses
-    assert (figures["within_5"], figures["within_10"]) == (1 / 6, 2 / 6)
-    assert figures["ratio"] == pytest.approx(1.02)
-    assert focal_figures(np.full((2, 2), np.nan), ratios[:2], np.array([True, False])) is None
-
-
 def test_summaries_and_reports_show_them() -> None:
     pairs = [pair(kind) for kind in ("general", "planar")]
     table = to_table(rows(pairs, "unknown"))
     summary = summarize(table)
-    assert summary["all"]["configurations"] == {**dict.fromkeys(CONFIGURATIONS, 0), "general": 1, "planar": 1}
+    assert summary["all"]["pair_types"] == {**dict.fromkeys(PAIR_TYPES, 0), "general": 1, "planar": 1}
     assert summary["all"]["focals"]["images"] == 4
     console = Console(width=80, record=True)
     for each in terminal_tables(summary, "t")[1:]:
@@ -149,29 +120,9 @@ def test_summaries_and_reports_show_them() -> None:
     assert "| family | 1 | 1 | 0 | 0 | 0 |" in page
     assert "folded" in page
     of_report = {each.heading: each for each in tables.report_tables({"run": table}, {"run": summary})}
-    assert [cell.text for cell in of_report["Configurations"].rows["run"]] == ["1", "1", "0", "0", "0"]
+    assert [cell.text for cell in of_report["Pair types"].rows["run"]] == ["1", "1", "0", "0", "0"]
     assert of_report["Focal lengths"].rows["run"][0].text == "4"
-    nobody = to_table([dataclasses.replace(row, configuration=None) for row in rows(pairs[:1], None)])
-    assert "Configurations" not in {part.heading for part in tables.parts(summarize(nobody))}
+    nobody = to_table([dataclasses.replace(row, pair_type=None) for row in rows(pairs[:1], None)])
+    assert "Pair types" not in {part.heading for part in tables.parts(summarize(nobody))}
     alone = terminal_tables(summarize(to_table(rows(pairs[:1], None))), "t")
     assert [each.title for each in alone] == ["t", "Relative pose"]  # all general: nothing to say
-
-
-@pytest.mark.parametrize("layout", writers.WRITERS)
-def test_layouts_with_cameras_give_them_to_the_estimator(layout: str, tmp_path: Path) -> None:
-    """Others' matches by `cameras=known`: with their calibrations, the pose is that of an essential matrix."""
-    root = writers.WRITERS[layout](tmp_path / layout)
-    needs = layout in ("hloc", "glue_factory", "vismatch")
-    options = {"truth": writers.truth(tmp_path / "Truth")} if needs else {}
-    pairs = list(H5Pairs(root, layout, **options))
-    for row, each in zip(rows(pairs, "known"), pairs, strict=True):
-        assert row.ok, row.reason
-        assert row.pose_reason is None
-        assert row.rotation_error is not None
-        assert row.rotation_error < 1
-        assert row.configuration == "general"
-        assert row.focal_error0 is row.focal_error1 is None  # which were given exactly
-        F, true = np.array(row.F), each.F.ravel()
-        assert min(np.abs(F - true).max(), np.abs(F + true).max()) < 0.05
-    unknown = rows(pairs, "unknown")
-    assert all(row.focal_error0 is not None for row in unknown)

@@ -7,8 +7,8 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from fmtorch.core.types import pair_key
-from fmtorch.evaluation.curves import panels, picture, svg
+from fmtorch.core import pair_key
+from fmtorch.evaluation.curves import picture, svg
 from fmtorch.runs import PairRow, to_table
 
 
@@ -37,16 +37,6 @@ def test_a_run_has_a_picture_of_all_and_of_each_family(families: list[str], curv
         assert 340 < float(place["x"]) < width
         assert 0 < float(place["y"]) < height
     assert "var(" not in ElementTree.tostring(root, encoding="unicode")
-
-
-def test_panels_are_of_families_and_of_all() -> None:
-    shown = panels({"x": table("a", "b"), "y": table("b", "c")})
-    assert {title: list(runs) for title, runs in shown.items()} == {
-        "all": ["x", "y"], "a": ["x"], "b": ["x", "y"], "c": ["y"],
-    }  # fmt: skip
-    assert len(shown["all"]["x"]) == 12
-    assert {title: list(runs) for title, runs in panels({"run": table("a")}).items()} == {"a": ["run"]}
-    assert panels({"x": table(), "y": table()}) == {}
 
 
 def test_a_curve_is_the_share_of_pairs_below_each_threshold() -> None:

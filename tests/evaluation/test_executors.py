@@ -17,12 +17,10 @@ from typing import Any
 
 import pytest
 
-from fmtorch.data.pairs import ImagePair
-from fmtorch.evaluation.run import evaluate_pairs
-from fmtorch.jobs.execution import Execution
-from fmtorch.jobs.pool import WorkersLost
-from fmtorch.pipeline.build import load_pipeline
-from fmtorch.pipeline.pipeline import Pipeline
+from fmtorch.data import ImagePair
+from fmtorch.evaluation import evaluate_pairs
+from fmtorch.jobs import Execution, WorkersLost
+from fmtorch.pipeline import Pipeline, load_pipeline
 from fmtorch.runs import PairRow
 from scripts.benchmark.pairs import synthetic_pair
 
@@ -173,26 +171,6 @@ def test_two_of_four_workers_are_killed(cluster: Cluster, pairs: list[ImagePair]
     assert rows == expected
 
 
-def test_a_worker_that_joins_late_works_too(
-    cluster: Cluster, pairs: list[ImagePair], expected: dict[int, PairRow]
-) -> None:
-    cluster.add_workers(1)
-    late = threading.Timer(2.0, cluster.add_workers, [1])
-    late.start()
-    rows: list[PairRow] = []
-    execution = Execution("dask", address=cluster.address)
-    counts = evaluate_pairs(
-        build(), pairs, seed=0, batch=1, execution=execution, store=rows.extend, build=build_slow
-    )  # fmt: skip
-    workers: set[str] = set()
-    with cluster.client() as client:
-        for _ in counts:
-            workers |= {worker for worker, calls in client.processing().items() if calls}
-    late.join()
-    assert len(workers) == 2
-    assert timeless(rows) == expected
-
-
 def test_a_scheduler_that_is_lost(cluster: Cluster, pairs: list[ImagePair], expected: dict[int, PairRow]) -> None:
     cluster.add_workers(1)
     rows: list[PairRow] = []
@@ -211,7 +189,7 @@ def test_a_scheduler_that_is_lost(cluster: Cluster, pairs: list[ImagePair], expe
 
 def test_an_address_that_nobody_answers(pairs: list[ImagePair], monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("distributed", reason="dask.distributed is not installed")
-    monkeypatch.setattr("fmtorch.jobs.pool.SECONDS_TO_CONNECT", 1.0)
+    monkeypatch.setattr("fmtorch.jobs.runner.SECONDS_TO_CONNECT", 1.0)
     with pytest.raises(ValueError, match=r"executor\.address=tcp://127\.0\.0\.1:9: no scheduler answers"):
         evaluated(pairs, Execution("dask", address="tcp://127.0.0.1:9"))
 

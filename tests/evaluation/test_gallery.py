@@ -16,23 +16,14 @@ from fmtorch.evaluation import gallery as module
 from fmtorch.evaluation.gallery import Options, Run, find_dataset, gallery
 from fmtorch.evaluation.page import Section, ShownPair, render
 from fmtorch.runs import PairRow, RunFolder, to_table
-from tests.data import lists
-from tests.helpers import compose, draw
+from tests.helpers import ROWS, compose, draw_set
 
 DOCS = Path(__file__).resolve().parents[2] / "docs" / "guides" / "reports.md"
-F = np.array([0, 0, 0, 0, 0, -1, 0, 1, 0]) / np.sqrt(2)
+F = ROWS.ravel() / np.sqrt(2)
 
 
 def distribution(root: Path, name: str = "Set", images: int = 3) -> Path:
-    """A small data set in the layout of `fmbench`: shifted pictures, whose epipolar lines are rows."""
-    folder = root / name / "scene" / "Images"
-    folder.mkdir(parents=True)
-    for i in range(images):
-        draw(folder / f"{i:08d}.png", seed=0, shift=9 * i)
-    lines = [f"0 {i} 0 0 0 0 0 -1 0 1 0" for i in range(1, images)]
-    (root / name / "pairs_with_gt.txt").write_text("\n".join(lines) + "\n")
-    (root / name / "pairs_which_dataset.txt").write_text("scene/\n" * len(lines))
-    return root / name
+    return draw_set(root / name, images=images, pairs=[(0, i) for i in range(1, images)])
 
 
 def rows(root: Path, **changes: Any) -> pa.Table:
@@ -125,14 +116,6 @@ def test_each_data_set_is_found_in_its_own_root(tmp_path: Path) -> None:
     assert module._places(presets.load("dataset", "rendered"), roots) == [{}]
 
 
-def test_many_runs_are_drawn_in_part_and_the_page_says_so(tmp_path: Path) -> None:
-    root = distribution(tmp_path)
-    many = [run(f"r{i}", {"pipeline": f"r{i}"}, rows(root)) for i in range(module.MAX_RUNS + 2)]
-    shown, notes = gallery(many, Options(1, [root]))
-    assert notes[0] == f"Pictures are of the first {module.MAX_RUNS} of {len(many)} runs."
-    assert [len(pair.runs) for pair in shown] == [module.MAX_RUNS]
-
-
 def test_no_pictures_are_explained(tmp_path: Path) -> None:
     root = distribution(tmp_path)
     table = rows(root)
@@ -143,13 +126,3 @@ def test_no_pictures_are_explained(tmp_path: Path) -> None:
     assert gallery([run("a", {}, table)], Options(3, [other])) == (
         [], ["No pictures: the data set does not hold the pairs of the runs."],
     )  # fmt: skip
-
-
-def test_the_list_of_pairs_lies_beside_the_folder_of_its_images(tmp_path: Path) -> None:
-    file = lists.write(tmp_path / "list.txt", [lists.superglue(1, 5)])
-    stored = {**presets.load("dataset", "pair_list"), "resize": 200}
-    stored["digest"] = data.load("pair_list", root=lists.images(), file=file, resize=200).digest
-    pairs = find_dataset(stored, Options(1, [lists.images(), file]))
-    assert pairs[0].image0.path == lists.images() / lists.name(1)
-    with pytest.raises(DataError, match="needs root"):
-        find_dataset(stored, Options(1, [lists.images()]))

@@ -8,21 +8,20 @@ import numpy as np
 import pytest
 import torch
 
-from fmtorch.commands import eval as eval_command
-from fmtorch.commands import report as report_command
 from fmtorch.data import load
 from fmtorch.evaluation.statistics import homography_figures
 from fmtorch.metrics import corner_error, pose_auc
 from fmtorch.runs import RunFolder
 from fmtorch.training import MatchedPairs
 from tests.data import planes
-from tests.helpers import compose
+from tests.helpers import call_command
 
 
-def run(root: Path, folder: Path, *words: str, pipeline: str = "sift_ratio") -> Path:
-    fixed = ("dataset=hpatches", f"dataset.root={root}", "dataset.short_side=200", "cache=off", f"run_dir={folder}")
-    config = compose("eval", (f"pipeline={pipeline}", "estimator=homography", *fixed, *words))
-    return eval_command.run(config, pipeline, ["estimator=homography"])
+def run(folder: Path, name: str, *words: str) -> None:
+    """An evaluation of the set in a folder."""
+    fixed = ("dataset=hpatches", "dataset.root=hpatches", "dataset.short_side=200", "cache=off", f"output={name}")
+    with pytest.MonkeyPatch.context() as patch:
+        call_command(patch, folder, "eval", "pipeline=sift_ratio", "estimator=homography", *fixed, *words)
 
 
 @pytest.fixture(scope="module")
@@ -31,8 +30,8 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("runs")
     root = planes.write_hpatches(folder / "hpatches")
     (root / "v_view/6.ppm").unlink()
-    run(root, folder / "runs/a")
-    run(root, folder / "runs/b", "estimator.hypotheses=250", "executor=processes", "workers=2")
+    run(folder, "runs/a")
+    run(folder, "runs/b", "estimator.hypotheses=250", "executor=processes", "workers=2")
     return folder
 
 
@@ -71,9 +70,8 @@ def test_the_summary_is_of_corner_errors(runs: Path) -> None:
 
 
 def test_the_report_compares_corner_errors(runs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(runs)
-    words = (f"runs=[{runs / 'runs'}]", f"root={runs / 'hpatches'}", f"output={runs / 'report.html'}", "pictures=2")
-    page = report_command.run(compose("report", words)).read_text()
+    call_command(monkeypatch, runs, "report", "runs", "root=hpatches", "pictures=2")
+    page = (runs / "report.html").read_text()
     for part in ("AUC@3 px", "corner error threshold [px]", "inliers of H", "minus each other run", "corner error 0."):
         assert part in page
     assert "NSGD" not in page.partition("<h2>Runs")[0].partition("</style>")[2]
@@ -89,21 +87,19 @@ def test_figures_of_known_errors() -> None:
     assert failed["corner_error"] is None
 
 
-def test_what_does_not_go_together_is_refused(runs: Path, tmp_path: Path) -> None:
-    root = runs / "hpatches"
-    for words, error in {
-        (
-            "estimator=lmeds",
-        ): r"gives fundamental matrices; a pipeline needs homography matrices here: estimator=homography",
-        ("cameras=unknown",): r"the data set has homography matrices, which take no export= and no cameras=",
-        ("export=h5",): r"take no export=",
-    }.items():
-        with pytest.raises(ValueError, match=error):
-            run(root, tmp_path / "run", *words)
-    config = compose("eval", ("pipeline=sift_ratio", "estimator=homography", "dataset=stereo", "cache=off"))
-    with pytest.raises(ValueError, match="gives homography matrices; a pipeline needs fundamental matrices here"):
-        eval_command.run(config, "sift_ratio")
-    assert not (tmp_path / "run").exists()
+@pytest.mark.parametrize(
+    ("words", "error"),
+    [
+        ("estimator=lmeds", "gives fundamental matrices; a pipeline needs homography matrices here: estimator=homog"),
+        ("cameras=unknown", "the data set has homography matrices, which take no export= and no cameras="),
+        ("export=h5", "take no export="),
+        ("~dataset.root ~dataset.short_side dataset=stereo", "gives homography matrices; a pipeline needs fundamental"),
+    ],
+)
+def test_what_does_not_go_together_is_refused(words: str, error: str, runs: Path) -> None:
+    with pytest.raises(SystemExit, match=error):
+        run(runs, "refused", *words.split())
+    assert not (runs / "refused").exists()
 
 
 def test_matches_are_not_labelled_by_homographies(runs: Path, tmp_path: Path) -> None:

@@ -8,14 +8,10 @@ import torch
 from omegaconf import OmegaConf
 
 from fmtorch import presets
-from fmtorch.core.stages import Pruner
-from fmtorch.core.types import Correspondences, Estimate
-from fmtorch.evaluation import identity as identity_module
-from fmtorch.evaluation.identity import run_identity
-from fmtorch.pipeline.build import build_pipeline, load_pipeline
-from fmtorch.pipeline.pipeline import Pipeline
-from fmtorch.runs import identity_digest
-from fmtorch.runs.fingerprint import libraries
+from fmtorch.core import Correspondences, Estimate, Pruner
+from fmtorch.evaluation import run_identity
+from fmtorch.pipeline import Pipeline, build_pipeline, load_pipeline
+from fmtorch.runs import identity_digest, libraries
 from tests.helpers import compose
 
 GROUPS = ("features", "matcher", "pruner", "estimator", "dataset")
@@ -59,7 +55,7 @@ def identity(*overrides: str, pipeline: Pipeline | None = None, **own: dict[str,
 
 def test_what_changes_speed_alone_is_no_part_of_it() -> None:
     plain = identity()
-    for change in ("limit=3", "batch=1", "workers=7", "processes=true", "device=cuda", "run_dir=x", "cache_limit=1"):
+    for change in ("limit=3", "batch=1", "workers=7", "processes=true", "device=cuda", "output=x", "cache_limit=1"):
         assert identity(change) == plain, change
     for change in ("seed=1", "pruner.ratio.threshold=0.9", "pruner=[one_to_one,ratio]", "dataset.size=full"):
         assert identity_digest(identity(change)) != identity_digest(plain), change
@@ -125,7 +121,7 @@ def test_code_of_a_users_own_stage_is_part_of_it(group: str, monkeypatch: pytest
     changed = {group: {"mine": own} if group == "pruner" else own}
     first = identity(pipeline=parts, **changed)
     assert list(first["code"]) == [f"{__name__}.Learned"]  # type: ignore[call-overload]
-    monkeypatch.setattr(identity_module, "code_digest", lambda module: f"edited {module}")
+    monkeypatch.setattr("fmtorch.evaluation.run.code_digest", lambda module: f"edited {module}")
     second = identity(pipeline=parts, **changed)
     assert second["code"] == {f"{__name__}.Learned": f"edited {__name__}"}
     assert identity_digest(first) != identity_digest(second)

@@ -3,7 +3,7 @@
 from typing import Any
 
 from fmtorch import presets
-from fmtorch.evaluation.page import run_names, shared_settings
+from fmtorch.evaluation.page import run_names
 
 
 def config(pipeline: str = "sift_ratio", estimator: str = "ransac", **changes: Any) -> dict[str, Any]:
@@ -56,20 +56,6 @@ def test_options_are_told_of_the_same_preset_only() -> None:
     assert names(two[0], config()) == ["lmeds hypotheses=100", "ransac"]
 
 
-def test_an_option_that_all_share_is_left_out() -> None:
-    runs = [{**config(), "estimator": with_options(name, hypotheses=100)} for name in ("lmeds", "ransac")]
-    assert names(*runs) == ["lmeds", "ransac"]
-    assert dict(shared_settings(runs[:1]))["estimator"] == "lmeds, hypotheses=100"
-
-
-def test_orders_and_choices_of_pruners() -> None:
-    forward, alone = ratio(0.8), ratio(0.8)[:1]
-    assert names(config(pruner=forward), config(pruner=forward[::-1])) == ["ratio+one_to_one", "one_to_one+ratio"]
-    assert names(config(pruner=alone), config(pruner=[]), config(pruner=ratio(0.9))) == [
-        "ratio threshold=0.8", "no pruner", "ratio+one_to_one threshold=0.9",
-    ]  # fmt: skip
-
-
 def test_parts_of_ones_own_go_by_their_class() -> None:
     mine = {**config(), "estimator": {"_target_": "my.package.Mine", "threshold": 1.0}}
     other = {**mine, "estimator": {"_target_": "my.package.Mine", "threshold": 2.0}}
@@ -94,11 +80,3 @@ def test_a_method_has_one_name_on_all_data_sets() -> None:
 def test_versions_are_told_by_their_first_digits() -> None:
     runs = [config(version=f"0.1.0+g{commit}") for commit in ("5c0279c1d2e3", "6c0279c1d2e3.dirty.0f1e2d3c4b5a")]
     assert names(*runs) == ["version=0.1.0+g5c0279c", "version=0.1.0+g6c0279c.dirty.0f1e2d3"]
-
-
-def test_what_is_shared_is_said_beside_the_names() -> None:
-    shared = dict(shared_settings([config(), config(estimator="lmeds")]))
-    assert shared == {
-        "pipeline": "sift_ratio", "features": "sift", "pruner": "ratio, one_to_one", "seed": "0", "version": "1",
-    }  # fmt: skip
-    assert shared_settings([{}, {"pipeline": "x"}]) == []

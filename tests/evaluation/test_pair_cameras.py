@@ -3,22 +3,21 @@
 import dataclasses
 import json
 import math
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from PIL import ExifTags, Image
 
 from fmtorch import presets
-from fmtorch.core.types import collate
+from fmtorch.core import collate
 from fmtorch.data import ImageSource
-from fmtorch.evaluation.pair_cameras import WithPairCameras, cameras_of
-from fmtorch.evaluation.rows import evaluate
-from fmtorch.pipeline.pipeline import Outcome
+from fmtorch.evaluation import WithPairCameras, cameras_of, evaluate
+from fmtorch.pipeline import Outcome
 from tests.conftest import shared_path
 from tests.evaluation.test_poses import outcome
-from tests.processes import run_command
 
 
 def photograph(path: Path, equivalent: int | None) -> ImageSource:
@@ -82,31 +81,25 @@ def test_poses_that_are_not_determined_and_pairs_without_estimates_among_others(
     assert rows[1].rotation_error < 0.5
 
 
-def test_a_run_with_cameras_is_another_run(tmp_path: Path) -> None:
-    arguments = ["pipeline=sift_fmtorch", "dataset=fmbench", f"dataset.root={shared_path('data/Strecha_train')}"]
-    arguments += ["limit=2", "workers=1"]
-    errors = {}
-    for word, name in (("null", "without"), ("known", "known")):
-        done = run_command("eval", *arguments, f"cameras={word}", f"run_dir={name}", cwd=tmp_path)
-        assert done.returncode == 0, done.stderr
-        identity = json.loads((tmp_path / name / "run.json").read_text())["config"]
-        assert identity.get("cameras") == (None if word == "null" else word)
-        summary = json.loads((tmp_path / name / "summary.json").read_text())
-        errors[word] = max(summary["all"]["pose"]["rotation"], summary["all"]["pose"]["translation"])
-    assert errors["known"] < 0.5
-    done = run_command("eval", *arguments, "cameras=known", "pose.signed=true", "run_dir=signed", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert json.loads((tmp_path / "signed" / "run.json").read_text())["config"]["pose"] == {"signed": True}
-    assert json.loads((tmp_path / "signed" / "summary.json").read_text())["all"]["pose"]["signed"] is True
-    for text in (done.stdout, (tmp_path / "signed" / "summary.md").read_text()):
+def test_a_run_with_cameras_is_another_run(command: Callable[..., str], tmp_path: Path) -> None:
+    words = ["eval", "pipeline=sift_fmtorch", "dataset=fmbench", f"dataset.root={shared_path('data/Strecha_train')}"]
+    words += ["limit=2", "workers=1"]
+
+    def run(name: str, *more: str) -> tuple[str, dict[str, Any], dict[str, Any]]:
+        said = command(*words, *more, f"output={name}", cwd=tmp_path)
+        run, summary = (json.loads((tmp_path / name / f"{file}.json").read_text()) for file in ("run", "summary"))
+        return said, run["config"], summary["all"]["pose"]
+
+    assert "cameras" not in run("without")[1]
+    _, identity, pose = run("known", "cameras=known")
+    assert identity["cameras"] == "known"
+    assert max(pose["rotation"], pose["translation"]) < 0.5
+    said, identity, pose = run("signed", "cameras=known", "pose.signed=true")
+    assert identity["pose"] == {"signed": True}
+    assert pose["signed"] is True
+    for text in (said, (tmp_path / "signed" / "summary.md").read_text()):
         assert "t error, signed" in text
         assert "whose sign counts" in " ".join(text.split())
-    odd = run_command("eval", *arguments, "pose.signed=2", cwd=tmp_path)
-    assert odd.returncode == 1
-    assert "pose.signed=2; it must be true or false" in odd.stderr
-    refused = run_command("eval", *arguments, "cameras=shared", "run_dir=known", cwd=tmp_path)
-    assert "cameras: 'known' -> 'shared'" in refused.stderr.replace('"', "'") or "holds another run" in refused.stderr
-    wrong = run_command("eval", *arguments, "cameras=some", cwd=tmp_path)
-    assert wrong.returncode == 1
-    assert "cameras=some" in wrong.stderr
-    assert np.isfinite(list(errors.values())).all()
+    assert "ended: error: pose.signed=2; it must be true or false" in command(*words, "pose.signed=2", cwd=tmp_path)
+    assert "holds another run" in command(*words, "cameras=shared", "output=known", cwd=tmp_path)
+    assert "ended: error: cameras=some" in command(*words, "cameras=some", cwd=tmp_path)

@@ -1,6 +1,6 @@
 import pytest
 
-from fmtorch.evaluation.summary import common_reasons
+from fmtorch.evaluation import common_reasons
 
 
 @pytest.mark.parametrize(

@@ -4,100 +4,20 @@ import math
 
 import numpy as np
 import pytest
-import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fmtorch import metrics
 from fmtorch.evaluation.statistics import (
-    MERITS,
     MIN_SCENES,
     MIN_UNITS,
-    PERCENT,
     RESAMPLES,
-    areas,
     bootstrap_mean,
-    described,
     difference,
     effective_pairs,
-    interval,
-    recalled,
-    scene_names,
     share_difference,
     share_interval,
 )
-from tests.reference import metrics as reference
 from tests.reference.bootstrap import bootstrap_interval
-
-
-def errors(*shape: int) -> np.ndarray:
-    nsgd = np.random.default_rng(0).uniform(0, 0.1, shape)
-    nsgd.flat[:4] = (0.0, 0.05, 1.0, math.nan)
-    return nsgd
-
-
-def test_means_over_pairs_are_the_metrics() -> None:
-    nsgd = errors(50)
-    tensor = torch.from_numpy(nsgd)
-    assert recalled(nsgd).mean() == pytest.approx(float(metrics.recall(tensor)))
-    assert recalled(nsgd, 0.01).mean() == pytest.approx(float(metrics.recall(tensor, 0.01)))
-    assert areas(nsgd).mean() == pytest.approx(float(metrics.mean_recall(tensor)))
-    assert areas(nsgd).mean() == pytest.approx(reference.mean_recall(np.nan_to_num(nsgd, nan=1.0), 0.05))
-    assert set(recalled(nsgd)) == {0.0, 1.0}
-    assert (recalled(nsgd)[:4].tolist(), areas(nsgd)[:4].tolist()) == ([1, 0, 0, 0], [1, 0, 0, 0])
-
-
-def test_seeds_are_averaged_pair_by_pair() -> None:
-    nsgd = errors(3, 20)
-    for values in MERITS.values():
-        np.testing.assert_allclose(values(nsgd), np.mean([values(seed_nsgd) for seed_nsgd in nsgd], axis=0), rtol=1e-15)
-
-
-def test_intervals_are_of_what_is_defined() -> None:
-    rng = np.random.default_rng(1)
-    a, b = rng.random((2, 30))
-    scenes = [f"s{i % 13}" for i in range(30)]
-    incomplete = a.copy()
-    incomplete[::4] = math.nan
-    kept = [i for i in range(30) if i % 4]
-    expected = bootstrap_mean(a[kept], [scenes[i] for i in kept])
-    assert interval(incomplete, scenes) == expected
-    percent = interval(incomplete, scenes, PERCENT)
-    assert (percent.value, percent.low, percent.high) == tuple(
-        PERCENT * end for end in (expected.value, expected.low, expected.high)
-    )
-    gain = bootstrap_mean(a[kept] - b[kept], [scenes[i] for i in kept])
-    assert difference(incomplete, b, scenes) == gain
-    assert difference(b, incomplete, scenes) == bootstrap_mean(b[kept] - a[kept], [scenes[i] for i in kept])
-    nothing = np.full(30, math.nan)
-    assert interval(nothing, scenes) is None
-    assert difference(nothing, b, scenes) is None
-    assert f"{expected:.1f}" == f"{expected.value:.1f} [{expected.low:.1f}, {expected.high:.1f}]"
-
-
-def test_shares_have_the_intervals_of_shares_over_several_seeds_too() -> None:
-    """As every run's summary; the mean over equal seeds is one seed."""
-    nsgd = np.random.default_rng(2).uniform(0, 0.1, (2, 40))
-    scenes = [f"s{i % 8}" for i in range(40)]
-    a, b = (recalled(e) for e in nsgd)
-    assert interval(a, scenes, share=True) == share_interval(nsgd[0] < 0.05, scenes)
-    assert difference(a, b, scenes, share=True) == share_difference(nsgd[0] < 0.05, nsgd[1] < 0.05, scenes)
-    twice = recalled(np.stack([nsgd[0], nsgd[0]]))
-    assert interval(twice, scenes, share=True) == interval(a, scenes, share=True)
-    both = recalled(nsgd)
-    gain = difference(both, b, scenes, share=True)
-    assert gain.value == pytest.approx((a.mean() - b.mean()) / 2)
-    assert gain.low < gain.value < gain.high
-
-
-def test_what_intervals_resample_is_said() -> None:
-    assert described(["a"]) == "1 pair of 1 scene, intervals over pairs"
-    assert described(list("aabbcdcd")) == "8 pairs of 4 scenes, intervals over pairs"
-    assert described(list("abcdeabcde")) == "10 pairs of 5 scenes, intervals over scenes"
-
-
-def test_one_name_in_two_families_is_two_scenes() -> None:
-    assert len(set(scene_names(["indoor", "orbit", "orbit"], ["s0", "s0", "s0"]))) == 2
 
 
 def correlated(scenes: int, pairs: int, seed: int = 0) -> tuple[np.ndarray, list[str]]:
@@ -130,13 +50,6 @@ def test_equals_the_reference(scenes: int) -> None:
     assert result.high == pytest.approx(high, abs=tolerance)
 
 
-def test_scenes_of_unequal_size_weigh_by_their_pairs() -> None:
-    values = np.array([1.0] * 6 + [0.0, 0.5, 0.0, 1.0])
-    result = bootstrap_mean(values, list("aaaaaabcde"))
-    assert result.value == 0.75
-    assert result.low < 0.75 < result.high
-
-
 def test_coverage_over_scenes() -> None:
     """Of independent data sets, about 95 % of the intervals hold the true mean, though pairs of a scene are alike."""
     trials, hold = 200, {"scene": 0, "pair": 0}
@@ -149,16 +62,6 @@ def test_coverage_over_scenes() -> None:
     # The percentile interval of 40 clusters is known to cover some 94 %; 3.5 standard deviations of a binomial share.
     assert hold["scene"] / trials > 0.94 - 3.5 * np.sqrt(0.94 * 0.06 / trials)
     assert hold["pair"] / trials < 0.75  # what ignoring the scenes would claim
-
-
-def test_repeatable_and_blind_to_names_and_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    values, names = correlated(10, 5)
-    result = bootstrap_mean(values, names)
-    assert bootstrap_mean(values, names) == result
-    assert bootstrap_mean(values, ["x" + name for name in names]) == result
-    monkeypatch.setattr("fmtorch.evaluation.statistics._BLOCK", 70)
-    again = bootstrap_mean(values, names)
-    assert again.low == pytest.approx(result.low, abs=quantile_error(values, 10, RESAMPLES))
 
 
 @pytest.mark.parametrize("value", [0.0, 1.0])
@@ -201,14 +104,6 @@ def test_published_answers(r: int, n: int, low: float, high: float) -> None:
     assert (interval.low, interval.high) == pytest.approx((low, high), abs=5e-5)
 
 
-def test_three_right_pairs_do_not_prove_perfection() -> None:
-    interval = share_interval(successes(3, 3), one_scene(3))
-    assert interval.high == 1.0
-    assert interval.low == pytest.approx(3 / (3 + 1.959964**2))  # p = 1: n / (n + z^2)
-    nothing = share_interval(successes(0, 3), one_scene(3))
-    assert (nothing.low, nothing.high) == pytest.approx((0.0, 1 - interval.low))
-
-
 @pytest.mark.parametrize("n", [3, 10, 40])
 def test_coverage_over_all_shares_is_the_level(n: int) -> None:
     """The mean coverage over p uniform in (0, 1), by the binomial sum: near 95 % for each n, unlike the bootstrap's."""
@@ -232,25 +127,6 @@ def test_pairs_that_succeed_together_count_as_one() -> None:
     wide, narrow = share_interval(together, scenes), share_interval(apart, scenes)
     assert wide.high - wide.low > 2.5 * (narrow.high - narrow.low)
     assert wide.over == narrow.over == "scene"
-
-
-def test_coverage_of_pairs_in_scenes() -> None:
-    """Right in 95 % of draws of 12 scenes of 8 pairs each, whose shares are Beta(4, 1): to three standard errors."""
-    rng = np.random.default_rng(0)
-    names = [f"s{i // 8}" for i in range(96)]
-    trials = 1500
-    hit = 0
-    for _ in range(trials):
-        chance = np.repeat(rng.beta(4, 1, 12), 8)
-        interval = share_interval(rng.random(96) < chance, names)
-        hit += interval.low <= 0.8 <= interval.high
-    assert hit / trials > 0.95 - 3 * math.sqrt(0.95 * 0.05 / trials) - 0.01  # Wilson's own dips below the level
-
-
-def test_few_scenes_are_not_the_units() -> None:
-    values = np.tile([1.0, 0.0], 20)
-    assert effective_pairs(values, [f"s{i % (MIN_SCENES - 1)}" for i in range(40)]) == 40
-    assert effective_pairs(np.ones(1), ["s"]) == 1
 
 
 def test_differences() -> None:

@@ -12,13 +12,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fmtorch.core.types import Correspondences, Estimate, Features
-from fmtorch.data.pairs import ImagePair, ImageSource
-from fmtorch.evaluation.run import _shared_out, evaluate_pairs
-from fmtorch.jobs.execution import Execution
-from fmtorch.jobs.pool import WorkersLost
-from fmtorch.pipeline.build import load_pipeline
-from fmtorch.pipeline.pipeline import Pipeline
+from fmtorch.core import Correspondences, Estimate, Features
+from fmtorch.data import ImagePair, ImageSource
+from fmtorch.evaluation import evaluate_pairs
+from fmtorch.jobs import Execution, WorkersLost
+from fmtorch.pipeline import Pipeline, load_pipeline
 from fmtorch.runs import PairRow
 
 ONE, TWO = (Execution("threads", count) for count in (1, 2))
@@ -43,7 +41,7 @@ def test_a_process_that_ends_is_told() -> None:
 
 WORKER = """
 import multiprocessing, time
-from fmtorch.jobs.pool import end_with_parent
+from fmtorch.jobs.runner import end_with_parent
 def work():
     end_with_parent()
     print(multiprocessing.current_process().pid, flush=True)
@@ -70,14 +68,6 @@ def alive(pid: int) -> bool:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except OSError:
         return False
-
-
-@pytest.mark.parametrize(
-    ("pairs", "batch", "workers", "size"),
-    [(80, 16, 2, 10), (80, 16, 1, 16), (3200, 16, 2, 16), (3, 16, 4, 1), (0, 16, 2, 1)],
-)
-def test_no_worker_is_long_alone_at_the_end(pairs: int, batch: int, workers: int, size: int) -> None:
-    assert _shared_out(pairs, batch, workers) == size
 
 
 class Watched:

@@ -1,13 +1,8 @@
-from __future__ import annotations
-
-import cv2
-import kornia
 import numpy as np
 import pytest
 import torch
 
-from fmtorch.features import FRAME_SIGMAS, SIFT, HessianDetector
-from tests.conftest import shared_path
+from fmtorch.features import FRAME_SIGMAS, HessianDetector
 from tests.features.scenes import texture
 from tests.reference.local_features import hessian_keypoints
 
@@ -97,50 +92,3 @@ def test_small_and_constant_images(shape: tuple[int, int], constant: bool) -> No
     if constant or min(shape) < 16:
         assert len(scores) == 0
     assert HessianDetector().detect_batch(torch.from_numpy(image)[None, None].float() / 255)[0].shape[1] == len(scores)
-
-
-@pytest.mark.parametrize("image", [np.zeros((0, 5), np.uint8), np.zeros((5, 5, 4), np.uint8), np.zeros(5, np.uint8)])
-def test_what_is_no_image_is_refused(image: np.ndarray) -> None:
-    with pytest.raises(ValueError, match="uint8"):
-        HessianDetector().detect(image)
-
-
-def repeatability(first: np.ndarray, second: np.ndarray, matrix: np.ndarray, shape: tuple[int, int]) -> float:
-    """Share of the keypoints (x, y, sigma) seen in both images that are found again: within half a sigma of their
-    place, and within 2^(1/3) of their size."""
-    h, w = shape
-    mapped = np.c_[first[:, :2] @ matrix[:, :2].T + matrix[:, 2], first[:, 2] * np.sqrt(np.linalg.det(matrix[:, :2]))]
-    seen = ((mapped[:, :2] > 20) & (mapped[:, :2] < [w - 21, h - 21])).all(1)
-    mapped = mapped[seen]
-    near = np.linalg.norm(mapped[:, None, :2] - second[None, :, :2], axis=2) < 0.5 * mapped[:, None, 2]
-    alike = np.abs(np.log2(mapped[:, None, 2] / second[None, :, 2])) < 1 / 3
-    return float((near & alike).any(1).mean())
-
-
-def test_repeats_as_well_as_kornias_and_better_than_dog() -> None:
-    image = cv2.imread(str(shared_path("data/Strecha_train/castle-P19/Images/00000004.jpg")), cv2.IMREAD_GRAYSCALE)
-    image = cv2.resize(image, (640, 427), interpolation=cv2.INTER_AREA)
-    h, w = image.shape
-    peer = kornia.feature.ScaleSpaceDetector(500, resp_module=kornia.feature.BlobHessian("diff"))
-
-    def detect(name: str, pixels: np.ndarray) -> np.ndarray:
-        if name == "kornia":
-            lafs = peer(torch.from_numpy(pixels)[None, None].float() / 255)[0][0].detach()
-            lafs = lafs[lafs.abs().sum((1, 2)) > 0]
-        else:
-            lafs = {"hessian": HessianDetector(500), "dog": SIFT(500)}[name].detect(pixels)[0]
-        scale = torch.linalg.det(lafs[..., :2]).sqrt() / 6
-        return torch.cat([lafs[..., 2], scale[:, None]], 1).numpy()
-
-    shares: dict[str, list[float]] = {"hessian": [], "kornia": [], "dog": []}
-    for angle, zoom in ((0, 0.8), (25, 1.0), (60, 0.7), (-40, 1.25), (10, 0.55)):
-        matrix = cv2.getRotationMatrix2D((w / 2, h / 2), angle, zoom)
-        blurred = cv2.GaussianBlur(image, (0, 0), 0.6 / zoom) if zoom < 1 else image
-        warped = cv2.warpAffine(blurred, matrix, (w, h), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT_101)
-        for name, values in shares.items():
-            values.append(repeatability(detect(name, image), detect(name, warped), matrix, (h, w)))
-    mean = {name: np.mean(values) for name, values in shares.items()}
-    print(mean)
-    assert mean["hessian"] > 0.5
-    assert mean["hessian"] > mean["kornia"] - 0.02
-    assert mean["hessian"] > mean["dog"] - 0.02

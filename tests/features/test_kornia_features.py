@@ -1,7 +1,5 @@
 """DISK and ALIKED behind the project's conventions; untrained networks, and probes whose answer is known."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import kornia
@@ -11,9 +9,8 @@ import torch
 from torch import Tensor, nn
 
 from fmtorch import presets
-from fmtorch.features.kornia_features import ALIKED, DISK
-from fmtorch.runs.feature_cache import ArrayCache, CachedFeatures
-from tests.features.test_sift import same, texture
+from fmtorch.features import ALIKED, DISK
+from tests.features.scenes import same, texture
 
 SIZE = (90, 131)  # no multiple of 16
 
@@ -108,25 +105,6 @@ def test_images_that_cannot_be(name: str, shape: tuple[int, ...]) -> None:
 
 
 @both
-def test_smallest_image(name: str) -> None:
-    untrained(name)(texture(0, 32, 32))
-
-
-@both
-def test_cached_by_weights(name: str, tmp_path: Path) -> None:
-    image, cache = texture(2, *SIZE), ArrayCache(tmp_path)
-    first, again = CachedFeatures(untrained(name), cache), CachedFeatures(untrained(name), cache)
-    assert same(first(image), again(image))
-    assert again.found == 1
-    other = untrained(name)
-    with torch.no_grad():
-        next(other.network.parameters()).add_(0.1)
-    changed = CachedFeatures(other, cache)
-    changed(image)
-    assert changed.computed == 1
-
-
-@both
 def test_weights_that_cannot_be_fetched(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     torch_home = tmp_path / "hub"
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(torch_home))
@@ -147,9 +125,3 @@ def test_weights_that_cannot_be_fetched(name: str, tmp_path: Path, monkeypatch: 
     }[name]
     for word in ("Name or service not known", publisher, f"copy its {file} to {torch_home / 'checkpoints' / file}"):
         assert word in str(told.value)
-
-
-@both
-def test_unknown_weights(name: str) -> None:
-    with pytest.raises(ValueError, match="there are: "):
-        presets.build("features", name, weights="best")

@@ -1,7 +1,5 @@
 """Images of 8192 x 8192 pixels, in a process of its own for its peak of memory."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

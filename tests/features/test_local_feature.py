@@ -1,15 +1,10 @@
-from __future__ import annotations
-
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-import kornia
 import numpy as np
 import pytest
 import torch
 
 from fmtorch import presets
-from fmtorch.core.types import Features
 from fmtorch.features import (
     SIFT,
     DominantGradient,
@@ -17,16 +12,12 @@ from fmtorch.features import (
     LocalFeature,
     NetworkDescriptor,
     NetworkShape,
-    PatchSIFT,
     local_feature,
 )
-from fmtorch.matching import NearestNeighborMatcher
-from fmtorch.pipeline.build import load_pipeline
 from fmtorch.runs.feature_cache import ArrayCache, CachedFeatures
-from tests.features.scenes import texture
+from tests.features.scenes import same, texture
 
 WITHOUT_NETWORK = ("rootsift", "dspsift", "rootsiftpca")
-PIPELINES = ("dspsift", "rootsiftpca", "l2net", "geodesc", "hardnet", "hesaffnet")
 
 
 def random_network(seed: int, outputs: int) -> torch.nn.Module:
@@ -44,10 +35,6 @@ def composed() -> LocalFeature:
         NetworkShape(lambda patches: 0.2 * torch.tanh(shape(patches))),
         DominantGradient(),
     )
-
-
-def same(a: Features, b: Features) -> bool:
-    return torch.equal(a.lafs, b.lafs) and torch.equal(a.scores, b.scores) and torch.equal(a.descriptors, b.descriptors)
 
 
 @pytest.mark.parametrize("name", WITHOUT_NETWORK)
@@ -85,39 +72,6 @@ def test_equal_parts_define_equal_detection() -> None:
     assert hessian.detector.max_features == 8000
 
 
-def test_one_instance_serves_several_threads() -> None:
-    extract, images = composed(), [texture(i) for i in range(4)]
-    alone = [extract(image) for image in images]
-    with ThreadPoolExecutor(4) as pool:
-        assert all(map(same, alone, pool.map(extract, images)))
-
-
-@pytest.mark.parametrize("shape", [(1, 1), (1, 300), (300, 1), (9, 9), (20, 31), (60, 80, 3)])
-@pytest.mark.parametrize("constant", [True, False])
-def test_images_smaller_than_a_patch_or_constant(shape: tuple[int, ...], constant: bool) -> None:
-    if constant:
-        image = np.full(shape, 77, np.uint8)
-    else:
-        image = np.random.default_rng(0).integers(0, 256, shape).astype(np.uint8)
-    for extract in (composed(), local_feature("dog", "rootsift"), presets.build("features", "rootsiftpca")):
-        found = extract(image)
-        assert found.image_size.tolist() == list(shape[:2])
-        assert torch.isfinite(found.descriptors).all()
-        assert torch.isfinite(found.lafs).all()
-        if constant:
-            assert len(found) == 0
-
-
-def test_quarter_turns() -> None:
-    # The frames of a turned image are the turned frames, and their descriptors stay.
-    image = texture(3, 240, 260)
-    extract = LocalFeature(HessianDetector(150), PatchSIFT(root=True), None, DominantGradient())
-    first, second = extract(image), extract(np.rot90(image))
-    c = NearestNeighborMatcher()(first, second)
-    expected = torch.stack([c.x0[0, :, 1], image.shape[1] - 1 - c.x0[0, :, 0]], 1)
-    assert ((c.x1[0] - expected).norm(dim=1) < 1).float().mean() > 0.8
-
-
 @pytest.mark.parametrize(
     ("options", "told"),
     [
@@ -133,26 +87,6 @@ def test_quarter_turns() -> None:
 def test_unknown_parts_and_options(options: dict[str, object], told: str) -> None:
     with pytest.raises(ValueError, match=told):
         local_feature(**options)  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize("name", [f"{s}{p}_ratio" for p in PIPELINES for s in ("", "paper/")])
-def test_pipelines_of_the_features_table(name: str) -> None:
-    pipeline = load_pipeline(name)
-    paper = name.startswith("paper/")
-    assert list(pipeline.pruners) == (["ratio"] if paper else ["ratio", "one_to_one"])
-    assert pipeline.pruners["ratio"].threshold == 0.8  # type: ignore[attr-defined]
-    detector = HessianDetector if "hesaff" in name else SIFT
-    assert isinstance(pipeline.extractor.detector, detector)  # type: ignore[attr-defined]
-
-
-@pytest.mark.parametrize(
-    "name", [f"{s}{p}_gms" for p in ("rootsiftpca", "geodesc", "hardnet", "hesaffnet") for s in ("", "paper/")]
-)
-def test_pipelines_of_the_systems_table(name: str) -> None:
-    pipeline = load_pipeline(name)
-    assert next(iter(pipeline.pruners)) == "ratio"
-    assert list(pipeline.pruners)[-1] == "gms"
-    assert type(pipeline.estimator.score).__name__ == "Median"  # type: ignore[attr-defined]
 
 
 def test_networks_are_read_when_first_used(tmp_path: Path) -> None:
@@ -193,13 +127,6 @@ def test_hesaffnet_runs_through_onnx(tmp_path: Path) -> None:
     torch.testing.assert_close(found.descriptors, described, atol=1e-4, rtol=0)
 
 
-def test_kornias_hardnet_serves_as_a_part() -> None:
-    module = kornia.feature.HardNet(False).eval().requires_grad_(False)
-    extract = LocalFeature(SIFT(40), NetworkDescriptor(module))
-    found = extract(texture(6))
-    assert found.descriptors.shape == (40, 128)
-
-
 def test_large_images_are_reduced_for_opencv() -> None:
     image = texture(7, 300, 401)
     full, reduced = SIFT(), SIFT(max_pixels=300 * 401 // 2)
@@ -211,15 +138,3 @@ def test_large_images_are_reduced_for_opencv() -> None:
     shift = (b.lafs[close][..., 2] - a.lafs[nearest[close]][..., 2]).median(0).values
     assert shift.abs().max() < 0.15  # half a pixel missed would show as 0.2
     assert torch.equal(SIFT(max_pixels=300 * 401)(image).lafs, a.lafs)
-
-
-@pytest.mark.parametrize("name", ["l2net", "geodesc", "hardnet", "hesaffnet", "hesaffnet_fast"])
-@pytest.mark.parametrize("shape", [(1, 300), (20, 31), (40, 45)])
-def test_shipped_networks_on_small_images(name: str, shape: tuple[int, int]) -> None:
-    image = np.random.default_rng(0).integers(0, 256, shape).astype(np.uint8)
-    extract = presets.build("features", name)
-    found = extract(image)
-    assert found.image_size.tolist() == list(shape)
-    assert torch.isfinite(found.descriptors).all()
-    assert torch.isfinite(found.lafs).all()
-    assert len(extract(np.full(shape, 77, np.uint8))) == 0

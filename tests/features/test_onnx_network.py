@@ -1,8 +1,5 @@
 """Patch networks through ONNX Runtime: they agree with torch, neighbours are invisible, bad files are named."""
 
-from __future__ import annotations
-
-import pickle
 from pathlib import Path
 
 import onnx
@@ -11,12 +8,11 @@ import torch
 from onnx import TensorProto, helper
 from torch import Tensor
 
-from fmtorch.core.files import models_dir
-from fmtorch.core.onnx_network import NetworkFileError
-from fmtorch.features.networks import ARCHITECTURES, build, load_weights
-from fmtorch.features.onnx_network import PatchNetwork, network_file
-from fmtorch.training.onnx_export import export, quantize
-from tests.conftest import oracle, shared_path
+from fmtorch.core import NetworkFileError, models_dir
+from fmtorch.features import PatchNetwork
+from fmtorch.features.networks import ARCHITECTURES, build
+from scripts.patch_networks.onnx_export import export, quantize
+from tests.conftest import oracle
 from tests.features.test_networks import randomized
 
 NEIGHBOURS = 1e-5  # what design allows a descriptor to change with its batch
@@ -46,17 +42,6 @@ def test_onnx_agrees_with_torch_on_real_patches(name: str, tmp_path: Path, patch
     assert [f.name for f in tmp_path.iterdir()] == ["network.onnx"]  # one file, weights inside
 
 
-@pytest.mark.parametrize(("name", "file", "field"), [
-    ("affnet", "AffNet.pth", "affnet_features"), ("orinet", "OriNet.pth", "orinet_features"),
-])  # fmt: skip
-def test_the_authors_weights_as_onnx(name: str, file: str, field: str, tmp_path: Path, patches: Tensor) -> None:
-    network = build(name)
-    load_weights(network, shared_path(f"weights/{file}"))
-    export(network, tmp_path / "network.onnx")
-    expected = torch.from_numpy(oracle("affnet_orinet.npz")[field])
-    torch.testing.assert_close(PatchNetwork(tmp_path / "network.onnx")(patches), expected, atol=1e-4, rtol=0)
-
-
 def test_neighbours_and_batch_size_are_invisible(hardnet: Path, patches: Tensor) -> None:
     expected = PatchNetwork(hardnet)(patches)
     for batch in (1, 7, 64, 300):
@@ -67,19 +52,6 @@ def test_neighbours_and_batch_size_are_invisible(hardnet: Path, patches: Tensor)
     garbage = patches.clone()
     garbage[6:] = torch.nan
     torch.testing.assert_close(PatchNetwork(hardnet)(garbage)[:6], expected[:6], atol=0, rtol=0)
-
-
-def test_no_patches(hardnet: Path) -> None:
-    assert PatchNetwork(hardnet)(torch.zeros(0, 1, 32, 32)).shape == (0, 128)
-    assert PatchNetwork(hardnet).outputs == 128
-
-
-def test_a_network_can_be_pickled_after_use(hardnet: Path, patches: Tensor) -> None:
-    network = PatchNetwork(hardnet, threads=1, batch=32)
-    expected = network(patches)
-    again = pickle.loads(pickle.dumps(network))
-    assert (again.path, again.threads, again.batch) == (hardnet, 1, 32)
-    torch.testing.assert_close(again(patches), expected, atol=0, rtol=0)
 
 
 def test_other_shapes_of_patches_are_refused(hardnet: Path) -> None:
@@ -131,14 +103,6 @@ def test_int8_keeps_descriptors_close_and_the_file_small(hardnet: Path, tmp_path
     assert (tmp_path / "hardnet.int8.onnx").stat().st_size < 0.3 * hardnet.stat().st_size
     nodes = {node.op_type for node in onnx.load(tmp_path / "hardnet.int8.onnx").graph.node}
     assert {"QuantizeLinear", "DequantizeLinear"} <= nodes
-
-
-def test_names_of_files() -> None:
-    assert network_file("hardnet") == models_dir() / "hardnet.onnx"
-    assert network_file("hardnet", "int8") == models_dir() / "hardnet.int8.onnx"
-    assert network_file("/data/mine.onnx", "int8") == Path("/data/mine.onnx")
-    with pytest.raises(ValueError, match="precision=fp16; there are: fp32, int8"):
-        network_file("hardnet", "fp16")
 
 
 def test_files_tell_nothing_of_where_they_were_made(hardnet: Path) -> None:

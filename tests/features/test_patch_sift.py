@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
@@ -9,12 +7,11 @@ from fmtorch.features import (
     ImagePyramid,
     PatchSIFT,
     RootSIFTPCA,
-    keypoints_to_lafs,
     learn_projection,
     root_sift,
     sift_of_patches,
 )
-from fmtorch.features.sift import load_projection, project
+from fmtorch.features.sift import project
 from tests.conftest import oracle
 from tests.features.scenes import random_frames, texture
 from tests.reference.local_features import sift
@@ -52,19 +49,6 @@ def test_domain_sizes_are_averaged() -> None:
     torch.testing.assert_close(root, root_sift(PatchSIFT()(pyramid, lafs)))
 
 
-def test_pooling_forgives_a_wrong_size() -> None:
-    # What domain-size pooling is for: the same place described at sizes that differ by 1.4 stays closer.
-    pyramid, lafs = ImagePyramid(texture(2, 400, 400)), random_frames(2, 200, 400, 400, 15, 30)
-    larger = lafs.clone()
-    larger[..., :2] *= 1.4
-    gaps = {}
-    for name, extract in (("plain", PatchSIFT()), ("pooled", PatchSIFT(smallest=1 / 6, largest=3.0, sizes=10))):
-        first, second = extract(pyramid, lafs), extract(pyramid, larger)
-        unlike = (first - first.roll(1, 0)).norm(dim=1).mean()
-        gaps[name] = float((first - second).norm(dim=1).mean() / unlike)
-    assert gaps["pooled"] < 0.8 * gaps["plain"]
-
-
 def test_unaffected_by_light_and_neighbours() -> None:
     patches = ImagePyramid(texture(3)).extract(random_frames(3, 150, 160, 200))
     together = sift_of_patches(patches)
@@ -90,20 +74,6 @@ def test_projection_keeps_the_variance() -> None:
     plain = (x - mean) @ basis
     assert torch.equal(projected.sign(), plain.sign())
     torch.testing.assert_close(projected[0].square() / projected[0, 0] ** 2, plain[0].abs() / plain[0, 0].abs())
-
-
-def test_shipped_projection() -> None:
-    mean, basis = load_projection(RootSIFTPCA().model)
-    assert basis.shape == (128, 80)
-    torch.testing.assert_close(basis.T @ basis, torch.eye(80), atol=1e-4, rtol=0)
-    pyramid = ImagePyramid(texture(4))
-    lafs = keypoints_to_lafs([])
-    assert RootSIFTPCA()(pyramid, lafs).shape == (0, 80)
-    described = RootSIFTPCA()(pyramid, random_frames(4, 20, 160, 200))
-    torch.testing.assert_close(described.norm(dim=1), torch.ones(20))
-    # RootSIFT of photographs has most of its variance in 80 dimensions, that of noise textures nearly as much.
-    root = PatchSIFT(root=True)(pyramid, random_frames(4, 20, 160, 200)) - mean
-    assert ((root @ basis).square().sum() / root.square().sum()) > 0.8
 
 
 def test_a_projection_that_is_absent_or_broken(tmp_path: object) -> None:

@@ -1,13 +1,9 @@
-from __future__ import annotations
-
-import cv2
 import kornia
 import numpy as np
 import pytest
 import torch
 
 from fmtorch.features import ImagePyramid, upright_frames
-from tests.conftest import shared_path
 from tests.features.scenes import random_frames, texture
 from tests.reference.local_features import patch
 
@@ -32,18 +28,6 @@ def test_sees_what_a_camera_would(side: float) -> None:
     assert ours < 1.05 * peer
     if side > 40:
         assert ours < 0.3 * plain
-
-
-def test_on_a_photograph() -> None:
-    image = cv2.imread(str(shared_path("data/Strecha_train/castle-P19/Images/00000004.jpg")), cv2.IMREAD_GRAYSCALE)
-    lafs = random_frames(2, 20, *image.shape, 12, 150)
-    expected = np.stack([patch(image / 255, laf.double().numpy()) for laf in lafs])
-    ours = error(ImagePyramid(image).extract(lafs)[:, 0], expected)
-    tensor = torch.from_numpy(image)[None, None].float() / 255
-    peer = error(kornia.feature.extract_patches_from_pyramid(tensor, lafs[None])[0, :, 0], expected)
-    print(f"ours {ours:.2f}, kornia's pyramid {peer:.2f} grey levels")
-    assert ours < peer
-    assert ours < 4
 
 
 def test_small_frames_are_kornias_patches() -> None:

@@ -1,26 +1,12 @@
-from __future__ import annotations
-
-from concurrent.futures import ThreadPoolExecutor
-
 import cv2
 import kornia
 import numpy as np
 import pytest
 import torch
 
-from fmtorch.core.types import Features
 from fmtorch.features import FRAME_SIGMAS, SIFT, keypoints_to_lafs, root_sift
 from tests.conftest import oracle
-
-
-def texture(seed: int, h: int = 120, w: int = 160) -> np.ndarray:
-    noise = np.random.default_rng(seed).normal(size=(h, w))
-    smooth = cv2.GaussianBlur(noise, (0, 0), 2.5)
-    return np.clip(128 + 90 * smooth / smooth.std() / 2, 0, 255).astype(np.uint8)
-
-
-def same(a: Features, b: Features) -> bool:
-    return torch.equal(a.lafs, b.lafs) and torch.equal(a.scores, b.scores) and torch.equal(a.descriptors, b.descriptors)
+from tests.features.scenes import texture
 
 
 @pytest.mark.parametrize("number", ["000", "001"])
@@ -65,45 +51,8 @@ def test_frames_turn_with_the_image() -> None:
     assert (gaps < 0.1).float().mean() > 0.9
 
 
-@pytest.mark.parametrize("shape", [(1, 1), (1, 200), (200, 1), (2, 2), (40, 60), (40, 60, 3)])
-def test_no_keypoints_is_no_exception(shape: tuple[int, ...]) -> None:
-    for root in (False, True):
-        found = SIFT(root=root)(np.full(shape, 77, np.uint8))
-        assert len(found) == 0
-        assert found.descriptors.shape == (0, 128)
-        assert found.image_size.tolist() == list(shape[:2])
-
-
-def test_colour_counts_as_its_grey_levels() -> None:
-    image = np.stack([texture(1), texture(2), texture(3)], -1)
-    assert same(SIFT()(image), SIFT()(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)))
-
-
-def test_at_most_max_features_the_strongest() -> None:
-    image = np.tile(texture(5, 60, 60), (2, 3))  # repeated texture: equal scores
-    everything, few = SIFT()(image), SIFT(max_features=25)(image)
-    assert len(few) == 25
-    assert few.scores.min() >= everything.scores.sort(descending=True).values[24]
-
-
 def test_root_sift_compares_by_hellinger() -> None:
     plain, root = SIFT()(texture(1)), SIFT(root=True)(texture(1))
     torch.testing.assert_close(root.descriptors.square() * plain.descriptors.sum(-1, keepdim=True), plain.descriptors)
     torch.testing.assert_close(root.descriptors.norm(dim=-1), torch.ones(len(root)))
     assert not root_sift(torch.zeros(1, 128)).any()
-
-
-def test_one_instance_serves_several_threads() -> None:
-    sift, images = SIFT(), [texture(i) for i in range(6)]
-    alone = [sift(image) for image in images]
-    with ThreadPoolExecutor(4) as pool:
-        assert all(map(same, alone, pool.map(sift, images)))
-
-
-@pytest.mark.parametrize(
-    "image",
-    [np.zeros((0, 5), np.uint8), np.zeros((5, 5, 4), np.uint8), np.zeros(5, np.uint8)],
-)
-def test_what_is_no_image_is_refused(image: np.ndarray) -> None:
-    with pytest.raises(ValueError, match="uint8"):
-        SIFT()(image)

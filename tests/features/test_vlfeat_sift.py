@@ -1,9 +1,5 @@
 """VLFeat's SIFT: frames of blobs, turned images, what OpenCV finds at the same places, bad images."""
 
-from __future__ import annotations
-
-from concurrent.futures import ThreadPoolExecutor
-
 import cv2
 import numpy as np
 import pytest
@@ -11,7 +7,7 @@ import torch
 
 from fmtorch import presets
 from fmtorch.features import FRAME_SIGMAS, SIFT, VLFeatSIFT
-from tests.features.test_sift import same, texture
+from tests.features.scenes import texture
 
 pytest.importorskip("pycolmap", reason="extra colmap is not installed")
 
@@ -55,32 +51,6 @@ def test_agrees_with_opencv_where_both_find_a_keypoint() -> None:
     assert ((a[..., 0] - b[..., 0]).norm(dim=1) / b[..., 0].norm(dim=1)).median() < 0.1
     between = (ours.descriptors[i[near]] - opencv.descriptors[near]).norm(dim=1)
     assert between.median() < 0.3 * 512  # of vectors of length 512
-
-
-def test_without_a_threshold_there_are_more_and_the_largest_are_kept() -> None:
-    image = texture(7)
-    every, some = VLFeatSIFT()(image), VLFeatSIFT(peak_threshold=0.02)(image)
-    assert len(every.lafs) > len(some.lafs)
-    few = VLFeatSIFT(max_features=20)(image)
-    assert len(few.lafs) == 20
-    assert few.scores.min() >= every.scores.sort(descending=True).values[19]
-
-
-def test_grey_and_colour_threads_and_empty_images() -> None:
-    images = [texture(seed) for seed in range(4)]
-    features = VLFeatSIFT()
-    expected = [features(image) for image in images]
-    with ThreadPoolExecutor(4) as workers:
-        found = list(workers.map(features, images))
-    assert all(same(a, b) for a, b in zip(expected, found, strict=True))
-    assert same(features(np.repeat(images[0][..., None], 3, 2)), expected[0])
-    for nothing in (np.full((64, 64), 9, np.uint8), texture(1, 15, 40), np.zeros((1, 1), np.uint8)):
-        none = features(nothing)
-        assert none.lafs.shape == (0, 2, 3)
-        assert none.descriptors.shape == (0, 128)
-        assert none.image_size.tolist() == list(nothing.shape)
-    with pytest.raises(ValueError, match="non-empty uint8"):
-        features(np.zeros((0, 4), np.uint8))
 
 
 def test_the_preset_names_it() -> None:

@@ -1,7 +1,5 @@
 """Synthetic pairs of each configuration."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
@@ -9,7 +7,8 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from fmtorch.core.types import CONFIGURATIONS
+from fmtorch.core import PAIR_TYPES
+from tests.reference.solvers import skew
 
 K = np.array([[768.0, 0, 319.5], [0, 768, 239.5], [0, 0, 1]])
 SIZE = (480, 640)
@@ -26,13 +25,9 @@ class Drawn(NamedTuple):
     t: np.ndarray
 
 
-def cross_matrix(t: np.ndarray) -> np.ndarray:
-    return np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
-
-
 def draw(kind: str, seed: int, n: int = 200, wrong: float = 0.3, noise: float = 0.5, off_plane: int = 0) -> Drawn:
     """A pair of a kind; off_plane: matches of a planar one that are not on the plane."""
-    rng = np.random.default_rng([seed, CONFIGURATIONS.index(kind)])
+    rng = np.random.default_rng([seed, PAIR_TYPES.index(kind)])
     X = np.c_[rng.uniform(-2, 2, (n, 2)), rng.uniform(4, 8, n)]
     R = Rotation.from_rotvec(rng.normal(size=3) * 0.1).as_matrix()
     t = np.array([0.6, 0.1, 0.1])
@@ -49,11 +44,7 @@ def draw(kind: str, seed: int, n: int = 200, wrong: float = 0.3, noise: float = 
         scale = rng.choice([1.0, 0.7])
         H = np.array([[scale, 0, 12.5], [0, scale, -3], [0, 0, 1]])
         x1 = scale * x0 + [12.5, -3]
-    F = (
-        inverse.T @ cross_matrix(t) @ R @ inverse
-        if kind in ("general", "planar")
-        else cross_matrix(np.array([1.0, 2, 0.01])) @ H
-    )
+    F = inverse.T @ skew(t) @ R @ inverse if kind in ("general", "planar") else skew(np.array([1.0, 2, 0.01])) @ H
     x0, x1 = x0 + rng.normal(0, noise, x0.shape), x1 + rng.normal(0, noise, x1.shape)
     k = n if kind == "unrelated" else round(wrong * n)
     x1[n - k :] = rng.uniform([0, 0], SIZE[::-1], (k, 2))
@@ -61,7 +52,7 @@ def draw(kind: str, seed: int, n: int = 200, wrong: float = 0.3, noise: float = 
 
 
 def batch(drawn: list[Drawn]) -> dict[str, Tensor]:
-    """The arguments of `configuration_evidence`, padded by what is not a number."""
+    """The arguments of `pair_evidence`, padded by what is not a number."""
     longest = max(len(d.x0) for d in drawn)
     points = np.full((2, len(drawn), longest, 2), np.nan)
     for i, d in enumerate(drawn):

@@ -1,14 +1,15 @@
 """Exact two-view scenes for the solvers' tests."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from torch import Tensor
+
+from tests.reference.solvers import skew
+
+SCALE = 0.02  # of losses at `near_scene`
 
 
 class Scene(NamedTuple):
@@ -19,10 +20,6 @@ class Scene(NamedTuple):
     K1: Tensor
     R: Tensor
     t: Tensor
-
-
-def _cross_matrix(t: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
 
 
 def scene(n: int, seed: int = 0, noise: float = 0.0, planar: bool = False) -> Scene:
@@ -39,7 +36,7 @@ def scene(n: int, seed: int = 0, noise: float = 0.0, planar: bool = False) -> Sc
     y0, y1 = X @ K0.T, (X @ R.T + t) @ K1.T
     x0, x1 = y0[:, :2] / y0[:, 2:], y1[:, :2] / y1[:, 2:]
     x0, x1 = x0 + noise * rng.normal(size=x0.shape), x1 + noise * rng.normal(size=x1.shape)
-    F = np.linalg.inv(K1).T @ _cross_matrix(t) @ R @ np.linalg.inv(K0)
+    F = np.linalg.inv(K1).T @ skew(t) @ R @ np.linalg.inv(K0)
     F = F / np.linalg.norm(F)
     return Scene(*(torch.from_numpy(a) for a in (x0, x1, F, K0, K1, R, t)))
 
@@ -61,9 +58,36 @@ def unit_scene(
     R = R @ np.array([[1, 0, 0], [0, np.cos(b), -np.sin(b)], [0, np.sin(b), np.cos(b)]])
     t = rng.normal(size=3)
     t /= np.linalg.norm(t)
-    F = _cross_matrix(t) @ R
+    F = skew(t) @ R
     Y = X @ R.T + t
     x0, x1 = X[:, :2] / X[:, 2:], Y[:, :2] / Y[:, 2:]
     x0, x1 = x0 + rng.normal(0, noise, x0.shape), x1 + rng.normal(0, noise, x1.shape)
     x1[:outliers] = rng.uniform(-1, 1, (outliers, 2))
     return F / np.linalg.norm(F), x0, x1
+
+
+def distance(A: Tensor, B: Tensor) -> Tensor:
+    """Of matrices (9, ...) of unit norm, up to sign."""
+    return torch.minimum((A - B).norm(dim=0), (A + B).norm(dim=0))
+
+
+def near_scene(seed: int, n: int = 24, noise: float = 3e-3, outliers: int = 3) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Points of both images, a model near theirs and weights."""
+    F, x0, x1 = (torch.from_numpy(v) for v in unit_scene(seed, n, noise, outliers))
+    rng = np.random.default_rng(seed)
+    near = F + 0.02 * torch.from_numpy(rng.normal(size=(3, 3)))
+    return x0, x1, near, torch.from_numpy(rng.uniform(0.2, 1, n))
+
+
+def tolerances(loss: str) -> dict[str, float | bool]:
+    """Of `gradcheck`, along random directions. Central differences round 1e-15 times the condition 1e3 over the step.
+
+    The tabulated loss is linear between its entries, 1 / 1000 apart, whose slopes differ by as much.
+    """
+    return {
+        "eps": 1e-6,
+        "atol": 1e-5,
+        "rtol": 1e-3 if loss == "magsac" else 1e-5,
+        "fast_mode": True,
+        "check_undefined_grad": False,
+    }

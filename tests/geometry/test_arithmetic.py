@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import decimal
 
 import numpy as np
@@ -19,13 +17,17 @@ from fmtorch.geometry.arithmetic import (
     determinant,
     logarithm,
     logarithm_1p,
-    matmul3,
-    outer_sum,
     product,
+    smallest_but,
+    sort_by,
+    sqrt,
     stable_sum,
     unit,
 )
 from fmtorch.geometry.significance import LOG_MODELS
+from fmtorch.jit.kernel import F8x2, kernel
+from fmtorch.jit.lanes import LANES, load, store
+from fmtorch.jit.lanes import sqrt as sqrt_of_lanes
 
 
 @pytest.mark.parametrize("n", [0, 1, 2, 3, 7, 8, 9, 100, 760, 1000])
@@ -63,18 +65,6 @@ def test_component_sum_has_the_same_bits_in_small_and_in_large_tensors(n, dim):
     assert torch.equal(component_sum(turned, dim).view(torch.int64), summed[..., 30:130].view(torch.int64))
     attached = x[..., 30:130].clone().requires_grad_()
     assert torch.equal(component_sum(attached, dim).view(torch.int64), summed[..., 30:130].view(torch.int64))
-
-
-def test_matmul3_broadcasts():
-    a, b = torch.randn(4, 1, 3, 3, dtype=torch.float64), torch.randn(5, 3, 3, dtype=torch.float64)
-    torch.testing.assert_close(matmul3(a, b), a @ b)
-
-
-def test_outer_sum():
-    generator = torch.Generator().manual_seed(0)
-    a, b = (torch.randint(-9, 9, (5, n, 20), generator=generator).double() for n in (3, 4))
-    expected = torch.einsum("kis,kjs->ijs", a, b)
-    assert torch.equal(outer_sum(a[:, :, None], b[:, None]), expected)  # integers: exact
 
 
 def test_exponential_and_logarithm() -> None:
@@ -128,3 +118,66 @@ def test_constants_are_the_nearest_numbers() -> None:
         assert float(decimal.Decimal(10).ln()) == arithmetic.LOG10
         assert float(decimal.Decimal(3).ln()) == LOG_MODELS
         assert float(decimal.Decimal(focal_prior.USUAL_FOCAL).ln()) == focal_prior.LOG_USUAL
+
+
+@pytest.mark.parametrize("m", [0, 1, 2, 3, 10, 200])
+@pytest.mark.parametrize("different", [3, 10**9])
+def test_keys_are_sorted_with_their_values_and_ties_by_these(m: int, different: int) -> None:
+    rng = np.random.default_rng(m)
+    key, value = rng.integers(0, different, m), rng.permutation(m)
+    order = np.lexsort([value, key])
+    expected = key[order], value[order]
+    for k in range(0, m, 7):
+        assert smallest_but(key.copy(), 0, m, k) == expected[0][k]
+    sort_by(key, value)
+    np.testing.assert_array_equal((key, value), expected)
+
+
+KINDS = {torch.float32: np.float32, torch.float64: np.float64}
+
+
+@kernel
+def roots_of_lanes(x: F8x2, out: F8x2) -> None:
+    for row in range(len(x)):
+        store(out, row, sqrt_of_lanes(load(x, row)))
+
+
+def numbers(dtype: torch.dtype) -> torch.Tensor:
+    """Mantissas of all kinds at all usual exponents, and the ends of the range."""
+    generator = torch.Generator().manual_seed(0)
+    x = torch.rand(1 << 18, dtype=torch.float64, generator=generator) + 1
+    x = torch.ldexp(x, torch.randint(-60, 60, x.shape, generator=generator)).to(dtype)
+    limits = torch.finfo(dtype)
+    ends = [0.0, -0.0, limits.smallest_normal, limits.smallest_normal / 4, limits.max, torch.inf, 1.0, 4.0]
+    return torch.cat([x, torch.tensor(ends, dtype=dtype)])
+
+
+@pytest.mark.parametrize("dtype", KINDS)
+def test_roots_are_those_of_numpy(dtype: torch.dtype) -> None:
+    x = numbers(dtype)
+    expected = np.sqrt(x.numpy())
+    np.testing.assert_array_equal(sqrt(x).numpy(), expected)
+    np.testing.assert_array_equal(sqrt(x.clone().requires_grad_()).detach().numpy(), expected)
+    np.testing.assert_array_equal(sqrt(x[3::5]).numpy(), expected[3::5])
+    np.testing.assert_array_equal(sqrt(x[:4096].view(64, 64).T).numpy(), expected[:4096].reshape(64, 64).T)
+    np.testing.assert_array_equal(sqrt(x[7]).numpy(), expected[7])
+    assert sqrt(x[:0]).shape == (0,)
+    assert torch.isnan(sqrt(torch.tensor([-1.0, torch.nan], dtype=dtype))).all()
+
+
+def test_roots_in_kernels_are_the_same() -> None:
+    x = numbers(torch.float64)[: 1 << 12]
+    out = np.empty((len(x) // LANES, LANES))
+    roots_of_lanes(x.numpy().reshape(out.shape), out)
+    np.testing.assert_array_equal(sqrt(x).numpy(), out.ravel())
+
+
+def test_gradients_of_first_and_second_order() -> None:
+    x = torch.tensor([0.25, 1.0, 3.0, 1e6], dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(sqrt, x)
+    assert torch.autograd.gradgradcheck(sqrt, x)
+    zero = torch.tensor([0.0, -0.0, 4.0], dtype=torch.float64, requires_grad=True)
+    (slope,) = torch.autograd.grad(sqrt(zero).sum(), zero, create_graph=True)
+    assert slope.tolist() == [0, 0, 0.25]
+    (second,) = torch.autograd.grad(slope.sum(), zero)
+    assert second.tolist() == [0, 0, -1 / 32]

@@ -1,14 +1,11 @@
 """Homographies of four matches equal the DLT of the definitions; samples that determine none give none."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np
 import pytest
 
 from fmtorch.geometry.homography import four_point
-from fmtorch.jit.lanes import LANES
 from tests.reference import homography_family as reference
 
 ROUNDING32, ROUNDING64 = 2.0**-24, 2.0**-53
@@ -52,14 +49,6 @@ def test_samples_equal_the_dlt(kind: str) -> None:
         np.testing.assert_allclose(h, truth, atol=ROUNDING32 + 64 * ROUNDING64 * condition)
 
 
-@pytest.mark.parametrize("count", [1, LANES - 1, LANES, LANES + 1])
-def test_any_number_of_samples(count: int) -> None:
-    points = np.hstack([quadrilateral(seed) for seed in range(count)])
-    H, _ = solved(points, np.arange(4 * count).reshape(count, 4).T.copy())
-    for h, i in zip(H, range(count), strict=True):
-        np.testing.assert_array_equal(h, alone(points[:, 4 * i : 4 * i + 4])[0])
-
-
 @pytest.mark.parametrize("image", [0, 1])
 @pytest.mark.parametrize("three", list(itertools.combinations(range(4), 3)))
 def test_three_points_on_a_line_give_no_model(three: tuple[int, int, int], image: int) -> None:
@@ -86,21 +75,12 @@ def test_a_mirrored_plane_gives_no_model() -> None:
         assert len(alone(match)) == 0
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_values_that_are_not_finite_give_no_model(value: float) -> None:
-    for place in np.ndindex(4, 4):
-        match = quadrilateral(1)
-        match[place] = value
-        assert len(alone(match)) == 0
-
-
 @pytest.mark.parametrize("scale", [1e-9, 1e9])
 def test_points_of_any_unit(scale: float) -> None:
     """Also which samples are degenerate does not depend on it."""
     for seed in range(20):
         match = quadrilateral(seed)
         h, D = reference.four_points(match)[0], np.diag([scale, scale, 1])
-        assert h is not None
         expected = D @ h.reshape(3, 3) @ np.linalg.inv(D)
         (H,) = alone(match * scale)
         np.testing.assert_allclose(H, expected.ravel() / np.linalg.norm(expected), atol=2 * ROUNDING32)

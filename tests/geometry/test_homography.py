@@ -1,46 +1,18 @@
 """Homographies equal their definitions."""
 
-from __future__ import annotations
-
 import numpy as np
+import pytest
+import torch
 
-from fmtorch.geometry.homography import (
-    least_squares_homography as compiled_least_squares_homography,
+from fmtorch.geometry import (
+    homography,
+    homography_points,
+    homography_sampson,
+    homography_transfer,
+    refine_homography,
 )
-from fmtorch.geometry.homography import (
-    near_plane as compiled_near_plane,
-)
-from fmtorch.geometry.homography import (
-    plane_and_parallax as compiled_plane_and_parallax,
-)
-from fmtorch.geometry.homography import (
-    plane_homography as compiled_plane_homography,
-)
-from fmtorch.jit.kernel import B1x1, F8x1, F8x2, I8x1, kernel
 from tests.reference import homography as reference
-from tests.reference.solvers import skew
-
-PROBLEMS = 12
-
-
-@kernel
-def least_squares_homography(points: F8x2, inside: B1x1, H: F8x1) -> bool:
-    return compiled_least_squares_homography(points, inside, H)
-
-
-@kernel
-def plane_homography(F: F8x1, e1: F8x1, points: F8x2, triplet: I8x1, H: F8x1) -> bool:
-    return compiled_plane_homography(F, e1, points, triplet, H)
-
-
-@kernel
-def plane_and_parallax(H: F8x1, points: F8x2, i: int, j: int, F: F8x1) -> bool:
-    return compiled_plane_and_parallax(H, points, i, j, F)
-
-
-@kernel
-def near_plane(H: F8x1, points: F8x2, limit: float, out: B1x1) -> int:
-    return compiled_near_plane(H, points, limit, out)
+from tests.reference.homography_family import mapped, sampson_squared
 
 
 def planar(seed: int, n: int, noise: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
@@ -52,45 +24,163 @@ def planar(seed: int, n: int, noise: float = 0.0) -> tuple[np.ndarray, np.ndarra
     return np.ascontiguousarray(np.c_[x0, y[:, :2] / y[:, 2:] + noise * rng.normal(size=x0.shape)].T), H
 
 
-def test_least_squares() -> None:
-    for seed in range(PROBLEMS):
-        points, _ = planar(seed, 40, noise=0.01)
-        inside, H = np.arange(40) < 30, np.empty(9)
-        assert least_squares_homography(points, inside, H)
-        expected = reference.dlt(points[:2, :30].T, points[2:, :30].T)
-        # M squares the condition of the equations (some 10): rounding of 40 sums times 1e2 over the gap.
-        np.testing.assert_allclose(reference.unit(H.reshape(3, 3)), expected, atol=1e-11)
-    assert not least_squares_homography(points, np.zeros(40, bool), H)
+PX = 400.0  # of a unit of the points
 
 
-def test_matches_near_a_plane() -> None:
-    for seed in range(PROBLEMS):
-        points, H = planar(seed, 60, noise=0.05)
-        expected = [reference.transfer(H, x[:2], x[2:]) for x in points.T]
-        near = np.empty(60, bool)
-        assert near_plane(H.ravel().copy(), points, 0.1**2, near) == np.count_nonzero(near)
-        np.testing.assert_array_equal(near, np.array(expected) <= 0.1)
-    assert near_plane(np.zeros(9), points, 1.0, near) == 0
+def pairs(batch: tuple[int, ...], n: int, noise: float = 0.0) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Matches (*batch, n, 2) in pixels on a plane of their own each, and the homographies (*batch, 3, 3)."""
+    x, truth = np.empty((*batch, 4, n)), np.empty((*batch, 3, 3))
+    for k, i in enumerate(np.ndindex(batch)):
+        points, H = planar(k, n, noise)
+        to_pixels = np.array([[PX, 0, PX], [0, PX, PX], [0, 0, 1]])
+        x[i], truth[i] = points * PX + PX, to_pixels @ H @ np.linalg.inv(to_pixels)
+    x0, x1 = (torch.from_numpy(x[..., k : k + 2, :]).mT.contiguous() for k in (0, 2))
+    return x0, x1, torch.from_numpy(truth)
 
 
-def test_plane_through_three_matches_of_a_fundamental_matrix() -> None:
-    for seed in range(PROBLEMS):
-        points, truth = planar(seed, 5)
-        e1, H = np.random.default_rng(seed).normal(size=3), np.empty(9)
-        F = skew(e1) @ truth
-        assert plane_homography(F.ravel(), e1, points, np.array([1, 4, 2]), H)
-        plane = reference.unit(H.reshape(3, 3))
-        np.testing.assert_allclose(plane, reference.unit(truth), atol=1e-9)
-        x0, x1 = points[:2, [1, 4, 2]].T, points[2:, [1, 4, 2]].T
-        np.testing.assert_allclose(plane, reference.through_plane(F, x0, x1), atol=1e-9)
-    assert not plane_homography(F.ravel(), e1, points, np.array([1, 1, 2]), H)
+@pytest.mark.parametrize("batch", [(), (3,), (2, 3)])
+@pytest.mark.parametrize("n", [4, 5, 50])
+def test_least_squares(batch: tuple[int, ...], n: int) -> None:
+    x0, x1, truth = pairs(batch, n, noise=0.005 if n > 4 else 0.0)
+    w = torch.rand(*batch, n, dtype=torch.float64) + 0.1
+    for weight in (None, w):
+        H, valid = homography(x0, x1, weight)
+        assert valid.shape == batch
+        assert bool(valid.all())
+        for i in np.ndindex(batch):
+            expected = reference.dlt(x0[i].numpy(), x1[i].numpy(), None if weight is None else weight[i].numpy())
+            there = mapped(expected, x0[i].numpy())
+            # M squares the condition of the equations, some 30 here: 1e-16 * 1e3 in units, of 400 px.
+            np.testing.assert_allclose(homography_points(H[i], x0[i]).numpy(), there, atol=1e-8)
+    if n == 4:
+        H = homography(x0, x1)[0]
+        assert bool((homography_transfer(H, x0, x1)[1] < 1e-8).all())
+        assert bool((homography_points(H, x0) - homography_points(truth, x0)).abs().max() < 1e-8)
+    depth = (torch.cat([x0, torch.ones_like(x0[..., :1])], -1) @ H[..., 2, :, None])[..., 0]
+    assert bool((depth > 0).all())
 
 
-def test_plane_and_parallax() -> None:
-    for seed in range(PROBLEMS):
-        _, H = planar(seed, 4)
-        points, F = np.random.default_rng(seed).uniform(-1, 1, (4, 5)), np.empty(9)
-        assert plane_and_parallax(H.ravel(), points, 3, 1, F)
-        expected = reference.plane_and_parallax(H, points[:2, [3, 1]].T, points[2:, [3, 1]].T)
-        np.testing.assert_allclose(reference.unit(F.reshape(3, 3)), expected, atol=1e-10)
-        assert not plane_and_parallax(H.ravel(), points, 2, 2, F)
+@pytest.mark.parametrize("scale", [1e-9, 1.0, 1e9])
+def test_degenerate_matches(scale: float) -> None:
+    x0, x1, _ = pairs((), 6)
+    x0, x1 = x0 * scale, x1 * scale
+    assert bool(homography(x0, x1)[1])
+    along = torch.linspace(0, 1, 6, dtype=torch.float64)[:, None]
+    on_line = x0[:1] * along + x0[1:2] * (1 - along)
+    on_line1 = x1[:1] * along + x1[1:2] * (1 - along)
+    one_off = torch.cat([on_line[:5], x0[2:3]]), torch.cat([on_line1[:5], x1[2:3]])
+    cases = {
+        "three matches": (x0[:3], x1[:3]), "none": (x0[:0], x1[:0]), "one line": (on_line, on_line1),
+        "one point off a line": one_off, "coincident": (x0[:1].expand(6, 2), x1[:1].expand(6, 2)),
+        "three different": (x0[[0, 1, 2, 2, 1, 0]], x1[[0, 1, 2, 2, 1, 0]]),
+        "a plane to a point": (x0, x1[:1].expand(6, 2)),
+        "not finite": (x0.index_fill(0, torch.tensor([2]), torch.inf), x1),
+    }  # fmt: skip
+    for name, (a, b) in cases.items():
+        H, valid = homography(a.requires_grad_(), b)
+        assert not bool(valid), name
+        assert bool((H == 0).all()), name
+        if len(a):
+            H.sum().backward()
+            assert a.grad is None or bool(torch.isfinite(a.grad).all()), name
+    assert not bool(homography(x0, x1, -torch.ones(6, dtype=torch.float64))[1])
+
+
+def test_distances() -> None:
+    x0, x1, H = pairs((3,), 20, noise=0.05)
+    d0, d1 = homography_transfer(H, x0, x1)
+    sampson = homography_sampson(H, x0, x1)
+    for i in range(3):
+        a, b, h = x0[i].numpy(), x1[i].numpy(), H[i].numpy()
+        expected = [reference.transfer(h, p, q) for p, q in zip(a, b, strict=True)]
+        np.testing.assert_allclose(torch.maximum(d0, d1)[i].numpy(), expected, rtol=1e-9)
+        np.testing.assert_allclose(d1[i].numpy(), np.linalg.norm(mapped(h, a) - b, axis=1), rtol=1e-9)
+        expected = [np.sqrt(sampson_squared(h, np.append(p, q))) for p, q in zip(a, b, strict=True)]
+        np.testing.assert_allclose(sampson[i].numpy(), expected, rtol=1e-8)
+    for factor in (-1.0, 1e-200, 1e200):  # of any scale and sign
+        for ours, scaled in zip((d0, d1), homography_transfer(H * factor, x0, x1), strict=True):
+            torch.testing.assert_close(scaled, ours, rtol=1e-9, atol=0)
+        torch.testing.assert_close(homography_sampson(H * factor, x0, x1), sampson, rtol=1e-9, atol=0)
+    assert torch.equal(homography_sampson(H, x0[:1], x1)[0], sampson[0])  # leading dimensions broadcast
+    far = [points.float() * 1e9 for points in (x0, x1)]  # powers of which float32 does not hold
+    exact = homography_sampson(H.float().double(), *(points.double() for points in far))
+    assert torch.equal(homography_sampson(H.float(), *far), exact.float())
+    assert bool(homography_sampson(H.float(), *far).isfinite().all())
+
+
+def test_horizons_are_infinitely_far() -> None:
+    H = torch.tensor([[1.0, 0, 0], [0, 1, 0], [1, 0, 0]], requires_grad=True)  # its horizon is x = 0; singular
+    x0, x1 = torch.tensor([[0.0, 3.0], [2.0, 3.0]]), torch.tensor([[1.0, 1.0], [1.0, 1.5]])
+    d0, d1 = homography_transfer(H, x0, x1)
+    assert torch.equal(d1.detach(), torch.tensor([torch.inf, 0.0]))
+    assert bool(torch.isinf(homography_points(H, x0)[0]).all())
+    torch.where(torch.isfinite(d0), d0, 0).sum().backward(retain_graph=True)
+    torch.where(torch.isfinite(d1), d1, 0).sum().backward()
+    assert bool(torch.isfinite(H.grad).all())
+
+
+def test_gradients() -> None:
+    x0, x1, H = pairs((2,), 7, noise=0.01)
+    x0, x1 = x0 / PX, x1 / PX
+    D = torch.diag(torch.tensor([PX, PX, 1.0], dtype=torch.float64))
+    H = torch.linalg.inv(D) @ H @ D
+    weight = torch.rand(2, 7, dtype=torch.float64) + 0.1
+    for tensor in (x0, x1, H, weight):
+        tensor.requires_grad_()
+    assert torch.autograd.gradcheck(lambda a, b, w: homography(a, b, w)[0], (x0, x1, weight))
+    assert torch.autograd.gradcheck(lambda a, b: homography(a, b)[0], (x0[:, :4], x1[:, :4]))
+    for distance in (homography_transfer, homography_sampson):
+        assert torch.autograd.gradcheck(distance, (H, x0, x1))
+    assert torch.autograd.gradcheck(homography_points, (H, x0))
+    exact = homography_points(H.detach(), x0)
+    (gradient,) = torch.autograd.grad(homography_sampson(H, x0, exact).sum(), x0)
+    assert bool(torch.isfinite(gradient).all())
+
+
+@pytest.mark.parametrize("loss", ["truncated", "cauchy", "geman_mcclure", "huber", "magsac"])
+def test_gradients_of_refined_homographies_are_those_of_the_optimum(loss: str) -> None:
+    """By differences of optima, each found anew."""
+    x0, x1, truth = pairs((2,), 25, noise=0.003)  # 1.2 px
+    x1[:, 0] += 30  # a wrong match
+    weight = torch.rand(2, 25, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) + 0.1
+    inputs = [x0.requires_grad_(), x1.requires_grad_(), weight.requires_grad_()]
+    scale = torch.tensor([8.0, 12.0], dtype=torch.float64)
+    corners = torch.tensor([[0.0, 0.0], [800.0, 0.0], [800.0, 800.0], [0.0, 800.0]], dtype=torch.float64)
+
+    def seen(a: torch.Tensor, b: torch.Tensor, w: torch.Tensor) -> torch.Tensor:
+        H = refine_homography(truth, a, b, w, loss=loss, scale=scale, iterations=60)
+        return homography_points(H, corners).sum((-2, -1))
+
+    value = seen(*inputs)
+    generator = torch.Generator().manual_seed(1)
+    for k, (of, step) in enumerate(zip(inputs, (1e-3, 1e-3, 1e-4), strict=True)):
+        gradients = torch.autograd.grad(value.sum(), of, retain_graph=True)[0]
+        for _ in range(3):
+            along = torch.randn(of.shape, dtype=torch.float64, generator=generator)
+            ends = []
+            for sign in (1, -1):
+                moved = [t.detach().clone() for t in inputs]
+                moved[k] += sign * step * along
+                ends.append(seen(*moved))
+            slope = (ends[0] - ends[1]) / (2 * step)
+            expected = (gradients * along).flatten(1).sum(1)
+            torch.testing.assert_close(slope, expected, rtol=2e-3, atol=1e-3 * float(gradients.norm()))
+
+
+def test_refined_homographies() -> None:
+    x0, x1, truth = pairs((2,), 40, noise=0.003)
+    many = torch.stack([truth, -3 * truth, torch.zeros_like(truth), torch.full_like(truth, torch.nan)], 1)
+    refined = refine_homography(many, x0, x1, loss="cauchy", scale=3.0, iterations=20)
+    assert refined.shape == many.shape
+    assert torch.equal(refined[:, 0], refine_homography(truth, x0, x1, loss="cauchy", scale=3.0, iterations=20))
+    torch.testing.assert_close(refined[:, 0], refined[:, 1], rtol=0, atol=1e-9)
+    assert not bool(torch.isfinite(refined[:, 2:]).all(-1).any())
+    costs = [(1 + homography_sampson(H, x0, x1).square() / 9).log().sum(-1) for H in (truth, refined[:, 0])]
+    assert bool((costs[1] < costs[0]).all())
+    x0.requires_grad_()
+    attached = refine_homography(many, x0, x1, loss="cauchy", scale=3.0, iterations=20)
+    assert torch.equal(attached.detach().nan_to_num(7), refined.nan_to_num(7))
+    attached[:, :2].sum().backward()
+    assert bool(torch.isfinite(x0.grad).all())
+    with pytest.raises(ValueError, match="welsch"):
+        refine_homography(truth, x0, x1, loss="welsch")

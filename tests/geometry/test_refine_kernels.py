@@ -1,18 +1,17 @@
 """Levenberg-Marquardt on the manifold of rank 2 by kernels, against its definition."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
 
+from fmtorch.geometry import LOSSES
 from fmtorch.geometry.irls import reweighted, reweighted_kernel
 from fmtorch.geometry.levenberg_marquardt import FIRST_DAMPING, LOSS_CODES, Schedule, Weighted, evaluate, loss_table
 from fmtorch.geometry.rank2_manifold import SQUARINGS
 from fmtorch.geometry.refine import refine_kernel
-from fmtorch.geometry.robust_losses import LOSSES
 from tests.estimators.pairs import apart
 from tests.reference import refine as reference
+from tests.reference.solvers import skew
 
 SCALE = 0.02
 
@@ -26,8 +25,7 @@ def matches(n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray, 
     t = rng.normal(size=3) * 0.5
     x0, x1 = X[:, :2] / X[:, 2:], (X @ R.T + t)[:, :2] / (X @ R.T + t)[:, 2:]
     points = np.ascontiguousarray(np.concatenate([x0, x1], 1).T + 0.003 * rng.normal(size=(4, n)))
-    cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
-    F = (cross @ R).ravel() + 0.02 * rng.normal(size=(5, 9))
+    F = (skew(t) @ R).ravel() + 0.02 * rng.normal(size=(5, 9))
     return F, points, rng.random(n), (SCALE * rng.uniform(0.5, 2, n)) ** 2
 
 

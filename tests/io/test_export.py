@@ -13,11 +13,9 @@ import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 
+from fmtorch.io import DATABASE, MatchStore, StoredImage, StoredPair, export_kinds, indices, write_exports
 from fmtorch.io.colmap import ORIGIN, write_database
-from fmtorch.io.export import DATABASE, export_kinds, write_exports
-from fmtorch.io.match_store import MatchStore, StoredImage, StoredPair, indices
-from fmtorch.pipeline.build import load_pipeline
-from fmtorch.pipeline.folder import FolderMatches, chosen_pairs, images_below
+from fmtorch.pipeline import FolderMatches, chosen_pairs, images_below, load_pipeline
 from tests.conftest import shared_path
 
 K = np.array([[1000.0, 0, 480], [0, 1000, 410], [0, 0, 1]])
@@ -166,14 +164,6 @@ def test_keypoints_are_found_again() -> None:
         indices(points[:0], points[:1])
 
 
-def test_keypoints_are_found_as_a_dictionary_finds_them() -> None:
-    rng = np.random.default_rng(0)
-    points = rng.choice(np.array([-1.5, -0.0, 0.0, 0.25, 7], np.float32), (60, 2))
-    x = points[rng.integers(0, 60, 200)] * np.float32([1, -1]) * np.float32([1, -1])
-    place = {tuple(point): i for i, point in reversed(list(enumerate(points.tolist())))}
-    assert indices(points, x).tolist() == [place[tuple(point)] for point in x.tolist()]
-
-
 def journal(folder: Path, circle: Circle) -> tuple[MatchStore, list[tuple[Path, Path]]]:
     (folder / "images").mkdir(parents=True)
     paths = [folder / "images" / image.name for image in circle.images]
@@ -225,18 +215,6 @@ def test_hloc_files(tmp_path: Path) -> None:
         np.testing.assert_array_equal(group.attrs["F"], pair.F)
     with sqlite3.connect(tmp_path / DATABASE) as file:
         assert file.execute("SELECT COUNT(*) FROM two_view_geometries").fetchone() == (len(circle.pairs),)
-
-
-def test_indices_beyond_16_bits(tmp_path: Path) -> None:
-    points = np.random.default_rng(0).uniform(0, 800, (40_000, 2)).astype(np.float32)
-    circle = Circle()
-    circle.images = [StoredImage(f"{i}.png", points, points[:, 0], SIZE) for i in (0, 1)]
-    matches = np.array([[39_999, 39_998]], np.int32)
-    circle.pairs = [StoredPair("0.png", "1.png", matches, np.ones(1, np.float32), np.ones(1, bool), np.eye(3))]
-    kept, ends = journal(tmp_path, circle)
-    write_exports(kept, ends, ("h5",), tmp_path)
-    with h5py.File(tmp_path / "matches.h5") as file:
-        assert file["0.png/1.png/matches0"][39_999] == 39_998
 
 
 def test_kinds() -> None:

@@ -3,7 +3,6 @@
 import itertools
 import json
 import re
-import threading
 from pathlib import Path
 from typing import Any
 
@@ -11,18 +10,14 @@ import h5py
 import numpy as np
 import pycolmap
 import pytest
-import torch
 from omegaconf import DictConfig
 
 from fmtorch import data
-from fmtorch.commands import eval as eval_command
 from fmtorch.commands import match as match_command
-from fmtorch.io.export import DATABASE, FEATURES, MATCHES
-from fmtorch.pipeline import folder
-from fmtorch.pipeline.folder import chosen_pairs, images_below, open_folder
-from fmtorch.pipeline.two_images import Described
+from fmtorch.io import DATABASE, FEATURES, MATCHES
+from fmtorch.pipeline import chosen_pairs, images_below, open_folder
 from fmtorch.runs import RunFolder
-from tests.helpers import compose, draw
+from tests.helpers import call_command, compose, draw, draw_set
 
 OPTIONS = ("features.max_features=400", "estimator=lmeds", "estimator.hypotheses=100", "cache=off")
 
@@ -34,7 +29,6 @@ def config(command: str, *words: str) -> DictConfig:
 @pytest.fixture
 def images(tmp_path: Path) -> Path:
     """Three views of one picture, one in a folder of its own, and another picture."""
-    (tmp_path / "images" / "more").mkdir(parents=True)
     for i, name in enumerate(("a.png", "b.png", "more/c.png")):
         draw(tmp_path / "images" / name, seed=0, shift=12 * i)
     draw(tmp_path / "images" / "other.png", seed=1)
@@ -47,7 +41,7 @@ def match(images: Path, output: Path, *words: str) -> Path:
 
 
 def test_a_folder_of_images(images: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    output = match(images, tmp_path / "out", "export='h5,colmap'")
+    output = match(images, tmp_path / "out", "export=h5,colmap")
     said = capsys.readouterr().out
     assert "3 of 6 pairs show one scene" in said
     assert "taken from" not in said
@@ -110,41 +104,6 @@ def test_pairs_that_look_alike(images: Path, tmp_path: Path, capsys: pytest.Capt
     assert re.search("[234] of 4 pairs taken from an earlier run", capsys.readouterr().out)
 
 
-def test_images_are_described_by_several_threads(
-    images: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (images / "bad.png").write_bytes(b"\x89PNG and no more")
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    match(images, tmp_path / "one", "export=h5")
-    expected = capsys.readouterr()
-    both, described = threading.Barrier(2, timeout=60), folder.describe
-
-    def together(*arguments: Any) -> Described:
-        both.wait()  # raises where the other does not come
-        return described(*arguments)
-
-    monkeypatch.setattr(folder, "describe", together)  # of four sound images
-    torch.set_num_threads(2)
-    match(images, tmp_path / "two", "export=h5")
-    torch.set_num_threads(threads)
-    captured = capsys.readouterr()
-    times = re.compile(r"\d+:\d\d:\d\d")  # of the progress bar
-    assert times.sub("", captured.err) == times.sub("", expected.err)
-    assert "3 of 10 pairs show one scene" in captured.out
-    for name in (FEATURES, MATCHES):
-        with h5py.File(tmp_path / "one" / name) as first, h5py.File(tmp_path / "two" / name) as second:
-            compared = []
-
-            def compare(at: str, item: object, other: h5py.File = second, seen: list[str] = compared) -> None:
-                if isinstance(item, h5py.Dataset):
-                    np.testing.assert_array_equal(item[:], other[at][:])
-                    seen.append(at)
-
-            first.visititems(compare)
-            assert len(compared) >= 4
-
-
 @pytest.mark.parametrize(
     ("text", "said"),
     [
@@ -197,25 +156,23 @@ def test_settings_that_cannot_be_read(tmp_path: Path) -> None:
         open_folder(tmp_path, {"seed": 0})
 
 
-def test_an_evaluation_and_its_way_back(tmp_path: Path) -> None:
+def test_an_evaluation_and_its_way_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What an evaluation exports, also after it has ended, and what that is as a data set."""
-    folder = tmp_path / "Set" / "scene" / "Images"
-    folder.mkdir(parents=True)
-    for i in range(3):
-        draw(folder / f"{i:08d}.png", seed=0, shift=9 * i)
+    root = draw_set(tmp_path / "Set", pairs=[(0, 1), (0, 2), (1, 2)])
     camera = np.concatenate([[300, 0, 160, 0, 300, 120, 0, 0, 1], np.eye(3).ravel()])
-    np.savetxt(folder.parent / "Camera.txt", [np.concatenate([camera, [-i, 0, 0]]) for i in range(3)])
-    F = "0 0 0 0 0 -1 0 1 0"
-    (tmp_path / "Set" / "pairs_with_gt.txt").write_text(f"0 1 {F}\n0 2 {F}\n1 2 {F}\n2 0 nan{F[1:]}\n")
-    (tmp_path / "Set" / "pairs_which_dataset.txt").write_text("scene/\n" * 4)
+    np.savetxt(root / "scene" / "Camera.txt", [np.concatenate([camera, [-i, 0, 0]]) for i in range(3)])
+    for name, line in (("gt", "2 0 nan 0 0 0 0 -1 0 1 0"), ("which_dataset", "scene/")):
+        path = next(root.glob(f"pairs_*{name}.txt"))
+        path.write_text(f"{path.read_text()}{line}\n")
 
     def run(run_dir: str, *words: str) -> tuple[Path, dict[str, list[Any]]]:
-        path = eval_command.run(config("eval", f"run_dir={tmp_path / run_dir}", *words), "sift_ratio")
+        call_command(monkeypatch, tmp_path, "eval", "pipeline=sift_ratio", *OPTIONS, f"output={run_dir}", *words)
+        path = tmp_path / run_dir
         return path, RunFolder.load(path).read().sort_by("pair").to_pydict()
 
     ours = ("dataset=fmbench", f"dataset.root={tmp_path / 'Set'}")
     _, plain = run("run", *ours)
-    path, rows = run("run", *ours, "export='h5,colmap'")  # its pairs are done, but were not kept
+    path, rows = run("run", *ours, "export=h5,colmap")  # its pairs are done, but were not kept
     assert rows == plain
     with pycolmap.Database.open(path / DATABASE) as file:
         assert (file.num_images(), file.num_cameras(), file.num_matched_image_pairs()) == (3, 1, 3)
@@ -246,5 +203,5 @@ def test_an_evaluation_and_its_way_back(tmp_path: Path) -> None:
         assert theirs[column] == plain[column]
     assert theirs["features0"][:3] == plain["features0"][:3]
     assert all(np.isnan(seconds or np.nan) for seconds in theirs["seconds_features"])
-    with pytest.raises(ValueError, match="no pair has images in which a pipeline finds keypoints"):
+    with pytest.raises(SystemExit, match="no pair has images in which a pipeline finds keypoints"):
         run("none", *words, "pruner=[]", "export=h5")

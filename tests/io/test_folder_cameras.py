@@ -1,6 +1,5 @@
 """Folders of photographs with what is known of their cameras: intrinsics and two-view geometries of the exports."""
 
-import json
 import math
 import shutil
 from pathlib import Path
@@ -16,9 +15,8 @@ from PIL import ExifTags, Image
 
 import fmtorch
 from fmtorch.commands import match as match_command
-from fmtorch.data import load, read_image
-from fmtorch.data.lenses import Lens
-from fmtorch.io.export import DATABASE, MATCHES
+from fmtorch.data import Lens, load, read_image
+from fmtorch.io import DATABASE, MATCHES
 from fmtorch.metrics import pose_error
 from tests.commands.test_match_cameras import BENT, photographed
 from tests.conftest import shared_path
@@ -156,10 +154,3 @@ def test_what_colmap_makes_of_turned_photographs_is_said(tmp_path: Path, capsys:
         assert ("COLMAP reads files as they are stored" in said) == (orient == "true")
         with pycolmap.Database.open(output / DATABASE) as file:
             assert [camera.height for camera in file.read_all_cameras()] == [512, height]
-
-
-def test_one_photograph_of_a_file_is_missing(tmp_path: Path) -> None:
-    scene = Scene(tmp_path / "photos")
-    (tmp_path / "k.json").write_text(json.dumps({"a.jpg": [690, 690, 384, 256]}))
-    with pytest.raises(ValueError, match=r"k\.json: no camera of .*b\.jpg"):
-        scene.match(tmp_path / "out", f"cameras={tmp_path / 'k.json'}")

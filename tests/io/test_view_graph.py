@@ -8,9 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fmtorch.evaluation.view_graph_picture import MAX_THUMBNAILS, spectral_order, view_graph_svg
-from fmtorch.io.export import Edge, ViewGraph, view_graph, write_view_graph
-from fmtorch.io.match_store import MatchStore, StoredPair
+from fmtorch.evaluation.curves import MAX_THUMBNAILS, spectral_order, view_graph_svg
+from fmtorch.io import Edge, MatchStore, StoredPair, ViewGraph, view_graph, write_view_graph
 
 SVG = "{http://www.w3.org/2000/svg}"
 
@@ -25,7 +24,7 @@ def test_of_a_journal(tmp_path: Path) -> None:
         image.write_text(image.name)
     journal = MatchStore(tmp_path / "export", tmp_path)
     matches, scores, inliers = np.zeros((3, 2), np.int32), np.ones(3, np.float32), np.array([True, True, False])
-    verdict = {"significance": 12.5, "configuration": "planar"}
+    verdict = {"significance": 12.5, "pair_type": "planar"}
     given = StoredPair("a.png", "b.png", matches, scores, inliers, np.eye(3), **verdict)
     journal.add_pair(*images[:2], given)
     journal.add_pair(images[0], images[2], StoredPair(
@@ -39,7 +38,7 @@ def test_of_a_journal(tmp_path: Path) -> None:
     assert write_view_graph(graph, tmp_path) == ["graph.json", "graph.csv"]
     content = json.loads((tmp_path / "graph.json").read_text())
     assert content["components"] == [["a.png", "b.png"], ["c.png"]]
-    assert content["pairs"][0]["configuration"] == "planar"
+    assert content["pairs"][0]["pair_type"] == "planar"
     with (tmp_path / "graph.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [(row["image1"], row["inliers"], row["significance"]) for row in rows] == [

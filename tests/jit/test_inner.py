@@ -1,7 +1,5 @@
 """Inner functions are compiled without machine code of their own, by private names of numba that may go."""
 
-from __future__ import annotations
-
 import gc
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,11 +1,7 @@
 """Compiled functions: made when first called, kept by version, refused where they do not fit, dispensable."""
 
-from __future__ import annotations
-
-import copy
 import importlib.util
 import os
-import pickle
 import subprocess
 import sys
 import threading
@@ -21,7 +17,7 @@ from fmtorch.jit import cache as files
 from fmtorch.jit import kernel as messages
 from fmtorch.jit import kernel as switch
 from fmtorch.jit import together
-from fmtorch.jit.kernel import Inner, Kernel, inner, kernel
+from fmtorch.jit.kernel import Kernel, kernel
 from fmtorch.jit.lanes import fused
 from tests.processes import run_command
 
@@ -82,8 +78,6 @@ def load(folder: Path, source: str = SOURCE) -> types.ModuleType:
     path = folder / "some_kernels.py"
     path.write_text(source)
     spec = importlib.util.spec_from_file_location("some_kernels", path)
-    assert spec is not None
-    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules["some_kernels"] = module
     spec.loader.exec_module(module)
@@ -133,13 +127,6 @@ def test_kernels_compiled_in_any_order_and_loaded_call_one_another(tmp_path: Pat
     assert again.half.kept
 
 
-@pytest.mark.parametrize("annotation", ["", " -> int", " -> None", " -> tuple"])
-def test_what_a_kernel_returns_to_kernels_must_be_annotated(tmp_path: Path, annotation: str) -> None:
-    module = load(tmp_path, RETURNING.format(annotation=annotation))
-    with pytest.raises((TypeError, numba.core.errors.TypingError), match=r"half|none"):
-        module.quarter(8.0, True)
-
-
 def test_what_does_not_fit_the_signature_is_refused(module: types.ModuleType) -> None:
     x = np.ones((2, 2), np.float32)
     module.scaled_squares(x[0], 2, x[1])  # an integer for a float will do
@@ -147,18 +134,6 @@ def test_what_does_not_fit_the_signature_is_refused(module: types.ModuleType) ->
         with pytest.raises(TypeError):
             module.rows(wrong, x)
     assert len(module.scaled_squares.compiled().signatures) == 1
-
-
-def test_a_signature_of_one_argument(tmp_path: Path) -> None:
-    source = """
-from fmtorch.jit.kernel import F8x2
-from fmtorch.jit.kernel import kernel
-
-@kernel
-def first(x: F8x2):
-    return x[0, 0]
-"""
-    assert load(tmp_path, source).first(np.full((1, 1), 2.0)) == 2
 
 
 def test_what_was_compiled_is_kept_and_told_once(
@@ -172,18 +147,6 @@ def test_what_was_compiled_is_kept_and_told_once(
     assert result(load(tmp_path)) == EXPECTED
     assert capsys.readouterr().err == ""
     assert {path: path.stat().st_ino for path in cache.rglob("*.bin")} == files
-
-
-def test_a_log_gets_one_line_and_a_terminal_a_passing_one(
-    module: types.ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    for each in (module.rows, module.scaled_squares):
-        each.compiled()
-    assert len(capsys.readouterr().err.splitlines()) == 1
-    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
-    messages.begun("rows", "for this machine", "3 of 40: ")
-    messages.ended()
-    assert capsys.readouterr().err == "\r\x1b[K3 of 40: compiling rows for this machine\r\x1b[K"
 
 
 @pytest.mark.parametrize("importable", [True, False])
@@ -217,7 +180,6 @@ def test_the_other_process_ends_with_the_one_that_asked(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "fmtorch.jit.together", "endless:rows"]
     path = os.pathsep.join([str(REPOSITORY), str(tmp_path)])
     helper = subprocess.Popen(command, stdin=subprocess.PIPE, env={**os.environ, "PYTHONPATH": path})
-    assert helper.stdin is not None
     helper.stdin.close()
     assert helper.wait(60) == 1
 
@@ -245,11 +207,6 @@ def all_fused(a: F4x1, b: F4x1, c: F4x1, out: F4x1):
     load(tmp_path, source).all_fused(a, b, c, out)
     np.testing.assert_array_equal(out, [fused(*values) for values in zip(a, b, c, strict=True)])
     assert (out != a + b * c).any()
-
-
-def test_an_edited_kernel_outside_the_package_is_compiled_anew(tmp_path: Path) -> None:
-    assert result(load(tmp_path)) == EXPECTED
-    assert result(load(tmp_path, SOURCE.replace("x * x", "x * x * x"))) == [[2, 16], [54, 128]]
 
 
 def test_kernels_that_a_function_makes_have_names_of_their_own() -> None:
@@ -324,7 +281,6 @@ def test_folders_long_unused_are_removed(cache: Path) -> None:
         os.utime(cache / name / files.ABOUT, (then, then))
     (cache / "of somebody else").mkdir()
     now = files.folder()
-    assert now is not None
     assert {path.name for path in cache.iterdir()} == {"recent", "of somebody else", now.name}
 
 
@@ -380,19 +336,6 @@ def test_several_processes_compile_each_kernel_once(tmp_path: Path, cache: Path)
     assert not list(cache.rglob("*.lock"))
 
 
-def test_several_processes_share_the_folder(tmp_path: Path, cache: Path) -> None:
-    (tmp_path / "some_kernels.py").write_text(SOURCE)
-    code = "import numpy as np, some_kernels as k; x = np.ones((1, 3), 'f4'); k.rows(x, x); print(x.tolist())"
-    path = os.pathsep.join([str(REPOSITORY), str(tmp_path)])
-    env = {**os.environ, "PYTHONPATH": path}
-    processes = [
-        subprocess.Popen([sys.executable, "-c", code], env=env, stdout=subprocess.PIPE, text=True) for _ in range(2)
-    ]
-    assert [process.communicate(timeout=300)[0].strip() for process in processes] == ["[[2.0, 2.0, 2.0]]"] * 2
-    assert len(list(cache.rglob("*.bin"))) == 2
-    assert not list(cache.rglob("*.tmp"))
-
-
 def test_numba_is_not_imported_before_a_kernel_is_called() -> None:
     code = "import sys, fmtorch.jit.kernel, fmtorch; sys.exit('numba' in sys.modules or 'llvmlite' in sys.modules)"
     subprocess.run([sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": str(REPOSITORY)}, check=True)
@@ -421,29 +364,6 @@ def test_kernels_can_be_switched_off(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(switch.SWITCH, "no")
     with pytest.raises(ValueError, match="FMTORCH_KERNELS=no; it must be on or off"):
         switch.available()
-
-
-def test_they_are_pickled_and_copied_by_name(module: types.ModuleType) -> None:
-    for function in (module.rows, module.square):
-        assert pickle.loads(pickle.dumps(function)) is function
-        assert copy.deepcopy(function) is function
-
-
-def test_decorators_take_checked_functions() -> None:
-    """The tests' import hook wraps every function of the package; what is compiled is what was written."""
-
-    def written(x: float) -> float:
-        return x
-
-    def checked(x: float) -> float:
-        return written(x)
-
-    checked.__wrapped__ = written  # type: ignore[attr-defined]
-    for decorator in (kernel, kernel(holds_gil=True)):
-        assert isinstance(decorator(checked), Kernel)
-        assert decorator(checked).function is written
-    assert isinstance(inner(inline=True)(checked), Inner)
-    assert inner(checked).function is written
 
 
 def test_the_storage_command_lists_and_clears_them(module: types.ModuleType, cache: Path, tmp_path: Path) -> None:

@@ -1,7 +1,5 @@
 """Random numbers of kernels: those of the definition, and of tensors, bit by bit."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """Signatures are read from annotations: arrays, numbers, and groups of them."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

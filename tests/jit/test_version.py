@@ -1,7 +1,5 @@
 """Versions of compiled functions: what they depend on, what not, and that every process tells the same."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

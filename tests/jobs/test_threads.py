@@ -9,14 +9,9 @@ import torch
 
 import fmtorch
 from fmtorch import presets
-from fmtorch.core.types import collate
+from fmtorch.core import collate
 from fmtorch.data import read_image
-from fmtorch.estimators import batch
-from fmtorch.evaluation.run import evaluate_pairs
-from fmtorch.jobs.execution import Execution
-from fmtorch.jobs.threads import available, mapped, one_thread
-from fmtorch.matching import nearest
-from fmtorch.pruning import position_consistency as consistency
+from fmtorch.jobs import available, mapped, one_thread
 from tests.helpers import draw, pair
 from tests.helpers import small_pipeline as pipeline
 from tests.laws import degenerate, scene
@@ -52,48 +47,15 @@ def test_pruners_and_estimators_of_a_pipeline_have_one_thread(threads: int, tmp_
     assert torch.get_num_threads() == threads
 
 
-def test_matching_and_the_prior_of_find_fundamental_have_one_thread(
-    threads: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    seen = []
-
-    def watch(module: object, name: str) -> None:
-        function = getattr(module, name)
-
-        def watched(*arguments: object) -> object:
-            seen.append(torch.get_num_threads())
-            return function(*arguments)
-
-        monkeypatch.setattr(module, name, watched)
-
-    for module, name in ((nearest, "_finite"), (nearest, "_match_one_pair"), (consistency, "position_agreement")):
-        watch(module, name)
-    nearest.nearest_neighbors(torch.rand(30, 8), torch.rand(20, 8))
-    c = scene(0, 60)
-    assert bool(fmtorch.find_fundamental(c.x0, c.x1).ok)
-    assert seen == [1] * 4
-    assert torch.get_num_threads() == threads
-
-
 def test_an_error_leaves_threads_as_they_were(threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
     def fails(*_: object) -> None:
         raise RuntimeError("no")
 
-    monkeypatch.setattr(batch, "normalize_pair", fails)
+    monkeypatch.setattr("fmtorch.estimators.batch.normalize_pair", fails)
     built = presets.build("estimator", "msac", hypotheses=10)
     with pytest.raises(RuntimeError, match="no"):
         built(collate([scene(0, 60), scene(1, 60)]))
     assert torch.get_num_threads() == threads
-
-
-def test_threads_that_torch_may_use_stay_known(threads: int) -> None:
-    with one_thread("cpu"):
-        with one_thread("cpu"):
-            assert (torch.get_num_threads(), available()) == (1, threads)
-        assert available() == threads
-    torch.set_num_threads(1)
-    with one_thread("cpu"):
-        assert available() == 1
 
 
 def test_items_are_mapped_in_order_by_threads_that_share_no_more(threads: int) -> None:
@@ -138,25 +100,11 @@ def test_a_batch_in_threads_has_the_bits_of_one_thread(threads: int, graph: bool
             e.F.square()[:, 0, 1].sum().backward()
         results.append((e, x0.grad))
     (threaded, gradient), (single, expected) = results
-    for name in ("F", "inliers", "ok", "draws", "significance"):
+    for name in ("F", "inliers", "ok", "samples", "significance"):
         assert torch.equal(getattr(threaded, name), getattr(single, name)), name
     assert threaded.reason == single.reason
     if graph:
         torch.testing.assert_close(gradient, expected)
-
-
-def test_mapped_items_share_the_threads_that_there_are(threads: int) -> None:
-    together = threading.Barrier(2, timeout=60)
-
-    def meet(_: int) -> tuple[int, int]:
-        together.wait()
-        return torch.get_num_threads(), available()
-
-    assert mapped(meet, range(2), share=True) == [(1, 1)] * 2
-    assert mapped(lambda _: torch.get_num_threads(), range(1), share=True) == [threads]
-    torch.set_num_threads(4)
-    assert mapped(meet, range(2), share=True) == [(2, 2)] * 2
-    assert torch.get_num_threads() == available() == 4
 
 
 def test_two_photographs_are_described_at_once(threads: int, tmp_path: Path) -> None:
@@ -179,18 +127,3 @@ def test_two_photographs_are_described_at_once(threads: int, tmp_path: Path) -> 
     assert torch.equal(matched.F, expected.F)
     for name in ("keypoints0", "keypoints1", "inliers"):
         assert torch.equal(getattr(matched, name), getattr(expected, name)), name
-
-
-def test_workers_of_an_evaluation_share_no_threads(threads: int, tmp_path: Path) -> None:
-    seen, built = [], pipeline()
-    estimator = built.estimator
-
-    def watched(*arguments: object) -> object:
-        seen.append(available())
-        return estimator(*arguments)  # type: ignore[arg-type]
-
-    built.estimator = watched  # type: ignore[assignment]
-    pairs = [pair(str(i), draw(tmp_path / f"{i}a.png", i), draw(tmp_path / f"{i}b.png", i, shift=12)) for i in range(4)]
-    for _ in evaluate_pairs(built, pairs, seed=0, batch=1, execution=Execution("threads", 2), store=lambda rows: None):
-        pass
-    assert seen == [1] * 4

@@ -1,7 +1,5 @@
 """A package `vismatch` of the documented interface, for tests: matchers by names, in a folder of its own."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -1,9 +1,7 @@
-from __future__ import annotations
-
 import pytest
 import torch
 
-from fmtorch.core.types import Features, collate
+from fmtorch.core import Features, collate
 from fmtorch.matching import NearestNeighborMatcher, nearest_neighbors
 
 
@@ -24,7 +22,7 @@ def test_slots_are_the_features_of_image_0() -> None:
     assert torch.equal(matches.x0[0], f0.keypoints)
     assert torch.equal(matches.x1[0], f1.keypoints[neighbors.nearest])
     assert torch.equal(matches.lafs1[0], f1.lafs[neighbors.nearest])
-    assert torch.equal(matches.quality[0], neighbors.ratio)
+    assert torch.equal(matches.ratio[0], neighbors.ratio)
     assert matches.mask.all()
     assert matches.size0.tolist() == [[101, 200]]
     assert matches.size1.tolist() == [[102, 200]]
@@ -34,21 +32,6 @@ def test_mutual_masks_one_sided_matches() -> None:
     f0, f1 = features(1, 30), features(2, 20)
     neighbors = nearest_neighbors(f0.descriptors, f1.descriptors)
     assert torch.equal(NearestNeighborMatcher(mutual=True)(f0, f1).mask[0], neighbors.mutual)
-
-
-@pytest.mark.parametrize("mutual", [False, True])
-def test_neighbours_and_padding_are_invisible(mutual: bool) -> None:
-    pairs = [(features(1, 9), features(2, 7)), (features(3, 0), features(4, 4)), (features(5, 6), features(6, 0))]
-    matcher = NearestNeighborMatcher(mutual=mutual)
-    together = matcher(collate([f0 for f0, _ in pairs]), collate([f1 for _, f1 in pairs]))
-    for b, (f0, f1) in enumerate(pairs):
-        alone, row = matcher(f0, f1), together[b]
-        n = len(f0)
-        assert torch.equal(row.mask[:, :n], alone.mask)
-        assert not row.mask[:, n:].any()
-        for name in ("x0", "x1", "quality", "lafs0", "lafs1"):
-            assert torch.equal(getattr(row, name)[:, :n], getattr(alone, name))
-    assert together.mask.any(-1).tolist() == [True, False, False]
 
 
 def test_what_does_not_fit_is_refused() -> None:

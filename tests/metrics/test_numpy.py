@@ -1,7 +1,5 @@
 """Every metric takes NumPy arrays as it takes tensors."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

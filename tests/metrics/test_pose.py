@@ -1,7 +1,5 @@
 """Pose errors: known answers, SuperGlue's evaluation, OpenCV's decomposition, gradients, laws."""
 
-from __future__ import annotations
-
 import math
 
 import cv2
@@ -54,21 +52,13 @@ def test_matches_scalar_reference() -> None:
             assert (error.rotation[i, j].item(), error.translation[i, j].item()) == pytest.approx((r, d), rel=1e-9)
 
 
-def test_bad_poses_are_the_worst_and_leave_neighbours_alone() -> None:
+def test_bad_poses_are_the_worst() -> None:
     R, t, R_gt, t_gt = poses(1, 6)
-    good = pose_error(R, t, R_gt, t_gt)
     R[1], t[2], t[3], t_gt[4] = torch.nan, torch.inf, 0.0, 0.0
-    error = pose_error(R.requires_grad_(), t.requires_grad_(), R_gt, t_gt)
+    error = pose_error(R, t, R_gt, t_gt)
     assert error.rotation[[1, 2]].tolist() == [180, 180]
     assert error.translation[[1, 2, 3, 4]].tolist() == [90, 90, 90, 0]
     assert pose_error(R, t, R_gt, t_gt, up_to_sign=False).translation[3].item() == 180
-    for value in (*torch.autograd.grad(error.worst.sum(), [R, t]),):
-        assert value.isfinite().all()
-    for i in range(6):
-        alone = pose_error(R[i], t[i], R_gt[i], t_gt[i])
-        assert torch.equal(alone.rotation, error.rotation[i])
-        assert torch.equal(alone.translation, error.translation[i])
-    assert torch.equal(good.rotation[[0, 5]], error.rotation[[0, 5]])
 
 
 def test_gradients() -> None:
@@ -111,26 +101,6 @@ def test_the_right_fundamental_matrix_has_no_error_at_any_scale_and_sign() -> No
     assert signed.translation.item() == pytest.approx(180, abs=1e-5)
 
 
-def test_of_a_fundamental_matrix_the_three_laws() -> None:
-    inputs = perturbed(6)
-    mask = torch.arange(20).expand(6, 20) < torch.tensor([20, 15, 12, 20, 0, 8])[:, None]
-    for x in inputs[3:5]:
-        x[~mask] = torch.nan
-    inputs[0][3] = torch.nan
-    leaves = [a.requires_grad_() for a in inputs[:3]]
-    error = fundamental_pose_error(*inputs, mask)
-    assert error.rotation[[3, 4]].tolist() == [180, 180]  # no F; no match whose depth could be looked at
-    assert error.translation[[3, 4]].tolist() == [90, 90]
-    assert error.worst[[0, 1, 2, 5]].max() < 90
-    for i, n in enumerate([20, 15, 12, 20, 0, 8]):
-        F, K0, K1, x0, x1, R, t = (a[i] for a in inputs)
-        alone = fundamental_pose_error(F, K0, K1, x0[:n], x1[:n], R, t)
-        assert torch.equal(alone.rotation, error.rotation[i])
-        assert torch.equal(alone.translation, error.translation[i])
-    for gradient in torch.autograd.grad(error.worst.sum(), leaves):
-        assert gradient.isfinite().all()
-
-
 def test_gradient_of_a_fundamental_matrix() -> None:
     F, K0, K1, x0, x1, R, t = (a[0] for a in perturbed(1))
     pixels = torch.diag(torch.tensor([500.0, 500, 1], dtype=torch.float64))  # of unit size, for finite differences
@@ -159,19 +129,14 @@ def test_the_closest_pose_of_a_fundamental_matrix_is_the_reference() -> None:
     assert float(error.worst[10:].max()) > 90
 
 
-def test_the_closest_pose_needs_no_match_and_keeps_the_three_laws() -> None:
-    F, K0, K1, _, _, R_gt, t_gt = perturbed(5)
-    good = closest_pose_error(F, K0, K1, R_gt, t_gt)
-    back = closest_pose_error(F, K0, K1, R_gt, -t_gt)  # another of the four points backwards
-    assert torch.allclose(good.worst, back.worst, atol=1e-6)
-    F[1], K0[2] = torch.nan, 0.0
-    leaves = [a.requires_grad_() for a in (F, K0, K1)]
-    error = closest_pose_error(*leaves, R_gt, t_gt)
-    assert error.rotation[[1, 2]].tolist() == error.translation[[1, 2]].tolist() == [180, 180]
-    for i in (0, 3, 4):
-        alone = closest_pose_error(F[i], K0[i], K1[i], R_gt[i], t_gt[i])
-        assert torch.equal(alone.rotation, error.rotation[i])
-        assert torch.equal(alone.rotation, good.rotation[i])
-        assert torch.equal(alone.translation, error.translation[i])
-    for value in torch.autograd.grad(error.worst.sum(), leaves):
-        assert value.isfinite().all()
+def test_without_a_matrix_or_a_match_before_the_cameras_the_error_is_the_worst() -> None:
+    inputs = perturbed(3)
+    F, K0, K1, *_, R, t = inputs
+    inputs[0][1] = torch.nan
+    mask = torch.ones(3, 20, dtype=torch.bool)
+    mask[2] = False
+    error, closest = fundamental_pose_error(*inputs, mask), closest_pose_error(F, K0, K1, R, t)
+    assert error.rotation[1:].tolist() == [180, 180]
+    assert error.translation[1:].tolist() == [90, 90]
+    assert float(error.worst[0]) < 90
+    assert closest.rotation[1].item() == closest.translation[1].item() == 180

@@ -1,7 +1,5 @@
 """Recall of pose errors: known answers, SuperGlue's area, OANet's histogram, the thresholds of the RANSAC tutorial."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from hypothesis import given
@@ -30,14 +28,6 @@ def test_auc_as_superglue(values: list[float]) -> None:
     assert auc.tolist() == pytest.approx(reference.pose_auc(values, thresholds), abs=1e-12)
 
 
-def test_auc_batches() -> None:
-    errors = torch.rand(2, 3, 40, dtype=torch.float64) * 30
-    auc = pose_auc(errors)
-    assert auc.shape == (2, 3, 3)
-    torch.testing.assert_close(auc[1, 2], pose_auc(errors[1, 2]), rtol=1e-13, atol=0)
-    assert torch.autograd.gradcheck(pose_auc, errors[0].requires_grad_())
-
-
 def test_binned_known_answers() -> None:
     errors = torch.tensor([0.5, 5.0, 7.0, torch.nan], dtype=torch.float64)
     # Below 5: one of four; below 10, 15 and 20: three.
@@ -60,12 +50,6 @@ def test_wider_bins_never_give_less(values: list[float]) -> None:
     step = pose_map(errors, (20,), bin=0.01)[0]  # nearly the area under the step curve
     assert pose_map(errors, (20,))[0] >= step - 1e-12
     assert abs(step - torch.relu(1 - errors / 20).mean()) <= 0.01 / 20 + 1e-12
-
-
-def test_binned_batches() -> None:
-    errors = torch.rand(2, 3, 40, dtype=torch.float64) * 30
-    assert torch.equal(pose_map(errors)[1, 2], pose_map(errors[1, 2]))
-    assert torch.equal(pose_maa(errors)[1, 2], pose_maa(errors[1, 2]))
 
 
 @pytest.mark.parametrize("thresholds", [(), (0,), (-5.0,), (7,), (5, 12.5)])

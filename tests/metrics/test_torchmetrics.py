@@ -1,7 +1,5 @@
 """torchmetrics classes give over batches what the functions give over all pairs; a clear error without the extra."""
 
-from __future__ import annotations
-
 import importlib
 import importlib.util
 import sys

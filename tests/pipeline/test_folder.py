@@ -13,16 +13,10 @@ import numpy as np
 import pytest
 import torch
 
-from fmtorch.data.pairs import ImageSource
-from fmtorch.io.match_store import MatchStore
-from fmtorch.jobs.execution import Execution
-from fmtorch.jobs.pool import WorkerPool, WorkersLost
-from fmtorch.jobs.runner import DEATH
-from fmtorch.pipeline import folder
-from fmtorch.pipeline.build import load_pipeline
-from fmtorch.pipeline.folder import FolderMatches, folder_workers
-from fmtorch.pipeline.photograph_cameras import PhotographCameras
-from fmtorch.pipeline.pipeline import Pipeline
+from fmtorch.data import ImageSource
+from fmtorch.io import MatchStore
+from fmtorch.jobs import DEATH, Execution, WorkerPool, WorkersLost
+from fmtorch.pipeline import FolderMatches, PhotographCameras, Pipeline, folder, folder_workers, load_pipeline
 
 
 class Recorded(Executor):

@@ -7,7 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
-from fmtorch.pipeline.folder import chosen_pairs, default_output, images_below, in_blocks, natural_order
+from fmtorch.pipeline import chosen_pairs, images_below
+from fmtorch.pipeline.folder import default_output, in_blocks, natural_order
 
 
 def picture(path: Path) -> Path:

@@ -10,16 +10,11 @@ import pytest
 import torch
 
 from fmtorch import data, match, presets
-from fmtorch.core.stages import ImagePruner
-from fmtorch.data import read_image
-from fmtorch.data.pairs import GivenMatches
+from fmtorch.core import ImagePruner
+from fmtorch.data import GivenMatches, read_image
 from fmtorch.geometry import sampson
-from fmtorch.io.match_store import MatchStore
-from fmtorch.pipeline import pipeline as module
-from fmtorch.pipeline.build import load_pipeline
-from fmtorch.pipeline.exporting import match_records
-from fmtorch.pipeline.folder import FolderMatches
-from fmtorch.pipeline.pipeline import Pipeline
+from fmtorch.io import MatchStore
+from fmtorch.pipeline import FolderMatches, Pipeline, load_pipeline, match_records
 from tests.conftest import shared_path
 
 PRUNERS = "pruner=[ratio,one_to_one,frame_consistency,match_noise,refine_matches]"
@@ -41,7 +36,7 @@ def reads(monkeypatch: pytest.MonkeyPatch) -> collections.Counter[Any]:
         counts[source.path] += 1
         return read_image(source)
 
-    monkeypatch.setattr(module, "read_image", counted)
+    monkeypatch.setattr("fmtorch.pipeline.pipeline.read_image", counted)
     return counts
 
 

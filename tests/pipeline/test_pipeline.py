@@ -10,9 +10,9 @@ import pytest
 import torch
 
 from fmtorch import presets
-from fmtorch.core.types import Correspondences, Estimate, Features
+from fmtorch.core import Correspondences, Estimate, Features
 from fmtorch.data import ImagePair, ImageSource
-from fmtorch.pipeline.pipeline import Memo
+from fmtorch.pipeline import Memo
 from tests.helpers import draw, pair
 from tests.helpers import small_pipeline as pipeline
 

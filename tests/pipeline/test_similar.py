@@ -4,13 +4,11 @@ import numpy as np
 import pytest
 import torch
 
-from fmtorch.core.types import Features
+from fmtorch.core import Features
 from fmtorch.data import read_image
 from fmtorch.features.vlad import image_vector
+from fmtorch.pipeline import Described, describe, load_pipeline, similar_pairs, vectors_of
 from fmtorch.pipeline import folder as similar
-from fmtorch.pipeline.build import load_pipeline
-from fmtorch.pipeline.folder import similar_pairs, vectors_of
-from fmtorch.pipeline.two_images import Described, describe
 from tests.conftest import shared_path
 
 

@@ -6,10 +6,9 @@ import pytest
 
 import fmtorch
 from fmtorch import presets
-from fmtorch.commands.list import HEADINGS, listed
-from fmtorch.core.files import conf_dir
-from fmtorch.pipeline.build import load_pipeline
-from fmtorch.presets.composition import compose
+from fmtorch.core import conf_dir
+from fmtorch.pipeline import load_pipeline
+from fmtorch.presets import compose
 from tests.laws import scene
 
 
@@ -65,16 +64,6 @@ def test_a_users_own_preset_comes_before_the_projects(own: Path) -> None:
     assert presets.load("estimator", "irls", folder)["method"] == "lmeds"
     pipeline = load_pipeline("sift_ratio", overrides=["estimator=own"], config_dir=folder)
     assert pipeline.estimator.name == "OpenCV FM_LMEDS"
-
-
-def test_the_list_has_the_papers_presets_last_under_a_heading() -> None:
-    for group in ("pipeline", "estimator"):
-        lines = listed(group)
-        heading = lines.index(f"  {HEADINGS['paper']}:")
-        assert [line.split()[0] for line in [*lines[:heading], *lines[heading + 1 :]]] == presets.available(group)
-        assert all(line.startswith("  paper/") for line in lines[heading + 1 :])
-        assert not any("paper/" in line.split()[0] for line in lines[:heading])
-    assert not any(HEADINGS["paper"] in line for line in listed("pruner"))
 
 
 def test_preset_files_are_where_their_names_say() -> None:

@@ -1,13 +1,11 @@
 """Real matches that several pruners are tested on."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch import Tensor
 
 from fmtorch import data, presets
-from fmtorch.core.types import Correspondences
+from fmtorch.core import Correspondences
 from fmtorch.geometry import sampson
 from fmtorch.pipeline.pipeline import Pipeline
 from tests.conftest import shared_path
@@ -23,7 +21,6 @@ def real_matches() -> list[tuple[Correspondences, Tensor]]:
     matches = []
     for i in range(0, 60, 12):
         c = front.correspondences([dataset[i]])[0].correspondences
-        assert c is not None
         F = torch.from_numpy(dataset[i].F)[None]
         matches.append((c, sampson(F, c.x0.double(), c.x1.double()) < 2))
     return matches

@@ -1,7 +1,5 @@
 """Gradients held to differences of a slow definition."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np
@@ -12,7 +10,6 @@ def expect_gradients(fields: dict[str, Tensor], defined: Callable[..., float], s
     """The gradients of the fields are those of `defined`, a function of their arrays, at some of their entries."""
     rng = np.random.default_rng(0)
     for name, tensor in fields.items():
-        assert tensor.grad is not None
         for place in rng.choice(tensor.numel(), 3, replace=False):
             values = []
             for change in (step, -step):

@@ -1,14 +1,11 @@
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.spatial import cKDTree
 from torch import Tensor
 
-from fmtorch.core.types import Correspondences
+from fmtorch.core import Correspondences
 from fmtorch.jit.kernel import F8x2, I8x2, kernel
 from fmtorch.pruning import LPM, lpm
 from fmtorch.pruning import neighbors as knn_kernels
@@ -54,28 +51,6 @@ def test_nearest_points_equal_the_definition(seed: int, n: int, m: int, count: i
         assert row == expected + [-1] * (count - len(expected))
 
 
-@pytest.mark.parametrize("kind", ["uniform", "clusters", "line", "grid", "one place"])
-def test_nearest_points_of_many(kind: str) -> None:
-    rng = np.random.default_rng(1)
-    n = 1500
-    points = {
-        "uniform": rng.uniform(0, 1000, (n, 2)),
-        "clusters": rng.normal(0, 1, (n, 2)) + 500 * rng.integers(0, 3, (n, 2)),
-        "line": np.stack([np.full(n, 3.0), rng.uniform(0, 1000, n)], 1),
-        "grid": np.stack(np.meshgrid(np.arange(50), np.arange(30)), -1).reshape(-1, 2)[rng.permutation(n)] * 1.0,
-        "one place": np.full((n, 2), 7.0),
-    }[kind]
-    queries = np.concatenate([points[:400], rng.uniform(-200, 1200, (100, 2))])
-    neighbors = nearest_points(queries, points, 9)
-    expected = cKDTree(points).query(queries, 9)[0]
-    distances = np.linalg.norm(points[neighbors] - queries[:, None], axis=-1)
-    np.testing.assert_allclose(distances, expected, rtol=1e-14, atol=1e-14)  # a few roundings of float64
-    squared = ((points[neighbors] - queries[:, None]) ** 2).sum(-1)
-    assert ((np.diff(squared) > 0) | (np.diff(neighbors) > 0)).all()  # ties by index
-    if kind == "one place":
-        assert (neighbors[:400] == np.arange(9)).all()
-
-
 def test_masks_equal_the_original() -> None:
     file = oracle("lpm.npz")
     for i, name in enumerate(file["names"]):
@@ -103,32 +78,6 @@ def test_neighbourhoods_may_be_large() -> None:
     mask = lpm(x0[None], x1[None], neighbors=(260, 6), thresholds=(0.8, 0.8))
     assert 0 < expected.sum() < 300
     np.testing.assert_array_equal(mask[0], expected)
-
-
-def test_keeps_a_common_motion_and_drops_scattered_matches() -> None:
-    x0, x1 = moving(0, 1000, outliers=0.5)
-    turn = torch.tensor([[0.95, 0.2], [-0.2, 0.95]], dtype=torch.float64)
-    right = (x1 - x0 @ turn - torch.tensor([30.0, 10.0])).norm(dim=1) < 3
-    kept = lpm(x0[None], x1[None])[0]
-    assert (kept & right).sum() > 0.9 * right.sum()
-    assert (kept & ~right).sum() < 0.05 * kept.sum()
-
-
-def test_padding_and_neighbours_are_invisible() -> None:
-    counts = [120, 0, 1, 57, 300]
-    pairs = [moving(i, n) for i, n in enumerate(counts)]
-    alone = [lpm(a[None], b[None])[0] for a, b in pairs]
-    for garbage in (float("nan"), 1e30, 100.0):
-        x0, x1 = torch.full((5, 340, 2), garbage).double(), torch.full((5, 340, 2), garbage).double()
-        mask = torch.zeros(5, 340, dtype=torch.bool)
-        slots = torch.randperm(340, generator=torch.Generator().manual_seed(0))
-        for b, (a0, a1) in enumerate(pairs):
-            here = slots[: len(a0)].sort().values
-            x0[b, here], x1[b, here], mask[b, here] = a0, a1, True
-        together = lpm(x0, x1, mask=mask)
-        assert not together[~mask].any()
-        for b, (a0, _) in enumerate(pairs):
-            assert torch.equal(together[b, slots[: len(a0)].sort().values], alone[b])
 
 
 def test_stage_and_bad_input() -> None:

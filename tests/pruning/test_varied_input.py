@@ -1,7 +1,5 @@
 """Pruners on random, degenerate, small, tied and real input against their definitions, one pair and batches."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np
@@ -9,10 +7,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from fmtorch.core.types import Correspondences
+from fmtorch.core import Correspondences
 from fmtorch.pruning import frame_agreement, gms, lpm, lpm_cost, one_to_one, position_agreement
-from fmtorch.pruning.neighbors import CURVES, MIN_VOTE, NOISE, TOLERANCE, WINDOW, WORST_RATIO
-from fmtorch.pruning.position_consistency import SCALES, TURNS
+from fmtorch.pruning.consistency import CURVES, MIN_VOTE, NOISE, SCALES, TOLERANCE, TURNS, WINDOW, WORST_RATIO
 from tests.laws import degenerate, scene, scenes, small, with_padding
 from tests.reference import frame_consistency, position_consistency
 from tests.reference.gms import gms as gms_reference
@@ -29,8 +26,7 @@ def inputs() -> Iterator[tuple[str, Correspondences]]:
     yield from small().items()
     c = scene(6, 400)  # duplicates and integers: ties everywhere
     points = [(x / 90).round() * 90 for x in (c.x0, c.x1)]
-    assert c.quality is not None
-    yield "ties", c.replace(x0=points[0], x1=points[1], quality=(c.quality * 10).round() / 10)
+    yield "ties", c.replace(x0=points[0], x1=points[1], ratio=(c.ratio * 10).round() / 10)
     signs = torch.rand(c.x0.shape, generator=torch.Generator().manual_seed(0)) < 0.5
     yield "negative zero", c.replace(x0=torch.where(signs, -0.0, 0.0))
     yield "double precision", scene(3, 300).replace(x0=scene(3, 300).x0.double() + 1e-9, x1=scene(3, 300).x1.double())
@@ -76,28 +72,24 @@ def test_lpm(real_matches: list[tuple[Correspondences, Tensor]]) -> None:
 
 def test_one_to_one(real_matches: list[tuple[Correspondences, Tensor]]) -> None:
     for what, c, i, slots, x0, x1 in pairs(real_matches):
-        assert c.quality is not None
-        quality = c.quality[i].numpy()[slots]
-        expected = one_to_one_reference(x0, x1, np.where(np.isnan(quality), np.inf, quality))
-        expect_mask(one_to_one(c.x0, c.x1, c.quality, c.mask)[i], slots, expected, what)
+        ratio = c.ratio[i].numpy()[slots]
+        expected = one_to_one_reference(x0, x1, np.where(np.isnan(ratio), np.inf, ratio))
+        expect_mask(one_to_one(c.x0, c.x1, c.ratio, c.mask)[i], slots, expected, what)
 
 
 @pytest.mark.parametrize("ratios", [True, False])
 def test_agreement_of_few_matches(ratios: bool) -> None:
     for what, c in small().items():
-        assert c.lafs0 is not None
-        assert c.lafs1 is not None
-        assert c.quality is not None
-        quality = c.quality if ratios else None
-        vote = np.maximum(WORST_RATIO - c.quality[0].double().numpy(), MIN_VOTE) if ratios else np.ones(len(c.mask[0]))
+        ratio = c.ratio if ratios else None
+        vote = np.maximum(WORST_RATIO - c.ratio[0].double().numpy(), MIN_VOTE) if ratios else np.ones(len(c.mask[0]))
         x0, x1, A0, A1 = (t[0].double().numpy() for t in (c.x0, c.x1, c.lafs0[..., :2], c.lafs1[..., :2]))
         by_frames = frame_consistency.agreement(
             x0, x1, A1 @ np.linalg.inv(A0), vote, CURVES, WINDOW, TOLERANCE, NOISE
         )  # fmt: skip
         similarity = position_consistency.similarity(x0, x1, CURVES, TURNS, SCALES)
         by_motion = position_consistency.agreement(x0, x1, similarity, vote, CURVES, WINDOW, TOLERANCE, NOISE)
-        frames = frame_agreement(c.x0, c.x1, c.lafs0, c.lafs1, quality, c.mask)[0]
+        frames = frame_agreement(c.x0, c.x1, c.lafs0, c.lafs1, ratio, c.mask)[0]
         # float32: coordinates of 1e3 px are rounded to 6e-5 px, against lengths of at least 4 px
         np.testing.assert_allclose(frames, by_frames, rtol=1e-3, atol=1e-5, err_msg=what)
-        motion = position_agreement(c.x0, c.x1, quality, c.mask)[0]
+        motion = position_agreement(c.x0, c.x1, ratio, c.mask)[0]
         np.testing.assert_allclose(motion, by_motion, rtol=1e-3, atol=1e-5, err_msg=what)

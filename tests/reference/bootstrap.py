@@ -1,7 +1,5 @@
 """The percentile bootstrap of a mean over clusters, one resample at a time."""
 
-from __future__ import annotations
-
 import random
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """The share of support in front of both cameras, by triangulating every match before each of E's four camera pairs."""
 
-from __future__ import annotations
-
 import numpy as np
 
 

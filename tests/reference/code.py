@@ -1,7 +1,5 @@
 """The two regressions of CODE from their definitions, in NumPy and float64, one match and one centre at a time."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

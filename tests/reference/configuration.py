@@ -4,8 +4,6 @@ Matches are mixtures of wrong ones, uniform, and of right ones: near their epipo
 where a homography takes them (in two), with noise by Student's law of FREEDOM degrees.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation

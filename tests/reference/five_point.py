@@ -4,8 +4,6 @@ Stewenius, Engels & Nister, "Recent developments on direct relative orientation"
 monomials, then multiplication by x maps the ten others to combinations of themselves.
 """
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

@@ -7,18 +7,12 @@ size less ``A / (1 + (ln f0 - ln f1)^2 / s3^2)``; for each measured focal length
 ``5 z^2 / (z^2 + 10)`` where its deviation s is 0.02 or more, of ``z = (ln f - ln measured) / s``.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from tests.reference.refine import sampson
-
-
-def cross_matrix(t: np.ndarray) -> np.ndarray:
-    """``[t]x``."""
-    return np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
+from tests.reference.solvers import skew
 
 
 def calibration(focal: float, size: tuple[int, int]) -> np.ndarray:
@@ -32,7 +26,7 @@ def fundamental(parameters: np.ndarray, size0: tuple[int, int], size1: tuple[int
     """F of rotation vector (3), translation (3), log focal lengths (2)."""
     R = Rotation.from_rotvec(parameters[:3]).as_matrix()
     K0, K1 = calibration(np.exp(parameters[6]), size0), calibration(np.exp(parameters[7]), size1)
-    return np.linalg.inv(K1).T @ cross_matrix(parameters[3:6]) @ R @ np.linalg.inv(K0)
+    return np.linalg.inv(K1).T @ skew(parameters[3:6]) @ R @ np.linalg.inv(K0)
 
 
 def parameters_of(F: np.ndarray, size0: tuple[int, int], size1: tuple[int, int]) -> np.ndarray:
@@ -42,7 +36,7 @@ def parameters_of(F: np.ndarray, size0: tuple[int, int], size1: tuple[int, int])
     p, D = np.array([0, 0, 1.0]), np.diag([1.0, 1, 0])
 
     def squared(G: np.ndarray) -> float:
-        e = cross_matrix(np.linalg.svd(G.T)[2][2])  # of the epipole in the second image
+        e = skew(np.linalg.svd(G.T)[2][2])  # of the epipole in the second image
         return float(-(p @ e @ D @ G @ p) * (p @ G.T @ p) / (p @ e @ D @ G @ D @ G.T @ p))
 
     f0, f1 = np.sqrt(squared(G)) / max(size0), np.sqrt(squared(G.T)) / max(size1)

@@ -1,8 +1,8 @@
 """Agreement of local affine frames, match by match, from the definition."""
 
-from __future__ import annotations
-
 import math
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -24,7 +24,7 @@ def morton_order(points: np.ndarray, shift: float, angle: float, bits: int = 15)
 
 
 def agreement(
-    x0: np.ndarray, x1: np.ndarray, S: np.ndarray, vote: np.ndarray, curves: tuple[tuple[float, float], ...],
+    x0: np.ndarray, x1: np.ndarray, S: np.ndarray, vote: np.ndarray, curves: Sequence[Any],
     window: int, tolerance: float, noise: float,
 ) -> np.ndarray:  # fmt: skip
     """The share of votes that agree with each match; S (N, 2, 2) maps frame 0 to frame 1."""
@@ -43,4 +43,4 @@ def agreement(
                     e = error / (scale * np.linalg.norm(d0) + np.linalg.norm(d1) + noise)
                     total[i] += vote[j] * (1 + (e / tolerance) ** 2 / 8) ** -8
                     votes[i] += vote[j]
-    return total / votes
+    return total / np.maximum(votes, np.finfo(float).tiny)

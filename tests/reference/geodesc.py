@@ -1,7 +1,5 @@
 """GeoDesc (Luo et al., ECCV 2018, arXiv 1807.06294) from its definitions: one match after the other."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 

@@ -1,7 +1,5 @@
 """Grid-based motion statistics (Bian et al., CVPR 2017), one cell at a time, for one pair."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 

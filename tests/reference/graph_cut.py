@@ -1,7 +1,5 @@
 """The labelling of Graph-Cut RANSAC by a maximum flow, and by looking at every labelling there is."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

@@ -1,15 +1,8 @@
 """Homographies and plane-and-parallax from the definitions, one problem at a time, with NumPy's SVD."""
 
-from __future__ import annotations
-
 import numpy as np
 
-from tests.reference.solvers import hartley, homogeneous, skew
-
-
-def unit(H: np.ndarray) -> np.ndarray:
-    H = H / np.linalg.norm(H)
-    return H * np.sign(H.flat[np.abs(H).argmax()])
+from tests.reference.solvers import hartley, homogeneous, skew, unit
 
 
 def dlt(x0: np.ndarray, x1: np.ndarray, weight: np.ndarray | None = None) -> np.ndarray:

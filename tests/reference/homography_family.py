@@ -3,13 +3,10 @@
 So derivatives are exact: that of f by h in the direction v is ``Im f(h + i t v) / t`` for a tiny t (the complex step).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import cast
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from tests.reference.solvers import homogeneous
 
@@ -64,16 +61,6 @@ def gauss_newton(h: np.ndarray, points: np.ndarray, weight: np.ndarray) -> np.nd
         G = np.stack([(a + B @ d).imag / STEP for a, B in moved], 1)
         total += w * G.T @ np.linalg.solve(J @ J.T, G)
     return total
-
-
-def reprojection(h: np.ndarray, match: np.ndarray) -> float:
-    """The distance of a match from the nearest one that H maps exactly."""
-
-    def apart(x: np.ndarray) -> np.ndarray:
-        return np.concatenate([x - match[:2], mapped(h, x[None])[0] - match[2:]])
-
-    fit = least_squares(apart, match[:2], method="lm", xtol=1e-15, ftol=1e-15, gtol=1e-15)
-    return float(np.linalg.norm(fit.fun))
 
 
 def mapped(h: np.ndarray, x: np.ndarray) -> np.ndarray:

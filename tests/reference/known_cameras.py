@@ -1,15 +1,14 @@
 """Pairs of known cameras: scenes, images of square pixels, and the pose of least error, one pair at a time."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from tests.reference.focal import Measured, cross_matrix
+from tests.reference.focal import Measured
 from tests.reference.refine import sampson
+from tests.reference.solvers import skew
 
 SIZE = (480, 640)
 Sizes = tuple[tuple[int, int], tuple[int, int]]
@@ -54,7 +53,7 @@ def square(K: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray
 
 def fundamental(R: np.ndarray, t: np.ndarray, cameras: Cameras = (K0, K1)) -> np.ndarray:
     """F = K1^-T [t]x R K0^-1 of unit norm."""
-    F = np.linalg.inv(cameras[1]).T @ cross_matrix(t) @ R @ np.linalg.inv(cameras[0])
+    F = np.linalg.inv(cameras[1]).T @ skew(t) @ R @ np.linalg.inv(cameras[0])
     return F / np.linalg.norm(F)
 
 

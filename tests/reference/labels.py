@@ -1,12 +1,10 @@
 """Labels of matches, point by point from the definitions."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
 
-from fmtorch.scenes.camera import Camera
+from fmtorch.scenes.raycast import Camera
 from fmtorch.scenes.surfaces import Surfaces
 
 

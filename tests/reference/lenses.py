@@ -1,7 +1,5 @@
 """Lens models as COLMAP's documentation writes them, one point at a time."""
 
-from __future__ import annotations
-
 from math import atan, hypot, sqrt, tan
 
 

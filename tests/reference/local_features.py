@@ -1,7 +1,5 @@
 """Detectors, patches, orientations and descriptors pixel by pixel, from their definitions."""
 
-from __future__ import annotations
-
 import itertools
 import math
 

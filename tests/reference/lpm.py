@@ -1,7 +1,5 @@
 """Locality preserving matching (Ma et al., IJCV 2019), one match at a time, for one pair."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

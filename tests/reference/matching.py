@@ -1,7 +1,5 @@
 """Nearest neighbours and one match per location, one match at a time, from their definitions."""
 
-from __future__ import annotations
-
 import numpy as np
 
 
@@ -30,10 +28,10 @@ def mutual(descriptors0: np.ndarray, descriptors1: np.ndarray) -> np.ndarray:
     return np.array([backward[j] == i for i, j in enumerate(forward)], bool)
 
 
-def one_to_one(x0: np.ndarray, x1: np.ndarray, quality: np.ndarray) -> np.ndarray:
-    """A match is kept unless another at its location in either image is better: lower quality, then lower index."""
+def one_to_one(x0: np.ndarray, x1: np.ndarray, ratio: np.ndarray) -> np.ndarray:
+    """A match is kept unless another at its location in either image is better: lower ratio, then lower index."""
     kept = []
     for i in range(len(x0)):
         rivals = np.flatnonzero((x0 == x0[i]).all(1) | (x1 == x1[i]).all(1))
-        kept.append(all((quality[i], i) <= (quality[j], j) for j in rivals))
+        kept.append(all((ratio[i], i) <= (ratio[j], j) for j in rivals))
     return np.array(kept, bool)

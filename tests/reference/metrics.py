@@ -1,7 +1,5 @@
 """The metrics for one pair and one draw at a time, written from the definitions; random numbers are arguments."""
 
-from __future__ import annotations
-
 import itertools
 import math
 

@@ -29,22 +29,3 @@ def context_batch_norm_relu(
     padded = torch.zeros_like(x)
     padded[:, mask] = y
     return padded
-
-
-def ngransac_log_probabilities(weights: dict[str, Tensor], x: Tensor) -> Tensor:
-    """The network of Brachmann & Rother, "Neural-guided RANSAC", ICCV 2019, on one pair's input (n, 5)."""
-
-    def linear(y: Tensor, name: str) -> Tensor:
-        return weights[f"{name}.weight"][:, :, 0, 0] @ y + weights[f"{name}.bias"][:, None]
-
-    def norm(y: Tensor, name: str) -> Tensor:
-        running = (weights[f"{name}.running_mean"], weights[f"{name}.running_var"])
-        mask = torch.ones(1, y.shape[1], dtype=torch.bool)
-        affine = weights[f"{name}.weight"], weights[f"{name}.bias"]
-        return context_batch_norm_relu(y[:, None], mask, *affine, running)[:, 0]
-
-    y = torch.relu(linear(x.T, "p_in"))
-    for block in range(12):
-        z = norm(linear(y, f"{block}s0"), f"{block}s1")
-        y = y + norm(linear(z, f"{block}s2"), f"{block}s3")
-    return torch.nn.functional.logsigmoid(linear(y, "p_out")[0]).log_softmax(0)

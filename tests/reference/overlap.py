@@ -1,7 +1,5 @@
 """How much two images show in common, pixel by pixel and point by point from the definitions."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 

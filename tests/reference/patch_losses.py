@@ -1,7 +1,5 @@
 """Losses and figures of patch descriptors, written from their definitions one pair at a time."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -1,13 +1,12 @@
 """Position consistency, match by match, from its definition."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
+from tests.reference.frame_consistency import agreement as by_frames
 from tests.reference.frame_consistency import morton_order
 
 
@@ -39,17 +38,5 @@ def agreement(
     window: int, tolerance: float, noise: float,
 ) -> np.ndarray:  # fmt: skip
     """The weighted share of neighbours along the curves whose displacement the similarity S predicts."""
-    z0, z1 = x0[:, 0] + 1j * x0[:, 1], x1[:, 0] + 1j * x1[:, 1]
-    agreeing, votes = np.zeros(len(x0)), np.zeros(len(x0))
-    for points in (x0, x1):
-        for shift, angle in curves:
-            order = morton_order(points, shift, angle)
-            for place, i in enumerate(order):
-                for j in order[max(0, place - window) : place + window + 1]:
-                    if j == i:
-                        continue
-                    d, u = z0[j] - z0[i], z1[j] - z1[i]
-                    e = abs(S * d - u) / (abs(S) * abs(d) + abs(u) + noise)
-                    agreeing[i] += vote[j] * (1 + (e / tolerance) ** 2 / 8) ** -8
-                    votes[i] += vote[j]
-    return agreeing / np.maximum(votes, np.finfo(float).tiny)
+    maps = np.tile([[S.real, -S.imag], [S.imag, S.real]], (len(x0), 1, 1))
+    return by_frames(x0, x1, maps, vote, curves, window, tolerance, noise)

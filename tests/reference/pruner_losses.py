@@ -1,7 +1,5 @@
 """Losses of learned pruners, one pair, one match and one point at a time, written from the definitions."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The random numbers of `core.random`, one at a time in Python's integers, from the definition of splitmix64."""
 
-from __future__ import annotations
-
 WORD = 1 << 64
 GAMMA = 0x9E3779B97F4A7C15
 

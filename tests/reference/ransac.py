@@ -1,7 +1,5 @@
 """Scores of one hypothesis, match by match, from the definitions; residuals are in thresholds."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 
@@ -10,13 +8,6 @@ import numpy as np
 from tests.reference.refine import magsac_loss
 
 REACH = 5  # scales, from which on the gain of Geman & McClure is zero
-
-
-def sampson(F: np.ndarray, x0: np.ndarray, x1: np.ndarray) -> float:
-    """The Sampson distance of one match (Hartley & Zisserman 2004, equation 11.9)."""
-    h0, h1 = np.append(x0, 1.0), np.append(x1, 1.0)
-    line1, line0 = F @ h0, F.T @ h1
-    return float(abs(h1 @ line1) / math.sqrt(line1[0] ** 2 + line1[1] ** 2 + line0[0] ** 2 + line0[1] ** 2))
 
 
 def inlier(r: float) -> float:

@@ -1,14 +1,12 @@
 """The robust Sampson optimum by another road: Bartoli and Sturm's rotations, and SciPy's optimisers."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
-from scipy.optimize import least_squares, minimize
+from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 from scipy.special import gamma, gammainc, gammaincc
 
-from fmtorch.geometry.robust_losses import LOSSES
+from fmtorch.geometry import LOSSES
 
 
 def sampson(F: np.ndarray, x0: np.ndarray, x1: np.ndarray) -> np.ndarray:
@@ -47,7 +45,7 @@ def magsac_loss(r2: np.ndarray, s2: float) -> np.ndarray:
 
 
 def optimum(
-    F: np.ndarray, x0: np.ndarray, x1: np.ndarray, weight: np.ndarray, name: str = "truncated", scale: float = np.inf
+    F: np.ndarray, x0: np.ndarray, x1: np.ndarray, weight: np.ndarray, name: str, scale: float
 ) -> tuple[np.ndarray, float]:
     """The local minimum near F of ``sum w rho(r^2)``, and its cost; points of about unit scale."""
     U, s, Vt = np.linalg.svd(F)
@@ -62,14 +60,8 @@ def optimum(
         return float((weight * loss(sampson(matrix(theta), x0, x1) ** 2, scale**2, name)).sum())
 
     theta = np.zeros(7)
-    if np.isinf(scale):
-        fit = least_squares(
-            lambda t: np.sqrt(weight) * sampson(matrix(t), x0, x1), theta, xtol=1e-15, ftol=1e-15, gtol=1e-15
-        )
-        theta = fit.x
-    else:
-        for _ in range(3):
-            theta = minimize(cost, theta, method="BFGS", options={"gtol": 1e-14, "maxiter": 500}).x
+    for _ in range(3):
+        theta = minimize(cost, theta, method="BFGS", options={"gtol": 1e-14, "maxiter": 500}).x
     return matrix(theta), cost(theta)
 
 

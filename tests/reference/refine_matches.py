@@ -1,7 +1,5 @@
 """Least-squares matching of one window, sample by sample, from the definition."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

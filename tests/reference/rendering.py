@@ -1,12 +1,10 @@
 """Ray-casting and light in NumPy: piece by piece, and all pixels at once."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from fmtorch.scenes.light import SHADOW_MAP, Stage
 from fmtorch.scenes.raycast import SEAM, Bounds, Geometry, Hits, Met, Pieces
-from fmtorch.scenes.textures import TO_LINEAR, Texture, bilinear
+from fmtorch.scenes.surfaces import TO_LINEAR, Texture, bilinear
 
 
 def cast(geometry: Geometry, pieces: Pieces, bounds: Bounds, met: Met) -> None:

@@ -1,7 +1,5 @@
 """Samples of matches from the definitions, one draw at a time, in Python's integers and fractions."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from fractions import Fraction

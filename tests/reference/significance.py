@@ -1,7 +1,5 @@
 """The number of false alarms of a fundamental matrix, one match after the other, from the definition."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """The solvers written from the definitions, one problem at a time, with NumPy's SVD and polynomial roots."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """Whether inliers determine a model, by the singular values of their positions."""
 
-from __future__ import annotations
-
 import numpy as np
 
 

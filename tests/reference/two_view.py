@@ -4,16 +4,18 @@ Parameters (7,) are a rotation vector that multiplies R from the left, two along
 added to the logarithms of both focal lengths.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from collections.abc import Callable
+from typing import Self
 
 import numpy as np
 from scipy.linalg import null_space
 from scipy.spatial.transform import Rotation
 from scipy.stats import norm
+
+from tests.reference.refine import sampson
+from tests.reference.solvers import skew
 
 STEP = 1e-6  # of central differences
 
@@ -29,12 +31,12 @@ class Cameras:
     basis: np.ndarray
 
     @classmethod
-    def of(cls, R: np.ndarray, t: np.ndarray, focal: np.ndarray, principal: np.ndarray) -> Cameras:
+    def of(cls, R: np.ndarray, t: np.ndarray, focal: np.ndarray, principal: np.ndarray) -> Self:
         return cls(R, t / np.linalg.norm(t), focal, principal, null_space(t[None]))
 
-    def moved(self, by: np.ndarray) -> Cameras:
+    def moved(self, by: np.ndarray) -> Self:
         R = Rotation.from_rotvec(by[:3]).as_matrix() @ self.R
-        return Cameras.of(R, self.t + self.basis @ by[3:5], self.focal * np.exp(by[5:]), self.principal)
+        return self.of(R, self.t + self.basis @ by[3:5], self.focal * np.exp(by[5:]), self.principal)
 
     def fundamental(self) -> np.ndarray:
         """Of unit Frobenius norm, in pixels."""
@@ -46,10 +48,9 @@ class Cameras:
         K0, K1 = (
             np.array([[f, 0, p[0]], [0, f, p[1]], [0, 0, 1]]) for f, p in zip(self.focal, self.principal, strict=True)
         )
-        x, y, z = self.t
-        return np.linalg.inv(K1).T @ np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ self.R @ np.linalg.inv(K0)
+        return np.linalg.inv(K1).T @ skew(self.t) @ self.R @ np.linalg.inv(K0)
 
-    def difference(self, other: Cameras) -> np.ndarray:
+    def difference(self, other: Self) -> np.ndarray:
         """The parameters (7,) that move these to others, to first order in the direction of t."""
         omega = Rotation.from_matrix(other.R @ self.R.T).as_rotvec()
         return np.concatenate([omega, self.basis.T @ (other.t - self.t), np.log(other.focal / self.focal)])
@@ -57,10 +58,7 @@ class Cameras:
 
 def residuals(cameras: Cameras, x0: np.ndarray, x1: np.ndarray) -> np.ndarray:
     """Signed Sampson distances (n,) in pixels."""
-    a, b = (np.c_[x, np.ones(len(x))] for x in (x0, x1))
-    F = cameras.fundamental()
-    l1, l0 = a @ F.T, b @ F
-    return (b * l1).sum(1) / np.sqrt((l1[:, :2] ** 2).sum(1) + (l0[:, :2] ** 2).sum(1))
+    return sampson(cameras.fundamental(), x0, x1)
 
 
 def normals(cameras: Cameras, x0: np.ndarray, x1: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -1,7 +1,5 @@
 """VLAD from its definition, one descriptor and one centre at a time."""
 
-from __future__ import annotations
-
 import numpy as np
 
 

@@ -1,7 +1,5 @@
 """Arguments for generated calls: sound ones by what an annotation asks for, and what users hand over by mistake."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -77,7 +75,7 @@ class Scene:
             frames = self.rng.normal(size=full)
             frames[..., 2] = self.x1 if name == "lafs1" else self.x0
             return frames
-        if name in ("weight", "quality", "prior", "noise", "nsgd", "errors", "thresholds"):
+        if name in ("weight", "ratio", "prior", "noise", "nsgd", "errors", "thresholds"):
             return self.rng.uniform(0.01, 1, full)
         return self.rng.normal(size=full)
 

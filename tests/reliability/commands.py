@@ -1,7 +1,5 @@
 """The commands as a user runs them, on small data sets, killed at a chosen moment."""
 
-from __future__ import annotations
-
 import contextlib
 import subprocess
 from collections.abc import Iterator
@@ -10,31 +8,13 @@ from pathlib import Path
 import numpy as np
 
 from fmtorch.runs import RunFolder
-from tests.helpers import draw
 
 EVAL = ["features.max_features=400", "estimator=lmeds", "estimator.hypotheses=200", "batch=1", "workers=1"]
-SIDEWAYS = "0 0 0 0 0 -1 0 1 0"
-
-
-def data_set(folder: Path, scenes: int, images: int) -> Path:
-    """Scenes of images moved sideways, in the layout of FM-Bench; pairs of neighbours."""
-    lines, names = [], []
-    for scene in range(scenes):
-        place = folder / f"scene{scene}" / "Images"
-        place.mkdir(parents=True)
-        for i in range(images):
-            draw(place / f"{i:08d}.png", seed=scene, shift=9 * i)
-        for i in range(images - 1):
-            lines.append(f"{i} {i + 1} {SIDEWAYS}")
-            names.append(f"scene{scene}/")
-    (folder / "pairs_with_gt.txt").write_text("\n".join(lines) + "\n")
-    (folder / "pairs_which_dataset.txt").write_text("\n".join(names) + "\n")
-    return folder
 
 
 def evaluation(root: Path, run_dir: Path, *extra: str) -> list[str]:
     """Arguments of an evaluation."""
-    return ["dataset=fmbench", f"dataset.root={root}", *EVAL, f"run_dir={run_dir}", *extra]
+    return ["dataset=fmbench", f"dataset.root={root}", *EVAL, f"output={run_dir}", *extra]
 
 
 def results(run_dir: Path) -> list[dict[str, object]]:

@@ -1,14 +1,13 @@
 """What the trials share: the process that starts commands, a data set, the runs that nothing disturbs."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
 
 from tests import processes
+from tests.helpers import draw_set
 from tests.processes import Starter
-from tests.reliability.commands import data_set, evaluation, results
+from tests.reliability.commands import evaluation, results
 
 Rows = list[dict[str, object]]
 
@@ -30,7 +29,7 @@ def starter() -> Starter:
 @pytest.fixture(scope="package")
 def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A data set of nine pairs."""
-    return data_set(tmp_path_factory.mktemp("data") / "Set", scenes=1, images=10)
+    return draw_set(tmp_path_factory.mktemp("data") / "Set", ["scene0"], images=10)
 
 
 @pytest.fixture(scope="package")

@@ -5,8 +5,6 @@ with one of the names. It is a program of its own since the test suite checks th
 do not have. The calls are the same every time.
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import faulthandler
@@ -36,9 +34,9 @@ from torch import Tensor
 
 import fmtorch
 from fmtorch import geometry, matching, metrics, pruning
+from fmtorch.core import Correspondences, Estimate, Features, collate
 from fmtorch.core.annotations import arguments_of, arrays_of
-from fmtorch.core.types import Correspondences, Estimate, Features, collate
-from fmtorch.pipeline.build import load_pipeline
+from fmtorch.pipeline.pipeline import load_pipeline
 from fmtorch.presets.objects import merged
 from tests.laws import PEERS, calibrated, few, quick_pruner
 from tests.reliability.arguments import KINDS, MISTAKES, NUMBERS, SEQUENCES, Scene, batches, scenes
@@ -160,7 +158,7 @@ def functions(module: ModuleType) -> dict[str, Callable[..., Any]]:
 
 FIELDS: Mapping[str, tuple[str, tuple[str, ...]]] = {
     "x0": ("Float", ("b", "n", "2")), "x1": ("Float", ("b", "n", "2")), "mask": ("Bool", ("b", "n")),
-    "quality": ("Float", ("b", "n")), "prior": ("Float", ("b", "n")), "noise": ("Float", ("b", "n")),
+    "ratio": ("Float", ("b", "n")), "prior": ("Float", ("b", "n")), "noise": ("Float", ("b", "n")),
     "lafs0": ("Float", ("b", "n", "2", "3")), "lafs1": ("Float", ("b", "n", "2", "3")),
     "size0": ("Real", ("b", "2")), "size1": ("Real", ("b", "2")), "key": ("Int", ("b",)),
 }  # fmt: skip
@@ -403,7 +401,6 @@ def _expect_clear(error: Exception, names: set[str]) -> None:
     trace = error.__traceback__
     while trace is not None and trace.tb_next is not None:
         trace = trace.tb_next
-    assert trace is not None
     file, line = trace.tb_frame.f_code.co_filename, trace.tb_lineno
     ours = file.startswith(HOME) and linecache.getline(file, line).strip().startswith("raise ")
     named = any(re.search(rf"\b{name}\b", str(error)) for name in names)

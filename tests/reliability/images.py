@@ -1,7 +1,5 @@
 """Image files that are damaged, rare or hostile, made from nothing but the formats' definitions and Pillow."""
 
-from __future__ import annotations
-
 import io
 import struct
 import zlib

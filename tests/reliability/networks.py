@@ -3,15 +3,14 @@
 ``python -m tests.reliability.networks file folder count``
 """
 
-from __future__ import annotations
-
 import sys
 from collections import Counter
 from pathlib import Path
 
 import numpy as np
 
-from fmtorch.core.onnx_network import NetworkFileError, onnx_session
+from fmtorch.core import NetworkFileError
+from fmtorch.core.onnx_network import onnx_session
 
 
 def main(source: Path, folder: Path, count: int) -> None:

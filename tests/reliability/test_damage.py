@@ -1,7 +1,5 @@
 """Damaged files: told, computed anew, or of no consequence; never another result, never a crash."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -12,12 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fmtorch.core.files import models_dir
-from fmtorch.core.types import pair_key
-from fmtorch.data.images import ImageError, read_image
-from fmtorch.runs import PairRow, RunFolder
+from fmtorch.core import models_dir, pair_key
+from fmtorch.data import ImageError, read_image
+from fmtorch.runs import PairRow, RunFolder, RunFolderError
 from fmtorch.runs.feature_cache import ArrayCache
-from fmtorch.runs.run_folder import RunFolderError
 from tests.processes import ONE_THREAD
 from tests.reliability.images import NO_IMAGES, SOUND
 
@@ -109,15 +105,12 @@ def damaged_features(path: Path, count: int, seed: int) -> int:
 TRIALS = {"parts": damaged_parts, "run.json": damaged_identities, "features": damaged_features}
 
 
+@pytest.mark.parametrize("count", [BOUNDED, pytest.param(WHOLE, marks=pytest.mark.reliability)])
 @pytest.mark.parametrize("kind", TRIALS)
-def test_damaged_files(kind: str, tmp_path: Path) -> None:
-    assert TRIALS[kind](tmp_path / "here", BOUNDED, 0) > BOUNDED / 2
-
-
-@pytest.mark.reliability
-@pytest.mark.parametrize("kind", TRIALS)
-def test_many_damaged_files(kind: str, tmp_path: Path, record_property: Property) -> None:
-    record_property(f"damaged {kind}, told", TRIALS[kind](tmp_path / "here", WHOLE, 1))
+def test_damaged_files(kind: str, count: int, tmp_path: Path, record_property: Property) -> None:
+    told = TRIALS[kind](tmp_path / "here", count, 0)
+    assert told > count / 2
+    record_property(f"damaged {kind}, told", told)
 
 
 def damaged_networks(path: Path, count: int) -> str:
@@ -132,13 +125,11 @@ def damaged_networks(path: Path, count: int) -> str:
     return done.stdout.splitlines()[-1]
 
 
-def test_damaged_networks(tmp_path: Path) -> None:
-    assert "told" in damaged_networks(tmp_path, 12)
-
-
-@pytest.mark.reliability
-def test_many_damaged_networks(tmp_path: Path, record_property: Property) -> None:
-    record_property("damaged networks", damaged_networks(tmp_path, 400))
+@pytest.mark.parametrize("count", [12, pytest.param(400, marks=pytest.mark.reliability)])
+def test_damaged_networks(count: int, tmp_path: Path, record_property: Property) -> None:
+    outcomes = damaged_networks(tmp_path, count)
+    assert "told" in outcomes
+    record_property("damaged networks", outcomes)
 
 
 @pytest.mark.parametrize("name", SOUND)
@@ -186,12 +177,8 @@ def damaged_images(path: Path, count: int, seed: int) -> tuple[int, int]:
 
 
 @PILLOWS_WARNINGS
-def test_damaged_images(tmp_path: Path) -> None:
-    refused, read = damaged_images(tmp_path, 140, 0)
+@pytest.mark.parametrize("count", [140, pytest.param(7000, marks=pytest.mark.reliability)])
+def test_damaged_images(count: int, tmp_path: Path, record_property: Property) -> None:
+    refused, read = damaged_images(tmp_path, count, 0)
     assert refused > read
-
-
-@PILLOWS_WARNINGS
-@pytest.mark.reliability
-def test_many_damaged_images(tmp_path: Path, record_property: Property) -> None:
-    record_property("damaged images, refused and read", damaged_images(tmp_path, 7000, 1))
+    record_property("damaged images, refused and read", (refused, read))

@@ -4,8 +4,6 @@ Rights do not bind an administrator, as whom tests often run; so folders that ca
 read-only, and files that stand in the place of folders. Where nothing may be mounted those tests are skipped.
 """
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from collections.abc import Callable
@@ -13,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.helpers import draw_set
 from tests.processes import Command, Starter
 from tests.reliability.commands import evaluation, parts, remount, results, small_disk
 from tests.reliability.conftest import Rows
@@ -102,9 +101,7 @@ def arguments(name: str, root: Path, output: Path) -> list[str]:
 
     two = root.parent / "Two"
     if not two.exists():
-        from tests.reliability.commands import data_set
-
-        data_set(two, scenes=2, images=4)
+        draw_set(two, ["scene0", "scene1"], images=4)
     return ["dataset=fmbench", f"dataset.root={two}", *TRAIN, f"output={output}"]
 
 

@@ -1,7 +1,5 @@
 """Generated calls of every public function, in a process of their own (see `generated`)."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

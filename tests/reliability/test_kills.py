@@ -1,18 +1,18 @@
 """kill -9 when some results are already on disk: the same command goes on, and ends as if nothing had happened."""
 
-from __future__ import annotations
-
 import json
 import os
 import time
 from collections.abc import Callable
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from tests.helpers import draw_set
 from tests.processes import Starter
-from tests.reliability.commands import data_set, delays, evaluation, parts, results
+from tests.reliability.commands import delays, evaluation, parts, results
 from tests.reliability.conftest import Rows
 
 EVAL_KILLS, MATCH_KILLS, TRAIN_KILLS, PROCESS_KILLS = (
@@ -24,6 +24,14 @@ TRAIN = [
     "validation.uses.hard.estimator=ransac", "validation.uses.prior.estimator=msac", "augmentation.crop=0",
     "features.max_features=300", "pruner.lc.network.channels=8", "pruner.lc.network.blocks=2",
 ]  # fmt: skip
+
+
+Property = Callable[[str, object], None]
+
+
+def bounded_and_whole(bounded: int, whole: int) -> list[Any]:
+    """A small trial for every run of the tests, and the whole one on demand."""
+    return [bounded, pytest.param(whole, marks=pytest.mark.reliability)]
 
 
 def evaluate_with_kills(
@@ -46,24 +54,19 @@ def evaluate_with_kills(
     return killed, finished
 
 
-def test_an_evaluation_goes_on(starter: Starter, root: Path, truth: Rows, tmp_path: Path) -> None:
-    killed, finished = evaluate_with_kills(starter, root, tmp_path, 3, 0)
-    assert killed == 3
-    assert all(rows == truth for rows in finished)
-
-
-@pytest.mark.reliability
-def test_an_evaluation_goes_on_always(
-    starter: Starter, root: Path, truth: Rows, tmp_path: Path, record_property: Callable[[str, object], None]
+@pytest.mark.parametrize("kills", bounded_and_whole(3, EVAL_KILLS))
+def test_an_evaluation_goes_on(
+    kills: int, starter: Starter, root: Path, truth: Rows, tmp_path: Path, record_property: Property
 ) -> None:
-    killed, finished = evaluate_with_kills(starter, root, tmp_path, EVAL_KILLS, 1)
+    killed, finished = evaluate_with_kills(starter, root, tmp_path, kills, 0)
+    assert killed == kills
     assert all(rows == truth for rows in finished)
     record_property("kills of eval", killed)
 
 
 @pytest.mark.reliability
 def test_with_processes_none_is_left_behind(
-    starter: Starter, root: Path, truth: Rows, tmp_path: Path, record_property: Callable[[str, object], None]
+    starter: Starter, root: Path, truth: Rows, tmp_path: Path, record_property: Property
 ) -> None:
     extra = ("processes=true", "workers=2", "batch=1")
     killed, finished = evaluate_with_kills(starter, root, tmp_path, PROCESS_KILLS, 2, *extra)
@@ -117,16 +120,12 @@ def match_with_kills(starter: Starter, root: Path, folder: Path, kills: int, see
     return killed
 
 
-def test_two_photographs_are_matched_again(starter: Starter, root: Path, tmp_path: Path) -> None:
-    assert match_with_kills(starter, root, tmp_path, 1, 0) == 1
-
-
-@pytest.mark.reliability
-def test_two_photographs_are_matched_again_always(
-    starter: Starter, root: Path, tmp_path: Path, record_property: Callable[[str, object], None]
+@pytest.mark.parametrize("kills", bounded_and_whole(1, MATCH_KILLS))
+def test_two_photographs_are_matched_again(
+    kills: int, starter: Starter, root: Path, tmp_path: Path, record_property: Property
 ) -> None:
-    killed = match_with_kills(starter, root, tmp_path, MATCH_KILLS, 1)
-    assert killed == MATCH_KILLS
+    killed = match_with_kills(starter, root, tmp_path, kills, 0)
+    assert killed == kills
     record_property("kills of match", killed)
 
 
@@ -143,7 +142,7 @@ def newest(folder: Path) -> int:
 def train_with_kills(starter: Starter, folder: Path, kills: int, seed: int) -> int:
     """Train, killed once a later checkpoint is on disk, and again; checks that the weights are no others."""
     pytest.importorskip("lightning", reason="training needs the extra `train`")
-    root = data_set(folder / "Set", scenes=2, images=4)
+    root = draw_set(folder / "Set", ["scene0", "scene1"], images=4)
     arguments = ["dataset=fmbench", f"dataset.root={root}", *TRAIN]
     done = starter.run(folder, "train", *arguments, "output=undisturbed")
     assert done.status == 0, done.said()
@@ -163,12 +162,8 @@ def train_with_kills(starter: Starter, folder: Path, kills: int, seed: int) -> i
     return killed
 
 
-def test_a_training_goes_on(starter: Starter, tmp_path: Path) -> None:
-    assert train_with_kills(starter, tmp_path, 1, 0) == 1
-
-
-@pytest.mark.reliability
-def test_a_training_goes_on_always(
-    starter: Starter, tmp_path: Path, record_property: Callable[[str, object], None]
-) -> None:
-    record_property("kills of train", train_with_kills(starter, tmp_path, TRAIN_KILLS, 1))
+@pytest.mark.parametrize("kills", bounded_and_whole(1, TRAIN_KILLS))
+def test_a_training_goes_on(kills: int, starter: Starter, tmp_path: Path, record_property: Property) -> None:
+    killed = train_with_kills(starter, tmp_path, kills, 0)
+    assert killed == kills
+    record_property("kills of train", killed)

@@ -1,39 +1,36 @@
 """Arrays on disk: whole or absent, bounded, shared by processes, and never trusted."""
 
+import multiprocessing
 import os
 import pickle
 import signal
-import subprocess
-import sys
-import threading
 import time
 import warnings
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from fmtorch.runs import feature_cache as module
-from fmtorch.runs.feature_cache import ABANDONED, SLACK, ArrayCache
-
-WRITER = """
-import sys
-from pathlib import Path
-import numpy as np
-from fmtorch.runs.feature_cache import ArrayCache
-cache = ArrayCache(Path(sys.argv[1]), int(sys.argv[2]) or None)
-for i in range(int(sys.argv[3])):
-    cache.write("some", f"{i % 50}", {"a": np.full(50_000, i % 50)})
-    found = cache.read("some", f"{(i * 7) % 50}")
-    assert found is None or (found["a"] == (i * 7) % 50).all()
-"""
+from fmtorch.runs import ArrayCache
+from tests.helpers import in_threads
 
 
-def writer(folder: Path, limit: int = 0, count: int = 1_000_000) -> subprocess.Popen[str]:
-    """A process that writes files of 400 kB in a row, and reads others back."""
-    env = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[2])}
-    command = [sys.executable, "-W", "error", "-c", WRITER, str(folder), str(limit), str(count)]
-    return subprocess.Popen(command, env=env, stderr=subprocess.PIPE, text=True)
+def write_many(folder: Path, limit: int, count: int) -> None:
+    """Write files of 400 kB in a row, and read others back."""
+    warnings.simplefilter("error")
+    cache = ArrayCache(folder, limit or None)
+    for i in range(count):
+        cache.write("some", f"{i % 50}", {"a": np.full(50_000, i % 50)})
+        found = cache.read("some", f"{(i * 7) % 50}")
+        assert found is None or (found["a"] == (i * 7) % 50).all()
+
+
+def writer(folder: Path, limit: int = 0, count: int = 1_000_000) -> BaseProcess:
+    """A process that does so."""
+    process = multiprocessing.get_context("fork").Process(target=write_many, args=(folder, limit, count))
+    process.start()
+    return process
 
 
 def test_what_is_written_is_read(tmp_path: Path) -> None:
@@ -49,7 +46,7 @@ def test_what_is_written_is_read(tmp_path: Path) -> None:
     assert [path.name for path, _ in cache.files()] == ["name.npz"]
 
 
-@pytest.mark.parametrize("keep", [0.0, 0.3, 0.97, 0.999])
+@pytest.mark.parametrize("keep", [0.0, 0.3, 0.999])
 def test_a_truncated_file_counts_as_absent(tmp_path: Path, keep: float) -> None:
     cache = ArrayCache(tmp_path)
     cache.write("some", "name", {"a": np.arange(1000)})
@@ -103,7 +100,7 @@ def test_the_least_recently_used_files_go(tmp_path: Path) -> None:
     for i in range(12, 40):
         cache.write("other", f"{i}", {"a": np.full(1000, i)})
         time.sleep(0.002)  # file systems' clocks tick in milliseconds
-        assert sum(status.st_size for _, status in cache.files()) <= (1 + SLACK) * 20 * size
+        assert sum(status.st_size for _, status in cache.files()) <= 1.05 * 20 * size
         if i == 24:
             assert cache.read("some", "0") is not None
             assert cache.read("some", "1") is None
@@ -117,7 +114,7 @@ def test_dead_writers_leftovers_are_removed_and_live_ones_kept(tmp_path: Path) -
     dead, live = tmp_path / "some" / "a.npz.1.tmp", tmp_path / "some" / "b.npz.2.tmp"
     for path in (dead, live):
         path.write_bytes(b"half")
-    before = time.time() - 2 * ABANDONED
+    before = time.time() - 7200
     os.utime(dead, (before, before))
     ArrayCache(tmp_path).write("some", "c", {"a": np.zeros(1)})
     assert not dead.exists()
@@ -130,9 +127,9 @@ def test_a_killed_writer_leaves_no_broken_file(tmp_path: Path) -> None:
         deadline = time.monotonic() + 60
         while len(list(tmp_path.glob("some/*.npz"))) < 3 + kill and time.monotonic() < deadline:
             time.sleep(0.002)
-        process.send_signal(signal.SIGKILL)
-        _, errors = process.communicate(timeout=60)
-        assert process.returncode == -signal.SIGKILL, errors
+        process.kill()
+        process.join(60)
+        assert process.exitcode == -signal.SIGKILL
     cache = ArrayCache(tmp_path)
     names = [path.stem for path, _ in cache.files()]
     assert len(names) >= 3
@@ -147,44 +144,35 @@ def test_a_killed_writer_leaves_no_broken_file(tmp_path: Path) -> None:
 def test_processes_share_a_cache(tmp_path: Path, limit: int) -> None:
     processes = [writer(tmp_path, limit, 55) for _ in range(2)]
     for process in processes:
-        _, errors = process.communicate(timeout=120)
-        assert process.returncode == 0, errors
+        process.join(120)
+        assert process.exitcode == 0
     cache = ArrayCache(tmp_path)
     files = list(cache.files())
     for path, _ in files:
         cached = cache.read("some", path.stem)
         assert (cached["a"] == int(path.stem)).all()
     total = sum(status.st_size for _, status in files)
-    assert len(files) == 50 if limit == 0 else total <= (1 + 2 * SLACK) * limit + 2 * 400_500
+    assert len(files) == 50 if limit == 0 else total <= 1.1 * limit + 2 * 400_500
     assert not list(tmp_path.glob("some/*.tmp"))
 
 
 def test_threads_share_a_cache(tmp_path: Path) -> None:
     cache = ArrayCache(tmp_path, limit=30 * 8000)
-    errors: list[BaseException] = []
 
     def work(start: int) -> None:
-        try:
-            for i in range(start, start + 60):
-                cache.write("some", f"{i % 40}", {"a": np.full(1000, i % 40)})
-                cached = cache.read("some", f"{(i * 3) % 40}")
-                assert cached is None or (cached["a"] == (i * 3) % 40).all()
-        except BaseException as error:
-            errors.append(error)
+        for i in range(start, start + 60):
+            cache.write("some", f"{i % 40}", {"a": np.full(1000, i % 40)})
+            cached = cache.read("some", f"{(i * 3) % 40}")
+            assert cached is None or (cached["a"] == (i * 3) % 40).all()
 
-    threads = [threading.Thread(target=work, args=(k,)) for k in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert errors == []
+    in_threads(4, work)
 
 
 def test_what_cannot_be_written_is_told_and_harms_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*_: object, **__: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(module.np, "savez", full)
+    monkeypatch.setattr("numpy.savez", full)
     cache = ArrayCache(tmp_path)
     with pytest.warns(UserWarning, match="No space left on device"):
         cache.write("some", "name", {"a": np.zeros(1)})

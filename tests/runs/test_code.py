@@ -126,32 +126,6 @@ def test_a_module_is_all_that_it_imports_of_its_own(
         sys.modules.pop(name, None)
 
 
-def test_imports_are_found_in_every_block() -> None:
-    source = """
-import a
-def f():
-    import b
-class C:
-    if x: import c
-    else: import d
-try: import e
-except E: import f
-else: import g
-finally: import h
-match x:
-    case 1: import i
-async def f():
-    async with x: import j
-    async for y in x: import k
-for y in x: import l
-else:
-    while x: import m
-"""
-    assert sorted(name for entry in fingerprint._imports(source.encode()) for name in entry.names) == list(
-        "abcdefghijklm"
-    )
-
-
 def test_a_module_without_a_file_is_refused() -> None:
     with pytest.raises(TypeError, match="sys is in no file"):
         fingerprint.code_digest("sys")

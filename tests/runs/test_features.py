@@ -1,13 +1,10 @@
 """The feature cache: bit-equal, by content and configuration, shared detection, honest seconds."""
 
 import dataclasses
-import importlib
 import os
 import re
-import subprocess
+import runpy
 import sys
-import threading
-import types
 from pathlib import Path
 
 import numpy as np
@@ -18,14 +15,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from fmtorch import presets
-from fmtorch.core.stages import TimedExtractor, TwoStepExtractor
-from fmtorch.core.types import Features
-from fmtorch.features import RootSIFTPCA
-from fmtorch.pipeline.build import load_pipeline
+from fmtorch.core import Features
+from fmtorch.pipeline import load_pipeline
+from fmtorch.runs import ArrayCache, CachedFeatures, cached, configuration, image_digest
 from fmtorch.runs import fingerprint as configuration_module
-from fmtorch.runs.feature_cache import ArrayCache, CachedFeatures, cached, image_digest
-from fmtorch.runs.fingerprint import configuration, learned
-from tests.conftest import shared_path
+from tests.helpers import in_threads
 
 
 def picture(seed: int = 0, shape: tuple[int, ...] = (120, 160)) -> NDArray[np.uint8]:
@@ -76,8 +70,7 @@ class TwoSteps:
         return Features(lafs, scores, self.describe(image, lafs), torch.tensor(image.shape[:2]))
 
 
-@pytest.mark.parametrize("root", [False, True])
-@pytest.mark.parametrize("shape", [(240, 320), (240, 320, 3), (8, 8)])
+@pytest.mark.parametrize(("shape", "root"), [((240, 320), False), ((240, 320, 3), True), ((8, 8), False)])
 def test_bit_equal_with_and_without(tmp_path: Path, shape: tuple[int, ...], root: bool) -> None:
     sift = presets.build("features", "sift", max_features=300, root=root)
     image = picture(shape=shape)
@@ -88,20 +81,6 @@ def test_bit_equal_with_and_without(tmp_path: Path, shape: tuple[int, ...], root
     assert equal(second(image), truth)
     assert (first.computed, first.found) == (1, 0)
     assert (second.computed, second.found) == (0, 1)
-
-
-def test_bit_equal_on_a_real_photograph(tmp_path: Path) -> None:
-    from fmtorch.data import read_image
-
-    path = next(shared_path("data/Strecha_train").rglob("*.jpg"))
-    sift = presets.build("features", "sift", max_features=2000)
-    image = read_image(path)
-    kept = CachedFeatures(sift, ArrayCache(tmp_path))
-    assert equal(kept(image), sift(image))
-    assert equal(kept(image), sift(image))
-    assert kept.found == 1
-    ((_, status),) = kept.cache.files()
-    assert status.st_size < 2000 * (128 + 24 + 4 + 1) + 4000  # SIFT's descriptors are bytes
 
 
 def test_every_float_survives(tmp_path: Path) -> None:
@@ -127,7 +106,6 @@ def test_every_float_survives(tmp_path: Path) -> None:
 def test_extractors_with_the_same_detection_share_it(tmp_path: Path) -> None:
     cache, image = ArrayCache(tmp_path), picture()
     half_gain, double_gain, coarse = TwoSteps(gain=0.5), TwoSteps(gain=2.0), TwoSteps(Detector(step=16))
-    assert isinstance(half_gain, TwoStepExtractor)
     for extractor, expected in (
         (half_gain, ["detect", "describe"]),
         (double_gain, ["describe"]),
@@ -165,7 +143,6 @@ def test_another_option_image_or_shape_is_another_file(tmp_path: Path) -> None:
 def test_seconds_are_those_of_the_computation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     sift = presets.build("features", "sift")
     first, second = (CachedFeatures(sift, ArrayCache(tmp_path)) for _ in range(2))
-    assert isinstance(first, TimedExtractor)
     seconds = first.timed(picture())[1]
     assert seconds > 0
     assert second.timed(picture())[1] == seconds
@@ -198,17 +175,11 @@ def test_threads(tmp_path: Path) -> None:
     sift = presets.build("features", "sift")
     kept = CachedFeatures(sift, ArrayCache(tmp_path))
     truths = [sift(picture(seed)) for seed in range(3)]
-    wrong: list[int] = []
 
-    def work() -> None:
-        wrong.extend(seed for seed in [0, 1, 2] * 4 if not equal(kept(picture(seed)), truths[seed]))
+    def work(_: int) -> None:
+        assert all(equal(kept(picture(seed)), truths[seed]) for seed in [0, 1, 2] * 4)
 
-    threads = [threading.Thread(target=work) for _ in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert wrong == []
+    in_threads(4, work)
     assert kept.found + kept.computed == 48
     assert kept.found >= 48 - 3 * 4
 
@@ -296,75 +267,18 @@ def test_configuration_of_files_tensors_networks_and_code(tmp_path: Path, monkey
     configuration_module.code_digest.cache_clear()
 
 
-def test_code_is_what_a_module_imports_from_its_own_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    package = tmp_path / "somebody"
-    (package / "parts").mkdir(parents=True)
-    sources = {
-        "__init__.py": "", "parts/__init__.py": "", "unused.py": "", "deep.py": "", "parts/beside.py": "",
-        "used.py": "def helper():\n    from somebody import deep\n    return deep\n",
-        "parts/detector.py": "import dataclasses\nfrom somebody.used import helper\n\n"
-        "@dataclasses.dataclass(frozen=True)\nclass Detector:\n    step: int = 8\n",
-    }  # fmt: skip
-    for name, text in sources.items():
-        (package / name).write_text(text)
-    monkeypatch.syspath_prepend(str(tmp_path))
-    detector = importlib.import_module("somebody.parts.detector").Detector()
-
-    def code() -> str:
-        configuration_module.code_digest.cache_clear()
-        return str(configuration(detector)["code"])
-
-    before = code()
-    for name, matters in {
-        "unused.py": False, "parts/beside.py": True, "deep.py": True, "used.py": True, "__init__.py": True,
-        "parts/detector.py": True,
-    }.items():  # fmt: skip
-        (package / name).write_text(sources[name] + "\nchanged = True\n")
-        assert (code() != before) == matters, name
-        (package / name).write_text(sources[name])
-    assert code() == before
-    for name in [name for name in sys.modules if name.partition(".")[0] == "somebody"]:
-        monkeypatch.delitem(sys.modules, name)
-
-
-class Typed(torch.nn.Linear):
-    """A network as if typed in where no file holds it."""
-
-
-def test_learned_files_are_digests(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    file = tmp_path / "a.npz"
-    file.write_bytes(b"one")
-    before = learned(presets.build("features", "rootsiftpca", descriptor={"name": "rootsiftpca", "model": str(file)}))
-    assert len(before) == 1
-    file.write_bytes(b"two")
-    os.utime(file, (1, 1))
-    after = learned({"a": [RootSIFTPCA(file), RootSIFTPCA(file)]})
-    assert len(after) == 1
-    assert after != before
-    network = torch.nn.Linear(2, 2)
-    (before,) = learned(network)
-    with torch.no_grad():
-        network.weight[0, 0] += 1
-    assert learned(network) != [before]
-    monkeypatch.setitem(sys.modules, "typed_in", types.ModuleType("typed_in"))
-    monkeypatch.setattr(Typed, "__module__", "typed_in")
-    assert len(learned(Typed(2, 2))) == 1
-    assert learned(presets.build("features", "sift")) == []
-    assert learned(lambda: None) == []
-    assert learned(RootSIFTPCA(tmp_path / "absent.npz")) == []
-
-
-def test_the_command_tells_what_is_there(tmp_path: Path) -> None:
+def test_the_command_tells_what_is_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("FMTORCH_CACHE", str(tmp_path))
+    monkeypatch.setenv("COLUMNS", "200")
+    monkeypatch.setattr(sys, "argv", ["runs"])
     CachedFeatures(TwoSteps(), ArrayCache(tmp_path / "features"))(picture())
-    source = str(Path(__file__).resolve().parents[2])
-    env = {**os.environ, "PYTHONPATH": source, "FMTORCH_CACHE": str(tmp_path), "COLUMNS": "200"}
-    command = [sys.executable, "-W", "error", "-m", "fmtorch.runs"]
-    output = subprocess.run(command, env=env, capture_output=True, text=True, timeout=120, check=True).stdout
-    assert "2 files" in output
-    assert "scenes drawn" not in output
     (tmp_path / "rendered" / "orbit").mkdir(parents=True)
     (tmp_path / "rendered" / "orbit" / "00.jpg").write_bytes(bytes(1_500_000))
-    again = subprocess.run(command, env=env, capture_output=True, text=True, timeout=120, check=True).stdout
-    assert re.search(r"rendered: scenes drawn\s+│\s+1 │ 1\.5 MB", again)
+    runpy.run_module("fmtorch.runs", run_name="__main__")
+    output = capsys.readouterr().out
+    assert "2 files" in output
+    assert re.search(r"rendered: scenes drawn\s+│\s+1 │ 1\.5 MB", output)
     assert "detection-" in output
     assert "TwoSteps-" in output

@@ -5,14 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fmtorch import scenes
 from fmtorch.data import DepthDataset, load
-from fmtorch.scenes import Plan, RenderedPairs
-from fmtorch.scenes import dataset as depth_module
-from fmtorch.scenes.camera import Camera, calibration, look_at
-from fmtorch.scenes.dataset import depth_at
-from fmtorch.scenes.generate import Task, build
-from fmtorch.scenes.light import Lens, Light
-from fmtorch.scenes.scene import Scene, Shot
+from fmtorch.scenes import Camera, Plan, RenderedPairs, Task, build, calibration, depth_at, look_at
+from fmtorch.scenes.light import DrawnScene, Lens, Light, Shot
 from fmtorch.scenes.surfaces import Surfaces, vec
 from tests.reference.labels import first_hit
 
@@ -38,10 +34,10 @@ def staged(monkeypatch: pytest.MonkeyPatch) -> tuple[Task, Camera]:
     shots = [Shot(camera, Lens(), light=k) for k in range(2)]
     light = Light((0.0, 0.0, 1.0))
     sky = np.zeros((8, 8, 3), np.uint8)
-    scene = Scene([wall_and_screen(False), wall_and_screen(True)], [light] * 2, sky, shots, [(0, 1)])
-    recent = depth_module._Recent()
+    scene = DrawnScene([wall_and_screen(False), wall_and_screen(True)], [light] * 2, sky, shots, [(0, 1)])
+    recent = scenes.dataset._Recent()
     recent.scene = lambda task: scene  # type: ignore[assignment]
-    monkeypatch.setattr(depth_module, "_recent", recent)
+    monkeypatch.setattr("fmtorch.scenes.dataset._recent", recent)
     return Task("indoor", "test", 0, 0, SMALL), camera
 
 
@@ -62,7 +58,7 @@ def test_depth_is_the_reference_ray_casters() -> None:
     surfaces = scene.surfaces[shot.light]
     assert all(texture.opaque for texture in surfaces.textures)
     h, w = shot.camera.size
-    points = np.random.default_rng(0).uniform(-0.5, [w - 0.5, h - 0.5], (60, 2))
+    points = np.random.default_rng(0).uniform(-0.5, [w - 0.5, h - 0.5], (25, 2))
     computed = depth_at(task, 0, points)
     direct = []
     for (x, y), depth in zip(points, computed, strict=True):

@@ -1,15 +1,12 @@
 """The ray-caster draws surfaces where the cameras say they are."""
 
-import cv2
 import numpy as np
 import pytest
 
-from fmtorch.scenes.camera import Camera, calibration, fundamental, look_at, relative_pose
-from fmtorch.scenes.generate import FAMILIES, Plan, Task, build
+from fmtorch.scenes import FAMILIES, Camera, Plan, Task, build, calibration, fundamental, look_at, relative_pose
 from fmtorch.scenes.light import Light, Stage
 from fmtorch.scenes.raycast import Geometry
-from fmtorch.scenes.surfaces import Surfaces, vec
-from fmtorch.scenes.textures import TO_LINEAR, Texture, to_srgb
+from fmtorch.scenes.surfaces import Surfaces, Texture, vec
 from tests.reference.rendering import colour
 
 SIZE = (120, 160)
@@ -19,23 +16,6 @@ def camera(
     x: float, y: float, z: float, target: tuple[float, float, float] = (0.0, 0.0, 1.0), focal: float = 150.0
 ) -> Camera:
     return look_at(calibration(focal, SIZE), SIZE, (x, y, z), target, roll=0.1 * x)
-
-
-def block_world(texture: np.ndarray) -> Surfaces:
-    """A wall, a floor and a box before them."""
-    surfaces = Surfaces()
-    number = surfaces.texture(texture)
-    surfaces.quad(vec(-6, 2, 5), vec(12, 0, 0), vec(0, 0, -5), number)
-    surfaces.quad(vec(-6, 2, 0), vec(12, 0, 0), vec(0, -8, 0), number)
-    surfaces.box(vec(-0.5, 0, 0), vec(1.2, 0.1, 0), vec(-0.1, 1, 0), 1.5, [number] * 5)
-    return surfaces
-
-
-def smooth_texture(seed: int = 0) -> np.ndarray:
-    noise = np.random.default_rng(seed).random((256, 256, 3)).astype(np.float32)
-    noise = cv2.GaussianBlur(noise, (0, 0), 8, borderType=cv2.BORDER_REFLECT)
-    noise = (noise - noise.min()) / np.ptp(noise)
-    return (noise * 255).astype(np.uint8)
 
 
 def points_seen(geometry: Geometry, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
@@ -78,23 +58,6 @@ def line_distance(F: np.ndarray, x0: np.ndarray, x1: np.ndarray) -> np.ndarray:
     return np.maximum(error / np.hypot(l1[:, 0], l1[:, 1]), error / np.hypot(l0[:, 0], l0[:, 1]))
 
 
-def test_rays_meet_the_planes_that_a_scalar_intersection_finds() -> None:
-    geometry = Geometry(block_world(smooth_texture()))
-    c = camera(1.2, -3.0, 1.4)
-    hits, depth = geometry.look(c), geometry.depth_map(c)
-    for x, y in np.random.default_rng(1).integers(0, [SIZE[1], SIZE[0]], (150, 2)):
-        ray = c.R.T @ np.linalg.inv(c.K) @ [x, y, 1.0]
-        best, piece = np.inf, -1
-        for i in range(len(geometry.O)):
-            M = np.column_stack([geometry.U[i], geometry.V[i], -ray])
-            s, t, z = np.linalg.solve(M, c.centre - geometry.O[i])
-            front = (c.centre - geometry.O[i]) @ geometry.normal[i] > 0
-            if 0 <= s <= 1 and 0 <= t <= 1 and 0.05 < z < best and front:
-                best, piece = z, i
-        assert hits.piece[y, x] == piece
-        assert depth[y, x] == pytest.approx(best, rel=1e-9)
-
-
 @pytest.mark.parametrize("family", FAMILIES)
 def test_what_a_pixel_sees_lies_on_its_epipolar_line(family: str) -> None:
     scene = build(Task(family, "train", 0, 3, Plan(1, 3, 2, 0.1)))
@@ -104,42 +67,6 @@ def test_what_a_pixel_sees_lies_on_its_epipolar_line(family: str) -> None:
     np.testing.assert_allclose(c0.project(X)[0], pixel, atol=1e-8)
     ahead = X @ c1.R[2] + c1.t[2] > 0.1
     assert line_distance(fundamental(c0, c1), pixel[ahead], c1.project(X[ahead])[0]).max() < 1e-6
-
-
-def bilinear(image: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Colours at points (n, 2) inside the image by at least a pixel."""
-    x = np.clip(x, 0, np.array(image.shape[1::-1]) - 1.001)
-    i, f = np.floor(x).astype(int), x - np.floor(x)
-    fx, fy = f[:, :1], f[:, 1:]
-    top = image[i[:, 1], i[:, 0]] * (1 - fx) + image[i[:, 1], i[:, 0] + 1] * fx
-    low = image[i[:, 1] + 1, i[:, 0]] * (1 - fx) + image[i[:, 1] + 1, i[:, 0] + 1] * fx
-    return top * (1 - fy) + low * fy
-
-
-def test_depth_carries_one_picture_into_the_other() -> None:
-    """Without noise and blur a point has the same colour in both views; its light does not depend on the viewer."""
-    surfaces = block_world(smooth_texture())
-    geometry = Geometry(surfaces)
-    stage = Stage(geometry, Light((0.3, -0.5, 0.8), sun=(0.0, 0.0, 0.0)), np.full((8, 16, 3), 90, np.uint8))
-    c0, c1 = camera(-0.8, -3.0, 1.3), camera(0.8, -3.2, 1.7)
-    image0, image1 = stage.radiance(c0, (0.0, 0.0)), stage.radiance(c1, (0.0, 0.0))
-    pixel, X = points_seen(geometry, c0)
-    x1, depth1 = c1.project(X)
-    inside = (x1 >= 1).all(1) & (x1 <= [SIZE[1] - 2, SIZE[0] - 2]).all(1)
-    pixel, x1, depth1 = pixel[inside].astype(int), x1[inside], depth1[inside]
-    near = np.rint(x1).astype(int)
-    seen = np.abs(geometry.depth_map(c1)[near[:, 1], near[:, 0]] - depth1) < 0.02 * depth1
-    assert seen.mean() > 0.6
-    assert (~seen).mean() > 0.02  # there is occlusion
-    there = bilinear(image1, x1)
-    here = image0[pixel[:, 1], pixel[:, 0]]
-    error = np.abs(there - here).max(1)[seen]
-    contrast = image0.std()
-    # What is left is interpolation of a texture blurred with sigma 8 texels, and 8-bit steps; a shift of one pixel
-    # would give several times this.
-    shifted = bilinear(image1, x1 + 1)
-    assert np.median(error) < 0.05 * contrast
-    assert np.median(error) < 0.25 * np.median(np.abs(shifted - here).max(1)[seen])
 
 
 def test_a_mark_is_drawn_where_it_projects() -> None:
@@ -170,24 +97,3 @@ def test_textures_keep_their_mean_when_they_shrink_and_do_not_alias() -> None:
     far = colour(texture, u, u[::-1].copy(), np.full(500, 5.0, np.float32))
     assert far.mean() == pytest.approx(0.5, abs=0.01)
     assert far.std() < 0.01
-
-
-def test_textures_repeat() -> None:
-    texture = Texture(smooth_texture())
-    u, v = np.random.default_rng(0).random((2, 100)).astype(np.float32)
-    lod = np.full(100, 1.3, np.float32)
-    np.testing.assert_allclose(colour(texture, u, v, lod), colour(texture, u + 3, v - 2, lod), atol=2e-3)
-
-
-def test_transfer_curve_and_its_inverse() -> None:
-    np.testing.assert_allclose(to_srgb(TO_LINEAR) * 255, np.arange(256), atol=1e-3)
-
-
-def test_a_lathe_faces_outward() -> None:
-    surfaces = Surfaces()
-    number = surfaces.texture(smooth_texture())
-    surfaces.lathe(vec(0, 0, 0), [(0, 1), (1, 1.2), (2, 0.8)], number)
-    geometry = Geometry(surfaces)
-    middle = geometry.O + (geometry.U + geometry.V) / 3
-    assert ((middle[:, :2] * geometry.normal[:, :2]).sum(1) > 0).all()
-    assert ((geometry.normals[:, 0] * geometry.normal).sum(1) > 0.8).all()

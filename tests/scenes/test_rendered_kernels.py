@@ -1,15 +1,11 @@
 """The ray-caster and light draw the same pictures as their definitions in NumPy, to the last bit."""
 
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
 import pytest
 
-from fmtorch.scenes import raycast
-from fmtorch.scenes.camera import Camera, calibration, look_at
-from fmtorch.scenes.dataset import depth_at
-from fmtorch.scenes.generate import FAMILIES, Plan, Task, build
+from fmtorch.scenes import FAMILIES, Camera, Plan, Task, build, calibration, look_at, raycast
 from fmtorch.scenes.light import Lens, Light, Stage, expose
 from fmtorch.scenes.raycast import Geometry
 from fmtorch.scenes.surfaces import Surfaces, vec
@@ -62,7 +58,7 @@ def view(stage: Stage, camera: Camera) -> tuple[np.ndarray, ...]:
 
 @pytest.mark.parametrize("family", FAMILIES)
 def test_forms_draw_the_same_scenes(family: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    scene = build(Task(family, "train", 1, 5, Plan(1, 3, 2, 0.3)))
+    scene = build(Task(family, "train", 1, 5, Plan(1, 3, 2, 0.15)))
     shots = [scene.shots[0], scene.shots[-1]]
     for light in {shot.light for shot in shots}:
         pair = stages(scene.surfaces[light], scene.lights[light], scene.sky, monkeypatch)
@@ -89,13 +85,13 @@ def random_world(rng: np.random.Generator) -> Surfaces:
     return surfaces
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_forms_draw_the_same_random_worlds(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(seed)
     sky = rng.integers(0, 256, (16, 32, 3), dtype=np.uint8)
     light = Light((0.3, -0.5, 0.8), through_walls=bool(seed % 2))
     pair = stages(random_world(rng), light, sky, monkeypatch)
-    for _ in range(4):
+    for _ in range(3):
         eye, target = rng.normal(0, 3, (2, 3))
         assert_equal_views(pair, look_at(calibration(80.0, SIZE), SIZE, eye.tolist(), target.tolist()), monkeypatch)
 
@@ -106,21 +102,6 @@ def test_forms_draw_an_empty_view(monkeypatch: pytest.MonkeyPatch) -> None:
     pair = stages(surfaces, Light((0.3, -0.5, 0.8)), np.full((8, 16, 3), 90, np.uint8), monkeypatch)
     camera = look_at(calibration(80.0, SIZE), SIZE, (0.0, 0.0, 5.0), (0.0, 1.0, 9.0))
     assert (assert_equal_views(pair, camera, monkeypatch) == -1).all()
-
-
-def test_forms_give_the_same_depth(monkeypatch: pytest.MonkeyPatch) -> None:
-    task = Task("orbit", "train", 0, 3, Plan(1, 3, 2, 0.2))
-    points = np.random.default_rng(0).uniform(0, 100, (500, 2))
-
-    def depth() -> np.ndarray:
-        with ThreadPoolExecutor(1) as thread:  # each thread remembers its own views
-            return thread.submit(depth_at, task, 1, points).result()
-
-    depths = [depth()]
-    take_reference(monkeypatch)
-    depths.append(depth())
-    np.testing.assert_array_equal(*depths)
-    assert np.isfinite(depths[0]).any()
 
 
 def test_textures_too_small_to_shrink_are_refused() -> None:

@@ -8,14 +8,11 @@ import numpy as np
 import pytest
 import torch
 
-from fmtorch.core.types import Correspondences
+from fmtorch.core import Correspondences
 from fmtorch.data import ImagePair, ImageSource
-from fmtorch.pipeline.pipeline import Outcome
+from fmtorch.pipeline import Outcome
 from scripts.benchmark import __main__
 from scripts.benchmark.runner import Item, Row
-from tests.helpers import draw
-
-PIXEL_SHIFT = "0 0 0 0 0 -1 0 1 0"  # F of two images of which one is moved along x
 
 
 def pair(name: str, F: np.ndarray | None = None, **known: np.ndarray) -> ImagePair:
@@ -45,17 +42,3 @@ def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *ar
 
 def read(path: Path) -> list[Row]:
     return [json.loads(line) for line in path.read_text().splitlines()]
-
-
-def drawn_set(root: Path, scenes: str = "a", images: int = 2) -> Path:
-    """A set in FM-Bench's layout whose scenes have images moved along x, each with the next."""
-    lines, places = [], []
-    for seed, scene in enumerate(scenes):
-        (root / scene / "Images").mkdir(parents=True)
-        for i in range(images):
-            draw(root / scene / "Images" / f"{i:08d}.png", seed=seed, shift=9 * i)
-        lines += [f"{i} {i + 1} {PIXEL_SHIFT}\n" for i in range(images - 1)]
-        places += [f"{scene}/\n"] * (images - 1)
-    (root / "pairs_with_gt.txt").write_text("".join(lines))
-    (root / "pairs_which_dataset.txt").write_text("".join(places))
-    return root

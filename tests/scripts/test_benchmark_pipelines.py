@@ -9,14 +9,14 @@ from scripts.benchmark.methods import pipeline_of
 from scripts.benchmark.pipelines import (
     BENCHMARKS,
     RULE,
-    chosen_pipelines,
     differences_sheet,
     figures_sheet,
     settings_of,
 )
 from scripts.benchmark.runner import Row
 from scripts.benchmark.tables import FIGURES, MEDIANS, Results, published
-from tests.scripts.samples import drawn_set, read, row, run
+from tests.helpers import draw_set
+from tests.scripts.samples import read, row, run
 
 
 @pytest.mark.parametrize("name", [*BENCHMARKS, "related"])
@@ -36,7 +36,7 @@ def test_an_interrupted_run_goes_on_and_its_tables_are_written(
 ) -> None:
     rows, table = tmp_path / "rows.jsonl", tmp_path / "own.csv"
     mine = "mine = sift_ratio pruner=[ratio] + lpm"
-    arguments = ["--root", drawn_set(tmp_path / "Set", images=3), "--seeds", 2, "--cache", "off", "--rows", rows,
+    arguments = ["--root", draw_set(tmp_path / "Set", images=3), "--seeds", 2, "--cache", "off", "--rows", rows,
                  "--pipelines", "RATIO", "GMS*", mine, "--overrides", "features.max_features=300"]  # fmt: skip
     run(capsys, monkeypatch, "pruning", *arguments)
     first = read(rows)
@@ -52,16 +52,6 @@ def test_an_interrupted_run_goes_on_and_its_tables_are_written(
     assert len(table.read_text().splitlines()) == 5
     with pytest.raises(SystemExit, match="nothing to show: name sets with --root"):
         run(capsys, monkeypatch, "pruning", "--rows", tmp_path / "none.jsonl")
-
-
-def test_pipelines_are_taken_by_name_pattern_or_words() -> None:
-    known = {"a": "sift_ratio", "a b": "sift_gms", "c": "sift_lpm"}
-    assert chosen_pipelines(known, ["a*"]) == {"a": "sift_ratio", "a b": "sift_gms"}
-    assert chosen_pipelines(known, ["c", "x = sift_ratio estimator=msac", "sift_lc"]) == {
-        "c": "sift_lpm", "x": "sift_ratio estimator=msac", "sift_lc": "sift_lc",
-    }  # fmt: skip
-    with pytest.raises(SystemExit, match=r"'d\*': there are a, a b, c"):
-        chosen_pipelines(known, ["d*"])
 
 
 def counted(method: str, pair: str, nsgd: float, **others: object) -> Row:
@@ -93,6 +83,7 @@ def test_recall_is_given_apart_for_pairs_that_the_rule_leaves_out(
     assert [ratio[f"%Recall, {part}"] for part in ("selected", "left out")] == ["100.0", "0.0"]
     assert [own[f"%Recall, {part}"] for part in ("selected", "left out")] == ["100.0", "100.0"]
     rows = tmp_path / "rows.jsonl"
-    run(capsys, monkeypatch, "hard", "--root", drawn_set(tmp_path / "Set"), "--pipelines", "sift_ratio", "--seeds", 1,
+    root = draw_set(tmp_path / "Set", images=2)
+    run(capsys, monkeypatch, "hard", "--root", root, "--pipelines", "sift_ratio", "--seeds", 1,
         "--cache", "off", "--rows", rows)  # fmt: skip
     assert [(r["method"], r.get("selected")) for r in read(rows)] == [(RULE, True), ("sift_ratio", None)]

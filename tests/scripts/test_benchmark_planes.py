@@ -8,11 +8,9 @@ import pytest
 import torch
 from skimage import data as images
 
-from fmtorch.core.types import Correspondences
 from fmtorch.geometry import homography_transfer
 from fmtorch.two_view.pair_type import classify
 from scripts.benchmark import photographs, planes
-from tests.geometry.kinds import batch, draw
 from tests.scripts.samples import run
 
 
@@ -44,7 +42,7 @@ def cells(printed: str) -> list[list[str]]:
 def test_the_commands(folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("pycolmap")
     arguments = ["--photographs", folder, "--limit", 2]
-    printed = run(capsys, monkeypatch, "configuration", *arguments, "--colmap", 4)
+    printed = run(capsys, monkeypatch, "pair_types", *arguments, "--colmap", 4)
     lines = [
         [cell.strip() for cell in line.split("|")] for line in printed.splitlines() if line.startswith("| fmtorch")
     ]
@@ -63,13 +61,3 @@ def test_an_estimate_is_judged_where_the_plane_is_seen(folder: Path) -> None:
     errors = [planes.Homography("x", lambda c, seed, H=H: H).figures(item, 0)["corner_error"]
               for H in (item.pair.H, shifted, None)]  # fmt: skip
     assert errors == [pytest.approx(0, abs=1e-9), pytest.approx(5), np.inf]
-
-
-def test_poses_of_a_plane() -> None:
-    """From exact cameras and matches with noise: H gives the pose as one of two, F whatever it likes."""
-    drawn = draw("planar", 0, wrong=0.0, noise=0.2)
-    given = batch([drawn])
-    fields = {name: given[name] for name in ("x0", "x1", "mask", "size0", "size1", "K0", "K1")}
-    _, first, better = planes.pose_errors(Correspondences(**fields), drawn.R, drawn.t)
-    assert better <= first
-    assert better < 2

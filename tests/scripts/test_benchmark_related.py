@@ -1,20 +1,16 @@
 """`python -m scripts.benchmark related`: unrelated pairs, tables, ROC curves, and the command."""
 
-import math
 from pathlib import Path
-from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 
-from fmtorch.core.types import RELATED
 from fmtorch.data import ImagePair, ImageSource
-from fmtorch.scenes.dataset import RenderedPairs
-from fmtorch.scenes.generate import Plan
-from fmtorch.scenes.textures import PICTURES
+from fmtorch.scenes import PICTURES, Plan, RenderedPairs
 from scripts.benchmark import pairs, related
 from scripts.benchmark.runner import Row
-from tests.scripts.samples import drawn_set, read, run
+from tests.helpers import draw_set
+from tests.scripts.samples import read, run
 from tests.scripts.samples import row as plain_row
 
 
@@ -54,40 +50,12 @@ def test_rendered_scenes_that_show_one_photograph_are_not_paired(
     assert crossed == {"a | c", "a | d", "b | d", "c | d"}  # neither a | b, b | c, nor a drawn and a real one
 
 
-def test_area_counts_ties_half() -> None:
-    right, unrelated = [row(True, 0, s, 9) for s in (1.0, 2.0)], [row(False, 1, s, 9) for s in (0.0, 1.0, -math.inf)]
-    assert related.area(right, unrelated, related.significance) == pytest.approx(5.5 / 6)
-    assert related.area(right, unrelated, related.inliers) == 0.5
-
-
-def test_tables_tell_what_each_rule_does() -> None:
-    of_scenes = [row(False, 1, -3.0, 12), row(False, 1, RELATED, 16)]
-    rows = {"sift": [*of_scenes, row(True, 0.01, 9.0, 14), row(True, 0.9, 0, 14)]}
-    (line,) = related.rates_sheet(rows).records
-    assert (line["unrelated pairs"], line["right pairs"], line["accepted, %"].value) == (2, 1, "50.00")
-    rates = [line[f"{rule}: {kind}, %"] for rule in related.RULES for kind in ("accepted", "rejected")]
-    assert rates == ["50.00", "100.00", "50.00", "100.00", "0.00", "100.00"]
-    levels = {each["level"]: each for each in related.levels_sheet(rows).records}
-    assert (levels["-2"]["accepted, %"], levels["-2"]["rejected, %"]) == ("50.00", "0.00")
-    own, other = ([v for k, v in line.items() if "pairs" in k] for line in related.sets_sheet(rows).records)
-    assert (own, other) == ([1, 1, 1, 0], [0, 0, 2, 1])
-
-
-def test_roc_goes_from_all_to_none(tmp_path: Path) -> None:
-    rows = [row(False, 1, s, 9) for s in (-math.inf, 0.0, 1.0)] + [row(True, 0, s, 9) for s in (1.0, 2.0)]
-    accepted, rejected = related.roc([*rows, row(True, 0.9, 3.0, 9)], related.significance)
-    assert accepted.tolist() == pytest.approx([1, 2 / 3, 1 / 3, 0, 0])  # at -inf, 0, 1, 2 and above all
-    assert rejected.tolist() == [0, 0, 0, 0.5, 1]
-    related.draw({"sift_a": rows, "sift_b": rows[:1] + rows[4:], "none": rows[:3]}, tmp_path / "a.svg")
-    texts = {element.text for element in ElementTree.parse(tmp_path / "a.svg").iter() if element.text}
-    assert {"sift_a", "sift_b (along the axes)", "unrelated pairs accepted, %"} <= texts
-
-
 def test_the_command_tells_pairs_apart(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rows, pipelines = tmp_path / "rows.jsonl", ["sift_gms", "sift_ratio*"]
-    run(capsys, monkeypatch, "related", "--root", drawn_set(tmp_path / "Set", "ab"), "--unrelated", 3, "--pipelines",
+    root = draw_set(tmp_path / "Set", "ab", images=2)
+    run(capsys, monkeypatch, "related", "--root", root, "--unrelated", 3, "--pipelines",
         *pipelines, "--cache", "off", "--rows", rows, "--figure", tmp_path / "roc.svg")  # fmt: skip
     own = read(rows)
     assert len(own) == 2 * (2 + 3)

@@ -3,17 +3,11 @@
 import dataclasses
 from pathlib import Path
 
-import numpy as np
 import pytest
-import torch
 
-from fmtorch.core.types import Correspondences
-from fmtorch.data import load, read_image, to_grey
-from fmtorch.data.construction import keypoints, ratio_matches
 from fmtorch.geometry import eight_point
-from fmtorch.pipeline.pipeline import Outcome
 from fmtorch.presets import build as preset
-from scripts.benchmark import methods, pairs, runner
+from scripts.benchmark import methods, runner
 from scripts.benchmark.runner import Item, Kept, Measured, Row, measure
 from tests.laws import scene
 from tests.scripts.samples import item, pair, read
@@ -108,43 +102,3 @@ def test_truth_is_the_fit_that_starts_from_the_true_matrix() -> None:
         near, far = (row["nsgd"] for row in measure([methods.method(spec)], both, 1, Kept(None)))
         assert 1e-6 < near < 0.01, spec  # the matches' noise moves it
         assert far > 0.05, spec  # and does not bring it home from elsewhere
-
-
-def test_what_is_withheld_does_not_reach_the_estimator(monkeypatch: pytest.MonkeyPatch) -> None:
-    seen: list[Correspondences] = []
-    ransac = preset("estimator", "ransac", hypotheses=20)
-    monkeypatch.setattr(methods, "_estimated", lambda estimator, pair, c, seed: seen.append(c) or ransac(c, seed))
-    given = item(pair("orbit/0/0"), scene(0, 60))
-    specs = ["ransac", "ransac@sizeless", "ransac@ratioless+sizeless"]
-    rows = measure([methods.method(spec) for spec in specs], [given], 1, Kept(None))
-    assert [(c.quality is None, c.size0 is None) for c in seen[1::2]] == [(False, False), (False, True), (True, True)]
-    assert len({row["nsgd"] for row in rows}) == 1  # judged with the sizes all the same
-
-
-def test_a_pruner_that_looks_at_images_is_given_those_of_the_pair() -> None:
-    stereo = load("stereo")[0]
-    grey = [to_grey(read_image(image)) for image in (stereo.image0, stereo.image1)]
-    x0, x1 = (torch.from_numpy(x)[None, :200].float() for x in ratio_matches(*map(keypoints, grey)))
-    sizes = [torch.tensor([image.shape]) for image in grey]
-    c = Correspondences(x0, x1, torch.ones(x0.shape[:2], dtype=torch.bool), size0=sizes[0], size1=sizes[1])
-    front = pairs.front_of("sift", [])
-    refined, plain = methods.method("lmeds@refine_matches"), methods.method("lmeds")
-    outcome = Outcome(stereo, (200, 200), c)
-    given = Item(stereo, lambda: outcome, images=lambda: front.images(stereo))
-    distances = [measure([each], [given], 1, Kept(None))[0]["distance"] for each in (refined, plain)]
-    assert distances[0] < distances[1]
-    with pytest.raises(ValueError, match="there are no images"):
-        refined.figures(Item(stereo, lambda: outcome), 0)
-
-
-@pytest.mark.skipif(not Path("/proc/self/clear_refs").is_file(), reason="peaks are told by Linux alone")
-def test_what_a_call_claims_and_frees_is_measured_whatever_was_claimed_before() -> None:
-    np.ones(200 << 17)  # 200 MiB, freed again
-    assert 45 < runner.peak_growth(lambda: np.ones(50 << 17)) < 60
-    assert runner.peak_growth(lambda: None) < 5
-
-
-def test_elsewhere_peaks_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(runner, "PROC", tmp_path / "none")
-    with pytest.raises(SystemExit, match="on Linux alone"):
-        runner.peak_growth(lambda: None)

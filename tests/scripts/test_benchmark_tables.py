@@ -2,17 +2,15 @@
 
 import csv
 from pathlib import Path
-from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 
 from fmtorch import presets
 from fmtorch.evaluation.statistics import bootstrap_mean, share_difference
-from scripts.benchmark import estimators, figures
-from scripts.benchmark.estimators import Curve
+from scripts.benchmark import estimators
 from scripts.benchmark.methods import options, read_specs, split, stages_of
-from scripts.benchmark.tables import BASELINES, Results, Sheet, Span, show
+from scripts.benchmark.tables import Results, Sheet, Span, show
 from tests.scripts.samples import row
 
 FOLDER = Path(estimators.__file__).parent
@@ -46,39 +44,6 @@ def test_intervals_are_those_of_every_other_table(scenes: int, over: str) -> Non
     assert own.time_ratio("theirs", "ours", own.pairs()) == "2.00"
 
 
-def test_a_method_has_its_own_pairs_and_of_equal_rows_the_last_counts() -> None:
-    own = Results([row("a", "orbit/s/0", 0.5), row("a", "orbit/s/0", 0.001), row("a", "orbit/s/1", 0.5),
-                   row("b", "orbit/s/0", 0.02), row("b", "orbit/s/0", 0.02, seed=1)])  # fmt: skip
-    assert own.pairs() == ["orbit/s/0"]
-    assert own.pairs("a") == ["orbit/s/0", "orbit/s/1"]
-    lines = own.records(own.groups(own.all_pairs), ["R.05", "failed"], label="method")
-    assert [(line["pairs"], line["R.05"], line["failed"]) for line in lines] == [
-        (2, "50.0", "0.0"),
-        (1, "100.0", "0.0"),
-    ]
-    assert own.get("b", ["orbit/s/0"])("nsgd").shape == (2, 1)
-
-
-def test_figures_that_are_not_defined_do_not_count() -> None:
-    of_pair = [
-        row("a", "orbit/s/0", 1.0, 0, ok=False, inlier_rate=None),
-        row("a", "orbit/s/0", 0.0, 1, inlier_rate=0.8),
-        row("a", "orbit/s/1", 1.0, 0, ok=False, inlier_rate=None),
-    ]
-    own = Results(of_pair)
-    assert own.cell("a", ["orbit/s/0"], "%Inlier") == "80.0"
-    assert own.cell("a", ["orbit/s/1"], "%Inlier") == own.cell("a", [], "R.05") == ""
-    assert own.cell("a", ["orbit/s/0"], "failed") == "0.5"
-
-
-def test_groups_are_sets_baselines_and_all() -> None:
-    own = results(families=("driving", "orbit", "KITTI"), pairs=2)
-    groups = own.groups(own.pairs())
-    assert list(groups) == ["orbit", "KITTI", "driving", *BASELINES, "all"]
-    assert [len(members) for members in groups.values()] == [2, 2, 2, 2, 4, 6]
-    assert list(results().groups(results().pairs())) == ["orbit"]
-
-
 def test_a_table_is_markdown_here_and_one_value_a_cell_in_its_file(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -107,29 +72,3 @@ def test_the_files_of_estimators_name_estimators_there_are() -> None:
         assert set(stages_of(spec)) <= {*presets.available("pruner"), "ngransac", "sizeless", "ratioless"}, spec
     with pytest.raises(SystemExit, match=r"'other \| ransac \| 10' is not CURVE"):
         estimators.read_curves(["other | ransac | 10"])
-
-
-def test_the_knee_is_the_cheapest_point_near_the_best(tmp_path: Path) -> None:
-    """AUC@0.05 of a pair is 1 - NSGD / 0.05: 80, 89.8 and 90 %."""
-    (curve,) = estimators.read_curves(["<mine> | x:a={} | 1 2 3"])
-    assert curve == Curve("<mine>", ("x:a=1", "x:a=2", "x:a=3"), ("1", "2", "3"))
-    points = zip(curve.specs, (0.01, 0.0051, 0.005), (1.0, 20.0, 30.0), strict=True)
-    own = Results(
-        row(spec, f"{family}/{i}/{i}", nsgd, ms=ms)
-        for spec, nsgd, ms in points for family in ("orbit", "driving") for i in range(2)
-    )  # fmt: skip
-    knees = {"<mine>": estimators.knee(curve, own)}
-    assert knees == {"<mine>": "x:a=2"}
-    lines = estimators.curve_sheet([curve], own, knees).records
-    assert [line["mark"] for line in lines] == ["", "knee", "best"]
-    assert [line["wide baselines: AUC@0.05"] for line in lines] == ["80.0", "89.8", "90.0"]
-    estimators.draw_curves([curve], own, knees, tmp_path / "curves.svg")
-    texts = [element.text for element in ElementTree.parse(tmp_path / "curves.svg").iter() if element.text]
-    assert {"<mine>", *BASELINES, "AUC@0.05 [%]"} <= set(texts)
-
-
-def test_a_figure_is_drawn_the_same_every_time(tmp_path: Path) -> None:
-    panels = {"one": {"a": figures.Line([0.1, 50], [1, 2], 1)}, "two": {"b": figures.Line([1, 2], [2, 1])}}
-    for name in ("a.svg", "b.svg"):
-        figures.draw(tmp_path / name, panels, "x", "y", shares=True)
-    assert (tmp_path / "a.svg").read_text() == (tmp_path / "b.svg").read_text()

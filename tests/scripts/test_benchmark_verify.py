@@ -3,17 +3,13 @@
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pycolmap
 import pytest
 
-from fmtorch.data import load, read_image
-from fmtorch.data.overlap import overlap_of
-from fmtorch.data.scenes import ScenePairs
 from scripts.benchmark import verify
 from scripts.benchmark.runner import Kept
-from scripts.benchmark.scenes import Scene, Truth, calibrate, read_scene, triangulate
+from scripts.benchmark.scenes import Scene, Truth, calibrate
 from scripts.benchmark.verify import accuracy, centre_errors, sheets
 from tests.verification import databases
 
@@ -88,21 +84,3 @@ def test_an_interrupted_run_measures_what_is_missing(tmp_path: Path, monkeypatch
     assert means[0][5:9] == ["100.0", "50.0", "50.0", "50.0"]
     assert pairs[0][3:7] == ["walk", 1, "3", "3"]
     assert [line[3:7] for line in models] == [[m, "walk", 1, "3.0"] for m in ("incremental", "global")]
-
-
-@pytest.mark.slow
-def test_a_scene_is_triangulated_with_its_own_cameras(tmp_path: Path) -> None:
-    """The stereo pair, which has no point that three images see."""
-    pair = load("stereo")[0]
-    images = tmp_path / "scene/Images"
-    images.mkdir(parents=True)
-    for i, source in enumerate((pair.image0, pair.image1)):
-        cv2.imwrite(str(images / f"{i:08d}.png"), read_image(source)[..., ::-1])
-    identity = np.concatenate([pair.K0.ravel(), np.eye(3).ravel(), np.zeros(3)])
-    second = np.concatenate([pair.K1.ravel(), pair.R.ravel(), pair.t])
-    np.savetxt(tmp_path / "scene/Camera.txt", [identity, second])
-    assert triangulate(read_scene(tmp_path / "scene"), tmp_path / "models/scene") == (0, 0)
-    dataset = load("colmap", root=tmp_path / "models/scene", pairs=None)
-    assert isinstance(dataset, ScenePairs)
-    assert min(np.abs(dataset[0].F - pair.F).max(), np.abs(dataset[0].F + pair.F).max()) < 1e-9
-    assert overlap_of(dataset).of((0, 0, 1)) == 0

@@ -1,50 +1,29 @@
 """Training patches: warps, keypoints, rendered scenes and planes, and the correspondences that they give."""
 
 import json
-import math
 from pathlib import Path
-from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 
-from fmtorch.scenes.camera import Camera, calibration, fundamental, look_at
-from fmtorch.scenes.generate import Plan, Task
-from fmtorch.scenes.textures import photograph
-from fmtorch.training.planes import Photograph, PlaneViews, list_photographs, local_affine, warp
+from fmtorch.scenes import Camera, Plan, Task, calibration, fundamental, look_at, photograph
+from fmtorch.training.options import PlaneViews
+from fmtorch.training.planes import Photograph, list_photographs
 from scripts.patch_networks.patches import (
-    CONTEXT_SIZE,
     Tolerance,
     View,
     Warps,
-    apply,
-    cut,
-    detect,
-    linked,
-    near,
-    patch_similarity,
-    patches_of_warps,
-    random_homography,
-    rays_and_incidence,
     tracks_of_views,
-    training_scenes,
     transferred,
     views_of_plane,
 )
 from scripts.patch_networks.stores import Cutting, PatchStore, build_store, package_photographs, split
-from tests.reference import geodesc as reference
 
 SIZE = (240, 320)
 WALL, SCREEN = 4.0, 2.5  # metres in front of the first camera: the wall everywhere, the screen left of its middle
 PLANES = PlaneViews(views=4, tilt=15.0, scale=(0.5, 0.6))
-
-
-@pytest.fixture(scope="module")
-def grey() -> np.ndarray:
-    return cv2.cvtColor(photograph("chelsea.png"), cv2.COLOR_RGB2GRAY)
 
 
 def correlations(patches: np.ndarray, point: np.ndarray) -> tuple[float, float]:
@@ -54,62 +33,6 @@ def correlations(patches: np.ndarray, point: np.ndarray) -> tuple[float, float]:
     first = np.searchsorted(point, np.arange(point.max() + 1))
     a, b = flat[first], flat[first + 1]
     return float(np.median((a * b).mean(1))), float(np.median((a * np.roll(b, 1, 0)).mean(1)))
-
-
-def test_a_view_contains_the_image_and_its_derivative_is_the_differences() -> None:
-    for seed in range(20):
-        H, (h, w) = random_homography(np.random.default_rng(seed), (300, 400), Warps())
-        corners = apply(H, np.array([[0, 0], [399, 0], [0, 299], [399, 299.0]]))
-        assert corners.min() > -1
-        assert (corners.max(0) < np.array([w, h]) + 1).all()
-        x, step = np.array([[120.0, 80.0]]), 1e-4
-        numeric = np.stack([(apply(H, x + d) - apply(H, x - d))[0] / (2 * step) for d in step * np.eye(2)], -1)
-        np.testing.assert_allclose(local_affine(H, x)[0], numeric, atol=1e-6)
-
-
-def test_a_warped_view_shows_what_the_homography_says(grey: np.ndarray) -> None:
-    smooth = cv2.GaussianBlur(grey, (0, 0), 4)
-    H, size = random_homography(np.random.default_rng(3), smooth.shape, Warps())
-    view = warp(smooth, H, size)
-    points = np.random.default_rng(0).uniform([40, 40], [smooth.shape[1] - 40, smooth.shape[0] - 40], (200, 2))
-    there = apply(H, points)
-    seen = cv2.remap(view, *there.astype(np.float32).T.reshape(2, -1, 1), cv2.INTER_LINEAR)[:, 0]
-    truth = cv2.remap(smooth, *points.astype(np.float32).T.reshape(2, -1, 1), cv2.INTER_LINEAR)[:, 0]
-    assert np.abs(seen.astype(float) - truth).mean() < 3  # grey levels; blur by reduction, rounding
-
-
-def test_keypoints_turn_with_the_image(grey: np.ndarray) -> None:
-    grey = np.ascontiguousarray(grey[:257, :385])  # so that halving keeps the same pixels after the turn
-    before, after = detect(grey, 300), detect(np.ascontiguousarray(np.rot90(grey, -1)), 300)
-    assert 300 < len(before) <= 600
-    # clockwise: (x, y) -> (h - 1 - y, x), angles (x towards y) grow by 90 degrees
-    moved = np.c_[grey.shape[0] - 1 - before[:, 1], before[:, 0]]
-    apart = np.hypot(*(moved[:, None] - after[None, :, :2]).transpose(2, 0, 1))
-    turn = (after[None, :, 3] - before[:, None, 3] - math.pi / 2 + math.pi) % (2 * math.pi) - math.pi
-    same = (apart < 1.0) & (np.abs(np.log(after[None, :, 2] / before[:, None, 2])) < 0.1) & (np.abs(turn) < 0.1)
-    assert same.any(1).mean() > 0.8
-
-
-def test_patches_of_a_turned_image_are_the_same(grey: np.ndarray) -> None:
-    grey = np.ascontiguousarray(grey[:257, :385])
-    points = np.array([[200.0, 150, 3, 0.4], [260, 120, 9, -2]])
-    turned = np.c_[grey.shape[0] - 1 - points[:, 1], points[:, 0], points[:, 2], points[:, 3] + math.pi / 2]
-    a, b = cut(grey, points), cut(np.ascontiguousarray(np.rot90(grey, -1)), turned)
-    assert a.shape == (2, CONTEXT_SIZE, CONTEXT_SIZE)
-    assert np.abs(a.astype(int) - b).mean() < 2
-    assert a.std() > 10
-
-
-def test_every_point_has_patches_that_resemble_one_another() -> None:
-    image, rng = photograph("chelsea.png"), np.random.default_rng(0)
-    patches, point, _ = patches_of_warps(image, rng, Warps(views=6), 150, Tolerance())
-    counts = np.bincount(point)
-    assert counts.min() >= 2
-    assert counts.max() <= 6
-    assert (np.diff(point) >= 0).all()
-    assert patches.shape == (len(point), CONTEXT_SIZE, CONTEXT_SIZE)
-    same, other = correlations(patches, point)
-    assert same > 0.6 > 0.3 > other
 
 
 def test_a_store_is_complete_deterministic_and_gives_two_different_views(tmp_path: Path) -> None:
@@ -134,20 +57,6 @@ def test_a_store_is_complete_deterministic_and_gives_two_different_views(tmp_pat
         assert torch.equal(mine[shown[0]], a[0])
         assert torch.equal(mine[shown[1]], b[0])
         assert shown[0] != shown[1]
-
-
-def test_a_store_of_planes_and_scenes_keeps_their_geometry(tmp_path: Path) -> None:
-    task = Task("indoor", "train", 0, 3, Plan(1, 3, 0, scale=0.4))
-    cutting = Cutting(PLANES, 60, longest_side=300)
-    options: dict[str, Any] = {"seed": 0, "scenes": [task, task]}
-    one, two = (build_store(tmp_path / name, package_photographs()[:1], cutting, **options) for name in ("a", "b"))
-    for a, b in zip(one.tracks, two.tracks, strict=True):
-        np.testing.assert_array_equal(a, b)
-    assert len(one.tracks.view) == len(one.patches) == one.first[-1]
-    of_point = [set(one.tracks.view[a:b]) for a, b in zip(one.first[:-1], one.first[1:], strict=True)]
-    assert all(len(views) >= 2 for views in of_point)
-    last = {view for views in of_point[-5:] for view in views}
-    assert min(last) > max(of_point[0])  # views are numbered through
 
 
 def test_an_unreadable_photograph_leaves_no_store(tmp_path: Path) -> None:
@@ -223,77 +132,6 @@ def test_points_are_where_the_surfaces_put_them() -> None:
     assert seen[free].all()
 
 
-def test_scale_and_orientation_are_those_of_the_derivative() -> None:
-    a, b = view(0.0), view(0.6, -0.15)
-    there, seen = transferred(a.keypoints, a, b)
-    for axis, shift in enumerate(0.01 * np.eye(2)):
-        moved, still = a.keypoints.copy(), a.keypoints.copy()
-        moved[:, :2] += shift
-        moved[:, 3] = still[:, 3] = axis * np.pi / 2
-        beside, also = transferred(moved, a, b)
-        turned = transferred(still, a, b)[0]
-        both = seen & also
-        d = (beside - there)[both, :2]
-        error = (np.arctan2(d[:, 1], d[:, 0]) - turned[both, 3] + np.pi) % (2 * np.pi) - np.pi
-        assert np.abs(error).max() < 1e-2
-    # The same plane seen straight from twice as far is half as large.
-    far = Camera(a.camera.K, a.camera.R, a.camera.t + np.array([0.0, 0.0, WALL]), SIZE)
-    wall = View(a.image, a.camera, np.full(SIZE, 1 / WALL), a.keypoints)
-    halved, seen = transferred(wall.keypoints, wall, View(a.image, far, np.full(SIZE, 0.5 / WALL), a.keypoints))
-    assert seen.any()
-    np.testing.assert_allclose(halved[seen, 2], 1.0)
-    np.testing.assert_allclose(halved[seen, 3], a.keypoints[seen, 3])
-
-
-def test_points_are_linked_once_and_are_not_near_each_other() -> None:
-    rng = np.random.default_rng(0)
-    first, views = view(0.0), []
-    for x, turn in ((0.0, 0.0), (0.4, -0.1), (0.8, -0.2)):
-        v = view(x, turn)
-        there, seen = transferred(first.keypoints, first, v)
-        found = there[seen] + rng.normal(0, 0.1, (seen.sum(), 4)) * [1, 1, 0.1, 0.1]
-        extra = np.c_[rng.uniform(20, 200, (40, 2)), np.full(40, 3.0), rng.uniform(-3, 3, 40)]
-        views.append(View(v.image, v.camera, v.inverse_depth, np.concatenate([found, extra])))
-    owners = linked(views, Tolerance())
-    for owner in owners:
-        shown = owner[owner >= 0]
-        assert len(np.unique(shown)) == len(shown)
-    counts = np.bincount(np.concatenate(owners)[np.concatenate(owners) >= 0])
-    assert (counts == 3).sum() > 300
-    for a, mine in zip(views, owners, strict=True):
-        for b, theirs in zip(views, owners, strict=True):
-            there, seen = transferred(a.keypoints, a, b)
-            i, j, _ = near(there[seen], b.keypoints, Tolerance())
-            one, other = mine[seen][i], theirs[j]
-            # What is as near as one point can be is one point, but for what chance put between two of them.
-            assert (one == other)[(one >= 0) & (other >= 0)].mean() > 0.97
-
-
-def test_angles_and_similarity_are_their_definitions() -> None:
-    a, b = view(0.0), view(1.2, -0.25)
-    points = world_points(a)
-    pixels, _ = b.camera.project(points)
-    b = View(b.image, b.camera, b.inverse_depth, np.c_[pixels, a.keypoints[:, 2:]])
-    found = [rays_and_incidence(v.keypoints, v) for v in (a, b)]
-    on_edge = np.abs(a.keypoints[:, 0] - (SIZE[1] - 1) / 2) < 1.5
-    assert np.isnan(found[0][1][on_edge]).all()
-    assert np.isfinite(found[0][1][~on_edge]).mean() > 0.9
-    seen = np.isfinite(found[0][1]) & np.isfinite(found[1][1]) & (np.abs(world_points(b) - points) < 1e-6).all(1)
-    assert seen.sum() > 300
-    similarity = patch_similarity(found[0][0], found[1][0], found[0][1], found[1][1])
-    normal = (0.0, -1.0, 0.0)  # of both surfaces, towards the cameras
-    for i in np.flatnonzero(seen)[::7]:
-        point = points[i].tolist()
-        for v, (rays, incidence) in zip((a, b), found, strict=True):
-            towards = v.camera.centre - points[i]
-            np.testing.assert_allclose(rays[i], towards / np.linalg.norm(towards), atol=1e-9)
-            assert incidence[i] == pytest.approx(reference.angle(towards.tolist(), normal), abs=1e-6)
-        centres = a.camera.centre.tolist(), b.camera.centre.tolist()
-        assert similarity[i] == pytest.approx(reference.patch_similarity(point, normal, *centres), abs=1e-6)
-    assert similarity[seen].max() - similarity[seen].min() > 0.1
-    np.testing.assert_allclose(patch_similarity(found[0][0], found[0][0], found[0][1], found[0][1])[seen], 1.0)
-
-
 def test_tracks_of_a_plane_show_the_same_point_under_its_angles() -> None:
     views = views_of_plane(photograph("chelsea.png"), np.random.default_rng(0), PLANES, points=150)
     patches, point, columns = tracks_of_views(views, Tolerance())
@@ -302,9 +140,3 @@ def test_tracks_of_a_plane_show_the_same_point_under_its_angles() -> None:
     # The plane is z = 0, seen from z < 0: its normal is (0, 0, -1).
     angles = np.degrees(np.arccos(-columns["rays"][:, 2]))
     np.testing.assert_allclose(columns["incidence"], angles, atol=0.02)  # float32 rays: eps / sin
-
-
-def test_training_scenes_are_of_the_training_side() -> None:
-    tasks = training_scenes(2, 5, 1)
-    assert len({task.name for task in tasks}) == len(tasks) == 8
-    assert all(task.split == "train" and task.plan.shots == 5 for task in tasks)

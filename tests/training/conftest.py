@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from fmtorch.core.types import Correspondences, pair_key
-from fmtorch.scenes import Plan, RenderedPairs
-from fmtorch.scenes.camera import calibration
+from fmtorch.core import Correspondences, pair_key
+from fmtorch.scenes import Plan, RenderedPairs, calibration
 from fmtorch.training import LabelledMatches, MatchedPairs
 from tests.conftest import own_cache
 
@@ -75,7 +74,7 @@ def _exact_pair(rng: np.random.Generator, n: int, share: float, ignored: float) 
     F = np.linalg.inv(K1).T @ cross @ R @ np.linalg.inv(K0)
     frames = [np.concatenate([rng.normal(0, 3, (n, 2, 2)), x[..., None]], -1) for x in (x0, x1)]
     return {
-        "x0": x0, "x1": x1, "quality": rng.uniform(0.3, 1, n), "mutual": rng.random(n) < 0.5,
+        "x0": x0, "x1": x1, "ratio": rng.uniform(0.3, 1, n), "mutual": rng.random(n) < 0.5,
         "lafs0": frames[0], "lafs1": frames[1], "size0": np.array(sizes[0]), "size1": np.array(sizes[1]),
         "K0": K0, "K1": K1, "label": label, "F": F / np.linalg.norm(F),
     }  # fmt: skip

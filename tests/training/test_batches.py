@@ -7,14 +7,12 @@ import pytest
 import torch
 
 from fmtorch.training import (
-    Augmentation,
     Draw,
     LabelledMatches,
     SimilarLengthBatches,
     collate,
     collate_trimmed,
 )
-from fmtorch.training.batches import MAX_PADDING, longest
 from tests.training.conftest import exact
 
 
@@ -81,37 +79,11 @@ def test_ranks_share_the_epoch_out_and_have_as_many_batches(world_size: int) -> 
     assert len(sampler) == len(ranks[-1])
 
 
-@pytest.mark.parametrize("matches", [None, (50, 4000)])
-def test_padding_stays_below_a_fifth_and_few_matches_are_cut_for_it(matches: tuple[int, int] | None) -> None:
-    pairs = Pairs()
-    kept = cut = 0
-    for batch in SimilarLengthBatches(pairs, 32, matches=matches):
-        counts = torch.tensor([min(int(pairs.counts[d.pair]), d.matches or 10**6) for d in batch])
-        n = longest(counts, MAX_PADDING)
-        filled = int(counts.clamp(max=n).sum())
-        assert 1 - filled / (len(batch) * n) <= MAX_PADDING
-        kept, cut = kept + filled, cut + int(counts.sum()) - filled
-    assert cut < 0.1 * (kept + cut)
-
-
-def test_longest_is_the_largest_that_keeps_the_bound() -> None:
-    rng = np.random.default_rng(0)
-    for _ in range(50):
-        counts = torch.from_numpy(rng.integers(1, 200, rng.integers(1, 10)))
-        n = longest(counts, 0.2)
-        allowed = [
-            k for k in range(1, int(counts.max()) + 1) if int(counts.clamp(max=k).sum()) >= 0.8 * len(counts) * k
-        ]
-        assert n == max(allowed)
-    assert longest(torch.tensor([5, 5]), 0.2) == 5
-    assert longest(torch.zeros(0, dtype=torch.int64), 0.2) == 1
-
-
 def test_trimmed_collation_keeps_real_matches_and_the_bound() -> None:
     items = [exact(seed, n=n) for seed, n in enumerate((20, 150, 160, 170, 400))]
     assert padding(collate(items)) > 0.5
     batch = collate_trimmed(items)
-    assert padding(batch) <= MAX_PADDING
+    assert padding(batch) <= 0.2
     for i, item in enumerate(items):
         mine = batch[i].compact()
         n = mine.label.shape[1]
@@ -120,14 +92,6 @@ def test_trimmed_collation_keeps_real_matches_and_the_bound() -> None:
     assert padding(collate_trimmed(items, padding=0.0)) == 0
     with pytest.raises(ValueError, match="at least one"):
         collate_trimmed([])
-
-
-def test_trimming_cuts_a_random_subset_of_what_an_augmentation_gives() -> None:
-    m = exact(n=400)
-    first = Augmentation.none()(m, seed=0).first(100).correspondences
-    ranks = torch.searchsorted(m.correspondences.x0[0, :, 0].sort().values, first.x0[0, :, 0].contiguous()).double()
-    # The mean rank of 100 of 400 without replacement: standard error 400 / sqrt(12 * 100) * sqrt(3 / 4).
-    assert abs(float(ranks.mean()) - 199.5) < 4 * 400 / np.sqrt(1200) * np.sqrt(0.75)
 
 
 def test_mistakes_are_named() -> None:

@@ -12,7 +12,7 @@ from torch.utils.data import DataLoader
 pytest.importorskip("lightning", reason="training needs the extra `train`")
 
 from fmtorch import presets
-from fmtorch.pruning.networks import LC
+from fmtorch.pruning import LC
 from fmtorch.training import LabelledMatches, Objective, Use, Validation, collate, loop
 from fmtorch.training.loop import Optimisation, PrunerTraining, latest_checkpoint
 from tests.processes import run_command
@@ -100,6 +100,18 @@ t.trained(Path({str(tmp_path / "parts")!r}))
 
 class Ended(Exception):
     """What a kill would do."""
+
+
+def test_interrupted_it_says_what_is_kept(tmp_path: Path) -> None:
+    stopped = module()
+
+    def stop(*_: object) -> None:
+        if stopped.global_step == 7:
+            raise KeyboardInterrupt
+
+    stopped.on_train_batch_start = stop
+    with pytest.raises(KeyboardInterrupt, match=rf"step 6 of {STEPS} is kept in {tmp_path}"):
+        train(stopped, tmp_path, every=5, checkpoint_every=3, monitor="hard/AUC@0.05")
 
 
 def test_ended_before_a_validation_it_is_made_again(tmp_path: Path) -> None:

@@ -1,7 +1,6 @@
 """The losses of pruners and their objective: known answers, scalar references, gradients, degenerate pairs."""
 
 import functools
-import math
 from collections.abc import Callable
 
 import numpy as np
@@ -11,11 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from fmtorch.core import types
-from fmtorch.core.types import Correspondences
+from fmtorch.core import Correspondences
 from fmtorch.geometry import eight_point, fundamental_from_calibration, irls, refine, reweighted_fits
 from fmtorch.jit.random import Stream, uniform
-from fmtorch.pruning.networks import LC
+from fmtorch.pruning import LC
 from fmtorch.pruning.networks.learned import Prediction, predict
 from fmtorch.training import (
     LabelledMatches,
@@ -26,10 +24,9 @@ from fmtorch.training import (
     nsgd_loss,
     virtual_points,
 )
-from fmtorch.training.objective import LIMIT_E, LIMIT_F, TRIES, fits
+from fmtorch.training.objective import LIMIT_E, LIMIT_F, TRIES
 from tests import laws
 from tests.metrics.test_nsgd import random_pairs, rows_shifted
-from tests.reference import metrics as metric_reference
 from tests.reference import pruner_losses as reference
 from tests.training.conftest import labelled_pair
 
@@ -65,15 +62,6 @@ def test_classification_matches_scalar_reference(balanced: bool) -> None:
     assert found.item() == pytest.approx(sum(stages) / 2, rel=1e-12)
     first = classification_loss(logit[0], label, balanced=balanced)
     assert first.item() == pytest.approx(stages[0], rel=1e-12)
-
-
-@pytest.mark.parametrize("balanced", [False, True])
-def test_classification_is_least_at_the_share_of_inliers(balanced: bool) -> None:
-    """Matches that look alike share one logit, whose best value is the log-odds of their share of inliers."""
-    label = torch.tensor([[1] * 30 + [0] * 90 + [-1] * 7], dtype=torch.int8)
-    z = torch.tensor(math.log(30 / 90), dtype=torch.float64, requires_grad=True)
-    (gradient,) = torch.autograd.grad(classification_loss(z.expand(1, 127), label, balanced=balanced), z)
-    assert abs(gradient.item()) < 1e-15
 
 
 @settings(max_examples=20, deadline=None)
@@ -125,28 +113,6 @@ def test_virtual_points_match_scalar_reference() -> None:
         for j, (m0, m1) in enumerate(points):
             np.testing.assert_allclose(x0[i, j], m0, rtol=1e-12)
             np.testing.assert_allclose(x1[i, j], m1, rtol=1e-9, atol=1e-9)  # as in the tests of NSGD
-
-
-@settings(max_examples=20, deadline=None)
-@given(seed=st.integers(0, 1000), scale=st.floats(-9, 9))
-def test_virtual_points_are_exact_and_inside(seed: int, scale: float) -> None:
-    F, _ = random_pairs(seed, 3)
-    F[2] = torch.tensor([torch.nan, 0.0, 1.0])[seed % 3]
-    size0, size1 = sizes(3)
-    x0, x1, mask = virtual_points(F * 10**scale, size0, size1, count=30, seed=seed)
-    assert not bool(mask[2].any()) or seed % 3 == 2
-    assert bool((x0[~mask] == 0).all())
-    for x, size in ((x0, size0), (x1, size1)):
-        limit = size.flip(-1)[:, None] - 0.5
-        assert bool(((x >= -0.5 - 1e-9) & (x <= limit + 1e-9))[mask].all())
-    for i in range(2):
-        for m0, m1 in zip(x0[i, mask[i]].numpy(), x1[i, mask[i]].numpy(), strict=True):
-            line = F[i].numpy() @ metric_reference.homogeneous(m0)
-            assert metric_reference.distance(m1, line) < 1e-8
-    alone = virtual_points(F[1:2], size0[1:2], size1[1:2], count=30, seed=seed)
-    torch.testing.assert_close(alone.x1[0], x1[1], rtol=1e-9, atol=1e-9)
-    with pytest.raises(ValueError, match="count is 0"):
-        virtual_points(F, size0, size1, count=0)
 
 
 K = torch.tensor([[500.0, 1.0, 310.0], [0.0, 520.0, 250.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
@@ -260,19 +226,19 @@ def test_training_goes_through_degenerate_scenes(fit: Fit) -> None:
 
     Losses: classification, and the geometry of a fit with its weights, in both forms.
     """
-    c = types.collate([laws.scene(1), laws.scene(2), *laws.degenerate().values()])
+    c = core.collate([laws.scene(1), laws.scene(2), *laws.degenerate().values()])
     c = c.replace(x0=c.x0.double(), x1=c.x1.double())
     E = fundamental_from_calibration(
         K[None], K[None], torch.eye(3, dtype=torch.float64)[None], torch.tensor([[1.0, 0.0, 0.2]]).double()
     )
     shared = (E.expand(len(c.mask), 3, 3), c.size0, c.size1)
-    label = torch.where(c.mask, (c.quality < 0.6).to(torch.int8), -1)
+    label = torch.where(c.mask, (c.ratio < 0.6).to(torch.int8), -1)
     torch.manual_seed(0)
     network = torch.nn.Sequential(torch.nn.Linear(1, 8), torch.nn.Tanh(), torch.nn.Linear(8, 1)).double()
     optimiser = torch.optim.Adam(network.parameters(), lr=2e-2)
     losses = []
     for step in range(5):
-        logit = network(torch.where(c.mask, c.quality, 0.0).nan_to_num(0.0)[..., None].double())[..., 0]
+        logit = network(torch.where(c.mask, c.ratio, 0.0).nan_to_num(0.0)[..., None].double())[..., 0]
         F, valid = fit(c, torch.where(c.mask, torch.sigmoid(logit), 0.0))
         options = {"valid": valid, "seed": step, "key": c.key}
         judged = classification_loss(logit, label)
@@ -304,19 +270,6 @@ def test_geometric_terms_come_in_after_classification_alone() -> None:
     assert torch.equal(before["loss"], before["classification"])
     total = after["classification"] + 0.5 * after["geometric"] + 0.25 * after["nsgd"]
     assert after["loss"].item() == pytest.approx(total.item(), rel=1e-6)
-
-
-def test_terms_are_the_losses_of_the_weighted_fit() -> None:
-    batch = collate([labelled_pair(i) for i in range(2)])
-    c, made = batch.correspondences, prediction(batch)
-    F, valid = fits(made, batch)
-    own, _ = eight_point(c.x0.double(), c.x1.double(), made.weight[0].double(), c.mask)
-    assert torch.equal(F[0], own)
-    terms = Objective(classification_steps=0)(made, batch, 7)
-    expected = geometric_loss(F, batch.F, c.size0, c.size1, valid=valid, points=100, seed=7, key=c.keys)
-    assert float(terms["geometric"].detach()) == pytest.approx(float(expected.detach()))
-    classification = classification_loss(made.logit, batch.label)
-    assert float(terms["classification"].detach()) == pytest.approx(float(classification.detach()))
 
 
 def test_a_pair_that_cannot_be_judged_adds_nothing() -> None:

@@ -2,18 +2,16 @@
 
 from pathlib import Path
 
-import numpy as np
 import onnx
 import onnxruntime
 import pytest
 import torch
-from onnx import numpy_helper
 from torch import Tensor
 
-from fmtorch.core.files import models_dir
+from fmtorch.core import models_dir
+from fmtorch.features import PatchNetwork
 from fmtorch.features.networks import ARCHITECTURES, build
-from fmtorch.features.onnx_network import PatchNetwork
-from fmtorch.training.onnx_export import export, laid_out, quantize
+from scripts.patch_networks.onnx_export import export, laid_out, quantize
 from tests.features.test_networks import randomized
 
 SHIPPED = [
@@ -52,7 +50,7 @@ def exported(name: str, folder: Path, patches: Tensor) -> tuple[Path, Path]:
     fp32, int8 = folder / "fp32.onnx", folder / "int8.onnx"
     export(randomized(build(name)), fp32)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("fmtorch.training.onnx_export.lay_out", lambda path: None)
+        patch.setattr("scripts.patch_networks.onnx_export.lay_out", lambda path: None)
         quantize(fp32, int8, patches)
     return fp32, int8
 
@@ -68,29 +66,6 @@ def test_the_outputs_are_the_same(name: str, tmp_path: Path, patches: Tensor) ->
             found = PatchNetwork(tmp_path / "laid_out.onnx", batch=batch)(patches)
             assert float(expected.nan_to_num().std()) > 0
             torch.testing.assert_close(found, expected, atol=atol, rtol=0, equal_nan=True)  # L2-Net of constant patches
-
-
-def test_rows_of_few_channels_give_several_pixels_and_the_last_convolution_is_a_product(
-    tmp_path: Path, patches: Tensor
-) -> None:
-    _, path = exported("affnet", tmp_path, patches)
-    nodes = laid_out(onnx.load(path), 32).graph
-    kernels = {
-        tuple(a.ints) for n in nodes.node for a in n.attribute if n.op_type == "Conv" and a.name == "kernel_shape"
-    }
-    assert kernels == {(3, 10), (3, 6), (3, 3)}  # eight pixels of grey, four of 16 channels, one of more
-    assert [n.op_type for n in nodes.node].count("Gemm") == 1
-    wide = {t.name: numpy_helper.to_array(t) for t in nodes.initializer}["features.0.weight_quantized"]
-    for pixel in range(8):
-        seen = wide[16 * pixel : 16 * (pixel + 1)]
-        assert np.array_equal(seen[..., pixel : pixel + 3], wide[:16, ..., :3])
-        assert np.count_nonzero(seen) == np.count_nonzero(wide[:16, ..., :3])
-
-
-def test_quantize_lays_out(tmp_path: Path, patches: Tensor) -> None:
-    export(randomized(build("hardnet")), tmp_path / "hardnet.onnx")
-    quantize(tmp_path / "hardnet.onnx", tmp_path / "hardnet.int8.onnx", patches)
-    assert "Gemm" in {node.op_type for node in onnx.load(tmp_path / "hardnet.int8.onnx").graph.node}
 
 
 @pytest.mark.parametrize(("name", "file"), SHIPPED)

@@ -5,21 +5,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import torch
 
-from fmtorch.data import DepthDataset, ImagePair
-from fmtorch.data.images import ImageError
-from fmtorch.scenes.camera import Camera
-from fmtorch.scenes.textures import skimage_file
-from fmtorch.training import MatchedPairs, collate
-from fmtorch.training.planes import (
-    Photograph,
-    PlanePairs,
-    PlaneViews,
-    plane_depth,
-    plane_homography,
-    random_camera,
-)
+from fmtorch.data import DepthDataset, ImageError, ImagePair
+from fmtorch.scenes import Camera, skimage_file
+from fmtorch.training import MatchedPairs
+from fmtorch.training.options import PlaneViews
+from fmtorch.training.planes import Photograph, PlanePairs, plane_homography, random_camera
 from tests.training.conftest import SIFT
 
 SIZE = (300, 400)
@@ -54,41 +45,6 @@ def test_the_homography_is_the_cameras_projection() -> None:
         assert (depth > 0).all()
 
 
-def test_depth_leads_back_to_the_plane() -> None:
-    for camera in cameras(20):
-        h, w = camera.size
-        x = np.random.default_rng(1).uniform(0, [w - 1, h - 1], (50, 2))
-        rays = np.column_stack([x, np.ones(50)]) @ np.linalg.inv(camera.K).T
-        world = (plane_depth(camera, x)[:, None] * rays - camera.t) @ camera.R
-        assert np.abs(world[:, 2]).max() < 1e-9
-    outside = np.array([[-1.0, 5.0], [w, 5.0], [5.0, h]])
-    assert np.isnan(plane_depth(camera, outside)).all()
-
-
-def test_views_look_at_the_photograph_as_far_as_they_may() -> None:
-    limits = PlaneViews(tilt=50.0, roll=0.0, part=(0.5, 0.8))
-    tilts = []
-    for camera in cameras(200, limits):
-        middle = np.array([[(camera.size[1] - 1) / 2, (camera.size[0] - 1) / 2]])
-        seen = cv2.perspectiveTransform(middle[None], np.linalg.inv(plane_homography(camera, SIZE)))[0, 0]
-        assert (seen >= 0).all()
-        assert (seen <= [SIZE[1], SIZE[0]]).all()
-        tilts.append(np.degrees(np.arccos(camera.R[2, 2])))
-    assert 40 < max(tilts) <= 50.0
-    assert min(tilts) < 5
-
-
-def test_views_show_the_photograph(photographs: list[Photograph], tmp_path: Path) -> None:
-    """The view of a frontal camera is the photograph, but for light and noise."""
-    frontal = PlaneViews(views=2, tilt=0.0, roll=0.0, part=(1.0, 1.0), scale=(1.0, 1.0))
-    pairs = PlanePairs(photographs[:1], frontal, root=tmp_path)
-    view = cv2.imread(str(pairs[0].image0.path), cv2.IMREAD_GRAYSCALE).astype(float)
-    picture = cv2.imread(str(photographs[0].path), cv2.IMREAD_GRAYSCALE).astype(float)
-    assert view.shape == picture.shape
-    rank = [np.argsort(np.argsort(cv2.GaussianBlur(v, (0, 0), 4).ravel())) for v in (view, picture)]
-    assert np.corrcoef(*rank)[0, 1] > 0.7
-
-
 def test_matches_are_judged_by_the_homography(planes: PlanePairs, tmp_path: Path) -> None:
     """Labels by depth are those of the map between the views, and SIFT finds enough right matches."""
     assert isinstance(planes, DepthDataset)
@@ -110,42 +66,12 @@ def test_matches_are_judged_by_the_homography(planes: PlanePairs, tmp_path: Path
     assert right > 100
 
 
-def test_the_homography_between_views_is_that_of_the_depths(planes: PlanePairs) -> None:
-    for pair in planes:
-        H = planes.homography(pair)
-        expected = between_views(planes, pair)  # of coordinates of float32
-        grid = np.array([[[x, y] for x in (60.0, 120, 190) for y in (60.0, 120, 190)]])
-        apart = cv2.perspectiveTransform(grid, H) - cv2.perspectiveTransform(grid, expected)
-        assert np.abs(apart).max() < 1e-2
-        assert (np.c_[grid[0], np.ones(9)] @ H[2] > 0).all()
-
-
 def between_views(planes: PlanePairs, pair: ImagePair) -> np.ndarray:
     """The homography from the first view to the second, through four of the first one's points in space."""
     x = np.array([[50.0, 50.0], [200.0, 50.0], [200.0, 200.0], [50.0, 200.0]])
     X = planes.depth(pair.image0, x)[:, None] * np.column_stack([x, np.ones(4)]) @ np.linalg.inv(pair.K0).T
     there = (X @ pair.R.T + pair.t) @ pair.K1.T
     return cv2.getPerspectiveTransform(x.astype(np.float32), (there[:, :2] / there[:, 2:]).astype(np.float32))
-
-
-def test_pairs_of_planes_train_the_classification_alone(planes: PlanePairs, tmp_path: Path) -> None:
-    pytest.importorskip("lightning", reason="training needs the extra `train`")
-    from fmtorch.pruning.networks import LC
-    from fmtorch.pruning.networks.learned import predict
-    from fmtorch.training.objective import Objective
-
-    matched = MatchedPairs(planes, **SIFT, root=tmp_path, workers=1)
-    batch = collate([matched[i] for i in range(3)])
-    torch.manual_seed(0)
-    network = LC(channels=8, blocks=1)
-    terms = Objective(geometric=1.0, nsgd=1.0, classification_steps=0)(
-        predict(network, batch.correspondences), batch, 0
-    )
-    assert terms["geometric"].item() == 0
-    assert terms["nsgd"].item() == 0
-    assert terms["loss"].item() == pytest.approx(terms["classification"].item())
-    terms["loss"].backward()
-    assert all(bool(torch.isfinite(p.grad).all()) for p in network.parameters() if p.grad is not None)
 
 
 def test_views_are_drawn_once_and_depend_on_what_defines_them(photographs: list[Photograph], tmp_path: Path) -> None:

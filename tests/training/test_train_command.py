@@ -2,7 +2,6 @@
 
 import json
 import re
-import subprocess
 from pathlib import Path
 
 import pytest
@@ -13,7 +12,7 @@ pytest.importorskip("lightning", reason="training needs the extra `train`")
 
 from fmtorch.training.run import run
 from tests.conftest import own_cache
-from tests.helpers import compose, draw
+from tests.helpers import compose, draw, draw_set
 from tests.processes import run_command
 
 SHORT = [
@@ -24,26 +23,10 @@ SHORT = [
 ]  # fmt: skip
 
 
-def command(name: str, *arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    """Run a command of the package as a user does, in another directory."""
-    return run_command(name, *arguments, cwd=cwd)
-
-
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
-    """A set of two scenes in the FM-Bench layout: photographs moved sideways."""
-    lines, scenes = [], []
-    for scene in ("a", "b"):
-        images = tmp_path / "Set" / scene / "Images"
-        images.mkdir(parents=True)
-        for i in range(3):
-            draw(images / f"{i:08d}.png", seed=ord(scene), shift=9 * i)
-        for left, right in ((0, 1), (0, 2), (1, 2)):
-            lines.append(f"{left} {right} 0 0 0 0 0 -1 0 1 0")
-            scenes.append(f"{scene}/")
-    (tmp_path / "Set" / "pairs_with_gt.txt").write_text("\n".join(lines) + "\n")
-    (tmp_path / "Set" / "pairs_which_dataset.txt").write_text("\n".join(scenes) + "\n")
-    return tmp_path / "Set"
+    """A set of two scenes: photographs moved sideways."""
+    return draw_set(tmp_path / "Set", "ab", pairs=[(0, 1), (0, 2), (1, 2)])
 
 
 def documented(title: str) -> list[str]:
@@ -63,7 +46,7 @@ def test_a_network_of_ones_own_is_trained_and_used(root: Path, tmp_path: Path) -
     (here / "my_conf" / "pruner" / "mine.yaml").write_text(preset)
     train, evaluate = (line.removeprefix("fmtorch ").split() for line in commands.strip().splitlines())
     data = ["dataset=fmbench", f"dataset.root={root}"]
-    trained = command(
+    trained = run_command(
         *[w.strip("'") for w in train if not w.startswith("dataset")], *data, *SHORT, "output=out", cwd=here
     )
     assert trained.returncode == 0, trained.stderr
@@ -72,8 +55,8 @@ def test_a_network_of_ones_own_is_trained_and_used(root: Path, tmp_path: Path) -
     figures = json.loads((here / "out" / "validation.json").read_text())
     assert 0 <= figures["prior/AUC@0.05"] <= 1
     used = [w.strip("'") for w in evaluate if not w.startswith(("dataset", "pruner.mine.file"))]
-    evaluated = command(
-        *used, *data, "pruner.mine.file=out/mine.safetensors", "run_dir=run", "features.max_features=300", cwd=here
+    evaluated = run_command(
+        *used, *data, "pruner.mine.file=out/mine.safetensors", "output=run", "features.max_features=300", cwd=here
     )
     assert evaluated.returncode == 0, evaluated.stderr
     identity = (here / "run" / "run.json").read_text()
@@ -84,7 +67,7 @@ def test_two_processes_train_one_network(root: Path, tmp_path: Path) -> None:
     """With gloo, on the CPU: each has batches of its own, and gradients are averaged."""
     small = ["pruner.lc.network.channels=8", "pruner.lc.network.blocks=2", "output=out"]
     two = ["trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2"]
-    ended = command("train", "dataset=fmbench", f"dataset.root={root}", *SHORT, *small, *two, cwd=tmp_path)
+    ended = run_command("train", "dataset=fmbench", f"dataset.root={root}", *SHORT, *small, *two, cwd=tmp_path)
     assert ended.returncode == 0, ended.stderr
     checkpoint = torch.load(tmp_path / "out" / "checkpoints" / "step=6.ckpt", weights_only=True)
     assert checkpoint["global_step"] == 6
@@ -117,7 +100,6 @@ def test_the_command_goes_on_and_refuses_another_training(
 def test_photographs_join_the_training(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Two photographs seen as planes beside the pairs of a data set; the same command finds its views and matches."""
     for name in ("one", "two"):
-        (tmp_path / "photographs" / name).mkdir(parents=True)
         draw(tmp_path / "photographs" / name / "a.png", seed=len(name))
     options = ["dataset=fmbench", f"dataset.root={root}", *SHORT, "pruner.lc.network.channels=8",
                "pruner.lc.network.blocks=2", f"planes.photographs={tmp_path / 'photographs'}", "planes.views=3",

@@ -65,6 +65,11 @@ def test_wrong_arguments_are_named(arguments: dict[str, Any], said: str) -> None
     assert str(error.value).startswith(said) or said in str(error.value)
 
 
+def test_a_name_that_is_none_has_a_near_one() -> None:
+    with pytest.raises(ValueError, match=r"^focal is 'shraed'; it must be .*; did you mean 'shared'\?"):
+        fmtorch.find_fundamental(SCENE.x0, SCENE.x1, focal="shraed")
+
+
 def test_homographies_have_no_essential_matrix() -> None:
     with pytest.raises(ValueError, match="needs one that gives fundamental matrices"):
         fmtorch.find_essential(SCENE.x0, SCENE.x1, K, K, estimator="homography")

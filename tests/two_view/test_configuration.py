@@ -5,7 +5,7 @@ import torch
 
 import fmtorch
 from fmtorch import presets
-from fmtorch.core.types import CONFIGURATIONS, Correspondences, Estimate, collate
+from fmtorch.core import PAIR_TYPES, Correspondences, Estimate, collate
 from fmtorch.two_view.pair_type import classify
 from tests.geometry.kinds import batch, draw
 
@@ -22,7 +22,7 @@ def estimated(c: Correspondences) -> Estimate:
 
 
 @pytest.mark.parametrize("known", [True, False])
-@pytest.mark.parametrize("kind", CONFIGURATIONS)
+@pytest.mark.parametrize("kind", PAIR_TYPES)
 def test_kinds(kind: str, known: bool) -> None:
     """Of estimated models, with calibrations and by image sizes alone, the cameras being usual ones."""
     c = collate([pair(kind, seed) for seed in range(20)])
@@ -57,10 +57,10 @@ def test_a_rotation_needs_cameras_or_sizes() -> None:
 
 def test_laws() -> None:
     few = pair("general", 9, 5)
-    pairs = [pair(kind, i, 60 + 31 * i) for i, kind in enumerate(CONFIGURATIONS)]
+    pairs = [pair(kind, i, 60 + 31 * i) for i, kind in enumerate(PAIR_TYPES)]
     c = collate([*pairs[:3], few, *pairs[3:]])
     classified = classify(c, estimated(c))
-    assert classified.names == (*CONFIGURATIONS[:3], "unrelated", *CONFIGURATIONS[3:])
+    assert classified.names == (*PAIR_TYPES[:3], "unrelated", *PAIR_TYPES[3:])
     for i, single in enumerate([*pairs[:3], few, *pairs[3:]]):
         alone = classify(single, estimated(single))
         for a, b in zip((alone.kind, *alone.evidence), (classified.kind, *classified.evidence), strict=True):

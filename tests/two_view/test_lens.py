@@ -128,7 +128,7 @@ def test_sizes_may_be_assumed() -> None:
         ({"lens": -0.6}, "lens of image 0 of pair 0 is [-0.6, 0.0]; it is lambda in half diagonals, from -0.45"),
         ({"lens": (-0.1, -1)}, "lens of image 0 of pair 0 is"),
         ({"lens": (0.1, 0.1, 0.1)}, "lens has shape (3,)"),
-        ({"lens": "shared", "covariance": True}, "covariance and configuration are of pinholes"),
+        ({"lens": "shared", "covariance": True}, "covariance and pair_type are of pinholes"),
         ({"lens": "shared", "size0": "unknown", "size1": "unknown"}, "lens needs the image sizes"),
         ({"lens": "shared", "K0": np.eye(3), "K1": np.eye(3), "size0": None, "size1": None}, "lens needs the image"),
         ({"lens": "shared", "estimator": "ransac"}, "lens needs an estimator with the option focal"),

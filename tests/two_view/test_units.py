@@ -1,10 +1,13 @@
 """Points that are obviously not in pixels are refused, with what to do; what may be in pixels is not."""
 
+import warnings
+
 import numpy as np
 import pytest
+import torch
 
 import fmtorch
-from tests.reference.known_cameras import K0, K1, SIZE, scene
+from tests.reference.known_cameras import K0, K1, SIZE, angle, scene
 
 SCENE = scene(0)
 X0, X1 = SCENE.x0, SCENE.x1
@@ -36,8 +39,8 @@ def test_normalized_points_have_the_identity_for_their_camera() -> None:
     estimate = fmtorch.find_essential(x0, x1, np.eye(3), np.eye(3))
     assert bool(estimate.ok)
     assert int(estimate.inliers.sum()) < 0.8 * len(x0)
-    with_configuration = fmtorch.find_essential(x0, x1, np.eye(3), np.eye(3), configuration=True)
-    assert with_configuration.configuration == ("general",)
+    with_pair_type = fmtorch.find_essential(x0, x1, np.eye(3), np.eye(3), pair_type=True)
+    assert with_pair_type.pair_type == ("general",)
     with pytest.raises(
         ValueError, match=r"x0 runs from .*, as normalised points do, but K0 is in pixels; give points in"
     ):
@@ -57,6 +60,53 @@ def test_sizes_that_contradict_the_points() -> None:
     with pytest.raises(ValueError, match=r"size1 is \(48, 64\), but .* % of x1 lie outside such an image"):
         fmtorch.find_fundamental(X0, X1, size0=SIZE, size1=(48, 64))
     assert bool(fmtorch.find_fundamental(X0, X1, size0=SIZE, size1=SIZE).ok)
+
+
+def test_points_of_a_wide_lens_are_no_swapped_sizes() -> None:
+    """Undistorted, most lie outside on all sides; points from the principal point lie there, too, but never beyond."""
+    from_centre = [(x - (319.5, 239.5)) for x in (X0, X1)]
+    far = [(x - (319.5, 239.5)) * 4 + (319.5, 239.5) for x in (X0, X1)]
+    assert bool(fmtorch.find_fundamental(*far, size0=SIZE, size1=SIZE).ok)
+    with pytest.raises(ValueError, match=r"size0 is \(480, 640\), but .* % of x0 lie outside such an image"):
+        fmtorch.find_fundamental(*from_centre, size0=SIZE, size1=SIZE)
+
+
+def part(corner: tuple[float, float], size: tuple[int, int]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """The matches whose both points are in a crop of the images, in its pixels, and its calibrations."""
+    h, w = size
+    x0, x1 = SCENE.x0 - corner, SCENE.x1 - corner
+    inside = ((x0 >= 0) & (x0 < (w, h)) & (x1 >= 0) & (x1 < (w, h))).all(1)
+    shift = np.array([[0, 0, corner[0]], [0, 0, corner[1]], [0, 0, 0]])
+    return [x0[inside], x1[inside]], [K0 - shift, K1 - shift]
+
+
+@pytest.mark.parametrize("sizes", [{}, {"size0": (480, 300), "size1": (480, 300)}])
+def test_the_principal_point_of_a_crop_may_lie_outside(sizes: dict[str, tuple[int, int]]) -> None:
+    """The pose is that of the whole images, alone and in a batch, and nothing is said against K."""
+    (x0, x1), Ks = part((340, 0), (480, 300))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        alone = fmtorch.find_essential(x0, x1, *Ks, **sizes)
+        batch = fmtorch.find_essential([x0, x0[:40]], [x1, x1[:40]], *Ks, **sizes)
+    assert angle(alone.R[0].numpy(), SCENE.R) < 0.5
+    assert alone.warning == ("",)
+    assert torch.equal(batch.R[0], alone.R[0])
+    assert bool(batch.ok.all())
+
+
+def test_calibrations_of_another_resolution_are_doubted() -> None:
+    """Their pose is off by many degrees, though some matches agree with it."""
+    quarter = [np.diag([0.25, 0.25, 1]) @ K for K in (K0, K1)]
+    for sizes in ({}, {"size0": SIZE, "size1": SIZE}):
+        with pytest.warns(UserWarning, match="pair 0: far more matches agree without the calibration matrices"):
+            wrong = fmtorch.find_essential(X0, X1, *quarter, **sizes)
+        assert "another resolution" in wrong.warning[0]
+        assert angle(wrong.R[0].numpy(), SCENE.R) > 2
+    both = [[K, wrong] for K, wrong in zip((K0, K1), quarter, strict=True)]
+    with pytest.warns(UserWarning, match="^pair 1: "):
+        batch = fmtorch.find_essential([X0, X0], [X1, X1], *both, pair_type=True)
+    assert batch.warning[0] == ""
+    assert "another resolution" in batch.warning[1]
 
 
 def test_pairs_of_a_batch_stand_for_one_another() -> None:

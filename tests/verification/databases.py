@@ -1,6 +1,7 @@
 """COLMAP databases of cameras before random points, written by pycolmap."""
 
 import dataclasses
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -8,6 +9,8 @@ from typing import Any
 import numpy as np
 import pycolmap
 from scipy.spatial.transform import Rotation
+
+from tests.processes import starter
 
 SIZE = (480, 640)  # h, w
 F = 600.0
@@ -121,3 +124,16 @@ def plain(geometries: dict[tuple[int, int], Any]) -> dict[tuple[int, int], tuple
         )
         for pair, g in geometries.items()
     }  # fmt: skip
+
+
+def killed_and_continued(folder: Path, end: Path, *words: str) -> None:
+    """Kill `fmtorch verify` after some batches, which leaves no `end`; the same command then goes on, to the end."""
+    slowly = "import fmtorch.verification.run as v\nv.BATCH = 2\n"
+    there, parts = end.exists(), end.with_name(f"{end.name}.parts")
+    command = starter().start(folder, "verify", *words, before=slowly)
+    assert command.kill_when(lambda: len(list(parts.glob("*.npz"))) > 2), command.said()
+    assert end.exists() == there
+    command = starter().run(folder, "verify", *words, before=slowly)
+    assert command.wait() == 0, command.said()
+    assert re.search(r"had a geometry\W+\d+", command.said())
+    assert not [path for path in folder.iterdir() if path.name.endswith((".partial", ".parts", "-wal", ".tmp"))]

@@ -5,6 +5,7 @@ import os
 import re
 import shutil
 import sqlite3
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +14,12 @@ import pycolmap
 import pytest
 
 import fmtorch
-from fmtorch.core.types import pair_key
-from fmtorch.data.lenses import MODELS
+from fmtorch.core import pair_key
+from fmtorch.data.cameras import MODELS
 from fmtorch.io.colmap import EXIF_DEVIATION, MatchDatabase, database_image
-from fmtorch.verification import run
-from tests.conftest import shared_path
 from tests.processes import run_command, starter
 from tests.verification import databases
-from tests.verification.databases import SIZE, plain, read, scene, write
+from tests.verification.databases import SIZE, killed_and_continued, plain, read, scene, write
 
 Configuration = pycolmap.TwoViewGeometryConfiguration
 BACK = np.array([[1.0, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])
@@ -122,11 +121,10 @@ def test_scales_and_shapes_of_keypoints_change_nothing(columns: int, tmp_path: P
     assert plain(read(path)) == plain(read(points))
 
 
-@pytest.mark.parametrize("columns", [1, 3, 5])
-def test_keypoints_of_other_columns(columns: int) -> None:
+def test_keypoints_of_other_columns() -> None:
     camera = pycolmap.Camera(model="PINHOLE", width=640, height=480, params=databases.PARAMS["PINHOLE"])
-    with pytest.raises(ValueError, match=f"the keypoints of a have {columns} columns; they must have 2, 4 or 6"):
-        database_image("a", camera, np.zeros((3, columns), np.float32))
+    with pytest.raises(ValueError, match="the keypoints of a have 3 columns; they must have 2, 4 or 6"):
+        database_image("a", camera, np.zeros((3, 3), np.float32))
 
 
 def test_what_a_camera_is_known_for() -> None:
@@ -224,6 +222,9 @@ def test_a_copy_leaves_the_database_as_it_is(tmp_path: Path) -> None:
     assert (result.path, result.verified) == (copy, 3)
     assert digest(path) == before
     assert len(read(copy)) == 3
+    assert fmtorch.verify(path, output=copy).kept == 3
+    with pycolmap.Database.open(copy) as database:
+        database.delete_two_view_geometry(1, 2)
     with pytest.raises(ValueError, match=re.escape(f"output={copy} exists; name another file, or replace it")):
         fmtorch.verify(path, output=copy)
     with pytest.raises(ValueError, match="is the database itself"):
@@ -287,55 +288,34 @@ def test_pairs_of_few_matches_are_degenerate(tmp_path: Path) -> None:
     assert fmtorch.verify(path).configurations == {"degenerate": 1}
 
 
-def _nothing(path: Path) -> None:
-    path.unlink()
-
-
-def _text(path: Path) -> None:
-    path.write_text("matches\n" * 20)
-
-
-def _folder(path: Path) -> None:
-    path.unlink()
-    path.mkdir()
-
-
-def _newer(path: Path) -> None:
+def sql(path: Path, statement: str) -> None:
     with sqlite3.connect(path) as connection:
-        connection.execute("PRAGMA user_version = 99000000")
-
-
-def _other(path: Path) -> None:
-    path.unlink()
-    with sqlite3.connect(path) as connection:
-        connection.execute("CREATE TABLE songs (name TEXT)")
-
-
-def _no_matches(path: Path) -> None:
-    with pycolmap.Database.open(path) as database:
-        database.clear_matches()
-
-
-def _no_keypoints(path: Path) -> None:
-    with pycolmap.Database.open(path) as database:
-        database.clear_keypoints()
-
-
-def _truncated(path: Path) -> None:
-    os.truncate(path, 5000)
+        connection.execute(statement)
 
 
 @pytest.mark.parametrize(
     ("damage", "said"),
     [
-        (_nothing, "there is no file {}; give the database of a COLMAP project: database.db"),
-        (_text, "{} is not a COLMAP database; give the database.db of a COLMAP project"),
-        (_folder, "{} is a folder; give the database file in it: {}/database.db"),
-        (_newer, "{} was written by a newer COLMAP"),
-        (_other, "{} is a database, but none of COLMAP's: it has no table cameras, images, keypoints, matches"),
-        (_no_matches, "{} holds no matches; match the images (colmap exhaustive_matcher) first"),
-        (_no_keypoints, "{} holds no keypoints; extract features (colmap feature_extractor) first"),
-        (_truncated, "{} cannot be read as a COLMAP database: "),
+        (lambda p: p.unlink(), "there is no file {}; give the database of a COLMAP project: database.db"),
+        (
+            lambda p: p.write_text("matches\n" * 20),
+            "{} is not a COLMAP database; give the database.db",
+        ),
+        (lambda p: (p.unlink(), p.mkdir()), "{} is a folder; give the database file in it: {}/database.db"),
+        (lambda p: sql(p, "PRAGMA user_version = 99000000"), "{} was written by a newer COLMAP"),
+        (
+            lambda p: (p.unlink(), sql(p, "CREATE TABLE songs (name TEXT)")),
+            "{} is a database, but none of COLMAP's: it",
+        ),
+        (
+            lambda p: sql(p, "DELETE FROM matches"),
+            "{} holds no matches; match the images (colmap exhaus",
+        ),
+        (
+            lambda p: sql(p, "DELETE FROM keypoints"),
+            "{} holds no keypoints; extract features (colmap f",
+        ),
+        (lambda p: os.truncate(p, 5000), "{} cannot be read as a COLMAP database: "),
     ],
 )
 def test_what_is_no_database_to_verify(damage: Any, said: str, tmp_path: Path) -> None:
@@ -397,7 +377,7 @@ def test_keypoints_are_read_for_many_images_in_blocks(tmp_path: Path, monkeypatc
     write(path, scene(6))
     write(other, scene(6))
     fmtorch.verify(path)
-    monkeypatch.setattr(run, "BATCH", 2)
+    monkeypatch.setattr("fmtorch.verification.run.BATCH", 2)
     monkeypatch.setattr("fmtorch.io.colmap.BLOCK", 2)
     monkeypatch.setattr("fmtorch.io.colmap.MEMORY", 3)
     with MatchDatabase(other) as database:
@@ -405,9 +385,6 @@ def test_keypoints_are_read_for_many_images_in_blocks(tmp_path: Path, monkeypatc
     assert pairs[5:12] == [(2, 3), (2, 4), (2, 5), (3, 4), (3, 5), (2, 6), (3, 6)]
     fmtorch.verify(other)
     assert plain(read(other)) == plain(read(path))
-
-
-SLOWLY = "import time, fmtorch.verification.run as v\nv.BATCH = 2\n"
 
 
 @pytest.mark.parametrize("way", ["in place", "copy", "forced", "forced copy"])
@@ -424,34 +401,16 @@ def test_a_killed_verification_continues(way: str, tmp_path: Path) -> None:
         with pycolmap.Database.open(source) as database:
             for pair in read(truth):
                 database.write_two_view_geometry(*pair, old)
-    before = plain(read(source))
     end = tmp_path / ("copy.db" if "copy" in way else "database.db")
-    parts = end.with_name(f"{end.name}.parts")
-    started = starter()
-    command = started.start(tmp_path, "verify", "database.db", *arguments, before=SLOWLY)
-    assert command.kill_when(lambda: len(list(parts.glob("*.npz"))) > 2), command.said()
-    assert plain(read(source)) == before
-    if "copy" in way:
-        assert not end.exists()
-    command = started.run(tmp_path, "verify", "database.db", *arguments, before=SLOWLY)
-    assert command.wait() == 0, command.said()
-    assert re.search(r"had a geometry\W+\d+", command.said())
+    killed_and_continued(tmp_path, end, "database.db", *arguments)
     assert plain(read(end)) == plain(read(truth))
-    assert not {name for name in os.listdir(tmp_path) if name.endswith((".partial", ".parts", "-wal", ".tmp"))}
 
 
-def test_the_command(tmp_path: Path) -> None:
+def test_the_command(command: Callable[..., str], tmp_path: Path) -> None:
     write(tmp_path / "database.db", scene(3))
-    done = run_command("verify", "database.db", "output=copy.db", "cameras=shared", "estimator=msac", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert re.search(r"verified\W+3\W", done.stdout)
-    assert "uncalibrated" in done.stdout
-    done = run_command("verify", "nothing.db", cwd=tmp_path)
-    assert (done.returncode, done.stderr.count("\n")) == (1, 1)
-    assert done.stderr.startswith("error: there is no file nothing.db; give the database of a COLMAP project")
-    done = run_command("verify", "database.db", "cameras=known", cwd=tmp_path)
-    assert (done.returncode, done.stderr.count("\n")) == (1, 1)
-    assert "cameras=known" in done.stderr
+    said = command("verify", "database.db", "output=copy.db", "cameras=shared", "estimator=msac", cwd=tmp_path)
+    assert re.search(r"verified\W+3\W", said)
+    assert "uncalibrated" in said
 
 
 def test_without_pycolmap_an_extra_is_named(tmp_path: Path) -> None:
@@ -461,47 +420,25 @@ def test_without_pycolmap_an_extra_is_named(tmp_path: Path) -> None:
     assert done.stderr == "error: pycolmap is not installed; pip install 'fmtorch[colmap]' brings it\n"
 
 
-@pytest.mark.slow
-def test_the_incremental_mapper_registers_all_images(tmp_path: Path) -> None:
-    """With calibrated cameras, and to poses that are the true ones after a similarity."""
-    path, cameras = tmp_path / "database.db", scene(6, count=400)
-    write(path, cameras)
-    fmtorch.verify(path)
-    options = pycolmap.IncrementalPipelineOptions(min_model_size=3, extract_colors=False)
-    models = pycolmap.incremental_mapping(path, tmp_path, tmp_path / "model", options)
-    assert [model.num_reg_images() for model in models.values()] == [6]
-    (model,) = models.values()
-    poses = {image.name: image.cam_from_world().rotation.matrix() for image in model.images.values()}
-    for i in range(1, 6):
-        R = poses[f"{i:03d}.jpg"] @ poses["000.jpg"].T
-        assert angle(R.T @ cameras.relative(0, i)[0]) < 0.2
-
-
-@pytest.mark.slow
-def test_photographs_by_colmap_from_features_to_poses(tmp_path: Path) -> None:
-    """COLMAP's SIFT and matches of castle-P19, our geometries, COLMAP's mapper: all images, at the true rotations."""
-    folder = shared_path("data/Strecha_train/castle-P19")
-    names = [f"{i:08d}.jpg" for i in range(5)]
-    path, cpu = tmp_path / "database.db", pycolmap.Device.cpu
-    extraction = pycolmap.FeatureExtractionOptions(num_threads=1)
-    extraction.sift.max_num_features = 2000
-    pycolmap.extract_features(
-        path, folder / "Images", names, pycolmap.CameraMode.SINGLE, extraction_options=extraction, device=cpu
-    )
-    matching = pycolmap.FeatureMatchingOptions(num_threads=1, skip_geometric_verification=True)
-    pycolmap.match_exhaustive(path, matching_options=matching, device=cpu)
+@pytest.mark.parametrize("focal", [10.0, 0.0, -600.0, np.inf])
+def test_an_absurd_focal_length_counts_as_unknown(focal: float, tmp_path: Path) -> None:
+    path, cameras = tmp_path / "database.db", scene(2, count=400)
+    write(path, cameras, "SIMPLE_PINHOLE", noise=0.1)
+    with pycolmap.Database.open(path) as database:
+        camera = database.read_camera(1)
+        camera.params = [focal, 320, 240]
+        database.update_camera(camera)
     result = fmtorch.verify(path)
-    assert (result.pairs, result.problems) == (10, ())
-    assert result.verified >= 8
-    true = [line.reshape(-1)[9:18].reshape(3, 3) for line in np.loadtxt(folder / "Camera.txt")[:5]]
-    for (first, second), geometry in read(path).items():
-        if geometry.config == Configuration.UNCALIBRATED and len(geometry.inlier_matches) > 100:
-            R = geometry.cam2_from_cam1.rotation.matrix()
-            assert angle((true[second - 1] @ true[first - 1].T).T @ R) < 3
-    options = pycolmap.IncrementalPipelineOptions(min_model_size=3, extract_colors=False)
-    models = pycolmap.incremental_mapping(path, folder / "Images", tmp_path / "model", options)
-    (model,) = models.values()
-    assert model.num_reg_images() == 5
-    poses = {image.name: image.cam_from_world().rotation.matrix() for image in model.images.values()}
-    for name, R in zip(names, true, strict=True):
-        assert angle((R @ true[0].T).T @ poses[name] @ poses[names[0]].T) < 1
+    assert (result.configurations, result.problems) == ({"uncalibrated": 1}, ())
+    assert f"a focal length of {focal:g} px for 640 x 480 pixels counts as unknown" in result.warnings[0]
+    (geometry,) = read(path).values()
+    assert angle(cameras.relative(0, 1)[0].T @ geometry.cam2_from_cam1.rotation.matrix()) < 1
+
+
+def test_a_crop_of_a_database_is_calibrated(tmp_path: Path) -> None:
+    path, cameras = tmp_path / "database.db", scene(2, count=400)
+    cameras.X[:, 0] += 4
+    write(path, cameras, "PINHOLE", params=[600, 600, -20, 240])
+    assert fmtorch.verify(path).configurations == {"calibrated": 1}
+    (geometry,) = read(path).values()
+    assert angle(cameras.relative(0, 1)[0].T @ geometry.cam2_from_cam1.rotation.matrix()) < 0.5

@@ -1,7 +1,7 @@
 """hloc's files verified: inliers of the public function, whatever happens on the way."""
 
 import os
-import re
+from collections.abc import Callable
 from pathlib import Path
 
 import h5py
@@ -9,13 +9,11 @@ import numpy as np
 import pytest
 
 import fmtorch
-from fmtorch.core.types import pair_key
-from tests.processes import run_command, starter
-from tests.verification.databases import SIZE, Scene, matches, scene
+from fmtorch.core import pair_key
+from tests.verification.databases import SIZE, Scene, killed_and_continued, matches, scene
 
 K = np.array([[600.0, 0, 319.5], [0, 600, 239.5], [0, 0, 1]])
 FILES = ("features=features.h5", "matches=matches.h5", "output=verified.h5")
-SLOWLY = "import fmtorch.verification.run as v\nv.BATCH = 2\n"
 
 
 def write(folder: Path, cameras: Scene) -> list[tuple[str, str]]:
@@ -76,6 +74,21 @@ def test_inliers_and_matrices_are_those_of_find_fundamental(tmp_path: Path) -> N
     assert sorted(os.listdir(tmp_path)) == ["features.h5", "matches.h5", "verified.h5"]
 
 
+def test_keys_of_an_older_hloc_are_read(tmp_path: Path) -> None:
+    """Names joined by _, which they may hold themselves."""
+    write(tmp_path, scene(2))
+    with h5py.File(tmp_path / "features.h5", "a") as file:
+        file.move("mapping/000.jpg", "map_1/000_a.jpg")
+    with h5py.File(tmp_path / "matches.h5", "a") as file:
+        file.move("mapping-000.jpg/mapping-001.jpg", "map_1-000_a.jpg_mapping-001.jpg")
+    paths = {f"{name}": tmp_path / f"{name}.h5" for name in ("features", "matches")}
+    result = fmtorch.verify(**paths, output=tmp_path / "verified.h5")
+    assert (result.configurations, result.problems) == ({"uncalibrated": 1}, ())
+    with h5py.File(tmp_path / "verified.h5") as file:
+        assert list(file) == ["map_1-000_a.jpg_mapping-001.jpg"]
+    assert fmtorch.verify(**paths, output=tmp_path / "verified.h5").kept == 1
+
+
 def test_broken_pairs_are_lines_and_stay_out(tmp_path: Path) -> None:
     pairs = write(tmp_path, scene(4))
     with h5py.File(tmp_path / "features.h5", "a") as file:
@@ -108,25 +121,18 @@ def test_broken_pairs_are_lines_and_stay_out(tmp_path: Path) -> None:
         ([FILES[0], "matches=text.h5", FILES[2]], "text.h5: is not a valid HDF5 file"),
     ],
 )
-def test_what_are_no_files_to_verify(words: list[str], said: str, tmp_path: Path) -> None:
+def test_what_are_no_files_to_verify(words: list[str], said: str, command: Callable[..., str], tmp_path: Path) -> None:
     write(tmp_path, scene(2))
     (tmp_path / "text.h5").write_text("matches")
-    done = run_command("verify", *words, cwd=tmp_path)
-    assert (done.returncode, done.stderr.count("\n")) == (1, 1)
-    assert done.stderr.startswith("error: ")
-    assert said in done.stderr
+    end = command("verify", *words, cwd=tmp_path)
+    assert end.startswith("ended: error: ")
+    assert said in end
+    assert "\n" not in end
     assert not list(tmp_path.glob("verified*"))
 
 
 def test_a_killed_verification_of_files_continues(tmp_path: Path) -> None:
     write(tmp_path, scene(7))
-    command = starter().start(tmp_path, "verify", *FILES, before=SLOWLY)
-    parts = tmp_path / "verified.h5.parts"
-    assert command.kill_when(lambda: len(list(parts.glob("*.npz"))) > 2), command.said()
-    assert not (tmp_path / "verified.h5").exists()
-    command = starter().run(tmp_path, "verify", *FILES, before=SLOWLY)
-    assert command.wait() == 0, command.said()
-    assert re.search(r"had a geometry\W+\d+", command.said())
+    killed_and_continued(tmp_path, tmp_path / "verified.h5", *FILES)
     fmtorch.verify(features=tmp_path / "features.h5", matches=tmp_path / "matches.h5", output=tmp_path / "truth.h5")
     assert contents(tmp_path / "verified.h5") == contents(tmp_path / "truth.h5")
-    assert not [name for name in os.listdir(tmp_path) if name.endswith((".parts", ".tmp"))]

@@ -1,7 +1,7 @@
 """Matches alone verified: what the public function finds, of one pair and of many, in npz and HDF5 files."""
 
 import os
-import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,15 +10,12 @@ import numpy as np
 import pytest
 
 import fmtorch
-from fmtorch.core.types import pair_key
-from tests.processes import run_command, starter
-from tests.verification.databases import SIZE, matches, scene
+from fmtorch.core import pair_key
+from tests.verification.databases import SIZE, killed_and_continued, matches, scene
 
 K = np.array([[600.0, 0, 319.5], [0, 600, 239.5], [0, 0, 1]])
-MATRICES = ("F", "E", "H", "R", "t")
 SIZES = {"size0": np.array(SIZE), "size1": np.array(SIZE)}
 CALIBRATIONS = {"K0": K, "K1": K}
-SLOWLY = "import fmtorch.verification.run as v\nv.BATCH = 2\n"
 
 
 def points(count: int = 2, kind: str = "general") -> list[tuple[np.ndarray, np.ndarray]]:
@@ -63,8 +60,13 @@ def load(path: Path) -> dict[str, Any]:
     return entries
 
 
-@pytest.mark.parametrize("known", [{}, SIZES, CALIBRATIONS, {**SIZES, **CALIBRATIONS}, {**SIZES, "K0": K}])
-@pytest.mark.parametrize("endings", [(".npz", ".npz"), (".h5", ".h5"), (".npz", ".hdf5")])
+@pytest.mark.parametrize(
+    ("known", "endings"),
+    [
+        ({}, (".npz", ".npz")), (SIZES, (".h5", ".h5")), (CALIBRATIONS, (".npz", ".hdf5")),
+        ({**SIZES, **CALIBRATIONS}, (".npz", ".npz")), ({**SIZES, "K0": K}, (".h5", ".h5")),
+    ],
+)  # fmt: skip
 def test_one_pair_is_that_of_find_fundamental(known: dict[str, Any], endings: tuple[str, str], tmp_path: Path) -> None:
     """By what is known: without sizes F and H alone, with sizes a pose too, with K a calibrated one."""
     (x0, x1), output = points()[0], tmp_path / f"verified{endings[1]}"
@@ -129,10 +131,58 @@ def test_broken_pairs_are_lines_and_stay_out(tmp_path: Path) -> None:
     assert said[2] == "d/x0, d/x1: d/K0 has shape (2, 3); it must be (3, 3)"
     assert said[3] == "e/x0, e/x1: size1 is [0.0, 640.0]; it must be the height and width of the image"
     assert said[4] == "f/x0, f/x1: f/x0 is of bool; it must hold real numbers"
-    assert "give the sizes of both images" in said[5]
+    assert "K0 alone needs the image sizes" in said[5]
     assert said[6].startswith("h/x0, h/x1: K0")
     assert said[7].startswith("i/x0, i/x1: i/x0 cannot be read")
     assert {key.partition("/")[0] for key in load(tmp_path / "verified.npz")} == {"a"}
+
+
+def test_the_checks_are_those_of_the_functions(tmp_path: Path) -> None:
+    """Crops are taken; normalised points, with K in pixels too, and sizes as (w, h) are lines, not geometries."""
+    x0, x1 = points()[0]
+    n0, n1 = (((x - K[:2, 2]) / 600).astype(np.float16) for x in (x0, x1))
+    crop = K - [[0, 0, 330], [0, 0, 0], [0, 0, 0]]
+    inside = (x0[:, 0] >= 0) & (x0[:, 0] < 310) & (x1[:, 0] >= 330)
+    y0, y1 = x0[inside], x1[inside] - [330, 0]
+    given: dict[str, dict[str, Any]] = {
+        "crop": {"x0": y0, "x1": y1, "K0": K, "K1": crop, "size0": np.array([480, 310]), "size1": np.array([480, 500])},
+        "normalised": {"x0": n0, "x1": n1}, "units": {"x0": n0, "x1": n1, **CALIBRATIONS},
+        "sizes": {"x0": x0, "x1": x1, "size0": np.array(SIZE[::-1]), "size1": np.array(SIZE[::-1])},
+        "few": {"x0": x0[:5], "x1": x1[:5]},
+        "resolution": {"x0": x0, "x1": x1, **SIZES, "K0": K / [[4], [4], [1]], "K1": K / [[4], [4], [1]]},
+    }  # fmt: skip
+    arrays = {f"{pair}/{key}": value for pair, entries in given.items() for key, value in entries.items()}
+    path, output = save(tmp_path / "matches.npz", arrays), tmp_path / "verified.npz"
+    result = fmtorch.verify(matches=path, output=output)
+    said = sorted(result.problems)
+    assert [line.partition("/")[0] for line in said] == ["normalised", "sizes", "units"]
+    for line, expected in zip(said, ("no pixels", "sizes are (h, w)", "K0 is in pixels"), strict=True):
+        assert expected in line
+    (warning,) = result.warnings
+    assert warning.startswith("resolution/x0, resolution/x1: far more matches agree without the calibration")
+    verified = load(output)
+    pose = fmtorch.find_essential(y0, y1, K, crop)
+    np.testing.assert_allclose(verified["crop/R"], pose.R[0], atol=2e-3)
+    assert verified["few/reason"] == "5 matches; at least 7 are needed"
+    assert "another resolution" in verified["resolution/warning"]
+
+
+@pytest.mark.parametrize("ending", [".npz", ".h5"])
+def test_a_complete_output_is_left_as_it_is(ending: str, tmp_path: Path) -> None:
+    path, output = tmp_path / f"matches{ending}", tmp_path / f"verified{ending}"
+    x0, x1 = points()[0]
+    save(path, {"a/x0": x0, "a/x1": x1})
+    fmtorch.verify(matches=path, output=output)
+    before = output.read_bytes()
+    again = fmtorch.verify(matches=path, output=output)
+    assert (again.path, again.pairs, again.kept, dict(again.configurations)) == (output, 1, 1, {})
+    assert output.read_bytes() == before
+    done = run_command("verify", f"matches={path.name}", f"output={output.name}", cwd=tmp_path)
+    assert done.returncode == 0
+    assert f"nothing to do: {output.name} has a geometry of each of 1 pairs" in done.stdout
+    save(path, {"a/x0": x0, "a/x1": x1, "b/x0": x0, "b/x1": x1})
+    with pytest.raises(ValueError, match="exists; name another file"):
+        fmtorch.verify(matches=path, output=output)
 
 
 @pytest.mark.parametrize(
@@ -150,7 +200,7 @@ def test_broken_pairs_are_lines_and_stay_out(tmp_path: Path) -> None:
         (["a.db", "matches=matches.npz", "output=v.npz"], "hloc's files need"),
     ],
 )
-def test_what_is_no_file_of_matches(words: list[str], said: str, tmp_path: Path) -> None:
+def test_what_is_no_file_of_matches(words: list[str], said: str, command: Callable[..., str], tmp_path: Path) -> None:
     x0, x1 = points()[0]
     save(tmp_path / "matches.npz", {"x0": x0, "x1": x1})
     save(tmp_path / "other.npz", {"x0": x0})
@@ -158,10 +208,10 @@ def test_what_is_no_file_of_matches(words: list[str], said: str, tmp_path: Path)
         np.save(file, x0)
     for name in ("text.npz", "text.h5", "matches.txt"):
         (tmp_path / name).write_text("matches")
-    done = run_command("verify", *words, cwd=tmp_path)
-    assert (done.returncode, done.stderr.count("\n")) == (1, 1), done.stderr
-    assert done.stderr.startswith("error: ")
-    assert said in done.stderr
+    end = command("verify", *words, cwd=tmp_path)
+    assert end.startswith("ended: error: ")
+    assert said in end
+    assert "\n" not in end
     assert not list(tmp_path.glob("v.*"))
 
 
@@ -170,13 +220,6 @@ def test_a_killed_verification_of_matches_continues(ending: str, tmp_path: Path)
     arrays = {f"{i}/{key}": x for i, pair in enumerate(points(7)) for key, x in zip(("x0", "x1"), pair, strict=True)}
     save(tmp_path / f"matches{ending}", arrays)
     words = [f"matches=matches{ending}", f"output=verified{ending}"]
-    command = starter().start(tmp_path, "verify", *words, before=SLOWLY)
-    parts = tmp_path / f"verified{ending}.parts"
-    assert command.kill_when(lambda: len(list(parts.glob("*.npz"))) > 2), command.said()
-    assert not (tmp_path / f"verified{ending}").exists()
-    command = starter().run(tmp_path, "verify", *words, before=SLOWLY)
-    assert command.wait() == 0, command.said()
-    assert re.search(r"had a geometry\W+\d+", command.said())
+    killed_and_continued(tmp_path, tmp_path / f"verified{ending}", *words)
     fmtorch.verify(matches=tmp_path / f"matches{ending}", output=tmp_path / f"truth{ending}")
     assert load(tmp_path / f"verified{ending}") == load(tmp_path / f"truth{ending}")
-    assert not [name for name in os.listdir(tmp_path) if name.endswith((".parts", ".tmp"))]

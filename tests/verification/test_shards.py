@@ -6,16 +6,14 @@ from pathlib import Path
 import pytest
 
 import fmtorch
-from fmtorch.jobs.execution import Execution
-from fmtorch.verification import run
-from tests.verification import test_hloc as hloc
+from fmtorch.jobs import Execution
 from tests.verification import test_matches as alone
 from tests.verification.databases import plain, read, scene, write
 
 
 @pytest.fixture(autouse=True)
 def _small_batches(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(run, "BATCH", 2)
+    monkeypatch.setattr("fmtorch.verification.run.BATCH", 2)
 
 
 def test_processes_find_what_threads_find(tmp_path: Path) -> None:
@@ -78,15 +76,3 @@ def test_shards_of_matches_alone(tmp_path: Path) -> None:
     alone.save(path, arrays)
     with pytest.raises(ValueError, match=r"holds geometries of other settings; what differs .*: files: "):
         fmtorch.verify(matches=path, output=tmp_path / "new.npz", shard="2/2")
-
-
-def test_shards_of_hlocs_files(tmp_path: Path) -> None:
-    hloc.write(tmp_path, scene(4))
-    files = {name: tmp_path / f"{name}.h5" for name in ("features", "matches")}
-    unsharded = fmtorch.verify(**files, output=tmp_path / "whole.h5")  # type: ignore[arg-type]
-    for shard in ("1/2", "2/2"):
-        assert not fmtorch.verify(**files, output=tmp_path / "merged.h5", shard=shard).path.is_file()  # type: ignore[arg-type]
-    merged = fmtorch.verify(**files, output=tmp_path / "merged.h5")  # type: ignore[arg-type]
-    assert (merged.pairs, merged.kept) == (6, 6)
-    assert hloc.contents(merged.path) == hloc.contents(unsharded.path)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["features.h5", "matches.h5", "merged.h5", "whole.h5"]

@@ -1,7 +1,5 @@
 """COLMAP's LO-RANSAC and two-view geometries by pycolmap (extra `colmap`)."""
 
-from __future__ import annotations
-
 from typing import Any, Literal, NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Any function of one pair's matches as an estimator of batches, and what the functions of this folder share."""
 
-from __future__ import annotations
-
 import dataclasses
 import importlib
 import math
@@ -50,7 +48,7 @@ Solution = tuple[Points | None, NDArray[np.bool_]] | Posed
 class Pair:
     """A pair's matches as these libraries take them: x0, x1 (N, 2) in pixels, likelihood (N,), sizes (h, w).
 
-    likelihood: the prior where there is one, else 1 - quality, else 1; matches are in its descending order if asked.
+    likelihood: the prior where there is one, else 1 - ambiguity, else 1; matches are in its descending order if asked.
     calibrations: where cameras are asked for, K0 and K1 (3, 3), None for an unknown focal length; calibrated: whether
     both are exact; shared_focal: whether both unknown focal lengths are one.
     """
@@ -215,8 +213,8 @@ def fundamental_of_pose(K0: Points, K1: Points, R: Points, t: Points) -> Points:
 def _likelihood(c: Correspondences, i: int) -> torch.Tensor:
     if c.prior is not None:
         value = c.prior[i]
-    elif c.quality is not None:
-        value = 1 - c.quality[i]
+    elif c.ambiguity is not None:
+        value = 1 - c.ambiguity[i]
     else:
         value = torch.ones(c.mask.shape[1])
     return value.detach().cpu().to(torch.float64)

@@ -1,7 +1,5 @@
 """PoseLib's LO-RANSAC, with and without one unknown focal length (extra `peers`)."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

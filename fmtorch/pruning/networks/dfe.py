@@ -1,7 +1,5 @@
 """Deep fundamental matrix estimation (Ranftl & Koltun, ECCV 2018)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

@@ -3,8 +3,6 @@
 Reading one executes nothing of it: whoever reads the file builds the network, which has to be the one that it states.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Mapping

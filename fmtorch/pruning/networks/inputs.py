@@ -1,7 +1,5 @@
 """Correspondences as the input of a network: normalised coordinates and side information, one column a match."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 
@@ -10,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from fmtorch.core.types import Correspondences
-from fmtorch.pruning.frame_consistency import frame_agreement, usable_frame_maps
+from fmtorch.pruning.consistency import frame_agreement, usable_frame_maps
 
 COORDINATES = ("size", "K")
 MIN_AREA_RATIO = 1e-12  # of two frames; keeps the gradient of the logarithm finite
@@ -26,7 +24,7 @@ class MatchInputs:
       "K": rays ``K^-1 (x, y, 1)``, as Yi et al., CVPR 2018, for the essential matrix.
     side: names from `SIDE`, in this order after the coordinates. What is not known, of a match or of all, is 0, which
     no channel but "scale" (beside "rotation") and "agreement" otherwise takes:
-      "ratio": `quality` as it is, (0, 1].
+      "ratio": the ratio, or 1 - score, as it is, [0, 1].
       "mutual": 1 or -1.
       "scale": half the logarithm of the determinant of the map from frame 0 to frame 1.
       "rotation": cosine and sine of that map's rotation (of its polar decomposition), so without a jump at any angle.
@@ -110,7 +108,7 @@ def _by_calibration(x: Float[Tensor, "b n 2"], K: Tensor | None, name: str) -> F
 
 
 def _ratio(c: Correspondences) -> list[Tensor]:
-    return [torch.zeros_like(c.x0[..., 0]) if c.quality is None else torch.where(c.mask, c.quality, 0)]
+    return [torch.zeros_like(c.x0[..., 0]) if c.ambiguity is None else torch.where(c.mask, c.ambiguity, 0)]
 
 
 def _mutual(c: Correspondences) -> list[Tensor]:
@@ -143,7 +141,7 @@ def _rotation(c: Correspondences) -> list[Tensor]:
 def _agreement(c: Correspondences) -> list[Tensor]:
     if c.lafs0 is None or c.lafs1 is None:
         return [torch.zeros_like(c.x0[..., 0])]
-    return [2 * frame_agreement(c.x0, c.x1, c.lafs0, c.lafs1, c.quality, c.mask) - 1]
+    return [2 * frame_agreement(c.x0, c.x1, c.lafs0, c.lafs1, c.ambiguity, c.mask) - 1]
 
 
 SIDE: dict[str, tuple[int, Callable[[Correspondences], list[Tensor]]]] = {

@@ -1,7 +1,5 @@
 """Learning to find good correspondences (Yi et al., CVPR 2018)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

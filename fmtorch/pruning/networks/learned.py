@@ -1,7 +1,5 @@
 """Learned pruners: a network and its learned file as a stage, which drops matches or supplies their prior."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable, Mapping
 from pathlib import Path

@@ -1,15 +1,14 @@
 """Matches of two whole photographs whose cameras are known."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from fmtorch.core.types import Correspondences
+from fmtorch.core import Correspondences
 from tests.reference import focal as reference
+from tests.reference.solvers import skew
 
 WIDE, TALL = (640, 960), (1000, 700)  # (h, w)
 Sizes = tuple[tuple[int, int], tuple[int, int]]
@@ -43,7 +42,7 @@ def photographs(
         torch.from_numpy(x0)[None], torch.from_numpy(x1)[None], torch.ones(1, count, dtype=torch.bool),
         size0=torch.tensor(sizes[:1]), size1=torch.tensor(sizes[1:]), key=torch.tensor([seed + 1]),
     )  # fmt: skip
-    F = np.linalg.inv(K[1]).T @ reference.cross_matrix(t) @ R @ np.linalg.inv(K[0])
+    F = np.linalg.inv(K[1]).T @ skew(t) @ R @ np.linalg.inv(K[0])
     return Photographs(c, F / np.linalg.norm(F), np.concatenate([rotation, t / np.linalg.norm(t), np.log(focal)]))
 
 

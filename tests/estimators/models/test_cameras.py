@@ -1,13 +1,12 @@
 """Cameras near models: their F is the model where it is one of plausible cameras; else usual focal lengths."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
 import pytest
 import torch
 
+from fmtorch.estimators import Pair
 from fmtorch.estimators.models.focal_prior import LOG_USUAL
 from fmtorch.estimators.models.posterior import (
     Cameras,
@@ -18,7 +17,6 @@ from fmtorch.estimators.models.posterior import (
     tangents_of,
     translate,
 )
-from fmtorch.estimators.pair import Pair
 from tests.estimators.models.photographs import TALL, WIDE, photographs
 from tests.estimators.pairs import apart, frames, in_pixels, pair_of, to_units
 from tests.reference import focal as reference
@@ -86,27 +84,3 @@ def test_points_from_the_principal_points_and_the_scale_of_a_loss() -> None:
     G, moved = (shifted[1].T @ truth @ shifted[0]).reshape(1, 9), np.empty((1, 9))
     translate(G, images.offset, moved)
     assert apart(in_pixels(moved[0], pair), truth) < 1e-12
-
-
-def test_sizes_of_another_unit_have_no_half_pixel() -> None:
-    c, _, _ = photographs(2)
-    scaled = c.replace(
-        x0=c.x0 * 1e-3,
-        x1=c.x1 * 1e-3,
-        size0=c.size0.double() * 1e-3,
-        size1=c.size1.double() * 1e-3,  # type: ignore[union-attr]
-    )
-    in_pixels, in_units = images_of(pair_of(c)), images_of(pair_of(scaled))
-    pixels = pair_of(scaled).pixels_per_unit * 1e3 / pair_of(c).pixels_per_unit
-    half = 0.5 / pair_of(c).pixels_per_unit
-    np.testing.assert_allclose(in_units.offset * pixels, in_pixels.offset - half, atol=1e-12)
-
-
-def test_a_model_that_is_not_finite_leaves_the_others_alone() -> None:
-    c, truth, _ = photographs(3)
-    pair = pair_of(c)
-    good = np.stack([to_units(truth + 0.01 * k * truth.T, pair) for k in range(3)])
-    bad = np.concatenate([good[:1], np.full((1, 9), np.nan), np.zeros((1, 9)), good[1:]])
-    alone, among = near(good, pair), near(bad, pair)
-    np.testing.assert_array_equal(among.axes[[0, 3, 4]], alone.axes)
-    np.testing.assert_array_equal(among.focal[[0, 3, 4]], alone.focal)

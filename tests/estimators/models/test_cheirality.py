@@ -1,7 +1,5 @@
 """Which matches lie in front of both cameras: as by triangulation, whatever signs the factors of E have."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -75,9 +73,3 @@ def test_support_is_the_gain_of_geman_and_mcclure() -> None:
     # The same, each match weighted by its gain, with a scale so small that all count fully.
     cheirality(cameras, ones, F, Weighted(points, weight * gain, np.full(60, 1e-12), loss, NO_TABLE), 0.0, out)
     assert computed == pytest.approx(out[0], abs=60 * 2.0**-BITS / (weight * gain).sum())
-
-
-def test_without_support_there_is_no_share() -> None:
-    _, _, U, V = factors(0)
-    points = np.random.default_rng(0).uniform(-1, 1, (4, 9))
-    assert np.isnan(share(U, V, np.ones(2), points, np.zeros(9), 0.0))

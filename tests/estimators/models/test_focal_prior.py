@@ -1,7 +1,5 @@
 """The prior on focal lengths where these are measured, shared, or neither: its cost and its draws."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Samples of five matches and drawn focal lengths, and what the assumption of plausible cameras is good for."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -20,7 +18,6 @@ from fmtorch.estimators.models.focal_prior import (
 )
 from fmtorch.estimators.models.posterior import images_of
 from fmtorch.estimators.models.with_focals import FundamentalWithFocals
-from fmtorch.geometry import sampson
 from fmtorch.jit.random import Stream
 from fmtorch.metrics import nsgd
 from tests.estimators.models.photographs import TALL, WIDE, Photographs, Sizes, photographs
@@ -87,22 +84,6 @@ def test_a_plane_does_not_deceive_where_cameras_are_plausible() -> None:
             values.append(error(presets.build("estimator", "fmtorch", focal={"samples": samples})(pair.c, 0).F, pair))
     assert np.median(errors[250]) < 0.02
     assert np.median(errors[250]) < 0.5 * np.median(errors[0])
-
-
-def test_an_exact_plane_has_a_solution_where_cameras_are_plausible() -> None:
-    """Any seven of its matches leave F open, so that there is no sample of seven; five and a focal length suffice."""
-    pair = photographs(4, (WIDE, WIDE), (1.0, 1.0), 150, noise=0.0, outliers=0.0, relief=0.0)
-    estimate = presets.build("estimator", "fmtorch")(pair.c, 0)
-    assert bool(estimate.ok[0])
-    assert float(sampson(estimate.F, pair.c.x0, pair.c.x1).max()) < 1e-3
-    assert int(estimate.inliers.sum()) == 150
-    assert error(estimate.F, pair) < 0.05
-
-
-def test_other_cameras_fall_back_to_the_fit_without_prior() -> None:
-    """The principal point far off the centre: the matches contradict the prior, and the estimate is that without."""
-    pair = photographs(3, (WIDE, WIDE), (1.0, 1.0), 400, noise=0.1, outliers=0.1, shift=250.0)
-    assert error(presets.build("estimator", "fmtorch")(pair.c, 0).F, pair) < 0.01
 
 
 def test_unknown_sizes_are_searched_without_assumptions() -> None:

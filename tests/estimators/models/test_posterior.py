@@ -1,7 +1,5 @@
 """The posterior of two cameras: its derivatives, its maximum as SciPy finds it, and what the prior costs there."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -9,9 +7,8 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from fmtorch.core.types import Correspondences
+from fmtorch.estimators import Pair, SevenPoint
 from fmtorch.estimators.final_fits import PRIOR_CONFLICT_GAIN
-from fmtorch.estimators.models.fundamental import SevenPoint
 from fmtorch.estimators.models.model import Loss, Steps
 from fmtorch.estimators.models.posterior import (
     Cameras,
@@ -25,9 +22,7 @@ from fmtorch.estimators.models.posterior import (
     no_optimum,
 )
 from fmtorch.estimators.models.with_focals import LOSS_SCALE_PX, FundamentalWithFocals, Refined
-from fmtorch.estimators.pair import Pair
 from fmtorch.geometry.levenberg_marquardt import LOSS_CODES, NO_TABLE, Weighted
-from tests.conftest import oracle
 from tests.estimators.models.photographs import TALL, WIDE, Sizes, photographs, with_prior
 from tests.estimators.pairs import apart, in_pixels, pair_of, to_units
 from tests.reference import focal as reference
@@ -122,28 +117,6 @@ def test_the_cost_at_the_optimum_is_that_of_scipy(seed: int) -> None:
     # parameters enters squared, and SciPy stops within 1e-7 of the least cost.
     assert computed <= expected * (1 + 1e-9)
     assert computed == pytest.approx(expected, rel=1e-7)
-
-
-@pytest.mark.parametrize("name", ["000", "010", "020"])
-def test_scipy_finds_nothing_better_nearby_on_real_pairs(name: str) -> None:
-    data = oracle("robust.npz")
-    x0, x1 = data[f"{name}.X1"].astype(np.float64), data[f"{name}.X2"].astype(np.float64)
-    sizes = [(int(h), int(w)) for h, w in (data[f"{name}.size1"], data[f"{name}.size2"])]
-    pair = pair_of(
-        Correspondences(
-            torch.from_numpy(x0)[None], torch.from_numpy(x1)[None], torch.ones(1, len(x0), dtype=torch.bool),
-            size0=torch.tensor(sizes[:1]), size1=torch.tensor(sizes[1:]),
-        )
-    )  # fmt: skip
-    _, refined = FAMILY.refine(to_units(data[f"{name}.F_gt"], pair)[None], pair, 50)
-    refined_cameras = in_pixels(refined.models[0], pair)
-    parameters = reference.parameters_of(refined_cameras, sizes[0], sizes[1])
-    same = sizes[0] == sizes[1]
-    expected = reference.prior_cost(parameters[6], parameters[7], same)  # by way of F and Bougnoux
-    assert refined.cost[0] == pytest.approx(expected, rel=1e-4)
-    cost = reference.cost(refined_cameras, parameters[6:], x0, x1, np.ones(len(x0)), LOSS_SCALE_PX, same)
-    _, min_cost = reference.optimum(parameters, x0, x1, np.ones(len(x0)), LOSS_SCALE_PX, sizes[0], sizes[1])
-    assert cost <= min_cost * (1 + 1e-6)
 
 
 def test_without_noise_a_model_stays_and_strange_focal_lengths_cost() -> None:

@@ -1,7 +1,5 @@
 """Learned files: others' checkpoints converted, refusals."""
 
-from __future__ import annotations
-
 import runpy
 import sys
 from pathlib import Path
@@ -10,9 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from fmtorch.core.types import Correspondences
-from fmtorch.pruning import LearnedPruner
-from fmtorch.pruning.networks import LC
+from fmtorch.core import Correspondences
+from fmtorch.pruning import LC, LearnedPruner
 from scripts.make_models import ngransac_state
 from tests.conftest import oracle, shared_path
 
@@ -39,7 +36,7 @@ def test_a_checkpoint_of_neural_guided_ransac_becomes_a_pruner(tmp_path: Path) -
         torch.from_numpy(data[f"001.{name}"])[None] for name in ("X1", "X2", "ratio", "size1", "size2")
     )
     mask = torch.ones(x0.shape[:2], dtype=torch.bool)
-    c = Correspondences(x0, x1, mask, quality=ratio.double(), size0=size0, size1=size1)
+    c = Correspondences(x0, x1, mask, ratio=ratio.double(), size0=size0, size1=size1)
     p = LearnedPruner(LC(side=["ratio"]), file=tmp_path / "net.safetensors").probability(c)[0].double()
     expected = data["001.logprob_F_r1.00"].astype(np.float64)
     computed = (p / p.sum()).log().numpy()

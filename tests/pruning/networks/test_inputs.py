@@ -1,14 +1,12 @@
 """What networks see of matches: known values, missing information, padding."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
 import torch
 
-from fmtorch.core.types import Correspondences
-from fmtorch.pruning.networks import MatchInputs
+from fmtorch.core import Correspondences
+from fmtorch.pruning import MatchInputs
 from tests.laws import scene
 
 SIDE = ("ratio", "mutual", "scale", "rotation", "agreement")
@@ -20,7 +18,7 @@ def one_match(**changes: object) -> Correspondences:
     lafs0 = torch.tensor([[[[3.0, 0, 10], [0, 3, 20]]]])
     lafs1 = torch.tensor([[[[6 * c, -6 * s, 30], [6 * s, 6 * c, 50]]]])
     return Correspondences(
-        lafs0[..., 2], lafs1[..., 2], torch.ones(1, 1, dtype=torch.bool), quality=torch.tensor([[0.7]]),
+        lafs0[..., 2], lafs1[..., 2], torch.ones(1, 1, dtype=torch.bool), ratio=torch.tensor([[0.7]]),
         lafs0=lafs0, lafs1=lafs1, size0=torch.tensor([[100, 200]]), size1=torch.tensor([[400, 100]]),
         K0=torch.tensor([[[100.0, 2, 50], [0, 50, 40], [0, 0, 1]]]), K1=torch.eye(3)[None],
         mutual=torch.tensor([[False]]),
@@ -36,7 +34,6 @@ def test_coordinates_by_size() -> None:
 
 def test_coordinates_by_calibration_are_the_inverse_of_K() -> None:
     c = one_match()
-    assert c.K0 is not None
     x, _ = MatchInputs("K")(c)
     ray = torch.linalg.inv(c.K0[0]) @ torch.tensor([10.0, 20, 1])
     torch.testing.assert_close(x[0, :, 0], torch.tensor([float(ray[0]), float(ray[1]), 30, 50]))
@@ -59,9 +56,9 @@ def test_rotation_has_no_jump(angle: float) -> None:
 
 
 def test_what_is_not_known_is_zero() -> None:
-    bare = one_match(lafs0=None, lafs1=None, quality=None, mutual=None)
+    bare = one_match(lafs0=None, lafs1=None, ratio=None, mutual=None)
     assert not MatchInputs("size", SIDE)(bare)[0][:, 4:].any()
-    flat = one_match(lafs0=torch.zeros(1, 1, 2, 3), quality=torch.tensor([[torch.nan]]))
+    flat = one_match(lafs0=torch.zeros(1, 1, 2, 3), ratio=torch.tensor([[torch.nan]]))
     assert torch.isfinite(MatchInputs("size", SIDE)(flat)[0]).all()
 
 
@@ -72,10 +69,8 @@ def test_padding_is_zero_and_not_finite_matches_are_masked(coordinates: str) -> 
     mask = c.mask.clone()
     mask[0, 15:] = False
     expected, _ = MatchInputs(coordinates, SIDE)(c.keep(mask).compact())
-    assert c.quality is not None
-    assert c.lafs0 is not None
     garbage = {
-        "x0": torch.where(mask[..., None], c.x0, torch.nan), "quality": torch.where(mask, c.quality, torch.inf),
+        "x0": torch.where(mask[..., None], c.x0, torch.nan), "ratio": torch.where(mask, c.ratio, torch.inf),
         "lafs0": torch.where(mask[..., None, None], c.lafs0, torch.nan),
     }  # fmt: skip
     x, input_mask = MatchInputs(coordinates, SIDE)(c.replace(mask=mask, **garbage))

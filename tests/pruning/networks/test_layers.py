@@ -3,7 +3,10 @@
 import pytest
 import torch
 
+from fmtorch.core import collate
+from fmtorch.pruning import DFE, LC
 from fmtorch.pruning.networks.layers import ContextBatchNormReLU, ResidualBlock, Slots
+from tests.laws import scene
 from tests.reference.networks import context_batch_norm_relu
 
 
@@ -77,3 +80,18 @@ def test_matches_without_variance_have_finite_gradients(count):
     assert torch.isfinite(y).all()
     assert all(torch.isfinite(g).all() for g in gradients)
     assert torch.isfinite(block.norm0.running_var).all()
+
+
+@pytest.mark.parametrize("network", [LC(side=["ratio"], blocks=4), DFE(side=["ratio"], widths=(16, 32, 8))])
+def test_padding_and_neighbours_change_a_networks_values_by_rounding_alone(network):
+    """At inference; NaN in masked slots. `LearnedPruner` has the same bits."""
+    counts, network = (60, 1, 100, 30), network.eval()
+    c = collate([scene(i, count=n) for i, n in enumerate(counts)])
+    with torch.no_grad():
+        together = network(c.replace(x1=torch.where(c.mask[..., None], c.x1, torch.nan)))
+        for i, n in enumerate(counts):
+            alone = network(scene(i, count=n))
+            torch.testing.assert_close(together.logit[:, i, :n], alone.logit[:, 0], rtol=1e-4, atol=1e-4)
+            torch.testing.assert_close(together.weight[:, i, :n], alone.weight[:, 0], rtol=1e-3, atol=1e-4)
+            assert not together.weight[:, i, n:].any()
+    assert torch.isfinite(together.logit).all()

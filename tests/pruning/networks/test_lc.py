@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from fmtorch.core.types import Correspondences, collate
-from fmtorch.pruning.networks import DFE, LC
+from fmtorch.core import Correspondences, collate
+from fmtorch.pruning import DFE, LC
 from fmtorch.pruning.networks.layers import Slots
 from scripts.make_models import ngransac_state
 from tests.conftest import oracle
@@ -24,7 +24,7 @@ def test_outputs_of_neural_guided_ransac(model: str) -> None:
     for case in cases:
         x0, x1, ratio, size0, size1 = (data[f"{case}.{name}"][None] for name in ("X1", "X2", "ratio", "size1", "size2"))
         mask = torch.ones(x0.shape[:2], dtype=torch.bool)
-        x, _ = network.inputs(Correspondences(x0, x1, mask, quality=ratio, size0=size0, size1=size1))
+        x, _ = network.inputs(Correspondences(x0, x1, mask, ratio=ratio, size0=size0, size1=size1))
         torch.testing.assert_close(x[0].mT, data[f"{case}.inp"], rtol=0, atol=1e-6)  # another order of rounding
         with torch.no_grad():
             logit = network.backbone(x.double(), Slots.of(mask, torch.float64))[0, 0]
@@ -36,35 +36,6 @@ def matches(counts: tuple[int, ...]) -> Correspondences:
     """Pairs of several lengths with NaN in their padding."""
     c = collate([scene(i, count=n) for i, n in enumerate(counts)])
     return c.replace(x1=torch.where(c.mask[..., None], c.x1, torch.nan))
-
-
-def test_padding_and_neighbours() -> None:
-    """In evaluation mode a pair's log-odds in a padded batch are those of the pair alone, to rounding of float32."""
-    torch.manual_seed(0)
-    network, counts = LC(side=["ratio"], blocks=4).eval(), (60, 1, 100, 30)
-    with torch.no_grad():
-        together = network(matches(counts))
-        for i, n in enumerate(counts):
-            alone = network(scene(i, count=n))
-            torch.testing.assert_close(together.logit[:, i, :n], alone.logit[:, 0], rtol=1e-4, atol=1e-4)
-            assert not together.weight[:, i, n:].any()
-    assert torch.isfinite(together.logit).all()
-
-
-def test_wider_padding_changes_no_step_of_training() -> None:
-    """Statistics of the batch and gradients exclude padding."""
-    gradients = []
-    for slots in (0, 37):
-        torch.manual_seed(0)
-        network, c = LC(side=["ratio"], blocks=2, channels=16).double(), matches((60, 100, 30))
-        wide = collate([c, c[0].keep(torch.zeros(1, 100, dtype=torch.bool)), scene(9, count=100 + slots)])
-        wide = wide[:-1]  # one pair without matches, and padding as long as the longest that was there
-        x, mask = network.inputs(wide)
-        logit = network.backbone(x.double(), Slots.of(mask, torch.float64))[:, 0]
-        loss = torch.where(mask, logit, 0).square().sum()
-        gradients.append(torch.autograd.grad(loss, list(network.parameters())))
-        assert wide.mask.shape == (4, 100 + slots)
-    torch.testing.assert_close(gradients[1], gradients[0], rtol=1e-9, atol=1e-12)
 
 
 def test_weights_are_those_published() -> None:

@@ -1,0 +1,287 @@
+"""Photographs for a pipeline: what is known of their cameras, and how they are reduced for matching."""
+
+import functools
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+import PIL.Image
+import torch
+from jaxtyping import Float
+from numpy.typing import NDArray
+from torch import Tensor
+
+from fmtorch.core.types import Correspondences
+from fmtorch.data import ImageCameras, ImageSource, Lens, exif_focal, read_image
+from fmtorch.data.cameras import undistorted_frames, undistorted_points
+from fmtorch.geometry.cameras import calibration_problems
+from fmtorch.geometry.epipolar import unit_frobenius
+from fmtorch.io.match_store import PairGeometry
+from fmtorch.runs.fingerprint import file_digest
+from fmtorch.two_view.arguments import camera_fields
+
+WORDS = ("unknown", "shared", "exif")
+
+
+class PhotographCamera(NamedTuple):
+    """What is known of the camera of one photograph.
+
+    lens: its calibration, with distortion. focal: px, and its relative deviation, where that alone is known. note: what
+    is said of it.
+    """
+
+    lens: Lens | None = None
+    focal: tuple[float, float] | None = None
+    note: str = ""
+
+
+class PhotographCameras:
+    """The cameras of photographs.
+
+    Args:
+        cameras: one of `WORDS`, a file of cameras (`ImageCameras`), or None where nothing is asked of them.
+        K: fx, fy, cx, cy of all, px, as numbers or as a text, or None.
+
+    Raises:
+        ValueError: where both are given, or for what no camera is.
+        DataError: for a file that is damaged or holds something else.
+    """
+
+    def __init__(self, cameras: Path | None = None, K: str | Sequence[float | int] | None = None) -> None:
+        if K is not None and cameras is not None:
+            raise ValueError("cameras and K are given; give one of them")
+        self.word = str(cameras) if cameras is not None and str(cameras) in WORDS else None
+        self._of_all = None if K is None else _pinhole(K)
+        self._file: Path | None = None
+        self._stored: ImageCameras | None = None
+        self._known: dict[tuple[Path, tuple[int, int]], PhotographCamera] = {}
+        if cameras is not None and self.word is None:
+            if not cameras.exists():
+                known_words = f"it must be {', '.join(WORDS)}, a COLMAP model or a JSON file"
+                raise ValueError(f"cameras={cameras}: no such file; {known_words}. One calibration is K=fx,fy,cx,cy")
+            self._file, self._stored = cameras, ImageCameras(cameras)
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """What results depend on, as plain values; empty where nothing is asked of cameras."""
+        if self._file is not None:
+            files = sorted(self._file.iterdir()) if self._file.is_dir() else [self._file]
+            digests = [file_digest(path) for path in files if path.is_file()]
+            return {"cameras": {"files": digests}}
+        if self._of_all is not None:
+            lens = self._of_all
+            return {"cameras": {"K": [lens.fx, lens.fy, lens.cx, lens.cy]}}
+        return {} if self.word is None else {"cameras": self.word}
+
+    def source(self, path: Path) -> ImageSource:
+        """A photograph for `read_image`, which raises ImageError for one that is not of its camera's size."""
+        return ImageSource(path.name, path, None if self._stored is None else self._stored.of(path).size)
+
+    def of(self, path: Path, size: tuple[int, int]) -> PhotographCamera:
+        if (path, size) not in self._known:
+            self._known[path, size] = self._of(path, size)
+        return self._known[path, size]
+
+    def _of(self, path: Path, size: tuple[int, int]) -> PhotographCamera:
+        if self._of_all is not None:
+            return PhotographCamera(self._of_all)
+        if self._stored is not None:
+            lens = self._stored.of(path).lens
+            if lens is None or not lens.bends:
+                return PhotographCamera(lens)
+            what = f"{path.name}: F and the pose are of the image without the distortion of its {lens.model} lens"
+            return PhotographCamera(lens, note=f"{what}; points are where they are in the photograph")
+        if self.word == "exif":
+            exif = exif_focal(path, size)
+            if exif.known:
+                return PhotographCamera(focal=(exif.focal, exif.deviation))
+            return PhotographCamera(note=f"{path.name}: focal length not known: {exif.source}")
+        return PhotographCamera()
+
+    def knowledge(self, camera0: PhotographCamera, camera1: PhotographCamera) -> dict[str, Any]:
+        """K0, K1, focal, lens0 and lens1 of a pair, as `fmtorch.match` takes them."""
+        if self.word in ("unknown", "shared"):
+            return {"focal": self.word}
+        if self.word == "exif":
+            measured = [camera0.focal, camera1.focal]
+            return {"focal": "unknown" if measured == [None, None] else measured}
+        if self._of_all is None and self._stored is None:
+            return {}
+        knowledge: dict[str, Any] = {}
+        for i, camera in enumerate((camera0, camera1)):
+            knowledge[f"K{i}"] = None if camera.lens is None else camera.lens.K
+            if camera.lens is not None and camera.lens.bends:
+                knowledge[f"lens{i}"] = camera.lens
+        if camera0.lens is None and camera1.lens is None:
+            knowledge["focal"] = "unknown"
+        return knowledge
+
+    def given(self, paths: Sequence[Path], sizes: Sequence[tuple[int, int]]) -> dict[str, Any]:
+        """What `relate` takes of a pair's cameras."""
+        known = self.knowledge(*(self.of(path, size) for path, size in zip(paths, sizes, strict=True)))
+        lenses = known.get("lens0"), known.get("lens1")
+        fields = camera_fields(known.get("K0"), known.get("K1"), known.get("focal"), sizes_known=True)
+        return {"cameras": fields, "lenses": lenses}
+
+
+def _pinhole(K: str | Sequence[float | int]) -> Lens:
+    words = K.replace(",", " ").replace("[", " ").replace("]", " ").split() if isinstance(K, str) else K
+    try:
+        numbers = [float(word) for word in words]
+    except ValueError:
+        numbers = []
+    if len(numbers) != 4 or not all(map(math.isfinite, numbers)) or min(numbers[:2]) <= 0:
+        raise ValueError(f"K={K}; it must be fx,fy,cx,cy in pixels, with positive focal lengths")
+    fx, fy, cx, cy = numbers
+    return Lens(fx, fy, cx, cy)
+
+
+# Images as they are given, reduced for matching, and what was found in them in pixels of the originals
+
+
+Image = NDArray[np.uint8]
+GivenImage = Path | str | Image | Any  # or one of Pillow's, which is imported by who has one
+Array = NDArray[np.float64]
+
+
+def given_image(image: GivenImage, name: str) -> Image:
+    """The pixels of a file, turned as its EXIF orientation says, of Pillow's image, or of an array.
+
+    Raises ImageError for a file that is no sound image, TypeError or ValueError, naming it, for what is no image.
+    """
+    if isinstance(image, Path | str):
+        return read_image(image, orient=True)
+    if isinstance(image, PIL.Image.Image):
+        grey = image.mode in ("1", "L", "LA")
+        if not grey and image.mode not in ("RGB", "RGBA", "P", "CMYK", "YCbCr", "HSV", "LAB"):
+            raise ValueError(f"{name} is a Pillow image of mode {image.mode}; it must be of 8 bits: L or RGB")
+        return np.asarray(image.convert("L" if grey else "RGB"))
+    if not isinstance(image, np.ndarray):
+        raise TypeError(
+            f"{name} is a {type(image).__name__}; it must be a file's path, a Pillow image or a uint8 array of NumPy"
+        )
+    colour = image.ndim == 3 and image.shape[2] == 3
+    if image.dtype != np.uint8 or image.size == 0 or not (image.ndim == 2 or colour):
+        raise ValueError(f"{name} is {image.dtype} {image.shape}; it must be non-empty uint8, (H, W) or RGB (H, W, 3)")
+    return image
+
+
+def reduced_image(image: Image, longest_side: int) -> tuple[Image, Float[Tensor, " xy"]]:
+    """The image with its longest side at most that long, and its scale in x and y (rounding makes them differ)."""
+    h, w = image.shape[:2]
+    scale = min(1.0, longest_side / max(h, w))
+    size = (max(1, round(w * scale)), max(1, round(h * scale)))
+    if size != (w, h):
+        image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+    return image, torch.tensor([size[0] / w, size[1] / h], dtype=torch.float64)
+
+
+def to_original(x: Tensor, s: Tensor) -> Tensor:
+    """Points of a reduced image in pixels of the original; exactly x where nothing was reduced."""
+    return x / s + (1 - s) / (2 * s)
+
+
+def frames_to_original(lafs: Float[Tensor, "*batch 2 3"] | None, s: Tensor) -> Float[Tensor, "*batch 2 3"] | None:
+    """Local affine frames of a reduced image in pixels of the original."""
+    if lafs is None:
+        return None
+    return torch.cat([lafs[..., :2] / s[:, None], to_original(lafs[..., 2:].mT, s).mT], -1)
+
+
+def reduced_cameras(
+    fields: Mapping[str, Tensor], scales: Sequence[Tensor], sizes: Sequence[tuple[int, int]]
+) -> dict[str, Tensor]:
+    """What is known of the cameras of two images as they were reduced, of a batch of one.
+
+    fields: of `camera_fields`, for the originals. scales: of both images in x and y. sizes: (h, w) of the originals.
+    Raises ValueError, naming it, for a K that is no calibration matrix of its image, and for a focal of several pairs.
+    """
+    if "focal" in fields and fields["focal"].shape != (2, 2):
+        raise ValueError(f"focal has shape {tuple(fields['focal'].shape)}; it must be of one pair of images")
+    reduced = {name: value[None].clone() for name, value in fields.items()}
+    for i, (s, size) in enumerate(zip(scales, sizes, strict=True)):
+        if f"K{i}" in reduced:
+            K = reduced[f"K{i}"].to(torch.float64)
+            if K.shape != (1, 3, 3):
+                raise ValueError(f"K{i} has shape {tuple(K.shape[1:])}; it must be (3, 3)")
+            if problem := calibration_problems(K, torch.tensor([size]), f"K{i}")[0]:
+                raise ValueError(problem)
+            reduced[f"K{i}"] = _reduction(s) @ K
+        if "focal" in reduced:
+            reduced["focal"][:, i, 0] *= s.prod().sqrt().item()
+    return reduced
+
+
+def _reduction(s: Tensor) -> Tensor:
+    """The map (3, 3) from pixels of the original to those of the reduced image."""
+    # (0, 0) is the centre of the first pixel, so x_reduced + 1/2 = s (x + 1/2).
+    return torch.tensor([[s[0], 0, (s[0] - 1) / 2], [0, s[1], (s[1] - 1) / 2], [0, 0, 1]], dtype=torch.float64)
+
+
+def undistorted_matches(c: Correspondences, lenses: Sequence[Lens | None], scales: Sequence[Tensor]) -> Correspondences:
+    """Matches of two reduced photographs as pinholes of the same K would have them, in pixels of the reduced images.
+
+    lenses: of the originals, None where nothing is distorted. A match that a pinhole does not see is masked.
+    """
+    fields: dict[str, Tensor] = {"mask": c.mask}
+    for i, (lens, scale, x, lafs) in enumerate(zip(lenses, scales, (c.x0, c.x1), (c.lafs0, c.lafs1), strict=True)):
+        if lens is None or not lens.bends:
+            continue
+        points = x[0].detach().cpu().double().numpy()
+        to_pinhole = functools.partial(_reduced_pinhole, lens, scale.cpu().numpy())
+        there = torch.from_numpy(to_pinhole(points))
+        seen = there.isfinite().all(-1)
+        fields["mask"] = fields["mask"] & seen.to(c.mask.device)
+        fields[f"x{i}"] = torch.where(seen[:, None], there, 0)[None].to(x)
+        if lafs is not None:
+            frames = undistorted_frames(to_pinhole, points, lafs[0, ..., :2].detach().cpu().double().numpy())
+            moved = torch.cat([torch.from_numpy(frames).nan_to_num(0), there.nan_to_num(0)[..., None]], -1)
+            fields[f"lafs{i}"] = moved[None].to(lafs)
+    return c.replace(**fields)
+
+
+def _reduced_pinhole(lens: Lens, scale: Array, points: Array) -> Array:
+    """Pixels of a reduced photograph (n, 2) in its pinhole's image, reduced likewise."""
+    return (undistorted_points(lens, (points + 0.5) / scale - 0.5) + 0.5) * scale - 0.5
+
+
+def evenly_reduced(
+    c: Correspondences, F: Float[Tensor, "b 3 3"], scales: Sequence[Tensor]
+) -> tuple[Correspondences, Float[Tensor, "b 3 3"], list[Tensor]]:
+    """Matches, F and scales of images reduced alike in x and y, which whole pixels seldom are.
+
+    A crop of a photograph is otherwise stretched beside it by more than its noise, as no copy is.
+    """
+    even = [s.prod().sqrt().expand(2) for s in scales]
+    ratios = [(s / each).to(c.x0.device) for s, each in zip(scales, even, strict=True)]
+    maps = [_reduction(1 / ratio.cpu()).to(F) for ratio in ratios]
+    fields: dict[str, Tensor | None] = {}
+    ends = (c.x0, c.lafs0, c.K0), (c.x1, c.lafs1, c.K1)
+    for i, ((x, lafs, K), ratio, A) in enumerate(zip(ends, ratios, maps, strict=True)):
+        fields[f"x{i}"] = to_original(x.double(), ratio)
+        fields[f"lafs{i}"] = frames_to_original(lafs, ratio.to(x))
+        fields[f"K{i}"] = None if K is None else A.to(K) @ K
+    back0, back1 = (torch.linalg.inv(A) for A in maps)
+    return c.derived(**fields), unit_frobenius(back1.T @ F @ back0), even
+
+
+def geometry_to_original(geometry: PairGeometry, s0: Tensor, s1: Tensor) -> PairGeometry:
+    """The geometry of two reduced images in pixels of the originals."""
+    A0, A1 = (_reduction(s).numpy() for s in (s0.cpu(), s1.cpu()))
+    F, H = geometry.F, geometry.H
+    if F is not None:
+        F = A1.T @ F @ A0
+        F = F / np.linalg.norm(F)
+    if H is not None:
+        H = np.linalg.inv(A1) @ H @ A0
+        H = H / np.linalg.norm(H)
+    return geometry._replace(F=F, H=H)
+
+
+def fundamental_to_original(F: Float[Tensor, "3 3"], s0: Tensor, s1: Tensor) -> Float[Tensor, "3 3"]:
+    """F between two reduced images in pixels of the originals, of unit Frobenius norm."""
+    A0, A1 = (_reduction(s).to(F) for s in (s0, s1))
+    return unit_frobenius(A1.T @ F @ A0)

@@ -1,0 +1,189 @@
+"""The covariance of a two-view estimate: the reference, derivatives, what is not determined, laws, simulated noise."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import binom, chi2
+from torch import Tensor
+
+from fmtorch.geometry import two_view_covariance
+from tests.geometry.scenes import scene
+from tests.reference import two_view as reference
+from tests.reference.two_view import Cameras
+
+INF = math.inf
+PRECISIONS = {
+    "unknown": (np.diag([4.0, 9.0]), False),
+    "correlated": (np.array([[6.0, -4.0], [-4.0, 6.0]]), False),
+    "shared": (np.array([[3.0, 0.0], [0.0, 3.0]]), True),
+    "first known": (np.diag([INF, 5.0]), False),
+    "second known": (np.diag([5.0, INF]), False),
+    "both known": (np.diag([INF, INF]), False),
+    "shared and known": (np.diag([INF, 0.0]), True),
+}
+
+
+def problem(seed: int, n: int = 60, noise: float = 0.5) -> tuple[Cameras, np.ndarray, np.ndarray]:
+    """Cameras with square pixels near those that have noisy matches (n, 2), in pixels."""
+    s = scene(n, seed, noise)
+    rng = np.random.default_rng(seed)
+    principal = np.array([[500.0, 400], [520, 380]])
+    cameras = Cameras.of(s.R.numpy(), s.t.numpy(), np.array([910.0, 1090.0]), principal)
+    return cameras.moved(1e-4 * rng.normal(size=7)), s.x0.numpy(), s.x1.numpy()
+
+
+def arguments(*cameras: Cameras) -> dict[str, Tensor]:
+    return {
+        "R": torch.from_numpy(np.stack([c.R for c in cameras])),
+        "t": torch.from_numpy(np.stack([c.t for c in cameras])),
+        "focal": torch.from_numpy(np.stack([c.focal for c in cameras])),
+        "principal0": torch.from_numpy(np.stack([c.principal[0] for c in cameras])),
+        "principal1": torch.from_numpy(np.stack([c.principal[1] for c in cameras])),
+    }
+
+
+def batch(sizes: tuple[int, ...], noise: float = 0.5) -> dict[str, Tensor]:
+    """Pairs of different numbers of matches, with weights and noise, padded by what is not a number."""
+    problems = [problem(i, n, noise) for i, n in enumerate(sizes)]
+    longest, rng = max(sizes), np.random.default_rng(0)
+
+    def padded(values: list[np.ndarray]) -> Tensor:
+        filled = np.full((len(values), longest, *values[0].shape[1:]), np.nan)
+        for row, value in zip(filled, values, strict=True):
+            row[: len(value)] = value
+        return torch.from_numpy(filled)
+
+    return arguments(*(m[0] for m in problems)) | {
+        "x0": padded([m[1] for m in problems]), "x1": padded([m[2] for m in problems]),
+        "weight": padded([rng.uniform(0.2, 1, n) for n in sizes]),
+        "noise": padded([rng.uniform(0.5, 2, n) for n in sizes]),
+        "mask": torch.arange(longest) < torch.tensor(sizes)[:, None],
+        "truncation": torch.full((len(sizes),), 4.0, dtype=torch.float64),
+        "focal_precision": torch.diag_embed(torch.tensor([[4.0, 4.0]] * len(sizes), dtype=torch.float64)),
+        "shared_focal": torch.arange(len(sizes)) % 2 == 1,
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", PRECISIONS)
+def test_against_the_definitions(kind: str) -> None:
+    precision, shared = PRECISIONS[kind]
+    given = batch((40, 60, 90)) | {
+        "focal_precision": torch.from_numpy(precision).expand(3, 2, 2),
+        "shared_focal": torch.tensor([shared]).expand(3),
+    }
+    result = two_view_covariance(**given)
+    finite = np.where(np.isinf(precision), 0, precision)
+    basis = reference.directions(np.isinf(np.diag(precision)), shared)
+    for i, n in enumerate((40, 60, 90)):
+        cameras = problem(i, n)[0]
+        x0, x1, w, noise = (given[name][i, :n].numpy() for name in ("x0", "x1", "weight", "noise"))
+        C, V, s = reference.covariance(cameras, x0, x1, w, noise, 4.0, finite, basis)
+        turn = np.eye(7)  # tangents are any basis of a plane
+        turn[3:5, 3:5] = result.tangent[i].numpy().T @ cameras.basis
+        scale = np.sqrt(np.diag(turn @ C @ turn.T)) + 1e-12
+        # Central differences of step 1e-6 are good to 1e-9 or so, and the noise ends within a quarter to the tenth.
+        np.testing.assert_allclose(result.noise[i], s, rtol=1e-5)
+        np.testing.assert_allclose(
+            result.covariance[i].numpy() / np.outer(scale, scale), turn @ C @ turn.T / np.outer(scale, scale), atol=3e-5
+        )
+        np.testing.assert_allclose(result.fundamental[i].numpy(), V, atol=3e-5 * V.max())
+        known = np.isinf(np.diag(precision)) | (shared and np.isinf(precision).any())
+        assert not bool(result.covariance[i][5:][known].any())
+    degrees = torch.rad2deg(result.covariance.diagonal(dim1=1, dim2=2)[:, :5].split([3, 2], 1)[0].sum(1).sqrt())
+    torch.testing.assert_close(result.deviation_degrees[:, 0], degrees)
+
+
+def test_cameras_that_are_none_and_what_matches_leave_open_are_uncertain() -> None:
+    given = batch((50,) * 9)
+    bad = {k: v.clone() for k, v in given.items()}
+    bad["R"][0, 0, 0] = torch.nan
+    bad["t"][1] = 0
+    bad["focal"][2, 1] = -3
+    bad["truncation"][3] = 0
+    bad["focal_precision"][4] = torch.tensor([[1.0, torch.nan], [torch.nan, 1.0]])
+    bad["mask"][5] = False
+    bad["x0"][6], bad["x1"][6] = 7.0, 9.0
+    bad["focal_precision"][7] = torch.tensor([[-1e9, 0.0], [0.0, -1e9]])  # a prior that is no maximum adds nothing
+    result = two_view_covariance(**bad)
+    assert result.valid.tolist() == [False] * 5 + [True] * 4
+    for value in result:
+        assert not bool(value.isnan().any())
+    empty = two_view_covariance(**{name: value[:0] for name, value in given.items()})
+    assert empty.covariance.shape == (0, 7, 7)
+    nothing_known = torch.tensor([math.degrees(1.33 * 3**0.5), math.degrees(1.21 * 2**0.5)], dtype=torch.float64)
+    torch.testing.assert_close(result.deviation_degrees[:6], nothing_known.expand(6, 2))
+    assert bool((result.deviation_degrees[6] > 60).all())
+    assert bool((result.covariance.diagonal(dim1=1, dim2=2) >= 0).all())
+
+
+def test_what_is_not_determined_is_uncertain() -> None:
+    """A camera that turns has no direction of translation, one that moves along its axis no focal length."""
+    rng = np.random.default_rng(0)
+    X = np.c_[rng.uniform(-2, 2, (300, 2)), rng.uniform(4, 8, 300)]
+    principal = np.array([[500.0, 400], [500, 400]])
+
+    def deviations(R: np.ndarray, t: np.ndarray, precision: np.ndarray) -> tuple[Tensor, Tensor]:
+        Y = X @ R.T + t
+        x0, x1 = (900 * Z[:, :2] / Z[:, 2:] + principal[0] + rng.normal(0, 0.5, (300, 2)) for Z in (X, Y))
+        assumed = Cameras.of(R, t if t.any() else np.array([1.0, 0, 0]), np.array([900.0, 900]), principal)
+        result = two_view_covariance(
+            torch.from_numpy(x0)[None], torch.from_numpy(x1)[None], **arguments(assumed),
+            truncation=torch.tensor([1.5]), focal_precision=torch.from_numpy(precision)[None],
+        )  # fmt: skip
+        return result.deviation_degrees[0], result.covariance[0].diagonal()[5:].sqrt()
+
+    turned = reference.Rotation.from_rotvec([0.05, 0.2, 0.02]).as_matrix()
+    known = np.diag([INF, INF])
+    assert float(deviations(turned, np.zeros(3), known)[0][1]) > 20
+    assert float(deviations(turned, np.array([1.0, 0.1, 0]), known)[0][1]) < 1
+    prior = np.diag([6.25, 6.25])  # of a deviation of 0.4
+    along = deviations(np.eye(3), np.array([0, 0, 1.0]), prior)[1]
+    across = deviations(turned, np.array([1.0, 0.1, 0.3]), prior)[1]
+    assert bool((along > 0.2).all())
+    assert bool((across < 0.1).all())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["known", "shared", "unknown"])
+@pytest.mark.parametrize("n", [100, 200, 500])
+def test_ellipsoids_hold_simulated_noise(n: int, kind: str) -> None:
+    """Of 300 fits at 0.5 px, 95 % ellipsoids of R and t and intervals of log f hold 93 to 97 % of the truths.
+
+    Beyond that range the count must lie where chance has a thousandth.
+    """
+    trials, sigma = 300, 0.5
+    known, shared = kind == "known", kind == "shared"
+    precision = np.zeros((2, 2)) if known else np.diag([6.25, 6.25])
+    basis = reference.directions(np.array([known, known]), shared)
+    truths, fits, points = [], [], []
+    for trial in range(trials):
+        rng = np.random.default_rng([n, trial])
+        X = np.c_[rng.uniform(-2, 2, (n, 2)), rng.uniform(4, 8, n)]
+        R = reference.Rotation.from_rotvec(rng.normal(size=3) * 0.15).as_matrix()
+        t = np.array([1.0, *rng.normal(size=2) * 0.5])
+        truth = Cameras.of(R, t, np.array([900.0, 900.0]), np.array([[500.0, 400], [500, 400]]))
+        x0, x1 = (900 * Z[:, :2] / Z[:, 2:] + [500, 400] + rng.normal(0, sigma, (n, 2)) for Z in (X, X @ R.T + truth.t))
+        mean = np.log(np.array([900.0, 900.0]))  # far from deciding anything
+        fits.append(reference.fit(truth, x0, x1, 2 * sigma, basis, mean, precision, sigma))
+        truths.append(truth)
+        points.append((x0, x1))
+    result = two_view_covariance(
+        *(torch.from_numpy(np.stack(x)) for x in zip(*points, strict=True)), **arguments(*fits),
+        truncation=torch.full((trials,), 2 * sigma, dtype=torch.float64),
+        focal_precision=torch.from_numpy(np.diag([INF, INF]) if known else precision).expand(trials, 2, 2),
+        shared_focal=torch.full((trials,), shared),
+    )  # fmt: skip
+    C, tangent = result.covariance.numpy(), result.tangent.numpy()
+    held = np.zeros((trials, 2), bool)
+    for i, (truth, fit) in enumerate(zip(truths, fits, strict=True)):
+        by = fit.difference(truth)
+        by[3:5] = tangent[i].T @ (truth.t - fit.t)
+        held[i, 0] = by[:5] @ np.linalg.solve(C[i, :5, :5], by[:5]) < chi2.ppf(0.95, 5)
+        held[i, 1] = known or abs(by[5]) < 1.96 * math.sqrt(C[i, 5, 5])
+    low, high = binom.ppf(0.001, trials, 0.93), binom.ppf(0.999, trials, 0.97)
+    for name, count in zip(("R and t", "log f"), held.sum(0), strict=True):
+        print(f"{kind}, n = {n}, {name}: {count / trials:.1%}")
+        assert known or low <= count <= high, name
+    assert low <= held[:, 0].sum() <= high

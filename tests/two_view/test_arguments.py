@@ -1,0 +1,239 @@
+"""What users hand over: lists of pairs, sizes for all, NumPy everywhere, presets of their own, empty batches."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import fmtorch
+from fmtorch import metrics
+from fmtorch.core import Correspondences, Estimate, collate
+from fmtorch.data import ImageSource
+from fmtorch.evaluation import evaluate
+from fmtorch.pipeline import load_pipeline
+from tests.helpers import draw, pair
+from tests.helpers import small_pipeline as pipeline
+from tests.laws import quick, scene, shown
+from tests.processes import run_command
+from tests.reference import known_cameras
+from tests.variants import OTHER_LIBRARIES, built, keywords, variants
+
+EVERY = [n for n in variants("estimator") if not n.startswith(OTHER_LIBRARIES[1:])]
+PAIRS = [scene(i, count) for i, count in enumerate((60, 90, 40))]
+FAST = {"estimator": "msac", "hypotheses": 100}
+
+
+def test_a_list_of_pairs_is_a_padded_batch() -> None:
+    batch = collate(PAIRS)
+    batched = fmtorch.find_fundamental(
+        batch.x0, batch.x1, mask=batch.mask, ratio=batch.ratio, lafs0=batch.lafs0, lafs1=batch.lafs1,
+        size0=batch.size0, size1=batch.size1, key=batch.key,
+    )  # fmt: skip
+    listed = fmtorch.find_fundamental(
+        [c.x0[0].numpy() for c in PAIRS], [c.x1[0] for c in PAIRS], ratio=[c.ratio[0].numpy() for c in PAIRS],
+        lafs0=[c.lafs0[0] for c in PAIRS], lafs1=[c.lafs1[0] for c in PAIRS], size0=(640, 960), size1=[640, 960],
+        key=[1, 2, 3],
+    )  # fmt: skip
+    assert torch.equal(listed.F, batched.F)
+    assert torch.equal(listed.inliers, batched.inliers)
+    assert bool(listed.ok.all())
+
+
+def test_gradients_reach_the_pairs_of_a_list() -> None:
+    points = [c.x0[0].double().requires_grad_() for c in PAIRS]
+    fmtorch.find_fundamental(points, [c.x1[0] for c in PAIRS], **FAST).F.sum().backward()
+    assert all(x.grad is not None and bool((x.grad != 0).any()) for x in points)
+
+
+def test_one_size_is_that_of_all_pairs() -> None:
+    batch = collate([PAIRS[0], PAIRS[0]])
+    each = fmtorch.find_fundamental(batch.x0, batch.x1, size0=batch.size0, size1=batch.size1)
+    for size in ((640, 960), np.array([640, 960]), torch.tensor([[640, 960]])):
+        assert torch.equal(fmtorch.find_fundamental(batch.x0, batch.x1, size0=size, size1=size).F, each.F)
+    with pytest.raises(ValueError, match=r"size0 has shape \(3, 2\)"):
+        fmtorch.find_fundamental(batch.x0, batch.x1, size0=[(640, 960)] * 3, size1=(640, 960))
+
+
+@pytest.mark.parametrize(
+    ("x0", "x1", "options", "message"),
+    [
+        ([np.zeros((9, 2))], np.zeros((9, 2)), {}, "x0 is a list of pairs and the other is not"),
+        ([np.zeros((9, 2))] * 2, [np.zeros((9, 2))], {}, "x1 must be a list of 2 arrays"),
+        ([np.zeros((9, 2))], [np.zeros((8, 2))], {}, "pair 0: x0 has shape .9, 2. but x1 .8, 2."),
+        ([np.zeros((9, 3))], [np.zeros((9, 3))], {}, "pair 0: x0 has shape .9, 3.; it must be"),
+        ([np.zeros((9, 2))], [np.zeros((9, 2))], {"prior": np.zeros((2, 9))}, "prior must be a list of 1 arrays"),
+        (np.zeros((9, 2)), np.zeros((9, 2)), {"key": np.array(0.5)}, "key is of torch.float64; it must be whole"),
+    ],
+)
+def test_what_does_not_fit_is_named(x0: object, x1: object, options: dict[str, object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        fmtorch.find_fundamental(x0, x1, **options)  # type: ignore[arg-type]
+
+
+SCENE = known_cameras.scene(7, 200, noise=0.2)
+EASY = {"estimator": "msac", "hypotheses": 300}
+
+
+@pytest.mark.parametrize("kind", [torch.float16, torch.bfloat16, torch.uint8, torch.int16, torch.uint16, torch.int64])
+def test_numbers_of_any_type_are_those_of_float64(kind: torch.dtype) -> None:
+    """Points, priors and calibrations of mixed precision or of whole numbers: what they are, not how they are held."""
+    x0, x1 = ((torch.from_numpy(x) / 3).to(kind) for x in (SCENE.x0, SCENE.x1))
+    K0, K1 = (torch.from_numpy(K).to(torch.float16).to(torch.float64) for K in (known_cameras.K0, known_cameras.K1))
+    prior = torch.from_numpy(np.where(SCENE.right, 0.75, 0.25))
+    wide = (x0.double(), x1.double(), K0, K1)
+    given = fmtorch.find_essential(x0, x1, K0.half(), K1.half(), prior=prior.half(), **EASY)
+    expected = fmtorch.find_essential(*wide, prior=prior, **EASY)
+    assert torch.equal(given.inliers, expected.inliers)
+    torch.testing.assert_close(given.F.double(), expected.F.double(), rtol=0, atol=1e-6)
+    if kind == torch.uint16:
+        assert torch.equal(fmtorch.find_essential(x0.numpy(), x1.numpy(), K0, K1, prior=prior, **EASY).F, expected.F)
+
+
+def test_masked_complex_and_boolean_points_are_refused() -> None:
+    x0, x1 = SCENE.x0, SCENE.x1
+    masked = np.ma.masked_array(x0, mask=np.zeros_like(x0, bool))
+    assert bool(fmtorch.find_fundamental(masked, x1, **EASY).ok)
+    masked[3] = np.ma.masked
+    with pytest.raises(ValueError, match="x0 is a masked array; give its data, and what counts in `mask`"):
+        fmtorch.find_fundamental(masked, x1)
+    with pytest.raises(TypeError, match=r"x1 is a tensor of torch\.complex128; it must hold real numbers"):
+        fmtorch.find_fundamental(x0, torch.from_numpy(x1 + 0j))
+    with pytest.raises(TypeError, match="x0 holds booleans"):
+        fmtorch.find_fundamental(x0 > 0, x1)
+
+
+def test_raw_distances_are_no_ratios() -> None:
+    """They were taken for ratios, and an easy pair had a wrong F or none; a score beyond 1 is refused by its name."""
+    distances = np.where(SCENE.right, 120.0, 310.0)
+    with pytest.raises(
+        ValueError, match=r"^ratio of match 0 of pair 0 is .*within \[0, 1\]\. Of raw distances.*`score`"
+    ):
+        fmtorch.find_fundamental(SCENE.x0, SCENE.x1, ratio=distances)
+    with pytest.raises(ValueError, match=r"^score of match 0 of pair 0 is 310"):
+        fmtorch.find_fundamental(SCENE.x0, SCENE.x1, score=np.flip(np.sort(distances)))
+    assert bool(fmtorch.find_fundamental(SCENE.x0, SCENE.x1, ratio=distances / 310, **EASY).ok)
+
+
+def test_a_list_of_single_points_is_one_pair() -> None:
+    """As `list(points)` of OpenCV's (n, 1, 2) is; the other points may come in another form."""
+    listed = [list(x[:, None]) for x in (SCENE.x0, SCENE.x1)]
+    expected = fmtorch.find_fundamental(SCENE.x0, SCENE.x1, **EASY)
+    for x0, x1 in (listed, (SCENE.x0, listed[1]), (listed[0], [torch.from_numpy(x) for x in listed[1]])):
+        assert torch.equal(fmtorch.find_fundamental(x0, x1, **EASY).F, expected.F)
+
+
+# Wrong types are tried in a process of their own: the tests' import hook would refuse them before we do.
+WRONG_TYPES = """
+import numpy as np, torch, fmtorch
+x, image = np.zeros((9, 2)), np.zeros((9, 9), np.uint8)
+for call in (
+    lambda: fmtorch.find_fundamental(None, None),
+    lambda: fmtorch.find_fundamental("ab", "ab"),
+    lambda: fmtorch.find_fundamental([[1, 2], [3]], [[1, 2], [3]]),
+    lambda: fmtorch.find_fundamental(x, x, ratio=object()),
+    lambda: fmtorch.find_fundamental([x], [x], prior=0.5),
+    lambda: fmtorch.match(None, image),
+    lambda: fmtorch.match(image, [1, 2]),
+    lambda: fmtorch.match(b"a.jpg", b"b.jpg"),
+    lambda: fmtorch.match(torch.zeros(4, 4), image),
+    lambda: fmtorch.match(image, image, pipeline=None),
+):
+    try:
+        print("taken", call())
+    except Exception as error:
+        print(f"{type(error).__name__}: {error}")
+"""
+TOLD = """\
+TypeError: x0 is a NoneType of object; it must be an array or tensor of numbers
+TypeError: x0 is a str of <U2; it must be an array or tensor of numbers
+TypeError: x0 is a list of uneven rows; it must be an array or a tensor
+TypeError: ratio is a object of object; it must be an array or tensor of numbers
+ValueError: prior must be a list of 1 arrays, one for each pair of x0
+TypeError: image0 is a NoneType; it must be a file's path or a uint8 array of NumPy
+TypeError: image1 is a list; it must be a file's path or a uint8 array of NumPy
+TypeError: image0 is a bytes; it must be a file's path or a uint8 array of NumPy
+TypeError: image0 is a Tensor; it must be a file's path or a uint8 array of NumPy
+TypeError: pipeline is a NoneType; it must be the name of a preset or a Pipeline
+"""
+
+
+def test_wrong_types_are_named(tmp_path: Path) -> None:
+    done = run_command("-c", WRONG_TYPES, cwd=tmp_path)
+    assert done.stdout == TOLD, done.stderr
+
+
+def test_presets_of_ones_own(tmp_path: Path) -> None:
+    for group in ("estimator", "pipeline"):
+        (tmp_path / group).mkdir()
+    file = tmp_path / "estimator" / "mine.yaml"
+    file.write_text("_target_: fmtorch.estimators.Ransac\nthreshold: 0.5\nhypotheses: 100\n")
+    (tmp_path / "pipeline" / "my_pipeline.yaml").write_text(
+        "# @package _global_\ndefaults:\n  - override /estimator: mine\n  - override /pruner: [one_to_one, ratio]\n"
+    )
+    x0, x1 = PAIRS[0].x0[0], PAIRS[0].x1[0]
+    own = fmtorch.find_fundamental(x0, x1, estimator="mine", config_dir=tmp_path)
+    assert torch.equal(own.F, fmtorch.find_fundamental(x0, x1, threshold=0.5, final="least_squares", **FAST).F)
+    file.write_text(file.read_text().replace("0.5", "2.5"))  # edited: read anew
+    assert not torch.equal(own.F, fmtorch.find_fundamental(x0, x1, estimator="mine", config_dir=str(tmp_path)).F)
+    built = load_pipeline("my_pipeline", config_dir=tmp_path)
+    assert list(built.pruners) == ["one_to_one", "ratio"]
+    assert built.estimator.search.hypotheses == 100  # type: ignore[attr-defined]
+    with pytest.raises(ValueError, match=r"no preset 'their_pipeline' in conf/pipeline; there are: .*my_pipeline"):
+        load_pipeline("their_pipeline", config_dir=tmp_path)
+    with pytest.raises(ValueError, match=r"config_dir=.*nowhere is no folder"):
+        load_pipeline("my_pipeline", config_dir=tmp_path / "nowhere")
+    with pytest.raises(ValueError, match="no preset 'mine'"):
+        fmtorch.find_fundamental(x0, x1, estimator="mine")
+
+
+@pytest.mark.parametrize("shape", [(0, 5), (0, 0), (2, 0)])
+def test_an_empty_batch_gives_an_empty_result(shape: tuple[int, int]) -> None:
+    b, n = shape
+    numbers, frames, sizes = torch.zeros(b, n), torch.zeros(b, n, 2, 3), torch.ones(b, 2, dtype=torch.int64)
+    yes = torch.ones(b, n, dtype=torch.bool)
+    c = Correspondences(
+        torch.zeros(b, n, 2), torch.zeros(b, n, 2), yes, ratio=numbers, prior=numbers, lafs0=frames, lafs1=frames,
+        size0=sizes, size1=sizes, mutual=yes, noise=numbers,
+    )  # fmt: skip
+    for name in EVERY:
+        estimate = (quick(name) if "opencv" not in name else built("estimator", name))(c)
+        assert estimate.F.shape == (b, 3, 3), name
+        assert not bool(estimate.ok.any()), name
+    for name in variants("pruner"):
+        assert shown(built("pruner", name))(c).compact().mask.shape == (b, 0), name
+    assert len(fmtorch.find_fundamental(c.x0, c.x1)) == b
+    assert len(fmtorch.find_fundamental([], [])) == 0
+    F = torch.zeros(b, 3, 3)
+    assert metrics.nsgd(F, F, sizes, sizes).shape == metrics.nsgd_released(F, F, sizes, sizes).shape == (b,)
+    assert metrics.inlier_rate(F, c.x0, c.x1, yes, sizes, sizes).after.shape == (b,)
+
+
+@pytest.mark.parametrize("name", [n for n in variants("estimator") if n.startswith(("opencv", "kornia"))])
+def test_estimators_without_gradients_say_so(name: str) -> None:
+    x0, x1 = PAIRS[0].x0[0].double(), PAIRS[0].x1[0].double()
+    assert bool(fmtorch.find_fundamental(x0, x1, **keywords(name)).ok)
+    with pytest.raises(ValueError, match="passes no gradient on"):
+        fmtorch.find_fundamental(x0.requires_grad_(), x1, **keywords(name))
+    with torch.no_grad():
+        assert bool(fmtorch.find_fundamental(x0, x1, **keywords(name)).ok)
+
+
+@pytest.mark.parametrize("wrong", [float("nan"), float("inf"), 0.0])
+def test_an_estimator_that_gives_no_matrix_makes_failed_rows(wrong: float, tmp_path: Path) -> None:
+    images = [draw(tmp_path / f"{i}.png", seed=0, shift=9 * i) for i in range(3)]
+    built = pipeline()
+    sound = built.estimator
+
+    def spoiled(c: Correspondences, seed: int = 0) -> Estimate:
+        estimate = sound(c, seed)
+        F = estimate.F.clone()
+        F[0] = wrong if wrong != wrong or wrong else 0
+        return estimate.replace(F=F)
+
+    built.estimator = spoiled
+    pairs = [pair(name, images[0], ImageSource(name, image.path)) for name, image in zip("ab", images[1:], strict=True)]
+    first, second = evaluate(built.run(pairs))
+    assert (first.ok, second.ok) == (False, True)
+    assert first.reason == "estimation: F is zero or not finite, though the estimator calls it ok"
+    assert first.corrs == 0
