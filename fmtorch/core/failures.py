@@ -50,5 +50,7 @@ def _is_own(file: str) -> bool:
     """Whether a file is neither of this project, nor of an installed package, nor of Python."""
     if file.startswith("<") and not file.startswith("<ipython"):
         return False
+    if file.endswith((".pyx", ".pxd", ".pxi")):  # as compiled extensions name their sources, such as HDF5's
+        return False
     path, library = Path(file).resolve(), Path(sysconfig.get_path("stdlib")).resolve()
     return not (set(INSTALLED) & set(path.parts) or path.is_relative_to(PACKAGE) or path.is_relative_to(library))

@@ -158,8 +158,8 @@ def train(
             try:
                 lightning_trainer.fit(module, own, validation, ckpt_path=path, weights_only=True)
             except SystemExit:  # which Lightning makes of Ctrl-C
-                kept = f"step {latest_checkpoint(folder)[1]} of {total} is kept in {folder}"
-                raise KeyboardInterrupt(kept) from None
+                reached = latest_checkpoint(folder)[1]
+                raise KeyboardInterrupt(f"step {reached} of {total} is kept in {folder}") from None
             step = lightning_trainer.global_step
     return step, module.seconds
 

@@ -16,7 +16,7 @@ from fmtorch.training import (
 from tests.training.conftest import exact
 
 
-class Pairs:
+class Pairs(StoredMatches):
     """Pairs of which only the lengths are known, as various as those of the rendered scenes."""
 
     def __init__(self, n: int = 300) -> None:
