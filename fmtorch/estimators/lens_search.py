@@ -66,7 +66,7 @@ def fit_with_lenses(
     )
     weighted = Weighted(matches.points, pair.weight, matches.s2, LOSS_CODES["truncated"], NO_TABLE)
     limits = Limits(squared(pair.pixels_per_unit / (scale_px / FitScale().scale_sigmas)), iterations, FOCAL_TOLERANCE)
-    minimise_with_lenses(own, weighted, images, half_diagonals(pair), prior, limits, out)
+    minimise_with_lenses(own, weighted, images, prior._replace(diagonal=half_diagonals(pair)), limits, out)
     F = np.empty((k, 9))
     translate(out.F, images.offset, F)
     F /= np.linalg.norm(F, axis=1, keepdims=True)

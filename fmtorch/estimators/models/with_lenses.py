@@ -42,12 +42,14 @@ ROWS = 12  # of a match: derivatives by nine entries and two lenses, and the res
 class LensPrior(NamedTuple):
     """What is known of the lenses of both images.
 
-    mean, precision: (2,), of lambda, one over its variance. shared: whether there is one lens for both.
+    mean, precision: (2,), of lambda, one over its variance. shared: whether there is one lens for both. diagonal: (2,),
+    half of the images', in the unit of the points.
     """
 
     mean: F8x1
     precision: F8x1
     shared: bool
+    diagonal: F8x1 = np.ones(2)
 
 
 class LensOptimum(NamedTuple):
@@ -121,7 +123,7 @@ class _Data(NamedTuple):
 
 @kernel
 def minimise_with_lenses(
-    cameras: Cameras, matches: Weighted, images: Images, diagonal: F8x1, prior: LensPrior, limits: Limits,
+    cameras: Cameras, matches: Weighted, images: Images, prior: LensPrior, limits: Limits,
     out: LensOptimum,
 ) -> None:  # fmt: skip
     """Cameras and lenses of least negative logarithm of the posterior near these, in place; what it is there -> out.
@@ -136,7 +138,9 @@ def minimise_with_lenses(
         np.empty((k, PARAMETERS, PARAMETERS)),
     )  # fmt: skip
     rows, products = in_rows(matches.points, matches.weight, matches.s2), matrix(ROWS, ROWS)
-    data = _Data(rows, matches.loss, matches.table, images, diagonal, prior, limits, np.zeros((k, 9, LANES)), products)
+    data = _Data(
+        rows, matches.loss, matches.table, images, prior.diagonal, prior, limits, np.zeros((k, 9, LANES)), products
+    )
     _minimise(data, state, trial, np.full(k, FIRST_DAMPING), limits.iterations, limits.tolerance >= 0)
 
 
