@@ -69,10 +69,27 @@ def _fields(app: object, what: str, name: str, obj: Any, options: object, lines:
     entries = []
     for names, words in about.items():
         first = re.split(r"[ ,]", names)[0]
-        entries += [f"- **{names}** : ``{_type(fields[first].type)}``", f"  -- {words}"]
+        entries += [f"- `{names}` : ``{_type(fields[first].type)}``", f"  -- {words}"]
     named = {name for names in about for name in re.findall(r"\w+", names)}
-    entries += [f"- **{key}** : ``{_type(field.type)}``" for key, field in fields.items() if key not in named]
+    entries += [f"- `{key}` : ``{_type(field.type)}``" for key, field in fields.items() if key not in named]
     lines[:] = [line for part in paragraphs for line in (part, "")] + entries + [""]
+
+
+def _signature(
+    app: object, what: str, name: str, obj: Any, options: object, signature: str | None, returned: str | None
+) -> tuple[str | None, str | None] | None:
+    """Shapes and arrays as a reader knows them; a record's fields are a list below."""
+    if what == "class" and dataclasses.is_dataclass(obj):
+        return "", None
+    return _readable(signature), _readable(returned)
+
+
+def _readable(text: str | None) -> str | None:
+    if text is None:
+        return None
+    text = text.replace("Tensor | ndarray[tuple[Any, ...], dtype[Any]] | Sequence[Any]", "Arrays")
+    shaped = re.compile(r"~?(?:jaxtyping\.)?(\w+)\[Tensor, '([^']*)'\]")
+    return shaped.sub(lambda found: f"{found[1]}[{', '.join(found[2].replace('#', '').split())}]", text)
 
 
 def _type(annotation: Any) -> str:
@@ -93,5 +110,6 @@ def _front(app: Any, error: Exception | None) -> None:
 def setup(app: Any) -> None:
     """Called by Sphinx."""
     app.connect("autodoc-process-docstring", _fields, priority=100)
+    app.connect("autodoc-process-signature", _signature)
     app.connect("build-finished", _front)
     app.connect("autodoc-process-docstring", _plain_text, priority=1000)

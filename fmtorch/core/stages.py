@@ -167,7 +167,7 @@ def output_of(
             precision, or pairs that are not those given. The message begins with the part's name.
     """
     named = part if isinstance(part, type) or hasattr(part, "__qualname__") else type(part)
-    name = f"{named.__module__}.{named.__qualname__}"  # type: ignore[attr-defined]
+    name = f"{named.__module__}.{named.__qualname__}"
     if not isinstance(value, kind):
         what = "None" if value is None else f"a {type(value).__name__}"
         raise TypeError(f"{name} returned {what}; it must return {kind.__name__}")

@@ -56,7 +56,7 @@ class PairGeometry(NamedTuple):
     @property
     def texts(self) -> dict[str, str]:
         """What files say of the pair in words: its configuration, and reason and warning where there are any."""
-        texts = {"pair_type": self.kind, "reason": self.reason, "warning": self.warning}
+        texts = {"configuration": self.kind, "reason": self.reason, "warning": self.warning}
         return {name: text for name, text in texts.items() if text}
 
 

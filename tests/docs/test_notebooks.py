@@ -59,7 +59,9 @@ def test_train_a_pruner(run: Any) -> None:
     losses = torch.tensor(names["losses"])
     assert len(losses) == 20
     assert losses[-5:].mean() < 0.8 * losses[:2].mean()
-    assert all(len(errors) == 8 for errors in names["errors"].values())
+    assert set(names["errors"]) == {"no prior", "the default prior", "the network's"}
+    assert all(len(errors) == len(names["scenes"]) == 16 for errors in names["errors"].values())
+    assert all(values.mean() > 20 for values in names["auc"].values())
 
 
 @pytest.mark.parametrize("path", sorted(NOTEBOOKS.glob("*.ipynb")), ids=lambda path: path.stem)
