@@ -5,8 +5,9 @@ every other name of this module is OpenCV's own. Flags stand for presets, see `P
 points (FM_7POINT, FM_8POINT, method 0 of homographies) it computes here, too.
 
 Thresholds decide which matches the mask holds, as OpenCV's do; by which distances models are searched and fitted is the
-presets' own. `confidence` and `maxIters` where they are not given are the presets', too. Image sizes, cameras of two
-kinds, priors and gradients have no place in these signatures: `fmtorch.find_fundamental` takes them.
+presets' own. `confidence` and `maxIters` where they are not given are the presets', too. Image sizes are assumed from
+the points' extent, as `fmtorch.find_fundamental` does where none are given. Cameras of two kinds, priors and gradients
+have no place in these signatures, but in its own.
 """
 
 from __future__ import annotations

@@ -21,6 +21,7 @@ from fmtorch.core.annotations import Rule
 from fmtorch.core.display import table_html
 from fmtorch.core.records import Index, Record, as_index, expect_fields, gathered, padded, slotted
 
+MIN_LENS, MAX_LENS = -0.45, 0.2  # of lenses that leave an image unfolded and its corners in front of the camera
 PROBABILITY = Rule(lambda prior: (prior >= 0) & (prior <= 1), "it is P(inlier), within [0, 1]")
 DEVIATION = Rule(lambda noise: noise > 0, "it is a standard deviation, positive")
 SIZE = Rule(lambda size: (size > 0) & (size < torch.inf), "image sizes (h, w) are positive")
@@ -29,6 +30,13 @@ FOCAL = Rule(
         (focal[..., 1] == torch.inf) | ((focal[..., 1] >= 0) & (focal[..., 0] > 0) & (focal[..., 0] < torch.inf))
     ),
     "it is a positive focal length in pixels and a relative deviation, 0 if exact, infinite if unknown",
+)
+LENS = Rule(
+    lambda lens: (
+        (lens[..., 1] == torch.inf)
+        | ((lens[..., 1] >= 0) & (lens[..., 0] >= MIN_LENS) & (lens[..., 0] <= MAX_LENS) & (lens[..., 1] < torch.inf))
+    ),
+    "it is lambda in half diagonals, from -0.45, below which images fold, to 0.2, and its deviation",
 )
 
 RELATED = 1.0
@@ -110,6 +118,8 @@ class Correspondences(Record):
     focal: what estimators may take for known of the focal lengths of both images, (B, 2, 2): px and relative standard
     deviation (0 exact, infinite unknown), for square pixels and central principal points. shared_focal: (B,), whether
     both are one in units of the longer sides. Without these estimates are of F alone, whatever K0 and K1 are.
+    lens: what is known of the lenses of both images, (B, 2, 2): lambda of the division model and its standard deviation
+    (0 exact, infinite unknown), see `fmtorch.find_fundamental`. shared_lens: (B,), whether both are one.
     """
 
     x0: Float[Tensor, "b n 2"]
@@ -128,6 +138,8 @@ class Correspondences(Record):
     noise: Annotated[Float[Tensor, "b n"], DEVIATION] | None = None
     focal: Annotated[Float[Tensor, "b 2 2"], FOCAL] | None = None
     shared_focal: Bool[Tensor, " b"] | None = None
+    lens: Annotated[Float[Tensor, "b 2 2"], LENS] | None = None
+    shared_lens: Bool[Tensor, " b"] | None = None
     score: Annotated[Float[Tensor, "b n"], PROBABILITY] | None = None
 
     def __post_init__(self) -> None:
@@ -202,6 +214,10 @@ class Estimate(Record):
     plane, the rotation or the copy, zero where there is none; other_R, other_t, the second pose that explains a plane,
     NaN where there is none.
 
+    Where image sizes are not given and may be assumed: sizes (B, 2, 2), (h, w) of both images as the points tell them,
+    NaN where these tell none; sizes_doubtful (B,), whether images of one size and of two were both likely.
+
+    Where lenses are estimated: lens (B, 2), lambda of both, NaN where they are not determined.
     Where calibration matrices are known: contradicted (B,), whether far more matches agree without them.
     """
 
@@ -225,6 +241,9 @@ class Estimate(Record):
     homography: Float[Tensor, "b 3 3"] | None = None
     other_R: Float[Tensor, "b 3 3"] | None = None
     other_t: Float[Tensor, "b 3"] | None = None
+    sizes: Float[Tensor, "b 2 2"] | None = None
+    sizes_doubtful: Bool[Tensor, " b"] | None = None
+    lens: Float[Tensor, "b 2"] | None = None
     contradicted: Bool[Tensor, " b"] | None = None
 
     def __post_init__(self) -> None:
@@ -263,16 +282,22 @@ class Estimate(Record):
 
     @property
     def warning(self) -> tuple[str, ...]:
-        """What the type of each pair leaves open, and whether its matches contradict its calibration matrices.
+        """What the type of each pair leaves open, whether its matches contradict its calibration matrices, and which
+        sizes were doubtful.
 
-        Empty where there is nothing to say. Raises as `pair_type` where neither was looked at.
+        Empty where there is nothing to say. Raises as `pair_type` where none of these was looked at.
         """
-        if self.pair_type_index is None and self.contradicted is not None:
+        looked = self.contradicted is not None or self.sizes_doubtful is not None
+        if self.pair_type_index is None and looked:
             opens = [""] * len(self)
         else:
             opens = [WARNINGS[name] for name in self.pair_type]
         contradicted = [False] * len(self) if self.contradicted is None else self.contradicted.tolist()
-        said = ((CONTRADICTED if wrong else "", left) for wrong, left in zip(contradicted, opens, strict=True))
+        said = [[CONTRADICTED if wrong else "", left] for wrong, left in zip(contradicted, opens, strict=True)]
+        if self.sizes is not None and self.sizes_doubtful is not None:
+            for i in self.sizes_doubtful.nonzero()[:, 0].tolist():
+                sizes = " and ".join(f"({h:.0f}, {w:.0f})" for h, w in self.sizes[i].tolist())
+                said[i].append(f"image sizes are not given, and {sizes} is assumed: give size0 and size1, or 'unknown'")
         return tuple("; ".join(filter(None, each)) for each in said)
 
     @property

@@ -18,7 +18,8 @@ from fmtorch.estimators.final_fits import Fit, scale_of
 from fmtorch.estimators.gradients import Attach, Solved, with_gradients
 from fmtorch.estimators.models.model import Estimated
 from fmtorch.estimators.models.posterior import focal_precision, focals_near, focals_px
-from fmtorch.estimators.pair import EXACT, Pair, PixelMatches, bucket, calibration_of, normalize_pair
+from fmtorch.estimators.models.with_lenses import undistorted
+from fmtorch.estimators.pair import EXACT, Lens, Pair, PixelMatches, bucket, calibration_of, normalize_pair
 from fmtorch.estimators.preselection import degenerate_support
 from fmtorch.geometry.arithmetic import sqrt
 from fmtorch.geometry.epipolar import SAMPSON, Residual
@@ -31,15 +32,20 @@ PARTS_OF_A_THREAD = 4  # so that no thread is long alone at the end
 MIN_WORK = 500  # matches: a pair of fewer takes as long as one of these
 NOT_SOLVED = "every minimal sample was degenerate"
 NOT_FINITE = "the final fit is not finite"
+NO_SIZES = "a lens needs the image sizes"
+MAX_LENS_DEVIATION = 0.1  # standard deviation above which matches do not determine a lens
 
 
 class Solution(NamedTuple):
-    """What an estimator says of one pair: the fit, None with a reason where there is none; samples drawn; inliers."""
+    """What an estimator says of one pair: the fit, None with a reason where there is none; samples drawn; inliers;
+    lenses (2,) and their standard deviations (2,), None where they are not estimated."""
 
     fit: Fit | None
     samples: int
     inliers: Array | None = None
     reason: str = ""
+    lens: Array | None = None
+    deviation: Array | None = None
 
 
 class CameraRows(NamedTuple):
@@ -88,6 +94,7 @@ class Estimation:
         self.F, self.inliers, self.ok = np.zeros((b, 3, 3)), np.zeros((b, n), np.bool_), np.zeros(b, np.bool_)
         self.samples, self.significance, self.reasons = np.zeros(b, np.int64), np.full(b, -np.inf), [""] * b
         self.cameras = CameraRows(np.full((b, 2), np.nan), np.full(b, np.nan), np.full((b, 2, 2), np.nan))
+        self.lens = np.full((b, 2), np.nan)
         self.asked_for_cameras = family.model == "fundamental" and c.asks_for_cameras
         self.graphed = torch.is_grad_enabled() and c.requires_grad
         self.solved: dict[int, Solved] = {}
@@ -117,7 +124,11 @@ class Estimation:
             self.ok[i] = True
             self.inliers[i, row.slot] = solution.inliers
             fundamental = self.family.model == "fundamental"
-            self.significance[i] = _significance(self.F[i], row.matches) if fundamental else np.nan
+            matches = row.matches if solution.lens is None else _straight(row, solution.lens)
+            self.significance[i] = _significance(self.F[i], matches) if fundamental else np.nan
+            if solution.lens is not None:
+                told = solution.deviation is None or solution.deviation <= MAX_LENS_DEVIATION
+                self.lens[i] = np.where(told, solution.lens, np.nan)
             if self.asked_for_cameras and pair.sizes_known:
                 self.cameras.fill(i, solution.fit, pair)
             if self.graphed:
@@ -129,9 +140,19 @@ class Estimation:
         arrays["significance"] = self.significance
         if self.asked_for_cameras:
             arrays |= self.cameras._asdict()
+        if self.batch.lens is not None:
+            arrays["lens"] = self.lens
         fields = {name: torch.from_numpy(value).to(self.c.mask.device) for name, value in arrays.items()}
         estimates = Estimate.unchecked(reason=tuple(self.reasons), model=self.family.model, **fields)
         return with_gradients(estimates, self.c, self.solved, attach) if self.graphed else estimates
+
+
+def _straight(row: Row, lens: Array) -> PixelMatches:
+    """The matches of a pair as pinholes would have them."""
+    pair, x0, x1 = row.pair, row.matches.x0.copy(), row.matches.x1.copy()
+    points = undistorted(pair, lens).points.T * pair.pixels_per_unit + pair.centre
+    x0[row.slot], x1[row.slot] = points[:, :2], points[:, 2:]
+    return row.matches._replace(x0=x0, x1=x1)
 
 
 def _significance(F: Array, matches: PixelMatches) -> float:
@@ -164,7 +185,7 @@ def shared_out(c: Correspondences) -> list[Tensor]:
 class Batch(NamedTuple):
     """The tensors of a batch on the host as arrays, one row a pair; sizes: (b, 4), h, w, h, w, empty where unknown.
 
-    focal: (b, 2, 2); shared: (b,), whether both focal lengths are one.
+    focal: (b, 2, 2); shared: (b,), whether both focal lengths are one; lens: (b, 2, 2), and one_lens (b,) likewise.
     """
 
     x0: Array
@@ -177,6 +198,8 @@ class Batch(NamedTuple):
     keys: list[int]
     focal: Array | None
     shared: Array
+    lens: Array | None
+    one_lens: Array
 
     @staticmethod
     def of(c: Correspondences) -> Batch:
@@ -190,7 +213,10 @@ class Batch(NamedTuple):
         focal = None if c.focal is None else np.asarray(_array(c.focal), np.float64)
         if focal is None and shared.any():
             focal = np.full((len(keys), 2, 2), np.inf)
-        return Batch(_array(c.x0), _array(c.x1), c.mask.numpy(), prior, noise, ambiguity, sizes, keys, focal, shared)
+        lens = None if c.lens is None else np.asarray(_array(c.lens), np.float64)
+        one_lens = np.zeros(len(keys), np.bool_) if c.shared_lens is None else c.shared_lens.numpy()
+        matches = _array(c.x0), _array(c.x1), c.mask.numpy()
+        return Batch(*matches, prior, noise, ambiguity, sizes, keys, focal, shared, lens, one_lens)
 
     def pair(self, i: int) -> PixelMatches:
         """One row, in float64."""
@@ -221,9 +247,16 @@ class Batch(NamedTuple):
         if not unit:
             return "all matches coincide"
         calibration = None if focal is None else calibration_of(focal, bool(self.shared[i]))
+        lens = None
+        if self.lens is not None:
+            if not matches.sizes.size:
+                return NO_SIZES
+            (m0, s0), (m1, s1) = self.lens[i].tolist()
+            lens = Lens((m0, m1), (s0, s1), bool(self.one_lens[i]))
         pair = Pair(
-            table, known, bucket(count), unit, self.keys[i], seed, frame[:4], matches.sizes, residual, calibration
-        )
+            table, known, bucket(count), unit, self.keys[i], seed, frame[:4], matches.sizes, residual, calibration,
+            lens=lens,
+        )  # fmt: skip
         return pair, slot
 
 

@@ -53,6 +53,17 @@ def calibration_of(focal: Array, shared: bool) -> Calibration | None:
     return Calibration((f0, f1), (s0, s1), shared)
 
 
+class Lens(NamedTuple):
+    """What is known of the lenses of two images, lambda of the division model in half diagonals.
+
+    deviations: 0 of exactly known ones, infinite of unknown ones. shared: whether both are one.
+    """
+
+    means: tuple[float, float]
+    deviations: tuple[float, float]
+    shared: bool
+
+
 class Pair:
     """The matches of one pair. Arrays are float64 and C-contiguous.
 
@@ -64,19 +75,19 @@ class Pair:
     pair, which decides how priors are quantised and whether models are preselected. pixels_per_unit: a power of
     two. centre: (4,), of the points, pixels. sizes: (4,), of the images as h, w, h, w, pixels; empty where unknown.
     key, seed: of every random choice. residual: of the family of models, by which matches are judged. calibration:
-    what is known of the focal lengths, of a pair whose sizes are known. images: what families compute of the images,
-    for all subsets of the matches.
+    what is known of the focal lengths, of a pair whose sizes are known; lens: of the lenses, None of pinholes. images:
+    what families compute of the images, for all subsets of the matches.
     """
 
     def __init__(
         self, table: Array, known: tuple[bool, bool, bool], bucket: int, pixels_per_unit: float, key: int, seed: int,
         centre: Array, sizes: Array, residual: Residual = SAMPSON, calibration: Calibration | None = None,
-        images: dict[Hashable, Any] | None = None,
+        images: dict[Hashable, Any] | None = None, lens: Lens | None = None,
     ) -> None:  # fmt: skip
         """known: whether the caller has given a prior, noise, ambiguity."""
         self.table, self.known, self.bucket, self.pixels_per_unit = table, known, bucket, pixels_per_unit
         self.key, self.seed, self.centre, self.sizes, self.residual = key, seed, centre, sizes, residual
-        self.calibration = calibration
+        self.calibration, self.lens = calibration, lens
         self.count = table.shape[1]
         self.points, self.weight = table[:4], table[4]
         self.pixels_per_noise, self.match_weight = table[5], table[6]
@@ -132,7 +143,7 @@ class Pair:
         """The same pair with the matches of these indices."""
         return Pair(
             self.table.take(index, 1), self.known, self.bucket, self.pixels_per_unit, self.key, self.seed, self.centre,
-            self.sizes, self.residual, self.calibration, self.images,
+            self.sizes, self.residual, self.calibration, self.images, self.lens,
         )  # fmt: skip
 
 

@@ -20,10 +20,12 @@ from fmtorch.estimators.final_fits import FinalFit, Fit
 from fmtorch.estimators.focal_search import FocalSearch, PlausibleCandidates
 from fmtorch.estimators.gradients import Attached
 from fmtorch.estimators.inliers import InlierRule, StoppingRule, residuals_squared_px
+from fmtorch.estimators.lens_search import lens_fit, lenses_of, squared_px
 from fmtorch.estimators.models.model import Refining
 from fmtorch.estimators.models.with_focals import FundamentalWithFocals
+from fmtorch.estimators.models.with_lenses import undistorted
 from fmtorch.estimators.options import Count, Focal, Preselect, Refine, Select, stage
-from fmtorch.estimators.pair import Pair
+from fmtorch.estimators.pair import Lens, Pair
 from fmtorch.estimators.precompiled import OF_HOMOGRAPHIES, WITH_FOCALS
 from fmtorch.estimators.preselection import Preselection
 from fmtorch.estimators.refinement import LocalOptimization, Refinement
@@ -151,6 +153,11 @@ class Ransac:
         return Attached(self.final, self.family).reached
 
     @property
+    def assumes_cameras(self) -> bool:
+        """Whether image sizes make a difference to the search."""
+        return self.focal is not None
+
+    @property
     def uses_prior(self) -> bool:
         """Whether a prior makes a difference to the search."""
         return getattr(self.sampler, "uses_prior", False) or getattr(self.score, "prior_weighted", False)
@@ -177,12 +184,32 @@ class Ransac:
 
     def estimate(self, pair: Pair) -> Solution:
         """Search to fit of one pair."""
+        if pair.lens is not None:
+            return self._with_lenses(pair, pair.lens)
         selection, draws = self.selected(pair)
         if not selection.valid:
             return Solution(None, draws, reason=NOT_SOLVED)
         inliers = self.inliers(selection.F, pair)
         fit: Fit = self.final(selection, pair, inliers, self.family)
         return Solution(fit, draws, self.inliers(fit.F, pair) if self.refit_inliers else inliers)
+
+    def _with_lenses(self, pair: Pair, known: Lens) -> Solution:
+        """The same of bent photographs: searched in images of pinholes, judged as photographed."""
+        assert self.focal is not None
+        lens = lenses_of(pair, self.focal)
+        straight = undistorted(pair, lens)
+        solution = self.estimate(straight)
+        if solution.fit is None or solution.inliers is None:
+            return solution
+        fit, cameras = solution.fit, solution.fit.cameras
+        if cameras is None or not (lens.any() or np.isfinite(known.deviations).all()):
+            return solution._replace(lens=lens)
+        refined = lens_fit(lens, cameras, pair, solution.inliers)
+        if not np.isfinite(refined.F).all():
+            return solution._replace(lens=lens)
+        inliers = self.inlier_rule(squared_px(refined.F, refined.lens, pair), pair)
+        own = fit._replace(F=refined.F, at=refined.F, cameras=refined.cameras)
+        return Solution(own, solution.samples, inliers, lens=refined.lens, deviation=refined.deviation)
 
     def selected(self, pair: Pair) -> tuple[Selection, int]:
         """The selected model, and the samples drawn: among plausible cameras first where the image sizes are known."""

@@ -26,6 +26,7 @@ Array = Tensor | NDArray[Any]
 Arrays = Array | Sequence[Any]
 """One array, or a list of them: of pairs of different lengths."""
 Focal = Literal["shared", "unknown"] | float | Arrays | Mapping[str, Any] | None
+Lens = Literal["shared", "unknown"] | float | Arrays | None
 
 PER_MATCH = {name: len(Correspondences.declared[name].shape) - 1 for name in Correspondences.per_slot}
 """The dimensions of what has an entry for each match, of one pair."""
@@ -37,6 +38,8 @@ RATIO = Rule(
     "such as DMatch.distance, give none, or as `ratio` quotients; `score` is a confidence in [0, 1], larger is better",
 )
 UNKNOWN = (1.0, math.inf)  # px, relative deviation
+LENS_FORMS = "None, 'unknown', 'shared', lambda, (lambda, deviation) or ((lambda, deviation), (lambda, deviation))"
+UNKNOWN_LENS = (0.0, math.inf)  # lambda, deviation
 MIN_PIXELS = 10.0  # a photograph's points reach farther from its first pixel
 FOCAL_NAMES = ("shared", "unknown")
 
@@ -48,6 +51,7 @@ def correspondences(
     K0: Arrays | None = None,
     K1: Arrays | None = None,
     focal: Focal = None,
+    lens: Lens = None,
     plane: bool = False,
     **fields: Arrays | int | None,
 ) -> Correspondences:
@@ -56,7 +60,7 @@ def correspondences(
     Args:
         x0, x1: (N, 2) of one pair, (B, N, 2) of a padded batch, or a list of (N, 2) of different N, in pixels. Whole
             numbers become float64, half precision float32; x0 decides the device.
-        K0, K1, focal: as of `fmtorch.find_fundamental`.
+        K0, K1, focal, lens: as of `fmtorch.find_fundamental`.
         plane: x0 may be in the unit of a plane.
         fields: of `Correspondences`, or None. Per-match fields come in the form of the points. A size is one for all
             pairs, (2,), or one each, (B, 2), and so is a key.
@@ -66,7 +70,7 @@ def correspondences(
         ValueError: for wrong shapes, values that cannot be, a calibration that is none, and points of no pixels.
     """
     cameras = camera_fields(K0, K1, focal, fields.get("size0") is not None)
-    c = _batch(x0, x1, {**fields, **cameras})
+    c = _batch(x0, x1, {**fields, **cameras, **lens_fields(lens)})
     expect_plausible(c, plane)
     return c
 
@@ -212,8 +216,8 @@ def expect_values(c: Correspondences, **more: Rule) -> None:
     value, text = getattr(c, name)[pair], rules[name].text
     if name in PER_MATCH:
         raise ValueError(f"{name} of match {place} of pair {pair} is {value[place].item()}; {text}")
-    if name == "focal":
-        raise ValueError(f"focal of image {place} of pair {pair} is {value[place].tolist()}; {text}")
+    if name in ("focal", "lens"):
+        raise ValueError(f"{name} of image {place} of pair {pair} is {value[place].tolist()}; {text}")
     raise ValueError(f"{name} is {tuple(value.tolist())}; {text}")
 
 
@@ -234,6 +238,25 @@ def camera_fields(K0: Arrays | None, K1: Arrays | None, focal: Focal, sizes_know
     if isinstance(focal, str):
         return fields | _named(focal)
     return fields | {"focal": _deviations(focal, K0 is not None, K1 is not None) if fields else _measured(focal)}
+
+
+def lens_fields(lens: Lens) -> dict[str, Any]:
+    """The fields lens, shared_lens of the argument of `find_fundamental`; none where there is no lens."""
+    if lens is None:
+        return {}
+    if isinstance(lens, str):
+        if lens not in ("shared", "unknown"):
+            raise ValueError(f"lens is {lens!r}; it must be {LENS_FORMS}")
+        nothing = torch.tensor([UNKNOWN_LENS, UNKNOWN_LENS], dtype=torch.float64)
+        return {"lens": nothing} if lens == "unknown" else {"lens": nothing, "shared_lens": torch.tensor(True)}
+    if isinstance(lens, list | tuple):
+        lens = [UNKNOWN_LENS if entry is None else entry for entry in lens]
+    values = _floating(lens, "lens")
+    values = torch.cat([values.reshape(1), values.new_zeros(1)]) if values.numel() == 1 else values
+    values = values.expand(2, 2) if values.shape == (2,) else values
+    if values.dim() not in (2, 3) or values.shape[-2:] != (2, 2):
+        raise ValueError(f"lens has shape {tuple(values.shape)}; it must be {LENS_FORMS}")
+    return {"lens": values}
 
 
 def _expect_calibrations(c: Correspondences) -> None:

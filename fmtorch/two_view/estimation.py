@@ -22,6 +22,7 @@ from fmtorch.jobs.execution import one_thread
 from fmtorch.presets.files import load
 from fmtorch.presets.objects import construct, instantiate, merged
 from fmtorch.pruning.consistency import FrameConsistency, PositionConsistency
+from fmtorch.two_view.assumed_sizes import attempts_of, better_of
 from fmtorch.two_view.known_cameras import KnownCameras
 
 RANSAC = f"fmtorch.estimators.{Ransac.__name__}"  # the `_target_` of presets of this project's own engine
@@ -29,12 +30,12 @@ RANSAC = f"fmtorch.estimators.{Ransac.__name__}"  # the `_target_` of presets of
 
 def estimated(
     c: Correspondences, model: str, name: str, config_dir: Path | str | None, seed: int, options: Mapping[str, Any],
-    covariance: bool = False,
+    covariance: bool = False, assume_sizes: bool = False,
 ) -> Estimate:  # fmt: skip
     """The estimate of matches by a preset, with a prior of their consistency where it uses one and none is given.
 
     model: what the preset must estimate. What is known of cameras counts where `focal` or `shared_focal` is given; then
-    the estimate may have a covariance.
+    the estimate may have a covariance. assume_sizes: whether sizes that are not given may be taken from the points.
     """
     seed = int(number("seed", seed, integer=True))
     estimator = estimator_of(name, config_dir, options)
@@ -43,13 +44,20 @@ def estimated(
         option = f" (here by model={model})" if "model" in load("estimator", name, config_dir) else ""
         needed = f"find_{model} needs one that gives {model} matrices{option}"
         raise ValueError(f"estimator={name} gives {gives} matrices; {needed}")
-    return estimated_by(estimator, c, seed, covariance)
+    if c.lens is not None:
+        _expect_lenses(c, estimator, name)
+    return estimated_by(estimator, c, seed, covariance, assume_sizes)
 
 
-def estimated_by(estimator: Estimator, c: Correspondences, seed: int, covariance: bool = False) -> Estimate:
+def estimated_by(
+    estimator: Estimator, c: Correspondences, seed: int, covariance: bool = False, assume_sizes: bool = False
+) -> Estimate:
     """The same of an estimator that is built, and of values that are known to be right."""
     if not c.asks_for_cameras:
         c = _with_prior(c, estimator)
+        if assume_sizes and c.size0 is None and getattr(estimator, "assumes_cameras", False):
+            attempts = attempts_of(c)
+            return better_of(attempts, [judged(estimator(batch, seed), batch) for batch in attempts.batches])
         return judged(estimator(c, seed), c)
     return KnownCameras(estimator, functools.partial(_with_prior, estimator=estimator), covariance)(c, seed)
 
@@ -66,6 +74,14 @@ def _expect_gradients(c: Correspondences, estimator: Estimator, name: str) -> No
                 f"{field} requires a gradient, and the final fit of estimator={name} passes none to it: "
                 f"give {field}.detach(), or take another (estimator=fmtorch, or the option final=gauss_newton)"
             )
+
+
+def _expect_lenses(c: Correspondences, estimator: Estimator, name: str) -> None:
+    """Raise ValueError where lenses cannot be estimated."""
+    if not getattr(estimator, "assumes_cameras", False):
+        raise ValueError(f"lens needs an estimator with the option focal, as fmtorch; estimator={name} has none")
+    if c.requires_grad:
+        raise ValueError("lens is given, and its estimates have no gradients: give points, prior and noise detached")
 
 
 def _with_prior(c: Correspondences, estimator: Estimator) -> Correspondences:

@@ -11,7 +11,8 @@ from typing import Any, ParamSpec, TypeVar, cast
 
 from fmtorch.core.types import CONTRADICTED, Estimate, PoseEstimate
 from fmtorch.jobs.execution import one_thread
-from fmtorch.two_view.arguments import Arrays, Focal, correspondences
+from fmtorch.two_view.arguments import Arrays, Focal, Lens, correspondences
+from fmtorch.two_view.assumed_sizes import Size, given_sizes
 from fmtorch.two_view.estimation import estimated
 from fmtorch.two_view.pair_type import with_pair_type
 from fmtorch.two_view.planes import homographies
@@ -50,11 +51,12 @@ def find_fundamental(
     lafs0: Arrays | None = None,
     lafs1: Arrays | None = None,
     noise: Arrays | None = None,
-    size0: Arrays | None = None,
-    size1: Arrays | None = None,
+    size0: Size = None,
+    size1: Size = None,
     K0: Arrays | None = None,
     K1: Arrays | None = None,
     focal: Focal = None,
+    lens: Lens = None,
     covariance: bool = False,
     pair_type: bool = False,
     key: Arrays | int | None = None,
@@ -77,7 +79,8 @@ def find_fundamental(
         lafs0, lafs1: (B, N, 2, 3) local affine frames.
         noise: (B, N), each match's standard deviation relative to a usual one's (`fmtorch.pruning.MatchNoise` derives
             it from frames).
-        size0, size1: image sizes (h, w), one for all pairs or (B, 2).
+        size0, size1: image sizes (h, w), one for all pairs or (B, 2); assumed from the points' extent when not given,
+            unless these are centred; "unknown" assumes nothing.
         K0, K1: calibration matrices, px, (3, 3) for all pairs or (B, 3, 3), of both images or of one. Gradients reach
             them.
         focal: what else is known of the focal lengths, for square pixels and a central principal point where there is
@@ -95,6 +98,12 @@ def find_fundamental(
 
             A deviation of 0 is exact and an infinite one nothing; 0.05 suits EXIF. From 0.02 on measurements may be
             wrong altogether. A mapping says nothing of cameras: it holds options of the preset's stage of that name.
+        lens: how much the lenses bend straight lines, ``x_u = x_d / (1 + lambda r_d^2)`` about the principal point, r_d
+            in half diagonals of the image: -0.05 of a usual phone at its wide end, -0.3 of an action camera. None: not
+            at all; "shared": one unknown lambda, "unknown": one for each image; lambda, exactly; (lambda, s) up to a
+            standard deviation s; ((lambda0, s0), (lambda1, s1)) or (B, 2, 2) for each image, None in place of an
+            unknown one. Points and inliers are of the photographs, F, E and the pose of the pixels of pinholes. With
+            K0 or K1 it needs the image sizes. There are no gradients, covariance or pair type then.
         covariance: whether the estimate has its covariance, which needs K0 and K1 or the image sizes. Where nothing is
             said of the cameras these are as of ``focal="unknown"``.
         pair_type: whether it has the type of each pair: general, planar, rotation, identical, unrelated.
@@ -106,9 +115,10 @@ def find_fundamental(
     Returns:
         An `Estimate` of B pairs (of one pair for (N, 2) points, of none for an empty list), with F of unit Frobenius
         norm, inliers, ok, reason, significance. A pair that cannot be solved is ``ok=False``, never an exception. An F
-        that is ok may be of images that show nothing in common: `related` tells. With K0, K1 or `focal` also focals,
-        E, R and t, NaN where they are not determined; `deviation_degrees` says how far these may be off and `warning`
-        what the pair type leaves open.
+        that is ok may be of images that show nothing in common: `related` tells. `sizes` are those that were assumed,
+        and `warning` says where they are doubtful; `lens` (B, 2), lambdas where these are estimated. With K0, K1 or
+        `focal` also focals, E, R and t, NaN where they are not determined; `deviation_degrees` says how far these may
+        be off and `warning` what the pair type leaves open.
 
     Raises:
         ValueError: for points of another shape, points that are no pixels or outside images of these sizes, a prior
@@ -129,17 +139,28 @@ def find_fundamental(
     """
     if covariance and K0 is None and K1 is None and focal is None:
         focal = "unknown"
+    if lens is not None:
+        _expect_lens(size0, K0 is not None or K1 is not None, covariance or pair_type)
+    h0w0, h1w1, assume_sizes = given_sizes(size0, size1)
     c = correspondences(
-        x0, x1, mask=mask, ratio=ratio, score=score, prior=prior, lafs0=lafs0, lafs1=lafs1, noise=noise, size0=size0,
-        size1=size1, K0=K0, K1=K1, focal=focal, key=key,
+        x0, x1, mask=mask, ratio=ratio, score=score, prior=prior, lafs0=lafs0, lafs1=lafs1, noise=noise, size0=h0w0,
+        size1=h1w1, K0=K0, K1=K1, focal=focal, lens=lens, key=key,
     )  # fmt: skip
     if isinstance(focal, Mapping):
         options["focal"] = focal
-    estimate = estimated(c, "fundamental", estimator, config_dir, seed, options, covariance)
+    estimate = estimated(c, "fundamental", estimator, config_dir, seed, options, covariance, assume_sizes)
     if estimate.contradicted is not None and bool(estimate.contradicted.any()):
         pairs = estimate.contradicted.nonzero()[:, 0].tolist()
         warnings.warn(f"pair {', '.join(map(str, pairs))}: {CONTRADICTED}", stacklevel=2)
     return with_pair_type(estimate, c, seed) if pair_type else estimate
+
+
+def _expect_lens(size: Size, calibrated: bool, more: bool) -> None:
+    """Raise ValueError where a lens has no place."""
+    if more:
+        raise ValueError("lens is given: covariance and pair_type are of pinholes; undistort the points for them")
+    if isinstance(size, str) or (calibrated and size is None):
+        raise ValueError("lens needs the image sizes, in whose half diagonals it is: give size0 and size1")
 
 
 @eager
@@ -150,6 +171,7 @@ def find_essential(
     K1: Arrays,
     *,
     focal: Focal = None,
+    lens: Lens = None,
     estimator: str = "fmtorch",
     mask: Arrays | None = None,
     ratio: Arrays | None = None,
@@ -158,8 +180,8 @@ def find_essential(
     lafs0: Arrays | None = None,
     lafs1: Arrays | None = None,
     noise: Arrays | None = None,
-    size0: Arrays | None = None,
-    size1: Arrays | None = None,
+    size0: Size = None,
+    size1: Size = None,
     covariance: bool = False,
     pair_type: bool = False,
     key: Arrays | int | None = None,
@@ -177,6 +199,7 @@ def find_essential(
         focal: how well the focal lengths of K0 and K1 are known: None for exactly, or their relative standard
             deviation, one number, (s0, s1) or (B, 2); 0.05 suits EXIF; "shared" or "unknown" where K tells principal
             points and the shape of pixels alone. What is not exact is estimated.
+        lens: as of `find_fundamental`.
         size0, size1: image sizes (h, w), one for all pairs or (B, 2). Twice the principal point when not given.
         estimator, mask, ratio, score, prior, lafs0, lafs1, noise, covariance, pair_type, key, seed, config_dir: as of
             `find_fundamental`.
@@ -209,8 +232,8 @@ def find_essential(
             raise ValueError(f"{name} is None; find_fundamental estimates pairs of which one camera or none is known")
     estimate = find_fundamental(
         x0, x1, estimator=estimator, mask=mask, ratio=ratio, score=score, prior=prior, lafs0=lafs0, lafs1=lafs1,
-        noise=noise, size0=size0, size1=size1, K0=K0, K1=K1, focal=focal, covariance=covariance, pair_type=pair_type,
-        key=key, seed=seed, config_dir=config_dir, **options,
+        noise=noise, size0=size0, size1=size1, K0=K0, K1=K1, focal=focal, lens=lens, covariance=covariance,
+        pair_type=pair_type, key=key, seed=seed, config_dir=config_dir, **options,
     )  # fmt: skip
     return PoseEstimate.unchecked(**vars(estimate))
 

@@ -10,6 +10,7 @@ from fmtorch.training import (
     Draw,
     LabelledMatches,
     SimilarLengthBatches,
+    StoredMatches,
     collate,
     collate_trimmed,
 )

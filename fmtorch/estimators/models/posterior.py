@@ -270,14 +270,14 @@ def minimise(cameras: Cameras, matches: Weighted, images: Images, limits: Limits
 @kernel(holds_gil=True)
 def tangents_of(cameras: Cameras, longest: F8x1, F: F8x2, out: F8x3) -> None:
     """Fundamental matrices -> F (k, 9), and their derivatives by five rotations and two logarithms -> (k, 9, LANES)."""
-    _models(cameras.axes, cameras.focal, longest, F, out)
+    camera_models(cameras.axes, cameras.focal, longest, F, out)
 
 
 @inner
 def _evaluate(state: _State, data: _Data, derivatives: bool) -> None:
-    _models(state.axes, state.focal, data.images.longest, state.F, data.tangents)
+    camera_models(state.axes, state.focal, data.images.longest, state.F, data.tangents)
     if state.shared:
-        _tie(data.tangents)
+        tie(data.tangents)
     evaluate(state.F, data.matches, derivatives, data.products, state.cost)
     work = vector(5)
     for k in range(len(state.cost)):
@@ -290,7 +290,7 @@ def _evaluate(state: _State, data: _Data, derivatives: bool) -> None:
 
 
 @inner
-def _models(axes: Array, focal: Array, longest: Array, F: Array, tangents: Array) -> None:
+def camera_models(axes: Array, focal: Array, longest: Array, F: Array, tangents: Array) -> None:
     """Fundamental matrices -> F (k, 9), and their derivatives by five rotations and two logarithms -> (k, 9, LANES)."""
     for k in range(len(F)):
         U, V, T = axes[k, 0], axes[k, 1], tangents[k]
@@ -306,7 +306,7 @@ def _models(axes: Array, focal: Array, longest: Array, F: Array, tangents: Array
 
 
 @inner
-def _tie(tangents: Array) -> None:
+def tie(tangents: Array) -> None:
     """One logarithm for both images: derivatives (k, 9, LANES) by the first are those by it, by the second zero."""
     for k in range(len(tangents)):
         for q in range(9):
@@ -345,8 +345,8 @@ def _step(state: _State, damping: Array, trial: _State) -> None:
     Q = matrix(7, LANES)
     for k in range(len(damping)):
         damped_step(state.hessian[k], state.gradient[k], damping[k], Q)
-        _rotate(state.axes[k, 0], Q[0, 7] / 2, Q[1, 7] / 2, Q[2, 7] / 2, trial.axes[k, 0])
-        _rotate(state.axes[k, 1], Q[3, 7] / 2, Q[4, 7] / 2, 0.0, trial.axes[k, 1])
+        rotate(state.axes[k, 0], Q[0, 7] / 2, Q[1, 7] / 2, Q[2, 7] / 2, trial.axes[k, 0])
+        rotate(state.axes[k, 1], Q[3, 7] / 2, Q[4, 7] / 2, 0.0, trial.axes[k, 1])
         for i in range(2):
             step = Q[5 if state.shared else 5 + i, 7]
             trial.focal[k, i] = min(max(state.focal[k, i] + min(max(step, -1.0), 1.0), -3.0), 3.0)
@@ -364,7 +364,7 @@ def damped_step(hessian: Array, gradient: Array, damping: float, Q: Array) -> No
 
 
 @inner
-def _rotate(A: Array, x: float, y: float, z: float, out: Array) -> None:
+def rotate(A: Array, x: float, y: float, z: float, out: Array) -> None:
     """``A R`` with the Cayley rotation of (x, y, z), half of its angles -> out (3, 3)."""
     n = x * x + y * y + z * z
     factor = 2 / (1 + n)

@@ -1,0 +1,29 @@
+"""Sizes of images as their matched points tell them, one pair and one number at a time."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+
+def extents(x0: np.ndarray, x1: np.ndarray) -> list[tuple[float, float]] | None:
+    """The sizes (h, w) of both images; None where the points (n, 2) tell none."""
+    there = [(a, b) for a, b in zip(x0.tolist(), x1.tolist(), strict=True) if all(map(math.isfinite, a + b))]
+    n, sizes = len(there), []
+    for i in range(2):
+        x, y = [pair[i][0] for pair in there], [pair[i][1] for pair in there]
+        if n < 20 or min(x + y) <= -1 or min(max(x), max(y)) <= 10:
+            return None
+        sizes.append((max(y) * (1 + 1.5 / n) + 0.5, max(x) * (1 + 1.5 / n) + 0.5))
+    return sizes
+
+
+def assumed(
+    sizes: list[tuple[float, float]], one_size: float, two_sizes: float
+) -> tuple[list[tuple[float, float]], bool]:
+    """The sizes that are taken, and whether they are doubtful; of the significance of estimates of one size and two."""
+    (h0, w0), (h1, w1) = sizes
+    h, w = max(h0, h1), max(w0, w1)
+    doubtful = max(h / h0, h / h1, w / w0, w / w1) > 1.1
+    return (sizes if doubtful and two_sizes > one_size + 3 else [(h, w), (h, w)]), doubtful
