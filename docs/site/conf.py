@@ -18,7 +18,7 @@ root_doc = "docs/index"  # the source folder is the repository, so that links be
 include_patterns = ["README.md", "CHANGELOG.md", "CONTRIBUTING.md", "docs/*.md", "docs/*/*.md", "models/*.md"]
 myst_heading_anchors = 3
 myst_enable_extensions = ["colon_fence"]
-suppress_warnings = ["myst.header"]
+suppress_warnings = ["myst.header", "ref.python"]  # a dimension may have the name of a field
 
 autodoc_typehints = "signature"
 autodoc_typehints_format = "short"
