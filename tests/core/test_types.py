@@ -43,6 +43,8 @@ def matches(b: int = 4, n: int = 6, seed: int = 0) -> Correspondences:
         noise=torch.rand(b, n, generator=g),
         focal=torch.rand(b, 2, 2, generator=g),
         shared_focal=torch.rand(b, generator=g) < 0.5,
+        lens=torch.rand(b, 2, 2, generator=g),
+        shared_lens=torch.rand(b, generator=g) < 0.5,
     )
 
 
@@ -70,6 +72,9 @@ def estimate(b: int = 4, n: int = 6, seed: int = 0) -> Estimate:
         other_R=torch.rand(b, 3, 3, generator=g),
         other_t=torch.rand(b, 3, generator=g),
         contradicted=torch.rand(b, generator=g) < 0.5,
+        sizes=torch.rand(b, 2, 2, generator=g),
+        sizes_doubtful=torch.rand(b, generator=g) < 0.5,
+        lens=torch.rand(b, 2, generator=g),
     )
 
 

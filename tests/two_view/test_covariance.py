@@ -143,7 +143,7 @@ def test_both_poses_of_a_plane_explain_it() -> None:
 
 def test_what_was_not_asked_for_is_not_there() -> None:
     s = reference.scene(0)
-    e = fmtorch.find_fundamental(s.x0, s.x1)
+    e = fmtorch.find_fundamental(s.x0, s.x1, size0="unknown")
     assert e.covariance is None
     for name, argument in (
         ("pair_type", "pair_type"),
