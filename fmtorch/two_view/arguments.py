@@ -8,7 +8,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal, cast
+from typing import Any, Literal, Protocol, cast, runtime_checkable
 
 import numpy as np
 import torch
@@ -22,8 +22,16 @@ from fmtorch.core.options import nearest
 from fmtorch.core.types import Correspondences, collate
 from fmtorch.geometry.cameras import calibration_problems
 
+
+@runtime_checkable
+class Shared(Protocol):
+    """An array of another library, which DLPack shares."""
+
+    def __dlpack__(self, **options: Any) -> Any: ...
+
+
 Array = Tensor | NDArray[Any]
-Arrays = Array | Sequence[Any]
+Arrays = Array | Sequence[Any] | Shared
 """One array, or a list of them: of pairs of different lengths."""
 Focal = Literal["shared", "unknown"] | float | Arrays | Mapping[str, Any] | None
 Lens = Literal["shared", "unknown"] | float | Arrays | None

@@ -13,10 +13,19 @@ CODE = [*(SOURCE / "fmtorch").rglob("*.py"), *(SOURCE / "scripts").rglob("*.py")
 PAGES = [*SOURCE.glob("*.md"), *(SOURCE / "docs").rglob("*.md"), *(SOURCE / "models").glob("*.md")]
 LIBRARIES = {
     "concurrent", "cv2", "json", "kornia", "mpi4py", "np", "numpy", "onnxruntime", "poselib", "pycolmap", "torch",
-    "vismatch",
+    "vismatch", "PIL",
 }  # fmt: skip
-VARIABLES = {"F", "c", "config", "e", "estimate", "lens", "pose", "result"}  # of the examples around them
-FOREIGN = {"CompileResult", "Dataset", "Path", "TwoViewGeometry"}  # classes of other libraries
+VARIABLES = {"F", "c", "config", "e", "estimate", "lens", "pose", "result", "x"}  # of the examples around them
+FOREIGN = {
+    "CompileResult",
+    "DMatch",
+    "Dataset",
+    "KeyPoint",
+    "Path",
+    "Progress",
+    "TwoViewGeometry",
+    "UsacParams",
+}  # classes of other libraries
 SETS = {"Fgt", "Strecha_train", "TanksLike"}
 DOTTED = re.compile(r"([A-Za-z_]\w*(?:\.[A-Za-z_]\w*)+)(?:\(.*)?")
 FILE = re.compile(

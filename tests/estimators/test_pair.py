@@ -49,7 +49,7 @@ def test_a_pair_holds_its_usable_matches_in_order(kind: str, scale: float) -> No
         assert pair.pixels_per_unit / 2 < half <= pair.pixels_per_unit
         np.testing.assert_array_equal(pair.points, (pixels - pair.centre[:, None]) / pair.pixels_per_unit)
         assert (pair.count, pair.key, pair.bucket) == (mask.sum(), int(c.keys[i]), bucket(int(mask.sum())))
-        values = {name: getattr(c, name) for name in ("prior", "noise", "ratio")}
+        values = {name: getattr(c, name) for name in ("prior", "noise", "ambiguity")}
         for name, value in values.items():
             assert (getattr(pair, name) is None) == (value is None) == (kind != "all")
         prior, noise, _ = (
@@ -142,7 +142,7 @@ def test_a_part_of_a_pair_keeps_its_frame() -> None:
     index = np.array([7, 3, 30])
     part = pair.take(index)
     np.testing.assert_array_equal(part.table, pair.table[:, index])
-    assert part.ratio is not None
+    assert part.ambiguity is not None
     for name in ("bucket", "pixels_per_unit", "key", "seed", "centre", "sizes", "residual", "images"):
         assert getattr(part, name) is getattr(pair, name), name
     assert pair.cached("sum", lambda pair: float(pair.points.sum())) == pair.points.sum()

@@ -150,10 +150,10 @@ TypeError: x0 is a str of <U2; it must be an array or tensor of numbers
 TypeError: x0 is a list of uneven rows; it must be an array or a tensor
 TypeError: ratio is a object of object; it must be an array or tensor of numbers
 ValueError: prior must be a list of 1 arrays, one for each pair of x0
-TypeError: image0 is a NoneType; it must be a file's path or a uint8 array of NumPy
-TypeError: image1 is a list; it must be a file's path or a uint8 array of NumPy
-TypeError: image0 is a bytes; it must be a file's path or a uint8 array of NumPy
-TypeError: image0 is a Tensor; it must be a file's path or a uint8 array of NumPy
+TypeError: image0 is a NoneType; it must be a file's path, a Pillow image or a uint8 array of NumPy
+TypeError: image1 is a list; it must be a file's path, a Pillow image or a uint8 array of NumPy
+TypeError: image0 is a bytes; it must be a file's path, a Pillow image or a uint8 array of NumPy
+TypeError: image0 is a Tensor; it must be a file's path, a Pillow image or a uint8 array of NumPy
 TypeError: pipeline is a NoneType; it must be the name of a preset or a Pipeline
 """
 
