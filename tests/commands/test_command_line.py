@@ -129,10 +129,10 @@ COUNT = "it must be a whole number of at least 1"
         ("verify no.db cameras=known", "cameras=known; it must be"),
         ("verify no.db force=2", "force=2; it must be true or false"),
         ("verify no.db more.db", "more.db: only database may stand without NAME="),
-        ("train batch=0", f"batch=0; {COUNT}"),
-        ("train optimisation.steps=some", "optimisation.steps=some; it must be a whole number"),
-        ("train trainer.devices={}", "trainer.devices={}; it must be"),
-        ("train augmentation.crop=often", "augmentation.crop=often; it must be a number"),
+        ("train pruner=lc batch=0", f"batch=0; {COUNT}"),
+        ("train pruner=lc optimisation.steps=some", "optimisation.steps=some; it must be a whole number"),
+        ("train pruner=lc trainer.devices={}", "trainer.devices={}; it must be"),
+        ("train pruner=lc augmentation.crop=often", "augmentation.crop=often; it must be a number"),
     ],
 )
 def test_a_mistake_is_told_in_one_line_and_nothing_written(

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from fmtorch.data import ImageSource, load
-from fmtorch.data.cameras import STEP, TOLERANCE
-from fmtorch.data.construction import DepthOverlap, Seen, overlap_of, seen_share, shared_points
+from fmtorch.data.construction import STEP, TOLERANCE, DepthOverlap, Seen, overlap_of, seen_share, shared_points
 from fmtorch.data.scenes import DepthScenePairs, incidence
 from fmtorch.scenes import Plan, RenderedPairs
 from tests.data.native import write_colmap, write_kitti
+from tests.helpers import call_command
 from tests.reference import overlap as reference
 
 PLAN = Plan(scenes=1, shots=4, pairs=4, scale=0.15)

@@ -11,6 +11,7 @@ import pytest
 
 import fmtorch
 from fmtorch.core import pair_key
+from tests.processes import run_command
 from tests.verification.databases import SIZE, killed_and_continued, matches, scene
 
 K = np.array([[600.0, 0, 319.5], [0, 600, 239.5], [0, 0, 1]])
