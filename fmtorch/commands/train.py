@@ -1,5 +1,7 @@
 """`fmtorch train pruner=lc`: train a learned pruner on the labelled matches of a data set."""
 
+import sys
+
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
@@ -20,6 +22,8 @@ def task(config: DictConfig) -> None:
     name = str(HydraConfig.get().runtime.choices["pruner"])
     if not any(word.startswith("pruner=") for word in HydraConfig.get().overrides.task):
         console.print(f"no pruner= is given: {name} is trained, the network of Yi et al. (CVPR 2018)", highlight=False)
+    if sys.argv[1:2] != ["train"]:
+        sys.argv.insert(1, "train")  # Lightning starts its other processes by these words
     run(config, name)
 
 
