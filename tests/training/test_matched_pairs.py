@@ -310,7 +310,7 @@ def test_the_training_loop_of_the_page_runs(
     assert 'load("rendered", split="train")' in code
     monkeypatch.setenv("FMTORCH_CACHE", str(cache))
     monkeypatch.setattr("fmtorch.scenes.dataset.PLANS", {("small", "train"): TINY})  # what `rendered` has drawn
-    monkeypatch.setattr("fmtorch.scenes.dataset.FAMILIES", {FAMILY: None})
+    monkeypatch.setattr("fmtorch.scenes.dataset.FAMILIES", {FAMILY: FAMILIES[FAMILY]})
     (tmp_path / "loop.py").write_text(code)
     torch.manual_seed(0)
     names = runpy.run_path(str(tmp_path / "loop.py"))
