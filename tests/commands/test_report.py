@@ -166,7 +166,7 @@ def test_the_command_on_two_runs(tmp_path: Path) -> None:
             f"estimator={estimator}", "estimator.hypotheses=100",
         )  # fmt: skip
     command("report", "root=Set", "pictures=2")
-    page = (tmp_path / "report.html").read_text()
+    page = (tmp_path / "runs/report.html").read_text()
     assert "drawn again" not in page  # what is drawn is what was stored
     assert page.count("data:image/jpeg") == 2 * 2 * 2  # pairs, runs, pictures
     assert "fmbench, test: Set" in page

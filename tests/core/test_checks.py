@@ -124,7 +124,7 @@ def test_annotations_are_read() -> None:
     assert expectation(float | Tensor) == Expected("number or array", dtype="Float")
     assert expectation(Any).kind == expectation(int | str).kind == ""
     assert {name for name, field in arrays_of(Correspondences).items() if field.bounds} == {
-        "score", "prior", "noise", "size0", "size1", "focal",
+        "score", "prior", "noise", "size0", "size1", "focal", "lens",
     }  # fmt: skip
 
 

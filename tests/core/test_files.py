@@ -10,6 +10,11 @@ from fmtorch.core.files import replacing
 from fmtorch.core.terminal import error_line
 
 
+def message(error: BaseException) -> str:
+    """What a command says of an error, without the place in this file, which counts as a user's own code."""
+    return error_line(error).partition(f" ({Path(__file__).name}:")[0]
+
+
 @pytest.mark.parametrize("error", [OSError(errno.ENOSPC, "No space left on device"), OSError(errno.EIO, "I/O error")])
 def test_a_failed_write_names_the_file_and_leaves_what_was_there(error: OSError, tmp_path: Path) -> None:
     path = tmp_path / "run.json"
@@ -23,7 +28,7 @@ def test_a_failed_write_names_the_file_and_leaves_what_was_there(error: OSError,
     with pytest.raises(OSError, match=error.strerror) as caught:
         write()
     assert caught.value.errno == error.errno
-    assert error_line(caught.value) == f"{path}: {error.strerror}"
+    assert message(caught.value) == f"{path}: {error.strerror}"
     assert path.read_text() == "before"
     assert list(tmp_path.iterdir()) == [path]
 
@@ -32,14 +37,14 @@ def test_a_folder_that_is_not_there_is_named_by_the_file() -> None:
     path = Path("/nowhere/at/all.txt")
     with pytest.raises(FileNotFoundError) as caught, replacing(path) as temporary:
         temporary.write_text("")
-    assert error_line(caught.value) == f"{path}: No such file or directory"
+    assert message(caught.value) == f"{path}: No such file or directory"
 
 
 def test_another_files_error_stays_its_own(tmp_path: Path) -> None:
     other = tmp_path / "image.png"
     with pytest.raises(FileNotFoundError) as caught, replacing(tmp_path / "out.json"):
         other.read_bytes()
-    assert error_line(caught.value) == f"{other}: No such file or directory"
+    assert message(caught.value) == f"{other}: No such file or directory"
 
 
 def test_a_device_that_is_full(tmp_path: Path) -> None:
@@ -53,7 +58,7 @@ def test_a_device_that_is_full(tmp_path: Path) -> None:
         full.open("wb") as file,
     ):
         file.write(b"x" * 100_000)
-    assert error_line(caught.value) == f"{tmp_path / 'out.json'}: No space left on device"
+    assert message(caught.value) == f"{tmp_path / 'out.json'}: No space left on device"
 
 
 def _installation(root: Path, monkeypatch: pytest.MonkeyPatch, *folders: str) -> Path:
@@ -61,7 +66,7 @@ def _installation(root: Path, monkeypatch: pytest.MonkeyPatch, *folders: str) ->
     package.mkdir(parents=True)
     for folder in folders:
         (root / "site-packages" / folder).mkdir(parents=True)
-    monkeypatch.setattr(files, "_PACKAGE", package)
+    monkeypatch.setattr(files, "PACKAGE", package)
     return package
 
 
