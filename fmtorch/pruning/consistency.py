@@ -23,7 +23,7 @@ from fmtorch.core.types import Correspondences
 from fmtorch.geometry.arithmetic import component_sum, gradient_wanted, sqrt
 from fmtorch.jit.batches import for_each_pair
 from fmtorch.jit.kernel import Array, B1x1, F4x1, F4x2, F4x3, inner, kernel
-from fmtorch.pruning.calibration import Calibration
+from fmtorch.pruning.calibration import Calibration, calibrated
 from fmtorch.pruning.curves import CURVES, CURVES32, curve_orders, put_in_order, slots_along_curves
 
 WINDOW = 8  # neighbours before and after each match along each curve
@@ -382,7 +382,7 @@ class PositionConsistency:
     kernels: worth compiling together with those of an estimator.
     """
 
-    kernels: ClassVar = (position_agreement_kernel,)
+    kernels: ClassVar = (position_agreement_kernel, calibrated)
 
     def __init__(self, *, calibration: Mapping[str, Mapping[str, float]]) -> None:
         self.calibration = Calibration(**calibration)

@@ -63,7 +63,7 @@ def test_samples_of_prosac_are_those_of_the_definition(count: int, size: int) ->
     for n in range(1, count):  # a whole number that rounding has put above itself is rounded up to the next
         excess = table[n] - table[n - 1] - (exact[n] - exact[n - 1])
         assert excess == 0 or (excess == 1 and grown[n].denominator == 1), n
-    best = np.argsort(matches.ratio, kind="stable")
+    best = np.argsort(matches.ambiguity, kind="stable")
     for start in (0, table[-1] // 2, max(table[-1] - 10, 0)):
         draws = min(20, table[-1] - start)
         expected = [
@@ -84,7 +84,7 @@ def test_prosac_is_uniform_after_its_growth_and_where_nothing_is_ranked() -> Non
     """Without a rank the order of matches means nothing: the first half may be a part of the image."""
     matches = pair(20)
     end = int(Prosac().growth(20, 7)[-1])
-    assert (Prosac().draw(matches, end - 1, 1, 7) == np.argsort(matches.ratio)[-1]).any()
+    assert (Prosac().draw(matches, end - 1, 1, 7) == np.argsort(matches.ambiguity)[-1]).any()
     across = Prosac().draw(matches, end - 30, 60, 7)
     np.testing.assert_array_equal(across[:, :30], Prosac().draw(matches, end - 30, 30, 7))
     np.testing.assert_array_equal(across[:, 30:], Uniform().draw(matches, end, 30, 7))

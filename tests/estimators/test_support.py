@@ -67,7 +67,8 @@ def test_few_and_degenerate_matches_of_any_scale_give_a_supported_model_or_a_rea
     assert not any(bool(estimate.ok[list(kinds).index(kind)]) for kind in HOPELESS)
     if name in OWN and estimate.model == "fundamental":
         usual = torch.tensor([kind in RANK_TWO for kind in kinds])
-        assert float(torch.linalg.det(estimate.F[usual]).abs().max()) < 1e-12
+        # Rank two in the unit of the points; in pixels, a thousandth of it, 1e6 roundings of 2e-16 are left.
+        assert float(torch.linalg.svdvals(estimate.F[usual])[:, 2].max()) < 1e-9
 
 
 def test_the_default_has_no_support_at_thresholds_far_below_rounding() -> None:
