@@ -36,7 +36,7 @@ class WithinThreshold:
         return inside
 
 
-FLOOR = 1e-3  # px, of robust deviations, as OpenCV's: those of exact matches are rounding
+FLOOR_PX = 1e-3  # px, of robust deviations, as OpenCV's: those of exact matches are rounding
 
 
 class BetterHalf:
@@ -44,7 +44,7 @@ class BetterHalf:
 
     def __call__(self, squared_px: Array, pair: Pair) -> Array:
         """As `InlierRule`."""
-        better: Array = squared_px <= max(lower_median(squared_px), squared(FLOOR))
+        better: Array = squared_px <= max(lower_median(squared_px), squared(FLOOR_PX))
         return better
 
 
@@ -57,7 +57,7 @@ class RobustDeviations:
         """As `InlierRule`."""
         spare = max(pair.count - self.PARAMETERS, 1)
         sigma = 1.4826 * (1 + 5 / spare) * math.sqrt(lower_median(squared_px))
-        inside: Array = squared_px <= squared(max(2.5 * sigma, FLOOR))
+        inside: Array = squared_px <= squared(max(2.5 * sigma, FLOOR_PX))
         return inside
 
 

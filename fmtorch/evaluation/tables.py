@@ -221,10 +221,11 @@ def _on_terminal(part: Part) -> TerminalTable:
     )  # fmt: skip
     words = [word for name in part.rows for word in name.split()]
     table.add_column("", overflow="fold", min_width=max(map(len, words), default=1))
-    for heading in part.columns:
-        table.add_column(heading, justify="right", no_wrap=True, overflow="fold")
-    for name, group in part.rows.items():
-        table.add_row(name, *_cells(part, group), style="bold" if name == ALL else "")
+    rows = {name: _cells(part, group) for name, group in part.rows.items()}
+    for heading, *cells in zip(part.columns, *rows.values(), strict=True):
+        table.add_column(heading, justify="right", no_wrap=True, min_width=max(map(len, (heading, *cells))))
+    for name, row in rows.items():
+        table.add_row(name, *row, style="bold" if name == ALL else "")
     return table
 
 

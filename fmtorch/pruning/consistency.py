@@ -195,7 +195,7 @@ class FrameConsistency:
     kernels: worth compiling together with those of an estimator.
     """
 
-    kernels: ClassVar = (frame_prior_kernel,)
+    kernels: ClassVar = (frame_prior_kernel, frame_agreement_kernel)
 
     def __init__(self, *, odds: float, floor: float, slope: float) -> None:
         self.odds, self.floor, self.slope = odds, floor, slope

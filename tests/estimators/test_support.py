@@ -10,7 +10,7 @@ import torch
 
 from fmtorch import find_fundamental
 from fmtorch.core import Correspondences, Estimate, collate
-from fmtorch.estimators import Fundamental, GraphCut, Homography, degensac
+from fmtorch.estimators import Fundamental, GraphCut, Homography, degensac, inliers
 from fmtorch.estimators.models import with_focals
 from fmtorch.estimators.models.model import FitScale
 from fmtorch.presets.objects import merged
@@ -21,7 +21,8 @@ EVERY = variants("estimator")
 OWN = [name for name in EVERY if not name.startswith(OTHER_LIBRARIES)]
 PIXELS = [  # what is a distance in pixels and no option
     (degensac, "PLANE_THRESHOLD_PX"), (with_focals, "INLIER_SIGMA_PX"), (with_focals, "LOSS_SCALE_PX"),
-    (with_focals, "PARALLEL_PX"), (GraphCut, "RADIUS_PX"), (Fundamental, "fit_scale"), (Homography, "fit_scale"),
+    (with_focals, "PARALLEL_PX"), (inliers, "FLOOR_PX"), (GraphCut, "RADIUS_PX"),
+    (Fundamental, "fit_scale"), (Homography, "fit_scale"),
 ]  # fmt: skip
 
 

@@ -98,8 +98,9 @@ def test_a_run_with_cameras_is_another_run(command: Callable[..., str], tmp_path
     assert identity["pose"] == {"signed": True}
     assert pose["signed"] is True
     for text in (said, (tmp_path / "signed" / "summary.md").read_text()):
-        assert "t error, signed" in text
-        assert "whose sign counts" in " ".join(text.split())
+        spoken = " ".join(text.split())
+        assert "t error, signed" in spoken
+        assert "whose sign counts" in spoken
     assert "ended: error: pose.signed=2; it must be true or false" in command(*words, "pose.signed=2", cwd=tmp_path)
     assert "holds another run" in command(*words, "cameras=shared", "output=known", cwd=tmp_path)
     assert "ended: error: cameras=some" in command(*words, "cameras=some", cwd=tmp_path)

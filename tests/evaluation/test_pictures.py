@@ -5,18 +5,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fmtorch.geometry.eight_point import WIDTH
 from fmtorch.pipeline.pictures import (
     BAD,
     COLOURS,
     GOOD,
+    HEIGHT,
+    WIDTH,
     Place,
     draw_epipolar_lines,
     draw_epipolar_lines_of_corners,
     draw_matches,
     spread,
 )
-from fmtorch.scenes.videos import HEIGHT
 
 ROWS = np.array([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # a sideways camera: epipolar lines are rows
 NONE = np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, bool)

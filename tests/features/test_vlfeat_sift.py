@@ -30,7 +30,7 @@ def test_a_blob_is_found_where_it_is(x: float, y: float, sigma: float) -> None:
 
 
 def test_frames_turn_with_the_image() -> None:
-    image = texture(3)
+    image = texture(3, 120, 160)
     upright, turned = VLFeatSIFT(peak_threshold=0.01)(image), VLFeatSIFT(peak_threshold=0.01)(np.rot90(image))
     matrix, shift = torch.tensor([[0.0, 1.0], [-1.0, 0.0]]), torch.tensor([0.0, image.shape[1] - 1.0])
     expected = matrix @ upright.lafs
