@@ -27,6 +27,7 @@ from fmtorch.estimators.models.with_lenses import (
     undistorted,
 )
 from fmtorch.estimators.pair import Lens, Pair, squared
+from fmtorch.geometry.arithmetic import logarithm_kernel
 from fmtorch.geometry.levenberg_marquardt import LOSS_CODES, NO_TABLE, Weighted
 from fmtorch.jit.kernel import Array
 from fmtorch.jit.lanes import LANES
@@ -53,6 +54,24 @@ class LensFit(NamedTuple):
     deviation: Array
 
 
+def _inverse(A: Array) -> tuple[Array, float]:
+    """The inverse (n, n) by elimination, whose operations are rounded alike everywhere, and log |det A|.
+
+    Of a matrix without an inverse these are infinite and not a number.
+    """
+    n, logarithm = len(A), 0.0
+    rows = np.hstack([A, np.eye(n)])
+    for i in range(n):
+        pivot = rows[i, i]
+        if not (math.isfinite(pivot) and pivot):
+            return np.full((n, n), math.inf), math.nan
+        logarithm += float(logarithm_kernel(abs(float(pivot))))
+        rows[i] /= pivot
+        others = np.arange(n) != i
+        rows[others] -= rows[others, i, None] * rows[i]
+    return rows[:, n:], logarithm
+
+
 def fit_with_lenses(
     cameras: Cameras, lens: Array, prior: LensPrior, pair: Pair, scale_px: float, iterations: int
 ) -> list[LensFit]:  # fmt: skip
@@ -69,16 +88,13 @@ def fit_with_lenses(
     minimise_with_lenses(own, weighted, images, prior._replace(diagonal=half_diagonals(pair)), limits, out)
     F = np.empty((k, 9))
     translate(out.F, images.offset, F)
-    F /= np.linalg.norm(F, axis=1, keepdims=True)
+    F /= np.sqrt((F * F).sum(1, keepdims=True))
     fits = []
     for i in range(k):
-        determinant = float(np.linalg.slogdet(out.hessian[i])[1]) if math.isfinite(out.cost[i]) else math.nan
-        normaliser = float(np.log(prior.precision[: 1 if prior.shared else 2]).sum())
+        inverse, determinant = _inverse(out.hessian[i])
+        normaliser = sum(float(logarithm_kernel(p)) for p in prior.precision[: 1 if prior.shared else 2])
         evidence = -float(out.cost[i]) - determinant / 2 + normaliser / 2
-        try:
-            variances = np.linalg.inv(out.hessian[i]).diagonal()[[7, 7 if prior.shared else 8]]
-        except np.linalg.LinAlgError:
-            variances = np.full(2, math.inf)
+        variances = inverse.diagonal()[[7, 7 if prior.shared else 8]]
         cost, deviation = float(out.cost[i]), np.sqrt(np.abs(variances))
         fits.append(LensFit(own.of(i), out.lens[i], F[i], cost, out.gradient[i], out.hessian[i], evidence, deviation))
     return fits
@@ -165,5 +181,5 @@ def _model(cameras: Cameras, pair: Pair) -> Array:
     F, out, images = np.empty((1, 9)), np.empty((1, 9)), images_of(pair)
     tangents_of(cameras, images.longest, F, np.zeros((1, 9, LANES)))
     translate(F, images.offset, out)
-    unit: Array = out[0] / np.linalg.norm(out[0])
+    unit: Array = out[0] / math.sqrt((out[0] * out[0]).sum())
     return unit

@@ -41,7 +41,7 @@ def match(images: Path, output: Path, *words: str) -> Path:
 
 
 def test_a_folder_of_images(images: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    output = match(images, tmp_path / "out", "export=h5,colmap")
+    output = match(images, tmp_path / "out", "export=[h5,colmap]")
     said = capsys.readouterr().out
     assert "3 of 6 pairs show one scene" in said
     assert "taken from" not in said
