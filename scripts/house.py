@@ -21,7 +21,11 @@ LIMITS: dict[str, float] = {
     "words of pages": 38_000, "words of the longest page": 1_500,
 }  # fmt: skip
 FOREIGN = ("hydra", "cv2", "pyarrow", "kornia", "scipy.sparse")  # what a first estimate has no use for
-ESTIMATE = "import torch, fmtorch; x = torch.rand(2, 30, 2) * 500; fmtorch.find_fundamental(x[0], x[1])"
+ESTIMATE = """
+import torch, fmtorch
+x = torch.rand(2, 30, 2) * 500
+fmtorch.find_fundamental(x[0], x[1], size0="unknown", size1="unknown")
+"""
 WATCH = """
 import os, sys, threading, traceback
 def watch(frame, event, argument):
@@ -89,7 +93,7 @@ def printed(code: str, **environment: str) -> list[str]:
 
 def loaded() -> list[str]:
     """The modules that a process has imported when it has estimated one fundamental matrix."""
-    return printed(f"{ESTIMATE}; import sys; print(*sys.modules)")
+    return printed(f"{ESTIMATE}import sys; print(*sys.modules)")
 
 
 def road() -> list[str]:
