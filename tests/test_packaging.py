@@ -154,13 +154,14 @@ def test_the_wheel_is_installed_on_every_python_that_is_here(wheel: Path, python
         folder = tmp_path / str(i)
         subprocess.run([interpreter, "-m", "venv", str(folder)], check=True)
         install = [folder / "bin/pip", "install", "-q", "--no-deps", "--no-index", "--disable-pip-version-check", wheel]
-        subprocess.run(install, check=True)  # compiles every file
+        subprocess.run(install, check=True)
+        (package,) = folder.glob("lib/*/site-packages/fmtorch")
+        subprocess.run([folder / "bin/python", "-m", "compileall", "-q", package], check=True)
         for words in (["--version"], ["--help"], ["verify", "--help"]):
             done = subprocess.run(
                 [folder / "bin/fmtorch", *words], cwd=tmp_path, capture_output=True, text=True, check=False
             )
             assert (done.returncode, done.stderr) == (0, ""), words
-        assert len(list(folder.glob("lib/*/site-packages/fmtorch/**/*.pyc"))) > 200
 
 
 RELEASED = ("pyproject.toml", "fmtorch/core/version.py", "CITATION.cff", "CHANGELOG.md", "scripts/release")
