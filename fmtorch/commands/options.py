@@ -64,8 +64,7 @@ class EvalOptions:
     cache: Cache = option(None, CACHE)
     cache_limit: Gigabytes | None = option(20, CACHE_LIMIT)
     export: str | list[str] | None = option(
-        None,
-        "h5, colmap or both, with a comma: hloc's files, a COLMAP database, in the run folder (docs/exchange.md)",
+        None, "h5, colmap or both, with a comma: hloc's files, a COLMAP database, in the run folder (docs/exchange.md)"
     )
     debug: Debug = option(False, f"{DEBUG}. One worker")
 

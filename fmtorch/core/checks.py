@@ -75,15 +75,13 @@ def as_tensor(value: Any, name: str) -> Tensor:
     try:
         array = np.asarray(value)
     except ValueError as error:
-        raise TypeError(
-            f"{name} is a {type(value).__name__} of uneven rows; it must be an array or a tensor"
-        ) from error
+        kind = type(value).__name__
+        raise TypeError(f"{name} is a {kind} of uneven rows; it must be an array or a tensor") from error
     if array.dtype.name == "bfloat16":  # of ml_dtypes, as JAX has it
         array = array.astype(np.float32)
     if array.dtype.kind not in "biuf":
-        raise TypeError(
-            f"{name} is a {type(value).__name__} of {array.dtype}; it must be an array or tensor of numbers"
-        )
+        kind = type(value).__name__
+        raise TypeError(f"{name} is a {kind} of {array.dtype}; it must be an array or tensor of numbers")
     if array.dtype.kind == "f" and array.dtype.itemsize > 8:
         array = array.astype(np.float64)
     if array.dtype.kind == "u" and array.dtype.itemsize > 1:
@@ -109,19 +107,17 @@ def number(name: str, value: Any, integer: bool) -> Any:
     """A number, not NaN; what has one element may be one. Raises TypeError or ValueError naming the argument."""
     if isinstance(value, bool | np.bool_ | str | bytes | complex | np.complexfloating):
         raise TypeError(f"{name} is {value!r}; it must be a {'whole ' if integer else ''}number")
-    if isinstance(value, int | float):
-        plain: Any = value
-    else:
+    if not isinstance(value, int | float):
         try:
-            plain = operator.index(value) if integer else float(value)
+            value = operator.index(value) if integer else float(value)
         except (TypeError, ValueError, RuntimeError, OverflowError):
             said = "whole number" if integer else "number"
             raise TypeError(f"{name} is a {type(value).__name__}; it must be a {said}") from None
-    if integer and not isinstance(plain, int):
+    if integer and not isinstance(value, int):
         raise TypeError(f"{name} is {value!r}; it must be a whole number")
-    if math.isnan(plain):
+    if math.isnan(value):
         raise ValueError(f"{name} is nan; it must be a number")
-    return value if isinstance(value, int | float) else plain
+    return value
 
 
 def _checked_value(name: str, value: Any, want: Expected, device: torch.device) -> Any:
@@ -129,8 +125,9 @@ def _checked_value(name: str, value: Any, want: Expected, device: torch.device) 
     if want.kind in ("int", "float") or (want.kind == "number or array" and not isinstance(value, Tensor | np.ndarray)):
         return number(name, value, want.kind == "int")
     if want.kind in ("numbers", "whole numbers"):
-        integer = want.kind == "whole numbers"
-        return tuple(number(f"{name}[{i}]", entry, integer) for i, entry in enumerate(_sequence(name, value)))
+        if isinstance(value, str | bytes | Mapping) or not hasattr(value, "__len__") or getattr(value, "ndim", 1) != 1:
+            raise TypeError(f"{name} is a {type(value).__name__}; it must be a sequence of numbers")
+        return tuple(number(f"{name}[{i}]", each, want.kind == "whole numbers") for i, each in enumerate(value))
     if want.kind in ("bool", "str"):
         kind = {"bool": (bool, np.bool_), "str": (str,)}[want.kind]
         if not isinstance(value, kind):
@@ -152,21 +149,13 @@ def _checked_value(name: str, value: Any, want: Expected, device: torch.device) 
     return _numbers(name, tensor, want)
 
 
-def _sequence(name: str, value: Any) -> list[Any]:
-    if isinstance(value, str | bytes | Mapping) or not hasattr(value, "__len__") or getattr(value, "ndim", 1) != 1:
-        raise TypeError(f"{name} is a {type(value).__name__}; it must be a sequence of numbers")
-    return list(value)
-
-
 def _numbers(name: str, tensor: Tensor, want: Expected) -> Tensor:
     """The tensor, with elements of the kind asked for. Raises ValueError naming the argument for others."""
     integer = numbers_of(tensor.dtype) == WHOLE and not tensor.is_quantized
-    if want.dtype == "Float" and integer:
+    if (want.dtype == "Float" and integer) or (tensor.dtype in WIDENED and want.dtype in ("Float", "Real")):
         return widened(tensor)
     if want.dtype == "Bool" and integer:
         return tensor != 0
-    if tensor.dtype in WIDENED and want.dtype in ("Float", "Real"):
-        return widened(tensor)
     if tensor.is_quantized or not want.holds(tensor.dtype):
         raise ValueError(f"{name} is of {tensor.dtype}; it must hold {want.numbers}")
     return tensor

@@ -22,10 +22,17 @@ def lazy_exports(package: str, checked: bool = False) -> None:
 
 
 class _LazyPackage(ModuleType):
+    _checked = False
+
     def __getattr__(self, name: str) -> Any:
         source = None if name.startswith("_") else _sources(str(self.__file__)).get(name)
         if source is not None:
-            value = self._exported(getattr(importlib.import_module(source), name))
+            value = getattr(importlib.import_module(source), name)
+            if self._checked and inspect.isfunction(value):
+                from fmtorch.core.checks import checked
+
+                value = checked(value, common_type=True)
+                value.__module__ = self.__name__  # where pickle finds it
         elif not name.startswith("_") and importlib.util.find_spec(f"{self.__name__}.{name}") is not None:
             value = importlib.import_module(f"{self.__name__}.{name}")
         else:
@@ -41,18 +48,9 @@ class _LazyPackage(ModuleType):
     def __dir__(self) -> list[str]:
         return sorted({*vars(self), *self.__all__})
 
-    def _exported(self, value: Any) -> Any:
-        return value
-
 
 class _CheckedPackage(_LazyPackage):
-    def _exported(self, value: Any) -> Any:
-        from fmtorch.core.checks import checked
-
-        if inspect.isfunction(value):
-            value = checked(value, common_type=True)
-            value.__module__ = self.__name__  # where pickle finds it
-        return value
+    _checked = True
 
 
 @functools.cache

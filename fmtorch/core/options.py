@@ -36,10 +36,9 @@ class Within:
     exclusive: bool = False
 
     def __call__(self, value: Any) -> bool:
-        """Whether a number is in bounds."""
         number = float(value) if isinstance(value, numbers.Real) else math.nan
-        inside = self.minimum <= number <= self.maximum
-        return inside and not (self.exclusive and number in (self.minimum, self.maximum))
+        ends = (self.minimum, self.maximum) if self.exclusive else ()
+        return self.minimum <= number <= self.maximum and number not in ends
 
     def __str__(self) -> str:
         low, high = (str(bound) if isinstance(bound, int) else f"{bound:g}" for bound in (self.minimum, self.maximum))
@@ -54,7 +53,6 @@ class DeviceName:
     """A rule for texts: what `torch.device` takes, and ``auto``."""
 
     def __call__(self, value: str) -> bool:
-        """Whether it is the name of a device."""
         return re.fullmatch(r"auto|cpu|mps|(cuda|xpu)(:\d+)?", value) is not None
 
     def __str__(self) -> str:
@@ -78,7 +76,7 @@ def option(default: T, about: str) -> T:
 
 def defaults_of(options: type) -> dict[str, Any]:
     """The default of each field of a dataclass of options as a config has it: those of a nested one as a mapping."""
-    return {field.name: _plain(getattr(options(), field.name)) for field in dataclasses.fields(options)}
+    return cast(dict[str, Any], _plain(options()))
 
 
 def _plain(value: Any) -> Any:

@@ -36,7 +36,6 @@ class Record:
     per_slot: ClassVar[tuple[str, ...]] = ()
 
     def __init_subclass__(cls) -> None:
-        """Read the annotations once."""
         cls.declared = arrays_of(cls)
         cls.per_slot = tuple(name for name, field in cls.declared.items() if SLOTS in field.shape)
 
@@ -67,13 +66,8 @@ class Record:
         return record
 
     def derived(self: AnyRecord, **changes: Any) -> AnyRecord:
-        """A copy with some fields changed, unchecked: by tensors that fit because of how they are made of this record.
-
-        What a user may have a hand in goes through `replace`.
-        """
-        record = object.__new__(type(self))
-        vars(record).update(vars(self), **changes)
-        return record
+        """As `replace`, unchecked, by tensors that fit because of how they are made of this record: not a user's."""
+        return self.unchecked(**{**vars(self), **changes})
 
     def save(self, path: Path | str) -> None:
         """Write the record to a file in the format of safetensors, which holds numbers and text, never code."""
@@ -103,12 +97,8 @@ class Record:
         return cls(**tensors, **{name: tuple(v) if isinstance(v, list) else v for name, v in plain.items()})
 
     def __repr__(self) -> str:
-        """Shapes and types of the tensors, in one line."""
-        shapes = (
-            f"{name}: {tuple(value.shape)} {str(value.dtype).removeprefix('torch.')}"
-            for name, value in vars(self).items()
-            if isinstance(value, Tensor)
-        )
+        tensors = ((name, value) for name, value in vars(self).items() if isinstance(value, Tensor))
+        shapes = (f"{name}: {tuple(x.shape)} {str(x.dtype).removeprefix('torch.')}" for name, x in tensors)
         return f"{type(self).__name__}({', '.join(shapes)})"
 
     def _map(self: AnyRecord, function: Any, **changes: Any) -> AnyRecord:
@@ -146,9 +136,8 @@ def expect_fields(record: Record, **sizes: int) -> None:
                 known.setdefault(dimension, size)
         wanted = tuple([known.get(dimension) for dimension in dimensions])
         if shape != wanted:
-            raise ValueError(
-                f"{name} has shape {tuple(shape)}; it must be {_in_letters(field.shape) if None in wanted else wanted}"
-            )
+            said = _in_letters(field.shape) if None in wanted else wanted
+            raise ValueError(f"{name} has shape {tuple(shape)}; it must be {said}")
         device = value.device if device is None else device
         if value.device != device:
             raise ValueError(f"{name} is on {value.device} and another field on {device}; all must be on one device")
@@ -202,11 +191,7 @@ def as_index(index: Index, length: int) -> slice | Tensor:
 def padded(value: Tensor, dim: int, length: int) -> Tensor:
     """`value` filled with zeros (False) along `dim` up to `length`."""
     missing = length - value.shape[dim]
-    if missing <= 0:
-        return value
-    shape = list(value.shape)
-    shape[dim] = missing
-    return torch.cat([value, value.new_zeros(shape)], dim)
+    return torch.nn.functional.pad(value, [0, 0] * (value.dim() - 1 - dim) + [0, missing]) if missing > 0 else value
 
 
 def gathered(value: Tensor, order: Int[Tensor, "b m"]) -> Tensor:

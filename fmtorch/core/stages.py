@@ -67,15 +67,12 @@ class TwoStepExtractor(FeatureExtractor, Protocol):
     @property
     def detection(self) -> object:
         """What defines the frames and scores: parts, options, files (`fingerprint.configuration`)."""
-        ...
 
     def detect(self, image: NDArray[np.uint8]) -> tuple[Float[Tensor, "n 2 3"], Float[Tensor, " n"]]:
         """Local affine frames and their scores."""
-        ...
 
     def describe(self, image: NDArray[np.uint8], lafs: Float[Tensor, "n 2 3"]) -> Float[Tensor, "n d"]:
         """The descriptors of the frames, which may be on the CPU."""
-        ...
 
 
 @runtime_checkable
@@ -84,7 +81,6 @@ class TimedExtractor(FeatureExtractor, Protocol):
 
     def timed(self, image: NDArray[np.uint8]) -> tuple[Features, float]:
         """The features, and the seconds that computing them takes or took."""
-        ...
 
 
 @runtime_checkable
@@ -100,7 +96,6 @@ class ImageMatcher(Matcher, Protocol):
 
     def match_images(self, image0: NDArray[np.uint8], image1: NDArray[np.uint8]) -> Correspondences:
         """Images (H, W) or RGB (H, W, 3), uint8 -> putative correspondences of that one pair, with image sizes."""
-        ...
 
 
 @runtime_checkable
@@ -116,7 +111,6 @@ class ImagePruner(Pruner, Protocol):
 
     def with_images(self, c: Correspondences, images: Callable[[int], PairImages]) -> Correspondences:
         """images: of pair i of the batch, read when they are asked for."""
-        ...
 
 
 def pruned(pruner: Pruner, c: Correspondences, images: Callable[[int], PairImages]) -> Correspondences:
@@ -134,8 +128,7 @@ class Estimator(Protocol):
 
 def model_of(estimator: Estimator) -> str:
     """What an estimator's matrices are, `Estimate.model`: fundamental, unless it says otherwise."""
-    model: str = getattr(estimator, "model", "fundamental")
-    return model
+    return str(getattr(estimator, "model", "fundamental"))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -145,7 +138,6 @@ class NoFeatures:
     keep = False
 
     def __call__(self, image: NDArray[np.uint8]) -> Features:
-        """No features of an image."""
         size = torch.tensor(image.shape[:2], dtype=torch.int64)
         return Features(torch.zeros(0, 2, 3), torch.zeros(0), torch.zeros(0, 0), size)
 
@@ -153,25 +145,21 @@ class NoFeatures:
 def output_of(
     part: object, value: object, kind: type[Output], given: Correspondences | None = None, like: Tensor | None = None
 ) -> Output:
-    """What a stage returned, which may be anybody's code.
+    """What a stage returned, which may be anybody's code: a value of this kind.
 
     Args:
-        part: that returned it.
-        value: what it returned.
-        kind: what it must be.
         given: the matches that it was given, whose pairs and device are those of the result.
         like: a tensor on the device that the result must be on, where no matches were given.
 
-    Raises:
-        TypeError: for something else; ValueError: for another number of pairs or matches, another device, half
-            precision, or pairs that are not those given. The message begins with the part's name.
+    Raises TypeError for something else, and ValueError for another number of pairs or matches, another device, half
+    precision, or pairs that are not those given. The message begins with the part's name.
     """
     named = part if isinstance(part, type) or hasattr(part, "__qualname__") else type(part)
     name = f"{named.__module__}.{named.__qualname__}"
     if not isinstance(value, kind):
         what = "None" if value is None else f"a {type(value).__name__}"
         raise TypeError(f"{name} returned {what}; it must return {kind.__name__}")
-    first = value.lafs if isinstance(value, Features) else value.x0 if isinstance(value, Correspondences) else value.F
+    first = value.x0 if isinstance(value, Correspondences) else value.F if isinstance(value, Estimate) else value.lafs
     if first.dtype not in (torch.float32, torch.float64):
         raise ValueError(f"{name} returned {kind.__name__} of {first.dtype}; they must be of float32 or float64")
     if isinstance(value, Features):

@@ -7,16 +7,8 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
+from rich import progress as bars
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TaskID,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 
 from fmtorch.core.failures import place_of
 
@@ -26,27 +18,24 @@ LINE_SECONDS = 60.0  # between two lines of progress where there is no terminal
 MISTAKES = (ValueError, OSError, ImportError)  # what a user can put right
 
 
-class _Bars(Progress):
+class _Bars(bars.Progress):
     """Bars on a terminal; where there is none, as in a log, a line every `LINE_SECONDS`."""
 
     _said = math.inf
 
     def start(self) -> None:
-        """Begin."""
         self._said = time.monotonic()
         super().start()
 
-    def update(self, task_id: TaskID, **changes: Any) -> None:
-        """As of `Progress`."""
+    def update(self, task_id: bars.TaskID, **changes: Any) -> None:
         super().update(task_id, **changes)
         self._say(task_id)
 
-    def advance(self, task_id: TaskID, advance: float = 1) -> None:
-        """As of `Progress`."""
+    def advance(self, task_id: bars.TaskID, advance: float = 1) -> None:
         super().advance(task_id, advance)
         self._say(task_id)
 
-    def _say(self, task_id: TaskID) -> None:
+    def _say(self, task_id: bars.TaskID) -> None:
         if self.console.is_terminal or time.monotonic() - self._said < LINE_SECONDS:
             return
         self._said = time.monotonic()
@@ -56,21 +45,15 @@ class _Bars(Progress):
         print(line, file=sys.stderr, flush=True)
 
 
-def progress_bars() -> Progress:
+def progress_bars() -> bars.Progress:
     """Progress bars on the terminal's error stream, as all commands show them; a context manager."""
-    columns = (
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
-    return _Bars(*columns, console=errors)
+    counts = bars.MofNCompleteColumn(), bars.TimeElapsedColumn(), bars.TimeRemainingColumn()
+    return _Bars(bars.TextColumn("{task.description}", markup=False), bars.BarColumn(), *counts, console=errors)
 
 
-def reporter(progress: Progress, description: str) -> Callable[[int, int], None]:
+def reporter(progress: bars.Progress, description: str) -> Callable[[int, int], None]:
     """A function of (done, total) that shows a bar from its first call on."""
-    bar: list[TaskID] = []
+    bar: list[bars.TaskID] = []
 
     def report(done: int, total: int) -> None:
         if not bar:
@@ -82,9 +65,7 @@ def reporter(progress: Progress, description: str) -> Callable[[int, int], None]
 
 def error_line(error: BaseException) -> str:
     """An error in one line, with the path that an OSError is about, and where a user's own code raised it."""
-    text = str(error)
-    if not isinstance(error, MISTAKES):
-        text = f"{type(error).__name__}: {text}"
+    text = str(error) if isinstance(error, MISTAKES) else f"{type(error).__name__}: {error}"
     if isinstance(error, OSError) and error.strerror and error.errno is not None:
         paths = [str(path) for path in (error.filename, error.filename2) if path is not None]
         text = f"{' -> '.join(paths)}: {error.strerror}" if paths else error.strerror

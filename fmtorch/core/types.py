@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import html
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Annotated, Any, TypeVar, cast
 
 import torch
@@ -18,7 +19,6 @@ from jaxtyping import Bool, Float, Int, Real
 from torch import Tensor
 
 from fmtorch.core.annotations import Rule
-from fmtorch.core.display import table_html
 from fmtorch.core.records import Index, Record, as_index, expect_fields, gathered, padded, slotted
 
 MIN_LENS, MAX_LENS = -0.45, 0.2  # of lenses that leave an image unfolded and its corners in front of the camera
@@ -39,6 +39,7 @@ LENS = Rule(
     "it is lambda in half diagonals, from -0.45, below which images fold, to 0.2, and its deviation",
 )
 
+MAX_ROWS = 20  # of a table in a notebook
 RELATED = 1.0
 """The significance from which on two images are called related; chosen on tuning pairs (docs/concepts/related.md)."""
 
@@ -93,7 +94,6 @@ class Features(Record):
         return cast(Tensor, self.mask)
 
     def __len__(self) -> int:
-        """Number of feature slots, padding included."""
         return int(self.lafs.shape[-3])
 
     def __getitem__(self, index: Index) -> Features:
@@ -166,11 +166,9 @@ class Correspondences(Record):
         return self.focal is not None or self.shared_focal is not None
 
     def __len__(self) -> int:
-        """Number of pairs."""
         return int(self.x0.shape[0])
 
     def __getitem__(self, index: Index) -> Correspondences:
-        """The selected pairs, always as a batch."""
         i = as_index(index, len(self))
         return self._map(lambda value: value[i])
 
@@ -288,10 +286,8 @@ class Estimate(Record):
         Empty where there is nothing to say. Raises as `pair_type` where none of these was looked at.
         """
         looked = self.contradicted is not None or self.sizes_doubtful is not None
-        if self.pair_type_index is None and looked:
-            opens = [""] * len(self)
-        else:
-            opens = [WARNINGS[name] for name in self.pair_type]
+        unknown = self.pair_type_index is None and looked
+        opens = [""] * len(self) if unknown else [WARNINGS[name] for name in self.pair_type]
         contradicted = [False] * len(self) if self.contradicted is None else self.contradicted.tolist()
         said = [[CONTRADICTED if wrong else "", left] for wrong, left in zip(contradicted, opens, strict=True)]
         if self.sizes is not None and self.sizes_doubtful is not None:
@@ -310,17 +306,14 @@ class Estimate(Record):
         return torch.rad2deg(torch.stack([variances[:, :3].sum(-1), variances[:, 3:5].sum(-1)], -1).sqrt())
 
     def __len__(self) -> int:
-        """Number of pairs."""
         return int(self.F.shape[0])
 
     def __getitem__(self, index: Index) -> Estimate:
-        """The selected pairs, always as a batch."""
         i = as_index(index, len(self))
         picked = torch.arange(len(self), device=self.ok.device)[i].tolist()
         return self._map(lambda value: value[i], reason=tuple(self.reason[j] for j in picked))
 
     def __repr__(self) -> str:
-        """One line: what was found of a pair, or of how many."""
         if len(self) == 1:
             return f"{type(self).__name__}({', '.join(filter(None, self._row(0)[1:]))})"
         inliers = self.inliers.sum(-1).tolist()
@@ -329,9 +322,11 @@ class Estimate(Record):
         return f"{type(self).__name__}({len(self)} pairs: {ok} ok, {related} related{spread})"
 
     def _repr_html_(self) -> str:
-        """What a notebook shows: a line for each pair."""
-        header = ("pair", "found", "inliers", "support")
-        return table_html(header, [self._row(i) for i in range(len(self))], repr(self))
+        rows = [_html_row(self._row(i)) for i in range(min(len(self), MAX_ROWS))]
+        if len(self) > MAX_ROWS:
+            rows.append(f'<tr><td colspan="4">and {len(self) - MAX_ROWS} more</td></tr>')
+        header = _html_row(("pair", "found", "inliers", "support"), "th")
+        return f"<table><caption>{html.escape(repr(self))}</caption>{header}{''.join(rows)}</table>"
 
     def _row(self, i: int) -> tuple[str, str, str, str]:
         """A pair's number, what was found, its inliers and its significance."""
@@ -345,6 +340,10 @@ class Estimate(Record):
         value = float(cast(Tensor, self.significance)[i])
         support = "" if math.isnan(value) else f"significance {value:.1f}, {'' if self.related[i] else 'not '}related"
         return str(i), found, f"{int(self.inliers[i].sum())} inliers", support
+
+
+def _html_row(cells: Iterable[str], tag: str = "td") -> str:
+    return f"<tr>{''.join(f'<{tag}>{html.escape(cell)}</{tag}>' for cell in cells)}</tr>"
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -371,8 +370,9 @@ def collate(items: Sequence[Item]) -> Item:
     first = items[0]
     if len({(type(item), item.lafs.dim() if isinstance(item, Features) else 0) for item in items}) > 1:
         raise TypeError(f"collate needs items of one kind, not {', '.join(type(item).__name__ for item in items[:5])}")
-    n = max(_slots(item) for item in items)
     single = isinstance(first, Features) and first.image_size.dim() == 1
+    axis = 0 if single else 1  # of slots
+    n = max(getattr(item, first.per_slot[0]).shape[axis] for item in items)
     merged: dict[str, Any] = {}
     for field in dataclasses.fields(first):
         values = [getattr(item, field.name) for item in items]
@@ -385,14 +385,7 @@ def collate(items: Sequence[Item]) -> Item:
         elif any(value is None for value in values):
             merged[field.name] = None
         else:
-            filled = (
-                [padded(value, 0 if single else 1, n) for value in values] if field.name in first.per_slot else values
-            )
-            merged[field.name] = torch.stack(filled) if single else torch.cat(filled)
+            if field.name in first.per_slot:
+                values = [padded(value, axis, n) for value in values]
+            merged[field.name] = torch.stack(values) if single else torch.cat(values)
     return type(first)(**merged)
-
-
-def _slots(item: Features | Correspondences | Estimate) -> int:
-    if isinstance(item, Features):
-        return len(item)
-    return int((item.x0 if isinstance(item, Correspondences) else item.inliers).shape[1])

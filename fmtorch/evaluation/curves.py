@@ -1,6 +1,5 @@
 """Pictures as SVG: recall curves, within a page or of their own, and view graphs."""
 
-import base64
 import dataclasses
 import html
 import math
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 
 from fmtorch.evaluation.statistics import ALL, THRESHOLD
 from fmtorch.io.export import Edge, ViewGraph
+from fmtorch.pipeline.pictures import jpeg_url
 
 MAXIMUM = 0.2  # the last NSGD threshold, the paper's
 MAX_CORNER_ERROR = 10.0  # px, the last of SuperGlue's and LoFTR's thresholds
@@ -52,24 +52,14 @@ def axis_of(runs: Mapping[str, pa.Table]) -> Axis:
 
 def panels(runs: Mapping[str, pa.Table]) -> dict[str, dict[str, NDArray[np.float64]]]:
     """Title of a panel -> name of a run -> errors of its pairs: a panel of each family, and of all of several."""
-    families = by_family(runs)
-    if len(families) < 2:
-        return families
     column = axis_of(runs).column
     overall = {name: table[column].to_numpy().astype(np.float64) for name, table in runs.items() if len(table)}
-    return {ALL: overall, **families}
-
-
-def by_family(runs: Mapping[str, pa.Table]) -> dict[str, dict[str, NDArray[np.float64]]]:
-    """Family -> name of a run -> errors of its pairs, of `axis_of`."""
-    column = axis_of(runs).column
-    out: dict[str, dict[str, NDArray[np.float64]]] = {}
-    for name, table in runs.items():
-        family = np.asarray(table["family"].to_pylist(), dtype=object)
-        errors = table[column].to_numpy().astype(np.float64)
+    families: dict[str, dict[str, NDArray[np.float64]]] = {}
+    for name, errors in overall.items():
+        family = np.asarray(runs[name]["family"].to_pylist(), dtype=object)
         for each in dict.fromkeys(family):
-            out.setdefault(str(each), {})[name] = errors[family == each]
-    return out
+            families.setdefault(str(each), {})[name] = errors[family == each]
+    return families if len(families) < 2 else {ALL: overall, **families}
 
 
 def style(number: int) -> tuple[str, str]:
@@ -84,9 +74,9 @@ def swatch(number: int) -> str:
     return f'<svg class="swatch {colour}" viewBox="0 0 26 8" aria-hidden="true">{line}</svg>'
 
 
-def style_sheet() -> str:
-    """The colours and lines of curves."""
-    return resources.files(__package__).joinpath("curves.css").read_text(encoding="utf-8")
+def resource(name: str) -> str:
+    """The text of a file beside this one."""
+    return resources.files(__package__).joinpath(name).read_text(encoding="utf-8")
 
 
 def picture(name: str, table: pa.Table) -> str:
@@ -100,7 +90,7 @@ def picture(name: str, table: pa.Table) -> str:
         recall = f"{100 * axis.below(errors, axis.mark):.1f}"
         rows.append(f'<text x="{_WIDTH + 38}" y="{y}">{recall} {html.escape(title)}</text>')
     height = max(_HEIGHT, _TOP + _LINE * len(curves)) + _LINE
-    colours, _, rules = style_sheet().partition("@media")
+    colours, _, rules = resource("curves.css").partition("@media")
     light = dict(re.findall(r"(--\w+): (#\w+)", colours))  # by their values: not every viewer knows variables
     rules = re.sub(r"var\((--\w+)\)", lambda match: light[match[1]], rules[rules.index(".c0") :])
     return (
@@ -156,9 +146,6 @@ def _x(share: float) -> float:
 
 def _y(share: float) -> float:
     return _HEIGHT - _BOTTOM - (_HEIGHT - _TOP - _BOTTOM) * share
-
-
-# A picture of a view graph as SVG: images on a circle, those that see the same things side by side
 
 
 MAX_THUMBNAILS, MAX_LABELS, MAX_EDGES, MAX_SPECTRAL = 40, 80, 20_000, 1_500
@@ -231,15 +218,9 @@ def _node(name: str, at: tuple[float, float], colour: str, picture: Image | None
         return f'<circle cx="{x:.1f}" cy="{y:.1f}" r="4" fill="{colour}">{title}</circle>'
     scale = _THUMBNAIL / max(picture.shape[:2])
     h, w = (max(round(side * scale), 1) for side in picture.shape[:2])
-    small = cv2.resize(picture, (2 * w, 2 * h), interpolation=cv2.INTER_AREA)
-    small = small[..., ::-1] if small.ndim == 3 else small
-    encoded = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1]
-    data = base64.b64encode(encoded.tobytes()).decode()
+    url = jpeg_url(np.asarray(cv2.resize(picture, (2 * w, 2 * h), interpolation=cv2.INTER_AREA), np.uint8), _QUALITY)
     box = f'x="{x - w / 2:.1f}" y="{y - h / 2:.1f}" width="{w}" height="{h}"'
-    return (
-        f'<g><image {box} href="data:image/jpeg;base64,{data}"/>'
-        f'<rect {box} fill="none" stroke="{colour}" stroke-width="2"/>{title}</g>'
-    )
+    return f'<g><image {box} href="{url}"/><rect {box} fill="none" stroke="{colour}" stroke-width="2"/>{title}</g>'
 
 
 def _label(name: str, angle: float, center: float, radius: float) -> str:

@@ -24,9 +24,6 @@ from fmtorch.pipeline.pipeline import Outcome, Pipeline, build_pipeline
 from fmtorch.runs import RunFolder
 from fmtorch.scenes import RenderedPairs
 
-# A pair of a run seen again: its pictures, and where its pipeline now gives another result than the run stored
-
-
 SAME_F = 1e-12  # difference of any element, of unit Frobenius norm, within which two F are the same
 SAME_CORNERS = 0.01  # px, corner error up to which two homographies are the same: what captions show
 SAME_NSGD = 1e-4  # between the F of a run and the one drawn again, up to which they are the same: what captions show
@@ -65,11 +62,8 @@ def _difference_of_homographies(
     again = outcome.estimate
     if again is None or not bool(again.ok[0]) or not stored["ok"]:
         has_homography = again is not None and bool(again.ok[0])
-        return (
-            ""
-            if has_homography == bool(stored["ok"])
-            else f"{'gives a' if has_homography else 'gives no'} homography now, unlike in its run"
-        )
+        said = f"gives {'a' if has_homography else 'no'} homography now, unlike in its run"
+        return "" if has_homography == bool(stored["ok"]) else said
     size, H = torch.tensor([images[0].shape[:2]]), torch.tensor(stored["H"], dtype=torch.float64).reshape(1, 3, 3)
     apart = float(corner_error(again.F.cpu(), H, size)[0])
     return "" if apart <= SAME_CORNERS else f"gives another homography when it is drawn again, {apart:.2f} px apart"
@@ -178,7 +172,10 @@ def find_dataset(stored: Mapping[str, Any], options: Options) -> PairDataset:
     reasons = []
     for place in _places(known, options.roots):
         try:
-            return _same(data.build({**known, **place}), stored)
+            dataset = data.build({**known, **place})
+            if stored.get("digest") in (None, dataset.digest):
+                return dataset
+            reasons.append("the data set has changed since the run, or another one lies in root")
         except _NOT_BUILT as error:
             reasons.append(str(error))
     raise DataError("; ".join(dict.fromkeys(reasons)))
@@ -200,12 +197,6 @@ def _places(known: Mapping[str, Any], roots: Sequence[Path]) -> list[dict[str, A
     else:
         places.append({})  # its usual place
     return places or [{}]
-
-
-def _same(dataset: PairDataset, stored: Mapping[str, Any]) -> PairDataset:
-    if stored.get("digest") not in (None, dataset.digest):
-        raise DataError("the data set has changed since the run, or another one lies in root")
-    return dataset
 
 
 def rebuilt(r: Run, options: Options) -> Pipeline:

@@ -5,7 +5,6 @@ import dataclasses
 import hashlib
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from importlib import resources
 from typing import Any
 
 import cv2
@@ -17,6 +16,7 @@ from fmtorch.core.settings import leaves
 from fmtorch.evaluation import curves, tables
 from fmtorch.evaluation.statistics import THRESHOLD, summarize
 from fmtorch.pipeline.photographs import Image
+from fmtorch.pipeline.pictures import jpeg_url
 
 QUALITY, WIDTH = 80, 1280  # of JPEG pictures; px
 DISAGREEMENT = 0.1  # NSGD beyond which a result is as bad as any
@@ -36,9 +36,7 @@ class Picture:
         if image.shape[1] > WIDTH:
             height = round(image.shape[0] * WIDTH / image.shape[1])
             image = np.asarray(cv2.resize(image, (WIDTH, height), interpolation=cv2.INTER_AREA), np.uint8)
-        jpeg = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1].tobytes()
-        height, width = image.shape[:2]
-        return f"data:image/jpeg;base64,{base64.b64encode(jpeg).decode('ascii')}", width, height
+        return jpeg_url(image, QUALITY), image.shape[1], image.shape[0]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,10 +92,7 @@ class Section:
 
 
 def render(
-    title: str,
-    sections: Sequence[Section],
-    runs: Sequence[Sequence[str]],
-    shared: Sequence[tuple[str, str]] = (),
+    title: str, sections: Sequence[Section], runs: Sequence[Sequence[str]], shared: Sequence[tuple[str, str]] = ()
 ) -> str:
     """The page: one file that loads nothing, whose script sorts and filters and whose content does without it.
 
@@ -108,15 +103,13 @@ def render(
     except ImportError as error:
         raise ImportError("a report needs jinja2: pip install 'fmtorch[report]'") from error
     names = list(dict.fromkeys([*(row[0] for row in runs), *(name for s in sections for name in s.runs)]))
-    script = _resource("report.js")
-    environment = jinja2.Environment(
-        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    return environment.from_string(_resource("report.html.j2")).render(
+    script = curves.resource("report.js")
+    options = {"undefined": jinja2.StrictUndefined, "trim_blocks": True, "lstrip_blocks": True}
+    return jinja2.Environment(autoescape=True, **options).from_string(curves.resource("report.html.j2")).render(
         title=title, runs=runs, shared=shared, names=names,
         swatches={name: curves.swatch(i) for i, name in enumerate(names)},
         sections=[_context(section, names) for section in sections],
-        style=curves.style_sheet() + _resource("report.css"), script=script,
+        style=curves.resource("curves.css") + curves.resource("report.css"), script=script,
         policy="default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-"
         + base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() + "'",
     )  # fmt: skip
@@ -150,10 +143,6 @@ def differing_pairs(runs: Mapping[str, pa.Table], count: int) -> list[str]:
     return [names[rows[i]] for i in chosen]
 
 
-def _resource(name: str) -> str:
-    return resources.files(__package__).joinpath(name).read_text(encoding="utf-8")
-
-
 def _context(section: Section, names: Sequence[str]) -> dict[str, Any]:
     summaries = {name: summarize(table, name in section.signed) for name, table in section.runs.items()}
     axis = curves.axis_of(section.runs)
@@ -173,9 +162,6 @@ def _context(section: Section, names: Sequence[str]) -> dict[str, Any]:
         "pairs": section.pairs,
         "notes": section.notes,
     }
-
-
-# Short names of runs: what differs between them and nothing else
 
 
 MAX_OPTIONS = 3  # that a name tells of a stage; of more the identity's first digits do
@@ -198,21 +184,17 @@ def run_names(
         groups: what runs are shown together, such as the data set: the same method on another has the same name. All
             in one group if not given.
     """
-    groups = groups if groups is not None else [""] * len(configs)
+    groups = [""] * len(configs) if groups is None else groups
     pipelines = [str(config.get("pipeline", "run")) for config in configs]
     details = []
     for pipeline, config in zip(pipelines, configs, strict=True):
         same = [other for name, other in zip(pipelines, configs, strict=True) if name == pipeline]
         details.append(list(_details(config, same)))
     shared = len(set(pipelines)) == 1 and len(configs) > 1 and all(details)
-    names = [
-        " ".join(words if shared else [pipeline, *words]) for pipeline, words in zip(pipelines, details, strict=True)
-    ]
-    grouped = list(zip(names, groups, strict=True))
-    return [
-        entry[0] if grouped.count(entry) == 1 else f"{entry[0]} {identity[:_DIGITS]}"
-        for entry, identity in zip(grouped, identities, strict=True)
-    ]
+    each = zip(pipelines, details, groups, strict=True)
+    named = [(" ".join(words if shared else [pipeline, *words]), group) for pipeline, words, group in each]
+    own = zip(named, identities, strict=True)
+    return [entry[0] if named.count(entry) == 1 else f"{entry[0]} {digits[:_DIGITS]}" for entry, digits in own]
 
 
 def shared_settings(configs: Sequence[Mapping[str, Any]]) -> list[tuple[str, str]]:
@@ -222,10 +204,9 @@ def shared_settings(configs: Sequence[Mapping[str, Any]]) -> list[tuple[str, str
         values = [config.get(group) for config in configs]
         if values[0] in (None, {}, []) or any(value != values[0] for value in values):
             continue
-        if group == "pruner":
-            words = list(_pruners(values[0]))
-        else:
-            words = list(_stage(group, values[0], [])) if isinstance(values[0], Mapping) else [str(values[0])]
+        words = [*_pruners(values[0])] if group == "pruner" else [str(values[0])]
+        if isinstance(values[0], Mapping):
+            words = list(_stage(group, values[0], []))
         settings.append((group, ", ".join(words)))
     return settings
 

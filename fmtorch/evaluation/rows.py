@@ -136,12 +136,10 @@ def pose_errors(outcomes: Sequence[Outcome], signed: bool = False) -> list[PairP
     """
     poses = [_without_estimate(outcome, signed) for outcome in outcomes]
     known = [i for i, pose in enumerate(poses) if pose.pose_reason is None]
-    for estimated, error_of, reason in (
-        (True, functools.partial(_of_pose, up_to_sign=not signed), "the pose is not determined"),
-        (False, _closest, "F has no pose") if signed else
-        (False, _of_fundamental, "no inlier in front of both cameras"),
-    ):  # fmt: skip
-        own = [i for i in known if _has_pose(outcomes[i]) == estimated]
+    own_pose = functools.partial(_of_pose, up_to_sign=not signed), "the pose is not determined"
+    of_F = (_closest, "F has no pose") if signed else (_of_fundamental, "no inlier in front of both cameras")
+    for estimated, (error_of, reason) in ((True, own_pose), (False, of_F)):
+        own = [i for i in known if (cast(Estimate, outcomes[i].estimate).R is not None) == estimated]
         error = error_of([outcomes[i] for i in own]) if own else PoseError(torch.zeros(0), torch.zeros(0))
         for i, rotation, translation in zip(own, error.rotation.tolist(), error.translation.tolist(), strict=True):
             poses[i] = PairPose(rotation, translation, reason if rotation >= LARGEST_ROTATION else None)
@@ -162,10 +160,6 @@ def _unknown(pair: ImagePair) -> str | None:
         return f"{', '.join(missing)} unknown"
     broken = [name for name, value in values.items() if not np.isfinite(cast(NDArray[np.float64], value)).all()]
     return f"{', '.join(broken)} not finite" if broken else None
-
-
-def _has_pose(outcome: Outcome) -> bool:
-    return outcome.estimate is not None and outcome.estimate.R is not None
 
 
 def _of_pose(outcomes: Sequence[Outcome], up_to_sign: bool) -> PoseError:

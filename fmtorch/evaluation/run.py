@@ -61,10 +61,8 @@ def run_identity(
         and its digest; `cameras`, where they are given; `pose`, where translations are signed.
     """
     stages = presets.stages(config)
-    dataset = {
-        **{key: value for key, value in plain(config.dataset).items() if key not in PLACES},
-        "digest": dataset_digest,
-    }
+    dataset = {key: value for key, value in plain(config.dataset).items() if key not in PLACES}
+    dataset["digest"] = dataset_digest
     return {
         "pipeline": pipeline_name, **stages, "seed": config.seed, "version": fmtorch_version(),
         "libraries": libraries(presets.peer_packages(stages)), "kernels": kernel.identity(),
@@ -111,9 +109,6 @@ def _code(config: object) -> dict[str, str]:
         except (TypeError, KeyError, OSError):
             digests[target] = "in no file"
     return digests
-
-
-# Runs whose estimator is given what is known of each pair's cameras: ``cameras=known``, ``shared``, ``exif``
 
 
 Cameras = Literal["known", "shared", "exif", "unknown"]
@@ -180,16 +175,10 @@ class WithPairCameras:
 
     def given(self, c: Correspondences) -> Correspondences:
         own = [self.cameras[key] for key in c.keys.tolist()]
-        K0, K1 = (_stacked(K, c.mask.device) for K in ([each.K0 for each in own], [each.K1 for each in own]))
-        focal = torch.stack([each.focal for each in own]).to(c.mask.device)
-        shared = torch.tensor([each.shared_focal for each in own], device=c.mask.device)
-        return c.derived(K0=K0, K1=K1, focal=focal, shared_focal=shared)
-
-
-def _stacked(K: Sequence[Tensor | None], device: torch.device) -> Tensor | None:
-    """The calibrations (B, 3, 3) of a run, of whose pairs all have one, or none."""
-    given = [each for each in K if each is not None]
-    return torch.stack(given).to(device) if given else None
+        K0, K1, focal, shared = zip(*own, strict=True)
+        stacked = [None if K[0] is None else torch.stack(K).to(c.mask.device) for K in (K0, K1, focal)]  # all, or none
+        fields = dict(zip(("K0", "K1", "focal"), stacked, strict=True))
+        return c.derived(**fields, shared_focal=torch.tensor(shared, device=c.mask.device))
 
 
 def built_with(build: Callable[[], Pipeline], cameras: Mapping[int, PairCameras]) -> Pipeline:
@@ -197,9 +186,6 @@ def built_with(build: Callable[[], Pipeline], cameras: Mapping[int, PairCameras]
     pipeline = build()
     pipeline.estimator = WithPairCameras(pipeline.estimator, cameras)
     return pipeline
-
-
-# What a worker does with a batch of pairs: it runs a pipeline and evaluates its outcomes
 
 
 Build = Callable[[], Pipeline]
@@ -277,20 +263,14 @@ def with_contents(pair: ImagePair) -> ImagePair:
         return pair
     with contextlib.suppress(Exception):
         if pair.matches is not None:
-            return dataclasses.replace(pair, matches=_Read(pair.matches()))
+            return dataclasses.replace(pair, matches=functools.partial(_read, pair.matches()))
         images = (dataclasses.replace(image, data=image.path.read_bytes()) for image in (pair.image0, pair.image1))
         return dataclasses.replace(pair, image0=next(images), image1=next(images))
     return pair
 
 
-@dataclasses.dataclass(frozen=True)
-class _Read:
-    """Given matches that are read already."""
-
-    matches: GivenMatches
-
-    def __call__(self) -> GivenMatches:
-        return self.matches
+def _read(matches: GivenMatches) -> GivenMatches:
+    return matches
 
 
 def batch_contents(pairs: list[ImagePair]) -> list[ImagePair]:
@@ -305,9 +285,6 @@ def batch_contents(pairs: list[ImagePair]) -> list[ImagePair]:
         ]
         result.append(dataclasses.replace(own, image0=images[0], image1=images[1]))
     return result
-
-
-# The loop that makes a run: batches of pairs through a pipeline by several workers, rows stored as they come
 
 
 BATCHES_OF_A_WORKER = 4  # at least, where there are pairs enough

@@ -79,11 +79,8 @@ def areas(nsgd: Values) -> Values:
     return _per_pair(metrics.mean_recall(torch.from_numpy(nsgd)[..., None], THRESHOLD))
 
 
-MERITS: dict[str, Callable[[Values], Values]] = {
-    "recall_05": recalled,
-    "recall_01": partial(recalled, threshold=FINE_THRESHOLD),
-    "auc_05": areas,
-}
+_FINE = partial(recalled, threshold=FINE_THRESHOLD)
+MERITS: dict[str, Callable[[Values], Values]] = {"recall_05": recalled, "recall_01": _FINE, "auc_05": areas}
 """The figures of merit, by the names that rows, summaries and JSON files have for them: NSGD -> values of pairs."""
 
 
@@ -178,11 +175,7 @@ def difference(a: Values, b: Values, scenes: Sequence[str], scale: float = 1.0, 
     Of the pairs for which both are not NaN; None where there are none, or, for a figure that is no share, fewer than
     `MIN_UNITS` units. The methods differ at this level where the interval does not hold 0.
 
-    Args:
-        a, b: one per pair, (n,).
-        scenes: the scene of each pair.
-        scale: of the result.
-        share: the values are successes, see `share_difference`.
+    a, b, scenes: one per pair, (n,). share: the values are successes, see `share_difference`.
     """
     if len(a) != len(b):
         raise ValueError(f"a difference is of the same pairs, but a has {len(a)} and b has {len(b)}")
@@ -230,11 +223,7 @@ def bootstrap_mean(values: Values, scenes: Sequence[str]) -> Interval:
 
     With fewer than `MIN_SCENES` scenes the pairs are resampled instead, which is too narrow where pairs of a scene
     succeed and fail together. The interval has no width where all values are equal. The same input always gives the
-    same interval.
-
-    Args:
-        values: one per pair, (n,), n >= 1.
-        scenes: the scene of each pair.
+    same interval. values, scenes: one per pair, (n,), n >= 1.
     """
     cluster = _clusters(scenes)
     sums, sizes = np.bincount(cluster, values), np.bincount(cluster)
@@ -258,9 +247,7 @@ def effective_pairs(values: NDArray[np.float64], scenes: Sequence[str]) -> float
     at least 1; and by the squared ratio of Student's quantiles, because few scenes tell their own spread badly. n with
     fewer than `MIN_SCENES` scenes, whose spread cannot be seen, and where all values are equal.
 
-    Args:
-        values: one per pair, (n,), n >= 1.
-        scenes: the scene of each pair.
+    values, scenes: one per pair, (n,), n >= 1.
     """
     n, m = len(values), len(set(scenes))
     centred = values - values.mean()
@@ -275,9 +262,8 @@ def effective_pairs(values: NDArray[np.float64], scenes: Sequence[str]) -> float
 def share_interval(successes: Values | NDArray[np.bool_], scenes: Sequence[str]) -> Interval:
     """The share of pairs that succeed, with Wilson's 95 % score interval for the effective number of pairs.
 
-    Args:
-        successes: (n,), n >= 1; of several seeds the share of those with which a pair succeeds, in [0, 1].
-        scenes: the scene of each pair; `Interval.over` says whether scenes were many enough to be the units.
+    successes: (n,), n >= 1; of several seeds the share of those with which a pair succeeds, in [0, 1]. scenes: one per
+    pair; `Interval.over` says whether these were many enough to be the units.
     """
     values = successes.astype(np.float64)
     p, n = float(values.mean()), effective_pairs(values, scenes)
@@ -294,9 +280,7 @@ def share_difference(a: Values | NDArray[np.bool_], b: Values | NDArray[np.bool_
     based on paired data", Journal of Educational and Behavioral Statistics 2012), so that methods which agree on every
     pair still have an interval of the width that so few pairs allow.
 
-    Args:
-        a, b: (n,), n >= 1, where either method succeeds; of several seeds as in `share_interval`.
-        scenes: the scene of each pair.
+    a, b: (n,), n >= 1, where either method succeeds; of several seeds as in `share_interval`. scenes: one per pair.
     """
     difference = a.astype(np.float64) - b.astype(np.float64)
     n = effective_pairs(difference, scenes)
@@ -306,9 +290,6 @@ def share_difference(a: Values | NDArray[np.bool_], b: Values | NDArray[np.bool_
     value = float(difference.mean())
     low, high = max(-1.0, p - q - half), min(1.0, p - q + half)
     return Interval(value, min(low, value), max(high, value), unit(scenes))
-
-
-# The figures of a run: recall with its interval, inlier rates, counts, failures, seconds; by family and over all
 
 
 ALL = "all"
@@ -368,10 +349,10 @@ def _group(table: pa.Table, signed: bool) -> Group:
 
     for name in ("inlier_rate", "inlier_rate_before"):
         rate = _column(table, name)
-        group[name] = _mean(rate[ok])
-        group[f"{name}_failures_0"] = _mean(np.where(ok, np.nan_to_num(rate), 0.0))
+        group[name] = _of_known(np.mean, rate[ok])
+        group[f"{name}_failures_0"] = _of_known(np.mean, np.where(ok, np.nan_to_num(rate), 0.0))
     for name in ("corrs", "corrs_before"):
-        group[name] = _mean(_column(table, name)[ok])
+        group[name] = _of_known(np.mean, _column(table, name)[ok])
 
     group["pose"] = pose_figures(_column(table, "rotation_error"), _column(table, "translation_error"), signed)
     group["homography"] = homography_figures(_column(table, "corner_error"))
@@ -386,9 +367,9 @@ def _group(table: pa.Table, signed: bool) -> Group:
         "reasons": common_reasons([reason for reason in table["reason"].to_pylist() if reason], _REASONS),
     }  # fmt: skip
     seconds = np.stack([_column(table, f"seconds_{stage}") for stage in STAGES])
-    group["seconds"] = {stage: _median(row) for stage, row in zip(STAGES, seconds, strict=True)}
-    unknown = np.isnan(seconds).all(0)
-    group["seconds"]["total"] = _median(np.where(unknown, np.nan, np.nansum(seconds, axis=0)))
+    total = np.where(np.isnan(seconds).all(0), np.nan, np.nansum(seconds, axis=0))
+    named = zip((*STAGES, "total"), (*seconds, total), strict=True)
+    group["seconds"] = {stage: _of_known(np.median, values) for stage, values in named}
     return group
 
 
@@ -397,14 +378,9 @@ def _column(table: pa.Table, name: str) -> NDArray[np.float64]:
     return values
 
 
-def _mean(values: NDArray[np.float64]) -> float | None:
+def _of_known(figure: Callable[[Values], Any], values: Values) -> float | None:
     known = values[~np.isnan(values)]
-    return float(known.mean()) if len(known) else None
-
-
-def _median(values: NDArray[np.float64]) -> float | None:
-    known = values[~np.isnan(values)]
-    return float(np.median(known)) if len(known) else None
+    return float(figure(known)) if len(known) else None
 
 
 def common_reasons(reasons: Sequence[str], count: int) -> dict[str, int]:

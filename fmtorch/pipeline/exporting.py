@@ -110,10 +110,8 @@ def _pair(
     at no keypoint.
     """
     mask = c.mask[0].cpu()
-    index = [
-        indices(keypoints, x[0].detach().cpu().float()[mask].numpy())
-        for keypoints, x in zip(points, (c.x0, c.x1), strict=True)
-    ]
+    ends = (x[0].detach().cpu().float()[mask].numpy() for x in (c.x0, c.x1))
+    index = [indices(keypoints, x) for keypoints, x in zip(points, ends, strict=True)]
     ambiguity = torch.zeros(len(mask)) if c.ambiguity is None else c.ambiguity[0].detach().cpu().float()
     scores = (1 - ambiguity[mask]).nan_to_num(0.0).clamp(0.0, 1.0)
     return StoredPair(

@@ -52,9 +52,8 @@ def images_below(folder: Path) -> list[Path]:
 def _images(folder: Path) -> Iterator[Path]:
     for parent, folders, files in os.walk(folder):
         inside = Path(parent)
-        folders[:] = [
-            name for name in folders if not (name.startswith(".") or (inside / name / _SET_OF_PAIRS).is_file())
-        ]
+        seen = (name for name in folders if not name.startswith("."))
+        folders[:] = [name for name in seen if not (inside / name / _SET_OF_PAIRS).is_file()]
         drawn = _DRAWN if "result.json" in files else ()
         for name in files:
             path = inside / name
@@ -375,7 +374,6 @@ class FolderMatches:
         self._troubles[pair] = f"{self.journal.name(pair[0])}, {self.journal.name(pair[1])}: {reason}"
 
     def _forget(self, needed: set[Path]) -> None:
-        """Keep the features of the last images, and of those that are needed."""
         for image in [*self._described]:
             if len(self._described) <= MEMORY:
                 return

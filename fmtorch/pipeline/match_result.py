@@ -15,13 +15,12 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from fmtorch.core.display import picture_html
 from fmtorch.core.files import replacing
 from fmtorch.core.types import RELATED, Correspondences
 from fmtorch.data.cameras import Lens, undistorted
 from fmtorch.io.match_store import PairGeometry
 from fmtorch.pipeline.photographs import GivenImage, Image, given_image
-from fmtorch.pipeline.pictures import draw_epipolar_lines, draw_matches, headed
+from fmtorch.pipeline.pictures import draw_epipolar_lines, draw_matches, headed, jpeg_url
 from fmtorch.two_view.arguments import Arrays
 
 FLAT = ("planar", "rotation", "identical")  # pair types of which a homography explains all matches
@@ -124,11 +123,8 @@ class MatchResult:
         """
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        names = ["matches"]
-        if self._pruners:
-            names.append("pruning")
-        if self.ok or truth is not None:
-            names.append("epipolar")
+        drawn = {"matches": True, "pruning": bool(self._pruners), "epipolar": self.ok or truth is not None}
+        names = [name for name in get_args(Picture) if drawn[name]]
         with replacing(folder / "result.json") as path:
             path.write_text(json.dumps({**(report or {}), **self.report()}) + "\n")
         for name in get_args(Picture):
@@ -139,7 +135,7 @@ class MatchResult:
             with replacing(path) as temporary:
                 nsgd = (report or {}).get("nsgd")
                 picture = self._epipolar(truth, nsgd) if name == "epipolar" else self.draw(name)
-                temporary.write_bytes(_encoded(picture, "png"))
+                temporary.write_bytes(cv2.imencode(".png", picture[..., ::-1])[1].tobytes())
         return ["result.json", *(f"{name}.png" for name in names)]
 
     def report(self) -> dict[str, Any]:
@@ -163,14 +159,12 @@ class MatchResult:
         return report
 
     def __repr__(self) -> str:
-        """One line: matches, inliers, and what they say of the photographs."""
         found = [f"{len(self.inliers)} matches"]
-        if self.ok:
-            verdict = "related" if self.related else "not related"
-            found += [f"{int(self.inliers.sum())} inliers", f"significance {self.significance:.1f}", verdict]
-            found += [self.pair_type] if self.pair_type not in ("", "unrelated") else []
-        else:
-            found.append(f"no F: {self.reason}")
+        if not self.ok:
+            return f"MatchResult({found[0]}, no F: {self.reason})"
+        verdict = "related" if self.related else "not related"
+        found += [f"{int(self.inliers.sum())} inliers", f"significance {self.significance:.1f}", verdict]
+        found += [self.pair_type] if self.pair_type not in ("", "unrelated") else []
         return f"MatchResult({', '.join(found)})"
 
     def _repr_html_(self) -> str:
@@ -178,7 +172,7 @@ class MatchResult:
         line = f"<p>{html.escape(repr(self))}</p>"
         if self.photographs is None:
             return line
-        return line + picture_html(_encoded(self.draw(), "jpeg"), "jpeg", "matches")
+        return f'{line}<img src="{jpeg_url(self.draw())}" alt="matches" style="max-width: 100%">'
 
     @property
     def _pruners(self) -> list[str]:
@@ -220,8 +214,3 @@ class MatchResult:
 def _plain(value: Tensor | None) -> Any:
     """The only row of a tensor as numbers."""
     return None if value is None else value[0].tolist()
-
-
-def _encoded(picture: Image, kind: str) -> bytes:
-    """The bytes of a picture's file."""
-    return bytes(cv2.imencode(f".{kind}", picture[..., ::-1])[1])

@@ -57,7 +57,7 @@ class PhotographCameras:
         self._of_all = None if K is None else _pinhole(K)
         self._file: Path | None = None
         self._stored: ImageCameras | None = None
-        self._known: dict[tuple[Path, tuple[int, int]], PhotographCamera] = {}
+        self.of = functools.cache(self._of)
         if cameras is not None and self.word is None:
             if not cameras.exists():
                 known_words = f"it must be {', '.join(WORDS)}, a COLMAP model or a JSON file"
@@ -69,21 +69,14 @@ class PhotographCameras:
         """What results depend on, as plain values; empty where nothing is asked of cameras."""
         if self._file is not None:
             files = sorted(self._file.iterdir()) if self._file.is_dir() else [self._file]
-            digests = [file_digest(path) for path in files if path.is_file()]
-            return {"cameras": {"files": digests}}
-        if self._of_all is not None:
-            lens = self._of_all
+            return {"cameras": {"files": [file_digest(path) for path in files if path.is_file()]}}
+        if (lens := self._of_all) is not None:
             return {"cameras": {"K": [lens.fx, lens.fy, lens.cx, lens.cy]}}
         return {} if self.word is None else {"cameras": self.word}
 
     def source(self, path: Path) -> ImageSource:
         """A photograph for `read_image`, which raises ImageError for one that is not of its camera's size."""
         return ImageSource(path.name, path, None if self._stored is None else self._stored.of(path).size)
-
-    def of(self, path: Path, size: tuple[int, int]) -> PhotographCamera:
-        if (path, size) not in self._known:
-            self._known[path, size] = self._of(path, size)
-        return self._known[path, size]
 
     def _of(self, path: Path, size: tuple[int, int]) -> PhotographCamera:
         if self._of_all is not None:
@@ -139,9 +132,6 @@ def _pinhole(K: str | Sequence[float | int]) -> Lens:
     return Lens(fx, fy, cx, cy)
 
 
-# Images as they are given, reduced for matching, and what was found in them in pixels of the originals
-
-
 Image = NDArray[np.uint8]
 GivenImage = Path | str | Image | Any  # or one of Pillow's, which is imported by who has one
 Array = NDArray[np.float64]
@@ -160,9 +150,8 @@ def given_image(image: GivenImage, name: str) -> Image:
             raise ValueError(f"{name} is a Pillow image of mode {image.mode}; it must be of 8 bits: L or RGB")
         return np.asarray(image.convert("L" if grey else "RGB"))
     if not isinstance(image, np.ndarray):
-        raise TypeError(
-            f"{name} is a {type(image).__name__}; it must be a file's path, a Pillow image or a uint8 array of NumPy"
-        )
+        kind = type(image).__name__
+        raise TypeError(f"{name} is a {kind}; it must be a file's path, a Pillow image or a uint8 array of NumPy")
     colour = image.ndim == 3 and image.shape[2] == 3
     if image.dtype != np.uint8 or image.size == 0 or not (image.ndim == 2 or colour):
         raise ValueError(f"{name} is {image.dtype} {image.shape}; it must be non-empty uint8, (H, W) or RGB (H, W, 3)")
@@ -271,13 +260,9 @@ def evenly_reduced(
 def geometry_to_original(geometry: PairGeometry, s0: Tensor, s1: Tensor) -> PairGeometry:
     """The geometry of two reduced images in pixels of the originals."""
     A0, A1 = (_reduction(s).numpy() for s in (s0.cpu(), s1.cpu()))
-    F, H = geometry.F, geometry.H
-    if F is not None:
-        F = A1.T @ F @ A0
-        F = F / np.linalg.norm(F)
-    if H is not None:
-        H = np.linalg.inv(A1) @ H @ A0
-        H = H / np.linalg.norm(H)
+    F = None if geometry.F is None else A1.T @ geometry.F @ A0
+    H = None if geometry.H is None else np.linalg.inv(A1) @ geometry.H @ A0
+    F, H = (None if matrix is None else matrix / np.linalg.norm(matrix) for matrix in (F, H))
     return geometry._replace(F=F, H=H)
 
 

@@ -1,5 +1,6 @@
 """Two images on one canvas: where each stands, its lines and points in pixels of the canvas, a caption below."""
 
+import base64
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 
@@ -74,8 +75,7 @@ def placed(image0: Image, image1: Image, height: int | None) -> tuple[Image, Pla
         tall = height or min(HEIGHT, (WIDTH - _GAP) / sum(widths))
         sizes = [(max(1, round(tall * x)), max(1, round(tall))) for x in widths]
         origins = [(0, 0), (sizes[0][0] + _GAP, 0)]
-    end = np.array(origins[1]) + np.max(sizes, axis=0) * [origins[1][0] == 0, origins[1][1] == 0]
-    end += np.array(sizes[1]) * [origins[1][0] > 0, origins[1][1] > 0]
+    end = np.add(origins[1], sizes[1])
     canvas = np.full((end[1], end[0], 3), 255, np.uint8)
     places = []
     for image, shape, origin, size in zip((image0, image1), shapes, origins, sizes, strict=True):
@@ -119,6 +119,13 @@ def headed(picture: Image, text: str, doubtful: bool) -> Image:
     return np.concatenate([line, picture])
 
 
+def jpeg_url(image: Image, quality: int = 95) -> str:
+    """An image, RGB or grey, as the URL of a JPEG file that holds it."""
+    image = image[..., ::-1] if image.ndim == 3 else image
+    data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
+    return f"data:image/jpeg;base64,{base64.b64encode(data).decode()}"
+
+
 def fine_line(canvas: Image) -> float:
     """The width of a fine line: 1 px for a picture of WIDTH x 640."""
     return float(np.sqrt(canvas.shape[0] * canvas.shape[1] / (WIDTH * 640)))
@@ -149,9 +156,6 @@ def fixed(points: Points) -> list[tuple[int, int]]:
     """Points (N, 2) as OpenCV takes them with `SUBPIXEL` fractional bits."""
     rounded = np.round(points * (1 << SUBPIXEL)).astype(int)
     return [(int(x), int(y)) for x, y in rounded]
-
-
-# Pictures of matched pairs: their matches, and the epipolar lines of some of them
 
 
 # RGB; told apart by all kinds of colour vision (Okabe & Ito), lightened.

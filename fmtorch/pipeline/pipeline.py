@@ -8,7 +8,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from concurrent.futures import Future
 from pathlib import Path
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 import torch
@@ -16,24 +16,11 @@ from hydra.errors import HydraException
 from numpy.typing import NDArray
 from omegaconf import DictConfig
 
+from fmtorch.core import stages
 from fmtorch.core.failures import own_traceback, place_of
-from fmtorch.core.stages import (
-    Estimator,
-    FeatureExtractor,
-    GreyPyramid,
-    ImageMatcher,
-    ImagePruner,
-    Matcher,
-    PairImages,
-    Pruner,
-    TimedExtractor,
-    grey_pyramid,
-    model_of,
-    output_of,
-    pruned,
-)
+from fmtorch.core.stages import Estimator, FeatureExtractor, GreyPyramid, ImageMatcher, Matcher, PairImages, Pruner
 from fmtorch.core.types import Correspondences, Estimate, Features, collate
-from fmtorch.data import GivenMatches, ImagePair, ImageSource, read_image, to_grey
+from fmtorch.data import ImagePair, ImageSource, read_image, to_grey
 from fmtorch.geometry.significance import judged
 from fmtorch.jobs.execution import one_thread
 from fmtorch.presets.composition import PIPELINES, build_pruners, compose, plain
@@ -72,9 +59,6 @@ class Memo(Generic[Key, Value]):
         return future.result()
 
 
-# How long the steps of a pipeline take
-
-
 class Clock:
     """The seconds between its calls."""
 
@@ -94,9 +78,6 @@ def synchronise(device: torch.device) -> None:
     """Wait for what a GPU is still doing."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
-
-
-# What a pipeline made of one pair, and of several as one batch
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -151,9 +132,6 @@ def described(stage: str, error: Exception) -> str:
     return f"{stage}: {type(error).__name__}: {error}".splitlines()[0] + (f" ({place})" if place else "")
 
 
-# The four stages in a row: features, matching, pruning, estimation; batching, timing, failures as data
-
-
 STAGES = ("features", "matching", "pruning", "estimation")
 MAX_TRACEBACKS = 3  # of different failures of a user's own code that are kept
 
@@ -175,7 +153,7 @@ class Pipeline:
         families: Mapping[str, Mapping[str, Pruner]] | None = None, model: str | None = "fundamental",
         debug: bool = False,
     ) -> None:  # fmt: skip
-        if model is not None and (gives := model_of(estimator)) != model:
+        if model is not None and (gives := stages.model_of(estimator)) != model:
             hint = ": estimator=homography" if model == "homography" else ""
             raise ValueError(f"the estimator gives {gives} matrices; a pipeline needs {model} matrices here{hint}")
         self.extractor, self.matcher, self.pruners, self.estimator = features, matcher, dict(pruners), estimator
@@ -186,7 +164,7 @@ class Pipeline:
         self._memo: Memo[Hashable, tuple[Features, float]] = Memo(memory)
         self._pyramids: Memo[Hashable, GreyPyramid] = Memo(memory)
         every = [self.pruners, *self.families.values()]
-        self.looks_at_images = any(isinstance(pruner, ImagePruner) for stages in every for pruner in stages.values())
+        self.looks_at_images = any(isinstance(pruner, stages.ImagePruner) for each in every for pruner in each.values())
 
     def features(self, image: ImageSource) -> tuple[Features, float]:
         """The features of an image and the seconds they took, kept for the next pair that shows the image."""
@@ -197,22 +175,22 @@ class Pipeline:
         return self._pyramid(pair.image0), self._pyramid(pair.image1)
 
     def _pyramid(self, image: ImageSource) -> GreyPyramid:
-        return self._pyramids.get(image.pixels, lambda: grey_pyramid(to_grey(read_image(image))))
+        return self._pyramids.get(image.pixels, lambda: stages.grey_pyramid(to_grey(read_image(image))))
 
     def _pixels(self, image: ImageSource) -> NDArray[np.uint8]:
         """An image's pixels for its features, whose grey levels are kept where a pruner will look at them."""
         pixels = read_image(image)
         if self.looks_at_images:
-            self._pyramids.get(image.pixels, lambda: grey_pyramid(to_grey(pixels)))
+            self._pyramids.get(image.pixels, lambda: stages.grey_pyramid(to_grey(pixels)))
         return pixels
 
     def extract(self, image: NDArray[np.uint8]) -> tuple[Features, float]:
         """The features of pixels on the pipeline's device, and the seconds that computing them takes or took."""
-        if isinstance(self.extractor, TimedExtractor):
+        if isinstance(self.extractor, stages.TimedExtractor):
             features, seconds = self.extractor.timed(image)
             return features.to(self.device), seconds
         start = time.perf_counter()
-        features = output_of(self.extractor, self.extractor(image), Features).to(self.device)
+        features = stages.output_of(self.extractor, self.extractor(image), Features).to(self.device)
         synchronise(self.device)
         return features, time.perf_counter() - start
 
@@ -223,15 +201,17 @@ class Pipeline:
     def estimate(self, outcomes: Sequence[Outcome], seed: int = 0) -> list[Outcome]:
         return self._batched("estimation", functools.partial(self._estimate, seed=seed), outcomes)
 
-    def matched(self, features0: Features, features1: Features) -> Correspondences:
-        """The matcher's matches of two images."""
-        c = self.matcher(features0, features1)
-        return output_of(self.matcher, c, Correspondences, like=features0.lafs)
+    def matched(self, image0: Any, image1: Any) -> Correspondences:
+        """The matcher's matches of two images, given by their features; by their pixels for an `ImageMatcher`."""
+        if isinstance(self.matcher, ImageMatcher):
+            c = self.matcher.match_images(image0, image1)
+            return stages.output_of(self.matcher, c, Correspondences).to(self.device)
+        return stages.output_of(self.matcher, self.matcher(image0, image1), Correspondences, like=image0.lafs)
 
     def estimated(self, c: Correspondences, seed: int = 0, estimator: Estimator | None = None) -> Estimate:
         """The estimate of a batch with its significance; estimator: another one than the pipeline's."""
         used = estimator or self.estimator
-        return judged(expect_finite(output_of(used, used(c, seed), Estimate, c).detach()), c)
+        return judged(expect_finite(stages.output_of(used, used(c, seed), Estimate, c).detach()), c)
 
     def run(self, pairs: Sequence[ImagePair], seed: int = 0) -> list[Outcome]:
         return self.estimate(self.correspondences(pairs), seed)
@@ -263,59 +243,38 @@ class Pipeline:
     def _match(self, pair: ImagePair) -> Outcome:
         if pair.problem is not None:
             return Outcome(pair, reason=pair.problem)
-        if pair.matches is not None:
-            return self._given(pair, pair.matches)
-        if isinstance(self.matcher, ImageMatcher):
-            return self._match_images(pair, self.matcher)
+        stage, counts, seconds = "matches", (0, 0), dict[str, float]()
         try:
-            (features0, seconds0), (features1, seconds1) = self.features(pair.image0), self.features(pair.image1)
+            if pair.matches is not None:
+                c, counts = pair.matches()
+            elif isinstance(self.matcher, ImageMatcher):
+                stage = "images"
+                images = read_image(pair.image0), read_image(pair.image1)
+                stage, start = "matching", time.perf_counter()
+                c = self.matched(*images)
+                seconds["matching"] = time.perf_counter() - start
+                counts = (int(c.count()), int(c.count()))
+            else:
+                stage = "features"
+                (features0, seconds0), (features1, seconds1) = self.features(pair.image0), self.features(pair.image1)
+                counts, seconds["features"] = (len(features0), len(features1)), seconds0 + seconds1
+                if min(counts) == 0:
+                    which = " and ".join(f"image {i}" for i in (0, 1) if counts[i] == 0)
+                    return Outcome(pair, counts, seconds=seconds, reason=f"no keypoints in {which}")
+                stage, start = "matching", time.perf_counter()
+                c = self.matched(features0, features1)
+                seconds["matching"] = time.perf_counter() - start
         except Exception as error:  # a pair that fails becomes a row with this reason
-            return Outcome(pair, reason=self._failure("features", error))
-        seconds = {"features": seconds0 + seconds1}
-        counts = (len(features0), len(features1))
-        if min(counts) == 0:
-            which = " and ".join(f"image {i}" for i in (0, 1) if counts[i] == 0)
-            return Outcome(pair, counts, seconds=seconds, reason=f"no keypoints in {which}")
-        start = time.perf_counter()
-        try:
-            c = self.matched(features0, features1)
-        except Exception as error:
-            return Outcome(pair, counts, seconds=seconds, reason=self._failure("matching", error))
-        seconds["matching"] = time.perf_counter() - start
-        images = self.images(pair) if self.looks_at_images else None
-        return Outcome(pair, counts, self._with_calibrations(pair, c), None, seconds, images=images)
-
-    def _match_images(self, pair: ImagePair, matcher: ImageMatcher) -> Outcome:
-        """The matches of a matcher that takes the images themselves, in place of the first two stages."""
-        try:
-            images = read_image(pair.image0), read_image(pair.image1)
-        except Exception as error:
-            return Outcome(pair, reason=self._failure("images", error))
-        start = time.perf_counter()
-        try:
-            c = output_of(matcher, matcher.match_images(*images), Correspondences).to(self.device)
-        except Exception as error:
-            return Outcome(pair, reason=self._failure("matching", error))
-        seconds = {"matching": time.perf_counter() - start}
-        count = int(c.count())
-        pyramids = self.images(pair) if self.looks_at_images else None
-        return Outcome(pair, (count, count), self._with_calibrations(pair, c), None, seconds, images=pyramids)
-
-    def _given(self, pair: ImagePair, matches: Callable[[], GivenMatches]) -> Outcome:
-        try:
-            c, counts = matches()
-        except Exception as error:  # a pair that cannot be read becomes a row with this reason
-            return Outcome(pair, reason=self._failure("matches", error))
-        return Outcome(pair, counts, self._with_calibrations(pair, c.to(self.device)))
+            return Outcome(pair, counts, seconds=seconds, reason=self._failure(stage, error))
+        pyramids = self.images(pair) if self.looks_at_images and pair.matches is None else None
+        return Outcome(pair, counts, self._with_calibrations(pair, c), None, seconds, images=pyramids)
 
     def _with_calibrations(self, pair: ImagePair, c: Correspondences) -> Correspondences:
-        K0, K1 = (
-            None if K is None else torch.from_numpy(K).to(self.device, torch.float64)[None] for K in (pair.K0, pair.K1)
-        )
-        return c.replace(key=torch.tensor([pair.key], device=self.device), K0=K0, K1=K1)
+        given = (None if K is None else torch.from_numpy(K).to(self.device, torch.float64) for K in (pair.K0, pair.K1))
+        K0, K1 = (None if K is None else K[None] for K in given)
+        return c.to(self.device).replace(key=torch.tensor([pair.key], device=self.device), K0=K0, K1=K1)
 
     def pruners_of(self, family: str) -> dict[str, Pruner]:
-        """The pruners that pairs of a family get, in order."""
         return {**self.pruners, **self.families.get(family, {})}
 
     def _prune(self, outcomes: list[Outcome]) -> list[Outcome]:
@@ -332,7 +291,7 @@ class Pipeline:
                     return family_outcomes[i].images or self.images(family_outcomes[i].pair)
 
                 for pruner in self.pruners_of(family or "").values():
-                    c = pruned(pruner, c, images)
+                    c = stages.pruned(pruner, c, images)
                     if self.looks_at_images:
                         keypoints = keypoints.derived(mask=c.mask).compact()
                     c = c.compact()
@@ -342,12 +301,9 @@ class Pipeline:
         return result
 
     def _estimate(self, outcomes: list[Outcome], seed: int) -> list[Outcome]:
-        c = collated(outcomes)
-        estimate = self.estimated(c, seed)
-        return [
-            dataclasses.replace(outcome, estimate=estimate[i], reason=estimate.reason[i])
-            for i, outcome in enumerate(outcomes)
-        ]
+        estimate = self.estimated(collated(outcomes), seed)
+        each = ((outcome, estimate[i], estimate.reason[i]) for i, outcome in enumerate(outcomes))
+        return [dataclasses.replace(outcome, estimate=own, reason=reason) for outcome, own, reason in each]
 
     def _alone(self, stage: str, function: Callable[[list[Outcome]], list[Outcome]], outcome: Outcome) -> Outcome:
         """A stage on a single pair; what it raises becomes the reason for that pair's failure."""
@@ -367,9 +323,6 @@ class Pipeline:
         return reason
 
 
-# Which pair types the pairs of a run are in, by the matches and what the estimator was given of the cameras
-
-
 Knowledge = Callable[[Correspondences], Correspondences]
 
 
@@ -381,7 +334,7 @@ def examined(
     knowledge: gives correspondences what the estimator was given of their cameras; None: nothing, and their K counts
     for nothing here. Matches of the results have what it gives. Of homographies nothing is asked.
     """
-    if model_of(pipeline.estimator) != "fundamental":
+    if stages.model_of(pipeline.estimator) != "fundamental":
         return list(outcomes)
     matched = [i for i, o in enumerate(outcomes) if o.correspondences is not None and o.estimate is not None]
     results = list(outcomes)
@@ -396,17 +349,12 @@ def examined(
 
 
 def _examined(outcomes: Sequence[Outcome], seed: int, knowledge: Knowledge | None) -> list[Outcome]:
-    c = collate([o.correspondences for o in outcomes if o.correspondences is not None])
+    c = collated(outcomes)
     estimate = collate([o.estimate for o in outcomes if o.estimate is not None])
-    if knowledge is None:
-        pair_type = classify(c.derived(K0=None, K1=None), estimate, seed=seed)
-    else:
-        c = knowledge(c)
-        pair_type = classify(c, estimate, seed=seed)
-    return [
-        dataclasses.replace(outcome, correspondences=c[i], pair_type=pair_type.of_pair(i))
-        for i, outcome in enumerate(outcomes)
-    ]
+    c = c if knowledge is None else knowledge(c)
+    pair_type = classify(c.derived(K0=None, K1=None) if knowledge is None else c, estimate, seed=seed)
+    each = ((outcome, c[i], pair_type.of_pair(i)) for i, outcome in enumerate(outcomes))
+    return [dataclasses.replace(outcome, correspondences=own, pair_type=kind) for outcome, own, kind in each]
 
 
 def _pair_alone(outcome: Outcome, seed: int, knowledge: Knowledge | None) -> Outcome:
@@ -415,9 +363,6 @@ def _pair_alone(outcome: Outcome, seed: int, knowledge: Knowledge | None) -> Out
     except Exception as error:  # what it is in stays unknown, and the row says why
         reason = f"not examined: {type(error).__name__}: {error}".splitlines()[0]
         return dataclasses.replace(outcome, not_examined=reason)
-
-
-# Pipelines of presets and of composed configs
 
 
 def build_pipeline(
@@ -438,10 +383,7 @@ def build_pipeline(
 
 
 def load_pipeline(
-    name: str,
-    device: torch.device | str = "cpu",
-    overrides: Sequence[str] = (),
-    config_dir: Path | str | None = None,
+    name: str, device: torch.device | str = "cpu", overrides: Sequence[str] = (), config_dir: Path | str | None = None
 ) -> Pipeline:
     """The `Pipeline` of ``conf/pipeline/<name>.yaml``, changed by `overrides` as on the command line.
 

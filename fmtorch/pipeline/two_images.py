@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from fmtorch import presets
-from fmtorch.core.stages import GreyPyramid, ImageMatcher, NoFeatures, PairImages, grey_pyramid, output_of, pruned
+from fmtorch.core.stages import GreyPyramid, ImageMatcher, NoFeatures, PairImages, grey_pyramid, pruned
 from fmtorch.core.types import Correspondences, Features
 from fmtorch.data import Lens, to_grey
 from fmtorch.jobs.execution import mapped, one_thread
@@ -22,12 +22,7 @@ from fmtorch.pipeline.photographs import GivenImage, Image, frames_to_original, 
 from fmtorch.pipeline.pipeline import Clock, Pipeline, load_pipeline
 from fmtorch.two_view.arguments import Arrays, Focal, camera_fields
 from fmtorch.two_view.known_cameras import KnownCameras
-from fmtorch.two_view.pair_type import (
-    classify,
-    compile_with,
-    still_warning,
-    warnings_of,
-)
+from fmtorch.two_view.pair_type import classify, compile_with, still_warning, warnings_of
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -57,9 +52,6 @@ def describe(pipeline: Pipeline, image: Image, longest_side: int) -> Described:
     features, seconds = (NoFeatures()(reduced), 0.0) if itself else pipeline.extract(reduced)
     pyramid = grey_pyramid(to_grey(reduced)) if pipeline.looks_at_images else None
     return Described(features, scale, (image.shape[0], image.shape[1]), seconds, pyramid, reduced if itself else None)
-
-
-# Two photographs of any size through a pipeline: their matches and fundamental matrix in their own pixels
 
 
 NOTHING_KNOWN: Mapping[str, Tensor] = {}
@@ -151,18 +143,16 @@ def relate(
     return _restored(result, scales, sizes)
 
 
-@functools.lru_cache(maxsize=8)
-def _pipeline(name: str, device: str) -> Pipeline:
-    return load_pipeline(name, device)
+_pipeline = functools.lru_cache(maxsize=8)(load_pipeline)
 
 
 def _matched(pipeline: Pipeline, described: Sequence[Described], clock: Clock) -> MatchResult:
     """Matching and pruning, in pixels of the images as they were described; a reason where there are no keypoints."""
-    features0, features1 = (each.features for each in described)
-    putative = _of_images(pipeline, described)
     images = cast(PairImages, tuple(each.pyramid for each in described))
-    ends = features0.keypoints, features1.keypoints
-    if putative is not None:
+    keypoints0, keypoints1 = (each.features.keypoints for each in described)
+    ends, putative = (keypoints0, keypoints1), None
+    if isinstance(pipeline.matcher, ImageMatcher):
+        putative = pipeline.matched(*(each.image for each in described))
         ends = putative.x0[0][putative.mask[0]], putative.x1[0][putative.mask[0]]
     none = torch.zeros(1, 0, dtype=torch.bool, device=ends[0].device)
     nothing = Correspondences(ends[0][None, :0], ends[1][None, :0], none)
@@ -175,7 +165,7 @@ def _matched(pipeline: Pipeline, described: Sequence[Described], clock: Clock) -
         reason = reason if putative is None else "the matcher finds no matches"
         return dataclasses.replace(nothing_found, reason=reason, seconds=clock.seconds)
     if putative is None:
-        putative = pipeline.matched(features0, features1)
+        putative = pipeline.matched(*(each.features for each in described))
     c = putative
     clock("matching")
     counts = {"matching": int(c.count())}
@@ -188,14 +178,6 @@ def _matched(pipeline: Pipeline, described: Sequence[Described], clock: Clock) -
         counts[name] = len(slots)
     kept = torch.zeros_like(putative.mask[0]).index_fill(0, slots, True)
     return dataclasses.replace(nothing_found, putative=putative, kept=kept, correspondences=c, counts=counts)
-
-
-def _of_images(pipeline: Pipeline, described: Sequence[Described]) -> Correspondences | None:
-    image0, image1 = (each.image for each in described)
-    if not isinstance(pipeline.matcher, ImageMatcher) or image0 is None or image1 is None:
-        return None
-    matches = pipeline.matcher.match_images(image0, image1)
-    return output_of(pipeline.matcher, matches, Correspondences).to(pipeline.device)
 
 
 def _estimated(

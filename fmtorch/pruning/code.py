@@ -84,13 +84,7 @@ def gaussians(z: Float[Tensor, "n d"], centres: Float[Tensor, "m d"]) -> Float[T
 
 
 def predictive_gaussians(
-    matches: MatchDomain,
-    centres: MatchDomain,
-    *,
-    position: float,
-    displacement: float,
-    rotation: float,
-    scale: float,
+    matches: MatchDomain, centres: MatchDomain, *, position: float, displacement: float, rotation: float, scale: float
 ) -> Float[Tensor, "n m"]:
     """Gaussians over position, displacement and shape, where each centre's frame predicts the displacement.
 

@@ -143,8 +143,7 @@ class ValidationOptions:
 
     every: Count = option(250, "steps")
     scenes: Count | None = option(
-        None,
-        "the last training scenes of each family, not trained on; null: 4, a quarter where it has fewer than 16",
+        None, "the last training scenes of each family, not trained on; null: 4, a quarter where it has fewer than 16"
     )
     roots: list[str] = option([], "further folders in the layout of fmbench")
     pairs: Count = option(25, "of each family at most")
