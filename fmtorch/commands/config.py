@@ -62,7 +62,7 @@ def job(task: Task) -> Task:
             if config.get("debug"):
                 _debugged(error, config.debug == "pdb")
             if trace := own_traceback(error):
-                errors.print(trace, markup=False, highlight=False, soft_wrap=True)
+                errors.print(trace, soft_wrap=True)
             if not (trace or isinstance(error, MISTAKES)):
                 raise
             if HydraConfig.get().mode == RunMode.MULTIRUN:

@@ -68,10 +68,10 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
             raise KeyboardInterrupt(f"{kept} of {len(own)} pairs are kept in {folder.path}") from None
     if len(todo) < len(own):
         earlier = f"{len(own) - len(todo)} of {len(own)} pairs taken from an earlier run in {folder.path}"
-        console.print(earlier, markup=False, highlight=False)
+        console.print(earlier)
     table = folder.read({pair.key for pair in pairs}, without=("pair", "F"))
     if shard is not None and len(table) < len(pairs):
-        console.print(f"{len(table)} of {len(pairs)} pairs have rows; other shards have the rest", highlight=False)
+        console.print(f"{len(table)} of {len(pairs)} pairs have rows; other shards have the rest")
     if shard is not None and not len(table):  # of an empty shard, before the others
         return folder.path
     title = f"{' '.join([pipeline_name, *overrides])} on {dataset.name}"
@@ -83,7 +83,7 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
     if isinstance(pipeline.extractor, CachedFeatures):
         console.print(pipeline.extractor.report(), style="dim")
     for reason, trace in pipeline.tracebacks.items():
-        errors.print(f"{reason}\n{trace}".strip(), markup=False, highlight=False, soft_wrap=True)
+        errors.print(f"{reason}\n{trace}".strip(), soft_wrap=True)
     if pairs and summary[ALL]["failures"] == len(pairs):
         reason = next(iter(table["reason"].to_pylist()))
         again = f"once that is mended, delete {folder.path} to run again"
@@ -145,7 +145,7 @@ def _summarize(table: pa.Table, folder: RunFolder, title: str, signed: bool) -> 
         console.print(each)
     about = f"; of all {len(run_table)} pairs" if part else ""
     written = f"{folder.path}: pairs/, summary.json, summary.md, recall.svg{about}"
-    console.print(written, style="dim", highlight=False, soft_wrap=True)
+    console.print(written, style="dim", soft_wrap=True)
     if file := os.environ.get(SWEPT):
         with open(file, "a", encoding="utf-8") as swept:
             swept.write(f"{folder.path.absolute()}\n")

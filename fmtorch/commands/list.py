@@ -43,6 +43,6 @@ def main() -> None:
     with exits_with_message():
         for group in sys.argv[1:] or groups():
             lines = listed(group)
-            console.print(group, style="bold", highlight=False)
+            console.print(group, style="bold")
             for line in lines:
-                console.print(line, highlight=False, soft_wrap=True)
+                console.print(line, soft_wrap=True)

@@ -33,20 +33,8 @@ from fmtorch.io.export import ViewGraph, export_kinds, view_graph, write_exports
 from fmtorch.io.match_store import MatchStore
 from fmtorch.jobs.execution import MIN_PAIRS_FOR_PROCESSES
 from fmtorch.metrics import nsgd
-from fmtorch.pipeline.folder import (
-    EXHAUSTIVE,
-    MEMORY,
-    SIMILAR,
-    FolderMatches,
-    chosen_pairs,
-    count_of,
-    default_output,
-    folder_workers,
-    images_below,
-    open_folder,
-    similar_pairs,
-    vectors_of,
-)
+from fmtorch.pipeline import folder as folders
+from fmtorch.pipeline.folder import EXHAUSTIVE, SIMILAR, FolderMatches
 from fmtorch.pipeline.match_result import MatchResult
 from fmtorch.pipeline.photographs import Image, PhotographCameras
 from fmtorch.pipeline.pipeline import Pipeline, build_pipeline
@@ -54,8 +42,6 @@ from fmtorch.pipeline.two_images import match
 from fmtorch.presets.composition import execution_of, read_fields
 from fmtorch.runs.feature_cache import CachedFeatures, cached
 from fmtorch.runs.fingerprint import fmtorch_version
-
-# `fmtorch match images=FOLDER export=h5,colmap`: the pairs of a folder of images, for other programs
 
 
 def match_folder(
@@ -70,37 +56,37 @@ def match_folder(
     kinds = export_kinds(fields.export)
     if fields.camera == "shared" and "colmap" not in kinds:
         raise ValueError("camera=shared needs export=colmap; cameras=shared is what is known of the photographs")
-    images = images_below(folder)
-    similar = count_of(fields.pairs, SIMILAR)
-    pairs = [] if similar else chosen_pairs(folder, images, fields.pairs)
+    images = folders.images_below(folder)
+    similar = folders.count_of(fields.pairs, SIMILAR)
+    pairs = [] if similar else folders.chosen_pairs(folder, images, fields.pairs)
     presets.expect_stages(config)
     stages = presets.stages(config)
     vector = functools.partial(image_vector, kind=descriptor_kind(stages["features"])) if similar else None
     pipeline: Pipeline = build_pipeline(config, presets.resolve_device(fields.device))
     if isinstance(pipeline.matcher, ImageMatcher):
         raise ValueError("images: a folder is matched by keypoints of each image; this matcher takes pairs of images")
-    output = fields.output or default_output(folder)
+    output = fields.output or folders.default_output(folder)
     identity = {
         "version": fmtorch_version(), "images": str(folder.absolute()), **stages, "seed": fields.seed,
         "orient": fields.orient, "longest_side": fields.longest_side, **cameras.identity,
     }  # fmt: skip
-    journal = MatchStore(open_folder(output, identity), folder)
+    journal = MatchStore(folders.open_folder(output, identity), folder)
     scratch = journal.folder / "features"
-    if len(images) > MEMORY and not isinstance(pipeline.extractor, CachedFeatures):  # none is computed twice
+    if len(images) > folders.MEMORY and not isinstance(pipeline.extractor, CachedFeatures):  # none is computed twice
         pipeline.extractor = cached(pipeline.extractor, scratch)
-    console.print(f"{' '.join([pipeline_name, *overrides])}: {folder}", style="italic", markup=False, highlight=False)
+    console.print(f"{' '.join([pipeline_name, *overrides])}: {folder}", style="italic")
     count = len(images) * similar if similar else len(pairs)
     many = count >= MIN_PAIRS_FOR_PROCESSES and pipeline.device.type == "cpu"
     execution = execution_of(config, fields.workers).decided(many)
     build = None if execution.shared else functools.partial(build_pipeline, config, pipeline.device)
-    with folder_workers(pipeline, execution) as workers, progress_bars() as progress:
+    with folders.folder_workers(pipeline, execution) as workers, progress_bars() as progress:
         work = FolderMatches(
             pipeline, journal, fields.longest_side, fields.orient, fields.seed,
             workers=workers, build=build, cameras=cameras,
         )  # fmt: skip
         if similar and vector is not None:
             seen = progress.track(work.images(images), len(images), description="images")
-            pairs = similar_pairs(images, vectors_of(seen, vector), similar)
+            pairs = folders.similar_pairs(images, folders.vectors_of(seen, vector), similar)
         for _ in progress.track(work.each(pairs), len(pairs), description=pipeline_name):
             pass
     shutil.rmtree(scratch, ignore_errors=True)
@@ -110,19 +96,19 @@ def match_folder(
     written = ["export.json", *write_exports(journal, pairs, kinds, output, shared)]
     written += [*write_view_graph(graph, output), _draw_graph(graph, folder, fields.orient, output)]
     _say(work, graph, len(pairs))
-    console.print(f"{output}: {', '.join(written)}", style="dim", markup=False, highlight=False)
+    console.print(f"{output}: {', '.join(written)}", style="dim")
     if "colmap" in kinds and fields.orient:
         _say_turned(images, folder)
     if isinstance(pipeline.extractor, CachedFeatures) and pipeline.extractor.cache.folder != scratch:
-        console.print(pipeline.extractor.report(), style="dim", markup=False, highlight=False)
+        console.print(pipeline.extractor.report(), style="dim")
     return output
 
 
 def _expect_some(work: FolderMatches, pairs: int) -> None:
     for trouble in work.troubles:
-        errors.print(trouble, style="bold", markup=False, highlight=False, soft_wrap=True)
+        errors.print(trouble, style="bold", soft_wrap=True)
     if work.taken:
-        console.print(f"{work.taken} of {pairs} pairs taken from an earlier run", highlight=False)
+        console.print(f"{work.taken} of {pairs} pairs taken from an earlier run")
     if work.troubles and not work.done + work.taken:
         raise ValueError(f"no pair could be matched, the first because: {work.troubles[0]}")
 
@@ -130,10 +116,10 @@ def _expect_some(work: FolderMatches, pairs: int) -> None:
 def _say(work: FolderMatches, graph: ViewGraph, pairs: int) -> None:
     sizes = [len(part) for part in graph.components() if len(part) > 1]
     apart = len(graph.images) - sum(sizes)
-    console.print(f"{work.related} of {pairs} pairs show one scene", highlight=False)
+    console.print(f"{work.related} of {pairs} pairs show one scene")
     if sizes:
         others = f"; {apart} images are in no related pair" if apart else ""
-        console.print(f"connected images: {', '.join(map(str, sizes))}{others}", highlight=False)
+        console.print(f"connected images: {', '.join(map(str, sizes))}{others}")
 
 
 def _say_turned(images: Sequence[Path], folder: Path) -> None:
@@ -142,8 +128,7 @@ def _say_turned(images: Sequence[Path], folder: Path) -> None:
         console.print(
             f"turned by their orientation tags: {head(turned)}. Keypoints and cameras in database.db are those of the "
             "turned images, from which COLMAP's mapper works; but COLMAP reads files as they are stored, so that its "
-            "colours, undistorted images and dense reconstruction will not fit. Turn the files, or use orient=false",
-            highlight=False,
+            "colours, undistorted images and dense reconstruction will not fit. Turn the files, or use orient=false"
         )
 
 
@@ -204,9 +189,6 @@ def pose_line(result: MatchResult) -> str:
     return f"rotation {angle:.2f}°, translation ({direction}), focal lengths {focals} px"
 
 
-# `fmtorch match image0=a.jpg image1=b.jpg`: the fundamental matrix of two photographs, with pictures
-
-
 MAX_RANK3 = 0.01  # third singular value of a true F over the second one: its numbers may be rounded
 
 
@@ -246,20 +228,20 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
     report = {"version": __version__, **settings, "image0": str(paths[0]), "image1": str(paths[1])}
     written = result.save(folder, truth=truth, report=report | ({} if error is None else {"nsgd": error}))
     heading = f"{' '.join([pipeline_name, *overrides])}: {paths[0].name}, {paths[1].name}"
-    console.print(heading, style="italic", markup=False, highlight=False)
+    console.print(heading, style="italic")
     extractor = pipeline.extractor
     console.print(_table(result, isinstance(extractor, CachedFeatures) and not extractor.computed))
     if result.related:
-        console.print(_verdict(result), style="bold", highlight=False, soft_wrap=True)
+        console.print(_verdict(result), style="bold", soft_wrap=True)
     if error is not None:
-        console.print(f"NSGD to the true F: {error:.4f}", highlight=False)
+        console.print(f"NSGD to the true F: {error:.4f}")
     if line := pose_line(result):
-        console.print(line, highlight=False)
+        console.print(line)
     for trouble in (*given.notes, *_troubles(result)):
-        errors.print(trouble, style="bold", highlight=False, soft_wrap=True)
-    console.print(f"{folder}: {', '.join(written)}", style="dim", highlight=False)
+        errors.print(trouble, style="bold", soft_wrap=True)
+    console.print(f"{folder}: {', '.join(written)}", style="dim")
     if isinstance(pipeline.extractor, CachedFeatures):
-        console.print(pipeline.extractor.report(), style="dim", highlight=False)
+        console.print(pipeline.extractor.report(), style="dim")
     return folder
 
 
@@ -357,6 +339,4 @@ def task(config: DictConfig) -> None:
     run(config, *chosen_pipeline())
 
 
-def main() -> None:
-    """The command."""
-    run_command(MATCH, task)
+main = functools.partial(run_command, MATCH, task)

@@ -25,7 +25,6 @@ class LeastAndGreatest:
     """A rule for lists: two shares, of which the first is not the greater."""
 
     def __call__(self, value: Any) -> bool:
-        """Whether it is such a list."""
         return len(value) == 2 and 0 <= value[0] <= value[1] <= 1
 
     def __str__(self) -> str:

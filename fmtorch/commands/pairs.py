@@ -39,9 +39,7 @@ def run(config: DictConfig) -> Path:
     construction = Construction(dataset, fields.output, fields.count, fields.seed, fields.quality, overlap)
     construction.begin()
     if construction.complete:
-        console.print(
-            f"{construction.folder} is complete: dataset=fmbench dataset.root={construction.folder}", highlight=False
-        )
+        console.print(f"{construction.folder} is complete: dataset=fmbench dataset.root={construction.folder}")
         return construction.folder
     many = dataset.candidates >= MIN_CANDIDATES_FOR_PROCESSES
     execution = _execution(config, fields, many)
@@ -110,9 +108,8 @@ def _each(
         for given in arguments:
             yield getattr(construction, method)(*given)
         return
-    source: Source[Construction] = (
-        Local(construction) if execution.shared else Factory(functools.partial(_same, construction))
-    )
+    here, elsewhere = Local(construction), Factory(functools.partial(_same, construction))
+    source: Source[Construction] = here if execution.shared else elsewhere
     tasks = ((method, given) for given in arguments)
     with WorkerPool(execution, PRELOADED) as pool:
         for _, result in in_order(pool, source, _call, tasks):
@@ -130,16 +127,12 @@ def _call(construction: Construction, task: tuple[str, tuple[object, ...]]) -> A
 
 def _print_summary(construction: Construction, summary: dict[str, int], problems: list[str], seconds: float) -> None:
     judged = f"{summary['judged']} of {summary['candidates']} candidates were judged in {seconds:.0f} s"
-    console.print(f"{summary['kept']} pairs of {summary['images']} images; {judged}", highlight=False)
+    console.print(f"{summary['kept']} pairs of {summary['images']} images; {judged}")
     if construction.count is not None and summary["kept"] < construction.count:
-        console.print(f"no more pass the rule than these; {construction.count} were asked for", highlight=False)
+        console.print(f"no more pass the rule than these; {construction.count} were asked for")
     if problems:
-        console.print(
-            f"{len(problems)} candidates or images cannot be used{_first(problems)}", markup=False, highlight=False
-        )
-    console.print(
-        f"python -m fmtorch.eval dataset=fmbench dataset.root={construction.folder}", style="dim", highlight=False
-    )
+        console.print(f"{len(problems)} candidates or images cannot be used{_first(problems)}")
+    console.print(f"python -m fmtorch.eval dataset=fmbench dataset.root={construction.folder}", style="dim")
 
 
 def _first(problems: list[str]) -> str:
@@ -152,6 +145,4 @@ def task(config: DictConfig) -> None:
     run(config)
 
 
-def main() -> None:
-    """The command."""
-    run_command(PAIRS, task)
+main = functools.partial(run_command, PAIRS, task)

@@ -29,10 +29,8 @@ def run(config: DictConfig) -> Path:
     if _order(fields.order, paths) == "recall":
         runs.sort(key=lambda r: -_recall(r.table))
     roots = [fields.root] if isinstance(fields.root, str) else fields.root or []
-    options = Options(
-        fields.pictures, [Path(root) for root in roots], fields.own_code, presets.resolve_device(fields.device),
-        config.cache, fields.cache_limit,
-    )  # fmt: skip
+    places, device = [Path(root) for root in roots], presets.resolve_device(fields.device)
+    options = Options(fields.pictures, places, fields.own_code, device, config.cache, fields.cache_limit)
     beside = paths[0].parent if (paths[0] / "run.json").exists() else paths[0]
     output = fields.output or beside / "report.html"
     expect_writable(output.parent)
@@ -44,18 +42,19 @@ def run(config: DictConfig) -> Path:
         pairs, notes = gallery(group, options, bar)
         signed = [r.name for r in group if r.folder.config.get("pose") is not None]
         sections.append(Section(heading, {r.name: r.table for r in group}, pairs, notes, signed))
+    ran = [(heading, r.name, r.folder) for heading, group in groups.items() for r in group]
+    settings = [[str(folder.config.get(name)) for name in ("version", "seed")] for _, _, folder in ran]
     rows = [
-        [r.name, heading, r.folder.identity[:8], *(str(r.folder.config.get(k)) for k in ("version", "seed")),
-         str(r.folder.path)]
-        for heading, group in groups.items() for r in group
-    ]  # fmt: skip
+        [name, heading, folder.identity[:8], *own, str(folder.path)]
+        for (heading, name, folder), own in zip(ran, settings, strict=True)
+    ]
     page = render(str(config.title), sections, rows, shared_settings([r.folder.config for r in runs]))
     with replacing(output) as temporary:
         temporary.write_text(page, encoding="utf-8")
     for section in sections:
         for note in section.notes:
-            console.print(f"{section.heading}: {note}", markup=False, highlight=False)
-    console.print(f"{output}: {len(runs)} runs, {output.stat().st_size / 2**20:.1f} MB", style="dim", highlight=False)
+            console.print(f"{section.heading}: {note}")
+    console.print(f"{output}: {len(runs)} runs, {output.stat().st_size / 2**20:.1f} MB", style="dim")
     return output
 
 
@@ -141,6 +140,4 @@ def task(config: DictConfig) -> None:
     run(config)
 
 
-def main() -> None:
-    """The command."""
-    run_command(REPORT, task)
+main = functools.partial(run_command, REPORT, task)

@@ -1,5 +1,6 @@
 """`fmtorch train pruner=lc`: train a learned pruner on the labelled matches of a data set."""
 
+import functools
 import sys
 
 from hydra.core.hydra_config import HydraConfig
@@ -21,12 +22,10 @@ def task(config: DictConfig) -> None:
         raise ImportError(f"training needs {error.name}: pip install 'fmtorch[train]'") from error
     name = str(HydraConfig.get().runtime.choices["pruner"])
     if not any(word.startswith("pruner=") for word in HydraConfig.get().overrides.task):
-        console.print(f"no pruner= is given: {name} is trained, the network of Yi et al. (CVPR 2018)", highlight=False)
+        console.print(f"no pruner= is given: {name} is trained, the network of Yi et al. (CVPR 2018)")
     if sys.argv[1:2] != ["train"]:
         sys.argv.insert(1, "train")  # Lightning starts its other processes by these words
     run(config, name)
 
 
-def main() -> None:
-    """The command."""
-    run_command(TRAIN, task)
+main = functools.partial(run_command, TRAIN, task)

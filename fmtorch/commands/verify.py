@@ -36,18 +36,16 @@ def run(config: DictConfig, estimator: str) -> Verification:
         settings = {"estimator": plain(config.estimator)}
         result = verify_by(make, settings, paths, mode, report)
     for problem in result.problems[:MAX_PROBLEMS]:
-        errors.print(problem, style="bold", markup=False, highlight=False, soft_wrap=True)
+        errors.print(problem, style="bold", soft_wrap=True)
     if len(result.problems) > MAX_PROBLEMS:
-        errors.print(f"and {len(result.problems) - MAX_PROBLEMS} more", highlight=False)
+        errors.print(f"and {len(result.problems) - MAX_PROBLEMS} more")
     for warning in result.warnings[:MAX_PROBLEMS]:
-        errors.print(f"warning: {warning}", markup=False, highlight=False, soft_wrap=True)
+        errors.print(f"warning: {warning}", soft_wrap=True)
     if result.kept == result.pairs and not result.configurations:
-        said = (
-            f"nothing to do: {result.path} has a geometry of each of {result.pairs:,} pairs; force=true replaces them"
-        )
-        console.print(said, markup=False, highlight=False, soft_wrap=True)
+        said = f"{result.path} has a geometry of each of {result.pairs:,} pairs; force=true replaces them"
+        console.print(f"nothing to do: {said}", soft_wrap=True)
     console.print(_table(result))
-    console.print(str(result.path), style="dim", highlight=False)
+    console.print(str(result.path), style="dim")
     return result
 
 
@@ -69,14 +67,13 @@ def _table(result: Verification) -> Table:
     table = Table()
     table.add_column("pairs")
     table.add_column("", justify="right")
-    table.add_row("with matches", f"{result.pairs:,}")
-    if result.kept:
-        table.add_row("had a geometry", f"{result.kept:,}")
-    table.add_row("verified", f"{result.verified:,}")
-    for kind, count in sorted(result.configurations.items(), key=lambda entry: -entry[1]):
-        table.add_row(f"  {kind.replace('_', ' ')}", f"{count:,}")
-    if result.problems:
-        table.add_row("could not be read", f"{len(result.problems):,}")
+    kinds = sorted(result.configurations.items(), key=lambda entry: -entry[1])
+    rows: list[tuple[str, int]] = [("with matches", result.pairs)]
+    rows += [("had a geometry", result.kept)] * bool(result.kept)
+    rows += [("verified", result.verified), *((f"  {kind.replace('_', ' ')}", count) for kind, count in kinds)]
+    rows += [("could not be read", len(result.problems))] * bool(result.problems)
+    for name, count in rows:
+        table.add_row(name, f"{count:,}")
     table.add_row("seconds", f"{result.seconds:.1f}")
     table.add_row("a second", f"{sum(result.configurations.values()) / result.seconds:.1f}")
     return table

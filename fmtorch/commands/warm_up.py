@@ -47,4 +47,4 @@ def main() -> None:
         count = warm_up()
         seconds, processor = time.perf_counter() - start, cache.versions()["processor"]
         kept = f"{count} kernels for {processor} in {seconds:.0f} s: {cache.folder()}"
-        console.print(kept, highlight=False, soft_wrap=True)
+        console.print(kept, soft_wrap=True)

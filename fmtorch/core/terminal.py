@@ -12,8 +12,8 @@ from rich.console import Console
 
 from fmtorch.core.failures import place_of
 
-console = Console(markup=False)  # paths and names may hold brackets; styles are given by style=...
-errors = Console(stderr=True, markup=False)
+console = Console(markup=False, highlight=False)  # paths and names may hold brackets; styles are given by style=...
+errors = Console(stderr=True, markup=False, highlight=False)
 LINE_SECONDS = 60.0  # between two lines of progress where there is no terminal
 MISTAKES = (ValueError, OSError, ImportError)  # what a user can put right
 

@@ -64,10 +64,8 @@ def sgd(
     """Symmetric geometry distance in pixels, at most the mean of the two image diagonals; otherwise as `nsgd`.
 
     Args:
-        F_gt: true fundamental matrices (..., 3, 3), of any scale and sign.
-        F_est: estimated ones.
-        size0: sizes (..., 2) of image 0 as (h, w).
-        size1: those of image 1.
+        F_gt, F_est: true and estimated fundamental matrices (..., 3, 3), of any scale and sign.
+        size0, size1: sizes (..., 2) of the images as (h, w).
         samples: accepted draws.
         seed: of the draws.
         key: (...), the pairs' keys.
@@ -96,10 +94,8 @@ def nsgd(
     The value is 1 where no draw is accepted, and where a matrix is zero or not finite.
 
     Args:
-        F_gt: true fundamental matrices (..., 3, 3), of any scale and sign.
-        F_est: estimated ones.
-        size0: sizes (..., 2) of image 0 as (h, w).
-        size1: those of image 1.
+        F_gt, F_est: true and estimated fundamental matrices (..., 3, 3), of any scale and sign.
+        size0, size1: sizes (..., 2) of the images as (h, w).
         samples: accepted draws, of at most ten times as many tries.
         seed: of the draws.
         key: (...), the pairs' keys, which select their random points; with the same key and seed the points are the
@@ -180,8 +176,7 @@ def nsgd_released(
     The matrices are used as they are given, in pixels from 0 or from 1. A failed estimate, zero or not finite, gets 1:
     the evaluator never measures those and counts them as misses. Not differentiable; `nsgd` is.
     """
-    pairs, shape = _flattened(F_gt, F_est, size0, size1, samples, key)
-    F_gt, F_est, size0, size1, key = pairs
+    (F_gt, F_est, size0, size1, key), shape = _flattened(F_gt, F_est, size0, size1, samples, key)
     tensors = (F_gt, F_est, size0, size1, torch.stack([diagonal(size) for size in (size0, size1)], 1), key)
     constants = mixed_seed(seed, Stream.METRIC), samples, True
     out = torch.empty(len(F_est), 2, dtype=torch.float64)
@@ -216,9 +211,6 @@ def diagonal(size: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch"]:
     """Length of the image diagonal, in pixels."""
     h, w = size.unbind(-1)
     return sqrt(h * h + w * w)
-
-
-# The draws of one pair, compiled
 
 
 @kernel

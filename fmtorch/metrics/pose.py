@@ -148,10 +148,7 @@ def _angle(sine: Tensor, cosine: Tensor) -> Tensor:
 
 def _dot(u: Tensor, v: Tensor) -> Tensor:
     """Inner product over the last dimension in a fixed order."""
-    total = torch.zeros_like(u[..., 0] * v[..., 0])
-    for a, b in zip(u.unbind(-1), v.unbind(-1), strict=True):
-        total = total + a * b
-    return total
+    return sum(a * b for a, b in zip(u.unbind(-1), v.unbind(-1), strict=True))  # type: ignore[return-value]
 
 
 def _sum_of_squares(u: Tensor) -> Tensor:

@@ -24,6 +24,7 @@ class _MeanOverPairs(Metric):  # type: ignore[misc, unused-ignore]
     """Sum and number of a figure per pair."""
 
     full_state_update = False
+    is_differentiable, higher_is_better = False, True
     total: Tensor
     pairs: Tensor
 
@@ -45,8 +46,7 @@ class _MeanOverPairs(Metric):  # type: ignore[misc, unused-ignore]
 class NSGD(_MeanOverPairs):
     """Mean of `fmtorch.metrics.nsgd` over pairs."""
 
-    is_differentiable = True
-    higher_is_better = False
+    is_differentiable, higher_is_better = True, False
 
     def __init__(self, *, samples: int = 1000, seed: int = 0, **options: Any) -> None:
         super().__init__(**options)
@@ -68,9 +68,6 @@ class NSGD(_MeanOverPairs):
 class Recall(_MeanOverPairs):
     """`fmtorch.metrics.recall` over all pairs, from their NSGD."""
 
-    is_differentiable = False
-    higher_is_better = True
-
     def __init__(self, *, threshold: float = THRESHOLD, **options: Any) -> None:
         super().__init__(**options)
         self.threshold = threshold
@@ -84,7 +81,6 @@ class MeanRecall(_MeanOverPairs):
     """AUC@0.05: `fmtorch.metrics.mean_recall` over all pairs, from their NSGD."""
 
     is_differentiable = True
-    higher_is_better = True
 
     def __init__(self, *, maximum: float = THRESHOLD, **options: Any) -> None:
         super().__init__(**options)
@@ -98,9 +94,6 @@ class MeanRecall(_MeanOverPairs):
 class PoseMAA(_MeanOverPairs):
     """mAA(10): `fmtorch.metrics.pose_maa` over all pairs, from their pose errors in degrees."""
 
-    is_differentiable = False
-    higher_is_better = True
-
     def __init__(self, *, maximum: int = MAA_MAXIMUM, **options: Any) -> None:
         super().__init__(**options)
         self.maximum = maximum
@@ -112,9 +105,6 @@ class PoseMAA(_MeanOverPairs):
 
 class PoseMAP(_MeanOverPairs):
     """Binned mAP: `fmtorch.metrics.pose_map` at one threshold over all pairs, from their pose errors in degrees."""
-
-    is_differentiable = False
-    higher_is_better = True
 
     def __init__(self, *, threshold: float | int = THRESHOLDS[1], bin: float | int = BIN, **options: Any) -> None:
         super().__init__(**options)
@@ -128,9 +118,7 @@ class PoseMAP(_MeanOverPairs):
 class PoseAUC(Metric):  # type: ignore[misc, unused-ignore]
     """`fmtorch.metrics.pose_auc` over all pairs, (t,), from their pose errors in degrees, all of which are kept."""
 
-    is_differentiable = True
-    higher_is_better = True
-    full_state_update = False
+    is_differentiable, higher_is_better, full_state_update = True, True, False
     errors: list[Tensor]
 
     def __init__(self, *, thresholds: Sequence[float | int] = THRESHOLDS, **options: Any) -> None:

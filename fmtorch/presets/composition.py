@@ -26,9 +26,6 @@ from fmtorch.jobs.execution import Execution
 from fmtorch.presets.files import available, naming_file
 from fmtorch.presets.objects import expect_buildable, instantiate
 
-# Presets of pruners need no `# @package` line: several are chosen at once, and each goes under its own name
-
-
 SEVERAL = ("pruner",)  # groups of which several presets are chosen at once
 
 
@@ -53,9 +50,6 @@ def register() -> None:
     """Have Hydra read folders by this reader; once is enough for a process."""
     Plugins.instance()  # registers Hydra's own readers, of which this replaces one
     SourcesRegistry.instance().types[FileConfigSource.scheme()] = FileConfigSource
-
-
-# Pruners of a composed config, and those that take other options for pairs of some families
 
 
 FAMILIES = "families"  # among a pruner's options: family -> options that its pairs get instead
@@ -83,19 +77,9 @@ def pruner_configs(config: DictConfig) -> dict[str, Any]:
             "pruner: a `_target_` stands where the names of pruners belong; the `# @package` line of a preset of yours "
             "must be `# @package pruner.<name>`, or be left out"
         )
-    return {str(name): value for name, value in plain.items() if not _left_over(value)}
-
-
-def _left_over(value: Any) -> bool:
-    """Whether a pipeline's preset says this of a pruner that others have taken the place of."""
-    return isinstance(value, Mapping) and bool(value) and OF_PIPELINES.issuperset(value)
-
-
-def expect_pruners(config: DictConfig) -> None:
-    """Raises ValueError, naming the option, where a pruner cannot be built with its options, for any family."""
-    for name, value in pruner_configs(config).items():
-        for where, options, _ in _versions(name, value):
-            expect_buildable(options, where)
+    # A pipeline's preset may speak of a pruner that others have taken the place of
+    left = [name for name, value in plain.items() if isinstance(value, Mapping) and value and {*value} <= OF_PIPELINES]
+    return {str(name): value for name, value in plain.items() if name not in left}
 
 
 def build_pruners(config: DictConfig) -> tuple[dict[str, Pruner], dict[str, dict[str, Pruner]]]:
@@ -219,7 +203,9 @@ def expect_stages(config: DictConfig) -> None:
     for group in STAGES:
         if group != "pruner" and group in config:  # a training has no estimator
             expect_buildable(plain(config[group]), group)
-    expect_pruners(config)
+    for name, value in pruner_configs(config).items():
+        for where, options, _ in _versions(name, value):
+            expect_buildable(options, where)
 
 
 def compose(config_name: str, overrides: Sequence[str], config_dir: Path | None = None) -> DictConfig:
@@ -227,15 +213,11 @@ def compose(config_name: str, overrides: Sequence[str], config_dir: Path | None 
 
     config_dir: a folder with a user's presets, which are read anew.
     """
-    return _kept(config_name, tuple(overrides)) if config_dir is None else _composed(config_name, overrides, config_dir)
+    words = tuple(overrides)
+    return _kept(config_name, words, None) if config_dir is None else _composed(config_name, words, config_dir)
 
 
-@functools.lru_cache(maxsize=64)
-def _kept(config_name: str, overrides: tuple[str, ...]) -> DictConfig:
-    return _composed(config_name, overrides)
-
-
-def _composed(config_name: str, overrides: Sequence[str], config_dir: Path | None = None) -> DictConfig:
+def _composed(config_name: str, overrides: tuple[str, ...], config_dir: Path | None) -> DictConfig:
     own = [] if config_dir is None else [f"hydra.searchpath=['file://{config_dir.resolve()}']"]
     with _composing:
         hydra_of_caller, GlobalHydra.instance().hydra = GlobalHydra.instance().hydra, None
@@ -246,8 +228,7 @@ def _composed(config_name: str, overrides: Sequence[str], config_dir: Path | Non
             GlobalHydra.instance().hydra = hydra_of_caller
 
 
-# The options of a command, checked, from the config that Hydra composed of them
-
+_kept = functools.lru_cache(maxsize=64)(_composed)
 
 Fields = TypeVar("Fields")
 
@@ -290,9 +271,6 @@ def path_fields(fields: type) -> list[str]:
 
 def _is_path(hint: Any) -> bool:
     return hint is Path or Path in get_args(hint)
-
-
-# The executor of a command's config: the group `executor`, and its short forms `workers` and `processes`
 
 
 @dataclasses.dataclass(frozen=True)

@@ -26,11 +26,10 @@ def build(group: str, name: str, config_dir: Path | str | None = None, **options
 
 def merged(config: Mapping[str, Any], options: Mapping[str, Any]) -> dict[str, Any]:
     """`config` with the values of `options`, mappings merged level by level."""
-    changes = {
-        key: merged(before, value) if isinstance(value, Mapping) and isinstance(before, Mapping) else value
-        for key, value, before in ((key, value, config.get(key)) for key, value in options.items())
+    both = {
+        key for key, value in options.items() if isinstance(value, Mapping) and isinstance(config.get(key), Mapping)
     }
-    return {**config, **changes}
+    return {**config, **options, **{key: merged(config[key], options[key]) for key in both}}
 
 
 def instantiate(config: Mapping[str, Any], where: str, **extra: Any) -> Any:

@@ -92,7 +92,6 @@ class RatioPrior:
         self.calibration = Calibration(**calibration)
 
     def __call__(self, c: Correspondences) -> Correspondences:
-        """The same matches with a prior."""
         return self.calibration(c, self.evidence(c))
 
     def evidence(self, c: Correspondences) -> Float[Tensor, "b n"]:

@@ -1,4 +1,7 @@
-"""The match domain: where a match is, where it goes and how its frame changes; and Gaussians over it."""
+"""CODE, coherence-based decision boundaries (Lin et al., TPAMI 2018): two robust regressions over the match domain.
+
+The domain is where a match is, where it goes and how its frame changes.
+"""
 
 from __future__ import annotations
 
@@ -123,8 +126,7 @@ def spread_centres(kernel: Float[Tensor, "n n"], count: int) -> Int[Tensor, " m"
     by_centre = kernel.T.contiguous()
     chosen: list[Tensor] = []
     for _ in range(min(count, len(kernel))):
-        best = (support * uncovered).argmax()
-        chosen.append(best)
+        chosen.append(best := (support * uncovered).argmax())
         uncovered = torch.minimum(uncovered, 1 - by_centre[best])
     return torch.stack(chosen) if chosen else torch.zeros(0, dtype=torch.int64, device=kernel.device)
 
@@ -134,9 +136,6 @@ def evenly(index: Int[Tensor, " n"], count: int) -> Int[Tensor, " m"]:
     if len(index) <= count:
         return index
     return index[torch.arange(count, device=index.device) * len(index) // count]
-
-
-# Robust ridge regression by iteratively reweighted least squares
 
 
 def huber_regression(
@@ -163,9 +162,6 @@ def huber_regression(
         factor = torch.linalg.cholesky_ex(normal).L
         coefficients = torch.cholesky_solve((weighted @ target).double(), factor).to(basis.dtype)
     return coefficients
-
-
-# The first regression: a smooth likelihood over the match domain, seeded by distinctive matches
 
 
 @dataclasses.dataclass(frozen=True)
@@ -234,8 +230,6 @@ class LikelihoodField:
         )
 
 
-# The second regression: a smooth affine motion through the likely matches
-
 _FREE = 1e-3  # the common affine motion's share of the ridge
 MIN_MATCHES = 8  # likely matches without which there is no motion
 
@@ -293,8 +287,6 @@ class SmoothMotion:
         dx, dy = ((matches.p0[:, None, i] - centres.p0[None, :, i]) / self.position for i in (0, 1))
         return torch.cat([torch.ones_like(g[:, :1]), matches.p0, g, g * dx, g * dy], 1)
 
-
-# CODE: coherence-based decision boundaries (Lin et al., TPAMI 2018)
 
 MIN_LIKELIHOOD, LARGEST_RESIDUAL = 0.5, 0.06
 
@@ -404,18 +396,3 @@ class CODE:
         if self.soft:
             return c
         return c.keep((result.likelihood > self.least_likelihood) & (result.residual < self.largest_residual))
-
-
-# CODE: two robust regressions over the match domain decide which matches are coherent
-
-__all__ = [
-    "CODE",
-    "Coherence",
-    "LikelihoodField",
-    "MatchDomain",
-    "SmoothMotion",
-    "code",
-    "coherence",
-    "huber_regression",
-    "match_domain",
-]

@@ -33,17 +33,11 @@ class RatioTest:
 
     threshold: Annotated[float, Within(0)] = 0.8
 
-    def __call__(self, correspondences: Correspondences) -> Correspondences:
-        """The same matches, of which only distinctive ones survive."""
-        ambiguity = correspondences.ambiguity
-        if ambiguity is None:
-            raise ValueError(
-                "the ratio test needs `ratio`, the nearest-neighbour distance ratio of each match, or `score`"
-            )
-        return correspondences.keep(ratio_test(ambiguity, self.threshold))
-
-
-# The mutual-nearest-neighbour check: on index lists, and as a stage
+    def __call__(self, c: Correspondences) -> Correspondences:
+        if c.ambiguity is None:
+            said = "the nearest-neighbour distance ratio of each match"
+            raise ValueError(f"the ratio test needs `ratio`, {said}, or `score`")
+        return c.keep(ratio_test(c.ambiguity, self.threshold))
 
 
 def mutual(
@@ -66,13 +60,9 @@ class MutualCheck:
     """Matches survive that are the best ones of both features. Raises ValueError where the matcher did not tell."""
 
     def __call__(self, c: Correspondences) -> Correspondences:
-        """The same matches, of which only mutual ones survive."""
         if c.mutual is None:
             raise ValueError("the mutual check needs `mutual`, which a matcher of both directions supplies")
         return c.keep(c.mutual)
-
-
-# One match per keypoint location in each image
 
 
 def one_to_one(
@@ -134,16 +124,10 @@ def _drop_all_but_the_best(x: Array, rank: Array, valid: Array, out: Array) -> N
 class OneToOne:
     """`one_to_one` as a stage. Raises ValueError for correspondences with neither `ratio` nor `score`."""
 
-    def __call__(self, correspondences: Correspondences) -> Correspondences:
-        """The same matches, of which at most one survives at each location of each image."""
-        c = correspondences
-        ambiguity = c.ambiguity
-        if ambiguity is None:
+    def __call__(self, c: Correspondences) -> Correspondences:
+        if c.ambiguity is None:
             raise ValueError("one-to-one needs `ratio` or `score`, by which the best match of a location is chosen")
-        return c.keep(one_to_one(c.x0, c.x1, ambiguity, c.mask))
-
-
-# Keeping the matches that are likely to be right
+        return c.keep(one_to_one(c.x0, c.x1, c.ambiguity, c.mask))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -155,8 +139,8 @@ class Likely:
 
     min_probability: float = 0.5
 
-    def __call__(self, correspondences: Correspondences) -> Correspondences:
+    def __call__(self, c: Correspondences) -> Correspondences:
         """The same matches, of which only likely ones survive; a prior that is NaN fails."""
-        if correspondences.prior is None:
+        if c.prior is None:
             raise ValueError("`likely` needs `prior`: put a stage that supplies it before, e.g. frame_consistency")
-        return correspondences.keep(correspondences.prior >= self.min_probability)
+        return c.keep(c.prior >= self.min_probability)

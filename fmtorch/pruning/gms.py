@@ -1,7 +1,7 @@
 """Grid-based motion statistics: GMS (Bian et al., CVPR 2017)."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -14,9 +14,6 @@ from fmtorch.core.types import Correspondences
 from fmtorch.jit.batches import for_each_pair
 from fmtorch.jit.kernel import Array, B1x1, F8x1, F8x2, I8x1, inner, kernel
 from fmtorch.pruning.calibration import calibration_of
-
-# `gms` for one pair, compiled
-
 
 GRID = 20  # cells a side in image 0
 CELLS = GRID * GRID
@@ -148,9 +145,7 @@ def _around(table: Array, filled: Array, line: int, end: int, side: int, turn: i
 
 
 @inner
-def _standing(
-    p0: Array, p1: Array, sides: Array, turns: int, factor: float, authors: bool
-) -> tuple[Array, int]:  # fmt: skip
+def _standing(p0: Array, p1: Array, sides: Array, turns: int, factor: float, authors: bool) -> tuple[Array, int]:
     """The rotations, as bits, under which each match follows an assignment that stands, (grids, m), and the
     hypothesis, grid * turns + turn, that keeps most matches, the first of equals."""
     m, largest = len(p0), 0
@@ -190,6 +185,7 @@ def _standing(
 
 
 Border = Literal["opencv", "authors"]
+Options = tuple[bool, bool, float, Border]  # with_rotation, with_scale, threshold_factor, border
 # Cells a side in image 1 at the scale ratios 1, 1/2, 1/sqrt(2), sqrt(2), 2, rounded down as the released code does.
 GRIDS = (20, 10, 14, 28, 40)
 
@@ -219,9 +215,8 @@ def gms(
     cells of shifted grids. Time and memory are linear in the number of matches, besides a table of cell pairs. Computed
     on the CPU. Raises ValueError for sizes that contradict the points of all pairs, such as (w, h).
     """
-    tensors, options = _given(x0, x1, size0, size1, mask), _options(with_rotation, with_scale, threshold_factor, border)
-    out = torch.empty(x0.shape[:2], dtype=torch.bool)
-    return for_each_pair(gms_kernel, tensors, *options, out=out, kind=torch.float64, group=Matches)
+    options = with_rotation, with_scale, threshold_factor, border
+    return _of_each_pair(gms_kernel, torch.bool, (x0, x1), (size0, size1), mask, options)
 
 
 def gms_support(
@@ -244,28 +239,26 @@ def gms_support(
     the grids; 0 for a match that is alone, outside or masked. Rotation and scale are those of the hypothesis that keeps
     most matches of the pair in `gms`, whose arguments these are.
     """
-    tensors, options = _given(x0, x1, size0, size1, mask), _options(with_rotation, with_scale, threshold_factor, border)
-    out = torch.empty(x0.shape[:2], dtype=torch.float64)
-    for_each_pair(gms_support_kernel, tensors, *options, out=out, kind=torch.float64, group=Matches)
-    return out.to(x0)
+    options = with_rotation, with_scale, threshold_factor, border
+    return _of_each_pair(gms_support_kernel, torch.float64, (x0, x1), (size0, size1), mask, options).to(x0)
 
 
-def _given(x0: Tensor, x1: Tensor, size0: Tensor, size1: Tensor, mask: Tensor | None) -> tuple[Tensor, ...]:
-    """What the kernels are given of each pair."""
-    mask = torch.ones_like(x0[..., 0], dtype=torch.bool) if mask is None else mask
-    for i, (x, size) in enumerate(((x0, size0), (x1, size1))):
-        expect_inside(x, mask, size, f"x{i}", f"size{i}")
-    return x0, x1, size0.float(), size1.float(), mask
-
-
-def _options(with_rotation: bool, with_scale: bool, threshold_factor: float, border: Border) -> tuple[Any, ...]:
-    """What they are given of all pairs: sides of the grids in image 1, rotations, factor, whose rule at the border."""
-    return (
+def _of_each_pair(
+    of_pair: Any, kind: torch.dtype, x: Sequence[Tensor], sizes: Sequence[Tensor], mask: Tensor | None, options: Options
+) -> Tensor:
+    """What a kernel makes of the matches of each pair, numbers of a kind."""
+    with_rotation, with_scale, threshold_factor, border = options
+    mask = torch.ones_like(x[0][..., 0], dtype=torch.bool) if mask is None else mask
+    for i, size in enumerate(sizes):
+        expect_inside(x[i], mask, size, f"x{i}", f"size{i}")
+    tensors, out = (*x, sizes[0].float(), sizes[1].float(), mask), torch.empty(mask.shape, dtype=kind)
+    same = (
         np.array(GRIDS if with_scale else GRIDS[:1]),
         8 if with_rotation else 1,
         threshold_factor,
         border == "authors",
     )
+    return for_each_pair(of_pair, tensors, *same, out=out, kind=torch.float64, group=Matches)
 
 
 class GMS:

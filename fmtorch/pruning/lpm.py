@@ -15,8 +15,6 @@ from fmtorch.jit.kernel import Array, B1x1, F8x1, F8x2, I8x1, inner, kernel, vec
 from fmtorch.pruning.calibration import calibration_of
 from fmtorch.pruning.neighbors import search
 
-# `lpm` for one pair, compiled
-
 
 class Passes(NamedTuple):
     """Of each pass (p,) the cost up to which matches are kept, neighbours, and the agreement of motions that differ."""

@@ -186,9 +186,5 @@ def neighbour_maps(x0: F8x2, x1: F8x2, out: F8x3) -> None:
                     squares += r[k]
             if agreeing > best:
                 best = agreeing
-                out[i, 0, 0], out[i, 0, 1], out[i, 1, 0], out[i, 1, 1] = (
-                    c / squares,
-                    -d / squares,
-                    d / squares,
-                    c / squares,
-                )
+                out[i, 0, 0], out[i, 0, 1] = c / squares, -d / squares
+                out[i, 1, 0], out[i, 1, 1] = d / squares, c / squares

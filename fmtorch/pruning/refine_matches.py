@@ -22,8 +22,6 @@ from fmtorch.jit.lanes import fill, load, store
 from fmtorch.jobs.execution import mapped
 from fmtorch.pruning.neighbors import neighbour_maps
 
-# One window, compiled: its linear model, Gauss-Newton steps, the covariance of the point
-
 PARAMETERS = 8  # offset, gain, four of the affine map, two of the shift: as many as `lanes` has lanes
 WINDOW_SIGMA = 0.8  # of the Gaussian weight, in radii of the window
 DAMPED_FROM, DAMPING = 2, 1e-3  # of the affine map and the shift, relative to their curvature
@@ -367,12 +365,9 @@ class RefineMatches:
     kernels: ClassVar = (refine_windows, neighbour_maps)
 
     def __post_init__(self) -> None:
-        """Raises ValueError for a window or a number of steps that is none."""
         if self.radius < 1 or self.iterations < 1 or not self.spacing > 0:
-            raise ValueError(
-                f"radius={self.radius}, iterations={self.iterations}, spacing={self.spacing}; radius and iterations "
-                "must be at least 1, spacing above 0 px"
-            )
+            given = f"radius={self.radius}, iterations={self.iterations}, spacing={self.spacing}"
+            raise ValueError(f"{given}; radius and iterations must be at least 1, spacing above 0 px")
 
     def __call__(self, c: Correspondences) -> Correspondences:
         """Raises ValueError: matches alone do not say what the images show."""
@@ -404,20 +399,18 @@ class RefineMatches:
         return c.derived(x1=x1, lafs1=lafs1, noise=noise)
 
     def _refined(self, rows: dict[str, Array], image0: GreyPyramid, image1: GreyPyramid) -> Refined:
-        """The matches of one pair, all of them finite, refined."""
         n = len(rows["x0"])
-        affine, side = (
-            _frame_maps(rows["lafs0"], rows["lafs1"]) if "lafs0" in rows else (np.empty((n, 2, 2)), np.zeros(n))
-        )
-        if "lafs0" not in rows:
+        affine, side = np.empty((n, 2, 2)), np.zeros(n)
+        if "lafs0" in rows:
+            affine, side = _frame_maps(rows["lafs0"], rows["lafs1"])
+        else:
             neighbour_maps(rows["x0"], rows["x1"], affine)
         with np.errstate(all="ignore"):  # maps that are none: the kernel leaves what is not finite
             scale = np.sqrt(np.abs(affine[:, 0, 0] * affine[:, 1, 1] - affine[:, 0, 1] * affine[:, 1, 0]))
             spacing = np.maximum(np.maximum(self.spacing, self.spacing / scale), self.share * side)
         windows = Windows(rows["x0"], rows["x1"], affine, spacing, np.ones(n, np.bool_))
-        fit = Fit(
-            self.radius, self.iterations, float(self.min_correlation), float(self.max_shift), float(self.max_deviation)
-        )
+        limits = map(float, (self.min_correlation, self.max_shift, self.max_deviation))
+        fit = Fit(self.radius, self.iterations, *limits)
         out = Refined(np.empty((n, 2)), np.empty((n, 2, 2)), np.empty((n, 3)), np.empty(n), np.empty(n, np.bool_))
         refine_windows(windows, Pyramid(*image0), Pyramid(*image1), fit, out)
         return out

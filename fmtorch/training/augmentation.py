@@ -119,9 +119,7 @@ class _Draw:
         self.ratio = None if a.ratio is None else _within(a.ratio, u[1])
         self.share = _within(a.inlier_share, u[3]) if u[2] < a.thin else None
         self.sigma = 0.0 if a.noise is None else _within(a.noise, u[4])
-        self.count = None
-        if a.matches is not None:
-            self.count = subset_size(a.matches, u[5])
+        self.count = None if a.matches is None else subset_size(a.matches, u[5])
 
     def angle(self, image: int) -> float:
         """The turn of an image in degrees, 0 for none."""

@@ -40,13 +40,11 @@ def sha256(path: Path) -> str:
 def save_weights(
     network: nn.Module, path: Path, *, temperature: float = 1.0, notes: Mapping[str, str] | None = None
 ) -> None:
-    """Write a network's weights as safetensors, whole or not at all.
+    """Write a network's weights as safetensors, whole or not at all, into a folder that is made.
 
     Args:
         network: any module; one with an attribute `options` states them in the file.
-        path: to write to; its folder is made.
-        temperature: by which log-odds are divided at inference.
-        notes: what else the file is to say.
+        temperature: by which log-odds are divided at inference. notes: what else the file is to say.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     state = {key: value.detach().cpu().contiguous() for key, value in network.state_dict().items()}
@@ -63,8 +61,8 @@ def export_onnx(
     Raises ValueError for a network that is not `Exportable`, ArithmeticError where ONNX Runtime disagrees with torch.
     """
     if not isinstance(network, Exportable):
-        raise ValueError(f"{type(network).__name__} has no `backbone`, `input_channels`, `options` and `predict`: "
-                         "it cannot be exported to ONNX, and runs with torch alone")  # fmt: skip
+        missing = f"{type(network).__name__} has no `backbone`, `input_channels`, `options` and `predict`"
+        raise ValueError(f"{missing}: it cannot be exported to ONNX, and runs with torch alone")
     outside = [key for key in network.state_dict() if not key.startswith("backbone.")]
     if outside:
         raise ValueError(f"{', '.join(outside)}: parameters outside the backbone would not be in the ONNX file")
@@ -85,14 +83,14 @@ def export_onnx(
 
 def onnx_model(network: nn.Module, example: Tensor, name: str, output: str, *, free_axis: int) -> Any:
     """A module of one input as an ONNX model, one axis of the input of any length, without notes of source lines."""
-    with _quiet():
+    with quiet(("torch.onnx",), logging.ERROR), warnings.catch_warnings():  # of operators that are not installed
+        warnings.simplefilter("ignore", FutureWarning)  # of the exporter's own deprecated calls
         program = torch.onnx.export(
             network, (example,), dynamo=True, opset_version=OPSET, input_names=[name], output_names=[output],
             dynamic_shapes=({free_axis: torch.export.Dim("n", min=1)},), verbose=False,
         )  # fmt: skip
     assert program is not None
-    model = program.model_proto
-    forget_origin(model)
+    forget_origin(model := program.model_proto)
     return model
 
 
@@ -104,17 +102,17 @@ def expect_equal(path: Path, exported: Tensor, expected: Tensor) -> None:
 
 
 @contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """Without the exporter's messages on operators that are not installed and on its own deprecated calls."""
-    logger = logging.getLogger("torch.onnx")
-    level = logger.level
-    logger.setLevel(logging.ERROR)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", FutureWarning)
-            yield
-    finally:
+def quiet(names: Sequence[str], level: int) -> Iterator[None]:
+    """Without messages of these loggers below a level."""
+    loggers = [logging.getLogger(name) for name in names]
+    before = [logger.level for logger in loggers]
+    for logger in loggers:
         logger.setLevel(level)
+    try:
+        yield
+    finally:
+        for logger, old in zip(loggers, before, strict=True):
+            logger.setLevel(old)
 
 
 class _OnePair(nn.Module):
@@ -141,16 +139,19 @@ def forget_origin(model: Any) -> None:
 
 
 def _forget(graph: Any) -> None:
-    for part in (graph, *graph.value_info, *graph.input, *graph.output, *graph.initializer):
-        part.ClearField("metadata_props")
-        part.ClearField("doc_string")
+    _clear(graph, *graph.value_info, *graph.input, *graph.output, *graph.initializer)
     _forget_nodes(graph.node)
 
 
+def _clear(*parts: Any) -> None:
+    for part in parts:
+        part.ClearField("metadata_props")
+        part.ClearField("doc_string")
+
+
 def _forget_nodes(nodes: Any) -> None:
+    _clear(*nodes)
     for node in nodes:
-        node.ClearField("metadata_props")
-        node.ClearField("doc_string")
         for attribute in node.attribute:
             for inner in (*attribute.graphs, *([attribute.g] if attribute.HasField("g") else [])):
                 _forget(inner)
@@ -171,14 +172,8 @@ def write_result(
     """Evaluate the best weights of a training and write them into its folder.
 
     The files are `name` with .safetensors, .md and, where the network can be exported and the extra `export` is
-    installed, .onnx.
-
-    Args:
-        folder: of the training.
-        name: of the files.
-        network: with its best weights.
-        validation: what it is evaluated by.
-        facts: what the card says of the training: `data`, `seconds`, `steps`, `best_step`, `processor`, the identity.
+    installed, .onnx. facts: what the card says of the training: `data`, `seconds`, `steps`, `best_step`, `processor`,
+    the identity.
     """
     network = network.to("cpu").eval()
     evaluation = validation(network)

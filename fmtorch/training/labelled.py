@@ -73,16 +73,10 @@ class LabelledMatches(Record):
 
     def compact(self, multiple: int = 1) -> "LabelledMatches":
         """Matches moved to the front in their order, padding cut to the longest pair (rounded up to `multiple`)."""
-        mask = self.correspondences.mask
-        order = torch.argsort(mask.logical_not().to(torch.uint8), dim=-1, stable=True)
-        longest = int(mask.sum(-1).max()) if mask.numel() else 0
-        n = -(-longest // multiple) * multiple
-        moved = self.reorder(order[:, :n])
-        if moved.label.shape[1] == n:
-            return moved
-        return dataclasses.replace(
-            moved, correspondences=moved.correspondences.compact(multiple), label=_padded(moved.label, n)
-        )
+        c, mask = self.correspondences.compact(multiple), self.correspondences.mask
+        n = c.x0.shape[1]
+        order = torch.argsort(mask.logical_not().to(torch.uint8), dim=-1, stable=True)[:, :n]
+        return LabelledMatches(c, _padded(gathered(self.label, order), n), self.F)
 
     def reorder(self, order: Int[Tensor, "b m"]) -> "LabelledMatches":
         """The matches in the slots `order` of each pair, in that order."""
@@ -126,8 +120,8 @@ def label(dataset: PairDataset, pair: ImagePair, x0: Points, x1: Points) -> Labe
 
 
 def by_line(line: NDArray[np.float64]) -> Labels:
-    """Labels of matches whose larger distance (n,) to the epipolar lines is given in pixels."""
-    return _banded(line)
+    """Labels of matches whose larger distance (n,) to the epipolar lines, or other error, is given in pixels."""
+    return np.select([line <= INLIER_PX, line > OUTLIER_PX], [INLIER, OUTLIER], IGNORED).astype(np.int8)
 
 
 def by_transfer(forward: NDArray[np.float64], backward: NDArray[np.float64], line: NDArray[np.float64]) -> Labels:
@@ -136,12 +130,8 @@ def by_transfer(forward: NDArray[np.float64], backward: NDArray[np.float64], lin
     Where neither depth is known (the sky) a match far from its line is an outlier, and one near it is ignored.
     """
     unknown = np.isnan(forward) & np.isnan(backward)
-    labels = _banded(np.fmax(forward, backward))
+    labels = by_line(np.fmax(forward, backward))
     return np.where(unknown, np.where(line > OUTLIER_PX, OUTLIER, IGNORED), labels).astype(np.int8)
-
-
-def _banded(error: NDArray[np.float64]) -> Labels:
-    return np.select([error <= INLIER_PX, error > OUTLIER_PX], [INLIER, OUTLIER], IGNORED).astype(np.int8)
 
 
 def depths(dataset: DepthDataset, image: ImageSource, x: Points) -> NDArray[np.float64]:

@@ -3,12 +3,11 @@
 What is already done is taken up again, whatever ended the last attempt.
 """
 
-import contextlib
 import logging
 import re
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +19,13 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from numpy.typing import NDArray
 from rich.progress import Progress, TaskID
 from torch import Tensor, nn
-from torch.utils.data import DataLoader, Dataset
+from torch.utils.data import DataLoader
 
 from fmtorch.core.terminal import progress_bars
 from fmtorch.data import ImagePair, read_image
 from fmtorch.pipeline.pictures import draw_matches
 from fmtorch.pruning.networks.learned import predict
+from fmtorch.training.export import quiet
 from fmtorch.training.labelled import LabelledMatches
 from fmtorch.training.objective import Objective
 from fmtorch.training.options import Optimisation as Optimisation
@@ -34,6 +34,7 @@ from fmtorch.training.validation import Evaluation, Validation
 CHECKPOINTS, BEST, LOGS = "checkpoints", "best.ckpt", "logs"
 SMALLER_IS_BETTER = ("log_loss", "calibration_error")  # figures of validation; of the others larger is
 PICTURE_HEIGHT = 480  # px
+QUIET = ("lightning.pytorch", "lightning.fabric")  # loggers, whose advice does not apply here
 
 
 class PrunerTraining(lightning.LightningModule):
@@ -94,12 +95,8 @@ class PrunerTraining(lightning.LightningModule):
 
 def latest_checkpoint(folder: Path) -> tuple[Path | None, int]:
     """The checkpoint of most steps that can be read, and its steps; (None, 0) where there is none."""
-    checkpoints = []
-    for path in (folder / CHECKPOINTS).glob("step=*.ckpt"):
-        match = re.fullmatch(r"step=(\d+)", path.stem)
-        if match:
-            checkpoints.append((int(match[1]), path))
-    for step, path in sorted(checkpoints, reverse=True):
+    names = ((re.fullmatch(r"step=(\d+)", path.stem), path) for path in (folder / CHECKPOINTS).glob("step=*.ckpt"))
+    for step, path in sorted(((int(match[1]), path) for match, path in names if match), reverse=True):
         try:
             torch.load(path, map_location="cpu", weights_only=True)
         except Exception as error:  # torch.load raises nearly anything for damaged bytes; an older file may do
@@ -144,7 +141,9 @@ def train(
         folder / CHECKPOINTS, "best", monitor=figure, mode=mode, enable_version_counter=False, save_weights_only=True
     )
     stop = [] if patience is None else [EarlyStopping(figure, mode=mode, patience=patience, strict=True)]
-    with _quiet():
+    with quiet(QUIET, logging.WARNING), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*(does not have many workers|exists and is not empty).*")
+        warnings.filterwarnings("ignore", category=FutureWarning, module="lightning.*")
         lightning_trainer = lightning.Trainer(
             max_steps=total, max_epochs=1, val_check_interval=every, check_val_every_n_epoch=None,
             num_sanity_val_steps=0, log_every_n_steps=min(10, every), default_root_dir=folder,
@@ -154,7 +153,8 @@ def train(
         )  # fmt: skip
         if step < total:
             own = batches(step, lightning_trainer.global_rank, lightning_trainer.world_size)
-            validation: DataLoader[Any] = DataLoader(_Once(), batch_size=None)
+            once: Any = [0]  # one item, for the one step of validation, which has its own pairs
+            validation: DataLoader[Any] = DataLoader(once, batch_size=None)
             try:
                 lightning_trainer.fit(module, own, validation, ckpt_path=path, weights_only=True)
             except SystemExit:  # which Lightning makes of Ctrl-C
@@ -184,36 +184,6 @@ class _ResumableCheckpoint(ModelCheckpoint):
         super().on_validation_end(trainer, pl_module)  # what the last batch puts off
 
 
-class _Once(Dataset[int]):
-    """One item, for the one step of validation, which has its own pairs."""
-
-    def __len__(self) -> int:
-        return 1
-
-    def __getitem__(self, index: int) -> int:
-        if index:
-            raise IndexError(index)
-        return 0
-
-
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """Lightning without the advice that does not apply here."""
-    loggers = [logging.getLogger(name) for name in ("lightning.pytorch", "lightning.fabric")]
-    before = [logger.level for logger in loggers]
-    for logger in loggers:
-        logger.setLevel(logging.WARNING)
-    try:
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", message=".*does not have many workers.*")
-            warnings.filterwarnings("ignore", message=".*exists and is not empty.*")
-            warnings.filterwarnings("ignore", category=FutureWarning, module="lightning.*")
-            yield
-    finally:
-        for logger, level in zip(loggers, before, strict=True):
-            logger.setLevel(level)
-
-
 class _TrainingBar(Callback):
     """The progress bar of a training, earlier attempts included: steps, loss, and the best figure of validation so far.
 
@@ -241,7 +211,6 @@ class _TrainingBar(Callback):
             self._progress.update(self._bar, completed=trainer.global_step, description=text)
 
     def on_validation_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
-        """Takes the latest figure into the bar's text."""
         value = trainer.callback_metrics.get(f"validation/{self.monitor}")
         if value is not None:
             self._figure = f", {self.monitor} {float(value):.3f}"
@@ -263,7 +232,6 @@ class ValidationPictures(Callback):
 
     @torch.no_grad()
     def on_validation_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
-        """Adds the pictures of the network's present state to the log."""
         assert isinstance(pl_module, PrunerTraining)
         if not isinstance(trainer.logger, TensorBoardLogger) or not trainer.is_global_zero:
             return

@@ -78,9 +78,8 @@ class MatchedPairs(StoredMatches):
         if not len(dataset):
             raise ValueError(f"the data set {dataset.name} has no pairs")
         if (model := getattr(dataset, "model", "fundamental")) != "fundamental":
-            raise ValueError(
-                f"the data set {dataset.name} has {model} matrices; matches are labelled by fundamental ones"
-            )
+            what = f"the data set {dataset.name} has {model} matrices"
+            raise ValueError(f"{what}; matches are labelled by fundamental ones")
         stages, execution = pipeline, execution or Execution("threads", workers)
         if isinstance(stages, str):
             build = build or functools.partial(load_pipeline, stages, overrides=tuple(overrides))
@@ -107,13 +106,11 @@ class MatchedPairs(StoredMatches):
 
 
 def _identity(dataset: PairDataset, stages: Pipeline, most: int) -> dict[str, Any]:
-    extractor = stages.extractor
-    if isinstance(extractor, CachedFeatures):
-        extractor = extractor.extractor
+    extractor: Any = stages.extractor
+    extractor = extractor.extractor if isinstance(extractor, CachedFeatures) else extractor
+    families = [stages.families] if stages.families else []
     try:
-        parts = configuration(
-            [extractor, stages.matcher, stages.pruners, *([stages.families] if stages.families else [])]
-        )
+        parts = configuration([extractor, stages.matcher, stages.pruners, *families])
     except TypeError as error:
         raise ValueError(f"the matches of this pipeline cannot be kept: {error}") from error
     rules = [labelled.INLIER_PX, labelled.OUTLIER_PX, labelled.EDGE_PX]
@@ -128,13 +125,13 @@ def _sound(path: Path, pairs: int) -> bool:
     if not path.exists():
         return False
     try:
-        shard = Shard(path, verify=True)
-        if len(shard) != pairs:
-            raise ShardError(f"{path} has {len(shard)} pairs instead of {pairs}")
+        count = len(Shard(path, verify=True))
+        problem = "" if count == pairs else f"{path} has {count} pairs instead of {pairs}"
     except ShardError as error:
-        warnings.warn(f"{error}; it is computed anew", stacklevel=3)
-        return False
-    return True
+        problem = str(error)
+    if problem:
+        warnings.warn(f"{problem}; it is computed anew", stacklevel=3)
+    return not problem
 
 
 def partition(pairs: Sequence[ImagePair]) -> list[list[int]]:
@@ -168,17 +165,14 @@ class Job(NamedTuple):
     pairs: list[ImagePair]
 
 
-def matching(dataset: PairDataset, stages: Pipeline, most: int, images: int) -> Matching:
-    """The matching by a pipeline's stages, with the features of so many images kept."""
+def matching(dataset: PairDataset, build: Callable[[], Pipeline], most: int, images: int = _IMAGES) -> Matching:
+    """The matching by the stages of a pipeline that is built, with the features of so many images kept."""
+    stages = build()
     pipeline = Pipeline(
         stages.extractor, stages.matcher, stages.pruners, stages.estimator,
         device=stages.device, memory=images, families=stages.families,
     )  # fmt: skip
     return Matching(dataset, pipeline, most)
-
-
-def _matching_in_process(dataset: PairDataset, build: Callable[[], Pipeline], most: int) -> Matching:
-    return matching(dataset, build(), most, _IMAGES)
 
 
 def compute_shards(
@@ -195,10 +189,10 @@ def compute_shards(
     pool = WorkerPool(execution, PRELOADED)
     source: Source[Matching]
     if execution.shared:
-        source = Local(matching(dataset, stages, most, _IMAGES * pool.size))
+        source = Local(matching(dataset, lambda: stages, most, _IMAGES * pool.size))
     else:
         assert build is not None
-        source = Factory(functools.partial(_matching_in_process, dataset, build, most))
+        source = Factory(functools.partial(matching, dataset, build, most))
     runner = TaskRunner(pool, source, matched_rows, lambda job, rows: write_shard(job.path, rows))
     threads = torch.get_num_threads(), cv2.getNumThreads()
     use_one_thread()

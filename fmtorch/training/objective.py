@@ -140,16 +140,12 @@ def geometric_loss(
     Args:
         F_est: estimates in pixels, of any scale, of one or more stages.
         F_true: true fundamental matrices in pixels, of any scale.
-        size0: image sizes as (h, w), pixels.
-        size1: likewise, of image 1.
-        K0: calibration of image 0. With both, distances are in focal lengths; without, in half longer sides of the
-            images.
-        K1: calibration of image 1.
+        size0, size1: image sizes as (h, w), pixels.
+        K0, K1: calibrations. With both, distances are in focal lengths; without, in half longer sides of the images.
         valid: False for estimates to leave out; those that are zero or not finite are left out anyway.
         limit: clamp, in squared units of the normalised coordinates; by default LIMIT_E with calibration, else LIMIT_F.
         points: virtual points for each pair.
-        seed: of the virtual points.
-        key: the pairs' keys, which select their virtual points.
+        seed, key: the pairs' keys, which select their virtual points.
 
     Returns:
         The loss, between 0 and the limit.
@@ -196,13 +192,11 @@ def nsgd_loss(
     Args:
         F_est: estimates in pixels, of any scale, of one or more stages.
         F_true: true fundamental matrices in pixels, of any scale.
-        size0: image sizes as (h, w), pixels.
-        size1: likewise, of image 1.
+        size0, size1: image sizes as (h, w), pixels.
         valid: False for estimates to leave out; those that are zero or not finite are left out anyway.
         limit: clamp of a pair's figure, in image diagonals, beyond which it has no gradient; None: no clamp.
         samples: accepted draws for each pair.
-        seed: of the draws.
-        key: the pairs' keys, which select their draws.
+        seed, key: the pairs' keys, which select their draws.
 
     Returns:
         The loss in image diagonals.
@@ -242,8 +236,7 @@ def virtual_points(
 
     Args:
         F: true fundamental matrices in pixels, of any scale.
-        size0: image sizes as (h, w), pixels.
-        size1: likewise, of image 1.
+        size0, size1: image sizes as (h, w), pixels.
         count: points for each pair.
         seed: of the draws, a function of (seed, key).
         key: the pairs' keys; 0 for all where None.

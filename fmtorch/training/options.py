@@ -47,7 +47,6 @@ class Planes(PlaneViews):
 
     @property
     def limits(self) -> PlaneViews:
-        """How views are drawn, without the rest."""
         return PlaneViews(**{field.name: getattr(self, field.name) for field in dataclasses.fields(PlaneViews)})
 
 

@@ -61,15 +61,10 @@ def list_photographs(
     else:
         files = sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES)
         names = [path.relative_to(folder) for path in files]
-        photographs = [
-            (path, str(name.parent if len(name.parts) > 1 else name), str(name))
-            for path, name in zip(files, names, strict=True)
-        ]
-    kept = [
-        Photograph(path, source)
-        for path, source, full in photographs
-        if (sources is None or source in sources) and not any(part in full for part in excluded)
-    ]
+        own = [str(name.parent if len(name.parts) > 1 else name) for name in names]
+        photographs = list(zip(files, own, map(str, names), strict=True))
+    allowed = [each for each in photographs if sources is None or each[1] in sources]
+    kept = [Photograph(path, own) for path, own, full in allowed if not any(part in full for part in excluded)]
     if not kept:
         raise ValueError(f"{folder}: none of its {len(photographs)} photographs is left by sources and excluded")
     return kept
@@ -116,11 +111,8 @@ class PlanePairs(PairDataset):
                 for i, camera in enumerate(cameras):
                     self._cameras[f"{scene}/{i}"], self._paths[f"{scene}/{i}"] = camera, folder / f"{i:02d}.jpg"
                 report(done, len(files))
-        self._pairs = [
-            (scene, i, j)
-            for scene in dict.fromkeys(self._scenes)
-            for i, j in itertools.combinations(range(self.views.views), 2)
-        ]
+        ends = list(itertools.combinations(range(self.views.views), 2))
+        self._pairs = [(scene, i, j) for scene in dict.fromkeys(self._scenes) for i, j in ends]
 
     def __len__(self) -> int:
         return len(self._pairs)
@@ -209,9 +201,8 @@ def warp(image: Grey, H: Matrix, size: tuple[int, int]) -> Grey:
     smallest = float(np.linalg.svd(local_affine(H, centre)[0], compute_uv=False)[-1])
     fine = int(np.clip(math.ceil(1 / smallest - 0.25), 1, 4))
     up = np.array([[fine, 0, (fine - 1) / 2], [0, fine, (fine - 1) / 2], [0, 0, 1.0]])
-    view = cv2.warpPerspective(
-        image, up @ H, (w * fine, h * fine), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101
-    )
+    options = {"flags": cv2.INTER_LINEAR, "borderMode": cv2.BORDER_REFLECT_101}
+    view = cv2.warpPerspective(image, up @ H, (w * fine, h * fine), **options)
     return view if fine == 1 else cv2.resize(view, (w, h), interpolation=cv2.INTER_AREA)  # type: ignore[return-value]
 
 

@@ -77,23 +77,14 @@ def run(config: DictConfig, name: str) -> Path:
     first = int(os.environ.get("LOCAL_RANK", "0")) == 0  # of several processes the one that reports
     if first:
         about = f"{len(matches.training)} pairs to train on, {len(matches.validation)} to validate on"
-        console.print(f"{about}; {folder}", highlight=False, markup=False, soft_wrap=True)
+        console.print(f"{about}; {folder}", soft_wrap=True)
         if len(matches.training) < FEW:
-            console.print(f"so few pairs show that it runs, and teach little; {MORE}", highlight=False, soft_wrap=True)
+            console.print(f"so few pairs show that it runs, and teach little; {MORE}", soft_wrap=True)
     shown = matches.validation[:: max(1, len(matches.validation) // PICTURES)][:PICTURES]
-    steps, seconds = train(
-        module,
-        lambda step, rank, processes: training_batches(
-            matches.training, config.batch, config.seed, step, rank, processes, workers=config.loaders
-        ),
-        folder,
-        plain(config.trainer),
-        every=options.validation.every,
-        checkpoint_every=options.checkpoint_every,
-        patience=options.validation.patience,
-        monitor=options.validation.monitor,
-        callbacks=(ValidationPictures(shown),),
-    )
+    batches = functools.partial(training_batches, matches.training, config.batch, config.seed, workers=config.loaders)
+    how: dict[str, Any] = {name: getattr(options.validation, name) for name in ("every", "patience", "monitor")}
+    how |= {"checkpoint_every": options.checkpoint_every, "callbacks": (ValidationPictures(shown),)}
+    steps, seconds = train(module, batches, folder, plain(config.trainer), **how)
     if first:
         processor = f"{os.cpu_count()} cores of {platform.processor() or platform.machine()}"
         facts = {**identity, "steps": steps, "seconds": seconds, "data": matches.description, "processor": processor}
@@ -105,10 +96,10 @@ def run(config: DictConfig, name: str) -> Path:
 def report(result: Result, name: str) -> None:
     """Say on the terminal what came out and how to use it."""
     for key, value in result.evaluation.figures.items():
-        console.print(f"{key:32} {value:.4f}", highlight=False)
+        console.print(f"{key:32} {value:.4f}")
     use = use_line(name, result.files[0], sys.argv[1:])
     for line in (", ".join(str(path) for path in result.files), f"use it: {use}"):
-        console.print(line, highlight=False, markup=False, soft_wrap=True)
+        console.print(line, soft_wrap=True)
 
 
 def use_line(name: str, file: Path, words: Sequence[str]) -> str:
@@ -130,9 +121,8 @@ def network_of(config: DictConfig, name: str) -> dict[str, Any]:
     chosen = pruners if "_target_" in pruners else next(iter(pruners.values()), {}) if len(pruners) == 1 else {}
     network = chosen.get("network") if isinstance(chosen, Mapping) else None
     if not isinstance(network, Mapping) or "_target_" not in network:
-        raise ValueError(
-            f"pruner={name} has nothing to train: its preset must have a `network` with a `_target_`, as lc has"
-        )
+        needs = "its preset must have a `network` with a `_target_`, as lc has"
+        raise ValueError(f"pruner={name} has nothing to train: {needs}")
     return {str(key): value for key, value in network.items()}
 
 

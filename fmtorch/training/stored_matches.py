@@ -4,9 +4,10 @@ import copy
 import itertools
 import warnings
 import zlib
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -37,11 +38,8 @@ SCHEMA = pa.schema(
     [
         pa.field("key", pa.int64()),
         *(pa.field(name, pa.string()) for name in _TEXTS),
-        pa.field("matches", pa.int64()),
-        pa.field("inliers", pa.int64()),
-        pa.field("outliers", pa.int64()),
-        *(pa.field(name, pa.list_(pa.from_numpy_dtype(kind))) for name, (kind, _) in _PER_PAIR.items()),
-        *(pa.field(name, pa.list_(pa.from_numpy_dtype(kind))) for name, (kind, _) in _PER_MATCH.items()),
+        *(pa.field(name, pa.int64()) for name in ("matches", "inliers", "outliers")),
+        *(pa.field(name, pa.list_(pa.from_numpy_dtype(kind))) for name, (kind, _) in (_PER_PAIR | _PER_MATCH).items()),
     ]
 )
 INDEX = ("key", *_TEXTS, "matches", "inliers", "outliers")  # what is known of a pair without its matches
@@ -57,13 +55,8 @@ def write_shard(path: Path, rows: Sequence[Row]) -> None:
     """Write rows of `SCHEMA`: texts, integers, flat arrays, None for what a pair does not have. Whole or absent."""
     columns = [pa.array([row.get(field.name) for row in rows], field.type) for field in SCHEMA]
     batch = pa.record_batch(columns, schema=SCHEMA)
-    about = {"format": str(FORMAT), "checksum": str(_checksum(batch))}
-    batch = batch.replace_schema_metadata(about)
-    with (
-        replacing(path) as temporary,
-        pa.OSFile(str(temporary), "wb") as sink,
-        pa.ipc.new_file(sink, batch.schema) as writer,
-    ):
+    batch = batch.replace_schema_metadata({"format": str(FORMAT), "checksum": str(_checksum(batch))})
+    with replacing(path) as temporary, pa.ipc.new_file(str(temporary), batch.schema) as writer:
         writer.write_batch(batch)
 
 
@@ -91,7 +84,6 @@ class Shard:
             raise error if isinstance(error, ShardError) else ShardError(f"{path} cannot be read: {error}") from error
 
     def __len__(self) -> int:
-        """Number of pairs."""
         return int(self.batch.num_rows)
 
     def index(self) -> dict[str, list[Any]]:
@@ -173,7 +165,6 @@ class StoredMatches(Dataset[LabelledMatches]):
         self._tell_failures()
 
     def __len__(self) -> int:
-        """Number of pairs that have matches."""
         return len(self._rows)
 
     def __getitem__(self, index: int | Draw) -> LabelledMatches:
@@ -186,7 +177,6 @@ class StoredMatches(Dataset[LabelledMatches]):
         return change(matches, seed=self.seed, epoch=draw.epoch, count=draw.matches)
 
     def stored(self, index: int) -> LabelledMatches:
-        """The matches of a pair as they are on disk."""
         number, row = self._rows[index]
         tensors = {name: torch.from_numpy(array.copy())[None] for name, array in self._shard(number).read(row).items()}
         label, F = tensors.pop("label"), tensors.pop("F")
@@ -210,7 +200,6 @@ class StoredMatches(Dataset[LabelledMatches]):
         ]
 
     def select(self, indices: Iterable[int]) -> "StoredMatches":
-        """The same data set with these pairs only."""
         chosen = list(indices)
         other = copy.copy(self)
         other._rows = [self._rows[i] for i in chosen]
@@ -226,7 +215,6 @@ class StoredMatches(Dataset[LabelledMatches]):
         return both
 
     def augmented(self, augmentation: Augmentation | None, seed: int = 0) -> "StoredMatches":
-        """The same data set with other random changes."""
         other = copy.copy(self)
         other.augmentation, other.seed = augmentation, seed
         return other
@@ -247,9 +235,8 @@ class StoredMatches(Dataset[LabelledMatches]):
             return
         identity, reason = self.failures[0]
         total = len(self.failures) + len(self)
-        message = (
-            f"{len(self.failures)} of {total} pairs have no matches and are left out, the first is {identity}: {reason}"
-        )
+        said = "pairs have no matches and are left out, the first is"
+        message = f"{len(self.failures)} of {total} {said} {identity}: {reason}"
         if not len(self):
             raise ValueError(message)
         warnings.warn(message, stacklevel=3)
@@ -269,20 +256,13 @@ def split_scenes(matches: StoredMatches, last: int = 4) -> tuple[StoredMatches, 
 
     Raises ValueError for a family that has no more scenes than that.
     """
-    scenes: dict[str, set[str]] = {}
-    for about in matches.pairs:
-        scenes.setdefault(about["family"], set()).add(about["scene"])
-    for family, names in scenes.items():
-        if len(names) <= last:
-            raise ValueError(
-                f"family {family} has {len(names)} scenes; with {last} for validation none is left to train"
-            )
-    held = last_scenes(((about["family"], about["scene"]) for about in matches.pairs), last)
-    inside = [(about["family"], about["scene"]) in held for about in matches.pairs]
-    return (
-        matches.select(i for i, held_out in enumerate(inside) if not held_out),
-        matches.select(i for i, held_out in enumerate(inside) if held_out),
-    )
+    scenes = [(about["family"], about["scene"]) for about in matches.pairs]
+    for family, count in Counter(family for family, _ in dict.fromkeys(scenes)).items():
+        if count <= last:
+            raise ValueError(f"family {family} has {count} scenes; with {last} for validation none is left to train")
+    held = last_scenes(scenes, last)
+    training, validation = ([i for i, scene in enumerate(scenes) if (scene in held) is side] for side in (False, True))
+    return matches.select(training), matches.select(validation)
 
 
 HELD_OUT = 4  # scenes of a family
@@ -297,31 +277,15 @@ def last_scenes(scenes: Iterable[tuple[str, str]], last: int | None) -> set[tupl
     names: dict[str, set[str]] = {}
     for family, name in scenes:
         names.setdefault(family, set()).add(name)
-    return {
-        (family, name)
-        for family, of_family in names.items()
-        for name in sorted(of_family)[max(1, len(of_family) - (last or _few(len(of_family)))) :]
-    }
-
-
-def _few(scenes: int) -> int:
-    return min(HELD_OUT, max(1, scenes // QUARTER))
-
-
-# Batches of pairs with similar numbers of matches, drawn by seed and epoch, and collated with little padding
+    held = set()
+    for family, own in names.items():
+        count = last or min(HELD_OUT, max(1, len(own) // QUARTER))
+        held |= {(family, name) for name in sorted(own)[max(1, len(own) - count) :]}
+    return held
 
 
 MAX_PADDING = 0.2  # share of a batch's slots
 _POOL = 8  # batches that are sorted by length together: more make lengths more similar and batches less random
-
-
-@runtime_checkable
-class Lengths(Protocol):
-    """What a data set must tell of itself: its size, and about how many matches each pair will have in an epoch."""
-
-    def __len__(self) -> int: ...
-
-    def lengths(self, epoch: int) -> Sequence[float]: ...
 
 
 class SimilarLengthBatches(Sampler[list[Draw]]):
@@ -343,7 +307,7 @@ class SimilarLengthBatches(Sampler[list[Draw]]):
     """
 
     def __init__(
-        self, dataset: Lengths, batch: int = 32, *, seed: int = 0, matches: Sequence[int] | None = (50, 4000),
+        self, dataset: StoredMatches, batch: int = 32, *, seed: int = 0, matches: Sequence[int] | None = (50, 4000),
         rank: int = 0, world_size: int = 1,
     ) -> None:  # fmt: skip
         if batch < 1:
@@ -359,15 +323,12 @@ class SimilarLengthBatches(Sampler[list[Draw]]):
         self.epoch, self.start = epoch, start
 
     def state_dict(self) -> dict[str, int]:
-        """What `load_state_dict` needs."""
         return {"epoch": self.epoch, "start": self.start}
 
     def load_state_dict(self, state: dict[str, int]) -> None:
-        """Go on where `state_dict` was taken."""
         self.set_epoch(state["epoch"], state["start"])
 
     def __len__(self) -> int:
-        """Batches of this process in what is left of the epoch."""
         batches = -(-len(self.dataset) // self.batch)
         return max(-(-batches // self.world_size) - self.start, 0)
 

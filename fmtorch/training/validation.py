@@ -74,7 +74,8 @@ class Validation:
         network.eval()
         torch.set_num_threads(1)
         try:
-            logits = [self._logit(network, pair, device) for pair in self.pairs]
+            predictions = (predict(network, pair.correspondences.to(device)) for pair in self.pairs)
+            logits = [prediction.logit[-1].to("cpu", torch.float64) for prediction in predictions]
             nsgd = {name: self._nsgd(use, logits) for name, use in self.uses.items()}
         finally:
             torch.set_num_threads(threads)
@@ -87,9 +88,6 @@ class Validation:
         for name, values in nsgd.items():
             figures |= self._recalls(name, values)
         return Evaluation(figures, logit, label)
-
-    def _logit(self, network: nn.Module, pair: LabelledMatches, device: torch.device) -> Tensor:
-        return predict(network, pair.correspondences.to(device)).logit[-1].to("cpu", torch.float64)
 
     def _nsgd(self, use: Use, logits: Sequence[Tensor]) -> Tensor:
         """NSGD of each pair; 1 where the estimate failed."""

@@ -1,4 +1,4 @@
-"""Pairs of a COLMAP database as correspondences."""
+"""Pairs of stored matches, estimated batch by batch; their geometries are kept until all are there."""
 
 import dataclasses
 import shutil
@@ -44,12 +44,10 @@ def as_correspondences(pair: DatabasePair, cameras: Cameras) -> Correspondences:
     can be, and as `fmtorch.find_fundamental` for values, sizes and points that contradict each other.
     """
     images, stored = (pair.image0, pair.image1), cameras == "stored"
-    problem = next((image.problem for image in images if image.problem), "") if stored else ""
-    if problem:
+    if stored and (problem := images[0].problem or images[1].problem):
         raise ValueError(problem)
     known: dict[str, Any] = {f"size{i}": image.size for i, image in enumerate(images)}
-    if stored:
-        known |= {f"K{i}": image.K for i, image in enumerate(images)}
+    known |= {f"K{i}": image.K for i, image in enumerate(images)} if stored else {}
     sized, with_K = any(image.size is not None for image in images), stored and any(i.K is not None for i in images)
     if cameras == "shared" and not sized:
         raise ValueError("cameras=shared needs the image sizes: size0 and size1")
@@ -68,17 +66,12 @@ def as_correspondences(pair: DatabasePair, cameras: Cameras) -> Correspondences:
 
 def _shared(image0: DatabaseImage, image1: DatabaseImage, cameras: Cameras) -> bool:
     """Whether both images are known to have one focal length, which is not known exactly."""
-    return cameras == "shared" or (
-        cameras == "stored" and image0.camera_id == image1.camera_id and image0.deviation > 0
-    )
-
-
-# Two-view geometries of a verification that is under way: a file a batch in one folder, until all are there
+    same = image0.camera_id == image1.camera_id and image0.deviation > 0
+    return cameras == "shared" or (cameras == "stored" and same)
 
 
 SETTINGS = "settings.json"
-
-_GeometryIds = tuple[Any, Any]
+_PairIds = tuple[Any, Any]
 
 
 class GeometryParts:
@@ -90,12 +83,12 @@ class GeometryParts:
     def __init__(self, folder: Path, settings: Mapping[str, Any]) -> None:
         self.folder = folder
         claim(folder / SETTINGS, settings, "geometries", f"give the same, or delete {folder}")
-        self.done: set[_GeometryIds] = set()
+        self.done: set[_PairIds] = set()
         for path in self._files():
             with np.load(path) as part:
-                self.done.update(map(_ids, part["pairs"].tolist()))
+                self.done.update((first, second) for first, second in part["pairs"].tolist())
 
-    def write(self, geometries: Iterable[tuple[_GeometryIds, PairGeometry]]) -> None:
+    def write(self, geometries: Iterable[tuple[_PairIds, PairGeometry]]) -> None:
         arrays: dict[str, Any] = {}
         pairs, kinds, texts = [], [], []
         for i, (ids, geometry) in enumerate(geometries):
@@ -108,14 +101,14 @@ class GeometryParts:
             np.savez(file, pairs=np.array(pairs), kinds=np.array(kinds), texts=np.array(texts), **arrays)
         self.done.update(pairs)
 
-    def read(self) -> Iterator[tuple[_GeometryIds, PairGeometry]]:
-        seen: set[_GeometryIds] = set()
+    def read(self) -> Iterator[tuple[_PairIds, PairGeometry]]:
+        seen: set[_PairIds] = set()
         for path in self._files():
             with np.load(path) as part:
-                for i, (pair, kind) in enumerate(zip(part["pairs"].tolist(), part["kinds"].tolist(), strict=True)):
-                    if (ids := _ids(pair)) not in seen:
-                        seen.add(ids)
-                        yield ids, _geometry(part, i, str(kind))
+                for i, ((first, second), kind) in enumerate(zip(part["pairs"].tolist(), part["kinds"], strict=True)):
+                    if (first, second) not in seen:
+                        seen.add((first, second))
+                        yield (first, second), _geometry(part, i, str(kind))
 
     def remove(self) -> None:
         shutil.rmtree(self.folder)
@@ -124,49 +117,30 @@ class GeometryParts:
         return sorted(self.folder.glob("*.npz"))
 
 
-def _ids(ids: list[Any]) -> _GeometryIds:
-    first, second = ids
-    return first, second
-
-
 def _geometry(part: Any, i: int, kind: str) -> PairGeometry:
     matrices = (part.get(f"{name}-{i}") for name in MATRICES)
     return PairGeometry(cast(Kind, kind), part[f"inliers-{i}"], *matrices, *part["texts"][i].tolist())
 
 
-# Pairs of stored matches, estimated batch by batch; their geometries are kept until all are there
-
-
 BATCH = 64  # pairs that are read, and kept, at a time
 PRELOADED = (__name__,)  # by the process that workers are forked of
-
-_PairIds = tuple[Any, Any]
 
 
 @runtime_checkable
 class PairStore(Protocol):
-    """Matches of pairs of images, and a place for their geometries; see `MatchDatabase`."""
+    """Matches of pairs of images, and a place for their geometries; see `MatchDatabase`.
 
-    def identity(self) -> dict[str, Any]:
-        """By what the matches are known again, as plain values."""
+    identity: by what the matches are known again, as plain values. pairs: those that have matches. matches: of a pair,
+    keypoints (n, 2) of its images. has_geometry: of a failure too. write: the geometries of all pairs, or none.
+    """
 
-    def pairs(self) -> list[_PairIds]:
-        """The pairs of images that have matches."""
-
-    def image(self, image_id: Any) -> DatabaseImage:
-        """An image with its keypoints."""
-
-    def matches(self, pair: _PairIds) -> NDArray[np.int64]:
-        """The matches of a pair, keypoints (n, 2) of its images."""
-
-    def has_geometry(self, pair: _PairIds) -> bool:
-        """Whether a pair has a geometry, of a failure too."""
-
-    def write(self, geometries: Iterable[tuple[_PairIds, PairGeometry]]) -> None:
-        """Write the geometries of all pairs, all of them or none."""
-
-    def name(self, image_id: Any) -> str:
-        """The name of an image."""
+    def identity(self) -> dict[str, Any]: ...
+    def pairs(self) -> list[_PairIds]: ...
+    def image(self, image_id: Any) -> DatabaseImage: ...
+    def matches(self, pair: _PairIds) -> NDArray[np.int64]: ...
+    def has_geometry(self, pair: _PairIds) -> bool: ...
+    def write(self, geometries: Iterable[tuple[_PairIds, PairGeometry]]) -> None: ...
+    def name(self, image_id: Any) -> str: ...
 
 
 @dataclasses.dataclass(frozen=True)
@@ -227,8 +201,6 @@ def estimate_batch(how: Estimation, batch: Batch) -> Geometries:
             pairs.append(pair)
         except Exception as error:  # one pair does not end the work on the others
             problems.append((own, _first_line(error)))
-    if not ids:
-        return Geometries([], [], problems)
     results: dict[int, PairGeometry] = {}
     for alike in _alike(given):
         c = collate([given[i] for i in alike])

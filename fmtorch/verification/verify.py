@@ -14,16 +14,7 @@ from fmtorch import presets
 from fmtorch.core.checks import number
 from fmtorch.core.stages import Estimator, model_of
 from fmtorch.core.version import __version__
-from fmtorch.io.colmap import (
-    MatchDatabase,
-    copy_database,
-    expect_database,
-    expect_writable,
-    finished_pairs,
-    imported,
-    move_database,
-    remove_database,
-)
+from fmtorch.io import colmap
 from fmtorch.io.match_file import HlocMatches, MatchFile, expect_suffix
 from fmtorch.jobs.execution import Execution, Shard, shard_of
 from fmtorch.verification.run import Cameras, Estimation, GeometryParts, PairStore, Verification, VerificationRun
@@ -167,7 +158,7 @@ def _finished(paths: VerifyPaths) -> int:
         if any(output.samefile(path) for path in paths[:3] if path is not None):
             return 0
         if database is not None:
-            return finished_pairs(database, output)
+            return colmap.finished_pairs(database, output)
         if matches is not None:
             with MatchFile(matches, output) if features is None else HlocMatches(features, matches, output) as files:
                 return files.finished()
@@ -195,8 +186,8 @@ def _opened(paths: VerifyPaths, force: bool, whole: bool) -> Iterator[tuple[Pair
         return
     if database is None:
         raise ValueError("database is missing; give the database of a COLMAP project: fmtorch verify database.db")
-    imported()
-    expect_database(database)
+    colmap.imported()
+    colmap.expect_database(database)
     if output is not None:
         if output.exists() and output.samefile(database):
             raise ValueError(f"output={output} is the database itself; leave output out to write into it")
@@ -207,15 +198,15 @@ def _opened(paths: VerifyPaths, force: bool, whole: bool) -> Iterator[tuple[Pair
             work = Path(stack.enter_context(tempfile.TemporaryDirectory())) / database.name
         elif output is not None:
             work = output.with_name(f"{output.name}.partial")
-            remove_database(work)
+            colmap.remove_database(work)
         if work == database:
-            expect_writable(database)
+            colmap.expect_writable(database)
         else:
-            copy_database(database, work)
-        with MatchDatabase(work) as store:
+            colmap.copy_database(database, work)
+        with colmap.MatchDatabase(work) as store:
             yield store, output or database
         if whole and output is not None:
-            move_database(work, output)
+            colmap.move_database(work, output)
 
 
 def _expect_files(features: Path | None, matches: Path, output: Path, force: bool) -> None:

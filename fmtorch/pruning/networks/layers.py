@@ -169,7 +169,6 @@ class ResidualBlock(nn.Module):
         self.linear1, self.norm1 = Perceptron(channels, channels, bias=False), ContextBatchNormReLU(channels)
 
     def forward(self, x: Float[Tensor, "c b n"], slots: Slots) -> Float[Tensor, "c b n"]:
-        """Zero in masked slots, in which x has to be zero, too."""
         y = self.norm0(self.linear0(x), slots)
         y = self.norm1(self.linear1(y), slots)
         return x + y  # type: ignore[no-any-return]

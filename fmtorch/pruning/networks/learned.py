@@ -14,9 +14,6 @@ from fmtorch.core.types import Correspondences
 from fmtorch.pruning.networks.files import SUFFIXES, OnnxBackbone, learned_file, load_weights
 from fmtorch.pruning.networks.layers import Slots
 
-# What a learned pruner says of a batch of pairs, and what it has to be made of to run without torch
-
-
 Backbone = Callable[[Tensor, Slots], Tensor]  # (B, channels, N), zero in masked slots -> (B, outputs, N)
 
 
@@ -62,10 +59,8 @@ def predict(network: nn.Module, c: Correspondences) -> Prediction:
         kind = type(output).__name__
         raise TypeError(f"{type(network).__name__} returns {kind}; a network of matches returns log-odds or Prediction")
     if output.shape != c.mask.shape:
-        raise ValueError(
-            f"{type(network).__name__} returns log-odds of shape {tuple(output.shape)} for matches of shape "
-            f"{tuple(c.mask.shape)}; there must be one for each match"
-        )
+        of = f"log-odds of shape {tuple(output.shape)} for matches of shape {tuple(c.mask.shape)}"
+        raise ValueError(f"{type(network).__name__} returns {of}; there must be one for each match")
     return Prediction(output[None], torch.where(c.mask, torch.tanh(torch.relu(output)), 0)[None])
 
 

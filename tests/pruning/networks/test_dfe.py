@@ -7,7 +7,7 @@ from torch import Tensor
 from fmtorch.core import Correspondences, collate
 from fmtorch.geometry import eight_point, sampson
 from fmtorch.pruning import DFE
-from fmtorch.pruning.networks.dfe import masked_softmax
+from fmtorch.pruning.networks.architectures import masked_softmax
 from fmtorch.pruning.networks.layers import Slots
 from tests.laws import scene
 

@@ -1,6 +1,7 @@
-"""Deep fundamental matrix estimation (Ranftl & Koltun, ECCV 2018)."""
+"""The networks: LC (Yi et al., CVPR 2018) and DFE (Ranftl & Koltun, ECCV 2018)."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -9,21 +10,80 @@ from torch import Tensor, nn
 from fmtorch.core.types import Correspondences
 from fmtorch.geometry.irls import reweighted_fits
 from fmtorch.pruning.networks.inputs import MatchInputs
-from fmtorch.pruning.networks.layers import ContextBatchNormReLU, Perceptron, Slots
+from fmtorch.pruning.networks.layers import ContextBatchNormReLU, Perceptron, ResidualBlock, Slots
 from fmtorch.pruning.networks.learned import Backbone, Prediction
 
 RESIDUAL_UNIT = 1e-3  # of the image's longest side, or of the focal length: about a pixel
 LARGEST_RESIDUAL = 0.5  # of the same; as published
 
 
-class PointwiseNetwork(nn.Module):
-    """Perceptrons with context norm, batch norm and ReLU, and a perceptron to the outputs.
+class _OfBackbone(nn.Module):
+    """A network of a `backbone`, with `options` that the run's identity holds."""
+
+    options: dict[str, Any]
+
+    def extra_repr(self) -> str:
+        return ", ".join(f"{key}={value}" for key, value in self.options.items())
+
+    def forward(self, c: Correspondences) -> Prediction:
+        """The prediction of each match. Raises ValueError where image sizes or calibration matrices are missing."""
+        return self.predict(c, self.backbone)  # type: ignore[no-any-return, operator]
+
+
+class PointCN(nn.Module):
+    """The same perceptrons for every match, which see the others by context norm.
+
+    A perceptron, residual blocks of two layers each, and a perceptron to the outputs.
+    """
+
+    def __init__(self, inputs: int, channels: int, blocks: int, outputs: int = 1) -> None:
+        super().__init__()
+        self.p_in = Perceptron(inputs, channels)
+        self.blocks = nn.ModuleList(ResidualBlock(channels) for _ in range(blocks))
+        self.p_out = Perceptron(channels, outputs)
+
+    def forward(self, x: Float[Tensor, "b inputs n"], slots: Slots) -> Float[Tensor, "b outputs n"]:
+        """x has to be zero in masked slots, where the result means nothing."""
+        y = slots.clean(torch.relu(self.p_in(x.transpose(0, 1))))
+        for block in self.blocks:
+            y = block(y, slots)
+        return self.p_out(y).transpose(0, 1)  # type: ignore[no-any-return]
+
+
+class LC(_OfBackbone):
+    """Classifies all matches of a pair at once.
+
+    Yi, Trulls, Ono, Lepetit, Salzmann, Fua, "Learning to find good correspondences", CVPR 2018.
 
     Args:
-        inputs: numbers for each match.
-        widths: of the layers between.
-        outputs: numbers for each match.
+        channels: of each layer.
+        blocks: residual blocks of two layers.
+        coordinates: "size", for the fundamental matrix, or "K", for the essential matrix as published.
+        side: side information, see `MatchInputs`.
+
+    Raises:
+        ValueError: for unknown coordinates or side information.
     """
+
+    def __init__(
+        self, *, channels: int = 128, blocks: int = 12, coordinates: str = "size", side: Sequence[str] = ()
+    ) -> None:
+        super().__init__()
+        self.inputs = MatchInputs(coordinates, tuple(side))
+        self.options = {"channels": channels, "blocks": blocks, "coordinates": coordinates, "side": list(side)}
+        self.input_channels = self.inputs.channels
+        self.backbone = PointCN(self.input_channels, channels, blocks)
+
+    def predict(self, c: Correspondences, backbone: Backbone) -> Prediction:
+        """One stage; ``weight = tanh(relu(logit))`` as published (section 3.3), 0 where masked."""
+        x, mask = self.inputs(c)
+        logit = backbone(x, Slots.of(mask))[:, 0]
+        weight = torch.where(mask, torch.tanh(torch.relu(logit)), 0)
+        return Prediction(logit[None], weight[None])
+
+
+class PointwiseNetwork(nn.Module):
+    """Perceptrons of these widths with context norm, batch norm and ReLU, and a perceptron to the outputs."""
 
     def __init__(self, inputs: int, widths: Sequence[int], outputs: int) -> None:
         super().__init__()
@@ -40,7 +100,7 @@ class PointwiseNetwork(nn.Module):
         return self.p_out(y).transpose(0, 1)  # type: ignore[no-any-return]
 
 
-class DFE(nn.Module):
+class DFE(_OfBackbone):
     """Iterated weighted 8-point fits; a network predicts the weights, from the second fit on with the last residuals.
 
     Ranftl & Koltun, "Deep fundamental matrix estimation", ECCV 2018, section 4, through `geometry.reweighted_fits`.
@@ -79,19 +139,8 @@ class DFE(nn.Module):
         self.input_channels = self.inputs.channels + 2
         self.backbone = PointwiseNetwork(self.input_channels, tuple(widths), 2)
 
-    def extra_repr(self) -> str:
-        """The options, which the run's identity holds."""
-        return ", ".join(f"{key}={value}" for key, value in self.options.items())
-
-    def forward(self, c: Correspondences) -> Prediction:
-        """One stage for each fit, with weights that sum to 1 over the matches of a pair.
-
-        Raises ValueError where image sizes or calibration matrices are missing.
-        """
-        return self.predict(c, self.backbone)
-
     def predict(self, c: Correspondences, backbone: Backbone) -> Prediction:
-        """`forward` with something else that computes what `backbone` does, e.g. an ONNX file."""
+        """One stage for each fit, with weights that sum to 1 over the matches of a pair."""
         x, mask = self.inputs(c)
         slots = Slots.of(mask)
         unit = self.inputs.unit(c)[:, None] * RESIDUAL_UNIT
