@@ -16,10 +16,9 @@ if TYPE_CHECKING:
         to_colmap,
         to_poselib,
     )
-    from fmtorch.pipeline.match_result import MatchResult
     from fmtorch.pipeline.pictures import draw_epipolar_lines, draw_matches
     from fmtorch.pipeline.pipeline import Pipeline
-    from fmtorch.pipeline.two_images import match
+    from fmtorch.pipeline.two_images import MatchResult, match
     from fmtorch.two_view.find import find_essential, find_fundamental, find_homography
     from fmtorch.verification.run import Verification
     from fmtorch.verification.verify import verify

@@ -233,10 +233,8 @@ def _preset(
 
 def _scale_to_pixels(points: list[Matrix], threshold: float | int, src: Matrix | None = None) -> float:
     """What makes pixels, in which presets search, of points in another unit, as of a camera of a focal length of 1.
-
     1 for pixels, and where the threshold is so wide that it is not of this unit. src: the other points of a homography,
-    beside which a threshold below a pixel shows that the unit is a larger one.
-    """
+    beside which a threshold below a pixel shows that the unit is a larger one."""
     finite = [x[np.isfinite(x).all(1)] for x in points]
     reach = max((float(np.abs(x).max()) for x in finite if len(x)), default=0.0)
     if 0 < reach < MIN_PIXELS:

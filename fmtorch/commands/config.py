@@ -93,9 +93,7 @@ def chosen_pipeline() -> tuple[str, list[str]]:
 
 def run_command(command: Command, task: Task) -> None:
     """Run a `job` on the config that a command's declaration and the command line compose.
-
-    task: a `job` that its module holds under its own name, so that launchers can send it to other processes.
-    """
+    task: a `job` that its module holds under its own name, so that launchers can send it to other processes."""
     with exits_with_message(command.interrupted):
         paths = [*path_fields(command.options), *command.texts]
         sys.argv[1:] = hydra_arguments(sys.argv[1:], paths, command.positional)

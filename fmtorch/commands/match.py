@@ -35,10 +35,9 @@ from fmtorch.jobs.execution import MIN_PAIRS_FOR_PROCESSES
 from fmtorch.metrics import nsgd
 from fmtorch.pipeline import folder as folders
 from fmtorch.pipeline.folder import EXHAUSTIVE, SIMILAR, FolderMatches
-from fmtorch.pipeline.match_result import MatchResult
 from fmtorch.pipeline.photographs import Image, PhotographCameras
 from fmtorch.pipeline.pipeline import Pipeline, build_pipeline
-from fmtorch.pipeline.two_images import match
+from fmtorch.pipeline.two_images import MatchResult, match
 from fmtorch.presets.composition import execution_of, read_fields
 from fmtorch.runs.feature_cache import CachedFeatures, cached
 from fmtorch.runs.fingerprint import fmtorch_version
@@ -48,9 +47,7 @@ def match_folder(
     config: DictConfig, fields: MatchOptions, cameras: PhotographCameras, pipeline_name: str, overrides: Sequence[str]
 ) -> Path:
     """Match the pairs of a folder of images, write what is to be exported and return the folder with it.
-
-    Raises ValueError for what the options cannot mean, and where no pair could be matched.
-    """
+    Raises ValueError for what the options cannot mean, and where no pair could be matched."""
     folder = fields.images
     assert folder is not None
     kinds = export_kinds(fields.export)
@@ -194,9 +191,7 @@ MAX_RANK3 = 0.01  # third singular value of a true F over the second one: its nu
 
 def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -> Path:
     """Match the two photographs of a composed config and return the folder with the results.
-
-    overrides: what the command line changed of the pipeline of that name; said beside it.
-    """
+    overrides: what the command line changed of the pipeline of that name; said beside it."""
     fields = read_fields(MatchOptions, config)
     if fields.images is not None:
         if fields.image0 is not None or fields.image1 is not None or fields.truth is not None:
@@ -247,9 +242,7 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
 
 def read_matrix(path: Path) -> NDArray[np.float64]:
     """The 3 x 3 matrix of a text file of nine numbers, row by row, apart by spaces, commas or new lines.
-
-    Raises ValueError for a file of anything else.
-    """
+    Raises ValueError for a file of anything else."""
     words = path.read_text().replace(",", " ").split()
     try:
         numbers = np.array([float(word) for word in words])

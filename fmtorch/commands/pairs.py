@@ -28,9 +28,7 @@ PRELOADED = (Construction.__module__,)  # by the process that workers are forked
 
 def run(config: DictConfig) -> Path:
     """Make the set that a composed config describes and return its folder.
-
-    Raises ValueError, before anything is computed or written, where an option is not what it may be.
-    """
+    Raises ValueError, before anything is computed or written, where an option is not what it may be."""
     fields = read_fields(PairsOptions, config)
     if fields.output is None:
         raise ValueError("output is missing; it names the folder of the set that is made: output=KITTI")

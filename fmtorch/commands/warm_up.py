@@ -22,9 +22,7 @@ WITH_KERNELS = ("estimators", "geometry", "matching", "metrics", "pruning", "sce
 
 def warm_up() -> int:
     """Compile the kernels of all modules that this machine has not compiled yet; how many there are.
-
-    Raises ValueError where kernels are switched off or cannot be kept.
-    """
+    Raises ValueError where kernels are switched off or cannot be kept."""
     if not switch.available():
         raise ValueError(f"kernels are switched off ({switch.SWITCH}=off), or numba cannot be imported")
     if cache.folder() is None:

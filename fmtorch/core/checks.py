@@ -59,9 +59,7 @@ def checked(function: Callable[P, R], *, common_type: bool = False) -> Callable[
 
 def as_tensor(value: Any, name: str) -> Tensor:
     """A tensor of real numbers, of an array or what DLPack shares without copying; points (N, 2) of OpenCV's keypoints.
-
-    Raises TypeError, naming the argument, for anything else, and ValueError for a masked array that masks something.
-    """
+    Raises TypeError, naming the argument, for anything else, and ValueError for a masked array that masks something."""
     if isinstance(value, Tensor):
         return _real(value, name)
     if isinstance(value, list | tuple) and value and all(isinstance(entry, Tensor) for entry in value):
@@ -239,10 +237,8 @@ SWAPPED = 0.05  # fraction outside from which on a size is taken for (w, h), if 
 
 def expect_inside(x: Tensor, mask: Tensor, size: Tensor, name: str, size_name: str) -> None:
     """Raise ValueError where the points (b, n, 2) of all pairs contradict the image's size (b, 2), h and w.
-
     Points that reach beyond opposite borders are no pixels of another image or unit: a wide lens was undistorted. Fewer
-    than MIN_MATCHES say nothing.
-    """
+    than MIN_MATCHES say nothing."""
     mask = mask & x.isfinite().all(-1)
     enough = mask.sum(1) >= MIN_MATCHES
     if not bool(enough.any()):

@@ -10,10 +10,8 @@ from pathlib import Path
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """A temporary name beside `path` to write to; on leaving it becomes `path`, after an error it is removed.
-
     A process that dies in between leaves at most a file that ends in ``.tmp``. Safe with several writers: each has a
-    name of its own, and the last one to leave wins. An OSError within, such as of a full disk, names `path`.
-    """
+    name of its own, and the last one to leave wins. An OSError within, such as of a full disk, names `path`."""
     temporary = temporary_name(path)
     try:
         with naming(path, temporary):

@@ -217,9 +217,7 @@ def dataclass_in(annotation: Any) -> type | None:
 
 def resolved(target: Callable[..., Any]) -> dict[str, Any]:
     """The annotations of the parameters of anybody's class or function; without those for type checkers alone.
-
-    Those of a dataclass's fields may stand in a base of it, in whose module they mean something.
-    """
+    Those of a dataclass's fields may stand in a base of it, in whose module they mean something."""
     function = inspect.unwrap(target.__init__ if isinstance(target, type) else target)  # type: ignore[misc]
     names = getattr(function, "__globals__", {})
     bases = [vars(sys.modules[base.__module__]) for base in target.__mro__] if isinstance(target, type) else []

@@ -28,9 +28,8 @@ FIXED = {"2": 2, "3": 3}  # dimensions that have a size by their names
 
 class Record:
     """Tensors with a common leading batch dimension, moved, indexed and replaced together.
-
-    declared: what the annotations of a kind's tensors say, by field. per_slot: the fields with an entry for each slot.
-    """
+    declared: what the annotations of a kind's tensors say, by field. per_slot: the fields with an entry for each
+    slot."""
 
     declared: ClassVar[Mapping[str, Expected]] = {}
     per_slot: ClassVar[tuple[str, ...]] = ()
@@ -81,9 +80,7 @@ class Record:
     @classmethod
     def load(cls: type[AnyRecord], path: Path | str) -> AnyRecord:
         """The record that `save` wrote, on the CPU, checked again.
-
-        Raises FileNotFoundError, or ValueError for another file.
-        """
+        Raises FileNotFoundError, or ValueError for another file."""
         try:
             with safe_open(path, "pt") as file:
                 told = file.metadata() or {}
@@ -117,9 +114,7 @@ def _mapped(record: Record, function: Any, within: Any) -> dict[str, Any]:
 
 def expect_fields(record: Record, **sizes: int) -> None:
     """Raises TypeError or ValueError for a field that is no tensor of the declared shape and numbers, on one device.
-
-    sizes: of dimensions by their names, where known beforehand; else the first field that has a dimension decides.
-    """
+    sizes: of dimensions by their names, where known beforehand; else the first field that has a dimension decides."""
     known, device, batched = FIXED | sizes, None, None
     for name, field in record.declared.items():
         value = getattr(record, name)
@@ -159,9 +154,7 @@ def slotted(record: Record) -> dict[str, Tensor]:
 
 def ungraphed(inputs: Record, compute: Callable[[], AnyRecord]) -> AnyRecord:
     """compute(), without autograd's bookkeeping unless a gradient can reach the inputs.
-
-    That takes a fifth of the time of small tensors. The result's tensors are ordinary ones, free to use in a graph.
-    """
+    That takes a fifth of the time of small tensors. The result's tensors are ordinary ones, free to use in a graph."""
     if inputs.requires_grad or torch.is_inference_mode_enabled():
         return compute()
     with torch.inference_mode():
@@ -171,9 +164,7 @@ def ungraphed(inputs: Record, compute: Callable[[], AnyRecord]) -> AnyRecord:
 
 def as_index(index: Index, length: int) -> slice | Tensor:
     """An index that keeps the batch dimension: the integer i selects the batch of one that holds element i.
-
-    A list of booleans is a mask. Raises IndexError for an integer that is out of range, which also ends iteration.
-    """
+    A list of booleans is a mask. Raises IndexError for an integer that is out of range, which also ends iteration."""
     if isinstance(index, slice):
         return index
     if isinstance(index, Tensor) and index.dim() > 0:

@@ -53,9 +53,7 @@ def claim(file: Path, settings: Mapping[str, Any], holds: str, instead: str, alo
 
 def create(file: Path, text: str) -> None:
     """Write a file unless another process has just done so: of several, the first one wins.
-
-    Where the file system has no hard links the last one wins.
-    """
+    Where the file system has no hard links the last one wins."""
     temporary = temporary_name(file)
     try:
         with naming(file, temporary):
@@ -82,9 +80,8 @@ def differences(old: Any, new: Any) -> str:
 
 def leaves(value: Any, name: str = "") -> Iterator[tuple[str, str]]:
     """Dotted names and JSON texts of all that nested settings hold.
-
-    A list of mappings of one name each, such as a pipeline's pruners, is that order of names, and what is below each.
-    """
+    A list of mappings of one name each, such as a pipeline's pruners, is that order of names, and what is below
+    each."""
     if isinstance(value, list) and value and all(isinstance(entry, dict) and len(entry) == 1 for entry in value):
         names = [key for entry in value for key in entry]
         yield name, f"[{', '.join(names)}]"

@@ -60,9 +60,7 @@ class FeatureExtractor(Protocol):
 @runtime_checkable
 class TwoStepExtractor(FeatureExtractor, Protocol):
     """An extractor whose two steps a cache keeps apart: extractors with the same detection share its results.
-
-    Calling it equals ``describe(image, lafs)`` after ``lafs, scores = detect(image)``: a descriptor for each frame.
-    """
+    Calling it equals ``describe(image, lafs)`` after ``lafs, scores = detect(image)``: a descriptor for each frame."""
 
     @property
     def detection(self) -> object:

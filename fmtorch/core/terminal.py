@@ -76,9 +76,7 @@ def error_line(error: BaseException) -> str:
 @contextlib.contextmanager
 def exits_with_message(interrupted: str = "interrupted") -> Iterator[None]:
     """Ends the process with status 1 and one line for what a user can put right, rather than with a traceback.
-
-    Interrupted, with status 130 and a line: `interrupted`, and what the KeyboardInterrupt says was kept.
-    """
+    Interrupted, with status 130 and a line: `interrupted`, and what the KeyboardInterrupt says was kept."""
     try:
         yield
     except KeyboardInterrupt as stop:

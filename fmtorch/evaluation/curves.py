@@ -177,9 +177,7 @@ def view_graph_svg(graph: ViewGraph, read: Callable[[str], Image | None]) -> str
 
 def spectral_order(names: Sequence[str], edges: Sequence[Edge]) -> list[str]:
     """Connected images in the order of the Fiedler vector: the second eigenvector of the Laplacian (Fiedler, 1973).
-
-    Pairs weigh as the logarithm of one more than their inliers. More images than MAX_SPECTRAL stay as they are.
-    """
+    Pairs weigh as the logarithm of one more than their inliers. More images than MAX_SPECTRAL stay as they are."""
     if not 3 <= len(names) <= MAX_SPECTRAL:
         return list(names)
     number = {name: i for i, name in enumerate(names)}

@@ -73,9 +73,7 @@ def drawn(
     pair: ImagePair, images: Sequence[Image], stored: Mapping[str, Any], outcome: Outcome, name: str
 ) -> list[Picture]:
     """A run's matches of a pair, drawn again, and the epipolar lines of the F that it stored.
-
-    Of a pair that has no F, its matches; nothing where there are none, or none of an F that was stored.
-    """
+    Of a pair that has no F, its matches; nothing where there are none, or none of an F that was stored."""
     c, estimate = outcome.correspondences, outcome.estimate
     if c is None or estimate is None or (stored["ok"] and not bool(estimate.ok[0])):
         return []
@@ -119,10 +117,8 @@ class Run:
 @dataclasses.dataclass(frozen=True)
 class Options:
     """What a report may use for its pictures.
-
     roots: folders where images may lie; which data set is in which shows by its digest. own_code: whether parts and
-    data sets that are not this project's are loaded, which runs their code. cache, cache_limit: of features.
-    """
+    data sets that are not this project's are loaded, which runs their code. cache, cache_limit: of features."""
 
     count: int
     roots: Sequence[Path] = ()
@@ -160,10 +156,8 @@ def gallery(
 
 def find_dataset(stored: Mapping[str, Any], options: Options) -> PairDataset:
     """The data set that a run evaluated, in the first of the roots that holds it.
-
     stored: its config and digest in the run's identity. A run of others' results, which names no data set, is looked
-    for in the roots in the layout of `fmbench`. Raises DataError where it is another or nowhere to be found.
-    """
+    for in the roots in the layout of `fmbench`. Raises DataError where it is another or nowhere to be found."""
     known = {key: value for key, value in stored.items() if key != "digest"}
     if "_target_" not in known:
         known = presets.load("dataset", "fmbench")

@@ -42,9 +42,7 @@ class Picture:
 @dataclasses.dataclass(frozen=True)
 class Shown:
     """A pair as one run sees it. nsgd: None where it failed, with the reason. pair_type: empty where unknown.
-
-    corner_error: px, in place of NSGD where the pair has a homography.
-    """
+    corner_error: px, in place of NSGD where the pair has a homography."""
 
     run: str
     nsgd: float | None
@@ -79,10 +77,8 @@ class ShownPair:
 @dataclasses.dataclass(frozen=True)
 class Section:
     """The runs on one data set: tables of `PAIR_SCHEMA` by the runs' names, the first is what others differ from.
-
     notes: what the reader should know of the pictures of pairs, or why there are none. signed: the runs in which the
-    sign of a translation counts.
-    """
+    sign of a translation counts."""
 
     heading: str
     runs: Mapping[str, pa.Table]
@@ -95,9 +91,7 @@ def render(
     title: str, sections: Sequence[Section], runs: Sequence[Sequence[str]], shared: Sequence[tuple[str, str]] = ()
 ) -> str:
     """The page: one file that loads nothing, whose script sorts and filters and whose content does without it.
-
-    runs: name, data set, identity, version, seed and folder of each run. shared: settings that all have in common.
-    """
+    runs: name, data set, identity, version, seed and folder of each run. shared: settings that all have in common."""
     try:
         import jinja2
     except ImportError as error:
@@ -117,9 +111,7 @@ def render(
 
 def differing_pairs(runs: Mapping[str, pa.Table], count: int) -> list[str]:
     """Identities of `count` pairs that all runs hold: those where NSGD differs most, of as many scenes as there are.
-
-    Of a single run: from its best pair to its worst, in equal steps.
-    """
+    Of a single run: from its best pair to its worst, in equal steps."""
     axis = curves.axis_of(runs)
     most = DISAGREEMENT if axis is curves.NSGD else axis.maximum
     nsgd = np.stack([np.minimum(v, most) for v in tables.common(runs, axis.column)])

@@ -180,10 +180,8 @@ def _closest(outcomes: Sequence[Outcome]) -> PoseError:
 
 class FocalErrors(NamedTuple):
     """Of both images: ``|f - f_true| / f_true``, and ``log(f / f_true)``.
-
     None where no focal length was estimated, since it was given exactly or nobody asked, or the true one is not known.
-    Where it was to be estimated and is not determined the error is infinite and the ratio None.
-    """
+    Where it was to be estimated and is not determined the error is infinite and the ratio None."""
 
     error: tuple[float | None, float | None] = (None, None)
     log_ratio: tuple[float | None, float | None] = (None, None)

@@ -194,10 +194,8 @@ Build = Callable[[], Pipeline]
 @dataclasses.dataclass(frozen=True)
 class Batch:
     """Pairs to evaluate.
-
     cameras: of their keys, for a pipeline that was built without them. export: whether keypoints, matches and F are to
-    be exported. counted: whether the worker counts the images that it computed. signed: of `pose_errors`.
-    """
+    be exported. counted: whether the worker counts the images that it computed. signed: of `pose_errors`."""
 
     pairs: list[ImagePair]
     seed: int
@@ -210,10 +208,8 @@ class Batch:
 @dataclasses.dataclass(frozen=True)
 class Work:
     """The rows of a batch.
-
     computed, from_cache: images whose features a process computed or took from the cache for it. tracebacks: of
-    `Pipeline.tracebacks`.
-    """
+    `Pipeline.tracebacks`."""
 
     rows: list[PairRow]
     computed: int = 0
@@ -293,9 +289,7 @@ PRELOADED = (__name__,)  # by the process that workers are forked of
 
 def select(pairs: Sequence[ImagePair], limit: int | None) -> list[ImagePair]:
     """The pairs, ordered so that those that share images follow one another; with a limit, that many of each family.
-
-    The limited choice is by the pairs' keys: spread over the scenes, and a smaller one is part of a larger one.
-    """
+    The limited choice is by the pairs' keys: spread over the scenes, and a smaller one is part of a larger one."""
     chosen = list(pairs)
     if limit is not None:
         families: dict[str, list[ImagePair]] = {}

@@ -47,9 +47,7 @@ Values = NDArray[np.float64]
 @dataclasses.dataclass(frozen=True)
 class Interval:
     """A mean with its percentile bootstrap interval. over: what was resampled, ``scene`` or ``pair``.
-
-    As text it is ``value [low, high]``, each number in the given format: ``f"{interval:+.1f}"``.
-    """
+    As text it is ``value [low, high]``, each number in the given format: ``f"{interval:+.1f}"``."""
 
     value: float
     low: float
@@ -65,17 +63,13 @@ class Interval:
 
 def recalled(nsgd: Values, threshold: float = THRESHOLD) -> Values:
     """What each pair adds to recall, (n,): 1 where its NSGD is below the threshold, else 0; the mean over seeds.
-
-    nsgd: (n,), or (seeds, n); NaN is a miss.
-    """
+    nsgd: (n,), or (seeds, n); NaN is a miss."""
     return _per_pair(metrics.recall(torch.from_numpy(nsgd)[..., None], threshold))
 
 
 def areas(nsgd: Values) -> Values:
     """What each pair adds to AUC@0.05, (n,): the share of thresholds from 0 to 0.05 above its NSGD; mean over seeds.
-
-    nsgd: (n,), or (seeds, n); NaN is a miss.
-    """
+    nsgd: (n,), or (seeds, n); NaN is a miss."""
     return _per_pair(metrics.mean_recall(torch.from_numpy(nsgd)[..., None], THRESHOLD))
 
 
@@ -160,9 +154,7 @@ def homography_figures(errors: Values) -> dict[str, float | int | None] | None:
 
 def interval(values: Values, scenes: Sequence[str], scale: float = 1.0, share: bool = False) -> Interval | None:
     """Mean of the values that are not NaN, times `scale`, with its 95 % interval; None where all are NaN.
-
-    values, scenes: one per pair, (n,). share: the values are successes, see `share_interval`.
-    """
+    values, scenes: one per pair, (n,). share: the values are successes, see `share_interval`."""
     known, places = _known(scenes, values)
     if not len(places):
         return None
@@ -261,10 +253,8 @@ def effective_pairs(values: NDArray[np.float64], scenes: Sequence[str]) -> float
 
 def share_interval(successes: Values | NDArray[np.bool_], scenes: Sequence[str]) -> Interval:
     """The share of pairs that succeed, with Wilson's 95 % score interval for the effective number of pairs.
-
     successes: (n,), n >= 1; of several seeds the share of those with which a pair succeeds, in [0, 1]. scenes: one per
-    pair; `Interval.over` says whether these were many enough to be the units.
-    """
+    pair; `Interval.over` says whether these were many enough to be the units."""
     values = successes.astype(np.float64)
     p, n = float(values.mean()), effective_pairs(values, scenes)
     middle = (p + _Z**2 / (2 * n)) / (1 + _Z**2 / n)

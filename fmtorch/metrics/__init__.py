@@ -12,16 +12,8 @@ if TYPE_CHECKING:
     from fmtorch.metrics.homography import corner_error, right_of_homography
     from fmtorch.metrics.inlier_rate import InlierRate, ground_truth_inliers, inlier_rate
     from fmtorch.metrics.nsgd import nsgd, nsgd_released, sgd
-    from fmtorch.metrics.pose import (
-        PoseError,
-        closest_pose_error,
-        fundamental_pose_error,
-        pose_auc,
-        pose_error,
-        pose_maa,
-        pose_map,
-    )
-    from fmtorch.metrics.recall import mean_recall, recall, recall_curve
+    from fmtorch.metrics.pose import PoseError, closest_pose_error, fundamental_pose_error, pose_error
+    from fmtorch.metrics.recall import mean_recall, pose_auc, pose_maa, pose_map, recall, recall_curve
 
 __all__ = [
     "InlierRate", "PoseError", "closest_pose_error", "corner_error", "fundamental_pose_error", "ground_truth_inliers",

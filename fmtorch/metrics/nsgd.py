@@ -36,10 +36,8 @@ RELEASED_BORDER, NORMAL_OFFSET = 0.5, 1e-10  # of `nsgd_released`: pixels count 
 
 class Comparison(NamedTuple):
     """Two models of each pair, or of one, F_gt, F_est (3, 3), for `nsgd` scaled to a largest element of 1.
-
-    size0, size1: (h, w) of the images, pixels. unit: (2,), pixels by which distances in image 0 and 1 are divided.
-    key: (1,), selects the draws.
-    """
+    size0, size1: (h, w) of the images, pixels. unit: (2,), pixels by which distances in image 0 and 1 are divided. key:
+    (1,), selects the draws."""
 
     F_gt: F8x2
     F_est: F8x2
@@ -190,9 +188,7 @@ def _flattened(
     F_gt: Tensor, F_est: Tensor, size0: Tensor, size1: Tensor, samples: int, key: Tensor | None
 ) -> tuple[tuple[Tensor, Tensor, Tensor, Tensor, Tensor], torch.Size]:
     """Matrices, sizes (b, 2) and keys (b, 1) with the leading dimensions flattened to one, in float64; their shape.
-
-    Without keys every key is 0. Raises ValueError for wrong sizes, and for less than one sample.
-    """
+    Without keys every key is 0. Raises ValueError for wrong sizes, and for less than one sample."""
     expect_sizes(size0=size0, size1=size1)
     if samples < 1:
         raise ValueError(f"samples is {samples}; it must be at least 1")
@@ -216,10 +212,8 @@ def diagonal(size: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch"]:
 @kernel
 def sum_of_draws(pair: Comparison, mixed_seed: int, samples: int, released: bool, out: F8x1) -> None:
     """The sum of the first accepted draws of a pair, and their number -> out (2,).
-
     mixed_seed: of the seed and the stream. samples: draws to accept, of 10 x `samples` tries. released: they are those
-    of `nsgd_released`.
-    """
+    of `nsgd_released`."""
     state, u, values = stream_state(mixed_seed, pair.key[0]), vector(COLUMNS), vector(BLOCK)
     total, count = 0.0, 0
     for start in range(0, TRIES * samples, BLOCK):
@@ -357,9 +351,8 @@ def segment_in_image(
     a: float, b: float, c: float, size: Array, border: float
 ) -> tuple[float, float, float, float, bool]:
     """x and y of the ends of the part of a line inside the rectangle (border, border + size); whether there is one.
-
-    The line may have any scale, sign and direction. The first end is the left one, or the upper one of a vertical line.
-    """
+    The line may have any scale, sign and direction. The first end is the left one, or the upper one of a vertical
+    line."""
     half_h, half_w = size[0] / 2, size[1] / 2
     centre_x, centre_y = half_w + border, half_h + border
     squared = a * a + b * b

@@ -1,6 +1,5 @@
 """Errors of a relative pose in degrees."""
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -137,9 +136,7 @@ def closest_pose_error(
 
 def _angle(sine: Tensor, cosine: Tensor) -> Tensor:
     """Twice the angle, in degrees, whose squared sine and cosine are in the given proportion; gradient 0 at both ends.
-
-    By `atan`, not `atan2`, whose last bit depends on an element's place in the tensor.
-    """
+    By `atan`, not `atan2`, whose last bit depends on an element's place in the tensor."""
     opposite = cosine == 0
     squared = sine / torch.where(opposite, 1.0, cosine)
     angle = 2 * torch.atan(squared * inverse_root(squared))
@@ -153,112 +150,3 @@ def _dot(u: Tensor, v: Tensor) -> Tensor:
 
 def _sum_of_squares(u: Tensor) -> Tensor:
     return _dot(u, u)
-
-
-# Recall of pose errors: the exact area under its curve, and the means over bins that stand for it in older papers
-
-THRESHOLDS = (5, 10, 20)  # degrees, as SuperGlue (Sarlin et al., CVPR 2020)
-MAA_MAXIMUM = 10  # degrees, as the Image Matching Challenge
-BIN = 5  # degrees, as Yi et al. (CVPR 2018) and OANet (Zhang et al., ICCV 2019)
-
-
-@checked
-def pose_auc(
-    errors: Float[Tensor, "*batch pairs"], thresholds: Sequence[float | int] = THRESHOLDS
-) -> Float[Tensor, "*batch t"]:
-    """Area under the recall curve of pose errors up to each threshold, divided by the threshold.
-
-    As SuperGlue and LoFTR compute it: the curve rises linearly between sorted errors, from recall 0 at error 0.
-
-    Args:
-        errors: of each pair, in degrees; NaN and infinity count as misses.
-        thresholds: in degrees.
-
-    Returns:
-        The area for each threshold, within [0, 1].
-
-    Raises:
-        ValueError: a threshold is not positive, or there is none.
-
-    Example:
-        >>> import torch
-        >>> from fmtorch.metrics import pose_auc, pose_maa
-        >>> errors = torch.tensor([0.5, 4.0, torch.nan])
-        >>> [round(auc, 3) for auc in pose_auc(errors).tolist()], round(pose_maa(errors).item(), 3)
-        ([0.5, 0.583, 0.625], 0.567)
-    """
-    _expect_positive(thresholds)
-    pairs = errors.shape[-1]
-    errors = torch.where(errors.isnan(), torch.inf, errors).sort(dim=-1).values
-    step = torch.arange(1, pairs + 1, dtype=errors.dtype, device=errors.device) / pairs
-    return torch.stack([_area(errors, step, float(t)) / t for t in thresholds], -1)
-
-
-def _area(errors: Tensor, step: Tensor, threshold: float) -> Tensor:
-    """Trapezoids below the points (error, recall) left of the threshold, level from the last one to the threshold."""
-    reached = (errors < threshold).to(errors.dtype).mean(-1, keepdim=True)
-    zero = torch.zeros_like(reached)
-    e = torch.cat([zero, errors.clamp(max=threshold), zero + threshold], -1)
-    r = torch.cat([zero, torch.minimum(step, reached), reached], -1)
-    return ((r[..., 1:] + r[..., :-1]) / 2 * e.diff(dim=-1)).sum(-1)
-
-
-@checked
-def pose_map(
-    errors: Float[Tensor, "*batch pairs"], thresholds: Sequence[float | int] = THRESHOLDS, bin: float | int = BIN
-) -> Float[Tensor, "*batch t"]:
-    """Binned mAP of pose errors up to each threshold: the mean of recall at bin, 2 bin, ..., threshold.
-
-    As Yi et al. (CVPR 2018) and OANet (Zhang et al., ICCV 2019) report it; mAP at 5 degrees is recall there. It is a
-    coarse mean and usually larger than `pose_auc`, with which it is not to be compared.
-
-    Args:
-        errors: of each pair, in degrees, recalled strictly below a bin's end; NaN is a miss.
-        thresholds: in degrees, multiples of `bin`.
-        bin: in degrees.
-
-    Returns:
-        The mean for each threshold, within [0, 1].
-
-    Raises:
-        ValueError: a threshold is not a positive multiple of the bin, or there is none.
-    """
-    _expect_positive(thresholds)
-    counts = [round(threshold / bin) if bin > 0 else 0 for threshold in thresholds]
-    if not all(n > 0 and abs(n * bin - t) < 1e-9 * t for n, t in zip(counts, thresholds, strict=True)):
-        raise ValueError(f"thresholds are {tuple(thresholds)}; they must be multiples of bin={bin}")
-    ends = [[bin * (i + 1) for i in range(n)] for n in counts]
-    return torch.stack([_recalled(errors, thresholds_of_bin, strict=True).mean(-1) for thresholds_of_bin in ends], -1)
-
-
-@checked
-def pose_maa(errors: Float[Tensor, "*batch pairs"], maximum: int = MAA_MAXIMUM) -> Float[Tensor, "*batch"]:
-    """Mean average accuracy: the mean of recall at 1, 2, ..., `maximum` degrees.
-
-    As the Image Matching Challenge (Jin et al., IJCV 2021) and the RANSAC tutorial (CVPR 2020) define mAA(10).
-
-    Args:
-        errors: of each pair, in degrees, recalled up to and including a threshold; NaN is a miss.
-        maximum: the last threshold, in degrees.
-
-    Returns:
-        The mean, within [0, 1].
-
-    Raises:
-        ValueError: `maximum` is less than 1.
-    """
-    if maximum < 1:
-        raise ValueError(f"maximum is {maximum}; it must be a whole number of degrees from 1")
-    return _recalled(errors, [float(i + 1) for i in range(maximum)], strict=False).mean(-1)
-
-
-def _recalled(errors: Tensor, thresholds: Sequence[float | int], *, strict: bool) -> Tensor:
-    """Share of errors below each threshold, or up to it: (*batch, t)."""
-    limits = torch.tensor(thresholds, dtype=errors.dtype, device=errors.device)[:, None]
-    below = errors[..., None, :] < limits if strict else errors[..., None, :] <= limits
-    return below.to(errors.dtype).mean(-1)
-
-
-def _expect_positive(thresholds: Sequence[float | int]) -> None:
-    if not thresholds or not all(threshold > 0 for threshold in thresholds):
-        raise ValueError(f"thresholds are {tuple(thresholds)}; they must be positive, and at least one")

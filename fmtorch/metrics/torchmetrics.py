@@ -10,9 +10,8 @@ import torch
 from jaxtyping import Float, Int, Real
 from torch import Tensor
 
-from fmtorch.metrics.nsgd import nsgd
-from fmtorch.metrics.pose import BIN, MAA_MAXIMUM, THRESHOLDS, pose_auc, pose_maa, pose_map
-from fmtorch.metrics.recall import THRESHOLD, mean_recall, recall
+from fmtorch.metrics import mean_recall, nsgd, pose_auc, pose_maa, pose_map, recall
+from fmtorch.metrics.recall import BIN, MAA_MAXIMUM, THRESHOLD, THRESHOLDS
 
 try:
     from torchmetrics import Metric  # type: ignore[import-not-found, unused-ignore]

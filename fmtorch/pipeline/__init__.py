@@ -15,10 +15,9 @@ if TYPE_CHECKING:
         similar_pairs,
         vectors_of,
     )
-    from fmtorch.pipeline.match_result import MatchResult
     from fmtorch.pipeline.photographs import PhotographCameras
     from fmtorch.pipeline.pipeline import Memo, Outcome, Pipeline, build_pipeline, examined, load_pipeline
-    from fmtorch.pipeline.two_images import Described, describe, match
+    from fmtorch.pipeline.two_images import Described, MatchResult, describe, match
 
 __all__ = [
     "Described", "FolderMatches", "MatchResult", "Memo", "Outcome", "PhotographCameras", "Pipeline",

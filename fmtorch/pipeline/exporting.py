@@ -13,11 +13,10 @@ from fmtorch.data.pairs import ImagePair, ImageSource
 from fmtorch.geometry.cameras import cross_matrix
 from fmtorch.geometry.pose import pose_from_fundamental
 from fmtorch.io.match_store import MatchRecords, PairGeometry, StoredImage, StoredPair, indices
-from fmtorch.pipeline.match_result import MatchResult
 from fmtorch.pipeline.pair_geometries import pair_geometries
 from fmtorch.pipeline.photographs import PhotographCamera
 from fmtorch.pipeline.pipeline import Outcome, Pipeline
-from fmtorch.pipeline.two_images import Described
+from fmtorch.pipeline.two_images import Described, MatchResult
 from fmtorch.two_view.pair_type import PairTypes
 
 EXACT = (1.0, 0.0)  # px, relative deviation; K stands for the pixels
@@ -47,9 +46,7 @@ def match_records(pipeline: Pipeline, outcomes: Sequence[Outcome]) -> MatchRecor
 
 def _geometry(matches: NDArray[np.int32], c: Correspondences, estimate: Estimate, pair_type: PairTypes) -> PairGeometry:
     """The geometry of one pair for COLMAP, whose surviving matches are these keypoints, (m, 2).
-
-    Where the estimator was given nothing of cameras that are known, and F is determined, the pose is that of F.
-    """
+    Where the estimator was given nothing of cameras that are known, and F is determined, the pose is that of F."""
     if not c.asks_for_cameras and c.K0 is not None and c.K1 is not None and bool(pair_type.determined[0]):
         ends = estimate.F.double(), c.K0.double(), c.K1.double(), c.x0.double(), c.x1.double()
         pose = pose_from_fundamental(*ends, estimate.inliers & c.mask)
@@ -105,10 +102,8 @@ def _pair(
     c: Correspondences, F: Tensor, inliers: Tensor, related: bool,
 ) -> StoredPair:  # fmt: skip
     """The surviving matches of one pair, as the matcher left them, as indices of the images' points.
-
-    Scores are the matcher's, or 1 - ratio, and 1 where there is neither. Raises ValueError for matches that are
-    at no keypoint.
-    """
+    Scores are the matcher's, or 1 - ratio, and 1 where there is neither. Raises ValueError for matches that are at no
+    keypoint."""
     mask = c.mask[0].cpu()
     ends = (x[0].detach().cpu().float()[mask].numpy() for x in (c.x0, c.x1))
     index = [indices(keypoints, x) for keypoints, x in zip(points, ends, strict=True)]

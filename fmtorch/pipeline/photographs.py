@@ -28,10 +28,8 @@ WORDS = ("unknown", "shared", "exif")
 
 class PhotographCamera(NamedTuple):
     """What is known of the camera of one photograph.
-
     lens: its calibration, with distortion. focal: px, and its relative deviation, where that alone is known. note: what
-    is said of it.
-    """
+    is said of it."""
 
     lens: Lens | None = None
     focal: tuple[float, float] | None = None
@@ -139,9 +137,7 @@ Array = NDArray[np.float64]
 
 def given_image(image: GivenImage, name: str) -> Image:
     """The pixels of a file, turned as its EXIF orientation says, of Pillow's image, or of an array.
-
-    Raises ImageError for a file that is no sound image, TypeError or ValueError, naming it, for what is no image.
-    """
+    Raises ImageError for a file that is no sound image, TypeError or ValueError, naming it, for what is no image."""
     if isinstance(image, Path | str):
         return read_image(image, orient=True)
     if isinstance(image, PIL.Image.Image):
@@ -184,10 +180,9 @@ def reduced_cameras(
     fields: Mapping[str, Tensor], scales: Sequence[Tensor], sizes: Sequence[tuple[int, int]]
 ) -> dict[str, Tensor]:
     """What is known of the cameras of two images as they were reduced, of a batch of one.
-
     fields: of `camera_fields`, for the originals. scales: of both images in x and y. sizes: (h, w) of the originals.
-    Raises ValueError, naming it, for a K that is no calibration matrix of its image, and for a focal of several pairs.
-    """
+    Raises ValueError, naming it, for a K that is no calibration matrix of its image, and for a focal of several
+    pairs."""
     if "focal" in fields and fields["focal"].shape != (2, 2):
         raise ValueError(f"focal has shape {tuple(fields['focal'].shape)}; it must be of one pair of images")
     reduced = {name: value[None].clone() for name, value in fields.items()}
@@ -212,9 +207,7 @@ def _reduction(s: Tensor) -> Tensor:
 
 def undistorted_matches(c: Correspondences, lenses: Sequence[Lens | None], scales: Sequence[Tensor]) -> Correspondences:
     """Matches of two reduced photographs as pinholes of the same K would have them, in pixels of the reduced images.
-
-    lenses: of the originals, None where nothing is distorted. A match that a pinhole does not see is masked.
-    """
+    lenses: of the originals, None where nothing is distorted. A match that a pinhole does not see is masked."""
     fields: dict[str, Tensor] = {"mask": c.mask}
     for i, (lens, scale, x, lafs) in enumerate(zip(lenses, scales, (c.x0, c.x1), (c.lafs0, c.lafs1), strict=True)):
         if lens is None or not lens.bends:
@@ -241,9 +234,7 @@ def evenly_reduced(
     c: Correspondences, F: Float[Tensor, "b 3 3"], scales: Sequence[Tensor]
 ) -> tuple[Correspondences, Float[Tensor, "b 3 3"], list[Tensor]]:
     """Matches, F and scales of images reduced alike in x and y, which whole pixels seldom are.
-
-    A crop of a photograph is otherwise stretched beside it by more than its noise, as no copy is.
-    """
+    A crop of a photograph is otherwise stretched beside it by more than its noise, as no copy is."""
     even = [s.prod().sqrt().expand(2) for s in scales]
     ratios = [(s / each).to(c.x0.device) for s, each in zip(scales, even, strict=True)]
     maps = [_reduction(1 / ratio.cpu()).to(F) for ratio in ratios]

@@ -312,9 +312,7 @@ def _lines_and_points(
     line_colour: int | None = None,
 ) -> None:  # fmt: skip
     """Draw in one image lines and, dashed and white, true lines if `lines` has them; then points on top.
-
-    colour, line_colour: the colours' numbers of the first point and, if it is another, the first line.
-    """
+    colour, line_colour: the colours' numbers of the first point and, if it is another, the first line."""
     part, unit = place.view(canvas), fine_line(canvas)
     start = colour if line_colour is None else line_colour
     for k, ends in enumerate(lines[0], start):
@@ -329,9 +327,7 @@ def _lines_and_points(
 
 def spread(points: Points, count: int) -> NDArray[np.intp]:
     """Indices, ascending, of at most `count` points (N, D) far from one another: each the farthest from those before.
-
-    The first is the nearest to the mean. O(N count). Ties go to the lowest index.
-    """
+    The first is the nearest to the mean. O(N count). Ties go to the lowest index."""
     if len(points) <= count:
         return np.arange(len(points))
     distance = -((points - points.mean(0)) ** 2).sum(1)
@@ -345,10 +341,8 @@ def spread(points: Points, count: int) -> NDArray[np.intp]:
 
 def thinned(points: Points, count: int) -> NDArray[np.intp]:
     """Indices, ascending, of at most `count` points (N, 2): of a path through all of them every so many-th.
-
     The path goes up one strip of the plane and down the next. Dense and sparse regions keep their shares, and among
-    matches so do right and wrong ones, whereas `spread` prefers what is far from the rest: the wrong.
-    """
+    matches so do right and wrong ones, whereas `spread` prefers what is far from the rest: the wrong."""
     if len(points) <= count:
         return np.arange(len(points))
     x, y = points.T

@@ -31,10 +31,8 @@ SEVERAL = ("pruner",)  # groups of which several presets are chosen at once
 
 class FileConfigSource(file_config_source.FileConfigSource):
     """Hydra's reader of config folders, which gives presets of such groups the package of their name.
-
     It has the name of the reader that it replaces: a launcher's processes register Hydra's own once more, which Hydra
-    skips where one of the same name is there and refuses where it is of another.
-    """
+    skips where one of the same name is there and refuses where it is of another."""
 
     def load_config(self, config_path: str) -> ConfigResult:
         with naming_file(Path(self.path) / self._normalize_file_name(config_path)):
@@ -65,9 +63,7 @@ WIDE = (
 
 def pruner_configs(config: DictConfig) -> dict[str, Any]:
     """The pruners' configs by name, in the order in which they run.
-
-    Raises ValueError where one pruner's options stand in the place of the names.
-    """
+    Raises ValueError where one pruner's options stand in the place of the names."""
     if not config.get("pruner"):
         return {}
     plain = OmegaConf.to_container(config.pruner, resolve=True)
@@ -138,9 +134,7 @@ def _given(override: str) -> Iterator[tuple[str, ...]]:
 
 def _versions(name: str, config: Any) -> Iterator[tuple[str, Any, tuple[str, ...]]]:
     """Where the options of a pruner stand, the options, and the families that they are for: none, the usual ones first.
-
-    Those of a family that is named come after those of all wide baselines, which they add to.
-    """
+    Those of a family that is named come after those of all wide baselines, which they add to."""
     where = f"pruner.{name}"
     if not isinstance(config, Mapping) or FAMILIES not in config:
         yield where, config, ()
@@ -235,9 +229,8 @@ Fields = TypeVar("Fields")
 
 def read_fields(fields: type[Fields], config: DictConfig, where: str = "") -> Fields:
     """The fields of a dataclass from a config that may hold more.
-
-    Raises ValueError naming the first that is wrong, as ``limit=-3; it must be a whole number of at least 1 or null``.
-    """
+    Raises ValueError naming the first that is wrong, as ``limit=-3; it must be a whole number of at least 1 or
+    null``."""
     names = [field.name for field in dataclasses.fields(fields) if field.name in config]  # type: ignore[arg-type]
     values: dict[str, Any] = {
         name: OmegaConf.to_container(config[name], resolve=True) if OmegaConf.is_config(config[name]) else config[name]
@@ -285,10 +278,8 @@ class ExecutorFields:
 
 def execution_of(config: DictConfig, workers: int | None = None, processes: bool | None = None) -> Execution:
     """The execution that a composed config asks for.
-
-    workers: in place of ``executor.workers``. processes: true or false in place of the executors of these kinds.
-    Raises ValueError for what is wrong or contradicts itself.
-    """
+    workers: in place of ``executor.workers``. processes: true or false in place of the executors of these kinds. Raises
+    ValueError for what is wrong or contradicts itself."""
     options = plain(config.executor)
     fields = read_fields(ExecutorFields, config.executor, "executor")
     if workers is not None and fields.workers not in (None, workers):

@@ -131,9 +131,7 @@ def resolve_device(name: str) -> torch.device:
 
 def open_files(part: Any, device: torch.device) -> None:
     """Have this project's parts read their learned files now, at any depth, where they have an `open_file`.
-
-    Raises ValueError, naming the file, where one cannot be used.
-    """
+    Raises ValueError, naming the file, where one cannot be used."""
     if hasattr(part, "open_file"):
         part.open_file(device)
     elif isinstance(part, Mapping | list | tuple):

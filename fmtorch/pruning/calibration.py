@@ -21,10 +21,8 @@ _LARGEST = 12.0  # log-odds beyond which P(inlier) is as good as 0 or 1; the log
 @inner
 def logistic(z: Any) -> Any:
     """``o / (1 + o)`` with ``o = (1 + z / 1024)^1024``, the logistic function but for 0.001 at most. Of tensors, too.
-
-    Made of arithmetic alone, whose last bits, unlike those of exp, do not depend on where in memory a number stands.
-    z: float64, since the power multiplies a rounding error by 1024; between -1024 and 1024.
-    """
+    Made of arithmetic alone, whose last bits, unlike those of exp, do not depend on where in memory a number stands. z:
+    float64, since the power multiplies a rounding error by 1024; between -1024 and 1024."""
     odds = 1 + z / 2**_SQUARINGS
     for _ in range(_SQUARINGS):
         odds = odds * odds
@@ -34,9 +32,7 @@ def logistic(z: Any) -> Any:
 @kernel
 def calibrated(evidence: F4x1, ratio: F4x1, mask: B1x1, numbers: F4x1, out: F4x1) -> None:
     """P(inlier) of `Calibration` from evidence and ratio (n,) -> out (n,); zero where masked.
-
-    ratio: empty where unknown. numbers: constant, weights of evidence and ratio.
-    """
+    ratio: empty where unknown. numbers: constant, weights of evidence and ratio."""
     for i in range(len(mask)):
         z = numbers[0] + numbers[1] * evidence[i]
         if len(ratio):

@@ -24,10 +24,8 @@ LARGEST_CHANGE = 100.0  # of a frame's size between images of a common scale: wh
 
 class MatchDomain(NamedTuple):
     """The N matches of one pair, in coordinates of zero mean and unit mean square in each image.
-
     S is the linear map from frame 0 to frame 1; shape its entries scaled to Frobenius norm sqrt(2), which for a
-    similarity are the cosine and the sine of its rotation, and the logarithm of the factor taken out.
-    """
+    similarity are the cosine and the sine of its rotation, and the logarithm of the factor taken out."""
 
     p0: Float[Tensor, "n 2"]
     p1: Float[Tensor, "n 2"]
@@ -90,10 +88,8 @@ def predictive_gaussians(
     matches: MatchDomain, centres: MatchDomain, *, position: float, displacement: float, rotation: float, scale: float
 ) -> Float[Tensor, "n m"]:
     """Gaussians over position, displacement and shape, where each centre's frame predicts the displacement.
-
-    With differences from centre m to match j, ``exp(-(|dp0|^2 / position^2 + |dp1 - S_m dp0|^2 / displacement^2 +
-    |d entries|^2 / rotation^2 + |d log size|^2 / scale^2) / 2)``: the widths, in units of the normalised coordinates.
-    """
+    With differences from centre m to match j, ``exp(-(|dp0|^2 / position^2 + |dp1 - S_m dp0|^2 / displacement^2 + |d
+    entries|^2 / rotation^2 + |d log size|^2 / scale^2) / 2)``: the widths, in units of the normalised coordinates."""
     width = torch.tensor([position] * 2 + [rotation] * 4 + [scale], device=matches.p0.device)
     z, c = (torch.cat([part.p0, part.shape], 1) / width for part in (matches, centres))
     exponent = _exponent(z, c)

@@ -41,9 +41,7 @@ MIN_SQUARE32, MIN_VOTES32, ONE32 = np.float32(MIN_SQUARE), np.float32(MIN_VOTES)
 
 class FramedMatches(NamedTuple):
     """The matches of one pair: points x0, x1 (n, 2), frames lafs0, lafs1 (n, 2, 3), pixels; which are real, mask (n,).
-
-    ratio: (n,), empty where unknown.
-    """
+    ratio: (n,), empty where unknown."""
 
     x0: F4x2
     x1: F4x2
@@ -234,9 +232,7 @@ TWO_TANGENT32 = np.float32(math.tan(math.pi / 8))
 @kernel
 def position_agreement_kernel(x0: F4x2, x1: F4x2, ratio: F4x1, mask: B1x1, out: F4x1) -> None:
     """`position_agreement` of x0, x1 (n, 2), mask (n,), and its a, b and s -> out (n + 3,).
-
-    ratio: (n,), empty where unknown.
-    """
+    ratio: (n,), empty where unknown."""
     n, m = len(mask), 0
     out[:] = 0
     rows, match = np.empty((5, n), x0.dtype), np.empty(n, np.int64)

@@ -18,9 +18,7 @@ CURVES32 = np.array([(shift, math.cos(angle), math.sin(angle)) for shift, angle 
 @inner
 def curve_order(x: Array, y: Array, shift: float, cosine: float, sine: float, order: Array) -> None:
     """The order of points x, y (n,) along a curve -> order (n,) i8.
-
-    shift, cosine, sine: of the grid and of the rotation, in the type of the points.
-    """
+    shift, cosine, sine: of the grid and of the rotation, in the type of the points."""
     n = len(x)
     if n == 0:
         return

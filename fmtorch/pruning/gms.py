@@ -35,9 +35,7 @@ class Matches(NamedTuple):
 @kernel
 def gms_kernel(matches: Matches, sides: I8x1, turns: int, factor: float, authors: bool, out: B1x1) -> None:
     """`gms.gms` of n matches -> out (n,).
-
-    sides: cells a side of the grids in image 1. authors: whose rule at the border holds.
-    """
+    sides: cells a side of the grids in image 1. authors: whose rule at the border holds."""
     match, p0, p1 = _inside(matches)
     bits, winner = _standing(p0, p1, sides, turns, factor, authors)
     out[:] = False
@@ -105,9 +103,7 @@ def _count(
     p0: Array, end: Array, shift: int, side: int, authors: bool, line: Array, table: Array, filled: Array
 ) -> None:  # fmt: skip
     """The cells of image 0 in a shifted grid -> line (m,), -1 for none; and the matches that go where, and from where.
-
-    shift: 1 along x, 2 along y, 3 along both.
-    """
+    shift: 1 along x, 2 along y, 3 along both."""
     filled[:] = 0
     min_cell = 1 if authors else 0
     for i in range(len(p0)):

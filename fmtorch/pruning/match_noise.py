@@ -74,9 +74,7 @@ def _match_noise64(lafs0: F8x3, lafs1: F8x3, ratio: F8x1, prior: F8x1, numbers: 
 @inner
 def _noise_of_each(lafs0: Array, lafs1: Array, ratio: Array, prior: Array, numbers: Array, out: Array) -> None:
     """`match_noise` of n matches -> out (n,). ratio, prior: (n,), empty where unknown.
-
-    numbers: usual, radius in pixels, slope, least area in square pixels, least prior.
-    """
+    numbers: usual, radius in pixels, slope, least area in square pixels, least prior."""
     usual, radius, slope, min_area, min_prior = numbers[0], numbers[1], numbers[2], numbers[3], numbers[4]
     whole = out.dtype.type(1)
     for i in range(len(out)):

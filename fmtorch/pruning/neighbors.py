@@ -14,10 +14,8 @@ _LEAF = 8  # points a leaf, at most
 @inner
 def search(queries: Array, points: Array, neighbors: Array) -> None:
     """The nearest points (m, 2) of queries (n, 2): indices, neighbors (n, count), nearest first; -1 past the last.
-
-    Squared distances in float64, ties by index, exactly as an exhaustive search finds them.
-    Node j of depth d holds the places from (j m) >> d on in an order of the points, its box and their lowest index.
-    """
+    Squared distances in float64, ties by index, exactly as an exhaustive search finds them. Node j of depth d holds the
+    places from (j m) >> d on in an order of the points, its box and their lowest index."""
     m = len(points)
     neighbors[:] = -1
     if m == 0:
@@ -153,10 +151,8 @@ TOLERANCE, NOISE_PX = 0.15, 1.0  # of a prediction: relative to the neighbour's 
 @kernel
 def neighbour_maps(x0: F8x2, x1: F8x2, out: F8x3) -> None:
     """Of each of n matches, points x0, x1 (n, 2), the similarity around it -> out (n, 2, 2); NaN for none.
-
     Each of its nearest neighbours in image 0 proposes the one that maps it exactly. Of the proposal with which most
-    neighbours agree, the first of equals, it is the least-squares similarity of these.
-    """
+    neighbours agree, the first of equals, it is the least-squares similarity of these."""
     n = len(x0)
     neighbors = np.empty((n, min(NEIGHBOURS + 1, n)), np.int64)
     search(x0, x0, neighbors)

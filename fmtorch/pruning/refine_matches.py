@@ -33,10 +33,8 @@ SAMPLE_PITCH = 3.0  # pixels of a level between samples, at most; half of it whe
 
 class Pyramid(NamedTuple):
     """A grey image at ever coarser scales, as `core.stages.grey_pyramid` makes it.
-
     pixels: (sum,), of all levels, row by row. levels: (l, 3), of each its height, its width and where it begins. Point
-    x of the image is at x / 2^l of level l.
-    """
+    x of the image is at x / 2^l of level l."""
 
     pixels: U1x1
     levels: I8x2
@@ -146,9 +144,7 @@ def search(
     image: Pyramid, level: int, template: Any, start: Array, iterations: int, best: Array
 ) -> tuple[float, float, float]:
     """Gauss-Newton steps from a place, point and affine map (6,), to that of the highest correlation -> best.
-
-    The correlations at the start and at the best place, and the residual variance there, in grey levels of image 0.
-    """
+    The correlations at the start and at the best place, and the residual variance there, in grey levels of image 0."""
     L, solution, first, highest, variance = template.L, vector(PARAMETERS), -2.0, -2.0, math.inf
     place, short = start.copy(), False
     best[:] = start
@@ -176,9 +172,7 @@ def search(
 @inner
 def _compose(place: Array, solution: Array) -> bool:
     """The place after a step: its map after the inverse of that which the step makes of the window of image 0.
-
-    False, and the place as it was, for a step that changes the area by too much.
-    """
+    False, and the place as it was, for a step that changes the area by too much."""
     gain = solution[1]
     p, q, r, s = 1.0 + solution[2] / gain, solution[3] / gain, solution[4] / gain, 1.0 + solution[5] / gain
     area = p * s - q * r
@@ -237,9 +231,7 @@ def _backward(L: Array, b: Array) -> None:
 @inner
 def covariance(L: Array, best: Array, variance: float, out: Array) -> None:
     """The covariance of the point, xx, xy, yy -> out (3,): that of the shift in steps, mapped to pixels.
-
-    The last two rows of L are the factor of the shift's information, all other parameters eliminated.
-    """
+    The last two rows of L are the factor of the shift's information, all other parameters eliminated."""
     p, q, r = L[6, 6], L[7, 6], L[7, 7]
     a, c = best[2] / p, best[4] / p
     b, d = (best[3] - a * q) / r, (best[5] - c * q) / r
@@ -266,11 +258,9 @@ class Windows(NamedTuple):
 
 class Fit(NamedTuple):
     """How windows are fitted.
-
     radius: samples from the centre of a window to its sides. iterations: at most. min_correlation: of two windows that
     show one surface. max_shift: of a point, in samples. max_deviation: of a point in the direction in which it is least
-    exact, in pixels.
-    """
+    exact, in pixels."""
 
     radius: int
     iterations: int
@@ -417,10 +407,8 @@ class RefineMatches:
 
     def _noise(self, out: Refined) -> Array:
         """Of those refined: the expected distance to the epipolar line, in that of a usual match.
-
         The point's covariance counts as if both points shared it: an error e of image 1 moves the Sampson distance by
-        at most ``e / sqrt(1 + s^2)``, s the change of scale.
-        """
+        at most ``e / sqrt(1 + s^2)``, s the change of scale."""
         (xx, _, yy), affine = out.covariance[out.refined].T, out.affine[out.refined]
         area = np.abs(affine[:, 0, 0] * affine[:, 1, 1] - affine[:, 0, 1] * affine[:, 1, 0])
         variance = (xx + yy) / (1 + area)

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 from fmtorch.core.lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from fmtorch.training.augmentation import Augmentation
-    from fmtorch.training.labelled import LabelledMatches, collate
+    from fmtorch.training.labelled import Augmentation, LabelledMatches, collate
     from fmtorch.training.matched_pairs import MatchedPairs
     from fmtorch.training.objective import Objective, classification_loss, geometric_loss, nsgd_loss, virtual_points
     from fmtorch.training.stored_matches import Draw, SimilarLengthBatches, StoredMatches, collate_trimmed, split_scenes

@@ -21,9 +21,8 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from fmtorch.core.files import replacing
-from fmtorch.pruning.networks.files import INPUT, OUTPUT, LearnedFile, OnnxBackbone, stated_network
 from fmtorch.pruning.networks.layers import Slots
-from fmtorch.pruning.networks.learned import Exportable
+from fmtorch.pruning.networks.learned import INPUT, OUTPUT, Exportable, LearnedFile, OnnxBackbone, stated_network
 from fmtorch.training.validation import Evaluation, Validation, reliability
 
 ATOL = 1e-4  # of torch against ONNX
@@ -56,10 +55,8 @@ def export_onnx(
     network: nn.Module, path: Path, *, temperature: float = 1.0, notes: Mapping[str, str] | None = None
 ) -> None:
     """Write a network's backbone as ONNX: float `matches` (1, channels, N), N free, to `outputs` (1, K, N).
-
-    Needs the extra `export`. Arguments as of `save_weights`.
-    Raises ValueError for a network that is not `Exportable`, ArithmeticError where ONNX Runtime disagrees with torch.
-    """
+    Needs the extra `export`. Arguments as of `save_weights`. Raises ValueError for a network that is not `Exportable`,
+    ArithmeticError where ONNX Runtime disagrees with torch."""
     if not isinstance(network, Exportable):
         missing = f"{type(network).__name__} has no `backbone`, `input_channels`, `options` and `predict`"
         raise ValueError(f"{missing}: it cannot be exported to ONNX, and runs with torch alone")
@@ -170,11 +167,9 @@ def write_result(
     folder: Path, name: str, network: nn.Module, validation: Validation, facts: Mapping[str, Any]
 ) -> Result:
     """Evaluate the best weights of a training and write them into its folder.
-
     The files are `name` with .safetensors, .md and, where the network can be exported and the extra `export` is
     installed, .onnx. facts: what the card says of the training: `data`, `seconds`, `steps`, `best_step`, `processor`,
-    the identity.
-    """
+    the identity."""
     network = network.to("cpu").eval()
     evaluation = validation(network)
     temperature = evaluation.temperature()

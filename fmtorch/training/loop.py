@@ -166,9 +166,7 @@ def train(
 
 class _ResumableCheckpoint(ModelCheckpoint):
     """Checkpoints at every so many steps: at a step of validation when that is done, its best figure included.
-
-    Lightning saves before it validates, and a training that goes on from there would lack that validation.
-    """
+    Lightning saves before it validates, and a training that goes on from there would lack that validation."""
 
     def __init__(self, *args: Any, validated_every: int, **options: Any) -> None:
         super().__init__(*args, **options)
@@ -186,9 +184,7 @@ class _ResumableCheckpoint(ModelCheckpoint):
 
 class _TrainingBar(Callback):
     """The progress bar of a training, earlier attempts included: steps, loss, and the best figure of validation so far.
-
-    total: steps in all. monitor: the figure of validation that is shown.
-    """
+    total: steps in all. monitor: the figure of validation that is shown."""
 
     def __init__(self, total: int, monitor: str) -> None:
         self.total, self.monitor = total, monitor
@@ -223,9 +219,7 @@ class _TrainingBar(Callback):
 
 class ValidationPictures(Callback):
     """Draws some validation pairs: matches with P(inlier) >= 0.5 green, the others thin and red.
-
-    pairs: the pairs and their matches, batches of one.
-    """
+    pairs: the pairs and their matches, batches of one."""
 
     def __init__(self, pairs: Sequence[tuple[ImagePair, LabelledMatches]]) -> None:
         self.pairs = list(pairs)

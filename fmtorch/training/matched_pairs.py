@@ -20,7 +20,7 @@ from fmtorch.pipeline.pipeline import Outcome, Pipeline, load_pipeline
 from fmtorch.runs import CachedFeatures, identity_digest
 from fmtorch.runs.fingerprint import configuration, environment
 from fmtorch.training import labelled
-from fmtorch.training.augmentation import Augmentation
+from fmtorch.training.labelled import Augmentation
 from fmtorch.training.stored_matches import FORMAT, Shard, ShardError, StoredMatches, write_shard
 
 MAX_MATCHES = 4000  # matches kept of a pair
@@ -148,10 +148,8 @@ def partition(pairs: Sequence[ImagePair]) -> list[list[int]]:
 
 class Matching(NamedTuple):
     """What pairs are matched and labelled by.
-
     dataset: where they are from. pipeline: its stages before estimation are run. most: matches kept of a pair, the best
-    by ratio.
-    """
+    by ratio."""
 
     dataset: PairDataset
     pipeline: Pipeline

@@ -262,9 +262,7 @@ def virtual_points(
 @kernel
 def points_on_lines(F: F8x2, size0: F8x1, size1: F8x1, key: I8x1, mixed_seed: int, out: F8x2) -> None:
     """The `virtual_points` of a pair, x0, y0, x1, y1, 1 -> out (count, 5); 0 past the last.
-
-    mixed_seed: of the seed and the stream.
-    """
+    mixed_seed: of the seed and the stream."""
     state, count = stream_state(mixed_seed, key[0]), 0
     out[:] = 0
     for draw in range(TRIES * len(out)):

@@ -159,9 +159,7 @@ class PlanePairs(PairDataset):
 
 def random_camera(rng: np.random.Generator, size: tuple[int, int], limits: PlaneViews) -> Camera:
     """A camera that looks at the plane z = 0 from z < 0; the photograph of size (h, w) lies on it about the origin.
-
-    Its longest side is 1, x goes right and y down, as in the photograph. The horizon is never in view.
-    """
+    Its longest side is 1, x goes right and y down, as in the photograph. The horizon is never in view."""
     h, w = size
     scale, part, focal = (_log_uniform(rng, range_) for range_ in (limits.scale, limits.part, limits.focal))
     out = max(32, round(h * scale)), max(32, round(w * scale))
@@ -201,8 +199,8 @@ def warp(image: Grey, H: Matrix, size: tuple[int, int]) -> Grey:
     smallest = float(np.linalg.svd(local_affine(H, centre)[0], compute_uv=False)[-1])
     fine = int(np.clip(math.ceil(1 / smallest - 0.25), 1, 4))
     up = np.array([[fine, 0, (fine - 1) / 2], [0, fine, (fine - 1) / 2], [0, 0, 1.0]])
-    options = {"flags": cv2.INTER_LINEAR, "borderMode": cv2.BORDER_REFLECT_101}
-    view = cv2.warpPerspective(image, up @ H, (w * fine, h * fine), **options)
+    size = (w * fine, h * fine)
+    view = cv2.warpPerspective(image, up @ H, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
     return view if fine == 1 else cv2.resize(view, (w, h), interpolation=cv2.INTER_AREA)  # type: ignore[return-value]
 
 

@@ -30,9 +30,8 @@ from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.presets.composition import execution_of, plain, read_fields
 from fmtorch.runs import cached, identity_digest
 from fmtorch.scenes import RenderedPairs
-from fmtorch.training.augmentation import Augmentation, keep_ratio
 from fmtorch.training.export import Result, write_result
-from fmtorch.training.labelled import LabelledMatches
+from fmtorch.training.labelled import Augmentation, LabelledMatches, keep_ratio
 from fmtorch.training.loop import PrunerTraining, ValidationPictures, load_best, train
 from fmtorch.training.matched_pairs import MatchedPairs
 from fmtorch.training.objective import Objective
@@ -48,10 +47,8 @@ PICTURES = 4  # validation pairs that are drawn into the log
 
 def run(config: DictConfig, name: str) -> Path:
     """Train what a composed config describes and return the folder of the result.
-
-    Started again, it goes on from the last checkpoint; a finished training only writes its files anew.
-    name: of the pruner's preset, e.g. ``lc``. Raises ValueError for options that cannot be.
-    """
+    Started again, it goes on from the last checkpoint; a finished training only writes its files anew. name: of the
+    pruner's preset, e.g. ``lc``. Raises ValueError for options that cannot be."""
     options = read_fields(TrainOptions, config)
     expect_options(Trainer, plain(config.trainer), "trainer")
     presets.expect_buildable(plain(config.dataset), "dataset")
@@ -104,9 +101,7 @@ def report(result: Result, name: str) -> None:
 
 def use_line(name: str, file: Path, words: Sequence[str]) -> str:
     """The command that uses a learned file as a prior, by which it serves best. words: of the training's command.
-
-    Options are given with ``++``, since a preset of a user's own need not have them.
-    """
+    Options are given with ``++``, since a preset of a user's own need not have them."""
     folders = [shlex.quote(b) for a, b in itertools.pairwise(words) if a in ("--config-dir", "-cd")]
     folders += [shlex.quote(word.partition("=")[2]) for word in words if word.startswith("--config-dir=")]
     network = [shlex.quote(word) for word in words if word.lstrip("+").startswith(f"pruner.{name}.network.")]
@@ -146,9 +141,7 @@ class Matches:
 
 def labelled_matches(config: DictConfig, options: TrainOptions, progress: Progress) -> Matches:
     """The matches of the config's data set, split by scenes, and of its further validation sets.
-
-    Raises ValueError where there is nothing to train on or to validate on.
-    """
+    Raises ValueError where there is nothing to train on or to validate on."""
     photographs, given, validated = list[Photograph](), config.photographs, options.validation
     if options.planes.photographs is not None:
         photographs = list_photographs(options.planes.photographs, given.sources, given.excluded)

@@ -18,8 +18,7 @@ from torch.utils.data import DataLoader, Dataset, Sampler
 from fmtorch.core.files import replacing
 from fmtorch.core.types import Correspondences
 from fmtorch.jit.random import Stream, uniform
-from fmtorch.training.augmentation import Augmentation, subset_size
-from fmtorch.training.labelled import LabelledMatches, collate
+from fmtorch.training.labelled import Augmentation, LabelledMatches, collate, subset_size
 
 PATTERN = "shard-*.arrow"
 FORMAT = 1  # of the files; raised when the schema changes
@@ -62,10 +61,8 @@ def write_shard(path: Path, rows: Sequence[Row]) -> None:
 
 class Shard:
     """A file of matches, mapped into memory: reading a pair touches the bytes of that pair only.
-
-    verify: check every byte against the checksum, at about 1 GB/s.
-    Raises ShardError for a file that is missing, damaged or of another version.
-    """
+    verify: check every byte against the checksum, at about 1 GB/s. Raises ShardError for a file that is missing,
+    damaged or of another version."""
 
     def __init__(self, path: Path, *, verify: bool = False) -> None:
         self.path = path
@@ -271,9 +268,7 @@ QUARTER = 4  # of a family of fewer scenes one in so many
 
 def last_scenes(scenes: Iterable[tuple[str, str]], last: int | None) -> set[tuple[str, str]]:
     """Of scenes (family, name), each given any number of times, the last of each family by name; never its first.
-
-    last: how many; None: `HELD_OUT`, or a quarter of a family that has few.
-    """
+    last: how many; None: `HELD_OUT`, or a quarter of a family that has few."""
     names: dict[str, set[str]] = {}
     for family, name in scenes:
         names.setdefault(family, set()).add(name)

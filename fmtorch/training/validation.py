@@ -66,9 +66,7 @@ class Validation:
     @torch.no_grad()
     def __call__(self, network: nn.Module) -> Evaluation:
         """The figures of a network in its present state, which is left as it was.
-
-        Each pair is evaluated alone, in evaluation mode and on the CPU's one thread, as in use.
-        """
+        Each pair is evaluated alone, in evaluation mode and on the CPU's one thread, as in use."""
         training, threads = network.training, torch.get_num_threads()
         device = next((p.device for p in network.parameters()), torch.device("cpu"))
         network.eval()

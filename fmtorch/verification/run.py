@@ -39,10 +39,8 @@ class DatabasePair(NamedTuple):
 
 def as_correspondences(pair: DatabasePair, cameras: Cameras) -> Correspondences:
     """The pair as a batch of one, with what is known of its cameras; of pinholes where these are those stored.
-
     Without image sizes and K nothing is asked of cameras. Raises ValueError where a stored camera is none that there
-    can be, and as `fmtorch.find_fundamental` for values, sizes and points that contradict each other.
-    """
+    can be, and as `fmtorch.find_fundamental` for values, sizes and points that contradict each other."""
     images, stored = (pair.image0, pair.image1), cameras == "stored"
     if stored and (problem := images[0].problem or images[1].problem):
         raise ValueError(problem)
@@ -76,9 +74,7 @@ _PairIds = tuple[Any, Any]
 
 class GeometryParts:
     """The folder, which any number of processes and shards of the same settings may write to.
-
-    done: the pairs that it has. Raises ValueError where it holds geometries of other settings.
-    """
+    done: the pairs that it has. Raises ValueError where it holds geometries of other settings."""
 
     def __init__(self, folder: Path, settings: Mapping[str, Any]) -> None:
         self.folder = folder
@@ -129,10 +125,8 @@ PRELOADED = (__name__,)  # by the process that workers are forked of
 @runtime_checkable
 class PairStore(Protocol):
     """Matches of pairs of images, and a place for their geometries; see `MatchDatabase`.
-
     identity: by what the matches are known again, as plain values. pairs: those that have matches. matches: of a pair,
-    keypoints (n, 2) of its images. has_geometry: of a failure too. write: the geometries of all pairs, or none.
-    """
+    keypoints (n, 2) of its images. has_geometry: of a failure too. write: the geometries of all pairs, or none."""
 
     def identity(self) -> dict[str, Any]: ...
     def pairs(self) -> list[_PairIds]: ...
@@ -227,10 +221,8 @@ def divided(batch: Batch) -> list[Batch]:
 
 class VerificationRun:
     """The pairs of one store of matches.
-
     parts: keeps their geometries. shard: only these pairs, which are kept there; None: all, and `write` moves what is
-    kept into the store. force: estimate pairs that have a geometry in the store, too.
-    """
+    kept into the store. force: estimate pairs that have a geometry in the store, too."""
 
     def __init__(self, store: PairStore, parts: GeometryParts, shard: Shard | None = None, force: bool = False) -> None:
         self.store, self.parts = store, parts

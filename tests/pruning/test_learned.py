@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from fmtorch.core import Correspondences, NetworkFileError, collate
 from fmtorch.pruning import DFE, LC, LearnedPruner
-from fmtorch.pruning.networks.files import learned_file
+from fmtorch.pruning.networks.learned import learned_file
 from fmtorch.runs.fingerprint import configuration, learned
 from fmtorch.training.export import export_onnx, save_weights
 from tests.laws import scene

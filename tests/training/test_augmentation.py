@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from fmtorch.geometry import symmetric_max
 from fmtorch.training import Augmentation, LabelledMatches
-from fmtorch.training.augmentation import (
+from fmtorch.training.labelled import (
     crop,
     keep_ratio,
     move,

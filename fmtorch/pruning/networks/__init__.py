@@ -1,7 +1,6 @@
 """Networks that tell inliers from outliers: Correspondences -> Prediction."""
 
-from fmtorch.pruning.networks.architectures import DFE, LC
-from fmtorch.pruning.networks.inputs import MatchInputs
+from fmtorch.pruning.networks.architectures import DFE, LC, MatchInputs
 from fmtorch.pruning.networks.learned import Exportable, Prediction, predict
 
 __all__ = ["DFE", "LC", "Exportable", "MatchInputs", "Prediction", "predict"]

@@ -20,9 +20,7 @@ MOMENTUM = 0.1  # of running statistics
 
 class Slots(NamedTuple):
     """Which of the (B, N) slots hold matches.
-
-    matches: of each pair, (B,). mask: 1 or 0, (B, N); None where every slot holds one.
-    """
+    matches: of each pair, (B,). mask: 1 or 0, (B, N); None where every slot holds one."""
 
     matches: Float[Tensor, " b"]
     mask: Float[Tensor, "b n"] | None
@@ -159,9 +157,7 @@ class _NormReLU(torch.autograd.Function):
 
 class ResidualBlock(nn.Module):
     """Perceptron, context norm, batch norm, ReLU; twice; and the input added (Yi et al., CVPR 2018, section 3.2).
-
-    Its perceptrons have no bias: context normalisation takes any away.
-    """
+    Its perceptrons have no bias: context normalisation takes any away."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
