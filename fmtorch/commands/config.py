@@ -39,15 +39,11 @@ class Mistake(ValueError):
     """A user's mistake in one job of a sweep, error_line by its message: it can be sent between processes."""
 
 
-def _register(command: Command) -> None:
-    quiet = [{f"override hydra/{part}_logging": "none"} for part in ("hydra", "job")]
-    own = {"output_subdir": None, "run": {"dir": "."}, "sweep": {"dir": command.sweeps, "subdir": "."}}
-    defaults = [*({group: name} for group, name in command.groups.items()), "_self_", *quiet]
-    ConfigStore.instance().store(command.name, {"defaults": defaults, **command.defaults, "hydra": own})
-
-
 for each in COMMANDS.values():
-    _register(each)
+    quiet = [{f"override hydra/{part}_logging": "none"} for part in ("hydra", "job")]
+    own = {"output_subdir": None, "run": {"dir": "."}, "sweep": {"dir": each.sweeps, "subdir": "."}}
+    defaults = [*({group: name} for group, name in each.groups.items()), "_self_", *quiet]
+    ConfigStore.instance().store(each.name, {"defaults": defaults, **each.defaults, "hydra": own})
 
 
 def job(task: Task) -> Task:
@@ -59,8 +55,11 @@ def job(task: Task) -> Task:
             _expect_known(HydraConfig.get().overrides.task)
             task(with_explicit(config, HydraConfig.get().overrides.task))
         except Exception as error:
-            if config.get("debug"):
-                _debugged(error, config.debug == "pdb")
+            if config.get("debug"):  # show all of the traceback, and what it leads to
+                traceback.print_exception(error)
+                if config.debug == "pdb":
+                    pdb.post_mortem(error.__traceback__)
+                sys.exit(1)
             if trace := own_traceback(error):
                 errors.print(trace, soft_wrap=True)
             if not (trace or isinstance(error, MISTAKES)):
@@ -70,14 +69,6 @@ def job(task: Task) -> Task:
             sys.exit(f"error: {error_line(error)}")
 
     return wrapped
-
-
-def _debugged(error: Exception, interactive: bool) -> None:
-    """Show all of a traceback, and what it leads to in the debugger if wanted; ends the command."""
-    traceback.print_exception(error)
-    if interactive:
-        pdb.post_mortem(error.__traceback__)
-    sys.exit(1)
 
 
 def chosen_pipeline() -> tuple[str, list[str]]:
@@ -156,16 +147,10 @@ def _line(text: str) -> str:
 
 
 def hydra_arguments(words: Sequence[str], paths: Sequence[str], positional: Sequence[str]) -> list[str]:
-    """The arguments for Hydra: its own flags first, then ``name=value``.
-
-    Args:
-        words: the command line.
-        paths: fields that hold a path. It may hold spaces, brackets, commas and ``=`` without further quotes.
-        positional: fields that may be given by place alone; the last one takes a list if its name ends in ``...``.
-
-    Raises:
-        ValueError: for more positional arguments than there are.
-    """
+    """The arguments for Hydra, of the words of a command line: its own flags first, then ``name=value``.
+    paths: fields that hold a path, which may hold spaces, brackets, commas and ``=`` without further quotes.
+    positional: fields that may be given by place alone; the last one takes a list if its name ends in ``...``. Raises
+    ValueError for more positional arguments than there are."""
     flags, overrides = _split(words)
     multirun = any(flag in ("-m", "--multirun") for flag in flags)
     placed = [word for word in overrides if _is_positional(word)]

@@ -17,7 +17,7 @@ from fmtorch.commands.options import EVAL, EvalOptions
 from fmtorch.commands.report import by_dataset, named
 from fmtorch.core.files import replacing
 from fmtorch.core.terminal import console, errors, progress_bars, reporter
-from fmtorch.data import ImagePair, PairDataset
+from fmtorch.data import ImagePair
 from fmtorch.evaluation.curves import picture
 from fmtorch.evaluation.run import built_with, cameras_of, evaluate_pairs, run_identity, select
 from fmtorch.evaluation.statistics import ALL, Group, summarize
@@ -35,11 +35,8 @@ SWEPT = "FMTORCH_SWEPT"  # names the file in which the jobs of a sweep note thei
 
 def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -> Path:
     """Evaluate one composed config and return the run folder.
-
-    overrides: what the command line changed of the pipeline of that name; said beside it.
-
-    Raises ValueError, before anything is computed or written, where an option is not what it may be.
-    """
+    overrides: what the command line changed of the pipeline of that name; said beside it. Raises ValueError, before
+    anything is computed or written, where an option is not what it may be."""
     fields = read_fields(EvalOptions, config)
     execution_of(config, fields.workers, fields.processes)
     shard = shard_of(fields.shard)
@@ -54,7 +51,9 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
     with progress_bars() as progress:
         pipeline: Pipeline = build_pipeline(config, device, model)
         dataset = data.build(dataset_config, reporter(progress, "drawing scenes"))
-        folder = _open_folder(config, fields, pipeline_name, pipeline, dataset)
+        identity = run_identity(config, pipeline_name, pipeline, dataset.digest, fields.cameras, fields.pose.signed)
+        name = f"{pipeline_name.replace('/', '-')}-{identity_digest(identity)[:8]}"
+        folder = RunFolder.open(fields.output or Path(f"runs/{dataset.name}/{name}"), identity)
         pairs = select([dataset[i] for i in range(len(dataset))], fields.limit)
         journal = _journal(folder.path, pairs) if exports else None
         own = pairs if shard is None else shard.of(pairs)
@@ -91,14 +90,6 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
             again = f"an edit of your parts makes a new run; mended otherwise, delete {folder.path} to run again"
         raise ValueError(f"every pair failed, the first because: {reason}; {again}")
     return folder.path
-
-
-def _open_folder(
-    config: DictConfig, fields: EvalOptions, pipeline_name: str, pipeline: Pipeline, dataset: PairDataset
-) -> RunFolder:
-    identity = run_identity(config, pipeline_name, pipeline, dataset.digest, fields.cameras, fields.pose.signed)
-    name = f"{pipeline_name.replace('/', '-')}-{identity_digest(identity)[:8]}"
-    return RunFolder.open(fields.output or Path(f"runs/{dataset.name}/{name}"), identity)
 
 
 def _missing(pairs: Sequence[ImagePair], folder: RunFolder, journal: MatchStore | None, again: bool) -> list[ImagePair]:

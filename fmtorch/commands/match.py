@@ -153,18 +153,10 @@ class Photographs:
 def photographs(
     paths: Sequence[Path], cameras: Path | None, K: str | list[float | int] | None, orient: bool
 ) -> Photographs:
-    """Read two photographs with what is known of their cameras.
-
-    Args:
-        paths: of the two.
-        cameras: one of `WORDS`, a file of cameras (`ImageCameras`), or None.
-        K: fx, fy, cx, cy of both in pixels, or None.
-        orient: turn them as their EXIF orientation says.
-
-    Raises:
-        ValueError: where both are given, or for what no camera is.
-        ImageError: for a file that is no image, or is not of its camera's size.
-    """
+    """Read two photographs with what is known of their cameras, turned as their EXIF orientation says if asked to.
+    cameras: one of `WORDS`, a file of cameras (`ImageCameras`), or None. K: fx, fy, cx, cy of both in pixels, or None.
+    Raises ValueError where both are given, or for what no camera is, and ImageError for a file that is no image, or is
+    not of its camera's size."""
     known = PhotographCameras(cameras, K)
     image0, image1 = (read_image(known.source(path), orient=orient) for path in paths)
     ends = zip(paths, (image0, image1), strict=True)

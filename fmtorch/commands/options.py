@@ -179,19 +179,12 @@ class VerifyOptions:
 
 @dataclasses.dataclass(frozen=True)
 class Command:
-    """A command whose config Hydra composes.
-
-    Attributes:
-        name: as in ``fmtorch NAME``.
-        about: what its help says after its summary.
-        options: the dataclass of its options, each an `option`.
-        groups: groups of presets, with those that stand in each where the user names no other.
-        group_help: what help says of a group.
-        positional: options that need no name, in order; the last takes several if its name ends in ``...``.
-        texts: options, beside those that are paths, whose value Hydra shall not take apart at commas and brackets.
-        interrupted: what is said where the user stops it.
-        sweeps: the folder of what Hydra keeps of a sweep.
-    """
+    """A command, ``fmtorch NAME``, whose config Hydra composes.
+    about: what its help says after its summary. options: the dataclass of its options, each an `option`. groups: groups
+    of presets, with those that stand in each where the user names no other; group_help: what help says of them.
+    positional: options that need no name, in order; the last takes several if its name ends in ``...``. texts: options,
+    beside those that are paths, whose value Hydra shall not take apart at commas and brackets. interrupted: what is
+    said where the user stops it. sweeps: the folder of what Hydra keeps of a sweep."""
 
     name: str
     about: str

@@ -39,8 +39,11 @@ def run(config: DictConfig) -> Path:
     if construction.complete:
         console.print(f"{construction.folder} is complete: dataset=fmbench dataset.root={construction.folder}")
         return construction.folder
-    many = dataset.candidates >= MIN_CANDIDATES_FOR_PROCESSES
-    execution = _execution(config, fields, many)
+    asked = execution_of(config, fields.workers)
+    many = dataset.candidates >= MIN_CANDIDATES_FOR_PROCESSES if asked.workers is None else asked.workers > 1
+    execution = asked.decided(many)
+    if execution.shared and asked.workers is None:
+        execution = dataclasses.replace(execution, workers=1)  # here
     start = time.monotonic()
     with progress_bars() as progress:
         kept, judged, problems = _select(construction, execution, progress)
@@ -56,13 +59,6 @@ def run(config: DictConfig) -> Path:
     construction.finish(kept, summary)
     _print_summary(construction, summary, problems, time.monotonic() - start)
     return construction.folder
-
-
-def _execution(config: DictConfig, fields: PairsOptions, many: bool) -> Execution:
-    """By whom candidates are judged: with nothing said, by processes where there are many, else here."""
-    asked = execution_of(config, fields.workers)
-    execution = asked.decided(many if asked.workers is None else asked.workers > 1)
-    return dataclasses.replace(execution, workers=1) if execution.shared and asked.workers is None else execution
 
 
 def _load(config: DictConfig) -> ScenePairs:

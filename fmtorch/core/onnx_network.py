@@ -14,19 +14,9 @@ class NetworkFileError(ValueError):
 
 
 def onnx_session(path: Path | str, threads: int, hint: str) -> Any:
-    """An inference session of ONNX Runtime on CPU; one for each file and thread count serves the whole process.
-
-    Args:
-        path: the file.
-        threads: of one operator; operators run one after the other.
-        hint: what makes such a file, for the errors.
-
-    Returns:
-        An ``onnxruntime.InferenceSession``, which several threads may use. A file that changed is opened again.
-
-    Raises:
-        NetworkFileError: the file is absent or cannot be run.
-    """
+    """An ``onnxruntime.InferenceSession`` on CPU, which several threads may use: one for each file and thread count.
+    threads: of one operator; operators run one after the other. hint: what makes such a file, for the errors. A file
+    that changed is opened again. Raises NetworkFileError where it is absent or cannot be run."""
     path = Path(path).absolute()
     if not path.is_file():
         raise NetworkFileError(f"{path} does not exist: {hint}")
@@ -53,11 +43,8 @@ Network = TypeVar("Network")
 
 def pretrained(load: Callable[[], Network], name: str, publisher: str, file: str, kept_as: str = "") -> Network:
     """The network that a library's own loader fetches once and keeps in torch's hub folder.
-
-    file: of the publisher. kept_as: where the loader looks for it, where that is another name.
-
-    Raises ConnectionError, saying what to put where, where it cannot be fetched.
-    """
+    file: of the publisher. kept_as: where the loader looks for it, where that is another name. Raises ConnectionError,
+    saying what to put where, where it cannot be fetched."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of each attempt; the last one's error says it all

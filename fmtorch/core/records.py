@@ -131,19 +131,15 @@ def expect_fields(record: Record, **sizes: int) -> None:
                 known.setdefault(dimension, size)
         wanted = tuple([known.get(dimension) for dimension in dimensions])
         if shape != wanted:
-            said = _in_letters(field.shape) if None in wanted else wanted
+            letters = ", ".join(name.upper() for name in field.shape if name != BATCH)
+            batch = f", or (B, {letters}) of a batch" if BATCH in field.shape else ""
+            said = f"({letters}){batch}" if None in wanted else wanted
             raise ValueError(f"{name} has shape {tuple(shape)}; it must be {said}")
         device = value.device if device is None else device
         if value.device != device:
             raise ValueError(f"{name} is on {value.device} and another field on {device}; all must be on one device")
         if not field.holds(value.dtype):
             raise ValueError(f"{name} is of {value.dtype}; it must hold {field.numbers}")
-
-
-def _in_letters(shape: tuple[str, ...]) -> str:
-    """A declared shape as a reader knows it; BATCH stands for one dimension or none."""
-    unbatched = ", ".join(name.upper() for name in shape if name != BATCH)
-    return f"({unbatched}), or (B, {unbatched}) of a batch" if BATCH in shape else f"({unbatched})"
 
 
 def slotted(record: Record) -> dict[str, Tensor]:

@@ -17,17 +17,10 @@ def canonical(settings: Mapping[str, Any]) -> str:
 
 
 def claim(file: Path, settings: Mapping[str, Any], holds: str, instead: str, alone: bool = True) -> None:
-    """Make the folder of a file that of these settings, which the file keeps as JSON, or see that it is.
-
-    Args:
-        file: in the folder, which is made where it is not there. Of several processes the first one writes it.
-        settings: mappings, lists, texts, numbers, booleans and None.
-        holds: what is in such a folder; instead: what to do where it is of other settings; both for messages.
-        alone: refuse a folder without the file that is not empty.
-
-    Raises:
-        ValueError: for a folder of other settings, naming what differs; for one that holds something else.
-    """
+    """Make the folder of a file, and the file, which keeps settings as JSON, or see that it is a folder of these.
+    Of several processes the first one writes it. holds: what is in such a folder; instead: what to do where it is of
+    other settings; both for messages. alone: refuse a folder without the file that is not empty. Raises ValueError for
+    a folder of other settings, naming what differs, and for one that holds something else."""
     folder, wanted = file.parent, json.loads(canonical(settings))
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"{folder} is a file; {instead}")

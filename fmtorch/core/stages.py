@@ -144,14 +144,10 @@ def output_of(
     part: object, value: object, kind: type[Output], given: Correspondences | None = None, like: Tensor | None = None
 ) -> Output:
     """What a stage returned, which may be anybody's code: a value of this kind.
-
-    Args:
-        given: the matches that it was given, whose pairs and device are those of the result.
-        like: a tensor on the device that the result must be on, where no matches were given.
-
-    Raises TypeError for something else, and ValueError for another number of pairs or matches, another device, half
-    precision, or pairs that are not those given. The message begins with the part's name.
-    """
+    given: the matches that it was given, whose pairs and device are those of the result. like: a tensor on the device
+    that the result must be on, where no matches were given. Raises TypeError for something else, and ValueError for
+    another number of pairs or matches, another device, half precision, or pairs that are not those given. The message
+    begins with the part's name."""
     named = part if isinstance(part, type) or hasattr(part, "__qualname__") else type(part)
     name = f"{named.__module__}.{named.__qualname__}"
     if not isinstance(value, kind):

@@ -165,17 +165,10 @@ def run_names(
     configs: Sequence[Mapping[str, Any]], identities: Sequence[str], groups: Sequence[str] | None = None
 ) -> list[str]:
     """A name for each run, no two alike within a group.
-
     The pipeline's name, unless all runs share it and differ in something else; of the runs of one pipeline the presets,
     options, seeds and versions in which they differ, other than those that the pipeline has of itself; and an
-    identity's first digits where that does not tell them apart.
-
-    Args:
-        configs: what defines each run, `RunFolder.config`.
-        identities: `RunFolder.identity` of each, or what else is unique.
-        groups: what runs are shown together, such as the data set: the same method on another has the same name. All
-            in one group if not given.
-    """
+    identity's first digits where that does not tell them apart. configs: `RunFolder.config` of each. identities: what
+    is unique. groups: what runs are shown together, such as the data set; all in one if not given."""
     groups = [""] * len(configs) if groups is None else groups
     pipelines = [str(config.get("pipeline", "run")) for config in configs]
     details = []

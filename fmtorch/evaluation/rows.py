@@ -128,12 +128,9 @@ class PairPose(NamedTuple):
 
 def pose_errors(outcomes: Sequence[Outcome], signed: bool = False) -> list[PairPose]:
     """The pose error of each pair: of the estimate's R and t, or else of its F, K0, K1 and the estimator's inliers.
-
     See `pose_error` and `fundamental_pose_error`. A pair without F, or without a pose, has the largest errors and a
-    reason; one whose calibration or motion is unknown has a reason only.
-
-    signed: the sign of the translation counts, and of the four poses of F the best one: `closest_pose_error`.
-    """
+    reason; one whose calibration or motion is unknown has a reason only. signed: the sign of the translation counts,
+    and of the four poses of F the best one: `closest_pose_error`."""
     poses = [_without_estimate(outcome, signed) for outcome in outcomes]
     known = [i for i, pose in enumerate(poses) if pose.pose_reason is None]
     own_pose = functools.partial(_of_pose, up_to_sign=not signed), "the pose is not determined"

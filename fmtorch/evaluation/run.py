@@ -313,7 +313,8 @@ def evaluate_pairs(
     die whatever they do, or a scheduler is gone.
     """
     pool = WorkerPool(execution, PRELOADED, limit=max(1, len(pairs)))
-    batch = _shared_out(len(pairs), batch, pool.size)
+    if pool.size > 1:  # no one of several workers shall be long alone at the end
+        batch = max(1, min(batch, -(-len(pairs) // (BATCHES_OF_A_WORKER * pool.size))))
     source: Source[Pipeline] = Local(pipeline) if execution.shared or build is None else Factory(build)
 
     def given(members: Sequence[ImagePair]) -> Batch:
@@ -366,8 +367,3 @@ def _images_after_the_first(pairs: Sequence[ImagePair]) -> Iterator[ImageSource]
                 if image.pixels not in seen:
                     seen.add(image.pixels)
                     yield image
-
-
-def _shared_out(pairs: int, batch: int, workers: int) -> int:
-    """The size of a batch of so many pairs that no one of several workers is long alone at the end."""
-    return batch if workers == 1 else max(1, min(batch, -(-pairs // (BATCHES_OF_A_WORKER * workers))))

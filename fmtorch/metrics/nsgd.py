@@ -59,19 +59,7 @@ def sgd(
     key: Int[Tensor, "*#batch"] | None = None,
     cap: bool = True,
 ) -> Float[Tensor, "*#batch"]:
-    """Symmetric geometry distance in pixels, at most the mean of the two image diagonals; otherwise as `nsgd`.
-
-    Args:
-        F_gt, F_est: true and estimated fundamental matrices (..., 3, 3), of any scale and sign.
-        size0, size1: sizes (..., 2) of the images as (h, w).
-        samples: accepted draws.
-        seed: of the draws.
-        key: (...), the pairs' keys.
-        cap: whether the value has that limit.
-
-    Returns:
-        (...).
-    """
+    """Symmetric geometry distance in pixels, at most the mean of the two image diagonals; otherwise as `nsgd`."""
     return _mean_distance(False, F_gt, F_est, size0, size1, samples, seed, key, cap)
 
 

@@ -20,18 +20,11 @@ MAX_CONFLICT = 3.0  # deviations, of an estimated focal length from that of a ca
 def pair_geometries(
     matches: Sequence[NDArray[np.integer[Any]]], c: Correspondences, estimate: Estimate, pair_type: PairTypes
 ) -> list[PairGeometry]:
-    """The geometries of a batch of pairs.
-
+    """The geometries of a batch of pairs, whose matches are keypoints (n, 2) of both images.
     Of general pairs F, its inliers, and E and the pose where there is one; of others the homography and its inliers,
     and the pose where the cameras are known or only turn. A pair is calibrated where both focal lengths are known and
-    the matches agree; one whose support is not beyond chance is degenerate.
-
-    Args:
-        matches: keypoints of both images, (n, 2), of each pair.
-        c: the same matches, with what the estimator was given of their cameras.
-        estimate: their estimates.
-        pair_type: of `classify`.
-    """
+    the matches agree; one whose support is not beyond chance is degenerate. c: the same matches, with what the
+    estimator was given of their cameras."""
     calibrated = _calibrated(c, estimate)
     said = [*zip(estimate.reason, warnings_of(estimate, pair_type), strict=True)]
     kind, homography = pair_type.kind, pair_type.homography

@@ -265,19 +265,15 @@ def _matrix(F: Arrays, name: str) -> NDArray[np.float64]:
     return matrix.reshape(3, 3)
 
 
-def draw_epipolar_lines_of_corners(
-    image0: Image, image1: Image, F: Points, *, truth: Points | None = None, most: int = 7
-) -> Image:
+def draw_epipolar_lines_of_corners(image0: Image, image1: Image, F: Points, *, truth: Points | None = None) -> Image:
     """Two images with some of their own corners as points, and the epipolar line of each in the other image; RGB.
-
-    For an F whose matches are not known. A point and its line have one colour, which no other point has where `most` is
-    that of `COLOURS` or fewer; more than half of the points lie in image 0. Where there is a choice they are corners
-    whose true line crosses the other image. truth: as for `draw_epipolar_lines`.
-    """
+    For an F whose matches are not known. A point and its line have one colour, which no other point has; more than half
+    of the points lie in image 0. Where there is a choice they are corners whose true line crosses the other image.
+    truth: as for `draw_epipolar_lines`."""
     canvas, place0, place1 = placed(image0, image1, None)
     known = F if truth is None else truth
-    chosen0 = _corners(image0, lambda line: place1.clip(line), known, most - most // 2)
-    chosen1 = _corners(image1, lambda line: place0.clip(line), known.T, most // 2)
+    chosen0 = _corners(image0, place1.clip, known, len(COLOURS) - len(COLOURS) // 2)
+    chosen1 = _corners(image1, place0.clip, known.T, len(COLOURS) // 2)
     both = [matrix for matrix in (F, truth) if matrix is not None]
     first = len(chosen0)
     lines0 = _lines(place0, [matrix.T for matrix in both], chosen1)

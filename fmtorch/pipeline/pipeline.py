@@ -267,12 +267,10 @@ class Pipeline:
         except Exception as error:  # a pair that fails becomes a row with this reason
             return Outcome(pair, counts, seconds=seconds, reason=self._failure(stage, error))
         pyramids = self.images(pair) if self.looks_at_images and pair.matches is None else None
-        return Outcome(pair, counts, self._with_calibrations(pair, c), None, seconds, images=pyramids)
-
-    def _with_calibrations(self, pair: ImagePair, c: Correspondences) -> Correspondences:
         given = (None if K is None else torch.from_numpy(K).to(self.device, torch.float64) for K in (pair.K0, pair.K1))
         K0, K1 = (None if K is None else K[None] for K in given)
-        return c.to(self.device).replace(key=torch.tensor([pair.key], device=self.device), K0=K0, K1=K1)
+        c = c.to(self.device).replace(key=torch.tensor([pair.key], device=self.device), K0=K0, K1=K1)
+        return Outcome(pair, counts, c, None, seconds, images=pyramids)
 
     def pruners_of(self, family: str) -> dict[str, Pruner]:
         return {**self.pruners, **self.families.get(family, {})}

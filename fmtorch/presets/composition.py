@@ -94,13 +94,8 @@ def build_pruners(config: DictConfig) -> tuple[dict[str, Pruner], dict[str, dict
 
 def with_explicit(config: DictConfig, overrides: Sequence[str]) -> DictConfig:
     """A composed config in which an option of a pruner that was given explicitly holds for all families.
-
     A preset's options of families give way to it; those of a family that were given explicitly themselves stay.
-
-    Args:
-        config: what Hydra composed; it is not changed.
-        overrides: the words that it was composed with, e.g. ``pruner.gms.with_scale=false``.
-    """
+    overrides: the words that it was composed with, e.g. ``pruner.gms.with_scale=false``."""
     words = [word for word in overrides if word.lstrip("+~").startswith("pruner.")]
     given = {path[1:] for word in words for path in _given(word)}
     changed = config

@@ -257,7 +257,9 @@ class SmoothMotion:
         if len(members) < MIN_MATCHES:
             return torch.full_like(matches.p0[:, 0], math.inf)
         fitted = matches.take(evenly(members, self.most_matches))
-        centres = fitted.take(self._centres(fitted))
+        candidates = evenly(torch.arange(len(fitted.p0), device=fitted.p0.device), self.candidates)
+        z = self._domain(fitted)[candidates]
+        centres = fitted.take(candidates[spread_centres(gaussians(z, z), self.centres)])
         basis = self._basis(fitted, centres)
         penalty = torch.full_like(basis[0], self.ridge)
         penalty[:3] *= _FREE
@@ -272,11 +274,6 @@ class SmoothMotion:
 
     def _domain(self, matches: MatchDomain) -> Float[Tensor, "n 4"]:
         return torch.cat([matches.p0 / self.position, (matches.p1 - matches.p0) / self.displacement], 1)
-
-    def _centres(self, matches: MatchDomain) -> Int[Tensor, " m"]:
-        candidates = evenly(torch.arange(len(matches.p0), device=matches.p0.device), self.candidates)
-        z = self._domain(matches)[candidates]
-        return candidates[spread_centres(gaussians(z, z), self.centres)]
 
     def _basis(self, matches: MatchDomain, centres: MatchDomain) -> Float[Tensor, "n k"]:
         g = gaussians(self._domain(matches), self._domain(centres))

@@ -40,23 +40,18 @@ def save_weights(
     network: nn.Module, path: Path, *, temperature: float = 1.0, notes: Mapping[str, str] | None = None
 ) -> None:
     """Write a network's weights as safetensors, whole or not at all, into a folder that is made.
-
-    Args:
-        network: any module; one with an attribute `options` states them in the file.
-        temperature: by which log-odds are divided at inference. notes: what else the file is to say.
-    """
+    An attribute `options` of the network is stated in the file. temperature: by which log-odds are divided at
+    inference. notes: what else the file is to say."""
     path.parent.mkdir(parents=True, exist_ok=True)
     state = {key: value.detach().cpu().contiguous() for key, value in network.state_dict().items()}
     with replacing(path) as unfinished:
         save_file(state, unfinished, metadata=_metadata(network, temperature, notes))
 
 
-def export_onnx(
-    network: nn.Module, path: Path, *, temperature: float = 1.0, notes: Mapping[str, str] | None = None
-) -> None:
+def export_onnx(network: nn.Module, path: Path, *, temperature: float = 1.0) -> None:
     """Write a network's backbone as ONNX: float `matches` (1, channels, N), N free, to `outputs` (1, K, N).
-    Needs the extra `export`. Arguments as of `save_weights`. Raises ValueError for a network that is not `Exportable`,
-    ArithmeticError where ONNX Runtime disagrees with torch."""
+    Needs the extra `export`. temperature: as of `save_weights`. Raises ValueError for a network that is not
+    `Exportable`, ArithmeticError where ONNX Runtime disagrees with torch."""
     if not isinstance(network, Exportable):
         missing = f"{type(network).__name__} has no `backbone`, `input_channels`, `options` and `predict`"
         raise ValueError(f"{missing}: it cannot be exported to ONNX, and runs with torch alone")
@@ -69,7 +64,7 @@ def export_onnx(
     generator = torch.Generator().manual_seed(0)
     example = torch.rand(1, network.input_channels, EXAMPLE_MATCHES, generator=generator)
     model = onnx_model(alone, example, INPUT, OUTPUT, free_axis=2)
-    onnx.helper.set_model_props(model, _metadata(network, temperature, notes))
+    onnx.helper.set_model_props(model, _metadata(network, temperature, None))
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as unfinished, torch.no_grad():
         onnx.save(model, unfinished)

@@ -153,13 +153,8 @@ def transfer_error(
     R: NDArray[np.float64], t: NDArray[np.float64],
 ) -> NDArray[np.float64]:  # fmt: skip
     """How far (n,), in pixels, points are carried past their partners in the other image, at the kindest of k depths.
-
-    Args:
-        x, partner: matched points (n, 2) in pixels. depth: candidates (k, n), NaN where unknown.
-        K, K_other: calibration of the two images. R, t: ``X_other = R X + t``.
-
-    Returns: NaN where no depth is known, infinity where a point would be behind the other camera.
-    """
+    NaN where no depth is known, infinity where a point would be behind the other camera. x, partner: matched points (n,
+    2) in pixels. depth: candidates (k, n), NaN where unknown. K, K_other: calibrations. R, t: ``X_other = R X + t``."""
     rays = np.column_stack([x, np.ones(len(x))]) @ np.linalg.inv(K).T
     there = (depth[..., None] * rays @ R.T + t) @ K_other.T
     ahead = there[..., 2] > 0
@@ -190,14 +185,9 @@ class Augmentation(AugmentationOptions):
     def __call__(
         self, matches: LabelledMatches, *, seed: int, epoch: int = 0, count: int | None = None
     ) -> LabelledMatches:
-        """The matches of one pair, changed.
-
-        Args:
-            matches: a batch of one. seed, epoch: select the random numbers, with the pair's key.
-            count: at most so many matches, in place of a random number of them.
-
-        Raises ValueError for a batch of several pairs: their numbers of matches would differ.
-        """
+        """The matches of one pair, a batch of one, changed; at most `count` of them, in place of a random number.
+        seed, epoch: select the random numbers, with the pair's key. Raises ValueError for a batch of several pairs:
+        their numbers of matches would differ."""
         if len(matches) != 1:
             raise ValueError(f"an augmentation changes one pair at a time, not a batch of {len(matches)}")
         key = matches.correspondences.keys.cpu()
@@ -346,14 +336,8 @@ def swap(matches: LabelledMatches) -> LabelledMatches:
 
 def rotate(matches: LabelledMatches, image: int, degrees: float | int) -> LabelledMatches:
     """One of the images turned in its plane, from its x axis to its y axis; multiples of 90 degrees are exact.
-
-    The new image is the bounding box of the turned one, its sides rounded up, with the same middle.
-
-    Args:
-        matches: labelled matches with the image's size. image: 0 or 1. degrees: the angle.
-
-    Raises ValueError where the size is not known.
-    """
+    The new image is the bounding box of the turned one, its sides rounded up, with the same middle. Raises ValueError
+    where the size of the image is not known."""
     size = _size(matches, image)
     cos, sin = _direction(degrees)
     turn = torch.tensor([[cos, -sin], [sin, cos]], dtype=torch.float64, device=size.device)
@@ -367,12 +351,7 @@ def rotate(matches: LabelledMatches, image: int, degrees: float | int) -> Labell
 
 def crop(matches: LabelledMatches, image: int, box: tuple[int, int, int, int]) -> LabelledMatches:
     """A part of one of the images; matches outside fall away, and the principal point is no longer in the middle.
-
-    Args:
-        matches: labelled matches. image: 0 or 1. box: first column, first row, and past the last ones, in pixels.
-
-    Raises ValueError for an empty box.
-    """
+    box: first column, first row, and past the last ones, in pixels. Raises ValueError for an empty box."""
     left, top, right, bottom = box
     if left >= right or top >= bottom:
         raise ValueError(f"the box {box} is empty; it must be (left, top, right, bottom) in pixels")

@@ -73,13 +73,10 @@ class PrunerTraining(lightning.LightningModule):
     def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
         norms = [p.grad.norm() for p in self.network.parameters() if p.grad is not None]
         total = torch.stack(norms).norm() if norms else torch.zeros(())
-        if not bool(torch.isfinite(total)) and not self._scales_gradients():
+        scaler = getattr(self.trainer.precision_plugin, "scaler", None)  # which skips a step that overflowed, as meant
+        if not bool(torch.isfinite(total)) and scaler is None:
             raise FloatingPointError(f"the gradient of step {self.global_step} is not finite")
         self.log("train/gradient_norm", total)
-
-    def _scales_gradients(self) -> bool:
-        """Whether mixed precision scales the loss: its scaler then skips a step that overflowed, as it is meant to."""
-        return getattr(self.trainer.precision_plugin, "scaler", None) is not None
 
     def validation_step(self, batch: Any, index: int) -> None:
         """All of validation, in one step; on rank zero's pairs, the same on every rank."""
@@ -119,17 +116,10 @@ def train(
     callbacks: tuple[Callback, ...] = (),
 ) -> tuple[int, float]:  # fmt: skip
     """Train in `folder`, going on from its last checkpoint; returns the steps and seconds made in all.
-
-    Args:
-        module: what is trained.
-        batches: from (step, rank, processes) to the training batches from that step on, which must always be the same.
-        folder: keeps checkpoints and TensorBoard's logs.
-        trainer: further arguments of lightning.Trainer (accelerator, devices, strategy, precision, gradient clipping).
-        every: steps between two validations. checkpoint_every: steps between two checkpoints.
-        patience: validations without a better figure after which training ends; None: never.
-        monitor: the figure of validation that chooses the best weights.
-        callbacks: further ones.
-    """
+    batches: from (step, rank, processes) to the training batches from that step on, which must always be the same.
+    folder: keeps checkpoints and TensorBoard's logs. trainer: further arguments of lightning.Trainer. every,
+    checkpoint_every: steps between two validations, and two checkpoints. patience: validations without a better figure
+    after which training ends; None: never. monitor: the figure of validation that chooses the best weights."""
     path, step = latest_checkpoint(folder)
     figure, mode = f"validation/{monitor}", "min" if monitor in SMALLER_IS_BETTER else "max"
     total = module.optimisation.steps

@@ -178,12 +178,8 @@ def compute_shards(
     execution: Execution,
 ) -> Iterator[int]:  # fmt: skip
     """Write each job's shard; yields the number of its pairs when it is written.
-
-    Args:
-        dataset: where the pairs are from. stages: the pipeline whose stages before estimation are run by threads.
-        build: makes it in other processes; pickled. jobs: files and their pairs. most: matches kept of a pair.
-        execution: by which workers, each with one thread of the libraries.
-    """
+    stages: the pipeline whose stages before estimation are run by threads; build: makes it in other processes, pickled.
+    most: matches kept of a pair. execution: by which workers, each with one thread of the libraries."""
     pool = WorkerPool(execution, PRELOADED)
     source: Source[Matching]
     if execution.shared:

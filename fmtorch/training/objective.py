@@ -33,16 +33,9 @@ class Objective(ObjectiveWeights):
     """The loss of a batch, as a sum of terms that a config weighs; every stage of the network is supervised."""
 
     def __call__(self, prediction: Prediction, batch: LabelledMatches, step: int) -> dict[str, Float[Tensor, ""]]:
-        """The terms of the loss, unweighted, and their weighted sum `loss`.
-
-        Args:
-            prediction: of the network, for the batch's correspondences.
-            batch: labelled matches; pairs without labels, or whose fit is not determined, add nothing.
-            step: optimisation steps done so far.
-
-        Returns:
-            A scalar for each term that counts at this step, and `loss`. Gradients are finite for every batch.
-        """
+        """The terms of the loss that count at this step, unweighted, and their weighted sum `loss`, with finite
+        gradients.
+        step: optimisation steps done so far. Pairs without labels, or whose fit is not determined, add nothing."""
         terms = {}
         if self.classification:
             terms["classification"] = classification_loss(prediction.logit, batch.label)
@@ -190,10 +183,7 @@ def nsgd_loss(
     train with another loss beside this one.
 
     Args:
-        F_est: estimates in pixels, of any scale, of one or more stages.
-        F_true: true fundamental matrices in pixels, of any scale.
-        size0, size1: image sizes as (h, w), pixels.
-        valid: False for estimates to leave out; those that are zero or not finite are left out anyway.
+        F_est, F_true, size0, size1, valid: as of `geometric_loss`.
         limit: clamp of a pair's figure, in image diagonals, beyond which it has no gradient; None: no clamp.
         samples: accepted draws for each pair.
         seed, key: the pairs' keys, which select their draws.

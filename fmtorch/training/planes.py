@@ -161,7 +161,9 @@ def random_camera(rng: np.random.Generator, size: tuple[int, int], limits: Plane
     """A camera that looks at the plane z = 0 from z < 0; the photograph of size (h, w) lies on it about the origin.
     Its longest side is 1, x goes right and y down, as in the photograph. The horizon is never in view."""
     h, w = size
-    scale, part, focal = (_log_uniform(rng, range_) for range_ in (limits.scale, limits.part, limits.focal))
+    scale, part, focal = (
+        math.exp(rng.uniform(*map(math.log, range_))) for range_ in (limits.scale, limits.part, limits.focal)
+    )
     out = max(32, round(h * scale)), max(32, round(w * scale))
     K = calibration(focal * out[1], out)
     corner = math.degrees(math.atan(math.hypot(*out) / 2 / K[0, 0]))
@@ -252,10 +254,6 @@ def change_camera(rng: np.random.Generator, image: Grey) -> Grey:
         _, coded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(25, 95))])
         image = np.asarray(cv2.imdecode(coded, cv2.IMREAD_GRAYSCALE), np.uint8)
     return image
-
-
-def _log_uniform(rng: np.random.Generator, limits: tuple[float | int, float | int]) -> float:
-    return math.exp(rng.uniform(math.log(limits[0]), math.log(limits[1])))
 
 
 def _rotation(vector: tuple[float, float, float]) -> Matrix:

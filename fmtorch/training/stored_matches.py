@@ -317,12 +317,6 @@ class SimilarLengthBatches(Sampler[list[Draw]]):
         """Choose the epoch, and how many of its batches (of this process) are left out at its start."""
         self.epoch, self.start = epoch, start
 
-    def state_dict(self) -> dict[str, int]:
-        return {"epoch": self.epoch, "start": self.start}
-
-    def load_state_dict(self, state: dict[str, int]) -> None:
-        self.set_epoch(state["epoch"], state["start"])
-
     def __len__(self) -> int:
         batches = -(-len(self.dataset) // self.batch)
         return max(-(-batches // self.world_size) - self.start, 0)
@@ -390,12 +384,8 @@ def training_batches(
     matches: StoredMatches, batch: int, seed: int, step: int, rank: int = 0, processes: int = 1, *, workers: int = 0
 ) -> DataLoader[LabelledMatches]:
     """A loader of augmented batches from `step` on, which never ends.
-
-    Args:
-        matches: with the augmentation of the training.
-        batch: pairs in a batch of one process. seed: selects batches and augmentation. step: steps done so far.
-        rank, processes: of a distributed training. workers: processes that load; 0: this one.
-    """
+    matches: with the augmentation of the training. batch: pairs in a batch of one process. rank, processes: of a
+    distributed training. workers: processes that load; 0: this one."""
     lengths = None if matches.augmentation is None else matches.augmentation.matches
     similar = SimilarLengthBatches(matches, batch, seed=seed, matches=lengths, rank=rank, world_size=processes)
     return DataLoader(

@@ -55,17 +55,14 @@ def as_correspondences(pair: DatabasePair, cameras: Cameras) -> Correspondences:
     mask: Any = np.isfinite(points[0]).all(-1) & np.isfinite(points[1]).all(-1)
     c = correspondences(*points, mask=mask, focal=focal, key=key, **known)
     if sized or with_K:
-        c = c.derived(shared_focal=torch.tensor([_shared(*images, cameras)]))
+        same = (
+            stored and images[0].camera_id == images[1].camera_id and images[0].deviation > 0
+        )  # and not exactly known
+        c = c.derived(shared_focal=torch.tensor([cameras == "shared" or same]))
     if not stored or all(image.pinhole is image.points for image in images):
         return c
     x0, x1 = (torch.from_numpy(image.pinhole[pair.matches[:, i]])[None] for i, image in enumerate(images))
     return c.derived(x0=x0, x1=x1, mask=torch.isfinite(x0).all(-1) & torch.isfinite(x1).all(-1))
-
-
-def _shared(image0: DatabaseImage, image1: DatabaseImage, cameras: Cameras) -> bool:
-    """Whether both images are known to have one focal length, which is not known exactly."""
-    same = image0.camera_id == image1.camera_id and image0.deviation > 0
-    return cameras == "shared" or (cameras == "stored" and same)
 
 
 SETTINGS = "settings.json"
@@ -177,12 +174,7 @@ class Batch(NamedTuple):
     problems: list[tuple[_PairIds, str]]
 
 
-class Geometries(NamedTuple):
-    """The geometries of a batch's pairs; the problems of the others."""
-
-    ids: list[_PairIds]
-    geometries: list[PairGeometry]
-    problems: list[tuple[_PairIds, str]]
+Geometries = tuple[list[tuple[_PairIds, PairGeometry]], list[tuple[_PairIds, str]]]  # and the problems of the others
 
 
 def estimate_batch(how: Estimation, batch: Batch) -> Geometries:
@@ -202,7 +194,7 @@ def estimate_batch(how: Estimation, batch: Batch) -> Geometries:
         configuration = classify(c, estimate, focal_deviation=0, seed=how.seed)
         of_these = pair_geometries([pairs[i].matches for i in alike], c, estimate, configuration)
         results |= zip(alike, of_these, strict=True)
-    return Geometries(ids, [results[i] for i in range(len(ids))], problems)
+    return [(own, results[i]) for i, own in enumerate(ids)], problems
 
 
 def _alike(given: Sequence[Correspondences]) -> list[list[int]]:
@@ -240,11 +232,16 @@ class VerificationRun:
         todo = self.todo
         if report is not None and todo:
             report(0, len(todo))
+
+        def given_up(batch: Batch, reason: str) -> None:
+            self._keep(batch, ([], [(ids, reason) for ids in batch.ids]))
+
         source: Source[Estimation] = Local(make()) if execution.shared else Factory(make)
         batches = (self._read(todo[start : start + BATCH]) for start in range(0, len(todo), BATCH))
         done = 0
         with WorkerPool(execution, PRELOADED) as pool:
-            for batch in TaskRunner(pool, source, estimate_batch, self._keep, self._give_up, divided).each(batches):
+            runner = TaskRunner(pool, source, estimate_batch, self._keep, given_up, divided)
+            for batch in runner.each(batches):
                 done += len(batch.ids) + len(batch.problems)
                 if report is not None:
                     report(done, len(todo))
@@ -279,16 +276,10 @@ class VerificationRun:
         return batch
 
     def _keep(self, batch: Batch, result: Geometries) -> None:
-        self._note([*batch.problems, *result.problems])
-        if result.ids:
-            self.parts.write(self._counted(zip(result.ids, result.geometries, strict=True)))
-
-    def _give_up(self, batch: Batch, reason: str) -> None:
-        self._note([*batch.problems, *((ids, reason) for ids in batch.ids)])
-
-    def _note(self, problems: Iterable[tuple[_PairIds, str]]) -> None:
-        for pair, problem in problems:
-            self.problems.append(f"{self._names(pair)}: {problem}")
+        geometries, problems = result
+        self.problems += [f"{self._names(pair)}: {problem}" for pair, problem in (*batch.problems, *problems)]
+        if geometries:
+            self.parts.write(self._counted(geometries))
 
     def _names(self, pair: _PairIds) -> str:
         return ", ".join(self.store.name(image) for image in pair)

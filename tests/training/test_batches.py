@@ -58,11 +58,8 @@ def test_batches_are_a_function_of_seed_and_epoch_and_go_on_where_they_stopped()
     epoch = list(batches)
     again = SimilarLengthBatches(Pairs(), 16, seed=2)
     again.set_epoch(7, start=5)
-    state = again.state_dict()
-    fresh = SimilarLengthBatches(Pairs(), 16, seed=2)
-    fresh.load_state_dict(state)
-    assert list(again) == list(fresh) == epoch[5:]
-    assert len(fresh) == len(epoch) - 5
+    assert list(again) == epoch[5:]
+    assert len(again) == len(epoch) - 5
     other = SimilarLengthBatches(Pairs(), 16, seed=3)
     other.set_epoch(7)
     assert list(other) != epoch

@@ -176,13 +176,13 @@ class PointCN(nn.Module):
     """The same perceptrons for every match, which see the others by context norm.
     A perceptron, residual blocks of two layers each, and a perceptron to the outputs."""
 
-    def __init__(self, inputs: int, channels: int, blocks: int, outputs: int = 1) -> None:
+    def __init__(self, inputs: int, channels: int, blocks: int) -> None:
         super().__init__()
         self.p_in = Perceptron(inputs, channels)
         self.blocks = nn.ModuleList(ResidualBlock(channels) for _ in range(blocks))
-        self.p_out = Perceptron(channels, outputs)
+        self.p_out = Perceptron(channels, 1)
 
-    def forward(self, x: Float[Tensor, "b inputs n"], slots: Slots) -> Float[Tensor, "b outputs n"]:
+    def forward(self, x: Float[Tensor, "b inputs n"], slots: Slots) -> Float[Tensor, "b 1 n"]:
         """x has to be zero in masked slots, where the result means nothing."""
         y = slots.clean(torch.relu(self.p_in(x.transpose(0, 1))))
         for block in self.blocks:

@@ -61,19 +61,9 @@ def plain(value: Any) -> Any:
 
 
 def load_weights(network: nn.Module, path: Path, hint: str) -> LearnedFile:
-    """Load a safetensors file into a network, strictly.
-
-    Args:
-        network: built as the file states.
-        path: the file.
-        hint: what makes such a file, for the errors.
-
-    Returns:
-        What else the file says.
-
-    Raises:
-        NetworkFileError: the file is absent, unreadable, or of another network.
-    """
+    """Load a safetensors file into a network, which is built as it states, strictly; what else the file says.
+    hint: what makes such a file, for the errors. Raises NetworkFileError where it is absent, unreadable, or of another
+    network."""
     if not path.is_file():
         raise NetworkFileError(f"{path} does not exist: {hint}")
     try:
