@@ -20,8 +20,7 @@ if TYPE_CHECKING:
     from fmtorch.pipeline.pipeline import Pipeline
     from fmtorch.pipeline.two_images import MatchResult, match
     from fmtorch.two_view.find import find_essential, find_fundamental, find_homography
-    from fmtorch.verification.run import Verification
-    from fmtorch.verification.verify import verify
+    from fmtorch.verification.verify import Verification, verify
 
 __all__ = [
     "Correspondences",

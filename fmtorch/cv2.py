@@ -19,9 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fmtorch.core.types import Estimate
+from fmtorch.two_view import find, planes
 from fmtorch.two_view.arguments import MIN_PIXELS
-from fmtorch.two_view.find import find_essential, find_fundamental, find_homography
-from fmtorch.two_view.planes import COMPARABLE
 
 Matrix = NDArray[np.float64]
 Mask = NDArray[np.uint8]
@@ -90,7 +89,7 @@ def findFundamentalMat(  # OpenCV's name, as all of this module
         return of_all[0], _written(of_all[1], mask)
     scale = _scale_to_pixels([x1, x2], ransacReprojThreshold)
     name, options = _preset(method, scale * ransacReprojThreshold, confidence, maxIters)
-    estimate = find_fundamental(scale * x1, scale * x2, estimator=name, **options)
+    estimate = find.find_fundamental(scale * x1, scale * x2, estimator=name, **options)
     S = np.diag([scale, scale, 1.0])
     return _result(estimate, S @ estimate.F[0].cpu().numpy() @ S, mask)
 
@@ -123,7 +122,7 @@ def findHomography(
     method = opencv.RANSAC if method == opencv.RHO else method
     _, options = _preset(method, scale * ransacReprojThreshold, confidence, maxIters)
     options["inlier_threshold"] = scale * ransacReprojThreshold
-    estimate = find_homography(src, scale * dst, **options)
+    estimate = find.find_homography(src, scale * dst, **options)
     H, inliers = _result(estimate, np.diag([1 / scale, 1 / scale, 1.0]) @ estimate.F[0].cpu().numpy(), mask)
     return H, np.zeros((len(src), 1), np.uint8) if inliers is None else inliers
 
@@ -152,7 +151,7 @@ def findEssentialMat(points1: Any, points2: Any, *arguments: Any, **named: Any) 
     S = np.diag([scale, scale, 1])
     prob, threshold = rest.get("prob"), rest.get("threshold", 1.0)
     name, options = _preset(rest.get("method", opencv.RANSAC), scale * threshold, prob, rest.get("maxIters"))
-    estimate = find_essential(scale * x1, scale * x2, S @ K1, S @ K2, estimator=name, **options)
+    estimate = find.find_essential(scale * x1, scale * x2, S @ K1, S @ K2, estimator=name, **options)
     valid = bool(estimate.ok[0]) and estimate.E is not None and bool(estimate.E.isfinite().all())
     if not valid or estimate.E is None:
         return None, _written(None, rest.get("mask"))
@@ -183,10 +182,8 @@ def recoverPose(*arguments: Any, **named: Any) -> Any:
         _points_of(given["points1"], "points1"), _points_of(given["points2"], "points2"),
         tuple(given[name] for name in names[2:6]), {},
     )  # fmt: skip
-    y1, y2 = (
-        opencv.undistortPoints(x[:, None], np.asarray(given[f"cameraMatrix{i}"], float), None)
-        for i, x in ((1, x1), (2, x2))
-    )
+    matrices = (np.asarray(given[name], float) for name in ("cameraMatrix1", "cameraMatrix2"))
+    y1, y2 = (opencv.undistortPoints(x[:, None], K, None) for x, K in zip((x1, x2), matrices, strict=True))
     retval, R, t, mask, _ = opencv.recoverPose(E, y1, y2, np.eye(3), distanceThresh=FARTHEST, mask=inliers)
     for name, value in (("E", E), ("R", R), ("t", t), ("mask", mask)):
         _put(value, given.get(name))
@@ -217,9 +214,8 @@ def _preset(
 ) -> tuple[str, dict[str, Any]]:
     """The preset of a flag and its options. Raises TypeError or ValueError where there is none."""
     if not isinstance(method, int | np.integer):
-        raise TypeError(
-            f"method is a {type(method).__name__}; UsacParams are of OpenCV's own search: call its function"
-        )
+        kind = type(method).__name__
+        raise TypeError(f"method is a {kind}; UsacParams are of OpenCV's own search: call its function")
     method = int(method)
     if method not in PRESETS:
         raise ValueError(f"method is {method}; it must be one of {sorted(PRESETS)}, OpenCV's RANSAC, LMEDS and USAC_*")
@@ -242,7 +238,7 @@ def _scale_to_pixels(points: list[Matrix], threshold: float | int, src: Matrix |
     if src is None or not 0 < threshold < SUBPIXEL or len(src) < 2:
         return 1.0
     extents = [float(np.ptp(x[np.isfinite(x).all(1)], axis=0).max(initial=0.0)) for x in (src, points[0])]
-    comparable = extents[0] < COMPARABLE * extents[1] and extents[1] < COMPARABLE * extents[0]
+    comparable = extents[0] < planes.COMPARABLE * extents[1] and extents[1] < planes.COMPARABLE * extents[0]
     return 1.0 if comparable else USUAL_THRESHOLD / threshold
 
 
@@ -291,9 +287,7 @@ def _calibrated(
     x1: Matrix, x2: Matrix, arguments: tuple[Any, ...], named: dict[str, Any]
 ) -> tuple[Matrix, Matrix, Matrix, Matrix, dict[str, Any]]:
     """Points without distortion, the camera matrices, and the other arguments by name, of any form of OpenCV's."""
-    first = (
-        arguments[0] if arguments else next((named[n] for n in ("cameraMatrix", "cameraMatrix1") if n in named), 1.0)
-    )
+    first = arguments[0] if arguments else named.get("cameraMatrix", named.get("cameraMatrix1", 1.0))
     two = "cameraMatrix2" in named or (len(arguments) > 3 and np.shape(arguments[2]) == (3, 3))
     rest = ("method", "prob", "threshold", "maxIters", "mask")
     if np.shape(first) != (3, 3):

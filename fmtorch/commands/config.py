@@ -21,12 +21,10 @@ from omegaconf import DictConfig
 from omegaconf.errors import GrammarParseError, OmegaConfBaseException
 
 from fmtorch.commands.options import COMMANDS, Command
-from fmtorch.core.failures import own_traceback
+from fmtorch.core import failures, terminal
 from fmtorch.core.files import STAGES, conf_dir
 from fmtorch.core.options import nearest
-from fmtorch.core.terminal import MISTAKES, error_line, errors, exits_with_message
-from fmtorch.presets import available
-from fmtorch.presets.composition import path_fields, with_explicit
+from fmtorch.presets import available, composition
 from fmtorch.presets.files import groups
 
 Task = Callable[[DictConfig], None]
@@ -53,20 +51,20 @@ def job(task: Task) -> Task:
     def wrapped(config: DictConfig) -> None:
         try:
             _expect_known(HydraConfig.get().overrides.task)
-            task(with_explicit(config, HydraConfig.get().overrides.task))
+            task(composition.with_explicit(config, HydraConfig.get().overrides.task))
         except Exception as error:
             if config.get("debug"):  # show all of the traceback, and what it leads to
                 traceback.print_exception(error)
                 if config.debug == "pdb":
                     pdb.post_mortem(error.__traceback__)
                 sys.exit(1)
-            if trace := own_traceback(error):
-                errors.print(trace, soft_wrap=True)
-            if not (trace or isinstance(error, MISTAKES)):
+            if trace := failures.own_traceback(error):
+                terminal.errors.print(trace, soft_wrap=True)
+            if not (trace or isinstance(error, terminal.MISTAKES)):
                 raise
             if HydraConfig.get().mode == RunMode.MULTIRUN:
-                raise Mistake(error_line(error)) from None
-            sys.exit(f"error: {error_line(error)}")
+                raise Mistake(terminal.error_line(error)) from None
+            sys.exit(f"error: {terminal.error_line(error)}")
 
     return wrapped
 
@@ -85,8 +83,8 @@ def chosen_pipeline() -> tuple[str, list[str]]:
 def run_command(command: Command, task: Task) -> None:
     """Run a `job` on the config that a command's declaration and the command line compose.
     task: a `job` that its module holds under its own name, so that launchers can send it to other processes."""
-    with exits_with_message(command.interrupted):
-        paths = [*path_fields(command.options), *command.texts]
+    with terminal.exits_with_message(command.interrupted):
+        paths = [*composition.path_fields(command.options), *command.texts]
         sys.argv[1:] = hydra_arguments(sys.argv[1:], paths, command.positional)
         if any(word.startswith("hydra/launcher=submitit") for word in sys.argv):
             print(SUBMITTED, flush=True)

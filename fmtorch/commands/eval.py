@@ -18,10 +18,9 @@ from fmtorch.commands.report import by_dataset, named
 from fmtorch.core.files import replacing
 from fmtorch.core.terminal import console, errors, progress_bars, reporter
 from fmtorch.data import ImagePair
-from fmtorch.evaluation.curves import picture
+from fmtorch.evaluation import curves, tables
 from fmtorch.evaluation.run import built_with, cameras_of, evaluate_pairs, run_identity, select
 from fmtorch.evaluation.statistics import ALL, Group, summarize
-from fmtorch.evaluation.tables import summary_markdown, terminal_tables
 from fmtorch.io.export import export_kinds, write_exports
 from fmtorch.io.match_store import MatchStore
 from fmtorch.jobs.execution import MIN_PAIRS_FOR_PROCESSES, Execution, shard_of
@@ -128,11 +127,11 @@ def _summarize(table: pa.Table, folder: RunFolder, title: str, signed: bool) -> 
     run_table = folder.read()
     summary = summarize(table, signed)
     all_rows = summary if len(run_table) == len(table) else summarize(run_table, signed)
-    folder.write_summary(all_rows, summary_markdown(all_rows, title=title))
+    folder.write_summary(all_rows, tables.summary_markdown(all_rows, title=title))
     with replacing(folder.path / "recall.svg") as path:
-        path.write_text(picture(title.partition(" ")[0], run_table), encoding="utf-8")
+        path.write_text(curves.picture(title.partition(" ")[0], run_table), encoding="utf-8")
     part = "" if len(run_table) == len(table) else f", {len(table)} of the {len(run_table)} pairs of the run"
-    for each in terminal_tables(summary, f"{title}{part}", console.width):
+    for each in tables.terminal_tables(summary, f"{title}{part}", console.width):
         console.print(each)
     about = f"; of all {len(run_table)} pairs" if part else ""
     written = f"{folder.path}: pairs/, summary.json, summary.md, recall.svg{about}"
@@ -183,5 +182,5 @@ def _print_sweep(folders: Sequence[str]) -> None:
     runs = named([RunFolder.load(path) for path in paths]) if len(paths) > 1 else []
     for heading, group in by_dataset(runs).items():
         figures = {r.name: summarize(r.table, r.folder.config.get("pose") is not None)[ALL] for r in group}
-        for table in terminal_tables(figures, f"{len(group)} runs on {heading}", console.width):
+        for table in tables.terminal_tables(figures, f"{len(group)} runs on {heading}", console.width):
             console.print(table)

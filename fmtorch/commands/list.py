@@ -2,9 +2,8 @@
 
 import sys
 
-from fmtorch.core.files import conf_dir
+from fmtorch.core import files, terminal
 from fmtorch.core.options import nearest
-from fmtorch.core.terminal import console, exits_with_message
 from fmtorch.presets.files import available, groups, summary
 
 USAGE = """fmtorch list: the presets of all groups, or of some; those of FM-Bench's paper, paper/NAME, last
@@ -29,7 +28,7 @@ def listed(group: str) -> list[str]:
         if (inside := name.rpartition("/")[0]) != folder:
             folder = inside
             lines.append(f"  {HEADINGS.get(folder, folder)}:")
-        lines.append(f"  {name:{width}}  {summary(conf_dir() / group / f'{name}.yaml')}")
+        lines.append(f"  {name:{width}}  {summary(files.conf_dir() / group / f'{name}.yaml')}")
     return lines
 
 
@@ -38,9 +37,9 @@ def main() -> None:
     if {"--help", "-h"} & set(sys.argv[1:]):
         print(USAGE + ", ".join(groups()))
         return
-    with exits_with_message():
+    with terminal.exits_with_message():
         for group in sys.argv[1:] or groups():
             lines = listed(group)
-            console.print(group, style="bold")
+            terminal.console.print(group, style="bold")
             for line in lines:
-                console.print(line, soft_wrap=True)
+                terminal.console.print(line, soft_wrap=True)

@@ -29,8 +29,7 @@ from fmtorch.core.version import __version__
 from fmtorch.data.images import read_image, stored_orientation
 from fmtorch.evaluation.curves import view_graph_svg
 from fmtorch.features.vlad import descriptor_kind, image_vector
-from fmtorch.io.export import ViewGraph, export_kinds, view_graph, write_exports, write_view_graph
-from fmtorch.io.match_store import MatchStore
+from fmtorch.io import export, match_store
 from fmtorch.jobs.execution import MIN_PAIRS_FOR_PROCESSES
 from fmtorch.metrics import nsgd
 from fmtorch.pipeline import folder as folders
@@ -50,7 +49,7 @@ def match_folder(
     Raises ValueError for what the options cannot mean, and where no pair could be matched."""
     folder = fields.images
     assert folder is not None
-    kinds = export_kinds(fields.export)
+    kinds = export.export_kinds(fields.export)
     if fields.camera == "shared" and "colmap" not in kinds:
         raise ValueError("camera=shared needs export=colmap; cameras=shared is what is known of the photographs")
     images = folders.images_below(folder)
@@ -67,7 +66,7 @@ def match_folder(
         "version": fmtorch_version(), "images": str(folder.absolute()), **stages, "seed": fields.seed,
         "orient": fields.orient, "longest_side": fields.longest_side, **cameras.identity,
     }  # fmt: skip
-    journal = MatchStore(folders.open_folder(output, identity), folder)
+    journal = match_store.MatchStore(folders.open_folder(output, identity), folder)
     scratch = journal.folder / "features"
     if len(images) > folders.MEMORY and not isinstance(pipeline.extractor, CachedFeatures):  # none is computed twice
         pipeline.extractor = cached(pipeline.extractor, scratch)
@@ -88,10 +87,10 @@ def match_folder(
             pass
     shutil.rmtree(scratch, ignore_errors=True)
     _expect_some(work, len(pairs))
-    graph = view_graph(journal, images, pairs)
+    graph = export.view_graph(journal, images, pairs)
     shared = fields.camera == "shared" or cameras.word == "shared"
-    written = ["export.json", *write_exports(journal, pairs, kinds, output, shared)]
-    written += [*write_view_graph(graph, output), _draw_graph(graph, folder, fields.orient, output)]
+    written = ["export.json", *export.write_exports(journal, pairs, kinds, output, shared)]
+    written += [*export.write_view_graph(graph, output), _draw_graph(graph, folder, fields.orient, output)]
     _say(work, graph, len(pairs))
     console.print(f"{output}: {', '.join(written)}", style="dim")
     if "colmap" in kinds and fields.orient:
@@ -110,7 +109,7 @@ def _expect_some(work: FolderMatches, pairs: int) -> None:
         raise ValueError(f"no pair could be matched, the first because: {work.troubles[0]}")
 
 
-def _say(work: FolderMatches, graph: ViewGraph, pairs: int) -> None:
+def _say(work: FolderMatches, graph: export.ViewGraph, pairs: int) -> None:
     sizes = [len(part) for part in graph.components() if len(part) > 1]
     apart = len(graph.images) - sum(sizes)
     console.print(f"{work.related} of {pairs} pairs show one scene")
@@ -129,7 +128,7 @@ def _say_turned(images: Sequence[Path], folder: Path) -> None:
         )
 
 
-def _draw_graph(graph: ViewGraph, folder: Path, orient: bool, output: Path) -> str:
+def _draw_graph(graph: export.ViewGraph, folder: Path, orient: bool, output: Path) -> str:
     def read(name: str) -> NDArray[np.uint8] | None:
         try:
             return read_image(folder / name, orient=orient)
@@ -189,17 +188,14 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
         if fields.image0 is not None or fields.image1 is not None or fields.truth is not None:
             raise ValueError("images takes a folder; image0, image1 and truth are of a single pair")
         return match_folder(config, fields, PhotographCameras(fields.cameras, fields.K), pipeline_name, overrides)
-    if fields.camera != "per_image":
-        raise ValueError(
-            f"camera is of a folder's database; cameras={fields.camera} is what is known of two photographs"
-        )
+    if (camera := fields.camera) != "per_image":
+        raise ValueError(f"camera is of a folder's database; cameras={camera} is what is known of two photographs")
     if fields.export is not None or str(fields.pairs or EXHAUSTIVE) != EXHAUSTIVE:
         raise ValueError("export and pairs are of a folder of images: give images=FOLDER")
     paths = _given(fields.image0, fields.image1)
     presets.expect_stages(config)
     truth = None if fields.truth is None else read_matrix(fields.truth)
     given = photographs(paths, fields.cameras, fields.K, fields.orient)
-    image0, image1 = given.images
     settings = {
         "pipeline": pipeline_name, "overrides": list(overrides), "seed": fields.seed, "orient": fields.orient,
         "longest_side": fields.longest_side, "truth": None if fields.truth is None else str(fields.truth),
@@ -208,9 +204,8 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
     folder = fields.output or _default_output(paths, settings)
     expect_writable(folder)
     pipeline: Pipeline = build_pipeline(config, presets.resolve_device(fields.device))
-    result = match(
-        image0, image1, pipeline=pipeline, longest_side=fields.longest_side, seed=fields.seed, **given.knowledge
-    )
+    options = {"longest_side": fields.longest_side, "seed": fields.seed, **given.knowledge}
+    result = match(*given.images, pipeline=pipeline, **options)
     error = None if truth is None or not result.ok else _nsgd(result, truth)
     report = {"version": __version__, **settings, "image0": str(paths[0]), "image1": str(paths[1])}
     written = result.save(folder, truth=truth, report=report | ({} if error is None else {"nsgd": error}))
@@ -305,10 +300,9 @@ def _table(result: MatchResult, cached: bool) -> Table:
     table.add_column("step")
     table.add_column("left", justify="right")
     table.add_column("seconds", justify="right")
+    keypoints = [len(result.keypoints0), len(result.keypoints1)]
     for step, seconds in result.seconds.items():
-        counts = (
-            [len(result.keypoints0), len(result.keypoints1)] if step == "features" else [result.counts.get(step, 0)]
-        )
+        counts = keypoints if step == "features" else [result.counts.get(step, 0)]
         unit = {"features": "keypoints", "estimation": "inliers"}.get(step, "matches")
         left = f"{' + '.join(f'{count:,}' for count in counts)} {unit}"
         table.add_row(

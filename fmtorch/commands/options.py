@@ -10,11 +10,9 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from fmtorch.core.files import STAGES
-from fmtorch.core.options import Cache, Count, Device, Gigabytes, Seed, Within, defaults_of, option
+from fmtorch.core.options import CACHE, CACHE_LIMIT, Cache, Count, Device, Gigabytes, Seed, Within, defaults_of, option
 from fmtorch.training.options import TrainOptions
 
-CACHE = "folder of features computed before; null: features in $FMTORCH_CACHE or ~/.cache/fmtorch; off: none"
-CACHE_LIMIT = "GB, beyond which the least recently used features go; null: no bound"
 DEVICE = "auto | cpu | cuda | cuda:1 | mps"
 DEBUG = "true: stop at the first error of a part and show all of its traceback; pdb: and look at it in the debugger"
 Debug = bool | Literal["pdb"]

@@ -12,8 +12,7 @@ from rich.progress import track
 from fmtorch import presets
 from fmtorch.commands.config import job, run_command
 from fmtorch.commands.options import REPORT, ReportOptions
-from fmtorch.core.files import expect_writable, replacing
-from fmtorch.core.terminal import console
+from fmtorch.core import files, terminal
 from fmtorch.evaluation.curves import axis_of
 from fmtorch.evaluation.gallery import Options, Run, gallery
 from fmtorch.evaluation.page import Section, render, run_names, shared_settings
@@ -33,12 +32,12 @@ def run(config: DictConfig) -> Path:
     options = Options(fields.pictures, places, fields.own_code, device, config.cache, fields.cache_limit)
     beside = paths[0].parent if (paths[0] / "run.json").exists() else paths[0]
     output = fields.output or beside / "report.html"
-    expect_writable(output.parent)
+    files.expect_writable(output.parent)
     if output.is_dir():
         raise ValueError(f"output={output} is a folder; it must name a file")
     sections, groups = [], by_dataset(runs)
     for heading, group in groups.items():
-        bar = functools.partial(track, description="drawing pairs", console=console, transient=True)
+        bar = functools.partial(track, description="drawing pairs", console=terminal.console, transient=True)
         pairs, notes = gallery(group, options, bar)
         signed = [r.name for r in group if r.folder.config.get("pose") is not None]
         sections.append(Section(heading, {r.name: r.table for r in group}, pairs, notes, signed))
@@ -49,12 +48,12 @@ def run(config: DictConfig) -> Path:
         for (heading, name, folder), own in zip(ran, settings, strict=True)
     ]
     page = render(str(config.title), sections, rows, shared_settings([r.folder.config for r in runs]))
-    with replacing(output) as temporary:
+    with files.replacing(output) as temporary:
         temporary.write_text(page, encoding="utf-8")
     for section in sections:
         for note in section.notes:
-            console.print(f"{section.heading}: {note}")
-    console.print(f"{output}: {len(runs)} runs, {output.stat().st_size / 2**20:.1f} MB", style="dim")
+            terminal.console.print(f"{section.heading}: {note}")
+    terminal.console.print(f"{output}: {len(runs)} runs, {output.stat().st_size / 2**20:.1f} MB", style="dim")
     return output
 
 

@@ -16,8 +16,7 @@ from fmtorch.commands.options import VERIFY, VerifyOptions
 from fmtorch.core.terminal import console, errors, progress_bars, reporter
 from fmtorch.jobs.execution import shard_of
 from fmtorch.presets.composition import execution_of, plain, read_fields
-from fmtorch.verification.run import Verification
-from fmtorch.verification.verify import ONE_THREAD, VerifyMode, VerifyPaths, verify_by
+from fmtorch.verification.verify import ONE_THREAD, Verification, VerifyMode, VerifyPaths, verify_by
 
 MAX_PROBLEMS = 20  # that are printed
 

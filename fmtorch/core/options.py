@@ -64,6 +64,8 @@ Seed = Annotated[int, Within(-(2**63), 2**63 - 1)]
 Device = Annotated[str, DeviceName()]
 Cache = Path | bool | None  # false is off
 Gigabytes = Annotated[int | float, Within(0)]
+CACHE = "folder of features computed before; null: features in $FMTORCH_CACHE or ~/.cache/fmtorch; off: none"
+CACHE_LIMIT = "GB, beyond which the least recently used features go; null: no bound"
 
 
 def option(default: T, about: str) -> T:

@@ -16,8 +16,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from fmtorch.core.annotations import Expected, arrays_of
-from fmtorch.core.files import replacing
+from fmtorch.core import annotations, files
 
 Index = int | slice | Sequence[int] | Sequence[bool] | Tensor
 AnyRecord = TypeVar("AnyRecord", bound="Record")
@@ -31,11 +30,11 @@ class Record:
     declared: what the annotations of a kind's tensors say, by field. per_slot: the fields with an entry for each
     slot."""
 
-    declared: ClassVar[Mapping[str, Expected]] = {}
+    declared: ClassVar[Mapping[str, annotations.Expected]] = {}
     per_slot: ClassVar[tuple[str, ...]] = ()
 
     def __init_subclass__(cls) -> None:
-        cls.declared = arrays_of(cls)
+        cls.declared = annotations.arrays_of(cls)
         cls.per_slot = tuple(name for name, field in cls.declared.items() if SLOTS in field.shape)
 
     def to(self: AnyRecord, device: torch.device | str) -> AnyRecord:
@@ -74,7 +73,7 @@ class Record:
         tensors = {name: value.detach().cpu().clone() for name, value in values.items() if isinstance(value, Tensor)}
         plain = {name: value for name, value in values.items() if not isinstance(value, Tensor | None)}
         told = {"record": type(self).__name__, "fields": json.dumps(plain)}
-        with replacing(Path(path)) as temporary:
+        with files.replacing(Path(path)) as temporary:
             save_file({name: value.contiguous() for name, value in tensors.items()}, temporary, told)
 
     @classmethod

@@ -111,13 +111,9 @@ def svg(title: str, curves: Mapping[str, NDArray[np.float64]], order: Sequence[s
         y = _y(percent / 100)
         parts.append(f'<line class="grid" x1="{_LEFT}" x2="{_WIDTH - _RIGHT}" y1="{y:.1f}" y2="{y:.1f}"/>')
         parts.append(f'<text x="{_LEFT - 6}" y="{y + 4:.1f}" text-anchor="end">{percent}</text>')
-    parts += [
-        f'<text x="{_x(tick / axis.maximum):.1f}" y="{_HEIGHT - 22}" text-anchor="middle">{tick:g}</text>'
-        for tick in axis.ticks
-    ]
-    parts.append(
-        f'<text x="{(_LEFT + _WIDTH - _RIGHT) / 2:.0f}" y="{_HEIGHT - 5}" text-anchor="middle">{axis.label}</text>'
-    )
+    middle = 'text-anchor="middle"'
+    parts += [f'<text x="{_x(t / axis.maximum):.1f}" y="{_HEIGHT - 22}" {middle}>{t:g}</text>' for t in axis.ticks]
+    parts.append(f'<text x="{(_LEFT + _WIDTH - _RIGHT) / 2:.0f}" y="{_HEIGHT - 5}" {middle}>{axis.label}</text>')
     x = _x(axis.mark / axis.maximum)
     parts.append(f'<line class="mark" x1="{x:.1f}" x2="{x:.1f}" y1="{_y(1.0):.1f}" y2="{_y(0.0):.1f}"/>')
     for name in reversed(list(curves)):

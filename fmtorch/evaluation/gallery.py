@@ -12,8 +12,7 @@ import torch
 from omegaconf import OmegaConf
 
 from fmtorch import data, presets
-from fmtorch.data import DataError, ImageError, ImagePair, PairDataset, read_image
-from fmtorch.data.pair_list import PairList
+from fmtorch.data import DataError, ImageError, ImagePair, PairDataset, pair_list, read_image
 from fmtorch.evaluation.page import Picture, Shown, ShownPair, differing_pairs
 from fmtorch.evaluation.run import PLACES
 from fmtorch.io.dataset import WITHOUT_GEOMETRY, H5Pairs
@@ -24,16 +23,17 @@ from fmtorch.pipeline.pipeline import Outcome, Pipeline, build_pipeline
 from fmtorch.runs import RunFolder
 from fmtorch.scenes import RenderedPairs
 
+Row = Mapping[str, Any]  # what a run stored of a pair
 SAME_F = 1e-12  # difference of any element, of unit Frobenius norm, within which two F are the same
 SAME_CORNERS = 0.01  # px, corner error up to which two homographies are the same: what captions show
 SAME_NSGD = 1e-4  # between the F of a run and the one drawn again, up to which they are the same: what captions show
 
 
-def difference(pair: ImagePair, images: Sequence[Image], stored: Mapping[str, Any], outcome: Outcome) -> str:
+def difference(pair: ImagePair, images: Sequence[Image], stored: Row, outcome: Outcome) -> str:
     """What differs between the row of a pair and what its pipeline makes of it now; empty where nothing does."""
     again, reason = outcome.estimate, outcome.reason
     if pair.H is not None:
-        return _difference_of_homographies(pair, images, stored, outcome)
+        return _other_homography(pair, images, stored, outcome)
     if again is None or not bool(again.ok[0]):
         return f"gives no F when it is drawn again ({reason}), unlike in its run" if stored["ok"] else ""
     run = torch.tensor(stored["F"], dtype=torch.float64) if stored["ok"] else None
@@ -56,9 +56,7 @@ def difference(pair: ImagePair, images: Sequence[Image], stored: Mapping[str, An
     )
 
 
-def _difference_of_homographies(
-    pair: ImagePair, images: Sequence[Image], stored: Mapping[str, Any], outcome: Outcome
-) -> str:
+def _other_homography(pair: ImagePair, images: Sequence[Image], stored: Row, outcome: Outcome) -> str:
     again = outcome.estimate
     if again is None or not bool(again.ok[0]) or not stored["ok"]:
         has_homography = again is not None and bool(again.ok[0])
@@ -69,9 +67,7 @@ def _difference_of_homographies(
     return "" if apart <= SAME_CORNERS else f"gives another homography when it is drawn again, {apart:.2f} px apart"
 
 
-def drawn(
-    pair: ImagePair, images: Sequence[Image], stored: Mapping[str, Any], outcome: Outcome, name: str
-) -> list[Picture]:
+def drawn(pair: ImagePair, images: Sequence[Image], stored: Row, outcome: Outcome, name: str) -> list[Picture]:
     """A run's matches of a pair, drawn again, and the epipolar lines of the F that it stored.
     Of a pair that has no F, its matches; nothing where there are none, or none of an F that was stored."""
     c, estimate = outcome.correspondences, outcome.estimate
@@ -91,7 +87,7 @@ def drawn(
     return pictures
 
 
-def from_stored(pair: ImagePair, images: Sequence[Image], stored: Mapping[str, Any], name: str) -> list[Picture]:
+def from_stored(pair: ImagePair, images: Sequence[Image], stored: Row, name: str) -> list[Picture]:
     """The epipolar lines of the F that a run stored, of corners of the images; nothing of a pair without F."""
     if not stored["ok"] or pair.H is not None:
         return []
@@ -154,7 +150,7 @@ def gallery(
     return shown, notes if shown else ["No pictures: the data set does not hold the pairs of the runs."]
 
 
-def find_dataset(stored: Mapping[str, Any], options: Options) -> PairDataset:
+def find_dataset(stored: Row, options: Options) -> PairDataset:
     """The data set that a run evaluated, in the first of the roots that holds it.
     stored: its config and digest in the run's identity. A run of others' results, which names no data set, is looked
     for in the roots in the layout of `fmbench`. Raises DataError where it is another or nowhere to be found."""
@@ -180,7 +176,7 @@ def _places(known: Mapping[str, Any], roots: Sequence[Path]) -> list[dict[str, A
     target = presets.target_of(known, "dataset")
     taken = [name for name in PLACES if name in inspect.signature(target).parameters] or ["root"]
     places: list[dict[str, Any]] = [{taken[0]: root} for root in roots]
-    if target is PairList:
+    if target is pair_list.PairList:
         places = [{"root": r, "file": f} for r in roots if r.is_dir() for f in roots if f.is_file()]
     elif target is H5Pairs:
         other = "truth" if known.get("layout") in WITHOUT_GEOMETRY else "images"

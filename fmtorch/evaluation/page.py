@@ -13,8 +13,7 @@ import pyarrow as pa
 
 from fmtorch import presets
 from fmtorch.core.settings import leaves
-from fmtorch.evaluation import curves, tables
-from fmtorch.evaluation.statistics import THRESHOLD, summarize
+from fmtorch.evaluation import curves, statistics, tables
 from fmtorch.pipeline.photographs import Image
 from fmtorch.pipeline.pictures import jpeg_url
 
@@ -55,7 +54,7 @@ class Shown:
     def good(self) -> bool:
         if self.corner_error is not None:
             return self.corner_error < curves.CORNERS.mark
-        return self.nsgd is not None and self.nsgd < THRESHOLD
+        return self.nsgd is not None and self.nsgd < statistics.THRESHOLD
 
     @property
     def result(self) -> str:
@@ -98,7 +97,7 @@ def render(
         raise ImportError("a report needs jinja2: pip install 'fmtorch[report]'") from error
     names = list(dict.fromkeys([*(row[0] for row in runs), *(name for s in sections for name in s.runs)]))
     script = curves.resource("report.js")
-    options = {"undefined": jinja2.StrictUndefined, "trim_blocks": True, "lstrip_blocks": True}
+    options: dict[str, Any] = {"undefined": jinja2.StrictUndefined, "trim_blocks": True, "lstrip_blocks": True}
     return jinja2.Environment(autoescape=True, **options).from_string(curves.resource("report.html.j2")).render(
         title=title, runs=runs, shared=shared, names=names,
         swatches={name: curves.swatch(i) for i, name in enumerate(names)},
@@ -136,7 +135,7 @@ def differing_pairs(runs: Mapping[str, pa.Table], count: int) -> list[str]:
 
 
 def _context(section: Section, names: Sequence[str]) -> dict[str, Any]:
-    summaries = {name: summarize(table, name in section.signed) for name, table in section.runs.items()}
+    summaries = {name: statistics.summarize(table, name in section.signed) for name, table in section.runs.items()}
     axis = curves.axis_of(section.runs)
     pairs = {table.num_rows for table in section.runs.values()}
     facts = f"{len(section.runs)} runs" if len(section.runs) > 1 else "One run"

@@ -33,8 +33,7 @@ from fmtorch.pipeline.pipeline import Outcome, Pipeline, examined
 from fmtorch.presets import plain
 from fmtorch.runs import CachedFeatures, PairRow
 from fmtorch.runs.fingerprint import code_digest, file_digest, fmtorch_version, learned, libraries
-from fmtorch.two_view.known_cameras import KnownCameras
-from fmtorch.two_view.pair_type import compile_with
+from fmtorch.two_view import known_cameras, pair_type
 
 PLACES = ("root", "file", "truth", "images")
 """Options of data sets that say where things lie; the digest says what they are."""
@@ -164,7 +163,7 @@ class WithPairCameras:
 
     def __init__(self, estimator: Estimator, cameras: Mapping[int, PairCameras]) -> None:
         """cameras: of `cameras_of`, of all pairs that will come; or they are added before their pairs come."""
-        self._estimator, self.cameras = KnownCameras(estimator), dict(cameras)
+        self._estimator, self.cameras = known_cameras.KnownCameras(estimator), dict(cameras)
 
     def __call__(self, c: Correspondences, seed: int = 0) -> Estimate:
         return self._estimator(self.given(c), seed)
@@ -225,7 +224,7 @@ def evaluate_batch(pipeline: Pipeline, batch: Batch) -> Work:
     if batch.cameras is not None:
         assert isinstance(pipeline.estimator, WithPairCameras)
         pipeline.estimator.cameras |= batch.cameras
-    compile_with([*pipeline.pruners.values(), pipeline.estimator])
+    pair_type.compile_with([*pipeline.pruners.values(), pipeline.estimator])
     knowledge = pipeline.estimator.given if isinstance(pipeline.estimator, WithPairCameras) else None
     outcomes = examined(pipeline, pipeline.run(batch.pairs, batch.seed), batch.seed, knowledge)
     records = match_records(pipeline, outcomes) if batch.export else None

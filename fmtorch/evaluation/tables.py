@@ -6,16 +6,14 @@ from typing import NamedTuple
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 from rich import box
 from rich.console import Console
 from rich.measure import Measurement
 from rich.table import Table as TerminalTable
 
 from fmtorch.core.types import PAIR_TYPES
-from fmtorch.evaluation import statistics
-from fmtorch.evaluation.curves import NSGD, axis_of
-from fmtorch.evaluation.statistics import ALL, LEVEL, MIN_UNITS, STAGES, THRESHOLD, Group, Interval
+from fmtorch.evaluation import curves, statistics
+from fmtorch.evaluation.statistics import ALL, LEVEL, MIN_UNITS, STAGES, THRESHOLD, Group, Interval, Values
 
 Columns = Mapping[str, Callable[[Group], str]]  # what stands below a heading, of the figures of a row
 Summaries = Mapping[str, Mapping[str, Group]]  # of `summarize`, by the runs' names
@@ -348,7 +346,7 @@ def _families(summaries: Summaries) -> Table | None:
 def _differences(runs: Mapping[str, pa.Table]) -> Table | None:
     if len(runs) < 2:
         return None
-    axis = axis_of(runs)
+    axis = curves.axis_of(runs)
     first, *others = runs
     keys, families, scenes = (runs[first][name].to_pylist() for name in ("key", "family", "scene"))
     scene = dict(zip(keys, statistics.scene_names(families, scenes), strict=True))
@@ -357,19 +355,16 @@ def _differences(runs: Mapping[str, pa.Table]) -> Table | None:
         two = {first: runs[first], other: runs[other]}
         a, b = common(two, axis.column)
         counts.append(len(a))
-        compared.append(_ahead(a, b, [scene[key] for key in shared_keys(two)], axis is NSGD))
+        compared.append(_ahead(a, b, [scene[key] for key in shared_keys(two)], axis is curves.NSGD))
     ends = [abs(end) for cells in compared for _, i in cells if i for end in (i.low, i.high)]
     widest = max(ends, default=1.0) or 1.0
     rows = {
         name: [Cell(f"{count:,}"), *(Cell(text, bar=_around_zero(i, widest)) for text, i in cells)]
         for name, count, cells in zip(others, counts, compared, strict=True)
     }
-    figures = [f"recall at {THRESHOLD}", f"at {statistics.FINE_THRESHOLD}", "AUC@0.05"]
-    head = [
-        "run",
-        "shared pairs",
-        *(figures if axis is NSGD else [f"AUC@{t} px" for t in statistics.CORNER_THRESHOLDS]),
-    ]
+    of_nsgd = [f"recall at {THRESHOLD}", f"at {statistics.FINE_THRESHOLD}", "AUC@0.05"]
+    figures = of_nsgd if axis is curves.NSGD else [f"AUC@{t} px" for t in statistics.CORNER_THRESHOLDS]
+    head = ["run", "shared pairs", *figures]
     note = (
         f"In points; positive where {first} is ahead of the row's run. In brackets the paired {LEVEL:.0%} interval "
         f"(Bonett and Price's for recall, a bootstrap for AUC@0.05 from {MIN_UNITS} scenes or pairs on): a difference "
@@ -378,14 +373,11 @@ def _differences(runs: Mapping[str, pa.Table]) -> Table | None:
     return Table(f"{first} minus each other run, pair by pair", head, rows, note)
 
 
-def _ahead(
-    a: NDArray[np.float64], b: NDArray[np.float64], scenes: Sequence[str], of_nsgd: bool
-) -> list[tuple[str, Interval | None]]:
+def _ahead(a: Values, b: Values, scenes: Sequence[str], of_nsgd: bool) -> list[tuple[str, Interval | None]]:
     """Differences of recall at both thresholds and of AUC@0.05, or of areas below corner errors, of the same pairs."""
     if of_nsgd:
-        values = [
-            (statistics.recalled(a, t), statistics.recalled(b, t), True) for t in (THRESHOLD, statistics.FINE_THRESHOLD)
-        ]
+        limits = THRESHOLD, statistics.FINE_THRESHOLD
+        values = [(statistics.recalled(a, t), statistics.recalled(b, t), True) for t in limits]
         values.append((statistics.areas(a), statistics.areas(b), False))
     else:
         values = [(_area(a, t), _area(b, t), False) for t in statistics.CORNER_THRESHOLDS]
@@ -397,8 +389,8 @@ def _ahead(
     return cells
 
 
-def _area(errors: NDArray[np.float64], threshold: float) -> NDArray[np.float64]:
-    area: NDArray[np.float64] = np.clip(1 - np.nan_to_num(errors, nan=np.inf) / threshold, 0, 1)
+def _area(errors: Values, threshold: float) -> Values:
+    area: Values = np.clip(1 - np.nan_to_num(errors, nan=np.inf) / threshold, 0, 1)
     return area
 
 
@@ -430,7 +422,7 @@ def shared_keys(runs: Mapping[str, pa.Table]) -> list[int]:
     return [key for key in tables[0]["key"].to_pylist() if key in shared]
 
 
-def common(runs: Mapping[str, pa.Table], column: str) -> list[NDArray[np.float64]]:
+def common(runs: Mapping[str, pa.Table], column: str) -> list[Values]:
     """A column of each run, of the pairs that all hold."""
     keys = shared_keys(runs)
     columns = []

@@ -57,10 +57,8 @@ def _calibrated(c: Correspondences, estimate: Estimate) -> Tensor:
 
 
 def _with_lines(kind: Kind, inliers: NDArray[np.integer[Any]], estimate: Estimate, i: int, H: Any) -> PairGeometry:
-    E, R, t = (
-        None if value is None else _known(value[i], value[i].isfinite().all())
-        for value in (estimate.E, estimate.R, estimate.t)
-    )
+    pose = estimate.E, estimate.R, estimate.t
+    E, R, t = (None if value is None else _known(value[i], value[i].isfinite().all()) for value in pose)
     return PairGeometry(kind, inliers, estimate.F[i].detach().cpu().double().numpy(), E, H, R, t)
 
 

@@ -16,8 +16,7 @@ from hydra.errors import HydraException
 from numpy.typing import NDArray
 from omegaconf import DictConfig
 
-from fmtorch.core import stages
-from fmtorch.core.failures import own_traceback, place_of
+from fmtorch.core import failures, stages
 from fmtorch.core.stages import Estimator, FeatureExtractor, GreyPyramid, ImageMatcher, Matcher, PairImages, Pruner
 from fmtorch.core.types import Correspondences, Estimate, Features, collate
 from fmtorch.data import ImagePair, ImageSource, read_image, to_grey
@@ -128,11 +127,12 @@ def collated(outcomes: Sequence[Outcome]) -> Correspondences:
 
 def described(stage: str, error: Exception) -> str:
     """What a stage raised, as a reason of one line, with the line of a user's own code that did."""
-    place = place_of(error)
+    place = failures.place_of(error)
     return f"{stage}: {type(error).__name__}: {error}".splitlines()[0] + (f" ({place})" if place else "")
 
 
 STAGES = ("features", "matching", "pruning", "estimation")
+Stage = Callable[[list[Outcome]], list[Outcome]]
 MAX_TRACEBACKS = 3  # of different failures of a user's own code that are kept
 
 
@@ -216,9 +216,7 @@ class Pipeline:
     def run(self, pairs: Sequence[ImagePair], seed: int = 0) -> list[Outcome]:
         return self.estimate(self.correspondences(pairs), seed)
 
-    def _batched(
-        self, stage: str, function: Callable[[list[Outcome]], list[Outcome]], outcomes: Sequence[Outcome]
-    ) -> list[Outcome]:
+    def _batched(self, stage: str, function: Stage, outcomes: Sequence[Outcome]) -> list[Outcome]:
         """A batched stage over the pairs with matches; where it raises, pair by pair: only the culprit fails."""
         matched = [i for i, outcome in enumerate(outcomes) if outcome.correspondences is not None]
         start = time.perf_counter()
@@ -232,7 +230,7 @@ class Pipeline:
                 if all(result.correspondences is not None for result in results):
                     reason = described(stage, error)
                     said = f"of a batch of {len(matched)} pairs, though of each alone it does not: {reason}"
-                    self.tracebacks.setdefault(said, own_traceback(error))
+                    self.tracebacks.setdefault(said, failures.own_traceback(error))
         synchronise(self.device)
         share = (time.perf_counter() - start) / max(len(matched), 1)
         result = list(outcomes)
@@ -303,7 +301,7 @@ class Pipeline:
         each = ((outcome, estimate[i], estimate.reason[i]) for i, outcome in enumerate(outcomes))
         return [dataclasses.replace(outcome, estimate=own, reason=reason) for outcome, own, reason in each]
 
-    def _alone(self, stage: str, function: Callable[[list[Outcome]], list[Outcome]], outcome: Outcome) -> Outcome:
+    def _alone(self, stage: str, function: Stage, outcome: Outcome) -> Outcome:
         """A stage on a single pair; what it raises becomes the reason for that pair's failure."""
         try:
             return function([outcome])[0]
@@ -316,7 +314,7 @@ class Pipeline:
         if self.debug:
             raise error
         reason = described(stage, error)
-        if len(self.tracebacks) < MAX_TRACEBACKS and (text := own_traceback(error)):
+        if len(self.tracebacks) < MAX_TRACEBACKS and (text := failures.own_traceback(error)):
             self.tracebacks.setdefault(reason, text)
         return reason
 

@@ -25,10 +25,9 @@ from fmtorch.data import Lens, to_grey
 from fmtorch.data.cameras import undistorted
 from fmtorch.io.match_store import PairGeometry
 from fmtorch.jobs.execution import mapped, one_thread
-from fmtorch.pipeline import photographs
+from fmtorch.pipeline import photographs, pictures
 from fmtorch.pipeline.pair_geometries import pair_geometries
 from fmtorch.pipeline.photographs import GivenImage, Image, frames_to_original, given_image, to_original
-from fmtorch.pipeline.pictures import draw_epipolar_lines, draw_matches, headed, jpeg_url
 from fmtorch.pipeline.pipeline import Clock, Pipeline, load_pipeline
 from fmtorch.two_view.arguments import Arrays, Focal, camera_fields
 from fmtorch.two_view.known_cameras import KnownCameras
@@ -116,8 +115,8 @@ class MatchResult:
         elif self.ok:
             good[good] = self.inliers.cpu().numpy()
             names = ("inliers of F", "others, dropped by pruning or estimation")
-        picture = draw_matches(*self._images(), self.putative.x0[0], self.putative.x1[0], good, names=names)
-        return headed(picture, *self._verdict)
+        picture = pictures.draw_matches(*self._images(), self.putative.x0[0], self.putative.x1[0], good, names=names)
+        return pictures.headed(picture, *self._verdict)
 
     def save(
         self, folder: Path | str, *, truth: Arrays | None = None, report: Mapping[str, Any] | None = None
@@ -183,7 +182,7 @@ class MatchResult:
         line = f"<p>{html.escape(repr(self))}</p>"
         if self.photographs is None:
             return line
-        return f'{line}<img src="{jpeg_url(self.draw())}" alt="matches" style="max-width: 100%">'
+        return f'{line}<img src="{pictures.jpeg_url(self.draw())}" alt="matches" style="max-width: 100%">'
 
     @property
     def _pruners(self) -> list[str]:
@@ -215,11 +214,11 @@ class MatchResult:
         image0, image1 = (image if lens is None else undistorted(image, lens) for image, lens in bent)
         F = self.F if self.ok or truth is None else truth
         dashed = truth if self.ok else None
-        picture = draw_epipolar_lines(image0, image1, seen.x0[0][good], seen.x1[0][good], F, truth=dashed)
+        picture = pictures.draw_epipolar_lines(image0, image1, seen.x0[0][good], seen.x1[0][good], F, truth=dashed)
         said, doubtful = self._verdict
         said += "; a point and the line of its partner have one colour"
         said += "" if dashed is None else "; dashed white: true lines"
-        return headed(picture, said + ("" if nsgd is None else f"; NSGD {nsgd:.4f}"), doubtful)
+        return pictures.headed(picture, said + ("" if nsgd is None else f"; NSGD {nsgd:.4f}"), doubtful)
 
 
 def _plain(value: Tensor | None) -> Any:
@@ -358,9 +357,8 @@ def _matched(pipeline: Pipeline, described: Sequence[Described], clock: Clock) -
         ends = putative.x0[0][putative.mask[0]], putative.x1[0][putative.mask[0]]
     none = torch.zeros(1, 0, dtype=torch.bool, device=ends[0].device)
     nothing = Correspondences(ends[0][None, :0], ends[1][None, :0], none)
-    nothing_found = MatchResult(
-        *ends, nothing, nothing.mask[0], nothing, nothing.mask[0], ends[0].new_zeros(3, 3, dtype=torch.float64)
-    )
+    no_F = ends[0].new_zeros(3, 3, dtype=torch.float64)
+    nothing_found = MatchResult(*ends, nothing, nothing.mask[0], nothing, nothing.mask[0], no_F)
     empty = [f"image{i}" for i in (0, 1) if len(ends[i]) == 0]
     if empty:
         reason = f"no keypoints in {' and '.join(empty)}: too small, or without texture"

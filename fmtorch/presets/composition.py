@@ -23,8 +23,7 @@ from fmtorch.core.files import STAGES, conf_dir
 from fmtorch.core.options import Count, dataclass_in, expect_options
 from fmtorch.core.stages import Pruner
 from fmtorch.jobs.execution import Execution
-from fmtorch.presets.files import available, naming_file
-from fmtorch.presets.objects import expect_buildable, instantiate
+from fmtorch.presets import files, objects
 
 SEVERAL = ("pruner",)  # groups of which several presets are chosen at once
 
@@ -35,7 +34,7 @@ class FileConfigSource(file_config_source.FileConfigSource):
     skips where one of the same name is there and refuses where it is of another."""
 
     def load_config(self, config_path: str) -> ConfigResult:
-        with naming_file(Path(self.path) / self._normalize_file_name(config_path)):
+        with files.naming_file(Path(self.path) / self._normalize_file_name(config_path)):
             result = super().load_config(config_path)
         path = PurePosixPath(config_path)
         group = str(path.parent)
@@ -84,7 +83,7 @@ def build_pruners(config: DictConfig) -> tuple[dict[str, Pruner], dict[str, dict
     for_families: dict[str, dict[str, Pruner]] = {}
     for name, value in pruner_configs(config).items():
         for where, options, families in _versions(name, value):
-            pruner = instantiate(options, where)
+            pruner = objects.instantiate(options, where)
             if not families:
                 usual[name] = pruner
             for family in families:
@@ -178,7 +177,7 @@ def plain(config: Any) -> dict[str, Any]:
 @functools.cache
 def pipeline_stages(name: str) -> dict[str, Any] | None:
     """The `stages` of the project's own pipeline `name`, unchanged; None where it has no such pipeline."""
-    return stages(compose(PIPELINES, (f"pipeline={name}",))) if name in available("pipeline") else None
+    return stages(compose(PIPELINES, (f"pipeline={name}",))) if name in files.available("pipeline") else None
 
 
 def composed(stages: Mapping[str, Any]) -> dict[str, Any]:
@@ -191,10 +190,10 @@ def expect_stages(config: DictConfig) -> None:
     """Raises ValueError, naming the option, where a stage of a composed config cannot be built with its options."""
     for group in STAGES:
         if group != "pruner" and group in config:  # a training has no estimator
-            expect_buildable(plain(config[group]), group)
+            objects.expect_buildable(plain(config[group]), group)
     for name, value in pruner_configs(config).items():
         for where, options, _ in _versions(name, value):
-            expect_buildable(options, where)
+            objects.expect_buildable(options, where)
 
 
 def compose(config_name: str, overrides: Sequence[str], config_dir: Path | None = None) -> DictConfig:
@@ -282,8 +281,8 @@ def execution_of(config: DictConfig, workers: int | None = None, processes: bool
     count = workers or fields.workers
     if "_target_" in options:
         target = {key: value for key, value in options.items() if key not in ExecutorFields.__dataclass_fields__}
-        expect_buildable(target, "executor")
-        make = functools.partial(instantiate, target, "executor")
+        objects.expect_buildable(target, "executor")
+        make = functools.partial(objects.instantiate, target, "executor")
         return Execution("threads", count, None, fields.send_images, cast("functools.partial[Executor]", make))
     kind = fields.name
     if processes is not None:

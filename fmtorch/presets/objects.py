@@ -26,10 +26,8 @@ def build(group: str, name: str, config_dir: Path | str | None = None, **options
 
 def merged(config: Mapping[str, Any], options: Mapping[str, Any]) -> dict[str, Any]:
     """`config` with the values of `options`, mappings merged level by level."""
-    both = {
-        key for key, value in options.items() if isinstance(value, Mapping) and isinstance(config.get(key), Mapping)
-    }
-    return {**config, **options, **{key: merged(config[key], options[key]) for key in both}}
+    nested = [k for k, v in options.items() if isinstance(v, Mapping) and isinstance(config.get(k), Mapping)]
+    return {**config, **options, **{key: merged(config[key], options[key]) for key in nested}}
 
 
 def instantiate(config: Mapping[str, Any], where: str, **extra: Any) -> Any:
@@ -43,18 +41,16 @@ def instantiate(config: Mapping[str, Any], where: str, **extra: Any) -> Any:
 
 def construct(make: Callable[..., T], config: Mapping[str, Any], where: str, **extra: Any) -> T:
     """The same with the target given: of the entries of a config but for its `_target_`."""
-    _expect_constructible(make, config, where, extra)
+    _expect_fit(make, config, where, extra)
     return _constructed(make, config, where, extra)
 
 
 def expect_buildable(config: Mapping[str, Any], where: str, given: Iterable[str] = ()) -> None:
     """Raises ValueError, naming the option, where a config, or one within it, does not fit its target's signature."""
-    _expect_constructible(target_of(config, where), config, where, given)
+    _expect_fit(target_of(config, where), config, where, given)
 
 
-def _expect_constructible(
-    make: Callable[..., Any], config: Mapping[str, Any], where: str, given: Iterable[str]
-) -> None:
+def _expect_fit(make: Callable[..., Any], config: Mapping[str, Any], where: str, given: Iterable[str]) -> None:
     values = {str(key): value for key, value in config.items() if key != "_target_"}
     expect_options(make, values, where, given)
     for key, value in values.items():

@@ -1,6 +1,6 @@
 """Labelled matches of any data set with ground truth, and the training of learned pruners on them.
 
-The loop needs the extra `train`: `fmtorch.training.loop`, run by `fmtorch train`.
+The loop needs the extra `train`: `fmtorch.training.run`, run by `fmtorch train`.
 """
 
 from typing import TYPE_CHECKING
@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 from fmtorch.core.lazy import lazy_exports
 
 if TYPE_CHECKING:
+    from fmtorch.training.export import Use, Validation, reliability, temperature
     from fmtorch.training.labelled import Augmentation, LabelledMatches, collate
     from fmtorch.training.matched_pairs import MatchedPairs
     from fmtorch.training.objective import Objective, classification_loss, geometric_loss, nsgd_loss, virtual_points
     from fmtorch.training.stored_matches import Draw, SimilarLengthBatches, StoredMatches, collate_trimmed, split_scenes
-    from fmtorch.training.validation import Use, Validation, reliability, temperature
 
 __all__ = [
     "Augmentation", "Draw", "LabelledMatches", "MatchedPairs", "Objective", "SimilarLengthBatches", "StoredMatches",

@@ -10,8 +10,7 @@ import cv2
 import numpy as np
 import torch
 
-from fmtorch.core.files import cache_dir
-from fmtorch.core.settings import claim
+from fmtorch.core import files, settings
 from fmtorch.core.types import Correspondences
 from fmtorch.data.pairs import DepthDataset, ImagePair, PairDataset
 from fmtorch.jobs.execution import Execution, use_one_thread
@@ -20,7 +19,6 @@ from fmtorch.pipeline.pipeline import Outcome, Pipeline, load_pipeline
 from fmtorch.runs import CachedFeatures, identity_digest
 from fmtorch.runs.fingerprint import configuration, environment
 from fmtorch.training import labelled
-from fmtorch.training.labelled import Augmentation
 from fmtorch.training.stored_matches import FORMAT, Shard, ShardError, StoredMatches, write_shard
 
 MAX_MATCHES = 4000  # matches kept of a pair
@@ -70,7 +68,7 @@ class MatchedPairs(StoredMatches):
     def __init__(
         self, dataset: PairDataset, pipeline: Pipeline | str, *, overrides: Sequence[str] = (),
         root: str | Path | None = None, workers: int | None = None, progress: Progress | None = None,
-        most: int = MAX_MATCHES, augmentation: Augmentation | None = None, seed: int = 0,
+        most: int = MAX_MATCHES, augmentation: labelled.Augmentation | None = None, seed: int = 0,
         execution: Execution | None = None, build: Callable[[], Pipeline] | None = None,
     ) -> None:  # fmt: skip
         if most < 1:
@@ -88,10 +86,10 @@ class MatchedPairs(StoredMatches):
             raise ValueError("overrides change a pipeline that is given by name; this one is given as an object")
         if build is None and not execution.shared:
             raise ValueError("other processes need to make the pipeline: give its name, or `build`")
-        home = Path(root).expanduser() if root is not None else cache_dir() / "matched"
+        home = Path(root).expanduser() if root is not None else files.cache_dir() / "matched"
         identity = _identity(dataset, stages, most)
         folder = home / f"{dataset.name}-{identity_digest(identity)[:16]}"
-        claim(folder / "about.json", identity, "matches", "delete the folder", alone=False)
+        settings.claim(folder / "about.json", identity, "matches", "delete the folder", alone=False)
         pairs = [dataset[i] for i in range(len(dataset))]
         shards = [[pairs[i] for i in members] for members in partition(pairs)]
         jobs = [Job(folder / f"shard-{number:05d}.arrow", members) for number, members in enumerate(shards)]

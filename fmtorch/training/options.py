@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
-from fmtorch.core.options import Cache, Count, Gigabytes, Seed, Within, option
+from fmtorch.core.options import CACHE, CACHE_LIMIT, Cache, Count, Gigabytes, Seed, Within, option
 
 Real = float | int
 Range = Sequence[Real]  # the least and the most
@@ -171,10 +171,8 @@ class TrainOptions:
     limit: Count | None = option(None, "train on so many pairs of each family")
     seed: Seed = option(0, "of the first weights, of batches and augmentation")
     output: Path | None = option(None, "null: runs/train/<pruner>-<first digits of what defines the training>")
-    cache: Cache = option(
-        None, "folder of features computed before; null: features in $FMTORCH_CACHE or ~/.cache/fmtorch; off: none"
-    )
-    cache_limit: Gigabytes | None = option(20, "GB, beyond which the least recently used features go; null: no bound")
+    cache: Cache = option(None, CACHE)
+    cache_limit: Gigabytes | None = option(20, CACHE_LIMIT)
     workers: Count | None = option(None, "short for executor.workers, which compute matches; null: one for each core")
     loaders: Annotated[int, Within(0)] = option(0, "processes that load batches; 0: the training's own")
     threads: Count | None = option(None, "of torch; null: one for each core. The weights' last bits depend on it")

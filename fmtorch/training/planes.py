@@ -161,9 +161,8 @@ def random_camera(rng: np.random.Generator, size: tuple[int, int], limits: Plane
     """A camera that looks at the plane z = 0 from z < 0; the photograph of size (h, w) lies on it about the origin.
     Its longest side is 1, x goes right and y down, as in the photograph. The horizon is never in view."""
     h, w = size
-    scale, part, focal = (
-        math.exp(rng.uniform(*map(math.log, range_))) for range_ in (limits.scale, limits.part, limits.focal)
-    )
+    ranges = limits.scale, limits.part, limits.focal  # of ratios
+    scale, part, focal = (math.exp(rng.uniform(math.log(low), math.log(high))) for low, high in ranges)
     out = max(32, round(h * scale)), max(32, round(w * scale))
     K = calibration(focal * out[1], out)
     corner = math.degrees(math.atan(math.hypot(*out) / 2 / K[0, 0]))

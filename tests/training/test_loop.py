@@ -14,7 +14,7 @@ pytest.importorskip("lightning", reason="training needs the extra `train`")
 from fmtorch import presets
 from fmtorch.pruning import LC
 from fmtorch.training import LabelledMatches, Objective, Use, Validation, collate, loop
-from fmtorch.training.loop import Optimisation, PrunerTraining, latest_checkpoint
+from fmtorch.training.run import Optimisation, PrunerTraining, latest_checkpoint
 from tests.processes import run_command
 from tests.training.conftest import labelled_pair
 

@@ -128,7 +128,7 @@ def plain(geometries: dict[tuple[int, int], Any]) -> dict[tuple[int, int], tuple
 
 def killed_and_continued(folder: Path, end: Path, *words: str) -> None:
     """Kill `fmtorch verify` after some batches, which leaves no `end`; the same command then goes on, to the end."""
-    slowly = "import fmtorch.verification.run as v\nv.BATCH = 2\n"
+    slowly = "import fmtorch.verification.verify as v\nv.BATCH = 2\n"
     there, parts = end.exists(), end.with_name(f"{end.name}.parts")
     command = starter().start(folder, "verify", *words, before=slowly)
     assert command.kill_when(lambda: len(list(parts.glob("*.npz"))) > 2), command.said()

@@ -377,7 +377,7 @@ def test_keypoints_are_read_for_many_images_in_blocks(tmp_path: Path, monkeypatc
     write(path, scene(6))
     write(other, scene(6))
     fmtorch.verify(path)
-    monkeypatch.setattr("fmtorch.verification.run.BATCH", 2)
+    monkeypatch.setattr("fmtorch.verification.verify.BATCH", 2)
     monkeypatch.setattr("fmtorch.io.colmap.BLOCK", 2)
     monkeypatch.setattr("fmtorch.io.colmap.MEMORY", 3)
     with MatchDatabase(other) as database:

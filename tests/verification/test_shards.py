@@ -13,7 +13,7 @@ from tests.verification.databases import plain, read, scene, write
 
 @pytest.fixture(autouse=True)
 def _small_batches(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fmtorch.verification.run.BATCH", 2)
+    monkeypatch.setattr("fmtorch.verification.verify.BATCH", 2)
 
 
 def test_processes_find_what_threads_find(tmp_path: Path) -> None:
