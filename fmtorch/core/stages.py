@@ -22,10 +22,8 @@ SMOOTHING = 0.5  # px, of every level: contrast between pixels is then lowered n
 
 class GreyPyramid(NamedTuple):
     """Levels of an image, each of half the samples of the one before: point x of the image is at x / 2^l of level l.
-
     pixels: (sum,) uint8, the grey levels of all, row by row. levels: (l, 3) int64, of each its height, its width and
-    where it begins in `pixels`. Four thirds of a byte for each pixel of the image.
-    """
+    where it begins in `pixels`. Four thirds of a byte for each pixel of the image."""
 
     pixels: NDArray[np.uint8]
     levels: NDArray[np.int64]
@@ -33,9 +31,7 @@ class GreyPyramid(NamedTuple):
 
 def grey_pyramid(image: NDArray[np.uint8]) -> GreyPyramid:
     """The pyramid of a grey image (H, W): Burt and Adelson, The Laplacian Pyramid as a Compact Image Code, 1983.
-
-    Every other sample is taken of an image smoothed by a binomial filter; what is kept of each is smoothed slightly.
-    """
+    Every other sample is taken of an image smoothed by a binomial filter; what is kept of each is smoothed slightly."""
     import cv2  # not before an image is there: protocols of matches alone name this file
 
     images: list[Any] = [image]

@@ -65,11 +65,9 @@ def pair_key(identity: str) -> int:
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Features(Record):
     """The local features of one image, or of a padded batch of images (a leading dimension on every field).
-
-    lafs: local affine frames (N, 2, 3) in kornia's convention, the last column being the centre in pixels.
-    scores: detector response (N,). descriptors: (N, D). image_size: (h, w).
-    mask: (N,), True for a real feature; all True when not given.
-    """
+    lafs: local affine frames (N, 2, 3) in kornia's convention, the last column being the centre in pixels. scores:
+    detector response (N,). descriptors: (N, D). image_size: (h, w). mask: (N,), True for a real feature; all True when
+    not given."""
 
     lafs: Float[Tensor, "*batch n 2 3"]
     scores: Float[Tensor, "*batch n"]
@@ -266,9 +264,7 @@ class Estimate(Record):
     @property
     def related(self) -> Bool[Tensor, " b"]:
         """Whether the two images are taken to show one scene: ok, with a significance of at least `RELATED`.
-
-        Recall and all other figures are of `ok` alone; this tells whom to believe.
-        """
+        Recall and all other figures are of `ok` alone; this tells whom to believe."""
         return self.ok & (cast(Tensor, self.significance) >= RELATED)
 
     @property
@@ -282,9 +278,7 @@ class Estimate(Record):
     def warning(self) -> tuple[str, ...]:
         """What the type of each pair leaves open, whether its matches contradict its calibration matrices, and which
         sizes were doubtful.
-
-        Empty where there is nothing to say. Raises as `pair_type` where none of these was looked at.
-        """
+        Empty where there is nothing to say. Raises as `pair_type` where none of these was looked at."""
         looked = self.contradicted is not None or self.sizes_doubtful is not None
         unknown = self.pair_type_index is None and looked
         opens = [""] * len(self) if unknown else [WARNINGS[name] for name in self.pair_type]
@@ -361,10 +355,8 @@ Item = TypeVar("Item", Features, Correspondences, Estimate)
 
 def collate(items: Sequence[Item]) -> Item:
     """One padded batch from several items: single-image `Features` are stacked, batches are joined.
-
     Optional fields survive only where every item has them. Raises ValueError for an empty list, TypeError for items of
-    several kinds (single images and batches of images are two kinds).
-    """
+    several kinds (single images and batches of images are two kinds)."""
     if not items:
         raise ValueError("collate needs at least one item")
     first = items[0]

@@ -28,9 +28,7 @@ Figures = dict[str, Any]  # fields of `PairRow`
 
 def evaluate(outcomes: Sequence[Outcome], seed: int = 0, signed: bool = False) -> list[PairRow]:
     """One row a pair. NSGD is 1 where the pipeline failed; an inlier rate is NaN where it is not defined.
-
-    Pairs of known homographies have corner errors in place of NSGD and poses. signed: of `pose_errors`.
-    """
+    Pairs of known homographies have corner errors in place of NSGD and poses. signed: of `pose_errors`."""
     rows: dict[int, PairRow] = {}
     for planar in (False, True):
         index = [i for i, outcome in enumerate(outcomes) if (outcome.pair.H is not None) == planar]

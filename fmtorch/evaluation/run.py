@@ -125,11 +125,9 @@ class PairCameras(NamedTuple):
 
 def cameras_of(pairs: Sequence[ImagePair], cameras: Cameras) -> dict[int, PairCameras]:
     """What is known of the cameras of pairs, by their keys.
-
     known: their calibrations. exif: the focal lengths in the files of their images, unknown where there are none.
-    shared: that both images of a pair are of one camera. unknown: nothing.
-    Raises ValueError for `known` where a pair has no calibration.
-    """
+    shared: that both images of a pair are of one camera. unknown: nothing. Raises ValueError for `known` where a pair
+    has no calibration."""
     if cameras == "known":
         return {pair.key: _calibrated(pair) for pair in pairs if pair.problem is None}
     if cameras == "exif":

@@ -163,12 +163,9 @@ def interval(values: Values, scenes: Sequence[str], scale: float = 1.0, share: b
 
 def difference(a: Values, b: Values, scenes: Sequence[str], scale: float = 1.0, share: bool = False) -> Interval | None:
     """mean(a) - mean(b) of two methods on the same pairs, times `scale`, with its 95 % interval.
-
     Of the pairs for which both are not NaN; None where there are none, or, for a figure that is no share, fewer than
     `MIN_UNITS` units. The methods differ at this level where the interval does not hold 0.
-
-    a, b, scenes: one per pair, (n,). share: the values are successes, see `share_difference`.
-    """
+    a, b, scenes: one per pair, (n,). share: the values are successes, see `share_difference`."""
     if len(a) != len(b):
         raise ValueError(f"a difference is of the same pairs, but a has {len(a)} and b has {len(b)}")
     known, places = _known(scenes, a, b)
@@ -212,11 +209,9 @@ def _clusters(scenes: Sequence[str]) -> NDArray[np.int64]:
 
 def bootstrap_mean(values: Values, scenes: Sequence[str]) -> Interval:
     """The mean over all pairs, with a 95 % percentile interval from 2,000 resamples of scenes (Efron 1979).
-
     With fewer than `MIN_SCENES` scenes the pairs are resampled instead, which is too narrow where pairs of a scene
     succeed and fail together. The interval has no width where all values are equal. The same input always gives the
-    same interval. values, scenes: one per pair, (n,), n >= 1.
-    """
+    same interval. values, scenes: one per pair, (n,), n >= 1."""
     cluster = _clusters(scenes)
     sums, sizes = np.bincount(cluster, values), np.bincount(cluster)
     means = np.concatenate([sums[draw].sum(1) / sizes[draw].sum(1) for draw in _draws(len(sums))])
@@ -375,10 +370,8 @@ def _of_known(figure: Callable[[Values], Any], values: Values) -> float | None:
 
 def common_reasons(reasons: Sequence[str], count: int) -> dict[str, int]:
     """At most `count` reasons with the number of their pairs, the commonest first.
-
     Reasons whose words are equal but for those with digits are one, which shows the range of numbers and what names
-    have in common: "5 to 7 matches; at least 8 are needed", "no image scene/0000….png".
-    """
+    have in common: "5 to 7 matches; at least 8 are needed", "no image scene/0000….png"."""
     kinds: dict[tuple[str, ...], list[list[str]]] = {}
     for reason in reasons:
         words = reason.split()

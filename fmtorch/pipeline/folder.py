@@ -38,9 +38,7 @@ Pair = tuple[Path, Path]
 
 def images_below(folder: Path) -> list[Path]:
     """The images of a folder, at any depth, by name; none that fmtorch itself has written, nor in hidden folders.
-
-    Raises ValueError where there are fewer than two.
-    """
+    Raises ValueError where there are fewer than two."""
     if not folder.is_dir():
         raise ValueError(f"images={folder} is no folder")
     images = sorted(_images(folder))
@@ -73,11 +71,9 @@ def count_of(pairs: Path | str | None, kind: str) -> int | None:
 
 def chosen_pairs(folder: Path, images: Sequence[Path], pairs: Path | None) -> list[Pair]:
     """All pairs of the images, neighbours in the order of their names, or those of a file.
-
     pairs: ``exhaustive`` or None, ``sequential:N`` (each image with the N next ones), or a text file with the names of
     two images a line, below the folder. There an empty line and one that begins with # is left out, and a pair that
-    stands there again. Raises ValueError for anything else, naming file and line for what is no pair.
-    """
+    stands there again. Raises ValueError for anything else, naming file and line for what is no pair."""
     if pairs is None or str(pairs) == EXHAUSTIVE:
         return list(itertools.combinations(images, 2))
     if count := count_of(pairs, SEQUENTIAL):
@@ -139,9 +135,7 @@ def default_output(folder: Path) -> Path:
 
 def open_folder(output: Path, identity: Mapping[str, Any]) -> Path:
     """The folder for what is found of pairs, in `output`; the identity is kept beside it.
-
-    Raises ValueError where the output holds results of another identity.
-    """
+    Raises ValueError where the output holds results of another identity."""
     claim(output / RECORD, identity, "matches", "choose another output, or delete the folder", alone=False)
     return output / "export"
 
@@ -158,9 +152,7 @@ def vectors_of(described: Iterable[Described | None], vector: Callable[[Tensor],
 
 def similar_pairs(images: Sequence[Path], vectors: Float[Tensor, "n d"], count: int) -> list[Pair]:
     """Each image with its `count` most similar ones, by the inner products of the vectors; a pair once, in order.
-
-    Images without a vector, zeros, are in no pair. Of equally similar ones those of lower number come first.
-    """
+    Images without a vector, zeros, are in no pair. Of equally similar ones those of lower number come first."""
     described = (vectors != 0).any(1)
     selected: set[tuple[int, int]] = set()
     for start in range(0, len(vectors), ROWS):
@@ -230,12 +222,9 @@ def folder_workers(pipeline: Pipeline, execution: Execution | None = None) -> Wo
 
 class FolderMatches:
     """Matches pairs of images into a journal, which this process alone writes; what that has already is taken.
-
     workers: who does it, not closed at the end; None: those of `folder_workers`. build: makes the pipeline in other
     processes; None: threads share it. cameras: of the images.
-
-    done, taken, related: pairs matched now, taken from the journal, and of either those that show one scene.
-    """
+    done, taken, related: pairs matched now, taken from the journal, and of either those that show one scene."""
 
     def __init__(
         self, pipeline: Pipeline, journal: MatchStore, longest_side: int, orient: bool, seed: int, *,
@@ -266,9 +255,7 @@ class FolderMatches:
 
     def each(self, pairs: Sequence[Pair]) -> Iterator[None]:
         """Match the pairs, keep what is found of each, and yield after it.
-
-        Raises WorkersLost where workers die whatever they do, or a scheduler is gone.
-        """
+        Raises WorkersLost where workers die whatever they do, or a scheduler is gone."""
         before = self._passed
         with self._pool() as pool:
             runner = TaskRunner(pool, self.source, described_or_matched, self._keep, self._keep)

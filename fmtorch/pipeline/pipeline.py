@@ -326,10 +326,8 @@ def examined(
     pipeline: Pipeline, outcomes: Sequence[Outcome], seed: int = 0, knowledge: Knowledge | None = None
 ) -> list[Outcome]:
     """The outcomes of a run with their pair types; a pair that cannot be examined has none and harms no other.
-
     knowledge: gives correspondences what the estimator was given of their cameras; None: nothing, and their K counts
-    for nothing here. Matches of the results have what it gives. Of homographies nothing is asked.
-    """
+    for nothing here. Matches of the results have what it gives. Of homographies nothing is asked."""
     if stages.model_of(pipeline.estimator) != "fundamental":
         return list(outcomes)
     matched = [i for i, o in enumerate(outcomes) if o.correspondences is not None and o.estimate is not None]
@@ -365,9 +363,7 @@ def build_pipeline(
     config: DictConfig, device: torch.device | str = "cpu", model: str | None = "fundamental"
 ) -> Pipeline:
     """The `Pipeline` that features (with cache), matcher, pruner and estimator of a composed config describe.
-
-    model: what the estimator must give, "fundamental" or "homography"; None: either.
-    """
+    model: what the estimator must give, "fundamental" or "homography"; None: either."""
     extractor = cached(instantiate(plain(config.features), "features"), config.cache, config.cache_limit)
     pruners, for_families = build_pruners(config)
     open_files([extractor, pruners, for_families], torch.device(device))  # a damaged one is no failure of each pair

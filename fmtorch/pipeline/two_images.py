@@ -229,10 +229,8 @@ def _plain(value: Tensor | None) -> Any:
 @dataclasses.dataclass(frozen=True, eq=False)
 class Described:
     """A photograph's features in pixels of it as it was reduced, the scale of that in x and y, and its size (h, w).
-
     seconds: that describing it takes or took. pyramid: its grey levels, for pruners that look at them. image: reduced,
-    for a matcher that takes the images themselves, and has no features.
-    """
+    for a matcher that takes the images themselves, and has no features."""
 
     features: Features
     scale: Float[Tensor, " xy"]

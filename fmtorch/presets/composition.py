@@ -159,10 +159,8 @@ ConfigStore.instance().store(PIPELINES, {"defaults": _DEFAULTS, "cache": None, "
 
 def stages(config: DictConfig) -> dict[str, Any]:
     """What a composed config says of each group of `STAGES`, as plain values.
-
     Pruners are a list of mappings of one name each, in the order in which they run, which decides results and which no
-    mapping keeps on its way through JSON with sorted keys.
-    """
+    mapping keeps on its way through JSON with sorted keys."""
     plain = {group: OmegaConf.to_container(config[group], resolve=True) for group in STAGES if config.get(group)}
     return {**plain, "pruner": [{name: value} for name, value in pruner_configs(config).items()]}
 
@@ -198,9 +196,7 @@ def expect_stages(config: DictConfig) -> None:
 
 def compose(config_name: str, overrides: Sequence[str], config_dir: Path | None = None) -> DictConfig:
     """The config that a command composes from its arguments; a caller's own Hydra stays as it is.
-
-    config_dir: a folder with a user's presets, which are read anew.
-    """
+    config_dir: a folder with a user's presets, which are read anew."""
     words = tuple(overrides)
     return _kept(config_name, words, None) if config_dir is None else _composed(config_name, words, config_dir)
 

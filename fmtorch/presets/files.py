@@ -38,9 +38,7 @@ def summary(path: Path) -> str:
 
 def load(group: str, name: str, config_dir: Path | str | None = None) -> dict[str, Any]:
     """The contents of one preset file; files in `config_dir` come before the project's own.
-
-    Raises ValueError with the available names where there is no such preset.
-    """
+    Raises ValueError with the available names where there is no such preset."""
     folders = [Path(config_dir)] if config_dir is not None else []
     for folder in [*folders, conf_dir()]:
         path = folder / group / f"{name}.yaml"
@@ -115,9 +113,7 @@ def known_targets() -> frozenset[str]:
 
 def closest(group: str, config: Mapping[str, Any]) -> tuple[str, dict[str, Any]] | None:
     """The project's preset of a group from which a config differs least, and the options in which it does.
-
-    None where no preset builds what the config does, or the options are not those of the preset.
-    """
+    None where no preset builds what the config does, or the options are not those of the preset."""
     candidates = []
     for name, preset in _shipped(group).items():
         if preset.get("_target_") == config.get("_target_") and preset.keys() >= config.keys():

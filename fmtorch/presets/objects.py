@@ -17,10 +17,8 @@ T = TypeVar("T")
 
 def build(group: str, name: str, config_dir: Path | str | None = None, **options: Any) -> Any:
     """The object that a preset describes, with some of its options replaced.
-
     Where an option is itself an object, its own are replaced: ``build("estimator", "cf_ransac", fine={"round": 100})``.
-    Raises ValueError for an unknown preset or option, naming those that exist.
-    """
+    Raises ValueError for an unknown preset or option, naming those that exist."""
     return instantiate(merged(load(group, name, config_dir), options), where=f"{group}={name}")
 
 
@@ -32,10 +30,8 @@ def merged(config: Mapping[str, Any], options: Mapping[str, Any]) -> dict[str, A
 
 def instantiate(config: Mapping[str, Any], where: str, **extra: Any) -> Any:
     """The object of a config with a `_target_`; `where` names the config in errors, `extra` arguments are added.
-
-    A value that is a mapping with a `_target_` of its own becomes an object first.
-    Raises ValueError where `expect_buildable` does; what the target itself raises passes through.
-    """
+    A value that is a mapping with a `_target_` of its own becomes an object first. Raises ValueError where
+    `expect_buildable` does; what the target itself raises passes through."""
     return construct(target_of(config, where), config, where, **extra)
 
 

@@ -43,10 +43,8 @@ def calibrated(evidence: F4x1, ratio: F4x1, mask: B1x1, numbers: F4x1, out: F4x1
 @dataclasses.dataclass(frozen=True)
 class Calibration:
     """``P(inlier) = logistic(constant + evidence e + ratio q)`` of the evidence e and the distance ratio q.
-
-    with_ratio: {constant, evidence, ratio}, where matches have a `ratio`. alone: {constant, evidence}, where they
-    have none; without it their prior stays as it is. `scripts/calibrate_priors.py` fits these numbers.
-    """
+    with_ratio: {constant, evidence, ratio}, where matches have a `ratio`. alone: {constant, evidence}, where they have
+    none; without it their prior stays as it is. `scripts/calibrate_priors.py` fits these numbers."""
 
     with_ratio: Mapping[str, float]
     alone: Mapping[str, float] | None = None

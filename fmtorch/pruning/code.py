@@ -112,11 +112,9 @@ def _exponent(z: Float[Tensor, "n d"], centres: Float[Tensor, "m d"]) -> Float[T
 
 def spread_centres(kernel: Float[Tensor, "n n"], count: int) -> Int[Tensor, " m"]:
     """Indices of at most `count` of the points, crowded places first, none near another; the first of equals.
-
     kernel (i, j): what the Gaussian at j gives at i. Each centre is the point with the largest uncovered support: the
     sum of its Gaussian over all points, times one minus the largest Gaussian of earlier centres at it. Coherent matches
-    crowd, wrong ones are alone.
-    """
+    crowd, wrong ones are alone."""
     support = kernel.sum(0)
     uncovered = torch.ones_like(support)
     by_centre = kernel.T.contiguous()
@@ -143,11 +141,9 @@ def huber_regression(
     iterations: int,
 ) -> Float[Tensor, "m k"]:
     """The coefficients C (m, k) that minimise ``sum_j huber(|target_j - basis_j C|) + tr(C^T ridge C)``.
-
-    Huber's loss is quadratic up to `scale` and linear beyond; a row of the target counts by its length. Starts from
-    C = 0. Each iteration weights the rows by their residuals and solves the normal equations, which are summed in the
-    type of the basis and solved in float64 by Cholesky's decomposition; `ridge` (positive definite) keeps them regular.
-    """
+    Huber's loss is quadratic up to `scale` and linear beyond; a row of the target counts by its length. Starts from C =
+    0. Each iteration weights the rows by their residuals and solves the normal equations, which are summed in the type
+    of the basis and solved in float64 by Cholesky's decomposition; `ridge` (positive definite) keeps them regular."""
     coefficients = basis.new_zeros(basis.shape[1], target.shape[1])
     scale2 = basis.new_tensor(scale * scale)
     for _ in range(iterations):
@@ -286,11 +282,9 @@ MIN_LIKELIHOOD, LARGEST_RESIDUAL = 0.5, 0.06
 
 class Coherence(NamedTuple):
     """How coherent each match is.
-
-    likelihood: near 1 for a match that agrees with many distinctive ones, near 0 or below otherwise.
-    residual: distance of its partner from the smooth motion of the likely matches, in units of the root mean square
-    coordinate in image 1; infinite where there is no motion. Zero and infinite for what is no match.
-    """
+    likelihood: near 1 for a match that agrees with many distinctive ones, near 0 or below otherwise. residual: distance
+    of its partner from the smooth motion of the likely matches, in units of the root mean square coordinate in image 1;
+    infinite where there is no motion. Zero and infinite for what is no match."""
 
     likelihood: Float[Tensor, "b n"]
     residual: Float[Tensor, "b n"]
@@ -356,10 +350,8 @@ def coherence(
 
 class CODE:
     """`code` as a stage, which also supplies ``prior``: P(inlier).
-
-    The odds are ``odds (max(likelihood, 0) + floor)^3 / (1 + (residual / reach)^2)``. soft: True keeps every match
-    and gives the prior only. likelihood, motion: options of `LikelihoodField` and `SmoothMotion`.
-    """
+    The odds are ``odds (max(likelihood, 0) + floor)^3 / (1 + (residual / reach)^2)``. soft: True keeps every match and
+    gives the prior only. likelihood, motion: options of `LikelihoodField` and `SmoothMotion`."""
 
     def __init__(
         self,

@@ -149,11 +149,9 @@ def frame_agreement(
     mask: Bool[Tensor, "b n"],
 ) -> Float[Tensor, "b n"]:
     """The share of its neighbours' votes that agree with each match, in [0, 1]; zero where masked.
-
     For neighbours i, j with frame maps S: ``e = max(|S_i dx0 - dx1|, |S_j dx0 - dx1|) / (s_i |dx0| + |dx1| + NOISE)``
     with s the scale change of S; the agreement is the mean of ``(1 + (e / TOLERANCE)^2 / 8)^-8`` over the neighbours in
-    both images, weighted by votes. Computed in float32, on the CPU; differentiable in all but the mask.
-    """
+    both images, weighted by votes. Computed in float32, on the CPU; differentiable in all but the mask."""
     tensors, out = (x0, x1, lafs0, lafs1, ratio, mask), torch.empty(mask.shape, dtype=torch.float32)
     agreement = for_each_pair(frame_agreement_kernel, tensors, out=out, group=FramedMatches).to(x0.dtype)
     if not gradient_wanted(x0, x1, lafs0, lafs1, ratio):
@@ -269,11 +267,9 @@ def position_agreement_kernel(x0: F4x2, x1: F4x2, ratio: F4x1, mask: B1x1, out: 
 @inner
 def _similarity(rows: Array, orders: Array, along: Array) -> Array:
     """The map of small vectors (a x - b y, b x + a y) that most neighbours in either image have in common: a, b, s.
-
     Every two consecutive matches along a curve vote for the turn and scale between them. Right matches vote alike in
     both images' orders. Wrong ones vote for large scales in the order of image 0, where they are near each other in
-    image 0 alone, and for small ones in the other: the product of the two (smoothed) histograms is low there.
-    """
+    image 0 alone, and for small ones in the other: the product of the two (smoothed) histograms is low there."""
     scales, turns = MAPS32.shape[:2]
     bins = scales * turns
     merit = np.ones(bins, np.int64)
@@ -368,10 +364,8 @@ def position_agreement(
 
 class PositionConsistency:
     """Supplies ``prior``: P(inlier) from the agreement of neighbours' motion and, where known, the ratio.
-
-    Needs no frames, no sizes and no ratio. Linear memory: about 600 bytes a match.
-    kernels: worth compiling together with those of an estimator.
-    """
+    Needs no frames, no sizes and no ratio. Linear memory: about 600 bytes a match. kernels: worth compiling together
+    with those of an estimator."""
 
     kernels: ClassVar = (position_agreement_kernel, calibrated)
 

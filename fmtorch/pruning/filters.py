@@ -20,9 +20,7 @@ def ratio_test(
     ratio: Float[Tensor, "b n"], threshold: float = 0.8, mask: Bool[Tensor, "b n"] | None = None
 ) -> Bool[Tensor, "b n"]:
     """True where the ratio of the distances to the nearest and second nearest descriptor is below `threshold`.
-
-    The ratio is of Euclidean, not squared, distances; a ratio that is NaN fails. Lowe, IJCV 2004, section 7.1.
-    """
+    The ratio is of Euclidean, not squared, distances; a ratio that is NaN fails. Lowe, IJCV 2004, section 7.1."""
     kept = ratio < threshold
     return kept if mask is None else kept & mask
 
@@ -44,9 +42,7 @@ def mutual(
     index: Int[Tensor, "b n0"], reverse: Int[Tensor, "b n1"], mask: Bool[Tensor, "b n0"] | None = None
 ) -> Bool[Tensor, "b n0"]:
     """True for a feature i of image 0 whose match j = index[i] is matched back to it, reverse[j] = i.
-
-    Negative entries are features without a match. Raises ValueError for a feature of image 1 that there is not.
-    """
+    Negative entries are features without a match. Raises ValueError for a feature of image 1 that there is not."""
     if reverse.shape[-1] == 0:
         return torch.zeros_like(index, dtype=torch.bool)
     matched = index >= 0 if mask is None else (index >= 0) & mask
@@ -72,11 +68,9 @@ def one_to_one(
     mask: Bool[Tensor, "b n"] | None = None,
 ) -> Bool[Tensor, "b n"]:
     """True for a match that is the best one at its location in image 0 and the best one at its location in image 1.
-
     The best has the lowest `ambiguity` (NaN is worst), ties by lowest index. Locations are the same when coordinates
     are exactly equal, as those of one keypoint with several orientations are. The rule is symmetric in the images and
-    independent of the order of the matches, ties apart. Matches with a non-finite coordinate are dropped. O(N).
-    """
+    independent of the order of the matches, ties apart. Matches with a non-finite coordinate are dropped. O(N)."""
     mask = torch.ones_like(x0[..., 0], dtype=torch.bool) if mask is None else mask
     out = torch.empty(mask.shape, dtype=torch.bool)
     return for_each_pair(one_to_one_kernel, (x0, x1, ambiguity, mask), out=out, kind=torch.float64)
@@ -133,9 +127,7 @@ class OneToOne:
 @dataclasses.dataclass(frozen=True)
 class Likely:
     """Keeps the matches whose ``prior``, P(inlier), is at least `min_probability`.
-
-    It makes a filter of any stage that supplies a prior. Raises ValueError for correspondences without a prior.
-    """
+    It makes a filter of any stage that supplies a prior. Raises ValueError for correspondences without a prior."""
 
     min_probability: float = 0.5
 

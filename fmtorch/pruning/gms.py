@@ -259,10 +259,8 @@ def _of_each_pair(
 
 class GMS:
     """`gms` as a stage; or, `soft`, a stage that keeps every match and supplies ``prior``: P(inlier) by `gms_support`.
-
     calibration: of the support, see `Calibration`; needed by the soft form alone. The other options are those of `gms`.
-    Raises ValueError for the soft form without a calibration, and for correspondences without image sizes.
-    """
+    Raises ValueError for the soft form without a calibration, and for correspondences without image sizes."""
 
     def __init__(
         self,

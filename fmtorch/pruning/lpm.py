@@ -122,10 +122,8 @@ def lpm_cost(
     taus: Sequence[float] = (0.2, 0.2),
 ) -> Float[Tensor, "b n"]:
     """The mean of the costs of the passes of `lpm`, in [0, 1]; 1 for masked matches and non-finite points.
-
     The first pass sees all matches, the second those that the first kept: together they tell right matches from wrong
-    ones better than either does. Arguments as `lpm`.
-    """
+    ones better than either does. Arguments as `lpm`."""
     return _kept_and_cost(x0, x1, mask, _passes(thresholds, neighbors, taus))[:, 1].to(x0.dtype)
 
 
@@ -149,10 +147,8 @@ def _passes(thresholds: Sequence[float], neighbors: Sequence[int], taus: Sequenc
 
 class LPM:
     """`lpm` as a stage; or, `soft`, a stage that keeps every match and supplies ``prior``: P(inlier) by `lpm_cost`.
-
     `thresholds`, `neighbors`, `taus` hold one value for each of the two passes. calibration: of one minus the cost, see
-    `Calibration`; needed by the soft form alone, which raises ValueError without it.
-    """
+    `Calibration`; needed by the soft form alone, which raises ValueError without it."""
 
     def __init__(
         self,

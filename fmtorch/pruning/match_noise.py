@@ -30,11 +30,9 @@ def match_noise(
     slope: float,
 ) -> Float[Tensor, "b n"]:
     """Standard deviation of each match's distance to its epipolar line, in units of a usual match's.
-
     ``(1 + s / radius) (1 + slope ratio)^2 P^(-1/4) / usual`` with s the larger of the two frames' scales in pixels: a
     keypoint is located to a share of its size, and matches that are hard to tell apart, or that their neighbours
-    contradict somewhat, are less exact. One where masked, and where a number is not finite. On the CPU.
-    """
+    contradict somewhat, are less exact. One where masked, and where a number is not finite. On the CPU."""
     single = lafs0.dtype == torch.float32
     numbers = np.array((usual, radius, slope, MIN_AREA, MIN_PRIOR), np.float32 if single else np.float64)
     tensors, out = (lafs0, lafs1, ratio, prior), torch.empty(lafs0.shape[:2], dtype=lafs0.dtype)
@@ -110,11 +108,9 @@ def _finite(lafs: Array, i: int) -> bool:
 @dataclasses.dataclass(frozen=True)
 class MatchNoise:
     """Supplies ``noise`` by `match_noise`; matches without frames are left as they are.
-
-    `Ransac` divides each match's residual by it, in its scores (but not that of the median) and in its
-    non-linear fits; the 8-point algorithm, the `irls_*` estimators and other libraries do not look at it. Inliers are
-    reported by their distance in pixels all the same. usual, radius, slope: see `match_noise`.
-    """
+    `Ransac` divides each match's residual by it, in its scores (but not that of the median) and in its non-linear fits;
+    the 8-point algorithm, the `irls_*` estimators and other libraries do not look at it. Inliers are reported by their
+    distance in pixels all the same. usual, radius, slope: see `match_noise`."""
 
     usual: float
     radius: float

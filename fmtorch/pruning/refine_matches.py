@@ -42,11 +42,9 @@ class Pyramid(NamedTuple):
 
 class Template(NamedTuple):
     """The linear model of a window of image 0.
-
     grid: samples (m, 2) in steps from the centre. weight: (m,), of sum one. columns: (m, 8), the derivatives of a grey
     level by the parameters: offset, gain, the four entries of the affine map, the shift in steps. weighted: (m, 8), the
-    same times the weights. L: (8, 8), the Cholesky factor of their products.
-    """
+    same times the weights. L: (8, 8), the Cholesky factor of their products."""
 
     grid: F8x2
     weight: F8x1

@@ -46,9 +46,7 @@ BISECTIONS = 50  # halvings of the interval of log temperature: 9.2 / 2^50
 @dataclasses.dataclass(frozen=True, eq=False)
 class Use:
     """One way of using P(inlier) before an estimator.
-
-    threshold: matches with a smaller P are dropped and no prior is given; None: all are kept, with P as their prior.
-    """
+    threshold: matches with a smaller P are dropped and no prior is given; None: all are kept, with P as their prior."""
 
     estimator: Estimator
     threshold: float | None = None
@@ -151,11 +149,9 @@ def _classified(logit: Tensor, label: Tensor) -> dict[str, float]:
 
 class Reliability(NamedTuple):
     """Predicted against observed shares of inliers, over bins of equal width of the predicted probability.
-
     edges: of the bins. matches: how many fell in each. predicted: their mean probability. observed: their share of
-    inliers; both NaN in an empty bin. error: the expected calibration error, the mean over matches of
-    |predicted - observed| of their bin (Naeini et al., AAAI 2015); NaN without matches.
-    """
+    inliers; both NaN in an empty bin. error: the expected calibration error, the mean over matches of |predicted -
+    observed| of their bin (Naeini et al., AAAI 2015); NaN without matches."""
 
     edges: Float[Tensor, " bins_and_1"]
     matches: Int[Tensor, " bins"]

@@ -47,10 +47,8 @@ _AROUND = EDGE_PX * np.array([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [
 @dataclasses.dataclass(frozen=True, eq=False)
 class LabelledMatches(Record):
     """A batch of B pairs with N matches each (padded), labels and the true fundamental matrices.
-
-    correspondences: the matches. label: (B, N) int8, 1 inlier, 0 outlier, -1 ignored, always -1 in masked slots.
-    F: (B, 3, 3) float64 of unit Frobenius norm, ``x1^T F x0 = 0``; zero where none is known or determined.
-    """
+    correspondences: the matches. label: (B, N) int8, 1 inlier, 0 outlier, -1 ignored, always -1 in masked slots. F: (B,
+    3, 3) float64 of unit Frobenius norm, ``x1^T F x0 = 0``; zero where none is known or determined."""
 
     correspondences: Correspondences
     label: Int8[Tensor, "b n"]
@@ -100,9 +98,7 @@ class LabelledMatches(Record):
 
 def collate(items: Sequence[LabelledMatches]) -> LabelledMatches:
     """One padded batch from several: for torch's DataLoader. Optional fields survive only where every item has them.
-
-    Raises ValueError for an empty list.
-    """
+    Raises ValueError for an empty list."""
     c = types.collate([item.correspondences for item in items])
     n = c.x0.shape[1]
     label = torch.cat([_padded(item.label, n) for item in items])
@@ -173,10 +169,8 @@ _ROUNDING = 1e-6  # pixels that a rotated side may exceed a whole number by
 
 class Augmentation(AugmentationOptions):
     """Random changes of a pair's labelled matches, after which the truth is still true.
-
     The same (seed, key, epoch) gives the same matches, so a training that is resumed sees what it would have seen.
-    Matches come out in random order, so the first ones of them are a random subset. None turns a change off.
-    """
+    Matches come out in random order, so the first ones of them are a random subset. None turns a change off."""
 
     @classmethod
     def none(cls) -> "Augmentation":

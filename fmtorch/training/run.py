@@ -149,13 +149,8 @@ def train(
         folder / CHECKPOINTS, "{step}", save_top_k=1, monitor="step", mode="max", every_n_train_steps=checkpoint_every,
         enable_version_counter=False, save_on_train_epoch_end=False, validated_every=every,
     )  # fmt: skip
-    options: dict[str, Any] = {
-        "monitor": figure,
-        "mode": mode,
-        "enable_version_counter": False,
-        "save_weights_only": True,
-    }
-    best = ModelCheckpoint(folder / CHECKPOINTS, "best", **options)
+    chosen: dict[str, Any] = {"monitor": figure, "mode": mode, "save_weights_only": True}
+    best = ModelCheckpoint(folder / CHECKPOINTS, "best", enable_version_counter=False, **chosen)
     stop = [] if patience is None else [EarlyStopping(figure, mode=mode, patience=patience, strict=True)]
     with quiet(QUIET, logging.WARNING), warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*(does not have many workers|exists and is not empty).*")

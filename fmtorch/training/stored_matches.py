@@ -345,10 +345,8 @@ class SimilarLengthBatches(Sampler[list[Draw]]):
 
 def collate_trimmed(items: Sequence[LabelledMatches], padding: float = MAX_PADDING) -> LabelledMatches:
     """`collate`, with the longest pairs cut so that at most `padding` of all slots are padding.
-
-    The first matches of a pair are kept, a random subset of those that an `Augmentation` gives.
-    Raises ValueError for an empty list.
-    """
+    The first matches of a pair are kept, a random subset of those that an `Augmentation` gives. Raises ValueError for
+    an empty list."""
     counts = torch.tensor([int(item.correspondences.mask.sum()) for item in items])
     n = longest(counts, padding)
     return collate([item.compact().first(n) for item in items])

@@ -68,9 +68,7 @@ class MatchInputs:
 
     def unit(self, c: Correspondences) -> Float[Tensor, " b"]:
         """How many pixels one unit of the coordinates is, on average over both images; as `x0` in type.
-
-        Raises ValueError where image sizes or calibration matrices are missing.
-        """
+        Raises ValueError where image sizes or calibration matrices are missing."""
         if self.coordinates == "size":
             sizes = _known(c.size0, "size0", BY_SIZE), _known(c.size1, "size1", BY_SIZE)
             unit0, unit1 = (size.amax(-1) for size in sizes)

@@ -143,9 +143,7 @@ class Prediction(NamedTuple):
 @runtime_checkable
 class Exportable(Protocol):
     """A network whose parameters all belong to its `backbone`, a function of tensors: ONNX Runtime can take its place.
-
-    input_channels: of the backbone. options: the arguments that build the network, which its files state.
-    """
+    input_channels: of the backbone. options: the arguments that build the network, which its files state."""
 
     backbone: Any
     input_channels: int
@@ -158,9 +156,7 @@ class Exportable(Protocol):
 
 def predict(network: nn.Module, c: Correspondences) -> Prediction:
     """What any network says of a batch: one that returns log-odds (B, N) alone gets weights of ``tanh(relu(logit))``.
-
-    Raises TypeError or ValueError where the network returns something else.
-    """
+    Raises TypeError or ValueError where the network returns something else."""
     output = network(c)
     if isinstance(output, Prediction):
         return output
