@@ -65,8 +65,7 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
             kept = len({pair.key for pair in own} & folder.done())
             raise KeyboardInterrupt(f"{kept} of {len(own)} pairs are kept in {folder.path}") from None
     if len(todo) < len(own):
-        earlier = f"{len(own) - len(todo)} of {len(own)} pairs taken from an earlier run in {folder.path}"
-        console.print(earlier)
+        console.print(f"{len(own) - len(todo)} of {len(own)} pairs taken from an earlier run in {folder.path}")
     table = folder.read({pair.key for pair in pairs}, without=("pair", "F"))
     if shard is not None and len(table) < len(pairs):
         console.print(f"{len(table)} of {len(pairs)} pairs have rows; other shards have the rest")

@@ -124,6 +124,5 @@ def _line(name: str, value: Any, about: str) -> str:
     if isinstance(value, dict):
         name, value, about = f"{name}.NAME", "", f"{about}; NAME: {', '.join(value)}"
     start = f"  {name}={shown(value) if value != '' else ''}"
-    lines = textwrap.wrap(about, _WIDTH - _COLUMN, break_on_hyphens=False) or [""]
-    indented = f"\n{' ' * _COLUMN}".join(lines)
+    indented = f"\n{' ' * _COLUMN}".join(textwrap.wrap(about, _WIDTH - _COLUMN, break_on_hyphens=False) or [""])
     return f"{start:{_COLUMN - 1}} {indented}".rstrip()

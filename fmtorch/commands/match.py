@@ -209,8 +209,7 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
     error = None if truth is None or not result.ok else _nsgd(result, truth)
     report = {"version": __version__, **settings, "image0": str(paths[0]), "image1": str(paths[1])}
     written = result.save(folder, truth=truth, report=report | ({} if error is None else {"nsgd": error}))
-    heading = f"{' '.join([pipeline_name, *overrides])}: {paths[0].name}, {paths[1].name}"
-    console.print(heading, style="italic")
+    console.print(f"{' '.join([pipeline_name, *overrides])}: {paths[0].name}, {paths[1].name}", style="italic")
     extractor = pipeline.extractor
     console.print(_table(result, isinstance(extractor, CachedFeatures) and not extractor.computed))
     if result.related:

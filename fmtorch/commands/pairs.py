@@ -84,8 +84,7 @@ def _select(construction: Construction, execution: Execution, progress: Progress
     kept, judged, problems = list[int](), 0, dict[str, None]()
     here, there = itertools.tee(blocks(order))
     for (_, ranks), verdicts in zip(here, _each(construction, execution, "judge", there), strict=False):
-        passed = [rank for rank, good in zip(ranks, verdicts.kept, strict=True) if good]
-        kept += passed
+        kept += [rank for rank, good in zip(ranks, verdicts.kept, strict=True) if good]
         judged += len(ranks)
         problems.update(dict.fromkeys(verdicts.problems))
         progress.update(bar, completed=judged if construction.count is None else min(len(kept), total))

@@ -32,8 +32,7 @@ def run(config: DictConfig, estimator: str) -> Verification:
     mode = VerifyMode(fields.cameras, fields.force, fields.seed, execution, shard_of(fields.shard))
     with _begun_by_reports(estimator) as report:
         paths = VerifyPaths(fields.database, fields.features_file, fields.matches, fields.output)
-        settings = {"estimator": plain(config.estimator)}
-        result = verify_by(make, settings, paths, mode, report)
+        result = verify_by(make, {"estimator": plain(config.estimator)}, paths, mode, report)
     for problem in result.problems[:MAX_PROBLEMS]:
         errors.print(problem, style="bold", soft_wrap=True)
     if len(result.problems) > MAX_PROBLEMS:

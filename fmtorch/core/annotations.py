@@ -82,8 +82,7 @@ def arguments_of(function: Callable[..., Any]) -> dict[str, Expected]:
 
 def arrays_of(kind: type) -> dict[str, Expected]:
     """What the annotations of a class say of its arrays, by field."""
-    hints = typing.get_type_hints(kind, include_extras=True)
-    fields = {name: expectation(hint) for name, hint in hints.items()}
+    fields = {name: expectation(hint) for name, hint in typing.get_type_hints(kind, include_extras=True).items()}
     return {name: expected for name, expected in fields.items() if expected.kind == "array"}
 
 

@@ -15,8 +15,7 @@ def lazy_exports(package: str, checked: bool = False) -> None:
     """Import the names that a package lists under ``if TYPE_CHECKING:``, and its modules, at their first use.
     checked: exported functions check their arguments, see `fmtorch.core.checks.checked`. The package's own modules
     import each other's functions unchecked, from where they are defined."""
-    module = sys.modules[package]
-    module.__class__ = _CheckedPackage if checked else _LazyPackage
+    sys.modules[package].__class__ = _CheckedPackage if checked else _LazyPackage
 
 
 class _LazyPackage(ModuleType):

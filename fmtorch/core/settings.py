@@ -76,8 +76,7 @@ def leaves(value: Any, name: str = "") -> Iterator[tuple[str, str]]:
     A list of mappings of one name each, such as a pipeline's pruners, is that order of names, and what is below
     each."""
     if isinstance(value, list) and value and all(isinstance(entry, dict) and len(entry) == 1 for entry in value):
-        names = [key for entry in value for key in entry]
-        yield name, f"[{', '.join(names)}]"
+        yield name, f"[{', '.join([key for entry in value for key in entry])}]"
         value = {key: below for entry in value for key, below in entry.items()}
     if isinstance(value, dict) and value:
         for key, entry in value.items():

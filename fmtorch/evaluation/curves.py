@@ -132,8 +132,7 @@ def _path(errors: NDArray[np.float64]) -> str:
     share = np.searchsorted(np.sort(errors), thresholds, side="left") / max(len(errors), 1)
     change = np.diff(share) != 0
     keep = np.concatenate([[True], change]) | np.concatenate([change, [True]])
-    points = [f"{_x(t):.1f},{_y(s):.1f}" for t, s in zip(thresholds[keep], share[keep], strict=True)]
-    return "M" + "L".join(points)
+    return "M" + "L".join([f"{_x(t):.1f},{_y(s):.1f}" for t, s in zip(thresholds[keep], share[keep], strict=True)])
 
 
 def _x(share: float) -> float:

@@ -91,8 +91,7 @@ def from_stored(pair: ImagePair, images: Sequence[Image], stored: Row, name: str
     """The epipolar lines of the F that a run stored, of corners of the images; nothing of a pair without F."""
     if not stored["ok"] or pair.H is not None:
         return []
-    F = np.array(stored["F"]).reshape(3, 3)
-    lines = draw_epipolar_lines_of_corners(images[0], images[1], F, truth=pair.F)
+    lines = draw_epipolar_lines_of_corners(images[0], images[1], np.array(stored["F"]).reshape(3, 3), truth=pair.F)
     said = "Epipolar lines of some corners, each in the other image, by the stored F; the true ones dashed in white"
     return [Picture(lines, f"epipolar lines of {name}", said)]
 

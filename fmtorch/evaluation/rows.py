@@ -75,8 +75,7 @@ def _of_fundamental_matrices(outcomes: Sequence[Outcome], seed: int, signed: boo
         rates = metrics.inlier_rate(F, c.x0, c.x1, estimate.inliers, *sizes, mask=c.mask)
         for i, before, after in zip(matched, rates.before.tolist(), rates.after.tolist(), strict=True):
             figures[i] |= {"inlier_rate_before": before, "inlier_rate": after if outcomes[i].solved else math.nan}
-    poses = pose_errors(outcomes, signed)
-    return [each | pose._asdict() for each, pose in zip(figures, poses, strict=True)]
+    return [each | pose._asdict() for each, pose in zip(figures, pose_errors(outcomes, signed), strict=True)]
 
 
 def _of_homographies(outcomes: Sequence[Outcome]) -> list[Figures]:

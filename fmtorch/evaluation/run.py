@@ -171,8 +171,7 @@ class WithPairCameras:
         return getattr(self._estimator.estimator, "kernels", ())
 
     def given(self, c: Correspondences) -> Correspondences:
-        own = [self.cameras[key] for key in c.keys.tolist()]
-        K0, K1, focal, shared = zip(*own, strict=True)
+        K0, K1, focal, shared = zip(*[self.cameras[key] for key in c.keys.tolist()], strict=True)
         stacked = [None if K[0] is None else torch.stack(K).to(c.mask.device) for K in (K0, K1, focal)]  # all, or none
         fields = dict(zip(("K0", "K1", "focal"), stacked, strict=True))
         return c.derived(**fields, shared_focal=torch.tensor(shared, device=c.mask.device))

@@ -390,8 +390,7 @@ def _merged(words: Sequence[str]) -> str:
         ordered = sorted((match[1] for match in numbers), key=float)
         return f"{ordered[0]} to {ordered[-1]}{numbers[0][2]}"
     head = _shared_start(different)
-    tail = _shared_start([word[len(head) :][::-1] for word in different])[::-1]
-    return f"{head}…{tail}"
+    return f"{head}…{_shared_start([word[len(head) :][::-1] for word in different])[::-1]}"
 
 
 def _shared_start(words: Sequence[str]) -> str:

@@ -192,8 +192,7 @@ def _parts_of_run(summary: Mapping[str, Group], binned: bool) -> list[Part]:
 def terminal_tables(summary: Mapping[str, Group], title: str, width: int = 80) -> list[TerminalTable]:
     """The main figures of a run, or of several by their names, for a terminal of so many columns.
     Columns for which there is no room are left out, and the note says so, rather than words and numbers broken."""
-    columns = known_columns(TERMINAL_COLUMNS, summary)
-    first = Part(title, caption(summary), columns, _groups(summary))
+    first = Part(title, caption(summary), known_columns(TERMINAL_COLUMNS, summary), _groups(summary))
     return [_fitted(part, width) for part in (first, *_parts_of_run(summary, binned=False))]
 
 

@@ -43,8 +43,7 @@ def corner_error(
     finite = (torch.isfinite(a) & torch.isfinite(b)).all(-1)
     difference = torch.where(finite[..., None], a - b, 0.0)
     squared = component_sum(difference * difference, -1)
-    distance = squared * inverse_root(squared)
-    return torch.where(finite.all(-1), component_sum(distance, -1) / 4, torch.inf)
+    return torch.where(finite.all(-1), component_sum(squared * inverse_root(squared), -1) / 4, torch.inf)
 
 
 @checked

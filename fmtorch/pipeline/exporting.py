@@ -36,8 +36,7 @@ def match_records(pipeline: Pipeline, outcomes: Sequence[Outcome]) -> MatchRecor
         F = estimate.F[0] if outcome.solved else torch.zeros(3, 3)
         points = records.images[ends[0]].points, records.images[ends[1]].points
         matched = c if outcome.keypoints is None else outcome.keypoints
-        names = str(ends[0]), str(ends[1])
-        kept = _pair(names, points, matched, F, estimate.inliers[0], bool(estimate.related[0]))
+        kept = _pair((str(ends[0]), str(ends[1])), points, matched, F, estimate.inliers[0], bool(estimate.related[0]))
         if outcome.pair_type is not None:
             kept = dataclasses.replace(kept, geometry=_geometry(kept.matches, c, estimate, outcome.pair_type))
         records.pairs[ends] = kept
@@ -50,8 +49,7 @@ def _geometry(matches: NDArray[np.int32], c: Correspondences, estimate: Estimate
     if not c.asks_for_cameras and c.K0 is not None and c.K1 is not None and bool(pair_type.determined[0]):
         ends = estimate.F.double(), c.K0.double(), c.K1.double(), c.x0.double(), c.x1.double()
         pose = pose_from_fundamental(*ends, estimate.inliers & c.mask)
-        E = cross_matrix(pose.t) @ pose.R
-        estimate = estimate.derived(E=E, R=pose.R, t=pose.t)
+        estimate = estimate.derived(E=cross_matrix(pose.t) @ pose.R, R=pose.R, t=pose.t)
         c = c.derived(focal=torch.tensor([[EXACT, EXACT]], dtype=torch.float64, device=c.mask.device))
     index = np.zeros((c.mask.shape[1], 2), np.int32)
     index[c.mask[0].cpu().numpy()] = matches

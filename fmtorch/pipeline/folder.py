@@ -197,8 +197,7 @@ def described_or_matched(pipeline: Pipeline, task: Photograph | DescribedPair) -
     try:
         with one_thread(pipeline.device):
             if isinstance(task, DescribedPair):
-                result = relate(pipeline, *task.ends, task.seed, **task.known)
-                return exported_match(task.names, task.ends, result)
+                return exported_match(task.names, task.ends, relate(pipeline, *task.ends, task.seed, **task.known))
             if isinstance(task.image, str):
                 return task.image
             return describe(pipeline, read_image(task.image, orient=task.orient), task.longest_side)

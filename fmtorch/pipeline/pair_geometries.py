@@ -52,8 +52,7 @@ def _calibrated(c: Correspondences, estimate: Estimate) -> Tensor:
     """Whether both focal lengths of a pair are known, and the pose with them: (b,)."""
     if c.focal is None or estimate.R is None:
         return torch.zeros_like(estimate.ok)
-    known = c.focal[..., 1].isfinite().all(1)
-    return known & estimate.R.isfinite().flatten(1).all(1) & ~_conflicting(c, estimate)
+    return c.focal[..., 1].isfinite().all(1) & estimate.R.isfinite().flatten(1).all(1) & ~_conflicting(c, estimate)
 
 
 def _with_lines(kind: Kind, inliers: NDArray[np.integer[Any]], estimate: Estimate, i: int, H: Any) -> PairGeometry:

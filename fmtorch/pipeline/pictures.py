@@ -35,8 +35,7 @@ class Place:
 
     def __call__(self, x: Points) -> NDArray[np.float64]:
         """Pixels of the image as pixels of the canvas; (0, 0) is the centre of the first pixel of either."""
-        scale = np.array(self.size) / self.shape[::-1]
-        return np.asarray((x + 0.5) * scale - 0.5 + self.origin, np.float64)
+        return np.asarray((x + 0.5) * (np.array(self.size) / self.shape[::-1]) - 0.5 + self.origin, np.float64)
 
     def view(self, canvas: Image) -> Image:
         return canvas[self.origin[1] : self.origin[1] + self.size[1], self.origin[0] : self.origin[0] + self.size[0]]
@@ -154,8 +153,7 @@ def dashes(ends: Points, length: float) -> Iterator[Points]:
 
 def fixed(points: Points) -> list[tuple[int, int]]:
     """Points (N, 2) as OpenCV takes them with `SUBPIXEL` fractional bits."""
-    rounded = np.round(points * (1 << SUBPIXEL)).astype(int)
-    return [(int(x), int(y)) for x, y in rounded]
+    return [(int(x), int(y)) for x, y in np.round(points * (1 << SUBPIXEL)).astype(int)]
 
 
 # RGB; told apart by all kinds of colour vision (Okabe & Ito), lightened.
@@ -276,8 +274,7 @@ def draw_epipolar_lines_of_corners(image0: Image, image1: Image, F: Points, *, t
     chosen1 = _corners(image1, place0.clip, known.T, len(COLOURS) // 2)
     both = [matrix for matrix in (F, truth) if matrix is not None]
     first = len(chosen0)
-    lines0 = _lines(place0, [matrix.T for matrix in both], chosen1)
-    _lines_and_points(canvas, place0, lines0, chosen0, 0, first)
+    _lines_and_points(canvas, place0, _lines(place0, [matrix.T for matrix in both], chosen1), chosen0, 0, first)
     _lines_and_points(canvas, place1, _lines(place1, both, chosen0), chosen1, first, 0)
     return canvas
 

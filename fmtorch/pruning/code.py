@@ -148,10 +148,8 @@ def huber_regression(
     scale2 = basis.new_tensor(scale * scale)
     for _ in range(iterations):
         residual = target - basis @ coefficients
-        weight = huber_weight(residual.square().sum(1), scale2)
-        weighted = (basis * weight[:, None]).T
-        normal = (weighted @ basis).double() + ridge.double()
-        factor = torch.linalg.cholesky_ex(normal).L
+        weighted = (basis * huber_weight(residual.square().sum(1), scale2)[:, None]).T
+        factor = torch.linalg.cholesky_ex((weighted @ basis).double() + ridge.double()).L
         coefficients = torch.cholesky_solve((weighted @ target).double(), factor).to(basis.dtype)
     return coefficients
 

@@ -165,8 +165,7 @@ def frame_map(lafs0: Float[Tensor, "b n 2 3"], lafs1: Float[Tensor, "b n 2 3"]) 
     (a, b), (c, d) = (row.unbind(-1) for row in lafs0[..., :2].unbind(-2))
     determinant = a * d - b * c
     inverse = torch.stack([torch.stack([d, -b], -1), torch.stack([-c, a], -1)], -2)
-    A1 = lafs1[..., :2]
-    product = (A1[..., :, :, None] * inverse[..., None, :, :]).sum(-2)
+    product = (lafs1[..., :2][..., :, :, None] * inverse[..., None, :, :]).sum(-2)
     return product / determinant[..., None, None]
 
 

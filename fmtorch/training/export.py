@@ -102,8 +102,7 @@ class Validation:
         labelled = [pair.labelled for pair in self.pairs]
         logit = torch.cat([value[mask] for value, mask in zip(logits, labelled, strict=True)])
         label = torch.cat([pair.label[mask] for pair, mask in zip(self.pairs, labelled, strict=True)])
-        loss = float(classification_loss(logit[None], label[None]))
-        figures = {"log_loss": loss, **_classified(logit, label)}
+        figures = {"log_loss": float(classification_loss(logit[None], label[None])), **_classified(logit, label)}
         for name, values in nsgd.items():
             figures |= self._recalls(name, values)
         return Evaluation(figures, logit, label)
@@ -260,8 +259,7 @@ def export_onnx(network: nn.Module, path: Path, *, temperature: float = 1.0) -> 
     import onnx
 
     alone = _OnePair(copy.deepcopy(network.backbone)).eval().cpu().float()
-    generator = torch.Generator().manual_seed(0)
-    example = torch.rand(1, network.input_channels, EXAMPLE_MATCHES, generator=generator)
+    example = torch.rand(1, network.input_channels, EXAMPLE_MATCHES, generator=torch.Generator().manual_seed(0))
     model = onnx_model(alone, example, INPUT, OUTPUT, free_axis=2)
     onnx.helper.set_model_props(model, _metadata(network, temperature, None))
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -314,8 +312,7 @@ class _OnePair(nn.Module):
         self.backbone = backbone
 
     def forward(self, x: Float[Tensor, "1 channels n"]) -> Float[Tensor, "1 outputs n"]:
-        matches = torch.ones_like(x[:, 0]).sum(1)
-        return self.backbone(x, Slots(matches, None))  # type: ignore[no-any-return]
+        return self.backbone(x, Slots(torch.ones_like(x[:, 0]).sum(1), None))  # type: ignore[no-any-return]
 
 
 def _metadata(network: nn.Module, temperature: float, notes: Mapping[str, str] | None) -> dict[str, str]:

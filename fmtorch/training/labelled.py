@@ -57,8 +57,7 @@ class LabelledMatches(Record):
     def __post_init__(self) -> None:
         b, n = self.correspondences.x0.shape[:2]
         expect_fields(self, b=b, n=n)
-        label = torch.where(self.correspondences.mask, self.label, IGNORED)
-        object.__setattr__(self, "label", label)
+        object.__setattr__(self, "label", torch.where(self.correspondences.mask, self.label, IGNORED))
 
     @property
     def labelled(self) -> Bool[Tensor, "b n"]:
@@ -106,8 +105,7 @@ def collate(items: Sequence[LabelledMatches]) -> LabelledMatches:
 
 
 def _padded(label: Tensor, n: int) -> Tensor:
-    missing = max(n - label.shape[1], 0)
-    return torch.nn.functional.pad(label, (0, missing), value=IGNORED)[:, :n]
+    return torch.nn.functional.pad(label, (0, max(n - label.shape[1], 0)), value=IGNORED)[:, :n]
 
 
 def label(dataset: PairDataset, pair: ImagePair, x0: Points, x1: Points) -> Labels:
@@ -121,8 +119,7 @@ def label(dataset: PairDataset, pair: ImagePair, x0: Points, x1: Points) -> Labe
     K0, K1, R, t = (np.asarray(value) for value in cameras)
     depth0, depth1 = (depths(dataset, image, x) for image, x in ((pair.image0, x0), (pair.image1, x1)))
     forward = transfer_error(x0, depth0, x1, K0, K1, R, t)
-    backward = transfer_error(x1, depth1, x0, K1, K0, R.T, -R.T @ t)
-    return by_transfer(forward, backward, line)
+    return by_transfer(forward, transfer_error(x1, depth1, x0, K1, K0, R.T, -R.T @ t), line)
 
 
 def by_line(line: NDArray[np.float64]) -> Labels:
@@ -140,8 +137,7 @@ def by_transfer(forward: NDArray[np.float64], backward: NDArray[np.float64], lin
 
 def depths(dataset: DepthDataset, image: ImageSource, x: Points) -> NDArray[np.float64]:
     """The depths (k, n) at points (n, 2) of an image and `EDGE_PX` beside them."""
-    around = (x[None] + _AROUND[:, None]).reshape(-1, 2)
-    return dataset.depth(image, around).reshape(len(_AROUND), -1)
+    return dataset.depth(image, (x[None] + _AROUND[:, None]).reshape(-1, 2)).reshape(len(_AROUND), -1)
 
 
 def transfer_error(
@@ -293,8 +289,8 @@ def _box(size: list[int], width: float, height: float, x: float, y: float) -> tu
 def _unless_poor(changed: LabelledMatches, before: LabelledMatches) -> LabelledMatches:
     """`changed`, unless it leaves too few inliers, or no match at all."""
     needed = min(MIN_INLIERS, int(before.inlier.sum()))
-    poor = int(changed.inlier.sum()) < needed or not bool(changed.correspondences.mask.any())
-    return before if poor else changed
+    enough = int(changed.inlier.sum()) >= needed and bool(changed.correspondences.mask.any())
+    return changed if enough else before
 
 
 def _thinned(matches: LabelledMatches, share: float, order: Int[Tensor, " n"]) -> Bool[Tensor, "1 n"]:
@@ -312,8 +308,7 @@ def _thinned(matches: LabelledMatches, share: float, order: Int[Tensor, " n"]) -
 
 
 def _numbers(seed: int, key: int, n: int, columns: int) -> Float[Tensor, "n columns"]:
-    drawn = uniform(seed, torch.tensor([key]), Stream.AUGMENTATION, 0, n, columns)[0]
-    return drawn.clamp(min=2.0**-53)
+    return uniform(seed, torch.tensor([key]), Stream.AUGMENTATION, 0, n, columns)[0].clamp(min=2.0**-53)
 
 
 def _order(seed: int, key: int, n: int) -> Int[Tensor, " n"]:

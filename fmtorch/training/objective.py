@@ -272,8 +272,7 @@ def points_on_lines(F: F8x2, size0: F8x1, size1: F8x1, key: I8x1, mixed_seed: in
 def _mean_over_pairs(value: Float[Tensor, "*stages b"], counted: Bool[Tensor, "*#stages b"]) -> Float[Tensor, ""]:
     """The mean over the pairs that count, of each stage, then over stages; 0 for a stage where none counts."""
     counted = counted.expand(value.shape)
-    count = counted.sum(-1).clamp(min=1)
-    return (stable_sum(torch.where(counted, value, 0.0)) / count).mean()
+    return (stable_sum(torch.where(counted, value, 0.0)) / counted.sum(-1).clamp(min=1)).mean()
 
 
 def _valid_models(F: Float[Tensor, "*stages b 3 3"], valid: Tensor | None = None) -> Bool[Tensor, "*stages b"]:
@@ -287,8 +286,7 @@ def _by_size(size: Real[Tensor, "b 2"]) -> Float[Tensor, "b 3 3"]:
     h, w = size.to(torch.float64).unbind(-1)
     half = torch.maximum(h, w) / 2
     zero, ones = torch.zeros_like(h), torch.ones_like(h)
-    rows = [half, zero, (w - 1) / 2, zero, half, (h - 1) / 2, zero, zero, ones]
-    return torch.stack(rows, -1).reshape(-1, 3, 3)
+    return torch.stack([half, zero, (w - 1) / 2, zero, half, (h - 1) / 2, zero, zero, ones], -1).reshape(-1, 3, 3)
 
 
 def _diagonal(A: Float[Tensor, "b 3 3"]) -> Bool[Tensor, " b"]:

@@ -216,8 +216,7 @@ def grey_of(rng: np.random.Generator, image: NDArray[np.uint8]) -> Grey:
     """A grey image of an RGB one with random weights of the channels, as under light of another colour."""
     if image.ndim == 2:
         return image
-    weights = rng.dirichlet([3.0, 5.0, 2.0])
-    return np.clip(image @ weights, 0, 255).astype(np.uint8)
+    return np.clip(image @ rng.dirichlet([3.0, 5.0, 2.0]), 0, 255).astype(np.uint8)
 
 
 def change_light(rng: np.random.Generator, image: Grey) -> Grey:
@@ -226,8 +225,7 @@ def change_light(rng: np.random.Generator, image: Grey) -> Grey:
     x = x ** np.float32(math.exp(rng.uniform(-0.5, 0.5)))
     if rng.random() < 0.6:
         coarse = rng.normal(0, rng.uniform(0.1, 0.4), (int(rng.integers(2, 6)), int(rng.integers(2, 6))))
-        field = cv2.resize(coarse.astype(np.float32), image.shape[::-1], interpolation=cv2.INTER_CUBIC)
-        x = x * np.exp(field)
+        x = x * np.exp(cv2.resize(coarse.astype(np.float32), image.shape[::-1], interpolation=cv2.INTER_CUBIC))
     low, high = float(x.min()), float(x.max())
     bottom, top = rng.uniform(-0.1, 0.2), rng.uniform(0.65, 1.15)
     x = bottom + (x - low) / max(high - low, 1e-6) * (top - bottom)
@@ -247,8 +245,7 @@ def change_camera(rng: np.random.Generator, image: Grey) -> Grey:
         kernel = np.asarray(cv2.warpAffine(line, turn, (length, length)), np.float32)
         image = np.asarray(cv2.filter2D(image, -1, kernel / max(float(kernel.sum()), 1e-6)), np.uint8)
     if rng.random() < 0.6:
-        noise = rng.normal(0, rng.uniform(1, 9), image.shape)
-        image = np.clip(image + noise, 0, 255).round().astype(np.uint8)
+        image = np.clip(image + rng.normal(0, rng.uniform(1, 9), image.shape), 0, 255).round().astype(np.uint8)
     if rng.random() < 0.6:
         _, coded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(25, 95))])
         image = np.asarray(cv2.imdecode(coded, cv2.IMREAD_GRAYSCALE), np.uint8)

@@ -84,8 +84,7 @@ class PrunerTraining(lightning.LightningModule):
 
     def training_step(self, batch: LabelledMatches, index: int) -> Tensor:
         """The loss of a batch. Raises FloatingPointError where it is not finite: no step is skipped in silence."""
-        prediction = predict(self.network, batch.correspondences)
-        terms = self.objective(prediction, batch, self.global_step)
+        terms = self.objective(predict(self.network, batch.correspondences), batch, self.global_step)
         if not bool(torch.isfinite(terms["loss"])):
             values = {name: float(value) for name, value in terms.items()}
             raise FloatingPointError(f"the loss of step {self.global_step} is not finite: {values}")
@@ -393,8 +392,7 @@ def labelled_matches(config: DictConfig, options: TrainOptions, progress: Progre
             digests.append(stored.folder.name)
             pairs = {source[i].key: source[i] for i in selected}
             for i, about in enumerate(stored.pairs):
-                matches = keep_ratio(stored.stored(i), validated.ratio).compact()
-                validation.append((pairs[about["key"]], matches))
+                validation.append((pairs[about["key"]], keep_ratio(stored.stored(i), validated.ratio).compact()))
     if not validation:
         raise ValueError("no pairs to validate on: give validation.scenes or validation.roots")
     families = Counter(pair.family for pair, _ in validation)

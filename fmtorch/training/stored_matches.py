@@ -336,8 +336,7 @@ class SimilarLengthBatches(Sampler[list[Draw]]):
         yield from everyone[self.rank :: self.world_size][self.start :]
 
     def _numbers(self, n: int, purpose: int) -> torch.Tensor:
-        key = torch.tensor([self.epoch * 3 + purpose])
-        return uniform(self.seed, key, Stream.BATCHES, 0, n, 1)[0, :, 0]
+        return uniform(self.seed, torch.tensor([self.epoch * 3 + purpose]), Stream.BATCHES, 0, n, 1)[0, :, 0]
 
     def _shuffled(self, n: int, purpose: int) -> torch.Tensor:
         return torch.argsort(self._numbers(n, purpose))
@@ -347,8 +346,7 @@ def collate_trimmed(items: Sequence[LabelledMatches], padding: float = MAX_PADDI
     """`collate`, with the longest pairs cut so that at most `padding` of all slots are padding.
     The first matches of a pair are kept, a random subset of those that an `Augmentation` gives. Raises ValueError for
     an empty list."""
-    counts = torch.tensor([int(item.correspondences.mask.sum()) for item in items])
-    n = longest(counts, padding)
+    n = longest(torch.tensor([int(item.correspondences.mask.sum()) for item in items]), padding)
     return collate([item.compact().first(n) for item in items])
 
 

@@ -124,8 +124,7 @@ def _scale(c: Correspondences) -> list[Tensor]:
     S = _frame_map(c)
     if S is None:
         return [torch.zeros_like(c.x0[..., 0])]
-    determinant = S[..., 0, 0] * S[..., 1, 1] - S[..., 0, 1] * S[..., 1, 0]
-    return [determinant.abs().clamp_min(MIN_AREA_RATIO).log() / 2]
+    return [(S[..., 0, 0] * S[..., 1, 1] - S[..., 0, 1] * S[..., 1, 0]).abs().clamp_min(MIN_AREA_RATIO).log() / 2]
 
 
 def _rotation(c: Correspondences) -> list[Tensor]:
@@ -216,8 +215,7 @@ class LC(_OfBackbone):
         """One stage; ``weight = tanh(relu(logit))`` as published (section 3.3), 0 where masked."""
         x, mask = self.inputs(c)
         logit = backbone(x, Slots.of(mask))[:, 0]
-        weight = torch.where(mask, torch.tanh(torch.relu(logit)), 0)
-        return Prediction(logit[None], weight[None])
+        return Prediction(logit[None], torch.where(mask, torch.tanh(torch.relu(logit)), 0)[None])
 
 
 class PointwiseNetwork(nn.Module):
@@ -303,6 +301,5 @@ class DFE(_OfBackbone):
 
 def masked_softmax(logit: Float[Tensor, "b n"], mask: Bool[Tensor, "b n"]) -> Float[Tensor, "b n"]:
     """Softmax over the matches of each pair; zero where masked, also where all are."""
-    lowest = torch.finfo(logit.dtype).min
-    weight = torch.softmax(torch.where(mask, logit, lowest), -1)
+    weight = torch.softmax(torch.where(mask, logit, torch.finfo(logit.dtype).min), -1)
     return torch.where(mask, weight, 0)

@@ -46,8 +46,7 @@ def learned_file(name: str | Path, runtime: str) -> Path:
     path = Path(name)
     if path.suffix in SUFFIXES.values():
         return path
-    folder = models_dir() if len(path.parts) == 1 else path.parent
-    return folder / f"{path.name}{SUFFIXES[runtime]}"
+    return (models_dir() if len(path.parts) == 1 else path.parent) / f"{path.name}{SUFFIXES[runtime]}"
 
 
 def stated_network(network: nn.Module) -> dict[str, Any]:
