@@ -21,8 +21,7 @@ from fmtorch.data import ImagePair
 from fmtorch.evaluation import curves, tables
 from fmtorch.evaluation.run import built_with, cameras_of, evaluate_pairs, run_identity, select
 from fmtorch.evaluation.statistics import ALL, Group, summarize
-from fmtorch.io.export import export_kinds, write_exports
-from fmtorch.io.match_store import MatchStore
+from fmtorch.io import MatchStore, export_kinds, write_exports
 from fmtorch.jobs.execution import MIN_PAIRS_FOR_PROCESSES, Execution, shard_of
 from fmtorch.pipeline.exporting import exportable
 from fmtorch.pipeline.pipeline import Pipeline, build_pipeline

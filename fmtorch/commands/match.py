@@ -32,14 +32,12 @@ from fmtorch.features.vlad import descriptor_kind, image_vector
 from fmtorch.io import export, match_store
 from fmtorch.jobs.execution import MIN_PAIRS_FOR_PROCESSES
 from fmtorch.metrics import nsgd
+from fmtorch.pipeline import MatchResult, Pipeline, build_pipeline, match
 from fmtorch.pipeline import folder as folders
 from fmtorch.pipeline.folder import EXHAUSTIVE, SIMILAR, FolderMatches
 from fmtorch.pipeline.photographs import Image, PhotographCameras
-from fmtorch.pipeline.pipeline import Pipeline, build_pipeline
-from fmtorch.pipeline.two_images import MatchResult, match
 from fmtorch.presets.composition import execution_of, read_fields
-from fmtorch.runs.feature_cache import CachedFeatures, cached
-from fmtorch.runs.fingerprint import fmtorch_version
+from fmtorch.runs import CachedFeatures, cached, fmtorch_version
 
 
 def match_folder(

@@ -28,8 +28,7 @@ from fmtorch.io.match_store import MatchRecords, MatchStore
 from fmtorch.jit import kernel
 from fmtorch.jobs.execution import Execution
 from fmtorch.jobs.runner import Factory, Local, Source, TaskRunner, WorkerPool
-from fmtorch.pipeline.exporting import match_records
-from fmtorch.pipeline.pipeline import Outcome, Pipeline, examined
+from fmtorch.pipeline import Outcome, Pipeline, examined, match_records
 from fmtorch.presets import plain
 from fmtorch.runs import CachedFeatures, PairRow
 from fmtorch.runs.fingerprint import code_digest, file_digest, fmtorch_version, learned, libraries

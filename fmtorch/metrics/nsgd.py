@@ -19,8 +19,7 @@ from jaxtyping import Float, Int, Real
 from torch import Tensor
 
 from fmtorch.core.checks import checked, expect_sizes
-from fmtorch.geometry.arithmetic import sqrt
-from fmtorch.geometry.epipolar import unit_largest
+from fmtorch.geometry import arithmetic, epipolar
 from fmtorch.jit.batches import for_each_pair
 from fmtorch.jit.kernel import Array, F8x1, F8x2, F8x3, I8x1, inner, kernel, vector
 from fmtorch.jit.random import Stream, mixed_seed, stream_state, uniform_kernel
@@ -119,7 +118,7 @@ def _mean_distance(
     pairs, shape = _flattened(F_gt, F_est, size0, size1, samples, key)
     F = torch.stack(pairs[:2], 1)
     valid = F.detach().isfinite().flatten(1).all(1)
-    F = unit_largest(torch.where(valid[:, None, None, None], F, 0.0))
+    F = epipolar.unit_largest(torch.where(valid[:, None, None, None], F, 0.0))
     diagonals = torch.stack([diagonal(size) for size in pairs[2:4]], 1)
     units = diagonals if normalised else torch.ones_like(diagonals)
     tensors = (*F.unbind(1), *pairs[2:4], units, pairs[4])
@@ -194,7 +193,7 @@ def _flattened(
 def diagonal(size: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch"]:
     """Length of the image diagonal, in pixels."""
     h, w = size.unbind(-1)
-    return sqrt(h * h + w * w)
+    return arithmetic.sqrt(h * h + w * w)
 
 
 @kernel

@@ -16,9 +16,8 @@ from hydra.errors import HydraException
 from numpy.typing import NDArray
 from omegaconf import DictConfig
 
-from fmtorch.core import failures, stages
+from fmtorch.core import Correspondences, Estimate, Features, collate, failures, stages
 from fmtorch.core.stages import Estimator, FeatureExtractor, GreyPyramid, ImageMatcher, Matcher, PairImages, Pruner
-from fmtorch.core.types import Correspondences, Estimate, Features, collate
 from fmtorch.data import ImagePair, ImageSource, read_image, to_grey
 from fmtorch.geometry.significance import judged
 from fmtorch.jobs.execution import one_thread

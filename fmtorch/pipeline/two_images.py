@@ -18,9 +18,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from fmtorch import presets
-from fmtorch.core.files import replacing
-from fmtorch.core.stages import GreyPyramid, ImageMatcher, NoFeatures, PairImages, grey_pyramid, pruned
-from fmtorch.core.types import RELATED, Correspondences, Features
+from fmtorch.core import RELATED, Correspondences, Features, files, stages
 from fmtorch.data import Lens, to_grey
 from fmtorch.data.cameras import undistorted
 from fmtorch.io.match_store import PairGeometry
@@ -29,8 +27,7 @@ from fmtorch.pipeline import photographs, pictures
 from fmtorch.pipeline.pair_geometries import pair_geometries
 from fmtorch.pipeline.photographs import GivenImage, Image, frames_to_original, given_image, to_original
 from fmtorch.pipeline.pipeline import Clock, Pipeline, load_pipeline
-from fmtorch.two_view.arguments import Arrays, Focal, camera_fields
-from fmtorch.two_view.known_cameras import KnownCameras
+from fmtorch.two_view import arguments, known_cameras
 from fmtorch.two_view.pair_type import classify, compile_with, still_warning, warnings_of
 
 FLAT = ("planar", "rotation", "identical")  # pair types of which a homography explains all matches
@@ -94,7 +91,7 @@ class MatchResult:
         """Whether a fundamental matrix was found."""
         return not self.reason
 
-    def draw(self, what: Picture = "matches", *, truth: Arrays | None = None) -> Image:
+    def draw(self, what: Picture = "matches", *, truth: arguments.Arrays | None = None) -> Image:
         """A picture of both photographs, RGB (H, W, 3).
 
         Args:
@@ -119,7 +116,7 @@ class MatchResult:
         return pictures.headed(picture, *self._verdict)
 
     def save(
-        self, folder: Path | str, *, truth: Arrays | None = None, report: Mapping[str, Any] | None = None
+        self, folder: Path | str, *, truth: arguments.Arrays | None = None, report: Mapping[str, Any] | None = None
     ) -> list[str]:
         """Write `result.json` and the pictures into a folder, as `fmtorch match` does.
 
@@ -135,14 +132,14 @@ class MatchResult:
         folder.mkdir(parents=True, exist_ok=True)
         drawn = {"matches": True, "pruning": bool(self._pruners), "epipolar": self.ok or truth is not None}
         names = [name for name in get_args(Picture) if drawn[name]]
-        with replacing(folder / "result.json") as path:
+        with files.replacing(folder / "result.json") as path:
             path.write_text(json.dumps({**(report or {}), **self.report()}) + "\n")
         for name in get_args(Picture):
             path = folder / f"{name}.png"
             if name not in names:  # of an earlier run
                 path.unlink(missing_ok=True)
                 continue
-            with replacing(path) as temporary:
+            with files.replacing(path) as temporary:
                 nsgd = (report or {}).get("nsgd")
                 picture = self._epipolar(truth, nsgd) if name == "epipolar" else self.draw(name)
                 temporary.write_bytes(cv2.imencode(".png", picture[..., ::-1])[1].tobytes())
@@ -205,7 +202,7 @@ class MatchResult:
             return f"not related: so many inliers agree by chance (significance {self.significance:.1f})", True
         return f"related, {self.pair_type or 'general'}", False
 
-    def _epipolar(self, truth: Arrays | None, nsgd: float | None) -> Image:
+    def _epipolar(self, truth: arguments.Arrays | None, nsgd: float | None) -> Image:
         if not self.ok and truth is None:
             raise ValueError(f"there are no epipolar lines without F: {self.reason}")
         seen = self.correspondences if self.undistorted is None else self.undistorted
@@ -236,7 +233,7 @@ class Described:
     scale: Float[Tensor, " xy"]
     size: tuple[int, int]
     seconds: float
-    pyramid: GreyPyramid | None = None
+    pyramid: stages.GreyPyramid | None = None
     image: Image | None = None
 
     @property
@@ -247,9 +244,9 @@ class Described:
 def describe(pipeline: Pipeline, image: Image, longest_side: int) -> Described:
     """The features of a photograph, for `relate`; see `match`."""
     reduced, scale = photographs.reduced_image(image, longest_side)
-    itself = isinstance(pipeline.matcher, ImageMatcher)
-    features, seconds = (NoFeatures()(reduced), 0.0) if itself else pipeline.extract(reduced)
-    pyramid = grey_pyramid(to_grey(reduced)) if pipeline.looks_at_images else None
+    itself = isinstance(pipeline.matcher, stages.ImageMatcher)
+    features, seconds = (stages.NoFeatures()(reduced), 0.0) if itself else pipeline.extract(reduced)
+    pyramid = stages.grey_pyramid(to_grey(reduced)) if pipeline.looks_at_images else None
     return Described(features, scale, (image.shape[0], image.shape[1]), seconds, pyramid, reduced if itself else None)
 
 
@@ -265,9 +262,9 @@ def match(
     device: torch.device | str | None = None,
     longest_side: int = 1600,
     seed: int = 0,
-    K0: Arrays | None = None,
-    K1: Arrays | None = None,
-    focal: Focal = None,
+    K0: arguments.Arrays | None = None,
+    K1: arguments.Arrays | None = None,
+    focal: arguments.Focal = None,
     lens0: Lens | None = None,
     lens1: Lens | None = None,
 ) -> MatchResult:
@@ -312,7 +309,7 @@ def match(
         raise ValueError(f"device={device}, but the pipeline was built for {pipeline.device}; leave one of them out")
     images = [photographs.given_image(image, name) for image, name in ((image0, "image0"), (image1, "image1"))]
     K0, K1 = (K if lens is None else lens.K for K, lens in ((K0, lens0), (K1, lens1)))
-    cameras = camera_fields(K0, K1, focal, sizes_known=True)
+    cameras = arguments.camera_fields(K0, K1, focal, sizes_known=True)
     describing = functools.partial(describe, pipeline, longest_side=longest_side)
     at_once = functools.partial(mapped, share=True) if pipeline.device.type == "cpu" else map
     described0, described1 = at_once(describing, images)
@@ -347,10 +344,10 @@ _pipeline = functools.lru_cache(maxsize=8)(load_pipeline)
 
 def _matched(pipeline: Pipeline, described: Sequence[Described], clock: Clock) -> MatchResult:
     """Matching and pruning, in pixels of the images as they were described; a reason where there are no keypoints."""
-    images = cast(PairImages, tuple(each.pyramid for each in described))
+    images = cast(stages.PairImages, tuple(each.pyramid for each in described))
     keypoints0, keypoints1 = (each.features.keypoints for each in described)
     ends, putative = (keypoints0, keypoints1), None
-    if isinstance(pipeline.matcher, ImageMatcher):
+    if isinstance(pipeline.matcher, stages.ImageMatcher):
         putative = pipeline.matched(*(each.image for each in described))
         ends = putative.x0[0][putative.mask[0]], putative.x1[0][putative.mask[0]]
     none = torch.zeros(1, 0, dtype=torch.bool, device=ends[0].device)
@@ -370,7 +367,7 @@ def _matched(pipeline: Pipeline, described: Sequence[Described], clock: Clock) -
     slots = torch.arange(c.mask.shape[1], device=c.mask.device)
     for name, pruner in pipeline.pruners.items():
         with one_thread(pipeline.device):
-            c = pruned(pruner, c, lambda _: images)
+            c = stages.pruned(pruner, c, lambda _: images)
         slots, c = slots[c.mask[0]], c.compact()
         clock(name)
         counts[name] = len(slots)
@@ -382,7 +379,7 @@ def _estimated(
     pipeline: Pipeline, matched: MatchResult, c: Correspondences, scales: list[Tensor], seed: int, clock: Clock
 ) -> MatchResult:
     """The result with an estimate. c: the matches as pinholes have them, with what is known of the cameras."""
-    estimator = KnownCameras(pipeline.estimator) if c.asks_for_cameras else pipeline.estimator
+    estimator = known_cameras.KnownCameras(pipeline.estimator) if c.asks_for_cameras else pipeline.estimator
     estimate = pipeline.estimated(c, seed, estimator)
     clock("estimation")
     even, F, even_scales = photographs.evenly_reduced(c, estimate.F, scales)

@@ -14,8 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from fmtorch.core.stages import GreyPyramid, PairImages
-from fmtorch.core.types import Correspondences
+from fmtorch.core import Correspondences, GreyPyramid, PairImages
 from fmtorch.geometry.arithmetic import sqrt
 from fmtorch.jit.kernel import Array, B1x1, F8x1, F8x2, F8x3, I8x2, U1x1, inner, kernel, matrix, vector
 from fmtorch.jit.lanes import fill, load, store

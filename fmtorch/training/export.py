@@ -26,16 +26,7 @@ from fmtorch import metrics
 from fmtorch.core.files import replacing
 from fmtorch.core.stages import Estimator
 from fmtorch.metrics.recall import FINE_THRESHOLD
-from fmtorch.pruning.networks.layers import Slots
-from fmtorch.pruning.networks.learned import (
-    INPUT,
-    OUTPUT,
-    Exportable,
-    LearnedFile,
-    OnnxBackbone,
-    predict,
-    stated_network,
-)
+from fmtorch.pruning.networks import layers, learned
 from fmtorch.training.labelled import LabelledMatches
 from fmtorch.training.objective import classification_loss
 
@@ -93,7 +84,7 @@ class Validation:
         network.eval()
         torch.set_num_threads(1)
         try:
-            predictions = (predict(network, pair.correspondences.to(device)) for pair in self.pairs)
+            predictions = (learned.predict(network, pair.correspondences.to(device)) for pair in self.pairs)
             logits = [prediction.logit[-1].to("cpu", torch.float64) for prediction in predictions]
             nsgd = {name: self._nsgd(use, logits) for name, use in self.uses.items()}
         finally:
@@ -250,7 +241,7 @@ def export_onnx(network: nn.Module, path: Path, *, temperature: float = 1.0) -> 
     """Write a network's backbone as ONNX: float `matches` (1, channels, N), N free, to `outputs` (1, K, N).
     Needs the extra `export`. temperature: as of `save_weights`. Raises ValueError for a network that is not
     `Exportable`, ArithmeticError where ONNX Runtime disagrees with torch."""
-    if not isinstance(network, Exportable):
+    if not isinstance(network, learned.Exportable):
         missing = f"{type(network).__name__} has no `backbone`, `input_channels`, `options` and `predict`"
         raise ValueError(f"{missing}: it cannot be exported to ONNX, and runs with torch alone")
     outside = [key for key in network.state_dict() if not key.startswith("backbone.")]
@@ -260,13 +251,15 @@ def export_onnx(network: nn.Module, path: Path, *, temperature: float = 1.0) -> 
 
     alone = _OnePair(copy.deepcopy(network.backbone)).eval().cpu().float()
     example = torch.rand(1, network.input_channels, EXAMPLE_MATCHES, generator=torch.Generator().manual_seed(0))
-    model = onnx_model(alone, example, INPUT, OUTPUT, free_axis=2)
+    model = onnx_model(alone, example, learned.INPUT, learned.OUTPUT, free_axis=2)
     onnx.helper.set_model_props(model, _metadata(network, temperature, None))
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as unfinished, torch.no_grad():
         onnx.save(model, unfinished)
         x = torch.rand(1, network.input_channels, 3 * EXAMPLE_MATCHES)
-        exported = OnnxBackbone(network, unfinished, "")(x, Slots(torch.tensor([float(x.shape[2])]), None))
+        exported = learned.OnnxBackbone(network, unfinished, "")(
+            x, layers.Slots(torch.tensor([float(x.shape[2])]), None)
+        )
         expect_equal(unfinished, exported, alone(x))
 
 
@@ -312,11 +305,11 @@ class _OnePair(nn.Module):
         self.backbone = backbone
 
     def forward(self, x: Float[Tensor, "1 channels n"]) -> Float[Tensor, "1 outputs n"]:
-        return self.backbone(x, Slots(torch.ones_like(x[:, 0]).sum(1), None))  # type: ignore[no-any-return]
+        return self.backbone(x, layers.Slots(torch.ones_like(x[:, 0]).sum(1), None))  # type: ignore[no-any-return]
 
 
 def _metadata(network: nn.Module, temperature: float, notes: Mapping[str, str] | None) -> dict[str, str]:
-    return LearnedFile(stated_network(network), float(temperature), dict(notes or {})).metadata()
+    return learned.LearnedFile(learned.stated_network(network), float(temperature), dict(notes or {})).metadata()
 
 
 def forget_origin(model: Any) -> None:
@@ -366,7 +359,7 @@ def write_result(
     temperature = evaluation.temperature()
     files = [folder / f"{name}.safetensors"]
     save_weights(network, files[0], temperature=temperature)
-    if isinstance(network, Exportable) and importlib.util.find_spec("onnxscript") is not None:
+    if isinstance(network, learned.Exportable) and importlib.util.find_spec("onnxscript") is not None:
         files.append(folder / f"{name}.onnx")
         export_onnx(network, files[-1], temperature=temperature)
     card = folder / f"{name}.md"

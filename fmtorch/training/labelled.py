@@ -24,9 +24,7 @@ from jaxtyping import Bool, Float, Int, Int8
 from numpy.typing import NDArray
 from torch import Tensor
 
-from fmtorch.core import types
-from fmtorch.core.records import Index, Record, as_index, expect_fields, gathered, slotted
-from fmtorch.core.types import Correspondences
+from fmtorch.core import Correspondences, records, types
 from fmtorch.data.cameras import line_distance
 from fmtorch.data.pairs import DepthDataset, ImagePair, ImageSource, PairDataset
 from fmtorch.geometry.epipolar import unit_frobenius
@@ -45,7 +43,7 @@ _AROUND = EDGE_PX * np.array([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class LabelledMatches(Record):
+class LabelledMatches(records.Record):
     """A batch of B pairs with N matches each (padded), labels and the true fundamental matrices.
     correspondences: the matches. label: (B, N) int8, 1 inlier, 0 outlier, -1 ignored, always -1 in masked slots. F: (B,
     3, 3) float64 of unit Frobenius norm, ``x1^T F x0 = 0``; zero where none is known or determined."""
@@ -56,7 +54,7 @@ class LabelledMatches(Record):
 
     def __post_init__(self) -> None:
         b, n = self.correspondences.x0.shape[:2]
-        expect_fields(self, b=b, n=n)
+        records.expect_fields(self, b=b, n=n)
         object.__setattr__(self, "label", torch.where(self.correspondences.mask, self.label, IGNORED))
 
     @property
@@ -70,9 +68,9 @@ class LabelledMatches(Record):
     def __len__(self) -> int:
         return len(self.correspondences)
 
-    def __getitem__(self, index: Index) -> "LabelledMatches":
+    def __getitem__(self, index: records.Index) -> "LabelledMatches":
         """The selected pairs, always as a batch."""
-        i = as_index(index, len(self))
+        i = records.as_index(index, len(self))
         return self._map(lambda value: value[i])
 
     def keep(self, mask: Bool[Tensor, "b n"]) -> "LabelledMatches":
@@ -83,15 +81,15 @@ class LabelledMatches(Record):
         c, mask = self.correspondences.compact(multiple), self.correspondences.mask
         n = c.x0.shape[1]
         order = torch.argsort(mask.logical_not().to(torch.uint8), dim=-1, stable=True)[:, :n]
-        return LabelledMatches(c, _padded(gathered(self.label, order), n), self.F)
+        return LabelledMatches(c, _padded(records.gathered(self.label, order), n), self.F)
 
     def reorder(self, order: Int[Tensor, "b m"]) -> "LabelledMatches":
         """The matches in the slots `order` of each pair, in that order."""
-        moved = {name: gathered(value, order) for name, value in slotted(self.correspondences).items()}
-        return LabelledMatches(self.correspondences.replace(**moved), gathered(self.label, order), self.F)
+        moved = {name: records.gathered(value, order) for name, value in records.slotted(self.correspondences).items()}
+        return LabelledMatches(self.correspondences.replace(**moved), records.gathered(self.label, order), self.F)
 
     def first(self, count: int) -> "LabelledMatches":
-        cut = {name: value[:, :count] for name, value in slotted(self.correspondences).items()}
+        cut = {name: value[:, :count] for name, value in records.slotted(self.correspondences).items()}
         return LabelledMatches(self.correspondences.replace(**cut), self.label[:, :count], self.F)
 
 

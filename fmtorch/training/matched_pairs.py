@@ -10,8 +10,7 @@ import cv2
 import numpy as np
 import torch
 
-from fmtorch.core import files, settings
-from fmtorch.core.types import Correspondences
+from fmtorch.core import Correspondences, files, settings
 from fmtorch.data.pairs import DepthDataset, ImagePair, PairDataset
 from fmtorch.jobs.execution import Execution, use_one_thread
 from fmtorch.jobs.runner import Factory, Local, Source, TaskRunner, WorkerPool

@@ -11,9 +11,8 @@ import torch
 from jaxtyping import Bool, Float, Int, Int8, Real
 from torch import Tensor
 
-from fmtorch.geometry.arithmetic import matmul3, stable_sum
+from fmtorch.geometry import arithmetic, epipolar
 from fmtorch.geometry.eight_point import eight_point
-from fmtorch.geometry.epipolar import residual_and_normals, unit_largest
 from fmtorch.jit.batches import for_each_pair
 from fmtorch.jit.kernel import F8x1, F8x2, I8x1, kernel
 from fmtorch.jit.random import Stream, mixed_seed, stream_state, uniform_kernel
@@ -99,14 +98,14 @@ def classification_loss(
     weight = labelled.to(logit.dtype)
     if balanced:
         # One more of each class, in weights and log-odds alike, keeps the optimum and serves pairs of one class.
-        inliers = stable_sum(target)[:, None] + 1
-        outliers = stable_sum(weight - target)[:, None] + 1
+        inliers = arithmetic.stable_sum(target)[:, None] + 1
+        outliers = arithmetic.stable_sum(weight - target)[:, None] + 1
         logit = torch.where(labelled, logit - (inliers / outliers).log(), 0.0)
         weight = weight * torch.where(label > 0, 1 / inliers, 1 / outliers)
-    total = stable_sum(weight)
+    total = arithmetic.stable_sum(weight)
     weight = weight / torch.where(total > 0, total, 1.0)[:, None]
     entropy = torch.nn.functional.softplus(logit) - target * logit
-    return _mean_over_pairs(stable_sum(weight * entropy), total > 0)
+    return _mean_over_pairs(arithmetic.stable_sum(weight * entropy), total > 0)
 
 
 def geometric_loss(
@@ -155,13 +154,13 @@ def geometric_loss(
     A0, A1 = (torch.where(calibrated[:, None, None], A, torch.eye(3, dtype=A.dtype, device=A.device)) for A in (A0, A1))
     mask = mask & calibrated[:, None]
     valid = _valid_models(F_est, valid)
-    F = unit_largest(torch.where(valid[..., None, None], F_est.to(torch.float64), 0.0))
-    F = unit_largest(matmul3(matmul3(A1.mT, F), A0))
-    e, squared0, squared1 = residual_and_normals(F, _normalised(x0, A0), _normalised(x1, A1))
+    F = epipolar.unit_largest(torch.where(valid[..., None, None], F_est.to(torch.float64), 0.0))
+    F = epipolar.unit_largest(arithmetic.matmul3(arithmetic.matmul3(A1.mT, F), A0))
+    e, squared0, squared1 = epipolar.residual_and_normals(F, _normalised(x0, A0), _normalised(x1, A1))
     floor = NORMAL_FLOOR**2
     squared = e * e * (1 / (squared0 + floor) + 1 / (squared1 + floor))
     count = mask.sum(-1)
-    mean = stable_sum(torch.where(mask, squared.clamp(max=limit), 0.0)) / count.clamp(min=1)
+    mean = arithmetic.stable_sum(torch.where(mask, squared.clamp(max=limit), 0.0)) / count.clamp(min=1)
     return _mean_over_pairs(mean, valid & (count > 0)).to(F_est.dtype)
 
 
@@ -242,7 +241,7 @@ def virtual_points(
         raise ValueError(f"count is {count}; it must be at least 1")
     F = F.detach().to(torch.float64)
     valid = F.isfinite().all(-1).all(-1)
-    F = unit_largest(torch.where(valid[:, None, None], F, 0.0))
+    F = epipolar.unit_largest(torch.where(valid[:, None, None], F, 0.0))
     key = torch.zeros(len(F), dtype=torch.int64) if key is None else key
     tensors, out = (F, size0.double(), size1.double(), key[:, None]), torch.empty(len(F), count, 5, dtype=torch.float64)
     points = for_each_pair(points_on_lines, tensors, mixed_seed(seed, Stream.TRAINING), out=out, kind=torch.float64)
@@ -272,7 +271,7 @@ def points_on_lines(F: F8x2, size0: F8x1, size1: F8x1, key: I8x1, mixed_seed: in
 def _mean_over_pairs(value: Float[Tensor, "*stages b"], counted: Bool[Tensor, "*#stages b"]) -> Float[Tensor, ""]:
     """The mean over the pairs that count, of each stage, then over stages; 0 for a stage where none counts."""
     counted = counted.expand(value.shape)
-    return (stable_sum(torch.where(counted, value, 0.0)) / counted.sum(-1).clamp(min=1)).mean()
+    return (arithmetic.stable_sum(torch.where(counted, value, 0.0)) / counted.sum(-1).clamp(min=1)).mean()
 
 
 def _valid_models(F: Float[Tensor, "*stages b 3 3"], valid: Tensor | None = None) -> Bool[Tensor, "*stages b"]:

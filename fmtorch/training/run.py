@@ -33,9 +33,8 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
 from fmtorch import data, presets
+from fmtorch.core import settings, terminal
 from fmtorch.core.options import expect_options
-from fmtorch.core.settings import claim
-from fmtorch.core.terminal import console, progress_bars, reporter
 from fmtorch.core.version import __version__
 from fmtorch.data import ImagePair, PairDataset, construction, read_image, subset
 from fmtorch.evaluation.run import select
@@ -204,7 +203,7 @@ class _TrainingBar(Callback):
 
     def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         if trainer.is_global_zero:
-            self._progress = progress_bars()
+            self._progress = terminal.progress_bars()
             self._progress.start()
             self._bar = self._progress.add_task("training", total=self.total, completed=trainer.global_step)
 
@@ -277,7 +276,7 @@ def run(config: DictConfig, name: str) -> Path:
     network_config = network_of(config, name)
     objective = Objective(**dataclasses.asdict(options.objective))
     uses = {key: use_of(key, value) for key, value in options.validation.uses.items()}
-    with progress_bars() as progress:
+    with terminal.progress_bars() as progress:
         matches = labelled_matches(config, options, progress)
     identity = {
         "network": network_config, "objective": dataclasses.asdict(objective), "batch": config.batch,
@@ -286,7 +285,7 @@ def run(config: DictConfig, name: str) -> Path:
         "validation": {k: v for k, v in plain(config.validation).items() if k != "roots"},
     }  # fmt: skip
     folder = Path(config.output or f"runs/train/{name}-{identity_digest(identity)[:8]}")
-    claim(folder / "training.json", identity, "checkpoints", "choose another output")
+    settings.claim(folder / "training.json", identity, "checkpoints", "choose another output")
     torch.set_num_threads(int(config.threads or os.cpu_count() or 1))
     torch.manual_seed(config.seed)
     network = presets.instantiate(network_config, f"pruner={name}, network")
@@ -295,9 +294,9 @@ def run(config: DictConfig, name: str) -> Path:
     first = int(os.environ.get("LOCAL_RANK", "0")) == 0  # of several processes the one that reports
     if first:
         about = f"{len(matches.training)} pairs to train on, {len(matches.validation)} to validate on"
-        console.print(f"{about}; {folder}", soft_wrap=True)
+        terminal.console.print(f"{about}; {folder}", soft_wrap=True)
         if len(matches.training) < FEW:
-            console.print(f"so few pairs show that it runs, and teach little; {MORE}", soft_wrap=True)
+            terminal.console.print(f"so few pairs show that it runs, and teach little; {MORE}", soft_wrap=True)
     shown = matches.validation[:: max(1, len(matches.validation) // PICTURES)][:PICTURES]
     batches = functools.partial(training_batches, matches.training, config.batch, config.seed, workers=config.loaders)
     how: dict[str, Any] = {name: getattr(options.validation, name) for name in ("every", "patience", "monitor")}
@@ -314,10 +313,10 @@ def run(config: DictConfig, name: str) -> Path:
 def report(result: Result, name: str) -> None:
     """Say on the terminal what came out and how to use it."""
     for key, value in result.evaluation.figures.items():
-        console.print(f"{key:32} {value:.4f}")
+        terminal.console.print(f"{key:32} {value:.4f}")
     use = use_line(name, result.files[0], sys.argv[1:])
     for line in (", ".join(str(path) for path in result.files), f"use it: {use}"):
-        console.print(line, soft_wrap=True)
+        terminal.console.print(line, soft_wrap=True)
 
 
 def use_line(name: str, file: Path, words: Sequence[str]) -> str:
@@ -377,7 +376,7 @@ def labelled_matches(config: DictConfig, options: TrainOptions, progress: Progre
         return MatchedPairs(
             subset(source, indices) if len(indices) < len(source) else source, front,
             execution=execution_of(config, config.workers).decided(False), build=functools.partial(_front, config),
-            progress=reporter(progress, f"matches {what}"),
+            progress=terminal.reporter(progress, f"matches {what}"),
         )  # fmt: skip
 
     training = matched(dataset, chosen, "to train on")
@@ -402,7 +401,7 @@ def labelled_matches(config: DictConfig, options: TrainOptions, progress: Progre
         + f" (of {dataset.name} the last scenes of each family, which may share photographs with the training scenes)",
     }
     if photographs:
-        workers, report = config.workers or os.cpu_count() or 1, reporter(progress, "views of photographs")
+        workers, report = config.workers or os.cpu_count() or 1, terminal.reporter(progress, "views of photographs")
         drawn = PlanePairs(photographs, options.planes.limits, options.planes.seed, workers=workers, progress=report)
         planes = matched(drawn, range(len(drawn)), "of photographs")
         planes = planes.select(i for i, about in enumerate(planes.pairs) if about["inliers"] > construction.ENOUGH)
@@ -418,7 +417,7 @@ def _dataset(config: DictConfig, progress: Progress) -> PairDataset:
     options = plain(config.dataset)
     if presets.target_of(options, "dataset") is RenderedPairs:
         options["split"] = "train"
-    return data.build(options, reporter(progress, "drawing scenes"))
+    return data.build(options, terminal.reporter(progress, "drawing scenes"))
 
 
 def _split(dataset: PairDataset, last: int | None) -> tuple[list[int], list[int]]:

@@ -11,8 +11,7 @@ from torch import Tensor, nn
 from fmtorch.core.types import Correspondences
 from fmtorch.geometry.irls import reweighted_fits
 from fmtorch.pruning.consistency import frame_agreement, usable_frame_maps
-from fmtorch.pruning.networks.layers import ContextBatchNormReLU, Perceptron, ResidualBlock, Slots
-from fmtorch.pruning.networks.learned import Backbone, Prediction
+from fmtorch.pruning.networks import layers, learned
 
 COORDINATES = ("size", "K")
 MIN_AREA_RATIO = 1e-12  # of two frames; keeps the gradient of the logarithm finite
@@ -164,7 +163,7 @@ class _OfBackbone(nn.Module):
     def extra_repr(self) -> str:
         return ", ".join(f"{key}={value}" for key, value in self.options.items())
 
-    def forward(self, c: Correspondences) -> Prediction:
+    def forward(self, c: Correspondences) -> learned.Prediction:
         """The prediction of each match. Raises ValueError where image sizes or calibration matrices are missing."""
         return self.predict(c, self.backbone)  # type: ignore[no-any-return, operator]
 
@@ -175,11 +174,11 @@ class PointCN(nn.Module):
 
     def __init__(self, inputs: int, channels: int, blocks: int) -> None:
         super().__init__()
-        self.p_in = Perceptron(inputs, channels)
-        self.blocks = nn.ModuleList(ResidualBlock(channels) for _ in range(blocks))
-        self.p_out = Perceptron(channels, 1)
+        self.p_in = layers.Perceptron(inputs, channels)
+        self.blocks = nn.ModuleList(layers.ResidualBlock(channels) for _ in range(blocks))
+        self.p_out = layers.Perceptron(channels, 1)
 
-    def forward(self, x: Float[Tensor, "b inputs n"], slots: Slots) -> Float[Tensor, "b 1 n"]:
+    def forward(self, x: Float[Tensor, "b inputs n"], slots: layers.Slots) -> Float[Tensor, "b 1 n"]:
         """x has to be zero in masked slots, where the result means nothing."""
         y = slots.clean(torch.relu(self.p_in(x.transpose(0, 1))))
         for block in self.blocks:
@@ -211,11 +210,11 @@ class LC(_OfBackbone):
         self.input_channels = self.inputs.channels
         self.backbone = PointCN(self.input_channels, channels, blocks)
 
-    def predict(self, c: Correspondences, backbone: Backbone) -> Prediction:
+    def predict(self, c: Correspondences, backbone: learned.Backbone) -> learned.Prediction:
         """One stage; ``weight = tanh(relu(logit))`` as published (section 3.3), 0 where masked."""
         x, mask = self.inputs(c)
-        logit = backbone(x, Slots.of(mask))[:, 0]
-        return Prediction(logit[None], torch.where(mask, torch.tanh(torch.relu(logit)), 0)[None])
+        logit = backbone(x, layers.Slots.of(mask))[:, 0]
+        return learned.Prediction(logit[None], torch.where(mask, torch.tanh(torch.relu(logit)), 0)[None])
 
 
 class PointwiseNetwork(nn.Module):
@@ -224,11 +223,11 @@ class PointwiseNetwork(nn.Module):
     def __init__(self, inputs: int, widths: Sequence[int], outputs: int) -> None:
         super().__init__()
         pairs = zip((inputs, *widths), widths, strict=False)
-        self.linear = nn.ModuleList(Perceptron(before, after, bias=False) for before, after in pairs)
-        self.norm = nn.ModuleList(ContextBatchNormReLU(width) for width in widths)
-        self.p_out = Perceptron((inputs, *widths)[-1], outputs)
+        self.linear = nn.ModuleList(layers.Perceptron(before, after, bias=False) for before, after in pairs)
+        self.norm = nn.ModuleList(layers.ContextBatchNormReLU(width) for width in widths)
+        self.p_out = layers.Perceptron((inputs, *widths)[-1], outputs)
 
-    def forward(self, x: Float[Tensor, "b inputs n"], slots: Slots) -> Float[Tensor, "b outputs n"]:
+    def forward(self, x: Float[Tensor, "b inputs n"], slots: layers.Slots) -> Float[Tensor, "b outputs n"]:
         """x has to be zero in masked slots, where the result means nothing."""
         y = x.transpose(0, 1)
         for linear, norm in zip(self.linear, self.norm, strict=True):
@@ -275,10 +274,10 @@ class DFE(_OfBackbone):
         self.input_channels = self.inputs.channels + 2
         self.backbone = PointwiseNetwork(self.input_channels, tuple(widths), 2)
 
-    def predict(self, c: Correspondences, backbone: Backbone) -> Prediction:
+    def predict(self, c: Correspondences, backbone: learned.Backbone) -> learned.Prediction:
         """One stage for each fit, with weights that sum to 1 over the matches of a pair."""
         x, mask = self.inputs(c)
-        slots = Slots.of(mask)
+        slots = layers.Slots.of(mask)
         unit = self.inputs.unit(c)[:, None] * RESIDUAL_UNIT
         logits: list[Tensor] = []
         weights: list[Tensor] = []
@@ -296,7 +295,7 @@ class DFE(_OfBackbone):
             return weights[-1].double()
 
         fits = reweighted_fits(c.x0, c.x1, weigh, self.iterations, mask)
-        return Prediction(torch.stack(logits), torch.stack(weights), fits.F)
+        return learned.Prediction(torch.stack(logits), torch.stack(weights), fits.F)
 
 
 def masked_softmax(logit: Float[Tensor, "b n"], mask: Bool[Tensor, "b n"]) -> Float[Tensor, "b n"]:

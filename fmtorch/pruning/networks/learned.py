@@ -16,9 +16,8 @@ from jaxtyping import Float
 from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
-from fmtorch.core.files import models_dir
+from fmtorch.core import Correspondences, models_dir
 from fmtorch.core.onnx_network import NetworkFileError, onnx_session
-from fmtorch.core.types import Correspondences
 from fmtorch.pruning.networks.layers import Slots
 
 SUFFIXES = {"torch": ".safetensors", "onnx": ".onnx"}  # of the file that each runtime reads
