@@ -191,7 +191,6 @@ def recoverPose(*arguments: Any, **named: Any) -> Any:
 
 
 def _pose_of_matrix(arguments: tuple[Any, ...], named: dict[str, Any]) -> Any:
-    """The pose of a given E."""
     rest = arguments[3:]
     if "distanceThresh" in named or (len(rest) > 1 and isinstance(rest[1], int | float)):
         return opencv.recoverPose(*arguments, **named)

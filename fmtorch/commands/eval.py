@@ -175,7 +175,6 @@ def main() -> None:
 
 
 def _print_sweep(folders: Sequence[str]) -> None:
-    """A table of runs for each data set."""
     paths = list(dict.fromkeys(folders))
     runs = named([RunFolder.load(path) for path in paths]) if len(paths) > 1 else []
     for heading, group in by_dataset(runs).items():

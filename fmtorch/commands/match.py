@@ -274,7 +274,6 @@ def _nsgd(result: MatchResult, truth: NDArray[np.float64]) -> float:
 
 
 def _verdict(result: MatchResult) -> str:
-    """What is said of photographs that are related."""
     inliers, matches = int(result.inliers.sum()), result.correspondences.mask.shape[1]
     support = f"related: {inliers:,} of {matches:,} matches are inliers of F"
     return f"{support}, significance {result.significance:.0f}, pair type {result.pair_type}"

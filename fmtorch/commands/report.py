@@ -58,7 +58,6 @@ def run(config: DictConfig) -> Path:
 
 
 def _recall(table: pa.Table) -> float:
-    """The recall of a run at the threshold of its kind, NSGD or corner error."""
     axis = axis_of({"": table})
     return axis.below(table[axis.column].to_numpy().astype(np.float64), axis.mark)
 

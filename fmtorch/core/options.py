@@ -157,7 +157,6 @@ def fits(value: Any, annotation: Any) -> bool:
 
 
 def _fit(values: Sequence[Any], kind: type, args: tuple[Any, ...]) -> bool:
-    """Whether a list, and its elements, fit a generic type and its arguments."""
     if not (issubclass(list, kind) or issubclass(kind, tuple | set | frozenset)):
         return False
     if issubclass(kind, tuple) and args and args[-1] is not Ellipsis:

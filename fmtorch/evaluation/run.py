@@ -300,13 +300,10 @@ def evaluate_pairs(
     cameras: Mapping[int, PairCameras] | None = None, journal: MatchStore | None = None, signed: bool = False,
 ) -> Iterator[int]:  # fmt: skip
     """Run and evaluate the pairs, hand each batch's rows to `store`, and yield how many pairs it held.
-
-    execution: by which workers. build: makes the same pipeline in another process, where these are no threads.
-    cameras: what a pipeline that `build` makes is given of the pairs' cameras, see `built_with`.
-    journal: keeps keypoints, matches and F for an export. signed: of `pose_errors`.
-    Rows and journal are written here. Results do not depend on `batch` or `execution`. Raises WorkersLost where workers
-    die whatever they do, or a scheduler is gone.
-    """
+    execution: by which workers. build: makes the same pipeline in another process, where these are no threads. cameras:
+    what a pipeline that `build` makes is given of the pairs' cameras, see `built_with`. journal: keeps keypoints,
+    matches and F for an export. signed: of `pose_errors`. Rows and journal are written here. Results do not depend on
+    `batch` or `execution`. Raises WorkersLost where workers die whatever they do, or a scheduler is gone."""
     pool = WorkerPool(execution, PRELOADED, limit=max(1, len(pairs)))
     if pool.size > 1:  # no one of several workers shall be long alone at the end
         batch = max(1, min(batch, -(-len(pairs) // (BATCHES_OF_A_WORKER * pool.size))))
@@ -354,7 +351,6 @@ def _features_ahead(pool: WorkerPool, pipeline: Pipeline, pairs: Sequence[ImageP
 
 
 def _images_after_the_first(pairs: Sequence[ImagePair]) -> Iterator[ImageSource]:
-    """The images that pairs show, each once, without those of the first pair."""
     seen = {pairs[0].image0.pixels, pairs[0].image1.pixels}
     for pair in pairs[1:]:
         if pair.problem is None and pair.matches is None:

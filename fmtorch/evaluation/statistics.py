@@ -229,13 +229,10 @@ def _draws(count: int) -> Iterator[NDArray[np.int64]]:
 
 def effective_pairs(values: NDArray[np.float64], scenes: Sequence[str]) -> float:
     """How many independent pairs tell as much of the mean as these, which come in scenes; at most n.
-
     n divided by the design effect: the variance of the mean with whole scenes as units over that with pairs as units,
     at least 1; and by the squared ratio of Student's quantiles, because few scenes tell their own spread badly. n with
     fewer than `MIN_SCENES` scenes, whose spread cannot be seen, and where all values are equal.
-
-    values, scenes: one per pair, (n,), n >= 1.
-    """
+    values, scenes: one per pair, (n,), n >= 1."""
     n, m = len(values), len(set(scenes))
     centred = values - values.mean()
     alone = float((centred**2).sum()) * n / (n - 1) if n > 1 else 0.0
@@ -260,13 +257,10 @@ def share_interval(successes: Values | NDArray[np.bool_], scenes: Sequence[str])
 
 def share_difference(a: Values | NDArray[np.bool_], b: Values | NDArray[np.bool_], scenes: Sequence[str]) -> Interval:
     """Share of a minus share of b, of the same pairs, with the adjusted Wald interval of Bonett and Price.
-
     One pair more is counted on either side ("Adjusted Wald confidence interval for a difference of binomial proportions
     based on paired data", Journal of Educational and Behavioral Statistics 2012), so that methods which agree on every
     pair still have an interval of the width that so few pairs allow.
-
-    a, b: (n,), n >= 1, where either method succeeds; of several seeds as in `share_interval`. scenes: one per pair.
-    """
+    a, b: (n,), n >= 1, where either method succeeds; of several seeds as in `share_interval`. scenes: one per pair."""
     difference = a.astype(np.float64) - b.astype(np.float64)
     n = effective_pairs(difference, scenes)
     only_a, only_b = (float((sign * difference).clip(min=0.0).mean()) for sign in (1, -1))

@@ -234,7 +234,6 @@ def gradient_of_draws(pair: Comparison, mixed_seed: int, samples: int, out: F8x3
 
 @inner
 def _uniform_numbers(state: Any, draw: int, u: Array) -> None:
-    """The random numbers of a draw."""
     for column in range(len(u)):
         u[column] = uniform_kernel(state, draw * len(u) + column)
 

@@ -10,6 +10,9 @@ from fmtorch.core.checks import checked
 from fmtorch.geometry.epipolar import inverse_root
 from fmtorch.geometry.pose import pose_from_fundamental, poses_from_fundamental
 
+Rotations = Float[Tensor, "*#batch 3 3"]
+Translations = Float[Tensor, "*#batch 3"]
+
 
 class PoseError(NamedTuple):
     """Angular errors in degrees, each (...)."""
@@ -25,12 +28,7 @@ class PoseError(NamedTuple):
 
 @checked
 def pose_error(
-    R_est: Float[Tensor, "*#batch 3 3"],
-    t_est: Float[Tensor, "*#batch 3"],
-    R_gt: Float[Tensor, "*#batch 3 3"],
-    t_gt: Float[Tensor, "*#batch 3"],
-    *,
-    up_to_sign: bool = True,
+    R_est: Rotations, t_est: Translations, R_gt: Rotations, t_gt: Translations, *, up_to_sign: bool = True
 ) -> PoseError:
     """Angle of the rotation R_est R_gt^T, and angle between the translation directions, in degrees.
 

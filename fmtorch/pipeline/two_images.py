@@ -219,7 +219,6 @@ class MatchResult:
 
 
 def _plain(value: Tensor | None) -> Any:
-    """The only row of a tensor as numbers."""
     return None if value is None else value[0].tolist()
 
 

@@ -323,13 +323,10 @@ def coherence(
     motion: SmoothMotion | None = None,
 ) -> Coherence:
     """The likelihood of each match and its distance from the smooth motion of those above `least_likelihood`.
-
-    Two robust regressions on radial basis functions, as in CODE; our form differs from the authors' in that the
-    centres are chosen where distinctive matches crowd, and that each predicts its neighbours' displacement by its
-    frame. Points in pixels or any unit; `ratio` is the distance ratio. Matches that are not finite or have a
-    degenerate frame are none. Every pair is computed from its own matches alone; memory is linear in their number.
-    Not differentiable.
-    """
+    Two robust regressions on radial basis functions, as in CODE; our form differs from the authors' in that the centres
+    are chosen where distinctive matches crowd, and that each predicts its neighbours' displacement by its frame. Points
+    in pixels or any unit; `ratio` is the distance ratio. Matches that are not finite or have a degenerate frame are
+    none. Every pair is computed from its own matches alone; memory is linear in their number. Not differentiable."""
     finite = finite_matches(x0, x1, lafs0, lafs1)
     mask = finite if mask is None else finite & mask
     likelihood, motion = likelihood or LikelihoodField(), motion or SmoothMotion()

@@ -32,6 +32,10 @@ SHARPNESS = TOLERANCE**-2 / 8
 NOISE = 4.0  # px, keeps close neighbours from being judged by their localisation noise
 WORST_RATIO, MIN_VOTE = 0.85, 0.02  # a neighbour votes with WORST_RATIO - ratio, at least MIN_VOTE
 MIN_SQUARE, MIN_VOTES = 1e-12, float(np.finfo(np.float32).tiny)  # keep a root's gradient and a quotient finite
+Points = Float[Tensor, "b n 2"]
+Frames = Float[Tensor, "b n 2 3"]
+Maps = Float[Tensor, "b n 2 2"]
+PerMatch = Float[Tensor, "b n"]
 FARTHEST = 1e15  # px; a match beyond is none: its squares could overflow
 
 SHARPNESS32, NOISE32, FARTHEST32 = np.float32(SHARPNESS), np.float32(NOISE), np.float32(FARTHEST)
@@ -141,13 +145,8 @@ def frame_prior_kernel(matches: FramedMatches, numbers: F4x1, out: F4x1) -> None
 
 
 def frame_agreement(
-    x0: Float[Tensor, "b n 2"],
-    x1: Float[Tensor, "b n 2"],
-    lafs0: Float[Tensor, "b n 2 3"],
-    lafs1: Float[Tensor, "b n 2 3"],
-    ratio: Float[Tensor, "b n"] | None,
-    mask: Bool[Tensor, "b n"],
-) -> Float[Tensor, "b n"]:
+    x0: Points, x1: Points, lafs0: Frames, lafs1: Frames, ratio: PerMatch | None, mask: Bool[Tensor, "b n"]
+) -> PerMatch:
     """The share of its neighbours' votes that agree with each match, in [0, 1]; zero where masked.
     For neighbours i, j with frame maps S: ``e = max(|S_i dx0 - dx1|, |S_j dx0 - dx1|) / (s_i |dx0| + |dx1| + NOISE)``
     with s the scale change of S; the agreement is the mean of ``(1 + (e / TOLERANCE)^2 / 8)^-8`` over the neighbours in
@@ -160,7 +159,7 @@ def frame_agreement(
     return with_gradient(agreement, x0, x1, maps, votes_of(ratio, x0[..., 0]), usable)
 
 
-def frame_map(lafs0: Float[Tensor, "b n 2 3"], lafs1: Float[Tensor, "b n 2 3"]) -> Float[Tensor, "b n 2 2"]:
+def frame_map(lafs0: Frames, lafs1: Frames) -> Maps:
     """The linear map from frame 0 to frame 1, ``A1 A0^-1``."""
     (a, b), (c, d) = (row.unbind(-1) for row in lafs0[..., :2].unbind(-2))
     determinant = a * d - b * c
@@ -169,9 +168,7 @@ def frame_map(lafs0: Float[Tensor, "b n 2 3"], lafs1: Float[Tensor, "b n 2 3"]) 
     return product / determinant[..., None, None]
 
 
-def usable_frame_maps(
-    lafs0: Float[Tensor, "b n 2 3"], lafs1: Float[Tensor, "b n 2 3"], mask: Bool[Tensor, "b n"]
-) -> tuple[Float[Tensor, "b n 2 2"], Bool[Tensor, "b n"]]:
+def usable_frame_maps(lafs0: Frames, lafs1: Frames, mask: Bool[Tensor, "b n"]) -> tuple[Maps, Bool[Tensor, "b n"]]:
     """`frame_map`, and of which matches: the identity where masked, and for frames not finite or without area."""
     for lafs in (lafs0, lafs1):
         (a, b), (c, d) = (row.unbind(-1) for row in lafs[..., :2].unbind(-2))
@@ -182,12 +179,10 @@ def usable_frame_maps(
 
 class FrameConsistency:
     """Supplies ``prior``: P(inlier) from the agreement of local affine frames and the ratio.
-
     The odds are ``odds (w + floor)^3 / (1 + slope ratio)^2`` with the agreement w: arithmetic alone, and a better fit
     on the tuning scenes than a logistic model of ln(w) and the ratio. Where matches have no frames or no ratio the
-    prior is left as it is. Linear memory: about 700 bytes a match.
-    kernels: worth compiling together with those of an estimator.
-    """
+    prior is left as it is. Linear memory: about 700 bytes a match. kernels: worth compiling together with those of an
+    estimator."""
 
     kernels: ClassVar = (frame_prior_kernel, frame_agreement_kernel)
 
@@ -339,19 +334,12 @@ def _positions_agree(along: Array, k: int, similarity: Array, agree: Array) -> N
         agree[i] = _agrees(p * p + q * q, length)
 
 
-def position_agreement(
-    x0: Float[Tensor, "b n 2"],
-    x1: Float[Tensor, "b n 2"],
-    ratio: Float[Tensor, "b n"] | None,
-    mask: Bool[Tensor, "b n"],
-) -> Float[Tensor, "b n"]:
+def position_agreement(x0: Points, x1: Points, ratio: PerMatch | None, mask: Bool[Tensor, "b n"]) -> PerMatch:
     """The share of its neighbours' votes that agree with each match, in [0, 1]; zero where masked.
-
-    For neighbours with differences dx0, dx1 and the common similarity S of the pair, of scale s,
-    ``e = |S dx0 - dx1| / (s |dx0| + |dx1| + NOISE)``; the agreement is the mean of ``(1 + (e / TOLERANCE)^2 / 8)^-8``
-    over the neighbours in both images, weighted by votes (`frame_agreement` has the same constants and votes). Computed
-    in float32, on the CPU; differentiable in points and ratio, S being a constant.
-    """
+    For neighbours with differences dx0, dx1 and the common similarity S of the pair, of scale s, ``e = |S dx0 - dx1| /
+    (s |dx0| + |dx1| + NOISE)``; the agreement is the mean of ``(1 + (e / TOLERANCE)^2 / 8)^-8`` over the neighbours in
+    both images, weighted by votes (`frame_agreement` has the same constants and votes). Computed in float32, on the
+    CPU; differentiable in points and ratio, S being a constant."""
     out = torch.empty(len(mask), mask.shape[1] + 3, dtype=torch.float32)
     out = for_each_pair(position_agreement_kernel, (x0, x1, ratio, mask), out=out).to(x0.dtype)
     agreement, (a, b, _) = out[:, :-3], out[:, -3:].unbind(1)
@@ -394,13 +382,8 @@ def votes_of(ratio: Float[Tensor, "b n"] | None, like: Float[Tensor, "b n"]) -> 
 
 
 def with_gradient(
-    agreement: Float[Tensor, "b n"],
-    x0: Float[Tensor, "b n 2"],
-    x1: Float[Tensor, "b n 2"],
-    maps: Float[Tensor, "b n 2 2"],
-    vote: Float[Tensor, "b n"],
-    mask: Bool[Tensor, "b n"],
-) -> Float[Tensor, "b n"]:
+    agreement: PerMatch, x0: Points, x1: Points, maps: Maps, vote: PerMatch, mask: Bool[Tensor, "b n"]
+) -> PerMatch:
     """The agreement, attached to the graph of points, maps from image 0 to 1 and votes; the curves are constants."""
     S = maps.flatten(2).unbind(-1)
     scale = sqrt((S[0] * S[3] - S[1] * S[2]).abs())

@@ -118,7 +118,6 @@ def _count(
 
 @inner
 def _clear(line: Array, end: Array, side: int, table: Array) -> None:
-    """Sets the table to zero again."""
     for i in range(len(line)):
         if line[i] >= 0:
             table[line[i] * side * side + end[i]] = 0

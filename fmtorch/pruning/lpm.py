@@ -128,7 +128,6 @@ def lpm_cost(
 
 
 def _kept_and_cost(x0: Tensor, x1: Tensor, mask: Tensor | None, passes: Passes) -> Float[Tensor, "b 2 n"]:
-    """Of each match 1 if it is kept, and its cost."""
     mask = torch.ones_like(x0[..., 0], dtype=torch.bool) if mask is None else mask
     out = torch.empty(len(x0), 2, x0.shape[1], dtype=torch.float64)
     return for_each_pair(lpm_kernel, (x0, x1, mask), passes, out=out, kind=torch.float64)

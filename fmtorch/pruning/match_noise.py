@@ -97,7 +97,6 @@ def _scale(lafs: Array, i: int, min_area: Any) -> Any:
 
 @inner
 def _finite(lafs: Array, i: int) -> bool:
-    """Whether all numbers of frame i are finite."""
     finite = True
     for row in range(2):
         for column in range(3):

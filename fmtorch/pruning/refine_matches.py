@@ -443,7 +443,6 @@ def _array(tensor: Tensor) -> Array:
 
 
 def _finite(*arrays: Array) -> Array:
-    """Of which matches (n,) all numbers are finite."""
     finite: Array = np.all([np.isfinite(array).all(tuple(range(1, array.ndim))) for array in arrays], 0)
     return finite
 

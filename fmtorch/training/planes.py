@@ -45,12 +45,10 @@ def list_photographs(
     folder: Path | str, sources: Sequence[str] | None = None, excluded: Sequence[str] = ()
 ) -> list[Photograph]:
     """The photographs of a folder, in a fixed order.
-
     The source is the fourth column of ``sources.txt`` (file width height source path) where the folder has one, with
     the path appended after a colon for `excluded`; else the subfolder, or for files at the top the file itself.
-    sources: only these; None: all. excluded: parts of "source:path" that are left out.
-    Raises FileNotFoundError where the folder is absent, ValueError where nothing is left.
-    """
+    sources: only these; None: all. excluded: parts of "source:path" that are left out. Raises FileNotFoundError where
+    the folder is absent, ValueError where nothing is left."""
     folder = Path(folder)
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder} is no folder of photographs")

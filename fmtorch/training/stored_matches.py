@@ -197,10 +197,8 @@ class StoredMatches(Dataset[LabelledMatches]):
         ]
 
     def select(self, indices: Iterable[int]) -> "StoredMatches":
-        chosen = list(indices)
-        other = copy.copy(self)
-        other._rows = [self._rows[i] for i in chosen]
-        other.pairs = [self.pairs[i] for i in chosen]
+        chosen, other = list(indices), copy.copy(self)
+        other._rows, other.pairs = [self._rows[i] for i in chosen], [self.pairs[i] for i in chosen]
         return other
 
     def joined(self, other: "StoredMatches") -> "StoredMatches":

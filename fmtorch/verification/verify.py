@@ -136,12 +136,10 @@ class PairStore(Protocol):
 @dataclasses.dataclass(frozen=True)
 class Verification:
     """What `verify` did with a database.
-
     path: of the database with the geometries; of a shard, the folder that keeps them. pairs: that have matches. kept:
-    of these, that had a geometry before, or were finished by an interrupted run or a shard. configurations: how many
-    of each of COLMAP's kinds were written. problems: why pairs could not be read, a line each; the next run tries them
-    again. warnings: what of a camera was not believed, a line each. seconds: of the whole.
-    """
+    of these, that had a geometry before, or were finished by an interrupted run or a shard. configurations: how many of
+    each of COLMAP's kinds were written. problems: why pairs could not be read, a line each; the next run tries them
+    again. warnings: what of a camera was not believed, a line each. seconds: of the whole."""
 
     path: Path
     pairs: int

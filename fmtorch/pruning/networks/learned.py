@@ -126,12 +126,10 @@ Backbone = Callable[[Tensor, Slots], Tensor]  # (B, channels, N), zero in masked
 
 class Prediction(NamedTuple):
     """The output of a network over S stages (one, or one for each iteration); the last stage counts.
-
-    logit: log-odds that a match is an inlier, (S, B, N); finite and without meaning in masked slots.
-    weight: of the match in a weighted 8-point fit, (S, B, N); not negative, 0 where masked.
-    F: fundamental matrices that the network fits itself, (S, B, 3, 3), float64, in pixels and of unit Frobenius norm;
-    where a fit is not determined the one of the stage before, or zero; None where the network fits none.
-    """
+    logit: log-odds that a match is an inlier, (S, B, N); finite and without meaning in masked slots. weight: of the
+    match in a weighted 8-point fit, (S, B, N); not negative, 0 where masked. F: fundamental matrices that the network
+    fits itself, (S, B, 3, 3), float64, in pixels and of unit Frobenius norm; where a fit is not determined the one of
+    the stage before, or zero; None where the network fits none."""
 
     logit: Float[Tensor, "stages b n"]
     weight: Float[Tensor, "stages b n"]
@@ -255,7 +253,6 @@ class LearnedPruner:
         return p
 
     def _alone(self, c: Correspondences) -> Float[Tensor, " n"]:
-        """P(inlier) of the matches of one pair without padding."""
         runtime = self._runtime(c.x0.device)
         ready, temperature = self._prepared(runtime, c.x0.device)
         prediction: Prediction = (
