@@ -10,8 +10,6 @@ the points' extent, as `fmtorch.find_fundamental` does where none are given. Cam
 have no place in these signatures, but in its own.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import cv2 as opencv
@@ -145,7 +143,7 @@ def findEssentialMat(points1: Any, points2: Any, *arguments: Any, **named: Any) 
     Raises:
         ValueError, TypeError: for another form, and as `fmtorch.find_essential`.
     """
-    x1, x2, K1, K2, rest = _calibrated(_points_of(points1, "points1"), _points_of(points2, "points2"), arguments, named)
+    x1, x2, K1, K2, rest = _calibrated(points1, points2, arguments, named)
     focal = float(np.abs([K1[0, 0], K1[1, 1], K2[0, 0], K2[1, 1]]).max())
     scale = UNIT_FOCAL / focal if focal < MIN_PIXELS else 1.0  # thresholds are in the unit of the points
     S = np.diag([scale, scale, 1])
@@ -178,10 +176,7 @@ def recoverPose(*arguments: Any, **named: Any) -> Any:
     if E is None or inliers is None:
         _written(None, given.get("mask"))
         raise ValueError("no essential matrix agrees with the points")
-    x1, x2, *_ = _calibrated(
-        _points_of(given["points1"], "points1"), _points_of(given["points2"], "points2"),
-        tuple(given[name] for name in names[2:6]), {},
-    )  # fmt: skip
+    x1, x2, *_ = _calibrated(given["points1"], given["points2"], tuple(given[name] for name in names[2:6]), {})
     matrices = (np.asarray(given[name], float) for name in ("cameraMatrix1", "cameraMatrix2"))
     y1, y2 = (opencv.undistortPoints(x[:, None], K, None) for x, K in zip((x1, x2), matrices, strict=True))
     retval, R, t, mask, _ = opencv.recoverPose(E, y1, y2, np.eye(3), distanceThresh=FARTHEST, mask=inliers)
@@ -283,9 +278,10 @@ def __getattr__(name: str) -> Any:
 
 
 def _calibrated(
-    x1: Matrix, x2: Matrix, arguments: tuple[Any, ...], named: dict[str, Any]
+    points1: Any, points2: Any, arguments: tuple[Any, ...], named: dict[str, Any]
 ) -> tuple[Matrix, Matrix, Matrix, Matrix, dict[str, Any]]:
     """Points without distortion, the camera matrices, and the other arguments by name, of any form of OpenCV's."""
+    x1, x2 = _points_of(points1, "points1"), _points_of(points2, "points2")
     first = arguments[0] if arguments else named.get("cameraMatrix", named.get("cameraMatrix1", 1.0))
     two = "cameraMatrix2" in named or (len(arguments) > 3 and np.shape(arguments[2]) == (3, 3))
     rest = ("method", "prob", "threshold", "maxIters", "mask")

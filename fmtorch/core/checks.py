@@ -180,9 +180,8 @@ def _expect_shapes(tensors: Mapping[str, Tensor], expected: Mapping[str, Expecte
     if MODELS in leading and SETS in leading:
         (models, name), (sets, whose) = leading[MODELS], leading[SETS]
         if models != sets and models[:-1] != sets:
-            raise ValueError(
-                f"{name} has leading dimensions {models}; they must be {sets}, as of {whose}, or {sets} and one more"
-            )
+            wanted = f"{sets}, as of {whose}, or {sets} and one more"
+            raise ValueError(f"{name} has leading dimensions {models}; they must be {wanted}")
 
 
 def _expect_leading(
@@ -198,9 +197,8 @@ def _expect_leading(
     try:
         leading[group] = tuple(torch.broadcast_shapes(known, mine)), whose  # type: ignore[no-untyped-call]
     except RuntimeError:
-        raise ValueError(
-            f"{name} has shape {shape}; its leading dimensions must broadcast with {known}, as of {whose}"
-        ) from None
+        wanted = f"broadcast with {known}, as of {whose}"
+        raise ValueError(f"{name} has shape {shape}; its leading dimensions must {wanted}") from None
 
 
 def _common_type(tensors: Mapping[str, Tensor], expected: Mapping[str, Expected]) -> dict[str, Tensor]:
@@ -252,9 +250,8 @@ def expect_inside(x: Tensor, mask: Tensor, size: Tensor, name: str, size_name: s
         return
     h, w = size[0].tolist()
     hint = "sizes are (h, w), and it looks like (w, h)" if bool(swapped[0]) else "sizes are (h, w) in pixels"
-    raise ValueError(
-        f"{size_name} is ({h:g}, {w:g}), but {100 * float(far[0]):.0f} % of {name} lie outside such an image; {hint}"
-    )
+    outside = f"{100 * float(far[0]):.0f} % of {name} lie outside such an image"
+    raise ValueError(f"{size_name} is ({h:g}, {w:g}), but {outside}; {hint}")
 
 
 def _fraction_outside(x: Tensor, mask: Tensor, limit: Tensor) -> Tensor:

@@ -56,17 +56,16 @@ class FeatureExtractor(Protocol):
 @runtime_checkable
 class TwoStepExtractor(FeatureExtractor, Protocol):
     """An extractor whose two steps a cache keeps apart: extractors with the same detection share its results.
-    Calling it equals ``describe(image, lafs)`` after ``lafs, scores = detect(image)``: a descriptor for each frame."""
+    Calling it equals ``describe(image, lafs)`` after ``lafs, scores = detect(image)``: a descriptor for each frame.
+    detection: what defines the frames and scores: parts, options, files (`fingerprint.configuration`). detect: local
+    affine frames and their scores. describe: the descriptors of the frames, which may be on the CPU."""
 
     @property
-    def detection(self) -> object:
-        """What defines the frames and scores: parts, options, files (`fingerprint.configuration`)."""
+    def detection(self) -> object: ...
 
-    def detect(self, image: NDArray[np.uint8]) -> tuple[Float[Tensor, "n 2 3"], Float[Tensor, " n"]]:
-        """Local affine frames and their scores."""
+    def detect(self, image: NDArray[np.uint8]) -> tuple[Float[Tensor, "n 2 3"], Float[Tensor, " n"]]: ...
 
-    def describe(self, image: NDArray[np.uint8], lafs: Float[Tensor, "n 2 3"]) -> Float[Tensor, "n d"]:
-        """The descriptors of the frames, which may be on the CPU."""
+    def describe(self, image: NDArray[np.uint8], lafs: Float[Tensor, "n 2 3"]) -> Float[Tensor, "n d"]: ...
 
 
 @runtime_checkable

@@ -195,9 +195,8 @@ def rebuilt(r: Run, options: Options) -> Pipeline:
         raise ValueError("its folder does not say what its pipeline was")
     foreign = presets.targets_of(stages) - presets.known_targets()
     if foreign and not options.own_code:
-        raise ValueError(
-            f"it has parts of your own ({', '.join(sorted(foreign))}), which a report loads with own_code=true"
-        )
+        own = ", ".join(sorted(foreign))
+        raise ValueError(f"it has parts of your own ({own}), which a report loads with own_code=true")
     cache = {"cache": options.cache, "cache_limit": options.cache_limit}
     return build_pipeline(OmegaConf.create({**presets.composed(stages), **cache}), options.device, None)
 

@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING
 from fmtorch.core.lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from fmtorch.metrics.homography import corner_error, right_of_homography
-    from fmtorch.metrics.inlier_rate import InlierRate, ground_truth_inliers, inlier_rate
+    from fmtorch.metrics.inlier_rate import InlierRate, ground_truth_inliers, inlier_rate, right_of_homography
     from fmtorch.metrics.nsgd import nsgd, nsgd_released, sgd
-    from fmtorch.metrics.pose import PoseError, closest_pose_error, fundamental_pose_error, pose_error
+    from fmtorch.metrics.pose import PoseError, closest_pose_error, corner_error, fundamental_pose_error, pose_error
     from fmtorch.metrics.recall import mean_recall, pose_auc, pose_maa, pose_map, recall, recall_curve
 
 __all__ = [

@@ -1,4 +1,4 @@
-"""Share of matches that agree with the ground truth, before and after estimation."""
+"""Matches that agree with the true F or H, and their share before and after estimation."""
 
 from typing import NamedTuple
 
@@ -8,6 +8,7 @@ from torch import Tensor
 
 from fmtorch.core.checks import checked, expect_sizes
 from fmtorch.geometry.epipolar import epipolar_distances
+from fmtorch.geometry.homography import homography_transfer
 from fmtorch.metrics.nsgd import diagonal
 
 THRESHOLD = 0.003  # of the image diagonal (Bian et al., BMVC 2019)
@@ -80,10 +81,7 @@ def ground_truth_inliers(
     """Matches whose two distances to their true epipolar lines are both below `threshold` image diagonals.
 
     Args:
-        F_gt: true fundamental matrices, x1^T F x0 = 0 in pixels.
-        x0, x1: matches in pixels.
-        size0, size1: image sizes as (h, w), pixels.
-        mask: which of the matches count; all when not given.
+        F_gt, x0, x1, size0, size1, mask: as of `inlier_rate`.
         threshold: in diagonals of the image in which a distance is measured.
 
     Returns:
@@ -103,3 +101,31 @@ def ground_truth_inliers(
 
 def _share(part: Tensor, total: Tensor) -> Tensor:
     return part.sum(-1).to(torch.float64) / total.sum(-1).to(torch.float64)
+
+
+MATCH_THRESHOLD = 3.0  # px, of right matches, as LightGlue's table of HPatches (Lindenberger et al., ICCV 2023)
+
+
+@checked
+def right_of_homography(
+    H_gt: Float[Tensor, "*#batch 3 3"],
+    x0: Float[Tensor, "*#batch n 2"],
+    x1: Float[Tensor, "*#batch n 2"],
+    *,
+    mask: Bool[Tensor, "*#batch n"] | None = None,
+    threshold: float = MATCH_THRESHOLD,
+) -> Bool[Tensor, "*#batch n"]:
+    """Matches whose transfer distances under the true homography, in both images, have a mean below the threshold.
+
+    Args:
+        H_gt: true homographies, x1 ~ H x0 in pixels.
+        x0, x1: matches in pixels.
+        mask: which of the matches count; all when not given.
+        threshold: px.
+
+    Returns:
+        (..., N).
+    """
+    back, forth = homography_transfer(H_gt.to(torch.float64), x0.to(torch.float64), x1.to(torch.float64))
+    right = (back + forth) / 2 < threshold
+    return right if mask is None else right & mask

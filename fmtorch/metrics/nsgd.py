@@ -30,6 +30,7 @@ TRIES = 10  # draws made at most, per accepted draw wanted
 PARALLEL = 1e-12  # sine of the angle below which a line does not cross a border: 1e-8 px over 10,000 px
 BORDER = -0.5  # left and top edge of the first pixel
 NORMAL_FLOOR = 1e-12  # length of a normal, for F of unit size, that is as good as none: its line is at infinity
+Two = tuple[Tensor, Tensor]
 RELEASED_BORDER, NORMAL_OFFSET = 0.5, 1e-10  # of `nsgd_released`: pixels count from 1; added to the length of a normal
 
 
@@ -59,7 +60,7 @@ def sgd(
     cap: bool = True,
 ) -> Float[Tensor, "*#batch"]:
     """Symmetric geometry distance in pixels, at most the mean of the two image diagonals; otherwise as `nsgd`."""
-    return _mean_distance(False, F_gt, F_est, size0, size1, samples, seed, key, cap)
+    return _mean_distance(False, (F_gt, F_est), (size0, size1), samples, seed, key, cap)
 
 
 @checked
@@ -100,22 +101,14 @@ def nsgd(
         >>> round(nsgd(rows, 5 * rows, size, size).item(), 6), bool(nsgd(rows, columns, size, size) > 0.05)
         (0.0, True)
     """
-    return _mean_distance(True, F_gt, F_est, size0, size1, samples, seed, key, cap)
+    return _mean_distance(True, (F_gt, F_est), (size0, size1), samples, seed, key, cap)
 
 
 def _mean_distance(
-    normalised: bool,
-    F_gt: Tensor,
-    F_est: Tensor,
-    size0: Tensor,
-    size1: Tensor,
-    samples: int,
-    seed: int,
-    key: Tensor | None,
-    cap: bool,
+    normalised: bool, models: Two, sizes: Two, samples: int, seed: int, key: Tensor | None, cap: bool
 ) -> Tensor:
     """Mean over accepted draws of the distances in pixels, or `normalised`, in diagonals of the images."""
-    pairs, shape = _flattened(F_gt, F_est, size0, size1, samples, key)
+    pairs, shape = _flattened(*models, *sizes, samples, key)
     F = torch.stack(pairs[:2], 1)
     valid = F.detach().isfinite().flatten(1).all(1)
     F = epipolar.unit_largest(torch.where(valid[:, None, None, None], F, 0.0))
@@ -132,7 +125,7 @@ def _mean_distance(
         total = total + (slope * (F - F.detach())).sum((1, 2, 3))  # adds zeros
     worst = (diagonals / units).sum(1) / 2
     value = torch.where(count > 0, total / count.clamp(min=1), worst)
-    return (torch.minimum(value, worst) if cap else value).reshape(shape).to(F_est.dtype)
+    return (torch.minimum(value, worst) if cap else value).reshape(shape).to(models[1].dtype)
 
 
 @checked

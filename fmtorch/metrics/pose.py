@@ -1,13 +1,15 @@
-"""Errors of a relative pose in degrees."""
+"""Errors of a relative pose in degrees, and of a homography ``x1 ~ H x0`` in pixels."""
 
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Real
 from torch import Tensor
 
-from fmtorch.core.checks import checked
+from fmtorch.core.checks import checked, expect_sizes
+from fmtorch.geometry.arithmetic import component_sum
 from fmtorch.geometry.epipolar import inverse_root
+from fmtorch.geometry.homography import homography_points
 from fmtorch.geometry.pose import pose_from_fundamental, poses_from_fundamental
 
 Rotations = Float[Tensor, "*#batch 3 3"]
@@ -117,9 +119,7 @@ def closest_pose_error(
     As PoseBench (github.com/PoseLib/posebench) judges fundamental matrices. The sign of t counts, no match decides.
 
     Args:
-        F: estimated fundamental matrices, x1^T F x0 = 0 in pixels.
-        K0, K1: calibration matrices.
-        R_gt, t_gt: the true motion, X1 = R X0 + t; the length of t does not count.
+        F, K0, K1, R_gt, t_gt: as of `fundamental_pose_error`.
 
     Returns:
         Angles in degrees, at most 180 each, and both 180 where there is no pose. Differentiable in F, K0 and K1.
@@ -130,6 +130,40 @@ def closest_pose_error(
     best = (errors.rotation + errors.translation).detach().argmin(-1, keepdim=True)
     rotation, translation = (angle.gather(-1, best)[..., 0] for angle in errors)
     return PoseError(torch.where(four.valid, rotation, 180.0), torch.where(four.valid, translation, 180.0))
+
+
+@checked
+def corner_error(
+    H_est: Float[Tensor, "*#batch 3 3"], H_gt: Float[Tensor, "*#batch 3 3"], size0: Real[Tensor, "*#batch 2"]
+) -> Float[Tensor, "*#batch"]:
+    """Mean distance in image 1 between the corners of image 0 as two homographies map them (DeTone et al., 2018).
+
+    Args:
+        H_est, H_gt: the estimated and the true homography, x1 ~ H x0 in pixels, of any scale and sign.
+        size0: of image 0, (h, w); its corners are the centres of its four corner pixels.
+
+    Returns:
+        Pixels, (...), float64; infinite where a corner has no finite image.
+
+    Raises:
+        ValueError: a size is not positive.
+
+    Example:
+        >>> import torch
+        >>> from fmtorch.metrics import corner_error
+        >>> moved = torch.tensor([[1.0, 0, 3], [0, 1, 4], [0, 0, 1]])
+        >>> corner_error(moved, torch.eye(3), torch.tensor([480, 640])).item()
+        5.0
+    """
+    expect_sizes(size0=size0)
+    h, w = (size0.to(torch.float64) - 1).unbind(-1)
+    zero = torch.zeros_like(h)
+    corners = torch.stack([torch.stack(c, -1) for c in ((zero, zero), (w, zero), (w, h), (zero, h))], -2)
+    a, b = (homography_points(H.to(torch.float64), corners) for H in (H_est, H_gt))
+    finite = (torch.isfinite(a) & torch.isfinite(b)).all(-1)
+    difference = torch.where(finite[..., None], a - b, 0.0)
+    squared = component_sum(difference * difference, -1)
+    return torch.where(finite.all(-1), component_sum(squared * inverse_root(squared), -1) / 4, torch.inf)
 
 
 def _angle(sine: Tensor, cosine: Tensor) -> Tensor:

@@ -1,7 +1,5 @@
 """Two photographs of any size through a pipeline: their matches and F in their own pixels, with pictures and files."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import html

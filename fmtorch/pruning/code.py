@@ -18,6 +18,7 @@ from fmtorch.core.types import Correspondences
 from fmtorch.geometry.robust_losses import huber_weight
 from fmtorch.pruning.consistency import frame_map
 
+Frames = Float[Tensor, "n 2 3"]
 BLOCK = 4096  # matches whose basis functions exist at a time
 LARGEST_CHANGE = 100.0  # of a frame's size between images of a common scale: what is beyond is no match
 
@@ -42,10 +43,7 @@ class MatchDomain(NamedTuple):
 
 
 def match_domain(
-    x0: Float[Tensor, "n 2"],
-    x1: Float[Tensor, "n 2"],
-    lafs0: Float[Tensor, "n 2 3"] | None,
-    lafs1: Float[Tensor, "n 2 3"] | None,
+    x0: Float[Tensor, "n 2"], x1: Float[Tensor, "n 2"], lafs0: Frames | None, lafs1: Frames | None
 ) -> MatchDomain:
     """The domain of the matches, float32; without frames S is the identity."""
     p0, spread0 = _normalized(x0)
@@ -191,13 +189,9 @@ class LikelihoodField:
         candidates = matches.take(evenly(seeds, self.candidates))
         centres = candidates.take(spread_centres(self._basis(candidates, candidates, framed), self.centres))
         basis = self._basis(matches.take(seeds), centres, framed)
-        weights = huber_regression(
-            basis,
-            torch.ones_like(basis[:, :1]),
-            self.ridge * len(seeds) * torch.eye(basis.shape[1], device=basis.device),
-            scale=self.huber,
-            iterations=self.iterations,
-        )
+        ridge = self.ridge * len(seeds) * torch.eye(basis.shape[1], device=basis.device)
+        target = torch.ones_like(basis[:, :1])
+        weights = huber_regression(basis, target, ridge, scale=self.huber, iterations=self.iterations)
         return torch.cat([self._basis(block, centres, framed) @ weights for block in matches.blocks()])[:, 0]
 
     def distinctive(self, matches: MatchDomain, ratio: Float[Tensor, " n"] | None) -> Int[Tensor, " s"]:
@@ -210,14 +204,9 @@ class LikelihoodField:
         return ratio.argsort(stable=True)[: self.least_seeds].sort().values
 
     def _basis(self, matches: MatchDomain, centres: MatchDomain, framed: bool) -> Float[Tensor, "n m"]:
-        return predictive_gaussians(
-            matches,
-            centres,
-            position=self.position,
-            displacement=self.displacement if framed else self.unframed_displacement,
-            rotation=self.rotation,
-            scale=self.scale,
-        )
+        displacement = self.displacement if framed else self.unframed_displacement
+        widths = {"position": self.position, "rotation": self.rotation, "scale": self.scale}
+        return predictive_gaussians(matches, centres, displacement=displacement, **widths)
 
 
 _FREE = 1e-3  # the common affine motion's share of the ridge

@@ -15,6 +15,8 @@ from fmtorch.jit.batches import for_each_pair
 from fmtorch.jit.kernel import Array, B1x1, F8x1, F8x2, inner, kernel, vector
 from fmtorch.jit.random import mix
 
+Points = Float[Tensor, "b n 2"]
+
 
 def ratio_test(
     ratio: Float[Tensor, "b n"], threshold: float = 0.8, mask: Bool[Tensor, "b n"] | None = None
@@ -62,10 +64,7 @@ class MutualCheck:
 
 
 def one_to_one(
-    x0: Float[Tensor, "b n 2"],
-    x1: Float[Tensor, "b n 2"],
-    ambiguity: Float[Tensor, "b n"],
-    mask: Bool[Tensor, "b n"] | None = None,
+    x0: Points, x1: Points, ambiguity: Float[Tensor, "b n"], mask: Bool[Tensor, "b n"] | None = None
 ) -> Bool[Tensor, "b n"]:
     """True for a match that is the best one at its location in image 0 and the best one at its location in image 1.
     The best has the lowest `ambiguity` (NaN is worst), ties by lowest index. Locations are the same when coordinates

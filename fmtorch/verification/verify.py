@@ -155,17 +155,11 @@ class Verification:
         return sum(count for kind, count in self.configurations.items() if kind != "degenerate")
 
 
-class Estimation(NamedTuple):
-    """What estimates batches of pairs."""
+class Batch(NamedTuple):
+    """Pairs that were read, and how to estimate them; the problems of those that could not be read."""
 
-    estimator: stages.Estimator
     cameras: Cameras
     seed: int
-
-
-class Batch(NamedTuple):
-    """Pairs that were read; the problems of those that could not be, or not be estimated."""
-
     ids: list[_PairIds]
     pairs: list[DatabasePair]
     problems: list[tuple[_PairIds, str]]
@@ -174,12 +168,12 @@ class Batch(NamedTuple):
 Geometries = tuple[list[tuple[_PairIds, PairGeometry]], list[tuple[_PairIds, str]]]  # and the problems of the others
 
 
-def estimate_batch(how: Estimation, batch: Batch) -> Geometries:
+def estimate_batch(estimator: stages.Estimator, batch: Batch) -> Geometries:
     """What a worker does."""
     ids, pairs, given, problems = [], [], [], list[tuple[_PairIds, str]]()
     for own, pair in zip(batch.ids, batch.pairs, strict=True):
         try:
-            given.append(as_correspondences(pair, how.cameras))
+            given.append(as_correspondences(pair, batch.cameras))
             ids.append(own)
             pairs.append(pair)
         except Exception as error:  # one pair does not end the work on the others
@@ -187,8 +181,8 @@ def estimate_batch(how: Estimation, batch: Batch) -> Geometries:
     results: dict[int, PairGeometry] = {}
     for alike in _alike(given):
         c = collate([given[i] for i in alike])
-        estimate = estimated_by(how.estimator, c, how.seed)
-        configuration = pair_type.classify(c, estimate, focal_deviation=0, seed=how.seed)
+        estimate = estimated_by(estimator, c, batch.seed)
+        configuration = pair_type.classify(c, estimate, focal_deviation=0, seed=batch.seed)
         of_these = pair_geometries([pairs[i].matches for i in alike], c, estimate, configuration)
         results |= zip(alike, of_these, strict=True)
     return [(own, results[i]) for i, own in enumerate(ids)], problems
@@ -205,7 +199,8 @@ def _alike(given: Sequence[Correspondences]) -> list[list[int]]:
 
 def divided(batch: Batch) -> list[Batch]:
     """The pairs of a batch in batches of their own."""
-    return [Batch([ids], [pair], []) for ids, pair in zip(batch.ids, batch.pairs, strict=True)]
+    each = zip(batch.ids, batch.pairs, strict=True)
+    return [batch._replace(ids=[ids], pairs=[pair], problems=[]) for ids, pair in each]
 
 
 class VerificationRun:
@@ -213,8 +208,10 @@ class VerificationRun:
     parts: keeps their geometries. shard: only these pairs, which are kept there; None: all, and `write` moves what is
     kept into the store. force: estimate pairs that have a geometry in the store, too."""
 
-    def __init__(self, store: PairStore, parts: GeometryParts, shard: Shard | None = None, force: bool = False) -> None:
-        self.store, self.parts = store, parts
+    def __init__(
+        self, store: PairStore, parts: GeometryParts, cameras: Cameras, seed: int, shard: Shard | None, force: bool
+    ) -> None:
+        self.store, self.parts, self.cameras, self.seed = store, parts, cameras, seed
         pairs = store.pairs()
         self.pairs = pairs if shard is None else list(shard.of(pairs))
         self.todo = [p for p in self.pairs if p not in parts.done and (force or not store.has_geometry(p))]
@@ -223,7 +220,7 @@ class VerificationRun:
         self.warnings: dict[str, None] = {}  # in order
 
     def each_batch(
-        self, make: Callable[[], Estimation], execution: Execution, report: Callable[[int, int], None] | None
+        self, make: Callable[[], stages.Estimator], execution: Execution, report: Callable[[int, int], None] | None
     ) -> None:
         """Estimate and keep the pairs that are not done, batch by batch; `make` is pickled for workers elsewhere."""
         todo = self.todo
@@ -233,7 +230,7 @@ class VerificationRun:
         def given_up(batch: Batch, reason: str) -> None:
             self._keep(batch, ([], [(ids, reason) for ids in batch.ids]))
 
-        source: Source[Estimation] = Local(make()) if execution.shared else Factory(make)
+        source: Source[stages.Estimator] = Local(make()) if execution.shared else Factory(make)
         batches = (self._read(todo[start : start + BATCH]) for start in range(0, len(todo), BATCH))
         done = 0
         with WorkerPool(execution, PRELOADED) as pool:
@@ -260,7 +257,7 @@ class VerificationRun:
             yield ids, geometry
 
     def _read(self, pairs: Sequence[_PairIds]) -> Batch:
-        batch = Batch([], [], [])
+        batch = Batch(self.cameras, self.seed, [], [], [])
         for pair in pairs:
             try:
                 matches = self.store.matches(pair)
@@ -406,8 +403,8 @@ def verify_by(
     whole = mode.shard is None
     with _opened(paths, mode.force, whole) as (store, end):
         parts = GeometryParts(end.with_name(f"{end.name}.parts"), {**settings, **store.identity()})
-        run = VerificationRun(store, parts, mode.shard, mode.force)
-        run.each_batch(functools.partial(_estimation, make, cast(Cameras, known), seed), mode.execution, report)
+        run = VerificationRun(store, parts, cast(Cameras, known), seed, mode.shard, mode.force)
+        run.each_batch(make, mode.execution, report)
         if whole:
             run.write()
     if whole:
@@ -429,10 +426,6 @@ def _finished(paths: VerifyPaths) -> int:
             with MatchFile(matches, output) if features is None else HlocMatches(features, matches, output) as files:
                 return files.finished()
     return 0
-
-
-def _estimation(make: Callable[[], stages.Estimator], cameras: Cameras, seed: int) -> Estimation:
-    return Estimation(make(), cameras, seed)
 
 
 @contextlib.contextmanager

@@ -13,7 +13,7 @@ pytest.importorskip("lightning", reason="training needs the extra `train`")
 
 from fmtorch import presets
 from fmtorch.pruning import LC
-from fmtorch.training import LabelledMatches, Objective, Use, Validation, collate, loop
+from fmtorch.training import LabelledMatches, Objective, Use, Validation, collate, run
 from fmtorch.training.run import Optimisation, PrunerTraining, latest_checkpoint
 from tests.processes import run_command
 from tests.training.conftest import labelled_pair
@@ -49,7 +49,7 @@ def module() -> PrunerTraining:
 def train(made: PrunerTraining, folder: Path, every: int, checkpoint_every: int, monitor: str) -> int:
     cpu = {"accelerator": "cpu", "devices": 1, "gradient_clip_val": 1.0}
     often = {"every": every, "checkpoint_every": checkpoint_every}
-    return loop.train(made, batches, folder, cpu, **often, patience=None, monitor=monitor)[0]
+    return run.train(made, batches, folder, cpu, **often, patience=None, monitor=monitor)[0]
 
 
 def trained(folder: Path, seen: list[int] | None = None) -> PrunerTraining:
@@ -92,8 +92,8 @@ t.trained(Path({str(tmp_path / "parts")!r}))
     assert seen == list(range(6, STEPS))
     expect_equal(whole.state_dict(), parts.state_dict())
     # The best weights are kept, and a damaged checkpoint is passed over.
-    loop.load_best(tmp_path / "parts", parts)
-    (tmp_path / "parts" / loop.CHECKPOINTS / "step=99.ckpt").write_bytes(b"not a checkpoint")
+    run.load_best(tmp_path / "parts", parts)
+    (tmp_path / "parts" / run.CHECKPOINTS / "step=99.ckpt").write_bytes(b"not a checkpoint")
     with pytest.warns(UserWarning, match="step=99"):
         assert latest_checkpoint(tmp_path / "parts")[1] == STEPS
 
@@ -126,7 +126,7 @@ def test_ended_before_a_validation_it_is_made_again(tmp_path: Path) -> None:
 
         made.on_validation_start = starts  # type: ignore[method-assign]
         train(made, folder, every=4, checkpoint_every=4, monitor="log_loss")
-        return loop.load_best(folder, made), made.state_dict()
+        return run.load_best(folder, made), made.state_dict()
 
     whole = best(tmp_path / "whole", None)
     for last in (1, 2, 3):  # validations after 4, 8 and 12 steps

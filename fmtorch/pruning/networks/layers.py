@@ -16,6 +16,7 @@ from torch.autograd.function import once_differentiable
 
 EPS = 1e-5  # added to variances, as torch's instance and batch norms do
 MOMENTUM = 0.1  # of running statistics
+Running = tuple[Tensor, Tensor] | None  # mean and variance
 
 
 class Slots(NamedTuple):
@@ -104,13 +105,7 @@ class _NormReLU(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any,
-        x: Tensor,
-        mask: Tensor | None,
-        count: Tensor,
-        weight: Tensor,
-        bias: Tensor,
-        running: tuple[Tensor, Tensor] | None,
+        ctx: Any, x: Tensor, mask: Tensor | None, count: Tensor, weight: Tensor, bias: Tensor, running: Running
     ) -> tuple[Tensor, Tensor]:
         n = count.clamp_min(1)
         centred = x - (x.sum(-1) / n)[..., None]
