@@ -158,14 +158,11 @@ def findEssentialMat(points1: Any, points2: Any, *arguments: Any, **named: Any) 
 
 def recoverPose(*arguments: Any, **named: Any) -> Any:
     """The pose of an essential matrix in OpenCV's forms, as `cv2.recoverPose` returns it.
-
     ``(E, points1, points2, cameraMatrix[, R[, t[, mask]]])`` and ``(E, points1, points2[, R[, t[, focal[, pp[,
     mask]]]]])`` choose between the four poses of E by all points, however far they are; OpenCV by those within 50
     baselines, among which there are none where the camera hardly moves. With ``distanceThresh`` it is OpenCV's own.
-
     In the form ``(points1, points2, cameraMatrix1, distCoeffs1, cameraMatrix2, distCoeffs2, ...)``, without a matrix,
-    that is of `findEssentialMat` above: ``retval, E, R, t, mask``. Raises ValueError where there is none.
-    """
+    that is of `findEssentialMat` above: ``retval, E, R, t, mask``. Raises ValueError where there is none."""
     cameras = len(arguments) > 4 and np.shape(arguments[2]) == np.shape(arguments[4]) == (3, 3)
     if "cameraMatrix2" not in named and (not cameras or np.shape(arguments[0]) == (3, 3)):
         return _pose_of_matrix(arguments, named)

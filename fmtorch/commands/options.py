@@ -222,9 +222,7 @@ whatever features find. Which pairs are looked at, the data set says (window, ca
     texts=("dataset.root",),
     interrupted="interrupted; the same command goes on from there",
 )
-REPORT = Command(
-    "report", "It has tables, curves and pictures.", ReportOptions, {}, positional=("runs...",),
-)  # fmt: skip
+REPORT = Command("report", "It has tables, curves and pictures.", ReportOptions, {}, positional=("runs...",))
 TRAIN = Command(
     "train",
     """The data set has ground truth: fmtorch train pruner=lc.

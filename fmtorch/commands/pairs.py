@@ -53,9 +53,8 @@ def run(config: DictConfig) -> Path:
             progress.advance(bar)
     summary = {"candidates": dataset.candidates, "judged": judged, "kept": len(kept), "images": len(images)}
     if not kept:
-        raise ValueError(
-            f"none of {judged} candidates passes the rule{_first(problems)}; {construction.folder} was not completed"
-        )
+        none = f"none of {judged} candidates passes the rule{_first(problems)}"
+        raise ValueError(f"{none}; {construction.folder} was not completed")
     construction.finish(kept, summary)
     _print_summary(construction, summary, problems, time.monotonic() - start)
     return construction.folder
@@ -69,10 +68,8 @@ def _load(config: DictConfig) -> ScenePairs:
     if isinstance(dataset, RenderedPairs):
         return dataset.scene_pairs()
     if not isinstance(dataset, ScenePairs):
-        raise ValueError(
-            f"dataset={dataset.name} has no candidates to judge; it must be one of tum, kitti, colmap, bundler, "
-            "cameras, rendered, or a `ScenePairs` of your own"
-        )
+        allowed = "tum, kitti, colmap, bundler, cameras, rendered, or a `ScenePairs` of your own"
+        raise ValueError(f"dataset={dataset.name} has no candidates to judge; it must be one of {allowed}")
     return dataset
 
 

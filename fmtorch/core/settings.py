@@ -28,20 +28,16 @@ def claim(file: Path, settings: Mapping[str, Any], holds: str, instead: str, alo
     if not file.exists():
         foreign = sorted(entry.name for entry in folder.iterdir() if entry.suffix != ".tmp")
         if alone and foreign:
-            raise ValueError(
-                f"{folder} is not empty and has no {file.name}, so it holds no {holds} (it holds {head(foreign)}); "
-                f"{instead}"
-            )
+            what = f"has no {file.name}, so it holds no {holds} (it holds {head(foreign)})"
+            raise ValueError(f"{folder} is not empty and {what}; {instead}")
         create(file, json.dumps(wanted, indent=2) + "\n")
     try:
         stored = json.loads(file.read_text(encoding="utf-8"))
     except ValueError as error:
         raise ValueError(f"{file} is not valid JSON ({error}); delete {folder} and run again") from error
     if stored != wanted:
-        raise ValueError(
-            f"{folder} holds {holds} of other settings; what differs (there -> now): {differences(stored, wanted)}. "
-            f"{instead[0].upper()}{instead[1:]}"
-        )
+        what = f"what differs (there -> now): {differences(stored, wanted)}"
+        raise ValueError(f"{folder} holds {holds} of other settings; {what}. {instead[0].upper()}{instead[1:]}")
 
 
 def create(file: Path, text: str) -> None:

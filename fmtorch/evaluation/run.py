@@ -45,12 +45,9 @@ def run_identity(
     """The identity of a run, as plain values.
 
     Args:
-        config: a composed config: stages, data set, seed.
-        pipeline_name: the preset that it began with.
-        pipeline: what was built of the config.
-        dataset_digest: of the contents of the data set.
-        cameras: what the estimator is given of the cameras; None: nothing.
-        signed: whether the sign of a translation counts.
+        config: a composed config: stages, data set, seed. pipeline_name: the preset that it began with.
+        pipeline: what was built of the config. dataset_digest: of the contents of the data set.
+        cameras: what the estimator is given of them; None: nothing. signed: whether the sign of a translation counts.
 
     Returns:
         `pipeline`, each stage's config (pruners as a list), `seed`; `version` of fmtorch, in a checkout its commit;

@@ -81,14 +81,12 @@ def synchronise(device: torch.device) -> None:
 @dataclasses.dataclass(frozen=True, eq=False)
 class Outcome:
     """What a pipeline made of one pair.
-
-    correspondences, estimate: batches of one; None where the pair failed before that stage.
-    features: how many each image has. seconds: per stage; a batched stage is shared out evenly, and features count in
-    full for each pair that uses them, cached ones with the seconds they took when they were computed.
-    reason: why the pair failed, empty where it did not. pair_type, not_examined: of this pair alone, or why there
-    is none, where it was asked for (`fmtorch.pipeline.pipeline`). images: for pruners that look at them. keypoints:
-    the correspondences as the matcher left them, where pruners that look at images may have moved their points.
-    """
+    correspondences, estimate: batches of one; None where the pair failed before that stage. features: how many each
+    image has. seconds: per stage; a batched stage is shared out evenly, and features count in full for each pair that
+    uses them, cached ones with the seconds they took when they were computed. reason: why the pair failed, empty where
+    it did not. pair_type, not_examined: of this pair alone, or why there is none, where it was asked for
+    (`fmtorch.pipeline.pipeline`). images: for pruners that look at them. keypoints: the correspondences as the matcher
+    left them, where pruners that look at images may have moved their points."""
 
     pair: ImagePair
     features: tuple[int, int] = (0, 0)
@@ -137,14 +135,11 @@ MAX_TRACEBACKS = 3  # of different failures of a user's own code that are kept
 
 class Pipeline:
     """Features, matcher, pruners in order, estimator. Safe to call from several threads.
-
     memory: how many images' features are kept for pairs to come (about 5 MB an image at 8,000 SIFT features), and their
-    grey levels where a pruner looks at them.
-    families: by family, pruners that its pairs get in place of those of the same names.
-    model: what the estimator must give, "fundamental" or "homography" (`Estimate.model`); None: either.
-    debug: raise what a stage raises, which otherwise becomes the reason for its pair's failure.
-    tracebacks: of stages that are a user's own code and raised something, by what is said of it.
-    """
+    grey levels where a pruner looks at them. families: by family, pruners that its pairs get in place of those of the
+    same names. model: what the estimator must give, "fundamental" or "homography" (`Estimate.model`); None: either.
+    debug: raise what a stage raises, which otherwise becomes the reason for its pair's failure. tracebacks: of stages
+    that are a user's own code and raised something, by what is said of it."""
 
     def __init__(
         self, features: FeatureExtractor, matcher: Matcher, pruners: Mapping[str, Pruner], estimator: Estimator, *,

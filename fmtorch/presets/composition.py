@@ -137,10 +137,8 @@ def _versions(name: str, config: Any) -> Iterator[tuple[str, Any, tuple[str, ...
     yield where, usual, ()
     families = config[FAMILIES] or {}
     if not isinstance(families, Mapping) or not all(isinstance(options, Mapping) for options in families.values()):
-        raise ValueError(
-            f"{where}.{FAMILIES}={families}; it must be a mapping of families to options, e.g. "
-            "{wide: {with_scale: true}}"
-        )
+        what = "it must be a mapping of families to options, e.g. {wide: {with_scale: true}}"
+        raise ValueError(f"{where}.{FAMILIES}={families}; {what}")
     wide = families.get(WIDE_FAMILIES, {})
     if WIDE_FAMILIES in families:
         yield f"{where}.{FAMILIES}.{WIDE_FAMILIES}", {**usual, **wide}, WIDE

@@ -37,18 +37,17 @@ def instantiate(config: Mapping[str, Any], where: str, **extra: Any) -> Any:
 
 def construct(make: Callable[..., T], config: Mapping[str, Any], where: str, **extra: Any) -> T:
     """The same with the target given: of the entries of a config but for its `_target_`."""
-    _expect_fit(make, config, where, extra)
+    expect_buildable(config, where, extra, make)
     return _constructed(make, config, where, extra)
 
 
-def expect_buildable(config: Mapping[str, Any], where: str, given: Iterable[str] = ()) -> None:
-    """Raises ValueError, naming the option, where a config, or one within it, does not fit its target's signature."""
-    _expect_fit(target_of(config, where), config, where, given)
-
-
-def _expect_fit(make: Callable[..., Any], config: Mapping[str, Any], where: str, given: Iterable[str]) -> None:
+def expect_buildable(
+    config: Mapping[str, Any], where: str, given: Iterable[str] = (), make: Callable[..., Any] | None = None
+) -> None:
+    """Raises ValueError, naming the option, where a config, or one within it, does not fit its target's signature.
+    given: names of arguments that are added later. make: in place of the target."""
     values = {str(key): value for key, value in config.items() if key != "_target_"}
-    expect_options(make, values, where, given)
+    expect_options(make or target_of(config, where), values, where, given)
     for key, value in values.items():
         if _is_object(value):
             expect_buildable(value, f"{where}.{key}")

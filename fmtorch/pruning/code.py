@@ -216,14 +216,11 @@ MIN_MATCHES = 8  # likely matches without which there is no motion
 @dataclasses.dataclass(frozen=True)
 class SmoothMotion:
     """The displacement as one affine motion plus, around each of some centres, an affine motion that fades away.
-
     ``d(z) = A [p0, 1] + sum_m g(z, c_m) A_m [(p0 - c_m) / position, 1]`` minimises ``sum_j huber(|d_j - d(z_j)|) +
     ridge sum |A_m|^2`` over the likely matches j. The Gaussians g are over position and, widely, over displacement, so
     that neighbouring surfaces may move differently.
-
-    most_matches: so many likely matches take part, evenly. candidates, centres: as in the likelihood.
-    position, displacement: widths; huber: in the same units, those of the normalised coordinates.
-    """
+    most_matches: so many likely matches take part, evenly. candidates, centres: as in the likelihood. position,
+    displacement: widths; huber: in the same units, those of the normalised coordinates."""
 
     most_matches: int = 4000
     candidates: int = 1000
@@ -325,9 +322,8 @@ def coherence(
             continue
         ratios, frames0, frames1 = (None if v is None else v[pair][here] for v in (ratio, lafs0, lafs1))
         matches = match_domain(x0[pair][here], x1[pair][here], frames0, frames1)
-        result.likelihood[pair, here] = f = likelihood(
-            matches, ratios, framed=frames0 is not None and frames1 is not None
-        )
+        framed = frames0 is not None and frames1 is not None
+        result.likelihood[pair, here] = f = likelihood(matches, ratios, framed=framed)
         result.residual[pair, here] = motion(matches, f > least_likelihood)
     return result
 

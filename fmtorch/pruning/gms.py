@@ -227,13 +227,11 @@ def gms_support(
     border: Border = "opencv",
 ) -> Float[Tensor, "b n"]:
     """How many neighbours move with each match, against how many would suffice by the square root; in [0, 1).
-
     In each of the four grids, ``z = (score - 1) / sqrt(mean matches of the nine cells, at least 1)``, where the score
     counts the matches, itself included, of the nine cells around that go where the match's own cells say: the paper's
     S_i for each match instead of for the assignment of its cell. The support is ``z / (z + 1.5)`` of the mean z over
     the grids; 0 for a match that is alone, outside or masked. Rotation and scale are those of the hypothesis that keeps
-    most matches of the pair in `gms`, whose arguments these are.
-    """
+    most matches of the pair in `gms`, whose arguments these are."""
     options = with_rotation, with_scale, threshold_factor, border
     return _of_each_pair(gms_support_kernel, torch.float64, (x0, x1), (size0, size1), mask, options).to(x0)
 
@@ -247,12 +245,8 @@ def _of_each_pair(
     for i, size in enumerate(sizes):
         expect_inside(x[i], mask, size, f"x{i}", f"size{i}")
     tensors, out = (*x, sizes[0].float(), sizes[1].float(), mask), torch.empty(mask.shape, dtype=kind)
-    same = (
-        np.array(GRIDS if with_scale else GRIDS[:1]),
-        8 if with_rotation else 1,
-        threshold_factor,
-        border == "authors",
-    )
+    sides = np.array(GRIDS if with_scale else GRIDS[:1])
+    same = sides, 8 if with_rotation else 1, threshold_factor, border == "authors"
     return for_each_pair(of_pair, tensors, *same, out=out, kind=torch.float64, group=Matches)
 
 

@@ -99,16 +99,13 @@ def lpm(
     taus: Sequence[float] = (0.2, 0.2),
 ) -> Bool[Tensor, "b n"]:
     """True for matches whose neighbourhoods in the two images hold the same matches, moving alike.
-
-    The cost of a match is the mean over three neighbourhood sizes (K + 2, K, K - 2) of the share of its neighbours
-    that are near in one image only or whose motion differs, ``cos(angle) * ratio of squared lengths < tau``. Two
-    passes, each with its threshold lambda, K and tau: the second seeks neighbours among the matches that the first
-    kept, if those are at least K + 4, and decides. Equal to the released code with exact neighbours, ties by index; a
-    neighbour that does not exist, where matches are few, counts as lost.
-
-    Points in any common unit. Non-finite points are dropped. Memory is linear in the number of matches. Computed on
-    the CPU. Raises ValueError for K below 4, and for options of different lengths.
-    """
+    The cost of a match is the mean over three neighbourhood sizes (K + 2, K, K - 2) of the share of its neighbours that
+    are near in one image only or whose motion differs, ``cos(angle) * ratio of squared lengths < tau``. Two passes,
+    each with its threshold lambda, K and tau: the second seeks neighbours among the matches that the first kept, if
+    those are at least K + 4, and decides. Equal to the released code with exact neighbours, ties by index; a neighbour
+    that does not exist, where matches are few, counts as lost.
+    Points in any common unit. Non-finite points are dropped. Memory is linear in the number of matches. Computed on the
+    CPU. Raises ValueError for K below 4, and for options of different lengths."""
     return _kept_and_cost(x0, x1, mask, _passes(thresholds, neighbors, taus))[:, 0] > 0
 
 

@@ -257,9 +257,8 @@ def export_onnx(network: nn.Module, path: Path, *, temperature: float = 1.0) -> 
     with replacing(path) as unfinished, torch.no_grad():
         onnx.save(model, unfinished)
         x = torch.rand(1, network.input_channels, 3 * EXAMPLE_MATCHES)
-        exported = learned.OnnxBackbone(network, unfinished, "")(
-            x, layers.Slots(torch.tensor([float(x.shape[2])]), None)
-        )
+        slots = layers.Slots(torch.tensor([float(x.shape[2])]), None)
+        exported = learned.OnnxBackbone(network, unfinished, "")(x, slots)
         expect_equal(unfinished, exported, alone(x))
 
 

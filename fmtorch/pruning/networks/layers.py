@@ -56,15 +56,12 @@ class Perceptron(nn.Module):
 
 class ContextBatchNormReLU(nn.Module):
     """Context normalisation, then batch normalisation, then ReLU, all over real matches only.
-
     Context normalisation (Yi et al., CVPR 2018, eq. 2 and 3) brings each channel of each pair to mean 0 and, of a
     variance v before, to variance ``v / (v + eps)``. The statistics that batch normalisation takes over all matches of
     the batch are therefore known: mean 0 and the mean of ``v / (v + eps)``, pairs weighted by their matches. Both
     normalisations are one affine map for each pair and channel, which is what is computed, with its own gradient.
-
     Running statistics as torch's BatchNorm keeps them: momentum 0.1, variance times ``M / (M - 1)`` for M matches. The
-    running mean only ever moves towards 0; it is kept for weights trained elsewhere.
-    """
+    running mean only ever moves towards 0; it is kept for weights trained elsewhere."""
 
     running_mean: Tensor
     running_var: Tensor

@@ -115,9 +115,8 @@ def _checked(network: nn.Module, path: Path, metadata: Mapping[str, str]) -> Lea
         raise NetworkFileError(f"{path}: temperature {stated.temperature}; it has to be positive")
     expected = stated_network(network)
     if stated.network != expected:
-        raise NetworkFileError(
-            f"{path} holds {stated.network}, the preset names {expected}: take the file's options, or train this one"
-        )
+        both = f"{path} holds {stated.network}, the preset names {expected}"
+        raise NetworkFileError(f"{both}: take the file's options, or train this one")
     return stated
 
 
