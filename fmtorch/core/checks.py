@@ -28,9 +28,9 @@ def checked(function: Callable[P, R], *, common_type: bool = False) -> Callable[
     """The function, which takes NumPy arrays and lists for tensors and names what does not fit its annotations.
     Whole numbers become float64 where the annotation asks for floating-point ones, and half precision is widened to
     float32. Arrays go to the device of the first tensor. Where everything fits, the function gets what it was given.
-    common_type: bring floating-point tensors of several types to the widest one.
-    Raises (beside what the function itself raises) TypeError for what is no array or number, ValueError for a shape, a
-    type of numbers or a device that does not fit; the message begins with the argument's name."""
+    common_type: bring floating-point tensors of several types to the widest one. Raises (beside what the function
+    itself raises) TypeError for what is no array or number, ValueError for a shape, a type of numbers or a device that
+    does not fit; the message begins with the argument's name."""
     signature = inspect.signature(function)
     expected = functools.cache(functools.partial(arguments_of, function))
 

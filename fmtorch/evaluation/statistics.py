@@ -85,14 +85,10 @@ def _per_pair(values: torch.Tensor) -> Values:
 
 def pose_figures(rotation: Values, translation: Values, signed: bool = False) -> dict[str, float | int] | None:
     """Accuracy of poses over the pairs whose true pose is known; None where there is none.
-
-    rotation, translation: angles in degrees of each pair, (n,); NaN where the true pose is unknown.
-
-    - pairs: how many are known.
-    - auc_5, auc_10, auc_20: `fmtorch.metrics.pose_auc` of the larger of the two angles; map_5, map_10, map_20: its
-      binned mAP, `pose_map`; maa_10: `pose_maa`.
-    - rotation, translation: median angles. signed: whether the sign of a translation counts, as it was told.
-    """
+    rotation, translation: angles in degrees of each pair, (n,); NaN where the true pose is unknown. signed: whether the
+    sign of a translation counts, as it was told. auc_5, auc_10, auc_20: `fmtorch.metrics.pose_auc` of the larger of the
+    two angles; map_5, map_10, map_20: its binned mAP, `pose_map`; maa_10: `pose_maa`; rotation, translation: median
+    angles."""
     known = ~(np.isnan(rotation) | np.isnan(translation))
     if not known.any():
         return None
@@ -110,14 +106,10 @@ def pose_figures(rotation: Values, translation: Values, signed: bool = False) ->
 
 def focal_figures(errors: Values, log_ratios: Values, ok: NDArray[np.bool_]) -> dict[str, float | int | None] | None:
     """Accuracy of estimated focal lengths, of pairs (n, 2) by image; None where none was estimated.
-
     errors: relative, infinite where a focal length is not determined; NaN where none was to be estimated. log_ratios:
-    log(f / f_true), NaN where there is none. ok: (n,), the others are misses.
-
-    - images: how many focal lengths were to be estimated, those of failed pairs with them.
-    - error: their median relative error, None where that is infinite; ratio: median f / f_true of those determined.
-    - within_5, within_10: shares with a relative error of at most 5 and 10 %.
-    """
+    log(f / f_true), NaN where there is none. ok: (n,), the others are misses. images: how many focal lengths were to be
+    estimated, those of failed pairs with them; error: their median relative error, None where that is infinite; ratio:
+    median f / f_true of those determined; within_5, within_10: shares with a relative error of at most 5 and 10 %."""
     asked = ~np.isnan(errors)
     if not asked.any():
         return None
@@ -134,13 +126,9 @@ def focal_figures(errors: Values, log_ratios: Values, ok: NDArray[np.bool_]) -> 
 
 def homography_figures(errors: Values) -> dict[str, float | int | None] | None:
     """Accuracy of homographies over the pairs whose true one is known; None where there is none.
-
-    errors: corner errors in pixels, (n,), infinite where a pair failed, NaN where no homography is known.
-
-    - pairs: how many are known.
-    - auc_1px, auc_3px, auc_5px: area under the recall curve of the corner error (`fmtorch.metrics.pose_auc`).
-    - corner_error: the median, None where that is infinite.
-    """
+    errors: corner errors in pixels, (n,), infinite where a pair failed, NaN where no homography is known. auc_1px,
+    auc_3px, auc_5px: area under the recall curve of the corner error (`fmtorch.metrics.pose_auc`); corner_error: the
+    median, None where that is infinite."""
     known = errors[~np.isnan(errors)]
     if not len(known):
         return None

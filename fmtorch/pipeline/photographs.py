@@ -38,15 +38,9 @@ class PhotographCamera(NamedTuple):
 
 class PhotographCameras:
     """The cameras of photographs.
-
-    Args:
-        cameras: one of `WORDS`, a file of cameras (`ImageCameras`), or None where nothing is asked of them.
-        K: fx, fy, cx, cy of all, px, as numbers or as a text, or None.
-
-    Raises:
-        ValueError: where both are given, or for what no camera is.
-        DataError: for a file that is damaged or holds something else.
-    """
+    cameras: one of `WORDS`, a file of cameras (`ImageCameras`), or None where nothing is asked of them. K: fx, fy, cx,
+    cy of all, px, as numbers or as a text, or None. Raises ValueError where both are given, or for what no camera is,
+    and DataError for a file that is damaged or holds something else."""
 
     def __init__(self, cameras: Path | None = None, K: str | Sequence[float | int] | None = None) -> None:
         if K is not None and cameras is not None:

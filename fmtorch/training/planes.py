@@ -70,18 +70,12 @@ def list_photographs(
 
 class PlanePairs(PairDataset):
     """Pairs of views of photographs, each photograph a plane; a `DepthDataset`. F is zero: none is determined.
-
     The plane goes on past the photograph's edges as its mirror image. Light, focus, noise and compression of each view
     are changed as by another camera on another day. Views are drawn on first use and kept; a view depends on its
-    photograph's bytes, `views`, `seed` and its number alone.
-
-    Args:
-        photographs: files that OpenCV reads. views: how to look at them. seed: of the views.
-        root: folder that keeps the views, by default ``planes`` in the cache folder.
-        workers: threads that draw. progress: called with (photographs done, photographs in all).
-
-    Raises ImageError for a file that is no image, ValueError where there is none.
-    """
+    photograph's bytes, `views`, `seed` and its number alone. photographs: files that OpenCV reads. root: folder that
+    keeps the views, by default ``planes`` in the cache folder. workers: threads that draw. progress: called with
+    (photographs done, photographs in all). Raises ImageError for a file that is no image, ValueError where there is
+    none."""
 
     name = "planes"
 
