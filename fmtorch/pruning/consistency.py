@@ -94,7 +94,7 @@ def frame_agreement_kernel(matches: FramedMatches, out: F4x1) -> None:
 @inner
 def _frames_agree(along: Array, k: int, ahead: Array, behind: Array) -> None:
     """For matches i and j = i + k: how well j agrees with i -> ahead[i], i with j -> behind[i]."""
-    noise, tiny = NOISE32, MIN_SQUARE32
+    noise, sharpness, tiny = NOISE32, SHARPNESS32, MIN_SQUARE32
     X0, Y0, X1, Y1, A, B, C, D, S = (
         along[0], along[1], along[2], along[3], along[4], along[5], along[6], along[7], along[8],
     )  # fmt: skip
@@ -106,17 +106,18 @@ def _frames_agree(along: Array, k: int, ahead: Array, behind: Array) -> None:
         own, other = p * p + q * q, r * r + s * s
         error = own if own > other else other
         length0, length1 = math.sqrt(dx * dx + dy * dy + tiny), math.sqrt(ux * ux + uy * uy + tiny)
-        ahead[i] = _agrees(error, length0 * S[i] + length1 + noise)
-        behind[i] = _agrees(error, length0 * S[j] + length1 + noise)
-
-
-@inner
-def _agrees(squared: Any, length: Any) -> Any:
-    """How well a neighbour agrees whose squared error is relative to a length: ``(1 + (e / TOLERANCE)^2 / 8)^-8``."""
-    t = ONE32 + squared / (length * length) * SHARPNESS32
-    t = t * t
-    t = t * t
-    return ONE32 / (t * t)
+        length = length0 * S[i] + length1 + noise
+        t = ONE32 + error / (length * length) * sharpness
+        t = t * t
+        t = t * t
+        t = t * t
+        ahead[i] = ONE32 / t
+        length = length0 * S[j] + length1 + noise
+        t = ONE32 + error / (length * length) * sharpness
+        t = t * t
+        t = t * t
+        t = t * t
+        behind[i] = ONE32 / t
 
 
 @inner
@@ -324,14 +325,18 @@ def _turn(x: Any, y: Any) -> int:
 @inner
 def _positions_agree(along: Array, k: int, similarity: Array, agree: Array) -> None:
     """How well matches i and i + k agree -> agree[i]."""
-    noise, tiny = NOISE32, MIN_SQUARE32
+    noise, sharpness, tiny = NOISE32, SHARPNESS32, MIN_SQUARE32
     a, b, scale = similarity[0], similarity[1], similarity[2]
     X0, Y0, X1, Y1 = along[0], along[1], along[2], along[3]
     for i in range(along.shape[1] - k):
         dx, dy, ux, uy = X0[i + k] - X0[i], Y0[i + k] - Y0[i], X1[i + k] - X1[i], Y1[i + k] - Y1[i]
         p, q = a * dx - b * dy - ux, b * dx + a * dy - uy
         length = scale * math.sqrt(dx * dx + dy * dy + tiny) + math.sqrt(ux * ux + uy * uy + tiny) + noise
-        agree[i] = _agrees(p * p + q * q, length)
+        t = ONE32 + (p * p + q * q) / (length * length) * sharpness
+        t = t * t
+        t = t * t
+        t = t * t
+        agree[i] = ONE32 / t
 
 
 def position_agreement(x0: Points, x1: Points, ratio: PerMatch | None, mask: Bool[Tensor, "b n"]) -> PerMatch:
