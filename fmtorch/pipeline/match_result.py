@@ -45,7 +45,8 @@ class MatchResult:
     pair_type: one of `PAIR_TYPES`; empty where nothing could be matched. geometry: the two-view geometry for
     COLMAP, whose inliers are indices of the kept matches, twice. undistorted: where a lens distorts, the kept matches
     as pinholes would have them, which F and homography relate; points are otherwise those of the photographs.
-    photographs, lenses: as they were given, for pictures.
+    lens: (2,), lambda of both lenses as of `Estimate.lens`, where these were estimated.
+    photographs: as they were given, lenses: as they are known or were estimated; for pictures.
     """
 
     keypoints0: Float[Tensor, "n0 2"]
@@ -63,6 +64,7 @@ class MatchResult:
     R: Float[Tensor, "3 3"] | None = None
     t: Float[Tensor, " 3"] | None = None
     focals: Float[Tensor, " 2"] | None = None
+    lens: Float[Tensor, " 2"] | None = None
     pair_type: str = ""
     geometry: PairGeometry | None = None
     undistorted: Correspondences | None = None
@@ -160,6 +162,8 @@ class MatchResult:
             determined = self.ok and bool(torch.isfinite(self.R).all())
             report |= {name: value.tolist() if determined else None for name, value in (("R", self.R), ("t", self.t))}
             report["focals"] = [focal if math.isfinite(focal) else None for focal in self.focals.tolist()]
+        if self.lens is not None:
+            report["lens"] = [value if math.isfinite(value) else None for value in self.lens.tolist()]
         return report
 
     def __repr__(self) -> str:
