@@ -175,6 +175,14 @@ def pose_line(result: MatchResult) -> str:
     return f"rotation {angle:.2f}°, translation ({direction}), focal lengths {focals} px"
 
 
+def lens_line(result: MatchResult) -> str:
+    """``lens: lambda -0.102, -0.102; F is of undistorted points``; empty where none bends an image."""
+    if result.lens is None or not bool(result.lens.any()):
+        return ""
+    bending = ", ".join("?" if math.isnan(value) else f"{value:.3f}" for value in result.lens.tolist())
+    return f"lens: lambda {bending}; F relates undistorted points, as epipolar.png shows"
+
+
 MAX_RANK3 = 0.01  # third singular value of a true F over the second one: its numbers may be rounded
 
 
@@ -183,8 +191,8 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
     overrides: what the command line changed of the pipeline of that name; said beside it."""
     fields = read_fields(MatchOptions, config)
     if fields.images is not None:
-        if fields.image0 is not None or fields.image1 is not None or fields.truth is not None:
-            raise ValueError("images takes a folder; image0, image1 and truth are of a single pair")
+        if any(each is not None for each in (fields.image0, fields.image1, fields.truth, fields.lens)):
+            raise ValueError("images takes a folder; image0, image1, truth and lens are of a single pair")
         return match_folder(config, fields, PhotographCameras(fields.cameras, fields.K), pipeline_name, overrides)
     if (camera := fields.camera) != "per_image":
         raise ValueError(f"camera is of a folder's database; cameras={camera} is what is known of two photographs")
@@ -197,12 +205,12 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
     settings = {
         "pipeline": pipeline_name, "overrides": list(overrides), "seed": fields.seed, "orient": fields.orient,
         "longest_side": fields.longest_side, "truth": None if fields.truth is None else str(fields.truth),
-        "cameras": PhotographCameras(fields.cameras, fields.K).identity.get("cameras"),
+        "cameras": PhotographCameras(fields.cameras, fields.K).identity.get("cameras"), "lens": fields.lens,
     }  # fmt: skip
     folder = fields.output or _default_output(paths, settings)
     expect_writable(folder)
     pipeline: Pipeline = build_pipeline(config, presets.resolve_device(fields.device))
-    options = {"longest_side": fields.longest_side, "seed": fields.seed, **given.knowledge}
+    options = {"longest_side": fields.longest_side, "seed": fields.seed, "lens": fields.lens, **given.knowledge}
     result = match(*given.images, pipeline=pipeline, **options)
     error = None if truth is None or not result.ok else _nsgd(result, truth)
     report = {"version": __version__, **settings, "image0": str(paths[0]), "image1": str(paths[1])}
@@ -214,7 +222,7 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
         console.print(_verdict(result), style="bold", soft_wrap=True)
     if error is not None:
         console.print(f"NSGD to the true F: {error:.4f}")
-    if line := pose_line(result):
+    for line in filter(None, (pose_line(result), lens_line(result))):
         console.print(line)
     for trouble in (*given.notes, *_troubles(result)):
         errors.print(trouble, style="bold", soft_wrap=True)

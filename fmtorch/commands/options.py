@@ -92,6 +92,11 @@ class MatchOptions:
     K: str | list[float | int] | None = option(
         None, "fx,fy,cx,cy of all cameras, in pixels of the images as they are shown"
     )
+    lens: Literal["shared", "unknown"] | float | None = option(
+        None,
+        "how much lenses bend straight lines: shared (one unknown lens), unknown (one of each image), or lambda of the "
+        "division model in half diagonals; null: not at all",
+    )
     truth: Path | None = option(
         None, "a text file with the nine numbers of the true F, row by row, in pixels of the images as they are shown"
     )

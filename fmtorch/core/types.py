@@ -56,6 +56,10 @@ CONTRADICTED = (
     "far more matches agree without the calibration matrices: they are of other images or of another resolution"
 )
 
+BENT = (
+    "a lens bends the images (lambda about {:.2f}), and F is of pinholes: give lens='shared', or undistort the points"
+)
+
 
 def pair_key(identity: str) -> int:
     """The stable signed 64-bit key of a pair's identity (blake2b), which selects its random streams."""
@@ -214,6 +218,8 @@ class Estimate(Record):
     NaN where these tell none; sizes_doubtful (B,), whether images of one size and of two were both likely.
 
     Where lenses are estimated: lens (B, 2), lambda of both, NaN where they are not determined.
+    Where pinholes are assumed: lens_suggested (B,), lambda of one lens for both images with which the matches agree
+    where they contradict pinholes, NaN where they do not.
     Where calibration matrices are known: contradicted (B,), whether far more matches agree without them.
     """
 
@@ -240,6 +246,7 @@ class Estimate(Record):
     sizes: Float[Tensor, "b 2 2"] | None = None
     sizes_doubtful: Bool[Tensor, " b"] | None = None
     lens: Float[Tensor, "b 2"] | None = None
+    lens_suggested: Float[Tensor, " b"] | None = None
     contradicted: Bool[Tensor, " b"] | None = None
 
     def __post_init__(self) -> None:
@@ -276,11 +283,11 @@ class Estimate(Record):
 
     @property
     def warning(self) -> tuple[str, ...]:
-        """What the type of each pair leaves open, whether its matches contradict its calibration matrices, and which
-        sizes were doubtful.
+        """What the type of each pair leaves open, whether its matches contradict its calibration matrices or pinholes,
+        and which sizes were doubtful.
         Empty where there is nothing to say. Raises as `pair_type` where none of these was looked at."""
-        looked = self.contradicted is not None or self.sizes_doubtful is not None
-        unknown = self.pair_type_index is None and looked
+        lens, looks = self.lens_suggested, (self.contradicted, self.sizes_doubtful, self.lens_suggested)
+        unknown = self.pair_type_index is None and any(look is not None for look in looks)
         opens = [""] * len(self) if unknown else [WARNINGS[name] for name in self.pair_type]
         contradicted = [False] * len(self) if self.contradicted is None else self.contradicted.tolist()
         said = [[CONTRADICTED if wrong else "", left] for wrong, left in zip(contradicted, opens, strict=True)]
@@ -288,6 +295,8 @@ class Estimate(Record):
             for i in self.sizes_doubtful.nonzero()[:, 0].tolist():
                 sizes = " and ".join(f"({h:.0f}, {w:.0f})" for h, w in self.sizes[i].tolist())
                 said[i].append(f"image sizes are not given, and {sizes} is assumed: give size0 and size1, or 'unknown'")
+        for i in [] if lens is None else lens.isfinite().nonzero()[:, 0].tolist():
+            said[i].append(BENT.format(float(cast(Tensor, lens)[i])))
         return tuple("; ".join(filter(None, each)) for each in said)
 
     @property

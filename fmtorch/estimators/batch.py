@@ -6,6 +6,7 @@ changes no result. What stands beside a pair in the batch is never looked at.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
@@ -38,7 +39,8 @@ MAX_LENS_DEVIATION = 0.1  # standard deviation above which matches do not determ
 
 class Solution(NamedTuple):
     """What an estimator says of one pair: the fit, None with a reason where there is none; samples drawn; inliers;
-    lenses (2,) and their standard deviations (2,), None where they are not estimated."""
+    lenses (2,) and their standard deviations (2,), None where they are not estimated; of pinholes, the lens that the
+    matches suggest, NaN where they agree with these."""
 
     fit: Fit | None
     samples: int
@@ -46,6 +48,7 @@ class Solution(NamedTuple):
     reason: str = ""
     lens: Array | None = None
     deviation: Array | None = None
+    lens_suggested: float = math.nan
 
 
 class CameraRows(NamedTuple):
@@ -79,7 +82,7 @@ class Estimation:
     """The estimation of a batch of pairs on the host: the pairs, and the estimates that become of them.
 
     family: of the models. minimal: matches below which a pair is not tried, and inliers below which a model is none.
-    calibrated: the same of a pair whose focal lengths are exactly known; None: no difference.
+    calibrated: the same of a pair whose focal lengths are exactly known; None: cameras make no difference.
     """
 
     def __init__(
@@ -94,7 +97,8 @@ class Estimation:
         self.F, self.inliers, self.ok = np.zeros((b, 3, 3)), np.zeros((b, n), np.bool_), np.zeros(b, np.bool_)
         self.samples, self.significance, self.reasons = np.zeros(b, np.int64), np.full(b, -np.inf), [""] * b
         self.cameras = CameraRows(np.full((b, 2), np.nan), np.full(b, np.nan), np.full((b, 2, 2), np.nan))
-        self.lens = np.full((b, 2), np.nan)
+        self.lens, self.lens_suggested = np.full((b, 2), np.nan), np.full(b, np.nan)
+        self.assumes_cameras = calibrated is not None
         self.asked_for_cameras = family.model == "fundamental" and c.asks_for_cameras
         self.graphed = torch.is_grad_enabled() and c.requires_grad
         self.solved: dict[int, Solved] = {}
@@ -127,8 +131,9 @@ class Estimation:
             matches = row.matches if solution.lens is None else _straight(row, solution.lens)
             self.significance[i] = _significance(self.F[i], matches) if fundamental else np.nan
             if solution.lens is not None:
-                told = solution.deviation is None or solution.deviation <= MAX_LENS_DEVIATION
-                self.lens[i] = np.where(told, solution.lens, np.nan)
+                determined = solution.deviation is None or solution.deviation <= MAX_LENS_DEVIATION
+                self.lens[i] = np.where(determined, solution.lens, np.nan)
+            self.lens_suggested[i] = solution.lens_suggested
             if self.asked_for_cameras and pair.sizes_known:
                 self.cameras.fill(i, solution.fit, pair)
             if self.graphed:
@@ -142,6 +147,8 @@ class Estimation:
             arrays |= self.cameras._asdict()
         if self.batch.lens is not None:
             arrays["lens"] = self.lens
+        elif self.assumes_cameras:
+            arrays["lens_suggested"] = self.lens_suggested
         fields = {name: torch.from_numpy(value).to(self.c.mask.device) for name, value in arrays.items()}
         estimates = Estimate.unchecked(reason=tuple(self.reasons), model=self.family.model, **fields)
         return with_gradients(estimates, self.c, self.solved, attach) if self.graphed else estimates

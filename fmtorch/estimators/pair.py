@@ -139,6 +139,13 @@ class Pair:
         uniforms(self.mixed_seed(Stream.SAMPLING), self.key, start, out)
         return out
 
+    def with_lens(self, lens: Lens) -> Pair:
+        """The same pair of images of such lenses."""
+        return Pair(
+            self.table, self.known, self.bucket, self.pixels_per_unit, self.key, self.seed, self.centre, self.sizes,
+            self.residual, self.calibration, self.images, lens,
+        )  # fmt: skip
+
     def take(self, index: Array) -> Pair:
         """The same pair with the matches of these indices."""
         return Pair(

@@ -20,7 +20,7 @@ from fmtorch.estimators.final_fits import FinalFit, Fit
 from fmtorch.estimators.focal_search import FocalSearch, PlausibleCandidates
 from fmtorch.estimators.gradients import Attached
 from fmtorch.estimators.inliers import InlierRule, StoppingRule, residuals_squared_px
-from fmtorch.estimators.lens_search import lens_fit, lenses_of, squared_px
+from fmtorch.estimators.lens_search import lens_fit, lenses_of, squared_px, suggested_lens
 from fmtorch.estimators.models.model import Refining
 from fmtorch.estimators.models.with_focals import FundamentalWithFocals
 from fmtorch.estimators.models.with_lenses import undistorted
@@ -186,6 +186,12 @@ class Ransac:
         """Search to fit of one pair."""
         if pair.lens is not None:
             return self._with_lenses(pair, pair.lens)
+        solution = self._of_pinholes(pair)
+        if self.focal is None or solution.fit is None or not pair.sizes_known:
+            return solution
+        return solution._replace(lens_suggested=suggested_lens(solution.fit, pair))
+
+    def _of_pinholes(self, pair: Pair) -> Solution:
         selection, draws = self.selected(pair)
         if not selection.valid:
             return Solution(None, draws, reason=NOT_SOLVED)
@@ -198,7 +204,7 @@ class Ransac:
         assert self.focal is not None
         lens = lenses_of(pair, self.focal)
         straight = undistorted(pair, lens)
-        solution = self.estimate(straight)
+        solution = self._of_pinholes(straight)
         if solution.fit is None or solution.inliers is None:
             return solution
         fit, cameras = solution.fit, solution.fit.cameras

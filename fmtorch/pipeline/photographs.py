@@ -199,6 +199,26 @@ def _reduction(s: Tensor) -> Tensor:
     return torch.tensor([[s[0], 0, (s[0] - 1) / 2], [0, s[1], (s[1] - 1) / 2], [0, 0, 1]], dtype=torch.float64)
 
 
+def division_lenses(
+    bent: Float[Tensor, " images"], c: Correspondences, scales: Sequence[Tensor]
+) -> tuple[Lens | None, Lens | None]:
+    """Lenses of the originals from estimated lambdas (2,), None of images that are straight or not determined.
+
+    c: a batch of one, of the reduced images, whose K have focal lengths and principal points if they are known.
+    """
+    lenses: list[Lens | None] = []
+    for value, K, size, scale in zip(bent.tolist(), (c.K0, c.K1), (c.size0, c.size1), scales, strict=True):
+        assert size is not None
+        half, (h, w) = float(size[0].double().norm()) / 2, size[0].tolist()
+        fx, fy, cx, cy = half, half, (w - 1) / 2, (h - 1) / 2
+        if K is not None:
+            (fx, _, cx), (_, fy, cy), _ = (K[0] / K[0, 2, 2]).tolist()
+        k, (sx, sy) = value * fx * fy / half**2, scale.tolist()
+        at = fx / sx, fy / sy, (cx + 0.5) / sx - 0.5, (cy + 0.5) / sy - 0.5
+        lenses.append(Lens(*at, "DIVISION", (k,)) if math.isfinite(value) and value else None)
+    return lenses[0], lenses[1]
+
+
 def undistorted_matches(c: Correspondences, lenses: Sequence[Lens | None], scales: Sequence[Tensor]) -> Correspondences:
     """Matches of two reduced photographs as pinholes of the same K would have them, in pixels of the reduced images.
     lenses: of the originals, None where nothing is distorted. A match that a pinhole does not see is masked."""

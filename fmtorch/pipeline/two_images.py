@@ -26,6 +26,7 @@ from fmtorch.pipeline.pair_geometries import pair_geometries
 from fmtorch.pipeline.photographs import GivenImage, Image, frames_to_original, given_image, to_original
 from fmtorch.pipeline.pipeline import Clock, Pipeline, load_pipeline
 from fmtorch.two_view import arguments, known_cameras
+from fmtorch.two_view.estimation import expect_lenses
 from fmtorch.two_view.pair_type import classify, compile_with, still_warning, warnings_of
 
 FLAT = ("planar", "rotation", "identical")  # pair types of which a homography explains all matches
@@ -49,7 +50,8 @@ class MatchResult:
     pair_type: one of `PAIR_TYPES`; empty where nothing could be matched. geometry: the two-view geometry for
     COLMAP, whose inliers are indices of the kept matches, twice. undistorted: where a lens distorts, the kept matches
     as pinholes would have them, which F and homography relate; points are otherwise those of the photographs.
-    photographs, lenses: as they were given, for pictures.
+    lens: (2,), lambda of both lenses as of `Estimate.lens`, where these were estimated.
+    photographs: as they were given, lenses: as they are known or were estimated; for pictures.
     """
 
     keypoints0: Float[Tensor, "n0 2"]
@@ -67,6 +69,7 @@ class MatchResult:
     R: Float[Tensor, "3 3"] | None = None
     t: Float[Tensor, " 3"] | None = None
     focals: Float[Tensor, " 2"] | None = None
+    lens: Float[Tensor, " 2"] | None = None
     pair_type: str = ""
     geometry: PairGeometry | None = None
     undistorted: Correspondences | None = None
@@ -161,6 +164,8 @@ class MatchResult:
             determined = self.ok and bool(torch.isfinite(self.R).all())
             report |= {name: value.tolist() if determined else None for name, value in (("R", self.R), ("t", self.t))}
             report["focals"] = [focal if math.isfinite(focal) else None for focal in self.focals.tolist()]
+        if self.lens is not None:
+            report["lens"] = [value if math.isfinite(value) else None for value in self.lens.tolist()]
         return report
 
     def __repr__(self) -> str:
@@ -262,6 +267,7 @@ def match(
     K0: arguments.Arrays | None = None,
     K1: arguments.Arrays | None = None,
     focal: arguments.Focal = None,
+    lens: arguments.Lens = None,
     lens0: Lens | None = None,
     lens1: Lens | None = None,
 ) -> MatchResult:
@@ -276,6 +282,8 @@ def match(
             the results are always in pixels of the originals.
         seed: of sampling.
         K0, K1, focal: what is known of the cameras, in pixels of the photographs, as of `find_fundamental`.
+        lens: how much lenses bend straight lines that nobody calibrated, as of `find_fundamental`: "shared", "unknown",
+            or lambda. What is estimated is in `lens`, F relates undistorted points, as with lens0 and lens1.
         lens0, lens1: lenses that distort, whose calibrations stand for K0 and K1. Features are those of the
             photographs; matches are undistorted before the estimator, and F relates undistorted points.
 
@@ -306,31 +314,38 @@ def match(
         raise ValueError(f"device={device}, but the pipeline was built for {pipeline.device}; leave one of them out")
     images = [photographs.given_image(image, name) for image, name in ((image0, "image0"), (image1, "image1"))]
     K0, K1 = (K if lens is None else lens.K for K, lens in ((K0, lens0), (K1, lens1)))
+    if lens is not None:
+        expect_lenses(pipeline.estimator, type(pipeline.estimator).__name__)
+    if lens is not None and (lens0 is not None or lens1 is not None):
+        raise ValueError("lens and lens0 or lens1 are given; a lens is estimated or calibrated: leave one of them out")
     cameras = arguments.camera_fields(K0, K1, focal, sizes_known=True)
     describing = functools.partial(describe, pipeline, longest_side=longest_side)
     at_once = functools.partial(mapped, share=True) if pipeline.device.type == "cpu" else map
     described0, described1 = at_once(describing, images)
-    result = relate(pipeline, described0, described1, seed, cameras, (lens0, lens1))
-    return dataclasses.replace(result, photographs=(image0, image1), lenses=(lens0, lens1))
+    result = relate(pipeline, described0, described1, seed, cameras | arguments.lens_fields(lens), (lens0, lens1))
+    return dataclasses.replace(result, photographs=(image0, image1))
 
 
 def relate(
     pipeline: Pipeline, described0: Described, described1: Described, seed: int = 0,
     cameras: Mapping[str, Tensor] = NOTHING_KNOWN, lenses: Lenses = (None, None),
 ) -> MatchResult:  # fmt: skip
-    """What `match` finds of two photographs that are described already. cameras: of `camera_fields`."""
+    """What `match` finds of two photographs that are described already.
+
+    cameras: of `camera_fields` and `lens_fields`. lenses: those that are calibrated.
+    """
     compile_with([*pipeline.pruners.values(), pipeline.estimator])
     clock = Clock(pipeline.device)
     clock("features", described0.seconds + described1.seconds)
     scales = [described0.scale, described1.scale]
     known = photographs.reduced_cameras(cameras, scales, [described0.size, described1.size])
     known = {name: value.to(pipeline.device) for name, value in known.items()}
-    result = _matched(pipeline, (described0, described1), clock)
+    result = dataclasses.replace(_matched(pipeline, (described0, described1), clock), lenses=lenses)
     if not result.reason:
         c = result.correspondences
         c = photographs.undistorted_matches(c, lenses, scales).replace(**known)
         result = _estimated(pipeline, result, c, scales, seed, clock)
-    if not any(lens is not None and lens.bends for lens in lenses):
+    if not any(lens is not None and lens.bends for lens in result.lenses):
         result = dataclasses.replace(result, undistorted=None)
     sizes = [torch.tensor([d.size], device=pipeline.device) for d in (described0, described1)]
     return _restored(result, scales, sizes)
@@ -379,19 +394,25 @@ def _estimated(
     estimator = known_cameras.KnownCameras(pipeline.estimator) if c.asks_for_cameras else pipeline.estimator
     estimate = pipeline.estimated(c, seed, estimator)
     clock("estimation")
+    lenses = matched.lenses
+    if estimate.lens is not None:
+        lenses = photographs.division_lenses(estimate.lens[0], c, scales)
+        c = photographs.undistorted_matches(c, lenses, scales).derived(lens=None, shared_lens=None)
     even, F, even_scales = photographs.evenly_reduced(c, estimate.F, scales)
     pair_type = classify(even, estimate.derived(F=F), seed=seed)
     clock("pair_type")
     index = np.arange(c.mask.shape[1]).repeat(2).reshape(-1, 2)
     (geometry,) = pair_geometries([index], even, estimate.derived(F=F), pair_type)
     inliers = estimate.inliers[0]
-    R, t, focals = (None if value is None else value[0] for value in (estimate.R, estimate.t, estimate.focals))
+    cameras = estimate.R, estimate.t, estimate.focals, estimate.lens
+    R, t, focals, lens = (None if value is None else value[0] for value in cameras)
     return dataclasses.replace(
         matched, inliers=inliers, F=estimate.F[0].to(torch.float64), reason=estimate.reason[0],
         warning=still_warning(matched.correspondences, inliers) or warnings_of(estimate, pair_type)[0],
         counts={**matched.counts, "estimation": int(inliers.sum())}, seconds=clock.seconds,
-        significance=float(cast(Tensor, estimate.significance)[0]), R=R, t=t, focals=focals,
+        significance=float(cast(Tensor, estimate.significance)[0]), R=R, t=t, focals=focals, lens=lens,
         pair_type=pair_type.names[0], geometry=photographs.geometry_to_original(geometry, *even_scales), undistorted=c,
+        lenses=lenses,
     )  # fmt: skip
 
 

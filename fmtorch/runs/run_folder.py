@@ -62,6 +62,7 @@ class PairRow:
     focal_error1: float | None = None  # not determined; None where it is given exactly, or the true one is unknown
     focal_log_ratio0: float | None = None  # log(f / f_true); None where it is not determined, too
     focal_log_ratio1: float | None = None
+    lens_suggested: float | None = None  # lambda of both lenses where matches contradict pinholes
     H: Sequence[float] | None = None  # row by row, x1 ~ H x0 in pixels, unit Frobenius norm
     corner_error: float | None = None  # px in image 1, of the corners of image 0; infinite where the pair failed
 

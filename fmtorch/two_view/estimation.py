@@ -45,7 +45,9 @@ def estimated(
         needed = f"find_{model} needs one that gives {model} matrices{option}"
         raise ValueError(f"estimator={name} gives {gives} matrices; {needed}")
     if c.lens is not None:
-        _expect_lenses(c, estimator, name)
+        expect_lenses(estimator, f"estimator={name}")
+        if c.requires_grad:
+            raise ValueError("lens is given, and its estimates have no gradients: give points, prior, noise detached")
     return estimated_by(estimator, c, seed, covariance, assume_sizes)
 
 
@@ -76,12 +78,10 @@ def _expect_gradients(c: Correspondences, estimator: Estimator, name: str) -> No
             )
 
 
-def _expect_lenses(c: Correspondences, estimator: Estimator, name: str) -> None:
-    """Raise ValueError where lenses cannot be estimated."""
+def expect_lenses(estimator: Estimator, name: str) -> None:
+    """Raise ValueError where an estimator of this name estimates no lenses."""
     if not getattr(estimator, "assumes_cameras", False):
-        raise ValueError(f"lens needs an estimator with the option focal, as fmtorch; estimator={name} has none")
-    if c.requires_grad:
-        raise ValueError("lens is given, and its estimates have no gradients: give points, prior and noise detached")
+        raise ValueError(f"lens needs an estimator with the option focal, as fmtorch; {name} has none")
 
 
 def _with_prior(c: Correspondences, estimator: Estimator) -> Correspondences:

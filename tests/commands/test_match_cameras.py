@@ -108,6 +108,35 @@ def test_a_lens_bends_points_and_not_images(pair: ImagePair, pipeline: fmtorch.P
     assert nsgd(truth, result.F[None], sizes, sizes) < 0.005 < nsgd(truth, ignored.F[None], sizes, sizes)
 
 
+def test_a_lens_that_nobody_calibrated(pair: ImagePair, pipeline: fmtorch.Pipeline) -> None:
+    """It is suggested of bent photographs, and estimated; F is then of undistorted points, and pictures straight."""
+    plain = [fmtorch.data.read_image(image) for image in (pair.image0, pair.image1)]
+    h, w = plain[0].shape[:2]
+    half = math.hypot(h, w) / 2
+    division = Lens(half, half, (w - 1) / 2, (h - 1) / 2, "SIMPLE_DIVISION", (-0.1,))
+    bent = [photographed(image, division) for image in plain]
+    given, size, truth = {"pipeline": pipeline, "longest_side": SIDE}, torch.tensor([[h, w]]), torch.from_numpy(pair.F)
+    ignored = fmtorch.match(*bent, **given)
+    result = fmtorch.match(*bent, **given, lens="shared")
+    assert "a lens bends the images (lambda about -0.1" in ignored.warning
+    assert result.warning == ""
+    assert result.lens.tolist() == pytest.approx([-0.1, -0.1], abs=0.02)
+    assert torch.equal(result.correspondences.x0, ignored.correspondences.x0)  # of the photographs
+    assert nsgd(truth[None], result.F[None], size, size) < 0.005 < nsgd(truth[None], ignored.F[None], size, size)
+    expected = undistorted_points(division, result.correspondences.x0[0][result.inliers].numpy())
+    np.testing.assert_allclose(result.undistorted.x0[0][result.inliers].numpy(), expected, atol=2)
+    assert result.report()["lens"] == result.lens.tolist()
+    calibrated = fmtorch.match(*bent, **given, lens=-0.1, K0=pair.K0, K1=pair.K1)
+    assert error(calibrated, pair) < 0.5
+    straight = fmtorch.match(*plain, **given, lens="shared")
+    assert straight.lens.tolist() == [0, 0]
+    assert straight.undistorted is None
+    with pytest.raises(ValueError, match="lens and lens0 or lens1 are given"):
+        fmtorch.match(*bent, **given, lens="shared", lens0=division)
+    with pytest.raises(ValueError, match="lens needs an estimator with the option focal"):
+        fmtorch.match(*bent, pipeline="sift_gms", lens="shared")
+
+
 def with_exif(folder: Path, name: str, **tags: int) -> Path:
     """A picture of 60 x 40 px with these tags."""
     exif = Image.Exif()

@@ -72,6 +72,7 @@ def estimate(b: int = 4, n: int = 6, seed: int = 0) -> Estimate:
         other_R=torch.rand(b, 3, 3, generator=g),
         other_t=torch.rand(b, 3, generator=g),
         contradicted=torch.rand(b, generator=g) < 0.5,
+        lens_suggested=torch.rand(b, generator=g),
         sizes=torch.rand(b, 2, 2, generator=g),
         sizes_doubtful=torch.rand(b, generator=g) < 0.5,
         lens=torch.rand(b, 2, generator=g),

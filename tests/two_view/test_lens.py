@@ -9,6 +9,7 @@ import torch
 
 import fmtorch
 from fmtorch.core.types import Estimate
+from fmtorch.estimators.models.with_lenses import inverted
 from fmtorch.metrics import nsgd
 from fmtorch.two_view.arguments import lens_fields
 from tests.reference import division
@@ -144,3 +145,28 @@ def test_gradients_are_refused() -> None:
     x0, x1, _, _ = division.photographs(1, (0, 0))
     with pytest.raises(ValueError, match="lens is given, and its estimates have no gradients"):
         found(torch.from_numpy(x0).requires_grad_(), torch.from_numpy(x1), lens="shared")
+
+
+def test_matches_that_contradict_pinholes_suggest_a_lens() -> None:
+    """In a batch as alone; nothing is suggested of photographs that are straight, nor where lenses are estimated."""
+    bent, straight = division.photographs(2, (-0.1, -0.1)), division.photographs(2, (0.0, 0.0))
+    estimate = found([bent[0], straight[0]], [bent[1], straight[1]])
+    assert estimate.lens_suggested is not None
+    assert float(estimate.lens_suggested[0]) == pytest.approx(-0.1, abs=0.02)
+    assert bool(estimate.lens_suggested[1].isnan())
+    assert "give lens='shared'" in estimate.warning[0]
+    assert estimate.warning[1] == ""
+    alone = found(bent[0], bent[1]).lens_suggested
+    assert alone is not None
+    assert torch.equal(alone, estimate.lens_suggested[:1])
+    assert found(bent[0], bent[1], lens="shared").lens_suggested is None
+
+
+def test_an_inverse_and_its_determinant() -> None:
+    A = np.random.default_rng(0).normal(size=(9, 9))
+    A, out = A @ A.T, np.empty((9, 9))
+    logarithm = inverted(A, out)
+    assert out @ A == pytest.approx(np.eye(9), abs=1e-9)
+    assert logarithm == pytest.approx(np.linalg.slogdet(A)[1], abs=1e-9)
+    assert np.isnan(inverted(np.zeros((9, 9)), out))
+    assert np.isinf(out).all()

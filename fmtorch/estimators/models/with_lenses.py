@@ -28,6 +28,7 @@ from fmtorch.estimators.models.posterior import (
     tie,
 )
 from fmtorch.estimators.pair import Pair
+from fmtorch.geometry.arithmetic import logarithm_kernel
 from fmtorch.geometry.levenberg_marquardt import MATCH, TINY, Weighted, in_rows, levenberg_marquardt, robust
 from fmtorch.geometry.matrices import assign, assign_rows
 from fmtorch.geometry.rank2_manifold import eliminate
@@ -154,6 +155,31 @@ def photograph_residuals(F: F8x1, lens: F8x1, diagonal: F8x1, points: F8x2, out:
         store(r2, 0, value)
         for i in range(min(LANES, n - first)):
             out[first + i] = r2[0, i]
+
+
+@kernel(holds_gil=True)
+def inverted(A: F8x2, out: F8x2) -> float:
+    """The inverse of A (n, n) -> out, and log |det A|; infinite and not a number where there is none."""
+    n, rows, logarithm = len(A), A.copy(), 0.0
+    for i in range(n):
+        for c in range(n):
+            out[i, c] = 1.0 if i == c else 0.0
+    for i in range(n):
+        pivot = rows[i, i]
+        if not abs(pivot) < math.inf or pivot == 0:
+            out[:] = math.inf
+            return math.nan
+        logarithm += logarithm_kernel(abs(pivot))
+        for c in range(n):
+            rows[i, c] /= pivot
+            out[i, c] /= pivot
+        for r in range(n):
+            factor = rows[r, i]
+            if r != i:
+                for c in range(n):
+                    rows[r, c] -= factor * rows[i, c]
+                    out[r, c] -= factor * out[i, c]
+    return logarithm
 
 
 @inner
