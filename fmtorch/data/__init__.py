@@ -28,11 +28,7 @@ Progress = Callable[[int, int], None]
 
 
 def load(
-    name: str,
-    split: str = "test",
-    root: str | Path | None = None,
-    progress: Progress | None = None,
-    **options: Any,
+    name: str, split: str = "test", root: str | Path | None = None, progress: Progress | None = None, **options: Any
 ) -> PairDataset:
     """The data set ``conf/dataset/<name>.yaml``: an indexable of `ImagePair`, as torch's DataLoader takes it.
 

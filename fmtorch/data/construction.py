@@ -11,23 +11,21 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 import scipy.sparse
-from numpy.typing import NDArray
 
 from fmtorch.core.files import replacing
 from fmtorch.core.settings import claim
 from fmtorch.data.cameras import line_distance
+from fmtorch.data.files import Indices, Matrix, Pixels, Singles
 from fmtorch.data.fmbench import CAMERAS, IMAGES, SUFFIXES
 from fmtorch.data.images import ImageError, read_image, to_grey
 from fmtorch.data.pairs import DepthDataset, ImageSource
-from fmtorch.data.scenes import Indices, ScenePairs, View, image_pair, incidence
+from fmtorch.data.scenes import ScenePairs, View, image_pair, incidence
 
 # How much of what one image of a pair shows the other shows too, whatever features find: by depth, or by points
-
 
 STEP = 4  # px between the pixels of which depth is asked, along rows and columns
 TOLERANCE = 0.05  # by which depths may differ, relative to the one seen, for the same surface
 
-Matrix = NDArray[np.float64]
 Place = tuple[int, int, int]
 """Number of the scene, and of its two views."""
 
@@ -150,10 +148,10 @@ def _size(image: ImageSource) -> tuple[int, int]:
 SIFT_FEATURES, RATIO, NEAR_LINE, ENOUGH = 8000, 0.8, 1.0, 20
 _AT_ONCE = 512  # keypoints that are matched together
 
-Keypoints = tuple[NDArray[np.float64], NDArray[np.float32]]
+Keypoints = tuple[Matrix, Singles]
 
 
-def keypoints(grey: NDArray[np.uint8]) -> Keypoints:
+def keypoints(grey: Pixels) -> Keypoints:
     """OpenCV's SIFT: points (n, 2) and descriptors (n, 128)."""
     detected, descriptors = cv2.SIFT.create(nfeatures=SIFT_FEATURES).detectAndCompute(grey, np.ones_like(grey))
     if not detected:
@@ -161,7 +159,7 @@ def keypoints(grey: NDArray[np.uint8]) -> Keypoints:
     return np.array([k.pt for k in detected], dtype=np.float64), descriptors.astype(np.float32)
 
 
-def ratio_matches(a: Keypoints, b: Keypoints) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def ratio_matches(a: Keypoints, b: Keypoints) -> tuple[Matrix, Matrix]:
     """Nearest neighbours from the first image to the second that pass the ratio test: points (n, 2) and (n, 2)."""
     if len(a[0]) == 0 or len(b[0]) < 2:
         return np.zeros((0, 2)), np.zeros((0, 2))
@@ -174,7 +172,7 @@ def ratio_matches(a: Keypoints, b: Keypoints) -> tuple[NDArray[np.float64], NDAr
     return a[0][good], b[0][best[good]]
 
 
-def matchable(a: Keypoints, b: Keypoints, F: NDArray[np.float64]) -> bool:
+def matchable(a: Keypoints, b: Keypoints, F: Matrix) -> bool:
     """Whether more than `ENOUGH` ratio matches lie within `NEAR_LINE` pixels of the true lines in both images.
 
     Looks at some of the first image's keypoints at a time, until there are enough.
@@ -189,7 +187,6 @@ def matchable(a: Keypoints, b: Keypoints, F: NDArray[np.float64]) -> bool:
 
 
 # Which candidates of a data set make pairs, by the paper's rule or by overlap, and FM-Bench's layout of these pairs
-
 
 BLOCK = 64  # candidates that one worker judges at a time
 MAX_DRAWN = 10_000_000  # candidates of which an order is drawn, 80 MB; with more, among so many drawn at random
@@ -252,7 +249,7 @@ class Construction:
         claim(self.folder / "pairs.json", self.identity, "pairs", "name another folder as output")
         self.work.mkdir(exist_ok=True)
 
-    def order(self) -> Sequence[int] | NDArray[np.int64]:
+    def order(self) -> Sequence[int] | Indices:
         total, rng = self.dataset.candidates, np.random.default_rng(self.seed)
         if self.count is None:
             return range(total)
@@ -361,11 +358,11 @@ def _as_it_is(source: ImageSource) -> bool:
     return source.lens is None and source.path.suffix in SUFFIXES
 
 
-def _numbers(values: NDArray[np.float64]) -> str:
+def _numbers(values: Matrix) -> str:
     return " ".join(repr(float(value)) for value in values.ravel())
 
 
-def blocks(order: Sequence[int] | NDArray[np.int64]) -> Iterator[tuple[int, list[int]]]:
+def blocks(order: Sequence[int] | Indices) -> Iterator[tuple[int, list[int]]]:
     """The blocks of an order of candidates: their numbers and candidates."""
     for begin in range(0, len(order), BLOCK):
         yield begin // BLOCK, [int(rank) for rank in order[begin : begin + BLOCK]]

@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from fmtorch.core.files import replacing
 from fmtorch.data.cameras import MODELS, Lens
+from fmtorch.data.files import Array, Indices, Mask, Matrix, Singles
 from fmtorch.geometry.cameras import MIN_FOCAL, USUAL_FOCAL, calibration_problems
 from fmtorch.io.match_store import ORIGIN, PairGeometry, StoredImage, StoredPair, two_view_geometry
 
@@ -48,7 +48,7 @@ def write_database(
     pycolmap = imported()
     cameras: dict[object, int] = {}
     ids: dict[str, int] = {}
-    known: dict[str, NDArray[np.float64] | None] = {}
+    known: dict[str, Matrix | None] = {}
     path.unlink(missing_ok=True)
     with pycolmap.Database.open(path) as database:
         for image in images:
@@ -96,9 +96,7 @@ def _parameters(image: StoredImage) -> tuple[str, list[float], bool]:
     return "SIMPLE_RADIAL", [focal, w / 2, h / 2, 0.0], image.focal is not None
 
 
-def _geometry(
-    pair: StoredPair, matches: NDArray[np.int32], known: dict[str, NDArray[np.float64] | None]
-) -> PairGeometry:
+def _geometry(pair: StoredPair, matches: Array, known: dict[str, Matrix | None]) -> PairGeometry:
     """The geometry of a pair, whose inliers are among the matches (m, 2)."""
     written = set(map(tuple, matches.tolist()))
     if pair.geometry is not None:
@@ -114,7 +112,7 @@ def _geometry(
     return PairGeometry("calibrated", inliers, pair.F, K1.T @ pair.F @ K0)
 
 
-def _one_to_one(pair: StoredPair) -> NDArray[np.bool_]:
+def _one_to_one(pair: StoredPair) -> Mask:
     """Matches that share no keypoint with a better one: COLMAP's tracks allow one each; inliers come first."""
     keep = np.zeros(len(pair.matches), bool)
     taken0: set[int] = set()
@@ -134,10 +132,7 @@ def _one_to_one(pair: StoredPair) -> NDArray[np.bool_]:
 
 # Images of a COLMAP database: keypoints as of an ideal pinhole, and what is known of cameras
 
-
 EXIF_DEVIATION = 0.05  # relative, of focal lengths by EXIF (docs/cameras.md)
-
-Array = NDArray[np.float64]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -155,15 +150,15 @@ class DatabaseImage:
     name: str
     camera_id: int
     size: tuple[int, int] | None
-    K: Array | None
+    K: Matrix | None
     deviation: float
-    points: NDArray[np.float32]
-    pinhole: NDArray[np.float32]
+    points: Singles
+    pinhole: Singles
     problem: str = ""
     warning: str = ""
 
 
-def database_image(name: str, camera: Any, keypoints: NDArray[np.float32]) -> DatabaseImage:
+def database_image(name: str, camera: Any, keypoints: Singles) -> DatabaseImage:
     """The image of a `pycolmap.Camera` and its keypoints (n, 2), (n, 4) or (n, 6); raises ValueError for others."""
     size, columns = (int(camera.height), int(camera.width)), keypoints.shape[1]
     if columns not in (2, 4, 6):
@@ -190,7 +185,7 @@ def database_image(name: str, camera: Any, keypoints: NDArray[np.float32]) -> Da
     return DatabaseImage(name, camera.camera_id, size, K, deviation, points, pinhole, problem, warning)
 
 
-def _deviation(camera: Any, lens: Lens, K: Array) -> float:
+def _deviation(camera: Any, lens: Lens, K: Matrix) -> float:
     """Relative, of the focal length: that of EXIF where nothing else of the camera is known, else of a calibration."""
     if not camera.has_prior_focal_length:
         return math.inf
@@ -199,14 +194,13 @@ def _deviation(camera: Any, lens: Lens, K: Array) -> float:
     return EXIF_DEVIATION if usual else 0.0
 
 
-def _undistorted(camera: Any, K: Array, points: NDArray[Any]) -> Array:
+def _undistorted(camera: Any, K: Matrix, points: Array) -> Matrix:
     """Pixels (n, 2) of a pinhole for COLMAP's pixels (n, 2) of the photograph."""
     rays = np.asarray(camera.cam_from_img(np.ascontiguousarray(points, np.float64)), np.float64).reshape(-1, 2)
     return np.asarray(rays @ K[:2, :2].T + K[:2, 2])
 
 
 # A COLMAP database of anyone's keypoints and matches: read pair by pair, and given two-view geometries
-
 
 MAGIC = b"SQLite format 3\0"
 TABLES = {"cameras", "images", "keypoints", "matches", "two_view_geometries"}
@@ -260,7 +254,7 @@ class MatchDatabase:
     def has_geometry(self, pair: Ids) -> bool:
         return bool(self._database.exists_two_view_geometry(*pair))
 
-    def matches(self, pair: Ids) -> NDArray[np.int64]:
+    def matches(self, pair: Ids) -> Indices:
         """The matches of a pair, keypoints (n, 2) of its images.
 
         Raises ValueError where there are no such keypoints.

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from fmtorch.data import DataError, FMBenchPairs, GivenMatches, ImagePair, ImageSource, PairDataset, stored_size
-from fmtorch.data.files import given_root
+from fmtorch.data.files import Matrix, given_root
 from fmtorch.data.pairs import HeldPairs
 from fmtorch.io import h5, predictions
-from fmtorch.io.predictions import Array, Size
+from fmtorch.io.predictions import Size
 
 MATCHES, RATIOS, CALIBRATIONS, ROTATIONS, TRANSLATIONS, TRUTH = (
     f"{name}.h5" for name in ("matches", "match_conf", "K1_K2", "R", "T", "Fgt")
@@ -75,7 +75,7 @@ class _Cameras:
         self.folder = folder
         self._files, self._open = files, dict[str, Any]()
         self._images: dict[str, ImageSource] = {}
-        self.by_image: dict[str, tuple[Array, Array]] = {}
+        self.by_image: dict[str, tuple[Matrix, Matrix]] = {}
         self.problems: dict[str, str] = {}
         rotations, translations = folder / ROTATIONS, folder / TRANSLATIONS
         if rotations.exists() and translations.exists():
@@ -105,13 +105,13 @@ class _Cameras:
         lack = f"names no two images of {ROTATIONS} and {TRANSLATIONS}" if self._known else "does not name two images"
         raise DataError(f"{self.folder / MATCHES}: {key!r} {lack}")
 
-    def calibration(self, key: str) -> tuple[Array, Array]:
+    def calibration(self, key: str) -> tuple[Matrix, Matrix]:
         K = h5.reshaped(self._file(CALIBRATIONS), key, 2, 3, 3)
         if not np.linalg.det(K).all():
             raise DataError(f"{self.folder / CALIBRATIONS}: {key!r}: a calibration matrix is singular")
         return K[0], K[1]
 
-    def truth(self, key: str) -> Array:
+    def truth(self, key: str) -> Matrix:
         if not (self.folder / TRUTH).exists():
             raise DataError(
                 f"{self.folder}: neither {ROTATIONS} and {TRANSLATIONS} nor {TRUTH}: the test split has no ground truth"
@@ -125,7 +125,7 @@ class _Cameras:
         return self._open[name]
 
 
-def _size(source: ImageSource, K: Array, images: Path | None) -> Size:
+def _size(source: ImageSource, K: Matrix, images: Path | None) -> Size:
     """(h, w) of an image, by its principal point where there is no file. Raises DataError where the two disagree."""
     by_centre, size = predictions.size_by_centre(K), stored_size(source.path) if images else None
     if size is not None:
@@ -163,7 +163,6 @@ def _pair(root: Path, folder: Path, key: str, cameras: _Cameras, images: Path | 
 # PoseBench's files of relative poses: a group for each pair, with ``x1``, ``x2`` (n, 2), ``camera1``, ``camera2``
 # (``model``, ``width``, ``height``, ``params``), ``R`` (3, 3) and ``t`` (3,), X2 = R X1 + t
 
-
 FOCAL_LENGTHS = {"SIMPLE_PINHOLE": 1, "PINHOLE": 2, "SIMPLE_RADIAL": 1, "RADIAL": 1, "OPENCV": 2, "FULL_OPENCV": 2}
 """Camera models that are pinholes where their distortion is zero, and how many focal lengths begin their parameters."""
 
@@ -174,7 +173,7 @@ class PoseBenchMatches:
 
     path: Path
     key: str
-    K: tuple[Array, Array]
+    K: tuple[Matrix, Matrix]
     sizes: tuple[Size | None, Size | None]
 
     def __call__(self) -> GivenMatches:
@@ -212,7 +211,7 @@ def _posebench_pair(file: Any, path: Path, family: str, key: str, images: Path |
     return dataclasses.replace(pair, matches=PoseBenchMatches(path, key, (K0, K1), (size0, size1)))
 
 
-def _camera(file: Any, path: Path, key: str, source: ImageSource) -> tuple[Array, Size | None]:
+def _camera(file: Any, path: Path, key: str, source: ImageSource) -> tuple[Matrix, Size | None]:
     model = h5.text(file, f"{key}/model")
     parameters = h5.numbers(file, f"{key}/params").reshape(-1)
     count = FOCAL_LENGTHS.get(model)
@@ -248,7 +247,7 @@ class OANetMatches:
 
     path: Path
     key: str
-    K: tuple[Array, Array]
+    K: tuple[Matrix, Matrix]
     sizes: tuple[Size, Size]
 
     def __call__(self) -> GivenMatches:
@@ -261,7 +260,7 @@ class OANetMatches:
             mutual=None if mutuals is None else mutuals.astype(bool),
         )  # fmt: skip
 
-    def _side(self, file: Any, name: str, count: int) -> Array | None:
+    def _side(self, file: Any, name: str, count: int) -> Matrix | None:
         if not h5.holds(file, name):
             return None
         values = h5.numbers(file, f"{name}/{self.key}").reshape(-1)
@@ -296,7 +295,7 @@ def _oanet_pair(file: Any, path: Path, family: str, key: str, images: Path | Non
     return dataclasses.replace(pair, matches=OANetMatches(path, key, K, sizes))
 
 
-def _calibration(file: Any, key: str, which: int) -> Array:
+def _calibration(file: Any, key: str, which: int) -> Matrix:
     cx, cy = (h5.reshaped(file, f"{name}{which}s/{key}", 1)[0] for name in ("cx", "cy"))
     fx, fy = h5.reshaped(file, f"f{which}s/{key}", 2)
     if fx == 0 or fy == 0:
@@ -305,7 +304,6 @@ def _calibration(file: Any, key: str, which: int) -> Array:
 
 
 # The data set `h5`: pairs whose matches somebody else computed, in the layouts that the field exchanges
-
 
 CORNER = 0.5  # where glue-factory puts the centre of the first pixel
 WITH_GEOMETRY: Mapping[str, Callable[[Path, Path | None], Iterator[ImagePair]]] = {

@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from fmtorch.core.checks import as_tensor
 from fmtorch.core.types import Estimate, PoseEstimate
+from fmtorch.data.files import Indices
 from fmtorch.geometry.cameras import cross_matrix
 from fmtorch.geometry.epipolar import unit_frobenius
 from fmtorch.io.colmap import imported
@@ -224,7 +224,7 @@ def _estimate(value: Any, model: str, inliers: Tensor, pose: Any, reason: str) -
     )  # fmt: skip
 
 
-def _same(count: int) -> NDArray[np.int64]:
+def _same(count: int) -> Indices:
     """Matches (count, 2) of keypoint i in both images."""
     return np.arange(count).repeat(2).reshape(-1, 2)
 

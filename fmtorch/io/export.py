@@ -93,7 +93,6 @@ def _by_keypoint(pair: StoredPair, count: int) -> Iterator[tuple[str, np.ndarray
 
 # The view graph of a folder's images: which pairs were matched, and by how much they support one another
 
-
 GRAPH_JSON, GRAPH_CSV = "graph.json", "graph.csv"
 
 

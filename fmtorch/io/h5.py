@@ -9,9 +9,8 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fmtorch.data.files import DataError
+from fmtorch.data.files import Array, DataError, Matrix
 
 HASHED_WHOLE = 1 << 30  # bytes up to which a file is hashed as a whole
 _BLOCKS, _BLOCK = 4096, 1 << 16  # of larger files: how many blocks of how many bytes
@@ -74,7 +73,7 @@ def holds(file: Any, key: str) -> bool:
         raise DataError(f"{_where(file, key)} cannot be read ({_first_line(error)})") from error
 
 
-def array(file: Any, key: str, *shape: int | None) -> NDArray[Any]:
+def array(file: Any, key: str, *shape: int | None) -> Array:
     """The array under a key, of this shape; None stands for any length, no shape for any.
 
     Raises DataError, naming file and key, where it is missing, damaged or of another shape.
@@ -101,7 +100,7 @@ def array(file: Any, key: str, *shape: int | None) -> NDArray[Any]:
     return values
 
 
-def _plain_array(file: Any, key: str) -> NDArray[Any] | None:
+def _plain_array(file: Any, key: str) -> Array | None:
     """The numbers under a key by HDF5's own calls, in a third of h5py's time; None where it is anything else."""
     h5py = imported()
     try:
@@ -115,7 +114,7 @@ def _plain_array(file: Any, key: str) -> NDArray[Any] | None:
     return values
 
 
-def numbers(file: Any, key: str, *shape: int | None) -> NDArray[np.float64]:
+def numbers(file: Any, key: str, *shape: int | None) -> Matrix:
     """`array` as float64. Raises DataError where it holds no real numbers."""
     values = array(file, key, *shape)
     if values.dtype.kind not in "fiub":
@@ -123,7 +122,7 @@ def numbers(file: Any, key: str, *shape: int | None) -> NDArray[np.float64]:
     return values.astype(np.float64)
 
 
-def reshaped(file: Any, key: str, *shape: int) -> NDArray[np.float64]:
+def reshaped(file: Any, key: str, *shape: int) -> Matrix:
     """`numbers` of any shape that hold as many as this one, finite. Raises DataError where they do not."""
     values = numbers(file, key)
     if values.size != math.prod(shape):

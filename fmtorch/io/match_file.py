@@ -8,10 +8,9 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fmtorch.core.files import replacing
-from fmtorch.data.files import DataError
+from fmtorch.data.files import Array, DataError, Indices, Matrix
 from fmtorch.io import h5
 from fmtorch.io.colmap import DatabaseImage
 from fmtorch.io.match_store import MATRICES, PairGeometry
@@ -75,7 +74,7 @@ class HlocMatches(_OpenFiles):
         with h5.opened(self._output) as written:
             return len(self._keys) if all(h5.holds(written, key) for key in self._keys.values()) else 0
 
-    def matches(self, pair: Names) -> NDArray[np.int64]:
+    def matches(self, pair: Names) -> Indices:
         """The matches of a pair, keypoints (n, 2). Raises DataError where there are no such keypoints."""
         second = self._second(pair)
         counts = [len(self.image(name).points) for name in pair]
@@ -107,13 +106,13 @@ class HlocMatches(_OpenFiles):
             first, second = next((both for both in ends if self._stored.keys() >= set(both)), (first, second))
         return self._stored.get(first, first), self._stored.get(second, second)
 
-    def _second(self, pair: Names) -> NDArray[np.int64]:
+    def _second(self, pair: Names) -> Indices:
         values = h5.array(self._matches, f"{self._keys[pair]}/matches0", None)
         if values.dtype.kind not in "iu":
             raise DataError(f"matches0 is of {values.dtype}; it must hold whole numbers")
         return values.astype(np.int64)
 
-    def _scores(self, pair: Names) -> NDArray[np.float64] | None:
+    def _scores(self, pair: Names) -> Matrix | None:
         key = f"{self._keys[pair]}/matching_scores0"
         return h5.numbers(self._matches, key, None) if h5.holds(self._matches, key) else None
 
@@ -131,7 +130,6 @@ def write_geometry(group: Any, geometry: PairGeometry) -> None:
 
 # Matches alone: x0, x1 of one pair or of many in an npz or HDF5 file, and their geometries in another
 
-
 NPZ = ".npz"
 SUFFIXES = (NPZ, *h5.SUFFIXES)
 
@@ -142,7 +140,7 @@ class ArrayFile(NamedTuple):
     """The keys of a file's arrays, such as ``a/x0``, and what reads one, or raises DataError."""
 
     keys: list[str]
-    read: Callable[[str], NDArray[Any]]
+    read: Callable[[str], Array]
 
 
 class MatchFile(_OpenFiles):
@@ -177,7 +175,7 @@ class MatchFile(_OpenFiles):
             keys = set(written.keys)
         return len(self._pairs) if all(f"{pair}inliers" in keys for pair in self._pairs) else 0
 
-    def matches(self, pair: Ids) -> NDArray[np.int64]:
+    def matches(self, pair: Ids) -> Indices:
         """Point i with point i. Raises DataError where x0 and x1 have different lengths."""
         counts = [len(self.image(side).points) for side in pair]
         if counts[0] != counts[1]:
@@ -190,7 +188,7 @@ class MatchFile(_OpenFiles):
             entries = (self._entries(*pair) for pair in geometries)
             (_write_npz if self._output.suffix == NPZ else _write_h5)(temporary, entries)
 
-    def _entries(self, ids: Ids, geometry: PairGeometry) -> dict[str, NDArray[Any]]:
+    def _entries(self, ids: Ids, geometry: PairGeometry) -> dict[str, Array]:
         pair = ids[0].removesuffix("x0")
         inliers = np.zeros(len(self.image(ids[0]).points), bool)
         inliers[geometry.inliers[:, 0]] = True
@@ -213,7 +211,7 @@ class MatchFile(_OpenFiles):
         deviation = np.inf if K is None else 0.0
         return DatabaseImage(image_id, i, known, K, deviation, points, points)
 
-    def _numbers(self, key: str, shape: tuple[int | None, ...]) -> NDArray[np.float64]:
+    def _numbers(self, key: str, shape: tuple[int | None, ...]) -> Matrix:
         values = self._file.read(key)
         if values.dtype.kind not in "fiu":
             raise DataError(f"{key} is of {values.dtype}; it must hold real numbers")
@@ -243,7 +241,7 @@ def _arrays(path: Path) -> Iterator[ArrayFile]:
     if not isinstance(npz, np.lib.npyio.NpzFile):
         raise DataError(f"{path}: is a single array; write x0 and x1 by numpy.savez")
 
-    def read(key: str) -> NDArray[Any]:
+    def read(key: str) -> Array:
         try:
             return np.asarray(npz[key])
         except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
@@ -253,7 +251,7 @@ def _arrays(path: Path) -> Iterator[ArrayFile]:
         yield ArrayFile(list(npz.files), read)
 
 
-def _write_npz(path: Path, pairs: Iterable[Mapping[str, NDArray[Any]]]) -> None:
+def _write_npz(path: Path, pairs: Iterable[Mapping[str, Array]]) -> None:
     """As `numpy.savez` writes it, with one pair in memory."""
     with zipfile.ZipFile(path, "w") as archive:
         for entries in pairs:
@@ -262,7 +260,7 @@ def _write_npz(path: Path, pairs: Iterable[Mapping[str, NDArray[Any]]]) -> None:
                     np.lib.format.write_array(file, np.asarray(value), allow_pickle=False)
 
 
-def _write_h5(path: Path, pairs: Iterable[Mapping[str, NDArray[Any]]]) -> None:
+def _write_h5(path: Path, pairs: Iterable[Mapping[str, Array]]) -> None:
     """`inliers` as a data set of each pair's group, the others as its attributes."""
     h5py = h5.imported()
     with h5py.File(path, "w") as file:

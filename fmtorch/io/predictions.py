@@ -7,22 +7,21 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from fmtorch.core.types import Correspondences
 from fmtorch.data import DataError, GivenMatches, ImagePair, ImageSource, PairDataset, stored_size
+from fmtorch.data.files import Indices, Mask, Matrix
 from fmtorch.geometry.cameras import fundamental_from_projections
 from fmtorch.io import h5
 
-Array = NDArray[np.float64]
 Size = tuple[int, int]  # (h, w)
 MAX_OFF_CENTRE = 0.1  # of a principal point, in units of the side: those of reduced images are farther off
 _ZERO = np.zeros((3, 3))  # where there is no F
 
 
 def given(
-    x0: Array, x1: Array, sizes: tuple[Size, Size], features: tuple[int, int], *, ratio: Array | None = None,
-    score: Array | None = None, mutual: NDArray[np.bool_] | None = None,
+    x0: Matrix, x1: Matrix, sizes: tuple[Size, Size], features: tuple[int, int], *, ratio: Matrix | None = None,
+    score: Matrix | None = None, mutual: Mask | None = None,
 ) -> GivenMatches:  # fmt: skip
     """Matches of one pair, (n, 2) in pixels each; those that are not finite do not count.
 
@@ -41,21 +40,21 @@ def given(
     )  # fmt: skip
 
 
-def _figure(values: Array | None) -> torch.Tensor | None:
+def _figure(values: Matrix | None) -> torch.Tensor | None:
     return None if values is None else torch.from_numpy(values.astype(np.float32))[None]
 
 
 def calibrated(
-    identity: str, family: str, scene: str, images: tuple[ImageSource, ImageSource], K: tuple[Array, Array],
-    R: Array, t: Array,
+    identity: str, family: str, scene: str, images: tuple[ImageSource, ImageSource], K: tuple[Matrix, Matrix],
+    R: Matrix, t: Matrix,
 ) -> ImagePair:  # fmt: skip
     """A pair of cameras with X1 = R X0 + t, and the F of these; a problem where they define none."""
     return with_fundamentals([posed(identity, family, scene, images, K, R, t)])[0]
 
 
 def posed(
-    identity: str, family: str, scene: str, images: tuple[ImageSource, ImageSource], K: tuple[Array, Array],
-    R: Array, t: Array, matches: Callable[[], GivenMatches] | None = None,
+    identity: str, family: str, scene: str, images: tuple[ImageSource, ImageSource], K: tuple[Matrix, Matrix],
+    R: Matrix, t: Matrix, matches: Callable[[], GivenMatches] | None = None,
 ) -> ImagePair:  # fmt: skip
     """The same, of which `with_fundamentals` finds F or the problem."""
     return ImagePair(identity, family, scene, *images, _ZERO, *K, R, t, None, matches)
@@ -97,7 +96,7 @@ def image(family: str, scene: str, name: str, folder: Path | None) -> ImageSourc
     return ImageSource(f"{family}/{scene}/{name}", path)
 
 
-def expect_size(source: ImageSource, size: Size, K: Array) -> None:
+def expect_size(source: ImageSource, size: Size, K: Matrix) -> None:
     """Raises DataError where an image's size (h, w) contradicts its camera: a copy that was reduced or cropped."""
     h, w = size
     if max(abs(K[0, 2] / w - 0.5), abs(K[1, 2] / h - 0.5)) > MAX_OFF_CENTRE:
@@ -107,14 +106,14 @@ def expect_size(source: ImageSource, size: Size, K: Array) -> None:
         )
 
 
-def size_by_points(K: Array, x: Array) -> Size:
+def size_by_points(K: Matrix, x: Matrix) -> Size:
     """(h, w) of an image of unknown size: its principal point is the centre, and it holds all of the points (n, 2)."""
     bound = x[np.isfinite(x).all(-1)].max(0, initial=0.0)
     width, height = (max(2 * float(c) + 1, np.ceil(b) + 1) for c, b in zip(K[:2, 2], bound, strict=True))
     return round(height), round(width)
 
 
-def size_by_centre(K: Array) -> Size:
+def size_by_centre(K: Matrix) -> Size:
     """(h, w) of an image whose principal point is its centre: the best guess where nothing else tells it."""
     width, height = 2 * K[0, 2] + 1, 2 * K[1, 2] + 1
     if not (np.isfinite(width) and np.isfinite(height) and width >= 2 and height >= 2):
@@ -123,7 +122,6 @@ def size_by_centre(K: Array) -> Size:
 
 
 # Which stored image or pair is which of a data set: others name images by their path, or by its end
-
 
 DEPTH = 4  # parts of a path that a name may hold
 
@@ -170,7 +168,6 @@ def _keys(name0: str, name1: str) -> Iterator[str]:
 
 
 # Predictions for the pairs of a data set: hloc's features and matches, glue-factory's and vismatch's predictions
-
 
 NO_MATCH = -1
 
@@ -236,14 +233,14 @@ class PairPrediction:
         x0, x1 = (x[k] - self.origin for k in order)
         return given(x0, x1, (sizes[0], sizes[1]), (counts[order[0]], counts[order[1]]), score=score)
 
-    def _indexed(self, group: Any) -> tuple[list[Array], list[int], Array | None]:
+    def _indexed(self, group: Any) -> tuple[list[Matrix], list[int], Matrix | None]:
         points = [h5.numbers(group, f"keypoints{k}", None, 2) for k in (0, 1)]
         chosen, scores = _read_indices(group, self.path, "")
         counts = [len(p) for p in points]
         i, j = _indices(chosen, counts, f"{self.path}: {self.key + '/matches0'!r}")
         return [points[0][i], points[1][j]], counts, None if scores is None else scores[i]
 
-    def _matched(self, group: Any) -> tuple[list[Array], list[int], Array | None]:
+    def _matched(self, group: Any) -> tuple[list[Matrix], list[int], Matrix | None]:
         x = [h5.numbers(group, f"matched_kpts{k}", None, 2) for k in (0, 1)]
         if len(x[0]) != len(x[1]):
             raise DataError(
@@ -313,7 +310,7 @@ def _expect_distinct(names: dict[str, str | None], path: Path) -> None:
             )
 
 
-def _read_indices(file: Any, path: Path, key: str) -> tuple[NDArray[np.int64], Array | None]:
+def _read_indices(file: Any, path: Path, key: str) -> tuple[Indices, Matrix | None]:
     prefix = f"{key}/" if key else ""
     chosen = h5.array(file, f"{prefix}matches0", None)
     if chosen.dtype.kind not in "iu":
@@ -324,7 +321,7 @@ def _read_indices(file: Any, path: Path, key: str) -> tuple[NDArray[np.int64], A
     return chosen.astype(np.int64), scores
 
 
-def _indices(chosen: NDArray[np.int64], counts: list[int], where: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _indices(chosen: Indices, counts: list[int], where: str) -> tuple[Indices, Indices]:
     """The matched keypoints of both images. Raises DataError where the indices cannot be those of the keypoints."""
     if len(chosen) != counts[0]:
         raise DataError(f"{where} has {len(chosen)} entries, but the first image has {counts[0]} keypoints")
@@ -336,7 +333,7 @@ def _indices(chosen: NDArray[np.int64], counts: list[int], where: str) -> tuple[
     return i, chosen[i]
 
 
-def _keypoints(file: Any, path: Path, name: str) -> Array:
+def _keypoints(file: Any, path: Path, name: str) -> Matrix:
     points = h5.numbers(file, f"{name}/keypoints", None, None)
     if points.shape[1] < 2:
         raise DataError(f"{path}: {name + '/keypoints'!r} has shape {points.shape}; it must be (n, 2) or wider")

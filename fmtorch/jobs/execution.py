@@ -82,7 +82,6 @@ def shard_of(text: str | None) -> Shard | None:
 
 # How many threads a stage, a worker or a loop over pairs computes with
 
-
 R = TypeVar("R")
 
 _held: ContextVar[int] = ContextVar("_held", default=1)

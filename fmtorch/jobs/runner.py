@@ -222,7 +222,6 @@ class _Cluster:
 
 # Many tasks by a pool of workers: results as they come, and the tasks of workers that died done again
 
-
 T = TypeVar("T")
 Task = TypeVar("Task")
 MAX_DEATHS = 3  # of workers that a task has to itself

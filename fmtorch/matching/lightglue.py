@@ -27,11 +27,7 @@ class LightGlue:
     """
 
     def __init__(
-        self,
-        features: str = "aliked",
-        threshold: float = 0.1,
-        device: str = "auto",
-        network: nn.Module | None = None,
+        self, features: str = "aliked", threshold: float = 0.1, device: str = "auto", network: nn.Module | None = None
     ) -> None:
         if features not in FEATURES:
             raise ValueError(f"no weights of LightGlue for {features!r}; there are: {', '.join(FEATURES)}")

@@ -21,7 +21,6 @@ from fmtorch.jobs.execution import one_thread
 
 # Two nearest neighbours, compiled: products of 8-bit integers leave few candidates, whose distances are exact
 
-
 GROUP = 32  # columns that are passed over together where none can be a neighbour
 FAR = 1 << 30  # squared 8-bit distance of a column of padding; those of others are less
 _MAX_INT32 = 2**31 - 1

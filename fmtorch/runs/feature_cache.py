@@ -136,7 +136,6 @@ def _listed(paths: Iterator[Path]) -> Iterator[tuple[Path, os.stat_result]]:
 
 # The feature cache: what an extractor finds in an image is kept under the image's and the extractor's digests
 
-
 OFF = ("off", "none", "")
 
 

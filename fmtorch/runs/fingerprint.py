@@ -164,7 +164,6 @@ def digest(data: Any) -> str:
 
 # What defines the results of a feature extractor, as plain values: its options, learned files, code, libraries
 
-
 LIBRARIES = ("numpy", "torch", "kornia", "onnxruntime")  # and OpenCV, which has several names as a package
 VARIANTS = {"onnxruntime": ("onnxruntime-gpu", "onnxruntime-directml")}  # other packages of the same library
 

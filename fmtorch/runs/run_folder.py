@@ -133,7 +133,6 @@ def _plain(value: object) -> object:
 
 # The parts of a run's table: files that are whole or absent, merged as they grow in number
 
-
 MERGED = 16  # parts of one level that become one of the next
 MAX_LEVEL = 3  # 16^3 batches to a part at most: merging needs the memory of one
 
@@ -211,7 +210,6 @@ def content_digest(data: bytes) -> str:
 
 
 # The run folder: one evaluation's identity, its pairs' results as they come, its summary
-
 
 FORMAT = 1  # of the folder; to be raised when the schema changes, or what the identity tells
 _LISTINGS = 20  # at most, until parts are those that were listed

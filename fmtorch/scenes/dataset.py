@@ -237,7 +237,6 @@ def read(folder: Path) -> tuple[list[tuple[Path, Camera]], list[tuple[int, int]]
 
 # The embedded data sets: `RenderedPairs`, drawn on first use from known cameras, and `StereoPair`, a real pair
 
-
 _SCENES = 2  # that each thread keeps, some 100 MB each: pairs of one scene follow one another
 _PHOTOGRAPHS = 48  # whose visible pieces each thread keeps, some 2 MB each
 
@@ -279,7 +278,6 @@ _recent = _Recent()
 
 
 # `RenderedPairs`: the embedded data set, drawn on first use from known cameras
-
 
 class RenderedPairs(PairDataset):
     """Image pairs of textured 3-D scenes with exact ground truth, in four families after the paper's four sets.

@@ -186,7 +186,6 @@ def orbit_scene(rng: Rng, split: str, shots: int, scale: Real) -> DrawnScene:
 
 # The collection family, after CPC: a landmark photographed by many people; other cameras, zooms, light and weather
 
-
 SIZES = ((600, 800), (533, 800), (450, 800), (576, 768), (683, 1024), (480, 640))
 LIGHTS = 4  # times of day
 

@@ -137,7 +137,6 @@ def material(split: str, kind: str) -> Pixels | None:
 
 # What a scene is made of: textured parallelograms and triangles, and the shapes built from them
 
-
 Vector = NDArray[np.float64]
 
 

@@ -133,7 +133,6 @@ def driving_scene(rng: Rng, split: str, shots: int, scale: Real) -> DrawnScene:
 
 # The indoor family, after TUM RGB-D: hand-held video of a room; short baselines, bare walls, motion blur, noise
 
-
 SIZE = (480, 640)
 FOCAL = 525.0  # the depth sensor's colour camera
 RATE = 30.0  # frames a second
