@@ -7,12 +7,11 @@ from typing import Annotated
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
 from numpy.typing import NDArray
-from torch import Tensor
 
 from fmtorch.core.options import Within
 from fmtorch.core.types import Features
+from fmtorch.features.patches import Image
 from fmtorch.features.sift import SIFT, as_grey, strongest
 
 ROTATION_STEP = 72.0  # degrees, divided by the tilt; section 5.2 of the paper
@@ -33,7 +32,7 @@ class ASIFT(SIFT):
     max_features: Annotated[int, Within(1)] = 30000
     tilts: int = 6
 
-    def __call__(self, image: NDArray[np.uint8]) -> Features:
+    def __call__(self, image: Image) -> Features:
         """The features of a grey (H, W) or RGB (H, W, 3) uint8 image; none, with N = 0, where nothing is found.
 
         lafs: the frames of the views in the image, full affine. scores, descriptors: as found in the views. Frames that
@@ -47,12 +46,8 @@ class ASIFT(SIFT):
             parts.append(_mapped_back(super().__call__(view), to_view, grey.shape))
         scores = torch.cat([f.scores for f in parts])
         kept = torch.from_numpy(strongest(scores.numpy(), self.max_features))
-        return Features(
-            lafs=torch.cat([f.lafs for f in parts])[kept],
-            scores=scores[kept],
-            descriptors=torch.cat([f.descriptors for f in parts])[kept],
-            image_size=parts[0].image_size,
-        )
+        lafs, descriptors = (torch.cat([getattr(f, name) for f in parts])[kept] for name in ("lafs", "descriptors"))
+        return Features(lafs, scores[kept], descriptors, parts[0].image_size)
 
 
 def simulated_views(tilts: int) -> list[tuple[float, float]]:
@@ -66,7 +61,7 @@ def simulated_views(tilts: int) -> list[tuple[float, float]]:
     return views
 
 
-def simulate_view(grey: NDArray[np.uint8], tilt: float, angle: float) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+def simulate_view(grey: Image, tilt: float, angle: float) -> tuple[Image, NDArray[np.float64]]:
     """The view of a grey image rotated by `angle` degrees and reduced `tilt` times along x, and the map to it (2, 3).
 
     The border of the image is continued where the view shows more. Blurred before it is reduced.
@@ -92,16 +87,9 @@ def _mapped_back(features: Features, to_view: NDArray[np.float64], shape: tuple[
     lafs = features.lafs.double()
     centre = (lafs[..., 2] - torch.from_numpy(to_view[:, 2])) @ to_image.T
     half_side = torch.linalg.vector_norm(lafs[..., 0], dim=-1)
-    kept = _inside(centre, half_side, to_image, shape)
+    # A circle of the view reaches |row of the map| times its radius in the image.
+    reach = half_side[:, None] * torch.linalg.vector_norm(to_image, dim=1)
+    far = torch.tensor([shape[1] - 1, shape[0] - 1], dtype=centre.dtype)
+    kept = ((centre >= reach) & (centre <= far - reach)).all(-1)
     mapped = torch.cat([to_image @ lafs[..., :2], centre[..., None]], -1)
     return features.replace(lafs=mapped.float())[kept]
-
-
-def _inside(
-    centre: Float[Tensor, "n 2"], radius: Float[Tensor, " n"], to_image: Float[Tensor, "2 2"], shape: tuple[int, ...]
-) -> Bool[Tensor, " n"]:
-    """Whether a circle of the view, mapped to the image, stays in it: it reaches |row of the map| times its radius."""
-    reach = radius[:, None] * torch.linalg.vector_norm(to_image, dim=1)
-    far = torch.tensor([shape[1] - 1, shape[0] - 1], dtype=centre.dtype)
-    inside: Tensor = ((centre >= reach) & (centre <= far - reach)).all(-1)
-    return inside

@@ -178,13 +178,10 @@ class NetworkShape:
         first, second, centre = upright.unbind(-1)
         columns = [first * shape[:, :1, k] + second * shape[:, 1:, k] for k in (0, 1)]
         shaped = make_upright(torch.stack([*columns, centre], -1))
-        shaped = _rescaled(shaped, frame_scale(upright) / frame_scale(shaped))
+        factor = frame_scale(upright) / frame_scale(shaped)
+        shaped = torch.cat([shaped[..., :2] * factor[:, None, None], shaped[..., 2:]], -1)
         valid = torch.isfinite(shaped).all(2).all(1) & (_elongation(shaped) <= LONGEST)
         return torch.where(valid[:, None, None], shaped, upright)
-
-
-def _rescaled(lafs: Tensor, factor: Tensor) -> Tensor:
-    return torch.cat([lafs[..., :2] * factor[:, None, None], lafs[..., 2:]], -1)
 
 
 def _elongation(lafs: Float[Tensor, "n 2 3"]) -> Float[Tensor, " n"]:

@@ -9,11 +9,11 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Int
-from numpy.typing import NDArray
 from torch import Tensor
 
 from fmtorch.core.options import Within
 from fmtorch.features.frames import upright_frames
+from fmtorch.features.patches import Image
 from fmtorch.features.sift import as_grey
 
 # Maxima of a scale space: 3 x 3 x 3 neighbourhoods and the quadratic through them (Brown and Lowe, BMVC 2002)
@@ -196,7 +196,7 @@ class HessianDetector:
     sigma: float = 1.6
     border: float = 3.0
 
-    def detect(self, image: NDArray[np.uint8]) -> tuple[Float[Tensor, "n 2 3"], Float[Tensor, " n"]]:
+    def detect(self, image: Image) -> tuple[Float[Tensor, "n 2 3"], Float[Tensor, " n"]]:
         """Upright frames of half side `FRAME_SIGMAS` sigma and responses, strongest first.
 
         image: grey (H, W) or RGB (H, W, 3) uint8. N = 0 where nothing is found. Memory: about 32 bytes a pixel.

@@ -3,20 +3,17 @@
 import dataclasses
 import functools
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import Annotated, Any, Protocol, TypeVar, runtime_checkable
 
-import numpy as np
 import torch
 from jaxtyping import Float
-from numpy.typing import NDArray
 from torch import Tensor
 
 from fmtorch.core.options import Within
 from fmtorch.core.types import Features
 from fmtorch.features.frames import DominantGradient, NetworkOrientation, NetworkShape, PatchFunction
 from fmtorch.features.hessian import HessianDetector
-from fmtorch.features.patches import ImagePyramid
+from fmtorch.features.patches import Image, ImagePyramid
 from fmtorch.features.sift import SIFT, PatchSIFT, RootSIFTPCA, as_grey
 
 
@@ -24,7 +21,7 @@ from fmtorch.features.sift import SIFT, PatchSIFT, RootSIFTPCA, as_grey
 class Detector(Protocol):
     """An image -> frames and scores."""
 
-    def detect(self, image: NDArray[np.uint8]) -> tuple[Float[Tensor, "n 2 3"], Float[Tensor, " n"]]: ...
+    def detect(self, image: Image) -> tuple[Float[Tensor, "n 2 3"], Float[Tensor, " n"]]: ...
 
 
 @runtime_checkable
@@ -72,7 +69,7 @@ class LocalFeature:
     orientation: FrameStep | None = None
     device: str = "cpu"
 
-    def __call__(self, image: NDArray[np.uint8]) -> Features:
+    def __call__(self, image: Image) -> Features:
         """The features of a grey (H, W) or RGB (H, W, 3) uint8 image; none, with N = 0, where nothing is found.
 
         Raises ValueError for another type, shape or an empty image, and what a network says of its file.
@@ -86,7 +83,7 @@ class LocalFeature:
         """The parts that define frames and scores."""
         return self.detector, self.shape, self.orientation, self.device
 
-    def detect(self, image: NDArray[np.uint8]) -> tuple[Float[Tensor, "n 2 3"], Float[Tensor, " n"]]:
+    def detect(self, image: Image) -> tuple[Float[Tensor, "n 2 3"], Float[Tensor, " n"]]:
         """Frames in kornia's convention, with shape and orientation, and the detector's scores."""
         lafs, scores = self.detector.detect(image)
         steps = [step for step in (self.shape, self.orientation) if step is not None]
@@ -96,11 +93,11 @@ class LocalFeature:
                 lafs = step(pyramid, lafs)
         return lafs.cpu(), scores.cpu()
 
-    def describe(self, image: NDArray[np.uint8], lafs: Float[Tensor, "n 2 3"]) -> Float[Tensor, "n d"]:
+    def describe(self, image: Image, lafs: Float[Tensor, "n 2 3"]) -> Float[Tensor, "n d"]:
         """A descriptor of each frame."""
         return self.descriptor(self._pyramid(image), lafs.to(self.device)).cpu()
 
-    def _pyramid(self, image: NDArray[np.uint8]) -> ImagePyramid:
+    def _pyramid(self, image: Image) -> ImagePyramid:
         grey = as_grey(image)
         if self.device == "cpu":
             return ImagePyramid(grey)
@@ -148,10 +145,8 @@ def local_feature(
         "hessian": functools.partial(HessianDetector, max_features=max_features),
     }
     shapes: dict[str, Callable[..., FrameStep]] = {name: by(NetworkShape, name) for name in ("affnet", "affnet_fast")}
-    orientations: dict[str, Callable[..., FrameStep]] = {
-        "dominant_gradient": DominantGradient,
-        "orinet": by(NetworkOrientation, "orinet"),
-    }
+    orinet = by(NetworkOrientation, "orinet")
+    orientations: dict[str, Callable[..., FrameStep]] = {"dominant_gradient": DominantGradient, "orinet": orinet}
     descriptors: dict[str, Callable[..., Descriptor]] = {
         "sift": PatchSIFT,
         "rootsift": functools.partial(PatchSIFT, root=True),
@@ -159,13 +154,10 @@ def local_feature(
         "rootsiftpca": RootSIFTPCA,
         **{name: by(NetworkDescriptor, name) for name in ("l2net", "geodesc", "hardnet", "hardnet_fast")},
     }
-    return LocalFeature(
-        detector=_part("detector", detector, detectors),
-        descriptor=_part("descriptor", descriptor, descriptors),
-        shape=None if shape is None else _part("shape", shape, shapes),
-        orientation=None if orientation is None else _part("orientation", orientation, orientations),
-        device=device,
-    )
+    shape_step = None if shape is None else _part("shape", shape, shapes)
+    turn_step = None if orientation is None else _part("orientation", orientation, orientations)
+    ends = _part("detector", detector, detectors), _part("descriptor", descriptor, descriptors)
+    return LocalFeature(*ends, shape_step, turn_step, device)
 
 
 def _part(kind: str, choice: Choice, known: Mapping[str, Callable[..., Part]]) -> Part:
@@ -183,6 +175,4 @@ def _network(name: str, precision: str, threads: int) -> PatchFunction:
     """The network of models/ under this name."""
     from fmtorch.features.onnx_network import PatchNetwork, network_file
 
-    file: Path = network_file(name, precision)
-    network: PatchFunction = PatchNetwork(file, threads=threads)
-    return network
+    return PatchNetwork(network_file(name, precision), threads=threads)

@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float
-from numpy.typing import NDArray
 from torch import Tensor
 
 from fmtorch.core.files import models_dir
@@ -68,7 +67,8 @@ class PatchNetwork:
         result = np.zeros((len(array), outputs), np.float32)
         for start in range(0, len(array), self.batch):
             part = array[start : start + self.batch]
-            result[start : start + len(part)] = session.run(None, {name: _filled(part, self.batch)})[0][: len(part)]
+            filled = np.concatenate([part, np.zeros((self.batch - len(part), *PATCH_SHAPE), np.float32)])
+            result[start : start + len(part)] = session.run(None, {name: filled})[0][: len(part)]
         return torch.from_numpy(result).to(patches.device)
 
     @property
@@ -86,12 +86,6 @@ class PatchNetwork:
     def outputs(self) -> int:
         """D, the length of an output; opens the file."""
         return _session(self.path, self.threads)[2]
-
-
-def _filled(part: NDArray[np.float32], count: int) -> NDArray[np.float32]:
-    if len(part) == count:
-        return part
-    return np.concatenate([part, np.zeros((count - len(part), *PATCH_SHAPE), np.float32)])
 
 
 def _session(path: Path, threads: int) -> tuple[Any, str, int]:

@@ -11,6 +11,8 @@ from jaxtyping import Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
+Image = NDArray[np.uint8]
+
 PATCH = 32  # pixels, the side that the networks take
 COARSEST = 8  # pixels, the least shorter side of a level
 # A level has a blur of about 0.7 of its pixels (the binomial filter's 0.58, and the interpolation's): samples up to
@@ -23,7 +25,7 @@ MAX_SAMPLES = 8  # along an axis for one pixel of a patch
 class ImagePyramid:
     """Grey images in [0, 1], each half the size of the one before; pixel x of a level is pixel 2x of the finer one."""
 
-    def __init__(self, grey: NDArray[np.uint8] | Float[Tensor, "h w"]) -> None:
+    def __init__(self, grey: Image | Float[Tensor, "h w"]) -> None:
         """Of an image (H, W): uint8 for OpenCV on the CPU, or a tensor in [0, 1] for torch on its device."""
         if isinstance(grey, np.ndarray):
             finest = torch.from_numpy(np.multiply(grey, 1 / 255, dtype=np.float32))

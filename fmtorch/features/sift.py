@@ -8,7 +8,6 @@ import math
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
-from types import ModuleType
 from typing import Annotated, Any
 
 import cv2
@@ -23,7 +22,7 @@ from fmtorch.core.files import models_dir
 from fmtorch.core.options import Within
 from fmtorch.core.types import Features
 from fmtorch.features.frames import FRAME_SIGMAS
-from fmtorch.features.patches import PATCH, ImagePyramid
+from fmtorch.features.patches import PATCH, Image, ImagePyramid
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,7 +45,7 @@ class SIFT:
     max_pixels: int = 16_000_000
     root: bool = False
 
-    def __call__(self, image: NDArray[np.uint8]) -> Features:
+    def __call__(self, image: Image) -> Features:
         """The features of a grey (H, W) or RGB (H, W, 3) uint8 image; none, with N = 0, where nothing is found.
 
         lafs: half side `FRAME_SIGMAS` sigma, kornia's angle (minus OpenCV's). scores: contrast. descriptors: (N, 128)
@@ -58,14 +57,10 @@ class SIFT:
         descriptors = np.zeros((0, 128), np.float32) if computed is None else computed
         lafs, scores, kept = self._kept(keypoints, seen.shape, grey.shape)
         features = torch.from_numpy(descriptors[kept])
-        return Features(
-            lafs=lafs,
-            scores=scores,
-            descriptors=root_sift(features) if self.root else features,
-            image_size=torch.tensor(grey.shape, dtype=torch.int64),
-        )
+        size = torch.tensor(grey.shape, dtype=torch.int64)
+        return Features(lafs, scores, root_sift(features) if self.root else features, size)
 
-    def detect(self, image: NDArray[np.uint8]) -> tuple[Float[Tensor, "n 2 3"], Float[Tensor, " n"]]:
+    def detect(self, image: Image) -> tuple[Float[Tensor, "n 2 3"], Float[Tensor, " n"]]:
         """The frames and scores of the features that a call finds, without their descriptors."""
         grey = as_grey(image)
         seen = self._reduced(grey)
@@ -73,15 +68,11 @@ class SIFT:
         return lafs, scores
 
     def _opencv(self) -> cv2.SIFT:
-        return cv2.SIFT.create(
-            nfeatures=self.max_features,
-            contrastThreshold=self.contrast_threshold,
-            edgeThreshold=self.edge_threshold,
-            sigma=self.sigma,
-            enable_precise_upscale=self.precise_upscale,
-        )
+        thresholds = {"contrastThreshold": self.contrast_threshold, "edgeThreshold": self.edge_threshold}
+        upscale = self.precise_upscale
+        return cv2.SIFT.create(self.max_features, sigma=self.sigma, enable_precise_upscale=upscale, **thresholds)
 
-    def _reduced(self, grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    def _reduced(self, grey: Image) -> Image:
         """The image, or a smaller one of at most `max_pixels`."""
         factor = math.sqrt(self.max_pixels / grey.size)
         if factor >= 1:
@@ -128,7 +119,7 @@ def strongest(scores: NDArray[np.float32], count: int) -> NDArray[np.int64]:
     return np.sort(np.argsort(-scores, kind="stable")[:count])
 
 
-def as_grey(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def as_grey(image: Image) -> Image:
     """A grey image of a grey or RGB one. Raises ValueError for another type, shape or an empty image."""
     if image.dtype != np.uint8 or image.size == 0 or not (image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)):
         raise ValueError(f"image is {image.dtype} {image.shape}; it must be a non-empty uint8 (H, W) or RGB (H, W, 3)")
@@ -150,11 +141,9 @@ class VLFeatSIFT:
     The paper (Bian et al., BMVC 2019) took its keypoints and descriptors from there. VLFeat does not double the image
     and, by default, has no threshold of contrast, so that it finds more keypoints than OpenCV, of larger scales.
 
-    max_features: the keypoints of the largest scales that are kept.
-    first_octave: -1 doubles the image first.
-    peak_threshold: least contrast |DoG|, for intensities in [0, 1]; 0 takes every extremum.
-    edge_threshold: largest ratio of principal curvatures.
-    root: RootSIFT instead.
+    max_features: the keypoints of the largest scales that are kept. first_octave: -1 doubles the image first.
+    peak_threshold: least contrast |DoG|, for intensities in [0, 1]; 0 takes every extremum. edge_threshold: largest
+    ratio of principal curvatures. root: RootSIFT instead.
     """
 
     max_features: Annotated[int, Within(1)] = 20000
@@ -166,7 +155,7 @@ class VLFeatSIFT:
     def __post_init__(self) -> None:
         _library()
 
-    def __call__(self, image: NDArray[np.uint8]) -> Features:
+    def __call__(self, image: Image) -> Features:
         """The features of a grey (H, W) or RGB (H, W, 3) uint8 image; none, with N = 0, where nothing is found.
 
         lafs: half side `FRAME_SIGMAS` sigma. scores: sigma in pixels, as VLFeat tells no contrast. descriptors:
@@ -205,15 +194,14 @@ def octaves(shape: tuple[int, ...], first: int) -> int:
     return max(int(math.log2(min(shape))) - first - 3, 1)
 
 
-def _library() -> ModuleType:
+def _library() -> Any:
     """pycolmap, which says nothing but warnings. Raises ImportError naming the extra where it is not installed."""
     try:
         import pycolmap
     except ImportError as error:
         raise ImportError("features=sift_vlfeat needs pycolmap: pip install 'fmtorch[colmap]'") from error
     pycolmap.logging.minloglevel = pycolmap.logging.WARNING.value
-    module: ModuleType = pycolmap
-    return module
+    return pycolmap
 
 
 # SIFT of patches, plain, as RootSIFT, and pooled over domain sizes; batched (Lowe, IJCV 2004, section 6)
@@ -261,8 +249,7 @@ def sift_of_patches(patches: Float[Tensor, "n 1 32 32"]) -> Float[Tensor, "n 128
     pooling, along, across = _matrices(patches.device)
     parts = []
     for part in torch.split(patches[:, 0], CHUNK):
-        gx = across @ part @ along.T
-        gy = along @ part @ across.T
+        gx, gy = across @ part @ along.T, along @ part @ across.T
         squared = (gx * gx + gy * gy).flatten(1)
         magnitude = torch.where(squared > FLAT * FLAT, squared, 0.0).sqrt()
         position = (torch.atan2(-gy, gx) * (DIRECTIONS / (2 * math.pi))).flatten(1)
@@ -351,19 +338,23 @@ def learn_projection(
     return mean.float(), (basis * sign).float()
 
 
-@functools.lru_cache(maxsize=8)
-def load_projection(path: Path) -> tuple[Float[Tensor, 128], Float[Tensor, "128 d"]]:
-    """Mean and basis of a learned file. Raises FileNotFoundError and ValueError that say how to make it."""
-    remedy = "make it with `python scripts/make_models.py pca`"
+def read_learned(path: Path, names: Sequence[str], what: str, remedy: str) -> list[Tensor]:
+    """Tensors of a learned file, `what` in messages. Raises FileNotFoundError, ValueError, which end with `remedy`."""
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file; {remedy}")
     try:
         with np.load(path, allow_pickle=False) as file:
-            mean, basis = (torch.from_numpy(file[name].astype(np.float32)) for name in ("mean", "basis"))
+            return [torch.from_numpy(file[name].astype(np.float32)) for name in names]
     except (KeyError, ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
-        raise ValueError(f"{path}: no file with `mean` and `basis` ({error}); {remedy}") from error
+        raise ValueError(f"{path}: no file with {what} ({error}); {remedy}") from error
+
+
+@functools.lru_cache(maxsize=8)
+def load_projection(path: Path) -> tuple[Float[Tensor, 128], Float[Tensor, "128 d"]]:
+    """Mean and basis of a learned file. Raises FileNotFoundError and ValueError that say how to make it."""
+    remedy = "make it with `python scripts/make_models.py pca`"
+    mean, basis = read_learned(path, ("mean", "basis"), "`mean` and `basis`", remedy)
     if mean.shape != (128,) or basis.dim() != 2 or len(basis) != 128:
-        raise ValueError(
-            f"{path}: mean {tuple(mean.shape)}, basis {tuple(basis.shape)} must be (128,), (128, D); {remedy}"
-        )
+        shapes = f"mean {tuple(mean.shape)}, basis {tuple(basis.shape)}"
+        raise ValueError(f"{path}: {shapes} must be (128,), (128, D); {remedy}")
     return mean, basis

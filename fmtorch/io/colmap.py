@@ -9,7 +9,6 @@ import sqlite3
 import tempfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -24,14 +23,13 @@ from fmtorch.io.match_store import ORIGIN, PairGeometry, StoredImage, StoredPair
 FOCAL_LENGTH = 1.2  # of the longer side, where it is unknown: COLMAP's own default
 
 
-def imported() -> ModuleType:
+def imported() -> Any:
     """pycolmap. Raises ImportError naming the extra where it is not installed."""
     try:
         import pycolmap
     except ImportError as error:
         raise ImportError("pycolmap is not installed; pip install 'fmtorch[colmap]' brings it") from error
-    module: ModuleType = pycolmap
-    return module
+    return pycolmap
 
 
 def write_database(
@@ -71,9 +69,8 @@ def write_database(
 
 def _camera(pycolmap: Any, database: Any, cameras: dict[object, int], image: StoredImage, shared: bool) -> int:
     model, parameters, prior = _parameters(image)
-    key: object = image.name
-    if image.K is not None or image.lens is not None or shared:
-        key = (image.size, model, *parameters)
+    own = image.K is None and image.lens is None and not shared
+    key: object = image.name if own else (image.size, model, *parameters)
     if key not in cameras:
         h, w = image.size
         camera = pycolmap.Camera(model=model, width=w, height=h, params=parameters)
@@ -114,9 +111,7 @@ def _geometry(pair: StoredPair, matches: Array, known: dict[str, Matrix | None])
 
 def _one_to_one(pair: StoredPair) -> Mask:
     """Matches that share no keypoint with a better one: COLMAP's tracks allow one each; inliers come first."""
-    keep = np.zeros(len(pair.matches), bool)
-    taken0: set[int] = set()
-    taken1: set[int] = set()
+    keep, taken0, taken1 = np.zeros(len(pair.matches), bool), set[int](), set[int]()
     inliers = pair.inliers
     if pair.geometry is not None:
         verified = set(map(tuple, pair.geometry.inliers.tolist()))
@@ -224,13 +219,14 @@ class MatchDatabase:
         with _naming(path):
             self._database = self._pycolmap.Database.open(path)
         self.image = functools.lru_cache(maxsize=MEMORY)(self._image)
-        for count, what, step in (
-            (self._database.num_keypoints(), "keypoints", "extract features (colmap feature_extractor)"),
-            (self._database.num_matched_image_pairs(), "matches", "match the images (colmap exhaustive_matcher)"),
-        ):
-            if not count:
-                self.close()
-                raise ValueError(f"{path} holds no {what}; {step} first")
+        lacking = ""
+        if not self._database.num_matched_image_pairs():
+            lacking = "matches; match the images (colmap exhaustive_matcher)"
+        if not self._database.num_keypoints():
+            lacking = "keypoints; extract features (colmap feature_extractor)"
+        if lacking:
+            self.close()
+            raise ValueError(f"{path} holds no {lacking} first")
 
     def __enter__(self) -> "MatchDatabase":
         return self
@@ -301,9 +297,8 @@ def _naming(path: Path) -> Iterator[None]:
         yield
     except RuntimeError as error:
         said = str(error).partition("SQLite error: ")[2]
-        raise OSError(
-            f"{path} cannot be written: {said or 'another process holds it, or its disk is full or read-only'}"
-        ) from error
+        reason = said or "another process holds it, or its disk is full or read-only"
+        raise OSError(f"{path} cannot be written: {reason}") from error
 
 
 def expect_database(path: Path) -> None:
@@ -316,14 +311,11 @@ def expect_database(path: Path) -> None:
         if file.read(len(MAGIC)) != MAGIC:
             raise ValueError(f"{path} is not a COLMAP database; give the database.db of a COLMAP project")
     version, tables = _schema(path)
-    missing = TABLES - tables
-    if missing:
-        raise ValueError(f"{path} is a database, but none of COLMAP's: it has no table {', '.join(sorted(missing))}")
+    if missing := ", ".join(sorted(TABLES - tables)):
+        raise ValueError(f"{path} is a database, but none of COLMAP's: it has no table {missing}")
     if version > (newest := _newest_version()):
-        raise ValueError(
-            f"{path} was written by a newer COLMAP (schema {version}; this pycolmap {imported().__version__} "
-            f"reads up to {newest}); pip install --upgrade pycolmap"
-        )
+        schemas = f"schema {version}; this pycolmap {imported().__version__} reads up to {newest}"
+        raise ValueError(f"{path} was written by a newer COLMAP ({schemas}); pip install --upgrade pycolmap")
 
 
 def finished_pairs(path: Path, output: Path) -> int:
@@ -386,18 +378,14 @@ def _schema(path: Path) -> tuple[int, set[str]]:
 @contextlib.contextmanager
 def _reading(path: Path) -> Iterator[sqlite3.Connection]:
     """A connection that only reads; of a folder that cannot be written to as well."""
-    address = path.absolute().as_uri()
-    waiting = _beside(path, "wal").exists()
-    with contextlib.closing(
-        sqlite3.connect(f"{address}?mode=ro{'' if waiting else '&immutable=1'}", uri=True)
-    ) as open_:
-        yield open_
+    mode = "mode=ro" if _beside(path, "wal").exists() else "mode=ro&immutable=1"
+    with contextlib.closing(sqlite3.connect(f"{path.absolute().as_uri()}?{mode}", uri=True)) as connection:
+        yield connection
 
 
 @functools.cache
 def _newest_version() -> int:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "empty.db"
-        opened: Any = imported().Database.open(path)
-        opened.close()
+        imported().Database.open(path).close()
         return _schema(path)[0]

@@ -2,6 +2,7 @@
 
 import contextlib
 import functools
+import hashlib
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -35,7 +36,10 @@ class _OpenFiles:
         self._open.close()
 
     def identity(self) -> dict[str, Any]:
-        return {"files": h5.digest_of(*self.files)}
+        digest = hashlib.blake2b(digest_size=16)
+        for path in self.files:
+            h5.add_to_digest(digest, path)
+        return {"files": digest.hexdigest()}
 
     def has_geometry(self, pair: Names) -> bool:
         return False
@@ -160,10 +164,8 @@ class MatchFile(_OpenFiles):
             ends = [key.removesuffix("x0") for key in self._keys if key.rpartition("/")[2] == "x0"]
             self._pairs = sorted(end for end in ends if f"{end}x1" in self._keys)
             if not self._pairs:
-                raise DataError(
-                    f"{path} holds no x0 and x1; give matches x0, x1 (n, 2), alone or of each pair in a group, "
-                    "or hloc's features=F.h5 as well"
-                )
+                wanted = "matches x0, x1 (n, 2), alone or of each pair in a group, or hloc's features=F.h5 as well"
+                raise DataError(f"{path} holds no x0 and x1; give {wanted}")
             self._open = stack.pop_all()
 
     def pairs(self) -> list[Ids]:
@@ -199,24 +201,20 @@ class MatchFile(_OpenFiles):
     def _image(self, image_id: str) -> DatabaseImage:
         pair, i = image_id[:-2], int(image_id[-1])
         points = self._numbers(image_id, (None, 2)).astype(np.float32)
-        K, size = (
-            self._numbers(f"{pair}{key}", shape) if f"{pair}{key}" in self._keys else None
-            for key, shape in ((f"K{i}", (3, 3)), (f"size{i}", (2,)))
-        )
+        wanted = ((f"{pair}K{i}", (3, 3)), (f"{pair}size{i}", (2,)))
+        K, size = (self._numbers(key, shape) if key in self._keys else None for key, shape in wanted)
         known = None
         if size is not None:
             if not (np.isfinite(size).all() and (size >= 1).all()):
                 raise DataError(f"size{i} is {size.tolist()}; it must be the height and width of the image")
             known = int(size[0]), int(size[1])
-        deviation = np.inf if K is None else 0.0
-        return DatabaseImage(image_id, i, known, K, deviation, points, points)
+        return DatabaseImage(image_id, i, known, K, np.inf if K is None else 0.0, points, points)
 
     def _numbers(self, key: str, shape: tuple[int | None, ...]) -> Matrix:
         values = self._file.read(key)
         if values.dtype.kind not in "fiu":
             raise DataError(f"{key} is of {values.dtype}; it must hold real numbers")
-        fits = values.ndim == len(shape) and all(n in (None, m) for n, m in zip(shape, values.shape, strict=True))
-        if not fits:
+        if not h5.fits(values, shape):
             wanted = ", ".join("n" if n is None else str(n) for n in shape)
             raise DataError(f"{key} has shape {values.shape}; it must be ({wanted})")
         return values.astype(np.float64)
@@ -232,7 +230,7 @@ def expect_suffix(name: str, path: Path) -> None:
 def _arrays(path: Path) -> Iterator[ArrayFile]:
     if path.suffix != NPZ:
         with h5.opened(path) as file:
-            yield ArrayFile(h5.paths(file), functools.partial(h5.array, file))
+            yield ArrayFile(h5.keys(file, deep=True), functools.partial(h5.array, file))
         return
     try:
         npz = np.load(path)

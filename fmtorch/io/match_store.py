@@ -149,10 +149,7 @@ class MatchStore:
 
     def add_image(self, image: Path, value: StoredImage) -> None:
         arrays: dict[str, Array] = {"points": value.points, "scores": value.scores, "size": np.array(value.size)}
-        if value.K is not None:
-            arrays["K"] = value.K
-        if value.focal is not None:
-            arrays["focal"] = np.array(value.focal)
+        arrays |= {name: np.asarray(k) for name in ("K", "focal") if (k := getattr(value, name)) is not None}
         if (lens := value.lens) is not None:
             arrays["lens_model"] = np.array(lens.model)
             arrays["lens"] = np.array([lens.fx, lens.fy, lens.cx, lens.cy, *lens.coefficients])

@@ -1,7 +1,7 @@
 """Matches that other programs stored for the pairs of a data set: hloc's, glue-factory's and vismatch's files."""
 
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -44,22 +44,6 @@ def _figure(values: Matrix | None) -> torch.Tensor | None:
     return None if values is None else torch.from_numpy(values.astype(np.float32))[None]
 
 
-def calibrated(
-    identity: str, family: str, scene: str, images: tuple[ImageSource, ImageSource], K: tuple[Matrix, Matrix],
-    R: Matrix, t: Matrix,
-) -> ImagePair:  # fmt: skip
-    """A pair of cameras with X1 = R X0 + t, and the F of these; a problem where they define none."""
-    return with_fundamentals([posed(identity, family, scene, images, K, R, t)])[0]
-
-
-def posed(
-    identity: str, family: str, scene: str, images: tuple[ImageSource, ImageSource], K: tuple[Matrix, Matrix],
-    R: Matrix, t: Matrix, matches: Callable[[], GivenMatches] | None = None,
-) -> ImagePair:  # fmt: skip
-    """The same, of which `with_fundamentals` finds F or the problem."""
-    return ImagePair(identity, family, scene, *images, _ZERO, *K, R, t, None, matches)
-
-
 def with_fundamentals(pairs: Sequence[ImagePair]) -> list[ImagePair]:
     """The pairs with the F of their cameras, all at once; those with a problem, or without a pose, as they are."""
     result = list(pairs)
@@ -83,11 +67,6 @@ def with_fundamentals(pairs: Sequence[ImagePair]) -> list[ImagePair]:
     return result
 
 
-def broken(identity: str, family: str, scene: str, images: tuple[ImageSource, ImageSource], problem: str) -> ImagePair:
-    """A pair that cannot be used, which becomes a row with this reason."""
-    return ImagePair(identity, family, scene, *images, np.zeros((3, 3)), problem=problem)
-
-
 def image(family: str, scene: str, name: str, folder: Path | None) -> ImageSource:
     """An image of which only the name is known, in a folder, or its sub-folder of the scene, where one is given."""
     path = Path(name)
@@ -100,10 +79,9 @@ def expect_size(source: ImageSource, size: Size, K: Matrix) -> None:
     """Raises DataError where an image's size (h, w) contradicts its camera: a copy that was reduced or cropped."""
     h, w = size
     if max(abs(K[0, 2] / w - 0.5), abs(K[1, 2] / h - 0.5)) > MAX_OFF_CENTRE:
-        raise DataError(
-            f"{source.path}: {w} x {h} px, but its camera's principal point is ({K[0, 2]:g}, {K[1, 2]:g}); it must be "
-            "the image as it was when its camera was determined"
-        )
+        centre = f"its camera's principal point is ({K[0, 2]:g}, {K[1, 2]:g})"
+        wanted = "the image as it was when its camera was determined"
+        raise DataError(f"{source.path}: {w} x {h} px, but {centre}; it must be {wanted}")
 
 
 def size_by_points(K: Matrix, x: Matrix) -> Size:
@@ -142,18 +120,16 @@ def pair_keys(pair: ImagePair) -> Iterator[tuple[str, bool]]:
 
     ``a/b``, as hloc and glue-factory write it with hyphens for slashes within names, and ``a_b``.
     """
-    for swapped in (False, True):
-        image, other = (pair.image1, pair.image0) if swapped else (pair.image0, pair.image1)
-        for a, b in zip(names_of(image), names_of(other), strict=False):
-            for key in _keys(a, b):
-                yield key, swapped
+    names0, names1 = names_of(pair.image0), names_of(pair.image1)
+    for swapped, names in ((False, (names0, names1)), (True, (names1, names0))):
+        for a, b in zip(*names, strict=False):
+            yield from ((key, swapped) for key in _keys(a, b))
 
 
 def hloc_keys(name0: str, name1: str) -> Iterator[tuple[str, bool]]:
     """The keys of hloc's matches of two images of these names, and whether the images are in the other order."""
-    for swapped, (a, b) in ((False, (name0, name1)), (True, (name1, name0))):
-        for key in _keys(a, b):
-            yield key, swapped
+    yield from ((key, False) for key in _keys(name0, name1))
+    yield from ((key, True) for key in _keys(name1, name0))
 
 
 def pair_key_of(name0: str, name1: str) -> str:
@@ -191,19 +167,16 @@ class HLocMatches:
     def __call__(self) -> GivenMatches:
         with h5.opened(self.features) as file:
             points = [_keypoints(file, self.features, name) - self.origin for name in self.names]
-            sizes = tuple(
-                _size(file, f"{name}/image_size", image) for name, image in zip(self.names, self.images, strict=True)
-            )
+            ends = zip(self.names, self.images, strict=True)
+            size0, size1 = (_size(file, f"{name}/image_size", image) for name, image in ends)
         with h5.opened(self.matches) as file:
             chosen, scores = _read_indices(file, self.matches, self.key)
         order = (1, 0) if self.swapped else (0, 1)
         i, j = _indices(chosen, [len(points[k]) for k in order], f"{self.matches}: {self.key + '/matches0'!r}")
         index = (j, i) if self.swapped else (i, j)
-        score = None if scores is None else scores[i]
-        return given(
-            points[0][index[0]], points[1][index[1]], (sizes[0], sizes[1]), (len(points[0]), len(points[1])),
-            score=score,
-        )  # fmt: skip
+        x0, x1 = (p[k] for p, k in zip(points, index, strict=True))
+        counts = len(points[0]), len(points[1])
+        return given(x0, x1, (size0, size1), counts, score=None if scores is None else scores[i])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -223,10 +196,7 @@ class PairPrediction:
     def __call__(self) -> GivenMatches:
         with h5.opened(self.path) as file:
             group = file[self.key]
-            if h5.holds(group, "matches0"):
-                x, counts, score = self._indexed(group)
-            else:
-                x, counts, score = self._matched(group)
+            x, counts, score = (self._indexed if h5.holds(group, "matches0") else self._matched)(group)
             suffixes = ("1", "0") if self.swapped else ("0", "1")
             sizes = [_size(group, f"image_size{s}", image) for s, image in zip(suffixes, self.images, strict=True)]
         order = (1, 0) if self.swapped else (0, 1)
@@ -243,12 +213,10 @@ class PairPrediction:
     def _matched(self, group: Any) -> tuple[list[Matrix], list[int], Matrix | None]:
         x = [h5.numbers(group, f"matched_kpts{k}", None, 2) for k in (0, 1)]
         if len(x[0]) != len(x[1]):
-            raise DataError(
-                f"{self.path}: {self.key!r} has {len(x[0])} points in matched_kpts0 and {len(x[1])} in matched_kpts1"
-            )
-        score = None
-        if h5.holds(group, "matched_confidences"):
-            score = h5.numbers(group, "matched_confidences", len(x[0]))
+            lengths = f"{len(x[0])} points in matched_kpts0 and {len(x[1])} in matched_kpts1"
+            raise DataError(f"{self.path}: {self.key!r} has {lengths}")
+        confident = h5.holds(group, "matched_confidences")
+        score = h5.numbers(group, "matched_confidences", len(x[0])) if confident else None
         counts = [len(p) for p in x]
         for k in (0, 1):
             if h5.holds(group, f"all_kpts{k}"):
@@ -304,10 +272,8 @@ def _expect_distinct(names: dict[str, str | None], path: Path) -> None:
     seen: dict[str, str] = {}
     for identity, name in names.items():
         if name is not None and seen.setdefault(name, identity) != identity:
-            raise DataError(
-                f"{path}: {name!r} could be image {seen[name]} or {identity}; names must tell images apart, "
-                "such as by their folder"
-            )
+            both = f"{path}: {name!r} could be image {seen[name]} or {identity}"
+            raise DataError(f"{both}; names must tell images apart, such as by their folder")
 
 
 def _read_indices(file: Any, path: Path, key: str) -> tuple[Indices, Matrix | None]:
@@ -315,9 +281,8 @@ def _read_indices(file: Any, path: Path, key: str) -> tuple[Indices, Matrix | No
     chosen = h5.array(file, f"{prefix}matches0", None)
     if chosen.dtype.kind not in "iu":
         raise DataError(f"{path}: {prefix + 'matches0'!r} is of {chosen.dtype}; it must hold whole numbers")
-    scores = None
-    if h5.holds(file, f"{prefix}matching_scores0"):
-        scores = h5.numbers(file, f"{prefix}matching_scores0", len(chosen))
+    scored = h5.holds(file, f"{prefix}matching_scores0")
+    scores = h5.numbers(file, f"{prefix}matching_scores0", len(chosen)) if scored else None
     return chosen.astype(np.int64), scores
 
 

@@ -12,6 +12,7 @@ from typing import TypeVar
 import torch
 
 T = TypeVar("T")
+R = TypeVar("R")
 
 KINDS = ("auto", "threads", "processes", "dask")
 MIN_PAIRS_FOR_PROCESSES = 1000  # of given matches, start included: 10.0 s by one thread, 8.4 by two processes
@@ -81,8 +82,6 @@ def shard_of(text: str | None) -> Shard | None:
 
 
 # How many threads a stage, a worker or a loop over pairs computes with
-
-R = TypeVar("R")
 
 _held: ContextVar[int] = ContextVar("_held", default=1)
 

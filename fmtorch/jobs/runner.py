@@ -19,16 +19,8 @@ import time
 import types
 from collections import OrderedDict
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import (
-    FIRST_COMPLETED,
-    BrokenExecutor,
-    CancelledError,
-    Executor,
-    Future,
-    ProcessPoolExecutor,
-    ThreadPoolExecutor,
-    wait,
-)
+from concurrent import futures
+from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
 from typing import Any, Generic, TypeVar, cast
 
 import torch
@@ -101,9 +93,8 @@ class WorkerPool:
         """What to say where an error means that the scheduler is gone."""
         if self._cluster is None or not self._cluster.lost(error):
             return None
-        return WorkersLost(
-            f"the scheduler at {self._cluster.address} was lost; with another, the same command goes on from here"
-        )
+        lost = f"the scheduler at {self._cluster.address} was lost"
+        return WorkersLost(f"{lost}; with another, the same command goes on from here")
 
     def _started(self) -> Executor:
         execution = self.execution
@@ -119,7 +110,7 @@ class WorkerPool:
         if execution.kind == "dask":
             self._cluster = _Cluster(execution.address, self.size)
             return self._cluster.executor
-        return self._processes() if execution.kind == "processes" else ThreadPoolExecutor(self.size)
+        return self._processes() if execution.kind == "processes" else futures.ThreadPoolExecutor(self.size)
 
     def _processes(self) -> Executor:
         """Forked of a process that has no threads, where there is fork; each has the environment of this one."""
@@ -127,12 +118,12 @@ class WorkerPool:
         context = multiprocessing.get_context("spawn" if spawned else "forkserver")
         if not spawned:
             context.set_forkserver_preload(list(self.preload))
-        pool = ProcessPoolExecutor if self.needs_main else _WithoutMain
+        pool = futures.ProcessPoolExecutor if self.needs_main else _WithoutMain
         environment = {**os.environ, **_ONE_THREAD}
         return pool(self.size, context, initializer=_begin, initargs=(environment,))
 
 
-class _WithoutMain(ProcessPoolExecutor):
+class _WithoutMain(futures.ProcessPoolExecutor):
     """Processes that do not import this one's main module: they start within `submit`, as if it were empty."""
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
@@ -180,24 +171,20 @@ class _Cluster:
         self._local: Any = None
         if address is None:
             # What workers log of a worker that died, and of their own end, is ours to say.
-            self._local = distributed.LocalCluster(
-                workers, threads_per_worker=1, dashboard_address=None, silence_logs=50, protocol="tcp"
-            )
+            options = {"dashboard_address": None, "silence_logs": 50, "protocol": "tcp"}
+            self._local = distributed.LocalCluster(workers, threads_per_worker=1, **options)
         try:
             self.client = distributed.Client(self._local or address, timeout=SECONDS_TO_CONNECT, set_as_default=False)
         except (OSError, TimeoutError, ValueError) as error:
-            raise ValueError(
-                f"executor.address={address}: no scheduler answers; start one by `dask scheduler`, or leave the "
-                "address out for a cluster on this machine"
-            ) from error
+            remedy = "start one by `dask scheduler`, or leave the address out for a cluster on this machine"
+            raise ValueError(f"executor.address={address}: no scheduler answers; {remedy}") from error
         self.address = str(address or self._local.scheduler_address)
         try:
             self.client.wait_for_workers(1, timeout=SECONDS_FOR_WORKERS)
         except TimeoutError as error:
             self.close()
-            raise ValueError(
-                f"executor.address={address}: the scheduler has no workers; start some by `dask worker {address}`"
-            ) from error
+            remedy = f"start some by `dask worker {address}`"
+            raise ValueError(f"executor.address={address}: the scheduler has no workers; {remedy}") from error
         self.executor = cast(Executor, self.client.get_executor(pure=False))
         self._threads, self._counted = 1, 0.0
 
@@ -335,21 +322,18 @@ class TaskRunner(Generic[Task]):
                 for task in todo:
                     if task is None:
                         break
-                    self._submit(task)
+                    self.begin(task)
                     if len(self.waiting) >= self.pool.ahead:
                         break
                 if not self.waiting:
                     break
-                finished, _ = wait(self.waiting, return_when=FIRST_COMPLETED)
+                finished, _ = futures.wait(self.waiting, return_when=futures.FIRST_COMPLETED)
                 yield from self._finished(finished)
         finally:
             self._end()
 
-    def begin(self, task: Task) -> Future[Any]:
-        """Have a task begun before those of `each`, which yields it."""
-        return self._submit(task)
-
-    def _submit(self, task: Task, with_factory: bool = False) -> Future[Any]:
+    def begin(self, task: Task, with_factory: bool = False) -> Future[Any]:
+        """Have a task begun before those of `each`, which yields it; with_factory: see `Factory.call`."""
         call = self.source.call(self.function, with_factory)
         try:
             future: Future[Any] = self.pool.executor.submit(call, task)
@@ -363,21 +347,20 @@ class TaskRunner(Generic[Task]):
         self.waiting[future] = task
         return future
 
-    def _finished(self, futures: Iterable[Future[Any]]) -> Iterator[Task]:
+    def _finished(self, ended: Iterable[Future[Any]]) -> Iterator[Task]:
         suspects: list[Task] = []
         broken = False
-        for future in futures:
+        for future in ended:
             task = self.waiting.pop(future)
             try:
                 if self._done(task, future.result()):
                     yield task
             except (Exception, CancelledError) as error:
-                if not self._is_death(error):
-                    raise
+                self._expect_death(error)
                 broken = broken or isinstance(error, BrokenExecutor)
                 suspects.append(task)
         if broken:  # all that is under way ends, with a result or for the same reason
-            finished, _ = wait(self.waiting)
+            finished, _ = futures.wait(self.waiting)
             for future in finished:
                 task = self.waiting.pop(future)
                 if future.cancelled() or future.exception() is not None:
@@ -390,7 +373,7 @@ class TaskRunner(Generic[Task]):
 
     def _done(self, task: Task, result: Any) -> bool:
         if isinstance(result, NeedsFactory):
-            self._submit(task, with_factory=True)
+            self.begin(task, with_factory=True)
             return False
         self._succeeded = True
         self.keep(task, result)
@@ -400,12 +383,11 @@ class TaskRunner(Generic[Task]):
         """A task with no other under way, so that a worker that dies is its doing."""
         parts = [task] if self.split is None else self.split(task)
         for _ in range(MAX_DEATHS if len(parts) == 1 else 1):
-            future = self._submit(task, with_factory=True)
+            future = self.begin(task, with_factory=True)
             try:
                 result = future.result()
             except (Exception, CancelledError) as error:
-                if not self._is_death(error):
-                    raise
+                self._expect_death(error)
                 self.pool.renew()
             else:
                 if self._done(task, result):
@@ -426,24 +408,23 @@ class TaskRunner(Generic[Task]):
         try:
             self.pool.executor.submit(self.source.call(_nothing, True), None).result()
         except (Exception, CancelledError) as error:
-            if not self._is_death(error):
-                raise
+            self._expect_death(error)
             self.pool.renew()
             return False
         return True
 
-    def _is_death(self, error: BaseException) -> bool:
-        if any(cls.__name__ in _DEATHS for cls in type(error).__mro__) or isinstance(error, BrokenExecutor):
-            return True
-        if (lost := self.pool.lost(error)) is not None:
-            raise lost from error
-        return False
+    def _expect_death(self, error: BaseException) -> None:
+        """Raise an error that is not the death of a worker; WorkersLost where the scheduler is gone."""
+        if not (isinstance(error, BrokenExecutor) or any(cls.__name__ in _DEATHS for cls in type(error).__mro__)):
+            if (lost := self.pool.lost(error)) is not None:
+                raise lost from error
+            raise error
 
     def _end(self) -> None:
         """Wait for what is under way, and keep it; what has not begun is dropped."""
         for future in self.waiting:
             future.cancel()
-        wait(self.waiting)
+        futures.wait(self.waiting)
         for future, task in self.waiting.items():
             if not future.cancelled() and future.exception() is None:
                 result = future.result()

@@ -73,12 +73,16 @@ class ArrayCache:
 
     def write(self, section: str, name: str, arrays: Arrays) -> None:
         path = self._path(section, name)
+        digest = np.frombuffer(self._digest(section, name, arrays), np.uint8)
         with self._excused(path):
             path.parent.mkdir(parents=True, exist_ok=True)
             with replacing(path) as temporary, temporary.open("wb") as file:
-                digest = np.frombuffer(self._digest(section, name, arrays), np.uint8)
                 np.savez(file, **arrays, **{DIGEST: digest})  # type: ignore[arg-type]
-            self._grown(sum(array.nbytes for array in arrays.values()))
+            with self._lock:
+                self._unseen += sum(array.nbytes for array in arrays.values())
+                if self._unseen >= SLACK * (self.limit or np.inf):
+                    self.trim()
+                    self._unseen = 0
 
     def files(self) -> Iterator[tuple[Path, os.stat_result]]:
         yield from _listed(self.folder.glob("*/*.npz"))
@@ -111,13 +115,6 @@ class ArrayCache:
 
     def _path(self, section: str, name: str) -> Path:
         return self.folder / section / f"{name}.npz"
-
-    def _grown(self, size: int) -> None:
-        with self._lock:
-            self._unseen += size
-            if self._unseen >= SLACK * (self.limit or np.inf):
-                self.trim()
-                self._unseen = 0
 
     @contextlib.contextmanager
     def _excused(self, path: Path) -> Iterator[None]:
@@ -204,7 +201,8 @@ class CachedFeatures:
         arrays = self.cache.read(section, digest)
         if arrays is not None:
             seconds = float(arrays.pop("seconds"))
-            return _Step({name: _unpacked(array) for name, array in arrays.items()}, seconds, computed=False)
+            wide = {key: each.astype(np.float32) if each.dtype == np.uint8 else each for key, each in arrays.items()}
+            return _Step({key: torch.from_numpy(each) for key, each in wide.items()}, seconds, computed=False)
         start = time.perf_counter()
         tensors = {name: value.detach().cpu() for name, value in compute().items()}
         seconds = time.perf_counter() - start
@@ -262,7 +260,3 @@ def _packed(value: Tensor) -> NDArray[Any]:
         if np.array_equal(small.astype(np.float32).view(np.uint32), array.view(np.uint32)):  # to the sign of zero
             return small
     return array
-
-
-def _unpacked(array: NDArray[Any]) -> Tensor:
-    return torch.from_numpy(array.astype(np.float32) if array.dtype == np.uint8 else array)

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from fmtorch.scenes import patterns
-from fmtorch.scenes.patterns import Rng, colour, to_pixels
+from fmtorch.scenes.patterns import Rng, colour
 from fmtorch.scenes.surfaces import Floats, Real, Surfaces, Vector, material, vec
 
 
@@ -43,7 +43,7 @@ def foliage(surfaces: Surfaces, rng: Rng, size: int = 256) -> tuple[int, int]:
     """Textures of leaves and bark."""
     leaf = surfaces.texture(patterns.leaves(rng, size, colour(rng, (0.18, 0.34), (0.4, 0.7), (0.35, 0.65))))
     bark = patterns.wood(rng, 128, 128, 3, colour(rng, (0.06, 0.1), (0.3, 0.5), (0.25, 0.45)))
-    return leaf, surfaces.texture(to_pixels(np.ascontiguousarray(bark.transpose(1, 0, 2))))
+    return leaf, surfaces.paint(np.ascontiguousarray(bark.transpose(1, 0, 2)))
 
 
 def post(surfaces: Surfaces, foot: Vector, height: Real, texture: int) -> None:
@@ -55,8 +55,8 @@ def post(surfaces: Surfaces, foot: Vector, height: Real, texture: int) -> None:
 def car(surfaces: Surfaces, rng: Rng, foot: Vector, ahead: Vector) -> None:
     """A car centred on `foot`: a bonnet and a cabin as boxes, painted sides that stand a little off."""
     tone = colour(rng, (0, 1), (0, 0.8), (0.15, 0.95))
-    side, end = surfaces.texture(patterns.car_side(rng, tone)), surfaces.texture(to_pixels(patterns.car_end(rng, tone)))
-    metal = surfaces.texture(to_pixels(patterns.plaster(rng, 64, 64, tone, 0.5)))
+    side, end = surfaces.texture(patterns.car_side(rng, tone)), surfaces.paint(patterns.car_end(rng, tone))
+    metal = surfaces.paint(patterns.plaster(rng, 64, 64, tone, 0.5))
     left = np.cross(vec(0, 0, 1), ahead)
     length, width = rng.uniform(3.9, 4.7), rng.uniform(1.7, 1.85)
     rear = foot - ahead * (length / 2) + left * (width / 2)
@@ -112,13 +112,13 @@ def marble(surfaces: Surfaces, rng: Rng, h: int = 512, w: int = 512) -> int:
             ..., None
         ]
     )
-    return surfaces.texture(to_pixels(out.astype(np.float32)))
+    return surfaces.paint(out.astype(np.float32))
 
 
 def ashlar(surfaces: Surfaces, rng: Rng, rows: int = 6, cols: int = 8, h: int = 512, w: int = 1024) -> int:
     """A texture of large dressed stones."""
     tint = colour(rng, (0.05, 0.13), (0.1, 0.4), (0.5, 0.85))
-    return surfaces.texture(to_pixels(patterns.masonry(rng, h, w, rows, cols, tint, joint=0.03)))
+    return surfaces.paint(patterns.masonry(rng, h, w, rows, cols, tint, joint=0.03))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -205,7 +205,7 @@ def front(
     """
     picture = wall_picture(rng, split, int(height * style.density), int(width * style.density), style.density)
     openings, boards = _paint_openings(picture, rng, width, height, style)
-    relief = Relief(surfaces, surfaces.texture(to_pixels(picture)), foot, right, width, height)
+    relief = Relief(surfaces, surfaces.paint(picture), foot, right, width, height)
     _set_back(relief, openings, style)
     for board in boards:
         relief.block(*board, 0.12)

@@ -279,6 +279,7 @@ _recent = _Recent()
 
 # `RenderedPairs`: the embedded data set, drawn on first use from known cameras
 
+
 class RenderedPairs(PairDataset):
     """Image pairs of textured 3-D scenes with exact ground truth, in four families after the paper's four sets.
 

@@ -7,9 +7,9 @@ import numpy as np
 from fmtorch.scenes import buildings
 from fmtorch.scenes.buildings import Style, direction
 from fmtorch.scenes.light import DrawnScene, Lens, Light, Shot, sun
-from fmtorch.scenes.patterns import Rng, cells, colour, heaven, heights, masonry, meadow, poster, sign, to_pixels
+from fmtorch.scenes.patterns import Rng, cells, colour, heaven, heights, masonry, meadow, poster, sign
 from fmtorch.scenes.raycast import calibration, look_at
-from fmtorch.scenes.surfaces import Real, Surfaces, material, pictures, vec
+from fmtorch.scenes.surfaces import Real, Surfaces, material, pictures, to_pixels, vec
 
 SIZE = (540, 960)
 FOCAL = 760.0  # pixels: a phone's wide lens
@@ -30,7 +30,7 @@ def ground(surfaces: Surfaces, rng: Rng, split: str, reach: Real) -> None:
         paving = masonry(rng, 1024, 1024, 12, 12, tint, joint=0.03, bond=float(rng.choice([0.0, 0.5])), vary=0.09)
     else:
         paving = cells(rng, 1024, 1024, int(rng.integers(28, 60)), tint)
-    number = surfaces.texture(to_pixels(paving))
+    number = surfaces.paint(paving)
     side = 9.0
     n = int(np.ceil(reach / side))
     for i in range(-n, n):
@@ -72,7 +72,7 @@ def _structure(surfaces: Surfaces, rng: Rng, split: str) -> float:
             Style(density=110, storey=1.5, bay=1.1, depth=0.22, pilasters=kind < 0.75, same_windows=0.8), sides=sides,
         )  # fmt: skip
     base += height
-    frieze = surfaces.texture(to_pixels(buildings.wall_picture(rng, split, 256, 1024, 60)))
+    frieze = surfaces.paint(buildings.wall_picture(rng, split, 256, 1024, 60))
     surfaces.box(
         vec(-width / 2 - 0.3, -depth / 2 - 0.3, base), vec(width + 0.6, 0, 0), vec(0, depth + 0.6, 0), 0.6,
         [frieze, frieze, frieze, frieze, stone], ((0, 0, 1, 0.6),) * 5,
@@ -103,7 +103,7 @@ def _boards_and_rocks(surfaces: Surfaces, rng: Rng, split: str, reach: Real, bac
         top = foot - right * wide / 2 + vec(0, 0, tall + 0.35)
         surfaces.quad(top, right * wide, vec(0, 0, -tall), number)
         surfaces.quad(top + right * wide, -right * wide, vec(0, 0, -tall), back)
-    relief = surfaces.texture(to_pixels(buildings.wall_picture(rng, split, 256, 256, 90)))
+    relief = surfaces.paint(buildings.wall_picture(rng, split, 256, 256, 90))
     for _ in range(6):
         angle = rng.uniform(0, 360)
         foot = direction(angle) * (reach + rng.uniform(0.5, 2.5))
@@ -134,7 +134,7 @@ def surroundings(surfaces: Surfaces, rng: Rng, split: str, near: Real, far: Real
     for _ in range(9):
         at = direction(rng.uniform(0, 360)) * rng.uniform(near, far * 0.8)
         buildings.tree(surfaces, rng, at, rng.uniform(4, 8), leaf, bark)
-    metal = surfaces.texture(to_pixels(np.full((32, 32, 3), 0.3, dtype=np.float32)))
+    metal = surfaces.paint(np.full((32, 32, 3), 0.3, dtype=np.float32))
     for _ in range(4):
         buildings.post(surfaces, direction(rng.uniform(0, 360)) * near, 4.2, metal)
 
@@ -145,7 +145,7 @@ def orbit_scene(rng: Rng, split: str, shots: int, scale: Real) -> DrawnScene:
     height = _structure(surfaces, rng, split)
     ground(surfaces, rng, split, 22)
     surroundings(surfaces, rng, split, 17, 36, 8)
-    leaf_bed = surfaces.texture(to_pixels(meadow(rng, 256, 256, colour(rng, (0.2, 0.95), (0.3, 0.6), (0.4, 0.6)))))
+    leaf_bed = surfaces.paint(meadow(rng, 256, 256, colour(rng, (0.2, 0.95), (0.3, 0.6), (0.4, 0.6))))
     for _ in range(3):
         a = np.radians(rng.uniform(0, 360))
         _mound(surfaces, rng, leaf_bed, (float(6.5 * np.cos(a)), float(6.5 * np.sin(a))), 2.4, 0.7)
@@ -224,7 +224,7 @@ def _landmark(surfaces: Surfaces, rng: Rng, split: str) -> float:
         )  # fmt: skip
     for x in np.linspace(-portico / 2 + 0.5, portico / 2 - 0.5, int(rng.integers(4, 7))):
         buildings.column(surfaces, vec(float(x), -out + 0.5, 0.64), tall - 0.64, 0.42, stone)
-    banner = surfaces.texture(to_pixels(sign(rng, 96, 1024)))
+    banner = surfaces.paint(sign(rng, 96, 1024))
     surfaces.box(
         vec(-portico / 2, -out, tall), vec(portico, 0, 0), vec(0, out, 0), 1.0, [banner, block, block, block, stone],
         ((0, 0, 1, 1), (0, 0, 0.4, 0.2), (0, 0, 1, 0.2), (0, 0, 0.4, 0.2), (0, 0, 1, 1)),

@@ -357,6 +357,7 @@ def sun(azimuth: Real, elevation: Real) -> tuple[float, float, float]:
 
 # What a family makes: geometry, lights and shots; the generator draws them and keeps the matchable pairs
 
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Shot:
     """One photograph to take. `camera` is the ground truth; `moments` the cameras during a long exposure."""

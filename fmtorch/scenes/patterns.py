@@ -8,9 +8,8 @@ import string
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from fmtorch.scenes.surfaces import Floats, Pixels, Real
+from fmtorch.scenes.surfaces import Floats, Pixels, Real, Vector, to_pixels
 
 Rng = np.random.Generator
 _BORDER = 2  # points of a grid of noise beyond each side
@@ -19,11 +18,6 @@ _BORDER = 2  # points of a grid of noise beyond each side
 def rgb(red: Real, green: Real, blue: Real) -> Floats:
     """A colour (3,)."""
     return np.array([red, green, blue], dtype=np.float32)
-
-
-def to_pixels(picture: Floats) -> Pixels:
-    """[0, 1] to 8 bits."""
-    return (np.clip(picture, 0, 1) * 255 + 0.5).astype(np.uint8)
 
 
 def colour(rng: Rng, hue: tuple[Real, Real], saturation: tuple[Real, Real], value: tuple[Real, Real]) -> Floats:
@@ -193,7 +187,7 @@ def heaven(rng: Rng, cover: Real) -> Pixels:
     return to_pixels((out * (1 - veil) + shade * veil).astype(np.float32))
 
 
-def heights(rng: Rng, m: int, n: int, coarsest: int = 8) -> NDArray[np.float64]:
+def heights(rng: Rng, m: int, n: int, coarsest: int = 8) -> Vector:
     """A smooth random field (m, n) in [0, 1] for relief."""
     field = fractal(rng, m, n, coarsest, 1, 0.45).astype(np.float64)
     field -= field.min()

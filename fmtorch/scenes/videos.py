@@ -6,9 +6,9 @@ import numpy as np
 from fmtorch.scenes import patterns
 from fmtorch.scenes.buildings import Style, car, direction, foliage, front, post, statue, tree, walker
 from fmtorch.scenes.light import DrawnScene, Lens, Light, Shot, sun
-from fmtorch.scenes.patterns import Rng, colour, to_pixels
+from fmtorch.scenes.patterns import Rng, colour
 from fmtorch.scenes.raycast import Camera, calibration, look_at
-from fmtorch.scenes.surfaces import Real, Surfaces, Vector, pictures, vec
+from fmtorch.scenes.surfaces import Real, Surfaces, Vector, pictures, to_pixels, vec
 
 DRIVING_SIZE = (376, 1241)
 DRIVING_FOCAL, DRIVING_CENTRE = 718.856, (607.19, 185.22)  # KITTI odometry, sequence 00
@@ -26,15 +26,13 @@ def _road(surfaces: Surfaces, rng: Rng, length: float, half: float, walk: float)
     for y in (16, 490):
         cv2.line(road, (0, y), (1024, y), (0.75, 0.75, 0.7), 6)
     worn = (0.65 * road + 0.3 * patterns.asphalt(rng, 512, 1024)).astype(np.float32)
-    asphalts = [surfaces.texture(to_pixels(road)), surfaces.texture(to_pixels(worn))]
+    asphalts = [surfaces.paint(road), surfaces.paint(worn)]
     tiles = patterns.masonry(
         rng, 256, 512, 6, 10, colour(rng, (0.05, 0.12), (0.02, 0.15), (0.45, 0.7)), joint=0.04, vary=0.08
     )
     cobbles = patterns.cells(rng, 256, 512, 20, patterns.rgb(0.5, 0.48, 0.46))
-    stones = surfaces.texture(to_pixels(tiles if rng.random() < 0.6 else cobbles))
-    green = surfaces.texture(
-        to_pixels(patterns.meadow(rng, 512, 512, colour(rng, (0.2, 0.3), (0.4, 0.6), (0.35, 0.5))))
-    )
+    stones = surfaces.paint(tiles if rng.random() < 0.6 else cobbles)
+    green = surfaces.paint(patterns.meadow(rng, 512, 512, colour(rng, (0.2, 0.3), (0.4, 0.6), (0.35, 0.5))))
     for i in range(-1, int(np.ceil(length / STRETCH)) + 6):
         along, start = vec(STRETCH, 0, 0), i * STRETCH
         surfaces.quad(vec(start, half, 0), along, vec(0, -2 * half, 0), asphalts[int(rng.integers(2))])
@@ -74,7 +72,7 @@ def _row_of_houses(surfaces: Surfaces, rng: Rng, split: str, length: float, wall
 
 def _roadside(surfaces: Surfaces, rng: Rng, length: float, half: float, side: int) -> None:
     leaf, bark = foliage(surfaces, rng)
-    metal = surfaces.texture(to_pixels(np.full((32, 32, 3), 0.35, dtype=np.float32)))
+    metal = surfaces.paint(np.full((32, 32, 3), 0.35, dtype=np.float32))
     x = rng.uniform(0, 8)
     while x < length + 30:
         kind = rng.random()
@@ -142,9 +140,7 @@ SUBFRAMES = 6
 
 
 def _flat(surfaces: Surfaces, rng: Rng, tint: tuple[Real, Real] = (0.05, 0.15)) -> int:
-    return surfaces.texture(
-        to_pixels(patterns.plaster(rng, 256, 256, colour(rng, tint, (0.05, 0.4), (0.3, 0.85)), 0.6))
-    )
+    return surfaces.paint(patterns.plaster(rng, 256, 256, colour(rng, tint, (0.05, 0.4), (0.3, 0.85)), 0.6))
 
 
 def _room(surfaces: Surfaces, rng: Rng, half: Real, height: Real) -> None:
@@ -157,13 +153,13 @@ def _room(surfaces: Surfaces, rng: Rng, half: Real, height: Real) -> None:
     )  # fmt: skip
     number = surfaces.texture(floor)
     surfaces.quad(vec(-half, half, 0), vec(2 * half, 0, 0), vec(0, -2 * half, 0), number)
-    ceiling = surfaces.texture(to_pixels(patterns.plaster(rng, 256, 256, patterns.rgb(0.85, 0.85, 0.83), 0.3)))
+    ceiling = surfaces.paint(patterns.plaster(rng, 256, 256, patterns.rgb(0.85, 0.85, 0.83), 0.3))
     surfaces.quad(vec(-half, -half, height), vec(2 * half, 0, 0), vec(0, 2 * half, 0), ceiling)
     for k in range(4):
         inward, right = -direction(90 * k), direction(90 * k - 90)
         wall = patterns.plaster(rng, 512, 1024, tint, 0.5)
         wall[478:] = tint * 0.6
-        number = surfaces.texture(to_pixels(wall))
+        number = surfaces.paint(wall)
         surfaces.quad(-inward * half - right * half + vec(0, 0, height), right * 2 * half, vec(0, 0, -height), number)
 
 
@@ -183,7 +179,7 @@ def _turn(base: Vector, degrees: Real) -> tuple[Vector, Vector, Vector]:
 
 
 def _desk(surfaces: Surfaces, rng: Rng, split: str, centre: Vector) -> None:
-    top = surfaces.texture(to_pixels(patterns.wood(rng, 256, 512, 4, colour(rng, (0.05, 0.1), (0.3, 0.6), (0.4, 0.7)))))
+    top = surfaces.paint(patterns.wood(rng, 256, 512, 4, colour(rng, (0.05, 0.1), (0.3, 0.6), (0.4, 0.7))))
     facing = rng.uniform(-25, 25)
     _, right, back = _turn(centre, facing)
     wide, deep, tall = 1.7, 0.85, 0.74
@@ -212,9 +208,9 @@ def _desk(surfaces: Surfaces, rng: Rng, split: str, centre: Vector) -> None:
                 colour(rng, (0.04, 0.1), (0.4, 0.7), (0.4, 0.7))
                 * (1 + 0.3 * patterns.fractal(rng, 256, 256, 16, 1, 0.8))[..., None]
             )
-            statue(surfaces, rng, base, 0.42, surfaces.texture(to_pixels(fur.astype(np.float32))), detail=12)
+            statue(surfaces, rng, base, 0.42, surfaces.paint(fur.astype(np.float32)), detail=12)
         elif k < 5:
-            number = surfaces.texture(to_pixels(patterns.books(rng, 160, 256)))
+            number = surfaces.paint(patterns.books(rng, 160, 256))
             plain = _flat(surfaces, rng, (0, 1))
             surfaces.box(base, r * rng.uniform(0.2, 0.34), b * 0.17, 0.23, [number, plain, plain, plain, plain])
         else:
@@ -227,9 +223,9 @@ def _desk(surfaces: Surfaces, rng: Rng, split: str, centre: Vector) -> None:
 def _cabinet(surfaces: Surfaces, rng: Rng, base: Vector, degrees: Real) -> None:
     _, right, back = _turn(base, degrees)
     front = patterns.door(rng, 512, 300)
-    sides = surfaces.texture(to_pixels(front * 0 + patterns.plaster(rng, 512, 300, front[4, 4], 0.7)))
-    surfaces.box(base, right * 0.9, back * 0.45, 1.3, [surfaces.texture(to_pixels(front)), sides, sides, sides, sides])
-    shelf = surfaces.texture(to_pixels(patterns.books(rng, 192, 512)))
+    sides = surfaces.paint(front * 0 + patterns.plaster(rng, 512, 300, front[4, 4], 0.7))
+    surfaces.box(base, right * 0.9, back * 0.45, 1.3, [surfaces.paint(front), sides, sides, sides, sides])
+    shelf = surfaces.paint(patterns.books(rng, 192, 512))
     surfaces.box(
         base + right * 0.05 + vec(0, 0, 1.3), right * 0.8, back * 0.2, 0.26, [shelf, sides, sides, sides, sides]
     )
@@ -261,7 +257,7 @@ def indoor_scene(rng: Rng, split: str, shots: int, scale: Real) -> DrawnScene:
         surfaces, to_pixels(patterns.window(rng, 512, 420, style) * 2.2 + 0.1), 2 * int(rng.integers(2)), half, -1.2,
         1.6, 1.1,
     )  # fmt: skip
-    shelf = surfaces.texture(to_pixels(patterns.books(rng, 192, 768)))
+    shelf = surfaces.paint(patterns.books(rng, 192, 768))
     board = _flat(surfaces, rng)
     x = rng.uniform(-0.6, 0.4)
     for z in (1.25, 1.62)[: int(rng.integers(1, 3))]:
@@ -269,7 +265,7 @@ def indoor_scene(rng: Rng, split: str, shots: int, scale: Real) -> DrawnScene:
         surfaces.box(vec(x + 0.05, half - 0.2, z + 0.03), vec(0.9, 0, 0), vec(0, 0.2, 0), 0.22,
                      [shelf, board, board, board, board])  # fmt: skip
     _cabinet(surfaces, rng, vec(half - 1.2, half - 0.55, 0), rng.uniform(-6, 6))
-    rug = surfaces.texture(to_pixels(patterns.cloth(rng, 384, 512)))
+    rug = surfaces.paint(patterns.cloth(rng, 384, 512))
     surfaces.quad(vec(-1.1, half - 1.3, 0.01), vec(2.2, 0, 0), vec(0, -1.6, 0), rug)
     size = (round(SIZE[0] * scale), round(SIZE[1] * scale))
     K = calibration(FOCAL * scale, size)
