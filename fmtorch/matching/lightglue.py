@@ -50,15 +50,10 @@ class LightGlue:
             if len(shape) != 2 or shape[1] != self._length:
                 raise ValueError(f"descriptors are {shape}; for this LightGlue they must be (N, {self._length})")
         pairs, score = self._matches(features0, features1)
-        return Correspondences(
-            x0=features0.keypoints[pairs[:, 0]][None],
-            x1=features1.keypoints[pairs[:, 1]][None],
-            mask=torch.ones_like(score, dtype=torch.bool)[None],
-            score=score[None],
-            prior=score[None],
-            size0=features0.image_size[None],
-            size1=features1.image_size[None],
-        )
+        x0, x1 = features0.keypoints[pairs[:, 0]][None], features1.keypoints[pairs[:, 1]][None]
+        mask, score = torch.ones_like(score, dtype=torch.bool)[None], score[None]
+        size0, size1 = features0.image_size[None], features1.image_size[None]
+        return Correspondences(x0, x1, mask, score=score, prior=score, size0=size0, size1=size1)
 
     def _matches(self, features0: Features, features1: Features) -> tuple[Tensor, Tensor]:
         """Indices (S, 2) of the features that match, and the scores (S,)."""

@@ -231,10 +231,8 @@ def _rounded(values: Tensor, center: float, step: float, padded: int) -> tuple[T
 
 def _no_neighbors(n0: int, n1: int, padded: int) -> Nearest:
     """Nothing found: any distance improves it, but that of padding."""
-    return Nearest(
-        np.full(n0, -1), np.full(n0, np.inf), np.full(n0, np.inf), np.full(n1, -1), np.full(n1, np.inf),
-        np.full(padded, FAR - 1, np.int32),
-    )  # fmt: skip
+    rows, columns = ((np.full(n, -1), np.full(n, np.inf)) for n in (n0, n1))
+    return Nearest(*rows, np.full(n0, np.inf), *columns, np.full(padded, FAR - 1, np.int32))
 
 
 _GROUP = 32  # columns whose minimum is taken together; a group is searched only where it can hold a neighbour
@@ -302,11 +300,9 @@ def _nearest_neighbors(
     mask0, mask1 = _finite(flat0, mask0), _finite(flat1, mask1)
     by_pair = [_match_one_pair(*pair, chunk) for pair in zip(flat0, flat1, mask0, mask1, strict=True)]
     if not by_pair:
-        by_pair = [_nothing(descriptors0, n0, n1)]
-        return Neighbors(*(column.expand(*batch, -1) for column in by_pair[0]))
-    return Neighbors(
-        *(torch.stack(column).reshape(*batch, column[0].shape[-1]) for column in zip(*by_pair, strict=True))
-    )
+        return Neighbors(*(column.expand(*batch, -1) for column in _nothing(descriptors0, n0, n1)))
+    columns = [torch.stack(column) for column in zip(*by_pair, strict=True)]
+    return Neighbors(*(column.reshape(*batch, column.shape[-1]) for column in columns))
 
 
 def _finite(flat: Tensor, mask: Tensor | None) -> Tensor:
@@ -328,22 +324,20 @@ def _match_one_pair(d0: Tensor, d1: Tensor, mask0: Tensor, mask1: Tensor, chunk:
     if len(slots0) == 0 or len(slots1) == 0:
         return result
     rows, columns, unit = _integers(d0[slots0], d1[slots1])
-    nearest, reverse = _compiled(rows, columns) or _two_nearest(rows, columns, chunk)
-    result.nearest[slots0] = slots1[nearest.column]
-    result.distance[slots0] = (sqrt(nearest.squared.double()) * unit).float()
-    result.second[slots0] = (sqrt(nearest.second_squared.double()) * unit).float()
-    result.reverse[slots1] = slots0[reverse]
+    (nearest, *squared), reverse = _compiled(rows, columns) or _two_nearest(rows, columns, chunk)
+    result.nearest[slots0], result.reverse[slots1] = slots1[nearest], slots0[reverse]
+    for distance, values in zip((result.distance, result.second), squared, strict=True):
+        distance[slots0] = (sqrt(values.double()) * unit).float()
     return result
 
 
-def _compiled(rows: Tensor, columns: Tensor) -> tuple[_Nearest, Tensor] | None:
+def _compiled(rows: Tensor, columns: Tensor) -> tuple[list[Tensor], Tensor] | None:
     """`_two_nearest` by kernels, None where they do not serve."""
-    served = rows.device.type == "cpu" and available()
-    neighbors = two_nearest(rows, columns) if served else None
+    neighbors = two_nearest(rows, columns) if rows.device.type == "cpu" and available() else None
     if neighbors is None:
         return None
-    tensors = (torch.from_numpy(value) for value in (neighbors.nearest, neighbors.squared, neighbors.second_squared))
-    return _Nearest(*tensors), torch.from_numpy(neighbors.reverse)
+    tensors = [torch.from_numpy(values) for values in neighbors[:4]]
+    return tensors[:3], tensors[3]
 
 
 def _integers(d0: Tensor, d1: Tensor) -> tuple[Tensor, Tensor, float]:
@@ -364,14 +358,8 @@ def _longest(d: Tensor) -> float:
     return float(sqrt(stable_sum(d[norms >= norms.max() * (1 - _ROUNDING)].double().square())).max())
 
 
-class _Nearest(NamedTuple):
-    column: Tensor
-    squared: Tensor
-    second_squared: Tensor
-
-
-def _two_nearest(rows: Tensor, columns: Tensor, chunk: int) -> tuple[_Nearest, Tensor]:
-    """Two nearest columns of every row and the nearest row of every column, by exact squared distances.
+def _two_nearest(rows: Tensor, columns: Tensor, chunk: int) -> tuple[list[Tensor], Tensor]:
+    """Of every row the nearest column, its and the second's squared distance; of every column the nearest row. Exact.
 
     |a - b|^2 = [a, |a|^2, 1] . [-2 b, 1, |b|^2]: one product a block, padded to whole groups with infinite columns.
     """
@@ -393,10 +381,10 @@ def _two_nearest(rows: Tensor, columns: Tensor, chunk: int) -> tuple[_Nearest, T
         reverse[improved] = squared[:, improved].argmin(0) + start
         best_of_column = torch.minimum(best_of_column, block_best)
         blocks.append(_two_smallest(squared))
-    return _Nearest(*(torch.cat(column) for column in zip(*blocks, strict=True))), reverse[:n1]
+    return [torch.cat(column) for column in zip(*blocks, strict=True)], reverse[:n1]
 
 
-def _two_smallest(squared: Tensor) -> _Nearest:
+def _two_smallest(squared: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Of every row the first index of its smallest value, that value and the second smallest.
 
     The minima of groups of columns lead to the group with the smallest value; the second smallest is in the same
@@ -410,4 +398,4 @@ def _two_smallest(squared: Tensor) -> _Nearest:
     best = members.gather(1, member)
     rest = members.scatter(1, member, math.inf).amin(1, keepdim=True)
     second = minima.scatter(1, group, rest).amin(1)
-    return _Nearest((group * _GROUP + member)[:, 0], best[:, 0], second)
+    return (group * _GROUP + member)[:, 0], best[:, 0], second

@@ -1,14 +1,15 @@
 """The families of landmarks: a walk round a structure after Tanks and Temples, and photographs of a place after CPC."""
 
+from collections import Counter
 from typing import Literal
 
 import numpy as np
 
 from fmtorch.scenes import buildings
 from fmtorch.scenes.buildings import Style, direction
-from fmtorch.scenes.light import DrawnScene, Lens, Light, Shot, sun
+from fmtorch.scenes.light import DrawnScene, Lens, Light, Shot, shuffled_pairs, sun
 from fmtorch.scenes.patterns import Rng, cells, colour, heaven, heights, masonry, meadow, poster, sign
-from fmtorch.scenes.raycast import calibration, look_at
+from fmtorch.scenes.raycast import calibration, look_at, scaled_camera
 from fmtorch.scenes.surfaces import Real, Surfaces, material, pictures, to_pixels, vec
 
 SIZE = (540, 960)
@@ -80,9 +81,9 @@ def _structure(surfaces: Surfaces, rng: Rng, split: str) -> float:
     base += 0.6
     if rng.random() < 0.5:  # a dome
         r = 0.36 * min(width, depth)
-        profile = [(0.0, r * 1.05), (0.4, r)] + [
-            (0.4 + r * float(np.sin(a)), r * float(np.cos(a)) + 1e-3) for a in np.linspace(0.1, np.pi / 2, 7)
-        ]
+        angles = np.linspace(0.1, np.pi / 2, 7)
+        cap = [(0.4 + r * float(np.sin(a)), r * float(np.cos(a)) + 1e-3) for a in angles]
+        profile = [(0.0, r * 1.05), (0.4, r), *cap]
         surfaces.lathe(vec(0, 0, base), profile, block, sides=16, repeat=(2, 1))
     else:
         buildings.statue(surfaces, rng, vec(0, 0, base), 2.2, stone)
@@ -151,13 +152,11 @@ def orbit_scene(rng: Rng, split: str, shots: int, scale: Real) -> DrawnScene:
         _mound(surfaces, rng, leaf_bed, (float(6.5 * np.cos(a)), float(6.5 * np.sin(a))), 2.4, 0.7)
     leaf, bark = buildings.foliage(surfaces, rng)
     for _ in range(5):
-        buildings.tree(
-            surfaces, rng, direction(rng.uniform(0, 360)) * rng.uniform(6.0, 8.5), rng.uniform(2.2, 3.6), leaf, bark
-        )
+        foot = direction(rng.uniform(0, 360)) * rng.uniform(6.0, 8.5)
+        buildings.tree(surfaces, rng, foot, rng.uniform(2.2, 3.6), leaf, bark)
     for _ in range(6):
         buildings.walker(surfaces, rng, direction(rng.uniform(0, 360)) * rng.uniform(5, 8), rng.uniform(0, 360))
-    size = (round(SIZE[0] * scale), round(SIZE[1] * scale))
-    K = calibration(FOCAL * scale, size)
+    K, size = scaled_camera(FOCAL, SIZE, scale)
     arc = min(360.0, 20.0 * shots)
     start = rng.uniform(0, 360)
     azimuth = start + arc * (np.arange(shots) + rng.uniform(-0.3, 0.3, shots)) / shots
@@ -171,15 +170,12 @@ def orbit_scene(rng: Rng, split: str, shots: int, scale: Real) -> DrawnScene:
         taken.append(Shot(camera, lens, jpeg=88))
     light = Light(sun(rng.uniform(0, 360), rng.uniform(30, 65)))
     apart = np.abs((azimuth[:, None] - azimuth[None] + 180) % 360 - 180)
-    pairs = [(i, j) for i in range(shots) for j in range(i + 1, shots) if ANGLES[0] <= apart[i, j] <= ANGLES[1]]
     # Wide before narrow within each round, so that the pairs kept spread evenly over the angles.
-    width = (ANGLES[1] - ANGLES[0]) / 4
-    rounds: dict[int, int] = {}
-    order = []
-    for k in rng.permutation(len(pairs)):
-        step = int((apart[pairs[k]] - ANGLES[0]) / width)
-        rounds[step] = rounds.get(step, 0) + 1
-        order.append((rounds[step], -step, pairs[k]))
+    width, rounds, order = (ANGLES[1] - ANGLES[0]) / 4, Counter[int](), []
+    for pair in shuffled_pairs(rng, shots, lambda i, j: bool(ANGLES[0] <= apart[i, j] <= ANGLES[1])):
+        step = int((apart[pair] - ANGLES[0]) / width)
+        rounds[step] += 1
+        order.append((rounds[step], -step, pair))
     sky = heaven(rng, rng.uniform(-0.4, 0.6))
     return DrawnScene([surfaces], [light], sky, taken, [pair for _, _, pair in sorted(order)])
 
@@ -236,16 +232,13 @@ def _landmark(surfaces: Surfaces, rng: Rng, split: str) -> float:
                   Style(density=52, storey=4.0, bay=2.5, depth=0.35))  # fmt: skip
     for x in np.linspace(-width / 2 + 2, width / 2 - 2, 6):
         if abs(x) > portico / 2 + 1.5:
-            surfaces.box(
-                vec(x - 0.7, -3.6, 0), vec(1.4, 0, 0), vec(0, 1.4, 0), 1.6, [block] * 5, ((0, 0, 0.25, 0.4),) * 5
-            )
+            foot, window = vec(x - 0.7, -3.6, 0), (0, 0, 0.25, 0.4)
+            surfaces.box(foot, vec(1.4, 0, 0), vec(0, 1.4, 0), 1.6, [block] * 5, (window,) * 5)
             buildings.statue(surfaces, rng, vec(x, -2.9, 1.6), 2.6, stone, detail=12)
     for picture in pictures(split, rng, 2):
-        x = rng.uniform(-width / 2 + 1, width / 2 - 4)
-        wide = 2.4
-        tall_picture = wide * picture.shape[0] / picture.shape[1]
-        number = surfaces.texture(picture)
-        surfaces.quad(vec(x, -0.5, 1.4 + tall_picture), vec(wide, 0, 0), vec(0, 0, -tall_picture), number)
+        x, wide = rng.uniform(-width / 2 + 1, width / 2 - 4), 2.4
+        high = wide * picture.shape[0] / picture.shape[1]
+        surfaces.quad(vec(x, -0.5, 1.4 + high), vec(wide, 0, 0), vec(0, 0, -high), surfaces.texture(picture))
     return width
 
 
@@ -256,9 +249,8 @@ def collection_scene(rng: Rng, split: str, shots: int, scale: Real) -> DrawnScen
     _surroundings(fixed, rng, split, width)
     lights, surfaces = _times_of_day(fixed, rng, width)
     taken = [_photograph(rng, width, scale, light=i % LIGHTS) for i in range(shots)]
-    pairs = [(i, j) for i in range(shots) for j in range(i + 1, shots)]
     sky = heaven(rng, rng.uniform(-0.3, 0.7))
-    return DrawnScene(surfaces, lights, sky, taken, [pairs[k] for k in rng.permutation(len(pairs))])
+    return DrawnScene(surfaces, lights, sky, taken, shuffled_pairs(rng, shots))
 
 
 def _surroundings(surfaces: Surfaces, rng: Rng, split: str, width: Real) -> None:

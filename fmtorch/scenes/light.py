@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+import itertools
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import cv2
@@ -334,9 +335,8 @@ def develop(linear: Floats, lens: Lens, rng: np.random.Generator) -> Pixels:
     if lens.blur > 0:
         linear = cv2.GaussianBlur(linear, (0, 0), lens.blur).astype(np.float32)
     y, x = np.linspace(-1, 1, h, dtype=np.float32)[:, None], np.linspace(-1, 1, w, dtype=np.float32)
-    linear = (
-        linear * (1 - np.float32(lens.vignette) * (x * x + y * y))[..., None] * np.array(lens.balance, dtype=np.float32)
-    )
+    darkening = (1 - np.float32(lens.vignette) * (x * x + y * y))[..., None]
+    linear = linear * darkening * np.array(lens.balance, dtype=np.float32)
     if lens.grey:
         linear = (linear @ np.array([0.2126, 0.7152, 0.0722], dtype=np.float32))[..., None]
     # A shoulder instead of clipping, as film and cameras have it.
@@ -381,3 +381,11 @@ class DrawnScene:
     sky: Pixels
     shots: Sequence[Shot]
     pairs: Sequence[tuple[int, int]]
+
+
+def shuffled_pairs(
+    rng: np.random.Generator, shots: int, allowed: Callable[[int, int], bool] = lambda i, j: True
+) -> list[tuple[int, int]]:
+    """The pairs of shots that are allowed, in random order."""
+    pairs = [(i, j) for i, j in itertools.combinations(range(shots), 2) if allowed(i, j)]
+    return [pairs[k] for k in rng.permutation(len(pairs))]

@@ -59,6 +59,16 @@ def calibration(focal: Real, size: tuple[int, int], centre: tuple[float, float] 
     return np.array([[focal, 0.0, cx], [0.0, focal, cy], [0.0, 0.0, 1.0]])
 
 
+def scaled_camera(
+    focal: Real, size: tuple[int, int], scale: Real, centre: tuple[float, float] | None = None
+) -> tuple[Matrix, tuple[int, int]]:
+    """K and the size (h, w) of an image of a camera, in pixels, that is scaled."""
+    scaled = round(size[0] * scale), round(size[1] * scale)
+    return calibration(
+        focal * scale, scaled, None if centre is None else (centre[0] * scale, centre[1] * scale)
+    ), scaled
+
+
 def look_at(
     K: Matrix, size: tuple[int, int], centre: Sequence[Real], target: Sequence[Real], roll: Real = 0.0
 ) -> Camera:
