@@ -318,8 +318,9 @@ def _inverted(lens: Lens, target: Matrix) -> Matrix:
         size = np.hypot(error[:, 0], error[:, 1])
         if not (size > TOLERANCE).any():
             break
-        jacobian = np.stack([(distort(x + step) - distort(x - step)) / (2 * STEP) for step in STEP * np.eye(2)], -1)
-        move = _solved(jacobian, error)
+        J = np.stack([(distort(x + step) - distort(x - step)) / (2 * STEP) for step in STEP * np.eye(2)], -1)
+        (a, b), (c, d), (u, v) = (J[:, 0].T, J[:, 1].T, error.T)
+        move = np.stack([d * u - b * v, a * v - c * u], -1) / (a * d - b * c)[:, None]
         for share in (1.0, 0.25, 0.0625):  # shorter where the error would grow
             trial = x - share * move
             left = distort(trial) - target
@@ -330,13 +331,6 @@ def _inverted(lens: Lens, target: Matrix) -> Matrix:
     outwards = (np.diff(along, axis=0) * x).sum(-1) > 0
     valid = (np.hypot(error[:, 0], error[:, 1]) <= TOLERANCE) & (outwards.all(0) | ~x.any(1))
     return np.where(valid[:, None], x, np.nan)
-
-
-def _solved(J: Matrix, b: Matrix) -> Matrix:
-    det = J[:, 0, 0] * J[:, 1, 1] - J[:, 0, 1] * J[:, 1, 0]
-    x = J[:, 1, 1] * b[:, 0] - J[:, 0, 1] * b[:, 1]
-    y = J[:, 0, 0] * b[:, 1] - J[:, 1, 0] * b[:, 0]
-    return np.stack([x, y], -1) / det[:, None]
 
 
 # Photographs as a pinhole of the same focal lengths and principal point would have taken them

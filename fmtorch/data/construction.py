@@ -36,10 +36,8 @@ def overlap_of(dataset: ScenePairs) -> "DepthOverlap | PointOverlap":
         return DepthOverlap(dataset)
     if dataset.points is not None:
         return PointOverlap(dataset.points)
-    raise ValueError(
-        f"overlap needs depth or the points of a reconstruction and dataset={dataset.name} has neither; it must be "
-        "rendered, colmap, bundler, or tum with depth images"
-    )
+    needed = f"overlap needs depth or the points of a reconstruction and dataset={dataset.name} has neither"
+    raise ValueError(f"{needed}; it must be rendered, colmap, bundler, or tum with depth images")
 
 
 class PointOverlap:
@@ -104,7 +102,11 @@ class DepthOverlap:
         return min(seen_share(a, b, pair.R, pair.t), seen_share(b, a, pair.R.T, -pair.R.T @ pair.t))
 
     def _seen(self, view: View) -> Seen:
-        return Seen(view.K, _size(view.image), functools.partial(self._depth, view.image))
+        size = view.image.size
+        if size is None:
+            height, width = read_image(view.image).shape[:2]
+            size = height, width
+        return Seen(view.K, size, functools.partial(self._depth, view.image))
 
 
 def seen_share(image: Seen, other: Seen, R: Matrix, t: Matrix, step: int = STEP) -> float:
@@ -136,13 +138,6 @@ def seen_share(image: Seen, other: Seen, R: Matrix, t: Matrix, step: int = STEP)
     same = np.abs(known - ahead[within, 2]) <= TOLERANCE * known
     count = len(X) - unknown.sum()
     return float(same.sum() / count) if count else 0.0
-
-
-def _size(image: ImageSource) -> tuple[int, int]:
-    if image.size is not None:
-        return image.size
-    h, w = read_image(image).shape[:2]
-    return h, w
 
 
 SIFT_FEATURES, RATIO, NEAR_LINE, ENOUGH = 8000, 0.8, 1.0, 20
@@ -290,8 +285,10 @@ class Construction:
 
     def write_image(self, scene: int, number: int) -> None:
         """Write one image of a scene unless it is there: the file itself, or as JPEG what was undistorted."""
-        source = self.dataset.scenes[scene].views[number].image
-        target = self._image(scene, number)
+        drawn = self.dataset.scenes[scene]
+        source = drawn.views[number].image
+        suffix = source.path.suffix if _as_it_is(source) else SUFFIXES[0]
+        target = self.folder / drawn.name / IMAGES / f"{number:08d}{suffix}"
         if target.is_file():
             return
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -335,11 +332,6 @@ class Construction:
         for name, text in ((CAMERAS, lines), ("names.txt", names)):
             with replacing(self.folder / scene.name / name) as path:
                 path.write_text("".join(text), encoding="utf-8")
-
-    def _image(self, scene: int, number: int) -> Path:
-        source = self.dataset.scenes[scene].views[number].image
-        suffix = source.path.suffix if _as_it_is(source) else SUFFIXES[0]
-        return self.folder / self.dataset.scenes[scene].name / IMAGES / f"{number:08d}{suffix}"
 
     def _keypoints(self, image: ImageSource) -> Keypoints:
         """SIFT of an image, from the work folder where it is there; descriptors are whole numbers up to 255."""

@@ -141,7 +141,7 @@ class FMBenchPairs(HeldPairs):
     ) -> ImagePair:
         left, right = (_image_number(line, value) for value in row[:2])
         F, problems = _normalized(row[2:].reshape(3, 3))
-        sources = []
+        sources = list[ImageSource]()
         for stem in (f"{left:08d}", f"{right:08d}"):
             path = images.get(stem, folder / scene / IMAGES / f"{stem}{SUFFIXES[0]}")
             sources.append(ImageSource(f"{folder.name}/{scene}/{stem}", path))
@@ -149,7 +149,7 @@ class FMBenchPairs(HeldPairs):
                 problems.append(f"no image {path} (or {SUFFIXES[1]})")
         identity = files.numbered_again(f"{folder.name}/{scene}/{left}-{right}", self._seen)
         problem = f"{line}: {'; '.join(problems)}" if problems else None
-        pair = ImagePair(identity, folder.name, scene, *sources, F, problem=problem)
+        pair = ImagePair(identity, folder.name, scene, sources[0], sources[1], F, problem=problem)
         if cameras is None:
             return pair
         if max(left, right) >= len(cameras):

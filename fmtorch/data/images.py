@@ -168,7 +168,7 @@ def _heic(path: Path, data: bytes) -> Array:
 def _eight_bits(path: Path, image: Array) -> Pixels:
     """An image of any depth with its own range as 0 to 255."""
     if image.dtype == np.uint8:
-        return image  # type: ignore[return-value]
+        return image
     values = image.astype(np.float64)
     known = np.isfinite(values)
     if not known.any():

@@ -207,7 +207,7 @@ def read_grey(path: Path) -> Array:
     pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     if pixels is None or pixels.dtype != np.uint16 or pixels.ndim != 2:
         raise ImageError(f"{path}: it must be a depth image, grey with 16 bits")
-    return pixels  # type: ignore[return-value]
+    return pixels
 
 
 @functools.lru_cache(maxsize=_KEPT)

@@ -46,7 +46,7 @@ def refined_maxima(volume: Float[Tensor, "s h w"], seeds: Int[Tensor, "m 3"], th
     at, offset, value = (torch.cat(parts) for parts in zip(*chunks, strict=True))
     kept = value > threshold
     at, offset, value = at[kept], offset[kept], value[kept]
-    first = _first_of_each(_linear(volume, at))
+    first = np.sort(np.unique(_linear(volume, at).numpy(), return_index=True)[1])
     return Peaks(at[first].double() + offset[first], value[first])
 
 
@@ -117,14 +117,6 @@ def _quadratic(v: Float[Tensor, "27 m"]) -> tuple[Tensor, Tensor, Tensor]:
     dx = (cofactors[2] * gs + (sy * sx - ss * yx) * gy + minor * gx) / safe
     value = c + 0.5 * (gs * ds + gy * dy + gx * dx)
     return torch.stack([ds, dy, dx], 1), value.to(v.dtype), peaked
-
-
-def _first_of_each(key: Tensor) -> Tensor:
-    """Indices, in order, of the first occurrence of each key."""
-    order = torch.argsort(key, stable=True)
-    first = torch.ones_like(order, dtype=torch.bool)
-    first[1:] = key[order[1:]] != key[order[:-1]]
-    return order[first].sort().values
 
 
 # The image filters of the detector, through OpenCV

@@ -13,6 +13,7 @@ from fmtorch.core.options import Within
 from fmtorch.core.types import Features
 from fmtorch.features.frames import DominantGradient, NetworkOrientation, NetworkShape, PatchFunction
 from fmtorch.features.hessian import HessianDetector
+from fmtorch.features.onnx_network import PatchNetwork, network_file
 from fmtorch.features.patches import Image, ImagePyramid
 from fmtorch.features.sift import SIFT, PatchSIFT, RootSIFTPCA, as_grey
 
@@ -135,10 +136,9 @@ def local_feature(
     """
     if precision not in ("fp32", "int8"):
         raise ValueError(f"precision={precision}: it must be fp32 or int8")
-    load = functools.partial(_network, precision=precision, threads=threads)
 
     def by(part: Callable[[PatchFunction], Part], name: str) -> Callable[..., Part]:
-        return lambda network=name: part(load(network))
+        return lambda network=name: part(PatchNetwork(network_file(network, precision), threads=threads))
 
     detectors: dict[str, Callable[..., Detector]] = {
         "dog": functools.partial(SIFT, max_features=max_features),
@@ -169,10 +169,3 @@ def _part(kind: str, choice: Choice, known: Mapping[str, Callable[..., Part]]) -
         return known[str(name)](**options)
     except TypeError as error:
         raise ValueError(f"{kind}={name}: {error}") from error
-
-
-def _network(name: str, precision: str, threads: int) -> PatchFunction:
-    """The network of models/ under this name."""
-    from fmtorch.features.onnx_network import PatchNetwork, network_file
-
-    return PatchNetwork(network_file(name, precision), threads=threads)

@@ -68,9 +68,8 @@ class SIFT:
         return lafs, scores
 
     def _opencv(self) -> cv2.SIFT:
-        thresholds = {"contrastThreshold": self.contrast_threshold, "edgeThreshold": self.edge_threshold}
-        upscale = self.precise_upscale
-        return cv2.SIFT.create(self.max_features, sigma=self.sigma, enable_precise_upscale=upscale, **thresholds)
+        thresholds, upscale = (self.contrast_threshold, self.edge_threshold), self.precise_upscale
+        return cv2.SIFT.create(self.max_features, 3, *thresholds, self.sigma, enable_precise_upscale=upscale)
 
     def _reduced(self, grey: Image) -> Image:
         """The image, or a smaller one of at most `max_pixels`."""

@@ -175,7 +175,9 @@ def database_image(name: str, camera: Any, keypoints: Singles) -> DatabaseImage:
     wrong = calibration_problems(torch.from_numpy(K)[None], torch.tensor([size]), "its calibration")[0]
     pinhole = points
     if lens.bends and not (absurd or wrong):
-        pinhole = _undistorted(camera, K, keypoints[:, :2]).astype(np.float32)
+        pixels = np.ascontiguousarray(keypoints[:, :2], np.float64)
+        rays = np.asarray(camera.cam_from_img(pixels), np.float64).reshape(-1, 2)
+        pinhole = (rays @ K[:2, :2].T + K[:2, 2]).astype(np.float32)
     problem = f"{whose}: {wrong}" if wrong else ""
     return DatabaseImage(name, camera.camera_id, size, K, deviation, points, pinhole, problem, warning)
 
@@ -187,12 +189,6 @@ def _deviation(camera: Any, lens: Lens, K: Matrix) -> float:
     centre = ((camera.width - 1) / 2, (camera.height - 1) / 2)
     usual = lens.fx == lens.fy and tuple(K[:2, 2]) == centre and not any(lens.coefficients)
     return EXIF_DEVIATION if usual else 0.0
-
-
-def _undistorted(camera: Any, K: Matrix, points: Array) -> Matrix:
-    """Pixels (n, 2) of a pinhole for COLMAP's pixels (n, 2) of the photograph."""
-    rays = np.asarray(camera.cam_from_img(np.ascontiguousarray(points, np.float64)), np.float64).reshape(-1, 2)
-    return np.asarray(rays @ K[:2, :2].T + K[:2, 2])
 
 
 # A COLMAP database of anyone's keypoints and matches: read pair by pair, and given two-view geometries

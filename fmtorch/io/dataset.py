@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import functools
 import hashlib
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from fmtorch.data import DataError, FMBenchPairs, GivenMatches, ImagePair, ImageSource, PairDataset, stored_size
+from fmtorch.data import DataError, FMBenchPairs, GivenMatches, ImagePair, ImageSource, stored_size
 from fmtorch.data.files import Matrix, given_root
 from fmtorch.data.pairs import HeldPairs
 from fmtorch.io import h5, predictions
@@ -206,11 +207,6 @@ def _pairs(root: Path, images: Path | None, keys_of: Callable[[Any], list[str]],
                 yield from predictions.with_fundamentals([pair])
 
 
-def posebench_pairs(root: Path, images: Path | None) -> Iterator[ImagePair]:
-    """The pairs of a file, or of all files of a folder."""
-    yield from _pairs(root, images, h5.keys, _posebench_pair)
-
-
 def _posebench_pair(file: Any, path: Path, key: str, sources: Sources) -> Stored:
     (K0, size0), (K1, size1) = (_camera(file, path, f"{key}/camera{i}", s) for i, s in enumerate(sources, start=1))
     R, t = h5.reshaped(file, f"{key}/R", 3, 3), h5.reshaped(file, f"{key}/t", 3)
@@ -272,11 +268,6 @@ class OANetMatches:
         return values
 
 
-def oanet_pairs(root: Path, images: Path | None) -> Iterator[ImagePair]:
-    """The pairs of a file, or of all files of a folder."""
-    yield from _pairs(root, images, _oanet_keys, _oanet_pair)
-
-
 def _oanet_keys(file: Any) -> list[str]:
     if not h5.holds(file, "xs"):
         raise DataError(f"{file.filename}: 'xs' is missing; it is no file of OANet's layout")
@@ -306,8 +297,10 @@ def _pinhole(fx: float, fy: float, cx: float, cy: float) -> Matrix:
 
 CORNER = 0.5  # where glue-factory puts the centre of the first pixel
 WITH_GEOMETRY: Mapping[str, Callable[[Path, Path | None], Iterator[ImagePair]]] = {
-    "ransac_tutorial": tutorial_pairs, "posebench": posebench_pairs, "oanet": oanet_pairs,
-}  # fmt: skip
+    "ransac_tutorial": tutorial_pairs,
+    "posebench": functools.partial(_pairs, keys_of=h5.keys, read=_posebench_pair),
+    "oanet": functools.partial(_pairs, keys_of=_oanet_keys, read=_oanet_pair),
+}
 WITHOUT_GEOMETRY = {"hloc": 0.0, "glue_factory": CORNER, "vismatch": 0.0}
 """Layouts that hold matches alone, and where they put the centre of the first pixel."""
 LAYOUTS = (*WITHOUT_GEOMETRY, *WITH_GEOMETRY)
@@ -353,7 +346,10 @@ class H5Pairs(HeldPairs):
             files = tutorial_files(folder) if layout == "ransac_tutorial" else h5.files(folder)
         else:
             _expect_unset(layout, images=images)
-            known = _truth(layout, truth)
+            if truth is None:
+                needed = "give dataset.truth=DIR, the `fmbench` set that it was computed on"
+                raise DataError(f"layout {layout} holds no geometry: {needed}")
+            known = FMBenchPairs(truth)
             digest.update(known.digest.encode())
             offset = WITHOUT_GEOMETRY[layout] if origin is None else origin
             if layout == "hloc":
@@ -368,13 +364,6 @@ class H5Pairs(HeldPairs):
         if not self._pairs:
             raise DataError(f"{folder}: holds no pairs")
         self.digest = digest.hexdigest()
-
-
-def _truth(layout: str, truth: str | Path | None) -> PairDataset:
-    if truth is None:
-        needed = "give dataset.truth=DIR, the `fmbench` set that it was computed on"
-        raise DataError(f"layout {layout} holds no geometry: {needed}")
-    return FMBenchPairs(truth)
 
 
 def _expect_distinct(pairs: list[ImagePair], folder: Path) -> None:

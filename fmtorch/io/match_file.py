@@ -97,8 +97,9 @@ class HlocMatches(_OpenFiles):
                 second = np.full(len(self._second(pair)), NO_MATCH, np.int32)
                 second[geometry.inliers[:, 0]] = geometry.inliers[:, 1]
                 group["matches0"] = second
-                scores = self._scores(pair)
-                if scores is not None:
+                key = f"{self._keys[pair]}/matching_scores0"
+                if h5.holds(self._matches, key):
+                    scores = h5.numbers(self._matches, key, None)
                     group["matching_scores0"] = np.where(second == NO_MATCH, 0, scores).astype(np.float32)
                 write_geometry(group, geometry)
 
@@ -115,10 +116,6 @@ class HlocMatches(_OpenFiles):
         if values.dtype.kind not in "iu":
             raise DataError(f"matches0 is of {values.dtype}; it must hold whole numbers")
         return values.astype(np.int64)
-
-    def _scores(self, pair: Names) -> Matrix | None:
-        key = f"{self._keys[pair]}/matching_scores0"
-        return h5.numbers(self._matches, key, None) if h5.holds(self._matches, key) else None
 
     def _image(self, name: str) -> DatabaseImage:
         points = h5.numbers(self._features, f"{name}/keypoints", None, 2).astype(np.float32)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -45,20 +44,12 @@ def for_each_pair(
 
 def _array(tensor: Tensor | None, kind: torch.dtype, pairs: int) -> NDArray[Any]:
     if tensor is None:
-        return np.empty((pairs, 0), _numpy(kind))
+        return np.empty((pairs, 0), torch.empty(0, dtype=kind).numpy().dtype)
     if tensor.is_floating_point() and tensor.dtype != kind:
         tensor = tensor.to(kind)
-    array: NDArray[Any] = as_array(tensor.cpu().contiguous())
-    return array
-
-
-@functools.cache
-def _numpy(kind: torch.dtype) -> Any:
-    """NumPy's name of a type of torch's."""
-    return torch.empty(0, dtype=kind).numpy().dtype
+    return as_array(tensor.cpu().contiguous())
 
 
 def as_array(tensor: Tensor) -> NDArray[Any]:
     """A tensor on the CPU as an array, a view, on no graph."""
-    array: NDArray[Any] = (tensor.detach() if tensor.requires_grad else tensor).numpy()
-    return array
+    return (tensor.detach() if tensor.requires_grad else tensor).numpy()

@@ -32,7 +32,7 @@ from typing import Any
 
 import numpy as np
 
-from fmtorch.core.files import cache_dir
+from fmtorch.core.files import cache_dir, replacing
 from fmtorch.jit import linking
 
 Function = Callable[..., Any]
@@ -88,10 +88,8 @@ def _code(code: types.CodeType, docstring: str | None = None) -> tuple[Any, ...]
 
 def _names(code: types.CodeType) -> list[str]:
     """All names in code, attributes among them, and in the code within it."""
-    return [
-        *code.co_names,
-        *(name for each in code.co_consts if isinstance(each, types.CodeType) for name in _names(each)),
-    ]
+    within = [each for each in code.co_consts if isinstance(each, types.CodeType)]
+    return [*code.co_names, *(name for each in within for name in _names(each))]
 
 
 def _global_names(code: types.CodeType) -> list[str]:
@@ -159,9 +157,8 @@ def named_by_version(function: Function, version: str) -> Function:
     """
     untyped: Any = function
     name = f"{untyped.__qualname__}_{version[:16]}"
-    named = types.FunctionType(
-        untyped.__code__, untyped.__globals__, untyped.__name__, untyped.__defaults__, untyped.__closure__
-    )
+    taken = (untyped.__code__, untyped.__globals__, untyped.__name__, untyped.__defaults__, untyped.__closure__)
+    named = types.FunctionType(*taken)
     named.__kwdefaults__, named.__module__, named.__qualname__ = untyped.__kwdefaults__, untyped.__module__, name
     return named
 
@@ -298,7 +295,10 @@ class KernelFile:
             data = dumps(_alone(result))
             self.calls = linking.called(data)
             if self.path is not None and not result._asdict()["library"].has_dynamic_globals:
-                _write(self.path, _signature(data) + data)
+                with replacing(self.path) as temporary:
+                    temporary.write_bytes(_signature(data) + data)
+        except OSError as error:
+            warnings.warn(f"compiled kernels are not kept: {error}", stacklevel=2)
         finally:
             self._release()
 
@@ -348,16 +348,6 @@ def _alone(result: Any) -> Any:
     return (library, kind, (code, defined.as_bitcode())), *rest, used
 
 
-def _write(path: Path, data: bytes) -> None:
-    from fmtorch.core.files import replacing
-
-    try:
-        with replacing(path) as temporary:
-            temporary.write_bytes(data)
-    except OSError as error:
-        warnings.warn(f"compiled kernels are not kept: {error}", stacklevel=3)
-
-
 def _of(signature: Any, result: Any) -> Any:
     """A compiled function by the types of this process: a group of a script or a notebook is another class in each."""
     from numba.core import sigutils
@@ -372,4 +362,4 @@ def _signature(data: bytes) -> bytes:
 
 
 def _hex(data: bytes) -> str:
-    return hashlib.blake2b(data, digest_size=16).hexdigest()
+    return _signature(data).hex()

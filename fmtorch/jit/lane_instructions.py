@@ -85,10 +85,6 @@ def _lowered(function: Any, instruction: Callable[[Any, Any, Any], Any]) -> None
     lower_builtin(function, LanesType, LanesType)(code)
 
 
-def _arithmetic(name: str) -> Callable[[Any, Any, Any], Any]:
-    return lambda builder, a, b: getattr(builder, name)(a, b)
-
-
 def _comparison(sign: str) -> Callable[[Any, Any, Any], Any]:
     ordered = sign != "!="  # a number differs from what is none
     return lambda builder, a, b: (builder.fcmp_ordered if ordered else builder.fcmp_unordered)(sign, a, b)
@@ -97,7 +93,7 @@ def _comparison(sign: str) -> Callable[[Any, Any, Any], Any]:
 for _name, _instruction in ARITHMETIC.items():
     for _function in (getattr(operator, _name), getattr(operator, f"i{_name}")):
         _typed(_function, lambda kind: kind)
-        _lowered(_function, _arithmetic(_instruction))
+        _lowered(_function, lambda builder, a, b, name=_instruction: getattr(builder, name)(a, b))
 for _name, _sign in COMPARISONS.items():
     _typed(getattr(operator, _name), lambda kind: kind.mask)
     _lowered(getattr(operator, _name), _comparison(_sign))
@@ -176,90 +172,61 @@ def fill(count: int) -> Any:
     return of_number
 
 
-def store() -> Any:
+@intrinsic  # type: ignore[untyped-decorator]
+def store(context: Any, A: Any, row: Any, value: Any) -> Any:
     """`lanes.store`."""
+    if A.dtype != value.dtype:
+        raise numba.TypingError(f"{value} cannot be stored in an array of {A.dtype}")
 
-    @intrinsic  # type: ignore[untyped-decorator]
-    def to_row(context: Any, A: Any, row: Any, value: Any) -> Any:
-        if A.dtype != value.dtype:
-            raise numba.TypingError(f"{value} cannot be stored in an array of {A.dtype}")
+    def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        bits, vector = context.get_data_type(A.dtype), args[2]
+        if A.dtype == types.boolean:
+            vector = builder.zext(vector, ir.VectorType(bits, value.count))
+        place = _place(context, builder, A, args[0], args[1], value.count, bits)
+        builder.store(vector, place, align=_size(A.dtype))
+        return context.get_dummy_value()
 
-        def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-            bits, vector = context.get_data_type(A.dtype), args[2]
-            if A.dtype == types.boolean:
-                vector = builder.zext(vector, ir.VectorType(bits, value.count))
-            place = _place(context, builder, A, args[0], args[1], value.count, bits)
-            builder.store(vector, place, align=_size(A.dtype))
-            return context.get_dummy_value()
-
-        return types.void(A, types.int64, value), code
-
-    return to_row
+    return types.void(A, types.int64, value), code
 
 
-def where() -> Any:
+@intrinsic  # type: ignore[untyped-decorator]
+def where(context: Any, mask: Any, this: Any, other: Any) -> Any:
     """`lanes.where`."""
+    kind = operands((this, other))
+    if kind is None or mask != kind.mask:
+        raise numba.TypingError(f"where of {mask}, {this} and {other}")
 
-    @intrinsic  # type: ignore[untyped-decorator]
-    def select(context: Any, mask: Any, this: Any, other: Any) -> Any:
-        kind = operands((this, other))
-        if kind is None or mask != kind.mask:
-            raise numba.TypingError(f"where of {mask}, {this} and {other}")
+    def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        first = filled(context, builder, args[1], this, kind)
+        return builder.select(args[0], first, filled(context, builder, args[2], other, kind))
 
-        def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-            first = filled(context, builder, args[1], this, kind)
-            return builder.select(args[0], first, filled(context, builder, args[2], other, kind))
-
-        return kind(mask, this, other), code
-
-    return select
+    return kind(mask, this, other), code
 
 
-def sqrt() -> Any:
-    """`lanes.sqrt`."""
-    return _library("llvm.sqrt", 1)
-
-
-def absolute() -> Any:
-    """`lanes.absolute`."""
-    return _library("llvm.fabs", 1)
-
-
-def copysign() -> Any:
-    """`lanes.copysign`."""
-    return _library("llvm.copysign", 2)
-
-
-def any_lane() -> Any:
+@intrinsic  # type: ignore[untyped-decorator]
+def any_lane(context: Any, mask: Any) -> Any:
     """`lanes.any_lane`."""
 
-    @intrinsic  # type: ignore[untyped-decorator]
-    def of_mask(context: Any, mask: Any) -> Any:
-        def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-            bits = builder.bitcast(args[0], ir.IntType(mask.count))
-            return builder.icmp_unsigned("!=", bits, ir.Constant(bits.type, 0))
+    def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        bits = builder.bitcast(args[0], ir.IntType(mask.count))
+        return builder.icmp_unsigned("!=", bits, ir.Constant(bits.type, 0))
 
-        return types.boolean(mask), code
-
-    return of_mask
+    return types.boolean(mask), code
 
 
-def added() -> Any:
+@intrinsic  # type: ignore[untyped-decorator]
+def added(context: Any, value: Any) -> Any:
     """`lanes.added`."""
 
-    @intrinsic  # type: ignore[untyped-decorator]
-    def of_value(context: Any, value: Any) -> Any:
-        def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-            (total,), count = args, value.count
-            while count > 1:
-                count //= 2
-                halves = [_selected_lanes(builder, total, range(k * count, (k + 1) * count)) for k in range(2)]
-                total = builder.fadd(*halves)
-            return builder.extract_element(total, ir.Constant(INDEX, 0))
+    def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        (total,), count = args, value.count
+        while count > 1:
+            count //= 2
+            halves = [_selected_lanes(builder, total, range(k * count, (k + 1) * count)) for k in range(2)]
+            total = builder.fadd(*halves)
+        return builder.extract_element(total, ir.Constant(INDEX, 0))
 
-        return value.dtype(value), code
-
-    return of_value
+    return value.dtype(value), code
 
 
 def _selected_lanes(builder: Any, vector: Any, lanes: range) -> Any:
@@ -293,6 +260,9 @@ def _library(name: str, arguments: int) -> Any:
         return implementation((value, other))
 
     return binary
+
+
+sqrt, absolute, copysign = _library("llvm.sqrt", 1), _library("llvm.fabs", 1), _library("llvm.copysign", 2)
 
 
 def type_of(function: Any) -> Any:

@@ -48,9 +48,10 @@ class LaneFunction(Inner[..., Any]):
 
     @functools.cached_property
     def _numba_type_(self) -> Any:  # asked by numba where a kernel calls this function
-        from fmtorch.jit import lane_instructions as lane_functions
+        from fmtorch.jit import lane_instructions
 
-        return lane_functions.type_of(getattr(lane_functions, self.function.__name__)(*self.parameters))
+        intrinsic = getattr(lane_instructions, self.function.__name__)
+        return lane_instructions.type_of(intrinsic(*self.parameters) if self.parameters else intrinsic)
 
 
 class Lanes(NamedTuple):

@@ -50,7 +50,7 @@ def _helped(kernels: Sequence[Kernel[..., Any]]) -> Iterator[None]:
     path = os.pathsep.join([str(HOME), *filter(None, [os.environ.get("PYTHONPATH")])])
     try:
         helper = subprocess.Popen(
-            [sys.executable, "-m", "fmtorch.jit.together", *names], env={**os.environ, "PYTHONPATH": path},
+            [sys.executable, "-m", __name__, *names], env={**os.environ, "PYTHONPATH": path},
             stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
         )  # fmt: skip
     except OSError:

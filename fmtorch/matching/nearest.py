@@ -189,7 +189,8 @@ def two_nearest(rows: Tensor, columns: Tensor, block: int = BLOCK) -> Nearest | 
     padded = -(-n1 // GROUP) * GROUP
     rounded0, first = _rounded(rows, center, step, n0)
     rounded1, second = _rounded(columns, center, step, padded)
-    neighbors = _no_neighbors(n0, n1, padded)
+    no_rows, no_columns = ((np.full(n, -1), np.full(n, np.inf)) for n in (n0, n1))
+    neighbors = Nearest(*no_rows, np.full(n0, np.inf), *no_columns, np.full(padded, FAR - 1, np.int32))
     multiply = torch._int_mm if int8_products_are_exact() else _float_products
     transposed = rounded1.T
     if multiply is _float_products:
@@ -227,12 +228,6 @@ def _rounded(values: Tensor, center: float, step: float, padded: int) -> tuple[T
     norms = np.full(padded, FAR, np.int32)
     error = round_to_8_bits(exact, float(center), float(step), rounded.numpy(), norms)
     return rounded, Descriptors(exact, norms, error * (1 + 1e-9), float(step))
-
-
-def _no_neighbors(n0: int, n1: int, padded: int) -> Nearest:
-    """Nothing found: any distance improves it, but that of padding."""
-    rows, columns = ((np.full(n, -1), np.full(n, np.inf)) for n in (n0, n1))
-    return Nearest(*rows, np.full(n0, np.inf), *columns, np.full(padded, FAR - 1, np.int32))
 
 
 _GROUP = 32  # columns whose minimum is taken together; a group is searched only where it can hold a neighbour

@@ -214,7 +214,7 @@ def relative_noise(precision0: Array, precision1: Array) -> Array:
         return np.ones(len(variance))
     usual = np.median(np.sqrt(variance[valid]))
     noise = np.sqrt(np.where(valid, variance, usual**2)) / usual
-    return np.clip(noise, 1 / MAX_RATIO, MAX_RATIO)
+    return np.asarray(np.clip(noise, 1 / MAX_RATIO, MAX_RATIO))
 
 
 def _mean_variance(precision: Array) -> Array:

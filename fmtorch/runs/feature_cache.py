@@ -165,14 +165,15 @@ class CachedFeatures:
         digest = image_digest(image)
         extractor = self.extractor
         if isinstance(extractor, TwoStepExtractor):
-            frames = self._kept(self._detection, digest, lambda: _named(("lafs", "scores"), extractor.detect(image)))
+            names = ("lafs", "scores")
+            frames = self._kept(self._detection, digest, lambda: dict(zip(names, extractor.detect(image), strict=True)))
             lafs = frames.tensors["lafs"]
             described = self._kept(self._extraction, digest, lambda: {"descriptors": extractor.describe(image, lafs)})
             steps = [frames, described]
             size = {"image_size": torch.tensor(image.shape[:2], dtype=torch.int64)}
         else:
             whole = self._kept(
-                self._extraction, digest, lambda: _fields(output_of(extractor, extractor(image), Features))
+                self._extraction, digest, lambda: dict(vars(output_of(extractor, extractor(image), Features)))
             )
             steps, size = [whole], {}
         with self._lock:
@@ -241,14 +242,6 @@ class _Step:
     tensors: dict[str, Tensor]
     seconds: float
     computed: bool
-
-
-def _named(names: tuple[str, ...], tensors: tuple[Tensor, ...]) -> dict[str, Tensor]:
-    return dict(zip(names, tensors, strict=True))
-
-
-def _fields(features: Features) -> dict[str, Tensor]:
-    return {field.name: getattr(features, field.name) for field in dataclasses.fields(features)}
 
 
 def _packed(value: Tensor) -> NDArray[Any]:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from fmtorch.jit.kernel import F4x1, F4x2, F4x3, I4x1, I8x1, U1x1, inner, kernel
 from fmtorch.jit.lanes import fused
 from fmtorch.scenes.raycast import Camera, Geometry, Hits, Index, Number
-from fmtorch.scenes.surfaces import TO_LINEAR, Floats, Pixels, Real, Surfaces, Texture, bilinear, to_srgb
+from fmtorch.scenes.surfaces import TO_LINEAR, Floats, Pixels, Real, Surfaces, bilinear, to_srgb
 
 _ZERO, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
 # The four rays of a pixel share a footprint's long side, so that each filters only a quarter of it.
@@ -288,7 +288,10 @@ class Stage:
             2 * np.float32(offset[1]), float(self.bias), np.float32(self.light.ground_shade),
         )  # fmt: skip
         for i in np.flatnonzero(count).tolist():
-            shade(index[end[i] - count[i] : end[i]], seen, footprint, _picture(geometry.textures[i]), lighting, out)
+            texture = geometry.textures[i]
+            shape, coarsest = texture.atlas.shape[1:], np.float32(texture.coarsest)
+            picture = Picture(texture.atlas.reshape(-1), *shape, texture.origin, texture.scale, coarsest, TO_LINEAR)
+            shade(index[end[i] - count[i] : end[i]], seen, footprint, picture, lighting, out)
 
     def homography(self, hits: Hits) -> Floats:
         """From pixel to texel, of each piece (n, 7): rows (2, 2) of the numerator, and G^-1's last, the denominator."""
@@ -308,12 +311,6 @@ class Stage:
         elevation = np.arctan2(Z, np.hypot(X, Y)) * np.float32(2 / np.pi)
         coded = bilinear(self.sky, np.mod(azimuth, wide - 1), np.clip((1 - elevation) * (tall - 1), 0, tall - 1))
         return np.take(TO_LINEAR, coded)
-
-
-def _picture(texture: Texture) -> Picture:
-    _, wide, channels = texture.atlas.shape
-    atlas, coarsest = texture.atlas.reshape(-1), np.float32(texture.coarsest)
-    return Picture(atlas, wide, channels, texture.origin, texture.scale, coarsest, TO_LINEAR)
 
 
 def expose(stage: Stage, cameras: Sequence[Camera], lens: Lens, rng: np.random.Generator) -> Pixels:

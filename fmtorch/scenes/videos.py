@@ -222,7 +222,7 @@ def _cabinet(surfaces: Surfaces, rng: Rng, base: Vector, degrees: Real) -> None:
     surfaces.box(foot, right * 0.8, back * 0.2, 0.26, [shelf, sides, sides, sides, sides])
 
 
-def _path(rng: Rng, target: Vector) -> tuple[np.ndarray, np.ndarray]:
+def _path(rng: Rng) -> tuple[np.ndarray, np.ndarray]:
     """Amplitudes and phases of a hand's smooth movement: three sinusoids for each of six coordinates."""
     speed = rng.uniform(0.6, 1.5)
     frequency = np.array([0.11, 0.37, 1.3])[:, None] * rng.uniform(0.8, 1.2, (3, 6))
@@ -257,7 +257,7 @@ def indoor_scene(rng: Rng, split: str, shots: int, scale: Real) -> DrawnScene:
     rug = surfaces.paint(patterns.cloth(rng, 384, 512))
     surfaces.quad(vec(-1.1, half - 1.3, 0.01), vec(2.2, 0, 0), vec(0, -1.6, 0), rug)
     K, size = scaled_camera(FOCAL, SIZE, scale)
-    amplitude, (frequency, phase) = _path(rng, desk)
+    amplitude, (frequency, phase) = _path(rng)
     stand = desk + vec(rng.uniform(-0.6, 0.6), -rng.uniform(1.2, 1.9), rng.uniform(1.2, 1.5))
     aim = desk + vec(0, 0.2, rng.uniform(0.85, 1.1))
 
