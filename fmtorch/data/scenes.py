@@ -2,7 +2,6 @@
 that see the same points of its reconstruction.
 """
 
-import bisect
 import dataclasses
 import functools
 import hashlib
@@ -304,7 +303,7 @@ class ScenePairs(PairDataset):
 
     def candidate(self, rank: int) -> tuple[int, int, int]:
         """The candidate at a place among those of all scenes: number of the scene, and of its two views."""
-        scene = bisect.bisect_right(self._starts, rank) - 1
+        scene = int(np.searchsorted(self._starts, rank, side="right")) - 1
         ((i, j),) = self.scenes[scene].candidates.at(np.array([rank - self._starts[scene]]))
         return scene, int(i), int(j)
 

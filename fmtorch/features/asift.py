@@ -7,7 +7,6 @@ from typing import Annotated
 import cv2
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from fmtorch.core.options import Within
 from fmtorch.core.types import Features
@@ -61,7 +60,7 @@ def simulated_views(tilts: int) -> list[tuple[float, float]]:
     return views
 
 
-def simulate_view(grey: Image, tilt: float, angle: float) -> tuple[Image, NDArray[np.float64]]:
+def simulate_view(grey: Image, tilt: float, angle: float) -> tuple[Image, np.ndarray]:
     """The view of a grey image rotated by `angle` degrees and reduced `tilt` times along x, and the map to it (2, 3).
 
     The border of the image is continued where the view shows more. Blurred before it is reduced.
@@ -81,7 +80,7 @@ def simulate_view(grey: Image, tilt: float, angle: float) -> tuple[Image, NDArra
     return view.astype(np.uint8, copy=False), reduce[:, :2] @ rotate
 
 
-def _mapped_back(features: Features, to_view: NDArray[np.float64], shape: tuple[int, ...]) -> Features:
+def _mapped_back(features: Features, to_view: np.ndarray, shape: tuple[int, ...]) -> Features:
     """The features of a view in the image's coordinates, without those whose frame leaves the image."""
     to_image = torch.from_numpy(np.linalg.inv(to_view[:, :2]))
     lafs = features.lafs.double()

@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
@@ -133,7 +132,7 @@ def _histogram(patches: Float[Tensor, "n 1 p p"]) -> Float[Tensor, "n k"]:
 
 def _sobel(patches: Tensor) -> tuple[Tensor, Tensor]:
     """Derivatives along y and x (N, P, P); the border is continued."""
-    padded = F.pad(patches, (1, 1, 1, 1), mode="replicate")[:, 0]
+    padded = torch.nn.functional.pad(patches, (1, 1, 1, 1), mode="replicate")[:, 0]
     rows = torch.add(padded[:, :-2], padded[:, 1:-1], alpha=2).add_(padded[:, 2:])
     columns = torch.add(padded[:, :, :-2], padded[:, :, 1:-1], alpha=2).add_(padded[:, :, 2:])
     return (columns[:, 2:] - columns[:, :-2]).div_(8), (rows[:, :, 2:] - rows[:, :, :-2]).div_(8)

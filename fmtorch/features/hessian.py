@@ -7,7 +7,6 @@ from typing import Annotated, NamedTuple
 import cv2
 import numpy as np
 import torch
-import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor
 
@@ -201,7 +200,8 @@ class HessianDetector:
         level = blur(grey.float() / 255, math.sqrt(self.sigma**2 - IMAGE_BLUR**2))
         while min(level.shape) >= SMALLEST_OCTAVE:
             responses, level = self._octave(level)
-            seeds = [F.pad(maxima(responses[s], self.threshold), (1, 0), value=s) for s in range(1, self.levels + 1)]
+            by_level = [maxima(responses[s], self.threshold) for s in range(1, self.levels + 1)]
+            seeds = [torch.cat([torch.full_like(p[:, :1], s), p], 1) for s, p in enumerate(by_level, start=1)]
             peaks = refined_maxima(responses, torch.cat(seeds), self.threshold)
             sigma = self.sigma * 2 ** (peaks.position[:, :1] / self.levels)
             position = spacing * torch.cat([sigma, peaks.position[:, 1:]], 1)

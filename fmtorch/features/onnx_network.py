@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float
-from torch import Tensor
 
 from fmtorch.core.files import models_dir
 from fmtorch.core.onnx_network import NetworkFileError, onnx_session
@@ -54,7 +53,7 @@ class PatchNetwork:
     def __repr__(self) -> str:
         return f"PatchNetwork({str(self.path)!r}, threads={self.threads}, batch={self.batch})"
 
-    def __call__(self, patches: Float[Tensor, "n 1 32 32"]) -> Float[Tensor, "n d"]:
+    def __call__(self, patches: Float[torch.Tensor, "n 1 32 32"]) -> Float[torch.Tensor, "n d"]:
         """The network's output for each patch, float32, on the patches' device.
 
         Raises NetworkFileError for a file that is absent, corrupt or takes another shape, ValueError for patches of

@@ -1,7 +1,5 @@
 """Difference-of-Gaussians keypoints with SIFT descriptors, through OpenCV."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import math
@@ -318,7 +316,7 @@ class RootSIFTPCA:
 
 
 def project(
-    descriptors: Float[Tensor, "n 128"], mean: Float[Tensor, 128], basis: Float[Tensor, "128 d"], power: float
+    descriptors: Float[Tensor, "n 128"], mean: Float[Tensor, "128"], basis: Float[Tensor, "128 d"], power: float
 ) -> Float[Tensor, "n d"]:
     """Centred, projected, signed power of each entry, unit length."""
     projected = (descriptors - mean) @ basis
@@ -349,7 +347,7 @@ def read_learned(path: Path, names: Sequence[str], what: str, remedy: str) -> li
 
 
 @functools.lru_cache(maxsize=8)
-def load_projection(path: Path) -> tuple[Float[Tensor, 128], Float[Tensor, "128 d"]]:
+def load_projection(path: Path) -> tuple[Float[Tensor, "128"], Float[Tensor, "128 d"]]:
     """Mean and basis of a learned file. Raises FileNotFoundError and ValueError that say how to make it."""
     remedy = "make it with `python scripts/make_models.py pca`"
     mean, basis = read_learned(path, ("mean", "basis"), "`mean` and `basis`", remedy)

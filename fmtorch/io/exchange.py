@@ -3,8 +3,6 @@
 ``fmtorch.find_fundamental(**fmtorch.from_lightglue(features0, features1, matches))``.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -14,7 +12,6 @@ from torch import Tensor
 
 from fmtorch.core.checks import as_tensor
 from fmtorch.core.types import Estimate, PoseEstimate
-from fmtorch.data.files import Indices
 from fmtorch.geometry.cameras import cross_matrix
 from fmtorch.geometry.epipolar import unit_frobenius
 from fmtorch.io.colmap import imported
@@ -220,7 +217,7 @@ def _estimate(value: Any, model: str, inliers: Tensor, pose: Any, reason: str) -
     return Estimate(F, inliers & ok, torch.tensor([ok]), reasons, samples, model=model, **fields)
 
 
-def _same(count: int) -> Indices:
+def _same(count: int) -> np.ndarray:
     """Matches (count, 2) of keypoint i in both images."""
     return np.arange(count).repeat(2).reshape(-1, 2)
 

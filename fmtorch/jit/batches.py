@@ -1,13 +1,10 @@
 """The door from batched tensors to kernels, which see the arrays of one pair."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from fmtorch.jobs.execution import available, mapped
@@ -42,7 +39,7 @@ def for_each_pair(
     return out.to(next(t.device for t in tensors if t is not None))
 
 
-def _array(tensor: Tensor | None, kind: torch.dtype, pairs: int) -> NDArray[Any]:
+def _array(tensor: Tensor | None, kind: torch.dtype, pairs: int) -> np.ndarray:
     if tensor is None:
         return np.empty((pairs, 0), torch.empty(0, dtype=kind).numpy().dtype)
     if tensor.is_floating_point() and tensor.dtype != kind:
@@ -50,6 +47,6 @@ def _array(tensor: Tensor | None, kind: torch.dtype, pairs: int) -> NDArray[Any]
     return as_array(tensor.cpu().contiguous())
 
 
-def as_array(tensor: Tensor) -> NDArray[Any]:
+def as_array(tensor: Tensor) -> np.ndarray:
     """A tensor on the CPU as an array, a view, on no graph."""
     return (tensor.detach() if tensor.requires_grad else tensor).numpy()

@@ -10,8 +10,6 @@ bytecode and values count as well; of a kernel, which is called through its addr
 Comments, docstrings, line numbers, and what no kernel reaches count for nothing.
 """
 
-from __future__ import annotations
-
 import contextlib
 import dis
 import enum
@@ -350,11 +348,10 @@ def _alone(result: Any) -> Any:
 
 def _of(signature: Any, result: Any) -> Any:
     """A compiled function by the types of this process: a group of a script or a notebook is another class in each."""
-    from numba.core import sigutils
-    from numba.core.typing import signature as typed
+    from numba.core import sigutils, typing
 
     arguments, _ = sigutils.normalize_signature(signature)
-    return result._replace(signature=typed(result.signature.return_type, *arguments))
+    return result._replace(signature=typing.signature(result.signature.return_type, *arguments))
 
 
 def _signature(data: bytes) -> bytes:

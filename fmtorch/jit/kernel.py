@@ -11,8 +11,6 @@ is imported from numba before the first call. With ``FMTORCH_KERNELS=off`` estim
 Python, all else takes its tensor form.
 """
 
-from __future__ import annotations
-
 import functools
 import gc
 import inspect

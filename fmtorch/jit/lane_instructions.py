@@ -3,8 +3,6 @@
 Imported when the first kernel that uses lanes is compiled.
 """
 
-from __future__ import annotations
-
 import operator
 from collections.abc import Callable
 from typing import Any
@@ -12,8 +10,7 @@ from typing import Any
 import numba
 from llvmlite import ir
 from numba import types
-from numba.core import cgutils
-from numba.core.registry import cpu_target
+from numba.core import cgutils, registry
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 from numba.extending import intrinsic, lower_builtin, models, register_model
 
@@ -31,7 +28,7 @@ class LanesType(types.Type):  # type: ignore[misc]
         super().__init__(name=f"lanes({dtype} x {count})")
 
     @property
-    def mask(self) -> LanesType:
+    def mask(self) -> "LanesType":
         """The type of a comparison's value."""
         return LanesType(types.boolean, self.count)
 
@@ -267,6 +264,6 @@ sqrt, absolute, copysign = _library("llvm.sqrt", 1), _library("llvm.fabs", 1), _
 
 def type_of(function: Any) -> Any:
     """The type of an intrinsic, as which a kernel knows it."""
-    context = cpu_target.typing_context
+    context = registry.cpu_target.typing_context
     context.refresh()
     return context.resolve_value_type(function)

@@ -11,8 +11,6 @@ which they are written; a loop over the lanes would have to ask first whether it
 memory. From Python a value is an array that no operator changes.
 """
 
-from __future__ import annotations
-
 import functools
 import inspect
 import platform
@@ -20,11 +18,8 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fmtorch.jit.kernel import OPTIONS, Inner
-
-Array = NDArray[Any]
+from fmtorch.jit.kernel import OPTIONS, Array, Inner
 
 
 class Value(np.ndarray):

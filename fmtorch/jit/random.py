@@ -4,8 +4,6 @@ Tensors have `bits` and `uniform`, kernels `random_bits` and `uniform_kernel`: t
 same numbers.
 """
 
-from __future__ import annotations
-
 import enum
 import functools
 from typing import Any

@@ -4,8 +4,6 @@ The other process goes through the same kernels from the last to the first and l
 Where the two meet, one waits for the other: each kernel's file has a lock.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import subprocess

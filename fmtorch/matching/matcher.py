@@ -1,7 +1,5 @@
 """The nearest-neighbour matcher: Features x Features -> Correspondences."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import torch

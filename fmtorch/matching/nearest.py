@@ -4,8 +4,6 @@ On a CPU, kernels compute the exact distances of the few that may be neighbours 
 elsewhere, and where those tell too few apart, all distances are computed. The result is the same.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 from typing import NamedTuple

@@ -6,8 +6,6 @@ perhaps ``matched_confidences`` (N,). It downloads the weights of a matcher when
 downloaded here.
 """
 
-from __future__ import annotations
-
 import importlib
 import threading
 from collections.abc import Mapping, Sequence
@@ -97,7 +95,7 @@ class VisMatch:
             except Exception as error:  # anybody's network
                 raise ValueError(f"vismatch {self.name}: {_described(error)}") from error
 
-    def _matches(self, result: Mapping[str, Any], sizes: Sequence[Size]) -> _Matches:
+    def _matches(self, result: Mapping[str, Any], sizes: Sequence[Size]) -> "_Matches":
         if self._sample is not None:
             x0, x1, overlap, precisions = self._sample.take(sizes)
             return _Matches(x0, x1, overlap, relative_noise(*precisions))
@@ -180,7 +178,7 @@ class RecordedSample:
         return self._last
 
     @classmethod
-    def of(cls, matcher: Any) -> RecordedSample | None:
+    def of(cls, matcher: Any) -> "RecordedSample | None":
         """Of a matcher of vismatch that is a RoMa v2; None for any other."""
         model = getattr(matcher, "romav2_model", None)
         return cls(model) if hasattr(model, "sample") and hasattr(model, "to_pixel_coordinates") else None

@@ -1,7 +1,5 @@
 """How surfaces look: filtered texture, sun with shadows, sky light, and what a real camera adds."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 from collections.abc import Callable, Sequence
@@ -9,7 +7,6 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from fmtorch.jit.kernel import F4x1, F4x2, F4x3, I4x1, I8x1, U1x1, inner, kernel
 from fmtorch.jit.lanes import fused
@@ -299,7 +296,7 @@ class Stage:
         numerator = np.einsum("nki,nkj->nij", uv[:, [1, 2, 0]], hits.inverse)
         return np.concatenate([numerator[:, :, :2].reshape(-1, 4), hits.inverse[:, 2]], axis=1).astype(np.float32)
 
-    def _background(self, camera: Camera, offset: tuple[Real, Real], index: NDArray[np.int64]) -> Floats:
+    def _background(self, camera: Camera, offset: tuple[Real, Real], index: np.ndarray) -> Floats:
         """The sky (n, 3) at pixels (n,), at infinity: looked up by azimuth (once round) and elevation."""
         h, w = camera.size
         toward = camera.R.T @ np.linalg.inv(camera.K)

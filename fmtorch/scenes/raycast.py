@@ -5,8 +5,6 @@ pixel x meets its plane at ``(s, t, 1) = z G^-1 (x, y, 1)``: three linear forms 
 depth z is the reciprocal of the third form. Each piece is intersected with the rays of its bounding box only.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from collections.abc import Sequence
