@@ -333,8 +333,6 @@ def _inverted(lens: Lens, target: Matrix) -> Matrix:
     return np.where(valid[:, None], x, np.nan)
 
 
-# Photographs as a pinhole of the same focal lengths and principal point would have taken them
-
 _KEPT = 2  # maps of which lenses are remembered: frames of one video follow one another; 8 bytes a pixel
 
 

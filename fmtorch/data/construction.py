@@ -21,8 +21,6 @@ from fmtorch.data.images import ImageError, read_image, to_grey
 from fmtorch.data.pairs import DepthDataset, ImageSource
 from fmtorch.data.scenes import ScenePairs, View, image_pair, incidence
 
-# How much of what one image of a pair shows the other shows too, whatever features find: by depth, or by points
-
 STEP = 4  # px between the pixels of which depth is asked, along rows and columns
 TOLERANCE = 0.05  # by which depths may differ, relative to the one seen, for the same surface
 

@@ -167,8 +167,6 @@ class _DType:
 
 
 class _Array:
-    """An array as a pickle describes it."""
-
     def __init__(self, *_: object) -> None:
         self.__setstate__((1, (0,), _DType("u1"), False, b""))
 

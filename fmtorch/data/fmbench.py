@@ -64,8 +64,6 @@ def _scene(folder: Path, fps: int | float | None, window: int | float) -> Scene:
     return Scene(folder.name, family, views, pairs)
 
 
-# Image pairs in the layout of the FM-Bench distribution (Bian et al., BMVC 2019)
-
 _PAIRS, _SUBSETS = "pairs_with_gt.txt", "pairs_which_dataset.txt"
 _PAIR_COLUMNS = "l r F11 F12 F13 F21 F22 F23 F31 F32 F33"
 _LAYOUT = f"the layout is <set>/{_PAIRS} and <set>/{_SUBSETS}"

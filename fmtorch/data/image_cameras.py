@@ -328,7 +328,6 @@ def _number(tags: Tags, tag: int) -> float | None:
 
 
 def _read(path: Path) -> tuple[dict[int, Any], tuple[int, int]] | str:
-    """The EXIF tags of a file and its size (h, w), or why there are none."""
     try:
         with Image.open(path, formats=FORMATS) as image:
             tags = dict(image.getexif().get_ifd(ExifTags.IFD.Exif))
@@ -338,8 +337,6 @@ def _read(path: Path) -> tuple[dict[int, Any], tuple[int, int]] | str:
     except Exception as error:  # Pillow raises what its parts do for damaged files
         return f"damaged EXIF data ({type(error).__name__}: {error})"
 
-
-# Cameras of photographs by the photographs' names: of a COLMAP model, or of a JSON file
 
 FORM = '{"a.jpg": [fx, fy, cx, cy], "b.jpg": null}, in pixels with (0, 0) at the centre of the first one'
 SHOWN = 5  # names that an error shows

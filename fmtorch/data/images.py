@@ -97,7 +97,6 @@ _TURNS: dict[int, Callable[[Pixels], Pixels]] = {
 
 
 def _decoded(path: Path, orient: bool, data: bytes | None = None) -> Pixels:
-    """The pixels of a file, of which `data` are the bytes where they are known."""
     try:
         if data is None and path.exists() and not (path.is_file() or path.is_dir()):  # a pipe waits, a device too
             raise ImageError(f"{path}: no regular file; it must be an image file")
@@ -166,7 +165,6 @@ def _heic(path: Path, data: bytes) -> Array:
 
 
 def _eight_bits(path: Path, image: Array) -> Pixels:
-    """An image of any depth with its own range as 0 to 255."""
     if image.dtype == np.uint8:
         return image
     values = image.astype(np.float64)
@@ -184,7 +182,6 @@ def to_grey(image: Pixels) -> Pixels:
 
 
 def _expect_moderate(path: Path, data: bytes) -> None:
-    """Raises ImageError for an image whose header tells of more than `MAX_PIXELS`."""
     if data.startswith(_PNG):
         sizes = [(data[16:20], data[20:24])]  # IHDR comes first
     elif data.startswith(_JPEG):

@@ -198,8 +198,6 @@ def _pose_of_scene(path: Path, K: Matrix) -> Camera:
     return Camera(K, R, -R @ to_world[:3, 3])
 
 
-# Lists of image pairs on which others evaluate, such as MegaDepth-1500 and ScanNet-1500, with a folder of images
-
 TEXT_SUFFIXES, NPZ = (".txt", ".csv", ".list", ""), ".npz"
 _FRAME = re.compile(r"(.+?)_frame\W")  # scene0711_00_frame-001680.jpg
 
@@ -280,7 +278,6 @@ class PairList(HeldPairs):
         return ImageSource(identity, path, own, resampling=Resampling(target, turns))
 
     def _size(self, path: Path) -> Size | None:
-        """(h, w) of an image, read once; None where it has no header."""
         if path not in self._sizes:
             self._sizes[path] = stored_size(path)
         return self._sizes[path]

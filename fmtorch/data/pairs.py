@@ -63,9 +63,6 @@ def scaled_size(size: Size, scale: float) -> Size:
     return max(1, round(size[0] * scale)), max(1, round(size[1] * scale))
 
 
-# The item of every data set: an image pair with its ground truth, images read only when asked for
-
-
 @dataclasses.dataclass(frozen=True)
 class ImageSource:
     """One image on disk.
@@ -167,9 +164,6 @@ class DepthDataset(PairDataset, Protocol):
     """A data set that knows how far away the points of its images are, in the unit of the pairs' t."""
 
     def depth(self, image: ImageSource, points: Matrix) -> Matrix: ...
-
-
-# Some of a data set's pairs, as a data set
 
 
 class PairSubset(PairDataset):

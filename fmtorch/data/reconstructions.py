@@ -67,7 +67,6 @@ def _depth_folder(images: Path) -> Path:
 
 
 def _depth_paths(images: Path, scene: Scene) -> dict[str, Path]:
-    """The depth map of each view that has one, by the identity of its image."""
     paths = {}
     for view in scene.views:
         file = _depth_folder(images) / view.image.path.relative_to(images)
@@ -94,7 +93,6 @@ def _scene_folders(
 
 
 def _model_places(folder: Path, model: str | None) -> list[Path]:
-    """The folders below a scene's that hold a model."""
     places = _MODELS if model is None else (model,)
     return [folder / place for place in places if any((folder / place / file).is_file() for file in _FILES)]
 

@@ -232,9 +232,6 @@ def _expect_file(path: Path) -> None:
         raise ImageError(f"{path}: no such file; it must be a depth image")
 
 
-# Scenes of images with known cameras, and the data set of pairs of them; what every native reader gives
-
-
 @dataclasses.dataclass(frozen=True, eq=False)
 class View:
     """One image with its camera: K (3, 3), R (3, 3) and t (3,) map the world to pixels of the undistorted image.

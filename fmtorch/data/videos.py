@@ -92,8 +92,6 @@ def _kitti_scene(home: Path, folder: Path, camera: int, window: int | float) -> 
     return Scene(name, "KITTI", views, following(times, window))
 
 
-# TUM RGB-D (Sturm et al., IROS 2012): hand-held Kinect videos with poses of a motion-capture system
-
 SIZE = (480, 640)  # h, w of all images
 CALIBRATIONS = {
     "freiburg1": Lens(517.3, 516.5, 318.6, 255.3, "FULL_OPENCV", (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
@@ -219,7 +217,6 @@ def _tum_scene(folder: Path, lens: Lens, window: int | float) -> Scene:
 
 
 def _depth_paths(folder: Path, scene: Scene) -> dict[str, Path]:
-    """The depth image next in time to each view, by the identity of its image."""
     rgb = dict(zip(*read_listed(folder / "rgb.txt")[1::-1], strict=True))
     times, names, _ = read_listed(folder / "depth.txt")
     paths = {}

@@ -53,8 +53,6 @@ def make_upright(lafs: Float[Tensor, "*n 2 3"]) -> Float[Tensor, "*n 2 3"]:
     return torch.stack([first, second, lafs[..., 2]], -1)
 
 
-# Orientation of local affine frames from their patches: the angle by which the frame's axes turn
-
 PatchFunction = Callable[[Tensor], Tensor]
 """Patches (N, 1, 32, 32) float32, grey in [0, 1] -> (N, D); see `PatchNetwork`."""
 

@@ -75,7 +75,6 @@ def _linear(volume: Tensor, at: Tensor) -> Tensor:
 
 
 def _samples(volume: Tensor, at: Tensor) -> Float[Tensor, "27 m"]:
-    """The neighbourhoods of inner samples (M, 3)."""
     _, h, w = volume.shape
     steps = NEIGHBOURS @ torch.tensor([h * w, w, 1])
     return volume.reshape(-1)[_linear(volume, at) + steps[:, None]]
@@ -117,8 +116,6 @@ def _quadratic(v: Float[Tensor, "27 m"]) -> tuple[Tensor, Tensor, Tensor]:
     value = c + 0.5 * (gs * ds + gy * dy + gx * dx)
     return torch.stack([ds, dy, dx], 1), value.to(v.dtype), peaked
 
-
-# The image filters of the detector, through OpenCV
 
 KERNEL_SIGMAS = 3.0  # half the length of a sampled Gaussian
 STRIP = 128  # rows worked on together: the few strips of a 1536 px image then fit a core's cache

@@ -105,8 +105,6 @@ class LocalFeature:
         return ImagePyramid(torch.from_numpy(grey).to(self.device).float() / 255)
 
 
-# Local features from the names of their parts, as presets give them
-
 Part = TypeVar("Part")
 Options = Mapping[str, Any]
 Choice = str | Options

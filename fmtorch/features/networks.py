@@ -76,9 +76,6 @@ def as_float32(features: nn.Module, x: Tensor) -> Tensor:
     return out.flatten(1).float()
 
 
-# HardNet, L2-Net, GeoDesc and a faster HardNet: grey patches to descriptors of 128 numbers and unit length
-
-
 class HardNet(nn.Module):
     """HardNet (Mishchuk, Mishkin, Radenovic, Matas, NIPS 2017): L2-Net's layout, hardest-in-batch triplets.
 
@@ -149,9 +146,6 @@ class GeoDesc(nn.Module):
         return unit_length(as_float32(self.features, standardize(patches, eps=1e-6)))
 
 
-# AffNet and OriNet: grey patches to the affine shape and the orientation of their frame
-
-
 class AffNet(nn.Module):
     """AffNet (Mishkin, Radenovic, Matas, ECCV 2018): three numbers of an affine shape, each in (-1, 1).
 
@@ -209,8 +203,6 @@ class OriNet(nn.Module):
         return as_float32(self.features, standardize(patches, eps=1e-8))
 
 
-# Weights of patch networks from files: own checkpoints, kornia's and the authors' state_dicts, TorchScript
-
 ARCHITECTURES: dict[str, type[nn.Module]] = {
     "hardnet": HardNet, "hardnet_fast": HardNetFast, "l2net": L2Net, "geodesc": GeoDesc,
     "affnet": AffNet, "affnet_fast": AffNetFast, "orinet": OriNet,
@@ -248,7 +240,6 @@ def read_checkpoint(path: Path | str) -> dict[str, Any]:
 
 
 def _is_script(path: Path) -> bool:
-    """Whether a file is a TorchScript archive."""
     if not zipfile.is_zipfile(path):
         return False
     with zipfile.ZipFile(path) as archive:
@@ -321,8 +312,6 @@ def _with_dropout(state: dict[str, Tensor]) -> dict[str, Tensor]:
     parts = ((name.split("."), value) for name, value in state.items())
     return {".".join([stem, moved.get(index, index), *rest]): value for (stem, index, *rest), value in parts}
 
-
-# Patch networks as torch modules: (N, 1, 32, 32) grey patches to descriptors, affine shapes or orientations
 
 __all__ = [
     "ARCHITECTURES", "DESCRIPTORS", "AffNet", "AffNetFast", "GeoDesc", "HardNet", "HardNetFast", "L2Net", "OriNet",

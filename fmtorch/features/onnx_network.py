@@ -88,7 +88,6 @@ class PatchNetwork:
 
 
 def _session(path: Path, threads: int) -> tuple[Any, str, int]:
-    """An inference session, its input's name and the length of an output."""
     session = onnx_session(path, threads, _hint(path))
     inputs, outputs = session.get_inputs(), session.get_outputs()
     shape = inputs[0].shape if len(inputs) == 1 else None

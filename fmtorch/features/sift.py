@@ -70,7 +70,6 @@ class SIFT:
         return cv2.SIFT.create(self.max_features, 3, *thresholds, self.sigma, enable_precise_upscale=upscale)
 
     def _reduced(self, grey: Image) -> Image:
-        """The image, or a smaller one of at most `max_pixels`."""
         factor = math.sqrt(self.max_pixels / grey.size)
         if factor >= 1:
             return grey
@@ -124,8 +123,6 @@ def as_grey(image: Image) -> Image:
         return np.ascontiguousarray(image)
     return cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)  # type: ignore[return-value]
 
-
-# VLFeat's difference-of-Gaussians keypoints with SIFT descriptors, through pycolmap (extra `colmap`)
 
 ORIENTATIONS = 4  # of one location at most, as VLFeat
 SMALLEST = 16  # px, the shorter side: the smallest octave has 8, and VLFeat takes no smaller image

@@ -94,7 +94,6 @@ def _parameters(image: StoredImage) -> tuple[str, list[float], bool]:
 
 
 def _geometry(pair: StoredPair, matches: Array, known: dict[str, Matrix | None]) -> PairGeometry:
-    """The geometry of a pair, whose inliers are among the matches (m, 2)."""
     written = set(map(tuple, matches.tolist()))
     if pair.geometry is not None:
         verified = [match for match in pair.geometry.inliers.tolist() if tuple(match) in written]
@@ -124,8 +123,6 @@ def _one_to_one(pair: StoredPair) -> Mask:
             taken1.add(j)
     return keep
 
-
-# Images of a COLMAP database: keypoints as of an ideal pinhole, and what is known of cameras
 
 EXIF_DEVIATION = 0.05  # relative, of focal lengths by EXIF (docs/cameras.md)
 
@@ -190,8 +187,6 @@ def _deviation(camera: Any, lens: Lens, K: Matrix) -> float:
     usual = lens.fx == lens.fy and tuple(K[:2, 2]) == centre and not any(lens.coefficients)
     return EXIF_DEVIATION if usual else 0.0
 
-
-# A COLMAP database of anyone's keypoints and matches: read pair by pair, and given two-view geometries
 
 MAGIC = b"SQLite format 3\0"
 TABLES = {"cameras", "images", "keypoints", "matches", "two_view_geometries"}

@@ -293,8 +293,6 @@ def _pinhole(fx: float, fy: float, cx: float, cy: float) -> Matrix:
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
 
 
-# The data set `h5`: pairs whose matches somebody else computed, in the layouts that the field exchanges
-
 CORNER = 0.5  # where glue-factory puts the centre of the first pixel
 WITH_GEOMETRY: Mapping[str, Callable[[Path, Path | None], Iterator[ImagePair]]] = {
     "ransac_tutorial": tutorial_pairs,
@@ -383,7 +381,6 @@ def _expect_unset(layout: str, **options: Any) -> None:
 
 
 def _file_of_kind(folder: Path, name: str | None, kind: str) -> Path:
-    """The file of this name in the folder, or the only one whose name speaks of its kind."""
     if name is not None:
         path = folder / name
         if not path.is_file():

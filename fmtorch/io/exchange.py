@@ -81,7 +81,6 @@ def from_lightglue(
 
 
 def _lightglue_matches(matches: Mapping[str, Any], b: int | None) -> tuple[Tensor, Tensor]:
-    """Indices (n, 2) and scores (n,) of a pair."""
 
     def of_pair(name: str) -> Tensor:
         return as_tensor(matches[name] if b is None else matches[name][b], name)
@@ -218,7 +217,6 @@ def _estimate(value: Any, model: str, inliers: Tensor, pose: Any, reason: str) -
 
 
 def _same(count: int) -> np.ndarray:
-    """Matches (count, 2) of keypoint i in both images."""
     return np.arange(count).repeat(2).reshape(-1, 2)
 
 

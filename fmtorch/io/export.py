@@ -90,8 +90,6 @@ def write_hloc(
                 write_geometry(group, pair.geometry)
 
 
-# The view graph of a folder's images: which pairs were matched, and by how much they support one another
-
 GRAPH_JSON, GRAPH_CSV = "graph.json", "graph.csv"
 
 

@@ -129,8 +129,6 @@ def write_geometry(group: Any, geometry: PairGeometry) -> None:
     group.attrs.update({**geometry.texts, **geometry.matrices})
 
 
-# Matches alone: x0, x1 of one pair or of many in an npz or HDF5 file, and their geometries in another
-
 NPZ = ".npz"
 SUFFIXES = (NPZ, *h5.SUFFIXES)
 

@@ -20,8 +20,6 @@ from fmtorch.core.files import replacing
 from fmtorch.data.cameras import Lens
 from fmtorch.data.files import Array, Indices, Mask, Matrix, Singles
 
-# The geometry of a pair as COLMAP's databases hold it
-
 ORIGIN = 0.5  # px: COLMAP's coordinates of the first pixel's centre
 
 Kind = Literal["calibrated", "uncalibrated", "planar", "panoramic", "planar_or_panoramic", "degenerate"]

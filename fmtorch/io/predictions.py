@@ -143,8 +143,6 @@ def _keys(name0: str, name1: str) -> Iterator[str]:
     yield f"{a}_{b}"
 
 
-# Predictions for the pairs of a data set: hloc's features and matches, glue-factory's and vismatch's predictions
-
 NO_MATCH = -1
 
 
@@ -306,7 +304,6 @@ def _keypoints(file: Any, path: Path, name: str) -> Matrix:
 
 
 def _size(file: Any, key: str, image: ImageSource) -> Size:
-    """(h, w) as stored, (w, h), or of the image itself."""
     if h5.holds(file, key):
         width, height = h5.reshaped(file, key, 2)
         return int(height), int(width)

@@ -315,7 +315,6 @@ class KernelFile:
         return True
 
     def _release(self) -> None:
-        """Let other processes that wait for the file have it."""
         if self._lock is not None:
             self._lock.release()
             with contextlib.suppress(OSError):

@@ -121,11 +121,7 @@ infer_global(operator.neg)(_Negative)
 lower_builtin(operator.neg, LanesType)(lambda context, builder, sig, args: builder.fneg(args[0]))
 
 
-# `lanes` for numba: the functions of lanes as intrinsics, made of vector instructions of LLVM
-
-
 def _place(context: Any, builder: Any, array: Any, given: Any, row: Any, count: int, bits: Any) -> Any:
-    """Where a row of an array (rows, lanes) begins, as the place of a vector."""
     data = context.make_array(array)(context, builder, given).data
     place = builder.gep(data, [builder.mul(row, ir.Constant(INDEX, count))])
     return builder.bitcast(place, ir.VectorType(bits, count).as_pointer())
@@ -227,13 +223,11 @@ def added(context: Any, value: Any) -> Any:
 
 
 def _selected_lanes(builder: Any, vector: Any, lanes: range) -> Any:
-    """These lanes of a vector."""
     which = ir.Constant(ir.VectorType(ir.IntType(32), len(lanes)), list(lanes))
     return builder.shuffle_vector(vector, ir.Constant(vector.type, ir.Undefined), which)
 
 
 def _library(name: str, arguments: int) -> Any:
-    """A function of LLVM that takes so many values of lanes."""
 
     def implementation(kinds: tuple[Any, ...]) -> Any:
         def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:

@@ -81,8 +81,6 @@ def shard_of(text: str | None) -> Shard | None:
     return Shard(int(match[1]), int(match[2]))
 
 
-# How many threads a stage, a worker or a loop over pairs computes with
-
 _held: ContextVar[int] = ContextVar("_held", default=1)
 
 

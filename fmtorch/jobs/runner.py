@@ -207,8 +207,6 @@ class _Cluster:
             self._local.close(timeout=SECONDS_TO_CONNECT)
 
 
-# Many tasks by a pool of workers: results as they come, and the tasks of workers that died done again
-
 T = TypeVar("T")
 Task = TypeVar("Task")
 MAX_DEATHS = 3  # of workers that a task has to itself

@@ -56,7 +56,6 @@ class LightGlue:
         return Correspondences(x0, x1, mask, score=score, prior=score, size0=size0, size1=size1)
 
     def _matches(self, features0: Features, features1: Features) -> tuple[Tensor, Tensor]:
-        """Indices (S, 2) of the features that match, and the scores (S,)."""
         home = features0.lafs.device
         if min(len(features0), len(features1)) < 2:  # the network normalises over the features
             return torch.zeros(0, 2, dtype=torch.int64, device=home), torch.zeros(0, device=home)

@@ -51,7 +51,6 @@ class NearestNeighborMatcher:
 
 
 def _take(lafs: Tensor, index: Int[Tensor, "b n0"]) -> Tensor:
-    """The frames at `index`, zero where it is -1."""
     if lafs.shape[1] == 0:
         return lafs.new_zeros(*index.shape, 2, 3)
     taken = lafs.gather(1, index.clamp(min=0)[..., None, None].expand(-1, -1, 2, 3))

@@ -163,9 +163,6 @@ def _squared_distance(a: Array, b: Array) -> float:
     return float(total)
 
 
-# Two nearest neighbours on a CPU: products of 8-bit integers first, then exact distances of those that may be
-# nearest
-
 BLOCK = 128  # rows whose products with all columns exist at a time: 4 MB at 8,000 columns
 MAX_COMPUTED = 256  # exact distances a descriptor, beyond which rounding does not help: nearly equal ones
 MAX_LENGTH = 1 << 10  # of a descriptor: products stay below 2^24, exact in float32, and squared distances below FAR
@@ -299,7 +296,6 @@ def _nearest_neighbors(
 
 
 def _finite(flat: Tensor, mask: Tensor | None) -> Tensor:
-    """The mask of the descriptors that are finite."""
     finite = flat.abs().amax(-1) < math.inf if flat.shape[-1] else torch.isfinite(flat).all(-1)
     return finite if mask is None else finite & mask.reshape(finite.shape)
 

@@ -106,7 +106,6 @@ class ArrayCache:
 
     @staticmethod
     def _digest(section: str, name: str, arrays: Arrays) -> bytes:
-        """Of the file's place and all that it holds."""
         digest = hashlib.blake2b(f"{section}/{name}".encode(), digest_size=16)
         for key, array in sorted(arrays.items()):
             digest.update(repr((key, array.dtype.str, array.shape)).encode())
@@ -130,8 +129,6 @@ def _listed(paths: Iterator[Path]) -> Iterator[tuple[Path, os.stat_result]]:
         with contextlib.suppress(FileNotFoundError):
             yield path, path.stat()
 
-
-# The feature cache: what an extractor finds in an image is kept under the image's and the extractor's digests
 
 OFF = ("off", "none", "")
 
@@ -198,7 +195,6 @@ class CachedFeatures:
         return section
 
     def _kept(self, section: str, digest: str, compute: Callable[[], Mapping[str, Tensor]]) -> "_Step":
-        """One step's result, from the cache or computed and kept."""
         arrays = self.cache.read(section, digest)
         if arrays is not None:
             seconds = float(arrays.pop("seconds"))

@@ -150,8 +150,6 @@ def digest(data: Any) -> str:
     return hashlib.blake2b(data, digest_size=16).hexdigest()
 
 
-# What defines the results of a feature extractor, as plain values: its options, learned files, code, libraries
-
 LIBRARIES = ("numpy", "torch", "kornia", "onnxruntime")  # and OpenCV, which has several names as a package
 VARIANTS = {"onnxruntime": ("onnxruntime-gpu", "onnxruntime-directml")}  # other packages of the same library
 

@@ -122,8 +122,6 @@ def to_table(rows: Sequence[PairRow]) -> pa.Table:
     return pa.table(columns, schema=PAIR_SCHEMA)
 
 
-# The parts of a run's table: files that are whole or absent, merged as they grow in number
-
 MERGED = 16  # parts of one level that become one of the next
 MAX_LEVEL = 3  # 16^3 batches to a part at most: merging needs the memory of one
 
@@ -199,8 +197,6 @@ def content_digest(data: bytes) -> str:
     """Hex digest (blake2b, 64 bits) of a part, which its name ends with."""
     return hashlib.blake2b(data, digest_size=8).hexdigest()
 
-
-# The run folder: one evaluation's identity, its pairs' results as they come, its summary
 
 FORMAT = 1  # of the folder; to be raised when the schema changes, or what the identity tells
 _LISTINGS = 20  # at most, until parts are those that were listed

@@ -235,8 +235,6 @@ def read(folder: Path) -> tuple[list[tuple[Path, Camera]], list[tuple[int, int]]
     return views, [(i, j) for i, j in record["pairs"]]
 
 
-# The embedded data sets: `RenderedPairs`, drawn on first use from known cameras, and `StereoPair`, a real pair
-
 _SCENES = 2  # that each thread keeps, some 100 MB each: pairs of one scene follow one another
 _PHOTOGRAPHS = 48  # whose visible pieces each thread keeps, some 2 MB each
 
@@ -275,9 +273,6 @@ class _Recent(threading.local):
 
 
 _recent = _Recent()
-
-
-# `RenderedPairs`: the embedded data set, drawn on first use from known cameras
 
 
 class RenderedPairs(PairDataset):

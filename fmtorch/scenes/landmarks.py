@@ -290,7 +290,6 @@ def _times_of_day(fixed: Surfaces, rng: Rng, width: Real) -> tuple[list[Light], 
 
 
 def _photograph(rng: Rng, width: Real, scale: Real, light: int) -> Shot:
-    """What somebody takes of a landmark of this width, with a camera of their own."""
     h, w = SIZES[int(rng.integers(len(SIZES)))]
     if rng.random() < 0.3:
         h, w = w, h

@@ -349,9 +349,6 @@ def sun(azimuth: Real, elevation: Real) -> tuple[float, float, float]:
     return float(np.cos(a) * np.cos(e)), float(np.sin(a) * np.cos(e)), float(np.sin(e))
 
 
-# What a family makes: geometry, lights and shots; the generator draws them and keeps the matchable pairs
-
-
 @dataclasses.dataclass(frozen=True, eq=False)
 class Shot:
     """One photograph to take. `camera` is the ground truth; `moments` the cameras during a long exposure."""

@@ -82,8 +82,6 @@ def look_at(
     return Camera(K, R, -R @ c, size)
 
 
-# Which surface each pixel's ray meets first: exact ray-plane intersection, batched over pixels, with a depth buffer
-
 Booleans = NDArray[np.bool_]
 Number: TypeAlias = Any  # a number of Python's or NumPy's; in a compiled function each has one type
 Index: TypeAlias = Any

@@ -139,9 +139,6 @@ def material(split: str, kind: str) -> Pixels | None:
     return np.ascontiguousarray(np.concatenate([picture, picture[::-1]], axis=0))
 
 
-# Textured parallelograms and triangles, and the shapes built from them
-
-
 def vec(*v: Real) -> Vector:
     """A float64 vector."""
     return np.array(v, dtype=np.float64)
