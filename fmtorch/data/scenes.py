@@ -9,7 +9,7 @@ import itertools
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -27,17 +27,6 @@ WINDOW = 1.0  # s: a frame is paired with those of the following second (Bian et
 MIN_SHARED = 1  # points of a reconstruction that two images must both see
 _ROUNDING = 1e-6  # s, of time stamps in text files
 _AT_ONCE = 512  # images whose shared points are counted together
-
-
-@runtime_checkable
-class Candidates(Protocol):
-    """Pairs (i, j), i < j, of a scene's images in a fixed order; not necessarily all in memory."""
-
-    def __len__(self) -> int: ...
-
-    def at(self, ranks: Indices) -> Indices:
-        """The pairs (n, 2) at these places (n,) of the order."""
-        ...
 
 
 class AllPairs:
@@ -66,8 +55,11 @@ class ListedPairs:
         return len(self.pairs)
 
     def at(self, ranks: Indices) -> Indices:
-        """The pairs (n, 2) at these places (n,)."""
         return self.pairs[ranks]
+
+
+Candidates = AllPairs | ListedPairs
+"""Pairs (i, j), i < j, of a scene's images in a fixed order; not necessarily all in memory."""
 
 
 def following(times: Sequence[float] | Matrix, window: int | float = WINDOW) -> ListedPairs:

@@ -25,18 +25,10 @@ class Detector(Protocol):
     def detect(self, image: Image) -> tuple[Float[Tensor, "n 2 3"], Float[Tensor, " n"]]: ...
 
 
-@runtime_checkable
-class FrameStep(Protocol):
-    """An image and frames -> the same frames with another shape or orientation."""
-
-    def __call__(self, pyramid: ImagePyramid, lafs: Float[Tensor, "n 2 3"]) -> Float[Tensor, "n 2 3"]: ...
-
-
-@runtime_checkable
-class Descriptor(Protocol):
-    """An image and frames -> a descriptor of each."""
-
-    def __call__(self, pyramid: ImagePyramid, lafs: Float[Tensor, "n 2 3"]) -> Float[Tensor, "n d"]: ...
+FrameStep = Callable[[ImagePyramid, Tensor], Tensor]
+"""An image and frames (n, 2, 3) -> the same frames with another shape or orientation."""
+Descriptor = Callable[[ImagePyramid, Tensor], Tensor]
+"""An image and frames (n, 2, 3) -> a descriptor of each (n, d)."""
 
 
 @dataclasses.dataclass(frozen=True)

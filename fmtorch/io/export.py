@@ -115,21 +115,16 @@ class ViewGraph:
 
     def components(self) -> list[list[str]]:
         """The images that related pairs connect, largest component first, each in the order of the images."""
-        parent = {name: name for name in self.images}
-
-        def root(name: str) -> str:
-            while parent[name] != name:
-                parent[name] = parent[parent[name]]
-                name = parent[name]
-            return name
-
+        groups = {name: {name} for name in self.images}
         for edge in self.edges:
-            if edge.related:
-                parent[root(edge.image1)] = root(edge.image0)
-        groups: dict[str, list[str]] = {}
+            smaller, larger = sorted((groups[edge.image0], groups[edge.image1]), key=len)
+            if edge.related and smaller is not larger:
+                larger |= smaller
+                groups |= dict.fromkeys(smaller, larger)
+        ordered: dict[int, list[str]] = {}
         for name in self.images:
-            groups.setdefault(root(name), []).append(name)
-        return sorted(groups.values(), key=len, reverse=True)
+            ordered.setdefault(id(groups[name]), []).append(name)
+        return sorted(ordered.values(), key=len, reverse=True)
 
 
 def view_graph(journal: MatchStore, images: Sequence[Path], pairs: Sequence[tuple[Path, Path]]) -> ViewGraph:

@@ -242,9 +242,8 @@ class Inner(Generic[P, R]):
     Called from Python it is the plain function, slow and easy to test.
     """
 
-    def __init__(self, function: Callable[P, R], inline: bool) -> None:
+    def __init__(self, function: Callable[P, R]) -> None:
         self.function: Callable[P, R] = inspect.unwrap(function)
-        self.inline = inline
         functools.update_wrapper(self, self.function)
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
@@ -255,9 +254,8 @@ class Inner(Generic[P, R]):
     def _dispatcher(self) -> Any:
         import numba
 
-        how: dict[str, Any] = {"inline": "always"} if self.inline else {}
         function = cache.named_by_version(self.function, cache.version(self.function))
-        return numba.njit(**OPTIONS, no_cpython_wrapper=True, pipeline_class=linking.inner_compiler(), **how)(function)
+        return numba.njit(**OPTIONS, no_cpython_wrapper=True, pipeline_class=linking.inner_compiler())(function)
 
     @property
     def _numba_type_(self) -> Any:
@@ -267,10 +265,13 @@ class Inner(Generic[P, R]):
 
     def described(self) -> tuple[str, Callable[..., Any] | None]:
         """How it is compiled, and its function, which is compiled into those that call it."""
-        return f"inner, inline={self.inline}", self.function
+        return "inner", self.function
 
     def __reduce__(self) -> str:
         return str(self.__qualname__)  # type: ignore[attr-defined]  # the name to import it by
+
+
+inner = Inner
 
 
 @overload
@@ -298,15 +299,6 @@ def kernel(
         return Kernel(function, holds_gil, always_compiled)
 
     return named
-
-
-@overload
-def inner(function: Callable[P, R]) -> Inner[P, R]: ...
-@overload
-def inner(*, inline: bool) -> Callable[[Callable[P, R]], Inner[P, R]]: ...
-def inner(function: Callable[P, R] | None = None, *, inline: bool = False) -> Any:
-    """Makes a function an `Inner` one. inline: numba, too, inlines it; LLVM does so anyway where it is small."""
-    return Inner(function, inline) if function is not None else lambda f: Inner(f, inline)
 
 
 def _compiled(uncompiled: Kernel[P, R], count: str) -> tuple[Callable[P, R], list[Kernel[..., Any]]]:

@@ -34,7 +34,7 @@ class LaneFunction(Inner[..., Any]):
     """A function of lanes: in Python that of arrays, in kernels the intrinsic of this name in `lane_instructions`."""
 
     def __init__(self, function: Callable[..., Any], *parameters: int) -> None:
-        super().__init__(function, inline=False)
+        super().__init__(function)
         self.parameters = parameters
 
     def described(self) -> tuple[str, None]:
@@ -151,4 +151,4 @@ def _fused(a: Any, b: Any, c: Any) -> Any:
     return np.float32(np.float64(a) + np.float64(b) * np.float64(c))
 
 
-fused = _Fused(_fused, inline=False)
+fused = _Fused(_fused)

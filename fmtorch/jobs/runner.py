@@ -268,21 +268,17 @@ def _called(digest: str, factory: bytes | None, function: Callable[[Any, Any], A
         if digest not in _values:
             if factory is None:
                 return NeedsFactory()
-            _values[digest] = _made(factory)
+            use_one_thread()  # as many workers compute: contended threads collapse
+            version, make = pickle.loads(factory)
+            if version != __version__:
+                both = f"a worker has fmtorch {__version__}, the command {version}"
+                raise VersionError(f"{both}; install the same on both")
+            _values[digest] = make()
         _values.move_to_end(digest)
         while len(_values) > KEPT:
             _values.popitem(last=False)
         value = _values[digest]
     return function(value, task)
-
-
-def _made(factory: bytes) -> Any:
-    """What a factory makes, in a process whose workers compute with a thread each: contended ones collapse."""
-    use_one_thread()
-    version, make = pickle.loads(factory)
-    if version != __version__:
-        raise VersionError(f"a worker has fmtorch {__version__}, the command {version}; install the same on both")
-    return make()
 
 
 class TaskRunner(Generic[Task]):
@@ -423,11 +419,10 @@ class TaskRunner(Generic[Task]):
         for future in self.waiting:
             future.cancel()
         futures.wait(self.waiting)
-        for future, task in self.waiting.items():
-            if not future.cancelled() and future.exception() is None:
-                result = future.result()
-                if not isinstance(result, NeedsFactory):
-                    self.keep(task, result)
+        ended = [(task, future) for future, task in self.waiting.items() if not future.cancelled()]
+        for task, result in [(task, future.result()) for task, future in ended if future.exception() is None]:
+            if not isinstance(result, NeedsFactory):
+                self.keep(task, result)
         self.waiting.clear()
 
 

@@ -39,9 +39,9 @@ def tree(surfaces: Surfaces, rng: Rng, foot: Vector, height: Real, leaf: int, ba
         card(surfaces, at, rng.uniform(0, 360), side, side, leaf)
 
 
-def foliage(surfaces: Surfaces, rng: Rng, size: int = 256) -> tuple[int, int]:
+def foliage(surfaces: Surfaces, rng: Rng) -> tuple[int, int]:
     """Textures of leaves and bark."""
-    leaf = surfaces.texture(patterns.leaves(rng, size, colour(rng, (0.18, 0.34), (0.4, 0.7), (0.35, 0.65))))
+    leaf = surfaces.texture(patterns.leaves(rng, 256, colour(rng, (0.18, 0.34), (0.4, 0.7), (0.35, 0.65))))
     bark = patterns.wood(rng, 128, 128, 3, colour(rng, (0.06, 0.1), (0.3, 0.5), (0.25, 0.45)))
     return leaf, surfaces.paint(np.ascontiguousarray(bark.transpose(1, 0, 2)))
 

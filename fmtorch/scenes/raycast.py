@@ -8,7 +8,7 @@ depth z is the reciprocal of the third form. Each piece is intersected with the 
 import dataclasses
 import functools
 from collections.abc import Sequence
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,10 +83,12 @@ def look_at(
 
 
 Booleans = NDArray[np.bool_]
-Number: TypeAlias = Any  # a number of Python's or NumPy's; in a compiled function each has one type
-Index: TypeAlias = Any
+Number = Any  # a number of Python's or NumPy's; in a compiled function each has one type
+Index = Any
 
 _OPAQUE_FROM = 128  # of 255
+SEAM = 1e-4  # pieces reach this much (of their own extent) beyond their edges, so that neighbours leave no gap
+_LOW, _HIGH = np.float32(-SEAM), np.float32(1 + SEAM)  # of s and t, exclusive
 
 
 class Pieces(NamedTuple):
@@ -116,14 +118,6 @@ class Cutouts(NamedTuple):
     opacity: U1x1
 
 
-class Bounds(NamedTuple):
-    """Of s and t, exclusive, and of the depth."""
-
-    low: np.float32
-    high: np.float32
-    near: np.float32
-
-
 class Met(NamedTuple):
     """What the ray of each pixel (h, w) meets first so far: its depth, the piece's number, s and t."""
 
@@ -134,11 +128,10 @@ class Met(NamedTuple):
 
 
 @kernel(always_compiled=True)
-def cast_pieces(pieces: Pieces, cutouts: Cutouts, bounds: Bounds, met: Met) -> None:
-    """Casts rays against pieces; what they meet -> met."""
+def cast_pieces(pieces: Pieces, cutouts: Cutouts, near: np.float32, met: Met) -> None:
+    """Casts rays against pieces, of depths beyond `near`; what they meet -> met."""
     order, boxes, forms, depth, closest, triangle = pieces
     cutout, window, opacity = cutouts
-    low, high, near = bounds
     buffer, piece, s, t = met
     width = buffer.shape[1]
     axis = np.arange(width).astype(np.float32)
@@ -165,7 +158,7 @@ def cast_pieces(pieces: Pieces, cutouts: Cutouts, bounds: Bounds, met: Met) -> N
                 t_here = (t_x * axis[x] + t_y) / q
                 z = z_s * s_here + (z_t * t_here + z_0)
                 edge = s_here + t_here if is_triangle else (s_here if s_here > t_here else t_here)
-                hit = (s_here > low) & (t_here > low) & (edge < high) & (z < before[x]) & (z > near)
+                hit = (s_here > _LOW) & (t_here > _LOW) & (edge < _HIGH) & (z < before[x]) & (z > near)
                 row_s[x], row_t[x], row_z[x], row_hit[x] = s_here, t_here, z, hit
                 hits += hit
             if hits == 0:
@@ -212,7 +205,6 @@ def _open_holes(
 
 
 NEAR = 0.05  # metres
-SEAM = 1e-4  # pieces reach this much (of their own extent) beyond their edges, so that neighbours leave no gap
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -274,10 +266,9 @@ class Geometry:
         pieces = Pieces(order, boxes, forms, z_of, closest, self.triangle)
         s, t = np.zeros((2, h, w), dtype=np.float32)
         hits = Hits(np.full((h, w), -1, dtype=np.int32), s, t, inverse)
-        near = -np.inf if centre is None else NEAR
-        bounds = Bounds(np.float32(-SEAM), np.float32(1 + SEAM), np.float32(near))
+        near = np.float32(-np.inf if centre is None else NEAR)
         met = Met(np.full(hits.piece.shape, np.inf, dtype=np.float32), hits.piece, hits.s, hits.t)
-        cast_pieces(pieces, self._cutouts(pieces.boxes), bounds, met)
+        cast_pieces(pieces, self._cutouts(pieces.boxes), near, met)
         return hits
 
     @functools.cached_property
