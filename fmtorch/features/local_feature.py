@@ -52,15 +52,13 @@ class NetworkDescriptor:
 class LocalFeature:
     """Detects frames, gives them shape and orientation, describes them; an instance may be used by several threads.
 
-    shape, orientation: None keeps the detector's. device: where patches are cut and handed to the networks; on "cpu"
-    through OpenCV. Of two instances with equal `detection` the frames are equal.
+    shape, orientation: None keeps the detector's. Of two instances with equal `detection` the frames are equal.
     """
 
     detector: Detector
     descriptor: Descriptor
     shape: FrameStep | None = None
     orientation: FrameStep | None = None
-    device: str = "cpu"
 
     def __call__(self, image: Image) -> Features:
         """The features of a grey (H, W) or RGB (H, W, 3) uint8 image; none, with N = 0, where nothing is found.
@@ -74,27 +72,21 @@ class LocalFeature:
     @property
     def detection(self) -> tuple[object, ...]:
         """The parts that define frames and scores."""
-        return self.detector, self.shape, self.orientation, self.device
+        return self.detector, self.shape, self.orientation
 
     def detect(self, image: Image) -> tuple[Float[Tensor, "n 2 3"], Float[Tensor, " n"]]:
         """Frames in kornia's convention, with shape and orientation, and the detector's scores."""
         lafs, scores = self.detector.detect(image)
         steps = [step for step in (self.shape, self.orientation) if step is not None]
         if steps and len(lafs):
-            pyramid, lafs = self._pyramid(image), lafs.to(self.device)
+            pyramid = ImagePyramid(as_grey(image))
             for step in steps:
                 lafs = step(pyramid, lafs)
-        return lafs.cpu(), scores.cpu()
+        return lafs, scores
 
     def describe(self, image: Image, lafs: Float[Tensor, "n 2 3"]) -> Float[Tensor, "n d"]:
         """A descriptor of each frame."""
-        return self.descriptor(self._pyramid(image), lafs.to(self.device)).cpu()
-
-    def _pyramid(self, image: Image) -> ImagePyramid:
-        grey = as_grey(image)
-        if self.device == "cpu":
-            return ImagePyramid(grey)
-        return ImagePyramid(torch.from_numpy(grey).to(self.device).float() / 255)
+        return self.descriptor(ImagePyramid(as_grey(image)), lafs)
 
 
 Part = TypeVar("Part")
@@ -111,7 +103,6 @@ def local_feature(
     max_features: Annotated[int, Within(1)] = 8000,
     precision: str = "fp32",
     threads: int = 1,
-    device: str = "cpu",
 ) -> LocalFeature:
     """A `LocalFeature` of named parts.
 
@@ -120,7 +111,7 @@ def local_feature(
     descriptor: `sift`, `rootsift`, `dspsift` (options of `PatchSIFT`), `rootsiftpca` (of `RootSIFTPCA`), `l2net`,
     `geodesc`, `hardnet` or `hardnet_fast`. A part that is a network takes the option `network`, the path of another
     ONNX file than the shipped one.
-    precision: of the networks, fp32 or int8. threads: of each network. device: for torch, see `LocalFeature`.
+    precision: of the networks, fp32 or int8. threads: of each network.
 
     Raises ValueError for an unknown name or option, naming those there are. Networks are read when first used.
     """
@@ -147,7 +138,7 @@ def local_feature(
     shape_step = None if shape is None else _part("shape", shape, shapes)
     turn_step = None if orientation is None else _part("orientation", orientation, orientations)
     ends = _part("detector", detector, detectors), _part("descriptor", descriptor, descriptors)
-    return LocalFeature(*ends, shape_step, turn_step, device)
+    return LocalFeature(*ends, shape_step, turn_step)
 
 
 def _part(kind: str, choice: Choice, known: Mapping[str, Callable[..., Part]]) -> Part:

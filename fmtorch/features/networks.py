@@ -131,7 +131,7 @@ class GeoDesc(HardNet):
 
     def __init__(self) -> None:
         super().__init__(dropout=0.0)
-        self.features = self.features[:-1]
+        self.features = nn.Sequential(*list(self.features)[:-1])
 
 
 class AffNet(nn.Module):

@@ -90,7 +90,7 @@ def _comparison(sign: str) -> Callable[[Any, Any, Any], Any]:
 for _name, _instruction in ARITHMETIC.items():
     for _function in (getattr(operator, _name), getattr(operator, f"i{_name}")):
         _typed(_function, lambda kind: kind)
-        _lowered(_function, lambda builder, a, b, name=_instruction: getattr(builder, name)(a, b))
+        _lowered(_function, getattr(ir.IRBuilder, _instruction))
 for _name, _sign in COMPARISONS.items():
     _typed(getattr(operator, _name), lambda kind: kind.mask)
     _lowered(getattr(operator, _name), _comparison(_sign))

@@ -286,8 +286,9 @@ class Stage:
         )  # fmt: skip
         for i in np.flatnonzero(count).tolist():
             texture = geometry.textures[i]
-            shape, coarsest = texture.atlas.shape[1:], np.float32(texture.coarsest)
-            picture = Picture(texture.atlas.reshape(-1), *shape, texture.origin, texture.scale, coarsest, TO_LINEAR)
+            levels = texture.origin, texture.scale, np.float32(texture.coarsest)
+            _, width, channels = texture.atlas.shape
+            picture = Picture(texture.atlas.reshape(-1), width, channels, *levels, TO_LINEAR)
             shade(index[end[i] - count[i] : end[i]], seen, footprint, picture, lighting, out)
 
     def homography(self, hits: Hits) -> Floats:

@@ -85,7 +85,7 @@ def masonry(
     wobble = np.float32(joint) * (1 + 0.35 * fractal(rng, h, w, 16, 2))
     gap = np.clip((wobble - np.minimum(edge_x, edge_y)) / np.float32(joint * 0.4) + 0.5, 0, 1)[..., None]
     mortar = (0.55 * tint + 0.15) * (1 + 0.1 * fractal(rng, h, w, 8, 1))[..., None]
-    return (out * (1 - gap) + mortar * gap).astype(np.float32)
+    return np.asarray(out * (1 - gap) + mortar * gap, dtype=np.float32)
 
 
 def cells(rng: Rng, h: int, w: int, size: int, tint: Floats) -> Floats:

@@ -36,14 +36,7 @@ def test_small_frames_are_kornias_patches() -> None:
     lafs = torch.cat([lafs[..., :2] * 0.8, lafs[..., 2:]], -1)
     tensor = torch.from_numpy(image)[None, None].float() / 255
     expected = kornia.feature.extract_patches_simple(tensor, lafs[None])[0]
-    for pyramid in (ImagePyramid(image), ImagePyramid(tensor[0, 0])):
-        torch.testing.assert_close(pyramid.extract(lafs), expected, atol=2e-4, rtol=0)
-
-
-def test_torch_and_opencv_agree() -> None:
-    image, lafs = texture(3, 301, 270), random_frames(3, 200, 301, 270, 3, 200)
-    both = [ImagePyramid(x).extract(lafs) for x in (image, torch.from_numpy(image).float() / 255)]
-    torch.testing.assert_close(*both, atol=3e-4, rtol=0)
+    torch.testing.assert_close(ImagePyramid(image).extract(lafs), expected, atol=2e-4, rtol=0)
 
 
 def test_neighbours_are_invisible() -> None:
