@@ -248,22 +248,16 @@ def _polynomial(x: Matrix, k: tuple[float, ...]) -> Matrix:
 
 
 MODELS = {
-    "SIMPLE_PINHOLE": Model(1, "", pinhole),
-    "PINHOLE": Model(2, "", pinhole),
-    "SIMPLE_RADIAL": Model(1, "k", radial),
-    "RADIAL": Model(1, "k1 k2", radial),
-    "OPENCV": Model(2, "k1 k2 p1 p2", rational),
-    "OPENCV_FISHEYE": Model(2, "k1 k2 k3 k4", equidistant, fisheye=True),
-    "FULL_OPENCV": Model(2, "k1 k2 p1 p2 k3 k4 k5 k6", rational),
-    "FOV": Model(2, "omega", field_of_view),
+    "SIMPLE_PINHOLE": Model(1, "", pinhole), "PINHOLE": Model(2, "", pinhole),
+    "SIMPLE_RADIAL": Model(1, "k", radial), "RADIAL": Model(1, "k1 k2", radial),
+    "OPENCV": Model(2, "k1 k2 p1 p2", rational), "OPENCV_FISHEYE": Model(2, "k1 k2 k3 k4", equidistant, fisheye=True),
+    "FULL_OPENCV": Model(2, "k1 k2 p1 p2 k3 k4 k5 k6", rational), "FOV": Model(2, "omega", field_of_view),
     "SIMPLE_RADIAL_FISHEYE": Model(1, "k", equidistant, fisheye=True),
     "RADIAL_FISHEYE": Model(1, "k1 k2", equidistant, fisheye=True),
     "THIN_PRISM_FISHEYE": Model(2, "k1 k2 p1 p2 k3 k4 sx1 sy1", thin_prism, fisheye=True),
     "RAD_TAN_THIN_PRISM_FISHEYE": Model(2, "k0 k1 k2 k3 k4 k5 p0 p1 s0 s1 s2 s3", rad_tan_thin_prism, fisheye=True),
-    "SIMPLE_DIVISION": Model(1, "k", division),
-    "DIVISION": Model(2, "k", division),
-    "SIMPLE_FISHEYE": Model(1, "", equidistant, fisheye=True),
-    "FISHEYE": Model(2, "", equidistant, fisheye=True),
+    "SIMPLE_DIVISION": Model(1, "k", division), "DIVISION": Model(2, "k", division),
+    "SIMPLE_FISHEYE": Model(1, "", equidistant, fisheye=True), "FISHEYE": Model(2, "", equidistant, fisheye=True),
     "EUCM": Model(2, "alpha beta", unified),
 }  # fmt: skip
 """The models by name, in the order of the numbers that COLMAP's binary files give them."""

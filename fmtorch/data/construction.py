@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-import scipy.sparse
 
 from fmtorch.core.files import replacing
 from fmtorch.core.settings import claim
@@ -43,7 +42,7 @@ class PointOverlap:
 
     def __init__(self, points: Sequence[Callable[[], Sequence[Indices]]]) -> None:
         self.points = points
-        self._last: tuple[int, scipy.sparse.csr_array] | None = None  # a scene, and which of its views sees what
+        self._last: tuple[int, Any] | None = None  # a scene, and which of its views sees what
 
     @property
     def record(self) -> dict[str, Any]:
@@ -58,7 +57,7 @@ class PointOverlap:
         return float(shared_points(last[1], np.array([[i, j]]))[0])
 
 
-def shared_points(sees: scipy.sparse.csr_array, pairs: Indices) -> Matrix:
+def shared_points(sees: Any, pairs: Indices) -> Matrix:
     """Overlaps (n,) of pairs (n, 2) of images: points that both see, over those of the image that sees more of them.
 
     sees: which image sees which point, as `incidence` gives it. Zero where an image sees none.

@@ -9,7 +9,7 @@ import itertools
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import cv2
 import numpy as np
@@ -18,10 +18,6 @@ from fmtorch.data.cameras import fundamental, relative_pose, share_centre
 from fmtorch.data.files import Array, DataError, Indices, Matrix, Singles
 from fmtorch.data.images import ImageError
 from fmtorch.data.pairs import ImagePair, ImageSource, PairDataset
-
-if TYPE_CHECKING:
-    import scipy.sparse
-
 
 WINDOW = 1.0  # s: a frame is paired with those of the following second (Bian et al., BMVC 2019, Section 3)
 MIN_SHARED = 1  # points of a reconstruction that two images must both see
@@ -94,8 +90,8 @@ def collection_pairs(views: int, points: Sequence[Indices] | None, minimum: int)
     return AllPairs(views) if points is None else sharing_points(points, minimum)
 
 
-def incidence(points: Sequence[Indices]) -> "scipy.sparse.csr_array":
-    """Which image sees which point, (images, points) of ones; points: of each image the numbers it sees."""
+def incidence(points: Sequence[Indices]) -> Any:
+    """A `scipy.sparse.csr_array` (images, points), 1 where an image sees a point; points: the numbers that each sees."""
     import scipy.sparse  # which takes longer to import than a small database to verify
 
     seen = [np.unique(p) for p in points]

@@ -60,9 +60,7 @@ class DISK(_NetworkFeatures):
 
     weights: `depth` or `epipolar`, the released models. max_features: the strongest kept. window: side in pixels of the
     non-maximum suppression. score_threshold: least score, a logit. device: auto, cpu, cuda. network: in place of the
-    released one.
-
-    Raises ConnectionError where the weights cannot be fetched.
+    released one. Raises ConnectionError where the weights cannot be fetched.
     """
 
     def __init__(
@@ -95,9 +93,8 @@ class ALIKED(_NetworkFeatures):
 
     weights: `aliked-n16`, `aliked-n16rot`, `aliked-n32` or `aliked-t16` (whose descriptors have 64 numbers).
     max_features: the strongest kept. score_threshold: least score, in (0, 1). radius: of the non-maximum suppression,
-    in pixels. device: auto, cpu, cuda. network: in place of the released one.
-
-    Raises ConnectionError where the weights cannot be fetched.
+    in pixels. device: auto, cpu, cuda. network: in place of the released one. Raises ConnectionError where the weights
+    cannot be fetched.
     """
 
     def __init__(

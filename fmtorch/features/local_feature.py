@@ -110,10 +110,8 @@ def local_feature(
     shape: None, `affnet` or `affnet_fast`. orientation: None for the detector's, `dominant_gradient` or `orinet`.
     descriptor: `sift`, `rootsift`, `dspsift` (options of `PatchSIFT`), `rootsiftpca` (of `RootSIFTPCA`), `l2net`,
     `geodesc`, `hardnet` or `hardnet_fast`. A part that is a network takes the option `network`, the path of another
-    ONNX file than the shipped one.
-    precision: of the networks, fp32 or int8. threads: of each network.
-
-    Raises ValueError for an unknown name or option, naming those there are. Networks are read when first used.
+    ONNX file than the shipped one. precision: of the networks, fp32 or int8. threads: of each network. Raises
+    ValueError for an unknown name or option, naming those there are. Networks are read when first used.
     """
     if precision not in ("fp32", "int8"):
         raise ValueError(f"precision={precision}: it must be fp32 or int8")
@@ -121,20 +119,14 @@ def local_feature(
     def by(part: Callable[[PatchFunction], Part], name: str) -> Callable[..., Part]:
         return lambda network=name: part(PatchNetwork(network_file(network, precision), threads=threads))
 
-    detectors: dict[str, Callable[..., Detector]] = {
-        "dog": functools.partial(SIFT, max_features=max_features),
-        "hessian": functools.partial(HessianDetector, max_features=max_features),
-    }
+    kinds: dict[str, Callable[..., Detector]] = {"dog": SIFT, "hessian": HessianDetector}
+    detectors = {name: functools.partial(kind, max_features=max_features) for name, kind in kinds.items()}
     shapes: dict[str, Callable[..., FrameStep]] = {name: by(NetworkShape, name) for name in ("affnet", "affnet_fast")}
     orinet = by(NetworkOrientation, "orinet")
     orientations: dict[str, Callable[..., FrameStep]] = {"dominant_gradient": DominantGradient, "orinet": orinet}
-    descriptors: dict[str, Callable[..., Descriptor]] = {
-        "sift": PatchSIFT,
-        "rootsift": functools.partial(PatchSIFT, root=True),
-        "dspsift": PatchSIFT,
-        "rootsiftpca": RootSIFTPCA,
-        **{name: by(NetworkDescriptor, name) for name in ("l2net", "geodesc", "hardnet", "hardnet_fast")},
-    }
+    plain = {"sift": PatchSIFT, "rootsift": functools.partial(PatchSIFT, root=True), "dspsift": PatchSIFT}
+    networks = {name: by(NetworkDescriptor, name) for name in ("l2net", "geodesc", "hardnet", "hardnet_fast")}
+    descriptors: dict[str, Callable[..., Descriptor]] = {**plain, "rootsiftpca": RootSIFTPCA, **networks}
     shape_step = None if shape is None else _part("shape", shape, shapes)
     turn_step = None if orientation is None else _part("orientation", orientation, orientations)
     ends = _part("detector", detector, detectors), _part("descriptor", descriptor, descriptors)

@@ -146,9 +146,8 @@ class MatchFile(_OpenFiles):
     """The pairs of one file; each has matches of its own. output: the file of geometries that is written.
 
     A file holds ``x0, x1`` (n, 2), pixels with (0, 0) at the centre of the first one, and perhaps ``K0, K1`` (3, 3) and
-    ``size0, size1`` (h, w): of one pair, or of each pair below a name of its own (``a/x0``; in HDF5 a group).
-
-    Raises DataError where the file is of another kind or holds no such pair.
+    ``size0, size1`` (h, w): of one pair, or of each pair below a name of its own (``a/x0``; in HDF5 a group). Raises
+    DataError where the file is of another kind or holds no such pair.
     """
 
     def __init__(self, path: Path, output: Path) -> None:

@@ -27,17 +27,13 @@ def given(
 
     ratio, score, mutual: (n,), as of `Correspondences`. features: how many keypoints each image has.
     """
-    p0, p1 = (torch.from_numpy(np.ascontiguousarray(x, np.float32))[None] for x in (x0, x1))
     mask = torch.from_numpy(np.isfinite(x0).all(-1) & np.isfinite(x1).all(-1))[None]
-    return GivenMatches(
-        Correspondences(
-            torch.where(mask[..., None], p0, 0.0), torch.where(mask[..., None], p1, 0.0), mask,
-            ratio=_figure(ratio), score=_figure(score),
-            mutual=None if mutual is None else torch.from_numpy(mutual)[None] & mask,
-            size0=torch.tensor([sizes[0]]), size1=torch.tensor([sizes[1]]),
-        ),
-        features,
-    )  # fmt: skip
+    points = (torch.from_numpy(np.ascontiguousarray(x, np.float32))[None] for x in (x0, x1))
+    p0, p1 = (torch.where(mask[..., None], x, 0.0) for x in points)
+    size0, size1 = (torch.tensor([size]) for size in sizes)
+    known = {"ratio": _figure(ratio), "score": _figure(score), "size0": size0, "size1": size1}
+    both = None if mutual is None else torch.from_numpy(mutual)[None] & mask
+    return GivenMatches(Correspondences(p0, p1, mask, mutual=both, **known), features)
 
 
 def _figure(values: Matrix | None) -> torch.Tensor | None:

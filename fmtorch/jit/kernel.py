@@ -49,9 +49,8 @@ NUMBERS = {int: "int64", float: "float64", bool: "boolean", np.float32: "float32
 def signature_of(function: Callable[..., Any]) -> tuple[Any, ...]:
     """The types of a function's arguments, as numba compiles for them, from its annotations.
 
-    They are array types of this file, numbers, bool, and groups: NamedTuples of such types.
-
-    Raises TypeError, naming the argument, for a type that is none of these.
+    They are array types of this file, numbers, bool, and groups: NamedTuples of such types. Raises TypeError, naming
+    the argument, for a type that is none of these.
     """
     hints = get_type_hints(function, include_extras=True)
     names = function.__code__.co_varnames[: function.__code__.co_argcount]

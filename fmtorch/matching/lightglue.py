@@ -19,11 +19,10 @@ def weight_file(features: str) -> str:
 class LightGlue:
     """Matches the features of two images by a transformer; the slots of the result are the matches found.
 
-    score and prior: the network's score, its P(match). Frames are not handed on: the features that it is
-    for have none. features: `aliked` or `disk`, what the weights were trained for; threshold: least score.
-    device: auto, cpu, cuda. network: in place of the released one. For any number of threads.
-
-    Raises ConnectionError where the weights cannot be fetched.
+    score and prior: the network's score, its P(match). Frames are not handed on: the features that it is for have none.
+    features: `aliked` or `disk`, what the weights were trained for; threshold: least score. device: auto, cpu, cuda.
+    network: in place of the released one. For any number of threads. Raises ConnectionError where the weights cannot be
+    fetched.
     """
 
     def __init__(

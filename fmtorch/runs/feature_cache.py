@@ -139,7 +139,6 @@ class CachedFeatures:
     A `TwoStepExtractor` is kept in two files, frames under the digest of its `detection` alone; any other in one.
     Results are on the CPU. `timed` gives the seconds that the computation took when it was done, here or in another
     run. found, computed: images so far that needed no computation, and that needed some. For any number of threads.
-
     Raises TypeError where the extractor does not say what defines it, OSError where a file of it cannot be read (see
     `configuration`).
     """

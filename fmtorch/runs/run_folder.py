@@ -25,7 +25,6 @@ class PairRow:
     """The result of one image pair. What could not be computed is None or NaN, and null in the table.
 
     A pair of a known homography has a corner error, infinite where it failed, and H in place of F; its NSGD is NaN.
-
     Raises ValueError for a row that contradicts itself: a failed pair has a reason, NSGD 1 and no F; a sound one has no
     reason and nine finite elements of F or H; NSGD is in [0, 1]; there are both angles of a pose error or neither.
     """
