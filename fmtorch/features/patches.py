@@ -28,9 +28,10 @@ class ImagePyramid:
     """
 
     def __init__(self, grey: Image) -> None:
-        self.levels = [np.multiply(grey, 1 / 255, dtype=np.float32)]
+        self.levels = [torch.from_numpy(np.multiply(grey, 1 / 255, dtype=np.float32))]
         while min(self.levels[-1].shape) >= 2 * COARSEST:
-            self.levels.append(np.asarray(cv2.pyrDown(self.levels[-1], borderType=cv2.BORDER_REPLICATE), np.float32))
+            coarser = cv2.pyrDown(self.levels[-1].numpy(), borderType=cv2.BORDER_REPLICATE)
+            self.levels.append(torch.from_numpy(np.asarray(coarser)))
 
     def extract(self, lafs: Float[Tensor, "n 2 3"], size: int = PATCH) -> Float[Tensor, "n 1 size size"]:
         """Patches in [0, 1] whose pixels tile the frames' squares; the image's border is continued outside.
@@ -40,7 +41,7 @@ class ImagePyramid:
         averaged over as many samples along the other axis as keep them so close. A frame that is not finite gives
         zeros.
         """
-        plan = _plan(lafs, len(self.levels), size)
+        plan, images = _plan(lafs, len(self.levels), size), [level.numpy() for level in self.levels]
         out = np.zeros((len(lafs), size, size), np.float32)
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         order = _by_place(lafs, plan)
@@ -48,7 +49,7 @@ class ImagePyramid:
         for i, matrix, (level, (nx, ny)) in zip(order.tolist(), maps, places, strict=True):
             shape, dense = (size * nx, size * ny), out[i] if nx == ny == 1 else None
             samples = cv2.warpAffine(
-                self.levels[level], matrix, shape, dst=dense, flags=flags, borderMode=cv2.BORDER_REPLICATE
+                images[level], matrix, shape, dst=dense, flags=flags, borderMode=cv2.BORDER_REPLICATE
             )
             if dense is None:
                 cv2.resize(samples, (size, size), dst=out[i], interpolation=cv2.INTER_AREA)
