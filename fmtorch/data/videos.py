@@ -43,36 +43,25 @@ class KittiPairs(ScenePairs):
         super().__init__("kitti", read, [*files, *poses], (camera, window), pairs, seed)
 
 
-def read_projections(path: Path) -> dict[str, Matrix]:
-    """The matrices (3, 4) of a ``calib.txt`` by their names, P0 to P3; others, such as Tr, too."""
-    projections = {}
-    for number, line in numbered(path, _LAYOUT):
-        name, _, rest = line.partition(":")
-        projections[name.strip()] = to_finite(path, number, rest.split(), _PROJECTION, 12).reshape(3, 4)
-    return projections
-
-
-def read_times(path: Path) -> Matrix:
-    """The seconds (n,) of a ``times.txt``; they must ascend."""
-    times: list[float] = []
-    for number, line in numbered(path, _LAYOUT):
-        (time,) = to_finite(path, number, line.split(), "seconds", 1)
-        if times and time <= times[-1]:
-            raise DataError(f"{path}, line {number}: {time:g} s does not come after {times[-1]:g} s; times must ascend")
-        times.append(float(time))
-    return np.array(times)
-
-
 def _kitti_scene(home: Path, folder: Path, camera: int, window: int | float) -> Scene:
     name, images = folder.name, folder / f"image_{camera}"
-    projections = read_projections(folder / "calib.txt")
+    calibration, stamps = folder / "calib.txt", folder / "times.txt"
+    projections, times = dict[str, Matrix](), list[float]()
+    for number, line in numbered(calibration, _LAYOUT):
+        key, _, rest = line.partition(":")
+        projections[key.strip()] = to_finite(calibration, number, rest.split(), _PROJECTION, 12).reshape(3, 4)
     if f"P{camera}" not in projections:
-        raise DataError(f"{folder / 'calib.txt'}: no line P{camera}; it must hold {_PROJECTION}")
-    times = read_times(folder / "times.txt")
+        raise DataError(f"{calibration}: no line P{camera}; it must hold {_PROJECTION}")
+    for number, line in numbered(stamps, _LAYOUT):
+        (time,) = to_finite(stamps, number, line.split(), "seconds", 1).tolist()
+        if times and time <= times[-1]:
+            between = f"{time:g} s does not come after {times[-1]:g} s"
+            raise DataError(f"{stamps}, line {number}: {between}; times must ascend")
+        times.append(time)
     poses = home / "poses" / f"{name}.txt"
     lines = list(numbered(poses, _LAYOUT))
     if len(lines) != len(times):
-        ends = f"{poses} ends at line {len(lines)} and {folder / 'times.txt'} at line {len(times)}"
+        ends = f"{poses} ends at line {len(lines)} and {stamps} at line {len(times)}"
         raise DataError(f"{ends}; each must have one line a frame: is one of them truncated?")
     if not images.is_dir():
         raise DataError(f"{images}: no such folder; {_LAYOUT}")

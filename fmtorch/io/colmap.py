@@ -196,7 +196,7 @@ MEMORY = 2 * BLOCK + 1  # images whose keypoints are kept
 Ids = tuple[int, int]
 
 
-class MatchDatabase:
+class MatchDatabase(contextlib.AbstractContextManager["MatchDatabase"]):
     """An open database. Its images are read when they are needed, and few of them are kept.
 
     Raises what `expect_database` raises, and ValueError where there are no keypoints or no matches; OSError where the
@@ -218,9 +218,6 @@ class MatchDatabase:
         if lacking:
             self.close()
             raise ValueError(f"{path} holds no {lacking} first")
-
-    def __enter__(self) -> "MatchDatabase":
-        return self
 
     def __exit__(self, *error: object) -> None:
         self.close()

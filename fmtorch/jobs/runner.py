@@ -8,7 +8,6 @@ says nothing to the worker, the task is sent again with how to make it.
 import contextlib
 import functools
 import hashlib
-import multiprocessing
 import multiprocessing.connection
 import os
 import pickle
@@ -40,7 +39,7 @@ class WorkersLost(ConnectionError):
     """Workers, or the scheduler, that are there no more; what was stored is kept."""
 
 
-class WorkerPool:
+class WorkerPool(contextlib.AbstractContextManager["WorkerPool"]):
     """The workers of an `Execution`, started at their first task, and replaced where they broke; a context manager.
 
     Args:
@@ -58,9 +57,6 @@ class WorkerPool:
         self.size = max(1, count if limit is None else min(count, limit))
         self._executor: Executor | None = None
         self._cluster: _Cluster | None = None
-
-    def __enter__(self) -> "WorkerPool":
-        return self
 
     def __exit__(self, *error: object) -> None:
         self.close()
