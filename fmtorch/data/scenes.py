@@ -91,7 +91,7 @@ def collection_pairs(views: int, points: Sequence[Indices] | None, minimum: int)
 
 
 def incidence(points: Sequence[Indices]) -> Any:
-    """A `scipy.sparse.csr_array` (images, points), 1 where an image sees a point; points: the numbers of those."""
+    """A sparse array of SciPy's (images, points), 1 where an image sees a point; points: the numbers of those."""
     import scipy.sparse  # which takes longer to import than a small database to verify
 
     seen = [np.unique(p) for p in points]

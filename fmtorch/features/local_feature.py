@@ -124,7 +124,8 @@ def local_feature(
     shapes: dict[str, Callable[..., FrameStep]] = {name: by(NetworkShape, name) for name in ("affnet", "affnet_fast")}
     orinet = by(NetworkOrientation, "orinet")
     orientations: dict[str, Callable[..., FrameStep]] = {"dominant_gradient": DominantGradient, "orinet": orinet}
-    plain = {"sift": PatchSIFT, "rootsift": functools.partial(PatchSIFT, root=True), "dspsift": PatchSIFT}
+    rooted = functools.partial(PatchSIFT, root=True)
+    plain: dict[str, Callable[..., Descriptor]] = {"sift": PatchSIFT, "rootsift": rooted, "dspsift": PatchSIFT}
     networks = {name: by(NetworkDescriptor, name) for name in ("l2net", "geodesc", "hardnet", "hardnet_fast")}
     descriptors: dict[str, Callable[..., Descriptor]] = {**plain, "rootsiftpca": RootSIFTPCA, **networks}
     shape_step = None if shape is None else _part("shape", shape, shapes)

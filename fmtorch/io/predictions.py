@@ -164,13 +164,11 @@ class HLocMatches:
             ends = zip(self.names, self.images, strict=True)
             size0, size1 = (_size(file, f"{name}/image_size", image) for name, image in ends)
         with h5.opened(self.matches) as file:
-            chosen, scores = _read_indices(file, self.matches, self.key)
-        order = (1, 0) if self.swapped else (0, 1)
-        i, j = _indices(chosen, [len(points[k]) for k in order], f"{self.matches}: {self.key + '/matches0'!r}")
+            counts = [len(p) for p in (reversed(points) if self.swapped else points)]
+            i, j, score = _read_matches(file, self.matches, self.key, self.key, counts)
         index = (j, i) if self.swapped else (i, j)
         x0, x1 = (p[k] for p, k in zip(points, index, strict=True))
-        counts = len(points[0]), len(points[1])
-        return given(x0, x1, (size0, size1), counts, score=None if scores is None else scores[i])
+        return given(x0, x1, (size0, size1), (len(points[0]), len(points[1])), score=score)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -199,10 +197,9 @@ class PairPrediction:
 
     def _indexed(self, group: Any) -> tuple[list[Matrix], list[int], Matrix | None]:
         points = [h5.numbers(group, f"keypoints{k}", None, 2) for k in (0, 1)]
-        chosen, scores = _read_indices(group, self.path, "")
         counts = [len(p) for p in points]
-        i, j = _indices(chosen, counts, f"{self.path}: {self.key + '/matches0'!r}")
-        return [points[0][i], points[1][j]], counts, None if scores is None else scores[i]
+        i, j, score = _read_matches(group, self.path, "", self.key, counts)
+        return [points[0][i], points[1][j]], counts, score
 
     def _matched(self, group: Any) -> tuple[list[Matrix], list[int], Matrix | None]:
         x = [h5.numbers(group, f"matched_kpts{k}", None, 2) for k in (0, 1)]
@@ -270,18 +267,16 @@ def _expect_distinct(names: dict[str, str | None], path: Path) -> None:
             raise DataError(f"{both}; names must tell images apart, such as by their folder")
 
 
-def _read_indices(file: Any, path: Path, key: str) -> tuple[Indices, Matrix | None]:
-    prefix = f"{key}/" if key else ""
-    chosen = h5.array(file, f"{prefix}matches0", None)
-    if chosen.dtype.kind not in "iu":
-        raise DataError(f"{path}: {prefix + 'matches0'!r} is of {chosen.dtype}; it must hold whole numbers")
-    scored = h5.holds(file, f"{prefix}matching_scores0")
+def _read_matches(
+    file: Any, path: Path, key: str, shown: str, counts: Sequence[int]
+) -> tuple[Indices, Indices, Matrix | None]:
+    """The matched keypoints of both images, and scores. Raises DataError for what cannot be of so many keypoints."""
+    prefix, where = f"{key}/" if key else "", f"{path}: {shown + '/matches0'!r}"
+    stored = h5.array(file, f"{prefix}matches0", None)
+    if stored.dtype.kind not in "iu":
+        raise DataError(f"{path}: {prefix + 'matches0'!r} is of {stored.dtype}; it must hold whole numbers")
+    scored, chosen = h5.holds(file, f"{prefix}matching_scores0"), stored.astype(np.int64)
     scores = h5.numbers(file, f"{prefix}matching_scores0", len(chosen)) if scored else None
-    return chosen.astype(np.int64), scores
-
-
-def _indices(chosen: Indices, counts: list[int], where: str) -> tuple[Indices, Indices]:
-    """The matched keypoints of both images. Raises DataError where the indices cannot be those of the keypoints."""
     if len(chosen) != counts[0]:
         raise DataError(f"{where} has {len(chosen)} entries, but the first image has {counts[0]} keypoints")
     if len(chosen) and chosen.min() < NO_MATCH:
@@ -289,7 +284,7 @@ def _indices(chosen: Indices, counts: list[int], where: str) -> tuple[Indices, I
     if len(chosen) and chosen.max() >= counts[1]:
         raise DataError(f"{where} names keypoint {chosen.max()}, but the second image has {counts[1]}")
     i = np.flatnonzero(chosen != NO_MATCH)
-    return i, chosen[i]
+    return i, chosen[i], None if scores is None else scores[i]
 
 
 def _keypoints(file: Any, path: Path, name: str) -> Matrix:
