@@ -8,7 +8,6 @@ from typing import Any
 
 import torch
 from jaxtyping import Float, Int
-from torch import Tensor
 
 from fmtorch import presets
 from fmtorch.data.cameras import Lens
@@ -28,11 +27,7 @@ Progress = Callable[[int, int], None]
 
 
 def load(
-    name: str,
-    split: str = "test",
-    root: str | Path | None = None,
-    progress: Progress | None = None,
-    **options: Any,
+    name: str, split: str = "test", root: str | Path | None = None, progress: Progress | None = None, **options: Any
 ) -> PairDataset:
     """The data set ``conf/dataset/<name>.yaml``: an indexable of `ImagePair`, as torch's DataLoader takes it.
 
@@ -73,8 +68,8 @@ class PairBatch:
     """Several pairs and, stacked, their fundamental matrices (B, 3, 3) float64 and keys (B,)."""
 
     pairs: tuple[ImagePair, ...]
-    F: Float[Tensor, "b 3 3"]
-    key: Int[Tensor, " b"]
+    F: Float[torch.Tensor, "b 3 3"]
+    key: Int[torch.Tensor, " b"]
 
     def __len__(self) -> int:
         return len(self.pairs)

@@ -3,15 +3,12 @@
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from fmtorch.data.files import DataError
-
-Matrix = NDArray[np.float64]
+from fmtorch.data.files import Array, DataError, Matrix, Pixels, Singles
 
 SAME_CENTRE = 1e-9  # baseline below which there is no F, relative to the cameras' distance from the origin (float64)
 NEARLY_ROTATION = 0.05  # change of an entry up to which a matrix is taken for a rotation that was rounded
@@ -74,8 +71,7 @@ def line_distance(F: Matrix, x0: Matrix, x1: Matrix) -> Matrix:
 
 def from_projection(P: Matrix, R: Matrix, t: Matrix) -> Camera:
     """The camera ``P [R | t; 0 1]``, of a projection (3, 4) of an already rectified camera: ``P = K [I | K^-1 p4]``."""
-    K = P[:, :3]
-    return Camera(K, R, t + np.linalg.solve(K, P[:, 3]))
+    return Camera(P[:, :3], R, t + np.linalg.solve(P[:, :3], P[:, 3]))
 
 
 def nearest_rotation(matrix: Matrix, place: str) -> Matrix:
@@ -105,9 +101,7 @@ def rotation_of_quaternion(quaternion: Matrix, place: str) -> Matrix:
 
 # Lens models: where a lens puts what an ideal pinhole would have put elsewhere. All of COLMAP's, by its names
 
-
-Array = NDArray[np.float64]
-Distortion = Callable[..., tuple[Array, Array]]
+Distortion = Callable[..., tuple[Matrix, Matrix]]
 
 _TINY = 1e-12  # squared radius or parameter below which a quotient is replaced by its limit
 
@@ -127,7 +121,7 @@ class Lens:
     coefficients: tuple[float, ...] = ()
 
     @property
-    def K(self) -> Array:
+    def K(self) -> Matrix:
         """The calibration (3, 3) of the undistorted image."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
@@ -136,7 +130,7 @@ class Lens:
         """Whether the image differs from a pinhole's."""
         return MODELS[self.model].fisheye or any(self.coefficients)
 
-    def distort(self, points: Array) -> Array:
+    def distort(self, points: Matrix) -> Matrix:
         """Where points (..., 2) of the undistorted image are in the photograph, both in pixels."""
         u, v = (points[..., 0] - self.cx) / self.fx, (points[..., 1] - self.cy) / self.fy
         u, v = MODELS[self.model].distort(u, v, *self.coefficients)
@@ -161,19 +155,19 @@ class Model:
         """The names of all parameters, in COLMAP's order."""
         return [*(["f"] if self.focals == 1 else ["fx", "fy"]), "cx", "cy", *self.coefficients.split()]
 
-    def lens(self, name: str, values: Array) -> Lens:
+    def lens(self, name: str, values: Matrix) -> Lens:
         """The lens of a model's parameters, whose principal point has the origin of the lens."""
         fx, fy = (values[0], values[0]) if self.focals == 1 else (values[0], values[1])
         cx, cy = values[self.focals : self.focals + 2]
         return Lens(float(fx), float(fy), float(cx), float(cy), name, tuple(map(float, values[self.focals + 2 :])))
 
 
-def pinhole(u: Array, v: Array) -> tuple[Array, Array]:
+def pinhole(u: Matrix, v: Matrix) -> tuple[Matrix, Matrix]:
     """No distortion."""
     return u, v
 
 
-def radial(u: Array, v: Array, k1: float = 0.0, k2: float = 0.0) -> tuple[Array, Array]:
+def radial(u: Matrix, v: Matrix, k1: float = 0.0, k2: float = 0.0) -> tuple[Matrix, Matrix]:
     """A polynomial in the squared radius."""
     r2 = u * u + v * v
     factor = 1 + r2 * (k1 + r2 * k2)
@@ -181,9 +175,9 @@ def radial(u: Array, v: Array, k1: float = 0.0, k2: float = 0.0) -> tuple[Array,
 
 
 def rational(
-    u: Array, v: Array,
+    u: Matrix, v: Matrix,
     k1: float, k2: float, p1: float, p2: float, k3: float = 0.0, k4: float = 0.0, k5: float = 0.0, k6: float = 0.0,
-) -> tuple[Array, Array]:  # fmt: skip
+) -> tuple[Matrix, Matrix]:  # fmt: skip
     """A quotient of polynomials, and decentring (Brown): OpenCV's model."""
     r2 = u * u + v * v
     factor = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
@@ -191,7 +185,7 @@ def rational(
     return u * factor + du, v * factor + dv
 
 
-def field_of_view(u: Array, v: Array, omega: float) -> tuple[Array, Array]:
+def field_of_view(u: Matrix, v: Matrix, omega: float) -> tuple[Matrix, Matrix]:
     """The radius is an angle: ``atan(2 r tan(omega / 2)) / omega``."""
     r = np.hypot(u, v)
     if omega * omega < _TINY:
@@ -201,7 +195,7 @@ def field_of_view(u: Array, v: Array, omega: float) -> tuple[Array, Array]:
     return u * factor, v * factor
 
 
-def equidistant(u: Array, v: Array, *k: float) -> tuple[Array, Array]:
+def equidistant(u: Matrix, v: Matrix, *k: float) -> tuple[Matrix, Matrix]:
     """The radius is the angle to the axis, times a polynomial in its square with coefficients k."""
     r = np.hypot(u, v)
     theta = np.arctan(r)
@@ -209,11 +203,9 @@ def equidistant(u: Array, v: Array, *k: float) -> tuple[Array, Array]:
     return u * factor, v * factor
 
 
-def thin_prism(
-    u: Array, v: Array,
-    k1: float, k2: float, p1: float, p2: float, k3: float, k4: float, sx1: float, sy1: float,
-) -> tuple[Array, Array]:  # fmt: skip
+def thin_prism(u: Matrix, v: Matrix, *c: float) -> tuple[Matrix, Matrix]:
     """A fish-eye whose sensor is tilted (Weng et al., PAMI 1992)."""
+    k1, k2, p1, p2, k3, k4, sx1, sy1 = c
     u, v = equidistant(u, v)
     r2 = u * u + v * v
     du, dv = _decentred(u, v, r2, p1, p2)
@@ -221,7 +213,7 @@ def thin_prism(
     return u * factor + du + sx1 * r2, v * factor + dv + sy1 * r2
 
 
-def rad_tan_thin_prism(u: Array, v: Array, *c: float) -> tuple[Array, Array]:
+def rad_tan_thin_prism(u: Matrix, v: Matrix, *c: float) -> tuple[Matrix, Matrix]:
     """The fish-eye of Project Aria's cameras: six radial, two tangential and four thin-prism coefficients."""
     (p0, p1), (s0, s1, s2, s3) = c[6:8], c[8:]
     u, v = equidistant(u, v, *c[:6])
@@ -230,7 +222,7 @@ def rad_tan_thin_prism(u: Array, v: Array, *c: float) -> tuple[Array, Array]:
     return u + du + r2 * (s0 + r2 * s1), v + dv + r2 * (s2 + r2 * s3)
 
 
-def division(u: Array, v: Array, k: float) -> tuple[Array, Array]:
+def division(u: Matrix, v: Matrix, k: float) -> tuple[Matrix, Matrix]:
     """The undistorted point is the distorted one divided by ``1 + k r^2``. NaN beyond the largest radius for k > 0."""
     root = 1 - 4 * k * (u * u + v * v)
     with np.errstate(invalid="ignore"):
@@ -238,17 +230,17 @@ def division(u: Array, v: Array, k: float) -> tuple[Array, Array]:
     return u * factor, v * factor
 
 
-def unified(u: Array, v: Array, alpha: float, beta: float) -> tuple[Array, Array]:
+def unified(u: Matrix, v: Matrix, alpha: float, beta: float) -> tuple[Matrix, Matrix]:
     """The enhanced unified camera model (Khomutenko et al., RA-L 2016)."""
     factor = 1 / (alpha * np.sqrt(beta * (u * u + v * v) + 1) + 1 - alpha)
     return u * factor, v * factor
 
 
-def _decentred(u: Array, v: Array, r2: Array, p1: float, p2: float) -> tuple[Array, Array]:
+def _decentred(u: Matrix, v: Matrix, r2: Matrix, p1: float, p2: float) -> tuple[Matrix, Matrix]:
     return 2 * p1 * u * v + p2 * (r2 + 2 * u * u), 2 * p2 * u * v + p1 * (r2 + 2 * v * v)
 
 
-def _polynomial(x: Array, k: tuple[float, ...]) -> Array:
+def _polynomial(x: Matrix, k: tuple[float, ...]) -> Matrix:
     total = np.zeros_like(x)
     for coefficient in reversed(k):
         total = (total + coefficient) * x
@@ -256,31 +248,22 @@ def _polynomial(x: Array, k: tuple[float, ...]) -> Array:
 
 
 MODELS = {
-    "SIMPLE_PINHOLE": Model(1, "", pinhole),
-    "PINHOLE": Model(2, "", pinhole),
-    "SIMPLE_RADIAL": Model(1, "k", radial),
-    "RADIAL": Model(1, "k1 k2", radial),
-    "OPENCV": Model(2, "k1 k2 p1 p2", rational),
-    "OPENCV_FISHEYE": Model(2, "k1 k2 k3 k4", equidistant, fisheye=True),
-    "FULL_OPENCV": Model(2, "k1 k2 p1 p2 k3 k4 k5 k6", rational),
-    "FOV": Model(2, "omega", field_of_view),
+    "SIMPLE_PINHOLE": Model(1, "", pinhole), "PINHOLE": Model(2, "", pinhole),
+    "SIMPLE_RADIAL": Model(1, "k", radial), "RADIAL": Model(1, "k1 k2", radial),
+    "OPENCV": Model(2, "k1 k2 p1 p2", rational), "OPENCV_FISHEYE": Model(2, "k1 k2 k3 k4", equidistant, fisheye=True),
+    "FULL_OPENCV": Model(2, "k1 k2 p1 p2 k3 k4 k5 k6", rational), "FOV": Model(2, "omega", field_of_view),
     "SIMPLE_RADIAL_FISHEYE": Model(1, "k", equidistant, fisheye=True),
     "RADIAL_FISHEYE": Model(1, "k1 k2", equidistant, fisheye=True),
     "THIN_PRISM_FISHEYE": Model(2, "k1 k2 p1 p2 k3 k4 sx1 sy1", thin_prism, fisheye=True),
-    "RAD_TAN_THIN_PRISM_FISHEYE": Model(
-        2, "k0 k1 k2 k3 k4 k5 p0 p1 s0 s1 s2 s3", rad_tan_thin_prism, fisheye=True
-    ),
-    "SIMPLE_DIVISION": Model(1, "k", division),
-    "DIVISION": Model(2, "k", division),
-    "SIMPLE_FISHEYE": Model(1, "", equidistant, fisheye=True),
-    "FISHEYE": Model(2, "", equidistant, fisheye=True),
+    "RAD_TAN_THIN_PRISM_FISHEYE": Model(2, "k0 k1 k2 k3 k4 k5 p0 p1 s0 s1 s2 s3", rad_tan_thin_prism, fisheye=True),
+    "SIMPLE_DIVISION": Model(1, "k", division), "DIVISION": Model(2, "k", division),
+    "SIMPLE_FISHEYE": Model(1, "", equidistant, fisheye=True), "FISHEYE": Model(2, "", equidistant, fisheye=True),
     "EUCM": Model(2, "alpha beta", unified),
 }  # fmt: skip
 """The models by name, in the order of the numbers that COLMAP's binary files give them."""
 
 
 # Points and local affine frames of photographs as a pinhole of the same K would have them
-
 
 ITERATIONS = 50  # at most; most points take four
 STEP = 1e-6  # of the derivatives, in units of the focal length
@@ -289,13 +272,13 @@ RAY = np.linspace(0.0, 1.0, 33)  # where, from the centre to a point, a lens mus
 FRAME_STEP = 0.5  # px: a frame's columns are moved by the lens as short steps of that length
 
 
-def undistorted_points(lens: Lens, photographed: NDArray[np.floating[Any]]) -> Array:
+def undistorted_points(lens: Lens, photographed: Array) -> Matrix:
     """Pixels (..., 2) of a pinhole of calibration `lens.K` for those of the photograph; NaN where it sees nothing.
 
     The inverse of `Lens.distort` by Newton's method. NaN too where the model folds back between centre and point: there
     a polynomial has left the range to which it was fitted, as `undistorted` leaves such pixels black.
     """
-    points: Array = np.array(photographed, np.float64)
+    points: Matrix = np.array(photographed, np.float64)
     if not lens.bends:
         return points
     centre, focal = np.array([lens.cx, lens.cy]), np.array([lens.fx, lens.fy])
@@ -305,25 +288,22 @@ def undistorted_points(lens: Lens, photographed: NDArray[np.floating[Any]]) -> A
     return np.asarray(x * focal + centre, np.float64).reshape(points.shape)
 
 
-def undistorted_frames(
-    undistorted: Callable[[Array], Array], photographed: NDArray[np.floating[Any]], frames: NDArray[np.floating[Any]]
-) -> Array:
+def undistorted_frames(undistorted: Callable[[Matrix], Matrix], photographed: Array, frames: Array) -> Matrix:
     """Local affine frames (n, 2, 2), by columns, of a pinhole's image, by the lens's derivatives at points (n, 2)."""
-    points: Array = np.array(photographed, np.float64)
+    points: Matrix = np.array(photographed, np.float64)
     there = undistorted(points)
     moved = [undistorted(points + step) - there for step in FRAME_STEP * np.eye(2)]
     return np.asarray(np.stack(moved, -1) / FRAME_STEP @ frames, np.float64)
 
 
-def _inverted(lens: Lens, target: Array) -> Array:
+def _inverted(lens: Lens, target: Matrix) -> Matrix:
     """Normalised points (n, 2) that the lens puts at the target (n, 2)."""
-    model = MODELS[lens.model]
 
-    def distort(x: Array) -> Array:
-        return np.stack(model.distort(x[..., 0], x[..., 1], *lens.coefficients), -1)
+    def distort(x: Matrix) -> Matrix:
+        return np.stack(MODELS[lens.model].distort(x[..., 0], x[..., 1], *lens.coefficients), -1)
 
     x = target.copy()
-    if model.fisheye:  # whose radius is about the angle to the axis
+    if MODELS[lens.model].fisheye:  # whose radius is about the angle to the axis
         angle = np.hypot(target[:, 0], target[:, 1])
         x = np.where((angle > 0)[:, None], target * (np.tan(angle) / angle)[:, None], target)
         x = np.where((angle < np.pi / 2)[:, None], x, target)
@@ -332,7 +312,9 @@ def _inverted(lens: Lens, target: Array) -> Array:
         size = np.hypot(error[:, 0], error[:, 1])
         if not (size > TOLERANCE).any():
             break
-        move = _solved(_jacobian(distort, x), error)
+        J = np.stack([(distort(x + step) - distort(x - step)) / (2 * STEP) for step in STEP * np.eye(2)], -1)
+        (a, b), (c, d), (u, v) = (J[:, 0].T, J[:, 1].T, error.T)
+        move = np.stack([d * u - b * v, a * v - c * u], -1) / (a * d - b * c)[:, None]
         for share in (1.0, 0.25, 0.0625):  # shorter where the error would grow
             trial = x - share * move
             left = distort(trial) - target
@@ -345,24 +327,10 @@ def _inverted(lens: Lens, target: Array) -> Array:
     return np.where(valid[:, None], x, np.nan)
 
 
-def _jacobian(distort: Callable[[Array], Array], x: Array) -> Array:
-    return np.stack([(distort(x + step) - distort(x - step)) / (2 * STEP) for step in STEP * np.eye(2)], -1)
-
-
-def _solved(J: Array, b: Array) -> Array:
-    det = J[:, 0, 0] * J[:, 1, 1] - J[:, 0, 1] * J[:, 1, 0]
-    x = J[:, 1, 1] * b[:, 0] - J[:, 0, 1] * b[:, 1]
-    y = J[:, 0, 0] * b[:, 1] - J[:, 1, 0] * b[:, 0]
-    return np.stack([x, y], -1) / det[:, None]
-
-
-# Photographs as a pinhole of the same focal lengths and principal point would have taken them
-
-
 _KEPT = 2  # maps of which lenses are remembered: frames of one video follow one another; 8 bytes a pixel
 
 
-def undistorted(image: NDArray[np.uint8], lens: Lens) -> NDArray[np.uint8]:
+def undistorted(image: Pixels, lens: Lens) -> Pixels:
     """The image (H, W) or (H, W, 3) without the distortion of its lens: same size, and `lens.K` is its calibration.
 
     Interpolated bilinearly. Black where the photograph shows nothing, and where a polynomial model folds back.
@@ -374,7 +342,7 @@ def undistorted(image: NDArray[np.uint8], lens: Lens) -> NDArray[np.uint8]:
 
 
 @functools.lru_cache(maxsize=_KEPT)
-def _maps(lens: Lens, h: int, w: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _maps(lens: Lens, h: int, w: int) -> tuple[Singles, Singles]:
     """For every pixel (h, w) of the undistorted image where in the photograph it is; -2, which is outside, if nowhere.
 
     Where a step outwards no longer leads outwards, a polynomial has left the range to which it was fitted: nothing is

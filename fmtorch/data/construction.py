@@ -10,24 +10,19 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-import scipy.sparse
-from numpy.typing import NDArray
 
 from fmtorch.core.files import replacing
 from fmtorch.core.settings import claim
 from fmtorch.data.cameras import line_distance
+from fmtorch.data.files import Indices, Matrix, Pixels, Singles
 from fmtorch.data.fmbench import CAMERAS, IMAGES, SUFFIXES
 from fmtorch.data.images import ImageError, read_image, to_grey
 from fmtorch.data.pairs import DepthDataset, ImageSource
-from fmtorch.data.scenes import Indices, ScenePairs, View, image_pair, incidence
-
-# How much of what one image of a pair shows the other shows too, whatever features find: by depth, or by points
-
+from fmtorch.data.scenes import ScenePairs, View, image_pair, incidence
 
 STEP = 4  # px between the pixels of which depth is asked, along rows and columns
 TOLERANCE = 0.05  # by which depths may differ, relative to the one seen, for the same surface
 
-Matrix = NDArray[np.float64]
 Place = tuple[int, int, int]
 """Number of the scene, and of its two views."""
 
@@ -38,10 +33,8 @@ def overlap_of(dataset: ScenePairs) -> "DepthOverlap | PointOverlap":
         return DepthOverlap(dataset)
     if dataset.points is not None:
         return PointOverlap(dataset.points)
-    raise ValueError(
-        f"overlap needs depth or the points of a reconstruction and dataset={dataset.name} has neither; it must be "
-        "rendered, colmap, bundler, or tum with depth images"
-    )
+    needed = f"overlap needs depth or the points of a reconstruction and dataset={dataset.name} has neither"
+    raise ValueError(f"{needed}; it must be rendered, colmap, bundler, or tum with depth images")
 
 
 class PointOverlap:
@@ -49,7 +42,7 @@ class PointOverlap:
 
     def __init__(self, points: Sequence[Callable[[], Sequence[Indices]]]) -> None:
         self.points = points
-        self._last: tuple[int, scipy.sparse.csr_array] | None = None  # a scene, and which of its views sees what
+        self._last: tuple[int, Any] | None = None  # a scene, and which of its views sees what
 
     @property
     def record(self) -> dict[str, Any]:
@@ -64,7 +57,7 @@ class PointOverlap:
         return float(shared_points(last[1], np.array([[i, j]]))[0])
 
 
-def shared_points(sees: scipy.sparse.csr_array, pairs: Indices) -> Matrix:
+def shared_points(sees: Any, pairs: Indices) -> Matrix:
     """Overlaps (n,) of pairs (n, 2) of images: points that both see, over those of the image that sees more of them.
 
     sees: which image sees which point, as `incidence` gives it. Zero where an image sees none.
@@ -106,7 +99,11 @@ class DepthOverlap:
         return min(seen_share(a, b, pair.R, pair.t), seen_share(b, a, pair.R.T, -pair.R.T @ pair.t))
 
     def _seen(self, view: View) -> Seen:
-        return Seen(view.K, _size(view.image), functools.partial(self._depth, view.image))
+        size = view.image.size
+        if size is None:
+            height, width = read_image(view.image).shape[:2]
+            size = height, width
+        return Seen(view.K, size, functools.partial(self._depth, view.image))
 
 
 def seen_share(image: Seen, other: Seen, R: Matrix, t: Matrix, step: int = STEP) -> float:
@@ -140,20 +137,13 @@ def seen_share(image: Seen, other: Seen, R: Matrix, t: Matrix, step: int = STEP)
     return float(same.sum() / count) if count else 0.0
 
 
-def _size(image: ImageSource) -> tuple[int, int]:
-    if image.size is not None:
-        return image.size
-    h, w = read_image(image).shape[:2]
-    return h, w
-
-
 SIFT_FEATURES, RATIO, NEAR_LINE, ENOUGH = 8000, 0.8, 1.0, 20
 _AT_ONCE = 512  # keypoints that are matched together
 
-Keypoints = tuple[NDArray[np.float64], NDArray[np.float32]]
+Keypoints = tuple[Matrix, Singles]
 
 
-def keypoints(grey: NDArray[np.uint8]) -> Keypoints:
+def keypoints(grey: Pixels) -> Keypoints:
     """OpenCV's SIFT: points (n, 2) and descriptors (n, 128)."""
     detected, descriptors = cv2.SIFT.create(nfeatures=SIFT_FEATURES).detectAndCompute(grey, np.ones_like(grey))
     if not detected:
@@ -161,7 +151,7 @@ def keypoints(grey: NDArray[np.uint8]) -> Keypoints:
     return np.array([k.pt for k in detected], dtype=np.float64), descriptors.astype(np.float32)
 
 
-def ratio_matches(a: Keypoints, b: Keypoints) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def ratio_matches(a: Keypoints, b: Keypoints) -> tuple[Matrix, Matrix]:
     """Nearest neighbours from the first image to the second that pass the ratio test: points (n, 2) and (n, 2)."""
     if len(a[0]) == 0 or len(b[0]) < 2:
         return np.zeros((0, 2)), np.zeros((0, 2))
@@ -174,7 +164,7 @@ def ratio_matches(a: Keypoints, b: Keypoints) -> tuple[NDArray[np.float64], NDAr
     return a[0][good], b[0][best[good]]
 
 
-def matchable(a: Keypoints, b: Keypoints, F: NDArray[np.float64]) -> bool:
+def matchable(a: Keypoints, b: Keypoints, F: Matrix) -> bool:
     """Whether more than `ENOUGH` ratio matches lie within `NEAR_LINE` pixels of the true lines in both images.
 
     Looks at some of the first image's keypoints at a time, until there are enough.
@@ -189,7 +179,6 @@ def matchable(a: Keypoints, b: Keypoints, F: NDArray[np.float64]) -> bool:
 
 
 # Which candidates of a data set make pairs, by the paper's rule or by overlap, and FM-Bench's layout of these pairs
-
 
 BLOCK = 64  # candidates that one worker judges at a time
 MAX_DRAWN = 10_000_000  # candidates of which an order is drawn, 80 MB; with more, among so many drawn at random
@@ -252,7 +241,7 @@ class Construction:
         claim(self.folder / "pairs.json", self.identity, "pairs", "name another folder as output")
         self.work.mkdir(exist_ok=True)
 
-    def order(self) -> Sequence[int] | NDArray[np.int64]:
+    def order(self) -> Sequence[int] | Indices:
         total, rng = self.dataset.candidates, np.random.default_rng(self.seed)
         if self.count is None:
             return range(total)
@@ -293,8 +282,10 @@ class Construction:
 
     def write_image(self, scene: int, number: int) -> None:
         """Write one image of a scene unless it is there: the file itself, or as JPEG what was undistorted."""
-        source = self.dataset.scenes[scene].views[number].image
-        target = self._image(scene, number)
+        drawn = self.dataset.scenes[scene]
+        source = drawn.views[number].image
+        suffix = source.path.suffix if _as_it_is(source) else SUFFIXES[0]
+        target = self.folder / drawn.name / IMAGES / f"{number:08d}{suffix}"
         if target.is_file():
             return
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -339,11 +330,6 @@ class Construction:
             with replacing(self.folder / scene.name / name) as path:
                 path.write_text("".join(text), encoding="utf-8")
 
-    def _image(self, scene: int, number: int) -> Path:
-        source = self.dataset.scenes[scene].views[number].image
-        suffix = source.path.suffix if _as_it_is(source) else SUFFIXES[0]
-        return self.folder / self.dataset.scenes[scene].name / IMAGES / f"{number:08d}{suffix}"
-
     def _keypoints(self, image: ImageSource) -> Keypoints:
         """SIFT of an image, from the work folder where it is there; descriptors are whole numbers up to 255."""
         path = self.work / "features" / f"{image.identity}.npz"
@@ -361,11 +347,11 @@ def _as_it_is(source: ImageSource) -> bool:
     return source.lens is None and source.path.suffix in SUFFIXES
 
 
-def _numbers(values: NDArray[np.float64]) -> str:
+def _numbers(values: Matrix) -> str:
     return " ".join(repr(float(value)) for value in values.ravel())
 
 
-def blocks(order: Sequence[int] | NDArray[np.int64]) -> Iterator[tuple[int, list[int]]]:
+def blocks(order: Sequence[int] | Indices) -> Iterator[tuple[int, list[int]]]:
     """The blocks of an order of candidates: their numbers and candidates."""
     for begin in range(0, len(order), BLOCK):
         yield begin // BLOCK, [int(rank) for rank in order[begin : begin + BLOCK]]

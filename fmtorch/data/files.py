@@ -3,12 +3,20 @@
 import pickle
 import re
 import zipfile
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+Array = NDArray[Any]
+Matrix = NDArray[np.float64]
+Singles = NDArray[np.float32]
+Indices = NDArray[np.int64]
+Pixels = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
 
 
 class DataError(ValueError):
@@ -25,6 +33,18 @@ def given_root(root: str | Path | None, name: str, what: str) -> Path:
 def images_by_stem(folder: Path, suffixes: Sequence[str]) -> dict[str, Path]:
     """The image files of a folder by their stems; of two with one stem that of the first suffix by name."""
     return {file.stem: file for file in sorted(folder.iterdir(), reverse=True) if file.suffix in suffixes}
+
+
+def add_to_digest(digest: Any, name: str, path: Path) -> None:
+    """Add a file, by a name that holds no place of its own: its size and bytes."""
+    content = path.read_bytes() if path.is_file() else b""
+    digest.update(f"{name}:{len(content)}:".encode() + content)
+
+
+def numbered_again(identity: str, seen: Counter[str]) -> str:
+    """The identity of a pair, with a number where it was seen before: a pair on a second line is a second pair."""
+    seen[identity] += 1
+    return identity if seen[identity] == 1 else f"{identity}#{seen[identity]}"
 
 
 def read_lines(path: Path, hint: str = "") -> list[str]:
@@ -48,7 +68,7 @@ def numbered(path: Path, hint: str = "") -> Iterator[tuple[int, str]]:
             yield number, line
 
 
-def to_numbers(path: Path, number: int, words: list[str], columns: str, count: int) -> NDArray[np.float64]:
+def to_numbers(path: Path, number: int, words: list[str], columns: str, count: int) -> Matrix:
     """The numbers of one line. Raises DataError unless there are `count`; `columns` says what they mean."""
     if len(words) != count:
         raise DataError(f"{path}, line {number}: {len(words)} columns; it must have {count}: {columns}")
@@ -58,7 +78,7 @@ def to_numbers(path: Path, number: int, words: list[str], columns: str, count: i
         raise DataError(f"{path}, line {number}: {error}; it must hold {count} numbers: {columns}") from error
 
 
-def to_finite(path: Path, number: int, words: list[str], columns: str, count: int) -> NDArray[np.float64]:
+def to_finite(path: Path, number: int, words: list[str], columns: str, count: int) -> Matrix:
     """The same where none may be NaN or infinite."""
     values = to_numbers(path, number, words, columns, count)
     if not np.isfinite(values).all():
@@ -74,15 +94,13 @@ def to_whole(path: Path, number: int, word: str, what: str) -> int:
         raise DataError(f"{path}, line {number}: {what} is {word!r}; it must be a whole number") from None
 
 
-def read_numbers(path: Path, columns: str, count: int, hint: str = "") -> list[NDArray[np.float64]]:
+def read_numbers(path: Path, columns: str, count: int, hint: str = "") -> list[Matrix]:
     """A table of numbers without comments, one array a line."""
     lines = enumerate(read_lines(path, hint), start=1)
     return [to_numbers(path, number, line.split(), columns, count) for number, line in lines]
 
 
-# Arrays of ``.npz`` files, also those that NumPy stored as pickled objects, read without running what a pickle
-# names
-
+# Arrays of ``.npz`` files, also pickled objects, read without running what a pickle names
 
 _CODE = re.compile(r"[biufUSO]\d*")  # dtypes: numbers, texts, objects
 _CORE = re.compile(r"^numpy\._?core\.")  # before and from NumPy 2
@@ -107,27 +125,20 @@ class NpzArrays:
     def __contains__(self, name: str) -> bool:
         return name in self.names
 
-    def __getitem__(self, name: str) -> NDArray[Any]:
+    def __getitem__(self, name: str) -> Array:
         """An array of numbers or texts, or of dtype object, whose elements are None, plain values, lists or arrays."""
         if name not in self:
             raise DataError(f"{self.path}: no array {name!r}; it has {', '.join(self.names) or 'none'}")
         try:
             return self._read(name)
         except _ForeignError as error:
-            raise DataError(
-                f"{self.path}: {name!r} holds objects that are not read here ({error}); {_CONVERT}"
-            ) from error
+            problem = f"holds objects that are not read here ({error}); {_CONVERT}"
+            raise DataError(f"{self.path}: {name!r} {problem}") from error
         except Exception as error:  # a damaged archive or pickle raises whatever its parts do
             problem = f"{type(error).__name__}: {error}".splitlines()[0]
             raise DataError(f"{self.path}: {name!r} cannot be read ({problem}); copy it again") from error
 
-    def get(self, name: str) -> NDArray[Any] | None:
-        """The same; None where there is no such array."""
-        if name not in self:
-            return None
-        return self[name]
-
-    def _read(self, name: str) -> NDArray[Any]:
+    def _read(self, name: str) -> Array:
         with zipfile.ZipFile(self.path) as file, file.open(f"{name}.npy") as stream:
             version = np.lib.format.read_magic(stream)
             header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
@@ -156,8 +167,6 @@ class _DType:
 
 
 class _Array:
-    """An array as a pickle describes it."""
-
     def __init__(self, *_: object) -> None:
         self.__setstate__((1, (0,), _DType("u1"), False, b""))
 
@@ -171,7 +180,7 @@ class _Array:
         array.__setstate__((1, shape, dtype, order == "F", bytes(content)))
         return array
 
-    def value(self) -> NDArray[Any]:
+    def value(self) -> Array:
         dtype = self.dtype.value()
         if dtype.kind == "O":
             flat = np.empty(len(self.content), object)

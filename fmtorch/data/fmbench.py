@@ -8,10 +8,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fmtorch.data import files
 from fmtorch.data.cameras import Camera, relative_pose
-from fmtorch.data.files import DataError, given_root, images_by_stem, numbered, read_lines, read_numbers, to_finite
+from fmtorch.data.files import DataError, Matrix, given_root, images_by_stem, read_numbers
 from fmtorch.data.pairs import HeldPairs, ImagePair, ImageSource
 from fmtorch.data.scenes import WINDOW, AllPairs, Candidates, Scene, ScenePairs, View, folders, following
 
@@ -35,9 +35,8 @@ class CameraFilePairs(ScenePairs):
             raise DataError(f"split {split!r}: cameras has only 'test'; choose scenes by root or sequences")
         if fps is not None and fps <= 0:
             raise DataError(f"fps={fps:g}; it must be positive, or null for images in no order")
-        home = given_root(
-            root, "cameras", "a folder of scenes with Camera.txt and Images/ each, or one such scene"
-        ).absolute()
+        wanted = "a folder of scenes with Camera.txt and Images/ each, or one such scene"
+        home = given_root(root, "cameras", wanted).absolute()
         if sequences is None and (home / CAMERAS).is_file():
             home, sequences = home.parent, [home.name]
         names = sequences or sorted(path.parent.name for path in home.glob(f"*/{CAMERAS}"))
@@ -55,18 +54,14 @@ def _scene(folder: Path, fps: int | float | None, window: int | float) -> Scene:
         raise DataError(f"{images}: no such folder; it must hold the images of {folder / CAMERAS}")
     there = images_by_stem(images, SUFFIXES)
     views = list[View]()
-    for number, line in numbered(folder / CAMERAS):
-        stem, values = f"{len(views):08d}", to_finite(folder / CAMERAS, number, line.split(), COLUMNS, 21)
+    for number, line in files.numbered(folder / CAMERAS):
+        stem, values = f"{len(views):08d}", files.to_finite(folder / CAMERAS, number, line.split(), COLUMNS, 21)
         source = ImageSource(f"{family}/{folder.name}/{stem}", there.get(stem, images / f"{stem}{SUFFIXES[0]}"))
         place = f"{folder / CAMERAS}, line {number}"
         views.append(View(source, values[:9].reshape(3, 3), values[9:18].reshape(3, 3), values[18:], place))
-    pairs: Candidates = AllPairs(len(views))
-    if fps is not None:
-        pairs = following(np.arange(len(views)) / fps, window)
+    count = len(views)
+    pairs: Candidates = AllPairs(count) if fps is None else following(np.arange(count) / fps, window)
     return Scene(folder.name, family, views, pairs)
-
-
-# Image pairs in the layout of the FM-Bench distribution (Bian et al., BMVC 2019)
 
 
 _PAIRS, _SUBSETS = "pairs_with_gt.txt", "pairs_which_dataset.txt"
@@ -103,66 +98,56 @@ class FMBenchPairs(HeldPairs):
         self._pairs: list[ImagePair] = []
         self._seen: Counter[str] = Counter()
         self._present: set[str] = set()
-        for folder in _set_folders(
-            given_root(root, "fmbench", "a set's folder with pairs_with_gt.txt, or a folder of such sets"), sets
-        ):
+        home = given_root(root, "fmbench", "a set's folder with pairs_with_gt.txt, or a folder of such sets")
+        for folder in _set_folders(home, sets):
             self._read_set(folder)
         for missing in sorted((self._subsets or set()) - self._present):
-            raise DataError(f"{root}: no pairs of subset {missing!r}; it has {_listed(self._present) or 'no pairs'}")
+            there = ", ".join(sorted(self._present)) or "no pairs"
+            raise DataError(f"{root}: no pairs of subset {missing!r}; it has {there}")
         self.digest = self._hash.hexdigest()
 
     def _read_set(self, folder: Path) -> None:
         table = read_numbers(folder / _PAIRS, _PAIR_COLUMNS, 11, _LAYOUT)
-        scenes = [line.strip().replace("\\", "/").strip("/") for line in read_lines(folder / _SUBSETS, _LAYOUT)]
+        scenes = [line.strip().replace("\\", "/").strip("/") for line in files.read_lines(folder / _SUBSETS, _LAYOUT)]
         if len(table) != len(scenes):
             raise DataError(
                 f"{folder / _SUBSETS} has {len(scenes)} lines and {folder / _PAIRS} has {len(table)}; "
                 "each must have one line a pair, in the same order"
             )
         self._present.update(scenes)
-        self._add_to_digest(folder.name, folder / _PAIRS, folder / _SUBSETS)
+        for file in (_PAIRS, _SUBSETS):
+            files.add_to_digest(self._hash, f"{folder.name}/{file}", folder / file)
         chosen = sorted(set(scenes) if self._subsets is None else set(scenes) & self._subsets)
         self._hash.update(repr(chosen).encode())
         images = {scene: _images(folder, scene) for scene in chosen}
         cameras = {scene: self._read_cameras(folder, scene) for scene in chosen}
-        for row, (numbers, scene) in enumerate(zip(table, scenes, strict=True)):
+        for number, (row, scene) in enumerate(zip(table, scenes, strict=True), start=1):
             if scene in images:
-                line = f"{folder / _PAIRS}, line {row + 1}"
-                self._pairs.append(self._pair(line, folder, scene, numbers, images[scene], cameras[scene]))
+                line = f"{folder / _PAIRS}, line {number}"
+                self._pairs.append(self._pair(line, folder, scene, row, images[scene], cameras[scene]))
 
     def _read_cameras(self, folder: Path, scene: str) -> list[Camera] | None:
         path = folder / scene / CAMERAS
         if not self._cameras or not path.is_file():
             return None
-        self._add_to_digest(f"{folder.name}/{scene}", path)
+        files.add_to_digest(self._hash, f"{folder.name}/{scene}/{CAMERAS}", path)
         rows = read_numbers(path, f"{COLUMNS}; or give cameras=false to do without", 21)
         return [Camera(r[:9].reshape(3, 3), r[9:18].reshape(3, 3), r[18:]) for r in rows]
 
-    def _add_to_digest(self, name: str, *paths: Path) -> None:
-        for path in paths:
-            content = path.read_bytes()
-            self._hash.update(f"{name}/{path.name}:{len(content)}:".encode() + content)
-
     def _pair(
-        self, line: str, folder: Path, scene: str, numbers: NDArray[np.float64], images: dict[str, Path],
-        cameras: list[Camera] | None,
-    ) -> ImagePair:  # fmt: skip
-        left, right = (_image_number(line, value) for value in numbers[:2])
-        F, problems = _normalized(numbers[2:].reshape(3, 3))
-        sources = []
+        self, line: str, folder: Path, scene: str, row: Matrix, images: dict[str, Path], cameras: list[Camera] | None
+    ) -> ImagePair:
+        left, right = (_image_number(line, value) for value in row[:2])
+        F, problems = _normalized(row[2:].reshape(3, 3))
+        sources = list[ImageSource]()
         for stem in (f"{left:08d}", f"{right:08d}"):
             path = images.get(stem, folder / scene / IMAGES / f"{stem}{SUFFIXES[0]}")
             sources.append(ImageSource(f"{folder.name}/{scene}/{stem}", path))
             if stem not in images:
                 problems.append(f"no image {path} (or {SUFFIXES[1]})")
-        identity = f"{folder.name}/{scene}/{left}-{right}"
-        self._seen[identity] += 1
-        if self._seen[identity] > 1:  # the same pair on a second line is a second pair
-            identity += f"#{self._seen[identity]}"
-        pair = ImagePair(
-            identity=identity, family=folder.name, scene=scene, image0=sources[0], image1=sources[1], F=F,
-            problem=f"{line}: {'; '.join(problems)}" if problems else None,
-        )  # fmt: skip
+        identity = files.numbered_again(f"{folder.name}/{scene}/{left}-{right}", self._seen)
+        problem = f"{line}: {'; '.join(problems)}" if problems else None
+        pair = ImagePair(identity, folder.name, scene, sources[0], sources[1], F, problem=problem)
         if cameras is None:
             return pair
         if max(left, right) >= len(cameras):
@@ -175,7 +160,7 @@ class FMBenchPairs(HeldPairs):
         return dataclasses.replace(pair, K0=c0.K, K1=c1.K, R=R, t=t)
 
 
-def _normalized(F: NDArray[np.float64]) -> tuple[NDArray[np.float64], list[str]]:
+def _normalized(F: Matrix) -> tuple[Matrix, list[str]]:
     """F with unit Frobenius norm, or zero and what is wrong with it."""
     largest = float(np.abs(F).max())
     if not np.isfinite(largest):
@@ -190,20 +175,14 @@ def _set_folders(root: Path, sets: Sequence[str] | None) -> list[Path]:
     if not root.is_dir():
         raise DataError(f"{root}: no such folder; it must be a set's folder with {_PAIRS}, or a folder of such sets")
     root = Path(os.path.abspath(root))  # a link keeps its name
-    if (root / _PAIRS).is_file():
-        folders = {root.name: root}
-    else:
-        folders = {folder.name: folder for folder in sorted(root.iterdir()) if (folder / _PAIRS).is_file()}
+    candidates = [root] if (root / _PAIRS).is_file() else sorted(root.iterdir())
+    folders = {folder.name: folder for folder in candidates if (folder / _PAIRS).is_file()}
     if not folders:
         raise DataError(f"{root}: neither {_PAIRS} nor a sub-folder that holds one")
     for name in sets or ():
         if name not in folders:
-            raise DataError(f"{root}: no set {name!r}; it has {_listed(folders)}")
+            raise DataError(f"{root}: no set {name!r}; it has {', '.join(sorted(folders))}")
     return [folders[name] for name in (sets or folders)]
-
-
-def _listed(names: Sequence[str] | set[str] | dict[str, Path]) -> str:
-    return ", ".join(sorted(names))
 
 
 def _images(folder: Path, scene: str) -> dict[str, Path]:

@@ -9,10 +9,9 @@ from typing import Annotated
 import numpy as np
 
 from fmtorch.core.options import Within
-from fmtorch.data.cameras import Matrix
-from fmtorch.data.files import DataError, given_root, read_numbers
+from fmtorch.data.files import DataError, Matrix, add_to_digest, given_root, read_numbers
 from fmtorch.data.images import stored_size
-from fmtorch.data.pairs import HeldPairs, ImagePair, ImageSource, Resampling, shorter_side
+from fmtorch.data.pairs import HeldPairs, ImagePair, ImageSource, Resampling, scaled_size
 
 FAMILIES = {"i": "illumination", "v": "viewpoint"}  # by the first letter of a sequence's name
 LARGE = (
@@ -46,9 +45,8 @@ class HPatchesPairs(HeldPairs):
         home = given_root(root, "hpatches", "the folder of the sequences, i_* and v_*")
         there = sorted(folder.name for kind in FAMILIES for folder in home.glob(f"{kind}_*") if folder.is_dir())
         if not there:
-            raise DataError(
-                f"{home}: no sequences; it must hold folders i_* and v_*, with 1.ppm to 6.ppm and H_1_2 ..."
-            )
+            wanted = "folders i_* and v_*, with 1.ppm to 6.ppm and H_1_2 ..."
+            raise DataError(f"{home}: no sequences; it must hold {wanted}")
         for name in sequences or ():
             if name not in there:
                 raise DataError(f"{home}: no sequence {name!r}; there are: {', '.join(there[:8])} ...")
@@ -57,9 +55,8 @@ class HPatchesPairs(HeldPairs):
         self._pairs = list[ImagePair]()
         for sequence in taken:
             for other in OTHERS:
-                file = home / sequence / f"H_1_{other}"
-                content = file.read_bytes() if file.is_file() else b""
-                digest.update(f"{sequence}/{file.name}:{len(content)}:".encode() + content)
+                file = f"{sequence}/H_1_{other}"
+                add_to_digest(digest, file, home / file)
                 self._pairs.append(_pair(home / sequence, other, short_side))
         self.digest = digest.hexdigest()
 
@@ -88,7 +85,7 @@ def _image(folder: Path, number: int, short_side: int | None) -> ImageSource:
     size = None if short_side is None else stored_size(path)
     if size is None or short_side is None:
         return ImageSource(identity, path)
-    return ImageSource(identity, path, size, resampling=Resampling(shorter_side(size, short_side)))
+    return ImageSource(identity, path, size, resampling=Resampling(scaled_size(size, short_side / min(size))))
 
 
 def _homography(path: Path) -> Matrix:

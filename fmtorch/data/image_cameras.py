@@ -11,11 +11,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import ExifTags, Image
 
-from fmtorch.data.cameras import MODELS, Lens, Matrix, rotation_of_quaternion
-from fmtorch.data.files import DataError, numbered, read_lines, to_finite, to_whole
+from fmtorch.data.cameras import MODELS, Lens, rotation_of_quaternion
+from fmtorch.data.files import DataError, Indices, Matrix, numbered, read_lines, to_finite, to_whole
 
 HALF_PIXEL = 0.5  # COLMAP puts the centre of the first pixel at (0.5, 0.5)
 _POINT = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
@@ -23,6 +22,7 @@ _MAX_NAME = 4096  # bytes of a file name
 _CAMERA = "CAMERA_ID MODEL WIDTH HEIGHT PARAMS..."
 _IMAGE = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
 _POINTS = "a line of X Y POINT3D_ID for each point, which may be empty"
+_Camera = tuple[str, int, str, int, int, Matrix]  # place, number, model, width, height, parameters
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,7 +44,7 @@ class ModelImage:
     camera: int
     R: Matrix
     t: Matrix
-    points: NDArray[np.int64]
+    points: Indices
     place: str
 
 
@@ -57,25 +57,6 @@ class Model:
     files: tuple[Path, ...]
 
 
-class _CameraRecord(NamedTuple):
-    place: str
-    number: int
-    model: str
-    width: int
-    height: int
-    parameters: Matrix
-
-
-class _ImageRecord(NamedTuple):
-    """pose: QW QX QY QZ TX TY TZ; points: the numbers of 3-D points, -1 where there is none."""
-
-    place: str
-    pose: Matrix
-    camera: int
-    name: str
-    points: NDArray[np.int64]
-
-
 def read_model(folder: Path, points: bool = True) -> Model:
     """The model in a folder, of binary files where these are there, else of text files.
 
@@ -86,13 +67,12 @@ def read_model(folder: Path, points: bool = True) -> Model:
         raise DataError(f"{folder}: neither cameras.bin nor cameras.txt; it must hold a COLMAP model")
     files = (folder / f"cameras{suffix}", folder / f"images{suffix}")
     cameras, images = read_cameras(files[0]), dict[str, ModelImage]()
-    for place, pose, camera, name, seen in (_binary_images if suffix == ".bin" else _text_images)(files[1], points):
-        R = rotation_of_quaternion(pose[:4], place)
-        if camera not in cameras:
-            raise DataError(f"{place}: camera {camera} of {name} is not in {files[0].name}")
-        if name in images:
-            raise DataError(f"{place}: image {name} is already at {images[name].place}")
-        images[name] = ModelImage(name, camera, R, pose[4:], seen[seen >= 0], place)
+    for image in (_binary_images if suffix == ".bin" else _text_images)(files[1], points):
+        if image.camera not in cameras:
+            raise DataError(f"{image.place}: camera {image.camera} of {image.name} is not in {files[0].name}")
+        if image.name in images:
+            raise DataError(f"{image.place}: image {image.name} is already at {images[image.name].place}")
+        images[image.name] = image
     if not images:
         raise DataError(f"{files[1]}: no image; a model must have some")
     return Model(cameras, sorted(images.values(), key=lambda image: image.name), files)
@@ -101,17 +81,16 @@ def read_model(folder: Path, points: bool = True) -> Model:
 def read_cameras(path: Path) -> dict[int, ModelCamera]:
     """The cameras of a file cameras.txt or cameras.bin by their numbers. Raises DataError as `read_model`."""
     cameras: dict[int, ModelCamera] = {}
-    for record in (_binary_cameras if path.suffix == ".bin" else _text_cameras)(path):
-        if record.number in cameras:
-            raise DataError(f"{record.place}: camera {record.number} stands twice")
-        cameras[record.number] = _camera(record)
+    records = (_binary_cameras if path.suffix == ".bin" else _text_cameras)(path)
+    for place, number, model, width, height, parameters in records:
+        if number in cameras:
+            raise DataError(f"{place}: camera {number} stands twice")
+        cameras[number] = _camera(place, model, width, height, parameters)
     return cameras
 
 
-def _camera(record: _CameraRecord) -> ModelCamera:
+def _camera(place: str, model: str, width: int, height: int, parameters: Matrix) -> ModelCamera:
     """The camera of one record. Raises DataError for a model, size or numbers that no camera has."""
-    place, _, model, width, height, parameters = record
-    _expect_known(place, model)
     kind = MODELS[model]
     names = kind.parameters
     if len(parameters) != len(names):
@@ -125,12 +104,17 @@ def _camera(record: _CameraRecord) -> ModelCamera:
     return ModelCamera(kind.lens(model, shifted), (height, width))
 
 
+def _image(place: str, pose: Matrix, camera: int, name: str, points: Indices) -> ModelImage:
+    """The image of one record. pose: QW QX QY QZ TX TY TZ; points: numbers of 3-D points, -1 where there is none."""
+    return ModelImage(name, camera, rotation_of_quaternion(pose[:4], place), pose[4:], points[points >= 0], place)
+
+
 def _expect_known(place: str, model: str) -> None:
     if model not in MODELS:
         raise DataError(f"{place}: camera model {model} is not known here; there are {', '.join(MODELS)}")
 
 
-def _text_cameras(path: Path) -> Iterator[_CameraRecord]:
+def _text_cameras(path: Path) -> Iterator[_Camera]:
     lines = list(numbered(path))
     for number, line in lines:
         words, place = line.split(), f"{path}, line {number}"
@@ -139,11 +123,11 @@ def _text_cameras(path: Path) -> Iterator[_CameraRecord]:
         _expect_known(place, words[1])
         key, width, height = (to_whole(path, number, words[i], _CAMERA.split()[i]) for i in (0, 2, 3))
         parameters = to_finite(path, number, words[4:], "the parameters of the camera", len(words) - 4)
-        yield _CameraRecord(place, key, words[1], width, height, parameters)
+        yield place, key, words[1], width, height, parameters
     _expect_announced(path, "cameras", len(lines))
 
 
-def _text_images(path: Path, points: bool) -> Iterator[_ImageRecord]:
+def _text_images(path: Path, points: bool) -> Iterator[ModelImage]:
     """Two lines an image; the second may be empty, hence empty lines count after the first."""
     lines, count, at = read_lines(path), 0, 0
     while at < len(lines):
@@ -156,7 +140,7 @@ def _text_images(path: Path, points: bool) -> Iterator[_ImageRecord]:
         pose = to_finite(path, at + 1, words[1:8], "QW QX QY QZ TX TY TZ", 7)
         key = to_whole(path, at + 1, words[8], "CAMERA_ID")
         seen = lines[at + 1] if at + 1 < len(lines) else ""  # the last image's may have been an empty line
-        yield _ImageRecord(place, pose, key, words[9].strip(), _seen(path, at + 2, seen if points else ""))
+        yield _image(place, pose, key, words[9].strip(), _seen(path, at + 2, seen if points else ""))
         count, at = count + 1, at + 2
     _expect_announced(path, "images", count)
 
@@ -166,12 +150,11 @@ def _expect_announced(path: Path, what: str, count: int) -> None:
     for line in itertools.takewhile(lambda line: line.startswith("#"), read_lines(path)):
         announced = re.match(rf"# Number of {what}: (\d+)", line)
         if announced and count < int(announced[1]):
-            raise DataError(
-                f"{path}: {count} {what}, but it announces {announced[1]}: the file is truncated, copy it again"
-            )
+            contradiction = f"{count} {what}, but it announces {announced[1]}"
+            raise DataError(f"{path}: {contradiction}: the file is truncated, copy it again")
 
 
-def _seen(path: Path, number: int, line: str) -> NDArray[np.int64]:
+def _seen(path: Path, number: int, line: str) -> Indices:
     words = line.split()
     if len(words) % 3:
         raise DataError(f"{path}, line {number}: {len(words)} columns; it must be {_POINTS}: is the file truncated?")
@@ -188,9 +171,8 @@ class _Records:
         try:
             self.data = path.read_bytes()
         except OSError as error:
-            raise DataError(
-                f"{path}: cannot be read ({error.strerror}); it must be a file of a COLMAP model"
-            ) from error
+            problem = f"cannot be read ({error.strerror})"
+            raise DataError(f"{path}: {problem}; it must be a file of a COLMAP model") from error
         self.path, self.what, self.at, self.record = path, what, 0, "its header"
 
     def places(self) -> Iterator[str]:
@@ -205,9 +187,8 @@ class _Records:
 
     def take(self, count: int) -> bytes:
         if count > len(self.data) - self.at:
-            raise DataError(
-                f"{self.path}: damaged or truncated, its {len(self.data)} bytes end within {self.record}; copy it again"
-            )
+            problem = f"damaged or truncated, its {len(self.data)} bytes end within {self.record}"
+            raise DataError(f"{self.path}: {problem}; copy it again")
         self.at += count
         return self.data[self.at - count : self.at]
 
@@ -226,17 +207,17 @@ class _Records:
             raise DataError(f"{self.path}: damaged, the name of {self.record} is no text; copy it again") from error
 
 
-def _binary_cameras(path: Path) -> Iterator[_CameraRecord]:
+def _binary_cameras(path: Path) -> Iterator[_Camera]:
     records, names = _Records(path, "camera"), list(MODELS)
     for place in records.places():
         key, model, width, height = records.numbers("iiQQ")
         name = names[model] if 0 <= model < len(names) else f"number {model}"
         _expect_known(place, name)
         parameters = np.array(records.numbers(f"{len(MODELS[name].parameters)}d"))
-        yield _CameraRecord(place, key, name, width, height, parameters)
+        yield place, key, name, width, height, parameters
 
 
-def _binary_images(path: Path, points: bool) -> Iterator[_ImageRecord]:
+def _binary_images(path: Path, points: bool) -> Iterator[ModelImage]:
     records = _Records(path, "image")
     for place in records.places():
         _, *pose, key = records.numbers("i7di")
@@ -245,11 +226,10 @@ def _binary_images(path: Path, points: bool) -> Iterator[_ImageRecord]:
             raise DataError(f"{place}: a pose that is not finite; the file is damaged, copy it again")
         (count,) = records.numbers("Q")
         seen = np.frombuffer(records.take(count * _POINT.itemsize), _POINT)["point"].astype(np.int64)
-        yield _ImageRecord(place, np.array(pose), key, name, seen if points else seen[:0])
+        yield _image(place, np.array(pose), key, name, seen if points else seen[:0])
 
 
 # The focal length of a photograph in pixels, by what its camera wrote into the file (EXIF 2.32, JEITA CP-3451)
-
 
 FORMATS = ("JPEG", "PNG", "TIFF", "WEBP")
 DIAGONAL_OF_35_MM = math.hypot(36, 24)  # mm
@@ -348,7 +328,6 @@ def _number(tags: Tags, tag: int) -> float | None:
 
 
 def _read(path: Path) -> tuple[dict[int, Any], tuple[int, int]] | str:
-    """The EXIF tags of a file and its size (h, w), or why there are none."""
     try:
         with Image.open(path, formats=FORMATS) as image:
             tags = dict(image.getexif().get_ifd(ExifTags.IFD.Exif))
@@ -357,9 +336,6 @@ def _read(path: Path) -> tuple[dict[int, Any], tuple[int, int]] | str:
         return f"cannot be read ({error})"
     except Exception as error:  # Pillow raises what its parts do for damaged files
         return f"damaged EXIF data ({type(error).__name__}: {error})"
-
-
-# Cameras of photographs by the photographs' names: of a COLMAP model, or of a JSON file
 
 
 FORM = '{"a.jpg": [fx, fy, cx, cy], "b.jpg": null}, in pixels with (0, 0) at the centre of the first one'
@@ -408,9 +384,8 @@ class ImageCameras:
         names = [name for name in self._named if absolute.endswith(f"/{name}")]
         if not names:
             examples = ", ".join(sorted(self._named)[:SHOWN])
-            raise DataError(
-                f"{self._path}: no camera of {image}; it has those of {len(self._named)} images: {examples} ..."
-            )
+            known = f"those of {len(self._named)} images: {examples} ..."
+            raise DataError(f"{self._path}: no camera of {image}; it has {known}")
         return self._named[max(names, key=len)]
 
 

@@ -4,17 +4,17 @@ import contextlib
 import io
 import re
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal
 
 import cv2
 import kornia_rs
 import numpy as np
-from numpy.typing import NDArray
 from PIL import ExifTags, Image, TiffImagePlugin
 
 from fmtorch.data.cameras import undistorted
+from fmtorch.data.files import Array, Pixels
 from fmtorch.data.pairs import ImageSource
 
 _JPEG, _PNG = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
@@ -23,7 +23,6 @@ _END_OF_IMAGE, _START_OF_IMAGE = 0xD9, 0xD8
 _FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # of any coding; the three are tables and an extension
 _HUFFMAN_FRAMES = (0xC0, 0xC1, 0xC2)  # baseline, extended sequential, progressive
 _TurboJpeg = getattr(kornia_rs, "io", kornia_rs).ImageDecoder  # where it is depends on the version
-
 
 MAX_PIXELS = 2**28
 """Larger images are refused by their headers: a few kilobytes may claim gigabytes. The largest sensors have 2e8."""
@@ -37,7 +36,7 @@ FORMATS = "JPEG, PNG, TIFF, WebP, AVIF, BMP, GIF, JPEG 2000, PNM, PFM, Radiance 
 """What `read_image` reads."""
 
 
-def read_image(source: ImageSource | Path | str, *, orient: bool = False) -> NDArray[np.uint8]:
+def read_image(source: ImageSource | Path | str, *, orient: bool = False) -> Pixels:
     """The image at `source` as uint8, (H, W) when the file is grey and RGB (H, W, 3) when it has colour.
 
     Any of `FORMATS`, of an animation the first frame. Values of more than 8 bits and floats are scaled so that the
@@ -59,10 +58,8 @@ def read_image(source: ImageSource | Path | str, *, orient: bool = False) -> NDA
     image = _decoded(source.path, orient, source.data)
     if source.size is not None and image.shape[:2] != source.size:
         (h, w), (height, width) = image.shape[:2], source.size
-        raise ImageError(
-            f"{source.path}: {w} x {h} px, but its camera is of {width} x {height} px; it must be the image as it was "
-            "when its camera was determined"
-        )
+        sizes = f"{w} x {h} px, but its camera is of {width} x {height} px"
+        raise ImageError(f"{source.path}: {sizes}; it must be the image as it was when its camera was determined")
     image = image if source.lens is None else undistorted(image, source.lens)
     return image if source.resampling is None else source.resampling(image)
 
@@ -86,40 +83,34 @@ def stored_orientation(file: Path | io.BytesIO) -> int:
     return 1
 
 
-_TURNS: dict[int, Callable[[NDArray[np.uint8]], NDArray[np.uint8]]] = {
-    1: lambda image: image,
-    2: lambda image: image[:, ::-1],
-    3: lambda image: image[::-1, ::-1],
-    4: lambda image: image[::-1],
-    5: lambda image: image.swapaxes(0, 1),
-    6: lambda image: image[::-1].swapaxes(0, 1),
-    7: lambda image: image[::-1, ::-1].swapaxes(0, 1),
-    8: lambda image: image[:, ::-1].swapaxes(0, 1),
-}
-"""By the values of EXIF's Orientation (JEITA CP-3451, 4.6.4): what makes an image upright."""
+_TURNS = {1: (1, 1), 2: (1, -1), 3: (-1, -1), 4: (-1, 1), 5: (1, 1), 6: (-1, 1), 7: (-1, -1), 8: (1, -1)}
+"""By EXIF's Orientation (JEITA CP-3451, 4.6.4): steps along rows and columns, which are exchanged then from 5 on."""
 
 
-def _decoded(path: Path, orient: bool, data: bytes | None = None) -> NDArray[np.uint8]:
-    """The pixels of a file, of which `data` are the bytes where they are known."""
+def _decoded(path: Path, orient: bool, data: bytes | None = None) -> Pixels:
     try:
-        if data is None:
-            if path.exists() and not (path.is_file() or path.is_dir()):  # a pipe waits, a device never ends
-                raise ImageError(f"{path}: no regular file; it must be an image file")
-            data = path.read_bytes()
+        if data is None and path.exists() and not (path.is_file() or path.is_dir()):  # a pipe waits, a device too
+            raise ImageError(f"{path}: no regular file; it must be an image file")
+        data = path.read_bytes() if data is None else data
     except OSError as error:
         raise ImageError(f"{path}: cannot be read ({error.strerror}); it must be an image file") from error
     if not data:
         raise ImageError(f"{path}: the file is empty; it must be a complete image")
-    _expect_complete(path, data)
+    if data.startswith(_JPEG) and all(marker != _END_OF_IMAGE for marker, _ in _jpeg_segments(data)):
+        raise ImageError(f"{path}: truncated JPEG, {len(data)} bytes without end-of-image marker; copy it again")
+    if data.startswith(_PNG) and (fault := _png_fault(data)):
+        raise ImageError(f"{path}: {fault}; copy it again")
     _expect_moderate(path, data)
     image = _eight_bits(path, _heic(path, data) if _is_heic(data) else _by_opencv(path, data))
     if data.startswith(_JPEG) and not _jpeg_decodes(data):
         raise ImageError(f"{path}: corrupt JPEG, its compressed data are damaged; copy it again")
-    turn = _TURNS[stored_orientation(io.BytesIO(data)) if orient and not _is_heic(data) else 1]
-    return np.ascontiguousarray(turn(image))
+    orientation = stored_orientation(io.BytesIO(data)) if orient and not _is_heic(data) else 1
+    rows, columns = _TURNS[orientation]
+    turned = image[::rows, ::columns]
+    return np.ascontiguousarray(turned.swapaxes(0, 1) if orientation >= 5 else turned)
 
 
-def _by_opencv(path: Path, data: bytes) -> NDArray[np.generic]:
+def _by_opencv(path: Path, data: bytes) -> Array:
     """The pixels as stored, of any depth, grey or RGB."""
     deep = 0 if data[4:8] == b"ftyp" else cv2.IMREAD_ANYDEPTH  # 10 bits of an AVIF are a photograph's
     flags = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION | deep
@@ -154,7 +145,7 @@ def _is_heic(data: bytes) -> bool:
     return any(brands[i : i + 4] in (b"heic", b"heix", b"heim", b"heis", b"hevc") for i in range(0, len(brands), 4))
 
 
-def _heic(path: Path, data: bytes) -> NDArray[np.generic]:
+def _heic(path: Path, data: bytes) -> Array:
     try:
         import pillow_heif
     except ImportError as error:
@@ -166,10 +157,9 @@ def _heic(path: Path, data: bytes) -> NDArray[np.generic]:
     return np.asarray(image if image.mode == "L" else image.convert("RGB"))
 
 
-def _eight_bits(path: Path, image: NDArray[np.generic]) -> NDArray[np.uint8]:
-    """An image of any depth with its own range as 0 to 255."""
+def _eight_bits(path: Path, image: Array) -> Pixels:
     if image.dtype == np.uint8:
-        return image  # type: ignore[return-value]
+        return image
     values = image.astype(np.float64)
     known = np.isfinite(values)
     if not known.any():
@@ -179,48 +169,28 @@ def _eight_bits(path: Path, image: NDArray[np.generic]) -> NDArray[np.uint8]:
     return np.rint(scaled).astype(np.uint8)
 
 
-def to_grey(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def to_grey(image: Pixels) -> Pixels:
     """Grey levels (H, W) of a grey or RGB image, with OpenCV's weights and rounding (its BGR2GRAY)."""
     return image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)  # type: ignore[return-value]
 
 
-def _expect_complete(path: Path, data: bytes) -> None:
-    """Raises ImageError for a JPEG or PNG whose structure does not reach its end."""
-    if data.startswith(_JPEG) and not _jpeg_ends(data):
-        raise ImageError(f"{path}: truncated JPEG, {len(data)} bytes without end-of-image marker; copy it again")
-    if data.startswith(_PNG):
-        fault = _png_fault(data)
-        if fault:
-            raise ImageError(f"{path}: {fault}; copy it again")
-
-
 def _expect_moderate(path: Path, data: bytes) -> None:
-    """Raises ImageError for an image whose header tells of more than `MAX_PIXELS`."""
     if data.startswith(_PNG):
         sizes = [(data[16:20], data[20:24])]  # IHDR comes first
     elif data.startswith(_JPEG):
         frames = (at for marker, at in _jpeg_segments(data) if marker in _FRAMES)
         sizes = [(data[at + 5 : at + 7], data[at + 3 : at + 5]) for at in frames]
-    else:
-        _expect_moderate_rarity(path, data)
-        return
+    else:  # Pillow reads the header; its own limit is 1.8e8 pixels
+        try:
+            Image.open(io.BytesIO(data)).close()
+        except Image.DecompressionBombError as error:
+            raise ImageError(f"{path}: {error}; it must have fewer pixels, reduce it") from error
+        except Exception:  # what is no image to Pillow may be one to OpenCV, which is asked next
+            pass
+        sizes = []
     for width, height in ((int.from_bytes(w, "big"), int.from_bytes(h, "big")) for w, h in sizes):
         if width * height > MAX_PIXELS:
             raise ImageError(f"{path}: {width} x {height} px; it must have at most {MAX_PIXELS} pixels, reduce it")
-
-
-def _expect_moderate_rarity(path: Path, data: bytes) -> None:
-    """The same for other formats, of which Pillow reads the header; its own limit is 1.8e8 pixels."""
-    try:
-        Image.open(io.BytesIO(data)).close()
-    except Image.DecompressionBombError as error:
-        raise ImageError(f"{path}: {error}; it must have fewer pixels, reduce it") from error
-    except Exception:  # what is no image to Pillow may be one to OpenCV, which is asked next
-        return
-
-
-def _jpeg_ends(data: bytes) -> bool:
-    return any(marker == _END_OF_IMAGE for marker, _ in _jpeg_segments(data))
 
 
 def _jpeg_segments(data: bytes) -> Iterator[tuple[int, int]]:
@@ -232,9 +202,8 @@ def _jpeg_segments(data: bytes) -> Iterator[tuple[int, int]]:
         yield marker, position
         if marker == _END_OF_IMAGE:
             return
-        if marker == 0x01 or marker == _START_OF_IMAGE:  # markers without a length
-            continue
-        position += int.from_bytes(data[position : position + 2], "big")
+        if marker not in (0x01, _START_OF_IMAGE):  # markers without a length
+            position += int.from_bytes(data[position : position + 2], "big")
 
 
 def _jpeg_decodes(data: bytes) -> bool:

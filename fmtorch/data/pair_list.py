@@ -7,6 +7,7 @@ are those of the images before they are turned. glue-factory: names, K0, K1, and
 
 import dataclasses
 import hashlib
+import itertools
 import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -15,10 +16,11 @@ from typing import Any
 
 import numpy as np
 
-from fmtorch.data.cameras import Camera, Matrix, fundamental, nearest_rotation, relative_pose
-from fmtorch.data.files import DataError, NpzArrays, given_root, numbered, read_numbers, to_numbers, to_whole
+from fmtorch.data import files
+from fmtorch.data.cameras import Camera, fundamental, nearest_rotation, relative_pose
+from fmtorch.data.files import DataError, Matrix, NpzArrays, given_root, numbered, read_numbers
 from fmtorch.data.images import stored_size
-from fmtorch.data.pairs import HeldPairs, ImagePair, ImageSource, Resampling, Size, longer_side
+from fmtorch.data.pairs import HeldPairs, ImagePair, ImageSource, Resampling, Size, scaled_size
 
 SUPERGLUE, GLUE_FACTORY, GLUE_FACTORY_4X4 = 38, 32, 36  # columns of a line
 LAYOUTS = {
@@ -63,20 +65,17 @@ def text_pairs(path: Path) -> Iterator[ListedPair]:
             forms = "; ".join(f"{count}: {form}" for count, form in LAYOUTS.items())
             without = " without cameras" if len(words) <= SUPERGLUE - GLUE_FACTORY else ""
             raise DataError(f"{path}, line {number}: {len(words)} columns{without}; it must have {forms}")
-        names, values, turns = (words[0], words[1]), words[2:], (0, 0)
+        names, values, turns, origin = (words[0], words[1]), words[2:], (0, 0), CORNER
         if len(words) == SUPERGLUE:
-            turns = _turns(path, number, values[0]), _turns(path, number, values[1])
+            turns, origin = (_turns(path, number, values[0]), _turns(path, number, values[1])), 0.0
             values = values[2:]
-        cameras = to_numbers(path, number, values, "K0, K1 and the pose", len(values))
-        R, t = _pose(cameras[18:])
-        place = f"{path}, line {number}"
-        origin = 0.0 if len(words) == SUPERGLUE else CORNER
-        K0, K1 = cameras[:9].reshape(3, 3), cameras[9:18].reshape(3, 3)
-        yield ListedPair(place, names, K0, K1, R, t, turns, origin=origin)
+        cameras = files.to_numbers(path, number, values, "K0, K1 and the pose", len(values))
+        K0, K1 = cameras[:18].reshape(2, 3, 3)
+        yield ListedPair(f"{path}, line {number}", names, K0, K1, *_pose(cameras[18:]), turns, origin=origin)
 
 
 def _turns(path: Path, number: int, word: str) -> int:
-    turns = to_whole(path, number, word, "the number of quarter turns")
+    turns = files.to_whole(path, number, word, "the number of quarter turns")
     if not 0 <= turns < _QUARTERS:
         raise DataError(f"{path}, line {number}: {turns} quarter turns; it must be 0, 1, 2 or 3")
     return turns
@@ -90,7 +89,6 @@ def _pose(values: Matrix) -> tuple[Matrix, Matrix]:
 
 
 # LoFTR's lists of image pairs (Sun et al., CVPR 2021): the ``.npz`` files of its MegaDepth-1500 and ScanNet-1500
-
 
 DEPTH_SIZE = (480, 640)  # (h, w) of ScanNet's depth images, whose K intrinsics.npz holds
 INTRINSICS = "intrinsics.npz"
@@ -108,9 +106,8 @@ def npz_pairs(path: Path, root: Path) -> Iterator[ListedPair]:
     elif "name" in arrays:
         yield from _scannet(arrays, root)
     else:
-        raise DataError(
-            f"{path}: neither pair_infos (MegaDepth) nor name (ScanNet) among its arrays, {', '.join(arrays.names)}"
-        )
+        there = ", ".join(arrays.names)
+        raise DataError(f"{path}: neither pair_infos (MegaDepth) nor name (ScanNet) among its arrays, {there}")
 
 
 def camera_files(path: Path, root: Path) -> list[tuple[str, Path]]:
@@ -152,7 +149,7 @@ def _matrix(value: Any, size: int) -> Matrix:
 
 def _scannet(arrays: NpzArrays, root: Path) -> Iterator[ListedPair]:
     frames = _frames(arrays)
-    motions = arrays.get("rel_pose")
+    motions = arrays["rel_pose"] if "rel_pose" in arrays.names else None
     if motions is not None and motions.shape not in ((len(frames), 12), (len(frames), 3, 4)):
         raise DataError(f"{arrays.path}: 'rel_pose' is {motions.shape}; it must be ({len(frames)}, 12)")
     beside = arrays.path.parent / INTRINSICS
@@ -164,9 +161,8 @@ def _scannet(arrays: NpzArrays, root: Path) -> Iterator[ListedPair]:
         K, place = calibrations[scene], f"{arrays.path}, pair {record}"
         names = f"{scene}/color/{first}.jpg", f"{scene}/color/{second}.jpg"
         if motions is None:
-            R, t = relative_pose(
-                *(_pose_of_scene(root / scene / "pose" / f"{frame}.txt", K) for frame in (first, second))
-            )
+            places = (root / scene / "pose" / f"{frame}.txt" for frame in (first, second))
+            R, t = relative_pose(*(_pose_of_scene(file, K) for file in places))
         else:
             motion = motions[record].reshape(3, 4).astype(np.float64)
             R, t = motion[:, :3], motion[:, 3]
@@ -187,9 +183,8 @@ def _calibration(intrinsics: NpzArrays | None, root: Path, scene: str) -> Matrix
         return _matrix(intrinsics[scene], 3)
     path = root / scene / _COLOUR
     if not path.is_file():
-        raise DataError(
-            f"{path}: no such file, nor {INTRINSICS} beside the list; one of them must hold the calibration"
-        )
+        either = f"nor {INTRINSICS} beside the list; one of them must hold the calibration"
+        raise DataError(f"{path}: no such file, {either}")
     return np.stack(read_numbers(path, "a matrix (4, 4)", 4))[:3, :3]
 
 
@@ -201,9 +196,6 @@ def _pose_of_scene(path: Path, K: Matrix) -> Camera:
         return Camera(K, np.full((3, 3), np.nan), np.full(3, np.nan))
     R = to_world[:3, :3].T
     return Camera(K, R, -R @ to_world[:3, 3])
-
-
-# Lists of image pairs on which others evaluate, such as MegaDepth-1500 and ScanNet-1500, with a folder of images
 
 
 TEXT_SUFFIXES, NPZ = (".txt", ".csv", ".list", ""), ".npz"
@@ -242,7 +234,7 @@ class PairList(HeldPairs):
         if not path.is_file():
             raise DataError(f"{path}: no such file; dataset.file must be the list of pairs")
         self._home, self._family, self._resize = home, path.stem, _resize(resize)
-        listed, files = _listed(path, home)
+        listed, sources = _listed(path, home)
         if not listed:
             raise DataError(f"{path}: holds no pairs")
         self._origin = origin
@@ -251,16 +243,13 @@ class PairList(HeldPairs):
         scenes = _scenes([name for pair in listed for name in pair.names], path.stem)
         self._pairs = [self._pair(pair, scenes[pair.names[0]]) for pair in listed]
         digest = hashlib.blake2b(repr((self._resize, self._origin)).encode(), digest_size=16)
-        for name, each in files:
-            content = each.read_bytes()
-            digest.update(f"{name}:{len(content)}:".encode() + content)
+        for name, source in sources:
+            files.add_to_digest(digest, name, source)
         self.digest = digest.hexdigest()
 
     def _pair(self, listed: ListedPair, scene: str) -> ImagePair:
         identity = f"{self.name}/{listed.names[0]}-{listed.names[1]}"  # draws do not follow the name of the list
-        self._seen[identity] += 1
-        if self._seen[identity] > 1:  # the same pair on a second line is a second pair
-            identity += f"#{self._seen[identity]}"
+        identity = files.numbered_again(identity, self._seen)
         ends = list(zip(listed.names, (listed.K0, listed.K1), listed.quarter_turns, strict=True))
         images = [self._image(name, turns, listed.size) for name, _, turns in ends]
         pair = ImagePair(identity, self._family, scene, images[0], images[1], np.zeros((3, 3)))
@@ -285,11 +274,10 @@ class PairList(HeldPairs):
             return ImageSource(identity, path)
         target = size if self._resize is None else self._resize
         if isinstance(target, int):
-            target = longer_side(own, target)
+            target = scaled_size(own, target / max(own))
         return ImageSource(identity, path, own, resampling=Resampling(target, turns))
 
     def _size(self, path: Path) -> Size | None:
-        """(h, w) of an image, read once; None where it has no header."""
         if path not in self._sizes:
             self._sizes[path] = stored_size(path)
         return self._sizes[path]
@@ -334,20 +322,19 @@ def _listed(path: Path, home: Path) -> tuple[list[ListedPair], list[tuple[str, P
 
 
 def _resize(resize: int | Sequence[int] | None) -> int | Size | None:
-    values = [resize] if isinstance(resize, int) else list(resize or [])
-    if resize is None or (len(values) in (1, 2) and all(isinstance(v, int) and v > 0 for v in values)):
-        return None if resize is None else values[0] if len(values) == 1 else (values[1], values[0])
+    if resize is None:
+        return None
+    values = [resize] if isinstance(resize, int) else list(resize)
+    if len(values) in (1, 2) and all(isinstance(v, int) and v > 0 for v in values):
+        return values[0] if len(values) == 1 else (values[1], values[0])
     raise DataError(f"resize={resize}; it must be one length of the longer side, or [width, height], in pixels")
 
 
 def _scenes(names: Sequence[str], family: str) -> dict[str, str]:
     """The scene of each image: the first folder in which the names differ, or what stands before ``_frame``."""
     folders = {name: Path(name).parts[:-1] for name in names}
-    shared = 0
-    for parts in zip(*folders.values(), strict=False):
-        if len(set(parts)) > 1:
-            break
-        shared += 1
+    levels = zip(*folders.values(), strict=False)
+    shared = len(list(itertools.takewhile(lambda parts: len(set(parts)) == 1, levels)))
     scenes = {}
     for name, parts in folders.items():
         frame = _FRAME.match(Path(name).name)

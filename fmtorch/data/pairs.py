@@ -8,12 +8,11 @@ from typing import NamedTuple, Protocol, runtime_checkable
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from fmtorch.core.types import Correspondences, pair_key
 from fmtorch.data.cameras import Lens
+from fmtorch.data.files import Matrix, Pixels
 
-Matrix = NDArray[np.float64]
 Size = tuple[int, int]  # (h, w), px
 
 
@@ -28,7 +27,7 @@ class Resampling:
     size: Size | None = None
     quarter_turns: int = 0
 
-    def __call__(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    def __call__(self, image: Pixels) -> Pixels:
         if self.size is not None and image.shape[:2] != self.size:
             shrinks = self.size[0] <= image.shape[0] and self.size[1] <= image.shape[1]
             kind = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
@@ -52,28 +51,16 @@ class Resampling:
     def rotation(self) -> Matrix:
         """The rotation (3, 3) of the camera's axes that goes with the turn: x right and y down of the turned image."""
         quarter = np.array([[0, 1.0, 0], [-1.0, 0, 0], [0, 0, 1.0]])
-        rotation: Matrix = np.linalg.matrix_power(quarter, self.quarter_turns)
-        return rotation
+        return np.asarray(np.linalg.matrix_power(quarter, self.quarter_turns))
 
     def calibration(self, K: Matrix, size: Size) -> Matrix:
         """The calibration (3, 3) of what is read, K being that of an image of `size`: ``matrix K rotation^T``."""
-        calibration: Matrix = self.matrix(size) @ K @ self.rotation.T
-        return calibration
+        return np.asarray(self.matrix(size) @ K @ self.rotation.T)
 
 
-def longer_side(size: Size, length: int) -> Size:
-    """The size (h, w) of the same shape whose longer side is `length`."""
-    scale = length / max(size)
+def scaled_size(size: Size, scale: float) -> Size:
+    """The size (h, w) times a factor, in whole pixels, at least one."""
     return max(1, round(size[0] * scale)), max(1, round(size[1] * scale))
-
-
-def shorter_side(size: Size, length: int) -> Size:
-    """The size (h, w) of the same shape whose shorter side is `length`."""
-    scale = length / min(size)
-    return max(1, round(size[0] * scale)), max(1, round(size[1] * scale))
-
-
-# The item of every data set: an image pair with its ground truth, images read only when asked for
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,7 +76,7 @@ class ImageSource:
 
     identity: str
     path: Path
-    size: tuple[int, int] | None = None
+    size: Size | None = None
     lens: Lens | None = None
     data: bytes | None = dataclasses.field(default=None, repr=False, compare=False)
     resampling: Resampling | None = None
@@ -126,14 +113,14 @@ class ImagePair:
     scene: str
     image0: ImageSource
     image1: ImageSource
-    F: NDArray[np.float64]
-    K0: NDArray[np.float64] | None = None
-    K1: NDArray[np.float64] | None = None
-    R: NDArray[np.float64] | None = None
-    t: NDArray[np.float64] | None = None
+    F: Matrix
+    K0: Matrix | None = None
+    K1: Matrix | None = None
+    R: Matrix | None = None
+    t: Matrix | None = None
     problem: str | None = None
     matches: Callable[[], GivenMatches] | None = None
-    H: NDArray[np.float64] | None = None
+    H: Matrix | None = None
 
     @property
     def key(self) -> int:
@@ -176,10 +163,7 @@ class HeldPairs(PairDataset):
 class DepthDataset(PairDataset, Protocol):
     """A data set that knows how far away the points of its images are, in the unit of the pairs' t."""
 
-    def depth(self, image: ImageSource, points: NDArray[np.float64]) -> NDArray[np.float64]: ...
-
-
-# Some of a data set's pairs, as a data set
+    def depth(self, image: ImageSource, points: Matrix) -> Matrix: ...
 
 
 class PairSubset(PairDataset):
@@ -200,7 +184,7 @@ class PairSubset(PairDataset):
 class _DepthSubset(PairSubset):
     dataset: DepthDataset
 
-    def depth(self, image: ImageSource, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    def depth(self, image: ImageSource, points: Matrix) -> Matrix:
         return self.dataset.depth(image, points)
 
 

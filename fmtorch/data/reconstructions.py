@@ -6,27 +6,14 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fmtorch.data import files, scenes
 from fmtorch.data.cameras import Lens, nearest_rotation
-from fmtorch.data.files import DataError, given_root, numbered, read_lines, to_finite, to_whole
+from fmtorch.data.files import DataError, Indices, given_root
 from fmtorch.data.image_cameras import Model, read_model
 from fmtorch.data.images import stored_size
 from fmtorch.data.pairs import ImageSource
-from fmtorch.data.scenes import (
-    MIN_SHARED,
-    AllPairs,
-    Candidates,
-    DepthImages,
-    DepthScenePairs,
-    Scene,
-    ScenePairs,
-    View,
-    chosen,
-    folders,
-    read_colmap,
-    sharing_points,
-)
+from fmtorch.data.scenes import MIN_SHARED, Scene, ScenePairs, View
 
 _MODELS = ("sparse/0", "sparse", "dense/sparse", ".")  # below a scene's folder, in the order in which they are tried
 _FILES = ("cameras.bin", "cameras.txt")
@@ -57,23 +44,22 @@ def colmap_pairs(
     point and size (`fmtorch.data.cameras`). Principal points are lowered by COLMAP's half pixel. An image of another
     size than its camera's is refused when it is read. Raises DataError for a missing or damaged model.
     """
-    home, model_folders = scene_folders(root, split, sequences, model)
-    scenes, files = [], []
-    for folder in model_folders:
-        reconstruction = read_model(_model_folder(folder, model), points=candidates == "points")
-        scenes.append(_scene(folder, reconstruction, images, candidates, shared, family or home.name))
-        files += [(f"{folder.name}/{path.name}", path) for path in reconstruction.files]
+    home, scene_folders = _scene_folders(root, split, sequences, model)
+    model_folders = [_model_folder(folder, model) for folder in scene_folders]
+    read, sources = [], []
+    for folder, model_folder in zip(scene_folders, model_folders, strict=True):
+        reconstruction = read_model(model_folder, points=candidates == "points")
+        read.append(_scene(folder, reconstruction, images, candidates, shared, family or home.name))
+        sources += [(f"{folder.name}/{path.name}", path) for path in reconstruction.files]
     options = (candidates, shared, family or home.name)
-    dataset: ScenePairs
-    if not depth or not all(_depth_folder(folder / images).is_dir() for folder in model_folders):
-        dataset = ScenePairs("colmap", scenes, files, options, pairs, seed)
-        dataset.points = [functools.partial(_points, _model_folder(folder, model)) for folder in model_folders]
+    if not depth or not all(_depth_folder(folder / images).is_dir() for folder in scene_folders):
+        dataset = ScenePairs("colmap", read, sources, options, pairs, seed)
+        dataset.points = [functools.partial(_points, folder) for folder in model_folders]
         return dataset
-    dataset = DepthScenePairs("colmap", scenes, files, (*options, "depth"), pairs, seed)
-    paths = [_depth_paths(folder / images, scene) for folder, scene in zip(model_folders, scenes, strict=True)]
-    by_image = {key: path for by_identity in paths for key, path in by_identity.items()}
-    dataset.depth_images = DepthImages(by_image, 1.0, read_colmap, reduced=True)
-    return dataset
+    with_depth = scenes.DepthScenePairs("colmap", read, sources, (*options, "depth"), pairs, seed)
+    paths = [_depth_paths(folder / images, scene) for folder, scene in zip(scene_folders, read, strict=True)]
+    with_depth.depth_images = scenes.DepthImages(paths, 1.0, scenes.read_colmap, reduced=True)
+    return with_depth
 
 
 def _depth_folder(images: Path) -> Path:
@@ -81,43 +67,40 @@ def _depth_folder(images: Path) -> Path:
 
 
 def _depth_paths(images: Path, scene: Scene) -> dict[str, Path]:
-    """The depth map of each view that has one, by the identity of its image."""
     paths = {}
     for view in scene.views:
-        name = view.image.path.relative_to(images)
-        for kind in ("geometric", "photometric"):
-            path = _depth_folder(images) / f"{name}.{kind}.bin"
+        file = _depth_folder(images) / view.image.path.relative_to(images)
+        for kind in ("photometric", "geometric"):  # the latter counts
+            path = file.with_name(f"{file.name}.{kind}.bin")
             if path.is_file():
                 paths[view.image.identity] = path
-                break
     return paths
 
 
-def _points(folder: Path) -> list[NDArray[np.int64]]:
+def _points(folder: Path) -> list[Indices]:
     return [image.points for image in read_model(folder).images]
 
 
-def scene_folders(
+def _scene_folders(
     root: str | Path | None, split: str, sequences: Sequence[str] | None, model: str | None
 ) -> tuple[Path, list[Path]]:
     """The folder of scenes, and the scenes' folders: `root` itself where it is one."""
     home = given_root(root, "colmap", "a folder of scenes with a COLMAP model each, or one such scene").absolute()
-    if sequences is None and any((home / place / file).is_file() for place in _places(model) for file in _FILES):
+    if sequences is None and _model_places(home, model):
         return home.parent, [home]
-    return home, folders(
-        home, chosen("colmap", split, sequences, ()), "a folder for each scene, with sparse/ and images/"
-    )
+    names = scenes.chosen("colmap", split, sequences, ())
+    return home, scenes.folders(home, names, "a folder for each scene, with sparse/ and images/")
 
 
-def _places(model: str | None) -> tuple[str, ...]:
-    return _MODELS if model is None else (model,)
+def _model_places(folder: Path, model: str | None) -> list[Path]:
+    places = _MODELS if model is None else (model,)
+    return [folder / place for place in places if any((folder / place / file).is_file() for file in _FILES)]
 
 
 def _model_folder(folder: Path, model: str | None) -> Path:
-    for place in _places(model):
-        if any((folder / place / file).is_file() for file in _FILES):
-            return folder / place
-    tried = ", ".join(_places(model))
+    if there := _model_places(folder, model):
+        return there[0]
+    tried = ", ".join(_MODELS if model is None else (model,))
     raise DataError(f"{folder}: no COLMAP model in {tried}; one of these must hold {' or '.join(_FILES)}")
 
 
@@ -130,20 +113,18 @@ def _scene(
         lens = camera.lens if camera.lens.bends else None
         source = ImageSource(f"{family}/{folder.name}/{image.name}", folder / images / image.name, camera.size, lens)
         views.append(View(source, camera.lens.K, image.R, image.t, image.place))
-    pairs: Candidates = AllPairs(len(views))
-    if candidates == "points":
-        pairs = sharing_points([image.points for image in model.images], shared)
-    return Scene(folder.name, family, views, pairs)
+    points = [image.points for image in model.images] if candidates == "points" else None
+    return Scene(folder.name, family, views, scenes.collection_pairs(len(views), points, shared))
 
 
 # Scenes reconstructed by Bundler (Snavely et al., SIGGRAPH 2006), as 1DSfM (Wilson and Snavely, ECCV 2014) has them
-
 
 _BUNDLES = ("gt_bundle.out", "bundle.out", "bundle/bundle.out")  # within a scene's folder, in the order they are tried
 _LIST = "list.txt"
 _HEADER = "# Bundle file v0.3"
 _FLIP = np.diag([1.0, -1.0, -1.0])  # Bundler's y points up and its camera looks along -z
 _LINES = 5  # a camera: f k1 k2, R in three lines, t
+_COUNTED = ("cameras", "points")
 _COLUMNS = ("f k1 k2", "the first row of R", "the second row of R", "the third row of R", "t")
 
 
@@ -162,20 +143,17 @@ class BundlerPairs(ScenePairs):
         candidates: Literal["all", "points"] = "all", shared: int = MIN_SHARED, pairs: int | None = 1000,
         seed: int = 0, family: str | None = None,
     ) -> None:  # fmt: skip
-        home = given_root(
-            root, "bundler", "a folder of scenes with list.txt and a Bundler file each, or one such scene"
-        ).absolute()
+        wanted = "a folder of scenes with list.txt and a Bundler file each, or one such scene"
+        home = given_root(root, "bundler", wanted).absolute()
         if sequences is None and (home / _LIST).is_file():
             home, sequences = home.parent, [home.name]
-        scene_folders = folders(home, chosen("colmap", split, sequences, ()), f"a folder for each scene, with {_LIST}")
-        files = [_bundle(folder) for folder in scene_folders]
-        scenes = [
-            _bundler_scene(folder, file, candidates, shared, family or home.name)
-            for folder, file in zip(scene_folders, files, strict=True)
-        ]
-        sources = [(f.name, path) for f, file in zip(scene_folders, files, strict=True) for path in (file, f / _LIST)]
-        super().__init__("bundler", scenes, sources, (candidates, shared, family or home.name), pairs, seed)
-        self.points = [functools.partial(_bundler_points, file) for file in files]
+        names = scenes.chosen("colmap", split, sequences, ())
+        bundles = [(f, _bundle(f)) for f in scenes.folders(home, names, f"a folder for each scene, with {_LIST}")]
+        family = family or home.name
+        read = [_bundler_scene(folder, file, candidates, shared, family) for folder, file in bundles]
+        sources = [(folder.name, path) for folder, file in bundles for path in (file, folder / _LIST)]
+        super().__init__("bundler", read, sources, (candidates, shared, family), pairs, seed)
+        self.points = [functools.partial(_bundler_points, file) for _, file in bundles]
 
 
 def _bundle(folder: Path) -> Path:
@@ -186,20 +164,18 @@ def _bundle(folder: Path) -> Path:
 
 
 def _bundler_scene(folder: Path, file: Path, candidates: Literal["all", "points"], shared: int, family: str) -> Scene:
-    names = [line.split()[0] for _, line in numbered(folder / _LIST)]  # a focal length may stand behind
-    lines = read_lines(file)
+    names = [line.split()[0] for _, line in files.numbered(folder / _LIST)]  # a focal length may stand behind
+    lines = files.read_lines(file)
     if not lines or lines[0].strip() != _HEADER:
         raise DataError(f"{file}, line 1: {lines[0][:40] if lines else ''!r}; it must be {_HEADER!r}")
     cameras, points = _counts(file, lines)
     if cameras != len(names):
-        raise DataError(
-            f"{file}, line 2: {cameras} cameras and {folder / _LIST} has {len(names)} images; both must agree"
-        )
+        listed = f"{folder / _LIST} has {len(names)} images"
+        raise DataError(f"{file}, line 2: {cameras} cameras and {listed}; both must agree")
     end = 2 + _LINES * cameras + 3 * points
     if len(lines) < end:
-        raise DataError(
-            f"{file} ends at line {len(lines)}; {cameras} cameras and {points} points need {end}: truncated?"
-        )
+        needed = f"{cameras} cameras and {points} points need {end}"
+        raise DataError(f"{file} ends at line {len(lines)}; {needed}: truncated?")
     views, numbers = list[View](), dict[int, int]()
     for i, name in enumerate(names):
         view = _view(file, lines, i, ImageSource(f"{family}/{folder.name}/{name}", folder / name))
@@ -208,15 +184,13 @@ def _bundler_scene(folder: Path, file: Path, candidates: Literal["all", "points"
             views.append(view)
     if not views:
         raise DataError(f"{file}: no camera has a focal length; none was registered")
-    pairs: Candidates = AllPairs(len(views))
-    if candidates == "points":
-        pairs = sharing_points(_seen(file, lines, cameras, points, numbers), shared)
-    return Scene(folder.name, family, views, pairs)
+    seen = _seen(file, lines, cameras, points, numbers) if candidates == "points" else None
+    return Scene(folder.name, family, views, scenes.collection_pairs(len(views), seen, shared))
 
 
-def _bundler_points(file: Path) -> list[NDArray[np.int64]]:
+def _bundler_points(file: Path) -> list[Indices]:
     """The points that each registered camera of a file sees; the file was read before."""
-    lines = read_lines(file)
+    lines = files.read_lines(file)
     cameras, points = _counts(file, lines)
     registered = [i for i in range(cameras) if float(lines[2 + _LINES * i].split()[0]) != 0]
     return _seen(file, lines, cameras, points, {i: number for number, i in enumerate(registered)})
@@ -226,13 +200,15 @@ def _counts(file: Path, lines: list[str]) -> tuple[int, int]:
     words = lines[1].split() if len(lines) > 1 else []
     if len(words) != 2:
         raise DataError(f"{file}, line 2: {len(words)} columns; it must hold the numbers of cameras and of points")
-    return to_whole(file, 2, words[0], "the number of cameras"), to_whole(file, 2, words[1], "the number of points")
+    return files.to_whole(file, 2, words[0], "the number of cameras"), files.to_whole(
+        file, 2, words[1], "the number of points"
+    )
 
 
 def _view(file: Path, lines: list[str], i: int, source: ImageSource) -> View | None:
     """The view of camera i, if it was registered; an image that cannot be opened has a size that no pair will use."""
     first = 2 + _LINES * i
-    rows = [to_finite(file, first + k + 1, lines[first + k].split(), _COLUMNS[k], 3) for k in range(_LINES)]
+    rows = [files.to_finite(file, first + k + 1, lines[first + k].split(), _COLUMNS[k], 3) for k in range(_LINES)]
     focal, k1, k2 = (float(value) for value in rows[0])
     if focal == 0:
         return None
@@ -246,16 +222,16 @@ def _view(file: Path, lines: list[str], i: int, source: ImageSource) -> View | N
     return View(image, lens.K, R, _FLIP @ rows[4], place)
 
 
-def _seen(file: Path, lines: list[str], cameras: int, points: int, numbers: dict[int, int]) -> list[NDArray[np.int64]]:
+def _seen(file: Path, lines: list[str], cameras: int, points: int, numbers: dict[int, int]) -> list[Indices]:
     seen: list[list[int]] = [[] for _ in numbers]
     for point in range(points):
         number = 2 + _LINES * cameras + 3 * point + 3  # of the line, from 1
         words = lines[number - 1].split()
-        count = to_whole(file, number, words[0], "the length of the view list") if words else -1
+        count = files.to_whole(file, number, words[0], "the length of the view list") if words else -1
         if len(words) != 1 + 4 * count:
             raise DataError(f"{file}, line {number}: {len(words)} columns; it must hold n and n times camera key x y")
         for word in words[1::4]:
-            camera = to_whole(file, number, word, "the number of a camera")
+            camera = files.to_whole(file, number, word, "the number of a camera")
             if camera in numbers:
                 seen[numbers[camera]].append(point)
     return [np.array(indices, dtype=np.int64) for indices in seen]

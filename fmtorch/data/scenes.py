@@ -2,7 +2,6 @@
 that see the same points of its reconstruction.
 """
 
-import bisect
 import dataclasses
 import functools
 import hashlib
@@ -10,37 +9,20 @@ import itertools
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from fmtorch.data.cameras import Matrix, fundamental, relative_pose, share_centre
-from fmtorch.data.files import DataError
+from fmtorch.data.cameras import fundamental, relative_pose, share_centre
+from fmtorch.data.files import Array, DataError, Indices, Matrix, Singles
 from fmtorch.data.images import ImageError
 from fmtorch.data.pairs import ImagePair, ImageSource, PairDataset
-
-if TYPE_CHECKING:
-    import scipy.sparse
-
-Indices = NDArray[np.int64]
 
 WINDOW = 1.0  # s: a frame is paired with those of the following second (Bian et al., BMVC 2019, Section 3)
 MIN_SHARED = 1  # points of a reconstruction that two images must both see
 _ROUNDING = 1e-6  # s, of time stamps in text files
 _AT_ONCE = 512  # images whose shared points are counted together
-
-
-@runtime_checkable
-class Candidates(Protocol):
-    """Pairs (i, j), i < j, of a scene's images in a fixed order; not necessarily all in memory."""
-
-    def __len__(self) -> int: ...
-
-    def at(self, ranks: Indices) -> Indices:
-        """The pairs (n, 2) at these places (n,) of the order."""
-        ...
 
 
 class AllPairs:
@@ -69,11 +51,14 @@ class ListedPairs:
         return len(self.pairs)
 
     def at(self, ranks: Indices) -> Indices:
-        """The pairs (n, 2) at these places (n,)."""
         return self.pairs[ranks]
 
 
-def following(times: Sequence[float] | NDArray[np.float64], window: int | float = WINDOW) -> ListedPairs:
+Candidates = AllPairs | ListedPairs
+"""Pairs (i, j), i < j, of a scene's images in a fixed order; not necessarily all in memory."""
+
+
+def following(times: Sequence[float] | Matrix, window: int | float = WINDOW) -> ListedPairs:
     """Each frame with those at most `window` seconds later; times (n,) in seconds, ascending."""
     t = np.asarray(times, dtype=np.float64)
     ends = np.searchsorted(t, t + window + _ROUNDING, side="right")
@@ -83,7 +68,7 @@ def following(times: Sequence[float] | NDArray[np.float64], window: int | float 
     return ListedPairs(np.stack([first, first + 1 + within], -1).astype(np.int64))
 
 
-def sharing_points(points: Sequence[NDArray[np.int64]], minimum: int = MIN_SHARED) -> ListedPairs:
+def sharing_points(points: Sequence[Indices], minimum: int = MIN_SHARED) -> ListedPairs:
     """The pairs of images that both see at least `minimum` points; points: of each image the numbers it sees.
 
     Memory is that of the pairs found; a reconstruction of n images with a mean track of m images has, in all, about
@@ -100,8 +85,13 @@ def sharing_points(points: Sequence[NDArray[np.int64]], minimum: int = MIN_SHARE
     return ListedPairs(np.concatenate([*blocks, np.zeros((0, 2), np.int64)]))
 
 
-def incidence(points: Sequence[Indices]) -> "scipy.sparse.csr_array":
-    """Which image sees which point, (images, points) of ones; points: of each image the numbers it sees."""
+def collection_pairs(views: int, points: Sequence[Indices] | None, minimum: int) -> Candidates:
+    """All pairs of views, or those that see as many points in common; points: that each view sees, None: all pairs."""
+    return AllPairs(views) if points is None else sharing_points(points, minimum)
+
+
+def incidence(points: Sequence[Indices]) -> Any:
+    """A sparse array of SciPy's (images, points), 1 where an image sees a point; points: the numbers of those."""
     import scipy.sparse  # which takes longer to import than a small database to verify
 
     seen = [np.unique(p) for p in points]
@@ -121,15 +111,9 @@ def drawn(total: int, count: int | None, seed: int) -> Sequence[int] | Indices:
 
 # Which sequences the paper trains and tests on (Bian et al., BMVC 2019, Section 4 and its supplement)
 
-
 SPLITS: dict[str, dict[str, tuple[str, ...]]] = {
-    "tum": {
-        "test": tuple(f"rgbd_dataset_freiburg3_{name}" for name in ("teddy", "large_cabinet", "long_office_household")),
-    },
-    "kitti": {
-        "test": ("06", "07", "08", "09", "10"),
-        "train": ("00", "01", "02", "03", "04", "05"),
-    },
+    "tum": {"test": tuple(f"rgbd_dataset_freiburg3_{n}" for n in ("teddy", "large_cabinet", "long_office_household"))},
+    "kitti": {"test": ("06", "07", "08", "09", "10"), "train": ("00", "01", "02", "03", "04", "05")},
     "colmap": {
         "test": ("Panther", "Playground", "Train", "Roman_Forum"),
         "train": ("Family", "Francis", "Horse", "Lighthouse", "M60"),
@@ -161,8 +145,6 @@ def chosen(name: str, split: str, sequences: Sequence[str] | None, there: Sequen
 
 # Depth of each pixel of a photograph, measured or reconstructed, kept in a file beside it
 
-
-Values = NDArray[np.uint16] | NDArray[np.float32]
 _KEPT = 8  # depth images that are remembered, some MB each
 _COLMAP_HEADER = re.compile(rb"(\d{1,6})&(\d{1,6})&1&")
 
@@ -170,16 +152,18 @@ _COLMAP_HEADER = re.compile(rb"(\d{1,6})&(\d{1,6})&1&")
 class DepthImages:
     """Depth images by the identity of the photographs, pixel by pixel on the photographs as they were taken.
 
-    paths: of the depth images. scale: their values per unit of length; 0 and less is no measurement. read: the values
-    (h, w) of a file. reduced: whether depth images may be smaller than their photographs, of the same proportions.
+    paths: of the depth images, scene by scene. scale: their values per unit of length; 0 and less is no measurement.
+    read: the values (h, w) of a file. reduced: whether they may be smaller than their photographs, of the same
+    proportions.
     """
 
     def __init__(
-        self, paths: Mapping[str, Path], scale: float, read: Callable[[Path], Values], reduced: bool = False
+        self, paths: Iterable[Mapping[str, Path]], scale: float, read: Callable[[Path], Array], reduced: bool = False
     ) -> None:
-        self.paths, self.scale, self.read, self.reduced = dict(paths), scale, read, reduced
+        self.paths = {identity: path for of_scene in paths for identity, path in of_scene.items()}
+        self.scale, self.read, self.reduced = scale, read, reduced
 
-    def at(self, image: ImageSource, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    def at(self, image: ImageSource, points: Matrix) -> Matrix:
         """Depth (n,) along the optical axis at points (n, 2) of the undistorted image: that of the nearest pixel.
 
         NaN outside, where nothing was measured, and everywhere in a photograph without a depth image. Raises ImageError
@@ -190,34 +174,31 @@ class DepthImages:
         path = self.paths[image.identity]
         pixels = self.read(path)
         h, w = pixels.shape
-        if image.size is not None and not self._fits((h, w), image.size):
+        height, width = image.size or (h, w)
+        in_proportion = h <= height and abs(h * width / height - w) <= 1
+        if (h, w) != (height, width) and not (self.reduced and in_proportion):
             raise ImageError(f"{path}: {(h, w)} px; its photograph has {image.size}")
         there = points if image.lens is None else image.lens.distort(points)
-        if image.size is not None and image.size != (h, w):
-            there = (there + 0.5) * [w / image.size[1], h / image.size[0]] - 0.5
+        if (h, w) != (height, width):
+            there = (there + 0.5) * [w / width, h / height] - 0.5
         column, row = np.round(np.nan_to_num(there, nan=-1.0, posinf=-1.0, neginf=-1.0)).astype(np.int64).T
         inside = (column >= 0) & (row >= 0) & (column < w) & (row < h)
         value = np.where(inside, pixels[np.where(inside, row, 0), np.where(inside, column, 0)], 0).astype(np.float64)
         return np.where(value > 0, value / self.scale, np.nan)
 
-    def _fits(self, size: tuple[int, int], photograph: tuple[int, int]) -> bool:
-        """Whether a depth image has the size of its photograph, or the same proportions to a pixel."""
-        (h, w), (height, width) = size, photograph
-        return size == photograph or (self.reduced and h <= height and abs(h * width / height - w) <= 1)
-
 
 @functools.lru_cache(maxsize=_KEPT)
-def read_grey(path: Path) -> NDArray[np.uint16]:
+def read_grey(path: Path) -> Array:
     """A grey image with 16 bits (h, w). Raises ImageError for anything else."""
     _expect_file(path)
     pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     if pixels is None or pixels.dtype != np.uint16 or pixels.ndim != 2:
         raise ImageError(f"{path}: it must be a depth image, grey with 16 bits")
-    return pixels  # type: ignore[return-value]
+    return pixels
 
 
 @functools.lru_cache(maxsize=_KEPT)
-def read_colmap(path: Path) -> NDArray[np.float32]:
+def read_colmap(path: Path) -> Singles:
     """A depth map of COLMAP's dense reconstruction (h, w): ``width&height&1&``, then float32, row by row.
 
     Raises ImageError for anything else.
@@ -237,9 +218,6 @@ def read_colmap(path: Path) -> NDArray[np.float32]:
 def _expect_file(path: Path) -> None:
     if not path.is_file():
         raise ImageError(f"{path}: no such file; it must be a depth image")
-
-
-# Scenes of images with known cameras, and the data set of pairs of them; what every native reader gives
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -285,7 +263,7 @@ class ScenePairs(PairDataset):
     at all is not asked here (`fmtorch pairs`).
     """
 
-    points: Sequence[Callable[[], Sequence[NDArray[np.int64]]]] | None = None
+    points: Sequence[Callable[[], Sequence[Indices]]] | None = None
 
     def __init__(
         self, name: str, scenes: Sequence[Scene], sources: Iterable[tuple[str, Path]], options: Sequence[object] = (),
@@ -310,7 +288,7 @@ class ScenePairs(PairDataset):
 
     def candidate(self, rank: int) -> tuple[int, int, int]:
         """The candidate at a place among those of all scenes: number of the scene, and of its two views."""
-        scene = bisect.bisect_right(self._starts, rank) - 1
+        scene = int(np.searchsorted(self._starts, rank, side="right")) - 1
         ((i, j),) = self.scenes[scene].candidates.at(np.array([rank - self._starts[scene]]))
         return scene, int(i), int(j)
 
@@ -320,7 +298,7 @@ class DepthScenePairs(ScenePairs):
 
     depth_images: DepthImages
 
-    def depth(self, image: ImageSource, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    def depth(self, image: ImageSource, points: Matrix) -> Matrix:
         """Depth (n,) along the optical axis at points (n, 2) of an image, in the unit of t; NaN where unknown."""
         return self.depth_images.at(image, points)
 
@@ -329,16 +307,12 @@ def image_pair(scene: Scene, i: int, j: int) -> ImagePair:
     """Views i and j of a scene as a pair; F is zero, with a `problem`, where the two cameras are at one place."""
     a, b = scene.views[i], scene.views[j]
     problems = [problem for problem in (a.problem, b.problem) if problem]
-    if share_centre(a, b):
-        F = np.zeros((3, 3))
+    apart = not share_centre(a, b)
+    if not apart:
         problems.append(f"{a.place} and {b.place}: both cameras are at one place, hence there is no F")
-    else:
-        F = fundamental(a, b)
-    R, t = relative_pose(a, b)
-    return ImagePair(
-        identity=f"{scene.family}/{scene.name}/{i}-{j}", family=scene.family, scene=scene.name, image0=a.image,
-        image1=b.image, F=F, K0=a.K, K1=b.K, R=R, t=t, problem="; ".join(problems) or None,
-    )  # fmt: skip
+    F, motion = fundamental(a, b) if apart else np.zeros((3, 3)), relative_pose(a, b)
+    identity, problem = f"{scene.family}/{scene.name}/{i}-{j}", "; ".join(problems) or None
+    return ImagePair(identity, scene.family, scene.name, a.image, b.image, F, a.K, b.K, *motion, problem)
 
 
 def folders(root: Path, wanted: Sequence[str], what: str) -> list[Path]:

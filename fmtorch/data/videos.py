@@ -4,24 +4,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-from fmtorch.data.cameras import Lens, Matrix, from_projection, nearest_rotation
-from fmtorch.data.files import DataError, given_root, images_by_stem, numbered, to_finite
+from fmtorch.data import scenes
+from fmtorch.data.cameras import Lens, from_projection, nearest_rotation
+from fmtorch.data.files import DataError, Mask, Matrix, given_root, images_by_stem, numbered, to_finite
 from fmtorch.data.pairs import ImageSource
-from fmtorch.data.scenes import (
-    WINDOW,
-    DepthImages,
-    DepthScenePairs,
-    Scene,
-    ScenePairs,
-    View,
-    chosen,
-    folders,
-    following,
-    read_grey,
-)
+from fmtorch.data.scenes import WINDOW, Scene, ScenePairs, View, following
 
 _SUFFIXES = (".png", ".jpg")
 _LAYOUT = "the layout is sequences/NN/calib.txt, times.txt, image_0/ and poses/NN.txt"
@@ -46,56 +35,40 @@ class KittiPairs(ScenePairs):
     ) -> None:  # fmt: skip
         home = given_root(root, "kitti", "the folder with sequences/ and poses/ of KITTI odometry")
         there = sorted(f.name for f in (home / "sequences").iterdir()) if (home / "sequences").is_dir() else []
-        sequence_folders = folders(
-            home / "sequences", chosen("kitti", split, sequences, there), "a folder for each sequence"
-        )
-        scenes = [_kitti_scene(home, folder, camera, window) for folder in sequence_folders]
-        files = [(f.name, f / name) for f in sequence_folders for name in ("calib.txt", "times.txt")]
-        poses = [(f.name, home / "poses" / f"{f.name}.txt") for f in sequence_folders]
-        super().__init__("kitti", scenes, [*files, *poses], (camera, window), pairs, seed)
-
-
-def read_projections(path: Path) -> dict[str, Matrix]:
-    """The matrices (3, 4) of a ``calib.txt`` by their names, P0 to P3; others, such as Tr, too."""
-    projections = {}
-    for number, line in numbered(path, _LAYOUT):
-        name, _, rest = line.partition(":")
-        projections[name.strip()] = to_finite(path, number, rest.split(), _PROJECTION, 12).reshape(3, 4)
-    return projections
-
-
-def read_times(path: Path) -> NDArray[np.float64]:
-    """The seconds (n,) of a ``times.txt``; they must ascend."""
-    times: list[float] = []
-    for number, line in numbered(path, _LAYOUT):
-        (time,) = to_finite(path, number, line.split(), "seconds", 1)
-        if times and time <= times[-1]:
-            raise DataError(f"{path}, line {number}: {time:g} s does not come after {times[-1]:g} s; times must ascend")
-        times.append(float(time))
-    return np.array(times)
+        names = scenes.chosen("kitti", split, sequences, there)
+        folders = scenes.folders(home / "sequences", names, "a folder for each sequence")
+        read = [_kitti_scene(home, folder, camera, window) for folder in folders]
+        files = [(f.name, f / name) for f in folders for name in ("calib.txt", "times.txt")]
+        poses = [(f.name, home / "poses" / f"{f.name}.txt") for f in folders]
+        super().__init__("kitti", read, [*files, *poses], (camera, window), pairs, seed)
 
 
 def _kitti_scene(home: Path, folder: Path, camera: int, window: int | float) -> Scene:
     name, images = folder.name, folder / f"image_{camera}"
-    projections = read_projections(folder / "calib.txt")
+    calibration, stamps = folder / "calib.txt", folder / "times.txt"
+    projections, times = dict[str, Matrix](), list[float]()
+    for number, line in numbered(calibration, _LAYOUT):
+        key, _, rest = line.partition(":")
+        projections[key.strip()] = to_finite(calibration, number, rest.split(), _PROJECTION, 12).reshape(3, 4)
     if f"P{camera}" not in projections:
-        raise DataError(f"{folder / 'calib.txt'}: no line P{camera}; it must hold {_PROJECTION}")
-    times = read_times(folder / "times.txt")
+        raise DataError(f"{calibration}: no line P{camera}; it must hold {_PROJECTION}")
+    for number, line in numbered(stamps, _LAYOUT):
+        (time,) = to_finite(stamps, number, line.split(), "seconds", 1).tolist()
+        if times and time <= times[-1]:
+            between = f"{time:g} s does not come after {times[-1]:g} s"
+            raise DataError(f"{stamps}, line {number}: {between}; times must ascend")
+        times.append(time)
     poses = home / "poses" / f"{name}.txt"
     lines = list(numbered(poses, _LAYOUT))
     if len(lines) != len(times):
-        raise DataError(
-            f"{poses} ends at line {len(lines)} and {folder / 'times.txt'} at line {len(times)}; each must have one "
-            "line a frame: is one of them truncated?"
-        )
+        ends = f"{poses} ends at line {len(lines)} and {stamps} at line {len(times)}"
+        raise DataError(f"{ends}; each must have one line a frame: is one of them truncated?")
     if not images.is_dir():
         raise DataError(f"{images}: no such folder; {_LAYOUT}")
     there = images_by_stem(images, _SUFFIXES)
     if len(there) > len(lines):
-        raise DataError(
-            f"{poses} ends at line {len(lines)} and {images} has {len(there)} images; each must have its line: is the "
-            "file truncated?"
-        )
+        ends = f"{poses} ends at line {len(lines)} and {images} has {len(there)} images"
+        raise DataError(f"{ends}; each must have its line: is the file truncated?")
     views = []
     for frame, (number, line) in enumerate(lines):
         place = f"{poses}, line {number}"
@@ -106,9 +79,6 @@ def _kitti_scene(home: Path, folder: Path, camera: int, window: int | float) -> 
         path = there.get(stem, images / f"{stem}{_SUFFIXES[0]}")
         views.append(View(ImageSource(f"KITTI/{name}/image_{camera}/{stem}", path), c.K, c.R, c.t, place))
     return Scene(name, "KITTI", views, following(times, window))
-
-
-# TUM RGB-D (Sturm et al., IROS 2012): hand-held Kinect videos with poses of a motion-capture system
 
 
 SIZE = (480, 640)  # h, w of all images
@@ -148,20 +118,20 @@ def tum_pairs(
     """
     home = given_root(root, "tum", "the folder of the sequences' folders of TUM RGB-D")
     there = sorted(f.parent.name for f in home.glob("*/groundtruth.txt") if (f.parent / "rgb.txt").is_file())
-    sequence_folders = folders(home, chosen("tum", split, sequences, there), "a folder for each sequence")
-    scenes = [_tum_scene(folder, _lens(folder, camera), window) for folder in sequence_folders]
-    files = [(folder.name, folder / name) for folder in sequence_folders for name in ("rgb.txt", "groundtruth.txt")]
-    if not depth or not all((folder / "depth.txt").is_file() for folder in sequence_folders):
-        return ScenePairs("tum", scenes, files, (window,), pairs, seed)
-    files += [(folder.name, folder / "depth.txt") for folder in sequence_folders]
-    dataset = DepthScenePairs("tum", scenes, files, (window,), pairs, seed)
-    paths = [_depth_paths(folder, scene) for folder, scene in zip(sequence_folders, scenes, strict=True)]
-    by_image = {key: path for by_identity in paths for key, path in by_identity.items()}
-    dataset.depth_images = DepthImages(by_image, DEPTH_SCALE, read_grey)
+    names = scenes.chosen("tum", split, sequences, there)
+    folders = scenes.folders(home, names, "a folder for each sequence")
+    read = [_tum_scene(folder, _lens(folder, camera), window) for folder in folders]
+    files = [(folder.name, folder / name) for folder in folders for name in ("rgb.txt", "groundtruth.txt")]
+    if not depth or not all((folder / "depth.txt").is_file() for folder in folders):
+        return ScenePairs("tum", read, files, (window,), pairs, seed)
+    files += [(folder.name, folder / "depth.txt") for folder in folders]
+    dataset = scenes.DepthScenePairs("tum", read, files, (window,), pairs, seed)
+    paths = [_depth_paths(folder, scene) for folder, scene in zip(folders, read, strict=True)]
+    dataset.depth_images = scenes.DepthImages(paths, DEPTH_SCALE, scenes.read_grey)
     return dataset
 
 
-def read_listed(path: Path) -> tuple[NDArray[np.float64], list[str], list[int]]:
+def read_listed(path: Path) -> tuple[Matrix, list[str], list[int]]:
     """Time stamps (n,) in seconds, file names and line numbers of an ``rgb.txt`` or ``depth.txt``."""
     times, names, lines = list[float](), list[str](), list[int]()
     for number, line in numbered(path, _TUM_LAYOUT):
@@ -176,9 +146,9 @@ def read_listed(path: Path) -> tuple[NDArray[np.float64], list[str], list[int]]:
     return np.array(times), names, lines
 
 
-def read_trajectory(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64], Rotation]:
+def read_trajectory(path: Path) -> tuple[Matrix, Matrix, Rotation]:
     """Times (n,) in seconds, positions (n, 3) and orientations of a ``groundtruth.txt``, camera to world."""
-    times, poses = list[float](), list[NDArray[np.float64]]()
+    times, poses = list[float](), list[Matrix]()
     for number, line in numbered(path, _TUM_LAYOUT):
         words = line.split()
         values = to_finite(path, number, words, _TUM_POSE, 8)
@@ -194,9 +164,7 @@ def read_trajectory(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64
     return np.array(times), table[:, :3], Rotation.from_quat(table[:, 3:])
 
 
-def interpolated(
-    path: Path, wanted: NDArray[np.float64]
-) -> tuple[NDArray[np.bool_], NDArray[np.float64], NDArray[np.float64]]:
+def interpolated(path: Path, wanted: Matrix) -> tuple[Mask, Matrix, Matrix]:
     """Which of the wanted times (n,) have a pose; of those rotations (m, 3, 3) and positions (m, 3), to the world."""
     times, positions, orientations = read_trajectory(path)
     after = np.clip(np.searchsorted(times, wanted), 1, len(times) - 1)
@@ -227,9 +195,8 @@ def _tum_scene(folder: Path, lens: Lens, window: int | float) -> Scene:
     times, names, lines = read_listed(listed)
     has, rotations, positions = interpolated(folder / "groundtruth.txt", times)
     if not has.any():
-        raise DataError(
-            f"{folder / 'groundtruth.txt'}: no pose at the times of {listed.name}; is it another sequence's?"
-        )
+        truth = folder / "groundtruth.txt"
+        raise DataError(f"{truth}: no pose at the times of {listed.name}; is it another sequence's?")
     views = []
     for frame, to_world, position in zip(np.flatnonzero(has).tolist(), rotations, positions, strict=True):
         key = f"TUM/{folder.name}/{names[frame]}"
@@ -239,7 +206,6 @@ def _tum_scene(folder: Path, lens: Lens, window: int | float) -> Scene:
 
 
 def _depth_paths(folder: Path, scene: Scene) -> dict[str, Path]:
-    """The depth image next in time to each view, by the identity of its image."""
     rgb = dict(zip(*read_listed(folder / "rgb.txt")[1::-1], strict=True))
     times, names, _ = read_listed(folder / "depth.txt")
     paths = {}

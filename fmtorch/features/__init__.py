@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING
 from fmtorch.core.lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from fmtorch.features.asift import ASIFT, simulate_view, simulated_views
     from fmtorch.features.frames import (
         FRAME_SIGMAS,
         DominantGradient,
@@ -23,6 +22,7 @@ if TYPE_CHECKING:
     from fmtorch.features.onnx_network import PatchNetwork
     from fmtorch.features.patches import ImagePyramid
     from fmtorch.features.sift import (
+        ASIFT,
         SIFT,
         PatchSIFT,
         RootSIFTPCA,
@@ -31,6 +31,8 @@ if TYPE_CHECKING:
         learn_projection,
         root_sift,
         sift_of_patches,
+        simulate_view,
+        simulated_views,
     )
 
 __all__ = [

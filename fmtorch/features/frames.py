@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
@@ -54,8 +53,6 @@ def make_upright(lafs: Float[Tensor, "*n 2 3"]) -> Float[Tensor, "*n 2 3"]:
     return torch.stack([first, second, lafs[..., 2]], -1)
 
 
-# Orientation of local affine frames from their patches: the angle by which the frame's axes turn
-
 PatchFunction = Callable[[Tensor], Tensor]
 """Patches (N, 1, 32, 32) float32, grey in [0, 1] -> (N, D); see `PatchNetwork`."""
 
@@ -100,8 +97,11 @@ def dominant_gradient(patches: Float[Tensor, "n 1 p p"]) -> Float[Tensor, " n"]:
     Sobel gradients, weighted by a Gaussian window, vote for the two nearest of `BINS` directions; the smoothed
     histogram's highest peak is refined by a parabola. A patch without gradient gives pi.
     """
-    histograms = [_histogram(part) for part in torch.split(patches, CHUNK)]
-    smooth = _smoothed(torch.cat(histograms) if histograms else patches.new_zeros(0, BINS))
+    parts = [_histogram(part) for part in torch.split(patches, CHUNK)]
+    histogram = torch.cat(parts) if parts else patches.new_zeros(0, BINS)
+    taps = [math.exp(-0.5 * (step / SMOOTHING) ** 2) for step in range(-2, 3)]
+    shifted = (weight / sum(taps) * histogram.roll(step, 1) for step, weight in zip(range(-2, 3), taps, strict=True))
+    smooth = functools.reduce(torch.add, shifted)
     value, peak = smooth.max(1)
     left, right = (smooth.gather(1, ((peak + step) % BINS)[:, None])[:, 0] for step in (-1, 1))
     curvature = left + right - 2 * value
@@ -130,17 +130,10 @@ def _histogram(patches: Float[Tensor, "n 1 p p"]) -> Float[Tensor, "n k"]:
 
 def _sobel(patches: Tensor) -> tuple[Tensor, Tensor]:
     """Derivatives along y and x (N, P, P); the border is continued."""
-    padded = F.pad(patches, (1, 1, 1, 1), mode="replicate")[:, 0]
+    padded = torch.nn.functional.pad(patches, (1, 1, 1, 1), mode="replicate")[:, 0]
     rows = torch.add(padded[:, :-2], padded[:, 1:-1], alpha=2).add_(padded[:, 2:])
     columns = torch.add(padded[:, :, :-2], padded[:, :, 1:-1], alpha=2).add_(padded[:, :, 2:])
     return (columns[:, 2:] - columns[:, :-2]).div_(8), (rows[:, :, 2:] - rows[:, :, :-2]).div_(8)
-
-
-def _smoothed(histogram: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
-    """The circular histogram blurred by a Gaussian of five taps."""
-    taps = [math.exp(-0.5 * (step / SMOOTHING) ** 2) for step in range(-2, 3)]
-    shifted = (weight / sum(taps) * histogram.roll(step, 1) for step, weight in zip(range(-2, 3), taps, strict=True))
-    return functools.reduce(torch.add, shifted)
 
 
 @functools.cache
@@ -178,17 +171,11 @@ class NetworkShape:
         first, second, centre = upright.unbind(-1)
         columns = [first * shape[:, :1, k] + second * shape[:, 1:, k] for k in (0, 1)]
         shaped = make_upright(torch.stack([*columns, centre], -1))
-        shaped = _rescaled(shaped, frame_scale(upright) / frame_scale(shaped))
-        valid = torch.isfinite(shaped).all(2).all(1) & (_elongation(shaped) <= LONGEST)
+        factor = frame_scale(upright) / frame_scale(shaped)
+        shaped = torch.cat([shaped[..., :2] * factor[:, None, None], shaped[..., 2:]], -1)
+        scale = frame_scale(shaped)
+        # Half the sum a^2 + 1 / a^2 of the squared axes of the ellipse that a frame makes of the unit circle.
+        half_sum = 0.5 * shaped[..., :2].square().sum((1, 2)) / (scale * scale)
+        elongation = half_sum + (half_sum * half_sum - 1).clamp(min=0).sqrt()
+        valid = torch.isfinite(shaped).all(2).all(1) & (elongation <= LONGEST)
         return torch.where(valid[:, None, None], shaped, upright)
-
-
-def _rescaled(lafs: Tensor, factor: Tensor) -> Tensor:
-    return torch.cat([lafs[..., :2] * factor[:, None, None], lafs[..., 2:]], -1)
-
-
-def _elongation(lafs: Float[Tensor, "n 2 3"]) -> Float[Tensor, " n"]:
-    """Ratio of the axes of the ellipse that a frame makes of the unit circle."""
-    scale = frame_scale(lafs)
-    half_sum = 0.5 * lafs[..., :2].square().sum((1, 2)) / (scale * scale)  # of the squared axes a^2 + 1 / a^2
-    return half_sum + (half_sum * half_sum - 1).clamp(min=0).sqrt()

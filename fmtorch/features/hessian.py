@@ -2,22 +2,20 @@
 
 import dataclasses
 import math
-from typing import Annotated, NamedTuple, Protocol, runtime_checkable
+from typing import Annotated, NamedTuple
 
 import cv2
 import numpy as np
 import torch
-import torch.nn.functional as F
-from jaxtyping import Bool, Float, Int
-from numpy.typing import NDArray
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from fmtorch.core.options import Within
 from fmtorch.features.frames import upright_frames
+from fmtorch.features.patches import Image
 from fmtorch.features.sift import as_grey
 
 # Maxima of a scale space: 3 x 3 x 3 neighbourhoods and the quadratic through them (Brown and Lowe, BMVC 2002)
-
 
 MOVES = 4  # how often a maximum may move to the neighbour that the quadratic points to
 CONVERGED = 0.6  # largest offset from the last sample, in samples; 0.5 and some slack between two samples
@@ -29,15 +27,14 @@ CENTRE = 13
 
 
 class Peaks(NamedTuple):
-    """Refined maxima. image: index (M,). position: (level, y, x) in samples (M, 3) float64. value: response (M,)."""
+    """Refined maxima. position: (level, y, x) in samples (M, 3) float64. value: response (M,)."""
 
-    image: Int[Tensor, " m"]
     position: Float[Tensor, "m 3"]
     value: Float[Tensor, " m"]
 
 
-def refined_maxima(volume: Float[Tensor, "b s h w"], seeds: Int[Tensor, "m 4"], threshold: float) -> Peaks:
-    """The maxima among `seeds`, samples (b, level, y, x), refined to sub-sample positions and values.
+def refined_maxima(volume: Float[Tensor, "s h w"], seeds: Int[Tensor, "m 3"], threshold: float) -> Peaks:
+    """The maxima among `seeds`, samples (level, y, x), refined to sub-sample positions and values.
 
     A seed is a maximum where it exceeds the neighbours before it in memory and no neighbour after it exceeds it, so
     that of equal neighbours one remains. A maximum moves to the sample nearest to the quadratic's; it is dropped where
@@ -48,45 +45,44 @@ def refined_maxima(volume: Float[Tensor, "b s h w"], seeds: Int[Tensor, "m 4"], 
     at, offset, value = (torch.cat(parts) for parts in zip(*chunks, strict=True))
     kept = value > threshold
     at, offset, value = at[kept], offset[kept], value[kept]
-    first = _first_of_each(_linear(volume, at))
-    return Peaks(at[first, 0], at[first, 1:].double() + offset[first], value[first])
+    first = np.sort(np.unique(_linear(volume, at).numpy(), return_index=True)[1])
+    return Peaks(at[first].double() + offset[first], value[first])
 
 
 def _refine(volume: Tensor, at: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The samples (K, 4), offsets (K, 3) and values (K,) of the seeds that are maxima and settle."""
+    """The samples (K, 3), offsets (K, 3) and values (K,) of the seeds that are maxima and settle."""
     at = at[_exceeds_levels(volume, at)]
     at = at[_is_maximum(_samples(volume, at))]
-    last = torch.tensor(volume.shape[1:], device=volume.device) - 2
+    last = torch.tensor(volume.shape) - 2
     offset, value, peaked = _quadratic(_samples(volume, at))
     for _ in range(MOVES):
         moving = torch.nonzero(peaked & (offset.abs() > CONVERGED).any(1))[:, 0]
-        moved = at[moving, 1:] + offset[moving].round().clamp(-1, 1).long()
+        moved = at[moving] + offset[moving].round().clamp(-1, 1).long()
         inside = ((moved >= 1) & (moved <= last)).all(1)
         moving, moved = moving[inside], moved[inside]
         if len(moving) == 0:
             break
-        at[moving, 1:] = moved
+        at[moving] = moved
         offset[moving], value[moving], peaked[moving] = _quadratic(_samples(volume, at[moving]))
     settled = peaked & (offset.abs() <= CONVERGED).all(1)
     return at[settled], offset[settled], value[settled]
 
 
 def _linear(volume: Tensor, at: Tensor) -> Tensor:
-    """Position in memory of the samples (M, 4)."""
-    _, s, h, w = volume.shape
-    return ((at[:, 0] * s + at[:, 1]) * h + at[:, 2]) * w + at[:, 3]
+    """Position in memory of the samples (M, 3)."""
+    _, h, w = volume.shape
+    return (at[:, 0] * h + at[:, 1]) * w + at[:, 2]
 
 
 def _samples(volume: Tensor, at: Tensor) -> Float[Tensor, "27 m"]:
-    """The neighbourhoods of inner samples (M, 4)."""
-    _, _, h, w = volume.shape
-    steps = NEIGHBOURS.to(volume.device) @ torch.tensor([h * w, w, 1], device=volume.device)
+    _, h, w = volume.shape
+    steps = NEIGHBOURS @ torch.tensor([h * w, w, 1])
     return volume.reshape(-1)[_linear(volume, at) + steps[:, None]]
 
 
 def _exceeds_levels(volume: Tensor, at: Tensor) -> Tensor:
-    """Whether inner samples (M, 4) can be maxima by the samples before and after them: most seeds are not."""
-    _, _, h, w = volume.shape
+    """Whether inner samples (M, 3) can be maxima by the samples before and after them: most seeds are not."""
+    _, h, w = volume.shape
     values, place = volume.reshape(-1), _linear(volume, at)
     centre = values[place]
     return (centre > values[place - h * w]) & (centre >= values[place + h * w])
@@ -103,22 +99,9 @@ def _quadratic(v: Float[Tensor, "27 m"]) -> tuple[Tensor, Tensor, Tensor]:
     """
     cube = v.double().reshape(3, 3, 3, -1)
     c = cube[1, 1, 1]
-    gs, gy, gx = (
-        0.5 * (high - low)
-        for low, high in (
-            (cube[0, 1, 1], cube[2, 1, 1]),
-            (cube[1, 0, 1], cube[1, 2, 1]),
-            (cube[1, 1, 0], cube[1, 1, 2]),
-        )
-    )
-    ss, yy, xx = (
-        2 * c - low - high
-        for low, high in (
-            (cube[0, 1, 1], cube[2, 1, 1]),
-            (cube[1, 0, 1], cube[1, 2, 1]),
-            (cube[1, 1, 0], cube[1, 1, 2]),
-        )
-    )
+    sides = [cube[::2, 1, 1], cube[1, ::2, 1], cube[1, 1, ::2]]  # before and after the centre along each axis
+    gs, gy, gx = (0.5 * (high - low) for low, high in sides)
+    ss, yy, xx = (2 * c - low - high for low, high in sides)
     sy = -0.25 * (cube[2, 2, 1] - cube[2, 0, 1] - cube[0, 2, 1] + cube[0, 0, 1])
     sx = -0.25 * (cube[2, 1, 2] - cube[2, 1, 0] - cube[0, 1, 2] + cube[0, 1, 0])
     yx = -0.25 * (cube[1, 2, 2] - cube[1, 2, 0] - cube[1, 0, 2] + cube[1, 0, 0])
@@ -134,105 +117,48 @@ def _quadratic(v: Float[Tensor, "27 m"]) -> tuple[Tensor, Tensor, Tensor]:
     return torch.stack([ds, dy, dx], 1), value.to(v.dtype), peaked
 
 
-def _first_of_each(key: Tensor) -> Tensor:
-    """Indices, in order, of the first occurrence of each key."""
-    order = torch.argsort(key, stable=True)
-    first = torch.ones_like(order, dtype=torch.bool)
-    first[1:] = key[order[1:]] != key[order[:-1]]
-    return order[first].sort().values
-
-
-# The image filters of the detectors twice: by OpenCV for one image on a CPU, by torch for a batch on any device
-
 KERNEL_SIGMAS = 3.0  # half the length of a sampled Gaussian
 STRIP = 128  # rows worked on together: the few strips of a 1536 px image then fit a core's cache
 
 
-@runtime_checkable
-class Filters(Protocol):
-    """What a detector needs of an image (B, h, w)."""
-
-    def blur(self, image: Float[Tensor, "b h w"], sigma: float) -> Float[Tensor, "b h w"]:
-        """The image convolved with a Gaussian."""
-
-    def hessian_determinant(self, image: Float[Tensor, "b h w"], scale: float, out: Float[Tensor, "b h w"]) -> None:
-        """Writes scale (Ixx Iyy - Ixy^2) by central differences; 0 on the outermost pixels."""
-
-    def maxima(self, response: Float[Tensor, "b h w"], threshold: float) -> Int[Tensor, "m 3"]:
-        """(b, y, x) of the pixels that no neighbour exceeds and that are above `threshold`, in this order."""
-
-
-def gaussian_kernel(sigma: float) -> Float[Tensor, " k"]:
-    """A sampled Gaussian of sum 1, cut at `KERNEL_SIGMAS` sigma."""
+def blur(image: Float[Tensor, "h w"], sigma: float) -> Float[Tensor, "h w"]:
+    """The image convolved with a Gaussian, sampled, of sum 1, cut at `KERNEL_SIGMAS` sigma."""
     radius = math.ceil(KERNEL_SIGMAS * sigma)
-    x = torch.arange(-radius, radius + 1, dtype=torch.float64)
-    kernel = torch.exp(-0.5 * (x / sigma) ** 2)
-    return (kernel / kernel.sum()).float()
+    weights = torch.exp(-0.5 * (torch.arange(-radius, radius + 1, dtype=torch.float64) / sigma) ** 2)
+    kernel = (weights / weights.sum()).float().numpy()
+    blurred = cv2.sepFilter2D(image.numpy(), cv2.CV_32F, kernel, kernel, borderType=cv2.BORDER_REPLICATE)
+    return torch.from_numpy(np.asarray(blurred))
 
 
-class OpenCVFilters:
-    """`Filters` for one image on the CPU."""
-
-    def blur(self, image: Float[Tensor, "1 h w"], sigma: float) -> Float[Tensor, "1 h w"]:
-        kernel = gaussian_kernel(sigma).numpy()
-        blurred = cv2.sepFilter2D(image[0].numpy(), cv2.CV_32F, kernel, kernel, borderType=cv2.BORDER_REPLICATE)
-        return torch.from_numpy(np.asarray(blurred))[None]
-
-    def hessian_determinant(self, image: Float[Tensor, "1 h w"], scale: float, out: Float[Tensor, "1 h w"]) -> None:
-        pixels, result = image[0].numpy(), out[0].numpy()
-        identity, first, second = (np.array(k, np.float32) for k in ([1], [-0.5, 0, 0.5], [1, -2, 1]))
-        h = len(pixels)
-        for y in range(0, h, STRIP):
-            top, bottom = max(y - 1, 0), min(y + STRIP + 1, h)
-            strip = pixels[top:bottom]
-            xx, yy, xy = (
-                cv2.sepFilter2D(strip, cv2.CV_32F, kx, ky)
-                for kx, ky in ((second, identity), (identity, second), (first, first))
-            )
-            determinant = cv2.subtract(cv2.multiply(xx, yy, dst=xx), cv2.multiply(xy, xy, dst=xy), dst=xx)
-            np.multiply(determinant[y - top : y - top + STRIP], np.float32(scale), out=result[y : y + STRIP])
-        result[[0, -1]] = 0
-        result[:, [0, -1]] = 0
-
-    def maxima(self, response: Float[Tensor, "1 h w"], threshold: float) -> Int[Tensor, "m 3"]:
-        values = response[0].numpy()
-        h, width = values.shape
-        square = np.ones((3, 3), np.uint8)
-        by_strip = []
-        for y in range(0, h, STRIP):
-            top, bottom = max(y - 1, 0), min(y + STRIP + 1, h)
-            largest = cv2.dilate(values[top:bottom], square)[y - top : y - top + STRIP]
-            strip = values[y : y + STRIP]
-            maximal = strip >= largest
-            maximal &= strip > threshold
-            by_strip.append(np.flatnonzero(maximal) + y * width)
-        place = torch.from_numpy(np.concatenate(by_strip))
-        return torch.stack([torch.zeros_like(place), place // width, place % width], 1)
+def hessian_determinant(image: Float[Tensor, "h w"], scale: float, out: Float[Tensor, "h w"]) -> None:
+    """Writes scale (Ixx Iyy - Ixy^2) by central differences; 0 on the outermost pixels."""
+    pixels, result = image.numpy(), out.numpy()
+    identity, first, second = (np.array(k, np.float32) for k in ([1], [-0.5, 0, 0.5], [1, -2, 1]))
+    for y in range(0, len(pixels), STRIP):
+        top = max(y - 1, 0)
+        strip = pixels[top : y + STRIP + 1]
+        kernels = ((second, identity), (identity, second), (first, first))
+        xx, yy, xy = (cv2.sepFilter2D(strip, cv2.CV_32F, kx, ky) for kx, ky in kernels)
+        determinant = cv2.subtract(cv2.multiply(xx, yy, dst=xx), cv2.multiply(xy, xy, dst=xy), dst=xx)
+        np.multiply(determinant[y - top : y - top + STRIP], np.float32(scale), out=result[y : y + STRIP])
+    result[[0, -1]] = 0
+    result[:, [0, -1]] = 0
 
 
-class TorchFilters:
-    """`Filters` for a batch on its device."""
-
-    def blur(self, image: Float[Tensor, "b h w"], sigma: float) -> Float[Tensor, "b h w"]:
-        # Tap by tap: a convolution's rounding depends on the batch.
-        kernel = gaussian_kernel(sigma).tolist()
-        radius, (_, h, w) = len(kernel) // 2, image.shape
-        padded = F.pad(image[:, None], (radius, radius, 0, 0), mode="replicate")[:, 0]
-        rows = sum((k * padded[:, :, i : i + w] for i, k in enumerate(kernel)), torch.zeros_like(image))
-        padded = F.pad(rows[:, None], (0, 0, radius, radius), mode="replicate")[:, 0]
-        return sum((k * padded[:, i : i + h] for i, k in enumerate(kernel)), torch.zeros_like(image))
-
-    def hessian_determinant(self, image: Float[Tensor, "b h w"], scale: float, out: Float[Tensor, "b h w"]) -> None:
-        middle = image[:, 1:-1, 1:-1]
-        xx = image[:, 1:-1, 2:] - 2 * middle + image[:, 1:-1, :-2]
-        yy = image[:, 2:, 1:-1] - 2 * middle + image[:, :-2, 1:-1]
-        xy = 0.25 * (image[:, 2:, 2:] - image[:, 2:, :-2] - image[:, :-2, 2:] + image[:, :-2, :-2])
-        out.zero_()
-        out[:, 1:-1, 1:-1] = scale * (xx * yy - xy * xy)
-
-    def maxima(self, response: Float[Tensor, "b h w"], threshold: float) -> Int[Tensor, "m 3"]:
-        largest = F.max_pool2d(response, 3, stride=1, padding=1)
-        return torch.nonzero((response >= largest) & (response > threshold))
+def maxima(response: Float[Tensor, "h w"], threshold: float) -> Int[Tensor, "m 2"]:
+    """(y, x) of the pixels that no neighbour exceeds and that are above `threshold`, in this order."""
+    values, square = response.numpy(), np.ones((3, 3), np.uint8)
+    height, width = values.shape
+    by_strip = []
+    for y in range(0, height, STRIP):
+        top = max(y - 1, 0)
+        largest = cv2.dilate(values[top : y + STRIP + 1], square)[y - top : y - top + STRIP]
+        strip = values[y : y + STRIP]
+        maximal = strip >= largest
+        maximal &= strip > threshold
+        by_strip.append(np.flatnonzero(maximal) + y * width)
+    place = torch.from_numpy(np.concatenate(by_strip))
+    return torch.stack([place // width, place % width], 1)
 
 
 IMAGE_BLUR = 0.5  # pixels: what a camera leaves; Lowe, IJCV 2004, section 3.3
@@ -258,72 +184,44 @@ class HessianDetector:
     sigma: float = 1.6
     border: float = 3.0
 
-    def detect(self, image: NDArray[np.uint8]) -> tuple[Float[Tensor, "n 2 3"], Float[Tensor, " n"]]:
-        """Upright frames of half side `FRAME_SIGMAS` sigma and responses, strongest first, through OpenCV's filters.
+    def detect(self, image: Image) -> tuple[Float[Tensor, "n 2 3"], Float[Tensor, " n"]]:
+        """Upright frames of half side `FRAME_SIGMAS` sigma and responses, strongest first.
 
         image: grey (H, W) or RGB (H, W, 3) uint8. N = 0 where nothing is found. Memory: about 32 bytes a pixel.
         Raises ValueError for another type, shape or an empty image.
         """
-        grey = torch.from_numpy(as_grey(image))[None]
-        lafs, scores, _ = self._detect(grey.float() / 255, OpenCVFilters())
-        return lafs[0], scores[0]
-
-    def detect_batch(
-        self, images: Float[Tensor, "b 1 h w"]
-    ) -> tuple[Float[Tensor, "b n 2 3"], Float[Tensor, "b n"], Bool[Tensor, "b n"]]:
-        """`detect` for a batch of grey images in [0, 1] on their device: frames, responses, mask.
-
-        Padded with zeros to the image with most keypoints. Equal to `detect` up to the rounding of the filters.
-        """
-        return self._detect(images[:, 0], TorchFilters())
-
-    def _detect(self, images: Tensor, filters: Filters) -> tuple[Tensor, Tensor, Tensor]:
-        by_octave = [
-            Peaks(images.new_zeros(0, dtype=torch.int64), images.new_zeros(0, 3).double(), images.new_zeros(0))
-        ]
-        batch, height, width = images.shape
+        grey = torch.from_numpy(as_grey(image))
+        height, width = grey.shape
+        by_octave = [Peaks(torch.zeros(0, 3).double(), torch.zeros(0))]
         spacing = 1.0  # of the octave's pixels in the image
-        level = filters.blur(images, math.sqrt(self.sigma**2 - IMAGE_BLUR**2))
-        while min(level.shape[1:]) >= SMALLEST_OCTAVE:
-            responses, level = self._octave(level, filters)
-            seeds = [filters.maxima(responses[:, s], self.threshold) for s in range(1, self.levels + 1)]
-            at = [torch.cat([p[:, :1], torch.full_like(p[:, :1], s + 1), p[:, 1:]], 1) for s, p in enumerate(seeds)]
-            peaks = refined_maxima(responses, torch.cat(at), self.threshold)
+        level = blur(grey.float() / 255, math.sqrt(self.sigma**2 - IMAGE_BLUR**2))
+        while min(level.shape) >= SMALLEST_OCTAVE:
+            responses, level = self._octave(level)
+            by_level = [maxima(responses[s], self.threshold) for s in range(1, self.levels + 1)]
+            seeds = [torch.cat([torch.full_like(p[:, :1], s), p], 1) for s, p in enumerate(by_level, start=1)]
+            peaks = refined_maxima(responses, torch.cat(seeds), self.threshold)
             sigma = self.sigma * 2 ** (peaks.position[:, :1] / self.levels)
-            by_octave.append(peaks._replace(position=spacing * torch.cat([sigma, peaks.position[:, 1:]], 1)))
+            position = spacing * torch.cat([sigma, peaks.position[:, 1:]], 1)
+            by_octave.append(Peaks(position, peaks.value))
             del responses
             spacing *= 2
-        index, position, scores = (torch.cat(parts) for parts in zip(*by_octave, strict=True))
+        position, scores = (torch.cat(parts) for parts in zip(*by_octave, strict=True))
         sigma, y, x = position.unbind(1)
-        nearest = torch.stack([x, y, width - 1 - x, height - 1 - y]).amin(0)
-        inside = nearest >= self.border * sigma
-        lafs = upright_frames(torch.stack([x, y], 1), sigma).float()
-        return _strongest(lafs[inside], scores[inside], index[inside], batch, self.max_features)
+        inside = torch.stack([x, y, width - 1 - x, height - 1 - y]).amin(0) >= self.border * sigma
+        lafs, scores = upright_frames(torch.stack([x, y], 1), sigma).float()[inside], scores[inside]
+        order = torch.argsort(scores, descending=True, stable=True)[: self.max_features]
+        return lafs[order], scores[order]
 
-    def _octave(self, level: Tensor, filters: Filters) -> tuple[Tensor, Tensor]:
-        """The responses (B, levels + 2, h, w) of an octave from its first level, and the first level of the next."""
-        volume = level.new_empty(level.shape[0], self.levels + 2, *level.shape[1:])
+    def _octave(self, level: Tensor) -> tuple[Tensor, Tensor]:
+        """The responses (levels + 2, h, w) of an octave from its first level, and the first level of the next."""
+        volume = level.new_empty(self.levels + 2, *level.shape)
         following = level
         for s in range(self.levels + 2):
-            blur = self.sigma * 2 ** (s / self.levels)
+            sigma = self.sigma * 2 ** (s / self.levels)
             if s > 0:
                 before = self.sigma * 2 ** ((s - 1) / self.levels)
-                level = filters.blur(level, math.sqrt(blur**2 - before**2))
+                level = blur(level, math.sqrt(sigma**2 - before**2))
             if s == self.levels:
-                following = level[:, ::2, ::2].contiguous()
-            filters.hessian_determinant(level, blur**4, out=volume[:, s])
+                following = level[::2, ::2].contiguous()
+            hessian_determinant(level, sigma**4, out=volume[s])
         return volume, following
-
-
-def _strongest(
-    lafs: Float[Tensor, "m 2 3"], scores: Float[Tensor, " m"], image: Tensor, batch: int, count: int
-) -> tuple[Float[Tensor, "b n 2 3"], Float[Tensor, "b n"], Bool[Tensor, "b n"]]:
-    """The `count` highest scores of each image in falling order, ties in the order given, padded with zeros."""
-    order = torch.argsort(scores, descending=True, stable=True)
-    chosen = [order[image[order] == i][:count] for i in range(batch)]
-    longest = max((len(i) for i in chosen), default=0)
-    out_lafs, out_scores = lafs.new_zeros(batch, longest, 2, 3), scores.new_zeros(batch, longest)
-    mask = torch.zeros(batch, longest, dtype=torch.bool, device=lafs.device)
-    for i, kept in enumerate(chosen):
-        out_lafs[i, : len(kept)], out_scores[i, : len(kept)], mask[i, : len(kept)] = lafs[kept], scores[kept], True
-    return out_lafs, out_scores, mask

@@ -6,12 +6,12 @@ import kornia
 import numpy as np
 import torch
 from jaxtyping import Float
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from fmtorch.core.onnx_network import pretrained
 from fmtorch.core.options import Within
 from fmtorch.core.types import Features
+from fmtorch.features.patches import Image
 from fmtorch.features.sift import strongest
 
 SMALLEST = 32  # px, the shorter side: the networks reduce the image 16 and 32 times
@@ -29,7 +29,7 @@ class _NetworkFeatures:
         self.network = network.eval().to(self.device)
         self.identity = {"device": self.device.type, "network": self.network, **options}
 
-    def __call__(self, image: NDArray[np.uint8]) -> Features:
+    def __call__(self, image: Image) -> Features:
         """The features of a grey (H, W) or RGB (H, W, 3) uint8 image; none, with N = 0, where nothing is found.
 
         lafs: circles of one pixel, which say nothing of scale or orientation: give them to no pruner. scores: the
@@ -45,13 +45,11 @@ class _NetworkFeatures:
         """Keypoints in pixels (0 is the centre of the first), scores, descriptors."""
         raise NotImplementedError
 
-    def _tensor(self, image: NDArray[np.uint8]) -> Float[Tensor, "1 3 h w"]:
+    def _tensor(self, image: Image) -> Float[Tensor, "1 3 h w"]:
         colour = image.ndim == 3 and image.shape[-1] == 3
         if image.dtype != np.uint8 or not (image.ndim == 2 or colour) or min(image.shape[:2]) < SMALLEST:
-            raise ValueError(
-                f"image is {image.dtype} {image.shape}; it must be uint8, (H, W) or RGB (H, W, 3), "
-                f"of at least {SMALLEST} x {SMALLEST} px"
-            )
+            wanted = f"uint8, (H, W) or RGB (H, W, 3), of at least {SMALLEST} x {SMALLEST} px"
+            raise ValueError(f"image is {image.dtype} {image.shape}; it must be {wanted}")
         channels = np.broadcast_to(image if colour else image[..., None], (*image.shape[:2], 3))
         pixels = torch.from_numpy(channels.transpose(2, 0, 1).copy()).to(self.device)
         return pixels[None].to(torch.float32) / 255
@@ -62,9 +60,7 @@ class DISK(_NetworkFeatures):
 
     weights: `depth` or `epipolar`, the released models. max_features: the strongest kept. window: side in pixels of the
     non-maximum suppression. score_threshold: least score, a logit. device: auto, cpu, cuda. network: in place of the
-    released one.
-
-    Raises ConnectionError where the weights cannot be fetched.
+    released one. Raises ConnectionError where the weights cannot be fetched.
     """
 
     def __init__(
@@ -97,9 +93,8 @@ class ALIKED(_NetworkFeatures):
 
     weights: `aliked-n16`, `aliked-n16rot`, `aliked-n32` or `aliked-t16` (whose descriptors have 64 numbers).
     max_features: the strongest kept. score_threshold: least score, in (0, 1). radius: of the non-maximum suppression,
-    in pixels. device: auto, cpu, cuda. network: in place of the released one.
-
-    Raises ConnectionError where the weights cannot be fetched.
+    in pixels. device: auto, cpu, cuda. network: in place of the released one. Raises ConnectionError where the weights
+    cannot be fetched.
     """
 
     def __init__(
@@ -127,8 +122,6 @@ class ALIKED(_NetworkFeatures):
         with torch.inference_mode():
             (detected,) = self.network(image)
         kept = torch.from_numpy(strongest(detected.keypoint_scores.cpu().numpy(), self.max_features)).to(self.device)
-        return (
-            detected.keypoints[kept].clone(),
-            detected.keypoint_scores[kept].clone(),
-            detected.descriptors[kept].clone(),
-        )
+        outputs = (detected.keypoints, detected.keypoint_scores, detected.descriptors)
+        keypoints, scores, descriptors = (output[kept].clone() for output in outputs)
+        return keypoints, scores, descriptors

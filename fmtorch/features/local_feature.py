@@ -3,20 +3,18 @@
 import dataclasses
 import functools
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import Annotated, Any, Protocol, TypeVar, runtime_checkable
 
-import numpy as np
 import torch
 from jaxtyping import Float
-from numpy.typing import NDArray
 from torch import Tensor
 
 from fmtorch.core.options import Within
 from fmtorch.core.types import Features
 from fmtorch.features.frames import DominantGradient, NetworkOrientation, NetworkShape, PatchFunction
 from fmtorch.features.hessian import HessianDetector
-from fmtorch.features.patches import ImagePyramid
+from fmtorch.features.onnx_network import PatchNetwork, network_file
+from fmtorch.features.patches import Image, ImagePyramid
 from fmtorch.features.sift import SIFT, PatchSIFT, RootSIFTPCA, as_grey
 
 
@@ -24,21 +22,13 @@ from fmtorch.features.sift import SIFT, PatchSIFT, RootSIFTPCA, as_grey
 class Detector(Protocol):
     """An image -> frames and scores."""
 
-    def detect(self, image: NDArray[np.uint8]) -> tuple[Float[Tensor, "n 2 3"], Float[Tensor, " n"]]: ...
+    def detect(self, image: Image) -> tuple[Float[Tensor, "n 2 3"], Float[Tensor, " n"]]: ...
 
 
-@runtime_checkable
-class FrameStep(Protocol):
-    """An image and frames -> the same frames with another shape or orientation."""
-
-    def __call__(self, pyramid: ImagePyramid, lafs: Float[Tensor, "n 2 3"]) -> Float[Tensor, "n 2 3"]: ...
-
-
-@runtime_checkable
-class Descriptor(Protocol):
-    """An image and frames -> a descriptor of each."""
-
-    def __call__(self, pyramid: ImagePyramid, lafs: Float[Tensor, "n 2 3"]) -> Float[Tensor, "n d"]: ...
+FrameStep = Callable[[ImagePyramid, Tensor], Tensor]
+"""An image and frames (n, 2, 3) -> the same frames with another shape or orientation."""
+Descriptor = Callable[[ImagePyramid, Tensor], Tensor]
+"""An image and frames (n, 2, 3) -> a descriptor of each (n, d)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,17 +52,15 @@ class NetworkDescriptor:
 class LocalFeature:
     """Detects frames, gives them shape and orientation, describes them; an instance may be used by several threads.
 
-    shape, orientation: None keeps the detector's. device: where patches are cut and handed to the networks; on "cpu"
-    through OpenCV. Of two instances with equal `detection` the frames are equal.
+    shape, orientation: None keeps the detector's. Of two instances with equal `detection` the frames are equal.
     """
 
     detector: Detector
     descriptor: Descriptor
     shape: FrameStep | None = None
     orientation: FrameStep | None = None
-    device: str = "cpu"
 
-    def __call__(self, image: NDArray[np.uint8]) -> Features:
+    def __call__(self, image: Image) -> Features:
         """The features of a grey (H, W) or RGB (H, W, 3) uint8 image; none, with N = 0, where nothing is found.
 
         Raises ValueError for another type, shape or an empty image, and what a network says of its file.
@@ -84,30 +72,22 @@ class LocalFeature:
     @property
     def detection(self) -> tuple[object, ...]:
         """The parts that define frames and scores."""
-        return self.detector, self.shape, self.orientation, self.device
+        return self.detector, self.shape, self.orientation
 
-    def detect(self, image: NDArray[np.uint8]) -> tuple[Float[Tensor, "n 2 3"], Float[Tensor, " n"]]:
+    def detect(self, image: Image) -> tuple[Float[Tensor, "n 2 3"], Float[Tensor, " n"]]:
         """Frames in kornia's convention, with shape and orientation, and the detector's scores."""
         lafs, scores = self.detector.detect(image)
         steps = [step for step in (self.shape, self.orientation) if step is not None]
         if steps and len(lafs):
-            pyramid, lafs = self._pyramid(image), lafs.to(self.device)
+            pyramid = ImagePyramid(as_grey(image))
             for step in steps:
                 lafs = step(pyramid, lafs)
-        return lafs.cpu(), scores.cpu()
+        return lafs, scores
 
-    def describe(self, image: NDArray[np.uint8], lafs: Float[Tensor, "n 2 3"]) -> Float[Tensor, "n d"]:
+    def describe(self, image: Image, lafs: Float[Tensor, "n 2 3"]) -> Float[Tensor, "n d"]:
         """A descriptor of each frame."""
-        return self.descriptor(self._pyramid(image), lafs.to(self.device)).cpu()
+        return self.descriptor(ImagePyramid(as_grey(image)), lafs)
 
-    def _pyramid(self, image: NDArray[np.uint8]) -> ImagePyramid:
-        grey = as_grey(image)
-        if self.device == "cpu":
-            return ImagePyramid(grey)
-        return ImagePyramid(torch.from_numpy(grey).to(self.device).float() / 255)
-
-
-# Local features from the names of their parts, as presets give them
 
 Part = TypeVar("Part")
 Options = Mapping[str, Any]
@@ -123,7 +103,6 @@ def local_feature(
     max_features: Annotated[int, Within(1)] = 8000,
     precision: str = "fp32",
     threads: int = 1,
-    device: str = "cpu",
 ) -> LocalFeature:
     """A `LocalFeature` of named parts.
 
@@ -131,41 +110,28 @@ def local_feature(
     shape: None, `affnet` or `affnet_fast`. orientation: None for the detector's, `dominant_gradient` or `orinet`.
     descriptor: `sift`, `rootsift`, `dspsift` (options of `PatchSIFT`), `rootsiftpca` (of `RootSIFTPCA`), `l2net`,
     `geodesc`, `hardnet` or `hardnet_fast`. A part that is a network takes the option `network`, the path of another
-    ONNX file than the shipped one.
-    precision: of the networks, fp32 or int8. threads: of each network. device: for torch, see `LocalFeature`.
-
-    Raises ValueError for an unknown name or option, naming those there are. Networks are read when first used.
+    ONNX file than the shipped one. precision: of the networks, fp32 or int8. threads: of each network. Raises
+    ValueError for an unknown name or option, naming those there are. Networks are read when first used.
     """
     if precision not in ("fp32", "int8"):
         raise ValueError(f"precision={precision}: it must be fp32 or int8")
-    load = functools.partial(_network, precision=precision, threads=threads)
 
     def by(part: Callable[[PatchFunction], Part], name: str) -> Callable[..., Part]:
-        return lambda network=name: part(load(network))
+        return lambda network=name: part(PatchNetwork(network_file(network, precision), threads=threads))
 
-    detectors: dict[str, Callable[..., Detector]] = {
-        "dog": functools.partial(SIFT, max_features=max_features),
-        "hessian": functools.partial(HessianDetector, max_features=max_features),
-    }
+    kinds: dict[str, Callable[..., Detector]] = {"dog": SIFT, "hessian": HessianDetector}
+    detectors = {name: functools.partial(kind, max_features=max_features) for name, kind in kinds.items()}
     shapes: dict[str, Callable[..., FrameStep]] = {name: by(NetworkShape, name) for name in ("affnet", "affnet_fast")}
-    orientations: dict[str, Callable[..., FrameStep]] = {
-        "dominant_gradient": DominantGradient,
-        "orinet": by(NetworkOrientation, "orinet"),
-    }
-    descriptors: dict[str, Callable[..., Descriptor]] = {
-        "sift": PatchSIFT,
-        "rootsift": functools.partial(PatchSIFT, root=True),
-        "dspsift": PatchSIFT,
-        "rootsiftpca": RootSIFTPCA,
-        **{name: by(NetworkDescriptor, name) for name in ("l2net", "geodesc", "hardnet", "hardnet_fast")},
-    }
-    return LocalFeature(
-        detector=_part("detector", detector, detectors),
-        descriptor=_part("descriptor", descriptor, descriptors),
-        shape=None if shape is None else _part("shape", shape, shapes),
-        orientation=None if orientation is None else _part("orientation", orientation, orientations),
-        device=device,
-    )
+    orinet = by(NetworkOrientation, "orinet")
+    orientations: dict[str, Callable[..., FrameStep]] = {"dominant_gradient": DominantGradient, "orinet": orinet}
+    rooted = functools.partial(PatchSIFT, root=True)
+    plain: dict[str, Callable[..., Descriptor]] = {"sift": PatchSIFT, "rootsift": rooted, "dspsift": PatchSIFT}
+    networks = {name: by(NetworkDescriptor, name) for name in ("l2net", "geodesc", "hardnet", "hardnet_fast")}
+    descriptors: dict[str, Callable[..., Descriptor]] = {**plain, "rootsiftpca": RootSIFTPCA, **networks}
+    shape_step = None if shape is None else _part("shape", shape, shapes)
+    turn_step = None if orientation is None else _part("orientation", orientation, orientations)
+    ends = _part("detector", detector, detectors), _part("descriptor", descriptor, descriptors)
+    return LocalFeature(*ends, shape_step, turn_step)
 
 
 def _part(kind: str, choice: Choice, known: Mapping[str, Callable[..., Part]]) -> Part:
@@ -177,12 +143,3 @@ def _part(kind: str, choice: Choice, known: Mapping[str, Callable[..., Part]]) -
         return known[str(name)](**options)
     except TypeError as error:
         raise ValueError(f"{kind}={name}: {error}") from error
-
-
-def _network(name: str, precision: str, threads: int) -> PatchFunction:
-    """The network of models/ under this name."""
-    from fmtorch.features.onnx_network import PatchNetwork, network_file
-
-    file: Path = network_file(name, precision)
-    network: PatchFunction = PatchNetwork(file, threads=threads)
-    return network

@@ -46,11 +46,8 @@ def trunk(layout: Layout, dropout: float, outputs: int, *, bias: bool = False) -
     layers: list[nn.Module] = []
     channels = 1
     for out, stride in layout:
-        layers += [
-            nn.Conv2d(channels, out, kernel_size=3, stride=stride, padding=1, bias=False),
-            nn.BatchNorm2d(out, affine=False),
-            nn.ReLU(inplace=True),
-        ]
+        convolution = nn.Conv2d(channels, out, kernel_size=3, stride=stride, padding=1, bias=False)
+        layers += [convolution, nn.BatchNorm2d(out, affine=False), nn.ReLU(inplace=True)]
         channels = out
     side = PATCH_SIZE // math.prod(stride for _, stride in layout)
     return [*layers, nn.Dropout(dropout), nn.Conv2d(channels, outputs, kernel_size=side, bias=bias)]
@@ -76,9 +73,6 @@ def as_float32(features: nn.Module, x: Tensor) -> Tensor:
     return out.flatten(1).float()
 
 
-# HardNet, L2-Net, GeoDesc and a faster HardNet: grey patches to descriptors of 128 numbers and unit length
-
-
 class HardNet(nn.Module):
     """HardNet (Mishchuk, Mishkin, Radenovic, Matas, NIPS 2017): L2-Net's layout, hardest-in-batch triplets.
 
@@ -87,6 +81,7 @@ class HardNet(nn.Module):
 
     outputs = 128
     layout: Layout = l2net_layout(32)
+    eps = 1e-6  # added to the deviation of a patch
 
     def __init__(self, dropout: float = 0.3) -> None:
         super().__init__()
@@ -96,7 +91,7 @@ class HardNet(nn.Module):
 
     def forward(self, patches: Float[Tensor, "n 1 32 32"]) -> Float[Tensor, "n 128"]:
         """Descriptors of unit length; their Euclidean distance lies in [0, 2]."""
-        return unit_length(as_float32(self.features, standardize(patches, eps=1e-6)))
+        return unit_length(as_float32(self.features, standardize(patches, self.eps)))
 
 
 class HardNetFast(HardNet):
@@ -108,48 +103,35 @@ class HardNetFast(HardNet):
     layout: Layout = ((32, 2), (32, 1), (64, 2), (64, 1), (64, 1))
 
 
-class L2Net(nn.Module):
+class L2Net(HardNet):
     """L2-Net (Tian, Fan, Wu, CVPR 2017).
 
     Unlike HardNet's, its input loses the mean patch of the training set (`pixel_mean`) before each patch is
     standardised, and its output passes local response normalisation over all channels, that is division by the length.
     """
 
-    outputs = 128
+    eps = 1e-12
     pixel_mean: Tensor
 
     def __init__(self, dropout: float = 0.1) -> None:
-        super().__init__()
+        super().__init__(dropout)
         self.register_buffer("pixel_mean", torch.zeros(1, 1, PATCH_SIZE, PATCH_SIZE))
-        layers = trunk(l2net_layout(32), dropout, self.outputs)
-        self.features = nn.Sequential(*layers, nn.BatchNorm2d(self.outputs, affine=False))
-        orthogonal_(self.features)
 
     def forward(self, patches: Float[Tensor, "n 1 32 32"]) -> Float[Tensor, "n 128"]:
         """Descriptors of unit length (the release's normalisation with kappa 0, alpha 1 and beta 1/2)."""
-        return unit_length(as_float32(self.features, standardize(patches - self.pixel_mean, eps=1e-12)))
+        return super().forward(patches - self.pixel_mean)
 
 
-class GeoDesc(nn.Module):
+class GeoDesc(HardNet):
     """GeoDesc (Luo et al., ECCV 2018): L2-Net's layout without a batch norm after the last convolution.
 
     Each patch is standardised by itself, as in the authors' training code (lzx551402/tfmatch, cnn_wrapper/descnet.py);
     there is no dropout.
     """
 
-    outputs = 128
-
     def __init__(self) -> None:
-        super().__init__()
-        self.features = nn.Sequential(*trunk(l2net_layout(32), 0.0, self.outputs))
-        orthogonal_(self.features)
-
-    def forward(self, patches: Float[Tensor, "n 1 32 32"]) -> Float[Tensor, "n 128"]:
-        """Descriptors of unit length."""
-        return unit_length(as_float32(self.features, standardize(patches, eps=1e-6)))
-
-
-# AffNet and OriNet: grey patches to the affine shape and the orientation of their frame
+        super().__init__(dropout=0.0)
+        self.features = nn.Sequential(*list(self.features)[:-1])
 
 
 class AffNet(nn.Module):
@@ -209,8 +191,6 @@ class OriNet(nn.Module):
         return as_float32(self.features, standardize(patches, eps=1e-8))
 
 
-# Weights of patch networks from files: own checkpoints, kornia's and the authors' state_dicts, TorchScript
-
 ARCHITECTURES: dict[str, type[nn.Module]] = {
     "hardnet": HardNet, "hardnet_fast": HardNetFast, "l2net": L2Net, "geodesc": GeoDesc,
     "affnet": AffNet, "affnet_fast": AffNetFast, "orinet": OriNet,
@@ -235,9 +215,8 @@ def read_checkpoint(path: Path | str) -> dict[str, Any]:
     if not path.is_file():
         raise FileNotFoundError(f"{path} does not exist")
     try:
-        content: Any = (
-            _script_state(path) if _is_script(path) else torch.load(path, map_location="cpu", weights_only=True)
-        )
+        script = _is_script(path)
+        content: Any = _script_state(path) if script else torch.load(path, map_location="cpu", weights_only=True)
     except (RuntimeError, pickle.UnpicklingError, EOFError, ValueError, KeyError) as error:
         raise ValueError(f"{path} is neither a state_dict nor TorchScript: {error}") from error
     if isinstance(content, Mapping) and isinstance(content.get("state_dict"), Mapping):
@@ -248,7 +227,6 @@ def read_checkpoint(path: Path | str) -> dict[str, Any]:
 
 
 def _is_script(path: Path) -> bool:
-    """Whether a file is a TorchScript archive."""
     if not zipfile.is_zipfile(path):
         return False
     with zipfile.ZipFile(path) as archive:
@@ -304,9 +282,8 @@ def _folded(state: dict[str, Tensor], network: nn.Module) -> dict[str, Tensor]:
         gamma = torch.ones_like(var) if gamma is None else gamma.double()
         if not bool((gamma > 0).all()):
             raise ValueError(f"{name}.weight has scales that are not positive: they cannot be folded away")
-        mean = (
-            mean - (0 if bias is None else bias.double()) - (0 if beta is None else beta.double() * var.sqrt() / gamma)
-        )
+        mean = mean if bias is None else mean - bias.double()
+        mean = mean if beta is None else mean - beta.double() * var.sqrt() / gamma
         state[f"{name}.running_mean"] = mean.float()
         state[f"{name}.running_var"] = (var / gamma.square() - module.eps).float()
     optional = [name for name in expected if name == "pixel_mean" or name.endswith("num_batches_tracked")]
@@ -321,8 +298,6 @@ def _with_dropout(state: dict[str, Tensor]) -> dict[str, Tensor]:
     parts = ((name.split("."), value) for name, value in state.items())
     return {".".join([stem, moved.get(index, index), *rest]): value for (stem, index, *rest), value in parts}
 
-
-# Patch networks as torch modules: (N, 1, 32, 32) grey patches to descriptors, affine shapes or orientations
 
 __all__ = [
     "ARCHITECTURES", "DESCRIPTORS", "AffNet", "AffNetFast", "GeoDesc", "HardNet", "HardNetFast", "L2Net", "OriNet",

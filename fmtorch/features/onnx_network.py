@@ -6,8 +6,6 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float
-from numpy.typing import NDArray
-from torch import Tensor
 
 from fmtorch.core.files import models_dir
 from fmtorch.core.onnx_network import NetworkFileError, onnx_session
@@ -55,7 +53,7 @@ class PatchNetwork:
     def __repr__(self) -> str:
         return f"PatchNetwork({str(self.path)!r}, threads={self.threads}, batch={self.batch})"
 
-    def __call__(self, patches: Float[Tensor, "n 1 32 32"]) -> Float[Tensor, "n d"]:
+    def __call__(self, patches: Float[torch.Tensor, "n 1 32 32"]) -> Float[torch.Tensor, "n d"]:
         """The network's output for each patch, float32, on the patches' device.
 
         Raises NetworkFileError for a file that is absent, corrupt or takes another shape, ValueError for patches of
@@ -68,7 +66,8 @@ class PatchNetwork:
         result = np.zeros((len(array), outputs), np.float32)
         for start in range(0, len(array), self.batch):
             part = array[start : start + self.batch]
-            result[start : start + len(part)] = session.run(None, {name: _filled(part, self.batch)})[0][: len(part)]
+            filled = np.concatenate([part, np.zeros((self.batch - len(part), *PATCH_SHAPE), np.float32)])
+            result[start : start + len(part)] = session.run(None, {name: filled})[0][: len(part)]
         return torch.from_numpy(result).to(patches.device)
 
     @property
@@ -88,14 +87,7 @@ class PatchNetwork:
         return _session(self.path, self.threads)[2]
 
 
-def _filled(part: NDArray[np.float32], count: int) -> NDArray[np.float32]:
-    if len(part) == count:
-        return part
-    return np.concatenate([part, np.zeros((count - len(part), *PATCH_SHAPE), np.float32)])
-
-
 def _session(path: Path, threads: int) -> tuple[Any, str, int]:
-    """An inference session, its input's name and the length of an output."""
     session = onnx_session(path, threads, _hint(path))
     inputs, outputs = session.get_inputs(), session.get_outputs()
     shape = inputs[0].shape if len(inputs) == 1 else None

@@ -1,14 +1,11 @@
 """Difference-of-Gaussians keypoints with SIFT descriptors, through OpenCV."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import math
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
-from types import ModuleType
 from typing import Annotated, Any
 
 import cv2
@@ -23,7 +20,7 @@ from fmtorch.core.files import models_dir
 from fmtorch.core.options import Within
 from fmtorch.core.types import Features
 from fmtorch.features.frames import FRAME_SIGMAS
-from fmtorch.features.patches import PATCH, ImagePyramid
+from fmtorch.features.patches import PATCH, Image, ImagePyramid
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,7 +43,7 @@ class SIFT:
     max_pixels: int = 16_000_000
     root: bool = False
 
-    def __call__(self, image: NDArray[np.uint8]) -> Features:
+    def __call__(self, image: Image) -> Features:
         """The features of a grey (H, W) or RGB (H, W, 3) uint8 image; none, with N = 0, where nothing is found.
 
         lafs: half side `FRAME_SIGMAS` sigma, kornia's angle (minus OpenCV's). scores: contrast. descriptors: (N, 128)
@@ -58,14 +55,10 @@ class SIFT:
         descriptors = np.zeros((0, 128), np.float32) if computed is None else computed
         lafs, scores, kept = self._kept(keypoints, seen.shape, grey.shape)
         features = torch.from_numpy(descriptors[kept])
-        return Features(
-            lafs=lafs,
-            scores=scores,
-            descriptors=root_sift(features) if self.root else features,
-            image_size=torch.tensor(grey.shape, dtype=torch.int64),
-        )
+        size = torch.tensor(grey.shape, dtype=torch.int64)
+        return Features(lafs, scores, root_sift(features) if self.root else features, size)
 
-    def detect(self, image: NDArray[np.uint8]) -> tuple[Float[Tensor, "n 2 3"], Float[Tensor, " n"]]:
+    def detect(self, image: Image) -> tuple[Float[Tensor, "n 2 3"], Float[Tensor, " n"]]:
         """The frames and scores of the features that a call finds, without their descriptors."""
         grey = as_grey(image)
         seen = self._reduced(grey)
@@ -73,16 +66,10 @@ class SIFT:
         return lafs, scores
 
     def _opencv(self) -> cv2.SIFT:
-        return cv2.SIFT.create(
-            nfeatures=self.max_features,
-            contrastThreshold=self.contrast_threshold,
-            edgeThreshold=self.edge_threshold,
-            sigma=self.sigma,
-            enable_precise_upscale=self.precise_upscale,
-        )
+        thresholds, upscale = (self.contrast_threshold, self.edge_threshold), self.precise_upscale
+        return cv2.SIFT.create(self.max_features, 3, *thresholds, self.sigma, enable_precise_upscale=upscale)
 
-    def _reduced(self, grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The image, or a smaller one of at most `max_pixels`."""
+    def _reduced(self, grey: Image) -> Image:
         factor = math.sqrt(self.max_pixels / grey.size)
         if factor >= 1:
             return grey
@@ -128,7 +115,7 @@ def strongest(scores: NDArray[np.float32], count: int) -> NDArray[np.int64]:
     return np.sort(np.argsort(-scores, kind="stable")[:count])
 
 
-def as_grey(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def as_grey(image: Image) -> Image:
     """A grey image of a grey or RGB one. Raises ValueError for another type, shape or an empty image."""
     if image.dtype != np.uint8 or image.size == 0 or not (image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)):
         raise ValueError(f"image is {image.dtype} {image.shape}; it must be a non-empty uint8 (H, W) or RGB (H, W, 3)")
@@ -136,8 +123,6 @@ def as_grey(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         return np.ascontiguousarray(image)
     return cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)  # type: ignore[return-value]
 
-
-# VLFeat's difference-of-Gaussians keypoints with SIFT descriptors, through pycolmap (extra `colmap`)
 
 ORIENTATIONS = 4  # of one location at most, as VLFeat
 SMALLEST = 16  # px, the shorter side: the smallest octave has 8, and VLFeat takes no smaller image
@@ -150,11 +135,9 @@ class VLFeatSIFT:
     The paper (Bian et al., BMVC 2019) took its keypoints and descriptors from there. VLFeat does not double the image
     and, by default, has no threshold of contrast, so that it finds more keypoints than OpenCV, of larger scales.
 
-    max_features: the keypoints of the largest scales that are kept.
-    first_octave: -1 doubles the image first.
-    peak_threshold: least contrast |DoG|, for intensities in [0, 1]; 0 takes every extremum.
-    edge_threshold: largest ratio of principal curvatures.
-    root: RootSIFT instead.
+    max_features: the keypoints of the largest scales that are kept. first_octave: -1 doubles the image first.
+    peak_threshold: least contrast |DoG|, for intensities in [0, 1]; 0 takes every extremum. edge_threshold: largest
+    ratio of principal curvatures. root: RootSIFT instead.
     """
 
     max_features: Annotated[int, Within(1)] = 20000
@@ -166,7 +149,7 @@ class VLFeatSIFT:
     def __post_init__(self) -> None:
         _library()
 
-    def __call__(self, image: NDArray[np.uint8]) -> Features:
+    def __call__(self, image: Image) -> Features:
         """The features of a grey (H, W) or RGB (H, W, 3) uint8 image; none, with N = 0, where nothing is found.
 
         lafs: half side `FRAME_SIGMAS` sigma. scores: sigma in pixels, as VLFeat tells no contrast. descriptors:
@@ -205,15 +188,95 @@ def octaves(shape: tuple[int, ...], first: int) -> int:
     return max(int(math.log2(min(shape))) - first - 3, 1)
 
 
-def _library() -> ModuleType:
+def _library() -> Any:
     """pycolmap, which says nothing but warnings. Raises ImportError naming the extra where it is not installed."""
     try:
         import pycolmap
     except ImportError as error:
         raise ImportError("features=sift_vlfeat needs pycolmap: pip install 'fmtorch[colmap]'") from error
     pycolmap.logging.minloglevel = pycolmap.logging.WARNING.value
-    module: ModuleType = pycolmap
-    return module
+    return pycolmap
+
+
+ROTATION_STEP = 72.0  # degrees, divided by the tilt; section 5.2 of the paper
+ANTIALIAS_SIGMA = 0.8  # times sqrt(t^2 - 1), the blur along the axis that is then reduced t times; section 5.1
+
+
+@dataclasses.dataclass(frozen=True)
+class ASIFT(SIFT):
+    """SIFT on simulated views of an image, the keypoints mapped back; an instance may be used by several threads.
+
+    A view is the image rotated by an angle, then reduced t times along x: as a camera would see a distant plane from
+    latitude arccos(1 / t). The tilts are ``t = sqrt(2)^k``, k = 0 ... tilts - 1, at the angles 0, 72 / t, ... below
+    180 degrees: 43 views for the paper's six tilts, about 14 times the area of the image. No tilt is plain SIFT.
+
+    max_features: the strongest kept over all views. The other options are those of `SIFT` in each view.
+    """
+
+    max_features: Annotated[int, Within(1)] = 30000
+    tilts: int = 6
+
+    def __call__(self, image: Image) -> Features:
+        """The features of a grey (H, W) or RGB (H, W, 3) uint8 image; none, with N = 0, where nothing is found.
+
+        lafs: the frames of the views in the image, full affine. scores, descriptors: as found in the views. Frames that
+        leave the image are dropped, except in the view that is the image. Raises ValueError for another type, shape or
+        an empty image.
+        """
+        grey = as_grey(image)
+        parts = [super().__call__(grey)]
+        for tilt, angle in simulated_views(self.tilts)[1:]:
+            view, to_view = simulate_view(grey, tilt, angle)
+            parts.append(_mapped_back(super().__call__(view), to_view, grey.shape))
+        scores = torch.cat([f.scores for f in parts])
+        kept = torch.from_numpy(strongest(scores.numpy(), self.max_features))
+        lafs, descriptors = (torch.cat([getattr(f, name) for f in parts])[kept] for name in ("lafs", "descriptors"))
+        return Features(lafs, scores[kept], descriptors, parts[0].image_size)
+
+
+def simulated_views(tilts: int) -> list[tuple[float, float]]:
+    """(tilt, angle in degrees) of the views, the image itself, (1, 0), first. Raises ValueError for no tilts."""
+    if tilts < 1:
+        raise ValueError(f"tilts is {tilts}; there must be at least one, which is the image itself")
+    views = [(1.0, 0.0)]
+    for k in range(1, tilts):
+        tilt = math.sqrt(2) ** k
+        views += [(tilt, i * ROTATION_STEP / tilt) for i in range(math.ceil(180 * tilt / ROTATION_STEP - 1e-9))]
+    return views
+
+
+def simulate_view(grey: Image, tilt: float, angle: float) -> tuple[Image, np.ndarray]:
+    """The view of a grey image rotated by `angle` degrees and reduced `tilt` times along x, and the map to it (2, 3).
+
+    The border of the image is continued where the view shows more. Blurred before it is reduced.
+    """
+    h, w = grey.shape
+    cosine, sine = math.cos(math.radians(angle)), math.sin(math.radians(angle))
+    rotation = np.array([[cosine, -sine], [sine, cosine]])
+    corners = rotation @ np.array([[0, w - 1, 0, w - 1], [0, 0, h - 1, h - 1]])
+    low, high = corners.min(1), corners.max(1)
+    width, height = (math.ceil(extent - 1e-6) + 1 for extent in high - low)
+    rotate = np.concatenate([rotation, -low[:, None]], 1)
+    turned = cv2.warpAffine(grey, rotate, (width, height), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    blurred = cv2.GaussianBlur(turned, (0, 0), sigmaX=ANTIALIAS_SIGMA * math.sqrt(tilt**2 - 1), sigmaY=0.01)
+    reduce = np.array([[1 / tilt, 0, 0], [0, 1, 0]])
+    narrow = math.floor((width - 1) / tilt) + 1
+    view = cv2.warpAffine(blurred, reduce, (narrow, height), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return view.astype(np.uint8, copy=False), reduce[:, :2] @ rotate
+
+
+def _mapped_back(features: Features, to_view: np.ndarray, shape: tuple[int, ...]) -> Features:
+    """The features of a view in the image's coordinates, without those whose frame leaves the image."""
+    to_image = torch.from_numpy(np.linalg.inv(to_view[:, :2]))
+    lafs = features.lafs.double()
+    centre = (lafs[..., 2] - torch.from_numpy(to_view[:, 2])) @ to_image.T
+    half_side = torch.linalg.vector_norm(lafs[..., 0], dim=-1)
+    # A circle of the view reaches |row of the map| times its radius in the image.
+    reach = half_side[:, None] * torch.linalg.vector_norm(to_image, dim=1)
+    far = torch.tensor([shape[1] - 1, shape[0] - 1], dtype=centre.dtype)
+    kept = ((centre >= reach) & (centre <= far - reach)).all(-1)
+    mapped = torch.cat([to_image @ lafs[..., :2], centre[..., None]], -1)
+    return features.replace(lafs=mapped.float())[kept]
 
 
 # SIFT of patches, plain, as RootSIFT, and pooled over domain sizes; batched (Lowe, IJCV 2004, section 6)
@@ -261,8 +324,7 @@ def sift_of_patches(patches: Float[Tensor, "n 1 32 32"]) -> Float[Tensor, "n 128
     pooling, along, across = _matrices(patches.device)
     parts = []
     for part in torch.split(patches[:, 0], CHUNK):
-        gx = across @ part @ along.T
-        gy = along @ part @ across.T
+        gx, gy = across @ part @ along.T, along @ part @ across.T
         squared = (gx * gx + gy * gy).flatten(1)
         magnitude = torch.where(squared > FLAT * FLAT, squared, 0.0).sqrt()
         position = (torch.atan2(-gy, gx) * (DIRECTIONS / (2 * math.pi))).flatten(1)
@@ -332,7 +394,7 @@ class RootSIFTPCA:
 
 
 def project(
-    descriptors: Float[Tensor, "n 128"], mean: Float[Tensor, 128], basis: Float[Tensor, "128 d"], power: float
+    descriptors: Float[Tensor, "n 128"], mean: Float[Tensor, "128"], basis: Float[Tensor, "128 d"], power: float
 ) -> Float[Tensor, "n d"]:
     """Centred, projected, signed power of each entry, unit length."""
     projected = (descriptors - mean) @ basis
@@ -351,19 +413,23 @@ def learn_projection(
     return mean.float(), (basis * sign).float()
 
 
-@functools.lru_cache(maxsize=8)
-def load_projection(path: Path) -> tuple[Float[Tensor, 128], Float[Tensor, "128 d"]]:
-    """Mean and basis of a learned file. Raises FileNotFoundError and ValueError that say how to make it."""
-    remedy = "make it with `python scripts/make_models.py pca`"
+def read_learned(path: Path, names: Sequence[str], what: str, remedy: str) -> list[Tensor]:
+    """Tensors of a learned file, `what` in messages. Raises FileNotFoundError, ValueError, which end with `remedy`."""
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file; {remedy}")
     try:
         with np.load(path, allow_pickle=False) as file:
-            mean, basis = (torch.from_numpy(file[name].astype(np.float32)) for name in ("mean", "basis"))
+            return [torch.from_numpy(file[name].astype(np.float32)) for name in names]
     except (KeyError, ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
-        raise ValueError(f"{path}: no file with `mean` and `basis` ({error}); {remedy}") from error
+        raise ValueError(f"{path}: no file with {what} ({error}); {remedy}") from error
+
+
+@functools.lru_cache(maxsize=8)
+def load_projection(path: Path) -> tuple[Float[Tensor, "128"], Float[Tensor, "128 d"]]:
+    """Mean and basis of a learned file. Raises FileNotFoundError and ValueError that say how to make it."""
+    remedy = "make it with `python scripts/make_models.py pca`"
+    mean, basis = read_learned(path, ("mean", "basis"), "`mean` and `basis`", remedy)
     if mean.shape != (128,) or basis.dim() != 2 or len(basis) != 128:
-        raise ValueError(
-            f"{path}: mean {tuple(mean.shape)}, basis {tuple(basis.shape)} must be (128,), (128, D); {remedy}"
-        )
+        shapes = f"mean {tuple(mean.shape)}, basis {tuple(basis.shape)}"
+        raise ValueError(f"{path}: {shapes} must be (128,), (128, D); {remedy}")
     return mean, basis

@@ -4,18 +4,16 @@ SIFT of any kind is taken as RootSIFT-PCA, so that two codebooks serve: one for 
 """
 
 import functools
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from fmtorch.core.files import models_dir
-from fmtorch.features.sift import load_projection, normalized, project, root_sift
+from fmtorch.features.sift import load_projection, normalized, project, read_learned, root_sift
 
 Kind = Literal["sift", "rootsiftpca", "hardnet"]
 POWER = 0.5  # of RootSIFT-PCA's entries, as `features=rootsiftpca` has it
@@ -57,13 +55,7 @@ def codebook(kind: Kind) -> Codebook:
 def load_codebook(path: Path) -> Codebook:
     """The codebook of a learned file. Raises FileNotFoundError and ValueError that say how to make it."""
     remedy = "make it with `python scripts/make_models.py codebooks`"
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file; {remedy}")
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            book = Codebook(*(torch.from_numpy(file[name].astype(np.float32)) for name in Codebook._fields))
-    except (KeyError, ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
-        raise ValueError(f"{path}: no file with {', '.join(Codebook._fields)} ({error}); {remedy}") from error
+    book = Codebook(*read_learned(path, Codebook._fields, ", ".join(Codebook._fields), remedy))
     if book.basis.shape != (len(book.mean), book.centers.shape[-1]):
         raise ValueError(f"{path}: mean, basis and centers do not fit; {remedy}")
     return book

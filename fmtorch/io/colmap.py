@@ -9,29 +9,27 @@ import sqlite3
 import tempfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from fmtorch.core.files import replacing
 from fmtorch.data.cameras import MODELS, Lens
+from fmtorch.data.files import Array, Indices, Mask, Matrix, Singles
 from fmtorch.geometry.cameras import MIN_FOCAL, USUAL_FOCAL, calibration_problems
 from fmtorch.io.match_store import ORIGIN, PairGeometry, StoredImage, StoredPair, two_view_geometry
 
 FOCAL_LENGTH = 1.2  # of the longer side, where it is unknown: COLMAP's own default
 
 
-def imported() -> ModuleType:
+def imported() -> Any:
     """pycolmap. Raises ImportError naming the extra where it is not installed."""
     try:
         import pycolmap
     except ImportError as error:
         raise ImportError("pycolmap is not installed; pip install 'fmtorch[colmap]' brings it") from error
-    module: ModuleType = pycolmap
-    return module
+    return pycolmap
 
 
 def write_database(
@@ -48,7 +46,7 @@ def write_database(
     pycolmap = imported()
     cameras: dict[object, int] = {}
     ids: dict[str, int] = {}
-    known: dict[str, NDArray[np.float64] | None] = {}
+    known: dict[str, Matrix | None] = {}
     path.unlink(missing_ok=True)
     with pycolmap.Database.open(path) as database:
         for image in images:
@@ -71,9 +69,8 @@ def write_database(
 
 def _camera(pycolmap: Any, database: Any, cameras: dict[object, int], image: StoredImage, shared: bool) -> int:
     model, parameters, prior = _parameters(image)
-    key: object = image.name
-    if image.K is not None or image.lens is not None or shared:
-        key = (image.size, model, *parameters)
+    own = image.K is None and image.lens is None and not shared
+    key: object = image.name if own else (image.size, model, *parameters)
     if key not in cameras:
         h, w = image.size
         camera = pycolmap.Camera(model=model, width=w, height=h, params=parameters)
@@ -96,10 +93,7 @@ def _parameters(image: StoredImage) -> tuple[str, list[float], bool]:
     return "SIMPLE_RADIAL", [focal, w / 2, h / 2, 0.0], image.focal is not None
 
 
-def _geometry(
-    pair: StoredPair, matches: NDArray[np.int32], known: dict[str, NDArray[np.float64] | None]
-) -> PairGeometry:
-    """The geometry of a pair, whose inliers are among the matches (m, 2)."""
+def _geometry(pair: StoredPair, matches: Array, known: dict[str, Matrix | None]) -> PairGeometry:
     written = set(map(tuple, matches.tolist()))
     if pair.geometry is not None:
         verified = [match for match in pair.geometry.inliers.tolist() if tuple(match) in written]
@@ -114,11 +108,9 @@ def _geometry(
     return PairGeometry("calibrated", inliers, pair.F, K1.T @ pair.F @ K0)
 
 
-def _one_to_one(pair: StoredPair) -> NDArray[np.bool_]:
+def _one_to_one(pair: StoredPair) -> Mask:
     """Matches that share no keypoint with a better one: COLMAP's tracks allow one each; inliers come first."""
-    keep = np.zeros(len(pair.matches), bool)
-    taken0: set[int] = set()
-    taken1: set[int] = set()
+    keep, taken0, taken1 = np.zeros(len(pair.matches), bool), set[int](), set[int]()
     inliers = pair.inliers
     if pair.geometry is not None:
         verified = set(map(tuple, pair.geometry.inliers.tolist()))
@@ -132,12 +124,7 @@ def _one_to_one(pair: StoredPair) -> NDArray[np.bool_]:
     return keep
 
 
-# Images of a COLMAP database: keypoints as of an ideal pinhole, and what is known of cameras
-
-
 EXIF_DEVIATION = 0.05  # relative, of focal lengths by EXIF (docs/cameras.md)
-
-Array = NDArray[np.float64]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -155,15 +142,15 @@ class DatabaseImage:
     name: str
     camera_id: int
     size: tuple[int, int] | None
-    K: Array | None
+    K: Matrix | None
     deviation: float
-    points: NDArray[np.float32]
-    pinhole: NDArray[np.float32]
+    points: Singles
+    pinhole: Singles
     problem: str = ""
     warning: str = ""
 
 
-def database_image(name: str, camera: Any, keypoints: NDArray[np.float32]) -> DatabaseImage:
+def database_image(name: str, camera: Any, keypoints: Singles) -> DatabaseImage:
     """The image of a `pycolmap.Camera` and its keypoints (n, 2), (n, 4) or (n, 6); raises ValueError for others."""
     size, columns = (int(camera.height), int(camera.width)), keypoints.shape[1]
     if columns not in (2, 4, 6):
@@ -185,27 +172,20 @@ def database_image(name: str, camera: Any, keypoints: NDArray[np.float32]) -> Da
     wrong = calibration_problems(torch.from_numpy(K)[None], torch.tensor([size]), "its calibration")[0]
     pinhole = points
     if lens.bends and not (absurd or wrong):
-        pinhole = _undistorted(camera, K, keypoints[:, :2]).astype(np.float32)
+        pixels = np.ascontiguousarray(keypoints[:, :2], np.float64)
+        rays = np.asarray(camera.cam_from_img(pixels), np.float64).reshape(-1, 2)
+        pinhole = (rays @ K[:2, :2].T + K[:2, 2]).astype(np.float32)
     problem = f"{whose}: {wrong}" if wrong else ""
     return DatabaseImage(name, camera.camera_id, size, K, deviation, points, pinhole, problem, warning)
 
 
-def _deviation(camera: Any, lens: Lens, K: Array) -> float:
+def _deviation(camera: Any, lens: Lens, K: Matrix) -> float:
     """Relative, of the focal length: that of EXIF where nothing else of the camera is known, else of a calibration."""
     if not camera.has_prior_focal_length:
         return math.inf
     centre = ((camera.width - 1) / 2, (camera.height - 1) / 2)
     usual = lens.fx == lens.fy and tuple(K[:2, 2]) == centre and not any(lens.coefficients)
     return EXIF_DEVIATION if usual else 0.0
-
-
-def _undistorted(camera: Any, K: Array, points: NDArray[Any]) -> Array:
-    """Pixels (n, 2) of a pinhole for COLMAP's pixels (n, 2) of the photograph."""
-    rays = np.asarray(camera.cam_from_img(np.ascontiguousarray(points, np.float64)), np.float64).reshape(-1, 2)
-    return np.asarray(rays @ K[:2, :2].T + K[:2, 2])
-
-
-# A COLMAP database of anyone's keypoints and matches: read pair by pair, and given two-view geometries
 
 
 MAGIC = b"SQLite format 3\0"
@@ -216,7 +196,7 @@ MEMORY = 2 * BLOCK + 1  # images whose keypoints are kept
 Ids = tuple[int, int]
 
 
-class MatchDatabase:
+class MatchDatabase(contextlib.AbstractContextManager["MatchDatabase"]):
     """An open database. Its images are read when they are needed, and few of them are kept.
 
     Raises what `expect_database` raises, and ValueError where there are no keypoints or no matches; OSError where the
@@ -230,16 +210,14 @@ class MatchDatabase:
         with _naming(path):
             self._database = self._pycolmap.Database.open(path)
         self.image = functools.lru_cache(maxsize=MEMORY)(self._image)
-        for count, what, step in (
-            (self._database.num_keypoints(), "keypoints", "extract features (colmap feature_extractor)"),
-            (self._database.num_matched_image_pairs(), "matches", "match the images (colmap exhaustive_matcher)"),
-        ):
-            if not count:
-                self.close()
-                raise ValueError(f"{path} holds no {what}; {step} first")
-
-    def __enter__(self) -> "MatchDatabase":
-        return self
+        lacking = ""
+        if not self._database.num_matched_image_pairs():
+            lacking = "matches; match the images (colmap exhaustive_matcher)"
+        if not self._database.num_keypoints():
+            lacking = "keypoints; extract features (colmap feature_extractor)"
+        if lacking:
+            self.close()
+            raise ValueError(f"{path} holds no {lacking} first")
 
     def __exit__(self, *error: object) -> None:
         self.close()
@@ -260,7 +238,7 @@ class MatchDatabase:
     def has_geometry(self, pair: Ids) -> bool:
         return bool(self._database.exists_two_view_geometry(*pair))
 
-    def matches(self, pair: Ids) -> NDArray[np.int64]:
+    def matches(self, pair: Ids) -> Indices:
         """The matches of a pair, keypoints (n, 2) of its images.
 
         Raises ValueError where there are no such keypoints.
@@ -307,9 +285,8 @@ def _naming(path: Path) -> Iterator[None]:
         yield
     except RuntimeError as error:
         said = str(error).partition("SQLite error: ")[2]
-        raise OSError(
-            f"{path} cannot be written: {said or 'another process holds it, or its disk is full or read-only'}"
-        ) from error
+        reason = said or "another process holds it, or its disk is full or read-only"
+        raise OSError(f"{path} cannot be written: {reason}") from error
 
 
 def expect_database(path: Path) -> None:
@@ -322,14 +299,11 @@ def expect_database(path: Path) -> None:
         if file.read(len(MAGIC)) != MAGIC:
             raise ValueError(f"{path} is not a COLMAP database; give the database.db of a COLMAP project")
     version, tables = _schema(path)
-    missing = TABLES - tables
-    if missing:
-        raise ValueError(f"{path} is a database, but none of COLMAP's: it has no table {', '.join(sorted(missing))}")
+    if missing := ", ".join(sorted(TABLES - tables)):
+        raise ValueError(f"{path} is a database, but none of COLMAP's: it has no table {missing}")
     if version > (newest := _newest_version()):
-        raise ValueError(
-            f"{path} was written by a newer COLMAP (schema {version}; this pycolmap {imported().__version__} "
-            f"reads up to {newest}); pip install --upgrade pycolmap"
-        )
+        schemas = f"schema {version}; this pycolmap {imported().__version__} reads up to {newest}"
+        raise ValueError(f"{path} was written by a newer COLMAP ({schemas}); pip install --upgrade pycolmap")
 
 
 def finished_pairs(path: Path, output: Path) -> int:
@@ -392,18 +366,14 @@ def _schema(path: Path) -> tuple[int, set[str]]:
 @contextlib.contextmanager
 def _reading(path: Path) -> Iterator[sqlite3.Connection]:
     """A connection that only reads; of a folder that cannot be written to as well."""
-    address = path.absolute().as_uri()
-    waiting = _beside(path, "wal").exists()
-    with contextlib.closing(
-        sqlite3.connect(f"{address}?mode=ro{'' if waiting else '&immutable=1'}", uri=True)
-    ) as open_:
-        yield open_
+    mode = "mode=ro" if _beside(path, "wal").exists() else "mode=ro&immutable=1"
+    with contextlib.closing(sqlite3.connect(f"{path.absolute().as_uri()}?{mode}", uri=True)) as connection:
+        yield connection
 
 
 @functools.cache
 def _newest_version() -> int:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "empty.db"
-        opened: Any = imported().Database.open(path)
-        opened.close()
+        imported().Database.open(path).close()
         return _schema(path)[0]

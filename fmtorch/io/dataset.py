@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import functools
 import hashlib
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -9,12 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from fmtorch.data import DataError, FMBenchPairs, GivenMatches, ImagePair, ImageSource, PairDataset, stored_size
-from fmtorch.data.files import given_root
+from fmtorch.data import DataError, FMBenchPairs, GivenMatches, ImagePair, ImageSource, stored_size
+from fmtorch.data.files import Matrix, given_root
 from fmtorch.data.pairs import HeldPairs
 from fmtorch.io import h5, predictions
-from fmtorch.io.predictions import Array, Size
+from fmtorch.io.predictions import Size
 
+Sources = tuple[ImageSource, ImageSource]
 MATCHES, RATIOS, CALIBRATIONS, ROTATIONS, TRANSLATIONS, TRUTH = (
     f"{name}.h5" for name in ("matches", "match_conf", "K1_K2", "R", "T", "Fgt")
 )
@@ -36,10 +38,8 @@ class TutorialMatches:
             with h5.opened(self.folder / RATIOS) as file:
                 ratios = h5.numbers(file, self.key).reshape(-1)
             if len(ratios) != len(points):
-                raise DataError(
-                    f"{self.folder / RATIOS}: {self.key!r} has {len(ratios)} entries, "
-                    f"but {MATCHES} has {len(points)} matches of that pair"
-                )
+                lengths = f"{len(ratios)} entries, but {MATCHES} has {len(points)} matches of that pair"
+                raise DataError(f"{self.folder / RATIOS}: {self.key!r} has {lengths}")
         return predictions.given(points[:, :2], points[:, 2:], self.sizes, (len(points), len(points)), ratio=ratios)
 
 
@@ -75,7 +75,7 @@ class _Cameras:
         self.folder = folder
         self._files, self._open = files, dict[str, Any]()
         self._images: dict[str, ImageSource] = {}
-        self.by_image: dict[str, tuple[Array, Array]] = {}
+        self.by_image: dict[str, tuple[Matrix, Matrix]] = {}
         self.problems: dict[str, str] = {}
         rotations, translations = folder / ROTATIONS, folder / TRANSLATIONS
         if rotations.exists() and translations.exists():
@@ -105,17 +105,16 @@ class _Cameras:
         lack = f"names no two images of {ROTATIONS} and {TRANSLATIONS}" if self._known else "does not name two images"
         raise DataError(f"{self.folder / MATCHES}: {key!r} {lack}")
 
-    def calibration(self, key: str) -> tuple[Array, Array]:
+    def calibration(self, key: str) -> tuple[Matrix, Matrix]:
         K = h5.reshaped(self._file(CALIBRATIONS), key, 2, 3, 3)
         if not np.linalg.det(K).all():
             raise DataError(f"{self.folder / CALIBRATIONS}: {key!r}: a calibration matrix is singular")
         return K[0], K[1]
 
-    def truth(self, key: str) -> Array:
+    def truth(self, key: str) -> Matrix:
         if not (self.folder / TRUTH).exists():
-            raise DataError(
-                f"{self.folder}: neither {ROTATIONS} and {TRANSLATIONS} nor {TRUTH}: the test split has no ground truth"
-            )
+            files = f"neither {ROTATIONS} and {TRANSLATIONS} nor {TRUTH}"
+            raise DataError(f"{self.folder}: {files}: the test split has no ground truth")
         return h5.reshaped(self._file(TRUTH), key, 3, 3)
 
     def _file(self, name: str) -> Any:
@@ -125,7 +124,7 @@ class _Cameras:
         return self._open[name]
 
 
-def _size(source: ImageSource, K: Array, images: Path | None) -> Size:
+def _size(source: ImageSource, K: Matrix, images: Path | None) -> Size:
     """(h, w) of an image, by its principal point where there is no file. Raises DataError where the two disagree."""
     by_centre, size = predictions.size_by_centre(K), stored_size(source.path) if images else None
     if size is not None:
@@ -136,7 +135,7 @@ def _size(source: ImageSource, K: Array, images: Path | None) -> Size:
 def _pair(root: Path, folder: Path, key: str, cameras: _Cameras, images: Path | None) -> ImagePair:
     family, scene = root.name, folder.name
     identity = key if folder == root else f"{scene}/{key}"  # whatever the folder is called: draws follow from it
-    sources: tuple[ImageSource, ImageSource] | None = None
+    sources: Sources | None = None
     try:
         name0, name1 = cameras.split(key)
         sources = cameras.image(family, name0, images), cameras.image(family, name1, images)
@@ -149,20 +148,21 @@ def _pair(root: Path, folder: Path, key: str, cameras: _Cameras, images: Path | 
             (R0, t0), (R1, t1) = cameras.by_image[name0], cameras.by_image[name1]
             R = R1 @ R0.T
             matches = TutorialMatches(folder, key, sizes)
-            return predictions.posed(identity, family, scene, sources, (K0, K1), R, t1 - R @ t0, matches)
+            pose = R, t1 - R @ t0
+            return ImagePair(identity, family, scene, *sources, np.zeros((3, 3)), K0, K1, *pose, matches=matches)
         F = cameras.truth(key)
         norm = float(np.linalg.norm(F))
         problem = None if norm else f"{folder / TRUTH}: {key!r} is zero"
         pair = ImagePair(identity, family, scene, *sources, F / (norm or 1.0), K0, K1, problem=problem)
     except DataError as error:
         unnamed = predictions.image(family, scene, key, images)
-        return predictions.broken(identity, family, scene, sources or (unnamed, unnamed), str(error))
+        shown = sources or (unnamed, unnamed)
+        return ImagePair(identity, family, scene, *shown, np.zeros((3, 3)), problem=str(error))
     return dataclasses.replace(pair, matches=TutorialMatches(folder, key, sizes))
 
 
 # PoseBench's files of relative poses: a group for each pair, with ``x1``, ``x2`` (n, 2), ``camera1``, ``camera2``
 # (``model``, ``width``, ``height``, ``params``), ``R`` (3, 3) and ``t`` (3,), X2 = R X1 + t
-
 
 FOCAL_LENGTHS = {"SIMPLE_PINHOLE": 1, "PINHOLE": 2, "SIMPLE_RADIAL": 1, "RADIAL": 1, "OPENCV": 2, "FULL_OPENCV": 2}
 """Camera models that are pinholes where their distortion is zero, and how many focal lengths begin their parameters."""
@@ -174,7 +174,7 @@ class PoseBenchMatches:
 
     path: Path
     key: str
-    K: tuple[Array, Array]
+    K: tuple[Matrix, Matrix]
     sizes: tuple[Size | None, Size | None]
 
     def __call__(self) -> GivenMatches:
@@ -182,37 +182,38 @@ class PoseBenchMatches:
             x0, x1 = (h5.numbers(file, f"{self.key}/{name}", None, 2) for name in ("x1", "x2"))
         if len(x0) != len(x1):
             raise DataError(f"{self.path}: {self.key!r} has {len(x0)} points in x1 and {len(x1)} in x2")
-        size0, size1 = (
-            predictions.size_by_points(K, x) if size is None else size
-            for size, K, x in zip(self.sizes, self.K, (x0, x1), strict=True)
-        )
+        known = zip(self.sizes, self.K, (x0, x1), strict=True)
+        size0, size1 = (predictions.size_by_points(K, x) if size is None else size for size, K, x in known)
         return predictions.given(x0, x1, (size0, size1), (len(x0), len(x1)))
 
 
-def posebench_pairs(root: Path, images: Path | None) -> Iterator[ImagePair]:
-    """The pairs of a file, or of all files of a folder."""
+Stored = tuple[tuple[Matrix, Matrix], Matrix, Matrix, Callable[[], GivenMatches]]  # K of both images, R, t, matches
+Read = Callable[[Any, Path, str, Sources], Stored]
+
+
+def _pairs(root: Path, images: Path | None, keys_of: Callable[[Any], list[str]], read: Read) -> Iterator[ImagePair]:
+    """The pairs of a file, or of all files of a folder; read: what a file has under a key."""
     for path in h5.files(root):
         with h5.opened(path) as file:
-            for key in h5.keys(file):
-                yield _posebench_pair(file, path, root.stem, key, images)
+            for key in keys_of(file):
+                family, scene, identity = root.stem, path.stem, f"{path.stem}/{key}"
+                source0, source1 = (predictions.image(family, scene, f"{key}/{i}", images) for i in (1, 2))
+                pair = ImagePair(identity, family, scene, source0, source1, np.zeros((3, 3)))
+                try:
+                    K, R, t, matches = read(file, path, key, (source0, source1))
+                    pair = dataclasses.replace(pair, K0=K[0], K1=K[1], R=R, t=t, matches=matches)
+                except DataError as error:
+                    pair = dataclasses.replace(pair, problem=str(error))
+                yield from predictions.with_fundamentals([pair])
 
 
-def _posebench_pair(file: Any, path: Path, family: str, key: str, images: Path | None) -> ImagePair:
-    scene, identity = path.stem, f"{path.stem}/{key}"
-    sources = predictions.image(family, scene, f"{key}/1", images), predictions.image(family, scene, f"{key}/2", images)
-    try:
-        (K0, size0), (K1, size1) = (
-            _camera(file, path, f"{key}/{name}", source)
-            for name, source in zip(("camera1", "camera2"), sources, strict=True)
-        )
-        R, t = h5.reshaped(file, f"{key}/R", 3, 3), h5.reshaped(file, f"{key}/t", 3)
-    except DataError as error:
-        return predictions.broken(identity, family, scene, sources, str(error))
-    pair = predictions.calibrated(identity, family, scene, sources, (K0, K1), R, t)
-    return dataclasses.replace(pair, matches=PoseBenchMatches(path, key, (K0, K1), (size0, size1)))
+def _posebench_pair(file: Any, path: Path, key: str, sources: Sources) -> Stored:
+    (K0, size0), (K1, size1) = (_camera(file, path, f"{key}/camera{i}", s) for i, s in enumerate(sources, start=1))
+    R, t = h5.reshaped(file, f"{key}/R", 3, 3), h5.reshaped(file, f"{key}/t", 3)
+    return (K0, K1), R, t, PoseBenchMatches(path, key, (K0, K1), (size0, size1))
 
 
-def _camera(file: Any, path: Path, key: str, source: ImageSource) -> tuple[Array, Size | None]:
+def _camera(file: Any, path: Path, key: str, source: ImageSource) -> tuple[Matrix, Size | None]:
     model = h5.text(file, f"{key}/model")
     parameters = h5.numbers(file, f"{key}/params").reshape(-1)
     count = FOCAL_LENGTHS.get(model)
@@ -222,9 +223,7 @@ def _camera(file: Any, path: Path, key: str, source: ImageSource) -> tuple[Array
         raise DataError(f"{path}: {key + '/params'!r} holds {parameters}, which are no parameters of {model}")
     if parameters[count + 2 :].any():
         raise DataError(f"{path}: {key + '/params'!r} of {model} has distortion; F needs undistorted points")
-    fx, fy = (parameters[0], parameters[count - 1])
-    cx, cy = parameters[count : count + 2]
-    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+    K = _pinhole(parameters[0], parameters[count - 1], *parameters[count : count + 2])
     sides = [_side(file, f"{key}/{name}") for name in ("height", "width")]
     if all(sides):
         return K, (sides[0], sides[1])
@@ -248,7 +247,7 @@ class OANetMatches:
 
     path: Path
     key: str
-    K: tuple[Array, Array]
+    K: tuple[Matrix, Matrix]
     sizes: tuple[Size, Size]
 
     def __call__(self) -> GivenMatches:
@@ -256,61 +255,50 @@ class OANetMatches:
             rays = h5.numbers(file, f"xs/{self.key}", 1, None, 4)[0]
             ratios, mutuals = (self._side(file, name, len(rays)) for name in ("ratios", "mutuals"))
         x0, x1 = (x * K.diagonal()[:2] + K[:2, 2] for x, K in zip((rays[:, :2], rays[:, 2:]), self.K, strict=True))
-        return predictions.given(
-            x0, x1, self.sizes, (len(rays), len(rays)), ratio=ratios,
-            mutual=None if mutuals is None else mutuals.astype(bool),
-        )  # fmt: skip
+        mutual = None if mutuals is None else mutuals.astype(bool)
+        return predictions.given(x0, x1, self.sizes, (len(rays), len(rays)), ratio=ratios, mutual=mutual)
 
-    def _side(self, file: Any, name: str, count: int) -> Array | None:
+    def _side(self, file: Any, name: str, count: int) -> Matrix | None:
         if not h5.holds(file, name):
             return None
         values = h5.numbers(file, f"{name}/{self.key}").reshape(-1)
         if len(values) != count:
-            raise DataError(
-                f"{self.path}: {f'{name}/{self.key}'!r} has {len(values)} entries, "
-                f"but {f'xs/{self.key}'!r} has {count} matches"
-            )
+            lengths = f"{len(values)} entries, but {f'xs/{self.key}'!r} has {count} matches"
+            raise DataError(f"{self.path}: {f'{name}/{self.key}'!r} has {lengths}")
         return values
 
 
-def oanet_pairs(root: Path, images: Path | None) -> Iterator[ImagePair]:
-    """The pairs of a file, or of all files of a folder."""
-    for path in h5.files(root):
-        with h5.opened(path) as file:
-            if not h5.holds(file, "xs"):
-                raise DataError(f"{path}: 'xs' is missing; it is no file of OANet's layout")
-            for key in sorted(h5.keys(file["xs"]), key=lambda key: (len(key), key)):
-                yield _oanet_pair(file, path, root.stem, key, images)
+def _oanet_keys(file: Any) -> list[str]:
+    if not h5.holds(file, "xs"):
+        raise DataError(f"{file.filename}: 'xs' is missing; it is no file of OANet's layout")
+    return sorted(h5.keys(file["xs"]), key=lambda key: (len(key), key))
 
 
-def _oanet_pair(file: Any, path: Path, family: str, key: str, images: Path | None) -> ImagePair:
-    scene, identity = path.stem, f"{path.stem}/{key}"
-    sources = predictions.image(family, scene, f"{key}/1", images), predictions.image(family, scene, f"{key}/2", images)
-    try:
-        K = _calibration(file, key, 1), _calibration(file, key, 2)
-        R, t = h5.reshaped(file, f"Rs/{key}", 3, 3), h5.reshaped(file, f"ts/{key}", 3)
-        sizes = predictions.size_by_centre(K[0]), predictions.size_by_centre(K[1])
-    except DataError as error:
-        return predictions.broken(identity, family, scene, sources, str(error))
-    pair = predictions.calibrated(identity, family, scene, sources, K, R, t)
-    return dataclasses.replace(pair, matches=OANetMatches(path, key, K, sizes))
+def _oanet_pair(file: Any, path: Path, key: str, _: Sources) -> Stored:
+    K = _calibration(file, key, 1), _calibration(file, key, 2)
+    R, t = h5.reshaped(file, f"Rs/{key}", 3, 3), h5.reshaped(file, f"ts/{key}", 3)
+    sizes = predictions.size_by_centre(K[0]), predictions.size_by_centre(K[1])
+    return K, R, t, OANetMatches(path, key, K, sizes)
 
 
-def _calibration(file: Any, key: str, which: int) -> Array:
+def _calibration(file: Any, key: str, which: int) -> Matrix:
     cx, cy = (h5.reshaped(file, f"{name}{which}s/{key}", 1)[0] for name in ("cx", "cy"))
     fx, fy = h5.reshaped(file, f"f{which}s/{key}", 2)
     if fx == 0 or fy == 0:
         raise DataError(f"{file.filename}: 'f{which}s/{key}' holds a focal length of zero")
+    return _pinhole(fx, fy, cx, cy)
+
+
+def _pinhole(fx: float, fy: float, cx: float, cy: float) -> Matrix:
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
-
-
-# The data set `h5`: pairs whose matches somebody else computed, in the layouts that the field exchanges
 
 
 CORNER = 0.5  # where glue-factory puts the centre of the first pixel
 WITH_GEOMETRY: Mapping[str, Callable[[Path, Path | None], Iterator[ImagePair]]] = {
-    "ransac_tutorial": tutorial_pairs, "posebench": posebench_pairs, "oanet": oanet_pairs,
-}  # fmt: skip
+    "ransac_tutorial": tutorial_pairs,
+    "posebench": functools.partial(_pairs, keys_of=h5.keys, read=_posebench_pair),
+    "oanet": functools.partial(_pairs, keys_of=_oanet_keys, read=_oanet_pair),
+}
 WITHOUT_GEOMETRY = {"hloc": 0.0, "glue_factory": CORNER, "vismatch": 0.0}
 """Layouts that hold matches alone, and where they put the centre of the first pixel."""
 LAYOUTS = (*WITHOUT_GEOMETRY, *WITH_GEOMETRY)
@@ -344,8 +332,7 @@ class H5Pairs(HeldPairs):
         if not folder.exists():
             raise DataError(f"{folder}: no such file or folder")
         folder = folder.resolve()
-        digest = hashlib.blake2b(digest_size=16)
-        digest.update(repr((layout, origin)).encode())
+        digest = hashlib.blake2b(repr((layout, origin)).encode(), digest_size=16)
         if layout in WITH_GEOMETRY:
             _expect_unset(layout, truth=truth, features=features, matches=matches, origin=origin)
             where = None if images is None else Path(images).expanduser()
@@ -357,7 +344,10 @@ class H5Pairs(HeldPairs):
             files = tutorial_files(folder) if layout == "ransac_tutorial" else h5.files(folder)
         else:
             _expect_unset(layout, images=images)
-            known = _truth(layout, truth)
+            if truth is None:
+                needed = "give dataset.truth=DIR, the `fmbench` set that it was computed on"
+                raise DataError(f"layout {layout} holds no geometry: {needed}")
+            known = FMBenchPairs(truth)
             digest.update(known.digest.encode())
             offset = WITHOUT_GEOMETRY[layout] if origin is None else origin
             if layout == "hloc":
@@ -374,23 +364,15 @@ class H5Pairs(HeldPairs):
         self.digest = digest.hexdigest()
 
 
-def _truth(layout: str, truth: str | Path | None) -> PairDataset:
-    if truth is None:
-        raise DataError(
-            f"layout {layout} holds no geometry: give dataset.truth=DIR, the `fmbench` set that it was computed on"
-        )
-    return FMBenchPairs(truth)
-
-
 def _expect_distinct(pairs: list[ImagePair], folder: Path) -> None:
     seen: dict[Path, str] = {}
     for pair in pairs:
         for path in (pair.image0.path, pair.image1.path):
             if path.exists() and seen.setdefault(path, pair.scene) != pair.scene:
-                raise DataError(
-                    f"{path} would stand for images of the scenes {seen[path]} and {pair.scene}: give each "
-                    f"a folder, {folder / seen[path]} and {folder / pair.scene}"
-                )
+                other = seen[path]
+                folders = f"{folder / other} and {folder / pair.scene}"
+                both = f"{path} would stand for images of the scenes {other} and {pair.scene}"
+                raise DataError(f"{both}: give each a folder, {folders}")
 
 
 def _expect_unset(layout: str, **options: Any) -> None:
@@ -399,7 +381,6 @@ def _expect_unset(layout: str, **options: Any) -> None:
 
 
 def _file_of_kind(folder: Path, name: str | None, kind: str) -> Path:
-    """The file of this name in the folder, or the only one whose name speaks of its kind."""
     if name is not None:
         path = folder / name
         if not path.is_file():

@@ -3,14 +3,11 @@
 ``fmtorch.find_fundamental(**fmtorch.from_lightglue(features0, features1, matches))``.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from fmtorch.core.checks import as_tensor
@@ -48,7 +45,7 @@ def from_opencv(keypoints0: Sequence[Any], keypoints1: Sequence[Any], matches: S
             axes = torch.stack([angle.cos(), -angle.sin(), angle.sin(), angle.cos()], -1).reshape(-1, 2, 2)
             fields[f"lafs{i}"] = torch.cat([half[:, None, None] * axes, table[:, :2, None]], -1)
     if not {"lafs0", "lafs1"} <= fields.keys():
-        fields = {name: value for name, value in fields.items() if name in ("x0", "x1")}
+        fields = {name: fields[name] for name in ("x0", "x1")}
     if rows and all(len(row) > 1 for row in rows):
         fields["ratio"] = torch.tensor([min(row[0].distance / max(row[1].distance, 1e-12), 1.0) for row in rows])
     return fields
@@ -84,7 +81,6 @@ def from_lightglue(
 
 
 def _lightglue_matches(matches: Mapping[str, Any], b: int | None) -> tuple[Tensor, Tensor]:
-    """Indices (n, 2) and scores (n,) of a pair."""
 
     def of_pair(name: str) -> Tensor:
         return as_tensor(matches[name] if b is None else matches[name][b], name)
@@ -164,10 +160,8 @@ def from_colmap(geometry: Any, matches: Any) -> Estimate:
     inliers = torch.tensor([tuple(match) in verified for match in index.tolist()], dtype=torch.bool)[None]
     to = np.array([[1.0, 0, ORIGIN], [0, 1, ORIGIN], [0, 0, 1]])
     model = "homography" if geometry.F is None and geometry.H is not None else "fundamental"
-    value = None
-    if geometry.F is not None:
-        value = to.T @ geometry.F @ to
-    elif geometry.H is not None:
+    value = None if geometry.F is None else to.T @ geometry.F @ to
+    if model == "homography":
         value = np.linalg.inv(to) @ geometry.H @ to
     pose = None if geometry.cam2_from_cam1 is None else np.asarray(geometry.cam2_from_cam1.matrix())
     kind = str(imported().TwoViewGeometryConfiguration(geometry.config).name)
@@ -215,17 +209,14 @@ def _estimate(value: Any, model: str, inliers: Tensor, pose: Any, reason: str) -
     matrix = torch.as_tensor(value if ok else np.zeros((3, 3)), dtype=torch.float64)[None]
     fields = {}
     if ok and pose is not None and np.any(pose[:, 3]):
-        R, t = torch.from_numpy(pose[:, :3].copy())[None], torch.from_numpy(pose[:, 3].copy())[None]
-        t = t / t.norm()
-        fields = {"R": R, "t": t, "E": cross_matrix(t) @ R}
-    return Estimate(
-        unit_frobenius(matrix), inliers & ok, torch.tensor([ok]), ("" if ok else reason or "no model",),
-        torch.zeros(1, dtype=torch.int64), model=model, **fields,
-    )  # fmt: skip
+        R, t = (torch.from_numpy(part.copy())[None] for part in (pose[:, :3], pose[:, 3]))
+        fields = {"R": R, "t": t / t.norm(), "E": cross_matrix(t / t.norm()) @ R}
+    reasons, samples = ("" if ok else reason or "no model",), torch.zeros(1, dtype=torch.int64)
+    F = unit_frobenius(matrix)
+    return Estimate(F, inliers & ok, torch.tensor([ok]), reasons, samples, model=model, **fields)
 
 
-def _same(count: int) -> NDArray[np.int64]:
-    """Matches (count, 2) of keypoint i in both images."""
+def _same(count: int) -> np.ndarray:
     return np.arange(count).repeat(2).reshape(-1, 2)
 
 

@@ -4,7 +4,7 @@ import csv
 import dataclasses
 import json
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,7 @@ import numpy as np
 from fmtorch.core.files import replacing
 from fmtorch.io import colmap, h5
 from fmtorch.io.match_file import write_geometry
-from fmtorch.io.match_store import MatchStore, StoredImage, StoredPair
+from fmtorch.io.match_store import MatchStore, StoredImage
 from fmtorch.io.predictions import pair_key_of
 
 KINDS = ("h5", "colmap")
@@ -75,23 +75,19 @@ def write_hloc(
     with replacing(folder / MATCHES) as temporary, h5py.File(temporary, "w") as file:
         for pair in (journal.pair(*ends) for ends in pairs):
             group = file.create_group(pair_key_of(pair.name0, pair.name1))
-            for name, values in _by_keypoint(pair, counts[pair.name0]):
-                group[name] = values
+            # By keypoint of the first image, which keeps the best of several: the last one written.
+            count, order = counts[pair.name0], np.argsort(pair.scores, kind="stable")
+            i, j = pair.matches[order].T
+            for name, blank, values in (
+                ("matches0", np.full(count, -1, np.int32), j),
+                ("matching_scores0", np.zeros(count, np.float32), pair.scores[order]),
+                ("inliers0", np.zeros(count, bool), pair.inliers[order]),
+            ):
+                blank[i] = values
+                group[name] = blank
             group.attrs["F"], group.attrs["related"] = pair.F, pair.related
             if pair.geometry is not None:
                 write_geometry(group, pair.geometry)
-
-
-def _by_keypoint(pair: StoredPair, count: int) -> Iterator[tuple[str, np.ndarray]]:
-    """The matches by keypoint of the first image, which keeps the best of several."""
-    order = np.argsort(pair.scores, kind="stable")  # the last one written wins
-    i, j = pair.matches[order].T
-    matches, scores, inliers = np.full(count, -1, np.int32), np.zeros(count, np.float32), np.zeros(count, bool)
-    matches[i], scores[i], inliers[i] = j, pair.scores[order], pair.inliers[order]
-    yield from (("matches0", matches), ("matching_scores0", scores), ("inliers0", inliers))
-
-
-# The view graph of a folder's images: which pairs were matched, and by how much they support one another
 
 
 GRAPH_JSON, GRAPH_CSV = "graph.json", "graph.csv"
@@ -119,21 +115,16 @@ class ViewGraph:
 
     def components(self) -> list[list[str]]:
         """The images that related pairs connect, largest component first, each in the order of the images."""
-        parent = {name: name for name in self.images}
-
-        def root(name: str) -> str:
-            while parent[name] != name:
-                parent[name] = parent[parent[name]]
-                name = parent[name]
-            return name
-
+        groups = {name: {name} for name in self.images}
         for edge in self.edges:
-            if edge.related:
-                parent[root(edge.image1)] = root(edge.image0)
-        groups: dict[str, list[str]] = {}
+            smaller, larger = sorted((groups[edge.image0], groups[edge.image1]), key=len)
+            if edge.related and smaller is not larger:
+                larger |= smaller
+                groups |= dict.fromkeys(smaller, larger)
+        ordered: dict[int, list[str]] = {}
         for name in self.images:
-            groups.setdefault(root(name), []).append(name)
-        return sorted(groups.values(), key=len, reverse=True)
+            ordered.setdefault(id(groups[name]), []).append(name)
+        return sorted(ordered.values(), key=len, reverse=True)
 
 
 def view_graph(journal: MatchStore, images: Sequence[Path], pairs: Sequence[tuple[Path, Path]]) -> ViewGraph:

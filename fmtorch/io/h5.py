@@ -3,29 +3,26 @@
 import contextlib
 import hashlib
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fmtorch.data.files import DataError
+from fmtorch.data.files import Array, DataError, Matrix
 
 HASHED_WHOLE = 1 << 30  # bytes up to which a file is hashed as a whole
 _BLOCKS, _BLOCK = 4096, 1 << 16  # of larger files: how many blocks of how many bytes
 SUFFIXES = (".h5", ".hdf5")
 
 
-def imported() -> ModuleType:
+def imported() -> Any:
     """h5py. Raises ImportError naming the extra where it is not installed."""
     try:
         import h5py
     except ImportError as error:
         raise ImportError("h5py is not installed; pip install 'fmtorch[h5]' brings it") from error
-    module: ModuleType = h5py
-    return module
+    return h5py
 
 
 @contextlib.contextmanager
@@ -42,27 +39,20 @@ def opened(path: Path) -> Iterator[Any]:
         yield file
 
 
-def keys(file: Any) -> list[str]:
-    """The names directly below a file or group. Raises DataError where they cannot be read."""
-    try:
-        return [str(name) for name in file]
-    except (OSError, RuntimeError) as error:
-        raise DataError(f"{_where(file)}: its keys cannot be read ({_first_line(error)})") from error
-
-
-def paths(file: Any) -> list[str]:
-    """The names below a file or group, at any depth. Raises DataError where they cannot be read."""
+def keys(file: Any, deep: bool = False) -> list[str]:
+    """The names directly below a file or group, or at any depth. Raises DataError where they cannot be read."""
     names: list[str] = []
     try:
-        file.visit(names.append)
+        if deep:
+            file.visit(names.append)
+        return names if deep else [str(name) for name in file]
     except (OSError, RuntimeError) as error:
         raise DataError(f"{_where(file)}: its keys cannot be read ({_first_line(error)})") from error
-    return names
 
 
 def groups_with(file: Any, *names: str) -> list[str]:
     """The paths of the groups that hold an array of one of these names, at any depth."""
-    ends = (path.rpartition("/") for path in paths(file))
+    ends = (path.rpartition("/") for path in keys(file, deep=True))
     return [group for group, _, name in ends if name in names and group]
 
 
@@ -74,7 +64,7 @@ def holds(file: Any, key: str) -> bool:
         raise DataError(f"{_where(file, key)} cannot be read ({_first_line(error)})") from error
 
 
-def array(file: Any, key: str, *shape: int | None) -> NDArray[Any]:
+def array(file: Any, key: str, *shape: int | None) -> Array:
     """The array under a key, of this shape; None stands for any length, no shape for any.
 
     Raises DataError, naming file and key, where it is missing, damaged or of another shape.
@@ -92,16 +82,18 @@ def array(file: Any, key: str, *shape: int | None) -> NDArray[Any]:
         if not holds(file, key):
             raise DataError(f"{_where(file, key)} is missing") from None
         raise DataError(f"{_where(file, key)} cannot be read ({_first_line(error)})") from error
-    fits = len(values.shape) == len(shape) and all(
-        want in (None, got) for want, got in zip(shape, values.shape, strict=True)
-    )
-    if shape and not fits:
+    if shape and not fits(values, shape):
         wanted = ", ".join("any" if n is None else str(n) for n in shape)
         raise DataError(f"{_where(file, key)} has shape {values.shape}; it must be ({wanted})")
     return values
 
 
-def _plain_array(file: Any, key: str) -> NDArray[Any] | None:
+def fits(values: Array, shape: Sequence[int | None]) -> bool:
+    """Whether an array has a shape, in which None stands for any length."""
+    return values.ndim == len(shape) and all(n in (None, m) for n, m in zip(shape, values.shape, strict=True))
+
+
+def _plain_array(file: Any, key: str) -> Array | None:
     """The numbers under a key by HDF5's own calls, in a third of h5py's time; None where it is anything else."""
     h5py = imported()
     try:
@@ -115,7 +107,7 @@ def _plain_array(file: Any, key: str) -> NDArray[Any] | None:
     return values
 
 
-def numbers(file: Any, key: str, *shape: int | None) -> NDArray[np.float64]:
+def numbers(file: Any, key: str, *shape: int | None) -> Matrix:
     """`array` as float64. Raises DataError where it holds no real numbers."""
     values = array(file, key, *shape)
     if values.dtype.kind not in "fiub":
@@ -123,7 +115,7 @@ def numbers(file: Any, key: str, *shape: int | None) -> NDArray[np.float64]:
     return values.astype(np.float64)
 
 
-def reshaped(file: Any, key: str, *shape: int) -> NDArray[np.float64]:
+def reshaped(file: Any, key: str, *shape: int) -> Matrix:
     """`numbers` of any shape that hold as many as this one, finite. Raises DataError where they do not."""
     values = numbers(file, key)
     if values.size != math.prod(shape):
@@ -138,14 +130,6 @@ def text(file: Any, key: str) -> str:
     value: Any = array(file, key).reshape(-1)
     value = value[0] if len(value) else ""
     return value.decode() if isinstance(value, bytes) else str(value)
-
-
-def digest_of(*paths: Path) -> str:
-    """The hex digest of files, see `add_to_digest`."""
-    digest = hashlib.blake2b(digest_size=16)
-    for path in paths:
-        add_to_digest(digest, path)
-    return digest.hexdigest()
 
 
 def add_to_digest(digest: Any, path: Path) -> None:

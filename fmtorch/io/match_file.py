@@ -2,16 +2,16 @@
 
 import contextlib
 import functools
+import hashlib
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fmtorch.core.files import replacing
-from fmtorch.data.files import DataError
+from fmtorch.data.files import Array, DataError, Indices, Matrix
 from fmtorch.io import h5
 from fmtorch.io.colmap import DatabaseImage
 from fmtorch.io.match_store import MATRICES, PairGeometry
@@ -36,7 +36,10 @@ class _OpenFiles:
         self._open.close()
 
     def identity(self) -> dict[str, Any]:
-        return {"files": h5.digest_of(*self.files)}
+        digest = hashlib.blake2b(digest_size=16)
+        for path in self.files:
+            h5.add_to_digest(digest, path)
+        return {"files": digest.hexdigest()}
 
     def has_geometry(self, pair: Names) -> bool:
         return False
@@ -75,7 +78,7 @@ class HlocMatches(_OpenFiles):
         with h5.opened(self._output) as written:
             return len(self._keys) if all(h5.holds(written, key) for key in self._keys.values()) else 0
 
-    def matches(self, pair: Names) -> NDArray[np.int64]:
+    def matches(self, pair: Names) -> Indices:
         """The matches of a pair, keypoints (n, 2). Raises DataError where there are no such keypoints."""
         second = self._second(pair)
         counts = [len(self.image(name).points) for name in pair]
@@ -94,8 +97,9 @@ class HlocMatches(_OpenFiles):
                 second = np.full(len(self._second(pair)), NO_MATCH, np.int32)
                 second[geometry.inliers[:, 0]] = geometry.inliers[:, 1]
                 group["matches0"] = second
-                scores = self._scores(pair)
-                if scores is not None:
+                key = f"{self._keys[pair]}/matching_scores0"
+                if h5.holds(self._matches, key):
+                    scores = h5.numbers(self._matches, key, None)
                     group["matching_scores0"] = np.where(second == NO_MATCH, 0, scores).astype(np.float32)
                 write_geometry(group, geometry)
 
@@ -107,15 +111,11 @@ class HlocMatches(_OpenFiles):
             first, second = next((both for both in ends if self._stored.keys() >= set(both)), (first, second))
         return self._stored.get(first, first), self._stored.get(second, second)
 
-    def _second(self, pair: Names) -> NDArray[np.int64]:
+    def _second(self, pair: Names) -> Indices:
         values = h5.array(self._matches, f"{self._keys[pair]}/matches0", None)
         if values.dtype.kind not in "iu":
             raise DataError(f"matches0 is of {values.dtype}; it must hold whole numbers")
         return values.astype(np.int64)
-
-    def _scores(self, pair: Names) -> NDArray[np.float64] | None:
-        key = f"{self._keys[pair]}/matching_scores0"
-        return h5.numbers(self._matches, key, None) if h5.holds(self._matches, key) else None
 
     def _image(self, name: str) -> DatabaseImage:
         points = h5.numbers(self._features, f"{name}/keypoints", None, 2).astype(np.float32)
@@ -129,9 +129,6 @@ def write_geometry(group: Any, geometry: PairGeometry) -> None:
     group.attrs.update({**geometry.texts, **geometry.matrices})
 
 
-# Matches alone: x0, x1 of one pair or of many in an npz or HDF5 file, and their geometries in another
-
-
 NPZ = ".npz"
 SUFFIXES = (NPZ, *h5.SUFFIXES)
 
@@ -142,16 +139,15 @@ class ArrayFile(NamedTuple):
     """The keys of a file's arrays, such as ``a/x0``, and what reads one, or raises DataError."""
 
     keys: list[str]
-    read: Callable[[str], NDArray[Any]]
+    read: Callable[[str], Array]
 
 
 class MatchFile(_OpenFiles):
     """The pairs of one file; each has matches of its own. output: the file of geometries that is written.
 
     A file holds ``x0, x1`` (n, 2), pixels with (0, 0) at the centre of the first one, and perhaps ``K0, K1`` (3, 3) and
-    ``size0, size1`` (h, w): of one pair, or of each pair below a name of its own (``a/x0``; in HDF5 a group).
-
-    Raises DataError where the file is of another kind or holds no such pair.
+    ``size0, size1`` (h, w): of one pair, or of each pair below a name of its own (``a/x0``; in HDF5 a group). Raises
+    DataError where the file is of another kind or holds no such pair.
     """
 
     def __init__(self, path: Path, output: Path) -> None:
@@ -162,10 +158,8 @@ class MatchFile(_OpenFiles):
             ends = [key.removesuffix("x0") for key in self._keys if key.rpartition("/")[2] == "x0"]
             self._pairs = sorted(end for end in ends if f"{end}x1" in self._keys)
             if not self._pairs:
-                raise DataError(
-                    f"{path} holds no x0 and x1; give matches x0, x1 (n, 2), alone or of each pair in a group, "
-                    "or hloc's features=F.h5 as well"
-                )
+                wanted = "matches x0, x1 (n, 2), alone or of each pair in a group, or hloc's features=F.h5 as well"
+                raise DataError(f"{path} holds no x0 and x1; give {wanted}")
             self._open = stack.pop_all()
 
     def pairs(self) -> list[Ids]:
@@ -177,7 +171,7 @@ class MatchFile(_OpenFiles):
             keys = set(written.keys)
         return len(self._pairs) if all(f"{pair}inliers" in keys for pair in self._pairs) else 0
 
-    def matches(self, pair: Ids) -> NDArray[np.int64]:
+    def matches(self, pair: Ids) -> Indices:
         """Point i with point i. Raises DataError where x0 and x1 have different lengths."""
         counts = [len(self.image(side).points) for side in pair]
         if counts[0] != counts[1]:
@@ -190,7 +184,7 @@ class MatchFile(_OpenFiles):
             entries = (self._entries(*pair) for pair in geometries)
             (_write_npz if self._output.suffix == NPZ else _write_h5)(temporary, entries)
 
-    def _entries(self, ids: Ids, geometry: PairGeometry) -> dict[str, NDArray[Any]]:
+    def _entries(self, ids: Ids, geometry: PairGeometry) -> dict[str, Array]:
         pair = ids[0].removesuffix("x0")
         inliers = np.zeros(len(self.image(ids[0]).points), bool)
         inliers[geometry.inliers[:, 0]] = True
@@ -201,24 +195,20 @@ class MatchFile(_OpenFiles):
     def _image(self, image_id: str) -> DatabaseImage:
         pair, i = image_id[:-2], int(image_id[-1])
         points = self._numbers(image_id, (None, 2)).astype(np.float32)
-        K, size = (
-            self._numbers(f"{pair}{key}", shape) if f"{pair}{key}" in self._keys else None
-            for key, shape in ((f"K{i}", (3, 3)), (f"size{i}", (2,)))
-        )
+        wanted = ((f"{pair}K{i}", (3, 3)), (f"{pair}size{i}", (2,)))
+        K, size = (self._numbers(key, shape) if key in self._keys else None for key, shape in wanted)
         known = None
         if size is not None:
             if not (np.isfinite(size).all() and (size >= 1).all()):
                 raise DataError(f"size{i} is {size.tolist()}; it must be the height and width of the image")
             known = int(size[0]), int(size[1])
-        deviation = np.inf if K is None else 0.0
-        return DatabaseImage(image_id, i, known, K, deviation, points, points)
+        return DatabaseImage(image_id, i, known, K, np.inf if K is None else 0.0, points, points)
 
-    def _numbers(self, key: str, shape: tuple[int | None, ...]) -> NDArray[np.float64]:
+    def _numbers(self, key: str, shape: tuple[int | None, ...]) -> Matrix:
         values = self._file.read(key)
         if values.dtype.kind not in "fiu":
             raise DataError(f"{key} is of {values.dtype}; it must hold real numbers")
-        fits = values.ndim == len(shape) and all(n in (None, m) for n, m in zip(shape, values.shape, strict=True))
-        if not fits:
+        if not h5.fits(values, shape):
             wanted = ", ".join("n" if n is None else str(n) for n in shape)
             raise DataError(f"{key} has shape {values.shape}; it must be ({wanted})")
         return values.astype(np.float64)
@@ -234,7 +224,7 @@ def expect_suffix(name: str, path: Path) -> None:
 def _arrays(path: Path) -> Iterator[ArrayFile]:
     if path.suffix != NPZ:
         with h5.opened(path) as file:
-            yield ArrayFile(h5.paths(file), functools.partial(h5.array, file))
+            yield ArrayFile(h5.keys(file, deep=True), functools.partial(h5.array, file))
         return
     try:
         npz = np.load(path)
@@ -243,7 +233,7 @@ def _arrays(path: Path) -> Iterator[ArrayFile]:
     if not isinstance(npz, np.lib.npyio.NpzFile):
         raise DataError(f"{path}: is a single array; write x0 and x1 by numpy.savez")
 
-    def read(key: str) -> NDArray[Any]:
+    def read(key: str) -> Array:
         try:
             return np.asarray(npz[key])
         except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
@@ -253,7 +243,7 @@ def _arrays(path: Path) -> Iterator[ArrayFile]:
         yield ArrayFile(list(npz.files), read)
 
 
-def _write_npz(path: Path, pairs: Iterable[Mapping[str, NDArray[Any]]]) -> None:
+def _write_npz(path: Path, pairs: Iterable[Mapping[str, Array]]) -> None:
     """As `numpy.savez` writes it, with one pair in memory."""
     with zipfile.ZipFile(path, "w") as archive:
         for entries in pairs:
@@ -262,7 +252,7 @@ def _write_npz(path: Path, pairs: Iterable[Mapping[str, NDArray[Any]]]) -> None:
                     np.lib.format.write_array(file, np.asarray(value), allow_pickle=False)
 
 
-def _write_h5(path: Path, pairs: Iterable[Mapping[str, NDArray[Any]]]) -> None:
+def _write_h5(path: Path, pairs: Iterable[Mapping[str, Array]]) -> None:
     """`inliers` as a data set of each pair's group, the others as its attributes."""
     h5py = h5.imported()
     with h5py.File(path, "w") as file:

@@ -15,19 +15,15 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fmtorch.core.files import replacing
 from fmtorch.data.cameras import Lens
-
-# The geometry of a pair as COLMAP's databases hold it
-
+from fmtorch.data.files import Array, Indices, Mask, Matrix, Singles
 
 ORIGIN = 0.5  # px: COLMAP's coordinates of the first pixel's centre
 
 Kind = Literal["calibrated", "uncalibrated", "planar", "panoramic", "planar_or_panoramic", "degenerate"]
 """COLMAP's configurations: of a general pair by whether both focal lengths are known, of others by what they show."""
-Matrix = NDArray[np.float64] | None
 MATRICES = ("F", "E", "H", "R", "t")
 
 
@@ -39,17 +35,17 @@ class PairGeometry(NamedTuple):
     """
 
     kind: Kind
-    inliers: NDArray[np.integer[Any]]
-    F: Matrix = None
-    E: Matrix = None
-    H: Matrix = None
-    R: Matrix = None
-    t: Matrix = None
+    inliers: Array
+    F: Matrix | None = None
+    E: Matrix | None = None
+    H: Matrix | None = None
+    R: Matrix | None = None
+    t: Matrix | None = None
     reason: str = ""
     warning: str = ""
 
     @property
-    def matrices(self) -> dict[str, NDArray[np.float64]]:
+    def matrices(self) -> dict[str, Matrix]:
         """Those of `MATRICES` that the pair has."""
         return {name: value for name in MATRICES if (value := getattr(self, name)) is not None}
 
@@ -77,7 +73,6 @@ def two_view_geometry(pycolmap: Any, pair: PairGeometry) -> Any:
     return geometry
 
 
-Array = NDArray[np.float64]
 _PAIR = ("matches", "scores", "inliers", "F", "related", "significance", "pair_type")
 
 
@@ -89,10 +84,10 @@ class StoredImage:
     """
 
     name: str
-    points: NDArray[np.float32]
-    scores: NDArray[np.float32]
+    points: Singles
+    scores: Singles
     size: tuple[int, int]
-    K: Array | None = None
+    K: Matrix | None = None
     lens: Lens | None = None
     focal: float | None = None
 
@@ -108,10 +103,10 @@ class StoredPair:
 
     name0: str
     name1: str
-    matches: NDArray[np.int32]
-    scores: NDArray[np.float32]
-    inliers: NDArray[np.bool_]
-    F: Array
+    matches: Array
+    scores: Singles
+    inliers: Mask
+    F: Matrix
     related: bool = True
     geometry: PairGeometry | None = None
     significance: float = math.nan
@@ -151,18 +146,15 @@ class MatchStore:
         return self._pair(image0, image1).exists()
 
     def add_image(self, image: Path, value: StoredImage) -> None:
-        arrays: dict[str, NDArray[Any]] = {"points": value.points, "scores": value.scores, "size": np.array(value.size)}
-        if value.K is not None:
-            arrays["K"] = value.K
-        if value.focal is not None:
-            arrays["focal"] = np.array(value.focal)
+        arrays: dict[str, Array] = {"points": value.points, "scores": value.scores, "size": np.array(value.size)}
+        arrays |= {name: np.asarray(k) for name in ("K", "focal") if (k := getattr(value, name)) is not None}
         if (lens := value.lens) is not None:
             arrays["lens_model"] = np.array(lens.model)
             arrays["lens"] = np.array([lens.fx, lens.fy, lens.cx, lens.cy, *lens.coefficients])
         _write(self._image(image), arrays)
 
     def add_pair(self, image0: Path, image1: Path, value: StoredPair) -> None:
-        arrays: dict[str, NDArray[Any]] = {name: np.asarray(getattr(value, name)) for name in _PAIR}
+        arrays: dict[str, Array] = {name: np.asarray(getattr(value, name)) for name in _PAIR}
         if (geometry := value.geometry) is not None:
             arrays |= {"kind": np.array(geometry.kind), "geometry_inliers": np.asarray(geometry.inliers)}
             arrays |= {f"geometry_{name}": matrix for name, matrix in geometry.matrices.items()}
@@ -200,7 +192,7 @@ class MatchStore:
         return _digest(self.name(image), image.absolute(), status.st_size, status.st_mtime_ns)
 
 
-def indices(points: NDArray[np.float32], x: NDArray[np.float32]) -> NDArray[np.int32]:
+def indices(points: Singles, x: Singles) -> Array:
     """Which of the points, (n, 2), each of x, (m, 2), is: the first at that location.
 
     Raises ValueError where x holds a point that is none of them: a matcher that moves points cannot be exported so.
@@ -216,7 +208,7 @@ def indices(points: NDArray[np.float32], x: NDArray[np.float32]) -> NDArray[np.i
     return index.astype(np.int32)
 
 
-def _keys(points: NDArray[np.float32]) -> NDArray[np.int64]:
+def _keys(points: Singles) -> Indices:
     """The bits of both coordinates of each point, (n,); 0 and -0 are one."""
     return np.ascontiguousarray(points + np.float32(0), np.float32).view(np.int64)[:, 0]
 
@@ -229,7 +221,7 @@ def _digest(name: str, path: Path, size: int, changed: int) -> str:
     return digest.hexdigest()
 
 
-def _write(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
+def _write(path: Path, arrays: dict[str, Array]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as temporary, temporary.open("wb") as file:
         np.savez(file, **arrays)  # type: ignore[arg-type]

@@ -1,64 +1,43 @@
 """Matches that other programs stored for the pairs of a data set: hloc's, glue-factory's and vismatch's files."""
 
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from fmtorch.core.types import Correspondences
 from fmtorch.data import DataError, GivenMatches, ImagePair, ImageSource, PairDataset, stored_size
+from fmtorch.data.files import Indices, Mask, Matrix
 from fmtorch.geometry.cameras import fundamental_from_projections
 from fmtorch.io import h5
 
-Array = NDArray[np.float64]
 Size = tuple[int, int]  # (h, w)
 MAX_OFF_CENTRE = 0.1  # of a principal point, in units of the side: those of reduced images are farther off
 _ZERO = np.zeros((3, 3))  # where there is no F
 
 
 def given(
-    x0: Array, x1: Array, sizes: tuple[Size, Size], features: tuple[int, int], *, ratio: Array | None = None,
-    score: Array | None = None, mutual: NDArray[np.bool_] | None = None,
+    x0: Matrix, x1: Matrix, sizes: tuple[Size, Size], features: tuple[int, int], *, ratio: Matrix | None = None,
+    score: Matrix | None = None, mutual: Mask | None = None,
 ) -> GivenMatches:  # fmt: skip
     """Matches of one pair, (n, 2) in pixels each; those that are not finite do not count.
 
     ratio, score, mutual: (n,), as of `Correspondences`. features: how many keypoints each image has.
     """
-    p0, p1 = (torch.from_numpy(np.ascontiguousarray(x, np.float32))[None] for x in (x0, x1))
     mask = torch.from_numpy(np.isfinite(x0).all(-1) & np.isfinite(x1).all(-1))[None]
-    return GivenMatches(
-        Correspondences(
-            torch.where(mask[..., None], p0, 0.0), torch.where(mask[..., None], p1, 0.0), mask,
-            ratio=_figure(ratio), score=_figure(score),
-            mutual=None if mutual is None else torch.from_numpy(mutual)[None] & mask,
-            size0=torch.tensor([sizes[0]]), size1=torch.tensor([sizes[1]]),
-        ),
-        features,
-    )  # fmt: skip
+    points = (torch.from_numpy(np.ascontiguousarray(x, np.float32))[None] for x in (x0, x1))
+    p0, p1 = (torch.where(mask[..., None], x, 0.0) for x in points)
+    size0, size1 = (torch.tensor([size]) for size in sizes)
+    known = {"ratio": _figure(ratio), "score": _figure(score), "size0": size0, "size1": size1}
+    both = None if mutual is None else torch.from_numpy(mutual)[None] & mask
+    return GivenMatches(Correspondences(p0, p1, mask, mutual=both, **known), features)
 
 
-def _figure(values: Array | None) -> torch.Tensor | None:
+def _figure(values: Matrix | None) -> torch.Tensor | None:
     return None if values is None else torch.from_numpy(values.astype(np.float32))[None]
-
-
-def calibrated(
-    identity: str, family: str, scene: str, images: tuple[ImageSource, ImageSource], K: tuple[Array, Array],
-    R: Array, t: Array,
-) -> ImagePair:  # fmt: skip
-    """A pair of cameras with X1 = R X0 + t, and the F of these; a problem where they define none."""
-    return with_fundamentals([posed(identity, family, scene, images, K, R, t)])[0]
-
-
-def posed(
-    identity: str, family: str, scene: str, images: tuple[ImageSource, ImageSource], K: tuple[Array, Array],
-    R: Array, t: Array, matches: Callable[[], GivenMatches] | None = None,
-) -> ImagePair:  # fmt: skip
-    """The same, of which `with_fundamentals` finds F or the problem."""
-    return ImagePair(identity, family, scene, *images, _ZERO, *K, R, t, None, matches)
 
 
 def with_fundamentals(pairs: Sequence[ImagePair]) -> list[ImagePair]:
@@ -84,11 +63,6 @@ def with_fundamentals(pairs: Sequence[ImagePair]) -> list[ImagePair]:
     return result
 
 
-def broken(identity: str, family: str, scene: str, images: tuple[ImageSource, ImageSource], problem: str) -> ImagePair:
-    """A pair that cannot be used, which becomes a row with this reason."""
-    return ImagePair(identity, family, scene, *images, np.zeros((3, 3)), problem=problem)
-
-
 def image(family: str, scene: str, name: str, folder: Path | None) -> ImageSource:
     """An image of which only the name is known, in a folder, or its sub-folder of the scene, where one is given."""
     path = Path(name)
@@ -97,24 +71,23 @@ def image(family: str, scene: str, name: str, folder: Path | None) -> ImageSourc
     return ImageSource(f"{family}/{scene}/{name}", path)
 
 
-def expect_size(source: ImageSource, size: Size, K: Array) -> None:
+def expect_size(source: ImageSource, size: Size, K: Matrix) -> None:
     """Raises DataError where an image's size (h, w) contradicts its camera: a copy that was reduced or cropped."""
     h, w = size
     if max(abs(K[0, 2] / w - 0.5), abs(K[1, 2] / h - 0.5)) > MAX_OFF_CENTRE:
-        raise DataError(
-            f"{source.path}: {w} x {h} px, but its camera's principal point is ({K[0, 2]:g}, {K[1, 2]:g}); it must be "
-            "the image as it was when its camera was determined"
-        )
+        centre = f"its camera's principal point is ({K[0, 2]:g}, {K[1, 2]:g})"
+        wanted = "the image as it was when its camera was determined"
+        raise DataError(f"{source.path}: {w} x {h} px, but {centre}; it must be {wanted}")
 
 
-def size_by_points(K: Array, x: Array) -> Size:
+def size_by_points(K: Matrix, x: Matrix) -> Size:
     """(h, w) of an image of unknown size: its principal point is the centre, and it holds all of the points (n, 2)."""
     bound = x[np.isfinite(x).all(-1)].max(0, initial=0.0)
     width, height = (max(2 * float(c) + 1, np.ceil(b) + 1) for c, b in zip(K[:2, 2], bound, strict=True))
     return round(height), round(width)
 
 
-def size_by_centre(K: Array) -> Size:
+def size_by_centre(K: Matrix) -> Size:
     """(h, w) of an image whose principal point is its centre: the best guess where nothing else tells it."""
     width, height = 2 * K[0, 2] + 1, 2 * K[1, 2] + 1
     if not (np.isfinite(width) and np.isfinite(height) and width >= 2 and height >= 2):
@@ -123,7 +96,6 @@ def size_by_centre(K: Array) -> Size:
 
 
 # Which stored image or pair is which of a data set: others name images by their path, or by its end
-
 
 DEPTH = 4  # parts of a path that a name may hold
 
@@ -144,18 +116,16 @@ def pair_keys(pair: ImagePair) -> Iterator[tuple[str, bool]]:
 
     ``a/b``, as hloc and glue-factory write it with hyphens for slashes within names, and ``a_b``.
     """
-    for swapped in (False, True):
-        image, other = (pair.image1, pair.image0) if swapped else (pair.image0, pair.image1)
-        for a, b in zip(names_of(image), names_of(other), strict=False):
-            for key in _keys(a, b):
-                yield key, swapped
+    names0, names1 = names_of(pair.image0), names_of(pair.image1)
+    for swapped, names in ((False, (names0, names1)), (True, (names1, names0))):
+        for a, b in zip(*names, strict=False):
+            yield from ((key, swapped) for key in _keys(a, b))
 
 
 def hloc_keys(name0: str, name1: str) -> Iterator[tuple[str, bool]]:
     """The keys of hloc's matches of two images of these names, and whether the images are in the other order."""
-    for swapped, (a, b) in ((False, (name0, name1)), (True, (name1, name0))):
-        for key in _keys(a, b):
-            yield key, swapped
+    yield from ((key, False) for key in _keys(name0, name1))
+    yield from ((key, True) for key in _keys(name1, name0))
 
 
 def pair_key_of(name0: str, name1: str) -> str:
@@ -167,9 +137,6 @@ def _keys(name0: str, name1: str) -> Iterator[str]:
     a, b = name0.replace("/", "-"), name1.replace("/", "-")
     yield f"{a}/{b}"
     yield f"{a}_{b}"
-
-
-# Predictions for the pairs of a data set: hloc's features and matches, glue-factory's and vismatch's predictions
 
 
 NO_MATCH = -1
@@ -194,19 +161,14 @@ class HLocMatches:
     def __call__(self) -> GivenMatches:
         with h5.opened(self.features) as file:
             points = [_keypoints(file, self.features, name) - self.origin for name in self.names]
-            sizes = tuple(
-                _size(file, f"{name}/image_size", image) for name, image in zip(self.names, self.images, strict=True)
-            )
+            ends = zip(self.names, self.images, strict=True)
+            size0, size1 = (_size(file, f"{name}/image_size", image) for name, image in ends)
         with h5.opened(self.matches) as file:
-            chosen, scores = _read_indices(file, self.matches, self.key)
-        order = (1, 0) if self.swapped else (0, 1)
-        i, j = _indices(chosen, [len(points[k]) for k in order], f"{self.matches}: {self.key + '/matches0'!r}")
+            counts = [len(p) for p in (reversed(points) if self.swapped else points)]
+            i, j, score = _read_matches(file, self.matches, self.key, self.key, counts)
         index = (j, i) if self.swapped else (i, j)
-        score = None if scores is None else scores[i]
-        return given(
-            points[0][index[0]], points[1][index[1]], (sizes[0], sizes[1]), (len(points[0]), len(points[1])),
-            score=score,
-        )  # fmt: skip
+        x0, x1 = (p[k] for p, k in zip(points, index, strict=True))
+        return given(x0, x1, (size0, size1), (len(points[0]), len(points[1])), score=score)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -226,32 +188,26 @@ class PairPrediction:
     def __call__(self) -> GivenMatches:
         with h5.opened(self.path) as file:
             group = file[self.key]
-            if h5.holds(group, "matches0"):
-                x, counts, score = self._indexed(group)
-            else:
-                x, counts, score = self._matched(group)
+            x, counts, score = (self._indexed if h5.holds(group, "matches0") else self._matched)(group)
             suffixes = ("1", "0") if self.swapped else ("0", "1")
             sizes = [_size(group, f"image_size{s}", image) for s, image in zip(suffixes, self.images, strict=True)]
         order = (1, 0) if self.swapped else (0, 1)
         x0, x1 = (x[k] - self.origin for k in order)
         return given(x0, x1, (sizes[0], sizes[1]), (counts[order[0]], counts[order[1]]), score=score)
 
-    def _indexed(self, group: Any) -> tuple[list[Array], list[int], Array | None]:
+    def _indexed(self, group: Any) -> tuple[list[Matrix], list[int], Matrix | None]:
         points = [h5.numbers(group, f"keypoints{k}", None, 2) for k in (0, 1)]
-        chosen, scores = _read_indices(group, self.path, "")
         counts = [len(p) for p in points]
-        i, j = _indices(chosen, counts, f"{self.path}: {self.key + '/matches0'!r}")
-        return [points[0][i], points[1][j]], counts, None if scores is None else scores[i]
+        i, j, score = _read_matches(group, self.path, "", self.key, counts)
+        return [points[0][i], points[1][j]], counts, score
 
-    def _matched(self, group: Any) -> tuple[list[Array], list[int], Array | None]:
+    def _matched(self, group: Any) -> tuple[list[Matrix], list[int], Matrix | None]:
         x = [h5.numbers(group, f"matched_kpts{k}", None, 2) for k in (0, 1)]
         if len(x[0]) != len(x[1]):
-            raise DataError(
-                f"{self.path}: {self.key!r} has {len(x[0])} points in matched_kpts0 and {len(x[1])} in matched_kpts1"
-            )
-        score = None
-        if h5.holds(group, "matched_confidences"):
-            score = h5.numbers(group, "matched_confidences", len(x[0]))
+            lengths = f"{len(x[0])} points in matched_kpts0 and {len(x[1])} in matched_kpts1"
+            raise DataError(f"{self.path}: {self.key!r} has {lengths}")
+        confident = h5.holds(group, "matched_confidences")
+        score = h5.numbers(group, "matched_confidences", len(x[0])) if confident else None
         counts = [len(p) for p in x]
         for k in (0, 1):
             if h5.holds(group, f"all_kpts{k}"):
@@ -307,25 +263,20 @@ def _expect_distinct(names: dict[str, str | None], path: Path) -> None:
     seen: dict[str, str] = {}
     for identity, name in names.items():
         if name is not None and seen.setdefault(name, identity) != identity:
-            raise DataError(
-                f"{path}: {name!r} could be image {seen[name]} or {identity}; names must tell images apart, "
-                "such as by their folder"
-            )
+            both = f"{path}: {name!r} could be image {seen[name]} or {identity}"
+            raise DataError(f"{both}; names must tell images apart, such as by their folder")
 
 
-def _read_indices(file: Any, path: Path, key: str) -> tuple[NDArray[np.int64], Array | None]:
-    prefix = f"{key}/" if key else ""
-    chosen = h5.array(file, f"{prefix}matches0", None)
-    if chosen.dtype.kind not in "iu":
-        raise DataError(f"{path}: {prefix + 'matches0'!r} is of {chosen.dtype}; it must hold whole numbers")
-    scores = None
-    if h5.holds(file, f"{prefix}matching_scores0"):
-        scores = h5.numbers(file, f"{prefix}matching_scores0", len(chosen))
-    return chosen.astype(np.int64), scores
-
-
-def _indices(chosen: NDArray[np.int64], counts: list[int], where: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """The matched keypoints of both images. Raises DataError where the indices cannot be those of the keypoints."""
+def _read_matches(
+    file: Any, path: Path, key: str, shown: str, counts: Sequence[int]
+) -> tuple[Indices, Indices, Matrix | None]:
+    """The matched keypoints of both images, and scores. Raises DataError for what cannot be of so many keypoints."""
+    prefix, where = f"{key}/" if key else "", f"{path}: {shown + '/matches0'!r}"
+    stored = h5.array(file, f"{prefix}matches0", None)
+    if stored.dtype.kind not in "iu":
+        raise DataError(f"{path}: {prefix + 'matches0'!r} is of {stored.dtype}; it must hold whole numbers")
+    scored, chosen = h5.holds(file, f"{prefix}matching_scores0"), stored.astype(np.int64)
+    scores = h5.numbers(file, f"{prefix}matching_scores0", len(chosen)) if scored else None
     if len(chosen) != counts[0]:
         raise DataError(f"{where} has {len(chosen)} entries, but the first image has {counts[0]} keypoints")
     if len(chosen) and chosen.min() < NO_MATCH:
@@ -333,10 +284,10 @@ def _indices(chosen: NDArray[np.int64], counts: list[int], where: str) -> tuple[
     if len(chosen) and chosen.max() >= counts[1]:
         raise DataError(f"{where} names keypoint {chosen.max()}, but the second image has {counts[1]}")
     i = np.flatnonzero(chosen != NO_MATCH)
-    return i, chosen[i]
+    return i, chosen[i], None if scores is None else scores[i]
 
 
-def _keypoints(file: Any, path: Path, name: str) -> Array:
+def _keypoints(file: Any, path: Path, name: str) -> Matrix:
     points = h5.numbers(file, f"{name}/keypoints", None, None)
     if points.shape[1] < 2:
         raise DataError(f"{path}: {name + '/keypoints'!r} has shape {points.shape}; it must be (n, 2) or wider")
@@ -344,7 +295,6 @@ def _keypoints(file: Any, path: Path, name: str) -> Array:
 
 
 def _size(file: Any, key: str, image: ImageSource) -> Size:
-    """(h, w) as stored, (w, h), or of the image itself."""
     if h5.holds(file, key):
         width, height = h5.reshaped(file, key, 2)
         return int(height), int(width)

@@ -1,14 +1,10 @@
 """The door from batched tensors to kernels, which see the arrays of one pair."""
 
-from __future__ import annotations
-
-import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from fmtorch.jobs.execution import available, mapped
@@ -43,22 +39,14 @@ def for_each_pair(
     return out.to(next(t.device for t in tensors if t is not None))
 
 
-def _array(tensor: Tensor | None, kind: torch.dtype, pairs: int) -> NDArray[Any]:
+def _array(tensor: Tensor | None, kind: torch.dtype, pairs: int) -> np.ndarray:
     if tensor is None:
-        return np.empty((pairs, 0), _numpy(kind))
+        return np.empty((pairs, 0), torch.empty(0, dtype=kind).numpy().dtype)
     if tensor.is_floating_point() and tensor.dtype != kind:
         tensor = tensor.to(kind)
-    array: NDArray[Any] = as_array(tensor.cpu().contiguous())
-    return array
+    return as_array(tensor.cpu().contiguous())
 
 
-@functools.cache
-def _numpy(kind: torch.dtype) -> Any:
-    """NumPy's name of a type of torch's."""
-    return torch.empty(0, dtype=kind).numpy().dtype
-
-
-def as_array(tensor: Tensor) -> NDArray[Any]:
+def as_array(tensor: Tensor) -> np.ndarray:
     """A tensor on the CPU as an array, a view, on no graph."""
-    array: NDArray[Any] = (tensor.detach() if tensor.requires_grad else tensor).numpy()
-    return array
+    return (tensor.detach() if tensor.requires_grad else tensor).numpy()

@@ -10,8 +10,6 @@ bytecode and values count as well; of a kernel, which is called through its addr
 Comments, docstrings, line numbers, and what no kernel reaches count for nothing.
 """
 
-from __future__ import annotations
-
 import contextlib
 import dis
 import enum
@@ -32,7 +30,7 @@ from typing import Any
 
 import numpy as np
 
-from fmtorch.core.files import cache_dir
+from fmtorch.core.files import cache_dir, replacing
 from fmtorch.jit import linking
 
 Function = Callable[..., Any]
@@ -88,10 +86,8 @@ def _code(code: types.CodeType, docstring: str | None = None) -> tuple[Any, ...]
 
 def _names(code: types.CodeType) -> list[str]:
     """All names in code, attributes among them, and in the code within it."""
-    return [
-        *code.co_names,
-        *(name for each in code.co_consts if isinstance(each, types.CodeType) for name in _names(each)),
-    ]
+    within = [each for each in code.co_consts if isinstance(each, types.CodeType)]
+    return [*code.co_names, *(name for each in within for name in _names(each))]
 
 
 def _global_names(code: types.CodeType) -> list[str]:
@@ -159,9 +155,8 @@ def named_by_version(function: Function, version: str) -> Function:
     """
     untyped: Any = function
     name = f"{untyped.__qualname__}_{version[:16]}"
-    named = types.FunctionType(
-        untyped.__code__, untyped.__globals__, untyped.__name__, untyped.__defaults__, untyped.__closure__
-    )
+    taken = (untyped.__code__, untyped.__globals__, untyped.__name__, untyped.__defaults__, untyped.__closure__)
+    named = types.FunctionType(*taken)
     named.__kwdefaults__, named.__module__, named.__qualname__ = untyped.__kwdefaults__, untyped.__module__, name
     return named
 
@@ -298,7 +293,10 @@ class KernelFile:
             data = dumps(_alone(result))
             self.calls = linking.called(data)
             if self.path is not None and not result._asdict()["library"].has_dynamic_globals:
-                _write(self.path, _signature(data) + data)
+                with replacing(self.path) as temporary:
+                    temporary.write_bytes(_signature(data) + data)
+        except OSError as error:
+            warnings.warn(f"compiled kernels are not kept: {error}", stacklevel=2)
         finally:
             self._release()
 
@@ -317,7 +315,6 @@ class KernelFile:
         return True
 
     def _release(self) -> None:
-        """Let other processes that wait for the file have it."""
         if self._lock is not None:
             self._lock.release()
             with contextlib.suppress(OSError):
@@ -348,23 +345,12 @@ def _alone(result: Any) -> Any:
     return (library, kind, (code, defined.as_bitcode())), *rest, used
 
 
-def _write(path: Path, data: bytes) -> None:
-    from fmtorch.core.files import replacing
-
-    try:
-        with replacing(path) as temporary:
-            temporary.write_bytes(data)
-    except OSError as error:
-        warnings.warn(f"compiled kernels are not kept: {error}", stacklevel=3)
-
-
 def _of(signature: Any, result: Any) -> Any:
     """A compiled function by the types of this process: a group of a script or a notebook is another class in each."""
-    from numba.core import sigutils
-    from numba.core.typing import signature as typed
+    from numba.core import sigutils, typing
 
     arguments, _ = sigutils.normalize_signature(signature)
-    return result._replace(signature=typed(result.signature.return_type, *arguments))
+    return result._replace(signature=typing.signature(result.signature.return_type, *arguments))
 
 
 def _signature(data: bytes) -> bytes:
@@ -372,4 +358,4 @@ def _signature(data: bytes) -> bytes:
 
 
 def _hex(data: bytes) -> str:
-    return hashlib.blake2b(data, digest_size=16).hexdigest()
+    return _signature(data).hex()

@@ -11,9 +11,6 @@ is imported from numba before the first call. With ``FMTORCH_KERNELS=off`` estim
 Python, all else takes its tensor form.
 """
 
-from __future__ import annotations
-
-import contextlib
 import functools
 import gc
 import inspect
@@ -21,43 +18,30 @@ import os
 import sys
 import threading
 import warnings
-from collections.abc import Callable, Iterable, Iterator
-from typing import (
-    Annotated,
-    Any,
-    Generic,
-    ParamSpec,
-    TypeAlias,
-    TypeVar,
-    get_args,
-    get_origin,
-    get_type_hints,
-    overload,
-)
+from collections.abc import Callable, Iterable
+from typing import Annotated, Any, Generic, ParamSpec, TypeVar, get_args, get_origin, get_type_hints, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fmtorch.jit import cache, linking
-from fmtorch.jit.cache import named_by_version, version
-from fmtorch.jit.linking import inner_compiler
 
-Array: TypeAlias = NDArray[Any]
-F8x1: TypeAlias = Annotated[NDArray[np.float64], "f8[::1]"]
-F8x2: TypeAlias = Annotated[NDArray[np.float64], "f8[:, ::1]"]
-F8x3: TypeAlias = Annotated[NDArray[np.float64], "f8[:, :, ::1]"]
-F8x4: TypeAlias = Annotated[NDArray[np.float64], "f8[:, :, :, ::1]"]
-F4x1: TypeAlias = Annotated[NDArray[np.float32], "f4[::1]"]
-F4x2: TypeAlias = Annotated[NDArray[np.float32], "f4[:, ::1]"]
-F4x3: TypeAlias = Annotated[NDArray[np.float32], "f4[:, :, ::1]"]
-I1x2: TypeAlias = Annotated[NDArray[np.int8], "i1[:, ::1]"]
-I8x1: TypeAlias = Annotated[NDArray[np.int64], "i8[::1]"]
-I8x2: TypeAlias = Annotated[NDArray[np.int64], "i8[:, ::1]"]
-I4x1: TypeAlias = Annotated[NDArray[np.int32], "i4[::1]"]
-I4x2: TypeAlias = Annotated[NDArray[np.int32], "i4[:, ::1]"]
-U1x1: TypeAlias = Annotated[NDArray[np.uint8], "u1[::1]"]
-B1x1: TypeAlias = Annotated[NDArray[np.bool_], "b1[::1]"]
-B1x2: TypeAlias = Annotated[NDArray[np.bool_], "b1[:, ::1]"]
+Array = NDArray[Any]
+F8x1 = Annotated[NDArray[np.float64], "f8[::1]"]
+F8x2 = Annotated[NDArray[np.float64], "f8[:, ::1]"]
+F8x3 = Annotated[NDArray[np.float64], "f8[:, :, ::1]"]
+F8x4 = Annotated[NDArray[np.float64], "f8[:, :, :, ::1]"]
+F4x1 = Annotated[NDArray[np.float32], "f4[::1]"]
+F4x2 = Annotated[NDArray[np.float32], "f4[:, ::1]"]
+F4x3 = Annotated[NDArray[np.float32], "f4[:, :, ::1]"]
+I1x2 = Annotated[NDArray[np.int8], "i1[:, ::1]"]
+I8x1 = Annotated[NDArray[np.int64], "i8[::1]"]
+I8x2 = Annotated[NDArray[np.int64], "i8[:, ::1]"]
+I4x1 = Annotated[NDArray[np.int32], "i4[::1]"]
+I4x2 = Annotated[NDArray[np.int32], "i4[:, ::1]"]
+U1x1 = Annotated[NDArray[np.uint8], "u1[::1]"]
+B1x1 = Annotated[NDArray[np.bool_], "b1[::1]"]
+B1x2 = Annotated[NDArray[np.bool_], "b1[:, ::1]"]
 
 NUMBERS = {int: "int64", float: "float64", bool: "boolean", np.float32: "float32"}  # numba's names
 
@@ -65,9 +49,8 @@ NUMBERS = {int: "int64", float: "float64", bool: "boolean", np.float32: "float32
 def signature_of(function: Callable[..., Any]) -> tuple[Any, ...]:
     """The types of a function's arguments, as numba compiles for them, from its annotations.
 
-    They are array types of this file, numbers, bool, and groups: NamedTuples of such types.
-
-    Raises TypeError, naming the argument, for a type that is none of these.
+    They are array types of this file, numbers, bool, and groups: NamedTuples of such types. Raises TypeError, naming
+    the argument, for a type that is none of these.
     """
     hints = get_type_hints(function, include_extras=True)
     names = function.__code__.co_varnames[: function.__code__.co_argcount]
@@ -97,9 +80,8 @@ def _type(hint: Any, what: str) -> Any:
         fields = get_type_hints(hint, include_extras=True)
         members = [_type(fields[name], f"{what}.{name}") for name in hint._fields]
         return types.BaseTuple.from_types(members, hint)  # where all are alike, a type of its own
-    raise TypeError(
-        f"{what} is annotated {hint}; it must be an array type of `fmtorch.jit.kernel`, a number or a NamedTuple"
-    )
+    wanted = "an array type of `fmtorch.jit.kernel`, a number or a NamedTuple"
+    raise TypeError(f"{what} is annotated {hint}; it must be {wanted}")
 
 
 SWITCH = "FMTORCH_KERNELS"
@@ -197,7 +179,7 @@ class Kernel(Generic[P, R]):
     @functools.cached_property
     def version(self) -> str:
         """What it is made of, in hexadecimal digits (`fmtorch.jit.cache`)."""
-        return version(self.function, described(self.signature), f"holds_gil={self.holds_gil}")
+        return cache.version(self.function, described(self.signature), f"holds_gil={self.holds_gil}")
 
     def described(self) -> tuple[str, None]:
         """Its name and types, all that a kernel that calls it depends on."""
@@ -259,9 +241,8 @@ class Inner(Generic[P, R]):
     Called from Python it is the plain function, slow and easy to test.
     """
 
-    def __init__(self, function: Callable[P, R], inline: bool) -> None:
+    def __init__(self, function: Callable[P, R]) -> None:
         self.function: Callable[P, R] = inspect.unwrap(function)
-        self.inline = inline
         functools.update_wrapper(self, self.function)
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
@@ -272,9 +253,8 @@ class Inner(Generic[P, R]):
     def _dispatcher(self) -> Any:
         import numba
 
-        how: dict[str, Any] = {"inline": "always"} if self.inline else {}
-        function = named_by_version(self.function, version(self.function))
-        return numba.njit(**OPTIONS, no_cpython_wrapper=True, pipeline_class=inner_compiler(), **how)(function)
+        function = cache.named_by_version(self.function, cache.version(self.function))
+        return numba.njit(**OPTIONS, no_cpython_wrapper=True, pipeline_class=linking.inner_compiler())(function)
 
     @property
     def _numba_type_(self) -> Any:
@@ -284,10 +264,13 @@ class Inner(Generic[P, R]):
 
     def described(self) -> tuple[str, Callable[..., Any] | None]:
         """How it is compiled, and its function, which is compiled into those that call it."""
-        return f"inner, inline={self.inline}", self.function
+        return "inner", self.function
 
     def __reduce__(self) -> str:
         return str(self.__qualname__)  # type: ignore[attr-defined]  # the name to import it by
+
+
+inner = Inner
 
 
 @overload
@@ -317,25 +300,15 @@ def kernel(
     return named
 
 
-@overload
-def inner(function: Callable[P, R]) -> Inner[P, R]: ...
-@overload
-def inner(*, inline: bool) -> Callable[[Callable[P, R]], Inner[P, R]]: ...
-def inner(function: Callable[P, R] | None = None, *, inline: bool = False) -> Any:
-    """Makes a function an `Inner` one. inline: numba, too, inlines it; LLVM does so anyway where it is small."""
-    return Inner(function, inline) if function is not None else lambda f: Inner(f, inline)
-
-
 def _compiled(uncompiled: Kernel[P, R], count: str) -> tuple[Callable[P, R], list[Kernel[..., Any]]]:
     """The compiled function of a kernel, whose address its cell holds from now on, and the kernels that it calls."""
     import numba
 
     function = uncompiled.function
     how = OPTIONS | {"nogil": not uncompiled.holds_gil}
-    dispatcher: Any = numba.njit(**how)(named_by_version(function, uncompiled.version))
+    dispatcher: Any = numba.njit(**how)(cache.named_by_version(function, uncompiled.version))
     if not hasattr(dispatcher, "compile"):
         return function, []  # NUMBA_DISABLE_JIT=1
-
     announced: list[str] = []
 
     def announce(where: str) -> None:
@@ -343,8 +316,13 @@ def _compiled(uncompiled: Kernel[P, R], count: str) -> tuple[Callable[P, R], lis
         announced.append(where)
 
     file = dispatcher._cache = cache.KernelFile(cache.path(function, uncompiled.version), announce)
-    with _no_garbage_collection():
+    enabled = gc.isenabled()
+    gc.disable()  # numba makes millions of objects, nearly all of which stay
+    try:
         dispatcher.compile(uncompiled.signature)
+    finally:
+        if enabled:
+            gc.enable()
     if announced:
         ended()
     dispatcher.disable_compile()
@@ -352,18 +330,6 @@ def _compiled(uncompiled: Kernel[P, R], count: str) -> tuple[Callable[P, R], lis
     linking.publish(function, result)
     compiled: Callable[P, R] = dispatcher
     return compiled, file.calls
-
-
-@contextlib.contextmanager
-def _no_garbage_collection() -> Iterator[None]:
-    """Within it Python does not look for circles of objects: numba makes millions, nearly all of which stay."""
-    enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if enabled:
-            gc.enable()
 
 
 @inner

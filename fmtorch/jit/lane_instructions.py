@@ -3,8 +3,6 @@
 Imported when the first kernel that uses lanes is compiled.
 """
 
-from __future__ import annotations
-
 import operator
 from collections.abc import Callable
 from typing import Any
@@ -12,8 +10,7 @@ from typing import Any
 import numba
 from llvmlite import ir
 from numba import types
-from numba.core import cgutils
-from numba.core.registry import cpu_target
+from numba.core import cgutils, registry
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 from numba.extending import intrinsic, lower_builtin, models, register_model
 
@@ -31,7 +28,7 @@ class LanesType(types.Type):  # type: ignore[misc]
         super().__init__(name=f"lanes({dtype} x {count})")
 
     @property
-    def mask(self) -> LanesType:
+    def mask(self) -> "LanesType":
         """The type of a comparison's value."""
         return LanesType(types.boolean, self.count)
 
@@ -85,10 +82,6 @@ def _lowered(function: Any, instruction: Callable[[Any, Any, Any], Any]) -> None
     lower_builtin(function, LanesType, LanesType)(code)
 
 
-def _arithmetic(name: str) -> Callable[[Any, Any, Any], Any]:
-    return lambda builder, a, b: getattr(builder, name)(a, b)
-
-
 def _comparison(sign: str) -> Callable[[Any, Any, Any], Any]:
     ordered = sign != "!="  # a number differs from what is none
     return lambda builder, a, b: (builder.fcmp_ordered if ordered else builder.fcmp_unordered)(sign, a, b)
@@ -97,7 +90,7 @@ def _comparison(sign: str) -> Callable[[Any, Any, Any], Any]:
 for _name, _instruction in ARITHMETIC.items():
     for _function in (getattr(operator, _name), getattr(operator, f"i{_name}")):
         _typed(_function, lambda kind: kind)
-        _lowered(_function, _arithmetic(_instruction))
+        _lowered(_function, getattr(ir.IRBuilder, _instruction))
 for _name, _sign in COMPARISONS.items():
     _typed(getattr(operator, _name), lambda kind: kind.mask)
     _lowered(getattr(operator, _name), _comparison(_sign))
@@ -128,11 +121,7 @@ infer_global(operator.neg)(_Negative)
 lower_builtin(operator.neg, LanesType)(lambda context, builder, sig, args: builder.fneg(args[0]))
 
 
-# `lanes` for numba: the functions of lanes as intrinsics, made of vector instructions of LLVM
-
-
 def _place(context: Any, builder: Any, array: Any, given: Any, row: Any, count: int, bits: Any) -> Any:
-    """Where a row of an array (rows, lanes) begins, as the place of a vector."""
     data = context.make_array(array)(context, builder, given).data
     place = builder.gep(data, [builder.mul(row, ir.Constant(INDEX, count))])
     return builder.bitcast(place, ir.VectorType(bits, count).as_pointer())
@@ -176,100 +165,69 @@ def fill(count: int) -> Any:
     return of_number
 
 
-def store() -> Any:
+@intrinsic  # type: ignore[untyped-decorator]
+def store(context: Any, A: Any, row: Any, value: Any) -> Any:
     """`lanes.store`."""
+    if A.dtype != value.dtype:
+        raise numba.TypingError(f"{value} cannot be stored in an array of {A.dtype}")
 
-    @intrinsic  # type: ignore[untyped-decorator]
-    def to_row(context: Any, A: Any, row: Any, value: Any) -> Any:
-        if A.dtype != value.dtype:
-            raise numba.TypingError(f"{value} cannot be stored in an array of {A.dtype}")
+    def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        bits, vector = context.get_data_type(A.dtype), args[2]
+        if A.dtype == types.boolean:
+            vector = builder.zext(vector, ir.VectorType(bits, value.count))
+        place = _place(context, builder, A, args[0], args[1], value.count, bits)
+        builder.store(vector, place, align=_size(A.dtype))
+        return context.get_dummy_value()
 
-        def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-            bits, vector = context.get_data_type(A.dtype), args[2]
-            if A.dtype == types.boolean:
-                vector = builder.zext(vector, ir.VectorType(bits, value.count))
-            place = _place(context, builder, A, args[0], args[1], value.count, bits)
-            builder.store(vector, place, align=_size(A.dtype))
-            return context.get_dummy_value()
-
-        return types.void(A, types.int64, value), code
-
-    return to_row
+    return types.void(A, types.int64, value), code
 
 
-def where() -> Any:
+@intrinsic  # type: ignore[untyped-decorator]
+def where(context: Any, mask: Any, this: Any, other: Any) -> Any:
     """`lanes.where`."""
+    kind = operands((this, other))
+    if kind is None or mask != kind.mask:
+        raise numba.TypingError(f"where of {mask}, {this} and {other}")
 
-    @intrinsic  # type: ignore[untyped-decorator]
-    def select(context: Any, mask: Any, this: Any, other: Any) -> Any:
-        kind = operands((this, other))
-        if kind is None or mask != kind.mask:
-            raise numba.TypingError(f"where of {mask}, {this} and {other}")
+    def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        first = filled(context, builder, args[1], this, kind)
+        return builder.select(args[0], first, filled(context, builder, args[2], other, kind))
 
-        def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-            first = filled(context, builder, args[1], this, kind)
-            return builder.select(args[0], first, filled(context, builder, args[2], other, kind))
-
-        return kind(mask, this, other), code
-
-    return select
+    return kind(mask, this, other), code
 
 
-def sqrt() -> Any:
-    """`lanes.sqrt`."""
-    return _library("llvm.sqrt", 1)
-
-
-def absolute() -> Any:
-    """`lanes.absolute`."""
-    return _library("llvm.fabs", 1)
-
-
-def copysign() -> Any:
-    """`lanes.copysign`."""
-    return _library("llvm.copysign", 2)
-
-
-def any_lane() -> Any:
+@intrinsic  # type: ignore[untyped-decorator]
+def any_lane(context: Any, mask: Any) -> Any:
     """`lanes.any_lane`."""
 
-    @intrinsic  # type: ignore[untyped-decorator]
-    def of_mask(context: Any, mask: Any) -> Any:
-        def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-            bits = builder.bitcast(args[0], ir.IntType(mask.count))
-            return builder.icmp_unsigned("!=", bits, ir.Constant(bits.type, 0))
+    def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        bits = builder.bitcast(args[0], ir.IntType(mask.count))
+        return builder.icmp_unsigned("!=", bits, ir.Constant(bits.type, 0))
 
-        return types.boolean(mask), code
-
-    return of_mask
+    return types.boolean(mask), code
 
 
-def added() -> Any:
+@intrinsic  # type: ignore[untyped-decorator]
+def added(context: Any, value: Any) -> Any:
     """`lanes.added`."""
 
-    @intrinsic  # type: ignore[untyped-decorator]
-    def of_value(context: Any, value: Any) -> Any:
-        def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-            (total,), count = args, value.count
-            while count > 1:
-                count //= 2
-                halves = [_selected_lanes(builder, total, range(k * count, (k + 1) * count)) for k in range(2)]
-                total = builder.fadd(*halves)
-            return builder.extract_element(total, ir.Constant(INDEX, 0))
+    def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        (total,), count = args, value.count
+        while count > 1:
+            count //= 2
+            halves = [_selected_lanes(builder, total, range(k * count, (k + 1) * count)) for k in range(2)]
+            total = builder.fadd(*halves)
+        return builder.extract_element(total, ir.Constant(INDEX, 0))
 
-        return value.dtype(value), code
-
-    return of_value
+    return value.dtype(value), code
 
 
 def _selected_lanes(builder: Any, vector: Any, lanes: range) -> Any:
-    """These lanes of a vector."""
     which = ir.Constant(ir.VectorType(ir.IntType(32), len(lanes)), list(lanes))
     return builder.shuffle_vector(vector, ir.Constant(vector.type, ir.Undefined), which)
 
 
 def _library(name: str, arguments: int) -> Any:
-    """A function of LLVM that takes so many values of lanes."""
 
     def implementation(kinds: tuple[Any, ...]) -> Any:
         def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
@@ -295,8 +253,11 @@ def _library(name: str, arguments: int) -> Any:
     return binary
 
 
+sqrt, absolute, copysign = _library("llvm.sqrt", 1), _library("llvm.fabs", 1), _library("llvm.copysign", 2)
+
+
 def type_of(function: Any) -> Any:
     """The type of an intrinsic, as which a kernel knows it."""
-    context = cpu_target.typing_context
+    context = registry.cpu_target.typing_context
     context.refresh()
     return context.resolve_value_type(function)

@@ -11,8 +11,6 @@ which they are written; a loop over the lanes would have to ask first whether it
 memory. From Python a value is an array that no operator changes.
 """
 
-from __future__ import annotations
-
 import functools
 import inspect
 import platform
@@ -20,11 +18,8 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fmtorch.jit.kernel import OPTIONS, Inner
-
-Array = NDArray[Any]
+from fmtorch.jit.kernel import OPTIONS, Array, Inner
 
 
 class Value(np.ndarray):
@@ -39,7 +34,7 @@ class LaneFunction(Inner[..., Any]):
     """A function of lanes: in Python that of arrays, in kernels the intrinsic of this name in `lane_instructions`."""
 
     def __init__(self, function: Callable[..., Any], *parameters: int) -> None:
-        super().__init__(function, inline=False)
+        super().__init__(function)
         self.parameters = parameters
 
     def described(self) -> tuple[str, None]:
@@ -48,9 +43,10 @@ class LaneFunction(Inner[..., Any]):
 
     @functools.cached_property
     def _numba_type_(self) -> Any:  # asked by numba where a kernel calls this function
-        from fmtorch.jit import lane_instructions as lane_functions
+        from fmtorch.jit import lane_instructions
 
-        return lane_functions.type_of(getattr(lane_functions, self.function.__name__)(*self.parameters))
+        intrinsic = getattr(lane_instructions, self.function.__name__)
+        return lane_instructions.type_of(intrinsic(*self.parameters) if self.parameters else intrinsic)
 
 
 class Lanes(NamedTuple):
@@ -155,4 +151,4 @@ def _fused(a: Any, b: Any, c: Any) -> Any:
     return np.float32(np.float64(a) + np.float64(b) * np.float64(c))
 
 
-fused = _Fused(_fused, inline=False)
+fused = _Fused(_fused)

@@ -5,8 +5,6 @@ kernel has a cell of memory that holds its address, and what calls it knows the 
 compiled once, alone and in any order; before it is first called, those that it calls must have their addresses.
 """
 
-from __future__ import annotations
-
 import ctypes
 import functools
 import importlib
@@ -68,17 +66,14 @@ def callable_type(function: Callable[..., Any], signature: Any) -> Any:
     Raises TypeError unless the function says by an annotation that it returns None, bool, int or float.
     """
     from llvmlite import ir
-    from numba.core import cgutils, sigutils, types
-    from numba.core.registry import cpu_target
-    from numba.core.typing import signature as typed
-    from numba.core.typing.templates import make_concrete_template
+    from numba.core import cgutils, registry, sigutils, types, typing
 
     annotation = returned(function)
     if annotation not in RETURNED:
         names = ", ".join(RETURNED)
         raise TypeError(f"{function.__qualname__} is called by a kernel: annotate what it returns as one of {names}")
     arguments, _ = sigutils.normalize_signature(signature)
-    numba_signature = typed(getattr(types, RETURNED[annotation]), *arguments)
+    numba_signature = typing.signature(getattr(types, RETURNED[annotation]), *arguments)
     module, name = function.__module__, function.__qualname__
     cell(module, name)
 
@@ -93,8 +88,8 @@ def callable_type(function: Callable[..., Any], signature: Any) -> Any:
             context.call_conv.return_status_propagate(builder, status)
         return value
 
-    cpu_target.target_context.insert_func_defn([(call, function, numba_signature.args)])
-    return types.Function(make_concrete_template(name, function, [numba_signature]))
+    registry.cpu_target.target_context.insert_func_defn([(call, function, numba_signature.args)])
+    return types.Function(typing.templates.make_concrete_template(name, function, [numba_signature]))
 
 
 def publish(function: Callable[..., Any], result: Any) -> None:
@@ -126,8 +121,7 @@ def inner_compiler() -> Any:
     whole after all of its inner functions have been linked in, so that this would be half of compiling's time for
     nothing. The names used here are numba's own.
     """
-    from numba.core.codegen import JITCodeLibrary
-    from numba.core.compiler import Compiler
+    from numba.core import codegen, compiler
 
     class Codegen:
         """The code generator of a library whose functions have no environment in memory."""
@@ -141,7 +135,7 @@ def inner_compiler() -> Any:
         def set_env(self, name: str, env: Any) -> None:
             """Nothing: there is no machine code that would read it."""
 
-    class InnerLibrary(JITCodeLibrary):  # type: ignore[misc]
+    class InnerLibrary(codegen.JITCodeLibrary):  # type: ignore[misc]
         """Code that is only linked."""
 
         @property
@@ -157,7 +151,7 @@ def inner_compiler() -> Any:
         def get_pointer_to_function(self, name: str) -> int:
             return 0
 
-    class InnerCompiler(Compiler):  # type: ignore[misc]
+    class InnerCompiler(compiler.Compiler):  # type: ignore[misc]
         """numba's compiler, into an `InnerLibrary`."""
 
         def __init__(self, typingctx: Any, targetctx: Any, library: Any, *others: Any) -> None:

@@ -4,8 +4,6 @@ Tensors have `bits` and `uniform`, kernels `random_bits` and `uniform_kernel`: t
 same numbers.
 """
 
-from __future__ import annotations
-
 import enum
 import functools
 from typing import Any
@@ -51,7 +49,6 @@ _GAMMA, _MIX1, _MIX2 = (wrap(c) for c in (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9
 
 
 def _shift_right(x: Tensor, n: int) -> Tensor:
-    """Logical right shift of int64."""
     return (x >> n).bitwise_and_((1 << (64 - n)) - 1)
 
 

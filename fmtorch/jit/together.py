@@ -4,8 +4,6 @@ The other process goes through the same kernels from the last to the first and l
 Where the two meet, one waits for the other: each kernel's file has a lock.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import subprocess
@@ -50,7 +48,7 @@ def _helped(kernels: Sequence[Kernel[..., Any]]) -> Iterator[None]:
     path = os.pathsep.join([str(HOME), *filter(None, [os.environ.get("PYTHONPATH")])])
     try:
         helper = subprocess.Popen(
-            [sys.executable, "-m", "fmtorch.jit.together", *names], env={**os.environ, "PYTHONPATH": path},
+            [sys.executable, "-m", __name__, *names], env={**os.environ, "PYTHONPATH": path},
             stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
         )  # fmt: skip
     except OSError:

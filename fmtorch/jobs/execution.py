@@ -12,6 +12,7 @@ from typing import TypeVar
 import torch
 
 T = TypeVar("T")
+R = TypeVar("R")
 
 KINDS = ("auto", "threads", "processes", "dask")
 MIN_PAIRS_FOR_PROCESSES = 1000  # of given matches, start included: 10.0 s by one thread, 8.4 by two processes
@@ -79,11 +80,6 @@ def shard_of(text: str | None) -> Shard | None:
         raise ValueError(f"shard={text}; it must be i/n with i from 1 to n: shard=2/8")
     return Shard(int(match[1]), int(match[2]))
 
-
-# How many threads a stage, a worker or a loop over pairs computes with
-
-
-R = TypeVar("R")
 
 _held: ContextVar[int] = ContextVar("_held", default=1)
 

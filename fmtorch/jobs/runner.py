@@ -8,7 +8,6 @@ says nothing to the worker, the task is sent again with how to make it.
 import contextlib
 import functools
 import hashlib
-import multiprocessing
 import multiprocessing.connection
 import os
 import pickle
@@ -19,16 +18,8 @@ import time
 import types
 from collections import OrderedDict
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import (
-    FIRST_COMPLETED,
-    BrokenExecutor,
-    CancelledError,
-    Executor,
-    Future,
-    ProcessPoolExecutor,
-    ThreadPoolExecutor,
-    wait,
-)
+from concurrent import futures
+from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
 from typing import Any, Generic, TypeVar, cast
 
 import torch
@@ -48,7 +39,7 @@ class WorkersLost(ConnectionError):
     """Workers, or the scheduler, that are there no more; what was stored is kept."""
 
 
-class WorkerPool:
+class WorkerPool(contextlib.AbstractContextManager["WorkerPool"]):
     """The workers of an `Execution`, started at their first task, and replaced where they broke; a context manager.
 
     Args:
@@ -66,9 +57,6 @@ class WorkerPool:
         self.size = max(1, count if limit is None else min(count, limit))
         self._executor: Executor | None = None
         self._cluster: _Cluster | None = None
-
-    def __enter__(self) -> "WorkerPool":
-        return self
 
     def __exit__(self, *error: object) -> None:
         self.close()
@@ -101,9 +89,8 @@ class WorkerPool:
         """What to say where an error means that the scheduler is gone."""
         if self._cluster is None or not self._cluster.lost(error):
             return None
-        return WorkersLost(
-            f"the scheduler at {self._cluster.address} was lost; with another, the same command goes on from here"
-        )
+        lost = f"the scheduler at {self._cluster.address} was lost"
+        return WorkersLost(f"{lost}; with another, the same command goes on from here")
 
     def _started(self) -> Executor:
         execution = self.execution
@@ -119,7 +106,7 @@ class WorkerPool:
         if execution.kind == "dask":
             self._cluster = _Cluster(execution.address, self.size)
             return self._cluster.executor
-        return self._processes() if execution.kind == "processes" else ThreadPoolExecutor(self.size)
+        return self._processes() if execution.kind == "processes" else futures.ThreadPoolExecutor(self.size)
 
     def _processes(self) -> Executor:
         """Forked of a process that has no threads, where there is fork; each has the environment of this one."""
@@ -127,12 +114,12 @@ class WorkerPool:
         context = multiprocessing.get_context("spawn" if spawned else "forkserver")
         if not spawned:
             context.set_forkserver_preload(list(self.preload))
-        pool = ProcessPoolExecutor if self.needs_main else _WithoutMain
+        pool = futures.ProcessPoolExecutor if self.needs_main else _WithoutMain
         environment = {**os.environ, **_ONE_THREAD}
         return pool(self.size, context, initializer=_begin, initargs=(environment,))
 
 
-class _WithoutMain(ProcessPoolExecutor):
+class _WithoutMain(futures.ProcessPoolExecutor):
     """Processes that do not import this one's main module: they start within `submit`, as if it were empty."""
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
@@ -180,24 +167,20 @@ class _Cluster:
         self._local: Any = None
         if address is None:
             # What workers log of a worker that died, and of their own end, is ours to say.
-            self._local = distributed.LocalCluster(
-                workers, threads_per_worker=1, dashboard_address=None, silence_logs=50, protocol="tcp"
-            )
+            options = {"dashboard_address": None, "silence_logs": 50, "protocol": "tcp"}
+            self._local = distributed.LocalCluster(workers, threads_per_worker=1, **options)
         try:
             self.client = distributed.Client(self._local or address, timeout=SECONDS_TO_CONNECT, set_as_default=False)
         except (OSError, TimeoutError, ValueError) as error:
-            raise ValueError(
-                f"executor.address={address}: no scheduler answers; start one by `dask scheduler`, or leave the "
-                "address out for a cluster on this machine"
-            ) from error
+            remedy = "start one by `dask scheduler`, or leave the address out for a cluster on this machine"
+            raise ValueError(f"executor.address={address}: no scheduler answers; {remedy}") from error
         self.address = str(address or self._local.scheduler_address)
         try:
             self.client.wait_for_workers(1, timeout=SECONDS_FOR_WORKERS)
         except TimeoutError as error:
             self.close()
-            raise ValueError(
-                f"executor.address={address}: the scheduler has no workers; start some by `dask worker {address}`"
-            ) from error
+            remedy = f"start some by `dask worker {address}`"
+            raise ValueError(f"executor.address={address}: the scheduler has no workers; {remedy}") from error
         self.executor = cast(Executor, self.client.get_executor(pure=False))
         self._threads, self._counted = 1, 0.0
 
@@ -218,9 +201,6 @@ class _Cluster:
         self.client.close(timeout=SECONDS_TO_CONNECT)
         if self._local is not None:
             self._local.close(timeout=SECONDS_TO_CONNECT)
-
-
-# Many tasks by a pool of workers: results as they come, and the tasks of workers that died done again
 
 
 T = TypeVar("T")
@@ -284,21 +264,17 @@ def _called(digest: str, factory: bytes | None, function: Callable[[Any, Any], A
         if digest not in _values:
             if factory is None:
                 return NeedsFactory()
-            _values[digest] = _made(factory)
+            use_one_thread()  # as many workers compute: contended threads collapse
+            version, make = pickle.loads(factory)
+            if version != __version__:
+                both = f"a worker has fmtorch {__version__}, the command {version}"
+                raise VersionError(f"{both}; install the same on both")
+            _values[digest] = make()
         _values.move_to_end(digest)
         while len(_values) > KEPT:
             _values.popitem(last=False)
         value = _values[digest]
     return function(value, task)
-
-
-def _made(factory: bytes) -> Any:
-    """What a factory makes, in a process whose workers compute with a thread each: contended ones collapse."""
-    use_one_thread()
-    version, make = pickle.loads(factory)
-    if version != __version__:
-        raise VersionError(f"a worker has fmtorch {__version__}, the command {version}; install the same on both")
-    return make()
 
 
 class TaskRunner(Generic[Task]):
@@ -336,21 +312,18 @@ class TaskRunner(Generic[Task]):
                 for task in todo:
                     if task is None:
                         break
-                    self._submit(task)
+                    self.begin(task)
                     if len(self.waiting) >= self.pool.ahead:
                         break
                 if not self.waiting:
                     break
-                finished, _ = wait(self.waiting, return_when=FIRST_COMPLETED)
+                finished, _ = futures.wait(self.waiting, return_when=futures.FIRST_COMPLETED)
                 yield from self._finished(finished)
         finally:
             self._end()
 
-    def begin(self, task: Task) -> Future[Any]:
-        """Have a task begun before those of `each`, which yields it."""
-        return self._submit(task)
-
-    def _submit(self, task: Task, with_factory: bool = False) -> Future[Any]:
+    def begin(self, task: Task, with_factory: bool = False) -> Future[Any]:
+        """Have a task begun before those of `each`, which yields it; with_factory: see `Factory.call`."""
         call = self.source.call(self.function, with_factory)
         try:
             future: Future[Any] = self.pool.executor.submit(call, task)
@@ -364,21 +337,20 @@ class TaskRunner(Generic[Task]):
         self.waiting[future] = task
         return future
 
-    def _finished(self, futures: Iterable[Future[Any]]) -> Iterator[Task]:
+    def _finished(self, ended: Iterable[Future[Any]]) -> Iterator[Task]:
         suspects: list[Task] = []
         broken = False
-        for future in futures:
+        for future in ended:
             task = self.waiting.pop(future)
             try:
                 if self._done(task, future.result()):
                     yield task
             except (Exception, CancelledError) as error:
-                if not self._is_death(error):
-                    raise
+                self._expect_death(error)
                 broken = broken or isinstance(error, BrokenExecutor)
                 suspects.append(task)
         if broken:  # all that is under way ends, with a result or for the same reason
-            finished, _ = wait(self.waiting)
+            finished, _ = futures.wait(self.waiting)
             for future in finished:
                 task = self.waiting.pop(future)
                 if future.cancelled() or future.exception() is not None:
@@ -391,7 +363,7 @@ class TaskRunner(Generic[Task]):
 
     def _done(self, task: Task, result: Any) -> bool:
         if isinstance(result, NeedsFactory):
-            self._submit(task, with_factory=True)
+            self.begin(task, with_factory=True)
             return False
         self._succeeded = True
         self.keep(task, result)
@@ -401,12 +373,11 @@ class TaskRunner(Generic[Task]):
         """A task with no other under way, so that a worker that dies is its doing."""
         parts = [task] if self.split is None else self.split(task)
         for _ in range(MAX_DEATHS if len(parts) == 1 else 1):
-            future = self._submit(task, with_factory=True)
+            future = self.begin(task, with_factory=True)
             try:
                 result = future.result()
             except (Exception, CancelledError) as error:
-                if not self._is_death(error):
-                    raise
+                self._expect_death(error)
                 self.pool.renew()
             else:
                 if self._done(task, result):
@@ -427,29 +398,27 @@ class TaskRunner(Generic[Task]):
         try:
             self.pool.executor.submit(self.source.call(_nothing, True), None).result()
         except (Exception, CancelledError) as error:
-            if not self._is_death(error):
-                raise
+            self._expect_death(error)
             self.pool.renew()
             return False
         return True
 
-    def _is_death(self, error: BaseException) -> bool:
-        if any(cls.__name__ in _DEATHS for cls in type(error).__mro__) or isinstance(error, BrokenExecutor):
-            return True
-        if (lost := self.pool.lost(error)) is not None:
-            raise lost from error
-        return False
+    def _expect_death(self, error: BaseException) -> None:
+        """Raise an error that is not the death of a worker; WorkersLost where the scheduler is gone."""
+        if not (isinstance(error, BrokenExecutor) or any(cls.__name__ in _DEATHS for cls in type(error).__mro__)):
+            if (lost := self.pool.lost(error)) is not None:
+                raise lost from error
+            raise error
 
     def _end(self) -> None:
         """Wait for what is under way, and keep it; what has not begun is dropped."""
         for future in self.waiting:
             future.cancel()
-        wait(self.waiting)
-        for future, task in self.waiting.items():
-            if not future.cancelled() and future.exception() is None:
-                result = future.result()
-                if not isinstance(result, NeedsFactory):
-                    self.keep(task, result)
+        futures.wait(self.waiting)
+        ended = [(task, future) for future, task in self.waiting.items() if not future.cancelled()]
+        for task, result in [(task, future.result()) for task, future in ended if future.exception() is None]:
+            if not isinstance(result, NeedsFactory):
+                self.keep(task, result)
         self.waiting.clear()
 
 

@@ -6,8 +6,7 @@ from fmtorch.core.lazy import lazy_exports
 
 if TYPE_CHECKING:
     from fmtorch.matching.lightglue import LightGlue
-    from fmtorch.matching.matcher import NearestNeighborMatcher
-    from fmtorch.matching.nearest import Neighbors, nearest_neighbors
+    from fmtorch.matching.nearest import NearestNeighborMatcher, Neighbors, nearest_neighbors
     from fmtorch.matching.vismatch import VisMatch
 
 __all__ = [

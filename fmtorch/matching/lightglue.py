@@ -19,19 +19,14 @@ def weight_file(features: str) -> str:
 class LightGlue:
     """Matches the features of two images by a transformer; the slots of the result are the matches found.
 
-    score and prior: the network's score, its P(match). Frames are not handed on: the features that it is
-    for have none. features: `aliked` or `disk`, what the weights were trained for; threshold: least score.
-    device: auto, cpu, cuda. network: in place of the released one. For any number of threads.
-
-    Raises ConnectionError where the weights cannot be fetched.
+    score and prior: the network's score, its P(match). Frames are not handed on: the features that it is for have none.
+    features: `aliked` or `disk`, what the weights were trained for; threshold: least score. device: auto, cpu, cuda.
+    network: in place of the released one. For any number of threads. Raises ConnectionError where the weights cannot be
+    fetched.
     """
 
     def __init__(
-        self,
-        features: str = "aliked",
-        threshold: float = 0.1,
-        device: str = "auto",
-        network: nn.Module | None = None,
+        self, features: str = "aliked", threshold: float = 0.1, device: str = "auto", network: nn.Module | None = None
     ) -> None:
         if features not in FEATURES:
             raise ValueError(f"no weights of LightGlue for {features!r}; there are: {', '.join(FEATURES)}")
@@ -54,18 +49,12 @@ class LightGlue:
             if len(shape) != 2 or shape[1] != self._length:
                 raise ValueError(f"descriptors are {shape}; for this LightGlue they must be (N, {self._length})")
         pairs, score = self._matches(features0, features1)
-        return Correspondences(
-            x0=features0.keypoints[pairs[:, 0]][None],
-            x1=features1.keypoints[pairs[:, 1]][None],
-            mask=torch.ones_like(score, dtype=torch.bool)[None],
-            score=score[None],
-            prior=score[None],
-            size0=features0.image_size[None],
-            size1=features1.image_size[None],
-        )
+        x0, x1 = features0.keypoints[pairs[:, 0]][None], features1.keypoints[pairs[:, 1]][None]
+        mask, score = torch.ones_like(score, dtype=torch.bool)[None], score[None]
+        size0, size1 = features0.image_size[None], features1.image_size[None]
+        return Correspondences(x0, x1, mask, score=score, prior=score, size0=size0, size1=size1)
 
     def _matches(self, features0: Features, features1: Features) -> tuple[Tensor, Tensor]:
-        """Indices (S, 2) of the features that match, and the scores (S,)."""
         home = features0.lafs.device
         if min(len(features0), len(features1)) < 2:  # the network normalises over the features
             return torch.zeros(0, 2, dtype=torch.int64, device=home), torch.zeros(0, device=home)

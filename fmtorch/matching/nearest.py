@@ -4,8 +4,7 @@ On a CPU, kernels compute the exact distances of the few that may be neighbours 
 elsewhere, and where those tell too few apart, all distances are computed. The result is the same.
 """
 
-from __future__ import annotations
-
+import dataclasses
 import functools
 import math
 from typing import NamedTuple
@@ -15,12 +14,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from fmtorch.core.types import Correspondences, Features
 from fmtorch.geometry.arithmetic import sqrt, stable_sum
 from fmtorch.jit.kernel import Array, F8x1, I1x2, I4x1, I4x2, I8x1, available, inner, kernel
 from fmtorch.jobs.execution import one_thread
 
 # Two nearest neighbours, compiled: products of 8-bit integers leave few candidates, whose distances are exact
-
 
 GROUP = 32  # columns that are passed over together where none can be a neighbour
 FAR = 1 << 30  # squared 8-bit distance of a column of padding; those of others are less
@@ -166,9 +165,6 @@ def _squared_distance(a: Array, b: Array) -> float:
     return float(total)
 
 
-# Two nearest neighbours on a CPU: products of 8-bit integers first, then exact distances of those that may be
-# nearest
-
 BLOCK = 128  # rows whose products with all columns exist at a time: 4 MB at 8,000 columns
 MAX_COMPUTED = 256  # exact distances a descriptor, beyond which rounding does not help: nearly equal ones
 MAX_LENGTH = 1 << 10  # of a descriptor: products stay below 2^24, exact in float32, and squared distances below FAR
@@ -190,7 +186,8 @@ def two_nearest(rows: Tensor, columns: Tensor, block: int = BLOCK) -> Nearest | 
     padded = -(-n1 // GROUP) * GROUP
     rounded0, first = _rounded(rows, center, step, n0)
     rounded1, second = _rounded(columns, center, step, padded)
-    neighbors = _no_neighbors(n0, n1, padded)
+    no_rows, no_columns = ((np.full(n, -1), np.full(n, np.inf)) for n in (n0, n1))
+    neighbors = Nearest(*no_rows, np.full(n0, np.inf), *no_columns, np.full(padded, FAR - 1, np.int32))
     multiply = torch._int_mm if int8_products_are_exact() else _float_products
     transposed = rounded1.T
     if multiply is _float_products:
@@ -228,14 +225,6 @@ def _rounded(values: Tensor, center: float, step: float, padded: int) -> tuple[T
     norms = np.full(padded, FAR, np.int32)
     error = round_to_8_bits(exact, float(center), float(step), rounded.numpy(), norms)
     return rounded, Descriptors(exact, norms, error * (1 + 1e-9), float(step))
-
-
-def _no_neighbors(n0: int, n1: int, padded: int) -> Nearest:
-    """Nothing found: any distance improves it, but that of padding."""
-    return Nearest(
-        np.full(n0, -1), np.full(n0, np.inf), np.full(n0, np.inf), np.full(n1, -1), np.full(n1, np.inf),
-        np.full(padded, FAR - 1, np.int32),
-    )  # fmt: skip
 
 
 _GROUP = 32  # columns whose minimum is taken together; a group is searched only where it can hold a neighbour
@@ -303,15 +292,12 @@ def _nearest_neighbors(
     mask0, mask1 = _finite(flat0, mask0), _finite(flat1, mask1)
     by_pair = [_match_one_pair(*pair, chunk) for pair in zip(flat0, flat1, mask0, mask1, strict=True)]
     if not by_pair:
-        by_pair = [_nothing(descriptors0, n0, n1)]
-        return Neighbors(*(column.expand(*batch, -1) for column in by_pair[0]))
-    return Neighbors(
-        *(torch.stack(column).reshape(*batch, column[0].shape[-1]) for column in zip(*by_pair, strict=True))
-    )
+        return Neighbors(*(column.expand(*batch, -1) for column in _nothing(descriptors0, n0, n1)))
+    columns = [torch.stack(column) for column in zip(*by_pair, strict=True)]
+    return Neighbors(*(column.reshape(*batch, column.shape[-1]) for column in columns))
 
 
 def _finite(flat: Tensor, mask: Tensor | None) -> Tensor:
-    """The mask of the descriptors that are finite."""
     finite = flat.abs().amax(-1) < math.inf if flat.shape[-1] else torch.isfinite(flat).all(-1)
     return finite if mask is None else finite & mask.reshape(finite.shape)
 
@@ -329,22 +315,20 @@ def _match_one_pair(d0: Tensor, d1: Tensor, mask0: Tensor, mask1: Tensor, chunk:
     if len(slots0) == 0 or len(slots1) == 0:
         return result
     rows, columns, unit = _integers(d0[slots0], d1[slots1])
-    nearest, reverse = _compiled(rows, columns) or _two_nearest(rows, columns, chunk)
-    result.nearest[slots0] = slots1[nearest.column]
-    result.distance[slots0] = (sqrt(nearest.squared.double()) * unit).float()
-    result.second[slots0] = (sqrt(nearest.second_squared.double()) * unit).float()
-    result.reverse[slots1] = slots0[reverse]
+    (nearest, *squared), reverse = _compiled(rows, columns) or _two_nearest(rows, columns, chunk)
+    result.nearest[slots0], result.reverse[slots1] = slots1[nearest], slots0[reverse]
+    for distance, values in zip((result.distance, result.second), squared, strict=True):
+        distance[slots0] = (sqrt(values.double()) * unit).float()
     return result
 
 
-def _compiled(rows: Tensor, columns: Tensor) -> tuple[_Nearest, Tensor] | None:
+def _compiled(rows: Tensor, columns: Tensor) -> tuple[list[Tensor], Tensor] | None:
     """`_two_nearest` by kernels, None where they do not serve."""
-    served = rows.device.type == "cpu" and available()
-    neighbors = two_nearest(rows, columns) if served else None
+    neighbors = two_nearest(rows, columns) if rows.device.type == "cpu" and available() else None
     if neighbors is None:
         return None
-    tensors = (torch.from_numpy(value) for value in (neighbors.nearest, neighbors.squared, neighbors.second_squared))
-    return _Nearest(*tensors), torch.from_numpy(neighbors.reverse)
+    tensors = [torch.from_numpy(values) for values in neighbors[:4]]
+    return tensors[:3], tensors[3]
 
 
 def _integers(d0: Tensor, d1: Tensor) -> tuple[Tensor, Tensor, float]:
@@ -365,14 +349,8 @@ def _longest(d: Tensor) -> float:
     return float(sqrt(stable_sum(d[norms >= norms.max() * (1 - _ROUNDING)].double().square())).max())
 
 
-class _Nearest(NamedTuple):
-    column: Tensor
-    squared: Tensor
-    second_squared: Tensor
-
-
-def _two_nearest(rows: Tensor, columns: Tensor, chunk: int) -> tuple[_Nearest, Tensor]:
-    """Two nearest columns of every row and the nearest row of every column, by exact squared distances.
+def _two_nearest(rows: Tensor, columns: Tensor, chunk: int) -> tuple[list[Tensor], Tensor]:
+    """Of every row the nearest column, its and the second's squared distance; of every column the nearest row. Exact.
 
     |a - b|^2 = [a, |a|^2, 1] . [-2 b, 1, |b|^2]: one product a block, padded to whole groups with infinite columns.
     """
@@ -394,10 +372,10 @@ def _two_nearest(rows: Tensor, columns: Tensor, chunk: int) -> tuple[_Nearest, T
         reverse[improved] = squared[:, improved].argmin(0) + start
         best_of_column = torch.minimum(best_of_column, block_best)
         blocks.append(_two_smallest(squared))
-    return _Nearest(*(torch.cat(column) for column in zip(*blocks, strict=True))), reverse[:n1]
+    return [torch.cat(column) for column in zip(*blocks, strict=True)], reverse[:n1]
 
 
-def _two_smallest(squared: Tensor) -> _Nearest:
+def _two_smallest(squared: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Of every row the first index of its smallest value, that value and the second smallest.
 
     The minima of groups of columns lead to the group with the smallest value; the second smallest is in the same
@@ -411,4 +389,51 @@ def _two_smallest(squared: Tensor) -> _Nearest:
     best = members.gather(1, member)
     rest = members.scatter(1, member, math.inf).amin(1, keepdim=True)
     second = minima.scatter(1, group, rest).amin(1)
-    return _Nearest((group * _GROUP + member)[:, 0], best[:, 0], second)
+    return (group * _GROUP + member)[:, 0], best[:, 0], second
+
+
+@dataclasses.dataclass(frozen=True)
+class NearestNeighborMatcher:
+    """Matches every feature of image 0 with the feature of image 1 whose descriptor is nearest (Euclidean).
+
+    The slots of the result are the features of image 0, in their order; `mask` is True for those that found a
+    partner. `ratio` is the ratio of the distances to the nearest and the second nearest descriptor, in [0, 1], and
+    1 where it means nothing (a single candidate, two identical candidates).
+
+    mutual: keep only matches whose partner's own nearest neighbour is the feature itself. It costs nothing, both
+    directions being found in one pass; without it the result says which matches these are (`Correspondences.mutual`).
+    chunk: rows of the distance matrix that exist at a time; changes speed and memory only.
+    """
+
+    mutual: bool = False
+    chunk: int = 64
+
+    def __call__(self, features0: Features, features1: Features) -> Correspondences:
+        """The matches of one pair (a batch of one), or of a batch of pairs when the features have a leading dimension.
+
+        Raises ValueError when the two batches or descriptor lengths differ.
+        """
+        shape0, shape1 = features0.descriptors.shape, features1.descriptors.shape
+        if shape0[:-2] != shape1[:-2] or shape0[-1] != shape1[-1]:
+            both = f"{tuple(shape0)} and {tuple(shape1)}"
+            raise ValueError(f"descriptors {both} do not fit: batch and length must be the same")
+        if len(shape0) == 2:
+            names = [field.name for field in dataclasses.fields(Features)]
+            features0, features1 = (
+                f.replace(**{n: getattr(f, n)[None] for n in names}) for f in (features0, features1)
+            )
+        neighbors = nearest_neighbors(
+            features0.descriptors, features1.descriptors, features0.valid, features1.valid, chunk=self.chunk
+        )
+        mask, lafs0, lafs1 = neighbors.nearest >= 0, features0.lafs, _take(features1.lafs, neighbors.nearest)
+        frames = {"lafs0": lafs0, "lafs1": lafs1, "size0": features0.image_size, "size1": features1.image_size}
+        known = {"ratio": neighbors.ratio.to(lafs0.dtype), "mutual": neighbors.mutual & mask}
+        kept = mask & neighbors.mutual if self.mutual else mask
+        return Correspondences(features0.keypoints, lafs1[..., 2], kept, **frames, **known)
+
+
+def _take(lafs: Tensor, index: Int[Tensor, "b n0"]) -> Tensor:
+    if lafs.shape[1] == 0:
+        return lafs.new_zeros(*index.shape, 2, 3)
+    taken = lafs.gather(1, index.clamp(min=0)[..., None, None].expand(-1, -1, 2, 3))
+    return torch.where(index[..., None, None] >= 0, taken, 0.0)

@@ -42,7 +42,6 @@ def _below(folder: Path) -> list[int]:
 
 
 def _kernels() -> Sizes:
-    """Sizes of the compiled kernels of each version, and when it was last used."""
     sizes = {}
     for about in kernels_dir().glob(f"*/{ABOUT}"):
         day = time.strftime("%Y-%m-%d", time.localtime(about.stat().st_mtime))

@@ -73,12 +73,16 @@ class ArrayCache:
 
     def write(self, section: str, name: str, arrays: Arrays) -> None:
         path = self._path(section, name)
+        digest = np.frombuffer(self._digest(section, name, arrays), np.uint8)
         with self._excused(path):
             path.parent.mkdir(parents=True, exist_ok=True)
             with replacing(path) as temporary, temporary.open("wb") as file:
-                digest = np.frombuffer(self._digest(section, name, arrays), np.uint8)
                 np.savez(file, **arrays, **{DIGEST: digest})  # type: ignore[arg-type]
-            self._grown(sum(array.nbytes for array in arrays.values()))
+            with self._lock:
+                self._unseen += sum(array.nbytes for array in arrays.values())
+                if self._unseen >= SLACK * (self.limit or np.inf):
+                    self.trim()
+                    self._unseen = 0
 
     def files(self) -> Iterator[tuple[Path, os.stat_result]]:
         yield from _listed(self.folder.glob("*/*.npz"))
@@ -102,7 +106,6 @@ class ArrayCache:
 
     @staticmethod
     def _digest(section: str, name: str, arrays: Arrays) -> bytes:
-        """Of the file's place and all that it holds."""
         digest = hashlib.blake2b(f"{section}/{name}".encode(), digest_size=16)
         for key, array in sorted(arrays.items()):
             digest.update(repr((key, array.dtype.str, array.shape)).encode())
@@ -111,13 +114,6 @@ class ArrayCache:
 
     def _path(self, section: str, name: str) -> Path:
         return self.folder / section / f"{name}.npz"
-
-    def _grown(self, size: int) -> None:
-        with self._lock:
-            self._unseen += size
-            if self._unseen >= SLACK * (self.limit or np.inf):
-                self.trim()
-                self._unseen = 0
 
     @contextlib.contextmanager
     def _excused(self, path: Path) -> Iterator[None]:
@@ -134,9 +130,6 @@ def _listed(paths: Iterator[Path]) -> Iterator[tuple[Path, os.stat_result]]:
             yield path, path.stat()
 
 
-# The feature cache: what an extractor finds in an image is kept under the image's and the extractor's digests
-
-
 OFF = ("off", "none", "")
 
 
@@ -146,7 +139,6 @@ class CachedFeatures:
     A `TwoStepExtractor` is kept in two files, frames under the digest of its `detection` alone; any other in one.
     Results are on the CPU. `timed` gives the seconds that the computation took when it was done, here or in another
     run. found, computed: images so far that needed no computation, and that needed some. For any number of threads.
-
     Raises TypeError where the extractor does not say what defines it, OSError where a file of it cannot be read (see
     `configuration`).
     """
@@ -169,14 +161,15 @@ class CachedFeatures:
         digest = image_digest(image)
         extractor = self.extractor
         if isinstance(extractor, TwoStepExtractor):
-            frames = self._kept(self._detection, digest, lambda: _named(("lafs", "scores"), extractor.detect(image)))
+            names = ("lafs", "scores")
+            frames = self._kept(self._detection, digest, lambda: dict(zip(names, extractor.detect(image), strict=True)))
             lafs = frames.tensors["lafs"]
             described = self._kept(self._extraction, digest, lambda: {"descriptors": extractor.describe(image, lafs)})
             steps = [frames, described]
             size = {"image_size": torch.tensor(image.shape[:2], dtype=torch.int64)}
         else:
             whole = self._kept(
-                self._extraction, digest, lambda: _fields(output_of(extractor, extractor(image), Features))
+                self._extraction, digest, lambda: dict(vars(output_of(extractor, extractor(image), Features)))
             )
             steps, size = [whole], {}
         with self._lock:
@@ -201,11 +194,11 @@ class CachedFeatures:
         return section
 
     def _kept(self, section: str, digest: str, compute: Callable[[], Mapping[str, Tensor]]) -> "_Step":
-        """One step's result, from the cache or computed and kept."""
         arrays = self.cache.read(section, digest)
         if arrays is not None:
             seconds = float(arrays.pop("seconds"))
-            return _Step({name: _unpacked(array) for name, array in arrays.items()}, seconds, computed=False)
+            wide = {key: each.astype(np.float32) if each.dtype == np.uint8 else each for key, each in arrays.items()}
+            return _Step({key: torch.from_numpy(each) for key, each in wide.items()}, seconds, computed=False)
         start = time.perf_counter()
         tensors = {name: value.detach().cpu() for name, value in compute().items()}
         seconds = time.perf_counter() - start
@@ -246,14 +239,6 @@ class _Step:
     computed: bool
 
 
-def _named(names: tuple[str, ...], tensors: tuple[Tensor, ...]) -> dict[str, Tensor]:
-    return dict(zip(names, tensors, strict=True))
-
-
-def _fields(features: Features) -> dict[str, Tensor]:
-    return {field.name: getattr(features, field.name) for field in dataclasses.fields(features)}
-
-
 def _packed(value: Tensor) -> NDArray[Any]:
     """The array of a tensor; bytes where every element is a whole number from 0 to 255, as SIFT's are."""
     array = value.numpy()
@@ -263,7 +248,3 @@ def _packed(value: Tensor) -> NDArray[Any]:
         if np.array_equal(small.astype(np.float32).view(np.uint32), array.view(np.uint32)):  # to the sign of zero
             return small
     return array
-
-
-def _unpacked(array: NDArray[Any]) -> Tensor:
-    return torch.from_numpy(array.astype(np.float32) if array.dtype == np.uint8 else array)

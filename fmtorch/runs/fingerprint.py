@@ -5,7 +5,6 @@ import contextlib
 import dataclasses
 import functools
 import hashlib
-import importlib
 import importlib.metadata
 import os
 import platform
@@ -13,7 +12,7 @@ import subprocess
 import sys
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import torch
@@ -92,40 +91,28 @@ def _imported(file: Path, start: Path, own: bool) -> set[Path]:
     return files
 
 
-class _Import(NamedTuple):
-    """An import statement: the dots it begins with (None: no `from`), the module after `from`, and the names."""
-
-    level: int | None
-    module: str
-    names: tuple[str, ...]
+_Import = tuple[int | None, str, list[str]]  # dots that begin it (None: no `from`), module after `from`, names
 
 
 @functools.cache  # parts of a pipeline share most of what they import
-def _imports(source: bytes) -> tuple[_Import, ...]:
+def _imports(source: bytes) -> list[_Import]:
     try:
         nodes = _statements(ast.parse(source))
     except (SyntaxError, ValueError):
-        return ()
-    return tuple(
-        _Import(
-            node.level if isinstance(node, ast.ImportFrom) else None,
-            (isinstance(node, ast.ImportFrom) and node.module) or "",
-            tuple(alias.name for alias in node.names),
-        )
-        for node in nodes
-        if isinstance(node, ast.Import | ast.ImportFrom)
-    )
+        return []
+    imports = [node for node in nodes if isinstance(node, ast.Import | ast.ImportFrom)]
+    return [
+        (getattr(node, "level", None), getattr(node, "module", None) or "", [alias.name for alias in node.names])
+        for node in imports
+    ]
 
 
 def _statements(tree: ast.Module) -> list[ast.AST]:
     """All statements of a file, wherever in it; much faster than a walk through its expressions, too."""
-    statements: list[ast.AST] = []
-    todo: list[ast.AST] = [tree]
-    while todo:
-        node = todo.pop()
-        statements.append(node)
+    statements: list[ast.AST] = [tree]
+    for node in statements:  # which grows while it is read
         for block in ("body", "orelse", "finalbody", "handlers", "cases"):
-            todo += getattr(node, block, ())
+            statements += getattr(node, block, ())
     return statements
 
 
@@ -160,9 +147,6 @@ def _digest_of(files: list[Path]) -> str:
 def digest(data: Any) -> str:
     """The hex digest (blake2b, 128 bits) of bytes, or of an array's."""
     return hashlib.blake2b(data, digest_size=16).hexdigest()
-
-
-# What defines the results of a feature extractor, as plain values: its options, learned files, code, libraries
 
 
 LIBRARIES = ("numpy", "torch", "kornia", "onnxruntime")  # and OpenCV, which has several names as a package
@@ -211,17 +195,13 @@ def learned(part: object) -> list[str]:
 
 
 def _learned(value: Any) -> Iterator[str]:
-    if isinstance(value, list):
-        for entry in value:
+    for key, entry in value.items() if isinstance(value, dict) else enumerate(value if isinstance(value, list) else ()):
+        if key == "file" and isinstance(entry, str):
+            yield entry
+        elif key == "weights":
+            yield digest(repr(entry).encode())
+        else:
             yield from _learned(entry)
-    elif isinstance(value, dict):
-        for key, entry in value.items():
-            if key == "file" and isinstance(entry, str):
-                yield entry
-            elif key == "weights":
-                yield digest(repr(entry).encode())
-            else:
-                yield from _learned(entry)
 
 
 def _options(part: object, code: bool) -> dict[str, Any]:
@@ -231,10 +211,9 @@ def _options(part: object, code: bool) -> dict[str, Any]:
         return {f.name: _plain(getattr(part, f.name), code) for f in dataclasses.fields(part) if f.compare}
     if isinstance(part, torch.nn.Module):
         return {"network": repr(part), "weights": _plain(part.state_dict(), code)}
-    raise TypeError(
-        f"{type(part).__module__}.{type(part).__qualname__} does not say what defines its results; "
-        "make it a dataclass, or give it an attribute `identity` of plain values"
-    )
+    remedy = "make it a dataclass, or give it an attribute `identity` of plain values"
+    name = f"{type(part).__module__}.{type(part).__qualname__}"
+    raise TypeError(f"{name} does not say what defines its results; {remedy}")
 
 
 def _class(kind: type, code: bool) -> dict[str, str]:

@@ -25,7 +25,6 @@ class PairRow:
     """The result of one image pair. What could not be computed is None or NaN, and null in the table.
 
     A pair of a known homography has a corner error, infinite where it failed, and H in place of F; its NSGD is NaN.
-
     Raises ValueError for a row that contradicts itself: a failed pair has a reason, NSGD 1 and no F; a sound one has no
     reason and nine finite elements of F or H; NSGD is in [0, 1]; there are both angles of a pose error or neither.
     """
@@ -74,10 +73,8 @@ class PairRow:
             raise ValueError(f"pair {self.pair!r}: nsgd is {self.nsgd}; it must be in [0, 1]")
         angles = [a for a in (self.rotation_error, self.translation_error) if a is not None and not math.isnan(a)]
         if len(angles) == 1 or not all(0.0 <= a <= 180.0 for a in angles):
-            raise ValueError(
-                f"pair {self.pair!r}: rotation_error is {self.rotation_error} and translation_error is "
-                f"{self.translation_error}; both must be angles in [0, 180] degrees, or neither known"
-            )
+            both = f"rotation_error is {self.rotation_error} and translation_error is {self.translation_error}"
+            raise ValueError(f"pair {self.pair!r}: {both}; both must be angles in [0, 180] degrees, or neither known")
         if self.related and not self.ok:
             raise ValueError(f"pair {self.pair!r} failed, but is called related")
         if self.ok:
@@ -86,25 +83,20 @@ class PairRow:
             if self.F is None or len(self.F) != 9 or not all(map(math.isfinite, self.F)):
                 raise ValueError(f"pair {self.pair!r} is ok: F must be nine finite numbers, but is {self.F}")
         elif not self.reason or self.nsgd != 1.0 or self.F is not None:
-            raise ValueError(
-                f"pair {self.pair!r} failed: it needs a reason, nsgd 1 and no F, "
-                f"but has reason={self.reason!r}, nsgd={self.nsgd}, F={self.F}"
-            )
+            values = f"reason={self.reason!r}, nsgd={self.nsgd}, F={self.F}"
+            raise ValueError(f"pair {self.pair!r} failed: it needs a reason, nsgd 1 and no F, but has {values}")
 
 
 def _expect_homography(row: PairRow) -> None:
     error, H = row.corner_error, row.H
     if error is None or not error >= 0.0 or not math.isnan(row.nsgd) or row.F is not None:
-        raise ValueError(
-            f"pair {row.pair!r} has a homography: it needs a corner error of at least 0, NSGD NaN and no F, but has "
-            f"corner_error={error}, nsgd={row.nsgd}, F={row.F}"
-        )
+        needs, has = "a corner error of at least 0, NSGD NaN and no F", f"nsgd={row.nsgd}, F={row.F}"
+        raise ValueError(f"pair {row.pair!r} has a homography: it needs {needs}, but has corner_error={error}, {has}")
     has_homography = H is not None and len(H) == 9 and all(map(math.isfinite, H))
     if row.ok != has_homography or row.ok == bool(row.reason) or (not row.ok and math.isfinite(error)):
-        raise ValueError(
-            f"pair {row.pair!r} has a homography: it needs nine finite numbers of H and no reason, or a reason, no H "
-            f"and an infinite corner error, but has H={H}, reason={row.reason!r}, corner_error={error}"
-        )
+        needs = "nine finite numbers of H and no reason, or a reason, no H and an infinite corner error"
+        has = f"H={H}, reason={row.reason!r}, corner_error={error}"
+        raise ValueError(f"pair {row.pair!r} has a homography: it needs {needs}, but has {has}")
 
 
 _ARROW: dict[Any, pa.DataType] = {
@@ -122,17 +114,12 @@ PAIR_SCHEMA = pa.schema([_field(field.name, field.type) for field in dataclasses
 
 
 def to_table(rows: Sequence[PairRow]) -> pa.Table:
-    """The rows as a table of `PAIR_SCHEMA`; NaN becomes null."""
-    columns = {name: [_plain(getattr(row, name)) for row in rows] for name in PAIR_SCHEMA.names}
-    columns["nsgd"] = [row.nsgd for row in rows]  # NaN where there is no F
+    """The rows as a table of `PAIR_SCHEMA`; NaN becomes null, but for NSGD's, which says that there is no F."""
+    columns = {name: [getattr(row, name) for row in rows] for name in PAIR_SCHEMA.names}
+    for name in PAIR_SCHEMA.names:
+        if name != "nsgd":
+            columns[name] = [None if isinstance(v, float) and math.isnan(v) else v for v in columns[name]]
     return pa.table(columns, schema=PAIR_SCHEMA)
-
-
-def _plain(value: object) -> object:
-    return None if isinstance(value, float) and math.isnan(value) else value
-
-
-# The parts of a run's table: files that are whole or absent, merged as they grow in number
 
 
 MERGED = 16  # parts of one level that become one of the next
@@ -211,9 +198,6 @@ def content_digest(data: bytes) -> str:
     return hashlib.blake2b(data, digest_size=8).hexdigest()
 
 
-# The run folder: one evaluation's identity, its pairs' results as they come, its summary
-
-
 FORMAT = 1  # of the folder; to be raised when the schema changes, or what the identity tells
 _LISTINGS = 20  # at most, until parts are those that were listed
 
@@ -253,18 +237,14 @@ class RunFolder:
         foreign = sorted(entry.name for entry in path.iterdir() if entry.suffix != ".tmp")
         if not (path / "run.json").exists():
             if foreign:
-                raise RunFolderError(
-                    f"{path} is not empty and has no run.json, so it is no run folder (it holds {head(foreign)}); "
-                    "choose another output"
-                )
+                problem = f"is not empty and has no run.json, so it is no run folder (it holds {head(foreign)})"
+                raise RunFolderError(f"{path} {problem}; choose another output")
             stored = {"format": FORMAT, "identity": identity_digest(wanted), "config": wanted}
             create(path / "run.json", json.dumps(stored, indent=2) + "\n")
         folder = cls.load(path)
         if folder.identity != identity_digest(wanted):
-            raise RunFolderError(
-                f"{path} holds another run; what differs (there -> now): {differences(folder.config, wanted)}. "
-                "Choose another output, or delete the folder"
-            )
+            differing = f"what differs (there -> now): {differences(folder.config, wanted)}"
+            raise RunFolderError(f"{path} holds another run; {differing}. Choose another output, or delete the folder")
         (path / "pairs").mkdir(exist_ok=True)
         return folder
 
@@ -281,14 +261,11 @@ class RunFolder:
         if not isinstance(stored, dict) or not isinstance(stored.get("config"), dict):
             raise RunFolderError(f"{file} was not written by this program: it has no 'config'")
         if stored.get("format") != FORMAT:
-            raise RunFolderError(
-                f"{file} has format {stored.get('format')}, this version reads {FORMAT}; choose another output"
-            )
+            formats = f"has format {stored.get('format')}, this version reads {FORMAT}"
+            raise RunFolderError(f"{file} {formats}; choose another output")
         if stored.get("identity") != identity_digest(stored["config"]):
-            raise RunFolderError(
-                f"{file} was changed: its identity is not that of its config; put it back as it was, or delete the "
-                "folder and run again"
-            )
+            remedy = "put it back as it was, or delete the folder and run again"
+            raise RunFolderError(f"{file} was changed: its identity is not that of its config; {remedy}")
         return cls(Path(path), stored["config"])
 
     @property
@@ -296,9 +273,8 @@ class RunFolder:
         return identity_digest(self.config)
 
     def append(self, rows: Sequence[PairRow]) -> None:
-        if not rows:
-            return
-        self._writer.add(to_table(rows))
+        if rows:
+            self._writer.add(to_table(rows))
 
     def done(self) -> set[int]:
         return {int(key) for part in self._parts(["key"]) for key in part["key"].to_numpy()}
@@ -351,6 +327,5 @@ class RunFolder:
         except FileNotFoundError:
             raise
         except (pa.ArrowException, OSError) as error:
-            raise RunFolderError(
-                f"{file} cannot be read ({error}); delete it and start the run again, which computes its pairs anew"
-            ) from error
+            remedy = "delete it and start the run again, which computes its pairs anew"
+            raise RunFolderError(f"{file} cannot be read ({error}); {remedy}") from error

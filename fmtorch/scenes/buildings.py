@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from fmtorch.scenes import patterns
-from fmtorch.scenes.patterns import Rng, colour, to_pixels
+from fmtorch.scenes.patterns import Rng, colour
 from fmtorch.scenes.surfaces import Floats, Real, Surfaces, Vector, material, vec
 
 
@@ -39,11 +39,11 @@ def tree(surfaces: Surfaces, rng: Rng, foot: Vector, height: Real, leaf: int, ba
         card(surfaces, at, rng.uniform(0, 360), side, side, leaf)
 
 
-def foliage(surfaces: Surfaces, rng: Rng, size: int = 256) -> tuple[int, int]:
+def foliage(surfaces: Surfaces, rng: Rng) -> tuple[int, int]:
     """Textures of leaves and bark."""
-    leaf = surfaces.texture(patterns.leaves(rng, size, colour(rng, (0.18, 0.34), (0.4, 0.7), (0.35, 0.65))))
+    leaf = surfaces.texture(patterns.leaves(rng, 256, colour(rng, (0.18, 0.34), (0.4, 0.7), (0.35, 0.65))))
     bark = patterns.wood(rng, 128, 128, 3, colour(rng, (0.06, 0.1), (0.3, 0.5), (0.25, 0.45)))
-    return leaf, surfaces.texture(to_pixels(np.ascontiguousarray(bark.transpose(1, 0, 2))))
+    return leaf, surfaces.paint(np.ascontiguousarray(bark.transpose(1, 0, 2)))
 
 
 def post(surfaces: Surfaces, foot: Vector, height: Real, texture: int) -> None:
@@ -55,8 +55,8 @@ def post(surfaces: Surfaces, foot: Vector, height: Real, texture: int) -> None:
 def car(surfaces: Surfaces, rng: Rng, foot: Vector, ahead: Vector) -> None:
     """A car centred on `foot`: a bonnet and a cabin as boxes, painted sides that stand a little off."""
     tone = colour(rng, (0, 1), (0, 0.8), (0.15, 0.95))
-    side, end = surfaces.texture(patterns.car_side(rng, tone)), surfaces.texture(to_pixels(patterns.car_end(rng, tone)))
-    metal = surfaces.texture(to_pixels(patterns.plaster(rng, 64, 64, tone, 0.5)))
+    side, end = surfaces.texture(patterns.car_side(rng, tone)), surfaces.paint(patterns.car_end(rng, tone))
+    metal = surfaces.paint(patterns.plaster(rng, 64, 64, tone, 0.5))
     left = np.cross(vec(0, 0, 1), ahead)
     length, width = rng.uniform(3.9, 4.7), rng.uniform(1.7, 1.85)
     rear = foot - ahead * (length / 2) + left * (width / 2)
@@ -103,22 +103,18 @@ def column(surfaces: Surfaces, foot: Vector, height: Real, radius: Real, texture
     surfaces.lathe(foot, profile, texture, sides=sides, repeat=(1, 1))
 
 
-def marble(surfaces: Surfaces, rng: Rng, h: int = 512, w: int = 512) -> int:
+def marble(surfaces: Surfaces, rng: Rng) -> int:
     """A weathered stone texture."""
+    h = w = 512
     tint = colour(rng, (0.06, 0.14), (0.05, 0.35), (0.5, 0.85))
-    out = (
-        tint
-        * (1 + 0.16 * patterns.fractal(rng, h, w, 128, 1, 0.72) + 0.08 * patterns.fractal(rng, h, w, 8, 1, 0.9))[
-            ..., None
-        ]
-    )
-    return surfaces.texture(to_pixels(out.astype(np.float32)))
+    veins, grain = patterns.fractal(rng, h, w, 128, 1, 0.72), patterns.fractal(rng, h, w, 8, 1, 0.9)
+    return surfaces.paint((tint * (1 + 0.16 * veins + 0.08 * grain)[..., None]).astype(np.float32))
 
 
-def ashlar(surfaces: Surfaces, rng: Rng, rows: int = 6, cols: int = 8, h: int = 512, w: int = 1024) -> int:
+def ashlar(surfaces: Surfaces, rng: Rng) -> int:
     """A texture of large dressed stones."""
     tint = colour(rng, (0.05, 0.13), (0.1, 0.4), (0.5, 0.85))
-    return surfaces.texture(to_pixels(patterns.masonry(rng, h, w, rows, cols, tint, joint=0.03)))
+    return surfaces.paint(patterns.masonry(rng, 512, 1024, 6, 8, tint, joint=0.03))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -133,6 +129,10 @@ class Style:
     pilasters: bool = False
     same_windows: Real = 0.5  # chance that a window is a copy of its neighbour
 
+    def grid(self, width: Real, height: Real) -> tuple[int, int]:
+        """Bays and storeys of a front."""
+        return max(1, int(width / self.bay)), max(1, int(height / self.storey))
+
 
 def wall_picture(rng: Rng, split: str, h: int, w: int, density: Real) -> Floats:
     """A bare wall (h, w, 3) of plaster, brick, ashlar, or the split's photograph of stone, with stains of its own."""
@@ -143,13 +143,11 @@ def wall_picture(rng: Rng, split: str, h: int, w: int, density: Real) -> Floats:
         out = patterns.plaster(rng, h, w, tint, 1.6)
     elif kind < 0.55:
         tint = colour(rng, (0.0, 0.06), (0.35, 0.65), (0.4, 0.7))
-        out = patterns.masonry(
-            rng, h, w, max(4, round(metres_h / 0.14)), max(4, round(metres_w / 0.32)), tint, vary=0.16
-        )
+        bricks = max(4, round(metres_h / 0.14)), max(4, round(metres_w / 0.32))
+        out = patterns.masonry(rng, h, w, *bricks, tint, vary=0.16)
     elif kind < 0.8:
-        out = patterns.masonry(
-            rng, h, w, max(3, round(metres_h / 0.45)), max(3, round(metres_w / 0.9)), tint, joint=0.04
-        )
+        stones = max(3, round(metres_h / 0.45)), max(3, round(metres_w / 0.9))
+        out = patterns.masonry(rng, h, w, *stones, tint, joint=0.04)
     else:
         stone = material(split, "stone")
         assert stone is not None
@@ -176,16 +174,16 @@ class Relief(NamedTuple):
 
     def panel(self, x0: Real, z0: Real, x1: Real, z1: Real, depth: Real) -> None:
         """A rectangle parallel to the wall, by so much in front of it."""
-        out, up = np.cross(self.right, vec(0, 0, 1)), vec(0, 0, 1)
-        corner = self.foot + self.right * x0 + up * z1 + out * depth
+        up = vec(0, 0, 1)
+        corner = self.foot + self.right * x0 + up * z1 + np.cross(self.right, up) * depth
         part = (x0 / self.width, 1 - z1 / self.height, x1 / self.width, 1 - z0 / self.height)
         self.surfaces.quad(corner, self.right * (x1 - x0), up * (z0 - z1), self.number, part)
 
     def block(self, x0: Real, z0: Real, x1: Real, z1: Real, depth: Real) -> None:
         """A box set off from the wall (depth > 0) or a niche set back into it (depth < 0), with four sides."""
         self.panel(x0, z0, x1, z1, depth)
-        right, quad, number = self.right, self.surfaces.quad, self.number
-        out, up = np.cross(right, vec(0, 0, 1)), vec(0, 0, 1)
+        right, quad, number, up = self.right, self.surfaces.quad, self.number, vec(0, 0, 1)
+        out = np.cross(right, up)
         near, reach = self.foot + out * depth, -out * depth
         u0, u1, v0, v1 = x0 / self.width, x1 / self.width, 1 - z1 / self.height, 1 - z0 / self.height
         thin = abs(depth) / self.width
@@ -205,7 +203,7 @@ def front(
     """
     picture = wall_picture(rng, split, int(height * style.density), int(width * style.density), style.density)
     openings, boards = _paint_openings(picture, rng, width, height, style)
-    relief = Relief(surfaces, surfaces.texture(to_pixels(picture)), foot, right, width, height)
+    relief = Relief(surfaces, surfaces.paint(picture), foot, right, width, height)
     _set_back(relief, openings, style)
     for board in boards:
         relief.block(*board, 0.12)
@@ -213,22 +211,17 @@ def front(
     return relief.number
 
 
-def _grid(width: Real, height: Real, style: Style) -> tuple[int, int]:
-    return max(1, int(width / style.bay)), max(1, int(height / style.storey))
-
-
 def _paint_openings(
     picture: Floats, rng: Rng, width: Real, height: Real, style: Style
 ) -> tuple[list[list[Rectangle]], list[Rectangle]]:
     """Paints windows, doors and signs on the picture of a wall; where they are: openings by storey, and signs."""
-    d, (bays, storeys) = style.density, _grid(width, height, style)
+    d, (bays, storeys) = style.density, style.grid(width, height)
     step_x, step_z = width / bays, height / storeys
     seed = int(rng.integers(2**31))
     win_w, win_h = step_x * rng.uniform(0.36, 0.55), step_z * rng.uniform(0.45, 0.62)
     glass = patterns.window(rng, int(win_h * d), int(win_w * d), np.random.SeedSequence(seed))
     entrance = int(rng.integers(bays))
-    openings: list[list[Rectangle]] = []
-    boards: list[Rectangle] = []
+    openings, boards = list[list[Rectangle]](), list[Rectangle]()
     for row in range(storeys):
         low = row * step_z + (0.25 * step_z if row else 0.05)
         high = low + win_h if row else low + 0.72 * step_z
@@ -236,17 +229,15 @@ def _paint_openings(
         for bay in range(bays):
             x0 = bay * step_x + (step_x - win_w) / 2
             size = (max(8, int((high - low) * d)), max(8, int(win_w * d)))
-            if row == 0 and (bay == entrance or style.shop):
-                pane = np.random.SeedSequence(seed + bay)
-                _paste(
-                    picture, patterns.door(rng, *size) if bay == entrance else patterns.window(rng, *size, pane), x0,
-                    low, d,
-                )  # fmt: skip
+            if row == 0 and bay == entrance:
+                part = patterns.door(rng, *size)
+            elif row == 0 and style.shop:
+                part = patterns.window(rng, *size, np.random.SeedSequence(seed + bay))
             elif rng.random() < style.same_windows:
-                _paste(picture, cv2.resize(glass, size[::-1]).astype(np.float32), x0, low, d)
+                part = cv2.resize(glass, size[::-1]).astype(np.float32)
             else:
-                glass = patterns.window(rng, *size, np.random.SeedSequence(seed))
-                _paste(picture, glass, x0, low, d)
+                part = glass = patterns.window(rng, *size, np.random.SeedSequence(seed))
+            _paste(picture, part, x0, low, d)
             line.append((x0, low, x0 + win_w, high))
             if row == 0 and style.shop and rng.random() < 0.6:
                 board = (bay * step_x + 0.1 * step_x, high + 0.05, bay * step_x + 0.9 * step_x, high + 0.22 * step_z)
@@ -285,7 +276,7 @@ def _set_back(relief: Relief, openings: list[list[Rectangle]], style: Style) -> 
 def _set_off(relief: Relief, style: Style) -> None:
     """Cornices between storeys and at the top, and pilasters between bays."""
     width, height = relief.width, relief.height
-    bays, storeys = _grid(width, height, style)
+    bays, storeys = style.grid(width, height)
     step_x, step_z = width / bays, height / storeys
     for row in range(1, storeys):
         relief.block(0, row * step_z - 0.1, width, row * step_z + 0.1, 0.5 * style.depth)
@@ -311,9 +302,8 @@ def house(
     top = vec(0, 0, height)
     twins = np.random.SeedSequence(int(rng.integers(2**31))).spawn(2)
     number = -1
-    for i, (corner, along, length) in enumerate(
-        zip(corners, (right, back, -right, -back), (width, depth, width, depth), strict=True)
-    ):
+    edges = zip(corners, (right, back, -right, -back), (width, depth, width, depth), strict=True)
+    for i, (corner, along, length) in enumerate(edges):
         if sides == "plain" and i > 0:
             surfaces.quad(corner + top, along * length, -top, number, (0, 0, length / width, 1))
         else:

@@ -12,16 +12,14 @@ import json
 import os
 import shutil
 import threading
-import uuid
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from fmtorch.core.files import cache_dir
+from fmtorch.core.files import cache_dir, temporary_name
 from fmtorch.data.construction import Keypoints, keypoints, matchable
 from fmtorch.data.pairs import HeldPairs, ImagePair, ImageSource, PairDataset
 from fmtorch.data.scenes import AllPairs, Scene, ScenePairs, View
@@ -62,10 +60,8 @@ class Plan:
 
 
 PLANS = {
-    ("small", "test"): Plan(5, 4, 4, spare=6),
-    ("small", "train"): Plan(5, 4, 4, spare=6),
-    ("full", "test"): Plan(8, 14, 25, spare=6),
-    ("full", "train"): Plan(32, 14, 25, spare=6),
+    **{("small", split): Plan(5, 4, 4, spare=6) for split in SPLITS},
+    **{("full", split): Plan(scenes, 14, 25, spare=6) for split, scenes in zip(SPLITS, (8, 32), strict=True)},
 }
 
 
@@ -163,17 +159,18 @@ def generate(task: Task, folder: Path) -> Path:
     cv2.setNumThreads(1)
     try:
         scene = build(task)
-        temporary = folder / f".{task.name}-{os.getpid()}-{uuid.uuid4().hex[:8]}.tmp"
+        temporary = temporary_name(final)
         temporary.mkdir(parents=True)
         try:
             decided = recorded_pairs().get(digest(task.family, task.split, task.seed, task.plan), {}).get(task.name)
             photographs = draw(scene, seeds(task))
             if decided is None:
-                _write(temporary, scene, photographs, task.plan)
+                record = _judged(temporary, scene, photographs, task.plan)
             else:
-                taken = list(itertools.islice(zip(scene.shots, photographs, strict=True), decided["photographs"]))
+                taken = itertools.islice(zip(scene.shots, photographs, strict=True), decided["photographs"])
                 cameras = [_saved(temporary, i, shot, image) for i, (shot, image) in enumerate(taken)]
-                _record(temporary, cameras, decided["pairs"])
+                record = {"cameras": cameras, "pairs": decided["pairs"]}
+            (temporary / "scene.json").write_text(json.dumps(record, indent=1), encoding="utf-8")
             os.replace(temporary, final)
         except OSError:
             if not final.is_dir():  # otherwise another process was faster, with the same bytes
@@ -185,7 +182,8 @@ def generate(task: Task, folder: Path) -> Path:
     return final
 
 
-def _write(folder: Path, scene: DrawnScene, images: Iterable[Pixels], plan: Plan) -> None:
+def _judged(folder: Path, scene: DrawnScene, images: Iterable[Pixels], plan: Plan) -> dict[str, Any]:
+    """The record of a scene whose pairs are judged while it is drawn."""
     features: list[Keypoints] = []
     cameras: list[dict[str, Any]] = []
     waiting, kept = list(scene.pairs), list[tuple[int, int]]()
@@ -196,16 +194,14 @@ def _write(folder: Path, scene: DrawnScene, images: Iterable[Pixels], plan: Plan
         features.append(keypoints(grey.astype(np.uint8, copy=False)))
         if len(features) < plan.shots:
             continue
-        possible = [pair for pair in waiting if max(pair) <= i]
-        waiting = [pair for pair in waiting if max(pair) > i]
-        for a, b in possible:
-            if len(kept) == plan.pairs:
-                break
-            if matchable(features[a], features[b], fundamental(scene.shots[a].camera, scene.shots[b].camera)):
+        for a, b in [pair for pair in waiting if max(pair) <= i]:
+            F = fundamental(scene.shots[a].camera, scene.shots[b].camera)
+            if len(kept) < plan.pairs and matchable(features[a], features[b], F):
                 kept.append((a, b))
+        waiting = [pair for pair in waiting if max(pair) > i]
         if len(kept) == plan.pairs:
             break
-    _record(folder, cameras, sorted(kept))
+    return {"cameras": cameras, "pairs": sorted(kept)}
 
 
 def _saved(folder: Path, number: int, shot: Shot, image: Pixels) -> dict[str, Any]:
@@ -213,16 +209,8 @@ def _saved(folder: Path, number: int, shot: Shot, image: Pixels) -> dict[str, An
     picture = image if image.ndim == 2 else np.ascontiguousarray(image[..., ::-1])
     if not cv2.imwrite(str(path), picture, [cv2.IMWRITE_JPEG_QUALITY, shot.jpeg]):
         raise OSError(f"{path} could not be written")
-    camera = shot.camera
-    return {
-        "image": path.name, "size": list(camera.size),
-        "K": camera.K.tolist(), "R": camera.R.tolist(), "t": camera.t.tolist(),
-    }  # fmt: skip
-
-
-def _record(folder: Path, cameras: list[dict[str, Any]], pairs: Sequence[Sequence[int]]) -> None:
-    record = {"cameras": cameras, "pairs": pairs}
-    (folder / "scene.json").write_text(json.dumps(record, indent=1), encoding="utf-8")
+    matrices = {name: getattr(shot.camera, name).tolist() for name in ("K", "R", "t")}
+    return {"image": path.name, "size": list(shot.camera.size), **matrices}
 
 
 def read(folder: Path) -> tuple[list[tuple[Path, Camera]], list[tuple[int, int]]]:
@@ -233,9 +221,6 @@ def read(folder: Path) -> tuple[list[tuple[Path, Camera]], list[tuple[int, int]]
         K, R, t = (np.array(c[k], dtype=np.float64) for k in ("K", "R", "t"))
         views.append((folder / c["image"], Camera(K, R, t, (c["size"][0], c["size"][1]))))
     return views, [(i, j) for i, j in record["pairs"]]
-
-
-# The embedded data sets: `RenderedPairs`, drawn on first use from known cameras, and `StereoPair`, a real pair
 
 
 _SCENES = 2  # that each thread keeps, some 100 MB each: pairs of one scene follow one another
@@ -267,7 +252,7 @@ class _Recent(threading.local):
         self.scene = functools.lru_cache(maxsize=_SCENES)(build)
         self.visible = functools.lru_cache(maxsize=_PHOTOGRAPHS)(self._visible)
 
-    def _visible(self, task: Task, number: int) -> tuple[NDArray[np.int32], Matrix]:
+    def _visible(self, task: Task, number: int) -> tuple[np.ndarray, Matrix]:
         """Per pixel (h, w) the piece that is met (-1: none), and of each piece (n, 3) the form of its 1 / depth."""
         scene = self.scene(task)
         shot = scene.shots[number]
@@ -278,7 +263,9 @@ class _Recent(threading.local):
 _recent = _Recent()
 
 
-# `RenderedPairs`: the embedded data set, drawn on first use from known cameras
+def _truth(camera0: Camera, camera1: Camera) -> tuple[Matrix, Matrix, Matrix, Matrix, Matrix]:
+    """F, K0, K1, R and t."""
+    return fundamental(camera0, camera1), camera0.K, camera1.K, *relative_pose(camera0, camera1)
 
 
 class RenderedPairs(PairDataset):
@@ -331,14 +318,11 @@ class RenderedPairs(PairDataset):
     def __getitem__(self, index: int) -> ImagePair:
         task, i, j = self._pairs[index]
         (path0, camera0), (path1, camera1) = self._views[task.name][i], self._views[task.name][j]
-        R, t = relative_pose(camera0, camera1)
-        return ImagePair(
-            identity=f"{self.name}/{task.name}/{i}-{j}", family=task.family, scene=task.name,
-            image0=ImageSource(f"{task.name}/{i}", path0), image1=ImageSource(f"{task.name}/{j}", path1),
-            F=fundamental(camera0, camera1), K0=camera0.K, K1=camera1.K, R=R, t=t,
-        )  # fmt: skip
+        images = ImageSource(f"{task.name}/{i}", path0), ImageSource(f"{task.name}/{j}", path1)
+        identity = f"{self.name}/{task.name}/{i}-{j}"
+        return ImagePair(identity, task.family, task.name, *images, *_truth(camera0, camera1))
 
-    def depth(self, image: ImageSource, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    def depth(self, image: ImageSource, points: Matrix) -> Matrix:
         """Depth (n,) in metres along the optical axis at points (n, 2) of an image; NaN for the sky and outside.
 
         The scene is built anew and its rays are cast, as when it was drawn; the last few images are remembered.
@@ -366,7 +350,7 @@ class RenderedScenePairs(ScenePairs):
         super().__init__("rendered", scenes, (), (drawn.digest,))
         self.drawn = drawn
 
-    def depth(self, image: ImageSource, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    def depth(self, image: ImageSource, points: Matrix) -> Matrix:
         return self.drawn.depth(image, points)
 
 
@@ -394,15 +378,11 @@ class StereoPair(HeldPairs):
         x, y = _CENTRE
         left = Camera(calibration(_FOCAL, _SIZE, (x, y)), np.eye(3), np.zeros(3), _SIZE)
         right = Camera(calibration(_FOCAL, _SIZE, (x + _SHIFT, y)), np.eye(3), np.array([-_BASELINE, 0.0, 0.0]), _SIZE)
-        R, t = relative_pose(left, right)
-        self._pairs = [ImagePair(
-            identity=f"{self.name}/motorcycle/left-right", family=self.name, scene="motorcycle",
-            image0=ImageSource("motorcycle/left", self._paths[0]),
-            image1=ImageSource("motorcycle/right", self._paths[1]), F=fundamental(left, right), K0=left.K, K1=right.K,
-            R=R, t=t,
-        )]  # fmt: skip
+        images = [ImageSource(f"motorcycle/{side}", self._paths[i]) for i, side in enumerate(("left", "right"))]
+        identity, truth = f"{self.name}/motorcycle/left-right", _truth(left, right)
+        self._pairs = [ImagePair(identity, self.name, "motorcycle", images[0], images[1], *truth)]
 
-    def matches(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def matches(self) -> tuple[Matrix, Matrix]:
         """Points (n, 2) on the left and where they are on the right, for every pixel with a measured disparity."""
         with np.load(self._paths[2]) as file:
             disparity = file["arr_0"].astype(np.float64)

@@ -1,15 +1,16 @@
 """The families of landmarks: a walk round a structure after Tanks and Temples, and photographs of a place after CPC."""
 
+from collections import Counter
 from typing import Literal
 
 import numpy as np
 
 from fmtorch.scenes import buildings
 from fmtorch.scenes.buildings import Style, direction
-from fmtorch.scenes.light import DrawnScene, Lens, Light, Shot, sun
-from fmtorch.scenes.patterns import Rng, cells, colour, heaven, heights, masonry, meadow, poster, sign, to_pixels
-from fmtorch.scenes.raycast import calibration, look_at
-from fmtorch.scenes.surfaces import Real, Surfaces, material, pictures, vec
+from fmtorch.scenes.light import DrawnScene, Lens, Light, Shot, shuffled_pairs, sun
+from fmtorch.scenes.patterns import Rng, cells, colour, heaven, heights, masonry, meadow, poster, sign
+from fmtorch.scenes.raycast import calibration, look_at, scaled_camera
+from fmtorch.scenes.surfaces import Real, Surfaces, material, pictures, to_pixels, vec
 
 SIZE = (540, 960)
 FOCAL = 760.0  # pixels: a phone's wide lens
@@ -30,7 +31,7 @@ def ground(surfaces: Surfaces, rng: Rng, split: str, reach: Real) -> None:
         paving = masonry(rng, 1024, 1024, 12, 12, tint, joint=0.03, bond=float(rng.choice([0.0, 0.5])), vary=0.09)
     else:
         paving = cells(rng, 1024, 1024, int(rng.integers(28, 60)), tint)
-    number = surfaces.texture(to_pixels(paving))
+    number = surfaces.paint(paving)
     side = 9.0
     n = int(np.ceil(reach / side))
     for i in range(-n, n):
@@ -72,7 +73,7 @@ def _structure(surfaces: Surfaces, rng: Rng, split: str) -> float:
             Style(density=110, storey=1.5, bay=1.1, depth=0.22, pilasters=kind < 0.75, same_windows=0.8), sides=sides,
         )  # fmt: skip
     base += height
-    frieze = surfaces.texture(to_pixels(buildings.wall_picture(rng, split, 256, 1024, 60)))
+    frieze = surfaces.paint(buildings.wall_picture(rng, split, 256, 1024, 60))
     surfaces.box(
         vec(-width / 2 - 0.3, -depth / 2 - 0.3, base), vec(width + 0.6, 0, 0), vec(0, depth + 0.6, 0), 0.6,
         [frieze, frieze, frieze, frieze, stone], ((0, 0, 1, 0.6),) * 5,
@@ -80,9 +81,9 @@ def _structure(surfaces: Surfaces, rng: Rng, split: str) -> float:
     base += 0.6
     if rng.random() < 0.5:  # a dome
         r = 0.36 * min(width, depth)
-        profile = [(0.0, r * 1.05), (0.4, r)] + [
-            (0.4 + r * float(np.sin(a)), r * float(np.cos(a)) + 1e-3) for a in np.linspace(0.1, np.pi / 2, 7)
-        ]
+        angles = np.linspace(0.1, np.pi / 2, 7)
+        cap = [(0.4 + r * float(np.sin(a)), r * float(np.cos(a)) + 1e-3) for a in angles]
+        profile = [(0.0, r * 1.05), (0.4, r), *cap]
         surfaces.lathe(vec(0, 0, base), profile, block, sides=16, repeat=(2, 1))
     else:
         buildings.statue(surfaces, rng, vec(0, 0, base), 2.2, stone)
@@ -103,7 +104,7 @@ def _boards_and_rocks(surfaces: Surfaces, rng: Rng, split: str, reach: Real, bac
         top = foot - right * wide / 2 + vec(0, 0, tall + 0.35)
         surfaces.quad(top, right * wide, vec(0, 0, -tall), number)
         surfaces.quad(top + right * wide, -right * wide, vec(0, 0, -tall), back)
-    relief = surfaces.texture(to_pixels(buildings.wall_picture(rng, split, 256, 256, 90)))
+    relief = surfaces.paint(buildings.wall_picture(rng, split, 256, 256, 90))
     for _ in range(6):
         angle = rng.uniform(0, 360)
         foot = direction(angle) * (reach + rng.uniform(0.5, 2.5))
@@ -134,7 +135,7 @@ def surroundings(surfaces: Surfaces, rng: Rng, split: str, near: Real, far: Real
     for _ in range(9):
         at = direction(rng.uniform(0, 360)) * rng.uniform(near, far * 0.8)
         buildings.tree(surfaces, rng, at, rng.uniform(4, 8), leaf, bark)
-    metal = surfaces.texture(to_pixels(np.full((32, 32, 3), 0.3, dtype=np.float32)))
+    metal = surfaces.paint(np.full((32, 32, 3), 0.3, dtype=np.float32))
     for _ in range(4):
         buildings.post(surfaces, direction(rng.uniform(0, 360)) * near, 4.2, metal)
 
@@ -145,19 +146,17 @@ def orbit_scene(rng: Rng, split: str, shots: int, scale: Real) -> DrawnScene:
     height = _structure(surfaces, rng, split)
     ground(surfaces, rng, split, 22)
     surroundings(surfaces, rng, split, 17, 36, 8)
-    leaf_bed = surfaces.texture(to_pixels(meadow(rng, 256, 256, colour(rng, (0.2, 0.95), (0.3, 0.6), (0.4, 0.6)))))
+    leaf_bed = surfaces.paint(meadow(rng, 256, 256, colour(rng, (0.2, 0.95), (0.3, 0.6), (0.4, 0.6))))
     for _ in range(3):
         a = np.radians(rng.uniform(0, 360))
         _mound(surfaces, rng, leaf_bed, (float(6.5 * np.cos(a)), float(6.5 * np.sin(a))), 2.4, 0.7)
     leaf, bark = buildings.foliage(surfaces, rng)
     for _ in range(5):
-        buildings.tree(
-            surfaces, rng, direction(rng.uniform(0, 360)) * rng.uniform(6.0, 8.5), rng.uniform(2.2, 3.6), leaf, bark
-        )
+        foot = direction(rng.uniform(0, 360)) * rng.uniform(6.0, 8.5)
+        buildings.tree(surfaces, rng, foot, rng.uniform(2.2, 3.6), leaf, bark)
     for _ in range(6):
         buildings.walker(surfaces, rng, direction(rng.uniform(0, 360)) * rng.uniform(5, 8), rng.uniform(0, 360))
-    size = (round(SIZE[0] * scale), round(SIZE[1] * scale))
-    K = calibration(FOCAL * scale, size)
+    K, size = scaled_camera(FOCAL, SIZE, scale)
     arc = min(360.0, 20.0 * shots)
     start = rng.uniform(0, 360)
     azimuth = start + arc * (np.arange(shots) + rng.uniform(-0.3, 0.3, shots)) / shots
@@ -171,21 +170,17 @@ def orbit_scene(rng: Rng, split: str, shots: int, scale: Real) -> DrawnScene:
         taken.append(Shot(camera, lens, jpeg=88))
     light = Light(sun(rng.uniform(0, 360), rng.uniform(30, 65)))
     apart = np.abs((azimuth[:, None] - azimuth[None] + 180) % 360 - 180)
-    pairs = [(i, j) for i in range(shots) for j in range(i + 1, shots) if ANGLES[0] <= apart[i, j] <= ANGLES[1]]
     # Wide before narrow within each round, so that the pairs kept spread evenly over the angles.
-    width = (ANGLES[1] - ANGLES[0]) / 4
-    rounds: dict[int, int] = {}
-    order = []
-    for k in rng.permutation(len(pairs)):
-        step = int((apart[pairs[k]] - ANGLES[0]) / width)
-        rounds[step] = rounds.get(step, 0) + 1
-        order.append((rounds[step], -step, pairs[k]))
+    width, rounds, order = (ANGLES[1] - ANGLES[0]) / 4, Counter[int](), []
+    for pair in shuffled_pairs(rng, shots, lambda i, j: bool(ANGLES[0] <= apart[i, j] <= ANGLES[1])):
+        step = int((apart[pair] - ANGLES[0]) / width)
+        rounds[step] += 1
+        order.append((rounds[step], -step, pair))
     sky = heaven(rng, rng.uniform(-0.4, 0.6))
     return DrawnScene([surfaces], [light], sky, taken, [pair for _, _, pair in sorted(order)])
 
 
 # The collection family, after CPC: a landmark photographed by many people; other cameras, zooms, light and weather
-
 
 SIZES = ((600, 800), (533, 800), (450, 800), (576, 768), (683, 1024), (480, 640))
 LIGHTS = 4  # times of day
@@ -225,7 +220,7 @@ def _landmark(surfaces: Surfaces, rng: Rng, split: str) -> float:
         )  # fmt: skip
     for x in np.linspace(-portico / 2 + 0.5, portico / 2 - 0.5, int(rng.integers(4, 7))):
         buildings.column(surfaces, vec(float(x), -out + 0.5, 0.64), tall - 0.64, 0.42, stone)
-    banner = surfaces.texture(to_pixels(sign(rng, 96, 1024)))
+    banner = surfaces.paint(sign(rng, 96, 1024))
     surfaces.box(
         vec(-portico / 2, -out, tall), vec(portico, 0, 0), vec(0, out, 0), 1.0, [banner, block, block, block, stone],
         ((0, 0, 1, 1), (0, 0, 0.4, 0.2), (0, 0, 1, 0.2), (0, 0, 0.4, 0.2), (0, 0, 1, 1)),
@@ -237,16 +232,13 @@ def _landmark(surfaces: Surfaces, rng: Rng, split: str) -> float:
                   Style(density=52, storey=4.0, bay=2.5, depth=0.35))  # fmt: skip
     for x in np.linspace(-width / 2 + 2, width / 2 - 2, 6):
         if abs(x) > portico / 2 + 1.5:
-            surfaces.box(
-                vec(x - 0.7, -3.6, 0), vec(1.4, 0, 0), vec(0, 1.4, 0), 1.6, [block] * 5, ((0, 0, 0.25, 0.4),) * 5
-            )
+            foot, window = vec(x - 0.7, -3.6, 0), (0, 0, 0.25, 0.4)
+            surfaces.box(foot, vec(1.4, 0, 0), vec(0, 1.4, 0), 1.6, [block] * 5, (window,) * 5)
             buildings.statue(surfaces, rng, vec(x, -2.9, 1.6), 2.6, stone, detail=12)
     for picture in pictures(split, rng, 2):
-        x = rng.uniform(-width / 2 + 1, width / 2 - 4)
-        wide = 2.4
-        tall_picture = wide * picture.shape[0] / picture.shape[1]
-        number = surfaces.texture(picture)
-        surfaces.quad(vec(x, -0.5, 1.4 + tall_picture), vec(wide, 0, 0), vec(0, 0, -tall_picture), number)
+        x, wide = rng.uniform(-width / 2 + 1, width / 2 - 4), 2.4
+        high = wide * picture.shape[0] / picture.shape[1]
+        surfaces.quad(vec(x, -0.5, 1.4 + high), vec(wide, 0, 0), vec(0, 0, -high), surfaces.texture(picture))
     return width
 
 
@@ -257,9 +249,8 @@ def collection_scene(rng: Rng, split: str, shots: int, scale: Real) -> DrawnScen
     _surroundings(fixed, rng, split, width)
     lights, surfaces = _times_of_day(fixed, rng, width)
     taken = [_photograph(rng, width, scale, light=i % LIGHTS) for i in range(shots)]
-    pairs = [(i, j) for i in range(shots) for j in range(i + 1, shots)]
     sky = heaven(rng, rng.uniform(-0.3, 0.7))
-    return DrawnScene(surfaces, lights, sky, taken, [pairs[k] for k in rng.permutation(len(pairs))])
+    return DrawnScene(surfaces, lights, sky, taken, shuffled_pairs(rng, shots))
 
 
 def _surroundings(surfaces: Surfaces, rng: Rng, split: str, width: Real) -> None:
@@ -299,7 +290,6 @@ def _times_of_day(fixed: Surfaces, rng: Rng, width: Real) -> tuple[list[Light], 
 
 
 def _photograph(rng: Rng, width: Real, scale: Real, light: int) -> Shot:
-    """What somebody takes of a landmark of this width, with a camera of their own."""
     h, w = SIZES[int(rng.integers(len(SIZES)))]
     if rng.random() < 0.3:
         h, w = w, h

@@ -1,19 +1,17 @@
 """How surfaces look: filtered texture, sun with shadows, sky light, and what a real camera adds."""
 
-from __future__ import annotations
-
 import dataclasses
-from collections.abc import Sequence
+import itertools
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from fmtorch.jit.kernel import F4x1, F4x2, F4x3, I4x1, I8x1, U1x1, inner, kernel
 from fmtorch.jit.lanes import fused
 from fmtorch.scenes.raycast import Camera, Geometry, Hits, Index, Number
-from fmtorch.scenes.surfaces import TO_LINEAR, Floats, Pixels, Real, Surfaces, Texture, bilinear, to_srgb
+from fmtorch.scenes.surfaces import TO_LINEAR, Floats, Pixels, Real, Surfaces, bilinear, to_srgb
 
 _ZERO, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
 # The four rays of a pixel share a footprint's long side, so that each filters only a quarter of it.
@@ -287,7 +285,11 @@ class Stage:
             2 * np.float32(offset[1]), float(self.bias), np.float32(self.light.ground_shade),
         )  # fmt: skip
         for i in np.flatnonzero(count).tolist():
-            shade(index[end[i] - count[i] : end[i]], seen, footprint, _picture(geometry.textures[i]), lighting, out)
+            texture = geometry.textures[i]
+            levels = texture.origin, texture.scale, np.float32(texture.coarsest)
+            _, width, channels = texture.atlas.shape
+            picture = Picture(texture.atlas.reshape(-1), width, channels, *levels, TO_LINEAR)
+            shade(index[end[i] - count[i] : end[i]], seen, footprint, picture, lighting, out)
 
     def homography(self, hits: Hits) -> Floats:
         """From pixel to texel, of each piece (n, 7): rows (2, 2) of the numerator, and G^-1's last, the denominator."""
@@ -295,7 +297,7 @@ class Stage:
         numerator = np.einsum("nki,nkj->nij", uv[:, [1, 2, 0]], hits.inverse)
         return np.concatenate([numerator[:, :, :2].reshape(-1, 4), hits.inverse[:, 2]], axis=1).astype(np.float32)
 
-    def _background(self, camera: Camera, offset: tuple[Real, Real], index: NDArray[np.int64]) -> Floats:
+    def _background(self, camera: Camera, offset: tuple[Real, Real], index: np.ndarray) -> Floats:
         """The sky (n, 3) at pixels (n,), at infinity: looked up by azimuth (once round) and elevation."""
         h, w = camera.size
         toward = camera.R.T @ np.linalg.inv(camera.K)
@@ -307,12 +309,6 @@ class Stage:
         elevation = np.arctan2(Z, np.hypot(X, Y)) * np.float32(2 / np.pi)
         coded = bilinear(self.sky, np.mod(azimuth, wide - 1), np.clip((1 - elevation) * (tall - 1), 0, tall - 1))
         return np.take(TO_LINEAR, coded)
-
-
-def _picture(texture: Texture) -> Picture:
-    _, wide, channels = texture.atlas.shape
-    atlas, coarsest = texture.atlas.reshape(-1), np.float32(texture.coarsest)
-    return Picture(atlas, wide, channels, texture.origin, texture.scale, coarsest, TO_LINEAR)
 
 
 def expose(stage: Stage, cameras: Sequence[Camera], lens: Lens, rng: np.random.Generator) -> Pixels:
@@ -334,9 +330,8 @@ def develop(linear: Floats, lens: Lens, rng: np.random.Generator) -> Pixels:
     if lens.blur > 0:
         linear = cv2.GaussianBlur(linear, (0, 0), lens.blur).astype(np.float32)
     y, x = np.linspace(-1, 1, h, dtype=np.float32)[:, None], np.linspace(-1, 1, w, dtype=np.float32)
-    linear = (
-        linear * (1 - np.float32(lens.vignette) * (x * x + y * y))[..., None] * np.array(lens.balance, dtype=np.float32)
-    )
+    darkening = (1 - np.float32(lens.vignette) * (x * x + y * y))[..., None]
+    linear = linear * darkening * np.array(lens.balance, dtype=np.float32)
     if lens.grey:
         linear = (linear @ np.array([0.2126, 0.7152, 0.0722], dtype=np.float32))[..., None]
     # A shoulder instead of clipping, as film and cameras have it.
@@ -353,9 +348,6 @@ def sun(azimuth: Real, elevation: Real) -> tuple[float, float, float]:
     """The unit direction at an azimuth and elevation in degrees."""
     a, e = np.radians(azimuth), np.radians(elevation)
     return float(np.cos(a) * np.cos(e)), float(np.sin(a) * np.cos(e)), float(np.sin(e))
-
-
-# What a family makes: geometry, lights and shots; the generator draws them and keeps the matchable pairs
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -381,3 +373,11 @@ class DrawnScene:
     sky: Pixels
     shots: Sequence[Shot]
     pairs: Sequence[tuple[int, int]]
+
+
+def shuffled_pairs(
+    rng: np.random.Generator, shots: int, allowed: Callable[[int, int], bool] = lambda i, j: True
+) -> list[tuple[int, int]]:
+    """The pairs of shots that are allowed, in random order."""
+    pairs = [(i, j) for i, j in itertools.combinations(range(shots), 2) if allowed(i, j)]
+    return [pairs[k] for k in rng.permutation(len(pairs))]

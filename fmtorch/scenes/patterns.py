@@ -8,9 +8,8 @@ import string
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from fmtorch.scenes.surfaces import Floats, Pixels, Real
+from fmtorch.scenes.surfaces import Floats, Pixels, Real, Vector, to_pixels
 
 Rng = np.random.Generator
 _BORDER = 2  # points of a grid of noise beyond each side
@@ -19,11 +18,6 @@ _BORDER = 2  # points of a grid of noise beyond each side
 def rgb(red: Real, green: Real, blue: Real) -> Floats:
     """A colour (3,)."""
     return np.array([red, green, blue], dtype=np.float32)
-
-
-def to_pixels(picture: Floats) -> Pixels:
-    """[0, 1] to 8 bits."""
-    return (np.clip(picture, 0, 1) * 255 + 0.5).astype(np.uint8)
 
 
 def colour(rng: Rng, hue: tuple[Real, Real], saturation: tuple[Real, Real], value: tuple[Real, Real]) -> Floats:
@@ -90,13 +84,13 @@ def masonry(
     edge_x = np.minimum(c - np.floor(c), 1 - (c - np.floor(c))) * np.float32(aspect)
     wobble = np.float32(joint) * (1 + 0.35 * fractal(rng, h, w, 16, 2))
     gap = np.clip((wobble - np.minimum(edge_x, edge_y)) / np.float32(joint * 0.4) + 0.5, 0, 1)[..., None]
-    mortar: Floats = (0.55 * tint + 0.15) * (1 + 0.1 * fractal(rng, h, w, 8, 1))[..., None]
-    wall: Floats = (out * (1 - gap) + mortar * gap).astype(np.float32)
-    return wall
+    mortar = (0.55 * tint + 0.15) * (1 + 0.1 * fractal(rng, h, w, 8, 1))[..., None]
+    return np.asarray(out * (1 - gap) + mortar * gap, dtype=np.float32)
 
 
-def cells(rng: Rng, h: int, w: int, size: int, tint: Floats, *, vary: Real = 0.12, joint: Real = 2.0) -> Floats:
+def cells(rng: Rng, h: int, w: int, size: int, tint: Floats) -> Floats:
     """Irregular stones (Voronoi cells of a jittered grid): cobbles, rubble."""
+    vary, joint = 0.12, 2.0
     seeds = np.full((h, w), 255, dtype=np.uint8)
     gy, gx = np.mgrid[size // 2 : h : size, size // 2 : w : size]
     jitter = rng.integers(-size // 3, size // 3 + 1, (2, *gy.shape))
@@ -168,9 +162,9 @@ def cloth(rng: Rng, h: int, w: int) -> Floats:
     return (out * (1 + 0.10 * fractal(rng, h, w, 4, 1, 0.9))[..., None]).astype(np.float32)
 
 
-def leaves(rng: Rng, size: int, tint: Floats, count: int = 320) -> Pixels:
+def leaves(rng: Rng, size: int, tint: Floats) -> Pixels:
     """A cloud of leaves with opacity (size, size, 4)."""
-    out = np.zeros((size, size, 4), dtype=np.float32)
+    count, out = 320, np.zeros((size, size, 4), dtype=np.float32)
     out[..., :3] = tint * 0.5
     radius = size * 0.42 * np.sqrt(rng.random(count))
     angle = rng.uniform(0, 2 * np.pi, count)
@@ -193,7 +187,7 @@ def heaven(rng: Rng, cover: Real) -> Pixels:
     return to_pixels((out * (1 - veil) + shade * veil).astype(np.float32))
 
 
-def heights(rng: Rng, m: int, n: int, coarsest: int = 8) -> NDArray[np.float64]:
+def heights(rng: Rng, m: int, n: int, coarsest: int = 8) -> Vector:
     """A smooth random field (m, n) in [0, 1] for relief."""
     field = fractal(rng, m, n, coarsest, 1, 0.45).astype(np.float64)
     field -= field.min()
@@ -291,10 +285,8 @@ def poster(rng: Rng, h: int, w: int) -> Floats:
         r = float(rng.uniform(0.02, 0.16)) * w
         kind = rng.random()
         if kind < 0.4:
-            cv2.ellipse(
-                out, p.astype(int).tolist(), (int(r), int(r * rng.uniform(0.3, 1))), rng.uniform(0, 180), 0, 360,
-                tone, -1, cv2.LINE_AA,
-            )  # fmt: skip
+            at, axes = p.astype(int).tolist(), (int(r), int(r * rng.uniform(0.3, 1)))
+            cv2.ellipse(out, at, axes, rng.uniform(0, 180), 0, 360, tone, -1, cv2.LINE_AA)
         elif kind < 0.75:
             corners = (p + rng.normal(0, r, (int(rng.integers(3, 6)), 2))).astype(np.int32)
             cv2.fillPoly(out, [corners], tone, cv2.LINE_AA)
@@ -374,7 +366,6 @@ def person(rng: Rng) -> Pixels:
     for y in range(60, 148, int(rng.integers(6, 16))):
         cv2.line(out, (28, y), (68, y), (*(coat * rng.uniform(0.5, 1.3)).tolist(), 1.0), 2)
     cv2.circle(out, (48, 30), 17, (*skin.tolist(), 1.0), -1)
-    cv2.ellipse(
-        out, (48, 23), (18, 13), 0, 180, 360, (*colour(rng, (0, 0.15), (0, 0.7), (0.05, 0.6)).tolist(), 1.0), -1
-    )
+    hair = colour(rng, (0, 0.15), (0, 0.7), (0.05, 0.6))
+    cv2.ellipse(out, (48, 23), (18, 13), 0, 180, 360, (*hair.tolist(), 1.0), -1)
     return to_pixels(out)

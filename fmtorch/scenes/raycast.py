@@ -5,12 +5,10 @@ pixel x meets its plane at ``(s, t, 1) = z G^-1 (x, y, 1)``: three linear forms 
 depth z is the reciprocal of the third form. Each piece is intersected with the rays of its bounding box only.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from collections.abc import Sequence
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,6 +57,16 @@ def calibration(focal: Real, size: tuple[int, int], centre: tuple[float, float] 
     return np.array([[focal, 0.0, cx], [0.0, focal, cy], [0.0, 0.0, 1.0]])
 
 
+def scaled_camera(
+    focal: Real, size: tuple[int, int], scale: Real, centre: tuple[float, float] | None = None
+) -> tuple[Matrix, tuple[int, int]]:
+    """K and the size (h, w) of an image of a camera, in pixels, that is scaled."""
+    scaled = round(size[0] * scale), round(size[1] * scale)
+    return calibration(
+        focal * scale, scaled, None if centre is None else (centre[0] * scale, centre[1] * scale)
+    ), scaled
+
+
 def look_at(
     K: Matrix, size: tuple[int, int], centre: Sequence[Real], target: Sequence[Real], roll: Real = 0.0
 ) -> Camera:
@@ -74,14 +82,13 @@ def look_at(
     return Camera(K, R, -R @ c, size)
 
 
-# Which surface each pixel's ray meets first: exact ray-plane intersection, batched over pixels, with a depth buffer
-
-
 Booleans = NDArray[np.bool_]
-Number: TypeAlias = Any  # a number of Python's or NumPy's; in a compiled function each has one type
-Index: TypeAlias = Any
+Number = Any  # a number of Python's or NumPy's; in a compiled function each has one type
+Index = Any
 
 _OPAQUE_FROM = 128  # of 255
+SEAM = 1e-4  # pieces reach this much (of their own extent) beyond their edges, so that neighbours leave no gap
+_LOW, _HIGH = np.float32(-SEAM), np.float32(1 + SEAM)  # of s and t, exclusive
 
 
 class Pieces(NamedTuple):
@@ -111,14 +118,6 @@ class Cutouts(NamedTuple):
     opacity: U1x1
 
 
-class Bounds(NamedTuple):
-    """Of s and t, exclusive, and of the depth."""
-
-    low: np.float32
-    high: np.float32
-    near: np.float32
-
-
 class Met(NamedTuple):
     """What the ray of each pixel (h, w) meets first so far: its depth, the piece's number, s and t."""
 
@@ -129,11 +128,10 @@ class Met(NamedTuple):
 
 
 @kernel(always_compiled=True)
-def cast_pieces(pieces: Pieces, cutouts: Cutouts, bounds: Bounds, met: Met) -> None:
-    """Casts rays against pieces; what they meet -> met."""
+def cast_pieces(pieces: Pieces, cutouts: Cutouts, near: np.float32, met: Met) -> None:
+    """Casts rays against pieces, of depths beyond `near`; what they meet -> met."""
     order, boxes, forms, depth, closest, triangle = pieces
     cutout, window, opacity = cutouts
-    low, high, near = bounds
     buffer, piece, s, t = met
     width = buffer.shape[1]
     axis = np.arange(width).astype(np.float32)
@@ -160,7 +158,7 @@ def cast_pieces(pieces: Pieces, cutouts: Cutouts, bounds: Bounds, met: Met) -> N
                 t_here = (t_x * axis[x] + t_y) / q
                 z = z_s * s_here + (z_t * t_here + z_0)
                 edge = s_here + t_here if is_triangle else (s_here if s_here > t_here else t_here)
-                hit = (s_here > low) & (t_here > low) & (edge < high) & (z < before[x]) & (z > near)
+                hit = (s_here > _LOW) & (t_here > _LOW) & (edge < _HIGH) & (z < before[x]) & (z > near)
                 row_s[x], row_t[x], row_z[x], row_hit[x] = s_here, t_here, z, hit
                 hits += hit
             if hits == 0:
@@ -207,7 +205,6 @@ def _open_holes(
 
 
 NEAR = 0.05  # metres
-SEAM = 1e-4  # pieces reach this much (of their own extent) beyond their edges, so that neighbours leave no gap
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -269,10 +266,9 @@ class Geometry:
         pieces = Pieces(order, boxes, forms, z_of, closest, self.triangle)
         s, t = np.zeros((2, h, w), dtype=np.float32)
         hits = Hits(np.full((h, w), -1, dtype=np.int32), s, t, inverse)
-        near = -np.inf if centre is None else NEAR
-        bounds = Bounds(np.float32(-SEAM), np.float32(1 + SEAM), np.float32(near))
+        near = np.float32(-np.inf if centre is None else NEAR)
         met = Met(np.full(hits.piece.shape, np.inf, dtype=np.float32), hits.piece, hits.s, hits.t)
-        cast_pieces(pieces, self._cutouts(pieces.boxes), bounds, met)
+        cast_pieces(pieces, self._cutouts(pieces.boxes), near, met)
         return hits
 
     @functools.cached_property

@@ -11,6 +11,7 @@ from PIL import Image
 
 Floats = NDArray[np.float32]
 Pixels = NDArray[np.uint8]
+Vector = NDArray[np.float64]
 Real = float | int
 
 _BORDER = 2
@@ -25,6 +26,11 @@ def to_srgb(linear: Floats) -> Floats:
     """Linear light in [0, 1] to sRGB in [0, 1]."""
     x = np.clip(linear, 0.0, 1.0)
     return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.power(x, np.float32(1 / 2.4)) - 0.055).astype(np.float32)
+
+
+def to_pixels(picture: Floats) -> Pixels:
+    """[0, 1] to 8 bits."""
+    return (np.clip(picture, 0, 1) * 255 + 0.5).astype(np.uint8)
 
 
 class Texture:
@@ -97,10 +103,8 @@ def skimage_file(name: str) -> Path:
         raise FileNotFoundError(f"{name} belongs to the scikit-image package, which is not installed")
     path = Path(spec.submodule_search_locations[0]) / "data" / name
     if not path.is_file():
-        raise FileNotFoundError(
-            f"{path} is absent: this installation of scikit-image does not hold it (release 0.26 does); "
-            "nothing is downloaded"
-        )
+        reason = "this installation of scikit-image does not hold it (release 0.26 does); nothing is downloaded"
+        raise FileNotFoundError(f"{path} is absent: {reason}")
     return path
 
 
@@ -135,12 +139,6 @@ def material(split: str, kind: str) -> Pixels | None:
     return np.ascontiguousarray(np.concatenate([picture, picture[::-1]], axis=0))
 
 
-# What a scene is made of: textured parallelograms and triangles, and the shapes built from them
-
-
-Vector = NDArray[np.float64]
-
-
 def vec(*v: Real) -> Vector:
     """A float64 vector."""
     return np.array(v, dtype=np.float64)
@@ -159,7 +157,7 @@ class Surfaces:
 
     def __init__(self) -> None:
         self.textures: list[Texture] = []
-        self._rows: list[NDArray[np.float64]] = []
+        self._rows: list[Vector] = []
         self._texture: list[int] = []
         self._flags: list[tuple[bool, bool]] = []
 
@@ -167,12 +165,16 @@ class Surfaces:
         self.textures.append(Texture(picture))
         return len(self.textures) - 1
 
+    def paint(self, picture: Floats) -> int:
+        """A texture of a picture in [0, 1]."""
+        return self.texture(to_pixels(picture))
+
     def __len__(self) -> int:
         return len(self._rows)
 
     def piece(
-        self, corner: Vector, U: Vector, V: Vector, texture: int, uv: NDArray[np.float64],
-        *, triangle: bool = False, normals: NDArray[np.float64] | None = None, both_sides: bool = False,
+        self, corner: Vector, U: Vector, V: Vector, texture: int, uv: Vector,
+        *, triangle: bool = False, normals: Vector | None = None, both_sides: bool = False,
     ) -> None:  # fmt: skip
         """One piece; `uv` (3, 2) and `normals` (3, 3): values at the corner and their change along U and along V."""
         flat = _FLAT if normals is None else normals.ravel()
@@ -195,12 +197,11 @@ class Surfaces:
         """An upright box on its lower front left corner; textures of front, right, back, left side and top."""
         up = vec(0.0, 0.0, height)
         corners = [base, base + right, base + right + back, base + back]
-        for i in range(4):
-            a, b = corners[i], corners[(i + 1) % 4]
-            self.quad(a + up, b - a, -up, textures[i], windows[i])
+        for i, a in enumerate(corners):
+            self.quad(a + up, corners[(i + 1) % 4] - a, -up, textures[i], windows[i])
         self.quad(base + back + up, right, -back, textures[4], windows[4])
 
-    def grid(self, points: NDArray[np.float64], texture: int, repeat: tuple[Real, Real] = (1.0, 1.0)) -> None:
+    def grid(self, points: Vector, texture: int, repeat: tuple[Real, Real] = (1.0, 1.0)) -> None:
         """A smooth surface through a grid of points (m, n, 3), rows from top to bottom seen from outside."""
         m, n = points.shape[:2]
         du = np.gradient(points, axis=1)
@@ -217,13 +218,12 @@ class Surfaces:
                     U, V = points[along] - points[corner], points[down] - points[corner]
                     if np.linalg.norm(np.cross(U, V)) < 1e-9:
                         continue
-                    tex = np.stack([uv[corner], uv[along] - uv[corner], uv[down] - uv[corner]])
-                    nor = np.stack([normal[corner], normal[along] - normal[corner], normal[down] - normal[corner]])
+                    tex, nor = (np.stack([x[corner], x[along] - x[corner], x[down] - x[corner]]) for x in (uv, normal))
                     self.piece(points[corner], U, V, texture, tex, triangle=True, normals=nor)
 
     def lathe(
         self, base: Vector, profile: Sequence[tuple[Real, Real]], texture: int, sides: int = 12,
-        repeat: tuple[Real, Real] = (1.0, 1.0), bumps: NDArray[np.float64] | None = None,
+        repeat: tuple[Real, Real] = (1.0, 1.0), bumps: Vector | None = None,
     ) -> None:  # fmt: skip
         """A turned shape: (height, radius) from bottom to top round the upright axis; `bumps` scale the radius."""
         steps = np.array(profile[::-1], dtype=np.float64)
@@ -241,11 +241,11 @@ class Surfaces:
     def copy(self) -> "Surfaces":
         """A list of its own with the same pieces and textures, to which more can be added."""
         other = Surfaces()
-        other.textures, other._rows = list(self.textures), list(self._rows)
-        other._texture, other._flags = list(self._texture), list(self._flags)
+        for name, values in vars(self).items():
+            setattr(other, name, list(values))
         return other
 
-    def arrays(self) -> dict[str, NDArray[np.float64]]:
+    def arrays(self) -> dict[str, Vector]:
         """All pieces as arrays: O, U, V (n, 3), uv (n, 3, 2), normals (n, 3, 3)."""
         rows = np.array(self._rows).reshape(-1, 24)
         flat = np.isnan(rows[:, 15])

@@ -5,10 +5,10 @@ import numpy as np
 
 from fmtorch.scenes import patterns
 from fmtorch.scenes.buildings import Style, car, direction, foliage, front, post, statue, tree, walker
-from fmtorch.scenes.light import DrawnScene, Lens, Light, Shot, sun
-from fmtorch.scenes.patterns import Rng, colour, to_pixels
-from fmtorch.scenes.raycast import Camera, calibration, look_at
-from fmtorch.scenes.surfaces import Real, Surfaces, Vector, pictures, vec
+from fmtorch.scenes.light import DrawnScene, Lens, Light, Shot, shuffled_pairs, sun
+from fmtorch.scenes.patterns import Rng, colour
+from fmtorch.scenes.raycast import Camera, look_at, scaled_camera
+from fmtorch.scenes.surfaces import Real, Surfaces, Vector, pictures, to_pixels, vec
 
 DRIVING_SIZE = (376, 1241)
 DRIVING_FOCAL, DRIVING_CENTRE = 718.856, (607.19, 185.22)  # KITTI odometry, sequence 00
@@ -26,15 +26,12 @@ def _road(surfaces: Surfaces, rng: Rng, length: float, half: float, walk: float)
     for y in (16, 490):
         cv2.line(road, (0, y), (1024, y), (0.75, 0.75, 0.7), 6)
     worn = (0.65 * road + 0.3 * patterns.asphalt(rng, 512, 1024)).astype(np.float32)
-    asphalts = [surfaces.texture(to_pixels(road)), surfaces.texture(to_pixels(worn))]
-    tiles = patterns.masonry(
-        rng, 256, 512, 6, 10, colour(rng, (0.05, 0.12), (0.02, 0.15), (0.45, 0.7)), joint=0.04, vary=0.08
-    )
+    asphalts = [surfaces.paint(road), surfaces.paint(worn)]
+    tint = colour(rng, (0.05, 0.12), (0.02, 0.15), (0.45, 0.7))
+    tiles = patterns.masonry(rng, 256, 512, 6, 10, tint, joint=0.04, vary=0.08)
     cobbles = patterns.cells(rng, 256, 512, 20, patterns.rgb(0.5, 0.48, 0.46))
-    stones = surfaces.texture(to_pixels(tiles if rng.random() < 0.6 else cobbles))
-    green = surfaces.texture(
-        to_pixels(patterns.meadow(rng, 512, 512, colour(rng, (0.2, 0.3), (0.4, 0.6), (0.35, 0.5))))
-    )
+    stones = surfaces.paint(tiles if rng.random() < 0.6 else cobbles)
+    green = surfaces.paint(patterns.meadow(rng, 512, 512, colour(rng, (0.2, 0.3), (0.4, 0.6), (0.35, 0.5))))
     for i in range(-1, int(np.ceil(length / STRETCH)) + 6):
         along, start = vec(STRETCH, 0, 0), i * STRETCH
         surfaces.quad(vec(start, half, 0), along, vec(0, -2 * half, 0), asphalts[int(rng.integers(2))])
@@ -74,7 +71,7 @@ def _row_of_houses(surfaces: Surfaces, rng: Rng, split: str, length: float, wall
 
 def _roadside(surfaces: Surfaces, rng: Rng, length: float, half: float, side: int) -> None:
     leaf, bark = foliage(surfaces, rng)
-    metal = surfaces.texture(to_pixels(np.full((32, 32, 3), 0.35, dtype=np.float32)))
+    metal = surfaces.paint(np.full((32, 32, 3), 0.35, dtype=np.float32))
     x = rng.uniform(0, 8)
     while x < length + 30:
         kind = rng.random()
@@ -103,8 +100,7 @@ def driving_scene(rng: Rng, split: str, shots: int, scale: Real) -> DrawnScene:
     frames = np.concatenate([[0], np.cumsum(rng.integers(1, 5, shots - 1))])
     length = 30.0 + float(frames[-1]) * SPACING
     _street(surfaces, rng, split, length)
-    size = (round(DRIVING_SIZE[0] * scale), round(DRIVING_SIZE[1] * scale))
-    K = calibration(DRIVING_FOCAL * scale, size, (DRIVING_CENTRE[0] * scale, DRIVING_CENTRE[1] * scale))
+    K, size = scaled_camera(DRIVING_FOCAL, DRIVING_SIZE, scale, DRIVING_CENTRE)
     speed, bend = float(np.exp(rng.uniform(np.log(0.03), np.log(1.2)))) * SPACING, rng.normal(0, 0.6)
     drift = rng.uniform(-1.2, 0.2)
     light = Light(sun(rng.uniform(0, 360), rng.uniform(25, 60)))
@@ -127,12 +123,11 @@ def driving_scene(rng: Rng, split: str, shots: int, scale: Real) -> DrawnScene:
             car(view, np.random.default_rng(model), foot, vec(1.0 if lane < 0 else -1.0, 0, 0))
         views.append(view)
     sky = patterns.heaven(rng, rng.uniform(-0.3, 0.8))
-    pairs = [(i, j) for i in range(shots) for j in range(i + 1, shots) if frames[j] - frames[i] <= DRIVING_WINDOW]
-    return DrawnScene(views, [light] * shots, sky, taken, [pairs[k] for k in rng.permutation(len(pairs))])
+    pairs = shuffled_pairs(rng, shots, lambda i, j: bool(frames[j] - frames[i] <= DRIVING_WINDOW))
+    return DrawnScene(views, [light] * shots, sky, taken, pairs)
 
 
 # The indoor family, after TUM RGB-D: hand-held video of a room; short baselines, bare walls, motion blur, noise
-
 
 SIZE = (480, 640)
 FOCAL = 525.0  # the depth sensor's colour camera
@@ -143,28 +138,25 @@ SUBFRAMES = 6
 
 
 def _flat(surfaces: Surfaces, rng: Rng, tint: tuple[Real, Real] = (0.05, 0.15)) -> int:
-    return surfaces.texture(
-        to_pixels(patterns.plaster(rng, 256, 256, colour(rng, tint, (0.05, 0.4), (0.3, 0.85)), 0.6))
-    )
+    return surfaces.paint(patterns.plaster(rng, 256, 256, colour(rng, tint, (0.05, 0.4), (0.3, 0.85)), 0.6))
 
 
 def _room(surfaces: Surfaces, rng: Rng, half: Real, height: Real) -> None:
     tint = colour(rng, (0.08, 0.65), (0.02, 0.15), (0.7, 0.9))
-    floor = to_pixels(
-        patterns.wood(rng, 1024, 1024, 22, colour(rng, (0.05, 0.1), (0.35, 0.6), (0.4, 0.65))) if rng.random() < 0.6
-        else patterns.masonry(
-            rng, 1024, 1024, 14, 14, colour(rng, (0.05, 0.6), (0.03, 0.2), (0.5, 0.8)), bond=0.0, vary=0.04
-        )
-    )  # fmt: skip
-    number = surfaces.texture(floor)
+    if rng.random() < 0.6:
+        floor = patterns.wood(rng, 1024, 1024, 22, colour(rng, (0.05, 0.1), (0.35, 0.6), (0.4, 0.65)))
+    else:
+        stone = colour(rng, (0.05, 0.6), (0.03, 0.2), (0.5, 0.8))
+        floor = patterns.masonry(rng, 1024, 1024, 14, 14, stone, bond=0.0, vary=0.04)
+    number = surfaces.paint(floor)
     surfaces.quad(vec(-half, half, 0), vec(2 * half, 0, 0), vec(0, -2 * half, 0), number)
-    ceiling = surfaces.texture(to_pixels(patterns.plaster(rng, 256, 256, patterns.rgb(0.85, 0.85, 0.83), 0.3)))
+    ceiling = surfaces.paint(patterns.plaster(rng, 256, 256, patterns.rgb(0.85, 0.85, 0.83), 0.3))
     surfaces.quad(vec(-half, -half, height), vec(2 * half, 0, 0), vec(0, 2 * half, 0), ceiling)
     for k in range(4):
         inward, right = -direction(90 * k), direction(90 * k - 90)
         wall = patterns.plaster(rng, 512, 1024, tint, 0.5)
         wall[478:] = tint * 0.6
-        number = surfaces.texture(to_pixels(wall))
+        number = surfaces.paint(wall)
         surfaces.quad(-inward * half - right * half + vec(0, 0, height), right * 2 * half, vec(0, 0, -height), number)
 
 
@@ -179,14 +171,10 @@ def _on_wall(surfaces: Surfaces, picture: np.ndarray, k: int, half: Real, x: Rea
     surfaces.quad(top, -inward * 0.03, vec(0, 0, -tall), frame, both_sides=True)
 
 
-def _turn(base: Vector, degrees: Real) -> tuple[Vector, Vector, Vector]:
-    return base, direction(degrees), direction(degrees + 90)
-
-
 def _desk(surfaces: Surfaces, rng: Rng, split: str, centre: Vector) -> None:
-    top = surfaces.texture(to_pixels(patterns.wood(rng, 256, 512, 4, colour(rng, (0.05, 0.1), (0.3, 0.6), (0.4, 0.7)))))
+    top = surfaces.paint(patterns.wood(rng, 256, 512, 4, colour(rng, (0.05, 0.1), (0.3, 0.6), (0.4, 0.7))))
     facing = rng.uniform(-25, 25)
-    _, right, back = _turn(centre, facing)
+    right, back = direction(facing), direction(facing + 90)
     wide, deep, tall = 1.7, 0.85, 0.74
     corner = centre - right * wide / 2 - back * deep / 2
     strip = ((0.0, 0.0, 1.0, 0.06),) * 4 + ((0.0, 0.0, 1.0, 1.0),)
@@ -202,20 +190,19 @@ def _desk(surfaces: Surfaces, rng: Rng, split: str, centre: Vector) -> None:
             continue
         taken.append((x, y))
         base = corner + right * x + back * y + vec(0, 0, tall)
-        _, r, b = _turn(base, facing + rng.uniform(-40, 40))
+        turned = facing + rng.uniform(-40, 40)
+        r, b = direction(turned), direction(turned + 90)
         if k == 0:
             screen = surfaces.texture(photos[0])
             case = surfaces.texture(np.full((8, 8, 3), 25, dtype=np.uint8))
             surfaces.box(base + vec(0, 0, 0.08), r * 0.46, b * 0.04, 0.29, [screen, case, case, case, case])
             surfaces.box(base + r * 0.18, r * 0.1, b * 0.04, 0.08, [case] * 5)
         elif k == 1:
-            fur = (
-                colour(rng, (0.04, 0.1), (0.4, 0.7), (0.4, 0.7))
-                * (1 + 0.3 * patterns.fractal(rng, 256, 256, 16, 1, 0.8))[..., None]
-            )
-            statue(surfaces, rng, base, 0.42, surfaces.texture(to_pixels(fur.astype(np.float32))), detail=12)
+            tint = colour(rng, (0.04, 0.1), (0.4, 0.7), (0.4, 0.7))
+            fur = tint * (1 + 0.3 * patterns.fractal(rng, 256, 256, 16, 1, 0.8))[..., None]
+            statue(surfaces, rng, base, 0.42, surfaces.paint(fur.astype(np.float32)), detail=12)
         elif k < 5:
-            number = surfaces.texture(to_pixels(patterns.books(rng, 160, 256)))
+            number = surfaces.paint(patterns.books(rng, 160, 256))
             plain = _flat(surfaces, rng, (0, 1))
             surfaces.box(base, r * rng.uniform(0.2, 0.34), b * 0.17, 0.23, [number, plain, plain, plain, plain])
         else:
@@ -226,17 +213,16 @@ def _desk(surfaces: Surfaces, rng: Rng, split: str, centre: Vector) -> None:
 
 
 def _cabinet(surfaces: Surfaces, rng: Rng, base: Vector, degrees: Real) -> None:
-    _, right, back = _turn(base, degrees)
+    right, back = direction(degrees), direction(degrees + 90)
     front = patterns.door(rng, 512, 300)
-    sides = surfaces.texture(to_pixels(front * 0 + patterns.plaster(rng, 512, 300, front[4, 4], 0.7)))
-    surfaces.box(base, right * 0.9, back * 0.45, 1.3, [surfaces.texture(to_pixels(front)), sides, sides, sides, sides])
-    shelf = surfaces.texture(to_pixels(patterns.books(rng, 192, 512)))
-    surfaces.box(
-        base + right * 0.05 + vec(0, 0, 1.3), right * 0.8, back * 0.2, 0.26, [shelf, sides, sides, sides, sides]
-    )
+    sides = surfaces.paint(front * 0 + patterns.plaster(rng, 512, 300, front[4, 4], 0.7))
+    surfaces.box(base, right * 0.9, back * 0.45, 1.3, [surfaces.paint(front), sides, sides, sides, sides])
+    shelf = surfaces.paint(patterns.books(rng, 192, 512))
+    foot = base + right * 0.05 + vec(0, 0, 1.3)
+    surfaces.box(foot, right * 0.8, back * 0.2, 0.26, [shelf, sides, sides, sides, sides])
 
 
-def _path(rng: Rng, target: Vector) -> tuple[np.ndarray, np.ndarray]:
+def _path(rng: Rng) -> tuple[np.ndarray, np.ndarray]:
     """Amplitudes and phases of a hand's smooth movement: three sinusoids for each of six coordinates."""
     speed = rng.uniform(0.6, 1.5)
     frequency = np.array([0.11, 0.37, 1.3])[:, None] * rng.uniform(0.8, 1.2, (3, 6))
@@ -258,11 +244,9 @@ def indoor_scene(rng: Rng, split: str, shots: int, scale: Real) -> DrawnScene:
     _on_wall(surfaces, photos[1], 0, half, rng.uniform(-1, 0.5), 1.5, 0.7)
     _on_wall(surfaces, photos[3], 2, half, rng.uniform(-0.5, 1), 1.5, 0.6)
     style = np.random.SeedSequence(int(rng.integers(2**31)))
-    _on_wall(
-        surfaces, to_pixels(patterns.window(rng, 512, 420, style) * 2.2 + 0.1), 2 * int(rng.integers(2)), half, -1.2,
-        1.6, 1.1,
-    )  # fmt: skip
-    shelf = surfaces.texture(to_pixels(patterns.books(rng, 192, 768)))
+    view = to_pixels(patterns.window(rng, 512, 420, style) * 2.2 + 0.1)
+    _on_wall(surfaces, view, 2 * int(rng.integers(2)), half, -1.2, 1.6, 1.1)
+    shelf = surfaces.paint(patterns.books(rng, 192, 768))
     board = _flat(surfaces, rng)
     x = rng.uniform(-0.6, 0.4)
     for z in (1.25, 1.62)[: int(rng.integers(1, 3))]:
@@ -270,11 +254,10 @@ def indoor_scene(rng: Rng, split: str, shots: int, scale: Real) -> DrawnScene:
         surfaces.box(vec(x + 0.05, half - 0.2, z + 0.03), vec(0.9, 0, 0), vec(0, 0.2, 0), 0.22,
                      [shelf, board, board, board, board])  # fmt: skip
     _cabinet(surfaces, rng, vec(half - 1.2, half - 0.55, 0), rng.uniform(-6, 6))
-    rug = surfaces.texture(to_pixels(patterns.cloth(rng, 384, 512)))
+    rug = surfaces.paint(patterns.cloth(rng, 384, 512))
     surfaces.quad(vec(-1.1, half - 1.3, 0.01), vec(2.2, 0, 0), vec(0, -1.6, 0), rug)
-    size = (round(SIZE[0] * scale), round(SIZE[1] * scale))
-    K = calibration(FOCAL * scale, size)
-    amplitude, (frequency, phase) = _path(rng, desk)
+    K, size = scaled_camera(FOCAL, SIZE, scale)
+    amplitude, (frequency, phase) = _path(rng)
     stand = desk + vec(rng.uniform(-0.6, 0.6), -rng.uniform(1.2, 1.9), rng.uniform(1.2, 1.5))
     aim = desk + vec(0, 0.2, rng.uniform(0.85, 1.1))
 
@@ -291,12 +274,11 @@ def indoor_scene(rng: Rng, split: str, shots: int, scale: Real) -> DrawnScene:
     for t in times:
         moments = [camera(float(t + EXPOSURE * (k / (SUBFRAMES - 1) - 0.5))) for k in range(SUBFRAMES)]
         taken.append(Shot(camera(float(t)), Lens(blur=0.6, noise=4.0, exposure=1.15), moments=moments, jpeg=95))
-    up = rng.uniform(0.7, 1.0)
-    direct = rng.uniform(0.25, 0.5)
+    up, direct = rng.uniform(0.7, 1.0), rng.uniform(0.25, 0.5)
     light = Light(
         (rng.uniform(-0.5, 0.5), rng.uniform(-0.8, -0.3), 1.0), sun=(direct, 0.95 * direct, 0.85 * direct),
         sky=(up, 0.97 * up, 0.92 * up), ground_shade=0.2, through_walls=True,
     )  # fmt: skip
     sky = np.full((8, 16, 3), 128, dtype=np.uint8)
-    pairs = [(i, j) for i in range(shots) for j in range(i + 1, shots) if 0 < times[j] - times[i] <= WINDOW]
-    return DrawnScene([surfaces], [light], sky, taken, [pairs[k] for k in rng.permutation(len(pairs))])
+    pairs = shuffled_pairs(rng, shots, lambda i, j: bool(0 < times[j] - times[i] <= WINDOW))
+    return DrawnScene([surfaces], [light], sky, taken, pairs)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from fmtorch.data import ImageSource, read_image
-from fmtorch.data.pairs import Resampling, longer_side, shorter_side
+from fmtorch.data.pairs import Resampling, scaled_size
 
 SIZE = (6, 9)
 
@@ -53,6 +53,6 @@ def test_an_image_source_is_resized_then_turned(tmp_path: Path) -> None:
 
 
 def test_sides() -> None:
-    assert longer_side((480, 640), 320) == (240, 320)
-    assert shorter_side((480, 640), 240) == (240, 320)
-    assert longer_side((10, 4000), 100) == (1, 100)
+    assert scaled_size((480, 640), 320 / 640) == (240, 320)
+    assert scaled_size((480, 640), 240 / 480) == (240, 320)
+    assert scaled_size((10, 4000), 100 / 4000) == (1, 100)

@@ -40,25 +40,6 @@ def test_a_gaussian_blob_has_its_place_and_size(sigma: float, sign: int) -> None
     assert found[0, 2] == pytest.approx(np.hypot(sigma, 0.5), rel=0.06)
 
 
-def test_the_batch_in_torch_equals_each_image_through_opencv() -> None:
-    images = [texture(i) for i in range(3)]
-    batch = torch.from_numpy(np.stack(images))[:, None].float() / 255
-    detector = HessianDetector()
-    lafs, scores, mask = detector.detect_batch(batch)
-    for i, image in enumerate(images):
-        expected_lafs, expected_scores = detector.detect(image)
-        assert int(mask[i].sum()) == len(expected_lafs) > 100
-        # Equal scores, up to rounding, may change places: each keypoint is compared with the nearest one.
-        apart = (lafs[i, mask[i]].flatten(1)[:, None] - expected_lafs.flatten(1)).abs().amax(2)
-        gap, other = apart.min(1)
-        assert gap.max() < 2e-2
-        assert len(other.unique()) == len(expected_lafs)
-        torch.testing.assert_close(scores[i, mask[i]], expected_scores[other], rtol=1e-3, atol=0)
-        assert not lafs[i, ~mask[i]].any()
-        alone = detector.detect_batch(batch[i : i + 1])
-        assert torch.equal(alone[0][0], lafs[i, mask[i]])
-
-
 def test_at_most_max_features_the_strongest() -> None:
     image = np.tile(texture(1, 60, 60), (2, 3))  # equal blobs: equal scores
     everything, few = HessianDetector().detect(image)[1], HessianDetector(max_features=20).detect(image)[1]
@@ -91,4 +72,3 @@ def test_small_and_constant_images(shape: tuple[int, int], constant: bool) -> No
     assert lafs.shape == (len(scores), 2, 3)
     if constant or min(shape) < 16:
         assert len(scores) == 0
-    assert HessianDetector().detect_batch(torch.from_numpy(image)[None, None].float() / 255)[0].shape[1] == len(scores)

@@ -36,14 +36,7 @@ def test_small_frames_are_kornias_patches() -> None:
     lafs = torch.cat([lafs[..., :2] * 0.8, lafs[..., 2:]], -1)
     tensor = torch.from_numpy(image)[None, None].float() / 255
     expected = kornia.feature.extract_patches_simple(tensor, lafs[None])[0]
-    for pyramid in (ImagePyramid(image), ImagePyramid(tensor[0, 0])):
-        torch.testing.assert_close(pyramid.extract(lafs), expected, atol=2e-4, rtol=0)
-
-
-def test_torch_and_opencv_agree() -> None:
-    image, lafs = texture(3, 301, 270), random_frames(3, 200, 301, 270, 3, 200)
-    both = [ImagePyramid(x).extract(lafs) for x in (image, torch.from_numpy(image).float() / 255)]
-    torch.testing.assert_close(*both, atol=3e-4, rtol=0)
+    torch.testing.assert_close(ImagePyramid(image).extract(lafs), expected, atol=2e-4, rtol=0)
 
 
 def test_neighbours_are_invisible() -> None:
@@ -62,13 +55,13 @@ def test_neighbours_are_invisible() -> None:
 def test_small_images_continue_at_their_border(shape: tuple[int, int]) -> None:
     flat = np.full(shape, 51, np.uint8)
     lafs = upright_frames(torch.tensor([[0.0, 0.0], [3.0, 2.0]]), torch.tensor([1.0, 40.0]))
-    for pyramid in (ImagePyramid(flat), ImagePyramid(torch.full(shape, 0.2))):
-        torch.testing.assert_close(pyramid.extract(lafs), torch.full((2, 1, 32, 32), 0.2))
+    torch.testing.assert_close(ImagePyramid(flat).extract(lafs), torch.full((2, 1, 32, 32), 0.2))
 
 
 def test_pixel_x_of_a_level_is_pixel_2x_of_the_finer_one() -> None:
-    y, x = np.mgrid[0:120, 0:150]
-    ramp = torch.from_numpy((x + 2 * y) / 400).float()
+    y, x = np.mgrid[0:100, 0:150]
+    ramp = (x + y).astype(np.uint8)
     for level, image in enumerate(ImagePyramid(ramp).levels):
         inner = image[3:-3, 3:-3] if min(image.shape) > 8 else image[:0]
-        torch.testing.assert_close(inner, ramp[:: 2**level, :: 2**level][3:-3, 3:-3][: len(inner)])
+        expected = ramp[:: 2**level, :: 2**level][3:-3, 3:-3][: len(inner)] / 255
+        np.testing.assert_allclose(inner, expected, rtol=1e-5, atol=1e-6)

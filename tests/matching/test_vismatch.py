@@ -11,7 +11,7 @@ import torch
 
 from fmtorch.data import read_image
 from fmtorch.matching import VisMatch
-from fmtorch.matching.matcher import MAX_RATIO, relative_noise
+from fmtorch.matching.vismatch import MAX_RATIO, relative_noise
 from fmtorch.pipeline.pipeline import Pipeline, load_pipeline
 from tests.data import lists
 from tests.matching import stand_in

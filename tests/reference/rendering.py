@@ -3,11 +3,11 @@
 import numpy as np
 
 from fmtorch.scenes.light import SHADOW_MAP, Stage
-from fmtorch.scenes.raycast import SEAM, Bounds, Geometry, Hits, Met, Pieces
+from fmtorch.scenes.raycast import SEAM, Geometry, Hits, Met, Pieces
 from fmtorch.scenes.surfaces import TO_LINEAR, Texture, bilinear
 
 
-def cast(geometry: Geometry, pieces: Pieces, bounds: Bounds, met: Met) -> None:
+def cast(geometry: Geometry, pieces: Pieces, near: np.float32, met: Met) -> None:
     """`raycast_kernels.cast_pieces`."""
     h, w = met.piece.shape
     x_axis, y_axis = np.arange(w, dtype=np.float32), np.arange(h, dtype=np.float32)
@@ -26,7 +26,7 @@ def cast(geometry: Geometry, pieces: Pieces, bounds: Bounds, met: Met) -> None:
             s, t = st
             z_s, z_t, z_0 = pieces.depth[i]
             z = z_s * s + (z_t * t + z_0)
-            hit = (s > -SEAM) & (t > -SEAM) & (z < before) & (z > bounds.near)
+            hit = (s > -SEAM) & (t > -SEAM) & (z < before) & (z > near)
             if geometry.triangle[i]:
                 hit &= s + t < 1 + SEAM
             else:
