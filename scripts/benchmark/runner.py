@@ -162,7 +162,7 @@ class Method(Measured):
     """Pruners, whose time counts, and an estimator.
 
     stages: of a family's pairs, by name. untimed: the names of those whose time does not count. takes: whether it is
-    measured on an item.
+    measured on an item. view: what is done to a pair and its matches before.
     """
 
     name: str
@@ -171,14 +171,15 @@ class Method(Measured):
     estimator: Callable[[ImagePair, Correspondences, int], Estimate]
     untimed: frozenset[str] = frozenset()
     takes: Callable[[Item], bool] = lambda item: True
+    view: Callable[[Outcome], Outcome] = lambda outcome: outcome
 
     def applies(self, item: Item) -> bool:
         return self.takes(item)
 
     def figures(self, item: Item, seed: int) -> Row:
         """`KEPT` of the pair's row, and milliseconds of pruners and of all."""
-        matched = item.outcome
-        assert matched is not None
+        assert item.outcome is not None
+        matched = self.view(item.outcome)
         if matched.correspondences is None:
             return {**judged(matched, seed), "ms": 0.0, "ms_pruning": 0.0}
         c, pruning = matched.correspondences, 0.0

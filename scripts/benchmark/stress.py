@@ -25,9 +25,7 @@ from fmtorch.pipeline.pipeline import Outcome, Pipeline
 from fmtorch.presets.composition import WIDE
 from fmtorch.scenes.dataset import FAMILIES
 from scripts.benchmark import figures, pairs
-from scripts.benchmark.methods import method, read_specs
-from scripts.benchmark.runner import Item, Kept, Method, Row, add_command, measure
-from scripts.benchmark.stress_changes import (
+from scripts.benchmark.changes import (
     CONDITIONED,
     MIN_RIGHT,
     SWEEPS,
@@ -38,6 +36,8 @@ from scripts.benchmark.stress_changes import (
     on_plane,
     parallax,
 )
+from scripts.benchmark.methods import method, read_specs
+from scripts.benchmark.runner import Item, Kept, Method, Row, add_command, measure
 from scripts.benchmark.tables import FIGURES, Record, Results, Sheet, show
 
 SPECS = Path(__file__).with_name("stress.txt")
