@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from scripts.benchmark import figures, pairs
+from scripts.benchmark import pairs, tables
 from scripts.benchmark.methods import NGRANSAC, method, ngransac, read_specs, stages_of
 from scripts.benchmark.runner import Kept, Row, add_command, measure
 from scripts.benchmark.tables import BASELINES, FIGURES, Record, Results, Sheet, show
@@ -174,6 +174,6 @@ def draw_curves(curves: Sequence[Curve], results: Results, knees: Mapping[str, s
             x = [float(np.median(results.get(spec, own)("ms"))) for spec in curve.specs]
             y = [figure.scale * float(figure.of(results.get(spec, own)).mean()) for spec in curve.specs]
             marked = curve.specs.index(knees[curve.name]) if knees.get(curve.name) in curve.specs else None
-            lines[curve.name] = figures.Line(x, y, marked)
+            lines[curve.name] = tables.Line(x, y, marked)
         panels[group] = lines
-    figures.draw(path, panels, "ms a pair (median)", "AUC@0.05 [%]", xscale="log")
+    tables.draw(path, panels, ("ms a pair (median)", "AUC@0.05 [%]"), "log")

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from fmtorch.core.types import RELATED
 from fmtorch.evaluation.statistics import share_interval
-from scripts.benchmark import figures, pairs
+from scripts.benchmark import pairs, tables
 from scripts.benchmark.pipelines import add_pipeline_options, chosen_pipelines, measured, settings_of
 from scripts.benchmark.runner import Kept, Row, add_command
 from scripts.benchmark.tables import Record, Sheet, Span, show
@@ -174,7 +174,7 @@ def roc(rows: Sequence[Row], figure: Callable[[Row], float]) -> tuple[NDArray[np
 
 def draw(rows: Rows, path: Path) -> None:
     """The ROC curves: a panel for each way to judge pairs, a line for each pipeline, a dot at the verdict's level."""
-    panels: dict[str, dict[str, figures.Line]] = {"by significance": {}, "by the number of inliers": {}}
+    panels: dict[str, dict[str, tables.Line]] = {"by significance": {}, "by the number of inliers": {}}
     for name, own in ((name, own) for name, own in rows.items() if all(split(own))):
         for figure, lines in zip((significance, inliers), panels.values(), strict=True):
             accepted, rejected = (100 * shares for shares in roc(own, figure))
@@ -183,5 +183,5 @@ def draw(rows: Rows, path: Path) -> None:
             if figure is significance:
                 levels = np.append(np.unique([figure(row) for part in split(own) for row in part]), np.inf)
                 dot = int(np.searchsorted(levels, RELATED))
-            lines[name + perfect] = figures.Line(accepted.tolist(), rejected.tolist(), dot)
-    figures.draw(path, panels, "unrelated pairs accepted, %", "right pairs rejected, %", shares=True)
+            lines[name + perfect] = tables.Line(accepted.tolist(), rejected.tolist(), dot)
+    tables.draw(path, panels, ("unrelated pairs accepted, %", "right pairs rejected, %"), "shares")

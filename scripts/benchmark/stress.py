@@ -24,18 +24,8 @@ from fmtorch.evaluation.run import select
 from fmtorch.pipeline.pipeline import Outcome, Pipeline
 from fmtorch.presets.composition import WIDE
 from fmtorch.scenes.dataset import FAMILIES
-from scripts.benchmark import figures, pairs
-from scripts.benchmark.changes import (
-    CONDITIONED,
-    MIN_RIGHT,
-    SWEEPS,
-    Case,
-    Change,
-    Level,
-    case_of,
-    on_plane,
-    parallax,
-)
+from scripts.benchmark import pairs, tables
+from scripts.benchmark.changes import CONDITIONED, MIN_RIGHT, SWEEPS, Case, Change, Level, case_of, on_plane, parallax
 from scripts.benchmark.methods import method, read_specs
 from scripts.benchmark.runner import Item, Kept, Method, Row, add_command, measure
 from scripts.benchmark.tables import FIGURES, Record, Results, Sheet, show
@@ -170,13 +160,13 @@ def time_sheet(rows: Sequence[Row]) -> Sheet:
 
 def draw(rows: Sequence[Row], sweep: str, path: Path) -> None:
     """AUC@0.05 against the level, a panel for each set."""
-    panels: dict[str, dict[str, figures.Line]] = {}
+    panels: dict[str, dict[str, tables.Line]] = {}
     area = FIGURES["AUC@0.05"]
     for _, level, results in (each for each in by_level(rows) if each[0] == sweep):
         for name, own in results.groups(results.pairs()).items():
             for estimator in results.methods if name in results.families else ():
-                line = panels.setdefault(name, {}).setdefault(estimator, figures.Line([], []))
+                line = panels.setdefault(name, {}).setdefault(estimator, tables.Line([], []))
                 line.x.append(float(level))
                 line.y.append(area.scale * float(area.of(results.get(estimator, own)).mean()))
     scale = "linear" if sweep == "noise" else "log"
-    figures.draw(path, panels, AXES[sweep], "AUC@0.05 [%]", xscale=scale, ticks=[float(x) for x in SWEEPS[sweep]])
+    tables.draw(path, panels, (AXES[sweep], "AUC@0.05 [%]"), scale, [float(x) for x in SWEEPS[sweep]])
