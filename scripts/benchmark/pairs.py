@@ -6,7 +6,7 @@ import argparse
 import dataclasses
 import functools
 import itertools
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 from unittest import mock
@@ -25,7 +25,7 @@ from fmtorch.runs.feature_cache import cached
 from fmtorch.scenes import RenderedPairs, surfaces
 from fmtorch.scenes import dataset as generate
 from scripts.benchmark import methods
-from scripts.benchmark.runner import Item, Stages, identity
+from scripts.benchmark.runner import Item, Kept, Row, Stages, identity
 
 SIZE = (768, 1024)  # (h, w) of synthetic pairs
 UNRELATED = "unrelated"  # what the names of families of pairs of different scenes begin with
@@ -63,6 +63,15 @@ def pairs_of(arguments: argparse.Namespace) -> list[ImagePair]:
 def named(arguments: argparse.Namespace) -> bool:
     """Whether the options name a data set."""
     return bool(arguments.root or arguments.rendered)
+
+
+def rows_of(arguments: argparse.Namespace, measured: Callable[[Kept], list[Row]]) -> list[Row]:
+    """The rows of the data sets that the options name, or else all that are kept. Raises SystemExit for none."""
+    kept = Kept(arguments.rows)
+    rows = measured(kept) if named(arguments) else kept.rows
+    if not rows:
+        raise SystemExit("nothing to show: name sets with --root or --rendered, or a file of earlier --rows")
+    return rows
 
 
 def front_of(features: str, pruners: Iterable[str], cache: str = "off", memory: int = 64) -> Pipeline:

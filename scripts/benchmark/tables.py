@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import functools
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -103,6 +104,15 @@ def show(sheets: Sequence[Sheet], table: Path | None = None) -> None:
         if table is not None:
             alone = len(sheets) == 1 or not sheet.name
             sheet.write(table if alone else table.with_name(f"{table.stem}_{sheet.name}{table.suffix}"))
+
+
+def chance_of_more(a: Sequence[float] | Values, b: Sequence[float] | Values) -> float:
+    """The chance that one of `a` is more than one of `b`, ties count half: the area under the ROC curve; NaN of none."""
+    if len(a) == 0 or len(b) == 0:
+        return float("nan")
+    ordered = np.sort(b)
+    below, up_to = (np.searchsorted(ordered, a, side) for side in ("left", "right"))
+    return float((below + up_to).mean() / (2 * len(b)))
 
 
 def _known(values: Values) -> Values:
@@ -271,10 +281,9 @@ KIN = {
 Published = Mapping[tuple[str, str], dict[str, str]]
 
 
-def published(path: Path | None) -> Published:
+@functools.cache
+def published(path: Path) -> Published:
     """The figures of Bian et al. (BMVC 2019) from a CSV file, by data set and method."""
-    if path is None:
-        return {}
     with path.open(encoding="utf-8") as file:
         return {(line["dataset"], line["method"]): line for line in csv.DictReader(file)}
 
