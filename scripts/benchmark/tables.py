@@ -107,7 +107,7 @@ def show(sheets: Sequence[Sheet], table: Path | None = None) -> None:
 
 
 def chance_of_more(a: Sequence[float] | Values, b: Sequence[float] | Values) -> float:
-    """The chance that one of `a` is more than one of `b`, ties count half: the area under the ROC curve; NaN of none."""
+    """The area under the ROC curve: the chance that one of `a` exceeds one of `b`, ties count half; NaN of none."""
     if len(a) == 0 or len(b) == 0:
         return float("nan")
     ordered = np.sort(b)
