@@ -188,7 +188,7 @@ def main() -> None:
                 table.add_row(name, entry.architecture, "MIT", entry.sha256 or "not known", entry.url)
             sets = Table("dataset", "files", "licence", "citation")
             for name, source in DATASETS.items():
-                sets.add_row(name, ", ".join(source.files or ["by hand"]), source.licence, source.citation)
+                sets.add_row(name, ", ".join(source.files) or "by hand", source.licence, source.citation)
             console.print(table, sets)
         else:
             fetch(config)
