@@ -8,8 +8,6 @@ fitted here (logistic regression, every pair with the same weight), and with con
 the constants. Inliers are the matches within --threshold px (Sampson) of the true geometry.
 """
 
-from __future__ import annotations
-
 import argparse
 from typing import Any, NamedTuple
 

@@ -9,8 +9,6 @@ the models before the final fit, and gradients, besides public functions of `fmt
 used. Exit status 1 where anything differs.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import subprocess

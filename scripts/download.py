@@ -14,8 +14,6 @@ by scripts.patch_networks.export architecture=l2net.
 Then: python -m scripts.patch_networks.export checkpoint=weights/AffNet.pth architecture=affnet licence=MIT
 """
 
-from __future__ import annotations
-
 import hashlib
 import http.client
 import os

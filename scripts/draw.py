@@ -4,8 +4,6 @@ python scripts/draw.py gallery [--output docs/gallery]          those of docs/ga
 python scripts/draw.py overview [--output docs/overview.jpg]    that of the README: a pair of each rendered family
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Sequence
 from pathlib import Path

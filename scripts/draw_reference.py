@@ -3,8 +3,6 @@
 python scripts/draw_reference.py
 """
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import re

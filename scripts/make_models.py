@@ -15,8 +15,6 @@ Photographs: scikit-image's of the train split and, with --photos, a folder whos
 only those of --sources are read.
 """
 
-from __future__ import annotations
-
 import argparse
 import hashlib
 import itertools

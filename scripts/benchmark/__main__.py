@@ -1,7 +1,5 @@
 """`python -m scripts.benchmark estimators ...`, in the checkout's folder: one command for each benchmark."""
 
-from __future__ import annotations
-
 import argparse
 
 import cv2

@@ -14,8 +14,6 @@ python -m scripts.benchmark estimators --rendered full --specs scripts/benchmark
 seeds, pairs and estimators need. A row counts only for the code, options and learned files that it was made with.
 """
 
-from __future__ import annotations
-
 import argparse
 import csv
 from collections.abc import Mapping, Sequence

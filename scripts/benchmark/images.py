@@ -1,7 +1,5 @@
 """Where the time of images goes: processor milliseconds by stage, and pairs proposed by the likeness of images."""
 
-from __future__ import annotations
-
 import argparse
 import functools
 import time

@@ -7,8 +7,6 @@ pair: `sizeless` and `ratioless` (these are not given), `part:left=0,top=0,right
 in fractions of their sides) and `bent:lens=-0.15` (points of two such lenses, F of pinholes). The last two come first.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import json

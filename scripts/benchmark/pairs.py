@@ -1,7 +1,5 @@
 """The pairs that benchmarks run on, with their matches: data sets, synthetic ones, photographs of different scenes."""
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import functools

@@ -1,7 +1,5 @@
 """Pairs made of photographs: planes seen from the side, rotations, copies and crops, and unrelated photographs."""
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence

@@ -9,8 +9,6 @@ python -m scripts.benchmark pipelines --root DATA/Strecha --root DATA/PhotoTouri
 python -m scripts.benchmark pruning --rendered full --limit 50 --pipelines RATIO 'mine = sift_ratio pruner=[ratio,lpm]'
 """
 
-from __future__ import annotations
-
 import argparse
 import fnmatch
 import functools

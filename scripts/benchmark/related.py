@@ -7,8 +7,6 @@ python -m scripts.benchmark related --rows related.jsonl
 The second line shows what the file holds: rows are kept pair by pair, and the command goes on where it was interrupted.
 """
 
-from __future__ import annotations
-
 import argparse
 import math
 from collections.abc import Callable, Sequence

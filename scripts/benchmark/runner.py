@@ -1,7 +1,5 @@
 """What every benchmark shares: rows that are kept as they are made, methods that take turns, time and memory."""
 
-from __future__ import annotations
-
 import argparse
 import ctypes
 import dataclasses

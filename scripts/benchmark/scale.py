@@ -1,7 +1,5 @@
 """What evaluation costs at any size: stages, workers, bytes and memory."""
 
-from __future__ import annotations
-
 import argparse
 import functools
 import multiprocessing

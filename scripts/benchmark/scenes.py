@@ -1,7 +1,5 @@
 """Scenes with true cameras, as COLMAP databases without two-view geometries and as COLMAP models."""
 
-from __future__ import annotations
-
 import argparse
 import shutil
 import subprocess

@@ -6,8 +6,6 @@ python -m scripts.benchmark speed --estimators @gms @lpm @code --matches 2000 --
 FMTORCH_CACHE=$(mktemp -d) python -m scripts.benchmark speed --peers    # the first call compiles the kernels
 """
 
-from __future__ import annotations
-
 import argparse
 import multiprocessing
 import time

@@ -7,8 +7,6 @@ python -m scripts.benchmark stress --root DATA/Strecha --root DATA/PhotoTourism 
 seeds need. `sizeless` among an estimator's stages takes the image sizes away, and with them the prior on cameras.
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import functools

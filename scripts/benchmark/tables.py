@@ -3,8 +3,6 @@
 And their curves, drawn as SVG.
 """
 
-from __future__ import annotations
-
 import csv
 import dataclasses
 import functools

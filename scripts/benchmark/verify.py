@@ -8,13 +8,11 @@ that a mapper does not register count as wrong. Rows are kept in --work: an inte
 python -m scripts.benchmark verify --root DATA --work runs/verify --table docs/tables/verify.csv
 """
 
-from __future__ import annotations
-
 import argparse
 import itertools
 import shutil
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -85,6 +83,9 @@ def measure(scene: Scene, database: Path, key: tuple[Any, ...], mappers: Sequenc
     remove(path)
 
 
+_warm: set[Path] = set()
+
+
 def verified_by(method: str, path: Path, seed: int) -> Row:
     """Verify a database in place: pairs, those with a geometry, and processor seconds."""
     import pycolmap
@@ -109,9 +110,6 @@ def verified_by(method: str, path: Path, seed: int) -> Row:
     return {"pairs": pairs, "verified": verified, "seconds": seconds}
 
 
-_warm: set[Path] = set()
-
-
 def mapped(mapper: str, path: Path, scene: Scene, cameras: str, seed: int) -> Row:
     """The largest model of a mapper on one thread, with its processor seconds.
 
@@ -129,7 +127,7 @@ def mapped(mapper: str, path: Path, scene: Scene, cameras: str, seed: int) -> Ro
     if (mapper, cameras) == ("global", "unknown"):
         pycolmap.calibrate_view_graph(copy, pycolmap.ViewGraphCalibrationOptions(random_seed=seed))
     mapping = pycolmap.global_mapping if mapper == "global" else pycolmap.incremental_mapping
-    models = mapping(copy, scene.images, output, _options(mapper, cameras, seed))
+    models = mapping(copy, scene.images, output, _options(mapper, cameras == "unknown", seed))
     row: Row = {"seconds": time.process_time() - start, "registered": 0, "images": len(scene.truth.R)}
     poses: dict[str, Any] = {}
     if models:
@@ -143,23 +141,24 @@ def mapped(mapper: str, path: Path, scene: Scene, cameras: str, seed: int) -> Ro
     return row | accuracy(poses, scene.truth)
 
 
-def _options(mapper: str, cameras: str, seed: int) -> Any:
-    """Of COLMAP's mappers."""
+def _options(mapper: str, refined: bool, seed: int) -> Any:
+    """Of COLMAP's mappers. refined: whether intrinsics are estimated."""
     import pycolmap
 
+    own: dict[str, Any] = {"min_model_size": MIN_MODEL, "num_threads": 1, "random_seed": seed}
     if mapper == "global":
-        options: Any = pycolmap.GlobalPipelineOptions(min_model_size=MIN_MODEL, num_threads=1, random_seed=seed)
-        options.mapper.num_threads, options.mapper.random_seed = 1, seed
-        options.mapper.global_positioning.random_seed = options.mapper.rotation_averaging.random_seed = seed
-        if cameras == "known":
-            adjustment = options.mapper.bundle_adjustment
-            adjustment.refine_focal_length = adjustment.refine_extra_params = False
-        return options
-    options = pycolmap.IncrementalPipelineOptions(min_model_size=MIN_MODEL, num_threads=1, random_seed=seed)
-    options.extract_colors = False
-    if cameras == "known":
-        options.ba_refine_focal_length = options.ba_refine_extra_params = False
-        options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
+        options = pycolmap.GlobalPipelineOptions()
+        steps: dict[str, Any] = {step: {"random_seed": seed} for step in ("global_positioning", "rotation_averaging")}
+        if not refined:
+            steps["bundle_adjustment"] = {"refine_focal_length": False, "refine_extra_params": False}
+        own["mapper"] = {"num_threads": 1, "random_seed": seed, **steps}
+    else:
+        options = pycolmap.IncrementalPipelineOptions()
+        own["extract_colors"] = False
+        if not refined:
+            own |= {"ba_refine_focal_length": False, "ba_refine_extra_params": False}
+            own["mapper"] = {"abs_pose_refine_focal_length": False, "abs_pose_refine_extra_params": False}
+    options.mergedict(own)
     return options
 
 
@@ -186,18 +185,16 @@ def relative_error(relative: Any, truth: Truth, a: str, b: str) -> float:
 
 def centre_errors(poses: dict[str, Any], truth: Truth) -> Array:
     """Distances from the true centres after the best similarity (Umeyama 1991), per cent of the centres' RMS spread."""
+    import pycolmap
+
     names = sorted(truth.R)
     true = np.array([-truth.R[name].T @ truth.t[name] for name in names])
     size, errors = np.sqrt(((true - true.mean(0)) ** 2).sum(1).mean()), np.full(len(names), np.inf)
     here = [i for i, name in enumerate(names) if name in poses]
-    if len(here) < MIN_MODEL:
-        return errors
-    centres = np.array([poses[names[i]].inverse().translation for i in here])
-    P, Q = centres - centres.mean(0), true[here] - true[here].mean(0)
-    U, D, Vt = np.linalg.svd(Q.T @ P)
-    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])
-    scale = (D * signs).sum() / (P**2).sum()
-    errors[here] = np.linalg.norm(scale * P @ (U * signs @ Vt).T - Q, axis=1) / size * 100
+    if len(here) >= MIN_MODEL:
+        centres = np.array([poses[names[i]].inverse().translation for i in here])
+        moved = np.c_[centres, np.ones(len(here))] @ pycolmap.estimate_sim3d(centres, true[here]).matrix().T
+        errors[here] = np.linalg.norm(moved - true[here], axis=1) / size * 100
     return errors
 
 
@@ -223,18 +220,30 @@ MODEL |= {f"{name}{limit}": 1 for name in ("auc", "centre") for limit in THRESHO
 def sheets(rows: Sequence[Row]) -> list[Sheet]:
     """Means of the scenes; pairs and models of each scene and method, means of the seeds."""
     each: dict[str, list[Record]] = {"means": [], "pairs": [], "models": []}
-    places = [tuple(row[name] for name in ("features", "cameras", "method")) for row in rows]
-    for place in dict.fromkeys(places):
-        own = [_with_speed(row) for row, at in zip(rows, places, strict=True) if at == place]
+    for (*place,), placed in _grouped(map(_with_speed, rows), "features", "cameras", "method"):
         about: Record = dict(zip(("features", "intrinsics", "verified by"), place, strict=True))
-        each["means"].append(about | _means(own))
-        for mapper, scene in dict.fromkeys((row["mapper"], row["scene"]) for row in own):
-            mine = [row for row in own if (row["mapper"], row["scene"]) == (mapper, scene)]
-            line: Record = {**about, **({"mapper": mapper} if mapper else {}), "scene": scene, "seeds": len(mine)}
-            columns = MODEL if mapper else VERIFICATION
-            line |= {name: _mean([row.get(name, np.nan) for row in mine], digits) for name, digits in columns.items()}
+        of_scenes: dict[str, list[dict[str, float]]] = {}  # by mapper, means of the seeds
+        for (mapper, scene), own in _grouped(placed, "mapper", "scene"):
+            means = {name: _mean([row[name] for row in own if name in row]) for name in (*own[0], *MODEL)
+                     if name not in FIELDS}  # fmt: skip
+            of_scenes.setdefault(mapper, []).append(means)
+            line: Record = {**about, **({"mapper": mapper} if mapper else {}), "scene": scene, "seeds": len(own)}
+            line |= {name: _text(means[name], digits) for name, digits in (MODEL if mapper else VERIFICATION).items()}
             each["models" if mapper else "pairs"].append(line)
+        speed = sum(of["pairs"] for of in of_scenes[""]) / max(sum(of["seconds"] for of in of_scenes[""]), 1e-9)
+        about |= {"scenes": len(of_scenes[""]), "pairs a second": f"{speed:.0f}"}
+        for mapper, field in itertools.product(MAPPERS, ("registered, %", *(f"auc{n}" for n in THRESHOLDS))):
+            about[f"{mapper}: {field}"] = _text(_mean([of[field] for of in of_scenes.get(mapper, [])]), 1)
+        each["means"].append(about)
     return [Sheet(name, f"Verified databases: {name}", records) for name, records in each.items()]
+
+
+def _grouped(rows: Iterable[Row], *fields: str) -> list[tuple[tuple[Any, ...], list[Row]]]:
+    """The rows by the values of some fields."""
+    groups: dict[tuple[Any, ...], list[Row]] = {}
+    for row in rows:
+        groups.setdefault(tuple(row[field] for field in fields), []).append(row)
+    return list(groups.items())
 
 
 def _with_speed(row: Row) -> Row:
@@ -243,22 +252,9 @@ def _with_speed(row: Row) -> Row:
     return {**row, "ms a pair": 1e3 * row["seconds"] / row["pairs"], "pairs a second": row["pairs"] / row["seconds"]}
 
 
-def _means(rows: Sequence[Row]) -> Record:
-    """Means over the scenes: pairs a second, and of each mapper registered images and AUC of relative poses."""
-    scenes = list(dict.fromkeys(row["scene"] for row in rows))
-
-    def by_scene(mapper: str, field: str) -> list[float]:
-        own = [[row[field] for row in rows if (row["scene"], row["mapper"]) == (s, mapper)] for s in scenes]
-        return [float(np.mean(values)) for values in own if values]
-
-    speed = sum(by_scene("", "pairs")) / max(sum(by_scene("", "seconds")), 1e-9)
-    line: Record = {"scenes": len(scenes), "pairs a second": f"{speed:.0f}"}
-    for mapper in MAPPERS:
-        for field in ("registered, %", *(f"auc{n}" for n in THRESHOLDS)):
-            line[f"{mapper}: {field}"] = _mean(by_scene(mapper, field), 1)
-    return line
+def _mean(values: Sequence[float]) -> float:
+    return float(np.mean(values)) if values else float("nan")
 
 
-def _mean(values: Sequence[float], digits: int) -> str:
-    known = [value for value in values if not np.isnan(value)]
-    return f"{np.mean(known):.{digits}f}" if known else ""
+def _text(value: float, digits: int) -> str:
+    return "" if np.isnan(value) else f"{value:.{digits}f}"

@@ -9,8 +9,6 @@ precision=int8 quantises weights per channel and activations by what `calibratio
 validation=FOLDER of patches adds the ONNX file's own figures to the card.
 """
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path

@@ -4,8 +4,6 @@ Row i of two descriptors is the same point. Of GeoDesc's loss (Luo et al., ECCV 
 authors' released code (lzx551402/tfmatch) has another form, so that none of theirs stands beside this one.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable

@@ -12,8 +12,6 @@ int8 networks keep their outputs to the last bit where the processor sums produc
 saturate), those in fp32 up to the order of a sum.
 """
 
-from __future__ import annotations
-
 import copy
 import tempfile
 from pathlib import Path

@@ -5,8 +5,6 @@ other and are lit anew; where a point of one view is in another is known from th
 whose viewing angles say how hard it is to match two patches of a point (Luo et al., GeoDesc, ECCV 2018, section 3.3).
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Sequence

@@ -11,8 +11,6 @@ Every step is a function of the seed and its number, so that a run can be resume
 or matches of pairs of photographs (`MatchSetTraining`, as GeoDesc is trained).
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import time
