@@ -35,14 +35,7 @@ from scripts.benchmark.runner import Item, Kept, Measured, Row, add_command, ide
 from scripts.benchmark.tables import Record, Results, Sheet, show
 
 Array = NDArray[Any]
-LEVELS = {
-    "known": "both calibrations are known",
-    "rough": "focal lengths are known to 10 %",
-    "wrong": "focal lengths are 1.5 times too long",
-    "one_sided": "the calibration of image 0 is known",
-    "shared": "one unknown focal length",
-    "unknown": "nothing is known",
-}
+LEVELS = ("known", "rough", "wrong", "one_sided", "shared", "unknown")
 ROUGH = 1.1  # largest factor of a roughly known focal length; log-uniform, of each camera its own
 DEVIATION = 0.06  # relative, of such a factor: log(1.1) / sqrt(3), rounded up
 WRONG = 1.5  # factor of a wrong focal length
@@ -52,7 +45,7 @@ FOCAL_ERRORS = (0.05, 0.1)  # relative
 PRIOR = ("frame_consistency", "match_noise")  # P(inlier) and noise of each match, before our own estimator
 EXACT = ("known", "rough", "wrong")
 TAKES = {
-    "fmtorch": tuple(LEVELS), "fmtorch_f": tuple(LEVELS), "poselib": (*EXACT, "shared"),
+    "fmtorch": LEVELS, "fmtorch_f": LEVELS, "poselib": (*EXACT, "shared"),
     "poselib_f": (*EXACT, "one_sided", "shared", "unknown"), "colmap": (*EXACT, "one_sided", "shared", "unknown"),
     "colmap_f": EXACT, "opencv": EXACT, "kornia": EXACT,
 }  # fmt: skip
@@ -67,19 +60,17 @@ def add_arguments(commands: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    kept = Kept(arguments.rows)
-    rows = kept.rows
-    if pairs.named(arguments):
+    def measured_rows(kept: Kept) -> list[Row]:
         words = [*arguments.methods, *(read_specs(arguments.specs) if arguments.specs else [])]
         if not words:
             raise SystemExit("name at least one method: --methods or --specs")
         matches = pairs.matches_identity(arguments)
-        methods = [CameraMethod.of(word, matches) for word in words]
         items = [item for item in pairs.matched(arguments) if has_cameras(item.pair)]
         if not items:
             raise SystemExit("no pair has cameras; a --root must hold Camera.txt files")
-        rows = measure(methods, items, arguments.seeds, kept)
-    show([sheet(rows)], arguments.table)
+        return measure([CameraMethod.of(word, matches) for word in words], items, arguments.seeds, kept)
+
+    show([sheet(pairs.rows_of(arguments, measured_rows))], arguments.table)
 
 
 def has_cameras(pair: ImagePair) -> bool:
@@ -177,9 +168,8 @@ class CameraMethod(Measured):
         ms = 1e3 * (time.process_time() - start)
         assert item.outcome is not None
         inliers = estimate.inliers if estimate.inliers.shape == c.mask.shape else c.mask
-        outcome = dataclasses.replace(
-            item.outcome, estimate=estimate.replace(inliers=inliers), reason=estimate.reason[0]
-        )
+        estimate = estimate.replace(inliers=inliers)
+        outcome = dataclasses.replace(item.outcome, estimate=estimate, reason=estimate.reason[0])
         row = {**judged(outcome, seed), "ms": ms}
         if estimate.t is not None and pair.t is not None and bool(estimate.ok[0]) and bool(estimate.t.isfinite().all()):
             row["flipped"] = bool(estimate.t[0].double().numpy() @ pair.t < 0)
@@ -203,7 +193,7 @@ def _solver(name: str, level: str, changed: dict[str, Any]) -> tuple[Solve, list
         stages = [("estimator", kind, changed), *(("pruner", word, {}) for word in PRIOR)]
         return lambda c, given, seed: solve(functools.reduce(lambda x, stage: stage(x), prior, c), given, seed), stages
     if kind in ESSENTIAL:
-        solve = functools.partial(_with_cameras, ESSENTIAL[kind](**changed), exact=True)
+        solve = functools.partial(_with_cameras, _by_essential(kind, changed), exact=True)
         return functools.partial(_best_first, solve), []
     usual: dict[str, Any] = {"iterations": 5000, "prosac": True} if kind == "poselib" else {"two_view": not alone}
     shared = {"shared_focal": True} if (name, level) == ("poselib", "shared") else {}
@@ -212,10 +202,8 @@ def _solver(name: str, level: str, changed: dict[str, Any]) -> tuple[Solve, list
         estimator = presets.build("estimator", kind, **changed)
     except ImportError as error:
         raise SystemExit(f"{name}: {error}") from error
-    call = _decomposed if alone or shared else _with_cameras
-    return functools.partial(_best_first, functools.partial(call, estimator, exact=True)), [
-        ("estimator", kind, changed)
-    ]
+    call = functools.partial(_decomposed if alone or shared else _with_cameras, estimator, exact=True)
+    return functools.partial(_best_first, call), [("estimator", kind, changed)]
 
 
 def _with_cameras(estimator: Any, c: Correspondences, given: Knowledge, seed: int, exact: bool) -> Estimate:
@@ -250,13 +238,16 @@ def _posed(estimate: Estimate, c: Correspondences, given: Knowledge) -> Estimate
         return estimate
     F = estimate.F[0].double().numpy()
     K0, K1 = given.calibrations(bougnoux(F, given))
-    rays = [np.c_[x[0].double().numpy(), np.ones(len(inliers))][inliers] @ np.linalg.inv(K).T
-            for x, K in ((c.x0, K0), (c.x1, K1))]  # fmt: skip
-    normalised = [np.ascontiguousarray(each[:, :2]) for each in rays]
+    normalised = [rays(x[0].double().numpy()[inliers], K) for x, K in ((c.x0, K0), (c.x1, K1))]
     far = 1e9  # baselines: OpenCV's own bound of 50 rejects short ones
     _, R, t, _, _ = cv2.recoverPose(K1.T @ F @ K0, normalised[0], normalised[1], np.eye(3), distanceThresh=far)
     pose = {"R": np.asarray(R), "t": np.asarray(t).ravel(), "focals": focals_of(K0, K1)}
     return estimate.replace(**{name: torch.from_numpy(np.asarray(v, np.float64))[None] for name, v in pose.items()})
+
+
+def rays(x: Array, K: Array) -> Array:
+    """Pixels (n, 2) in units of the focal length, from the principal point."""
+    return np.ascontiguousarray((np.c_[x, np.ones(len(x))] @ np.linalg.inv(K).T)[:, :2])
 
 
 def bougnoux(F: Array, given: Knowledge) -> Array:
@@ -279,58 +270,48 @@ def _squared_focal(G: Array) -> float:
         return float(-(row @ p) * (p @ G.T @ p) / (row @ D @ G.T @ p))
 
 
-Essential = Callable[[Any, Array, Array], tuple[Any, Any]]  # a pair, K0 and K1 -> E and its inliers
+def _opencv(
+    pair: Any, K0: Array, K1: Array, method: str = "USAC_MAGSAC", threshold: float = 1.0, confidence: float = 0.999
+) -> tuple[Any, Any]:
+    cv2.setRNGSeed(pair.seed)
+    return cv2.findEssentialMat(pair.x0, pair.x1, K0, None, K1, None, getattr(cv2, method), confidence, threshold)
 
 
-def _essential(name: str, find: Essential) -> PairwiseEstimator:
+def _kornia(pair: Any, K0: Array, K1: Array, threshold: float = 1.0, rounds: int = 10) -> tuple[Any, Any]:
+    from kornia.geometry import RANSAC
+
+    unit = float(np.mean([K0[0, 0], K1[0, 0]]))  # px
+    ransac = RANSAC("essential", inl_th=threshold / unit, max_iter=rounds, prosac_sampling=True, seed=pair.seed)
+    E, mask = ransac(*(torch.from_numpy(rays(x, K)) for x, K in ((pair.x0, K0), (pair.x1, K1))))
+    return E.double().numpy(), mask.numpy()
+
+
+ESSENTIAL: dict[str, Callable[..., tuple[Any, Any]]] = {"opencv": _opencv, "kornia": _kornia}
+"""From a pair, K0, K1 and options to E and its inliers."""
+
+
+def _by_essential(kind: str, changed: dict[str, Any]) -> PairwiseEstimator:
     """An estimator of fundamental matrices by a library's essential matrices, of matches that come best first."""
 
     def solve(pair: Any) -> tuple[Array | None, Array]:
         K0, K1 = pair.exact
-        E, mask = find(pair, K0, K1)
+        E, mask = ESSENTIAL[kind](pair, K0, K1, **changed)
         if E is None or mask is None or np.shape(E) != (3, 3):
             return None, np.zeros(len(pair.x0), np.bool_)
         return np.linalg.inv(K1).T @ np.asarray(E, np.float64) @ np.linalg.inv(K0), np.asarray(mask).ravel() > 0
 
-    return PairwiseEstimator(name, solve, best_first=True)
-
-
-def _opencv(method: str = "USAC_MAGSAC", threshold: float = 1.0, confidence: float = 0.999) -> PairwiseEstimator:
-    def find(pair: Any, K0: Array, K1: Array) -> tuple[Any, Any]:
-        cv2.setRNGSeed(pair.seed)
-        return cv2.findEssentialMat(pair.x0, pair.x1, K0, None, K1, None, getattr(cv2, method), confidence, threshold)
-
-    return _essential("OpenCV", find)
-
-
-def _kornia(threshold: float = 1.0, rounds: int = 10, prosac: bool = True) -> PairwiseEstimator:
-    from kornia.geometry import RANSAC
-
-    def find(pair: Any, K0: Array, K1: Array) -> tuple[Any, Any]:
-        unit = float(np.mean([K0[0, 0], K1[0, 0]]))  # px
-        ransac = RANSAC("essential", inl_th=threshold / unit, max_iter=rounds, prosac_sampling=prosac, seed=pair.seed)
-        rays = [np.c_[x, np.ones(len(x))] @ np.linalg.inv(K).T for x, K in ((pair.x0, K0), (pair.x1, K1))]
-        E, mask = ransac(*(torch.from_numpy(np.ascontiguousarray(each[:, :2])) for each in rays))
-        return E.double().numpy(), mask.numpy()
-
-    return _essential("kornia", find)
-
-
-ESSENTIAL: dict[str, Callable[..., PairwiseEstimator]] = {"opencv": _opencv, "kornia": _kornia}
+    return PairwiseEstimator(kind, solve, best_first=True)
 
 
 def sheet(rows: Sequence[Row]) -> Sheet:
     """Each level's methods on each set, and what our own method of the level, or else the first of it, has more."""
     records: list[Record] = []
-    columns = [
-        "pose@5", "pose@10", "pose@20", "R.01", "AUC@0.05", "flipped, %", *(f"focal within {p} %, %" for p in (5, 10)),
-        "ms", "time ratio",
-    ]  # fmt: skip
+    columns = [*(f"pose@{t}" for t in (5, 10, 20)), "R.01", "AUC@0.05", "flipped, %"]
+    columns += [*(f"focal within {p} %, %" for p in (5, 10)), "ms", "time ratio"]
     for level in LEVELS:
         own = [row for row in rows if row["method"].split(":")[1] == level]
         results = Results(sorted(own, key=lambda row: row["method"].split(":")[0] != "fmtorch"))
-        lines = results.records(results.groups(results.all_pairs), columns, label="method", minus=["pose@5"])
+        lines = results.records(results.groups(results.all_pairs), columns, "method", ["pose@5"])
         records += [{"known": level, "method": line.pop("method"), **line} for line in lines]
-    return Sheet(
-        "poses", "AUC of the larger pose error at 5, 10 and 20 degrees, recall and AUC@0.05 of F, in %", records
-    )
+    title = "AUC of the larger pose error at 5, 10 and 20 degrees, recall and AUC@0.05 of F, in %"
+    return Sheet("poses", title, records)
