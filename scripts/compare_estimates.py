@@ -1,12 +1,11 @@
 """Do two checkouts compute the same estimates, to the bit? Run on one machine, before and after a change.
 
-    python scripts/compare_estimates.py BEFORE [AFTER] [--quick] [--presets ransac fmtorch] [--matches robust.npz]
+    python scripts/compare_estimates.py BEFORE [AFTER] [--quick] [--presets ransac fmtorch]
 
-BEFORE and AFTER are checkouts, or files written with --save; AFTER is this checkout by default. Every estimator preset
-of the project runs on the same pairs in a process of each checkout: synthetic scenes with and without prior, noise,
-image sizes; pairs that are degenerate; and, with --matches, real ones. Compared are F, inliers, ok, reasons, samples,
-the models before the final fit, and gradients, besides public functions of `fmtorch.geometry`. Only public names are
-used. Exit status 1 where anything differs.
+BEFORE and AFTER are checkouts; AFTER is this one by default. Every estimator preset of the project runs on the same
+pairs in a process of each checkout: synthetic scenes with and without prior, noise, image sizes, and pairs that are
+degenerate. Compared are F, inliers, ok, reasons, samples, the models before the final fit, and gradients, besides
+public functions of `fmtorch.geometry`. Only public names are used. Exit status 1 where anything differs.
 """
 
 import argparse
@@ -22,11 +21,10 @@ import torch
 
 HERE = Path(__file__).resolve().parents[1]
 OWN = ("Ransac", "IterativelyReweighted", "CoarseToFine")
-QUICK_MATCHES, MATCHES = 400, 1000  # of a real pair, at most
 FIELDS = ("x0", "x1", "mask", "ratio", "prior", "noise", "size0", "size1", "key", "lafs0", "lafs1")
 
 
-def inputs(quick: bool, matches: Path | None) -> dict[str, dict[str, torch.Tensor]]:
+def inputs(quick: bool) -> dict[str, dict[str, torch.Tensor]]:
     """Batches of pairs as plain tensors, by name, so that both checkouts read the same."""
     sys.path.insert(0, str(HERE))
     from fmtorch.core.types import collate
@@ -53,25 +51,10 @@ def inputs(quick: bool, matches: Path | None) -> dict[str, dict[str, torch.Tenso
         }
     kinds = [*degenerate().values(), *small().values()]
     batches["degenerate"] = collate(kinds[::4] if quick else kinds)
-    if matches is not None:
-        arrays = np.load(matches)
-        names = range(0, len(arrays["names"]), 8 if quick else 1)
-        batches |= {f"real {i}": real(arrays, i, QUICK_MATCHES if quick else MATCHES) for i in names}
     return {
         name: {f: v.clone() for f in FIELDS if isinstance(v := getattr(c, f), torch.Tensor)}
         for name, c in batches.items()
     }
-
-
-def real(arrays: Any, i: int, most: int) -> Any:
-    from fmtorch import Correspondences, presets
-
-    x0, x1 = (torch.from_numpy(arrays[f"{i:03d}.{x}"][:most].astype(np.float32))[None] for x in ("X1", "X2"))
-    size0, size1 = (torch.from_numpy(arrays[f"{i:03d}.{s}"].astype(np.int64))[None] for s in ("size1", "size2"))
-    ratio = torch.from_numpy(np.random.default_rng(i).uniform(0.3, 0.95, x0.shape[:2]).astype(np.float32))
-    mask, key = torch.ones(x0.shape[:2], dtype=torch.bool), torch.tensor([i + 1])
-    c = Correspondences(x0, x1, mask, ratio=ratio, size0=size0, size1=size1, key=key)
-    return presets.build("pruner", "position_consistency")(c)
 
 
 def dump(pairs: Path, out: Path, presets_: list[str], quick: bool) -> None:
@@ -151,17 +134,14 @@ def geometry() -> dict[str, torch.Tensor]:
     return arrays
 
 
-def computed(source: Path, pairs: Path, arguments: argparse.Namespace, folder: Path) -> dict[str, torch.Tensor]:
-    """The results of a checkout, or those of a file."""
-    out = source
-    if source.is_dir():
-        out = folder / f"{len(list(folder.iterdir()))}.pt"
-        command = [sys.executable, str(Path(__file__).resolve()), "--dump", str(pairs), str(out), "--presets"]
-        command += [*arguments.presets, *(["--quick"] if arguments.quick else [])]
-        environment = {**os.environ, "PYTHONPATH": str(source.resolve()), "OMP_NUM_THREADS": "1"}
-        subprocess.run(command, check=True, env=environment, cwd=source)
-    loaded: dict[str, torch.Tensor] = torch.load(out)
-    return loaded
+def computed(source: Path, folder: Path, out: Path, arguments: argparse.Namespace) -> dict[str, torch.Tensor]:
+    """The results of a checkout on the pairs of a folder."""
+    command = [sys.executable, str(Path(__file__).resolve()), "--dump", str(folder / "pairs.pt"), str(out), "--presets"]
+    command += [*arguments.presets, *(["--quick"] if arguments.quick else [])]
+    environment = {**os.environ, "PYTHONPATH": str(source.resolve()), "OMP_NUM_THREADS": "1"}
+    subprocess.run(command, check=True, env=environment, cwd=source)
+    results: dict[str, torch.Tensor] = torch.load(out)
+    return results
 
 
 def same(a: torch.Tensor, b: torch.Tensor) -> bool:
@@ -172,12 +152,10 @@ def same(a: torch.Tensor, b: torch.Tensor) -> bool:
     return bool((((a == b) & signed) | ((a != a) & (b != b))).all())
 
 
-def differences(before: dict[str, torch.Tensor], after: dict[str, torch.Tensor], presets_: list[str]) -> list[str]:
+def differences(before: dict[str, torch.Tensor], after: dict[str, torch.Tensor]) -> list[str]:
     """What differs, in words."""
     lines = []
     for name in sorted(before.keys() | after.keys()):
-        if presets_ and name.split(" | ")[0] not in (*presets_, "geometry"):
-            continue
         if name not in before or name not in after:
             lines.append(f"{name}: only {'before' if name in before else 'after'}")
         elif not same(before[name], after[name]):
@@ -193,25 +171,19 @@ def main() -> None:
     parser.add_argument("after", type=Path, nargs="?", default=HERE)
     parser.add_argument("--quick", action="store_true", help="fewer pairs, one seed: a minute in place of many")
     parser.add_argument("--presets", nargs="*", default=[], help="of conf/estimator; all by default")
-    parser.add_argument("--matches", type=Path, help="real pairs: an .npz file with names, NNN.X1, .X2, .size1, .size2")
-    parser.add_argument("--save", type=Path, help="keep what BEFORE computes (nothing else where AFTER is the same)")
     parser.add_argument("--dump", type=Path, nargs=2, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.dump:
         dump(*arguments.dump, arguments.presets, arguments.quick)
         return
     if arguments.before is None:
-        parser.error("BEFORE is missing: a checkout, or a file written with --save")
+        parser.error("BEFORE is missing: a checkout")
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        torch.save(inputs(arguments.quick, arguments.matches), folder / "pairs.pt")
-        before = computed(arguments.before, folder / "pairs.pt", arguments, folder)
-        if arguments.save:
-            torch.save(before, arguments.save)
-        if arguments.save and arguments.after.resolve() == arguments.before.resolve():
-            return
-        after = computed(arguments.after, folder / "pairs.pt", arguments, folder)
-    lines = differences(before, after, arguments.presets)
+        torch.save(inputs(arguments.quick), folder / "pairs.pt")
+        before = computed(arguments.before, folder, folder / "before.pt", arguments)
+        after = computed(arguments.after, folder, folder / "after.pt", arguments)
+    lines = differences(before, after)
     print("\n".join(lines[:60]) + f"\n{len(lines)} of {len(before.keys() | after.keys())} arrays differ")
     sys.exit(bool(lines))
 

@@ -25,7 +25,7 @@ from fmtorch.geometry import refine
 from fmtorch.pipeline.pipeline import Outcome, Pipeline, build_pipeline, load_pipeline
 from fmtorch.presets.composition import PIPELINES, compose
 from scripts.benchmark import changes
-from scripts.benchmark.runner import Method, Stages, identity
+from scripts.benchmark.runner import Method, identity
 
 TRUTH, NGRANSAC, FIND = "truth", "ngransac", "find_fundamental"
 FIND_STAGES = [
@@ -54,15 +54,11 @@ def options(text: str) -> dict[str, Any]:
         inside = changed
         for part in parts:
             inside = inside.setdefault(part, {})
-        inside[last] = _parsed(value)
+        try:
+            inside[last] = json.loads(value)
+        except json.JSONDecodeError:
+            inside[last] = value
     return changed
-
-
-def _parsed(value: str) -> Any:
-    try:
-        return json.loads(value)
-    except json.JSONDecodeError:
-        return value
 
 
 def split(word: str) -> tuple[str, dict[str, Any]]:
@@ -89,12 +85,6 @@ def estimate_by_call(options: Mapping[str, Any], c: Correspondences, seed: int) 
     return fmtorch.find_fundamental(c.x0, c.x1, **given)
 
 
-def stages_identified(group: str, word: str) -> Stages:
-    """The presets that a word's results depend on."""
-    name, changed = split(word)
-    return FIND_STAGES if group == "estimator" and name == FIND else [(group, name, changed)]
-
-
 def stages_of(spec: str) -> list[str]:
     """The words after ``@``."""
     return [stage for stage in spec.partition("@")[2].split("+") if stage]
@@ -105,10 +95,11 @@ def method(spec: str, matches: str = "", extra: Mapping[str, Pruner] = NO_STAGES
     word, words = spec.partition("@")[0], stages_of(spec)
     names = [name for name in words if split(name)[0] not in VIEWS]
     stages = {name: extra[name] if name in extra else build("pruner", name) for name in names}
-    own = [] if word == TRUTH else stages_identified("estimator", word)
-    own += [part for name in names if name not in {*extra, *WITHHELD} for part in stages_identified("pruner", name)]
+    called = split(word)[0] == FIND
+    own = FIND_STAGES if called else [] if word == TRUTH else [("estimator", *split(word))]
+    own = [*own, *(("pruner", *split(name)) for name in names if name not in {*extra, *WITHHELD})]
     others: list[Any] = [part for stage in words for part in (stage, stages.get(stage))]
-    others += [{"_target_": f"fmtorch.{FIND}"}] if split(word)[0] == FIND else []
+    others += [{"_target_": f"fmtorch.{FIND}"}] if called else []
     solve = from_truth if word == TRUTH else functools.partial(_estimated, build("estimator", word))
     views = [functools.partial(VIEWS[name], **changed) for name, changed in map(split, words) if name in VIEWS]
     made_with = identity(own, word, matches, *others)
@@ -143,10 +134,8 @@ def from_truth(pair: ImagePair, c: Correspondences, seed: int) -> Estimate:
     for scale in (1.5, 0.7):  # px
         F = refine(F, c.x0, c.x1, c.prior, c.mask, loss="geman_mcclure", scale=scale, iterations=20)
     ok = torch.isfinite(F).all(-1).all(-1)
-    reason = "" if bool(ok) else "no fit"
-    return Estimate(
-        torch.where(ok[:, None, None], F, 0.0), c.mask & ok[:, None], ok, (reason,), torch.zeros(1, dtype=torch.int64)
-    )
+    F = torch.where(ok[:, None, None], F, 0.0)
+    return Estimate(F, c.mask & ok[:, None], ok, ("" if bool(ok) else "no fit",), torch.zeros(1, dtype=torch.int64))
 
 
 def pipeline_of(words: str, *overrides: str) -> Pipeline:
@@ -181,15 +170,7 @@ def ngransac(file: Path | None) -> dict[str, Pruner]:
     return {NGRANSAC: presets.build("pruner", "lc", soft=True, network=network, file=str(file))}
 
 
-def sizeless(c: Correspondences) -> Correspondences:
-    """The matches of images whose sizes nobody tells."""
-    return c.replace(size0=None, size1=None)
-
-
-def ratioless(c: Correspondences) -> Correspondences:
-    """The matches without their distance ratios."""
-    return c.replace(ratio=None)
-
-
-WITHHELD: dict[str, Pruner] = {"sizeless": sizeless, "ratioless": ratioless}
+WITHHELD: dict[str, Pruner] = {
+    "sizeless": lambda c: c.replace(size0=None, size1=None), "ratioless": lambda c: c.replace(ratio=None)
+}  # fmt: skip
 """Stages that are no presets: what an estimator is not given."""

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from fmtorch import match
 from fmtorch.core.types import Correspondences
-from fmtorch.data import ImagePair, ImageSource
+from fmtorch.data import ImagePair, ImageSource, read_image
 from fmtorch.pipeline.pipeline import Outcome
 from fmtorch.training.planes import Photograph, PlanePairs, PlaneViews
 from scripts.benchmark.runner import Item
@@ -198,10 +198,7 @@ def small(path: Path) -> Array:
 
 def _read(path: Path) -> Array:
     """A photograph, BGR."""
-    image = cv2.imread(str(path))
-    if image is None:
-        raise SystemExit(f"error: {path} is no photograph that OpenCV reads")
-    return np.asarray(image)
+    return np.asarray(read_image(path)[..., ::-1])
 
 
 def matched(image0: Array, image1: Array) -> Correspondences:

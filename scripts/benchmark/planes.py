@@ -27,7 +27,7 @@ import torch
 from rich.progress import track
 
 from fmtorch import find_homography, metrics, presets
-from fmtorch.core.types import PAIR_TYPES, Correspondences, collate
+from fmtorch.core.types import PAIR_TYPES, Correspondences, Estimate, collate
 from fmtorch.estimators.external import colmap
 from fmtorch.geometry import poses_from_homography
 from fmtorch.two_view.known_cameras import KnownCameras
@@ -38,7 +38,7 @@ from scripts.benchmark.photographs import Array, Plane, add_options, kinds, mapp
 from scripts.benchmark.runner import Item, Kept, Measured, Row, add_command, console, measure, milliseconds
 from scripts.benchmark.tables import Record, Results, Sheet, show
 
-Solver = Callable[[Correspondences, int], Array | None]
+POSES = ("from F", "from H, the first pose", "from H, the better one")
 METHODS = ("ours", "poselib:1", "poselib:2", "poselib:3", "usac_accurate:1", "usac_magsac:0.5")
 CONFIGURATION = """Kinds of image pairs: confusion tables of `classify` and of COLMAP's rule, on the same matches.
 
@@ -74,13 +74,12 @@ def add_arguments(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     paths = paths_of(arguments)
-    made = [*(warped(paths, arguments.warps) if {"warped", "hard"} & set(arguments.kinds) else ()),
-            *(views(paths, arguments.warps) if "views" in arguments.kinds else ())]  # fmt: skip
-    items = [item for item in track(made, "warping", console=console) if item.pair.family in arguments.kinds]
+    planes = [*(warped(paths, arguments.warps) if {"warped", "hard"} & set(arguments.kinds) else ()),
+              *(views(paths, arguments.warps) if "views" in arguments.kinds else ())]  # fmt: skip
+    items = [item for item in track(planes, "warping", console=console) if item.pair.family in arguments.kinds]
     results = Results(measure([Homography.of(word) for word in arguments.methods], items, arguments.seeds, Kept(None)))
-    columns = [*(f"AUC@{px} px" for px in (1, 3, 5)), "ms"]
     groups = {kind: own for kind, own in results.groups(results.all_pairs).items() if kind in results.families}
-    records = results.records(groups, columns, label="method", minus=["AUC@1 px"])
+    records = results.records(groups, [*(f"AUC@{px} px" for px in (1, 3, 5)), "ms"], "method", ["AUC@1 px"])
     show([Sheet("homography", "AUC of the mean distance of points, in %", records)], arguments.table)
 
 
@@ -89,7 +88,7 @@ class Homography(Measured):
     """An estimator of homographies."""
 
     name: str
-    solve: Solver
+    solve: Callable[[Correspondences, int], Array | None]
     identity: str = ""
 
     @classmethod
@@ -98,9 +97,7 @@ class Homography(Measured):
         name, _, setting = word.partition(":")
         if name == "ours":
             return cls(word, functools.partial(_ours, options(setting)))
-        if name == "poselib":
-            return cls(word, functools.partial(_poselib, float(setting)))
-        return cls(word, functools.partial(_opencv, getattr(cv2, name.upper()), float(setting)))
+        return cls(word, functools.partial(_peer, name, float(setting)))
 
     def figures(self, item: Item, seed: int) -> Row:
         """The mean error in pixels, infinite where there is no homography, and milliseconds."""
@@ -115,25 +112,28 @@ class Homography(Measured):
         return row
 
 
+def estimated(c: Correspondences, seed: int = 0, **changed: Any) -> Estimate:
+    """Our homography of a pair."""
+    given: dict[str, Any] = {name: getattr(c, name) for name in ("mask", "ratio", "prior", "noise", "key")}
+    return find_homography(c.x0, c.x1, seed=seed, **given, **changed)
+
+
 def _ours(changed: dict[str, Any], c: Correspondences, seed: int) -> Array | None:
-    given: dict[str, Any] = {"mask": c.mask, "ratio": c.ratio, "prior": c.prior, "noise": c.noise, "key": c.key}
-    estimate = find_homography(c.x0, c.x1, seed=seed, **given, **changed)
+    estimate = estimated(c, seed, **changed)
     return estimate.H[0].numpy() if bool(estimate.ok[0]) else None
 
 
-def _poselib(threshold: float, c: Correspondences, seed: int) -> Array | None:
-    import poselib
-
-    H, _ = poselib.estimate_homography(*points(c), {"max_reproj_error": threshold, "seed": seed}, {})
-    return np.asarray(H)
-
-
-def _opencv(method: int, threshold: float, c: Correspondences, seed: int) -> Array | None:
-    cv2.setRNGSeed(seed)
+def _peer(name: str, threshold: float, c: Correspondences, seed: int) -> Array | None:
+    """Of PoseLib, or by a method of OpenCV."""
     x0, x1 = points(c)
+    if name == "poselib":
+        import poselib
+
+        return np.asarray(poselib.estimate_homography(x0, x1, {"max_reproj_error": threshold, "seed": seed}, {})[0])
+    cv2.setRNGSeed(seed)
     if len(x0) < 4:
         return None
-    H, _ = cv2.findHomography(x0, x1, method, threshold, maxIters=2000, confidence=0.9999)
+    H, _ = cv2.findHomography(x0, x1, getattr(cv2, name.upper()), threshold, maxIters=2000, confidence=0.9999)
     return None if H is None else np.asarray(H)
 
 
@@ -179,13 +179,13 @@ class Ours:
 
 def by_colmap(threshold: float, c: Correspondences) -> str:
     """COLMAP's two-view geometry of calibrated cameras at a threshold of so many pixels."""
-    ends = []
-    for number, (K, size) in enumerate(((c.K0, c.size0), (c.K1, c.size1))):
-        assert K is not None
-        assert size is not None
-        ends.append(colmap.Camera(K[0].double().numpy(), number=number, size=(int(size[0, 0]), int(size[0, 1]))))
-    given = colmap.two_view_options(threshold, 0)
-    return COLMAP[colmap.two_view_geometry(*points(c), (ends[0], ends[1]), given).configuration]
+    known: Any = ((c.K0, c.size0), (c.K1, c.size1))
+    first, second = (
+        colmap.Camera(K[0].double().numpy(), number=number, size=(int(size[0, 0]), int(size[0, 1])))
+        for number, (K, size) in enumerate(known)
+    )
+    geometry = colmap.two_view_geometry(*points(c), (first, second), colmap.two_view_options(threshold, 0))
+    return COLMAP[geometry.configuration]
 
 
 def kinds_sheet(items: Sequence[Item], verdicts: dict[str, list[str]]) -> Sheet:
@@ -194,9 +194,8 @@ def kinds_sheet(items: Sequence[Item], verdicts: dict[str, list[str]]) -> Sheet:
     for name, said in verdicts.items():
         groups: dict[tuple[str, str], list[str]] = {}
         for item, kind in zip(items, said, strict=True):
-            groups.setdefault(
-                (f"{item.pair.family}/{item.pair.scene}" if item.images else item.pair.family, item.facts["truth"]), []
-            ).append(kind)
+            scene = f"/{item.pair.scene}" if item.images else ""
+            groups.setdefault((item.pair.family + scene, item.facts["truth"]), []).append(kind)
         for (group, truth), own in groups.items():
             line: Record = {"method": name, "pairs of": group, "truth": truth, "pairs": len(own)}
             line |= {kind: own.count(kind) for kind in PAIR_TYPES}
@@ -215,9 +214,7 @@ def pose_sheet(items: Sequence[Item], said: Sequence[str]) -> Sheet:
     for (family, kind), errors in groups.items():
         line: Record = {"set": family, "kind": kind, "pairs": len(errors)}
         areas = 100 * metrics.pose_auc(torch.from_numpy(np.stack(errors, 1)))
-        for name, own in zip(
-            ("from F", "from H, the first pose", "from H, the better one"), areas.tolist(), strict=True
-        ):
+        for name, own in zip(POSES, areas.tolist(), strict=True):
             line |= {f"{name} @{t}": f"{area:.1f}" for t, area in zip((5, 10, 20), own, strict=True)}
         records.append(line)
     return Sheet("poses", "AUC of the pose error, in %", records)
@@ -229,8 +226,7 @@ def pose_errors(c: Correspondences, R: torch.Tensor, t: torch.Tensor) -> Array:
     assert c.K1 is not None
     estimate = presets.build("estimator", "fmtorch")(c, 0)
     from_F = metrics.fundamental_pose_error(estimate.F, c.K0, c.K1, c.x0, c.x1, R[None], t[None], estimate.inliers)
-    given: dict[str, Any] = {"mask": c.mask, "ratio": c.ratio, "prior": c.prior, "noise": c.noise, "key": c.key}
-    H = find_homography(c.x0, c.x1, **given)
+    H = estimated(c)
     poses = poses_from_homography(H.F, c.K0, c.K1, c.x0.double(), c.x1.double(), H.inliers)
     seen = torch.where(poses.valid[..., None, None], poses.R, torch.nan)
     from_H = metrics.pose_error(seen, poses.t, R[None, None], t[None, None]).worst[0].nan_to_num(180.0)

@@ -48,7 +48,8 @@ def add_command(
 ) -> argparse.ArgumentParser:
     """A command with `--table` and, where `seeds` says how many by default, `--seeds` and `--rows`."""
     raw = argparse.RawDescriptionHelpFormatter
-    parser: argparse.ArgumentParser = commands.add_parser(name, help=about, description=about, formatter_class=raw)
+    head = (about or "").partition("\n")[0].replace("%", "%%")
+    parser: argparse.ArgumentParser = commands.add_parser(name, help=head, description=about, formatter_class=raw)
     if seeds is not None:
         parser.add_argument("--seeds", type=int, default=seeds, help="of the methods, from 0; figures are their means")
         parser.add_argument("--rows", type=Path, help=ROWS)

@@ -58,11 +58,10 @@ def stage_sheets(folder: Path, count: int) -> list[Sheet]:
     costs: list[Record] = []
     size = 0.0  # bytes of a row
     for name, pipeline in PIPELINES.items():
-        given = name == "given matches"
-        source = [synthetic_pair(i, MATCHES) for i in range(count)] if given else list(
-            RenderedPairs("test", size="small")
-        )  # fmt: skip
-        every = select(source, None)[: count if given else max(count // 10, 1)]
+        if name == "given matches":
+            every = select([synthetic_pair(i, MATCHES) for i in range(count)], None)
+        else:
+            every = select(list(RenderedPairs("test", size="small")), None)[: max(count // 10, 1)]
         stored, built = RunFolder.open(folder / pipeline, {"pipeline": pipeline}), pipeline_of(pipeline)
         evaluated(built, every[:2], [].extend)  # compiles and loads
         start = time.perf_counter()
@@ -71,10 +70,10 @@ def stage_sheets(folder: Path, count: int) -> list[Sheet]:
         rows = stored.read()
         ms = {s: 1e3 * sum(v or 0.0 for v in rows[f"seconds_{s}"].to_pylist()) / len(every) for s in STAGES}
         ms["rest"] = max(1e3 * wall / len(every) - sum(ms.values()), 0.0)
-        speed, hours = len(every) / wall, 1e6 * wall / len(every) / 3600
+        hours = 1e6 * wall / len(every) / 3600
         size = size or sum(path.stat().st_size for path in (stored.path / "pairs").iterdir()) / len(every)
         stages.append({"pipeline": name, "pairs": len(every), **{f"{s}, ms": f"{v:.1f}" for s, v in ms.items()},
-                       "pairs a second and core": f"{speed:.1f}"})  # fmt: skip
+                       "pairs a second and core": f"{len(every) / wall:.1f}"})  # fmt: skip
         costs.append({"pipeline": name, "core hours of 10^6 pairs": f"{hours:.0f}", "of 10^9": f"{1e3 * hours:.0f}",
                       "rows of 10^6, GB": f"{size / 1e3:.2f}", "of 10^9, TB": f"{size / 1e3:.2f}"})  # fmt: skip
     return [Sheet("stages", "Stages, by one worker", stages), Sheet("extrapolated", "Extrapolated", costs)]
@@ -91,8 +90,7 @@ def worker_sheet(executors: Sequence[str], workers: Sequence[int], batches: int)
     for executor in executors:
         line: Record = {"executor": executor}
         for count in workers:
-            number = 50 * count
-            efficiency = 100 * WAIT * number / count / _timed(executor, count, WAIT, number)
+            efficiency = 100 * WAIT * 50 / _timed(executor, count, WAIT, 50 * count)
             line[f"{count} worker{'s' * (count > 1)}: efficiency, %"] = f"{efficiency:.0f}"
         records.append(line | {"batches a second": f"{batches / _timed(executor, workers[-1], 0.0, batches):.0f}"})
     return Sheet("workers", f"Batches that only wait {1e3 * WAIT:.0f} ms, and such as do nothing", records)
@@ -101,7 +99,7 @@ def worker_sheet(executors: Sequence[str], workers: Sequence[int], batches: int)
 def _timed(executor: str, workers: int, seconds: float, count: int) -> float:
     """Seconds of so many calls from the first result on, when all workers have started."""
     execution = Execution(executor, workers)
-    source: Any = Local(seconds) if execution.shared else Factory(functools.partial(_seconds, seconds))
+    source: Any = Local(seconds) if execution.shared else Factory(functools.partial(float, seconds))
     warm = 4 * workers
     start = 0.0
     with WorkerPool(execution) as pool:
@@ -116,10 +114,6 @@ def wait(seconds: float, job: int) -> int:
     """A stage that only waits."""
     time.sleep(seconds)
     return job
-
-
-def _seconds(seconds: float) -> float:
-    return seconds
 
 
 def memory_sheet(rows: Sequence[int]) -> Sheet:
@@ -148,21 +142,20 @@ def stored(count: int) -> dict[str, float]:
         figures["finding what is done, MB"] = _peak()
         summarize(folder.read(without=("pair", "F")))
         size = sum(file.stat().st_size for file in files) / count
-        figures |= {"summary, MB": _peak(), "storing, s": seconds, "parts": len(files), "bytes a row on disk": size}
-    return figures
+        return figures | {
+            "summary, MB": _peak(), "storing, s": seconds, "parts": len(files), "bytes a row on disk": size
+        }  # fmt: skip
 
 
 def rows_of(nothing: None, numbers: range) -> list[PairRow]:
     """Rows as of solved pairs."""
-    F = [0.1234567 * (i + 1) for i in range(9)]
-    return [
-        PairRow(
-            f"family/scene{i // 1000}/im{i:07d}-im{i + 1:07d}", i, "family", f"scene{i // 1000}", ok=True,
-            nsgd=(i % 997) / 997, inlier_rate=0.9, F=[value + 1e-9 * i for value in F], corrs=i % 400, corrs_before=500,
-            **{f"seconds_{stage}": 1e-3 + 1e-9 * i for stage in STAGES},  # type: ignore[arg-type]
-        )
-        for i in numbers
-    ]  # fmt: skip
+    rows = []
+    for i in numbers:
+        name, F = f"family/scene{i // 1000}/im{i:07d}-im{i + 1:07d}", [0.1234567 * k + 1e-9 * i for k in range(1, 10)]
+        seconds: Any = {f"seconds_{stage}": 1e-3 + 1e-9 * i for stage in STAGES}
+        figures: Any = {"nsgd": (i % 997) / 997, "inlier_rate": 0.9, "F": F, "corrs": i % 400, "corrs_before": 500}
+        rows.append(PairRow(name, i, "family", f"scene{i // 1000}", ok=True, **figures, **seconds))
+    return rows
 
 
 def _peak() -> float:

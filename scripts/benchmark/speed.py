@@ -96,7 +96,8 @@ def in_turn(methods: dict[str, Call], inputs: Sequence[Correspondences], repeats
 
 
 def run_memory(arguments: argparse.Namespace) -> None:
-    own = [name for name in presets.available("estimator") if not is_peer(name)]
+    targets = {name: str(presets.load("estimator", name)["_target_"]) for name in presets.available("estimator")}
+    own = [name for name, target in targets.items() if not target.rpartition(".")[2].islower()]  # peers' are functions
     context = multiprocessing.get_context("spawn")
     records: list[Record] = []
     for spec in arguments.estimators or own:
@@ -105,11 +106,6 @@ def run_memory(arguments: argparse.Namespace) -> None:
         console.print(f"{spec}: {growth:.0f} MiB", highlight=False)
         records.append({"estimator": spec, "input, MiB": f"{size:.0f}", "peak growth, MiB": f"{growth:.0f}"})
     show([Sheet("memory", f"{arguments.pairs} pairs of {arguments.matches} matches", records)], arguments.table)
-
-
-def is_peer(name: str) -> bool:
-    """Whether a preset is another library's estimator: what makes those is a function, ours are classes."""
-    return str(presets.load("estimator", name)["_target_"]).rpartition(".")[2].islower()
 
 
 def peak(spec: str, count: int, matches: int) -> tuple[float, float]:
