@@ -188,9 +188,8 @@ def run_similar(arguments: argparse.Namespace) -> None:
     roots = sorted(arguments.root)
     paths = [path for root in roots for path in sorted(root.glob("*/Images/*"))]
     sets = [data.load("fmbench", root=root) for root in roots]  # pairs with a true F, which `fmtorch pairs` would keep
-    overlapping = {
-        frozenset((pair.image0.path, pair.image1.path)): f"{pair.family}/{pair.scene}" for own in sets for pair in own
-    }
+    true = [pair for own in sets for pair in own]
+    overlapping = {frozenset((p.image0.path, p.image1.path)): f"{p.family}/{p.scene}" for p in true}
     pipeline = pipeline_of(arguments.pipeline)
     kind = descriptor_kind((presets.pipeline_stages(arguments.pipeline) or {})["features"])
     book = codebook(kind) if arguments.codebook is None else load_codebook(arguments.codebook)

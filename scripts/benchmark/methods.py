@@ -25,15 +25,12 @@ from fmtorch.geometry import refine
 from fmtorch.pipeline.pipeline import Outcome, Pipeline, build_pipeline, load_pipeline
 from fmtorch.presets.composition import PIPELINES, compose
 from scripts.benchmark import changes
-from scripts.benchmark.runner import Method, identity
+from scripts.benchmark.runner import Method, Stages, identity
 
 TRUTH, NGRANSAC, FIND = "truth", "ngransac", "find_fundamental"
-FIND_STAGES = [
-    ("estimator", "fmtorch", {}),
-    ("pruner", "frame_consistency", {}),
-    ("pruner", "position_consistency", {}),
-]
-VIEWS = {"part": changes.part, "bent": changes.bent}
+FIND_STAGES: Stages = [("estimator", "fmtorch", {})]
+FIND_STAGES += [("pruner", name, {}) for name in ("frame_consistency", "position_consistency")]
+VIEWS: dict[str, Callable[..., Any]] = {"part": changes.part, "bent": changes.bent}
 SHARED = frozenset(("ratio", "one_to_one"))  # pruners that nearly all pipelines have, whose time does not count
 NO_STAGES: Mapping[str, Pruner] = {}
 
@@ -81,7 +78,7 @@ def estimate_by_call(options: Mapping[str, Any], c: Correspondences, seed: int) 
     options: its arguments, which replace these.
     """
     names = ("mask", "ratio", "prior", "noise", "size0", "size1", "key")
-    given = {name: getattr(c, name) for name in names} | {"seed": seed} | options
+    given: dict[str, Any] = {**{name: getattr(c, name) for name in names}, "seed": seed, **options}
     return fmtorch.find_fundamental(c.x0, c.x1, **given)
 
 

@@ -61,12 +61,13 @@ def run(arguments: argparse.Namespace) -> None:
 
 def methods_of(specs: Sequence[str]) -> list[Method]:
     """The estimators; those in brackets are measured under conditions alone."""
+    every = [method(spec.strip("()")) for spec in specs]
+    bracketed = {each.name for each, spec in zip(every, specs, strict=True) if spec.startswith("(")}
+    return [dataclasses.replace(each, takes=_conditioned) if each.name in bracketed else each for each in every]
 
-    def conditioned(item: Item) -> bool:
-        return bool(item.facts["sweep"] == CONDITIONED)
 
-    limited = {True: {"takes": conditioned}, False: {}}
-    return [dataclasses.replace(method(spec.strip("()")), **limited[spec.startswith("(")]) for spec in specs]
+def _conditioned(item: Item) -> bool:
+    return bool(item.facts["sweep"] == CONDITIONED)
 
 
 def items_of(arguments: argparse.Namespace) -> Iterator[Item]:

@@ -147,7 +147,7 @@ def _options(mapper: str, refined: bool, seed: int) -> Any:
 
     own: dict[str, Any] = {"min_model_size": MIN_MODEL, "num_threads": 1, "random_seed": seed}
     if mapper == "global":
-        options = pycolmap.GlobalPipelineOptions()
+        options: Any = pycolmap.GlobalPipelineOptions()
         steps: dict[str, Any] = {step: {"random_seed": seed} for step in ("global_positioning", "rotation_averaging")}
         if not refined:
             steps["bundle_adjustment"] = {"refine_focal_length": False, "refine_extra_params": False}
@@ -193,7 +193,8 @@ def centre_errors(poses: dict[str, Any], truth: Truth) -> Array:
     here = [i for i, name in enumerate(names) if name in poses]
     if len(here) >= MIN_MODEL:
         centres = np.array([poses[names[i]].inverse().translation for i in here])
-        moved = np.c_[centres, np.ones(len(here))] @ pycolmap.estimate_sim3d(centres, true[here]).matrix().T
+        similarity: Any = pycolmap.estimate_sim3d(centres, true[here])
+        moved = np.c_[centres, np.ones(len(here))] @ similarity.matrix().T
         errors[here] = np.linalg.norm(moved - true[here], axis=1) / size * 100
     return errors
 

@@ -219,7 +219,7 @@ def opened_stores(config: DictConfig) -> list[PatchStore]:
             patches, cutting = config.patches, cutting_of(config, tracks)
             count, seed = 0 if side else patches.scenes, patches.seed + side
             scenes = training_scenes(count, cutting.views.views, seed)
-            build_store(folder, [*chosen, *scenes], cutting, seed, patches.workers)
+            stores.build_store(folder, [*chosen, *scenes], cutting, seed, patches.workers)
         opened.append(PatchStore.open(folder))
     return opened
 
@@ -278,9 +278,8 @@ def main(config: DictConfig) -> None:
             spread = torch.from_numpy(train.patches[:: max(1, len(train.patches) // 20000)].copy())
             network.pixel_mean.copy_(objectives.middle(spread).float().mean(0) / 255)  # type: ignore[operator]
         network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        description: dict[str, Any] = {
-            k: training[k] for k in ("architecture", "network", "loss", "teacher") if k in training
-        }
+        told = ("architecture", "network", "loss", "teacher")
+        description: dict[str, Any] = {key: value for key, value in training.items() if key in told}
         description |= {"validation_data": validation.description, "licences": plain(config.photographs.sources)}
         checkpoint = Path(config.out) / f"{config.name}.pt"
         run = training_of(config, network, train, description, device)
