@@ -350,6 +350,6 @@ def draw(
         axes[0].set_ylabel(labels[1])
         labelled = (zip(*panel.get_legend_handles_labels(), strict=True) for panel in axes)
         handles = {label: handle for pairs in labelled for handle, label in pairs}
-        place = {"loc": "outside lower center", "ncols": 2, "frameon": False, "fontsize": 8}
+        place: dict[str, Any] = {"loc": "outside lower center", "ncols": 2, "frameon": False, "fontsize": 8}
         figure.legend([handles[name] for name in names], names, **place)
         figure.savefig(temporary, format="svg", transparent=True, metadata={"Date": None})
