@@ -60,10 +60,9 @@ class Case:
         words = [byte for name in names for byte in str(name).encode()]
         return np.random.default_rng([self.pair.key % 2**63, *words])
 
-    def sizes(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def sizes(self) -> list[NDArray[np.float64]]:
         """The images' (h, w)."""
-        size0, size1 = map(np.array, sizes_of(self.c))
-        return size0.astype(np.float64), size1.astype(np.float64)
+        return [np.array(size, np.float64) for size in sizes_of(self.c)]
 
 
 def case_of(pair: ImagePair, c: Correspondences) -> Case:
@@ -128,10 +127,10 @@ def inlier_ratio(case: Case, ratio: float) -> Case | None:
     drawn = case.c.ratio[:, torch.from_numpy(rng.choice(wrong, len(added)))]
     more = taken(case.spare, torch.from_numpy(added)).replace(ratio=drawn)
     away = torch.zeros(len(added), dtype=torch.bool)
-    joined = _joined(kept.c, more)
-    return dataclasses.replace(
-        kept, c=joined, right=torch.cat([kept.right, away]), wrong=torch.cat([kept.wrong, ~away])
-    )
+    slots = [name for name in more.per_slot if getattr(more, name) is not None]
+    joined = kept.c.replace(**{name: torch.cat([getattr(kept.c, name), getattr(more, name)], 1) for name in slots})
+    labels = torch.cat([kept.right, away]), torch.cat([kept.wrong, ~away])
+    return Case(kept.pair, joined, *labels, kept.spare)
 
 
 def noise(case: Case, sigma: float) -> Case | None:
@@ -266,12 +265,6 @@ def _placed(c: Correspondences, x0: Tensor, x1: Tensor, scale0: float = 1.0, sca
         if (lafs := getattr(c, name)) is not None:
             frames[name] = torch.cat([scale * lafs[..., :2], x[..., None].to(lafs)], -1)
     return c.replace(x0=x0.to(c.x0), x1=x1.to(c.x1), **frames)
-
-
-def _joined(a: Correspondences, b: Correspondences) -> Correspondences:
-    """The matches of two batches of one."""
-    slots = [name for name in a.per_slot if getattr(a, name) is not None]
-    return a.replace(**{name: torch.cat([getattr(a, name), getattr(b, name)], 1) for name in slots})
 
 
 Change = Callable[[Case], Case | None]

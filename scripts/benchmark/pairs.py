@@ -4,9 +4,8 @@ import argparse
 import dataclasses
 import functools
 import itertools
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import NamedTuple
 from unittest import mock
 
 import numpy as np
@@ -154,15 +153,6 @@ def _tensor(value: np.ndarray) -> torch.Tensor:
     return torch.from_numpy(value.astype(np.float32))[None]
 
 
-class Scene(NamedTuple):
-    """The photographs of one scene, and the names of those that its own surfaces show (rendered scenes)."""
-
-    name: str
-    images: tuple[ImageSource, ...]
-    shows: frozenset[str]
-    drawn: bool
-
-
 def unrelated_pairs(pairs: Sequence[ImagePair], datasets: Sequence[PairDataset], most: int) -> list[ImagePair]:
     """Pairs of the photographs of different scenes, at most so many of each two scenes, chosen by hash.
 
@@ -178,31 +168,25 @@ def unrelated_pairs(pairs: Sequence[ImagePair], datasets: Sequence[PairDataset],
     shown: dict[str, frozenset[str]] = {}
     for dataset in datasets:
         shown |= photographs_shown(dataset) if isinstance(dataset, RenderedPairs) else {}
+    scenes: dict[tuple[str, str], dict[str, ImageSource]] = {}
+    for pair in sorted(pairs, key=lambda pair: f"{pair.family}/{pair.scene}"):
+        scenes.setdefault((pair.family, pair.scene), {}).update({i.identity: i for i in (pair.image0, pair.image1)})
     chosen = []
-    for a, b in itertools.combinations(sorted(_scenes(pairs, shown), key=lambda scene: scene.name), 2):
-        if a.drawn == b.drawn and not a.shows & b.shows:
-            crossed = sorted((_crossed(a, b, i, j) for i in a.images for j in b.images), key=lambda pair: pair.key)
-            chosen += crossed[:most]
+    for a, b in itertools.combinations(scenes, 2):
+        drawn = a[1] in shown
+        if drawn == (b[1] in shown) and not (drawn and shown[a[1]] & shown[b[1]]):
+            both = itertools.product(scenes[a].values(), scenes[b].values())
+            crossed = [_crossed("/".join(a), "/".join(b), drawn, *images) for images in both]
+            chosen += sorted(crossed, key=lambda pair: pair.key)[:most]
     return chosen
 
 
-def _crossed(a: Scene, b: Scene, image0: ImageSource, image1: ImageSource) -> ImagePair:
-    family = f"{UNRELATED}, {'rendered' if a.drawn else 'real'}"
-    identity = f"{a.name}/{image0.identity} | {b.name}/{image1.identity}"
+def _crossed(a: str, b: str, drawn: bool, image0: ImageSource, image1: ImageSource) -> ImagePair:
+    family = f"{UNRELATED}, {'rendered' if drawn else 'real'}"
+    identity = f"{a}/{image0.identity} | {b}/{image1.identity}"
     if pair_key(identity) % 2:  # either scene comes first in half of the pairs
         image0, image1 = image1, image0
-    return ImagePair(identity, family, f"{a.name} | {b.name}", image0, image1, np.zeros((3, 3)))
-
-
-def _scenes(pairs: Sequence[ImagePair], shown: Mapping[str, frozenset[str]]) -> list[Scene]:
-    """The scenes of these pairs; shown: what each rendered scene shows, by its name."""
-    images: dict[tuple[str, str], dict[str, ImageSource]] = {}
-    for pair in pairs:
-        images.setdefault((pair.family, pair.scene), {}).update({i.identity: i for i in (pair.image0, pair.image1)})
-    return [
-        Scene(f"{family}/{scene}", tuple(of[key] for key in sorted(of)), shown.get(scene, frozenset()), scene in shown)
-        for (family, scene), of in images.items()
-    ]
+    return ImagePair(identity, family, f"{a} | {b}", image0, image1, np.zeros((3, 3)))
 
 
 def photographs_shown(dataset: RenderedPairs) -> dict[str, frozenset[str]]:

@@ -35,7 +35,7 @@ from fmtorch.two_view.pair_type import classify
 from scripts.benchmark import pairs
 from scripts.benchmark.methods import options
 from scripts.benchmark.photographs import Array, Plane, add_options, kinds, mapped, paths_of, points, views, warped
-from scripts.benchmark.runner import Item, Kept, Measured, Row, add_command, console, measure, milliseconds
+from scripts.benchmark.runner import Item, Kept, Measured, Row, add_command, console, measure
 from scripts.benchmark.tables import Record, Results, Sheet, show
 
 POSES = ("from F", "from H, the first pose", "from H, the better one")
@@ -194,7 +194,7 @@ def kinds_sheet(items: Sequence[Item], verdicts: dict[str, list[str]]) -> Sheet:
     for name, said in verdicts.items():
         groups: dict[tuple[str, str], list[str]] = {}
         for item, kind in zip(items, said, strict=True):
-            scene = f"/{item.pair.scene}" if item.images else ""
+            scene = "" if isinstance(item, Plane) else f"/{item.pair.scene}"
             groups.setdefault((item.pair.family + scene, item.facts["truth"]), []).append(kind)
         for (group, truth), own in groups.items():
             line: Record = {"method": name, "pairs of": group, "truth": truth, "pairs": len(own)}
@@ -240,5 +240,9 @@ def time_line(matches: Sequence[Correspondences]) -> str:
     estimator = presets.build("estimator", "fmtorch")
     estimate = estimator(c, 0)
     classify(c, estimate)
-    ms = [milliseconds(call) / len(c) for call in (lambda: estimator(c, 0), lambda: classify(c, estimate))]
+    times = [time.process_time()]
+    for call in (lambda: estimator(c, 0), lambda: classify(c, estimate)):
+        call()
+        times.append(time.process_time())
+    ms = 1e3 * np.diff(times) / len(c)
     return f"{len(c)} pairs, median {int(c.count().median())} matches: F {ms[0]:.2f} ms, kinds {ms[1]:.2f} ms"

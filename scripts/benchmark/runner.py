@@ -73,18 +73,13 @@ class Kept:
         if path is not None and path.exists():
             content = path.read_bytes()
             whole = content[: content.rfind(b"\n") + 1]
-            self.rows = [self._row(number, line) for number, line in enumerate(whole.splitlines(), 1)]
+            for number, line in enumerate(whole.splitlines(), 1):
+                try:
+                    self.rows.append(dict(json.loads(line)))
+                except (ValueError, TypeError):
+                    raise SystemExit(f"{path}, line {number}: no row of a benchmark; name another file") from None
             with path.open("r+b") as file:
                 file.truncate(len(whole))
-
-    def _row(self, number: int, line: bytes) -> Row:
-        try:
-            row = json.loads(line)
-        except ValueError:
-            row = None
-        if not isinstance(row, dict):
-            raise SystemExit(f"{self.path}, line {number}: no row of a benchmark; name another file")
-        return row
 
     def add(self, rows: Sequence[Row]) -> None:
         """Keep some rows, together: an interruption loses all of them or none."""
@@ -116,6 +111,10 @@ def identity(stages: Stages, *others: Any) -> str:
     return identity_digest(made_with)[:DIGITS]
 
 
+def no_images() -> PairImages:
+    raise ValueError("there are no images, which a stage looks at")
+
+
 @dataclasses.dataclass
 class Item:
     """A pair with its matches, which are made when a method first asks for them.
@@ -126,7 +125,7 @@ class Item:
     pair: ImagePair
     make: Callable[[], Outcome | None]
     facts: Row = dataclasses.field(default_factory=dict)
-    images: Callable[[], PairImages] | None = None
+    images: Callable[[], PairImages] = no_images
 
     @functools.cached_property
     def outcome(self) -> Outcome | None:
@@ -184,7 +183,7 @@ class Method(Measured):
         c, pruning = matched.correspondences, 0.0
         for name, stage in self.stages(item.pair.family).items():
             start = time.process_time()
-            c = pruned(stage, c, lambda _: _images(item))
+            c = pruned(stage, c, lambda _: item.images())
             c = c if bool(c.mask.all()) else c.compact()
             pruning += (time.process_time() - start) * (name not in self.untimed)
         start = time.process_time()
@@ -193,12 +192,6 @@ class Method(Measured):
         sized = c.replace(size0=matched.correspondences.size0, size1=matched.correspondences.size1)
         outcome = dataclasses.replace(matched, correspondences=sized, estimate=estimate, reason=estimate.reason[0])
         return {**judged(outcome, seed), "ms": 1e3 * (pruning + estimation), "ms_pruning": 1e3 * pruning}
-
-
-def _images(item: Item) -> PairImages:
-    if item.images is None:
-        raise ValueError(f"{item.pair.identity}: there are no images, which a stage looks at")
-    return item.images()
 
 
 def judged(outcome: Outcome, seed: int, signed: bool = False) -> Row:
@@ -230,8 +223,8 @@ def measure(
             for method in methods:
                 if not method.applies(item):
                     continue
-                about = {"pair": item.pair.identity, **item.facts, "seed": seed, "method": method.name,
-                         "identity": method.identity}  # fmt: skip
+                about = {"pair": item.pair.identity, **item.facts, "seed": seed}
+                about |= {"method": method.name, "identity": method.identity}
                 row = known.get(tuple(about.get(field) for field in WHICH))
                 if row is None:
                     if item.outcome is None:
@@ -245,13 +238,6 @@ def measure(
                 rows.append(row)
             kept.add(new)
     return rows
-
-
-def milliseconds(call: Callable[[], Any]) -> float:
-    """Of processor time."""
-    start = time.process_time()
-    call()
-    return 1e3 * (time.process_time() - start)
 
 
 def peak_growth(call: Callable[[], Any]) -> float:
@@ -275,5 +261,4 @@ def peak_growth(call: Callable[[], Any]) -> float:
 
 def _resident(field: str) -> int:
     """kB; of the process itself, whereas ru_maxrss is inherited."""
-    lines = (PROC / "status").read_text().splitlines()
-    return next(int(line.split()[1]) for line in lines if line.startswith(field))
+    return next(int(line.split()[1]) for line in (PROC / "status").open() if line.startswith(field))

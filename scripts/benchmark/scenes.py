@@ -87,8 +87,8 @@ def database_of(scene: Scene, features: str, cameras: str, work: Path) -> Path:
     return begun.rename(path)
 
 
-def match(scene: Scene, path: Path, verified: bool, cameras: Truth | None = None) -> None:
-    """COLMAP's SIFT of a scene's images and its matches of all pairs, in a new database."""
+def match(scene: Scene, path: Path, verified: bool) -> None:
+    """COLMAP's SIFT of a scene and its matches of all pairs, in a new database; verified: by the true cameras."""
     import pycolmap
 
     extraction = pycolmap.FeatureExtractionOptions(num_threads=1)
@@ -96,8 +96,8 @@ def match(scene: Scene, path: Path, verified: bool, cameras: Truth | None = None
     mode = pycolmap.CameraMode.SINGLE if scene.single else pycolmap.CameraMode.PER_IMAGE
     cpu = pycolmap.Device.cpu
     pycolmap.extract_features(path, scene.images, camera_mode=mode, extraction_options=extraction, device=cpu)
-    if cameras is not None:
-        calibrate(path, cameras)
+    if verified:
+        calibrate(path, scene.truth)
     matching = pycolmap.FeatureMatchingOptions(num_threads=1, skip_geometric_verification=not verified)
     pycolmap.match_exhaustive(path, matching_options=matching, device=cpu)
 
@@ -129,33 +129,29 @@ def calibrate(path: Path, truth: Truth) -> None:
 
 
 def run_known_models(arguments: argparse.Namespace) -> None:
-    for path in (file.parent for root in arguments.root for file in sorted(root.glob("*/Camera.txt"))):
-        target = arguments.folder / path.name
-        if not target.is_dir():
-            points, observations = triangulate(read_scene(path), target)
-            print(f"{target}: {points} points, {observations:.0f} seen in an image")
-
-
-def triangulate(scene: Scene, target: Path) -> tuple[int, float]:
-    """Write the model of a scene; returns the number of points and how many an image sees on average."""
     import pycolmap
 
-    target.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=target.parent) as temporary:
-        folder = Path(temporary) / "scene"
-        sparse, database = folder / "sparse", Path(temporary) / "database.db"
-        sparse.mkdir(parents=True)
-        match(scene, database, verified=True, cameras=scene.truth)
-        options = pycolmap.IncrementalPipelineOptions(num_threads=1, random_seed=0, extract_colors=False)
-        model = pycolmap.triangulate_points(
-            posed(scene, database), database, scene.images, sparse, refine_intrinsics=False, options=options
-        )
-        for file in sparse.iterdir():
-            file.unlink()
-        model.write_text(sparse)
-        shutil.copytree(scene.images, folder / "images")
-        folder.rename(target)
-    return model.num_points3D(), model.compute_mean_observations_per_reg_image()
+    options = pycolmap.IncrementalPipelineOptions(num_threads=1, random_seed=0, extract_colors=False)
+    for path in (file.parent for root in arguments.root for file in sorted(root.glob("*/Camera.txt"))):
+        target, scene = arguments.folder / path.name, read_scene(path)
+        if target.is_dir():
+            continue
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=target.parent) as temporary:
+            folder, database = Path(temporary) / "scene", Path(temporary) / "database.db"
+            sparse = folder / "sparse"
+            sparse.mkdir(parents=True)
+            match(scene, database, verified=True)
+            model = pycolmap.triangulate_points(
+                posed(scene, database), database, scene.images, sparse, refine_intrinsics=False, options=options
+            )
+            for file in sparse.iterdir():
+                file.unlink()
+            model.write_text(sparse)
+            shutil.copytree(scene.images, folder / "images")
+            folder.rename(target)
+        seen = model.compute_mean_observations_per_reg_image()
+        print(f"{target}: {model.num_points3D()} points, {seen:.0f} seen in an image")
 
 
 def posed(scene: Scene, database: Path) -> Any:

@@ -93,9 +93,8 @@ def _training(checkpoint: Mapping[str, Any]) -> dict[str, str]:
 
 def _quality(rows: Mapping[str, Mapping[str, float]], checkpoint: Mapping[str, Any]) -> list[str]:
     """A table of the figures on held-out patches; figures of circular shapes get a row of their own."""
-    table: dict[str, Mapping[str, float]] = {}
-    for name, row in rows.items():
-        table[name] = row
+    table = dict(rows)
+    for row in rows.values():
         if circle := {k.removeprefix("circle_"): v for k, v in row.items() if k.startswith("circle_")}:
             table["circles instead of shapes"] = circle
     if not table:

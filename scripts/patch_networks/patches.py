@@ -186,11 +186,11 @@ def random_homography(rng: np.random.Generator, size: tuple[int, int], warps: Wa
     # The tilt shrinks one direction by its full amount, as a turned plane is foreshortened.
     H[:2, :2] = _rotation(math.radians(turn) + axis) @ np.diag([scale, scale / tilt]) @ _rotation(-axis)
     H[2, :2] = rng.uniform(-warps.perspective, warps.perspective, 2) / np.array([w, h])
-    H = H @ _translation(-(w - 1) / 2, -(h - 1) / 2)
+    H[:, 2] -= H[:, :2] @ np.array([w - 1, h - 1]) / 2
     corners = apply(H, np.array([[0, 0], [w - 1, 0], [0, h - 1], [w - 1, h - 1]], np.float64))
     low, high = corners.min(0), corners.max(0)
     shrink = min(1.0, warps.longest_side / (high - low).max())
-    H = np.diag([shrink, shrink, 1.0]) @ _translation(-low[0], -low[1]) @ H
+    H = np.array([[shrink, 0, -shrink * low[0]], [0, shrink, -shrink * low[1]], [0, 0, 1.0]]) @ H
     out_w, out_h = np.maximum(np.round((high - low) * shrink), 32).astype(int)
     return H, (int(out_h), int(out_w))
 
@@ -203,10 +203,6 @@ def apply(H: Matrix, points: Matrix) -> Matrix:
 
 def _rotation(angle: float) -> Matrix:
     return np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
-
-
-def _translation(x: float, y: float) -> Matrix:
-    return np.array([[1, 0, x], [0, 1, y], [0, 0, 1.0]])
 
 
 def training_scenes(count: int, views: int, seed: int) -> list[Task]:
