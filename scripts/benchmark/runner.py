@@ -1,10 +1,8 @@
-"""What every benchmark shares: rows that are kept as they are made, methods that take turns, time and memory."""
+"""What every benchmark shares: rows that are kept as they are made, methods that take turns and time."""
 
 import argparse
-import ctypes
 import dataclasses
 import functools
-import gc
 import json
 import math
 import time
@@ -39,7 +37,6 @@ KEPT = (
     "significance", "rotation_error", "translation_error",
 )  # fmt: skip
 NEAR = 2.0  # px from the true epipolar line: matches whose exactness is looked at
-PROC = Path("/proc/self")
 ROWS = "keeps what each method makes of each pair, one line each; shown where no data set is named"
 
 
@@ -238,27 +235,3 @@ def measure(
                 rows.append(row)
             kept.add(new)
     return rows
-
-
-def peak_growth(call: Callable[[], Any]) -> float:
-    """MiB, the peak of the resident set during a call beyond what was resident before it.
-
-    What the process claimed before, as for compiled kernels, does not hide it. Raises SystemExit where the kernel does
-    not tell peaks anew, as anywhere but on Linux.
-    """
-    gc.collect()
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # what was freed is given back, or the call would use it
-    if trim is not None:
-        trim(0)
-    try:
-        (PROC / "clear_refs").write_text("5")  # the peak is counted from here
-        before = _resident("VmRSS")
-        call()
-        return (_resident("VmHWM") - before) / 1024
-    except OSError as error:
-        raise SystemExit(f"peaks of memory can be measured on Linux alone ({error})") from None
-
-
-def _resident(field: str) -> int:
-    """kB; of the process itself, whereas ru_maxrss is inherited."""
-    return next(int(line.split()[1]) for line in (PROC / "status").open() if line.startswith(field))
