@@ -71,20 +71,17 @@ def dump(pairs: Path, out: Path, presets_: list[str], quick: bool) -> None:
         unfitted = {"fine": {"final": "none"}} if "fine" in config else {"final": "none"} if "final" in config else None
         for label, c in batches.items():
             for seed in range(1 if quick else 3):
-                what = f"{name} | {label} | seed {seed} |"
-                arrays |= fields_of(what, estimator(c, seed))
+                estimate = estimator(c, seed)
+                reasons = bytearray("\n".join(estimate.reason).encode() + b"\n")
+                values = {f: getattr(estimate, f) for f in ("F", "inliers", "ok", "samples")}
+                values["reasons"] = torch.frombuffer(reasons, dtype=torch.uint8).clone()
+                arrays |= {f"{name} | {label} | seed {seed} | {f}": value for f, value in values.items()}
             if label == "scenes":
                 arrays |= gradients(f"{name} | {label} |", estimator, c)
                 if unfitted is not None:
                     plain = presets.build("estimator", name, **unfitted)(c, 0)
                     arrays[f"{name} | {label} | before the final fit"] = plain.F
     torch.save(arrays, out)
-
-
-def fields_of(what: str, estimate: Any) -> dict[str, torch.Tensor]:
-    reasons = torch.frombuffer(bytearray("\n".join(estimate.reason).encode() + b"\n"), dtype=torch.uint8).clone()
-    values = {f: getattr(estimate, f) for f in ("F", "inliers", "ok", "samples")}
-    return {f"{what} {f}": v for f, v in {**values, "reasons": reasons}.items()}
 
 
 def gradients(what: str, estimator: Any, c: Any) -> dict[str, torch.Tensor]:

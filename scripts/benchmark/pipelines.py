@@ -65,7 +65,8 @@ def add_pipeline_options(parser: argparse.ArgumentParser) -> None:
 def run(settings: Settings, arguments: argparse.Namespace) -> None:
     def measured_rows(kept: Kept) -> list[Row]:
         every = pairs.pairs_of(arguments)
-        rows = judged_by_rule(every, kept) if settings.get("rule") else []
+        bare = [Item(pair, functools.partial(Outcome, pair)) for pair in every]
+        rows = measure([Rule()], bare, 1, kept, RULE) if settings.get("rule") else []
         return rows + measured(settings["methods"], every, arguments, kept)
 
     rows = pairs.rows_of(arguments, measured_rows)
@@ -116,11 +117,6 @@ class Rule(Measured):
     def figures(self, item: Item, seed: int) -> Row:
         a, b = (self._keypoints(image) for image in (item.pair.image0, item.pair.image1))
         return {"selected": bool(matchable(a, b, item.pair.F))}
-
-
-def judged_by_rule(every: Sequence[ImagePair], kept: Kept) -> list[Row]:
-    """A row for each pair that says whether the paper's rule selects it."""
-    return measure([Rule()], [Item(pair, functools.partial(Outcome, pair)) for pair in every], 1, kept, RULE)
 
 
 def figures_sheet(results: Results, settings: Settings, selected: set[str]) -> Sheet:

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fmtorch.core.types import RELATED
 from fmtorch.evaluation.statistics import share_interval
@@ -145,19 +144,14 @@ def percent(values: Sequence[bool]) -> str:
     return f"{100 * np.mean(values):.2f}" if values else ""
 
 
-def roc(rows: Sequence[Row], figure: Callable[[Row], float]) -> tuple[NDArray[np.float64], ...]:
-    """Shares of unrelated pairs accepted and of right ones rejected at every level of a figure, and the levels."""
-    unrelated, good = (np.array([figure(row) for row in part], dtype=np.float64) for part in split(rows))
-    levels = np.append(np.unique(np.concatenate([unrelated, good])), np.inf)
-    return (unrelated >= levels[:, None]).mean(1), (good < levels[:, None]).mean(1), levels
-
-
 def draw(rows: Rows, path: Path) -> None:
     """The ROC curves: a panel for each way to judge pairs, a line for each pipeline, a dot at the verdict's level."""
     panels: dict[str, dict[str, tables.Line]] = {"by significance": {}, "by the number of inliers": {}}
     for name, own in ((name, own) for name, own in rows.items() if all(split(own))):
         for figure, lines in zip((significance, inliers), panels.values(), strict=True):
-            accepted, rejected, levels = roc(own, figure)
+            unrelated, good = (np.array([figure(row) for row in part], np.float64) for part in split(own))
+            levels = np.append(np.unique(np.concatenate([unrelated, good])), np.inf)
+            accepted, rejected = (unrelated >= levels[:, None]).mean(1), (good < levels[:, None]).mean(1)
             perfect = " (along the axes)" if ((accepted == 0) & (rejected == 0)).any() else ""
             dot = int(np.searchsorted(levels, RELATED)) if figure is significance else None
             lines[name + perfect] = tables.Line((100 * accepted).tolist(), (100 * rejected).tolist(), dot)
