@@ -58,7 +58,6 @@ def inputs(quick: bool) -> dict[str, dict[str, torch.Tensor]]:
 
 
 def dump(pairs: Path, out: Path, presets_: list[str], quick: bool) -> None:
-    """What this process's fmtorch computes of the pairs."""
     from fmtorch import Correspondences, presets
 
     torch.set_num_threads(1)
@@ -132,7 +131,6 @@ def geometry() -> dict[str, torch.Tensor]:
 
 
 def computed(source: Path, folder: Path, out: Path, arguments: argparse.Namespace) -> dict[str, torch.Tensor]:
-    """The results of a checkout on the pairs of a folder."""
     command = [sys.executable, str(Path(__file__).resolve()), "--dump", str(folder / "pairs.pt"), str(out), "--presets"]
     command += [*arguments.presets, *(["--quick"] if arguments.quick else [])]
     environment = {**os.environ, "PYTHONPATH": str(source.resolve()), "OMP_NUM_THREADS": "1"}
@@ -150,7 +148,6 @@ def same(a: torch.Tensor, b: torch.Tensor) -> bool:
 
 
 def differences(before: dict[str, torch.Tensor], after: dict[str, torch.Tensor]) -> list[str]:
-    """What differs, in words."""
     lines = []
     for name in sorted(before.keys() | after.keys()):
         if name not in before or name not in after:

@@ -157,7 +157,6 @@ def fetch_dataset(config: DictConfig) -> list[Path]:
 
 
 def fetch(config: DictConfig) -> Path:
-    """The file that a config asks for."""
     if config.weights not in WEIGHTS:
         raise ValueError(f"weights={config.weights}; there are: {', '.join(WEIGHTS)}")
     entry = WEIGHTS[config.weights]

@@ -59,7 +59,6 @@ def save(path: Path, picture: Picture, quality: int) -> None:
 
 
 def gallery(folder: Path) -> None:
-    """The pictures of the gallery."""
     pipeline, peer = load_pipeline(PIPELINE), presets.build("estimator", PEER[0], **PEER[1])
     pairs = list(data.load("rendered", families=["orbit", "collection"]))
     rows = []

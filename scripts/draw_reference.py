@@ -60,7 +60,6 @@ def rows(options: Any, prefix: str = "") -> Iterator[str]:
 
 
 def head(page: str) -> str:
-    """What a page says before its first section."""
     return (PAGES / page).read_text(encoding="utf-8").partition("\n## ")[0]
 
 

@@ -50,7 +50,6 @@ NGRANSAC_LAYERS = {"s0": "linear0", "s1": "norm0", "s2": "linear1", "s3": "norm1
 
 
 def images(arguments: argparse.Namespace) -> Iterator[NDArray[np.uint8]]:
-    """The photographs to learn from."""
     for name in PICTURES["train"]:
         yield photograph(name)
     if arguments.photos is not None:
@@ -85,7 +84,6 @@ def codebooks(arguments: argparse.Namespace) -> None:
 
 
 def learned(parts: list[Tensor], centers: int, dimensions: int) -> Codebook:
-    """The codebook of these local descriptors."""
     descriptors = torch.cat(parts)
     mean, basis = learn_projection(descriptors, dimensions)
     return Codebook(mean, basis, k_means((descriptors - mean) @ basis, centers))

@@ -77,7 +77,6 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def has_cameras(pair: ImagePair) -> bool:
-    """Whether the cameras of a pair are known."""
     return all(value is not None for value in (pair.K0, pair.K1, pair.R, pair.t))
 
 
@@ -185,7 +184,6 @@ def _solver(name: str, level: str, changed: dict[str, Any]) -> tuple[Solve, Stag
 
 
 def _with_cameras(estimator: Any, c: Correspondences, seed: int) -> Estimate:
-    """By an estimator that takes cameras."""
     return KnownCameras(estimator)(c, seed).detach()
 
 
@@ -280,7 +278,6 @@ def _by_essential(kind: str, changed: dict[str, Any]) -> PairwiseEstimator:
 
 
 def sheet(rows: Sequence[Row]) -> Sheet:
-    """Each level's methods on each set, and what our own method of the level, or else the first of it, has more."""
     records: list[Record] = []
     columns = [*(f"pose@{t}" for t in (5, 10, 20)), "R.01", "AUC@0.05", "flipped, %"]
     columns += [*(f"focal within {p} %, %" for p in (5, 10)), "ms", "time ratio"]

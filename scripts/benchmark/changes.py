@@ -61,7 +61,6 @@ class Case:
         return np.random.default_rng([self.pair.key % 2**63, *words])
 
     def sizes(self) -> list[NDArray[np.float64]]:
-        """The images' (h, w)."""
         return [np.array(size, np.float64) for size in sizes_of(self.c)]
 
 

@@ -75,7 +75,6 @@ class Clock:
 
 
 def medians(seconds: list[Seconds]) -> Record:
-    """Of each stage and of their sum, in milliseconds."""
     totals = [{**each, "all": sum(each.values())} for each in seconds]
     return {f"{stage}, ms": f"{1e3 * np.median([each[stage] for each in totals]):.1f}" for stage in totals[0]}
 

@@ -83,7 +83,6 @@ def estimate_by_call(options: Mapping[str, Any], c: Correspondences, seed: int) 
 
 
 def stages_of(spec: str) -> list[str]:
-    """The words after ``@``."""
     return [stage for stage in spec.partition("@")[2].split("+") if stage]
 
 
@@ -104,7 +103,6 @@ def method(spec: str, matches: str = "", extra: Mapping[str, Pruner] = NO_STAGES
 
 
 def viewed(views: Sequence[Callable[..., Any]], outcome: Outcome) -> Outcome:
-    """A pair and its matches after changes to both."""
     pair, c = outcome.pair, outcome.correspondences
     if c is None or not views:
         return outcome

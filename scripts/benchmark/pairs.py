@@ -29,7 +29,6 @@ UNRELATED = "unrelated"  # what the names of families of pairs of different scen
 
 
 def add_set_options(parser: argparse.ArgumentParser, limit: int | None = None) -> None:
-    """The options that say which pairs."""
     parser.add_argument("--root", action="append", default=[], help="a set in the FM-Bench layout; may be repeated")
     parser.add_argument("--rendered", choices=["small", "full"], help="also the embedded data set, of this size")
     parser.add_argument("--split", default="test", help="of --rendered: test or train; a --root has no splits")
@@ -58,7 +57,6 @@ def pairs_of(arguments: argparse.Namespace) -> list[ImagePair]:
 
 
 def named(arguments: argparse.Namespace) -> bool:
-    """Whether the options name a data set."""
     return bool(arguments.root or arguments.rendered)
 
 
@@ -91,7 +89,6 @@ def matched(arguments: argparse.Namespace) -> list[Item]:
 
 
 def items(pairs: Iterable[ImagePair], front: Pipeline) -> list[Item]:
-    """The pairs with the matches of a pipeline's first stages."""
     return [Item(p, functools.partial(_match, front, p), images=functools.partial(front.images, p)) for p in pairs]
 
 

@@ -37,7 +37,6 @@ Settings = Mapping[str, Any]
 
 
 def settings_of(name: str) -> dict[str, Any]:
-    """The page of settings of a benchmark."""
     settings: dict[str, Any] = yaml.safe_load((FOLDER / f"{name}.yaml").read_text(encoding="utf-8"))
     return settings
 
@@ -54,7 +53,6 @@ def add_arguments(commands: Any) -> None:
 
 
 def add_pipeline_options(parser: argparse.ArgumentParser) -> None:
-    """Which pipelines, with which options."""
     names = "names or patterns of the settings, or NAME = WORDS"
     parser.add_argument("--pipelines", nargs="*", default=["*"], help=names)
     parser.add_argument("--overrides", nargs="*", default=[], help="of each pipeline, e.g. features.precision=int8")

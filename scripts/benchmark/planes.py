@@ -132,7 +132,6 @@ class Homography(Measured):
 
 
 def estimated(c: Correspondences, seed: int = 0, **changed: Any) -> Estimate:
-    """Our homography of a pair."""
     given: dict[str, Any] = {name: getattr(c, name) for name in ("mask", "ratio", "prior", "noise", "key")}
     return find_homography(c.x0, c.x1, seed=seed, **given, **changed)
 
@@ -271,7 +270,6 @@ def paths_of(arguments: argparse.Namespace) -> list[Path]:
 
 
 def item_of(kind: str, path: Path, seed: int, c: Correspondences, points: Array | None = None, **known: Any) -> Plane:
-    """A pair that is made of a photograph, with its matches."""
     image = ImageSource(path.name, path)
     pair = ImagePair(f"{kind}/{path.name}/{seed}", kind, path.stem, image, image, np.zeros((3, 3)), **known)
     outcome = Outcome(pair, (c.mask.shape[1],) * 2, c)
@@ -419,13 +417,11 @@ def small(path: Path) -> Array:
 
 
 def matched(image0: Array, image1: Array) -> Correspondences:
-    """Matches of two images, BGR."""
     images = [np.ascontiguousarray(image[..., ::-1]) for image in (image0, image1)]
     return match(images[0], images[1], pipeline="sift_fmtorch").correspondences
 
 
 def mapped(H: Array, x: Array) -> Array:
-    """Points (n, 2) by a homography."""
     y = np.c_[x, np.ones(len(x))] @ H.T
     return np.asarray(y[:, :2] / y[:, 2:])
 

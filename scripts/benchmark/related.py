@@ -52,12 +52,10 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def true(row: Row) -> bool:
-    """Whether the photographs are of one scene."""
     return not row["family"].startswith(pairs.UNRELATED)
 
 
 def right(row: Row) -> bool:
-    """Whether the estimate of a related pair is right."""
     return true(row) and bool(row["nsgd"] < RIGHT)
 
 
@@ -72,7 +70,6 @@ def inliers(row: Row) -> float:
 
 
 def called_related(row: Row) -> bool:
-    """The verdict."""
     return significance(row) >= RELATED
 
 
@@ -85,7 +82,6 @@ RULES: dict[str, Callable[[Row], bool]] = {
 
 
 def split(rows: Sequence[Row]) -> tuple[list[Row], list[Row]]:
-    """The unrelated pairs, and the related ones whose estimate is right."""
     return [row for row in rows if not true(row)], [row for row in rows if right(row)]
 
 

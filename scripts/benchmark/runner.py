@@ -131,7 +131,6 @@ class Item:
 
     @property
     def matches(self) -> Correspondences:
-        """The matches, a batch of one."""
         assert self.outcome is not None
         assert self.outcome.correspondences is not None
         return self.outcome.correspondences
@@ -144,7 +143,6 @@ class Measured:
     identity: str
 
     def applies(self, item: Item) -> bool:
-        """Whether the method takes such a pair."""
         return True
 
     def figures(self, item: Item, seed: int) -> Row:

@@ -258,7 +258,7 @@ def memory_sheet(rows: Sequence[int]) -> Sheet:
 
 def stored(count: int) -> dict[str, float]:
     """Peaks after imports, storing, finding what is done and the summary; seconds, parts and bytes of storing."""
-    figures: dict[str, float] = {"imports, MB": _peak()}
+    figures: dict[str, float] = {"imports, MB": _peak_mb()}
     with tempfile.TemporaryDirectory() as name:
         folder = RunFolder.open(Path(name) / "run", {"rows": count})
         start = time.perf_counter()
@@ -267,19 +267,18 @@ def stored(count: int) -> dict[str, float]:
             for _ in runner.each(range(i, min(i + BATCH, count)) for i in range(0, count, BATCH)):
                 pass
         seconds = time.perf_counter() - start
-        figures["storing, MB"] = _peak()
+        figures["storing, MB"] = _peak_mb()
         files = list((folder.path / "pairs").iterdir())
         assert len(folder.done()) == count
-        figures["finding what is done, MB"] = _peak()
+        figures["finding what is done, MB"] = _peak_mb()
         summarize(folder.read(without=("pair", "F")))
         size = sum(file.stat().st_size for file in files) / count
         return figures | {
-            "summary, MB": _peak(), "storing, s": seconds, "parts": len(files), "bytes a row on disk": size
+            "summary, MB": _peak_mb(), "storing, s": seconds, "parts": len(files), "bytes a row on disk": size
         }  # fmt: skip
 
 
 def rows_of(nothing: None, numbers: range) -> list[PairRow]:
-    """Rows as of solved pairs."""
     rows = []
     for i in numbers:
         name, F = f"family/scene{i // 1000}/im{i:07d}-im{i + 1:07d}", [0.1234567 * k + 1e-9 * i for k in range(1, 10)]
@@ -289,6 +288,5 @@ def rows_of(nothing: None, numbers: range) -> list[PairRow]:
     return rows
 
 
-def _peak() -> float:
-    """MB."""
+def _peak_mb() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)

@@ -123,7 +123,6 @@ def by_level(rows: Sequence[Row]) -> Iterator[tuple[str, Level, Results]]:
 
 
 def group(family: str) -> str:
-    """What a family's pairs are shown with."""
     return "rendered" if family in FAMILIES else "real, wide" if family in WIDE else "real, short"
 
 

@@ -53,7 +53,6 @@ Record = dict[str, Any]  # a line of a table: what is printed of numbers and nam
 
 
 def span(found: Interval | None, form: str) -> Span | str:
-    """An interval as a cell."""
     return "" if found is None else Span(*(f"{value:{form}}" for value in (found.value, found.low, found.high)))
 
 
@@ -67,7 +66,6 @@ class Sheet:
 
     @property
     def columns(self) -> list[str]:
-        """The columns of all lines."""
         return list(dict.fromkeys(column for record in self.records for column in record))
 
     def markdown(self) -> str:
@@ -263,11 +261,9 @@ class Results:
         return lines
 
     def described(self, pairs: Sequence[str]) -> str:
-        """How many pairs and scenes there are, and what intervals resample."""
         return described(self.scenes(pairs))
 
     def seeds(self, method: str) -> int:
-        """How many seeds a method was measured with."""
         return min(map(len, self._rows[method].values()), default=0)
 
 

@@ -284,7 +284,6 @@ def sheets(rows: Sequence[Row]) -> list[Sheet]:
 
 
 def _grouped(rows: Iterable[Row], *fields: str) -> list[tuple[tuple[Any, ...], list[Row]]]:
-    """The rows by the values of some fields."""
     groups: dict[tuple[Any, ...], list[Row]] = {}
     for row in rows:
         groups.setdefault(tuple(row[field] for field in fields), []).append(row)
@@ -360,7 +359,6 @@ def _match_by_ours(scene: Scene, path: Path, work: Path) -> None:
 
 
 def calibrate(path: Path, truth: Truth) -> None:
-    """Replace the database's cameras by the true ones."""
     import pycolmap
 
     with pycolmap.Database.open(path) as database:

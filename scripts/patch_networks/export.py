@@ -107,7 +107,6 @@ def _quality(rows: Mapping[str, Mapping[str, float]], checkpoint: Mapping[str, A
 
 
 def main() -> None:
-    """The command."""
     with exits_with_message():
         config = OmegaConf.merge(OmegaConf.create(DEFAULTS), OmegaConf.from_cli())
         assert isinstance(config, DictConfig)

@@ -146,7 +146,6 @@ class DescriptorObjective:
     weight: float = 1.0
 
     def loss(self, network: nn.Module, pairs: Float[Tensor, "2 n 1 h w"], draws: Float[Tensor, "n k"]) -> Tensor:
-        """The criterion on both patches of each point, mirrored and turned alike at random."""
         patches = middle(pairs)
         left, up, over = (draws[:, column, None, None, None] < 0.5 for column in range(3))
         patches = torch.where(left, patches.flip(-1), patches)
@@ -161,7 +160,6 @@ class DescriptorObjective:
         return loss
 
     def evaluate(self, network: nn.Module, pairs: Float[Tensor, "2 n 1 h w"]) -> dict[str, float]:
-        """`patch_quality` of the descriptors."""
         return evaluate_descriptor(network, pairs)
 
 

@@ -196,7 +196,6 @@ def random_homography(rng: np.random.Generator, size: tuple[int, int], warps: Wa
 
 
 def apply(H: Matrix, points: Matrix) -> Matrix:
-    """Points (n, 2) under a homography."""
     mapped: Matrix = np.c_[points, np.ones(len(points))] @ H.T
     return mapped[:, :2] / mapped[:, 2:]
 

@@ -81,7 +81,6 @@ class PatchStore:
         return self.pairs(torch.stack([start + first, start + other + (other >= first)]))
 
     def pairs(self, index: Int[Tensor, "2 b"]) -> Float[Tensor, "2 b 1 h w"]:
-        """Patches by their indices, in [0, 1]."""
         return from_numpy(np.asarray(self.patches[index.numpy()])).unsqueeze(2).float() / 255
 
 

@@ -121,7 +121,6 @@ class PatchTraining:
             self.save(checkpoint)
 
     def progress(self) -> float:
-        """The part of the run that is done, 0 to 1."""
         o = self.options
         return self.step / o.steps if o.minutes is None else self.seconds / (60 * o.minutes)
 
@@ -266,7 +265,6 @@ def training_of(
 
 @hydra.main(version_base=None, config_path=str(conf_dir()), config_name="train_patch_network")
 def main(config: DictConfig) -> None:
-    """The command."""
     with exits_with_message("interrupted; resume=true goes on from the last checkpoint"):
         torch.set_num_threads(config.threads)
         device = presets.resolve_device(config.device)
