@@ -66,7 +66,7 @@ def _training(checkpoint: Mapping[str, Any]) -> dict[str, str]:
     o, data, losses = checkpoint["options"], checkpoint["data"], checkpoint["losses"][-100:]
     licences = checkpoint.get("licences", {}) | {"scikit-image": "photographs inside the package, BSD-3-Clause"}
     photographs = (
-        f"{count} of {source}" + f" ({licences[source]})" * (source in licences)
+        f"{count} of {source}" + (f" ({licences[source]})" if source in licences else "")
         for source, count in data["photographs"].items()
     )
     scenes = ", ".join(f"{count} of {family}" for family, count in data.get("scenes", {}).items())
