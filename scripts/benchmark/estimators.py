@@ -85,6 +85,9 @@ def sheet(results: Results) -> Sheet:
     return Sheet("recall", f"{title}; {results.described(results.pairs())}", records)
 
 
+Figures = Mapping[str, tuple[float, float]]  # of estimators, by `area_and_cost`
+
+
 class Curve(NamedTuple):
     """The estimators along a curve, and what is varied between them."""
 
@@ -97,11 +100,12 @@ def run_curves(arguments: argparse.Namespace) -> None:
     curves = read_curves(arguments.curves or read_specs(arguments.specs))
     specs = list(dict.fromkeys(spec for curve in curves for spec in curve.specs))
     results = measured(specs, arguments, {})
-    knees = {curve.name: knee(curve, results) for curve in curves}
+    figures = {spec: area_and_cost(results, spec) for spec in specs}
+    knees = {curve.name: knee({spec: figures[spec] for spec in curve.specs}) for curve in curves}
     if arguments.knees:
         with arguments.knees.open(encoding="utf-8") as file:
             knees |= {line["curve"]: line["estimator"] for line in csv.DictReader(file) if "knee" in line["mark"]}
-    show([curve_sheet(curves, results, knees)], arguments.table)
+    show([curve_sheet(curves, results, figures, knees)], arguments.table)
     if arguments.figure:
         draw_curves(curves, results, knees, arguments.figure)
 
@@ -126,9 +130,8 @@ def area_and_cost(results: Results, spec: str) -> tuple[float, float]:
     return area, float(np.mean([get("ms").mean() for get in own]))
 
 
-def knee(curve: Curve, results: Results) -> str:
-    """The cheapest estimator within KNEE_TOLERANCE of the best AUC@0.05, averaged over the families."""
-    figures = {spec: area_and_cost(results, spec) for spec in curve.specs}
+def knee(figures: Figures) -> str:
+    """The cheapest estimator of a curve within KNEE_TOLERANCE of its best."""
     best = max(area for area, _ in figures.values())
     return min((cost, spec) for spec, (area, cost) in figures.items() if area >= best - KNEE_TOLERANCE)[1]
 
@@ -139,17 +142,17 @@ def _shown(results: Results) -> dict[str, list[str]]:
     return {name: groups[name] for name in BASELINES if name in groups} or {list(groups)[-1]: results.pairs()}
 
 
-def curve_sheet(curves: Sequence[Curve], results: Results, knees: Mapping[str, str]) -> Sheet:
+def curve_sheet(curves: Sequence[Curve], results: Results, figures: Figures, knees: Mapping[str, str]) -> Sheet:
     """A line for each point: time, and recall at 0.05, at 0.01 and AUC@0.05 of wide and of short baselines."""
     records: list[Record] = []
     for curve in curves:
-        area = {spec: area_and_cost(results, spec)[0] for spec in curve.specs}
+        best = max(figures[spec][0] for spec in curve.specs)
         for spec, value in zip(curve.specs, curve.values, strict=True):
-            marks = ["best"] * (area[spec] == max(area.values())) + ["knee"] * (knees.get(curve.name) == spec)
+            marks = ["best"] * (figures[spec][0] == best) + ["knee"] * (knees.get(curve.name) == spec)
             line = {"curve": curve.name, "value": value, "ms": results.cell(spec, results.pairs(), "ms")}
             for group, own in _shown(results).items():
                 line |= {f"{group}: {name}": results.cell(spec, own, name) for name in ("R.05", "R.01", "AUC@0.05")}
-            line |= {"AUC@0.05 of families": f"{area[spec]:.1f}", "mark": " ".join(marks), "estimator": spec}
+            line |= {"AUC@0.05 of families": f"{figures[spec][0]:.1f}", "mark": " ".join(marks), "estimator": spec}
             records.append(line)
     return Sheet("curves", f"Accuracy in % against time: {results.described(results.pairs())}", records)
 
