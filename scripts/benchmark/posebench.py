@@ -26,7 +26,7 @@ import torch
 
 from fmtorch import data, metrics, presets
 from fmtorch.core.types import Correspondences
-from fmtorch.data import DataError, ImagePair
+from fmtorch.data import DataError
 from fmtorch.evaluation.statistics import MIN_UNITS, PERCENT, POSE_THRESHOLDS, difference
 from fmtorch.io import h5
 from fmtorch.pipeline.pipeline import Outcome
@@ -107,19 +107,12 @@ def _files(folder: Path, thresholds: Mapping[str, float], px: float | None) -> I
             raise SystemExit(f"{path.name} is none of PoseBench's sets: give its threshold in pixels, --threshold")
         for path, threshold in given.items():
             dataset = data.load("h5", root=path, layout="posebench")
-            items = [Item(pair, functools.partial(_given, pair), {"threshold": threshold}) for pair in dataset]
+            items = pairs.items(dataset, pairs.front_of("sift", []))  # which takes the matches that a pair comes with
+            for item in items:
+                item.facts["threshold"] = threshold
             yield path.stem, items, dataset.digest
     except DataError as error:
         raise SystemExit(f"{error}; give the folder `relative` of PoseBench's data") from error
-
-
-def _given(pair: ImagePair) -> Outcome:
-    assert pair.matches is not None
-    try:
-        c, counts = pair.matches()
-    except (ValueError, DataError) as error:
-        return Outcome(pair, reason=str(error))
-    return Outcome(pair, counts, c)
 
 
 @dataclasses.dataclass(frozen=True)
