@@ -1,20 +1,14 @@
 """Do two checkouts compute the same estimates, to the bit? Run on one machine, before and after a change.
 
-    python scripts/compare_estimates.py BEFORE [AFTER] [--quick] [--presets ransac fmtorch] [--matches robust.npz]
+    python scripts/compare_estimates.py BEFORE [AFTER] [--quick] [--presets ransac fmtorch]
 
-BEFORE and AFTER are checkouts, or files written with --save; AFTER is this checkout by default. Every estimator preset
-of the project runs on the same pairs in a process of each checkout: synthetic scenes with and without prior, noise,
-image sizes; pairs that are degenerate; and, with --matches, real ones. Compared are F, inliers, ok, reasons, samples,
-the models before the final fit, and gradients, besides public functions of `fmtorch.geometry`. Only public names are
-used, and of those that were renamed (`FORMER`) each checkout is asked by its own.
-Exit status 1 where anything differs.
+BEFORE and AFTER are checkouts; AFTER is this one by default. Every estimator preset of the project runs on the same
+pairs in a process of each checkout: synthetic scenes with and without prior, noise, image sizes, and pairs that are
+degenerate. Compared are F, inliers, ok, reasons, samples, the models before the final fit, and gradients, besides
+public functions of `fmtorch.geometry`. Only public names are used. Exit status 1 where anything differs.
 """
 
-from __future__ import annotations
-
 import argparse
-import dataclasses
-import inspect
 import os
 import subprocess
 import sys
@@ -26,31 +20,11 @@ import numpy as np
 import torch
 
 HERE = Path(__file__).resolve().parents[1]
-OWN = ("Ransac", "HypothesizeAndVerify", "IterativelyReweighted", "CoarseToFine")
-QUICK_MATCHES, MATCHES = 400, 1000  # of a real pair, at most
+OWN = ("Ransac", "IterativelyReweighted", "CoarseToFine")
 FIELDS = ("x0", "x1", "mask", "ratio", "prior", "noise", "size0", "size1", "key", "lafs0", "lafs1")
-FORMER = {"ratio": "quality", "samples": "draws", "loss": "kernel", "model_matrix": "F"}
 
 
-def name_in(names: Any, name: str) -> str:
-    """A name, or the former one where a checkout knows only that."""
-    return FORMER[name] if name in FORMER and name not in names else name
-
-
-def value_of(record: Any, name: str) -> Any:
-    """A member of a record by its name or its former one."""
-    return getattr(record, name_in(dir(record), name))
-
-
-def correspondences(values: dict[str, Any]) -> Any:
-    """The record of these fields."""
-    from fmtorch import Correspondences
-
-    known = {field.name for field in dataclasses.fields(Correspondences)}
-    return Correspondences(**{name_in(known, name): value for name, value in values.items()})
-
-
-def inputs(quick: bool, matches: Path | None) -> dict[str, dict[str, torch.Tensor]]:
+def inputs(quick: bool) -> dict[str, dict[str, torch.Tensor]]:
     """Batches of pairs as plain tensors, by name, so that both checkouts read the same."""
     sys.path.insert(0, str(HERE))
     from fmtorch.core.types import collate
@@ -73,37 +47,21 @@ def inputs(quick: bool, matches: Path | None) -> dict[str, dict[str, torch.Tenso
         batches |= {
             "hard": hard,
             "two sizes, noise, no prior": scenes.replace(size1=other, noise=noise(scenes), prior=None),
-            "no ratio": scenes.replace(**{name_in(dir(scenes), "ratio"): None}),
+            "no ratio": scenes.replace(ratio=None),
         }
     kinds = [*degenerate().values(), *small().values()]
     batches["degenerate"] = collate(kinds[::4] if quick else kinds)
-    if matches is not None:
-        arrays = np.load(matches)
-        names = range(0, len(arrays["names"]), 8 if quick else 1)
-        batches |= {f"real {i}": real(arrays, i, QUICK_MATCHES if quick else MATCHES) for i in names}
     return {
-        name: {f: v.clone() for f in FIELDS if isinstance(v := value_of(c, f), torch.Tensor)}
+        name: {f: v.clone() for f in FIELDS if isinstance(v := getattr(c, f), torch.Tensor)}
         for name, c in batches.items()
     }
 
 
-def real(arrays: Any, i: int, most: int) -> Any:
-    from fmtorch import presets
-
-    x0, x1 = (torch.from_numpy(arrays[f"{i:03d}.{x}"][:most].astype(np.float32))[None] for x in ("X1", "X2"))
-    size0, size1 = (torch.from_numpy(arrays[f"{i:03d}.{s}"].astype(np.int64))[None] for s in ("size1", "size2"))
-    ratio = torch.from_numpy(np.random.default_rng(i).uniform(0.3, 0.95, x0.shape[:2]).astype(np.float32))
-    mask, key = torch.ones(x0.shape[:2], dtype=torch.bool), torch.tensor([i + 1])
-    fields = {"x0": x0, "x1": x1, "mask": mask, "ratio": ratio, "size0": size0, "size1": size1, "key": key}
-    return presets.build("pruner", "position_consistency")(correspondences(fields))
-
-
 def dump(pairs: Path, out: Path, presets_: list[str], quick: bool) -> None:
-    """What this process's fmtorch computes of the pairs."""
-    from fmtorch import presets
+    from fmtorch import Correspondences, presets
 
     torch.set_num_threads(1)
-    batches = {name: correspondences(fields) for name, fields in torch.load(pairs).items()}
+    batches = {name: Correspondences(**fields) for name, fields in torch.load(pairs).items()}
     own = [n for n in presets.available("estimator") if str(presets.load("estimator", n)["_target_"]).endswith(OWN)]
     arrays: dict[str, torch.Tensor] = geometry()
     for name in presets_ or own:
@@ -112,27 +70,24 @@ def dump(pairs: Path, out: Path, presets_: list[str], quick: bool) -> None:
         unfitted = {"fine": {"final": "none"}} if "fine" in config else {"final": "none"} if "final" in config else None
         for label, c in batches.items():
             for seed in range(1 if quick else 3):
-                what = f"{name} | {label} | seed {seed} |"
-                arrays |= fields_of(what, estimator(c, seed))
+                estimate = estimator(c, seed)
+                reasons = bytearray("\n".join(estimate.reason).encode() + b"\n")
+                values = {f: getattr(estimate, f) for f in ("F", "inliers", "ok", "samples")}
+                values["reasons"] = torch.frombuffer(reasons, dtype=torch.uint8).clone()
+                arrays |= {f"{name} | {label} | seed {seed} | {f}": value for f, value in values.items()}
             if label == "scenes":
                 arrays |= gradients(f"{name} | {label} |", estimator, c)
                 if unfitted is not None:
                     plain = presets.build("estimator", name, **unfitted)(c, 0)
-                    arrays[f"{name} | {label} | before the final fit"] = value_of(plain, "model_matrix")
+                    arrays[f"{name} | {label} | before the final fit"] = plain.F
     torch.save(arrays, out)
-
-
-def fields_of(what: str, estimate: Any) -> dict[str, torch.Tensor]:
-    reasons = torch.frombuffer(bytearray("\n".join(estimate.reason).encode() + b"\n"), dtype=torch.uint8).clone()
-    values = {f: value_of(estimate, f) for f in ("model_matrix", "inliers", "ok", "samples")}
-    return {f"{what} {f}": v for f, v in {**values, "reasons": reasons}.items()}
 
 
 def gradients(what: str, estimator: Any, c: Any) -> dict[str, torch.Tensor]:
     asked = {f: getattr(c, f).double().requires_grad_() for f in ("x0", "x1", "prior", "noise")}
     estimate = estimator(c.replace(**asked), 1)
     weights = torch.linspace(-1, 1, 9, dtype=torch.float64).reshape(3, 3)
-    F = value_of(estimate, "model_matrix")
+    F = estimate.F
     if not F.requires_grad:
         return {f"{what} F with gradients": F}
     grads = torch.autograd.grad((F * weights).sum(), list(asked.values()), allow_unused=True)
@@ -150,10 +105,6 @@ def geometry() -> dict[str, torch.Tensor]:
     F0 = torch.randn(5, 2, 3, 3, generator=rng, dtype=torch.float64) * torch.tensor([1e-3, 1e-3, 1.0])
     K = torch.tensor([[700.0, 0, 300], [0, 720, 310], [0, 0, 1]], dtype=torch.float64).expand(5, 3, 3)
     mask = w > 0.1
-
-    def loss(function: Any, kind: str) -> dict[str, str]:
-        return {name_in(inspect.signature(function).parameters, "loss"): kind}
-
     calls = {
         "seven_point": lambda a, b, v: g.seven_point(a[:, :7], b[:, :7])[0],
         "eight_point": lambda a, b, v: g.eight_point(a, b, v, mask)[0],
@@ -162,14 +113,12 @@ def geometry() -> dict[str, torch.Tensor]:
         "calibration": lambda a, b, v: g.fundamental_from_calibration(K, K, K / 700, a[:, 0, :1].expand(5, 3) + 1),
         **{
             f"{name} {kind}": lambda a, b, v, f=f, kind=kind: f(
-                *((F0, a, b) if f is g.refine else (a, b, F0)), v, mask, **loss(f, kind), scale=3.0
+                *((F0, a, b) if f is g.refine else (a, b, F0)), v, mask, loss=kind, scale=3.0
             )
             for name, f in (("refine", g.refine), ("irls", g.irls))
             for kind in ("cauchy", "truncated", "magsac")
         },
-        "attached step": lambda a, b, v: g.attached_step(
-            F0, a, b, v, mask, **loss(g.attached_step, "huber"), scale=3.0
-        ),
+        "attached step": lambda a, b, v: g.attached_step(F0, a, b, v, mask, loss="huber", scale=3.0),
     }
     arrays = {}
     for name, call in calls.items():
@@ -181,36 +130,26 @@ def geometry() -> dict[str, torch.Tensor]:
     return arrays
 
 
-def computed(source: Path, pairs: Path, arguments: argparse.Namespace, folder: Path) -> dict[str, torch.Tensor]:
-    """The results of a checkout, or those of a file."""
-    if source.is_file():
-        loaded: dict[str, torch.Tensor] = torch.load(source)
-        return loaded
-    out = folder / f"{len(list(folder.iterdir()))}.pt"
-    command = [sys.executable, str(Path(__file__).resolve()), "--dump", str(pairs), str(out), "--presets"]
+def computed(source: Path, folder: Path, out: Path, arguments: argparse.Namespace) -> dict[str, torch.Tensor]:
+    command = [sys.executable, str(Path(__file__).resolve()), "--dump", str(folder / "pairs.pt"), str(out), "--presets"]
     command += [*arguments.presets, *(["--quick"] if arguments.quick else [])]
     environment = {**os.environ, "PYTHONPATH": str(source.resolve()), "OMP_NUM_THREADS": "1"}
     subprocess.run(command, check=True, env=environment, cwd=source)
-    loaded = torch.load(out)
-    return loaded
+    results: dict[str, torch.Tensor] = torch.load(out)
+    return results
 
 
 def same(a: torch.Tensor, b: torch.Tensor) -> bool:
     """Bit for bit, any NaN equal to any other."""
     if a.shape != b.shape or a.dtype != b.dtype:
         return False
-    equal = (a == b) | ((a != a) & (b != b))
-    if a.is_floating_point():
-        equal &= (a.signbit() == b.signbit()) | (a != a)
-    return bool(equal.all())
+    signed = (a.signbit() == b.signbit()) if a.is_floating_point() else True
+    return bool((((a == b) & signed) | ((a != a) & (b != b))).all())
 
 
-def differences(before: dict[str, torch.Tensor], after: dict[str, torch.Tensor], presets_: list[str]) -> list[str]:
-    """What differs, in words."""
+def differences(before: dict[str, torch.Tensor], after: dict[str, torch.Tensor]) -> list[str]:
     lines = []
     for name in sorted(before.keys() | after.keys()):
-        if presets_ and name.split(" | ")[0] not in (*presets_, "geometry"):
-            continue
         if name not in before or name not in after:
             lines.append(f"{name}: only {'before' if name in before else 'after'}")
         elif not same(before[name], after[name]):
@@ -226,25 +165,19 @@ def main() -> None:
     parser.add_argument("after", type=Path, nargs="?", default=HERE)
     parser.add_argument("--quick", action="store_true", help="fewer pairs, one seed: a minute in place of many")
     parser.add_argument("--presets", nargs="*", default=[], help="of conf/estimator; all by default")
-    parser.add_argument("--matches", type=Path, help="real pairs: an .npz file with names, NNN.X1, .X2, .size1, .size2")
-    parser.add_argument("--save", type=Path, help="keep what BEFORE computes (nothing else where AFTER is the same)")
     parser.add_argument("--dump", type=Path, nargs=2, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.dump:
         dump(*arguments.dump, arguments.presets, arguments.quick)
         return
     if arguments.before is None:
-        parser.error("BEFORE is missing: a checkout, or a file written with --save")
+        parser.error("BEFORE is missing: a checkout")
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        torch.save(inputs(arguments.quick, arguments.matches), folder / "pairs.pt")
-        before = computed(arguments.before, folder / "pairs.pt", arguments, folder)
-        if arguments.save:
-            torch.save(before, arguments.save)
-        if arguments.save and arguments.after.resolve() == arguments.before.resolve():
-            return
-        after = computed(arguments.after, folder / "pairs.pt", arguments, folder)
-    lines = differences(before, after, arguments.presets)
+        torch.save(inputs(arguments.quick), folder / "pairs.pt")
+        before = computed(arguments.before, folder, folder / "before.pt", arguments)
+        after = computed(arguments.after, folder, folder / "after.pt", arguments)
+    lines = differences(before, after)
     print("\n".join(lines[:60]) + f"\n{len(lines)} of {len(before.keys() | after.keys())} arrays differ")
     sys.exit(bool(lines))
 

@@ -14,8 +14,6 @@ by scripts.patch_networks.export architecture=l2net.
 Then: python -m scripts.patch_networks.export checkpoint=weights/AffNet.pth architecture=affnet licence=MIT
 """
 
-from __future__ import annotations
-
 import hashlib
 import http.client
 import os
@@ -27,7 +25,6 @@ import urllib.error
 import urllib.request
 import zlib
 from pathlib import Path, PurePosixPath, PureWindowsPath
-from typing import NamedTuple
 
 from omegaconf import DictConfig, OmegaConf
 from rich.table import Table
@@ -37,83 +34,8 @@ from fmtorch.core.terminal import console, exits_with_message
 DEFAULTS = {
     "weights": None, "dataset": None, "files": None, "sha256": None, "folder": None, "url": None, "timeout": 60,
 }  # fmt: skip
-AFFNET = "https://raw.githubusercontent.com/ducha-aiki/affnet/da7cf51ba09cb92e3cf0f46c12a89881f79e5051"
-HARDNET = "https://github.com/DagnyT/hardnet/raw/master/pretrained"
-
-
-class Weights(NamedTuple):
-    """A published file: where it is, for which architecture; sha256 is None where not known. All are under MIT."""
-
-    url: str
-    architecture: str
-    sha256: str | None = None
-
-    @property
-    def file(self) -> str:
-        return self.url.rsplit("/", 1)[-1]
-
-
-TABLE = {
-    "affnet": Weights(
-        f"{AFFNET}/pretrained/AffNet.pth", "affnet", "65c8bb2cf71e913818522d09dcc4262bcbcef5d756baa86a41f28526c2d61160"
-    ),
-    "orinet": Weights(
-        f"{AFFNET}/pretrained/OriNet.pth", "orinet", "030e7964ae3e136d00431c7e11c6b67df40ad299f02ac384fee0f1c3fd1dcb30"
-    ),
-    "affnet_jit": Weights(
-        f"{AFFNET}/convertJIT/AffNetJIT.pt",
-        "affnet",
-        "ab06ef8747ed1871415d34dc65308314f3b56521b3c6ff6a03005c996e9c32c7",
-    ),
-    "orinet_jit": Weights(
-        f"{AFFNET}/convertJIT/OriNetJIT.pt",
-        "orinet",
-        "984077b99385bf25083cafeff30be7a0f7fa2334d73015fbbea42b92b888a75a",
-    ),
-    "hardnet++": Weights(f"{HARDNET}/pretrained_all_datasets/HardNet++.pth", "hardnet"),
-    "hardnet_liberty": Weights(f"{HARDNET}/train_liberty_with_aug/checkpoint_liberty_with_aug.pth", "hardnet"),
-}
-
-
-class Source(NamedTuple):
-    """A published data set: `url` of an archive by its file's name, the files that the paper tests on, its terms.
-
-    by_hand: what to do where there is no address to fetch from.
-    """
-
-    licence: str
-    citation: str
-    url: str = ""
-    files: tuple[str, ...] = ()
-    by_hand: str = ""
-
-
-DATASETS = {
-    "tum": Source(
-        "CC BY 4.0", "Sturm et al., A Benchmark for the Evaluation of RGB-D SLAM Systems, IROS 2012",
-        "https://cvg.cit.tum.de/rgbd/dataset/{camera}/rgbd_dataset_{file}.tgz",
-        ("freiburg3_teddy", "freiburg3_large_cabinet", "freiburg3_long_office_household"),
-    ),
-    "1dsfm": Source(
-        "photographs of Flickr under their owners' licences",
-        "Wilson and Snavely, Robust Global Translations, ECCV 2014",
-        "http://landmark.cs.cornell.edu/projects/1dsfm/images.{file}.tar", ("Roman_Forum",),
-    ),
-    "kitti": Source(
-        "CC BY-NC-SA 3.0", "Geiger et al., Are we ready for Autonomous Driving?, CVPR 2012",
-        by_hand="on https://www.cvlibs.net/datasets/kitti/eval_odometry.php ask, with an e-mail address, for "
-        "data_odometry_gray.zip, data_odometry_calib.zip and data_odometry_poses.zip; unpack all three in one folder",
-    ),
-    "tanks_and_temples": Source(
-        "CC BY-NC-SA 3.0, as its page states", "Knapitsch et al., Tanks and Temples, SIGGRAPH 2017",
-        by_hand="take the images of Panther, Playground and Train from https://www.tanksandtemples.org/download, and "
-        "reconstruct each scene with COLMAP",
-    ),
-    "fmbench": Source(
-        "those of its four sets", "Bian et al., An Evaluation of Feature Matchers, BMVC 2019",
-        by_hand="follow the link on https://github.com/JiawangBian/FM-Bench and unpack the archive",
-    ),
-}  # fmt: skip
+KNOWN = OmegaConf.load(Path(__file__).with_suffix(".yaml"))
+WEIGHTS, DATASETS = KNOWN.weights, KNOWN.datasets
 
 
 def resume(url: str, path: Path, timeout: float | int = 60) -> None:
@@ -181,14 +103,11 @@ def unpack(archive: Path, folder: Path) -> list[Path]:
                     _extract(tar, member, Path(temporary))
         except (tarfile.TarError, EOFError, zlib.error, OSError) as error:
             raise ValueError(f"{archive}: cannot be unpacked ({error}); delete it and fetch it again") from error
-        unpacked = []
-        for path in sorted(Path(temporary).iterdir()):
+        unpacked = sorted(Path(temporary).iterdir())
+        for path in unpacked:
             if (folder / path.name).exists():
                 raise ValueError(f"{folder / path.name} is there already; name another folder or remove it")
-        for path in sorted(Path(temporary).iterdir()):
-            os.replace(path, folder / path.name)
-            unpacked.append(folder / path.name)
-    return unpacked
+        return [path.replace(folder / path.name) for path in unpacked]
 
 
 def _extract(tar: tarfile.TarFile, member: tarfile.TarInfo, folder: Path) -> None:
@@ -238,19 +157,16 @@ def fetch_dataset(config: DictConfig) -> list[Path]:
 
 
 def fetch(config: DictConfig) -> Path:
-    """The file that a config asks for."""
-    if config.weights not in TABLE:
-        raise ValueError(f"weights={config.weights}; there are: {', '.join(TABLE)}")
-    entry = TABLE[config.weights]
-    expected = config.sha256 or entry.sha256
+    if config.weights not in WEIGHTS:
+        raise ValueError(f"weights={config.weights}; there are: {', '.join(WEIGHTS)}")
+    entry = WEIGHTS[config.weights]
+    name, expected = entry.url.rpartition("/")[2], config.sha256 or entry.sha256
     if expected is None:
-        raise ValueError(
-            f"the SHA-256 of {entry.file} is not pinned: give sha256=HEX as its publisher states it, "
-            "or sha256=any to accept what comes"
-        )
+        as_stated = "give sha256=HEX as its publisher states it, or sha256=any to accept what comes"
+        raise ValueError(f"the SHA-256 of {name} is not pinned: {as_stated}")
     if expected != "any" and not re.fullmatch(r"[0-9a-fA-F]{64}", expected):
         raise ValueError(f"sha256={expected} is no SHA-256: 64 hexadecimal digits, or any")
-    path = Path(config.folder or "weights") / entry.file
+    path = Path(config.folder or "weights") / name
     digest = download(config.url or entry.url, path, None if expected == "any" else expected, config.timeout)
     state = "not verified" if expected == "any" else "verified"
     console.print(f"{path}  SHA-256 {digest} ({state})  licence: MIT  architecture={entry.architecture}")
@@ -265,13 +181,12 @@ def main() -> None:
             fetch_dataset(config)
         elif config.weights is None:
             table = Table("weights", "architecture", "licence", "SHA-256", "URL")
-            for name, entry in TABLE.items():
+            for name, entry in WEIGHTS.items():
                 table.add_row(name, entry.architecture, "MIT", entry.sha256 or "not known", entry.url)
-            console.print(table)
             sets = Table("dataset", "files", "licence", "citation")
             for name, source in DATASETS.items():
                 sets.add_row(name, ", ".join(source.files) or "by hand", source.licence, source.citation)
-            console.print(sets)
+            console.print(table, sets)
         else:
             fetch(config)
 

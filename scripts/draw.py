@@ -4,10 +4,7 @@ python scripts/draw.py gallery [--output docs/gallery]          those of docs/ga
 python scripts/draw.py overview [--output docs/overview.jpg]    that of the README: a pair of each rendered family
 """
 
-from __future__ import annotations
-
 import argparse
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -39,15 +36,13 @@ class Row(NamedTuple):
     theirs: Estimate
     errors: tuple[float, float]
 
-    def images(self) -> tuple[Picture, Picture]:
-        return read_image(self.pair.image0), read_image(self.pair.image1)
 
-    def points(self) -> tuple[NDArray[Any], NDArray[Any], NDArray[np.bool_]]:
-        """Both ends of the matches (N, 2), px, and which are inliers of ours."""
-        return points(self.matches, self.ours)
+def images_of(pair: ImagePair) -> tuple[Picture, Picture]:
+    return read_image(pair.image0), read_image(pair.image1)
 
 
 def points(c: Correspondences, estimate: Estimate) -> tuple[NDArray[Any], NDArray[Any], NDArray[np.bool_]]:
+    """Both ends of the matches (N, 2), px, and which are inliers."""
     mask = c.mask[0]
     x0, x1 = (x[0][mask].double().numpy() for x in (c.x0, c.x1))
     return x0, x1, estimate.inliers[0][mask].numpy()
@@ -64,12 +59,10 @@ def save(path: Path, picture: Picture, quality: int) -> None:
 
 
 def gallery(folder: Path) -> None:
-    """The pictures of the gallery."""
     pipeline, peer = load_pipeline(PIPELINE), presets.build("estimator", PEER[0], **PEER[1])
     pairs = list(data.load("rendered", families=["orbit", "collection"]))
     rows = []
-    for pair in pairs:
-        outcome = pipeline.run([pair])[0]
+    for pair, outcome in zip(pairs, (pipeline.run([pair])[0] for pair in pairs), strict=True):
         c, ours = outcome.correspondences, outcome.estimate
         if c is not None and ours is not None:
             theirs, F = peer(c, 0), torch.as_tensor(pair.F)[None]
@@ -81,27 +74,25 @@ def gallery(folder: Path) -> None:
 
     def epipolar(name: str, row: Row, estimate: Estimate) -> None:
         """The lines of an estimate at inliers of ours; the true lines are dashed."""
-        x0, x1, good = row.points()
-        F = estimate.F[0].numpy()
-        keep(name, draw_epipolar_lines(*row.images(), x0[good], x1[good], F, truth=row.pair.F, most=10))
+        x0, x1, good = points(row.matches, row.ours)
+        ends = *images_of(row.pair), x0[good], x1[good]
+        keep(name, draw_epipolar_lines(*ends, estimate.F[0].numpy(), truth=row.pair.F, most=10))
 
     most = max((row for row in rows if row.pair.family == "orbit"), key=lambda row: int(row.matches.count()))
-    keep("matches", draw_matches(*most.images(), *most.points(), most=60))
+    keep("matches", draw_matches(*images_of(most.pair), *points(most.matches, most.ours), most=60))
     epipolar("epipolar", most, most.ours)
     apart = max(rows, key=lambda row: min(row.errors[1], 0.3) - 5 * row.errors[0])
     epipolar("wrong", apart, apart.theirs)
     epipolar("right", apart, apart.ours)
-    ours, theirs = (f"{error:.4f}" for error in apart.errors)
-    count = int(apart.matches.count())
-    print(f"{apart.pair.identity}: {count} matches; NSGD {ours} of fmtorch, {theirs} of {PEER[1]['method']}")
+    errors = "NSGD {:.4f} of fmtorch, {:.4f} of ".format(*apart.errors) + PEER[1]["method"]
+    print(f"{apart.pair.identity}: {int(apart.matches.count())} matches; {errors}")
 
     orbits = [pair for pair in pairs if pair.family == "orbit"]
     images = read_image(orbits[0].image0), read_image(orbits[-1].image0)
     result = fmtorch.match(*images, pipeline=PIPELINE)
     x0, x1 = (t[0].double().numpy() for t in (result.correspondences.x0, result.correspondences.x1))
-    inliers = result.inliers.numpy()
-    keep("unrelated", draw_matches(*images, x0, x1, inliers))
-    print(f"unrelated: {int(inliers.sum())} inliers of {len(x0)}, significance {result.significance:.1f}")
+    keep("unrelated", draw_matches(*images, x0, x1, result.inliers.numpy()))
+    print(f"unrelated: {int(result.inliers.sum())} inliers of {len(x0)}, significance {result.significance:.1f}")
 
 
 def overview(path: Path) -> None:
@@ -111,13 +102,12 @@ def overview(path: Path) -> None:
     for pair in data.load("rendered", "test"):
         families.setdefault(pair.family, []).append(pair)
     strips = []
-    for members in families.values():
-        pair = members[OVERVIEW_PAIR]
+    for pair in (members[OVERVIEW_PAIR] for members in families.values()):
         outcome = pipeline.run([pair])[0]
         assert outcome.correspondences is not None
         assert outcome.estimate is not None
-        found = points(outcome.correspondences.compact(), outcome.estimate)
-        strips.append(draw_matches(read_image(pair.image0), read_image(pair.image1), *found, height=HEIGHT, most=40))
+        matches = points(outcome.correspondences.compact(), outcome.estimate)
+        strips.append(draw_matches(*images_of(pair), *matches, height=HEIGHT, most=40))
     strips.sort(key=lambda strip: strip.shape[1])
     between = np.full((HEIGHT, GAP, 3), 255, np.uint8)
     beside = zip(strips, reversed(strips[len(strips) // 2 :]), strict=False)  # the widest beside the narrowest
@@ -126,15 +116,13 @@ def overview(path: Path) -> None:
     save(path, np.vstack([part for row in rows for part in (row, below)][:-1]), 85)
 
 
-def main(argv: Sequence[str] | None = None) -> None:
+def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=["gallery", "overview"])
     parser.add_argument("--output", type=Path, help="a folder, or the file of the overview")
-    arguments = parser.parse_args(argv)
-    if arguments.what == "gallery":
-        gallery(arguments.output or DOCS / "gallery")
-    else:
-        overview(arguments.output or DOCS / "overview.jpg")
+    arguments = parser.parse_args()
+    draw, usual = {"gallery": (gallery, "gallery"), "overview": (overview, "overview.jpg")}[arguments.what]
+    draw(arguments.output or DOCS / usual)
 
 
 if __name__ == "__main__":

@@ -1,14 +1,14 @@
 """Writes docs/reference/presets.md from the comments in conf/ and command_line.md from the commands' declarations.
 
+What a page says before its first section stays.
+
 python scripts/draw_reference.py
 """
-
-from __future__ import annotations
 
 import dataclasses
 import itertools
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from fmtorch.core.options import shown
 from fmtorch.presets.files import available, summary
 
 ROOT = Path(__file__).resolve().parents[1]
-CONF, PAGES = ROOT / "conf", ROOT / "docs" / "reference"
+PAGES = ROOT / "docs" / "reference"
 
 GROUPS = {
     "pipeline": "Pipelines: features, matcher, pruners and estimator by one name, `pipeline=NAME`.",
@@ -40,20 +40,6 @@ USAGES = {
     "train": "fmtorch train pruner=NAME [NAME=VALUE ...]",
     "verify": "fmtorch verify DATABASE [NAME=VALUE ...]",
 }
-PRESETS_HEAD = """# Presets
-
-Each preset is a YAML file of `conf/`, with the unit and the source of every value in its comments. A value is replaced
-on the command line, `estimator.threshold=0.5`, or in Python,
-`fmtorch.presets.build("estimator", "msac", threshold=0.5)`. Presets of your own stand in a folder of yours
-([Your own parts](../guides/own_parts.md)). This page is written by `python scripts/draw_reference.py`.
-"""
-COMMANDS_HEAD = """# Command line
-
-`fmtorch COMMAND` is the same as `python -m fmtorch COMMAND`. Options are `NAME=VALUE`; groups, such as
-`estimator=lmeds`, take a [preset](presets.md), and their values are set by path, `estimator.threshold=0.5`. `-m` runs a
-sweep over values that are separated by commas; `--config-dir FOLDER` adds presets of your own. A value of `null` is
-none. This page is written by `python scripts/draw_reference.py`.
-"""
 
 
 def text(comment: str) -> str:
@@ -61,10 +47,6 @@ def text(comment: str) -> str:
     parts = re.split(r"(`[^`]*`)", comment.strip())
     plain = [re.sub(r"([*_<\[\]])", r"\\\1", part) if i % 2 == 0 else part for i, part in enumerate(parts)]
     return "".join(plain).replace("|", "\\|")
-
-
-def sentence(words: str) -> str:
-    return text(words[0].upper() + words[1:]) + "."
 
 
 def rows(options: Any, prefix: str = "") -> Iterator[str]:
@@ -77,25 +59,32 @@ def rows(options: Any, prefix: str = "") -> Iterator[str]:
             yield f"| `{name}` | `{shown(value)}` | {text(str(field.metadata['about']))} |"
 
 
+def head(page: str) -> str:
+    return (PAGES / page).read_text(encoding="utf-8").partition("\n## ")[0]
+
+
+def table(columns: Sequence[str], lines: Iterable[str]) -> str:
+    return "\n".join([f"| {' | '.join(columns)} |", "|" + " --- |" * len(columns), *lines]) + "\n"
+
+
 def presets_page() -> str:
-    parts = [PRESETS_HEAD]
+    parts = [head("presets.md")]
     for group, title in GROUPS.items():
         for folder, names in itertools.groupby(available(group), lambda name: name.rpartition("/")[0]):
-            rows = [
-                f"| [`{name}`](../../conf/{group}/{name}.yaml) | {text(summary(CONF / group / f'{name}.yaml'))} |"
-                for name in names
-            ]
-            head = f"### {group}: {HEADINGS[folder]}\n" if folder else f"## {group}\n\n{title}\n"
-            parts.append("\n".join([head, "| name | what it is |", "| --- | --- |", *rows]) + "\n")
+            parts.append(f"### {group}: {HEADINGS[folder]}\n" if folder else f"## {group}\n\n{title}\n")
+            files = ((name, f"conf/{group}/{name}.yaml") for name in names)
+            lines = [f"| [`{name}`](../../{file}) | {text(summary(ROOT / file))} |" for name, file in files]
+            parts.append(table(("name", "what it is"), lines))
     return "\n".join(parts)
 
 
 def commands_page() -> str:
-    parts = [COMMANDS_HEAD]
+    parts = [head("command_line.md")]
     for name, usage in USAGES.items():
-        head = f"## {name}\n\n```text\n{usage}\n```\n\n{sentence(SUMMARIES[name])}\n"
-        table = ["| option | default | what it is |", "| --- | --- | --- |", *rows(COMMANDS[name].options())]
-        parts.append("\n".join([head, *table]) + "\n")
+        words = SUMMARIES[name]
+        about = text(words[0].upper() + words[1:])
+        parts.append(f"## {name}\n\n```text\n{usage}\n```\n\n{about}.\n")
+        parts.append(table(("option", "default", "what it is"), rows(COMMANDS[name].options())))
     return "\n".join(parts)
 
 

@@ -1,7 +1,5 @@
 """The size and shape of the project: `python scripts/house.py [--check]`; with --check, 1 where a limit is broken."""
 
-from __future__ import annotations
-
 import ast
 import functools
 import os

@@ -15,8 +15,6 @@ Photographs: scikit-image's of the train split and, with --photos, a folder whos
 only those of --sources are read.
 """
 
-from __future__ import annotations
-
 import argparse
 import hashlib
 import itertools
@@ -52,7 +50,6 @@ NGRANSAC_LAYERS = {"s0": "linear0", "s1": "norm0", "s2": "linear1", "s3": "norm1
 
 
 def images(arguments: argparse.Namespace) -> Iterator[NDArray[np.uint8]]:
-    """The photographs to learn from."""
     for name in PICTURES["train"]:
         yield photograph(name)
     if arguments.photos is not None:
@@ -87,7 +84,6 @@ def codebooks(arguments: argparse.Namespace) -> None:
 
 
 def learned(parts: list[Tensor], centers: int, dimensions: int) -> Codebook:
-    """The codebook of these local descriptors."""
     descriptors = torch.cat(parts)
     mean, basis = learn_projection(descriptors, dimensions)
     return Codebook(mean, basis, k_means((descriptors - mean) @ basis, centers))
@@ -144,21 +140,20 @@ def ngransac_state(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(required=True)
-    for function in (pca, codebooks, ngransac):
+    command = commands.add_parser("ngransac")
+    command.set_defaults(function=ngransac)
+    command.add_argument("checkpoint", type=Path)
+    command.add_argument("out", type=Path, help="a file .safetensors")
+    for function in (pca, codebooks):
         command = commands.add_parser(function.__name__)
         command.set_defaults(function=function)
-        if function is ngransac:
-            command.add_argument("checkpoint", type=Path)
-            command.add_argument("out", type=Path, help="a file .safetensors")
-            continue
         command.add_argument("--photos", type=Path)
         command.add_argument("--sources", nargs="+", default=SOURCES, help="as in the fourth column of sources.txt")
         command.add_argument("--output", type=Path, default=models_dir())
-        if function is codebooks:
-            command.add_argument("--only", choices=[*FEATURES], nargs="+", default=[*FEATURES])
-            command.add_argument("--every", type=int, default=1, help="of the photographs, every so many-th")
-            command.add_argument("--centers", type=int, default=CENTERS)
-            command.add_argument("--dimensions", type=int, default=DIMENSIONS)
+    command.add_argument("--only", choices=[*FEATURES], nargs="+", default=[*FEATURES])
+    command.add_argument("--every", type=int, default=1, help="of the photographs, every so many-th")
+    command.add_argument("--centers", type=int, default=CENTERS)
+    command.add_argument("--dimensions", type=int, default=DIMENSIONS)
     arguments = parser.parse_args()
     torch.set_num_threads(1)  # many small steps: threads would wait for one another
     with exits_with_message():

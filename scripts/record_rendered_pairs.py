@@ -5,8 +5,6 @@
 adds folders of `rendered` to fmtorch/scenes/pairs.json and drops those of other versions.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 from pathlib import Path

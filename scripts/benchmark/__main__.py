@@ -1,8 +1,7 @@
 """`python -m scripts.benchmark estimators ...`, in the checkout's folder: one command for each benchmark."""
 
-from __future__ import annotations
-
 import argparse
+import importlib
 
 import cv2
 import torch
@@ -10,29 +9,14 @@ import torch
 if not __package__:
     raise SystemExit("run it in the checkout's folder, as a module: python -m scripts.benchmark COMMAND ...")
 
-from scripts.benchmark import (
-    cameras,
-    estimators,
-    images,
-    pipelines,
-    planes,
-    posebench,
-    related,
-    scale,
-    scenes,
-    speed,
-    stress,
-    verify,
-)
-
-MODULES = (cameras, estimators, images, pipelines, planes, posebench, related, scale, scenes, speed, stress, verify)
+MODULES = "cameras estimators images pipelines planes posebench related speed stress verify"
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m scripts.benchmark", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
-    for module in MODULES:
-        module.add_arguments(commands)
+    for module in MODULES.split():
+        importlib.import_module(f"scripts.benchmark.{module}").add_arguments(commands)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     cv2.setNumThreads(1)

@@ -17,32 +17,28 @@ import functools
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from fmtorch import presets
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.data import ImagePair
 from fmtorch.estimators import PairwiseEstimator
+from fmtorch.evaluation.rows import focal_errors
+from fmtorch.pipeline.pipeline import Outcome
+from fmtorch.presets import build
 from fmtorch.two_view.known_cameras import KnownCameras
 from scripts.benchmark import pairs
-from scripts.benchmark.methods import build, options, read_specs
-from scripts.benchmark.runner import Item, Kept, Measured, Row, add_command, identity, judged, measure
+from scripts.benchmark.changes import sizes_of, taken
+from scripts.benchmark.methods import options, read_specs
+from scripts.benchmark.runner import Item, Kept, Measured, Row, Stages, add_command, identity, judged, measure
 from scripts.benchmark.tables import Record, Results, Sheet, show
 
 Array = NDArray[Any]
-LEVELS = {
-    "known": "both calibrations are known",
-    "rough": "focal lengths are known to 10 %",
-    "wrong": "focal lengths are 1.5 times too long",
-    "one_sided": "the calibration of image 0 is known",
-    "shared": "one unknown focal length",
-    "unknown": "nothing is known",
-}
+LEVELS = ("known", "rough", "wrong", "one_sided", "shared", "unknown")
 ROUGH = 1.1  # largest factor of a roughly known focal length; log-uniform, of each camera its own
 DEVIATION = 0.06  # relative, of such a factor: log(1.1) / sqrt(3), rounded up
 WRONG = 1.5  # factor of a wrong focal length
@@ -52,7 +48,7 @@ FOCAL_ERRORS = (0.05, 0.1)  # relative
 PRIOR = ("frame_consistency", "match_noise")  # P(inlier) and noise of each match, before our own estimator
 EXACT = ("known", "rough", "wrong")
 TAKES = {
-    "fmtorch": tuple(LEVELS), "fmtorch_f": tuple(LEVELS), "poselib": (*EXACT, "shared"),
+    "fmtorch": LEVELS, "fmtorch_f": LEVELS, "poselib": (*EXACT, "shared"),
     "poselib_f": (*EXACT, "one_sided", "shared", "unknown"), "colmap": (*EXACT, "one_sided", "shared", "unknown"),
     "colmap_f": EXACT, "opencv": EXACT, "kornia": EXACT,
 }  # fmt: skip
@@ -67,54 +63,26 @@ def add_arguments(commands: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    kept = Kept(arguments.rows)
-    rows = kept.rows
-    if pairs.named(arguments):
+    def measured_rows(kept: Kept) -> list[Row]:
         words = [*arguments.methods, *(read_specs(arguments.specs) if arguments.specs else [])]
         if not words:
             raise SystemExit("name at least one method: --methods or --specs")
         matches = pairs.matches_identity(arguments)
-        methods = [CameraMethod.of(word, matches) for word in words]
         items = [item for item in pairs.matched(arguments) if has_cameras(item.pair)]
         if not items:
             raise SystemExit("no pair has cameras; a --root must hold Camera.txt files")
-        rows = measure(methods, items, arguments.seeds, kept)
-    show([sheet(rows)], arguments.table)
+        return measure([CameraMethod.of(word, matches) for word in words], items, arguments.seeds, kept)
+
+    show([sheet(pairs.rows_of(arguments, measured_rows))], arguments.table)
 
 
 def has_cameras(pair: ImagePair) -> bool:
-    """Whether the cameras of a pair are known."""
     return all(value is not None for value in (pair.K0, pair.K1, pair.R, pair.t))
 
 
-class Knowledge(NamedTuple):
-    """What a method is given of two cameras.
-
-    K: (3, 3) of each image, None where unknown. deviation: relative standard deviation of their focal lengths, 0 where
-    exact. one_camera: whether both images are of one camera. sizes: (2, 2) as (h, w).
-    """
-
-    K: tuple[Array | None, Array | None]
-    deviation: float
-    one_camera: bool
-    sizes: Array
-
-    def calibrations(self, focals: Array) -> tuple[Array, Array]:
-        """Those that are given, and of square pixels with these focal lengths (2,) in pixels in place of others.
-
-        Principal points are those that are given or the centres of the images.
-        """
-        centres = [(size[::-1] - 1) / 2 for size in self.sizes]
-        K0, K1 = (
-            np.array([[f, 0, x], [0, f, y], [0, 0, 1]]) if K is None else K
-            for K, f, (x, y) in zip(self.K, focals, centres, strict=True)
-        )
-        return K0, K1
-
-
-def focals_of(K0: Array | None, K1: Array | None) -> Array:
-    """The focal lengths (2,) in pixels, geometric means of those along x and y; NaN where unknown."""
-    return np.array([np.nan if K is None else np.sqrt(K[0, 0] * K[1, 1]) for K in (K0, K1)])
+def focals_of(*calibrations: Array | None) -> Array:
+    """The focal lengths in pixels, geometric means of those along x and y; NaN where unknown."""
+    return np.array([np.nan if K is None else np.sqrt(K[0, 0] * K[1, 1]) for K in calibrations])
 
 
 def applies(level: str, pair: ImagePair) -> bool:
@@ -123,21 +91,31 @@ def applies(level: str, pair: ImagePair) -> bool:
     return level != "shared" or bool(abs(np.log(f0 / f1)) < ONE_CAMERA)
 
 
-def knowledge(level: str, pair: ImagePair, sizes: Array, seed: int) -> Knowledge:
-    """What a level tells of a pair's cameras. sizes: (2, 2) as (h, w). seed: of roughly known focal lengths."""
+def told(level: str, pair: ImagePair, c: Correspondences, seed: int) -> Correspondences:
+    """The matches with what a level tells of their cameras. seed: of roughly known focal lengths."""
     factors, deviation = np.ones(2), 0.0
     if level == "rough":
         rng = np.random.default_rng([pair.key % 2**64, seed])
         factors, deviation = np.exp(rng.uniform(-np.log(ROUGH), np.log(ROUGH), 2)), DEVIATION
     elif level == "wrong":
         factors, deviation = np.full(2, WRONG), DEVIATION
-    told = {"one_sided": 1, "shared": 0, "unknown": 0}.get(level, 2)
-    K = [k @ np.diag([f, f, 1.0]) for k, f in zip((pair.K0, pair.K1), factors, strict=True) if k is not None]
-    given = (K[0] if told > 0 else None, K[1] if told > 1 else None)
-    return Knowledge(given, deviation, level == "shared", sizes)
+    known = np.arange(2) < {"one_sided": 1, "shared": 0, "unknown": 0}.get(level, 2)
+    K = [torch.from_numpy(np.asarray(own) @ np.diag([f, f, 1.0]))[None] if given else None
+         for own, f, given in zip((pair.K0, pair.K1), factors, known, strict=True)]  # fmt: skip
+    focal = torch.tensor([[[1.0, deviation if given else np.inf] for given in known]], dtype=torch.float64)
+    return c.replace(K0=K[0], K1=K[1], focal=focal, shared_focal=torch.tensor([level == "shared"]))
 
 
-Solve = Callable[[Correspondences, Knowledge, int], Estimate]
+def calibrations(c: Correspondences, focals: Array) -> list[Array]:
+    """Those that are given; for others square pixels, these focal lengths (2,) in pixels and the centres of images."""
+    centred = [
+        np.array([[f, 0, (w - 1) / 2], [0, f, (h - 1) / 2], [0, 0, 1]])
+        for f, (h, w) in zip(focals, sizes_of(c), strict=True)
+    ]
+    return [own if K is None else K[0].numpy() for own, K in zip(centred, (c.K0, c.K1), strict=True)]
+
+
+Solve = Callable[[Correspondences, int], Estimate]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -168,105 +146,92 @@ class CameraMethod(Measured):
 
     def figures(self, item: Item, seed: int) -> Row:
         """The figures of F and pose, whether t points backwards, and the errors of focal lengths not given exactly."""
-        c, pair = item.matches, item.pair
-        assert c.size0 is not None
-        assert c.size1 is not None
-        given = knowledge(self.level, pair, np.stack([c.size0[0].numpy(), c.size1[0].numpy()]), seed)
+        pair, c = item.pair, told(self.level, item.pair, item.matches, seed)
         start = time.process_time()
-        estimate = self.solve(c, given, seed)
+        estimate = self.solve(c, seed)
         ms = 1e3 * (time.process_time() - start)
-        assert item.outcome is not None
         inliers = estimate.inliers if estimate.inliers.shape == c.mask.shape else c.mask
-        outcome = dataclasses.replace(
-            item.outcome, estimate=estimate.replace(inliers=inliers), reason=estimate.reason[0]
-        )
+        estimate = estimate.replace(inliers=inliers)
+        assert item.outcome is not None
+        outcome = Outcome(pair, item.outcome.features, c, estimate, reason=estimate.reason[0])
         row = {**judged(outcome, seed), "ms": ms}
         if estimate.t is not None and pair.t is not None and bool(estimate.ok[0]) and bool(estimate.t.isfinite().all()):
             row["flipped"] = bool(estimate.t[0].double().numpy() @ pair.t < 0)
-        asked = [K is None or given.deviation > 0 for K in given.K]
-        if any(asked):
-            found = focals_of(*given.K)
-            if bool(estimate.ok[0]) and estimate.focals is not None:
-                found = np.where(estimate.focals[0].isfinite(), estimate.focals[0].double().numpy(), np.inf)
-            errors = np.abs(found / focals_of(pair.K0, pair.K1) - 1)[asked]
-            row |= {f"focal_{round(100 * bound)}": float((errors <= bound).mean()) for bound in FOCAL_ERRORS}
+        if errors := [error for error in focal_errors(outcome).error if error is not None]:
+            row |= {f"focal_{round(100 * bound)}": float(np.mean(np.array(errors) <= bound)) for bound in FOCAL_ERRORS}
         return row
 
 
-def _solver(name: str, level: str, changed: dict[str, Any]) -> tuple[Solve, list[tuple[str, str, dict[str, Any]]]]:
+def _solver(name: str, level: str, changed: dict[str, Any]) -> tuple[Solve, Stages]:
     """What a method computes, and the presets that it is made of."""
     kind, _, alone = name.partition("_")
     if kind == "fmtorch":
         prior = [build("pruner", word) for word in PRIOR]
-        own = _with_cameras if not alone else _decomposed
-        solve = functools.partial(own, presets.build("estimator", kind, **changed), exact=False)
-        stages = [("estimator", kind, changed), *(("pruner", word, {}) for word in PRIOR)]
-        return lambda c, given, seed: solve(functools.reduce(lambda x, stage: stage(x), prior, c), given, seed), stages
+        own = functools.partial(_decomposed if alone else _with_cameras, build("estimator", kind, **changed))
+        stages: Stages = [("estimator", kind, changed), *(("pruner", word, {}) for word in PRIOR)]
+        return lambda c, seed: own(functools.reduce(lambda given, stage: stage(given), prior, c), seed), stages
     if kind in ESSENTIAL:
-        solve = functools.partial(_with_cameras, ESSENTIAL[kind](**changed), exact=True)
-        return functools.partial(_best_first, solve), []
+        return functools.partial(_peer, _with_cameras, _by_essential(kind, changed)), []
     usual: dict[str, Any] = {"iterations": 5000, "prosac": True} if kind == "poselib" else {"two_view": not alone}
     shared = {"shared_focal": True} if (name, level) == ("poselib", "shared") else {}
     changed = {**usual, **shared, **changed}
     try:
-        estimator = presets.build("estimator", kind, **changed)
+        estimator = build("estimator", kind, **changed)
     except ImportError as error:
         raise SystemExit(f"{name}: {error}") from error
     call = _decomposed if alone or shared else _with_cameras
-    return functools.partial(_best_first, functools.partial(call, estimator, exact=True)), [
-        ("estimator", kind, changed)
-    ]
+    return functools.partial(_peer, call, estimator), [("estimator", kind, changed)]
 
 
-def _with_cameras(estimator: Any, c: Correspondences, given: Knowledge, seed: int, exact: bool) -> Estimate:
-    """By an estimator that takes cameras. exact: it is another library's, which takes what is given for exact."""
-    K0, K1 = (None if K is None else torch.from_numpy(np.asarray(K))[None] for K in given.K)
-    deviations = [np.inf if K is None else 0.0 if exact else given.deviation for K in given.K]
-    focal = torch.tensor([[[1.0, deviation] for deviation in deviations]], dtype=torch.float64)
-    fields = {"K0": K0, "K1": K1, "focal": focal, "shared_focal": torch.tensor([given.one_camera])}
-    estimate: Estimate = KnownCameras(estimator)(c.replace(**fields), seed).detach()
-    lacks_pose = estimate.t is None or not bool(estimate.t.isfinite().all())
-    return _posed(estimate, c, given) if exact and lacks_pose else estimate
+def _with_cameras(estimator: Any, c: Correspondences, seed: int) -> Estimate:
+    return KnownCameras(estimator)(c, seed).detach()
 
 
-def _best_first(solve: Solve, c: Correspondences, given: Knowledge, seed: int) -> Estimate:
-    """By another library, which gets the matches in ascending order of their ratios."""
+def _peer(call: Callable[..., Estimate], estimator: Any, c: Correspondences, seed: int) -> Estimate:
+    """By another library, which takes what is given for exact, and gets the matches in ascending order of ratios."""
     assert c.ratio is not None
+    assert c.focal is not None
     order = c.ratio[0].argsort(stable=True)
-    slots = {name: getattr(c, name)[:, order] for name in c.per_slot if getattr(c, name) is not None}
-    estimate = solve(c.replace(**slots), given, seed)
+    exact = torch.where(c.focal.isinf(), torch.inf, torch.tensor([1.0, 0.0], dtype=torch.float64))
+    best_first = taken(c.replace(focal=exact), order)
+    estimate = call(estimator, best_first, seed)
+    if estimate.t is None or not bool(estimate.t.isfinite().all()):
+        estimate = _posed(estimate, best_first)
     return estimate.replace(inliers=estimate.inliers[:, order.argsort()])
 
 
-def _decomposed(estimator: Any, c: Correspondences, given: Knowledge, seed: int, exact: bool) -> Estimate:
+def _decomposed(estimator: Any, c: Correspondences, seed: int) -> Estimate:
     """F by an estimator that is told nothing of the cameras, and its pose."""
-    return _posed(estimator(c.replace(K0=None, K1=None), seed).detach(), c, given)
+    return _posed(estimator(c.replace(K0=None, K1=None, focal=None, shared_focal=None), seed).detach(), c)
 
 
-def _posed(estimate: Estimate, c: Correspondences, given: Knowledge) -> Estimate:
+def _posed(estimate: Estimate, c: Correspondences) -> Estimate:
     """The estimate with the pose of F, by the given calibrations or else focal lengths by `bougnoux`."""
     inliers = estimate.inliers[0].numpy()
     if not bool(estimate.ok[0]) or not inliers.any():
         return estimate
     F = estimate.F[0].double().numpy()
-    K0, K1 = given.calibrations(bougnoux(F, given))
-    rays = [np.c_[x[0].double().numpy(), np.ones(len(inliers))][inliers] @ np.linalg.inv(K).T
-            for x, K in ((c.x0, K0), (c.x1, K1))]  # fmt: skip
-    normalised = [np.ascontiguousarray(each[:, :2]) for each in rays]
+    K0, K1 = calibrations(c, bougnoux(F, c))
+    normalised = [rays(x[0].double().numpy()[inliers], K) for x, K in ((c.x0, K0), (c.x1, K1))]
     far = 1e9  # baselines: OpenCV's own bound of 50 rejects short ones
     _, R, t, _, _ = cv2.recoverPose(K1.T @ F @ K0, normalised[0], normalised[1], np.eye(3), distanceThresh=far)
     pose = {"R": np.asarray(R), "t": np.asarray(t).ravel(), "focals": focals_of(K0, K1)}
     return estimate.replace(**{name: torch.from_numpy(np.asarray(v, np.float64))[None] for name, v in pose.items()})
 
 
-def bougnoux(F: Array, given: Knowledge) -> Array:
+def rays(x: Array, K: Array) -> Array:
+    """Pixels (n, 2) in units of the focal length, from the principal point."""
+    return np.ascontiguousarray((np.c_[x, np.ones(len(x))] @ np.linalg.inv(K).T)[:, :2])
+
+
+def bougnoux(F: Array, c: Correspondences) -> Array:
     """Focal lengths (2,) in pixels by Bougnoux's formula (ICCV 1998); usual ones for both where one is not real."""
-    centre0, centre1 = Knowledge((None, None), 0.0, False, given.sizes).calibrations(np.ones(2))
-    for centre, K in ((centre0, given.K[0]), (centre1, given.K[1])):
-        centre[:2, 2] = centre[:2, 2] if K is None else K[:2, 2]
-    G = centre1.T @ F @ centre0
+    centres = calibrations(c.replace(K0=None, K1=None), np.ones(2))
+    for centre, K in zip(centres, calibrations(c, np.ones(2)), strict=True):
+        centre[:2, 2] = K[:2, 2]
+    G = centres[1].T @ F @ centres[0]
     squares = np.array([_squared_focal(G), _squared_focal(G.T)])
-    usual = USUAL * given.sizes.max(1)
+    usual = USUAL * np.array(sizes_of(c)).max(1)
     return np.asarray(np.sqrt(squares) if np.isfinite(squares).all() and (squares > 0).all() else usual)
 
 
@@ -279,58 +244,47 @@ def _squared_focal(G: Array) -> float:
         return float(-(row @ p) * (p @ G.T @ p) / (row @ D @ G.T @ p))
 
 
-Essential = Callable[[Any, Array, Array], tuple[Any, Any]]  # a pair, K0 and K1 -> E and its inliers
+def _opencv(
+    pair: Any, K0: Array, K1: Array, method: str = "USAC_MAGSAC", threshold: float = 1.0, confidence: float = 0.999
+) -> tuple[Any, Any]:
+    cv2.setRNGSeed(pair.seed)
+    return cv2.findEssentialMat(pair.x0, pair.x1, K0, None, K1, None, getattr(cv2, method), confidence, threshold)
 
 
-def _essential(name: str, find: Essential) -> PairwiseEstimator:
+def _kornia(pair: Any, K0: Array, K1: Array, threshold: float = 1.0, rounds: int = 10) -> tuple[Any, Any]:
+    from kornia.geometry import RANSAC
+
+    unit = float(np.mean([K0[0, 0], K1[0, 0]]))  # px
+    ransac = RANSAC("essential", inl_th=threshold / unit, max_iter=rounds, prosac_sampling=True, seed=pair.seed)
+    E, mask = ransac(*(torch.from_numpy(rays(x, K)) for x, K in ((pair.x0, K0), (pair.x1, K1))))
+    return E.double().numpy(), mask.numpy()
+
+
+ESSENTIAL: dict[str, Callable[..., tuple[Any, Any]]] = {"opencv": _opencv, "kornia": _kornia}
+"""From a pair, K0, K1 and options to E and its inliers."""
+
+
+def _by_essential(kind: str, changed: dict[str, Any]) -> PairwiseEstimator:
     """An estimator of fundamental matrices by a library's essential matrices, of matches that come best first."""
 
     def solve(pair: Any) -> tuple[Array | None, Array]:
         K0, K1 = pair.exact
-        E, mask = find(pair, K0, K1)
+        E, mask = ESSENTIAL[kind](pair, K0, K1, **changed)
         if E is None or mask is None or np.shape(E) != (3, 3):
             return None, np.zeros(len(pair.x0), np.bool_)
         return np.linalg.inv(K1).T @ np.asarray(E, np.float64) @ np.linalg.inv(K0), np.asarray(mask).ravel() > 0
 
-    return PairwiseEstimator(name, solve, best_first=True)
-
-
-def _opencv(method: str = "USAC_MAGSAC", threshold: float = 1.0, confidence: float = 0.999) -> PairwiseEstimator:
-    def find(pair: Any, K0: Array, K1: Array) -> tuple[Any, Any]:
-        cv2.setRNGSeed(pair.seed)
-        return cv2.findEssentialMat(pair.x0, pair.x1, K0, None, K1, None, getattr(cv2, method), confidence, threshold)
-
-    return _essential("OpenCV", find)
-
-
-def _kornia(threshold: float = 1.0, rounds: int = 10, prosac: bool = True) -> PairwiseEstimator:
-    from kornia.geometry import RANSAC
-
-    def find(pair: Any, K0: Array, K1: Array) -> tuple[Any, Any]:
-        unit = float(np.mean([K0[0, 0], K1[0, 0]]))  # px
-        ransac = RANSAC("essential", inl_th=threshold / unit, max_iter=rounds, prosac_sampling=prosac, seed=pair.seed)
-        rays = [np.c_[x, np.ones(len(x))] @ np.linalg.inv(K).T for x, K in ((pair.x0, K0), (pair.x1, K1))]
-        E, mask = ransac(*(torch.from_numpy(np.ascontiguousarray(each[:, :2])) for each in rays))
-        return E.double().numpy(), mask.numpy()
-
-    return _essential("kornia", find)
-
-
-ESSENTIAL: dict[str, Callable[..., PairwiseEstimator]] = {"opencv": _opencv, "kornia": _kornia}
+    return PairwiseEstimator(kind, solve, best_first=True)
 
 
 def sheet(rows: Sequence[Row]) -> Sheet:
-    """Each level's methods on each set, and what our own method of the level, or else the first of it, has more."""
     records: list[Record] = []
-    columns = [
-        "pose@5", "pose@10", "pose@20", "R.01", "AUC@0.05", "flipped, %", *(f"focal within {p} %, %" for p in (5, 10)),
-        "ms", "time ratio",
-    ]  # fmt: skip
+    columns = [*(f"pose@{t}" for t in (5, 10, 20)), "R.01", "AUC@0.05", "flipped, %"]
+    columns += [*(f"focal within {p} %, %" for p in (5, 10)), "ms", "time ratio"]
     for level in LEVELS:
         own = [row for row in rows if row["method"].split(":")[1] == level]
         results = Results(sorted(own, key=lambda row: row["method"].split(":")[0] != "fmtorch"))
-        lines = results.records(results.groups(results.all_pairs), columns, label="method", minus=["pose@5"])
+        lines = results.records(results.groups(results.all_pairs), columns, "method", ["pose@5"])
         records += [{"known": level, "method": line.pop("method"), **line} for line in lines]
-    return Sheet(
-        "poses", "AUC of the larger pose error at 5, 10 and 20 degrees, recall and AUC@0.05 of F, in %", records
-    )
+    title = "AUC of the larger pose error at 5, 10 and 20 degrees, recall and AUC@0.05 of F, in %"
+    return Sheet("poses", title, records)

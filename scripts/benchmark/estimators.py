@@ -1,9 +1,10 @@
 """Robust estimators on the same matches, one thread each: recall, AUC@0.05, milliseconds, paired intervals.
 
-An estimator is named as PRESET[:KEY=VALUE,...][@PRUNER+PRUNER...]; the pruners after @ count into its time. `truth` is
-the fit that starts from the true matrix, and so what the matches allow; `ratioless` and `sizeless` among the pruners
-take away distance ratios and image sizes. The pruner `ngransac` is the network of --ngransac; without it, estimators
-that name it are left out.
+An estimator is named as PRESET[:KEY=VALUE,...][@PRUNER+PRUNER...]; the pruners after @ count into its time.
+`find_fundamental[:KEY=VALUE,...]` is the public call with points, ratios and image sizes; `truth` the fit that starts
+from the true matrix, and so what the matches allow. Among the pruners, `ratioless` and `sizeless` take away distance
+ratios and image sizes, `part:left=0,top=0,right=0.5,bottom=0.5` crops both images, and `bent:lens=-0.15` gives them
+lenses. The pruner `ngransac` is the network of --ngransac; without it, estimators that name it are left out.
 
 python -m scripts.benchmark estimators --root DATA/Strecha --root DATA/PhotoTourism --seeds 5 \\
     --estimators fmtorch@frame_consistency opencv:method=usac_magsac,threshold=1.0 poselib:threshold=0.5,prosac=true
@@ -13,8 +14,6 @@ python -m scripts.benchmark estimators --rendered full --specs scripts/benchmark
 seeds, pairs and estimators need. A row counts only for the code, options and learned files that it was made with.
 """
 
-from __future__ import annotations
-
 import argparse
 import csv
 from collections.abc import Mapping, Sequence
@@ -23,7 +22,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from scripts.benchmark import figures, pairs
+from fmtorch.evaluation.statistics import PERCENT
+from scripts.benchmark import pairs, tables
 from scripts.benchmark.methods import NGRANSAC, method, ngransac, read_specs, stages_of
 from scripts.benchmark.runner import Kept, Row, add_command, measure
 from scripts.benchmark.tables import BASELINES, FIGURES, Record, Results, Sheet, show
@@ -58,38 +58,34 @@ def add_arguments(commands: Any) -> None:
 def run(arguments: argparse.Namespace) -> None:
     extra = ngransac(arguments.ngransac)
     specs = [*arguments.estimators, *(read_specs(arguments.specs) if arguments.specs else [])]
-    rows = measured([spec for spec in specs if extra or NGRANSAC not in stages_of(spec)], arguments, extra)
-    results = Results(rows)
+    results = measured([spec for spec in specs if extra or NGRANSAC not in stages_of(spec)], arguments, extra)
     show([sheet(results)], arguments.table)
 
 
-def measured(specs: Sequence[str], arguments: argparse.Namespace, extra: Mapping[str, Any] | None = None) -> list[Row]:
-    """The rows of these estimators on the pairs that are asked for, or where there are none all that are kept."""
-    kept = Kept(arguments.rows)
-    if not pairs.named(arguments):
-        rows = kept.rows
-    elif not specs:
-        raise SystemExit("name at least one estimator: --estimators or --specs")
-    else:
+def measured(specs: Sequence[str], arguments: argparse.Namespace, extra: Mapping[str, Any]) -> Results:
+    """These estimators on the pairs that are asked for, or where there are none all rows that are kept."""
+
+    def measured_rows(kept: Kept) -> list[Row]:
+        if not specs:
+            raise SystemExit("name at least one estimator: --estimators or --specs")
         matches = pairs.matches_identity(arguments)
-        methods = [method(spec, matches, extra or {}) for spec in specs]
-        rows = measure(methods, pairs.matched(arguments), arguments.seeds, kept)
-    if not rows:
-        raise SystemExit("nothing to show: name sets with --root or --rendered, or a file of earlier --rows")
-    return rows
+        methods = [method(spec, matches, extra) for spec in specs]
+        return measure(methods, pairs.matched(arguments), arguments.seeds, kept)
+
+    return Results(pairs.rows_of(arguments, measured_rows))
 
 
 def sheet(results: Results) -> Sheet:
     """Recall, AUC@0.05, the lead of the first estimator over each, and times, of each set."""
     merits = ("R.05", "R.01", "AUC@0.05")
-    records = results.records(
-        results.groups(results.pairs()), (*merits, "ms", "time ratio"), label="estimator", minus=merits[1:]
-    )
-    seeds = min(results.seeds(name) for name in results.methods)
-    title = (
-        f"Recall at NSGD 0.05, at 0.01 and AUC@0.05 in %, mean of {seeds} seeds; lead: {results.methods[0]} minus this"
-    )
+    groups = results.groups(results.pairs())
+    records = results.records(groups, (*merits, "ms", "time ratio"), "estimator", merits[1:])
+    seeds, first = min(results.seeds(name) for name in results.methods), results.methods[0]
+    title = f"Recall at NSGD 0.05, at 0.01 and AUC@0.05 in %, mean of {seeds} seeds; lead: {first} minus this"
     return Sheet("recall", f"{title}; {results.described(results.pairs())}", records)
+
+
+Figures = Mapping[str, tuple[float, float]]  # of estimators, by `area_and_cost`
 
 
 class Curve(NamedTuple):
@@ -103,12 +99,13 @@ class Curve(NamedTuple):
 def run_curves(arguments: argparse.Namespace) -> None:
     curves = read_curves(arguments.curves or read_specs(arguments.specs))
     specs = list(dict.fromkeys(spec for curve in curves for spec in curve.specs))
-    results = Results(measured(specs, arguments))
-    knees = {curve.name: knee(curve, results) for curve in curves}
+    results = measured(specs, arguments, {})
+    figures = {spec: area_and_cost(results, spec) for spec in specs}
+    knees = {curve.name: knee({spec: figures[spec] for spec in curve.specs}) for curve in curves}
     if arguments.knees:
         with arguments.knees.open(encoding="utf-8") as file:
             knees |= {line["curve"]: line["estimator"] for line in csv.DictReader(file) if "knee" in line["mark"]}
-    show([curve_sheet(curves, results, knees)], arguments.table)
+    show([curve_sheet(curves, results, figures, knees)], arguments.table)
     if arguments.figure:
         draw_curves(curves, results, knees, arguments.figure)
 
@@ -125,22 +122,18 @@ def read_curves(lines: Sequence[str]) -> list[Curve]:
     return curves
 
 
-def mean_area(results: Results, spec: str) -> float:
-    """AUC@0.05 in percent, averaged over the families."""
+def area_and_cost(results: Results, spec: str) -> tuple[float, float]:
+    """AUC@0.05 in percent and milliseconds, averaged over the families."""
     groups = results.groups(results.pairs())
-    figure = FIGURES["AUC@0.05"]
-    return float(np.mean([figure.scale * figure.of(results.get(spec, groups[f])).mean() for f in results.families]))
+    own = [results.get(spec, groups[family]) for family in results.families]
+    area = float(np.mean([PERCENT * FIGURES["AUC@0.05"].of(get).mean() for get in own]))
+    return area, float(np.mean([get("ms").mean() for get in own]))
 
 
-def knee(curve: Curve, results: Results) -> str:
-    """The cheapest estimator within KNEE_TOLERANCE of the best AUC@0.05, averaged over the families."""
-    groups = results.groups(results.pairs())
-    area = {spec: mean_area(results, spec) for spec in curve.specs}
-    cost = {
-        spec: np.mean([results.get(spec, groups[f])("ms").mean() for f in results.families]) for spec in curve.specs
-    }
-    good = [spec for spec in curve.specs if area[spec] >= max(area.values()) - KNEE_TOLERANCE]
-    return min(good, key=cost.__getitem__)
+def knee(figures: Figures) -> str:
+    """The cheapest estimator of a curve within KNEE_TOLERANCE of its best."""
+    best = max(area for area, _ in figures.values())
+    return min((cost, spec) for spec, (area, cost) in figures.items() if area >= best - KNEE_TOLERANCE)[1]
 
 
 def _shown(results: Results) -> dict[str, list[str]]:
@@ -149,30 +142,28 @@ def _shown(results: Results) -> dict[str, list[str]]:
     return {name: groups[name] for name in BASELINES if name in groups} or {list(groups)[-1]: results.pairs()}
 
 
-def curve_sheet(curves: Sequence[Curve], results: Results, knees: Mapping[str, str]) -> Sheet:
+def curve_sheet(curves: Sequence[Curve], results: Results, figures: Figures, knees: Mapping[str, str]) -> Sheet:
     """A line for each point: time, and recall at 0.05, at 0.01 and AUC@0.05 of wide and of short baselines."""
     records: list[Record] = []
     for curve in curves:
-        area = {spec: mean_area(results, spec) for spec in curve.specs}
+        best = max(figures[spec][0] for spec in curve.specs)
         for spec, value in zip(curve.specs, curve.values, strict=True):
-            marks = ["best"] * (area[spec] == max(area.values())) + ["knee"] * (knees.get(curve.name) == spec)
+            marks = ["best"] * (figures[spec][0] == best) + ["knee"] * (knees.get(curve.name) == spec)
             line = {"curve": curve.name, "value": value, "ms": results.cell(spec, results.pairs(), "ms")}
             for group, own in _shown(results).items():
                 line |= {f"{group}: {name}": results.cell(spec, own, name) for name in ("R.05", "R.01", "AUC@0.05")}
-            line |= {"AUC@0.05 of families": f"{area[spec]:.1f}", "mark": " ".join(marks), "estimator": spec}
+            line |= {"AUC@0.05 of families": f"{figures[spec][0]:.1f}", "mark": " ".join(marks), "estimator": spec}
             records.append(line)
     return Sheet("curves", f"Accuracy in % against time: {results.described(results.pairs())}", records)
 
 
 def draw_curves(curves: Sequence[Curve], results: Results, knees: Mapping[str, str], path: Path) -> None:
     """AUC@0.05 against milliseconds, a panel for wide and one for short baselines."""
-    figure, panels = FIGURES["AUC@0.05"], {}
+    panels: dict[str, dict[str, tables.Line]] = {}
     for group, own in _shown(results).items():
-        lines = {}
         for curve in curves:
             x = [float(np.median(results.get(spec, own)("ms"))) for spec in curve.specs]
-            y = [figure.scale * float(figure.of(results.get(spec, own)).mean()) for spec in curve.specs]
+            y = [PERCENT * float(FIGURES["AUC@0.05"].of(results.get(spec, own)).mean()) for spec in curve.specs]
             marked = curve.specs.index(knees[curve.name]) if knees.get(curve.name) in curve.specs else None
-            lines[curve.name] = figures.Line(x, y, marked)
-        panels[group] = lines
-    figures.draw(path, panels, "ms a pair (median)", "AUC@0.05 [%]", xscale="log")
+            panels.setdefault(group, {})[curve.name] = tables.Line(x, y, marked)
+    tables.draw(path, panels, ("ms a pair (median)", "AUC@0.05 [%]"), "log")

@@ -1,12 +1,10 @@
 """Where the time of images goes: processor milliseconds by stage, and pairs proposed by the likeness of images."""
 
-from __future__ import annotations
-
 import argparse
 import functools
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from rich.progress import track
 
-from fmtorch import presets
+from fmtorch import data, presets
 from fmtorch.core.stages import pruned
 from fmtorch.data import ImagePair, read_image, to_grey
 from fmtorch.features import ImagePyramid, LocalFeature
@@ -68,18 +66,15 @@ class Clock:
     """Seconds of processor time between one stage and the next."""
 
     def __init__(self, stages: tuple[str, ...]) -> None:
-        self.seconds: Seconds = dict.fromkeys(stages, 0.0)
-        self.last = time.process_time()
+        self.seconds, self.last = dict.fromkeys(stages, 0.0), time.process_time()
 
     def stage(self, name: str) -> None:
         """What was computed since the last call belongs to this stage."""
-        now = time.process_time()
-        self.seconds[name] += now - self.last
-        self.last = now
+        self.seconds[name] += time.process_time() - self.last
+        self.last = time.process_time()
 
 
 def medians(seconds: list[Seconds]) -> Record:
-    """Of each stage and of their sum, in milliseconds."""
     totals = [{**each, "all": sum(each.values())} for each in seconds]
     return {f"{stage}, ms": f"{1e3 * np.median([each[stage] for each in totals]):.1f}" for stage in totals[0]}
 
@@ -189,18 +184,19 @@ PEERS: dict[str, tuple[str, Peer]] = {
 
 
 def run_similar(arguments: argparse.Namespace) -> None:
-    images = {root: images_of(root) for root in sorted(arguments.root)}
-    paths = [path for of_root in images.values() for path in of_root.values()]
-    overlapping = {pair: scene for root in images for scene, pair in overlaps(root, images[root])}
+    roots = sorted(arguments.root)
+    paths = [path for root in roots for path in sorted(root.glob("*/Images/*"))]
+    sets = [data.load("fmbench", root=root) for root in roots]  # pairs with a true F, which `fmtorch pairs` would keep
+    true = [pair for own in sets for pair in own]
+    overlapping = {frozenset((p.image0.path, p.image1.path)): f"{p.family}/{p.scene}" for p in true}
     pipeline = pipeline_of(arguments.pipeline)
     kind = descriptor_kind((presets.pipeline_stages(arguments.pipeline) or {})["features"])
     book = codebook(kind) if arguments.codebook is None else load_codebook(arguments.codebook)
     described = [describe(pipeline, read_image(path), 1600).features.descriptors for path in paths]
     start = time.process_time()
     vectors = torch.stack([vlad(local_descriptors(descriptors, kind), book) for descriptors in described])
-    print(
-        f"{len(paths)} images; {1e3 * (time.process_time() - start) / len(paths):.1f} s for a thousand once described"
-    )
+    seconds = (time.process_time() - start) / len(paths)
+    print(f"{len(paths)} images; {1e3 * seconds:.1f} s for a thousand once described")
     proposed = {n: {frozenset(pair) for pair in similar_pairs(paths, vectors, n)} for n in arguments.count}
     records: list[Record] = []
     for scene, count in [*Counter(overlapping.values()).items(), ("all", len(overlapping))]:
@@ -210,16 +206,3 @@ def run_similar(arguments: argparse.Namespace) -> None:
             line |= {f"similar:{n}, recall, %": f"{100 * hits / count:.0f}", f"similar:{n}, pairs": len(chosen)}
         records.append(line)
     show([Sheet("similar", f"Pairs proposed, of {len(paths) * (len(paths) - 1) // 2}", records)], arguments.table)
-
-
-def images_of(root: Path) -> dict[tuple[str, int], Path]:
-    """The images of a set, by scene and number."""
-    return {(path.parents[1].name, int(path.stem)): path for path in sorted(root.glob("*/Images/*"))}
-
-
-def overlaps(root: Path, images: dict[tuple[str, int], Path]) -> Iterator[tuple[str, frozenset[Path]]]:
-    """The pairs of a set with a true F, with their scene: those that `fmtorch pairs` would keep."""
-    scenes = (root / "pairs_which_dataset.txt").read_text().split()
-    lines = (root / "pairs_with_gt.txt").read_text().splitlines()
-    for scene, line in zip((scene.strip("/") for scene in scenes), lines, strict=True):
-        yield f"{root.name}/{scene}", frozenset(images[scene, int(number)] for number in line.split()[:2])

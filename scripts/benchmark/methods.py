@@ -1,29 +1,36 @@
 """Methods that are named in one word, PRESET[:KEY=VALUE,...][@PRUNER+PRUNER...], or as a pipeline with overrides.
 
-Pruners may have options, too. The estimator `truth` is the fit that starts from the true matrix, and so what the
-matches allow; without an estimator, as in `@gms`, pruners alone are meant.
+Pruners may have options, too. In place of a preset `find_fundamental` is the public call, with points, distance ratios
+and image sizes, and options as its arguments; `truth` is the fit that starts from the true matrix, and so what the
+matches allow. Without an estimator, as in `@gms`, pruners alone are meant. Among the pruners may be what changes the
+pair: `sizeless` and `ratioless` (these are not given), `part:left=0,top=0,right=0.5,bottom=0.5` (both images cropped,
+in fractions of their sides) and `bent:lens=-0.15` (points of two such lenses, F of pinholes). The last two come first.
 """
 
-from __future__ import annotations
-
+import dataclasses
 import functools
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 
+import fmtorch
 from fmtorch import presets
 from fmtorch.core.stages import Estimator, Pruner
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.data import ImagePair
 from fmtorch.geometry import refine
-from fmtorch.pipeline.pipeline import Pipeline, build_pipeline, load_pipeline
+from fmtorch.pipeline.pipeline import Outcome, Pipeline, build_pipeline, load_pipeline
 from fmtorch.presets.composition import PIPELINES, compose
-from scripts.benchmark.runner import Method, identity
+from scripts.benchmark import changes
+from scripts.benchmark.runner import Method, Stages, identity
 
-TRUTH, NGRANSAC = "truth", "ngransac"
+TRUTH, NGRANSAC, FIND = "truth", "ngransac", "find_fundamental"
+FIND_STAGES: Stages = [("estimator", "fmtorch", {})]
+FIND_STAGES += [("pruner", name, {}) for name in ("frame_consistency", "position_consistency")]
+VIEWS: dict[str, Callable[..., Any]] = {"part": changes.part, "bent": changes.bent}
 SHARED = frozenset(("ratio", "one_to_one"))  # pruners that nearly all pipelines have, whose time does not count
 NO_STAGES: Mapping[str, Pruner] = {}
 
@@ -44,15 +51,11 @@ def options(text: str) -> dict[str, Any]:
         inside = changed
         for part in parts:
             inside = inside.setdefault(part, {})
-        inside[last] = _parsed(value)
+        try:
+            inside[last] = json.loads(value)
+        except json.JSONDecodeError:
+            inside[last] = value
     return changed
-
-
-def _parsed(value: str) -> Any:
-    try:
-        return json.loads(value)
-    except json.JSONDecodeError:
-        return value
 
 
 def split(word: str) -> tuple[str, dict[str, Any]]:
@@ -62,25 +65,50 @@ def split(word: str) -> tuple[str, dict[str, Any]]:
 
 
 def build(group: str, word: str) -> Any:
-    """The part of ``PRESET[:KEY=VALUE,...]``, or one of `WITHHELD`."""
+    """The part of ``PRESET[:KEY=VALUE,...]``, one of `WITHHELD`, or the public call."""
     name, changed = split(word)
+    if group == "estimator" and name == FIND:
+        return functools.partial(estimate_by_call, changed)
     return WITHHELD[name] if name in WITHHELD else presets.build(group, name, **changed)
 
 
+def estimate_by_call(options: Mapping[str, Any], c: Correspondences, seed: int) -> Estimate:
+    """What `find_fundamental` makes of points, ratios and image sizes, and of a pruner's prior and noise.
+
+    options: its arguments, which replace these.
+    """
+    names = ("mask", "ratio", "prior", "noise", "size0", "size1", "key")
+    given: dict[str, Any] = {**{name: getattr(c, name) for name in names}, "seed": seed, **options}
+    return fmtorch.find_fundamental(c.x0, c.x1, **given)
+
+
 def stages_of(spec: str) -> list[str]:
-    """The words after ``@``."""
     return [stage for stage in spec.partition("@")[2].split("+") if stage]
 
 
 def method(spec: str, matches: str = "", extra: Mapping[str, Pruner] = NO_STAGES) -> Method:
     """The method of a spec on given matches. matches: what these depend on; extra: further stages by name."""
-    word, names = spec.partition("@")[0], stages_of(spec)
+    word, words = spec.partition("@")[0], stages_of(spec)
+    names = [name for name in words if split(name)[0] not in VIEWS]
     stages = {name: extra[name] if name in extra else build("pruner", name) for name in names}
-    own = [] if word == TRUTH else [("estimator", *split(word))]
-    own += [("pruner", *split(stage)) for stage in names if stage not in {*extra, *WITHHELD}]
-    others = [part for stage in names for part in (stage, stages[stage])]
+    called = split(word)[0] == FIND
+    own = FIND_STAGES if called else [] if word == TRUTH else [("estimator", *split(word))]
+    own = [*own, *(("pruner", *split(name)) for name in names if name not in {*extra, *WITHHELD})]
+    others: list[Any] = [part for stage in words for part in (stage, stages.get(stage))]
+    others += [{"_target_": f"fmtorch.{FIND}"}] if called else []
     solve = from_truth if word == TRUTH else functools.partial(_estimated, build("estimator", word))
-    return Method(spec, identity(own, word, matches, *others), lambda family: stages, solve)
+    views = [functools.partial(VIEWS[name], **changed) for name, changed in map(split, words) if name in VIEWS]
+    made_with = identity(own, word, matches, *others)
+    return Method(spec, made_with, lambda family: stages, solve, view=functools.partial(viewed, views))
+
+
+def viewed(views: Sequence[Callable[..., Any]], outcome: Outcome) -> Outcome:
+    pair, c = outcome.pair, outcome.correspondences
+    if c is None or not views:
+        return outcome
+    for view in views:
+        pair, c = view(pair, c)
+    return dataclasses.replace(outcome, pair=pair, correspondences=c)
 
 
 def call(spec: str) -> Callable[[Correspondences], Any]:
@@ -101,10 +129,8 @@ def from_truth(pair: ImagePair, c: Correspondences, seed: int) -> Estimate:
     for scale in (1.5, 0.7):  # px
         F = refine(F, c.x0, c.x1, c.prior, c.mask, loss="geman_mcclure", scale=scale, iterations=20)
     ok = torch.isfinite(F).all(-1).all(-1)
-    reason = "" if bool(ok) else "no fit"
-    return Estimate(
-        torch.where(ok[:, None, None], F, 0.0), c.mask & ok[:, None], ok, (reason,), torch.zeros(1, dtype=torch.int64)
-    )
+    F = torch.where(ok[:, None, None], F, 0.0)
+    return Estimate(F, c.mask & ok[:, None], ok, ("" if bool(ok) else "no fit",), torch.zeros(1, dtype=torch.int64))
 
 
 def pipeline_of(words: str, *overrides: str) -> Pipeline:
@@ -139,15 +165,7 @@ def ngransac(file: Path | None) -> dict[str, Pruner]:
     return {NGRANSAC: presets.build("pruner", "lc", soft=True, network=network, file=str(file))}
 
 
-def sizeless(c: Correspondences) -> Correspondences:
-    """The matches of images whose sizes nobody tells."""
-    return c.replace(size0=None, size1=None)
-
-
-def ratioless(c: Correspondences) -> Correspondences:
-    """The matches without their distance ratios."""
-    return c.replace(ratio=None)
-
-
-WITHHELD: dict[str, Pruner] = {"sizeless": sizeless, "ratioless": ratioless}
+WITHHELD: dict[str, Pruner] = {
+    "sizeless": lambda c: c.replace(size0=None, size1=None), "ratioless": lambda c: c.replace(ratio=None)
+}  # fmt: skip
 """Stages that are no presets: what an estimator is not given."""

@@ -1,14 +1,11 @@
 """The pairs that benchmarks run on, with their matches: data sets, synthetic ones, photographs of different scenes."""
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import functools
 import itertools
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import NamedTuple
 from unittest import mock
 
 import numpy as np
@@ -25,14 +22,13 @@ from fmtorch.runs.feature_cache import cached
 from fmtorch.scenes import RenderedPairs, surfaces
 from fmtorch.scenes import dataset as generate
 from scripts.benchmark import methods
-from scripts.benchmark.runner import Item, Stages, identity
+from scripts.benchmark.runner import Item, Kept, Row, Stages, identity
 
 SIZE = (768, 1024)  # (h, w) of synthetic pairs
 UNRELATED = "unrelated"  # what the names of families of pairs of different scenes begin with
 
 
 def add_set_options(parser: argparse.ArgumentParser, limit: int | None = None) -> None:
-    """The options that say which pairs."""
     parser.add_argument("--root", action="append", default=[], help="a set in the FM-Bench layout; may be repeated")
     parser.add_argument("--rendered", choices=["small", "full"], help="also the embedded data set, of this size")
     parser.add_argument("--split", default="test", help="of --rendered: test or train; a --root has no splits")
@@ -61,8 +57,16 @@ def pairs_of(arguments: argparse.Namespace) -> list[ImagePair]:
 
 
 def named(arguments: argparse.Namespace) -> bool:
-    """Whether the options name a data set."""
     return bool(arguments.root or arguments.rendered)
+
+
+def rows_of(arguments: argparse.Namespace, measured: Callable[[Kept], list[Row]]) -> list[Row]:
+    """The rows of the data sets that the options name, or else all that are kept. Raises SystemExit for none."""
+    kept = Kept(arguments.rows)
+    rows = measured(kept) if named(arguments) else kept.rows
+    if not rows:
+        raise SystemExit("nothing to show: name sets with --root or --rendered, or a file of earlier --rows")
+    return rows
 
 
 def front_of(features: str, pruners: Iterable[str], cache: str = "off", memory: int = 64) -> Pipeline:
@@ -85,7 +89,6 @@ def matched(arguments: argparse.Namespace) -> list[Item]:
 
 
 def items(pairs: Iterable[ImagePair], front: Pipeline) -> list[Item]:
-    """The pairs with the matches of a pipeline's first stages."""
     return [Item(p, functools.partial(_match, front, p), images=functools.partial(front.images, p)) for p in pairs]
 
 
@@ -147,15 +150,6 @@ def _tensor(value: np.ndarray) -> torch.Tensor:
     return torch.from_numpy(value.astype(np.float32))[None]
 
 
-class Scene(NamedTuple):
-    """The photographs of one scene, and the names of those that its own surfaces show (rendered scenes)."""
-
-    name: str
-    images: tuple[ImageSource, ...]
-    shows: frozenset[str]
-    drawn: bool
-
-
 def unrelated_pairs(pairs: Sequence[ImagePair], datasets: Sequence[PairDataset], most: int) -> list[ImagePair]:
     """Pairs of the photographs of different scenes, at most so many of each two scenes, chosen by hash.
 
@@ -171,31 +165,25 @@ def unrelated_pairs(pairs: Sequence[ImagePair], datasets: Sequence[PairDataset],
     shown: dict[str, frozenset[str]] = {}
     for dataset in datasets:
         shown |= photographs_shown(dataset) if isinstance(dataset, RenderedPairs) else {}
+    scenes: dict[tuple[str, str], dict[str, ImageSource]] = {}
+    for pair in sorted(pairs, key=lambda pair: f"{pair.family}/{pair.scene}"):
+        scenes.setdefault((pair.family, pair.scene), {}).update({i.identity: i for i in (pair.image0, pair.image1)})
     chosen = []
-    for a, b in itertools.combinations(sorted(_scenes(pairs, shown), key=lambda scene: scene.name), 2):
-        if a.drawn == b.drawn and not a.shows & b.shows:
-            crossed = sorted((_crossed(a, b, i, j) for i in a.images for j in b.images), key=lambda pair: pair.key)
-            chosen += crossed[:most]
+    for a, b in itertools.combinations(scenes, 2):
+        drawn = a[1] in shown
+        if drawn == (b[1] in shown) and not (drawn and shown[a[1]] & shown[b[1]]):
+            both = itertools.product(scenes[a].values(), scenes[b].values())
+            crossed = [_crossed("/".join(a), "/".join(b), drawn, *images) for images in both]
+            chosen += sorted(crossed, key=lambda pair: pair.key)[:most]
     return chosen
 
 
-def _crossed(a: Scene, b: Scene, image0: ImageSource, image1: ImageSource) -> ImagePair:
-    family = f"{UNRELATED}, {'rendered' if a.drawn else 'real'}"
-    identity = f"{a.name}/{image0.identity} | {b.name}/{image1.identity}"
+def _crossed(a: str, b: str, drawn: bool, image0: ImageSource, image1: ImageSource) -> ImagePair:
+    family = f"{UNRELATED}, {'rendered' if drawn else 'real'}"
+    identity = f"{a}/{image0.identity} | {b}/{image1.identity}"
     if pair_key(identity) % 2:  # either scene comes first in half of the pairs
         image0, image1 = image1, image0
-    return ImagePair(identity, family, f"{a.name} | {b.name}", image0, image1, np.zeros((3, 3)))
-
-
-def _scenes(pairs: Sequence[ImagePair], shown: Mapping[str, frozenset[str]]) -> list[Scene]:
-    """The scenes of these pairs; shown: what each rendered scene shows, by its name."""
-    images: dict[tuple[str, str], dict[str, ImageSource]] = {}
-    for pair in pairs:
-        images.setdefault((pair.family, pair.scene), {}).update({i.identity: i for i in (pair.image0, pair.image1)})
-    return [
-        Scene(f"{family}/{scene}", tuple(of[key] for key in sorted(of)), shown.get(scene, frozenset()), scene in shown)
-        for (family, scene), of in images.items()
-    ]
+    return ImagePair(identity, family, f"{a} | {b}", image0, image1, np.zeros((3, 3)))
 
 
 def photographs_shown(dataset: RenderedPairs) -> dict[str, frozenset[str]]:

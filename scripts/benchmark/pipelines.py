@@ -9,12 +9,10 @@ python -m scripts.benchmark pipelines --root DATA/Strecha --root DATA/PhotoTouri
 python -m scripts.benchmark pruning --rendered full --limit 50 --pipelines RATIO 'mine = sift_ratio pruner=[ratio,lpm]'
 """
 
-from __future__ import annotations
-
 import argparse
 import fnmatch
 import functools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,17 +26,17 @@ from fmtorch.pipeline.pipeline import Outcome, Pipeline
 from scripts.benchmark import pairs
 from scripts.benchmark.methods import pipeline_method
 from scripts.benchmark.runner import Item, Kept, Measured, Method, Row, add_command, measure
-from scripts.benchmark.tables import KIN, Published, Record, Results, Sheet, published, show
+from scripts.benchmark.tables import KIN, Record, Results, Sheet, published, show
 
 FOLDER = Path(__file__).parent
 BENCHMARKS = ("pipelines", "hard", "paper", "pruning", "learned", "refinement", "gc_ransac")
 RULE = "the paper's rule"
 PAPER = {"%Recall": "recall", "%Inlier": "inlier", "%Inlier-m": "inlier_m", "#Corrs": "corrs", "#Corrs-m": "corrs_m"}
 """Columns of the paper's tables, by what they are called here and there."""
+Settings = Mapping[str, Any]
 
 
 def settings_of(name: str) -> dict[str, Any]:
-    """The page of settings of a benchmark."""
     settings: dict[str, Any] = yaml.safe_load((FOLDER / f"{name}.yaml").read_text(encoding="utf-8"))
     return settings
 
@@ -49,73 +47,61 @@ def add_arguments(commands: Any) -> None:
         about = f"{settings['about']}\n\n{(__doc__ or '').partition(chr(10))[2]}"
         parser = add_command(commands, name, functools.partial(run, settings), about, seeds=settings.get("seeds", 1))
         pairs.add_set_options(parser)
-        parser.add_argument(
-            "--asift-limit", type=int, default=10, help="the same of pipelines with ASIFT, a minute a pair"
-        )
+        asift = "the same of pipelines with ASIFT, a minute a pair"
+        parser.add_argument("--asift-limit", type=int, default=10, help=asift)
         add_pipeline_options(parser)
 
 
 def add_pipeline_options(parser: argparse.ArgumentParser) -> None:
-    """Which pipelines, with which options."""
-    parser.add_argument(
-        "--pipelines", nargs="*", default=["*"], help="names or patterns of the settings, or NAME = WORDS"
-    )
+    names = "names or patterns of the settings, or NAME = WORDS"
+    parser.add_argument("--pipelines", nargs="*", default=["*"], help=names)
     parser.add_argument("--overrides", nargs="*", default=[], help="of each pipeline, e.g. features.precision=int8")
     parser.add_argument("--label", default="", help="appended to the pipelines' names in the tables")
     parser.add_argument("--cache", default="null", help="folder of features; null: the user's; off: nowhere")
 
 
-def run(settings: Mapping[str, Any], arguments: argparse.Namespace) -> None:
-    kept = Kept(arguments.rows)
-    rows = kept.rows
-    if pairs.named(arguments):
+def run(settings: Settings, arguments: argparse.Namespace) -> None:
+    def measured_rows(kept: Kept) -> list[Row]:
         every = pairs.pairs_of(arguments)
-        chosen = chosen_pipelines(settings["methods"], arguments.pipelines)
-        rows = judged_by_rule(every, kept) if settings.get("rule") else []
-        rows += measured(chosen, every, arguments, kept)
-    if not rows:
-        raise SystemExit("nothing to show: name sets with --root or --rendered, or a file of earlier --rows")
+        bare = [Item(pair, functools.partial(Outcome, pair)) for pair in every]
+        rows = measure([Rule()], bare, 1, kept, RULE) if settings.get("rule") else []
+        return rows + measured(settings["methods"], every, arguments, kept)
+
+    rows = pairs.rows_of(arguments, measured_rows)
     selected = {row["pair"] for row in rows if row["method"] == RULE and row["selected"]}
     results = Results(row for row in rows if row["method"] != RULE)
     sheets = [figures_sheet(results, settings, selected), differences_sheet(results, settings)]
     show([sheet for sheet in sheets if sheet.records], arguments.table)
 
 
-def chosen_pipelines(known: Mapping[str, str], wanted: Sequence[str]) -> dict[str, str]:
+def selected_pipelines(known: Mapping[str, str], wanted: Sequence[str]) -> dict[str, str]:
     """The pipelines that are asked for, by name. Raises SystemExit for one that is none."""
-    chosen: dict[str, str] = {}
+    selected: dict[str, str] = {}
     for word in wanted:
         name, equals, words = (part.strip() for part in word.partition(" = "))
         names = fnmatch.filter(known, name)
         if not equals and not names and "*" in name:
             raise SystemExit(f"--pipelines {word!r}: there are {', '.join(known)}")
-        chosen |= {name: words} if equals else {n: known[n] for n in names} if names else {name: name}
-    return chosen
+        selected |= {name: words} if equals else {n: known[n] for n in names} if names else {name: name}
+    return selected
 
 
-def measured(chosen: Mapping[str, str], every: Sequence[ImagePair], arguments: Any, kept: Kept) -> list[Row]:
-    """The rows of pipelines on pairs; those with the same features share their matches and take turns."""
-    rows: list[Row] = []
-    for front, methods in by_front(chosen, arguments):
-        own = every
-        if isinstance(getattr(front.extractor, "extractor", front.extractor), ASIFT):
-            own = select(every, arguments.asift_limit)
-        rows += measure(methods, pairs.items(own, front), arguments.seeds, kept, methods[0].name)
-    return rows
-
-
-def by_front(chosen: Mapping[str, str], arguments: argparse.Namespace) -> Iterator[tuple[Pipeline, list[Method]]]:
-    """What makes matches, and the methods that start from these."""
+def measured(known: Mapping[str, str], every: Sequence[ImagePair], arguments: Any, kept: Kept) -> list[Row]:
+    """The rows of the pipelines that are asked for; those with the same features share their matches and take turns."""
     groups: dict[str, tuple[Pipeline, list[Method]]] = {}
-    for name, words in chosen.items():
-        made, pipeline, front = pipeline_method(
-            name + arguments.label, words, f"cache={arguments.cache}", *arguments.overrides
-        )
+    for name, words in selected_pipelines(known, arguments.pipelines).items():
+        overrides = f"cache={arguments.cache}", *arguments.overrides
+        method, pipeline, front = pipeline_method(name + arguments.label, words, *overrides)
         if front not in groups:
             shared = Pipeline(pipeline.extractor, pipeline.matcher, {}, pairs.no_estimator, model=None)
             groups[front] = shared, []
-        groups[front][1].append(made)
-    yield from groups.values()
+        groups[front][1].append(method)
+    rows: list[Row] = []
+    for pipeline, methods in groups.values():
+        slow = isinstance(getattr(pipeline.extractor, "extractor", pipeline.extractor), ASIFT)
+        own = select(every, arguments.asift_limit) if slow else every
+        rows += measure(methods, pairs.items(own, pipeline), arguments.seeds, kept, methods[0].name)
+    return rows
 
 
 class Rule(Measured):
@@ -131,59 +117,44 @@ class Rule(Measured):
         return {"selected": bool(matchable(a, b, item.pair.F))}
 
 
-def judged_by_rule(every: Sequence[ImagePair], kept: Kept) -> list[Row]:
-    """A row for each pair that says whether the paper's rule selects it."""
-    return measure([Rule()], [Item(pair, functools.partial(Outcome, pair)) for pair in every], 1, kept, RULE)
-
-
-def figures_sheet(results: Results, settings: Mapping[str, Any], selected: set[str]) -> Sheet:
+def figures_sheet(results: Results, settings: Settings, selected: set[str]) -> Sheet:
     """Each set's figures, beside the paper's; recall apart for pairs that the paper's rule selects and leaves out."""
-    paper = published(FOLDER / settings["published"] if "published" in settings else None)
     groups = results.groups(results.all_pairs)
     groups.pop("all", None)
-    records = results.records(
-        groups, settings["columns"], label="pipeline", intervals=True,
-        minus=settings.get("minus", ()), against=settings.get("against"),
-    )  # fmt: skip
+    minus, against = settings.get("minus", ()), settings.get("against", "")
+    records = results.records(groups, settings["columns"], "pipeline", minus, against, intervals=True)
     for record in records:
         own = [pair for pair in groups[record["set"]] if pair in results.pairs(record["pipeline"])]
-        if settings.get("rule"):
-            for head, inside in (("selected", True), ("left out", False)):
-                apart = [pair for pair in own if (pair in selected) == inside]
-                record[f"%Recall, {head}"] = results.cell(record["pipeline"], apart, "R.05")
-        if theirs := _papers(paper, settings, record["set"], record["pipeline"]):
-            record |= {
-                "paper's set": KIN[record["set"]],
-                **{f"paper: {c}": theirs[field] for c, field in PAPER.items()},
-            }
-    title = f"{settings['about']}: {results.described(results.all_pairs)}"
-    return Sheet("", title, records)
+        for head, inside in (("selected", True), ("left out", False)) if settings.get("rule") else ():
+            apart = [pair for pair in own if (pair in selected) == inside]
+            record[f"%Recall, {head}"] = results.cell(record["pipeline"], apart, "R.05")
+        if theirs := _papers(settings, record["set"], record["pipeline"]):
+            record |= {"paper's set": KIN[record["set"]]} | {f"paper: {c}": theirs[field] for c, field in PAPER.items()}
+    return Sheet("", f"{settings['about']}: {results.described(results.all_pairs)}", records)
 
 
-def _papers(paper: Published, settings: Mapping[str, Any], family: str, name: str) -> dict[str, str]:
+def _papers(settings: Settings, family: str, name: str) -> dict[str, str]:
     """The paper's figures of a pipeline, by its name or words, on its set of the same kind of motion."""
+    paper = published(FOLDER / settings["published"]) if "published" in settings else {}
     words = settings["methods"].get(name, name).replace(" features=sift_vlfeat", "")
     kin = KIN.get(family, "")
     return paper.get((kin, name)) or paper.get((kin, words)) or {}
 
 
-def differences_sheet(results: Results, settings: Mapping[str, Any]) -> Sheet:
+def differences_sheet(results: Results, settings: Settings) -> Sheet:
     """What one pipeline has more than another on the pairs that both have, of each set."""
-    paper = published(FOLDER / settings["published"] if "published" in settings else None)
-    two = [
-        (first, second) for first, second in settings.get("differences", []) if {first, second} <= set(results.methods)
-    ]
+    stated = [tuple(two) for two in settings.get("differences", []) if set(two) <= set(results.methods)]
     labelled = [(name, base) for name in results.methods for base in results.methods if name.startswith(f"{base} ")]
     records = []
     for group, every in results.groups(results.all_pairs).items():
-        for first, second in [*two, *(pair for pair in labelled if pair not in two)]:
+        for first, second in dict.fromkeys([*stated, *labelled]):
             common = [pair for pair in results.pairs(first, second) if pair in set(every)]
             if not common:
                 continue
             line: Record = {"set": group, "pairs": len(common), "pipeline": first, "minus": second}
             for name in settings.get("compared", ("%Recall", "AUC@0.05")):
                 line[name] = results.difference(first, second, common, name)
-            theirs = [_papers(paper, settings, group, name) for name in (first, second)]
+            theirs = [_papers(settings, group, name) for name in (first, second)]
             if all(theirs):
                 line["paper: %Recall"] = f"{float(theirs[0]['recall']) - float(theirs[1]['recall']):+.1f}"
             records.append(line)

@@ -18,28 +18,39 @@ import argparse
 import dataclasses
 import functools
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from rich.progress import track
 
-from fmtorch import find_homography, metrics, presets
-from fmtorch.core.types import PAIR_TYPES, Correspondences, collate
+from fmtorch import find_homography, match, metrics, presets
+from fmtorch.core.types import PAIR_TYPES, Correspondences, Estimate, collate
+from fmtorch.data import ImagePair, ImageSource, read_image
 from fmtorch.estimators.external import colmap
 from fmtorch.geometry import poses_from_homography
+from fmtorch.pipeline.pipeline import Outcome
+from fmtorch.training.planes import Photograph, PlanePairs, PlaneViews
 from fmtorch.two_view.known_cameras import KnownCameras
 from fmtorch.two_view.pair_type import classify
 from scripts.benchmark import pairs
 from scripts.benchmark.methods import options
-from scripts.benchmark.photographs import Array, Plane, add_options, kinds, mapped, paths_of, points, views, warped
-from scripts.benchmark.runner import Item, Kept, Measured, Row, add_command, console, measure, milliseconds
+from scripts.benchmark.runner import Item, Kept, Measured, Row, add_command, console, measure
 from scripts.benchmark.tables import Record, Results, Sheet, show
 
-Solver = Callable[[Correspondences, int], Array | None]
+POSES = ("from F", "from H, the first pose", "from H, the better one")
+KINDS = ("warped", "hard", "views")
 METHODS = ("ours", "poselib:1", "poselib:2", "poselib:3", "usac_accurate:1", "usac_magsac:0.5")
+Array = NDArray[Any]
+SIDE = 640  # px, the longer side of the photographs
+HARD_RIGHT, HARD_WRONG_SHARE = 60, 0.7
+GRID = 12  # points along each side of a view
+FOCAL, WIDE_FOCAL = 1.2, 0.8  # of the longer side: of warped photographs and copies; of one that is looked around in
+BEHIND = 7  # photographs further on is the one that is seen behind a plane
 CONFIGURATION = """Kinds of image pairs: confusion tables of `classify` and of COLMAP's rule, on the same matches.
 
 Photographs: each as a plane, looked around in, copied, cropped, and beside another one. Every second photograph is for
@@ -58,30 +69,37 @@ COLMAP = {
 
 
 def add_arguments(commands: Any) -> None:
-    parser = add_command(commands, "homography", run, __doc__, seeds=3)
-    add_options(parser, required=True)
-    parser.add_argument("--methods", nargs="+", default=METHODS, help="NAME:THRESHOLD or ours:KEY=VALUE,...")
-    parser.add_argument("--kinds", nargs="+", default=["warped", "hard", "views"], choices=["warped", "hard", "views"])
-    parser.add_argument("--warps", type=int, default=1, help="pairs of each kind and photograph")
-    parser.add_argument("--limit", type=int, help="photographs at most")
-    parser = add_command(commands, "pair_types", run_pair_types, CONFIGURATION)
-    add_options(parser, required=False)
-    pairs.add_match_options(parser)
-    parser.add_argument("--colmap", nargs="*", type=float, default=[4.0, 1.0], help="COLMAP's thresholds, px")
-    parser.add_argument("--unknown", action="store_true", help="without calibrations, by image sizes alone")
-    parser.set_defaults(pruners=["ratio", "one_to_one", "frame_consistency", "match_noise"])
+    planes = add_command(commands, "homography", run, __doc__, seeds=3)
+    types = add_command(commands, "pair_types", run_pair_types, CONFIGURATION)
+    for parser in (planes, types):
+        parser.add_argument("--photographs", type=Path, required=parser is planes, help="a folder of photographs")
+        parser.add_argument("--tuning", action="store_true", help="the photographs for choosing constants")
+    planes.add_argument("--methods", nargs="+", default=METHODS, help="NAME:THRESHOLD or ours:KEY=VALUE,...")
+    planes.add_argument("--kinds", nargs="+", default=KINDS, choices=KINDS)
+    planes.add_argument("--warps", type=int, default=1, help="pairs of each kind and photograph")
+    planes.add_argument("--limit", type=int, help="photographs at most")
+    pairs.add_match_options(types)
+    types.add_argument("--colmap", nargs="*", type=float, default=[4.0, 1.0], help="COLMAP's thresholds, px")
+    types.add_argument("--unknown", action="store_true", help="without calibrations, by image sizes alone")
+    types.set_defaults(pruners=["ratio", "one_to_one", "frame_consistency", "match_noise"])
 
 
 def run(arguments: argparse.Namespace) -> None:
     paths = paths_of(arguments)
-    made = [*(warped(paths, arguments.warps) if {"warped", "hard"} & set(arguments.kinds) else ()),
-            *(views(paths, arguments.warps) if "views" in arguments.kinds else ())]  # fmt: skip
-    items = [item for item in track(made, "warping", console=console) if item.pair.family in arguments.kinds]
+    planes = [*(warped(paths, arguments.warps) if {"warped", "hard"} & set(arguments.kinds) else ()),
+              *(views(paths, arguments.warps) if "views" in arguments.kinds else ())]  # fmt: skip
+    items = [item for item in track(planes, "warping", console=console) if item.pair.family in arguments.kinds]
     results = Results(measure([Homography.of(word) for word in arguments.methods], items, arguments.seeds, Kept(None)))
-    columns = [*(f"AUC@{px} px" for px in (1, 3, 5)), "ms"]
     groups = {kind: own for kind, own in results.groups(results.all_pairs).items() if kind in results.families}
-    records = results.records(groups, columns, label="method", minus=["AUC@1 px"])
+    records = results.records(groups, [*(f"AUC@{px} px" for px in (1, 3, 5)), "ms"], "method", ["AUC@1 px"])
     show([Sheet("homography", "AUC of the mean distance of points, in %", records)], arguments.table)
+
+
+@dataclasses.dataclass
+class Plane(Item):
+    """Two pictures of a plane. points: (n, 2), where an estimate of the homography is judged."""
+
+    points: Array = dataclasses.field(default_factory=lambda: np.zeros((0, 2)))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,7 +107,7 @@ class Homography(Measured):
     """An estimator of homographies."""
 
     name: str
-    solve: Solver
+    solve: Callable[[Correspondences, int], Array | None]
     identity: str = ""
 
     @classmethod
@@ -98,9 +116,7 @@ class Homography(Measured):
         name, _, setting = word.partition(":")
         if name == "ours":
             return cls(word, functools.partial(_ours, options(setting)))
-        if name == "poselib":
-            return cls(word, functools.partial(_poselib, float(setting)))
-        return cls(word, functools.partial(_opencv, getattr(cv2, name.upper()), float(setting)))
+        return cls(word, functools.partial(_peer, name, float(setting)))
 
     def figures(self, item: Item, seed: int) -> Row:
         """The mean error in pixels, infinite where there is no homography, and milliseconds."""
@@ -115,25 +131,27 @@ class Homography(Measured):
         return row
 
 
+def estimated(c: Correspondences, seed: int = 0, **changed: Any) -> Estimate:
+    given: dict[str, Any] = {name: getattr(c, name) for name in ("mask", "ratio", "prior", "noise", "key")}
+    return find_homography(c.x0, c.x1, seed=seed, **given, **changed)
+
+
 def _ours(changed: dict[str, Any], c: Correspondences, seed: int) -> Array | None:
-    given: dict[str, Any] = {"mask": c.mask, "ratio": c.ratio, "prior": c.prior, "noise": c.noise, "key": c.key}
-    estimate = find_homography(c.x0, c.x1, seed=seed, **given, **changed)
+    estimate = estimated(c, seed, **changed)
     return estimate.H[0].numpy() if bool(estimate.ok[0]) else None
 
 
-def _poselib(threshold: float, c: Correspondences, seed: int) -> Array | None:
-    import poselib
-
-    H, _ = poselib.estimate_homography(*points(c), {"max_reproj_error": threshold, "seed": seed}, {})
-    return np.asarray(H)
-
-
-def _opencv(method: int, threshold: float, c: Correspondences, seed: int) -> Array | None:
-    cv2.setRNGSeed(seed)
+def _peer(name: str, threshold: float, c: Correspondences, seed: int) -> Array | None:
+    """Of PoseLib, or by a method of OpenCV."""
     x0, x1 = points(c)
+    if name == "poselib":
+        import poselib
+
+        return np.asarray(poselib.estimate_homography(x0, x1, {"max_reproj_error": threshold, "seed": seed}, {})[0])
+    cv2.setRNGSeed(seed)
     if len(x0) < 4:
         return None
-    H, _ = cv2.findHomography(x0, x1, method, threshold, maxIters=2000, confidence=0.9999)
+    H, _ = cv2.findHomography(x0, x1, getattr(cv2, name.upper()), threshold, maxIters=2000, confidence=0.9999)
     return None if H is None else np.asarray(H)
 
 
@@ -141,8 +159,10 @@ def run_pair_types(arguments: argparse.Namespace) -> None:
     items: list[Item] = []
     if arguments.photographs:
         items += track(list(kinds(paths_of(arguments))), "warping", console=console)
-    if pairs.named(arguments):
-        items += real(arguments)
+    for item in pairs.matched(arguments) if pairs.named(arguments) else ():
+        if item.pair.K0 is not None and item.pair.K1 is not None and item.outcome and item.outcome.correspondences:
+            item.facts["truth"] = "general" if {item.pair.scene, item.pair.family} & GENERAL else ""
+            items.append(item)
     methods: dict[str, Callable[[Correspondences], str]] = {"fmtorch": Ours(not arguments.unknown)}
     methods |= {f"COLMAP, {px:g} px": functools.partial(by_colmap, px) for px in arguments.colmap}
     verdicts = {
@@ -151,17 +171,6 @@ def run_pair_types(arguments: argparse.Namespace) -> None:
     }
     show([kinds_sheet(items, verdicts), pose_sheet(items, verdicts["fmtorch"])], arguments.table)
     print(time_line([item.matches for item in items]))
-
-
-def real(arguments: argparse.Namespace) -> list[Item]:
-    """Pairs of data sets with their cameras; of scenes of depth they are general."""
-    items = []
-    for item in pairs.matched(arguments):
-        pair, outcome = item.pair, item.outcome
-        if pair.K0 is not None and pair.K1 is not None and outcome is not None and outcome.correspondences is not None:
-            item.facts["truth"] = "general" if {pair.scene, pair.family} & GENERAL else ""
-            items.append(item)
-    return items
 
 
 class Ours:
@@ -179,13 +188,13 @@ class Ours:
 
 def by_colmap(threshold: float, c: Correspondences) -> str:
     """COLMAP's two-view geometry of calibrated cameras at a threshold of so many pixels."""
-    ends = []
-    for number, (K, size) in enumerate(((c.K0, c.size0), (c.K1, c.size1))):
-        assert K is not None
-        assert size is not None
-        ends.append(colmap.Camera(K[0].double().numpy(), number=number, size=(int(size[0, 0]), int(size[0, 1]))))
-    given = colmap.two_view_options(threshold, 0)
-    return COLMAP[colmap.two_view_geometry(*points(c), (ends[0], ends[1]), given).configuration]
+    known: Any = ((c.K0, c.size0), (c.K1, c.size1))
+    first, second = (
+        colmap.Camera(K[0].double().numpy(), number=number, size=(int(size[0, 0]), int(size[0, 1])))
+        for number, (K, size) in enumerate(known)
+    )
+    geometry = colmap.two_view_geometry(*points(c), (first, second), colmap.two_view_options(threshold, 0))
+    return COLMAP[geometry.configuration]
 
 
 def kinds_sheet(items: Sequence[Item], verdicts: dict[str, list[str]]) -> Sheet:
@@ -194,9 +203,8 @@ def kinds_sheet(items: Sequence[Item], verdicts: dict[str, list[str]]) -> Sheet:
     for name, said in verdicts.items():
         groups: dict[tuple[str, str], list[str]] = {}
         for item, kind in zip(items, said, strict=True):
-            groups.setdefault(
-                (f"{item.pair.family}/{item.pair.scene}" if item.images else item.pair.family, item.facts["truth"]), []
-            ).append(kind)
+            scene = "" if isinstance(item, Plane) else f"/{item.pair.scene}"
+            groups.setdefault((item.pair.family + scene, item.facts["truth"]), []).append(kind)
         for (group, truth), own in groups.items():
             line: Record = {"method": name, "pairs of": group, "truth": truth, "pairs": len(own)}
             line |= {kind: own.count(kind) for kind in PAIR_TYPES}
@@ -215,9 +223,7 @@ def pose_sheet(items: Sequence[Item], said: Sequence[str]) -> Sheet:
     for (family, kind), errors in groups.items():
         line: Record = {"set": family, "kind": kind, "pairs": len(errors)}
         areas = 100 * metrics.pose_auc(torch.from_numpy(np.stack(errors, 1)))
-        for name, own in zip(
-            ("from F", "from H, the first pose", "from H, the better one"), areas.tolist(), strict=True
-        ):
+        for name, own in zip(POSES, areas.tolist(), strict=True):
             line |= {f"{name} @{t}": f"{area:.1f}" for t, area in zip((5, 10, 20), own, strict=True)}
         records.append(line)
     return Sheet("poses", "AUC of the pose error, in %", records)
@@ -229,8 +235,7 @@ def pose_errors(c: Correspondences, R: torch.Tensor, t: torch.Tensor) -> Array:
     assert c.K1 is not None
     estimate = presets.build("estimator", "fmtorch")(c, 0)
     from_F = metrics.fundamental_pose_error(estimate.F, c.K0, c.K1, c.x0, c.x1, R[None], t[None], estimate.inliers)
-    given: dict[str, Any] = {"mask": c.mask, "ratio": c.ratio, "prior": c.prior, "noise": c.noise, "key": c.key}
-    H = find_homography(c.x0, c.x1, **given)
+    H = estimated(c)
     poses = poses_from_homography(H.F, c.K0, c.K1, c.x0.double(), c.x1.double(), H.inliers)
     seen = torch.where(poses.valid[..., None, None], poses.R, torch.nan)
     from_H = metrics.pose_error(seen, poses.t, R[None, None], t[None, None]).worst[0].nan_to_num(180.0)
@@ -244,5 +249,184 @@ def time_line(matches: Sequence[Correspondences]) -> str:
     estimator = presets.build("estimator", "fmtorch")
     estimate = estimator(c, 0)
     classify(c, estimate)
-    ms = [milliseconds(call) / len(c) for call in (lambda: estimator(c, 0), lambda: classify(c, estimate))]
+    times = [time.process_time()]
+    for call in (lambda: estimator(c, 0), lambda: classify(c, estimate)):
+        call()
+        times.append(time.process_time())
+    ms = 1e3 * np.diff(times) / len(c)
     return f"{len(c)} pairs, median {int(c.count().median())} matches: F {ms[0]:.2f} ms, kinds {ms[1]:.2f} ms"
+
+
+# Pairs made of photographs: planes seen from the side, rotations, copies and crops, and unrelated photographs
+
+
+def paths_of(arguments: argparse.Namespace) -> list[Path]:
+    """The photographs that are asked for. Raises SystemExit for fewer than two."""
+    paths = sorted(path for path in arguments.photographs.iterdir() if path.suffix in (".jpg", ".png"))
+    paths = paths[(0 if arguments.tuning else 1) :: 2][: arguments.limit]
+    if len(paths) < 2:
+        raise SystemExit("error: two photographs at least are needed, of which one is behind the other")
+    return paths
+
+
+def item_of(kind: str, path: Path, seed: int, c: Correspondences, points: Array | None = None, **known: Any) -> Plane:
+    image = ImageSource(path.name, path)
+    pair = ImagePair(f"{kind}/{path.name}/{seed}", kind, path.stem, image, image, np.zeros((3, 3)), **known)
+    outcome = Outcome(pair, (c.mask.shape[1],) * 2, c)
+    return Plane(pair, lambda: outcome, points=np.zeros((0, 2)) if points is None else points)
+
+
+def warped(paths: Sequence[Path], warps: int, hard_too: bool = True) -> Iterator[Plane]:
+    """Each photograph as a plane seen from the side over another; of each the same with few right matches."""
+    for seed, path in ((i + 1000 * k, path) for k in range(warps) for i, path in enumerate(paths)):
+        image, background = small(path), small(paths[(seed % 1000 + min(BEHIND, len(paths) - 1)) % len(paths)])
+        view, H = tilted(np.random.default_rng(seed), image, background)
+        h, w = image.shape[:2]
+        corners = np.array([[0, 0], [w - 1, 0], [w - 1, h - 1], [0, h - 1]], float)
+        c = matched(image, view)
+        yield item_of("warped", path, seed, c, corners, H=H)
+        if hard_too:
+            yield item_of("hard", path, seed, hard(c, H, seed), corners, H=H)
+
+
+def tilted(rng: np.random.Generator, image: Array, background: Array) -> tuple[Array, Array]:
+    """A photograph as a plane before a pinhole camera that looks at it from the side, and the homography to that."""
+    h, w = image.shape[:2]
+    tilt, direction, turn = np.deg2rad([rng.uniform(20, 55), rng.uniform(0, 360), rng.uniform(-20, 20)])
+    axes = tilt * np.array([np.cos(direction), np.sin(direction), 0.0]), np.array([0, 0, turn])
+    R = cv2.Rodrigues(axes[0])[0] @ cv2.Rodrigues(axes[1])[0]
+    focal = FOCAL * max(h, w)
+    plane = np.array([[1, 0, -w / 2], [0, 1, -h / 2], [0, 0, 1.0]])  # its points, in the plane's own frame
+    camera = np.array([[focal, 0, w / 2], [0, focal, h / 2], [0, 0, 1.0]])
+    H = camera @ np.c_[R[:, :2], [0, 0, focal * rng.uniform(1.0, 1.3)]] @ plane
+    view = cv2.warpPerspective(image, H, (w, h), flags=cv2.INTER_AREA)
+    inside = cv2.warpPerspective(np.ones((h, w), np.float32), H, (w, h))[..., None]
+    view = cv2.GaussianBlur(inside * view + (1 - inside) * cv2.resize(background, (w, h)), (0, 0), 0.6)
+    return np.clip(view + rng.normal(0, 3, view.shape), 0, 255).astype(np.uint8), H / np.linalg.norm(H)
+
+
+def views(paths: Sequence[Path], count: int) -> Iterator[Plane]:
+    """So many pairs of views of each photograph, kept in the cache folder, that see a tenth of the grid in common."""
+    for seed, path in ((seed, path) for seed in range(count) for path in paths):
+        pairs = PlanePairs([Photograph(path, path.name)], PlaneViews(views=2), seed)
+        (pair,) = pairs
+        images = [np.asarray(read_image(image.path)[..., ::-1]) for image in (pair.image0, pair.image1)]
+        H, sizes = pairs.homography(pair), [np.array(image.shape[1::-1]) for image in images]
+        grid = np.stack(np.meshgrid(*(np.linspace(0, side - 1, GRID) for side in sizes[0])), -1).reshape(-1, 2)
+        there = mapped(H, grid)
+        seen = (there >= 0).all(1) & (there < sizes[1]).all(1) & (grid @ H[2, :2] + H[2, 2] > 0)
+        if seen.mean() >= 0.1:
+            yield item_of("views", path, seed, matched(*images), grid[seen], H=H)
+
+
+def hard(c: Correspondences, H: Array, seed: int) -> Correspondences:
+    """At most HARD_RIGHT right matches, and random ones beside them; no prior."""
+    rng = np.random.default_rng(seed)
+    x0, x1 = points(c)
+    right = np.flatnonzero(np.linalg.norm(mapped(H, x0) - x1, axis=1) < 2)
+    right = rng.permutation(right)[:HARD_RIGHT]
+    wrong = round(len(right) * HARD_WRONG_SHARE / (1 - HARD_WRONG_SHARE))
+    a = np.concatenate([x0[right], rng.uniform(x0.min(0), x0.max(0), (wrong, 2))])
+    b = np.concatenate([x1[right], rng.uniform(x1.min(0), x1.max(0), (wrong, 2))])
+    order = rng.permutation(len(a))
+    x = [torch.from_numpy(v[order][None]) for v in (a, b)]
+    return Correspondences(x[0], x[1], torch.ones(x[0].shape[:2], dtype=torch.bool), key=torch.tensor([seed]))
+
+
+def kinds(paths: Sequence[Path]) -> Iterator[Plane]:
+    """Of each photograph a plane, a rotation, a copy, a crop and an unrelated pair, with cameras; facts: its truth."""
+    for seed, plane in enumerate(warped(paths, 1, hard_too=False)):
+        path, behind = paths[seed], paths[(seed + min(BEHIND, len(paths) - 1)) % len(paths)]
+        yield _with_cameras("warped photographs", "planar", path, plane.matches, None)
+        for name, (group, truth, make) in MAKERS.items():
+            rng = np.random.default_rng([seed, len(name)])
+            view0, view1, focals = make(rng, small(path), small(behind))
+            yield _with_cameras(group, truth, path, matched(view0, view1), focals)
+
+
+def _with_cameras(group: str, truth: str, path: Path, c: Correspondences, focals: Array | None) -> Plane:
+    """Cameras of square pixels; focals: (2,) px."""
+    sizes = [s[0].numpy() for s in (c.size0, c.size1) if s is not None]
+    known = [FOCAL * max(size) for size in sizes] if focals is None else list(focals)
+    K0, K1 = (calibration(f, size) for f, size in zip(known, sizes, strict=True))
+    fields = {name: torch.from_numpy(K)[None] for name, K in (("K0", K0), ("K1", K1))}
+    item = item_of(group, path, 0, c.replace(**fields), K0=K0, K1=K1)
+    item.facts["truth"] = truth
+    return item
+
+
+def calibration(focal: float, size: Array) -> Array:
+    """Of square pixels and a central principal point; size: (h, w)."""
+    h, w = size
+    return np.array([[focal, 0, (w - 1) / 2], [0, focal, (h - 1) / 2], [0, 0, 1.0]])
+
+
+def _rotated(rng: np.random.Generator, photograph: Array, _: Array) -> tuple[Array, Array, Array]:
+    """Two views from the centre of a photograph's camera, of different focal lengths, within its field of view."""
+    h, w = photograph.shape[:2]
+    K = calibration(WIDE_FOCAL * max(h, w), np.array([h, w]))
+    size = np.array([round(0.7 * h), round(0.7 * w)])
+    views, focals = [], []
+    for side in (-1, 1):
+        focal = rng.uniform(0.9, 1.3) * max(size)
+        angles = np.radians([rng.uniform(-6, 6), side * rng.uniform(3, 10), rng.uniform(-8, 8)])
+        H = calibration(focal, size) @ cv2.Rodrigues(angles)[0] @ np.linalg.inv(K)
+        view = cv2.warpPerspective(photograph, H, (size[1], size[0]), flags=cv2.INTER_AREA)
+        noisy = cv2.GaussianBlur(view.astype(np.float32), (0, 0), 0.6) + rng.normal(0, 3, view.shape)
+        views.append(_compressed(np.clip(noisy, 0, 255).astype(np.uint8), 90))
+        focals.append(focal)
+    return views[0], views[1], np.array(focals)
+
+
+def _copied(rng: np.random.Generator, photograph: Array, _: Array) -> tuple[Array, Array, None]:
+    """The photograph, and a copy of another size and compression."""
+    scale = rng.choice([1.0, rng.uniform(0.5, 1.0)])
+    copy = cv2.resize(photograph, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    return photograph, _compressed(copy, int(rng.integers(50, 95))), None
+
+
+def _cropped(rng: np.random.Generator, photograph: Array, _: Array) -> tuple[Array, Array, None]:
+    """The photograph, and a part of 60 to 90 % of its sides."""
+    h, w = photograph.shape[:2]
+    share = rng.uniform(0.6, 0.9)
+    height, width = round(share * h), round(share * w)
+    top, left = rng.integers(h - height + 1), rng.integers(w - width + 1)
+    part = photograph[top : top + height, left : left + width]
+    return photograph, _compressed(part, int(rng.integers(50, 95))), None
+
+
+def _compressed(image: Array, quality: int) -> Array:
+    coded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+    return np.asarray(cv2.imdecode(coded, cv2.IMREAD_COLOR))
+
+
+Maker = Callable[[np.random.Generator, Array, Array], tuple[Array, Array, Array | None]]
+MAKERS: dict[str, tuple[str, str, Maker]] = {
+    "rotations": ("rotations cut from photographs", "rotation", _rotated),
+    "copies": ("copies, resized", "identical", _copied),
+    "crops": ("crops", "identical", _cropped),
+    "unrelated": ("unrelated photographs", "unrelated", lambda rng, photograph, other: (photograph, other, None)),
+}
+
+
+def small(path: Path) -> Array:
+    """A photograph whose longer side is SIDE, BGR."""
+    image = np.asarray(read_image(path)[..., ::-1])
+    scale = SIDE / max(image.shape[:2])
+    return np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA))
+
+
+def matched(image0: Array, image1: Array) -> Correspondences:
+    images = [np.ascontiguousarray(image[..., ::-1]) for image in (image0, image1)]
+    return match(images[0], images[1], pipeline="sift_fmtorch").correspondences
+
+
+def mapped(H: Array, x: Array) -> Array:
+    y = np.c_[x, np.ones(len(x))] @ H.T
+    return np.asarray(y[:, :2] / y[:, 2:])
+
+
+def points(c: Correspondences) -> tuple[Array, Array]:
+    """The matches of a batch of one, (n, 2) each."""
+    x0, x1 = (x[0][c.mask[0]].double().numpy() for x in (c.x0, c.x1))
+    return x0, x1

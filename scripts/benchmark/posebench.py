@@ -24,17 +24,16 @@ from typing import Any
 import numpy as np
 import torch
 
-import fmtorch
 from fmtorch import data, metrics, presets
 from fmtorch.core.types import Correspondences
-from fmtorch.data import DataError, ImagePair
+from fmtorch.data import DataError
 from fmtorch.evaluation.statistics import MIN_UNITS, PERCENT, POSE_THRESHOLDS, difference
 from fmtorch.io import h5
 from fmtorch.pipeline.pipeline import Outcome
 from fmtorch.presets.objects import merged
 from scripts.benchmark import pairs
 from scripts.benchmark.cameras import has_cameras
-from scripts.benchmark.methods import options
+from scripts.benchmark.methods import estimate_by_call, options
 from scripts.benchmark.runner import Item, Kept, Measured, Row, add_command, console, identity, judged, measure
 from scripts.benchmark.tables import FIGURES, Record, Results, Sheet, Span, show, span
 
@@ -62,10 +61,10 @@ def run(arguments: argparse.Namespace) -> None:
     kept = Kept(arguments.rows)
     rows: list[Row] = []
     for name, items, digest in sets_of(arguments, thresholds):
-        chosen = items[:: arguments.every]
-        usable = [item for item in chosen if item.pair.problem is None]
+        selected = items[:: arguments.every]
+        usable = [item for item in selected if item.pair.problem is None]
         own = measure([dataclasses.replace(each, matches=digest) for each in methods], usable, arguments.seeds, kept)
-        say_what_is_missing(name, chosen, own)
+        say_what_is_missing(name, selected, own)
         rows += [{**row, "family": name} for row in own]
     if not rows:
         raise SystemExit("no pair of pinhole cameras")
@@ -83,7 +82,7 @@ def sets_of(arguments: argparse.Namespace, thresholds: Mapping[str, float]) -> I
             raise SystemExit("--root: give the threshold in pixels, --threshold PX")
         families: dict[str, list[Item]] = {}
         for item in pairs.matched(arguments):
-            if has_cameras(item.pair):  # by their families, with points alone, as PoseBench has them
+            if has_cameras(item.pair):
                 own = Item(item.pair, functools.partial(_points_of, item), {"threshold": arguments.threshold})
                 families.setdefault(item.pair.family, []).append(own)
         digest = pairs.matches_identity(arguments)
@@ -91,6 +90,7 @@ def sets_of(arguments: argparse.Namespace, thresholds: Mapping[str, float]) -> I
 
 
 def _points_of(item: Item) -> Outcome | None:
+    """A pair with points alone, as PoseBench has them."""
     if item.outcome is None or item.outcome.correspondences is None:
         return item.outcome
     c = item.matches
@@ -98,30 +98,21 @@ def _points_of(item: Item) -> Outcome | None:
     return dataclasses.replace(item.outcome, correspondences=plain)
 
 
-def _files(
-    folder: Path, thresholds: Mapping[str, float], threshold: float | None
-) -> Iterator[tuple[str, list[Item], str]]:
+def _files(folder: Path, thresholds: Mapping[str, float], px: float | None) -> Iterator[tuple[str, list[Item], str]]:
     root = folder / "relative" if (folder / "relative").is_dir() else folder
     try:
-        given = {path: thresholds.get(path.stem, threshold) for path in h5.files(root)}
-        for path, px in given.items():
-            if px is None and not path.stem.startswith("fisheye_"):
-                raise SystemExit(f"{path.name} is none of PoseBench's sets: give its threshold in pixels, --threshold")
-            if px is not None:
-                dataset = data.load("h5", root=path, layout="posebench")
-                items = [Item(p, functools.partial(_given, p), {"threshold": px}) for p in dataset]
-                yield path.stem, items, dataset.digest
+        paths = [path for path in h5.files(root) if not path.stem.startswith("fisheye_") or path.stem in thresholds]
+        given = {path: thresholds.get(path.stem, px) for path in paths}
+        for path in (path for path, threshold in given.items() if threshold is None):
+            raise SystemExit(f"{path.name} is none of PoseBench's sets: give its threshold in pixels, --threshold")
+        for path, threshold in given.items():
+            dataset = data.load("h5", root=path, layout="posebench")
+            items = pairs.items(dataset, pairs.front_of("sift", []))  # which takes the matches that a pair comes with
+            for item in items:
+                item.facts["threshold"] = threshold
+            yield path.stem, items, dataset.digest
     except DataError as error:
         raise SystemExit(f"{error}; give the folder `relative` of PoseBench's data") from error
-
-
-def _given(pair: ImagePair) -> Outcome:
-    assert pair.matches is not None
-    try:
-        c, counts = pair.matches()
-    except (ValueError, DataError) as error:
-        return Outcome(pair, reason=str(error))
-    return Outcome(pair, counts, c)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -172,17 +163,12 @@ class Protocol(Measured):
         """What it makes of a pair: signed angles in degrees, 180 where it has no pose, and milliseconds."""
         matched, pair = item.outcome, item.pair
         assert matched is not None
-        c = matched.correspondences
         start = time.process_time()
-        if c is not None:
-            given: dict[str, Any] = {"mask": c.mask, "size0": c.size0, "size1": c.size1, "key": pair.key, "seed": seed}
-            given |= {"estimator": self.preset, **self.options(item.facts["threshold"])}
+        if (c := matched.correspondences) is not None:
+            given = {"estimator": self.preset, **self.options(item.facts["threshold"])}
+            given |= {"K0": pair.K0, "K1": pair.K1} if self.kind == "E" else {}
             try:
-                estimate: fmtorch.Estimate
-                if self.kind == "E":
-                    estimate = fmtorch.find_essential(c.x0, c.x1, pair.K0, pair.K1, **given)  # type: ignore[arg-type]
-                else:
-                    estimate = fmtorch.find_fundamental(c.x0, c.x1, **given)
+                estimate = estimate_by_call(given, c, seed)
                 matched = dataclasses.replace(matched, estimate=estimate, reason=estimate.reason[0])
             except ValueError as error:
                 matched = Outcome(pair, reason=str(error))
@@ -213,24 +199,22 @@ def installed(words: Sequence[str]) -> list[Protocol]:
 
 def say_what_is_missing(name: str, items: Sequence[Item], rows: Sequence[Row]) -> None:
     """Pairs that are left out, with a reason, and how many a method has no pose for."""
-    problems = [item.pair.problem for item in items if item.pair.problem is not None]
-    if problems:
+    if problems := [item.pair.problem for item in items if item.pair.problem is not None]:
         console.print(f"{name}: {len(problems)} of {len(items)} pairs left out: {problems[0]}", highlight=False)
+    reasons = {row["method"]: row["reason"] for row in reversed(rows) if row["reason"]}
     for method, count in Counter(row["method"] for row in rows if row["reason"]).items():
-        reason = next(row["reason"] for row in rows if row["method"] == method and row["reason"])
-        console.print(f"{name}, {method}: {count} misses, such as: {reason}", highlight=False)
+        console.print(f"{name}, {method}: {count} misses, such as: {reasons[method]}", highlight=False)
 
 
 def read_published() -> tuple[dict[str, float], Published]:
     """The threshold of each of PoseBench's sets in pixels, and its published figures."""
-    thresholds: dict[str, float] = {}
     figures: Published = {}
     with PUBLISHED.open(encoding="utf-8") as file:
-        for line in csv.DictReader(file):
-            thresholds[line["dataset"]] = float(line["threshold"])
-            areas = {f"published: AUC@{t}": float(line[f"auc{t}"]) for t in POSE_THRESHOLDS}
-            figures.setdefault(line["method"], {})[line["dataset"]] = areas
-    return thresholds, figures
+        lines = list(csv.DictReader(file))
+    for line in lines:
+        areas = {f"published: AUC@{t}": float(line[f"auc{t}"]) for t in POSE_THRESHOLDS}
+        figures.setdefault(line["method"], {})[line["dataset"]] = areas
+    return {line["dataset"]: float(line["threshold"]) for line in lines}, figures
 
 
 def sheet(rows: Sequence[Row], thresholds: Mapping[str, float], published: Published) -> Sheet:
@@ -239,24 +223,22 @@ def sheet(rows: Sequence[Row], thresholds: Mapping[str, float], published: Publi
     sets = {name: own for name, own in results.groups(results.all_pairs).items() if name in results.families}
     theirs = {m: {name: of[name] for name in sets if name in of} for m, of in published.items()}
     methods = [*results.methods, *(m for m, of in theirs.items() if of and m not in results.methods)]
-    each: dict[tuple[str, str], Record] = {}
-    for name, own in sets.items():
-        for m in methods:
-            measured = areas(results, m, own) if m in results.methods else {}
-            each[name, m] = {**measured, **theirs.get(m, {}).get(name, {})}
-    records: list[Record] = []
+    own_pairs = {m: set(results.pairs(m)) if m in results.methods else set() for m in methods}
+    means: list[Record] = []
+    of_sets: dict[tuple[str, str], Record] = {}
     for m in methods:
-        of_sets = [each[name, m] for name in sets]
-        heads = [head for head in of_sets[0] if all(head in of for of in of_sets)]
+        figures = {name: (areas(results, m, own) if own_pairs[m] else {}) | theirs.get(m, {}).get(name, {})
+                   for name, own in sets.items()}  # fmt: skip
+        heads = [head for head in next(iter(figures.values())) if all(head in of for of in figures.values())]
         line: Record = {"set": "mean of the sets", "method": m}
-        line |= {head: f"{np.mean([of[head] for of in of_sets]):.1f}" for head in heads}
+        line |= {head: f"{np.mean([of[head] for of in figures.values()]):.1f}" for head in heads}
         line["first of its kind minus this: AUC@5"] = lead(results, sets, m)
-        line["ms"] = results.cell(m, results.pairs(m), "ms") if m in results.methods else ""
-        records.append(line)
-    for (name, m), cells in each.items():
-        count = len([pair for pair in sets[name] if pair in results.pairs(m)]) if m in results.methods else ""
-        line = {"set": name, "method": m, "px": f"{thresholds.get(name, rows[0]['threshold']):g}", "pairs": count}
-        records.append(line | {head: f"{value:.1f}" for head, value in cells.items()})
+        means.append(line | {"ms": results.cell(m, results.pairs(m), "ms") if own_pairs[m] else ""})
+        for name, cells in figures.items():
+            count = len(own_pairs[m] & set(sets[name])) or ""
+            line = {"set": name, "method": m, "px": f"{thresholds.get(name, rows[0]['threshold']):g}", "pairs": count}
+            of_sets[name, m] = line | {head: f"{value:.1f}" for head, value in cells.items()}
+    records = means + [of_sets[name, m] for name in sets for m in methods]
     title = f"PoseBench's protocol: {len(sets)} sets, {len(set(sets) & set(thresholds))} of its {len(thresholds)}"
     return Sheet("poses", f"{title}; {len(results.all_pairs):,} pairs; signed angles, in %", records)
 

@@ -7,8 +7,6 @@ python -m scripts.benchmark related --rows related.jsonl
 The second line shows what the file holds: rows are kept pair by pair, and the command goes on where it was interrupted.
 """
 
-from __future__ import annotations
-
 import argparse
 import math
 from collections.abc import Callable, Sequence
@@ -16,12 +14,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fmtorch.core.types import RELATED
 from fmtorch.evaluation.statistics import share_interval
-from scripts.benchmark import figures, pairs
-from scripts.benchmark.pipelines import add_pipeline_options, chosen_pipelines, measured, settings_of
+from scripts.benchmark import pairs, tables
+from scripts.benchmark.pipelines import add_pipeline_options, measured, settings_of
 from scripts.benchmark.runner import Kept, Row, add_command
 from scripts.benchmark.tables import Record, Sheet, Span, show
 
@@ -40,33 +37,26 @@ def add_arguments(commands: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    kept = Kept(arguments.rows)
-    rows = kept.rows
-    if pairs.named(arguments):
+    def measured_rows(kept: Kept) -> list[Row]:
         related = [pair for pair in pairs.pairs_of(arguments) if pair.problem is None]
         unrelated = pairs.unrelated_pairs(related, pairs.sets_of(arguments), arguments.unrelated)
         every = sorted([*related, *unrelated], key=lambda p: (p.family, p.scene, p.image0.identity, p.image1.identity))
-        chosen = chosen_pipelines(settings_of("related")["methods"], arguments.pipelines)
-        rows = measured(chosen, every, arguments, kept)
-    if not rows:
-        raise SystemExit("nothing to show: name sets with --root or --rendered, or a file of earlier --rows")
-    by_method = by_pipeline(rows)
-    show([rates_sheet(by_method), levels_sheet(by_method), sets_sheet(by_method)], arguments.table)
+        return measured(settings_of("related")["methods"], every, arguments, kept)
+
+    newest = {(row["method"], row["pair"]): row for row in pairs.rows_of(arguments, measured_rows)}
+    names = dict.fromkeys(method for method, _ in newest)
+    rows = {name: [row for row in newest.values() if row["method"] == name] for name in names}
+    show([rates_sheet(rows), levels_sheet(rows), sets_sheet(rows)], arguments.table)
     if arguments.figure:
-        draw(by_method, arguments.figure)
-
-
-def by_pipeline(rows: Sequence[Row]) -> Rows:
-    """The rows of each pipeline, of equals the last."""
-    newest = {(row["method"], row["pair"]): row for row in rows}
-    return {
-        name: [row for row in newest.values() if row["method"] == name] for name in dict.fromkeys(m for m, _ in newest)
-    }
+        draw(rows, arguments.figure)
 
 
 def true(row: Row) -> bool:
-    """Whether the photographs are of one scene."""
     return not row["family"].startswith(pairs.UNRELATED)
+
+
+def right(row: Row) -> bool:
+    return true(row) and bool(row["nsgd"] < RIGHT)
 
 
 def significance(row: Row) -> float:
@@ -80,7 +70,6 @@ def inliers(row: Row) -> float:
 
 
 def called_related(row: Row) -> bool:
-    """The verdict."""
     return significance(row) >= RELATED
 
 
@@ -93,26 +82,23 @@ RULES: dict[str, Callable[[Row], bool]] = {
 
 
 def split(rows: Sequence[Row]) -> tuple[list[Row], list[Row]]:
-    """The unrelated pairs, and the related ones whose estimate is right."""
-    return [r for r in rows if not true(r)], [r for r in rows if true(r) and r["nsgd"] < RIGHT]
+    return [row for row in rows if not true(row)], [row for row in rows if right(row)]
 
 
 def rates_sheet(rows: Rows) -> Sheet:
     """Each rule: the share of unrelated pairs that it accepts, and of right estimates that it rejects."""
     records: list[Record] = []
     for name, own in rows.items():
-        unrelated, right = split(own)
-        line: Record = {"pipeline": name, "unrelated pairs": len(unrelated), "right pairs": len(right)}
-        line["unrelated pairs with an F, %"] = percent([bool(r["ok"]) for r in unrelated])
+        unrelated, good = split(own)
+        line: Record = {"pipeline": name, "unrelated pairs": len(unrelated), "right pairs": len(good)}
+        line["unrelated pairs with an F, %"] = percent([bool(row["ok"]) for row in unrelated])
         line["accepted, %"] = share(unrelated, called_related)
-        line["rejected, %"] = share(right, lambda row: not called_related(row))
+        line["rejected, %"] = share(good, lambda row: not called_related(row))
         for rule, accepts in RULES.items():
-            line[f"{rule}: accepted, %"] = percent([accepts(r) for r in unrelated])
-            line[f"{rule}: rejected, %"] = percent([not accepts(r) for r in right])
-        line |= {
-            "area": f"{area(right, unrelated, significance):.5f}",
-            "area by inliers": f"{area(right, unrelated, inliers):.5f}",
-        }
+            line[f"{rule}: accepted, %"] = percent([accepts(row) for row in unrelated])
+            line[f"{rule}: rejected, %"] = percent([not accepts(row) for row in good])
+        for head, figure in (("area", significance), ("area by inliers", inliers)):
+            line[head] = f"{tables.chance_of_more(*([figure(row) for row in part] for part in (good, unrelated))):.5f}"
         records.append(line)
     title = f"At level {RELATED:g}: unrelated pairs accepted and right ones (NSGD < {RIGHT}) rejected"
     return Sheet("rates", title, records)
@@ -122,10 +108,9 @@ def levels_sheet(rows: Rows) -> Sheet:
     """Points of the ROC curve: unrelated pairs accepted and right ones rejected at several levels."""
     records: list[Record] = []
     for name, own in rows.items():
-        unrelated, right = split(own)
+        unrelated, good = ([significance(row) for row in part] for part in split(own))
         for level in LEVELS:
-            accepted = percent([significance(r) >= level for r in unrelated])
-            rejected = percent([significance(r) < level for r in right])
+            accepted, rejected = percent([x >= level for x in unrelated]), percent([x < level for x in good])
             records.append({"pipeline": name, "level": f"{level:g}", "accepted, %": accepted, "rejected, %": rejected})
     return Sheet("levels", "Points of the ROC curves", records)
 
@@ -135,10 +120,9 @@ def sets_sheet(rows: Rows) -> Sheet:
     records: list[Record] = []
     for family in sorted({row["family"] for own in rows.values() for row in own}):
         for name, own in rows.items():
-            members = [row for row in own if row["family"] == family]
             line: Record = {"set": family, "pipeline": name}
-            for head, right in (("right", True), ("other", False)):
-                called = [called_related(row) for row in members if (true(row) and row["nsgd"] < RIGHT) == right]
+            for head, kind in (("right", True), ("other", False)):
+                called = [called_related(row) for row in own if row["family"] == family and right(row) == kind]
                 line |= {f"{head} pairs": len(called), f"{head} pairs called related": sum(called)}
             records.append(line)
     return Sheet("sets", "Pairs called related", records)
@@ -153,35 +137,18 @@ def share(rows: Sequence[Row], holds: Callable[[Row], bool]) -> Span | str:
 
 
 def percent(values: Sequence[bool]) -> str:
-    """A share in %."""
     return f"{100 * np.mean(values):.2f}" if values else ""
-
-
-def area(right: Sequence[Row], unrelated: Sequence[Row], figure: Callable[[Row], float]) -> float:
-    """The chance that a right pair has more of a figure than an unrelated one; ties count half."""
-    a, b = np.array([figure(row) for row in right]), np.sort([figure(row) for row in unrelated])
-    if len(a) == 0 or len(b) == 0:
-        return math.nan
-    return float((np.searchsorted(b, a, "left") + np.searchsorted(b, a, "right")).mean() / (2 * len(b)))
-
-
-def roc(rows: Sequence[Row], figure: Callable[[Row], float]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Shares of unrelated pairs accepted and of right ones rejected at every level of a figure, from the lowest on."""
-    unrelated, right = (np.array([figure(row) for row in part], dtype=np.float64) for part in split(rows))
-    levels = np.append(np.unique(np.concatenate([unrelated, right])), np.inf)
-    return (unrelated >= levels[:, None]).mean(1), (right < levels[:, None]).mean(1)
 
 
 def draw(rows: Rows, path: Path) -> None:
     """The ROC curves: a panel for each way to judge pairs, a line for each pipeline, a dot at the verdict's level."""
-    panels: dict[str, dict[str, figures.Line]] = {"by significance": {}, "by the number of inliers": {}}
+    panels: dict[str, dict[str, tables.Line]] = {"by significance": {}, "by the number of inliers": {}}
     for name, own in ((name, own) for name, own in rows.items() if all(split(own))):
         for figure, lines in zip((significance, inliers), panels.values(), strict=True):
-            accepted, rejected = (100 * shares for shares in roc(own, figure))
+            unrelated, good = (np.array([figure(row) for row in part], np.float64) for part in split(own))
+            levels = np.append(np.unique(np.concatenate([unrelated, good])), np.inf)
+            accepted, rejected = (unrelated >= levels[:, None]).mean(1), (good < levels[:, None]).mean(1)
             perfect = " (along the axes)" if ((accepted == 0) & (rejected == 0)).any() else ""
-            dot = None
-            if figure is significance:
-                levels = np.append(np.unique([figure(row) for part in split(own) for row in part]), np.inf)
-                dot = int(np.searchsorted(levels, RELATED))
-            lines[name + perfect] = figures.Line(accepted.tolist(), rejected.tolist(), dot)
-    figures.draw(path, panels, "unrelated pairs accepted, %", "right pairs rejected, %", shares=True)
+            dot = int(np.searchsorted(levels, RELATED)) if figure is significance else None
+            lines[name + perfect] = tables.Line((100 * accepted).tolist(), (100 * rejected).tolist(), dot)
+    tables.draw(path, panels, ("unrelated pairs accepted, %", "right pairs rejected, %"), "shares")

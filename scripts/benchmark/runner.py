@@ -1,12 +1,8 @@
-"""What every benchmark shares: rows that are kept as they are made, methods that take turns, time and memory."""
-
-from __future__ import annotations
+"""What every benchmark shares: rows that are kept as they are made, methods that take turns and time."""
 
 import argparse
-import ctypes
 import dataclasses
 import functools
-import gc
 import json
 import math
 import time
@@ -41,7 +37,6 @@ KEPT = (
     "significance", "rotation_error", "translation_error",
 )  # fmt: skip
 NEAR = 2.0  # px from the true epipolar line: matches whose exactness is looked at
-PROC = Path("/proc/self")
 ROWS = "keeps what each method makes of each pair, one line each; shown where no data set is named"
 
 
@@ -50,7 +45,8 @@ def add_command(
 ) -> argparse.ArgumentParser:
     """A command with `--table` and, where `seeds` says how many by default, `--seeds` and `--rows`."""
     raw = argparse.RawDescriptionHelpFormatter
-    parser: argparse.ArgumentParser = commands.add_parser(name, help=about, description=about, formatter_class=raw)
+    head = (about or "").partition("\n")[0].replace("%", "%%")
+    parser: argparse.ArgumentParser = commands.add_parser(name, help=head, description=about, formatter_class=raw)
     if seeds is not None:
         parser.add_argument("--seeds", type=int, default=seeds, help="of the methods, from 0; figures are their means")
         parser.add_argument("--rows", type=Path, help=ROWS)
@@ -74,18 +70,13 @@ class Kept:
         if path is not None and path.exists():
             content = path.read_bytes()
             whole = content[: content.rfind(b"\n") + 1]
-            self.rows = [self._row(number, line) for number, line in enumerate(whole.splitlines(), 1)]
+            for number, line in enumerate(whole.splitlines(), 1):
+                try:
+                    self.rows.append(dict(json.loads(line)))
+                except (ValueError, TypeError):
+                    raise SystemExit(f"{path}, line {number}: no row of a benchmark; name another file") from None
             with path.open("r+b") as file:
                 file.truncate(len(whole))
-
-    def _row(self, number: int, line: bytes) -> Row:
-        try:
-            row = json.loads(line)
-        except ValueError:
-            row = None
-        if not isinstance(row, dict):
-            raise SystemExit(f"{self.path}, line {number}: no row of a benchmark; name another file")
-        return row
 
     def add(self, rows: Sequence[Row]) -> None:
         """Keep some rows, together: an interruption loses all of them or none."""
@@ -117,6 +108,10 @@ def identity(stages: Stages, *others: Any) -> str:
     return identity_digest(made_with)[:DIGITS]
 
 
+def no_images() -> PairImages:
+    raise ValueError("there are no images, which a stage looks at")
+
+
 @dataclasses.dataclass
 class Item:
     """A pair with its matches, which are made when a method first asks for them.
@@ -127,7 +122,7 @@ class Item:
     pair: ImagePair
     make: Callable[[], Outcome | None]
     facts: Row = dataclasses.field(default_factory=dict)
-    images: Callable[[], PairImages] | None = None
+    images: Callable[[], PairImages] = no_images
 
     @functools.cached_property
     def outcome(self) -> Outcome | None:
@@ -136,7 +131,6 @@ class Item:
 
     @property
     def matches(self) -> Correspondences:
-        """The matches, a batch of one."""
         assert self.outcome is not None
         assert self.outcome.correspondences is not None
         return self.outcome.correspondences
@@ -149,7 +143,6 @@ class Measured:
     identity: str
 
     def applies(self, item: Item) -> bool:
-        """Whether the method takes such a pair."""
         return True
 
     def figures(self, item: Item, seed: int) -> Row:
@@ -162,7 +155,7 @@ class Method(Measured):
     """Pruners, whose time counts, and an estimator.
 
     stages: of a family's pairs, by name. untimed: the names of those whose time does not count. takes: whether it is
-    measured on an item.
+    measured on an item. view: what is done to a pair and its matches before.
     """
 
     name: str
@@ -171,20 +164,21 @@ class Method(Measured):
     estimator: Callable[[ImagePair, Correspondences, int], Estimate]
     untimed: frozenset[str] = frozenset()
     takes: Callable[[Item], bool] = lambda item: True
+    view: Callable[[Outcome], Outcome] = lambda outcome: outcome
 
     def applies(self, item: Item) -> bool:
         return self.takes(item)
 
     def figures(self, item: Item, seed: int) -> Row:
         """`KEPT` of the pair's row, and milliseconds of pruners and of all."""
-        matched = item.outcome
-        assert matched is not None
+        assert item.outcome is not None
+        matched = self.view(item.outcome)
         if matched.correspondences is None:
             return {**judged(matched, seed), "ms": 0.0, "ms_pruning": 0.0}
         c, pruning = matched.correspondences, 0.0
         for name, stage in self.stages(item.pair.family).items():
             start = time.process_time()
-            c = pruned(stage, c, lambda _: _images(item))
+            c = pruned(stage, c, lambda _: item.images())
             c = c if bool(c.mask.all()) else c.compact()
             pruning += (time.process_time() - start) * (name not in self.untimed)
         start = time.process_time()
@@ -193,12 +187,6 @@ class Method(Measured):
         sized = c.replace(size0=matched.correspondences.size0, size1=matched.correspondences.size1)
         outcome = dataclasses.replace(matched, correspondences=sized, estimate=estimate, reason=estimate.reason[0])
         return {**judged(outcome, seed), "ms": 1e3 * (pruning + estimation), "ms_pruning": 1e3 * pruning}
-
-
-def _images(item: Item) -> PairImages:
-    if item.images is None:
-        raise ValueError(f"{item.pair.identity}: there are no images, which a stage looks at")
-    return item.images()
 
 
 def judged(outcome: Outcome, seed: int, signed: bool = False) -> Row:
@@ -230,8 +218,8 @@ def measure(
             for method in methods:
                 if not method.applies(item):
                     continue
-                about = {"pair": item.pair.identity, **item.facts, "seed": seed, "method": method.name,
-                         "identity": method.identity}  # fmt: skip
+                about = {"pair": item.pair.identity, **item.facts, "seed": seed}
+                about |= {"method": method.name, "identity": method.identity}
                 row = known.get(tuple(about.get(field) for field in WHICH))
                 if row is None:
                     if item.outcome is None:
@@ -245,35 +233,3 @@ def measure(
                 rows.append(row)
             kept.add(new)
     return rows
-
-
-def milliseconds(call: Callable[[], Any]) -> float:
-    """Of processor time."""
-    start = time.process_time()
-    call()
-    return 1e3 * (time.process_time() - start)
-
-
-def peak_growth(call: Callable[[], Any]) -> float:
-    """MiB, the peak of the resident set during a call beyond what was resident before it.
-
-    What the process claimed before, as for compiled kernels, does not hide it. Raises SystemExit where the kernel does
-    not tell peaks anew, as anywhere but on Linux.
-    """
-    gc.collect()
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # what was freed is given back, or the call would use it
-    if trim is not None:
-        trim(0)
-    try:
-        (PROC / "clear_refs").write_text("5")  # the peak is counted from here
-        before = _resident("VmRSS")
-        call()
-        return (_resident("VmHWM") - before) / 1024
-    except OSError as error:
-        raise SystemExit(f"peaks of memory can be measured on Linux alone ({error})") from None
-
-
-def _resident(field: str) -> int:
-    """kB; of the process itself, whereas ru_maxrss is inherited."""
-    lines = (PROC / "status").read_text().splitlines()
-    return next(int(line.split()[1]) for line in lines if line.startswith(field))

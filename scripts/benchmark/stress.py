@@ -7,8 +7,6 @@ python -m scripts.benchmark stress --root DATA/Strecha --root DATA/PhotoTourism 
 seeds need. `sizeless` among an estimator's stages takes the image sizes away, and with them the prior on cameras.
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import functools
@@ -21,23 +19,14 @@ import numpy as np
 
 from fmtorch.data import ImagePair
 from fmtorch.evaluation.run import select
+from fmtorch.evaluation.statistics import PERCENT
 from fmtorch.pipeline.pipeline import Outcome, Pipeline
 from fmtorch.presets.composition import WIDE
 from fmtorch.scenes.dataset import FAMILIES
-from scripts.benchmark import figures, pairs
+from scripts.benchmark import pairs, tables
+from scripts.benchmark.changes import CONDITIONED, MIN_RIGHT, SWEEPS, Case, Change, Level, case_of, on_plane, parallax
 from scripts.benchmark.methods import method, read_specs
 from scripts.benchmark.runner import Item, Kept, Method, Row, add_command, measure
-from scripts.benchmark.stress_changes import (
-    CONDITIONED,
-    MIN_RIGHT,
-    SWEEPS,
-    Case,
-    Change,
-    Level,
-    case_of,
-    on_plane,
-    parallax,
-)
 from scripts.benchmark.tables import FIGURES, Record, Results, Sheet, show
 
 SPECS = Path(__file__).with_name("stress.txt")
@@ -61,12 +50,10 @@ def add_arguments(commands: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    kept = Kept(arguments.rows)
-    rows = kept.rows
-    if pairs.named(arguments):
-        rows = measure(methods_of(read_specs(arguments.specs)), items_of(arguments), arguments.seeds, kept)
-    if not rows:
-        raise SystemExit("nothing to show: name sets with --root or --rendered, or a file of earlier --rows")
+    def measured_rows(kept: Kept) -> list[Row]:
+        return measure(methods_of(read_specs(arguments.specs)), items_of(arguments), arguments.seeds, kept)
+
+    rows = pairs.rows_of(arguments, measured_rows)
     show([accuracy_sheet(rows), time_sheet(rows)], arguments.table)
     for sweep in {row["sweep"] for row in rows} & AXES.keys() if arguments.figures else ():
         draw(rows, sweep, arguments.figures / f"stress_{sweep.replace(' ', '_')}.svg")
@@ -74,11 +61,12 @@ def run(arguments: argparse.Namespace) -> None:
 
 def methods_of(specs: Sequence[str]) -> list[Method]:
     """The estimators; those in brackets are measured under conditions alone."""
-    methods = [(method(spec.strip("()")), spec.startswith("(")) for spec in specs]
-    return [dataclasses.replace(each, takes=_under_conditions) if some else each for each, some in methods]
+    every = [method(spec.strip("()")) for spec in specs]
+    bracketed = {each.name for each, spec in zip(every, specs, strict=True) if spec.startswith("(")}
+    return [dataclasses.replace(each, takes=_conditioned) if each.name in bracketed else each for each in every]
 
 
-def _under_conditions(item: Item) -> bool:
+def _conditioned(item: Item) -> bool:
     return bool(item.facts["sweep"] == CONDITIONED)
 
 
@@ -135,8 +123,12 @@ def by_level(rows: Sequence[Row]) -> Iterator[tuple[str, Level, Results]]:
 
 
 def group(family: str) -> str:
-    """What a family's pairs are shown with."""
     return "rendered" if family in FAMILIES else "real, wide" if family in WIDE else "real, short"
+
+
+def families_of(results: Results) -> dict[str, list[str]]:
+    """The pairs that all methods have, by `group`."""
+    return {name: own for name, own in results.groups(results.pairs()).items() if name in results.families}
 
 
 def label(spec: str) -> str:
@@ -151,8 +143,7 @@ def accuracy_sheet(rows: Sequence[Row]) -> Sheet:
     """Recall and AUC@0.05 of each set at each level, of the pairs that all have, and the lead of the first."""
     records: list[Record] = []
     for sweep, level, results in by_level(rows):
-        groups = {name: own for name, own in results.groups(results.pairs()).items() if name in results.families}
-        lines = results.records(groups, ("R.05", "R.01", "AUC@0.05"), label="estimator", minus=["AUC@0.05"])
+        lines = results.records(families_of(results), ("R.05", "R.01", "AUC@0.05"), "estimator", ["AUC@0.05"])
         records += [{"test": sweep, "set": line.pop("set"), "level": level, **line} for line in lines]
     return Sheet("accuracy", "Recall at NSGD 0.05, at 0.01 and AUC@0.05 in %; lead: the first minus this", records)
 
@@ -170,13 +161,11 @@ def time_sheet(rows: Sequence[Row]) -> Sheet:
 
 def draw(rows: Sequence[Row], sweep: str, path: Path) -> None:
     """AUC@0.05 against the level, a panel for each set."""
-    panels: dict[str, dict[str, figures.Line]] = {}
-    area = FIGURES["AUC@0.05"]
+    panels: dict[str, dict[str, tables.Line]] = {}
     for _, level, results in (each for each in by_level(rows) if each[0] == sweep):
-        for name, own in results.groups(results.pairs()).items():
-            for estimator in results.methods if name in results.families else ():
-                line = panels.setdefault(name, {}).setdefault(estimator, figures.Line([], []))
-                line.x.append(float(level))
-                line.y.append(area.scale * float(area.of(results.get(estimator, own)).mean()))
+        for (name, own), estimator in itertools.product(families_of(results).items(), results.methods):
+            line = panels.setdefault(name, {}).setdefault(estimator, tables.Line([], []))
+            line.x.append(float(level))
+            line.y.append(PERCENT * float(FIGURES["AUC@0.05"].of(results.get(estimator, own)).mean()))
     scale = "linear" if sweep == "noise" else "log"
-    figures.draw(path, panels, AXES[sweep], "AUC@0.05 [%]", xscale=scale, ticks=[float(x) for x in SWEEPS[sweep]])
+    tables.draw(path, panels, (AXES[sweep], "AUC@0.05 [%]"), scale, [float(x) for x in SWEEPS[sweep]])

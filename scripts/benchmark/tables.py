@@ -1,9 +1,11 @@
-"""Tables of benchmarks, from their rows: figures and paired differences with intervals; Markdown here, CSV in files."""
+"""Tables of benchmarks, from their rows: figures and paired differences with intervals; Markdown here, CSV in files.
 
-from __future__ import annotations
+And their curves, drawn as SVG.
+"""
 
 import csv
 import dataclasses
+import functools
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -12,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fmtorch.core.files import replacing
 from fmtorch.evaluation.statistics import (
     PERCENT,
     POSE_THRESHOLDS,
@@ -29,6 +32,8 @@ from scripts.benchmark.runner import Row
 
 BASELINES = ("wide baselines", "short baselines")
 Values = NDArray[np.float64]
+Names = Sequence[str]
+Groups = Mapping[str, Names]  # pairs by what they have in common
 Get = Callable[[str], Values]  # a field of the rows, (seeds, pairs), NaN where there is none
 
 
@@ -48,7 +53,6 @@ Record = dict[str, Any]  # a line of a table: what is printed of numbers and nam
 
 
 def span(found: Interval | None, form: str) -> Span | str:
-    """An interval as a cell."""
     return "" if found is None else Span(*(f"{value:{form}}" for value in (found.value, found.low, found.high)))
 
 
@@ -62,22 +66,17 @@ class Sheet:
 
     @property
     def columns(self) -> list[str]:
-        """The columns of all lines."""
         return list(dict.fromkeys(column for record in self.records for column in record))
 
     def markdown(self) -> str:
-        """The table, its columns padded to one width."""
-        lines = [self.columns, *([str(record.get(c, "")) for c in self.columns] for record in self.records)]
-        widths = [max(3, *(len(line[i]) for line in lines)) for i in range(len(self.columns))]
-        rule = ["-" * width for width in widths]
-        padded = [
-            [
-                cell.ljust(w) if _is_text(column) else cell.rjust(w)
-                for cell, w, column in zip(line, widths, zip(*lines[1:], strict=True), strict=True)
-            ]
-            for line in (lines[0], rule, *lines[1:])
-        ]
-        return f"{self.title}\n\n" + "\n".join(f"| {' | '.join(line)} |" for line in padded)
+        """The table, its columns padded to one width, numbers on the right."""
+        columns = []
+        for head in self.columns:
+            cells = [str(record.get(head, "")) for record in self.records]
+            width = max(3, *map(len, (head, *cells)))
+            numbers = all(re.match(r"[-+]?[\d.]", cell) for cell in cells if cell)
+            columns.append([f"{cell:{'>' if numbers else '<'}{width}}" for cell in (head, "-" * width, *cells)])
+        return f"{self.title}\n\n" + "\n".join(f"| {' | '.join(line)} |" for line in zip(*columns, strict=True))
 
     def write(self, path: Path) -> None:
         """As CSV, one value a cell; an interval takes three columns."""
@@ -87,25 +86,29 @@ class Sheet:
             writer = csv.DictWriter(file, heads, restval="", lineterminator="\n")
             writer.writeheader()
             for record in self.records:
-                line = {c: cell.value if isinstance(cell, Span) else cell for c, cell in record.items()}
+                line = dict(record)
                 for c, cell in record.items():
-                    line |= {f"{c} low": cell.low, f"{c} high": cell.high} if isinstance(cell, Span) else {}
+                    if isinstance(cell, Span):
+                        line |= {c: cell.value, f"{c} low": cell.low, f"{c} high": cell.high}
                 writer.writerow(line)
 
 
-def _is_text(cells: Sequence[str]) -> bool:
-    return not all(re.match(r"[-+]?[\d.]", cell) for cell in cells if cell)
-
-
 def show(sheets: Sequence[Sheet], table: Path | None = None) -> None:
-    """Print the tables; write them to `table`, of several each to a file of its own beside it."""
-    for sheet in sheets:
-        if not sheet.records:
-            continue
+    """Print the tables that have lines; write them to `table`, of several each to a file of its own beside it."""
+    for sheet in (sheet for sheet in sheets if sheet.records):
         print(sheet.markdown(), end="\n\n")
         if table is not None:
             alone = len(sheets) == 1 or not sheet.name
             sheet.write(table if alone else table.with_name(f"{table.stem}_{sheet.name}{table.suffix}"))
+
+
+def chance_of_more(a: Sequence[float] | Values, b: Sequence[float] | Values) -> float:
+    """The area under the ROC curve: the chance that one of `a` exceeds one of `b`, ties count half; NaN of none."""
+    if len(a) == 0 or len(b) == 0:
+        return float("nan")
+    ordered = np.sort(b)
+    below, up_to = (np.searchsorted(ordered, a, side) for side in ("left", "right"))
+    return float((below + up_to).mean() / (2 * len(b)))
 
 
 def _known(values: Values) -> Values:
@@ -173,18 +176,13 @@ class Results:
         self.all_pairs = list(self._places)
         self.families = sorted({family for family, _ in self._places.values()}, key=lambda f: (f not in WIDE, f))
 
-    def of(self, method: str, pairs: Sequence[str]) -> list[list[Row]]:
-        """The rows of some pairs, one list a pair; as many seeds as all of them have."""
-        own = [self._rows[method][pair] for pair in pairs]
-        seeds = min((len(rows) for rows in own), default=0)
-        return [rows[:seeds] for rows in own]
-
     def get(self, method: str, pairs: Sequence[str]) -> Get:
-        """The fields of the method's rows of these pairs."""
-        rows = self.of(method, pairs)
+        """The fields of the method's rows of these pairs, of as many seeds as all of them have."""
+        rows = [self._rows[method][pair] for pair in pairs]
+        seeds = min(map(len, rows), default=0)
 
         def values(field: str) -> Values:
-            listed = [[np.nan if (v := row.get(field)) is None else v for row in of_pair] for of_pair in rows]
+            listed = [[np.nan if (v := row.get(field)) is None else v for row in own[:seeds]] for own in rows]
             return np.array(listed, np.float64).reshape(len(rows), -1).T
 
         return values
@@ -238,14 +236,7 @@ class Results:
         return f"{np.median(own / reference):.2f}" if both else ""
 
     def records(
-        self,
-        groups: Mapping[str, Sequence[str]],
-        columns: Sequence[str],
-        *,
-        label: str,
-        intervals: bool = False,
-        minus: Sequence[str] = (),
-        against: str | None = None,
+        self, groups: Groups, columns: Names, label: str, minus: Names = (), against: str = "", intervals: bool = False
     ) -> list[Record]:
         """A line for each group of pairs and method. label: heads the methods; minus: figures less those of `against`.
 
@@ -270,12 +261,10 @@ class Results:
         return lines
 
     def described(self, pairs: Sequence[str]) -> str:
-        """How many pairs and scenes there are, and what intervals resample."""
         return described(self.scenes(pairs))
 
     def seeds(self, method: str) -> int:
-        """How many seeds a method was measured with."""
-        return min((len(rows) for rows in self._rows[method].values()), default=0)
+        return min(map(len, self._rows[method].values()), default=0)
 
 
 KIN = {
@@ -283,13 +272,80 @@ KIN = {
     "TanksLike": "T&T", "PhotoTourism": "CPC", "collection": "CPC",
 }  # fmt: skip
 """The paper's set of the same kind of camera motion; none of them is the same set."""
-PUBLISHED = ("recall", "inlier", "inlier_m", "corrs", "corrs_m")  # columns of the paper's tables
 Published = Mapping[tuple[str, str], dict[str, str]]
 
 
-def published(path: Path | None) -> Published:
+@functools.cache
+def published(path: Path) -> Published:
     """The figures of Bian et al. (BMVC 2019) from a CSV file, by data set and method."""
-    if path is None:
-        return {}
     with path.open(encoding="utf-8") as file:
         return {(line["dataset"], line["method"]): line for line in csv.DictReader(file)}
+
+
+# Lines in panels that share a legend, as SVG without background, legible on light and dark
+
+
+INK = "#808080"  # legible on white and on black
+COLOURS = ("#D55E00", "#E69F00", "#009E73", "#56B4E9", "#2F8FD0", "#CC79A7", "#9A9A9A", "#B8A800")
+DASHES = ("-", "-", "--", "--", "-.", "-.", ":", ":")
+STYLE: Any = {
+    "svg.fonttype": "none", "svg.hashsalt": "fmtorch", "font.size": 9, "font.family": "sans-serif", "text.color": INK,
+    "axes.edgecolor": INK, "axes.labelcolor": INK, "xtick.color": INK, "ytick.color": INK,
+}  # fmt: skip
+
+
+class Line(NamedTuple):
+    """A line through points. marked: the number of one that gets a dot."""
+
+    x: list[float]
+    y: list[float]
+    marked: int | None = None
+
+
+Panels = Mapping[str, Mapping[str, Line]]
+
+
+def draw(
+    path: Path, panels: Panels, labels: tuple[str, str], scale: str = "linear", ticks: Sequence[float] = ()
+) -> None:
+    """Write an SVG: a panel for each group of lines, one legend below.
+
+    labels: of x and y. scale: of x; "shares": both axes go from 0 to 100 % and are logarithmic above a tenth of a
+    percent. ticks: of x.
+    """
+    import matplotlib as mpl
+    from matplotlib.figure import Figure as Canvas
+    from matplotlib.ticker import FixedLocator
+
+    names = list(dict.fromkeys(name for lines in panels.values() for name in lines))
+    with mpl.rc_context(STYLE), replacing(path) as temporary:
+        figure = Canvas(figsize=(3.1 * len(panels) + 0.3, 3.0 + 0.16 * len(names)), layout="constrained")
+        axes: Any = figure.subplots(1, len(panels), squeeze=False, sharey=scale == "shares")[0]
+        for panel, (title, lines) in zip(axes, panels.items(), strict=True):
+            for name, line in lines.items():
+                i = names.index(name)
+                style = {"color": COLOURS[i % len(COLOURS)], "zorder": 3 - i / 100}
+                panel.plot(line.x, line.y, DASHES[i % len(DASHES)], linewidth=1.4 + (i == 0), label=name, **style)
+                if line.marked is not None:
+                    panel.plot(line.x[line.marked], line.y[line.marked], "o", markersize=5, clip_on=False, **style)
+            panel.set_title(title, loc="left", fontsize=9)
+            panel.set(xlabel=labels[0], facecolor="none")
+            if scale == "shares":  # per cent, linear up to a tenth and logarithmic above
+                panel.set(xlim=(0, 100), ylim=(0, 100))
+                for axis, rescale in ((panel.xaxis, panel.set_xscale), (panel.yaxis, panel.set_yscale)):
+                    rescale("symlog", linthresh=0.1, linscale=0.5)
+                    axis.set_major_locator(FixedLocator((0, 0.1, 1, 10, 100)))
+                    axis.set_major_formatter("{x:g}")
+            else:
+                panel.set_xscale(scale)
+            if ticks:
+                panel.set_xticks(ticks, [f"{x:g}" for x in ticks])
+            panel.minorticks_off()
+            panel.grid(color=INK, alpha=0.25, linewidth=0.5)
+            panel.spines[["top", "right"]].set_visible(False)
+        axes[0].set_ylabel(labels[1])
+        labelled = (zip(*panel.get_legend_handles_labels(), strict=True) for panel in axes)
+        handles = {label: handle for pairs in labelled for handle, label in pairs}
+        place: dict[str, Any] = {"loc": "outside lower center", "ncols": 2, "frameon": False, "fontsize": 8}
+        figure.legend([handles[name] for name in names], names, **place)
+        figure.savefig(temporary, format="svg", transparent=True, metadata={"Date": None})

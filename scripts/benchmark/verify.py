@@ -8,15 +8,16 @@ that a mapper does not register count as wrong. Rows are kept in --work: an inte
 python -m scripts.benchmark verify --root DATA --work runs/verify --table docs/tables/verify.csv
 """
 
-from __future__ import annotations
-
 import argparse
 import itertools
 import shutil
+import subprocess
+import sys
+import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -26,9 +27,16 @@ import fmtorch
 from fmtorch.estimators.external import colmap
 from fmtorch.metrics import pose_auc, pose_error
 from scripts.benchmark.runner import Kept, Row, add_command
-from scripts.benchmark.scenes import CAMERA_KINDS, FEATURE_KINDS, Scene, Truth, database_of, read_scene, remove
 from scripts.benchmark.tables import Record, Sheet, show
 
+FEATURES = 4096
+ORIGIN = 0.5  # px: COLMAP's coordinates of the first pixel's centre
+FEATURE_KINDS = ("colmap", "ours")  # COLMAP's SIFT; our default pipeline
+CAMERA_KINDS = ("unknown", "known")
+KNOWN_MODELS = """COLMAP models of scenes in FM-Bench's layout: SIFT matches triangulated with the known cameras.
+
+A scene becomes ``models/<scene>`` with sparse/ and images/, for dataset=colmap.
+"""
 SCENES = (
     "Strecha/Herz-Jesus-P8", "PhotoTourism/sacre_coeur", "Strecha/fountain-P11", "Strecha_train/castle-P19",
     "TanksLike/fox",
@@ -52,6 +60,40 @@ def add_arguments(commands: Any) -> None:
     parser.add_argument("--cameras", nargs="+", default=CAMERA_KINDS, choices=CAMERA_KINDS)
     parser.add_argument("--mappers", nargs="*", default=MAPPERS, choices=MAPPERS)
     parser.add_argument("--seeds", type=int, default=3)
+    parser = add_command(commands, "known_models", run_known_models, KNOWN_MODELS)
+    parser.add_argument("--root", type=Path, nargs="+", required=True, help="folders of scenes in FM-Bench's layout")
+    parser.add_argument("--folder", type=Path, default=Path("models"), help="of the models; those there are kept")
+
+
+class Truth(NamedTuple):
+    """Calibration and pose, world to camera, of images by name."""
+
+    K: dict[str, Array]
+    R: dict[str, Array]
+    t: dict[str, Array]
+
+
+class Scene(NamedTuple):
+    """A folder of photographs with true cameras. single: whether one camera took them all."""
+
+    name: str
+    images: Path
+    truth: Truth
+    single: bool
+
+
+def read_scene(folder: Path) -> Scene:
+    """FM-Bench's layout: `Images`, and `Camera.txt` with K, R and t of each image in a line.
+
+    Raises SystemExit where one of them is missing.
+    """
+    if not (folder / "Images").is_dir() or not (folder / "Camera.txt").is_file():
+        raise SystemExit(f"{folder} holds no Images and Camera.txt; give scenes in FM-Bench's layout")
+    lines = np.loadtxt(folder / "Camera.txt").reshape(-1, 21)
+    named = list(zip(sorted(path.name for path in (folder / "Images").iterdir()), lines, strict=True))
+    K, R = ({name: line[i : i + 9].reshape(3, 3) for name, line in named} for i in (0, 9))
+    truth = Truth(K, R, {name: line[18:] for name, line in named})
+    return Scene(folder.name, folder / "Images", truth, bool((lines[:, :9] == lines[0, :9]).all()))
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -85,6 +127,9 @@ def measure(scene: Scene, database: Path, key: tuple[Any, ...], mappers: Sequenc
     remove(path)
 
 
+_warm: set[Path] = set()
+
+
 def verified_by(method: str, path: Path, seed: int) -> Row:
     """Verify a database in place: pairs, those with a geometry, and processor seconds."""
     import pycolmap
@@ -109,9 +154,6 @@ def verified_by(method: str, path: Path, seed: int) -> Row:
     return {"pairs": pairs, "verified": verified, "seconds": seconds}
 
 
-_warm: set[Path] = set()
-
-
 def mapped(mapper: str, path: Path, scene: Scene, cameras: str, seed: int) -> Row:
     """The largest model of a mapper on one thread, with its processor seconds.
 
@@ -129,7 +171,7 @@ def mapped(mapper: str, path: Path, scene: Scene, cameras: str, seed: int) -> Ro
     if (mapper, cameras) == ("global", "unknown"):
         pycolmap.calibrate_view_graph(copy, pycolmap.ViewGraphCalibrationOptions(random_seed=seed))
     mapping = pycolmap.global_mapping if mapper == "global" else pycolmap.incremental_mapping
-    models = mapping(copy, scene.images, output, _options(mapper, cameras, seed))
+    models = mapping(copy, scene.images, output, _options(mapper, cameras == "unknown", seed))
     row: Row = {"seconds": time.process_time() - start, "registered": 0, "images": len(scene.truth.R)}
     poses: dict[str, Any] = {}
     if models:
@@ -143,23 +185,24 @@ def mapped(mapper: str, path: Path, scene: Scene, cameras: str, seed: int) -> Ro
     return row | accuracy(poses, scene.truth)
 
 
-def _options(mapper: str, cameras: str, seed: int) -> Any:
-    """Of COLMAP's mappers."""
+def _options(mapper: str, refined: bool, seed: int) -> Any:
+    """Of COLMAP's mappers. refined: whether intrinsics are estimated."""
     import pycolmap
 
+    own: dict[str, Any] = {"min_model_size": MIN_MODEL, "num_threads": 1, "random_seed": seed}
     if mapper == "global":
-        options: Any = pycolmap.GlobalPipelineOptions(min_model_size=MIN_MODEL, num_threads=1, random_seed=seed)
-        options.mapper.num_threads, options.mapper.random_seed = 1, seed
-        options.mapper.global_positioning.random_seed = options.mapper.rotation_averaging.random_seed = seed
-        if cameras == "known":
-            adjustment = options.mapper.bundle_adjustment
-            adjustment.refine_focal_length = adjustment.refine_extra_params = False
-        return options
-    options = pycolmap.IncrementalPipelineOptions(min_model_size=MIN_MODEL, num_threads=1, random_seed=seed)
-    options.extract_colors = False
-    if cameras == "known":
-        options.ba_refine_focal_length = options.ba_refine_extra_params = False
-        options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
+        options: Any = pycolmap.GlobalPipelineOptions()
+        steps: dict[str, Any] = {step: {"random_seed": seed} for step in ("global_positioning", "rotation_averaging")}
+        if not refined:
+            steps["bundle_adjustment"] = {"refine_focal_length": False, "refine_extra_params": False}
+        own["mapper"] = {"num_threads": 1, "random_seed": seed, **steps}
+    else:
+        options = pycolmap.IncrementalPipelineOptions()
+        own["extract_colors"] = False
+        if not refined:
+            own |= {"ba_refine_focal_length": False, "ba_refine_extra_params": False}
+            own["mapper"] = {"abs_pose_refine_focal_length": False, "abs_pose_refine_extra_params": False}
+    options.mergedict(own)
     return options
 
 
@@ -186,18 +229,17 @@ def relative_error(relative: Any, truth: Truth, a: str, b: str) -> float:
 
 def centre_errors(poses: dict[str, Any], truth: Truth) -> Array:
     """Distances from the true centres after the best similarity (Umeyama 1991), per cent of the centres' RMS spread."""
+    import pycolmap
+
     names = sorted(truth.R)
     true = np.array([-truth.R[name].T @ truth.t[name] for name in names])
     size, errors = np.sqrt(((true - true.mean(0)) ** 2).sum(1).mean()), np.full(len(names), np.inf)
     here = [i for i, name in enumerate(names) if name in poses]
-    if len(here) < MIN_MODEL:
-        return errors
-    centres = np.array([poses[names[i]].inverse().translation for i in here])
-    P, Q = centres - centres.mean(0), true[here] - true[here].mean(0)
-    U, D, Vt = np.linalg.svd(Q.T @ P)
-    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])
-    scale = (D * signs).sum() / (P**2).sum()
-    errors[here] = np.linalg.norm(scale * P @ (U * signs @ Vt).T - Q, axis=1) / size * 100
+    if len(here) >= MIN_MODEL:
+        centres = np.array([poses[names[i]].inverse().translation for i in here])
+        similarity: Any = pycolmap.estimate_sim3d(centres, true[here])
+        moved = np.c_[centres, np.ones(len(here))] @ similarity.matrix().T
+        errors[here] = np.linalg.norm(moved - true[here], axis=1) / size * 100
     return errors
 
 
@@ -223,18 +265,29 @@ MODEL |= {f"{name}{limit}": 1 for name in ("auc", "centre") for limit in THRESHO
 def sheets(rows: Sequence[Row]) -> list[Sheet]:
     """Means of the scenes; pairs and models of each scene and method, means of the seeds."""
     each: dict[str, list[Record]] = {"means": [], "pairs": [], "models": []}
-    places = [tuple(row[name] for name in ("features", "cameras", "method")) for row in rows]
-    for place in dict.fromkeys(places):
-        own = [_with_speed(row) for row, at in zip(rows, places, strict=True) if at == place]
+    for (*place,), placed in _grouped(map(_with_speed, rows), "features", "cameras", "method"):
         about: Record = dict(zip(("features", "intrinsics", "verified by"), place, strict=True))
-        each["means"].append(about | _means(own))
-        for mapper, scene in dict.fromkeys((row["mapper"], row["scene"]) for row in own):
-            mine = [row for row in own if (row["mapper"], row["scene"]) == (mapper, scene)]
-            line: Record = {**about, **({"mapper": mapper} if mapper else {}), "scene": scene, "seeds": len(mine)}
-            columns = MODEL if mapper else VERIFICATION
-            line |= {name: _mean([row.get(name, np.nan) for row in mine], digits) for name, digits in columns.items()}
+        of_scenes: dict[str, list[dict[str, float]]] = {}  # by mapper, means of the seeds
+        for (mapper, scene), own in _grouped(placed, "mapper", "scene"):
+            means = {name: _mean([row[name] for row in own if name in row]) for name in (*own[0], *MODEL)
+                     if name not in FIELDS}  # fmt: skip
+            of_scenes.setdefault(mapper, []).append(means)
+            line: Record = {**about, **({"mapper": mapper} if mapper else {}), "scene": scene, "seeds": len(own)}
+            line |= {name: _text(means[name], digits) for name, digits in (MODEL if mapper else VERIFICATION).items()}
             each["models" if mapper else "pairs"].append(line)
+        speed = sum(of["pairs"] for of in of_scenes[""]) / max(sum(of["seconds"] for of in of_scenes[""]), 1e-9)
+        about |= {"scenes": len(of_scenes[""]), "pairs a second": f"{speed:.0f}"}
+        for mapper, field in itertools.product(MAPPERS, ("registered, %", *(f"auc{n}" for n in THRESHOLDS))):
+            about[f"{mapper}: {field}"] = _text(_mean([of[field] for of in of_scenes.get(mapper, [])]), 1)
+        each["means"].append(about)
     return [Sheet(name, f"Verified databases: {name}", records) for name, records in each.items()]
+
+
+def _grouped(rows: Iterable[Row], *fields: str) -> list[tuple[tuple[Any, ...], list[Row]]]:
+    groups: dict[tuple[Any, ...], list[Row]] = {}
+    for row in rows:
+        groups.setdefault(tuple(row[field] for field in fields), []).append(row)
+    return list(groups.items())
 
 
 def _with_speed(row: Row) -> Row:
@@ -243,22 +296,116 @@ def _with_speed(row: Row) -> Row:
     return {**row, "ms a pair": 1e3 * row["seconds"] / row["pairs"], "pairs a second": row["pairs"] / row["seconds"]}
 
 
-def _means(rows: Sequence[Row]) -> Record:
-    """Means over the scenes: pairs a second, and of each mapper registered images and AUC of relative poses."""
-    scenes = list(dict.fromkeys(row["scene"] for row in rows))
-
-    def by_scene(mapper: str, field: str) -> list[float]:
-        own = [[row[field] for row in rows if (row["scene"], row["mapper"]) == (s, mapper)] for s in scenes]
-        return [float(np.mean(values)) for values in own if values]
-
-    speed = sum(by_scene("", "pairs")) / max(sum(by_scene("", "seconds")), 1e-9)
-    line: Record = {"scenes": len(scenes), "pairs a second": f"{speed:.0f}"}
-    for mapper in MAPPERS:
-        for field in ("registered, %", *(f"auc{n}" for n in THRESHOLDS)):
-            line[f"{mapper}: {field}"] = _mean(by_scene(mapper, field), 1)
-    return line
+def _mean(values: Sequence[float]) -> float:
+    return float(np.mean(values)) if values else float("nan")
 
 
-def _mean(values: Sequence[float], digits: int) -> str:
-    known = [value for value in values if not np.isnan(value)]
-    return f"{np.mean(known):.{digits}f}" if known else ""
+def _text(value: float, digits: int) -> str:
+    return "" if np.isnan(value) else f"{value:.{digits}f}"
+
+
+def remove(path: Path) -> None:
+    """Remove a database with what lies beside it."""
+    for old in path.parent.glob(f"{path.name}*"):
+        old.unlink()
+
+
+def database_of(scene: Scene, features: str, cameras: str, work: Path) -> Path:
+    """The database of all pairs' matches without geometries, made at most once in `work`.
+
+    cameras: "unknown", COLMAP's guess of a SIMPLE_RADIAL, or "known", the true PINHOLE with a prior focal length.
+    """
+    path = work / f"{scene.name}-{features}-{cameras}.db"
+    if path.exists():
+        return path
+    begun = path.with_suffix(".begun")
+    begun.unlink(missing_ok=True)
+    if cameras == "known":
+        shutil.copy(database_of(scene, features, "unknown", work), begun)
+        calibrate(begun, scene.truth)
+    elif features == "colmap":
+        match(scene, begun, verified=False)
+    else:
+        _match_by_ours(scene, begun, work)
+    return begun.rename(path)
+
+
+def match(scene: Scene, path: Path, verified: bool) -> None:
+    """COLMAP's SIFT of a scene and its matches of all pairs, in a new database; verified: by the true cameras."""
+    import pycolmap
+
+    extraction = pycolmap.FeatureExtractionOptions(num_threads=1)
+    extraction.sift.max_num_features = FEATURES
+    mode = pycolmap.CameraMode.SINGLE if scene.single else pycolmap.CameraMode.PER_IMAGE
+    cpu = pycolmap.Device.cpu
+    pycolmap.extract_features(path, scene.images, camera_mode=mode, extraction_options=extraction, device=cpu)
+    if verified:
+        calibrate(path, scene.truth)
+    matching = pycolmap.FeatureMatchingOptions(num_threads=1, skip_geometric_verification=not verified)
+    pycolmap.match_exhaustive(path, matching_options=matching, device=cpu)
+
+
+def _match_by_ours(scene: Scene, path: Path, work: Path) -> None:
+    """`fmtorch match images=`, of which the geometries are removed again."""
+    import pycolmap
+
+    output, camera = work / f"{scene.name}-match", "shared" if scene.single else "per_image"
+    words = [f"images={scene.images}", "export=colmap", f"camera={camera}", f"output={output}"]
+    if subprocess.run([sys.executable, "-m", "fmtorch", "match", *words], check=False).returncode:
+        raise SystemExit(f"{scene.images} could not be matched; see above")
+    shutil.copy(output / "database.db", path)
+    with pycolmap.Database.open(path) as database:
+        database.clear_two_view_geometries()
+
+
+def calibrate(path: Path, truth: Truth) -> None:
+    import pycolmap
+
+    with pycolmap.Database.open(path) as database:
+        for image in database.read_all_images():
+            K, camera = truth.K[image.name], database.read_camera(image.camera_id)
+            params: list[Any] = [K[0, 0], K[1, 1], K[0, 2] + ORIGIN, K[1, 2] + ORIGIN]
+            known = pycolmap.Camera(model="PINHOLE", width=camera.width, height=camera.height, params=params)
+            known.camera_id, known.has_prior_focal_length = image.camera_id, True
+            database.update_camera(known)
+
+
+def run_known_models(arguments: argparse.Namespace) -> None:
+    import pycolmap
+
+    options = pycolmap.IncrementalPipelineOptions(num_threads=1, random_seed=0, extract_colors=False)
+    for path in (file.parent for root in arguments.root for file in sorted(root.glob("*/Camera.txt"))):
+        target, scene = arguments.folder / path.name, read_scene(path)
+        if target.is_dir():
+            continue
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=target.parent) as temporary:
+            folder, database = Path(temporary) / "scene", Path(temporary) / "database.db"
+            sparse = folder / "sparse"
+            sparse.mkdir(parents=True)
+            match(scene, database, verified=True)
+            model = pycolmap.triangulate_points(
+                posed(scene, database), database, scene.images, sparse, refine_intrinsics=False, options=options
+            )
+            for file in sparse.iterdir():
+                file.unlink()
+            model.write_text(sparse)
+            shutil.copytree(scene.images, folder / "images")
+            folder.rename(target)
+        seen = model.compute_mean_observations_per_reg_image()
+        print(f"{target}: {model.num_points3D()} points, {seen:.0f} seen in an image")
+
+
+def posed(scene: Scene, database: Path) -> Any:
+    """A reconstruction of the true cameras, with the numbers that images have in a database, and without points."""
+    import pycolmap
+
+    model = pycolmap.Reconstruction()
+    with pycolmap.Database.open(database) as opened:
+        for image in opened.read_all_images():
+            if image.camera_id not in model.cameras:
+                model.add_camera_with_trivial_rig(opened.read_camera(image.camera_id))
+            rotation = pycolmap.Rotation3d(scene.truth.R[image.name])
+            given = pycolmap.Image(name=image.name, camera_id=image.camera_id, image_id=image.image_id)
+            model.add_image_with_trivial_frame(given, pycolmap.Rigid3d(rotation, scene.truth.t[image.name]))
+    return model

@@ -9,8 +9,6 @@ precision=int8 quantises weights per channel and activations by what `calibratio
 validation=FOLDER of patches adds the ONNX file's own figures to the card.
 """
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -33,17 +31,7 @@ DEFAULTS = {
     "calibration": None, "calibration_patches": 2048, "validation": None, "pairs": 5000, "seed": 0, "threads": 1,
     "licence": None,
 }  # fmt: skip
-HARDNET = "HardNet (Mishchuk, Mishkin, Radenovic, Matas, NIPS 2017)"
-AFFNET = "AffNet (Mishkin, Radenovic, Matas, ECCV 2018)"
-TITLES = {
-    "hardnet": HARDNET,
-    "l2net": "L2-Net (Tian, Fan, Wu, CVPR 2017)",
-    "geodesc": "GeoDesc (Luo, Shen, Zhou, Zhu, Zhang, Yao, Fang, Quan, ECCV 2018)",
-    "affnet": AFFNET,
-    "hardnet_fast": f"{HARDNET} in a smaller layout",
-    "affnet_fast": f"{AFFNET} in a smaller layout",
-    "orinet": "OriNet (Mishkin, Radenovic, Matas, ECCV 2018)",
-}
+CARDS = Path(__file__).with_name("cards.yaml")
 RATIO = "residual_tilt"
 FIGURES = {
     "fpr95": "FPR at 95 % recall (%)",
@@ -51,45 +39,25 @@ FIGURES = {
     "accuracy": "nearest is right (%)",
     RATIO: "ratio of axes left after rectification (median; 1 is best)",
 }
-OTHER_LOSS = {
-    ("affnet", "affine_covariance"): "The loss is this project's own, not AffNet's: a patch that was stretched in two "
-    "known ways should be rectified alike (scripts.patch_networks.objectives.CovarianceObjective). The published hard "
-    "negative-constant loss, with a HardNet that is itself robust to tilt, ended after 20 minutes in one shape for all "
-    "patches; it is the option training.loss.name=hard_negative_constant.",
-    ("affnet_fast", "affine_covariance"): "The loss is that of affnet.md, plus the departure from its shapes.",
-    ("l2net", "hardest_triplet"): "The loss is HardNet's: L2-Net's own, the option "
-    "training.loss.name=relative_distance, learns far more slowly in so short a run.",
-    ("geodesc", "geodesc"): "The method is GeoDesc's; the authors' weights are not. In place of their reconstructions, "
-    "photographs seen as planes and rendered scenes give matches with known angles. A batch has fewer pairs of "
-    "photographs than theirs (12), the optimiser is Adam instead of SGD, and the two patches of a match are not turned "
-    "at random by up to 90 degrees each, which the authors' later code limits to 5 (lzx551402/tfmatch).",
-}  # what a card says of an architecture and loss: how its training differs from that of its paper
 
 
-def model_card(
-    path: Path,
-    architecture: str,
-    precision: str,
-    checkpoint: Mapping[str, Any],
-    figures: Mapping[str, float] | None = None,
-    licence: str | None = None,
-) -> str:
+def model_card(config: DictConfig, path: Path, checkpoint: Mapping[str, Any], figures: Mapping[str, float]) -> str:
     """Markdown for the ONNX file at `path`, from what its checkpoint says beside the weights.
 
-    figures: of the ONNX file itself on the validation patches. licence: of weights that this project did not train.
+    figures: of the ONNX file itself on the validation patches; empty where it was not measured.
     """
-    trained = "options" in checkpoint
+    trained, about = "options" in checkpoint, OmegaConf.load(CARDS)[config.architecture]
     rows = {
         "SHA-256": f"`{sha256(path)}`",
         "bytes": path.stat().st_size,
-        "licence": licence or (OWN_LICENCE if trained else "as the checkpoint it was converted from"),
+        "licence": config.licence or (OWN_LICENCE if trained else "as the checkpoint it was converted from"),
         **(_training(checkpoint) if trained else {"origin": "converted"}),
     }
-    title = f"{TITLES[architecture]}, {precision}: float32 grey patches (N, 1, 32, 32) to (N, D)."
+    title = f"{about.title}, {config.precision}: float32 grey patches (N, 1, 32, 32) to (N, D)."
     lines = [f"# {path.name}", "", title, "", "| | |", "| --- | --- |", *(f"| {k} | {v} |" for k, v in rows.items())]
-    other_loss = OTHER_LOSS.get((architecture, checkpoint.get("loss", {}).get("name")))
+    other_loss = about.get(checkpoint.get("loss", {}).get("name", ""))
     lines += ["", other_loss] if other_loss else []
-    measured = {**checkpoint.get("validation", {}), **({"this file": figures} if figures is not None else {})}
+    measured = checkpoint.get("validation", {}) | ({"this file": figures} if figures else {})
     return "\n".join([*lines, "", *_quality(measured, checkpoint)]).rstrip() + "\n"
 
 
@@ -98,7 +66,7 @@ def _training(checkpoint: Mapping[str, Any]) -> dict[str, str]:
     o, data, losses = checkpoint["options"], checkpoint["data"], checkpoint["losses"][-100:]
     licences = checkpoint.get("licences", {}) | {"scikit-image": "photographs inside the package, BSD-3-Clause"}
     photographs = (
-        f"{count} of {source}" + f" ({licences[source]})" * (source in licences)
+        f"{count} of {source}" + (f" ({licences[source]})" if source in licences else "")
         for source, count in data["photographs"].items()
     )
     scenes = ", ".join(f"{count} of {family}" for family, count in data.get("scenes", {}).items())
@@ -125,9 +93,8 @@ def _training(checkpoint: Mapping[str, Any]) -> dict[str, str]:
 
 def _quality(rows: Mapping[str, Mapping[str, float]], checkpoint: Mapping[str, Any]) -> list[str]:
     """A table of the figures on held-out patches; figures of circular shapes get a row of their own."""
-    table: dict[str, Mapping[str, float]] = {}
-    for name, row in rows.items():
-        table[name] = row
+    table = dict(rows)
+    for row in rows.values():
         if circle := {k.removeprefix("circle_"): v for k, v in row.items() if k.startswith("circle_")}:
             table["circles instead of shapes"] = circle
     if not table:
@@ -140,16 +107,15 @@ def _quality(rows: Mapping[str, Mapping[str, float]], checkpoint: Mapping[str, A
 
 
 def main() -> None:
-    """The command."""
     with exits_with_message():
         config = OmegaConf.merge(OmegaConf.create(DEFAULTS), OmegaConf.from_cli())
         assert isinstance(config, DictConfig)
         torch.set_num_threads(config.threads)
         content = read_checkpoint(config.checkpoint)
-        architecture = config.architecture or content.get("architecture")
+        config.architecture = architecture = config.architecture or content.get("architecture")
         if architecture is None:
             raise ValueError(f"{config.checkpoint} does not say what it is: give architecture=")
-        network = build(str(architecture)).eval()
+        network = build(architecture).eval()
         load_weights(network, config.checkpoint)
         folder = models_dir() if config.folder is None else Path(config.folder)
         path = folder / network_file(config.name or architecture, config.precision).name
@@ -164,12 +130,12 @@ def main() -> None:
                 export(network, Path(temporary) / "fp32.onnx")
                 patches = middle(validation_pairs(store, config.calibration_patches, config.seed)[0])
                 quantize(Path(temporary) / "fp32.onnx", path, patches)
-        figures = None
+        figures: dict[str, float] = {}
         if config.validation is not None and architecture in DESCRIPTORS:
             pairs = validation_pairs(PatchStore.open(config.validation), config.pairs)
             figures = evaluate_descriptor(PatchNetwork(path), pairs)
         card = path.with_suffix(".md")
-        card.write_text(model_card(path, str(architecture), config.precision, content, figures, config.licence))
+        card.write_text(model_card(config, path, content, figures))
         console.print(f"{path} ({path.stat().st_size} bytes), {card}")
 
 

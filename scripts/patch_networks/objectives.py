@@ -4,12 +4,10 @@ Row i of two descriptors is the same point. Of GeoDesc's loss (Luo et al., ECCV 
 authors' released code (lzx551402/tfmatch) has another form, so that none of theirs stands beside this one.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable
-from typing import Protocol, runtime_checkable
+from typing import Protocol
 
 import torch
 from jaxtyping import Float
@@ -31,62 +29,20 @@ def distances(a: Float[Tensor, "n d"], b: Float[Tensor, "m d"]) -> Float[Tensor,
     return (2 - 2 * a @ b.mT).clamp_min(1e-6).sqrt()
 
 
-def positive_and_hardest_negative(
-    a: Float[Tensor, "n d"], b: Float[Tensor, "n d"]
-) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
-    """Distance of each pair, and that of the hardest negative in the batch for either of its ends (anchor swap)."""
-    d = distances(a, b)
-    excluded = torch.eye(len(d), dtype=torch.bool, device=d.device) | (d < SAME_PATCH)
-    negative = torch.where(excluded, 10.0, d)
-    return d.diagonal(), torch.minimum(negative.min(1).values, negative.min(0).values)
-
-
 def hardest_triplet(
     a: Float[Tensor, "n d"], b: Float[Tensor, "n d"], *, margin: float = 1.0, squared: bool = False
 ) -> Float[Tensor, ""]:
     """HardNet's loss (Mishchuk et al., NIPS 2017, eq. 4): max(0, margin + positive - hardest negative), the mean.
 
-    squared: the hinge squared, which presses less on triplets that are nearly right.
+    The hardest negative in the batch is that of either end of a pair (anchor swap). squared: the hinge squared, which
+    presses less on triplets that are nearly right.
     """
-    positive, negative = positive_and_hardest_negative(a, b)
-    hinge = (margin + positive - negative).clamp_min(0)
+    d = distances(a, b)
+    excluded = torch.eye(len(d), dtype=torch.bool, device=d.device) | (d < SAME_PATCH)
+    negative = torch.where(excluded, 10.0, d)
+    hardest = torch.minimum(negative.min(1).values, negative.min(0).values)
+    hinge = (margin + d.diagonal() - hardest).clamp_min(0)
     return (hinge.square() if squared else hinge).mean()
-
-
-def hard_negative_constant(
-    a: Float[Tensor, "n d"], b: Float[Tensor, "n d"], *, margin: float = 1.0
-) -> Float[Tensor, ""]:
-    """AffNet's loss (Mishkin et al., ECCV 2018, eq. 5): HardNet's, with the negative distance a constant.
-
-    A negative only chooses the weight of its pair; it does not push shapes away from each other.
-    """
-    positive, negative = positive_and_hardest_negative(a, b)
-    return (margin + positive - negative.detach()).clamp_min(0).mean()
-
-
-def relative_distance(
-    a: Float[Tensor, "n d"], b: Float[Tensor, "n d"], *, compactness: float = 1.0
-) -> Float[Tensor, ""]:
-    """L2-Net's loss (Tian, Fan, Wu, CVPR 2017, eq. 5 and 9), without its term on intermediate feature maps.
-
-    Minus the log of the positive's share of exp(2 - distance) in its row and its column, the mean over the batch; plus
-    `compactness` times half the sum of squared correlations between dimensions of the descriptor, divided by their
-    number so that it does not outgrow the first term.
-    """
-    similarity = 2 - distances(a, b)
-    rows, columns = similarity.log_softmax(1).diagonal(), similarity.log_softmax(0).diagonal()
-    return -(rows + columns).mean() / 2 + compactness * (_correlation(a) + _correlation(b)) / 2
-
-
-def _correlation(x: Float[Tensor, "n d"]) -> Float[Tensor, ""]:
-    """Half the sum of squared correlations between different columns, by the number of columns."""
-    centred = x - x.mean(0)
-    centred = centred / (centred.square().sum(0) + 1e-10).sqrt()
-    r = centred.mT @ centred
-    return (r.square().sum() - r.diagonal().square().sum()) / (2 * x.shape[1])
-
-
-LOSSES: dict[str, Callable[..., Tensor]] = {"hardest_triplet": hardest_triplet, "relative_distance": relative_distance}
 
 
 def geodesc(
@@ -166,17 +122,15 @@ def evaluate_descriptor(describe: PatchFunction, pairs: Float[Tensor, "2 n 1 h w
     return patch_quality(*(functional.normalize(torch.cat(described), dim=1) for described in parts))
 
 
-@runtime_checkable
 class Objective(Protocol):
-    """A loss of a network on pairs of patches with their surroundings, and its figures on validation pairs."""
+    """A loss of a network on pairs of patches with their surroundings, and its figures on validation pairs.
 
-    def loss(self, network: nn.Module, pairs: Float[Tensor, "2 n 1 h w"], draws: Float[Tensor, "n k"]) -> Tensor:
-        """The loss; `draws` are all the randomness there is beside dropout."""
-        ...
+    `draws` are all the randomness there is beside dropout. The figures are for the log and the model card.
+    """
 
-    def evaluate(self, network: nn.Module, pairs: Float[Tensor, "2 n 1 h w"]) -> dict[str, float]:
-        """Figures for the log and the model card."""
-        ...
+    def loss(self, network: nn.Module, pairs: Float[Tensor, "2 n 1 h w"], draws: Float[Tensor, "n k"]) -> Tensor: ...
+
+    def evaluate(self, network: nn.Module, pairs: Float[Tensor, "2 n 1 h w"]) -> dict[str, float]: ...
 
 
 @dataclasses.dataclass(frozen=True)
@@ -192,7 +146,6 @@ class DescriptorObjective:
     weight: float = 1.0
 
     def loss(self, network: nn.Module, pairs: Float[Tensor, "2 n 1 h w"], draws: Float[Tensor, "n k"]) -> Tensor:
-        """The criterion on both patches of each point, mirrored and turned alike at random."""
         patches = middle(pairs)
         left, up, over = (draws[:, column, None, None, None] < 0.5 for column in range(3))
         patches = torch.where(left, patches.flip(-1), patches)
@@ -207,47 +160,7 @@ class DescriptorObjective:
         return loss
 
     def evaluate(self, network: nn.Module, pairs: Float[Tensor, "2 n 1 h w"]) -> dict[str, float]:
-        """`patch_quality` of the descriptors."""
         return evaluate_descriptor(network, pairs)
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class ShapeObjective:
-    """Patches rectified by their estimated affine shapes should be described alike (Mishkin et al., ECCV 2018).
-
-    descriptor: a trained network that stays as it is. tilt: the largest ratio of axes by which each patch is stretched
-    in a random direction on its own, after both were turned by one random angle.
-    """
-
-    descriptor: nn.Module
-    tilt: float = 2.0
-
-    def loss(self, network: nn.Module, pairs: Float[Tensor, "2 n 1 h w"], draws: Float[Tensor, "n k"]) -> Tensor:
-        """The hard negative-constant loss."""
-        return hard_negative_constant(*self.described(network, pairs, draws))
-
-    @torch.no_grad()
-    def evaluate(self, network: nn.Module, pairs: Float[Tensor, "2 n 1 h w"]) -> dict[str, float]:
-        """`patch_quality` of stretched patches with the network's shapes, and with circles for comparison."""
-        draws = validation_draws(pairs[0])
-        figures: dict[str, float] = {}
-        for name, shapes in (("", network), ("circle_", None)):
-            chunks = zip(torch.split(pairs, 256, 1), torch.split(draws, 256), strict=True)
-            a, b = (torch.cat(parts) for parts in zip(*(self.described(shapes, *c) for c in chunks), strict=True))
-            figures |= {f"{name}{key}": value for key, value in patch_quality(a, b).items()}
-        return figures
-
-    def described(
-        self, network: nn.Module | None, pairs: Float[Tensor, "2 n 1 h w"], draws: Float[Tensor, "n k"]
-    ) -> tuple[Tensor, Tensor]:
-        """Descriptors of both patches, rectified by the network's shapes where there is one."""
-        turn = _rotation(2 * math.pi * draws[:, 0])
-        patches = pairs.flatten(0, 1)
-        frame = torch.cat([turn @ _stretch(self.tilt ** draws[:, i], math.pi * draws[:, i + 1]) for i in (1, 3)])
-        if network is not None:
-            frame = frame @ shape_matrix(network(sample(patches, frame)))
-        a, b = self.descriptor(sample(patches, frame)).chunk(2)
-        return a, b
 
 
 @dataclasses.dataclass(frozen=True)
@@ -281,7 +194,8 @@ class CovarianceObjective:
     @torch.no_grad()
     def evaluate(self, network: nn.Module, pairs: Float[Tensor, "2 n 1 h w"]) -> dict[str, float]:
         """Median ratio of axes that is left between the two rectified patches, and without shapes (1: none)."""
-        T1, T2, seen = self._stretched(pairs[0], validation_draws(pairs[0]))
+        numbers = random.uniform(0, torch.zeros(1, dtype=torch.int64), Stream.TRAINING, 0, len(pairs[0]), DRAWS)[0]
+        T1, T2, seen = self._stretched(pairs[0], numbers.to(pairs[0]))
         A1, A2 = shape_matrix(network(seen)).chunk(2)
         values = [torch.linalg.svdvals(m.cpu()) for m in (_inverse(T1 @ A1) @ T2 @ A2, _inverse(T1) @ T2)]
         medians = [float((s[:, 0] / s[:, 1]).median()) for s in values]
@@ -294,11 +208,6 @@ class CovarianceObjective:
             for i in (0, 3)
         )
         return T1, T2, torch.cat([sample(patches, T1), sample(patches, T2)])
-
-
-def validation_draws(patches: Float[Tensor, "n 1 h w"]) -> Float[Tensor, "n k"]:
-    """Random numbers of an objective for each patch, always the same."""
-    return random.uniform(0, torch.zeros(1, dtype=torch.int64), Stream.TRAINING, 0, len(patches), DRAWS)[0].to(patches)
 
 
 def _departure(matrix: Float[Tensor, "n 2 2"]) -> Float[Tensor, ""]:

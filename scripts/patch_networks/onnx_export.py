@@ -12,8 +12,6 @@ int8 networks keep their outputs to the last bit where the processor sums produc
 saturate), those in fp32 up to the order of a sum.
 """
 
-from __future__ import annotations
-
 import copy
 import tempfile
 from pathlib import Path
@@ -114,7 +112,9 @@ def laid_out(model: onnx.ModelProto, side: int) -> onnx.ModelProto:
     graph = _Graph(changed.graph)
     for node in [node for node in changed.graph.node if node.op_type == "Conv"]:
         channels, inputs, _, width = graph.weights(node).shape
-        seen, side = side, graph.output_side(node, side)
+        ways, seen = _attributes(node), side
+        around = ways["pads"].ints[1] + ways["pads"].ints[3]
+        side = int(side + around - width) // int(ways["strides"].ints[1]) + 1
         if side == 1 and width == seen:
             graph.make_product(node)
         elif graph.quantised(node):
@@ -152,12 +152,6 @@ class _Graph:
             self.constants[self.writer[name].input[0] if self.quantised(convolution) else name]
         )
 
-    def output_side(self, convolution: Any, side: int) -> int:
-        """Width of a convolution's output."""
-        ways = _attributes(convolution)
-        around = ways["pads"].ints[1] + ways["pads"].ints[3]
-        return int(side + around - self.weights(convolution).shape[3]) // int(ways["strides"].ints[1]) + 1
-
     def widen(self, convolution: Any, side: int, pixels: int) -> None:
         """Have each row of a convolution give several pixels beside one another. side: of the convolution's output."""
         if pixels == 1:
@@ -192,7 +186,10 @@ class _Graph:
         convolution.op_type = "Gemm"
         del convolution.attribute[:]
         convolution.attribute.extend(ways)
-        self._reshape_for_reader(written, [0, len(weights), 1, 1])
+        shape = self._constant(f"{written}_shape", [0, len(weights), 1, 1])
+        reader = self._reader(written)
+        self._insert_before(reader, "Reshape", [written, shape], f"{written}_whole")
+        reader.input[0] = f"{written}_whole"
 
     def _flatten(self, reader: Any, name: str) -> None:
         """Have a node read (n, inputs) for (n, channels, height, width)."""
@@ -208,11 +205,6 @@ class _Graph:
         self._insert_before(reader, "Reshape", [f"{name}_rows", shape], f"{name}_pixels")
         self._insert_before(reader, "Transpose", [f"{name}_pixels"], f"{name}_channels", perm=[0, 3, 1, 2])
         reader.input[0] = f"{name}_channels"
-
-    def _reshape_for_reader(self, name: str, shape: list[int]) -> None:
-        reader = self._reader(name)
-        self._insert_before(reader, "Reshape", [name, self._constant(f"{name}_shape", shape)], f"{name}_whole")
-        reader.input[0] = f"{name}_whole"
 
     def _reader(self, name: str) -> Any:
         (reader,) = [node for node in self.graph.node if name in node.input]

@@ -5,8 +5,6 @@ other and are lit anew; where a point of one view is in another is known from th
 whose viewing angles say how hard it is to match two patches of a point (Luo et al., GeoDesc, ECCV 2018, section 3.3).
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Sequence
@@ -188,27 +186,22 @@ def random_homography(rng: np.random.Generator, size: tuple[int, int], warps: Wa
     # The tilt shrinks one direction by its full amount, as a turned plane is foreshortened.
     H[:2, :2] = _rotation(math.radians(turn) + axis) @ np.diag([scale, scale / tilt]) @ _rotation(-axis)
     H[2, :2] = rng.uniform(-warps.perspective, warps.perspective, 2) / np.array([w, h])
-    H = H @ _translation(-(w - 1) / 2, -(h - 1) / 2)
+    H[:, 2] -= H[:, :2] @ np.array([w - 1, h - 1]) / 2
     corners = apply(H, np.array([[0, 0], [w - 1, 0], [0, h - 1], [w - 1, h - 1]], np.float64))
     low, high = corners.min(0), corners.max(0)
     shrink = min(1.0, warps.longest_side / (high - low).max())
-    H = np.diag([shrink, shrink, 1.0]) @ _translation(-low[0], -low[1]) @ H
+    H = np.array([[shrink, 0, -shrink * low[0]], [0, shrink, -shrink * low[1]], [0, 0, 1.0]]) @ H
     out_w, out_h = np.maximum(np.round((high - low) * shrink), 32).astype(int)
     return H, (int(out_h), int(out_w))
 
 
 def apply(H: Matrix, points: Matrix) -> Matrix:
-    """Points (n, 2) under a homography."""
     mapped: Matrix = np.c_[points, np.ones(len(points))] @ H.T
     return mapped[:, :2] / mapped[:, 2:]
 
 
 def _rotation(angle: float) -> Matrix:
     return np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
-
-
-def _translation(x: float, y: float) -> Matrix:
-    return np.array([[1, 0, x], [0, 1, y], [0, 0, 1.0]])
 
 
 def training_scenes(count: int, views: int, seed: int) -> list[Task]:

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, from_numpy
 
 from fmtorch.data.images import read_image
 from fmtorch.jit import random
@@ -26,7 +26,9 @@ from fmtorch.scenes.dataset import Task
 from fmtorch.scenes.surfaces import PICTURES, skimage_file
 from fmtorch.training.planes import Photograph, PlaneViews
 from scripts.patch_networks import patches as patches_module
-from scripts.patch_networks.patches import CONTEXT_SIZE, Part, Tolerance, Warps
+from scripts.patch_networks.patches import CONTEXT_SIZE, Part, Tolerance, Warps, patch_similarity
+
+MAX_SIMILARITY = 0.85  # of the photographs of a pair: GeoDesc's authors leave out those that are more alike
 
 
 class Tracks(NamedTuple):
@@ -72,15 +74,14 @@ class PatchStore:
 
     def views(self, points: Int[Tensor, " b"], draws: Float[Tensor, "b 2"]) -> Float[Tensor, "2 b 1 h w"]:
         """Two different patches of each point in [0, 1], chosen by two random numbers in [0, 1)."""
-        start = torch.from_numpy(self.first)[points]
-        count = torch.from_numpy(self.first)[points + 1] - start
+        start = from_numpy(self.first)[points]
+        count = from_numpy(self.first)[points + 1] - start
         first = (draws[:, 0] * count).long()
         other = (draws[:, 1] * (count - 1)).long()
         return self.pairs(torch.stack([start + first, start + other + (other >= first)]))
 
     def pairs(self, index: Int[Tensor, "2 b"]) -> Float[Tensor, "2 b 1 h w"]:
-        """Patches by their indices, in [0, 1]."""
-        return torch.from_numpy(np.asarray(self.patches[index.numpy()])).unsqueeze(2).float() / 255
+        return from_numpy(np.asarray(self.patches[index.numpy()])).unsqueeze(2).float() / 255
 
 
 def validation_pairs(store: PatchStore, count: int, seed: int = 0) -> Float[Tensor, "2 n 1 h w"]:
@@ -88,6 +89,81 @@ def validation_pairs(store: PatchStore, count: int, seed: int = 0) -> Float[Tens
     key = torch.zeros(1, dtype=torch.int64)
     points = random.bits(seed, key, Stream.TRAINING, 0, len(store), 1).flatten().argsort(stable=True)[:count]
     return store.views(points, random.uniform(seed + 1, key, Stream.TRAINING, 0, len(points), 2)[0])
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class MatchSets:
+    """The matches of pairs of photographs, set after set (Luo et al., GeoDesc, ECCV 2018, section 3.4).
+
+    The patches that a loss compares with each other then come from one pair of photographs, as when a descriptor is
+    used; pairs whose photographs are nearly alike are left out, since they teach little.
+
+    patches: (2, k) indices of the two patches of each match. similarity: (k,) its S_patch. first: (s + 1,) where each
+    set begins. image_similarity: (s,) the mean of a set's S_patch.
+    """
+
+    patches: NDArray[np.int64]
+    similarity: NDArray[np.float64]
+    first: NDArray[np.int64]
+    image_similarity: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return len(self.first) - 1
+
+    def draw(
+        self, sets: Sequence[int], matches: int, numbers: Float[Tensor, "s n"]
+    ) -> tuple[Int[Tensor, "2 s n"], Float[Tensor, "s n"]]:
+        """n = `matches` different matches of each of the sets, as random numbers in [0, 1) choose them.
+
+        Returns the indices of their patches and their S_patch.
+        """
+        rows = []
+        for i, row in zip(sets, numbers.tolist(), strict=True):
+            left = list(range(int(self.first[i]), int(self.first[i + 1])))
+            for k in range(matches):  # Fisher and Yates
+                other = k + int(row[k] * (len(left) - k))
+                left[k], left[other] = left[other], left[k]
+            rows.append(left[:matches])
+        index = np.array(rows).reshape(len(rows), matches)
+        return from_numpy(self.patches[:, index]), from_numpy(self.similarity[index])
+
+
+def match_sets(tracks: Tracks, matches: int, max_similarity: float = MAX_SIMILARITY) -> MatchSets:
+    """The sets of pairs of photographs that share at least `matches` points and are not more alike than allowed.
+
+    S_image, the similarity of two photographs, is the mean S_patch of their shared points (section 3.3). In the order
+    of the first photograph and then of the second; matches in the order of their points. Patches without a known
+    incidence angle match nothing.
+
+    Raises ValueError where no pair is left.
+    """
+    pairs = _pairs_of_points(tracks.first)
+    pairs = pairs[:, np.isfinite(tracks.incidence)[pairs].all(0)]
+    pairs = np.where(tracks.view[pairs[0]] > tracks.view[pairs[1]], pairs[::-1], pairs)
+    a, b = pairs = pairs[:, np.lexsort((pairs[0], *tracks.view[pairs][::-1]))]
+    similarity = patch_similarity(tracks.rays[a], tracks.rays[b], tracks.incidence[a], tracks.incidence[b])
+    begins = np.flatnonzero(np.r_[True, (np.diff(tracks.view[pairs]) != 0).any(0)][: len(a)])
+    counts = np.diff(np.r_[begins, len(a)])
+    image = np.add.reduceat(similarity, begins) / counts if len(begins) else np.zeros(0)
+    kept = (counts >= matches) & (image <= max_similarity)
+    if not kept.any():
+        raise ValueError(
+            f"no pair of photographs shares {matches} points and has a similarity of at most {max_similarity}: "
+            "lower match_sets.matches, or cut more points"
+        )
+    of_kept = np.repeat(kept, counts)
+    return MatchSets(pairs[:, of_kept], similarity[of_kept], np.r_[0, np.cumsum(counts[kept])], image[kept])
+
+
+def _pairs_of_points(first: NDArray[np.int64]) -> NDArray[np.int64]:
+    """All pairs (2, k) of patches of the same point."""
+    counts = np.diff(first)
+    parts = [np.zeros((2, 0), np.int64)]
+    for length in np.unique(counts[counts >= 2]):
+        i, j = np.triu_indices(length, 1)
+        start = first[:-1][counts == length][:, None]
+        parts.append(np.stack([(start + i).ravel(), (start + j).ravel()]))
+    return np.concatenate(parts, axis=1)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -102,17 +178,17 @@ class Cutting:
     tolerance: Tolerance = dataclasses.field(default_factory=Tolerance)
     longest_side: int = 1024
 
-    def patches_of(self, source: Path | Task, seed: tuple[int, int]) -> Part:
-        """The patches of a photograph or of a rendered scene."""
+    def patches_of(self, job: tuple[Photograph | Task, tuple[int, int]]) -> Part:
+        """The patches of a photograph or of a rendered scene, by a seed."""
+        source, seed = job
         cv2.setNumThreads(1)
         rng = np.random.default_rng(seed)
         if isinstance(source, Task):
             views = patches_module.views_of_scene(source, rng, self.points)
             patches, point, geometry = patches_module.tracks_of_views(views, self.tolerance)
             return patches, point, geometry if isinstance(self.views, PlaneViews) else {}
-        image = read_image(source)
-        scale = self.longest_side / max(image.shape[:2])
-        if scale < 1:
+        image = read_image(source.path)
+        if (scale := self.longest_side / max(image.shape[:2])) < 1:
             image = np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
         if isinstance(self.views, PlaneViews):
             views = patches_module.views_of_plane(image, rng, self.views, self.points)
@@ -121,26 +197,18 @@ class Cutting:
 
 
 def build_store(
-    folder: Path | str,
-    photographs: Sequence[Photograph],
-    cutting: Cutting,
-    *,
-    seed: int,
-    scenes: Sequence[Task] = (),
-    workers: int = 1,
+    folder: Path, sources: Sequence[Photograph | Task], cutting: Cutting, seed: int, workers: int = 1
 ) -> PatchStore:
     """Cut corresponding patches from photographs and rendered scenes into `folder`, which appears once it is complete.
 
-    The patches of a photograph or scene depend on the seed and its place in the lists alone.
+    The patches of a source depend on the seed and its place in the list alone.
     Raises FileExistsError if the folder exists.
     """
-    folder = Path(folder)
     if folder.exists():
         raise FileExistsError(f"{folder} exists; delete it to cut the patches again")
-    sources: list[Path | Task] = [*(photograph.path for photograph in photographs), *scenes]
     description = {
-        "photographs": dict(collections.Counter(photograph.source for photograph in photographs)),
-        "scenes": dict(collections.Counter(task.family for task in scenes)), "seed": seed,
+        "photographs": dict(collections.Counter(s.source for s in sources if isinstance(s, Photograph))),
+        "scenes": dict(collections.Counter(s.family for s in sources if isinstance(s, Task))), "seed": seed,
         "views": cutting.views.views, "limits": dataclasses.asdict(cutting.views),
         "tolerance": dataclasses.asdict(cutting.tolerance),
     }  # fmt: skip
@@ -148,18 +216,13 @@ def build_store(
     unfinished.mkdir(parents=True)
     try:
         with multiprocessing.get_context("spawn").Pool(workers) as pool:
-            jobs = [(cutting, source, (seed, i)) for i, source in enumerate(sources)]
-            _write(unfinished, pool.imap(_cut, jobs), description)
+            jobs = [(source, (seed, i)) for i, source in enumerate(sources)]
+            _write(unfinished, pool.imap(cutting.patches_of, jobs), description)
         unfinished.rename(folder)
     except BaseException:
         shutil.rmtree(unfinished)
         raise
     return PatchStore.open(folder)
-
-
-def _cut(job: tuple[Cutting, Path | Task, tuple[int, int]]) -> Part:
-    cutting, source, seed = job
-    return cutting.patches_of(source, seed)
 
 
 def _write(folder: Path, parts: Iterable[Part], description: dict[str, Any]) -> None:

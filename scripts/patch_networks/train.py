@@ -6,37 +6,202 @@ python -m scripts.patch_networks.train training=affnet images=FOLDER photographs
 The patches are cut once into <out>/patches, those of known geometry (training=geodesc) into <out>/tracks; delete that
 folder after a change of photographs, of `patches` or of `training.tracks`. The checkpoint <out>/<name>.pt carries what
 the model card says; resume=true goes on from it; scripts.patch_networks.export makes the ONNX network and the card.
+
+Every step is a function of the seed and its number, so that a run can be resumed. A batch is points of a whole store,
+or matches of pairs of photographs (`MatchSetTraining`, as GeoDesc is trained).
 """
 
-from __future__ import annotations
-
+import dataclasses
 import functools
+import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import hydra
 import torch
+from jaxtyping import Float, Int
 from omegaconf import DictConfig
-from torch import nn
+from torch import Tensor, nn
 
 from fmtorch import presets
-from fmtorch.core.files import conf_dir
+from fmtorch.core.files import conf_dir, replacing
 from fmtorch.core.terminal import console, exits_with_message
-from fmtorch.features.networks import build, load_weights
+from fmtorch.features.networks import build, read_checkpoint
 from fmtorch.features.onnx_network import PatchNetwork, network_file
+from fmtorch.jit import random
+from fmtorch.jit.random import Stream
 from fmtorch.presets import plain
 from fmtorch.training.planes import PlaneViews, list_photographs
 from scripts.patch_networks import objectives, stores
-from scripts.patch_networks.objectives import (
-    LOSSES,
-    CovarianceObjective,
-    DescriptorObjective,
-    Objective,
-    ShapeObjective,
-)
+from scripts.patch_networks.objectives import DRAWS, CovarianceObjective, DescriptorObjective, Objective
 from scripts.patch_networks.patches import Tolerance, Warps, training_scenes
-from scripts.patch_networks.stores import Cutting, PatchStore, build_store
-from scripts.patch_networks.training import MatchSetTraining, PatchTraining, TrainingOptions
+from scripts.patch_networks.stores import MAX_SIMILARITY, Cutting, PatchStore
+
+OPTIMIZERS: dict[str, Callable[..., torch.optim.Optimizer]] = {
+    "adam": torch.optim.Adam,
+    "sgd": functools.partial(torch.optim.SGD, momentum=0.9, dampening=0.9),  # as the authors of HardNet do
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainingOptions:
+    """How a patch network is trained; the learning rate falls linearly to zero over the run.
+
+    batch: points a step, with two patches each. steps: the run's length, or minutes where that is given: wall time that
+    this run has spent in all its parts. optimizer: adam or sgd. bf16: autocast to bfloat16. checkpoint_steps,
+    log_steps: how often to save, to log.
+    """
+
+    batch: int = 512
+    steps: int = 5000
+    minutes: float | None = None
+    optimizer: str = "adam"
+    learning_rate: float = 3e-3
+    weight_decay: float = 1e-4
+    seed: int = 0
+    bf16: bool = True
+    checkpoint_steps: int = 250
+    log_steps: int = 50
+
+
+class PatchTraining:
+    """A network in training: `run` goes on to the end, or until a step; `save` keeps all that is needed."""
+
+    def __init__(
+        self, network: nn.Module, objective: Objective, store: PatchStore, options: TrainingOptions,
+        description: dict[str, Any] | None = None, device: torch.device | str = "cpu",
+    ) -> None:  # fmt: skip
+        if options.batch > len(store):
+            raise ValueError(f"batch={options.batch} is more than the {len(store)} points there are")
+        if options.optimizer not in OPTIMIZERS:
+            raise ValueError(f"optimizer={options.optimizer}; there are: {', '.join(OPTIMIZERS)}")
+        self.network, self.objective, self.store, self.options = network.to(device), objective, store, options
+        self.description, self.device = description or {}, torch.device(device)
+        rates = {"lr": options.learning_rate, "weight_decay": options.weight_decay}
+        self.optimizer = OPTIMIZERS[options.optimizer](self.network.parameters(), **rates)
+        self.step, self.seconds, self.losses = 0, 0.0, list[float]()
+
+    def resume(self, path: Path | str) -> None:
+        """Go on from a checkpoint of a run with the same options; ValueError names what differs."""
+        content = read_checkpoint(path)
+        mine, theirs = dataclasses.asdict(self.options), content.get("options", {})
+        changed = [k for k, v in mine.items() if k not in ("steps", "minutes") and theirs.get(k) != v]
+        if content.get("match_sets") != self.description.get("match_sets"):
+            changed.append("match_sets")
+        if changed:
+            raise ValueError(f"{path} was trained with other {', '.join(changed)}; start anew or take those options")
+        self.network.load_state_dict(content["state_dict"])
+        self.optimizer.load_state_dict(content["optimizer"])
+        self.step, self.seconds, self.losses = content["step"], content["seconds"], list(content["losses"])
+
+    def run(
+        self, until: int | None = None, checkpoint: Path | None = None, log: Callable[[str], None] | None = None
+    ) -> None:
+        """Train to the end, or to the step `until`. Raises FloatingPointError where the loss is no longer finite."""
+        o = self.options
+        last = time.perf_counter()
+        self.network.train()
+        while self.progress() < 1 and (until is None or self.step < until):
+            for group in self.optimizer.param_groups:
+                group["lr"] = o.learning_rate * (1 - self.progress())
+            loss = self._one_step()
+            if not torch.isfinite(loss):
+                raise FloatingPointError(f"the loss is {float(loss)} at step {self.step}: lower the learning rate")
+            self.losses.append(float(loss))
+            self.step += 1
+            now = time.perf_counter()
+            self.seconds, last = self.seconds + now - last, now
+            if log and self.step % o.log_steps == 0:
+                recent = self.losses[-o.log_steps :]
+                log(f"step {self.step} loss {sum(recent) / len(recent):.4f} seconds {self.seconds:.0f}")
+            if checkpoint and self.step % o.checkpoint_steps == 0:
+                self.save(checkpoint)
+        if checkpoint:
+            self.save(checkpoint)
+
+    def progress(self) -> float:
+        o = self.options
+        return self.step / o.steps if o.minutes is None else self.seconds / (60 * o.minutes)
+
+    def save(self, path: Path | str, **more: Any) -> None:
+        """Write the checkpoint; a file that was there before is replaced when the new one is complete."""
+        path = Path(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        content = {
+            "state_dict": self.network.state_dict(), "optimizer": self.optimizer.state_dict(), "step": self.step,
+            "seconds": self.seconds, "losses": self.losses, "options": dataclasses.asdict(self.options),
+            "data": self.store.description, **self.description, **more,
+        }  # fmt: skip
+        with replacing(path) as unfinished:
+            torch.save(content, unfinished)
+
+    def _one_step(self) -> Tensor:
+        o = self.options
+        key = torch.tensor([self.step])
+        draws = random.uniform(o.seed, key, Stream.TRAINING, 0, o.batch, DRAWS + 2)[0].float()
+        torch.manual_seed(int(random.bits(o.seed, key, Stream.TRAINING, o.batch, 1, DRAWS + 2)[0, 0, 0]))  # dropout
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=o.bf16):
+            loss = self._loss(draws)
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()  # type: ignore[no-untyped-call]
+        self.optimizer.step()
+        return loss.detach()
+
+    def _loss(self, draws: Float[Tensor, "b k"]) -> Tensor:
+        """The loss of this step's patches; `draws` are `DRAWS` random numbers of each point and two more."""
+        pairs = self.store.views(self._selected(len(self.store), self.options.batch), draws[:, DRAWS:])
+        return self.objective.loss(self.network, pairs.to(self.device), draws.to(self.device))
+
+    def _selected(self, total: int, count: int) -> Int[Tensor, " b"]:
+        """This step's points or match sets: each epoch is a random order of all."""
+        epoch, i = divmod(self.step, total // count)
+        return _order(self.options.seed + 1, epoch, total)[i * count : (i + 1) * count]
+
+
+@functools.lru_cache(maxsize=2)
+def _order(seed: int, epoch: int, total: int) -> Int[Tensor, " n"]:
+    return random.bits(seed, torch.tensor([epoch]), Stream.TRAINING, 0, total, 1).flatten().argsort(stable=True)
+
+
+class MatchSetTraining(PatchTraining):
+    """`PatchTraining` on batches of `options.batch` / `matches` match sets, each epoch a random order of all.
+
+    loss: of the descriptors (s, n, d), twice, of match sets and of the S_patch (s, n) of their matches. matches: of
+    each set, N_1 of the paper; max_similarity: of the photographs of a pair, above which it is left out.
+
+    Raises ValueError where the store has no geometry, and where the batch is no multiple of `matches`, or larger than
+    all sets together.
+    """
+
+    def __init__(
+        self, network: nn.Module, loss: Callable[..., Tensor], store: PatchStore,
+        options: TrainingOptions, description: dict[str, Any] | None = None, device: torch.device | str = "cpu",
+        *, matches: int = 64, max_similarity: float = MAX_SIMILARITY,
+    ) -> None:  # fmt: skip
+        if store.tracks is None:
+            raise ValueError("training.match_sets needs patches with their geometry: training.tracks")
+        if options.batch % matches:
+            raise ValueError(f"batch={options.batch} must be a multiple of match_sets.matches={matches}")
+        self.matches, self.criterion = matches, loss
+        self.sets = stores.match_sets(store.tracks, matches, max_similarity)
+        if options.batch > matches * len(self.sets):
+            raise ValueError(f"batch={options.batch} is more than {matches} matches of the {len(self.sets)} sets")
+        super().__init__(network, DescriptorObjective(loss), store, options, description, device)  # for its figures
+
+    def _loss(self, draws: Float[Tensor, "b k"]) -> Tensor:
+        seed, count = self.options.seed, self.options.batch // self.matches
+        chosen = self._selected(len(self.sets), count).tolist()
+        numbers = random.uniform(seed + 2, torch.tensor([self.step]), Stream.TRAINING, 0, count, self.matches)[0]
+        patches, similarity = self.sets.draw(chosen, self.matches, numbers)
+        similarity = similarity.float().to(self.device)
+
+        def criterion(a: Tensor, b: Tensor) -> Tensor:
+            a, b = (x.reshape(*similarity.shape, -1) for x in (a, b))
+            return self.criterion(a, b, similarity)
+
+        pairs = self.store.pairs(patches.flatten(1)).to(self.device)
+        return DescriptorObjective(criterion).loss(self.network, pairs, draws.to(self.device))
 
 
 def opened_stores(config: DictConfig) -> list[PatchStore]:
@@ -53,7 +218,7 @@ def opened_stores(config: DictConfig) -> list[PatchStore]:
             patches, cutting = config.patches, cutting_of(config, tracks)
             count, seed = 0 if side else patches.scenes, patches.seed + side
             scenes = training_scenes(count, cutting.views.views, seed)
-            build_store(folder, chosen, cutting, seed=seed, scenes=scenes, workers=patches.workers)
+            stores.build_store(folder, [*chosen, *scenes], cutting, seed, patches.workers)
         opened.append(PatchStore.open(folder))
     return opened
 
@@ -68,23 +233,18 @@ def cutting_of(config: DictConfig, tracks: bool) -> Cutting:
     return Cutting(views, points, Tolerance(**patches["tolerance"]), patches["longest_side"])
 
 
-def objective_of(config: DictConfig, device: torch.device) -> Objective:
-    """The loss of a config: on descriptors, or on shapes as a trained descriptor sees them."""
+def objective_of(config: DictConfig) -> Objective:
+    """The loss of a config, on descriptors or on shapes."""
     loss, taught = plain(config.training.loss), dict[str, Any]()
     if "teacher" in config.training:
         teacher = config.training.teacher
         taught = {"teacher": PatchNetwork(network_file(teacher.network, teacher.precision)), "weight": teacher.weight}
     name = loss.pop("name")
-    if name == "hard_negative_constant":
-        descriptor = build("hardnet").to(device).eval().requires_grad_(False)
-        load_weights(descriptor, loss.pop("descriptor"))
-        return ShapeObjective(descriptor, **loss)
     if name == "affine_covariance":
         return CovarianceObjective(**loss, **taught)
-    if name not in LOSSES:
-        names = ", ".join((*LOSSES, "hard_negative_constant", "affine_covariance"))
-        raise ValueError(f"training.loss.name={name}; there are: {names}")
-    return DescriptorObjective(functools.partial(LOSSES[name], **loss), **taught)
+    if name != "hardest_triplet":
+        raise ValueError(f"training.loss.name={name}; there are: hardest_triplet, affine_covariance, geodesc")
+    return DescriptorObjective(functools.partial(objectives.hardest_triplet, **loss), **taught)
 
 
 def training_of(
@@ -94,7 +254,7 @@ def training_of(
     training = plain(config.training)
     options = TrainingOptions(**training["options"])
     if "match_sets" not in training:
-        return PatchTraining(network, objective_of(config, device), store, options, description, device)
+        return PatchTraining(network, objective_of(config), store, options, description, device)
     loss = training["loss"]
     if loss.pop("name") != "geodesc":
         raise ValueError("training.match_sets needs training.loss.name=geodesc")
@@ -103,16 +263,8 @@ def training_of(
     return MatchSetTraining(network, criterion, store, options, description, device, **training["match_sets"])
 
 
-def set_pixel_mean(network: nn.Module, store: PatchStore) -> None:
-    """L2-Net's mean patch, from training patches spread evenly over the store."""
-    if hasattr(network, "pixel_mean"):
-        some = torch.from_numpy(store.patches[:: max(1, len(store.patches) // 20000)].copy())
-        network.pixel_mean.copy_(objectives.middle(some).float().mean(0) / 255)  # type: ignore[operator]
-
-
 @hydra.main(version_base=None, config_path=str(conf_dir()), config_name="train_patch_network")
 def main(config: DictConfig) -> None:
-    """The command."""
     with exits_with_message("interrupted; resume=true goes on from the last checkpoint"):
         torch.set_num_threads(config.threads)
         device = presets.resolve_device(config.device)
@@ -120,11 +272,12 @@ def main(config: DictConfig) -> None:
         training = plain(config.training)
         torch.manual_seed(training["options"]["seed"])
         network = build(training["architecture"], **training["network"])
-        set_pixel_mean(network, train)
+        if hasattr(network, "pixel_mean"):  # L2-Net's, of patches spread evenly over the store
+            spread = torch.from_numpy(train.patches[:: max(1, len(train.patches) // 20000)].copy())
+            network.pixel_mean.copy_(objectives.middle(spread).float().mean(0) / 255)  # type: ignore[operator]
         network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        description: dict[str, Any] = {
-            k: training[k] for k in ("architecture", "network", "loss", "teacher") if k in training
-        }
+        told = ("architecture", "network", "loss", "teacher")
+        description: dict[str, Any] = {key: value for key, value in training.items() if key in told}
         description |= {"validation_data": validation.description, "licences": plain(config.photographs.sources)}
         checkpoint = Path(config.out) / f"{config.name}.pt"
         run = training_of(config, network, train, description, device)

@@ -22,27 +22,6 @@ def hardest_triplet(a: Vectors, b: Vectors, margin: float, squared: bool) -> flo
     return total / n
 
 
-def relative_distance(a: Vectors, b: Vectors, compactness: float) -> float:
-    """Tian, Fan, Wu, CVPR 2017, eq. 3 to 5 and 8 to 9 (by the number of pairs and of dimensions)."""
-    n, total = len(a), 0.0
-    s = [[math.exp(2 - distance(a[i], b[j])) for j in range(n)] for i in range(n)]
-    for i in range(n):
-        total -= math.log(s[i][i] / sum(s[i])) / 2 + math.log(s[i][i] / sum(row[i] for row in s)) / 2
-    return total / n + compactness * (_correlation(a) + _correlation(b)) / 2
-
-
-def _correlation(x: Vectors) -> float:
-    columns = list(zip(*x, strict=True))
-    centred = [[v - sum(c) / len(c) for v in c] for c in columns]
-    total = 0.0
-    for i, c in enumerate(centred):
-        for j, d in enumerate(centred):
-            if i != j:
-                r = sum(p * q for p, q in zip(c, d, strict=True))
-                total += r * r / (sum(p * p for p in c) * sum(q * q for q in d))
-    return total / 2 / len(columns)
-
-
 def fpr_at_recall(positive: Sequence[float], negative: Sequence[float], recall: float) -> float:
     """The least threshold that accepts the share `recall` of the positives, and what it accepts of the negatives."""
     for threshold in sorted(positive):

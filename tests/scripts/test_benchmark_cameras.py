@@ -9,7 +9,7 @@ import torch
 
 from fmtorch.core import Correspondences, Estimate
 from scripts.benchmark import cameras
-from scripts.benchmark.cameras import LEVELS, TAKES, CameraMethod, applies, bougnoux, knowledge
+from scripts.benchmark.cameras import LEVELS, TAKES, CameraMethod, applies, bougnoux, calibrations, told
 from scripts.benchmark.methods import read_specs
 from scripts.benchmark.runner import Item, Row
 from tests.helpers import cross_matrix
@@ -50,27 +50,31 @@ def zoomed(factor: float) -> np.ndarray:
 
 
 def test_levels_tell_what_they_say() -> None:
-    of = item().pair
+    own = item()
     known, wrong, one_sided, shared, unknown = (
-        knowledge(level, of, SIZES, 0) for level in ("known", "wrong", "one_sided", "shared", "unknown")
+        told(level, own.pair, own.matches, 0) for level in ("known", "wrong", "one_sided", "shared", "unknown")
     )
-    assert (known.deviation, known.K[0] is None) == (0, False)
-    assert np.array_equal(known.K[0], K)
-    assert np.allclose(wrong.K[1], zoomed(1.5))
-    assert [k is None for k in (*one_sided.K, *shared.K, *unknown.K)] == [False, True, True, True, True, True]
-    assert (shared.one_camera, unknown.one_camera) == (True, False)
-    assert np.array_equal(unknown.calibrations(np.array([3.0, 4]))[1], [[4, 0, 499.5], [0, 4, 379.5], [0, 0, 1]])
-    assert applies("shared", of)
+    assert known.focal is not None
+    assert known.K0 is not None
+    assert wrong.K1 is not None
+    assert known.focal[0, :, 1].tolist() == [0, 0]
+    assert np.array_equal(known.K0[0], K)
+    assert np.allclose(wrong.K1[0], zoomed(1.5))
+    given = [k is not None for c in (one_sided, shared, unknown) for k in (c.K0, c.K1)]
+    assert given == [True, False, False, False, False, False]
+    assert [bool(c.shared_focal) for c in (shared, unknown)] == [True, False]
+    assert np.array_equal(calibrations(unknown, np.array([3.0, 4]))[1], [[4, 0, 499.5], [0, 4, 379.5], [0, 0, 1]])
+    assert applies("shared", own.pair)
     assert not applies("shared", item(zoomed(1.01)).pair)
     assert applies("unknown", item(zoomed(1.01)).pair)
 
 
 def test_bougnoux_gives_the_focal_lengths_of_a_true_matrix() -> None:
-    of = item(zoomed(1.3)).pair
-    given = knowledge("unknown", of, SIZES, 0)
-    assert bougnoux(of.F, given) == pytest.approx([1.3 * 950, 950], rel=1e-8)
+    own = item(zoomed(1.3))
+    unknown = told("unknown", own.pair, own.matches, 0)
+    assert bougnoux(own.pair.F, unknown) == pytest.approx([1.3 * 950, 950], rel=1e-8)
     forward = true_f(K, K, np.eye(3), np.array([0, 0, 1.0]))  # axes that are one line determine none
-    assert bougnoux(forward, given) == pytest.approx([1200, 1200])
+    assert bougnoux(forward, unknown) == pytest.approx([1200, 1200])
 
 
 @pytest.mark.parametrize(("name", "level"), [(name, level) for name, levels in TAKES.items() for level in levels])
@@ -113,7 +117,7 @@ def judged(level: str, R: np.ndarray | None, t: np.ndarray = T, focals: tuple[fl
     answer = Estimate(
         F, mask & ok, ok, ("" if R is not None else "nothing",), torch.zeros(1, dtype=torch.int64), **posed
     )
-    return CameraMethod("x", level, lambda c, given, seed: answer, "").figures(given, 0)
+    return CameraMethod("x", level, lambda c, seed: answer, "").figures(given, 0)
 
 
 def test_judgement_of_a_true_a_flipped_and_no_pose() -> None:

@@ -10,7 +10,7 @@ from skimage import data as images
 
 from fmtorch.geometry import homography_transfer
 from fmtorch.two_view.pair_type import classify
-from scripts.benchmark import photographs, planes
+from scripts.benchmark import planes
 from tests.scripts.samples import run
 
 
@@ -23,7 +23,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_pairs_are_of_their_kinds(folder: Path) -> None:
-    items = list(photographs.kinds(sorted(folder.iterdir())[:2]))
+    items = list(planes.kinds(sorted(folder.iterdir())[:2]))
     truths = [item.facts["truth"] for item in items]
     assert truths == ["planar", "rotation", "identical", "identical", "unrelated"] * 2
     verdict = planes.Ours(known=True)
@@ -56,7 +56,7 @@ def test_the_commands(folder: Path, capsys: pytest.CaptureFixture[str], monkeypa
 
 
 def test_an_estimate_is_judged_where_the_plane_is_seen(folder: Path) -> None:
-    (item,) = photographs.warped(sorted(folder.iterdir())[:1], 1, hard_too=False)
+    (item,) = planes.warped(sorted(folder.iterdir())[:1], 1, hard_too=False)
     shifted = np.array([[1, 0, 3], [0, 1, 4], [0, 0, 1]]) @ item.pair.H
     errors = [planes.Homography("x", lambda c, seed, H=H: H).figures(item, 0)["corner_error"]
               for H in (item.pair.H, shifted, None)]  # fmt: skip

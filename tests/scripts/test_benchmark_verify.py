@@ -9,8 +9,7 @@ import pytest
 
 from scripts.benchmark import verify
 from scripts.benchmark.runner import Kept
-from scripts.benchmark.scenes import Scene, Truth, calibrate
-from scripts.benchmark.verify import accuracy, centre_errors, sheets
+from scripts.benchmark.verify import Scene, Truth, accuracy, calibrate, centre_errors, sheets
 from tests.verification import databases
 
 K = np.array([[700.0, 0, 310], [0, 701, 250], [0, 0, 1]])

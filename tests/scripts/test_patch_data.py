@@ -38,8 +38,8 @@ def correlations(patches: np.ndarray, point: np.ndarray) -> tuple[float, float]:
 def test_a_store_is_complete_deterministic_and_gives_two_different_views(tmp_path: Path) -> None:
     names, cutting = package_photographs()[:2], Cutting(Warps(views=4), 40, longest_side=300)
     task = Task("indoor", "train", 0, 3, Plan(1, 3, 0, scale=0.4))
-    store = build_store(tmp_path / "a", names, cutting, seed=5, scenes=[task])
-    again = build_store(tmp_path / "b", names, cutting, seed=5, scenes=[task], workers=2)
+    store = build_store(tmp_path / "a", [*names, task], cutting, seed=5)
+    again = build_store(tmp_path / "b", [*names, task], cutting, seed=5, workers=2)
     np.testing.assert_array_equal(store.patches, again.patches)
     np.testing.assert_array_equal(store.first, again.first)
     assert store.first[-1] == len(store.patches)

@@ -13,24 +13,21 @@ from omegaconf import DictConfig
 from torch import Tensor, nn
 
 from fmtorch.core import conf_dir
-from fmtorch.features.networks import AffNet, GeoDesc, HardNet, build
+from fmtorch.features.networks import GeoDesc, HardNet, build
 from fmtorch.scenes import photograph
 from fmtorch.training.options import PlaneViews
 from scripts.patch_networks.objectives import (
     DescriptorObjective,
-    ShapeObjective,
     fpr_at_recall,
     geodesc,
     geometric,
     hardest_triplet,
     patch_quality,
-    relative_distance,
     structured,
 )
 from scripts.patch_networks.patches import Tolerance, patch_similarity, tracks_of_views, views_of_plane
-from scripts.patch_networks.stores import PatchStore, Tracks, build_store, package_photographs, validation_pairs
-from scripts.patch_networks.train import cutting_of, training_of
-from scripts.patch_networks.training import MatchSetTraining, PatchTraining, TrainingOptions, match_sets
+from scripts.patch_networks.stores import PatchStore, Tracks, build_store, match_sets, package_photographs
+from scripts.patch_networks.train import MatchSetTraining, PatchTraining, TrainingOptions, cutting_of, training_of
 from tests.reference import geodesc as geodesc_reference
 from tests.reference import patch_losses as reference
 
@@ -66,9 +63,6 @@ def test_losses_are_their_definitions() -> None:
     for squared in (False, True):
         expected = reference.hardest_triplet(a.tolist(), b.tolist(), 1.0, squared)
         assert float(hardest_triplet(a, b, squared=squared)) == pytest.approx(expected, abs=1e-9)
-    a, b = unit(10, 5, 0)
-    expected = reference.relative_distance(a.tolist(), b.tolist(), 0.7)
-    assert float(relative_distance(a, b, compactness=0.7)) == pytest.approx(expected, abs=1e-6)
 
 
 def test_the_loss_of_match_sets_is_its_definition() -> None:
@@ -158,19 +152,6 @@ def test_a_checkpoint_of_other_options_is_refused(store: PatchStore, tmp_path: P
         set_training(store, batch=40)
     with pytest.raises(ValueError, match="batch=3200 is more than 16 matches of the"):
         set_training(store, batch=3200)
-
-
-def test_shape_training_moves_the_network_and_not_the_descriptor(store: PatchStore) -> None:
-    descriptor = HardNet().eval().requires_grad_(False)
-    before = {k: v.clone() for k, v in descriptor.state_dict().items()}
-    torch.manual_seed(0)
-    network = AffNet()
-    start = {k: v.clone() for k, v in network.state_dict().items()}
-    run = PatchTraining(network, ShapeObjective(descriptor), store, TrainingOptions(batch=16, steps=3, bf16=False))
-    run.run()
-    assert all(torch.equal(v, before[k]) for k, v in descriptor.state_dict().items())
-    assert all(not torch.equal(v, start[k]) for k, v in network.named_parameters())
-    assert set(run.objective.evaluate(network.eval(), validation_pairs(store, 30))) >= {"map", "circle_map"}
 
 
 def random_tracks(seed: int) -> tuple[Tracks, dict[tuple[int, int], float]]:

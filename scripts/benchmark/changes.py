@@ -1,13 +1,14 @@
-"""What the stress test does to a pair's matches: sweeps of one quantity, and conditions that hurt.
+"""What is done to a pair's matches: windows and lenses; sweeps of one quantity, and conditions that hurt.
 
-Each change takes a `Case` and gives another, or None where too few right matches would be left. Images are not drawn
-again: the matches of the whole photographs are thinned out, moved or seen through a window.
+Images are not drawn again: the matches of the whole photographs are thinned out, moved or seen through a window. Each
+change of the stress test takes a `Case` and gives another, or None where too few right matches would be left.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -59,11 +60,8 @@ class Case:
         words = [byte for name in names for byte in str(name).encode()]
         return np.random.default_rng([self.pair.key % 2**63, *words])
 
-    def sizes(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """The images' (h, w)."""
-        assert self.c.size0 is not None
-        assert self.c.size1 is not None
-        return self.c.size0[0].double().numpy(), self.c.size1[0].double().numpy()
+    def sizes(self) -> list[NDArray[np.float64]]:
+        return [np.array(size, np.float64) for size in sizes_of(self.c)]
 
 
 def case_of(pair: ImagePair, c: Correspondences) -> Case:
@@ -128,10 +126,10 @@ def inlier_ratio(case: Case, ratio: float) -> Case | None:
     drawn = case.c.ratio[:, torch.from_numpy(rng.choice(wrong, len(added)))]
     more = taken(case.spare, torch.from_numpy(added)).replace(ratio=drawn)
     away = torch.zeros(len(added), dtype=torch.bool)
-    joined = _joined(kept.c, more)
-    return dataclasses.replace(
-        kept, c=joined, right=torch.cat([kept.right, away]), wrong=torch.cat([kept.wrong, ~away])
-    )
+    slots = [name for name in more.per_slot if getattr(more, name) is not None]
+    joined = kept.c.replace(**{name: torch.cat([getattr(kept.c, name), getattr(more, name)], 1) for name in slots})
+    labels = torch.cat([kept.right, away]), torch.cat([kept.wrong, ~away])
+    return Case(kept.pair, joined, *labels, kept.spare)
 
 
 def noise(case: Case, sigma: float) -> Case | None:
@@ -198,36 +196,74 @@ def central(size: NDArray[np.float64], new: NDArray[np.float64]) -> Window:
 
 def seen(case: Case, window0: Window, window1: Window) -> Case | None:
     """The matches inside both windows, in the windows' pixels, with F of these; None: fewer than MIN_RIGHT right."""
+    pair, c, inside = windowed(case.pair, case.c, (window0, window1))
+    enough = int((case.right & inside).sum()) >= MIN_RIGHT
+    return dataclasses.replace(case, pair=pair, c=c).subset(inside) if enough else None
+
+
+def windowed(
+    pair: ImagePair, c: Correspondences, windows: tuple[Window, Window]
+) -> tuple[ImagePair, Correspondences, Bool[Tensor, " n"]]:
+    """The pair and its matches in the windows' pixels, and which matches are inside both; without cameras."""
     moved, inverse = [], []
-    inside = torch.ones_like(case.right)
-    for x, (corner, new, scale) in ((case.c.x0, window0), (case.c.x1, window1)):
+    inside = torch.ones_like(c.mask[0])
+    for x, (corner, new, scale) in zip((c.x0, c.x1), windows, strict=True):
         shift = scale * (0.5 - corner) - 0.5  # pixel (0, 0) has its centre there and its corner at -0.5
         y = scale * x[0].double() + torch.from_numpy(shift)
         inside &= ((y > -0.5) & (y < torch.from_numpy(new[::-1].copy()) - 0.5)).all(-1)
         moved.append(y[None])
         inverse.append(np.array([[1 / scale, 0, -shift[0] / scale], [0, 1 / scale, -shift[1] / scale], [0, 0, 1]]))
-    if int((case.right & inside).sum()) < MIN_RIGHT:
-        return None
-    c = _placed(case.c, moved[0], moved[1], window0[2], window1[2])
-    shapes = [torch.from_numpy(window[1].astype(np.int64))[None] for window in (window0, window1)]
-    pair = dataclasses.replace(case.pair, F=inverse[1].T @ case.pair.F @ inverse[0], K0=None, K1=None)
-    windowed = dataclasses.replace(case, pair=pair, c=c.replace(size0=shapes[0], size1=shapes[1], K0=None, K1=None))
-    return windowed.subset(inside)
+    size0, size1 = (torch.from_numpy(new.astype(np.int64))[None] for _, new, _ in windows)
+    c = _placed(c, moved[0], moved[1], windows[0][2], windows[1][2])
+    pair = dataclasses.replace(pair, F=inverse[1].T @ pair.F @ inverse[0], K0=None, K1=None)
+    return pair, c.replace(size0=size0, size1=size1, K0=None, K1=None), inside
+
+
+def part(
+    pair: ImagePair, c: Correspondences, left: float = 0.0, top: float = 0.0, right: float = 1.0, bottom: float = 1.0
+) -> tuple[ImagePair, Correspondences]:
+    """Both images cropped to a part, in fractions of width and height, with F of the parts."""
+    windows = []
+    for h, w in sizes_of(c):
+        edges = np.round([left * w, top * h, right * w, bottom * h])
+        windows.append((edges[:2], (edges[2:] - edges[:2])[::-1], 1.0))
+    pair, c, inside = windowed(pair, c, (windows[0], windows[1]))
+    return pair, taken(c, inside)
+
+
+def bent(pair: ImagePair, c: Correspondences, lens: float) -> tuple[ImagePair, Correspondences]:
+    """The matches as two lenses of this lambda bend them (`find_fundamental`); F stays that of the pinholes' pixels."""
+    moved, inside = {}, torch.ones_like(c.mask[0])
+    for i, (h, w) in enumerate(sizes_of(c)):
+        centre, half_diagonal = torch.tensor([(w - 1) / 2, (h - 1) / 2]), math.hypot(h, w) / 2
+        x = (getattr(c, f"x{i}")[0].double() - centre) / half_diagonal
+        root = (1 - 4 * lens * x.square().sum(-1, keepdim=True)).sqrt()  # NaN beyond what the lens sees
+        y = x * 2 / (1 + root)
+        photographed = centre + half_diagonal * y
+        inside &= ((photographed > -0.5) & (photographed < torch.tensor([w, h]) - 0.5)).all(-1)
+        moved[f"x{i}"] = photographed[None].to(c.x0)
+        if (lafs := getattr(c, f"lafs{i}")) is not None:
+            slope = (2 / (1 + root))[..., None] * torch.eye(2) + 2 * lens * y[:, :, None] * (y / root)[:, None]
+            moved[f"lafs{i}"] = torch.cat([slope @ lafs[0, ..., :2].double(), photographed[..., None]], -1)[None].to(
+                lafs
+            )
+    return pair, taken(c.replace(**moved), inside)
+
+
+def sizes_of(c: Correspondences) -> list[list[float]]:
+    """Height and width of both images of a batch of one."""
+    assert c.size0 is not None
+    assert c.size1 is not None
+    return [c.size0[0].tolist(), c.size1[0].tolist()]
 
 
 def _placed(c: Correspondences, x0: Tensor, x1: Tensor, scale0: float = 1.0, scale1: float = 1.0) -> Correspondences:
     """The matches at other points, with their frames."""
     frames = {}
     for name, x, scale in (("lafs0", x0, scale0), ("lafs1", x1, scale1)):
-        lafs = getattr(c, name)
-        frames[name] = torch.cat([scale * lafs[..., :2], x[..., None].to(lafs)], -1)
+        if (lafs := getattr(c, name)) is not None:
+            frames[name] = torch.cat([scale * lafs[..., :2], x[..., None].to(lafs)], -1)
     return c.replace(x0=x0.to(c.x0), x1=x1.to(c.x1), **frames)
-
-
-def _joined(a: Correspondences, b: Correspondences) -> Correspondences:
-    """The matches of two batches of one."""
-    slots = [name for name in a.per_slot if getattr(a, name) is not None]
-    return a.replace(**{name: torch.cat([getattr(a, name), getattr(b, name)], 1) for name in slots})
 
 
 Change = Callable[[Case], Case | None]
