@@ -64,9 +64,7 @@ class CameraRows(NamedTuple):
 
 class Row(NamedTuple):
     """A pair of a batch that can be tried: its place there, and its matches as they came.
-
-    slot: (n,), where the pair's matches are among these. needed: inliers below which a model is none.
-    """
+    slot: (n,), where the pair's matches are among these. needed: inliers below which a model is none."""
 
     place: int
     matches: PixelMatches
@@ -77,10 +75,8 @@ class Row(NamedTuple):
 
 class Estimation:
     """The estimation of a batch of pairs on the host: the pairs, and the estimates that become of them.
-
     family: of the models. minimal: matches below which a pair is not tried, and inliers below which a model is none.
-    calibrated: the same of a pair whose focal lengths are exactly known; None: no difference.
-    """
+    calibrated: the same of a pair whose focal lengths are exactly known; None: no difference."""
 
     def __init__(
         self, c: Correspondences, seed: int, family: Estimated, minimal: int, calibrated: int | None = None
@@ -184,9 +180,7 @@ def shared_out(c: Correspondences) -> list[Tensor]:
 
 class Batch(NamedTuple):
     """The tensors of a batch on the host as arrays, one row a pair; sizes: (b, 4), h, w, h, w, empty where unknown.
-
-    focal: (b, 2, 2); shared: (b,), whether both focal lengths are one; lens: (b, 2, 2), and one_lens (b,) likewise.
-    """
+    focal: (b, 2, 2); shared: (b,), whether both focal lengths are one; lens: (b, 2, 2), and one_lens (b,) likewise."""
 
     x0: Array
     x1: Array

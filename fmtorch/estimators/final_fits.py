@@ -47,10 +47,8 @@ class Fit(NamedTuple):
 @runtime_checkable
 class FinalFit(Protocol):
     """Turns the selected model and its inliers into the estimate.
-
     gradient: how gradients reach points, prior and noise: "none", "least_squares" of the matches that count, or
-    "optimum", by the implicit function theorem. weighted: whether these matches count by prior and noise.
-    """
+    "optimum", by the implicit function theorem. weighted: whether these matches count by prior and noise."""
 
     gradient: ClassVar[str]
     weighted: ClassVar[bool]

@@ -27,9 +27,7 @@ RIVAL_GAIN_SHARE, SAME_MODEL, SAME_CAMERAS = 0.85, 1e-3, 1e-2
 
 class PlausibleCandidates:
     """Models F (k, 9) of greatest posterior nearby, what that is (k,), minus infinity for none, and their cameras.
-
-    best: the candidate of the greatest posterior, the first of several. valid: whether there is one.
-    """
+    best: the candidate of the greatest posterior, the first of several. valid: whether there is one."""
 
     def __init__(self, F: Array, posterior: Array, cameras: Cameras) -> None:
         self.F, self.posterior, self.cameras = F, posterior, cameras
@@ -121,11 +119,9 @@ class FocalSearch:
 
     def select(self, free: Candidates, pair: Pair, plausible: PlausibleCandidates | None) -> Selection:
         """One of the models searched without assumptions, or of plausible cameras near them, or of those before.
-
         Plausible cameras are taken where their gain minus the cost of the prior is nearly the best gain without one;
         they are tried where good models differ, or where some were there before. Where anything is known of the cameras
-        they are tried and taken.
-        """
+        they are tried and taken."""
         known = pair.calibration is not None
         gain = np.where(free.valid, scores_of(self.gain, free.F, pair), -np.inf)
         order = np.argsort(-gain, kind="stable")

@@ -48,9 +48,7 @@ class Solved(NamedTuple):
 
 class GraphedMatches(NamedTuple):
     """The usable matches of P pairs in normalised units, attached to the caller's graph, padded to N slots; float64.
-
-    precision: one over the square of the noise. weight: the prior times that.
-    """
+    precision: one over the square of the noise. weight: the prior times that."""
 
     points: Float[Tensor, "4 p n"]
     mask: Bool[Tensor, "p n"]

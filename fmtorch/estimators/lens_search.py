@@ -56,9 +56,7 @@ class LensFit(NamedTuple):
 
 def _inverse(A: Array) -> tuple[Array, float]:
     """The inverse (n, n) by elimination, whose operations are rounded alike everywhere, and log |det A|.
-
-    Of a matrix without an inverse these are infinite and not a number.
-    """
+    Of a matrix without an inverse these are infinite and not a number."""
     n, logarithm = len(A), 0.0
     rows = np.hstack([A, np.eye(n)])
     for i in range(n):
@@ -76,9 +74,7 @@ def fit_with_lenses(
     cameras: Cameras, lens: Array, prior: LensPrior, pair: Pair, scale_px: float, iterations: int
 ) -> list[LensFit]:  # fmt: skip
     """The maxima a posteriori of the truncated error near candidates, cameras (k, ...) and lenses (k, 2).
-
-    scale_px: from which on matches do not count; of the pair as it was photographed.
-    """
+    scale_px: from which on matches do not count; of the pair as it was photographed."""
     k, matches, images, own = len(lens), centred(pair, scale_px), images_of(pair), cameras.copy()
     out = LensOptimum(
         lens.copy(), np.empty((k, 9)), np.empty(k), np.empty((k, PARAMETERS)), np.empty((k, PARAMETERS, PARAMETERS))

@@ -22,10 +22,8 @@ EXACT = 0.02  # relative deviation below which a focal length counts as exactly 
 
 class Calibration(NamedTuple):
     """Measured focal lengths of two images of square pixels and central principal points.
-
     focals: px. deviations: relative standard deviations, 0 of a calibration, infinite where a focal length is unknown.
-    shared: whether both are one, in units of the longer sides of the images.
-    """
+    shared: whether both are one, in units of the longer sides of the images."""
 
     focals: tuple[float, float]
     deviations: tuple[float, float]
@@ -55,9 +53,7 @@ def calibration_of(focal: Array, shared: bool) -> Calibration | None:
 
 class Lens(NamedTuple):
     """What is known of the lenses of two images, lambda of the division model in half diagonals.
-
-    deviations: 0 of exactly known ones, infinite of unknown ones. shared: whether both are one.
-    """
+    deviations: 0 of exactly known ones, infinite of unknown ones. shared: whether both are one."""
 
     means: tuple[float, float]
     deviations: tuple[float, float]
@@ -132,9 +128,7 @@ class Pair:
 
     def uniform(self, start: int, count: int, columns: int) -> Array:
         """Random numbers in [0, 1) for the draws start .. start + count - 1, (count, columns).
-
-        A function of (seed, key, draw, column): the same in any batch and in any order of draws.
-        """
+        A function of (seed, key, draw, column): the same in any batch and in any order of draws."""
         out = np.empty((count, columns))
         uniforms(self.mixed_seed(Stream.SAMPLING), self.key, start, out)
         return out
@@ -149,9 +143,7 @@ class Pair:
 
 class PixelMatches(NamedTuple):
     """One pair as it arrives: matches in pixels (n, 2), which are real (n,), and what is known of each; else empty.
-
-    sizes: (4,), of the images as h, w, h, w.
-    """
+    sizes: (4,), of the images as h, w, h, w."""
 
     x0: F8x2
     x1: F8x2
@@ -221,9 +213,7 @@ def power_of_two(half: float) -> Any:
 @kernel(holds_gil=True)
 def to_pixels(F: F8x1, centre: F8x1, unit: float, out: F8x2) -> bool:
     """A model (9,) of normalised points as that of pixels, canonical in scale and sign -> out (3, 3); if it is finite.
-
-    centre: (4,), of the points in pixels; unit: pixels in one unit of the points.
-    """
+    centre: (4,), of the points in pixels; unit: pixels in one unit of the points."""
     T0, T1, product, model = matrix(3, 3), matrix(3, 3), matrix(3, 3), matrix(3, 3)
     for i in range(3):
         for j in range(3):

@@ -4,25 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from fmtorch.estimators import (
-    focal_search,
-    inliers,
-    pair,
-    preselection,
-    refinement,
-    sampling,
-    scores,
-    search,
-)
-from fmtorch.estimators import (
-    preselection as support,
-)
-from fmtorch.estimators import (
-    scores as saturated,
-)
-from fmtorch.estimators import (
-    scores as scored_matches,
-)
+from fmtorch.estimators import focal_search, inliers, pair, preselection, refinement, sampling, scores, search
+from fmtorch.estimators import preselection as support
+from fmtorch.estimators import scores as saturated
+from fmtorch.estimators import scores as scored_matches
 from fmtorch.estimators.models import focal_prior, homography, model, posterior, with_focals
 from fmtorch.estimators.models import posterior as cameras
 from fmtorch.geometry import five_point, homography_refine, levenberg_marquardt

@@ -40,18 +40,14 @@ class Candidates(NamedTuple):
 @dataclasses.dataclass(frozen=True)
 class Refinement:
     """Local optimisation of each model on its inliers, then Levenberg-Marquardt on the matches near the pool.
-
-    options: of the latter; None: none. local_optimization: None: none.
-    """
+    options: of the latter; None: none. local_optimization: None: none."""
 
     options: Refine | None
     local_optimization: LocalOptimization | None = None
 
     def near(self, pool: Pool, pair: Pair) -> Pair:
         """The pair with the matches on which the pool's models are refined: at most so many of those within reach.
-
-        Which of them, the pair's key decides.
-        """
+        Which of them, the pair's key decides."""
         if self.options is None or self.options.matches is None:
             return pair
         limit = np.float32(squared(self.options.RADIUS * self.options.scale / pair.pixels_per_unit))
@@ -80,9 +76,7 @@ def near_of(residual: Residual) -> Kernel[..., int]:
     @kernel(name=f"near_{residual.name}")
     def near(F: F4x2, points: F4x2, limit: np.float32, mixed_seed: int, key: int, out: I8x1) -> int:
         """Points (4, n) within a squared residual of one of the models (k, 9), the first in a random order -> out.
-
-        How many they are. Nothing is near a model of zeros.
-        """
+        How many they are. Nothing is near a model of zeros."""
         x0, y0, x1, y1 = points[0], points[1], points[2], points[3]
         wanted = np.zeros(points.shape[1], np.bool_)
         for k in range(len(F)):

@@ -152,10 +152,8 @@ def _best_first(pair: Pair) -> Array:
 @kernel
 def draw(draws: Draws, out: I8x2) -> None:
     """Weighted sampling without replacement: intervals already drawn are cut out of [0, total) -> out (size, count).
-
     A position is drawn in what is left and pushed past every drawn interval in ascending order; the table says whose
-    interval it falls in. Without a table every interval has length one.
-    """
+    interval it falls in. Without a table every interval has length one."""
     table, totals, newest, order, seed, key, start = draws
     count, drawn = out.shape[1], len(out) - (1 if len(newest) else 0)
     state, guide, shift = stream_state(seed, key), _guide(table), _guide_shift(table)
@@ -229,9 +227,7 @@ def quantise(prior: F8x1, largest: float, weight: I8x1, table: I8x1) -> None:
 @kernel
 def prosac_table(size: int, growth: int, out: I8x1) -> None:
     """T'_n for n = 1 .. N -> out (N,): the last draw whose sample of `size` comes from the first n matches.
-
-    growth: T_N. Chum & Matas (CVPR 2005), equations 3 and 4.
-    """
+    growth: T_N. Chum & Matas (CVPR 2005), equations 3 and 4."""
     total, before = len(out), 0.0
     draws: Any = 0
     for n in range(1, total + 1):

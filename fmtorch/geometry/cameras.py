@@ -114,10 +114,8 @@ USUAL_FOCAL = 1.2  # in units of the longer side, where neither size nor princip
 
 class SquarePixels(NamedTuple):
     """The images that B images are mapped to.
-
     map: from coordinates of K to those of K', attached to K; that of a faulty K is the identity. focal: of K', px,
-    constant. size: (h, w), px. unit: the focal length of K in that of K', attached.
-    """
+    constant. size: (h, w), px. unit: the focal length of K in that of K', attached."""
 
     map: Float[Tensor, "b 3 3"]
     focal: Float[Tensor, " b"]
@@ -214,7 +212,6 @@ def mapped(x: Float[Tensor, "*batch n 2"], A: Float[Tensor, "*batch 3 3"]) -> Fl
 
 class PixelFrame(NamedTuple):
     """Normalised coordinates of P pairs: ``pixel = centre + pixels_per_unit * coordinate``; constants, float64.
-
     centre: middle of the box around the points of each image, x0, y0, x1, y1. pixels_per_unit: a power of two, so that
     the larger box reaches from about -1 to 1. spread: whether the points differ at all; where not, the unit is a pixel.
     """

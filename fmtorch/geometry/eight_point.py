@@ -62,10 +62,8 @@ def eight_point(
 
 class NormalEquations(NamedTuple):
     """What the eight-point algorithm needs to know of a set of matches, however many these are.
-
     M: the sum of w a a^T over normalised matches. T0, T1: the similarities that normalise the points. valid: whether
-    everything was finite.
-    """
+    everything was finite."""
 
     M: Float[Tensor, "*batch 9 9"]
     T0: Float[Tensor, "*batch 3 3"]
@@ -94,9 +92,7 @@ def linear_fundamental(
     x0: Float[Tensor, "*points n 2"], x1: Float[Tensor, "*points n 2"], weight: Float[Tensor, "*batch n"]
 ) -> tuple[Float[Tensor, "*batch 3 3"], Bool[Tensor, "*batch"]]:
     """The F of unit norm, of any rank, that minimises sum w (x1^T F x0)^2; False where it is not determined.
-
-    Arguments as of `normal_matrix`.
-    """
+    Arguments as of `normal_matrix`."""
     f, determined = smallest_eigenvector(normal_matrix(x0, x1, weight))
     return f.reshape(*f.shape[:-1], 3, 3), determined
 
@@ -105,10 +101,8 @@ def normal_matrix(
     x0: Float[Tensor, "*points n 2"], x1: Float[Tensor, "*points n 2"], weight: Float[Tensor, "*batch n"]
 ) -> Float[Tensor, "*batch 9 9"]:
     """The sum of w a a^T, with a . vec(F) = x1^T F x0.
-
     Expects normalised float64 points, finite, with weight zero for those that do not count. The points' leading shape
-    broadcasts against that of the weights.
-    """
+    broadcasts against that of the weights."""
     # a = x1 (x) x0, so M holds the sums of w (x1 x1^T) (x) (x0 x0^T): 6 x 6 different ones, in parts that fit a cache.
     p0, p1 = _products(x0), weight[..., None, :] * _products(x1)
     rows = [stable_sum(part[..., :, None, :] * p0[..., None, :, :], -1) for part in p1.chunk(3, -2)]
@@ -149,9 +143,7 @@ SHIFT, RANK_TOLERANCE, SQUARINGS = 1e-14, 1e-12, 14  # as in `eigenvector`
 @kernel
 def eight_point_kernel(points: F8x2, sample: I8x2, F: F4x2, draw: I8x1) -> int:
     """Consistently oriented models of samples (8, s) of points (4, n) -> F (s, 9), draw (s,); how many there are.
-
-    The models stand in the order of the samples. Buffers are rows of LANES numbers, one per sample.
-    """
+    The models stand in the order of the samples. Buffers are rows of LANES numbers, one per sample."""
     X, N, A, B = matrix(32, LANES), matrix(32, LANES), matrix(72, LANES), matrix(9, LANES)
     work, there = matrix(8, LANES), np.empty((1, LANES), np.bool_)
     centre, scale, f = matrix(4, LANES), matrix(2, LANES), vector(9)
@@ -222,9 +214,7 @@ def _denormalise(f: Array, image: int, s: float, cx: float, cy: float) -> None:
 @kernel
 def weighted_eight_point(points: F8x2, weight: F8x1, F: F8x1) -> bool:
     """The F of least sum w (x1^T F x0)^2, made rank two, of unit norm, largest entry positive -> F (9,).
-
-    `eight_point.eight_point` of points (4, n) and weights (n,), not negative: whether there is one.
-    """
+    `eight_point.eight_point` of points (4, n) and weights (n,), not negative: whether there is one."""
     n, largest = len(weight), 0.0
     for i in range(n):
         largest = max(largest, weight[i])

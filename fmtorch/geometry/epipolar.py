@@ -172,18 +172,14 @@ def lines_through(F: Tensor, x: Tensor) -> list[Tensor]:
 
 def inverse_root(squared: Tensor) -> Tensor:
     """1 / sqrt(squared), and 0 with zero gradient where squared = 0.
-
-    On a CPU `rsqrt` rounds root and quotient correctly, one after the other, as `arithmetic.sqrt` and a division do.
-    """
+    On a CPU `rsqrt` rounds root and quotient correctly, one after the other, as `arithmetic.sqrt` and a division do."""
     positive = squared != 0  # NaN stays NaN
     return torch.where(positive, torch.where(positive, squared, 1.0).rsqrt(), 0.0)
 
 
 def unit_largest(matrix: Tensor) -> Tensor:
     """A homogeneous matrix scaled so that squares neither under- nor overflow.
-
-    The scale is a constant to autograd: what is computed from the matrix does not depend on it.
-    """
+    The scale is a constant to autograd: what is computed from the matrix does not depend on it."""
     largest = matrix.detach().abs().amax((-2, -1), keepdim=True)
     return matrix / torch.where(largest == 0, 1.0, largest)
 
@@ -202,10 +198,8 @@ def linearise(
     F: Float[Tensor, "9 p k"], points: Float[Tensor, "2 3 m p 1 lanes"], derivatives: bool = True
 ) -> tuple[Tensor, Float[Tensor, "m p k lanes"], Float[Tensor, "m p k lanes"], Float[Tensor, "m p k lanes"]]:
     """The Sampson residual ``r = e / g`` and its Jacobian: g J (3, 3, m, p, k, lanes), then e, 1 / g^2, and r^2.
-
     ``g dr = x1^T dF x0 - (e / g^2) ((F x0)^T D dF x0 + x1^T dF D F^T x1)`` with ``D = diag(1, 1, 0)``: the sum of two
-    products of a column and a row. points: homogeneous. Without derivatives the first is empty.
-    """
+    products of a column and a row. points: homogeneous. Without derivatives the first is empty."""
     x0, x1 = points
     rows = F.reshape(3, 3, 1, *F.shape[1:], 1)
     line1 = torch.addcmul(torch.addcmul(rows[:, 2], rows[:, 0], x0[0]), rows[:, 1], x0[1])  # F x0
@@ -234,7 +228,6 @@ TINY32, TINY_OF_KERNEL = np.finfo(np.float32).tiny, float(np.finfo(np.float64).t
 
 class Residual(NamedTuple):
     """Three inner functions of one residual. name: unique, part of the names of the kernels that are made of it.
-
     of_row(f, rows, row): squared residuals of SINGLES matches, float32, times their scale. of_match(f, x0, y0, x1, y1):
     the square of one, in the type of its arguments. within(f, x0, y0, x1, y1, limit): whether that is within a limit.
     """

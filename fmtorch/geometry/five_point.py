@@ -30,7 +30,6 @@ MONOMIAL = np.array([[_MONOMIALS.index("".join(map(str, sorted((*pair, c))))) fo
 @kernel
 def five_point(points: F8x2, sample: I8x2, depth: F8x2, offset: F8x1, F: F4x2, draw: I8x1) -> int:
     """Consistently oriented models of samples (5, s) of points (4, n) -> F (10 s, 9), draw (10 s,); their number.
-
     points: from the principal points. depth: (2, s), the focal lengths of each sample, in the unit of the points.
     offset: (4,), from the centre of the coordinates that F is for to the principal points. In the order of the samples.
     """
@@ -70,9 +69,7 @@ def five_point(points: F8x2, sample: I8x2, depth: F8x2, offset: F8x1, F: F4x2, d
 @inner
 def _constraints(e: Array, A: Array) -> None:
     """``det E = 0`` and ``E E^T E - tr(E E^T) E / 2 = 0`` for E = x X + y Y + z Z + W -> A (10 20, LANES).
-
-    e: (4 9, LANES), the basis X, Y, Z, W.
-    """
+    e: (4 9, LANES), the basis X, Y, Z, W."""
     Q, N, zero = matrix(9, LANES), matrix(3, LANES), fill(0.0)
     for r in range(200):
         store(A, r, zero)
@@ -211,9 +208,7 @@ def _essential(B: Array, e: Array, far: Any, z: Any, E: Array) -> Any:
 @inner
 def _uncalibrated(E: Array, depth: Array, offset: Array, F: Array) -> Any:
     """Fundamental matrices of cameras of these focal lengths, of unit norm -> F (9, LANES); a mask: whether finite.
-
-    E: (9, LANES), overwritten. depth: (2, LANES).
-    """
+    E: (9, LANES), overwritten. depth: (2, LANES)."""
     for k in range(3):
         store(E, 3 * k + 2, load(E, 3 * k + 2) * load(depth, 0))
     for k in range(3):

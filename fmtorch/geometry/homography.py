@@ -239,9 +239,7 @@ def _homographies(X: Array, work: Array, h: Array) -> Any:
 @inner
 def _areas(X: Array, x: int, work: Array, out: int) -> Any:
     """D_1, D_2, D_3 of points X (16, LANES), whose x of the image are in row x -> rows of work from `out` on.
-
-    A mask: whether no three of the four points lie on a line, up to rounding.
-    """
+    A mask: whether no three of the four points lie on a line, up to rounding."""
     x3, y3 = load(X, 12 + x), load(X, 13 + x)
     largest = where(absolute(x3) > absolute(y3), absolute(x3), absolute(y3))
     longest, total = fill(0.0), fill(0.0)
@@ -306,7 +304,6 @@ def cross_times(e: Array, A: Array, out: Array) -> None:
 @inner
 def plane_homography(F: Array, e1: Array, points: Array, triplet: Array, H: Array) -> bool:
     """The homography of the plane through the matches (3,) of a triplet that satisfy F -> H; if it is determined.
-
     ``H = A - e1 (M^-1 b)^T`` with ``A = [e1]_x F``, the rows of M the points in image 0, and
     ``b_i = (x1_i x (A x0_i)) . (x1_i x e1) / |x1_i x e1|^2`` (result 13.6). e1: the epipole in image 1, ``F^T e1 = 0``.
     """
@@ -340,9 +337,7 @@ def plane_homography(F: Array, e1: Array, points: Array, triplet: Array, H: Arra
 @inner
 def plane_and_parallax(H: Array, points: Array, i: int, j: int, F: Array) -> bool:
     """The fundamental matrix of a plane's homography and matches i and j off it -> F, of unit norm; if there is one.
-
-    ``F = [e1]_x H``: the lines through x1 and H x0 of both matches meet in the epipole e1 (section 13.2).
-    """
+    ``F = [e1]_x H``: the lines through x1 and H x0 of both matches meet in the epipole e1 (section 13.2)."""
     lines, e, size2 = matrix(2, 3), vector(3), 0.0
     for k in range(9):
         size2 += H[k] * H[k]
@@ -370,9 +365,7 @@ def plane_and_parallax(H: Array, points: Array, i: int, j: int, F: Array) -> boo
 @inner
 def least_squares_homography(points: Array, weight: Array, H: Array) -> bool:
     """The normalised DLT of matches (n,) by their weights, or of those inside -> H; whether it is determined.
-
-    Hartley & Zisserman (2004), algorithm 4.2.
-    """
+    Hartley & Zisserman (2004), algorithm 4.2."""
     T, S, M = matrix(2, 3), np.zeros((4, 3, 3)), np.zeros((9, 9))
     for image in range(2):
         if not _similarity(points[2 * image], points[2 * image + 1], weight, T[image]):

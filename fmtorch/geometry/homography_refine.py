@@ -37,11 +37,9 @@ from fmtorch.jit.lanes import LANES, added, fill, load, store, where
 
 class HomographyError(NamedTuple):
     """Of models and matches that broadcast to *s; see `homography_objective_kernels`.
-
     squared: squared distances, infinite where undefined. front: whether the model's third coordinate at the match is
     positive. equations: e. inverse: the three entries of ``(J J^T)^-1``. corrected: x and y, their corrections added,
-    and W times the multipliers l. multipliers: l.
-    """
+    and W times the multipliers l. multipliers: l."""
 
     squared: Float[Tensor, "*s"]
     front: Bool[Tensor, "*s"]
@@ -86,10 +84,8 @@ def homography_gradient(
     s2: Float[Tensor, "p slots"],
 ) -> Float[Tensor, "9 p k"]:
     """Half the gradient of ``sum_i w_i rho(r_i^2)`` by the entries of H, ``G^T l``, attached to all inputs.
-
     s2: squared scales of the loss, one a pair or a match. Matches of weight zero and those behind the horizon count
-    nothing, wherever they are.
-    """
+    nothing, wherever they are."""
     counted = weight.detach() > 0
     matches = torch.where(counted, points, 0)[:, :, None]
     error = linearise_homography(H[..., None], matches)
@@ -138,9 +134,7 @@ class _State(NamedTuple):
 @kernel
 def evaluate_homographies(H: F8x2, weighted: Weighted, derivatives: bool, products: F8x3, cost: F8x1) -> None:
     """The robust error of models (k, 9) -> cost (k,); the normal equations -> products (k, 10, 10), if wanted.
-
-    These are ``G^T (J J^T)^-1 G``, the gradient and r^2, each times the weights of matches and loss, summed.
-    """
+    These are ``G^T (J J^T)^-1 G``, the gradient and r^2, each times the weights of matches and loss, summed."""
     rows, loss, table = in_rows(weighted.points, weighted.weight, weighted.s2), weighted.loss, weighted.table
     sums, factors, work = matrix(SUMS, LANES), matrix(14, LANES), matrix(3, LANES)
     for k in range(len(H)):
@@ -164,10 +158,8 @@ def evaluate_homographies(H: F8x2, weighted: Weighted, derivatives: bool, produc
 @inner
 def _linearise(h: Array, rows: Array, row: int, derivatives: bool, factors: Array) -> Any:
     """Squared distances of LANES matches; what their normal equations are made of -> factors (14, LANES), if wanted.
-
     G is (t, 0, c) and, in its second row, (0, t, d), in blocks of three entries: t, c, d, then the three entries of
-    ``(J J^T)^-1`` and the two of l.
-    """
+    ``(J J^T)^-1`` and the two of l."""
     x, y, u, v = load(rows, row), load(rows, row + 1), load(rows, row + 2), load(rows, row + 3)
     w = h[6] * x + h[7] * y + h[8]
     e, f = h[0] * x + h[1] * y + h[2] - u * w, h[3] * x + h[4] * y + h[5] - v * w
@@ -200,11 +192,9 @@ def _linearise(h: Array, rows: Array, row: int, derivatives: bool, factors: Arra
 @inner
 def _add_products(factors: Array, counted: Any, sums: Array) -> None:
     """Adds the products of LANES matches, times what they count; factors: of `_linearise`.
-
     The blocks share their factors, so there are 52 sums in place of the 55 of each row of G: those of t t^T with the
     three entries of the inverse (6 each), of t with the rows of the last block (9 each), of that block (6), the
-    gradient (9); the caller adds that of r^2.
-    """
+    gradient (9); the caller adds that of r^2."""
     p, q, s = load(factors, 9) * counted, load(factors, 10) * counted, load(factors, 11) * counted
     l0, l1 = load(factors, 12) * counted, load(factors, 13) * counted
     place = 0
@@ -385,10 +375,8 @@ def homography_at_optimum(
     s2: Float[Tensor, "p slots"],
 ) -> Float[Tensor, "9 p k"]:
     """H, optima of unit norm on no graph, attached to the graph of points and weights by the implicit function theorem.
-
     s2: squared scales of the loss, one a pair or a match. As `refine.at_optimum`: the optimum moves by minus the
-    inverse Hessian, across H, times the change of the gradient.
-    """
+    inverse Hessian, across H, times the change of the gradient."""
     valid = torch.isfinite(H).all(0) & (H != 0).any(0)
     model = torch.where(valid, H, torch.eye(3, dtype=H.dtype, device=H.device).reshape(9, 1, 1) / 3**0.5)
     inverse = inverse_hessian_of_homography(model, points.detach(), weight.detach(), robust, s2.detach())

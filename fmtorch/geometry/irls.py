@@ -152,11 +152,9 @@ def reweighted(
     scale: Float[Tensor, " p"],
 ) -> Float[Tensor, "9 p k"]:
     """One iteration, component by component: the 8-point algorithm with the weights that the residuals under F give.
-
     F: k models for each of p pairs, entries row by row. points: x0, y0, x1, y1, of about unit scale; finite. weight: 0
     in padded slots. scale: of the loss, in the unit of the points. Models of rank 2; one that the weighted matches do
-    not determine is kept as it was.
-    """
+    not determine is kept as it was."""
     finite = torch.isfinite(F).all(0)
     known = torch.where(finite, F, constant(F, RANK_TWO))
     _, _, inverse, r2 = linearise(known, homogeneous(points[:, None, :, None]), derivatives=False)
@@ -169,9 +167,7 @@ def weighted_fit(
     points: Float[Tensor, "4 p n"], weight: Float[Tensor, "p k n"]
 ) -> tuple[Float[Tensor, "9 p k"], Bool[Tensor, "p k"]]:
     """The normalised 8-point algorithm with k sets of weights for each of p pairs, and which of them determine a model.
-
-    points: as of `reweighted`. Models of rank 2, of any scale; what is not determined means nothing but is finite.
-    """
+    points: as of `reweighted`. Models of rank 2, of any scale; what is not determined means nothing but is finite."""
     p, k = weight.shape[:2]
     valid = (torch.isfinite(weight) & (weight >= 0)).all(-1, keepdim=True) & (weight > 0).any(-1, keepdim=True)
     scales = torch.where(valid, weight.detach(), 1)  # changes no fit

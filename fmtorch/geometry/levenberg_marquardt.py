@@ -18,7 +18,6 @@ from fmtorch.jit.lanes import LANES, added, fill, load, sqrt, store, where
 
 # `sampson_objective` for models on the matches of one pair, compiled; float64, LANES matches at a time
 
-
 TINY = 1e-30  # as in `residuals`
 HUBER, CAUCHY, GEMAN_MCCLURE, TRUNCATED, MAGSAC = 0, 1, 2, 3, 4  # losses
 LOSS_CODES = {
@@ -39,11 +38,9 @@ def loss_table(loss: str) -> Array:
 
 class Weighted(NamedTuple):
     """Matches and a robust loss of their errors.
-
     points: (4, n). weight: (n,), what each counts. s2: (n,), squared scales of the loss, a code. table: (2, t + 2), of
     the loss MAGSAC, its weight at the ends of t intervals of r^2 / s^2 and beyond, and the weight's integral up to
-    there; of others it is not read.
-    """
+    there; of others it is not read."""
 
     points: F8x2
     weight: F8x1
@@ -184,19 +181,15 @@ def levenberg_marquardt(
     evaluate: Callable[..., None], step: Callable[..., None], accept: Callable[..., bool]
 ) -> Callable[[Any, Any, Any, Array, int, bool], None]:
     """The loop for an objective: loop(data, state, trial, damping, iterations, ends), in place.
-
     evaluate(state, data, derivatives): the costs, and the derivatives if asked for, at the state's parameters.
     step(state, damping, trial): those of a trial. accept(state, trial, damping, done, data): the trial for the models
-    that it improves; whether all are done.
-    """
+    that it improves; whether all are done."""
 
     @inner
     def loop(data: Any, state: Any, trial: Any, damping: Array, iterations: int, ends: bool) -> None:
         """The state holds the start, then that of least cost; no cost ever rises.
-
         damping: (k,), the first of each model. ends: whether models are ever done; the state then keeps the
-        derivatives at the end.
-        """
+        derivatives at the end."""
         done = np.zeros(len(damping), np.bool_)
         evaluate(state, data, iterations > 0 or ends)
         for i in range(iterations):
@@ -217,9 +210,7 @@ class Problem(NamedTuple):
 
 def accepting(take: Callable[[Any, Any, int], None]) -> Callable[..., bool]:
     """The `accept` of an objective on a `Problem`: a step that is taken divides the damping by 10, another multiplies.
-
-    take(state, trial, k): gives the state model k of the trial; costs are copied here.
-    """
+    take(state, trial, k): gives the state model k of the trial; costs are copied here."""
 
     @inner
     def accept(state: Any, trial: Any, damping: Array, done: Array, problem: Problem) -> bool:

@@ -36,11 +36,9 @@ def rank2_components(F: Float[Tensor, " 9 *s"]) -> Float[Tensor, " 9 *s"]:
 
 def last_right_singular_vector(F: Float[Tensor, " 3 3 *s"]) -> Float[Tensor, " 3 *s"]:
     """The unit right singular vector v of the smallest singular value, float64; F[i, j] is row i, column j.
-
     The cofactor matrix C of F has v for its *first* right singular vector, and singular values s1 s2, s1 s3, s2 s3: so
     v belongs to the largest eigenvalue of C^T C, which is well determined whenever s3 < s2, while the smallest one of
-    F^T F has lost half of its digits.
-    """
+    F^T F has lost half of its digits."""
     with torch.no_grad():
         G = _scaled(F.detach())
         C = cofactors(G)
@@ -93,7 +91,6 @@ def _unit(x: Tensor, fallback: Tensor) -> Tensor:
 
 def _largest_eigenvector(K: Tensor) -> Tensor:
     """The unit eigenvector of the largest eigenvalue of symmetric 3 x 3 matrices (3, 3, *s); any, where it is multiple.
-
     K - mean = m X with X's eigenvalues y the roots of y^3 - 3 y = det X: the extreme root by Newton's method from 2,
     the others from the quadratic that remains. The eigenvector is the longest cross product of two rows of K - lambda.
     """
@@ -318,9 +315,7 @@ def invert(A: Array, out: Array) -> bool:
 @inner
 def orthogonal_factor(A: Array) -> bool:
     """The rotation nearest to a positive or negative multiple of A, in place, by Newton's iteration (Higham 1986).
-
-    False where A is singular.
-    """
+    False where A is singular."""
     C = vector(9)
     for _ in range(POLAR_STEPS):
         cofactors_kernel(A, C)

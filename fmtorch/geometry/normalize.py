@@ -41,14 +41,9 @@ def normalize_points(
 
 
 def normalize_pair(
-    x0: Float[Tensor, "*batch n 2"],
-    x1: Float[Tensor, "*batch n 2"],
-    mask: Bool[Tensor, "*batch n"] | None = None,
+    x0: Float[Tensor, "*batch n 2"], x1: Float[Tensor, "*batch n 2"], mask: Bool[Tensor, "*batch n"] | None = None
 ) -> tuple[
-    Float[Tensor, "*batch n 2"],
-    Float[Tensor, "*batch n 2"],
-    Float[Tensor, "*batch 3 3"],
-    Float[Tensor, "*batch 3 3"],
+    Float[Tensor, "*batch n 2"], Float[Tensor, "*batch n 2"], Float[Tensor, "*batch 3 3"], Float[Tensor, "*batch 3 3"]
 ]:
     """Points of both images centred each on its own, with one common scale: x0_n, x1_n, T0, T1.
 
@@ -203,10 +198,8 @@ def fitted_by(
     loss: str,
 ) -> tuple[Float[Tensor, "9 p k"], Float[Tensor, "p k"]]:
     """Models and costs after fit(models (k, 9), matches, out (k, 9), cost (k,)), a kernel, of each pair, on the CPU.
-
     s2: squared scales of the loss, one a pair or a match. A model that cannot be fitted comes back as it was, with
-    infinite cost.
-    """
+    infinite cost."""
     start = as_matrices(models).flatten(2).cpu().contiguous().numpy()
     columns, weights = (t.detach().cpu().contiguous().numpy() for t in (points.movedim(1, 0), weight))
     scales = s2.detach().expand_as(weight).cpu().contiguous().numpy()

@@ -18,7 +18,6 @@ from fmtorch.jit.kernel import Array, B1x1, F8x1, F8x2, inner, kernel, matrix, v
 
 # Evidence for the kinds of an image pair, compiled; see `pair_type`. Matches are those of one pair, in pixels
 
-
 FREEDOM = 3.0  # degrees, of Student's law: keypoints err by more than the normal one says
 PEAK = 0.36755259694786135  # of that law: 2 / (pi sqrt(3))
 START, COARSEST = 1 / 1500, 1 / 300  # noise that is tried first, and the largest, of the side of an image
@@ -171,10 +170,8 @@ def _noise(r2: Array, prior: Array, side: float, dimensions: int, work: Array) -
 @inner
 def _densities(r2: Array, s: float, side: float, dimensions: int, out: Array) -> None:
     """Of right matches over that of wrong ones -> out (n,), by Student's law of FREEDOM = 3 degrees.
-
     Of one dimension, the distance from a line, or of two, from a point; the Sampson distance being that of four
-    coordinates, both are wider across than it by a root of two.
-    """
+    coordinates, both are wider across than it by a root of two."""
     by = 1 / (FREEDOM * s * s)
     if dimensions == 1:
         peak = side / ROOT2 * PEAK / s
@@ -191,10 +188,8 @@ def _densities(r2: Array, s: float, side: float, dimensions: int, out: Array) ->
 @inner
 def _log_likelihood(d: Array, prior: Array, share: Array) -> Any:
     """The maximum over the shares of sum log L -> share (j + 1,), d (j, n) being the densities of right matches.
-
     A match that the prior takes to be right belongs to one of the j components by their shares, and else is wrong like
-    the others: ``L = 1 - P (w_1 + w_2) + P (w_1 d_1 + w_2 d_2)``.
-    """
+    the others: ``L = 1 - P (w_1 + w_2) + P (w_1 d_1 + w_2 d_2)``."""
     j, n = d.shape
     share[0], share[1], share[2] = 1 / (j + 1), 1 / (j + 1), 1 / (j + 1) if j > 1 else 0.0
     for _ in range(STEPS):

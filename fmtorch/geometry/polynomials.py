@@ -16,11 +16,9 @@ CUBIC_POLISHING_STEPS = 2  # the closed form is good to 1e-8, the quadratic to 1
 @inner
 def cubic_roots(c: Array, roots: Array, valid: Array) -> None:
     """The real roots of c[0] z^3 + c[1] z^2 + c[2] z + c[3] -> roots (3,), valid (3,). c is scaled in place.
-
     Three real roots by Viete's substitution (its extreme root by Newton's method instead of a cosine), one by Cardano's
     formula; both are arranged against cancellation. Leading coefficients may vanish (a quadratic, a line); multiple
-    roots fill as many slots. A polynomial that is zero or not finite has none.
-    """
+    roots fill as many slots. A polynomial that is zero or not finite has none."""
     scale, finite = 0.0, True
     for k in range(4):
         scale, finite = max(scale, abs(c[k])), finite and math.isfinite(c[k])
@@ -106,10 +104,8 @@ DEGREE = 10
 
 class Roots(NamedTuple):
     """Of LANES polynomials, their first roots in rows 0, their second in rows 1, ... (DEGREE, LANES).
-
     far: whether in the second chart, in which z is the inverse of the root. exists: whether there is one.
-    low, high, below, above: places of different sign around it, and the values there.
-    """
+    low, high, below, above: places of different sign around it, and the values there."""
 
     z: Array
     far: Array
@@ -131,9 +127,7 @@ def room_for_roots() -> Any:
 @inner
 def real_roots(p: Array, valid: Any, roots: Any) -> int:
     """Real roots of p (DEGREE + 1, LANES), highest power first, in their order -> roots; how many rows of them.
-
-    valid: a mask; of other polynomials there are none.
-    """
+    valid: a mask; of other polynomials there are none."""
     size, most = fill(0.0), 0
     for d in range(DEGREE + 1):
         magnitude = absolute(load(p, d))

@@ -131,7 +131,6 @@ def _decomposed(F: Tensor, K0: Tensor, K1: Tensor) -> _Decomposition:
 
 def _essential(E: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """The nearest matrix with singular values (1, 1, 0) up to scale, its left null vector t, and whether E has rank 2.
-
     Between the planes across the null vectors E is a 2 x 2 matrix, whose nearest rotation or reflection is closed form.
     """
     size = E.detach().abs().amax((0, 1))
@@ -198,9 +197,7 @@ RANK_2 = 1e-10  # share of the squared norm that the product of the singular val
 @inner
 def nearest_axes(M: Array, e0: Array, e1: Array, U: Array, V: Array) -> Any:
     """U and V (3, 3) of the essential matrix nearest to M (9,), whose epipoles are e0, e1; whether M has rank 2.
-
-    In the planes across the epipoles M is 2 x 2; its nearest orthogonal matrix gives both singular values 1.
-    """
+    In the planes across the epipoles M is 2 x 2; its nearest orthogonal matrix gives both singular values 1."""
     p, q, a, b = vector(3), vector(3), vector(3), vector(3)
     complement_kernel(e0, p, q)
     complement_kernel(e1, a, b)
@@ -223,10 +220,8 @@ def nearest_axes(M: Array, e0: Array, e1: Array, U: Array, V: Array) -> Any:
 @kernel(holds_gil=True)
 def pose(F: F8x2, cameras: F8x1, x0: F8x2, x1: F8x2, weight: F8x1, out: F8x1) -> None:
     """The pose of a fundamental matrix (3, 3), of four the one with the most support in front -> out (13,).
-
     cameras: (6,), focal length and principal point of both. x0, x1: (n, 2). weight: (n,), in [0, 1], by which matches
-    count. out: R row by row, t of unit length, and 1; all zero where there is no pose.
-    """
+    count. out: R row by row, t of unit length, and 1; all zero where there is no pose."""
     M, G, e0, e1, U, V, R = vector(9), vector(9), vector(3), vector(3), matrix(3, 3), matrix(3, 3), matrix(6, 3)
     f0, u0, v0, f1, u1, v1 = cameras
     for r in range(3):  # E = K1^T F K0
@@ -270,9 +265,7 @@ def pose(F: F8x2, cameras: F8x1, x0: F8x2, x1: F8x2, weight: F8x1, out: F8x1) ->
 @inner
 def _vote(R: Array, U: Array, a: Array, b: Array, weight: float, support: Array) -> None:
     """Adds the weight of a match of rays a, b to the poses R[:3], R[3:], and these with -t, in front of which it lies.
-
-    Least squares on d1 b = d0 R a + t: the signs of the depths are those of n (b x t) and n (R a x t), n = R a x b.
-    """
+    Least squares on d1 b = d0 R a + t: the signs of the depths are those of n (b x t) and n (R a x t), n = R a x b."""
     for k in range(2):
         p, q, r = 0.0, 0.0, 0.0
         for i in range(3):
@@ -303,11 +296,9 @@ def _determinant(M: Array) -> Any:
 @inner
 def consistently_oriented(F: Array, X: Array, size: int) -> Any:
     """Whether ``F x0`` and ``e1 x x1``, the same epipolar line, point the same way for all matches of a sample: a mask.
-
     Chum, Werner & Matas, "Epipolar geometry estimation via RANSAC benefits from the oriented epipolar constraint"
     (ICPR 2004). A model through a wrong match mostly fails, so a look at the sample alone tells most wrong models.
-    F: (9, LANES), of rank two. X: (4 size, LANES), x0, y0, x1, y1 of the matches that each model was made from.
-    """
+    F: (9, LANES), of rank two. X: (4 size, LANES), x0, y0, x1, y1 of the matches that each model was made from."""
     f0, f1, f2, f3, f4, f5 = load(F, 0), load(F, 1), load(F, 2), load(F, 3), load(F, 4), load(F, 5)
     f6, f7, f8 = load(F, 6), load(F, 7), load(F, 8)
     # The epipole is across all columns: here two combinations, which no usual epipole makes parallel.

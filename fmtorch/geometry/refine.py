@@ -55,9 +55,7 @@ class _State(NamedTuple):
 @kernel
 def refine_kernel(F: F8x2, squarings: int, matches: Weighted, schedule: Schedule, out: F8x2, cost: F8x1) -> None:
     """Models (k, 9) made rank 2 and refined -> out (k, 9), cost (k,); what cannot be is not finite, nor its cost.
-
-    squarings: of `start_one`.
-    """
+    squarings: of `start_one`."""
     k = len(F)
     state = _State(out, matrix(k, 3), matrix(k, 3), np.empty((k, 10, 10)), cost)
     trial = _State(matrix(k, 9), matrix(k, 3), matrix(k, 3), np.empty((k, 10, 10)), vector(k))
@@ -275,10 +273,8 @@ def inverse_hessian(
     exact: Float[Tensor, "p k 9 9"], gauss_newton: Float[Tensor, "p k 9 9"], frame: Float[Tensor, "p k 9 normals"]
 ) -> Float[Tensor, "9 9 p k"]:
     """The inverse of the exact Hessian across the orthonormal normals of a manifold, 0 along these.
-
     Where it is not finite or not positive definite, at what is no strict minimum, Gauss and Newton's takes its place.
-    Directions that the points leave open are damped.
-    """
+    Directions that the points leave open are damped."""
     across = torch.eye(9, dtype=exact.dtype, device=exact.device) - frame @ frame.mT
     largest = gauss_newton.diagonal(dim1=-2, dim2=-1).amax(-1)[..., None, None]
     blocked = largest * (frame @ frame.mT)  # so that these directions do not look open

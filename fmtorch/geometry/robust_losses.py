@@ -19,7 +19,6 @@ from fmtorch.jit.kernel import Array
 
 # MAGSAC++: residuals judged by all noise scales at once (Barath et al., CVPR 2020, section 3): its loss in tables
 
-
 QUANTILE = 3.64
 ENTRIES = 2048  # intervals of u in [0, 1] between which the tabulated weight is linear: off by at most 3e-5
 TERMS = 40  # of series in x up to QUANTILE^2 / 2: what is left out is below a rounding error
@@ -40,10 +39,8 @@ def marginal_weight(u: Array) -> Array:
 
 def _lower_gamma(s: float, x: Array) -> Array:
     """The lower incomplete gamma function of s, 3/2 or 5/2, of x from 0 to about 7.
-
     ``x^s exp(-x) sum_n x^n / (s (s + 1) ... (s + n))``, and exp by its series, too: sums of positive terms, by
-    arithmetic alone, so that tables made of it are the same on every processor.
-    """
+    arithmetic alone, so that tables made of it are the same on every processor."""
     total, exponential = np.zeros_like(x), np.ones_like(x)
     for n in range(TERMS, -1, -1):
         total = (total * x + 1) / (s + n)
@@ -75,9 +72,7 @@ _WEIGHT, _INTEGRAL = torch.from_numpy(LOSS_TABLE).unbind(0)
 
 class RobustLoss(NamedTuple):
     """A robust loss, its derivative with respect to r^2, and its curvature, all functions of (r2, s2).
-
-    curvature: half the second derivative with respect to r, ``rho' + 2 r^2 rho''``, and 0 where that is negative.
-    """
+    curvature: half the second derivative with respect to r, ``rho' + 2 r^2 rho''``, and 0 where that is negative."""
 
     loss: Callable[[Tensor, Tensor], Tensor]
     weight: Callable[[Tensor, Tensor], Tensor]

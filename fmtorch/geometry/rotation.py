@@ -39,10 +39,8 @@ def fit_rotation(
     points: Array, noise: Array, H: Array, cameras: Cameras, s: float, parameters: Array, fitted: Array
 ) -> float:
     """R and focal lengths of least robust cost -> parameters (11,): logarithms, R; K1 R K0^-1 -> fitted (9,).
-
     Starts at the rotation nearest to K1^-1 H K0. points (4, n) and s in pixels. Returns the cost of the prior, infinite
-    where a calibration is singular.
-    """
+    where a calibration is singular."""
     n, unit_px = len(noise), math.sqrt(abs(cameras.K0[0, 0] * cameras.K1[0, 0]))
     A0, A1, back = vector(9), vector(9), vector(9)
     _centred(cameras.K1, unit_px, A1)

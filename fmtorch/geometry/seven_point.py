@@ -19,16 +19,13 @@ from fmtorch.jit.lanes import LANES, absolute, load, store
 # The seven-point algorithm on the samples of one pair, compiled; float64, LANES samples at a time, models in
 # float32
 
-
 HALF = 0.5**0.5
 
 
 @kernel
 def seven_point_kernel(points: F8x2, sample: I8x2, F: F4x2, draw: I8x1) -> int:
     """Consistently oriented models of samples (7, s) of points (4, n) -> F (3 s, 9), draw (3 s,); how many there are.
-
-    They stand in the order of the samples, and of one sample in that of the roots of its cubic.
-    """
+    They stand in the order of the samples, and of one sample in that of the roots of its cubic."""
     X, f, there = matrix(28, LANES), np.empty((3, 9, LANES)), np.empty((3, LANES), np.bool_)
     models, work = 0, _room()
     for first in range(0, sample.shape[1], LANES):
@@ -49,9 +46,7 @@ def seven_point_kernel(points: F8x2, sample: I8x2, F: F4x2, draw: I8x1) -> int:
 @kernel
 def all_seven_point(points: F8x2, sample: I8x2, F: F8x3, valid: B1x2) -> None:
     """All models of samples (7, s) of points (4, n) -> F (s, 3, 9), of unit norm; which slots hold one -> valid (s, 3).
-
-    Those without one are zero.
-    """
+    Those without one are zero."""
     X, f, there = matrix(28, LANES), np.empty((3, 9, LANES)), np.empty((3, LANES), np.bool_)
     work = _room()
     for first in range(0, sample.shape[1], LANES):
@@ -86,9 +81,7 @@ def _room() -> Any:
 @inner
 def _solve(X: Array, work: Any, f: Array, there: Array) -> None:
     """Of LANES samples X (28, LANES) the singular matrices of the null space -> f (3, 9, LANES), there (3, LANES).
-
-    The null space is spanned by F0 and F1; det(a F0 + b F1) = 0 is a cubic (Hartley and Zisserman, 11.1.2).
-    """
+    The null space is spanned by F0 and F1; det(a F0 + b F1) = 0 is a cubic (Hartley and Zisserman, 11.1.2)."""
     equations(X, 7, work.A)
     store(work.full_rank, 0, null_space(work.A, 7, work.B, work.scale))
     _determinants(work.B, work.p)
@@ -138,11 +131,9 @@ def _mixtures(p: Array, lane: int, full_rank: bool, mixed: Array, there: Array) 
 @inner
 def _coefficients(p: Array, lane: int, c: Array) -> tuple[bool, bool]:
     """The cubic of a basis that keeps its roots finite -> c (4,); whether it was turned by 45 degrees, exchanged.
-
     From the determinants at (1, 0), (0, 1), and at their sum and difference over the root of two. The cubic vanishes in
     at most three directions, so one of these four can be sent to infinity: the basis is turned and exchanged until the
-    leading coefficient is the largest of the four, and no solution is lost at infinity.
-    """
+    leading coefficient is the largest of the four, and no solution is lost at infinity."""
     best = 0
     for k in range(1, 4):
         if abs(p[k, lane]) > abs(p[best, lane]):
@@ -214,10 +205,8 @@ def _solved(
 
 def _attached(F: Float[Tensor, "*batch 3 3 3"], x0: Tensor, x1: Tensor) -> Float[Tensor, "*batch 3 3 3"]:
     """F, on no graph, attached to that of the points by the implicit function theorem; zero matrices have no gradient.
-
     The nine entries are determined by the seven equations ``x1^T F x0 = 0``, ``det F = 0`` and the norm. Where roots
-    meet, singular values s of these constraints' Jacobian are inverted as ``s / (s^2 + GAP^2)``.
-    """
+    meet, singular values s of these constraints' Jacobian are inverted as ``s / (s^2 + GAP^2)``."""
     h0, h1 = (torch.cat([x, torch.ones_like(x[..., :1])], -1)[..., None, :, :] for x in (x0, x1))
     error = ((h1 @ F) * h0).sum(-1)
     with torch.no_grad():

@@ -85,9 +85,7 @@ def correspondences(
 
 def expect_plausible(c: Correspondences, plane: bool = False) -> None:
     """Raise ValueError naming the first value that cannot be, or where points contradict their unit, K or size.
-
-    plane: x0 may be in the unit of a plane.
-    """
+    plane: x0 may be in the unit of a plane."""
     _expect_calibrations(c)
     expect_values(c, ratio=RATIO)
     _expect_pixels(c, plane)
@@ -208,9 +206,7 @@ def _one_of_list(i: int, x0: Any, x1: Any, fields: Mapping[str, Any]) -> Corresp
 
 def expect_values(c: Correspondences, **more: Rule) -> None:
     """Raises ValueError naming the first wrong value of the real matches of a batch; a GPU is asked but once.
-
-    more: rules beside those of the fields.
-    """
+    more: rules beside those of the fields."""
     rules = {name: field.bounds for name, field in c.declared.items() if field.bounds} | more
     wrong = {
         name: ~rule.holds(value.detach()) & (c.mask if name in PER_MATCH else True)
@@ -231,9 +227,7 @@ def expect_values(c: Correspondences, **more: Rule) -> None:
 
 def camera_fields(K0: Arrays | None, K1: Arrays | None, focal: Focal, sizes_known: bool) -> dict[str, Any]:
     """The fields K0, K1, focal, shared_focal of the arguments of `find_fundamental`; none where nothing is said.
-
-    Raises ValueError or TypeError, naming the argument.
-    """
+    Raises ValueError or TypeError, naming the argument."""
     if isinstance(focal, str) and focal not in FOCAL_NAMES:
         near = nearest(focal, FOCAL_NAMES).split(", ")[0]
         raise ValueError(f"focal is {focal!r}; it must be {FORMS}; did you mean {near!r}?")
@@ -313,10 +307,8 @@ def _floating(value: Any, name: str) -> Tensor:
 
 def _expect_pixels(c: Correspondences, plane: bool) -> None:
     """Raise ValueError where the points of all pairs are obviously not in pixels, or contradict the image sizes.
-
     Of a batch in which some pairs are sound none is refused: no pair can take its batch down. Points of an image with a
-    calibration matrix may be in its unit, whatever that is, and those of a plane, too, if the others are in pixels.
-    """
+    calibration matrix may be in its unit, whatever that is, and those of a plane, too, if the others are in pixels."""
     images = []
     for i, (x, K, size) in enumerate(((c.x0, c.K0, c.size0), (c.x1, c.K1, c.size1))):
         x = x.detach()

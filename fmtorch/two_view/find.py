@@ -23,9 +23,7 @@ R = TypeVar("R")
 
 def eager(function: Callable[P, R]) -> Callable[P, R]:
     """The function, which `torch.compile` calls instead of tracing it: gradients pass, the graph ends before it.
-
-    `torch.compiler.disable` would import the compiler, for a second and more, into programs that have no use for it.
-    """
+    `torch.compiler.disable` would import the compiler, for a second and more, into programs that have no use for it."""
 
     @functools.wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:

@@ -72,11 +72,9 @@ class KnownCameras:
 
 class Images(NamedTuple):
     """What is known of both images of each pair, after their points are mapped to square pixels.
-
     map: None where the points are as they were. measured: focal lengths, px, and their relative deviations. size:
     (h, w), None where unknown. unit: pixels as they were in one of the square ones; None as `map`. problems: of K,
-    empty where there is none.
-    """
+    empty where there is none."""
 
     map: Float[Tensor, "b 2 3 3"] | None
     measured: Float[Tensor, "b 2 2"]
@@ -217,10 +215,8 @@ def covariance_fields(
     estimate: Estimate, c: Correspondences, maps: Float[Tensor, "b 2 3 3"] | None, focals: Float[Tensor, "b 2"]
 ) -> dict[str, Tensor]:
     """The fields `covariance`, `tangents`, `covariance_F` of an estimate with a pose; NaN where there is none.
-
     c: its matches, in images of square pixels and central principal points. maps: from the coordinates that F is of to
-    those of c, None where these are the same. focals: of c.
-    """
+    those of c, None where these are the same. focals: of c."""
     R, t, scale = estimate.R, estimate.t, estimate.fit_scale
     if R is None or t is None or scale is None or c.size0 is None or c.size1 is None:
         shapes = {"covariance": (7, 7), "tangents": (3, 2), "covariance_F": (9, 9)}

@@ -18,11 +18,9 @@ SAMPLE = 4  # matches that any homography agrees with
 
 def homographies(c: Correspondences, find: Callable[[Correspondences], Estimate]) -> Estimate:
     """Homographies by an estimator that keeps orientations, of either orientation: the better supported one.
-
     A plane whose y points up, and a mirrored photograph, turn over where they are seen. That is searched for where most
     matches disagree with the first estimate. x0 in the unit of a plane is scaled to the extent of x1, since thresholds
-    are in its pixels. An estimate whose support is that of chance is not ok.
-    """
+    are in its pixels. An estimate whose support is that of chance is not ok."""
     scale, middle = _unit_of_plane(c)
     changed = (scale != 1) | (middle != 0).any(1)
     seen = _moved(c, scale, middle) if bool(changed.any()) else c

@@ -94,7 +94,6 @@ def kornia_ransac(
 
 # MAGSAC++, GC-RANSAC, DEGENSAC and SupeRANSAC as their authors published them (extra `peers`)
 
-
 Part = TypeVar("Part", int, str)
 
 # The numbers of the samplers in the authors' bindings of MAGSAC++ and GC-RANSAC.

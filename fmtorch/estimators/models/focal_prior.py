@@ -84,9 +84,7 @@ def focal_prior(
 
 def same_camera_share(difference: float, deviation: Array) -> float:
     """The share of draws with one focal length for images of equal size: how likely one camera is by Bayes' rule.
-
-    difference: of the measured logarithms; deviation: (2,), of each.
-    """
+    difference: of the measured logarithms; deviation: (2,), of each."""
     if not np.isfinite(deviation).all():
         return SAME_CAMERA_SHARE
     if (deviation < EXACT).all():
@@ -110,9 +108,7 @@ def normal_quantiles() -> Array:
 @inner
 def focal_cost(focal: Array, prior: FocalPrior, out: Array) -> Any:
     """The cost of two log focal lengths; its gradient (2) and its Hessian (h00, h11, h01) -> out (5,).
-
-    Of a shared focal length the first is the only parameter and the second, which is equal, stays where it is put.
-    """
+    Of a shared focal length the first is the only parameter and the second, which is equal, stays where it is put."""
     difference = focal[0] - focal[1]
     squared = difference * difference
     mean = (focal[0] + focal[1]) * (0.5 / FOCAL_DEVIATION) - LOG_USUAL / FOCAL_DEVIATION
@@ -156,9 +152,7 @@ def prior_slopes(focal: F8x1, prior: FocalPrior, out: F8x1) -> None:
 @kernel(holds_gil=True)
 def draw_depths(prior: FocalPrior, longest: F8x1, mixed_seed: int, key: int, start: int, out: F8x2) -> None:
     """Focal lengths of both images for the draws start, start + 1, ..., in the unit of the points -> out (2, count).
-
-    longest: (2,), the longer sides of the images. mixed_seed: of the seed and the stream.
-    """
+    longest: (2,), the longer sides of the images. mixed_seed: of the seed and the stream."""
     normal, draw, common = prior.normal, prior.draw, prior.common
     state, mask, count = stream_state(mixed_seed, key), np.uint64(len(normal) - 1), len(normal)
     measured = prior.precision[0] > 0 or prior.precision[1] > 0

@@ -23,10 +23,8 @@ SQUARINGS = 1  # by which models are made rank 2, whose last singular value is b
 
 class Matrices:
     """What the families share whose models are matrices of a minimal sample, each by its kernels.
-
     size, solutions: matches of a minimal sample, and its models at most. minimal: samples -> models. linear: weighted
-    matches -> the model of least squares. gauss_newton: a model -> the model after one step.
-    """
+    matches -> the model of least squares. gauss_newton: a model -> the model after one step."""
 
     size: ClassVar[int]
     solutions: ClassVar[int]

@@ -32,11 +32,9 @@ class Homography(Matrices):
 
     def weight(self, pair: Pair) -> Array:
         """As `Matrices.weight`: by the noise, not by the prior.
-
         A plane is easy: two equations a match keep wrong ones out, and weights cost efficiency. On 99 photographs under
         known warps AUC of the corner error at 1 px is 66.2 without and 63.2 with them where matches are few, 83.1 and
-        83.0 otherwise; by a truncated loss in place of Cauchy's 62.2 and 80.9.
-        """
+        83.0 otherwise; by a truncated loss in place of Cauchy's 62.2 and 80.9."""
         return 1 / np.square(pair.noises)
 
     def minimise(self, F: Array, matches: Weighted, schedule: Schedule, out: Array, cost: Array) -> None:
@@ -47,9 +45,7 @@ class Homography(Matrices):
 @kernel(holds_gil=True)
 def homography_to_pixels(H: F8x1, centre: F8x1, unit_px: float, out: F8x2) -> bool:
     """A homography (9,) of normalised points as that of pixels, of unit norm -> out (3, 3); whether it is finite.
-
-    centre: (4,), of the points in pixels; unit_px: pixels in one unit of the points.
-    """
+    centre: (4,), of the points in pixels; unit_px: pixels in one unit of the points."""
     flat, finite = out.ravel(), True
     for r in range(3):  # H times the map from pixels, x = (pixel - centre) / unit
         out[r, 0], out[r, 1] = H[3 * r] / unit_px, H[3 * r + 1] / unit_px

@@ -22,9 +22,7 @@ from fmtorch.jit.lanes import absolute, added, fill, load, sqrt, where
 
 class Hypotheses(NamedTuple):
     """Models of one round in the order of their draws: F (m, 9) float32, and the draw (m,) that each is made of.
-
-    draw: counted from `start`. sample: (size, s), the matches of the draws start, start + 1, ...
-    """
+    draw: counted from `start`. sample: (size, s), the matches of the draws start, start + 1, ..."""
 
     F: Array
     draw: Array
@@ -45,11 +43,9 @@ class Family(Protocol):
 
 class FitScale(NamedTuple):
     """The last fit, at a pair's own noise.
-
     loss: its robust loss. sigmas_of_median: the standard deviation of a coordinate, in medians of inliers' residuals.
     scale_sigmas: the scale of the loss in these; it is within smallest_px and largest_px, and default_px where too few
-    inliers tell the noise. by_prior: whether a match counts by its prior, too, not by its noise alone.
-    """
+    inliers tell the noise. by_prior: whether a match counts by its prior, too, not by its noise alone."""
 
     loss: str = "truncated"
     sigmas_of_median: float = 1.4826
@@ -112,7 +108,6 @@ class Refining(Family, Estimated, Protocol):
 
 # On which side of both cameras matches lie: of the candidates of one pair
 
-
 BITS = 20  # fractional, of the support, so that its sums are exact
 REST = 1 / 26  # of the gain of Geman & McClure at 5 scales, from which on it is zero
 TINY = float(np.finfo(np.float64).tiny)
@@ -121,11 +116,9 @@ TINY = float(np.finfo(np.float64).tiny)
 @kernel(holds_gil=True)
 def cheirality(cameras: Cameras, longest: F8x1, F: F8x2, matches: Weighted, tolerance: float, out: F8x1) -> None:
     """The share of the support that lies in front of both cameras, for the better of their poses -> out (k,).
-
     Support is each match's weight times the gain of Geman & McClure; matches of rays that are parallel up to the
     tolerance, in the unit of the points, lie on either side. longest: (2,), the longer sides of the images. F: (k, 9),
-    the cameras' models. matches: from the principal points; their s2 is *one over* the square of each one's scale.
-    """
+    the cameras' models. matches: from the principal points; their s2 is *one over* the square of each one's scale."""
     axes, focal = cameras.axes, cameras.focal
     rows, shift = in_rows(matches.points, matches.weight, matches.s2), 1.5 * 2.0 ** (52 - BITS)
     for k in range(len(out)):

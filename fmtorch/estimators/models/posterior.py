@@ -22,7 +22,6 @@ from fmtorch.jit.lanes import LANES, fill, load, store
 
 # Two cameras of square pixels and central principal points: fundamental matrices by their parameters
 
-
 MIN_IMAGE_SIDE_PX = 16.0  # longer side of both images below which sizes are taken for those of another unit than pixels
 MIN_FOCAL, MAX_FOCAL = 0.25, 5.0  # focal lengths outside, in units of the longer side, are not believed at the start
 
@@ -97,7 +96,6 @@ def focals_near(F: Array, pair: Pair) -> Array:
 
 def focal_precision(focals: Array, pair: Pair) -> Array:
     """The second derivatives (2, 2) of the prior's cost by the logarithms of the focal lengths (2,), px.
-
     Infinite on the diagonal where a focal length is exactly known; one parameter that both share has the first place.
     """
     images, work = images_of(pair), np.empty(5)
@@ -148,9 +146,7 @@ def translate(F: F8x2, offset: F8x1, out: F8x2) -> None:
 @kernel(holds_gil=True)
 def centre(table: F8x2, offset: F8x1, scale_px: float, out: F8x2) -> None:
     """Points from the principal points, squared scales of a loss, and one over these -> out (6, n).
-
-    table: (9, n), of `Pair`. offset: (4,), what is added to points. scale_px: of the loss, of a usual match.
-    """
+    table: (9, n), of `Pair`. offset: (4,), what is added to points. scale_px: of the loss, of a usual match."""
     for i in range(table.shape[1]):
         for r in range(4):
             out[r, i] = table[r, i] + offset[r]
@@ -228,7 +224,6 @@ class Optimum(NamedTuple):
 
 class _State(NamedTuple):
     """Of k candidates, cameras, models (k, 9), costs (k,), and their derivatives (k, 7), (k, 7, 7).
-
     shared: whether the two focal lengths are one; the sixth parameter is then its logarithm and the seventh has none.
     """
 

@@ -41,10 +41,8 @@ ROWS = 12  # of a match: derivatives by nine entries and two lenses, and the res
 
 class LensPrior(NamedTuple):
     """What is known of the lenses of both images.
-
     mean, precision: (2,), of lambda, one over its variance. shared: whether there is one lens for both. diagonal: (2,),
-    half of the images', in the unit of the points.
-    """
+    half of the images', in the unit of the points."""
 
     mean: F8x1
     precision: F8x1
@@ -127,9 +125,7 @@ def minimise_with_lenses(
     out: LensOptimum,
 ) -> None:  # fmt: skip
     """Cameras and lenses of least negative logarithm of the posterior near these, in place; what it is there -> out.
-
-    matches: of the photographs, from the principal points.
-    """
+    matches: of the photographs, from the principal points."""
     k = len(out.cost)
     tied = images.prior.shared, prior.shared
     state = _State(tied, cameras.axes, cameras.focal, out.lens, out.F, out.cost, out.gradient, out.hessian)
