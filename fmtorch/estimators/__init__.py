@@ -8,17 +8,17 @@ if TYPE_CHECKING:
     from fmtorch.estimators.coarse_to_fine import CoarseToFine
     from fmtorch.estimators.degensac import Degensac
     from fmtorch.estimators.external.colmap import colmap
-    from fmtorch.estimators.external.fastpose import fastpose
     from fmtorch.estimators.external.libraries import (
         degensac_cpp,
+        fastpose,
         gc_ransac_cpp,
         kornia_ransac,
         magsac_cpp,
         opencv,
+        poselib,
         superansac_cpp,
     )
     from fmtorch.estimators.external.pairwise import PairwiseEstimator
-    from fmtorch.estimators.external.poselib import poselib
     from fmtorch.estimators.graph_cut import GraphCut
     from fmtorch.estimators.inliers import BetterHalf, InlierRule, RobustDeviations, StoppingRule, WithinThreshold
     from fmtorch.estimators.irls import IterativelyReweighted
