@@ -11,8 +11,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from fmtorch.geometry.arithmetic import stable_sum
-from fmtorch.geometry.eigenvector import smallest_eigenvector
-from fmtorch.geometry.matrices import EPS, nearest_rank2, nearest_rank2_kernel
+from fmtorch.geometry.matrices import (
+    EPS,
+    nearest_rank2,
+    nearest_rank2_kernel,
+    smallest_eigenvector,
+    smallest_eigenvector_kernel,
+)
 from fmtorch.geometry.normalize import canonical, denormalize_fundamental, normalize_points
 from fmtorch.geometry.null_space import equations, gather, null_space
 from fmtorch.geometry.pose import consistently_oriented
@@ -137,7 +142,6 @@ def finite_matches(
 # The eight-point algorithm on the samples of one pair, and weighted on its matches, compiled; float64
 
 WIDTH = 32  # partial sums over the matches: part of the last bits of a weighted fit
-SHIFT, RANK_TOLERANCE, SQUARINGS = 1e-14, 1e-12, 14  # as in `eigenvector`
 
 
 @kernel
@@ -298,62 +302,3 @@ def _normal_matrix(X: Array, w: Array) -> Array:
         for j in range(9):
             M[i, j] = _added(sums[6 * product[i // 3, j // 3] + product[i % 3, j % 3]])
     return M
-
-
-@inner
-def smallest_eigenvector_kernel(M: Array, v: Array) -> bool:
-    """`eigenvector.smallest_eigenvector` of a symmetric matrix (n, n), overwritten -> v; whether it is determined."""
-    n, trace = len(M), 0.0
-    for i in range(n):
-        trace += M[i, i]
-    if not (trace > 0 and math.isfinite(trace)):
-        return False
-    L, X, Y = np.eye(n), matrix(n, n), matrix(n, n)
-    pivot = vector(n)
-    for i in range(n):
-        for j in range(n):
-            M[i, j] /= trace
-        M[i, i] += SHIFT
-    for k in range(n):  # M = L D L^T; L becomes the inverse of L
-        pivot[k] = max(M[k, k], SHIFT / 2)
-        for i in range(k + 1, n):
-            factor = M[i, k] / pivot[k]
-            for j in range(k + 1):
-                L[i, j] -= factor * L[k, j]
-            for j in range(k + 1, n):
-                M[i, j] -= factor * M[k, j]
-    size = 0.0
-    for i in range(n):
-        for j in range(n):
-            total = 0.0
-            for k in range(n):
-                total += L[k, i] / pivot[k] * L[k, j]
-            X[i, j] = total
-        size += X[i, i]
-    inverse = X / size
-    X = inverse.copy()
-    for _ in range(SQUARINGS):
-        trace = 0.0
-        for i in range(n):
-            for j in range(n):
-                Y[i, j] = 0.0
-            for k in range(n):
-                for j in range(n):
-                    Y[i, j] += X[i, k] * X[k, j]
-            trace += Y[i, i]
-        for i in range(n):
-            for j in range(n):
-                X[i, j] = Y[i, j] / trace
-        if trace > 1 - 1e-14:
-            break
-    best, norm, along = 0, 0.0, 0.0
-    for i in range(n):
-        best = i if X[i, i] > X[best, best] else best
-    for i in range(n):
-        norm += X[best, i] * X[best, i]
-    for i in range(n):
-        v[i] = X[best, i] / math.sqrt(norm)
-    for i in range(n):
-        for j in range(n):
-            along += v[i] * inverse[i, j] * v[j]
-    return (1 - along) * size * RANK_TOLERANCE < 1

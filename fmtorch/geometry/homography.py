@@ -13,11 +13,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from fmtorch.geometry.arithmetic import cofactors, determinant, matmul3, stable_sum
-from fmtorch.geometry.eigenvector import smallest_eigenvector
-from fmtorch.geometry.eight_point import finite_matches, smallest_eigenvector_kernel
+from fmtorch.geometry.eight_point import finite_matches
 from fmtorch.geometry.epipolar import inverse_root, lines_through, unit_frobenius, unit_largest
 from fmtorch.geometry.homography_refine import linearise_homography
-from fmtorch.geometry.matrices import EPS, unit_kernel
+from fmtorch.geometry.matrices import EPS, smallest_eigenvector, smallest_eigenvector_kernel, unit_kernel
 from fmtorch.geometry.normalize import normalize_points
 from fmtorch.geometry.null_space import gather
 from fmtorch.jit.kernel import Array, F4x2, F8x1, F8x2, I8x1, I8x2, inner, kernel, matrix, vector

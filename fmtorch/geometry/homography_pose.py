@@ -7,8 +7,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from fmtorch.geometry.arithmetic import cofactors, component_sum, determinant, product, sqrt
-from fmtorch.geometry.eigenvector import smallest_eigenvector
 from fmtorch.geometry.homography import SINGULAR
+from fmtorch.geometry.matrices import smallest_eigenvector
 
 ITERATIONS = 2  # to the nearest rotation, from an error of 1e-8 at worst, which each squares
 FLAT = 1e-9  # of S, the squares of the stretch less one, below which there is no translation
