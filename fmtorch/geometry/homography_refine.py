@@ -19,7 +19,6 @@ from fmtorch.geometry.levenberg_marquardt import (
     Problem,
     Schedule,
     Weighted,
-    accepting,
     in_rows,
     levenberg_marquardt,
     robust,
@@ -306,7 +305,7 @@ def _take(state: _State, trial: _State, k: int) -> None:
     assign_rows(state.products[k], trial.products[k])
 
 
-_minimise = levenberg_marquardt(_evaluate, _step, accepting(_take))
+_minimise = levenberg_marquardt(_evaluate, _step, _take)
 
 
 def refine_homography(

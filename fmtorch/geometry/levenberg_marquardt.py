@@ -177,19 +177,52 @@ class Schedule(NamedTuple):
     tolerance: float
 
 
+class Problem(NamedTuple):
+    """The matches of a robust error, and the tolerance of the schedule."""
+
+    matches: Weighted
+    tolerance: float
+
+
+@inner
+def _by_share(problem: Problem, before: float, after: float) -> bool:
+    """Whether a step that lowers the cost of a model so far is its last."""
+    return problem.tolerance > 0 and before - after <= problem.tolerance * before
+
+
 def levenberg_marquardt(
-    evaluate: Callable[..., None], step: Callable[..., None], accept: Callable[..., bool]
-) -> Callable[[Any, Any, Any, Array, int, bool], None]:
+    evaluate: Callable[..., None], step: Callable[..., None], take: Callable[..., None],
+    converged: Callable[..., bool] = _by_share, min_damping: float = MIN_DAMPING,
+) -> Callable[[Any, Any, Any, Array, int, bool], None]:  # fmt: skip
     """The loop for an objective: loop(data, state, trial, damping, iterations, ends), in place.
+
     evaluate(state, data, derivatives): the costs, and the derivatives if asked for, at the state's parameters.
-    step(state, damping, trial): those of a trial. accept(state, trial, damping, done, data): the trial for the models
-    that it improves; whether all are done."""
+    step(state, damping, trial): those of a trial. take(state, trial, k): gives the state model k of the trial, but for
+    its cost, where that is lower: such a step divides the damping by 10, another multiplies it. converged(data, before,
+    after): whether a model is done after a step that has lowered its cost so.
+    """
+
+    @inner
+    def accept(state: Any, trial: Any, damping: Array, done: Array, data: Any) -> bool:
+        """The trial for the models that it improves; whether all are done."""
+        everything = True
+        for k in range(len(damping)):
+            better = trial.cost[k] < state.cost[k] and not done[k]
+            damping[k] = min(max(damping[k] / 10 if better else damping[k] * 10, min_damping), MAX_DAMPING)
+            if better:
+                done[k] |= converged(data, state.cost[k], trial.cost[k])
+                state.cost[k] = trial.cost[k]
+                take(state, trial, k)
+            everything = everything and done[k]
+        return everything
 
     @inner
     def loop(data: Any, state: Any, trial: Any, damping: Array, iterations: int, ends: bool) -> None:
         """The state holds the start, then that of least cost; no cost ever rises.
+
         damping: (k,), the first of each model. ends: whether models are ever done; the state then keeps the
-        derivatives at the end."""
+        derivatives at the end.
+        """
         done = np.zeros(len(damping), np.bool_)
         evaluate(state, data, iterations > 0 or ends)
         for i in range(iterations):
@@ -199,30 +232,3 @@ def levenberg_marquardt(
                 break
 
     return loop
-
-
-class Problem(NamedTuple):
-    """The matches of a robust error, and the tolerance of the schedule: what `accepting` looks at."""
-
-    matches: Weighted
-    tolerance: float
-
-
-def accepting(take: Callable[[Any, Any, int], None]) -> Callable[..., bool]:
-    """The `accept` of an objective on a `Problem`: a step that is taken divides the damping by 10, another multiplies.
-    take(state, trial, k): gives the state model k of the trial; costs are copied here."""
-
-    @inner
-    def accept(state: Any, trial: Any, damping: Array, done: Array, problem: Problem) -> bool:
-        everything = True
-        for k in range(len(damping)):
-            better = trial.cost[k] < state.cost[k] and not done[k]
-            damping[k] = min(max(damping[k] / 10 if better else damping[k] * 10, MIN_DAMPING), MAX_DAMPING)
-            if better:
-                done[k] |= problem.tolerance > 0 and state.cost[k] - trial.cost[k] <= problem.tolerance * state.cost[k]
-                state.cost[k] = trial.cost[k]
-                take(state, trial, k)
-            everything = everything and done[k]
-        return everything
-
-    return accept

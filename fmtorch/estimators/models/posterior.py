@@ -199,7 +199,7 @@ def _squared_focal(F: Array, column: int, row: int, e: Array) -> Any:
     return -(r2 * F[8]) / (r0 * F[2 * row] + r1 * F[2 * row + column])
 
 
-FIRST_DAMPING, MIN_DAMPING, MAX_DAMPING = 1e-3, 1e-9, 1e6
+FIRST_DAMPING, MIN_DAMPING = 1e-3, 1e-9
 
 
 class Limits(NamedTuple):
@@ -265,14 +265,12 @@ def minimise(cameras: Cameras, matches: Weighted, images: Images, limits: Limits
 @kernel(holds_gil=True)
 def tangents_of(cameras: Cameras, longest: F8x1, F: F8x2, out: F8x3) -> None:
     """Fundamental matrices -> F (k, 9), and their derivatives by five rotations and two logarithms -> (k, 9, LANES)."""
-    camera_models(cameras.axes, cameras.focal, longest, F, out)
+    camera_models(cameras.axes, cameras.focal, longest, False, F, out)
 
 
 @inner
 def _evaluate(state: _State, data: _Data, derivatives: bool) -> None:
-    camera_models(state.axes, state.focal, data.images.longest, state.F, data.tangents)
-    if state.shared:
-        tie(data.tangents)
+    camera_models(state.axes, state.focal, data.images.longest, state.shared, state.F, data.tangents)
     evaluate(state.F, data.matches, derivatives, data.products, state.cost)
     work = vector(5)
     for k in range(len(state.cost)):
@@ -285,8 +283,9 @@ def _evaluate(state: _State, data: _Data, derivatives: bool) -> None:
 
 
 @inner
-def camera_models(axes: Array, focal: Array, longest: Array, F: Array, tangents: Array) -> None:
-    """Fundamental matrices -> F (k, 9), and their derivatives by five rotations and two logarithms -> (k, 9, LANES)."""
+def camera_models(axes: Array, focal: Array, longest: Array, shared: bool, F: Array, tangents: Array) -> None:
+    """Fundamental matrices -> F (k, 9), and their derivatives by five rotations and two logarithms -> (k, 9, LANES).
+    shared: one logarithm for both images; the derivatives by the first are those by it, by the second zero."""
     for k in range(len(F)):
         U, V, T = axes[k, 0], axes[k, 1], tangents[k]
         d0, d1 = exponential(focal[k, 0]) * longest[0], exponential(focal[k, 1]) * longest[1]
@@ -298,15 +297,8 @@ def camera_models(axes: Array, focal: Array, longest: Array, F: Array, tangents:
                 T[q, 2] = (U[r, 1] * V[c, 0] - U[r, 0] * V[c, 1]) * by
                 T[q, 3], T[q, 4] = U[r, 1] * V[c, 2] * by, -U[r, 0] * V[c, 2] * by
                 T[q, 5], T[q, 6] = F[k, q] if c == 2 else 0.0, F[k, q] if r == 2 else 0.0
-
-
-@inner
-def tie(tangents: Array) -> None:
-    """One logarithm for both images: derivatives (k, 9, LANES) by the first are those by it, by the second zero."""
-    for k in range(len(tangents)):
-        for q in range(9):
-            tangents[k, q, 5] += tangents[k, q, 6]
-            tangents[k, q, 6] = 0.0
+                if shared:
+                    T[q, 5], T[q, 6] = T[q, 5] + T[q, 6], 0.0
 
 
 @inner
@@ -337,14 +329,22 @@ def _derivatives(
 
 @inner
 def _step(state: _State, damping: Array, trial: _State) -> None:
-    Q = matrix(7, LANES)
+    Q, x = matrix(7, LANES), vector(7)
     for k in range(len(damping)):
         damped_step(state.hessian[k], state.gradient[k], damping[k], Q)
-        rotate(state.axes[k, 0], Q[0, 7] / 2, Q[1, 7] / 2, Q[2, 7] / 2, trial.axes[k, 0])
-        rotate(state.axes[k, 1], Q[3, 7] / 2, Q[4, 7] / 2, 0.0, trial.axes[k, 1])
-        for i in range(2):
-            step = Q[5 if state.shared else 5 + i, 7]
-            trial.focal[k, i] = min(max(state.focal[k, i] + min(max(step, -1.0), 1.0), -3.0), 3.0)
+        for i in range(7):
+            x[i] = Q[i, 7]
+        move_cameras(state, k, x, state.shared, trial)
+
+
+@inner
+def move_cameras(state: Any, k: int, x: Array, shared: bool, trial: Any) -> None:
+    """The cameras of candidate k after a step x of five rotations and two logarithms, which is bounded -> trial."""
+    _rotate(state.axes[k, 0], x[0] / 2, x[1] / 2, x[2] / 2, trial.axes[k, 0])
+    _rotate(state.axes[k, 1], x[3] / 2, x[4] / 2, 0.0, trial.axes[k, 1])
+    for i in range(2):
+        step = x[5 if shared else 5 + i]
+        trial.focal[k, i] = min(max(state.focal[k, i] + min(max(step, -1.0), 1.0), -3.0), 3.0)
 
 
 @inner
@@ -359,7 +359,7 @@ def damped_step(hessian: Array, gradient: Array, damping: float, Q: Array) -> No
 
 
 @inner
-def rotate(A: Array, x: float, y: float, z: float, out: Array) -> None:
+def _rotate(A: Array, x: float, y: float, z: float, out: Array) -> None:
     """``A R`` with the Cayley rotation of (x, y, z), half of its angles -> out (3, 3)."""
     n = x * x + y * y + z * z
     factor = 2 / (1 + n)
@@ -372,22 +372,20 @@ def rotate(A: Array, x: float, y: float, z: float, out: Array) -> None:
 
 
 @inner
-def _accept(state: _State, trial: _State, damping: Array, done: Array, data: _Data) -> bool:
-    everything = True
-    for k in range(len(damping)):
-        better = trial.cost[k] < state.cost[k] and not done[k]
-        damping[k] = min(max(damping[k] / 10 if better else damping[k] * 10, MIN_DAMPING), MAX_DAMPING)
-        if better:
-            done[k] |= data.limits.tolerance >= 0 and state.cost[k] - trial.cost[k] <= data.limits.tolerance
-            state.cost[k] = trial.cost[k]
-            assign(state.focal[k], trial.focal[k])
-            assign(state.F[k], trial.F[k])
-            assign(state.gradient[k], trial.gradient[k])
-            assign_rows(state.axes[k, 0], trial.axes[k, 0])
-            assign_rows(state.axes[k, 1], trial.axes[k, 1])
-            assign_rows(state.hessian[k], trial.hessian[k])
-        everything = everything and done[k]
-    return everything
+def take_cameras(state: Any, trial: Any, k: int) -> None:
+    """Candidate k of a trial -> state, but for its cost."""
+    assign(state.focal[k], trial.focal[k])
+    assign(state.F[k], trial.F[k])
+    assign(state.gradient[k], trial.gradient[k])
+    assign_rows(state.axes[k, 0], trial.axes[k, 0])
+    assign_rows(state.axes[k, 1], trial.axes[k, 1])
+    assign_rows(state.hessian[k], trial.hessian[k])
 
 
-_minimise = levenberg_marquardt(_evaluate, _step, _accept)
+@inner
+def converged(data: Any, before: float, after: float) -> bool:
+    """Whether a step that lowers the cost of a candidate so far is its last."""
+    return data.limits.tolerance >= 0 and before - after <= data.limits.tolerance
+
+
+_minimise = levenberg_marquardt(_evaluate, _step, take_cameras, converged, MIN_DAMPING)

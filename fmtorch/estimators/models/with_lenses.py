@@ -17,19 +17,19 @@ from fmtorch.core.types import MAX_LENS, MIN_LENS
 from fmtorch.estimators.models.focal_prior import focal_cost
 from fmtorch.estimators.models.posterior import (
     FIRST_DAMPING,
-    MAX_DAMPING,
     MIN_DAMPING,
     Cameras,
     Images,
     Limits,
     camera_models,
+    converged,
     images_of,
-    rotate,
-    tie,
+    move_cameras,
+    take_cameras,
 )
 from fmtorch.estimators.pair import Pair
 from fmtorch.geometry.levenberg_marquardt import MATCH, TINY, Weighted, in_rows, levenberg_marquardt, robust
-from fmtorch.geometry.matrices import assign, assign_rows
+from fmtorch.geometry.matrices import assign
 from fmtorch.geometry.rank2_manifold import eliminate
 from fmtorch.jit.kernel import Array, F8x1, F8x2, F8x3, inner, kernel, matrix, vector
 from fmtorch.jit.lanes import LANES, added, fill, load, store, where
@@ -154,9 +154,7 @@ def photograph_residuals(F: F8x1, lens: F8x1, diagonal: F8x1, points: F8x2, out:
 
 @inner
 def _evaluate(state: _State, data: _Data, derivatives: bool) -> None:
-    camera_models(state.axes, state.focal, data.images.longest, state.F, data.tangents)
-    if data.images.prior.shared:
-        tie(data.tangents)
+    camera_models(state.axes, state.focal, data.images.longest, state.tied[0], state.F, data.tangents)
     work, W = vector(5), np.zeros((ROWS - 1, PARAMETERS))
     for k in range(len(state.cost)):
         cost = _summed(state.F[k], state.lens[k], data, derivatives) * data.limits.precision / 2
@@ -172,12 +170,8 @@ def _evaluate(state: _State, data: _Data, derivatives: bool) -> None:
 @inner
 def _summed(F: Array, lens: Array, data: _Data, derivatives: bool) -> Any:
     """The robust cost of one candidate; the products of derivatives and residuals -> data.products."""
-    sums, J, scaled, work = (
-        matrix(ROWS * (ROWS + 1) // 2, LANES),
-        matrix(ROWS, LANES),
-        matrix(ROWS, LANES),
-        matrix(3, LANES),
-    )
+    sums, work = matrix(ROWS * (ROWS + 1) // 2, LANES), matrix(3, LANES)
+    J, scaled = matrix(ROWS, LANES), matrix(ROWS, LANES)
     costs = fill(0.0)
     for q in range(len(sums)):
         store(sums, q, costs)
@@ -272,42 +266,26 @@ def _derivatives(state: _State, data: _Data, k: int, focal: Array, W: Array) -> 
 
 @inner
 def _step(state: _State, damping: Array, trial: _State) -> None:
-    Q, wide = np.zeros((2 * PARAMETERS, LANES)), 2
+    Q, x = np.zeros((2 * PARAMETERS, LANES)), vector(PARAMETERS)
     for k in range(len(damping)):
-        for r in range(PARAMETERS):
+        for r in range(PARAMETERS):  # two rows of Q for each of the system
             for c in range(PARAMETERS):
-                Q[wide * r + c // LANES, c % LANES] = state.hessian[k, r, c]
-            Q[wide * r + r // LANES, r % LANES] += state.hessian[k, r, r] * damping[k]
-            Q[wide * r + 1, PARAMETERS - LANES] = -state.gradient[k, r]
+                Q[2 * r + c // LANES, c % LANES] = state.hessian[k, r, c]
+            Q[2 * r + r // LANES, r % LANES] += state.hessian[k, r, r] * damping[k]
+            Q[2 * r + 1, PARAMETERS - LANES] = -state.gradient[k, r]
         eliminate(Q, PARAMETERS)
-        last = PARAMETERS - LANES
-        rotate(state.axes[k, 0], Q[1, last] / 2, Q[3, last] / 2, Q[5, last] / 2, trial.axes[k, 0])
-        rotate(state.axes[k, 1], Q[7, last] / 2, Q[9, last] / 2, 0.0, trial.axes[k, 1])
+        for r in range(PARAMETERS):
+            x[r] = Q[2 * r + 1, PARAMETERS - LANES]
+        move_cameras(state, k, x, state.tied[0], trial)
         for i in range(2):
-            step = Q[wide * (5 if state.tied[0] else 5 + i) + 1, last]
-            trial.focal[k, i] = min(max(state.focal[k, i] + min(max(step, -1.0), 1.0), -3.0), 3.0)
-            step = Q[wide * (7 if state.tied[1] else 7 + i) + 1, last]
+            step = x[7 if state.tied[1] else 7 + i]
             trial.lens[k, i] = min(max(state.lens[k, i] + min(max(step, -0.1), 0.1), MIN_LENS), MAX_LENS)
 
 
 @inner
-def _accept(state: _State, trial: _State, damping: Array, done: Array, data: _Data) -> bool:
-    everything = True
-    for k in range(len(damping)):
-        better = trial.cost[k] < state.cost[k] and not done[k]
-        damping[k] = min(max(damping[k] / 10 if better else damping[k] * 10, MIN_DAMPING), MAX_DAMPING)
-        if better:
-            done[k] |= data.limits.tolerance >= 0 and state.cost[k] - trial.cost[k] <= data.limits.tolerance
-            state.cost[k] = trial.cost[k]
-            assign(state.focal[k], trial.focal[k])
-            assign(state.lens[k], trial.lens[k])
-            assign(state.F[k], trial.F[k])
-            assign(state.gradient[k], trial.gradient[k])
-            assign_rows(state.axes[k, 0], trial.axes[k, 0])
-            assign_rows(state.axes[k, 1], trial.axes[k, 1])
-            assign_rows(state.hessian[k], trial.hessian[k])
-        everything = everything and done[k]
-    return everything
+def _take(state: _State, trial: _State, k: int) -> None:
+    assign(state.lens[k], trial.lens[k])
+    take_cameras(state, trial, k)
 
 
-_minimise = levenberg_marquardt(_evaluate, _step, _accept)
+_minimise = levenberg_marquardt(_evaluate, _step, _take, converged, MIN_DAMPING)
