@@ -16,9 +16,9 @@ from torch import Tensor
 from fmtorch.core.types import DEVIATION, FOCAL, PROBABILITY, SIZE, Correspondences, Estimate
 from fmtorch.estimators.final_fits import Fit, scale_of
 from fmtorch.estimators.gradients import Attach, Solved, with_gradients
+from fmtorch.estimators.lens_search import undistorted
 from fmtorch.estimators.models.model import Estimated
 from fmtorch.estimators.models.posterior import focal_precision, focals_near, focals_px
-from fmtorch.estimators.models.with_lenses import undistorted
 from fmtorch.estimators.pair import EXACT, Lens, Pair, PixelMatches, bucket, calibration_of, normalize_pair
 from fmtorch.estimators.preselection import degenerate_support
 from fmtorch.geometry.arithmetic import sqrt

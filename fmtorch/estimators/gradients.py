@@ -31,7 +31,7 @@ from fmtorch.estimators.pair import MAX_NOISE, MIN_NOISE, Pair
 from fmtorch.geometry import canonical, eight_point, unit_frobenius
 from fmtorch.geometry.cameras import PixelFrame
 from fmtorch.geometry.homography_refine import homography_at_optimum
-from fmtorch.geometry.levenberg_marquardt import LOSS_CODES, NO_TABLE, Weighted
+from fmtorch.geometry.levenberg_marquardt import Weighted
 from fmtorch.geometry.refine import STEP_DAMPING, gradient_of_cost
 from fmtorch.geometry.robust_losses import LOSSES
 from fmtorch.jit.kernel import Array
@@ -204,7 +204,7 @@ def camera_response(cameras: Cameras, pair: Pair, weight: Array, precision: floa
     weight: (n,), of the matches that count. precision: one over the variance of an inlier's distance.
     """
     images, optimum, tangents = images_of(pair), no_optimum(1), np.zeros((1, 9, LANES))
-    matches = Weighted(centred(pair).points, weight, np.full(pair.count, np.inf), LOSS_CODES["truncated"], NO_TABLE)
+    matches = Weighted.of(centred(pair).points, weight, np.full(pair.count, np.inf))
     minimise(cameras.copy(), matches, images, Limits(precision, 0, 0.0), optimum)
     tangents_of(cameras, images.longest, optimum.F, tangents)
     moves, hessian, by_focal = np.empty((7, 9)), optimum.hessian[0], np.eye(7, 2, -5)

@@ -20,7 +20,7 @@ from fmtorch.estimators.pair import Pair, squared
 from fmtorch.geometry import attached_step
 from fmtorch.geometry.eight_point import weighted_eight_point
 from fmtorch.geometry.irls import reweighted_kernel
-from fmtorch.geometry.levenberg_marquardt import LOSS_CODES, Schedule, Weighted, loss_table
+from fmtorch.geometry.levenberg_marquardt import Schedule, Weighted
 from fmtorch.geometry.rank2_manifold import SQUARINGS
 from fmtorch.geometry.refine import refine_kernel
 from fmtorch.geometry.robust_losses import named_loss
@@ -129,8 +129,8 @@ class IterativelyReweighted:
 
     def _weighted(self, pair: Pair, scale: float) -> Weighted:
         """The matches with the loss at a scale, in the unit of the points."""
-        s2, code = np.full(pair.count, squared(scale)), LOSS_CODES[self.loss]
-        return Weighted(pair.points, pair.cached("irls weight", _weight), s2, code, loss_table(self.loss))
+        s2 = np.full(pair.count, squared(scale))
+        return Weighted.of(pair.points, pair.cached("irls weight", _weight), s2, self.loss)
 
     def _first(self, pair: Pair) -> Array:
         """The 8-point algorithm with each power of the weights, where these determine a model, (k, 9)."""

@@ -20,10 +20,9 @@ from fmtorch.estimators.final_fits import FinalFit, Fit
 from fmtorch.estimators.focal_search import FocalSearch, PlausibleCandidates
 from fmtorch.estimators.gradients import Attached
 from fmtorch.estimators.inliers import InlierRule, StoppingRule, residuals_squared_px
-from fmtorch.estimators.lens_search import lens_fit, lenses_of, squared_px
+from fmtorch.estimators.lens_search import lens_fit, lenses_of, squared_px, undistorted
 from fmtorch.estimators.models.model import Refining
 from fmtorch.estimators.models.with_focals import FundamentalWithFocals
-from fmtorch.estimators.models.with_lenses import undistorted
 from fmtorch.estimators.options import Count, Focal, Preselect, Refine, Select, stage
 from fmtorch.estimators.pair import Lens, Pair
 from fmtorch.estimators.precompiled import OF_HOMOGRAPHIES, WITH_FOCALS

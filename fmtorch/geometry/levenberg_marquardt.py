@@ -5,6 +5,8 @@ Damped Gauss-Newton steps; each model takes its own where that lowers its cost, 
 call, between whose steps nothing waits for Python.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -12,28 +14,17 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fmtorch.geometry.arithmetic import logarithm_1p_kernel
-from fmtorch.geometry.robust_losses import LOSS_TABLE
+from fmtorch.geometry.robust_losses import LOSS_TABLE, LOSSES
 from fmtorch.jit.kernel import Array, F8x1, F8x2, F8x3, inner, kernel, matrix
 from fmtorch.jit.lanes import LANES, added, fill, load, sqrt, store, where
 
 # `sampson_objective` for models on the matches of one pair, compiled; float64, LANES matches at a time
 
 TINY = 1e-30  # as in `residuals`
-HUBER, CAUCHY, GEMAN_MCCLURE, TRUNCATED, MAGSAC = 0, 1, 2, 3, 4  # losses
-LOSS_CODES = {
-    "huber": HUBER,
-    "cauchy": CAUCHY,
-    "geman_mcclure": GEMAN_MCCLURE,
-    "truncated": TRUNCATED,
-    "magsac": MAGSAC,
-}
+LOSS_CODES = {name: code for code, name in enumerate(LOSSES)}
+HUBER, CAUCHY, GEMAN_MCCLURE, TRUNCATED, MAGSAC = LOSS_CODES.values()
 NO_TABLE = np.empty((2, 0))
 MATCH = 6  # rows of LANES matches: x0, y0, x1, y1, their weights, squared scales
-
-
-def loss_table(loss: str) -> Array:
-    """What `Weighted.table` is for a loss of this name."""
-    return LOSS_TABLE if loss == "magsac" else NO_TABLE
 
 
 class Weighted(NamedTuple):
@@ -47,6 +38,11 @@ class Weighted(NamedTuple):
     s2: F8x1
     loss: int
     table: F8x2
+
+    @staticmethod
+    def of(points: Array, weight: Array, s2: Array, loss: str = "truncated") -> Weighted:
+        """Matches with the loss of this name."""
+        return Weighted(points, weight, s2, LOSS_CODES[loss], LOSS_TABLE if loss == "magsac" else NO_TABLE)
 
 
 @kernel

@@ -11,7 +11,7 @@ from torch import Tensor
 from fmtorch.geometry.arithmetic import as_components, as_matrices, component_sum, matmul3, sqrt, stable_sum, unit
 from fmtorch.geometry.cameras import PixelFrame
 from fmtorch.geometry.epipolar import unit_frobenius
-from fmtorch.geometry.levenberg_marquardt import LOSS_CODES, Weighted, loss_table
+from fmtorch.geometry.levenberg_marquardt import Weighted
 from fmtorch.jit.kernel import Array
 
 
@@ -205,7 +205,7 @@ def fitted_by(
     scales = s2.detach().expand_as(weight).cpu().contiguous().numpy()
     out, cost = np.empty_like(start), np.empty(start.shape[:2])
     for p, given in enumerate(start):
-        matches = Weighted(columns[p], weights[p], scales[p], LOSS_CODES[loss], loss_table(loss))
+        matches = Weighted.of(columns[p], weights[p], scales[p], loss)
         fit(given, matches, out[p], cost[p])
     known = np.isfinite(cost)
     fitted = torch.from_numpy(np.where(known[..., None], out, start)).to(models.device)

@@ -15,7 +15,7 @@ from fmtorch.geometry.homography_refine import (
     linearise_homography,
     refine_homographies,
 )
-from fmtorch.geometry.levenberg_marquardt import LOSS_CODES, NO_TABLE, Schedule, Weighted
+from fmtorch.geometry.levenberg_marquardt import Schedule, Weighted
 from tests.reference import homography_family as reference
 
 EPS = 2.0**-52
@@ -31,11 +31,11 @@ class Problem(NamedTuple):
     s2: np.ndarray
 
     def weighted(self, loss: str) -> Weighted:
-        return Weighted(self.points, self.weight, self.s2, LOSS_CODES[loss], NO_TABLE)
+        return Weighted.of(self.points, self.weight, self.s2, loss)
 
     def unbounded(self) -> Weighted:
         """Without a robust loss."""
-        return Weighted(self.points, self.weight, np.full_like(self.s2, np.inf), LOSS_CODES["truncated"], NO_TABLE)
+        return Weighted.of(self.points, self.weight, np.full_like(self.s2, np.inf))
 
 
 def problem(seed: int, n: int = 30, noise: float = 0.02) -> Problem:

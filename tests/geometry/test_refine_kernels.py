@@ -6,7 +6,7 @@ import torch
 
 from fmtorch.geometry import LOSSES
 from fmtorch.geometry.irls import reweighted, reweighted_kernel
-from fmtorch.geometry.levenberg_marquardt import FIRST_DAMPING, LOSS_CODES, Schedule, Weighted, evaluate, loss_table
+from fmtorch.geometry.levenberg_marquardt import FIRST_DAMPING, LOSS_CODES, Schedule, Weighted, evaluate
 from fmtorch.geometry.rank2_manifold import SQUARINGS
 from fmtorch.geometry.refine import refine_kernel
 from tests.estimators.pairs import apart
@@ -36,7 +36,7 @@ def test_costs_and_normal_equations(loss: str, n: int) -> None:
     normal, expected_cost = zip(*(reference.normal_equations(f, points, weight, s2, loss) for f in F), strict=True)
     for derivatives in (True, False):
         products, cost = np.zeros((5, 10, 10)), np.empty(5)
-        evaluate(F, Weighted(points, weight, s2, LOSS_CODES[loss], loss_table(loss)), derivatives, products, cost)
+        evaluate(F, Weighted.of(points, weight, s2, loss), derivatives, products, cost)
         np.testing.assert_allclose(cost, expected_cost, rtol=1e-11)
         if derivatives:
             size = np.sqrt(np.einsum("kii,kjj->kij", normal, normal))  # what the sums of an entry cancel from, at most
@@ -53,13 +53,13 @@ def test_one_reweighted_fit(loss: str, n: int) -> None:
     tensors = (torch.from_numpy(a) for a in (F.T[:, None].copy(), points[:, None], weight[None]))
     expected = reweighted(*tensors, LOSSES[loss], torch.tensor([SCALE], dtype=torch.float64))[:, 0].T.numpy()
     fitted, s2 = F.copy(), np.full(n, SCALE**2)
-    reweighted_kernel(fitted, Weighted(points, weight, s2, LOSS_CODES[loss], loss_table(loss)))
+    reweighted_kernel(fitted, Weighted.of(points, weight, s2, loss))
     for fit, other in zip(fitted, expected, strict=True):
         # Rounding of the sums over the gap of their eigenvalues, 1e-8 of the largest.
         assert apart(fit, other) < 1e-8
     kept = F.copy()  # where the weights determine no model
     none = np.where(np.arange(n) < 6, weight, 0)
-    reweighted_kernel(kept, Weighted(points, none, s2, LOSS_CODES[loss], loss_table(loss)))
+    reweighted_kernel(kept, Weighted.of(points, none, s2, loss))
     np.testing.assert_array_equal(kept, F)
 
 
@@ -68,7 +68,7 @@ def refined(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Models and costs by the kernel."""
     fitted, cost = np.empty_like(F), np.empty(len(F))
-    weighted = Weighted(points, weight, s2, LOSS_CODES[loss], loss_table(loss))
+    weighted = Weighted.of(points, weight, s2, loss)
     refine_kernel(F, SQUARINGS, weighted, Schedule(iterations, FIRST_DAMPING, tolerance), fitted, cost)
     return fitted, cost
 

@@ -11,7 +11,7 @@ from fmtorch.estimators.models.model import FitScale, Hypotheses, Loss, Steps
 from fmtorch.estimators.pair import Pair, to_pixels
 from fmtorch.geometry.eight_point import eight_point_kernel, weighted_eight_point
 from fmtorch.geometry.epipolar import SAMPSON, Residual
-from fmtorch.geometry.levenberg_marquardt import LOSS_CODES, NO_TABLE, Schedule, Weighted, loss_table
+from fmtorch.geometry.levenberg_marquardt import Schedule, Weighted
 from fmtorch.geometry.rank2_manifold import gauss_newton, response
 from fmtorch.geometry.refine import refine_kernel
 from fmtorch.geometry.seven_point import seven_point_kernel
@@ -51,7 +51,7 @@ class Matrices:
     def refine(self, F: Array, pair: Pair, loss: Loss, steps: Steps) -> Array:
         """As `Refining.refine`."""
         s2 = np.square(loss.scale / pair.pixels_per_noise)
-        matches = Weighted(pair.points, self.weight(pair), s2, LOSS_CODES[loss.name], loss_table(loss.name))
+        matches = Weighted.of(pair.points, self.weight(pair), s2, loss.name)
         refined, cost = np.empty_like(F), np.empty(len(F))
         self.minimise(F, matches, Schedule(steps.iterations, steps.damping, steps.tolerance or 0.0), refined, cost)
         np.copyto(refined, F, where=~np.isfinite(cost)[:, None])
@@ -71,7 +71,7 @@ class Matrices:
 
 def squared_error(pair: Pair, weight: Array) -> Weighted:
     """Weighted matches, whose errors are squared without bound."""
-    return Weighted(pair.points, weight, np.full(pair.count, np.inf), LOSS_CODES["truncated"], NO_TABLE)
+    return Weighted.of(pair.points, weight, np.full(pair.count, np.inf))
 
 
 class Fundamental(Matrices):

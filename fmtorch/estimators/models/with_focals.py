@@ -26,7 +26,7 @@ from fmtorch.estimators.models.posterior import (
 )
 from fmtorch.estimators.pair import Pair, squared
 from fmtorch.geometry.five_point import five_point
-from fmtorch.geometry.levenberg_marquardt import LOSS_CODES, NO_TABLE, Weighted
+from fmtorch.geometry.levenberg_marquardt import GEMAN_MCCLURE, Weighted
 from fmtorch.geometry.matrices import unit_kernel
 from fmtorch.jit.kernel import Array, F8x1, F8x2, kernel, matrix, vector
 from fmtorch.jit.lanes import LANES
@@ -37,7 +37,6 @@ INLIER_SIGMA_PX = 0.3  # standard deviation of an inlier's Sampson distance
 LOSS_SCALE_PX = 0.7  # Sampson distance at which an inlier's cost is half of what a squared one would be
 PARALLEL_PX = 4.0  # in image 1: rays that differ less do not tell on which side of the cameras they meet
 STEP_DAMPING = 1e-10  # of a Gauss-Newton step at an optimum: bounds it where the points leave a direction open
-TRUNCATED, GEMAN_MCCLURE = LOSS_CODES["truncated"], LOSS_CODES["geman_mcclure"]
 
 
 class Refined(NamedTuple):
@@ -85,15 +84,11 @@ class FundamentalWithFocals:
     def fit(self, start: Cameras, pair: Pair, truncation: float, limits: Limits) -> FocalFit:
         """The maximum a posteriori of the truncated Sampson error near one candidate; truncation: px."""
         cameras, images, out, F, gain = start.copy(), images_of(pair), no_optimum(1), np.empty((1, 9)), np.empty(1)
-        minimise(cameras, _truncated(pair, truncation), images, limits, out)
+        matches = centred(pair, truncation)
+        minimise(cameras, Weighted.of(matches.points, pair.weight, matches.s2), images, limits, out)
         translate(out.F, images.offset, F)
         gain_without_prior(out.hessian[0], out.gradient[0], cameras.focal[0], images.prior, gain)
         return FocalFit(F[0], cameras, float(gain[0]))
-
-
-def _truncated(pair: Pair, truncation: float) -> Weighted:
-    matches = centred(pair, truncation)
-    return Weighted(matches.points, pair.weight, matches.s2, TRUNCATED, NO_TABLE)
 
 
 class Subset(NamedTuple):
@@ -108,10 +103,8 @@ class Subset(NamedTuple):
 def refine_with_prior(F: F8x2, subset: Subset, limits: Limits, cameras: Cameras, out: Refined) -> None:
     """`FundamentalWithFocals.refine` of models (k, 9) -> cameras, out."""
     table, images, k = subset.table, subset.images, len(F)
-    centred_matches, optimum = (
-        matrix(6, table.shape[1]),
-        Optimum(matrix(k, 9), vector(k), matrix(k, 7), np.empty((k, 7, 7))),
-    )
+    optimum = Optimum(matrix(k, 9), vector(k), matrix(k, 7), np.empty((k, 7, 7)))
+    centred_matches = matrix(6, table.shape[1])
     centre(table, images.offset, LOSS_SCALE_PX, centred_matches)
     points, s2, scale = centred_matches[:4], centred_matches[4], centred_matches[5]
     nearest_cameras(F, images, cameras)
