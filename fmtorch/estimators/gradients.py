@@ -32,8 +32,8 @@ from fmtorch.geometry import canonical, eight_point, unit_frobenius
 from fmtorch.geometry.cameras import PixelFrame
 from fmtorch.geometry.homography_refine import homography_at_optimum
 from fmtorch.geometry.levenberg_marquardt import Weighted
+from fmtorch.geometry.normalize import RobustSum
 from fmtorch.geometry.refine import STEP_DAMPING, gradient_of_cost
-from fmtorch.geometry.robust_losses import LOSSES
 from fmtorch.jit.kernel import Array
 from fmtorch.jit.lanes import LANES
 
@@ -122,8 +122,8 @@ class Attached:
         weight = torch.where(counted > 0, counted * weight, 0)
         if self.family.model == "homography":
             return _homographies_at_optimum(solved, at, matches, weight)
-        unbounded = torch.full_like(at[:, 0], torch.inf)
-        gradient = gradient_of_cost(at.T[..., None], matches.points, weight, LOSSES["truncated"], unbounded)[..., 0].T
+        error = RobustSum(matches.points, weight, "truncated", torch.full_like(at[:, :1], torch.inf))
+        gradient = gradient_of_cost(at.T[..., None], error)[..., 0].T
         response = torch.from_numpy(np.stack([_response(s) for s in solved])).to(device)
         return (response * (gradient - gradient.detach())[:, None]).sum(-1)
 
@@ -132,12 +132,12 @@ def _homographies_at_optimum(
     solved: list[Solved], at: Float[Tensor, "p 9"], matches: GraphedMatches, weight: Float[Tensor, "p n"]
 ) -> Float[Tensor, "p 9"]:
     """As `Attach`, of homographies, by the loss of their fits."""
-    robust, s2 = LOSSES["truncated"], torch.full_like(at[:, :1], torch.inf)
+    loss, s2 = "truncated", torch.full_like(at[:, :1], torch.inf)
     scales = [s.fit.s2 for s in solved if s.fit.s2 is not None]  # of all fits, or of none
     if scales:
-        robust, s2 = LOSSES["cauchy"], torch.where(matches.mask, _padded(scales, matches.mask), 1)
+        loss, s2 = "cauchy", torch.where(matches.mask, _padded(scales, matches.mask), 1)
     model = torch.nn.functional.normalize(at, dim=1).T[..., None]
-    attached = homography_at_optimum(model, matches.points, weight, robust, s2)[..., 0].T
+    attached = homography_at_optimum(model, RobustSum(matches.points, weight, loss, s2))[..., 0].T
     return attached - attached.detach()
 
 

@@ -4,6 +4,8 @@ Minimises ``sum_i w_i rho(r_i^2)`` over the sphere of the nine entries, by kerne
 graph of points and weights. A model is refined to the same bits in any batch.
 """
 
+import functools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,10 +26,9 @@ from fmtorch.geometry.levenberg_marquardt import (
     robust,
 )
 from fmtorch.geometry.matrices import assign, assign_rows, unit_kernel
-from fmtorch.geometry.normalize import NormalizedMatches, fitted_by
+from fmtorch.geometry.normalize import NormalizedMatches, RobustSum, fitted_by
 from fmtorch.geometry.rank2_manifold import eliminate
-from fmtorch.geometry.refine import inverse_hessian
-from fmtorch.geometry.robust_losses import RobustLoss, named_loss
+from fmtorch.geometry.refine import inverse_hessian, jacobian
 from fmtorch.jit.kernel import Array, F8x1, F8x2, F8x3, inner, kernel, matrix, vector
 from fmtorch.jit.lanes import LANES, added, fill, load, store, where
 
@@ -75,45 +76,32 @@ def equations_slope(error: HomographyError, points: Float[Tensor, " 4 *p"]) -> F
     return torch.stack([torch.stack(first), torch.stack(second)])
 
 
-def homography_gradient(
-    H: Float[Tensor, "9 p k"],
-    points: Float[Tensor, "4 p n"],
-    weight: Float[Tensor, "p n"],
-    robust: RobustLoss,
-    s2: Float[Tensor, "p slots"],
-) -> Float[Tensor, "9 p k"]:
-    """Half the gradient of ``sum_i w_i rho(r_i^2)`` by the entries of H, ``G^T l``, attached to all inputs.
-    s2: squared scales of the loss, one a pair or a match. Matches of weight zero and those behind the horizon count
-    nothing, wherever they are."""
-    counted = weight.detach() > 0
-    matches = torch.where(counted, points, 0)[:, :, None]
-    error = linearise_homography(H[..., None], matches)
-    counted = counted[:, None] & error.front
-    slope = robust.weight(torch.where(counted, error.squared, 0), s2[:, None])
-    influence = torch.where(counted, weight[:, None] * slope, 0)
-    first, second = equations_slope(error, matches)
-    l0, l1 = error.multipliers
+def homography_gradient(H: Float[Tensor, "9 p k"], error: RobustSum) -> Float[Tensor, "9 p k"]:
+    """Half the gradient of the cost by the entries of H, ``G^T l``, attached to all inputs.
+    Matches of weight zero and those behind the horizon count nothing, wherever they are."""
+    at, (first, second), influence = _influence(H, error, error.rho.weight)
+    l0, l1 = at.multipliers
     return stable_sum((first * l0 + second * l1) * influence)
 
 
-def homography_curvature(
-    H: Float[Tensor, "9 p k"],
-    points: Float[Tensor, "4 p n"],
-    weight: Float[Tensor, "p n"],
-    robust: RobustLoss,
-    s2: Float[Tensor, "p slots"],
-) -> Float[Tensor, "p k 9 9"]:
-    """The Gauss-Newton matrix ``G^T (J J^T)^-1 G`` with the curvature of the loss; arguments as of the gradient."""
-    counted = weight > 0
-    matches = torch.where(counted, points, 0)[:, :, None]
-    error = linearise_homography(H[..., None], matches)
-    counted = counted[:, None] & error.front
-    slope = robust.curvature(torch.where(counted, error.squared, 0), s2[:, None])
-    influence = torch.where(counted, weight[:, None] * slope, 0)
-    first, second = equations_slope(error, matches)
-    i00, i01, i11 = error.inverse
+def homography_curvature(H: Float[Tensor, "9 p k"], error: RobustSum) -> Float[Tensor, "p k 9 9"]:
+    """The Gauss-Newton matrix ``G^T (J J^T)^-1 G`` with the curvature of the loss."""
+    at, (first, second), influence = _influence(H, error, error.rho.curvature)
+    i00, i01, i11 = at.inverse
     rows = torch.stack([first * i00 + second * i01, first * i01 + second * i11]) * influence
     return torch.einsum("eapkn,ebpkn->pkab", rows, torch.stack([first, second]))
+
+
+def _influence(
+    H: Tensor, error: RobustSum, slope: Callable[[Tensor, Tensor], Tensor]
+) -> tuple[HomographyError, Tensor, Tensor]:
+    """The errors of matches, G, and the weights times the slopes of the loss (p, k, n)."""
+    counted = error.weight.detach() > 0
+    matches = torch.where(counted, error.points, 0)[:, :, None]
+    at = linearise_homography(H[..., None], matches)
+    counted = counted[:, None] & at.front
+    slopes = slope(torch.where(counted, at.squared, 0), error.s2[:, None])
+    return at, equations_slope(at, matches), torch.where(counted, error.weight[:, None] * slopes, 0)
 
 
 # The Sampson error of homographies, and its Levenberg-Marquardt on the sphere of their nine entries
@@ -352,59 +340,30 @@ def refine_homography(
         >>> bool(((refined / refined[2, 2] - H).abs() < 1e-6).all())
         True
     """
-    robust, schedule = named_loss(loss), Schedule(iterations, FIRST_DAMPING, 0.0)
-    wanted = gradient_wanted(x0, x1, weight)
+    schedule, wanted = Schedule(iterations, FIRST_DAMPING, 0.0), gradient_wanted(x0, x1, weight)
+
+    def fit(models: Array, matches: Weighted, out: Array, cost: Array) -> None:
+        refine_homographies(models, matches, schedule, out, cost)
+
     with torch.set_grad_enabled(wanted):
-        matches = NormalizedMatches(x0, x1, weight, mask, H.detach(), scale, homographies=True)
-        shared, s2 = (matches.points, matches.weight), matches.scale.square()[:, None]
-        models, _ = fitted_by(
-            lambda models, data, out, cost: refine_homographies(models, data, schedule, out, cost),
-            _seen_from_the_front(matches), *shared, s2, loss,
-        )  # fmt: skip
+        matches = NormalizedMatches(x0, x1, weight, mask, H.detach(), scale, loss, homographies=True)
+        models, _ = fitted_by(fit, _seen_from_the_front(matches), matches.error)
         if wanted:
-            models = homography_at_optimum(models, *shared, robust, s2)
+            models = homography_at_optimum(models, matches.error)
         return matches.to_pixels(models).reshape(H.shape)
 
 
-def homography_at_optimum(
-    H: Float[Tensor, "9 p k"],
-    points: Float[Tensor, "4 p n"],
-    weight: Float[Tensor, "p n"],
-    robust: RobustLoss,
-    s2: Float[Tensor, "p slots"],
-) -> Float[Tensor, "9 p k"]:
+def homography_at_optimum(H: Float[Tensor, "9 p k"], error: RobustSum) -> Float[Tensor, "9 p k"]:
     """H, optima of unit norm on no graph, attached to the graph of points and weights by the implicit function theorem.
-    s2: squared scales of the loss, one a pair or a match. As `refine.at_optimum`: the optimum moves by minus the
-    inverse Hessian, across H, times the change of the gradient."""
-    valid = torch.isfinite(H).all(0) & (H != 0).any(0)
+    As `refine.at_optimum`: the optimum moves by minus the inverse Hessian across H times the change of the gradient."""
+    valid, fixed = torch.isfinite(H).all(0) & (H != 0).any(0), error.detached()
     model = torch.where(valid, H, torch.eye(3, dtype=H.dtype, device=H.device).reshape(9, 1, 1) / 3**0.5)
-    inverse = inverse_hessian_of_homography(model, points.detach(), weight.detach(), robust, s2.detach())
-    gradient = homography_gradient(model, points, weight, robust, s2)
+    exact = jacobian(functools.partial(homography_gradient, error=fixed), model)
+    gauss_newton = homography_curvature(model, fixed)
+    inverse = inverse_hessian((exact + exact.mT) / 2, gauss_newton, model.movedim(0, -1)[..., None])
+    gradient = homography_gradient(model, error)
     moved = component_sum(inverse * (gradient - gradient.detach()), 1)
     return H - torch.where(valid, moved, 0)
-
-
-def inverse_hessian_of_homography(
-    H: Float[Tensor, "9 p k"],
-    points: Float[Tensor, "4 p n"],
-    weight: Float[Tensor, "p n"],
-    robust: RobustLoss,
-    s2: Float[Tensor, "p slots"],
-) -> Float[Tensor, "9 9 p k"]:
-    """That of half the cost at optima of unit norm, across these; arguments as of `homography_at_optimum`."""
-    exact = _hessian(H, points, weight, robust, s2)
-    gauss_newton = homography_curvature(H, points, weight, robust, s2)
-    return inverse_hessian(exact, gauss_newton, H.movedim(0, -1)[..., None])
-
-
-def _hessian(H: Tensor, points: Tensor, weight: Tensor, robust: RobustLoss, s2: Tensor) -> Float[Tensor, "p k 9 9"]:
-    """Half the second derivative of the cost."""
-    with torch.enable_grad():
-        model = H.detach().clone().requires_grad_()
-        gradient = homography_gradient(model, points, weight, robust, s2)
-        rows = [torch.autograd.grad(gradient[i].sum(), model, retain_graph=True)[0] for i in range(9)]
-    second = torch.stack(rows).movedim((0, 1), (-2, -1))
-    return (second + second.mT) / 2
 
 
 def _seen_from_the_front(matches: NormalizedMatches) -> Float[Tensor, "9 p k"]:

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from fmtorch.geometry import LOSSES
 from fmtorch.geometry.irls import reweighted, reweighted_kernel
 from fmtorch.geometry.levenberg_marquardt import FIRST_DAMPING, LOSS_CODES, Schedule, Weighted, evaluate
+from fmtorch.geometry.normalize import RobustSum
 from fmtorch.geometry.rank2_manifold import SQUARINGS
 from fmtorch.geometry.refine import refine_kernel
 from tests.estimators.pairs import apart
@@ -50,8 +50,9 @@ def test_costs_and_normal_equations(loss: str, n: int) -> None:
 def test_one_reweighted_fit(loss: str, n: int) -> None:
     F, points, weight, _ = matches(n)
     weight[:2] = [0, 1e-9]
-    tensors = (torch.from_numpy(a) for a in (F.T[:, None].copy(), points[:, None], weight[None]))
-    expected = reweighted(*tensors, LOSSES[loss], torch.tensor([SCALE], dtype=torch.float64))[:, 0].T.numpy()
+    models, *data = (torch.from_numpy(a) for a in (F.T[:, None].copy(), points[:, None], weight[None]))
+    error = RobustSum(*data, loss, torch.full((1, 1), SCALE**2, dtype=torch.float64))
+    expected = reweighted(models, error)[:, 0].T.numpy()
     fitted, s2 = F.copy(), np.full(n, SCALE**2)
     reweighted_kernel(fitted, Weighted.of(points, weight, s2, loss))
     for fit, other in zip(fitted, expected, strict=True):
