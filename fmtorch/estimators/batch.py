@@ -121,7 +121,8 @@ class Estimation:
             self.inliers[i, row.slot] = solution.inliers
             fundamental = self.family.model == "fundamental"
             matches = row.matches if solution.lens is None else _straight(row, solution.lens)
-            self.significance[i] = _significance(self.F[i], matches) if fundamental else np.nan
+            known = matches.x0, matches.x1, matches.mask, matches.sizes[:2], matches.sizes[2:]
+            self.significance[i] = of_one_pair(self.F[i], *known) if fundamental else np.nan
             if solution.lens is not None:
                 told = solution.deviation is None or solution.deviation <= MAX_LENS_DEVIATION
                 self.lens[i] = np.where(told, solution.lens, np.nan)
@@ -149,11 +150,6 @@ def _straight(row: Row, lens: Array) -> PixelMatches:
     points = undistorted(pair, lens).points.T * pair.pixels_per_unit + pair.centre
     x0[row.slot], x1[row.slot] = points[:, :2], points[:, 2:]
     return row.matches._replace(x0=x0, x1=x1)
-
-
-def _significance(F: Array, matches: PixelMatches) -> float:
-    """How far the support of a fundamental matrix (3, 3) is beyond chance."""
-    return of_one_pair(F, matches.x0, matches.x1, matches.mask, matches.sizes[:2], matches.sizes[2:])
 
 
 def with_sqrt_prior(c: Correspondences) -> Correspondences:

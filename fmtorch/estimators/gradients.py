@@ -155,17 +155,11 @@ def with_gradients(estimate: Estimate, c: Correspondences, solved: dict[int, Sol
     if not solved:
         return estimate.derived(F=estimate.F + _nothing(c).to(estimate.F))
     rows = torch.tensor(list(solved), device=c.mask.device)
-    pairs = [s.pair for s in solved.values()]
     zero = attach(list(solved.values()), graphed_matches(c, solved))
     F = torch.from_numpy(np.stack([s.fit.F for s in solved.values()])).to(zero)
-    centre = torch.from_numpy(np.stack([pair.centre for pair in pairs])).to(zero)
-    unit = torch.tensor([pair.pixels_per_unit for pair in pairs]).to(zero)
-    frame = PixelFrame(centre, unit, torch.ones_like(rows, dtype=torch.bool))
-    models = (F + zero[:, :9]).reshape(-1, 1, 3, 3)
-    if estimate.model == "homography":
-        G = unit_frobenius(frame.homography_to_pixels(models)[:, 0])
-    else:
-        G = canonical(frame.to_pixels(models)[:, 0])
+    homographies = estimate.model == "homography"
+    models = _frame(solved, zero).to_pixels((F + zero[:, :9]).reshape(-1, 1, 3, 3), homographies)[:, 0]
+    G = unit_frobenius(models) if homographies else canonical(models)
     attached = {"F": estimate.F.index_add(0, rows, G - G.detach())}
     if estimate.focals is not None and zero.shape[1] > 9:
         attached["focals"] = estimate.focals.index_add(0, rows, estimate.focals.detach()[rows] * zero[:, 9:])
@@ -186,15 +180,20 @@ def graphed_matches(c: Correspondences, solved: dict[int, Solved]) -> GraphedMat
         return None if value is None else torch.where(mask, value[rows].gather(1, index), 0).to(torch.float64)
 
     pixels = torch.cat([c.x0, c.x1], -1)[rows].to(torch.float64).gather(1, index[..., None].expand(-1, -1, 4))
-    centre = torch.from_numpy(np.stack([pair.centre for pair in pairs])).to(pixels)
-    unit = torch.tensor([pair.pixels_per_unit for pair in pairs]).to(pixels)
-    points = torch.where(mask[..., None], (pixels - centre[:, None]) / unit[:, None, None], 0).permute(2, 0, 1)
+    points = torch.where(mask[..., None], _frame(solved, pixels).normalized(pixels), 0).permute(2, 0, 1)
     prior, noise = take(c.prior), take(c.noise)
     precision = mask.to(torch.float64)
     if noise is not None:
         precision = precision / torch.where(mask, noise.nan_to_num(1).clamp(MIN_NOISE, MAX_NOISE), 1).square()
     weight = precision if prior is None else precision * prior.nan_to_num(0).clamp(0, 1)
     return GraphedMatches(points, mask, precision, weight, prior)
+
+
+def _frame(solved: dict[int, Solved], like: Tensor) -> PixelFrame:
+    """The normalised coordinates of pairs."""
+    pairs = [each.pair for each in solved.values()]
+    centre = torch.from_numpy(np.stack([pair.centre for pair in pairs])).to(like)
+    return PixelFrame(centre, torch.tensor([pair.pixels_per_unit for pair in pairs]).to(like))
 
 
 def camera_response(cameras: Cameras, pair: Pair, weight: Array, precision: float) -> Array:

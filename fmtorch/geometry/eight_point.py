@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -61,36 +61,12 @@ def eight_point(
         >>> bool(valid), bool((sampson(F, x0, x1) < 1e-6).all())
         (True, True)
     """
-    F, valid = fundamental_of(NormalEquations.of(x0, x1, weight, mask))
-    return F.to(x0.dtype), valid
-
-
-class NormalEquations(NamedTuple):
-    """What the eight-point algorithm needs to know of a set of matches, however many these are.
-    M: the sum of w a a^T over normalised matches. T0, T1: the similarities that normalise the points. valid: whether
-    everything was finite."""
-
-    M: Float[Tensor, "*batch 9 9"]
-    T0: Float[Tensor, "*batch 3 3"]
-    T1: Float[Tensor, "*batch 3 3"]
-    valid: Bool[Tensor, "*batch"]
-
-    @classmethod
-    def of(cls, x0: Tensor, x1: Tensor, weight: Tensor | None = None, mask: Tensor | None = None) -> NormalEquations:
-        """Arguments as of `eight_point`."""
-        x0d, x1d, w, valid = finite_matches(x0, x1, weight, mask)
-        x0n, T0 = normalize_points(x0d, weight=w)
-        x1n, T1 = normalize_points(x1d, weight=w)
-        return cls(normal_matrix(x0n, x1n, w), T0, T1, valid)
-
-
-def fundamental_of(equations: NormalEquations) -> tuple[Float[Tensor, "*batch 3 3"], Bool[Tensor, "*batch"]]:
-    """The fundamental matrices, float64, and which are valid, as of `eight_point`."""
-    f, determined = smallest_eigenvector(equations.M)
-    linear = f.reshape(*f.shape[:-1], 3, 3)
-    F = canonical(denormalize_fundamental(nearest_rank2(linear), equations.T0, equations.T1))
-    valid = equations.valid & determined & (F.detach() != 0).any(-1).any(-1)
-    return torch.where(valid[..., None, None], F, 0.0), valid
+    a, b, w, finite = finite_matches(x0, x1, weight, mask)
+    (a, T0), (b, T1) = normalize_points(a, weight=w), normalize_points(b, weight=w)
+    linear, determined = linear_fundamental(a, b, w)
+    F = canonical(denormalize_fundamental(nearest_rank2(linear), T0, T1))
+    valid = finite & determined & (F.detach() != 0).any(-1).any(-1)
+    return torch.where(valid[..., None, None], F, 0.0).to(x0.dtype), valid
 
 
 def linear_fundamental(

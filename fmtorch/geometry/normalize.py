@@ -193,10 +193,8 @@ class NormalizedMatches:
         is_model = (torch.isfinite(F).flatten(-2).all(-1) & (F != 0).flatten(-2).any(-1))[..., None, None]
         F = torch.where(is_model, F, F.detach())  # no gradient to what is zero or not finite
         matrices = F.to(torch.float64).reshape(p, math.prod(F.shape[x0.dim() - 2 : -2]), 3, 3)
-        frame = self.frame
-        self._to_pixels = frame.homography_to_pixels if homographies else frame.to_pixels
-        from_pixels = frame.homography_from_pixels if homographies else frame.from_pixels
-        self.models = as_components(_about_unit(from_pixels(matrices)))
+        self._homographies = homographies
+        self.models = as_components(_about_unit(self.frame.from_pixels(matrices, homographies)))
 
     def ordered(self, weight: Float[Tensor, "*batch n"]) -> Float[Tensor, "p n"]:
         """Values of matches in the caller's order in the order of `points`, 0 in padded slots; float64."""
@@ -205,7 +203,7 @@ class NormalizedMatches:
 
     def to_pixels(self, models: Float[Tensor, "9 p k"]) -> Float[Tensor, "p k 3 3"]:
         """Matrices in pixels, of unit norm."""
-        return as_matrices(unit(as_components(self._to_pixels(as_matrices(models)))))
+        return as_matrices(unit(as_components(self.frame.to_pixels(as_matrices(models), self._homographies))))
 
 
 @torch.no_grad()

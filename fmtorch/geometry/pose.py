@@ -101,7 +101,7 @@ def pose_from_fundamental(
     R, t, (inverse0, inverse1), regular = _decomposed(F, K0, K1)
     keep = mask & (x0.isfinite() & x1.isfinite()).all(-1)
     with torch.no_grad():
-        ray0, ray1 = (_rays(K, torch.where(keep[..., None], x, 0.0)) for K, x in ((inverse0, x0), (inverse1, x1)))
+        ray0, ray1 = (rays(K, torch.where(keep[..., None], x, 0.0)) for K, x in ((inverse0, x0), (inverse1, x1)))
         front = _in_front(R, t, ray0, ray1) & keep
         count = front.sum(-1)  # (4, *batch)
         best = (count if weight is None else _support(front, weight)).argmax(0)
@@ -120,10 +120,10 @@ def _decomposed(F: Tensor, K0: Tensor, K1: Tensor) -> _Decomposition:
     finite = torch.stack([A.isfinite().all(0).all(0) for A in (F_, K0_, K1_)]).all(0)
     F_, K0_, K1_ = (torch.where(finite, A, 0.0) for A in (F_, K0_, K1_))
     E = product(product(K1_.transpose(0, 1), F_), K0_)
-    inverse0, regular0 = _inverse(K0_)
-    inverse1, regular1 = _inverse(K1_)
+    inverse0, regular0 = inverse(K0_)
+    inverse1, regular1 = inverse(K1_)
     E, t, two = _essential(E)
-    straight, turned = cofactors(E), _cross_matrix_product(t, E)
+    straight, turned = cofactors(E), torch.stack([cross(t, E[:, j]) for j in range(3)], 1)
     R = torch.stack([straight - turned, straight + turned, straight - turned, straight + turned], 2)
     t = torch.stack([t, t, -t, -t], 1)
     return _Decomposition(R, t, (inverse0, inverse1), finite & regular0 & regular1 & two)
@@ -168,19 +168,14 @@ def _support(front: Tensor, weight: Tensor) -> Tensor:
     return torch.where(front, rounded, 0).sum(-1)
 
 
-def _rays(inverse: Tensor, x: Tensor) -> Tensor:
+def rays(inverse: Tensor, x: Tensor) -> Tensor:
     """K^-1 (x, y, 1): (3, *batch, n)."""
     x = x.to(torch.float64)
     columns = inverse[..., None]
     return columns[:, 0] * x[..., 0] + columns[:, 1] * x[..., 1] + columns[:, 2]
 
 
-def _cross_matrix_product(t: Tensor, E: Tensor) -> Tensor:
-    """[t]x E: the cross products of t with E's columns."""
-    return torch.stack([cross(t, E[:, j]) for j in range(3)], 1)
-
-
-def _inverse(K: Tensor) -> tuple[Tensor, Tensor]:
+def inverse(K: Tensor) -> tuple[Tensor, Tensor]:
     """K^-1 by cofactors, and whether there is one."""
     C = cofactors(K)
     determinant = component_sum(K[0] * C[0])

@@ -59,13 +59,11 @@ def counted_chances(F: F8x2, matches: Matches, out: F8x1) -> int:
     chance, place = np.zeros(count), np.zeros(count, np.int64)
     strip0 = _placed(point[0], point[1], matches.size0, place)
     strip1 = _placed(point[2], point[3], matches.size1, place)
-    f0, f1, f2 = F[0, 0] / peak, F[0, 1] / peak, F[0, 2] / peak
-    f3, f4, f5 = F[1, 0] / peak, F[1, 1] / peak, F[1, 2] / peak
-    f6, f7, f8 = F[2, 0] / peak, F[2, 1] / peak, F[2, 2] / peak
+    f = F.ravel() / peak
     for i in range(count):
         u, v, x, y = point[0, i], point[1, i], point[2, i], point[3, i]
-        a1, b1, c1 = f0 * u + f1 * v + f2, f3 * u + f4 * v + f5, f6 * u + f7 * v + f8
-        a0, b0 = f0 * x + f3 * y + f6, f1 * x + f4 * y + f7
+        a1, b1, c1 = f[0] * u + f[1] * v + f[2], f[3] * u + f[4] * v + f[5], f[6] * u + f[7] * v + f[8]
+        a0, b0 = f[0] * x + f[3] * y + f[6], f[1] * x + f[4] * y + f[7]
         e = abs(a1 * x + b1 * y + c1)
         chance[i] = max(_chance(e, a0 * a0 + b0 * b0, strip0), _chance(e, a1 * a1 + b1 * b1, strip1))
     return _median_of_places(chance, place, out)
@@ -247,29 +245,26 @@ def significance(
     mask = torch.ones(x0.shape[:2], dtype=torch.bool, device=x0.device) if mask is None else mask
     sizes = (None if size is None else size.to(torch.float64) for size in (size0, size1))
     out = torch.empty(len(F), 1, dtype=torch.float64)
-    into = _plane_into if model == "homography" else _into
+
+    def into(*arrays: Array) -> None:
+        arrays[-1][0] = of_one_pair(*arrays[:-1], model)
+
     return for_each_pair(into, (F, x0, x1, mask, *sizes), out=out, kind=torch.float64)[:, 0]
 
 
-def of_one_pair(F: Array, x0: Array, x1: Array, mask: Array, size0: Array, size1: Array) -> float:
+def of_one_pair(
+    F: Array, x0: Array, x1: Array, mask: Array, size0: Array, size1: Array, model: str = "fundamental"
+) -> float:
     """`significance` of one pair by kernels; float64, sizes empty where unknown."""
-    chance = np.empty(len(mask))
-    chance = chance[: counted_chances(F, Matches(x0, x1, mask, size0, size1), chance)]
-    chance.sort()
+    chance, matches = np.empty(len(mask)), Matches(x0, x1, mask, size0, size1)
     factorials = _log_factorials(1 << max(len(mask), SAMPLE + 1).bit_length())
+    if model == "homography":
+        chance = chance[: counted_plane_chances(F, matches, chance)]
+        chance.sort()
+        return most_significant(chance, factorials, PLANE_SAMPLE, LOG_PLANE_MODELS)
+    chance = chance[: counted_chances(F, matches, chance)]
+    chance.sort()
     return most_significant(chance, factorials, SAMPLE, LOG_MODELS)
-
-
-def _into(F: Array, x0: Array, x1: Array, mask: Array, size0: Array, size1: Array, out: Array) -> None:
-    out[0] = of_one_pair(F, x0, x1, mask, size0, size1)
-
-
-def _plane_into(H: Array, x0: Array, x1: Array, mask: Array, size0: Array, size1: Array, out: Array) -> None:
-    chance = np.empty(len(mask))
-    chance = chance[: counted_plane_chances(H, Matches(x0, x1, mask, size0, size1), chance)]
-    chance.sort()
-    factorials = _log_factorials(1 << max(len(mask), SAMPLE + 1).bit_length())
-    out[0] = most_significant(chance, factorials, PLANE_SAMPLE, LOG_PLANE_MODELS)
 
 
 @functools.lru_cache(maxsize=8)
