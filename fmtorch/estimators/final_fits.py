@@ -16,7 +16,7 @@ from fmtorch.estimators.models.model import FitScale, Loss, Refining, Steps
 from fmtorch.estimators.models.posterior import Cameras, Limits
 from fmtorch.estimators.models.with_focals import FundamentalWithFocals
 from fmtorch.estimators.pair import Pair, squared
-from fmtorch.estimators.selection import Selection
+from fmtorch.estimators.refinement import Selection
 from fmtorch.jit.kernel import Array
 
 MIN_INLIERS_FOR_NOISE = 15  # matches that tell the noise

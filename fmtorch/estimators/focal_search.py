@@ -12,10 +12,9 @@ from fmtorch.estimators.models.posterior import Cameras
 from fmtorch.estimators.models.with_focals import FundamentalWithFocals
 from fmtorch.estimators.options import Focal
 from fmtorch.estimators.pair import Pair
-from fmtorch.estimators.refinement import Candidates, Refinement
+from fmtorch.estimators.refinement import Candidates, Refinement, Selection, scores_of
 from fmtorch.estimators.scores import Score
 from fmtorch.estimators.search import Search, Stop
-from fmtorch.estimators.selection import Selection, scores_of
 from fmtorch.jit.kernel import Array, B1x1, F8x1, F8x2, kernel
 
 # Share of the best gain without prior that gain minus prior cost must reach; chosen on castle-P19, fox, crops of them.

@@ -15,18 +15,10 @@ from torch import Tensor
 
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.estimators.final_fits import FinalFit, Fit
+from fmtorch.estimators.models import posterior
 from fmtorch.estimators.models.fundamental import response_of
 from fmtorch.estimators.models.model import Refining
-from fmtorch.estimators.models.posterior import (
-    Cameras,
-    Limits,
-    centred,
-    images_of,
-    minimise,
-    no_optimum,
-    tangents_of,
-    translate,
-)
+from fmtorch.estimators.models.posterior import Cameras, Limits, centred, images_of, translate
 from fmtorch.estimators.pair import MAX_NOISE, MIN_NOISE, Pair
 from fmtorch.geometry import canonical, eight_point, unit_frobenius
 from fmtorch.geometry.cameras import PixelFrame
@@ -202,10 +194,10 @@ def camera_response(cameras: Cameras, pair: Pair, weight: Array, precision: floa
 
     weight: (n,), of the matches that count. precision: one over the variance of an inlier's distance.
     """
-    images, optimum, tangents = images_of(pair), no_optimum(1), np.zeros((1, 9, LANES))
+    images, optimum, tangents = images_of(pair), posterior.no_optimum(1), np.zeros((1, 9, LANES))
     matches = Weighted.of(centred(pair).points, weight, np.full(pair.count, np.inf))
-    minimise(cameras.copy(), matches, images, Limits(precision, 0, 0.0), optimum)
-    tangents_of(cameras, images.longest, optimum.F, tangents)
+    posterior.minimise(cameras.copy(), matches, images, Limits(precision, 0, 0.0), optimum)
+    posterior.tangents_of(cameras, images.longest, optimum.F, tangents)
     moves, hessian, by_focal = np.empty((7, 9)), optimum.hessian[0], np.eye(7, 2, -5)
     translate(np.ascontiguousarray(tangents[0, :, :7].T), images.offset, moves)
     if images.prior.shared:  # one parameter for both

@@ -8,8 +8,8 @@ import numpy as np
 
 from fmtorch.estimators.inliers import residuals_squared
 from fmtorch.estimators.pair import Pair, squared
+from fmtorch.estimators.refinement import scores_of
 from fmtorch.estimators.scores import Score
-from fmtorch.estimators.selection import scores_of
 from fmtorch.geometry.eight_point import weighted_eight_point
 from fmtorch.jit.kernel import Array, B1x1, F8x1, F8x2, I4x1, I4x2, I8x1, I8x2, inner, kernel, matrix, vector
 from fmtorch.jit.random import Stream, random_bits, stream_state

@@ -22,7 +22,7 @@ from fmtorch.estimators.models.model import FitScale
 from fmtorch.estimators.models.posterior import Cameras, Images, Limits, centred, images_of, tangents_of, translate
 from fmtorch.estimators.pair import Lens, Pair, squared
 from fmtorch.geometry.arithmetic import logarithm_kernel
-from fmtorch.geometry.levenberg_marquardt import MATCH, TINY, Weighted, in_rows, levenberg_marquardt, robust
+from fmtorch.geometry.levenberg_marquardt import MATCH, TINY, Weighted, in_rows, minimiser, robust
 from fmtorch.geometry.matrices import assign
 from fmtorch.geometry.rank2_manifold import eliminate
 from fmtorch.jit.kernel import Array, F8x1, F8x2, F8x3, inner, kernel, matrix, vector
@@ -282,7 +282,7 @@ def _take(state: _State, trial: _State, k: int) -> None:
     posterior.take_cameras(state, trial, k)
 
 
-_minimise = levenberg_marquardt(_evaluate, _step, _take, posterior.converged, posterior.MIN_DAMPING)
+_minimise = minimiser(_evaluate, _step, _take, posterior.converged, posterior.MIN_DAMPING)
 
 
 STARTS = ((0.0, 0.0), (-0.12, -0.12), (-0.25, -0.25))  # of both lenses, where they are one

@@ -27,12 +27,11 @@ from fmtorch.estimators.options import Count, Focal, Preselect, Refine, Select, 
 from fmtorch.estimators.pair import Lens, Pair
 from fmtorch.estimators.precompiled import OF_HOMOGRAPHIES, WITH_FOCALS
 from fmtorch.estimators.preselection import Preselection
-from fmtorch.estimators.refinement import LocalOptimization, Refinement
+from fmtorch.estimators.refinement import BestOfSearch, BestScore, LocalOptimization, Refinement, Selection, Selector
 from fmtorch.estimators.registry import part, thresholds
 from fmtorch.estimators.sampling import Sampler
 from fmtorch.estimators.scores import Score
 from fmtorch.estimators.search import Search
-from fmtorch.estimators.selection import BestOfSearch, BestScore, Selection, Selector
 from fmtorch.jit.kernel import Array, Kernel
 from fmtorch.jit.together import compile_together
 from fmtorch.jobs.execution import mapped

@@ -1,4 +1,4 @@
-"""The models of a pool made better before one of them is selected: on their inliers, and by Levenberg-Marquardt."""
+"""The models of a pool made better, on their inliers and by Levenberg-Marquardt, and one of them selected."""
 
 from __future__ import annotations
 
@@ -9,9 +9,11 @@ from typing import NamedTuple, Protocol, runtime_checkable
 import numpy as np
 
 from fmtorch.estimators.models.model import Loss, Refining, Steps
+from fmtorch.estimators.models.posterior import Cameras
 from fmtorch.estimators.options import Refine
 from fmtorch.estimators.pair import Pair, squared
 from fmtorch.estimators.preselection import first_shuffled
+from fmtorch.estimators.scores import Score, scored
 from fmtorch.estimators.search import Pool
 from fmtorch.geometry.epipolar import HOMOGRAPHY, SAMPSON, Residual
 from fmtorch.jit.kernel import Array, F4x2, I8x1, Kernel, kernel
@@ -97,3 +99,45 @@ def near_of(residual: Residual) -> Kernel[..., int]:
 
 near = near_of(SAMPSON)
 near_homography = near_of(HOMOGRAPHY)
+
+
+class Selection(NamedTuple):
+    """The selected model (9,), float64, whether there is one, and its cameras (1, ...), None where none are assumed."""
+
+    F: Array
+    valid: bool
+    cameras: Cameras | None = None
+
+
+@runtime_checkable
+class Selector(Protocol):
+    """Selects one model from a pool of refined ones."""
+
+    def __call__(self, candidates: Candidates, pair: Pair) -> Selection:
+        """The selection."""
+        ...
+
+
+class BestOfSearch:
+    """The best model of the search, the first of the pool."""
+
+    def __call__(self, candidates: Candidates, pair: Pair) -> Selection:
+        """As `Selector`."""
+        return Selection(candidates.F[0], bool(candidates.valid[0]))
+
+
+class BestScore:
+    """The model of the largest score."""
+
+    def __init__(self, score: Score) -> None:
+        self.score = score
+
+    def __call__(self, candidates: Candidates, pair: Pair) -> Selection:
+        """As `Selector`."""
+        score = np.where(candidates.valid, scores_of(self.score, candidates.F, pair), -np.inf)
+        return Selection(candidates.F[int(np.argmax(score))], bool(candidates.valid[0]))
+
+
+def scores_of(score: Score, F: Array, pair: Pair) -> Array:
+    """Scores (k,) of models (k, 9), float64, on all matches."""
+    return scored(score, F.astype(np.float32), np.arange(len(F)), pair)

@@ -391,19 +391,9 @@ class Median:
 
 def _rows(pair: Pair) -> Array:
     """The matches in rows, of scale and weight one."""
-    rows = np.zeros((rows_of(pair.count), SINGLES), np.float32)
-    pack_points(pair.points32, rows)
+    rows = scored_matches(pair, 1.0, False)
+    rows[4::MATCH] = 1
     return rows
-
-
-@kernel(holds_gil=True)
-def pack_points(points: F4x2, rows: F4x2) -> None:
-    """Points (4, n) as the rows of `scores.pack`, of scale and weight one; rows of zeros come in."""
-    for i in range(points.shape[1]):
-        row, lane = i // SINGLES * MATCH, i % SINGLES
-        for k in range(4):
-            rows[row + k, lane] = points[k, i]
-        rows[row + 4, lane], rows[row + 5, lane] = 1.0, 1.0
 
 
 @functools.cache

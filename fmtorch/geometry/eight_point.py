@@ -10,14 +10,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from fmtorch.geometry import matrices
 from fmtorch.geometry.arithmetic import stable_sum
-from fmtorch.geometry.matrices import (
-    EPS,
-    nearest_rank2,
-    nearest_rank2_kernel,
-    smallest_eigenvector,
-    smallest_eigenvector_kernel,
-)
+from fmtorch.geometry.matrices import EPS, nearest_rank2_kernel, smallest_eigenvector_kernel, unit_kernel
 from fmtorch.geometry.normalize import canonical, denormalize_fundamental, normalize_points
 from fmtorch.geometry.null_space import equations, gather, null_space
 from fmtorch.geometry.pose import consistently_oriented
@@ -64,7 +59,7 @@ def eight_point(
     a, b, w, finite = finite_matches(x0, x1, weight, mask)
     (a, T0), (b, T1) = normalize_points(a, weight=w), normalize_points(b, weight=w)
     linear, determined = linear_fundamental(a, b, w)
-    F = canonical(denormalize_fundamental(nearest_rank2(linear), T0, T1))
+    F = canonical(denormalize_fundamental(matrices.nearest_rank2(linear), T0, T1))
     valid = finite & determined & (F.detach() != 0).any(-1).any(-1)
     return torch.where(valid[..., None, None], F, 0.0).to(x0.dtype), valid
 
@@ -74,7 +69,7 @@ def linear_fundamental(
 ) -> tuple[Float[Tensor, "*batch 3 3"], Bool[Tensor, "*batch"]]:
     """The F of unit norm, of any rank, that minimises sum w (x1^T F x0)^2; False where it is not determined.
     Arguments as of `normal_matrix`."""
-    f, determined = smallest_eigenvector(normal_matrix(x0, x1, weight))
+    f, determined = matrices.smallest_eigenvector(normal_matrix(x0, x1, weight))
     return f.reshape(*f.shape[:-1], 3, 3), determined
 
 
@@ -140,12 +135,9 @@ def eight_point_kernel(points: F8x2, sample: I8x2, F: F4x2, draw: I8x1) -> int:
             nearest_rank2_kernel(f)
             for image in range(2):
                 _denormalise(f, image, scale[image, lane], centre[2 * image, lane], centre[2 * image + 1, lane])
-            norm = 0.0
+            norm = unit_kernel(f)
             for q in range(9):
-                norm += f[q] * f[q]
-            norm = math.sqrt(norm)
-            for q in range(9):
-                B[q, lane] = f[q] / norm
+                B[q, lane] = f[q]
             there[0, lane] &= norm > 0 and math.isfinite(norm)
         store(there, 0, load(there, 0) & consistently_oriented(B, X, 8))
         for lane in range(min(LANES, sample.shape[1] - first)):

@@ -14,15 +14,15 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from fmtorch.geometry.arithmetic import component_sum, gradient_wanted, stable_sum
+from fmtorch.geometry.epipolar import TINY
 from fmtorch.geometry.levenberg_marquardt import (
     FIRST_DAMPING,
     MATCH,
-    TINY,
     Problem,
     Schedule,
     Weighted,
     in_rows,
-    levenberg_marquardt,
+    minimiser,
     robust,
 )
 from fmtorch.geometry.matrices import assign, assign_rows, unit_kernel
@@ -293,7 +293,7 @@ def _take(state: _State, trial: _State, k: int) -> None:
     assign_rows(state.products[k], trial.products[k])
 
 
-_minimise = levenberg_marquardt(_evaluate, _step, _take)
+_minimise = minimiser(_evaluate, _step, _take)
 
 
 def refine_homography(

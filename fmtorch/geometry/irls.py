@@ -8,18 +8,13 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from fmtorch.geometry import normalize
 from fmtorch.geometry.arithmetic import component_sum, gradient_wanted, unit
 from fmtorch.geometry.eight_point import linear_fundamental, weighted_eight_point
 from fmtorch.geometry.epipolar import linearise, sampson
 from fmtorch.geometry.levenberg_marquardt import MATCH, Weighted, in_rows, linearise_kernel, robust
 from fmtorch.geometry.matrices import assign, nearest_rank2
-from fmtorch.geometry.normalize import (
-    NormalizedMatches,
-    RobustSum,
-    canonical,
-    denormalize_fundamental,
-    normalize_points,
-)
+from fmtorch.geometry.normalize import NormalizedMatches, RobustSum, canonical, normalize_points
 from fmtorch.geometry.rank2_manifold import RANK_TWO, constant
 from fmtorch.geometry.refine import jacobian
 from fmtorch.jit.kernel import F8x2, kernel, matrix, vector
@@ -175,7 +170,7 @@ def weighted_fit(
     x0, T0 = normalize_points(points[..., :2], weight=w)
     x1, T1 = normalize_points(points[..., 2:], weight=w)
     linear, determined = linear_fundamental(x0, x1, w)
-    fitted = denormalize_fundamental(nearest_rank2(linear), T0, T1).flatten(2).movedim(-1, 0)
+    fitted = normalize.denormalize_fundamental(nearest_rank2(linear), T0, T1).flatten(2).movedim(-1, 0)
     determined = determined & valid[..., 0] & torch.isfinite(fitted).all(0) & (fitted != 0).any(0)
     return fitted, determined
 

@@ -186,7 +186,7 @@ def _by_share(problem: Problem, before: float, after: float) -> bool:
     return problem.tolerance > 0 and before - after <= problem.tolerance * before
 
 
-def levenberg_marquardt(
+def minimiser(
     evaluate: Callable[..., None], step: Callable[..., None], take: Callable[..., None],
     converged: Callable[..., bool] = _by_share, min_damping: float = MIN_DAMPING,
 ) -> Callable[[Any, Any, Any, Array, int, bool], None]:  # fmt: skip

@@ -246,14 +246,15 @@ def cofactors_kernel(F: Array, C: Array) -> None:
 
 
 @inner
-def unit_kernel(v: Array) -> None:
-    """Scales to unit norm, in place; NaN where that is not possible."""
+def unit_kernel(v: Array) -> Any:
+    """Scales to unit norm, in place; NaN where that is not possible. The norm that it had."""
     total = 0.0
     for i in range(len(v)):
         total += v[i] * v[i]
     norm = math.sqrt(total)
     for i in range(len(v)):
         v[i] /= norm
+    return norm
 
 
 @inner

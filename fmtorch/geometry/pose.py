@@ -227,7 +227,7 @@ def pose(F: F8x2, cameras: F8x1, x0: F8x2, x1: F8x2, weight: F8x1, out: F8x1) ->
         M[6 + c] = G[c] * u1 + G[3 + c] * v1 + G[6 + c]
     start_one(M, SQUARINGS, G, e0, e1)
     valid = nearest_axes(G, e0, e1, U, V)
-    handed = _determinant(U) * _determinant(V)
+    handed = handedness(U) * handedness(V)
     for r in range(3):
         for c in range(3):
             turned, straight = U[r, 1] * V[c, 0] - U[r, 0] * V[c, 1], U[r, 2] * V[c, 2] * handed
@@ -278,7 +278,7 @@ def _vote(R: Array, U: Array, a: Array, b: Array, weight: float, support: Array)
 
 
 @inner
-def _determinant(M: Array) -> Any:
+def handedness(M: Array) -> Any:
     """The sign of the determinant (3, 3) of orthogonal columns."""
     a = M[0, 0] * (M[1, 1] * M[2, 2] - M[1, 2] * M[2, 1])
     b = M[0, 1] * (M[1, 2] * M[2, 0] - M[1, 0] * M[2, 2]) + M[0, 2] * (M[1, 0] * M[2, 1] - M[1, 1] * M[2, 0])

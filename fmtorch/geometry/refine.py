@@ -13,29 +13,13 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from fmtorch.geometry import rank2_manifold
 from fmtorch.geometry.arithmetic import as_rows, cofactors, component_sum, gradient_wanted, sqrt, stable_sum, unit
 from fmtorch.geometry.epipolar import linearise
-from fmtorch.geometry.levenberg_marquardt import (
-    FIRST_DAMPING,
-    Problem,
-    Schedule,
-    Weighted,
-    evaluate,
-    levenberg_marquardt,
-)
+from fmtorch.geometry.levenberg_marquardt import FIRST_DAMPING, Problem, Schedule, Weighted, evaluate, minimiser
 from fmtorch.geometry.matrices import assign, assign_rows
 from fmtorch.geometry.normalize import NormalizedMatches, RobustSum, fitted_by
-from fmtorch.geometry.rank2_manifold import (
-    RANK_TWO,
-    RANK_TWO_EPIPOLE,
-    SQUARINGS,
-    constant,
-    constrained_solve,
-    retract,
-    start,
-    start_one,
-    steps,
-)
+from fmtorch.geometry.rank2_manifold import RANK_TWO, RANK_TWO_EPIPOLE, SQUARINGS, constant, start_one, steps
 from fmtorch.jit.kernel import Array, F8x1, F8x2, inner, kernel, matrix, vector
 
 # Levenberg-Marquardt of the robust Sampson error on the manifold of rank 2 and unit norm, for the models of a pair
@@ -82,7 +66,7 @@ def _take(state: _State, trial: _State, k: int) -> None:
     assign_rows(state.products[k], trial.products[k])
 
 
-_minimise = levenberg_marquardt(_evaluate, _step, _take)
+_minimise = minimiser(_evaluate, _step, _take)
 
 
 def refine_components(
@@ -176,10 +160,10 @@ def attached_step(
     """
     matches = NormalizedMatches(x0, x1, weight, mask, F.detach(), scale, loss)
     with torch.no_grad():
-        model, e0, e1 = start(matches.models)
+        model, e0, e1 = rank2_manifold.start(matches.models)
         H = curvature_of_cost(model, matches.error)
         identity = torch.eye(9, dtype=H.dtype, device=H.device)[:, :, None, None].expand_as(H)
-        inverse = constrained_solve(H, model, e0, e1, torch.full_like(H[0, 0], STEP_DAMPING), identity)
+        inverse = rank2_manifold.constrained_solve(H, model, e0, e1, torch.full_like(H[0, 0], STEP_DAMPING), identity)
         valid = torch.isfinite(inverse).flatten(0, 1).all(0)
         inverse = torch.where(valid, inverse, 0)
         # Something of rank 2 instead of what is not finite: `where` alone would not keep NaN out of the gradients.
@@ -187,7 +171,7 @@ def attached_step(
         e0, e1 = (torch.where(valid, e, constant(e, RANK_TWO_EPIPOLE)) for e in (e0, e1))
     gradient = gradient_of_cost(model, matches.error)
     step = -component_sum((inverse * gradient).transpose(0, 1))
-    moved, _, _ = retract(model, step, e0, e1)
+    moved, _, _ = rank2_manifold.retract(model, step, e0, e1)
     return matches.to_pixels(torch.where(valid, moved, matches.models)).reshape(F.shape)
 
 

@@ -132,7 +132,7 @@ def _completed(c: Correspondences) -> Correspondences:
     problems = calibration_problems(K, sizes[known])
     valid = torch.tensor([not problem for problem in problems], dtype=torch.bool, device=K.device)
     similar = valid & (c.size0 == c.size1).all(1)
-    K = torch.where(similar[:, None, None], K.double(), _calibration(sizes[missing].amax(1).double(), sizes[missing]))
+    K = torch.where(similar[:, None, None], K.double(), calibration(sizes[missing].amax(1).double(), sizes[missing]))
     length, deviation = focal[:, missing].detach().double().unbind(-1)
     scale = torch.where(deviation < torch.inf, length * K[:, 2, 2] / sqrt(K[:, 0, 0] * K[:, 1, 1]), 1)
     K = K * torch.stack([scale, scale, torch.ones_like(scale)], -1)[:, None]  # columns of the focal lengths
@@ -190,7 +190,7 @@ def _pose(estimate: Estimate, square: Correspondences, focals: Tensor, known: Te
     F, sizes = estimate.F.double(), (square.size0, square.size1)
     if sizes[0] is None or sizes[1] is None:
         return F.new_full((len(F), 3, 3), torch.nan), F.new_full((len(F), 3), torch.nan)
-    K0, K1 = _calibration(focals[:, 0], sizes[0]), _calibration(focals[:, 1], sizes[1])
+    K0, K1 = calibration(focals[:, 0], sizes[0]), calibration(focals[:, 1], sizes[1])
     prior = torch.ones_like(square.x0[..., 0]) if square.prior is None else square.prior.nan_to_num(0)
     weight = torch.where(estimate.inliers & known[:, None], prior, 0).detach()
     cameras = torch.cat([K[:, [0, 0, 1], [0, 2, 2]] for K in (K0, K1)], 1)
@@ -203,7 +203,7 @@ def _pose(estimate: Estimate, square: Correspondences, focals: Tensor, known: Te
     return torch.where(valid[:, None, None], R, torch.nan), torch.where(valid[:, None], t, torch.nan)
 
 
-def _calibration(focal: Tensor, size: Tensor) -> Tensor:
+def calibration(focal: Tensor, size: Tensor) -> Tensor:
     """K (B, 3, 3) of square pixels and central principal points."""
     zero, ones = torch.zeros_like(focal), torch.ones_like(focal)
     x, y = (size[:, 1].to(focal) - 1) / 2, (size[:, 0].to(focal) - 1) / 2

@@ -16,6 +16,7 @@ from fmtorch.estimators.pair import Pair
 from fmtorch.geometry.arithmetic import exponential
 from fmtorch.geometry.epipolar import Residual
 from fmtorch.geometry.levenberg_marquardt import MATCH, Weighted, in_rows
+from fmtorch.geometry.pose import handedness
 from fmtorch.jit.kernel import Array, F8x1, F8x2, inner, kernel
 from fmtorch.jit.lanes import absolute, added, fill, load, sqrt, where
 
@@ -123,7 +124,7 @@ def cheirality(cameras: Cameras, longest: F8x1, F: F8x2, matches: Weighted, tole
     rows, shift = in_rows(matches.points, matches.weight, matches.s2), 1.5 * 2.0 ** (52 - BITS)
     for k in range(len(out)):
         U, V, f = axes[k, 0], axes[k, 1], F[k]
-        handed = 1.0 if (_determinant(U) > 0) == (_determinant(V) > 0) else -1.0
+        handed = handedness(U) * handedness(V)
         d0, d1 = exponential(focal[k, 0]) * longest[0], exponential(focal[k, 1]) * longest[1]
         total, front = fill(0.0), fill(0.0)
         back, mirrored, both = front, front, front
@@ -161,9 +162,3 @@ def _gain(f: Array, x0: Any, y0: Any, x1: Any, y1: Any, scale: Any) -> Any:
 def _ray(M: Array, axis: int, x: Any, y: Any, depth: float) -> Any:
     """A component of points' rays in the axes of a camera."""
     return M[2, axis] + M[0, axis] / depth * x + M[1, axis] / depth * y
-
-
-@inner
-def _determinant(M: Array) -> Any:
-    a = M[0, 0] * (M[1, 1] * M[2, 2] - M[1, 2] * M[2, 1])
-    return a + M[0, 1] * (M[1, 2] * M[2, 0] - M[1, 0] * M[2, 2]) + M[0, 2] * (M[1, 0] * M[2, 1] - M[1, 1] * M[2, 0])

@@ -13,7 +13,7 @@ import numpy as np
 from fmtorch.estimators.models.focal_prior import LOG_USUAL, FocalPrior, focal_cost, focal_prior, prior_slopes
 from fmtorch.estimators.pair import EXACT, Pair
 from fmtorch.geometry.arithmetic import exponential, logarithm_kernel
-from fmtorch.geometry.levenberg_marquardt import Weighted, evaluate, levenberg_marquardt
+from fmtorch.geometry.levenberg_marquardt import Weighted, evaluate, minimiser
 from fmtorch.geometry.matrices import assign, assign_rows
 from fmtorch.geometry.pose import nearest_axes
 from fmtorch.geometry.rank2_manifold import SQUARINGS, eliminate, start_one
@@ -388,4 +388,4 @@ def converged(data: Any, before: float, after: float) -> bool:
     return data.limits.tolerance >= 0 and before - after <= data.limits.tolerance
 
 
-_minimise = levenberg_marquardt(_evaluate, _step, take_cameras, converged, MIN_DAMPING)
+_minimise = minimiser(_evaluate, _step, take_cameras, converged, MIN_DAMPING)

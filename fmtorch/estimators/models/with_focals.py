@@ -7,23 +7,10 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
+from fmtorch.estimators.models import posterior
 from fmtorch.estimators.models.focal_prior import FocalPrior, draw_depths, focal_cost
 from fmtorch.estimators.models.model import Hypotheses, cheirality
-from fmtorch.estimators.models.posterior import (
-    Cameras,
-    Images,
-    Limits,
-    Optimum,
-    centre,
-    centred,
-    damped_step,
-    images_of,
-    minimise,
-    nearest_cameras,
-    no_cameras,
-    no_optimum,
-    translate,
-)
+from fmtorch.estimators.models.posterior import Cameras, Images, Limits, Optimum, centred, images_of
 from fmtorch.estimators.pair import Pair, squared
 from fmtorch.geometry.five_point import five_point
 from fmtorch.geometry.levenberg_marquardt import GEMAN_MCCLURE, Weighted
@@ -76,17 +63,17 @@ class FundamentalWithFocals:
         A model that is not finite comes back as something that is not, with a prior cost of infinity.
         """
         k, precision = len(F), squared(pair.pixels_per_unit / INLIER_SIGMA_PX)
-        cameras, refined = no_cameras(k), Refined(np.empty((k, 9)), np.empty(k), np.empty(k))
+        cameras, refined = posterior.no_cameras(k), Refined(np.empty((k, 9)), np.empty(k), np.empty(k))
         limits, parallel = Limits(precision, iterations, -1.0), PARALLEL_PX / pair.pixels_per_unit
         refine_with_prior(F, Subset(pair.table, images_of(pair), parallel), limits, cameras, refined)
         return cameras, refined
 
     def fit(self, start: Cameras, pair: Pair, truncation: float, limits: Limits) -> FocalFit:
         """The maximum a posteriori of the truncated Sampson error near one candidate; truncation: px."""
-        cameras, images, out, F, gain = start.copy(), images_of(pair), no_optimum(1), np.empty((1, 9)), np.empty(1)
-        matches = centred(pair, truncation)
-        minimise(cameras, Weighted.of(matches.points, pair.weight, matches.s2), images, limits, out)
-        translate(out.F, images.offset, F)
+        cameras, images, matches = start.copy(), images_of(pair), centred(pair, truncation)
+        out, F, gain = posterior.no_optimum(1), np.empty((1, 9)), np.empty(1)
+        posterior.minimise(cameras, Weighted.of(matches.points, pair.weight, matches.s2), images, limits, out)
+        posterior.translate(out.F, images.offset, F)
         gain_without_prior(out.hessian[0], out.gradient[0], cameras.focal[0], images.prior, gain)
         return FocalFit(F[0], cameras, float(gain[0]))
 
@@ -105,11 +92,11 @@ def refine_with_prior(F: F8x2, subset: Subset, limits: Limits, cameras: Cameras,
     table, images, k = subset.table, subset.images, len(F)
     optimum = Optimum(matrix(k, 9), vector(k), matrix(k, 7), np.empty((k, 7, 7)))
     centred_matches = matrix(6, table.shape[1])
-    centre(table, images.offset, LOSS_SCALE_PX, centred_matches)
+    posterior.centre(table, images.offset, LOSS_SCALE_PX, centred_matches)
     points, s2, scale = centred_matches[:4], centred_matches[4], centred_matches[5]
-    nearest_cameras(F, images, cameras)
-    minimise(cameras, Weighted(points, table[4], s2, GEMAN_MCCLURE, matrix(2, 0)), images, limits, optimum)
-    translate(optimum.F, images.offset, out.models)
+    posterior.nearest_cameras(F, images, cameras)
+    posterior.minimise(cameras, Weighted(points, table[4], s2, GEMAN_MCCLURE, matrix(2, 0)), images, limits, optimum)
+    posterior.translate(optimum.F, images.offset, out.models)
     work = vector(5)
     for i in range(k):
         unit_kernel(out.models[i])
@@ -135,7 +122,7 @@ def gain_without_prior(hessian: F8x2, gradient: F8x1, focal: F8x1, prior: FocalP
             if i >= 5 and j >= 5:
                 own = work[i - 3] if i == j else work[4]
             H[i, j] = hessian[i, j] - own
-    damped_step(H, g, STEP_DAMPING, Q)
+    posterior.damped_step(H, g, STEP_DAMPING, Q)
     for i in range(7):
         total += g[i] * Q[i, 7]
     out[0] = -total / 2
