@@ -6,7 +6,8 @@ the same bits whether anybody asks for gradients or not, and gradients are those
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol, runtime_checkable
+from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -59,14 +60,9 @@ class GraphedMatches(NamedTuple):
         return self.points[2:].permute(1, 2, 0)
 
 
-@runtime_checkable
-class Attach(Protocol):
-    """Gives fits their gradients."""
-
-    def __call__(self, solved: list[Solved], matches: GraphedMatches) -> Float[Tensor, "p m"]:
-        """A zero with the gradients of the fits, models (9) of normalised points; perhaps of the logarithms of two
-        focal lengths, too."""
-        ...
+Attach = Callable[[list[Solved], GraphedMatches], Float[Tensor, "p m"]]
+"""A zero with the gradients of fits, models (9) of normalised points; perhaps of the logarithms of two focal lengths,
+too."""
 
 
 class Attached:
@@ -75,27 +71,25 @@ class Attached:
     def __init__(self, final: FinalFit, family: Refining) -> None:
         self.final, self.family = final, family
         own: Attach | None = getattr(final, "attached", None)
-        kinds: dict[str, Attach] = {"least_squares": self._least_squares, "optimum": self._optimum, "none": _none}
-        kind = getattr(final, "gradient", "none")
-        if family.model == "homography" and kind == "least_squares":
-            kind = "optimum"  # of the Sampson error, near that of least squares
-        self._attach = own or kinds[kind]
+        self.kind = getattr(final, "gradient", "none")
+        kinds: dict[str, Attach] = {"least_squares": self._least_squares, "optimum": self._optimum, "none": self._none}
+        if family.model == "homography" and self.kind == "least_squares":
+            own = own or self._optimum  # of the Sampson error, near that of least squares
+        self.attach = own or kinds[self.kind]
 
     @property
     def reached(self) -> tuple[str, ...]:
         """The fields of `Correspondences` that gradients reach; all of a fit that has its own `attached`."""
         if hasattr(self.final, "attached"):
             return ("x0", "x1", "prior", "noise")
-        kind = getattr(self.final, "gradient", "none")
-        if kind == "none":
+        if self.kind == "none":
             return ()
-        if kind == "least_squares" and not self.final.weighted:
+        if self.kind == "least_squares" and not self.final.weighted:
             return ("x0", "x1")
         return ("x0", "x1", "noise", *(("prior",) if self.family.fit_scale.by_prior else ()))
 
-    def __call__(self, solved: list[Solved], matches: GraphedMatches) -> Float[Tensor, "p m"]:
-        """As `Attach`."""
-        return self._attach(solved, matches)
+    def _none(self, solved: list[Solved], matches: GraphedMatches) -> Float[Tensor, "p 9"]:
+        return matches.points.new_zeros(len(solved), 9)
 
     def _least_squares(self, solved: list[Solved], matches: GraphedMatches) -> Float[Tensor, "p 9"]:
         counted = _padded([s.fit.counted for s in solved], matches.mask)
@@ -214,11 +208,6 @@ def _nothing(c: Correspondences) -> Tensor:
     """Zero, with a gradient of zero to all that has one."""
     attached = [t for t in (c.x0, c.x1, c.prior, c.noise) if t is not None and t.requires_grad]
     return torch.stack([t[:0].sum().to(torch.float64) for t in attached]).sum() if attached else torch.zeros(())
-
-
-def _none(solved: list[Solved], matches: GraphedMatches) -> Float[Tensor, "p 9"]:
-    """No gradients."""
-    return matches.points.new_zeros(len(solved), 9)
 
 
 def _padded(rows: list[Array], mask: Bool[Tensor, "p n"]) -> Float[Tensor, "p n"]:

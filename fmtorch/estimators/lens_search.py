@@ -64,10 +64,7 @@ def undistorted(pair: Pair, lens: Array) -> Pair:
     """The pair of pinholes whose lenses (2,) are these; a match's noise grows as its points are stretched."""
     table = np.empty_like(pair.table)
     undistort(pair.table, images_of(pair).offset, lens, half_diagonals(pair), table)
-    return Pair(
-        table, (pair.known[0], True, pair.known[2]), pair.bucket, pair.pixels_per_unit, pair.key, pair.seed,
-        pair.centre, pair.sizes, pair.residual, pair.calibration, pair.images,
-    )  # fmt: skip
+    return pair.with_table(table, (pair.known[0], True, pair.known[2]), None)
 
 
 @kernel(holds_gil=True)

@@ -10,7 +10,8 @@ import numpy as np
 
 from fmtorch.geometry.arithmetic import logarithm_kernel
 from fmtorch.geometry.epipolar import SAMPSON, Residual
-from fmtorch.jit.kernel import Array, B1x1, F8x1, F8x2, I8x1, inner, kernel, matrix
+from fmtorch.geometry.matrices import multiply
+from fmtorch.jit.kernel import Array, B1x1, F8x1, F8x2, I8x1, inner, kernel, vector
 from fmtorch.jit.random import Stream, mixed_seed, stream_state, uniform_kernel
 
 T = TypeVar("T")
@@ -135,9 +136,13 @@ class Pair:
 
     def take(self, index: Array) -> Pair:
         """The same pair with the matches of these indices."""
+        return self.with_table(self.table.take(index, 1), self.known, self.lens)
+
+    def with_table(self, table: Array, known: tuple[bool, bool, bool], lens: Lens | None) -> Pair:
+        """The same pair with another table."""
         return Pair(
-            self.table.take(index, 1), self.known, self.bucket, self.pixels_per_unit, self.key, self.seed, self.centre,
-            self.sizes, self.residual, self.calibration, self.images, self.lens,
+            table, known, self.bucket, self.pixels_per_unit, self.key, self.seed, self.centre, self.sizes,
+            self.residual, self.calibration, self.images, lens,
         )  # fmt: skip
 
 
@@ -214,36 +219,26 @@ def power_of_two(half: float) -> Any:
 def to_pixels(F: F8x1, centre: F8x1, unit: float, out: F8x2) -> bool:
     """A model (9,) of normalised points as that of pixels, canonical in scale and sign -> out (3, 3); if it is finite.
     centre: (4,), of the points in pixels; unit: pixels in one unit of the points."""
-    T0, T1, product, model = matrix(3, 3), matrix(3, 3), matrix(3, 3), matrix(3, 3)
+    T0, T1, product, flat = vector(9), vector(9), vector(9), out.ravel()
     for i in range(3):
         for j in range(3):
             diagonal = (1.0 if i == 2 else 1 / unit) if i == j else 0.0
-            T0[i, j] = -centre[i] / unit if i < j == 2 else diagonal
-            T1[i, j] = -centre[2 + j] / unit if j < i == 2 else diagonal  # transposed
-            model[i, j] = F[3 * i + j]
-    _product(T1, model, product)
-    _product(product, T0, out)
-    largest, total, finite = out[0, 0], 0.0, True
+            T0[3 * i + j] = -centre[i] / unit if i < j == 2 else diagonal
+            T1[3 * i + j] = -centre[2 + j] / unit if j < i == 2 else diagonal  # transposed
+    multiply(T1, F, product)
+    multiply(product, T0, flat)
+    largest, total, finite = flat[0], 0.0, True
     for i in range(9):
-        entry = out[i // 3, i % 3]
-        largest = entry if abs(entry) > abs(largest) else largest
+        largest = flat[i] if abs(flat[i]) > abs(largest) else largest
     peak = abs(largest) if largest != 0 else 1.0
     for i in range(9):
-        out[i // 3, i % 3] /= peak
-        total += out[i // 3, i % 3] * out[i // 3, i % 3]
+        flat[i] /= peak
+        total += flat[i] * flat[i]
     scale, sign = 1 / math.sqrt(total) if total != 0 else 0.0, math.copysign(1.0, largest)
     for i in range(9):
-        out[i // 3, i % 3] = out[i // 3, i % 3] * scale * sign
-        finite = finite and math.isfinite(out[i // 3, i % 3])
+        flat[i] = flat[i] * scale * sign
+        finite = finite and math.isfinite(flat[i])
     return finite
-
-
-@inner
-def _product(a: Array, b: Array, out: Array) -> None:
-    """As `arithmetic.matmul3`."""
-    for r in range(3):
-        for c in range(3):
-            out[r, c] = a[r, 0] * b[0, c] + a[r, 1] * b[1, c] + a[r, 2] * b[2, c]
 
 
 @kernel(holds_gil=True)

@@ -178,7 +178,7 @@ class Ransac:
             mapped(estimate_part, estimation.parts)
         else:
             estimate_part(estimation.parts[0])
-        return estimation.estimates(Attached(self.final, self.family))
+        return estimation.estimates(Attached(self.final, self.family).attach)
 
     def estimate(self, pair: Pair) -> Solution:
         """Search to fit of one pair."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -109,20 +110,15 @@ class Selection(NamedTuple):
     cameras: Cameras | None = None
 
 
-@runtime_checkable
-class Selector(Protocol):
-    """Selects one model from a pool of refined ones."""
-
-    def __call__(self, candidates: Candidates, pair: Pair) -> Selection:
-        """The selection."""
-        ...
+Selector = Callable[[Candidates, Pair], Selection]
+"""Selects one model from a pool of refined ones."""
 
 
 class BestOfSearch:
     """The best model of the search, the first of the pool."""
 
     def __call__(self, candidates: Candidates, pair: Pair) -> Selection:
-        """As `Selector`."""
+        """The selection."""
         return Selection(candidates.F[0], bool(candidates.valid[0]))
 
 
@@ -133,7 +129,7 @@ class BestScore:
         self.score = score
 
     def __call__(self, candidates: Candidates, pair: Pair) -> Selection:
-        """As `Selector`."""
+        """The selection."""
         score = np.where(candidates.valid, scores_of(self.score, candidates.F, pair), -np.inf)
         return Selection(candidates.F[int(np.argmax(score))], bool(candidates.valid[0]))
 

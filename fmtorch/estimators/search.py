@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple
 
 import numpy as np
 
@@ -58,13 +58,8 @@ class Verified(NamedTuple):
     score: Array
 
 
-@runtime_checkable
-class Degeneracy(Protocol):
-    """Completes the best model of a round where its sample is degenerate."""
-
-    def __call__(self, hypotheses: Hypotheses, models: Verified, best: float, pair: Pair) -> Verified:
-        """The models of a round with those completed. best: the score to beat."""
-        ...
+Degeneracy = Callable[[Hypotheses, Verified, float, Pair], Verified]
+"""The models of a round, the best one completed where its sample is degenerate; the number is the score to beat."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -17,6 +17,10 @@ from torch import Tensor
 from fmtorch.jit.kernel import Array, Inner, inner
 from fmtorch.jit.lanes import lanes, where
 
+Matrix = Float[Tensor, "*#batch 3 3"]
+Points = Float[Tensor, "*#batch n 2"]
+PerMatch = Float[Tensor, "*#batch n"]
+
 
 def unit_frobenius(F: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
     """F divided by its Frobenius norm; the zero matrix stays zero, with finite gradients."""
@@ -27,7 +31,7 @@ def unit_frobenius(F: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"
     return F * inverse_root(squared)[..., None, None]
 
 
-def epipolar_lines(F: Float[Tensor, "*#batch 3 3"], x0: Float[Tensor, "*#batch n 2"]) -> Float[Tensor, "*#batch n 3"]:
+def epipolar_lines(F: Matrix, x0: Points) -> Float[Tensor, "*#batch n 3"]:
     """The lines (a, b, c) of x0 in image 1, ``a x + b y + c = 0`` with a^2 + b^2 = 1; pass ``F.mT`` for image 0.
 
     Where a = b = 0 (the epipole, or the line at infinity) the line is returned unscaled, as OpenCV does.
@@ -45,7 +49,7 @@ def epipolar_lines(F: Float[Tensor, "*#batch 3 3"], x0: Float[Tensor, "*#batch n
     return torch.stack([a, b, c], -1) * scale[..., None]
 
 
-def point_to_line(x: Float[Tensor, "*#batch n 2"], line: Float[Tensor, "*#batch n 3"]) -> Float[Tensor, "*#batch n"]:
+def point_to_line(x: Points, line: Float[Tensor, "*#batch n 3"]) -> PerMatch:
     """Distance in pixels of each point to its line (a, b, c) of any scale; 0 where a = b = 0.
 
     Args:
@@ -59,20 +63,13 @@ def point_to_line(x: Float[Tensor, "*#batch n 2"], line: Float[Tensor, "*#batch 
     return (a * x[..., 0] + b * x[..., 1] + c).abs() * inverse_root(a * a + b * b)
 
 
-def algebraic(
-    F: Float[Tensor, "*#batch 3 3"], x0: Float[Tensor, "*#batch n 2"], x1: Float[Tensor, "*#batch n 2"]
-) -> Float[Tensor, "*#batch n"]:
-    """The signed algebraic residual ``x1^T F x0``, in units of F.
-
-    Arguments and shape as of `sampson`.
-    """
+def algebraic(F: Matrix, x0: Points, x1: Points) -> PerMatch:
+    """The signed algebraic residual ``x1^T F x0``, in units of F; arguments and shape as of `sampson`."""
     a, b, c = lines_through(F, x0)
     return a * x1[..., 0] + b * x1[..., 1] + c
 
 
-def epipolar_distances(
-    F: Float[Tensor, "*#batch 3 3"], x0: Float[Tensor, "*#batch n 2"], x1: Float[Tensor, "*#batch n 2"]
-) -> tuple[Float[Tensor, "*#batch n"], Float[Tensor, "*#batch n"]]:
+def epipolar_distances(F: Matrix, x0: Points, x1: Points) -> tuple[PerMatch, PerMatch]:
     """Point-to-line distances in pixels: of x0 to the line ``F^T x1`` in image 0, of x1 to ``F x0`` in image 1.
 
     Args:
@@ -87,42 +84,26 @@ def epipolar_distances(
     return e.abs() * inverse_root(squared0), e.abs() * inverse_root(squared1)
 
 
-def symmetric_mean(
-    F: Float[Tensor, "*#batch 3 3"], x0: Float[Tensor, "*#batch n 2"], x1: Float[Tensor, "*#batch n 2"]
-) -> Float[Tensor, "*#batch n"]:
-    """Mean of the two point-to-line distances, in pixels.
-
-    Arguments and shape as of `sampson`.
-    """
+def symmetric_mean(F: Matrix, x0: Points, x1: Points) -> PerMatch:
+    """Mean of the two point-to-line distances, in pixels; arguments and shape as of `sampson`."""
     d0, d1 = epipolar_distances(F, x0, x1)
     return (d0 + d1) / 2
 
 
-def symmetric_max(
-    F: Float[Tensor, "*#batch 3 3"], x0: Float[Tensor, "*#batch n 2"], x1: Float[Tensor, "*#batch n 2"]
-) -> Float[Tensor, "*#batch n"]:
-    """Larger of the two point-to-line distances, in pixels.
-
-    Arguments and shape as of `sampson`.
-    """
+def symmetric_max(F: Matrix, x0: Points, x1: Points) -> PerMatch:
+    """Larger of the two point-to-line distances, in pixels; arguments and shape as of `sampson`."""
     d0, d1 = epipolar_distances(F, x0, x1)
     return torch.maximum(d0, d1)
 
 
-def symmetric_squared(
-    F: Float[Tensor, "*#batch 3 3"], x0: Float[Tensor, "*#batch n 2"], x1: Float[Tensor, "*#batch n 2"]
-) -> Float[Tensor, "*#batch n"]:
-    """Sum of the two squared point-to-line distances, in squared pixels (Hartley & Zisserman, eq. 11.10).
-
-    Arguments and shape as of `sampson`.
-    """
+def symmetric_squared(F: Matrix, x0: Points, x1: Points) -> PerMatch:
+    """Sum of the two squared point-to-line distances, in squared pixels (Hartley & Zisserman, eq. 11.10);
+    arguments and shape as of `sampson`."""
     d0, d1 = epipolar_distances(F, x0, x1)
     return d0 * d0 + d1 * d1
 
 
-def sampson(
-    F: Float[Tensor, "*#batch 3 3"], x0: Float[Tensor, "*#batch n 2"], x1: Float[Tensor, "*#batch n 2"]
-) -> Float[Tensor, "*#batch n"]:
+def sampson(F: Matrix, x0: Points, x1: Points) -> PerMatch:
     """Sampson distance in pixels: |x1^T F x0| over the norm of its gradient (Hartley & Zisserman, eq. 11.9).
 
     Args:
@@ -144,13 +125,8 @@ def sampson(
     return e.abs() * inverse_root(squared0 + squared1)
 
 
-def sampson_squared(
-    F: Float[Tensor, "*#batch 3 3"], x0: Float[Tensor, "*#batch n 2"], x1: Float[Tensor, "*#batch n 2"]
-) -> Float[Tensor, "*#batch n"]:
-    """Squared Sampson distance, in squared pixels.
-
-    Arguments and shape as of `sampson`.
-    """
+def sampson_squared(F: Matrix, x0: Points, x1: Points) -> PerMatch:
+    """Squared Sampson distance, in squared pixels; arguments and shape as of `sampson`."""
     distance = sampson(F, x0, x1)
     return distance * distance
 
@@ -236,7 +212,7 @@ class Residual(NamedTuple):
 
 
 @inner
-def _sampson(f: Array, x0: Any, y0: Any, x1: Any, y1: Any) -> tuple[Any, Any]:
+def sampson_parts(f: Array, x0: Any, y0: Any, x1: Any, y1: Any) -> tuple[Any, Any]:
     """The epipolar error, and the square of its slope."""
     a0, b0 = f[0] * x0 + f[1] * y0 + f[2], f[3] * x0 + f[4] * y0 + f[5]
     e = f[6] * x0 + f[7] * y0 + f[8] + a0 * x1 + b0 * y1
@@ -246,19 +222,19 @@ def _sampson(f: Array, x0: Any, y0: Any, x1: Any, y1: Any) -> tuple[Any, Any]:
 
 @inner
 def _sampson_of_row(f: Array, rows: Array, row: int) -> Any:
-    e, slope = _sampson(f, load(rows, row), load(rows, row + 1), load(rows, row + 2), load(rows, row + 3))
+    e, slope = sampson_parts(f, load(rows, row), load(rows, row + 1), load(rows, row + 2), load(rows, row + 3))
     return e * e / where(slope > TINY32, slope, TINY32) * load(rows, row + 4)
 
 
 @inner
 def _sampson_of_match(f: Array, x0: Any, y0: Any, x1: Any, y1: Any) -> Any:
-    e, slope = _sampson(f, x0, y0, x1, y1)
+    e, slope = sampson_parts(f, x0, y0, x1, y1)
     return e * e / (slope if slope > TINY_OF_KERNEL else TINY_OF_KERNEL)
 
 
 @inner
 def _sampson_within(f: Array, x0: Any, y0: Any, x1: Any, y1: Any, limit: Any) -> Any:
-    e, slope = _sampson(f, x0, y0, x1, y1)
+    e, slope = sampson_parts(f, x0, y0, x1, y1)
     return e * e <= limit * slope
 
 

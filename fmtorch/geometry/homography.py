@@ -14,7 +14,15 @@ from torch import Tensor
 
 from fmtorch.geometry.arithmetic import cofactors, determinant, matmul3, stable_sum
 from fmtorch.geometry.eight_point import finite_matches
-from fmtorch.geometry.epipolar import inverse_root, lines_through, unit_frobenius, unit_largest
+from fmtorch.geometry.epipolar import (
+    Matrix,
+    PerMatch,
+    Points,
+    inverse_root,
+    lines_through,
+    unit_frobenius,
+    unit_largest,
+)
 from fmtorch.geometry.homography_refine import linearise_homography
 from fmtorch.geometry.matrices import EPS, smallest_eigenvector, smallest_eigenvector_kernel, unit_kernel
 from fmtorch.geometry.normalize import normalize_points
@@ -71,9 +79,7 @@ def homography(
     return torch.where(valid[..., None, None], H, 0.0).to(x0.dtype), valid
 
 
-def homography_points(
-    H: Float[Tensor, "*#batch 3 3"], x0: Float[Tensor, "*#batch n 2"]
-) -> Float[Tensor, "*#batch n 2"]:
+def homography_points(H: Matrix, x0: Points) -> Points:
     """The points of image 1 that H maps x0 to, in pixels; infinite on its horizon.
 
     Args:
@@ -89,9 +95,7 @@ def homography_points(
     return torch.where(seen[..., None], torch.stack([X * by, Y * by], -1), torch.inf)
 
 
-def homography_transfer(
-    H: Float[Tensor, "*#batch 3 3"], x0: Float[Tensor, "*#batch n 2"], x1: Float[Tensor, "*#batch n 2"]
-) -> tuple[Float[Tensor, "*#batch n"], Float[Tensor, "*#batch n"]]:
+def homography_transfer(H: Matrix, x0: Points, x1: Points) -> tuple[PerMatch, PerMatch]:
     """Transfer distances in pixels: from ``H^-1 x1`` to x0 in image 0, from ``H x0`` to x1 in image 1.
 
     Infinite on a horizon, and in image 0 where H is singular. Their squares add up to the symmetric transfer error
@@ -116,9 +120,7 @@ def homography_transfer(
     return _distance(homography_points(adjugate, x1), x0), _distance(homography_points(H, x0), x1)
 
 
-def homography_sampson(
-    H: Float[Tensor, "*#batch 3 3"], x0: Float[Tensor, "*#batch n 2"], x1: Float[Tensor, "*#batch n 2"]
-) -> Float[Tensor, "*#batch n"]:
+def homography_sampson(H: Matrix, x0: Points, x1: Points) -> PerMatch:
     """Sampson distance of a homography in pixels: of both images together (Hartley & Zisserman, section 4.2.6).
 
     The length of the least correction of x0 and x1 that makes ``x1 ~ H x0`` hold to first order: of small errors the
@@ -260,6 +262,17 @@ def _areas(X: Array, x: int, work: Array, out: int) -> Any:
 
 
 # Homographies and the planes they stand for: ``x1 ~ H x0``. Matrices are (9,), row by row, points (4, n), float64
+
+
+@inner
+def in_pixels(H: Array, centre: Array, unit_px: float, out: Array) -> None:
+    """H of points in a unit, so many pixels, from the centre (4,) of both images, in pixels, as that of pixels -> out."""
+    for r in range(3):
+        out[3 * r], out[3 * r + 1] = H[3 * r] / unit_px, H[3 * r + 1] / unit_px
+        out[3 * r + 2] = H[3 * r + 2] - out[3 * r] * centre[0] - out[3 * r + 1] * centre[1]
+    for c in range(3):
+        out[c] = unit_px * out[c] + centre[2] * out[6 + c]
+        out[3 + c] = unit_px * out[3 + c] + centre[3] * out[6 + c]
 
 
 @inner

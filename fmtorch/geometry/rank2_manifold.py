@@ -52,7 +52,7 @@ def retract(F: Tensor, step: Tensor, e0: Tensor, e1: Tensor) -> tuple[Tensor, Te
     return G, unit(component_sum(C * e1[:, None])), unit(component_sum(C * e0, 1))
 
 
-def start(F: Float[Tensor, "9 p k"], squarings: int = SQUARINGS) -> tuple[Tensor, Tensor, Tensor]:
+def start(F: Float[Tensor, "9 p k"]) -> tuple[Tensor, Tensor, Tensor]:
     """A rank-2 matrix of unit norm close to F and its epipoles: ``F (I - e0 e0^T)``.
     e0 is the right singular vector of the smallest singular value, by squarings of the matrix whose dominant
     eigenvector it is: with five to rounding where the last two singular values differ by half, with none where F has
@@ -60,7 +60,7 @@ def start(F: Float[Tensor, "9 p k"], squarings: int = SQUARINGS) -> tuple[Tensor
     F = unit(F)
     C = cofactors(as_rows(F))
     K = component_sum(C[:, :, None] * C[:, None])  # C^T C
-    for _ in range(squarings):
+    for _ in range(SQUARINGS):
         K = K / K.abs().amax((0, 1))
         K = component_sum(K[:, :, None] * K[:, None])
     size = component_sum(K * K, 1)

@@ -10,7 +10,7 @@ from fmtorch.estimators.models.fundamental import Matrices
 from fmtorch.estimators.models.model import FitScale
 from fmtorch.estimators.pair import Pair
 from fmtorch.geometry.epipolar import HOMOGRAPHY, Residual
-from fmtorch.geometry.homography import four_point, weighted_homography
+from fmtorch.geometry.homography import four_point, in_pixels, weighted_homography
 from fmtorch.geometry.homography_refine import refine_homographies, step_of_homography
 from fmtorch.geometry.levenberg_marquardt import Schedule, Weighted
 from fmtorch.geometry.matrices import unit_kernel
@@ -47,12 +47,7 @@ def homography_to_pixels(H: F8x1, centre: F8x1, unit_px: float, out: F8x2) -> bo
     """A homography (9,) of normalised points as that of pixels, of unit norm -> out (3, 3); whether it is finite.
     centre: (4,), of the points in pixels; unit_px: pixels in one unit of the points."""
     flat, finite = out.ravel(), True
-    for r in range(3):  # H times the map from pixels, x = (pixel - centre) / unit
-        out[r, 0], out[r, 1] = H[3 * r] / unit_px, H[3 * r + 1] / unit_px
-        out[r, 2] = H[3 * r + 2] - out[r, 0] * centre[0] - out[r, 1] * centre[1]
-    for c in range(3):  # the map to pixels, times that
-        out[0, c] = unit_px * out[0, c] + centre[2] * out[2, c]
-        out[1, c] = unit_px * out[1, c] + centre[3] * out[2, c]
+    in_pixels(H, centre, unit_px, flat)
     peak = 0.0
     for q in range(9):
         peak = max(peak, abs(flat[q]))

@@ -9,12 +9,10 @@ from __future__ import annotations
 import math
 from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
-import numpy as np
-
 from fmtorch.estimators.models.posterior import Cameras
 from fmtorch.estimators.pair import Pair
 from fmtorch.geometry.arithmetic import exponential
-from fmtorch.geometry.epipolar import Residual
+from fmtorch.geometry.epipolar import TINY_OF_KERNEL, Residual, sampson_parts
 from fmtorch.geometry.levenberg_marquardt import MATCH, Weighted, in_rows
 from fmtorch.geometry.pose import handedness
 from fmtorch.jit.kernel import Array, F8x1, F8x2, inner, kernel
@@ -111,7 +109,6 @@ class Refining(Family, Estimated, Protocol):
 
 BITS = 20  # fractional, of the support, so that its sums are exact
 REST = 1 / 26  # of the gain of Geman & McClure at 5 scales, from which on it is zero
-TINY = float(np.finfo(np.float64).tiny)
 
 
 @kernel(holds_gil=True)
@@ -150,11 +147,8 @@ def cheirality(cameras: Cameras, longest: F8x1, F: F8x2, matches: Weighted, tole
 @inner
 def _gain(f: Array, x0: Any, y0: Any, x1: Any, y1: Any, scale: Any) -> Any:
     """The gains of matches."""
-    a0, b0 = f[0] * x0 + f[1] * y0 + f[2], f[3] * x0 + f[4] * y0 + f[5]
-    a1, b1 = f[0] * x1 + f[3] * y1 + f[6], f[1] * x1 + f[4] * y1 + f[7]
-    e = f[6] * x0 + f[7] * y0 + f[8] + a0 * x1 + b0 * y1
-    slope = a0 * a0 + b0 * b0 + a1 * a1 + b1 * b1
-    gain = 1.0 / (1.0 + e * e / where(slope > TINY, slope, TINY) * scale) - REST
+    e, slope = sampson_parts(f, x0, y0, x1, y1)
+    gain = 1.0 / (1.0 + e * e / where(slope > TINY_OF_KERNEL, slope, TINY_OF_KERNEL) * scale) - REST
     return where(gain > 0.0, gain, 0.0) * (1 / (1 - REST))
 
 
