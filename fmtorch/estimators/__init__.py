@@ -22,8 +22,7 @@ if TYPE_CHECKING:
     from fmtorch.estimators.graph_cut import GraphCut
     from fmtorch.estimators.inliers import BetterHalf, InlierRule, RobustDeviations, StoppingRule, WithinThreshold
     from fmtorch.estimators.irls import IterativelyReweighted
-    from fmtorch.estimators.models.fundamental import EightPoint, Fundamental, SevenPoint
-    from fmtorch.estimators.models.homography import Homography
+    from fmtorch.estimators.models.fundamental import EightPoint, Fundamental, Homography, SevenPoint
     from fmtorch.estimators.options import Focal, Preselect, Refine, Select
     from fmtorch.estimators.pair import Pair
     from fmtorch.estimators.ransac import Ransac

@@ -117,7 +117,7 @@ class Attached:
 def _homographies_at_optimum(
     solved: list[Solved], at: Float[Tensor, "p 9"], matches: GraphedMatches, weight: Float[Tensor, "p n"]
 ) -> Float[Tensor, "p 9"]:
-    """As `Attach`, of homographies, by the loss of their fits."""
+    """Zeros with the gradients of homographies, by the loss of their fits."""
     loss, s2 = "truncated", torch.full_like(at[:, :1], torch.inf)
     scales = [s.fit.s2 for s in solved if s.fit.s2 is not None]  # of all fits, or of none
     if scales:

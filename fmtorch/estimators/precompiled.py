@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from fmtorch.estimators import focal_search, inliers, pair, preselection, refinement, sampling, scores, search
-from fmtorch.estimators.models import focal_prior, homography, model, posterior, with_focals
+from fmtorch.estimators.models import focal_prior, fundamental, model, posterior, with_focals
 from fmtorch.geometry import five_point, homography_refine, levenberg_marquardt
 from fmtorch.geometry.homography import four_point
 from fmtorch.geometry.refine import refine_kernel
@@ -29,7 +29,7 @@ WITH_FOCALS: tuple[Kernel[..., Any], ...] = (
 
 OF_HOMOGRAPHIES: tuple[Kernel[..., Any], ...] = (
     homography_refine.refine_homographies, homography_refine.evaluate_homographies, four_point,
-    homography.homography_to_pixels, inliers.residuals_squared_homography, refinement.near_homography,
+    fundamental.homography_to_pixels, inliers.residuals_squared_homography, refinement.near_homography,
     scores.score_gains_homography, scores.score_saturated_homography, counted_plane_chances,
 )  # fmt: skip
 """Of an estimator of homographies, beside those that the former has too."""

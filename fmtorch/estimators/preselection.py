@@ -133,19 +133,12 @@ def degenerate_support(pair: Pair, inliers: Array, minimal: int, rounding: float
     on_line = np.empty(2, np.bool_)
     for first in (min(FIRST_LOOK, pair.count), pair.count):
         different = support(pair.points, inliers[:first], minimal, rounding, on_line)
-        reason = _reason(different, on_line, minimal)
-        if not reason:
-            break
-    return reason
-
-
-def _reason(count: int, on_line: Array, minimal: int) -> str:
-    if count < minimal:
-        return f"the best model has {count} different inliers; at least {minimal} are needed"
-    if on_line.any():
-        images = " and ".join(f"image {i}" for i in (0, 1) if on_line[i])
-        return f"the inliers of the best model lie on one line in {images}"
-    return ""
+        if different >= minimal and not on_line.any():
+            return ""
+    if different < minimal:
+        return f"the best model has {different} different inliers; at least {minimal} are needed"
+    images = " and ".join(f"image {i}" for i in (0, 1) if on_line[i])
+    return f"the inliers of the best model lie on one line in {images}"
 
 
 @kernel(holds_gil=True)

@@ -15,8 +15,7 @@ from fmtorch.estimators.degensac import Degensac
 from fmtorch.estimators.final_fits import Adaptive, GaussNewton, LeastSquares, NoFit, UnweightedLeastSquares
 from fmtorch.estimators.graph_cut import GraphCut
 from fmtorch.estimators.inliers import BetterHalf, RobustDeviations, WithinThreshold
-from fmtorch.estimators.models.fundamental import EightPoint, SevenPoint
-from fmtorch.estimators.models.homography import Homography
+from fmtorch.estimators.models.fundamental import EightPoint, Homography, SevenPoint
 from fmtorch.estimators.sampling import PriorWeighted, Prosac, Uniform
 from fmtorch.estimators.scores import InlierCount, Magsac, Median, Msac, SaturatedGains
 

@@ -26,12 +26,10 @@ class Sampler(Protocol):
 
 class Draws(NamedTuple):
     """What samples are drawn from.
-
     table: (n,), cumulative weights of the matches, below 2^30; empty for weights of one. totals: (count,), of the
     weights that each draw is made from. newest: (count,), the last match of each draw, the others being drawn from
     those before it; empty: all are drawn. order: (n,), the matches that indices stand for; empty: themselves.
-    seed: of the stream, mixed. start: the number of the first draw.
-    """
+    seed: of the stream, mixed. start: the number of the first draw."""
 
     table: I8x1
     totals: I8x1

@@ -213,8 +213,7 @@ def mapped(x: Float[Tensor, "*batch n 2"], A: Float[Tensor, "*batch 3 3"]) -> Fl
 class PixelFrame(NamedTuple):
     """Normalised coordinates of P pairs: ``pixel = centre + pixels_per_unit * coordinate``; constants, float64.
     centre: middle of the box around the points of each image, x0, y0, x1, y1. pixels_per_unit: a power of two, so that
-    the larger box reaches from about -1 to 1; 1 where all points are one.
-    """
+    the larger box reaches from about -1 to 1; 1 where all points are one."""
 
     centre: Float[Tensor, "p 4"]
     pixels_per_unit: Float[Tensor, " p"]

@@ -68,12 +68,10 @@ def _cross(t: Tensor, A: Tensor) -> Tensor:
 
 def residual_slopes(F: Tensor, slopes: Tensor, a0: Tensor, a1: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Signed Sampson distances (b, n), their derivatives (7, b, n) by the parameters, and the noise in two of these.
-
     With e = a1^T F a0 and q the sum of the squares of both lines' normals, r = e / sqrt(q), and ``dr = de / sqrt(q)``
     at the points corrected to first order, where e is zero. Zero where a point is the epipole. The last are the
     covariances (2, 2, b, n) of the derivatives by the direction of translation, in squared noises of a point: where the
-    images have no parallax these derivatives are nothing but noise, in the three directions that are not corrected.
-    """
+    images have no parallax these derivatives are nothing but noise, in the three directions that are not corrected."""
     ones = torch.ones_like(a0[:1])
     line1 = component_sum(F[..., None] * torch.cat([a0, ones])[None], 1)
     line0 = component_sum(F[..., None] * torch.cat([a1, ones])[:, None], 0)

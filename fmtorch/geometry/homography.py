@@ -175,12 +175,10 @@ SIZE = 4
 @kernel
 def four_point(points: F8x2, sample: I8x2, H: F4x2, draw: I8x1) -> int:
     """Homographies of samples (4, s) of points (4, n) -> H (s, 9), draw (s,), their samples; how many there are.
-
     points: rows x0, y0, x1, y1, of about unit scale. H: of unit norm, positive in the third coordinate of H x0 at the
     points of the sample. A sample gives none if three of its points lie on a line in either image, or if one of the
     four triangles is turned over between the images: then the points would lie on both sides of the plane's horizon, or
-    the plane would be seen from behind.
-    """
+    the plane would be seen from behind."""
     X, h, there = matrix(4 * SIZE, LANES), matrix(9, LANES), np.empty((1, LANES), np.bool_)
     work, models = matrix(6, LANES), 0
     for first in range(0, sample.shape[1], LANES):
@@ -266,7 +264,7 @@ def _areas(X: Array, x: int, work: Array, out: int) -> Any:
 
 @inner
 def in_pixels(H: Array, centre: Array, unit_px: float, out: Array) -> None:
-    """H of points in a unit, so many pixels, from the centre (4,) of both images, in pixels, as that of pixels -> out."""
+    """A homography of points about centres (4,), in units of so many pixels, as that of pixels -> out (9,)."""
     for r in range(3):
         out[3 * r], out[3 * r + 1] = H[3 * r] / unit_px, H[3 * r + 1] / unit_px
         out[3 * r + 2] = H[3 * r + 2] - out[3 * r] * centre[0] - out[3 * r + 1] * centre[1]

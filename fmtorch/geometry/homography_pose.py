@@ -9,6 +9,7 @@ from torch import Tensor
 from fmtorch.geometry.arithmetic import cofactors, component_sum, determinant, product, sqrt
 from fmtorch.geometry.homography import SINGULAR
 from fmtorch.geometry.matrices import smallest_eigenvector
+from fmtorch.geometry.normalize import Mask, Matrices, Points
 from fmtorch.geometry.pose import inverse, rays
 
 ITERATIONS = 2  # to the nearest rotation, from an error of 1e-8 at worst, which each squares
@@ -32,12 +33,7 @@ class PlanePoses(NamedTuple):
 
 
 def poses_from_homography(
-    H: Float[Tensor, "*batch 3 3"],
-    K0: Float[Tensor, "*batch 3 3"],
-    K1: Float[Tensor, "*batch 3 3"],
-    x0: Float[Tensor, "*batch n 2"],
-    x1: Float[Tensor, "*batch n 2"],
-    mask: Bool[Tensor, "*batch n"] | None = None,
+    H: Matrices, K0: Matrices, K1: Matrices, x0: Points, x1: Points, mask: Mask | None = None
 ) -> PlanePoses:
     """Poses of two calibrated cameras before a plane, from its homography ``x1 ~ H x0``.
 
@@ -91,9 +87,7 @@ def poses_from_homography(
     return PlanePoses(R, t, n, poses[3].movedim(0, -1), valid.movedim(0, -1))
 
 
-def rotation_from_homography(
-    H: Float[Tensor, "*batch 3 3"], K0: Float[Tensor, "*batch 3 3"], K1: Float[Tensor, "*batch 3 3"]
-) -> tuple[Float[Tensor, "*batch 3 3"], Bool[Tensor, "*batch"]]:
+def rotation_from_homography(H: Matrices, K0: Matrices, K1: Matrices) -> tuple[Matrices, Bool[Tensor, "*batch"]]:
     """The rotation nearest to K1^-1 H K0, up to scale: of a camera that only turns ``H = K1 R K0^-1``.
 
     The unit quaternion that maximises the trace of R^T G is the eigenvector of a 4 x 4 matrix (Davenport 1968; Horn

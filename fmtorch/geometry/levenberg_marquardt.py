@@ -191,12 +191,10 @@ def minimiser(
     converged: Callable[..., bool] = _by_share, min_damping: float = MIN_DAMPING,
 ) -> Callable[[Any, Any, Any, Array, int, bool], None]:  # fmt: skip
     """The loop for an objective: loop(data, state, trial, damping, iterations, ends), in place.
-
     evaluate(state, data, derivatives): the costs, and the derivatives if asked for, at the state's parameters.
     step(state, damping, trial): those of a trial. take(state, trial, k): gives the state model k of the trial, but for
     its cost, where that is lower: such a step divides the damping by 10, another multiplies it. converged(data, before,
-    after): whether a model is done after a step that has lowered its cost so.
-    """
+    after): whether a model is done after a step that has lowered its cost so."""
 
     @inner
     def accept(state: Any, trial: Any, damping: Array, done: Array, data: Any) -> bool:
@@ -215,10 +213,8 @@ def minimiser(
     @inner
     def loop(data: Any, state: Any, trial: Any, damping: Array, iterations: int, ends: bool) -> None:
         """The state holds the start, then that of least cost; no cost ever rises.
-
         damping: (k,), the first of each model. ends: whether models are ever done; the state then keeps the
-        derivatives at the end.
-        """
+        derivatives at the end."""
         done = np.zeros(len(damping), np.bool_)
         evaluate(state, data, iterations > 0 or ends)
         for i in range(iterations):

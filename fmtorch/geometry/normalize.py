@@ -18,12 +18,13 @@ from fmtorch.geometry.levenberg_marquardt import Weighted
 from fmtorch.geometry.robust_losses import LOSSES, RobustLoss, named_loss
 from fmtorch.jit.kernel import Array
 
+Points = Float[Tensor, "*batch n 2"]
+PerMatch = Float[Tensor, "*batch n"]
+Mask = Bool[Tensor, "*batch n"]
+Matrices = Float[Tensor, "*batch 3 3"]
 
-def normalize_points(
-    x: Float[Tensor, "*batch n 2"],
-    mask: Bool[Tensor, "*batch n"] | None = None,
-    weight: Float[Tensor, "*batch n"] | None = None,
-) -> tuple[Float[Tensor, "*batch n 2"], Float[Tensor, "*batch 3 3"]]:
+
+def normalize_points(x: Points, mask: Mask | None = None, weight: PerMatch | None = None) -> tuple[Points, Matrices]:
     """Points moved to zero mean and mean distance sqrt(2), and the similarity T that does it (x_n = T x).
 
     Hartley, In Defense of the Eight-Point Algorithm, PAMI 1997. Means are over the points in `mask`, weighted by
@@ -44,11 +45,7 @@ def normalize_points(
     return _apply(centred, mask, scale), _similarity(centroid, scale)
 
 
-def normalize_pair(
-    x0: Float[Tensor, "*batch n 2"], x1: Float[Tensor, "*batch n 2"], mask: Bool[Tensor, "*batch n"] | None = None
-) -> tuple[
-    Float[Tensor, "*batch n 2"], Float[Tensor, "*batch n 2"], Float[Tensor, "*batch 3 3"], Float[Tensor, "*batch 3 3"]
-]:
+def normalize_pair(x0: Points, x1: Points, mask: Mask | None = None) -> tuple[Points, Points, Matrices, Matrices]:
     """Points of both images centred each on its own, with one common scale: x0_n, x1_n, T0, T1.
 
     The mean distance to the centroid, over both images, becomes sqrt(2). Distances keep their proportions between the
@@ -86,7 +83,7 @@ def denormalize_fundamental(
     return matmul3(matmul3(T1.mT, F), T0)
 
 
-def canonical(F: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
+def canonical(F: Matrices) -> Matrices:
     """F scaled to unit Frobenius norm with its entry of largest magnitude (the first of equals) positive.
 
     A zero matrix stays zero, with zero gradient.
@@ -162,12 +159,10 @@ class RobustSum(NamedTuple):
 
 class NormalizedMatches:
     """Matches of P pairs, those that count first, centred, of about unit scale, and K models for each pair.
-
     points: (4, P, N), rows x0, y0, x1, y1, zero in padded slots. weight: (P, N), likewise. error: the robust sum of
     both. models: (9, P, K), entries row by row, of about unit scale. counts: which of the caller's matches count.
     Everything is float64 and attached to the caller's graph; the frame is constant. scale: of the loss, px.
-    homographies: the models F are homographies, not fundamental matrices. Raises ValueError for an unknown loss.
-    """
+    homographies: the models F are homographies, not fundamental matrices. Raises ValueError for an unknown loss."""
 
     def __init__(
         self, x0: Tensor, x1: Tensor, weight: Tensor | None, mask: Tensor | None, F: Tensor,
@@ -196,7 +191,7 @@ class NormalizedMatches:
         self._homographies = homographies
         self.models = as_components(_about_unit(self.frame.from_pixels(matrices, homographies)))
 
-    def ordered(self, weight: Float[Tensor, "*batch n"]) -> Float[Tensor, "p n"]:
+    def ordered(self, weight: PerMatch) -> Float[Tensor, "p n"]:
         """Values of matches in the caller's order in the order of `points`, 0 in padded slots; float64."""
         flat = weight.to(torch.float64).reshape(self._order.shape)
         return torch.where(self._mask, flat.gather(1, self._order), 0)

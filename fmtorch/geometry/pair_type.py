@@ -256,13 +256,11 @@ PLANE_PARAMETERS, COPY_PARAMETERS = 8, 3  # of a homography, and of a similarity
 
 class Evidence(NamedTuple):
     """Log likelihoods of B pairs in nats, relative to matches that are all wrong, each at its best shares.
-
     line: right matches lie on epipolar lines. plane: where H takes them. both: some here and some there. rotation:
     where K1 R K0^-1 takes them, less the cost of focal lengths that differ; -inf where no cameras are given. copy:
     where ``x1 = a x0 + b`` takes them. noise: of usual matches, px. matches: how many are real. on_plane, on_line:
     shares of the matches on the plane, and off it on their lines. R: the rotation; log_focal: what is added to the
-    logarithms of both focal lengths; scaled: a and b.
-    """
+    logarithms of both focal lengths; scaled: a and b."""
 
     line: Float[Tensor, " b"]
     plane: Float[Tensor, " b"]

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from fmtorch.geometry.arithmetic import cofactors, component_sum, cross, product, sqrt
 from fmtorch.geometry.matrices import complement, complement_kernel, last_right_singular_vector
+from fmtorch.geometry.normalize import Mask, Matrices, PerMatch, Points
 from fmtorch.geometry.rank2_manifold import SQUARINGS, start_one
 from fmtorch.jit.kernel import Array, F8x1, F8x2, inner, kernel, matrix, vector
 from fmtorch.jit.lanes import fill, load
@@ -20,7 +21,7 @@ class Pose(NamedTuple):
     Where `valid` is False, R is the identity and t is zero.
     """
 
-    R: Float[Tensor, "*batch 3 3"]
+    R: Matrices
     t: Float[Tensor, "*batch 3"]
     n_in_front: Int[Tensor, "*batch"]
     valid: Bool[Tensor, "*batch"]
@@ -46,9 +47,7 @@ class _Decomposition(NamedTuple):
     valid: Tensor
 
 
-def poses_from_fundamental(
-    F: Float[Tensor, "*batch 3 3"], K0: Float[Tensor, "*batch 3 3"], K1: Float[Tensor, "*batch 3 3"]
-) -> FourPoses:
+def poses_from_fundamental(F: Matrices, K0: Matrices, K1: Matrices) -> FourPoses:
     """The four decompositions of E = K1^T F K0, in no order of merit; matches tell which one is right.
 
     Hartley and Zisserman, Multiple View Geometry, 9.6.2. Float64 inside, F's type outside; differentiable.
@@ -69,13 +68,13 @@ def poses_from_fundamental(
 
 
 def pose_from_fundamental(
-    F: Float[Tensor, "*batch 3 3"],
-    K0: Float[Tensor, "*batch 3 3"],
-    K1: Float[Tensor, "*batch 3 3"],
-    x0: Float[Tensor, "*batch n 2"],
-    x1: Float[Tensor, "*batch n 2"],
-    mask: Bool[Tensor, "*batch n"] | None = None,
-    weight: Float[Tensor, "*batch n"] | None = None,
+    F: Matrices,
+    K0: Matrices,
+    K1: Matrices,
+    x0: Points,
+    x1: Points,
+    mask: Mask | None = None,
+    weight: PerMatch | None = None,
 ) -> Pose:
     """Rotation and direction of translation from E = K1^T F K0, of the four decompositions the one with most points
     of positive depth in both cameras.

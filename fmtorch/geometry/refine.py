@@ -73,11 +73,9 @@ def refine_components(
     F: Float[Tensor, "9 p k"], error: RobustSum, iterations: int
 ) -> tuple[Float[Tensor, "9 p k"], Float[Tensor, "p k"]]:
     """Refined models and their costs, component by component, without gradients.
-
     F: k models for each of p pairs, entries row by row; made rank 2 first where they are not. iterations: at most.
     The cost of a model never rises above that of its (rank-2) start; a model that cannot be improved is kept, one that
-    is not finite comes back as it was, with infinite cost.
-    """
+    is not finite comes back as it was, with infinite cost."""
     schedule = Schedule(iterations, FIRST_DAMPING, 0.0)
 
     def fit(models: Array, matches: Weighted, out: Array, cost: Array) -> None:
@@ -197,13 +195,11 @@ def curvature_of_cost(F: Float[Tensor, "9 p k"], error: RobustSum) -> Float[Tens
 
 def at_optimum(F: Float[Tensor, "9 p k"], error: RobustSum) -> Float[Tensor, "9 p k"]:
     """F, optima of rank 2 and unit norm, attached to the graph of points and weights by the implicit function theorem.
-
     The optimum moves by ``dF = -H^-1 d(gradient)`` in the tangent space of the manifold. H is the Hessian of the cost
     on it, exact: with the curvature of the residuals, and with that of the constraint ``det F = 0`` by its Lagrange
     multiplier: of ``cost + 2 multiplier det F``. Where it is not positive definite, at what is no strict minimum, Gauss
     and Newton's takes its place. Directions that the points leave open are damped; what is not finite or zero has a
-    gradient of zero. F on no graph. Returns the same values.
-    """
+    gradient of zero. F on no graph. Returns the same values."""
     fixed = error.detached()
     with torch.no_grad():
         valid = torch.isfinite(F).all(0) & (F != 0).any(0)

@@ -238,8 +238,10 @@ def camera_fields(K0: Arrays | None, K1: Arrays | None, focal: Focal, sizes_know
         raise ValueError(f"{missing} needs the image sizes: give size0 and size1")
     fields: dict[str, Any] = {name: _floating(K, name) for name, K in (("K0", K0), ("K1", K1)) if K is not None}
     if isinstance(focal, str):
-        return fields | _named(focal)
-    return fields | {"focal": _deviations(focal, K0 is not None, K1 is not None) if fields else _measured(focal)}
+        return fields | _unknown("focal", focal, UNKNOWN)
+    if fields:
+        return fields | {"focal": _deviations(focal, K0 is not None, K1 is not None)}
+    return {"focal": _of_both(focal, "focal", UNKNOWN, f"without K0 and K1 it must be {FORMS}")}
 
 
 def lens_fields(lens: Lens) -> dict[str, Any]:
@@ -247,18 +249,12 @@ def lens_fields(lens: Lens) -> dict[str, Any]:
     if lens is None:
         return {}
     if isinstance(lens, str):
-        if lens not in ("shared", "unknown"):
+        if lens not in FOCAL_NAMES:
             raise ValueError(f"lens is {lens!r}; it must be {LENS_FORMS}")
-        nothing = torch.tensor([UNKNOWN_LENS, UNKNOWN_LENS], dtype=torch.float64)
-        return {"lens": nothing} if lens == "unknown" else {"lens": nothing, "shared_lens": torch.tensor(True)}
-    if isinstance(lens, list | tuple):
-        lens = [UNKNOWN_LENS if entry is None else entry for entry in lens]
-    values = _floating(lens, "lens")
-    values = torch.cat([values.reshape(1), values.new_zeros(1)]) if values.numel() == 1 else values
-    values = values.expand(2, 2) if values.shape == (2,) else values
-    if values.dim() not in (2, 3) or values.shape[-2:] != (2, 2):
-        raise ValueError(f"lens has shape {tuple(values.shape)}; it must be {LENS_FORMS}")
-    return {"lens": values}
+        return _unknown("lens", lens, UNKNOWN_LENS)
+    if not isinstance(lens, list | tuple) and (value := _floating(lens, "lens")).numel() == 1:
+        lens = torch.cat([value.reshape(1), value.new_zeros(1)])
+    return {"lens": _of_both(lens, "lens", UNKNOWN_LENS, f"it must be {LENS_FORMS}")}
 
 
 def _expect_calibrations(c: Correspondences) -> None:
@@ -270,21 +266,20 @@ def _expect_calibrations(c: Correspondences) -> None:
             raise ValueError(problem)
 
 
-def _named(focal: str) -> dict[str, Any]:
-    """Fields where no focal length is known."""
-    nothing = torch.tensor([UNKNOWN, UNKNOWN], dtype=torch.float64)
-    return {"focal": nothing} if focal == "unknown" else {"focal": nothing, "shared_focal": torch.tensor(True)}
+def _unknown(name: str, which: str, unknown: tuple[float, float]) -> dict[str, Any]:
+    """Fields where nothing is known of either image, or that both are alike."""
+    nothing = {name: torch.tensor([unknown, unknown], dtype=torch.float64)}
+    return nothing | {f"shared_{name}": torch.tensor(True)} if which == "shared" else nothing
 
 
-def _measured(focal: Any) -> Tensor:
-    """Focal lengths and deviations (2, 2) or (B, 2, 2)."""
-    if isinstance(focal, list | tuple):
-        focal = [UNKNOWN if entry is None else entry for entry in focal]
-    values = _floating(focal, "focal")
-    if values.shape == (2,):
-        values = values.expand(2, 2)
+def _of_both(value: Any, name: str, unknown: tuple[float, float], forms: str) -> Tensor:
+    """What is measured and its deviations, (2, 2) or (B, 2, 2)."""
+    if isinstance(value, list | tuple):
+        value = [unknown if entry is None else entry for entry in value]
+    values = _floating(value, name)
+    values = values.expand(2, 2) if values.shape == (2,) else values
     if values.dim() not in (2, 3) or values.shape[-2:] != (2, 2):
-        raise ValueError(f"focal has shape {tuple(values.shape)}; without K0 and K1 it must be {FORMS}")
+        raise ValueError(f"{name} has shape {tuple(values.shape)}; {forms}")
     return values
 
 

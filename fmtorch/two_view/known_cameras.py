@@ -244,7 +244,7 @@ def _covariance_of(
     """The covariance of F, which is A1^T G A0 at unit norm, from that of G at unit norm."""
     G = matmul3(matmul3(_inverse(A1).mT, F), _inverse(A0)).flatten(1)
     M = (A1.mT[:, :, None, :, None] * A0.mT[:, None, :, None, :]).flatten(3).flatten(1, 2)
-    M = M / _inverse_norm(G)[:, None, None]
+    M = M / inverse_root(component_sum(G * G, -1))[:, None, None]
     f = F.flatten(1)
     J = M - f[:, :, None] * component_sum(f[:, :, None] * M, 1)[:, None]
     return _product(_product(J, C), J.mT)
@@ -258,7 +258,3 @@ def _inverse(A: Float[Tensor, "b 3 3"]) -> Float[Tensor, "b 3 3"]:
 def _product(A: Float[Tensor, "b k m"], B: Float[Tensor, "b m n"]) -> Float[Tensor, "b k n"]:
     """``A B``, the same bits in any batch."""
     return component_sum(A[..., None] * B[:, None], 2)
-
-
-def _inverse_norm(x: Float[Tensor, "b m"]) -> Float[Tensor, " b"]:
-    return inverse_root(component_sum(x * x, -1))

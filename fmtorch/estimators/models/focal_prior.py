@@ -38,12 +38,10 @@ QUANTILES = 1 << 10  # of the normal distribution, from which focal lengths are 
 
 class FocalPrior(NamedTuple):
     """The prior of one pair. same_size: whether the images may come from one camera. shared: whether they do.
-
     measured: (2,), logarithms; precision: (2,), one over the squares of their relative deviations, 0 of none.
     tail: (2,), whether a measurement may be wrong. normal: (QUANTILES,), quantiles of the normal distribution. draw:
     (5,), of the posterior of both given the measurements: means, and the factor (l00, l10, l11) of their covariance.
-    common: (2,), mean and deviation of one focal length for both; share: of the draws that take it.
-    """
+    common: (2,), mean and deviation of one focal length for both; share: of the draws that take it."""
 
     same_size: bool
     shared: bool
