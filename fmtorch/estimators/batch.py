@@ -48,20 +48,6 @@ class Solution(NamedTuple):
     deviation: Array | None = None
 
 
-class CameraRows(NamedTuple):
-    """Of b pairs, fields of `Estimate`: focals (b, 2), fit_scale (b,), focal_precision (b, 2, 2)."""
-
-    focals: Array
-    fit_scale: Array
-    focal_precision: Array
-
-    def fill(self, i: int, fit: Fit, pair: Pair) -> None:
-        """Those of one pair whose image sizes are known."""
-        self.focals[i] = focals_near(fit.F, pair) if fit.cameras is None else focals_px(fit.cameras, pair)
-        self.fit_scale[i] = scale_of(fit, pair)
-        self.focal_precision[i] = focal_precision(self.focals[i], pair)
-
-
 class Row(NamedTuple):
     """A pair of a batch that can be tried: its place there, and its matches as they came.
     slot: (n,), where the pair's matches are among these. needed: inliers below which a model is none."""
@@ -89,7 +75,8 @@ class Estimation:
         """The rows, shared out among threads."""
         self.F, self.inliers, self.ok = np.zeros((b, 3, 3)), np.zeros((b, n), np.bool_), np.zeros(b, np.bool_)
         self.samples, self.significance, self.reasons = np.zeros(b, np.int64), np.full(b, -np.inf), [""] * b
-        self.cameras = CameraRows(np.full((b, 2), np.nan), np.full(b, np.nan), np.full((b, 2, 2), np.nan))
+        shapes = {"focals": (b, 2), "fit_scale": (b,), "focal_precision": (b, 2, 2)}
+        self.cameras = {name: np.full(shape, np.nan) for name, shape in shapes.items()}
         self.lens = np.full((b, 2), np.nan)
         self.asked_for_cameras = family.model == "fundamental" and c.asks_for_cameras
         self.graphed = torch.is_grad_enabled() and c.requires_grad
@@ -121,13 +108,17 @@ class Estimation:
             self.inliers[i, row.slot] = solution.inliers
             fundamental = self.family.model == "fundamental"
             matches = row.matches if solution.lens is None else _straight(row, solution.lens)
-            known = matches.x0, matches.x1, matches.mask, matches.sizes[:2], matches.sizes[2:]
-            self.significance[i] = of_one_pair(self.F[i], *known) if fundamental else np.nan
+            given = matches.x0, matches.x1, matches.mask, matches.sizes[:2], matches.sizes[2:]
+            self.significance[i] = of_one_pair(self.F[i], *given) if fundamental else np.nan
             if solution.lens is not None:
                 told = solution.deviation is None or solution.deviation <= MAX_LENS_DEVIATION
                 self.lens[i] = np.where(told, solution.lens, np.nan)
             if self.asked_for_cameras and pair.sizes_known:
-                self.cameras.fill(i, solution.fit, pair)
+                fit = solution.fit
+                focals = focals_near(fit.F, pair) if fit.cameras is None else focals_px(fit.cameras, pair)
+                known = focals, scale_of(fit, pair), focal_precision(focals, pair)
+                for rows, value in zip(self.cameras.values(), known, strict=True):
+                    rows[i] = value
             if self.graphed:
                 self.solved[i] = Solved(pair, row.slot, solution.fit)
 
@@ -136,7 +127,7 @@ class Estimation:
         arrays = {"F": self.F, "inliers": self.inliers, "ok": self.ok, "samples": self.samples}
         arrays["significance"] = self.significance
         if self.asked_for_cameras:
-            arrays |= self.cameras._asdict()
+            arrays |= self.cameras
         if self.batch.lens is not None:
             arrays["lens"] = self.lens
         fields = {name: torch.from_numpy(value).to(self.c.mask.device) for name, value in arrays.items()}

@@ -72,13 +72,7 @@ def algebraic(F: Matrix, x0: Points, x1: Points) -> PerMatch:
 def epipolar_distances(F: Matrix, x0: Points, x1: Points) -> tuple[PerMatch, PerMatch]:
     """Point-to-line distances in pixels: of x0 to the line ``F^T x1`` in image 0, of x1 to ``F x0`` in image 1.
 
-    Args:
-        F: fundamental matrices (..., 3, 3), of any scale and sign.
-        x0: points in image 0, (..., N, 2), px.
-        x1: their matches in image 1, (..., N, 2), px.
-
-    Returns:
-        Two tensors (..., N), at least 0: in image 0, in image 1.
+    Arguments as of `sampson`. Two tensors (..., N), at least 0: in image 0, in image 1.
     """
     e, squared0, squared1 = residual_and_normals(F, x0, x1)
     return e.abs() * inverse_root(squared0), e.abs() * inverse_root(squared1)

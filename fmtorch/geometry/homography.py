@@ -47,10 +47,7 @@ def homography(
     float64, returned in x0's type.
 
     Args:
-        x0: points of image 0, pixels.
-        x1: their matches in image 1.
-        weight: of each match, not negative, any scale; 1 by default.
-        mask: True for a real match; all by default.
+        x0, x1, weight, mask: as of `eight_point`.
 
     Returns:
         H, and whether it is valid. Invalid (H = 0): fewer than eight independent equations (too few points, coincident
@@ -124,15 +121,7 @@ def homography_sampson(H: Matrix, x0: Points, x1: Points) -> PerMatch:
     """Sampson distance of a homography in pixels: of both images together (Hartley & Zisserman, section 4.2.6).
 
     The length of the least correction of x0 and x1 that makes ``x1 ~ H x0`` hold to first order: of small errors the
-    distance to the nearest exact match.
-
-    Args:
-        H: homographies (..., 3, 3), of any scale and sign.
-        x0: points in image 0, (..., N, 2), px.
-        x1: their matches in image 1, (..., N, 2), px.
-
-    Returns:
-        (..., N), at least 0.
+    distance to the nearest exact match. Arguments as of `homography_transfer`, (..., N).
     """
     h = unit_largest(H.to(torch.float64)).flatten(-2).movedim(-1, 0)[..., None]
     shape = np.broadcast_shapes(x0.shape, x1.shape)

@@ -94,9 +94,7 @@ def rotation_from_homography(H: Matrices, K0: Matrices, K1: Matrices) -> tuple[M
     1987, Closed-form solution of absolute orientation using unit quaternions).
 
     Args:
-        H: homographies (..., 3, 3), of any scale and sign.
-        K0: calibration matrices (..., 3, 3) of image 0.
-        K1: those of image 1.
+        H, K0, K1: as of `poses_from_homography`.
 
     Returns:
         R with X1 = R X0, and whether there is one; where H or a calibration is singular or not finite, the identity.

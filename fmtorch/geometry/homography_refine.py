@@ -316,13 +316,7 @@ def refine_homography(
 
     Args:
         H: one matrix for each set of matches, or K of them, (*batch, K, 3, 3), of any scale and sign.
-        x0: points of image 0, pixels.
-        x1: their matches in image 1.
-        weight: not negative, 1 by default.
-        mask: False in slots to ignore, whatever they hold; a match that is not finite is ignored too.
-        loss: a name of `robust_losses.LOSSES`.
-        scale: of the loss, in pixels (a number, or one per set).
-        iterations: Levenberg-Marquardt steps.
+        x0, x1, weight, mask, loss, scale, iterations: as of `refine`.
 
     Returns:
         Matrices of unit norm in float64, whose third coordinate of H x0 is positive at most of the weight; one that

@@ -51,13 +51,8 @@ def irls(
     and the values are the same in any case.
 
     Args:
-        x0: points of image 0, pixels.
-        x1: their matches in image 1.
         F0: one matrix for each set of matches, or K of them, (*batch, K, 3, 3).
-        weight: not negative, 1 by default.
-        mask: False in slots to ignore; matches that are not finite are ignored too.
-        loss: a name of `robust_losses.LOSSES`.
-        scale: of the loss, in pixels (a number, or one per set).
+        x0, x1, weight, mask, loss, scale: as of `refine`.
         iterations: reweighted fits.
 
     Returns:
@@ -180,14 +175,8 @@ def at_fixed_point(F: Float[Tensor, "9 p k"], step: Callable[[Tensor], Tensor]) 
     ``dF = (I - J)^-1 dG/dtheta dtheta`` (Bai et al., NeurIPS 2019, theorem 1). G maps to the manifold of rank 2 and
     unit norm, so J and dG map to its 7-dimensional tangent space, and dF lies in it. Where the iteration does not
     contract, singular values s of I - J are inverted as ``s / (s^2 + CONTRACTION_GAP^2)``, which bounds the gradient.
-
-    Args:
-        F: k models for each of p pairs, entries row by row, on no graph; of rank 2. One that is zero or not finite has
-            a gradient of zero.
-        step: one iteration of all models, each for itself; a model that it leaves as it is has a gradient of zero.
-
-    Returns:
-        The same values.
+    F: on no graph; of rank 2. One that is zero or not finite has a gradient of zero, and so has one that `step`, one
+    iteration of all models, each for itself, leaves as it is. Returns the same values.
     """
     valid = torch.isfinite(F).all(0) & (F != 0).any(0)
     fixed = unit(torch.where(valid, F, constant(F, RANK_TWO)))

@@ -53,8 +53,7 @@ def colmap(
 
     Args:
         threshold: pixels, Sampson distance; of homographies the distance in image 1.
-        confidence: of having drawn a sample without an outlier, at which the search ends.
-        iterations: samples at most.
+        confidence, iterations: as of `opencv`.
         min_iterations: samples at least, though not more than at most.
         two_view: choose between E, F and H as COLMAP's verification does, from 15 inliers on, with unknown focal
             lengths where they are asked for and it finds them. False: LO-RANSAC of E or F alone.

@@ -104,8 +104,7 @@ def magsac_cpp(
 
     Args:
         threshold: pixels, the largest noise scale.
-        confidence: of having drawn a sample without an outlier, at which the search ends.
-        iterations: samples at most.
+        confidence, iterations: as of `opencv`.
         sampler: one of `SAMPLERS`.
 
     Raises:
@@ -140,8 +139,7 @@ def gc_ransac_cpp(
 
     Args:
         threshold: pixels, Sampson distance.
-        confidence: of having drawn a sample without an outlier, at which the search ends.
-        iterations: samples at most.
+        confidence, iterations: as of `opencv`.
         sampler: one of `SAMPLERS`.
         coherence: weight of the spatial term.
 
@@ -170,8 +168,7 @@ def degensac_cpp(
 
     Args:
         threshold: pixels, Sampson distance.
-        confidence: of having drawn a sample without an outlier, at which the search ends.
-        iterations: samples at most.
+        confidence, iterations: as of `opencv`.
 
     Raises:
         ImportError: where `pydegensac` is not installed.
@@ -202,8 +199,7 @@ def superansac_cpp(
 
     Args:
         threshold: pixels.
-        confidence: of having drawn a sample without an outlier, at which the search ends.
-        iterations: samples at most.
+        confidence, iterations: as of `opencv`.
         sampler: one of `SUPERANSAC_SAMPLERS`.
         score: one of `SUPERANSAC_SCORES`.
 
@@ -260,8 +256,7 @@ def poselib(
 
     Args:
         threshold: pixels, Sampson distance.
-        confidence: of having drawn a sample without an outlier, at which the search ends.
-        iterations: samples at most.
+        confidence, iterations: as of `opencv`.
         min_iterations: samples at least, though not more than at most.
         prosac: draw samples from the best matches first.
         loss: of the non-linear refinement, one of `LOSSES`; PoseLib's own if not given.
@@ -362,8 +357,7 @@ def fastpose(
 
     Args:
         threshold: pixels; Sampson distance, for homographies the root mean square of both transfer errors.
-        confidence: of having drawn a sample without an outlier, at which the search ends.
-        iterations: samples at most.
+        confidence, iterations: as of `opencv`.
         min_iterations: samples at least, though not more than at most.
         model: fundamental or homography.
         focal: shared or varying: estimate a relative pose with one unknown focal length or two, for square pixels and

@@ -142,12 +142,6 @@ def focal_cost(focal: Array, prior: FocalPrior, out: Array) -> Any:
 
 
 @kernel(holds_gil=True)
-def prior_slopes(focal: F8x1, prior: FocalPrior, out: F8x1) -> None:
-    """The first and second derivatives of the cost of two log focal lengths (2,) -> out (5,), as `focal_cost`."""
-    focal_cost(focal, prior, out)
-
-
-@kernel(holds_gil=True)
 def draw_depths(prior: FocalPrior, longest: F8x1, mixed_seed: int, key: int, start: int, out: F8x2) -> None:
     """Focal lengths of both images for the draws start, start + 1, ..., in the unit of the points -> out (2, count).
     longest: (2,), the longer sides of the images. mixed_seed: of the seed and the stream."""

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fmtorch.estimators.models.focal_prior import LOG_USUAL, FocalPrior, focal_cost, focal_prior, prior_slopes
+from fmtorch.estimators.models.focal_prior import LOG_USUAL, FocalPrior, focal_cost, focal_prior
 from fmtorch.estimators.pair import EXACT, Pair
 from fmtorch.geometry.arithmetic import exponential, logarithm_kernel
 from fmtorch.geometry.levenberg_marquardt import Weighted, evaluate, minimiser
@@ -103,7 +103,7 @@ def focal_precision(focals: Array, pair: Pair) -> Array:
         focals = np.where(np.isnan(focals), pair.calibration.focals, focals)
     f0, f1 = (focals / (images.longest * pair.pixels_per_unit)).tolist()
     logarithms = np.array([logarithm_kernel(f0), logarithm_kernel(f1)])
-    prior_slopes(logarithms, images.prior, work)
+    focal_cost(logarithms, images.prior, work)
     precision = np.array([[work[2], work[4]], [work[4], 0.0 if images.prior.shared else work[3]]])
     if pair.calibration is not None:
         exact = np.array(pair.calibration.deviations) < EXACT
