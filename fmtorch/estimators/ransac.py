@@ -124,7 +124,10 @@ class Ransac:
         refinement = Refinement(stage(refine, Refine), optimization)
         choice = stage(select, Select)
         self.refine = refinement
-        self.select = _selector(self.score, choice, threshold, refinement)
+        changed = refinement.options is not None or optimization is not None
+        self.select: Selector = BestScore(self.score) if changed else BestOfSearch()
+        if choice is not None:
+            self.select = BestScore(part("score", choice.score, threshold=choice.scale))
         self.focal = _focal_search(stage(focal, Focal), self.select, self.search, refinement, choice)
 
     def _expect_fundamental(self, **options: object) -> None:
@@ -236,14 +239,6 @@ class Ransac:
                 "whether each match is an inlier"
             )
         return inliers
-
-
-def _selector(score: Score, choice: Select | None, threshold: float, refinement: Refinement) -> Selector:
-    """What selects one model of the refined pool."""
-    if choice is not None:
-        return BestScore(part("score", choice.score, threshold=choice.scale))
-    changed = refinement.options is not None or refinement.local_optimization is not None
-    return BestScore(score) if changed else BestOfSearch()
 
 
 def _focal_search(

@@ -70,7 +70,10 @@ def homography(
     depth = lines_through(linear.detach(), a.detach())[2]
     side = stable_sum(torch.where(depth > 0, w, -w).detach(), -1)
     regular = determinant(linear.detach().movedim((-2, -1), (0, 1))).abs() > SINGULAR
-    H = unit_frobenius(matmul3(matmul3(_inverse_similarity(T1), linear), T0))
+    s, zero = T1[..., 0, 0], torch.zeros_like(T1[..., 0, 0])
+    rows = [torch.ones_like(s), zero, -T1[..., 0, 2], zero, torch.ones_like(s), -T1[..., 1, 2], zero, zero, s]
+    back = torch.stack(rows, -1).reshape(T1.shape)  # a multiple of the inverse of [s, 0, tx; 0, s, ty; 0, 0, 1]
+    H = unit_frobenius(matmul3(matmul3(back, linear), T0))
     H = torch.where((side < 0)[..., None, None], -H, H)
     valid = finite & determined & regular
     return torch.where(valid[..., None, None], H, 0.0).to(x0.dtype), valid
@@ -146,13 +149,6 @@ def _normal_matrix(x0: Tensor, x1: Tensor, w: Tensor) -> Float[Tensor, "*batch 9
     S, X, Y, R = (stable_sum(products * by, -1) for by in (torch.ones_like(x), -x, -y, x * x + y * y))
     zero = torch.zeros_like(S)
     return torch.cat([torch.cat(row, -1) for row in ((S, zero, X), (zero, S, Y), (X, Y, R))], -2)
-
-
-def _inverse_similarity(T: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
-    """A multiple of the inverse of [s, 0, tx; 0, s, ty; 0, 0, 1]."""
-    zero, s = torch.zeros_like(T[..., 0, 0]), T[..., 0, 0]
-    rows = [torch.ones_like(s), zero, -T[..., 0, 2], zero, torch.ones_like(s), -T[..., 1, 2], zero, zero, s]
-    return torch.stack(rows, -1).reshape(T.shape)
 
 
 # Homographies of four matches each, compiled: the samples of one pair, LANES at a time, float64, models in float32

@@ -27,7 +27,7 @@ from fmtorch.geometry.levenberg_marquardt import (
 )
 from fmtorch.geometry.matrices import assign, assign_rows, unit_kernel
 from fmtorch.geometry.normalize import NormalizedMatches, RobustSum, fitted_by
-from fmtorch.geometry.rank2_manifold import eliminate
+from fmtorch.geometry.rank2_manifold import damped_system, eliminate
 from fmtorch.geometry.refine import inverse_hessian, jacobian
 from fmtorch.jit.kernel import Array, F8x1, F8x2, F8x3, inner, kernel, matrix, vector
 from fmtorch.jit.lanes import LANES, added, fill, load, store, where
@@ -266,25 +266,13 @@ def _step(state: _State, damping: Array, trial: _State) -> None:
 @inner
 def _stepped(products: Array, h: Array, damping: float, Q: Array, out: Array) -> None:
     """A damped step of h (9,) on the sphere -> out (9,)."""
-    _system(products, h, damping, Q)
+    damped_system(products, h, damping, Q)
     for r in range(9):
         Q[2 * r + 1, 9 - LANES] = -products[r, 9]
     eliminate(Q, 9)
     for i in range(9):
         out[i] = h[i] + Q[2 * i + 1, 9 - LANES]
     unit_kernel(out)
-
-
-@inner
-def _system(products: Array, h: Array, damping: float, Q: Array) -> None:
-    """The damped normal equations of h (9,) -> Q, (9, 10) in two rows of LANES each, without right side."""
-    curvature = 0.0
-    for i in range(9):
-        curvature = max(curvature, products[i, i])
-    for r in range(9):
-        for c in range(9):
-            Q[2 * r + c // LANES, c % LANES] = products[r, c] + curvature * h[r] * h[c]
-        Q[2 * r + r // LANES, r % LANES] += curvature * damping
 
 
 @inner

@@ -95,8 +95,11 @@ def pose_from_fundamental(
     with torch.no_grad():
         ray0, ray1 = (rays(K, torch.where(keep[..., None], x, 0.0)) for K, x in ((inverse0, x0), (inverse1, x1)))
         front = _in_front(R, t, ray0, ray1) & keep
-        count = front.sum(-1)  # (4, *batch)
-        best = (count if weight is None else _support(front, weight)).argmax(0)
+        count = support = front.sum(-1)  # (4, *batch)
+        if weight is not None:  # whole numbers, whose sums are the same in any order
+            counted = torch.where(front.any(0), weight.detach(), 0.0).clamp(0, 1).double()
+            support = torch.where(front, (counted * 2.0**20).round().to(torch.int64), 0).sum(-1)
+        best = support.argmax(0)
     n_in_front = torch.gather(count, 0, best[None])[0]
     valid = regular & (n_in_front > 0)
     R = torch.gather(R, 2, best[None, None, None].expand(3, 3, 1, *best.shape))[:, :, 0].movedim((0, 1), (-2, -1))
@@ -152,12 +155,6 @@ def _in_front(R: Tensor, t: Tensor, ray0: Tensor, ray1: Tensor) -> Tensor:
     depth0 = component_sum(normal * cross(ray1, shift))
     depth1 = component_sum(normal * cross(rotated, shift))
     return (depth0 > 0) & (depth1 > 0)
-
-
-def _support(front: Tensor, weight: Tensor) -> Tensor:
-    """The sum of the weights of points in front, (4, *batch), as whole numbers: the same in any order."""
-    rounded = (torch.where(front.any(0), weight.detach(), 0.0).clamp(0, 1).double() * 2.0**20).round().to(torch.int64)
-    return torch.where(front, rounded, 0).sum(-1)
 
 
 def rays(inverse: Tensor, x: Tensor) -> Tensor:

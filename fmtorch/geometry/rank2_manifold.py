@@ -170,17 +170,26 @@ def steps(
 
 @inner
 def _system(products: Array, F: Array, e0: Array, e1: Array, damping: float, Q: Array) -> None:
-    """The damped normal equations of a model -> Q, (10, 11) in two rows of LANES each, without right side."""
+    """The damped normal equations of a model, with the constraint -> Q, (10, 11) in two rows of LANES each, without
+    right side."""
+    damped_system(products, F, damping, Q)
+    for r in range(9):
+        normal = e1[r // 3] * e0[r % 3]
+        Q[2 * r + 1, 9 - LANES], Q[18 + r // LANES, r % LANES] = normal, normal
+    Q[19, 9 - LANES] = 0.0
+
+
+@inner
+def damped_system(products: Array, x: Array, damping: float, Q: Array) -> None:
+    """The damped normal equations of nine entries x (9,), to whose scale the residual is blind -> the first nine rows
+    of Q, in two rows of LANES each, without right side."""
     curvature = 0.0
     for i in range(9):
         curvature = max(curvature, products[i, i])
     for r in range(9):
         for c in range(9):
-            Q[2 * r + c // LANES, c % LANES] = products[r, c] + curvature * F[r] * F[c]
+            Q[2 * r + c // LANES, c % LANES] = products[r, c] + curvature * x[r] * x[c]
         Q[2 * r + r // LANES, r % LANES] += curvature * damping
-        normal = e1[r // 3] * e0[r % 3]
-        Q[2 * r + 1, 9 - LANES], Q[18 + r // LANES, r % LANES] = normal, normal
-    Q[19, 9 - LANES] = 0.0
 
 
 @inner

@@ -79,16 +79,10 @@ def correspondences(
     """
     cameras = camera_fields(K0, K1, focal, fields.get("size0") is not None)
     c = _batch(x0, x1, {**fields, **cameras, **lens_fields(lens)})
-    expect_plausible(c, plane)
-    return c
-
-
-def expect_plausible(c: Correspondences, plane: bool = False) -> None:
-    """Raise ValueError naming the first value that cannot be, or where points contradict their unit, K or size.
-    plane: x0 may be in the unit of a plane."""
     _expect_calibrations(c)
     expect_values(c, ratio=RATIO)
     _expect_pixels(c, plane)
+    return c
 
 
 def _batch(x0: Arrays, x1: Arrays, fields: Mapping[str, Any]) -> Correspondences:

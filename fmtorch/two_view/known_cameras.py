@@ -150,14 +150,11 @@ def _square(c: Correspondences, images: Images) -> Correspondences:
         fields["mask"] = mask = c.mask & x.isfinite().all(-1).all(1) & valid[:, None]
         fields["x0"], fields["x1"] = mapped(torch.where(mask[:, None, :, None], x, 0), images.map).unbind(1)
         for i, lafs in enumerate((c.lafs0, c.lafs1)):
-            fields[f"lafs{i}"] = None if lafs is None else _mapped_frames(lafs, images.map[:, i])
+            if lafs is not None:
+                A = images.map[:, i, None, :2]
+                columns = (A[..., 0, None] * lafs[..., :1, :] + A[..., 1, None] * lafs[..., 1:, :]).unbind(-1)
+                fields[f"lafs{i}"] = torch.stack([*columns[:2], columns[2] + A[..., 2]], -1).to(lafs.dtype)
     return c.derived(**fields)
-
-
-def _mapped_frames(lafs: Tensor, A: Tensor) -> Tensor:
-    """Local affine frames (B, N, 2, 3) by affine maps (B, 3, 3)."""
-    columns = (A[:, None, :2, 0, None] * lafs[..., :1, :] + A[:, None, :2, 1, None] * lafs[..., 1:, :]).unbind(-1)
-    return torch.stack([*columns[:2], columns[2] + A[:, None, :2, 2]], -1).to(lafs.dtype)
 
 
 def _with_cameras(estimate: Estimate, square: Correspondences, images: Images, covariance: bool) -> Estimate:

@@ -27,7 +27,9 @@ def homographies(c: Correspondences, find: Callable[[Correspondences], Estimate]
     estimate = find(seen)
     rows = (2 * estimate.inliers.sum(1) <= seen.count()).nonzero()[:, 0]
     if len(rows):
-        estimate = _better(estimate, find(_mirrored(seen[rows])), rows)
+        part, up = seen[rows], seen.x0.new_tensor([1.0, -1.0])  # with y of image 0 turned over
+        lafs = None if part.lafs0 is None else part.lafs0 * up.to(part.lafs0)[:, None]
+        estimate = _better(estimate, find(part.derived(x0=part.x0 * up, lafs0=lafs)), rows)
     estimate = _beyond_chance(estimate, c)
     if not bool(changed.any()):
         return estimate
@@ -62,12 +64,6 @@ def _moved(c: Correspondences, scale: Tensor, middle: Tensor) -> Correspondences
         shift = torch.stack([torch.zeros_like(middle), torch.zeros_like(middle), middle], -1)
         lafs = ((lafs - shift[:, None]) * scale[:, None, None, None]).to(lafs)
     return c.derived(x0=x0, lafs0=lafs)
-
-
-def _mirrored(c: Correspondences) -> Correspondences:
-    """The matches with y of image 0 turned over."""
-    up = c.x0.new_tensor([1.0, -1.0])
-    return c.derived(x0=c.x0 * up, lafs0=None if c.lafs0 is None else c.lafs0 * up.to(c.lafs0)[:, None])
 
 
 def _better(estimate: Estimate, mirrored: Estimate, rows: Tensor) -> Estimate:
