@@ -14,8 +14,6 @@ from fmtorch.geometry.eight_point import weighted_eight_point
 from fmtorch.jit.kernel import Array, B1x1, F8x1, F8x2, I4x1, I4x2, I8x1, I8x2, inner, kernel, matrix, vector
 from fmtorch.jit.random import Stream, random_bits, stream_state
 
-# Which matches are a model's inliers, given that neighbours tend to be alike: the labelling of Graph-Cut RANSAC
-
 WINDOW = 8  # candidates for neighbours before and after each match along each curve
 SHIFTS = (0.0, 0.5)  # of the grid of each curve; the two find 97 % of the edges within 20 px of real pairs
 MAX_NEIGHBOURS = 32  # of a match: WINDOW on each side of it along each of two curves

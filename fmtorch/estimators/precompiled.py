@@ -17,8 +17,8 @@ WITH_FOCALS: tuple[Kernel[..., Any], ...] = (
     # Solvers, samples and scores
     five_point.five_point, seven_point_kernel, counted_chances, refinement.near, sampling.draw,
     focal_prior.draw_depths, preselection.draw_by_prior, preselection.best, scores.score_gains, scores.score_saturated,
-    pair.normalize_pair, pair.to_pixels, preselection.support, inliers.residuals_squared, inliers.share_within,
-    search.merge, scores.saturated_cells, scores.pack, sampling.quantise, focal_search.posteriors,
+    pair.normalize_pair, pair.to_pixels, preselection.support, inliers.residuals_squared,
+    search.merge, scores.saturated_cells, scores.pack,
     focal_search.distinct_models, focal_search.same_model,
     # Cameras and fits; `evaluate` is called by `minimise` and `refine`
     posterior.centre, posterior.translate, with_focals.gain_without_prior, with_focals.refine_with_prior,

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import numpy as np
 
 from fmtorch.estimators.pair import Pair
-from fmtorch.jit.kernel import Array, F8x1, I8x1, I8x2, inner, kernel
+from fmtorch.jit.kernel import Array, I8x1, I8x2, inner, kernel
 from fmtorch.jit.random import Stream, random_bits, stream_state
 
 TOTAL_BITS = 30  # cumulative weights stay below 2^30, so that 32 random bits times a total fit an int64
@@ -134,9 +134,9 @@ def _drawn(
 
 def _quantised(pair: Pair) -> tuple[Array, Array]:
     """Weights and cumulative weights."""
-    weight, table = np.empty(pair.count, np.int64), np.empty(pair.count, np.int64)
-    quantise(pair.match_weight, 1.0 if pair.prior is None else largest_weight(pair.bucket), weight, table)
-    return weight, table
+    largest = 1.0 if pair.prior is None else largest_weight(pair.bucket)
+    weight = np.maximum(np.rint(pair.match_weight * largest).astype(np.int64), 1)
+    return weight, np.cumsum(weight)
 
 
 def _best_first(pair: Pair) -> Array:
@@ -210,16 +210,6 @@ def _guide(table: Array) -> Array:
             index += 1
         guide[entry] = index
     return guide
-
-
-@kernel(holds_gil=True)
-def quantise(prior: F8x1, largest: float, weight: I8x1, table: I8x1) -> None:
-    """Priors (n,) as weights from 1 up to the largest -> weight (n,), and these cumulated -> table (n,)."""
-    total = np.int64(0)
-    for i in range(len(prior)):
-        weight[i] = max(np.int64(np.rint(prior[i] * largest)), np.int64(1))
-        total += weight[i]
-        table[i] = total
 
 
 @kernel

@@ -18,8 +18,6 @@ from fmtorch.geometry.robust_losses import GAIN_TABLE
 from fmtorch.jit.kernel import Array, F4x1, F4x2, F8x1, F8x2, I4x2, I8x1, Kernel, inner, kernel
 from fmtorch.jit.lanes import added, sqrt, store, where
 
-# The matches of a pair as scores take them: in rows of float32 numbers, with the scale and the weight of each
-
 
 def fractional_bits(count: int) -> int:
     """Of so many float32 numbers in [0, 1], for their sums to be exact: 10, fewer beyond 2^14 numbers."""
@@ -371,8 +369,6 @@ def saturated_cells(table: F8x2, weighted: bool, out: I4x2) -> None:
 score_saturated = score_saturated_of(SAMPSON)
 score_saturated_homography = score_saturated_of(HOMOGRAPHY)
 
-
-# LMedS: the median residual as a score
 
 BIN_SHIFT, BINS = 21, 1 << 10  # of a float32 the exponent and two bits more
 

@@ -18,8 +18,6 @@ from torch import Tensor
 
 from fmtorch.jit.kernel import Array, inner
 
-# exp and log by arithmetic alone, compiled: the same operations, hence the same bits, as in the tensor form
-
 ROOT2, LOG2, LOG10 = math.sqrt(2), 0.6931471805599453, 2.302585092994046
 
 

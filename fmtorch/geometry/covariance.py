@@ -31,8 +31,6 @@ from fmtorch.geometry.arithmetic import cofactors, component_sum, determinant, s
 from fmtorch.geometry.epipolar import inverse_root
 from fmtorch.geometry.matrices import complement
 
-# Information of matches about a two-view estimate, and their noise; see `two_view_covariance`
-
 PARAMETERS = 7
 WINDOW = 2.5  # noises within which distances are taken to be those of right matches
 WINDOW_SHARE = 0.911256360935392  # `kept_share` of WINDOW

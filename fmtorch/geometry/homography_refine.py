@@ -32,8 +32,6 @@ from fmtorch.geometry.refine import inverse_hessian, jacobian
 from fmtorch.jit.kernel import Array, F8x1, F8x2, F8x3, inner, kernel, matrix, vector
 from fmtorch.jit.lanes import LANES, added, fill, load, store, where
 
-# The Sampson error of homographies in tensors, and its gradient with a graph to points and weights
-
 
 class HomographyError(NamedTuple):
     """Of models and matches that broadcast to *s; see `homography_objective_kernels`.

@@ -199,9 +199,6 @@ def at_fixed_point(F: Float[Tensor, "9 p k"], step: Callable[[Tensor], Tensor]) 
     return F + torch.where(valid, moved, 0.0)  # keeps the gradient of what is not finite out
 
 
-# `irls` for the matches of one pair, compiled; float64
-
-
 @kernel
 def reweighted_kernel(F: F8x2, weighted: Weighted) -> None:
     """`irls.reweighted` of models (k, 9), in place."""

@@ -18,8 +18,6 @@ from fmtorch.geometry.robust_losses import LOSS_TABLE, LOSSES
 from fmtorch.jit.kernel import Array, F8x1, F8x2, F8x3, inner, kernel, matrix
 from fmtorch.jit.lanes import LANES, added, fill, load, sqrt, store, where
 
-# `sampson_objective` for models on the matches of one pair, compiled; float64, LANES matches at a time
-
 TINY = 1e-30  # as in `residuals`
 LOSS_CODES = {name: code for code, name in enumerate(LOSSES)}
 HUBER, CAUCHY, GEMAN_MCCLURE, TRUNCATED, MAGSAC = LOSS_CODES.values()

@@ -16,8 +16,6 @@ from fmtorch.geometry.rotation import Cameras, fit_rotation
 from fmtorch.jit.batches import for_each_pair
 from fmtorch.jit.kernel import Array, B1x1, F8x1, F8x2, inner, kernel, matrix, vector
 
-# Evidence for the kinds of an image pair, compiled; see `pair_type`. Matches are those of one pair, in pixels
-
 FREEDOM = 3.0  # degrees, of Student's law: keypoints err by more than the normal one says
 PEAK = 0.36755259694786135  # of that law: 2 / (pi sqrt(3))
 START, COARSEST = 1 / 1500, 1 / 300  # noise that is tried first, and the largest, of the side of an image

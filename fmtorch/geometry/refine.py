@@ -22,8 +22,6 @@ from fmtorch.geometry.normalize import NormalizedMatches, RobustSum, fitted_by
 from fmtorch.geometry.rank2_manifold import RANK_TWO, RANK_TWO_EPIPOLE, SQUARINGS, constant, start_one, steps
 from fmtorch.jit.kernel import Array, F8x1, F8x2, inner, kernel, matrix, vector
 
-# Levenberg-Marquardt of the robust Sampson error on the manifold of rank 2 and unit norm, for the models of a pair
-
 
 class _State(NamedTuple):
     """Models of rank 2 (k, 9), their epipoles (k, 3), and the normal equations (k, 10, 10) and costs (k,) there."""

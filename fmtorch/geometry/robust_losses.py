@@ -17,8 +17,6 @@ from torch import Tensor
 from fmtorch.geometry.arithmetic import logarithm_1p, sqrt
 from fmtorch.jit.kernel import Array
 
-# MAGSAC++: residuals judged by all noise scales at once (Barath et al., CVPR 2020, section 3): its loss in tables
-
 QUANTILE = 3.64
 ENTRIES = 2048  # intervals of u in [0, 1] between which the tabulated weight is linear: off by at most 3e-5
 TERMS = 40  # of series in x up to QUANTILE^2 / 2: what is left out is below a rounding error

@@ -15,9 +15,6 @@ from fmtorch.geometry.pose import consistently_oriented
 from fmtorch.jit.kernel import Array, B1x2, F4x2, F8x2, F8x3, I8x1, I8x2, inner, kernel, matrix, vector
 from fmtorch.jit.lanes import LANES, absolute, load, store
 
-# The seven-point algorithm on the samples of one pair, compiled; float64, LANES samples at a time, models in
-# float32
-
 HALF = 0.5**0.5
 
 

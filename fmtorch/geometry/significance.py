@@ -22,8 +22,6 @@ from fmtorch.jit.batches import for_each_pair
 from fmtorch.jit.kernel import Array, B1x1, F8x1, F8x2, inner, kernel, matrix, vector
 from fmtorch.jobs.execution import one_thread
 
-# `significance` for the matches of one pair, in float64
-
 SAMPLE = 7  # matches that determine a model
 PLANE_SAMPLE = 4  # of a homography
 LOG_PLANE_MODELS = math.log(2.0)  # of both orientations
@@ -273,9 +271,6 @@ def _log_factorials(count: int) -> Array:
     For few counts, so that it is seldom made."""
     logarithms = logarithm(torch.arange(1, count, dtype=torch.float64))
     return np.concatenate([np.zeros(1), np.cumsum(logarithms.numpy())])
-
-
-# Whether two images show one scene: the significance of an estimate, the same for every estimator
 
 
 def judged(estimate: Estimate, c: Correspondences) -> Estimate:

@@ -20,8 +20,6 @@ from fmtorch.geometry.rank2_manifold import SQUARINGS, eliminate, start_one
 from fmtorch.jit.kernel import Array, F8x1, F8x2, F8x3, F8x4, inner, kernel, matrix, vector
 from fmtorch.jit.lanes import LANES, fill, load, store
 
-# Two cameras of square pixels and central principal points: fundamental matrices by their parameters
-
 MIN_IMAGE_SIDE_PX = 16.0  # longer side of both images below which sizes are taken for those of another unit than pixels
 MIN_FOCAL, MAX_FOCAL = 0.25, 5.0  # focal lengths outside, in units of the longer side, are not believed at the start
 
@@ -62,12 +60,8 @@ class Images(NamedTuple):
 def images_of(pair: Pair) -> Images:
     """The images of a pair whose sizes are known, computed once."""
     images: Images | None = pair.images.get("images")
-    if images is None:
-        images = pair.images["images"] = _images(pair)
-    return images
-
-
-def _images(pair: Pair) -> Images:
+    if images is not None:
+        return images
     unit, (h0, w0, h1, w1) = pair.pixels_per_unit, pair.sizes.tolist()
     sides = w0, h0, w1, h1
     # Half a pixel, of images in pixels; of sizes in another unit nobody knows what it is, and it is small.
@@ -77,7 +71,9 @@ def _images(pair: Pair) -> Images:
     if (known := pair.calibration) is not None:
         measured = known.logarithms((max(h0, w0), max(h1, w1)))
         prior = focal_prior(pair.same_size, known.shared, measured, known.deviations)
-    return Images(offset, np.array([max(h0, w0) / unit, max(h1, w1) / unit]), prior)
+    images = Images(offset, np.array([max(h0, w0) / unit, max(h1, w1) / unit]), prior)
+    pair.images["images"] = images
+    return images
 
 
 def focals_px(cameras: Cameras, pair: Pair) -> Array:
@@ -122,13 +118,13 @@ class CentredMatches(NamedTuple):
 
 def centred(pair: Pair, scale_px: float = 1.0) -> CentredMatches:
     """The matches of a pair whose image sizes are known, computed once. scale_px: of the loss."""
-    return pair.cached(("centred", scale_px), lambda pair: _centred(pair, scale_px))
 
+    def compute(pair: Pair) -> CentredMatches:
+        out = np.empty((6, pair.count))
+        centre(pair.table, images_of(pair).offset, scale_px, out)
+        return CentredMatches(out[:4], out[4], out[5])
 
-def _centred(pair: Pair, scale_px: float) -> CentredMatches:
-    out = np.empty((6, pair.count))
-    centre(pair.table, images_of(pair).offset, scale_px, out)
-    return CentredMatches(out[:4], out[4], out[5])
+    return pair.cached(("centred", scale_px), compute)
 
 
 @kernel(holds_gil=True)
