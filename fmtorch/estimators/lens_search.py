@@ -62,24 +62,18 @@ def half_diagonals(pair: Pair) -> Array:
 
 def undistorted(pair: Pair, lens: Array) -> Pair:
     """The pair of pinholes whose lenses (2,) are these; a match's noise grows as its points are stretched."""
-    table = np.empty_like(pair.table)
-    undistort(pair.table, images_of(pair).offset, lens, half_diagonals(pair), table)
+    table, offset, diagonal = pair.table.copy(), images_of(pair).offset, half_diagonals(pair)
+    stretch = np.zeros(pair.count)
+    for k in range(2):
+        x, y = table[2 * k] + offset[2 * k], table[2 * k + 1] + offset[2 * k + 1]
+        bent = lens[k] * (x * x + y * y) / (diagonal[k] * diagonal[k])
+        depth = np.maximum(1 + bent, MIN_DEPTH)
+        table[2 * k], table[2 * k + 1] = x / depth - offset[2 * k], y / depth - offset[2 * k + 1]
+        stretch += abs(1 - bent) / (depth * depth * depth) / 2
+    table[4] /= stretch
+    table[5] /= np.sqrt(stretch)
+    table[7] *= np.sqrt(stretch)
     return pair.with_table(table, (pair.known[0], True, pair.known[2]), None)
-
-
-@kernel(holds_gil=True)
-def undistort(table: F8x2, offset: F8x1, lens: F8x1, diagonal: F8x1, out: F8x2) -> None:
-    """The rows of `Pair` (9, n) of photographs as those of pinholes -> out (9, n)."""
-    for i in range(table.shape[1]):
-        stretch = 0.0
-        for k in range(2):
-            x, y = table[2 * k, i] + offset[2 * k], table[2 * k + 1, i] + offset[2 * k + 1]
-            bent = lens[k] * (x * x + y * y) / (diagonal[k] * diagonal[k])
-            depth = max(1 + bent, MIN_DEPTH)
-            out[2 * k, i], out[2 * k + 1, i] = x / depth - offset[2 * k], y / depth - offset[2 * k + 1]
-            stretch += abs(1 - bent) / (depth * depth * depth) / 2
-        out[4, i], out[5, i] = table[4, i] / stretch, table[5, i] / math.sqrt(stretch)
-        out[6, i], out[7, i], out[8, i] = table[6, i], table[7, i] * math.sqrt(stretch), table[8, i]
 
 
 class _State(NamedTuple):

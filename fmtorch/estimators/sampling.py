@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -76,9 +75,11 @@ class Prosac(Uniform):
 
     def growth(self, count: int, size: int) -> Array:
         """T'_n for n = 1 .. N: the last draw whose sample comes from the first n matches (equation 4), (n,) int64."""
-        table = np.empty(count, np.int64)
-        prosac_table(size, self.GROWTH, table)
-        return table
+        n, expected = np.arange(1, count + 1), np.full(count, float(self.GROWTH))
+        for i in range(size):  # equation 3
+            expected = expected * (np.maximum(n - i, 0) / max(count - i, 1))
+        steps = np.ceil(np.diff(expected, prepend=0.0)).astype(np.int64)
+        return np.cumsum(np.where(n > size, steps, n == size))
 
 
 class PriorWeighted:
@@ -210,21 +211,3 @@ def _guide(table: Array) -> Array:
             index += 1
         guide[entry] = index
     return guide
-
-
-@kernel
-def prosac_table(size: int, growth: int, out: I8x1) -> None:
-    """T'_n for n = 1 .. N -> out (N,): the last draw whose sample of `size` comes from the first n matches.
-    growth: T_N. Chum & Matas (CVPR 2005), equations 3 and 4."""
-    total, before = len(out), 0.0
-    draws: Any = 0
-    for n in range(1, total + 1):
-        expected = float(growth)
-        for i in range(size):
-            expected *= max(n - i, 0) / max(total - i, 1)
-        if n == size:
-            draws = 1
-        elif n > size:
-            draws += np.int64(math.ceil(expected - before))
-        out[n - 1] = draws
-        before = expected
