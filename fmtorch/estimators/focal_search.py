@@ -15,7 +15,7 @@ from fmtorch.estimators.pair import Pair
 from fmtorch.estimators.refinement import Candidates, Refinement, Selection, scores_of
 from fmtorch.estimators.scores import Score
 from fmtorch.estimators.search import Search, Stop
-from fmtorch.jit.kernel import Array, F8x1, F8x2, kernel
+from fmtorch.jit.kernel import Array, B1x1, F8x1, F8x2, kernel
 
 # Share of the best gain without prior that gain minus prior cost must reach; chosen on castle-P19, fox, crops of them.
 MIN_GAIN_SHARE = 0.85
@@ -111,10 +111,9 @@ class FocalSearch:
     def refined(self, F: Array, valid: Array, pair: Pair, near: Pair) -> PlausibleCandidates:
         """Candidates near models (k, 9), refined on some matches and judged on all."""
         cameras, refined = self.family.refine(F, near, self.options.iterations)
-        exact = pair.calibration is not None and pair.calibration.exact
+        posterior, exact = np.empty(len(F)), pair.calibration is not None and pair.calibration.exact
         gain = self.exact_gain if exact and self.exact_gain is not None else self.gain
-        posterior = scores_of(gain, refined.models, pair) * refined.share - refined.cost
-        posterior = np.where(valid & ~np.isnan(posterior), posterior, -np.inf)
+        posteriors(scores_of(gain, refined.models, pair), refined.share, refined.cost, valid, posterior)
         return PlausibleCandidates(refined.models, posterior, cameras)
 
     def select(self, free: Candidates, pair: Pair, plausible: PlausibleCandidates | None) -> Selection:
@@ -137,6 +136,14 @@ class FocalSearch:
         if not (believed or (known and candidates.valid)):
             return selection
         return selection._replace(F=candidates.F[candidates.best], cameras=candidates.cameras.of(candidates.best))
+
+
+@kernel(holds_gil=True)
+def posteriors(gain: F8x1, share: F8x1, cost: F8x1, valid: B1x1, out: F8x1) -> None:
+    """Gain times share in front of the cameras minus cost of the prior -> out (k,), minus infinity of none."""
+    for k in range(len(out)):
+        posterior = gain[k] * share[k] - cost[k]
+        out[k] = posterior if valid[k] and not math.isnan(posterior) else -math.inf
 
 
 @kernel(holds_gil=True)

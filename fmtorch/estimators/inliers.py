@@ -12,7 +12,7 @@ from fmtorch.estimators.pair import Pair, squared
 from fmtorch.estimators.sampling import Sampler
 from fmtorch.geometry.arithmetic import logarithm_1p_kernel
 from fmtorch.geometry.epipolar import HOMOGRAPHY, SAMPSON, Residual
-from fmtorch.jit.kernel import Array, F8x1, F8x2, Kernel, kernel
+from fmtorch.jit.kernel import Array, F8x1, F8x2, I8x1, Kernel, kernel
 
 
 @runtime_checkable
@@ -75,8 +75,8 @@ class StoppingRule:
     def __call__(self, F: Array, draws: int, pair: Pair, size: int) -> bool:
         """Whether the best model (9,), after so many draws of `size` matches, may be taken for the best there is."""
         weight = np.ones(pair.count, np.int64) if self.weight is None else self.weight(pair)
-        within = residuals_squared_px(F.astype(np.float64), pair) <= squared(self.threshold)
-        all_inliers = share = float(weight[within].sum() / weight.sum())
+        share = share_within(residuals_squared_px(F.astype(np.float64), pair), squared(self.threshold), weight)
+        all_inliers = share
         for _ in range(size - 1):  # a power would not have the same last bits everywhere
             all_inliers *= share
         missed: float = logarithm_1p_kernel(-min(all_inliers, 1 - 1e-12)) * draws
@@ -112,6 +112,16 @@ def residuals_squared_of(residual: Residual) -> Kernel[..., None]:
             out[i] = of_match(f, x0[i], y0[i], x1[i], y1[i]) * factor
 
     return residuals_squared
+
+
+@kernel(holds_gil=True)
+def share_within(r2: F8x1, limit: float, weight: I8x1) -> float:
+    """The share of the matches' weights (n,) of those whose squared residuals (n,) are within a limit."""
+    total, within = np.int64(0), np.int64(0)
+    for i in range(len(weight)):
+        total += weight[i]
+        within += weight[i] if r2[i] <= limit else 0
+    return within / total
 
 
 residuals_squared = residuals_squared_of(SAMPSON)

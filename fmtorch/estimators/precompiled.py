@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from fmtorch.estimators import focal_search, inliers, pair, preselection, refinement, sampling, scores
+from fmtorch.estimators import focal_search, inliers, pair, preselection, refinement, sampling, scores, search
 from fmtorch.estimators.models import focal_prior, fundamental, model, posterior, with_focals
 from fmtorch.geometry import five_point, homography_refine, levenberg_marquardt
 from fmtorch.geometry.homography import four_point
@@ -17,8 +17,8 @@ WITH_FOCALS: tuple[Kernel[..., Any], ...] = (
     # Solvers, samples and scores
     five_point.five_point, seven_point_kernel, counted_chances, refinement.near, sampling.draw,
     focal_prior.draw_depths, preselection.draw_by_prior, preselection.best, scores.score_gains, scores.score_saturated,
-    pair.normalize_pair, pair.to_pixels, inliers.residuals_squared,
-    scores.saturated_cells, scores.pack,
+    pair.normalize_pair, pair.to_pixels, preselection.support, inliers.residuals_squared, inliers.share_within,
+    search.merge, scores.saturated_cells, scores.pack, focal_search.posteriors,
     focal_search.distinct_models, focal_search.same_model,
     # Cameras and fits; `evaluate` is called by `minimise` and `refine`
     posterior.centre, posterior.translate, with_focals.gain_without_prior, with_focals.refine_with_prior,

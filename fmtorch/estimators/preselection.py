@@ -10,7 +10,7 @@ from fmtorch.estimators.options import Preselect
 from fmtorch.estimators.pair import Pair
 from fmtorch.estimators.scores import Score, scored
 from fmtorch.geometry.arithmetic import smallest_but, sort_by
-from fmtorch.jit.kernel import Array, F8x1, I8x1, inner, kernel, vector
+from fmtorch.jit.kernel import Array, B1x1, F8x1, F8x2, I8x1, inner, kernel, vector
 from fmtorch.jit.random import Stream, random_bits, stream_state
 
 LAST_WORD = (1 << 63) - 1
@@ -130,24 +130,54 @@ def degenerate_support(pair: Pair, inliers: Array, minimal: int, rounding: float
     coordinate of 1 is."""
     largest: float = max(map(abs, pair.centre.tolist()))
     rounding *= largest / pair.pixels_per_unit + 1  # in the unit of the points
+    on_line = np.empty(2, np.bool_)
     for first in (min(FIRST_LOOK, pair.count), pair.count):
-        x = pair.points[:, :first][:, inliers[:first]]
-        place = x[0] * DIRECTION[0] + x[1] * DIRECTION[1]
-        different = len(np.unique(place + x[2] * DIRECTION[2] + x[3] * DIRECTION[3]))
-        lines = [image for image in range(2) if _on_line(*x[2 * image : 2 * image + 2], rounding)]
-        if different >= minimal and not lines:
+        different = support(pair.points, inliers[:first], minimal, rounding, on_line)
+        if different >= minimal and not on_line.any():
             return ""
     if different < minimal:
         return f"the best model has {different} different inliers; at least {minimal} are needed"
-    return f"the inliers of the best model lie on one line in {' and '.join(f'image {i}' for i in lines)}"
+    images = " and ".join(f"image {i}" for i in (0, 1) if on_line[i])
+    return f"the inliers of the best model lie on one line in {images}"
 
 
-def _on_line(x: Array, y: Array, rounding: float) -> bool:
+@kernel(holds_gil=True)
+def support(points: F8x2, inliers: B1x1, minimal: int, rounding: float, on_line: B1x1) -> int:
+    """How many different ones the inliers (m,) among the first m points (4, n) are, counted up to `minimal`.
+    on_line: (2,), whether they lie on one line in each image. rounding: of coordinates, in the unit of the points."""
+    index, count = np.empty(len(inliers), np.int64), 0
+    for i in range(len(inliers)):
+        index[count] = i
+        count += inliers[i]
+    places, different = vector(minimal), 0
+    for i in range(count):
+        if different == minimal:
+            break
+        k, place = index[i], 0.0
+        place = points[0, k] * DIRECTION[0] + points[1, k] * DIRECTION[1]
+        place = place + points[2, k] * DIRECTION[2] + points[3, k] * DIRECTION[3]
+        new = True
+        for j in range(different):
+            new = new and places[j] != place
+        if new:
+            places[different] = place
+            different += 1
+    on_line[0] = count > 0 and _on_line(points[0], points[1], index, count, rounding)
+    on_line[1] = count > 0 and _on_line(points[2], points[3], index, count, rounding)
+    return different
+
+
+@inner
+def _on_line(x: Array, y: Array, index: Array, count: int, rounding: float) -> bool:
     """Whether points lie on one line, up to rounding: that through the first one and the one farthest from it."""
-    if not len(x):
-        return False
-    dx, dy = x - x[0], y - y[0]
-    squared = dx * dx + dy * dy
-    farthest = squared.argmax()
-    across, extent = abs(dx * dy[farthest] - dy * dx[farthest]).max(), math.sqrt(squared[farthest])
-    return bool(across <= max(ROUNDINGS * rounding, EXTENT_ROUNDING * extent) * extent)
+    ux, uy, longest, across = 0.0, 0.0, -1.0, 0.0
+    for i in range(count):
+        dx, dy = x[index[i]] - x[index[0]], y[index[i]] - y[index[0]]
+        squared = dx * dx + dy * dy
+        if squared > longest:
+            ux, uy, longest = dx, dy, squared
+    for i in range(count):
+        dx, dy = x[index[i]] - x[index[0]], y[index[i]] - y[index[0]]
+        across = max(across, abs(dx * uy - dy * ux))
+    extent = math.sqrt(longest)
+    return across <= max(ROUNDINGS * rounding, EXTENT_ROUNDING * extent) * extent

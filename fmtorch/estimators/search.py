@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -12,7 +13,8 @@ from fmtorch.estimators.models.model import Family, Hypotheses
 from fmtorch.estimators.pair import Pair
 from fmtorch.estimators.preselection import Preselection
 from fmtorch.estimators.sampling import Sampler, drawn
-from fmtorch.jit.kernel import Array
+from fmtorch.geometry.matrices import assign
+from fmtorch.jit.kernel import Array, F4x2, F8x1, I8x1, kernel
 
 Stop = Callable[[Array, int, Pair, int], bool]
 """Whether the best model (9,), after so many draws of samples of this size, may be taken for the best there is."""
@@ -44,14 +46,8 @@ class Pool:
         return np.full(max(self.filled, 1), self.filled > 0)
 
     def merge(self, models: Verified) -> None:
-        """Keep the best of this pool's models and the new ones; the earlier draw wins a tie. A score that is not finite
-        is that of no model."""
-        finite = np.isfinite(models.score)
-        F = np.concatenate([self.F[: self.filled], models.F[models.which[finite]]])
-        score = np.concatenate([self.score[: self.filled], models.score[finite]])
-        best = np.argsort(-score, kind="stable")[: len(self.score)]
-        self.filled = len(best)
-        self.F[: self.filled], self.score[: self.filled] = F[best], score[best]
+        """Keep the best of this pool's models and the new ones; the earlier draw wins a tie."""
+        self.filled = merge(models.F, models.which, models.score, self.filled, self.F, self.score)
 
 
 class Verified(NamedTuple):
@@ -99,3 +95,21 @@ class Search:
             if self.stop(pool.F[0], start, pair, self.family.size):
                 break
         return pool
+
+
+@kernel(holds_gil=True)
+def merge(F: F4x2, which: I8x1, score: F8x1, filled: int, pool: F4x2, pool_score: F8x1) -> int:
+    """Models F[which] (m, 9) with scores (k,) among the best so far -> pool (p, 9); how many there are.
+    filled: places of the pool in use, which are sorted, best first. A score that is not finite is that of no model."""
+    for k in range(len(which)):
+        if not math.isfinite(score[k]) or (filled == len(pool_score) and not score[k] > pool_score[filled - 1]):
+            continue
+        place = min(filled, len(pool_score) - 1)
+        while place > 0 and pool_score[place - 1] < score[k]:
+            pool_score[place] = pool_score[place - 1]
+            assign(pool[place], pool[place - 1])
+            place -= 1
+        pool_score[place] = score[k]
+        assign(pool[place], F[which[k]])
+        filled = min(filled + 1, len(pool_score))
+    return filled

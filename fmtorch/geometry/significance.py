@@ -57,11 +57,13 @@ def counted_chances(F: F8x2, matches: Matches, out: F8x1) -> int:
     chance, place = np.zeros(count), np.zeros(count, np.int64)
     strip0 = _placed(point[0], point[1], matches.size0, place)
     strip1 = _placed(point[2], point[3], matches.size1, place)
-    f = F.ravel() / peak
+    f0, f1, f2 = F[0, 0] / peak, F[0, 1] / peak, F[0, 2] / peak
+    f3, f4, f5 = F[1, 0] / peak, F[1, 1] / peak, F[1, 2] / peak
+    f6, f7, f8 = F[2, 0] / peak, F[2, 1] / peak, F[2, 2] / peak
     for i in range(count):
         u, v, x, y = point[0, i], point[1, i], point[2, i], point[3, i]
-        a1, b1, c1 = f[0] * u + f[1] * v + f[2], f[3] * u + f[4] * v + f[5], f[6] * u + f[7] * v + f[8]
-        a0, b0 = f[0] * x + f[3] * y + f[6], f[1] * x + f[4] * y + f[7]
+        a1, b1, c1 = f0 * u + f1 * v + f2, f3 * u + f4 * v + f5, f6 * u + f7 * v + f8
+        a0, b0 = f0 * x + f3 * y + f6, f1 * x + f4 * y + f7
         e = abs(a1 * x + b1 * y + c1)
         chance[i] = max(_chance(e, a0 * a0 + b0 * b0, strip0), _chance(e, a1 * a1 + b1 * b1, strip1))
     return _median_of_places(chance, place, out)

@@ -21,7 +21,7 @@ from fmtorch.estimators import (
 )
 from fmtorch.estimators.models.model import Hypotheses
 from fmtorch.estimators.preselection import Preselection
-from fmtorch.estimators.search import Pool, Search, Verified
+from fmtorch.estimators.search import Pool, Search, Verified, merge
 from tests.estimators.pairs import named, pair_of
 from tests.laws import scene
 from tests.reference import solvers as reference
@@ -100,13 +100,13 @@ def test_a_pool_is_a_stable_sort_of_all_that_it_was_offered(m: int, k: int, size
     rng = np.random.default_rng(m)
     F, score = rng.normal(size=(m, 9)).astype(np.float32), rng.integers(-20, 20, m) / 8.0
     which = np.sort(rng.permutation(m)[:k])
-    pool = Pool.empty(size)
+    pool, pool_score, filled = np.zeros((size, 9), np.float32), np.full(size, -np.inf), 0
     for part in np.array_split(which, 3):
-        pool.merge(Verified(F, part, score[part]))
+        filled = merge(F, part, score[part], filled, pool, pool_score)
     best = which[np.argsort(-score[which], kind="stable")][:size]
-    assert pool.filled == len(best)
-    np.testing.assert_array_equal(pool.F[: pool.filled], F[best])
-    np.testing.assert_array_equal(pool.score[: pool.filled], score[best])
+    assert filled == len(best)
+    np.testing.assert_array_equal(pool[:filled], F[best])
+    np.testing.assert_array_equal(pool_score[:filled], score[best])
 
 
 @pytest.mark.parametrize("preselect", [None, Preselect(64, 20)])

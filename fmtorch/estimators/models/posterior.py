@@ -293,8 +293,8 @@ def camera_models(axes: Array, focal: Array, longest: Array, shared: bool, F: Ar
                 T[q, 2] = (U[r, 1] * V[c, 0] - U[r, 0] * V[c, 1]) * by
                 T[q, 3], T[q, 4] = U[r, 1] * V[c, 2] * by, -U[r, 0] * V[c, 2] * by
                 T[q, 5], T[q, 6] = F[k, q] if c == 2 else 0.0, F[k, q] if r == 2 else 0.0
-                if shared:
-                    T[q, 5], T[q, 6] = T[q, 5] + T[q, 6], 0.0
+        for q in range(9 if shared else 0):
+            T[q, 5], T[q, 6] = T[q, 5] + T[q, 6], 0.0
 
 
 @inner
