@@ -165,7 +165,7 @@ def linearise(
     """The Sampson residual ``r = e / g`` and its Jacobian: g J (3, 3, p, k, n), then e, 1 / g^2, and r^2.
     ``g dr = x1^T dF x0 - (e / g^2) ((F x0)^T D dF x0 + x1^T dF D F^T x1)`` with ``D = diag(1, 1, 0)``: the sum of two
     products of a column and a row. points: x0, y0, x1, y1. Without derivatives the first is empty."""
-    x0, x1 = (torch.cat([x, torch.ones_like(x[:1])])[:, :, None] for x in points.split(2))
+    x0, x1 = (torch.cat([x, torch.ones_like(x[:1])])[:, :, None] for x in (points[:2], points[2:]))
     rows = F.reshape(3, 3, *F.shape[1:], 1)
     line1 = torch.addcmul(torch.addcmul(rows[:, 2], rows[:, 0], x0[0]), rows[:, 1], x0[1])  # F x0
     line0 = torch.addcmul(torch.addcmul(rows[2, :2], rows[0, :2], x1[0]), rows[1, :2], x1[1])  # F^T x1

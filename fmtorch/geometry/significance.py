@@ -246,8 +246,8 @@ def significance(
     sizes = (None if size is None else size.to(torch.float64) for size in (size0, size1))
     out = torch.empty(len(F), 1, dtype=torch.float64)
 
-    def into(*arrays: Array) -> None:
-        arrays[-1][0] = of_one_pair(*arrays[:-1], model)
+    def into(F: Array, x0: Array, x1: Array, mask: Array, size0: Array, size1: Array, out: Array) -> None:
+        out[0] = of_one_pair(F, x0, x1, mask, size0, size1, model)
 
     return for_each_pair(into, (F, x0, x1, mask, *sizes), out=out, kind=torch.float64)[:, 0]
 

@@ -379,7 +379,7 @@ def take_cameras(state: Any, trial: Any, k: int) -> None:
 
 
 @inner
-def converged(data: Any, before: float, after: float) -> bool:
+def converged(data: Any, before: float, after: float) -> Any:
     """Whether a step that lowers the cost of a candidate so far is its last."""
     return data.limits.tolerance >= 0 and before - after <= data.limits.tolerance
 
