@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, Real
-from numpy.typing import NDArray
 from torch import Tensor
 
 from fmtorch.core.types import PAIR_TYPES
@@ -243,8 +242,6 @@ def _fit_copy(points: Array, noise: Array, plane: Array, s: float, H: Array) -> 
         _distances(H, points, noise, False, r2)
 
 
-_Array = NDArray[Any]
-
 GENERAL, PLANAR, ROTATION, IDENTICAL, UNRELATED = range(len(PAIR_TYPES))
 MIN_EVIDENCE = 80.0  # nats; of the tuning pairs, unrelated ones reach 50 and related ones have 176 or more
 MIN_PARALLAX = 12.0  # nats; of the tuning pairs, planes reach 6, and wide scenes have 70
@@ -326,7 +323,7 @@ def pair_evidence(
     return Evidence(*columns)
 
 
-def _into(x0: _Array, x1: _Array, mask: _Array, prior: _Array, noise: _Array, *known: _Array) -> None:
+def _into(x0: Array, x1: Array, mask: Array, prior: Array, noise: Array, *known: Array) -> None:
     models, size0, size1, precision, out = known
     F, H, K0, K1 = models
     matches = Matches(x0, x1, mask, prior, noise)

@@ -173,7 +173,7 @@ def attached_step(
 
 # Gradients of the least robust Sampson error: those of the optimum
 
-STEP_DAMPING = 1e-10  # of the attached step: bounds its gradient where the points leave a direction open
+STEP_DAMPING = 1e-10  # of a Gauss-Newton step at an optimum: bounds it where the points leave a direction open
 
 
 def gradient_of_cost(F: Float[Tensor, "9 p k"], error: RobustSum) -> Float[Tensor, "9 p k"]:

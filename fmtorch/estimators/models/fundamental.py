@@ -17,11 +17,10 @@ from fmtorch.geometry.homography_refine import refine_homographies, step_of_homo
 from fmtorch.geometry.levenberg_marquardt import Schedule, Weighted
 from fmtorch.geometry.matrices import unit_kernel
 from fmtorch.geometry.rank2_manifold import gauss_newton, response
-from fmtorch.geometry.refine import refine_kernel
+from fmtorch.geometry.refine import STEP_DAMPING, refine_kernel
 from fmtorch.geometry.seven_point import seven_point_kernel
 from fmtorch.jit.kernel import Array, F8x1, F8x2, kernel
 
-STEP_DAMPING = 1e-10  # of a Gauss-Newton step at an optimum: bounds it where the points leave a direction open
 SQUARINGS = 1  # by which models are made rank 2, whose last singular value is but rounding of float32
 
 

@@ -15,6 +15,7 @@ from fmtorch.estimators.pair import Pair, squared
 from fmtorch.geometry.five_point import five_point
 from fmtorch.geometry.levenberg_marquardt import GEMAN_MCCLURE, Weighted
 from fmtorch.geometry.matrices import unit_kernel
+from fmtorch.geometry.refine import STEP_DAMPING
 from fmtorch.jit.kernel import Array, F8x1, F8x2, kernel, matrix, vector
 from fmtorch.jit.lanes import LANES
 from fmtorch.jit.random import Stream
@@ -23,7 +24,6 @@ SOLUTIONS = 10  # of five matches, at most
 INLIER_SIGMA_PX = 0.3  # standard deviation of an inlier's Sampson distance
 LOSS_SCALE_PX = 0.7  # Sampson distance at which an inlier's cost is half of what a squared one would be
 PARALLEL_PX = 4.0  # in image 1: rays that differ less do not tell on which side of the cameras they meet
-STEP_DAMPING = 1e-10  # of a Gauss-Newton step at an optimum: bounds it where the points leave a direction open
 
 
 class Refined(NamedTuple):
