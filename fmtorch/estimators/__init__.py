@@ -8,22 +8,21 @@ if TYPE_CHECKING:
     from fmtorch.estimators.coarse_to_fine import CoarseToFine
     from fmtorch.estimators.degensac import Degensac
     from fmtorch.estimators.external.colmap import colmap
-    from fmtorch.estimators.external.fastpose import fastpose
     from fmtorch.estimators.external.libraries import (
         degensac_cpp,
+        fastpose,
         gc_ransac_cpp,
         kornia_ransac,
         magsac_cpp,
         opencv,
+        poselib,
         superansac_cpp,
     )
     from fmtorch.estimators.external.pairwise import PairwiseEstimator
-    from fmtorch.estimators.external.poselib import poselib
     from fmtorch.estimators.graph_cut import GraphCut
     from fmtorch.estimators.inliers import BetterHalf, InlierRule, RobustDeviations, StoppingRule, WithinThreshold
     from fmtorch.estimators.irls import IterativelyReweighted
-    from fmtorch.estimators.models.fundamental import EightPoint, Fundamental, SevenPoint
-    from fmtorch.estimators.models.homography import Homography
+    from fmtorch.estimators.models.fundamental import EightPoint, Fundamental, Homography, SevenPoint
     from fmtorch.estimators.options import Focal, Preselect, Refine, Select
     from fmtorch.estimators.pair import Pair
     from fmtorch.estimators.ransac import Ransac

@@ -17,9 +17,9 @@ from torch import Tensor
 from fmtorch.core.types import DEVIATION, FOCAL, PROBABILITY, SIZE, Correspondences, Estimate
 from fmtorch.estimators.final_fits import Fit, scale_of
 from fmtorch.estimators.gradients import Attach, Solved, with_gradients
+from fmtorch.estimators.lens_search import undistorted
 from fmtorch.estimators.models.model import Estimated
 from fmtorch.estimators.models.posterior import focal_precision, focals_near, focals_px
-from fmtorch.estimators.models.with_lenses import undistorted
 from fmtorch.estimators.pair import EXACT, Lens, Pair, PixelMatches, bucket, calibration_of, normalize_pair
 from fmtorch.estimators.preselection import degenerate_support
 from fmtorch.geometry.arithmetic import sqrt
@@ -51,25 +51,9 @@ class Solution(NamedTuple):
     lens_suggested: float = math.nan
 
 
-class CameraRows(NamedTuple):
-    """Of b pairs, fields of `Estimate`: focals (b, 2), fit_scale (b,), focal_precision (b, 2, 2)."""
-
-    focals: Array
-    fit_scale: Array
-    focal_precision: Array
-
-    def fill(self, i: int, fit: Fit, pair: Pair) -> None:
-        """Those of one pair whose image sizes are known."""
-        self.focals[i] = focals_near(fit.F, pair) if fit.cameras is None else focals_px(fit.cameras, pair)
-        self.fit_scale[i] = scale_of(fit, pair)
-        self.focal_precision[i] = focal_precision(self.focals[i], pair)
-
-
 class Row(NamedTuple):
     """A pair of a batch that can be tried: its place there, and its matches as they came.
-
-    slot: (n,), where the pair's matches are among these. needed: inliers below which a model is none.
-    """
+    slot: (n,), where the pair's matches are among these. needed: inliers below which a model is none."""
 
     place: int
     matches: PixelMatches
@@ -80,10 +64,8 @@ class Row(NamedTuple):
 
 class Estimation:
     """The estimation of a batch of pairs on the host: the pairs, and the estimates that become of them.
-
     family: of the models. minimal: matches below which a pair is not tried, and inliers below which a model is none.
-    calibrated: the same of a pair whose focal lengths are exactly known; None: cameras make no difference.
-    """
+    calibrated: the same of a pair whose focal lengths are exactly known; None: cameras make no difference."""
 
     def __init__(
         self, c: Correspondences, seed: int, family: Estimated, minimal: int, calibrated: int | None = None
@@ -96,7 +78,8 @@ class Estimation:
         """The rows, shared out among threads."""
         self.F, self.inliers, self.ok = np.zeros((b, 3, 3)), np.zeros((b, n), np.bool_), np.zeros(b, np.bool_)
         self.samples, self.significance, self.reasons = np.zeros(b, np.int64), np.full(b, -np.inf), [""] * b
-        self.cameras = CameraRows(np.full((b, 2), np.nan), np.full(b, np.nan), np.full((b, 2, 2), np.nan))
+        shapes = {"focals": (b, 2), "fit_scale": (b,), "focal_precision": (b, 2, 2)}
+        self.cameras = {name: np.full(shape, np.nan) for name, shape in shapes.items()}
         self.lens, self.lens_suggested = np.full((b, 2), np.nan), np.full(b, np.nan)
         self.assumes_cameras = calibrated is not None
         self.asked_for_cameras = family.model == "fundamental" and c.asks_for_cameras
@@ -129,13 +112,18 @@ class Estimation:
             self.inliers[i, row.slot] = solution.inliers
             fundamental = self.family.model == "fundamental"
             matches = row.matches if solution.lens is None else _straight(row, solution.lens)
-            self.significance[i] = _significance(self.F[i], matches) if fundamental else np.nan
+            given = matches.x0, matches.x1, matches.mask, matches.sizes[:2], matches.sizes[2:]
+            self.significance[i] = of_one_pair(self.F[i], *given) if fundamental else np.nan
             if solution.lens is not None:
                 determined = solution.deviation is None or solution.deviation <= MAX_LENS_DEVIATION
                 self.lens[i] = np.where(determined, solution.lens, np.nan)
             self.lens_suggested[i] = solution.lens_suggested
             if self.asked_for_cameras and pair.sizes_known:
-                self.cameras.fill(i, solution.fit, pair)
+                fit = solution.fit
+                focals = focals_near(fit.F, pair) if fit.cameras is None else focals_px(fit.cameras, pair)
+                known = focals, scale_of(fit, pair), focal_precision(focals, pair)
+                for rows, value in zip(self.cameras.values(), known, strict=True):
+                    rows[i] = value
             if self.graphed:
                 self.solved[i] = Solved(pair, row.slot, solution.fit)
 
@@ -144,7 +132,7 @@ class Estimation:
         arrays = {"F": self.F, "inliers": self.inliers, "ok": self.ok, "samples": self.samples}
         arrays["significance"] = self.significance
         if self.asked_for_cameras:
-            arrays |= self.cameras._asdict()
+            arrays |= self.cameras
         if self.batch.lens is not None:
             arrays["lens"] = self.lens
         elif self.assumes_cameras:
@@ -160,11 +148,6 @@ def _straight(row: Row, lens: Array) -> PixelMatches:
     points = undistorted(pair, lens).points.T * pair.pixels_per_unit + pair.centre
     x0[row.slot], x1[row.slot] = points[:, :2], points[:, 2:]
     return row.matches._replace(x0=x0, x1=x1)
-
-
-def _significance(F: Array, matches: PixelMatches) -> float:
-    """How far the support of a fundamental matrix (3, 3) is beyond chance."""
-    return of_one_pair(F, matches.x0, matches.x1, matches.mask, matches.sizes[:2], matches.sizes[2:])
 
 
 def with_sqrt_prior(c: Correspondences) -> Correspondences:
@@ -191,9 +174,7 @@ def shared_out(c: Correspondences) -> list[Tensor]:
 
 class Batch(NamedTuple):
     """The tensors of a batch on the host as arrays, one row a pair; sizes: (b, 4), h, w, h, w, empty where unknown.
-
-    focal: (b, 2, 2); shared: (b,), whether both focal lengths are one; lens: (b, 2, 2), and one_lens (b,) likewise.
-    """
+    focal: (b, 2, 2); shared: (b,), whether both focal lengths are one; lens: (b, 2, 2), and one_lens (b,) likewise."""
 
     x0: Array
     x1: Array

@@ -80,10 +80,8 @@ def _limit(pair: Pair) -> float:
 @kernel
 def plane_of_sample(F: F8x1, sample: F8x2, triplets: I8x2, limit: float, H: F8x1) -> int:
     """The homography that is compatible with F and has most matches of its sample -> H (9,); how many these are.
-
     sample: (4, 7), points. triplets: (t, 3), of the sample, through each of which one homography goes. limit: of
-    squared transfer distances. Of equals the first is taken; without any H is zero.
-    """
+    squared transfer distances. Of equals the first is taken; without any H is zero."""
     G, Ft, e1 = vector(9), vector(9), vector(3)
     near, largest = np.empty(sample.shape[1], np.bool_), 0
     for i in range(9):
@@ -118,10 +116,8 @@ def fit_plane(H: F8x1, points: F8x2, limit: float, fits: int, inside: B1x1) -> N
 @kernel
 def parallax(H: F8x1, points: F8x2, table: I8x1, stream: I8x1, out: F4x2) -> int:
     """Models of a plane and two matches off it -> out (draws, 9); how many there are.
-
     table: cumulative weights (n,), below 2^31, by which matches are drawn, with replacement. stream: (3,), the mixed
-    seed, the key, and the first of the random numbers, two a draw.
-    """
+    seed, the key, and the first of the random numbers, two a draw."""
     state, total = stream_state(stream[0], stream[1]), np.uint64(table[-1])
     F, pair, models = vector(9), np.empty(2, np.int64), 0
     for draw in range(len(out)):

@@ -16,7 +16,7 @@ from fmtorch.estimators.models.model import FitScale, Loss, Refining, Steps
 from fmtorch.estimators.models.posterior import Cameras, Limits
 from fmtorch.estimators.models.with_focals import FundamentalWithFocals
 from fmtorch.estimators.pair import Pair, squared
-from fmtorch.estimators.selection import Selection
+from fmtorch.estimators.refinement import Selection
 from fmtorch.jit.kernel import Array
 
 MIN_INLIERS_FOR_NOISE = 15  # matches that tell the noise
@@ -29,12 +29,10 @@ FOCAL_TOLERANCE = 0.05  # of the logarithm of the posterior: a fifth of a standa
 
 class Fit(NamedTuple):
     """A fit's value, and what its gradient depends on.
-
     F: (9,), the estimate. at: (9,), the model at which the gradient is taken. counted: (n,), how much each match counts
     there: 1, or 0 beyond a truncated loss. cameras: those assumed at the optimum. precision: one over the variance of
     an inlier's distance, in the unit of the points, where cameras are assumed. s2: (n,), squared scales of Cauchy's
-    loss in that unit, where it is the fit's.
-    """
+    loss in that unit, where it is the fit's."""
 
     F: Array
     at: Array
@@ -47,10 +45,8 @@ class Fit(NamedTuple):
 @runtime_checkable
 class FinalFit(Protocol):
     """Turns the selected model and its inliers into the estimate.
-
     gradient: how gradients reach points, prior and noise: "none", "least_squares" of the matches that count, or
-    "optimum", by the implicit function theorem. weighted: whether these matches count by prior and noise.
-    """
+    "optimum", by the implicit function theorem. weighted: whether these matches count by prior and noise."""
 
     gradient: ClassVar[str]
     weighted: ClassVar[bool]
@@ -72,12 +68,10 @@ class NoFit:
 
 class LeastSquares:
     """Least squares on the inliers, the normalised 8-point algorithm; the hypothesis where they determine none.
-
     Where there is a prior, an inlier counts prior / noise^2, as in the other fits, and gradients reach the prior; where
     there is none, all count alike. On 60 pairs of castle-P19 and fox with the prior of frame consistency, three seeds,
     weights raise AUC@0.05 by 0.9 +- 0.4 (`ransac`), 0.9 +- 0.4 (`msac`) and 1.5 +- 0.6 points (`lmeds`, standard errors
-    over pairs); without the noise by 0.4, 0.6 and 1.0.
-    """
+    over pairs); without the noise by 0.4, 0.6 and 1.0."""
 
     gradient, weighted = "least_squares", True
 

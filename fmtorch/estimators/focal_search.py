@@ -12,10 +12,9 @@ from fmtorch.estimators.models.posterior import Cameras
 from fmtorch.estimators.models.with_focals import FundamentalWithFocals
 from fmtorch.estimators.options import Focal
 from fmtorch.estimators.pair import Pair
-from fmtorch.estimators.refinement import Candidates, Refinement
+from fmtorch.estimators.refinement import Candidates, Refinement, Selection, scores_of
 from fmtorch.estimators.scores import Score
 from fmtorch.estimators.search import Search, Stop
-from fmtorch.estimators.selection import Selection, scores_of
 from fmtorch.jit.kernel import Array, B1x1, F8x1, F8x2, kernel
 
 # Share of the best gain without prior that gain minus prior cost must reach; chosen on castle-P19, fox, crops of them.
@@ -27,9 +26,7 @@ RIVAL_GAIN_SHARE, SAME_MODEL, SAME_CAMERAS = 0.85, 1e-3, 1e-2
 
 class PlausibleCandidates:
     """Models F (k, 9) of greatest posterior nearby, what that is (k,), minus infinity for none, and their cameras.
-
-    best: the candidate of the greatest posterior, the first of several. valid: whether there is one.
-    """
+    best: the candidate of the greatest posterior, the first of several. valid: whether there is one."""
 
     def __init__(self, F: Array, posterior: Array, cameras: Cameras) -> None:
         self.F, self.posterior, self.cameras = F, posterior, cameras
@@ -121,11 +118,9 @@ class FocalSearch:
 
     def select(self, free: Candidates, pair: Pair, plausible: PlausibleCandidates | None) -> Selection:
         """One of the models searched without assumptions, or of plausible cameras near them, or of those before.
-
         Plausible cameras are taken where their gain minus the cost of the prior is nearly the best gain without one;
         they are tried where good models differ, or where some were there before. Where anything is known of the cameras
-        they are tried and taken.
-        """
+        they are tried and taken."""
         known = pair.calibration is not None
         gain = np.where(free.valid, scores_of(self.gain, free.F, pair), -np.inf)
         order = np.argsort(-gain, kind="stable")

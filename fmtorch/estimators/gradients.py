@@ -6,7 +6,8 @@ the same bits whether anybody asks for gradients or not, and gradients are those
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol, runtime_checkable
+from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -15,25 +16,17 @@ from torch import Tensor
 
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.estimators.final_fits import FinalFit, Fit
+from fmtorch.estimators.models import posterior
 from fmtorch.estimators.models.fundamental import response_of
 from fmtorch.estimators.models.model import Refining
-from fmtorch.estimators.models.posterior import (
-    Cameras,
-    Limits,
-    centred,
-    images_of,
-    minimise,
-    no_optimum,
-    tangents_of,
-    translate,
-)
+from fmtorch.estimators.models.posterior import Cameras, Limits, centred, images_of, translate
 from fmtorch.estimators.pair import MAX_NOISE, MIN_NOISE, Pair
 from fmtorch.geometry import canonical, eight_point, unit_frobenius
 from fmtorch.geometry.cameras import PixelFrame
 from fmtorch.geometry.homography_refine import homography_at_optimum
-from fmtorch.geometry.levenberg_marquardt import LOSS_CODES, NO_TABLE, Weighted
+from fmtorch.geometry.levenberg_marquardt import Weighted
+from fmtorch.geometry.normalize import RobustSum
 from fmtorch.geometry.refine import STEP_DAMPING, gradient_of_cost
-from fmtorch.geometry.robust_losses import LOSSES
 from fmtorch.jit.kernel import Array
 from fmtorch.jit.lanes import LANES
 
@@ -48,9 +41,7 @@ class Solved(NamedTuple):
 
 class GraphedMatches(NamedTuple):
     """The usable matches of P pairs in normalised units, attached to the caller's graph, padded to N slots; float64.
-
-    precision: one over the square of the noise. weight: the prior times that.
-    """
+    precision: one over the square of the noise. weight: the prior times that."""
 
     points: Float[Tensor, "4 p n"]
     mask: Bool[Tensor, "p n"]
@@ -69,14 +60,9 @@ class GraphedMatches(NamedTuple):
         return self.points[2:].permute(1, 2, 0)
 
 
-@runtime_checkable
-class Attach(Protocol):
-    """Gives fits their gradients."""
-
-    def __call__(self, solved: list[Solved], matches: GraphedMatches) -> Float[Tensor, "p m"]:
-        """A zero with the gradients of the fits, models (9) of normalised points; perhaps of the logarithms of two
-        focal lengths, too."""
-        ...
+Attach = Callable[[list[Solved], GraphedMatches], Float[Tensor, "p m"]]
+"""A zero with the gradients of fits, models (9) of normalised points; perhaps of the logarithms of two focal lengths,
+too."""
 
 
 class Attached:
@@ -85,27 +71,25 @@ class Attached:
     def __init__(self, final: FinalFit, family: Refining) -> None:
         self.final, self.family = final, family
         own: Attach | None = getattr(final, "attached", None)
-        kinds: dict[str, Attach] = {"least_squares": self._least_squares, "optimum": self._optimum, "none": _none}
-        kind = getattr(final, "gradient", "none")
-        if family.model == "homography" and kind == "least_squares":
-            kind = "optimum"  # of the Sampson error, near that of least squares
-        self._attach = own or kinds[kind]
+        self.kind = getattr(final, "gradient", "none")
+        kinds: dict[str, Attach] = {"least_squares": self._least_squares, "optimum": self._optimum, "none": self._none}
+        if family.model == "homography" and self.kind == "least_squares":
+            own = own or self._optimum  # of the Sampson error, near that of least squares
+        self.attach = own or kinds[self.kind]
 
     @property
     def reached(self) -> tuple[str, ...]:
         """The fields of `Correspondences` that gradients reach; all of a fit that has its own `attached`."""
         if hasattr(self.final, "attached"):
             return ("x0", "x1", "prior", "noise")
-        kind = getattr(self.final, "gradient", "none")
-        if kind == "none":
+        if self.kind == "none":
             return ()
-        if kind == "least_squares" and not self.final.weighted:
+        if self.kind == "least_squares" and not self.final.weighted:
             return ("x0", "x1")
         return ("x0", "x1", "noise", *(("prior",) if self.family.fit_scale.by_prior else ()))
 
-    def __call__(self, solved: list[Solved], matches: GraphedMatches) -> Float[Tensor, "p m"]:
-        """As `Attach`."""
-        return self._attach(solved, matches)
+    def _none(self, solved: list[Solved], matches: GraphedMatches) -> Float[Tensor, "p 9"]:
+        return matches.points.new_zeros(len(solved), 9)
 
     def _least_squares(self, solved: list[Solved], matches: GraphedMatches) -> Float[Tensor, "p 9"]:
         counted = _padded([s.fit.counted for s in solved], matches.mask)
@@ -124,8 +108,8 @@ class Attached:
         weight = torch.where(counted > 0, counted * weight, 0)
         if self.family.model == "homography":
             return _homographies_at_optimum(solved, at, matches, weight)
-        unbounded = torch.full_like(at[:, 0], torch.inf)
-        gradient = gradient_of_cost(at.T[..., None], matches.points, weight, LOSSES["truncated"], unbounded)[..., 0].T
+        error = RobustSum(matches.points, weight, "truncated", torch.full_like(at[:, :1], torch.inf))
+        gradient = gradient_of_cost(at.T[..., None], error)[..., 0].T
         response = torch.from_numpy(np.stack([_response(s) for s in solved])).to(device)
         return (response * (gradient - gradient.detach())[:, None]).sum(-1)
 
@@ -133,13 +117,13 @@ class Attached:
 def _homographies_at_optimum(
     solved: list[Solved], at: Float[Tensor, "p 9"], matches: GraphedMatches, weight: Float[Tensor, "p n"]
 ) -> Float[Tensor, "p 9"]:
-    """As `Attach`, of homographies, by the loss of their fits."""
-    robust, s2 = LOSSES["truncated"], torch.full_like(at[:, :1], torch.inf)
+    """Zeros with the gradients of homographies, by the loss of their fits."""
+    loss, s2 = "truncated", torch.full_like(at[:, :1], torch.inf)
     scales = [s.fit.s2 for s in solved if s.fit.s2 is not None]  # of all fits, or of none
     if scales:
-        robust, s2 = LOSSES["cauchy"], torch.where(matches.mask, _padded(scales, matches.mask), 1)
+        loss, s2 = "cauchy", torch.where(matches.mask, _padded(scales, matches.mask), 1)
     model = torch.nn.functional.normalize(at, dim=1).T[..., None]
-    attached = homography_at_optimum(model, matches.points, weight, robust, s2)[..., 0].T
+    attached = homography_at_optimum(model, RobustSum(matches.points, weight, loss, s2))[..., 0].T
     return attached - attached.detach()
 
 
@@ -157,17 +141,11 @@ def with_gradients(estimate: Estimate, c: Correspondences, solved: dict[int, Sol
     if not solved:
         return estimate.derived(F=estimate.F + _nothing(c).to(estimate.F))
     rows = torch.tensor(list(solved), device=c.mask.device)
-    pairs = [s.pair for s in solved.values()]
     zero = attach(list(solved.values()), graphed_matches(c, solved))
     F = torch.from_numpy(np.stack([s.fit.F for s in solved.values()])).to(zero)
-    centre = torch.from_numpy(np.stack([pair.centre for pair in pairs])).to(zero)
-    unit = torch.tensor([pair.pixels_per_unit for pair in pairs]).to(zero)
-    frame = PixelFrame(centre, unit, torch.ones_like(rows, dtype=torch.bool))
-    models = (F + zero[:, :9]).reshape(-1, 1, 3, 3)
-    if estimate.model == "homography":
-        G = unit_frobenius(frame.homography_to_pixels(models)[:, 0])
-    else:
-        G = canonical(frame.to_pixels(models)[:, 0])
+    homographies = estimate.model == "homography"
+    models = _frame(solved, zero).to_pixels((F + zero[:, :9]).reshape(-1, 1, 3, 3), homographies)[:, 0]
+    G = unit_frobenius(models) if homographies else canonical(models)
     attached = {"F": estimate.F.index_add(0, rows, G - G.detach())}
     if estimate.focals is not None and zero.shape[1] > 9:
         attached["focals"] = estimate.focals.index_add(0, rows, estimate.focals.detach()[rows] * zero[:, 9:])
@@ -188,9 +166,7 @@ def graphed_matches(c: Correspondences, solved: dict[int, Solved]) -> GraphedMat
         return None if value is None else torch.where(mask, value[rows].gather(1, index), 0).to(torch.float64)
 
     pixels = torch.cat([c.x0, c.x1], -1)[rows].to(torch.float64).gather(1, index[..., None].expand(-1, -1, 4))
-    centre = torch.from_numpy(np.stack([pair.centre for pair in pairs])).to(pixels)
-    unit = torch.tensor([pair.pixels_per_unit for pair in pairs]).to(pixels)
-    points = torch.where(mask[..., None], (pixels - centre[:, None]) / unit[:, None, None], 0).permute(2, 0, 1)
+    points = torch.where(mask[..., None], _frame(solved, pixels).normalized(pixels), 0).permute(2, 0, 1)
     prior, noise = take(c.prior), take(c.noise)
     precision = mask.to(torch.float64)
     if noise is not None:
@@ -199,16 +175,23 @@ def graphed_matches(c: Correspondences, solved: dict[int, Solved]) -> GraphedMat
     return GraphedMatches(points, mask, precision, weight, prior)
 
 
+def _frame(solved: dict[int, Solved], like: Tensor) -> PixelFrame:
+    """The normalised coordinates of pairs."""
+    pairs = [each.pair for each in solved.values()]
+    centre = torch.from_numpy(np.stack([pair.centre for pair in pairs])).to(like)
+    return PixelFrame(centre, torch.tensor([pair.pixels_per_unit for pair in pairs]).to(like))
+
+
 def camera_response(cameras: Cameras, pair: Pair, weight: Array, precision: float) -> Array:
     """How the optimum of the posterior moves with the gradient of its cost by the nine entries, (11, 9): its model and
     the logarithms of its focal lengths.
 
     weight: (n,), of the matches that count. precision: one over the variance of an inlier's distance.
     """
-    images, optimum, tangents = images_of(pair), no_optimum(1), np.zeros((1, 9, LANES))
-    matches = Weighted(centred(pair).points, weight, np.full(pair.count, np.inf), LOSS_CODES["truncated"], NO_TABLE)
-    minimise(cameras.copy(), matches, images, Limits(precision, 0, 0.0), optimum)
-    tangents_of(cameras, images.longest, optimum.F, tangents)
+    images, optimum, tangents = images_of(pair), posterior.no_optimum(1), np.zeros((1, 9, LANES))
+    matches = Weighted.of(centred(pair).points, weight, np.full(pair.count, np.inf))
+    posterior.minimise(cameras.copy(), matches, images, Limits(precision, 0, 0.0), optimum)
+    posterior.tangents_of(cameras, images.longest, optimum.F, tangents)
     moves, hessian, by_focal = np.empty((7, 9)), optimum.hessian[0], np.eye(7, 2, -5)
     translate(np.ascontiguousarray(tangents[0, :, :7].T), images.offset, moves)
     if images.prior.shared:  # one parameter for both
@@ -225,11 +208,6 @@ def _nothing(c: Correspondences) -> Tensor:
     """Zero, with a gradient of zero to all that has one."""
     attached = [t for t in (c.x0, c.x1, c.prior, c.noise) if t is not None and t.requires_grad]
     return torch.stack([t[:0].sum().to(torch.float64) for t in attached]).sum() if attached else torch.zeros(())
-
-
-def _none(solved: list[Solved], matches: GraphedMatches) -> Float[Tensor, "p 9"]:
-    """No gradients."""
-    return matches.points.new_zeros(len(solved), 9)
 
 
 def _padded(rows: list[Array], mask: Bool[Tensor, "p n"]) -> Float[Tensor, "p n"]:

@@ -8,14 +8,11 @@ import numpy as np
 
 from fmtorch.estimators.inliers import residuals_squared
 from fmtorch.estimators.pair import Pair, squared
+from fmtorch.estimators.refinement import scores_of
 from fmtorch.estimators.scores import Score
-from fmtorch.estimators.selection import scores_of
 from fmtorch.geometry.eight_point import weighted_eight_point
 from fmtorch.jit.kernel import Array, B1x1, F8x1, F8x2, I4x1, I4x2, I8x1, I8x2, inner, kernel, matrix, vector
 from fmtorch.jit.random import Stream, random_bits, stream_state
-
-# Which matches are a model's inliers, given that neighbours tend to be alike: the labelling of Graph-Cut RANSAC
-
 
 WINDOW = 8  # candidates for neighbours before and after each match along each curve
 SHIFTS = (0.0, 0.5)  # of the grid of each curve; the two find 97 % of the edges within 20 px of real pairs
@@ -67,9 +64,7 @@ def curve_codes(points: F8x2, shift: float, out: I8x1) -> None:
 @kernel
 def connect(points: F8x2, orders: I8x2, limit: float, window: int, graph: Graph) -> None:
     """Matches within a squared distance of each other, among the `window` next ones along each curve -> graph.
-
-    orders: (curves, n), along curves.
-    """
+    orders: (curves, n), along curves."""
     neighbours, degree = graph
     n = len(degree)
     for i in range(n):
@@ -99,9 +94,7 @@ def _among(members: Array, count: int, wanted: int) -> bool:
 @kernel
 def label(F: F8x1, points: F8x2, scale: float, graph: Graph, coherence: float, out: B1x1) -> None:
     """The inliers of a model (9,) among points (4, n) by the least energy -> out (n,).
-
-    scale: one over the square of epsilon, in the unit of the points. coherence: lambda.
-    """
+    scale: one over the square of epsilon, in the unit of the points. coherence: lambda."""
     neighbours, degree = graph
     n = len(out)
     K, field, weight = np.empty(n, np.float32), np.empty(n, np.float32), np.float32(coherence)
@@ -220,10 +213,8 @@ class GraphCut:
 @kernel
 def fit_samples(points: F8x2, labels: B1x1, stream: I8x1, size: int, out: F8x2) -> int:
     """Models of all inliers of points (4, n), and of samples of these -> out (samples + 1, 9); how many there are.
-
     labels: (n,), the inliers. stream: (3,), the mixed seed, the key, the number of the first sample. size: matches of
-    a sample, drawn with replacement.
-    """
+    a sample, drawn with replacement."""
     state = stream_state(stream[0], stream[1])
     inliers, total = np.empty(len(labels), np.int64), 0
     for i in range(len(labels)):

@@ -20,7 +20,7 @@ from fmtorch.estimators.pair import Pair, squared
 from fmtorch.geometry import attached_step
 from fmtorch.geometry.eight_point import weighted_eight_point
 from fmtorch.geometry.irls import reweighted_kernel
-from fmtorch.geometry.levenberg_marquardt import LOSS_CODES, Schedule, Weighted, loss_table
+from fmtorch.geometry.levenberg_marquardt import FIRST_DAMPING, Schedule, Weighted
 from fmtorch.geometry.rank2_manifold import SQUARINGS
 from fmtorch.geometry.refine import refine_kernel
 from fmtorch.geometry.robust_losses import named_loss
@@ -28,7 +28,6 @@ from fmtorch.jit.kernel import Array
 from fmtorch.jobs.execution import mapped
 
 DECAY = 0.65  # of the loss's scale, from one iteration to the next, down to the threshold
-FIRST_DAMPING = 1e-4  # of Levenberg-Marquardt
 NOT_DETERMINED = "the matches do not determine a model"
 
 
@@ -129,8 +128,8 @@ class IterativelyReweighted:
 
     def _weighted(self, pair: Pair, scale: float) -> Weighted:
         """The matches with the loss at a scale, in the unit of the points."""
-        s2, code = np.full(pair.count, squared(scale)), LOSS_CODES[self.loss]
-        return Weighted(pair.points, pair.cached("irls weight", _weight), s2, code, loss_table(self.loss))
+        s2 = np.full(pair.count, squared(scale))
+        return Weighted.of(pair.points, pair.cached("irls weight", _weight), s2, self.loss)
 
     def _first(self, pair: Pair) -> Array:
         """The 8-point algorithm with each power of the weights, where these determine a model, (k, 9)."""

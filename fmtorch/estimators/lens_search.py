@@ -1,46 +1,280 @@
-"""The lenses of a pair before its search: rounds among plausible cameras at a few lenses, refined with the lens.
+"""Cameras whose lenses bend straight lines: the division model, refined with the cameras, judged in the photograph.
 
-Points undistorted by one lens are a pair like any other, and from a lens within some 0.1 of the right one the
-refinement finds that. Whether a lens is straight the posterior decides, a spike at zero against a normal tail, by
-Laplace's approximation: freedom costs its determinant.
+``x_u = x_d / (1 + lambda |x_d|^2)`` (Fitzgibbon, CVPR 2001), from the principal point, in half diagonals of the image:
+0 of a pinhole, -0.05 of a usual phone, -0.3 of an action camera. In homogeneous coordinates ``h = (x, y, 1 + lambda
+r^2)`` the epipolar constraint is a polynomial, ``h1^T F h0 = 0``, whose Sampson distance by the photograph's own
+coordinates needs no undistorted point (the tangent Sampson error of Terekhov & Larsson, ICCV 2023).
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from fmtorch.core.types import MAX_LENS, MIN_LENS
 from fmtorch.estimators.final_fits import FOCAL_TOLERANCE, MIN_PRIOR_FOR_NOISE, Fit, fit_distance
 from fmtorch.estimators.focal_search import FocalSearch
-from fmtorch.estimators.models.focal_prior import MIN_DEVIATION
+from fmtorch.estimators.models import posterior
+from fmtorch.estimators.models.focal_prior import MIN_DEVIATION, focal_cost
 from fmtorch.estimators.models.model import FitScale
-from fmtorch.estimators.models.posterior import (
-    Cameras,
-    Limits,
-    centred,
-    images_of,
-    nearest_cameras,
-    no_cameras,
-    tangents_of,
-    translate,
-)
-from fmtorch.estimators.models.with_lenses import (
-    PARAMETERS,
-    LensOptimum,
-    LensPrior,
-    half_diagonals,
-    inverted,
-    minimise_with_lenses,
-    photograph_residuals,
-    undistorted,
-)
+from fmtorch.estimators.models.posterior import Cameras, Images, Limits, centred, images_of, tangents_of, translate
 from fmtorch.estimators.pair import Lens, Pair, squared
 from fmtorch.geometry.arithmetic import logarithm_kernel
-from fmtorch.geometry.levenberg_marquardt import LOSS_CODES, NO_TABLE, Weighted
-from fmtorch.jit.kernel import Array
-from fmtorch.jit.lanes import LANES
+from fmtorch.geometry.levenberg_marquardt import MATCH, TINY, Weighted, in_rows, minimiser, robust
+from fmtorch.geometry.matrices import assign
+from fmtorch.geometry.rank2_manifold import eliminate
+from fmtorch.jit.kernel import Array, F8x1, F8x2, F8x3, inner, kernel, matrix, vector
+from fmtorch.jit.lanes import LANES, added, fill, load, store, where
+
+MIN_DEPTH = 0.1  # of a point beyond the corner
+PARAMETERS = 9  # five rotations, two focal lengths, two lenses
+ROWS = 12  # of a match: derivatives by nine entries and two lenses, and the residual
+
+
+class LensPrior(NamedTuple):
+    """What is known of the lenses of both images.
+    mean, precision: (2,), of lambda, one over its variance. shared: whether there is one lens for both. diagonal: (2,),
+    half of the images', in the unit of the points."""
+
+    mean: F8x1
+    precision: F8x1
+    shared: bool
+    diagonal: F8x1 = np.ones(2)
+
+
+class LensOptimum(NamedTuple):
+    """Of k candidates: lens (k, 2), models F (k, 9) from the principal points, costs (k,), and their derivatives."""
+
+    lens: F8x2
+    F: F8x2
+    cost: F8x1
+    gradient: F8x2
+    hessian: F8x3
+
+
+def half_diagonals(pair: Pair) -> Array:
+    """Of both images (2,), in the unit of the points."""
+    h0, w0, h1, w1 = pair.sizes.tolist()
+    return np.array([math.sqrt(h0 * h0 + w0 * w0), math.sqrt(h1 * h1 + w1 * w1)]) / 2 / pair.pixels_per_unit
+
+
+def undistorted(pair: Pair, lens: Array) -> Pair:
+    """The pair of pinholes whose lenses (2,) are these; a match's noise grows as its points are stretched."""
+    table, offset, diagonal = pair.table.copy(), images_of(pair).offset, half_diagonals(pair)
+    stretch = np.zeros(pair.count)
+    for k in range(2):
+        x, y = table[2 * k] + offset[2 * k], table[2 * k + 1] + offset[2 * k + 1]
+        bent = lens[k] * (x * x + y * y) / (diagonal[k] * diagonal[k])
+        depth = np.maximum(1 + bent, MIN_DEPTH)
+        table[2 * k], table[2 * k + 1] = x / depth - offset[2 * k], y / depth - offset[2 * k + 1]
+        stretch += abs(1 - bent) / (depth * depth * depth) / 2
+    table[4] /= stretch
+    table[5] /= np.sqrt(stretch)
+    table[7] *= np.sqrt(stretch)
+    return pair.with_table(table, (pair.known[0], True, pair.known[2]), None)
+
+
+class _State(NamedTuple):
+    """Of k candidates, as `Cameras` and `LensOptimum`. tied: whether the second focal length, and the second lens, are
+    the first."""
+
+    tied: tuple[bool, bool]
+    axes: Array
+    focal: Array
+    lens: Array
+    F: Array
+    cost: Array
+    gradient: Array
+    hessian: Array
+
+
+class _Data(NamedTuple):
+    """tangents: (k, 9, LANES), of the cameras; products: (ROWS, ROWS), for the work."""
+
+    rows: Array
+    loss: int
+    table: Array
+    images: Images
+    diagonal: Array
+    prior: LensPrior
+    limits: Limits
+    tangents: Array
+    products: Array
+
+
+@kernel
+def minimise_with_lenses(
+    cameras: Cameras, matches: Weighted, images: Images, prior: LensPrior, limits: Limits,
+    out: LensOptimum,
+) -> None:  # fmt: skip
+    """Cameras and lenses of least negative logarithm of the posterior near these, in place; what it is there -> out.
+    matches: of the photographs, from the principal points."""
+    k = len(out.cost)
+    tied = images.prior.shared, prior.shared
+    state = _State(tied, cameras.axes, cameras.focal, out.lens, out.F, out.cost, out.gradient, out.hessian)
+    trial = _State(
+        tied, np.empty((k, 2, 3, 3)), matrix(k, 2), matrix(k, 2), matrix(k, 9), vector(k), matrix(k, PARAMETERS),
+        np.empty((k, PARAMETERS, PARAMETERS)),
+    )  # fmt: skip
+    rows, products = in_rows(matches.points, matches.weight, matches.s2), matrix(ROWS, ROWS)
+    data = _Data(
+        rows, matches.loss, matches.table, images, prior.diagonal, prior, limits, np.zeros((k, 9, LANES)), products
+    )
+    _minimise(data, state, trial, np.full(k, posterior.FIRST_DAMPING), limits.iterations, limits.tolerance >= 0)
+
+
+@kernel(holds_gil=True)
+def photograph_residuals(F: F8x1, lens: F8x1, diagonal: F8x1, points: F8x2, out: F8x1) -> None:
+    """Squared Sampson distances (n,) of points (4, n) of photographs, from the principal points, of a model (9,)."""
+    n, J = points.shape[1], matrix(ROWS, LANES)
+    rows, r2 = in_rows(points, np.ones(n), np.ones(n)), matrix(1, LANES)
+    for first in range(0, n, LANES):
+        _, value = _linearised(F, lens, diagonal, rows, first // LANES * MATCH, J)
+        store(r2, 0, value)
+        for i in range(min(LANES, n - first)):
+            out[first + i] = r2[0, i]
+
+
+@inner
+def _evaluate(state: _State, data: _Data, derivatives: bool) -> None:
+    posterior.camera_models(state.axes, state.focal, data.images.longest, state.tied[0], state.F, data.tangents)
+    work, W = vector(5), np.zeros((ROWS - 1, PARAMETERS))
+    for k in range(len(state.cost)):
+        cost = _summed(state.F[k], state.lens[k], data, derivatives) * data.limits.precision / 2
+        cost += focal_cost(state.focal[k], data.images.prior, work)
+        for i in range(1 if data.prior.shared else 2):
+            away = state.lens[k, i] - data.prior.mean[i]
+            cost += data.prior.precision[i] * away * away / 2
+        state.cost[k] = cost
+        if derivatives:
+            _derivatives(state, data, k, work, W)
+
+
+@inner
+def _summed(F: Array, lens: Array, data: _Data, derivatives: bool) -> Any:
+    """The robust cost of one candidate; the products of derivatives and residuals -> data.products."""
+    sums, work = matrix(ROWS * (ROWS + 1) // 2, LANES), matrix(3, LANES)
+    J, scaled = matrix(ROWS, LANES), matrix(ROWS, LANES)
+    costs = fill(0.0)
+    for q in range(len(sums)):
+        store(sums, q, costs)
+    for row in range(0, len(data.rows), MATCH):
+        inverse, r2 = _linearised(F, lens, data.diagonal, data.rows, row, J)
+        share, slope = robust(r2, load(data.rows, row + 5), data.loss, data.table, work)
+        costs += share * load(data.rows, row + 4)
+        if derivatives:
+            factor, q = inverse * (load(data.rows, row + 4) * slope), 0
+            for r in range(ROWS):
+                store(scaled, r, load(J, r) * factor)
+            for r in range(ROWS):
+                of_row = load(J, r)
+                for c in range(r + 1):
+                    store(sums, q, load(sums, q) + of_row * load(scaled, c))
+                    q += 1
+    q = 0
+    for r in range(ROWS if derivatives else 0):
+        for c in range(r + 1):
+            total = added(load(sums, q))
+            data.products[r, c], data.products[c, r] = total, total
+            q += 1
+    return added(costs)
+
+
+@inner
+def _linearised(f: Array, lens: Array, diagonal: Array, rows: Array, row: int, J: Array) -> tuple[Any, Any]:
+    """Derivatives and residual of LANES matches -> J (ROWS, LANES); inverse squared slopes, squared distances."""
+    l0, l1 = lens[0] / (diagonal[0] * diagonal[0]), lens[1] / (diagonal[1] * diagonal[1])
+    x0, y0, x1, y1 = load(rows, row), load(rows, row + 1), load(rows, row + 2), load(rows, row + 3)
+    r0, r1 = x0 * x0 + y0 * y0, x1 * x1 + y1 * y1
+    w0, w1 = r0 * l0 + 1.0, r1 * l1 + 1.0
+    p0, q0, s0 = f[0] * x0 + f[1] * y0 + f[2] * w0, f[3] * x0 + f[4] * y0 + f[5] * w0, f[6] * x0 + f[7] * y0 + f[8] * w0
+    p1, q1, s1 = f[0] * x1 + f[3] * y1 + f[6] * w1, f[1] * x1 + f[4] * y1 + f[7] * w1, f[2] * x1 + f[5] * y1 + f[8] * w1
+    e = x1 * p0 + y1 * q0 + w1 * s0
+    a0, b0 = p1 + x0 * s1 * (2 * l0), q1 + y0 * s1 * (2 * l0)  # slopes by the points of image 0, and of image 1
+    a1, b1 = p0 + x1 * s0 * (2 * l1), q0 + y1 * s0 * (2 * l1)
+    slope = a0 * a0 + b0 * b0 + a1 * a1 + b1 * b1
+    inverse = 1.0 / where(slope > TINY, slope, TINY)
+    c = e * inverse
+    t0, t1 = x0 * a0 + y0 * b0, x1 * a1 + y1 * b1
+    c0, c1 = t0 * (2 * l0), t1 * (2 * l1)
+    u, v, w = x1 - c * a1, y1 - c * b1, w1 - c * c1
+    p, q, s = c * a0, c * b0, c * c0
+    store(J, 0, u * x0 - x1 * p)
+    store(J, 1, u * y0 - x1 * q)
+    store(J, 2, u * w0 - x1 * s)
+    store(J, 3, v * x0 - y1 * p)
+    store(J, 4, v * y0 - y1 * q)
+    store(J, 5, v * w0 - y1 * s)
+    store(J, 6, w * x0 - w1 * p)
+    store(J, 7, w * y0 - w1 * q)
+    store(J, 8, w * w0 - w1 * s)
+    store(J, 9, r0 * s1 - c * (2.0 * s1 * t0 + r0 * (a1 * f[2] + b1 * f[5] + c1 * f[8])))
+    store(J, 10, r1 * s0 - c * (2.0 * s0 * t1 + r1 * (a0 * f[6] + b0 * f[7] + c0 * f[8])))
+    store(J, 11, e)
+    r2 = e * c
+    return inverse, where(r2 == r2, r2, math.nan)
+
+
+@inner
+def _derivatives(state: _State, data: _Data, k: int, focal: Array, W: Array) -> None:
+    """Gradient and Hessian of one candidate. focal: (5,), of `focal_cost`; W: (ROWS - 1, PARAMETERS), zeros or this."""
+    gradient, hessian, products, prior = state.gradient[k], state.hessian[k], data.products, data.prior
+    for q in range(9):
+        for i in range(7):
+            W[q, i] = data.tangents[k, q, i]
+    W[9, 7], W[10, 7 if prior.shared else 8] = 1 / data.diagonal[0] ** 2, 1 / data.diagonal[1] ** 2
+    for i in range(PARAMETERS):
+        total = 0.0
+        for q in range(ROWS - 1):
+            total += W[q, i] * products[q, ROWS - 1]
+        gradient[i] = total * data.limits.precision
+        for j in range(PARAMETERS):
+            total = 0.0
+            for q in range(ROWS - 1):
+                along = 0.0
+                for r in range(ROWS - 1):
+                    along += products[q, r] * W[r, j]
+                total += W[q, i] * along
+            hessian[i, j] = total * data.limits.precision
+    for i in range(2):
+        gradient[5 + i] += focal[i]
+        for j in range(2):
+            hessian[5 + i, 5 + j] += focal[2 + i] if i == j else focal[4]
+        if i == 0 or not prior.shared:
+            gradient[7 + i] += prior.precision[i] * (state.lens[k, i] - prior.mean[i])
+            hessian[7 + i, 7 + i] += prior.precision[i]
+    if prior.shared:
+        hessian[8, 8] = 1.0
+
+
+@inner
+def _step(state: _State, damping: Array, trial: _State) -> None:
+    Q, x = np.zeros((2 * PARAMETERS, LANES)), vector(PARAMETERS)
+    for k in range(len(damping)):
+        for r in range(PARAMETERS):  # two rows of Q for each of the system
+            for c in range(PARAMETERS):
+                Q[2 * r + c // LANES, c % LANES] = state.hessian[k, r, c]
+            Q[2 * r + r // LANES, r % LANES] += state.hessian[k, r, r] * damping[k]
+            Q[2 * r + 1, PARAMETERS - LANES] = -state.gradient[k, r]
+        eliminate(Q, PARAMETERS)
+        for r in range(PARAMETERS):
+            x[r] = Q[2 * r + 1, PARAMETERS - LANES]
+        posterior.move_cameras(state, k, x, state.tied[0], trial)
+        for i in range(2):
+            step = x[7 if state.tied[1] else 7 + i]
+            trial.lens[k, i] = min(max(state.lens[k, i] + min(max(step, -0.1), 0.1), MIN_LENS), MAX_LENS)
+
+
+@inner
+def _take(state: _State, trial: _State, k: int) -> None:
+    assign(state.lens[k], trial.lens[k])
+    posterior.take_cameras(state, trial, k)
+
+
+_minimise = minimiser(_evaluate, _step, _take, posterior.converged, posterior.MIN_DAMPING)
+
 
 STARTS = ((0.0, 0.0), (-0.12, -0.12), (-0.25, -0.25))  # of both lenses, where they are one
 OWN_STARTS = (*STARTS, (0.0, -0.2), (-0.2, 0.0))  # where each has its own
@@ -71,18 +305,41 @@ class LensFit(NamedTuple):
     deviation: Array
 
 
+@kernel(holds_gil=True)
+def inverted(A: F8x2, out: F8x2) -> float:
+    """The inverse of A (n, n) -> out, and log |det A|; infinite and not a number where there is none."""
+    n, rows, logarithm = len(A), A.copy(), 0.0
+    for i in range(n):
+        for c in range(n):
+            out[i, c] = 1.0 if i == c else 0.0
+    for i in range(n):
+        pivot = rows[i, i]
+        if not abs(pivot) < math.inf or pivot == 0:
+            out[:] = math.inf
+            return math.nan
+        logarithm += logarithm_kernel(abs(pivot))
+        for c in range(n):
+            rows[i, c] /= pivot
+            out[i, c] /= pivot
+        for r in range(n):
+            factor = rows[r, i]
+            if r != i:
+                for c in range(n):
+                    rows[r, c] -= factor * rows[i, c]
+                    out[r, c] -= factor * out[i, c]
+    return logarithm
+
+
 def fit_with_lenses(
     cameras: Cameras, lens: Array, prior: LensPrior, pair: Pair, scale_px: float, iterations: int
 ) -> list[LensFit]:  # fmt: skip
     """The maxima a posteriori of the truncated error near candidates, cameras (k, ...) and lenses (k, 2).
-
-    scale_px: from which on matches do not count; of the pair as it was photographed.
-    """
+    scale_px: from which on matches do not count; of the pair as it was photographed."""
     k, matches, images, own = len(lens), centred(pair, scale_px), images_of(pair), cameras.copy()
     out = LensOptimum(
         lens.copy(), np.empty((k, 9)), np.empty(k), np.empty((k, PARAMETERS)), np.empty((k, PARAMETERS, PARAMETERS))
     )
-    weighted = Weighted(matches.points, pair.weight, matches.s2, LOSS_CODES["truncated"], NO_TABLE)
+    weighted = Weighted.of(matches.points, pair.weight, matches.s2)
     limits = Limits(squared(pair.pixels_per_unit / (scale_px / FitScale().scale_sigmas)), iterations, FOCAL_TOLERANCE)
     minimise_with_lenses(own, weighted, images, prior._replace(diagonal=half_diagonals(pair)), limits, out)
     F = np.empty((k, 9))
@@ -193,8 +450,8 @@ def suggested_lens(fit: Fit, pair: Pair) -> float:
     """
     cameras = fit.cameras
     if cameras is None:
-        cameras = no_cameras(1)
-        nearest_cameras(fit.F[None], images_of(pair), cameras)
+        cameras = posterior.no_cameras(1)
+        posterior.nearest_cameras(fit.F[None], images_of(pair), cameras)
     none, unknown, straight = np.zeros((1, 2)), lens_prior(SHARED), lens_prior(STRAIGHT)
     (pinholes,) = fit_with_lenses(cameras, none, unknown, pair, START_SCALE_PX, 0)
     step = abs(float((pinholes.inverse[LENS] * pinholes.gradient).sum()))

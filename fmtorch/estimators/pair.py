@@ -10,7 +10,8 @@ import numpy as np
 
 from fmtorch.geometry.arithmetic import logarithm_kernel
 from fmtorch.geometry.epipolar import SAMPSON, Residual
-from fmtorch.jit.kernel import Array, B1x1, F8x1, F8x2, I8x1, inner, kernel, matrix
+from fmtorch.geometry.matrices import multiply
+from fmtorch.jit.kernel import Array, B1x1, F8x1, F8x2, I8x1, inner, kernel, vector
 from fmtorch.jit.random import Stream, mixed_seed, stream_state, uniform_kernel
 
 T = TypeVar("T")
@@ -22,10 +23,8 @@ EXACT = 0.02  # relative deviation below which a focal length counts as exactly 
 
 class Calibration(NamedTuple):
     """Measured focal lengths of two images of square pixels and central principal points.
-
     focals: px. deviations: relative standard deviations, 0 of a calibration, infinite where a focal length is unknown.
-    shared: whether both are one, in units of the longer sides of the images.
-    """
+    shared: whether both are one, in units of the longer sides of the images."""
 
     focals: tuple[float, float]
     deviations: tuple[float, float]
@@ -55,9 +54,7 @@ def calibration_of(focal: Array, shared: bool) -> Calibration | None:
 
 class Lens(NamedTuple):
     """What is known of the lenses of two images, lambda of the division model in half diagonals.
-
-    deviations: 0 of exactly known ones, infinite of unknown ones. shared: whether both are one.
-    """
+    deviations: 0 of exactly known ones, infinite of unknown ones. shared: whether both are one."""
 
     means: tuple[float, float]
     deviations: tuple[float, float]
@@ -132,33 +129,26 @@ class Pair:
 
     def uniform(self, start: int, count: int, columns: int) -> Array:
         """Random numbers in [0, 1) for the draws start .. start + count - 1, (count, columns).
-
-        A function of (seed, key, draw, column): the same in any batch and in any order of draws.
-        """
+        A function of (seed, key, draw, column): the same in any batch and in any order of draws."""
         out = np.empty((count, columns))
         uniforms(self.mixed_seed(Stream.SAMPLING), self.key, start, out)
         return out
 
-    def with_lens(self, lens: Lens) -> Pair:
-        """The same pair of images of such lenses."""
-        return Pair(
-            self.table, self.known, self.bucket, self.pixels_per_unit, self.key, self.seed, self.centre, self.sizes,
-            self.residual, self.calibration, self.images, lens,
-        )  # fmt: skip
-
     def take(self, index: Array) -> Pair:
         """The same pair with the matches of these indices."""
+        return self.with_table(self.table.take(index, 1), self.known, self.lens)
+
+    def with_table(self, table: Array, known: tuple[bool, bool, bool], lens: Lens | None) -> Pair:
+        """The same pair with another table."""
         return Pair(
-            self.table.take(index, 1), self.known, self.bucket, self.pixels_per_unit, self.key, self.seed, self.centre,
-            self.sizes, self.residual, self.calibration, self.images, self.lens,
+            table, known, self.bucket, self.pixels_per_unit, self.key, self.seed, self.centre, self.sizes,
+            self.residual, self.calibration, self.images, lens,
         )  # fmt: skip
 
 
 class PixelMatches(NamedTuple):
     """One pair as it arrives: matches in pixels (n, 2), which are real (n,), and what is known of each; else empty.
-
-    sizes: (4,), of the images as h, w, h, w.
-    """
+    sizes: (4,), of the images as h, w, h, w."""
 
     x0: F8x2
     x1: F8x2
@@ -228,39 +218,27 @@ def power_of_two(half: float) -> Any:
 @kernel(holds_gil=True)
 def to_pixels(F: F8x1, centre: F8x1, unit: float, out: F8x2) -> bool:
     """A model (9,) of normalised points as that of pixels, canonical in scale and sign -> out (3, 3); if it is finite.
-
-    centre: (4,), of the points in pixels; unit: pixels in one unit of the points.
-    """
-    T0, T1, product, model = matrix(3, 3), matrix(3, 3), matrix(3, 3), matrix(3, 3)
+    centre: (4,), of the points in pixels; unit: pixels in one unit of the points."""
+    T0, T1, product, flat = vector(9), vector(9), vector(9), out.ravel()
     for i in range(3):
         for j in range(3):
             diagonal = (1.0 if i == 2 else 1 / unit) if i == j else 0.0
-            T0[i, j] = -centre[i] / unit if i < j == 2 else diagonal
-            T1[i, j] = -centre[2 + j] / unit if j < i == 2 else diagonal  # transposed
-            model[i, j] = F[3 * i + j]
-    _product(T1, model, product)
-    _product(product, T0, out)
-    largest, total, finite = out[0, 0], 0.0, True
+            T0[3 * i + j] = -centre[i] / unit if i < j == 2 else diagonal
+            T1[3 * i + j] = -centre[2 + j] / unit if j < i == 2 else diagonal  # transposed
+    multiply(T1, F, product)
+    multiply(product, T0, flat)
+    largest, total, finite = flat[0], 0.0, True
     for i in range(9):
-        entry = out[i // 3, i % 3]
-        largest = entry if abs(entry) > abs(largest) else largest
+        largest = flat[i] if abs(flat[i]) > abs(largest) else largest
     peak = abs(largest) if largest != 0 else 1.0
     for i in range(9):
-        out[i // 3, i % 3] /= peak
-        total += out[i // 3, i % 3] * out[i // 3, i % 3]
+        flat[i] /= peak
+        total += flat[i] * flat[i]
     scale, sign = 1 / math.sqrt(total) if total != 0 else 0.0, math.copysign(1.0, largest)
     for i in range(9):
-        out[i // 3, i % 3] = out[i // 3, i % 3] * scale * sign
-        finite = finite and math.isfinite(out[i // 3, i % 3])
+        flat[i] = flat[i] * scale * sign
+        finite = finite and math.isfinite(flat[i])
     return finite
-
-
-@inner
-def _product(a: Array, b: Array, out: Array) -> None:
-    """As `arithmetic.matmul3`."""
-    for r in range(3):
-        for c in range(3):
-            out[r, c] = a[r, 0] * b[0, c] + a[r, 1] * b[1, c] + a[r, 2] * b[2, c]
 
 
 @kernel(holds_gil=True)

@@ -18,10 +18,8 @@ LAST_WORD = (1 << 63) - 1
 
 class Preselection:
     """Scores a round's models, the weaker ones dropped after a look at few matches.
-
     score: by which models are compared; its `preselection`, if it has one, on few matches. options: how many matches
-    these are, and how many models pass; None: every model is scored on every match.
-    """
+    these are, and how many models pass; None: every model is scored on every match."""
 
     def __init__(self, score: Score, options: Preselect | None) -> None:
         self.score, self.options = score, options
@@ -40,9 +38,7 @@ class Preselection:
 
     def subset(self, pair: Pair) -> Pair | None:
         """The pair with the few matches; None where there are not many more.
-
-        A score that weighs matches by their prior gets such as are drawn by it, each of which counts as one.
-        """
+        A score that weighs matches by their prior gets such as are drawn by it, each of which counts as one."""
         if self.options is None or pair.bucket < 2 * self.options.matches:
             return None
         by_prior, matches = self.score.prior_weighted and pair.prior is not None, self.options.matches
@@ -58,10 +54,8 @@ def shuffled_first(pair: Pair, count: int) -> Pair:
 
 def drawn_by_prior(pair: Pair, count: int) -> Pair:
     """The pair with so many matches drawn by their prior, without replacement; those of any prior count as one.
-
     They are the first by falling prior / u, u random and uniform, and each stands for as much of the prior: priority
-    sampling (Duffield, Lund & Thorup, J. ACM 2007).
-    """
+    sampling (Duffield, Lund & Thorup, J. ACM 2007)."""
     index = np.empty(min(count, pair.count), np.int64)
     draw_by_prior(pair.match_weight, pair.mixed_seed(Stream.PRESELECTION), pair.key, index)
     subset = pair.take(index)
@@ -123,7 +117,6 @@ def first_shuffled(index: Array, mixed_seed: int, key: int, out: Array) -> int:
 
 # Whether the inliers of a model could determine it: enough of them, and not all on one line
 
-
 ROUNDINGS = 4.0  # of coordinates, that exact points of a line may lie off it
 EXTENT_ROUNDING = 2.0**-23  # the same in units of the points' extent: nobody knows pixels better than a float32 holds
 FIRST_LOOK = 256  # matches that mostly suffice to see that there is support
@@ -133,36 +126,25 @@ DIRECTION = (0.3819660112501051, 0.7236067977499790, 0.8541019662496845, 0.52786
 
 def degenerate_support(pair: Pair, inliers: Array, minimal: int, rounding: float) -> str:
     """Why the inliers (n,) determine no model; empty where they may. Several at one place in both images count once.
-
     minimal: the size of a minimal sample; fewer inliers support a model no more than any other. rounding: how exact a
-    coordinate of 1 is.
-    """
+    coordinate of 1 is."""
     largest: float = max(map(abs, pair.centre.tolist()))
     rounding *= largest / pair.pixels_per_unit + 1  # in the unit of the points
     on_line = np.empty(2, np.bool_)
     for first in (min(FIRST_LOOK, pair.count), pair.count):
         different = support(pair.points, inliers[:first], minimal, rounding, on_line)
-        reason = _reason(different, on_line, minimal)
-        if not reason:
-            break
-    return reason
-
-
-def _reason(count: int, on_line: Array, minimal: int) -> str:
-    if count < minimal:
-        return f"the best model has {count} different inliers; at least {minimal} are needed"
-    if on_line.any():
-        images = " and ".join(f"image {i}" for i in (0, 1) if on_line[i])
-        return f"the inliers of the best model lie on one line in {images}"
-    return ""
+        if different >= minimal and not on_line.any():
+            return ""
+    if different < minimal:
+        return f"the best model has {different} different inliers; at least {minimal} are needed"
+    images = " and ".join(f"image {i}" for i in (0, 1) if on_line[i])
+    return f"the inliers of the best model lie on one line in {images}"
 
 
 @kernel(holds_gil=True)
 def support(points: F8x2, inliers: B1x1, minimal: int, rounding: float, on_line: B1x1) -> int:
     """How many different ones the inliers (m,) among the first m points (4, n) are, counted up to `minimal`.
-
-    on_line: (2,), whether they lie on one line in each image. rounding: of coordinates, in the unit of the points.
-    """
+    on_line: (2,), whether they lie on one line in each image. rounding: of coordinates, in the unit of the points."""
     index, count = np.empty(len(inliers), np.int64), 0
     for i in range(len(inliers)):
         index[count] = i

@@ -20,20 +20,18 @@ from fmtorch.estimators.final_fits import FinalFit, Fit
 from fmtorch.estimators.focal_search import FocalSearch, PlausibleCandidates
 from fmtorch.estimators.gradients import Attached
 from fmtorch.estimators.inliers import InlierRule, StoppingRule, residuals_squared_px
-from fmtorch.estimators.lens_search import lens_fit, lenses_of, squared_px, suggested_lens
+from fmtorch.estimators.lens_search import lens_fit, lenses_of, squared_px, suggested_lens, undistorted
 from fmtorch.estimators.models.model import Refining
 from fmtorch.estimators.models.with_focals import FundamentalWithFocals
-from fmtorch.estimators.models.with_lenses import undistorted
 from fmtorch.estimators.options import Count, Focal, Preselect, Refine, Select, stage
 from fmtorch.estimators.pair import Lens, Pair
 from fmtorch.estimators.precompiled import OF_HOMOGRAPHIES, WITH_FOCALS
 from fmtorch.estimators.preselection import Preselection
-from fmtorch.estimators.refinement import LocalOptimization, Refinement
+from fmtorch.estimators.refinement import BestOfSearch, BestScore, LocalOptimization, Refinement, Selection, Selector
 from fmtorch.estimators.registry import part, thresholds
 from fmtorch.estimators.sampling import Sampler
 from fmtorch.estimators.scores import Score
 from fmtorch.estimators.search import Search
-from fmtorch.estimators.selection import BestOfSearch, BestScore, Selection, Selector
 from fmtorch.jit.kernel import Array, Kernel
 from fmtorch.jit.together import compile_together
 from fmtorch.jobs.execution import mapped
@@ -126,7 +124,10 @@ class Ransac:
         refinement = Refinement(stage(refine, Refine), optimization)
         choice = stage(select, Select)
         self.refine = refinement
-        self.select = _selector(self.score, choice, threshold, refinement)
+        changed = refinement.options is not None or optimization is not None
+        self.select: Selector = BestScore(self.score) if changed else BestOfSearch()
+        if choice is not None:
+            self.select = BestScore(part("score", choice.score, threshold=choice.scale))
         self.focal = _focal_search(stage(focal, Focal), self.select, self.search, refinement, choice)
 
     def _expect_fundamental(self, **options: object) -> None:
@@ -180,7 +181,7 @@ class Ransac:
             mapped(estimate_part, estimation.parts)
         else:
             estimate_part(estimation.parts[0])
-        return estimation.estimates(Attached(self.final, self.family))
+        return estimation.estimates(Attached(self.final, self.family).attach)
 
     def estimate(self, pair: Pair) -> Solution:
         """Search to fit of one pair."""
@@ -244,14 +245,6 @@ class Ransac:
                 "whether each match is an inlier"
             )
         return inliers
-
-
-def _selector(score: Score, choice: Select | None, threshold: float, refinement: Refinement) -> Selector:
-    """What selects one model of the refined pool."""
-    if choice is not None:
-        return BestScore(part("score", choice.score, threshold=choice.scale))
-    changed = refinement.options is not None or refinement.local_optimization is not None
-    return BestScore(score) if changed else BestOfSearch()
 
 
 def _focal_search(

@@ -1,17 +1,20 @@
-"""The models of a pool made better before one of them is selected: on their inliers, and by Levenberg-Marquardt."""
+"""The models of a pool made better, on their inliers and by Levenberg-Marquardt, and one of them selected."""
 
 from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
 from fmtorch.estimators.models.model import Loss, Refining, Steps
+from fmtorch.estimators.models.posterior import Cameras
 from fmtorch.estimators.options import Refine
 from fmtorch.estimators.pair import Pair, squared
 from fmtorch.estimators.preselection import first_shuffled
+from fmtorch.estimators.scores import Score, scored
 from fmtorch.estimators.search import Pool
 from fmtorch.geometry.epipolar import HOMOGRAPHY, SAMPSON, Residual
 from fmtorch.jit.kernel import Array, F4x2, I8x1, Kernel, kernel
@@ -40,18 +43,14 @@ class Candidates(NamedTuple):
 @dataclasses.dataclass(frozen=True)
 class Refinement:
     """Local optimisation of each model on its inliers, then Levenberg-Marquardt on the matches near the pool.
-
-    options: of the latter; None: none. local_optimization: None: none.
-    """
+    options: of the latter; None: none. local_optimization: None: none."""
 
     options: Refine | None
     local_optimization: LocalOptimization | None = None
 
     def near(self, pool: Pool, pair: Pair) -> Pair:
         """The pair with the matches on which the pool's models are refined: at most so many of those within reach.
-
-        Which of them, the pair's key decides.
-        """
+        Which of them, the pair's key decides."""
         if self.options is None or self.options.matches is None:
             return pair
         limit = np.float32(squared(self.options.RADIUS * self.options.scale / pair.pixels_per_unit))
@@ -80,9 +79,7 @@ def near_of(residual: Residual) -> Kernel[..., int]:
     @kernel(name=f"near_{residual.name}")
     def near(F: F4x2, points: F4x2, limit: np.float32, mixed_seed: int, key: int, out: I8x1) -> int:
         """Points (4, n) within a squared residual of one of the models (k, 9), the first in a random order -> out.
-
-        How many they are. Nothing is near a model of zeros.
-        """
+        How many they are. Nothing is near a model of zeros."""
         x0, y0, x1, y1 = points[0], points[1], points[2], points[3]
         wanted = np.zeros(points.shape[1], np.bool_)
         for k in range(len(F)):
@@ -103,3 +100,40 @@ def near_of(residual: Residual) -> Kernel[..., int]:
 
 near = near_of(SAMPSON)
 near_homography = near_of(HOMOGRAPHY)
+
+
+class Selection(NamedTuple):
+    """The selected model (9,), float64, whether there is one, and its cameras (1, ...), None where none are assumed."""
+
+    F: Array
+    valid: bool
+    cameras: Cameras | None = None
+
+
+Selector = Callable[[Candidates, Pair], Selection]
+"""Selects one model from a pool of refined ones."""
+
+
+class BestOfSearch:
+    """The best model of the search, the first of the pool."""
+
+    def __call__(self, candidates: Candidates, pair: Pair) -> Selection:
+        """The selection."""
+        return Selection(candidates.F[0], bool(candidates.valid[0]))
+
+
+class BestScore:
+    """The model of the largest score."""
+
+    def __init__(self, score: Score) -> None:
+        self.score = score
+
+    def __call__(self, candidates: Candidates, pair: Pair) -> Selection:
+        """The selection."""
+        score = np.where(candidates.valid, scores_of(self.score, candidates.F, pair), -np.inf)
+        return Selection(candidates.F[int(np.argmax(score))], bool(candidates.valid[0]))
+
+
+def scores_of(score: Score, F: Array, pair: Pair) -> Array:
+    """Scores (k,) of models (k, 9), float64, on all matches."""
+    return scored(score, F.astype(np.float32), np.arange(len(F)), pair)

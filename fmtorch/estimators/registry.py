@@ -15,8 +15,7 @@ from fmtorch.estimators.degensac import Degensac
 from fmtorch.estimators.final_fits import Adaptive, GaussNewton, LeastSquares, NoFit, UnweightedLeastSquares
 from fmtorch.estimators.graph_cut import GraphCut
 from fmtorch.estimators.inliers import BetterHalf, RobustDeviations, WithinThreshold
-from fmtorch.estimators.models.fundamental import EightPoint, SevenPoint
-from fmtorch.estimators.models.homography import Homography
+from fmtorch.estimators.models.fundamental import EightPoint, Homography, SevenPoint
 from fmtorch.estimators.sampling import PriorWeighted, Prosac, Uniform
 from fmtorch.estimators.scores import InlierCount, Magsac, Median, Msac, SaturatedGains
 
@@ -54,10 +53,8 @@ def takes(role: str, spec: Any, option: str) -> bool:
 
 def part(role: str, spec: Any, **context: Any) -> Any:
     """The part that an option describes, None for none.
-
     context: what the engine tells its parts; each takes what its constructor names, unless its own options say so.
-    Raises ValueError for an unknown name or option, naming those there are.
-    """
+    Raises ValueError for an unknown name or option, naming those there are."""
     if spec is None or not isinstance(spec, str | Mapping):
         return spec
     name, options = (spec, {}) if isinstance(spec, str) else (spec.get("name"), dict(spec))
@@ -74,10 +71,8 @@ def thresholds(
     threshold: float | None, inlier_threshold: float | None, score: Any, inliers: Any, stops: bool, optimization: Any
 ) -> tuple[float, float]:
     """The thresholds of score and of inliers, px; ValueError where one is given that nothing asks for.
-
     score, inliers, optimization: as options name these parts. stops: whether there is a stopping rule, which counts
-    inliers.
-    """
+    inliers."""
     by_distance = stops or takes("inliers", inliers, "threshold")
     if inlier_threshold is not None and not by_distance:
         raise ValueError(f"inlier_threshold={inlier_threshold} has no effect: inliers={inliers} takes none")

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
 from fmtorch.estimators.pair import Pair
-from fmtorch.jit.kernel import Array, F8x1, I8x1, I8x2, inner, kernel
+from fmtorch.jit.kernel import Array, I8x1, I8x2, inner, kernel
 from fmtorch.jit.random import Stream, random_bits, stream_state
 
 TOTAL_BITS = 30  # cumulative weights stay below 2^30, so that 32 random bits times a total fit an int64
@@ -26,12 +25,10 @@ class Sampler(Protocol):
 
 class Draws(NamedTuple):
     """What samples are drawn from.
-
     table: (n,), cumulative weights of the matches, below 2^30; empty for weights of one. totals: (count,), of the
     weights that each draw is made from. newest: (count,), the last match of each draw, the others being drawn from
     those before it; empty: all are drawn. order: (n,), the matches that indices stand for; empty: themselves.
-    seed: of the stream, mixed. start: the number of the first draw.
-    """
+    seed: of the stream, mixed. start: the number of the first draw."""
 
     table: I8x1
     totals: I8x1
@@ -78,9 +75,11 @@ class Prosac(Uniform):
 
     def growth(self, count: int, size: int) -> Array:
         """T'_n for n = 1 .. N: the last draw whose sample comes from the first n matches (equation 4), (n,) int64."""
-        table = np.empty(count, np.int64)
-        prosac_table(size, self.GROWTH, table)
-        return table
+        n, expected = np.arange(1, count + 1), np.full(count, float(self.GROWTH))
+        for i in range(size):  # equation 3
+            expected = expected * (np.maximum(n - i, 0) / max(count - i, 1))
+        steps = np.ceil(np.diff(expected, prepend=0.0)).astype(np.int64)
+        return np.cumsum(np.where(n > size, steps, n == size))
 
 
 class PriorWeighted:
@@ -136,9 +135,9 @@ def _drawn(
 
 def _quantised(pair: Pair) -> tuple[Array, Array]:
     """Weights and cumulative weights."""
-    weight, table = np.empty(pair.count, np.int64), np.empty(pair.count, np.int64)
-    quantise(pair.match_weight, 1.0 if pair.prior is None else largest_weight(pair.bucket), weight, table)
-    return weight, table
+    largest = 1.0 if pair.prior is None else largest_weight(pair.bucket)
+    weight = np.maximum(np.rint(pair.match_weight * largest).astype(np.int64), 1)
+    return weight, np.cumsum(weight)
 
 
 def _best_first(pair: Pair) -> Array:
@@ -152,10 +151,8 @@ def _best_first(pair: Pair) -> Array:
 @kernel
 def draw(draws: Draws, out: I8x2) -> None:
     """Weighted sampling without replacement: intervals already drawn are cut out of [0, total) -> out (size, count).
-
     A position is drawn in what is left and pushed past every drawn interval in ascending order; the table says whose
-    interval it falls in. Without a table every interval has length one.
-    """
+    interval it falls in. Without a table every interval has length one."""
     table, totals, newest, order, seed, key, start = draws
     count, drawn = out.shape[1], len(out) - (1 if len(newest) else 0)
     state, guide, shift = stream_state(seed, key), _guide(table), _guide_shift(table)
@@ -214,33 +211,3 @@ def _guide(table: Array) -> Array:
             index += 1
         guide[entry] = index
     return guide
-
-
-@kernel(holds_gil=True)
-def quantise(prior: F8x1, largest: float, weight: I8x1, table: I8x1) -> None:
-    """Priors (n,) as weights from 1 up to the largest -> weight (n,), and these cumulated -> table (n,)."""
-    total = np.int64(0)
-    for i in range(len(prior)):
-        weight[i] = max(np.int64(np.rint(prior[i] * largest)), np.int64(1))
-        total += weight[i]
-        table[i] = total
-
-
-@kernel
-def prosac_table(size: int, growth: int, out: I8x1) -> None:
-    """T'_n for n = 1 .. N -> out (N,): the last draw whose sample of `size` comes from the first n matches.
-
-    growth: T_N. Chum & Matas (CVPR 2005), equations 3 and 4.
-    """
-    total, before = len(out), 0.0
-    draws: Any = 0
-    for n in range(1, total + 1):
-        expected = float(growth)
-        for i in range(size):
-            expected *= max(n - i, 0) / max(total - i, 1)
-        if n == size:
-            draws = 1
-        elif n > size:
-            draws += np.int64(math.ceil(expected - before))
-        out[n - 1] = draws
-        before = expected

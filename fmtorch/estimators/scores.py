@@ -18,8 +18,6 @@ from fmtorch.geometry.robust_losses import GAIN_TABLE
 from fmtorch.jit.kernel import Array, F4x1, F4x2, F8x1, F8x2, I4x2, I8x1, Kernel, inner, kernel
 from fmtorch.jit.lanes import added, sqrt, store, where
 
-# The matches of a pair as scores take them: in rows of float32 numbers, with the scale and the weight of each
-
 
 def fractional_bits(count: int) -> int:
     """Of so many float32 numbers in [0, 1], for their sums to be exact: 10, fewer beyond 2^14 numbers."""
@@ -41,9 +39,7 @@ def rows_of(count: int) -> int:
 @kernel(holds_gil=True)
 def pack(table: F8x2, threshold: float, weighted: bool, rows: F4x2) -> None:
     """SINGLES matches in MATCH rows each -> rows; those that fill the last ones have no weight.
-
-    table: (9, n), of `Pair`. weighted: by the prior. The scale of a match is one over the square of its threshold.
-    """
+    table: (9, n), of `Pair`. weighted: by the prior. The scale of a match is one over the square of its threshold."""
     n = table.shape[1]
     for first in range(0, n, SINGLES):
         row = first // SINGLES * MATCH
@@ -74,9 +70,7 @@ class Score(Protocol):
 
     def __call__(self, F: Array, which: Array, pair: Pair) -> Array:
         """Scores (k,) float64 of those of the models (m, 9), float32, that have the indices `which` (k,) int64.
-
-        Models are of the pair's points in normalised units.
-        """
+        Models are of the pair's points in normalised units."""
         ...
 
 
@@ -289,7 +283,6 @@ score_gains_homography = score_gains_of(HOMOGRAPHY)
 
 # A score that saturates where matches crowd, so that no single textured plane outvotes the rest of the image
 
-
 GRID = 12  # cells along each side of each image
 CELL_ROWS = 2 * GRID * GRID // SINGLES
 
@@ -335,9 +328,7 @@ def score_saturated_of(residual: Residual) -> Kernel[..., None]:
     @kernel(name=f"score_saturated_{residual.name}")
     def score_saturated(F: F4x2, which: I8x1, rows: F4x2, cells: I4x2, bits: int, out: F8x1) -> None:
         """Sums over the cells of both images of roots of summed gains of Geman & McClure -> out (k,).
-
-        rows: the matches. cells: of `saturated_cells`. bits: fractional, that gains and roots are rounded to.
-        """
+        rows: the matches. cells: of `saturated_cells`. bits: fractional, that gains and roots are rounded to."""
         shift = np.float32(1.5 * 2.0 ** (23 - bits))
         gains, sums = np.empty((len(rows) // MATCH, SINGLES), np.float32), np.empty((CELL_ROWS, SINGLES), np.float32)
         for k in range(len(which)):
@@ -361,9 +352,7 @@ def score_saturated_of(residual: Residual) -> Kernel[..., None]:
 @kernel(holds_gil=True)
 def saturated_cells(table: F8x2, weighted: bool, out: I4x2) -> None:
     """Each match's cells in grids over the matches of weight -> out (2, n), of image 0 and, counted on, of image 1.
-
-    table: (9, n), of `Pair`. weighted: by the prior.
-    """
+    table: (9, n), of `Pair`. weighted: by the prior."""
     for image in range(2):
         out[image] = image * GRID * GRID
         for axis in range(2):
@@ -379,9 +368,6 @@ def saturated_cells(table: F8x2, weighted: bool, out: I4x2) -> None:
 
 score_saturated = score_saturated_of(SAMPSON)
 score_saturated_homography = score_saturated_of(HOMOGRAPHY)
-
-
-# LMedS: the median residual as a score
 
 
 BIN_SHIFT, BINS = 21, 1 << 10  # of a float32 the exponent and two bits more
@@ -401,19 +387,9 @@ class Median:
 
 def _rows(pair: Pair) -> Array:
     """The matches in rows, of scale and weight one."""
-    rows = np.zeros((rows_of(pair.count), SINGLES), np.float32)
-    pack_points(pair.points32, rows)
+    rows = scored_matches(pair, 1.0, False)
+    rows[4::MATCH] = 1
     return rows
-
-
-@kernel(holds_gil=True)
-def pack_points(points: F4x2, rows: F4x2) -> None:
-    """Points (4, n) as the rows of `scores.pack`, of scale and weight one; rows of zeros come in."""
-    for i in range(points.shape[1]):
-        row, lane = i // SINGLES * MATCH, i % SINGLES
-        for k in range(4):
-            rows[row + k, lane] = points[k, i]
-        rows[row + 4, lane], rows[row + 5, lane] = 1.0, 1.0
 
 
 @functools.cache
@@ -437,9 +413,7 @@ def score_median_of(residual: Residual) -> Kernel[..., None]:
 @inner
 def _smallest(values: Array, counts: Array, of_bin: Array, rank: int) -> Any:
     """The value of a rank, from 1, in ascending order, of numbers that are not negative; NaN counts as infinite.
-
-    counts: (BINS,), of_bin: (n + 1,), for the work. First the bin of the value is found, by its upper bits.
-    """
+    counts: (BINS,), of_bin: (n + 1,), for the work. First the bin of the value is found, by its upper bits."""
     for i in range(len(values)):
         values[i] = values[i] if values[i] == values[i] else np.float32(math.inf)
     bits = values.view(np.int32)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,9 +23,7 @@ Stop = Callable[[Array, int, Pair, int], bool]
 @dataclasses.dataclass(eq=False)
 class Pool:
     """The best models of a pair, F (k, 9) float32 with descending scores (k,), of which `filled` are there.
-
-    samples: minimal samples drawn.
-    """
+    samples: minimal samples drawn."""
 
     F: Array
     score: Array
@@ -60,22 +58,15 @@ class Verified(NamedTuple):
     score: Array
 
 
-@runtime_checkable
-class Degeneracy(Protocol):
-    """Completes the best model of a round where its sample is degenerate."""
-
-    def __call__(self, hypotheses: Hypotheses, models: Verified, best: float, pair: Pair) -> Verified:
-        """The models of a round with those completed. best: the score to beat."""
-        ...
+Degeneracy = Callable[[Hypotheses, Verified, float, Pair], Verified]
+"""The models of a round, the best one completed where its sample is degenerate; the number is the score to beat."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Search:
     """Rounds of minimal samples: drawn, solved, scored, the best kept.
-
     pool: the best models that are kept. hypotheses: samples drawn at most. round: samples between two looks at the
-    stopping rule, None: never before `hypotheses`.
-    """
+    stopping rule, None: never before `hypotheses`."""
 
     family: Family
     sampler: Sampler
@@ -109,9 +100,7 @@ class Search:
 @kernel(holds_gil=True)
 def merge(F: F4x2, which: I8x1, score: F8x1, filled: int, pool: F4x2, pool_score: F8x1) -> int:
     """Models F[which] (m, 9) with scores (k,) among the best so far -> pool (p, 9); how many there are.
-
-    filled: places of the pool in use, which are sorted, best first. A score that is not finite is that of no model.
-    """
+    filled: places of the pool in use, which are sorted, best first. A score that is not finite is that of no model."""
     for k in range(len(which)):
         if not math.isfinite(score[k]) or (filled == len(pool_score) and not score[k] > pool_score[filled - 1]):
             continue

@@ -18,9 +18,6 @@ from torch import Tensor
 
 from fmtorch.jit.kernel import Array, inner
 
-# exp and log by arithmetic alone, compiled: the same operations, hence the same bits, as in the tensor form
-
-
 ROOT2, LOG2, LOG10 = math.sqrt(2), 0.6931471805599453, 2.302585092994046
 
 
@@ -69,11 +66,9 @@ def gradient_wanted(*inputs: object) -> bool:
 
 def stable_sum(x: Tensor, dim: int = -1) -> Tensor:
     """The sum over `dim` in a balanced binary tree that trailing zeros do not change.
-
     With h the largest power of two below n, element i is added to element i + h, then h is halved: the tree over the
     length rounded up to a power of two, in which absent elements are zeros. Padding with zeros, however long, leaves
-    every bit as it is. The rounding error grows with log2(n).
-    """
+    every bit as it is. The rounding error grows with log2(n)."""
     dim = dim % x.dim()
     n = x.shape[dim]
     if n == 0:
@@ -92,9 +87,7 @@ SMALL = 1 << 13  # elements up to which a cumulative sum takes less time than on
 
 def component_sum(x: Tensor, dim: int = 0) -> Tensor:
     """The sum over a short axis of fixed length, in order; of float64 numbers of any layout the same bits.
-
-    Small tensors are summed by a cumulative sum, which is sequential by definition: one call instead of many.
-    """
+    Small tensors are summed by a cumulative sum, which is sequential by definition: one call instead of many."""
     if x.numel() <= SMALL and x.dtype == torch.float64 and not x.is_cuda and not x.requires_grad:
         return x.cumsum(dim).select(dim, -1)
     first, *rest = x.unbind(dim)
@@ -162,11 +155,9 @@ def unit(x: Float[Tensor, " c *s"]) -> Float[Tensor, " c *s"]:
 
 def sqrt(x: Tensor) -> Tensor:
     """The square root of float32 or float64 numbers, rounded correctly on every processor; NaN below zero.
-
     On a CPU by NumPy, which takes the processor's instruction, as kernels do: `torch.sqrt` asks a vector library, which
     on an AMD EPYC is an ulp off for every fifth float32 and every seventieth float64 number.
-    The gradient is that of the root, and 0 instead of infinite where the root is 0.
-    """
+    The gradient is that of the root, and 0 instead of infinite where the root is 0."""
     if torch.is_grad_enabled() and x.requires_grad:
         return cast(Tensor, _Sqrt.apply(x))  # type: ignore[no-untyped-call]
     return _sqrt(x)

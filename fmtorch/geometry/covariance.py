@@ -31,9 +31,6 @@ from fmtorch.geometry.arithmetic import cofactors, component_sum, determinant, s
 from fmtorch.geometry.epipolar import inverse_root
 from fmtorch.geometry.matrices import complement
 
-# Information of matches about a two-view estimate, and their noise; see `two_view_covariance`
-
-
 PARAMETERS = 7
 WINDOW = 2.5  # noises within which distances are taken to be those of right matches
 WINDOW_SHARE = 0.911256360935392  # `kept_share` of WINDOW
@@ -69,12 +66,10 @@ def _cross(t: Tensor, A: Tensor) -> Tensor:
 
 def residual_slopes(F: Tensor, slopes: Tensor, a0: Tensor, a1: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Signed Sampson distances (b, n), their derivatives (7, b, n) by the parameters, and the noise in two of these.
-
     With e = a1^T F a0 and q the sum of the squares of both lines' normals, r = e / sqrt(q), and ``dr = de / sqrt(q)``
     at the points corrected to first order, where e is zero. Zero where a point is the epipole. The last are the
     covariances (2, 2, b, n) of the derivatives by the direction of translation, in squared noises of a point: where the
-    images have no parallax these derivatives are nothing but noise, in the three directions that are not corrected.
-    """
+    images have no parallax these derivatives are nothing but noise, in the three directions that are not corrected."""
     ones = torch.ones_like(a0[:1])
     line1 = component_sum(F[..., None] * torch.cat([a0, ones])[None], 1)
     line0 = component_sum(F[..., None] * torch.cat([a1, ones])[:, None], 0)
@@ -94,10 +89,8 @@ def residual_slopes(F: Tensor, slopes: Tensor, a0: Tensor, a1: Tensor) -> tuple[
 
 def explained_by_rotation(a0: Tensor, a1: Tensor, R: Tensor, f: Tensor, s: Tensor, near: Tensor) -> Tensor:
     """Whether points (2, b, n) move as a rotation near R (3, 3, b) says, up to their noise s (b, n): (b,).
-
     The rotation is fitted to the matches `near` (b, n), robustly; then half of its squared distances, in units of their
-    variance 2 s^2, are below the median of chi squared of two degrees, ln 4, as far as so many tell it.
-    """
+    variance 2 s^2, are below the median of chi squared of two degrees, ln 4, as far as so many tell it."""
     ones, count = torch.ones_like(a0[:1]), near.sum(-1)
     rays = torch.cat([a0 / f[0, :, None], ones])
     target = a1 / f[1, :, None]
@@ -136,10 +129,8 @@ def kept_share(c: Tensor) -> Tensor:
 
 def noise_of(r: Tensor, w: Tensor, T: Tensor, parameters: Tensor) -> Tensor:
     """s (b,): ``s^2 = sum w r^2 / (share (sum w - p share sum w^2 / sum w))`` within WINDOW s, iterated from 0.6 T.
-
     Within a window the share m / A of the variance is left; p parameters have taken theirs of that. At most T. Without
-    a limit it is started at the root mean square; of fewer matches than parameters it is not estimated.
-    """
+    a limit it is started at the root mean square; of fewer matches than parameters it is not estimated."""
     # Of each match: its count, weight, squared weight, weighted square of the distance.
     summands = torch.stack([(w > 0).to(r.dtype), w, w * w, w * r * r])
     _, total, _, square = stable_sum(summands)
@@ -189,9 +180,7 @@ class TwoViewCovariance(NamedTuple):
     @property
     def deviation_degrees(self) -> Float[Tensor, "b 2"]:
         """Root mean squared angles of rotation and of the direction of translation, in degrees.
-
-        Where nothing is known of them they are some 132 and 98 degrees.
-        """
+        Where nothing is known of them they are some 132 and 98 degrees."""
         variances = self.covariance.diagonal(dim1=-2, dim2=-1)
         turned, shifted = component_sum(variances[:, :3], -1), component_sum(variances[:, 3:5], -1)
         return torch.rad2deg(sqrt(torch.stack([turned, shifted], -1)))
@@ -283,9 +272,7 @@ def two_view_covariance(
 
 def _valid(*given: Tensor) -> tuple[Tensor, list[Tensor]]:
     """Whether the pairs have cameras, and those, float64, in whose place others stand where they have none.
-
-    given: R, t, focal, principal0, principal1, truncation, focal_precision.
-    """
+    given: R, t, focal, principal0, principal1, truncation, focal_precision."""
     R, t, focal, _, _, truncation, _ = given = tuple(a.to(torch.float64) for a in given)
     finite = [a.isfinite().flatten(1).all(1) for a in given if a is not truncation]
     valid = torch.stack([*finite, (t != 0).any(-1), (focal > 0).all(-1), truncation > 0]).all(0)
@@ -323,10 +310,8 @@ def _covariance(information: Tensor, Pi: Tensor, used: Tensor) -> Tensor:
 
 def _without(C: Tensor, share: Tensor) -> Tensor:
     """The covariance (7, 7, b) with a share (b,) of the information about the direction of translation taken away.
-
     The other parameters keep their distribution given that direction, whose own covariance becomes larger. What
-    `DIFFUSE` knows of it stays.
-    """
+    `DIFFUSE` knows of it stays."""
     S, eye = _inverse(C[3:5, 3:5]), torch.eye(2, dtype=C.dtype, device=C.device)[..., None]
     diffuse_information = eye * DIFFUSE[3] ** -2
     grown = _inverse(_positive_part(S * (1 - share) - diffuse_information) + diffuse_information)

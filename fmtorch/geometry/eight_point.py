@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from fmtorch.geometry import matrices
 from fmtorch.geometry.arithmetic import stable_sum
-from fmtorch.geometry.eigenvector import smallest_eigenvector
-from fmtorch.geometry.matrices import EPS, nearest_rank2, nearest_rank2_kernel
+from fmtorch.geometry.matrices import EPS, nearest_rank2_kernel, smallest_eigenvector_kernel, unit_kernel
 from fmtorch.geometry.normalize import canonical, denormalize_fundamental, normalize_points
 from fmtorch.geometry.null_space import equations, gather, null_space
 from fmtorch.geometry.pose import consistently_oriented
@@ -56,48 +56,20 @@ def eight_point(
         >>> bool(valid), bool((sampson(F, x0, x1) < 1e-6).all())
         (True, True)
     """
-    F, valid = fundamental_of(NormalEquations.of(x0, x1, weight, mask))
-    return F.to(x0.dtype), valid
-
-
-class NormalEquations(NamedTuple):
-    """What the eight-point algorithm needs to know of a set of matches, however many these are.
-
-    M: the sum of w a a^T over normalised matches. T0, T1: the similarities that normalise the points. valid: whether
-    everything was finite.
-    """
-
-    M: Float[Tensor, "*batch 9 9"]
-    T0: Float[Tensor, "*batch 3 3"]
-    T1: Float[Tensor, "*batch 3 3"]
-    valid: Bool[Tensor, "*batch"]
-
-    @classmethod
-    def of(cls, x0: Tensor, x1: Tensor, weight: Tensor | None = None, mask: Tensor | None = None) -> NormalEquations:
-        """Arguments as of `eight_point`."""
-        x0d, x1d, w, valid = finite_matches(x0, x1, weight, mask)
-        x0n, T0 = normalize_points(x0d, weight=w)
-        x1n, T1 = normalize_points(x1d, weight=w)
-        return cls(normal_matrix(x0n, x1n, w), T0, T1, valid)
-
-
-def fundamental_of(equations: NormalEquations) -> tuple[Float[Tensor, "*batch 3 3"], Bool[Tensor, "*batch"]]:
-    """The fundamental matrices, float64, and which are valid, as of `eight_point`."""
-    f, determined = smallest_eigenvector(equations.M)
-    linear = f.reshape(*f.shape[:-1], 3, 3)
-    F = canonical(denormalize_fundamental(nearest_rank2(linear), equations.T0, equations.T1))
-    valid = equations.valid & determined & (F.detach() != 0).any(-1).any(-1)
-    return torch.where(valid[..., None, None], F, 0.0), valid
+    a, b, w, finite = finite_matches(x0, x1, weight, mask)
+    (a, T0), (b, T1) = normalize_points(a, weight=w), normalize_points(b, weight=w)
+    linear, determined = linear_fundamental(a, b, w)
+    F = canonical(denormalize_fundamental(matrices.nearest_rank2(linear), T0, T1))
+    valid = finite & determined & (F.detach() != 0).any(-1).any(-1)
+    return torch.where(valid[..., None, None], F, 0.0).to(x0.dtype), valid
 
 
 def linear_fundamental(
     x0: Float[Tensor, "*points n 2"], x1: Float[Tensor, "*points n 2"], weight: Float[Tensor, "*batch n"]
 ) -> tuple[Float[Tensor, "*batch 3 3"], Bool[Tensor, "*batch"]]:
     """The F of unit norm, of any rank, that minimises sum w (x1^T F x0)^2; False where it is not determined.
-
-    Arguments as of `normal_matrix`.
-    """
-    f, determined = smallest_eigenvector(normal_matrix(x0, x1, weight))
+    Arguments as of `normal_matrix`."""
+    f, determined = matrices.smallest_eigenvector(normal_matrix(x0, x1, weight))
     return f.reshape(*f.shape[:-1], 3, 3), determined
 
 
@@ -105,10 +77,8 @@ def normal_matrix(
     x0: Float[Tensor, "*points n 2"], x1: Float[Tensor, "*points n 2"], weight: Float[Tensor, "*batch n"]
 ) -> Float[Tensor, "*batch 9 9"]:
     """The sum of w a a^T, with a . vec(F) = x1^T F x0.
-
     Expects normalised float64 points, finite, with weight zero for those that do not count. The points' leading shape
-    broadcasts against that of the weights.
-    """
+    broadcasts against that of the weights."""
     # a = x1 (x) x0, so M holds the sums of w (x1 x1^T) (x) (x0 x0^T): 6 x 6 different ones, in parts that fit a cache.
     p0, p1 = _products(x0), weight[..., None, :] * _products(x1)
     rows = [stable_sum(part[..., :, None, :] * p0[..., None, :, :], -1) for part in p1.chunk(3, -2)]
@@ -143,15 +113,12 @@ def finite_matches(
 # The eight-point algorithm on the samples of one pair, and weighted on its matches, compiled; float64
 
 WIDTH = 32  # partial sums over the matches: part of the last bits of a weighted fit
-SHIFT, RANK_TOLERANCE, SQUARINGS = 1e-14, 1e-12, 14  # as in `eigenvector`
 
 
 @kernel
 def eight_point_kernel(points: F8x2, sample: I8x2, F: F4x2, draw: I8x1) -> int:
     """Consistently oriented models of samples (8, s) of points (4, n) -> F (s, 9), draw (s,); how many there are.
-
-    The models stand in the order of the samples. Buffers are rows of LANES numbers, one per sample.
-    """
+    The models stand in the order of the samples. Buffers are rows of LANES numbers, one per sample."""
     X, N, A, B = matrix(32, LANES), matrix(32, LANES), matrix(72, LANES), matrix(9, LANES)
     work, there = matrix(8, LANES), np.empty((1, LANES), np.bool_)
     centre, scale, f = matrix(4, LANES), matrix(2, LANES), vector(9)
@@ -168,12 +135,9 @@ def eight_point_kernel(points: F8x2, sample: I8x2, F: F4x2, draw: I8x1) -> int:
             nearest_rank2_kernel(f)
             for image in range(2):
                 _denormalise(f, image, scale[image, lane], centre[2 * image, lane], centre[2 * image + 1, lane])
-            norm = 0.0
+            norm = unit_kernel(f)
             for q in range(9):
-                norm += f[q] * f[q]
-            norm = math.sqrt(norm)
-            for q in range(9):
-                B[q, lane] = f[q] / norm
+                B[q, lane] = f[q]
             there[0, lane] &= norm > 0 and math.isfinite(norm)
         store(there, 0, load(there, 0) & consistently_oriented(B, X, 8))
         for lane in range(min(LANES, sample.shape[1] - first)):
@@ -222,9 +186,7 @@ def _denormalise(f: Array, image: int, s: float, cx: float, cy: float) -> None:
 @kernel
 def weighted_eight_point(points: F8x2, weight: F8x1, F: F8x1) -> bool:
     """The F of least sum w (x1^T F x0)^2, made rank two, of unit norm, largest entry positive -> F (9,).
-
-    `eight_point.eight_point` of points (4, n) and weights (n,), not negative: whether there is one.
-    """
+    `eight_point.eight_point` of points (4, n) and weights (n,), not negative: whether there is one."""
     n, largest = len(weight), 0.0
     for i in range(n):
         largest = max(largest, weight[i])
@@ -308,62 +270,3 @@ def _normal_matrix(X: Array, w: Array) -> Array:
         for j in range(9):
             M[i, j] = _added(sums[6 * product[i // 3, j // 3] + product[i % 3, j % 3]])
     return M
-
-
-@inner
-def smallest_eigenvector_kernel(M: Array, v: Array) -> bool:
-    """`eigenvector.smallest_eigenvector` of a symmetric matrix (n, n), overwritten -> v; whether it is determined."""
-    n, trace = len(M), 0.0
-    for i in range(n):
-        trace += M[i, i]
-    if not (trace > 0 and math.isfinite(trace)):
-        return False
-    L, X, Y = np.eye(n), matrix(n, n), matrix(n, n)
-    pivot = vector(n)
-    for i in range(n):
-        for j in range(n):
-            M[i, j] /= trace
-        M[i, i] += SHIFT
-    for k in range(n):  # M = L D L^T; L becomes the inverse of L
-        pivot[k] = max(M[k, k], SHIFT / 2)
-        for i in range(k + 1, n):
-            factor = M[i, k] / pivot[k]
-            for j in range(k + 1):
-                L[i, j] -= factor * L[k, j]
-            for j in range(k + 1, n):
-                M[i, j] -= factor * M[k, j]
-    size = 0.0
-    for i in range(n):
-        for j in range(n):
-            total = 0.0
-            for k in range(n):
-                total += L[k, i] / pivot[k] * L[k, j]
-            X[i, j] = total
-        size += X[i, i]
-    inverse = X / size
-    X = inverse.copy()
-    for _ in range(SQUARINGS):
-        trace = 0.0
-        for i in range(n):
-            for j in range(n):
-                Y[i, j] = 0.0
-            for k in range(n):
-                for j in range(n):
-                    Y[i, j] += X[i, k] * X[k, j]
-            trace += Y[i, i]
-        for i in range(n):
-            for j in range(n):
-                X[i, j] = Y[i, j] / trace
-        if trace > 1 - 1e-14:
-            break
-    best, norm, along = 0, 0.0, 0.0
-    for i in range(n):
-        best = i if X[i, i] > X[best, best] else best
-    for i in range(n):
-        norm += X[best, i] * X[best, i]
-    for i in range(n):
-        v[i] = X[best, i] / math.sqrt(norm)
-    for i in range(n):
-        for j in range(n):
-            along += v[i] * inverse[i, j] * v[j]
-    return (1 - along) * size * RANK_TOLERANCE < 1

@@ -17,6 +17,10 @@ from torch import Tensor
 from fmtorch.jit.kernel import Array, Inner, inner
 from fmtorch.jit.lanes import lanes, where
 
+Matrix = Float[Tensor, "*#batch 3 3"]
+Points = Float[Tensor, "*#batch n 2"]
+PerMatch = Float[Tensor, "*#batch n"]
+
 
 def unit_frobenius(F: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
     """F divided by its Frobenius norm; the zero matrix stays zero, with finite gradients."""
@@ -27,7 +31,7 @@ def unit_frobenius(F: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"
     return F * inverse_root(squared)[..., None, None]
 
 
-def epipolar_lines(F: Float[Tensor, "*#batch 3 3"], x0: Float[Tensor, "*#batch n 2"]) -> Float[Tensor, "*#batch n 3"]:
+def epipolar_lines(F: Matrix, x0: Points) -> Float[Tensor, "*#batch n 3"]:
     """The lines (a, b, c) of x0 in image 1, ``a x + b y + c = 0`` with a^2 + b^2 = 1; pass ``F.mT`` for image 0.
 
     Where a = b = 0 (the epipole, or the line at infinity) the line is returned unscaled, as OpenCV does.
@@ -45,7 +49,7 @@ def epipolar_lines(F: Float[Tensor, "*#batch 3 3"], x0: Float[Tensor, "*#batch n
     return torch.stack([a, b, c], -1) * scale[..., None]
 
 
-def point_to_line(x: Float[Tensor, "*#batch n 2"], line: Float[Tensor, "*#batch n 3"]) -> Float[Tensor, "*#batch n"]:
+def point_to_line(x: Points, line: Float[Tensor, "*#batch n 3"]) -> PerMatch:
     """Distance in pixels of each point to its line (a, b, c) of any scale; 0 where a = b = 0.
 
     Args:
@@ -59,70 +63,41 @@ def point_to_line(x: Float[Tensor, "*#batch n 2"], line: Float[Tensor, "*#batch 
     return (a * x[..., 0] + b * x[..., 1] + c).abs() * inverse_root(a * a + b * b)
 
 
-def algebraic(
-    F: Float[Tensor, "*#batch 3 3"], x0: Float[Tensor, "*#batch n 2"], x1: Float[Tensor, "*#batch n 2"]
-) -> Float[Tensor, "*#batch n"]:
-    """The signed algebraic residual ``x1^T F x0``, in units of F.
-
-    Arguments and shape as of `sampson`.
-    """
+def algebraic(F: Matrix, x0: Points, x1: Points) -> PerMatch:
+    """The signed algebraic residual ``x1^T F x0``, in units of F; arguments and shape as of `sampson`."""
     a, b, c = lines_through(F, x0)
     return a * x1[..., 0] + b * x1[..., 1] + c
 
 
-def epipolar_distances(
-    F: Float[Tensor, "*#batch 3 3"], x0: Float[Tensor, "*#batch n 2"], x1: Float[Tensor, "*#batch n 2"]
-) -> tuple[Float[Tensor, "*#batch n"], Float[Tensor, "*#batch n"]]:
+def epipolar_distances(F: Matrix, x0: Points, x1: Points) -> tuple[PerMatch, PerMatch]:
     """Point-to-line distances in pixels: of x0 to the line ``F^T x1`` in image 0, of x1 to ``F x0`` in image 1.
 
-    Args:
-        F: fundamental matrices (..., 3, 3), of any scale and sign.
-        x0: points in image 0, (..., N, 2), px.
-        x1: their matches in image 1, (..., N, 2), px.
-
-    Returns:
-        Two tensors (..., N), at least 0: in image 0, in image 1.
+    Arguments as of `sampson`. Two tensors (..., N), at least 0: in image 0, in image 1.
     """
     e, squared0, squared1 = residual_and_normals(F, x0, x1)
     return e.abs() * inverse_root(squared0), e.abs() * inverse_root(squared1)
 
 
-def symmetric_mean(
-    F: Float[Tensor, "*#batch 3 3"], x0: Float[Tensor, "*#batch n 2"], x1: Float[Tensor, "*#batch n 2"]
-) -> Float[Tensor, "*#batch n"]:
-    """Mean of the two point-to-line distances, in pixels.
-
-    Arguments and shape as of `sampson`.
-    """
+def symmetric_mean(F: Matrix, x0: Points, x1: Points) -> PerMatch:
+    """Mean of the two point-to-line distances, in pixels; arguments and shape as of `sampson`."""
     d0, d1 = epipolar_distances(F, x0, x1)
     return (d0 + d1) / 2
 
 
-def symmetric_max(
-    F: Float[Tensor, "*#batch 3 3"], x0: Float[Tensor, "*#batch n 2"], x1: Float[Tensor, "*#batch n 2"]
-) -> Float[Tensor, "*#batch n"]:
-    """Larger of the two point-to-line distances, in pixels.
-
-    Arguments and shape as of `sampson`.
-    """
+def symmetric_max(F: Matrix, x0: Points, x1: Points) -> PerMatch:
+    """Larger of the two point-to-line distances, in pixels; arguments and shape as of `sampson`."""
     d0, d1 = epipolar_distances(F, x0, x1)
     return torch.maximum(d0, d1)
 
 
-def symmetric_squared(
-    F: Float[Tensor, "*#batch 3 3"], x0: Float[Tensor, "*#batch n 2"], x1: Float[Tensor, "*#batch n 2"]
-) -> Float[Tensor, "*#batch n"]:
-    """Sum of the two squared point-to-line distances, in squared pixels (Hartley & Zisserman, eq. 11.10).
-
-    Arguments and shape as of `sampson`.
-    """
+def symmetric_squared(F: Matrix, x0: Points, x1: Points) -> PerMatch:
+    """Sum of the two squared point-to-line distances, in squared pixels (Hartley & Zisserman, eq. 11.10);
+    arguments and shape as of `sampson`."""
     d0, d1 = epipolar_distances(F, x0, x1)
     return d0 * d0 + d1 * d1
 
 
-def sampson(
-    F: Float[Tensor, "*#batch 3 3"], x0: Float[Tensor, "*#batch n 2"], x1: Float[Tensor, "*#batch n 2"]
-) -> Float[Tensor, "*#batch n"]:
+def sampson(F: Matrix, x0: Points, x1: Points) -> PerMatch:
     """Sampson distance in pixels: |x1^T F x0| over the norm of its gradient (Hartley & Zisserman, eq. 11.9).
 
     Args:
@@ -144,13 +119,8 @@ def sampson(
     return e.abs() * inverse_root(squared0 + squared1)
 
 
-def sampson_squared(
-    F: Float[Tensor, "*#batch 3 3"], x0: Float[Tensor, "*#batch n 2"], x1: Float[Tensor, "*#batch n 2"]
-) -> Float[Tensor, "*#batch n"]:
-    """Squared Sampson distance, in squared pixels.
-
-    Arguments and shape as of `sampson`.
-    """
+def sampson_squared(F: Matrix, x0: Points, x1: Points) -> PerMatch:
+    """Squared Sampson distance, in squared pixels; arguments and shape as of `sampson`."""
     distance = sampson(F, x0, x1)
     return distance * distance
 
@@ -172,18 +142,14 @@ def lines_through(F: Tensor, x: Tensor) -> list[Tensor]:
 
 def inverse_root(squared: Tensor) -> Tensor:
     """1 / sqrt(squared), and 0 with zero gradient where squared = 0.
-
-    On a CPU `rsqrt` rounds root and quotient correctly, one after the other, as `arithmetic.sqrt` and a division do.
-    """
+    On a CPU `rsqrt` rounds root and quotient correctly, one after the other, as `arithmetic.sqrt` and a division do."""
     positive = squared != 0  # NaN stays NaN
     return torch.where(positive, torch.where(positive, squared, 1.0).rsqrt(), 0.0)
 
 
 def unit_largest(matrix: Tensor) -> Tensor:
     """A homogeneous matrix scaled so that squares neither under- nor overflow.
-
-    The scale is a constant to autograd: what is computed from the matrix does not depend on it.
-    """
+    The scale is a constant to autograd: what is computed from the matrix does not depend on it."""
     largest = matrix.detach().abs().amax((-2, -1), keepdim=True)
     return matrix / torch.where(largest == 0, 1.0, largest)
 
@@ -193,21 +159,14 @@ def unit_largest(matrix: Tensor) -> Tensor:
 TINY = 1e-30  # squared slope of the epipolar constraint below which it is taken for this, in fits
 
 
-def homogeneous(points: Float[Tensor, " 4 *s"]) -> Float[Tensor, " 2 3 *s"]:
-    """x0, y0, x1, y1 as homogeneous points of the two images."""
-    return torch.cat([points.reshape(2, 2, *points.shape[1:]), torch.ones_like(points[:2])[:, None]], 1)
-
-
 def linearise(
-    F: Float[Tensor, "9 p k"], points: Float[Tensor, "2 3 m p 1 lanes"], derivatives: bool = True
-) -> tuple[Tensor, Float[Tensor, "m p k lanes"], Float[Tensor, "m p k lanes"], Float[Tensor, "m p k lanes"]]:
-    """The Sampson residual ``r = e / g`` and its Jacobian: g J (3, 3, m, p, k, lanes), then e, 1 / g^2, and r^2.
-
+    F: Float[Tensor, "9 p k"], points: Float[Tensor, "4 p n"], derivatives: bool = True
+) -> tuple[Tensor, Float[Tensor, "p k n"], Float[Tensor, "p k n"], Float[Tensor, "p k n"]]:
+    """The Sampson residual ``r = e / g`` and its Jacobian: g J (3, 3, p, k, n), then e, 1 / g^2, and r^2.
     ``g dr = x1^T dF x0 - (e / g^2) ((F x0)^T D dF x0 + x1^T dF D F^T x1)`` with ``D = diag(1, 1, 0)``: the sum of two
-    products of a column and a row. points: homogeneous. Without derivatives the first is empty.
-    """
-    x0, x1 = points
-    rows = F.reshape(3, 3, 1, *F.shape[1:], 1)
+    products of a column and a row. points: x0, y0, x1, y1. Without derivatives the first is empty."""
+    x0, x1 = (torch.cat([x, torch.ones_like(x[:1])])[:, :, None] for x in (points[:2], points[2:]))
+    rows = F.reshape(3, 3, *F.shape[1:], 1)
     line1 = torch.addcmul(torch.addcmul(rows[:, 2], rows[:, 0], x0[0]), rows[:, 1], x0[1])  # F x0
     line0 = torch.addcmul(torch.addcmul(rows[2, :2], rows[0, :2], x1[0]), rows[1, :2], x1[1])  # F^T x1
     slope1 = line1[:2]
@@ -234,7 +193,6 @@ TINY32, TINY_OF_KERNEL = np.finfo(np.float32).tiny, float(np.finfo(np.float64).t
 
 class Residual(NamedTuple):
     """Three inner functions of one residual. name: unique, part of the names of the kernels that are made of it.
-
     of_row(f, rows, row): squared residuals of SINGLES matches, float32, times their scale. of_match(f, x0, y0, x1, y1):
     the square of one, in the type of its arguments. within(f, x0, y0, x1, y1, limit): whether that is within a limit.
     """
@@ -246,7 +204,7 @@ class Residual(NamedTuple):
 
 
 @inner
-def _sampson(f: Array, x0: Any, y0: Any, x1: Any, y1: Any) -> tuple[Any, Any]:
+def sampson_parts(f: Array, x0: Any, y0: Any, x1: Any, y1: Any) -> tuple[Any, Any]:
     """The epipolar error, and the square of its slope."""
     a0, b0 = f[0] * x0 + f[1] * y0 + f[2], f[3] * x0 + f[4] * y0 + f[5]
     e = f[6] * x0 + f[7] * y0 + f[8] + a0 * x1 + b0 * y1
@@ -256,19 +214,19 @@ def _sampson(f: Array, x0: Any, y0: Any, x1: Any, y1: Any) -> tuple[Any, Any]:
 
 @inner
 def _sampson_of_row(f: Array, rows: Array, row: int) -> Any:
-    e, slope = _sampson(f, load(rows, row), load(rows, row + 1), load(rows, row + 2), load(rows, row + 3))
+    e, slope = sampson_parts(f, load(rows, row), load(rows, row + 1), load(rows, row + 2), load(rows, row + 3))
     return e * e / where(slope > TINY32, slope, TINY32) * load(rows, row + 4)
 
 
 @inner
 def _sampson_of_match(f: Array, x0: Any, y0: Any, x1: Any, y1: Any) -> Any:
-    e, slope = _sampson(f, x0, y0, x1, y1)
+    e, slope = sampson_parts(f, x0, y0, x1, y1)
     return e * e / (slope if slope > TINY_OF_KERNEL else TINY_OF_KERNEL)
 
 
 @inner
 def _sampson_within(f: Array, x0: Any, y0: Any, x1: Any, y1: Any, limit: Any) -> Any:
-    e, slope = _sampson(f, x0, y0, x1, y1)
+    e, slope = sampson_parts(f, x0, y0, x1, y1)
     return e * e <= limit * slope
 
 

@@ -13,11 +13,18 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from fmtorch.geometry.arithmetic import cofactors, determinant, matmul3, stable_sum
-from fmtorch.geometry.eigenvector import smallest_eigenvector
-from fmtorch.geometry.eight_point import finite_matches, smallest_eigenvector_kernel
-from fmtorch.geometry.epipolar import inverse_root, lines_through, unit_frobenius, unit_largest
+from fmtorch.geometry.eight_point import finite_matches
+from fmtorch.geometry.epipolar import (
+    Matrix,
+    PerMatch,
+    Points,
+    inverse_root,
+    lines_through,
+    unit_frobenius,
+    unit_largest,
+)
 from fmtorch.geometry.homography_refine import linearise_homography
-from fmtorch.geometry.matrices import EPS, unit_kernel
+from fmtorch.geometry.matrices import EPS, smallest_eigenvector, smallest_eigenvector_kernel, unit_kernel
 from fmtorch.geometry.normalize import normalize_points
 from fmtorch.geometry.null_space import gather
 from fmtorch.jit.kernel import Array, F4x2, F8x1, F8x2, I8x1, I8x2, inner, kernel, matrix, vector
@@ -40,10 +47,7 @@ def homography(
     float64, returned in x0's type.
 
     Args:
-        x0: points of image 0, pixels.
-        x1: their matches in image 1.
-        weight: of each match, not negative, any scale; 1 by default.
-        mask: True for a real match; all by default.
+        x0, x1, weight, mask: as of `eight_point`.
 
     Returns:
         H, and whether it is valid. Invalid (H = 0): fewer than eight independent equations (too few points, coincident
@@ -66,15 +70,16 @@ def homography(
     depth = lines_through(linear.detach(), a.detach())[2]
     side = stable_sum(torch.where(depth > 0, w, -w).detach(), -1)
     regular = determinant(linear.detach().movedim((-2, -1), (0, 1))).abs() > SINGULAR
-    H = unit_frobenius(matmul3(matmul3(_inverse_similarity(T1), linear), T0))
+    s, zero = T1[..., 0, 0], torch.zeros_like(T1[..., 0, 0])
+    rows = [torch.ones_like(s), zero, -T1[..., 0, 2], zero, torch.ones_like(s), -T1[..., 1, 2], zero, zero, s]
+    back = torch.stack(rows, -1).reshape(T1.shape)  # a multiple of the inverse of [s, 0, tx; 0, s, ty; 0, 0, 1]
+    H = unit_frobenius(matmul3(matmul3(back, linear), T0))
     H = torch.where((side < 0)[..., None, None], -H, H)
     valid = finite & determined & regular
     return torch.where(valid[..., None, None], H, 0.0).to(x0.dtype), valid
 
 
-def homography_points(
-    H: Float[Tensor, "*#batch 3 3"], x0: Float[Tensor, "*#batch n 2"]
-) -> Float[Tensor, "*#batch n 2"]:
+def homography_points(H: Matrix, x0: Points) -> Points:
     """The points of image 1 that H maps x0 to, in pixels; infinite on its horizon.
 
     Args:
@@ -90,9 +95,7 @@ def homography_points(
     return torch.where(seen[..., None], torch.stack([X * by, Y * by], -1), torch.inf)
 
 
-def homography_transfer(
-    H: Float[Tensor, "*#batch 3 3"], x0: Float[Tensor, "*#batch n 2"], x1: Float[Tensor, "*#batch n 2"]
-) -> tuple[Float[Tensor, "*#batch n"], Float[Tensor, "*#batch n"]]:
+def homography_transfer(H: Matrix, x0: Points, x1: Points) -> tuple[PerMatch, PerMatch]:
     """Transfer distances in pixels: from ``H^-1 x1`` to x0 in image 0, from ``H x0`` to x1 in image 1.
 
     Infinite on a horizon, and in image 0 where H is singular. Their squares add up to the symmetric transfer error
@@ -117,21 +120,11 @@ def homography_transfer(
     return _distance(homography_points(adjugate, x1), x0), _distance(homography_points(H, x0), x1)
 
 
-def homography_sampson(
-    H: Float[Tensor, "*#batch 3 3"], x0: Float[Tensor, "*#batch n 2"], x1: Float[Tensor, "*#batch n 2"]
-) -> Float[Tensor, "*#batch n"]:
+def homography_sampson(H: Matrix, x0: Points, x1: Points) -> PerMatch:
     """Sampson distance of a homography in pixels: of both images together (Hartley & Zisserman, section 4.2.6).
 
     The length of the least correction of x0 and x1 that makes ``x1 ~ H x0`` hold to first order: of small errors the
-    distance to the nearest exact match.
-
-    Args:
-        H: homographies (..., 3, 3), of any scale and sign.
-        x0: points in image 0, (..., N, 2), px.
-        x1: their matches in image 1, (..., N, 2), px.
-
-    Returns:
-        (..., N), at least 0.
+    distance to the nearest exact match. Arguments as of `homography_transfer`, (..., N).
     """
     h = unit_largest(H.to(torch.float64)).flatten(-2).movedim(-1, 0)[..., None]
     shape = np.broadcast_shapes(x0.shape, x1.shape)
@@ -158,13 +151,6 @@ def _normal_matrix(x0: Tensor, x1: Tensor, w: Tensor) -> Float[Tensor, "*batch 9
     return torch.cat([torch.cat(row, -1) for row in ((S, zero, X), (zero, S, Y), (X, Y, R))], -2)
 
 
-def _inverse_similarity(T: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
-    """A multiple of the inverse of [s, 0, tx; 0, s, ty; 0, 0, 1]."""
-    zero, s = torch.zeros_like(T[..., 0, 0]), T[..., 0, 0]
-    rows = [torch.ones_like(s), zero, -T[..., 0, 2], zero, torch.ones_like(s), -T[..., 1, 2], zero, zero, s]
-    return torch.stack(rows, -1).reshape(T.shape)
-
-
 # Homographies of four matches each, compiled: the samples of one pair, LANES at a time, float64, models in float32
 
 ROUNDING = 16 * EPS  # of the area of three points on a line, relative to their coordinates and distances
@@ -174,12 +160,10 @@ SIZE = 4
 @kernel
 def four_point(points: F8x2, sample: I8x2, H: F4x2, draw: I8x1) -> int:
     """Homographies of samples (4, s) of points (4, n) -> H (s, 9), draw (s,), their samples; how many there are.
-
     points: rows x0, y0, x1, y1, of about unit scale. H: of unit norm, positive in the third coordinate of H x0 at the
     points of the sample. A sample gives none if three of its points lie on a line in either image, or if one of the
     four triangles is turned over between the images: then the points would lie on both sides of the plane's horizon, or
-    the plane would be seen from behind.
-    """
+    the plane would be seen from behind."""
     X, h, there = matrix(4 * SIZE, LANES), matrix(9, LANES), np.empty((1, LANES), np.bool_)
     work, models = matrix(6, LANES), 0
     for first in range(0, sample.shape[1], LANES):
@@ -239,9 +223,7 @@ def _homographies(X: Array, work: Array, h: Array) -> Any:
 @inner
 def _areas(X: Array, x: int, work: Array, out: int) -> Any:
     """D_1, D_2, D_3 of points X (16, LANES), whose x of the image are in row x -> rows of work from `out` on.
-
-    A mask: whether no three of the four points lie on a line, up to rounding.
-    """
+    A mask: whether no three of the four points lie on a line, up to rounding."""
     x3, y3 = load(X, 12 + x), load(X, 13 + x)
     largest = where(absolute(x3) > absolute(y3), absolute(x3), absolute(y3))
     longest, total = fill(0.0), fill(0.0)
@@ -263,6 +245,17 @@ def _areas(X: Array, x: int, work: Array, out: int) -> Any:
 
 
 # Homographies and the planes they stand for: ``x1 ~ H x0``. Matrices are (9,), row by row, points (4, n), float64
+
+
+@inner
+def in_pixels(H: Array, centre: Array, unit_px: float, out: Array) -> None:
+    """A homography of points about centres (4,), in units of so many pixels, as that of pixels -> out (9,)."""
+    for r in range(3):
+        out[3 * r], out[3 * r + 1] = H[3 * r] / unit_px, H[3 * r + 1] / unit_px
+        out[3 * r + 2] = H[3 * r + 2] - out[3 * r] * centre[0] - out[3 * r + 1] * centre[1]
+    for c in range(3):
+        out[c] = unit_px * out[c] + centre[2] * out[6 + c]
+        out[3 + c] = unit_px * out[3 + c] + centre[3] * out[6 + c]
 
 
 @inner
@@ -306,7 +299,6 @@ def cross_times(e: Array, A: Array, out: Array) -> None:
 @inner
 def plane_homography(F: Array, e1: Array, points: Array, triplet: Array, H: Array) -> bool:
     """The homography of the plane through the matches (3,) of a triplet that satisfy F -> H; if it is determined.
-
     ``H = A - e1 (M^-1 b)^T`` with ``A = [e1]_x F``, the rows of M the points in image 0, and
     ``b_i = (x1_i x (A x0_i)) . (x1_i x e1) / |x1_i x e1|^2`` (result 13.6). e1: the epipole in image 1, ``F^T e1 = 0``.
     """
@@ -340,9 +332,7 @@ def plane_homography(F: Array, e1: Array, points: Array, triplet: Array, H: Arra
 @inner
 def plane_and_parallax(H: Array, points: Array, i: int, j: int, F: Array) -> bool:
     """The fundamental matrix of a plane's homography and matches i and j off it -> F, of unit norm; if there is one.
-
-    ``F = [e1]_x H``: the lines through x1 and H x0 of both matches meet in the epipole e1 (section 13.2).
-    """
+    ``F = [e1]_x H``: the lines through x1 and H x0 of both matches meet in the epipole e1 (section 13.2)."""
     lines, e, size2 = matrix(2, 3), vector(3), 0.0
     for k in range(9):
         size2 += H[k] * H[k]
@@ -370,9 +360,7 @@ def plane_and_parallax(H: Array, points: Array, i: int, j: int, F: Array) -> boo
 @inner
 def least_squares_homography(points: Array, weight: Array, H: Array) -> bool:
     """The normalised DLT of matches (n,) by their weights, or of those inside -> H; whether it is determined.
-
-    Hartley & Zisserman (2004), algorithm 4.2.
-    """
+    Hartley & Zisserman (2004), algorithm 4.2."""
     T, S, M = matrix(2, 3), np.zeros((4, 3, 3)), np.zeros((9, 9))
     for image in range(2):
         if not _similarity(points[2 * image], points[2 * image + 1], weight, T[image]):

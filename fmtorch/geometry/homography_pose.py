@@ -7,8 +7,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from fmtorch.geometry.arithmetic import cofactors, component_sum, determinant, product, sqrt
-from fmtorch.geometry.eigenvector import smallest_eigenvector
 from fmtorch.geometry.homography import SINGULAR
+from fmtorch.geometry.matrices import smallest_eigenvector
+from fmtorch.geometry.normalize import Mask, Matrices, Points
+from fmtorch.geometry.pose import inverse, rays
 
 ITERATIONS = 2  # to the nearest rotation, from an error of 1e-8 at worst, which each squares
 FLAT = 1e-9  # of S, the squares of the stretch less one, below which there is no translation
@@ -31,12 +33,7 @@ class PlanePoses(NamedTuple):
 
 
 def poses_from_homography(
-    H: Float[Tensor, "*batch 3 3"],
-    K0: Float[Tensor, "*batch 3 3"],
-    K1: Float[Tensor, "*batch 3 3"],
-    x0: Float[Tensor, "*batch n 2"],
-    x1: Float[Tensor, "*batch n 2"],
-    mask: Bool[Tensor, "*batch n"] | None = None,
+    H: Matrices, K0: Matrices, K1: Matrices, x0: Points, x1: Points, mask: Mask | None = None
 ) -> PlanePoses:
     """Poses of two calibrated cameras before a plane, from its homography ``x1 ~ H x0``.
 
@@ -69,7 +66,7 @@ def poses_from_homography(
     kept = torch.ones_like(x0[..., 0], dtype=torch.bool) if mask is None else mask
     kept = kept & (x0.isfinite() & x1.isfinite()).all(-1)
     G, inverses, regular = _calibrated(H, K0, K1)
-    ray0, ray1 = (_rays(K, torch.where(kept[..., None], x, 0.0)) for K, x in zip(inverses, (x0, x1), strict=True))
+    ray0, ray1 = (rays(K, torch.where(kept[..., None], x, 0.0)) for K, x in zip(inverses, (x0, x1), strict=True))
     depth = component_sum(ray1 * component_sum(G[..., None] * ray0[None], 1))
     behind = _balance(depth, kept) < 0
     G, depth = torch.where(behind, -G, G), torch.where(behind[..., None], -depth, depth)
@@ -90,18 +87,14 @@ def poses_from_homography(
     return PlanePoses(R, t, n, poses[3].movedim(0, -1), valid.movedim(0, -1))
 
 
-def rotation_from_homography(
-    H: Float[Tensor, "*batch 3 3"], K0: Float[Tensor, "*batch 3 3"], K1: Float[Tensor, "*batch 3 3"]
-) -> tuple[Float[Tensor, "*batch 3 3"], Bool[Tensor, "*batch"]]:
+def rotation_from_homography(H: Matrices, K0: Matrices, K1: Matrices) -> tuple[Matrices, Bool[Tensor, "*batch"]]:
     """The rotation nearest to K1^-1 H K0, up to scale: of a camera that only turns ``H = K1 R K0^-1``.
 
     The unit quaternion that maximises the trace of R^T G is the eigenvector of a 4 x 4 matrix (Davenport 1968; Horn
     1987, Closed-form solution of absolute orientation using unit quaternions).
 
     Args:
-        H: homographies (..., 3, 3), of any scale and sign.
-        K0: calibration matrices (..., 3, 3) of image 0.
-        K1: those of image 1.
+        H, K0, K1: as of `poses_from_homography`.
 
     Returns:
         R with X1 = R X0, and whether there is one; where H or a calibration is singular or not finite, the identity.
@@ -129,17 +122,13 @@ def _calibrated(H: Tensor, K0: Tensor, K1: Tensor) -> tuple[Tensor, list[Tensor]
     H, K0, K1 = (torch.where(regular, A, eye) for A in (H, K0, K1))
     largest = H.abs().amax((0, 1))
     H = H / torch.where(largest > 0, largest, 1.0)
-    areas = [determinant(K) for K in (K0, K1)]
-    regular = regular & (areas[0] != 0) & (areas[1] != 0)
-    inverses = [
-        cofactors(K).transpose(0, 1) / torch.where(area != 0, area, 1.0)
-        for K, area in zip((K0, K1), areas, strict=True)
-    ]
-    G = product(product(inverses[1], H), K0)
+    (inverse0, regular0), (inverse1, regular1) = inverse(K0), inverse(K1)
+    regular = regular & regular0 & regular1
+    G = product(product(inverse1, H), K0)
     middle = sqrt(_middle_eigenvalue(product(G.transpose(0, 1), G)).clamp_min(0))
     G = G / torch.where(middle > 0, middle, 1.0)
     regular = regular & (middle > 0) & (determinant(G).abs() > SINGULAR)
-    return torch.where(regular, G, eye), [torch.where(regular, A, eye) for A in inverses], regular
+    return torch.where(regular, G, eye), [torch.where(regular, A, eye) for A in (inverse0, inverse1)], regular
 
 
 def _middle_eigenvalue(A: Tensor) -> Tensor:
@@ -183,12 +172,6 @@ def _decomposed(G: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     for _ in range(ITERATIONS):  # to the nearest rotation (Newton and Schulz)
         R = 1.5 * R - 0.5 * product(R, product(R.transpose(0, 1), R))
     return R, component_sum(R * star[None], 1), n
-
-
-def _rays(inverse: Tensor, x: Tensor) -> Tensor:
-    """K^-1 (x, y, 1): (3, *batch, n)."""
-    x, columns = x.to(torch.float64), inverse[..., None]
-    return columns[:, 0] * x[..., 0] + columns[:, 1] * x[..., 1] + columns[:, 2]
 
 
 def _balance(value: Tensor, kept: Tensor) -> Tensor:

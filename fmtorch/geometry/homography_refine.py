@@ -4,6 +4,8 @@ Minimises ``sum_i w_i rho(r_i^2)`` over the sphere of the nine entries, by kerne
 graph of points and weights. A model is refined to the same bits in any batch.
 """
 
+import functools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,36 +14,30 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from fmtorch.geometry.arithmetic import component_sum, gradient_wanted, stable_sum
+from fmtorch.geometry.epipolar import TINY
 from fmtorch.geometry.levenberg_marquardt import (
     FIRST_DAMPING,
     MATCH,
-    TINY,
     Problem,
     Schedule,
     Weighted,
-    accepting,
     in_rows,
-    levenberg_marquardt,
+    minimiser,
     robust,
 )
 from fmtorch.geometry.matrices import assign, assign_rows, unit_kernel
-from fmtorch.geometry.normalize import NormalizedMatches, fitted_by
-from fmtorch.geometry.rank2_manifold import eliminate
-from fmtorch.geometry.refine import inverse_hessian
-from fmtorch.geometry.robust_losses import RobustLoss, named_loss
+from fmtorch.geometry.normalize import NormalizedMatches, RobustSum, fitted_by
+from fmtorch.geometry.rank2_manifold import damped_system, eliminate
+from fmtorch.geometry.refine import inverse_hessian, jacobian
 from fmtorch.jit.kernel import Array, F8x1, F8x2, F8x3, inner, kernel, matrix, vector
 from fmtorch.jit.lanes import LANES, added, fill, load, store, where
-
-# The Sampson error of homographies in tensors, and its gradient with a graph to points and weights
 
 
 class HomographyError(NamedTuple):
     """Of models and matches that broadcast to *s; see `homography_objective_kernels`.
-
     squared: squared distances, infinite where undefined. front: whether the model's third coordinate at the match is
     positive. equations: e. inverse: the three entries of ``(J J^T)^-1``. corrected: x and y, their corrections added,
-    and W times the multipliers l. multipliers: l.
-    """
+    and W times the multipliers l. multipliers: l."""
 
     squared: Float[Tensor, "*s"]
     front: Bool[Tensor, "*s"]
@@ -78,47 +74,32 @@ def equations_slope(error: HomographyError, points: Float[Tensor, " 4 *p"]) -> F
     return torch.stack([torch.stack(first), torch.stack(second)])
 
 
-def homography_gradient(
-    H: Float[Tensor, "9 p k"],
-    points: Float[Tensor, "4 p n"],
-    weight: Float[Tensor, "p n"],
-    robust: RobustLoss,
-    s2: Float[Tensor, "p slots"],
-) -> Float[Tensor, "9 p k"]:
-    """Half the gradient of ``sum_i w_i rho(r_i^2)`` by the entries of H, ``G^T l``, attached to all inputs.
-
-    s2: squared scales of the loss, one a pair or a match. Matches of weight zero and those behind the horizon count
-    nothing, wherever they are.
-    """
-    counted = weight.detach() > 0
-    matches = torch.where(counted, points, 0)[:, :, None]
-    error = linearise_homography(H[..., None], matches)
-    counted = counted[:, None] & error.front
-    slope = robust.weight(torch.where(counted, error.squared, 0), s2[:, None])
-    influence = torch.where(counted, weight[:, None] * slope, 0)
-    first, second = equations_slope(error, matches)
-    l0, l1 = error.multipliers
+def homography_gradient(H: Float[Tensor, "9 p k"], error: RobustSum) -> Float[Tensor, "9 p k"]:
+    """Half the gradient of the cost by the entries of H, ``G^T l``, attached to all inputs.
+    Matches of weight zero and those behind the horizon count nothing, wherever they are."""
+    at, (first, second), influence = _influence(H, error, error.rho.weight)
+    l0, l1 = at.multipliers
     return stable_sum((first * l0 + second * l1) * influence)
 
 
-def homography_curvature(
-    H: Float[Tensor, "9 p k"],
-    points: Float[Tensor, "4 p n"],
-    weight: Float[Tensor, "p n"],
-    robust: RobustLoss,
-    s2: Float[Tensor, "p slots"],
-) -> Float[Tensor, "p k 9 9"]:
-    """The Gauss-Newton matrix ``G^T (J J^T)^-1 G`` with the curvature of the loss; arguments as of the gradient."""
-    counted = weight > 0
-    matches = torch.where(counted, points, 0)[:, :, None]
-    error = linearise_homography(H[..., None], matches)
-    counted = counted[:, None] & error.front
-    slope = robust.curvature(torch.where(counted, error.squared, 0), s2[:, None])
-    influence = torch.where(counted, weight[:, None] * slope, 0)
-    first, second = equations_slope(error, matches)
-    i00, i01, i11 = error.inverse
+def homography_curvature(H: Float[Tensor, "9 p k"], error: RobustSum) -> Float[Tensor, "p k 9 9"]:
+    """The Gauss-Newton matrix ``G^T (J J^T)^-1 G`` with the curvature of the loss."""
+    at, (first, second), influence = _influence(H, error, error.rho.curvature)
+    i00, i01, i11 = at.inverse
     rows = torch.stack([first * i00 + second * i01, first * i01 + second * i11]) * influence
     return torch.einsum("eapkn,ebpkn->pkab", rows, torch.stack([first, second]))
+
+
+def _influence(
+    H: Tensor, error: RobustSum, slope: Callable[[Tensor, Tensor], Tensor]
+) -> tuple[HomographyError, Tensor, Tensor]:
+    """The errors of matches, G, and the weights times the slopes of the loss (p, k, n)."""
+    counted = error.weight.detach() > 0
+    matches = torch.where(counted, error.points, 0)[:, :, None]
+    at = linearise_homography(H[..., None], matches)
+    counted = counted[:, None] & at.front
+    slopes = slope(torch.where(counted, at.squared, 0), error.s2[:, None])
+    return at, equations_slope(at, matches), torch.where(counted, error.weight[:, None] * slopes, 0)
 
 
 # The Sampson error of homographies, and its Levenberg-Marquardt on the sphere of their nine entries
@@ -138,9 +119,7 @@ class _State(NamedTuple):
 @kernel
 def evaluate_homographies(H: F8x2, weighted: Weighted, derivatives: bool, products: F8x3, cost: F8x1) -> None:
     """The robust error of models (k, 9) -> cost (k,); the normal equations -> products (k, 10, 10), if wanted.
-
-    These are ``G^T (J J^T)^-1 G``, the gradient and r^2, each times the weights of matches and loss, summed.
-    """
+    These are ``G^T (J J^T)^-1 G``, the gradient and r^2, each times the weights of matches and loss, summed."""
     rows, loss, table = in_rows(weighted.points, weighted.weight, weighted.s2), weighted.loss, weighted.table
     sums, factors, work = matrix(SUMS, LANES), matrix(14, LANES), matrix(3, LANES)
     for k in range(len(H)):
@@ -164,10 +143,8 @@ def evaluate_homographies(H: F8x2, weighted: Weighted, derivatives: bool, produc
 @inner
 def _linearise(h: Array, rows: Array, row: int, derivatives: bool, factors: Array) -> Any:
     """Squared distances of LANES matches; what their normal equations are made of -> factors (14, LANES), if wanted.
-
     G is (t, 0, c) and, in its second row, (0, t, d), in blocks of three entries: t, c, d, then the three entries of
-    ``(J J^T)^-1`` and the two of l.
-    """
+    ``(J J^T)^-1`` and the two of l."""
     x, y, u, v = load(rows, row), load(rows, row + 1), load(rows, row + 2), load(rows, row + 3)
     w = h[6] * x + h[7] * y + h[8]
     e, f = h[0] * x + h[1] * y + h[2] - u * w, h[3] * x + h[4] * y + h[5] - v * w
@@ -200,11 +177,9 @@ def _linearise(h: Array, rows: Array, row: int, derivatives: bool, factors: Arra
 @inner
 def _add_products(factors: Array, counted: Any, sums: Array) -> None:
     """Adds the products of LANES matches, times what they count; factors: of `_linearise`.
-
     The blocks share their factors, so there are 52 sums in place of the 55 of each row of G: those of t t^T with the
     three entries of the inverse (6 each), of t with the rows of the last block (9 each), of that block (6), the
-    gradient (9); the caller adds that of r^2.
-    """
+    gradient (9); the caller adds that of r^2."""
     p, q, s = load(factors, 9) * counted, load(factors, 10) * counted, load(factors, 11) * counted
     l0, l1 = load(factors, 12) * counted, load(factors, 13) * counted
     place = 0
@@ -289,7 +264,7 @@ def _step(state: _State, damping: Array, trial: _State) -> None:
 @inner
 def _stepped(products: Array, h: Array, damping: float, Q: Array, out: Array) -> None:
     """A damped step of h (9,) on the sphere -> out (9,)."""
-    _system(products, h, damping, Q)
+    damped_system(products, h, damping, Q)
     for r in range(9):
         Q[2 * r + 1, 9 - LANES] = -products[r, 9]
     eliminate(Q, 9)
@@ -299,24 +274,12 @@ def _stepped(products: Array, h: Array, damping: float, Q: Array, out: Array) ->
 
 
 @inner
-def _system(products: Array, h: Array, damping: float, Q: Array) -> None:
-    """The damped normal equations of h (9,) -> Q, (9, 10) in two rows of LANES each, without right side."""
-    curvature = 0.0
-    for i in range(9):
-        curvature = max(curvature, products[i, i])
-    for r in range(9):
-        for c in range(9):
-            Q[2 * r + c // LANES, c % LANES] = products[r, c] + curvature * h[r] * h[c]
-        Q[2 * r + r // LANES, r % LANES] += curvature * damping
-
-
-@inner
 def _take(state: _State, trial: _State, k: int) -> None:
     assign(state.H[k], trial.H[k])
     assign_rows(state.products[k], trial.products[k])
 
 
-_minimise = levenberg_marquardt(_evaluate, _step, accepting(_take))
+_minimise = minimiser(_evaluate, _step, _take)
 
 
 def refine_homography(
@@ -339,13 +302,7 @@ def refine_homography(
 
     Args:
         H: one matrix for each set of matches, or K of them, (*batch, K, 3, 3), of any scale and sign.
-        x0: points of image 0, pixels.
-        x1: their matches in image 1.
-        weight: not negative, 1 by default.
-        mask: False in slots to ignore, whatever they hold; a match that is not finite is ignored too.
-        loss: a name of `robust_losses.LOSSES`.
-        scale: of the loss, in pixels (a number, or one per set).
-        iterations: Levenberg-Marquardt steps.
+        x0, x1, weight, mask, loss, scale, iterations: as of `refine`.
 
     Returns:
         Matrices of unit norm in float64, whose third coordinate of H x0 is positive at most of the weight; one that
@@ -363,61 +320,30 @@ def refine_homography(
         >>> bool(((refined / refined[2, 2] - H).abs() < 1e-6).all())
         True
     """
-    robust, schedule = named_loss(loss), Schedule(iterations, FIRST_DAMPING, 0.0)
-    wanted = gradient_wanted(x0, x1, weight)
+    schedule, wanted = Schedule(iterations, FIRST_DAMPING, 0.0), gradient_wanted(x0, x1, weight)
+
+    def fit(models: Array, matches: Weighted, out: Array, cost: Array) -> None:
+        refine_homographies(models, matches, schedule, out, cost)
+
     with torch.set_grad_enabled(wanted):
-        matches = NormalizedMatches(x0, x1, weight, mask, H.detach(), scale, homographies=True)
-        shared, s2 = (matches.points, matches.weight), matches.scale.square()[:, None]
-        models, _ = fitted_by(
-            lambda models, data, out, cost: refine_homographies(models, data, schedule, out, cost),
-            _seen_from_the_front(matches), *shared, s2, loss,
-        )  # fmt: skip
+        matches = NormalizedMatches(x0, x1, weight, mask, H.detach(), scale, loss, homographies=True)
+        models, _ = fitted_by(fit, _seen_from_the_front(matches), matches.error)
         if wanted:
-            models = homography_at_optimum(models, *shared, robust, s2)
+            models = homography_at_optimum(models, matches.error)
         return matches.to_pixels(models).reshape(H.shape)
 
 
-def homography_at_optimum(
-    H: Float[Tensor, "9 p k"],
-    points: Float[Tensor, "4 p n"],
-    weight: Float[Tensor, "p n"],
-    robust: RobustLoss,
-    s2: Float[Tensor, "p slots"],
-) -> Float[Tensor, "9 p k"]:
+def homography_at_optimum(H: Float[Tensor, "9 p k"], error: RobustSum) -> Float[Tensor, "9 p k"]:
     """H, optima of unit norm on no graph, attached to the graph of points and weights by the implicit function theorem.
-
-    s2: squared scales of the loss, one a pair or a match. As `refine.at_optimum`: the optimum moves by minus the
-    inverse Hessian, across H, times the change of the gradient.
-    """
-    valid = torch.isfinite(H).all(0) & (H != 0).any(0)
+    As `refine.at_optimum`: the optimum moves by minus the inverse Hessian across H times the change of the gradient."""
+    valid, fixed = torch.isfinite(H).all(0) & (H != 0).any(0), error.detached()
     model = torch.where(valid, H, torch.eye(3, dtype=H.dtype, device=H.device).reshape(9, 1, 1) / 3**0.5)
-    inverse = inverse_hessian_of_homography(model, points.detach(), weight.detach(), robust, s2.detach())
-    gradient = homography_gradient(model, points, weight, robust, s2)
+    exact = jacobian(functools.partial(homography_gradient, error=fixed), model)
+    gauss_newton = homography_curvature(model, fixed)
+    inverse = inverse_hessian((exact + exact.mT) / 2, gauss_newton, model.movedim(0, -1)[..., None])
+    gradient = homography_gradient(model, error)
     moved = component_sum(inverse * (gradient - gradient.detach()), 1)
     return H - torch.where(valid, moved, 0)
-
-
-def inverse_hessian_of_homography(
-    H: Float[Tensor, "9 p k"],
-    points: Float[Tensor, "4 p n"],
-    weight: Float[Tensor, "p n"],
-    robust: RobustLoss,
-    s2: Float[Tensor, "p slots"],
-) -> Float[Tensor, "9 9 p k"]:
-    """That of half the cost at optima of unit norm, across these; arguments as of `homography_at_optimum`."""
-    exact = _hessian(H, points, weight, robust, s2)
-    gauss_newton = homography_curvature(H, points, weight, robust, s2)
-    return inverse_hessian(exact, gauss_newton, H.movedim(0, -1)[..., None])
-
-
-def _hessian(H: Tensor, points: Tensor, weight: Tensor, robust: RobustLoss, s2: Tensor) -> Float[Tensor, "p k 9 9"]:
-    """Half the second derivative of the cost."""
-    with torch.enable_grad():
-        model = H.detach().clone().requires_grad_()
-        gradient = homography_gradient(model, points, weight, robust, s2)
-        rows = [torch.autograd.grad(gradient[i].sum(), model, retain_graph=True)[0] for i in range(9)]
-    second = torch.stack(rows).movedim((0, 1), (-2, -1))
-    return (second + second.mT) / 2
 
 
 def _seen_from_the_front(matches: NormalizedMatches) -> Float[Tensor, "9 p k"]:

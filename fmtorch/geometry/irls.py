@@ -1,5 +1,6 @@
 """Iteratively reweighted least squares for fundamental matrices, differentiable, with weights of any origin."""
 
+import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -7,14 +8,15 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from fmtorch.geometry import normalize
 from fmtorch.geometry.arithmetic import component_sum, gradient_wanted, unit
 from fmtorch.geometry.eight_point import linear_fundamental, weighted_eight_point
-from fmtorch.geometry.epipolar import homogeneous, linearise, sampson
+from fmtorch.geometry.epipolar import linearise, sampson
 from fmtorch.geometry.levenberg_marquardt import MATCH, Weighted, in_rows, linearise_kernel, robust
 from fmtorch.geometry.matrices import assign, nearest_rank2
-from fmtorch.geometry.normalize import NormalizedMatches, canonical, denormalize_fundamental, normalize_points
+from fmtorch.geometry.normalize import NormalizedMatches, RobustSum, canonical, normalize_points
 from fmtorch.geometry.rank2_manifold import RANK_TWO, constant
-from fmtorch.geometry.robust_losses import RobustLoss, named_loss
+from fmtorch.geometry.refine import jacobian
 from fmtorch.jit.kernel import F8x2, kernel, matrix, vector
 from fmtorch.jit.lanes import LANES, load, store
 
@@ -49,13 +51,8 @@ def irls(
     and the values are the same in any case.
 
     Args:
-        x0: points of image 0, pixels.
-        x1: their matches in image 1.
         F0: one matrix for each set of matches, or K of them, (*batch, K, 3, 3).
-        weight: not negative, 1 by default.
-        mask: False in slots to ignore; matches that are not finite are ignored too.
-        loss: a name of `robust_losses.LOSSES`.
-        scale: of the loss, in pixels (a number, or one per set).
+        x0, x1, weight, mask, loss, scale: as of `refine`.
         iterations: reweighted fits.
 
     Returns:
@@ -65,14 +62,10 @@ def irls(
     Raises:
         ValueError: for an unknown loss.
     """
-    robust = named_loss(loss)
     wanted = gradient_wanted(x0, x1, weight, scale)
     with torch.set_grad_enabled(wanted):
-        matches = NormalizedMatches(x0, x1, weight, mask, F0, scale)
-
-        def step(F: Tensor) -> Tensor:
-            return reweighted(F, matches.points, matches.weight, robust, matches.scale)
-
+        matches = NormalizedMatches(x0, x1, weight, mask, F0, scale, loss)
+        step = functools.partial(reweighted, error=matches.error)
         F = matches.models.detach()
         with torch.no_grad():
             for _ in range(iterations):
@@ -124,7 +117,7 @@ def reweighted_fits(
     if iterations < 1:
         raise ValueError(f"iterations is {iterations}; it must be at least 1")
     first = torch.zeros(len(x0), 3, 3, dtype=torch.float64, device=x0.device) if F0 is None else F0.to(torch.float64)
-    matches = NormalizedMatches(x0, x1, None, mask, first, 1.0)
+    matches = NormalizedMatches(x0, x1, None, mask, first)
     clean0, clean1 = (torch.where(matches.counts[..., None], x, 0).to(torch.float64) for x in (x0, x1))
 
     def distances(F: Float[Tensor, "b 3 3"]) -> Float[Tensor, "b n"]:
@@ -144,24 +137,15 @@ def reweighted_fits(
     return Fits(torch.stack(fits), torch.stack(valid))
 
 
-def reweighted(
-    F: Float[Tensor, "9 p k"],
-    points: Float[Tensor, "4 p n"],
-    weight: Float[Tensor, "p n"],
-    robust: RobustLoss,
-    scale: Float[Tensor, " p"],
-) -> Float[Tensor, "9 p k"]:
+def reweighted(F: Float[Tensor, "9 p k"], error: RobustSum) -> Float[Tensor, "9 p k"]:
     """One iteration, component by component: the 8-point algorithm with the weights that the residuals under F give.
-
-    F: k models for each of p pairs, entries row by row. points: x0, y0, x1, y1, of about unit scale; finite. weight: 0
-    in padded slots. scale: of the loss, in the unit of the points. Models of rank 2; one that the weighted matches do
-    not determine is kept as it was.
-    """
+    F: k models for each of p pairs, entries row by row. Models of rank 2; one that the weighted matches do not
+    determine is kept as it was."""
     finite = torch.isfinite(F).all(0)
     known = torch.where(finite, F, constant(F, RANK_TWO))
-    _, _, inverse, r2 = linearise(known, homogeneous(points[:, None, :, None]), derivatives=False)
-    w = weight[:, None] * (robust.weight(r2, scale.square()[:, None, None]) * inverse)[0]
-    fitted, determined = weighted_fit(points, w)
+    _, _, inverse, r2 = linearise(known, error.points, derivatives=False)
+    w = error.weight[:, None] * (error.rho.weight(r2, error.s2[:, None]) * inverse)
+    fitted, determined = weighted_fit(error.points, w)
     return torch.where(finite & determined, fitted, F)
 
 
@@ -169,9 +153,7 @@ def weighted_fit(
     points: Float[Tensor, "4 p n"], weight: Float[Tensor, "p k n"]
 ) -> tuple[Float[Tensor, "9 p k"], Bool[Tensor, "p k"]]:
     """The normalised 8-point algorithm with k sets of weights for each of p pairs, and which of them determine a model.
-
-    points: as of `reweighted`. Models of rank 2, of any scale; what is not determined means nothing but is finite.
-    """
+    points: as of `reweighted`. Models of rank 2, of any scale; what is not determined means nothing but is finite."""
     p, k = weight.shape[:2]
     valid = (torch.isfinite(weight) & (weight >= 0)).all(-1, keepdim=True) & (weight > 0).any(-1, keepdim=True)
     scales = torch.where(valid, weight.detach(), 1)  # changes no fit
@@ -181,7 +163,7 @@ def weighted_fit(
     x0, T0 = normalize_points(points[..., :2], weight=w)
     x1, T1 = normalize_points(points[..., 2:], weight=w)
     linear, determined = linear_fundamental(x0, x1, w)
-    fitted = denormalize_fundamental(nearest_rank2(linear), T0, T1).flatten(2).movedim(-1, 0)
+    fitted = normalize.denormalize_fundamental(nearest_rank2(linear), T0, T1).flatten(2).movedim(-1, 0)
     determined = determined & valid[..., 0] & torch.isfinite(fitted).all(0) & (fitted != 0).any(0)
     return fitted, determined
 
@@ -193,14 +175,8 @@ def at_fixed_point(F: Float[Tensor, "9 p k"], step: Callable[[Tensor], Tensor]) 
     ``dF = (I - J)^-1 dG/dtheta dtheta`` (Bai et al., NeurIPS 2019, theorem 1). G maps to the manifold of rank 2 and
     unit norm, so J and dG map to its 7-dimensional tangent space, and dF lies in it. Where the iteration does not
     contract, singular values s of I - J are inverted as ``s / (s^2 + CONTRACTION_GAP^2)``, which bounds the gradient.
-
-    Args:
-        F: k models for each of p pairs, entries row by row, on no graph; of rank 2. One that is zero or not finite has
-            a gradient of zero.
-        step: one iteration of all models, each for itself; a model that it leaves as it is has a gradient of zero.
-
-    Returns:
-        The same values.
+    F: on no graph; of rank 2. One that is zero or not finite has a gradient of zero, and so has one that `step`, one
+    iteration of all models, each for itself, leaves as it is. Returns the same values.
     """
     valid = torch.isfinite(F).all(0) & (F != 0).any(0)
     fixed = unit(torch.where(valid, F, constant(F, RANK_TWO)))
@@ -210,12 +186,9 @@ def at_fixed_point(F: Float[Tensor, "9 p k"], step: Callable[[Tensor], Tensor]) 
         along = component_sum(G.detach() * fixed)
         return torch.where(along < 0, -G, G)
 
+    J = jacobian(mapped, fixed)
     with torch.enable_grad():
-        start = fixed.detach().clone().requires_grad_()
-        end = mapped(start)
-        rows = [torch.autograd.grad(end[i].sum(), start, retain_graph=True)[0] for i in range(9)]
         attached = mapped(fixed)
-    J = torch.stack(rows).movedim((0, 1), (-2, -1))
     known = valid & torch.isfinite(J).flatten(-2).all(-1)
     difference = torch.eye(9, dtype=J.dtype, device=J.device) - torch.where(known[..., None, None], J, 0.0)
     U, s, Vh = torch.linalg.svd(difference)
@@ -224,9 +197,6 @@ def at_fixed_point(F: Float[Tensor, "9 p k"], step: Callable[[Tensor], Tensor]) 
     size = torch.where(valid, component_sum(F * fixed), 0.0)
     moved = component_sum(inverse * (attached - attached.detach()), 1) * size
     return F + torch.where(valid, moved, 0.0)  # keeps the gradient of what is not finite out
-
-
-# `irls` for the matches of one pair, compiled; float64
 
 
 @kernel

@@ -5,6 +5,8 @@ Damped Gauss-Newton steps; each model takes its own where that lowers its cost, 
 call, between whose steps nothing waits for Python.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -12,44 +14,33 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fmtorch.geometry.arithmetic import logarithm_1p_kernel
-from fmtorch.geometry.robust_losses import LOSS_TABLE
+from fmtorch.geometry.robust_losses import LOSS_TABLE, LOSSES
 from fmtorch.jit.kernel import Array, F8x1, F8x2, F8x3, inner, kernel, matrix
 from fmtorch.jit.lanes import LANES, added, fill, load, sqrt, store, where
 
-# `sampson_objective` for models on the matches of one pair, compiled; float64, LANES matches at a time
-
-
 TINY = 1e-30  # as in `residuals`
-HUBER, CAUCHY, GEMAN_MCCLURE, TRUNCATED, MAGSAC = 0, 1, 2, 3, 4  # losses
-LOSS_CODES = {
-    "huber": HUBER,
-    "cauchy": CAUCHY,
-    "geman_mcclure": GEMAN_MCCLURE,
-    "truncated": TRUNCATED,
-    "magsac": MAGSAC,
-}
+LOSS_CODES = {name: code for code, name in enumerate(LOSSES)}
+HUBER, CAUCHY, GEMAN_MCCLURE, TRUNCATED, MAGSAC = LOSS_CODES.values()
 NO_TABLE = np.empty((2, 0))
 MATCH = 6  # rows of LANES matches: x0, y0, x1, y1, their weights, squared scales
 
 
-def loss_table(loss: str) -> Array:
-    """What `Weighted.table` is for a loss of this name."""
-    return LOSS_TABLE if loss == "magsac" else NO_TABLE
-
-
 class Weighted(NamedTuple):
     """Matches and a robust loss of their errors.
-
     points: (4, n). weight: (n,), what each counts. s2: (n,), squared scales of the loss, a code. table: (2, t + 2), of
     the loss MAGSAC, its weight at the ends of t intervals of r^2 / s^2 and beyond, and the weight's integral up to
-    there; of others it is not read.
-    """
+    there; of others it is not read."""
 
     points: F8x2
     weight: F8x1
     s2: F8x1
     loss: int
     table: F8x2
+
+    @staticmethod
+    def of(points: Array, weight: Array, s2: Array, loss: str = "truncated") -> Weighted:
+        """Matches with the loss of this name."""
+        return Weighted(points, weight, s2, LOSS_CODES[loss], LOSS_TABLE if loss == "magsac" else NO_TABLE)
 
 
 @kernel
@@ -180,23 +171,48 @@ class Schedule(NamedTuple):
     tolerance: float
 
 
-def levenberg_marquardt(
-    evaluate: Callable[..., None], step: Callable[..., None], accept: Callable[..., bool]
-) -> Callable[[Any, Any, Any, Array, int, bool], None]:
-    """The loop for an objective: loop(data, state, trial, damping, iterations, ends), in place.
+class Problem(NamedTuple):
+    """The matches of a robust error, and the tolerance of the schedule."""
 
+    matches: Weighted
+    tolerance: float
+
+
+@inner
+def _by_share(problem: Problem, before: float, after: float) -> bool:
+    """Whether a step that lowers the cost of a model so far is its last."""
+    return problem.tolerance > 0 and before - after <= problem.tolerance * before
+
+
+def minimiser(
+    evaluate: Callable[..., None], step: Callable[..., None], take: Callable[..., None],
+    converged: Callable[..., bool] = _by_share, min_damping: float = MIN_DAMPING,
+) -> Callable[[Any, Any, Any, Array, int, bool], None]:  # fmt: skip
+    """The loop for an objective: loop(data, state, trial, damping, iterations, ends), in place.
     evaluate(state, data, derivatives): the costs, and the derivatives if asked for, at the state's parameters.
-    step(state, damping, trial): those of a trial. accept(state, trial, damping, done, data): the trial for the models
-    that it improves; whether all are done.
-    """
+    step(state, damping, trial): those of a trial. take(state, trial, k): gives the state model k of the trial, but for
+    its cost, where that is lower: such a step divides the damping by 10, another multiplies it. converged(data, before,
+    after): whether a model is done after a step that has lowered its cost so."""
+
+    @inner
+    def accept(state: Any, trial: Any, damping: Array, done: Array, data: Any) -> bool:
+        """The trial for the models that it improves; whether all are done."""
+        everything = True
+        for k in range(len(damping)):
+            better = trial.cost[k] < state.cost[k] and not done[k]
+            damping[k] = min(max(damping[k] / 10 if better else damping[k] * 10, min_damping), MAX_DAMPING)
+            if better:
+                done[k] |= converged(data, state.cost[k], trial.cost[k])
+                state.cost[k] = trial.cost[k]
+                take(state, trial, k)
+            everything = everything and done[k]
+        return everything
 
     @inner
     def loop(data: Any, state: Any, trial: Any, damping: Array, iterations: int, ends: bool) -> None:
         """The state holds the start, then that of least cost; no cost ever rises.
-
         damping: (k,), the first of each model. ends: whether models are ever done; the state then keeps the
-        derivatives at the end.
-        """
+        derivatives at the end."""
         done = np.zeros(len(damping), np.bool_)
         evaluate(state, data, iterations > 0 or ends)
         for i in range(iterations):
@@ -206,32 +222,3 @@ def levenberg_marquardt(
                 break
 
     return loop
-
-
-class Problem(NamedTuple):
-    """The matches of a robust error, and the tolerance of the schedule: what `accepting` looks at."""
-
-    matches: Weighted
-    tolerance: float
-
-
-def accepting(take: Callable[[Any, Any, int], None]) -> Callable[..., bool]:
-    """The `accept` of an objective on a `Problem`: a step that is taken divides the damping by 10, another multiplies.
-
-    take(state, trial, k): gives the state model k of the trial; costs are copied here.
-    """
-
-    @inner
-    def accept(state: Any, trial: Any, damping: Array, done: Array, problem: Problem) -> bool:
-        everything = True
-        for k in range(len(damping)):
-            better = trial.cost[k] < state.cost[k] and not done[k]
-            damping[k] = min(max(damping[k] / 10 if better else damping[k] * 10, MIN_DAMPING), MAX_DAMPING)
-            if better:
-                done[k] |= problem.tolerance > 0 and state.cost[k] - trial.cost[k] <= problem.tolerance * state.cost[k]
-                state.cost[k] = trial.cost[k]
-                take(state, trial, k)
-            everything = everything and done[k]
-        return everything
-
-    return accept

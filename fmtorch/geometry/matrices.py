@@ -1,15 +1,19 @@
-"""The nearest matrix of rank two: the step that makes a linear estimate a fundamental matrix."""
+"""Small matrices in fixed-order arithmetic: the nearest of rank two, the eigenvector of the smallest eigenvalue.
+
+`torch.linalg.eigh` rounds differently with the memory alignment of each matrix, so the same matrix gives different
+last bits in different batch positions. These functions do not. Each has a tensor form and one for kernels.
+"""
 
 import math
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from fmtorch.geometry.arithmetic import cofactors, component_sum, determinant, sqrt
-from fmtorch.jit.kernel import Array, inner, vector
+from fmtorch.geometry.arithmetic import cofactors, component_sum, determinant, outer_sum, sqrt
+from fmtorch.jit.kernel import Array, inner, matrix, vector
 
 GAP = 1e-6
 """Eigenvalue gaps of F^T F below this share of its largest eigenvalue have their gradient held finite."""
@@ -22,25 +26,17 @@ def nearest_rank2(F: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]
     it the projection jump, and the gradient is held finite by gap / (gap^2 + eps^2) in place of 1 / gap.
     F must be finite.
     """
-    components = F.reshape(*F.shape[:-2], 9).movedim(-1, 0).contiguous()
-    return rank2_components(components).movedim(0, -1).reshape(F.shape)
-
-
-def rank2_components(F: Float[Tensor, " 9 *s"]) -> Float[Tensor, " 9 *s"]:
-    """`nearest_rank2` with the nine entries (row by row) as the first axis."""
-    rows = F.to(torch.float64).reshape(3, 3, *F.shape[1:])
+    rows = F.reshape(*F.shape[:-2], 9).movedim(-1, 0).contiguous().to(torch.float64).reshape(3, 3, *F.shape[:-2])
     v = last_right_singular_vector(rows)
     projected = rows - component_sum(rows * v, 1)[:, None] * v
-    return projected.reshape(F.shape).to(F.dtype)
+    return projected.flatten(0, 1).to(F.dtype).movedim(0, -1).reshape(F.shape)
 
 
 def last_right_singular_vector(F: Float[Tensor, " 3 3 *s"]) -> Float[Tensor, " 3 *s"]:
     """The unit right singular vector v of the smallest singular value, float64; F[i, j] is row i, column j.
-
     The cofactor matrix C of F has v for its *first* right singular vector, and singular values s1 s2, s1 s3, s2 s3: so
     v belongs to the largest eigenvalue of C^T C, which is well determined whenever s3 < s2, while the smallest one of
-    F^T F has lost half of its digits.
-    """
+    F^T F has lost half of its digits."""
     with torch.no_grad():
         G = _scaled(F.detach())
         C = cofactors(G)
@@ -93,7 +89,6 @@ def _unit(x: Tensor, fallback: Tensor) -> Tensor:
 
 def _largest_eigenvector(K: Tensor) -> Tensor:
     """The unit eigenvector of the largest eigenvalue of symmetric 3 x 3 matrices (3, 3, *s); any, where it is multiple.
-
     K - mean = m X with X's eigenvalues y the roots of y^3 - 3 y = det X: the extreme root by Newton's method from 2,
     the others from the quadratic that remains. The eigenvector is the longest cross product of two rows of K - lambda.
     """
@@ -139,7 +134,88 @@ def complement(v: Tensor) -> tuple[Tensor, Tensor]:
     return p, q
 
 
-# `rank2` for one matrix, compiled: matrices are (9,), row by row
+# The eigenvector of the smallest eigenvalue of symmetric 9 x 9, or other small, matrices
+
+SHIFT = 1e-14  # relative to the trace: above the rounding error of the factorisation, below any eigenvalue that counts
+RANK_TOLERANCE = 1e-12  # relative to the trace: relative errors of 1e-6 in the rows that M was summed from
+EIGENVALUE_GAP = 1e-8  # relative to the trace: eigenvalue gaps below it have their gradient held finite
+SQUARINGS = 14  # the power 2^14 parts eigenvalues whose ratio is 0.998
+
+
+def smallest_eigenvector(M: Float[Tensor, "*batch n n"]) -> tuple[Float[Tensor, "*batch n"], Bool[Tensor, "*batch"]]:
+    """The unit eigenvector of the smallest eigenvalue of positive semi-definite M, and whether it is determined.
+    Inverse iteration by repeated squaring: with M = L D L^T, the powers M^-1, M^-2, M^-4, ... (each at unit trace)
+    turn into v v^T. The largest entry of v is positive. It counts as determined when the rank is at least n - 1, that
+    is when the trace of M^-1 across v is not too large. M must be finite, float64.
+    Gradient: with gaps g_j to the smallest eigenvalue, sum_j v_j v_j^T g_j / (g_j^2 + eps^2) over the other
+    eigenvectors, finite where eigenvalues meet."""
+    return cast(tuple[Tensor, Tensor], _SmallestEigenvector.apply(M))  # type: ignore[no-untyped-call]
+
+
+class _SmallestEigenvector(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, M: Tensor) -> tuple[Tensor, Tensor]:
+        v, determined = _inverse_power(M.movedim((-2, -1), (0, 1)).contiguous())
+        v = v.movedim(0, -1).contiguous()
+        ctx.save_for_backward(M, v)
+        ctx.mark_non_differentiable(determined)
+        return v, determined
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> Tensor:
+        M, v = ctx.saved_tensors
+        trace = M.diagonal(dim1=-2, dim2=-1).sum(-1)
+        values, vectors = torch.linalg.eigh(M / torch.where(trace > 0, trace, 1.0)[..., None, None])
+        gap = values[..., 1:] - values[..., :1]
+        bounded = gap / (gap * gap + EIGENVALUE_GAP * EIGENVALUE_GAP)
+        others = vectors[..., 1:]
+        along = bounded * (others.mT @ gradients[0][..., None])[..., 0]
+        u = (others @ along[..., None])[..., 0] / torch.where(trace > 0, trace, 1.0)[..., None]
+        outer: Tensor = u[..., :, None] * v[..., None, :]
+        return -(outer + outer.mT) / 2
+
+
+def _inverse_power(M: Tensor) -> tuple[Tensor, Tensor]:
+    """`smallest_eigenvector` with the matrix axes first: (n, n, *s) to (n, *s)."""
+    n = M.shape[0]
+    trace = component_sum(M.diagonal(dim1=0, dim2=1).movedim(-1, 0))
+    nonzero = trace > 0
+    A = M / torch.where(nonzero, trace, 1.0)
+    for i in range(n):
+        A[i, i] += SHIFT
+    inverse_of_L = torch.eye(n, dtype=M.dtype, device=M.device)
+    inverse_of_L = inverse_of_L.reshape(n, n, *[1] * (M.dim() - 2)).repeat(1, 1, *M.shape[2:])
+    pivots = []
+    for i in range(n):
+        pivot = A[0, 0].clamp_min(SHIFT / 2)
+        column = A[1:, 0] / pivot
+        inverse_of_L[i + 1 :, : i + 1] -= column[:, None] * inverse_of_L[i, : i + 1]
+        A = A[1:, 1:] - column[:, None] * A[0, 1:]
+        pivots.append(pivot)
+    D = torch.stack(pivots)
+    inverse = outer_sum((inverse_of_L / D[:, None])[:, :, None], inverse_of_L[:, None])
+    size = _trace(inverse)
+    X = inverse = inverse / size
+    done = torch.zeros_like(nonzero)
+    for _ in range(SQUARINGS):
+        squared = outer_sum(X[:, :, None], X[:, None])
+        trace = _trace(squared)
+        X = torch.where(done, X, squared / trace)
+        done = done | (trace > 1 - 1e-14)
+        if bool(done.all()):
+            break
+    best = X.diagonal(dim1=0, dim2=1).movedim(-1, 0).argmax(0)
+    v = torch.gather(X, 0, best[None, None].expand(1, *X.shape[1:]))[0]
+    v = v / sqrt(component_sum(v * v))
+    across = (1 - component_sum(v * component_sum(inverse * v, 1))) * size  # the sum of 1 / eigenvalue over the others
+    return v, nonzero & (across * RANK_TOLERANCE < 1)
+
+
+def _trace(X: Tensor) -> Tensor:
+    return component_sum(X.diagonal(dim1=0, dim2=1).movedim(-1, 0))
+
+
+# The nearest matrix of rank two, compiled: matrices are (9,), row by row
 
 EPS = float(np.finfo(np.float64).eps)
 
@@ -167,14 +243,15 @@ def cofactors_kernel(F: Array, C: Array) -> None:
 
 
 @inner
-def unit_kernel(v: Array) -> None:
-    """Scales to unit norm, in place; NaN where that is not possible."""
+def unit_kernel(v: Array) -> Any:
+    """Scales to unit norm, in place; NaN where that is not possible. The norm that it had."""
     total = 0.0
     for i in range(len(v)):
         total += v[i] * v[i]
     norm = math.sqrt(total)
     for i in range(len(v)):
         v[i] /= norm
+    return norm
 
 
 @inner
@@ -189,7 +266,7 @@ def complement_kernel(v: Array, p: Array, q: Array) -> None:
 
 @inner
 def nearest_rank2_kernel(F: Array) -> None:
-    """Makes F the nearest matrix of rank two, F - F v v^T, in place, as `rank2_components`."""
+    """Makes F the nearest matrix of rank two, F - F v v^T, in place, as `nearest_rank2`."""
     v = vector(3)
     last_right_singular_vector_kernel(F, v)
     for r in range(3):
@@ -290,6 +367,65 @@ def _largest_eigenvector_kernel(K: Array, v: Array) -> None:
         _across_longest_kernel(K, v)
 
 
+@inner
+def smallest_eigenvector_kernel(M: Array, v: Array) -> bool:
+    """`smallest_eigenvector` of a symmetric matrix (n, n), overwritten -> v; whether it is determined."""
+    n, trace = len(M), 0.0
+    for i in range(n):
+        trace += M[i, i]
+    if not (trace > 0 and math.isfinite(trace)):
+        return False
+    L, X, Y = np.eye(n), matrix(n, n), matrix(n, n)
+    pivot = vector(n)
+    for i in range(n):
+        for j in range(n):
+            M[i, j] /= trace
+        M[i, i] += SHIFT
+    for k in range(n):  # M = L D L^T; L becomes the inverse of L
+        pivot[k] = max(M[k, k], SHIFT / 2)
+        for i in range(k + 1, n):
+            factor = M[i, k] / pivot[k]
+            for j in range(k + 1):
+                L[i, j] -= factor * L[k, j]
+            for j in range(k + 1, n):
+                M[i, j] -= factor * M[k, j]
+    size = 0.0
+    for i in range(n):
+        for j in range(n):
+            total = 0.0
+            for k in range(n):
+                total += L[k, i] / pivot[k] * L[k, j]
+            X[i, j] = total
+        size += X[i, i]
+    inverse = X / size
+    X = inverse.copy()
+    for _ in range(SQUARINGS):
+        trace = 0.0
+        for i in range(n):
+            for j in range(n):
+                Y[i, j] = 0.0
+            for k in range(n):
+                for j in range(n):
+                    Y[i, j] += X[i, k] * X[k, j]
+            trace += Y[i, i]
+        for i in range(n):
+            for j in range(n):
+                X[i, j] = Y[i, j] / trace
+        if trace > 1 - 1e-14:
+            break
+    best, norm, along = 0, 0.0, 0.0
+    for i in range(n):
+        best = i if X[i, i] > X[best, best] else best
+    for i in range(n):
+        norm += X[best, i] * X[best, i]
+    for i in range(n):
+        v[i] = X[best, i] / math.sqrt(norm)
+    for i in range(n):
+        for j in range(n):
+            along += v[i] * inverse[i, j] * v[j]
+    return (1 - along) * size * RANK_TOLERANCE < 1
+
+
 # 3 x 3 matrices (9,), row by row, compiled: products, inverses, orthogonal factors
 
 POLAR_STEPS = 10  # quadratic once near; scaled, so that few are needed before
@@ -318,9 +454,7 @@ def invert(A: Array, out: Array) -> bool:
 @inner
 def orthogonal_factor(A: Array) -> bool:
     """The rotation nearest to a positive or negative multiple of A, in place, by Newton's iteration (Higham 1986).
-
-    False where A is singular.
-    """
+    False where A is singular."""
     C = vector(9)
     for _ in range(POLAR_STEPS):
         cofactors_kernel(A, C)

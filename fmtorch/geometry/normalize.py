@@ -1,7 +1,10 @@
 """Normalisation of image points before linear estimation, and of fundamental matrices after it."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -11,15 +14,17 @@ from torch import Tensor
 from fmtorch.geometry.arithmetic import as_components, as_matrices, component_sum, matmul3, sqrt, stable_sum, unit
 from fmtorch.geometry.cameras import PixelFrame
 from fmtorch.geometry.epipolar import unit_frobenius
-from fmtorch.geometry.levenberg_marquardt import LOSS_CODES, Weighted, loss_table
+from fmtorch.geometry.levenberg_marquardt import Weighted
+from fmtorch.geometry.robust_losses import LOSSES, RobustLoss, named_loss
 from fmtorch.jit.kernel import Array
 
+Points = Float[Tensor, "*batch n 2"]
+PerMatch = Float[Tensor, "*batch n"]
+Mask = Bool[Tensor, "*batch n"]
+Matrices = Float[Tensor, "*batch 3 3"]
 
-def normalize_points(
-    x: Float[Tensor, "*batch n 2"],
-    mask: Bool[Tensor, "*batch n"] | None = None,
-    weight: Float[Tensor, "*batch n"] | None = None,
-) -> tuple[Float[Tensor, "*batch n 2"], Float[Tensor, "*batch 3 3"]]:
+
+def normalize_points(x: Points, mask: Mask | None = None, weight: PerMatch | None = None) -> tuple[Points, Matrices]:
     """Points moved to zero mean and mean distance sqrt(2), and the similarity T that does it (x_n = T x).
 
     Hartley, In Defense of the Eight-Point Algorithm, PAMI 1997. Means are over the points in `mask`, weighted by
@@ -40,16 +45,7 @@ def normalize_points(
     return _apply(centred, mask, scale), _similarity(centroid, scale)
 
 
-def normalize_pair(
-    x0: Float[Tensor, "*batch n 2"],
-    x1: Float[Tensor, "*batch n 2"],
-    mask: Bool[Tensor, "*batch n"] | None = None,
-) -> tuple[
-    Float[Tensor, "*batch n 2"],
-    Float[Tensor, "*batch n 2"],
-    Float[Tensor, "*batch 3 3"],
-    Float[Tensor, "*batch 3 3"],
-]:
+def normalize_pair(x0: Points, x1: Points, mask: Mask | None = None) -> tuple[Points, Points, Matrices, Matrices]:
     """Points of both images centred each on its own, with one common scale: x0_n, x1_n, T0, T1.
 
     The mean distance to the centroid, over both images, becomes sqrt(2). Distances keep their proportions between the
@@ -87,7 +83,7 @@ def denormalize_fundamental(
     return matmul3(matmul3(T1.mT, F), T0)
 
 
-def canonical(F: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
+def canonical(F: Matrices) -> Matrices:
     """F scaled to unit Frobenius norm with its entry of largest magnitude (the first of equals) positive.
 
     A zero matrix stays zero, with zero gradient.
@@ -141,25 +137,38 @@ def _similarity(centroid: Tensor, scale: Tensor) -> Tensor:
 # The way into the solvers: leading shapes flattened, masked slots moved to the end, coordinates normalised
 
 
+class RobustSum(NamedTuple):
+    """``sum_i w_i rho(r_i^2)`` over the matches of P pairs.
+    points: x0, y0, x1, y1, of about unit scale; finite. weight: 0 in padded slots. loss: the name of rho. s2: squared
+    scales of the loss, in the unit of the points, one a pair or a match."""
+
+    points: Float[Tensor, "4 p n"]
+    weight: Float[Tensor, "p n"]
+    loss: str
+    s2: Float[Tensor, "p slots"]
+
+    @property
+    def rho(self) -> RobustLoss:
+        """The loss with its derivatives."""
+        return LOSSES[self.loss]
+
+    def detached(self) -> RobustSum:
+        """The same on no graph."""
+        return RobustSum(self.points.detach(), self.weight.detach(), self.loss, self.s2.detach())
+
+
 class NormalizedMatches:
     """Matches of P pairs, those that count first, centred, of about unit scale, and K models for each pair.
-
-    points: (4, P, N), rows x0, y0, x1, y1, zero in padded slots. weight: (P, N), likewise. scale: of the loss in the
-    unit of the points, (P,). models: (9, P, K), entries row by row, of about unit scale. counts: which of the caller's
-    matches count. Everything is float64 and attached to the caller's graph; the frame is constant. homographies: the
-    models F are homographies, not fundamental matrices.
-    """
+    points: (4, P, N), rows x0, y0, x1, y1, zero in padded slots. weight: (P, N), likewise. error: the robust sum of
+    both. models: (9, P, K), entries row by row, of about unit scale. counts: which of the caller's matches count.
+    Everything is float64 and attached to the caller's graph; the frame is constant. scale: of the loss, px.
+    homographies: the models F are homographies, not fundamental matrices. Raises ValueError for an unknown loss."""
 
     def __init__(
-        self,
-        x0: Tensor,
-        x1: Tensor,
-        weight: Tensor | None,
-        mask: Tensor | None,
-        F: Tensor,
-        scale: float | Tensor,
-        homographies: bool = False,
-    ) -> None:
+        self, x0: Tensor, x1: Tensor, weight: Tensor | None, mask: Tensor | None, F: Tensor,
+        scale: float | Tensor = 1.0, loss: str = "truncated", homographies: bool = False,
+    ) -> None:  # fmt: skip
+        named_loss(loss)
         p, n = math.prod(x0.shape[:-2]), x0.shape[-2]
         x = torch.cat([x0, x1], -1).to(torch.float64).reshape(p, n, 4)
         w = torch.ones_like(x[..., 0]) if weight is None else weight.to(torch.float64).reshape(p, n)
@@ -173,46 +182,37 @@ class NormalizedMatches:
         self.weight = self.ordered(w)
         self.frame = PixelFrame.around(x, mask)
         self.points = torch.where(inside, self.frame.normalized(x), 0).permute(2, 0, 1).contiguous()
-        self.scale = torch.as_tensor(scale, dtype=torch.float64, device=x.device).expand(x0.shape[:-2]).reshape(p)
-        self.scale = self.scale / self.frame.pixels_per_unit
+        scales = torch.as_tensor(scale, dtype=torch.float64, device=x.device).expand(x0.shape[:-2]).reshape(p)
+        s2 = (scales / self.frame.pixels_per_unit).square()
+        self.error = RobustSum(self.points, self.weight, loss, s2[:, None])
         is_model = (torch.isfinite(F).flatten(-2).all(-1) & (F != 0).flatten(-2).any(-1))[..., None, None]
         F = torch.where(is_model, F, F.detach())  # no gradient to what is zero or not finite
         matrices = F.to(torch.float64).reshape(p, math.prod(F.shape[x0.dim() - 2 : -2]), 3, 3)
-        frame = self.frame
-        self._to_pixels = frame.homography_to_pixels if homographies else frame.to_pixels
-        from_pixels = frame.homography_from_pixels if homographies else frame.from_pixels
-        self.models = as_components(_about_unit(from_pixels(matrices)))
+        self._homographies = homographies
+        self.models = as_components(_about_unit(self.frame.from_pixels(matrices, homographies)))
 
-    def ordered(self, weight: Float[Tensor, "*batch n"]) -> Float[Tensor, "p n"]:
+    def ordered(self, weight: PerMatch) -> Float[Tensor, "p n"]:
         """Values of matches in the caller's order in the order of `points`, 0 in padded slots; float64."""
         flat = weight.to(torch.float64).reshape(self._order.shape)
         return torch.where(self._mask, flat.gather(1, self._order), 0)
 
     def to_pixels(self, models: Float[Tensor, "9 p k"]) -> Float[Tensor, "p k 3 3"]:
         """Matrices in pixels, of unit norm."""
-        return as_matrices(unit(as_components(self._to_pixels(as_matrices(models)))))
+        return as_matrices(unit(as_components(self.frame.to_pixels(as_matrices(models), self._homographies))))
 
 
 @torch.no_grad()
 def fitted_by(
-    fit: Callable[[Array, Weighted, Array, Array], None],
-    models: Float[Tensor, "9 p k"],
-    points: Float[Tensor, "4 p n"],
-    weight: Float[Tensor, "p n"],
-    s2: Float[Tensor, "p slots"],
-    loss: str,
+    fit: Callable[[Array, Weighted, Array, Array], None], models: Float[Tensor, "9 p k"], error: RobustSum
 ) -> tuple[Float[Tensor, "9 p k"], Float[Tensor, "p k"]]:
     """Models and costs after fit(models (k, 9), matches, out (k, 9), cost (k,)), a kernel, of each pair, on the CPU.
-
-    s2: squared scales of the loss, one a pair or a match. A model that cannot be fitted comes back as it was, with
-    infinite cost.
-    """
+    A model that cannot be fitted comes back as it was, with infinite cost."""
     start = as_matrices(models).flatten(2).cpu().contiguous().numpy()
-    columns, weights = (t.detach().cpu().contiguous().numpy() for t in (points.movedim(1, 0), weight))
-    scales = s2.detach().expand_as(weight).cpu().contiguous().numpy()
+    columns, weights = (t.detach().cpu().contiguous().numpy() for t in (error.points.movedim(1, 0), error.weight))
+    scales = error.s2.detach().expand_as(error.weight).cpu().contiguous().numpy()
     out, cost = np.empty_like(start), np.empty(start.shape[:2])
     for p, given in enumerate(start):
-        matches = Weighted(columns[p], weights[p], scales[p], LOSS_CODES[loss], loss_table(loss))
+        matches = Weighted.of(columns[p], weights[p], scales[p], error.loss)
         fit(given, matches, out[p], cost[p])
     known = np.isfinite(cost)
     fitted = torch.from_numpy(np.where(known[..., None], out, start)).to(models.device)

@@ -44,11 +44,9 @@ def equations(X: Array, size: int, A: Array) -> None:
 @inner
 def null_space(A: Array, m: int, B: Array, scale: Array) -> Any:
     """An orthonormal basis of the null space of A (m 9, LANES), which is overwritten -> B ((9 - m) 9, LANES).
-
     The last columns of Q in A^T = Q R (Golub and Van Loan, Matrix Computations, section 5.2); A^T A, whose condition is
     squared, is never formed. Not scaled against overflow: entries should be of about unit size. Returns a mask: whether
-    each matrix has rank m, without which its basis is finite but means nothing. scale: (m, LANES), for the work.
-    """
+    each matrix has rank m, without which its basis is finite but means nothing. scale: (m, LANES), for the work."""
     zero = fill(0.0)
     full_rank = zero == 0.0
     for k in range(m):

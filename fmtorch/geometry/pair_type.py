@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, Real
-from numpy.typing import NDArray
 from torch import Tensor
 
 from fmtorch.core.types import PAIR_TYPES
@@ -15,9 +14,6 @@ from fmtorch.geometry.epipolar import HOMOGRAPHY, SAMPSON
 from fmtorch.geometry.rotation import Cameras, fit_rotation
 from fmtorch.jit.batches import for_each_pair
 from fmtorch.jit.kernel import Array, B1x1, F8x1, F8x2, inner, kernel, matrix, vector
-
-# Evidence for the kinds of an image pair, compiled; see `pair_type`. Matches are those of one pair, in pixels
-
 
 FREEDOM = 3.0  # degrees, of Student's law: keypoints err by more than the normal one says
 PEAK = 0.36755259694786135  # of that law: 2 / (pi sqrt(3))
@@ -171,10 +167,8 @@ def _noise(r2: Array, prior: Array, side: float, dimensions: int, work: Array) -
 @inner
 def _densities(r2: Array, s: float, side: float, dimensions: int, out: Array) -> None:
     """Of right matches over that of wrong ones -> out (n,), by Student's law of FREEDOM = 3 degrees.
-
     Of one dimension, the distance from a line, or of two, from a point; the Sampson distance being that of four
-    coordinates, both are wider across than it by a root of two.
-    """
+    coordinates, both are wider across than it by a root of two."""
     by = 1 / (FREEDOM * s * s)
     if dimensions == 1:
         peak = side / ROOT2 * PEAK / s
@@ -191,10 +185,8 @@ def _densities(r2: Array, s: float, side: float, dimensions: int, out: Array) ->
 @inner
 def _log_likelihood(d: Array, prior: Array, share: Array) -> Any:
     """The maximum over the shares of sum log L -> share (j + 1,), d (j, n) being the densities of right matches.
-
     A match that the prior takes to be right belongs to one of the j components by their shares, and else is wrong like
-    the others: ``L = 1 - P (w_1 + w_2) + P (w_1 d_1 + w_2 d_2)``.
-    """
+    the others: ``L = 1 - P (w_1 + w_2) + P (w_1 d_1 + w_2 d_2)``."""
     j, n = d.shape
     share[0], share[1], share[2] = 1 / (j + 1), 1 / (j + 1), 1 / (j + 1) if j > 1 else 0.0
     for _ in range(STEPS):
@@ -250,8 +242,6 @@ def _fit_copy(points: Array, noise: Array, plane: Array, s: float, H: Array) -> 
         _distances(H, points, noise, False, r2)
 
 
-_Array = NDArray[Any]
-
 GENERAL, PLANAR, ROTATION, IDENTICAL, UNRELATED = range(len(PAIR_TYPES))
 MIN_EVIDENCE = 80.0  # nats; of the tuning pairs, unrelated ones reach 50 and related ones have 176 or more
 MIN_PARALLAX = 12.0  # nats; of the tuning pairs, planes reach 6, and wide scenes have 70
@@ -261,13 +251,11 @@ PLANE_PARAMETERS, COPY_PARAMETERS = 8, 3  # of a homography, and of a similarity
 
 class Evidence(NamedTuple):
     """Log likelihoods of B pairs in nats, relative to matches that are all wrong, each at its best shares.
-
     line: right matches lie on epipolar lines. plane: where H takes them. both: some here and some there. rotation:
     where K1 R K0^-1 takes them, less the cost of focal lengths that differ; -inf where no cameras are given. copy:
     where ``x1 = a x0 + b`` takes them. noise: of usual matches, px. matches: how many are real. on_plane, on_line:
     shares of the matches on the plane, and off it on their lines. R: the rotation; log_focal: what is added to the
-    logarithms of both focal lengths; scaled: a and b.
-    """
+    logarithms of both focal lengths; scaled: a and b."""
 
     line: Float[Tensor, " b"]
     plane: Float[Tensor, " b"]
@@ -335,7 +323,7 @@ def pair_evidence(
     return Evidence(*columns)
 
 
-def _into(x0: _Array, x1: _Array, mask: _Array, prior: _Array, noise: _Array, *known: _Array) -> None:
+def _into(x0: Array, x1: Array, mask: Array, prior: Array, noise: Array, *known: Array) -> None:
     models, size0, size1, precision, out = known
     F, H, K0, K1 = models
     matches = Matches(x0, x1, mask, prior, noise)

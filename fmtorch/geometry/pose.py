@@ -9,6 +9,7 @@ from torch import Tensor
 
 from fmtorch.geometry.arithmetic import cofactors, component_sum, cross, product, sqrt
 from fmtorch.geometry.matrices import complement, complement_kernel, last_right_singular_vector
+from fmtorch.geometry.normalize import Mask, Matrices, PerMatch, Points
 from fmtorch.geometry.rank2_manifold import SQUARINGS, start_one
 from fmtorch.jit.kernel import Array, F8x1, F8x2, inner, kernel, matrix, vector
 from fmtorch.jit.lanes import fill, load
@@ -20,7 +21,7 @@ class Pose(NamedTuple):
     Where `valid` is False, R is the identity and t is zero.
     """
 
-    R: Float[Tensor, "*batch 3 3"]
+    R: Matrices
     t: Float[Tensor, "*batch 3"]
     n_in_front: Int[Tensor, "*batch"]
     valid: Bool[Tensor, "*batch"]
@@ -46,20 +47,11 @@ class _Decomposition(NamedTuple):
     valid: Tensor
 
 
-def poses_from_fundamental(
-    F: Float[Tensor, "*batch 3 3"], K0: Float[Tensor, "*batch 3 3"], K1: Float[Tensor, "*batch 3 3"]
-) -> FourPoses:
+def poses_from_fundamental(F: Matrices, K0: Matrices, K1: Matrices) -> FourPoses:
     """The four decompositions of E = K1^T F K0, in no order of merit; matches tell which one is right.
 
-    Hartley and Zisserman, Multiple View Geometry, 9.6.2. Float64 inside, F's type outside; differentiable.
-
-    Args:
-        F: fundamental matrices (..., 3, 3), of any scale and sign.
-        K0: calibration matrices (..., 3, 3) of image 0.
-        K1: those of image 1.
-
-    Returns:
-        `FourPoses`.
+    Hartley and Zisserman, Multiple View Geometry, 9.6.2. Float64 inside, F's type outside; differentiable. Arguments as
+    of `pose_from_fundamental`.
     """
     R, t, _, valid = _decomposed(F, K0, K1)
     R, t = R.movedim((2, 0, 1), (-3, -2, -1)), t.movedim((1, 0), (-2, -1))
@@ -69,13 +61,13 @@ def poses_from_fundamental(
 
 
 def pose_from_fundamental(
-    F: Float[Tensor, "*batch 3 3"],
-    K0: Float[Tensor, "*batch 3 3"],
-    K1: Float[Tensor, "*batch 3 3"],
-    x0: Float[Tensor, "*batch n 2"],
-    x1: Float[Tensor, "*batch n 2"],
-    mask: Bool[Tensor, "*batch n"] | None = None,
-    weight: Float[Tensor, "*batch n"] | None = None,
+    F: Matrices,
+    K0: Matrices,
+    K1: Matrices,
+    x0: Points,
+    x1: Points,
+    mask: Mask | None = None,
+    weight: PerMatch | None = None,
 ) -> Pose:
     """Rotation and direction of translation from E = K1^T F K0, of the four decompositions the one with most points
     of positive depth in both cameras.
@@ -101,10 +93,13 @@ def pose_from_fundamental(
     R, t, (inverse0, inverse1), regular = _decomposed(F, K0, K1)
     keep = mask & (x0.isfinite() & x1.isfinite()).all(-1)
     with torch.no_grad():
-        ray0, ray1 = (_rays(K, torch.where(keep[..., None], x, 0.0)) for K, x in ((inverse0, x0), (inverse1, x1)))
+        ray0, ray1 = (rays(K, torch.where(keep[..., None], x, 0.0)) for K, x in ((inverse0, x0), (inverse1, x1)))
         front = _in_front(R, t, ray0, ray1) & keep
-        count = front.sum(-1)  # (4, *batch)
-        best = (count if weight is None else _support(front, weight)).argmax(0)
+        count = support = front.sum(-1)  # (4, *batch)
+        if weight is not None:  # whole numbers, whose sums are the same in any order
+            counted = torch.where(front.any(0), weight.detach(), 0.0).clamp(0, 1).double()
+            support = torch.where(front, (counted * 2.0**20).round().to(torch.int64), 0).sum(-1)
+        best = support.argmax(0)
     n_in_front = torch.gather(count, 0, best[None])[0]
     valid = regular & (n_in_front > 0)
     R = torch.gather(R, 2, best[None, None, None].expand(3, 3, 1, *best.shape))[:, :, 0].movedim((0, 1), (-2, -1))
@@ -120,10 +115,10 @@ def _decomposed(F: Tensor, K0: Tensor, K1: Tensor) -> _Decomposition:
     finite = torch.stack([A.isfinite().all(0).all(0) for A in (F_, K0_, K1_)]).all(0)
     F_, K0_, K1_ = (torch.where(finite, A, 0.0) for A in (F_, K0_, K1_))
     E = product(product(K1_.transpose(0, 1), F_), K0_)
-    inverse0, regular0 = _inverse(K0_)
-    inverse1, regular1 = _inverse(K1_)
+    inverse0, regular0 = inverse(K0_)
+    inverse1, regular1 = inverse(K1_)
     E, t, two = _essential(E)
-    straight, turned = cofactors(E), _cross_matrix_product(t, E)
+    straight, turned = cofactors(E), torch.stack([cross(t, E[:, j]) for j in range(3)], 1)
     R = torch.stack([straight - turned, straight + turned, straight - turned, straight + turned], 2)
     t = torch.stack([t, t, -t, -t], 1)
     return _Decomposition(R, t, (inverse0, inverse1), finite & regular0 & regular1 & two)
@@ -131,7 +126,6 @@ def _decomposed(F: Tensor, K0: Tensor, K1: Tensor) -> _Decomposition:
 
 def _essential(E: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """The nearest matrix with singular values (1, 1, 0) up to scale, its left null vector t, and whether E has rank 2.
-
     Between the planes across the null vectors E is a 2 x 2 matrix, whose nearest rotation or reflection is closed form.
     """
     size = E.detach().abs().amax((0, 1))
@@ -163,25 +157,14 @@ def _in_front(R: Tensor, t: Tensor, ray0: Tensor, ray1: Tensor) -> Tensor:
     return (depth0 > 0) & (depth1 > 0)
 
 
-def _support(front: Tensor, weight: Tensor) -> Tensor:
-    """The sum of the weights of points in front, (4, *batch), as whole numbers: the same in any order."""
-    rounded = (torch.where(front.any(0), weight.detach(), 0.0).clamp(0, 1).double() * 2.0**20).round().to(torch.int64)
-    return torch.where(front, rounded, 0).sum(-1)
-
-
-def _rays(inverse: Tensor, x: Tensor) -> Tensor:
+def rays(inverse: Tensor, x: Tensor) -> Tensor:
     """K^-1 (x, y, 1): (3, *batch, n)."""
     x = x.to(torch.float64)
     columns = inverse[..., None]
     return columns[:, 0] * x[..., 0] + columns[:, 1] * x[..., 1] + columns[:, 2]
 
 
-def _cross_matrix_product(t: Tensor, E: Tensor) -> Tensor:
-    """[t]x E: the cross products of t with E's columns."""
-    return torch.stack([cross(t, E[:, j]) for j in range(3)], 1)
-
-
-def _inverse(K: Tensor) -> tuple[Tensor, Tensor]:
+def inverse(K: Tensor) -> tuple[Tensor, Tensor]:
     """K^-1 by cofactors, and whether there is one."""
     C = cofactors(K)
     determinant = component_sum(K[0] * C[0])
@@ -198,9 +181,7 @@ RANK_2 = 1e-10  # share of the squared norm that the product of the singular val
 @inner
 def nearest_axes(M: Array, e0: Array, e1: Array, U: Array, V: Array) -> Any:
     """U and V (3, 3) of the essential matrix nearest to M (9,), whose epipoles are e0, e1; whether M has rank 2.
-
-    In the planes across the epipoles M is 2 x 2; its nearest orthogonal matrix gives both singular values 1.
-    """
+    In the planes across the epipoles M is 2 x 2; its nearest orthogonal matrix gives both singular values 1."""
     p, q, a, b = vector(3), vector(3), vector(3), vector(3)
     complement_kernel(e0, p, q)
     complement_kernel(e1, a, b)
@@ -223,10 +204,8 @@ def nearest_axes(M: Array, e0: Array, e1: Array, U: Array, V: Array) -> Any:
 @kernel(holds_gil=True)
 def pose(F: F8x2, cameras: F8x1, x0: F8x2, x1: F8x2, weight: F8x1, out: F8x1) -> None:
     """The pose of a fundamental matrix (3, 3), of four the one with the most support in front -> out (13,).
-
     cameras: (6,), focal length and principal point of both. x0, x1: (n, 2). weight: (n,), in [0, 1], by which matches
-    count. out: R row by row, t of unit length, and 1; all zero where there is no pose.
-    """
+    count. out: R row by row, t of unit length, and 1; all zero where there is no pose."""
     M, G, e0, e1, U, V, R = vector(9), vector(9), vector(3), vector(3), matrix(3, 3), matrix(3, 3), matrix(6, 3)
     f0, u0, v0, f1, u1, v1 = cameras
     for r in range(3):  # E = K1^T F K0
@@ -237,7 +216,7 @@ def pose(F: F8x2, cameras: F8x1, x0: F8x2, x1: F8x2, weight: F8x1, out: F8x1) ->
         M[6 + c] = G[c] * u1 + G[3 + c] * v1 + G[6 + c]
     start_one(M, SQUARINGS, G, e0, e1)
     valid = nearest_axes(G, e0, e1, U, V)
-    handed = _determinant(U) * _determinant(V)
+    handed = handedness(U) * handedness(V)
     for r in range(3):
         for c in range(3):
             turned, straight = U[r, 1] * V[c, 0] - U[r, 0] * V[c, 1], U[r, 2] * V[c, 2] * handed
@@ -270,9 +249,7 @@ def pose(F: F8x2, cameras: F8x1, x0: F8x2, x1: F8x2, weight: F8x1, out: F8x1) ->
 @inner
 def _vote(R: Array, U: Array, a: Array, b: Array, weight: float, support: Array) -> None:
     """Adds the weight of a match of rays a, b to the poses R[:3], R[3:], and these with -t, in front of which it lies.
-
-    Least squares on d1 b = d0 R a + t: the signs of the depths are those of n (b x t) and n (R a x t), n = R a x b.
-    """
+    Least squares on d1 b = d0 R a + t: the signs of the depths are those of n (b x t) and n (R a x t), n = R a x b."""
     for k in range(2):
         p, q, r = 0.0, 0.0, 0.0
         for i in range(3):
@@ -290,7 +267,7 @@ def _vote(R: Array, U: Array, a: Array, b: Array, weight: float, support: Array)
 
 
 @inner
-def _determinant(M: Array) -> Any:
+def handedness(M: Array) -> Any:
     """The sign of the determinant (3, 3) of orthogonal columns."""
     a = M[0, 0] * (M[1, 1] * M[2, 2] - M[1, 2] * M[2, 1])
     b = M[0, 1] * (M[1, 2] * M[2, 0] - M[1, 0] * M[2, 2]) + M[0, 2] * (M[1, 0] * M[2, 1] - M[1, 1] * M[2, 0])
@@ -303,11 +280,9 @@ def _determinant(M: Array) -> Any:
 @inner
 def consistently_oriented(F: Array, X: Array, size: int) -> Any:
     """Whether ``F x0`` and ``e1 x x1``, the same epipolar line, point the same way for all matches of a sample: a mask.
-
     Chum, Werner & Matas, "Epipolar geometry estimation via RANSAC benefits from the oriented epipolar constraint"
     (ICPR 2004). A model through a wrong match mostly fails, so a look at the sample alone tells most wrong models.
-    F: (9, LANES), of rank two. X: (4 size, LANES), x0, y0, x1, y1 of the matches that each model was made from.
-    """
+    F: (9, LANES), of rank two. X: (4 size, LANES), x0, y0, x1, y1 of the matches that each model was made from."""
     f0, f1, f2, f3, f4, f5 = load(F, 0), load(F, 1), load(F, 2), load(F, 3), load(F, 4), load(F, 5)
     f6, f7, f8 = load(F, 6), load(F, 7), load(F, 8)
     # The epipole is across all columns: here two combinations, which no usual epipole makes parallel.

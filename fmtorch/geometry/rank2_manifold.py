@@ -24,10 +24,8 @@ def constrained_solve(
     H: Float[Tensor, "9 9 p k"], F: Tensor, e0: Tensor, e1: Tensor, damping: Tensor, right: Float[Tensor, "9 r p k"]
 ) -> Float[Tensor, "9 r p k"]:
     """Solve ``(H + damping c I) x = right`` for x orthogonal to ``e1 e0^T`` by Gauss-Jordan elimination.
-
     The constraint has a row and a column of its own; H is positive semidefinite, so that no pivoting is needed.
-    Along F, to which the residual is blind, H is given the curvature c.
-    """
+    Along F, to which the residual is blind, H is given the curvature c."""
     normal = (e1[:, None] * e0).flatten(0, 1)
     curvature = H.diagonal(dim1=0, dim2=1).amax(-1)
     Q = H.new_zeros(10, 10 + right.shape[1], *F.shape[1:])
@@ -54,17 +52,15 @@ def retract(F: Tensor, step: Tensor, e0: Tensor, e1: Tensor) -> tuple[Tensor, Te
     return G, unit(component_sum(C * e1[:, None])), unit(component_sum(C * e0, 1))
 
 
-def start(F: Float[Tensor, "9 p k"], squarings: int = SQUARINGS) -> tuple[Tensor, Tensor, Tensor]:
+def start(F: Float[Tensor, "9 p k"]) -> tuple[Tensor, Tensor, Tensor]:
     """A rank-2 matrix of unit norm close to F and its epipoles: ``F (I - e0 e0^T)``.
-
     e0 is the right singular vector of the smallest singular value, by squarings of the matrix whose dominant
     eigenvector it is: with five to rounding where the last two singular values differ by half, with none where F has
-    rank 2 up to rounding already. The result has rank 2 in any case.
-    """
+    rank 2 up to rounding already. The result has rank 2 in any case."""
     F = unit(F)
     C = cofactors(as_rows(F))
     K = component_sum(C[:, :, None] * C[:, None])  # C^T C
-    for _ in range(squarings):
+    for _ in range(SQUARINGS):
         K = K / K.abs().amax((0, 1))
         K = component_sum(K[:, :, None] * K[:, None])
     size = component_sum(K * K, 1)
@@ -86,9 +82,7 @@ def constant(like: Tensor, components: tuple[float, ...]) -> Tensor:
 @inner
 def start_one(F: Array, squarings: int, G: Array, e0: Array, e1: Array) -> None:
     """The unit matrix of rank 2 near a model (9,) -> G, and its epipoles -> e0, e1 (3,).
-
-    squarings: of the matrix whose columns tend to the null vector; more for models that are farther from rank 2.
-    """
+    squarings: of the matrix whose columns tend to the null vector; more for models that are farther from rank 2."""
     C, K, P = vector(9), matrix(3, 3), matrix(3, 3)
     for i in range(9):
         G[i] = F[i]
@@ -142,9 +136,7 @@ def gauss_newton(F: F8x1, matches: Weighted, damping: float, out: F8x1) -> None:
 @kernel(holds_gil=True)
 def response(F: F8x1, matches: Weighted, damping: float, out: F8x2) -> None:
     """How an optimum (9,) moves with the gradient of its cost by the nine entries -> out (9, 9), minus inverse Hessian.
-
-    By the implicit function theorem, in the tangent space of the manifold, with Gauss and Newton's Hessian.
-    """
+    By the implicit function theorem, in the tangent space of the manifold, with Gauss and Newton's Hessian."""
     at, e0, e1 = matrix(1, 9), matrix(1, 3), matrix(1, 3)
     products, cost, Q = np.empty((1, 10, 10)), vector(1), np.zeros((20, LANES))
     start_one(F, SQUARINGS, at[0], e0[0], e1[0])
@@ -163,9 +155,7 @@ def steps(
     products: Array, F: Array, e0: Array, e1: Array, damping: Array, G: Array, g0: Array, g1: Array
 ) -> None:  # fmt: skip
     """Damped Gauss-Newton steps of models (k, 9), epipoles (k, 3) -> G (k, 9), g0, g1 (k, 3), again of rank 2.
-
-    products: (k, 10, 10), of `levenberg_marquardt.evaluate`. damping: (k,).
-    """
+    products: (k, 10, 10), of `levenberg_marquardt.evaluate`. damping: (k,)."""
     Q, C = np.zeros((20, LANES)), vector(9)
     for k in range(len(F)):
         _system(products[k], F[k], e0[k], e1[k], damping[k], Q)
@@ -180,25 +170,32 @@ def steps(
 
 @inner
 def _system(products: Array, F: Array, e0: Array, e1: Array, damping: float, Q: Array) -> None:
-    """The damped normal equations of a model -> Q, (10, 11) in two rows of LANES each, without right side."""
-    curvature = 0.0
-    for i in range(9):
-        curvature = max(curvature, products[i, i])
+    """The damped normal equations of a model, with the constraint -> Q, (10, 11) in two rows of LANES each, without
+    right side."""
+    damped_system(products, F, damping, Q)
     for r in range(9):
-        for c in range(9):
-            Q[2 * r + c // LANES, c % LANES] = products[r, c] + curvature * F[r] * F[c]
-        Q[2 * r + r // LANES, r % LANES] += curvature * damping
         normal = e1[r // 3] * e0[r % 3]
         Q[2 * r + 1, 9 - LANES], Q[18 + r // LANES, r % LANES] = normal, normal
     Q[19, 9 - LANES] = 0.0
 
 
 @inner
+def damped_system(products: Array, x: Array, damping: float, Q: Array) -> None:
+    """The damped normal equations of nine entries x (9,), to whose scale the residual is blind -> the first nine rows
+    of Q, in two rows of LANES each, without right side."""
+    curvature = 0.0
+    for i in range(9):
+        curvature = max(curvature, products[i, i])
+    for r in range(9):
+        for c in range(9):
+            Q[2 * r + c // LANES, c % LANES] = products[r, c] + curvature * x[r] * x[c]
+        Q[2 * r + r // LANES, r % LANES] += curvature * damping
+
+
+@inner
 def eliminate(Q: Array, n: int) -> None:
     """Gauss-Jordan elimination of (n, n + 1) without pivoting, in place: the solution is the last column.
-
-    Each row of the matrix is one or more of Q's rows of LANES.
-    """
+    Each row of the matrix is one or more of Q's rows of LANES."""
     wide = len(Q) // n
     for i in range(n):
         first, lane = i // LANES, i % LANES

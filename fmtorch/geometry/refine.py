@@ -5,6 +5,7 @@ and unit norm (see `rank2_manifold`), by kernels, and attaches the optimum to th
 is refined to the same bits in any batch.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -12,34 +13,14 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from fmtorch.geometry import rank2_manifold
 from fmtorch.geometry.arithmetic import as_rows, cofactors, component_sum, gradient_wanted, sqrt, stable_sum, unit
-from fmtorch.geometry.epipolar import homogeneous, linearise
-from fmtorch.geometry.levenberg_marquardt import (
-    FIRST_DAMPING,
-    Problem,
-    Schedule,
-    Weighted,
-    accepting,
-    evaluate,
-    levenberg_marquardt,
-)
+from fmtorch.geometry.epipolar import linearise
+from fmtorch.geometry.levenberg_marquardt import FIRST_DAMPING, Problem, Schedule, Weighted, evaluate, minimiser
 from fmtorch.geometry.matrices import assign, assign_rows
-from fmtorch.geometry.normalize import NormalizedMatches, fitted_by
-from fmtorch.geometry.rank2_manifold import (
-    RANK_TWO,
-    RANK_TWO_EPIPOLE,
-    SQUARINGS,
-    constant,
-    constrained_solve,
-    retract,
-    start,
-    start_one,
-    steps,
-)
-from fmtorch.geometry.robust_losses import RobustLoss, named_loss
+from fmtorch.geometry.normalize import NormalizedMatches, RobustSum, fitted_by
+from fmtorch.geometry.rank2_manifold import RANK_TWO, RANK_TWO_EPIPOLE, SQUARINGS, constant, start_one, steps
 from fmtorch.jit.kernel import Array, F8x1, F8x2, inner, kernel, matrix, vector
-
-# Levenberg-Marquardt of the robust Sampson error on the manifold of rank 2 and unit norm, for the models of a pair
 
 
 class _State(NamedTuple):
@@ -55,9 +36,7 @@ class _State(NamedTuple):
 @kernel
 def refine_kernel(F: F8x2, squarings: int, matches: Weighted, schedule: Schedule, out: F8x2, cost: F8x1) -> None:
     """Models (k, 9) made rank 2 and refined -> out (k, 9), cost (k,); what cannot be is not finite, nor its cost.
-
-    squarings: of `start_one`.
-    """
+    squarings: of `start_one`."""
     k = len(F)
     state = _State(out, matrix(k, 3), matrix(k, 3), np.empty((k, 10, 10)), cost)
     trial = _State(matrix(k, 9), matrix(k, 3), matrix(k, 3), np.empty((k, 10, 10)), vector(k))
@@ -85,33 +64,22 @@ def _take(state: _State, trial: _State, k: int) -> None:
     assign_rows(state.products[k], trial.products[k])
 
 
-_minimise = levenberg_marquardt(_evaluate, _step, accepting(_take))
+_minimise = minimiser(_evaluate, _step, _take)
 
 
 def refine_components(
-    F: Float[Tensor, "9 p k"],
-    points: Float[Tensor, "4 p n"],
-    weight: Float[Tensor, "p n"],
-    loss: str,
-    scale: Float[Tensor, " p"] | Float[Tensor, "p slots"],
-    iterations: int,
-    tolerance: float = 0.0,
+    F: Float[Tensor, "9 p k"], error: RobustSum, iterations: int
 ) -> tuple[Float[Tensor, "9 p k"], Float[Tensor, "p k"]]:
-    """Refined models and their costs ``sum_i w_i rho(r_i^2)``, component by component, without gradients.
-
-    F: k models for each of p pairs, entries row by row; made rank 2 first where they are not. points: x0, y0, x1, y1,
-    of about unit scale; finite. weight: 0 in padded slots. scale: of the loss, in the unit of the points,
-    one for all matches of a pair, (p,) or (p, 1), or one for each (p, n).
-    iterations: at most. tolerance: a model is done once a step has lowered its cost by no more than this share of it.
+    """Refined models and their costs, component by component, without gradients.
+    F: k models for each of p pairs, entries row by row; made rank 2 first where they are not. iterations: at most.
     The cost of a model never rises above that of its (rank-2) start; a model that cannot be improved is kept, one that
-    is not finite comes back as it was, with infinite cost.
-    """
-    schedule = Schedule(iterations, FIRST_DAMPING, tolerance)
-    scale = scale if scale.dim() > 1 else scale[:, None]
-    return fitted_by(
-        lambda models, matches, out, cost: refine_kernel(models, SQUARINGS, matches, schedule, out, cost),
-        F, points, weight, scale.square(), loss,
-    )  # fmt: skip
+    is not finite comes back as it was, with infinite cost."""
+    schedule = Schedule(iterations, FIRST_DAMPING, 0.0)
+
+    def fit(models: Array, matches: Weighted, out: Array, cost: Array) -> None:
+        refine_kernel(models, SQUARINGS, matches, schedule, out, cost)
+
+    return fitted_by(fit, F, error)
 
 
 def refine(
@@ -150,14 +118,12 @@ def refine(
     Raises:
         ValueError: for an unknown loss.
     """
-    robust = named_loss(loss)
     wanted = gradient_wanted(x0, x1, weight)
     with torch.set_grad_enabled(wanted):
-        matches = NormalizedMatches(x0, x1, weight, mask, F.detach(), scale)
-        shared = (matches.points, matches.weight)
-        models, _ = refine_components(matches.models, *shared, loss, matches.scale, iterations)
+        matches = NormalizedMatches(x0, x1, weight, mask, F.detach(), scale, loss)
+        models, _ = refine_components(matches.models, matches.error, iterations)
         if wanted:
-            models = at_optimum(models, *shared, robust, matches.scale)
+            models = at_optimum(models, matches.error)
         return matches.to_pixels(models).reshape(F.shape)
 
 
@@ -188,86 +154,81 @@ def attached_step(
     Raises:
         ValueError: there is no such loss.
     """
-    matches = NormalizedMatches(x0, x1, weight, mask, F.detach(), scale)
+    matches = NormalizedMatches(x0, x1, weight, mask, F.detach(), scale, loss)
     with torch.no_grad():
-        model, e0, e1 = start(matches.models)
-        robust = named_loss(loss)
-        H = curvature_of_cost(model, matches.points, matches.weight, robust, matches.scale)
+        model, e0, e1 = rank2_manifold.start(matches.models)
+        H = curvature_of_cost(model, matches.error)
         identity = torch.eye(9, dtype=H.dtype, device=H.device)[:, :, None, None].expand_as(H)
-        inverse = constrained_solve(H, model, e0, e1, torch.full_like(H[0, 0], STEP_DAMPING), identity)
+        inverse = rank2_manifold.constrained_solve(H, model, e0, e1, torch.full_like(H[0, 0], STEP_DAMPING), identity)
         valid = torch.isfinite(inverse).flatten(0, 1).all(0)
         inverse = torch.where(valid, inverse, 0)
         # Something of rank 2 instead of what is not finite: `where` alone would not keep NaN out of the gradients.
         model = torch.where(valid, model, constant(model, RANK_TWO))
         e0, e1 = (torch.where(valid, e, constant(e, RANK_TWO_EPIPOLE)) for e in (e0, e1))
-    gradient = gradient_of_cost(model, matches.points, matches.weight, robust, matches.scale)
+    gradient = gradient_of_cost(model, matches.error)
     step = -component_sum((inverse * gradient).transpose(0, 1))
-    moved, _, _ = retract(model, step, e0, e1)
+    moved, _, _ = rank2_manifold.retract(model, step, e0, e1)
     return matches.to_pixels(torch.where(valid, moved, matches.models)).reshape(F.shape)
 
 
 # Gradients of the least robust Sampson error: those of the optimum
 
-STEP_DAMPING = 1e-10  # of the attached step: bounds its gradient where the points leave a direction open
+STEP_DAMPING = 1e-10  # of a Gauss-Newton step at an optimum: bounds it where the points leave a direction open
 
 
-def gradient_of_cost(
-    F: Float[Tensor, "9 p k"],
-    points: Float[Tensor, "4 p n"],
-    weight: Float[Tensor, "p n"],
-    robust: RobustLoss,
-    scale: Float[Tensor, " p"],
-) -> Float[Tensor, "9 p k"]:
+def gradient_of_cost(F: Float[Tensor, "9 p k"], error: RobustSum) -> Float[Tensor, "9 p k"]:
     """Half the gradient of the cost with respect to F, ``sum_i w_i rho'(r_i^2) r_i dr_i``; attached to all inputs."""
-    J, e, inverse, r2 = linearise(F, homogeneous(points[:, None, :, None]))
-    influence = weight[:, None] * robust.weight(r2, scale.square()[:, None, None]) * inverse * e
-    return stable_sum(J.flatten(0, 1) * influence)[:, 0]
+    J, e, inverse, r2 = linearise(F, error.points)
+    influence = error.weight[:, None] * error.rho.weight(r2, error.s2[:, None]) * inverse * e
+    return stable_sum(J.flatten(0, 1) * influence)
 
 
-def curvature_of_cost(
-    F: Float[Tensor, "9 p k"],
-    points: Float[Tensor, "4 p n"],
-    weight: Float[Tensor, "p n"],
-    robust: RobustLoss,
-    scale: Float[Tensor, " p"],
-) -> Float[Tensor, "9 9 p k"]:
+def curvature_of_cost(F: Float[Tensor, "9 p k"], error: RobustSum) -> Float[Tensor, "9 9 p k"]:
     """The Gauss-Newton matrix ``J^T W J`` with Newton's weights, those of the loss's curvature, not those of IRLS."""
-    J, _, inverse, r2 = linearise(F, homogeneous(points[:, None, :, None]))
-    J = J.flatten(0, 1)[:, 0]
-    weighted = J * (weight[:, None] * robust.curvature(r2, scale.square()[:, None, None]) * inverse)[0]
+    J, _, inverse, r2 = linearise(F, error.points)
+    J = J.flatten(0, 1)
+    weighted = J * (error.weight[:, None] * error.rho.curvature(r2, error.s2[:, None]) * inverse)
     return torch.stack([stable_sum(weighted * column) for column in J], 1)
 
 
-def at_optimum(
-    F: Float[Tensor, "9 p k"],
-    points: Float[Tensor, "4 p n"],
-    weight: Float[Tensor, "p n"],
-    robust: RobustLoss,
-    scale: Float[Tensor, " p"],
-) -> Float[Tensor, "9 p k"]:
+def at_optimum(F: Float[Tensor, "9 p k"], error: RobustSum) -> Float[Tensor, "9 p k"]:
     """F, optima of rank 2 and unit norm, attached to the graph of points and weights by the implicit function theorem.
-
     The optimum moves by ``dF = -H^-1 d(gradient)`` in the tangent space of the manifold. H is the Hessian of the cost
     on it, exact: with the curvature of the residuals, and with that of the constraint ``det F = 0`` by its Lagrange
-    multiplier. Where it is not positive definite, at what is no strict minimum, Gauss and Newton's takes its place.
-    Directions that the points leave open are damped; what is not finite or zero has a gradient of zero.
-
-    Arguments as of `gradient_of_cost`; F on no graph. Returns the same values.
-    """
+    multiplier: of ``cost + 2 multiplier det F``. Where it is not positive definite, at what is no strict minimum, Gauss
+    and Newton's takes its place. Directions that the points leave open are damped; what is not finite or zero has a
+    gradient of zero. F on no graph. Returns the same values."""
+    fixed = error.detached()
     with torch.no_grad():
         valid = torch.isfinite(F).all(0) & (F != 0).any(0)
         model = unit(torch.where(valid, F, constant(F, RANK_TWO)))
         C = cofactors(as_rows(model)).flatten(0, 1)
         size = component_sum(C * C)
         valid = valid & (size > 0)
-        normal = C / sqrt(torch.where(size > 0, size, 1))
-        gauss_newton = curvature_of_cost(model, points, weight, robust, scale).movedim((0, 1), (-2, -1))
+        size = torch.where(size > 0, size, 1)
+        normal = C / sqrt(size)
+        gauss_newton = curvature_of_cost(model, fixed).movedim((0, 1), (-2, -1))
         frame = torch.stack([model, normal], -1).movedim(0, -2)
-    exact = _hessian(model, C, size, points.detach(), weight.detach(), robust, scale.detach())
-    inverse = inverse_hessian(exact, gauss_newton, frame)
-    gradient = gradient_of_cost(model, points, weight, robust, scale)
+
+    def lagrangian_slope(model: Tensor) -> Tensor:
+        gradient = gradient_of_cost(model, fixed)
+        multiplier = -component_sum(gradient.detach() * C) / size
+        return gradient + multiplier * cofactors(as_rows(model)).flatten(0, 1)
+
+    H = jacobian(lagrangian_slope, model)
+    inverse = inverse_hessian((H + H.mT) / 2, gauss_newton, frame)
+    gradient = gradient_of_cost(model, error)
     moved = component_sum(inverse * (gradient - gradient.detach()), 1)
     return F - torch.where(valid, moved, 0)  # keeps the gradient of what is not finite out
+
+
+def jacobian(function: Callable[[Tensor], Tensor], at: Float[Tensor, "9 p k"]) -> Float[Tensor, "p k 9 9"]:
+    """The derivatives of a function of models, of each for itself, by their entries."""
+    with torch.enable_grad():
+        models = at.detach().clone().requires_grad_()
+        values = function(models)
+        rows = [torch.autograd.grad(values[i].sum(), models, retain_graph=True)[0] for i in range(9)]
+    return torch.stack(rows).movedim((0, 1), (-2, -1))
 
 
 @torch.no_grad()
@@ -275,10 +236,8 @@ def inverse_hessian(
     exact: Float[Tensor, "p k 9 9"], gauss_newton: Float[Tensor, "p k 9 9"], frame: Float[Tensor, "p k 9 normals"]
 ) -> Float[Tensor, "9 9 p k"]:
     """The inverse of the exact Hessian across the orthonormal normals of a manifold, 0 along these.
-
     Where it is not finite or not positive definite, at what is no strict minimum, Gauss and Newton's takes its place.
-    Directions that the points leave open are damped.
-    """
+    Directions that the points leave open are damped."""
     across = torch.eye(9, dtype=exact.dtype, device=exact.device) - frame @ frame.mT
     largest = gauss_newton.diagonal(dim1=-2, dim2=-1).amax(-1)[..., None, None]
     blocked = largest * (frame @ frame.mT)  # so that these directions do not look open
@@ -291,17 +250,3 @@ def inverse_hessian(
     inverse = (vectors * (values / (values * values + open_below * open_below))[..., None, :]) @ vectors.mT
     projected: Tensor = across @ inverse @ across
     return projected.movedim((-2, -1), (0, 1))
-
-
-def _hessian(
-    F: Tensor, C: Tensor, size: Tensor, points: Tensor, weight: Tensor, robust: RobustLoss, scale: Tensor
-) -> Float[Tensor, "p k 9 9"]:
-    """Half the second derivative of the Lagrangian ``cost + 2 multiplier det F``; C are F's cofactors, size |C|^2."""
-    with torch.enable_grad():
-        model = F.detach().clone().requires_grad_()
-        gradient = gradient_of_cost(model, points, weight, robust, scale)
-        multiplier = -component_sum(gradient.detach() * C) / torch.where(size > 0, size, 1)
-        total = gradient + multiplier * cofactors(as_rows(model)).flatten(0, 1)
-        rows = [torch.autograd.grad(total[i].sum(), model, retain_graph=True)[0] for i in range(9)]
-    H = torch.stack(rows).movedim((0, 1), (-2, -1))
-    return (H + H.mT) / 2

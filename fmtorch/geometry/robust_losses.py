@@ -17,9 +17,6 @@ from torch import Tensor
 from fmtorch.geometry.arithmetic import logarithm_1p, sqrt
 from fmtorch.jit.kernel import Array
 
-# MAGSAC++: residuals judged by all noise scales at once (Barath et al., CVPR 2020, section 3): its loss in tables
-
-
 QUANTILE = 3.64
 ENTRIES = 2048  # intervals of u in [0, 1] between which the tabulated weight is linear: off by at most 3e-5
 TERMS = 40  # of series in x up to QUANTILE^2 / 2: what is left out is below a rounding error
@@ -33,17 +30,10 @@ def marginal_loss(u: Array) -> Array:
     return loss
 
 
-def marginal_weight(u: Array) -> Array:
-    """The derivative of the loss by r^2 over that at zero, for u in [0, 1]."""
-    return 1 - _lower_gamma(1.5, u * END) / _lower_gamma(1.5, END)
-
-
 def _lower_gamma(s: float, x: Array) -> Array:
     """The lower incomplete gamma function of s, 3/2 or 5/2, of x from 0 to about 7.
-
     ``x^s exp(-x) sum_n x^n / (s (s + 1) ... (s + n))``, and exp by its series, too: sums of positive terms, by
-    arithmetic alone, so that tables made of it are the same on every processor.
-    """
+    arithmetic alone, so that tables made of it are the same on every processor."""
     total, exponential = np.zeros_like(x), np.ones_like(x)
     for n in range(TERMS, -1, -1):
         total = (total * x + 1) / (s + n)
@@ -53,31 +43,21 @@ def _lower_gamma(s: float, x: Array) -> Array:
     return gamma
 
 
-def _loss_table() -> Array:
-    weight = np.append(marginal_weight(np.arange(ENTRIES + 1) / ENTRIES), 0.0)
-    integral = np.append(0.0, np.cumsum((weight[:-1] + weight[1:]) / (2 * ENTRIES)))
-    return np.stack([weight, integral])
-
-
-def _gain_table() -> Array:
-    middle = (np.arange(ENTRIES) + 0.5) / ENTRIES
-    return np.append(1 - marginal_loss(middle) / marginal_loss(np.ones(1)), 0.0).astype(np.float32)
-
-
-LOSS_TABLE = _loss_table()
+_u = np.arange(ENTRIES + 1) / ENTRIES
+_weight = np.append(1 - _lower_gamma(1.5, _u * END) / _lower_gamma(1.5, END), 0.0)  # the slope over that at zero
+_integral = np.append(0.0, np.cumsum((_weight[:-1] + _weight[1:]) / (2 * ENTRIES)))
+LOSS_TABLE = np.stack([_weight, _integral])
 """The weight at the ends of the intervals, zero beyond u = 1, and its integral up to each of them, (2, ENTRIES + 2)."""
-GAIN_TABLE = _gain_table()
+_gain = 1 - marginal_loss((np.arange(ENTRIES) + 0.5) / ENTRIES) / marginal_loss(np.ones(1))
+GAIN_TABLE = np.append(_gain, 0.0).astype(np.float32)
 """1 - rho / rho_max in the middle of each interval, and 0 from u = 1 on, (ENTRIES + 1,) float32."""
-
 
 _WEIGHT, _INTEGRAL = torch.from_numpy(LOSS_TABLE).unbind(0)
 
 
 class RobustLoss(NamedTuple):
     """A robust loss, its derivative with respect to r^2, and its curvature, all functions of (r2, s2).
-
-    curvature: half the second derivative with respect to r, ``rho' + 2 r^2 rho''``, and 0 where that is negative.
-    """
+    curvature: half the second derivative with respect to r, ``rho' + 2 r^2 rho''``, and 0 where that is negative."""
 
     loss: Callable[[Tensor, Tensor], Tensor]
     weight: Callable[[Tensor, Tensor], Tensor]

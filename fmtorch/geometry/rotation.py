@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fmtorch.geometry.arithmetic import exponential
+from fmtorch.geometry.homography import in_pixels
 from fmtorch.geometry.homography_refine import evaluate_homographies
 from fmtorch.geometry.levenberg_marquardt import GEMAN_MCCLURE, Weighted
 from fmtorch.geometry.matrices import assign, invert, multiply, orthogonal_factor
@@ -39,10 +40,8 @@ def fit_rotation(
     points: Array, noise: Array, H: Array, cameras: Cameras, s: float, parameters: Array, fitted: Array
 ) -> float:
     """R and focal lengths of least robust cost -> parameters (11,): logarithms, R; K1 R K0^-1 -> fitted (9,).
-
     Starts at the rotation nearest to K1^-1 H K0. points (4, n) and s in pixels. Returns the cost of the prior, infinite
-    where a calibration is singular.
-    """
+    where a calibration is singular."""
     n, unit_px = len(noise), math.sqrt(abs(cameras.K0[0, 0] * cameras.K1[0, 0]))
     A0, A1, back = vector(9), vector(9), vector(9)
     _centred(cameras.K1, unit_px, A1)
@@ -72,7 +71,8 @@ def fit_rotation(
     _minimise(turn, A1, back, matches, unit_s, prior, free)
     assign(parameters[:2], turn.focal)
     assign(parameters[2:], turn.R)
-    _in_pixels(turn.H[0], cameras, unit_px, fitted)
+    centre = np.array([cameras.K0[0, 2], cameras.K0[1, 2], cameras.K1[0, 2], cameras.K1[1, 2]])
+    in_pixels(turn.H[0], centre, unit_px, fitted)
     return _cost(turn.focal, prior)
 
 
@@ -199,14 +199,3 @@ def _centred(K: Array, unit_px: float, out: Array) -> None:
     for k in range(9):
         out[k] = 0.0
     out[0], out[1], out[4], out[8] = K[0, 0] / unit_px, K[0, 1] / unit_px, K[1, 1] / unit_px, 1.0
-
-
-@inner
-def _in_pixels(H: Array, cameras: Cameras, unit_px: float, out: Array) -> None:
-    """A homography between centred points in units as one between pixels -> out (9,)."""
-    for r in range(3):
-        out[3 * r], out[3 * r + 1] = H[3 * r] / unit_px, H[3 * r + 1] / unit_px
-        out[3 * r + 2] = H[3 * r + 2] - out[3 * r] * cameras.K0[0, 2] - out[3 * r + 1] * cameras.K0[1, 2]
-    for c in range(3):
-        out[c] = unit_px * out[c] + cameras.K1[0, 2] * out[6 + c]
-        out[3 + c] = unit_px * out[3 + c] + cameras.K1[1, 2] * out[6 + c]

@@ -22,9 +22,6 @@ from fmtorch.jit.batches import for_each_pair
 from fmtorch.jit.kernel import Array, B1x1, F8x1, F8x2, inner, kernel, matrix, vector
 from fmtorch.jobs.execution import one_thread
 
-# `significance` for the matches of one pair, in float64
-
-
 SAMPLE = 7  # matches that determine a model
 PLANE_SAMPLE = 4  # of a homography
 LOG_PLANE_MODELS = math.log(2.0)  # of both orientations
@@ -40,9 +37,7 @@ GOLDEN = np.uint64(0x9E3779B97F4A7C15)  # spreads places over the table
 
 class Matches(NamedTuple):
     """All matches of one pair, x0, x1 (n, 2), and which are real, mask (n,).
-
-    size0, size1: (h, w) of the images, empty where unknown. All in pixels.
-    """
+    size0, size1: (h, w) of the images, empty where unknown. All in pixels."""
 
     x0: F8x2
     x1: F8x2
@@ -54,9 +49,7 @@ class Matches(NamedTuple):
 @kernel
 def counted_chances(F: F8x2, matches: Matches, out: F8x1) -> int:
     """Of a model F (3, 3) the chances of the matches, the median one of each place, in no order -> out (m,); m.
-
-    Without a model m is 0.
-    """
+    Without a model m is 0."""
     point, peak = matrix(4, len(matches.mask)), _peak(F)
     count = _real(matches, point) if peak > 0 else 0
     if count <= SAMPLE:
@@ -202,9 +195,7 @@ def _median_of_places(chance: Array, place: Array, out: Array) -> int:
 @kernel(holds_gil=True)
 def most_significant(chance: F8x1, factorial: F8x1, sample: int, log_models: float) -> float:
     """-log10 of the least number of false alarms over k, of ascending chances; factorial: log i!, for i to n.
-
-    sample: matches that determine a model, of which there are log_models, a logarithm.
-    """
+    sample: matches that determine a model, of which there are log_models, a logarithm."""
     n, best = len(chance), -math.inf
     for k in range(sample + 1, n + 1):
         subsets = factorial[n] - factorial[k] - factorial[n - k]
@@ -254,42 +245,34 @@ def significance(
     mask = torch.ones(x0.shape[:2], dtype=torch.bool, device=x0.device) if mask is None else mask
     sizes = (None if size is None else size.to(torch.float64) for size in (size0, size1))
     out = torch.empty(len(F), 1, dtype=torch.float64)
-    into = _plane_into if model == "homography" else _into
+
+    def into(F: Array, x0: Array, x1: Array, mask: Array, size0: Array, size1: Array, out: Array) -> None:
+        out[0] = of_one_pair(F, x0, x1, mask, size0, size1, model)
+
     return for_each_pair(into, (F, x0, x1, mask, *sizes), out=out, kind=torch.float64)[:, 0]
 
 
-def of_one_pair(F: Array, x0: Array, x1: Array, mask: Array, size0: Array, size1: Array) -> float:
+def of_one_pair(
+    F: Array, x0: Array, x1: Array, mask: Array, size0: Array, size1: Array, model: str = "fundamental"
+) -> float:
     """`significance` of one pair by kernels; float64, sizes empty where unknown."""
-    chance = np.empty(len(mask))
-    chance = chance[: counted_chances(F, Matches(x0, x1, mask, size0, size1), chance)]
-    chance.sort()
+    chance, matches = np.empty(len(mask)), Matches(x0, x1, mask, size0, size1)
     factorials = _log_factorials(1 << max(len(mask), SAMPLE + 1).bit_length())
+    if model == "homography":
+        chance = chance[: counted_plane_chances(F, matches, chance)]
+        chance.sort()
+        return most_significant(chance, factorials, PLANE_SAMPLE, LOG_PLANE_MODELS)
+    chance = chance[: counted_chances(F, matches, chance)]
+    chance.sort()
     return most_significant(chance, factorials, SAMPLE, LOG_MODELS)
-
-
-def _into(F: Array, x0: Array, x1: Array, mask: Array, size0: Array, size1: Array, out: Array) -> None:
-    out[0] = of_one_pair(F, x0, x1, mask, size0, size1)
-
-
-def _plane_into(H: Array, x0: Array, x1: Array, mask: Array, size0: Array, size1: Array, out: Array) -> None:
-    chance = np.empty(len(mask))
-    chance = chance[: counted_plane_chances(H, Matches(x0, x1, mask, size0, size1), chance)]
-    chance.sort()
-    factorials = _log_factorials(1 << max(len(mask), SAMPLE + 1).bit_length())
-    out[0] = most_significant(chance, factorials, PLANE_SAMPLE, LOG_PLANE_MODELS)
 
 
 @functools.lru_cache(maxsize=8)
 def _log_factorials(count: int) -> Array:
     """log i! (count,) for i = 0 ... count - 1, in ascending order of summation, so that longer tables begin alike.
-
-    For few counts, so that it is seldom made.
-    """
+    For few counts, so that it is seldom made."""
     logarithms = logarithm(torch.arange(1, count, dtype=torch.float64))
     return np.concatenate([np.zeros(1), np.cumsum(logarithms.numpy())])
-
-
-# Whether two images show one scene: the significance of an estimate, the same for every estimator
 
 
 def judged(estimate: Estimate, c: Correspondences) -> Estimate:

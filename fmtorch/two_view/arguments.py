@@ -79,18 +79,10 @@ def correspondences(
     """
     cameras = camera_fields(K0, K1, focal, fields.get("size0") is not None)
     c = _batch(x0, x1, {**fields, **cameras, **lens_fields(lens)})
-    expect_plausible(c, plane)
-    return c
-
-
-def expect_plausible(c: Correspondences, plane: bool = False) -> None:
-    """Raise ValueError naming the first value that cannot be, or where points contradict their unit, K or size.
-
-    plane: x0 may be in the unit of a plane.
-    """
     _expect_calibrations(c)
     expect_values(c, ratio=RATIO)
     _expect_pixels(c, plane)
+    return c
 
 
 def _batch(x0: Arrays, x1: Arrays, fields: Mapping[str, Any]) -> Correspondences:
@@ -208,9 +200,7 @@ def _one_of_list(i: int, x0: Any, x1: Any, fields: Mapping[str, Any]) -> Corresp
 
 def expect_values(c: Correspondences, **more: Rule) -> None:
     """Raises ValueError naming the first wrong value of the real matches of a batch; a GPU is asked but once.
-
-    more: rules beside those of the fields.
-    """
+    more: rules beside those of the fields."""
     rules = {name: field.bounds for name, field in c.declared.items() if field.bounds} | more
     wrong = {
         name: ~rule.holds(value.detach()) & (c.mask if name in PER_MATCH else True)
@@ -231,9 +221,7 @@ def expect_values(c: Correspondences, **more: Rule) -> None:
 
 def camera_fields(K0: Arrays | None, K1: Arrays | None, focal: Focal, sizes_known: bool) -> dict[str, Any]:
     """The fields K0, K1, focal, shared_focal of the arguments of `find_fundamental`; none where nothing is said.
-
-    Raises ValueError or TypeError, naming the argument.
-    """
+    Raises ValueError or TypeError, naming the argument."""
     if isinstance(focal, str) and focal not in FOCAL_NAMES:
         near = nearest(focal, FOCAL_NAMES).split(", ")[0]
         raise ValueError(f"focal is {focal!r}; it must be {FORMS}; did you mean {near!r}?")
@@ -244,8 +232,10 @@ def camera_fields(K0: Arrays | None, K1: Arrays | None, focal: Focal, sizes_know
         raise ValueError(f"{missing} needs the image sizes: give size0 and size1")
     fields: dict[str, Any] = {name: _floating(K, name) for name, K in (("K0", K0), ("K1", K1)) if K is not None}
     if isinstance(focal, str):
-        return fields | _named(focal)
-    return fields | {"focal": _deviations(focal, K0 is not None, K1 is not None) if fields else _measured(focal)}
+        return fields | _unknown("focal", focal, UNKNOWN)
+    if fields:
+        return fields | {"focal": _deviations(focal, K0 is not None, K1 is not None)}
+    return {"focal": _of_both(focal, "focal", UNKNOWN, f"without K0 and K1 it must be {FORMS}")}
 
 
 def lens_fields(lens: Lens) -> dict[str, Any]:
@@ -253,18 +243,12 @@ def lens_fields(lens: Lens) -> dict[str, Any]:
     if lens is None:
         return {}
     if isinstance(lens, str):
-        if lens not in ("shared", "unknown"):
+        if lens not in FOCAL_NAMES:
             raise ValueError(f"lens is {lens!r}; it must be {LENS_FORMS}")
-        nothing = torch.tensor([UNKNOWN_LENS, UNKNOWN_LENS], dtype=torch.float64)
-        return {"lens": nothing} if lens == "unknown" else {"lens": nothing, "shared_lens": torch.tensor(True)}
-    if isinstance(lens, list | tuple):
-        lens = [UNKNOWN_LENS if entry is None else entry for entry in lens]
-    values = _floating(lens, "lens")
-    values = torch.cat([values.reshape(1), values.new_zeros(1)]) if values.numel() == 1 else values
-    values = values.expand(2, 2) if values.shape == (2,) else values
-    if values.dim() not in (2, 3) or values.shape[-2:] != (2, 2):
-        raise ValueError(f"lens has shape {tuple(values.shape)}; it must be {LENS_FORMS}")
-    return {"lens": values}
+        return _unknown("lens", lens, UNKNOWN_LENS)
+    if not isinstance(lens, list | tuple) and (value := _floating(lens, "lens")).numel() == 1:
+        lens = torch.cat([value.reshape(1), value.new_zeros(1)])
+    return {"lens": _of_both(lens, "lens", UNKNOWN_LENS, f"it must be {LENS_FORMS}")}
 
 
 def _expect_calibrations(c: Correspondences) -> None:
@@ -276,21 +260,20 @@ def _expect_calibrations(c: Correspondences) -> None:
             raise ValueError(problem)
 
 
-def _named(focal: str) -> dict[str, Any]:
-    """Fields where no focal length is known."""
-    nothing = torch.tensor([UNKNOWN, UNKNOWN], dtype=torch.float64)
-    return {"focal": nothing} if focal == "unknown" else {"focal": nothing, "shared_focal": torch.tensor(True)}
+def _unknown(name: str, which: str, unknown: tuple[float, float]) -> dict[str, Any]:
+    """Fields where nothing is known of either image, or that both are alike."""
+    nothing = {name: torch.tensor([unknown, unknown], dtype=torch.float64)}
+    return nothing | {f"shared_{name}": torch.tensor(True)} if which == "shared" else nothing
 
 
-def _measured(focal: Any) -> Tensor:
-    """Focal lengths and deviations (2, 2) or (B, 2, 2)."""
-    if isinstance(focal, list | tuple):
-        focal = [UNKNOWN if entry is None else entry for entry in focal]
-    values = _floating(focal, "focal")
-    if values.shape == (2,):
-        values = values.expand(2, 2)
+def _of_both(value: Any, name: str, unknown: tuple[float, float], forms: str) -> Tensor:
+    """What is measured and its deviations, (2, 2) or (B, 2, 2)."""
+    if isinstance(value, list | tuple):
+        value = [unknown if entry is None else entry for entry in value]
+    values = _floating(value, name)
+    values = values.expand(2, 2) if values.shape == (2,) else values
     if values.dim() not in (2, 3) or values.shape[-2:] != (2, 2):
-        raise ValueError(f"focal has shape {tuple(values.shape)}; without K0 and K1 it must be {FORMS}")
+        raise ValueError(f"{name} has shape {tuple(values.shape)}; {forms}")
     return values
 
 
@@ -313,10 +296,8 @@ def _floating(value: Any, name: str) -> Tensor:
 
 def _expect_pixels(c: Correspondences, plane: bool) -> None:
     """Raise ValueError where the points of all pairs are obviously not in pixels, or contradict the image sizes.
-
     Of a batch in which some pairs are sound none is refused: no pair can take its batch down. Points of an image with a
-    calibration matrix may be in its unit, whatever that is, and those of a plane, too, if the others are in pixels.
-    """
+    calibration matrix may be in its unit, whatever that is, and those of a plane, too, if the others are in pixels."""
     images = []
     for i, (x, K, size) in enumerate(((c.x0, c.K0, c.size0), (c.x1, c.K1, c.size1))):
         x = x.detach()

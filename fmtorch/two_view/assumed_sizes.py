@@ -55,9 +55,7 @@ class Extents(NamedTuple):
 
 def extents(c: Correspondences) -> Extents:
     """The sizes of images whose points spread evenly up to the border; of pairs whose points look like a photograph's.
-
-    Centred, normalised and undistorted points have negative coordinates: of these nothing is known.
-    """
+    Centred, normalised and undistorted points have negative coordinates: of these nothing is known."""
     x = torch.cat([c.x0, c.x1], -1).detach().double()
     there = (c.mask & x.isfinite().all(-1))[..., None]
     count = there.sum(1).to(x)
@@ -71,9 +69,7 @@ def extents(c: Correspondences) -> Extents:
 
 class Attempts(NamedTuple):
     """Estimates to make of a batch: of its pairs without sizes, of one size, and again of two where that is doubtful.
-
-    rows: (B,), whether a pair is tried; sizes: (B, 2, 2), those tried, NaN where none are; doubtful: (B,).
-    """
+    rows: (B,), whether a pair is tried; sizes: (B, 2, 2), those tried, NaN where none are; doubtful: (B,)."""
 
     rows: list[Bool[Tensor, " b"]]
     sizes: list[Float[Tensor, "b 2 2"]]

@@ -33,10 +33,8 @@ def estimated(
     covariance: bool = False, assume_sizes: bool = False,
 ) -> Estimate:  # fmt: skip
     """The estimate of matches by a preset, with a prior of their consistency where it uses one and none is given.
-
     model: what the preset must estimate. What is known of cameras counts where `focal` or `shared_focal` is given; then
-    the estimate may have a covariance. assume_sizes: whether sizes that are not given may be taken from the points.
-    """
+    the estimate may have a covariance. assume_sizes: whether sizes that are not given may be taken from the points."""
     seed = int(number("seed", seed, integer=True))
     estimator = estimator_of(name, config_dir, options)
     _expect_gradients(c, estimator, name)

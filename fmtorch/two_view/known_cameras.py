@@ -72,11 +72,9 @@ class KnownCameras:
 
 class Images(NamedTuple):
     """What is known of both images of each pair, after their points are mapped to square pixels.
-
     map: None where the points are as they were. measured: focal lengths, px, and their relative deviations. size:
     (h, w), None where unknown. unit: pixels as they were in one of the square ones; None as `map`. problems: of K,
-    empty where there is none.
-    """
+    empty where there is none."""
 
     map: Float[Tensor, "b 2 3 3"] | None
     measured: Float[Tensor, "b 2 2"]
@@ -134,7 +132,7 @@ def _completed(c: Correspondences) -> Correspondences:
     problems = calibration_problems(K, sizes[known])
     valid = torch.tensor([not problem for problem in problems], dtype=torch.bool, device=K.device)
     similar = valid & (c.size0 == c.size1).all(1)
-    K = torch.where(similar[:, None, None], K.double(), _calibration(sizes[missing].amax(1).double(), sizes[missing]))
+    K = torch.where(similar[:, None, None], K.double(), calibration(sizes[missing].amax(1).double(), sizes[missing]))
     length, deviation = focal[:, missing].detach().double().unbind(-1)
     scale = torch.where(deviation < torch.inf, length * K[:, 2, 2] / sqrt(K[:, 0, 0] * K[:, 1, 1]), 1)
     K = K * torch.stack([scale, scale, torch.ones_like(scale)], -1)[:, None]  # columns of the focal lengths
@@ -152,14 +150,11 @@ def _square(c: Correspondences, images: Images) -> Correspondences:
         fields["mask"] = mask = c.mask & x.isfinite().all(-1).all(1) & valid[:, None]
         fields["x0"], fields["x1"] = mapped(torch.where(mask[:, None, :, None], x, 0), images.map).unbind(1)
         for i, lafs in enumerate((c.lafs0, c.lafs1)):
-            fields[f"lafs{i}"] = None if lafs is None else _mapped_frames(lafs, images.map[:, i])
+            if lafs is not None:
+                A = images.map[:, i, None, :2]
+                columns = (A[..., 0, None] * lafs[..., :1, :] + A[..., 1, None] * lafs[..., 1:, :]).unbind(-1)
+                fields[f"lafs{i}"] = torch.stack([*columns[:2], columns[2] + A[..., 2]], -1).to(lafs.dtype)
     return c.derived(**fields)
-
-
-def _mapped_frames(lafs: Tensor, A: Tensor) -> Tensor:
-    """Local affine frames (B, N, 2, 3) by affine maps (B, 3, 3)."""
-    columns = (A[:, None, :2, 0, None] * lafs[..., :1, :] + A[:, None, :2, 1, None] * lafs[..., 1:, :]).unbind(-1)
-    return torch.stack([*columns[:2], columns[2] + A[:, None, :2, 2]], -1).to(lafs.dtype)
 
 
 def _with_cameras(estimate: Estimate, square: Correspondences, images: Images, covariance: bool) -> Estimate:
@@ -192,7 +187,7 @@ def _pose(estimate: Estimate, square: Correspondences, focals: Tensor, known: Te
     F, sizes = estimate.F.double(), (square.size0, square.size1)
     if sizes[0] is None or sizes[1] is None:
         return F.new_full((len(F), 3, 3), torch.nan), F.new_full((len(F), 3), torch.nan)
-    K0, K1 = _calibration(focals[:, 0], sizes[0]), _calibration(focals[:, 1], sizes[1])
+    K0, K1 = calibration(focals[:, 0], sizes[0]), calibration(focals[:, 1], sizes[1])
     prior = torch.ones_like(square.x0[..., 0]) if square.prior is None else square.prior.nan_to_num(0)
     weight = torch.where(estimate.inliers & known[:, None], prior, 0).detach()
     cameras = torch.cat([K[:, [0, 0, 1], [0, 2, 2]] for K in (K0, K1)], 1)
@@ -205,7 +200,7 @@ def _pose(estimate: Estimate, square: Correspondences, focals: Tensor, known: Te
     return torch.where(valid[:, None, None], R, torch.nan), torch.where(valid[:, None], t, torch.nan)
 
 
-def _calibration(focal: Tensor, size: Tensor) -> Tensor:
+def calibration(focal: Tensor, size: Tensor) -> Tensor:
     """K (B, 3, 3) of square pixels and central principal points."""
     zero, ones = torch.zeros_like(focal), torch.ones_like(focal)
     x, y = (size[:, 1].to(focal) - 1) / 2, (size[:, 0].to(focal) - 1) / 2
@@ -217,10 +212,8 @@ def covariance_fields(
     estimate: Estimate, c: Correspondences, maps: Float[Tensor, "b 2 3 3"] | None, focals: Float[Tensor, "b 2"]
 ) -> dict[str, Tensor]:
     """The fields `covariance`, `tangents`, `covariance_F` of an estimate with a pose; NaN where there is none.
-
     c: its matches, in images of square pixels and central principal points. maps: from the coordinates that F is of to
-    those of c, None where these are the same. focals: of c.
-    """
+    those of c, None where these are the same. focals: of c."""
     R, t, scale = estimate.R, estimate.t, estimate.fit_scale
     if R is None or t is None or scale is None or c.size0 is None or c.size1 is None:
         shapes = {"covariance": (7, 7), "tangents": (3, 2), "covariance_F": (9, 9)}
@@ -248,7 +241,7 @@ def _covariance_of(
     """The covariance of F, which is A1^T G A0 at unit norm, from that of G at unit norm."""
     G = matmul3(matmul3(_inverse(A1).mT, F), _inverse(A0)).flatten(1)
     M = (A1.mT[:, :, None, :, None] * A0.mT[:, None, :, None, :]).flatten(3).flatten(1, 2)
-    M = M / _inverse_norm(G)[:, None, None]
+    M = M / inverse_root(component_sum(G * G, -1))[:, None, None]
     f = F.flatten(1)
     J = M - f[:, :, None] * component_sum(f[:, :, None] * M, 1)[:, None]
     return _product(_product(J, C), J.mT)
@@ -262,7 +255,3 @@ def _inverse(A: Float[Tensor, "b 3 3"]) -> Float[Tensor, "b 3 3"]:
 def _product(A: Float[Tensor, "b k m"], B: Float[Tensor, "b m n"]) -> Float[Tensor, "b k n"]:
     """``A B``, the same bits in any batch."""
     return component_sum(A[..., None] * B[:, None], 2)
-
-
-def _inverse_norm(x: Float[Tensor, "b m"]) -> Float[Tensor, " b"]:
-    return inverse_root(component_sum(x * x, -1))

@@ -10,25 +10,17 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from fmtorch.core.types import PAIR_TYPES, WARNINGS, Correspondences, Estimate
+from fmtorch.geometry import pair_type as kinds
 from fmtorch.geometry.arithmetic import component_sum, sqrt
 from fmtorch.geometry.epipolar import inverse_root
 from fmtorch.geometry.homography_pose import PlanePoses, poses_from_homography
-from fmtorch.geometry.pair_type import (
-    GENERAL,
-    IDENTICAL,
-    PLANAR,
-    ROTATION,
-    UNRELATED,
-    Evidence,
-    classified,
-    pair_evidence,
-    weigh,
-)
+from fmtorch.geometry.pair_type import Evidence
 from fmtorch.jit import kernel
 from fmtorch.jit.together import compile_together
 from fmtorch.jobs.execution import one_thread
 from fmtorch.two_view.arguments import expect_values
 from fmtorch.two_view.estimation import estimated, estimator_of
+from fmtorch.two_view.known_cameras import calibration
 
 FOCAL_DEVIATION = 0.02
 """Of the focal lengths of a calibration, relative: what zoom and focus change between two days."""
@@ -40,10 +32,8 @@ OTHER_CAMERA = 0.5  # deviation of the logarithm of the ratio of both focal leng
 
 class PairTypes(NamedTuple):
     """Types of B pairs.
-
     kind: indices into `fmtorch.core.types.PAIR_TYPES`. evidence: for the kinds. homography: of the plane, or of
-    the rotation.
-    """
+    the rotation."""
 
     kind: Int[Tensor, " b"]
     evidence: Evidence
@@ -62,7 +52,7 @@ class PairTypes(NamedTuple):
     @property
     def flat(self) -> Bool[Tensor, " b"]:
         """Whether a homography explains all matches: of planes, rotations and copies."""
-        flat = (self.kind == PLANAR) | (self.kind == ROTATION) | (self.kind == IDENTICAL)
+        flat = (self.kind == kinds.PLANAR) | (self.kind == kinds.ROTATION) | (self.kind == kinds.IDENTICAL)
         return self.homography.ok & flat
 
     def of_pair(self, i: int) -> PairTypes:
@@ -72,14 +62,14 @@ class PairTypes(NamedTuple):
     @property
     def determined(self) -> Bool[Tensor, " b"]:
         """Whether the matches determine F: of the general pairs alone."""
-        return self.kind == GENERAL
+        return self.kind == kinds.GENERAL
 
 
 def compile_with(stages: Iterable[object]) -> None:
     """Have the kernels of these stages and of `classify` ready; two processes compile those that are new."""
     if kernel.available():
         stages = (estimator_of("homography", None, {}), *stages)
-        compile_together([weigh, *(each for stage in stages for each in getattr(stage, "kernels", ()))])
+        compile_together([kinds.weigh, *(each for stage in stages for each in getattr(stage, "kernels", ()))])
 
 
 def classify(
@@ -133,12 +123,12 @@ def classify(
     H = estimated(matches, "homography", "homography", None, seed, options)
     K0, K1, precision = _cameras(c, focal_deviation)
     with one_thread(c.mask.device):
-        evidence = pair_evidence(
+        evidence = kinds.pair_evidence(
             estimate.F, H.F, c.x0, c.x1, c.mask, c.prior, c.noise, c.size0, c.size1, K0, K1, precision
         )
     exact = None if precision is None else precision.diagonal(dim1=-2, dim2=-1).isinf().all(-1)
-    kind = classified(evidence, exact)
-    return PairTypes(torch.where(estimate.ok | H.ok, kind, UNRELATED), evidence, H)
+    kind = kinds.classified(evidence, exact)
+    return PairTypes(torch.where(estimate.ok | H.ok, kind, kinds.UNRELATED), evidence, H)
 
 
 def _cameras(c: Correspondences, deviation: float | int) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
@@ -165,7 +155,7 @@ def _camera(K: Tensor | None, size: Tensor | None, focal: Tensor, known: Tensor)
     """K (b, 3, 3), or that of an image of this size (b, 2) and focal length (b,), px, usual where it is not known."""
     if K is None:
         assert size is not None
-        A = _usual(size.to(torch.float64))
+        A = calibration(USUAL_FOCAL * size.to(torch.float64).amax(-1), size)
         scale = torch.where(known, focal / A[:, 0, 0], 1.0)
     else:
         A = K.to(torch.float64)
@@ -173,14 +163,6 @@ def _camera(K: Tensor | None, size: Tensor | None, focal: Tensor, known: Tensor)
         longest = (2 * A[:, :2, 2] + 1 if size is None else size.to(A)).amax(1)
         scale = torch.where(known, 1.0, USUAL_FOCAL * longest / sqrt(A[:, 0, 0] * A[:, 1, 1]))
     return A * torch.stack([scale, scale, torch.ones_like(scale)], -1)[:, None]
-
-
-def _usual(size: Tensor) -> Tensor:
-    """Calibrations (b, 3, 3) of square pixels, a central principal point and the usual focal length."""
-    K = torch.zeros(len(size), 3, 3, dtype=torch.float64, device=size.device)
-    K[:, 0, 0] = K[:, 1, 1] = USUAL_FOCAL * size.amax(-1)
-    K[:, 0, 2], K[:, 1, 2], K[:, 2, 2] = (size[:, 1] - 1) / 2, (size[:, 0] - 1) / 2, 1.0
-    return K
 
 
 def with_pair_type(estimate: Estimate, c: Correspondences, seed: int, **options: Any) -> Estimate:
@@ -191,7 +173,7 @@ def with_pair_type(estimate: Estimate, c: Correspondences, seed: int, **options:
     if c.K0 is not None and c.K1 is not None and estimate.R is not None:
         with one_thread(c.mask.device):
             poses = poses_from_homography(H.F, c.K0, c.K1, c.x0, c.x1, H.inliers)
-            fields |= _other_pose(estimate.R, poses, flat & (kind == PLANAR))
+            fields |= _other_pose(estimate.R, poses, flat & (kind == kinds.PLANAR))
     return estimate.derived(**fields)
 
 

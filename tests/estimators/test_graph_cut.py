@@ -18,7 +18,7 @@ from fmtorch.estimators.graph_cut import (
     neighbor_graph,
 )
 from fmtorch.estimators.inliers import residuals_squared_px
-from fmtorch.estimators.selection import scores_of
+from fmtorch.estimators.refinement import scores_of
 from fmtorch.jit.kernel import F4x1, F8x1, F8x2, kernel
 from fmtorch.jit.random import Stream
 from tests.conftest import oracle

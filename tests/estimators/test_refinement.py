@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from fmtorch.estimators import Msac, Pair, Ransac, Refine, SevenPoint
-from fmtorch.estimators.refinement import Candidates, Refinement
+from fmtorch.estimators.refinement import BestOfSearch, BestScore, Candidates, Refinement, scores_of
 from fmtorch.estimators.search import Pool
-from fmtorch.estimators.selection import BestOfSearch, BestScore, scores_of
 from fmtorch.jit.random import Stream
 from tests.estimators.pairs import FEW, SCALES, models, named, pair_of
 from tests.estimators.residuals import residuals

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from fmtorch.geometry import LOSSES
 from fmtorch.geometry.epipolar import HOMOGRAPHY
 from fmtorch.geometry.homography_refine import (
     evaluate_homographies,
@@ -15,7 +14,8 @@ from fmtorch.geometry.homography_refine import (
     linearise_homography,
     refine_homographies,
 )
-from fmtorch.geometry.levenberg_marquardt import LOSS_CODES, NO_TABLE, Schedule, Weighted
+from fmtorch.geometry.levenberg_marquardt import Schedule, Weighted
+from fmtorch.geometry.normalize import RobustSum
 from tests.reference import homography_family as reference
 
 EPS = 2.0**-52
@@ -31,11 +31,11 @@ class Problem(NamedTuple):
     s2: np.ndarray
 
     def weighted(self, loss: str) -> Weighted:
-        return Weighted(self.points, self.weight, self.s2, LOSS_CODES[loss], NO_TABLE)
+        return Weighted.of(self.points, self.weight, self.s2, loss)
 
     def unbounded(self) -> Weighted:
         """Without a robust loss."""
-        return Weighted(self.points, self.weight, np.full_like(self.s2, np.inf), LOSS_CODES["truncated"], NO_TABLE)
+        return Weighted.of(self.points, self.weight, np.full_like(self.s2, np.inf))
 
 
 def problem(seed: int, n: int = 30, noise: float = 0.02) -> Problem:
@@ -128,16 +128,16 @@ def test_gradient_in_tensors_and_its_graph(loss: str) -> None:
         torch.from_numpy(a) for a in (p.h[:, None, None], p.points[:, None].copy(), p.weight[None], p.s2[None])
     )
     expected, _ = evaluated(p.h, p.weighted(loss))
-    computed = homography_gradient(h, points, weight, LOSSES[loss], s2)
+    computed = homography_gradient(h, RobustSum(points, weight, loss, s2))
     np.testing.assert_allclose(computed[:, 0, 0].numpy(), expected[9, :9], atol=1e-11 * np.abs(expected).max())
     points.requires_grad_()
-    assert torch.autograd.gradcheck(lambda x: homography_gradient(h, x, weight, LOSSES[loss], s2), points)
+    assert torch.autograd.gradcheck(lambda x: homography_gradient(h, RobustSum(x, weight, loss, s2)), points)
 
 
 def test_gauss_newton_matrix_in_tensors() -> None:
     p = problem(4)
     h, points, weight = (torch.from_numpy(a) for a in (p.h[:, None, None], p.points[:, None].copy(), p.weight[None]))
     unbounded = torch.full((1, 1), torch.inf, dtype=torch.float64)
-    computed = homography_curvature(h, points, weight, LOSSES["truncated"], unbounded)[0, 0].numpy()
+    computed = homography_curvature(h, RobustSum(points, weight, "truncated", unbounded))[0, 0].numpy()
     expected = reference.gauss_newton(p.h, p.points, p.weight)
     np.testing.assert_allclose(computed, expected, atol=1e-11 * np.abs(expected).max())

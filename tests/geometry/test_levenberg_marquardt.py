@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from fmtorch.geometry.levenberg_marquardt import accepting, levenberg_marquardt
+from fmtorch.geometry.levenberg_marquardt import minimiser
 
 
 class State(NamedTuple):
@@ -42,7 +42,7 @@ def take(state: State, trial: State, k: int) -> None:
     state.x[k], state.slope[k], state.curvature[k] = trial.x[k], trial.slope[k], trial.curvature[k]
 
 
-minimise = levenberg_marquardt(evaluate, step, accepting(take))
+minimise = minimiser(evaluate, step, take)
 START = np.array([3.0, 1e-3, -2.0])
 
 

@@ -3,14 +3,14 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from fmtorch.geometry import polynomials
+from fmtorch.geometry.seven_point import cube_root, cubic_roots
 from fmtorch.jit.kernel import F8x1, kernel
 
 
 def roots_of(*coefficients):
     """The real roots, by the kernel's function interpreted."""
     roots, valid = np.zeros(3), np.zeros(3, np.bool_)
-    polynomials.cubic_roots(np.array(coefficients, dtype=np.float64), roots, valid)
+    cubic_roots(np.array(coefficients, dtype=np.float64), roots, valid)
     return sorted(roots[valid].tolist())
 
 
@@ -59,7 +59,7 @@ def test_never_nan_and_every_root_is_one(coefficients):
 @kernel
 def cube_roots(x: F8x1, out: F8x1) -> None:
     for i in range(len(x)):
-        out[i] = polynomials._cube_root(x[i])
+        out[i] = cube_root(x[i])
 
 
 def test_cube_roots():
@@ -67,4 +67,4 @@ def test_cube_roots():
     out = np.empty(len(x))
     cube_roots(x, out)
     np.testing.assert_allclose(out * out * out, x, rtol=8 * np.finfo(float).eps)
-    assert [polynomials._cube_root(number) for number in x[::100].tolist()] == out[::100].tolist()
+    assert [cube_root(number) for number in x[::100].tolist()] == out[::100].tolist()

@@ -7,7 +7,8 @@ import torch
 from torch import Tensor
 
 from fmtorch.geometry import LOSSES, attached_step, irls, refine
-from fmtorch.geometry.epipolar import homogeneous, linearise
+from fmtorch.geometry.epipolar import linearise
+from fmtorch.geometry.normalize import RobustSum
 from fmtorch.geometry.refine import refine_components
 from tests.geometry.scenes import SCALE, distance, near_scene, tolerances, unit_scene
 from tests.reference import refine as reference
@@ -33,8 +34,8 @@ def test_jacobian_equals_autograd(seed: int) -> None:
         line1, line0 = h0 @ f.reshape(3, 3).T, h1 @ f.reshape(3, 3)
         return (h1 * line1).sum(1) / (line1[:, :2].square().sum(1) + line0[:, :2].square().sum(1)).sqrt()
 
-    J, e, inverse, r2 = linearise(f, homogeneous(components(x0, x1)[:, None, :, None]))
-    jacobian = (J.flatten(0, 1) * inverse.sqrt())[:, 0, 0, 0].T
+    J, e, inverse, r2 = linearise(f, components(x0, x1))
+    jacobian = (J.flatten(0, 1) * inverse.sqrt())[:, 0, 0].T
     assert torch.allclose(e * e * inverse, r2)
     expected = torch.autograd.functional.jacobian(residual, f.flatten())
     assert torch.allclose(jacobian, expected, rtol=0, atol=1e-9 * float(expected.abs().max()))
@@ -49,7 +50,8 @@ def test_robust_optimum_equals_scipy(loss: str, seed: int) -> None:
     scale = 0.01
     F0 = models(F, 1, 1e-3, seed)
     ones = torch.ones(1, 120, dtype=torch.float64)
-    fitted, cost = refine_components(F0, components(x0, x1), ones, loss, torch.tensor([scale], dtype=torch.float64), 60)
+    s2 = torch.full((1, 1), scale**2, dtype=torch.float64)
+    fitted, cost = refine_components(F0, RobustSum(components(x0, x1), ones, loss, s2), 60)
     # From our optimum SciPy, which knows another parametrisation and numerical gradients, cannot get lower.
     _, min_cost = reference.optimum(fitted[:, 0, 0].reshape(3, 3).numpy(), x0, x1, np.ones(120), loss, scale)
     # The tabulated loss is linear between its entries, whose integral is off by up to 1e-7.
@@ -63,8 +65,8 @@ def test_cost_never_rises(loss: str) -> None:
     F, x0, x1 = unit_scene(7, 90, noise=5e-3, outliers=40)
     F0 = torch.cat([models(F, 10, 0.05), models(F, 10, 1.0)], 2)
     weight = torch.from_numpy(np.random.default_rng(0).uniform(0, 1, (1, 90)))
-    scale = torch.tensor([0.02], dtype=torch.float64)
-    costs = [refine_components(F0, components(x0, x1), weight, loss, scale, i)[1] for i in range(8)]
+    error = RobustSum(components(x0, x1), weight, loss, torch.full((1, 1), 0.02**2, dtype=torch.float64))
+    costs = [refine_components(F0, error, i)[1] for i in range(8)]
     for before, after in itertools.pairwise(costs):
         assert bool((after <= before).all())
     assert bool((costs[-1] < costs[0])[:, :10].any())

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from fmtorch.geometry import LOSSES
 from fmtorch.geometry.irls import reweighted, reweighted_kernel
-from fmtorch.geometry.levenberg_marquardt import FIRST_DAMPING, LOSS_CODES, Schedule, Weighted, evaluate, loss_table
+from fmtorch.geometry.levenberg_marquardt import FIRST_DAMPING, LOSS_CODES, Schedule, Weighted, evaluate
+from fmtorch.geometry.normalize import RobustSum
 from fmtorch.geometry.rank2_manifold import SQUARINGS
 from fmtorch.geometry.refine import refine_kernel
 from tests.estimators.pairs import apart
@@ -36,7 +36,7 @@ def test_costs_and_normal_equations(loss: str, n: int) -> None:
     normal, expected_cost = zip(*(reference.normal_equations(f, points, weight, s2, loss) for f in F), strict=True)
     for derivatives in (True, False):
         products, cost = np.zeros((5, 10, 10)), np.empty(5)
-        evaluate(F, Weighted(points, weight, s2, LOSS_CODES[loss], loss_table(loss)), derivatives, products, cost)
+        evaluate(F, Weighted.of(points, weight, s2, loss), derivatives, products, cost)
         np.testing.assert_allclose(cost, expected_cost, rtol=1e-11)
         if derivatives:
             size = np.sqrt(np.einsum("kii,kjj->kij", normal, normal))  # what the sums of an entry cancel from, at most
@@ -50,16 +50,17 @@ def test_costs_and_normal_equations(loss: str, n: int) -> None:
 def test_one_reweighted_fit(loss: str, n: int) -> None:
     F, points, weight, _ = matches(n)
     weight[:2] = [0, 1e-9]
-    tensors = (torch.from_numpy(a) for a in (F.T[:, None].copy(), points[:, None], weight[None]))
-    expected = reweighted(*tensors, LOSSES[loss], torch.tensor([SCALE], dtype=torch.float64))[:, 0].T.numpy()
+    models, *data = (torch.from_numpy(a) for a in (F.T[:, None].copy(), points[:, None], weight[None]))
+    error = RobustSum(*data, loss, torch.full((1, 1), SCALE**2, dtype=torch.float64))
+    expected = reweighted(models, error)[:, 0].T.numpy()
     fitted, s2 = F.copy(), np.full(n, SCALE**2)
-    reweighted_kernel(fitted, Weighted(points, weight, s2, LOSS_CODES[loss], loss_table(loss)))
+    reweighted_kernel(fitted, Weighted.of(points, weight, s2, loss))
     for fit, other in zip(fitted, expected, strict=True):
         # Rounding of the sums over the gap of their eigenvalues, 1e-8 of the largest.
         assert apart(fit, other) < 1e-8
     kept = F.copy()  # where the weights determine no model
     none = np.where(np.arange(n) < 6, weight, 0)
-    reweighted_kernel(kept, Weighted(points, none, s2, LOSS_CODES[loss], loss_table(loss)))
+    reweighted_kernel(kept, Weighted.of(points, none, s2, loss))
     np.testing.assert_array_equal(kept, F)
 
 
@@ -68,7 +69,7 @@ def refined(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Models and costs by the kernel."""
     fitted, cost = np.empty_like(F), np.empty(len(F))
-    weighted = Weighted(points, weight, s2, LOSS_CODES[loss], loss_table(loss))
+    weighted = Weighted.of(points, weight, s2, loss)
     refine_kernel(F, SQUARINGS, weighted, Schedule(iterations, FIRST_DAMPING, tolerance), fitted, cost)
     return fitted, cost
 

@@ -9,7 +9,7 @@ import torch
 
 import fmtorch
 from fmtorch.core.types import Estimate
-from fmtorch.estimators.models.with_lenses import inverted
+from fmtorch.estimators.lens_search import inverted
 from fmtorch.metrics import nsgd
 from fmtorch.two_view.arguments import lens_fields
 from tests.reference import division

@@ -1,5 +1,1 @@
-"""Other libraries' robust estimators behind the same call, one pair at a time: the yardsticks of this project's own.
-
-OpenCV and kornia are always there; PoseLib, MAGSAC++, GC-RANSAC, DEGENSAC and SupeRANSAC by their authors are the extra
-`peers`, COLMAP is the extra `colmap`.
-"""
+"""Other libraries' robust estimators behind the same call, one pair at a time, in the extras `peers` and `colmap`."""

@@ -5,18 +5,8 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fmtorch.estimators.external.pairwise import (
-    Confidence,
-    Iterations,
-    Pair,
-    PairwiseEstimator,
-    Points,
-    Posed,
-    Solution,
-    computed_by,
-    fundamental_of_pose,
-    peer,
-)
+from fmtorch.estimators.external import pairwise
+from fmtorch.estimators.external.pairwise import Confidence, Iterations, Pair, PairwiseEstimator, Points, Solution
 
 USUAL_FOCAL = 1.2  # in units of the longer side, of a camera without a prior: COLMAP's default
 MAX_SEED = 2**31 - 1
@@ -46,7 +36,7 @@ class TwoView(NamedTuple):
     inliers: NDArray[np.bool_]
 
 
-@computed_by("pycolmap")
+@pairwise.computed_by("pycolmap")
 def colmap(
     *,
     threshold: float = 4.0,
@@ -63,20 +53,16 @@ def colmap(
 
     Args:
         threshold: pixels, Sampson distance; of homographies the distance in image 1.
-        confidence: of having drawn a sample without an outlier, at which the search ends.
-        iterations: samples at most.
+        confidence, iterations: as of `opencv`.
         min_iterations: samples at least, though not more than at most.
         two_view: choose between E, F and H as COLMAP's verification does, from 15 inliers on, with unknown focal
             lengths where they are asked for and it finds them. False: LO-RANSAC of E or F alone.
         model: what is estimated; a homography by LO-RANSAC alone.
 
-    Returns:
-        The estimator.
-
     Raises:
         ImportError: with a hint, where pycolmap is not installed.
     """
-    library = peer("pycolmap", "COLMAP", extra="colmap")
+    library = pairwise.peer("pycolmap", "COLMAP", extra="colmap")
 
     def settings(pair: Pair) -> Any:
         options = two_view_options(threshold, pair.seed)
@@ -92,11 +78,11 @@ def colmap(
             if cameras is None:
                 return geometry.F, geometry.inliers
             focals = np.array([np.nan if K is None else K[0, 0] for K in (geometry.K0, geometry.K1)])
-            return Posed(geometry.F, geometry.inliers, focals, geometry.R, geometry.t)
+            return pairwise.Posed(geometry.F, geometry.inliers, focals, geometry.R, geometry.t)
         ransac = settings(pair).ransac
         if cameras is not None and pair.exact:
             F, inliers, R, t = essential_matrix(pair.x0, pair.x1, cameras, ransac)
-            return Posed(F, inliers, None, R, t)
+            return pairwise.Posed(F, inliers, None, R, t)
         return fundamental_matrix(pair.x0, pair.x1, ransac)
 
     def homography(pair: Pair) -> Solution:
@@ -112,14 +98,14 @@ def colmap(
 
 def two_view_options(threshold: float, seed: int) -> Any:
     """`pycolmap.TwoViewGeometryOptions` at a threshold in pixels, with relative poses."""
-    options = peer("pycolmap", "COLMAP", extra="colmap").TwoViewGeometryOptions(compute_relative_pose=True)
+    options = pairwise.peer("pycolmap", "COLMAP", extra="colmap").TwoViewGeometryOptions(compute_relative_pose=True)
     options.ransac.max_error, options.ransac.random_seed = threshold, seed % MAX_SEED
     return options
 
 
 def two_view_geometry(x0: Points, x1: Points, cameras: tuple[Camera, Camera], options: Any) -> TwoView:
     """COLMAP's two-view geometry of matches (n, 2) in pixels. options: `pycolmap.TwoViewGeometryOptions`."""
-    library = peer("pycolmap", "COLMAP", extra="colmap")
+    library = pairwise.peer("pycolmap", "COLMAP", extra="colmap")
     matches = np.repeat(np.arange(len(x0), dtype=np.uint32)[:, None], 2, 1)
     ends = [_pinhole(library, camera) for camera in cameras]
     result = library.estimate_two_view_geometry(ends[0], x0, ends[1], x1, matches, options)
@@ -135,7 +121,7 @@ def two_view_geometry(x0: Points, x1: Points, cameras: tuple[Camera, Camera], op
         return TwoView(configuration, F, None, None, K0, K1, inliers)
     R, t = np.asarray(result.cam2_from_cam1.rotation.matrix()), np.asarray(result.cam2_from_cam1.translation)
     if configuration != "UNCALIBRATED" and np.any(t):
-        F = fundamental_of_pose(K0, K1, R, t)
+        F = pairwise.fundamental_of_pose(K0, K1, R, t)
     return TwoView(configuration, F, R, t, K0, K1, inliers)
 
 
@@ -143,7 +129,7 @@ def essential_matrix(
     x0: Points, x1: Points, cameras: tuple[Camera, Camera], ransac: Any
 ) -> tuple[Points | None, NDArray[np.bool_], Points | None, Points | None]:
     """F of COLMAP's essential matrix, px, its inliers (n,), R and t; None without. ransac: `pycolmap.RANSACOptions`."""
-    library = peer("pycolmap", "COLMAP", extra="colmap")
+    library = pairwise.peer("pycolmap", "COLMAP", extra="colmap")
     result = library.estimate_essential_matrix(x0, x1, *(_pinhole(library, camera) for camera in cameras), ransac)
     if result is None:
         return None, np.zeros(len(x0), np.bool_), None, None
@@ -156,7 +142,7 @@ def essential_matrix(
 
 def fundamental_matrix(x0: Points, x1: Points, ransac: Any) -> tuple[Points | None, NDArray[np.bool_]]:
     """COLMAP's fundamental matrix, px, and its inliers (n,); None without. ransac: `pycolmap.RANSACOptions`."""
-    result = peer("pycolmap", "COLMAP", extra="colmap").estimate_fundamental_matrix(x0, x1, ransac)
+    result = pairwise.peer("pycolmap", "COLMAP", extra="colmap").estimate_fundamental_matrix(x0, x1, ransac)
     if result is None:
         return None, np.zeros(len(x0), np.bool_)
     return np.asarray(result["F"], np.float64), np.asarray(result["inlier_mask"], np.bool_)

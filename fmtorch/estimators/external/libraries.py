@@ -1,23 +1,15 @@
-"""OpenCV's, kornia's and the authors' own robust estimators (the latter in the extra `peers`)."""
+"""Robust estimators of OpenCV, kornia and, in the extra `peers`, of PoseLib, fastpose and the methods' authors."""
 
 from collections.abc import Mapping
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
-from fmtorch.estimators.external.pairwise import (
-    Confidence,
-    Iterations,
-    Pair,
-    PairwiseEstimator,
-    Solution,
-    computed_by,
-    peer,
-    solution,
-    within,
-)
+from fmtorch.estimators.external import pairwise
+from fmtorch.estimators.external.pairwise import Confidence, Iterations, Pair, PairwiseEstimator, Points, Solution
 
 
 def opencv(
@@ -32,9 +24,6 @@ def opencv(
         threshold: pixels, point to epipolar line (ransac) or Sampson distance (usac_*).
         confidence: of having drawn a sample without an outlier, at which the search ends.
         iterations: samples at most.
-
-    Returns:
-        The estimator.
 
     Raises:
         ValueError: for a name that is no such constant.
@@ -54,9 +43,6 @@ def opencv(
     return PairwiseEstimator(f"OpenCV {name}", solve, best_first=name == "USAC_PROSAC")
 
 
-# kornia's RANSAC
-
-
 def kornia_ransac(
     *,
     threshold: float = 1.0,
@@ -73,9 +59,6 @@ def kornia_ransac(
         batch_size: samples that are drawn together.
         rounds: batches at most.
         prosac: draw samples from the best matches first.
-
-    Returns:
-        The estimator.
     """
 
     import kornia  # nobody else's estimator waits for it
@@ -94,7 +77,6 @@ def kornia_ransac(
 
 # MAGSAC++, GC-RANSAC, DEGENSAC and SupeRANSAC as their authors published them (extra `peers`)
 
-
 Part = TypeVar("Part", int, str)
 
 # The numbers of the samplers in the authors' bindings of MAGSAC++ and GC-RANSAC.
@@ -110,7 +92,7 @@ SUPERANSAC_SAMPLERS = {
 SUPERANSAC_SCORES = {"ransac": "RANSAC", "msac": "MSAC", "magsac": "MAGSAC"}
 
 
-@computed_by("pymagsac")
+@pairwise.computed_by("pymagsac")
 def magsac_cpp(
     *,
     threshold: float = 3.0,
@@ -122,18 +104,14 @@ def magsac_cpp(
 
     Args:
         threshold: pixels, the largest noise scale.
-        confidence: of having drawn a sample without an outlier, at which the search ends.
-        iterations: samples at most.
+        confidence, iterations: as of `opencv`.
         sampler: one of `SAMPLERS`.
-
-    Returns:
-        The estimator.
 
     Raises:
         ImportError: where `pymagsac` is not installed.
         ValueError: for another sampler.
     """
-    number, library = _named("sampler", sampler, SAMPLERS), peer("pymagsac", "MAGSAC++")
+    number, library = _named("sampler", sampler, SAMPLERS), pairwise.peer("pymagsac", "MAGSAC++")
 
     def solve(pair: Pair) -> Solution:
         (h0, w0), (h1, w1) = pair.size0, pair.size1
@@ -141,12 +119,12 @@ def magsac_cpp(
         F, inside = library.findFundamentalMatrix(
             pair.joined, w0, h0, w1, h1, weights, number, True, threshold, confidence, 50, iterations, 5
         )
-        return solution(F, inside)
+        return pairwise.solution(F, inside)
 
     return PairwiseEstimator("MAGSAC++", solve, best_first=number in (1, 2))
 
 
-@computed_by("pygcransac")
+@pairwise.computed_by("pygcransac")
 def gc_ransac_cpp(
     *,
     threshold: float = 1.0,
@@ -161,19 +139,15 @@ def gc_ransac_cpp(
 
     Args:
         threshold: pixels, Sampson distance.
-        confidence: of having drawn a sample without an outlier, at which the search ends.
-        iterations: samples at most.
+        confidence, iterations: as of `opencv`.
         sampler: one of `SAMPLERS`.
         coherence: weight of the spatial term.
-
-    Returns:
-        The estimator.
 
     Raises:
         ImportError: where `pygcransac` is not installed.
         ValueError: for another sampler.
     """
-    number, library = _named("sampler", sampler, SAMPLERS), peer("pygcransac", "GC-RANSAC")
+    number, library = _named("sampler", sampler, SAMPLERS), pairwise.peer("pygcransac", "GC-RANSAC")
 
     def solve(pair: Pair) -> Solution:
         weights = pair.likelihood.tolist() if number > 2 else []
@@ -181,12 +155,12 @@ def gc_ransac_cpp(
             pair.joined, *pair.size0, *pair.size1, weights, threshold, confidence, coherence, iterations, 50, True,
             1e-5, number,
         )  # fmt: skip
-        return solution(F, [] if F is None else within(F, pair, threshold))
+        return pairwise.solution(F, [] if F is None else pairwise.within(F, pair, threshold))
 
     return PairwiseEstimator("GC-RANSAC", solve, best_first=number in (1, 2))
 
 
-@computed_by("pydegensac")
+@pairwise.computed_by("pydegensac")
 def degensac_cpp(
     *, threshold: float = 0.5, confidence: Confidence = 0.9999, iterations: Iterations = 10000
 ) -> PairwiseEstimator:
@@ -194,27 +168,23 @@ def degensac_cpp(
 
     Args:
         threshold: pixels, Sampson distance.
-        confidence: of having drawn a sample without an outlier, at which the search ends.
-        iterations: samples at most.
-
-    Returns:
-        The estimator.
+        confidence, iterations: as of `opencv`.
 
     Raises:
         ImportError: where `pydegensac` is not installed.
     """
-    library = peer("pydegensac", "DEGENSAC")
+    library = pairwise.peer("pydegensac", "DEGENSAC")
 
     def solve(pair: Pair) -> Solution:
         F, inside = library.findFundamentalMatrix(
             pair.x0, pair.x1, threshold, confidence, iterations, seed=pair.seed % (MAX_SEED - 1) + 1
         )
-        return solution(F, inside)
+        return pairwise.solution(F, inside)
 
     return PairwiseEstimator("DEGENSAC", solve)
 
 
-@computed_by("pysuperansac")
+@pairwise.computed_by("pysuperansac")
 def superansac_cpp(
     *,
     threshold: float = 1.5,
@@ -229,25 +199,19 @@ def superansac_cpp(
 
     Args:
         threshold: pixels.
-        confidence: of having drawn a sample without an outlier, at which the search ends.
-        iterations: samples at most.
+        confidence, iterations: as of `opencv`.
         sampler: one of `SUPERANSAC_SAMPLERS`.
         score: one of `SUPERANSAC_SCORES`.
-
-    Returns:
-        The estimator.
 
     Raises:
         ImportError: where `pysuperansac` is not installed.
         ValueError: for another sampler or score.
     """
     named = _named("sampler", sampler, SUPERANSAC_SAMPLERS), _named("score", score, SUPERANSAC_SCORES)
-    library = peer("pysuperansac", "SupeRANSAC")
+    library = pairwise.peer("pysuperansac", "SupeRANSAC")
 
     def solve(pair: Pair) -> Solution:
-        settings = (
-            library.RANSACSettings()
-        )  # each call divides the threshold of its settings by the scale of the points
+        settings = library.RANSACSettings()  # each call divides its threshold by the scale of the points
         settings.sampler = getattr(library.SamplerType, named[0])
         settings.scoring = getattr(library.ScoringType, named[1])
         settings.inlier_threshold, settings.confidence = threshold, confidence
@@ -257,7 +221,7 @@ def superansac_cpp(
         F, indices, _, _ = library.estimateFundamentalMatrix(pair.joined, [w0, h0, w1, h1], weights, settings)
         inliers = np.zeros(len(pair.x0), dtype=np.bool_)
         inliers[indices] = True
-        return solution(F, inliers)
+        return pairwise.solution(F, inliers)
 
     return PairwiseEstimator("SupeRANSAC", solve, best_first=sampler == "prosac")
 
@@ -267,3 +231,178 @@ def _named(option: str, name: str, choices: Mapping[str, Part]) -> Part:
     if name not in choices:
         raise ValueError(f"{option} is {name!r}; it must be one of: {', '.join(choices)}")
     return choices[name]
+
+
+LOSSES = ("trivial", "truncated", "huber", "cauchy", "truncated_cauchy", "truncated_le_zach")
+"""The robust losses of its refinement."""
+
+
+@pairwise.computed_by("poselib")
+def poselib(
+    *,
+    threshold: float = 1.0,
+    confidence: Confidence = 0.9999,
+    iterations: Iterations = 10000,
+    min_iterations: int = 1000,
+    prosac: bool = False,
+    loss: str | None = None,
+    loss_scale: float | None = None,
+    real_focal_check: bool = False,
+    shared_focal: bool = False,
+) -> PairwiseEstimator:
+    """PoseLib's LO-RANSAC for fundamental matrices, or for two cameras of one unknown focal length (Larsson 2020).
+
+    Where both focal lengths are exactly known (`find_essential`, `cameras=known`) it estimates a relative pose.
+
+    Args:
+        threshold: pixels, Sampson distance.
+        confidence, iterations: as of `opencv`.
+        min_iterations: samples at least, though not more than at most.
+        prosac: draw samples from the best matches first.
+        loss: of the non-linear refinement, one of `LOSSES`; PoseLib's own if not given.
+        loss_scale: pixels; PoseLib's own, half the threshold, if not given.
+        real_focal_check: reject samples whose models give an imaginary focal length for square pixels and central
+            principal points.
+        shared_focal: estimate a relative pose and one focal length, for square pixels and central principal points.
+            Pairs whose images differ in size get a fundamental matrix all the same.
+
+    Raises:
+        ImportError: with a hint, where PoseLib is not installed.
+        ValueError: for another loss, for both of the last two options, or where this version of PoseLib lacks one.
+    """
+    if real_focal_check and shared_focal:
+        raise ValueError("real_focal_check is of fundamental matrices alone: leave it out, or shared_focal")
+    library = pairwise.peer("poselib", "PoseLib")
+    options = {
+        "max_epipolar_error": threshold, "success_prob": confidence, "max_iterations": iterations,
+        "min_iterations": min(min_iterations, iterations), "progressive_sampling": prosac,
+    }  # fmt: skip
+    if real_focal_check:
+        if "real_focal_check" not in library.RansacOptions():
+            raise ValueError("this version of PoseLib has no real_focal_check; 2.0.4 and later have it")
+        options["real_focal_check"] = True
+    refinement = _refinement(loss, loss_scale)
+
+    def solve(pair: Pair) -> Solution:
+        seeded = {**options, "seed": pair.seed}
+        if pair.exact is not None:
+            return _relative_pose(library, pair, seeded, refinement)
+        if shared_focal and pair.size0 == pair.size1:
+            return _shared_focal(library, pair, seeded, refinement)
+        centres = [_centre(size) * real_focal_check for size in (pair.size0, pair.size1)]
+        F, info = library.estimate_fundamental(pair.x0 - centres[0], pair.x1 - centres[1], seeded, refinement)
+        to_centre = [np.array([[1, 0, -x], [0, 1, -y], [0, 0, 1]]) for x, y in centres]
+        return pairwise.solution(to_centre[1].T @ F @ to_centre[0], info["inliers"])
+
+    name = "PoseLib, shared focal length" if shared_focal else "PoseLib"
+    return PairwiseEstimator(name, solve, best_first=prosac)
+
+
+def _relative_pose(library: Any, pair: Pair, options: dict[str, Any], refinement: dict[str, Any]) -> Solution:
+    """The relative pose of two calibrated cameras; their lenses have no distortion."""
+    assert pair.exact is not None
+    cameras = [
+        {"model": "PINHOLE", "width": w, "height": h, "params": [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]}
+        for K, (h, w) in zip(pair.exact, (pair.size0, pair.size1), strict=True)
+    ]
+    pose, info = library.estimate_relative_pose(pair.x0, pair.x1, *cameras, options, refinement)
+    R, t = np.asarray(pose.R, np.float64), np.asarray(pose.t, np.float64)
+    inliers = np.asarray(info["inliers"], np.bool_)
+    return pairwise.Posed(pairwise.fundamental_of_pose(*pair.exact, R, t), inliers, None, R, t)
+
+
+def _shared_focal(library: Any, pair: Pair, options: dict[str, Any], refinement: dict[str, Any]) -> Solution:
+    """The fundamental matrix of the relative pose and the one focal length of two images of one size."""
+    centre = _centre(pair.size0)
+    image_pair, info = library.estimate_shared_focal_relative_pose(pair.x0, pair.x1, centre, options, refinement)
+    focal, pose = image_pair.camera1.params[0], image_pair.pose
+    if not (np.isfinite(focal) and focal > 0):
+        return None, np.zeros(len(pair.x0), dtype=np.bool_)
+    to_ray = np.array([[1 / focal, 0, -centre[0] / focal], [0, 1 / focal, -centre[1] / focal], [0, 0, 1]])
+    F = to_ray.T @ np.cross(np.eye(3), np.asarray(pose.t)).T @ np.asarray(pose.R) @ to_ray
+    return pairwise.solution(F, info["inliers"])
+
+
+def _centre(size: tuple[int, int]) -> NDArray[np.float64]:
+    """The middle (x, y) of an image of a size (h, w), in pixels."""
+    return (np.array(size[::-1], np.float64) - 1) / 2
+
+
+def _refinement(loss: str | None, scale: float | None) -> dict[str, Any]:
+    """PoseLib's options of the non-linear refinement: what is given. Raises ValueError for a loss it does not know."""
+    if loss is not None and loss not in LOSSES:
+        raise ValueError(f"loss is {loss!r}; it must be one of: {', '.join(LOSSES)}")
+    given = {"loss_type": loss and loss.upper(), "loss_scale": scale}
+    return {name: value for name, value in given.items() if value is not None}
+
+
+FOCALS = ("shared", "varying")
+MODELS = ("fundamental", "homography")
+
+
+@pairwise.computed_by("fastpose")
+def fastpose(
+    *,
+    threshold: float = 1.0,
+    confidence: Confidence = 0.9999,
+    iterations: Iterations = 10000,
+    min_iterations: int = 1000,
+    model: str = "fundamental",
+    focal: str | None = None,
+) -> PairwiseEstimator:
+    """fastpose's LO-RANSAC, whose kernels numba compiles at the first call.
+
+    Where both focal lengths are exactly known (`find_essential`, `cameras=known`) it estimates a relative pose, and
+    where cameras with unknown focal lengths are asked for, these with the pose.
+
+    Args:
+        threshold: pixels; Sampson distance, for homographies the root mean square of both transfer errors.
+        confidence, iterations: as of `opencv`.
+        min_iterations: samples at least, though not more than at most.
+        model: fundamental or homography.
+        focal: shared or varying: estimate a relative pose with one unknown focal length or two, for square pixels and
+            central principal points, even where no cameras are asked for.
+
+    Raises:
+        ImportError: with a hint, where fastpose is not installed.
+        ValueError: for another model or `focal`, or for both.
+    """
+    if model not in MODELS or focal not in (None, *FOCALS):
+        raise ValueError(f"model is {model!r} and focal {focal!r}; they must be of {MODELS} and {(None, *FOCALS)}")
+    if model == "homography" and focal is not None:
+        raise ValueError(f"focal={focal} is of fundamental matrices; leave it out, or model=homography")
+    library = pairwise.peer("fastpose", "fastpose").estimators
+    options = {"iterations": iterations, "min_iterations": min(min_iterations, iterations), "success_prob": confidence}
+
+    def solve(pair: Pair) -> Solution:
+        own: dict[str, Any] = {**options, "max_error": threshold, "seed": pair.seed % 2**32}
+        if model == "homography":
+            result, info = library.estimate_homography(pair.x0, pair.x1, **own)
+            return pairwise.solution(result["H"], info["inliers"])
+        if pair.exact is not None:
+            result, info = library.estimate_relative_pose(pair.x0, pair.x1, *pair.exact, **own)
+            return _posed(result, info, *pair.exact)
+        kind = focal or (("varying", "shared")[pair.shared_focal] if pair.calibrations == (None, None) else None)
+        if kind is not None:
+            call = getattr(library, f"estimate_relative_pose_with_{kind}_focal{'s' * (kind == 'varying')}")
+            centres = [(np.array(size[::-1], np.float64) - 1) / 2 for size in (pair.size0, pair.size1)]
+            result, info = call(pair.x0, pair.x1, *centres, **own)
+            names = ("f", "f") if kind == "shared" else ("f1", "f2")
+            K0, K1 = (
+                np.array([[result[name], 0, x], [0, result[name], y], [0, 0, 1]])
+                for name, (x, y) in zip(names, centres, strict=True)
+            )
+            return _posed(result, info, K0, K1, np.array([result[name] for name in names]))
+        result, info = library.estimate_fundamental(pair.x0, pair.x1, **own)
+        return pairwise.solution(result["F"], info["inliers"])
+
+    return PairwiseEstimator("fastpose", solve, model=model)
+
+
+def _posed(
+    result: dict[str, Any], info: dict[str, Any], K0: Points, K1: Points, focals: Points | None = None
+) -> pairwise.Posed:
+    """A relative pose with F of its cameras; none where there are no inliers."""
+    inliers = np.asarray(info["inliers"], np.bool_)
+    F = pairwise.fundamental_of_pose(K0, K1, result["R"], result["t"]) if info["num_inliers"] else None
+    return pairwise.Posed(F, inliers, focals, result["R"], result["t"])

@@ -28,10 +28,8 @@ FAILURES = (cv2.error, RuntimeError, ValueError, TypeError)  # how these librari
 
 class Posed(NamedTuple):
     """A solution of pairs whose cameras are asked for.
-
     F: (3, 3), px. inliers: (n,). focals: (2,), px, NaN where unknown. R, t: X1 = R X0 + t, None where the pose is to be
-    taken from F.
-    """
+    taken from F."""
 
     F: Points | None
     inliers: NDArray[np.bool_]
@@ -92,9 +90,7 @@ class PairwiseEstimator:
 
     def __call__(self, c: Correspondences, seed: int = 0) -> Estimate:
         """Estimate each pair in turn; a pair without a solution is `ok=False` with a reason.
-
-        Raises ValueError where somebody asks for gradients, which no other library gives.
-        """
+        Raises ValueError where somebody asks for gradients, which no other library gives."""
         if c.requires_grad:
             raise ValueError(
                 f"{self.name} passes no gradient on: give it matches that need none (`x0.detach()`), or take an "

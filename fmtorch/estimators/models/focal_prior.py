@@ -38,12 +38,10 @@ QUANTILES = 1 << 10  # of the normal distribution, from which focal lengths are 
 
 class FocalPrior(NamedTuple):
     """The prior of one pair. same_size: whether the images may come from one camera. shared: whether they do.
-
     measured: (2,), logarithms; precision: (2,), one over the squares of their relative deviations, 0 of none.
     tail: (2,), whether a measurement may be wrong. normal: (QUANTILES,), quantiles of the normal distribution. draw:
     (5,), of the posterior of both given the measurements: means, and the factor (l00, l10, l11) of their covariance.
-    common: (2,), mean and deviation of one focal length for both; share: of the draws that take it.
-    """
+    common: (2,), mean and deviation of one focal length for both; share: of the draws that take it."""
 
     same_size: bool
     shared: bool
@@ -84,9 +82,7 @@ def focal_prior(
 
 def same_camera_share(difference: float, deviation: Array) -> float:
     """The share of draws with one focal length for images of equal size: how likely one camera is by Bayes' rule.
-
-    difference: of the measured logarithms; deviation: (2,), of each.
-    """
+    difference: of the measured logarithms; deviation: (2,), of each."""
     if not np.isfinite(deviation).all():
         return SAME_CAMERA_SHARE
     if (deviation < EXACT).all():
@@ -110,9 +106,7 @@ def normal_quantiles() -> Array:
 @inner
 def focal_cost(focal: Array, prior: FocalPrior, out: Array) -> Any:
     """The cost of two log focal lengths; its gradient (2) and its Hessian (h00, h11, h01) -> out (5,).
-
-    Of a shared focal length the first is the only parameter and the second, which is equal, stays where it is put.
-    """
+    Of a shared focal length the first is the only parameter and the second, which is equal, stays where it is put."""
     difference = focal[0] - focal[1]
     squared = difference * difference
     mean = (focal[0] + focal[1]) * (0.5 / FOCAL_DEVIATION) - LOG_USUAL / FOCAL_DEVIATION
@@ -148,17 +142,9 @@ def focal_cost(focal: Array, prior: FocalPrior, out: Array) -> Any:
 
 
 @kernel(holds_gil=True)
-def prior_slopes(focal: F8x1, prior: FocalPrior, out: F8x1) -> None:
-    """The first and second derivatives of the cost of two log focal lengths (2,) -> out (5,), as `focal_cost`."""
-    focal_cost(focal, prior, out)
-
-
-@kernel(holds_gil=True)
 def draw_depths(prior: FocalPrior, longest: F8x1, mixed_seed: int, key: int, start: int, out: F8x2) -> None:
     """Focal lengths of both images for the draws start, start + 1, ..., in the unit of the points -> out (2, count).
-
-    longest: (2,), the longer sides of the images. mixed_seed: of the seed and the stream.
-    """
+    longest: (2,), the longer sides of the images. mixed_seed: of the seed and the stream."""
     normal, draw, common = prior.normal, prior.draw, prior.common
     state, mask, count = stream_state(mixed_seed, key), np.uint64(len(normal) - 1), len(normal)
     measured = prior.precision[0] > 0 or prior.precision[1] > 0

@@ -1,4 +1,5 @@
-"""Fundamental matrices without assumptions: samples of seven or eight matches, refined on the manifold of rank 2."""
+"""Matrices without assumptions: fundamental ones of seven or eight matches, refined on the manifold of rank 2, and
+homographies, ``x1 ~ H x0``, of four, refined on the sphere of nine entries."""
 
 from __future__ import annotations
 
@@ -10,23 +11,23 @@ import numpy as np
 from fmtorch.estimators.models.model import FitScale, Hypotheses, Loss, Steps
 from fmtorch.estimators.pair import Pair, to_pixels
 from fmtorch.geometry.eight_point import eight_point_kernel, weighted_eight_point
-from fmtorch.geometry.epipolar import SAMPSON, Residual
-from fmtorch.geometry.levenberg_marquardt import LOSS_CODES, NO_TABLE, Schedule, Weighted, loss_table
+from fmtorch.geometry.epipolar import HOMOGRAPHY, SAMPSON, Residual
+from fmtorch.geometry.homography import four_point, in_pixels, weighted_homography
+from fmtorch.geometry.homography_refine import refine_homographies, step_of_homography
+from fmtorch.geometry.levenberg_marquardt import Schedule, Weighted
+from fmtorch.geometry.matrices import unit_kernel
 from fmtorch.geometry.rank2_manifold import gauss_newton, response
-from fmtorch.geometry.refine import refine_kernel
+from fmtorch.geometry.refine import STEP_DAMPING, refine_kernel
 from fmtorch.geometry.seven_point import seven_point_kernel
-from fmtorch.jit.kernel import Array
+from fmtorch.jit.kernel import Array, F8x1, F8x2, kernel
 
-STEP_DAMPING = 1e-10  # of a Gauss-Newton step at an optimum: bounds it where the points leave a direction open
 SQUARINGS = 1  # by which models are made rank 2, whose last singular value is but rounding of float32
 
 
 class Matrices:
     """What the families share whose models are matrices of a minimal sample, each by its kernels.
-
     size, solutions: matches of a minimal sample, and its models at most. minimal: samples -> models. linear: weighted
-    matches -> the model of least squares. gauss_newton: a model -> the model after one step.
-    """
+    matches -> the model of least squares. gauss_newton: a model -> the model after one step."""
 
     size: ClassVar[int]
     solutions: ClassVar[int]
@@ -53,7 +54,7 @@ class Matrices:
     def refine(self, F: Array, pair: Pair, loss: Loss, steps: Steps) -> Array:
         """As `Refining.refine`."""
         s2 = np.square(loss.scale / pair.pixels_per_noise)
-        matches = Weighted(pair.points, self.weight(pair), s2, LOSS_CODES[loss.name], loss_table(loss.name))
+        matches = Weighted.of(pair.points, self.weight(pair), s2, loss.name)
         refined, cost = np.empty_like(F), np.empty(len(F))
         self.minimise(F, matches, Schedule(steps.iterations, steps.damping, steps.tolerance or 0.0), refined, cost)
         np.copyto(refined, F, where=~np.isfinite(cost)[:, None])
@@ -73,7 +74,7 @@ class Matrices:
 
 def squared_error(pair: Pair, weight: Array) -> Weighted:
     """Weighted matches, whose errors are squared without bound."""
-    return Weighted(pair.points, weight, np.full(pair.count, np.inf), LOSS_CODES["truncated"], NO_TABLE)
+    return Weighted.of(pair.points, weight, np.full(pair.count, np.inf))
 
 
 class Fundamental(Matrices):
@@ -110,3 +111,45 @@ def response_of(F: Array, pair: Pair, weight: Array) -> Array:
     inverse = np.empty((9, 9))
     response(F, squared_error(pair, weight), STEP_DAMPING, inverse)
     return inverse if np.isfinite(inverse).all() else np.zeros((9, 9))
+
+
+class Homography(Matrices):
+    """Maps of a plane, or of all of two images that a rotation joins; positive where the plane is seen."""
+
+    model: ClassVar[str] = "homography"
+    residual: ClassVar[Residual] = HOMOGRAPHY
+    fit_scale: ClassVar[FitScale] = FitScale("cauchy", 0.8493, 1.5, 0.1, 4.0, 1.0, by_prior=False)
+    size, solutions, minimal = 4, 1, four_point
+    linear, gauss_newton = weighted_homography, step_of_homography
+
+    def to_pixels(self, F: Array, pair: Pair, out: Array) -> bool:
+        """As `Estimated.to_pixels`."""
+        return homography_to_pixels(F, pair.centre, pair.pixels_per_unit, out)
+
+    def weight(self, pair: Pair) -> Array:
+        """As `Matrices.weight`: by the noise, not by the prior.
+        A plane is easy: two equations a match keep wrong ones out, and weights cost efficiency. On 99 photographs under
+        known warps AUC of the corner error at 1 px is 66.2 without and 63.2 with them where matches are few, 83.1 and
+        83.0 otherwise; by a truncated loss in place of Cauchy's 62.2 and 80.9."""
+        return 1 / np.square(pair.noises)
+
+    def minimise(self, F: Array, matches: Weighted, schedule: Schedule, out: Array, cost: Array) -> None:
+        """As `Matrices.minimise`, of the Sampson error."""
+        refine_homographies(F, matches, schedule, out, cost)
+
+
+@kernel(holds_gil=True)
+def homography_to_pixels(H: F8x1, centre: F8x1, unit_px: float, out: F8x2) -> bool:
+    """A homography (9,) of normalised points as that of pixels, of unit norm -> out (3, 3); whether it is finite.
+    centre: (4,), of the points in pixels; unit_px: pixels in one unit of the points."""
+    flat, finite = out.ravel(), True
+    in_pixels(H, centre, unit_px, flat)
+    peak = 0.0
+    for q in range(9):
+        peak = max(peak, abs(flat[q]))
+    for q in range(9):
+        flat[q] /= peak if peak > 0 else 1.0
+    unit_kernel(flat)
+    for q in range(9):
+        finite = finite and abs(flat[q]) <= 1.0
+    return finite

@@ -9,22 +9,19 @@ from __future__ import annotations
 import math
 from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
-import numpy as np
-
 from fmtorch.estimators.models.posterior import Cameras
 from fmtorch.estimators.pair import Pair
 from fmtorch.geometry.arithmetic import exponential
-from fmtorch.geometry.epipolar import Residual
+from fmtorch.geometry.epipolar import TINY_OF_KERNEL, Residual, sampson_parts
 from fmtorch.geometry.levenberg_marquardt import MATCH, Weighted, in_rows
+from fmtorch.geometry.pose import handedness
 from fmtorch.jit.kernel import Array, F8x1, F8x2, inner, kernel
 from fmtorch.jit.lanes import absolute, added, fill, load, sqrt, where
 
 
 class Hypotheses(NamedTuple):
     """Models of one round in the order of their draws: F (m, 9) float32, and the draw (m,) that each is made of.
-
-    draw: counted from `start`. sample: (size, s), the matches of the draws start, start + 1, ...
-    """
+    draw: counted from `start`. sample: (size, s), the matches of the draws start, start + 1, ..."""
 
     F: Array
     draw: Array
@@ -45,11 +42,9 @@ class Family(Protocol):
 
 class FitScale(NamedTuple):
     """The last fit, at a pair's own noise.
-
     loss: its robust loss. sigmas_of_median: the standard deviation of a coordinate, in medians of inliers' residuals.
     scale_sigmas: the scale of the loss in these; it is within smallest_px and largest_px, and default_px where too few
-    inliers tell the noise. by_prior: whether a match counts by its prior, too, not by its noise alone.
-    """
+    inliers tell the noise. by_prior: whether a match counts by its prior, too, not by its noise alone."""
 
     loss: str = "truncated"
     sigmas_of_median: float = 1.4826
@@ -112,25 +107,21 @@ class Refining(Family, Estimated, Protocol):
 
 # On which side of both cameras matches lie: of the candidates of one pair
 
-
 BITS = 20  # fractional, of the support, so that its sums are exact
 REST = 1 / 26  # of the gain of Geman & McClure at 5 scales, from which on it is zero
-TINY = float(np.finfo(np.float64).tiny)
 
 
 @kernel(holds_gil=True)
 def cheirality(cameras: Cameras, longest: F8x1, F: F8x2, matches: Weighted, tolerance: float, out: F8x1) -> None:
     """The share of the support that lies in front of both cameras, for the better of their poses -> out (k,).
-
     Support is each match's weight times the gain of Geman & McClure; matches of rays that are parallel up to the
     tolerance, in the unit of the points, lie on either side. longest: (2,), the longer sides of the images. F: (k, 9),
-    the cameras' models. matches: from the principal points; their s2 is *one over* the square of each one's scale.
-    """
+    the cameras' models. matches: from the principal points; their s2 is *one over* the square of each one's scale."""
     axes, focal = cameras.axes, cameras.focal
     rows, shift = in_rows(matches.points, matches.weight, matches.s2), 1.5 * 2.0 ** (52 - BITS)
     for k in range(len(out)):
         U, V, f = axes[k, 0], axes[k, 1], F[k]
-        handed = 1.0 if (_determinant(U) > 0) == (_determinant(V) > 0) else -1.0
+        handed = handedness(U) * handedness(V)
         d0, d1 = exponential(focal[k, 0]) * longest[0], exponential(focal[k, 1]) * longest[1]
         total, front = fill(0.0), fill(0.0)
         back, mirrored, both = front, front, front
@@ -156,11 +147,8 @@ def cheirality(cameras: Cameras, longest: F8x1, F: F8x2, matches: Weighted, tole
 @inner
 def _gain(f: Array, x0: Any, y0: Any, x1: Any, y1: Any, scale: Any) -> Any:
     """The gains of matches."""
-    a0, b0 = f[0] * x0 + f[1] * y0 + f[2], f[3] * x0 + f[4] * y0 + f[5]
-    a1, b1 = f[0] * x1 + f[3] * y1 + f[6], f[1] * x1 + f[4] * y1 + f[7]
-    e = f[6] * x0 + f[7] * y0 + f[8] + a0 * x1 + b0 * y1
-    slope = a0 * a0 + b0 * b0 + a1 * a1 + b1 * b1
-    gain = 1.0 / (1.0 + e * e / where(slope > TINY, slope, TINY) * scale) - REST
+    e, slope = sampson_parts(f, x0, y0, x1, y1)
+    gain = 1.0 / (1.0 + e * e / where(slope > TINY_OF_KERNEL, slope, TINY_OF_KERNEL) * scale) - REST
     return where(gain > 0.0, gain, 0.0) * (1 / (1 - REST))
 
 
@@ -168,9 +156,3 @@ def _gain(f: Array, x0: Any, y0: Any, x1: Any, y1: Any, scale: Any) -> Any:
 def _ray(M: Array, axis: int, x: Any, y: Any, depth: float) -> Any:
     """A component of points' rays in the axes of a camera."""
     return M[2, axis] + M[0, axis] / depth * x + M[1, axis] / depth * y
-
-
-@inner
-def _determinant(M: Array) -> Any:
-    a = M[0, 0] * (M[1, 1] * M[2, 2] - M[1, 2] * M[2, 1])
-    return a + M[0, 1] * (M[1, 2] * M[2, 0] - M[1, 0] * M[2, 2]) + M[0, 2] * (M[1, 0] * M[2, 1] - M[1, 1] * M[2, 0])

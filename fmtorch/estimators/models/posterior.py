@@ -10,18 +10,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fmtorch.estimators.models.focal_prior import LOG_USUAL, FocalPrior, focal_cost, focal_prior, prior_slopes
+from fmtorch.estimators.models.focal_prior import LOG_USUAL, FocalPrior, focal_cost, focal_prior
 from fmtorch.estimators.pair import EXACT, Pair
 from fmtorch.geometry.arithmetic import exponential, logarithm_kernel
-from fmtorch.geometry.levenberg_marquardt import Weighted, evaluate, levenberg_marquardt
+from fmtorch.geometry.levenberg_marquardt import Weighted, evaluate, minimiser
 from fmtorch.geometry.matrices import assign, assign_rows
 from fmtorch.geometry.pose import nearest_axes
 from fmtorch.geometry.rank2_manifold import SQUARINGS, eliminate, start_one
 from fmtorch.jit.kernel import Array, F8x1, F8x2, F8x3, F8x4, inner, kernel, matrix, vector
 from fmtorch.jit.lanes import LANES, fill, load, store
-
-# Two cameras of square pixels and central principal points: fundamental matrices by their parameters
-
 
 MIN_IMAGE_SIDE_PX = 16.0  # longer side of both images below which sizes are taken for those of another unit than pixels
 MIN_FOCAL, MAX_FOCAL = 0.25, 5.0  # focal lengths outside, in units of the longer side, are not believed at the start
@@ -63,12 +60,8 @@ class Images(NamedTuple):
 def images_of(pair: Pair) -> Images:
     """The images of a pair whose sizes are known, computed once."""
     images: Images | None = pair.images.get("images")
-    if images is None:
-        images = pair.images["images"] = _images(pair)
-    return images
-
-
-def _images(pair: Pair) -> Images:
+    if images is not None:
+        return images
     unit, (h0, w0, h1, w1) = pair.pixels_per_unit, pair.sizes.tolist()
     sides = w0, h0, w1, h1
     # Half a pixel, of images in pixels; of sizes in another unit nobody knows what it is, and it is small.
@@ -78,7 +71,9 @@ def _images(pair: Pair) -> Images:
     if (known := pair.calibration) is not None:
         measured = known.logarithms((max(h0, w0), max(h1, w1)))
         prior = focal_prior(pair.same_size, known.shared, measured, known.deviations)
-    return Images(offset, np.array([max(h0, w0) / unit, max(h1, w1) / unit]), prior)
+    images = Images(offset, np.array([max(h0, w0) / unit, max(h1, w1) / unit]), prior)
+    pair.images["images"] = images
+    return images
 
 
 def focals_px(cameras: Cameras, pair: Pair) -> Array:
@@ -97,7 +92,6 @@ def focals_near(F: Array, pair: Pair) -> Array:
 
 def focal_precision(focals: Array, pair: Pair) -> Array:
     """The second derivatives (2, 2) of the prior's cost by the logarithms of the focal lengths (2,), px.
-
     Infinite on the diagonal where a focal length is exactly known; one parameter that both share has the first place.
     """
     images, work = images_of(pair), np.empty(5)
@@ -105,7 +99,7 @@ def focal_precision(focals: Array, pair: Pair) -> Array:
         focals = np.where(np.isnan(focals), pair.calibration.focals, focals)
     f0, f1 = (focals / (images.longest * pair.pixels_per_unit)).tolist()
     logarithms = np.array([logarithm_kernel(f0), logarithm_kernel(f1)])
-    prior_slopes(logarithms, images.prior, work)
+    focal_cost(logarithms, images.prior, work)
     precision = np.array([[work[2], work[4]], [work[4], 0.0 if images.prior.shared else work[3]]])
     if pair.calibration is not None:
         exact = np.array(pair.calibration.deviations) < EXACT
@@ -124,13 +118,13 @@ class CentredMatches(NamedTuple):
 
 def centred(pair: Pair, scale_px: float = 1.0) -> CentredMatches:
     """The matches of a pair whose image sizes are known, computed once. scale_px: of the loss."""
-    return pair.cached(("centred", scale_px), lambda pair: _centred(pair, scale_px))
 
+    def compute(pair: Pair) -> CentredMatches:
+        out = np.empty((6, pair.count))
+        centre(pair.table, images_of(pair).offset, scale_px, out)
+        return CentredMatches(out[:4], out[4], out[5])
 
-def _centred(pair: Pair, scale_px: float) -> CentredMatches:
-    out = np.empty((6, pair.count))
-    centre(pair.table, images_of(pair).offset, scale_px, out)
-    return CentredMatches(out[:4], out[4], out[5])
+    return pair.cached(("centred", scale_px), compute)
 
 
 @kernel(holds_gil=True)
@@ -148,9 +142,7 @@ def translate(F: F8x2, offset: F8x1, out: F8x2) -> None:
 @kernel(holds_gil=True)
 def centre(table: F8x2, offset: F8x1, scale_px: float, out: F8x2) -> None:
     """Points from the principal points, squared scales of a loss, and one over these -> out (6, n).
-
-    table: (9, n), of `Pair`. offset: (4,), what is added to points. scale_px: of the loss, of a usual match.
-    """
+    table: (9, n), of `Pair`. offset: (4,), what is added to points. scale_px: of the loss, of a usual match."""
     for i in range(table.shape[1]):
         for r in range(4):
             out[r, i] = table[r, i] + offset[r]
@@ -203,7 +195,7 @@ def _squared_focal(F: Array, column: int, row: int, e: Array) -> Any:
     return -(r2 * F[8]) / (r0 * F[2 * row] + r1 * F[2 * row + column])
 
 
-FIRST_DAMPING, MIN_DAMPING, MAX_DAMPING = 1e-3, 1e-9, 1e6
+FIRST_DAMPING, MIN_DAMPING = 1e-3, 1e-9
 
 
 class Limits(NamedTuple):
@@ -228,7 +220,6 @@ class Optimum(NamedTuple):
 
 class _State(NamedTuple):
     """Of k candidates, cameras, models (k, 9), costs (k,), and their derivatives (k, 7), (k, 7, 7).
-
     shared: whether the two focal lengths are one; the sixth parameter is then its logarithm and the seventh has none.
     """
 
@@ -270,14 +261,12 @@ def minimise(cameras: Cameras, matches: Weighted, images: Images, limits: Limits
 @kernel(holds_gil=True)
 def tangents_of(cameras: Cameras, longest: F8x1, F: F8x2, out: F8x3) -> None:
     """Fundamental matrices -> F (k, 9), and their derivatives by five rotations and two logarithms -> (k, 9, LANES)."""
-    camera_models(cameras.axes, cameras.focal, longest, F, out)
+    camera_models(cameras.axes, cameras.focal, longest, False, F, out)
 
 
 @inner
 def _evaluate(state: _State, data: _Data, derivatives: bool) -> None:
-    camera_models(state.axes, state.focal, data.images.longest, state.F, data.tangents)
-    if state.shared:
-        tie(data.tangents)
+    camera_models(state.axes, state.focal, data.images.longest, state.shared, state.F, data.tangents)
     evaluate(state.F, data.matches, derivatives, data.products, state.cost)
     work = vector(5)
     for k in range(len(state.cost)):
@@ -290,8 +279,9 @@ def _evaluate(state: _State, data: _Data, derivatives: bool) -> None:
 
 
 @inner
-def camera_models(axes: Array, focal: Array, longest: Array, F: Array, tangents: Array) -> None:
-    """Fundamental matrices -> F (k, 9), and their derivatives by five rotations and two logarithms -> (k, 9, LANES)."""
+def camera_models(axes: Array, focal: Array, longest: Array, shared: bool, F: Array, tangents: Array) -> None:
+    """Fundamental matrices -> F (k, 9), and their derivatives by five rotations and two logarithms -> (k, 9, LANES).
+    shared: one logarithm for both images; the derivatives by the first are those by it, by the second zero."""
     for k in range(len(F)):
         U, V, T = axes[k, 0], axes[k, 1], tangents[k]
         d0, d1 = exponential(focal[k, 0]) * longest[0], exponential(focal[k, 1]) * longest[1]
@@ -303,15 +293,8 @@ def camera_models(axes: Array, focal: Array, longest: Array, F: Array, tangents:
                 T[q, 2] = (U[r, 1] * V[c, 0] - U[r, 0] * V[c, 1]) * by
                 T[q, 3], T[q, 4] = U[r, 1] * V[c, 2] * by, -U[r, 0] * V[c, 2] * by
                 T[q, 5], T[q, 6] = F[k, q] if c == 2 else 0.0, F[k, q] if r == 2 else 0.0
-
-
-@inner
-def tie(tangents: Array) -> None:
-    """One logarithm for both images: derivatives (k, 9, LANES) by the first are those by it, by the second zero."""
-    for k in range(len(tangents)):
-        for q in range(9):
-            tangents[k, q, 5] += tangents[k, q, 6]
-            tangents[k, q, 6] = 0.0
+        for q in range(9 if shared else 0):
+            T[q, 5], T[q, 6] = T[q, 5] + T[q, 6], 0.0
 
 
 @inner
@@ -342,14 +325,22 @@ def _derivatives(
 
 @inner
 def _step(state: _State, damping: Array, trial: _State) -> None:
-    Q = matrix(7, LANES)
+    Q, x = matrix(7, LANES), vector(7)
     for k in range(len(damping)):
         damped_step(state.hessian[k], state.gradient[k], damping[k], Q)
-        rotate(state.axes[k, 0], Q[0, 7] / 2, Q[1, 7] / 2, Q[2, 7] / 2, trial.axes[k, 0])
-        rotate(state.axes[k, 1], Q[3, 7] / 2, Q[4, 7] / 2, 0.0, trial.axes[k, 1])
-        for i in range(2):
-            step = Q[5 if state.shared else 5 + i, 7]
-            trial.focal[k, i] = min(max(state.focal[k, i] + min(max(step, -1.0), 1.0), -3.0), 3.0)
+        for i in range(7):
+            x[i] = Q[i, 7]
+        move_cameras(state, k, x, state.shared, trial)
+
+
+@inner
+def move_cameras(state: Any, k: int, x: Array, shared: bool, trial: Any) -> None:
+    """The cameras of candidate k after a step x of five rotations and two logarithms, which is bounded -> trial."""
+    _rotate(state.axes[k, 0], x[0] / 2, x[1] / 2, x[2] / 2, trial.axes[k, 0])
+    _rotate(state.axes[k, 1], x[3] / 2, x[4] / 2, 0.0, trial.axes[k, 1])
+    for i in range(2):
+        step = x[5 if shared else 5 + i]
+        trial.focal[k, i] = min(max(state.focal[k, i] + min(max(step, -1.0), 1.0), -3.0), 3.0)
 
 
 @inner
@@ -364,7 +355,7 @@ def damped_step(hessian: Array, gradient: Array, damping: float, Q: Array) -> No
 
 
 @inner
-def rotate(A: Array, x: float, y: float, z: float, out: Array) -> None:
+def _rotate(A: Array, x: float, y: float, z: float, out: Array) -> None:
     """``A R`` with the Cayley rotation of (x, y, z), half of its angles -> out (3, 3)."""
     n = x * x + y * y + z * z
     factor = 2 / (1 + n)
@@ -377,22 +368,20 @@ def rotate(A: Array, x: float, y: float, z: float, out: Array) -> None:
 
 
 @inner
-def _accept(state: _State, trial: _State, damping: Array, done: Array, data: _Data) -> bool:
-    everything = True
-    for k in range(len(damping)):
-        better = trial.cost[k] < state.cost[k] and not done[k]
-        damping[k] = min(max(damping[k] / 10 if better else damping[k] * 10, MIN_DAMPING), MAX_DAMPING)
-        if better:
-            done[k] |= data.limits.tolerance >= 0 and state.cost[k] - trial.cost[k] <= data.limits.tolerance
-            state.cost[k] = trial.cost[k]
-            assign(state.focal[k], trial.focal[k])
-            assign(state.F[k], trial.F[k])
-            assign(state.gradient[k], trial.gradient[k])
-            assign_rows(state.axes[k, 0], trial.axes[k, 0])
-            assign_rows(state.axes[k, 1], trial.axes[k, 1])
-            assign_rows(state.hessian[k], trial.hessian[k])
-        everything = everything and done[k]
-    return everything
+def take_cameras(state: Any, trial: Any, k: int) -> None:
+    """Candidate k of a trial -> state, but for its cost."""
+    assign(state.focal[k], trial.focal[k])
+    assign(state.F[k], trial.F[k])
+    assign(state.gradient[k], trial.gradient[k])
+    assign_rows(state.axes[k, 0], trial.axes[k, 0])
+    assign_rows(state.axes[k, 1], trial.axes[k, 1])
+    assign_rows(state.hessian[k], trial.hessian[k])
 
 
-_minimise = levenberg_marquardt(_evaluate, _step, _accept)
+@inner
+def converged(data: Any, before: float, after: float) -> Any:
+    """Whether a step that lowers the cost of a candidate so far is its last."""
+    return data.limits.tolerance >= 0 and before - after <= data.limits.tolerance
+
+
+_minimise = minimiser(_evaluate, _step, take_cameras, converged, MIN_DAMPING)

@@ -7,27 +7,15 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
+from fmtorch.estimators.models import posterior
 from fmtorch.estimators.models.focal_prior import FocalPrior, draw_depths, focal_cost
 from fmtorch.estimators.models.model import Hypotheses, cheirality
-from fmtorch.estimators.models.posterior import (
-    Cameras,
-    Images,
-    Limits,
-    Optimum,
-    centre,
-    centred,
-    damped_step,
-    images_of,
-    minimise,
-    nearest_cameras,
-    no_cameras,
-    no_optimum,
-    translate,
-)
+from fmtorch.estimators.models.posterior import Cameras, Images, Limits, Optimum, centred, images_of
 from fmtorch.estimators.pair import Pair, squared
 from fmtorch.geometry.five_point import five_point
-from fmtorch.geometry.levenberg_marquardt import LOSS_CODES, NO_TABLE, Weighted
+from fmtorch.geometry.levenberg_marquardt import GEMAN_MCCLURE, Weighted
 from fmtorch.geometry.matrices import unit_kernel
+from fmtorch.geometry.refine import STEP_DAMPING
 from fmtorch.jit.kernel import Array, F8x1, F8x2, kernel, matrix, vector
 from fmtorch.jit.lanes import LANES
 from fmtorch.jit.random import Stream
@@ -36,8 +24,6 @@ SOLUTIONS = 10  # of five matches, at most
 INLIER_SIGMA_PX = 0.3  # standard deviation of an inlier's Sampson distance
 LOSS_SCALE_PX = 0.7  # Sampson distance at which an inlier's cost is half of what a squared one would be
 PARALLEL_PX = 4.0  # in image 1: rays that differ less do not tell on which side of the cameras they meet
-STEP_DAMPING = 1e-10  # of a Gauss-Newton step at an optimum: bounds it where the points leave a direction open
-TRUNCATED, GEMAN_MCCLURE = LOSS_CODES["truncated"], LOSS_CODES["geman_mcclure"]
 
 
 class Refined(NamedTuple):
@@ -77,23 +63,19 @@ class FundamentalWithFocals:
         A model that is not finite comes back as something that is not, with a prior cost of infinity.
         """
         k, precision = len(F), squared(pair.pixels_per_unit / INLIER_SIGMA_PX)
-        cameras, refined = no_cameras(k), Refined(np.empty((k, 9)), np.empty(k), np.empty(k))
+        cameras, refined = posterior.no_cameras(k), Refined(np.empty((k, 9)), np.empty(k), np.empty(k))
         limits, parallel = Limits(precision, iterations, -1.0), PARALLEL_PX / pair.pixels_per_unit
         refine_with_prior(F, Subset(pair.table, images_of(pair), parallel), limits, cameras, refined)
         return cameras, refined
 
     def fit(self, start: Cameras, pair: Pair, truncation: float, limits: Limits) -> FocalFit:
         """The maximum a posteriori of the truncated Sampson error near one candidate; truncation: px."""
-        cameras, images, out, F, gain = start.copy(), images_of(pair), no_optimum(1), np.empty((1, 9)), np.empty(1)
-        minimise(cameras, _truncated(pair, truncation), images, limits, out)
-        translate(out.F, images.offset, F)
+        cameras, images, matches = start.copy(), images_of(pair), centred(pair, truncation)
+        out, F, gain = posterior.no_optimum(1), np.empty((1, 9)), np.empty(1)
+        posterior.minimise(cameras, Weighted.of(matches.points, pair.weight, matches.s2), images, limits, out)
+        posterior.translate(out.F, images.offset, F)
         gain_without_prior(out.hessian[0], out.gradient[0], cameras.focal[0], images.prior, gain)
         return FocalFit(F[0], cameras, float(gain[0]))
-
-
-def _truncated(pair: Pair, truncation: float) -> Weighted:
-    matches = centred(pair, truncation)
-    return Weighted(matches.points, pair.weight, matches.s2, TRUNCATED, NO_TABLE)
 
 
 class Subset(NamedTuple):
@@ -108,15 +90,13 @@ class Subset(NamedTuple):
 def refine_with_prior(F: F8x2, subset: Subset, limits: Limits, cameras: Cameras, out: Refined) -> None:
     """`FundamentalWithFocals.refine` of models (k, 9) -> cameras, out."""
     table, images, k = subset.table, subset.images, len(F)
-    centred_matches, optimum = (
-        matrix(6, table.shape[1]),
-        Optimum(matrix(k, 9), vector(k), matrix(k, 7), np.empty((k, 7, 7))),
-    )
-    centre(table, images.offset, LOSS_SCALE_PX, centred_matches)
+    optimum = Optimum(matrix(k, 9), vector(k), matrix(k, 7), np.empty((k, 7, 7)))
+    centred_matches = matrix(6, table.shape[1])
+    posterior.centre(table, images.offset, LOSS_SCALE_PX, centred_matches)
     points, s2, scale = centred_matches[:4], centred_matches[4], centred_matches[5]
-    nearest_cameras(F, images, cameras)
-    minimise(cameras, Weighted(points, table[4], s2, GEMAN_MCCLURE, matrix(2, 0)), images, limits, optimum)
-    translate(optimum.F, images.offset, out.models)
+    posterior.nearest_cameras(F, images, cameras)
+    posterior.minimise(cameras, Weighted(points, table[4], s2, GEMAN_MCCLURE, matrix(2, 0)), images, limits, optimum)
+    posterior.translate(optimum.F, images.offset, out.models)
     work = vector(5)
     for i in range(k):
         unit_kernel(out.models[i])
@@ -142,7 +122,7 @@ def gain_without_prior(hessian: F8x2, gradient: F8x1, focal: F8x1, prior: FocalP
             if i >= 5 and j >= 5:
                 own = work[i - 3] if i == j else work[4]
             H[i, j] = hessian[i, j] - own
-    damped_step(H, g, STEP_DAMPING, Q)
+    posterior.damped_step(H, g, STEP_DAMPING, Q)
     for i in range(7):
         total += g[i] * Q[i, 7]
     out[0] = -total / 2

@@ -30,7 +30,7 @@ def share(
     K0, K1 = (np.diag([1 / f, 1 / f, 1]) for f in focal)
     F, out = (K1 @ U @ np.diag([1, 1, 0]) @ V.T @ K0).reshape(1, 9), np.empty(1)
     cameras = Cameras(np.stack([U, V])[None].copy(), np.log(focal)[None])
-    matches = Weighted(points, support, np.full(len(support), 1e4), LOSS_CODES["geman_mcclure"], NO_TABLE)
+    matches = Weighted.of(points, support, np.full(len(support), 1e4), "geman_mcclure")
     cheirality(cameras, np.ones(2), F, matches, tolerance, out)
     return float(out[0])
 

@@ -22,7 +22,7 @@ from fmtorch.estimators.models.posterior import (
     no_optimum,
 )
 from fmtorch.estimators.models.with_focals import LOSS_SCALE_PX, FundamentalWithFocals, Refined
-from fmtorch.geometry.levenberg_marquardt import LOSS_CODES, NO_TABLE, Weighted
+from fmtorch.geometry.levenberg_marquardt import Weighted
 from tests.estimators.models.photographs import TALL, WIDE, Sizes, photographs, with_prior
 from tests.estimators.pairs import apart, in_pixels, pair_of, to_units
 from tests.reference import focal as reference
@@ -42,7 +42,7 @@ def start(F: np.ndarray, pair: Pair) -> Cameras:
 def evaluated(cameras: Cameras, pair: Pair, loss: str, scale_px: float, precision: float) -> Optimum:
     """The posterior at cameras: `minimise` without a step."""
     matches, out = centred(pair, scale_px), no_optimum(1)
-    weighted = Weighted(matches.points, pair.weight, matches.s2, LOSS_CODES[loss], NO_TABLE)
+    weighted = Weighted.of(matches.points, pair.weight, matches.s2, loss)
     minimise(cameras.copy(), weighted, images_of(pair), Limits(precision, 0, 0.0), out)
     return out
 
@@ -157,7 +157,7 @@ def test_a_fit_goes_on_after_a_rejected_step() -> None:
     precision, matches = (pair.pixels_per_unit / (px / 2)) ** 2, centred(pair_of(c), px)
     begin, _ = FAMILY.refine(to_units(truth, pair)[None], pair, 12)
     begin.focal[0] += [0.1, -0.1]
-    weighted = Weighted(matches.points, pair.weight, matches.s2, LOSS_CODES["truncated"], NO_TABLE)
+    weighted = Weighted.of(matches.points, pair.weight, matches.s2)
     before = evaluated(begin, pair, "truncated", px, precision)
     single_step, out = begin.copy(), no_optimum(1)
     minimise(single_step, weighted, images_of(pair), Limits(precision, 1, 0.05), out)

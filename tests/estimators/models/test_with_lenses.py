@@ -8,9 +8,16 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from fmtorch.core.types import Correspondences
-from fmtorch.estimators.lens_search import STRAIGHT, LensFit, fit_with_lenses, lens_prior, squared_px
+from fmtorch.estimators.lens_search import (
+    STRAIGHT,
+    LensFit,
+    LensPrior,
+    fit_with_lenses,
+    lens_prior,
+    squared_px,
+    undistorted,
+)
 from fmtorch.estimators.models.posterior import Cameras, images_of, nearest_cameras, no_cameras
-from fmtorch.estimators.models.with_lenses import LensPrior, undistorted
 from fmtorch.estimators.pair import Lens, Pair
 from tests.estimators.pairs import pair_of
 from tests.reference import division as reference
