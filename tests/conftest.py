@@ -12,10 +12,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from jaxtyping._import_hook import _JaxtypingLoader
 
 from fmtorch.jit.cache import kernels_dir
 
 torch.set_num_threads(1)
+# Where threads import modules at the same time, bytecode with checks can get the name of that without, which other
+# processes then load: it is kept nowhere.
+_JaxtypingLoader.set_data = lambda *_, **__: None
 
 SHARED = Path(os.environ.get("FMTORCH_TEST_DATA", Path(__file__).resolve().parents[2] / "shared"))
 KERNELS = kernels_dir()  # before any test sets $FMTORCH_CACHE

@@ -21,18 +21,14 @@ from tests.helpers import draw, draw_set
 CHECKOUT = Path(__file__).resolve().parents[2]
 
 
-def python(code: str, bytecode: Path) -> None:
-    """Run code in a fresh interpreter, which must end well.
-
-    bytecode: a folder of its own, since what jaxtyping's import hook compiles, with checks, can end up beside the rest.
-    """
-    command = [sys.executable, "-X", f"pycache_prefix={bytecode}", "-c", code]
+def python(code: str) -> None:
+    """Run code in a fresh interpreter, which must end well."""
     environment = {**os.environ, "PYTHONPATH": str(CHECKOUT)}
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
 
 
-def test_help_lists_the_commands_without_torch(tmp_path: Path) -> None:
+def test_help_lists_the_commands_without_torch() -> None:
     python(
         "import sys, io, contextlib\n"
         "from fmtorch.__main__ import main\n"
@@ -43,8 +39,7 @@ def test_help_lists_the_commands_without_torch(tmp_path: Path) -> None:
         "with contextlib.redirect_stdout(io.StringIO()) as page: main(['eval', '--help'])\n"
         "assert '  limit=null ' in page.getvalue()\n"
         "libraries = {'torch', 'hydra', 'numpy', 'cv2', 'pyarrow', 'rich', 'yaml'} & set(sys.modules)\n"
-        "assert not libraries, libraries",
-        tmp_path,
+        "assert not libraries, libraries"
     )
 
 
@@ -63,7 +58,7 @@ def test_a_subcommand_runs_as_its_module_does(tmp_path: Path, monkeypatch: pytes
         fmtorch.__main__.main()
 
 
-def test_public_names_are_imported_when_they_are_used(tmp_path: Path) -> None:
+def test_public_names_are_imported_when_they_are_used() -> None:
     python(
         "import inspect, fmtorch\n"
         "assert inspect.isfunction(fmtorch.match) and inspect.isfunction(fmtorch.verify)\n"
@@ -71,8 +66,7 @@ def test_public_names_are_imported_when_they_are_used(tmp_path: Path) -> None:
         "assert match is fmtorch.match\n"
         "assert fmtorch.Pipeline.__module__ == 'fmtorch.pipeline.pipeline'\n"
         "assert set(fmtorch.__all__) <= set(dir(fmtorch)) and fmtorch.geometry.sampson\n"
-        "assert not hasattr(fmtorch, 'nothing')\n",
-        tmp_path,
+        "assert not hasattr(fmtorch, 'nothing')\n"
     )
 
 
