@@ -87,10 +87,7 @@ def test_a_finished_set_is_not_made_again_and_another_is_refused(
 ) -> None:
     (tmp_path / "Made").mkdir()
     (tmp_path / "Made/notes.txt").write_text("mine")
-    with pytest.raises(
-        SystemExit,
-        match=r"error: Made is not empty and has no pairs\.json, .*; name another folder",
-    ):
+    with pytest.raises(SystemExit, match=r"error: Made is not empty and has no pairs\.json, .*; name another folder"):
         run(tmp_path, monkeypatch, "count=1")
     (tmp_path / "Made/notes.txt").unlink()
     run(tmp_path, monkeypatch, "count=1")

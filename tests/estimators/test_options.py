@@ -23,10 +23,7 @@ def test_losses_that_refine_names_are_those_there_are() -> None:
     [
         ({"refine": {"loss": "truncated", "threshold": 1}}, "refine: no option threshold; there are: "),
         ({"refine": {"scale": 1.0}}, "refine: loss is missing"),
-        (
-            {"refine": {"loss": "l1"}},
-            "refine.loss=l1; it must be one of: huber, cauchy, geman_mcclure",
-        ),
+        ({"refine": {"loss": "l1"}}, "refine.loss=l1; it must be one of: huber, cauchy, geman_mcclure"),
         ({"refine": {"loss": "cauchy", "scale": 0.0}}, "refine.scale=0.0; it must be a number above 0"),
         ({"refine": {"loss": "cauchy", "matches": 0}}, "refine.matches=0; it must be a whole number of at least 1"),
         ({"preselect": {"matches": 0}}, "preselect.matches=0; it must be a whole number of at least 1"),
@@ -34,16 +31,10 @@ def test_losses_that_refine_names_are_those_there_are() -> None:
         ({"select": {"scale": 0.0}}, "select.scale=0.0; it must be a number above 0"),
         ({"select": {}, "focal": {"samples": -1}}, "focal.samples=-1; it must be a whole number of at least 0"),
         ({"select": {}, "focal": {"min_rounds": 2}}, "focal.min_rounds is 2; it must be at most focal.rounds, 1"),
-        (
-            {"select": {}, "focal": {"confirmations": 0}},
-            "focal.confirmations=0; it must be a whole number",
-        ),
+        ({"select": {}, "focal": {"confirmations": 0}}, "focal.confirmations=0; it must be a whole number"),
         ({"focal": {}}, "focal needs select"),
         ({"score": "prior_saturated"}, "score is 'prior_saturated'; it must be one of: inlier_count, msac, saturated"),
-        (
-            {"score": {"name": "msac", "weighted": True}},
-            "score=msac: no option weighted; there are: prior_weighted",
-        ),
+        ({"score": {"name": "msac", "weighted": True}}, "score=msac: no option weighted; there are: prior_weighted"),
         ({"score": {"prior_weighted": True}}, "score is None; it must be one of"),
         ({"pool": 0}, "pool=0; it must be a whole number of at least 1"),
         ({"confidence": 1.0}, "confidence=1.0; it must be a number between 0 and 1 or null"),

@@ -2,15 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from fmtorch.features import (
-    SIFT,
-    ImagePyramid,
-    PatchSIFT,
-    RootSIFTPCA,
-    learn_projection,
-    root_sift,
-    sift_of_patches,
-)
+from fmtorch.features import SIFT, ImagePyramid, PatchSIFT, RootSIFTPCA, learn_projection, root_sift, sift_of_patches
 from fmtorch.features.sift import project
 from tests.conftest import oracle
 from tests.features.scenes import random_frames, texture

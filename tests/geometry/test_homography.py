@@ -4,13 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from fmtorch.geometry import (
-    homography,
-    homography_points,
-    homography_sampson,
-    homography_transfer,
-    refine_homography,
-)
+from fmtorch.geometry import homography, homography_points, homography_sampson, homography_transfer, refine_homography
 from tests.reference import homography as reference
 from tests.reference.homography_family import mapped, sampson_squared
 

@@ -102,13 +102,7 @@ def test_columns_draws_keys_and_streams_are_uncorrelated() -> None:
     u = uniform(0, key, Stream.SAMPLING, 0, 500, 2).numpy()
     other = uniform(0, key, Stream.METRIC, 0, 500, 2).numpy()
     seed = uniform(1, key, Stream.SAMPLING, 0, 500, 2).numpy()
-    for a, b in (
-        (u[..., 0], u[..., 1]),
-        (u[:, 1:, 0], u[:, :-1, 0]),
-        (u[1:], u[:-1]),
-        (u, other),
-        (u, seed),
-    ):
+    for a, b in ((u[..., 0], u[..., 1]), (u[:, 1:, 0], u[:, :-1, 0]), (u[1:], u[:-1]), (u, other), (u, seed)):
         # Of n independent pairs the correlation has standard deviation 1 / sqrt(n).
         assert abs(np.corrcoef(a.ravel(), b.ravel())[0, 1]) < 4 / np.sqrt(a.size)
 

@@ -102,10 +102,7 @@ def test_one_to_one_drops_what_has_no_location_and_ranks_nan_ratio_last() -> Non
 def test_stages_need_a_ratio_and_keep_the_rest() -> None:
     x0, x1, ratio = (a[None] for a in duplicated(0, 20))
     mask = torch.ones(1, 20, dtype=torch.bool)
-    for stage, expected in (
-        (RatioTest(0.5), ratio_test(ratio, 0.5)),
-        (OneToOne(), one_to_one(x0, x1, ratio)),
-    ):
+    for stage, expected in ((RatioTest(0.5), ratio_test(ratio, 0.5)), (OneToOne(), one_to_one(x0, x1, ratio))):
         out = stage(Correspondences(x0, x1, mask, ratio))
         assert torch.equal(out.mask, expected)
         assert torch.equal(out.x0, x0)

@@ -16,10 +16,7 @@ def distort(model: str, u: float, v: float, c: list[float]) -> tuple[float, floa
     if model in ("OPENCV", "FULL_OPENCV"):
         k1, k2, p1, p2, k3, k4, k5, k6 = (*c, 0.0, 0.0, 0.0, 0.0)[:8]
         s = (1 + k1 * r**2 + k2 * r**4 + k3 * r**6) / (1 + k4 * r**2 + k5 * r**4 + k6 * r**6)
-        return (
-            u * s + 2 * p1 * u * v + p2 * (r**2 + 2 * u**2),
-            v * s + 2 * p2 * u * v + p1 * (r**2 + 2 * v**2),
-        )
+        return (u * s + 2 * p1 * u * v + p2 * (r**2 + 2 * u**2), v * s + 2 * p2 * u * v + p1 * (r**2 + 2 * v**2))
     if model == "FOV":
         s = atan(2 * r * tan(c[0] / 2)) / (r * c[0])
         return u * s, v * s

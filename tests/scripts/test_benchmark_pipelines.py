@@ -6,13 +6,7 @@ import pytest
 
 from fmtorch import presets
 from scripts.benchmark.methods import pipeline_of
-from scripts.benchmark.pipelines import (
-    BENCHMARKS,
-    RULE,
-    differences_sheet,
-    figures_sheet,
-    settings_of,
-)
+from scripts.benchmark.pipelines import BENCHMARKS, RULE, differences_sheet, figures_sheet, settings_of
 from scripts.benchmark.runner import Row
 from scripts.benchmark.tables import FIGURES, MEDIANS, Results, published
 from tests.helpers import draw_set

@@ -11,14 +11,7 @@ from PIL import Image
 from fmtorch.scenes import Camera, Plan, Task, calibration, fundamental, look_at, photograph
 from fmtorch.training.options import PlaneViews
 from fmtorch.training.planes import Photograph, list_photographs
-from scripts.patch_networks.patches import (
-    Tolerance,
-    View,
-    Warps,
-    tracks_of_views,
-    transferred,
-    views_of_plane,
-)
+from scripts.patch_networks.patches import Tolerance, View, Warps, tracks_of_views, transferred, views_of_plane
 from scripts.patch_networks.stores import Cutting, PatchStore, build_store, package_photographs, split
 
 SIZE = (240, 320)

@@ -11,13 +11,7 @@ from hypothesis import strategies as st
 
 from fmtorch.geometry import symmetric_max
 from fmtorch.training import Augmentation, LabelledMatches
-from fmtorch.training.augmentation import (
-    crop,
-    keep_ratio,
-    move,
-    rotate,
-    swap,
-)
+from fmtorch.training.augmentation import crop, keep_ratio, move, rotate, swap
 from tests.training.conftest import exact
 
 CHANGES: dict[str, Callable[[LabelledMatches], LabelledMatches]] = {

@@ -6,14 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from fmtorch.training import (
-    Draw,
-    LabelledMatches,
-    SimilarLengthBatches,
-    StoredMatches,
-    collate,
-    collate_trimmed,
-)
+from fmtorch.training import Draw, LabelledMatches, SimilarLengthBatches, StoredMatches, collate, collate_trimmed
 from tests.training.conftest import exact
 
 

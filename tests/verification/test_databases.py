@@ -297,24 +297,15 @@ def sql(path: Path, statement: str) -> None:
     ("damage", "said"),
     [
         (lambda p: p.unlink(), "there is no file {}; give the database of a COLMAP project: database.db"),
-        (
-            lambda p: p.write_text("matches\n" * 20),
-            "{} is not a COLMAP database; give the database.db",
-        ),
+        (lambda p: p.write_text("matches\n" * 20), "{} is not a COLMAP database; give the database.db"),
         (lambda p: (p.unlink(), p.mkdir()), "{} is a folder; give the database file in it: {}/database.db"),
         (lambda p: sql(p, "PRAGMA user_version = 99000000"), "{} was written by a newer COLMAP"),
         (
             lambda p: (p.unlink(), sql(p, "CREATE TABLE songs (name TEXT)")),
             "{} is a database, but none of COLMAP's: it",
         ),
-        (
-            lambda p: sql(p, "DELETE FROM matches"),
-            "{} holds no matches; match the images (colmap exhaus",
-        ),
-        (
-            lambda p: sql(p, "DELETE FROM keypoints"),
-            "{} holds no keypoints; extract features (colmap f",
-        ),
+        (lambda p: sql(p, "DELETE FROM matches"), "{} holds no matches; match the images (colmap exhaus"),
+        (lambda p: sql(p, "DELETE FROM keypoints"), "{} holds no keypoints; extract features (colmap f"),
         (lambda p: os.truncate(p, 5000), "{} cannot be read as a COLMAP database: "),
     ],
 )

@@ -52,10 +52,7 @@ def test_shards_of_other_settings_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "database.db"
     write(path, scene(3))
     fmtorch.verify(path, shard="1/2")
-    with pytest.raises(
-        ValueError,
-        match=r"holds geometries of other settings; .*: seed: 0 -> 1\. Give the same, or",
-    ):
+    with pytest.raises(ValueError, match=r"holds geometries of other settings; .*: seed: 0 -> 1\. Give the same, or"):
         fmtorch.verify(path, shard="2/2", seed=1)
     with pytest.raises(ValueError, match=r"shard=3/2; it must be i/n"):
         fmtorch.verify(path, shard="3/2")
