@@ -14,7 +14,7 @@ from fmtorch.data.scenes import DepthScenePairs, incidence
 from fmtorch.scenes import Plan, RenderedPairs
 from tests.data.native import write_colmap, write_kitti
 from tests.helpers import call_command
-from tests.reference import overlap as reference
+from tests.reference import labels as reference
 
 PLAN = Plan(scenes=1, shots=4, pairs=4, scale=0.15)
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from fmtorch.estimators import Pair
 from fmtorch.jit.kernel import Array
-from tests.reference.epipolar import sampson
+from tests.reference.solvers import sampson
 
 SUMS, ROW, LAST = 8, 3, 16
 """Roundings of a term of x1' F x0; of one of F x0 or F' x1; of squares, their sum, a quotient and a product."""

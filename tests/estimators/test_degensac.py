@@ -26,7 +26,7 @@ from fmtorch.jit.random import Stream
 from tests.estimators.pairs import named, pair_of, to_units
 from tests.reference import homography as reference
 from tests.reference.random import number
-from tests.reference.sampling import quantised
+from tests.reference.ransac import quantised
 from tests.reference.solvers import skew
 
 PAIRS = 64

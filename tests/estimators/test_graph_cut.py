@@ -23,7 +23,7 @@ from fmtorch.jit.kernel import F4x1, F8x1, F8x2, kernel
 from fmtorch.jit.random import Stream
 from tests.conftest import oracle
 from tests.estimators.pairs import FEW, REAL, models, named, to_units
-from tests.reference import graph_cut as reference
+from tests.reference import ransac as reference
 from tests.reference.random import number
 from tests.reference.solvers import eight_point, normalised_equations, unit
 

@@ -19,9 +19,9 @@ from fmtorch.estimators.preselection import (
 )
 from fmtorch.jit.random import Stream
 from tests.estimators.pairs import FEW, SCALES, models, named, pair_of
-from tests.reference import sampling as reference
+from tests.reference import ransac as reference
 from tests.reference.random import number
-from tests.reference.support import degenerate_support as expected_support
+from tests.reference.ransac import degenerate_support as expected_support
 
 SEED = 3
 

@@ -13,7 +13,7 @@ from tests.estimators.residuals import residuals
 from tests.laws import scene
 from tests.reference import refine as reference
 from tests.reference.random import number
-from tests.reference.sampling import shuffled
+from tests.reference.ransac import shuffled
 
 
 def pool_of(F: np.ndarray) -> Pool:

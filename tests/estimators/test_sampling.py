@@ -13,7 +13,7 @@ from fmtorch.estimators.sampling import largest_weight
 from fmtorch.jit.random import Stream
 from tests.estimators.pairs import known, pair_of
 from tests.laws import scene, with_padding
-from tests.reference import sampling as reference
+from tests.reference import ransac as reference
 from tests.reference.random import number
 
 SAMPLERS = [Uniform(), PriorWeighted(), Prosac()]

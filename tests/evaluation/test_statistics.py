@@ -17,7 +17,7 @@ from fmtorch.evaluation.statistics import (
     share_difference,
     share_interval,
 )
-from tests.reference.bootstrap import bootstrap_interval
+from tests.reference.metrics import bootstrap_interval
 
 
 def correlated(scenes: int, pairs: int, seed: int = 0) -> tuple[np.ndarray, list[str]]:

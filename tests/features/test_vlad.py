@@ -18,7 +18,7 @@ from fmtorch.features.vlad import (
     vlad,
 )
 from scripts.make_models import k_means, learned
-from tests.reference import vlad as reference
+from tests.reference import local_features as reference
 
 
 def book(seed: int = 0) -> Codebook:

@@ -4,7 +4,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from fmtorch.geometry.five_point import five_point
-from tests.reference import five_point as reference
+from tests.reference import solvers as reference
 from tests.reference.solvers import consistently_oriented
 
 SAMPLES = 203  # not whole lanes

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fmtorch.geometry.homography import four_point
-from tests.reference import homography_family as reference
+from tests.reference import homography as reference
 
 ROUNDING32, ROUNDING64 = 2.0**-24, 2.0**-53
 

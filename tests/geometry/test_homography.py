@@ -6,7 +6,7 @@ import torch
 
 from fmtorch.geometry import homography, homography_points, homography_sampson, homography_transfer, refine_homography
 from tests.reference import homography as reference
-from tests.reference.homography_family import mapped, sampson_squared
+from tests.reference.homography import mapped, sampson_squared
 
 
 def planar(seed: int, n: int, noise: float = 0.0) -> tuple[np.ndarray, np.ndarray]:

@@ -16,7 +16,7 @@ from fmtorch.geometry.homography_refine import (
     refine_homographies,
 )
 from fmtorch.geometry.levenberg_marquardt import LOSS_CODES, NO_TABLE, Schedule, Weighted
-from tests.reference import homography_family as reference
+from tests.reference import homography as reference
 
 EPS = 2.0**-52
 KINDS = sorted(reference.LOSSES)

@@ -7,8 +7,8 @@ import torch
 from fmtorch.core import PAIR_TYPES
 from fmtorch.geometry.pair_type import classified, pair_evidence
 from tests.geometry.kinds import SIZE, K, batch, draw
-from tests.reference import configuration as reference
-from tests.reference.epipolar import sampson
+from tests.reference import significance as reference
+from tests.reference.solvers import sampson
 
 SIDE = float(np.sqrt(SIZE[0] * SIZE[1]))
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from fmtorch.matching import Neighbors, nearest_neighbors
 from tests.conftest import oracle
-from tests.reference.matching import two_nearest
+from tests.reference.local_features import two_nearest
 
 
 def sift_like(seed: int, n: int, d: int = 128, top: int = 60) -> Tensor:

@@ -13,8 +13,8 @@ from torch import Tensor
 from fmtorch.core import Correspondences, Features
 from fmtorch.matching import NearestNeighborMatcher, nearest_neighbors
 from fmtorch.pruning import MutualCheck, OneToOne, RatioTest, mutual, one_to_one, ratio_test
-from tests.reference import matching as matching_reference
-from tests.reference.matching import one_to_one as one_to_one_reference
+from tests.reference import local_features as matching_reference
+from tests.reference.local_features import one_to_one as one_to_one_reference
 
 
 def test_ratio_is_strict_and_refuses_nan() -> None:

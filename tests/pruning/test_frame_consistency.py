@@ -10,7 +10,7 @@ from fmtorch.pruning import frame_agreement
 from fmtorch.pruning.consistency import CURVES, MIN_VOTE, NOISE, TOLERANCE, WINDOW, WORST_RATIO
 from tests.laws import scene
 from tests.pruning.gradients import expect_gradients
-from tests.reference import frame_consistency as reference
+from tests.reference import consistency as reference
 
 
 def common_motion(count: int = 80) -> Correspondences:

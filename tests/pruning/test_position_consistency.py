@@ -11,7 +11,7 @@ from fmtorch.pruning import position_agreement
 from fmtorch.pruning.consistency import CURVES, MIN_VOTE, NOISE, SCALES, TOLERANCE, TURNS, WINDOW, WORST_RATIO
 from tests.laws import scene
 from tests.pruning.gradients import expect_gradients
-from tests.reference import position_consistency as reference
+from tests.reference import consistency as reference
 
 
 def agree(c: Correspondences) -> torch.Tensor:
@@ -33,7 +33,7 @@ def test_equals_the_definition(count: int, angle: float, scale: float, ratios: b
     x0, x1 = c.x0[0].double().numpy(), c.x1[0].double().numpy()
     S = reference.similarity(x0, x1, CURVES, TURNS, SCALES)
     vote = np.ones(count) if c.ratio is None else np.maximum(WORST_RATIO - c.ratio[0].double().numpy(), MIN_VOTE)
-    expected = reference.agreement(x0, x1, S, vote, CURVES, WINDOW, TOLERANCE, NOISE)
+    expected = reference.agreement_of_positions(x0, x1, S, vote, CURVES, WINDOW, TOLERANCE, NOISE)
     # float32: coordinates of 1e3 px are rounded to 6e-5 px, against lengths of at least 4 px
     np.testing.assert_allclose(agree(c)[0].numpy(), expected, rtol=1e-3, atol=1e-5)
 
@@ -59,7 +59,7 @@ def test_gradients_are_those_of_the_definition() -> None:
     def defined(x0: np.ndarray, x1: np.ndarray, ratio: np.ndarray) -> float:
         S = reference.similarity(x0[0], x1[0], CURVES, TURNS, SCALES)
         vote = np.maximum(WORST_RATIO - ratio[0], MIN_VOTE)
-        agreement = reference.agreement(x0[0], x1[0], S, vote, CURVES, WINDOW, TOLERANCE, NOISE)
+        agreement = reference.agreement_of_positions(x0[0], x1[0], S, vote, CURVES, WINDOW, TOLERANCE, NOISE)
         return float(weight.numpy() @ agreement)
 
     (position_agreement(**fields, mask=c.mask)[0] * weight).sum().backward()

@@ -11,10 +11,10 @@ from fmtorch.core import Correspondences
 from fmtorch.pruning import frame_agreement, gms, lpm, lpm_cost, one_to_one, position_agreement
 from fmtorch.pruning.consistency import CURVES, MIN_VOTE, NOISE, SCALES, TOLERANCE, TURNS, WINDOW, WORST_RATIO
 from tests.laws import degenerate, scene, scenes, small, with_padding
-from tests.reference import frame_consistency, position_consistency
+from tests.reference import consistency
 from tests.reference.gms import gms as gms_reference
+from tests.reference.local_features import one_to_one as one_to_one_reference
 from tests.reference.lpm import passes
-from tests.reference.matching import one_to_one as one_to_one_reference
 
 SIZE = (640, 960)  # of the images of a scene
 
@@ -87,11 +87,11 @@ def test_agreement_of_few_matches(ratios: bool) -> None:
         ratio = c.ratio if ratios else None
         vote = np.maximum(WORST_RATIO - c.ratio[0].double().numpy(), MIN_VOTE) if ratios else np.ones(len(c.mask[0]))
         x0, x1, A0, A1 = (t[0].double().numpy() for t in (c.x0, c.x1, c.lafs0[..., :2], c.lafs1[..., :2]))
-        by_frames = frame_consistency.agreement(
+        by_frames = consistency.agreement(
             x0, x1, A1 @ np.linalg.inv(A0), vote, CURVES, WINDOW, TOLERANCE, NOISE
         )  # fmt: skip
-        similarity = position_consistency.similarity(x0, x1, CURVES, TURNS, SCALES)
-        by_motion = position_consistency.agreement(x0, x1, similarity, vote, CURVES, WINDOW, TOLERANCE, NOISE)
+        similarity = consistency.similarity(x0, x1, CURVES, TURNS, SCALES)
+        by_motion = consistency.agreement_of_positions(x0, x1, similarity, vote, CURVES, WINDOW, TOLERANCE, NOISE)
         frames = frame_agreement(c.x0, c.x1, c.lafs0, c.lafs1, ratio, c.mask)[0]
         # float32: coordinates of 1e3 px are rounded to 6e-5 px, against lengths of at least 4 px
         np.testing.assert_allclose(frames, by_frames, rtol=1e-3, atol=1e-5, err_msg=what)

@@ -31,7 +31,6 @@ from scripts.patch_networks.patches import Tolerance, patch_similarity, tracks_o
 from scripts.patch_networks.stores import PatchStore, Tracks, build_store, package_photographs, validation_pairs
 from scripts.patch_networks.train import cutting_of, training_of
 from scripts.patch_networks.training import MatchSetTraining, PatchTraining, TrainingOptions, match_sets
-from tests.reference import geodesc as geodesc_reference
 from tests.reference import patch_losses as reference
 
 
@@ -74,8 +73,8 @@ def test_losses_are_their_definitions() -> None:
 def test_the_loss_of_match_sets_is_its_definition() -> None:
     a, b, similarity = sets_of(3, 9, 4, 0)
     sets = list(zip(a.tolist(), b.tolist(), similarity.tolist(), strict=True))
-    first = sum(geodesc_reference.structured(x, y, 0.3) for x, y, _ in sets) / 3
-    second = sum(geodesc_reference.geometric(x, y, s) for x, y, s in sets) / 3
+    first = sum(reference.structured(x, y, 0.3) for x, y, _ in sets) / 3
+    second = sum(reference.geometric(x, y, s) for x, y, s in sets) / 3
     assert min(first, second) > 0.02
     assert float(structured(a, b, ratio=0.3)) == pytest.approx(first, abs=1e-12)
     assert float(geometric(a, b, similarity)) == pytest.approx(second, abs=1e-12)
@@ -201,7 +200,7 @@ def test_match_sets_are_their_definition() -> None:
     everything = match_sets(tracks, 2, 1.0)
     assert len(everything) == 10
     limit = float(np.median(everything.image_similarity))
-    sets, expected = match_sets(tracks, 15, limit), geodesc_reference.match_sets(similarity, 15, limit)
+    sets, expected = match_sets(tracks, 15, limit), reference.match_sets(similarity, 15, limit)
     assert 0 < len(sets) < len(everything)
     assert len(sets) == len(expected)
     for i, (a, b) in enumerate(itertools.pairwise(sets.first)):

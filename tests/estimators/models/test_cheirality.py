@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from fmtorch.estimators.models.model import BITS, cheirality
 from fmtorch.estimators.models.posterior import Cameras
 from fmtorch.geometry.levenberg_marquardt import LOSS_CODES, NO_TABLE, Weighted
-from tests.reference import cheirality as reference
+from tests.reference import focal as reference
 
 
 def factors(seed: int) -> tuple[np.random.Generator, np.ndarray, np.ndarray, np.ndarray]:

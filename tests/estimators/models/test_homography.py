@@ -12,7 +12,7 @@ import fmtorch
 from fmtorch.estimators import Ransac
 from fmtorch.pipeline.pipeline import load_pipeline
 from tests.conftest import shared_path
-from tests.reference import homography_family as reference
+from tests.reference import homography as reference
 
 W, H = 640, 480
 CORNERS = np.array([[0, 0], [W - 1, 0], [W - 1, H - 1], [0, H - 1]], float)

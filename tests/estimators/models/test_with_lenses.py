@@ -13,7 +13,7 @@ from fmtorch.estimators.models.posterior import Cameras, images_of, nearest_came
 from fmtorch.estimators.models.with_lenses import LensPrior, undistorted
 from fmtorch.estimators.pair import Lens, Pair
 from tests.estimators.pairs import pair_of
-from tests.reference import division as reference
+from tests.reference import lenses as reference
 
 SIZE = (480, 640)
 LENSES = (-0.2, -0.1)

@@ -7,7 +7,7 @@ from fmtorch.core import collate
 from fmtorch.pruning import DFE, LC
 from fmtorch.pruning.networks.layers import ContextBatchNormReLU, ResidualBlock, Slots
 from tests.laws import scene
-from tests.reference.networks import context_batch_norm_relu
+from tests.reference.pruner_losses import context_batch_norm_relu
 
 
 def batch(channels=3, seed=0, dtype=torch.float64):
