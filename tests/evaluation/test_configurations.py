@@ -26,7 +26,7 @@ from fmtorch.evaluation import (
 )
 from fmtorch.pipeline import Outcome, Pipeline, examined
 from fmtorch.runs import PairRow, to_table
-from tests.geometry.kinds import K, batch, draw
+from tests.geometry.scenes import K, batch, draw
 from tests.helpers import unused
 
 

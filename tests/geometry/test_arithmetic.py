@@ -8,21 +8,13 @@ from fmtorch.estimators.models import focal_prior
 from fmtorch.geometry import arithmetic
 from fmtorch.geometry.arithmetic import (
     SMALL,
-    as_components,
-    as_matrices,
-    as_rows,
-    cofactors,
     component_sum,
-    cross,
-    determinant,
     logarithm,
     logarithm_1p,
-    product,
     smallest_but,
     sort_by,
     sqrt,
     stable_sum,
-    unit,
 )
 from fmtorch.geometry.significance import LOG_MODELS
 from fmtorch.jit.kernel import F8x2, kernel
@@ -44,13 +36,6 @@ def test_stable_sum_is_a_sum_that_padding_and_neighbours_do_not_change(n, dtype)
     for i in range(5):
         assert torch.equal(stable_sum(x[i], 0), total[i])
     assert torch.equal(stable_sum(x.permute(2, 0, 1).contiguous(), -1), total.permute(1, 0))
-
-
-@pytest.mark.parametrize("n", range(1, 17))
-@pytest.mark.parametrize("dim", [0, 1, -1])
-def test_component_sum(n, dim):
-    x = torch.arange(n**3, dtype=torch.float64).reshape(n, n, n)
-    assert torch.equal(component_sum(x, dim), x.sum(dim))  # integers: exact
 
 
 @pytest.mark.parametrize("n", [3, 7, 9])
@@ -81,20 +66,6 @@ def test_the_logarithm_is_alike_everywhere_and_far_from_one() -> None:
     torch.testing.assert_close(logarithm(x), torch.from_numpy(np.log(x.numpy())), rtol=4 * 2**-52, atol=4 * 2**-52)
     for start in range(1, 20):
         assert torch.equal(logarithm(x[start:]), logarithm(x)[start:])
-
-
-def test_small_matrices_as_by_numpy() -> None:
-    generator = torch.Generator().manual_seed(0)
-    A, B = torch.randn(2, 4, 5, 3, 3, generator=generator, dtype=torch.float64).unbind(0)
-    a, b = (as_rows(as_components(M)) for M in (A, B))
-    # Some additions of products of numbers of about 1: a few eps of absolute error.
-    tight = {"rtol": 0, "atol": 1e-13}
-    torch.testing.assert_close(as_matrices(product(a, b).flatten(0, 1)), A @ B, **tight)
-    torch.testing.assert_close(determinant(a), torch.linalg.det(A), **tight)
-    expected = torch.linalg.det(A)[..., None, None] * torch.linalg.inv(A).mT
-    torch.testing.assert_close(as_matrices(cofactors(a).flatten(0, 1)), expected, rtol=1e-11, atol=1e-11)
-    torch.testing.assert_close(cross(a[0], b[0]).movedim(0, -1), torch.cross(A[..., 0, :], B[..., 0, :], -1), **tight)
-    torch.testing.assert_close(unit(a.flatten(0, 1)).square().sum(0), torch.ones(4, 5, dtype=torch.float64), **tight)
 
 
 def test_the_logarithm_of_one_more_is_exact_near_zero_and_the_same_in_kernels() -> None:

@@ -1,10 +1,19 @@
+"""The eight-point algorithm and its steps: normalisation, rank 2."""
+
 import cv2
 import numpy as np
 import pytest
 import torch
 from kornia.geometry.epipolar import find_fundamental
 
-from fmtorch.geometry import canonical, eight_point
+from fmtorch.geometry import (
+    canonical,
+    denormalize_fundamental,
+    eight_point,
+    nearest_rank2,
+    normalize_pair,
+    normalize_points,
+)
 from tests.conftest import oracle
 from tests.geometry.scenes import scene, scenes
 from tests.reference import solvers as reference
@@ -136,3 +145,120 @@ def test_gradient():
     moved[3] = step
     difference = (invariant(x0.detach(), x1.detach(), moved)[0, 0] - loss.detach()) / step
     torch.testing.assert_close(gradient[3], difference, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("batch", [(), (3,), (2, 3)])
+def test_hartley_equals_the_definition(batch):
+    x, _, _ = scenes(batch, 20)
+    w = torch.rand(*batch, 20, dtype=torch.float64)
+    for weight in (None, w):
+        y, T = normalize_points(x, weight=weight)
+        for i in np.ndindex(batch):
+            expected = reference.hartley(x[i].numpy(), None if weight is None else w[i].numpy())
+            np.testing.assert_allclose(T[i], expected, rtol=1e-13, atol=1e-13)
+            np.testing.assert_allclose(y[i], (reference.homogeneous(x[i].numpy()) @ expected.T)[:, :2], atol=1e-13)
+
+
+def test_common_scale_is_one_scale():
+    s = scene(30)
+    x1 = 3 * s.x1
+    y0, y1, T0, T1 = normalize_pair(s.x0, x1)
+    assert torch.equal(T0[0, 0], T1[1, 1])
+    assert y0.mean(0).abs().max() < 1e-14
+    assert y1.mean(0).abs().max() < 1e-14
+    assert ((y0.norm(dim=-1).mean() + y1.norm(dim=-1).mean()) / 2 - 2**0.5).abs() < 1e-14
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_coincident_and_absent_points_keep_their_scale(dtype):
+    same = torch.full((9, 2), 123.4, dtype=dtype, requires_grad=True)
+    y, T = normalize_points(same)
+    assert T[0, 0] == 1
+    y.square().sum().backward()
+    assert same.grad.isfinite().all()
+    y, T = normalize_points(same, torch.zeros(9, dtype=torch.bool))
+    assert torch.equal(T, torch.eye(3, dtype=dtype))
+    assert not y.any()
+
+
+def test_denormalised_f_vanishes_where_the_normalised_one_does():
+    s = scene(20)
+    (_, T0), (_, T1) = normalize_points(s.x0), normalize_points(s.x1)
+    Fn = torch.linalg.inv(T1).mT @ s.F @ torch.linalg.inv(T0)
+    torch.testing.assert_close(canonical(denormalize_fundamental(Fn, T0, T1)), canonical(s.F))
+
+
+def test_canonical():
+    F = torch.randn(6, 3, 3, dtype=torch.float64)
+    U = canonical(F)
+    torch.testing.assert_close(U, torch.stack([torch.from_numpy(reference.unit(f.numpy())) for f in F]))
+    torch.testing.assert_close(canonical(-1e-200 * F), U)
+    zero = torch.zeros(3, 3, requires_grad=True)
+    canonical(zero).sum().backward()
+    assert not canonical(zero).any()
+    assert zero.grad.isfinite().all()
+
+
+def test_gradients_of_normalisation():
+    s = scene(9)
+    x0, x1 = (s.x0 / 500).requires_grad_(), (s.x1 / 500).requires_grad_()
+    w = torch.rand(9, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda x, w: normalize_points(x, weight=w), (x0, w))
+    assert torch.autograd.gradcheck(lambda a, b: normalize_pair(a, b), (x0, x1))
+    assert torch.autograd.gradcheck(canonical, (torch.randn(2, 3, 3, dtype=torch.float64, requires_grad=True),))
+
+
+EPS = torch.finfo(torch.float64).eps
+
+
+def random_matrices(batch, singular_values=None, seed=0):
+    F = torch.randn(*batch, 3, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    if singular_values is None:
+        return F
+    U, _, Vt = torch.linalg.svd(F)
+    return U @ torch.diag(torch.tensor(singular_values, dtype=torch.float64)) @ Vt
+
+
+@pytest.mark.parametrize("batch", [(), (3,), (2, 3), (500,)])
+def test_equals_the_svd(batch):
+    F = random_matrices(batch)
+    P = nearest_rank2(F)
+    for i in np.ndindex(batch):
+        S = np.linalg.svd(F[i].numpy())[1]
+        # The last singular vector of a matrix known to eps |F| is known to eps |F| / gap.
+        np.testing.assert_allclose(P[i], reference.rank2(F[i].numpy()), atol=32 * EPS * S[0] ** 2 / (S[1] - S[2]))
+
+
+@pytest.mark.parametrize(
+    "s",
+    [(1, 1, 1), (1, 0.5, 0.5), (1, 1, 0.5), (1, 0.5, 0.5 - 1e-9), (1, 1e-3, 1e-6), (1, 1e-6, 1e-9), (1, 1e-10, 1e-12),
+     (1, 1e-14, 0), (1, 1e-15, 1e-15), (1, 0, 0), (0, 0, 0), (1e-200, 1e-201, 1e-202), (1e100, 1e99, 1e98)],
+)  # fmt: skip
+def test_nearest_even_where_the_singular_vector_is_not_unique(s):
+    F = random_matrices((200,), s)
+    P = nearest_rank2(F)
+    distance = torch.linalg.matrix_norm((P - F) / max(s[0], 1e-300)) * max(s[0], 1e-300)
+    # Between singular values closer than sqrt(eps) the vector may lie anywhere: no farther than the second one.
+    second = s[1] if abs(s[1] - s[2]) < EPS**0.5 * s[1] else s[2]
+    assert (distance <= second + 16 * EPS * s[0]).all()
+    assert (torch.linalg.svdvals(P)[:, 2] <= 16 * EPS * s[0]).all()
+
+
+def test_float32_is_the_rounded_float64():
+    F = random_matrices((50,)).float()
+    assert torch.equal(nearest_rank2(F), nearest_rank2(F.double()).float())
+
+
+def test_gradient_of_rank2():
+    assert torch.autograd.gradcheck(nearest_rank2, (random_matrices((2, 3)).requires_grad_(),))
+
+
+@pytest.mark.parametrize("s", [(1, 1, 1), (1, 0.5, 0.5), (1, 0.5, 0.5 - 1e-9), (1, 0, 0), (0, 0, 0)])
+def test_gradient_stays_bounded(s):
+    F = random_matrices((50,), s).requires_grad_()
+    target = random_matrices((50,), seed=1)
+    (nearest_rank2(F) * target).sum().backward()
+    # |d(F v v^T)| <= |dF| + 2 s3 |dv|;
+    # |dv| <= 2 s1 |dF| max gap / (gap^2 + eps^2) = s1 |dF| / eps; eps = 1e-6 s1^2.
+    assert F.grad.isfinite().all()
+    assert F.grad.norm(dim=(1, 2)).max() <= (1 + 2e6) * target.norm(dim=(1, 2)).max()

@@ -1,10 +1,30 @@
-"""Homographies equal their definitions."""
+"""Homographies, their Sampson error and its minimum, and those of four matches, equal their definitions."""
+
+import itertools
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 import torch
 
-from fmtorch.geometry import homography, homography_points, homography_sampson, homography_transfer, refine_homography
+from fmtorch.geometry import (
+    LOSSES,
+    homography,
+    homography_points,
+    homography_sampson,
+    homography_transfer,
+    refine_homography,
+)
+from fmtorch.geometry.epipolar import HOMOGRAPHY
+from fmtorch.geometry.homography import four_point
+from fmtorch.geometry.homography_refine import (
+    evaluate_homographies,
+    homography_curvature,
+    homography_gradient,
+    linearise_homography,
+    refine_homographies,
+)
+from fmtorch.geometry.levenberg_marquardt import LOSS_CODES, NO_TABLE, Schedule, Weighted
 from tests.reference import homography as reference
 from tests.reference.homography import mapped, sampson_squared
 
@@ -178,3 +198,208 @@ def test_refined_homographies() -> None:
     assert bool(torch.isfinite(x0.grad).all())
     with pytest.raises(ValueError, match="welsch"):
         refine_homography(truth, x0, x1, loss="welsch")
+
+
+EPS = 2.0**-52
+KINDS = sorted(reference.LOSSES)
+
+
+class Problem(NamedTuple):
+    """A model (9,) of unit norm, noisy matches (4, n) of it, weights (n,) and squared scales (n,)."""
+
+    h: np.ndarray
+    points: np.ndarray
+    weight: np.ndarray
+    s2: np.ndarray
+
+    def weighted(self, loss: str) -> Weighted:
+        return Weighted(self.points, self.weight, self.s2, LOSS_CODES[loss], NO_TABLE)
+
+    def unbounded(self) -> Weighted:
+        """Without a robust loss."""
+        return Weighted(self.points, self.weight, np.full_like(self.s2, np.inf), LOSS_CODES["truncated"], NO_TABLE)
+
+
+def problem(seed: int, n: int = 30, noise: float = 0.02) -> Problem:
+    """The first two matches have no weight, the third is wrong."""
+    rng = np.random.default_rng(seed)
+    h = (np.eye(3) + rng.uniform(-0.2, 0.2, (3, 3))).ravel()
+    x0 = rng.uniform(-1, 1, (n, 2))
+    points = np.ascontiguousarray(np.c_[x0, reference.mapped(h, x0)].T) + noise * rng.normal(size=(4, n))
+    points[2:, 2] = rng.uniform(-1, 1, 2)
+    weight, s2 = rng.uniform(0.2, 1, n), (noise * rng.uniform(0.8, 3, n)) ** 2
+    weight[:2] = 0
+    return Problem(h / np.linalg.norm(h), points, weight, s2)
+
+
+def evaluated(h: np.ndarray, matches: Weighted) -> tuple[np.ndarray, float]:
+    products, cost = np.empty((1, 10, 10)), np.empty(1)
+    evaluate_homographies(h[None].copy(), matches, True, products, cost)
+    return products[0], float(cost[0])
+
+
+def behind(each: Problem) -> Problem:
+    """The same with the fourth match on the other side of the horizon, far from its weight on this one."""
+    points = each.points.copy()
+    points[:2, 3] = -2 * each.h[6:8] / (each.h[6:8] @ each.h[6:8]) * each.h[8]
+    return each._replace(points=points)
+
+
+def test_three_forms_of_the_error_equal_its_definition() -> None:
+    for seed in range(20):
+        p = behind(problem(seed))
+        expected = np.array([reference.sampson_squared(p.h, match) for match in p.points.T])
+        assert np.isinf(expected[3])
+        assert np.isfinite(np.delete(expected, 3)).all()
+        error = linearise_homography(torch.from_numpy(p.h[:, None]), torch.from_numpy(p.points))
+        tensors = torch.where(error.front, error.squared, torch.inf)
+        one_by_one = [HOMOGRAPHY.of_match(p.h, *match) for match in p.points.T]
+        # e cancels from terms of about 1, so r is exact to a few dozen roundings; r^2 to 2 r of these.
+        atol = 100 * EPS * np.sqrt(expected.min()) + 1e4 * EPS**2
+        for computed in (tensors.numpy(), np.array(one_by_one)):
+            np.testing.assert_allclose(computed, expected, rtol=1e-11, atol=atol)
+
+
+@pytest.mark.parametrize("loss", KINDS)
+def test_cost_and_gradient(loss: str) -> None:
+    for seed in range(5):
+        p = problem(seed)
+
+        def cost(h: np.ndarray, p: Problem = p) -> complex:
+            return reference.robust_sum(h, p.points, p.weight, p.s2, loss)
+
+        products, computed = evaluated(p.h, p.weighted(loss))
+        # Sums of 30 terms, each exact to 100 roundings over a residual of 1e-3 of coordinates of 1.
+        assert computed == pytest.approx(float(np.real(cost(p.h))), rel=1e-10)
+        slope = reference.gradient(cost, p.h)
+        np.testing.assert_allclose(2 * products[9, :9], slope, atol=1e-10 * np.abs(slope).max())
+        assert abs(products[9, :9] @ p.h) < 1e-10 * np.abs(slope).max()  # the scale of H counts nothing
+
+
+def test_gauss_newton_matrix() -> None:
+    for seed in range(5):
+        p = problem(seed)
+        expected = reference.gauss_newton(p.h, p.points, p.weight)
+        computed, _ = evaluated(p.h, p.unbounded())
+        np.testing.assert_allclose(computed[:9, :9], expected, atol=1e-11 * np.abs(expected).max())
+        np.testing.assert_array_equal(computed, computed.T)
+
+
+@pytest.mark.parametrize("loss", KINDS)
+def test_refinement_ends_where_the_gradient_vanishes(loss: str) -> None:
+    for seed in range(5):
+        p = problem(seed, n=60)
+        rng = np.random.default_rng(seed)
+        start = p.h + 0.005 * rng.normal(size=(2, 9))
+        out, cost = np.empty((2, 9)), np.empty(2)
+        refine_homographies(start, p.weighted(loss), Schedule(100, 1e-4, 0.0), out, cost)
+        for h, before, after in zip(out, start, cost, strict=True):
+            assert np.linalg.norm(h) == pytest.approx(1, abs=4 * EPS)
+            assert after == pytest.approx(reference.robust_sum(h, p.points, p.weight, p.s2, loss).real, rel=1e-10)
+            assert after <= reference.robust_sum(before, p.points, p.weight, p.s2, loss).real
+            products, _ = evaluated(h, p.weighted(loss))
+            # A step is refused once it lowers the cost by less than its rounding, EPS: gradients of sqrt(EPS) stay.
+            size = np.sqrt(np.diagonal(products)[:9] * after)
+            assert (np.abs(products[9, :9]) <= 1e-6 * size).all()
+
+
+@pytest.mark.parametrize("loss", KINDS)
+def test_gradient_in_tensors_and_its_graph(loss: str) -> None:
+    p = behind(problem(3, n=12))
+    h, points, weight, s2 = (
+        torch.from_numpy(a) for a in (p.h[:, None, None], p.points[:, None].copy(), p.weight[None], p.s2[None])
+    )
+    expected, _ = evaluated(p.h, p.weighted(loss))
+    computed = homography_gradient(h, points, weight, LOSSES[loss], s2)
+    np.testing.assert_allclose(computed[:, 0, 0].numpy(), expected[9, :9], atol=1e-11 * np.abs(expected).max())
+    points.requires_grad_()
+    assert torch.autograd.gradcheck(lambda x: homography_gradient(h, x, weight, LOSSES[loss], s2), points)
+
+
+def test_gauss_newton_matrix_in_tensors() -> None:
+    p = problem(4)
+    h, points, weight = (torch.from_numpy(a) for a in (p.h[:, None, None], p.points[:, None].copy(), p.weight[None]))
+    unbounded = torch.full((1, 1), torch.inf, dtype=torch.float64)
+    computed = homography_curvature(h, points, weight, LOSSES["truncated"], unbounded)[0, 0].numpy()
+    expected = reference.gauss_newton(p.h, p.points, p.weight)
+    np.testing.assert_allclose(computed, expected, atol=1e-11 * np.abs(expected).max())
+
+
+ROUNDING32, ROUNDING64 = 2.0**-24, 2.0**-53
+
+
+def solved(points: np.ndarray, sample: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """H (m, 9) and draw (m,) of samples (4, s)."""
+    H, draw = np.full((sample.shape[1], 9), np.nan, np.float32), np.full(sample.shape[1], -1)
+    count = four_point(points, sample, H, draw)
+    assert np.isnan(H[count:]).all()
+    return H[:count], draw[:count]
+
+
+def alone(match: np.ndarray) -> np.ndarray:
+    """The models of one sample, its matches (4, 4) in columns."""
+    return solved(np.ascontiguousarray(match), np.arange(4)[:, None])[0]
+
+
+def quadrilateral(seed: int, kind: str = "seen") -> np.ndarray:
+    """Matches (4, 4) of a plane that is seen, or of nothing."""
+    rng = np.random.default_rng(seed)
+    x0 = rng.uniform(-1, 1, (4, 2))
+    H = np.eye(3) + rng.uniform(-0.3, 0.3, (3, 3))
+    x1 = reference.mapped(H.ravel(), x0) if kind == "seen" else rng.uniform(-1, 1, (4, 2))
+    return np.ascontiguousarray(np.c_[x0, x1].T)
+
+
+@pytest.mark.parametrize("kind", ["seen", "random"])
+def test_samples_equal_the_dlt(kind: str) -> None:
+    count = 300
+    points = np.hstack([quadrilateral(seed, kind) for seed in range(count)])
+    sample = np.arange(4 * count).reshape(count, 4).T.copy()
+    H, draw = solved(points, sample)
+    assert (np.diff(draw) > 0).all()
+    expected = [reference.four_points(points[:, i]) for i in sample.T]
+    assert draw.tolist() == [i for i, (h, _) in enumerate(expected) if h is not None]
+    assert 10 < len(draw) < count or kind == "seen"
+    for h, i in zip(H, draw, strict=True):
+        truth, condition = expected[i]
+        # A rounding to float32, and 64 in float64 (9 entries of 3 products, the equations' own) times the condition.
+        np.testing.assert_allclose(h, truth, atol=ROUNDING32 + 64 * ROUNDING64 * condition)
+
+
+@pytest.mark.parametrize("image", [0, 1])
+@pytest.mark.parametrize("three", list(itertools.combinations(range(4), 3)))
+def test_three_points_on_a_line_give_no_model(three: tuple[int, int, int], image: int) -> None:
+    for seed in range(20):
+        match, share = quadrilateral(seed), np.random.default_rng(seed).uniform(-2, 2)
+        a, b, c = (match[2 * image : 2 * image + 2, k] for k in three)
+        c[:] = a + share * (b - a)  # to rounding
+        assert len(alone(match)) == 0
+
+
+@pytest.mark.parametrize("image", [0, 1])
+@pytest.mark.parametrize("two", list(itertools.combinations(range(4), 2)))
+def test_coincident_points_give_no_model(two: tuple[int, int], image: int) -> None:
+    match = quadrilateral(0)
+    match[2 * image : 2 * image + 2, two[1]] = match[2 * image : 2 * image + 2, two[0]]
+    assert len(alone(match)) == 0
+
+
+def test_a_mirrored_plane_gives_no_model() -> None:
+    for seed in range(20):
+        match = quadrilateral(seed)
+        assert len(alone(match)) == 1
+        match[2] *= -1
+        assert len(alone(match)) == 0
+
+
+@pytest.mark.parametrize("scale", [1e-9, 1e9])
+def test_points_of_any_unit(scale: float) -> None:
+    """Also which samples are degenerate does not depend on it."""
+    for seed in range(20):
+        match = quadrilateral(seed)
+        h, D = reference.four_points(match)[0], np.diag([scale, scale, 1])
+        expected = D @ h.reshape(3, 3) @ np.linalg.inv(D)
+        (H,) = alone(match * scale)
+        np.testing.assert_allclose(H, expected.ravel() / np.linalg.norm(expected), atol=2 * ROUNDING32)
+        match[2:, 3] = (match[2:, 0] + 2 * match[2:, 1]) / 3
+        assert len(alone(match * scale)) == 0

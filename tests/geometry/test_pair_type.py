@@ -6,7 +6,7 @@ import torch
 
 from fmtorch.core import PAIR_TYPES
 from fmtorch.geometry.pair_type import classified, pair_evidence
-from tests.geometry.kinds import SIZE, K, batch, draw
+from tests.geometry.scenes import SIZE, K, batch, draw
 from tests.reference import significance as reference
 from tests.reference.solvers import sampson
 

@@ -7,7 +7,7 @@ import fmtorch
 from fmtorch import presets
 from fmtorch.core import PAIR_TYPES, Correspondences, Estimate, collate
 from fmtorch.two_view.pair_type import classify
-from tests.geometry.kinds import batch, draw
+from tests.geometry.scenes import batch, draw
 
 
 def pair(kind: str, seed: int, n: int = 150, **options: float) -> Correspondences:

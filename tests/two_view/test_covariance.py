@@ -10,7 +10,7 @@ from scipy.stats import chi2
 
 import fmtorch
 from fmtorch.core import Estimate
-from tests.geometry.kinds import batch, draw
+from tests.geometry.scenes import batch, draw
 from tests.reference import known_cameras as reference
 
 CAMERAS: dict[str, Any] = {"K0": torch.from_numpy(reference.K0), "K1": torch.from_numpy(reference.K1)}
