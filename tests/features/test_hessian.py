@@ -1,9 +1,30 @@
+"""Detection by the Hessian, and orientation of frames."""
+
+import math
+
+import kornia
 import numpy as np
 import pytest
 import torch
+import torch.nn.functional as F
+from torch import Tensor
 
-from fmtorch.features import FRAME_SIGMAS, HessianDetector
-from tests.features.scenes import texture
+from fmtorch.features import (
+    FRAME_SIGMAS,
+    HessianDetector,
+    ImagePyramid,
+    NetworkOrientation,
+    NetworkShape,
+    dominant_gradient,
+    frame_scale,
+    make_upright,
+    rotate_frames,
+)
+from fmtorch.features.frames import BINS, _histogram, _window
+from fmtorch.features.hessian import STRIP, OpenCVFilters, TorchFilters, _exceeds_levels, _is_maximum, _samples
+from tests.conftest import oracle, shared_path
+from tests.features.scenes import random_frames, texture
+from tests.reference.local_features import dominant_gradient as reference_orientation
 from tests.reference.local_features import hessian_keypoints
 
 
@@ -92,3 +113,186 @@ def test_small_and_constant_images(shape: tuple[int, int], constant: bool) -> No
     if constant or min(shape) < 16:
         assert len(scores) == 0
     assert HessianDetector().detect_batch(torch.from_numpy(image)[None, None].float() / 255)[0].shape[1] == len(scores)
+
+
+THRESHOLD = 1e-3
+
+
+def response() -> Tensor:
+    """(1, h, w) determinants of a texture, rounded so that neighbours are often equal; more rows than a strip."""
+    image = torch.from_numpy(texture(0, 2 * STRIP + 11, 170))[None].float() / 255
+    out = torch.empty_like(image)
+    OpenCVFilters().hessian_determinant(image, 2.0, out=out)
+    return (out * 1024).round() / 1024
+
+
+def test_maxima_are_those_of_the_plain_comparison() -> None:
+    values = response()
+    largest = F.max_pool2d(values, 3, stride=1, padding=1)
+    expected = torch.nonzero((values >= largest) & (values > THRESHOLD))
+    assert len(expected) > 100
+    for filters in (OpenCVFilters(), TorchFilters()):
+        assert torch.equal(filters.maxima(values, THRESHOLD), expected)
+
+
+def test_the_scale_of_a_determinant_is_a_product_afterwards() -> None:
+    image, scale = torch.from_numpy(texture(1, STRIP + 30, 90))[None].float() / 255, 1.25 * 2 ** (1 / 3)
+    for filters in (OpenCVFilters(), TorchFilters()):
+        plain, scaled = (torch.empty_like(image) for _ in range(2))
+        filters.hessian_determinant(image, 1.0, out=plain)
+        filters.hessian_determinant(image, scale, out=scaled)
+        assert torch.equal(scaled, plain * scale)
+
+
+def test_samples_that_fail_against_two_neighbours_are_no_maxima() -> None:
+    volume = torch.randint(20, (1, 3, 40, 50), generator=torch.Generator().manual_seed(0)).float()  # many are equal
+    y, x = (a.flatten() for a in torch.meshgrid(*(torch.arange(1, n - 1) for n in volume.shape[2:]), indexing="ij"))
+    at = torch.stack([torch.zeros_like(y), torch.ones_like(y), y, x], 1)
+    maximal, possible = _is_maximum(_samples(volume, at)), _exceeds_levels(volume, at)
+    assert 10 < int(maximal.sum()) < int(possible.sum()) < len(at)
+    assert not bool((maximal & ~possible).any())
+
+
+def plain_histogram(patches: Tensor) -> Tensor:
+    n, size = patches.shape[0], patches.shape[-1]
+    padded = F.pad(patches, (1, 1, 1, 1), mode="replicate")[:, 0]
+    rows = padded[:, :-2] + 2 * padded[:, 1:-1] + padded[:, 2:]
+    columns = padded[:, :, :-2] + 2 * padded[:, :, 1:-1] + padded[:, :, 2:]
+    gy, gx = (columns[:, 2:] - columns[:, :-2]) / 8, (rows[:, :, 2:] - rows[:, :, :-2]) / 8
+    magnitude = (gx * gx + gy * gy).sqrt() * _window(size, patches.device)
+    position = (torch.atan2(gy, gx) + math.pi) * (BINS / (2 * math.pi))
+    lower = position.floor()
+    upper_weight = (position - lower) * magnitude
+    place = lower.long() + (BINS + 2) * torch.arange(n)[:, None, None]
+    votes = patches.new_zeros(n * (BINS + 2))
+    votes.scatter_add_(0, place.flatten(), (magnitude - upper_weight).flatten())
+    votes.scatter_add_(0, place.flatten() + 1, upper_weight.flatten())
+    histogram = votes.reshape(n, BINS + 2)
+    histogram[:, :2] += histogram[:, BINS:]
+    return histogram[:, :BINS]
+
+
+def test_histograms_of_directions_are_those_of_the_plain_formulas() -> None:
+    image = texture(2, 200, 200)
+    starts = np.random.default_rng(0).integers(0, 168, (90, 2))
+    patches = torch.from_numpy(np.stack([image[y : y + 32, x : x + 32] for y, x in starts]))[:, None].float() / 255
+    patches = torch.cat([patches, torch.full((1, 1, 32, 32), 0.5), torch.rand(20, 1, 32, 32)])
+    assert torch.equal(_histogram(patches), plain_histogram(patches))
+
+
+def angle_between(a: Tensor, b: Tensor) -> Tensor:
+    return ((a - b + np.pi) % (2 * np.pi) - np.pi).abs()
+
+
+def test_frame_algebra_is_kornias() -> None:
+    lafs = random_frames(0, 50, 100, 100)
+    torch.testing.assert_close(frame_scale(lafs), kornia.feature.get_laf_scale(lafs[None])[0, :, 0, 0])
+    torch.testing.assert_close(make_upright(lafs), kornia.feature.make_upright(lafs[None])[0], rtol=1e-4, atol=1e-4)
+    angle = torch.linspace(-3, 3, 50)
+    turned = kornia.feature.rotate_laf(lafs[None], torch.rad2deg(angle)[None, :, None])[0]
+    torch.testing.assert_close(rotate_frames(lafs, angle), turned, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(make_upright(turned), make_upright(lafs), rtol=1e-4, atol=1e-3)
+
+
+def test_orientation_equals_the_definition() -> None:
+    patches = ImagePyramid(texture(0)).extract(random_frames(0, 25, 160, 200))
+    expected = torch.tensor([reference_orientation(p[0].double().numpy()) for p in patches])
+    assert angle_between(dominant_gradient(patches), expected).max() < 1e-4
+
+
+def test_orientation_turns_with_the_patch() -> None:
+    patches = ImagePyramid(texture(2)).extract(random_frames(2, 100, 160, 200))
+    turned = dominant_gradient(patches.rot90(1, (2, 3)))  # counter-clockwise
+    assert (angle_between(turned, dominant_gradient(patches) + np.pi / 2) < 1e-3).float().mean() > 0.97
+    flat = dominant_gradient(torch.full((2, 1, 32, 32), 0.3))
+    assert torch.isfinite(flat).all()
+
+
+@pytest.mark.parametrize("part", [NetworkShape, NetworkOrientation])
+def test_no_frames(part: type) -> None:
+    def network(patches: Tensor) -> Tensor:
+        raise AssertionError("called without patches")
+
+    assert part(network)(ImagePyramid(texture(0)), torch.zeros(0, 2, 3)).shape == (0, 2, 3)
+    assert dominant_gradient(torch.zeros(0, 1, 32, 32)).shape == (0,)
+
+
+def test_shape_is_composed_as_kornias() -> None:
+    # The same numbers for a frame through both: kornia's network is replaced by one that gives known numbers.
+    lafs = random_frames(5, 64, 160, 200)
+    numbers = torch.empty(64, 3).uniform_(-0.4, 0.4, generator=torch.Generator().manual_seed(0))
+    peer = kornia.feature.LAFAffNetShapeEstimator(False, preserve_orientation=False).eval()
+    peer.features = torch.nn.Sequential(Constant(numbers))
+    image = texture(5)
+    expected = peer(lafs[None], torch.from_numpy(image)[None, None].float() / 255)[0]
+    found = NetworkShape(lambda patches: numbers)(ImagePyramid(image), lafs)
+    torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-3)
+    torch.testing.assert_close(frame_scale(found), frame_scale(lafs), rtol=1e-4, atol=1e-4)
+
+
+class Constant(torch.nn.Module):
+    def __init__(self, value: Tensor) -> None:
+        super().__init__()
+        self.value = value
+
+    def forward(self, patches: Tensor) -> Tensor:
+        return self.value[: len(patches)]
+
+
+def test_impossible_shapes_keep_the_frame() -> None:
+    lafs = random_frames(6, 5, 160, 200)
+    bad = torch.tensor([[0.1, 0, 0], [-1, 0, 0], [torch.nan, 0, 0], [0, 50, 0], [0.8, 0, -0.9]])
+    found = NetworkShape(lambda patches: bad)(ImagePyramid(texture(6)), lafs)
+    torch.testing.assert_close(found[1:], make_upright(lafs)[1:])
+    assert not torch.allclose(found[0], make_upright(lafs)[0])
+
+
+def test_orientation_network_turns_by_its_vector() -> None:
+    lafs = random_frames(7, 3, 160, 200)
+    vectors = torch.tensor([[0.0, 0.3], [0.5, 0.0], [0.1, -0.1]])
+    found = NetworkOrientation(lambda patches: vectors)(ImagePyramid(texture(7)), lafs)
+    expected = rotate_frames(lafs, torch.tensor([0.0, np.pi / 2, 0.75 * np.pi]))
+    torch.testing.assert_close(found, expected, atol=1e-4, rtol=1e-4)
+
+
+def authors(name: str) -> torch.nn.Module:
+    weights = torch.load(shared_path(f"weights/{name}.pth"), weights_only=True, map_location="cpu")["state_dict"]
+    kinds = {"AffNet": kornia.feature.LAFAffNetShapeEstimator, "OriNet": kornia.feature.OriNet}
+    module = kinds[name](False).eval()
+    module.load_state_dict(weights)
+    return module
+
+
+def test_authors_networks_give_the_stored_frames() -> None:
+    file = oracle("affnet_orinet.npz")
+    images = oracle("sift.npz")
+    affnet, orinet = authors("AffNet"), authors("OriNet")
+
+    @torch.no_grad()
+    def shape(patches: Tensor) -> Tensor:
+        return affnet.features(affnet._normalize_input(patches)).flatten(1)
+
+    @torch.no_grad()
+    def orientation(patches: Tensor) -> Tensor:
+        return orinet.features(orinet._normalize_input(patches)).flatten(1)
+
+    gaps = []
+    for number in (0, 1):
+        chosen = file["keypoints"][:, 4] == number
+        image = images[f"{number:03d}.image"]
+        lafs = torch.from_numpy(file["laf_in"][chosen]).float()
+        stored = torch.from_numpy(file["laf_affnet"][chosen]).float()
+        turned = torch.from_numpy(file["laf_oriented"][chosen]).float()
+        # Through kornia's patches, the stored frames. Entries of up to 100 px in float32 through a network.
+        torch.testing.assert_close(NetworkShape(shape)(KorniaPyramid(image), lafs), stored, atol=5e-3, rtol=1e-3)
+        oriented = NetworkOrientation(orientation)(KorniaPyramid(image), stored)
+        torch.testing.assert_close(oriented, turned, atol=5e-3, rtol=1e-3)
+        # Through ours, which are blurred otherwise, nearly so.
+        found = NetworkShape(shape)(ImagePyramid(image), lafs)
+        gaps.append((found - stored)[..., :2].abs().amax((1, 2)) / frame_scale(lafs))
+    assert torch.cat(gaps).median() < 0.05
+
+
+class KorniaPyramid(ImagePyramid):
+    def extract(self, lafs: Tensor, size: int = 32) -> Tensor:
+        return kornia.feature.extract_patches_from_pyramid(self.levels[0][None, None], lafs[None], size)[0]

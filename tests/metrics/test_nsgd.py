@@ -1,4 +1,4 @@
-"""SGD and NSGD: known answers, the scalar reference, the published evaluator, the three laws, gradients."""
+"""NSGD, inlier rates and recall: known answers, references, oracles, gradients."""
 
 import math
 
@@ -11,7 +11,16 @@ from torch import Tensor
 
 from fmtorch.geometry import cross_matrix, unit_frobenius
 from fmtorch.jit.random import Stream, uniform
-from fmtorch.metrics import nsgd, nsgd_released, sgd
+from fmtorch.metrics import (
+    ground_truth_inliers,
+    inlier_rate,
+    mean_recall,
+    nsgd,
+    nsgd_released,
+    recall,
+    recall_curve,
+    sgd,
+)
 from fmtorch.metrics.nsgd import COLUMNS
 from tests.conftest import oracle
 from tests.reference import metrics as reference
@@ -210,3 +219,101 @@ def test_loss_has_finite_gradients_whatever_stands_beside_it() -> None:
     alone = F_est[7].detach().requires_grad_()
     nsgd(F_gt[7], alone, VGA, VGA, samples=100, key=torch.tensor(7), cap=False).backward()
     assert torch.equal(alone.grad, F_est.grad[7])
+
+
+SIZE = torch.tensor([300, 400])  # diagonal 500: the limit is 1.5 px
+
+
+def test_known_answer() -> None:
+    x0 = torch.tensor([[10.0, 20.0]]).repeat(5, 1)
+    x1 = torch.tensor([[90.0, 20.0], [5.0, 21.4], [5.0, 18.6], [5.0, 21.6], [5.0, 80.0]])
+    kept = torch.tensor([True, True, False, True, False])
+    F = rows_shifted(0.0).float()
+    rate = inlier_rate(F, x0, x1, kept, SIZE, SIZE)
+    assert rate.before.item() == pytest.approx(3 / 5)
+    assert rate.after.item() == pytest.approx(2 / 3)
+    assert ground_truth_inliers(F, x0, x1, SIZE, SIZE).tolist() == [True, True, True, False, False]
+    # Each image's own diagonal limits its own distance: with half the size in image 1 the limit there is 0.75 px.
+    assert inlier_rate(F, x0, x1, kept, SIZE, SIZE / 2).before.item() == pytest.approx(1 / 5)
+    assert inlier_rate(F, x0, x1, kept, SIZE, SIZE, threshold=0.0033).before.item() == pytest.approx(4 / 5)
+
+
+def test_empty_sets_give_nan_and_no_pair_takes_its_batch_down() -> None:
+    F_gt, _ = random_pairs(0, 4)
+    F_gt[1], F_gt[2] = 0.0, torch.nan
+    x = torch.rand(4, 6, 2, dtype=torch.float64) * 200
+    inliers = torch.ones(4, 6, dtype=torch.bool)
+    inliers[3] = False
+    rate = inlier_rate(F_gt, x, x, inliers, SIZE, SIZE)
+    assert rate.after[3].isnan()
+    assert rate.before[1:3].tolist() == rate.after[1:3].tolist() == [0, 0]
+    none = inlier_rate(F_gt[0], x[0, :0], x[0, :0], inliers[0, :0], SIZE, SIZE)
+    assert none.before.isnan()
+    assert none.after.isnan()
+
+
+def test_matches_scalar_reference_and_hides_padding() -> None:
+    g = torch.Generator().manual_seed(4)
+    F_gt, _ = random_pairs(3, 5)
+    x0, x1 = (torch.rand(5, 40, 2, generator=g, dtype=torch.float64) * 300 for _ in range(2))
+    mask, inliers = (torch.rand(5, 40, generator=g) < 0.7 for _ in range(2))
+    size0, size1 = torch.tensor([300, 400]), torch.tensor([500, 300])
+    options = {"threshold": 0.05}
+    rate = inlier_rate(F_gt, x0, x1, inliers, size0, size1, mask=mask, **options)
+    for i in range(5):
+        arrays = (v[i].numpy() for v in (F_gt, x0, x1, inliers, mask))
+        expected = reference.inlier_rate(*arrays, size0.numpy(), size1.numpy(), **options)
+        assert (rate.before[i].item(), rate.after[i].item()) == expected
+    garbage = torch.where(mask[..., None], x0, torch.nan)
+    again = inlier_rate(F_gt, garbage, x1, inliers, size0, size1, mask=mask, **options)
+    wider = [torch.cat([v, v[:, :3]], 1) for v in (x0, x1, inliers)]
+    padded_mask = torch.cat([mask, torch.zeros(5, 3, dtype=torch.bool)], 1)
+    padded = inlier_rate(F_gt, *wider, size0, size1, mask=padded_mask, **options)
+    for other in (again, padded):
+        assert torch.equal(other.before, rate.before)
+        assert torch.equal(other.after, rate.after)
+
+
+def test_oracle() -> None:
+    file = oracle("fmbench_inlier_rate.npz")
+    for case in range(len(file["names"])):
+        get = {k[4:]: v for k, v in file.items() if k.startswith(f"{case:03d}.")}
+        F, x0, x1, kept, size0, size1 = (
+            torch.from_numpy(get[k]) for k in ("F_gt", "X1", "X2", "mask_in", "size1", "size2")
+        )
+        assert np.array_equal(ground_truth_inliers(F, x0, x1, size0, size1).numpy(), get["mask_gt"])
+        rate = inlier_rate(F, x0, x1, kept, size0, size1)
+        # Both are one division of the same two integers.
+        np.testing.assert_array_equal(torch.stack(rate).numpy(), get["inlier_rate"])
+
+
+errors = st.lists(st.floats(0, 0.3) | st.just(1.0) | st.just(float("nan")), min_size=1, max_size=30)
+
+
+def test_known_recalls() -> None:
+    nsgd = torch.tensor([0.0, 0.01, 0.05, 0.2, 1.0, torch.nan], dtype=torch.float64)
+    assert recall(nsgd).item() == pytest.approx(2 / 6)  # 0.05 itself is a miss, and so is NaN
+    assert recall(nsgd, 0.06).item() == pytest.approx(3 / 6)
+    assert mean_recall(nsgd).item() == pytest.approx((1 + 0.8) / 6)
+    curve = recall_curve(nsgd)
+    assert curve.shape == (20,)
+    assert curve[[0, 1, 5, 19]].tolist() == pytest.approx([0, 2 / 6, 3 / 6, 3 / 6])
+    assert recall_curve(nsgd, torch.tensor([0.5], dtype=torch.float64)).tolist() == pytest.approx([4 / 6])
+
+
+@given(errors)
+def test_recall_matches_scalar_reference(values: list[float]) -> None:
+    nsgd = torch.tensor(values, dtype=torch.float64)
+    for threshold in (0.01, 0.05, 0.2):
+        assert recall(nsgd, threshold).item() == reference.recall(nsgd.numpy(), threshold)
+        expected = reference.mean_recall(nsgd.numpy(), threshold)
+        assert mean_recall(nsgd, threshold).item() == pytest.approx(expected, abs=1e-12)
+    curve = recall_curve(nsgd).numpy()
+    assert curve.tolist() == [reference.recall(nsgd.numpy(), t) for t in torch.linspace(0, 0.2, 20, dtype=nsgd.dtype)]
+    assert (np.diff(curve) >= 0).all()
+
+
+def test_mean_recall_is_differentiable() -> None:
+    nsgd = torch.tensor([0.0, 0.02, 0.04, 0.3, torch.nan], dtype=torch.float64, requires_grad=True)
+    (gradient,) = torch.autograd.grad(mean_recall(nsgd), nsgd)
+    assert gradient.tolist() == pytest.approx([-4.0, -4.0, -4.0, 0.0, 0.0])  # -1 / (0.05 * 5)

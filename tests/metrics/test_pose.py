@@ -1,16 +1,33 @@
-"""Pose errors: known answers, SuperGlue's evaluation, OpenCV's decomposition, gradients, laws."""
+"""Errors of poses and homographies; metrics of arrays, and as torchmetrics."""
 
+import importlib
+import importlib.util
 import math
+import sys
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from torch import Tensor
 
+from fmtorch import metrics
 from fmtorch.geometry import cross_matrix
-from fmtorch.metrics import closest_pose_error, fundamental_pose_error, pose_error
+from fmtorch.metrics import (
+    closest_pose_error,
+    corner_error,
+    fundamental_pose_error,
+    pose_auc,
+    pose_error,
+    pose_maa,
+    pose_map,
+    right_of_homography,
+)
 from tests.geometry.scenes import scene
+from tests.metrics.test_nsgd import VGA, random_pairs
 from tests.reference import metrics as reference
 from tests.reference import solvers
 
@@ -140,3 +157,199 @@ def test_without_a_matrix_or_a_match_before_the_cameras_the_error_is_the_worst()
     assert error.translation[1:].tolist() == [90, 90]
     assert float(error.worst[0]) < 90
     assert closest.rotation[1].item() == closest.translation[1].item() == 180
+
+
+ERRORS = st.lists(
+    st.floats(0, 40) | st.sampled_from([1.0, 5.0, 10.0, 15.0, 20.0]) | st.just(float("inf")), min_size=1, max_size=20
+)
+
+
+def test_auc_known_answers() -> None:
+    errors = torch.tensor([2.0, 12.0], dtype=torch.float64)
+    # To 5: a triangle of base 2 and height 1/2, then 3 at 1/2. To 20: up to 12 it rises from 1/2 to 1, then 8 at 1.
+    expected = [(0.5 + 1.5) / 5, (0.5 + 4) / 10, (0.5 + 7.5 + 8) / 20]
+    assert pose_auc(errors).tolist() == pytest.approx(expected)
+    assert pose_auc(torch.tensor([torch.nan, torch.inf])).tolist() == [0, 0, 0]
+
+
+@given(ERRORS)
+def test_auc_as_superglue(values: list[float]) -> None:
+    thresholds = (5, 10, 20)
+    auc = pose_auc(torch.tensor(values, dtype=torch.float64), thresholds)
+    assert auc.tolist() == pytest.approx(reference.pose_auc(values, thresholds), abs=1e-12)
+
+
+def test_binned_known_answers() -> None:
+    errors = torch.tensor([0.5, 5.0, 7.0, torch.nan], dtype=torch.float64)
+    # Below 5: one of four; below 10, 15 and 20: three.
+    assert pose_map(errors).tolist() == pytest.approx([1 / 4, (1 + 3) / 8, (1 + 3 + 3 + 3) / 16])
+    # Up to 1, 2, 3, 4: one; up to 5 and 6: two; up to 7, 8, 9, 10: three.
+    assert pose_maa(errors).item() == pytest.approx((4 * 1 + 2 * 2 + 4 * 3) / 40)
+    assert pose_maa(torch.tensor([torch.nan, torch.inf])).item() == 0
+
+
+@given(ERRORS)
+def test_map_as_oanet_and_maa_as_the_ransac_tutorial(values: list[float]) -> None:
+    errors = torch.tensor(values, dtype=torch.float64)
+    assert pose_map(errors).tolist() == pytest.approx(reference.pose_map(values, (5, 10, 20)), abs=1e-12)
+    assert pose_maa(errors).item() == pytest.approx(reference.pose_maa(values), abs=1e-12)
+
+
+@given(ERRORS)
+def test_wider_bins_never_give_less(values: list[float]) -> None:
+    errors = torch.tensor(values, dtype=torch.float64)
+    step = pose_map(errors, (20,), bin=0.01)[0]  # nearly the area under the step curve
+    assert pose_map(errors, (20,))[0] >= step - 1e-12
+    assert abs(step - torch.relu(1 - errors / 20).mean()) <= 0.01 / 20 + 1e-12
+
+
+@pytest.mark.parametrize("thresholds", [(), (0,), (-5.0,), (7,), (5, 12.5)])
+def test_thresholds_that_are_no_multiples_are_refused(thresholds: tuple[float, ...]) -> None:
+    with pytest.raises(ValueError, match="thresholds are"):
+        pose_map(torch.zeros(3), thresholds)
+    with pytest.raises(ValueError, match="maximum is 0"):
+        pose_maa(torch.zeros(3), 0)
+
+
+SIZE = torch.tensor([480, 640])
+
+
+def mapped(H: np.ndarray, point: tuple[float, float]) -> np.ndarray:
+    x, y, w = H @ [*point, 1.0]
+    return np.array([x / w, y / w])
+
+
+def written_out(H: np.ndarray, true: np.ndarray, h: int, w: int) -> float:
+    corners = [(0, 0), (w - 1, 0), (w - 1, h - 1), (0, h - 1)]
+    return float(np.mean([np.linalg.norm(mapped(H, c) - mapped(true, c)) for c in corners]))
+
+
+def homographies(count: int) -> np.ndarray:
+    rng = np.random.default_rng(0)
+    return np.eye(3) + rng.uniform(-1, 1, (count, 3, 3)) * [[0.1, 0.1, 30], [0.1, 0.1, 30], [2e-4, 2e-4, 0]]
+
+
+def test_corner_error_is_the_mean_over_four_corners() -> None:
+    H, true = homographies(20), homographies(40)[20:]
+    errors = corner_error(torch.from_numpy(H), torch.from_numpy(true), SIZE)
+    expected = [written_out(a, b, 480, 640) for a, b in zip(H, true, strict=True)]
+    np.testing.assert_allclose(errors, expected, rtol=1e-9)
+    scaled = corner_error(-7 * torch.from_numpy(H), torch.from_numpy(true), SIZE)
+    torch.testing.assert_close(scaled, errors)
+    alone = torch.stack(
+        [corner_error(torch.from_numpy(a), torch.from_numpy(b), SIZE) for a, b in zip(H, true, strict=True)]
+    )
+    assert torch.equal(alone, errors)
+
+
+def test_corner_error_of_what_has_no_image_is_infinite() -> None:
+    horizon = torch.eye(3, dtype=torch.float64)
+    horizon[2] = torch.tensor([1.0, 0, -639])  # zero at the right corners
+    for H in (horizon, torch.zeros(3, 3), torch.full((3, 3), torch.nan)):
+        assert corner_error(H, torch.eye(3), SIZE) == torch.inf
+    with pytest.raises(ValueError, match="size0"):
+        corner_error(torch.eye(3), torch.eye(3), torch.tensor([0, 640]))
+
+
+def test_corner_error_has_gradients() -> None:
+    H = torch.from_numpy(homographies(3)).requires_grad_()
+    true = torch.from_numpy(homographies(6)[3:])
+    assert torch.autograd.gradcheck(lambda x: corner_error(x, true, SIZE), H)
+    corner_error(H, H.detach(), SIZE).sum().backward()  # at zero
+    assert torch.isfinite(H.grad).all()
+
+
+def test_right_matches_are_near_in_both_images() -> None:
+    true = homographies(1)[0]
+    x0 = np.random.default_rng(1).uniform(0, 400, (50, 2))
+    x1 = np.array([mapped(true, (x, y)) for x, y in x0]) + np.random.default_rng(2).normal(0, 3, (50, 2))
+    back = np.array([mapped(np.linalg.inv(true), (x, y)) for x, y in x1])
+    forth = np.array([mapped(true, (x, y)) for x, y in x0])
+    distance = (np.linalg.norm(back - x0, axis=1) + np.linalg.norm(forth - x1, axis=1)) / 2
+    ends = (torch.from_numpy(x) for x in (x0, x1))
+    right = right_of_homography(torch.from_numpy(true), *ends, mask=torch.arange(50) < 40)
+    np.testing.assert_array_equal(right, (distance < 3) & (np.arange(50) < 40))
+    assert 5 < int(right.sum()) < 40
+
+
+RNG = np.random.default_rng(0)
+F0, F1, R = RNG.normal(size=(3, 4, 3, 3))
+X0, X1 = RNG.uniform(0, 400, (2, 4, 20, 2))
+T = RNG.normal(size=(4, 3))
+SIZES = np.array([[480, 640]] * 4)
+CALLS: dict[str, tuple[Any, ...]] = {
+    "sgd": (F0, F1, SIZES, SIZES), "nsgd": (F0, F1, SIZES, SIZES), "nsgd_released": (F0, F1, SIZES, SIZES),
+    "inlier_rate": (F0, X0, X1, X0[..., 0] > 9, SIZES, SIZES), "ground_truth_inliers": (F0, X0, X1, SIZES, SIZES),
+    "pose_error": (R, T, R[::-1], T[::-1]), "pose_auc": (T[:, 0],), "recall": (T,), "recall_curve": (T, T[0]),
+    "mean_recall": (T,), "pose_map": (T[:, 0],), "pose_maa": (T,),
+    "fundamental_pose_error": (F0, np.eye(3) + 0 * R, np.eye(3) + 0 * R, X0, X1, R, T),
+    "closest_pose_error": (F0, np.eye(3) + 0 * R, np.eye(3) + 0 * R, R, T),
+    "corner_error": (F0, F1, SIZES), "right_of_homography": (F0, X0, X1),
+}  # fmt: skip
+
+
+def test_every_metric_is_called() -> None:
+    functions = {name for name in metrics.__all__ if name.islower()}
+    assert functions == CALLS.keys()
+
+
+@pytest.mark.parametrize("name", CALLS)
+def test_arrays_are_taken_as_tensors(name: str) -> None:
+    function = getattr(metrics, name)
+    expected = function(*(torch.from_numpy(np.ascontiguousarray(value)) for value in CALLS[name]))
+    for arguments in (CALLS[name], [CALLS[name][0], *map(torch.tensor, map(np.ascontiguousarray, CALLS[name][1:]))]):
+        result = function(*arguments)
+        for a, b in zip(result, expected, strict=True):
+            assert isinstance(a, torch.Tensor)
+            assert torch.equal(a, b)
+
+
+def test_a_size_may_be_a_tuple() -> None:
+    tuples = metrics.nsgd(F0, F1, (480, 640), size1=[480, 640], key=np.arange(4))
+    assert torch.equal(tuples, metrics.nsgd(F0, F1, SIZES, SIZES, key=torch.arange(4)))
+
+
+def test_says_which_extra_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "torchmetrics", None)
+    monkeypatch.delitem(sys.modules, "fmtorch.metrics.torchmetrics", raising=False)
+    with pytest.raises(ImportError, match=r"pip install 'fmtorch\[metrics\]'"):
+        importlib.import_module("fmtorch.metrics.torchmetrics")
+
+
+def test_accumulates_over_batches() -> None:
+    classes = importlib.import_module("fmtorch.metrics.torchmetrics")
+    F_gt, F_est = random_pairs(0, 7)
+    sizes, key = VGA.expand(7, 2), torch.arange(7)
+    values = metrics.nsgd(F_gt, F_est, sizes, sizes, key=key, samples=50)
+    values[3] = torch.nan
+    mean, recall, mean_recall = classes.NSGD(samples=50), classes.Recall(threshold=0.1), classes.MeanRecall(maximum=0.1)
+    for part in (slice(0, 4), slice(4, 4), slice(4, 7)):
+        mean.update(F_gt[part], F_est[part], sizes[part], sizes[part], key[part])
+        recall.update(values[part])
+        mean_recall.update(values[part])
+    expected = metrics.nsgd(F_gt, F_est, sizes, sizes, key=key, samples=50).mean()
+    # Two sums in another order.
+    torch.testing.assert_close(mean.compute(), expected, rtol=1e-14, atol=0)
+    torch.testing.assert_close(recall.compute(), metrics.recall(values, 0.1), rtol=1e-14, atol=0)
+    torch.testing.assert_close(mean_recall.compute(), metrics.mean_recall(values, 0.1), rtol=1e-14, atol=0)
+    recall.reset()
+    with pytest.warns(UserWarning, match="before the ``update`` method"):
+        assert recall.compute().isnan()
+
+
+def test_pose_errors_accumulate_over_batches() -> None:
+    classes = importlib.import_module("fmtorch.metrics.torchmetrics")
+    errors = torch.tensor([0.5, 3.0, torch.nan, 7.0, 12.0, 18.0, 40.0], dtype=torch.float64)
+    parts = (errors[:4], errors[4:4], errors[4:])
+    for metric, expected in (
+        (classes.PoseAUC(), metrics.pose_auc(errors)),
+        (classes.PoseAUC(thresholds=(7.5, 3)), metrics.pose_auc(errors, (7.5, 3))),
+        (classes.PoseMAA(), metrics.pose_maa(errors)),
+        (classes.PoseMAP(threshold=20), metrics.pose_map(errors, (20,))[0]),
+    ):
+        for part in parts:
+            metric.update(part)
+        torch.testing.assert_close(metric.compute(), expected, rtol=1e-14, atol=0)
+        metric.reset()
+        with pytest.warns(UserWarning, match="before the ``update`` method"):
+            assert metric.compute().isnan().all()

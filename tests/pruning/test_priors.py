@@ -11,9 +11,8 @@ import fmtorch
 from fmtorch import Correspondences, presets
 from fmtorch.pruning import GMS, LPM, Calibration, calibration, gms_support, lpm_cost
 from tests.laws import scene
-from tests.pruning.test_gms import SIZE0, SIZE1
+from tests.pruning.test_gms import SIZE0, SIZE1, moving
 from tests.pruning.test_gms import moving as moving_on_grids
-from tests.pruning.test_lpm import moving
 from tests.reference.gms import SCALES, normalised, run, support
 from tests.reference.lpm import passes
 from tests.variants import built

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from fmtorch.data.construction import Keypoints
-from fmtorch.scenes import FAMILIES, PICTURES, PLANS, Plan, RenderedPairs, Task, build
+from fmtorch.scenes import FAMILIES, PICTURES, PLANS, Plan, RenderedPairs, StereoPair, Task, build, skimage_file
 from fmtorch.scenes import dataset as generation
 from fmtorch.scenes.dataset import generate, read, recorded_pairs, seeds
 from fmtorch.scenes.light import DrawnScene
@@ -226,3 +226,30 @@ def test_recorded_pairs_are_those_of_the_rule(tmp_path: Path, monkeypatch: pytes
     assert sorted(path.name for path in recorded.iterdir()) == names
     for name in names:
         assert (recorded / name).read_bytes() == (judged / name).read_bytes()
+
+
+def test_one_pair_with_the_protocol() -> None:
+    data = StereoPair()
+    assert (data.name, len(data)) == ("stereo", 1)
+    assert len(data.digest) == 64
+    assert [pair.identity for pair in data] == [data[0].identity] == ["stereo/motorcycle/left-right"]
+    with pytest.raises(IndexError):
+        data[1]
+
+
+def test_matches_lie_on_the_epipolar_lines() -> None:
+    data = StereoPair()
+    left, right = data.matches()
+    assert len(left) > 200_000
+    F = data[0].F
+    algebraic = np.einsum("ni,ij,nj->n", np.column_stack([right, np.ones(len(right))]), F,
+                          np.column_stack([left, np.ones(len(left))]))  # fmt: skip
+    # F is a rotation generator over sqrt 2: the distance to the lines is sqrt 2 times the algebraic error.
+    assert np.sqrt(2) * np.abs(algebraic).max() < 1e-9
+
+
+def test_an_absent_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"motorcycle_left\.png"):
+        StereoPair(root=tmp_path)
+    with pytest.raises(FileNotFoundError, match="nothing is downloaded"):
+        skimage_file("kidney.tif")

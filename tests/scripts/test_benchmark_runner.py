@@ -1,16 +1,24 @@
-"""What benchmarks share: rows that are kept and resumed, what they depend on, methods in one word, memory."""
+"""Benchmarks: rows that are kept and resumed, tables, pages of settings."""
 
+import csv
 import dataclasses
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from fmtorch import presets
+from fmtorch.evaluation.statistics import bootstrap_mean, share_difference
 from fmtorch.geometry import eight_point
 from fmtorch.presets import build as preset
-from scripts.benchmark import methods, runner
+from scripts.benchmark import estimators, methods, runner
+from scripts.benchmark.methods import options, pipeline_of, read_specs, split, stages_of
+from scripts.benchmark.pipelines import BENCHMARKS, RULE, differences_sheet, figures_sheet, settings_of
 from scripts.benchmark.runner import Item, Kept, Measured, Row, measure
+from scripts.benchmark.tables import FIGURES, MEDIANS, Results, Sheet, Span, published, show
+from tests.helpers import draw_set
 from tests.laws import scene
-from tests.scripts.samples import item, pair, read
+from tests.scripts.samples import item, pair, read, row, run
 
 
 @dataclasses.dataclass
@@ -102,3 +110,134 @@ def test_truth_is_the_fit_that_starts_from_the_true_matrix() -> None:
         near, far = (row["nsgd"] for row in measure([methods.method(spec)], both, 1, Kept(None)))
         assert 1e-6 < near < 0.01, spec  # the matches' noise moves it
         assert far > 0.05, spec  # and does not bring it home from elsewhere
+
+
+FOLDER = Path(estimators.__file__).parent
+
+
+def results(scenes: int = 12, families: tuple[str, ...] = ("orbit",), seeds: int = 2, pairs: int = 48) -> Results:
+    """Two methods with other errors and times."""
+    rng = np.random.default_rng(0)
+    return Results(
+        row(method, f"{family}/s{i % scenes}/{i}", rng.uniform(0, 0.08), seed, ms=ms)
+        for method, ms in (("ours", 1.0), ("theirs", 2.0)) for family in families
+        for i in range(pairs) for seed in range(seeds)
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(("scenes", "over"), [(3, "pairs"), (12, "scenes")])
+def test_intervals_are_those_of_every_other_table(scenes: int, over: str) -> None:
+    own = results(scenes)
+    a, b = (own.get(method, own.pairs())("nsgd") for method in ("ours", "theirs"))
+    areas = [100 * np.clip(1 - nsgd / 0.05, 0, 1).mean(0) for nsgd in (a, b)]
+    expected = bootstrap_mean(areas[0] - areas[1], own.scenes(own.pairs()))
+    found = own.difference("ours", "theirs", own.pairs(), "AUC@0.05")
+    assert found == Span(*(f"{value:+.1f}" for value in (expected.value, expected.low, expected.high)))
+    shares = share_difference((a < 0.01).mean(0), (b < 0.01).mean(0), own.scenes(own.pairs()))
+    fine = own.difference("ours", "theirs", own.pairs(), "R.01")
+    assert fine == Span(*(f"{100 * value:+.1f}" for value in (shares.value, shares.low, shares.high)))
+    assert own.cell("theirs", own.pairs(), "AUC@0.05") == f"{areas[1].mean():.1f}"
+    assert own.described(own.pairs()) == f"48 pairs of {scenes} scenes, intervals over {over}"
+    assert own.difference("ours", "ours", own.pairs(), "R.01") == ""
+    assert own.difference("ours", "theirs", own.pairs()[:3], "AUC@0.05") == ""  # too few
+    assert own.time_ratio("theirs", "ours", own.pairs()) == "2.00"
+
+
+def test_a_table_is_markdown_here_and_one_value_a_cell_in_its_file(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sheet = Sheet("poses", "Poses", [{"set": "a", "lead": Span("+1.0", "-2.0", "+3.0")}, {"set": "b", "ms": "4"}])
+    show([sheet], tmp_path / "own.csv")
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "Poses"
+    assert lines[4] == "| a   | +1.0 [-2.0, +3.0] |     |"
+    with (tmp_path / "own.csv").open() as file:
+        first, second = csv.DictReader(file)
+    assert first == {"set": "a", "lead": "+1.0", "lead low": "-2.0", "lead high": "+3.0", "ms": ""}
+    assert second == {"set": "b", "lead": "", "lead low": "", "lead high": "", "ms": "4"}
+    show([Sheet("", "All", sheet.records), sheet, Sheet("none", "None", [])], tmp_path / "all.csv")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["all.csv", "all_poses.csv", "own.csv"]
+
+
+def test_the_files_of_estimators_name_estimators_there_are() -> None:
+    specs = [spec for curve in estimators.read_curves(read_specs(FOLDER / "curves.txt")) for spec in curve.specs]
+    for name in ("estimators.txt", "ablation.txt", "stress.txt"):
+        specs += [spec.strip("()") for spec in read_specs(FOLDER / name)]
+    assert len(specs) > 80
+    for spec in specs:
+        front = spec.partition("@")[0]
+        known = presets.load("estimator", split(front)[0]) if not front.startswith("truth") else {}
+        assert {key.split(".")[0] for key in options(front.partition(":")[2])} <= {*known, "focal"}, spec
+        assert set(stages_of(spec)) <= {*presets.available("pruner"), "ngransac", "sizeless", "ratioless"}, spec
+    with pytest.raises(SystemExit, match=r"'other \| ransac \| 10' is not CURVE"):
+        estimators.read_curves(["other | ransac | 10"])
+
+
+@pytest.mark.parametrize("name", [*BENCHMARKS, "related"])
+def test_settings_name_pipelines_columns_and_figures_there_are(name: str) -> None:
+    settings = settings_of(name)
+    assert {*settings.get("columns", ()), *settings.get("compared", ())} <= {*FIGURES, *MEDIANS, "failed"}
+    others = {word for two in settings.get("differences", ()) for word in two} - set(settings["methods"])
+    assert {word.split()[0] for word in others} <= set(presets.available("pipeline"))
+    if "published" in settings:
+        assert published(Path("scripts/benchmark") / settings["published"])
+    for words in list(settings["methods"].values())[::4]:  # composing takes a while
+        assert pipeline_of(words.partition(" + ")[0], "cache=off").pruners
+
+
+def test_an_interrupted_run_goes_on_and_its_tables_are_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rows, table = tmp_path / "rows.jsonl", tmp_path / "own.csv"
+    mine = "mine = sift_ratio pruner=[ratio] + lpm"
+    arguments = ["--root", draw_set(tmp_path / "Set", images=3), "--seeds", 2, "--cache", "off", "--rows", rows,
+                 "--pipelines", "RATIO", "GMS*", mine, "--overrides", "features.max_features=300"]  # fmt: skip
+    run(capsys, monkeypatch, "pruning", *arguments)
+    first = read(rows)
+    assert [len([r for r in first if r["method"] == m]) for m in ("RATIO", "GMS", "GMS, scale", "mine")] == [4] * 4
+    assert all(r["ok"] and r["features0"] > 50 for r in first if r["method"] == "RATIO")
+    assert all((r["ms_pruning"] == 0) == (r["method"] == "RATIO") for r in first)
+    rows.write_text("\n".join(rows.read_text().splitlines()[:5]) + '\n{"cut')
+    run(capsys, monkeypatch, "pruning", *arguments)
+    again = {(r["method"], r["pair"], r["seed"]): r["nsgd"] for r in read(rows)}
+    assert again == {(r["method"], r["pair"], r["seed"]): r["nsgd"] for r in first}
+    printed = run(capsys, monkeypatch, "pruning", "--rows", rows, "--table", table)
+    assert "R.05 minus RATIO" in printed
+    assert len(table.read_text().splitlines()) == 5
+    with pytest.raises(SystemExit, match="nothing to show: name sets with --root"):
+        run(capsys, monkeypatch, "pruning", "--rows", tmp_path / "none.jsonl")
+
+
+def counted(method: str, pair: str, nsgd: float, **others: object) -> Row:
+    counts = {"inlier_rate": 0.75, "inlier_rate_before": 0.5, "corrs": 30, "corrs_before": 40}
+    return row(method, pair, nsgd, **counts, features0=100, features1=300, **others)
+
+
+def test_figures_stand_beside_the_papers() -> None:
+    settings = settings_of("paper")
+    rows = [counted("RANSAC", f"{family}/s{i % 6}/{i}", 0.2) for family in ("TUM", "orbit") for i in range(12)]
+    rows += [counted("LMedS", f"TUM/s{i % 6}/{i}", 0.01 if i % 4 else 0.2) for i in range(12)]
+    results = Results(rows)
+    lines = {(line["set"], line["pipeline"]): line for line in figures_sheet(results, settings, set()).records}
+    lmeds = lines["TUM", "LMedS"]
+    assert lmeds["%Recall"].value == "75.0"
+    assert (lmeds["paper: %Recall"], lmeds["paper's set"], lmeds["keypoints"].value) == ("69.2", "TUM", "200")
+    assert (lmeds["kept, %"].value, lines["orbit", "RANSAC"]["paper's set"]) == ("75", "T&T")
+    (line,) = (each for each in differences_sheet(results, settings).records if each["set"] == "TUM")
+    assert (line["pipeline"], line["minus"], line["%Recall"].value) == ("LMedS", "RANSAC", "+75.0")
+    assert line["paper: %Recall"] == "+11.8"  # 69.2 - 57.4
+
+
+def test_recall_is_given_apart_for_pairs_that_the_rule_leaves_out(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    solved = {"sift_ratio": (0.01, 0.3), "sift_fmtorch": (0.01, 0.01)}  # pairs that it selects, and others
+    results = Results(counted(m, f"orbit/s/{i}", solved[m][i % 2]) for m in solved for i in range(4))
+    ratio, own = figures_sheet(results, settings_of("hard"), {"orbit/s/0", "orbit/s/2"}).records
+    assert [ratio[f"%Recall, {part}"] for part in ("selected", "left out")] == ["100.0", "0.0"]
+    assert [own[f"%Recall, {part}"] for part in ("selected", "left out")] == ["100.0", "100.0"]
+    rows = tmp_path / "rows.jsonl"
+    root = draw_set(tmp_path / "Set", images=2)
+    run(capsys, monkeypatch, "hard", "--root", root, "--pipelines", "sift_ratio", "--seeds", 1,
+        "--cache", "off", "--rows", rows)  # fmt: skip
+    assert [(r["method"], r.get("selected")) for r in read(rows)] == [(RULE, True), ("sift_ratio", None)]
