@@ -142,9 +142,7 @@ COUNT = "it must be a whole number of at least 1"
         ("train pruner=lc augmentation.crop=often", "augmentation.crop=often; it must be a number"),
     ],
 )
-def test_a_mistake_is_told_in_one_line_and_nothing_written(
-    words: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_mistake_is_told_in_one_line_and_nothing_written(words, message, tmp_path, monkeypatch, capfd):
     if words.startswith("train"):
         pytest.importorskip("lightning", reason="training needs the extra `train`")
     line = ended(monkeypatch, tmp_path, *words.split())
@@ -161,9 +159,7 @@ NAMES = [("my photo (1).png", "b=2,[x].png"), ("it's {a}.png", "c#d%.png"), ("nu
 
 @pytest.mark.parametrize("names", NAMES)
 @pytest.mark.parametrize("form", ["image0={} image1={}", "{} {}"])
-def test_any_file_name_is_a_photograph(
-    names: tuple[str, str], form: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_any_file_name_is_a_photograph(names, form, tmp_path, monkeypatch):
     """Both are read: the command ends at the second, which is no image, and names it."""
     draw(tmp_path / "a.png", seed=0, shift=0)
     (tmp_path / "a.png").rename(tmp_path / names[0])
@@ -206,9 +202,7 @@ def test_an_interrupted_command_says_what_is_kept(capsys: pytest.CaptureFixture[
     assert capsys.readouterr().err == "interrupted; the same command continues; 3 of 8 pairs are kept in runs/a\n"
 
 
-def test_without_a_terminal_progress_is_a_line_now_and_then(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_without_a_terminal_progress_is_a_line_now_and_then(monkeypatch, capsys):
     monkeypatch.setattr(terminal, "LINE_SECONDS", 0.0)
     with terminal.progress_bars() as progress:
         bar = progress.add_task("sift_gms", total=1200)
@@ -228,9 +222,7 @@ def data_set(tmp_path: Path) -> Path:
     return draw_set(tmp_path / "Set", images=2).parent
 
 
-def test_a_sweep_runs_all_jobs_and_tells_the_first_mistake(
-    data_set: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_sweep_runs_all_jobs_and_tells_the_first_mistake(data_set, monkeypatch, capfd):
     words = ["-m", *SMALL, "limit=0,1", "output=out"]
     assert ended(monkeypatch, data_set, "eval", *words) == f"error: limit=0; {COUNT} or null"
     assert (data_set / "out" / "summary.md").is_file()
@@ -243,9 +235,7 @@ def test_a_sweep_runs_all_jobs_and_tells_the_first_mistake(
 
 
 @pytest.mark.parametrize("launcher", ["joblib", "submitit_local"])
-def test_a_sweep_runs_in_processes_of_a_launcher(
-    launcher: str, data_set: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_sweep_runs_in_processes_of_a_launcher(launcher, data_set, monkeypatch, capfd):
     """Two jobs in processes of their own; one is a user's mistake, which this one tells."""
     plugin = {"joblib": "hydra_joblib_launcher", "submitit_local": "hydra_submitit_launcher"}[launcher]
     pytest.importorskip(f"hydra_plugins.{plugin}", reason=f"needs {plugin}")
@@ -275,9 +265,7 @@ def test_help_is_ours_and_fits_a_page(command: str, capsys: pytest.CaptureFixtur
     assert capsys.readouterr().out.strip() == fmtorch.__version__
 
 
-def test_warm_up_compiles_what_is_registered(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_warm_up_compiles_what_is_registered(tmp_path, monkeypatch, capsys):
     compiled: list[str] = []
     compile_together = "fmtorch.commands.warm_up.compile_together"
     monkeypatch.setattr(compile_together, lambda kernels: compiled.extend(kernel.__module__ for kernel in kernels))
@@ -290,9 +278,7 @@ def test_warm_up_compiles_what_is_registered(
         fmtorch.__main__.main(["warm-up"])
 
 
-def test_list_names_every_preset_with_what_it_is(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_list_names_every_preset_with_what_it_is(monkeypatch, capsys):
     fmtorch.__main__.main(["list", "estimator", "pruner"])
     lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("  ")]
     names = [line.split()[0] for line in lines if not line.endswith("as in FM-Bench's paper:")]

@@ -142,9 +142,7 @@ def test_a_users_own_pruner_by_config_dir(header: str, data: list[str], command:
         ("estimator.score=psac", "score is 'psac'"),
     ],
 )
-def test_what_cannot_be_run_is_told(
-    words: str, message: str, data: list[str], command: RunCommand, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_cannot_be_run_is_told(words, message, data, command, tmp_path, monkeypatch):
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     own(tmp_path, "pruner", "threshold: 0.5\n", "empty")
     own(tmp_path, "pruner", "# @package _global_\npruner: {_target_: fmtorch.pruning.OneToOne}\n", "elsewhere")

@@ -163,9 +163,7 @@ LMEDS = ("estimator=lmeds_eight_point",)
         ((np.zeros((4, 4), np.uint8),) * 2, {"longest_side": 0}, ValueError, "longest_side is 0"),
     ],
 )
-def test_errors(
-    arguments: tuple[object, ...], options: dict[str, object], error: type[Exception], message: str
-) -> None:
+def test_errors(arguments, options, error, message):
     with pytest.raises(error, match=message):
         fmtorch.match(*arguments, **options)  # type: ignore[arg-type]
 
@@ -291,9 +289,7 @@ def error(result: fmtorch.MatchResult, pair: ImagePair) -> float:
     return float(pose_error(result.R.double(), result.t.double(), R, t, up_to_sign=False).worst)
 
 
-def test_the_pose_of_reduced_photographs_by_what_is_known(
-    pair: ImagePair, pipeline_with_cameras: fmtorch.Pipeline
-) -> None:
+def test_the_pose_of_reduced_photographs_by_what_is_known(pair, pipeline_with_cameras):
     focal = math.sqrt(pair.K0[0, 0] * pair.K0[1, 1])
     plain = matched(pair, pipeline_with_cameras)
     assert plain.R is plain.t is plain.focals is None
@@ -437,6 +433,5 @@ def test_the_command_with_cameras(pair: ImagePair, command: Callable[..., str], 
     assert "translation (" in said
     report = json.loads((tmp_path / "out" / "result.json").read_text())
     assert report["focals"] == pytest.approx([math.sqrt(fx * fy)] * 2)
-    assert np.shape(report["R"]) == (3, 3)
-    assert np.linalg.norm(report["t"]) == pytest.approx(1)
+    assert (np.shape(report["R"]), np.linalg.norm(report["t"])) == ((3, 3), pytest.approx(1))
     assert "K=1,2,3; it must be fx,fy,cx,cy" in command("match", "images=.", "K=1,2,3", cwd=tmp_path)

@@ -35,8 +35,7 @@ def test_a_failed_write_names_the_file_and_leaves_what_was_there(error: OSError,
     with pytest.raises(OSError, match=error.strerror) as caught:
         write()
     assert caught.value.errno == error.errno
-    assert message(caught.value) == f"{path}: {error.strerror}"
-    assert path.read_text() == "before"
+    assert (message(caught.value), path.read_text()) == (f"{path}: {error.strerror}", "before")
     assert list(tmp_path.iterdir()) == [path]
 
 
@@ -79,8 +78,7 @@ def _installation(root: Path, monkeypatch: pytest.MonkeyPatch, *folders: str) ->
 
 def test_an_installed_wheel_uses_its_own_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     package = _installation(tmp_path, monkeypatch, "fmtorch/conf", "fmtorch/models", "conf", "models")
-    assert files.conf_dir() == package / "conf"
-    assert files.models_dir() == package / "models"
+    assert (files.conf_dir(), files.models_dir()) == (package / "conf", package / "models")
 
 
 def test_an_incomplete_installation_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -19,8 +19,7 @@ def test_real_images_have_the_f_and_the_pixels_of_the_fmbench_file() -> None:
     """The FM-Bench copy was undistorted from the same originals; it is JPEG, hence grey levels differ by its loss."""
     native = {p.identity.rpartition("/")[2]: p for p in load("colmap", root=_real(), pairs=None)}
     copy = load("fmbench", root=shared_path("data/PhotoTourism"))
-    assert len(native) == 45
-    assert len(copy) == 34
+    assert (len(native), len(copy)) == (45, 34)
     for pair in copy:
         assert apart(native[pair.identity.rpartition("/")[2]].F, pair.F) < 1e-6
     source, theirs = native["6-8"].image1, read_image(copy[29].image1).astype(int)

@@ -75,9 +75,7 @@ def run(folder: Path, monkeypatch: pytest.MonkeyPatch, *words: str) -> None:
     call_command(monkeypatch, folder, "pairs", "dataset=cameras", "dataset.root=Set", "output=Made", *words)
 
 
-def test_the_command_makes_a_set_of_the_pairs_that_can_be_matched(
-    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_makes_a_set_of_the_pairs_that_can_be_matched(scenes, tmp_path, monkeypatch, capsys):
     run(tmp_path, monkeypatch, "count=null")
     output = " ".join(capsys.readouterr().out.split())
     assert "4 pairs of 6 images; 20 of 20 candidates were judged" in output
@@ -99,9 +97,7 @@ def test_the_command_makes_a_set_of_the_pairs_that_can_be_matched(
     }  # fmt: skip
 
 
-def test_a_finished_set_is_not_made_again_and_another_is_refused(
-    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_finished_set_is_not_made_again_and_another_is_refused(scenes, tmp_path, monkeypatch, capsys):
     (tmp_path / "Made").mkdir()
     (tmp_path / "Made/notes.txt").write_text("mine")
     with pytest.raises(SystemExit, match=r"error: Made is not empty and has no pairs\.json, .*; name another folder"):
@@ -133,9 +129,7 @@ def test_a_finished_set_is_not_made_again_and_another_is_refused(
         (["dataset.root=empty"], "no folder with Camera.txt, one line an image: K"),
     ],
 )
-def test_a_mistake_is_told_in_one_line_and_nothing_written(
-    words: list[str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_mistake_is_told_in_one_line_and_nothing_written(words, message, tmp_path, monkeypatch):
     (tmp_path / "empty").mkdir()
     with pytest.raises(SystemExit, match=r"^error: ") as end:
         run(tmp_path, monkeypatch, *words)
@@ -144,9 +138,7 @@ def test_a_mistake_is_told_in_one_line_and_nothing_written(
     assert [path.name for path in tmp_path.iterdir()] == ["empty"]
 
 
-def test_a_draw_is_the_same_however_it_is_interrupted(
-    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_draw_is_the_same_however_it_is_interrupted(scenes, tmp_path, monkeypatch):
     """Blocks of one candidate each; the first try ends after nine of them, whose verdicts are not asked for again."""
     monkeypatch.setattr("fmtorch.data.construction.BLOCK", 1)
     dataset = load("cameras", root=scenes)
@@ -280,9 +272,7 @@ def test_the_command_selects_by_overlap(tmp_path: Path, monkeypatch: pytest.Monk
         (["overlap=[0.1,0.4]"], "overlap needs depth or the points of a reconstruction and dataset=kitti has neither"),
     ],
 )
-def test_what_is_no_overlap_is_refused_and_nothing_written(
-    words: list[str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_no_overlap_is_refused_and_nothing_written(words, message, tmp_path, monkeypatch):
     write_kitti(tmp_path / "kitti")
     with pytest.raises(SystemExit, match=r"^error: ") as end:
         run_overlap(tmp_path, monkeypatch, "dataset=kitti", "dataset.root=kitti", "dataset.sequences=['06']", *words)

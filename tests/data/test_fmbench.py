@@ -37,8 +37,7 @@ def small_set(folder: Path) -> Path:
 def test_a_pair(tmp_path: Path) -> None:
     pair = FMBenchPairs(small_set(tmp_path / "Set"))[0]
     assert (pair.identity, pair.family, pair.scene, pair.problem) == ("Set/a/0-1", "Set", "a", None)
-    assert pair.image0.identity == "Set/a/00000000"
-    assert pair.image1.path.name == "00000001.png"
+    assert (pair.image0.identity, pair.image1.path.name) == ("Set/a/00000000", "00000001.png")
     np.testing.assert_allclose(pair.F, np.array([[0, 0, 0], [0, 0, -1], [0, 1, 0]]) / np.sqrt(2), rtol=1e-15)
     assert pair.K0 is None
 
@@ -142,10 +141,8 @@ def test_real_sets() -> None:
 def test_pairs_go_through_a_data_loader(tmp_path: Path) -> None:
     dataset = FMBenchPairs(small_set(tmp_path / "S"))
     (batch,) = DataLoader(dataset, batch_size=2, collate_fn=collate)  # type: ignore[arg-type]
-    assert batch.F.shape == (2, 3, 3)
-    assert batch.key.tolist() == [p.key for p in dataset]
-    assert batch.pairs == tuple(dataset)
-    assert collate([]).F.shape == (0, 3, 3)
+    assert (batch.F.shape, batch.key.tolist()) == ((2, 3, 3), [p.key for p in dataset])
+    assert (batch.pairs, collate([]).F.shape) == (tuple(dataset), (0, 3, 3))
 
 
 def test_pairs_are_image_1_with_the_others(tmp_path: Path) -> None:
@@ -154,8 +151,7 @@ def test_pairs_are_image_1_with_the_others(tmp_path: Path) -> None:
     assert [(pair.family, pair.scene) for pair in dataset][4:6] == [
         ("illumination", "i_light"), ("viewpoint", "v_view"),
     ]  # fmt: skip
-    assert len(dataset) == 10
-    assert dataset.model == "homography"
+    assert (len(dataset), dataset.model) == (10, "homography")
     for k, pair in enumerate(list(dataset)[5:], start=2):
         H = planes.view(k) / np.linalg.norm(planes.view(k))
         np.testing.assert_allclose(pair.H, H, atol=1e-8)

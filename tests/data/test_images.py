@@ -166,8 +166,7 @@ def test_orientation_tags_turn_on_demand_alone(tmp_path: Path, suffix: str, tag:
         read = read_image(path, orient=orient)
         assert read.shape == right.shape
         assert np.abs(read.astype(int) - right).mean() < 8  # coding with losses; a turned image is beyond 60
-    assert stored_size(path) == BLOCKS.shape[:2]
-    assert stored_orientation(path) == tag
+    assert (stored_size(path), stored_orientation(path)) == (BLOCKS.shape[:2], tag)
 
 
 @pytest.mark.parametrize(
@@ -260,9 +259,7 @@ def test_rounding_counts(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("unit", "mm"), [(2, 25.4), (3, 10.0), (None, 25.4)])
-def test_the_sensor_gives_the_focal_length_where_there_is_no_equivalent(
-    unit: int | None, mm: float, tmp_path: Path
-) -> None:
+def test_the_sensor_gives_the_focal_length_where_there_is_no_equivalent(unit, mm, tmp_path):
     tags = {"FocalLength": IFDRational(35), "FocalPlaneXResolution": IFDRational(round(100 * mm), 1)}
     tags |= {"FocalLengthIn35mmFilm": 0, **({} if unit is None else {"FocalPlaneResolutionUnit": unit})}
     exif = exif_focal(with_exif(tmp_path, (2000, 3000), **tags))  # 100 px/mm: a sensor of 30 mm

@@ -57,8 +57,7 @@ def test_a_draw_is_of_the_seed_and_part_of_the_digest(tmp_path: Path) -> None:
     names = [[p.identity for p in d] for d in (first, again, other)]
     assert names[0] == names[1] != names[2]
     assert first.digest == again.digest != other.digest
-    assert len(set(names[0])) == 30
-    assert {p.scene for p in first} == {"06", "07"}
+    assert (len(set(names[0])), {p.scene for p in first}) == (30, {"06", "07"})
 
 
 def rewrite(name: str, change: Callable[[list[str]], list[str]]) -> Callable[[Path], None]:
@@ -170,8 +169,7 @@ def test_robust_inliers_of_real_frames_lie_on_the_lines_as_in_the_fmbench_copy()
     """
     root = shared_path("data/native/tum_rgbd")
     dataset = load("tum", root=root, sequences=["rgbd_dataset_freiburg1_rpy"], pairs=None, window=0.5)
-    assert len(dataset.scenes[0].views) == 10
-    assert len(dataset) == 31
+    assert (len(dataset.scenes[0].views), len(dataset)) == (10, 31)
     sift, features = cv2.SIFT.create(nfeatures=5000), {}
     for view in dataset.scenes[0].views:
         features[view.image.identity] = sift.detectAndCompute(to_grey(read_image(view.image)), None)

@@ -61,8 +61,7 @@ def test_f_relates_the_images_as_they_are_read(turns: tuple[int, int], tmp_path:
     shapes = [cv2.imread(str(lists.images() / lists.name(i))).shape[:2] for i in (0, 1)]
     for image, shape, turn in zip((pair.image0, pair.image1), shapes, turns, strict=True):
         pixels = read_image(image)
-        assert max(pixels.shape[:2]) == 400
-        assert image.size == shape
+        assert (max(pixels.shape[:2]), image.size) == (400, shape)
         assert (pixels.shape[0] > pixels.shape[1]) == ((shape[0] > shape[1]) ^ (turn % 2 == 1))
     A0, A1 = (
         image.resampling.matrix(shape)
@@ -103,8 +102,7 @@ def test_scannet_by_numbers(tmp_path: Path, with_motion: bool) -> None:
     np.testing.assert_allclose(pair.R, T[:3, :3], atol=1e-6)
     np.testing.assert_allclose(pair.t, T[:3, 3], atol=1e-6)
     assert read_image(pair.image0).shape[:2] == (480, 640)  # to which K belongs
-    assert pair.K0[0, 0] == 577
-    assert pair.scene == "test"
+    assert (pair.K0[0, 0], pair.scene) == (577, "test")
     (larger,) = load("pair_list", root=root, file=file, resize=[1280, 960])
     assert larger.K0[0, 0] == pytest.approx(2 * 577)
 
@@ -112,10 +110,8 @@ def test_scannet_by_numbers(tmp_path: Path, with_motion: bool) -> None:
 def test_scannet_by_the_scenes_own_calibration(tmp_path: Path) -> None:
     root, file = scannet(tmp_path, True, with_intrinsics=False)
     (stored,), (small,) = (load("pair_list", root=root, file=file, resize=size) for size in (None, [648, 484]))
-    assert read_image(stored.image0).shape[:2] == (968, 1296)
-    assert stored.K0[0, 0] == 1170
-    assert small.K0[0, 0] == pytest.approx(585)
-    assert small.K0[0, 2] == pytest.approx(323.5)
+    assert (read_image(stored.image0).shape[:2], stored.K0[0, 0]) == ((968, 1296), 1170)
+    assert (small.K0[0, 0], small.K0[0, 2]) == (pytest.approx(585), pytest.approx(323.5))
     (root / "scene0707_00/intrinsic/intrinsic_color.txt").unlink()
     with pytest.raises(DataError, match=r"intrinsic_color\.txt: no such file, nor intrinsics\.npz beside the list"):
         load("pair_list", root=root, file=file)

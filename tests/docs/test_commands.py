@@ -276,9 +276,7 @@ def test_the_commands_of_a_page_run(page_commands: list[str], workplace: Path, m
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page_commands", parameters(slow=True))
-def test_the_long_commands_of_a_page_run(
-    page_commands: list[str], workplace: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_long_commands_of_a_page_run(page_commands, workplace, monkeypatch):
     run_all(page_commands, workplace, monkeypatch)
 
 

@@ -1,4 +1,4 @@
-"""docs/guides/own_parts.md, its parts saved in an empty folder, and the notebooks: they run, and their results are sound."""
+"""docs/guides/own_parts.md, its parts saved in an empty folder, and the notebooks run with sound results."""
 
 import json
 import re
@@ -60,9 +60,7 @@ def test_every_part_is_evaluated(folder: Path) -> None:
     ("group", "protocol"),
     [("features", FeatureExtractor), ("matcher", Matcher), ("pruner", Pruner), ("estimator", Estimator)],
 )
-def test_each_is_built_by_name_in_python(
-    group: str, protocol: type, folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_each_is_built_by_name_in_python(group, protocol, folder, monkeypatch):
     from fmtorch import presets
 
     monkeypatch.syspath_prepend(str(folder))

@@ -1,4 +1,4 @@
-"""Pages: examples give what they say, links lead somewhere, pages are short, generated ones current, quoted names exist."""
+"""Pages: examples give what they say, links lead somewhere, pages are short and current, quoted names exist."""
 
 import ast
 import builtins

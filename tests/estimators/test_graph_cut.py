@@ -121,8 +121,7 @@ def gaussian(F: F8x1, points: F8x2, scale: float, K: F4x1) -> None:
 def edges_of(graph: Graph) -> list[tuple[int, int]]:
     """Each edge once; it is known to both of its ends."""
     ends = {(i, int(j)) for i, d in enumerate(graph.degree) for j in graph.neighbours[i, :d]}
-    assert len(ends) == graph.degree.sum()
-    assert {(j, i) for i, j in ends} == ends
+    assert (len(ends), {(j, i) for i, j in ends}) == (graph.degree.sum(), ends)
     return sorted((i, j) for i, j in ends if i < j)
 
 

@@ -89,8 +89,7 @@ def test_flat_and_nested_options_replace_those_of_a_preset() -> None:
     built = presets.build("estimator", "fmtorch", hypotheses=500, preselect={"survivors": 30}, focal={"samples": 100})
     assert built.search.hypotheses == 500
     assert built.search.preselection.options == Preselect(64, 30)
-    assert built.focal.search.hypotheses == 100
-    assert built.focal.search.pool == 24
+    assert (built.focal.search.hypotheses, built.focal.search.pool) == (100, 24)
     assert torch.equal(estimate.F, built(c.replace(key=None, ratio=None)).F)
     without = presets.build("estimator", "fmtorch", focal=None)
     assert without.focal is None

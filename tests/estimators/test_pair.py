@@ -256,9 +256,7 @@ def scaled(config: Mapping[str, Any], scale: float) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("name", OWN)
-def test_coordinates_sizes_and_thresholds_scaled_together_give_the_same_inliers(
-    name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_coordinates_sizes_and_thresholds_scaled_together_give_the_same_inliers(name, monkeypatch):
     pairs = [scene(i, 100, outliers=0.2, noise=0.1) for i in range(3)]
     c = collate(
         [p.replace(x0=p.x0.double(), x1=p.x1.double(), size0=p.size0.double(), size1=p.size1.double()) for p in pairs]

@@ -177,9 +177,7 @@ def batch(file: dict[str, np.ndarray]) -> dict[str, torch.Tensor]:
 
 
 @pytest.mark.parametrize("name", NAMESAKES)
-def test_solves_as_many_pairs_as_its_namesake(
-    name: str, file: dict[str, np.ndarray], batch: dict[str, torch.Tensor]
-) -> None:
+def test_solves_as_many_pairs_as_its_namesake(name, file, batch):
     count = len(file["names"])
     F_true, *sizes = (
         torch.from_numpy(np.stack([file[f"{i:03d}.{field}"] for i in range(count)]))

@@ -108,8 +108,7 @@ def test_a_pool_keeps_the_best_and_the_earlier_of_equals() -> None:
     offer([1.0, 3.0], 10)
     assert (pool.filled, pool.valid.tolist()) == (2, [True, True])
     offer([3.0, np.nan, -np.inf, 2.0, 0.0, np.inf], 20)
-    assert pool.score.tolist() == [3.0, 3.0, 2.0]
-    assert pool.F[:, 0].tolist() == [11, 20, 23]
+    assert (pool.score.tolist(), pool.F[:, 0].tolist()) == ([3.0, 3.0, 2.0], [11, 20, 23])
     offer([3.0, 2.0], 30)
     assert pool.F[:, 0].tolist() == [11, 20, 30]
 

@@ -93,9 +93,7 @@ def test_rows_of_threads_and_processes(kind: str, pairs: list[ImagePair], expect
 @pytest.mark.parametrize(("workers", "many", "kind"), [
     (1, True, "threads"), (2, True, "processes"), (2, False, "threads"), (None, True, "processes"),
 ])  # fmt: skip
-def test_many_pairs_go_to_processes_unless_there_is_a_single_worker(
-    workers: int | None, many: bool, kind: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_many_pairs_go_to_processes_unless_there_is_a_single_worker(workers, many, kind, monkeypatch):
     monkeypatch.setattr("fmtorch.jobs.execution.cores", lambda: 2)
     assert Execution("auto", workers).decided(many).kind == kind
     assert Execution("processes", workers).decided(many).kind == "processes"  # as it was asked for
@@ -175,8 +173,7 @@ def test_two_of_four_workers_are_killed(cluster: Cluster, pairs: list[ImagePair]
     assert started.wait(PATIENCE)
     rows = evaluated(pairs, Execution("dask", address=cluster.address, send_images=True), build_slow)
     killer.join()
-    assert len(set(killed)) == 2
-    assert rows == expected
+    assert (len(set(killed)), rows) == (2, expected)
 
 
 def test_a_scheduler_that_is_lost(cluster: Cluster, pairs: list[ImagePair], expected: dict[int, PairRow]) -> None:

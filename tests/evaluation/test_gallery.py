@@ -90,9 +90,7 @@ def test_results_of_others_become_a_run_as_documented(tmp_path: Path, monkeypatc
     assert [len(captions) for captions in pictures(shown).values()] == [1, 1]
 
 
-def test_own_methods_keep_their_pictures_and_run_only_where_that_is_asked_for(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_own_methods_keep_their_pictures_and_run_only_where_that_is_asked_for(tmp_path, monkeypatch):
     (tmp_path / "own_estimator_of_a_test.py").write_text(
         "from fmtorch import presets\n"
         "loaded = True\n"
@@ -381,5 +379,4 @@ def test_spread_takes_points_far_apart() -> None:
     assert {20, 90, 150} < set(chosen.tolist())
     assert (np.diff(chosen) > 0).all()
     assert np.array_equal(spread(points[:3], 4), np.arange(3))
-    assert len(spread(np.zeros((5, 2)), 3)) == 3
-    assert len(spread(np.zeros((0, 4)), 3)) == 0
+    assert (len(spread(np.zeros((5, 2)), 3)), len(spread(np.zeros((0, 4)), 3))) == (3, 0)

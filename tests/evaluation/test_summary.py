@@ -75,15 +75,12 @@ def test_known_answer() -> None:
     assert indoor["inlier_rate_failures_0"] == pytest.approx(3 * 0.75 / 5)
     assert indoor["inlier_rate_before"] == pytest.approx(0.5)
     assert indoor["inlier_rate_before_failures_0"] == pytest.approx(4 * 0.5 / 5)
-    assert indoor["corrs"] == pytest.approx(75)
-    assert indoor["corrs_before"] == pytest.approx(400)
-    assert indoor["seconds"]["features"] == 1.0
-    assert indoor["seconds"]["total"] == 1.875
+    assert (indoor["corrs"], indoor["corrs_before"]) == (pytest.approx(75), pytest.approx(400))
+    assert (indoor["seconds"]["features"], indoor["seconds"]["total"]) == (1.0, 1.875)
     assert orbit["interval_over"] == "pair"
     assert orbit["recall_released"] is None
     assert orbit["recall"] == pytest.approx(1 / 3)
-    assert everything["recall"] == pytest.approx(4 / 8)
-    assert everything["scenes"] == 6
+    assert (everything["recall"], everything["scenes"]) == (pytest.approx(4 / 8), 6)
     assert everything["reasons"] == {"5 to 7 matches; at least 8 are needed": 2, "no keypoints in a|b.png": 1}
     low, high = everything["recall_interval"]
     assert 0 <= low < everything["recall"] < high <= 1
@@ -125,8 +122,7 @@ def test_markdown() -> None:
     text = summary_markdown(summarize(known()), title="sift_ratio on rendered")
     lines = text.splitlines()
     tables = [line.replace("\\|", "").count("|") for line in lines if line.startswith("|")]
-    assert set(tables[:5]) == {13}
-    assert set(tables[5:]) == {8}
+    assert (set(tables[:5]), set(tables[5:])) == ({13}, {8})
     assert "| indoor | 5 | 5 | 60.0 [" in text
     assert "a\\|b.png" in text
     assert "1 (20.0%)" in text
@@ -177,8 +173,7 @@ def test_equals_the_reference(scenes: int) -> None:
     low, high = bootstrap_interval(values.tolist(), clusters, RESAMPLES)
     # Monte-Carlo error of both, and one step of the mean of 0/1 values, on which quantiles of few values lie.
     tolerance = quantile_error(values, len(set(clusters)), RESAMPLES) + 1 / len(values)
-    assert result.over == ("scene" if over_scenes else "pair")
-    assert result.value == values.mean()
+    assert (result.over, result.value) == ("scene" if over_scenes else "pair", values.mean())
     assert result.low == pytest.approx(low, abs=tolerance)
     assert result.high == pytest.approx(high, abs=tolerance)
 
@@ -320,8 +315,7 @@ def test_any_pairs_have_an_interval_around_their_share(rows: list[tuple[bool, bo
 )  # fmt: skip
 def test_reasons_that_differ_in_numbers_are_one(reasons: list[str], expected: dict[str, int]) -> None:
     common = common_reasons(reasons, 3)
-    assert common == expected
-    assert list(common) == list(expected)
+    assert (common, list(common)) == (expected, list(expected))
 
 
 def test_the_commonest_come_first_and_others_are_left_out() -> None:

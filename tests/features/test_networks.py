@@ -311,8 +311,7 @@ def test_aliked_keypoints_count_from_the_centre_of_the_first_pixel(monkeypatch: 
 
 def test_nothing_found() -> None:
     found = DISK(network=kornia.feature.DISK(unet=Probe()), device="cpu")(np.zeros(SIZE, np.uint8))
-    assert found.lafs.shape == (0, 2, 3)
-    assert found.descriptors.shape == (0, 128)
+    assert (found.lafs.shape, found.descriptors.shape) == ((0, 2, 3), (0, 128))
 
 
 @both

@@ -81,8 +81,7 @@ def test_views_are_the_published_ones() -> None:
     views = simulated_views(6)
     tilts = [t for t, _ in views]
     counts = [tilts.count(t) for t in sorted(set(tilts))]
-    assert counts == [1, 4, 5, 8, 10, 15]
-    assert views[0] == (1.0, 0.0)
+    assert (counts, views[0]) == ([1, 4, 5, 8, 10, 15], (1.0, 0.0))
     assert max(angle for _, angle in views) < 180
     with pytest.raises(ValueError, match="at least one"):
         simulated_views(0)

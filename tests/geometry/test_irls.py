@@ -153,8 +153,7 @@ def test_curvature_is_half_the_second_derivative_or_zero(name: str) -> None:
 @pytest.mark.parametrize("name", LOSSES)
 def test_quadratic_near_zero_and_never_above(name: str) -> None:
     zero = torch.zeros((), dtype=torch.float64)
-    assert LOSSES[name].loss(zero, S2) == 0
-    assert LOSSES[name].weight(zero, S2) == 1
+    assert (LOSSES[name].loss(zero, S2), LOSSES[name].weight(zero, S2)) == (0, 1)
     r2 = torch.logspace(-6, 6, 50, dtype=torch.float64)
     loss, weight = LOSSES[name].loss(r2, S2), LOSSES[name].weight(r2, S2)
     assert bool((loss <= r2 * (1 + 1e-15)).all())
@@ -194,8 +193,7 @@ def test_the_table_of_gains() -> None:
 
 
 def test_the_tables_have_the_same_bits_everywhere() -> None:
-    assert digest(LOSS_TABLE) == "deeedca20dc708b5"
-    assert digest(GAIN_TABLE) == "e7fdff710ef5cc3d"
+    assert (digest(LOSS_TABLE), digest(GAIN_TABLE)) == ("deeedca20dc708b5", "e7fdff710ef5cc3d")
 
 
 def digest(table: np.ndarray) -> str:

@@ -168,8 +168,7 @@ def test_pairs_of_different_scenes_are_not_verified(tmp_path: Path) -> None:
     chance = dataclasses.replace(circle.pairs[0], related=False)
     write_database(tmp_path / DATABASE, circle.images, [chance])
     with pycolmap.Database.open(tmp_path / DATABASE) as file:
-        assert file.num_matched_image_pairs() == 1
-        assert file.num_verified_image_pairs() == 0
+        assert (file.num_matched_image_pairs(), file.num_verified_image_pairs()) == (1, 0)
 
 
 def test_keypoints_are_found_again() -> None:
@@ -236,8 +235,7 @@ def test_hloc_files(tmp_path: Path) -> None:
 
 
 def test_kinds() -> None:
-    assert export_kinds(None) == ()
-    assert export_kinds("colmap, h5") == ("colmap", "h5")
+    assert (export_kinds(None), export_kinds("colmap, h5")) == ((), ("colmap", "h5"))
     assert export_kinds(["h5"]) == ("h5",)
     with pytest.raises(ValueError, match=r"export=h5,bundler: 'bundler' is none of h5, colmap"):
         export_kinds("h5,bundler")

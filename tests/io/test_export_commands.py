@@ -273,8 +273,7 @@ def test_a_calibration_of_all_gives_what_verify_gives(tmp_path: Path) -> None:
     with h5py.File(output / MATCHES) as file:
         attributes = dict(file["a.jpg/b.jpg"].attrs)
     np.testing.assert_allclose(attributes["R"], pose.rotation.matrix(), atol=1e-9)
-    assert attributes["configuration"] == "calibrated"
-    assert attributes["E"].shape == (3, 3)
+    assert (attributes["configuration"], attributes["E"].shape) == ("calibrated", (3, 3))
 
     # The same matches by `verify`, which reads the cameras of the database.
     done = fmtorch.verify(output / DATABASE, output=tmp_path / "verified.db", force=True)
@@ -323,8 +322,7 @@ def test_focal_lengths_by_exif_and_shared_ones(tmp_path: Path) -> None:
     focal = equivalent * math.hypot(768, 512) / math.hypot(36, 24)
     assert str(camera.model_name) == "SIMPLE_RADIAL"
     assert camera.has_prior_focal_length
-    assert camera.focal_length == pytest.approx(focal)
-    assert kind(geometry) == "CALIBRATED"
+    assert (camera.focal_length, kind(geometry)) == (pytest.approx(focal), "CALIBRATED")
     pose = geometry.cam2_from_cam1
     assert scene.error(pose.rotation.matrix(), pose.translation) < 3
     output = scene.match(tmp_path / "shared", "cameras=shared", "export=colmap")

@@ -29,8 +29,7 @@ def test_equals_the_reference(seed: int, stream: Stream) -> None:
         [[reference.number(seed, key, int(stream), draw, column, 3) for column in range(3)] for draw in range(5, 9)]
         for key in KEYS.tolist()
     ]
-    assert drawn.dtype == torch.int64
-    assert drawn.tolist() == expected
+    assert (drawn.dtype, drawn.tolist()) == (torch.int64, expected)
 
 
 def test_known_figures() -> None:

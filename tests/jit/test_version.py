@@ -152,8 +152,7 @@ def of_constants(folder: Path) -> dict[str, str]:
 
 def test_every_constant_counts_by_its_value_and_type(tmp_path: Path) -> None:
     versions = of_constants(tmp_path)
-    assert len(set(versions.values())) == len(CONSTANTS)
-    assert of_constants(tmp_path) == versions
+    assert (len(set(versions.values())), of_constants(tmp_path)) == (len(CONSTANTS), versions)
 
 
 def test_names_beyond_the_first_bytes(tmp_path: Path) -> None:
@@ -186,8 +185,7 @@ def test_every_process_tells_the_same_versions() -> None:
         for seed in ("1", "2")
     ]  # fmt: skip
     here = [each.version for each in WITH_FOCALS]  # with the checks that tests wrap around functions
-    assert [json.loads(each) for each in printed] == [here, here]
-    assert len(set(here)) == len(here)
+    assert ([json.loads(each) for each in printed], len(set(here))) == ([here, here], len(here))
 
 
 CLASHING = """

@@ -101,8 +101,7 @@ def test_chunk_batch_and_padding_are_invisible(make: object) -> None:
 def test_leading_dimensions() -> None:
     d0, d1 = sift_like(1, 6 * 10).reshape(2, 3, 10, 128), sift_like(2, 6 * 11).reshape(2, 3, 11, 128)
     neighbors = nearest_neighbors(d0, d1)
-    assert neighbors.nearest.shape == (2, 3, 10)
-    assert neighbors.reverse.shape == (2, 3, 11)
+    assert (neighbors.nearest.shape, neighbors.reverse.shape) == ((2, 3, 10), (2, 3, 11))
     assert torch.equal(neighbors.nearest[1, 2], nearest_neighbors(d0[1, 2], d1[1, 2]).nearest)
     assert nearest_neighbors(d0[:0], d1[:0]).nearest.shape == (0, 3, 10)
 
@@ -166,9 +165,7 @@ def without_rounding(monkeypatch: pytest.MonkeyPatch, d0: Tensor, d1: Tensor) ->
 @pytest.mark.parametrize("int8", [True, False])
 @pytest.mark.parametrize("make", [sift_like, unit, skewed])
 @pytest.mark.parametrize(("n0", "n1"), [(1, 1), (3, 2), (700, 1), (130, GROUP), (257, 300), (1000, 900)])
-def test_the_same_bits_as_computing_all_distances(
-    make: object, n0: int, n1: int, int8: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_same_bits_as_computing_all_distances(make, n0, n1, int8, monkeypatch):
     if int8 and not eight_bit.int8_products_are_exact():
         pytest.skip("this processor multiplies 8-bit integers inexactly")
     monkeypatch.setattr(eight_bit, "int8_products_are_exact", lambda: int8)
@@ -235,8 +232,7 @@ def test_slots_are_the_features_of_image_0() -> None:
     assert torch.equal(matches.lafs1[0], f1.lafs[neighbors.nearest])
     assert torch.equal(matches.ratio[0], neighbors.ratio)
     assert matches.mask.all()
-    assert matches.size0.tolist() == [[101, 200]]
-    assert matches.size1.tolist() == [[102, 200]]
+    assert (matches.size0.tolist(), matches.size1.tolist()) == ([[101, 200]], [[102, 200]])
 
 
 def test_mutual_masks_one_sided_matches() -> None:

@@ -94,9 +94,7 @@ def kept(output: Path) -> dict[str, dict[str, Any]]:
     return {path.name: dict(np.load(path)) for path in files}
 
 
-def test_any_number_of_workers_and_any_executor_keep_the_same(
-    pipeline: Pipeline, images: list[Path], tmp_path: Path
-) -> None:
+def test_any_number_of_workers_and_any_executor_keep_the_same(pipeline, images, tmp_path):
     pairs = list(itertools.combinations(images, 2))
     executor = Recorded()
     own = Execution(workers=1, make=lambda: executor)
@@ -131,9 +129,7 @@ def test_processes_keep_the_same(pipeline: Pipeline, images: list[Path], tmp_pat
             np.testing.assert_array_equal(stored[file][key], value)
 
 
-def test_no_image_is_described_twice(
-    pipeline: Pipeline, images: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_image_is_described_twice(pipeline, images, tmp_path, monkeypatch):
     described: list[str] = []
     lock, plain = threading.Lock(), folder.read_image
 
@@ -189,20 +185,15 @@ def fatal() -> Pipeline:
     return pipeline
 
 
-def test_an_image_that_ends_its_workers_is_told_and_the_others_are_matched(
-    pipeline: Pipeline, images: list[Path], tmp_path: Path
-) -> None:
+def test_an_image_that_ends_its_workers_is_told_and_the_others_are_matched(pipeline, images, tmp_path):
     assert cv2.imwrite(str(images[1]), np.zeros((240, 320), np.uint8))
     with folder_workers(pipeline, Execution("processes", 2)) as workers:
         matches = work(pipeline, images[:4], tmp_path / "out", workers=workers, build=fatal)
         assert len(list(matches.each(list(itertools.combinations(images[:4], 2))))) == 6
-    assert matches.done == 3
-    assert matches.troubles == [DEATH]
+    assert (matches.done, matches.troubles) == (3, [DEATH])
 
 
-def test_more_images_than_are_held_in_memory(
-    pipeline: Pipeline, images: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_more_images_than_are_held_in_memory(pipeline, images, tmp_path, monkeypatch):
     monkeypatch.setattr(folder, "MEMORY", 2)
     monkeypatch.setattr(folder, "AHEAD", 1)
     with WorkerPool(threads(2)) as workers:

@@ -5,7 +5,6 @@ import itertools
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
 import fmtorch
 from fmtorch import Correspondences, presets
@@ -134,9 +133,7 @@ def test_find_fundamental_derives_the_prior(given: tuple[str, ...]) -> None:
 
 
 @pytest.mark.parametrize(("name", "area"), [("frame_consistency", 0.9), ("position_consistency", 0.88)])
-def test_priors_tell_inliers_on_real_pairs(
-    name: str, area: float, real_matches: list[tuple[Correspondences, Tensor]]
-) -> None:
+def test_priors_tell_inliers_on_real_pairs(name, area, real_matches):
     """Area under the ROC curve; 0.95 over all pairs of this scene, where the ratio alone reaches 0.7 to 0.86."""
     areas = []
     for c, right in real_matches:

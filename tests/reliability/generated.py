@@ -221,8 +221,7 @@ def estimation(name: str, options: dict[str, Any], data: st.DataObject) -> tuple
 def sound_estimate(estimate: Any) -> None:
     """The promises of `Estimate`: of a pair that is ok a finite F of unit norm with support, of another a reason."""
     F, ok, reason = estimate.F.detach().double(), estimate.ok, estimate.reason
-    assert F.shape == (len(ok), 3, 3)
-    assert estimate.inliers.dtype == torch.bool
+    assert (F.shape, estimate.inliers.dtype) == ((len(ok), 3, 3), torch.bool)
     for i in range(len(ok)):
         support = int(estimate.inliers[i].sum())
         if bool(ok[i]):

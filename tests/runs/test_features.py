@@ -85,8 +85,7 @@ def test_bit_equal_with_and_without(tmp_path: Path, shape: tuple[int, ...], root
     assert shape == (8, 8) or len(truth) > 50
     assert equal(first(image), truth)
     assert equal(second(image), truth)
-    assert (first.computed, first.found) == (1, 0)
-    assert (second.computed, second.found) == (0, 1)
+    assert ((first.computed, first.found), (second.computed, second.found)) == ((1, 0), (0, 1))
 
 
 def test_every_float_survives(tmp_path: Path) -> None:
@@ -273,9 +272,7 @@ def test_configuration_of_files_tensors_networks_and_code(tmp_path: Path, monkey
     configuration_module.code_digest.cache_clear()
 
 
-def test_the_command_tells_what_is_there(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_tells_what_is_there(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("FMTORCH_CACHE", str(tmp_path))
     monkeypatch.setenv("COLUMNS", "200")
     monkeypatch.setattr(sys, "argv", ["runs"])

@@ -144,8 +144,7 @@ def test_the_order_of_a_list_of_names_is_part_of_the_identity(tmp_path: Path) ->
 def test_load_reads_whatever_the_identity(tmp_path: Path) -> None:
     RunFolder.open(tmp_path, CONFIG).append([row("a")])
     run = RunFolder.load(tmp_path)
-    assert run.config == CONFIG
-    assert run.read().num_rows == 1
+    assert (run.config, run.read().num_rows) == (CONFIG, 1)
     with pytest.raises(RunFolderError, match=r"no run\.json"):
         RunFolder.load(tmp_path / "absent")
 
@@ -268,8 +267,7 @@ def workers(path: Path, *configs: dict[str, object]) -> list[int | None]:
 def test_several_processes_write_one_folder(tmp_path: Path) -> None:
     assert workers(tmp_path / "run", CONFIG, CONFIG, CONFIG) == [0, 0, 0]
     run = RunFolder.load(tmp_path / "run")
-    assert run.read().num_rows == 3 * 10 + 10
-    assert len(run.done()) == 40
+    assert (run.read().num_rows, len(run.done())) == (3 * 10 + 10, 40)
     assert list(tmp_path.rglob("*.tmp")) == []
 
 
@@ -303,8 +301,7 @@ def test_replacing_keeps_the_old_file_on_error(tmp_path: Path) -> None:
 
     with pytest.raises(KeyboardInterrupt):
         interrupted()
-    assert file.read_text() == "old"
-    assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
+    assert (file.read_text(), [p.name for p in tmp_path.iterdir()]) == ("old", ["a.txt"])
 
 
 IDENTITY = {"pipeline": "sift_ratio", "seed": 0}
@@ -324,8 +321,7 @@ def test_few_parts_are_left_of_many_batches(tmp_path: Path) -> None:
     for batch in range(batches):
         folder.append([numbered_row(2 * batch), numbered_row(2 * batch + 1)])
     assert len(part_files(folder.path / "pairs")) == 2 + 3 + 5
-    assert keys(folder) == list(range(2 * batches))
-    assert folder.done() == set(range(2 * batches))
+    assert (keys(folder), folder.done()) == (list(range(2 * batches)), set(range(2 * batches)))
     assert RunFolder.load(folder.path).read()["reason"][7].as_py() == "reason 7"
 
 

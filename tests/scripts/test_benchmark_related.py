@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from fmtorch.data import ImagePair, ImageSource
 from fmtorch.scenes import PICTURES, Plan, RenderedPairs
@@ -35,9 +34,7 @@ def test_unrelated_pairs_cross_scenes_and_are_chosen_once() -> None:
     assert all(p.family.startswith(pairs.UNRELATED) and not p.F.any() for p in every)
 
 
-def test_rendered_scenes_that_show_one_photograph_are_not_paired(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_rendered_scenes_that_show_one_photograph_are_not_paired(tmp_path, monkeypatch):
     dataset = RenderedPairs("train", families=["indoor"], root=tmp_path, plan=Plan(1, 2, 1, scale=0.2), workers=1)
     (shown,) = pairs.photographs_shown(dataset).values()
     assert shown
@@ -50,9 +47,7 @@ def test_rendered_scenes_that_show_one_photograph_are_not_paired(
     assert crossed == {"a | c", "a | d", "b | d", "c | d"}  # neither a | b, b | c, nor a drawn and a real one
 
 
-def test_the_command_tells_pairs_apart(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_command_tells_pairs_apart(tmp_path, capsys, monkeypatch):
     rows, pipelines = tmp_path / "rows.jsonl", ["sift_gms", "sift_ratio*"]
     root = draw_set(tmp_path / "Set", "ab", images=2)
     run(capsys, monkeypatch, "related", "--root", root, "--unrelated", 3, "--pipelines",

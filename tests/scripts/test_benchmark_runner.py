@@ -86,8 +86,7 @@ def test_what_a_row_was_made_with_is_options_code_and_learned_files(monkeypatch:
 
     monkeypatch.setattr(runner, "libraries", lambda others: dict.fromkeys(others, "1"))  # PoseLib may be absent
     before = identities()
-    assert len(set(before)) == len(before)
-    assert identities() == before
+    assert (len(set(before)), identities()) == (len(before), before)
     with monkeypatch.context() as patch:
         patch.setattr(runner, "code_digest", lambda module: module)
         assert not set(before[:4]) & set(identities()[:4])
@@ -143,14 +142,11 @@ def test_intervals_are_those_of_every_other_table(scenes: int, over: str) -> Non
     assert own.time_ratio("theirs", "ours", own.pairs()) == "2.00"
 
 
-def test_a_table_is_markdown_here_and_one_value_a_cell_in_its_file(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_table_is_markdown_here_and_one_value_a_cell_in_its_file(tmp_path, capsys):
     sheet = Sheet("poses", "Poses", [{"set": "a", "lead": Span("+1.0", "-2.0", "+3.0")}, {"set": "b", "ms": "4"}])
     show([sheet], tmp_path / "own.csv")
     lines = capsys.readouterr().out.splitlines()
-    assert lines[0] == "Poses"
-    assert lines[4] == "| a   | +1.0 [-2.0, +3.0] |     |"
+    assert (lines[0], lines[4]) == ("Poses", "| a   | +1.0 [-2.0, +3.0] |     |")
     with (tmp_path / "own.csv").open() as file:
         first, second = csv.DictReader(file)
     assert first == {"set": "a", "lead": "+1.0", "lead low": "-2.0", "lead high": "+3.0", "ms": ""}
@@ -185,9 +181,7 @@ def test_settings_name_pipelines_columns_and_figures_there_are(name: str) -> Non
         assert pipeline_of(words.partition(" + ")[0], "cache=off").pruners
 
 
-def test_an_interrupted_run_goes_on_and_its_tables_are_written(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_interrupted_run_goes_on_and_its_tables_are_written(tmp_path, capsys, monkeypatch):
     rows, table = tmp_path / "rows.jsonl", tmp_path / "own.csv"
     mine = "mine = sift_ratio pruner=[ratio] + lpm"
     arguments = ["--root", draw_set(tmp_path / "Set", images=3), "--seeds", 2, "--cache", "off", "--rows", rows,
@@ -228,9 +222,7 @@ def test_figures_stand_beside_the_papers() -> None:
     assert line["paper: %Recall"] == "+11.8"  # 69.2 - 57.4
 
 
-def test_recall_is_given_apart_for_pairs_that_the_rule_leaves_out(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_recall_is_given_apart_for_pairs_that_the_rule_leaves_out(tmp_path, capsys, monkeypatch):
     solved = {"sift_ratio": (0.01, 0.3), "sift_fmtorch": (0.01, 0.01)}  # pairs that it selects, and others
     results = Results(counted(m, f"orbit/s/{i}", solved[m][i % 2]) for m in solved for i in range(4))
     ratio, own = figures_sheet(results, settings_of("hard"), {"orbit/s/0", "orbit/s/2"}).records

@@ -2,7 +2,6 @@
 
 import itertools
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -145,9 +144,7 @@ def set_training(store: PatchStore, batch: int = 32) -> MatchSetTraining:
 
 
 @pytest.mark.parametrize("make", [training, set_training])
-def test_a_resumed_run_is_the_uninterrupted_run(
-    make: Callable[[PatchStore], PatchTraining], store: PatchStore, tmp_path: Path
-) -> None:
+def test_a_resumed_run_is_the_uninterrupted_run(make, store, tmp_path):
     whole, first, second = make(store), make(store), make(store)
     whole.run(until=6)
     first.run(until=3, checkpoint=tmp_path / "run.pt")

@@ -262,8 +262,7 @@ def test_masked_slots_have_no_label_and_labels_move_with_their_matches() -> None
 def test_collate_pads_and_indexing_takes_apart() -> None:
     items = [exact(seed, n=n) for seed, n in enumerate((7, 3, 5))]
     batch = collate(items)
-    assert batch.label.shape == (3, 7)
-    assert batch.correspondences.count().tolist() == [7, 3, 5]
+    assert (batch.label.shape, batch.correspondences.count().tolist()) == ((3, 7), [7, 3, 5])
     assert (batch.label[1, 3:] == -1).all()
     for mine, item in zip(batch, items, strict=True):
         mine = mine.compact()

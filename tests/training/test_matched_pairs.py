@@ -73,8 +73,7 @@ def test_computed_once_by_any_number_of_workers(rendered: RenderedPairs, matched
     calls: list[tuple[int, int]] = []
     two = MatchedPairs(rendered, **SIFT, root=tmp_path, workers=2, progress=lambda *c: calls.append(c))
     assert contents(two.folder) == contents(matched.folder)
-    assert two.folder.name == matched.folder.name
-    assert calls[0] == (0, len(rendered))
+    assert (two.folder.name, calls[0]) == (matched.folder.name, (0, len(rendered)))
     assert calls[-1] == (len(rendered), len(rendered))
     pipeline = load_pipeline("sift_ratio", overrides=["pruner=[one_to_one]", f"cache={tmp_path / 'features'}"])
     calls.clear()
@@ -83,9 +82,7 @@ def test_computed_once_by_any_number_of_workers(rendered: RenderedPairs, matched
     assert calls == [(len(rendered), len(rendered))]
 
 
-def test_an_interrupted_computation_goes_on(
-    rendered: RenderedPairs, matched: MatchedPairs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_interrupted_computation_goes_on(rendered, matched, tmp_path, monkeypatch):
     written: list[Path] = []
 
     def interrupted(path: Path, rows: Any) -> None:
@@ -111,9 +108,7 @@ def test_an_interrupted_computation_goes_on(
 
 
 @pytest.mark.parametrize("damage", ["changed", "cut", "fewer pairs"])
-def test_a_damaged_file_is_computed_anew(
-    rendered: RenderedPairs, matched: MatchedPairs, tmp_path: Path, damage: str
-) -> None:
+def test_a_damaged_file_is_computed_anew(rendered, matched, tmp_path, damage):
     folder = tmp_path / matched.folder.name
     folder.mkdir()
     for file in matched.folder.iterdir():
@@ -130,9 +125,7 @@ def test_a_damaged_file_is_computed_anew(
     assert contents(folder) == contents(matched.folder)
 
 
-def test_what_would_change_the_matches_has_a_folder_of_its_own(
-    rendered: RenderedPairs, matched: MatchedPairs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_would_change_the_matches_has_a_folder_of_its_own(rendered, matched, tmp_path, monkeypatch):
     pairs = Some([rendered[0]])
     names = {MatchedPairs(pairs, **SIFT, root=tmp_path).folder.name}
     names.add(MatchedPairs(pairs, **SIFT, root=tmp_path, most=50).folder.name)
@@ -258,8 +251,7 @@ def test_what_is_written_is_read(tmp_path: Path) -> None:
     assert not first["x0"].flags.owndata  # a view of the file
     assert [file.name for file in tmp_path.iterdir()] == ["shard.arrow"]
     table = pa.ipc.open_file(path).read_all()  # as any library of data frames does
-    assert table.schema.names == SCHEMA.names
-    assert table.column("matches").to_pylist()[-1] == 0
+    assert (table.schema.names, table.column("matches").to_pylist()[-1]) == (SCHEMA.names, 0)
     write_shard(tmp_path / "again.arrow", rows())
     assert (tmp_path / "again.arrow").read_bytes() == path.read_bytes()
 
@@ -304,9 +296,7 @@ def test_what_is_no_such_file_is_refused(tmp_path: Path, content: str) -> None:
 
 
 @pytest.mark.skipif(not PAGE.is_file(), reason="the documentation is in a checkout only")
-def test_the_training_loop_of_the_page_runs(
-    rendered: RenderedPairs, cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_training_loop_of_the_page_runs(rendered, cache, tmp_path, monkeypatch):
     section = PAGE.read_text(encoding="utf-8").split("## Labelled matches")[1]
     code = re.search(r"```python\n(.*?)```", section, re.DOTALL)[1]
     loop = code.partition("\n\n")[2].strip().splitlines()

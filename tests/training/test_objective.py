@@ -155,8 +155,7 @@ def test_geometric_loss_known_answer() -> None:
     in_focal = geometric_loss(F_est, F_true, size, size, K0=focal, K1=focal)
     assert in_focal.item() == pytest.approx(2 * (8 / 500) ** 2, rel=1e-9)
     far = geometric_loss(rows_shifted(100.0)[None].float(), F_true, size, size)
-    assert far.item() == pytest.approx(LIMIT_F)
-    assert far.dtype == torch.float32
+    assert (far.item(), far.dtype) == (pytest.approx(LIMIT_F), torch.float32)
     assert nsgd_loss(F_est, F_true, size, size).item() == pytest.approx(8 / 800, rel=1e-9)
     assert nsgd_loss(F_est, F_true, size, size, limit=0.001).item() == 0.001
 
@@ -369,8 +368,7 @@ def test_temperature_is_the_least_of_the_loss(true: float, seed: int) -> None:
 def test_temperature_of_degenerate_validation() -> None:
     z = torch.tensor([2.0, -1.0, 0.5])
     one = torch.ones(3, dtype=torch.int8)
-    assert temperature(z, -one) == 1
-    assert temperature(z * 0, one) == 1
+    assert (temperature(z, -one), temperature(z * 0, one)) == (1, 1)
     right, wrong = (temperature(z, label.to(torch.int8)) for label in (z > 0, z < 0))  # the bounds
     assert right < 0.1
     assert right * wrong == pytest.approx(1)
@@ -386,8 +384,7 @@ def test_reliability() -> None:
     assert table.error == pytest.approx(expected, rel=1e-12)
     assert int(table.matches.sum()) == int(kept.sum())
     exact = reliability(torch.tensor([0.25] * 4 + [0.875] * 8), torch.tensor([1, 0, 0, 0, 0] + [1] * 7).to(torch.int8))
-    assert exact.error == 0
-    assert exact.observed[[2, 8]].tolist() == [0.25, 0.875]
+    assert (exact.error, exact.observed[[2, 8]].tolist()) == (0, [0.25, 0.875])
     assert bool(exact.predicted[[0, 1, 9]].isnan().all())
     assert math.isnan(reliability(p, torch.full_like(label, -1)).error)
     with pytest.raises(ValueError, match="bins is 0"):

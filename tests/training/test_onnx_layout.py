@@ -72,5 +72,4 @@ def test_the_outputs_are_the_same(name: str, tmp_path: Path, patches: Tensor) ->
 def test_shipped_networks_are_laid_out(name: str, file: str) -> None:
     convolutions = sum(isinstance(layer, torch.nn.Conv2d) for layer in build(name).modules())
     operators = [node.op_type for node in onnx.load(models_dir() / file).graph.node]
-    assert operators.count("Gemm") == 1
-    assert operators.count("Conv") == convolutions - 1
+    assert (operators.count("Gemm"), operators.count("Conv")) == (1, convolutions - 1)

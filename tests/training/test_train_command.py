@@ -92,9 +92,7 @@ def trained(monkeypatch: pytest.MonkeyPatch, folder: Path, *overrides: str) -> P
     return run(compose("train", overrides), "lc")
 
 
-def test_the_command_goes_on_and_refuses_another_training(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_command_goes_on_and_refuses_another_training(root, tmp_path, monkeypatch):
     small = ["pruner.lc.network.channels=8", "pruner.lc.network.blocks=2", "output=out"]
     options = ["dataset=fmbench", f"dataset.root={root}", *SHORT, *small]
     folder = trained(monkeypatch, tmp_path, *options)
@@ -137,9 +135,7 @@ def test_photographs_join_the_training(root: Path, tmp_path: Path, monkeypatch: 
         ("seed=0", "nowhere: no such folder"),
     ],
 )
-def test_mistakes_are_told_before_anything_is_written(
-    option: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_mistakes_are_told_before_anything_is_written(option, message, tmp_path, monkeypatch):
     with pytest.raises((ValueError, FileNotFoundError), match=re.escape(message)):
         trained(monkeypatch, tmp_path, option, "dataset=fmbench", "dataset.root=nowhere")
     assert [path.name for path in tmp_path.rglob("*")] == ["cache", "kernels"]  # put there by `own_cache`

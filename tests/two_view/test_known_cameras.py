@@ -224,9 +224,7 @@ VARIABLES = ("x0", "x1", "prior", "noise", "K0", "K1")
 @pytest.mark.usefixtures("converging")
 @pytest.mark.parametrize("field", ["F", "E", "R", "t", "focals"])
 @pytest.mark.parametrize("focal", [(0.0, 0.0), (0.05, 0.05), "shared"], ids=["exact", "rough", "shared"])
-def test_gradients_are_the_differences_of_estimates(
-    field: str, focal: tuple[float, float] | str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_gradients_are_the_differences_of_estimates(field, focal, monkeypatch):
     """At a converged fit of 14 inliers, too few to tell the noise, of which the scale of the fit would depend. The
     image of square pixels is a constant. Focal lengths are usual and equal ones, so that the prior does not pull: Gauss
     and Newton's Hessian leaves out the curvature of residuals."""

@@ -54,9 +54,7 @@ K = np.array([[600.0, 0, 309.5], [0, 612, 249.5], [0, 0, 1]])
         ("unknown", True, {"focal": "unknown"}),
     ],
 )
-def test_geometries_are_those_of_find_fundamental(
-    cameras: Any, prior: bool, known: dict[str, Any], tmp_path: Path
-) -> None:
+def test_geometries_are_those_of_find_fundamental(cameras, prior, known, tmp_path):
     """Bit by bit, whatever the batch."""
     path = tmp_path / "database.db"
     write(path, scene(4), prior=prior)
@@ -203,15 +201,13 @@ def test_geometries_are_kept_unless_forced(tmp_path: Path) -> None:
     result = fmtorch.verify(path)
     assert (result.pairs, result.kept, result.verified) == (3, 1, 2)
     first = read(path)
-    assert first[1, 3].config == Configuration.WATERMARK
-    assert fmtorch.verify(path).kept == 3
+    assert (first[1, 3].config, fmtorch.verify(path).kept) == (Configuration.WATERMARK, 3)
     assert plain(read(path)) == plain(first)
     result = fmtorch.verify(path, force=True)
     assert (result.kept, result.configurations) == (0, {"calibrated": 3})
     forced = read(path)
     assert forced[1, 3].config == Configuration.CALIBRATED
-    assert plain(forced)[1, 2] == plain(first)[1, 2]
-    assert os.listdir(tmp_path) == ["database.db"]
+    assert (plain(forced)[1, 2], os.listdir(tmp_path)) == (plain(first)[1, 2], ["database.db"])
 
 
 def test_a_copy_leaves_the_database_as_it_is(tmp_path: Path) -> None:
@@ -219,10 +215,8 @@ def test_a_copy_leaves_the_database_as_it_is(tmp_path: Path) -> None:
     write(path, scene(3))
     before = digest(path)
     result = fmtorch.verify(path, output=copy)
-    assert (result.path, result.verified) == (copy, 3)
-    assert digest(path) == before
-    assert len(read(copy)) == 3
-    assert fmtorch.verify(path, output=copy).kept == 3
+    assert ((result.path, result.verified), digest(path)) == ((copy, 3), before)
+    assert (len(read(copy)), fmtorch.verify(path, output=copy).kept) == (3, 3)
     with pycolmap.Database.open(copy) as database:
         database.delete_two_view_geometry(1, 2)
     with pytest.raises(ValueError, match=re.escape(f"output={copy} exists; name another file, or replace it")):
@@ -278,8 +272,7 @@ def test_broken_pairs_are_lines_with_reasons(tmp_path: Path) -> None:
         "001.jpg, 002.jpg: 002.jpg has no keypoints",
     ]
     assert "001.jpg, 003.jpg: a match is of keypoint 149, 003.jpg has 7 of them" in result.problems
-    assert list(read(path)) == [(1, 2)]
-    assert fmtorch.verify(path).kept == 1
+    assert (list(read(path)), fmtorch.verify(path).kept) == ([(1, 2)], 1)
 
 
 def test_pairs_of_few_matches_are_degenerate(tmp_path: Path) -> None:
@@ -458,5 +451,4 @@ def test_rigs_and_frames_stay_as_they_are(copied: bool, tmp_path: Path) -> None:
     result = fmtorch.verify(path, output=copy if copied else None)
     assert result.problems == ()
     assert result.verified > 30
-    assert rows(copy if copied else path) == before
-    assert rows(path) == before
+    assert (rows(copy if copied else path), rows(path)) == (before, before)

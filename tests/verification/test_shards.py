@@ -23,10 +23,8 @@ def test_processes_find_what_threads_find(tmp_path: Path) -> None:
     reports: list[tuple[int, int]] = []
     fmtorch.verify(path)
     result = fmtorch.verify(other, execution=Execution("processes", 2), report=lambda *c: reports.append(c))
-    assert (result.pairs, result.verified) == (10, 10)
-    assert reports[0] == (0, 10)
-    assert reports[-1] == (10, 10)
-    assert plain(read(other)) == plain(read(path))
+    assert ((result.pairs, result.verified), reports[0]) == ((10, 10), (0, 10))
+    assert (reports[-1], plain(read(other))) == ((10, 10), plain(read(path)))
 
 
 @pytest.mark.parametrize("output", [False, True])

@@ -263,9 +263,7 @@ class Found(PlausibleCandidates):
 
 @pytest.mark.parametrize("confirmations", [1, 2, 3])
 @pytest.mark.parametrize("min_rounds", [1, 3])
-def test_rounds_end_when_enough_of_them_confirm_the_best(
-    min_rounds: int, confirmations: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_rounds_end_when_enough_of_them_confirm_the_best(min_rounds, confirmations, monkeypatch):
     rng = np.random.default_rng(confirmations)
     again, one_model = rng.random((200, ROUNDS)) < 0.4, rng.random((200, ROUNDS)) < 0.05
     content = rng.random((200, ROUNDS)) < 0.8  # the stopping rule
