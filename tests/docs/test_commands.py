@@ -48,7 +48,7 @@ ELSEWHERE = {
     r"pipeline=vismatch|(dataset=|runs/)pair_list": "tests/matching/test_vismatch.py runs a stand-in on lists of pairs",
     r"dataset=hpatches": "tests/evaluation/test_poses.py runs these on sequences of its own",
     r"'overlap=|HARD/": "tests/data/test_construction.py, tests/scripts/test_benchmark_runner.py run these",
-    r"benchmark known_models": "needs the images of a scene; tests/scripts/test_benchmark_verify.py has some",
+    r"benchmark known_models": "needs the images of a scene; tests/scripts/test_benchmark_planes.py has some",
     r"--config-dir my_conf features=": "tests/docs/test_own_parts.py runs this page",
 }
 """Commands that are not run here, and why."""

@@ -4,11 +4,9 @@ import csv
 import dataclasses
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from fmtorch import presets
-from fmtorch.evaluation.statistics import bootstrap_mean, share_difference
 from fmtorch.geometry import eight_point
 from fmtorch.presets import build as preset
 from scripts.benchmark import estimators, methods, runner
@@ -94,12 +92,6 @@ def test_what_a_row_was_made_with_is_options_code_and_learned_files(monkeypatch:
     assert identities()[3] != before[3]
 
 
-def test_options_are_numbers_switches_or_words_and_those_of_a_part_are_nested() -> None:
-    assert methods.options("a=0.5,b=true,c=null,d=focal") == {"a": 0.5, "b": True, "c": None, "d": "focal"}
-    assert methods.options("a.b=1,c=x,a.d=2") == {"a": {"b": 1, "d": 2}, "c": "x"}
-    assert methods.options("") == {}
-
-
 def test_truth_is_the_fit_that_starts_from_the_true_matrix() -> None:
     exact = scene(0, 200, outliers=0, noise=0)
     (F,), _ = eight_point(exact.x0.double(), exact.x1.double())
@@ -112,34 +104,6 @@ def test_truth_is_the_fit_that_starts_from_the_true_matrix() -> None:
 
 
 FOLDER = Path(estimators.__file__).parent
-
-
-def results(scenes: int = 12, families: tuple[str, ...] = ("orbit",), seeds: int = 2, pairs: int = 48) -> Results:
-    """Two methods with other errors and times."""
-    rng = np.random.default_rng(0)
-    return Results(
-        row(method, f"{family}/s{i % scenes}/{i}", rng.uniform(0, 0.08), seed, ms=ms)
-        for method, ms in (("ours", 1.0), ("theirs", 2.0)) for family in families
-        for i in range(pairs) for seed in range(seeds)
-    )  # fmt: skip
-
-
-@pytest.mark.parametrize(("scenes", "over"), [(3, "pairs"), (12, "scenes")])
-def test_intervals_are_those_of_every_other_table(scenes: int, over: str) -> None:
-    own = results(scenes)
-    a, b = (own.get(method, own.pairs())("nsgd") for method in ("ours", "theirs"))
-    areas = [100 * np.clip(1 - nsgd / 0.05, 0, 1).mean(0) for nsgd in (a, b)]
-    expected = bootstrap_mean(areas[0] - areas[1], own.scenes(own.pairs()))
-    found = own.difference("ours", "theirs", own.pairs(), "AUC@0.05")
-    assert found == Span(*(f"{value:+.1f}" for value in (expected.value, expected.low, expected.high)))
-    shares = share_difference((a < 0.01).mean(0), (b < 0.01).mean(0), own.scenes(own.pairs()))
-    fine = own.difference("ours", "theirs", own.pairs(), "R.01")
-    assert fine == Span(*(f"{100 * value:+.1f}" for value in (shares.value, shares.low, shares.high)))
-    assert own.cell("theirs", own.pairs(), "AUC@0.05") == f"{areas[1].mean():.1f}"
-    assert own.described(own.pairs()) == f"48 pairs of {scenes} scenes, intervals over {over}"
-    assert own.difference("ours", "ours", own.pairs(), "R.01") == ""
-    assert own.difference("ours", "theirs", own.pairs()[:3], "AUC@0.05") == ""  # too few
-    assert own.time_ratio("theirs", "ours", own.pairs()) == "2.00"
 
 
 def test_a_table_is_markdown_here_and_one_value_a_cell_in_its_file(tmp_path, capsys):

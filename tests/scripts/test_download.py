@@ -154,15 +154,6 @@ def test_archives_cannot_write_elsewhere(members: dict[str, bytes], tmp_path: Pa
     assert sorted(p.name for p in tmp_path.rglob("*")) == ["evil.tgz", "in", "side"]
 
 
-@pytest.mark.usefixtures("python")
-def test_archives_are_unpacked(tmp_path: Path) -> None:
-    path, folder = tmp_path / "a.tgz", tmp_path / "folder"
-    archive(path, {"one/deep/a": b"1", "two": b"2"})
-    folder.mkdir()
-    assert SCRIPT["unpack"](path, folder) == [folder / "one", folder / "two"]
-    assert (folder / "one/deep/a").read_bytes() == b"1"
-
-
 def test_damaged_archives_and_folders_that_are_there_are_told(tmp_path: Path) -> None:
     path, folder = tmp_path / "a.tgz", tmp_path / "folder"
     content = archive(path, {"one/a": b"1" * 5000, "two/b": b"2"})
