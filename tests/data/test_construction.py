@@ -11,19 +11,8 @@ import numpy as np
 import pytest
 
 from fmtorch import presets
-from fmtorch.data import DataError, ImageSource, load, read_image, to_grey
+from fmtorch.data import DataError, ImageSource, construction, load, read_image, to_grey
 from fmtorch.data import construction as rule
-from fmtorch.data.construction import (
-    STEP,
-    TOLERANCE,
-    Construction,
-    DepthOverlap,
-    Seen,
-    blocks,
-    overlap_of,
-    seen_share,
-    shared_points,
-)
 from fmtorch.data.scenes import SPLITS, AllPairs, DepthScenePairs, chosen, drawn, following, incidence, sharing_points
 from fmtorch.scenes import Plan, RenderedPairs
 from tests.conftest import shared_path
@@ -142,19 +131,19 @@ def test_a_draw_is_the_same_however_it_is_interrupted(scenes, tmp_path, monkeypa
     """Blocks of one candidate each; the first try ends after nine of them, whose verdicts are not asked for again."""
     monkeypatch.setattr("fmtorch.data.construction.BLOCK", 1)
     dataset = load("cameras", root=scenes)
-    uninterrupted = Construction(dataset, tmp_path / "Whole", count=3, seed=5)  # type: ignore[arg-type]
-    broken = Construction(dataset, tmp_path / "Made", count=3, seed=5)  # type: ignore[arg-type]
+    uninterrupted = construction.Construction(dataset, tmp_path / "Whole", count=3, seed=5)  # type: ignore[arg-type]
+    broken = construction.Construction(dataset, tmp_path / "Made", count=3, seed=5)  # type: ignore[arg-type]
     assert sorted(uninterrupted.order().tolist()) == list(range(20))
     uninterrupted.begin()
     passed = [
         rank
-        for number, ranks in blocks(uninterrupted.order())
+        for number, ranks in construction.blocks(uninterrupted.order())
         for rank in ranks
         if uninterrupted.judge(number, ranks).kept[0]
     ]
     assert len(passed) == 4
     broken.begin()
-    for number, ranks in list(blocks(broken.order()))[:9]:
+    for number, ranks in list(construction.blocks(broken.order()))[:9]:
         broken.judge(number, ranks)
     asked, matchable = list[object](), rule.matchable
     monkeypatch.setattr(rule, "matchable", lambda *given: asked.append(given) or matchable(*given))
@@ -198,16 +187,16 @@ def one_by_one(dataset: DepthScenePairs, scene: int, i: int, j: int) -> float:
                 (first.image.size, second.image.size),
                 R,
                 second.t - R @ first.t,
-                STEP,
-                TOLERANCE,
+                construction.STEP,
+                construction.TOLERANCE,
             )
         )
     return min(shares)
 
 
 def test_overlap_of_rendered_pairs_is_that_counted_pixel_by_pixel(rendered: DepthScenePairs) -> None:
-    overlaps = overlap_of(rendered)
-    assert isinstance(overlaps, DepthOverlap)
+    overlaps = construction.overlap_of(rendered)
+    assert isinstance(overlaps, construction.DepthOverlap)
     places = [rendered.candidate(rank) for rank in range(rendered.candidates)]
     assert len(places) == 2 * 6
     shares = [overlaps.of(place) for place in places]
@@ -219,17 +208,19 @@ def test_overlap_of_rendered_pairs_is_that_counted_pixel_by_pixel(rendered: Dept
     ("other", "expected"),
     [
         (2.0, 0.5),  # the same wall, of which the other camera sees the right half
-        (2.0 * (1 + 0.9 * TOLERANCE), 0.5),
-        (2.0 / (1 - 1.1 * TOLERANCE), 0.0),  # another wall, behind
+        (2.0 * (1 + 0.9 * construction.TOLERANCE), 0.5),
+        (2.0 / (1 - 1.1 * construction.TOLERANCE), 0.0),  # another wall, behind
         (1.5, 0.0),  # hidden
         (np.nan, 0.0),  # what is within the other image is unknown, all else is outside
     ],
 )
 def test_a_wall_of_which_half_is_seen(other: float, expected: float) -> None:
     K = np.array([[40.0, 0.0, 19.5], [0.0, 40.0, 9.5], [0.0, 0.0, 1.0]])
-    sees = [Seen(K, (20, 40), lambda x, z=z: np.full(len(x), z)) for z in (2.0, other)]  # type: ignore[misc]
-    assert seen_share(*sees, np.eye(3), np.array([-1.0, 0.0, 0.0]), step=1) == expected
-    assert seen_share(*sees, np.eye(3), np.array([0.0, 0.0, -5.0])) == 0  # all of it is behind the other camera
+    sees = [construction.Seen(K, (20, 40), lambda x, z=z: np.full(len(x), z)) for z in (2.0, other)]  # type: ignore[misc]
+    assert construction.seen_share(*sees, np.eye(3), np.array([-1.0, 0.0, 0.0]), step=1) == expected
+    assert (
+        construction.seen_share(*sees, np.eye(3), np.array([0.0, 0.0, -5.0])) == 0
+    )  # all of it is behind the other camera
 
 
 def test_overlap_by_points_is_that_counted_point_by_point() -> None:
@@ -238,8 +229,8 @@ def test_overlap_by_points_is_that_counted_point_by_point() -> None:
     points[3] = np.zeros(0, np.int64)
     pairs = np.array(list(itertools.combinations(range(30), 2)))
     expected = [reference.by_points(points[i].tolist(), points[j].tolist()) for i, j in pairs]
-    np.testing.assert_allclose(shared_points(incidence(points), pairs), expected, rtol=0, atol=1e-15)
-    assert len(shared_points(incidence(points), pairs[:0])) == 0
+    np.testing.assert_allclose(construction.shared_points(incidence(points), pairs), expected, rtol=0, atol=1e-15)
+    assert len(construction.shared_points(incidence(points), pairs[:0])) == 0
 
 
 def run_overlap(folder: Path, monkeypatch: pytest.MonkeyPatch, *words: str) -> None:

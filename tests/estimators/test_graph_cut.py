@@ -8,27 +8,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from fmtorch.core import Correspondences, collate
-from fmtorch.estimators import Degensac, GraphCut, Msac, Pair, Ransac
-from fmtorch.estimators.degensac import (
-    FITS,
-    KEPT,
-    PARALLAX_DRAWS,
-    PLANE_THRESHOLD_PX,
-    fit_plane,
-    parallax,
-    plane_of_sample,
-)
-from fmtorch.estimators.graph_cut import (
-    FIRST_DRAW,
-    HALVINGS,
-    MAX_NEIGHBOURS,
-    SWEEPS,
-    UNIT,
-    Graph,
-    _gaussian,
-    label,
-    neighbor_graph,
-)
+from fmtorch.estimators import Degensac, GraphCut, Msac, Pair, Ransac, degensac, graph_cut
 from fmtorch.estimators.inliers import residuals_squared_px
 from fmtorch.estimators.models.model import Hypotheses
 from fmtorch.estimators.preselection import Preselection
@@ -62,7 +42,7 @@ def test_fits_are_those_of_all_inliers_and_of_samples_of_them(name: str) -> None
     for iteration in (0, 1):
         fits, expected, errors = part.fits(labels, pair, iteration), [inliers], []
         for s in range(part.SAMPLES):
-            draw = FIRST_DRAW + iteration * part.SAMPLES + s
+            draw = graph_cut.FIRST_DRAW + iteration * part.SAMPLES + s
             words = [number(pair.seed, pair.key, Stream.SAMPLING, draw, j, size) for j in range(size)]
             expected.append(inliers[[(word >> 31) * len(inliers) >> 32 for word in words]])
         assert len(fits) == len(expected)
@@ -92,7 +72,7 @@ def test_a_model_is_its_best_fit_as_long_as_the_score_rises() -> None:
     rounds = []
     for name in ("scene 100", "scene 300", *REAL):
         pair, part = named(name), GraphCut(1.0, Msac(1.0))
-        graph, F = neighbor_graph(pair, part.RADIUS_PX), searched(pair)
+        graph, F = graph_cut.neighbor_graph(pair, part.RADIUS_PX), searched(pair)
         F = np.vstack([F, part(F, pair)])  # those that are good already
         for start, improved in zip(F, part(F, pair), strict=True):
             path = [(scores_of(part.score, start[None], pair)[0], start)]
@@ -115,18 +95,18 @@ RECTIFIED = np.array([0, 0, 0, 0, 0, 1.0, 0, -1, 0])  # r^2 = (y1 - y0)^2 / 2
 @kernel
 def gaussian(F: F8x1, points: F8x2, scale: float, K: F4x1) -> None:
     """The kernel of residuals."""
-    _gaussian(F, points, scale, K)
+    graph_cut._gaussian(F, points, scale, K)
 
 
-def edges_of(graph: Graph) -> list[tuple[int, int]]:
+def edges_of(graph: graph_cut.Graph) -> list[tuple[int, int]]:
     """Each edge once; it is known to both of its ends."""
     ends = {(i, int(j)) for i, d in enumerate(graph.degree) for j in graph.neighbours[i, :d]}
     assert (len(ends), {(j, i) for i, j in ends}) == (graph.degree.sum(), ends)
     return sorted((i, j) for i, j in ends if i < j)
 
 
-def graph_of(n: int, edges: list[tuple[int, int]]) -> Graph:
-    graph = Graph(np.zeros((n, MAX_NEIGHBOURS), np.int32), np.zeros(n, np.int32))
+def graph_of(n: int, edges: list[tuple[int, int]]) -> graph_cut.Graph:
+    graph = graph_cut.Graph(np.zeros((n, graph_cut.MAX_NEIGHBOURS), np.int32), np.zeros(n, np.int32))
     for p, q in edges:
         for i, j in ((p, q), (q, p)):
             graph.neighbours[i, graph.degree[i]] = j
@@ -154,7 +134,7 @@ def distances(pair: Pair) -> np.ndarray:
 @pytest.mark.parametrize("name", REAL)
 def test_neighbours_are_within_the_radius_and_nearly_all_of_those(name: str) -> None:
     pair, _ = given(name)
-    edges, apart = edges_of(neighbor_graph(pair, RADIUS)), distances(pair)
+    edges, apart = edges_of(graph_cut.neighbor_graph(pair, RADIUS)), distances(pair)
     assert all(apart[p, q] <= RADIUS * (1 + 1e-12) for p, q in edges)
     assert len(edges) > 0.95 * np.count_nonzero(np.triu(apart <= RADIUS, 1))  # SHIFTS: the two curves find 97 %
 
@@ -163,8 +143,11 @@ def test_the_kernel_is_the_gaussian() -> None:
     z, K = np.linspace(0, 60, 5001), np.empty(5001, np.float32)
     gaussian(RECTIFIED, rectified(z), 1.0, K)
     # exp(-z) - (1 + z / n)^-n is z^2 exp(-z) / (2 n) at most, 0.27 / n; half a unit of rounding, and 1024 roundings.
-    assert np.abs(K - np.exp(-z / 2)).max() < (0.28 / 2**HALVINGS) + UNIT / 2 + 2**HALVINGS * 2.0**-24
-    np.testing.assert_array_equal(K / UNIT, np.round(K / UNIT))
+    assert (
+        np.abs(K - np.exp(-z / 2)).max()
+        < (0.28 / 2**graph_cut.HALVINGS) + graph_cut.UNIT / 2 + 2**graph_cut.HALVINGS * 2.0**-24
+    )
+    np.testing.assert_array_equal(K / graph_cut.UNIT, np.round(K / graph_cut.UNIT))
 
 
 def test_the_reference_cut_finds_the_least_energy() -> None:
@@ -195,8 +178,8 @@ def test_labels_on_random_graphs(coherence: float) -> None:
             )
             gaussian(RECTIFIED, points, 1.0, K)
             np.testing.assert_array_equal(K, wanted)
-            label(RECTIFIED, points, 1.0, graph_of(n, edges), coherence, labelled)
-            low, high = (reference.fixed_point(wanted, edges, coherence, start, SWEEPS) for start in (0, 1))
+            graph_cut.label(RECTIFIED, points, 1.0, graph_of(n, edges), coherence, labelled)
+            low, high = (reference.fixed_point(wanted, edges, coherence, start, graph_cut.SWEEPS) for start in (0, 1))
             cut = reference.least_cut(wanted, edges, coherence)
             assert (low <= cut).all()
             assert (cut <= high).all()
@@ -209,10 +192,10 @@ def test_labels_are_almost_those_of_the_exact_cut_on_real_pairs(epsilon: float, 
     same, excess = [], []
     for name in REAL:
         pair, F = given(name)
-        graph, scale = neighbor_graph(pair, RADIUS), (pair.pixels_per_unit / epsilon) ** 2
+        graph, scale = graph_cut.neighbor_graph(pair, RADIUS), (pair.pixels_per_unit / epsilon) ** 2
         K, labels = np.empty(pair.count, np.float32), np.empty(pair.count, np.bool_)
         gaussian(F, pair.points, scale, K)
-        label(F, pair.points, scale, graph, coherence, labels)
+        graph_cut.label(F, pair.points, scale, graph, coherence, labels)
         exact, edges = K.astype(np.float64), edges_of(graph)
         cut = reference.least_cut(exact, edges, coherence)
         assert 0 < cut.mean() < 1
@@ -228,10 +211,12 @@ def test_labels_are_almost_those_of_the_exact_cut_on_real_pairs(epsilon: float, 
 @pytest.mark.parametrize("name", FEW)
 def test_a_model_of_all_matches_has_all_labels_and_one_of_none_has_none(name: str) -> None:
     pair = named(name)
-    graph, labels = neighbor_graph(pair, RADIUS), np.empty(pair.count, np.bool_)
-    label(models(pair, 2)[1], pair.points, 1e-30, graph, 0.1, labels)
+    graph, labels = graph_cut.neighbor_graph(pair, RADIUS), np.empty(pair.count, np.bool_)
+    graph_cut.label(models(pair, 2)[1], pair.points, 1e-30, graph, 0.1, labels)
     assert labels.all()
-    label(np.array([0, 0, 0, 0, 0, 0, 0, 0, 1.0]), pair.points, 1.0, graph, 0.1, labels)  # no point is on its line
+    graph_cut.label(
+        np.array([0, 0, 0, 0, 0, 0, 0, 0, 1.0]), pair.points, 1.0, graph, 0.1, labels
+    )  # no point is on its line
     assert not labels.any()
 
 
@@ -279,14 +264,14 @@ def seven(index: int, on_plane: int) -> tuple[Pair, np.ndarray, np.ndarray]:
 
 
 def limit(pair: Pair) -> float:
-    return float((PLANE_THRESHOLD_PX / pair.pixels_per_unit) ** 2)
+    return float((degensac.PLANE_THRESHOLD_PX / pair.pixels_per_unit) ** 2)
 
 
 def transfers(H: np.ndarray, pair: Pair) -> np.ndarray:
     """Of all matches, in thresholds of a plane."""
     x = pair.points.T
     apart = [homography.transfer(H.reshape(3, 3), a[:2], a[2:]) for a in x]
-    return np.array(apart) * pair.pixels_per_unit / PLANE_THRESHOLD_PX
+    return np.array(apart) * pair.pixels_per_unit / degensac.PLANE_THRESHOLD_PX
 
 
 def round_of(pair: Pair, count: int = 100) -> tuple[Hypotheses, Verified]:
@@ -302,7 +287,7 @@ def test_the_plane_of_a_sample_is_that_of_the_best_triplet(on_plane: int) -> Non
     for index in range(10):
         pair, F, members = seven(index, on_plane)
         H = np.empty(9)
-        count = plane_of_sample(F, pair.points, Degensac.TRIPLETS, limit(pair), H)
+        count = degensac.plane_of_sample(F, pair.points, Degensac.TRIPLETS, limit(pair), H)
         planes = [
             homography.through_plane(F.reshape(3, 3), pair.points[:2, t].T, pair.points[2:, t].T)
             for t in Degensac.TRIPLETS
@@ -335,16 +320,16 @@ def test_planes_are_fitted_as_long_as_they_gain_matches(name: str) -> None:
     for k in np.argsort(-models.score, kind="stable")[:5]:
         sample, H, inside = hypotheses.sample[:, hypotheses.draw[k]], np.empty(9), np.empty(pair.count, np.bool_)
         points = np.ascontiguousarray(pair.points[:, sample])
-        if plane_of_sample(models.F[k].astype(np.float64), points, Degensac.TRIPLETS, limit(pair), H) < 3:
+        if degensac.plane_of_sample(models.F[k].astype(np.float64), points, Degensac.TRIPLETS, limit(pair), H) < 3:
             continue
         expected, near = H.reshape(3, 3), transfers(H, pair) <= 1
-        for _ in range(FITS):
+        for _ in range(degensac.FITS):
             G = homography.dlt(pair.points[:2, near].T, pair.points[2:, near].T)
             more = transfers(G, pair) <= 1
             if more.sum() <= near.sum():
                 break
             expected, near = G, more
-        fit_plane(H, pair.points, limit(pair), FITS, inside)
+        degensac.fit_plane(H, pair.points, limit(pair), degensac.FITS, inside)
         if (np.abs(transfers(expected, pair) - 1) > 1e-6).all():
             np.testing.assert_array_equal(inside, near)
             np.testing.assert_allclose(homography.unit(H.reshape(3, 3)), homography.unit(expected), atol=1e-7)
@@ -358,7 +343,7 @@ def test_models_of_plane_and_parallax_are_those_of_their_draws(name: str) -> Non
     weight, H = rng.integers(0, 5, pair.count), homography.unit(np.eye(3) + rng.normal(0, 0.05, (3, 3)))
     F = np.empty((50, 9), np.float32)
     state = pair.mixed_seed(Stream.PARALLAX), pair.key, 400
-    F = F[: parallax(H.ravel(), pair.points, np.cumsum(weight), np.array(state), F)]
+    F = F[: degensac.parallax(H.ravel(), pair.points, np.cumsum(weight), np.array(state), F)]
     line, expected = np.repeat(np.arange(pair.count), weight), []
     for draw in range(50):
         words = [number(pair.seed, pair.key, Stream.PARALLAX, 0, 400 + 2 * draw + k, 1) for k in (0, 1)]
@@ -376,14 +361,18 @@ def test_completed_models_are_the_best_of_plane_and_parallax(turn: int) -> None:
     pair, part = pair_of(scene(0)[0], seed=2), Degensac(Msac(1.0))
     pair.prior = pair.match_weight = pair.table[6]
     pair.table[6] = np.random.default_rng(0).uniform(0.1, 1, pair.count)
-    H, inside, F = reference_plane(pair), np.empty(pair.count, np.bool_), np.empty((PARALLAX_DRAWS, 9), np.float32)
+    H, inside, F = (
+        reference_plane(pair),
+        np.empty(pair.count, np.bool_),
+        np.empty((degensac.PARALLAX_DRAWS, 9), np.float32),
+    )
     completed, scores = part.completed(H.copy(), pair, turn)
-    fit_plane(H, pair.points, limit(pair), FITS, inside)
+    degensac.fit_plane(H, pair.points, limit(pair), degensac.FITS, inside)
     weight = np.where(inside, 0, quantised(pair.match_weight.tolist(), largest_weight(pair.bucket)))
-    state = pair.mixed_seed(Stream.PARALLAX), pair.key, 2 * turn * PARALLAX_DRAWS
-    F = F[: parallax(H, pair.points, np.cumsum(weight), np.array(state), F)]
+    state = pair.mixed_seed(Stream.PARALLAX), pair.key, 2 * turn * degensac.PARALLAX_DRAWS
+    F = F[: degensac.parallax(H, pair.points, np.cumsum(weight), np.array(state), F)]
     every = Msac(1.0)(F, np.arange(len(F)), pair)
-    best = np.argsort(-every, kind="stable")[:KEPT]
+    best = np.argsort(-every, kind="stable")[: degensac.KEPT]
     np.testing.assert_array_equal(completed, F[best])
     np.testing.assert_array_equal(scores, every[best])
 
@@ -394,7 +383,7 @@ def reference_plane(pair: Pair) -> np.ndarray:
     for k in np.argsort(-models.score, kind="stable"):
         points, H = np.ascontiguousarray(pair.points[:, hypotheses.sample[:, hypotheses.draw[k]]]), np.empty(9)
         F = models.F[k].astype(np.float64)
-        if plane_of_sample(F, points, Degensac.TRIPLETS, limit(pair), H) >= Degensac.ON_PLANE:
+        if degensac.plane_of_sample(F, points, Degensac.TRIPLETS, limit(pair), H) >= Degensac.ON_PLANE:
             return H
     raise AssertionError("no sample is degenerate")
 
@@ -411,7 +400,7 @@ def test_a_better_degenerate_model_is_completed_and_others_are_left_alone() -> N
             continue
         completed += 1
         added = len(verified.F) - len(models.F)
-        assert 0 < added <= KEPT
+        assert 0 < added <= degensac.KEPT
         np.testing.assert_array_equal(verified.F[: len(models.F)], models.F)
         np.testing.assert_array_equal(verified.which, [*models.which, *range(len(models.F), len(verified.F))])
         np.testing.assert_array_equal(verified.score[-added:], Msac(1.0)(verified.F, verified.which[-added:], pair))

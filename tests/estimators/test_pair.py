@@ -10,19 +10,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from fmtorch import find_fundamental
+from fmtorch import estimators, find_fundamental
 from fmtorch.core import Correspondences, Estimate, collate
-from fmtorch.estimators import (
-    Fundamental,
-    GraphCut,
-    Homography,
-    IterativelyReweighted,
-    Pair,
-    Ransac,
-    degensac,
-    final_fits,
-    inliers,
-)
 from fmtorch.estimators.batch import Batch, relative_rounding
 from fmtorch.estimators.models import with_focals
 from fmtorch.estimators.models.model import FitScale
@@ -36,7 +25,7 @@ from tests.reference.random import number
 from tests.variants import OTHER_LIBRARIES, built, loaded, variants
 
 
-def normalized(c: Correspondences, i: int = 0, minimal: int = 7) -> tuple[Pair, Any] | str:
+def normalized(c: Correspondences, i: int = 0, minimal: int = 7) -> tuple[estimators.Pair, Any] | str:
     batch = Batch.of(c)
     with np.errstate(all="raise"):  # what overflows is no error of the caller's
         return batch.normalized(batch.pair(i), i, 0, minimal)
@@ -149,8 +138,8 @@ def test_a_pair_is_a_copy_and_its_neighbours_are_invisible() -> None:
     matches = batch.pair(3)
     pair = batch.normalized(matches, 3, 0, 7)[0]
     alone = normalized(many[[3]])[0]
-    assert isinstance(pair, Pair)
-    assert isinstance(alone, Pair)
+    assert isinstance(pair, estimators.Pair)
+    assert isinstance(alone, estimators.Pair)
     np.testing.assert_array_equal(pair.table, alone.table)
     before = matches.x0.copy()
     pair.table[:] = 0
@@ -185,9 +174,9 @@ def test_the_rounding_of_coordinates() -> None:
 EVERY = variants("estimator")
 OWN = [name for name in EVERY if not name.startswith(OTHER_LIBRARIES)]
 PIXELS = [  # what is a distance in pixels and no option
-    (degensac, "PLANE_THRESHOLD_PX"), (with_focals, "INLIER_SIGMA_PX"), (with_focals, "LOSS_SCALE_PX"),
-    (with_focals, "PARALLEL_PX"), (inliers, "FLOOR_PX"), (GraphCut, "RADIUS_PX"),
-    (Fundamental, "fit_scale"), (Homography, "fit_scale"),
+    (estimators.degensac, "PLANE_THRESHOLD_PX"), (with_focals, "INLIER_SIGMA_PX"), (with_focals, "LOSS_SCALE_PX"),
+    (with_focals, "PARALLEL_PX"), (estimators.inliers, "FLOOR_PX"), (estimators.GraphCut, "RADIUS_PX"),
+    (estimators.Fundamental, "fit_scale"), (estimators.Homography, "fit_scale"),
 ]  # fmt: skip
 
 
@@ -322,11 +311,11 @@ UNMOVED = {"unweighted_least_squares": ("prior", "noise"), **{f"irls {name}": ("
 """What a fit takes no account of."""
 
 
-def attached_estimator(name: str) -> Ransac | IterativelyReweighted:
+def attached_estimator(name: str) -> estimators.Ransac | estimators.IterativelyReweighted:
     """One whose fits converge."""
     if name.startswith("irls "):
-        return IterativelyReweighted(loss=name.removeprefix("irls "), threshold=2.0, refine_iterations=60)
-    return Ransac(**(SEARCH | FITS[name]))  # type: ignore[arg-type]
+        return estimators.IterativelyReweighted(loss=name.removeprefix("irls "), threshold=2.0, refine_iterations=60)
+    return estimators.Ransac(**(SEARCH | FITS[name]))  # type: ignore[arg-type]
 
 
 def inputs(seed: int, noise: float, same: bool = False) -> dict[str, Tensor]:
@@ -342,9 +331,11 @@ def inputs(seed: int, noise: float, same: bool = False) -> dict[str, Tensor]:
 @pytest.fixture
 def converging(monkeypatch: pytest.MonkeyPatch) -> None:
     """Final fits that go on to the optimum."""
-    monkeypatch.setattr(final_fits, "STEPS", final_fits.STEPS._replace(iterations=30, tolerance=None))
-    monkeypatch.setattr(final_fits, "FOCAL_ITERATIONS", 30)
-    monkeypatch.setattr(final_fits, "FOCAL_TOLERANCE", 0.0)
+    monkeypatch.setattr(
+        estimators.final_fits, "STEPS", estimators.final_fits.STEPS._replace(iterations=30, tolerance=None)
+    )
+    monkeypatch.setattr(estimators.final_fits, "FOCAL_ITERATIONS", 30)
+    monkeypatch.setattr(estimators.final_fits, "FOCAL_TOLERANCE", 0.0)
 
 
 @pytest.mark.usefixtures("converging")

@@ -9,22 +9,8 @@ import pytest
 import torch
 from scipy import stats
 
+from fmtorch import estimators
 from fmtorch.core import Correspondences, collate
-from fmtorch.estimators import (
-    EightPoint,
-    InlierCount,
-    Magsac,
-    Msac,
-    Pair,
-    Preselect,
-    PriorWeighted,
-    Prosac,
-    Sampler,
-    SaturatedGains,
-    SevenPoint,
-    StoppingRule,
-    Uniform,
-)
 from fmtorch.estimators.models.model import Hypotheses
 from fmtorch.estimators.preselection import (
     FIRST_LOOK,
@@ -47,34 +33,34 @@ from tests.reference.ransac import degenerate_support as expected_support
 
 
 @dataclasses.dataclass
-class Told(StoppingRule):
+class Told(estimators.StoppingRule):
     """A stopping rule that does as told, and counts how often it is asked."""
 
     answer: Callable[[int], bool]
     asked: list[int] = dataclasses.field(default_factory=list)
 
-    def __call__(self, F: Any, draws: int, pair: Pair, size: int) -> bool:
+    def __call__(self, F: Any, draws: int, pair: estimators.Pair, size: int) -> bool:
         self.asked.append(draws)
         return self.answer(draws)
 
 
-class Late(SevenPoint):
+class Late(estimators.SevenPoint):
     """Samples before the hundredth give no model."""
 
-    def solve(self, pair: Pair, sample: Any, start: int) -> Hypotheses:
+    def solve(self, pair: estimators.Pair, sample: Any, start: int) -> Hypotheses:
         hypotheses = super().solve(pair, sample, start)
         return hypotheses if start >= 100 else hypotheses._replace(F=hypotheses.F[:0], draw=hypotheses.draw[:0])
 
 
-def search(family: Any = None, sampler: Sampler | None = None, **options: Any) -> Search:
-    preselection = Preselection(Msac(1.0), options.pop("preselect", None))
+def search(family: Any = None, sampler: estimators.Sampler | None = None, **options: Any) -> Search:
+    preselection = Preselection(estimators.Msac(1.0), options.pop("preselect", None))
     options = {"pool": 4, "hypotheses": 150, "round": 50, **options}
-    return Search(family or SevenPoint(), sampler or Uniform(), preselection, **options)
+    return Search(family or estimators.SevenPoint(), sampler or estimators.Uniform(), preselection, **options)
 
 
-@pytest.mark.parametrize("family", [SevenPoint(), EightPoint()])
-@pytest.mark.parametrize("sampler", [Uniform(), Prosac(), PriorWeighted()])
-def test_models_are_those_of_the_samples_of_their_draws(family: Any, sampler: Sampler) -> None:
+@pytest.mark.parametrize("family", [estimators.SevenPoint(), estimators.EightPoint()])
+@pytest.mark.parametrize("sampler", [estimators.Uniform(), estimators.Prosac(), estimators.PriorWeighted()])
+def test_models_are_those_of_the_samples_of_their_draws(family: Any, sampler: estimators.Sampler) -> None:
     """In the order of draws; each sample gives those that the definition gives and that its matches' sides agree to."""
     pair, draws, alike = named("scene 300"), 60, 0
     sample = sampler.draw(pair, 40, draws, family.size)
@@ -127,13 +113,13 @@ def test_a_pool_is_a_stable_sort_of_all_that_it_was_offered(m: int, k: int, size
     np.testing.assert_array_equal(pool_score[:filled], score[best])
 
 
-@pytest.mark.parametrize("preselect", [None, Preselect(64, 20)])
-def test_a_search_keeps_the_best_models_of_all_rounds(preselect: Preselect | None) -> None:
+@pytest.mark.parametrize("preselect", [None, estimators.Preselect(64, 20)])
+def test_a_search_keeps_the_best_models_of_all_rounds(preselect: estimators.Preselect | None) -> None:
     pair, single = named("scene 300"), search(preselect=preselect, round=50)
     pool = single(pair, 30)
     F, score = [], []
     for start in (30, 80, 130):
-        hypotheses = single.family.solve(pair, Uniform().draw(pair, start, 50, 7), start)
+        hypotheses = single.family.solve(pair, estimators.Uniform().draw(pair, start, 50, 7), start)
         which, scores = single.preselection(hypotheses.F, pair)
         F.append(hypotheses.F[which])
         score.append(scores)
@@ -163,7 +149,7 @@ def test_a_search_ends_when_the_stopping_rule_says_so() -> None:
 def test_a_search_goes_on_while_no_sample_gave_a_model() -> None:
     """All matches are inliers of the zero model that an empty pool holds."""
     pair = pair_of(scene(0, 100, outliers=0.0, noise=0.0))
-    pool = search(Late(), stop=StoppingRule(0.9999, 1.0, Uniform()), hypotheses=400)(pair)
+    pool = search(Late(), stop=estimators.StoppingRule(0.9999, 1.0, estimators.Uniform()), hypotheses=400)(pair)
     assert pool.filled
     assert pool.samples == 150
 
@@ -171,7 +157,7 @@ def test_a_search_goes_on_while_no_sample_gave_a_model() -> None:
 SEED = 3
 
 
-def numbers(pair: Pair) -> list[int]:
+def numbers(pair: estimators.Pair) -> list[int]:
     return [number(pair.seed, pair.key, Stream.PRESELECTION, 0, i, 1) for i in range(pair.count)]
 
 
@@ -213,10 +199,13 @@ def test_the_best_of_a_round_and_the_first_of_equals(m: int, k: int) -> None:
     np.testing.assert_array_equal(which, np.sort(np.argsort(-score, kind="stable")[:k]))
 
 
-@pytest.mark.parametrize("score", [InlierCount(1.5), Msac(1.5, True), Magsac(1.5), SaturatedGains(1.5)])
+@pytest.mark.parametrize(
+    "score",
+    [estimators.InlierCount(1.5), estimators.Msac(1.5, True), estimators.Magsac(1.5), estimators.SaturatedGains(1.5)],
+)
 @pytest.mark.parametrize("given", ["scene 700", "real 7"])
 def test_the_models_that_pass_are_the_best_on_few_matches(given: str, score: Any) -> None:
-    pair, options = named(given, seed=SEED), Preselect(matches=64, survivors=20)
+    pair, options = named(given, seed=SEED), estimators.Preselect(matches=64, survivors=20)
     F = models(pair, 120).astype(np.float32)
     which, scores = Preselection(score, options)(F, pair)
     draw = drawn_by_prior if score.prior_weighted and pair.prior is not None else shuffled_first
@@ -228,10 +217,10 @@ def test_the_models_that_pass_are_the_best_on_few_matches(given: str, score: Any
 @pytest.mark.parametrize("given", ["scene 700", *FEW])
 def test_all_models_are_scored_where_there_is_little_to_gain(given: str) -> None:
     """Without preselection, for no more models than pass, and for matches that are few anyway."""
-    pair, score = named(given), Msac(1.5)
+    pair, score = named(given), estimators.Msac(1.5)
     F = models(pair, 30).astype(np.float32)
-    few = None if pair.bucket >= 2 * 64 else Preselect(64, 20)
-    for options in (None, Preselect(64, 30), Preselect(512, 20), few):
+    few = None if pair.bucket >= 2 * 64 else estimators.Preselect(64, 20)
+    for options in (None, estimators.Preselect(64, 30), estimators.Preselect(512, 20), few):
         which, scores = Preselection(score, options)(F, pair)
         np.testing.assert_array_equal(which, np.arange(30))
         np.testing.assert_array_equal(scores, score(F, np.arange(30), pair))
@@ -305,11 +294,11 @@ def test_lines_up_to_the_rounding_of_float32_coordinates() -> None:
         assert ("line in image 0" in reason_of(line, other)) == on_line
 
 
-SAMPLERS = [Uniform(), PriorWeighted(), Prosac()]
+SAMPLERS = [estimators.Uniform(), estimators.PriorWeighted(), estimators.Prosac()]
 DRAW_SEED = 3
 
 
-def pair(count: int, prior: str = "given") -> Pair:
+def pair(count: int, prior: str = "given") -> estimators.Pair:
     c = known(count)
     index = torch.arange(count)[None]
     priors = {
@@ -319,7 +308,7 @@ def pair(count: int, prior: str = "given") -> Pair:
     return pair_of(c.replace(prior=priors[prior]), seed=DRAW_SEED)
 
 
-def numbers_of(pair: Pair, draw: int, columns: int) -> list[int]:
+def numbers_of(pair: estimators.Pair, draw: int, columns: int) -> list[int]:
     return [number(pair.seed, pair.key, Stream.SAMPLING, draw, j, columns) for j in range(columns)]
 
 
@@ -332,7 +321,7 @@ def test_samples_by_weight_are_those_of_the_definition(count: int, size: int, pr
     weights = (
         ones if matches.prior is None else reference.quantised(matches.prior.tolist(), largest_weight(matches.bucket))
     )
-    for sampler, expected in ((PriorWeighted(), weights), (Uniform(), ones)):
+    for sampler, expected in ((estimators.PriorWeighted(), weights), (estimators.Uniform(), ones)):
         assert sampler.weight(matches).tolist() == expected
         assert sum(expected) <= 1 << 30
         for start, draws in ((0, 20), (700, 11)):
@@ -346,7 +335,7 @@ def test_samples_by_weight_are_those_of_the_definition(count: int, size: int, pr
 @pytest.mark.parametrize("size", [4, 5, 7, 8])
 @pytest.mark.parametrize("count", [8, 9, 20, 40, 700])
 def test_samples_of_prosac_are_those_of_the_definition(count: int, size: int) -> None:
-    matches, sampler = pair(count), Prosac()
+    matches, sampler = pair(count), estimators.Prosac()
     exact, grown = reference.prosac_growth(count, size, sampler.GROWTH)
     table = sampler.growth(count, size).tolist()
     for n in range(1, count):  # a whole number that rounding has put above itself is rounded up to the next
@@ -365,7 +354,7 @@ def test_samples_of_prosac_are_those_of_the_definition(count: int, size: int) ->
 def test_prosac_ranks_by_prior_where_there_is_no_quality() -> None:
     matches = pair_of(scene(1, 100).replace(ratio=None))
     rank = np.argsort(np.argsort(-matches.prior, kind="stable"))
-    sample = rank[Prosac().draw(matches, 0, 300, 7)]
+    sample = rank[estimators.Prosac().draw(matches, 0, 300, 7)]
     assert sorted(sample[:, 0].tolist()) == list(range(7))
     assert (np.diff(sample.max(0)) >= 0).all()
 
@@ -373,13 +362,15 @@ def test_prosac_ranks_by_prior_where_there_is_no_quality() -> None:
 def test_prosac_is_uniform_after_its_growth_and_where_nothing_is_ranked() -> None:
     """Without a rank the order of matches means nothing: the first half may be a part of the image."""
     matches = pair(20)
-    end = int(Prosac().growth(20, 7)[-1])
-    assert (Prosac().draw(matches, end - 1, 1, 7) == np.argsort(matches.ambiguity)[-1]).any()
-    across = Prosac().draw(matches, end - 30, 60, 7)
-    np.testing.assert_array_equal(across[:, :30], Prosac().draw(matches, end - 30, 30, 7))
-    np.testing.assert_array_equal(across[:, 30:], Uniform().draw(matches, end, 30, 7))
+    end = int(estimators.Prosac().growth(20, 7)[-1])
+    assert (estimators.Prosac().draw(matches, end - 1, 1, 7) == np.argsort(matches.ambiguity)[-1]).any()
+    across = estimators.Prosac().draw(matches, end - 30, 60, 7)
+    np.testing.assert_array_equal(across[:, :30], estimators.Prosac().draw(matches, end - 30, 30, 7))
+    np.testing.assert_array_equal(across[:, 30:], estimators.Uniform().draw(matches, end, 30, 7))
     nothing = pair_of(scene(1, 100).replace(ratio=None, prior=None))
-    np.testing.assert_array_equal(Prosac().draw(nothing, 100, 300, 7), Uniform().draw(nothing, 100, 300, 7))
+    np.testing.assert_array_equal(
+        estimators.Prosac().draw(nothing, 100, 300, 7), estimators.Uniform().draw(nothing, 100, 300, 7)
+    )
 
 
 @pytest.mark.parametrize("key", [0, 1, -1, 2**63 - 1, -(2**63)])
@@ -387,10 +378,10 @@ def test_prosac_is_uniform_after_its_growth_and_where_nothing_is_ranked() -> Non
 def test_samples_of_any_key_and_seed(seed: int, key: int) -> None:
     matches = pair_of(scene(0, 30).replace(key=torch.tensor([key])), seed=seed)
     expected = [reference.weighted_sample([1] * 30, numbers_of(matches, d, 7)) for d in range(20)]
-    assert Uniform().draw(matches, 0, 20, 7).T.tolist() == expected
+    assert estimators.Uniform().draw(matches, 0, 20, 7).T.tolist() == expected
 
 
-@pytest.mark.parametrize("sampler", [Uniform(), PriorWeighted()])
+@pytest.mark.parametrize("sampler", [estimators.Uniform(), estimators.PriorWeighted()])
 def test_samples_follow_the_prior(sampler: Any) -> None:
     """Chi-square of how often a match is the first, and the second of a sample, at 1e-4."""
     matches, draws = pair(30), 50_000
@@ -403,7 +394,7 @@ def test_samples_follow_the_prior(sampler: Any) -> None:
 
 
 @pytest.mark.parametrize("sampler", SAMPLERS)
-def test_samples_are_a_function_of_seed_key_and_draw(sampler: Sampler) -> None:
+def test_samples_are_a_function_of_seed_key_and_draw(sampler: estimators.Sampler) -> None:
     def drawn(c: Correspondences, i: int = 0, start: int = 0, count: int = 400, seed: int = 0) -> Any:
         return sampler.draw(pair_of(c, seed, i), start, count, 7)
 

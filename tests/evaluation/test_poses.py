@@ -13,20 +13,9 @@ import torch
 from PIL import ExifTags, Image
 from rich.console import Console
 
-from fmtorch import presets
+from fmtorch import evaluation, presets
 from fmtorch.core import PAIR_TYPES, WARNINGS, Correspondences, Estimate, collate
 from fmtorch.data import GivenMatches, ImagePair, ImageSource, load
-from fmtorch.evaluation import (
-    WithPairCameras,
-    built_with,
-    cameras_of,
-    evaluate,
-    focal_errors,
-    summarize,
-    summary_markdown,
-    tables,
-    terminal_tables,
-)
 from fmtorch.evaluation.statistics import homography_figures
 from fmtorch.metrics import corner_error, pose_auc
 from fmtorch.pipeline import Outcome, Pipeline, examined
@@ -63,7 +52,7 @@ def without(o: Outcome, **changes: object) -> Outcome:
 
 def test_rows_have_the_pose_errors_of_the_reference() -> None:
     outcomes = [outcome(seed) for seed in range(4)]
-    for o, row in zip(outcomes, evaluate(outcomes), strict=True):
+    for o, row in zip(outcomes, evaluation.evaluate(outcomes), strict=True):
         kept = o.estimate.inliers[0].numpy()
         x0, x1 = (x[0].numpy()[kept] for x in (o.correspondences.x0, o.correspondences.x1))
         R, t, _ = solvers.pose(o.estimate.F[0].numpy(), o.pair.K0, o.pair.K1, x0, x1)
@@ -82,7 +71,7 @@ def test_why_a_pair_has_no_pose_error() -> None:
     uncalibrated = without(outcome(3), K0=None, K1=None)
     unposed = without(outcome(4), R=None, t=None)
     broken = without(outcome(5), t=np.full(3, np.nan))
-    rows = evaluate([failed, uncalibrated, sound, unposed, nothing, broken])
+    rows = evaluation.evaluate([failed, uncalibrated, sound, unposed, nothing, broken])
     assert [(row.rotation_error, row.translation_error, row.pose_reason) for row in (*rows[:2], *rows[3:])] == [
         (180.0, 90.0, "no F"),
         (None, None, "K0, K1 unknown"),
@@ -90,25 +79,25 @@ def test_why_a_pair_has_no_pose_error() -> None:
         (180.0, 90.0, "no inlier in front of both cameras"),
         (None, None, "t not finite"),
     ]
-    (alone,) = evaluate([sound])
+    (alone,) = evaluation.evaluate([sound])
     assert (alone.rotation_error, alone.translation_error) == (rows[2].rotation_error, rows[2].translation_error)
 
 
 def test_signed_errors_are_of_the_best_of_four_poses_and_keep_the_sign_of_an_estimates_own() -> None:
     outcomes = [outcome(seed) for seed in range(3)]
-    for o, row in zip(outcomes, evaluate(outcomes, signed=True), strict=True):
+    for o, row in zip(outcomes, evaluation.evaluate(outcomes, signed=True), strict=True):
         four = solvers.poses(o.pair.K1.T @ o.estimate.F[0].numpy() @ o.pair.K0)
         expected = reference.closest_pose_error(four, o.pair.R, o.pair.t)
         assert (row.rotation_error, row.translation_error) == pytest.approx(expected, abs=1e-6)
     own = [o.estimate.replace(R=torch.eye(3)[None], t=-torch.from_numpy(o.pair.t)[None].float()) for o in outcomes]
     posed = [dataclasses.replace(o, estimate=estimate) for o, estimate in zip(outcomes, own, strict=True)]
-    for row, folded in zip(evaluate(posed, signed=True), evaluate(posed), strict=True):
+    for row, folded in zip(evaluation.evaluate(posed, signed=True), evaluation.evaluate(posed), strict=True):
         assert row.translation_error == pytest.approx(180, abs=0.1)  # t in float32: the root of its rounding
         assert folded.translation_error == pytest.approx(0, abs=0.1)
         assert row.rotation_error == folded.rotation_error
     failed = dataclasses.replace(outcomes[0], estimate=None, correspondences=None, reason="no keypoints in image 0")
     nothing = dataclasses.replace(outcomes[1], estimate=outcomes[1].estimate.replace(F=torch.zeros(1, 3, 3).double()))
-    rows = evaluate([failed, nothing], signed=True)
+    rows = evaluation.evaluate([failed, nothing], signed=True)
     assert [(row.rotation_error, row.translation_error) for row in rows] == [(180.0, 180.0)] * 2
     assert [row.pose_reason for row in rows] == ["no F", "F has no pose"]
 
@@ -221,14 +210,14 @@ def test_what_each_word_gives(tmp_path: Path) -> None:
     pair = outcome(0).pair
     ends = photograph(tmp_path / "a.jpg", 36), photograph(tmp_path / "b.jpg", None)
     pair = dataclasses.replace(pair, image0=ends[0], image1=ends[1])
-    known = cameras_of([pair], "known")[pair.key]
+    known = evaluation.cameras_of([pair], "known")[pair.key]
     assert torch.equal(known.K0, torch.from_numpy(pair.K0))
     assert known.focal.tolist() == [[1, 0], [1, 0]]
-    exif = cameras_of([pair], "exif")[pair.key]
+    exif = evaluation.cameras_of([pair], "exif")[pair.key]
     assert exif.K0 is exif.K1 is None
     assert exif.focal[0].tolist() == pytest.approx([60, math.hypot(0.06, 1 / math.sqrt(12) / 36)])
     assert exif.focal[1].tolist() == [1, math.inf]
-    shared, unknown = (cameras_of([pair], word)[pair.key] for word in ("shared", "unknown"))
+    shared, unknown = (evaluation.cameras_of([pair], word)[pair.key] for word in ("shared", "unknown"))
     assert (shared.shared_focal, unknown.shared_focal) == (True, False)
     assert shared.focal[:, 1].tolist() == unknown.focal[:, 1].tolist() == [math.inf, math.inf]
 
@@ -236,22 +225,24 @@ def test_what_each_word_gives(tmp_path: Path) -> None:
 def test_a_calibration_that_is_missing_is_named() -> None:
     pair = dataclasses.replace(outcome(1).pair, K1=None)
     with pytest.raises(ValueError, match="cameras=known, but the data set has no calibration of pair p1"):
-        cameras_of([pair], "known")
-    assert cameras_of([dataclasses.replace(pair, problem="no image")], "known") == {}
+        evaluation.cameras_of([pair], "known")
+    assert evaluation.cameras_of([dataclasses.replace(pair, problem="no image")], "known") == {}
 
 
 def estimated(outcomes: list[Outcome], cameras: str) -> list[Outcome]:
     """The outcomes with the estimates of a batch whose estimator is given the cameras."""
     c = collate([o.correspondences.replace(key=torch.tensor([o.pair.key])) for o in outcomes])
-    estimator = WithPairCameras(presets.build("estimator", "fmtorch"), cameras_of([o.pair for o in outcomes], cameras))
+    estimator = evaluation.WithPairCameras(
+        presets.build("estimator", "fmtorch"), evaluation.cameras_of([o.pair for o in outcomes], cameras)
+    )
     estimate = estimator(c, 0)
     return [dataclasses.replace(o, estimate=estimate[i]) for i, o in enumerate(outcomes)]
 
 
 def test_rows_have_the_pose_of_the_estimate_and_neighbours_change_nothing() -> None:
     outcomes = [outcome(seed, noise=0.1) for seed in range(3)]
-    rows = evaluate(estimated(outcomes, "known"))
-    for row, alone in zip(rows, (evaluate(estimated([o], "known"))[0] for o in outcomes), strict=True):
+    rows = evaluation.evaluate(estimated(outcomes, "known"))
+    for row, alone in zip(rows, (evaluation.evaluate(estimated([o], "known"))[0] for o in outcomes), strict=True):
         assert row.ok
         assert row.pose_reason is None
         assert row.rotation_error < 0.5
@@ -263,7 +254,7 @@ def test_poses_that_are_not_determined_and_pairs_without_estimates_among_others(
     (posed,) = estimated([outcome(0, noise=0.1)], "known")
     nothing = torch.full((1, 3, 3), torch.nan, dtype=torch.float64)
     lost = dataclasses.replace(posed, estimate=posed.estimate.replace(R=nothing, t=nothing[:, 0]))
-    rows = evaluate([lost, posed, outcome(1)])
+    rows = evaluation.evaluate([lost, posed, outcome(1)])
     assert (rows[0].rotation_error, rows[0].translation_error) == (180, 90)
     assert [row.pose_reason for row in rows] == ["the pose is not determined", None, None]
     assert rows[1].rotation_error < 0.5
@@ -313,9 +304,9 @@ def pair(kind: str, n: int = 150) -> ImagePair:
 def rows(pairs: list[ImagePair], word: str | None) -> list[PairRow]:
     built = pipeline()
     if word is not None:
-        built = built_with(lambda: built, cameras_of(pairs, word))  # type: ignore[arg-type]
-    knowledge = built.estimator.given if isinstance(built.estimator, WithPairCameras) else None
-    return evaluate(examined(built, built.run(pairs), 0, knowledge))
+        built = evaluation.built_with(lambda: built, evaluation.cameras_of(pairs, word))  # type: ignore[arg-type]
+    knowledge = built.estimator.given if isinstance(built.estimator, evaluation.WithPairCameras) else None
+    return evaluation.evaluate(examined(built, built.run(pairs), 0, knowledge))
 
 
 @pytest.mark.parametrize("word", [None, "known", "unknown"])
@@ -337,7 +328,7 @@ def test_a_pair_that_cannot_be_examined_harms_no_other() -> None:
     broken = dataclasses.replace(outcomes[0], estimate=outcomes[0].estimate.replace(model="homography"))
     results = examined(built, [broken, outcomes[1]])
     assert [o.pair_type is None for o in results] == [True, False]
-    first, second = evaluate([dataclasses.replace(results[0], estimate=outcomes[0].estimate), results[1]])
+    first, second = evaluation.evaluate([dataclasses.replace(results[0], estimate=outcomes[0].estimate), results[1]])
     assert first.warning.startswith("not examined: ValueError: estimate is of homography matrices")
     assert second.pair_type == "planar"
 
@@ -358,37 +349,37 @@ def test_errors_of_focal_lengths() -> None:
     source = pair("general")
     c, _ = source.matches()
     asked = c.replace(focal=torch.tensor([[[1.0, torch.inf], [1.0, torch.inf]]], dtype=torch.float64))
-    focals = focal_errors(estimated_type(asked, [1.1 * 768, math.nan], (K, K)))
+    focals = evaluation.focal_errors(estimated_type(asked, [1.1 * 768, math.nan], (K, K)))
     assert focals.error[0] == pytest.approx(0.1)
     assert focals.log_ratio[0] == pytest.approx(math.log(1.1))
     assert (focals.error[1], focals.log_ratio[1]) == (math.inf, None)
     exact = asked.replace(focal=torch.tensor([[[768.0, 0.0], [768.0, 0.05]]], dtype=torch.float64))
     wide = np.diag([4.0, 1.0, 1.0]) @ K
-    focals = focal_errors(estimated_type(exact, [768.0, 768.0], (K, wide)))
+    focals = evaluation.focal_errors(estimated_type(exact, [768.0, 768.0], (K, wide)))
     assert focals.error == (None, pytest.approx(0.5))
-    assert focal_errors(estimated_type(asked, [768.0, 768.0], (None, K))).error == (None, 0)
-    assert focal_errors(estimated_type(c, [768.0, 768.0], (K, K))).error == (None, None)  # nobody asked
+    assert evaluation.focal_errors(estimated_type(asked, [768.0, 768.0], (None, K))).error == (None, 0)
+    assert evaluation.focal_errors(estimated_type(c, [768.0, 768.0], (K, K))).error == (None, None)  # nobody asked
 
 
 def test_summaries_and_reports_show_them() -> None:
     pairs = [pair(kind) for kind in ("general", "planar")]
     table = to_table(rows(pairs, "unknown"))
-    summary = summarize(table)
+    summary = evaluation.summarize(table)
     assert summary["all"]["pair_types"] == {**dict.fromkeys(PAIR_TYPES, 0), "general": 1, "planar": 1}
     assert summary["all"]["focals"]["images"] == 4
     console = Console(width=80, record=True)
-    for each in terminal_tables(summary, "t")[1:]:
+    for each in evaluation.terminal_tables(summary, "t")[1:]:
         console.print(each)
     shown = console.export_text()
     assert "Focal lengths" in shown
     assert "do not determine F" in shown
-    page = summary_markdown(summary, "run")
+    page = evaluation.summary_markdown(summary, "run")
     assert "| family | 1 | 1 | 0 | 0 | 0 |" in page
     assert "folded" in page
-    of_report = {each.heading: each for each in tables.report_tables({"run": table}, {"run": summary})}
+    of_report = {each.heading: each for each in evaluation.tables.report_tables({"run": table}, {"run": summary})}
     assert [cell.text for cell in of_report["Pair types"].rows["run"]] == ["1", "1", "0", "0", "0"]
     assert of_report["Focal lengths"].rows["run"][0].text == "4"
     nobody = to_table([dataclasses.replace(row, pair_type=None) for row in rows(pairs[:1], None)])
-    assert "Pair types" not in {part.heading for part in tables.parts(summarize(nobody))}
-    alone = terminal_tables(summarize(to_table(rows(pairs[:1], None))), "t")
+    assert "Pair types" not in {part.heading for part in evaluation.tables.parts(evaluation.summarize(nobody))}
+    alone = evaluation.terminal_tables(evaluation.summarize(to_table(rows(pairs[:1], None))), "t")
     assert [each.title for each in alone] == ["t", "Relative pose"]  # all general: nothing to say

@@ -15,17 +15,7 @@ from rich.console import Console
 
 from fmtorch import metrics
 from fmtorch.core import pair_key
-from fmtorch.evaluation import common_reasons, summarize, summary_markdown, terminal_tables
-from fmtorch.evaluation.statistics import (
-    MIN_SCENES,
-    MIN_UNITS,
-    RESAMPLES,
-    bootstrap_mean,
-    difference,
-    effective_pairs,
-    share_difference,
-    share_interval,
-)
+from fmtorch.evaluation import common_reasons, statistics, summarize, summary_markdown, terminal_tables
 from fmtorch.runs import PairRow, to_table
 from tests.reference.metrics import bootstrap_interval
 
@@ -164,15 +154,15 @@ def quantile_error(values: np.ndarray, clusters: int, resamples: int) -> float:
     return float(4.5 * np.sqrt(2) * means * np.sqrt(0.025 * 0.975 / resamples) / density)
 
 
-@pytest.mark.parametrize("scenes", [MIN_SCENES - 1, 40])
+@pytest.mark.parametrize("scenes", [statistics.MIN_SCENES - 1, 40])
 def test_equals_the_reference(scenes: int) -> None:
     values, names = correlated(scenes, 12)
-    result = bootstrap_mean(values, names)
-    over_scenes = scenes >= MIN_SCENES
+    result = statistics.bootstrap_mean(values, names)
+    over_scenes = scenes >= statistics.MIN_SCENES
     clusters = names if over_scenes else [str(i) for i in range(len(names))]
-    low, high = bootstrap_interval(values.tolist(), clusters, RESAMPLES)
+    low, high = bootstrap_interval(values.tolist(), clusters, statistics.RESAMPLES)
     # Monte-Carlo error of both, and one step of the mean of 0/1 values, on which quantiles of few values lie.
-    tolerance = quantile_error(values, len(set(clusters)), RESAMPLES) + 1 / len(values)
+    tolerance = quantile_error(values, len(set(clusters)), statistics.RESAMPLES) + 1 / len(values)
     assert (result.over, result.value) == ("scene" if over_scenes else "pair", values.mean())
     assert result.low == pytest.approx(low, abs=tolerance)
     assert result.high == pytest.approx(high, abs=tolerance)
@@ -184,7 +174,7 @@ def test_coverage_over_scenes() -> None:
     for seed in range(trials):
         values, names = correlated(40, 10, seed)
         for over, clusters in (("scene", names), ("pair", ["one"] * len(names))):
-            result = bootstrap_mean(values, clusters)
+            result = statistics.bootstrap_mean(values, clusters)
             assert result.over == over
             hold[over] += result.low <= 0.5 <= result.high
     # The percentile interval of 40 clusters is known to cover some 94 %; 3.5 standard deviations of a binomial share.
@@ -194,23 +184,28 @@ def test_coverage_over_scenes() -> None:
 
 @pytest.mark.parametrize("value", [0.0, 1.0])
 def test_no_spread_no_width(value: float) -> None:
-    result = bootstrap_mean(np.full(7, value), list("abcdefg"))
+    result = statistics.bootstrap_mean(np.full(7, value), list("abcdefg"))
     assert (result.value, result.low, result.high) == (value, value, value)
-    assert bootstrap_mean(np.array([value]), ["a"]).low == value
+    assert statistics.bootstrap_mean(np.array([value]), ["a"]).low == value
 
 
 def test_a_difference_of_the_same_pairs_is_sharper_than_apart() -> None:
     base, names = correlated(30, 10)
     rng = np.random.default_rng(1)
     better = np.maximum(base, rng.random(len(base)) < 0.1).astype(np.float64)  # a tenth of the misses become hits
-    result, flipped, same = (difference(a, b, names) for a, b in ((better, base), (base, better), (base, base)))
+    result, flipped, same = (
+        statistics.difference(a, b, names) for a, b in ((better, base), (base, better), (base, base))
+    )
     assert result.value == pytest.approx(better.mean() - base.mean(), abs=1e-12)
     assert result.low > 0
-    assert result.high - result.low < bootstrap_mean(base, names).high - bootstrap_mean(base, names).low
+    assert (
+        result.high - result.low
+        < statistics.bootstrap_mean(base, names).high - statistics.bootstrap_mean(base, names).low
+    )
     assert (flipped.low, flipped.high) == pytest.approx((-result.high, -result.low), abs=1e-12)
     assert (same.value, same.low, same.high) == (0, 0, 0)
     with pytest.raises(ValueError, match="a has 2 and b has 3"):
-        difference(np.zeros(2), np.zeros(3), ["a", "b"])
+        statistics.difference(np.zeros(2), np.zeros(3), ["a", "b"])
 
 
 def one_scene(n: int) -> list[str]:
@@ -227,7 +222,7 @@ def successes(r: int, n: int) -> np.ndarray:
     [(81, 263, 0.2553, 0.3662), (15, 148, 0.0624, 0.1605), (0, 20, 0.0, 0.1611), (1, 29, 0.0061, 0.1718)],
 )
 def test_published_answers(r: int, n: int, low: float, high: float) -> None:
-    interval = share_interval(successes(r, n), one_scene(n))
+    interval = statistics.share_interval(successes(r, n), one_scene(n))
     assert (interval.value, interval.over) == (r / n, "pair")
     assert (interval.low, interval.high) == pytest.approx((low, high), abs=5e-5)
 
@@ -238,7 +233,7 @@ def test_coverage_over_all_shares_is_the_level(n: int) -> None:
     p = (np.arange(2000) + 0.5) / 2000
     covered = np.zeros_like(p)
     for r in range(n + 1):
-        interval = share_interval(successes(r, n), one_scene(n))
+        interval = statistics.share_interval(successes(r, n), one_scene(n))
         chance = math.comb(n, r) * p**r * (1 - p) ** (n - r)
         covered += chance * ((interval.low <= p) & (p <= interval.high))
     assert 0.94 < covered.mean() < 0.97
@@ -249,10 +244,10 @@ def test_pairs_that_succeed_together_count_as_one() -> None:
     together = np.repeat(np.arange(20) % 2 == 0, 10)
     # Every scene is all or nothing: as good as 20 pairs, whose variance has 19 degrees of freedom in place of 199.
     alike = 20 * (19 / 20) * (200 / 199) * (1.971957 / 2.093024) ** 2
-    assert effective_pairs(together.astype(float), scenes) == pytest.approx(alike)
+    assert statistics.effective_pairs(together.astype(float), scenes) == pytest.approx(alike)
     apart = np.tile(np.arange(10) % 2 == 0, 20)
-    assert 150 < effective_pairs(apart.astype(float), scenes) <= 200
-    wide, narrow = share_interval(together, scenes), share_interval(apart, scenes)
+    assert 150 < statistics.effective_pairs(apart.astype(float), scenes) <= 200
+    wide, narrow = statistics.share_interval(together, scenes), statistics.share_interval(apart, scenes)
     assert wide.high - wide.low > 2.5 * (narrow.high - narrow.low)
     assert wide.over == narrow.over == "scene"
 
@@ -260,39 +255,39 @@ def test_pairs_that_succeed_together_count_as_one() -> None:
 def test_differences() -> None:
     a, b = successes(30, 40), successes(20, 40)
     scenes = one_scene(40)
-    interval = share_difference(a, b, scenes)
+    interval = statistics.share_difference(a, b, scenes)
     assert interval.value == 0.25
     # Bonett and Price by hand: n12 = 10, n21 = 0, n = 40.
     p, q = 11 / 42, 1 / 42
     half = 1.959964 * math.sqrt((p + q - (p - q) ** 2) / 42)
     assert (interval.low, interval.high) == pytest.approx((p - q - half, p - q + half))
-    back = share_difference(b, a, scenes)
+    back = statistics.share_difference(b, a, scenes)
     assert (back.low, back.high) == pytest.approx((-interval.high, -interval.low))
-    same = share_difference(a, a, scenes)
+    same = statistics.share_difference(a, a, scenes)
     assert same.value == 0
     assert same.low == -same.high < 0  # agreeing on forty pairs is no proof of being equal
-    assert share_difference(a[:3], a[:3], scenes[:3]).high > 0.4
+    assert statistics.share_difference(a[:3], a[:3], scenes[:3]).high > 0.4
 
 
 def test_means_of_few_pairs_have_no_interval() -> None:
     rng = np.random.default_rng(0)
-    a, b = rng.random(MIN_UNITS), rng.random(MIN_UNITS)
-    assert difference(a[1:], b[1:], one_scene(MIN_UNITS - 1)) is None
-    interval = difference(a, b, one_scene(MIN_UNITS))
+    a, b = rng.random(statistics.MIN_UNITS), rng.random(statistics.MIN_UNITS)
+    assert statistics.difference(a[1:], b[1:], one_scene(statistics.MIN_UNITS - 1)) is None
+    interval = statistics.difference(a, b, one_scene(statistics.MIN_UNITS))
     assert interval.low < interval.value < interval.high
-    six = [f"s{i % 6}" for i in range(9 * MIN_UNITS)]
-    assert difference(np.tile(a, 9), np.tile(b, 9), six) is None
+    six = [f"s{i % 6}" for i in range(9 * statistics.MIN_UNITS)]
+    assert statistics.difference(np.tile(a, 9), np.tile(b, 9), six) is None
 
 
 @given(st.lists(st.tuples(st.booleans(), st.booleans(), st.integers(0, 9)), min_size=1, max_size=60))
 def test_any_pairs_have_an_interval_around_their_share(rows: list[tuple[bool, bool, int]]) -> None:
     a, b = (np.array([row[i] for row in rows]) for i in (0, 1))
     scenes = [f"s{row[2]}" for row in rows]
-    share, gain = share_interval(a, scenes), share_difference(a, b, scenes)
+    share, gain = statistics.share_interval(a, scenes), statistics.share_difference(a, b, scenes)
     assert 0 <= share.low <= share.value <= share.high <= 1
     assert share.high > share.low
     assert -1 <= gain.low <= gain.value <= gain.high <= 1
-    assert 0 < effective_pairs(a.astype(float), scenes) <= len(rows)
+    assert 0 < statistics.effective_pairs(a.astype(float), scenes) <= len(rows)
 
 
 @pytest.mark.parametrize(

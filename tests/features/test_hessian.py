@@ -9,17 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from fmtorch.features import (
-    FRAME_SIGMAS,
-    HessianDetector,
-    ImagePyramid,
-    NetworkOrientation,
-    NetworkShape,
-    dominant_gradient,
-    frame_scale,
-    make_upright,
-    rotate_frames,
-)
+from fmtorch import features
 from fmtorch.features.frames import BINS, _histogram, _window
 from fmtorch.features.hessian import STRIP, OpenCVFilters, TorchFilters, _exceeds_levels, _is_maximum, _samples
 from tests.conftest import oracle, shared_path
@@ -28,17 +18,17 @@ from tests.reference.local_features import dominant_gradient as reference_orient
 from tests.reference.local_features import hessian_keypoints
 
 
-def keypoints(detector: HessianDetector, image: np.ndarray) -> np.ndarray:
+def keypoints(detector: features.HessianDetector, image: np.ndarray) -> np.ndarray:
     """Rows (x, y, sigma, response)."""
     lafs, scores = detector.detect(image)
-    return torch.cat([lafs[:, :, 2], lafs[:, :1, 0] / FRAME_SIGMAS, scores[:, None]], 1).double().numpy()
+    return torch.cat([lafs[:, :, 2], lafs[:, :1, 0] / features.FRAME_SIGMAS, scores[:, None]], 1).double().numpy()
 
 
 @pytest.mark.parametrize("levels", [2, 3])
 def test_equals_the_definition(levels: int) -> None:
     image = texture(0, 50, 61)
     expected = hessian_keypoints(image / 255, 1e-4, levels)
-    found = keypoints(HessianDetector(levels=levels, border=0.0), image)
+    found = keypoints(features.HessianDetector(levels=levels, border=0.0), image)
     assert len(found) == len(expected) > 15
     expected = expected[np.argsort(-expected[:, 3])]
     # float32 filters: rounding of 2^-24 of intensities against differences of about 0.01.
@@ -54,7 +44,7 @@ def test_a_gaussian_blob_has_its_place_and_size(sigma: float, sign: int) -> None
     y, x = np.mgrid[0:150, 0:170]
     centre = np.array([81.3, 70.6])
     blob = np.exp(-((x - centre[0]) ** 2 + (y - centre[1]) ** 2) / (2 * sigma**2))
-    found = keypoints(HessianDetector(max_features=1), (128 + sign * 100 * blob).round().astype(np.uint8))
+    found = keypoints(features.HessianDetector(max_features=1), (128 + sign * 100 * blob).round().astype(np.uint8))
     assert len(found) == 1
     np.testing.assert_allclose(found[0, :2], centre, atol=0.05 * sigma)
     # A quadratic over steps of 2^(1/3), kernels cut at 3 sigma, and rounding to 8 bits.
@@ -64,7 +54,7 @@ def test_a_gaussian_blob_has_its_place_and_size(sigma: float, sign: int) -> None
 def test_the_batch_in_torch_equals_each_image_through_opencv() -> None:
     images = [texture(i) for i in range(3)]
     batch = torch.from_numpy(np.stack(images))[:, None].float() / 255
-    detector = HessianDetector()
+    detector = features.HessianDetector()
     lafs, scores, mask = detector.detect_batch(batch)
     for i, image in enumerate(images):
         expected_lafs, expected_scores = detector.detect(image)
@@ -82,7 +72,10 @@ def test_the_batch_in_torch_equals_each_image_through_opencv() -> None:
 
 def test_at_most_max_features_the_strongest() -> None:
     image = np.tile(texture(1, 60, 60), (2, 3))  # equal blobs: equal scores
-    everything, few = HessianDetector().detect(image)[1], HessianDetector(max_features=20).detect(image)[1]
+    everything, few = (
+        features.HessianDetector().detect(image)[1],
+        features.HessianDetector(max_features=20).detect(image)[1],
+    )
     assert torch.equal(everything, everything.sort(descending=True).values)
     assert torch.equal(few, everything[:20])
 
@@ -91,14 +84,14 @@ def test_of_equal_neighbours_one_remains() -> None:
     # A blob centred between two pixels: their responses are equal in exact arithmetic.
     y, x = np.mgrid[0:60, 0:61]
     blob = np.exp(-((x - 29.5) ** 2 + (y - 30) ** 2) / (2 * 3.0**2))
-    found = keypoints(HessianDetector(), (100 + 100 * blob).round().astype(np.uint8))
+    found = keypoints(features.HessianDetector(), (100 + 100 * blob).round().astype(np.uint8))
     assert (np.abs(found[:, :2] - [29.5, 30]) < 0.1).all(1).sum() == 1
 
 
 def test_border() -> None:
     h, w = 100, 120
     for border in (0.0, 3.0, 6.0):
-        x, y, sigma = keypoints(HessianDetector(border=border), texture(2, h, w))[:, :3].T
+        x, y, sigma = keypoints(features.HessianDetector(border=border), texture(2, h, w))[:, :3].T
         room = np.min([x, y, w - 1 - x, h - 1 - y], 0)
         assert (room >= border * sigma - 1e-3).all()
         assert len(room) > 10
@@ -108,11 +101,13 @@ def test_border() -> None:
 @pytest.mark.parametrize("constant", [True, False])
 def test_small_and_constant_images(shape: tuple[int, int], constant: bool) -> None:
     image = np.full(shape, 90, np.uint8) if constant else texture(0, 400, 400)[: shape[0], : shape[1]]
-    lafs, scores = HessianDetector().detect(image)
+    lafs, scores = features.HessianDetector().detect(image)
     assert lafs.shape == (len(scores), 2, 3)
     if constant or min(shape) < 16:
         assert len(scores) == 0
-    assert HessianDetector().detect_batch(torch.from_numpy(image)[None, None].float() / 255)[0].shape[1] == len(scores)
+    assert features.HessianDetector().detect_batch(torch.from_numpy(image)[None, None].float() / 255)[0].shape[
+        1
+    ] == len(scores)
 
 
 THRESHOLD = 1e-3
@@ -186,35 +181,37 @@ def angle_between(a: Tensor, b: Tensor) -> Tensor:
 
 def test_frame_algebra_is_kornias() -> None:
     lafs = random_frames(0, 50, 100, 100)
-    torch.testing.assert_close(frame_scale(lafs), kornia.feature.get_laf_scale(lafs[None])[0, :, 0, 0])
-    torch.testing.assert_close(make_upright(lafs), kornia.feature.make_upright(lafs[None])[0], rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(features.frame_scale(lafs), kornia.feature.get_laf_scale(lafs[None])[0, :, 0, 0])
+    torch.testing.assert_close(
+        features.make_upright(lafs), kornia.feature.make_upright(lafs[None])[0], rtol=1e-4, atol=1e-4
+    )
     angle = torch.linspace(-3, 3, 50)
     turned = kornia.feature.rotate_laf(lafs[None], torch.rad2deg(angle)[None, :, None])[0]
-    torch.testing.assert_close(rotate_frames(lafs, angle), turned, rtol=1e-4, atol=1e-4)
-    torch.testing.assert_close(make_upright(turned), make_upright(lafs), rtol=1e-4, atol=1e-3)
+    torch.testing.assert_close(features.rotate_frames(lafs, angle), turned, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(features.make_upright(turned), features.make_upright(lafs), rtol=1e-4, atol=1e-3)
 
 
 def test_orientation_equals_the_definition() -> None:
-    patches = ImagePyramid(texture(0)).extract(random_frames(0, 25, 160, 200))
+    patches = features.ImagePyramid(texture(0)).extract(random_frames(0, 25, 160, 200))
     expected = torch.tensor([reference_orientation(p[0].double().numpy()) for p in patches])
-    assert angle_between(dominant_gradient(patches), expected).max() < 1e-4
+    assert angle_between(features.dominant_gradient(patches), expected).max() < 1e-4
 
 
 def test_orientation_turns_with_the_patch() -> None:
-    patches = ImagePyramid(texture(2)).extract(random_frames(2, 100, 160, 200))
-    turned = dominant_gradient(patches.rot90(1, (2, 3)))  # counter-clockwise
-    assert (angle_between(turned, dominant_gradient(patches) + np.pi / 2) < 1e-3).float().mean() > 0.97
-    flat = dominant_gradient(torch.full((2, 1, 32, 32), 0.3))
+    patches = features.ImagePyramid(texture(2)).extract(random_frames(2, 100, 160, 200))
+    turned = features.dominant_gradient(patches.rot90(1, (2, 3)))  # counter-clockwise
+    assert (angle_between(turned, features.dominant_gradient(patches) + np.pi / 2) < 1e-3).float().mean() > 0.97
+    flat = features.dominant_gradient(torch.full((2, 1, 32, 32), 0.3))
     assert torch.isfinite(flat).all()
 
 
-@pytest.mark.parametrize("part", [NetworkShape, NetworkOrientation])
+@pytest.mark.parametrize("part", [features.NetworkShape, features.NetworkOrientation])
 def test_no_frames(part: type) -> None:
     def network(patches: Tensor) -> Tensor:
         raise AssertionError("called without patches")
 
-    assert part(network)(ImagePyramid(texture(0)), torch.zeros(0, 2, 3)).shape == (0, 2, 3)
-    assert dominant_gradient(torch.zeros(0, 1, 32, 32)).shape == (0,)
+    assert part(network)(features.ImagePyramid(texture(0)), torch.zeros(0, 2, 3)).shape == (0, 2, 3)
+    assert features.dominant_gradient(torch.zeros(0, 1, 32, 32)).shape == (0,)
 
 
 def test_shape_is_composed_as_kornias() -> None:
@@ -225,9 +222,9 @@ def test_shape_is_composed_as_kornias() -> None:
     peer.features = torch.nn.Sequential(Constant(numbers))
     image = texture(5)
     expected = peer(lafs[None], torch.from_numpy(image)[None, None].float() / 255)[0]
-    found = NetworkShape(lambda patches: numbers)(ImagePyramid(image), lafs)
+    found = features.NetworkShape(lambda patches: numbers)(features.ImagePyramid(image), lafs)
     torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-3)
-    torch.testing.assert_close(frame_scale(found), frame_scale(lafs), rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(features.frame_scale(found), features.frame_scale(lafs), rtol=1e-4, atol=1e-4)
 
 
 class Constant(torch.nn.Module):
@@ -242,16 +239,16 @@ class Constant(torch.nn.Module):
 def test_impossible_shapes_keep_the_frame() -> None:
     lafs = random_frames(6, 5, 160, 200)
     bad = torch.tensor([[0.1, 0, 0], [-1, 0, 0], [torch.nan, 0, 0], [0, 50, 0], [0.8, 0, -0.9]])
-    found = NetworkShape(lambda patches: bad)(ImagePyramid(texture(6)), lafs)
-    torch.testing.assert_close(found[1:], make_upright(lafs)[1:])
-    assert not torch.allclose(found[0], make_upright(lafs)[0])
+    found = features.NetworkShape(lambda patches: bad)(features.ImagePyramid(texture(6)), lafs)
+    torch.testing.assert_close(found[1:], features.make_upright(lafs)[1:])
+    assert not torch.allclose(found[0], features.make_upright(lafs)[0])
 
 
 def test_orientation_network_turns_by_its_vector() -> None:
     lafs = random_frames(7, 3, 160, 200)
     vectors = torch.tensor([[0.0, 0.3], [0.5, 0.0], [0.1, -0.1]])
-    found = NetworkOrientation(lambda patches: vectors)(ImagePyramid(texture(7)), lafs)
-    expected = rotate_frames(lafs, torch.tensor([0.0, np.pi / 2, 0.75 * np.pi]))
+    found = features.NetworkOrientation(lambda patches: vectors)(features.ImagePyramid(texture(7)), lafs)
+    expected = features.rotate_frames(lafs, torch.tensor([0.0, np.pi / 2, 0.75 * np.pi]))
     torch.testing.assert_close(found, expected, atol=1e-4, rtol=1e-4)
 
 
@@ -284,15 +281,17 @@ def test_authors_networks_give_the_stored_frames() -> None:
         stored = torch.from_numpy(file["laf_affnet"][chosen]).float()
         turned = torch.from_numpy(file["laf_oriented"][chosen]).float()
         # Through kornia's patches, the stored frames. Entries of up to 100 px in float32 through a network.
-        torch.testing.assert_close(NetworkShape(shape)(KorniaPyramid(image), lafs), stored, atol=5e-3, rtol=1e-3)
-        oriented = NetworkOrientation(orientation)(KorniaPyramid(image), stored)
+        torch.testing.assert_close(
+            features.NetworkShape(shape)(KorniaPyramid(image), lafs), stored, atol=5e-3, rtol=1e-3
+        )
+        oriented = features.NetworkOrientation(orientation)(KorniaPyramid(image), stored)
         torch.testing.assert_close(oriented, turned, atol=5e-3, rtol=1e-3)
         # Through ours, which are blurred otherwise, nearly so.
-        found = NetworkShape(shape)(ImagePyramid(image), lafs)
-        gaps.append((found - stored)[..., :2].abs().amax((1, 2)) / frame_scale(lafs))
+        found = features.NetworkShape(shape)(features.ImagePyramid(image), lafs)
+        gaps.append((found - stored)[..., :2].abs().amax((1, 2)) / features.frame_scale(lafs))
     assert torch.cat(gaps).median() < 0.05
 
 
-class KorniaPyramid(ImagePyramid):
+class KorniaPyramid(features.ImagePyramid):
     def extract(self, lafs: Tensor, size: int = 32) -> Tensor:
         return kornia.feature.extract_patches_from_pyramid(self.levels[0][None, None], lafs[None], size)[0]

@@ -14,23 +14,9 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from torch import Tensor
 
-from fmtorch import find_fundamental, metrics, presets
+from fmtorch import find_fundamental, metrics, presets, pruning
 from fmtorch.core import Correspondences, Features
 from fmtorch.matching import NearestNeighborMatcher, nearest_neighbors
-from fmtorch.pruning import (
-    MutualCheck,
-    OneToOne,
-    RatioTest,
-    frame_agreement,
-    gms,
-    lpm,
-    lpm_cost,
-    match_noise,
-    mutual,
-    one_to_one,
-    position_agreement,
-    ratio_test,
-)
 from fmtorch.pruning.consistency import CURVES, MIN_VOTE, NOISE, SCALES, TOLERANCE, TURNS, WINDOW, WORST_RATIO
 from tests.geometry.scenes import scene as matched_scene
 from tests.laws import calibrated, degenerate, quick_pruner, scene, scenes, small, with_padding
@@ -44,8 +30,8 @@ from tests.variants import built, variants
 
 def test_ratio_is_strict_and_refuses_nan() -> None:
     ratio = torch.tensor([[0.0, 0.79, 0.8, 1.0, math.nan]])
-    assert ratio_test(ratio, 0.8).tolist() == [[True, True, False, False, False]]
-    assert ratio_test(ratio, 0.8, torch.tensor([[False, True, True, True, True]])).sum() == 1
+    assert pruning.ratio_test(ratio, 0.8).tolist() == [[True, True, False, False, False]]
+    assert pruning.ratio_test(ratio, 0.8, torch.tensor([[False, True, True, True, True]])).sum() == 1
 
 
 def test_mutual_agrees_with_the_matcher() -> None:
@@ -53,10 +39,10 @@ def test_mutual_agrees_with_the_matcher() -> None:
     d0, d1 = torch.rand(2, 40, 8, generator=generator), torch.rand(2, 30, 8, generator=generator)
     mask0, mask1 = torch.rand(2, 40, generator=generator) < 0.8, torch.rand(2, 30, generator=generator) < 0.8
     neighbors = nearest_neighbors(d0, d1, mask0, mask1)
-    assert torch.equal(mutual(neighbors.nearest, neighbors.reverse), neighbors.mutual)
+    assert torch.equal(pruning.mutual(neighbors.nearest, neighbors.reverse), neighbors.mutual)
     garbage = torch.where(mask0, neighbors.nearest, 10**9)
-    assert torch.equal(mutual(garbage, neighbors.reverse, mask0), neighbors.mutual)
-    assert not mutual(neighbors.nearest, neighbors.reverse[:, :0]).any()
+    assert torch.equal(pruning.mutual(garbage, neighbors.reverse, mask0), neighbors.mutual)
+    assert not pruning.mutual(neighbors.nearest, neighbors.reverse[:, :0]).any()
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -72,15 +58,15 @@ def test_ratio_and_mutual_stages_equal_their_definitions(seed: int) -> None:
         return Features(lafs, torch.ones(n), torch.from_numpy(descriptors), torch.tensor([9, 9]))
 
     matches = NearestNeighborMatcher()(features(d0), features(d1))
-    ratio, both = RatioTest(0.8)(matches).mask[0], MutualCheck()(matches).mask[0]
+    ratio, both = pruning.RatioTest(0.8)(matches).mask[0], pruning.MutualCheck()(matches).mask[0]
     np.testing.assert_array_equal(ratio, matching_reference.ratio_test(d0, d1, 0.8))
     np.testing.assert_array_equal(both, matching_reference.mutual(d0, d1))
     assert 0 < int(ratio.sum()) < 30
     assert 0 < int(both.sum()) < 30
     order = matches.compact()
-    assert torch.equal(MutualCheck()(order).count(), both.sum()[None])
+    assert torch.equal(pruning.MutualCheck()(order).count(), both.sum()[None])
     with pytest.raises(ValueError, match="needs `mutual`"):
-        MutualCheck()(matches.replace(mutual=None))
+        pruning.MutualCheck()(matches.replace(mutual=None))
 
 
 def grid_points(n: int) -> st.SearchStrategy[np.ndarray]:
@@ -92,7 +78,7 @@ def grid_points(n: int) -> st.SearchStrategy[np.ndarray]:
 def test_one_to_one_equals_the_definition(data: st.DataObject, n: int) -> None:
     x0, x1 = data.draw(grid_points(n)), data.draw(grid_points(n))
     ratio = data.draw(arrays(np.float32, (n,), elements=st.sampled_from([0.25, 0.5, math.inf])))
-    mask = one_to_one(*(torch.from_numpy(a)[None] for a in (x0, x1, ratio)))
+    mask = pruning.one_to_one(*(torch.from_numpy(a)[None] for a in (x0, x1, ratio)))
     np.testing.assert_array_equal(mask[0], one_to_one_reference(x0, x1, ratio))
 
 
@@ -108,11 +94,11 @@ def duplicated(seed: int, n: int, dtype: torch.dtype = torch.float32) -> tuple[T
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_one_to_one_is_symmetric_and_independent_of_order(dtype: torch.dtype) -> None:
     x0, x1, ratio = (a[None] for a in duplicated(0, 200, dtype))
-    kept = one_to_one(x0, x1, ratio)
+    kept = pruning.one_to_one(x0, x1, ratio)
     assert 0 < kept.sum() < 200
-    assert torch.equal(kept, one_to_one(x1, x0, ratio))
+    assert torch.equal(kept, pruning.one_to_one(x1, x0, ratio))
     order = torch.randperm(200, generator=torch.Generator().manual_seed(1))
-    assert torch.equal(kept[:, order], one_to_one(x0[:, order], x1[:, order], ratio[:, order]))
+    assert torch.equal(kept[:, order], pruning.one_to_one(x0[:, order], x1[:, order], ratio[:, order]))
     for x in (x0, x1):
         assert len(torch.unique(x[kept], dim=0)) == kept.sum()
 
@@ -121,13 +107,16 @@ def test_one_to_one_drops_what_has_no_location_and_ranks_nan_ratio_last() -> Non
     x0 = torch.tensor([[[math.nan, 0.0], [math.inf, 0.0], [1.0, 1.0], [1.0, 1.0]]])
     x1 = torch.arange(8.0).reshape(1, 4, 2)
     ratio = torch.tensor([[0.0, 0.0, math.nan, 0.9]])
-    assert one_to_one(x0, x1, ratio).tolist() == [[False, False, False, True]]
+    assert pruning.one_to_one(x0, x1, ratio).tolist() == [[False, False, False, True]]
 
 
 def test_stages_need_a_ratio_and_keep_the_rest() -> None:
     x0, x1, ratio = (a[None] for a in duplicated(0, 20))
     mask = torch.ones(1, 20, dtype=torch.bool)
-    for stage, expected in ((RatioTest(0.5), ratio_test(ratio, 0.5)), (OneToOne(), one_to_one(x0, x1, ratio))):
+    for stage, expected in (
+        (pruning.RatioTest(0.5), pruning.ratio_test(ratio, 0.5)),
+        (pruning.OneToOne(), pruning.one_to_one(x0, x1, ratio)),
+    ):
         out = stage(Correspondences(x0, x1, mask, ratio))
         assert torch.equal(out.mask, expected)
         assert torch.equal(out.x0, x0)
@@ -239,10 +228,10 @@ def test_gms(real_matches: list[tuple[Correspondences, Tensor]]) -> None:
         sizes = (SIZE, SIZE) if "real" not in what else tuple(tuple(s[i].tolist()) for s in (c.size0, c.size1))  # type: ignore[index]
         if what.startswith("huge"):
             with pytest.raises(ValueError, match="lie outside such an image"):
-                gms(c.x0, c.x1, size0=c.size0, size1=c.size1, mask=c.mask)
+                pruning.gms(c.x0, c.x1, size0=c.size0, size1=c.size1, mask=c.mask)
             continue
         searched = what.endswith(("random, 0", "planar, 0", "coincident, 0"))
-        mask = gms(
+        mask = pruning.gms(
             c.x0, c.x1, size0=c.size0, size1=c.size1, mask=c.mask, threshold_factor=3.0, with_rotation=searched,
             with_scale=searched, border="authors" if searched else "opencv",
         )[i]  # fmt: skip
@@ -253,10 +242,10 @@ def test_gms(real_matches: list[tuple[Correspondences, Tensor]]) -> None:
 def test_lpm(real_matches: list[tuple[Correspondences, Tensor]]) -> None:
     for what, c, i, slots, x0, x1 in pairs(real_matches):
         survivors, costs = passes(x0.astype(np.float64), x1.astype(np.float64))
-        expect_mask(lpm(c.x0, c.x1, mask=c.mask)[i], slots, np.isin(np.arange(len(slots)), survivors), what)
+        expect_mask(pruning.lpm(c.x0, c.x1, mask=c.mask)[i], slots, np.isin(np.arange(len(slots)), survivors), what)
         expected = np.ones(c.mask.shape[1])
         expected[slots] = np.mean(costs, 0)
-        computed = lpm_cost(c.x0.double(), c.x1.double(), mask=c.mask)[i]
+        computed = pruning.lpm_cost(c.x0.double(), c.x1.double(), mask=c.mask)[i]
         np.testing.assert_allclose(computed, expected, rtol=1e-12, err_msg=what)
 
 
@@ -264,7 +253,7 @@ def test_one_to_one(real_matches: list[tuple[Correspondences, Tensor]]) -> None:
     for what, c, i, slots, x0, x1 in pairs(real_matches):
         ratio = c.ratio[i].numpy()[slots]
         expected = one_to_one_reference(x0, x1, np.where(np.isnan(ratio), np.inf, ratio))
-        expect_mask(one_to_one(c.x0, c.x1, c.ratio, c.mask)[i], slots, expected, what)
+        expect_mask(pruning.one_to_one(c.x0, c.x1, c.ratio, c.mask)[i], slots, expected, what)
 
 
 @pytest.mark.parametrize("ratios", [True, False])
@@ -278,10 +267,10 @@ def test_agreement_of_few_matches(ratios: bool) -> None:
         )  # fmt: skip
         similarity = consistency.similarity(x0, x1, CURVES, TURNS, SCALES)
         by_motion = consistency.agreement_of_positions(x0, x1, similarity, vote, CURVES, WINDOW, TOLERANCE, NOISE)
-        frames = frame_agreement(c.x0, c.x1, c.lafs0, c.lafs1, ratio, c.mask)[0]
+        frames = pruning.frame_agreement(c.x0, c.x1, c.lafs0, c.lafs1, ratio, c.mask)[0]
         # float32: coordinates of 1e3 px are rounded to 6e-5 px, against lengths of at least 4 px
         np.testing.assert_allclose(frames, by_frames, rtol=1e-3, atol=1e-5, err_msg=what)
-        motion = position_agreement(c.x0, c.x1, ratio, c.mask)[0]
+        motion = pruning.position_agreement(c.x0, c.x1, ratio, c.mask)[0]
         np.testing.assert_allclose(motion, by_motion, rtol=1e-3, atol=1e-5, err_msg=what)
 
 
@@ -292,7 +281,7 @@ def test_is_its_formula() -> None:
     rng = np.random.default_rng(0)
     lafs0, lafs1 = (torch.from_numpy(rng.normal(size=(2, 50, 2, 3)) * 20) for _ in range(2))
     ratio, prior = (torch.from_numpy(rng.random((2, 50))) for _ in range(2))
-    noise = match_noise(lafs0, lafs1, ratio, prior, **NUMBERS)
+    noise = pruning.match_noise(lafs0, lafs1, ratio, prior, **NUMBERS)
     for b in range(2):
         for i in range(50):
             scales = [math.sqrt(abs(np.linalg.det(lafs[b, i, :, :2].numpy()))) for lafs in (lafs0, lafs1)]
@@ -300,7 +289,7 @@ def test_is_its_formula() -> None:
             expected = (1 + max(scales) / 15) * (1 + 0.65 * r) ** 2 * P**-0.25 / 4.06
             assert float(noise[b, i]) == pytest.approx(expected, rel=1e-9)
     inputs = [x[:1, :8].clone().requires_grad_() for x in (lafs0, lafs1, ratio, prior)]
-    assert torch.autograd.gradcheck(lambda *x: match_noise(*x, **NUMBERS), inputs)
+    assert torch.autograd.gradcheck(lambda *x: pruning.match_noise(*x, **NUMBERS), inputs)
 
 
 def test_matches_without_frames_are_left_as_they_are_and_what_cannot_be_told_is_usual() -> None:

@@ -8,20 +8,6 @@ import pytest
 
 from fmtorch import scenes
 from fmtorch.data import DepthDataset, load
-from fmtorch.scenes import (
-    FAMILIES,
-    Camera,
-    Plan,
-    RenderedPairs,
-    Task,
-    build,
-    calibration,
-    depth_at,
-    fundamental,
-    look_at,
-    raycast,
-    relative_pose,
-)
 from fmtorch.scenes.light import DrawnScene, Lens, Light, Shot, Stage, expose
 from fmtorch.scenes.raycast import Geometry
 from fmtorch.scenes.surfaces import Surfaces, Texture, vec
@@ -34,11 +20,11 @@ SIZE = (120, 160)
 
 def camera(
     x: float, y: float, z: float, target: tuple[float, float, float] = (0.0, 0.0, 1.0), focal: float = 150.0
-) -> Camera:
-    return look_at(calibration(focal, SIZE), SIZE, (x, y, z), target, roll=0.1 * x)
+) -> scenes.Camera:
+    return scenes.look_at(scenes.calibration(focal, SIZE), SIZE, (x, y, z), target, roll=0.1 * x)
 
 
-def points_seen(geometry: Geometry, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+def points_seen(geometry: Geometry, camera: scenes.Camera) -> tuple[np.ndarray, np.ndarray]:
     """Pixels (n, 2) whose ray meets a surface, and the world points (n, 3) that they see, exactly."""
     depth = geometry.depth_map(camera)
     y, x = np.nonzero(np.isfinite(depth))
@@ -62,10 +48,10 @@ def test_look_at_is_a_rotation_that_centres_its_target() -> None:
 def test_relative_pose_and_fundamental_agree_with_projected_points() -> None:
     c0, c1 = camera(-1, -4, 1.2), camera(1.5, -3.5, 1.8, focal=210.0)
     X = np.random.default_rng(0).uniform(-1, 1, (200, 3)) + vec(0, 0, 1)
-    R, t = relative_pose(c0, c1)
+    R, t = scenes.relative_pose(c0, c1)
     X0, X1 = X @ c0.R.T + c0.t, X @ c1.R.T + c1.t
     np.testing.assert_allclose(X0 @ R.T + t, X1, atol=1e-12)
-    F = fundamental(c0, c1)
+    F = scenes.fundamental(c0, c1)
     assert np.linalg.norm(F) == pytest.approx(1.0)
     assert line_distance(F, c0.project(X)[0], c1.project(X)[0]).max() < 1e-9
 
@@ -78,15 +64,15 @@ def line_distance(F: np.ndarray, x0: np.ndarray, x1: np.ndarray) -> np.ndarray:
     return np.maximum(error / np.hypot(l1[:, 0], l1[:, 1]), error / np.hypot(l0[:, 0], l0[:, 1]))
 
 
-@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize("family", scenes.FAMILIES)
 def test_what_a_pixel_sees_lies_on_its_epipolar_line(family: str) -> None:
-    scene = build(Task(family, "train", 0, 3, Plan(1, 3, 2, 0.1)))
+    scene = scenes.build(scenes.Task(family, "train", 0, 3, scenes.Plan(1, 3, 2, 0.1)))
     c0, c1 = scene.shots[0].camera, scene.shots[1].camera
     pixel, X = points_seen(Geometry(scene.surfaces[0]), c0)
     assert len(pixel) > 0.3 * c0.size[0] * c0.size[1]
     np.testing.assert_allclose(c0.project(X)[0], pixel, atol=1e-8)
     ahead = X @ c1.R[2] + c1.t[2] > 0.1
-    assert line_distance(fundamental(c0, c1), pixel[ahead], c1.project(X[ahead])[0]).max() < 1e-6
+    assert line_distance(scenes.fundamental(c0, c1), pixel[ahead], c1.project(X[ahead])[0]).max() < 1e-6
 
 
 def test_a_mark_is_drawn_where_it_projects() -> None:
@@ -127,12 +113,12 @@ def take_reference(patch: pytest.MonkeyPatch) -> None:
     geometries = list[Geometry]()
     cast = Geometry.cast
 
-    def remembered(self: Geometry, *arguments: Any) -> raycast.Hits:
+    def remembered(self: Geometry, *arguments: Any) -> scenes.raycast.Hits:
         geometries.append(self)
         return cast(self, *arguments)
 
     patch.setattr(Geometry, "cast", remembered)
-    patch.setattr(raycast, "cast_pieces", lambda pieces, _, *rest: reference.cast(geometries[-1], pieces, *rest))
+    patch.setattr(scenes.raycast, "cast_pieces", lambda pieces, _, *rest: reference.cast(geometries[-1], pieces, *rest))
     patch.setattr(Stage, "_shade", reference.shade)
 
 
@@ -145,7 +131,7 @@ def stages(surfaces: Surfaces, light: Light, sky: np.ndarray, monkeypatch: pytes
     return built
 
 
-def assert_equal_views(pair: list[Stage], camera: Camera, monkeypatch: pytest.MonkeyPatch) -> np.ndarray:
+def assert_equal_views(pair: list[Stage], camera: scenes.Camera, monkeypatch: pytest.MonkeyPatch) -> np.ndarray:
     """Kernels and definitions meet the same pieces in the same places and draw the same picture; returns the pieces."""
     seen = [view(pair[0], camera)]
     with monkeypatch.context() as patch:
@@ -156,7 +142,7 @@ def assert_equal_views(pair: list[Stage], camera: Camera, monkeypatch: pytest.Mo
     return seen[0][0]
 
 
-def view(stage: Stage, camera: Camera) -> tuple[np.ndarray, ...]:
+def view(stage: Stage, camera: scenes.Camera) -> tuple[np.ndarray, ...]:
     """The pieces and places that the pixels see, their colours, and the photograph."""
     offset = (0.125, -0.375)
     hits = stage.geometry.look(camera, offset)
@@ -164,9 +150,9 @@ def view(stage: Stage, camera: Camera) -> tuple[np.ndarray, ...]:
     return hits.piece, hits.s, hits.t, stage.radiance(camera, offset), picture
 
 
-@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize("family", scenes.FAMILIES)
 def test_forms_draw_the_same_scenes(family: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    scene = build(Task(family, "train", 1, 5, Plan(1, 3, 2, 0.15)))
+    scene = scenes.build(scenes.Task(family, "train", 1, 5, scenes.Plan(1, 3, 2, 0.15)))
     shots = [scene.shots[0], scene.shots[-1]]
     for light in {shot.light for shot in shots}:
         pair = stages(scene.surfaces[light], scene.lights[light], scene.sky, monkeypatch)
@@ -202,7 +188,9 @@ def test_forms_draw_the_same_random_worlds(seed: int, monkeypatch: pytest.Monkey
     for _ in range(3):
         eye, target = rng.normal(0, 3, (2, 3))
         assert_equal_views(
-            pair, look_at(calibration(80.0, KERNEL_SIZE), KERNEL_SIZE, eye.tolist(), target.tolist()), monkeypatch
+            pair,
+            scenes.look_at(scenes.calibration(80.0, KERNEL_SIZE), KERNEL_SIZE, eye.tolist(), target.tolist()),
+            monkeypatch,
         )
 
 
@@ -210,7 +198,7 @@ def test_forms_draw_an_empty_view(monkeypatch: pytest.MonkeyPatch) -> None:
     surfaces = Surfaces()
     surfaces.quad(vec(0, 0, 0), vec(1, 0, 0), vec(0, 1, 0), surfaces.texture(np.zeros((8, 8, 3), np.uint8)))
     pair = stages(surfaces, Light((0.3, -0.5, 0.8)), np.full((8, 16, 3), 90, np.uint8), monkeypatch)
-    camera = look_at(calibration(80.0, KERNEL_SIZE), KERNEL_SIZE, (0.0, 0.0, 5.0), (0.0, 1.0, 9.0))
+    camera = scenes.look_at(scenes.calibration(80.0, KERNEL_SIZE), KERNEL_SIZE, (0.0, 0.0, 5.0), (0.0, 1.0, 9.0))
     assert (assert_equal_views(pair, camera, monkeypatch) == -1).all()
 
 
@@ -221,7 +209,7 @@ def test_textures_too_small_to_shrink_are_refused() -> None:
 
 DEPTH_SIZE = (60, 80)
 WALL, SCREEN = 4.0, 2.5  # metres
-SMALL = Plan(scenes=1, shots=2, pairs=1, scale=0.15)
+SMALL = scenes.Plan(scenes=1, shots=2, pairs=1, scale=0.15)
 
 
 def wall_and_screen(with_screen: bool) -> Surfaces:
@@ -235,9 +223,9 @@ def wall_and_screen(with_screen: bool) -> Surfaces:
 
 
 @pytest.fixture
-def staged(monkeypatch: pytest.MonkeyPatch) -> tuple[Task, Camera]:
+def staged(monkeypatch: pytest.MonkeyPatch) -> tuple[scenes.Task, scenes.Camera]:
     """A scene in which the screen stands only when the second photograph is taken."""
-    camera = look_at(calibration(60.0, DEPTH_SIZE), DEPTH_SIZE, (0.0, 0.0, 0.0), (0.0, 1.0, 0.0))
+    camera = scenes.look_at(scenes.calibration(60.0, DEPTH_SIZE), DEPTH_SIZE, (0.0, 0.0, 0.0), (0.0, 1.0, 0.0))
     shots = [Shot(camera, Lens(), light=k) for k in range(2)]
     light = Light((0.0, 0.0, 1.0))
     sky = np.zeros((8, 8, 3), np.uint8)
@@ -245,28 +233,28 @@ def staged(monkeypatch: pytest.MonkeyPatch) -> tuple[Task, Camera]:
     recent = scenes.dataset._Recent()
     recent.scene = lambda task: scene  # type: ignore[assignment]
     monkeypatch.setattr("fmtorch.scenes.dataset._recent", recent)
-    return Task("indoor", "test", 0, 0, SMALL), camera
+    return scenes.Task("indoor", "test", 0, 0, SMALL), camera
 
 
-def test_what_moves_is_where_it_was_when_the_photograph_was_taken(staged: tuple[Task, Camera]) -> None:
+def test_what_moves_is_where_it_was_when_the_photograph_was_taken(staged: tuple[scenes.Task, scenes.Camera]) -> None:
     task, _ = staged
     points = np.array([[20.3, 30.1], [60.2, 30.7], [20.0, 1.0], [-0.6, 30.0], [30.0, 59.6], [np.nan, 1.0]])
     unknown = [np.nan] * 4  # the sky above the wall, left of the photograph, below it, no point
-    np.testing.assert_allclose(depth_at(task, 0, points), [WALL, WALL, *unknown], rtol=1e-12)
-    np.testing.assert_allclose(depth_at(task, 1, points)[:2], [SCREEN, WALL], rtol=1e-12)
-    assert depth_at(task, 0, np.zeros((0, 2))).shape == (0,)
+    np.testing.assert_allclose(scenes.depth_at(task, 0, points), [WALL, WALL, *unknown], rtol=1e-12)
+    np.testing.assert_allclose(scenes.depth_at(task, 1, points)[:2], [SCREEN, WALL], rtol=1e-12)
+    assert scenes.depth_at(task, 0, np.zeros((0, 2))).shape == (0,)
 
 
 def test_depth_is_the_reference_ray_casters() -> None:
     """The plane that the nearest pixel meets, at the point itself; away from edges that is what the point meets."""
-    task = Task("indoor", "test", 0, 0, SMALL)
-    scene = build(task)
+    task = scenes.Task("indoor", "test", 0, 0, SMALL)
+    scene = scenes.build(task)
     shot = scene.shots[0]
     surfaces = scene.surfaces[shot.light]
     assert all(texture.opaque for texture in surfaces.textures)
     h, w = shot.camera.size
     points = np.random.default_rng(0).uniform(-0.5, [w - 0.5, h - 0.5], (25, 2))
-    computed = depth_at(task, 0, points)
+    computed = scenes.depth_at(task, 0, points)
     direct = []
     for (x, y), depth in zip(points, computed, strict=True):
         pixel, _ = first_hit(surfaces, shot.camera, round(x), round(y))
@@ -278,12 +266,12 @@ def test_depth_is_the_reference_ray_casters() -> None:
 
 
 def test_rendered_pairs_know_depth_by_image(tmp_path: Path) -> None:
-    pairs = RenderedPairs(families=["indoor"], root=tmp_path, plan=SMALL, workers=1)
+    pairs = scenes.RenderedPairs(families=["indoor"], root=tmp_path, plan=SMALL, workers=1)
     assert isinstance(pairs, DepthDataset)
     assert not isinstance(load("stereo"), DepthDataset)
     pair = pairs[0]
     points = np.array([[10.2, 20.0], [40.0, 12.5]])
-    task = Task("indoor", "test", 0, 0, SMALL)
+    task = scenes.Task("indoor", "test", 0, 0, SMALL)
     number = int(pair.image1.identity.rpartition("/")[2])
-    np.testing.assert_array_equal(pairs.depth(pair.image1, points), depth_at(task, number, points))
+    np.testing.assert_array_equal(pairs.depth(pair.image1, points), scenes.depth_at(task, number, points))
     assert np.isfinite(pairs.depth(pair.image1, points)).all()

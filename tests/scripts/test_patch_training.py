@@ -16,16 +16,7 @@ from fmtorch.features.networks import AffNet, GeoDesc, HardNet, build
 from fmtorch.scenes import Camera, Plan, Task, calibration, fundamental, look_at, photograph
 from fmtorch.training.options import PlaneViews
 from fmtorch.training.planes import Photograph, list_photographs
-from scripts.patch_networks.objectives import (
-    DescriptorObjective,
-    ShapeObjective,
-    fpr_at_recall,
-    geodesc,
-    geometric,
-    hardest_triplet,
-    patch_quality,
-    structured,
-)
+from scripts.patch_networks import objectives, stores
 from scripts.patch_networks.patches import (
     Tolerance,
     View,
@@ -34,61 +25,54 @@ from scripts.patch_networks.patches import (
     transferred,
     views_of_plane,
 )
-from scripts.patch_networks.stores import (
-    Cutting,
-    PatchStore,
-    Tracks,
-    build_store,
-    package_photographs,
-    split,
-    validation_pairs,
-)
 from scripts.patch_networks.train import cutting_of, training_of
 from scripts.patch_networks.training import MatchSetTraining, PatchTraining, TrainingOptions
 
 
 @pytest.fixture(scope="module")
-def store() -> PatchStore:
+def store() -> stores.PatchStore:
     """Patches of a photograph as a plane, with their geometry."""
     planes = PlaneViews(views=4, tilt=15.0, scale=(0.5, 0.6))
     views = views_of_plane(photograph("chelsea.png"), np.random.default_rng(0), planes, points=150)
     patches, point, columns = tracks_of_views(views, Tolerance())
     first = np.r_[0, np.cumsum(np.bincount(point))]
     about = {"photographs": {"scikit-image": 1}, "points": len(first) - 1, "patches": len(patches), "views": 4}
-    return PatchStore(patches, first, {**about, "limits": {}}, Tracks(first, **columns))
+    return stores.PatchStore(patches, first, {**about, "limits": {}}, stores.Tracks(first, **columns))
 
 
 def test_the_margins_of_match_sets_are_those_of_the_paper() -> None:
     zero, one = torch.tensor([[0.0, 1]]), torch.tensor([[1.0, 0]])  # of cosine 0: the loss is the margin
-    margins = [float(geometric(zero, one, torch.tensor([s]))) for s in (1.0, 0.5, 0.4999, 0.2, 0.1999, 0.0)]
+    margins = [float(objectives.geometric(zero, one, torch.tensor([s]))) for s in (1.0, 0.5, 0.4999, 0.2, 0.1999, 0.0)]
     assert margins == pytest.approx([0.7, 0.7, 0.5, 0.5, 0.2, 0.2])
     # Two matches of similarity s whose patches are else of similarity c: no loss while c <= (1 - ratio) s.
     for c, s, expected in ((0.54, 0.9, 0.0), (0.64, 0.9, 0.2), (0.34, 0.4, 0.2)):
-        found = structured(torch.eye(2), torch.tensor([[s, c], [c, s]]).mT, ratio=0.4)
+        found = objectives.structured(torch.eye(2), torch.tensor([[s, c], [c, s]]).mT, ratio=0.4)
         assert float(found) == pytest.approx(expected, abs=1e-6)
 
 
 def test_figures_of_known_answers() -> None:
     # By hand: 95 % of 20 are 19.
-    assert fpr_at_recall(torch.arange(1, 21.0), torch.tensor([0.5, 19.0, 19.5, 30.0])) == 0.5
-    assert patch_quality(*(torch.eye(5),) * 2) == {"fpr95": 0.0, "map": 1.0, "accuracy": 1.0}
+    assert objectives.fpr_at_recall(torch.arange(1, 21.0), torch.tensor([0.5, 19.0, 19.5, 30.0])) == 0.5
+    assert objectives.patch_quality(*(torch.eye(5),) * 2) == {"fpr95": 0.0, "map": 1.0, "accuracy": 1.0}
 
 
 OPTIONS: dict[str, Any] = {"batch": 24, "steps": 30, "bf16": False, "checkpoint_steps": 1000, "seed": 3}
 
 
-def training(store: PatchStore, **options: Any) -> PatchTraining:
+def training(store: stores.PatchStore, **options: Any) -> PatchTraining:
     torch.manual_seed(0)
     made = TrainingOptions(**{**OPTIONS, **options})
     description = {"architecture": "hardnet", "loss": {"name": "hardest_triplet"}}
-    return PatchTraining(HardNet(dropout=0.3), DescriptorObjective(hardest_triplet), store, made, description)
+    return PatchTraining(
+        HardNet(dropout=0.3), objectives.DescriptorObjective(objectives.hardest_triplet), store, made, description
+    )
 
 
-def set_training(store: PatchStore, batch: int = 32) -> MatchSetTraining:
+def set_training(store: stores.PatchStore, batch: int = 32) -> MatchSetTraining:
     torch.manual_seed(0)
     options = TrainingOptions(batch=batch, steps=20, learning_rate=3e-4, bf16=False, checkpoint_steps=1000)
     description = {"architecture": "geodesc", "loss": {"name": "geodesc"}, "match_sets": {"matches": 16}}
-    return MatchSetTraining(GeoDesc(), geodesc, store, options, description, matches=16, max_similarity=1.0)
+    return MatchSetTraining(GeoDesc(), objectives.geodesc, store, options, description, matches=16, max_similarity=1.0)
 
 
 @pytest.mark.parametrize("make", [training, set_training])
@@ -109,7 +93,7 @@ def test_a_resumed_run_is_the_uninterrupted_run(make, store, tmp_path):
         second.resume(tmp_path / "run.pt")
 
 
-def test_a_checkpoint_of_other_options_is_refused(store: PatchStore, tmp_path: Path) -> None:
+def test_a_checkpoint_of_other_options_is_refused(store: stores.PatchStore, tmp_path: Path) -> None:
     training(store).save(tmp_path / "run.pt")
     with pytest.raises(ValueError, match="trained with other batch, seed"):
         training(store, batch=16, seed=4, steps=60).resume(tmp_path / "run.pt")
@@ -123,17 +107,19 @@ def test_a_checkpoint_of_other_options_is_refused(store: PatchStore, tmp_path: P
         set_training(store, batch=3200)
 
 
-def test_shape_training_moves_the_network_and_not_the_descriptor(store: PatchStore) -> None:
+def test_shape_training_moves_the_network_and_not_the_descriptor(store: stores.PatchStore) -> None:
     descriptor = HardNet().eval().requires_grad_(False)
     before = {k: v.clone() for k, v in descriptor.state_dict().items()}
     torch.manual_seed(0)
     network = AffNet()
     start = {k: v.clone() for k, v in network.state_dict().items()}
-    run = PatchTraining(network, ShapeObjective(descriptor), store, TrainingOptions(batch=16, steps=3, bf16=False))
+    run = PatchTraining(
+        network, objectives.ShapeObjective(descriptor), store, TrainingOptions(batch=16, steps=3, bf16=False)
+    )
     run.run()
     assert all(torch.equal(v, before[k]) for k, v in descriptor.state_dict().items())
     assert all(not torch.equal(v, start[k]) for k, v in network.named_parameters())
-    assert set(run.objective.evaluate(network.eval(), validation_pairs(store, 30))) >= {"map", "circle_map"}
+    assert set(run.objective.evaluate(network.eval(), stores.validation_pairs(store, 30))) >= {"map", "circle_map"}
 
 
 def config(*overrides: str) -> DictConfig:
@@ -152,7 +138,7 @@ def test_photographs_become_tracks_and_a_step_of_training(tmp_path: Path) -> Non
         "training.match_sets.max_similarity=1.0",
     ]  # fmt: skip
     made = config(*small)
-    store = build_store(tmp_path / "tracks", package_photographs()[:2], cutting_of(made, True), seed=0)
+    store = stores.build_store(tmp_path / "tracks", stores.package_photographs()[:2], cutting_of(made, True), seed=0)
     assert store.description["views"] == 3
     network, cpu = build("geodesc"), torch.device("cpu")
     run = training_of(made, network, store, {"architecture": "geodesc"}, cpu)
@@ -162,7 +148,7 @@ def test_photographs_become_tracks_and_a_step_of_training(tmp_path: Path) -> Non
     assert len(run.losses) == 1
     with pytest.raises(ValueError, match=r"training\.match_sets needs training\.loss\.name=geodesc"):
         training_of(config(*small, "training.loss.name=hardest_triplet"), network, store, {}, cpu)
-    plain = PatchStore(store.patches, store.first, store.description)
+    plain = stores.PatchStore(store.patches, store.first, store.description)
     with pytest.raises(ValueError, match=r"training\.match_sets needs .* training\.tracks"):
         training_of(made, network, plain, {}, cpu)
     assert cutting_of(made, False).views.views == 12
@@ -183,10 +169,10 @@ def correlations(patches: np.ndarray, point: np.ndarray) -> tuple[float, float]:
 
 
 def test_a_store_is_complete_deterministic_and_gives_two_different_views(tmp_path: Path) -> None:
-    names, cutting = package_photographs()[:2], Cutting(Warps(views=4), 40, longest_side=300)
+    names, cutting = stores.package_photographs()[:2], stores.Cutting(Warps(views=4), 40, longest_side=300)
     task = Task("indoor", "train", 0, 3, Plan(1, 3, 0, scale=0.4))
-    store = build_store(tmp_path / "a", names, cutting, seed=5, scenes=[task])
-    again = build_store(tmp_path / "b", names, cutting, seed=5, scenes=[task], workers=2)
+    store = stores.build_store(tmp_path / "a", names, cutting, seed=5, scenes=[task])
+    again = stores.build_store(tmp_path / "b", names, cutting, seed=5, scenes=[task], workers=2)
     np.testing.assert_array_equal(store.patches, again.patches)
     np.testing.assert_array_equal(store.first, again.first)
     assert store.first[-1] == len(store.patches)
@@ -194,7 +180,7 @@ def test_a_store_is_complete_deterministic_and_gives_two_different_views(tmp_pat
     told = json.loads((tmp_path / "a" / "store.json").read_text())
     assert (told["photographs"], told["scenes"]) == ({"scikit-image": 2}, {"indoor": 1})
     with pytest.raises(FileExistsError, match="delete it"):
-        build_store(tmp_path / "a", names, cutting, seed=5)
+        stores.build_store(tmp_path / "a", names, cutting, seed=5)
     assert {p.name for p in tmp_path.iterdir()} == {"a", "b"}
     points = torch.arange(len(store)).repeat_interleave(20)
     draws = torch.rand(len(points), 2, generator=torch.Generator().manual_seed(0))
@@ -209,10 +195,12 @@ def test_a_store_is_complete_deterministic_and_gives_two_different_views(tmp_pat
 def test_an_unreadable_photograph_leaves_no_store(tmp_path: Path) -> None:
     (tmp_path / "bad.jpg").write_bytes(b"no image")
     with pytest.raises(ValueError, match=r"bad\.jpg"):
-        build_store(tmp_path / "s", [Photograph(tmp_path / "bad.jpg", "x")], Cutting(Warps(views=2), 10), seed=0)
+        stores.build_store(
+            tmp_path / "s", [Photograph(tmp_path / "bad.jpg", "x")], stores.Cutting(Warps(views=2), 10), seed=0
+        )
     assert [p.name for p in tmp_path.iterdir()] == ["bad.jpg"]
     with pytest.raises(FileNotFoundError, match="holds no patches"):
-        PatchStore.open(tmp_path / "s")
+        stores.PatchStore.open(tmp_path / "s")
 
 
 def test_photographs_are_split_by_source(tmp_path: Path) -> None:
@@ -223,13 +211,13 @@ def test_photographs_are_split_by_source(tmp_path: Path) -> None:
     assert sorted((p.path.name, p.source) for p in found) == [
         ("1.jpg", "a"), ("2.png", "a"), ("3.jpg", "b"), ("4.jpg", "4.jpg"),
     ]  # fmt: skip
-    train, validation = split(found, ["a"])
+    train, validation = stores.split(found, ["a"])
     assert {p.source for p in train} == {"b", "4.jpg"}
     assert {p.path.name for p in validation} == {"1.jpg", "2.png"}
     with pytest.raises(ValueError, match=r"held_out names c; the sources are 4\.jpg, a, b"):
-        split(found, ["c"])
+        stores.split(found, ["c"])
     with pytest.raises(ValueError, match="both sides"):
-        split(found, ["a", "b", "4.jpg"])
+        stores.split(found, ["a", "b", "4.jpg"])
 
 
 def camera(x: float, turn: float = 0.0) -> Camera:

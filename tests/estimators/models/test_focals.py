@@ -13,18 +13,7 @@ from fmtorch import presets
 from fmtorch.core import Correspondences, collate
 from fmtorch.estimators import Focal, Pair, Ransac, SaturatedGains, focal_search
 from fmtorch.estimators.focal_search import FocalSearch, PlausibleCandidates
-from fmtorch.estimators.models.focal_prior import (
-    FOCAL_DEVIATION,
-    QUANTILES,
-    RATIO_DEVIATION,
-    SAME_CAMERA_SHARE,
-    USUAL_FOCAL,
-    draw_depths,
-    focal_cost,
-    focal_prior,
-    normal_quantiles,
-    same_camera_share,
-)
+from fmtorch.estimators.models import focal_prior
 from fmtorch.estimators.models.posterior import images_of, no_cameras
 from fmtorch.estimators.models.with_focals import FundamentalWithFocals
 from fmtorch.estimators.refinement import Candidates, Refinement
@@ -89,14 +78,18 @@ def error(F: torch.Tensor, pair: Photographs) -> float:
 @pytest.mark.parametrize("sizes", SIZES)
 def test_drawn_focal_lengths_are_functions_of_the_draw_that_follow_the_prior(sizes: Sizes) -> None:
     pair, seed, start, count = pair_of(photographs(0, sizes).c, 3), 3, 100, 4000
-    images, depth, normal = images_of(pair), np.empty((2, count)), normal_quantiles()
-    draw_depths(images.prior, images.longest, pair.mixed_seed(Stream.FOCAL), pair.key, start, depth)
+    images, depth, normal = images_of(pair), np.empty((2, count)), focal_prior.normal_quantiles()
+    focal_prior.draw_depths(images.prior, images.longest, pair.mixed_seed(Stream.FOCAL), pair.key, start, depth)
     ratios = np.log(depth / images.longest[:, None])
     for d in range(20):
-        words = [random.number(seed, pair.key, Stream.FOCAL, start + d, k, 3) % QUANTILES for k in range(3)]
-        half = 0.0 if pair.same_size and words[2] < SAME_CAMERA_SHARE * QUANTILES else normal[words[1]]
-        mean = math.log(USUAL_FOCAL) + FOCAL_DEVIATION * normal[words[0]]
-        expected = [mean + RATIO_DEVIATION / 2 * half, mean - RATIO_DEVIATION / 2 * half]
+        words = [random.number(seed, pair.key, Stream.FOCAL, start + d, k, 3) % focal_prior.QUANTILES for k in range(3)]
+        half = (
+            0.0
+            if pair.same_size and words[2] < focal_prior.SAME_CAMERA_SHARE * focal_prior.QUANTILES
+            else normal[words[1]]
+        )
+        mean = math.log(focal_prior.USUAL_FOCAL) + focal_prior.FOCAL_DEVIATION * normal[words[0]]
+        expected = [mean + focal_prior.RATIO_DEVIATION / 2 * half, mean - focal_prior.RATIO_DEVIATION / 2 * half]
         np.testing.assert_allclose(ratios[:, d], expected, atol=1e-12)
     # Four standard errors of 4000 draws (of 1200 ratios).
     mean, difference = ratios.mean(0), ratios[0] - ratios[1]
@@ -109,9 +102,9 @@ def test_drawn_focal_lengths_are_functions_of_the_draw_that_follow_the_prior(siz
 
 
 def test_quantiles_are_those_of_the_normal_distribution() -> None:
-    normal = normal_quantiles()
+    normal = focal_prior.normal_quantiles()
     shares = [0.5 * math.erfc(-q / math.sqrt(2)) for q in normal.tolist()]
-    np.testing.assert_allclose(shares, (np.arange(QUANTILES) + 0.5) / QUANTILES, atol=2.0**-40)
+    np.testing.assert_allclose(shares, (np.arange(focal_prior.QUANTILES) + 0.5) / focal_prior.QUANTILES, atol=2.0**-40)
 
 
 def test_hypotheses_pass_through_their_five_matches() -> None:
@@ -170,7 +163,7 @@ def test_its_cost_and_gradient(same: bool, known: str) -> None:
         def cost(at: np.ndarray, measured: reference.Measured = ((m0, s0), (m1, s1))) -> float:
             return reference.prior_cost(*at, same_size=same, measured=measured)
 
-        computed = focal_cost(focal, focal_prior(same, False, (m0, m1), (s0, s1)), out)
+        computed = focal_prior.focal_cost(focal, focal_prior.focal_prior(same, False, (m0, m1), (s0, s1)), out)
         assert computed == pytest.approx(cost(focal), rel=1e-9, abs=1e-9)
         for i, step in enumerate(h * np.eye(2)):
             # The well, 0.01 wide and 5 deep, has third derivatives of up to 1e8: h^2 of these.
@@ -180,13 +173,13 @@ def test_its_cost_and_gradient(same: bool, known: str) -> None:
 
 def test_a_shared_focal_length_is_one_parameter() -> None:
     """The first; what does not depend on it is left out."""
-    prior, out, h = focal_prior(True, True, (0.3, 0.0), (0.05, math.inf)), np.empty(5), 1e-6
+    prior, out, h = focal_prior.focal_prior(True, True, (0.3, 0.0), (0.05, math.inf)), np.empty(5), 1e-6
 
     def cost(at: float) -> float:
         return reference.prior_cost(at, at, measured=((0.3, 0.05), (0.0, math.inf)))
 
     for at in (0.1, 0.3, 0.7):
-        assert focal_cost(np.array([at, at]), prior, out) == pytest.approx(cost(at), rel=1e-12)
+        assert focal_prior.focal_cost(np.array([at, at]), prior, out) == pytest.approx(cost(at), rel=1e-12)
         assert out[0] == pytest.approx((cost(at + h) - cost(at - h)) / (2 * h), rel=1e-6, abs=1e-8)
         assert (out[1], out[3], out[4]) == (0.0, 1.0, 0.0)
         assert out[2] > 0
@@ -195,7 +188,7 @@ def test_a_shared_focal_length_is_one_parameter() -> None:
 def drawn(known: str, same: bool, shared: bool = False) -> np.ndarray:
     """Logarithms (2, COUNT) for measurements of 0.5 and 0.4."""
     depth = np.empty((2, COUNT))
-    draw_depths(focal_prior(same, shared, (0.5, 0.4), KNOWN[known]), np.ones(2), 3, 4, 0, depth)
+    focal_prior.draw_depths(focal_prior.focal_prior(same, shared, (0.5, 0.4), KNOWN[known]), np.ones(2), 3, 4, 0, depth)
     return np.log(depth)
 
 
@@ -220,7 +213,7 @@ def test_draws_of_one_camera() -> None:
     assert np.ptp(drawn("nothing", False, shared=True), axis=0).max() < 1e-12
     assert float((np.ptp(drawn("one", True), axis=0) < 1e-12).mean()) == pytest.approx(0.7, abs=4 * STANDARD_ERROR)
     assert not (np.ptp(drawn("both", True), axis=0) < 1e-12).any()  # which are not measured alike
-    share = same_camera_share(0.1, np.array([0.06, 0.06]))
+    share = focal_prior.same_camera_share(0.1, np.array([0.06, 0.06]))
     believed, rest = 0.4 * share, 0.6 * share  # those from the prior have the same share
     equal = float((np.ptp(drawn("both roughly", True), axis=0) < 1e-12).mean())
     assert equal == pytest.approx(believed + rest, abs=4 * STANDARD_ERROR)
@@ -234,8 +227,8 @@ def test_how_likely_one_camera_is() -> None:
             math.exp(-(difference**2) / 2 / v) / math.sqrt(v) for v in (0.0125 + 0.01**2, 0.0125 + 0.5**2)
         )
         expected = 0.7 * same / (0.7 * same + 0.3 * different)
-        assert same_camera_share(difference, s) == pytest.approx(expected, rel=1e-12)
-    assert same_camera_share(0.0, np.array([0.0, math.inf])) == 0.7
+        assert focal_prior.same_camera_share(difference, s) == pytest.approx(expected, rel=1e-12)
+    assert focal_prior.same_camera_share(0.0, np.array([0.0, math.inf])) == 0.7
 
 
 ROUNDS = 6

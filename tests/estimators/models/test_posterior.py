@@ -13,21 +13,9 @@ from fmtorch.core import Correspondences
 from fmtorch.estimators import Pair, SevenPoint
 from fmtorch.estimators.final_fits import PRIOR_CONFLICT_GAIN
 from fmtorch.estimators.lens_search import STRAIGHT, LensFit, fit_with_lenses, lens_prior, squared_px
+from fmtorch.estimators.models import posterior
 from fmtorch.estimators.models.focal_prior import LOG_USUAL
 from fmtorch.estimators.models.model import BITS, Loss, Steps, cheirality
-from fmtorch.estimators.models.posterior import (
-    Cameras,
-    Limits,
-    Optimum,
-    centred,
-    images_of,
-    minimise,
-    nearest_cameras,
-    no_cameras,
-    no_optimum,
-    tangents_of,
-    translate,
-)
 from fmtorch.estimators.models.with_focals import LOSS_SCALE_PX, FundamentalWithFocals, Refined
 from fmtorch.estimators.models.with_lenses import LensPrior, undistorted
 from fmtorch.estimators.pair import Lens
@@ -42,22 +30,24 @@ from tests.reference.refine import sampson
 FAMILY = FundamentalWithFocals()
 
 
-def start(F: np.ndarray, pair: Pair) -> Cameras:
+def start(F: np.ndarray, pair: Pair) -> posterior.Cameras:
     """The cameras near one model (3, 3) of pixels."""
-    cameras = no_cameras(1)
-    nearest_cameras(to_units(F, pair)[None], images_of(pair), cameras)
+    cameras = posterior.no_cameras(1)
+    posterior.nearest_cameras(to_units(F, pair)[None], posterior.images_of(pair), cameras)
     return cameras
 
 
-def evaluated(cameras: Cameras, pair: Pair, loss: str, scale_px: float, precision: float) -> Optimum:
+def evaluated(
+    cameras: posterior.Cameras, pair: Pair, loss: str, scale_px: float, precision: float
+) -> posterior.Optimum:
     """The posterior at cameras: `minimise` without a step."""
-    matches, out = centred(pair, scale_px), no_optimum(1)
+    matches, out = posterior.centred(pair, scale_px), posterior.no_optimum(1)
     weighted = Weighted(matches.points, pair.weight, matches.s2, LOSS_CODES[loss], NO_TABLE)
-    minimise(cameras.copy(), weighted, images_of(pair), Limits(precision, 0, 0.0), out)
+    posterior.minimise(cameras.copy(), weighted, posterior.images_of(pair), posterior.Limits(precision, 0, 0.0), out)
     return out
 
 
-def moved(cameras: Cameras, by: np.ndarray) -> Cameras:
+def moved(cameras: posterior.Cameras, by: np.ndarray) -> posterior.Cameras:
     """By three rotations of U, two of V, and two logarithms."""
     turned = cameras.copy()
     turned.axes[0, 0] = cameras.axes[0, 0] @ Rotation.from_rotvec(by[:3]).as_matrix()
@@ -76,18 +66,18 @@ def test_cost_and_derivatives(loss: str, sizes: Sizes) -> None:
     cameras = moved(start(truth, pair), np.random.default_rng(1).normal(0, 3e-4, 7))
     precision, scale = 40.0 / 0.3**2 * pair.pixels_per_unit**2, 0.7
     computed = evaluated(cameras, pair, loss, scale, precision)
-    x0, x1 = centred(pair).points[:2].T, centred(pair).points[2:].T
+    x0, x1 = posterior.centred(pair).points[:2].T, posterior.centred(pair).points[2:].T
     s = scale * noise[0].numpy() / pair.pixels_per_unit
 
-    def residuals(cameras: Cameras) -> np.ndarray:
+    def residuals(cameras: posterior.Cameras) -> np.ndarray:
         return sampson(evaluated(cameras, pair, loss, scale, precision).F.reshape(3, 3), x0, x1)
 
-    def data(cameras: Cameras) -> float:
+    def data(cameras: posterior.Cameras) -> float:
         r2 = residuals(cameras) ** 2
         each = [w * loss_of(np.array([r]), b * b, loss)[0] for w, r, b in zip(pair.weight, r2, s, strict=True)]
         return precision / 2 * sum(each)
 
-    def prior(cameras: Cameras) -> float:
+    def prior(cameras: posterior.Cameras) -> float:
         return reference.prior_cost(*cameras.focal[0].tolist(), same_size=sizes[0] == sizes[1])
 
     assert computed.cost[0] == pytest.approx(data(cameras) + prior(cameras), rel=1e-9)
@@ -148,7 +138,7 @@ def test_the_fit_reaches_the_optimum_and_tells_what_the_prior_costs(focal: tuple
     c, truth, _ = photographs(5, (WIDE, WIDE), focal, 150, noise, outliers=0.0)
     pair = pair_of(c)
     precision = (pair.pixels_per_unit / noise) ** 2
-    fit = FAMILY.fit(start(truth, pair), pair, wide, Limits(precision, 50, 0.0))
+    fit = FAMILY.fit(start(truth, pair), pair, wide, posterior.Limits(precision, 50, 0.0))
     end = evaluated(fit.cameras, pair, "truncated", wide, precision)
     assert np.abs(end.gradient).max() < 1e-6 * np.abs(end.hessian).max()
     # What a fit without prior gains from there, in logarithms of the likelihood.
@@ -164,15 +154,15 @@ def test_a_fit_goes_on_after_a_rejected_step() -> None:
     """The first step from this start raises the cost; shorter ones gain more than what ends the fit."""
     c, truth, _ = photographs(2, (WIDE, WIDE), (1.0, 1.0), 150, 0.5, 0.3)
     pair, px = pair_of(c), 1.0
-    precision, matches = (pair.pixels_per_unit / (px / 2)) ** 2, centred(pair_of(c), px)
+    precision, matches = (pair.pixels_per_unit / (px / 2)) ** 2, posterior.centred(pair_of(c), px)
     begin, _ = FAMILY.refine(to_units(truth, pair)[None], pair, 12)
     begin.focal[0] += [0.1, -0.1]
     weighted = Weighted(matches.points, pair.weight, matches.s2, LOSS_CODES["truncated"], NO_TABLE)
     before = evaluated(begin, pair, "truncated", px, precision)
-    single_step, out = begin.copy(), no_optimum(1)
-    minimise(single_step, weighted, images_of(pair), Limits(precision, 1, 0.05), out)
+    single_step, out = begin.copy(), posterior.no_optimum(1)
+    posterior.minimise(single_step, weighted, posterior.images_of(pair), posterior.Limits(precision, 1, 0.05), out)
     assert out.cost == before.cost
-    fit = FAMILY.fit(begin, pair, px, Limits(precision, 30, 0.05))
+    fit = FAMILY.fit(begin, pair, px, posterior.Limits(precision, 30, 0.05))
     after = evaluated(fit.cameras, pair, "truncated", px, precision)
     assert after.cost < before.cost - 0.05
 
@@ -209,7 +199,7 @@ def share(
     """Of exact points (4, n), whose gain is one."""
     K0, K1 = (np.diag([1 / f, 1 / f, 1]) for f in focal)
     F, out = (K1 @ U @ np.diag([1, 1, 0]) @ V.T @ K0).reshape(1, 9), np.empty(1)
-    cameras = Cameras(np.stack([U, V])[None].copy(), np.log(focal)[None])
+    cameras = posterior.Cameras(np.stack([U, V])[None].copy(), np.log(focal)[None])
     matches = Weighted(points, support, np.full(len(support), 1e4), LOSS_CODES["geman_mcclure"], NO_TABLE)
     cheirality(cameras, np.ones(2), F, matches, tolerance, out)
     return float(out[0])
@@ -246,7 +236,7 @@ def test_support_is_the_gain_of_geman_and_mcclure() -> None:
     r2 = (h1 * l1).sum(1) ** 2 / (l1[:, :2] ** 2 + l0[:, :2] ** 2).sum(1)
     scale = 30.0
     gain = np.maximum(1 / (1 + r2 * scale) - 1 / 26, 0) / (1 - 1 / 26)
-    cameras, out = Cameras(np.stack([U, V])[None].copy(), np.zeros((1, 2))), np.empty(1)
+    cameras, out = posterior.Cameras(np.stack([U, V])[None].copy(), np.zeros((1, 2))), np.empty(1)
     loss, F = LOSS_CODES["geman_mcclure"], (U @ np.diag([1, 1, 0]) @ V.T).reshape(1, 9)
     cheirality(cameras, ones, F, Weighted(points, weight, np.full(60, scale), loss, NO_TABLE), 0.0, out)
     computed = out[0]
@@ -255,19 +245,19 @@ def test_support_is_the_gain_of_geman_and_mcclure() -> None:
     assert computed == pytest.approx(out[0], abs=60 * 2.0**-BITS / (weight * gain).sum())
 
 
-def near(F: np.ndarray, pair: Pair) -> Cameras:
+def near(F: np.ndarray, pair: Pair) -> posterior.Cameras:
     """The cameras near models (k, 9) of a pair's points."""
-    cameras = no_cameras(len(F))
-    nearest_cameras(F, images_of(pair), cameras)
+    cameras = posterior.no_cameras(len(F))
+    posterior.nearest_cameras(F, posterior.images_of(pair), cameras)
     return cameras
 
 
-def models_of(cameras: Cameras, pair: Pair) -> np.ndarray:
+def models_of(cameras: posterior.Cameras, pair: Pair) -> np.ndarray:
     """Their fundamental matrices (k, 9), of a pair's points."""
-    k, images = len(cameras.focal), images_of(pair)
+    k, images = len(cameras.focal), posterior.images_of(pair)
     F, moved = np.empty((k, 9)), np.empty((k, 9))
-    tangents_of(cameras, images.longest, F, np.zeros((k, 9, 8)))
-    translate(F, images.offset, moved)
+    posterior.tangents_of(cameras, images.longest, F, np.zeros((k, 9, 8)))
+    posterior.translate(F, images.offset, moved)
     return moved
 
 
@@ -302,7 +292,7 @@ def test_points_from_the_principal_points_and_the_scale_of_a_loss() -> None:
     c, truth, _ = photographs(1)
     noise = np.random.default_rng(0).uniform(0.5, 2, (1, 200))
     pair = pair_of(c.replace(noise=torch.from_numpy(noise)))
-    matches, images = centred(pair, 0.7), images_of(pair)
+    matches, images = posterior.centred(pair, 0.7), posterior.images_of(pair)
     pixels = np.concatenate([c.x0[0].numpy(), c.x1[0].numpy()], 1).T
     principal = np.array([(WIDE[1] - 1) / 2, (WIDE[0] - 1) / 2, (TALL[1] - 1) / 2, (TALL[0] - 1) / 2])
     expected = (pixels - principal[:, None]) / pair.pixels_per_unit
@@ -315,7 +305,7 @@ def test_points_from_the_principal_points_and_the_scale_of_a_loss() -> None:
     shifted = [A.copy() for A in (A0, A1)]
     shifted[0][:2, 2], shifted[1][:2, 2] = principal[:2], principal[2:]
     G, moved = (shifted[1].T @ truth @ shifted[0]).reshape(1, 9), np.empty((1, 9))
-    translate(G, images.offset, moved)
+    posterior.translate(G, images.offset, moved)
     assert apart(in_pixels(moved[0], pair), truth) < 1e-12
 
 
@@ -344,13 +334,15 @@ def in_units(F: np.ndarray, pair: Pair) -> np.ndarray:
     return (G / np.linalg.norm(G)).ravel()
 
 
-def nearly(F: np.ndarray, pair: Pair) -> Cameras:
-    cameras = no_cameras(1)
-    nearest_cameras(in_units(F, pair)[None], images_of(pair), cameras)
+def nearly(F: np.ndarray, pair: Pair) -> posterior.Cameras:
+    cameras = posterior.no_cameras(1)
+    posterior.nearest_cameras(in_units(F, pair)[None], posterior.images_of(pair), cameras)
     return cameras
 
 
-def fitted(cameras: Cameras, lens: np.ndarray, pair: Pair, iterations: int, prior: LensPrior = FREE) -> LensFit:
+def fitted(
+    cameras: posterior.Cameras, lens: np.ndarray, pair: Pair, iterations: int, prior: LensPrior = FREE
+) -> LensFit:
     return fit_with_lenses(cameras, lens[None], prior, pair, 2.0, iterations)[0]
 
 
@@ -395,7 +387,7 @@ def test_derivatives_are_those_of_the_cost() -> None:
             focal[0, i - 5] += by
         else:
             own[i - 7] += by
-        return fitted(Cameras(axes, focal), own, pair, 0).cost
+        return fitted(posterior.Cameras(axes, focal), own, pair, 0).cost
 
     gradient = fitted(cameras, lens, pair, 0).gradient
     for i in range(9):
