@@ -15,14 +15,13 @@ from fmtorch.estimators.models.model import Hypotheses
 from fmtorch.estimators.preselection import (
     FIRST_LOOK,
     Preselection,
-    best,
     degenerate_support,
     draw_by_prior,
     drawn_by_prior,
     shuffled_first,
 )
 from fmtorch.estimators.sampling import largest_weight
-from fmtorch.estimators.search import Pool, Search, Verified, merge
+from fmtorch.estimators.search import Pool, Search, Verified
 from fmtorch.jit.random import Stream
 from tests.estimators.pairs import FEW, SCALES, known, models, named, pair_of
 from tests.laws import scene, with_padding
@@ -97,20 +96,6 @@ def test_a_pool_keeps_the_best_and_the_earlier_of_equals() -> None:
     assert (pool.score.tolist(), pool.F[:, 0].tolist()) == ([3.0, 3.0, 2.0], [11, 20, 23])
     offer([3.0, 2.0], 30)
     assert pool.F[:, 0].tolist() == [11, 20, 30]
-
-
-@pytest.mark.parametrize(("m", "k", "size"), [(1, 1, 1), (300, 96, 12), (40, 40, 100)])
-def test_a_pool_is_a_stable_sort_of_all_that_it_was_offered(m: int, k: int, size: int) -> None:
-    rng = np.random.default_rng(m)
-    F, score = rng.normal(size=(m, 9)).astype(np.float32), rng.integers(-20, 20, m) / 8.0
-    which = np.sort(rng.permutation(m)[:k])
-    pool, pool_score, filled = np.zeros((size, 9), np.float32), np.full(size, -np.inf), 0
-    for part in np.array_split(which, 3):
-        filled = merge(F, part, score[part], filled, pool, pool_score)
-    best = which[np.argsort(-score[which], kind="stable")][:size]
-    assert filled == len(best)
-    np.testing.assert_array_equal(pool[:filled], F[best])
-    np.testing.assert_array_equal(pool_score[:filled], score[best])
 
 
 @pytest.mark.parametrize("preselect", [None, estimators.Preselect(64, 20)])
@@ -188,15 +173,6 @@ def test_likely_matches_are_drawn_by_their_prior() -> None:
     assert seen[2] / seen.sum() == pytest.approx(0.75, abs=0.02 + 5 * np.sqrt(0.75 * 0.25 / (k * keys)))
     draw_by_prior(np.zeros(n), 5, 0, index)
     np.testing.assert_array_equal(index, np.arange(k))
-
-
-@pytest.mark.parametrize(("m", "k"), [(1, 1), (5, 5), (300, 96), (300, 1), (1000, 256)])
-def test_the_best_of_a_round_and_the_first_of_equals(m: int, k: int) -> None:
-    score = np.random.default_rng(m + k).integers(0, 40, m) / 8.0
-    score[::7] = -np.inf
-    which = np.empty(k, np.int64)
-    best(score, which)
-    np.testing.assert_array_equal(which, np.sort(np.argsort(-score, kind="stable")[:k]))
 
 
 @pytest.mark.parametrize(

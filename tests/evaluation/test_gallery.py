@@ -30,7 +30,6 @@ from fmtorch.pipeline.pictures import (
     draw_epipolar_lines,
     draw_epipolar_lines_of_corners,
     draw_matches,
-    spread,
 )
 from fmtorch.runs import PairRow, RunFolder, to_table
 from tests.helpers import ROWS, compose, draw_set
@@ -364,19 +363,3 @@ def test_lines_end_at_the_border(a: float, b: float, c: float, h: int, w: int) -
     assert np.abs(ends @ [a, b] + c).max() <= 1e-9 * (norm * 100 + abs(c))
     assert (ends >= -0.5 - 1e-6).all()
     assert (ends <= np.array([w, h]) - 0.5 + 1e-6).all()
-
-
-def test_a_line_that_is_none_is_not_drawn() -> None:
-    place = Place((10, 10), (0, 0), (10, 10))
-    for line in ([0.0, 0, 1], [np.nan, 1, 0], [np.inf, 1, 0]):
-        assert place.clip(np.array(line)).shape == (0, 2)
-
-
-def test_spread_takes_points_far_apart() -> None:
-    points = np.random.default_rng(0).normal(0, 0.01, (200, 2))
-    points[[20, 90, 150]] = [[5, 0], [0, 5], [-5, -5]]
-    chosen = spread(points, 4)
-    assert {20, 90, 150} < set(chosen.tolist())
-    assert (np.diff(chosen) > 0).all()
-    assert np.array_equal(spread(points[:3], 4), np.arange(3))
-    assert (len(spread(np.zeros((5, 2)), 3)), len(spread(np.zeros((0, 4)), 3))) == (3, 0)

@@ -168,20 +168,6 @@ def test_equals_the_reference(scenes: int) -> None:
     assert result.high == pytest.approx(high, abs=tolerance)
 
 
-def test_coverage_over_scenes() -> None:
-    """Of independent data sets, about 95 % of the intervals hold the true mean, though pairs of a scene are alike."""
-    trials, hold = 200, {"scene": 0, "pair": 0}
-    for seed in range(trials):
-        values, names = correlated(40, 10, seed)
-        for over, clusters in (("scene", names), ("pair", ["one"] * len(names))):
-            result = statistics.bootstrap_mean(values, clusters)
-            assert result.over == over
-            hold[over] += result.low <= 0.5 <= result.high
-    # The percentile interval of 40 clusters is known to cover some 94 %; 3.5 standard deviations of a binomial share.
-    assert hold["scene"] / trials > 0.94 - 3.5 * np.sqrt(0.94 * 0.06 / trials)
-    assert hold["pair"] / trials < 0.75  # what ignoring the scenes would claim
-
-
 @pytest.mark.parametrize("value", [0.0, 1.0])
 def test_no_spread_no_width(value: float) -> None:
     result = statistics.bootstrap_mean(np.full(7, value), list("abcdefg"))
@@ -225,18 +211,6 @@ def test_published_answers(r: int, n: int, low: float, high: float) -> None:
     interval = statistics.share_interval(successes(r, n), one_scene(n))
     assert (interval.value, interval.over) == (r / n, "pair")
     assert (interval.low, interval.high) == pytest.approx((low, high), abs=5e-5)
-
-
-@pytest.mark.parametrize("n", [3, 10, 40])
-def test_coverage_over_all_shares_is_the_level(n: int) -> None:
-    """The mean coverage over p uniform in (0, 1), by the binomial sum: near 95 % for each n, unlike the bootstrap's."""
-    p = (np.arange(2000) + 0.5) / 2000
-    covered = np.zeros_like(p)
-    for r in range(n + 1):
-        interval = statistics.share_interval(successes(r, n), one_scene(n))
-        chance = math.comb(n, r) * p**r * (1 - p) ** (n - r)
-        covered += chance * ((interval.low <= p) & (p <= interval.high))
-    assert 0.94 < covered.mean() < 0.97
 
 
 def test_pairs_that_succeed_together_count_as_one() -> None:

@@ -1,17 +1,12 @@
 """Detection by the Hessian, and orientation of frames."""
 
-import math
-
 import kornia
 import numpy as np
 import pytest
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from fmtorch import features
-from fmtorch.features.frames import BINS, _histogram, _window
-from fmtorch.features.hessian import STRIP, OpenCVFilters, TorchFilters, _exceeds_levels, _is_maximum, _samples
 from tests.conftest import oracle, shared_path
 from tests.features.scenes import random_frames, texture
 from tests.reference.local_features import dominant_gradient as reference_orientation
@@ -108,71 +103,6 @@ def test_small_and_constant_images(shape: tuple[int, int], constant: bool) -> No
     assert features.HessianDetector().detect_batch(torch.from_numpy(image)[None, None].float() / 255)[0].shape[
         1
     ] == len(scores)
-
-
-THRESHOLD = 1e-3
-
-
-def response() -> Tensor:
-    """(1, h, w) determinants of a texture, rounded so that neighbours are often equal; more rows than a strip."""
-    image = torch.from_numpy(texture(0, 2 * STRIP + 11, 170))[None].float() / 255
-    out = torch.empty_like(image)
-    OpenCVFilters().hessian_determinant(image, 2.0, out=out)
-    return (out * 1024).round() / 1024
-
-
-def test_maxima_are_those_of_the_plain_comparison() -> None:
-    values = response()
-    largest = F.max_pool2d(values, 3, stride=1, padding=1)
-    expected = torch.nonzero((values >= largest) & (values > THRESHOLD))
-    assert len(expected) > 100
-    for filters in (OpenCVFilters(), TorchFilters()):
-        assert torch.equal(filters.maxima(values, THRESHOLD), expected)
-
-
-def test_the_scale_of_a_determinant_is_a_product_afterwards() -> None:
-    image, scale = torch.from_numpy(texture(1, STRIP + 30, 90))[None].float() / 255, 1.25 * 2 ** (1 / 3)
-    for filters in (OpenCVFilters(), TorchFilters()):
-        plain, scaled = (torch.empty_like(image) for _ in range(2))
-        filters.hessian_determinant(image, 1.0, out=plain)
-        filters.hessian_determinant(image, scale, out=scaled)
-        assert torch.equal(scaled, plain * scale)
-
-
-def test_samples_that_fail_against_two_neighbours_are_no_maxima() -> None:
-    volume = torch.randint(20, (1, 3, 40, 50), generator=torch.Generator().manual_seed(0)).float()  # many are equal
-    y, x = (a.flatten() for a in torch.meshgrid(*(torch.arange(1, n - 1) for n in volume.shape[2:]), indexing="ij"))
-    at = torch.stack([torch.zeros_like(y), torch.ones_like(y), y, x], 1)
-    maximal, possible = _is_maximum(_samples(volume, at)), _exceeds_levels(volume, at)
-    assert 10 < int(maximal.sum()) < int(possible.sum()) < len(at)
-    assert not bool((maximal & ~possible).any())
-
-
-def plain_histogram(patches: Tensor) -> Tensor:
-    n, size = patches.shape[0], patches.shape[-1]
-    padded = F.pad(patches, (1, 1, 1, 1), mode="replicate")[:, 0]
-    rows = padded[:, :-2] + 2 * padded[:, 1:-1] + padded[:, 2:]
-    columns = padded[:, :, :-2] + 2 * padded[:, :, 1:-1] + padded[:, :, 2:]
-    gy, gx = (columns[:, 2:] - columns[:, :-2]) / 8, (rows[:, :, 2:] - rows[:, :, :-2]) / 8
-    magnitude = (gx * gx + gy * gy).sqrt() * _window(size, patches.device)
-    position = (torch.atan2(gy, gx) + math.pi) * (BINS / (2 * math.pi))
-    lower = position.floor()
-    upper_weight = (position - lower) * magnitude
-    place = lower.long() + (BINS + 2) * torch.arange(n)[:, None, None]
-    votes = patches.new_zeros(n * (BINS + 2))
-    votes.scatter_add_(0, place.flatten(), (magnitude - upper_weight).flatten())
-    votes.scatter_add_(0, place.flatten() + 1, upper_weight.flatten())
-    histogram = votes.reshape(n, BINS + 2)
-    histogram[:, :2] += histogram[:, BINS:]
-    return histogram[:, :BINS]
-
-
-def test_histograms_of_directions_are_those_of_the_plain_formulas() -> None:
-    image = texture(2, 200, 200)
-    starts = np.random.default_rng(0).integers(0, 168, (90, 2))
-    patches = torch.from_numpy(np.stack([image[y : y + 32, x : x + 32] for y, x in starts]))[:, None].float() / 255
-    patches = torch.cat([patches, torch.full((1, 1, 32, 32), 0.5), torch.rand(20, 1, 32, 32)])
-    assert torch.equal(_histogram(patches), plain_histogram(patches))
 
 
 def angle_between(a: Tensor, b: Tensor) -> Tensor:

@@ -135,11 +135,6 @@ NEIGHBOURS = 1e-5  # what design allows a descriptor to change with its batch
 
 
 @pytest.fixture(scope="module")
-def random_patches() -> Tensor:
-    return torch.from_numpy(oracle("affnet_orinet.npz")["patches"])[:, None].float() / 255
-
-
-@pytest.fixture(scope="module")
 def hardnet(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("onnx") / "hardnet.onnx"
     export(randomized(build("hardnet")), path)
@@ -147,25 +142,25 @@ def hardnet(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("name", ARCHITECTURES)
-def test_onnx_agrees_with_torch_on_real_patches(name: str, tmp_path: Path, random_patches: Tensor) -> None:
+def test_onnx_agrees_with_torch_on_real_patches(name: str, tmp_path: Path, patches: Tensor) -> None:
     network = randomized(build(name))
     if name == "l2net":
-        network.pixel_mean.copy_(random_patches.mean(0, keepdim=True))
+        network.pixel_mean.copy_(patches.mean(0, keepdim=True))
     export(network, tmp_path / "network.onnx")
-    found = PatchNetwork(tmp_path / "network.onnx", batch=40)(random_patches)
+    found = PatchNetwork(tmp_path / "network.onnx", batch=40)(patches)
     assert found.shape == (64, network.outputs)
-    torch.testing.assert_close(found, network(random_patches).detach(), atol=1e-4, rtol=0)
+    torch.testing.assert_close(found, network(patches).detach(), atol=1e-4, rtol=0)
     assert [f.name for f in tmp_path.iterdir()] == ["network.onnx"]  # one file, weights inside
 
 
-def test_neighbours_and_batch_size_are_invisible(hardnet: Path, random_patches: Tensor) -> None:
-    expected = PatchNetwork(hardnet)(random_patches)
+def test_neighbours_and_batch_size_are_invisible(hardnet: Path, patches: Tensor) -> None:
+    expected = PatchNetwork(hardnet)(patches)
     for batch in (1, 7, 64, 300):
-        found = PatchNetwork(hardnet, batch=batch)(random_patches)
+        found = PatchNetwork(hardnet, batch=batch)(patches)
         torch.testing.assert_close(found, expected, atol=NEIGHBOURS, rtol=0)
-    one = PatchNetwork(hardnet)(random_patches[5:6])
+    one = PatchNetwork(hardnet)(patches[5:6])
     torch.testing.assert_close(one, expected[5:6], atol=0, rtol=0)  # the same portion size: the same bits
-    garbage = random_patches.clone()
+    garbage = patches.clone()
     garbage[6:] = torch.nan
     torch.testing.assert_close(PatchNetwork(hardnet)(garbage)[:6], expected[:6], atol=0, rtol=0)
 
@@ -211,9 +206,9 @@ def test_a_network_of_another_shape_is_named(shape: list[object], out: list[obje
         PatchNetwork(tmp_path / "w.onnx")(torch.zeros(1, 1, 32, 32))
 
 
-def test_int8_keeps_descriptors_close_and_the_file_small(hardnet: Path, tmp_path: Path, random_patches: Tensor) -> None:
-    quantize(hardnet, tmp_path / "hardnet.int8.onnx", random_patches)
-    expected, found = (PatchNetwork(p)(random_patches) for p in (hardnet, tmp_path / "hardnet.int8.onnx"))
+def test_int8_keeps_descriptors_close_and_the_file_small(hardnet: Path, tmp_path: Path, patches: Tensor) -> None:
+    quantize(hardnet, tmp_path / "hardnet.int8.onnx", patches)
+    expected, found = (PatchNetwork(p)(patches) for p in (hardnet, tmp_path / "hardnet.int8.onnx"))
     cosine = (expected * found).sum(1)
     assert float(cosine.min()) > 0.9
     assert (tmp_path / "hardnet.int8.onnx").stat().st_size < 0.3 * hardnet.stat().st_size

@@ -19,7 +19,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from fmtorch import io
-from fmtorch.evaluation.curves import MAX_THUMBNAILS, spectral_order, view_graph_svg
+from fmtorch.evaluation.curves import MAX_THUMBNAILS, view_graph_svg
 from fmtorch.io.colmap import ORIGIN, write_database
 from fmtorch.pipeline import FolderMatches, chosen_pairs, images_below, load_pipeline
 from tests.conftest import shared_path
@@ -300,20 +300,6 @@ def test_of_a_journal(tmp_path: Path) -> None:
     assert [(row["image1"], row["inliers"], row["significance"]) for row in rows] == [
         ("b.png", "2", "12.5"), ("c.png", "1", ""),
     ]  # fmt: skip
-
-
-def test_components_are_those_that_related_pairs_connect() -> None:
-    edges = (edge("b", "d"), edge("d", "e"), edge("a", "b", related=False), edge("c", "f"))
-    graph = io.ViewGraph(tuple("abcdefg"), edges)
-    assert graph.components() == [["b", "d", "e"], ["c", "f"], ["a"], ["g"]]
-
-
-def test_a_walk_is_laid_out_as_it_was_walked() -> None:
-    walk = [f"{i:02d}" for i in range(12)]
-    shuffled = [walk[i] for i in np.random.default_rng(0).permutation(12)]
-    order = spectral_order(shuffled, [edge(a, b) for a, b in itertools.pairwise(walk)])
-    assert order in (walk, walk[::-1])
-    assert spectral_order(["b", "a"], []) == ["b", "a"]
 
 
 @pytest.mark.parametrize("count", [1, 3, MAX_THUMBNAILS + 1, 200])

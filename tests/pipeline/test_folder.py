@@ -1,4 +1,4 @@
-"""None"""
+"""Folders of photographs: what is matched, kept, resumed; images that are alike."""
 
 import itertools
 import json

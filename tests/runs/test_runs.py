@@ -1,4 +1,4 @@
-"""None"""
+"""Run folders: identity, rows, parts that are merged as they grow in number, by several writers with readers."""
 
 import dataclasses
 import errno

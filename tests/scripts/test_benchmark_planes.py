@@ -23,8 +23,8 @@ from scripts.benchmark.scenes import Scene, Truth, calibrate
 from scripts.benchmark.verify import accuracy, centre_errors, sheets
 from tests.helpers import cross_matrix, draw_set
 from tests.scripts.samples import item as plain_item
-from tests.scripts.samples import judged_row as plain_row
 from tests.scripts.samples import pair, read, run
+from tests.scripts.samples import row as plain_row
 from tests.verification import databases
 
 
