@@ -11,7 +11,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from fmtorch import presets
-from fmtorch.commands.config import job
+from fmtorch.commands import job
 from fmtorch.core import Correspondences, conf_dir
 from fmtorch.data import GivenMatches, ImagePair, ImageSource
 from fmtorch.pipeline import Pipeline, build_pipeline, load_pipeline

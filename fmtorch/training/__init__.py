@@ -8,17 +8,21 @@ from typing import TYPE_CHECKING
 from fmtorch.core.lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from fmtorch.training.augmentation import Augmentation
+    from fmtorch.training.augmentation import Augmentation, crop, keep_ratio, move, rotate, swap
+    from fmtorch.training.export import export_onnx, save_weights
     from fmtorch.training.labelled import LabelledMatches, collate
     from fmtorch.training.matched_pairs import MatchedPairs
     from fmtorch.training.objective import Objective, classification_loss, geometric_loss, nsgd_loss, virtual_points
+    from fmtorch.training.options import PlaneViews
+    from fmtorch.training.planes import Photograph, PlanePairs, list_photographs, plane_homography, random_camera
     from fmtorch.training.stored_matches import Draw, SimilarLengthBatches, StoredMatches, collate_trimmed, split_scenes
     from fmtorch.training.validation import Use, Validation, reliability, temperature
 
 __all__ = [
-    "Augmentation", "Draw", "LabelledMatches", "MatchedPairs", "Objective", "SimilarLengthBatches", "StoredMatches",
-    "Use", "Validation", "classification_loss", "collate", "collate_trimmed", "geometric_loss", "nsgd_loss",
-    "reliability", "split_scenes", "temperature", "virtual_points",
+    "Augmentation", "Draw", "LabelledMatches", "MatchedPairs", "Objective", "Photograph", "PlanePairs", "PlaneViews",
+    "SimilarLengthBatches", "StoredMatches", "Use", "Validation", "classification_loss", "collate", "collate_trimmed",
+    "crop", "export_onnx", "geometric_loss", "keep_ratio", "list_photographs", "move", "nsgd_loss", "plane_homography",
+    "random_camera", "reliability", "rotate", "save_weights", "split_scenes", "swap", "temperature", "virtual_points",
 ]  # fmt: skip
 
 lazy_exports(__name__)

@@ -9,11 +9,8 @@ from pathlib import Path
 import pytest
 
 import fmtorch.__main__
-from fmtorch.commands.config import hydra_arguments
-from fmtorch.commands.main import help_text
-from fmtorch.commands.options import COMMANDS
-from fmtorch.core import terminal
-from fmtorch.core.terminal import exits_with_message
+from fmtorch.commands import COMMANDS, help_text, hydra_arguments
+from fmtorch.core import exits_with_message, terminal
 from fmtorch.presets import available
 from tests.conftest import own_cache
 from tests.helpers import draw, draw_set

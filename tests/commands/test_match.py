@@ -19,8 +19,7 @@ from fmtorch import presets
 from fmtorch.commands import match as match_command
 from fmtorch.commands.match import photographs, pose_line
 from fmtorch.core import WARNINGS, conf_dir
-from fmtorch.data import ImageError, ImagePair, Lens, load, read_image
-from fmtorch.data.cameras import undistorted_points
+from fmtorch.data import ImageError, ImagePair, Lens, load, read_image, undistorted_points
 from fmtorch.geometry import homography_points, sampson
 from fmtorch.metrics import nsgd, pose_error
 from fmtorch.pipeline import load_pipeline

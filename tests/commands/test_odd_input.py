@@ -9,7 +9,7 @@ import pytest
 
 from fmtorch import presets
 from fmtorch.core import models_dir
-from fmtorch.pipeline.pipeline import build_pipeline
+from fmtorch.pipeline import build_pipeline
 from fmtorch.runs import RunFolder
 from tests.commands.test_command_line import ended
 from tests.commands.test_match import stereo

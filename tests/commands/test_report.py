@@ -14,9 +14,8 @@ from fmtorch import presets
 from fmtorch.commands import report
 from fmtorch.core import Estimate
 from fmtorch.data import read_image
-from fmtorch.evaluation import evaluate, summarize, tables
+from fmtorch.evaluation import Section, differing_pairs, evaluate, render, summarize, tables
 from fmtorch.evaluation.gallery import Options, difference, rebuilt, shown_pair
-from fmtorch.evaluation.page import Section, differing_pairs, render
 from fmtorch.pipeline import Outcome, build_pipeline
 from fmtorch.runs import PairRow, RunFolder, RunFolderError, to_table
 from tests.helpers import compose, draw, draw_set, pair

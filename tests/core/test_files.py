@@ -10,10 +10,17 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from fmtorch.core import Correspondences, Estimate, Features, files
-from fmtorch.core.files import replacing
-from fmtorch.core.records import Record, expect_fields, slotted
-from fmtorch.core.terminal import error_line
+from fmtorch.core import (
+    Correspondences,
+    Estimate,
+    Features,
+    Record,
+    error_line,
+    expect_fields,
+    files,
+    replacing,
+    slotted,
+)
 from fmtorch.training import LabelledMatches
 
 

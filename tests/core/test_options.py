@@ -19,11 +19,20 @@ from omegaconf import OmegaConf
 from torch import Tensor
 
 from fmtorch import geometry, matching, metrics, presets, pruning
-from fmtorch.core import Correspondences
-from fmtorch.core.annotations import Expected, Rule, arrays_of, expectation
-from fmtorch.core.checks import checked
-from fmtorch.core.options import Within, expect_options, fits, nearest
-from fmtorch.core.settings import claim, create
+from fmtorch.core import (
+    Correspondences,
+    Expected,
+    Rule,
+    Within,
+    arrays_of,
+    checked,
+    claim,
+    create,
+    expect_options,
+    expectation,
+    fits,
+    nearest,
+)
 
 Item = TypeVar("Item")
 
@@ -149,7 +158,7 @@ def test_a_wrong_option_is_refused_before_anything_within_is_built() -> None:
 
 def test_fields_of_a_base_in_another_module_are_checked() -> None:
     """Their annotations are names of the module where the base is."""
-    from fmtorch.commands.options import MatchOptions
+    from fmtorch.commands import MatchOptions
 
     class Fields(MatchOptions):
         pass

@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fmtorch.data import DataError, DepthDataset, ImageError, Lens, load, read_image
-from fmtorch.data.image_cameras import read_model
+from fmtorch.data import DataError, DepthDataset, ImageError, Lens, load, read_image, read_model
 from tests.conftest import shared_path
 from tests.data.native import SIZE, to_binary, write_bundler, write_colmap, write_image
 from tests.helpers import apart

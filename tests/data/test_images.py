@@ -24,10 +24,10 @@ from fmtorch.data import (
     Lens,
     exif_focal,
     read_image,
+    stored_orientation,
     stored_size,
     to_grey,
 )
-from fmtorch.data.images import stored_orientation
 from tests.data.native import SIZE, to_binary, write_colmap
 
 COLOUR = np.random.default_rng(0).integers(0, 256, (37, 53, 3), dtype=np.uint8)

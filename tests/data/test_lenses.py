@@ -8,8 +8,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from fmtorch.data import ImageSource, Lens, read_image
-from fmtorch.data.cameras import MODELS, undistorted, undistorted_frames, undistorted_points
+from fmtorch.data import MODELS, ImageSource, Lens, read_image, undistorted, undistorted_frames, undistorted_points
 from fmtorch.data.pairs import Resampling, longer_side, shorter_side
 from tests.reference import lenses as reference
 

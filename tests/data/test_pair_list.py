@@ -12,8 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from fmtorch.data import DataError, load, read_image
-from fmtorch.data.files import NpzArrays
+from fmtorch.data import DataError, NpzArrays, load, read_image
 from tests.data import lists
 from tests.helpers import apart, cross_matrix
 

@@ -7,8 +7,7 @@ import numpy as np
 import torch
 
 from fmtorch.core import Correspondences
-from fmtorch.estimators import Pair
-from fmtorch.estimators.batch import Batch
+from fmtorch.estimators import Batch, Pair
 from fmtorch.geometry.eight_point import weighted_eight_point
 from fmtorch.jit.kernel import Array
 from tests.conftest import oracle

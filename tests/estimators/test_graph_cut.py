@@ -8,15 +8,23 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from fmtorch.core import Correspondences, collate
-from fmtorch.estimators import Degensac, GraphCut, Msac, Pair, Ransac, degensac, graph_cut
+from fmtorch.estimators import (
+    Degensac,
+    GraphCut,
+    Hypotheses,
+    Msac,
+    Pair,
+    Preselection,
+    Ransac,
+    Verified,
+    degensac,
+    graph_cut,
+    largest_weight,
+    scores_of,
+)
 from fmtorch.estimators.inliers import residuals_squared_px
-from fmtorch.estimators.models.model import Hypotheses
-from fmtorch.estimators.preselection import Preselection
-from fmtorch.estimators.sampling import largest_weight
-from fmtorch.estimators.search import Verified
-from fmtorch.estimators.selection import scores_of
+from fmtorch.jit import Stream
 from fmtorch.jit.kernel import F4x1, F8x1, F8x2, kernel
-from fmtorch.jit.random import Stream
 from tests.conftest import oracle
 from tests.estimators.pairs import REAL, named, pair_of, to_units
 from tests.reference import homography

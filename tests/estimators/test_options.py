@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from fmtorch import find_fundamental, presets
-from fmtorch.estimators import InlierCount, Msac, Preselect, Ransac, Refine
-from fmtorch.estimators.registry import PARTS, part
+from fmtorch.estimators import PARTS, InlierCount, Msac, Preselect, Ransac, Refine, part
 from fmtorch.geometry.levenberg_marquardt import LOSS_CODES
 from tests.laws import scene
 

@@ -12,12 +12,10 @@ from torch import Tensor
 
 from fmtorch import estimators, find_fundamental
 from fmtorch.core import Correspondences, Estimate, collate
-from fmtorch.estimators.batch import Batch, relative_rounding
+from fmtorch.estimators import MAX_NOISE, MIN_NOISE, Batch, FitScale, bucket, relative_rounding
 from fmtorch.estimators.models import with_focals
-from fmtorch.estimators.models.model import FitScale
-from fmtorch.estimators.pair import MAX_NOISE, MIN_NOISE, bucket
 from fmtorch.geometry import LOSSES
-from fmtorch.presets.objects import merged
+from fmtorch.presets import merged
 from tests.estimators.models.test_focals import TALL, WIDE, photographs
 from tests.estimators.pairs import SCALES, known, named, pair_of, real
 from tests.laws import PEERS, degenerate, few, quick, scene, small, with_padding

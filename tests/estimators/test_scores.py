@@ -9,14 +9,12 @@ from scipy import integrate
 
 import fmtorch
 from fmtorch import estimators
+from fmtorch.estimators import BestOfSearch, BestScore, Candidates, Pool, Refinement, scores_of
 from fmtorch.estimators.inliers import residuals_squared_px
-from fmtorch.estimators.refinement import Candidates, Refinement
 from fmtorch.estimators.scores import GRID, fractional_bits, saturated_cells
-from fmtorch.estimators.search import Pool
-from fmtorch.estimators.selection import BestOfSearch, BestScore, scores_of
 from fmtorch.geometry.epipolar import HOMOGRAPHY, SAMPSON
 from fmtorch.geometry.robust_losses import ENTRIES, QUANTILE
-from fmtorch.jit.random import Stream
+from fmtorch.jit import Stream
 from tests.estimators.pairs import FEW, REAL, SCALES, known, models, named, pair_of, residuals
 from tests.laws import scene
 from tests.reference import known_cameras, refine

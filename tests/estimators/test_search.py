@@ -11,18 +11,15 @@ from scipy import stats
 
 from fmtorch import estimators
 from fmtorch.core import Correspondences, collate
-from fmtorch.estimators.models.model import Hypotheses
+from fmtorch.estimators import Hypotheses, Pool, Preselection, Search, Verified, largest_weight
 from fmtorch.estimators.preselection import (
     FIRST_LOOK,
-    Preselection,
     degenerate_support,
     draw_by_prior,
     drawn_by_prior,
     shuffled_first,
 )
-from fmtorch.estimators.sampling import largest_weight
-from fmtorch.estimators.search import Pool, Search, Verified
-from fmtorch.jit.random import Stream
+from fmtorch.jit import Stream
 from tests.estimators.pairs import FEW, SCALES, known, models, named, pair_of
 from tests.laws import scene, with_padding
 from tests.reference import ransac as reference

@@ -16,10 +16,9 @@ from hypothesis import strategies as st
 from fmtorch import data, presets
 from fmtorch.core import pair_key
 from fmtorch.data import DataError
+from fmtorch.evaluation import Section, ShownPair, picture, render, run_names, svg
 from fmtorch.evaluation import gallery as module
-from fmtorch.evaluation.curves import picture, svg
 from fmtorch.evaluation.gallery import Options, Run, find_dataset, gallery
-from fmtorch.evaluation.page import Section, ShownPair, render, run_names
 from fmtorch.pipeline.pictures import (
     BAD,
     COLOURS,

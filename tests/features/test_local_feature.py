@@ -15,7 +15,7 @@ from torch import Tensor
 from fmtorch import features, presets
 from fmtorch.core import models_dir
 from fmtorch.features import vlad
-from fmtorch.runs.feature_cache import ArrayCache, CachedFeatures
+from fmtorch.runs import ArrayCache, CachedFeatures
 from scripts.make_models import k_means, learned
 from tests.features.scenes import same, texture
 from tests.reference import local_features as reference

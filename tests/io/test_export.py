@@ -19,8 +19,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from fmtorch import io
-from fmtorch.evaluation.curves import MAX_THUMBNAILS, view_graph_svg
-from fmtorch.io.colmap import ORIGIN, write_database
+from fmtorch.evaluation import MAX_THUMBNAILS, view_graph_svg
+from fmtorch.io import ORIGIN, write_database
 from fmtorch.pipeline import FolderMatches, chosen_pairs, images_below, load_pipeline
 from tests.conftest import shared_path
 

@@ -5,9 +5,9 @@ import pytest
 import torch
 
 from fmtorch.core import pair_key
-from fmtorch.estimators.pair import uniforms
+from fmtorch.estimators import uniforms
 from fmtorch.estimators.preselection import shuffle
-from fmtorch.jit.random import Stream, bits, mixed_seed, uniform
+from fmtorch.jit import Stream, bits, mixed_seed, uniform
 from tests.reference import random as reference
 from tests.reference.random import number
 

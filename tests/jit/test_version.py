@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from fmtorch.estimators.precompiled import WITH_FOCALS
+from fmtorch.estimators import WITH_FOCALS
 from fmtorch.jit.cache import version
 from fmtorch.jit.kernel import F4x1, F8x1, F8x2, U1x1, kernel, signature_of
 

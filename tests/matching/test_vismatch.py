@@ -12,7 +12,7 @@ import torch
 from fmtorch.data import read_image
 from fmtorch.matching import VisMatch
 from fmtorch.matching.matcher import MAX_RATIO, relative_noise
-from fmtorch.pipeline.pipeline import Pipeline, load_pipeline
+from fmtorch.pipeline import Pipeline, load_pipeline
 from tests.data import lists
 from tests.matching import stand_in
 from tests.pipeline.test_pipeline import draw, pair

@@ -20,8 +20,7 @@ import torch
 
 import fmtorch
 from fmtorch import data, match, presets
-from fmtorch.core import Correspondences, Estimate, Features, ImagePruner
-from fmtorch.core.failures import own_traceback, place_of
+from fmtorch.core import Correspondences, Estimate, Features, ImagePruner, own_traceback, place_of
 from fmtorch.data import GivenMatches, ImagePair, ImageSource, read_image
 from fmtorch.geometry import sampson
 from fmtorch.io import MatchStore

@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from fmtorch.scenes.raycast import Camera
+from fmtorch.scenes import Camera
 from fmtorch.scenes.surfaces import Surfaces
 
 

@@ -34,10 +34,9 @@ from torch import Tensor
 
 import fmtorch
 from fmtorch import geometry, matching, metrics, pruning
-from fmtorch.core import Correspondences, Estimate, Features, collate
-from fmtorch.core.annotations import arguments_of, arrays_of
-from fmtorch.pipeline.pipeline import load_pipeline
-from fmtorch.presets.objects import merged
+from fmtorch.core import Correspondences, Estimate, Features, arguments_of, arrays_of, collate
+from fmtorch.pipeline import load_pipeline
+from fmtorch.presets import merged
 from tests.laws import PEERS, calibrated, few, quick_pruner
 from tests.reliability.arguments import KINDS, MISTAKES, NUMBERS, SEQUENCES, Scene, batches, scenes
 from tests.reliability.arguments import given as as_given

@@ -13,8 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from fmtorch.core import pair_key
-from fmtorch.core.files import replacing
+from fmtorch.core import pair_key, replacing
 from fmtorch.runs import PAIR_SCHEMA, PairRow, RunFolder, RunFolderError, identity_digest
 from fmtorch.runs import run_folder as parts_module
 from fmtorch.runs.run_folder import MAX_LEVEL, MERGED, content_digest, part_files

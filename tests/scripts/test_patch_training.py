@@ -14,8 +14,7 @@ from PIL import Image
 from fmtorch.core import conf_dir
 from fmtorch.features.networks import AffNet, GeoDesc, HardNet, build
 from fmtorch.scenes import Camera, Plan, Task, calibration, fundamental, look_at, photograph
-from fmtorch.training.options import PlaneViews
-from fmtorch.training.planes import Photograph, list_photographs
+from fmtorch.training import Photograph, PlaneViews, list_photographs
 from scripts.patch_networks import objectives, stores
 from scripts.patch_networks.patches import (
     Tolerance,

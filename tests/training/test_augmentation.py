@@ -16,11 +16,23 @@ from fmtorch.core import Correspondences
 from fmtorch.data import DepthDataset, ImageError, ImagePair, ImageSource
 from fmtorch.geometry import symmetric_max
 from fmtorch.scenes import Camera, RenderedPairs, calibration, fundamental, look_at, relative_pose, skimage_file
-from fmtorch.training import Augmentation, LabelledMatches, MatchedPairs, collate
-from fmtorch.training.augmentation import crop, keep_ratio, move, rotate, swap
+from fmtorch.training import (
+    Augmentation,
+    LabelledMatches,
+    MatchedPairs,
+    Photograph,
+    PlanePairs,
+    PlaneViews,
+    collate,
+    crop,
+    keep_ratio,
+    move,
+    plane_homography,
+    random_camera,
+    rotate,
+    swap,
+)
 from fmtorch.training.labelled import EDGE_PX, by_line, by_transfer, depths, label, line_distance, transfer_error
-from fmtorch.training.options import PlaneViews
-from fmtorch.training.planes import Photograph, PlanePairs, plane_homography, random_camera
 from tests.reference import labels as reference
 from tests.training.conftest import SIFT, exact
 

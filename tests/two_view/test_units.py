@@ -14,8 +14,7 @@ from fmtorch import presets
 from fmtorch.core import PAIR_TYPES, Correspondences, Estimate, collate
 from fmtorch.geometry import significance
 from fmtorch.metrics import nsgd
-from fmtorch.two_view.arguments import lens_fields
-from fmtorch.two_view.pair_type import classify
+from fmtorch.two_view import classify, lens_fields
 from tests.geometry.scenes import batch, draw
 from tests.reference import lenses as division
 from tests.reference.known_cameras import K0, K1, SIZE, angle, scene

@@ -15,8 +15,8 @@ import pytest
 
 import fmtorch
 from fmtorch.core import pair_key
-from fmtorch.data.cameras import MODELS
-from fmtorch.io.colmap import EXIF_DEVIATION, MatchDatabase, database_image
+from fmtorch.data import MODELS
+from fmtorch.io import EXIF_DEVIATION, MatchDatabase, database_image
 from tests.processes import run_command, starter
 from tests.verification import databases
 from tests.verification.databases import SIZE, killed_and_continued, plain, read, scene, write

@@ -11,13 +11,12 @@ from scipy.spatial.transform import Rotation
 
 from fmtorch import presets
 from fmtorch.core import Correspondences, collate
-from fmtorch.estimators import Focal, Pair, Ransac, SaturatedGains, focal_search
+from fmtorch.estimators import Candidates, Focal, Pair, Ransac, Refinement, SaturatedGains, focal_search
 from fmtorch.estimators.focal_search import FocalSearch, PlausibleCandidates
 from fmtorch.estimators.models import focal_prior
 from fmtorch.estimators.models.posterior import images_of, no_cameras
 from fmtorch.estimators.models.with_focals import FundamentalWithFocals
-from fmtorch.estimators.refinement import Candidates, Refinement
-from fmtorch.jit.random import Stream
+from fmtorch.jit import Stream
 from fmtorch.metrics import nsgd
 from tests.estimators.pairs import pair_of, to_units
 from tests.laws import scene

@@ -10,7 +10,7 @@ import torch
 
 import fmtorch
 from fmtorch.estimators import Ransac
-from fmtorch.pipeline.pipeline import load_pipeline
+from fmtorch.pipeline import load_pipeline
 from tests.conftest import shared_path
 from tests.reference import homography as reference
 

@@ -10,15 +10,13 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from fmtorch.core import Correspondences
-from fmtorch.estimators import Pair, SevenPoint
+from fmtorch.estimators import BITS, Lens, Loss, Pair, SevenPoint, Steps, cheirality
 from fmtorch.estimators.final_fits import PRIOR_CONFLICT_GAIN
 from fmtorch.estimators.lens_search import STRAIGHT, LensFit, fit_with_lenses, lens_prior, squared_px
 from fmtorch.estimators.models import posterior
 from fmtorch.estimators.models.focal_prior import LOG_USUAL
-from fmtorch.estimators.models.model import BITS, Loss, Steps, cheirality
 from fmtorch.estimators.models.with_focals import LOSS_SCALE_PX, FundamentalWithFocals, Refined
 from fmtorch.estimators.models.with_lenses import LensPrior, undistorted
-from fmtorch.estimators.pair import Lens
 from fmtorch.geometry.levenberg_marquardt import LOSS_CODES, NO_TABLE, Weighted
 from tests.estimators.models.test_focals import TALL, WIDE, Sizes, photographs, with_prior
 from tests.estimators.pairs import apart, in_pixels, pair_of, to_units
@@ -293,9 +291,9 @@ LENSES = (-0.2, -0.1)
 FREE = LensPrior(np.zeros(2), np.full(2, 1 / 0.15**2), False)
 
 
-def bent_pair(lenses: tuple[float, float] = LENSES) -> tuple[Pair, np.ndarray, np.ndarray]:
+def bent_pair(pair_of_lenses: tuple[float, float] = LENSES) -> tuple[Pair, np.ndarray, np.ndarray]:
     """A pair, its matches (n, 4) in pixels, and F of pinholes."""
-    x0, x1, F, _ = lenses.photographs(0, lenses, SIZE, wrong=0)
+    x0, x1, F, _ = lenses.photographs(0, pair_of_lenses, SIZE, wrong=0)
     c = Correspondences(
         torch.from_numpy(x0)[None], torch.from_numpy(x1)[None], torch.ones(1, len(x0), dtype=torch.bool),
         size0=torch.tensor([SIZE]), size1=torch.tensor([SIZE]),
