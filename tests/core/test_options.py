@@ -94,7 +94,7 @@ def test_what_fits_an_annotation(annotation: Any, right: list[Any], wrong: list[
     assert [value for value in wrong if fits(value, annotation)] == []
 
 
-def takes(needed: int, /, part: Part | None = None, *, threshold: Real = 1.0, kind: Unknown = 3) -> None:  # type: ignore[name-defined]
+def takes(needed: int, /, part: Part | None = None, *, threshold: Undefined = 1.0, kind: Unknown = 3) -> None:  # type: ignore[name-defined]
     """Two annotations that only a type checker sees."""
 
 

@@ -68,42 +68,37 @@ def words(line: int, change: Callable[[list[str]], list[str]]) -> Callable[[list
     return lambda lines: [" ".join(change(text.split())) if i == line else text for i, text in enumerate(lines)]
 
 
+POSES, TIMES, CALIB = "poses/06.txt", "sequences/06/times.txt", "sequences/06/calib.txt"
 DAMAGE = {
     "no poses": (lambda root: (root / "poses/06.txt").unlink(), r"poses/06\.txt: no such file; the layout is"),
     "truncated poses": (
-        rewrite("poses/06.txt", lambda lines: lines[:9]),
+        rewrite(POSES, lambda lines: lines[:9]),
         r"poses/06\.txt ends at line 9 and .*times\.txt at line 14; each must have one line a frame",
     ),
     "both truncated": (
-        lambda root: [rewrite(f, lambda lines: lines[:9])(root) for f in ("poses/06.txt", "sequences/06/times.txt")],
+        lambda root: [rewrite(f, lambda lines: lines[:9])(root) for f in (POSES, TIMES)],
         r"poses/06\.txt ends at line 9 and .*image_0 has 14 images",
     ),
     "cut within a line": (
-        rewrite("poses/06.txt", words(13, lambda w: w[:5])),
+        rewrite(POSES, words(13, lambda w: w[:5])),
         r"poses/06\.txt, line 14: 5 columns; it must have 12",
     ),
-    "no number": (rewrite("poses/06.txt", words(2, lambda w: ["x", *w[1:]])), r"poses/06\.txt, line 3: .*'x'"),
-    "nan": (rewrite("poses/06.txt", words(2, lambda w: ["nan", *w[1:]])), r"poses/06\.txt, line 3: .*not finite"),
+    "no number": (rewrite(POSES, words(2, lambda w: ["x", *w[1:]])), r"poses/06\.txt, line 3: .*'x'"),
+    "nan": (rewrite(POSES, words(2, lambda w: ["nan", *w[1:]])), r"poses/06\.txt, line 3: .*not finite"),
     "no rotation": (
-        rewrite("poses/06.txt", words(4, lambda w: ["2", *w[1:]])),
+        rewrite(POSES, words(4, lambda w: ["2", *w[1:]])),
         r"poses/06\.txt, line 5: the matrix is no rotation",
     ),
     "mirrored": (
-        rewrite("poses/06.txt", words(0, lambda w: [str(-float(v)) for v in w])),
+        rewrite(POSES, words(0, lambda w: [str(-float(v)) for v in w])),
         r"poses/06\.txt, line 1: the matrix is no rotation",
     ),
     "times out of order": (
-        rewrite("sequences/06/times.txt", lambda lines: [lines[1], lines[0], *lines[2:]]),
+        rewrite(TIMES, lambda lines: [lines[1], lines[0], *lines[2:]]),
         r"times\.txt, line 2: 0 s does not come after 0\.1 s; times must ascend",
     ),
-    "no camera": (
-        rewrite("sequences/06/calib.txt", lambda lines: lines[1:]),
-        r"calib\.txt: no line P0; it must hold P0: to P3:",
-    ),
-    "short projection": (
-        rewrite("sequences/06/calib.txt", words(0, lambda w: w[:7])),
-        r"calib\.txt, line 1: 6 columns; it must have 12",
-    ),
+    "no camera": (rewrite(CALIB, lambda lines: lines[1:]), r"calib\.txt: no line P0; it must hold P0: to P3:"),
+    "short projection": (rewrite(CALIB, words(0, lambda w: w[:7])), r"calib\.txt, line 1: 6 columns; it must have 12"),
     "no images": (
         lambda root: (root / "sequences/06/image_0").rename(root / "gone"),
         r"image_0: no such folder; the layout is sequences/NN",
@@ -135,7 +130,7 @@ def test_a_missing_image_is_a_problem_of_its_pairs_alone(tmp_path: Path) -> None
 
 def test_a_car_that_stands_still_has_no_f(tmp_path: Path) -> None:
     root = write_kitti(tmp_path)
-    rewrite("poses/06.txt", lambda lines: [lines[0], lines[0], *lines[2:]])(root)
+    rewrite(POSES, lambda lines: [lines[0], lines[0], *lines[2:]])(root)
     pairs = {p.identity.rpartition("/")[2]: p for p in load("kitti", root=root, sequences=["06"], pairs=None)}
     assert "line 2: both cameras are at one place, hence there is no F" in (pairs["0-1"].problem or "")
     assert not pairs["0-1"].F.any()
@@ -287,6 +282,7 @@ def rewrite_tum(name: str, line: int, change: Callable[[str], str]) -> Callable[
     )
 
 
+TRUTH = "groundtruth.txt"
 TUM_DAMAGE = {
     "no list": (lambda f: (f / "rgb.txt").unlink(), r"rgb\.txt: no such file; a sequence holds rgb\.txt"),
     "no poses": (lambda f: (f / "groundtruth.txt").unlink(), r"groundtruth\.txt: no such file; a sequence holds"),
@@ -298,16 +294,16 @@ TUM_DAMAGE = {
         r"rgb\.txt, line 5: 1305031236\.1 comes after 1305031236\.203000; time stamps must ascend",
     ),
     "poses out of order": (
-        rewrite_tum("groundtruth.txt", 50, lambda s: "1305031236.1" + s[15:]),
+        rewrite_tum(TRUTH, 50, lambda s: "1305031236.1" + s[15:]),
         r"groundtruth\.txt, line 50: 1305031236\.1\d* comes after 1305031236\.47",
     ),
     "cut": (
-        rewrite_tum("groundtruth.txt", 123, lambda s: s[:30]),
+        rewrite_tum(TRUTH, 123, lambda s: s[:30]),
         r"groundtruth\.txt, line 123: 5 columns; it must have 8: timestamp tx ty tz qx qy qz qw",
     ),
-    "nan": (rewrite_tum("groundtruth.txt", 9, lambda s: s.replace(" 0.5 ", " nan ")), r"line 9: a number that is not"),
+    "nan": (rewrite_tum(TRUTH, 9, lambda s: s.replace(" 0.5 ", " nan ")), r"line 9: a number that is not"),
     "zero quaternion": (
-        rewrite_tum("groundtruth.txt", 9, lambda s: " ".join([*s.split()[:4], "0 0 0 0"])),
+        rewrite_tum(TRUTH, 9, lambda s: " ".join([*s.split()[:4], "0 0 0 0"])),
         r"groundtruth\.txt, line 9: the quaternion is zero",
     ),
     "one pose": (
@@ -322,7 +318,7 @@ TUM_DAMAGE = {
         rewrite_tum("depth.txt", 5, lambda s: "1305031236.1" + s[17:]),
         r"depth\.txt, line 5: .* time stamps must ascend",
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("damage", TUM_DAMAGE)

@@ -16,14 +16,7 @@ from fmtorch.features.networks import AffNet, GeoDesc, HardNet, build
 from fmtorch.scenes import Camera, Plan, Task, calibration, fundamental, look_at, photograph
 from fmtorch.training import Photograph, PlaneViews, list_photographs
 from scripts.patch_networks import objectives, stores
-from scripts.patch_networks.patches import (
-    Tolerance,
-    View,
-    Warps,
-    tracks_of_views,
-    transferred,
-    views_of_plane,
-)
+from scripts.patch_networks.patches import Tolerance, View, Warps, tracks_of_views, transferred, views_of_plane
 from scripts.patch_networks.train import cutting_of, training_of
 from scripts.patch_networks.training import MatchSetTraining, PatchTraining, TrainingOptions
 
