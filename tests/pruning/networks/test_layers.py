@@ -233,11 +233,6 @@ def test_weights_of_no_match_are_zero() -> None:
     assert torch.isfinite(logit.grad).all()  # type: ignore[arg-type]
 
 
-def test_iterations() -> None:
-    with pytest.raises(ValueError, match="iterations=0"):
-        DFE(iterations=0)
-
-
 SCRIPT = Path(__file__).resolve().parents[3] / "scripts" / "make_models.py"
 
 
