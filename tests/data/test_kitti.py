@@ -15,8 +15,6 @@ from tests.conftest import shared_path
 from tests.data.native import turned, write_kitti, write_tum
 from tests.helpers import apart, edit_lines
 
-FIRST = 40  # frame of the sequence with which the FM-Bench copy and the native piece begin
-
 
 def test_real_frames_have_the_f_of_the_fmbench_file() -> None:
     """All pairs of the native frames, from both files' cameras, and those pairs that the FM-Bench file lists."""

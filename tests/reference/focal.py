@@ -29,24 +29,6 @@ def fundamental(parameters: np.ndarray, size0: tuple[int, int], size1: tuple[int
     return np.linalg.inv(K1).T @ skew(parameters[3:6]) @ R @ np.linalg.inv(K0)
 
 
-def parameters_of(F: np.ndarray, size0: tuple[int, int], size1: tuple[int, int]) -> np.ndarray:
-    """Parameters whose model is F: focal lengths by Bougnoux's formula (ICCV 1998), one of E's four poses."""
-    C0, C1 = (calibration(1 / max(size), size) for size in (size0, size1))  # f of one pixel
-    G = C1.T @ F @ C0
-    p, D = np.array([0, 0, 1.0]), np.diag([1.0, 1, 0])
-
-    def squared(G: np.ndarray) -> float:
-        e = skew(np.linalg.svd(G.T)[2][2])  # of the epipole in the second image
-        return float(-(p @ e @ D @ G @ p) * (p @ G.T @ p) / (p @ e @ D @ G @ D @ G.T @ p))
-
-    f0, f1 = np.sqrt(squared(G)) / max(size0), np.sqrt(squared(G.T)) / max(size1)
-    E = calibration(f1, size1).T @ F @ calibration(f0, size0)
-    U, _, Vt = np.linalg.svd(E)
-    R = U @ np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]]) @ Vt
-    R = R * np.sign(np.linalg.det(R))
-    return np.concatenate([Rotation.from_matrix(R).as_rotvec(), U[:, 2], np.log([f0, f1])])
-
-
 Measured = tuple[tuple[float, float], tuple[float, float]]
 UNMEASURED = ((0.0, np.inf), (0.0, np.inf))
 

@@ -24,18 +24,12 @@ from scripts.benchmark.verify import accuracy, centre_errors, sheets
 from tests.helpers import cross_matrix, draw_set
 from tests.scripts.samples import item as plain_item
 from tests.scripts.samples import pair, read, run
-from tests.scripts.samples import row as plain_row
 from tests.verification import databases
 
 
 def seen_pair(scene: str, i: int, j: int) -> ImagePair:
     images = [ImageSource(f"{scene}/{k}", Path(f"{scene}{k}.png")) for k in (i, j)]
     return ImagePair(f"family/{scene}/{i}-{j}", "family", scene, *images, np.eye(3))
-
-
-def judged_row(true: bool, nsgd: float, significance: float, inliers: int) -> Row:
-    of = "f" if true else pairs.UNRELATED
-    return plain_row("sift", f"{of}/s/{id(object())}", nsgd, significance=significance, corrs=inliers, corrs_before=50)
 
 
 def test_unrelated_pairs_cross_scenes_and_are_chosen_once() -> None:

@@ -141,9 +141,6 @@ def test_mistakes_are_told_before_anything_is_written(option, message, tmp_path,
     assert [path.name for path in tmp_path.rglob("*")] == ["cache", "kernels"]  # put there by `own_cache`
 
 
-pytest.importorskip("lightning", reason="training needs the extra `train`")
-
-
 STEPS = 12
 PAIRS = [labelled_pair(i) for i in range(24)]
 
@@ -179,7 +176,7 @@ def train(made: PrunerTraining, folder: Path, every: int, checkpoint_every: int,
 
 
 def trained_by_hand(folder: Path, seen: list[int] | None = None) -> PrunerTraining:
-    """The trained_by_hand module; `seen` gets the steps that were made."""
+    """The trained module; `seen` gets the steps that were made."""
     made = module()
     made.on_train_batch_start = lambda *_: None if seen is None else seen.append(made.global_step)
     assert train(made, folder, every=5, checkpoint_every=3, monitor="hard/AUC@0.05") == STEPS
@@ -206,7 +203,7 @@ def dies(self, batch, index):
         os.kill(os.getpid(), signal.SIGKILL)
     return step(self, batch, index)
 t.PrunerTraining.training_step = dies
-t.trained(Path({str(tmp_path / "parts")!r}))
+t.trained_by_hand(Path({str(tmp_path / "parts")!r}))
 """
     ended = run_command("-c", script, cwd=tmp_path)
     assert ended.returncode == -signal.SIGKILL, ended.stderr

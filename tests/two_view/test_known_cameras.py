@@ -301,7 +301,6 @@ def test_real_pairs_keep_the_order_of_knowledge() -> None:
 INF = float("inf")
 K = torch.from_numpy(reference.K0)
 SCENE = reference.scene(0)
-IMAGE_SIZES = {"size0": reference.SIZE, "size1": reference.SIZE}
 
 
 @pytest.mark.parametrize(
@@ -349,7 +348,7 @@ def test_forms_of_what_is_known(arguments: dict[str, Any], focal: list[Any]) -> 
 )
 def test_wrong_arguments_are_named(arguments: dict[str, Any], said: str) -> None:
     with pytest.raises(ValueError, match=r"^") as error:
-        fmtorch.find_fundamental(SCENE.x0, SCENE.x1, **(IMAGE_SIZES | arguments))
+        fmtorch.find_fundamental(SCENE.x0, SCENE.x1, **(SIZES | arguments))
     assert str(error.value).startswith(said) or said in str(error.value)
 
 
