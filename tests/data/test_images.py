@@ -340,7 +340,7 @@ def test_damage_never_raises(tmp_path: Path) -> None:
     assert exif_focal(tmp_path / "a.jpg").known
     at = intact.index(b"Exif")
     rng, path, outcomes = np.random.default_rng(0), tmp_path / "b.jpg", set()
-    for _ in range(1500):
+    for _ in range(500):
         data = bytearray(intact)
         for position in rng.integers(at, at + 160, rng.integers(1, 6)):
             data[position] = rng.choice([0, 1, 127, 255, rng.integers(256)])

@@ -17,7 +17,7 @@ from torch.utils.data import DataLoader
 
 from fmtorch.data import ImagePair, ImageSource
 from fmtorch.pipeline import Pipeline, load_pipeline
-from fmtorch.scenes import FAMILIES, PLANS, RenderedPairs, Task
+from fmtorch.scenes import FAMILIES, RenderedPairs
 from fmtorch.training import (
     Augmentation,
     Draw,
@@ -191,17 +191,6 @@ def test_validation_scenes_are_the_last_of_each_family(matched: MatchedPairs) ->
     assert torch.equal(validation[0].label, matched[where].label)
     with pytest.raises(ValueError, match="2 scenes"):
         split_scenes(matched)
-
-
-def test_training_has_no_scene_of_the_test_split(matched: MatchedPairs) -> None:
-    """What the scenes are made of is compared in tests/scenes/test_rendered.py."""
-    plans = {plan for (_, split), plan in PLANS.items() if split == "test"}
-    test = {Task(family, "test", n, 0, plan).name for plan in plans for family in FAMILIES for n in range(plan.scenes)}
-    training = {about["scene"] for about in matched.pairs}
-    assert test
-    assert training
-    assert not training & test
-    assert all(f"rendered/{about['scene']}/" in about["identity"] for about in matched.pairs)
 
 
 def rows(n: int = 5) -> list[dict[str, Any]]:

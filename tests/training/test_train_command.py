@@ -252,7 +252,7 @@ def test_ended_before_a_validation_it_is_made_again(tmp_path: Path) -> None:
         return loop.load_best(folder, made), made.state_dict()
 
     whole = best(tmp_path / "whole", None)
-    for last in (1, 2, 3):  # validations after 4, 8 and 12 steps
+    for last in (1, 3):  # validations after 4 and 12 steps
         with pytest.raises(Ended):
             best(tmp_path / f"{last}", last)
         parts = best(tmp_path / f"{last}", None)
