@@ -9,8 +9,7 @@ import pycolmap
 import pytest
 
 from fmtorch.data import MODELS, ImageSource, Lens, read_image, undistorted, undistorted_frames, undistorted_points
-from fmtorch.data.pairs import Resampling, longer_side, shorter_side
-from tests.reference import lenses as reference
+from fmtorch.data.pairs import Resampling
 
 SIZE = (120, 160)
 GIVEN = {"FOV": [0.9], "EUCM": [0.6, 1.1], "OPENCV_FISHEYE": [0.03, -0.02, 0.01, 0.002]}  # in place of random ones
@@ -27,15 +26,6 @@ def lens(model: str) -> Lens:
 
 def grid(n: int = 50) -> np.ndarray:
     return np.random.default_rng(1).uniform([0, 0], [SIZE[1], SIZE[0]], (n, 2))
-
-
-@pytest.mark.parametrize("model", MODELS)
-def test_each_model_is_its_definition(model: str) -> None:
-    used, points = lens(model), grid()
-    for x, there in zip(points, used.distort(points), strict=True):
-        u, v = (x[0] - used.cx) / used.fx, (x[1] - used.cy) / used.fy
-        u, v = reference.distort(model, u, v, list(used.coefficients))
-        np.testing.assert_allclose(there, [used.fx * u + used.cx, used.fy * v + used.cy], rtol=0, atol=1e-10)
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -205,9 +195,3 @@ def test_an_image_source_is_resized_then_turned(tmp_path: Path) -> None:
     small = cv2.resize(image[..., ::-1], (5, 3), interpolation=cv2.INTER_AREA)
     np.testing.assert_array_equal(read_image(source), np.rot90(small))
     assert source.pixels != ImageSource("a", path, RESAMPLED_SIZE).pixels
-
-
-def test_sides() -> None:
-    assert longer_side((480, 640), 320) == (240, 320)
-    assert shorter_side((480, 640), 240) == (240, 320)
-    assert longer_side((10, 4000), 100) == (1, 100)

@@ -12,14 +12,13 @@ from torch import Tensor
 
 from fmtorch import estimators, find_fundamental
 from fmtorch.core import Correspondences, Estimate, collate
-from fmtorch.estimators import MAX_NOISE, MIN_NOISE, Batch, FitScale, bucket, relative_rounding
+from fmtorch.estimators import MAX_NOISE, MIN_NOISE, Batch, FitScale, bucket
 from fmtorch.estimators.models import with_focals
 from fmtorch.geometry import LOSSES
 from fmtorch.presets import merged
 from tests.estimators.models.test_focals import TALL, WIDE, photographs
-from tests.estimators.pairs import SCALES, known, named, pair_of, real
+from tests.estimators.pairs import SCALES, known, named, real
 from tests.laws import PEERS, degenerate, few, quick, scene, small, with_padding
-from tests.reference.random import number
 from tests.variants import OTHER_LIBRARIES, built, loaded, variants
 
 
@@ -155,18 +154,6 @@ def test_a_part_of_a_pair_keeps_its_frame() -> None:
     assert pair.cached("sum", lambda pair: float(pair.points.sum())) == pair.points.sum()
     assert pair.cached("sum", lambda pair: pytest.fail("computed again")) == pair.points.sum()
     assert part.cached("sum", lambda pair: float(pair.points.sum())) == part.points.sum()
-
-
-def test_numbers_of_a_pair_are_those_of_its_seed_key_and_draw() -> None:
-    pair = pair_of(scene(0, 20), seed=5)
-    expected = [[(number(5, pair.key, 1, d, j, 4) >> 10) / 2**53 for j in range(4)] for d in range(100, 130)]
-    assert pair.uniform(100, 30, 4).tolist() == expected
-
-
-def test_the_rounding_of_coordinates() -> None:
-    c = scene(0, 20)
-    assert relative_rounding(c) == 2.0**-23
-    assert relative_rounding(c.replace(x0=c.x0.double(), x1=c.x1.double())) == 2.0**-52
 
 
 EVERY = variants("estimator")

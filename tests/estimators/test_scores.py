@@ -128,13 +128,6 @@ def test_the_reference_of_magsac_is_the_integral_over_sigma(r: float) -> None:
     assert reference.magsac(r) == pytest.approx(1 - loss / total, abs=1e-8)  # the tolerance of the quadrature
 
 
-@pytest.mark.parametrize("threshold", [0.0, -1.0, float("nan")])
-def test_a_threshold_must_be_positive(threshold: float) -> None:
-    for kind, _ in SCORES.values():
-        with pytest.raises(ValueError, match=f"threshold is {threshold}; .* must be positive"):
-            kind(threshold)
-
-
 def cells_of(pair: estimators.Pair, weighted: bool) -> np.ndarray:
     cells = np.empty((2, pair.count), np.int32)
     saturated_cells(pair.table, weighted, cells)

@@ -65,16 +65,6 @@ def test_the_batch_in_torch_equals_each_image_through_opencv() -> None:
         assert torch.equal(alone[0][0], lafs[i, mask[i]])
 
 
-def test_at_most_max_features_the_strongest() -> None:
-    image = np.tile(texture(1, 60, 60), (2, 3))  # equal blobs: equal scores
-    everything, few = (
-        features.HessianDetector().detect(image)[1],
-        features.HessianDetector(max_features=20).detect(image)[1],
-    )
-    assert torch.equal(everything, everything.sort(descending=True).values)
-    assert torch.equal(few, everything[:20])
-
-
 def test_of_equal_neighbours_one_remains() -> None:
     # A blob centred between two pixels: their responses are equal in exact arithmetic.
     y, x = np.mgrid[0:60, 0:61]
@@ -90,19 +80,6 @@ def test_border() -> None:
         room = np.min([x, y, w - 1 - x, h - 1 - y], 0)
         assert (room >= border * sigma - 1e-3).all()
         assert len(room) > 10
-
-
-@pytest.mark.parametrize("shape", [(1, 1), (1, 300), (300, 1), (2, 2), (15, 400), (16, 16), (31, 33)])
-@pytest.mark.parametrize("constant", [True, False])
-def test_small_and_constant_images(shape: tuple[int, int], constant: bool) -> None:
-    image = np.full(shape, 90, np.uint8) if constant else texture(0, 400, 400)[: shape[0], : shape[1]]
-    lafs, scores = features.HessianDetector().detect(image)
-    assert lafs.shape == (len(scores), 2, 3)
-    if constant or min(shape) < 16:
-        assert len(scores) == 0
-    assert features.HessianDetector().detect_batch(torch.from_numpy(image)[None, None].float() / 255)[0].shape[
-        1
-    ] == len(scores)
 
 
 def angle_between(a: Tensor, b: Tensor) -> Tensor:

@@ -185,14 +185,6 @@ def test_map_as_oanet_and_maa_as_the_ransac_tutorial(values: list[float]) -> Non
     assert metrics.pose_maa(errors).item() == pytest.approx(reference.pose_maa(values), abs=1e-12)
 
 
-@given(ERRORS)
-def test_wider_bins_never_give_less(values: list[float]) -> None:
-    errors = torch.tensor(values, dtype=torch.float64)
-    step = metrics.pose_map(errors, (20,), bin=0.01)[0]  # nearly the area under the step curve
-    assert metrics.pose_map(errors, (20,))[0] >= step - 1e-12
-    assert abs(step - torch.relu(1 - errors / 20).mean()) <= 0.01 / 20 + 1e-12
-
-
 @pytest.mark.parametrize("thresholds", [(), (0,), (-5.0,), (7,), (5, 12.5)])
 def test_thresholds_that_are_no_multiples_are_refused(thresholds: tuple[float, ...]) -> None:
     with pytest.raises(ValueError, match="thresholds are"):

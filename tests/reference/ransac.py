@@ -1,6 +1,5 @@
 """Parts of RANSAC from the definitions: scores, samples, support, graph cuts; one draw or match at a time."""
 
-import itertools
 import math
 from collections.abc import Sequence
 from fractions import Fraction
@@ -142,12 +141,6 @@ def energy(labels: np.ndarray, kernel: np.ndarray, edges: list[tuple[int, int]],
         mean = (kernel[p] + kernel[q]) / 2
         total += coherence * (1 if labels[p] != labels[q] else 1 - mean if labels[p] else mean)
     return float(total)
-
-
-def least_by_enumeration(kernel: np.ndarray, edges: list[tuple[int, int]], coherence: float) -> float:
-    """The least energy of all 2^n labellings."""
-    labellings = itertools.product((0, 1), repeat=len(kernel))
-    return min(energy(np.array(labels), kernel, edges, coherence) for labels in labellings)
 
 
 def least_cut(kernel: np.ndarray, edges: list[tuple[int, int]], coherence: float) -> np.ndarray:

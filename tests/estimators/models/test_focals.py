@@ -100,12 +100,6 @@ def test_drawn_focal_lengths_are_functions_of_the_draw_that_follow_the_prior(siz
     assert other.std() == pytest.approx(0.5, abs=4 * 0.5 / math.sqrt(2 * len(other)))
 
 
-def test_quantiles_are_those_of_the_normal_distribution() -> None:
-    normal = focal_prior.normal_quantiles()
-    shares = [0.5 * math.erfc(-q / math.sqrt(2)) for q in normal.tolist()]
-    np.testing.assert_allclose(shares, (np.arange(focal_prior.QUANTILES) + 0.5) / focal_prior.QUANTILES, atol=2.0**-40)
-
-
 def test_hypotheses_pass_through_their_five_matches() -> None:
     pair, start = pair_of(photographs(1, noise=0.0, outliers=0.0).c), 7
     rng = np.random.default_rng(0)
