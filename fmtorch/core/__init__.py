@@ -5,12 +5,12 @@ from typing import TYPE_CHECKING
 from fmtorch.core.lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from fmtorch.core.annotations import Expected, Rule, arguments_of, arrays_of, expectation
+    from fmtorch.core.annotations import arguments_of, arrays_of
     from fmtorch.core.checks import checked
     from fmtorch.core.failures import own_traceback, place_of
     from fmtorch.core.files import conf_dir, models_dir, replacing
     from fmtorch.core.onnx_network import NetworkFileError, onnx_session
-    from fmtorch.core.options import Within, expect_options, fits, nearest
+    from fmtorch.core.options import Within, expect_options, fits
     from fmtorch.core.records import Record, expect_fields, slotted
     from fmtorch.core.settings import claim, create
     from fmtorch.core.stages import (
@@ -27,11 +27,11 @@ if TYPE_CHECKING:
     from fmtorch.core.types import PAIR_TYPES, RELATED, WARNINGS, Correspondences, Estimate, Features, collate, pair_key
 
 __all__ = [
-    "PAIR_TYPES", "RELATED", "WARNINGS", "Correspondences", "Estimate", "Estimator", "Expected", "FeatureExtractor",
-    "Features", "GreyPyramid", "ImagePruner", "Matcher", "NetworkFileError", "PairImages", "Pruner", "Record", "Rule",
-    "Within", "arguments_of", "arrays_of", "checked", "claim", "collate", "conf_dir", "create", "error_line",
-    "exits_with_message", "expect_fields", "expect_options", "expectation", "fits", "grey_pyramid", "models_dir",
-    "nearest", "onnx_session", "own_traceback", "pair_key", "place_of", "replacing", "slotted",
+    "PAIR_TYPES", "RELATED", "WARNINGS", "Correspondences", "Estimate", "Estimator", "FeatureExtractor", "Features",
+    "GreyPyramid", "ImagePruner", "Matcher", "NetworkFileError", "PairImages", "Pruner", "Record", "Within",
+    "arguments_of", "arrays_of", "checked", "claim", "collate", "conf_dir", "create", "error_line",
+    "exits_with_message", "expect_fields", "expect_options", "fits", "grey_pyramid", "models_dir", "onnx_session",
+    "own_traceback", "pair_key", "place_of", "replacing", "slotted",
 ]  # fmt: skip
 
 lazy_exports(__name__)

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from fmtorch.core.lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from fmtorch.estimators.batch import Batch, relative_rounding
+    from fmtorch.estimators.batch import Batch
     from fmtorch.estimators.coarse_to_fine import CoarseToFine
     from fmtorch.estimators.degensac import Degensac
     from fmtorch.estimators.external.colmap import colmap
@@ -57,7 +57,7 @@ __all__ = [
     "Sampler", "SaturatedGains", "Score", "Search", "Select", "SevenPoint", "Solution", "Steps", "StoppingRule",
     "SummedGains", "Uniform", "Verified", "WithinThreshold", "bucket", "cheirality", "colmap", "degensac_cpp",
     "fastpose", "gc_ransac_cpp", "kernel", "kornia_ransac", "largest_weight", "magsac_cpp", "opencv", "part", "poselib",
-    "relative_rounding", "scores_of", "superansac_cpp", "uniforms",
+    "scores_of", "superansac_cpp", "uniforms",
 ]  # fmt: skip
 
 lazy_exports(__name__)

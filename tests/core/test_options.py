@@ -20,18 +20,12 @@ from torch import Tensor
 
 from fmtorch import geometry, matching, metrics, presets, pruning
 from fmtorch.core import (
-    Correspondences,
-    Expected,
-    Rule,
     Within,
-    arrays_of,
     checked,
     claim,
     create,
     expect_options,
-    expectation,
     fits,
-    nearest,
 )
 
 Item = TypeVar("Item")
@@ -128,12 +122,6 @@ def test_what_cannot_be_known_is_taken_on_trust() -> None:
     expect_options(any_more, {"b": object()}, "here")
     expect_options(Wide, {"first": {"scale": 2}}, "here", given=("threshold",))
     expect_options(Wide, {"threshold": 1, "first": OBJECT}, "here")
-
-
-def test_names_are_told_nearest_first_and_of_many_a_few() -> None:
-    assert nearest("lmed", ["ransac", "lmeds", "msac"]).startswith("lmeds, ")
-    assert nearest("x7", [f"x{i}" for i in range(30)]).startswith("x7, ")
-    assert nearest("x7", [f"x{i}" for i in range(30)]).endswith(" and 18 more")
 
 
 @pytest.mark.parametrize("group", ["features", "matcher", "pruner", "estimator"])
@@ -267,20 +255,6 @@ def test_models_are_one_a_set_of_matches_or_several() -> None:
     for wrong in (torch.rand(3, 3), torch.rand(3, 3, 3), torch.rand(4, 2, 2, 3, 3)):
         with pytest.raises(ValueError, match=r"leading dimensions .*; they must be \(4,\), as of x0, or \(4,\)"):
             geometry.refine(wrong, x0, x1)
-
-
-def test_annotations_are_read() -> None:
-    assert expectation(Float[Tensor, "*batch n 2"] | None) == Expected(
-        "array", ("*batch", "n", "2"), "Float", optional=True
-    )
-    rule = Rule(lambda value: value > 0, "it is positive")
-    assert expectation(Annotated[Float[Tensor, " n"], rule] | None).bounds is rule
-    assert expectation(Literal["a", "b"]) == Expected("choice", choices=("a", "b"))
-    assert expectation(float | Tensor) == Expected("number or array", dtype="Float")
-    assert expectation(Any).kind == expectation(int | str).kind == ""
-    assert {name for name, field in arrays_of(Correspondences).items() if field.bounds} == {
-        "score", "prior", "noise", "size0", "size1", "focal", "lens",
-    }  # fmt: skip
 
 
 def test_exported_functions_can_be_pickled_and_say_what_they_take() -> None:

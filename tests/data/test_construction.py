@@ -204,25 +204,6 @@ def test_overlap_of_rendered_pairs_is_that_counted_pixel_by_pixel(rendered: Dept
     assert min(shares) < 0.4 < 0.6 < max(shares)
 
 
-@pytest.mark.parametrize(
-    ("other", "expected"),
-    [
-        (2.0, 0.5),  # the same wall, of which the other camera sees the right half
-        (2.0 * (1 + 0.9 * construction.TOLERANCE), 0.5),
-        (2.0 / (1 - 1.1 * construction.TOLERANCE), 0.0),  # another wall, behind
-        (1.5, 0.0),  # hidden
-        (np.nan, 0.0),  # what is within the other image is unknown, all else is outside
-    ],
-)
-def test_a_wall_of_which_half_is_seen(other: float, expected: float) -> None:
-    K = np.array([[40.0, 0.0, 19.5], [0.0, 40.0, 9.5], [0.0, 0.0, 1.0]])
-    sees = [construction.Seen(K, (20, 40), lambda x, z=z: np.full(len(x), z)) for z in (2.0, other)]  # type: ignore[misc]
-    assert construction.seen_share(*sees, np.eye(3), np.array([-1.0, 0.0, 0.0]), step=1) == expected
-    assert (
-        construction.seen_share(*sees, np.eye(3), np.array([0.0, 0.0, -5.0])) == 0
-    )  # all of it is behind the other camera
-
-
 def test_overlap_by_points_is_that_counted_point_by_point() -> None:
     rng = np.random.default_rng(2)
     points = [rng.integers(0, 60, rng.integers(0, 40)) for _ in range(30)]

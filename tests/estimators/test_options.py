@@ -1,20 +1,13 @@
 """Options as configs write them: groups, parts by name, by mapping and by object, and what is refused."""
 
-import typing
-
 import pytest
 import torch
 
 from fmtorch import find_fundamental, presets
-from fmtorch.estimators import PARTS, InlierCount, Msac, Preselect, Ransac, Refine, part
-from fmtorch.geometry.levenberg_marquardt import LOSS_CODES
+from fmtorch.estimators import PARTS, InlierCount, Msac, Preselect, Ransac, part
 from tests.laws import scene
 
 MEDIAN = {"score": "median", "inliers": "lmeds", "confidence": None}
-
-
-def test_losses_that_refine_names_are_those_there_are() -> None:
-    assert typing.get_args(typing.get_type_hints(Refine)["loss"]) == tuple(LOSS_CODES)
 
 
 @pytest.mark.parametrize(

@@ -36,7 +36,7 @@ from fmtorch.pipeline import (
     vectors_of,
 )
 from fmtorch.pipeline import folder as similar
-from fmtorch.pipeline.folder import default_output, in_blocks, natural_order
+from fmtorch.pipeline.folder import default_output
 from tests.conftest import shared_path
 
 
@@ -267,29 +267,6 @@ def test_a_wrong_number_of_neighbours_is_told(pairs: str, tmp_path: Path) -> Non
     images = [picture(tmp_path / "a.jpg"), picture(tmp_path / "b.jpg")]
     with pytest.raises(ValueError, match="it must be sequential:N with a whole number N of at least 1"):
         chosen_pairs(tmp_path, images, Path(pairs))
-
-
-def test_natural_order() -> None:
-    names = ["b2", "B10", "a", "a1", "a01", "10", "9", "9a"]
-    assert sorted(names, key=natural_order) == ["9", "9a", "10", "a", "a01", "a1", "b2", "B10"]
-
-
-def test_blocks_hold_few_images_at_a_time() -> None:
-    images = [Path(f"{i}.jpg") for i in range(100)]
-    pairs = list(itertools.combinations(images, 2))
-    assert in_blocks(pairs[:3], 100) == pairs[:3]
-    ordered = in_blocks(pairs, 10)
-    assert sorted(ordered) == sorted(pairs)
-    held: dict[Path, None] = {}
-    loaded = 0
-    for pair in ordered:
-        for image in pair:
-            loaded += image not in held
-            held.pop(image, None)
-            held[image] = None
-        for image in list(held)[:-12]:
-            del held[image]
-    assert loaded <= 100 * 10 / 2 + 100  # once for each of ten blocks, of which half come after it
 
 
 def test_folders_of_one_name_have_outputs_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

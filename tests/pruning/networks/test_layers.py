@@ -13,7 +13,6 @@ from torch import Tensor
 from fmtorch.core import Correspondences, collate
 from fmtorch.geometry import eight_point, sampson
 from fmtorch.pruning import DFE, LC, LearnedPruner, MatchInputs
-from fmtorch.pruning.networks.dfe import masked_softmax
 from fmtorch.pruning.networks.layers import ContextBatchNormReLU, ResidualBlock, Slots
 from scripts.make_models import ngransac_state
 from tests.conftest import oracle, shared_path
@@ -223,14 +222,6 @@ def test_gradients_are_finite_on_degenerate_pairs(network: DFE) -> None:
     assert torch.isfinite(prediction.F).all()
     assert not prediction.F[:, 3:6].any()  # fewer than eight matches fit nothing
     assert all(torch.isfinite(b).all() for b in network.buffers())
-
-
-def test_weights_of_no_match_are_zero() -> None:
-    logit = torch.tensor([[1.0, 2.0], [3.0, 4.0]], requires_grad=True)
-    weight = masked_softmax(logit, torch.tensor([[False, False], [True, False]]))
-    assert weight.tolist() == [[0, 0], [1, 0]]
-    weight.square().sum().backward()
-    assert torch.isfinite(logit.grad).all()  # type: ignore[arg-type]
 
 
 SCRIPT = Path(__file__).resolve().parents[3] / "scripts" / "make_models.py"
