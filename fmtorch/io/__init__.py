@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from fmtorch.core.lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from fmtorch.io.colmap import EXIF_DEVIATION, ORIGIN, MatchDatabase, database_image, write_database
+    from fmtorch.io.colmap import EXIF_DEVIATION, MatchDatabase, database_image, write_database
     from fmtorch.io.dataset import H5Pairs
     from fmtorch.io.export import (
         DATABASE,
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
         write_exports,
         write_view_graph,
     )
-    from fmtorch.io.match_store import MatchStore, StoredImage, StoredPair, indices
+    from fmtorch.io.match_store import ORIGIN, MatchStore, StoredImage, StoredPair, indices
 
 __all__ = [
     "DATABASE", "EXIF_DEVIATION", "FEATURES", "MATCHES", "ORIGIN", "Edge", "H5Pairs", "MatchDatabase", "MatchStore",
