@@ -60,7 +60,7 @@ def test_scores_are_those_of_the_definitions(given: str, name: str, weighted: bo
         for threshold in {1.5, 1.5 * scale}:
             score = kind(threshold)
             score.prior_weighted = weighted
-            which = np.array([5, 1, 2, 3, 4, 2])
+            which = np.array([5, 1, 5])
             totals = score(F, which, pair)
             for k, total in zip(which, totals, strict=True):
                 lower, most = bounds(gain, F[k], pair, threshold, weighted, name == "saturated")

@@ -61,7 +61,7 @@ def test_the_outputs_are_the_same(name: str, tmp_path: Path, patches: Tensor) ->
         model = onnx.load(path)
         onnx.save(laid_out(model, 32), tmp_path / "laid_out.onnx")
         assert model == onnx.load(path)  # what was given is not changed
-        for batch in (1, 7, 64):
+        for batch in (1, 64):
             expected = PatchNetwork(path, batch=batch)(patches)
             found = PatchNetwork(tmp_path / "laid_out.onnx", batch=batch)(patches)
             assert float(expected.nan_to_num().std()) > 0
