@@ -14,8 +14,8 @@ from fmtorch.matching import VisMatch
 from fmtorch.matching.matcher import relative_noise
 from fmtorch.pipeline import Pipeline, load_pipeline
 from tests.data import lists
+from tests.helpers import draw, pair
 from tests.matching import stand_in
-from tests.pipeline.test_pipeline import draw, pair
 
 
 @pytest.fixture(autouse=True)

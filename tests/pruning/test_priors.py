@@ -10,8 +10,7 @@ import fmtorch
 from fmtorch import Correspondences, presets
 from fmtorch.pruning import GMS, LPM, Calibration, calibration, gms_support, lpm_cost
 from tests.laws import scene
-from tests.pruning.test_gms import SIZE0, SIZE1, moving
-from tests.pruning.test_gms import moving as moving_on_grids
+from tests.pruning.test_gms import SIZE0, SIZE1, moving, moving_along
 from tests.reference.gms import SCALES, normalised, run, support
 from tests.reference.lpm import passes
 from tests.variants import built
@@ -44,7 +43,7 @@ def test_calibration_uses_the_ratio_where_there_is_one() -> None:
 
 @pytest.mark.parametrize(("angle", "scale"), [(0.0, 1.0), (np.pi / 2, 0.5)])
 def test_gms_support_equals_the_definition(angle: float, scale: float) -> None:
-    x0, x1 = moving_on_grids(0, 400, angle, scale)
+    x0, x1 = moving(0, 400, angle, scale)
     searched = angle != 0
     computed = gms_support(
         x0[None], x1[None], size0=torch.tensor([SIZE0]), size1=torch.tensor([SIZE1]),
@@ -59,13 +58,13 @@ def test_gms_support_equals_the_definition(angle: float, scale: float) -> None:
 
 @pytest.mark.parametrize("n", [0, 1, 9, 40, 160])
 def test_lpm_cost_equals_the_definition(n: int) -> None:
-    x0, x1 = moving(n, n)
+    x0, x1 = moving_along(n, n)
     expected = np.mean(passes(x0.numpy(), x1.numpy())[1], axis=0)
     np.testing.assert_allclose(lpm_cost(x0[None], x1[None])[0], expected, rtol=1e-12)
 
 
 def test_priors_follow_the_right_matches_of_a_common_motion() -> None:
-    x0, x1 = (x[None].float() for x in moving(0, 1000, outliers=0.5))
+    x0, x1 = (x[None].float() for x in moving_along(0, 1000, outliers=0.5))
     turn = torch.tensor([[0.95, 0.2], [-0.2, 0.95]])
     right = (x1 - x0 @ turn - torch.tensor([30.0, 10.0])).norm(dim=-1)[0] < 3
     c = scene(0, 1000).replace(x0=x0, x1=x1, ratio=None, lafs0=None, lafs1=None, prior=None)
