@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fmtorch.core.types import Estimate
-from fmtorch.two_view import find, planes
+from fmtorch.two_view import find
 from fmtorch.two_view.arguments import MIN_PIXELS
 
 Matrix = NDArray[np.float64]
@@ -229,7 +229,7 @@ def _scale_to_pixels(points: list[Matrix], threshold: float | int, src: Matrix |
     if src is None or not 0 < threshold < SUBPIXEL or len(src) < 2:
         return 1.0
     extents = [float(np.ptp(x[np.isfinite(x).all(1)], axis=0).max(initial=0.0)) for x in (src, points[0])]
-    comparable = extents[0] < planes.COMPARABLE * extents[1] and extents[1] < planes.COMPARABLE * extents[0]
+    comparable = extents[0] < find.COMPARABLE * extents[1] and extents[1] < find.COMPARABLE * extents[0]
     return 1.0 if comparable else USUAL_THRESHOLD / threshold
 
 

@@ -26,8 +26,8 @@ KERNELS = kernels_dir()  # before any test sets $FMTORCH_CACHE
 
 
 LONGEST = (
-    "training/test_train_command.py", "test_command_line.py", "docs/test_commands.py", "reliability/",
-    "features/test_large_images.py", "test_eval.py", "training/", "scenes/test_rendered.py", "test_processors.py",
+    "training/test_train_command.py", "commands/", "docs/test_commands.py", "reliability/", "test_packaging.py",
+    "features/test_local_feature.py", "training/", "scenes/test_rendered.py", "test_processors.py",
 )  # fmt: skip
 """Files and folders with tests of many seconds."""
 

@@ -70,7 +70,7 @@ def warm_up() -> None:
         from numba.core.registry import cpu_target
 
         cpu_target.target_context.refresh()
-    from fmtorch.runs.fingerprint import code_digest, fmtorch_version
+    from fmtorch.runs import code_digest, fmtorch_version
 
     fmtorch_version()
     for name in ("fmtorch.features.sift", "fmtorch.estimators", "fmtorch.matching", "fmtorch.pruning"):

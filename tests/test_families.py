@@ -11,7 +11,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from fmtorch import presets
-from fmtorch.commands.config import job
+from fmtorch.commands import job
 from fmtorch.core import Correspondences, conf_dir
 from fmtorch.data import GivenMatches, ImagePair, ImageSource
 from fmtorch.pipeline import Pipeline, build_pipeline, load_pipeline
@@ -81,9 +81,7 @@ def test_gms_tries_scales_on_wide_baselines_alone() -> None:
         ("pruner.gms.with_scale=true pruner.gms.families=null", (True, True, True)),
     ],
 )
-def test_an_option_that_is_given_explicitly_holds_for_all_families(
-    overrides: str, scale: tuple[bool, ...], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_option_that_is_given_explicitly_holds_for_all_families(overrides, scale, monkeypatch):
     words = ("pipeline=sift_gms", *overrides.split(" "))
     expected = dict(zip(("KITTI", "Strecha", "CPC"), scale, strict=True))
 

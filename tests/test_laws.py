@@ -8,23 +8,8 @@ import torch
 
 from fmtorch import presets
 from fmtorch.core import Correspondences, Estimate, collate
-from fmtorch.two_view.known_cameras import KnownCameras
-from tests.laws import (
-    KNOWLEDGE,
-    Result,
-    Subject,
-    assert_same,
-    calibrated,
-    degenerate,
-    live_values,
-    quick,
-    quick_pruner,
-    scene,
-    scenes,
-    small,
-    with_knowledge,
-    with_padding,
-)
+from fmtorch.two_view import KnownCameras
+from tests import laws
 from tests.variants import OTHER_LIBRARIES, variants
 
 OWN = [n for n in variants("estimator") if not n.startswith(OTHER_LIBRARIES)]
@@ -32,95 +17,97 @@ PER_MATCH = ("inliers", "kept", "prior", "noise")
 NOISY = ("fmtorch", "fmtorch_fast", "gc_ransac", "msac")  # are also told the noise of matches
 
 
-def _results(e: Estimate) -> Result:
+def _results(e: Estimate) -> laws.Result:
     values = {"F": e.F, "inliers": e.inliers, "ok": e.ok, "samples": e.samples}
     return {**values, "significance": e.significance} if e.model == "fundamental" else values
 
 
-def _estimator(name: str) -> Subject:
-    estimator = quick(name)
-    return Subject(f"estimator={name}", lambda c: _results(estimator(c, seed=5)))
+def _estimator(name: str) -> laws.Subject:
+    estimator = laws.quick(name)
+    return laws.Subject(f"estimator={name}", lambda c: _results(estimator(c, seed=5)))
 
 
-def _pruner(name: str) -> Subject:
-    pruner = quick_pruner(name)
+def _pruner(name: str) -> laws.Subject:
+    pruner = laws.quick_pruner(name)
 
-    def run(c: Correspondences) -> Result:
-        pruned = pruner(calibrated(c))
+    def run(c: Correspondences) -> laws.Result:
+        pruned = pruner(laws.calibrated(c))
         fields = {name: getattr(pruned, name) for name in ("prior", "noise")}
         return {"kept": pruned.mask, **{name: value for name, value in fields.items() if value is not None}}
 
-    return Subject(f"pruner={name}", run)
+    return laws.Subject(f"pruner={name}", run)
 
 
-def _noisy(name: str) -> Subject:
-    estimator, noise = quick(name), presets.build("pruner", "match_noise")
-    return Subject(f"estimator={name} with noise", lambda c: _results(estimator(noise(c), seed=5)))
+def _noisy(name: str) -> laws.Subject:
+    estimator, noise = laws.quick(name), presets.build("pruner", "match_noise")
+    return laws.Subject(f"estimator={name} with noise", lambda c: _results(estimator(noise(c), seed=5)))
 
 
-def _calibrated(name: str, known: str) -> Subject:
+def _calibrated(name: str, known: str) -> laws.Subject:
     """An estimator that knows cameras; where there is no pose, its values are 7."""
-    estimator = KnownCameras(quick(name))
+    estimator = KnownCameras(laws.quick(name))
 
-    def run(c: Correspondences) -> Result:
-        e = estimator(with_knowledge(c, known), seed=5)
+    def run(c: Correspondences) -> laws.Result:
+        e = estimator(laws.with_knowledge(c, known), seed=5)
         poses = {"E": e.E, "R": e.R, "t": e.t, "focals": e.focals}
         return _results(e) | {field: torch.nan_to_num(value, 7) for field, value in poses.items() if value is not None}
 
-    return Subject(f"estimator={name}, {known} cameras", run)
+    return laws.Subject(f"estimator={name}, {known} cameras", run)
 
 
-def _subjects() -> list[Subject]:
+def _subjects() -> list[laws.Subject]:
     """Every preset of these groups: a new file in conf/ joins by being there."""
     estimators = [_estimator(n) for n in variants("estimator") if not n.startswith(OTHER_LIBRARIES[1:])]
-    cameras = [_calibrated("msac", "exact"), *(_calibrated("fmtorch", known) for known in KNOWLEDGE)]
+    cameras = [_calibrated("msac", "exact"), *(_calibrated("fmtorch", known) for known in laws.KNOWLEDGE)]
     return [*estimators, *cameras, *(_pruner(n) for n in variants("pruner")), *(_noisy(n) for n in NOISY)]
 
 
-def _row(result: Result, c: Correspondences, i: int) -> Result:
+def _row(result: laws.Result, c: Correspondences, i: int) -> laws.Result:
     """Pair i of a batch, with what is per match reduced to the matches that are not masked."""
-    return live_values({name: value[i : i + 1] for name, value in result.items()}, c[i])
+    return laws.live_values({name: value[i : i + 1] for name, value in result.items()}, c[i])
 
 
-GOOD = [scene(1), scene(2, 60)]
+GOOD = [laws.scene(1), laws.scene(2, 60)]
 SUBJECTS = _subjects()
 PLAIN = [s for s in SUBJECTS if not s.name.endswith("with noise")]
 everything = pytest.mark.parametrize("subject", SUBJECTS, ids=[s.name for s in SUBJECTS])
 
 
 @everything
-def test_padding_is_invisible(subject: Subject) -> None:
+def test_padding_is_invisible(subject: laws.Subject) -> None:
     """Garbage of three kinds in one batch, of one kind in each pair."""
     garbage = (float("nan"), 1e30, -7.0, float("nan"), 1e30)
-    padded = collate([with_padding(scenes()[i], np.random.default_rng(i), kind) for i, kind in enumerate(garbage)])
-    padded_result, expected = subject.run(padded), subject.run(scenes())
+    padded = collate(
+        [laws.with_padding(laws.scenes()[i], np.random.default_rng(i), kind) for i, kind in enumerate(garbage)]
+    )
+    padded_result, expected = subject.run(padded), subject.run(laws.scenes())
     for i, kind in enumerate(garbage):
-        alone, unpadded = _row(padded_result, padded, i), _row(expected, scenes(), i)
-        assert_same(unpadded, alone, f"{subject.name}, pair {i} with {kind} in masked slots")
+        alone, unpadded = _row(padded_result, padded, i), _row(expected, laws.scenes(), i)
+        laws.assert_same(unpadded, alone, f"{subject.name}, pair {i} with {kind} in masked slots")
 
 
 @everything
-def test_neighbours_are_invisible(subject: Subject) -> None:
-    pairs = [scene(i, count) for i, count in enumerate((150, 40, 333, 90, 150, 140, 700))]
+def test_neighbours_are_invisible(subject: laws.Subject) -> None:
+    pairs = [laws.scene(i, count) for i, count in enumerate((150, 40, 333, 90, 150, 140, 700))]
     together = subject.run(collate(pairs))
     for i, pair in enumerate(pairs):
         alone = subject.run(pair)
         n = pair.mask.shape[1]
         shared = {k: v[i : i + 1, :n] if k in PER_MATCH else v[i : i + 1] for k, v in together.items()}
-        assert_same(alone, shared, f"{subject.name}, pair {i}")
+        laws.assert_same(alone, shared, f"{subject.name}, pair {i}")
 
 
 @everything
-def test_no_pair_takes_its_batch_down(subject: Subject) -> None:
+def test_no_pair_takes_its_batch_down(subject: laws.Subject) -> None:
     """Beside degenerate pairs of every kind two good ones stay as they are, and no pair has NaN."""
-    kinds = degenerate()
+    kinds = laws.degenerate()
     n = max(pair.mask.shape[1] for pair in GOOD)
     alone = subject.run(collate(GOOD))
 
-    def beside(names: list[str]) -> Result:
+    def beside(names: list[str]) -> laws.Result:
         mixed = subject.run(collate([GOOD[0], *(kinds[kind] for kind in names), GOOD[1]]))
         kept = {k: v[[0, -1], :n] if k in PER_MATCH else v[[0, -1]] for k, v in mixed.items()}
-        assert_same(alone, kept, f"{subject.name} beside {', '.join(names)}")
+        laws.assert_same(alone, kept, f"{subject.name} beside {', '.join(names)}")
         return mixed
 
     try:
@@ -141,26 +128,26 @@ def test_no_pair_takes_its_batch_down(subject: Subject) -> None:
 
 
 @pytest.mark.parametrize("subject", PLAIN, ids=[s.name for s in PLAIN])
-def test_few_matches_alone_and_in_a_batch(subject: Subject) -> None:
-    pairs = small()
+def test_few_matches_alone_and_in_a_batch(subject: laws.Subject) -> None:
+    pairs = laws.small()
     together = subject.run(collate(list(pairs.values())))
     for i, (kind, pair) in enumerate(pairs.items()):
         n = pair.mask.shape[1]
         shared = {k: v[i : i + 1, :n] if k in PER_MATCH else v[i : i + 1] for k, v in together.items()}
-        assert_same(subject.run(pair), shared, f"{subject.name}: {kind}")
+        laws.assert_same(subject.run(pair), shared, f"{subject.name}: {kind}")
     for value in together.values():
         assert not bool(torch.isnan(value.to(torch.float64)).any()), f"{subject.name}: NaN"
 
 
 @pytest.mark.parametrize("name", OWN)
 def test_batch_workers_and_threads_change_nothing(name: str) -> None:
-    estimator = quick(name, 60, 30)
-    pairs = [scene(i, 24 + 53 * i % 120) for i in range(24)]
+    estimator = laws.quick(name, 60, 30)
+    pairs = [laws.scene(i, 24 + 53 * i % 120) for i in range(24)]
 
-    def run(batch: list[Correspondences]) -> Result:
+    def run(batch: list[Correspondences]) -> laws.Result:
         return _results(estimator(collate(batch), seed=5))
 
-    def first(result: Result, pairs: int, matches: int) -> Result:
+    def first(result: laws.Result, pairs: int, matches: int) -> laws.Result:
         return {k: v[:pairs, :matches] if k == "inliers" else v[:pairs] for k, v in result.items()}
 
     threads = torch.get_num_threads()
@@ -171,9 +158,9 @@ def test_batch_workers_and_threads_change_nothing(name: str) -> None:
         torch.set_num_threads(threads)
     seven = run(pairs[:7])
     n = seven["inliers"].shape[1]
-    assert_same(seven, first(threaded, 7, n), f"{name}: a batch of 7, and one of 24 in four threads")
+    laws.assert_same(seven, first(threaded, 7, n), f"{name}: a batch of 7, and one of 24 in four threads")
     with ThreadPoolExecutor(4) as workers:
         for i, alone in enumerate(workers.map(lambda pair: run([pair]), pairs[:7])):
             n_alone = pairs[i].mask.shape[1]
             shared = {k: v[i : i + 1, :n_alone] if k == "inliers" else v[i : i + 1] for k, v in seven.items()}
-            assert_same(alone, shared, f"{name}: pair {i} alone, in one of four workers")
+            laws.assert_same(alone, shared, f"{name}: pair {i} alone, in one of four workers")

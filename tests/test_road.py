@@ -28,9 +28,7 @@ print(*sys.modules)
 """
 
 
-def test_the_road_of_a_pair_is_the_files_that_the_page_names(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_the_road_of_a_pair_is_the_files_that_the_page_names(monkeypatch: pytest.MonkeyPatch) -> None:
     solve, road = SevenPoint.minimal, list[str]()
 
     def solver(*arguments: Any) -> int:

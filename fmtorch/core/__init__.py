@@ -5,8 +5,14 @@ from typing import TYPE_CHECKING
 from fmtorch.core.lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from fmtorch.core.files import conf_dir, models_dir
-    from fmtorch.core.onnx_network import NetworkFileError
+    from fmtorch.core.annotations import arguments_of, arrays_of
+    from fmtorch.core.checks import checked
+    from fmtorch.core.failures import own_traceback, place_of
+    from fmtorch.core.files import conf_dir, models_dir, replacing
+    from fmtorch.core.onnx_network import NetworkFileError, onnx_session
+    from fmtorch.core.options import Within, expect_options, fits
+    from fmtorch.core.records import Record, expect_fields, slotted
+    from fmtorch.core.settings import claim, create
     from fmtorch.core.stages import (
         Estimator,
         FeatureExtractor,
@@ -17,12 +23,15 @@ if TYPE_CHECKING:
         Pruner,
         grey_pyramid,
     )
+    from fmtorch.core.terminal import error_line, exits_with_message
     from fmtorch.core.types import PAIR_TYPES, RELATED, WARNINGS, Correspondences, Estimate, Features, collate, pair_key
 
 __all__ = [
     "PAIR_TYPES", "RELATED", "WARNINGS", "Correspondences", "Estimate", "Estimator", "FeatureExtractor", "Features",
-    "GreyPyramid", "ImagePruner", "Matcher", "NetworkFileError", "PairImages", "Pruner", "collate", "conf_dir",
-    "grey_pyramid", "models_dir", "pair_key",
+    "GreyPyramid", "ImagePruner", "Matcher", "NetworkFileError", "PairImages", "Pruner", "Record", "Within",
+    "arguments_of", "arrays_of", "checked", "claim", "collate", "conf_dir", "create", "error_line",
+    "exits_with_message", "expect_fields", "expect_options", "fits", "grey_pyramid", "models_dir", "onnx_session",
+    "own_traceback", "pair_key", "place_of", "replacing", "slotted",
 ]  # fmt: skip
 
 lazy_exports(__name__)

@@ -10,17 +10,18 @@ import torch
 from jaxtyping import Float, Int
 
 from fmtorch import presets
-from fmtorch.data.cameras import Lens
-from fmtorch.data.files import DataError
+from fmtorch.data.cameras import MODELS, Lens, undistorted, undistorted_frames, undistorted_points
+from fmtorch.data.files import DataError, NpzArrays
 from fmtorch.data.fmbench import FMBenchPairs
-from fmtorch.data.image_cameras import ExifFocal, ImageCameras, exif_focal
-from fmtorch.data.images import ImageError, read_image, stored_size, to_grey
+from fmtorch.data.image_cameras import ExifFocal, ImageCameras, exif_focal, read_model
+from fmtorch.data.images import ImageError, read_image, stored_orientation, stored_size, to_grey
 from fmtorch.data.pairs import DepthDataset, GivenMatches, ImagePair, ImageSource, PairDataset, subset
 
 __all__ = [
-    "DataError", "DepthDataset", "ExifFocal", "FMBenchPairs", "GivenMatches", "ImageCameras", "ImageError",
-    "ImagePair", "ImageSource", "Lens", "PairBatch", "PairDataset", "build", "collate", "exif_focal", "load",
-    "read_image", "stored_size", "subset", "to_grey",
+    "MODELS", "DataError", "DepthDataset", "ExifFocal", "FMBenchPairs", "GivenMatches", "ImageCameras", "ImageError",
+    "ImagePair", "ImageSource", "Lens", "NpzArrays", "PairBatch", "PairDataset", "build", "collate", "exif_focal",
+    "load", "read_image", "read_model", "stored_orientation", "stored_size", "subset", "to_grey", "undistorted",
+    "undistorted_frames", "undistorted_points",
 ]  # fmt: skip
 
 Progress = Callable[[int, int], None]

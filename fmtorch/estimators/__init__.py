@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from fmtorch.core.lazy import lazy_exports
 
 if TYPE_CHECKING:
+    from fmtorch.estimators.batch import Batch
     from fmtorch.estimators.coarse_to_fine import CoarseToFine
     from fmtorch.estimators.degensac import Degensac
     from fmtorch.estimators.external.colmap import colmap
@@ -18,15 +19,20 @@ if TYPE_CHECKING:
         poselib,
         superansac_cpp,
     )
-    from fmtorch.estimators.external.pairwise import PairwiseEstimator
+    from fmtorch.estimators.external.pairwise import PairwiseEstimator, Solution
     from fmtorch.estimators.graph_cut import GraphCut
     from fmtorch.estimators.inliers import BetterHalf, InlierRule, RobustDeviations, StoppingRule, WithinThreshold
     from fmtorch.estimators.irls import IterativelyReweighted
     from fmtorch.estimators.models.fundamental import EightPoint, Fundamental, Homography, SevenPoint
+    from fmtorch.estimators.models.model import BITS, FitScale, Hypotheses, Loss, Steps, cheirality
     from fmtorch.estimators.options import Focal, Preselect, Refine, Select
-    from fmtorch.estimators.pair import Pair
+    from fmtorch.estimators.pair import MAX_NOISE, MIN_NOISE, Lens, Pair, bucket, uniforms
+    from fmtorch.estimators.precompiled import WITH_FOCALS
+    from fmtorch.estimators.preselection import Preselection
     from fmtorch.estimators.ransac import Ransac
-    from fmtorch.estimators.sampling import PriorWeighted, Prosac, Sampler, Uniform
+    from fmtorch.estimators.refinement import BestOfSearch, BestScore, Candidates, Refinement, scores_of
+    from fmtorch.estimators.registry import PARTS, part
+    from fmtorch.estimators.sampling import PriorWeighted, Prosac, Sampler, Uniform, largest_weight
     from fmtorch.estimators.scores import (
         GemanMcClure,
         InlierCount,
@@ -37,15 +43,19 @@ if TYPE_CHECKING:
         Score,
         SummedGains,
     )
+    from fmtorch.estimators.search import Pool, Search, Verified
     from fmtorch.jit.kernel import F4x1, F4x2, F8x1, F8x2, I8x1, I8x2, kernel
 
 __all__ = [
-    "BetterHalf", "CoarseToFine", "Degensac", "EightPoint", "F4x1", "F4x2", "F8x1", "F8x2", "Focal", "Fundamental",
-    "GemanMcClure", "GraphCut", "Homography", "I8x1", "I8x2", "InlierCount", "InlierRule", "IterativelyReweighted",
-    "Magsac", "Median", "Msac", "Pair", "PairwiseEstimator", "Preselect", "PriorWeighted", "Prosac", "Ransac", "Refine",
-    "RobustDeviations", "Sampler", "SaturatedGains", "Score", "Select", "SevenPoint", "StoppingRule", "SummedGains",
-    "Uniform", "WithinThreshold", "colmap", "degensac_cpp", "fastpose", "gc_ransac_cpp", "kernel", "kornia_ransac",
-    "magsac_cpp", "opencv", "poselib", "superansac_cpp",
+    "BITS", "MAX_NOISE", "MIN_NOISE", "PARTS", "WITH_FOCALS", "Batch", "BestOfSearch", "BestScore", "BetterHalf",
+    "Candidates", "CoarseToFine", "Degensac", "EightPoint", "F4x1", "F4x2", "F8x1", "F8x2", "FitScale", "Focal",
+    "Fundamental", "GemanMcClure", "GraphCut", "Homography", "Hypotheses", "I8x1", "I8x2", "InlierCount", "InlierRule",
+    "IterativelyReweighted", "Lens", "Loss", "Magsac", "Median", "Msac", "Pair", "PairwiseEstimator", "Pool",
+    "Preselect", "Preselection", "PriorWeighted", "Prosac", "Ransac", "Refine", "Refinement", "RobustDeviations",
+    "Sampler", "SaturatedGains", "Score", "Search", "Select", "SevenPoint", "Solution", "Steps", "StoppingRule",
+    "SummedGains", "Uniform", "Verified", "WithinThreshold", "bucket", "cheirality", "colmap", "degensac_cpp",
+    "fastpose", "gc_ransac_cpp", "kernel", "kornia_ransac", "largest_weight", "magsac_cpp", "opencv", "part", "poselib",
+    "scores_of", "superansac_cpp", "uniforms",
 ]  # fmt: skip
 
 lazy_exports(__name__)

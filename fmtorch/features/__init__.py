@@ -29,6 +29,7 @@ if TYPE_CHECKING:
         VLFeatSIFT,
         keypoints_to_lafs,
         learn_projection,
+        project,
         root_sift,
         sift_of_patches,
         simulate_view,
@@ -39,7 +40,7 @@ __all__ = [
     "ALIKED", "ASIFT", "DISK", "FRAME_SIGMAS", "SIFT", "DominantGradient", "HessianDetector", "ImagePyramid",
     "LocalFeature", "NetworkDescriptor", "NetworkOrientation", "NetworkShape", "PatchNetwork", "PatchSIFT",
     "RootSIFTPCA", "VLFeatSIFT", "dominant_gradient", "frame_scale", "keypoints_to_lafs", "learn_projection",
-    "local_feature", "make_upright", "root_sift", "rotate_frames", "sift_of_patches", "simulate_view",
+    "local_feature", "make_upright", "project", "root_sift", "rotate_frames", "sift_of_patches", "simulate_view",
     "simulated_views", "upright_frames",
 ]  # fmt: skip
 

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from fmtorch.core.lazy import lazy_exports
 
 if TYPE_CHECKING:
+    from fmtorch.io.colmap import EXIF_DEVIATION, MatchDatabase, database_image, write_database
     from fmtorch.io.dataset import H5Pairs
     from fmtorch.io.export import (
         DATABASE,
@@ -17,11 +18,12 @@ if TYPE_CHECKING:
         write_exports,
         write_view_graph,
     )
-    from fmtorch.io.match_store import MatchStore, StoredImage, StoredPair, indices
+    from fmtorch.io.match_store import ORIGIN, MatchStore, StoredImage, StoredPair, indices
 
 __all__ = [
-    "DATABASE", "FEATURES", "MATCHES", "Edge", "H5Pairs", "MatchStore", "StoredImage", "StoredPair", "ViewGraph",
-    "export_kinds", "indices", "view_graph", "write_exports", "write_view_graph",
+    "DATABASE", "EXIF_DEVIATION", "FEATURES", "MATCHES", "ORIGIN", "Edge", "H5Pairs", "MatchDatabase", "MatchStore",
+    "StoredImage", "StoredPair", "ViewGraph", "database_image", "export_kinds", "indices", "view_graph",
+    "write_database", "write_exports", "write_view_graph",
 ]  # fmt: skip
 
 lazy_exports(__name__)

@@ -9,11 +9,8 @@ from pathlib import Path
 import pytest
 
 import fmtorch.__main__
-from fmtorch.commands.config import hydra_arguments
-from fmtorch.commands.main import help_text
-from fmtorch.commands.options import COMMANDS
-from fmtorch.core import terminal
-from fmtorch.core.terminal import exits_with_message
+from fmtorch.commands import COMMANDS, help_text, hydra_arguments
+from fmtorch.core import exits_with_message, terminal
 from fmtorch.presets import available
 from tests.conftest import own_cache
 from tests.helpers import draw, draw_set
@@ -87,19 +84,15 @@ COUNT = "it must be a whole number of at least 1"
     ("words", "message"),
     [
         ("eval limit=-3", f"limit=-3; {COUNT} or null"),
-        ("eval limit=2.5", f"limit=2.5; {COUNT} or null"),
         ("eval batch=0", f"batch=0; {COUNT}"),
-        ("eval workers=-2", f"workers=-2; {COUNT} or null"),
         ("eval executor=mpi", "no preset 'mpi' in executor; there are: "),
         ("eval executor=dask processes=true", "processes=true and executor=dask differ; give one of them"),
-        ("eval executor.workers=2 workers=3", "workers=3 and executor.workers=2 differ; give one of them"),
         ("eval shard=0/2", "shard=0/2; it must be i/n with i from 1 to n: shard=2/8"),
         ("eval processes=maybe", "processes=maybe; it must be true or false or null"),
         ("eval device=gpu", "device=gpu; it must be text that names a device: auto, cpu, cuda, cuda:1 or mps"),
         ("eval seed=x", "seed=x; it must be a whole number from"),
         ("eval cache_limit=-1", "cache_limit=-1; it must be a number of at least 0 or null"),
         ("eval pruner.ratio.threshold=high", "pruner.ratio.threshold=high; it must be a number"),
-        ("eval estimator.hypotheses=1.5", "estimator.hypotheses=1.5; it must be a whole number"),
         ("eval estimator=cf_ransac estimator.fine.hypotheses=many", "estimator.fine.hypotheses=many; it must be"),
         ("eval +estimator.treshold=2", "estimator: no option treshold; there are: threshold"),
         ("eval dataset.families=indoor", "dataset.families=indoor; it must be a list"),
@@ -110,16 +103,12 @@ COUNT = "it must be a whole number of at least 1"
         ("eval pruner=[ratio,gmss]", "no preset 'gmss' in pruner; there are: gms"),
         ("eval estimator.treshold=2", "no option estimator.treshold; there are: threshold"),
         ("eval limitt=2", "no option limitt; there are: limit"),
-        ("eval piepline=sift_ratio", "no option piepline; there are: pipeline"),
         ("eval --limit 5", "--limit: options have no dashes: limit=5"),
-        ("eval --pipeline=sift_gms", "--pipeline: options have no dashes: pipeline=sift_gms"),
         ("match a.png b.png --longest-side", "--longest-side: options have no dashes: longest_side=VALUE"),
         ("match .", ". is a folder; fmtorch match images=. matches its images with one another"),
-        ("eval estimater=lmeds", "no option estimater; there are: estimator"),
         ("eval --config-dir nowhere", "nowhere' not found"),
         ("eval limit=(1", "limit=(1 cannot be read; a value with special characters stands in quotes"),
         ("eval sift_gms", "sift_gms is not of the form NAME=VALUE"),
-        ("match longest_side=big", f"longest_side=big; {COUNT}"),
         ("match orient=up", "orient=up; it must be true or false"),
         ("match a.png", "image1 is missing; give two image files: fmtorch match a.jpg b.jpg"),
         ("match a.png b.png c.png", "c.png: only image0, image1 may stand without NAME="),
@@ -128,17 +117,13 @@ COUNT = "it must be a whole number of at least 1"
         ("verify", "database is missing; give the database of a COLMAP project: fmtorch verify database.db"),
         ("verify no.db", "there is no file no.db; give the database of a COLMAP project"),
         ("verify no.db cameras=known", "cameras=known; it must be"),
-        ("verify no.db force=2", "force=2; it must be true or false"),
         ("verify no.db more.db", "more.db: only database may stand without NAME="),
         ("train pruner=lc batch=0", f"batch=0; {COUNT}"),
-        ("train pruner=lc optimisation.steps=some", "optimisation.steps=some; it must be a whole number"),
         ("train pruner=lc trainer.devices={}", "trainer.devices={}; it must be"),
         ("train pruner=lc augmentation.crop=often", "augmentation.crop=often; it must be a number"),
     ],
 )
-def test_a_mistake_is_told_in_one_line_and_nothing_written(
-    words: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_mistake_is_told_in_one_line_and_nothing_written(words, message, tmp_path, monkeypatch, capfd):
     if words.startswith("train"):
         pytest.importorskip("lightning", reason="training needs the extra `train`")
     line = ended(monkeypatch, tmp_path, *words.split())
@@ -155,9 +140,7 @@ NAMES = [("my photo (1).png", "b=2,[x].png"), ("it's {a}.png", "c#d%.png"), ("nu
 
 @pytest.mark.parametrize("names", NAMES)
 @pytest.mark.parametrize("form", ["image0={} image1={}", "{} {}"])
-def test_any_file_name_is_a_photograph(
-    names: tuple[str, str], form: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_any_file_name_is_a_photograph(names, form, tmp_path, monkeypatch):
     """Both are read: the command ends at the second, which is no image, and names it."""
     draw(tmp_path / "a.png", seed=0, shift=0)
     (tmp_path / "a.png").rename(tmp_path / names[0])
@@ -200,9 +183,7 @@ def test_an_interrupted_command_says_what_is_kept(capsys: pytest.CaptureFixture[
     assert capsys.readouterr().err == "interrupted; the same command continues; 3 of 8 pairs are kept in runs/a\n"
 
 
-def test_without_a_terminal_progress_is_a_line_now_and_then(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_without_a_terminal_progress_is_a_line_now_and_then(monkeypatch, capsys):
     monkeypatch.setattr(terminal, "LINE_SECONDS", 0.0)
     with terminal.progress_bars() as progress:
         bar = progress.add_task("sift_gms", total=1200)
@@ -222,9 +203,7 @@ def data_set(tmp_path: Path) -> Path:
     return draw_set(tmp_path / "Set", images=2).parent
 
 
-def test_a_sweep_runs_all_jobs_and_tells_the_first_mistake(
-    data_set: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_sweep_runs_all_jobs_and_tells_the_first_mistake(data_set, monkeypatch, capfd):
     words = ["-m", *SMALL, "limit=0,1", "output=out"]
     assert ended(monkeypatch, data_set, "eval", *words) == f"error: limit=0; {COUNT} or null"
     assert (data_set / "out" / "summary.md").is_file()
@@ -237,9 +216,7 @@ def test_a_sweep_runs_all_jobs_and_tells_the_first_mistake(
 
 
 @pytest.mark.parametrize("launcher", ["joblib", "submitit_local"])
-def test_a_sweep_runs_in_processes_of_a_launcher(
-    launcher: str, data_set: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_sweep_runs_in_processes_of_a_launcher(launcher, data_set, monkeypatch, capfd):
     """Two jobs in processes of their own; one is a user's mistake, which this one tells."""
     plugin = {"joblib": "hydra_joblib_launcher", "submitit_local": "hydra_submitit_launcher"}[launcher]
     pytest.importorskip(f"hydra_plugins.{plugin}", reason=f"needs {plugin}")
@@ -269,9 +246,7 @@ def test_help_is_ours_and_fits_a_page(command: str, capsys: pytest.CaptureFixtur
     assert capsys.readouterr().out.strip() == fmtorch.__version__
 
 
-def test_warm_up_compiles_what_is_registered(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_warm_up_compiles_what_is_registered(tmp_path, monkeypatch, capsys):
     compiled: list[str] = []
     compile_together = "fmtorch.commands.warm_up.compile_together"
     monkeypatch.setattr(compile_together, lambda kernels: compiled.extend(kernel.__module__ for kernel in kernels))
@@ -284,9 +259,7 @@ def test_warm_up_compiles_what_is_registered(
         fmtorch.__main__.main(["warm-up"])
 
 
-def test_list_names_every_preset_with_what_it_is(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_list_names_every_preset_with_what_it_is(monkeypatch, capsys):
     fmtorch.__main__.main(["list", "estimator", "pruner"])
     lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("  ")]
     names = [line.split()[0] for line in lines if not line.endswith("as in FM-Bench's paper:")]

@@ -1,15 +1,22 @@
-"""The command: a run folder, continued and refused; failures as rows; errors that name what is wrong."""
+"""`fmtorch eval`: a run folder, continued and refused; failures as rows; errors; runs with the feature cache."""
 
 import json
 import re
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pyarrow.parquet as pq
 import pytest
+import torch
 
+from fmtorch import MatchResult, match
+from fmtorch.pipeline import load_pipeline
+from fmtorch.runs import ArrayCache
 from tests.helpers import draw_set
+from tests.processes import Command, run_command, starter
 
 OPTIONS = ["features.max_features=500", "estimator=lmeds", "estimator.hypotheses=200"]
 OWN_PRUNER = """import torch
@@ -23,7 +30,7 @@ network: {_target_: own_pruner.Mine}
 threshold: 0.5
 prior: false
 """
-Command = Callable[..., str]
+RunCommand = Callable[..., str]
 
 
 @pytest.fixture
@@ -48,7 +55,7 @@ def own(folder: Path, group: str, text: str, name: str = "mine") -> list[str]:
     return ["--config-dir", "my_conf"]
 
 
-def test_a_run_from_start_to_end(data: list[str], command: Command, tmp_path: Path) -> None:
+def test_a_run_from_start_to_end(data: list[str], command: RunCommand, tmp_path: Path) -> None:
     words, run_dir = [*data, "output=run", "batch=2"], tmp_path / "run"
     first = command("eval", *words, "limit=2", cwd=tmp_path)
     assert len(rows(run_dir)) == 2
@@ -82,7 +89,7 @@ def test_a_run_from_start_to_end(data: list[str], command: Command, tmp_path: Pa
     assert re.search("ended: .*holds another run.*seed: 0 -> 1", other)
 
 
-def test_shards_are_one_run(data: list[str], command: Command, tmp_path: Path) -> None:
+def test_shards_are_one_run(data: list[str], command: RunCommand, tmp_path: Path) -> None:
     command("eval", *data, "output=whole", cwd=tmp_path)
     assert "2 of 5 pairs have rows; other shards have the rest" in command(
         "eval", *data, "output=run", "shard=1/2", cwd=tmp_path
@@ -94,7 +101,7 @@ def test_shards_are_one_run(data: list[str], command: Command, tmp_path: Path) -
     assert merged == unsharded
 
 
-def test_an_executor_of_ones_own_by_config_dir(data: list[str], command: Command, tmp_path: Path) -> None:
+def test_an_executor_of_ones_own_by_config_dir(data: list[str], command: RunCommand, tmp_path: Path) -> None:
     words = own(tmp_path, "executor", "_target_: concurrent.futures.ThreadPoolExecutor\nmax_workers: 2\n")
     command("eval", *words, *data, "executor=mine", "output=run", cwd=tmp_path)
     assert len(rows(tmp_path / "run")) == 5
@@ -102,14 +109,14 @@ def test_an_executor_of_ones_own_by_config_dir(data: list[str], command: Command
     assert "ended: error: executor: it cannot be made (TypeError: " in wrong
 
 
-def test_sweep_gives_each_job_a_folder(data: list[str], command: Command, tmp_path: Path) -> None:
+def test_sweep_gives_each_job_a_folder(data: list[str], command: RunCommand, tmp_path: Path) -> None:
     command("eval", "-m", "pipeline=sift_ratio,paper/sift_ratio", *data[:2], "limit=1", cwd=tmp_path)
     folders = sorted(path.parent.name for path in (tmp_path / "runs").glob("*/*/run.json"))
     assert [name.rsplit("-", 1)[0] for name in folders] == ["paper-sift_ratio", "sift_ratio"]
 
 
 @pytest.mark.parametrize("header", ["", "# @package pruner.mine\n"])
-def test_a_users_own_pruner_by_config_dir(header: str, data: list[str], command: Command, tmp_path: Path) -> None:
+def test_a_users_own_pruner_by_config_dir(header: str, data: list[str], command: RunCommand, tmp_path: Path) -> None:
     """With or without a `@package` line it goes under its file's name, in its place, and takes options by that name."""
     words = own(tmp_path, "pruner", header + OWN_PRESET)
     (tmp_path / "own_pruner.py").write_text(OWN_PRUNER)
@@ -135,9 +142,7 @@ def test_a_users_own_pruner_by_config_dir(header: str, data: list[str], command:
         ("estimator.score=psac", "score is 'psac'"),
     ],
 )
-def test_what_cannot_be_run_is_told(
-    words: str, message: str, data: list[str], command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_cannot_be_run_is_told(words, message, data, command, tmp_path, monkeypatch):
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     own(tmp_path, "pruner", "threshold: 0.5\n", "empty")
     own(tmp_path, "pruner", "# @package _global_\npruner: {_target_: fmtorch.pruning.OneToOne}\n", "elsewhere")
@@ -148,8 +153,124 @@ def test_what_cannot_be_run_is_told(
     assert not (tmp_path / "run").exists()
 
 
-def test_a_run_in_which_nothing_succeeds_is_told(data: list[str], command: Command, tmp_path: Path) -> None:
+def test_a_run_in_which_nothing_succeeds_is_told(data: list[str], command: RunCommand, tmp_path: Path) -> None:
     for image in (tmp_path / "Set" / "scene" / "Images").iterdir():
         image.write_bytes(b"no picture")
     assert "every pair failed" in command("eval", *data, "output=run", cwd=tmp_path)
     assert len(rows(tmp_path / "run")) == 5
+
+
+IMAGES = 24
+Rows = list[dict[str, object]]
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A set of pairs of neighbours among `IMAGES` images."""
+    return draw_set(tmp_path_factory.mktemp("data") / "Set", "abc", images=IMAGES // 3)
+
+
+@pytest.fixture(scope="module")
+def truth(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Rows:
+    """The rows of a run without the cache, which leaves none."""
+    folder = tmp_path_factory.mktemp("off")
+    run = run_command("eval", *arguments(root, folder / "run", "cache=off"), cwd=folder)
+    assert run.returncode == 0, run.stderr
+    assert "images computed" not in run.stdout
+    kept = {path.relative_to(folder).as_posix() for path in (*folder.iterdir(), *folder.glob("cache/*"))}
+    assert kept <= {"run", "cache", "cache/kernels"}  # compiled kernels are no features
+    return results(folder / "run")
+
+
+def arguments(root: Path, run_dir: Path, *extra: str) -> list[str]:
+    return ["dataset=fmbench", f"dataset.root={root}", *OPTIONS, f"output={run_dir}", *extra]
+
+
+def start(cwd: Path, log: Path, *arguments: str) -> Command:
+    """The command in a process of its own; `log` and `log`.errors are what it writes."""
+    return starter().start(cwd, "eval", *arguments, log=log, errors=log.with_suffix(".errors"))
+
+
+def results(run_dir: Path) -> Rows:
+    """The rows without what depends on the time."""
+    plain = [{k: v for k, v in row.items() if not k.startswith("seconds")} for row in rows(run_dir)]
+    return sorted(plain, key=lambda row: str(row["pair"]))
+
+
+def counted(stdout: str) -> tuple[int, int]:
+    """Images computed and found, as the run tells."""
+    match = re.search(r"features of (\d+) images computed(?:, of (\d+) taken)?", stdout)
+    assert match is not None, stdout
+    return int(match[1]), int(match[2] or 0)
+
+
+def test_the_same_rows_with_an_empty_and_with_a_damaged_cache(root: Path, truth: Rows, tmp_path: Path) -> None:
+    cold = run_command("eval", *arguments(root, tmp_path / "cold"), cwd=tmp_path)
+    assert cold.returncode == 0, cold.stderr
+    assert counted(cold.stdout) == (IMAGES, 0)
+    assert f"{IMAGES} files" in cold.stdout
+    damaged = sorted(tmp_path.glob("cache/features/*/*.npz"))[0]
+    damaged.write_bytes(damaged.read_bytes()[:1000])
+    warm = run_command("eval", *arguments(root, tmp_path / "warm"), cwd=tmp_path)
+    assert warm.returncode == 0, warm.stderr
+    assert f"{damaged.name} is damaged" in warm.stderr
+    assert counted(warm.stdout) == (1, IMAGES - 1)
+    assert results(tmp_path / "cold") == results(tmp_path / "warm") == truth
+    before, after = (
+        {str(row["pair"]): row["seconds_features"] for row in rows(tmp_path / name)} for name in ("cold", "warm")
+    )
+    same = sum(before[pair] == after[pair] for pair in before)  # what computing took, not what reading did
+    assert same >= len(before) - 2  # one image, of one or two pairs, was computed again
+
+
+def test_a_killed_run_continues_with_what_it_had(root: Path, truth: Rows, tmp_path: Path) -> None:
+    these = arguments(root, tmp_path / "run", "batch=1", "workers=1")
+    process = start(tmp_path, tmp_path / "killed", *these)
+    deadline = time.monotonic() + 120
+    while len(list(tmp_path.glob("cache/features/*/*.npz"))) < 5 and time.monotonic() < deadline:
+        time.sleep(0.002)
+    assert process.kill()
+    had = len(list(tmp_path.glob("cache/features/*/*.npz")))
+    assert 5 <= had < IMAGES
+    again = run_command("eval", *these, cwd=tmp_path)
+    assert again.returncode == 0, again.stderr
+    assert "damaged" not in again.stderr
+    computed, from_cache = counted(again.stdout)
+    assert computed == IMAGES - had
+    assert from_cache > 0
+    assert results(tmp_path / "run") == truth
+
+
+def test_two_runs_at_once_share_the_cache(root: Path, truth: Rows, tmp_path: Path) -> None:
+    names = ("a", "b")
+    processes = [
+        start(tmp_path, tmp_path / f"{name}.out", *arguments(root, tmp_path / name, "workers=2", "batch=3"))
+        for name in names
+    ]
+    ended = [process.wait() for process in processes]
+    outputs = [(process.log.read_text(), process.log.with_suffix(".errors").read_text()) for process in processes]
+    assert ended == [0, 0], outputs
+    assert all("damaged" not in err and "nothing is kept" not in err for _, err in outputs)
+    assert results(tmp_path / "a") == results(tmp_path / "b") == truth
+    kept = list(ArrayCache(tmp_path / "cache" / "features").files())
+    assert len(kept) == IMAGES
+    assert not list(tmp_path.glob("cache/features/*/*.tmp"))
+    assert all(sum(counted(out)) == IMAGES for out, _ in outputs)
+
+
+def test_two_photographs(root: Path, tmp_path: Path) -> None:
+    images = [root / "a" / "Images" / f"{i:08d}.png" for i in (0, 1)]
+
+    def matched(*overrides: str, longest_side: int = 1600) -> tuple[MatchResult, Any]:
+        pipeline = load_pipeline("sift_gms", overrides=overrides)
+        return match(*images, pipeline=pipeline, longest_side=longest_side), pipeline.extractor
+
+    folder = f"cache={tmp_path / 'cache'}"
+    (plain, _), (cold, first), (warm, second) = matched(), matched(folder), matched(folder)
+    assert torch.equal(plain.F, cold.F)
+    assert torch.equal(plain.F, warm.F)
+    assert torch.equal(plain.keypoints0, warm.keypoints0)
+    assert cold.seconds["features"] == warm.seconds["features"]
+    assert (first.computed, second.found) == (2, 2)
+    _, reduced = matched(folder, longest_side=200)
+    assert reduced.computed == 2  # other pixels

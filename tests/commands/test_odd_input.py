@@ -9,7 +9,7 @@ import pytest
 
 from fmtorch import presets
 from fmtorch.core import models_dir
-from fmtorch.pipeline.pipeline import build_pipeline
+from fmtorch.pipeline import build_pipeline
 from fmtorch.runs import RunFolder
 from tests.commands.test_command_line import ended
 from tests.commands.test_match import stereo
@@ -47,9 +47,7 @@ def test_paths_with_brackets_are_printed_as_they_are(photographs: Path) -> None:
         (b"\xb5\xff\x00 binary", "no text in UTF-8; a preset is a mapping in YAML"),
     ],
 )
-def test_a_broken_preset_is_named(
-    monkeypatch: pytest.MonkeyPatch, photographs: Path, content: bytes, said: str
-) -> None:
+def test_a_broken_preset_is_named(monkeypatch, photographs, content, said):
     preset = photographs / "conf" / "estimator" / "mine.yaml"
     preset.parent.mkdir(parents=True)
     preset.write_bytes(content)

@@ -14,9 +14,8 @@ from fmtorch import presets
 from fmtorch.commands import report
 from fmtorch.core import Estimate
 from fmtorch.data import read_image
-from fmtorch.evaluation import evaluate, summarize, tables
+from fmtorch.evaluation import Section, differing_pairs, evaluate, render, summarize, tables
 from fmtorch.evaluation.gallery import Options, difference, rebuilt, shown_pair
-from fmtorch.evaluation.page import Section, differing_pairs, render
 from fmtorch.pipeline import Outcome, build_pipeline
 from fmtorch.runs import PairRow, RunFolder, RunFolderError, to_table
 from tests.helpers import compose, draw, draw_set, pair
@@ -90,9 +89,7 @@ def test_folders_of_runs_are_found_and_missed(tmp_path: Path) -> None:
         report.run(OmegaConf.create({**OPTIONS, "runs": [str(tmp_path)]}))
 
 
-def test_runs_keep_the_order_given_and_folders_are_ordered_by_recall(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_runs_keep_the_order_given_and_folders_are_ordered_by_recall(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name, nsgd in (("a", 0.2), ("b", 0.01), ("c", 0.2)):
         RunFolder.open(tmp_path / "runs" / name, {"pipeline": name}).append(results([nsgd, 0.3]))

@@ -204,9 +204,7 @@ def test_features_of_one_image_are_indexed_by_feature() -> None:
 
 def test_correspondences_defaults() -> None:
     c = Correspondences(torch.zeros(2, 3, 2), torch.zeros(2, 3, 2), torch.ones(2, 3, dtype=torch.bool))
-    assert len(c) == 2
-    assert c.keys.tolist() == [0, 0]
-    assert c.keys.dtype == torch.int64
+    assert (len(c), c.keys.tolist(), c.keys.dtype) == (2, [0, 0], torch.int64)
     assert c.count().tolist() == [3, 3]
     assert all(getattr(c, f) is None for f in ("ratio", "prior", "lafs0", "lafs1", "size0", "size1", "K0", "K1"))
     assert same(c[0].to("cpu").compact(), c[:1])
@@ -223,12 +221,9 @@ def test_compact_known_answer() -> None:
     x = torch.arange(8.0).reshape(2, 4, 1).expand(-1, -1, 2)
     mask = torch.tensor([[False, True, False, True], [False, False, True, False]])
     c = Correspondences(x, -x, mask, ratio=x[..., 0]).compact()
-    assert c.x0.shape == (2, 2, 2)
-    assert c.mask.tolist() == [[True, True], [True, False]]
-    assert c.x0[0, :, 0].tolist() == [1, 3]
-    assert c.x0[1, 0].tolist() == [6, 6]
-    assert c.x1[0, :, 1].tolist() == [-1, -3]
-    assert c.ratio[0].tolist() == [1, 3]
+    assert (c.x0.shape, c.mask.tolist()) == ((2, 2, 2), [[True, True], [True, False]])
+    assert (c.x0[0, :, 0].tolist(), c.x0[1, 0].tolist()) == ([1, 3], [6, 6])
+    assert (c.x1[0, :, 1].tolist(), c.ratio[0].tolist()) == ([-1, -3], [1, 3])
 
 
 def _survivors(c: Correspondences) -> list[dict[str, torch.Tensor]]:
@@ -277,8 +272,7 @@ def test_estimate_needs_a_reason_slot_for_each_pair() -> None:
 def test_collate_stacks_and_pads_single_images() -> None:
     items = [features(n, seed=n) for n in (3, 0, 5)]
     batch = collate(items)
-    assert batch.lafs.shape == (3, 5, 2, 3)
-    assert batch.valid.sum(-1).tolist() == [3, 0, 5]
+    assert (batch.lafs.shape, batch.valid.sum(-1).tolist()) == ((3, 5, 2, 3), [3, 0, 5])
     assert batch.image_size.tolist() == [[480, 643], [480, 640], [480, 645]]
     for i, item in enumerate(items):
         n = len(item)
@@ -292,8 +286,7 @@ def test_collate_stacks_and_pads_single_images() -> None:
 def test_collate_joins_and_pads_pairs() -> None:
     a, b = matches(2, 3), matches(3, 6, seed=1)
     joined = collate([a, b])
-    assert len(joined) == 5
-    assert joined.x0.shape == (5, 6, 2)
+    assert (len(joined), joined.x0.shape) == (5, (5, 6, 2))
     assert not joined.mask[:2, 3:].any()
     assert torch.equal(joined.keys, torch.cat([a.keys, b.keys]))
     assert joined.K0.shape == (5, 3, 3)

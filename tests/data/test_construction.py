@@ -1,5 +1,8 @@
-"""Pairs by the paper's rule, as a set in the FM-Bench layout: on real scenes, on made ones, and interrupted."""
+"""Pairs constructed from depth: candidates, overlap, splits, the command."""
 
+import functools
+import inspect
+import itertools
 import json
 from pathlib import Path
 
@@ -7,12 +10,15 @@ import cv2
 import numpy as np
 import pytest
 
+from fmtorch import presets
+from fmtorch.data import DataError, ImageSource, construction, load, read_image, to_grey
 from fmtorch.data import construction as rule
-from fmtorch.data import load, read_image, to_grey
-from fmtorch.data.construction import Construction, blocks
+from fmtorch.data.scenes import SPLITS, AllPairs, DepthScenePairs, chosen, drawn, following, incidence, sharing_points
+from fmtorch.scenes import Plan, RenderedPairs
 from tests.conftest import shared_path
-from tests.data.native import write_image
+from tests.data.native import write_colmap, write_image, write_kitti
 from tests.helpers import apart, call_command
+from tests.reference import labels as reference
 
 """The column `selected` of the README of the shared data, for the scenes of which all pairs were candidates."""
 
@@ -58,9 +64,7 @@ def run(folder: Path, monkeypatch: pytest.MonkeyPatch, *words: str) -> None:
     call_command(monkeypatch, folder, "pairs", "dataset=cameras", "dataset.root=Set", "output=Made", *words)
 
 
-def test_the_command_makes_a_set_of_the_pairs_that_can_be_matched(
-    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_makes_a_set_of_the_pairs_that_can_be_matched(scenes, tmp_path, monkeypatch, capsys):
     run(tmp_path, monkeypatch, "count=null")
     output = " ".join(capsys.readouterr().out.split())
     assert "4 pairs of 6 images; 20 of 20 candidates were judged" in output
@@ -82,15 +86,10 @@ def test_the_command_makes_a_set_of_the_pairs_that_can_be_matched(
     }  # fmt: skip
 
 
-def test_a_finished_set_is_not_made_again_and_another_is_refused(
-    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_finished_set_is_not_made_again_and_another_is_refused(scenes, tmp_path, monkeypatch, capsys):
     (tmp_path / "Made").mkdir()
     (tmp_path / "Made/notes.txt").write_text("mine")
-    with pytest.raises(
-        SystemExit,
-        match=r"error: Made is not empty and has no pairs\.json, .*; name another folder",
-    ):
+    with pytest.raises(SystemExit, match=r"error: Made is not empty and has no pairs\.json, .*; name another folder"):
         run(tmp_path, monkeypatch, "count=1")
     (tmp_path / "Made/notes.txt").unlink()
     run(tmp_path, monkeypatch, "count=1")
@@ -119,9 +118,7 @@ def test_a_finished_set_is_not_made_again_and_another_is_refused(
         (["dataset.root=empty"], "no folder with Camera.txt, one line an image: K"),
     ],
 )
-def test_a_mistake_is_told_in_one_line_and_nothing_written(
-    words: list[str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_mistake_is_told_in_one_line_and_nothing_written(words, message, tmp_path, monkeypatch):
     (tmp_path / "empty").mkdir()
     with pytest.raises(SystemExit, match=r"^error: ") as end:
         run(tmp_path, monkeypatch, *words)
@@ -130,25 +127,23 @@ def test_a_mistake_is_told_in_one_line_and_nothing_written(
     assert [path.name for path in tmp_path.iterdir()] == ["empty"]
 
 
-def test_a_draw_is_the_same_however_it_is_interrupted(
-    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_draw_is_the_same_however_it_is_interrupted(scenes, tmp_path, monkeypatch):
     """Blocks of one candidate each; the first try ends after nine of them, whose verdicts are not asked for again."""
     monkeypatch.setattr("fmtorch.data.construction.BLOCK", 1)
     dataset = load("cameras", root=scenes)
-    uninterrupted = Construction(dataset, tmp_path / "Whole", count=3, seed=5)  # type: ignore[arg-type]
-    broken = Construction(dataset, tmp_path / "Made", count=3, seed=5)  # type: ignore[arg-type]
+    uninterrupted = construction.Construction(dataset, tmp_path / "Whole", count=3, seed=5)  # type: ignore[arg-type]
+    broken = construction.Construction(dataset, tmp_path / "Made", count=3, seed=5)  # type: ignore[arg-type]
     assert sorted(uninterrupted.order().tolist()) == list(range(20))
     uninterrupted.begin()
     passed = [
         rank
-        for number, ranks in blocks(uninterrupted.order())
+        for number, ranks in construction.blocks(uninterrupted.order())
         for rank in ranks
         if uninterrupted.judge(number, ranks).kept[0]
     ]
     assert len(passed) == 4
     broken.begin()
-    for number, ranks in list(blocks(broken.order()))[:9]:
+    for number, ranks in list(construction.blocks(broken.order()))[:9]:
         broken.judge(number, ranks)
     asked, matchable = list[object](), rule.matchable
     monkeypatch.setattr(rule, "matchable", lambda *given: asked.append(given) or matchable(*given))
@@ -160,3 +155,180 @@ def test_a_draw_is_the_same_however_it_is_interrupted(
     assert [p.identity for p in load("fmbench", root=tmp_path / "Made")] == [
         f"Made/{'ab'[scene]}/{i}-{j}" for scene, i, j in places
     ]
+
+
+PLAN = Plan(scenes=1, shots=4, pairs=4, scale=0.15)
+
+
+@pytest.fixture(scope="module")
+def rendered(tmp_path_factory: pytest.TempPathFactory) -> DepthScenePairs:
+    """All pairs of four photographs each of two families; cameras of the collection have other sizes."""
+    root = tmp_path_factory.mktemp("rendered")
+    families = ["indoor", "collection"]
+    return RenderedPairs(families=families, root=root, plan=PLAN, workers=1).scene_pairs()
+
+
+def one_by_one(dataset: DepthScenePairs, scene: int, i: int, j: int) -> float:
+    """The overlap of a pair by the reference."""
+    a, b = (dataset.scenes[scene].views[k] for k in (i, j))
+
+    def depth(image: ImageSource, x: float, y: float) -> float:
+        return float(dataset.depth(image, np.array([[x, y]], np.float64))[0])
+
+    shares = []
+    for first, second in ((a, b), (b, a)):
+        R = second.R @ first.R.T
+        shares.append(
+            reference.share(
+                functools.partial(depth, first.image),
+                functools.partial(depth, second.image),
+                first.K,
+                second.K,
+                (first.image.size, second.image.size),
+                R,
+                second.t - R @ first.t,
+                construction.STEP,
+                construction.TOLERANCE,
+            )
+        )
+    return min(shares)
+
+
+def test_overlap_of_rendered_pairs_is_that_counted_pixel_by_pixel(rendered: DepthScenePairs) -> None:
+    overlaps = construction.overlap_of(rendered)
+    assert isinstance(overlaps, construction.DepthOverlap)
+    places = [rendered.candidate(rank) for rank in range(rendered.candidates)]
+    assert len(places) == 2 * 6
+    shares = [overlaps.of(place) for place in places]
+    assert shares[::3] == [one_by_one(rendered, *place) for place in places[::3]]
+    assert min(shares) < 0.4 < 0.6 < max(shares)
+
+
+def test_overlap_by_points_is_that_counted_point_by_point() -> None:
+    rng = np.random.default_rng(2)
+    points = [rng.integers(0, 60, rng.integers(0, 40)) for _ in range(30)]
+    points[3] = np.zeros(0, np.int64)
+    pairs = np.array(list(itertools.combinations(range(30), 2)))
+    expected = [reference.by_points(points[i].tolist(), points[j].tolist()) for i, j in pairs]
+    np.testing.assert_allclose(construction.shared_points(incidence(points), pairs), expected, rtol=0, atol=1e-15)
+    assert len(construction.shared_points(incidence(points), pairs[:0])) == 0
+
+
+def run_overlap(folder: Path, monkeypatch: pytest.MonkeyPatch, *words: str) -> None:
+    call_command(monkeypatch, folder, "pairs", "output=Made", "count=null", "workers=1", *words)
+
+
+def test_the_command_selects_by_overlap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Neighbours share four of five points, the first and the last image, which is number 1 by name, three of five."""
+    write_colmap(tmp_path / "Set/a")
+    words = ["dataset=colmap", "dataset.root=Set", "dataset.sequences=[a]"]
+    run_overlap(tmp_path, monkeypatch, *words, "overlap=[0.7,0.9]")
+    selected = load("fmbench", root=tmp_path / "Made")
+    assert [pair.identity for pair in selected] == ["Made/a/0-2", "Made/a/1-2"]
+    rule = json.loads((tmp_path / "Made/pairs.json").read_text())["rule"]
+    assert rule == {"overlap": [0.7, 0.9], "by": "points"}
+    with pytest.raises(SystemExit, match=r"holds pairs of other settings; .*: rule\.overlap: .*Name another folder"):
+        run_overlap(tmp_path, monkeypatch, *words, "overlap=[0.6,0.9]")
+    run_overlap(tmp_path, monkeypatch, *words, "overlap=[0.6,0.6]", "output=Other")
+    assert [pair.identity for pair in load("fmbench", root=tmp_path / "Other")] == ["Other/a/0-1"]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["overlap=[0.4,0.1]"], "overlap=[0.4, 0.1]; it must be a list, each a number from 0 to 1: least and greatest"),
+        (["overlap=[0.1,1.5]"], "as [0.1,0.4], or null"),
+        (["overlap=[0.1]"], "overlap=[0.1]; it must be"),
+        (["overlap=0.3"], "overlap=0.3; it must be"),
+        (["overlap=0.1..0.4"], "overlap=0.1..0.4; it must be"),
+        (["overlap=[0.1,0.4]"], "overlap needs depth or the points of a reconstruction and dataset=kitti has neither"),
+    ],
+)
+def test_what_is_no_overlap_is_refused_and_nothing_written(words, message, tmp_path, monkeypatch):
+    write_kitti(tmp_path / "kitti")
+    with pytest.raises(SystemExit, match=r"^error: ") as end:
+        run_overlap(tmp_path, monkeypatch, "dataset=kitti", "dataset.root=kitti", "dataset.sequences=['06']", *words)
+    assert message in str(end.value.code)
+    assert [path.name for path in tmp_path.iterdir()] == ["kitti"]
+
+
+def test_a_damaged_image_loses_its_own_pairs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_colmap(tmp_path / "Set/a")
+    (tmp_path / "Set/a/images/00.png").write_text("no image")
+    run_overlap(tmp_path, monkeypatch, "dataset=colmap", "dataset.root=Set", "dataset.sequences=[a]", "overlap=[0.1,1]")
+    assert [pair.identity for pair in load("fmbench", root=tmp_path / "Made")] == ["Made/a/1-2"]
+
+
+@pytest.mark.parametrize("n", [0, 1, 2, 7])
+def test_all_pairs_are_all_combinations_in_order(n: int) -> None:
+    pairs = AllPairs(n)
+    expected = list(itertools.combinations(range(n), 2))
+    assert len(pairs) == len(expected)
+    assert [tuple(p) for p in pairs.at(np.arange(len(pairs)))] == expected
+
+
+def test_all_pairs_of_a_million_images_are_not_listed() -> None:
+    pairs = AllPairs(1_000_000)
+    assert len(pairs) == 499_999_500_000
+    assert pairs.at(np.array([0, 999_999, len(pairs) - 1])).tolist() == [[0, 1], [1, 2], [999_998, 999_999]]
+    ranks = np.asarray(drawn(len(pairs), 1000, seed=0))
+    assert len(set(ranks.tolist())) == 1000
+    assert (np.diff(pairs.at(ranks)) > 0).all()
+
+
+@pytest.mark.parametrize("window", [0.0, 0.35, 100.0])
+def test_following_frames_are_those_within_the_window(window: float) -> None:
+    times = np.cumsum(np.random.default_rng(0).uniform(0.01, 0.2, 60))
+    expected = [(i, j) for i, j in itertools.combinations(range(60), 2) if times[j] - times[i] <= window]
+    pairs = following(times, window)
+    assert [tuple(p) for p in pairs.at(np.arange(len(pairs)))] == expected
+
+
+@pytest.mark.parametrize("minimum", [1, 5])
+def test_images_that_share_points_are_those_counted_one_by_one(minimum: int) -> None:
+    rng = np.random.default_rng(1)
+    points = [rng.integers(0, 60, rng.integers(0, 25)) for _ in range(40)]
+    points[4], points[7] = rng.integers(0, 2**40, 3).repeat(2), np.zeros(0, np.int64)
+    expected = [
+        (i, j)
+        for i, j in itertools.combinations(range(40), 2)
+        if len(set(points[i].tolist()) & set(points[j].tolist())) >= minimum
+    ]
+    pairs = sharing_points(points, minimum)
+    assert [tuple(p) for p in pairs.pairs.tolist()] == expected
+    assert len(expected) > 50
+    assert len(sharing_points([])) == 0
+
+
+THERE = ["06", "rgbd_dataset_freiburg1_xyz", "rgbd_dataset_freiburg3_teddy", "Horse", "Train"]
+
+
+@pytest.mark.parametrize("name", SPLITS)
+def test_no_sequence_is_in_both_splits(name: str) -> None:
+    train, test = (set(chosen(name, split, None, THERE)) for split in ("train", "test"))
+    assert train
+    assert test
+    assert not train & test
+    assert chosen(name, "test", ["other"], THERE) == ["other"]
+
+
+def test_the_splits_are_the_papers() -> None:
+    assert SPLITS["kitti"] == {"test": ("06", "07", "08", "09", "10"), "train": ("00", "01", "02", "03", "04", "05")}
+    short = [name.removeprefix("rgbd_dataset_freiburg3_") for name in SPLITS["tum"]["test"]]
+    assert short == ["teddy", "large_cabinet", "long_office_household"]
+    assert chosen("tum", "train", None, THERE) == ["06", "Horse", "Train", "rgbd_dataset_freiburg1_xyz"]
+
+
+def test_what_no_split_holds_is_told() -> None:
+    with pytest.raises(DataError, match="tum: no sequence in split 'train'"):
+        chosen("tum", "train", None, [])
+    with pytest.raises(DataError, match="kitti: no sequence in split 'test'"):
+        chosen("kitti", "test", [], [])
+
+
+@pytest.mark.parametrize("name", presets.available("dataset"))
+def test_the_preset_has_every_option_with_the_readers_default(name: str) -> None:
+    preset = presets.load("dataset", name)
+    parameters = inspect.signature(presets.target_of(preset, "dataset")).parameters
+    defaults = {key: p.default for key, p in parameters.items() if p.kind is not p.KEYWORD_ONLY}
+    assert {key: value for key, value in preset.items() if key != "_target_"} == defaults

@@ -1,12 +1,17 @@
+"""FM-Bench, HPatches, and parts of data sets."""
+
 import re
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from torch.utils.data import DataLoader
 
-from fmtorch.data import DataError, FMBenchPairs, collate, load, read_image
+from fmtorch.data import DataError, DepthDataset, FMBenchPairs, PairDataset, collate, load, read_image, subset
 from tests.conftest import shared_path
+from tests.data import planes
+from tests.data.native import write_tum
 from tests.helpers import apart, cross_matrix
 
 LINE = "0 1 0 0 0 0 0 -2 0 2 0"
@@ -16,10 +21,10 @@ def write_set(folder: Path, lines: list[str], subsets: list[str], images: dict[s
     folder.mkdir(parents=True)
     (folder / "pairs_with_gt.txt").write_text("\n".join(lines) + "\n")
     (folder / "pairs_which_dataset.txt").write_text("\n".join(subsets) + "\n")
-    for subset, names in images.items():
-        (folder / subset / "Images").mkdir(parents=True)
+    for part, names in images.items():
+        (folder / part / "Images").mkdir(parents=True)
         for name in names:
-            (folder / subset / "Images" / name).write_bytes(b"")
+            (folder / part / "Images" / name).write_bytes(b"")
     return folder
 
 
@@ -32,8 +37,7 @@ def small_set(folder: Path) -> Path:
 def test_a_pair(tmp_path: Path) -> None:
     pair = FMBenchPairs(small_set(tmp_path / "Set"))[0]
     assert (pair.identity, pair.family, pair.scene, pair.problem) == ("Set/a/0-1", "Set", "a", None)
-    assert pair.image0.identity == "Set/a/00000000"
-    assert pair.image1.path.name == "00000001.png"
+    assert (pair.image0.identity, pair.image1.path.name) == ("Set/a/00000000", "00000001.png")
     np.testing.assert_allclose(pair.F, np.array([[0, 0, 0], [0, 0, -1], [0, 1, 0]]) / np.sqrt(2), rtol=1e-15)
     assert pair.K0 is None
 
@@ -137,7 +141,73 @@ def test_real_sets() -> None:
 def test_pairs_go_through_a_data_loader(tmp_path: Path) -> None:
     dataset = FMBenchPairs(small_set(tmp_path / "S"))
     (batch,) = DataLoader(dataset, batch_size=2, collate_fn=collate)  # type: ignore[arg-type]
-    assert batch.F.shape == (2, 3, 3)
-    assert batch.key.tolist() == [p.key for p in dataset]
-    assert batch.pairs == tuple(dataset)
-    assert collate([]).F.shape == (0, 3, 3)
+    assert (batch.F.shape, batch.key.tolist()) == ((2, 3, 3), [p.key for p in dataset])
+    assert (batch.pairs, collate([]).F.shape) == (tuple(dataset), (0, 3, 3))
+
+
+def test_pairs_are_image_1_with_the_others(tmp_path: Path) -> None:
+    dataset = load("hpatches", root=planes.write_hpatches(tmp_path), short_side=None)
+    assert [pair.identity for pair in dataset][:2] == ["HPatches/i_light/1-2", "HPatches/i_light/1-3"]
+    assert [(pair.family, pair.scene) for pair in dataset][4:6] == [
+        ("illumination", "i_light"), ("viewpoint", "v_view"),
+    ]  # fmt: skip
+    assert (len(dataset), dataset.model) == (10, "homography")
+    for k, pair in enumerate(list(dataset)[5:], start=2):
+        H = planes.view(k) / np.linalg.norm(planes.view(k))
+        np.testing.assert_allclose(pair.H, H, atol=1e-8)
+        assert not pair.F.any()
+        assert read_image(pair.image0).shape == (*planes.SIZE, 3)
+
+
+def test_homographies_are_of_the_images_as_they_are_read(tmp_path: Path) -> None:
+    """Image 0, resized and mapped by H, is image 1, resized."""
+    dataset = load("hpatches", root=planes.write_hpatches(tmp_path), sequences=["v_view"], short_side=200)
+    for pair in dataset:
+        a, b = (read_image(image) for image in (pair.image0, pair.image1))
+        assert a.shape[:2] == b.shape[:2] == (200, 300)
+        warped = cv2.warpPerspective(a, pair.H, (300, 200)).astype(float)
+        seen = (
+            cv2.erode(cv2.warpPerspective(np.full((200, 300), 255, np.uint8), pair.H, (300, 200)), np.ones((9, 9))) > 0
+        )
+        assert np.abs(warped - b)[seen].mean() < 6  # of 255; a shift by one pixel makes it more than 10
+
+
+@pytest.mark.parametrize(
+    ("damage", "problem"),
+    [
+        (lambda f: (f / "3.ppm").unlink(), "no image"),
+        (lambda f: (f / "H_1_3").unlink(), "H_1_3: no such file"),
+        (lambda f: (f / "H_1_3").write_text("1 0 0\n0 1\n0 0 1\n"), "H_1_3, line 2: 2 columns; it must have 3"),
+        (lambda f: (f / "H_1_3").write_text("1 0 0\n0 1 0\n"), "H_1_3: no homography; it must hold three lines"),
+        (lambda f: (f / "H_1_3").write_text("1 0 0\n1 0 0\n0 0 1\n"), "H_1_3: no homography"),
+    ],
+)
+def test_one_bad_pair_has_a_problem(damage: object, problem: str, tmp_path: Path) -> None:
+    planes.write_sequence(tmp_path / "v_view", "0000.jpg", light=False)
+    damage(tmp_path / "v_view")  # type: ignore[operator]
+    first, second, *_ = load("hpatches", root=tmp_path)
+    assert first.problem is None
+    assert second.problem is not None
+    assert problem in second.problem
+    assert second.H is not None  # still a pair of a homography
+
+
+def test_folders_without_sequences_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"no sequences; it must hold folders i_\* and v_\*"):
+        load("hpatches", root=tmp_path)
+    planes.write_sequence(tmp_path / "v_view", "0000.jpg", light=False)
+    with pytest.raises(DataError, match="no sequence 'v_other'; there are: v_view"):
+        load("hpatches", root=tmp_path, sequences=["v_other"])
+
+
+def test_pairs_digest_and_depth(tmp_path: Path) -> None:
+    name = write_tum(tmp_path, depth=True).name
+    dataset, plain = (load("tum", root=tmp_path, sequences=[name], depth=depth) for depth in (True, False))
+    part = subset(dataset, [len(dataset) - 1])
+    assert isinstance(part, PairDataset)
+    assert isinstance(part, DepthDataset)
+    assert [pair.identity for pair in part] == [dataset[len(dataset) - 1].identity]
+    assert len({part.digest, dataset.digest, subset(dataset, [0]).digest}) == 3
+    x = np.array([[40.0, 30.0], [10.0, 70.0]])
+    assert np.array_equal(part.depth(part[0].image0, x), dataset.depth(part[0].image0, x), equal_nan=True)
+    assert not isinstance(subset(plain, [3, 1]), DepthDataset)

@@ -1,12 +1,15 @@
-"""Lens models against their definitions, OpenCV and COLMAP; undistorted images against what a pinhole sees."""
+"""Lenses: images and points without distortion; resampling."""
+
+import functools
+from pathlib import Path
 
 import cv2
 import numpy as np
+import pycolmap
 import pytest
 
-from fmtorch.data import Lens
-from fmtorch.data.cameras import MODELS, undistorted
-from tests.reference import lenses as reference
+from fmtorch.data import MODELS, ImageSource, Lens, read_image, undistorted, undistorted_frames, undistorted_points
+from fmtorch.data.pairs import Resampling
 
 SIZE = (120, 160)
 GIVEN = {"FOV": [0.9], "EUCM": [0.6, 1.1], "OPENCV_FISHEYE": [0.03, -0.02, 0.01, 0.002]}  # in place of random ones
@@ -23,15 +26,6 @@ def lens(model: str) -> Lens:
 
 def grid(n: int = 50) -> np.ndarray:
     return np.random.default_rng(1).uniform([0, 0], [SIZE[1], SIZE[0]], (n, 2))
-
-
-@pytest.mark.parametrize("model", MODELS)
-def test_each_model_is_its_definition(model: str) -> None:
-    used, points = lens(model), grid()
-    for x, there in zip(points, used.distort(points), strict=True):
-        u, v = (x[0] - used.cx) / used.fx, (x[1] - used.cy) / used.fy
-        u, v = reference.distort(model, u, v, list(used.coefficients))
-        np.testing.assert_allclose(there, [used.fx * u + used.cx, used.fy * v + used.cy], rtol=0, atol=1e-10)
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -96,3 +90,108 @@ def test_where_a_polynomial_folds_back_the_image_is_black() -> None:
     turning = np.sqrt(2 / 3)
     assert (result[radius < turning - 0.05] == 200).all()
     assert (result[radius > turning + 0.05] == 0).all()
+
+
+POINTS_SIZE, FOCAL = (480, 640), 400.0
+COEFFICIENTS = {
+    "SIMPLE_RADIAL": (-0.15,), "RADIAL": (0.1, -0.05), "OPENCV": (-0.2, 0.05, 1e-3, -2e-3),
+    "OPENCV_FISHEYE": (0.02, -0.01, 0.005, -0.002), "FULL_OPENCV": (-0.2, 0.05, 1e-3, -2e-3, 0.01, 0.02, 0.01, 0.001),
+    "FOV": (0.9,), "SIMPLE_RADIAL_FISHEYE": (0.03,), "RADIAL_FISHEYE": (0.03, -0.01),
+    "THIN_PRISM_FISHEYE": (0.02, -0.01, 1e-3, -1e-3, 0.002, 0.001, 1e-3, -1e-3), "SIMPLE_DIVISION": (-0.2,),
+    "DIVISION": (-0.2,), "EUCM": (0.6, 1.1),
+}  # fmt: skip
+
+
+def lens_of(model: str) -> Lens:
+    return Lens(FOCAL, FOCAL if MODELS[model].focals == 1 else 1.02 * FOCAL, 321.0, 238.0, model, COEFFICIENTS[model])
+
+
+def grid_of_points(step: int = 16) -> np.ndarray:
+    return np.stack(
+        np.meshgrid(np.arange(0.0, POINTS_SIZE[1], step), np.arange(0.0, POINTS_SIZE[0], step)), -1
+    ).reshape(-1, 2)
+
+
+@pytest.mark.parametrize("model", sorted(COEFFICIENTS))
+def test_the_inverse_of_every_model(model: str) -> None:
+    lens, points = lens_of(model), grid_of_points()
+    pinhole = undistorted_points(lens, points)
+    seen = np.isfinite(pinhole).all(-1)
+    assert seen.mean() > 0.9
+    np.testing.assert_allclose(lens.distort(pinhole[seen]), points[seen], atol=1e-6)
+    names = set(pycolmap.CameraModelId.__members__)
+    if model not in names:
+        pytest.skip(f"this pycolmap has no {model}")
+    focals = [lens.fx] if MODELS[model].focals == 1 else [lens.fx, lens.fy]
+    camera = pycolmap.Camera(
+        model=model, width=POINTS_SIZE[1], height=POINTS_SIZE[0], params=[*focals, lens.cx, lens.cy, *lens.coefficients]
+    )
+    theirs = np.asarray(camera.cam_from_img(points)).reshape(-1, 2) @ lens.K[:2, :2].T + lens.K[:2, 2]
+    both = seen & np.isfinite(theirs).all(-1)
+    assert both.sum() > 0.9 * len(points)
+    np.testing.assert_allclose(pinhole[both], theirs[both], rtol=1e-6, atol=1e-4)
+
+
+def test_nothing_is_taken_from_beyond_the_fold() -> None:
+    """r (1 - 0.4 r^2) has its largest value, 0.6086, at 0.9129: no pinhole's point is farther out."""
+    lens = Lens(100.0, 100.0, 0.0, 0.0, "SIMPLE_RADIAL", (-0.4,))
+    x = undistorted_points(lens, np.array([[0.0, 0.0], [60.0, 0], [61.0, 0], [0, -200.0], [np.nan, 0]]))
+    assert x[0].tolist() == [0, 0]
+    assert 60 < x[1, 0] < 91.3
+    assert np.isnan(x[2:]).all()
+    plain = np.array([[3.0, 4.0]])
+    assert undistorted_points(Lens(9.0, 9.0, 1.0, 1.0), plain).tolist() == plain.tolist()
+
+
+def test_frames_follow_the_derivatives() -> None:
+    lens = lens_of("OPENCV")
+    points = np.random.default_rng(0).uniform(50, 400, (20, 2))
+    frames = np.random.default_rng(1).normal(size=(20, 2, 2))
+    undistorted = undistorted_frames(functools.partial(undistorted_points, lens), points, frames)
+    pinhole = undistorted_points(lens, points)
+    step = 1e-3
+    for column in (0, 1):  # the lens takes a short step along the frame of the pinhole to one along the photograph's
+        back = lens.distort(pinhole + step * undistorted[..., column])
+        np.testing.assert_allclose((back - points) / step, frames[..., column], atol=5e-3)
+
+
+RESAMPLED_SIZE = (6, 9)
+
+
+def numbered_pixels(size: tuple[int, int] = RESAMPLED_SIZE) -> np.ndarray:
+    return np.arange(size[0] * size[1], dtype=np.uint8).reshape(size)
+
+
+@pytest.mark.parametrize("turns", [0, 1, 2, 3])
+def test_turned_pixels_are_where_the_matrix_says(turns: int) -> None:
+    image, turn = numbered_pixels(), Resampling(None, turns)
+    turned = turn(image)
+    np.testing.assert_array_equal(turned, np.rot90(image, turns))
+    for y in range(RESAMPLED_SIZE[0]):
+        for x in range(RESAMPLED_SIZE[1]):
+            u, v, _ = turn.matrix(RESAMPLED_SIZE) @ [x, y, 1]
+            assert turned[round(v), round(u)] == image[y, x]
+
+
+@pytest.mark.parametrize("turns", [0, 1, 2, 3])
+def test_a_point_is_seen_at_the_same_place_of_the_image(turns: int) -> None:
+    """K' (R X) is where the matrix puts K X; K' is upper triangular with positive focal lengths."""
+    change = Resampling((12, 12), turns)
+    K, X = np.array([[30, 0, 4.2], [0, 31, 2.9], [0, 0, 1.0]]), np.array([0.3, -0.2, 2.5])
+    K_read = change.calibration(K, RESAMPLED_SIZE)
+    seen, moved = K_read @ change.rotation @ X, change.matrix(RESAMPLED_SIZE) @ K @ X
+    np.testing.assert_allclose(seen / seen[2], moved / moved[2], atol=1e-12)
+    assert np.linalg.det(change.rotation) == pytest.approx(1)
+    assert (K_read[1, 0], K_read[0, 1]) == (pytest.approx(0), pytest.approx(0))
+    assert min(np.diag(K_read)) > 0
+
+
+def test_an_image_source_is_resized_then_turned(tmp_path: Path) -> None:
+    path = tmp_path / "a.png"
+    image = np.random.default_rng(0).integers(0, 256, (*RESAMPLED_SIZE, 3), np.uint8)
+    assert cv2.imwrite(str(path), image)
+    change = Resampling((3, 5), 1)
+    source = ImageSource("a", path, RESAMPLED_SIZE, resampling=change)
+    small = cv2.resize(image[..., ::-1], (5, 3), interpolation=cv2.INTER_AREA)
+    np.testing.assert_array_equal(read_image(source), np.rot90(small))
+    assert source.pixels != ImageSource("a", path, RESAMPLED_SIZE).pixels

@@ -26,7 +26,7 @@ from fmtorch.data import read_image
 from tests.conftest import own_cache
 from tests.io import writers
 from tests.processes import run_command
-from tests.verification import databases, test_hloc, test_matches
+from tests.verification import databases, test_matches
 
 SOURCE = Path(__file__).resolve().parents[2]
 PAGES = [
@@ -39,16 +39,16 @@ SETS = ("Strecha", "PhotoTourism", "KITTI", "TUM", "Strecha_train", "TanksLike")
 ELSEWHERE = {
     r"python3? -m venv|pip install": "a fresh environment: continuous integration runs these",
     r"python -m pytest|ruff check|^\.ci/": "what continuous integration does",
-    r"scripts/download": "tests/test_download.py runs it against a server of its own",
+    r"scripts/download": "tests/scripts/test_download.py runs it against a server of its own",
     r"benchmark homography": "needs a folder of photographs; tests/estimators/models/test_homography.py warps one",
     r"benchmark pair_types": "needs photographs; tests/scripts/test_benchmark_planes.py runs it on some",
     r"\bdask (scheduler|worker)\b": "tests/evaluation/test_executors.py runs a cluster",
     r"--config-dir my_conf (pruner|pipeline)=": "tests/training/test_train_command.py runs these files and commands",
     r"dataset=(tum|kitti|colmap|bundler|fmbench dataset\.root=KITTI)": "tests/data runs these on data of their layout",
     r"pipeline=vismatch|(dataset=|runs/)pair_list": "tests/matching/test_vismatch.py runs a stand-in on lists of pairs",
-    r"dataset=hpatches": "tests/evaluation/test_homographies.py runs these on sequences of its own",
-    r"'overlap=|HARD/": "tests/data/test_overlap.py, tests/scripts/test_benchmark_pipelines.py run these",
-    r"benchmark known_models": "needs the images of a scene; tests/scripts/test_benchmark_verify.py has some",
+    r"dataset=hpatches": "tests/evaluation/test_poses.py runs these on sequences of its own",
+    r"'overlap=|HARD/": "tests/data/test_construction.py, tests/scripts/test_benchmark_runner.py run these",
+    r"benchmark known_models": "needs the images of a scene; tests/scripts/test_benchmark_planes.py has some",
     r"--config-dir my_conf features=": "tests/docs/test_own_parts.py runs this page",
 }
 """Commands that are not run here, and why."""
@@ -195,7 +195,7 @@ def workplace(tmp_path_factory: pytest.TempPathFactory) -> Path:
         writers.WRITERS[layout](folder / "FILES" / layout)
     writers.truth(folder / "SET")
     databases.write(folder / "database.db", databases.scene(3))
-    test_hloc.write(folder, databases.scene(3))
+    test_matches.write(folder, databases.scene(3))
     np.savez(folder / "matches.npz", **dict(zip(("x0", "x1"), test_matches.points()[0], strict=True)))
     (folder / "my_conf" / "estimator").mkdir(parents=True)
     yaml = re.findall(
@@ -276,9 +276,7 @@ def test_the_commands_of_a_page_run(page_commands: list[str], workplace: Path, m
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page_commands", parameters(slow=True))
-def test_the_long_commands_of_a_page_run(
-    page_commands: list[str], workplace: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_long_commands_of_a_page_run(page_commands, workplace, monkeypatch):
     run_all(page_commands, workplace, monkeypatch)
 
 

@@ -10,7 +10,7 @@ import fmtorch
 from fmtorch import data, presets
 from fmtorch.core import Correspondences, Estimate
 from fmtorch.data import ImagePair
-from fmtorch.pipeline.pipeline import load_pipeline
+from fmtorch.pipeline import load_pipeline
 from tests.conftest import shared_path
 from tests.laws import scene
 

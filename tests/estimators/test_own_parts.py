@@ -13,27 +13,15 @@ from fmtorch import presets
 from fmtorch.core import collate
 from fmtorch.estimators import SummedGains
 from fmtorch.geometry import sampson
-from tests.estimators.own_parts import (
-    AllAlike,
-    BestHalf,
-    CompiledSquares,
-    CompiledTriweight,
-    Same,
-    Sampled,
-    Scored,
-    Squares,
-    Triweight,
-    Welsch,
-    Within2Px,
-)
+from tests.estimators import own_parts
 from tests.laws import assert_same, few, scene, scenes
 from tests.processes import run_command
 
 PARTS: dict[str, dict[str, Any]] = {
-    "score": {"score": Welsch(1.0)},
-    "compiled score": {"score": CompiledTriweight(1.0)},
-    "sampler": {"sampler": BestHalf()},
-    "rule": {"inliers": Within2Px()},
+    "score": {"score": own_parts.Welsch(1.0)},
+    "compiled score": {"score": own_parts.CompiledTriweight(1.0)},
+    "sampler": {"sampler": own_parts.BestHalf()},
+    "rule": {"inliers": own_parts.Within2Px()},
 }
 PRESETS = ("msac", "fmtorch")
 OWN_PARTS = "tests.estimators.own_parts"
@@ -64,7 +52,9 @@ def test_estimates_are_as_good_as_with_built_in_parts(name: str, preset: str) ->
 @pytest.mark.parametrize("preset", PRESETS)
 def test_a_compiled_gain_is_that_in_numpy(preset: str) -> None:
     c = scene(1, 200)
-    interpreted, compiled = (built(preset, {"score": score(1.0)})(c) for score in (Triweight, CompiledTriweight))
+    interpreted, compiled = (
+        built(preset, {"score": score(1.0)})(c) for score in (own_parts.Triweight, own_parts.CompiledTriweight)
+    )
     # Gains are rounded to 2^-10, which hides all but the rarest rounding of a float32.
     assert torch.equal(interpreted.inliers, compiled.inliers)
     torch.testing.assert_close(interpreted.F, compiled.F, rtol=0, atol=1e-9)
@@ -73,11 +63,15 @@ def test_a_compiled_gain_is_that_in_numpy(preset: str) -> None:
 @pytest.mark.parametrize(
     "parts",
     [
-        {"score": Squares(1.0)},
-        {"score": CompiledSquares(1.0)},
-        {"sampler": Same()},
+        {"score": own_parts.Squares(1.0)},
+        {"score": own_parts.CompiledSquares(1.0)},
+        {"sampler": own_parts.Same()},
         {"inliers": lambda squared_px, pair: squared_px <= 1.0},
-        {"score": CompiledSquares(1.0), "sampler": Same(), "inliers": lambda squared_px, pair: squared_px <= 1.0},
+        {
+            "score": own_parts.CompiledSquares(1.0),
+            "sampler": own_parts.Same(),
+            "inliers": lambda squared_px, pair: squared_px <= 1.0,
+        },
     ],
     ids=["score", "compiled score", "sampler", "rule", "all"],
 )
@@ -95,13 +89,13 @@ def test_parts_that_do_as_the_built_in_ones_give_the_same_bits(parts: dict[str, 
 def test_parts_are_named_as_targets() -> None:
     score = {"_target_": f"{OWN_PARTS}.Welsch", "threshold": 1.0}
     named = presets.build("estimator", "msac", score=score, sampler={"_target_": f"{OWN_PARTS}.BestHalf"})
-    given = presets.build("estimator", "msac", score=Welsch(1.0), sampler=BestHalf())
+    given = presets.build("estimator", "msac", score=own_parts.Welsch(1.0), sampler=own_parts.BestHalf())
     assert torch.equal(named(scene(0)).F, given(scene(0)).F)
 
 
 def test_a_rule_decides_the_inliers() -> None:
     c = scene(1, 200)
-    estimate = built("msac", {"inliers": Within2Px()}, final="none", refit_inliers=True)(c)
+    estimate = built("msac", {"inliers": own_parts.Within2Px()}, final="none", refit_inliers=True)(c)
     distance = sampson(estimate.F, c.x0.double(), c.x1.double())
     clear = (distance - 2).abs() > 1e-6
     assert torch.equal(estimate.inliers[clear], (distance <= 2)[clear])
@@ -115,17 +109,26 @@ class Gain(SummedGains):
 
 SAMPLES, GAINS = r"Sampled.draw returns .*", r"; it must be the shape of its argument, \(\d+, 60\): .* of numbers"
 WRONG: list[tuple[dict[str, Any], str]] = [
-    ({"sampler": Sampled(lambda m, size: np.zeros((m, size), np.int64))}, rf"{SAMPLES}int64 \(100, 7\); .* \(7, 100\)"),
-    ({"sampler": Sampled(lambda m, size: np.zeros((size, m)))}, rf"{SAMPLES}float64 \(7, 100\); it must be an array"),
-    ({"sampler": Sampled(lambda m, size: np.full((size, m), 60))}, f"{SAMPLES}indices from 60 to 60; .* from 0 to 59"),
-    ({"sampler": Sampled(lambda m, size: np.full((size, m), -1))}, f"{SAMPLES}indices from -1 to -1"),
-    ({"sampler": Sampled(None)}, f"{SAMPLES}NoneType; it must be an array of int64"),
     (
-        {"score": Scored(lambda which: np.zeros(len(which) + 1))},
+        {"sampler": own_parts.Sampled(lambda m, size: np.zeros((m, size), np.int64))},
+        rf"{SAMPLES}int64 \(100, 7\); .* \(7, 100\)",
+    ),
+    (
+        {"sampler": own_parts.Sampled(lambda m, size: np.zeros((size, m)))},
+        rf"{SAMPLES}float64 \(7, 100\); it must be an array",
+    ),
+    (
+        {"sampler": own_parts.Sampled(lambda m, size: np.full((size, m), 60))},
+        f"{SAMPLES}indices from 60 to 60; .* from 0 to 59",
+    ),
+    ({"sampler": own_parts.Sampled(lambda m, size: np.full((size, m), -1))}, f"{SAMPLES}indices from -1 to -1"),
+    ({"sampler": own_parts.Sampled(None)}, f"{SAMPLES}NoneType; it must be an array of int64"),
+    (
+        {"score": own_parts.Scored(lambda which: np.zeros(len(which) + 1))},
         r"Scored returns float64 \(\d+,\); it must be an array",
     ),
-    ({"score": Scored(lambda which: np.zeros(len(which), np.float32))}, "Scored returns float32"),
-    ({"score": Scored(lambda which: 1.0)}, "Scored returns float; it must be"),
+    ({"score": own_parts.Scored(lambda which: np.zeros(len(which), np.float32))}, "Scored returns float32"),
+    ({"score": own_parts.Scored(lambda which: 1.0)}, "Scored returns float; it must be"),
     ({"score": Gain(lambda squared: squared[:, :3])}, rf"Gain.gain returns shape \(\d+, 3\) of float32{GAINS}"),
     ({"score": Gain(lambda squared: squared.sum(1))}, rf"Gain.gain returns shape \(\d+,\) of float32{GAINS}"),
     ({"score": Gain(lambda squared: 1.0)}, rf"shape \(\) of float64{GAINS}"),
@@ -141,7 +144,7 @@ WRONG: list[tuple[dict[str, Any], str]] = [
 def test_what_parts_return_wrongly_is_refused_by_name(parts: dict[str, Any], complaint: str) -> None:
     with pytest.raises(ValueError, match=complaint):
         built("msac", parts)(scene(1, 60))
-    if isinstance(parts.get("score"), Scored):  # with preselection, too
+    if isinstance(parts.get("score"), own_parts.Scored):  # with preselection, too
         with pytest.raises(ValueError, match=complaint):
             built("msac", parts)(scene(1, 600))
 
@@ -153,9 +156,10 @@ def test_a_score_without_a_gain_is_refused_by_name() -> None:
 
 def test_scores_may_be_a_column() -> None:
     """Of a larger array: its memory has gaps."""
-    column = Scored(lambda which: np.stack([which * 1.0, which * 0.0], 1)[:, 0])
+    column = own_parts.Scored(lambda which: np.stack([which * 1.0, which * 0.0], 1)[:, 0])
     assert torch.equal(
-        built("msac", {"score": column})(scene(1, 600)).F, built("msac", {"score": Scored(np.float64)})(scene(1, 600)).F
+        built("msac", {"score": column})(scene(1, 600)).F,
+        built("msac", {"score": own_parts.Scored(np.float64)})(scene(1, 600)).F,
     )
 
 
@@ -163,9 +167,11 @@ def compared(preset: str) -> None:
     """Prints the draws of a preset and of its like with parts in NumPy, and the CPU times: each the least of some."""
     c = scene(1, 600, outliers=0.5)
     # The gain of `fmtorch` differs, but not the work: as many draws from all matches, as many models preselected.
-    score = Squares(1.0) if preset == "msac" else Welsch(1.5, prior_weighted=True)
+    score = own_parts.Squares(1.0) if preset == "msac" else own_parts.Welsch(1.5, prior_weighted=True)
     threshold = {} if preset == "msac" else {"threshold": None}
-    own = presets.build("estimator", preset, score=score, sampler=AllAlike(), inliers=Within2Px(), **threshold)
+    own = presets.build(
+        "estimator", preset, score=score, sampler=own_parts.AllAlike(), inliers=own_parts.Within2Px(), **threshold
+    )
     estimators = own, presets.build("estimator", preset)
     draws, fastest = [int(estimator(c).samples) for estimator in estimators], [math.inf, math.inf]
     for _ in range(20):

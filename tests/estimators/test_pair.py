@@ -1,22 +1,28 @@
-"""From a batch to one pair: which matches are usable, in which units; and a model back in pixels."""
+"""One pair of a batch: its units, what supports a model, and gradients."""
 
+import importlib.util
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
-from fmtorch.core import Correspondences, collate
-from fmtorch.estimators import Pair
-from fmtorch.estimators.batch import Batch, relative_rounding
-from fmtorch.estimators.pair import MAX_NOISE, MIN_NOISE, bucket
-from tests.estimators.pairs import SCALES, known, named, pair_of, real
-from tests.laws import degenerate, scene, small, with_padding
-from tests.reference.random import number
+from fmtorch import estimators, find_fundamental
+from fmtorch.core import Correspondences, Estimate, collate
+from fmtorch.estimators import MAX_NOISE, MIN_NOISE, Batch, FitScale, bucket
+from fmtorch.estimators.models import with_focals
+from fmtorch.geometry import LOSSES
+from fmtorch.presets import merged
+from tests.estimators.models.test_focals import TALL, WIDE, photographs
+from tests.estimators.pairs import SCALES, known, named, real
+from tests.laws import PEERS, degenerate, few, quick, scene, small, with_padding
+from tests.variants import OTHER_LIBRARIES, built, loaded, variants
 
 
-def normalized(c: Correspondences, i: int = 0, minimal: int = 7) -> tuple[Pair, Any] | str:
+def normalized(c: Correspondences, i: int = 0, minimal: int = 7) -> tuple[estimators.Pair, Any] | str:
     batch = Batch.of(c)
     with np.errstate(all="raise"):  # what overflows is no error of the caller's
         return batch.normalized(batch.pair(i), i, 0, minimal)
@@ -129,8 +135,8 @@ def test_a_pair_is_a_copy_and_its_neighbours_are_invisible() -> None:
     matches = batch.pair(3)
     pair = batch.normalized(matches, 3, 0, 7)[0]
     alone = normalized(many[[3]])[0]
-    assert isinstance(pair, Pair)
-    assert isinstance(alone, Pair)
+    assert isinstance(pair, estimators.Pair)
+    assert isinstance(alone, estimators.Pair)
     np.testing.assert_array_equal(pair.table, alone.table)
     before = matches.x0.copy()
     pair.table[:] = 0
@@ -150,13 +156,235 @@ def test_a_part_of_a_pair_keeps_its_frame() -> None:
     assert part.cached("sum", lambda pair: float(pair.points.sum())) == part.points.sum()
 
 
-def test_numbers_of_a_pair_are_those_of_its_seed_key_and_draw() -> None:
-    pair = pair_of(scene(0, 20), seed=5)
-    expected = [[(number(5, pair.key, 1, d, j, 4) >> 10) / 2**53 for j in range(4)] for d in range(100, 130)]
-    assert pair.uniform(100, 30, 4).tolist() == expected
+EVERY = variants("estimator")
+OWN = [name for name in EVERY if not name.startswith(OTHER_LIBRARIES)]
+PIXELS = [  # what is a distance in pixels and no option
+    (estimators.degensac, "PLANE_THRESHOLD_PX"), (with_focals, "INLIER_SIGMA_PX"), (with_focals, "LOSS_SCALE_PX"),
+    (with_focals, "PARALLEL_PX"), (estimators.inliers, "FLOOR_PX"), (estimators.GraphCut, "RADIUS_PX"),
+    (estimators.Fundamental, "fit_scale"), (estimators.Homography, "fit_scale"),
+]  # fmt: skip
 
 
-def test_the_rounding_of_coordinates() -> None:
-    c = scene(0, 20)
-    assert relative_rounding(c) == 2.0**-23
-    assert relative_rounding(c.replace(x0=c.x0.double(), x1=c.x1.double())) == 2.0**-52
+def estimator(name: str) -> Any:
+    if name in PEERS and importlib.util.find_spec(PEERS[name]) is None:
+        pytest.skip(f"{PEERS[name]} (extra `peers`) is not installed")
+    return quick(name) if name in OWN else built("estimator", name)
+
+
+def assert_supported(estimate: Estimate, c: Correspondences, what: str) -> None:
+    """What is ok has a minimal sample of different inliers, off a line, and an F of unit norm; the rest has nothing."""
+    points = torch.cat([c.x0, c.x1], -1).to(torch.float64).numpy()
+    for i, ok in enumerate(estimate.ok.tolist()):
+        inside = points[i][estimate.inliers[i].numpy()]
+        assert ok == (estimate.reason[i] == ""), what
+        if not ok:
+            assert not len(inside), what
+            assert not bool(estimate.F[i].any()), what
+            continue
+        minimal = 7 if estimate.model == "fundamental" else 4
+        assert len(np.unique(inside, axis=0)) >= minimal, f"{what}, pair {i}"
+        for image in (inside[:, :2], inside[:, 2:]):
+            spread = np.linalg.svd(image - image.mean(0), compute_uv=False)
+            assert spread[1] > 1e-9 * spread[0], f"{what}, pair {i}"
+        assert float(estimate.F[i].norm()) == pytest.approx(1), f"{what}, pair {i}"
+
+
+HOPELESS = ("empty", "one match", "all points equal", "NaN", "infinite")
+RANK_TWO = (*small(), "one plane", "identity", "all outliers", "all points equal")
+"""Pairs of usual coordinates, of which an F of unit norm in pixels has rank two to rounding."""
+
+
+@pytest.mark.parametrize(
+    ("name", "factor"), [*((name, 1.0) for name in EVERY), *((name, factor) for name in OWN for factor in (1e-9, 1e9))]
+)
+def test_few_and_degenerate_matches_of_any_scale_give_a_supported_model_or_a_reason(name: str, factor: float) -> None:
+    """Sizes are scaled alike."""
+    kinds = small() | degenerate() | {str(i): scene(100 + i, 20, outliers=1.0) for i in range(3)}
+    fields = ("x0", "x1", "size0", "size1")
+    c = collate([p.replace(**{f: getattr(p, f).double() * factor for f in fields}) for p in kinds.values()])
+    estimate = estimator(name)(c, 2)
+    assert_supported(estimate, c, name)
+    assert not any(bool(estimate.ok[list(kinds).index(kind)]) for kind in HOPELESS)
+    if name in OWN and estimate.model == "fundamental":
+        usual = torch.tensor([kind in RANK_TWO for kind in kinds])
+        # Rank two in the unit of the points; in pixels, a thousandth of it, 1e6 roundings of 2e-16 are left.
+        assert float(torch.linalg.svdvals(estimate.F[usual])[:, 2].max()) < 1e-9
+
+
+def test_the_default_has_no_support_at_thresholds_far_below_rounding() -> None:
+    c = scene(0, 60, outliers=0.0, noise=0.0)
+    estimate = find_fundamental(c.x0.double() * 1e12, c.x1.double() * 1e12)
+    assert not bool(estimate.ok[0])
+    assert "different inliers; at least 7 are needed" in estimate.reason[0]
+
+
+def scaled(config: Mapping[str, Any], scale: float) -> dict[str, Any]:
+    """The thresholds within a preset, times `scale`."""
+    levels = {key: scaled(value, scale) for key, value in config.items() if isinstance(value, Mapping)}
+    pixels = ("threshold", "inlier_threshold", "scale")
+    own = {k: v * scale for k, v in config.items() if k in pixels and isinstance(v, float)}
+    of_losses = config.get("threshold")
+    if isinstance(of_losses, Mapping):
+        own["threshold"] = {loss: value * scale for loss, value in of_losses.items()}
+    return {**levels, **own}
+
+
+@pytest.mark.parametrize("name", OWN)
+def test_coordinates_sizes_and_thresholds_scaled_together_give_the_same_inliers(name, monkeypatch):
+    pairs = [scene(i, 100, outliers=0.2, noise=0.1) for i in range(3)]
+    c = collate(
+        [p.replace(x0=p.x0.double(), x1=p.x1.double(), size0=p.size0.double(), size1=p.size1.double()) for p in pairs]
+    )
+    preset = loaded("estimator", name)
+    options = {} if name.startswith("irls") else few(preset)
+    pixels = {(owner, constant): getattr(owner, constant) for owner, constant in PIXELS}
+
+    def in_pixels(value: Any, scale: float) -> Any:
+        if not isinstance(value, FitScale):
+            return value * scale
+        limits = {name: getattr(value, name) * scale for name in ("smallest_px", "largest_px", "default_px")}
+        return value._replace(**limits)
+
+    inliers = {}
+    # Outliers carry Huber's loss away so far that its 30 steps do not end at an optimum; where they do depends on the
+    # unit of the points, which is the next power of two.
+    scales = (2.0**-30, 2.0**-10, 2.0**10, 2.0**30) if name == "irls:loss=huber" else (1e-9, 1e-3, 1e3, 1e9)
+    for scale in (1.0, *scales):
+        for (owner, constant), value in pixels.items():
+            monkeypatch.setattr(owner, constant, in_pixels(value, scale))
+        changed = built("estimator", name, **merged(options, scaled(preset, scale)))
+        sizes = {"size0": c.size0 * scale, "size1": c.size1 * scale}
+        estimate = changed(c.replace(x0=c.x0 * scale, x1=c.x1 * scale, **sizes), 3)
+        assert bool(estimate.ok.all()), estimate.reason
+        inliers[scale] = estimate.inliers
+    for scale, rescaled in inliers.items():
+        assert torch.equal(rescaled, inliers[1.0]), f"{name}: other inliers at {scale}"
+
+
+@pytest.mark.parametrize("name", OWN)
+def test_a_shift_changes_nothing(name: str) -> None:
+    pairs = [scene(i, 100, outliers=0.2, noise=0.1) for i in range(3)]
+    # Whole 1/256 of a pixel, so that shifted by whole pixels no coordinate is rounded; sizes say where the images are.
+    c = collate(
+        [
+            p.replace(
+                x0=(p.x0.double() * 256).round() / 256, x1=(p.x1.double() * 256).round() / 256, size0=None, size1=None
+            )
+            for p in pairs
+        ]
+    )
+    moved = quick(name)
+    before = moved(c, 3)
+    shift0, shift1 = torch.tensor([1e6, -3e5], dtype=torch.float64), torch.tensor([-7e4, 2e9], dtype=torch.float64)
+    after = moved(c.replace(x0=c.x0 + shift0, x1=c.x1 + shift1), 3)
+    assert torch.equal(after.inliers, before.inliers)
+    assert torch.equal(after.ok, before.ok)
+
+
+VARIABLES = ("x0", "x1", "prior", "noise")
+SEARCH = {"hypotheses": 200, "round": 200, "confidence": None, "refit_inliers": False, "inlier_threshold": 3.0}
+REFINED = {"refine": {"loss": "truncated"}, "select": {"scale": 1.0}, "pool": 4}
+CAMERAS = "adaptive, with cameras"
+FITS: Mapping[str, Mapping[str, object]] = {
+    "least_squares": {"final": "least_squares"},
+    "unweighted_least_squares": {"final": "unweighted_least_squares"},
+    "gauss_newton": {"final": "gauss_newton", **REFINED},
+    "adaptive": {"final": "adaptive", **REFINED},
+    CAMERAS: {"final": "adaptive", **REFINED, "focal": {"samples": 100, "pool": 8}},
+}
+UNMOVED = {"unweighted_least_squares": ("prior", "noise"), **{f"irls {name}": ("noise",) for name in LOSSES}}
+"""What a fit takes no account of."""
+
+
+def attached_estimator(name: str) -> estimators.Ransac | estimators.IterativelyReweighted:
+    """One whose fits converge."""
+    if name.startswith("irls "):
+        return estimators.IterativelyReweighted(loss=name.removeprefix("irls "), threshold=2.0, refine_iterations=60)
+    return estimators.Ransac(**(SEARCH | FITS[name]))  # type: ignore[arg-type]
+
+
+def inputs(seed: int, noise: float, same: bool = False) -> dict[str, Tensor]:
+    """Points, priors and noises of a pair without outliers."""
+    c, rng = (
+        photographs(seed, (WIDE, WIDE if same else TALL), (1.1, 1.2), 60, noise, 0.0).c,
+        np.random.default_rng(seed),
+    )
+    prior, sigma = torch.from_numpy(rng.uniform(0.2, 0.9, (1, 60))), torch.from_numpy(rng.uniform(0.5, 2, (1, 60)))
+    return {"x0": c.x0, "x1": c.x1, "prior": prior, "noise": sigma}
+
+
+@pytest.fixture
+def converging(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Final fits that go on to the optimum."""
+    monkeypatch.setattr(
+        estimators.final_fits, "STEPS", estimators.final_fits.STEPS._replace(iterations=30, tolerance=None)
+    )
+    monkeypatch.setattr(estimators.final_fits, "FOCAL_ITERATIONS", 30)
+    monkeypatch.setattr(estimators.final_fits, "FOCAL_TOLERANCE", 0.0)
+
+
+@pytest.mark.usefixtures("converging")
+@pytest.mark.parametrize("same", [False, True])
+@pytest.mark.parametrize("name", [*FITS, *(f"irls {loss}" for loss in LOSSES)])
+def test_they_are_the_differences_of_estimates(name: str, same: bool) -> None:
+    """Where residuals are small against the image: Gauss and Newton's Hessian leaves out their curvature."""
+    given, built = inputs(7, 1e-3, same), attached_estimator(name)
+    c = photographs(7, (WIDE, WIDE if same else TALL), (1.1, 1.2), 60).c
+    rng = np.random.default_rng(1)
+    weights, D = torch.from_numpy(rng.normal(size=(3, 3))), torch.diag(torch.tensor([480.0, 320, 1]).double())
+
+    def value(values: dict[str, Tensor]) -> Tensor:
+        (F,) = built(c.replace(**values)).F  # in units of half the image
+        G = D @ F @ D
+        return (weights * G / G.norm()).sum()
+
+    attached = {key: tensor.clone().requires_grad_() for key, tensor in given.items()}
+    output = value(attached)
+    assert torch.equal(output.detach(), value(given))
+    gradients = torch.autograd.grad(output, list(attached.values()), allow_unused=True)
+    for (key, tensor), gradient in zip(given.items(), gradients, strict=True):
+        if key in UNMOVED.get(name, ()):
+            assert gradient is None or not bool(gradient.any())
+            continue
+        step = torch.from_numpy(rng.normal(size=tuple(tensor.shape)))
+        h = 1e-4  # px, or of numbers about one
+        ends = [float(value(given | {key: tensor + sign * h * step})) for sign in (-1, 1)]
+        # By prior and noise the optimum moves in proportion to its residuals, 1e-5 of half the image and less.
+        numeric, rounding = (ends[1] - ends[0]) / (2 * h), 1e-12 / h
+        assert float((gradient * step).sum()) == pytest.approx(numeric, rel=5e-3, abs=rounding), key
+
+
+def with_noise(c: Correspondences) -> Correspondences:
+    """In float64, with the noise of matches."""
+    noise = torch.linspace(0.5, 2, c.mask.shape[1]).double()[None]
+    return c.replace(x0=c.x0.double(), x1=c.x1.double(), noise=noise)
+
+
+@pytest.mark.parametrize("name", [*FITS, "irls cauchy", "irls magsac"])
+def test_failed_pairs_have_none_and_change_no_other(name: str) -> None:
+    """Among degenerate pairs, as alone."""
+    good, built = [with_noise(scene(1)), with_noise(scene(2, 60))], attached_estimator(name)
+
+    def differentiated(c: Correspondences) -> tuple[Tensor, dict[str, Tensor]]:
+        values = {key: getattr(c, key).double() for key in VARIABLES}
+        attached = {key: value.clone().requires_grad_() for key, value in values.items()}
+        estimate, without = built(c.replace(**attached), seed=5), built(c.replace(**values), seed=5)
+        assert torch.equal(estimate.F.detach(), without.F)
+        assert torch.equal(estimate.inliers, without.inliers)
+        assert estimate.reason == without.reason
+        estimate.F[:, 0, 1].square().sum().backward()
+        return estimate.ok, {key: value.grad for key, value in attached.items() if value.grad is not None}
+
+    c = collate([good[0], *map(with_noise, degenerate().values()), good[1]])
+    ok, gradients = differentiated(c)
+    assert bool(ok[[0, -1]].all())
+    assert not bool(ok.all())
+    for key, gradient in gradients.items():
+        assert bool(gradient.isfinite().all()), key
+        assert not bool(gradient[~ok].any()), key
+        assert not bool(gradient[~c.mask].any()), key
+    assert bool(gradients["x0"][[0, -1]].flatten(1).any(1).all())
+    for row, each in ((0, good[0]), (-1, good[1])):
+        for key, alone in differentiated(each)[1].items():
+            # Sums over paddings of other lengths are rounded otherwise.
+            torch.testing.assert_close(gradients[key][row, : alone.shape[1]], alone[0], rtol=1e-9, atol=1e-15)

@@ -1,32 +1,39 @@
-"""Sums of gains, against their definitions: between what residuals rounded up and rounded down would give."""
+"""Scores, inliers by them, and the refinement of the best models."""
 
+import math
 from typing import Any
 
 import numpy as np
 import pytest
 from scipy import integrate
 
-from fmtorch.estimators import GemanMcClure, InlierCount, Magsac, Median, Msac, Pair, SaturatedGains, Score, SummedGains
+import fmtorch
+from fmtorch import estimators
+from fmtorch.estimators import BestOfSearch, BestScore, Candidates, Pool, Refinement, scores_of
+from fmtorch.estimators.inliers import residuals_squared_px
 from fmtorch.estimators.scores import GRID, fractional_bits, saturated_cells
 from fmtorch.geometry.epipolar import HOMOGRAPHY, SAMPSON
 from fmtorch.geometry.robust_losses import ENTRIES, QUANTILE
-from tests.estimators.pairs import FEW, REAL, SCALES, known, models, named, pair_of
-from tests.estimators.residuals import residuals
+from fmtorch.jit import Stream
+from tests.estimators.pairs import FEW, REAL, SCALES, known, models, named, pair_of, residuals
+from tests.laws import scene
+from tests.reference import known_cameras, refine
 from tests.reference import ransac as reference
-from tests.reference.ransac import lower_median
+from tests.reference.random import number
+from tests.reference.ransac import lower_median, shuffled
 
 SCORES: dict[str, tuple[Any, Any]] = {
-    "inlier_count": (InlierCount, reference.inlier),
-    "msac": (Msac, reference.truncated_square),
-    "geman_mcclure": (GemanMcClure, reference.geman_mcclure),
-    "magsac": (Magsac, reference.magsac),
-    "saturated": (SaturatedGains, reference.geman_mcclure),
+    "inlier_count": (estimators.InlierCount, reference.inlier),
+    "msac": (estimators.Msac, reference.truncated_square),
+    "geman_mcclure": (estimators.GemanMcClure, reference.geman_mcclure),
+    "magsac": (estimators.Magsac, reference.magsac),
+    "saturated": (estimators.SaturatedGains, reference.geman_mcclure),
 }
 GAIN_ROUNDING = 2.0**-21  # of a gain of about one: eight operations in float32
 
 
 def bounds(
-    gain: Any, F: Any, pair: Pair, threshold: float, weighted: bool, saturated: bool = False
+    gain: Any, F: Any, pair: estimators.Pair, threshold: float, weighted: bool, saturated: bool = False
 ) -> tuple[float, float]:
     """Between what a sum of gains is, which fall with the residual, summed in float32."""
     weight = pair.prior.astype(np.float32).tolist() if weighted and pair.prior is not None else [1.0] * pair.count
@@ -53,7 +60,7 @@ def test_scores_are_those_of_the_definitions(given: str, name: str, weighted: bo
         for threshold in {1.5, 1.5 * scale}:
             score = kind(threshold)
             score.prior_weighted = weighted
-            which = np.array([5, 1, 2, 3, 4, 2])
+            which = np.array([5, 1, 5])
             totals = score(F, which, pair)
             for k, total in zip(which, totals, strict=True):
                 lower, most = bounds(gain, F[k], pair, threshold, weighted, name == "saturated")
@@ -63,14 +70,14 @@ def test_scores_are_those_of_the_definitions(given: str, name: str, weighted: bo
                     assert most - lower <= 2.0**-9 * pair.count + 2
 
 
-class Biweight(SummedGains):
+class Biweight(estimators.SummedGains):
     """The square of MSAC's gain."""
 
     def gain(self, squared: Any) -> Any:
         return np.maximum(1 - squared, 0) ** 2
 
 
-class TruncatedSquares(SummedGains):
+class TruncatedSquares(estimators.SummedGains):
     """MSAC's gain."""
 
     def gain(self, squared: Any) -> Any:
@@ -84,7 +91,7 @@ def test_a_gain_in_numpy(given: str, weighted: bool) -> None:
     F, which = models(pair, 8).astype(np.float32), np.array([5, 1, 2, 3, 4, 2])
     for residual in (HOMOGRAPHY, SAMPSON):
         pair.residual = residual
-        compiled = Msac(1.5, weighted)(F, which, pair)
+        compiled = estimators.Msac(1.5, weighted)(F, which, pair)
         np.testing.assert_array_equal(TruncatedSquares(1.5, weighted)(F, which, pair), compiled)
     for k, total in zip(which, Biweight(1.5, weighted)(F, which, pair), strict=True):
         lower, most = bounds(lambda r: reference.truncated_square(r) ** 2, F[k], pair, 1.5, weighted)
@@ -92,7 +99,7 @@ def test_a_gain_in_numpy(given: str, weighted: bool) -> None:
 
 
 @pytest.mark.parametrize("score", [*(kind(2.0) for kind, _ in SCORES.values()), Biweight(2.0)])
-def test_sums_are_exact(score: Score) -> None:
+def test_sums_are_exact(score: estimators.Score) -> None:
     """Whatever the order of 20,000 matches and of models: summed are multiples of 2^-bits below 2^(24 - bits)."""
     pair = pair_of(known(20_000))
     F, which = models(pair, 6).astype(np.float32), np.arange(6)
@@ -121,14 +128,7 @@ def test_the_reference_of_magsac_is_the_integral_over_sigma(r: float) -> None:
     assert reference.magsac(r) == pytest.approx(1 - loss / total, abs=1e-8)  # the tolerance of the quadrature
 
 
-@pytest.mark.parametrize("threshold", [0.0, -1.0, float("nan")])
-def test_a_threshold_must_be_positive(threshold: float) -> None:
-    for kind, _ in SCORES.values():
-        with pytest.raises(ValueError, match=f"threshold is {threshold}; .* must be positive"):
-            kind(threshold)
-
-
-def cells_of(pair: Pair, weighted: bool) -> np.ndarray:
+def cells_of(pair: estimators.Pair, weighted: bool) -> np.ndarray:
     cells = np.empty((2, pair.count), np.int32)
     saturated_cells(pair.table, weighted, cells)
     return cells
@@ -164,7 +164,7 @@ def test_saturation_prefers_what_explains_the_whole_image() -> None:
     for x in (spread, crowd):
         pair = pair_of(known(128, "nothing"))
         pair.table[:4] = x
-        scores.append(float(SaturatedGains(1.0)(horizontal, np.zeros(1, np.int64), pair)[0]))
+        scores.append(float(estimators.SaturatedGains(1.0)(horizontal, np.zeros(1, np.int64), pair)[0]))
     # On the diagonal of the grid there are 12 cells, one match in ten or eleven in each; against one of 126, and two.
     matches = np.bincount(np.minimum((spread + 0.9) / 1.8 * 12, 11).astype(int))
     assert scores[0] == pytest.approx(2 * np.sqrt(matches).sum(), abs=24 * 2.0**-11)
@@ -180,7 +180,7 @@ def test_medians_are_those_of_the_definition(given: str) -> None:
     pair = named(given)
     F, which = models(pair, 8).astype(np.float32), np.array([5, 1, 2, 3, 4, 2])
     unit = float(pair.pixels_per_unit)
-    for k, score in zip(which, Median()(F, which, pair), strict=True):
+    for k, score in zip(which, estimators.Median()(F, which, pair), strict=True):
         r = residuals(F[k], pair, unit)
         noise = pair.pixels_per_noise / unit  # which does not count here
         low, high = (lower_median(((x / noise) ** 2).tolist()) for x in (r.low, r.high))
@@ -197,7 +197,161 @@ def test_the_median_of_unusual_residuals(kind: str, count: int) -> None:
     }[kind]  # fmt: skip
     pair.table[:4] = 0
     pair.table[3] = np.random.default_rng(0).permutation(apart)
-    (score,) = Median()(RECTIFIED, np.zeros(1, np.int64), pair)
+    (score,) = estimators.Median()(RECTIFIED, np.zeros(1, np.int64), pair)
     ordered = sorted(np.where(np.isnan(apart), np.inf, apart).astype(np.float32).astype(float))
     # A square, a sum of two, a quotient: three roundings of float32.
     assert -score == pytest.approx(lower_median(ordered) ** 2 / 2, rel=3 * 2.0**-24)
+
+
+@pytest.mark.parametrize("given", ["scene 150", "real 7", *FEW])
+def test_residuals_are_squared_sampson_distances_in_pixels(given: str) -> None:
+    for scale in SCALES if given in FEW else (1.0,):
+        pair = named(given, scale)
+        for F in models(pair, 8)[1:]:
+            squared = residuals_squared_px(F, pair)
+            r = residuals(F, pair, 1.0, np.float64)  # per noise
+            noise = np.ones(pair.count) if pair.noise is None else pair.noise
+            low, high = r.low * noise, r.high * noise
+            assert ((low**2 * (1 - 1e-15) <= squared) & (squared <= high**2 * (1 + 1e-15))).all()
+
+
+@pytest.mark.parametrize("count", [7, 8, 9, 20, 151])
+def test_rules_are_those_of_the_definitions(count: int) -> None:
+    pair, rng = named(f"scene {count}"), np.random.default_rng(count)
+    for r in (
+        rng.uniform(0, 3, count),
+        rng.integers(0, 3, count) * 1.0,
+        np.zeros(count),
+        10.0 ** rng.uniform(-9, 9, count),
+    ):
+        median = reference.lower_median((r**2).tolist())
+        sigma = 1.4826 * (1 + 5 / max(count - 7, 1)) * math.sqrt(median)
+        rules: list[tuple[estimators.InlierRule, list[bool]]] = [
+            (estimators.WithinThreshold(1.5), [x <= 1.5**2 for x in r**2]),
+            (estimators.BetterHalf(), [x <= max(median, 1e-6) for x in r**2]),
+            (estimators.RobustDeviations(), [x <= max(2.5 * sigma, 1e-3) ** 2 for x in r**2]),
+        ]
+        for rule, expected in rules:
+            assert rule(r**2, pair).tolist() == expected
+
+
+@pytest.mark.parametrize("name", ["lmeds", "cf_ransac", "paper/lmeds"])
+def test_all_exact_matches_are_inliers(name: str) -> None:
+    """Whose deviations are rounding, of which a half is larger than the median."""
+    s = known_cameras.scene(5, 150)
+    inliers = fmtorch.find_fundamental(s.x0, s.x1, estimator=name).inliers[0].numpy()
+    assert inliers[s.right].all()
+    assert not inliers[~s.right].any()
+
+
+def test_limits_belong_to_the_inliers_and_are_none_beyond_the_range_of_numbers() -> None:
+    pair = named("scene 8")
+    squared = np.array([0, 4, np.nextafter(4, 5), 1e300, np.inf, np.nan, 1, 2])
+    assert estimators.WithinThreshold(2.0)(squared, pair).tolist() == [
+        True,
+        True,
+        False,
+        False,
+        False,
+        False,
+        True,
+        True,
+    ]
+    assert estimators.WithinThreshold(1e200)(squared, pair).sum() == 7
+    assert not estimators.WithinThreshold(1e-200)(squared, pair)[1:].any()
+
+
+@pytest.mark.parametrize("probability", [0.5, 0.99, 0.9999])
+@pytest.mark.parametrize("sampler", [estimators.Uniform(), estimators.Prosac(), estimators.PriorWeighted()])
+def test_a_search_stops_after_as_many_draws_as_it_takes(sampler: estimators.Sampler, probability: float) -> None:
+    pair = named("scene 150")
+    shares = set()
+    for F in models(pair, 12)[1:].astype(np.float32):
+        for threshold in (0.1, 1.0, 10.0, 100.0):
+            inside = residuals_squared_px(F.astype(np.float64), pair) <= threshold**2
+            weight = sampler.weight(pair)  # type: ignore[attr-defined]
+            share = float(weight[inside].sum() / weight.sum())
+            for size in (5, 7):
+                stop = estimators.StoppingRule(probability, threshold, sampler)
+                if share in (0, 1):
+                    assert stop(F, 10**9, pair, size) == (share == 1)
+                    continue
+                draws = reference.draws_for_confidence(share, size, probability)
+                assert stop(F, math.ceil(draws * (1 + 1e-9)), pair, size)
+                assert not stop(F, math.ceil(draws * (1 - 1e-9)) - 1, pair, size)
+                shares.add(share)
+    assert len(shares) > 10
+
+
+def pool_of(F: np.ndarray) -> Pool:
+    return Pool(F.astype(np.float32), np.arange(len(F), 0, -1.0), len(F))
+
+
+@pytest.mark.parametrize("name", ["scene 40", "scene 300", "real 7", *FEW])
+def test_matches_near_a_pool(name: str) -> None:
+    """Within four scales of a model, the first in the order of their random numbers; nothing is near a zero model."""
+    for scale in SCALES if name in FEW else (1.0,):
+        pair, F = named(name, scale, seed=2), models(named(name, scale), 6)
+        reach = estimators.Refine.RADIUS * 1.5 * scale
+        rs = [residuals(model, pair, reach * pair.pixels_per_noise / pair.pixels_per_unit) for model in F[1:]]
+        surely = set(np.flatnonzero(np.any([r.high < 1 for r in rs], 0)).tolist())
+        perhaps = set(np.flatnonzero(np.any([r.low <= 1 for r in rs], 0)).tolist())
+        words = [number(pair.seed, pair.key, Stream.REFINEMENT, 0, i, 1) for i in range(pair.count)]
+        options = estimators.Refine("truncated", 1.5 * scale, matches=pair.count)
+        near = Refinement(options).near(pool_of(F), pair)
+        index = [int(np.flatnonzero((pair.table == column[:, None]).all(0))[0]) for column in near.table.T]
+        if len({tuple(column) for column in pair.table.T}) == pair.count:  # else equal matches are not told apart
+            assert surely <= set(index) <= perhaps
+            assert index == shuffled(sorted(index), words, pair.count)
+        for count in (1, 5):
+            fewer = Refinement(estimators.Refine("truncated", 1.5 * scale, matches=count)).near(pool_of(F), pair)
+            np.testing.assert_array_equal(fewer.table, near.table[:, :count])
+
+
+def test_all_matches_are_near_without_a_number_of_them() -> None:
+    pair, F = named("scene 40"), models(named("scene 40"), 3)
+    assert Refinement(estimators.Refine("truncated")).near(pool_of(F), pair) is pair
+    assert Refinement(None).near(pool_of(F), pair) is pair
+    nothing = Refinement(estimators.Refine("truncated", matches=10)).near(Pool.empty(4), pair)
+    assert nothing.count == 0
+
+
+@pytest.mark.parametrize("loss", ["truncated", "geman_mcclure", "cauchy", "huber", "magsac"])
+@pytest.mark.parametrize("name", ["scene 40", "scene 300", "real 7"])
+def test_refined_models_have_lower_errors(name: str, loss: str) -> None:
+    pair, scale = named(name), 2.0
+    pool = estimators.Ransac(hypotheses=200, pool=4).search(pair)
+    refined = Refinement(estimators.Refine(loss, scale, iterations=20))(pool, pair, estimators.SevenPoint())
+    assert refined.valid.all()
+    assert refined.near is pair
+
+    def cost(F: np.ndarray, pair: estimators.Pair) -> float:
+        r = residuals(F, pair, scale, np.float64).exact
+        return float((pair.weight * refine.loss(r**2, 1.0, loss) / pair.pixels_per_noise**2).sum())
+
+    before, after = ([cost(F, pair) for F in models] for models in (pool.models, refined.F))
+    assert all(a <= b * (1 + 1e-6) for a, b in zip(after, before, strict=True))  # first made rank 2, to float32
+    assert any(a < b * (1 - 1e-3) for a, b in zip(after, before, strict=True))
+
+
+def test_local_optimisation_comes_first() -> None:
+    pair, F = named("scene 40"), models(named("scene 40"), 3)[1:]
+    refined = Refinement(None, lambda F, pair: F + 1)(pool_of(F), pair, estimators.SevenPoint())
+    np.testing.assert_array_equal(refined.F, F.astype(np.float32).astype(np.float64) + 1)
+    plain = Refinement(None)(Pool.empty(3), pair, estimators.SevenPoint())
+    assert plain.valid.tolist() == [False]
+
+
+def test_the_first_of_the_pool_or_the_best_score_of_what_is_valid() -> None:
+    pair = pair_of(scene(1, 100))
+    F = np.random.default_rng(0).normal(size=(6, 9))
+    scores = scores_of(estimators.Msac(50.0), F, pair)
+    best = int(np.argmax(scores))
+    assert best > 0
+    everything = Candidates(F, np.ones(6, np.bool_), pair)
+    np.testing.assert_array_equal(BestOfSearch()(everything, pair).F, F[0])
+    np.testing.assert_array_equal(BestScore(estimators.Msac(50.0))(everything, pair).F, F[best])
+    valid = np.arange(6) != best
+    second = int(np.argmax(np.where(valid, scores, -np.inf)))
+    np.testing.assert_array_equal(BestScore(estimators.Msac(50.0))(Candidates(F, valid, pair), pair).F, F[second])
+    assert not BestScore(estimators.Msac(50.0))(Candidates(F, np.zeros(6, np.bool_), pair), pair).valid

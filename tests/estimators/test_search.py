@@ -1,4 +1,4 @@
-"""The search: models belong to their draws, the best are kept, the earlier of equals, and rounds end when told."""
+"""The search: samples, their preselection, and the best models of many."""
 
 import dataclasses
 from collections.abc import Callable
@@ -6,56 +6,57 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
+from scipy import stats
 
-from fmtorch.estimators import (
-    EightPoint,
-    Msac,
-    Pair,
-    Preselect,
-    PriorWeighted,
-    Prosac,
-    Sampler,
-    SevenPoint,
-    StoppingRule,
-    Uniform,
+from fmtorch import estimators
+from fmtorch.core import Correspondences, collate
+from fmtorch.estimators import Hypotheses, Pool, Preselection, Search, Verified, largest_weight
+from fmtorch.estimators.preselection import (
+    FIRST_LOOK,
+    degenerate_support,
+    draw_by_prior,
+    drawn_by_prior,
+    shuffled_first,
 )
-from fmtorch.estimators.models.model import Hypotheses
-from fmtorch.estimators.preselection import Preselection
-from fmtorch.estimators.search import Pool, Search, Verified, merge
-from tests.estimators.pairs import named, pair_of
-from tests.laws import scene
-from tests.reference import solvers as reference
+from fmtorch.jit import Stream
+from tests.estimators.pairs import FEW, SCALES, known, models, named, pair_of
+from tests.laws import scene, with_padding
+from tests.reference import ransac as reference
+from tests.reference import solvers
+from tests.reference.random import number
+from tests.reference.ransac import degenerate_support as expected_support
 
 
 @dataclasses.dataclass
-class Told(StoppingRule):
+class Told(estimators.StoppingRule):
     """A stopping rule that does as told, and counts how often it is asked."""
 
     answer: Callable[[int], bool]
     asked: list[int] = dataclasses.field(default_factory=list)
 
-    def __call__(self, F: Any, draws: int, pair: Pair, size: int) -> bool:
+    def __call__(self, F: Any, draws: int, pair: estimators.Pair, size: int) -> bool:
         self.asked.append(draws)
         return self.answer(draws)
 
 
-class Late(SevenPoint):
+class Late(estimators.SevenPoint):
     """Samples before the hundredth give no model."""
 
-    def solve(self, pair: Pair, sample: Any, start: int) -> Hypotheses:
+    def solve(self, pair: estimators.Pair, sample: Any, start: int) -> Hypotheses:
         hypotheses = super().solve(pair, sample, start)
         return hypotheses if start >= 100 else hypotheses._replace(F=hypotheses.F[:0], draw=hypotheses.draw[:0])
 
 
-def search(family: Any = None, sampler: Sampler | None = None, **options: Any) -> Search:
-    preselection = Preselection(Msac(1.0), options.pop("preselect", None))
+def search(family: Any = None, sampler: estimators.Sampler | None = None, **options: Any) -> Search:
+    preselection = Preselection(estimators.Msac(1.0), options.pop("preselect", None))
     options = {"pool": 4, "hypotheses": 150, "round": 50, **options}
-    return Search(family or SevenPoint(), sampler or Uniform(), preselection, **options)
+    return Search(family or estimators.SevenPoint(), sampler or estimators.Uniform(), preselection, **options)
 
 
-@pytest.mark.parametrize("family", [SevenPoint(), EightPoint()])
-@pytest.mark.parametrize("sampler", [Uniform(), Prosac(), PriorWeighted()])
-def test_models_are_those_of_the_samples_of_their_draws(family: Any, sampler: Sampler) -> None:
+@pytest.mark.parametrize("family", [estimators.SevenPoint(), estimators.EightPoint()])
+@pytest.mark.parametrize("sampler", [estimators.Uniform(), estimators.Prosac(), estimators.PriorWeighted()])
+def test_models_are_those_of_the_samples_of_their_draws(family: Any, sampler: estimators.Sampler) -> None:
     """In the order of draws; each sample gives those that the definition gives and that its matches' sides agree to."""
     pair, draws, alike = named("scene 300"), 60, 0
     sample = sampler.draw(pair, 40, draws, family.size)
@@ -65,9 +66,9 @@ def test_models_are_those_of_the_samples_of_their_draws(family: Any, sampler: Sa
     assert (np.diff(hypotheses.draw) >= 0).all()
     for d in range(draws):
         x0, x1 = pair.points[:2, sample[:, d]].T, pair.points[2:, sample[:, d]].T
-        every = reference.seven_point(x0, x1) if family.size == 7 else [reference.eight_point(x0, x1)]
-        expected = [F for F in every if reference.consistently_oriented(F, x0, x1)]
-        models = [reference.unit(F.astype(np.float64).reshape(3, 3)) for F in hypotheses.F[hypotheses.draw == d]]
+        every = solvers.seven_point(x0, x1) if family.size == 7 else [solvers.eight_point(x0, x1)]
+        expected = [F for F in every if solvers.consistently_oriented(F, x0, x1)]
+        models = [solvers.unit(F.astype(np.float64).reshape(3, 3)) for F in hypotheses.F[hypotheses.draw == d]]
         # Models are float32, of norm one; what is left of rounding grows where a sample is nearly degenerate.
         alike += len(models) == len(expected) and all(
             min(min(np.abs(F - other).max(), np.abs(F + other).max()) for other in expected) < 1e-5 for F in models
@@ -89,33 +90,18 @@ def test_a_pool_keeps_the_best_and_the_earlier_of_equals() -> None:
     offer([1.0, 3.0], 10)
     assert (pool.filled, pool.valid.tolist()) == (2, [True, True])
     offer([3.0, np.nan, -np.inf, 2.0, 0.0, np.inf], 20)
-    assert pool.score.tolist() == [3.0, 3.0, 2.0]
-    assert pool.F[:, 0].tolist() == [11, 20, 23]
+    assert (pool.score.tolist(), pool.F[:, 0].tolist()) == ([3.0, 3.0, 2.0], [11, 20, 23])
     offer([3.0, 2.0], 30)
     assert pool.F[:, 0].tolist() == [11, 20, 30]
 
 
-@pytest.mark.parametrize(("m", "k", "size"), [(1, 1, 1), (300, 96, 12), (40, 40, 100)])
-def test_a_pool_is_a_stable_sort_of_all_that_it_was_offered(m: int, k: int, size: int) -> None:
-    rng = np.random.default_rng(m)
-    F, score = rng.normal(size=(m, 9)).astype(np.float32), rng.integers(-20, 20, m) / 8.0
-    which = np.sort(rng.permutation(m)[:k])
-    pool, pool_score, filled = np.zeros((size, 9), np.float32), np.full(size, -np.inf), 0
-    for part in np.array_split(which, 3):
-        filled = merge(F, part, score[part], filled, pool, pool_score)
-    best = which[np.argsort(-score[which], kind="stable")][:size]
-    assert filled == len(best)
-    np.testing.assert_array_equal(pool[:filled], F[best])
-    np.testing.assert_array_equal(pool_score[:filled], score[best])
-
-
-@pytest.mark.parametrize("preselect", [None, Preselect(64, 20)])
-def test_a_search_keeps_the_best_models_of_all_rounds(preselect: Preselect | None) -> None:
+@pytest.mark.parametrize("preselect", [None, estimators.Preselect(64, 20)])
+def test_a_search_keeps_the_best_models_of_all_rounds(preselect: estimators.Preselect | None) -> None:
     pair, single = named("scene 300"), search(preselect=preselect, round=50)
     pool = single(pair, 30)
     F, score = [], []
     for start in (30, 80, 130):
-        hypotheses = single.family.solve(pair, Uniform().draw(pair, start, 50, 7), start)
+        hypotheses = single.family.solve(pair, estimators.Uniform().draw(pair, start, 50, 7), start)
         which, scores = single.preselection(hypotheses.F, pair)
         F.append(hypotheses.F[which])
         score.append(scores)
@@ -145,6 +131,251 @@ def test_a_search_ends_when_the_stopping_rule_says_so() -> None:
 def test_a_search_goes_on_while_no_sample_gave_a_model() -> None:
     """All matches are inliers of the zero model that an empty pool holds."""
     pair = pair_of(scene(0, 100, outliers=0.0, noise=0.0))
-    pool = search(Late(), stop=StoppingRule(0.9999, 1.0, Uniform()), hypotheses=400)(pair)
+    pool = search(Late(), stop=estimators.StoppingRule(0.9999, 1.0, estimators.Uniform()), hypotheses=400)(pair)
     assert pool.filled
     assert pool.samples == 150
+
+
+SEED = 3
+
+
+def numbers(pair: estimators.Pair) -> list[int]:
+    return [number(pair.seed, pair.key, Stream.PRESELECTION, 0, i, 1) for i in range(pair.count)]
+
+
+@pytest.mark.parametrize("given", ["scene 40", "scene 129", "scene 700", "7 random", "20 collinear"])
+def test_few_matches_are_those_of_the_definitions(given: str) -> None:
+    pair = named(given, seed=SEED)
+    n, words, prior = pair.count, numbers(pair), pair.prior.copy()
+    for count in (1, 5, n - 1, n, 2 * n):
+        any_few, likely = shuffled_first(pair, count), drawn_by_prior(pair, count)
+        np.testing.assert_array_equal(any_few.table, pair.table[:, reference.shuffled(range(n), words, count)])
+        drawn = reference.priority_sample(prior.tolist(), words, count)
+        np.testing.assert_array_equal(likely.points, pair.points[:, drawn])
+        np.testing.assert_array_equal(likely.match_weight, prior[drawn] > 0)
+    np.testing.assert_array_equal(pair.prior, prior)
+
+
+def test_likely_matches_are_drawn_by_their_prior() -> None:
+    """Three times as many of the kind three times as likely, and none that have no prior."""
+    n, k, seen, keys = 900, 60, np.zeros(3), 300
+    prior = np.repeat([0.0, 0.2, 0.6], n // 3)
+    index = np.empty(k, np.int64)
+    for key in range(keys):
+        draw_by_prior(prior, 5, key, index)
+        assert len(set(index.tolist())) == k
+        seen += np.bincount(index // (n // 3), minlength=3)
+    assert seen[0] == 0
+    # 60 of 600 at a time: by their prior up to some 2 % (those drawn are missing later); 5 standard errors of a share.
+    assert seen[2] / seen.sum() == pytest.approx(0.75, abs=0.02 + 5 * np.sqrt(0.75 * 0.25 / (k * keys)))
+    draw_by_prior(np.zeros(n), 5, 0, index)
+    np.testing.assert_array_equal(index, np.arange(k))
+
+
+@pytest.mark.parametrize(
+    "score",
+    [estimators.InlierCount(1.5), estimators.Msac(1.5, True), estimators.Magsac(1.5), estimators.SaturatedGains(1.5)],
+)
+@pytest.mark.parametrize("given", ["scene 700", "real 7"])
+def test_the_models_that_pass_are_the_best_on_few_matches(given: str, score: Any) -> None:
+    pair, options = named(given, seed=SEED), estimators.Preselect(matches=64, survivors=20)
+    F = models(pair, 120).astype(np.float32)
+    which, scores = Preselection(score, options)(F, pair)
+    draw = drawn_by_prior if score.prior_weighted and pair.prior is not None else shuffled_first
+    first = getattr(score, "preselection", score)(F, np.arange(120), draw(pair, 64))
+    np.testing.assert_array_equal(which, np.sort(np.argsort(-first, kind="stable")[:20]))
+    np.testing.assert_array_equal(scores, score(F, np.arange(120), pair)[which])
+
+
+@pytest.mark.parametrize("given", ["scene 700", *FEW])
+def test_all_models_are_scored_where_there_is_little_to_gain(given: str) -> None:
+    """Without preselection, for no more models than pass, and for matches that are few anyway."""
+    pair, score = named(given), estimators.Msac(1.5)
+    F = models(pair, 30).astype(np.float32)
+    few = None if pair.bucket >= 2 * 64 else estimators.Preselect(64, 20)
+    for options in (None, estimators.Preselect(64, 30), estimators.Preselect(512, 20), few):
+        which, scores = Preselection(score, options)(F, pair)
+        np.testing.assert_array_equal(which, np.arange(30))
+        np.testing.assert_array_equal(scores, score(F, np.arange(30), pair))
+
+
+EPS32 = 2.0**-23
+
+
+def reason_of(x0: np.ndarray, x1: np.ndarray, inliers: np.ndarray | None = None, dtype: type = np.float64) -> str:
+    """What is said of a pair of these matches."""
+    points = [torch.from_numpy(x.astype(dtype).astype(np.float64))[None] for x in (x0, x1)]
+    pair = pair_of(Correspondences(*points, torch.ones(1, len(x0), dtype=torch.bool)))
+    inside = np.ones(len(x0), np.bool_) if inliers is None else inliers
+    return degenerate_support(pair, inside, 7, float(np.finfo(dtype).eps))
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("shift", [0.0, 3000.0])
+@pytest.mark.parametrize("scale", SCALES)
+def test_points_of_a_line_are_told_from_points_near_one(scale: float, shift: float, dtype: type) -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        direction, start = rng.normal(size=2), rng.uniform(0, 500, 2) + shift
+        line = start + rng.uniform(-300, 300, (30, 1)) * direction / np.linalg.norm(direction)
+        near = line + rng.normal(0, 0.02, (30, 2))  # px: no detector is as exact
+        other = rng.uniform(0, 500, (30, 2))
+        for x0, x1, images in (
+            (line, other, "image 0"),
+            (other, line, "image 1"),
+            (line, line[::-1], "image 0 and image 1"),
+            (near, other, ""),
+        ):
+            expected = f"the inliers of the best model lie on one line in {images}" if images else ""
+            assert reason_of(scale * x0, scale * x1, dtype=dtype) == expected
+
+
+@pytest.mark.parametrize("count", [0, 6, 7])
+def test_inliers_count_once_at_one_place_and_late_ones_are_seen(count: int) -> None:
+    rng = np.random.default_rng(1)
+    x = rng.uniform(0, 500, (1000, 4))
+    few = f"the best model has {count} different inliers; at least 7 are needed" if count < 7 else ""
+    for first in (0, 100, FIRST_LOOK - 3, 900):
+        inliers = np.zeros(1000, np.bool_)
+        inliers[first : first + count] = True
+        assert reason_of(x[:, :2], x[:, 2:], inliers) == few
+        y = x.copy()
+        y[first + count : first + count + 20] = x[first + max(count - 1, 0)]
+        inliers[first + count : first + count + 20] = count > 0
+        assert reason_of(y[:, :2], y[:, 2:], inliers) == few
+
+
+@pytest.mark.parametrize("scale", SCALES)
+@pytest.mark.parametrize("name", ["scene 40", "scene 700", "real 7", *FEW])
+def test_what_is_said_is_what_the_definition_says(name: str, scale: float) -> None:
+    pair, rng = named(name, scale), np.random.default_rng(0)
+    for share in (0.01, 0.1, 0.5, 1.0):
+        inliers = rng.random(pair.count) < share
+        reason = degenerate_support(pair, inliers, 7, EPS32)
+        inside = pair.points[:, inliers].T
+        largest = np.abs(pair.centre).max() / pair.pixels_per_unit + 1
+        assert reason == expected_support(inside, 7, EPS32 * largest)
+
+
+def test_lines_up_to_the_rounding_of_float32_coordinates() -> None:
+    """Points off a line by less than that of their extent are on it, whatever their type; by more of it not."""
+    rng = np.random.default_rng(0)
+    along = np.append(rng.uniform(-300, 300, 28), [-300, 300])
+    other = rng.uniform(0, 500, (30, 2))
+    for off, on_line in ((EPS32 / 16, True), (4 * EPS32, False)):  # of 600; the first point is as near as 300
+        line = np.stack([along, 600 * off * rng.choice([-1, 1], 30)], 1)
+        assert ("line in image 0" in reason_of(line, other)) == on_line
+
+
+SAMPLERS = [estimators.Uniform(), estimators.PriorWeighted(), estimators.Prosac()]
+DRAW_SEED = 3
+
+
+def pair(count: int, prior: str = "given") -> estimators.Pair:
+    c = known(count)
+    index = torch.arange(count)[None]
+    priors = {
+        "none": None, "zero": torch.zeros(1, count), "one certain": (index == count // 2).float(),
+        "small": torch.logspace(-12, 0, count)[None], "given": c.prior,
+    }  # fmt: skip
+    return pair_of(c.replace(prior=priors[prior]), seed=DRAW_SEED)
+
+
+def numbers_of(pair: estimators.Pair, draw: int, columns: int) -> list[int]:
+    return [number(pair.seed, pair.key, Stream.SAMPLING, draw, j, columns) for j in range(columns)]
+
+
+@pytest.mark.parametrize("prior", ["given", "none", "zero", "one certain", "small"])
+@pytest.mark.parametrize("size", [4, 5, 7, 8])
+@pytest.mark.parametrize("count", [8, 9, 20, 40, 150, 700])
+def test_samples_by_weight_are_those_of_the_definition(count: int, size: int, prior: str) -> None:
+    matches = pair(count, prior)
+    ones = [1] * count
+    weights = (
+        ones if matches.prior is None else reference.quantised(matches.prior.tolist(), largest_weight(matches.bucket))
+    )
+    for sampler, expected in ((estimators.PriorWeighted(), weights), (estimators.Uniform(), ones)):
+        assert sampler.weight(matches).tolist() == expected
+        assert sum(expected) <= 1 << 30
+        for start, draws in ((0, 20), (700, 11)):
+            sample = sampler.draw(matches, start, draws, size)
+            assert sample.dtype == np.int64
+            assert sample.T.tolist() == [
+                reference.weighted_sample(expected, numbers_of(matches, start + d, size)) for d in range(draws)
+            ]
+
+
+@pytest.mark.parametrize("size", [4, 5, 7, 8])
+@pytest.mark.parametrize("count", [8, 9, 20, 40, 700])
+def test_samples_of_prosac_are_those_of_the_definition(count: int, size: int) -> None:
+    matches, sampler = pair(count), estimators.Prosac()
+    exact, grown = reference.prosac_growth(count, size, sampler.GROWTH)
+    table = sampler.growth(count, size).tolist()
+    for n in range(1, count):  # a whole number that rounding has put above itself is rounded up to the next
+        excess = table[n] - table[n - 1] - (exact[n] - exact[n - 1])
+        assert excess == 0 or (excess == 1 and grown[n].denominator == 1), n
+    best = np.argsort(matches.ambiguity, kind="stable")
+    for start in (0, table[-1] // 2, max(table[-1] - 10, 0)):
+        draws = min(20, table[-1] - start)
+        expected = [
+            reference.prosac_sample(table, start + d + 1, numbers_of(matches, start + d, size - 1))
+            for d in range(draws)
+        ]
+        np.testing.assert_array_equal(sampler.draw(matches, start, draws, size).T, best[expected])
+
+
+def test_prosac_ranks_by_prior_where_there_is_no_quality() -> None:
+    matches = pair_of(scene(1, 100).replace(ratio=None))
+    rank = np.argsort(np.argsort(-matches.prior, kind="stable"))
+    sample = rank[estimators.Prosac().draw(matches, 0, 300, 7)]
+    assert sorted(sample[:, 0].tolist()) == list(range(7))
+    assert (np.diff(sample.max(0)) >= 0).all()
+
+
+def test_prosac_is_uniform_after_its_growth_and_where_nothing_is_ranked() -> None:
+    """Without a rank the order of matches means nothing: the first half may be a part of the image."""
+    matches = pair(20)
+    end = int(estimators.Prosac().growth(20, 7)[-1])
+    assert (estimators.Prosac().draw(matches, end - 1, 1, 7) == np.argsort(matches.ambiguity)[-1]).any()
+    across = estimators.Prosac().draw(matches, end - 30, 60, 7)
+    np.testing.assert_array_equal(across[:, :30], estimators.Prosac().draw(matches, end - 30, 30, 7))
+    np.testing.assert_array_equal(across[:, 30:], estimators.Uniform().draw(matches, end, 30, 7))
+    nothing = pair_of(scene(1, 100).replace(ratio=None, prior=None))
+    np.testing.assert_array_equal(
+        estimators.Prosac().draw(nothing, 100, 300, 7), estimators.Uniform().draw(nothing, 100, 300, 7)
+    )
+
+
+@pytest.mark.parametrize("key", [0, 1, -1, 2**63 - 1, -(2**63)])
+@pytest.mark.parametrize("seed", [0, -3, 2**62])
+def test_samples_of_any_key_and_seed(seed: int, key: int) -> None:
+    matches = pair_of(scene(0, 30).replace(key=torch.tensor([key])), seed=seed)
+    expected = [reference.weighted_sample([1] * 30, numbers_of(matches, d, 7)) for d in range(20)]
+    assert estimators.Uniform().draw(matches, 0, 20, 7).T.tolist() == expected
+
+
+@pytest.mark.parametrize("sampler", [estimators.Uniform(), estimators.PriorWeighted()])
+def test_samples_follow_the_prior(sampler: Any) -> None:
+    """Chi-square of how often a match is the first, and the second of a sample, at 1e-4."""
+    matches, draws = pair(30), 50_000
+    p = sampler.weight(matches) / sampler.weight(matches).sum()
+    sample = sampler.draw(matches, 0, draws, 2)
+    # Without replacement: the second is j with probability sum_i p_i p_j / (1 - p_i), i != j.
+    second = [sum(p[i] * p[j] / (1 - p[i]) for i in range(30) if i != j) for j in range(30)]
+    for drawn, expected in zip(sample, (p, np.array(second)), strict=True):
+        assert stats.chisquare(np.bincount(drawn, minlength=30), draws * expected).pvalue > 1e-4
+
+
+@pytest.mark.parametrize("sampler", SAMPLERS)
+def test_samples_are_a_function_of_seed_key_and_draw(sampler: estimators.Sampler) -> None:
+    def drawn(c: Correspondences, i: int = 0, start: int = 0, count: int = 400, seed: int = 0) -> Any:
+        return sampler.draw(pair_of(c, seed, i), start, count, 7)
+
+    alone = drawn(scene(1, 150))
+    ordered = np.sort(alone, 0)
+    assert (ordered[1:] > ordered[:-1]).all()
+    np.testing.assert_array_equal(drawn(scene(1, 150), start=100, count=300), alone[:, 100:])
+    batch = with_padding(collate([scene(2, 250), scene(1, 150)]), np.random.default_rng(0), float("nan"))
+    np.testing.assert_array_equal(drawn(batch, 1), alone)
+    assert not np.array_equal(drawn(scene(1, 150), seed=1), alone)
+    assert not np.array_equal(drawn(scene(1, 150).replace(key=torch.tensor([5]))), alone)

@@ -1,4 +1,4 @@
-"""Runs by threads, processes, a cluster of dask and anybody's executor: the same rows, whatever dies meanwhile."""
+"""Evaluation by executors and workers, and what identifies a run."""
 
 import contextlib
 import dataclasses
@@ -15,14 +15,22 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
 import pytest
+import torch
+from numpy.typing import NDArray
+from omegaconf import OmegaConf
 
-from fmtorch.data import ImagePair
-from fmtorch.evaluation import evaluate_pairs
+from fmtorch import presets
+from fmtorch.core import Correspondences, Estimate, Features, Pruner
+from fmtorch.data import ImagePair, ImageSource
+from fmtorch.evaluation import evaluate_pairs, run_identity
 from fmtorch.jobs import Execution, WorkersLost
-from fmtorch.pipeline import Pipeline, load_pipeline
-from fmtorch.runs import PairRow
+from fmtorch.pipeline import Pipeline, build_pipeline, load_pipeline
+from fmtorch.runs import PairRow, identity_digest, libraries
 from scripts.benchmark.pairs import synthetic_pair
+from tests.helpers import compose
 
 PAIRS = 96
 SLOW_SECONDS = 0.3  # of each batch of a slow pipeline, so that there is time to kill its workers
@@ -85,9 +93,7 @@ def test_rows_of_threads_and_processes(kind: str, pairs: list[ImagePair], expect
 @pytest.mark.parametrize(("workers", "many", "kind"), [
     (1, True, "threads"), (2, True, "processes"), (2, False, "threads"), (None, True, "processes"),
 ])  # fmt: skip
-def test_many_pairs_go_to_processes_unless_there_is_a_single_worker(
-    workers: int | None, many: bool, kind: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_many_pairs_go_to_processes_unless_there_is_a_single_worker(workers, many, kind, monkeypatch):
     monkeypatch.setattr("fmtorch.jobs.execution.cores", lambda: 2)
     assert Execution("auto", workers).decided(many).kind == kind
     assert Execution("processes", workers).decided(many).kind == "processes"  # as it was asked for
@@ -167,8 +173,7 @@ def test_two_of_four_workers_are_killed(cluster: Cluster, pairs: list[ImagePair]
     assert started.wait(PATIENCE)
     rows = evaluated(pairs, Execution("dask", address=cluster.address, send_images=True), build_slow)
     killer.join()
-    assert len(set(killed)) == 2
-    assert rows == expected
+    assert (len(set(killed)), rows) == (2, expected)
 
 
 def test_a_scheduler_that_is_lost(cluster: Cluster, pairs: list[ImagePair], expected: dict[int, PairRow]) -> None:
@@ -197,3 +202,225 @@ def test_an_address_that_nobody_answers(pairs: list[ImagePair], monkeypatch: pyt
 def test_a_cluster_of_this_machine(pairs: list[ImagePair], expected: dict[int, PairRow]) -> None:
     pytest.importorskip("distributed", reason="dask.distributed is not installed")
     assert evaluated(pairs, Execution("dask", 2)) == expected
+
+
+ONE, TWO = (Execution("threads", count) for count in (1, 2))
+
+
+def _ends() -> Pipeline:
+    os._exit(3)
+
+
+def test_a_process_that_ends_is_told() -> None:
+    images = [ImageSource(f"scene/{i}", Path(f"{i}.png")) for i in range(3)]
+    pairs = [ImagePair(f"scene/0-{i}", "family", "scene", images[0], images[i], np.eye(3)) for i in (1, 2)]
+    rows: list[PairRow] = []
+    run = evaluate_pairs(
+        load_pipeline("sift_ratio"), pairs, seed=0, batch=1, execution=Execution("processes", 2),
+        store=rows.extend, build=_ends,
+    )  # fmt: skip
+    with pytest.raises(WorkersLost, match="the same command goes on"):
+        list(run)
+    assert rows == []
+
+
+WORKER = """
+import multiprocessing, time
+from fmtorch.jobs.runner import end_with_parent
+def work():
+    end_with_parent()
+    print(multiprocessing.current_process().pid, flush=True)
+    time.sleep(300)
+multiprocessing.get_context("fork").Process(target=work).start()
+time.sleep(300)
+"""
+
+
+def test_a_worker_ends_with_the_process_that_was_killed() -> None:
+    parent = subprocess.Popen([sys.executable, "-c", WORKER], stdout=subprocess.PIPE, text=True)
+    worker = int(parent.stdout.readline())
+    parent.kill()
+    parent.wait()
+    deadline = time.monotonic() + 60
+    while alive(worker) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    assert not alive(worker)
+
+
+def alive(pid: int) -> bool:
+    """Whether a process runs; one that has ended and waits to be buried does not."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+class Watched:
+    """A pipeline's stages that note what is called when; the first estimation waits until others have computed."""
+
+    def __init__(self, pipeline: Pipeline, images: int) -> None:
+        self.images, self.enough = images, threading.Event()
+        self.extracted: list[int] = []
+        self.at_first_estimate = -1
+        self.extractor, self.estimator = pipeline.extractor, pipeline.estimator
+        pipeline.extractor = self.extract  # type: ignore[assignment]
+        pipeline.estimator = self.estimate  # type: ignore[assignment]
+
+    def extract(self, image: NDArray[np.uint8]) -> Features:
+        features = self.extractor(image)
+        self.extracted.append(int(image.sum()))
+        if len(self.extracted) >= self.images:
+            self.enough.set()
+        return features
+
+    def estimate(self, c: Correspondences, seed: int) -> Estimate:
+        if self.at_first_estimate < 0:
+            self.enough.wait(60)
+            self.at_first_estimate = len(self.extracted)
+        return self.estimator(c, seed)
+
+
+def textured(path: Path, seed: int) -> Path:
+    noise = np.random.default_rng(seed).integers(0, 255, (60, 80), dtype=np.uint8)
+    cv2.imwrite(str(path), cv2.resize(noise, (240, 180)))
+    return path
+
+
+def test_features_are_computed_while_the_first_pair_is_worked_on(tmp_path: Path) -> None:
+    images = [ImageSource(f"scene/{i}", textured(tmp_path / f"{i}.png", i)) for i in range(7)]
+    bad = ImageSource("scene/bad", tmp_path / "absent.png")
+    pairs = [ImagePair(f"scene/0-{i}", "family", "scene", images[0], images[i], np.eye(3)) for i in range(1, 7)]
+    pairs.insert(2, ImagePair("scene/0-bad", "family", "scene", images[0], bad, np.eye(3)))
+    expected: list[PairRow] = []
+    list(
+        evaluate_pairs(
+            load_pipeline("sift_ratio"),
+            pairs,
+            seed=0,
+            batch=2,
+            execution=Execution("threads", 1),
+            store=expected.extend,
+        )
+    )
+    pipeline, rows = load_pipeline("sift_ratio"), list[PairRow]()
+    watched = Watched(pipeline, len(images))
+    counts = list(evaluate_pairs(pipeline, pairs, seed=0, batch=2, execution=TWO, store=rows.extend))
+    assert watched.at_first_estimate == len(images)  # all of them, while the first pair waited
+    assert len(watched.extracted) == len(set(watched.extracted)) == len(images)  # each once
+    assert sum(counts) == len(pairs)
+    by_pair = {row.pair: (row.nsgd, row.reason) for row in rows}
+    assert by_pair == {row.pair: (row.nsgd, row.reason) for row in expected}
+    assert "absent.png" in by_pair["scene/0-bad"][1]
+
+
+GROUPS = ("features", "matcher", "pruner", "estimator", "dataset")
+
+
+@dataclasses.dataclass(frozen=True)
+class Learned:
+    """A stage of any kind that says which file it was learned from."""
+
+    model: Path
+
+    def __call__(self, c: Correspondences) -> Correspondences:
+        return c
+
+
+class Secretive:
+    """A stage that reads a file and says nothing of it."""
+
+    def __init__(self, weights: str) -> None:
+        self.values = Path(weights).read_bytes()
+
+    def __call__(self, c: Correspondences, seed: int = 0) -> Estimate:
+        raise NotImplementedError
+
+
+class Described:
+    """A stage whose `identity` names its file, and a network of its own."""
+
+    def __init__(self, model: Path) -> None:
+        self.identity = {"threshold": 0.5, "files": [model]}
+
+    def __call__(self, c: Correspondences) -> Correspondences:
+        return c
+
+
+def identity(*overrides: str, pipeline: Pipeline | None = None, **own: dict[str, object]) -> dict[str, object]:
+    composed = compose("eval", ("pipeline=sift_ratio", "cache=off", *overrides))
+    config = OmegaConf.create({**{name: composed[name] for name in composed}, **own})
+    return run_identity(config, "sift_ratio", pipeline or build_pipeline(config), "abc")
+
+
+def test_what_changes_speed_alone_is_no_part_of_it() -> None:
+    plain = identity()
+    for change in ("limit=3", "batch=1", "workers=7", "processes=true", "device=cuda", "output=x", "cache_limit=1"):
+        assert identity(change) == plain, change
+    for change in ("seed=1", "pruner.ratio.threshold=0.9", "pruner=[one_to_one,ratio]", "dataset.size=full"):
+        assert identity_digest(identity(change)) != identity_digest(plain), change
+
+
+def test_signed_translations_are_part_of_it_and_folded_ones_change_no_earlier_identity() -> None:
+    config = compose("eval", ("pipeline=sift_ratio", "cache=off"))
+    pipeline = build_pipeline(config)
+    folded, signed = (run_identity(config, "sift_ratio", pipeline, "abc", signed=s) for s in (False, True))
+    assert "pose" not in folded
+    assert signed == {**folded, "pose": {"signed": True}}
+
+
+def test_versions_of_libraries_are_part_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert {"torch", "opencv", "onnxruntime", "numpy"} <= set(libraries())
+    assert identity()["libraries"]["torch"] == torch.__version__.partition("+")[0]  # not for which device it was built
+    assert "poselib" not in identity()["libraries"]
+    pytest.importorskip("poselib", reason="poselib (extra `peers`) is not installed")
+    assert "poselib" in identity("estimator=poselib")["libraries"]
+
+
+def test_whether_kernels_are_used_is_part_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FMTORCH_KERNELS", "off")
+    assert identity()["kernels"] == "off"
+    monkeypatch.setenv("FMTORCH_KERNELS", "on")
+    numba = pytest.importorskip("numba", reason="numba is not installed")
+    assert identity()["kernels"] == f"numba {numba.__version__}"
+
+
+def test_learned_files_of_every_stage_are_part_of_it(tmp_path: Path) -> None:
+    files = {name: tmp_path / f"{name}.bin" for name in ("matcher", "first", "second", "estimator")}
+    for name, file in files.items():
+        file.write_bytes(name.encode())
+
+    def learned() -> dict[str, list[str]]:
+        pruners: dict[str, Pruner] = {"a": Learned(files["first"]), "b": Described(files["second"])}
+        estimator = {"_target_": f"{__name__}.Secretive", "weights": str(files["estimator"])}
+        parts = Pipeline(
+            presets.build("features", "rootsiftpca"), Learned(files["matcher"]), pruners,  # type: ignore[arg-type]
+            presets.instantiate(estimator, "estimator"),
+        )  # fmt: skip
+        digests = identity(pipeline=parts, estimator=estimator)["learned"]
+        assert isinstance(digests, dict)
+        return digests
+
+    before = learned()
+    assert {group: len(digests) for group, digests in before.items()} == {
+        "features": 1, "matcher": 1, "pruner": 2, "estimator": 1,
+    }  # fmt: skip
+    for name, file in files.items():
+        file.write_bytes(b"other")
+        now = learned()
+        group = "pruner" if name in ("first", "second") else name
+        assert {g for g in now if now[g] != before[g]} == {group}, name
+        before = now
+
+
+@pytest.mark.parametrize("group", GROUPS)
+def test_code_of_a_users_own_stage_is_part_of_it(group: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert identity()["code"] == {}
+    own = {"_target_": f"{__name__}.Learned", "model": "x"}
+    parts = load_pipeline("sift_ratio")
+    changed = {group: {"mine": own} if group == "pruner" else own}
+    first = identity(pipeline=parts, **changed)
+    assert list(first["code"]) == [f"{__name__}.Learned"]  # type: ignore[call-overload]
+    monkeypatch.setattr("fmtorch.evaluation.run.code_digest", lambda module: f"edited {module}")
+    second = identity(pipeline=parts, **changed)
+    assert second["code"] == {f"{__name__}.Learned": f"edited {__name__}"}
+    assert identity_digest(first) != identity_digest(second)

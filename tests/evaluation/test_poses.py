@@ -1,17 +1,30 @@
-"""Pose errors of rows: of known cameras as the reference has them, and why a pair has none."""
+"""Evaluation of poses, homographies, cameras and pair types."""
 
 import dataclasses
+import json
+import math
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from PIL import ExifTags, Image
+from rich.console import Console
 
-from fmtorch.core import Correspondences, Estimate
-from fmtorch.data import ImagePair, ImageSource
-from fmtorch.evaluation import evaluate
-from fmtorch.pipeline import Outcome
-from tests.geometry.scenes import scene
+from fmtorch import evaluation, presets
+from fmtorch.core import PAIR_TYPES, WARNINGS, Correspondences, Estimate, collate
+from fmtorch.data import GivenMatches, ImagePair, ImageSource, load
+from fmtorch.evaluation.statistics import homography_figures
+from fmtorch.metrics import corner_error, pose_auc
+from fmtorch.pipeline import Outcome, Pipeline, examined
+from fmtorch.runs import PairRow, RunFolder, to_table
+from fmtorch.training import MatchedPairs
+from tests.conftest import shared_path
+from tests.data import planes
+from tests.geometry.scenes import K, batch, draw, scene
+from tests.helpers import call_command, unused
 from tests.reference import metrics as reference
 from tests.reference import solvers
 
@@ -39,7 +52,7 @@ def without(o: Outcome, **changes: object) -> Outcome:
 
 def test_rows_have_the_pose_errors_of_the_reference() -> None:
     outcomes = [outcome(seed) for seed in range(4)]
-    for o, row in zip(outcomes, evaluate(outcomes), strict=True):
+    for o, row in zip(outcomes, evaluation.evaluate(outcomes), strict=True):
         kept = o.estimate.inliers[0].numpy()
         x0, x1 = (x[0].numpy()[kept] for x in (o.correspondences.x0, o.correspondences.x1))
         R, t, _ = solvers.pose(o.estimate.F[0].numpy(), o.pair.K0, o.pair.K1, x0, x1)
@@ -58,7 +71,7 @@ def test_why_a_pair_has_no_pose_error() -> None:
     uncalibrated = without(outcome(3), K0=None, K1=None)
     unposed = without(outcome(4), R=None, t=None)
     broken = without(outcome(5), t=np.full(3, np.nan))
-    rows = evaluate([failed, uncalibrated, sound, unposed, nothing, broken])
+    rows = evaluation.evaluate([failed, uncalibrated, sound, unposed, nothing, broken])
     assert [(row.rotation_error, row.translation_error, row.pose_reason) for row in (*rows[:2], *rows[3:])] == [
         (180.0, 90.0, "no F"),
         (None, None, "K0, K1 unknown"),
@@ -66,24 +79,307 @@ def test_why_a_pair_has_no_pose_error() -> None:
         (180.0, 90.0, "no inlier in front of both cameras"),
         (None, None, "t not finite"),
     ]
-    (alone,) = evaluate([sound])
+    (alone,) = evaluation.evaluate([sound])
     assert (alone.rotation_error, alone.translation_error) == (rows[2].rotation_error, rows[2].translation_error)
 
 
 def test_signed_errors_are_of_the_best_of_four_poses_and_keep_the_sign_of_an_estimates_own() -> None:
     outcomes = [outcome(seed) for seed in range(3)]
-    for o, row in zip(outcomes, evaluate(outcomes, signed=True), strict=True):
+    for o, row in zip(outcomes, evaluation.evaluate(outcomes, signed=True), strict=True):
         four = solvers.poses(o.pair.K1.T @ o.estimate.F[0].numpy() @ o.pair.K0)
         expected = reference.closest_pose_error(four, o.pair.R, o.pair.t)
         assert (row.rotation_error, row.translation_error) == pytest.approx(expected, abs=1e-6)
     own = [o.estimate.replace(R=torch.eye(3)[None], t=-torch.from_numpy(o.pair.t)[None].float()) for o in outcomes]
     posed = [dataclasses.replace(o, estimate=estimate) for o, estimate in zip(outcomes, own, strict=True)]
-    for row, folded in zip(evaluate(posed, signed=True), evaluate(posed), strict=True):
+    for row, folded in zip(evaluation.evaluate(posed, signed=True), evaluation.evaluate(posed), strict=True):
         assert row.translation_error == pytest.approx(180, abs=0.1)  # t in float32: the root of its rounding
         assert folded.translation_error == pytest.approx(0, abs=0.1)
         assert row.rotation_error == folded.rotation_error
     failed = dataclasses.replace(outcomes[0], estimate=None, correspondences=None, reason="no keypoints in image 0")
     nothing = dataclasses.replace(outcomes[1], estimate=outcomes[1].estimate.replace(F=torch.zeros(1, 3, 3).double()))
-    rows = evaluate([failed, nothing], signed=True)
+    rows = evaluation.evaluate([failed, nothing], signed=True)
     assert [(row.rotation_error, row.translation_error) for row in rows] == [(180.0, 180.0)] * 2
     assert [row.pose_reason for row in rows] == ["no F", "F has no pose"]
+
+
+def run(folder: Path, name: str, *words: str) -> None:
+    """An evaluation of the set in a folder."""
+    fixed = ("dataset=hpatches", "dataset.root=hpatches", "dataset.short_side=200", "cache=off", f"output={name}")
+    with pytest.MonkeyPatch.context() as patch:
+        call_command(patch, folder, "eval", "pipeline=sift_ratio", "estimator=homography", *fixed, *words)
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two runs on two sequences, one image of which is missing."""
+    folder = tmp_path_factory.mktemp("runs")
+    root = planes.write_hpatches(folder / "hpatches")
+    (root / "v_view/6.ppm").unlink()
+    run(folder, "runs/a")
+    run(folder, "runs/b", "estimator.hypotheses=250", "executor=processes", "workers=2")
+    return folder
+
+
+def test_rows_hold_homographies_and_corner_errors(runs: Path) -> None:
+    dataset = load("hpatches", root=runs / "hpatches", short_side=200)
+    pairs = {pair.identity: pair for pair in dataset}
+    rows = RunFolder.load(runs / "runs/a").read().to_pylist()
+    assert len(rows) == 10
+    for row in rows:
+        pair = pairs[row["pair"]]
+        assert row["F"] is None
+        assert math.isnan(row["nsgd"])
+        assert row["rotation_error"] is None
+        if pair.problem is not None:
+            assert (row["ok"], row["corner_error"]) == (False, math.inf)
+            assert row["reason"] == "no image hpatches/v_view/6.ppm"
+            continue
+        H, true = (torch.tensor(np.reshape(m, (3, 3))) for m in (row["H"], pair.H))
+        assert row["corner_error"] == pytest.approx(float(corner_error(H, true, torch.tensor([200, 300]))))
+        assert row["corner_error"] < 1
+        assert row["inlier_rate"] > 0.9
+    assert sum(not row["ok"] for row in rows) == 1
+
+
+def test_the_summary_is_of_corner_errors(runs: Path) -> None:
+    summary = json.loads((runs / "runs/a/summary.json").read_text())
+    errors = torch.tensor(RunFolder.load(runs / "runs/a").read()["corner_error"].to_pylist(), dtype=torch.float64)
+    overall = summary["all"]["homography"]
+    assert overall["pairs"] == 10
+    assert [overall[f"auc_{t}px"] for t in (1, 3, 5)] == pytest.approx(pose_auc(errors, (1, 3, 5)).tolist())
+    assert summary["viewpoint"]["failures"] == 1
+    assert summary["all"]["recall"] is summary["all"]["pose"] is None
+    page = (runs / "runs/a/summary.md").read_text()
+    assert "AUC@1 px" in page
+    assert "%Recall" not in page
+    assert (runs / "runs/a/recall.svg").stat().st_size > 0
+
+
+def test_the_report_compares_corner_errors(runs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    call_command(monkeypatch, runs, "report", "runs", "root=hpatches", "pictures=2", "output=report.html")
+    page = (runs / "report.html").read_text()
+    for part in ("AUC@3 px", "corner error threshold [px]", "inliers of H", "minus each other run", "corner error 0."):
+        assert part in page
+    assert "NSGD" not in page.partition("<h2>Runs")[0].partition("</style>")[2]
+
+
+def test_figures_of_known_errors() -> None:
+    figures = homography_figures(np.array([0.5, 2.0, np.inf, np.nan]))
+    # To 1: a triangle to (0.5, 1/3), then 0.5 at 1/3.
+    assert figures["auc_1px"] == pytest.approx(0.5 / 6 + 0.5 / 3)
+    assert (figures["pairs"], figures["corner_error"]) == (3, 2.0)
+    assert homography_figures(np.array([np.nan])) is None
+    failed = homography_figures(np.array([np.inf, np.inf, 1.0]))
+    assert failed["corner_error"] is None
+
+
+@pytest.mark.parametrize(
+    ("words", "error"),
+    [
+        ("estimator=lmeds", "gives fundamental matrices; a pipeline needs homography matrices here: estimator=homog"),
+        ("cameras=unknown", "the data set has homography matrices, which take no export= and no cameras="),
+        ("export=h5", "take no export="),
+    ],
+)
+def test_what_does_not_go_together_is_refused(words: str, error: str, runs: Path) -> None:
+    with pytest.raises(SystemExit, match=error):
+        run(runs, "refused", words)
+    assert not (runs / "refused").exists()
+
+
+def test_homographies_need_a_set_that_has_them(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    with pytest.raises(SystemExit, match="gives homography matrices; a pipeline needs fundamental matrices here"):
+        call_command(monkeypatch, tmp_path, "eval", "dataset=stereo", "estimator=homography", "cache=off")
+
+
+def test_matches_are_not_labelled_by_homographies(runs: Path, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="the data set hpatches has homography matrices; matches are labelled by"):
+        MatchedPairs(load("hpatches", root=runs / "hpatches"), "sift_ratio", root=tmp_path)
+
+
+def photograph(path: Path, equivalent: int | None) -> ImageSource:
+    """A picture of 60 x 40 px with a focal length in 35 mm."""
+    exif = Image.Exif()
+    if equivalent:
+        exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm] = equivalent
+    Image.new("RGB", (60, 40)).save(path, exif=exif)
+    return ImageSource(path.stem, path)
+
+
+def test_what_each_word_gives(tmp_path: Path) -> None:
+    pair = outcome(0).pair
+    ends = photograph(tmp_path / "a.jpg", 36), photograph(tmp_path / "b.jpg", None)
+    pair = dataclasses.replace(pair, image0=ends[0], image1=ends[1])
+    known = evaluation.cameras_of([pair], "known")[pair.key]
+    assert torch.equal(known.K0, torch.from_numpy(pair.K0))
+    assert known.focal.tolist() == [[1, 0], [1, 0]]
+    exif = evaluation.cameras_of([pair], "exif")[pair.key]
+    assert exif.K0 is exif.K1 is None
+    assert exif.focal[0].tolist() == pytest.approx([60, math.hypot(0.06, 1 / math.sqrt(12) / 36)])
+    assert exif.focal[1].tolist() == [1, math.inf]
+    shared, unknown = (evaluation.cameras_of([pair], word)[pair.key] for word in ("shared", "unknown"))
+    assert (shared.shared_focal, unknown.shared_focal) == (True, False)
+    assert shared.focal[:, 1].tolist() == unknown.focal[:, 1].tolist() == [math.inf, math.inf]
+
+
+def test_a_calibration_that_is_missing_is_named() -> None:
+    pair = dataclasses.replace(outcome(1).pair, K1=None)
+    with pytest.raises(ValueError, match="cameras=known, but the data set has no calibration of pair p1"):
+        evaluation.cameras_of([pair], "known")
+    assert evaluation.cameras_of([dataclasses.replace(pair, problem="no image")], "known") == {}
+
+
+def estimated(outcomes: list[Outcome], cameras: str) -> list[Outcome]:
+    """The outcomes with the estimates of a batch whose estimator is given the cameras."""
+    c = collate([o.correspondences.replace(key=torch.tensor([o.pair.key])) for o in outcomes])
+    estimator = evaluation.WithPairCameras(
+        presets.build("estimator", "fmtorch"), evaluation.cameras_of([o.pair for o in outcomes], cameras)
+    )
+    estimate = estimator(c, 0)
+    return [dataclasses.replace(o, estimate=estimate[i]) for i, o in enumerate(outcomes)]
+
+
+def test_rows_have_the_pose_of_the_estimate_and_neighbours_change_nothing() -> None:
+    outcomes = [outcome(seed, noise=0.1) for seed in range(3)]
+    rows = evaluation.evaluate(estimated(outcomes, "known"))
+    for row, alone in zip(rows, (evaluation.evaluate(estimated([o], "known"))[0] for o in outcomes), strict=True):
+        assert row.ok
+        assert row.pose_reason is None
+        assert row.rotation_error < 0.5
+        assert row.translation_error < 5
+        assert (alone.rotation_error, alone.translation_error) == (row.rotation_error, row.translation_error)
+
+
+def test_poses_that_are_not_determined_and_pairs_without_estimates_among_others() -> None:
+    (posed,) = estimated([outcome(0, noise=0.1)], "known")
+    nothing = torch.full((1, 3, 3), torch.nan, dtype=torch.float64)
+    lost = dataclasses.replace(posed, estimate=posed.estimate.replace(R=nothing, t=nothing[:, 0]))
+    rows = evaluation.evaluate([lost, posed, outcome(1)])
+    assert (rows[0].rotation_error, rows[0].translation_error) == (180, 90)
+    assert [row.pose_reason for row in rows] == ["the pose is not determined", None, None]
+    assert rows[1].rotation_error < 0.5
+
+
+def test_a_run_with_cameras_is_another_run(command: Callable[..., str], tmp_path: Path) -> None:
+    words = ["eval", "pipeline=sift_fmtorch", "dataset=fmbench", f"dataset.root={shared_path('data/Strecha_train')}"]
+    words += ["limit=2", "workers=1"]
+
+    def run(name: str, *more: str) -> tuple[str, dict[str, Any], dict[str, Any]]:
+        said = command(*words, *more, f"output={name}", cwd=tmp_path)
+        run, summary = (json.loads((tmp_path / name / f"{file}.json").read_text()) for file in ("run", "summary"))
+        return said, run["config"], summary["all"]["pose"]
+
+    assert "cameras" not in run("without")[1]
+    _, identity, pose = run("known", "cameras=known")
+    assert identity["cameras"] == "known"
+    assert max(pose["rotation"], pose["translation"]) < 0.5
+    said, identity, pose = run("signed", "cameras=known", "pose.signed=true")
+    assert identity["pose"] == {"signed": True}
+    assert pose["signed"] is True
+    for text in (said, (tmp_path / "signed" / "summary.md").read_text()):
+        spoken = " ".join(text.split())
+        assert "t error, signed" in spoken
+        assert "whose sign counts" in spoken
+    assert "ended: error: pose.signed=2; it must be true or false" in command(*words, "pose.signed=2", cwd=tmp_path)
+    assert "holds another run" in command(*words, "cameras=shared", "output=known", cwd=tmp_path)
+    assert "ended: error: cameras=some" in command(*words, "cameras=some", cwd=tmp_path)
+
+
+def pipeline() -> Pipeline:
+    return Pipeline(unused, unused, {}, presets.build("estimator", "fmtorch"))
+
+
+def given(c: Correspondences) -> Callable[[], GivenMatches]:
+    return lambda: GivenMatches(c, (c.mask.shape[1],) * 2)
+
+
+def pair(kind: str, n: int = 150) -> ImagePair:
+    drawn = draw(kind, 1, n)
+    fields = batch([drawn])
+    c = Correspondences(**{name: fields[name] for name in ("x0", "x1", "mask", "size0", "size1")})
+    image = ImageSource(kind, Path(kind))
+    return ImagePair(kind, "family", kind, image, image, drawn.F, K, K, drawn.R, drawn.t, matches=given(c))
+
+
+def rows(pairs: list[ImagePair], word: str | None) -> list[PairRow]:
+    built = pipeline()
+    if word is not None:
+        built = evaluation.built_with(lambda: built, evaluation.cameras_of(pairs, word))  # type: ignore[arg-type]
+    knowledge = built.estimator.given if isinstance(built.estimator, evaluation.WithPairCameras) else None
+    return evaluation.evaluate(examined(built, built.run(pairs), 0, knowledge))
+
+
+@pytest.mark.parametrize("word", [None, "known", "unknown"])
+def test_rows_say_which_configuration_and_neighbours_change_nothing(word: str | None) -> None:
+    pairs = [pair(kind, 150 + 10 * i) for i, kind in enumerate(PAIR_TYPES)]
+    lost = dataclasses.replace(pairs[0], identity="lost", problem="no image")
+    together = rows([*pairs, lost], word)
+    assert [row.pair_type for row in together] == [*PAIR_TYPES, None]
+    assert [row.warning for row in together] == [*(WARNINGS[kind] for kind in PAIR_TYPES), None]
+    for each, row in zip(pairs, together, strict=False):
+        (alone,) = rows([each], word)
+        assert (alone.F, alone.pair_type) == (row.F, row.pair_type)
+        assert alone.focal_log_ratio0 == row.focal_log_ratio0
+
+
+def test_a_pair_that_cannot_be_examined_harms_no_other() -> None:
+    built = pipeline()
+    outcomes = built.run([pair("general"), pair("planar")])
+    broken = dataclasses.replace(outcomes[0], estimate=outcomes[0].estimate.replace(model="homography"))
+    results = examined(built, [broken, outcomes[1]])
+    assert [o.pair_type is None for o in results] == [True, False]
+    first, second = evaluation.evaluate([dataclasses.replace(results[0], estimate=outcomes[0].estimate), results[1]])
+    assert first.warning.startswith("not examined: ValueError: estimate is of homography matrices")
+    assert second.pair_type == "planar"
+
+
+def estimated_type(
+    c: Correspondences, focals: list[float], true: tuple[np.ndarray | None, np.ndarray | None]
+) -> Outcome:
+    source = pair("general")
+    outcome = pipeline().run([source])[0]
+    estimate = outcome.estimate.replace(focals=torch.tensor([focals], dtype=torch.float64))
+    return dataclasses.replace(
+        outcome, pair=dataclasses.replace(source, K0=true[0], K1=true[1]), correspondences=c, estimate=estimate
+    )
+
+
+def test_errors_of_focal_lengths() -> None:
+    """Known answers: 10 % too long, not determined, given exactly, without truth, of pixels that are not square."""
+    source = pair("general")
+    c, _ = source.matches()
+    asked = c.replace(focal=torch.tensor([[[1.0, torch.inf], [1.0, torch.inf]]], dtype=torch.float64))
+    focals = evaluation.focal_errors(estimated_type(asked, [1.1 * 768, math.nan], (K, K)))
+    assert focals.error[0] == pytest.approx(0.1)
+    assert focals.log_ratio[0] == pytest.approx(math.log(1.1))
+    assert (focals.error[1], focals.log_ratio[1]) == (math.inf, None)
+    exact = asked.replace(focal=torch.tensor([[[768.0, 0.0], [768.0, 0.05]]], dtype=torch.float64))
+    wide = np.diag([4.0, 1.0, 1.0]) @ K
+    focals = evaluation.focal_errors(estimated_type(exact, [768.0, 768.0], (K, wide)))
+    assert focals.error == (None, pytest.approx(0.5))
+    assert evaluation.focal_errors(estimated_type(asked, [768.0, 768.0], (None, K))).error == (None, 0)
+    assert evaluation.focal_errors(estimated_type(c, [768.0, 768.0], (K, K))).error == (None, None)  # nobody asked
+
+
+def test_summaries_and_reports_show_them() -> None:
+    pairs = [pair(kind) for kind in ("general", "planar")]
+    table = to_table(rows(pairs, "unknown"))
+    summary = evaluation.summarize(table)
+    assert summary["all"]["pair_types"] == {**dict.fromkeys(PAIR_TYPES, 0), "general": 1, "planar": 1}
+    assert summary["all"]["focals"]["images"] == 4
+    console = Console(width=80, record=True)
+    for each in evaluation.terminal_tables(summary, "t")[1:]:
+        console.print(each)
+    shown = console.export_text()
+    assert "Focal lengths" in shown
+    assert "do not determine F" in shown
+    page = evaluation.summary_markdown(summary, "run")
+    assert "| family | 1 | 1 | 0 | 0 | 0 |" in page
+    assert "folded" in page
+    of_report = {each.heading: each for each in evaluation.tables.report_tables({"run": table}, {"run": summary})}
+    assert [cell.text for cell in of_report["Pair types"].rows["run"]] == ["1", "1", "0", "0", "0"]
+    assert of_report["Focal lengths"].rows["run"][0].text == "4"
+    nobody = to_table([dataclasses.replace(row, pair_type=None) for row in rows(pairs[:1], None)])
+    assert "Pair types" not in {part.heading for part in evaluation.tables.parts(evaluation.summarize(nobody))}
+    alone = evaluation.terminal_tables(evaluation.summarize(to_table(rows(pairs[:1], None))), "t")
+    assert [each.title for each in alone] == ["t", "Relative pose"]  # all general: nothing to say

@@ -1,16 +1,23 @@
+"""Summaries: figures, intervals, reasons of failures."""
+
 import dataclasses
 import json
+import math
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from rich.console import Console
 
 from fmtorch import metrics
 from fmtorch.core import pair_key
-from fmtorch.evaluation import summarize, summary_markdown, terminal_tables
+from fmtorch.evaluation import common_reasons, statistics, summarize, summary_markdown, terminal_tables
 from fmtorch.runs import PairRow, to_table
+from tests.reference.metrics import bootstrap_interval
 
 F = (0.0, -0.5, 0.1, 0.5, 0.0, -0.1, 0.2, 0.3, 0.59)
 
@@ -58,15 +65,12 @@ def test_known_answer() -> None:
     assert indoor["inlier_rate_failures_0"] == pytest.approx(3 * 0.75 / 5)
     assert indoor["inlier_rate_before"] == pytest.approx(0.5)
     assert indoor["inlier_rate_before_failures_0"] == pytest.approx(4 * 0.5 / 5)
-    assert indoor["corrs"] == pytest.approx(75)
-    assert indoor["corrs_before"] == pytest.approx(400)
-    assert indoor["seconds"]["features"] == 1.0
-    assert indoor["seconds"]["total"] == 1.875
+    assert (indoor["corrs"], indoor["corrs_before"]) == (pytest.approx(75), pytest.approx(400))
+    assert (indoor["seconds"]["features"], indoor["seconds"]["total"]) == (1.0, 1.875)
     assert orbit["interval_over"] == "pair"
     assert orbit["recall_released"] is None
     assert orbit["recall"] == pytest.approx(1 / 3)
-    assert everything["recall"] == pytest.approx(4 / 8)
-    assert everything["scenes"] == 6
+    assert (everything["recall"], everything["scenes"]) == (pytest.approx(4 / 8), 6)
     assert everything["reasons"] == {"5 to 7 matches; at least 8 are needed": 2, "no keypoints in a|b.png": 1}
     low, high = everything["recall_interval"]
     assert 0 <= low < everything["recall"] < high <= 1
@@ -108,8 +112,7 @@ def test_markdown() -> None:
     text = summary_markdown(summarize(known()), title="sift_ratio on rendered")
     lines = text.splitlines()
     tables = [line.replace("\\|", "").count("|") for line in lines if line.startswith("|")]
-    assert set(tables[:5]) == {13}
-    assert set(tables[5:]) == {8}
+    assert (set(tables[:5]), set(tables[5:])) == ({13}, {8})
     assert "| indoor | 5 | 5 | 60.0 [" in text
     assert "a\\|b.png" in text
     assert "1 (20.0%)" in text
@@ -134,3 +137,156 @@ def test_poses_known_answer() -> None:
     assert [pose[f"map_{t}"] for t in (5, 10, 20)] == pytest.approx([2 / 4, 2 / 4, (2 + 2 + 3 + 3) / 16])
     assert pose["maa_10"] == pytest.approx((0 + 1 + 1 + 1 + 6 * 2) / 40)
     assert (pose["rotation"], pose["translation"]) == (2.75, 7.0)
+
+
+def correlated(scenes: int, pairs: int, seed: int = 0) -> tuple[np.ndarray, list[str]]:
+    """Hits of pairs whose chance of success is the scene's."""
+    rng = np.random.default_rng(seed)
+    chance = rng.beta(1, 1, scenes)
+    names = [f"s{i}" for i in range(scenes) for _ in range(pairs)]
+    return (rng.random(scenes * pairs) < chance.repeat(pairs)).astype(np.float64), names
+
+
+def quantile_error(values: np.ndarray, clusters: int, resamples: int) -> float:
+    """4.5 standard deviations of the difference of two estimates of a 2.5 % quantile of a normal variable."""
+    density = 0.0585  # of the standard normal at its 2.5 % quantile
+    means = values.reshape(clusters, -1).mean(1).std() / np.sqrt(clusters)
+    return float(4.5 * np.sqrt(2) * means * np.sqrt(0.025 * 0.975 / resamples) / density)
+
+
+@pytest.mark.parametrize("scenes", [statistics.MIN_SCENES - 1, 40])
+def test_equals_the_reference(scenes: int) -> None:
+    values, names = correlated(scenes, 12)
+    result = statistics.bootstrap_mean(values, names)
+    over_scenes = scenes >= statistics.MIN_SCENES
+    clusters = names if over_scenes else [str(i) for i in range(len(names))]
+    low, high = bootstrap_interval(values.tolist(), clusters, statistics.RESAMPLES)
+    # Monte-Carlo error of both, and one step of the mean of 0/1 values, on which quantiles of few values lie.
+    tolerance = quantile_error(values, len(set(clusters)), statistics.RESAMPLES) + 1 / len(values)
+    assert (result.over, result.value) == ("scene" if over_scenes else "pair", values.mean())
+    assert result.low == pytest.approx(low, abs=tolerance)
+    assert result.high == pytest.approx(high, abs=tolerance)
+
+
+@pytest.mark.parametrize("value", [0.0, 1.0])
+def test_no_spread_no_width(value: float) -> None:
+    result = statistics.bootstrap_mean(np.full(7, value), list("abcdefg"))
+    assert (result.value, result.low, result.high) == (value, value, value)
+    assert statistics.bootstrap_mean(np.array([value]), ["a"]).low == value
+
+
+def test_a_difference_of_the_same_pairs_is_sharper_than_apart() -> None:
+    base, names = correlated(30, 10)
+    rng = np.random.default_rng(1)
+    better = np.maximum(base, rng.random(len(base)) < 0.1).astype(np.float64)  # a tenth of the misses become hits
+    result, flipped, same = (
+        statistics.difference(a, b, names) for a, b in ((better, base), (base, better), (base, base))
+    )
+    assert result.value == pytest.approx(better.mean() - base.mean(), abs=1e-12)
+    assert result.low > 0
+    assert (
+        result.high - result.low
+        < statistics.bootstrap_mean(base, names).high - statistics.bootstrap_mean(base, names).low
+    )
+    assert (flipped.low, flipped.high) == pytest.approx((-result.high, -result.low), abs=1e-12)
+    assert (same.value, same.low, same.high) == (0, 0, 0)
+    with pytest.raises(ValueError, match="a has 2 and b has 3"):
+        statistics.difference(np.zeros(2), np.zeros(3), ["a", "b"])
+
+
+def one_scene(n: int) -> list[str]:
+    return ["s"] * n
+
+
+def successes(r: int, n: int) -> np.ndarray:
+    return np.arange(n) < r
+
+
+@pytest.mark.parametrize(
+    ("r", "n", "low", "high"),
+    # Newcombe, "Two-sided confidence intervals for the single proportion", Statistics in Medicine 1998, method 3.
+    [(81, 263, 0.2553, 0.3662), (15, 148, 0.0624, 0.1605), (0, 20, 0.0, 0.1611), (1, 29, 0.0061, 0.1718)],
+)
+def test_published_answers(r: int, n: int, low: float, high: float) -> None:
+    interval = statistics.share_interval(successes(r, n), one_scene(n))
+    assert (interval.value, interval.over) == (r / n, "pair")
+    assert (interval.low, interval.high) == pytest.approx((low, high), abs=5e-5)
+
+
+def test_pairs_that_succeed_together_count_as_one() -> None:
+    scenes = [f"s{i // 10}" for i in range(200)]
+    together = np.repeat(np.arange(20) % 2 == 0, 10)
+    # Every scene is all or nothing: as good as 20 pairs, whose variance has 19 degrees of freedom in place of 199.
+    alike = 20 * (19 / 20) * (200 / 199) * (1.971957 / 2.093024) ** 2
+    assert statistics.effective_pairs(together.astype(float), scenes) == pytest.approx(alike)
+    apart = np.tile(np.arange(10) % 2 == 0, 20)
+    assert 150 < statistics.effective_pairs(apart.astype(float), scenes) <= 200
+    wide, narrow = statistics.share_interval(together, scenes), statistics.share_interval(apart, scenes)
+    assert wide.high - wide.low > 2.5 * (narrow.high - narrow.low)
+    assert wide.over == narrow.over == "scene"
+
+
+def test_differences() -> None:
+    a, b = successes(30, 40), successes(20, 40)
+    scenes = one_scene(40)
+    interval = statistics.share_difference(a, b, scenes)
+    assert interval.value == 0.25
+    # Bonett and Price by hand: n12 = 10, n21 = 0, n = 40.
+    p, q = 11 / 42, 1 / 42
+    half = 1.959964 * math.sqrt((p + q - (p - q) ** 2) / 42)
+    assert (interval.low, interval.high) == pytest.approx((p - q - half, p - q + half))
+    back = statistics.share_difference(b, a, scenes)
+    assert (back.low, back.high) == pytest.approx((-interval.high, -interval.low))
+    same = statistics.share_difference(a, a, scenes)
+    assert same.value == 0
+    assert same.low == -same.high < 0  # agreeing on forty pairs is no proof of being equal
+    assert statistics.share_difference(a[:3], a[:3], scenes[:3]).high > 0.4
+
+
+def test_means_of_few_pairs_have_no_interval() -> None:
+    rng = np.random.default_rng(0)
+    a, b = rng.random(statistics.MIN_UNITS), rng.random(statistics.MIN_UNITS)
+    assert statistics.difference(a[1:], b[1:], one_scene(statistics.MIN_UNITS - 1)) is None
+    interval = statistics.difference(a, b, one_scene(statistics.MIN_UNITS))
+    assert interval.low < interval.value < interval.high
+    six = [f"s{i % 6}" for i in range(9 * statistics.MIN_UNITS)]
+    assert statistics.difference(np.tile(a, 9), np.tile(b, 9), six) is None
+
+
+@given(st.lists(st.tuples(st.booleans(), st.booleans(), st.integers(0, 9)), min_size=1, max_size=60))
+def test_any_pairs_have_an_interval_around_their_share(rows: list[tuple[bool, bool, int]]) -> None:
+    a, b = (np.array([row[i] for row in rows]) for i in (0, 1))
+    scenes = [f"s{row[2]}" for row in rows]
+    share, gain = statistics.share_interval(a, scenes), statistics.share_difference(a, b, scenes)
+    assert 0 <= share.low <= share.value <= share.high <= 1
+    assert share.high > share.low
+    assert -1 <= gain.low <= gain.value <= gain.high <= 1
+    assert 0 < statistics.effective_pairs(a.astype(float), scenes) <= len(rows)
+
+
+@pytest.mark.parametrize(
+    ("reasons", "expected"),
+    [
+        (["7 matches; at least 8 are needed"], {"7 matches; at least 8 are needed": 1}),
+        (
+            [f"{n} matches; at least 8 are needed" for n in (7, 5, 7, 10)],
+            {"5 to 10 matches; at least 8 are needed": 4},  # in the order of numbers, not of letters
+        ),
+        (
+            ["no image scene/00000012.png", "no image scene/00000034.png"],
+            {"no image scene/000000….png": 2},
+        ),
+        (["none in image 0", "late", "none in image 1"], {"none in image 0 to 1": 2, "late": 1}),
+        (["share 0.5, too small", "share 0.25, too small"], {"share 0.25 to 0.5, too small": 2}),
+        (["F7", "8"], {"…": 2}),
+        ([], {}),
+    ],
+)  # fmt: skip
+def test_reasons_that_differ_in_numbers_are_one(reasons: list[str], expected: dict[str, int]) -> None:
+    common = common_reasons(reasons, 3)
+    assert (common, list(common)) == (expected, list(expected))
+
+
+def test_the_commonest_come_first_and_others_are_left_out() -> None:
+    reasons = ["a"] * 2 + ["b"] * 4 + ["c"] + ["d"] * 3
+    assert list(common_reasons(reasons, 3).items()) == [("b", 4), ("d", 3), ("a", 2)]

@@ -1,15 +1,22 @@
-"""Patch networks: the authors' weights give the authors' outputs, and other layouts load as what they are."""
+"""Networks of features: kornia's, shipped ones, ONNX."""
 
 from pathlib import Path
 
 import kornia
 import numpy as np
+import onnx
 import pytest
 import torch
+from onnx import TensorProto, helper
 from torch import Tensor, nn
 
+from fmtorch import presets
+from fmtorch.core import NetworkFileError, models_dir
+from fmtorch.features import ALIKED, DISK, PatchNetwork
 from fmtorch.features.networks import ARCHITECTURES, DESCRIPTORS, AffNet, HardNet, L2Net, OriNet, build, load_weights
+from scripts.patch_networks.onnx_export import export, quantize
 from tests.conftest import oracle, shared_path
+from tests.features.scenes import same, texture
 
 RTOL = 1e-4  # of unit outputs: float32 sums of up to 8,192 terms in another order
 
@@ -122,3 +129,211 @@ def test_files_that_do_not_fit_are_named(tmp_path: Path) -> None:
         ValueError, match="there are: hardnet, hardnet_fast, l2net, geodesc, affnet, affnet_fast, orinet"
     ):
         build("siftnet")
+
+
+NEIGHBOURS = 1e-5  # what design allows a descriptor to change with its batch
+
+
+@pytest.fixture(scope="module")
+def hardnet(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("onnx") / "hardnet.onnx"
+    export(randomized(build("hardnet")), path)
+    return path
+
+
+@pytest.mark.parametrize("name", ARCHITECTURES)
+def test_onnx_agrees_with_torch_on_real_patches(name: str, tmp_path: Path, patches: Tensor) -> None:
+    network = randomized(build(name))
+    if name == "l2net":
+        network.pixel_mean.copy_(patches.mean(0, keepdim=True))
+    export(network, tmp_path / "network.onnx")
+    found = PatchNetwork(tmp_path / "network.onnx", batch=40)(patches)
+    assert found.shape == (64, network.outputs)
+    torch.testing.assert_close(found, network(patches).detach(), atol=1e-4, rtol=0)
+    assert [f.name for f in tmp_path.iterdir()] == ["network.onnx"]  # one file, weights inside
+
+
+def test_neighbours_and_batch_size_are_invisible(hardnet: Path, patches: Tensor) -> None:
+    expected = PatchNetwork(hardnet)(patches)
+    for batch in (1, 7, 64, 300):
+        found = PatchNetwork(hardnet, batch=batch)(patches)
+        torch.testing.assert_close(found, expected, atol=NEIGHBOURS, rtol=0)
+    one = PatchNetwork(hardnet)(patches[5:6])
+    torch.testing.assert_close(one, expected[5:6], atol=0, rtol=0)  # the same portion size: the same bits
+    garbage = patches.clone()
+    garbage[6:] = torch.nan
+    torch.testing.assert_close(PatchNetwork(hardnet)(garbage)[:6], expected[:6], atol=0, rtol=0)
+
+
+def test_other_shapes_of_patches_are_refused(hardnet: Path) -> None:
+    for shape in ((2, 1, 64, 64), (2, 3, 32, 32)):
+        with pytest.raises(Exception, match=r"\(N, 1, 32, 32\)|jaxtyping|Type-check"):
+            PatchNetwork(hardnet)(torch.zeros(shape))
+    with pytest.raises(ValueError, match="batch=0"):
+        PatchNetwork(hardnet, batch=0)
+
+
+def test_an_absent_file_is_named_with_what_makes_it(tmp_path: Path) -> None:
+    with pytest.raises(NetworkFileError, match=r"absent\.onnx does not exist: scripts\.patch_networks\.export"):
+        PatchNetwork(tmp_path / "absent.onnx")(torch.zeros(1, 1, 32, 32))
+    for use in (lambda n: n(torch.zeros(1, 1, 32, 32)), lambda n: n.identity):
+        with pytest.raises(
+            NetworkFileError, match=r"absent\.int8\.onnx does not exist: .*precision=int8.*calibration="
+        ):
+            use(PatchNetwork(tmp_path / "absent.int8.onnx"))
+
+
+def test_a_corrupt_file_is_named(hardnet: Path, tmp_path: Path) -> None:
+    (tmp_path / "cut.onnx").write_bytes(hardnet.read_bytes()[:100_000])
+    (tmp_path / "text.onnx").write_text("404: Not Found")
+    (tmp_path / "empty.onnx").write_bytes(b"")
+    (tmp_path / "bytes.onnx").write_bytes(hardnet.read_bytes().replace(b"Conv", b"\xe5onv"))  # the error is no text
+    for name in ("cut", "text", "empty", "bytes"):
+        with pytest.raises(NetworkFileError, match=rf"{name}\.onnx"):
+            PatchNetwork(tmp_path / f"{name}.onnx")(torch.zeros(1, 1, 32, 32))
+
+
+@pytest.mark.parametrize(("shape", "out"), [
+    (["n", 1, 64, 64], ["n", 4096]), (["n", 3, 32, 32], ["n", 3072]),
+    ([5, 1, 32, 32], [5, 1024]), (["n", 1024], ["n", 1024]),
+])  # fmt: skip
+def test_a_network_of_another_shape_is_named(shape: list[object], out: list[object], tmp_path: Path) -> None:
+    inputs = helper.make_tensor_value_info("x", TensorProto.FLOAT, shape)
+    outputs = helper.make_tensor_value_info("y", TensorProto.FLOAT, out)
+    graph = helper.make_graph([helper.make_node("Flatten", ["x"], ["y"])], "g", [inputs], [outputs])
+    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10), tmp_path / "w.onnx")
+    with pytest.raises(NetworkFileError, match=r"w\.onnx takes .*a patch network takes float \(N, 1, 32, 32\)"):
+        PatchNetwork(tmp_path / "w.onnx")(torch.zeros(1, 1, 32, 32))
+
+
+def test_int8_keeps_descriptors_close_and_the_file_small(hardnet: Path, tmp_path: Path, patches: Tensor) -> None:
+    quantize(hardnet, tmp_path / "hardnet.int8.onnx", patches)
+    expected, found = (PatchNetwork(p)(patches) for p in (hardnet, tmp_path / "hardnet.int8.onnx"))
+    cosine = (expected * found).sum(1)
+    assert float(cosine.min()) > 0.9
+    assert (tmp_path / "hardnet.int8.onnx").stat().st_size < 0.3 * hardnet.stat().st_size
+    nodes = {node.op_type for node in onnx.load(tmp_path / "hardnet.int8.onnx").graph.node}
+    assert {"QuantizeLinear", "DequantizeLinear"} <= nodes
+
+
+def test_files_tell_nothing_of_where_they_were_made(hardnet: Path) -> None:
+    """Exporters note the source line of every node, with its path."""
+    files = [*models_dir().glob("*.onnx"), hardnet]
+    assert len(files) > 6
+    for file in files:
+        content = file.read_bytes()
+        assert not [word for word in (b'.py", line ', b"/home/", b"/root/") if word in content], file
+
+
+SIZE = (90, 131)  # no multiple of 16
+
+
+def untrained(name: str) -> DISK | ALIKED:
+    torch.manual_seed(0)
+    if name == "disk":
+        return DISK(max_features=50, score_threshold=-100.0, device="cpu", network=kornia.feature.DISK())
+    return ALIKED(max_features=50, device="cpu", network=kornia.feature.ALIKED(detection_threshold=0.0))
+
+
+both = pytest.mark.parametrize("name", ["disk", "aliked"])
+
+
+@both
+@pytest.mark.parametrize("colour", [False, True])
+def test_shapes_and_ranges(name: str, colour: bool) -> None:
+    image = texture(0, *SIZE)
+    found = untrained(name)(np.stack([image, image[::-1], image], -1) if colour else image)
+    assert 10 < len(found) <= 50
+    assert found.image_size.tolist() == list(SIZE)
+    assert found.descriptors.shape == (len(found), 128)
+    torch.testing.assert_close(found.descriptors.norm(dim=1), torch.ones(len(found)))
+    assert found.scores.shape == (len(found),)
+    assert (found.keypoints >= 0).all()
+    assert (found.keypoints <= torch.tensor([SIZE[1] - 1.0, SIZE[0] - 1.0])).all()
+    assert torch.equal(found.lafs[..., :2], torch.eye(2).expand(len(found), 2, 2))
+    for value in (found.lafs, found.scores, found.descriptors):
+        value.add_(0)  # an inference tensor could not be changed, nor trained on
+        assert not value.requires_grad
+
+
+@both
+def test_grey_is_the_same_as_equal_channels(name: str) -> None:
+    image, extractor = texture(1, *SIZE), untrained(name)
+    assert same(extractor(image), extractor(np.stack([image] * 3, -1)))
+
+
+class Probe(nn.Module):
+    """In place of DISK's network: the heatmap is the red channel, the descriptors are constant."""
+
+    def forward(self, images: Tensor) -> Tensor:
+        constant = torch.ones_like(images[:, :1]).expand(-1, 128, -1, -1)
+        return torch.cat([constant, images[:, :1]], 1)
+
+
+DOTS = {(37, 21): 200, (10, 60): 255, (100, 70): 120}  # (x, y): brightness
+
+
+def dots() -> np.ndarray:
+    image = np.zeros((*SIZE, 3), np.uint8)
+    for (x, y), value in DOTS.items():
+        image[y, x, 0] = value
+    return image
+
+
+def test_disk_keypoints_count_from_the_centre_of_the_first_pixel() -> None:
+    found = DISK(network=kornia.feature.DISK(unet=Probe()), device="cpu")(dots())
+    assert {
+        (int(x), int(y)): round(255 * s)
+        for (x, y), s in zip(found.keypoints.tolist(), found.scores.tolist(), strict=True)
+    } == DOTS
+    few = DISK(network=kornia.feature.DISK(unet=Probe()), device="cpu", max_features=2)(dots())
+    assert sorted(round(255 * s) for s in few.scores.tolist()) == [200, 255]
+
+
+def test_aliked_keypoints_count_from_the_centre_of_the_first_pixel(monkeypatch: pytest.MonkeyPatch) -> None:
+    network = kornia.feature.ALIKED(detection_threshold=0.2)
+    dense = lambda image: (torch.ones_like(image[:, :1]).expand(-1, 128, -1, -1), image[:, :1])  # noqa: E731
+    monkeypatch.setattr(network, "extract_dense_map", dense)
+    found = ALIKED(network=network, device="cpu")(dots())
+    centres = found.keypoints.round().int().tolist()
+    assert {tuple(centre) for centre in centres} == set(DOTS)
+    # A dot is symmetric, so the refinement moves nothing; 1e-4 px is float32 on coordinates that went to [-1, 1].
+    assert (found.keypoints - found.keypoints.round()).abs().max() < 1e-4
+    few = ALIKED(network=network, device="cpu", max_features=2)(dots())
+    assert len(few) == 2
+    assert few.scores.min() > 0.7
+
+
+def test_nothing_found() -> None:
+    found = DISK(network=kornia.feature.DISK(unet=Probe()), device="cpu")(np.zeros(SIZE, np.uint8))
+    assert (found.lafs.shape, found.descriptors.shape) == ((0, 2, 3), (0, 128))
+
+
+@both
+@pytest.mark.parametrize("shape", [(31, 200), (0, 0), (1, 500, 3), (64, 64, 4)])
+def test_images_that_cannot_be(name: str, shape: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match="at least 32 x 32"):
+        untrained(name)(np.zeros(shape, np.uint8))
+
+
+@both
+def test_weights_that_cannot_be_fetched(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    torch_home = tmp_path / "hub"
+    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(torch_home))
+    cls = {"disk": kornia.feature.DISK, "aliked": kornia.feature.ALIKED}[name]
+
+    def offline(*_: object, **__: object) -> None:
+        try:
+            raise OSError("Name or service not known")
+        except OSError as error:
+            raise RuntimeError("Failed to load weights from all 2 source(s).") from error
+
+    monkeypatch.setattr(cls, "from_pretrained", offline)
+    with pytest.raises(ConnectionError) as told:
+        presets.build("features", name)
+    file, publisher = {
+        "disk": ("depth-save.pth", "github.com/cvlab-epfl/disk"),
+        "aliked": ("aliked-n16.pth", "github.com/Shiaoming/ALIKED"),
+    }[name]
+    for word in ("Name or service not known", publisher, f"copy its {file} to {torch_home / 'checkpoints' / file}"):
+        assert word in str(told.value)

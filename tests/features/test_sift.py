@@ -1,12 +1,16 @@
+"""SIFT, ASIFT, patches and SIFT of patches."""
+
 import cv2
 import kornia
 import numpy as np
 import pytest
 import torch
 
-from fmtorch.features import FRAME_SIGMAS, SIFT, keypoints_to_lafs, root_sift
+from fmtorch import features
+from fmtorch.features import project
 from tests.conftest import oracle
-from tests.features.scenes import texture
+from tests.features.scenes import random_frames, same, texture
+from tests.reference.local_features import patch, sift
 
 
 @pytest.mark.parametrize("number", ["000", "001"])
@@ -14,7 +18,7 @@ from tests.features.scenes import texture
 def test_equals_stored_keypoints(number: str, case: str) -> None:
     file = oracle("sift.npz")
     options = {"default": (8000, 0.04), "n1000_ct02": (1000, 0.02)}[case]
-    found = SIFT(*options, precise_upscale=False)(file[f"{number}.image"])
+    found = features.SIFT(*options, precise_upscale=False)(file[f"{number}.image"])
     expected = {name: file[f"{number}.{case}.{name}"] for name in ("xy", "size", "angle", "response", "desc")}
     np.testing.assert_array_equal(found.keypoints, expected["xy"])
     np.testing.assert_array_equal(found.scores, expected["response"])
@@ -26,24 +30,17 @@ def test_equals_stored_keypoints(number: str, case: str) -> None:
     assert found.image_size.tolist() == [512, 768]
     # Frames through kornia's own readers; angles in degrees carry a float32 rounding of about 2e-5.
     scale = kornia.feature.get_laf_scale(found.lafs[None])[0, :, 0, 0]
-    np.testing.assert_allclose(scale, FRAME_SIGMAS * expected["size"] / 2, rtol=1e-6)
+    np.testing.assert_allclose(scale, features.FRAME_SIGMAS * expected["size"] / 2, rtol=1e-6)
     angle = kornia.feature.get_laf_orientation(found.lafs[None])[0, :, 0]
     difference = (angle.numpy() + expected["angle"] + 180) % 360 - 180
     assert np.abs(difference).max() < 1e-3
-
-
-def test_frame_axis_points_along_opencvs_angle() -> None:
-    laf = keypoints_to_lafs([cv2.KeyPoint(10.0, 20.0, 4.0, 90.0)])[0]  # 90 degrees in OpenCV: down the image
-    torch.testing.assert_close(laf[:, 0], torch.tensor([0.0, 12.0]), atol=1e-5, rtol=0)
-    torch.testing.assert_close(laf[:, 1], torch.tensor([-12.0, 0.0]), atol=1e-5, rtol=0)
-    assert laf[:, 2].tolist() == [10.0, 20.0]
 
 
 def test_frames_turn_with_the_image() -> None:
     # Turning an image by 90 degrees maps (x, y) to (y, w - 1 - x); frames must follow. OpenCV rounds the upright
     # direction into 36 bins, which 90 degrees respects; the blurred pyramid is symmetric up to float rounding.
     image = texture(3)
-    upright, turned = SIFT()(image), SIFT()(np.rot90(image))
+    upright, turned = features.SIFT()(image), features.SIFT()(np.rot90(image))
     matrix, shift = torch.tensor([[0.0, 1.0], [-1.0, 0.0]]), torch.tensor([0.0, image.shape[1] - 1.0])
     expected = matrix @ upright.lafs
     expected[..., 2] += shift
@@ -52,7 +49,169 @@ def test_frames_turn_with_the_image() -> None:
 
 
 def test_root_sift_compares_by_hellinger() -> None:
-    plain, root = SIFT()(texture(1)), SIFT(root=True)(texture(1))
+    plain, root = features.SIFT()(texture(1)), features.SIFT(root=True)(texture(1))
     torch.testing.assert_close(root.descriptors.square() * plain.descriptors.sum(-1, keepdim=True), plain.descriptors)
     torch.testing.assert_close(root.descriptors.norm(dim=-1), torch.ones(len(root)))
-    assert not root_sift(torch.zeros(1, 128)).any()
+    assert not features.root_sift(torch.zeros(1, 128)).any()
+
+
+def test_views_are_the_published_ones() -> None:
+    # Morel and Yu: tilts sqrt(2)^k, longitudes 72 / t apart below 180 degrees.
+    views = features.simulated_views(6)
+    tilts = [t for t, _ in views]
+    counts = [tilts.count(t) for t in sorted(set(tilts))]
+    assert (counts, views[0]) == ([1, 4, 5, 8, 10, 15], (1.0, 0.0))
+    assert max(angle for _, angle in views) < 180
+    with pytest.raises(ValueError, match="at least one"):
+        features.simulated_views(0)
+
+
+@pytest.mark.parametrize(("tilt", "angle"), [(2**0.5, 0.0), (2.0, 36.0), (4.0, 126.0)])
+def test_a_view_shows_the_image_where_its_map_says(tilt: float, angle: float) -> None:
+    # A slow wave loses nothing by blur and interpolation, so the view must show it at the mapped places.
+    y, x = np.mgrid[0:120, 0:160]
+    wave = 128 + 60 * np.sin(x / 15) + 60 * np.cos(y / 18)
+    view, to_view = features.simulate_view(wave.round().astype(np.uint8), tilt, angle)
+    points = np.random.default_rng(0).uniform((30, 30), (129, 89), (500, 2))
+    u, v = (to_view[:, :2] @ points.T + to_view[:, 2:]).astype(np.float32)
+    found = cv2.remap(view.astype(np.float32), u[:, None], v[:, None], cv2.INTER_LINEAR)[:, 0]
+    expected = 128 + 60 * np.sin(points[:, 0] / 15) + 60 * np.cos(points[:, 1] / 18)
+    # Roundings to 8 bits, 3 * 0.5; interpolation and the blur of sigma 0.8 sqrt(t^2 - 1) <= 3.1 px lose less than
+    # 60 (1 - exp(-3.1^2 / (2 * 15^2))) = 1.3 of each amplitude; linear interpolation over t <= 4 px 60 (4 / 15)^2 / 8.
+    assert np.abs(found - expected).max() < 1.5 + 2.6 + 0.6 * 2
+    corners = to_view[:, :2] @ np.array([[0, 159, 0, 159], [0, 0, 119, 119]]) + to_view[:, 2:]
+    assert corners.min() > -1e-9
+    assert (corners.max(1) <= np.array(view.shape[::-1]) - 1 + 1).all()
+
+
+def test_one_tilt_is_sift() -> None:
+    image = texture(0)
+    assert same(features.ASIFT(tilts=1, max_features=8000)(image), features.SIFT()(image))
+
+
+def test_frames_carry_the_view() -> None:
+    image = texture(1)
+    found = features.ASIFT(tilts=3)(image)
+    assert len(found) > 2 * len(features.SIFT()(image))
+    singular = torch.linalg.svdvals(found.lafs[..., :2].double())
+    elongation = singular[:, 0] / singular[:, 1]
+    nearest = torch.stack([(elongation - t).abs() for t in (1, 2**0.5, 2)]).amin(0)
+    assert nearest.max() < 1e-3  # float32 entries
+    for t in (2**0.5, 2):  # what the view reduced along its x was longer in the image
+        assert ((elongation - t).abs() < 1e-3).sum() > 20
+    centres = found.keypoints
+    assert (centres >= 0).all()
+    assert (centres <= torch.tensor([199.0, 159.0])).all()
+
+
+def error(found: torch.Tensor, expected: np.ndarray) -> float:
+    """Root mean square difference in grey levels."""
+    return float(255 * np.sqrt(np.mean((found.numpy() - expected) ** 2)))
+
+
+@pytest.mark.parametrize("side", [8.0, 15.0, 24.0, 45.0, 90.0, 160.0])
+def test_sees_what_a_camera_would(side: float) -> None:
+    # Noise with detail down to a camera's blur: what is not averaged away is aliased.
+    image = texture(0, 800, 800, sigma=0.8)
+    lafs = random_frames(1, 5, 40, 40, side, side * 1.2)
+    lafs[..., 2] += 380
+    expected = np.stack([patch(image / 255, laf.double().numpy(), dense=4) for laf in lafs])
+    ours = error(features.ImagePyramid(image).extract(lafs)[:, 0], expected)
+    tensor = torch.from_numpy(image)[None, None].float() / 255
+    plain = error(kornia.feature.extract_patches_simple(tensor, lafs[None])[0, :, 0], expected)
+    peer = error(kornia.feature.extract_patches_from_pyramid(tensor, lafs[None])[0, :, 0], expected)
+    print(f"side {side}: ours {ours:.2f}, kornia's pyramid {peer:.2f}, no pyramid {plain:.2f} grey levels")
+    assert ours < 1.05 * peer
+    if side > 40:
+        assert ours < 0.3 * plain
+
+
+def test_small_frames_are_kornias_patches() -> None:
+    # Where pixels of the patch are denser than the image's, both interpolate the image itself.
+    image, lafs = texture(0), random_frames(0, 30, 160, 200, 3, 14)
+    lafs = torch.cat([lafs[..., :2] * 0.8, lafs[..., 2:]], -1)
+    tensor = torch.from_numpy(image)[None, None].float() / 255
+    expected = kornia.feature.extract_patches_simple(tensor, lafs[None])[0]
+    torch.testing.assert_close(features.ImagePyramid(image).extract(lafs), expected, atol=2e-4, rtol=0)
+
+
+def test_neighbours_are_invisible() -> None:
+    image, lafs = texture(4), random_frames(4, 40, 160, 200)
+    lafs[7] = torch.nan
+    lafs[9, 0, 0] = torch.inf
+    together = features.ImagePyramid(image).extract(lafs)
+    assert torch.isfinite(together).all()
+    assert not together[[7, 9]].any()
+    for i in (0, 8, 39):
+        assert torch.equal(features.ImagePyramid(image).extract(lafs[i : i + 1])[0], together[i])
+    assert features.ImagePyramid(image).extract(lafs[:0]).shape == (0, 1, 32, 32)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 90), (70, 1), (5, 7), (31, 33)])
+def test_small_images_continue_at_their_border(shape: tuple[int, int]) -> None:
+    flat = np.full(shape, 51, np.uint8)
+    lafs = features.upright_frames(torch.tensor([[0.0, 0.0], [3.0, 2.0]]), torch.tensor([1.0, 40.0]))
+    patches = features.ImagePyramid(flat).extract(lafs)
+    torch.testing.assert_close(patches, torch.full((2, 1, 32, 32), 0.2))
+
+
+def test_equals_the_definition() -> None:
+    patches = features.ImagePyramid(texture(0)).extract(random_frames(0, 20, 160, 200))
+    expected = np.stack([sift(p[0].double().numpy()) for p in patches])
+    np.testing.assert_allclose(features.sift_of_patches(patches), expected, atol=2e-5)
+
+
+def test_domain_sizes_are_averaged() -> None:
+    pyramid, lafs = features.ImagePyramid(texture(1)), random_frames(1, 30, 160, 200)
+    pooled = features.PatchSIFT(smallest=0.5, largest=2.0, sizes=4)(pyramid, lafs)
+    single = []
+    for size in (0.5, 1.0, 1.5, 2.0):
+        scaled = lafs.clone()
+        scaled[..., :2] *= size
+        single.append(features.PatchSIFT()(pyramid, scaled))
+    mean = torch.stack(single).mean(0)
+    torch.testing.assert_close(pooled, mean / mean.norm(dim=1, keepdim=True))
+    root = features.PatchSIFT(root=True)(pyramid, lafs)
+    torch.testing.assert_close(root, features.root_sift(features.PatchSIFT()(pyramid, lafs)))
+
+
+def test_unaffected_by_light_and_neighbours() -> None:
+    patches = features.ImagePyramid(texture(3)).extract(random_frames(3, 150, 160, 200))
+    together = features.sift_of_patches(patches)
+    torch.testing.assert_close(features.sift_of_patches(0.3 * patches + 0.2), together, atol=1e-4, rtol=0)
+    torch.testing.assert_close(features.sift_of_patches(patches[70:71]), together[70:71], atol=1e-5, rtol=0)
+    flat = features.sift_of_patches(torch.full((2, 1, 32, 32), 0.5))
+    assert not flat.any()
+    assert features.sift_of_patches(patches[:0]).shape == (0, 128)
+
+
+def test_projection_keeps_the_variance() -> None:
+    generator = torch.Generator().manual_seed(0)
+    x = torch.randn(3000, 128, generator=generator) * torch.linspace(2, 0.01, 128) + 1
+    mean, basis = features.learn_projection(x, 20)
+    torch.testing.assert_close(mean, x.mean(0), atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(basis.T @ basis, torch.eye(20), atol=1e-5, rtol=0)
+    variance = ((x - mean) @ basis).var(0)
+    assert (variance.diff() < 0).all()
+    singular = torch.linalg.svdvals(x - x.mean(0))[:20].square() / (len(x) - 1)
+    torch.testing.assert_close(variance, singular, rtol=1e-3, atol=0)
+    projected = project(x, mean, basis, 0.5)
+    torch.testing.assert_close(projected.norm(dim=1), torch.ones(len(x)))
+    plain = (x - mean) @ basis
+    assert torch.equal(projected.sign(), plain.sign())
+    torch.testing.assert_close(projected[0].square() / projected[0, 0] ** 2, plain[0].abs() / plain[0, 0].abs())
+
+
+def test_a_projection_that_is_absent_or_broken(tmp_path: object) -> None:
+    from pathlib import Path
+
+    folder = Path(str(tmp_path))
+    pyramid, lafs = features.ImagePyramid(texture(5)), random_frames(5, 2, 160, 200)
+    with pytest.raises(FileNotFoundError, match=r"absent\.npz.*make_models"):
+        features.RootSIFTPCA(model=folder / "absent.npz")(pyramid, lafs)
+    (folder / "text.npz").write_text("no projection")
+    np.savez(folder / "shape.npz", mean=np.zeros(5), basis=np.zeros((128, 80)))
+    np.savez(folder / "names.npz", average=np.zeros(128))
+    for name in ("text", "shape", "names"):
+        with pytest.raises(ValueError, match=rf"{name}\.npz.*make_models"):
+            features.RootSIFTPCA(model=folder / f"{name}.npz")(pyramid, lafs)

@@ -96,18 +96,6 @@ GENERATOR = torch.Generator().manual_seed(0)
 PIXELS = torch.rand(3, 50, 4, generator=GENERATOR, dtype=torch.float64) * torch.tensor([[[900.0]], [[30.0]], [[4e5]]])
 
 
-def test_points_reach_from_about_minus_one_to_one_in_units_of_a_power_of_two() -> None:
-    frame = PixelFrame.around(PIXELS, torch.ones(3, 50, dtype=torch.bool))
-    x = frame.normalized(PIXELS)
-    largest = x.abs().amax((1, 2))
-    assert bool((largest <= 1).all() & (largest > 0.5).all())
-    assert bool((x.amax(1) + x.amin(1)).abs().max() < 1e-12)  # centred in each image
-    mantissa, _ = torch.frexp(frame.pixels_per_unit)
-    assert bool((mantissa == 0.5).all())
-    back = frame.centre[:, None] + frame.pixels_per_unit[:, None, None] * x
-    torch.testing.assert_close(back, PIXELS, rtol=0, atol=4e5 * 2**-52)
-
-
 def test_matrices_follow_the_points() -> None:
     frame = PixelFrame.around(PIXELS, torch.ones(3, 50, dtype=torch.bool))
     F = torch.randn(3, 2, 3, 3, generator=GENERATOR, dtype=torch.float64)

@@ -1,10 +1,12 @@
+"""The eight-point algorithm and its steps: normalisation, rank 2."""
+
 import cv2
 import numpy as np
 import pytest
 import torch
 from kornia.geometry.epipolar import find_fundamental
 
-from fmtorch.geometry import canonical, eight_point
+from fmtorch import geometry
 from tests.conftest import oracle
 from tests.geometry.scenes import scene, scenes
 from tests.reference import solvers as reference
@@ -14,10 +16,10 @@ def test_opencv_and_kornia_oracle():
     data = oracle("epipolar_8pt.npz")
     for i in range(len(data["names"])):
         case = {k: torch.from_numpy(data[f"{i:03d}.{k}"]) for k in ("X1", "X2", "weights")}
-        theirs = {k: canonical(torch.from_numpy(data[f"{i:03d}.{k}"]))
+        theirs = {k: geometry.canonical(torch.from_numpy(data[f"{i:03d}.{k}"]))
                   for k in ("F_opencv", "F_kornia", "F_kornia_weighted")}  # fmt: skip
-        F, valid = eight_point(case["X1"], case["X2"])
-        weighted, _ = eight_point(case["X1"], case["X2"], case["weights"])
+        F, valid = geometry.eight_point(case["X1"], case["X2"])
+        weighted, _ = geometry.eight_point(case["X1"], case["X2"], case["weights"])
         assert valid
         # OpenCV and kornia agree to 3.1e-10 among themselves (n9 of the last pair, the least determined).
         assert (F - theirs["F_opencv"]).norm() < 4e-10
@@ -30,8 +32,8 @@ def test_opencv_and_kornia_oracle():
 def test_reference_opencv_and_kornia_live(batch, n):
     x0, x1, _ = (a.float().double() for a in scenes(batch, n, noise=0.5))  # OpenCV rounds points to float32
     w = torch.rand(*batch, n, dtype=torch.float64) + 0.1
-    F, valid = eight_point(x0, x1)
-    W, _ = eight_point(x0, x1, w)
+    F, valid = geometry.eight_point(x0, x1)
+    W, _ = geometry.eight_point(x0, x1, w)
     assert valid.all()
     for i in np.ndindex(batch):
         a, b = x0[i].numpy(), x1[i].numpy()
@@ -46,7 +48,7 @@ def test_reference_opencv_and_kornia_live(batch, n):
             s = np.linalg.svd(A if weights is None else np.sqrt(weights)[:, None] * A)[1]
             gap = (s[7] ** 2 - (s[8] ** 2 if n > 8 else 0)) / s[0] ** 2
             U0, U1 = (torch.linalg.inv(torch.from_numpy(T)) for T in (T0, T1))
-            error = canonical(U1.mT @ solution @ U0) - canonical(U1.mT @ expected @ U0)
+            error = geometry.canonical(U1.mT @ solution @ U0) - geometry.canonical(U1.mT @ expected @ U0)
             assert error.norm() < n * torch.finfo(torch.float64).eps / gap
 
 
@@ -54,7 +56,7 @@ def test_rectified_pair_known_by_heart():
     x0 = torch.tensor([[0.0, 0], [1, 0], [0, 1], [1, 1], [2, 1], [1, 3], [4, 2], [3, 5], [0, 4]], dtype=torch.float64)
     disparity = torch.tensor([1.0, 2, 3, 5, 7, 11, 13, 4, 9], dtype=torch.float64)
     x1 = x0 - torch.stack([disparity, torch.zeros_like(disparity)], 1)
-    F, valid = eight_point(x0, x1)
+    F, valid = geometry.eight_point(x0, x1)
     expected = torch.tensor([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64) / 2**0.5
     assert valid
     assert torch.minimum((F - expected).norm(), (F + expected).norm()) < 1e-12
@@ -65,14 +67,14 @@ def test_weight_zero_is_masked_and_masked_is_absent():
     mask = torch.ones(3, 40, dtype=torch.bool)
     mask[:, 30:] = False
     garbage = [torch.where(mask[..., None], x, torch.tensor([torch.nan, 1e30], dtype=x.dtype)) for x in (x0, x1)]
-    F, valid = eight_point(*garbage, mask=mask)
-    assert torch.equal(F, eight_point(x0, x1, weight=mask.double())[0])
-    assert torch.equal(F, eight_point(x0[:, :30], x1[:, :30])[0])
+    F, valid = geometry.eight_point(*garbage, mask=mask)
+    assert torch.equal(F, geometry.eight_point(x0, x1, weight=mask.double())[0])
+    assert torch.equal(F, geometry.eight_point(x0[:, :30], x1[:, :30])[0])
     padded = [torch.cat([x, x.new_full((3, 700, 2), torch.nan)], 1) for x in garbage]
     padded_mask = torch.cat([mask, torch.zeros(3, 700, dtype=torch.bool)], 1)
-    assert torch.equal(F, eight_point(*padded, mask=padded_mask)[0])
+    assert torch.equal(F, geometry.eight_point(*padded, mask=padded_mask)[0])
     weight = torch.where(padded_mask, 0.5, torch.nan).double()
-    assert torch.equal(F, eight_point(*padded, weight=weight, mask=padded_mask)[0])
+    assert torch.equal(F, geometry.eight_point(*padded, weight=weight, mask=padded_mask)[0])
     assert valid.all()
 
 
@@ -98,17 +100,17 @@ def degenerate(n, dtype=torch.float64):
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_degenerate_sets_are_invalid_and_alone(n, dtype):
     x0, x1 = degenerate(n, dtype)
-    F, valid = eight_point(x0, x1)
+    F, valid = geometry.eight_point(x0, x1)
     assert valid.tolist() == [True] * 2 + [False] * 10
     assert not F[2:].any()
-    assert torch.equal(F[:2], eight_point(x0[:2], x1[:2])[0])
+    assert torch.equal(F[:2], geometry.eight_point(x0[:2], x1[:2])[0])
 
 
 def test_bad_weights():
     x0, x1, _ = scenes((4,), 20)
     w = torch.ones(4, 20, dtype=torch.float64)
     w[0, 3], w[1, 3], w[2] = -1.0, torch.nan, 0.0
-    assert eight_point(x0, x1, w)[1].tolist() == [False, False, False, True]
+    assert geometry.eight_point(x0, x1, w)[1].tolist() == [False, False, False, True]
 
 
 def test_gradient():
@@ -119,7 +121,7 @@ def test_gradient():
     w[-1] = 1.5  # the largest stays the largest
 
     def invariant(a, b, w):
-        F, _ = eight_point(a, b, w)
+        F, _ = geometry.eight_point(a, b, w)
         return F @ F.mT
 
     assert torch.autograd.gradcheck(lambda a, b: invariant(a, b, w), (x0, x1))
@@ -136,3 +138,124 @@ def test_gradient():
     moved[3] = step
     difference = (invariant(x0.detach(), x1.detach(), moved)[0, 0] - loss.detach()) / step
     torch.testing.assert_close(gradient[3], difference, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("batch", [(), (3,), (2, 3)])
+def test_hartley_equals_the_definition(batch):
+    x, _, _ = scenes(batch, 20)
+    w = torch.rand(*batch, 20, dtype=torch.float64)
+    for weight in (None, w):
+        y, T = geometry.normalize_points(x, weight=weight)
+        for i in np.ndindex(batch):
+            expected = reference.hartley(x[i].numpy(), None if weight is None else w[i].numpy())
+            np.testing.assert_allclose(T[i], expected, rtol=1e-13, atol=1e-13)
+            np.testing.assert_allclose(y[i], (reference.homogeneous(x[i].numpy()) @ expected.T)[:, :2], atol=1e-13)
+
+
+def test_common_scale_is_one_scale():
+    s = scene(30)
+    x1 = 3 * s.x1
+    y0, y1, T0, T1 = geometry.normalize_pair(s.x0, x1)
+    assert torch.equal(T0[0, 0], T1[1, 1])
+    assert y0.mean(0).abs().max() < 1e-14
+    assert y1.mean(0).abs().max() < 1e-14
+    assert ((y0.norm(dim=-1).mean() + y1.norm(dim=-1).mean()) / 2 - 2**0.5).abs() < 1e-14
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_coincident_and_absent_points_keep_their_scale(dtype):
+    same = torch.full((9, 2), 123.4, dtype=dtype, requires_grad=True)
+    y, T = geometry.normalize_points(same)
+    assert T[0, 0] == 1
+    y.square().sum().backward()
+    assert same.grad.isfinite().all()
+    y, T = geometry.normalize_points(same, torch.zeros(9, dtype=torch.bool))
+    assert torch.equal(T, torch.eye(3, dtype=dtype))
+    assert not y.any()
+
+
+def test_denormalised_f_vanishes_where_the_normalised_one_does():
+    s = scene(20)
+    (_, T0), (_, T1) = geometry.normalize_points(s.x0), geometry.normalize_points(s.x1)
+    Fn = torch.linalg.inv(T1).mT @ s.F @ torch.linalg.inv(T0)
+    torch.testing.assert_close(
+        geometry.canonical(geometry.denormalize_fundamental(Fn, T0, T1)), geometry.canonical(s.F)
+    )
+
+
+def test_canonical():
+    F = torch.randn(6, 3, 3, dtype=torch.float64)
+    U = geometry.canonical(F)
+    torch.testing.assert_close(U, torch.stack([torch.from_numpy(reference.unit(f.numpy())) for f in F]))
+    torch.testing.assert_close(geometry.canonical(-1e-200 * F), U)
+    zero = torch.zeros(3, 3, requires_grad=True)
+    geometry.canonical(zero).sum().backward()
+    assert not geometry.canonical(zero).any()
+    assert zero.grad.isfinite().all()
+
+
+def test_gradients_of_normalisation():
+    s = scene(9)
+    x0, x1 = (s.x0 / 500).requires_grad_(), (s.x1 / 500).requires_grad_()
+    w = torch.rand(9, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda x, w: geometry.normalize_points(x, weight=w), (x0, w))
+    assert torch.autograd.gradcheck(lambda a, b: geometry.normalize_pair(a, b), (x0, x1))
+    assert torch.autograd.gradcheck(
+        geometry.canonical, (torch.randn(2, 3, 3, dtype=torch.float64, requires_grad=True),)
+    )
+
+
+EPS = torch.finfo(torch.float64).eps
+
+
+def random_matrices(batch, singular_values=None, seed=0):
+    F = torch.randn(*batch, 3, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    if singular_values is None:
+        return F
+    U, _, Vt = torch.linalg.svd(F)
+    return U @ torch.diag(torch.tensor(singular_values, dtype=torch.float64)) @ Vt
+
+
+@pytest.mark.parametrize("batch", [(), (3,), (2, 3), (500,)])
+def test_equals_the_svd(batch):
+    F = random_matrices(batch)
+    P = geometry.nearest_rank2(F)
+    for i in np.ndindex(batch):
+        S = np.linalg.svd(F[i].numpy())[1]
+        # The last singular vector of a matrix known to eps |F| is known to eps |F| / gap.
+        np.testing.assert_allclose(P[i], reference.rank2(F[i].numpy()), atol=32 * EPS * S[0] ** 2 / (S[1] - S[2]))
+
+
+@pytest.mark.parametrize(
+    "s",
+    [(1, 1, 1), (1, 0.5, 0.5), (1, 1, 0.5), (1, 0.5, 0.5 - 1e-9), (1, 1e-3, 1e-6), (1, 1e-6, 1e-9), (1, 1e-10, 1e-12),
+     (1, 1e-14, 0), (1, 1e-15, 1e-15), (1, 0, 0), (0, 0, 0), (1e-200, 1e-201, 1e-202), (1e100, 1e99, 1e98)],
+)  # fmt: skip
+def test_nearest_even_where_the_singular_vector_is_not_unique(s):
+    F = random_matrices((200,), s)
+    P = geometry.nearest_rank2(F)
+    distance = torch.linalg.matrix_norm((P - F) / max(s[0], 1e-300)) * max(s[0], 1e-300)
+    # Between singular values closer than sqrt(eps) the vector may lie anywhere: no farther than the second one.
+    second = s[1] if abs(s[1] - s[2]) < EPS**0.5 * s[1] else s[2]
+    assert (distance <= second + 16 * EPS * s[0]).all()
+    assert (torch.linalg.svdvals(P)[:, 2] <= 16 * EPS * s[0]).all()
+
+
+def test_float32_is_the_rounded_float64():
+    F = random_matrices((50,)).float()
+    assert torch.equal(geometry.nearest_rank2(F), geometry.nearest_rank2(F.double()).float())
+
+
+def test_gradient_of_rank2():
+    assert torch.autograd.gradcheck(geometry.nearest_rank2, (random_matrices((2, 3)).requires_grad_(),))
+
+
+@pytest.mark.parametrize("s", [(1, 1, 1), (1, 0.5, 0.5), (1, 0.5, 0.5 - 1e-9), (1, 0, 0), (0, 0, 0)])
+def test_gradient_stays_bounded(s):
+    F = random_matrices((50,), s).requires_grad_()
+    target = random_matrices((50,), seed=1)
+    (geometry.nearest_rank2(F) * target).sum().backward()
+    # |d(F v v^T)| <= |dF| + 2 s3 |dv|;
+    # |dv| <= 2 s1 |dF| max gap / (gap^2 + eps^2) = s1 |dF| / eps; eps = 1e-6 s1^2.
+    assert F.grad.isfinite().all()
+    assert F.grad.norm(dim=(1, 2)).max() <= (1 + 2e6) * target.norm(dim=(1, 2)).max()

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from fmtorch import geometry
 from tests.conftest import oracle
-from tests.reference import epipolar as reference
+from tests.reference import solvers as reference
 
 DISTANCES = ["symmetric_mean", "symmetric_max", "symmetric_squared", "sampson", "sampson_squared"]
 

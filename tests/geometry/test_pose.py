@@ -1,10 +1,14 @@
+"""Poses from fundamental matrices and from homographies: OpenCV, known cameras, degenerate input, gradients."""
+
 import cv2
 import numpy as np
 import pytest
 import torch
 from kornia.geometry.epipolar import motion_from_essential_choose_solution
+from scipy.spatial.transform import Rotation
+from torch import Tensor
 
-from fmtorch.geometry import pose_from_fundamental
+from fmtorch.geometry import homography_points, pose_from_fundamental, poses_from_homography, rotation_from_homography
 from fmtorch.geometry.pose import pose
 from tests.geometry.scenes import scene
 from tests.reference import known_cameras, solvers
@@ -19,9 +23,9 @@ def stack(batch, n=20, noise=0.0):
 @pytest.mark.parametrize("batch", [(), (3,), (2, 3)])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_exact_pose(batch, dtype):
-    x0, x1, F, K0, K1, R, t = stack(batch)
+    x0, x1, F, CAMERA0, CAMERA1, R, t = stack(batch)
     sign = torch.where(torch.rand(*batch, 1, 1) < 0.5, 1, -1)
-    pose = pose_from_fundamental(*(a.to(dtype) for a in (sign * F, K0, K1, x0, x1)))
+    pose = pose_from_fundamental(*(a.to(dtype) for a in (sign * F, CAMERA0, CAMERA1, x0, x1)))
     # F in pixels has entries from 1e-6 to 1: rounding it moves E by eps times 1000, the focal length.
     tolerance = 1e4 * torch.finfo(dtype).eps
     torch.testing.assert_close(pose.R, R.to(dtype), rtol=0, atol=tolerance)
@@ -52,15 +56,15 @@ def test_brute_force_opencv_and_kornia():
 
 
 def test_bad_input_is_invalid_and_alone():
-    x0, x1, F, K0, K1, R, _ = stack((7,))
+    x0, x1, F, CAMERA0, CAMERA1, R, _ = stack((7,))
     F[0] = 0
     F[1, 0, 0] = torch.nan
-    K0[2] = 0
-    K1[3, 0, 0] = torch.inf
+    CAMERA0[2] = 0
+    CAMERA1[3, 0, 0] = torch.inf
     F[4] = torch.outer(F[4, 0], F[4, 1])  # rank one
     mask = torch.ones(7, 20, dtype=torch.bool)
     mask[5] = False
-    pose = pose_from_fundamental(F, K0, K1, x0, x1, mask)
+    pose = pose_from_fundamental(F, CAMERA0, CAMERA1, x0, x1, mask)
     assert pose.valid.tolist() == [False] * 6 + [True]
     assert torch.equal(pose.R[:6], torch.eye(3, dtype=torch.float64).expand(6, 3, 3))
     assert not pose.t[:6].any()
@@ -72,17 +76,19 @@ def test_gradient():
     pixels = torch.diag(torch.tensor([500.0, 500, 1], dtype=torch.float64))
     F = pixels @ s.F @ pixels
     scale = torch.tensor([500.0, 500.0], dtype=torch.float64)
-    K0, K1 = (torch.diag(torch.tensor([1 / 500, 1 / 500, 1.0], dtype=torch.float64)) @ K for K in (s.K0, s.K1))
+    CAMERA0, CAMERA1 = (
+        torch.diag(torch.tensor([1 / 500, 1 / 500, 1.0], dtype=torch.float64)) @ K for K in (s.K0, s.K1)
+    )
     F = (F / F.norm()).requires_grad_()
 
-    def pose(F, K0, K1):
-        return pose_from_fundamental(F, K0, K1, s.x0 / scale, s.x1 / scale)[:2]
+    def pose(F, CAMERA0, CAMERA1):
+        return pose_from_fundamental(F, CAMERA0, CAMERA1, s.x0 / scale, s.x1 / scale)[:2]
 
-    assert torch.autograd.gradcheck(pose, (F, K0.requires_grad_(), K1.requires_grad_()))
+    assert torch.autograd.gradcheck(pose, (F, CAMERA0.requires_grad_(), CAMERA1.requires_grad_()))
 
 
 CAMERAS = np.array([650.0, 319.5, 239.5, 820, 300.5, 249.5])
-K0, K1 = (np.array([[f, 0, x], [0, f, y], [0, 0, 1]]) for f, x, y in (CAMERAS[:3], CAMERAS[3:]))
+CAMERA0, CAMERA1 = (np.array([[f, 0, x], [0, f, y], [0, 0, 1]]) for f, x, y in (CAMERAS[:3], CAMERAS[3:]))
 
 
 def pose_of(F: np.ndarray, s: known_cameras.Scene, weight: np.ndarray) -> np.ndarray:
@@ -94,18 +100,20 @@ def pose_of(F: np.ndarray, s: known_cameras.Scene, weight: np.ndarray) -> np.nda
 @pytest.mark.parametrize("noise", [0.0, 1.0])
 def test_it_is_that_of_all_decompositions(noise: float) -> None:
     for seed in range(10):
-        s = known_cameras.scene(seed, 40, noise, outliers=0.2, cameras=(K0, K1))
+        s = known_cameras.scene(seed, 40, noise, outliers=0.2, cameras=(CAMERA0, CAMERA1))
         rng = np.random.default_rng(seed)
-        F = known_cameras.fundamental(s.R, s.t, (K0, K1)) * rng.choice([-2, 3]) + 1e-7 * noise * rng.normal(size=(3, 3))
+        F = known_cameras.fundamental(s.R, s.t, (CAMERA0, CAMERA1)) * rng.choice([-2, 3]) + 1e-7 * noise * rng.normal(
+            size=(3, 3)
+        )
         weight = rng.uniform(0, 1, 40) * s.right
         out = pose_of(F, s, weight)
-        tensors = [torch.from_numpy(value)[None] for value in (F, K0, K1, s.x0, s.x1)]
+        tensors = [torch.from_numpy(value)[None] for value in (F, CAMERA0, CAMERA1, s.x0, s.x1)]
         graphed = pose_from_fundamental(*tensors, torch.ones(1, 40, dtype=torch.bool), torch.from_numpy(weight)[None])
         assert bool(graphed.valid)
         assert out[12] == 1
         np.testing.assert_allclose(out[:9].reshape(3, 3), graphed.R[0], atol=1e-9)
         np.testing.assert_allclose(out[9:12], graphed.t[0], atol=1e-9)
-        R, t, _ = solvers.pose(F, K0, K1, s.x0[s.right], s.x1[s.right])
+        R, t, _ = solvers.pose(F, CAMERA0, CAMERA1, s.x0[s.right], s.x1[s.right])
         np.testing.assert_allclose(out[:9].reshape(3, 3), R, atol=1e-6)
         np.testing.assert_allclose(out[9:12], t, atol=1e-6)
         if not noise:
@@ -114,15 +122,15 @@ def test_it_is_that_of_all_decompositions(noise: float) -> None:
 
 def test_weights_decide_on_which_side_points_lie() -> None:
     """In both forms: three heavy matches of the true motion against seven light ones of its mirror image."""
-    s = known_cameras.scene(1, 10, outliers=0.0, cameras=(K0, K1))
-    F = known_cameras.fundamental(s.R, s.t, (K0, K1))
-    mirrored = known_cameras.scene(1, 10, outliers=0.0, cameras=(K0, K1))
+    s = known_cameras.scene(1, 10, outliers=0.0, cameras=(CAMERA0, CAMERA1))
+    F = known_cameras.fundamental(s.R, s.t, (CAMERA0, CAMERA1))
+    mirrored = known_cameras.scene(1, 10, outliers=0.0, cameras=(CAMERA0, CAMERA1))
     e0, e1 = np.linalg.svd(F)[2][2], np.linalg.svd(F.T)[2][2]
     for x, e in ((mirrored.x0, e0[:2] / e0[2]), (mirrored.x1, e1[:2] / e1[2])):
         x[:7] = 2 * e - x[:7]  # on the other side of the epipole, on the same lines
     weight = np.r_[np.full(7, 0.1), np.full(3, 1.0)]
     heavy, light = pose_of(F, mirrored, weight), pose_of(F, mirrored, np.ones(10))
-    tensors = [torch.from_numpy(value)[None] for value in (F, K0, K1, mirrored.x0, mirrored.x1)]
+    tensors = [torch.from_numpy(value)[None] for value in (F, CAMERA0, CAMERA1, mirrored.x0, mirrored.x1)]
     mask = torch.ones(1, 10, dtype=torch.bool)
     for out, each in ((heavy, torch.from_numpy(weight)[None]), (light, None)):
         graphed = pose_from_fundamental(*tensors, mask, each)
@@ -134,7 +142,121 @@ def test_weights_decide_on_which_side_points_lie() -> None:
 
 @pytest.mark.parametrize("kind", ["zero", "NaN", "rank 1", "no matches"])
 def test_where_there_is_none_all_is_zero(kind: str) -> None:
-    s = known_cameras.scene(0, 10, cameras=(K0, K1))
-    F = known_cameras.fundamental(s.R, s.t, (K0, K1))
+    s = known_cameras.scene(0, 10, cameras=(CAMERA0, CAMERA1))
+    F = known_cameras.fundamental(s.R, s.t, (CAMERA0, CAMERA1))
     F = {"zero": 0 * F, "NaN": np.nan * F, "rank 1": np.outer(F[0], F[1]), "no matches": F}[kind]
     assert not pose_of(F, s, np.full(10, 0.0 if kind == "no matches" else 1.0)).any()
+
+
+K0 = np.array([[900.0, 0, 500], [0, 920, 400], [0, 0, 1]])
+K1 = np.array([[1100.0, 0, 520], [0, 1080, 380], [0, 0, 1]])
+
+
+def plane(seed: int, n: int = 30, parallel: bool = False, length: float = 0.4) -> tuple[np.ndarray, ...]:
+    """R, t, normal, the homography, and points (n, 2) of a plane that both cameras see; its distance is 1."""
+    rng = np.random.default_rng(seed)
+    R = Rotation.from_rotvec(rng.normal(size=3) * 0.2).as_matrix()
+    normal = np.array([*rng.normal(size=2) * 0.4, 1.0])
+    normal /= np.linalg.norm(normal)
+    t = R @ normal if parallel else rng.normal(size=3)
+    t *= length * (rng.choice([-1, 1]) if parallel else 1) / np.linalg.norm(t)
+    H = K1 @ (R + np.outer(t, normal)) @ np.linalg.inv(K0)
+    x0 = rng.uniform([300, 250], [700, 550], (n, 2))
+    return R, t, normal, H, x0
+
+
+def tensors(*arrays: np.ndarray) -> list[Tensor]:
+    return [torch.from_numpy(np.ascontiguousarray(a)) for a in arrays]
+
+
+def pairs(batch: tuple[int, ...], **options: object) -> list[Tensor]:
+    """R, t, normal, H, K0, K1, x0, x1 of many planes."""
+    many = [plane(i, **options) for i in range(int(np.prod(batch, dtype=int)))]  # type: ignore[arg-type]
+    R, t, n, H, x0 = (torch.from_numpy(np.stack(a)).reshape(*batch, *a[0].shape) for a in zip(*many, strict=True))
+    x1 = homography_points(H, x0)
+    return [R, t, n, H, *(torch.from_numpy(K).expand(*batch, 3, 3) for K in (K0, K1)), x0, x1]
+
+
+@pytest.mark.parametrize("batch", [(), (20,), (2, 3)])
+@pytest.mark.parametrize("sign", [1.0, -1e-3])
+def test_one_of_two_poses_is_the_true_one(batch: tuple[int, ...], sign: float) -> None:
+    R, t, n, H, k0, k1, x0, x1 = pairs(batch)
+    poses = poses_from_homography(sign * H, k0, k1, x0, x1)
+    assert bool(poses.valid.any(-1).all())
+    error = (poses.R - R[..., None, :, :]).abs().amax((-2, -1)) + (poses.t - t[..., None, :]).abs().amax(-1)
+    error = error + (poses.normal - n[..., None, :]).abs().amax(-1)
+    assert bool((error.amin(-1) < 1e-8).all())
+    rebuilt = poses.R + poses.t[..., :, None] * poses.normal[..., None, :]
+    true = (R + t[..., :, None] * n[..., None, :])[..., None, :, :]
+    assert bool(((rebuilt - true).abs().amax((-2, -1)) < 1e-9)[poses.valid].all())
+    torch.testing.assert_close(poses.R @ poses.R.mT, torch.eye(3).double().expand_as(poses.R), rtol=0, atol=1e-14)
+    assert bool((poses.in_front[..., 0] >= poses.in_front[..., 1]).all())
+    assert bool((poses.in_front[..., 0] == 1).all())
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_opencv(seed: int) -> None:
+    """The valid poses are among the four of OpenCV, and those that it finds possible are valid."""
+    _, _, _, H, x0 = plane(seed, length=0.1 + 0.05 * seed)
+    x1 = homography_points(*tensors(H, x0)).numpy()
+    G = np.linalg.inv(K1) @ H @ K0
+    _, rotations, translations, normals = cv2.decomposeHomographyMat(G, np.eye(3))
+    rays = [
+        (np.c_[x, np.ones(len(x))] @ np.linalg.inv(K).T)[:, None, :2].astype(np.float32)
+        for x, K in ((x0, K0), (x1, K1))
+    ]
+    possible = cv2.filterHomographyDecompByVisibleRefpoints(rotations, normals, *rays)
+    poses = poses_from_homography(*tensors(H, K0, K1, x0, x1))
+    computed = [
+        np.concatenate([R.ravel(), t, n])
+        for R, t, n, valid in zip(
+            poses.R.numpy(), poses.t.numpy(), poses.normal.numpy(), poses.in_front == 1, strict=True
+        )
+        if valid
+    ]
+    expected = [
+        np.concatenate([rotations[i].ravel(), translations[i][:, 0], normals[i][:, 0]]) for i in possible.ravel()
+    ]
+    assert len(computed) == len(expected)
+    for solution in expected:
+        assert min(np.abs(solution - ours).max() for ours in computed) < 1e-6
+
+
+def test_motion_along_the_normal_and_rotations() -> None:
+    R, t, _, H, k0, k1, x0, x1 = pairs((20,), parallel=True)
+    poses = poses_from_homography(H, k0, k1, x0, x1)
+    # The two normals meet: S is of rank one, and its minors, of which the roots are taken, are 1e-15 times some tens.
+    assert bool(((poses.R - R[:, None]).abs().amax((-2, -1)) < 1e-4).all())
+    assert bool(((poses.t - t[:, None]).abs().amax(-1) < 1e-4).all())
+    H = torch.from_numpy(K1) @ R @ torch.from_numpy(np.linalg.inv(K0))
+    turned = poses_from_homography(H, k0, k1, x0, homography_points(H, x0))
+    assert bool(turned.valid.all())
+    assert bool((turned.t.abs() < 1e-9).all())
+    for sign in (1, -3.0):
+        rotation, valid = rotation_from_homography(sign * H, k0, k1)
+        assert bool(valid.all())
+        torch.testing.assert_close(rotation, R, rtol=0, atol=1e-9)
+    torch.testing.assert_close(turned.R[:, 0], R, rtol=0, atol=1e-9)
+
+
+def test_the_nearest_rotation() -> None:
+    """Of a matrix that is none: by singular values."""
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        G = Rotation.random(random_state=rng).as_matrix() + 0.2 * rng.normal(size=(3, 3))
+        U, _, Vt = np.linalg.svd(G)
+        expected = U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt
+        rotation, valid = rotation_from_homography(torch.from_numpy(G), torch.eye(3).double(), torch.eye(3).double())
+        assert bool(valid)
+        np.testing.assert_allclose(rotation.numpy(), expected, atol=1e-7)
+
+
+def test_models_and_cameras_that_are_none_are_not_valid() -> None:
+    _, _, _, H, k0, k1, x0, x1 = pairs((6,))
+    mask = torch.ones(6, 30, dtype=torch.bool)
+    H, k0 = H.clone(), k0.clone()
+    H[0], H[1, 0, 0], H[2], k0[3], mask[4] = 0, torch.nan, torch.outer(H[2, 0], H[2, 1]), 0, False
+    poses = poses_from_homography(H, k0, k1, x0, x1, mask)
+    assert poses.valid.any(-1).tolist() == [False] * 5 + [True]
+    assert torch.equal(poses.R[:5], torch.eye(3).double().expand(5, 2, 3, 3))
+    assert rotation_from_homography(H, k0, k1)[1].tolist() == [False] * 4 + [True] * 2

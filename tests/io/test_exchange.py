@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 import fmtorch
-from fmtorch.features.sift import keypoints_to_lafs
+from fmtorch.features import keypoints_to_lafs
 from fmtorch.geometry import sampson
 from tests.laws import scene
 

@@ -1,8 +1,13 @@
 """Export: pycolmap reads the database, verifies the same matches and finds the cameras; hloc's files come back."""
 
+import csv
 import dataclasses
+import itertools
+import json
+import math
 import sqlite3
 import sys
+import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +18,9 @@ import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 
-from fmtorch.io import DATABASE, MatchStore, StoredImage, StoredPair, export_kinds, indices, write_exports
-from fmtorch.io.colmap import ORIGIN, write_database
+from fmtorch import io
+from fmtorch.evaluation import MAX_THUMBNAILS, view_graph_svg
+from fmtorch.io import ORIGIN, write_database
 from fmtorch.pipeline import FolderMatches, chosen_pairs, images_below, load_pipeline
 from tests.conftest import shared_path
 
@@ -37,7 +43,7 @@ class Circle:
             lonely = rng.uniform(0, 800, (i, 2))  # so that the same point has another index in each image
             points = np.concatenate([lonely, x]).astype(np.float32)
             scores = np.ones(len(points), np.float32)
-            self.images.append(StoredImage(f"{i}.png", points, scores, SIZE, K if known else None))
+            self.images.append(io.StoredImage(f"{i}.png", points, scores, SIZE, K if known else None))
         for i in range(IMAGES):
             for j in range(i + 1, IMAGES):
                 partner = np.arange(POINTS)
@@ -45,7 +51,7 @@ class Circle:
                 right = partner == np.arange(POINTS)
                 matches = np.stack([np.arange(POINTS) + i, partner + j], 1).astype(np.int32)
                 scores = rng.uniform(0.1, 1, POINTS).astype(np.float32)
-                self.pairs.append(StoredPair(f"{i}.png", f"{j}.png", matches, scores, right, self.F(i, j)))
+                self.pairs.append(io.StoredPair(f"{i}.png", f"{j}.png", matches, scores, right, self.F(i, j)))
 
     def F(self, i: int, j: int) -> np.ndarray:
         R = self.R[j] @ self.R[i].T
@@ -99,8 +105,8 @@ def verified(database: Path) -> dict[int, Any]:
 @pytest.mark.parametrize("known", [True, False])
 def test_pycolmap_reads_verifies_and_reconstructs(known: bool, tmp_path: Path) -> None:
     circle = Circle(known)
-    write_database(tmp_path / DATABASE, circle.images, circle.pairs, shared_camera=True)
-    with pycolmap.Database.open(tmp_path / DATABASE) as file:
+    write_database(tmp_path / io.DATABASE, circle.images, circle.pairs, shared_camera=True)
+    with pycolmap.Database.open(tmp_path / io.DATABASE) as file:
         assert (file.num_images(), file.num_cameras(), file.num_rigs(), file.num_frames()) == (IMAGES, 1, 1, IMAGES)
         image = file.read_image_with_name("3.png")
         np.testing.assert_array_equal(file.read_keypoints(image.image_id)[:, :2], circle.images[3].points + 0.5)
@@ -117,8 +123,8 @@ def test_pycolmap_reads_verifies_and_reconstructs(known: bool, tmp_path: Path) -
     distance = np.abs((ends[1] * lines).sum(1)) / np.linalg.norm(lines[:, :2], axis=1)
     assert distance.max() < 5 * 0.3 * np.sqrt(2)  # five standard deviations of the noise of both ends
     # The same matches by COLMAP's own RANSAC, whose threshold is 4 px: all of ours, and of the wrong ones few.
-    model = mapped(tmp_path / DATABASE, tmp_path, ba_refine_focal_length=not known)
-    ours, theirs = geometries(tmp_path / DATABASE), verified(tmp_path / DATABASE)
+    model = mapped(tmp_path / io.DATABASE, tmp_path, ba_refine_focal_length=not known)
+    ours, theirs = geometries(tmp_path / io.DATABASE), verified(tmp_path / io.DATABASE)
     assert ours.keys() == theirs.keys()
     for key, geometry in ours.items():
         a, b = (set(map(tuple, g.inlier_matches.tolist())) for g in (geometry, theirs[key]))
@@ -134,13 +140,13 @@ def test_pycolmap_reads_verifies_and_reconstructs(known: bool, tmp_path: Path) -
 
 
 def test_matches_that_share_a_keypoint_are_sorted_out_for_tracks(tmp_path: Path) -> None:
-    image = [StoredImage(f"{i}.png", np.eye(4, 2, dtype=np.float32), np.ones(4, np.float32), SIZE) for i in (0, 1)]
+    image = [io.StoredImage(f"{i}.png", np.eye(4, 2, dtype=np.float32), np.ones(4, np.float32), SIZE) for i in (0, 1)]
     matches = np.array([[0, 0], [0, 1], [1, 1], [2, 2]], np.int32)
     scores = np.array([0.2, 0.9, 0.5, 0.5], np.float32)
     inliers = np.array([True, False, False, True])
-    pair = StoredPair("0.png", "1.png", matches, scores, inliers, np.eye(3))
-    write_database(tmp_path / DATABASE, image, [pair])
-    with pycolmap.Database.open(tmp_path / DATABASE) as file:
+    pair = io.StoredPair("0.png", "1.png", matches, scores, inliers, np.eye(3))
+    write_database(tmp_path / io.DATABASE, image, [pair])
+    with pycolmap.Database.open(tmp_path / io.DATABASE) as file:
         assert sorted(file.read_matches(1, 2).tolist()) == [[0, 0], [1, 1], [2, 2]]  # an inlier before a better score
         assert file.read_two_view_geometry(1, 2).inlier_matches.tolist() == [[0, 0], [2, 2]]
 
@@ -148,28 +154,27 @@ def test_matches_that_share_a_keypoint_are_sorted_out_for_tracks(tmp_path: Path)
 def test_pairs_of_different_scenes_are_not_verified(tmp_path: Path) -> None:
     circle = Circle()
     chance = dataclasses.replace(circle.pairs[0], related=False)
-    write_database(tmp_path / DATABASE, circle.images, [chance])
-    with pycolmap.Database.open(tmp_path / DATABASE) as file:
-        assert file.num_matched_image_pairs() == 1
-        assert file.num_verified_image_pairs() == 0
+    write_database(tmp_path / io.DATABASE, circle.images, [chance])
+    with pycolmap.Database.open(tmp_path / io.DATABASE) as file:
+        assert (file.num_matched_image_pairs(), file.num_verified_image_pairs()) == (1, 0)
 
 
 def test_keypoints_are_found_again() -> None:
     points = np.array([[1, 2], [3, 4], [1, 2], [5, 6]], np.float32)
-    assert indices(points, points[[3, 2, 0]]).tolist() == [3, 0, 0]  # of several at one place the first
-    assert indices(points, points[:0]).shape == (0,)
+    assert io.indices(points, points[[3, 2, 0]]).tolist() == [3, 0, 0]  # of several at one place the first
+    assert io.indices(points, points[:0]).shape == (0,)
     with pytest.raises(ValueError, match=r"the match at \(1.5, 2.0\) is at no keypoint"):
-        indices(points, np.array([[1.5, 2.0]], np.float32))
+        io.indices(points, np.array([[1.5, 2.0]], np.float32))
     with pytest.raises(ValueError, match=r"the match at \(1.0, 2.0\) is at no keypoint"):
-        indices(points[:0], points[:1])
+        io.indices(points[:0], points[:1])
 
 
-def journal(folder: Path, circle: Circle) -> tuple[MatchStore, list[tuple[Path, Path]]]:
+def journal(folder: Path, circle: Circle) -> tuple[io.MatchStore, list[tuple[Path, Path]]]:
     (folder / "images").mkdir(parents=True)
     paths = [folder / "images" / image.name for image in circle.images]
     for i, path in enumerate(paths):
         cv2.imwrite(str(path), np.full((8, 10), i, np.uint8))
-    kept = MatchStore(folder / "export", folder / "images")
+    kept = io.MatchStore(folder / "export", folder / "images")
     for path, image in zip(paths, circle.images, strict=True):
         kept.add_image(path, image)
     ends = []
@@ -199,7 +204,11 @@ def test_what_a_journal_keeps_comes_back_and_is_of_the_image_it_was_made_of(tmp_
 def test_hloc_files(tmp_path: Path) -> None:
     circle = Circle()
     kept, ends = journal(tmp_path, circle)
-    assert write_exports(kept, ends, export_kinds("h5,colmap"), tmp_path) == ["features.h5", "matches.h5", DATABASE]
+    assert io.write_exports(kept, ends, io.export_kinds("h5,colmap"), tmp_path) == [
+        "features.h5",
+        "matches.h5",
+        io.DATABASE,
+    ]
     pair = circle.pairs[4]
     with h5py.File(tmp_path / "features.h5") as features, h5py.File(tmp_path / "matches.h5") as matches:
         assert features["0.png/keypoints"].dtype == np.float32
@@ -213,23 +222,22 @@ def test_hloc_files(tmp_path: Path) -> None:
         np.testing.assert_array_equal(group["matching_scores0"][:][first], pair.scores)
         np.testing.assert_array_equal(group["inliers0"][:][first], pair.inliers)
         np.testing.assert_array_equal(group.attrs["F"], pair.F)
-    with sqlite3.connect(tmp_path / DATABASE) as file:
+    with sqlite3.connect(tmp_path / io.DATABASE) as file:
         assert file.execute("SELECT COUNT(*) FROM two_view_geometries").fetchone() == (len(circle.pairs),)
 
 
 def test_kinds() -> None:
-    assert export_kinds(None) == ()
-    assert export_kinds("colmap, h5") == ("colmap", "h5")
-    assert export_kinds(["h5"]) == ("h5",)
+    assert (io.export_kinds(None), io.export_kinds("colmap, h5")) == ((), ("colmap", "h5"))
+    assert io.export_kinds(["h5"]) == ("h5",)
     with pytest.raises(ValueError, match=r"export=h5,bundler: 'bundler' is none of h5, colmap"):
-        export_kinds("h5,bundler")
+        io.export_kinds("h5,bundler")
 
 
 @pytest.mark.parametrize(("library", "kind"), [("h5py", "h5"), ("pycolmap", "colmap")])
 def test_says_which_extra_is_missing(library: str, kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, library, None)
     with pytest.raises(ImportError, match=rf"pip install 'fmtorch\[{kind}\]'"):
-        export_kinds(kind)
+        io.export_kinds(kind)
 
 
 def test_a_real_scene_is_reconstructed(tmp_path: Path) -> None:
@@ -241,13 +249,13 @@ def test_a_real_scene_is_reconstructed(tmp_path: Path) -> None:
         (images / path.name).symlink_to(path)
     options = ["features.max_features=2500", "estimator=lmeds", "estimator.hypotheses=300"]
     pipeline = load_pipeline("sift_ratio", overrides=options)
-    kept = MatchStore(tmp_path / "export", images)
+    kept = io.MatchStore(tmp_path / "export", images)
     pairs = chosen_pairs(images, images_below(images), None)
     work = FolderMatches(pipeline, kept, 1600, True, 0)
     assert len(list(work.each(pairs))) == len(pairs)
     assert not work.troubles
-    write_exports(kept, pairs, ("colmap",), tmp_path, shared_camera=True)
-    model = mapped(tmp_path / DATABASE, tmp_path)
+    io.write_exports(kept, pairs, ("colmap",), tmp_path, shared_camera=True)
+    model = mapped(tmp_path / io.DATABASE, tmp_path)
     cameras = np.loadtxt(source / "Camera.txt")
     names = [f"{i:08d}.jpg" for i in range(len(cameras))]
     R, t = cameras[:, 9:18].reshape(-1, 3, 3), cameras[:, 18:]
@@ -257,3 +265,64 @@ def test_a_real_scene_is_reconstructed(tmp_path: Path) -> None:
     assert camera.focal_length == pytest.approx((cameras[0, 0] + cameras[0, 4]) / 2, rel=0.02)
     assert shift < 0.01
     assert turn < 1.5  # the principal point, which stays in the middle, is off by 10 px of 1380
+
+
+SVG = "{http://www.w3.org/2000/svg}"
+
+
+def edge(image0: str, image1: str, inliers: int = 50, related: bool = True) -> io.Edge:
+    return io.Edge(image0, image1, 2 * inliers, inliers, 3.5 if related else None, related, "")
+
+
+def test_of_a_journal(tmp_path: Path) -> None:
+    images = [tmp_path / name for name in ("a.png", "b.png", "c.png")]
+    for image in images:
+        image.write_text(image.name)
+    journal = io.MatchStore(tmp_path / "export", tmp_path)
+    matches, scores, inliers = np.zeros((3, 2), np.int32), np.ones(3, np.float32), np.array([True, True, False])
+    verdict = {"significance": 12.5, "pair_type": "planar"}
+    given = io.StoredPair("a.png", "b.png", matches, scores, inliers, np.eye(3), **verdict)
+    journal.add_pair(*images[:2], given)
+    journal.add_pair(images[0], images[2], io.StoredPair(
+        "a.png", "c.png", matches, scores, ~inliers, np.zeros((3, 3)), False, significance=-math.inf))  # fmt: skip
+    pairs = [(images[0], images[1]), (images[0], images[2]), (images[1], images[2])]
+    graph = io.view_graph(journal, images, pairs)
+    assert graph.images == ("a.png", "b.png", "c.png")
+    assert graph.edges == (
+        io.Edge("a.png", "b.png", 3, 2, 12.5, True, "planar"), io.Edge("a.png", "c.png", 3, 1, None, False, ""),
+    )  # fmt: skip
+    assert io.write_view_graph(graph, tmp_path) == ["graph.json", "graph.csv"]
+    content = json.loads((tmp_path / "graph.json").read_text())
+    assert content["components"] == [["a.png", "b.png"], ["c.png"]]
+    assert content["pairs"][0]["pair_type"] == "planar"
+    with (tmp_path / "graph.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["image1"], row["inliers"], row["significance"]) for row in rows] == [
+        ("b.png", "2", "12.5"), ("c.png", "1", ""),
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("count", [1, 3, MAX_THUMBNAILS + 1, 200])
+def test_a_picture_of_any_number_of_images(count: int) -> None:
+    names = tuple(f"folder/<{i}>&.jpg" for i in range(count))
+    edges = tuple(edge(a, b, inliers=10 * i + 1) for i, (a, b) in enumerate(itertools.pairwise(names)))
+    unrelated = (edge(names[0], names[-1], related=False),)
+    asked = []
+
+    def read(name: str) -> np.ndarray | None:
+        asked.append(name)
+        return np.full((30, 40, 3) if len(asked) % 2 else (40, 30), 90, np.uint8) if len(asked) != 2 else None
+
+    root = ElementTree.fromstring(view_graph_svg(io.ViewGraph(names, edges + unrelated), read))
+    lines = root.findall(f"{SVG}line")
+    assert len(lines) == count - 1
+    widths = [float(line.get("stroke-width", "nan")) for line in lines]
+    assert widths == sorted(widths)
+    shown = count if count <= MAX_THUMBNAILS else 0
+    assert len(asked) == shown
+    assert len(root.findall(f"{SVG}g/{SVG}image")) == max(shown - (shown > 1), 0)
+    titles = [title.text for title in root.iter(f"{SVG}title")]
+    assert all(name in titles for name in names)
+    for node in root.findall(f"{SVG}circle"):
+        assert 0 < float(node.get("cx", "nan")) < 900
+        assert 0 < float(node.get("cy", "nan")) < 900

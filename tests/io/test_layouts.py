@@ -184,9 +184,7 @@ DAMAGE: list[tuple[str, str, str, Callable[[np.ndarray], Any] | None, str]] = [
 
 
 @pytest.mark.parametrize(("layout", "name", "key", "change", "said"), DAMAGE)
-def test_a_damaged_entry_is_named_and_harms_no_other(
-    layout: str, name: str, key: str, change: Callable[[np.ndarray], Any] | None, said: str, tmp_path: Path
-) -> None:
+def test_a_damaged_entry_is_named_and_harms_no_other(layout, name, key, change, said, tmp_path):
     root = writers.WRITERS[layout](tmp_path / layout)
     edit(root, name, key, change)
     first, second, third = outcomes(reload(layout, root))
@@ -213,9 +211,7 @@ def test_a_truncated_file_is_named(layout: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("missing", ["zero", "negative", "absent"])
-def test_a_camera_without_a_size_has_that_of_its_image_or_of_principal_point_and_points(
-    missing: str, tmp_path: Path
-) -> None:
+def test_a_camera_without_a_size_has_that_of_its_image_or_of_principal_point_and_points(missing, tmp_path):
     root = writers.write_posebench(tmp_path / "posebench")
     change = {"zero": lambda v: 0 * v, "negative": lambda v: 0 * v - 1, "absent": None}[missing]
     for camera in ("camera1", "camera2"):
@@ -283,8 +279,7 @@ def test_the_name_of_the_folder_decides_nothing(layout: str, tmp_path: Path) -> 
         roots = [root / "church" for root in roots]
         roots[1] = roots[1].rename(tmp_path / "chapel")
     keys = [[pair.key for pair in reload(layout, root)] for root in roots]
-    assert len(set(keys[0])) == writers.PAIRS
-    assert keys[0] == keys[1]
+    assert (len(set(keys[0])), keys[0]) == (writers.PAIRS, keys[1])
 
 
 def test_a_report_finds_it(tmp_path: Path) -> None:

@@ -136,23 +136,18 @@ def test_what_does_not_fit_the_signature_is_refused(module: types.ModuleType) ->
     assert len(module.scaled_squares.compiled().signatures) == 1
 
 
-def test_what_was_compiled_is_kept_and_told_once(
-    tmp_path: Path, cache: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_was_compiled_is_kept_and_told_once(tmp_path, cache, capsys):
     assert result(load(tmp_path)) == EXPECTED
     messages = capsys.readouterr().err
     assert [line.split(" for ")[0] for line in messages.splitlines()] == ["compiling rows and what else is missing"]
     files = {path: path.stat().st_ino for path in cache.rglob("*.bin")}
-    assert len(files) == 2
-    assert result(load(tmp_path)) == EXPECTED
+    assert (len(files), result(load(tmp_path))) == (2, EXPECTED)
     assert capsys.readouterr().err == ""
     assert {path: path.stat().st_ino for path in cache.rglob("*.bin")} == files
 
 
 @pytest.mark.parametrize("importable", [True, False])
-def test_two_processes_compile_together(
-    module: types.ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cache: Path, importable: bool
-) -> None:
+def test_two_processes_compile_together(module, tmp_path, monkeypatch, cache, importable):
     """What the other process cannot compile is compiled here."""
     monkeypatch.setenv("PYTHONPATH", str(tmp_path) if importable else "")
     monkeypatch.setattr(together, "cores", lambda: 2)
@@ -160,8 +155,7 @@ def test_two_processes_compile_together(
     assert not any(each.ready or each.kept for each in both)
     together.compile_together(both)
     assert all(each.ready and each.kept for each in both)
-    assert len(list(cache.rglob("*.bin"))) == 2
-    assert result(module) == EXPECTED
+    assert (len(list(cache.rglob("*.bin"))), result(module)) == (2, EXPECTED)
     monkeypatch.setattr(together, "_helped", None)  # is not asked again
     together.compile_together(both)
 
@@ -232,9 +226,7 @@ def test_a_damaged_file_is_compiled_anew(tmp_path: Path, cache: Path) -> None:
     assert result(load(tmp_path)) == EXPECTED
 
 
-def test_without_a_writable_cache_kernels_are_compiled_and_say_so(
-    module: types.ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_without_a_writable_cache_kernels_are_compiled_and_say_so(module, tmp_path, monkeypatch, capsys):
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("FMTORCH_CACHE", str(tmp_path / "file"))
     with pytest.warns(UserWarning, match="compiled kernels are not kept"):
@@ -242,9 +234,7 @@ def test_without_a_writable_cache_kernels_are_compiled_and_say_so(
     assert "compiling rows and what else is missing for this process" in capsys.readouterr().err
 
 
-def test_a_cache_that_can_only_be_read_is_used(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_cache_that_can_only_be_read_is_used(tmp_path, monkeypatch, capsys):
     result(load(tmp_path))
     capsys.readouterr()
     files.folder.cache_clear()
@@ -257,13 +247,10 @@ def test_a_cache_that_can_only_be_read_is_used(
     assert files.folder() is not None
     monkeypatch.undo()
     monkeypatch.setenv("FMTORCH_CACHE", str(tmp_path / "cache"))
-    assert result(load(tmp_path)) == EXPECTED
-    assert capsys.readouterr().err == ""
+    assert (result(load(tmp_path)), capsys.readouterr().err) == (EXPECTED, "")
 
 
-def test_a_full_disk_costs_the_file_and_not_the_result(
-    module: types.ModuleType, cache: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_full_disk_costs_the_file_and_not_the_result(module, cache, monkeypatch):
     def refused(*args: object) -> int:
         raise OSError("no space left on device")
 
@@ -284,17 +271,14 @@ def test_folders_long_unused_are_removed(cache: Path) -> None:
     assert {path.name for path in cache.iterdir()} == {"recent", "of somebody else", now.name}
 
 
-def test_threads_compile_it_once_and_run_at_the_same_time(
-    module: types.ModuleType, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_threads_compile_it_once_and_run_at_the_same_time(module, capsys):
     results: list[list[list[float]]] = []
     threads = [threading.Thread(target=lambda: results.append(result(module))) for _ in range(4)]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    assert results == [EXPECTED] * 4
-    assert capsys.readouterr().err.count("compiling rows") == 1
+    assert (results, capsys.readouterr().err.count("compiling rows")) == ([EXPECTED] * 4, 1)
 
 
 @pytest.mark.parametrize("holds_gil", [False, True])
@@ -341,9 +325,7 @@ def test_numba_is_not_imported_before_a_kernel_is_called() -> None:
     subprocess.run([sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": str(REPOSITORY)}, check=True)
 
 
-def test_without_numba_a_warning_tells_it_once(
-    monkeypatch: pytest.MonkeyPatch, recwarn: pytest.WarningsRecorder
-) -> None:
+def test_without_numba_a_warning_tells_it_once(monkeypatch, recwarn):
     monkeypatch.setitem(sys.modules, "numba", None)
     switch.numba_version.cache_clear()
     try:

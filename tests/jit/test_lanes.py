@@ -91,8 +91,7 @@ def test_an_operator_leaves_other_names_of_a_value_as_they_were() -> None:
     total = start = fill(1.0)
     total += 1.0
     total *= 3.0
-    assert start.tolist() == [1.0] * LANES
-    assert total.tolist() == [6.0] * LANES
+    assert (start.tolist(), total.tolist()) == ([1.0] * LANES, [6.0] * LANES)
 
 
 @pytest.mark.filterwarnings("ignore:divide by zero|invalid value|overflow:RuntimeWarning")

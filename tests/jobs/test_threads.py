@@ -43,8 +43,7 @@ def test_pruners_and_estimators_of_a_pipeline_have_one_thread(threads: int, tmp_
     assert not built.run([image_pair])[0].reason
     assert seen == [1, 1, 1]
     assert fmtorch.match(read_image(image_pair.image0), read_image(image_pair.image1), pipeline=built).ok
-    assert seen[3:5] == [1, 1]
-    assert torch.get_num_threads() == threads
+    assert (seen[3:5], torch.get_num_threads()) == ([1, 1], threads)
 
 
 def test_an_error_leaves_threads_as_they_were(threads: int, monkeypatch: pytest.MonkeyPatch) -> None:

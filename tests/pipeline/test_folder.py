@@ -1,4 +1,7 @@
+"""Folders of photographs: what is matched, kept, resumed; images that are alike."""
+
 import itertools
+import json
 import os
 import signal
 import threading
@@ -13,10 +16,28 @@ import numpy as np
 import pytest
 import torch
 
-from fmtorch.data import ImageSource
+from fmtorch.core import Features
+from fmtorch.data import ImageSource, read_image
+from fmtorch.features.vlad import image_vector
 from fmtorch.io import MatchStore
 from fmtorch.jobs import DEATH, Execution, WorkerPool, WorkersLost
-from fmtorch.pipeline import FolderMatches, PhotographCameras, Pipeline, folder, folder_workers, load_pipeline
+from fmtorch.pipeline import (
+    Described,
+    FolderMatches,
+    PhotographCameras,
+    Pipeline,
+    chosen_pairs,
+    describe,
+    folder,
+    folder_workers,
+    images_below,
+    load_pipeline,
+    similar_pairs,
+    vectors_of,
+)
+from fmtorch.pipeline import folder as similar
+from fmtorch.pipeline.folder import default_output
+from tests.conftest import shared_path
 
 
 class Recorded(Executor):
@@ -73,9 +94,7 @@ def kept(output: Path) -> dict[str, dict[str, Any]]:
     return {path.name: dict(np.load(path)) for path in files}
 
 
-def test_any_number_of_workers_and_any_executor_keep_the_same(
-    pipeline: Pipeline, images: list[Path], tmp_path: Path
-) -> None:
+def test_any_number_of_workers_and_any_executor_keep_the_same(pipeline, images, tmp_path):
     pairs = list(itertools.combinations(images, 2))
     executor = Recorded()
     own = Execution(workers=1, make=lambda: executor)
@@ -110,9 +129,7 @@ def test_processes_keep_the_same(pipeline: Pipeline, images: list[Path], tmp_pat
             np.testing.assert_array_equal(stored[file][key], value)
 
 
-def test_no_image_is_described_twice(
-    pipeline: Pipeline, images: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_image_is_described_twice(pipeline, images, tmp_path, monkeypatch):
     described: list[str] = []
     lock, plain = threading.Lock(), folder.read_image
 
@@ -168,20 +185,15 @@ def fatal() -> Pipeline:
     return pipeline
 
 
-def test_an_image_that_ends_its_workers_is_told_and_the_others_are_matched(
-    pipeline: Pipeline, images: list[Path], tmp_path: Path
-) -> None:
+def test_an_image_that_ends_its_workers_is_told_and_the_others_are_matched(pipeline, images, tmp_path):
     assert cv2.imwrite(str(images[1]), np.zeros((240, 320), np.uint8))
     with folder_workers(pipeline, Execution("processes", 2)) as workers:
         matches = work(pipeline, images[:4], tmp_path / "out", workers=workers, build=fatal)
         assert len(list(matches.each(list(itertools.combinations(images[:4], 2))))) == 6
-    assert matches.done == 3
-    assert matches.troubles == [DEATH]
+    assert (matches.done, matches.troubles) == (3, [DEATH])
 
 
-def test_more_images_than_are_held_in_memory(
-    pipeline: Pipeline, images: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_more_images_than_are_held_in_memory(pipeline, images, tmp_path, monkeypatch):
     monkeypatch.setattr(folder, "MEMORY", 2)
     monkeypatch.setattr(folder, "AHEAD", 1)
     with WorkerPool(threads(2)) as workers:
@@ -200,3 +212,112 @@ def test_what_was_kept_before_an_end_is_taken(pipeline: Pipeline, images: list[P
     list(again.each(pairs))
     assert (again.taken, again.done) == (first.done, len(pairs) - first.done)
     assert again.related == len(pairs)
+
+
+def picture(path: Path) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    assert cv2.imwrite(str(path), np.zeros((4, 4), np.uint8))
+    return path
+
+
+def text(path: Path, value: str = "{}") -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(value)
+
+
+def test_nothing_that_fmtorch_has_written_is_a_photograph(tmp_path: Path) -> None:
+    photographs = [picture(tmp_path / name) for name in ("a.jpg", "b.png", "more/c.tif", "more/matches.png")]
+    for name in ("matches.png", "pruning.png", "epipolar.png"):
+        picture(tmp_path / "matches/a-b" / name)
+        picture(tmp_path / name)  # output=.
+    for place in ("matches/a-b", "."):
+        text(tmp_path / place / "result.json")
+    picture(tmp_path / "set/scene/Images/00000000.jpg")  # an undistorted copy
+    text(tmp_path / "set/pairs.json")
+    picture(tmp_path / ".thumbnails/a.jpg")
+    assert images_below(tmp_path) == sorted(photographs)
+    assert images_below(tmp_path / "matches/..") != []
+
+
+def test_a_set_of_pairs_may_be_asked_for(tmp_path: Path) -> None:
+    text(tmp_path / "pairs.json")
+    images = [picture(tmp_path / f"scene/Images/{i}.jpg") for i in range(2)]
+    assert images_below(tmp_path) == images
+
+
+def test_only_regular_files_are_images(tmp_path: Path) -> None:
+    images = [picture(tmp_path / "a.jpg"), picture(tmp_path / "b.jpg")]
+    os.mkfifo(tmp_path / "c.jpg")
+    (tmp_path / "d.jpg").symlink_to("/dev/zero")
+    assert images_below(tmp_path) == images
+
+
+def test_sequential_pairs_follow_the_natural_order_of_names(tmp_path: Path) -> None:
+    for i in (1, 2, 9, 10, 11):
+        picture(tmp_path / f"frame{i}.jpg")
+    images = images_below(tmp_path)
+    pairs = chosen_pairs(tmp_path, images, Path("sequential:2"))
+    numbers = [tuple(int(image.stem.removeprefix("frame")) for image in pair) for pair in pairs]
+    assert numbers == [(1, 2), (1, 9), (2, 9), (2, 10), (9, 10), (9, 11), (10, 11)]
+    assert len(chosen_pairs(tmp_path, images, Path("sequential:100"))) == 10
+
+
+@pytest.mark.parametrize("pairs", ["sequential", "sequential:0", "sequential:-1", "sequential:x", "sequential:1.5"])
+def test_a_wrong_number_of_neighbours_is_told(pairs: str, tmp_path: Path) -> None:
+    images = [picture(tmp_path / "a.jpg"), picture(tmp_path / "b.jpg")]
+    with pytest.raises(ValueError, match="it must be sequential:N with a whole number N of at least 1"):
+        chosen_pairs(tmp_path, images, Path(pairs))
+
+
+def test_folders_of_one_name_have_outputs_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert default_output(tmp_path / "x/photos") == Path("matches/photos")
+    text(tmp_path / "matches/photos/export.json", json.dumps({"images": str(tmp_path / "x/photos")}))
+    assert default_output(Path("x/photos")) == Path("matches/photos")
+    other = default_output(tmp_path / "y/photos")
+    assert other.name.startswith("photos-")
+    assert other != default_output(tmp_path / "z/photos")
+
+
+def paths(n: int) -> list[Path]:
+    return [Path(f"{i}.jpg") for i in range(n)]
+
+
+@pytest.mark.parametrize("rows", [1, 3, 1024])
+@pytest.mark.parametrize("count", [1, 2, 50])
+def test_each_image_with_its_most_similar_ones(count: int, rows: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(similar, "ROWS", rows)
+    generator = torch.Generator().manual_seed(0)
+    vectors = torch.nn.functional.normalize(torch.randn(9, 5, generator=generator).double(), dim=1)
+    vectors[4] = 0  # an image that could not be read
+    expected = set()
+    for i in range(9):
+        others = [j for j in range(9) if j not in (i, 4) and i != 4]
+        others.sort(key=lambda j: (-float(np.dot(vectors[i].numpy(), vectors[j].numpy())), j))
+        expected |= {(min(i, j), max(i, j)) for j in others[:count]}
+    images = paths(9)
+    assert similar_pairs(images, vectors, count) == [(images[i], images[j]) for i, j in sorted(expected)]
+
+
+def test_equally_similar_images_come_by_number() -> None:
+    assert similar_pairs(paths(4), torch.ones(4, 1), 1) == [(Path("0.jpg"), Path(f"{i}.jpg")) for i in (1, 2, 3)]
+
+
+def test_an_image_that_cannot_be_read_has_no_vector() -> None:
+    features = Features(torch.zeros(2, 2, 3), torch.zeros(2), torch.ones(2, 7), torch.tensor([4, 4]))
+    described = Described(features, torch.ones(2), (4, 4), 0.0)
+    vectors = vectors_of([None, described], lambda descriptors: descriptors[0])
+    assert vectors.tolist() == [[0.0] * 7, [1.0] * 7]
+    assert vectors_of([None], lambda descriptors: descriptors[0]).shape == (1, 1)
+
+
+def test_scenes_are_told_apart() -> None:
+    """Four images of each of three real scenes: none is most like an image of another scene."""
+    folders = [shared_path(f"data/{name}/Images") for name in ("Strecha/fountain-P11", "KITTI/00", "TUM/fr1_rpy")]
+    images = [path for folder in folders for path in sorted(folder.iterdir())[:4]]
+    sift = load_pipeline("sift_ratio", overrides=["features.max_features=1500"])
+    described = [describe(sift, read_image(image), 800) for image in images]
+    vectors = vectors_of(described, lambda descriptors: image_vector(descriptors, "sift"))
+    pairs = similar_pairs(images, vectors, 1)
+    assert len(pairs) >= 6
+    assert all(a.parent == b.parent for a, b in pairs)

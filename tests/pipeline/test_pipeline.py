@@ -1,20 +1,36 @@
-"""The four stages in a row: outcomes, failures as data, shared features, independence of batches."""
+"""Pipelines: stages in a row, pruners that look at images, pictures, failures of own parts."""
 
+from __future__ import annotations
+
+import collections
+import dataclasses
+import json
+import pickle
+import re
 import threading
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
+import PIL.Image
 import pytest
 import torch
 
-from fmtorch import presets
-from fmtorch.core import Correspondences, Estimate, Features
-from fmtorch.data import ImagePair, ImageSource
-from fmtorch.pipeline import Memo
-from tests.helpers import draw, pair
+import fmtorch
+from fmtorch import data, match, presets
+from fmtorch.core import Correspondences, Estimate, Features, ImagePruner, own_traceback, place_of
+from fmtorch.data import GivenMatches, ImagePair, ImageSource, read_image
+from fmtorch.geometry import sampson
+from fmtorch.io import MatchStore
+from fmtorch.pipeline import FolderMatches, Memo, Pipeline, load_pipeline, match_records
+from fmtorch.presets import build, instantiate
+from tests.conftest import shared_path
+from tests.helpers import draw, pair, small_pipeline
 from tests.helpers import small_pipeline as pipeline
+from tests.laws import scene
+from tests.processes import run_command
 
 
 @pytest.fixture
@@ -146,8 +162,298 @@ def test_memo_computes_once_among_threads_and_forgets_the_oldest() -> None:
     release.set()
     for thread in threads:
         thread.join()
-    assert results == [7, 7, 7]
-    assert len(calls) == 1
-    assert memo.get(1, lambda: 1) == 1
+    assert (results, len(calls), memo.get(1, lambda: 1)) == ([7, 7, 7], 1, 1)
     assert memo.get(2, lambda: 2) == 2
     assert memo.get(0, lambda: 8) == 8  # 0 was forgotten
+
+
+PRUNERS = "pruner=[ratio,one_to_one,frame_consistency,match_noise,refine_matches]"
+
+
+def built(cache: str = "off") -> Pipeline:
+    pipeline: Pipeline = load_pipeline(
+        "sift_fmtorch", overrides=[PRUNERS, f"cache={cache}", "features.max_features=1500"]
+    )
+    return pipeline
+
+
+@pytest.fixture
+def reads(monkeypatch: pytest.MonkeyPatch) -> collections.Counter[Any]:
+    """How often each file is read."""
+    counts: collections.Counter[Any] = collections.Counter()
+
+    def counted(source: Any) -> Any:
+        counts[source.path] += 1
+        return read_image(source)
+
+    monkeypatch.setattr("fmtorch.pipeline.pipeline.read_image", counted)
+    return counts
+
+
+def test_files_are_read_once_and_matches_are_refined(reads: collections.Counter[Any], tmp_path: Any) -> None:
+    """Also where features are in the cache, and where matches come with the pair."""
+    dataset = data.load("fmbench", root=shared_path("data/Strecha_train"))
+    pairs = [dataset[i] for i in range(4)]
+    for _ in range(2):  # the second run finds its features in the cache
+        reads.clear()
+        pipeline = built(str(tmp_path))
+        outcomes = pipeline.correspondences(pairs)
+        assert set(reads.values()) == {1}
+        assert all(outcome.images is None for outcome in outcomes)
+    plain = load_pipeline("sift_fmtorch", overrides=[f"cache={tmp_path}", "features.max_features=1500"])
+    before = plain.correspondences(pairs)
+    gains = []
+    for old, new in zip(before, outcomes, strict=True):
+        F = torch.from_numpy(new.pair.F)[None]
+        first, second = (
+            sampson(F, c.x0.double(), c.x1.double()).abs()[0] for c in (old.correspondences, new.correspondences)
+        )
+        right = first < 1
+        gains.append(float(second[right].median() / first[right].median()))
+    assert np.median(gains) < 0.85
+    c = before[0].correspondences
+    given = dataclasses.replace(pairs[0], matches=lambda: GivenMatches(c, (1500, 1500)))
+    reads.clear()
+    fresh = Pipeline(pipeline.extractor, pipeline.matcher, {"refine": refiner()}, pipeline.estimator)
+    refined = fresh.correspondences([given])[0].correspondences
+    expected = outcomes[0].correspondences
+    assert reads == {pairs[0].image0.path: 1, pairs[0].image1.path: 1}
+    assert bool((refined.x1 == expected.x1).all())
+
+
+def refiner() -> ImagePruner:
+    stage: ImagePruner = presets.build("pruner", "refine_matches")
+    return stage
+
+
+def test_two_photographs_are_refined_in_their_reduced_pixels() -> None:
+    rng = np.random.default_rng(0)
+    noise = rng.integers(0, 256, (60, 80)).astype(np.uint8).repeat(8, 0).repeat(8, 1)
+    image = np.ascontiguousarray(noise[:440, :600]), np.ascontiguousarray(noise[13:453, 21:621])
+    result = match(*image, pipeline=built(), longest_side=500)
+    assert "refine_matches" in result.counts
+    c = result.correspondences
+    motion = (c.x0 - c.x1)[0]
+    assert float((motion - torch.tensor([21.0, 13.0])).norm(dim=-1).median()) < 0.1
+
+
+def test_refined_matches_are_exported_as_matches_of_keypoints(tmp_path: Path) -> None:
+    """They are at no keypoint any more; those of a run and of a folder are the same as without refinement."""
+    dataset = data.load("fmbench", root=shared_path("data/Strecha_train"))
+    pair = dataset[0]
+    ends = pair.image0.path, pair.image1.path
+    journals = []
+    for i, overrides in enumerate(([PRUNERS], [])):
+        pipeline = load_pipeline("sift_fmtorch", overrides=[*overrides, "cache=off", "features.max_features=500"])
+        run, folder = (
+            MatchStore(tmp_path / f"run{i}", ends[0].parent),
+            MatchStore(tmp_path / f"folder{i}", ends[0].parent),
+        )
+        run.add(match_records(pipeline, pipeline.run([pair])))
+        for _ in FolderMatches(pipeline, folder, 4000, True, 0).each([ends]):
+            pass
+        journals += [run, folder]
+    matches = [journal.pair(*ends).matches for journal in journals]
+    assert len(matches[0]) > 50
+    assert all(np.array_equal(matches[0], other) for other in matches[1:])
+
+
+@pytest.fixture(scope="module")
+def result() -> fmtorch.MatchResult:
+    pair = data.load("stereo")[0]
+    images = [PIL.Image.fromarray(data.read_image(image)) for image in (pair.image0, pair.image1)]
+    return fmtorch.match(*images, pipeline="sift_fmtorch", longest_side=400)
+
+
+def test_a_result_is_one_line_and_a_picture_in_a_notebook(result: fmtorch.MatchResult) -> None:
+    assert repr(result).startswith(f"MatchResult({len(result.inliers)} matches, {int(result.inliers.sum())} inliers")
+    assert len(repr(result)) < 120
+    assert "data:image/jpeg;base64," in result._repr_html_()
+
+
+def test_a_result_draws_itself(result: fmtorch.MatchResult) -> None:
+    pictures = [result.draw(what) for what in ("matches", "pruning", "epipolar")]
+    assert all(picture.dtype == np.uint8 and picture.shape[2] == 3 for picture in pictures)
+    assert not np.array_equal(pictures[0], pictures[1])
+
+
+def test_a_result_is_saved_as_the_command_saves_it(result: fmtorch.MatchResult, tmp_path: Path) -> None:
+    names = result.save(tmp_path / "out", report={"note": "mine"})
+    assert sorted(names) == sorted(path.name for path in (tmp_path / "out").iterdir())
+    stored = json.loads((tmp_path / "out" / "result.json").read_text())
+    assert np.array_equal(stored["F"], result.F)
+    assert stored["note"] == "mine"
+    picture = cv2.imread(str(tmp_path / "out" / "matches.png"))
+    assert np.array_equal(picture[..., ::-1], result.draw())
+
+
+def test_pillow_images_are_arrays(result: fmtorch.MatchResult) -> None:
+    pair = data.load("stereo")[0]
+    again = fmtorch.match(
+        *(data.read_image(image) for image in (pair.image0, pair.image1)), pipeline="sift_fmtorch", longest_side=400
+    )
+    assert torch.equal(again.F, result.F)
+    with pytest.raises(ValueError, match="image0 is a Pillow image of mode F; it must be of 8 bits"):
+        fmtorch.match(PIL.Image.new("F", (9, 9)), PIL.Image.new("L", (9, 9)))
+
+
+def test_matches_and_epipolar_lines_are_drawn_of_what_find_fundamental_takes_and_gives(tmp_path: Path) -> None:
+    c = scene(0, 60)
+    path = tmp_path / "a.png"
+    PIL.Image.new("RGB", (960, 640)).save(path)
+    estimate = fmtorch.find_fundamental(c.x0, c.x1)
+    image = np.zeros((640, 960), np.uint8)
+    drawn = fmtorch.draw_matches(path, image, c.x0, c.x1, estimate.inliers)
+    assert np.array_equal(drawn, fmtorch.draw_matches(image, image, c.x0[0].numpy(), c.x1[0], estimate.inliers[0]))
+    lines = fmtorch.draw_epipolar_lines(path, image, c.x0[0], c.x1[0], estimate.F)
+    assert lines.any()
+    with pytest.raises(ValueError, match=r"x0 has shape \(3, 60\); it must be \(N, 2\)"):
+        fmtorch.draw_matches(image, image, np.zeros((3, 60)), c.x1[0])
+
+
+def test_estimates_are_one_line_and_a_table_of_pairs() -> None:
+    c = scene(0, 60)
+    estimate = fmtorch.find_fundamental([c.x0[0], c.x0[0, :5]], [c.x1[0], c.x1[0, :5]])
+    assert repr(estimate[0]).startswith(f"Estimate(fundamental, {int(estimate.inliers.sum())} inliers, significance")
+    assert repr(estimate[1]) == f"Estimate(no fundamental matrix: {estimate.reason[1]})"
+    assert repr(estimate).startswith("Estimate(2 pairs: 1 ok, 1 related, 0 to ")
+    assert estimate._repr_html_().count("<tr>") == 3
+    assert len(repr(c)) < 500
+
+
+def test_a_record_is_the_same_after_its_file(tmp_path: Path) -> None:
+    c = scene(0, 60)
+    K = torch.tensor([[800.0, 0, 480], [0, 800, 320], [0, 0, 1]])
+    estimate = fmtorch.find_essential(c.x0, c.x1, K, K, covariance=True, pair_type=True)
+    path = tmp_path / "estimate.safetensors"
+    estimate.save(path)
+    for kind in (fmtorch.Estimate, fmtorch.PoseEstimate):
+        again = kind.load(path)
+        assert again.reason == estimate.reason
+        for name, value in vars(estimate).items():
+            if torch.is_tensor(value):
+                torch.testing.assert_close(getattr(again, name), value, rtol=0, atol=0, equal_nan=True)
+    with pytest.raises(ValueError, match=r"holds PoseEstimate; Correspondences\.load reads Correspondences"):
+        fmtorch.Correspondences.load(path)
+
+
+def test_a_file_with_code_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "estimate.pt"
+    path.write_bytes(pickle.dumps(print))
+    with pytest.raises(ValueError, match=r"estimate\.pt is no file that save\(\) wrote"):
+        fmtorch.Estimate.load(path)
+
+
+PART = """
+class Part:
+    def __init__(self, broken: bool = False) -> None:
+        if broken:
+            raise KeyError("weights")
+
+    def __call__(self, *given, seed=0):
+        return helper(*given)
+
+
+def helper(*given):
+    return {}["missing"]
+"""
+
+
+def features(n: int = 9) -> Features:
+    lafs = torch.eye(2, 3).repeat(n, 1, 1) + torch.arange(n)[:, None, None]
+    return Features(lafs, torch.ones(n), torch.eye(n), torch.tensor([40, 60]))
+
+
+def matches(a: Features, b: Features) -> Correspondences:
+    return Correspondences(a.keypoints[None], b.keypoints[None], torch.ones(1, len(a), dtype=torch.bool))
+
+
+def estimate(c: Correspondences, seed: int = 0, slots: int | None = None) -> Estimate:
+    b, none = len(c), torch.zeros(len(c), dtype=torch.int64)
+    return Estimate(torch.eye(3).repeat(b, 1, 1), c.mask[:, :slots], none == 0, ("",) * b, none)
+
+
+def outcomes(tmp_path: Path, count: int = 2, **parts: object) -> tuple[Any, list[Any]]:
+    given: dict[str, object] = {"features": lambda image: features(), "matcher": matches, "pruners": {}}
+    pipeline = small_pipeline(**{**given, "estimator": estimate, **parts})
+    images = [draw(tmp_path / f"{i}.png", i) for i in range(2 * count)]
+    return pipeline, pipeline.run([pair(f"{i}", images[2 * i], images[2 * i + 1]) for i in range(count)])
+
+
+def no_keys(c: Correspondences) -> Correspondences:
+    return Correspondences(c.x0, c.x1, c.mask)
+
+
+@pytest.mark.parametrize(
+    ("stage", "part", "said"),
+    [
+        ("features", lambda image: None, r"^features: TypeError: .*<lambda> returned None; it must return Features$"),
+        ("matcher", lambda a, b: (a, b), "^matching: TypeError: .* returned a tuple; it must return Correspondences"),
+        ("matcher", lambda a, b: Correspondences(a.keypoints[None].half(), b.keypoints[None].half(),
+         torch.ones(1, 9, dtype=torch.bool)), "Correspondences of torch.float16; they must be of float32 or float64"),
+        ("matcher", lambda a, b: matches(a, b).to("meta"), "Correspondences on meta; they must be on cpu"),
+        ("pruners", {"own": lambda c: c.mask}, "^pruning: TypeError: .* returned a Tensor; it must return Correspond"),
+        ("pruners", {"own": no_keys}, r"no_keys returned matches without their pairs' keys; use c\.keep\(mask\)"),
+        ("pruners", {"own": lambda c: c[:0]}, "Correspondences of 0 pairs; they must be of 1"),
+        ("estimator", lambda c, seed: c.x0, "^estimation: TypeError: .* returned a Tensor; it must return Estimate"),
+        ("estimator", lambda c, seed: estimate(c, slots=5), r"inliers of shape \(1, 5\); .* of the mask, \(1, 9\)"),
+    ],
+)  # fmt: skip
+def test_what_a_stage_must_not_return_is_named(stage: str, part: object, said: str, tmp_path: Path) -> None:
+    _, done = outcomes(tmp_path, **{stage: part})
+    for outcome in done:
+        assert not outcome.solved
+        assert re.search(said, outcome.reason), outcome.reason
+
+
+def test_a_part_that_fails_on_batches_alone_is_noticed(tmp_path: Path) -> None:
+    pipeline, done = outcomes(tmp_path, estimator=lambda c, seed: estimate(c[0]))
+    assert not any(outcome.reason for outcome in done)
+    ((said, trace),) = pipeline.tracebacks.items()
+    assert said.startswith("of a batch of 2 pairs, though of each alone it does not: estimation: ValueError: ")
+    assert trace == ""  # it returned something wrong, and raised nothing
+
+
+def test_tracebacks_are_those_of_the_users_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "failing_part.py").write_text(PART)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    part = instantiate({"_target_": "failing_part.Part"}, "estimator")
+    pipeline, done = outcomes(tmp_path, estimator=part)
+    assert {outcome.reason for outcome in done} == {"estimation: KeyError: 'missing' (failing_part.py:12, in helper)"}
+    (trace,) = pipeline.tracebacks.values()
+    assert [line.strip() for line in trace.splitlines() if line.startswith("  File")] == [
+        f'File "{tmp_path / "failing_part.py"}", line {line}, in {name}'
+        for line, name in ((8, "__call__"), (12, "helper"))
+    ]
+    assert trace.endswith("KeyError: 'missing'")
+    with pytest.raises(KeyError):
+        outcomes(tmp_path, estimator=part, debug=True)
+    with pytest.raises(ValueError, match="estimator: KeyError: 'weights'") as refusal:
+        instantiate({"_target_": "failing_part.Part", "broken": True}, "estimator")
+    assert place_of(refusal.value) == "failing_part.py:5, in __init__"
+
+
+def test_errors_of_the_projects_own_have_no_place() -> None:
+    with pytest.raises(ValueError, match="no preset") as refusal:
+        build("estimator", "ransca")
+    assert place_of(refusal.value) == own_traceback(refusal.value) == ""
+
+
+def test_eval_shows_the_line_and_says_how_to_go_on(tmp_path: Path) -> None:
+    (tmp_path / "failing_part.py").write_text(PART)
+    (tmp_path / "conf" / "estimator").mkdir(parents=True)
+    (tmp_path / "conf" / "estimator" / "mine.yaml").write_text("_target_: failing_part.Part\nbroken: false\n")
+    words = ("--config-dir", "conf", "pipeline=sift_ratio", "estimator=mine", "dataset=stereo", "output=run")
+    ended = run_command("eval", *words, cwd=tmp_path)
+    assert ended.returncode == 1
+    assert 'failing_part.py", line 12, in helper' in ended.stderr
+    assert "fmtorch/pipeline" not in ended.stderr
+    assert "an edit of your parts makes a new run" in ended.stderr
+    for word in ("debug=true", "debug=pdb"):  # of which the pair's row of before counts for nothing
+        ended = run_command("eval", *words, word, cwd=tmp_path)
+        assert ended.returncode == 1
+        assert "fmtorch/pipeline" in ended.stderr
+        assert ("failing_part.py(12)helper()" in ended.stdout) == (word == "debug=pdb")
+    ended = run_command("eval", *words, "estimator.broken=true", cwd=tmp_path)
+    assert "error: estimator: KeyError: 'weights' (failing_part.py:5, in __init__)" in ended.stderr
+    assert "fmtorch/" not in ended.stderr

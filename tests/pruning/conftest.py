@@ -7,7 +7,7 @@ from torch import Tensor
 from fmtorch import data, presets
 from fmtorch.core import Correspondences
 from fmtorch.geometry import sampson
-from fmtorch.pipeline.pipeline import Pipeline
+from fmtorch.pipeline import Pipeline
 from tests.conftest import shared_path
 
 

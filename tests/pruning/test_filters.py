@@ -1,6 +1,10 @@
-"""Ratio, mutual, one-to-one."""
+"""Pruners in general: known answers, edge cases, input of any size, match noise."""
 
 import math
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,17 +14,24 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from torch import Tensor
 
+from fmtorch import find_fundamental, metrics, presets, pruning
 from fmtorch.core import Correspondences, Features
 from fmtorch.matching import NearestNeighborMatcher, nearest_neighbors
-from fmtorch.pruning import MutualCheck, OneToOne, RatioTest, mutual, one_to_one, ratio_test
-from tests.reference import matching as matching_reference
-from tests.reference.matching import one_to_one as one_to_one_reference
+from fmtorch.pruning.consistency import CURVES, MIN_VOTE, NOISE, SCALES, TOLERANCE, TURNS, WINDOW, WORST_RATIO
+from tests.geometry.scenes import scene as matched_scene
+from tests.laws import calibrated, degenerate, quick_pruner, scene, scenes, small, with_padding
+from tests.reference import consistency
+from tests.reference import local_features as matching_reference
+from tests.reference.gms import gms as gms_reference
+from tests.reference.local_features import one_to_one as one_to_one_reference
+from tests.reference.lpm import passes
+from tests.variants import built, variants
 
 
 def test_ratio_is_strict_and_refuses_nan() -> None:
     ratio = torch.tensor([[0.0, 0.79, 0.8, 1.0, math.nan]])
-    assert ratio_test(ratio, 0.8).tolist() == [[True, True, False, False, False]]
-    assert ratio_test(ratio, 0.8, torch.tensor([[False, True, True, True, True]])).sum() == 1
+    assert pruning.ratio_test(ratio, 0.8).tolist() == [[True, True, False, False, False]]
+    assert pruning.ratio_test(ratio, 0.8, torch.tensor([[False, True, True, True, True]])).sum() == 1
 
 
 def test_mutual_agrees_with_the_matcher() -> None:
@@ -28,10 +39,10 @@ def test_mutual_agrees_with_the_matcher() -> None:
     d0, d1 = torch.rand(2, 40, 8, generator=generator), torch.rand(2, 30, 8, generator=generator)
     mask0, mask1 = torch.rand(2, 40, generator=generator) < 0.8, torch.rand(2, 30, generator=generator) < 0.8
     neighbors = nearest_neighbors(d0, d1, mask0, mask1)
-    assert torch.equal(mutual(neighbors.nearest, neighbors.reverse), neighbors.mutual)
+    assert torch.equal(pruning.mutual(neighbors.nearest, neighbors.reverse), neighbors.mutual)
     garbage = torch.where(mask0, neighbors.nearest, 10**9)
-    assert torch.equal(mutual(garbage, neighbors.reverse, mask0), neighbors.mutual)
-    assert not mutual(neighbors.nearest, neighbors.reverse[:, :0]).any()
+    assert torch.equal(pruning.mutual(garbage, neighbors.reverse, mask0), neighbors.mutual)
+    assert not pruning.mutual(neighbors.nearest, neighbors.reverse[:, :0]).any()
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -47,15 +58,15 @@ def test_ratio_and_mutual_stages_equal_their_definitions(seed: int) -> None:
         return Features(lafs, torch.ones(n), torch.from_numpy(descriptors), torch.tensor([9, 9]))
 
     matches = NearestNeighborMatcher()(features(d0), features(d1))
-    ratio, both = RatioTest(0.8)(matches).mask[0], MutualCheck()(matches).mask[0]
+    ratio, both = pruning.RatioTest(0.8)(matches).mask[0], pruning.MutualCheck()(matches).mask[0]
     np.testing.assert_array_equal(ratio, matching_reference.ratio_test(d0, d1, 0.8))
     np.testing.assert_array_equal(both, matching_reference.mutual(d0, d1))
     assert 0 < int(ratio.sum()) < 30
     assert 0 < int(both.sum()) < 30
     order = matches.compact()
-    assert torch.equal(MutualCheck()(order).count(), both.sum()[None])
+    assert torch.equal(pruning.MutualCheck()(order).count(), both.sum()[None])
     with pytest.raises(ValueError, match="needs `mutual`"):
-        MutualCheck()(matches.replace(mutual=None))
+        pruning.MutualCheck()(matches.replace(mutual=None))
 
 
 def grid_points(n: int) -> st.SearchStrategy[np.ndarray]:
@@ -67,7 +78,7 @@ def grid_points(n: int) -> st.SearchStrategy[np.ndarray]:
 def test_one_to_one_equals_the_definition(data: st.DataObject, n: int) -> None:
     x0, x1 = data.draw(grid_points(n)), data.draw(grid_points(n))
     ratio = data.draw(arrays(np.float32, (n,), elements=st.sampled_from([0.25, 0.5, math.inf])))
-    mask = one_to_one(*(torch.from_numpy(a)[None] for a in (x0, x1, ratio)))
+    mask = pruning.one_to_one(*(torch.from_numpy(a)[None] for a in (x0, x1, ratio)))
     np.testing.assert_array_equal(mask[0], one_to_one_reference(x0, x1, ratio))
 
 
@@ -83,11 +94,11 @@ def duplicated(seed: int, n: int, dtype: torch.dtype = torch.float32) -> tuple[T
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_one_to_one_is_symmetric_and_independent_of_order(dtype: torch.dtype) -> None:
     x0, x1, ratio = (a[None] for a in duplicated(0, 200, dtype))
-    kept = one_to_one(x0, x1, ratio)
+    kept = pruning.one_to_one(x0, x1, ratio)
     assert 0 < kept.sum() < 200
-    assert torch.equal(kept, one_to_one(x1, x0, ratio))
+    assert torch.equal(kept, pruning.one_to_one(x1, x0, ratio))
     order = torch.randperm(200, generator=torch.Generator().manual_seed(1))
-    assert torch.equal(kept[:, order], one_to_one(x0[:, order], x1[:, order], ratio[:, order]))
+    assert torch.equal(kept[:, order], pruning.one_to_one(x0[:, order], x1[:, order], ratio[:, order]))
     for x in (x0, x1):
         assert len(torch.unique(x[kept], dim=0)) == kept.sum()
 
@@ -96,18 +107,222 @@ def test_one_to_one_drops_what_has_no_location_and_ranks_nan_ratio_last() -> Non
     x0 = torch.tensor([[[math.nan, 0.0], [math.inf, 0.0], [1.0, 1.0], [1.0, 1.0]]])
     x1 = torch.arange(8.0).reshape(1, 4, 2)
     ratio = torch.tensor([[0.0, 0.0, math.nan, 0.9]])
-    assert one_to_one(x0, x1, ratio).tolist() == [[False, False, False, True]]
+    assert pruning.one_to_one(x0, x1, ratio).tolist() == [[False, False, False, True]]
 
 
 def test_stages_need_a_ratio_and_keep_the_rest() -> None:
     x0, x1, ratio = (a[None] for a in duplicated(0, 20))
     mask = torch.ones(1, 20, dtype=torch.bool)
     for stage, expected in (
-        (RatioTest(0.5), ratio_test(ratio, 0.5)),
-        (OneToOne(), one_to_one(x0, x1, ratio)),
+        (pruning.RatioTest(0.5), pruning.ratio_test(ratio, 0.5)),
+        (pruning.OneToOne(), pruning.one_to_one(x0, x1, ratio)),
     ):
         out = stage(Correspondences(x0, x1, mask, ratio))
         assert torch.equal(out.mask, expected)
         assert torch.equal(out.x0, x0)
         with pytest.raises(ValueError, match="ratio"):
             stage(Correspondences(x0, x1, mask))
+
+
+PRUNERS = variants("pruner")
+PER_MATCH = ("x0", "x1", "ratio", "prior", "lafs0", "lafs1", "mutual")
+H, W = 640, 960
+
+
+def edge_cases() -> dict[str, Correspondences]:
+    c, single = scene(0, 300), scene(0, 1)
+    right, bottom = float(W - 1), float(H - 1)
+    inside = [[0.0, 0.0], [right, 0.0], [0.0, bottom], [right, bottom]]
+    border = torch.tensor([*inside, [right + 1, bottom + 1], [-0.5, -0.5], [right + 50, 7.0], [3.0, -90.0]])
+    on_border = border.repeat(40, 1)[:300][None]
+    one_cell = c.x0 / 100 + 200
+    return {
+        "no slots": single.replace(**{f: getattr(single, f)[:, :0] for f in ("mask", *PER_MATCH)}),
+        "one cell": c.replace(x0=one_cell, x1=one_cell + 5),
+        "on and outside the border": c.replace(x0=on_border, x1=on_border.flip(1)),
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("name", PRUNERS)
+@pytest.mark.parametrize("case", edge_cases())
+def test_edge_case(name: str, case: str) -> None:
+    c = edge_cases()[case]
+    pruned = quick_pruner(name)(calibrated(c))
+    assert pruned.mask.shape == c.mask.shape
+    assert not (pruned.mask & ~c.mask).any()
+    if pruned.prior is not None and pruned.prior is not c.prior:
+        assert ((pruned.prior >= 0) & (pruned.prior <= 1)).all()
+        assert not pruned.prior[~c.mask].any()
+
+
+@pytest.mark.parametrize("name", ["gms", "lpm", "gms:soft=true", "lpm:soft=true", "position_consistency"])
+def test_matches_that_all_move_alike_in_one_cell_are_kept(name: str) -> None:
+    c = edge_cases()["one cell"].replace(ratio=None, lafs0=None, lafs1=None, prior=None)
+    pruned = built("pruner", name)(c)
+    assert pruned.mask.all()
+    if name not in ("gms", "lpm"):
+        assert pruned.prior.min() > 0.5
+
+
+MOST = [name for name in PRUNERS if name != "code"]  # its soft form does the same work
+MANY = """
+import sys, torch
+from tests.laws import calibrated, quick_pruner, scene
+torch.set_num_threads(1)
+many = calibrated(scene(1, 50_000))
+for name in sys.argv[1:]:
+    stage = quick_pruner(name)
+    framed = {} if name == "frame_consistency" else {"lafs0": None, "lafs1": None}  # the scene's frames are random
+    pruned = stage(many.replace(**framed))
+    assert 0 < int(pruned.mask.sum()) <= 50_000, name
+    assert pruned.prior is None or bool(torch.isfinite(pruned.prior).all()), name
+    # Not ru_maxrss, which a process inherits from the one that started it.
+    print(name, next(line.split()[1] for line in open("/proc/self/status") if line.startswith("VmHWM")))
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="peak memory is read from /proc")
+def test_many_matches_in_bounded_memory() -> None:
+    """50,000 matches: a table of pairs of matches would take 2.5 GB even at a byte each."""
+    result = subprocess.run([sys.executable, "-c", MANY, *MOST], capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+    peaks = {line.split()[0]: int(line.split()[1]) * 1024 for line in result.stdout.splitlines()}
+    assert list(peaks) == MOST
+    assert max(peaks.values()) < 1.5e9, peaks
+
+
+SIZE = (640, 960)  # of the images of a scene
+
+
+def inputs() -> Iterator[tuple[str, Correspondences]]:
+    yield "a batch", scenes()
+    yield "padding", with_padding(scenes(), np.random.default_rng(0), float("nan"))
+    yield from degenerate().items()
+    yield from small().items()
+    c = scene(6, 400)  # duplicates and integers: ties everywhere
+    points = [(x / 90).round() * 90 for x in (c.x0, c.x1)]
+    yield "ties", c.replace(x0=points[0], x1=points[1], ratio=(c.ratio * 10).round() / 10)
+    signs = torch.rand(c.x0.shape, generator=torch.Generator().manual_seed(0)) < 0.5
+    yield "negative zero", c.replace(x0=torch.where(signs, -0.0, 0.0))
+    yield "double precision", scene(3, 300).replace(x0=scene(3, 300).x0.double() + 1e-9, x1=scene(3, 300).x1.double())
+
+
+def pairs(
+    real_matches: list[tuple[Correspondences, Tensor]],
+) -> Iterator[tuple[str, Correspondences, int, np.ndarray, np.ndarray, np.ndarray]]:
+    """Every pair of the inputs: its name, its batch and place there, and slots, x0, x1 of its finite matches."""
+    for what, c in [*inputs(), *((f"real pair {i}", c) for i, (c, _) in enumerate(real_matches))]:
+        finite = c.mask & torch.isfinite(c.x0).all(-1) & torch.isfinite(c.x1).all(-1)
+        for i, here in enumerate(finite):
+            yield f"{what}, {i}", c, i, here.numpy().nonzero()[0], c.x0[i][here].numpy(), c.x1[i][here].numpy()
+
+
+def expect_mask(mask: Tensor, slots: np.ndarray, expected: np.ndarray, what: str) -> None:
+    whole = np.zeros(len(mask), bool)
+    whole[slots] = expected
+    np.testing.assert_array_equal(mask.numpy(), whole, what)
+
+
+def test_gms(real_matches: list[tuple[Correspondences, Tensor]]) -> None:
+    for what, c, i, slots, x0, x1 in pairs(real_matches):
+        sizes = (SIZE, SIZE) if "real" not in what else tuple(tuple(s[i].tolist()) for s in (c.size0, c.size1))  # type: ignore[index]
+        if what.startswith("huge"):
+            with pytest.raises(ValueError, match="lie outside such an image"):
+                pruning.gms(c.x0, c.x1, size0=c.size0, size1=c.size1, mask=c.mask)
+            continue
+        searched = what.endswith(("random, 0", "planar, 0", "coincident, 0"))
+        mask = pruning.gms(
+            c.x0, c.x1, size0=c.size0, size1=c.size1, mask=c.mask, threshold_factor=3.0, with_rotation=searched,
+            with_scale=searched, border="authors" if searched else "opencv",
+        )[i]  # fmt: skip
+        expected = gms_reference(x0, x1, *sizes, searched, searched, 3.0, authors=searched)  # type: ignore[arg-type]
+        expect_mask(mask, slots, expected, what)
+
+
+def test_lpm(real_matches: list[tuple[Correspondences, Tensor]]) -> None:
+    for what, c, i, slots, x0, x1 in pairs(real_matches):
+        survivors, costs = passes(x0.astype(np.float64), x1.astype(np.float64))
+        expect_mask(pruning.lpm(c.x0, c.x1, mask=c.mask)[i], slots, np.isin(np.arange(len(slots)), survivors), what)
+        expected = np.ones(c.mask.shape[1])
+        expected[slots] = np.mean(costs, 0)
+        computed = pruning.lpm_cost(c.x0.double(), c.x1.double(), mask=c.mask)[i]
+        np.testing.assert_allclose(computed, expected, rtol=1e-12, err_msg=what)
+
+
+def test_one_to_one(real_matches: list[tuple[Correspondences, Tensor]]) -> None:
+    for what, c, i, slots, x0, x1 in pairs(real_matches):
+        ratio = c.ratio[i].numpy()[slots]
+        expected = one_to_one_reference(x0, x1, np.where(np.isnan(ratio), np.inf, ratio))
+        expect_mask(pruning.one_to_one(c.x0, c.x1, c.ratio, c.mask)[i], slots, expected, what)
+
+
+@pytest.mark.parametrize("ratios", [True, False])
+def test_agreement_of_few_matches(ratios: bool) -> None:
+    for what, c in small().items():
+        ratio = c.ratio if ratios else None
+        vote = np.maximum(WORST_RATIO - c.ratio[0].double().numpy(), MIN_VOTE) if ratios else np.ones(len(c.mask[0]))
+        x0, x1, A0, A1 = (t[0].double().numpy() for t in (c.x0, c.x1, c.lafs0[..., :2], c.lafs1[..., :2]))
+        by_frames = consistency.agreement(
+            x0, x1, A1 @ np.linalg.inv(A0), vote, CURVES, WINDOW, TOLERANCE, NOISE
+        )  # fmt: skip
+        similarity = consistency.similarity(x0, x1, CURVES, TURNS, SCALES)
+        by_motion = consistency.agreement_of_positions(x0, x1, similarity, vote, CURVES, WINDOW, TOLERANCE, NOISE)
+        frames = pruning.frame_agreement(c.x0, c.x1, c.lafs0, c.lafs1, ratio, c.mask)[0]
+        # float32: coordinates of 1e3 px are rounded to 6e-5 px, against lengths of at least 4 px
+        np.testing.assert_allclose(frames, by_frames, rtol=1e-3, atol=1e-5, err_msg=what)
+        motion = pruning.position_agreement(c.x0, c.x1, ratio, c.mask)[0]
+        np.testing.assert_allclose(motion, by_motion, rtol=1e-3, atol=1e-5, err_msg=what)
+
+
+NUMBERS = {"usual": 4.06, "radius": 15.0, "slope": 0.65}
+
+
+def test_is_its_formula() -> None:
+    rng = np.random.default_rng(0)
+    lafs0, lafs1 = (torch.from_numpy(rng.normal(size=(2, 50, 2, 3)) * 20) for _ in range(2))
+    ratio, prior = (torch.from_numpy(rng.random((2, 50))) for _ in range(2))
+    noise = pruning.match_noise(lafs0, lafs1, ratio, prior, **NUMBERS)
+    for b in range(2):
+        for i in range(50):
+            scales = [math.sqrt(abs(np.linalg.det(lafs[b, i, :, :2].numpy()))) for lafs in (lafs0, lafs1)]
+            r, P = float(ratio[b, i]), max(float(prior[b, i]), 0.02)
+            expected = (1 + max(scales) / 15) * (1 + 0.65 * r) ** 2 * P**-0.25 / 4.06
+            assert float(noise[b, i]) == pytest.approx(expected, rel=1e-9)
+    inputs = [x[:1, :8].clone().requires_grad_() for x in (lafs0, lafs1, ratio, prior)]
+    assert torch.autograd.gradcheck(lambda *x: pruning.match_noise(*x, **NUMBERS), inputs)
+
+
+def test_matches_without_frames_are_left_as_they_are_and_what_cannot_be_told_is_usual() -> None:
+    stage = presets.build("pruner", "match_noise")
+    c = scene(0, 50)
+    assert stage(c.replace(lafs0=None, lafs1=None)).noise is None
+    lafs = c.lafs0.clone()
+    lafs[:, 3] = float("nan")
+    noise = stage(c.replace(lafs0=lafs)).noise
+    assert float(noise[0, 3]) == 1
+    assert bool(torch.isfinite(noise).all())
+    alone = stage(c.replace(ratio=None, prior=None)).noise
+    assert bool((alone[c.mask] > 0).all())
+
+
+def _noisy_pair(seed: int) -> tuple[torch.Tensor, ...]:
+    """Points of two views whose noise differs tenfold from match to match, the true F, and that noise."""
+    rng, exact = np.random.default_rng(seed), matched_scene(120, seed)
+    noise = torch.from_numpy(np.where(rng.random(120) < 0.5, 0.3, 3.0))
+    errors = torch.from_numpy(rng.normal(size=(2, 120, 2))) * 0.3 * noise[:, None]
+    return exact.x0 + errors[0], exact.x1 + errors[1], exact.F, noise
+
+
+def test_known_noise_makes_estimates_more_exact() -> None:
+    size = torch.tensor([[800, 1000]])
+    errors = []
+    for seed in range(12):
+        x0, x1, F, noise = _noisy_pair(seed)
+        row = []
+        for given_noise in (None, noise):
+            estimate = find_fundamental(x0, x1, noise=given_noise)  # with sizes, what is known of cameras helps both
+            assert bool(estimate.ok[0])
+            row.append(float(metrics.nsgd(F[None], estimate.F, size, size)))
+        errors.append(row)
+    without, with_noise = np.median(errors, 0)
+    assert with_noise < 0.6 * without

@@ -1,12 +1,21 @@
+"""GMS, LPM and CODE equal their definitions."""
+
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from torch import Tensor
 
 from fmtorch.core import Correspondences
-from fmtorch.pruning import GMS, gms
+from fmtorch.jit.kernel import F8x2, I8x2, kernel
+from fmtorch.pruning import GMS, LPM, LikelihoodField, code, gms, lpm
+from fmtorch.pruning import neighbors as knn_kernels
+from fmtorch.pruning.code import match_domain
 from tests.conftest import oracle
-from tests.reference.gms import gms as reference
+from tests.reference import code as code_reference
+from tests.reference.lpm import lpm as reference
+from tests.reference.lpm import nearest
 
 MODES = [(False, False), (True, False), (False, True), (True, True)]  # (rotation, scale), the oracle's order
 SIZE0, SIZE1 = (480, 640), (300, 500)
@@ -54,17 +63,6 @@ def test_masks_equal_the_originals() -> None:
                     np.testing.assert_array_equal(mask[0], expected, f"{name}, {border}, {factor}, row {row}")
 
 
-@pytest.mark.parametrize(("rotation", "scale"), MODES)
-@pytest.mark.parametrize("border", ["opencv", "authors"])
-def test_equals_the_definition(rotation: bool, scale: bool, border: str) -> None:
-    cases = [(0, 0, 1, 4.0), (1, 0, 1, 1.0), (150, 0, 1, 2.0), (200, 0.8, 1, 2.0), (200, 3.1, 0.5, 3.0)]
-    for seed, (n, angle, growth, factor) in enumerate(cases):
-        x0, x1 = moving(seed, n, angle, growth)
-        mask = run(x0[None], x1[None], with_rotation=rotation, with_scale=scale, threshold_factor=factor, border=border)
-        expected = reference(x0.numpy(), x1.numpy(), SIZE0, SIZE1, rotation, scale, factor, authors=border == "authors")
-        np.testing.assert_array_equal(mask[0], expected)
-
-
 def test_many_matches_in_one_cell() -> None:
     # More matches in a cell than 16 bits can count; a lone cell scores as much as it is filled.
     x0 = 5 + torch.rand(1, 50_000, 2, generator=torch.Generator().manual_seed(0))
@@ -94,3 +92,155 @@ def test_sizes_that_are_width_and_height_are_refused() -> None:
     x0[0, :40, 0] += 300
     with pytest.raises(ValueError, match=r"size0 is \(640, 480\), but .* it looks like \(w, h\)"):
         gms(x0, x1, size0=torch.tensor([SIZE0[::-1]]), size1=torch.tensor([SIZE1]))
+
+
+@kernel
+def search(queries: F8x2, points: F8x2, neighbors: I8x2) -> None:
+    knn_kernels.search(queries, points, neighbors)
+
+
+def nearest_points(queries: np.ndarray, points: np.ndarray, count: int) -> np.ndarray:
+    neighbors = np.empty((len(queries), count), np.int64)
+    search(queries, points, neighbors)
+    return neighbors
+
+
+def moving_along(seed: int, n: int, outliers: float = 0.4) -> tuple[Tensor, Tensor]:
+    """Matches that follow a smooth motion; some wrong, some repeated, some that do not move."""
+    rng = np.random.default_rng(seed)
+    x0 = rng.uniform(0, 500, (n, 2))
+    x1 = x0 @ np.array([[0.95, 0.2], [-0.2, 0.95]]) + (30, 10) + rng.normal(0, 0.5, (n, 2))
+    wrong = rng.random(n) < outliers
+    x1[wrong] = rng.uniform(0, 500, (int(wrong.sum()), 2))
+    if n > 20:
+        x0[5:10], x1[8:12] = x0[0], x1[1]
+        x1[15:18] = x0[15:18]
+    return torch.from_numpy(x0), torch.from_numpy(x1)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 10**6), st.integers(0, 60), st.integers(0, 60), st.integers(1, 12), st.booleans())
+def test_nearest_points_equal_the_definition(seed: int, n: int, m: int, count: int, coarse: bool) -> None:
+    rng = np.random.default_rng(seed)
+    queries, points = rng.uniform(0, 6, (n, 2)), rng.uniform(0, 6, (m, 2))
+    if coarse:  # ties everywhere
+        queries, points = queries.round(), points.round()
+    neighbors = nearest_points(queries, points, count)
+    for query, row in zip(queries, neighbors.tolist(), strict=True):
+        expected = nearest(query, points, list(range(m)), count)
+        assert row == expected + [-1] * (count - len(expected))
+
+
+def test_masks_equal_the_original() -> None:
+    file = oracle("lpm.npz")
+    for i, name in enumerate(file["names"]):
+        case = {k[4:]: v for k, v in file.items() if k.startswith(f"{i:03d}.")}
+        lambda1, lambda2, K1, K2, tau1, tau2 = case["params"].tolist()
+        x0, x1 = torch.from_numpy(case["X"]), torch.from_numpy(case["Y"])
+        mask = lpm(x0[None], x1[None], thresholds=(lambda1, lambda2), neighbors=(int(K1), int(K2)), taus=(tau1, tau2))
+        np.testing.assert_array_equal(mask[0], case["mask"], str(name))
+        for x, key in ((case["X"], "nX1"), (case["Y"], "nY1")):
+            np.testing.assert_array_equal(nearest_points(x, x, int(K1) + 3), case[key], str(name))
+
+
+def test_neighbourhoods_may_be_large() -> None:
+    x0, x1 = moving_along(3, 300)
+    expected = reference(x0.numpy(), x1.numpy(), (0.8, 0.8), (260, 6), (0.2, 0.2))
+    mask = lpm(x0[None], x1[None], neighbors=(260, 6), thresholds=(0.8, 0.8))
+    assert 0 < expected.sum() < 300
+    np.testing.assert_array_equal(mask[0], expected)
+
+
+def test_stage_and_bad_input() -> None:
+    x0, x1 = (x[None].float() for x in moving_along(3, 200))
+    x0[0, 7, 0] = torch.nan
+    mask = torch.arange(200)[None] % 3 != 0
+    kept = LPM(neighbors=[5, 6])(Correspondences(x0, x1, mask)).mask
+    assert torch.equal(kept, lpm(x0, x1, mask=mask, neighbors=(5, 6)))
+    assert not kept[0, 7]
+    with pytest.raises(ValueError, match="at least 4"):
+        lpm(x0, x1, neighbors=(3, 6))
+
+
+WIDTHS = {"position": 0.5, "displacement": 0.2, "rotation": 0.8, "scale": 0.5}
+
+
+def frames(x: np.ndarray, S: np.ndarray) -> np.ndarray:
+    return np.concatenate([S, x[:, :, None]], 2)
+
+
+def turn(angle: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    c, s = scale * np.cos(angle), scale * np.sin(angle)
+    return np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], -2)
+
+
+def warped(seed: int, n: int, outliers: float, noise: float = 0.5) -> tuple[Correspondences, Tensor]:
+    """Matches that follow a turn by 0.6, a zoom by 1.3 and a bend; outliers anywhere. And which are right."""
+    rng = np.random.default_rng(seed)
+    x0 = rng.uniform(0, 800, (n, 2))
+    A = turn(np.array(0.6), np.array(1.3))
+    bend = 4e-4 * np.stack([np.square(x0[:, 1] - 400), (x0[:, 0] - 400) * (x0[:, 1] - 400)], 1)
+    x1 = x0 @ A.T + bend + (100, -50) + rng.normal(0, noise, (n, 2))
+    J = np.zeros((n, 2, 2))
+    J[:, 0, 1], J[:, 1, 0], J[:, 1, 1] = 8e-4 * (x0[:, 1] - 400), 4e-4 * (x0[:, 1] - 400), 4e-4 * (x0[:, 0] - 400)
+    S0 = turn(rng.uniform(-np.pi, np.pi, n), rng.uniform(10, 40, n))
+    S1 = turn(rng.normal(0, 0.1, n), np.exp(rng.normal(0, 0.1, n))) @ (A + J) @ S0
+    wrong = rng.random(n) < outliers
+    x1[wrong] = rng.uniform(x1.min(0), x1.max(0), (int(wrong.sum()), 2))
+    S1[wrong] = turn(rng.uniform(-np.pi, np.pi, n), rng.uniform(10, 40, n))[wrong]
+    ratio = np.where(wrong, rng.uniform(0.7, 1, n), rng.uniform(0.4, 1, n))
+
+    def tensor(value: np.ndarray) -> Tensor:
+        return torch.from_numpy(value.astype(np.float32))[None]
+
+    c = Correspondences(
+        tensor(x0), tensor(x1), torch.ones(1, n, dtype=torch.bool), ratio=tensor(ratio),
+        lafs0=tensor(frames(x0, S0)), lafs1=tensor(frames(x1, S1)),
+    )  # fmt: skip
+    return c, torch.from_numpy(~wrong)
+
+
+def run_code(c: Correspondences) -> Tensor:
+    return code(c.x0, c.x1, mask=c.mask, ratio=c.ratio, lafs0=c.lafs0, lafs1=c.lafs1)[0]
+
+
+def domain_of(c: Correspondences) -> tuple:
+    x0, x1, lafs0, lafs1 = (v[0].double().numpy() for v in (c.x0, c.x1, c.lafs0, c.lafs1))
+    (p0, s0), (p1, s1) = code_reference.normalised(x0), code_reference.normalised(x1)
+    S = [b[:, :2] @ np.linalg.inv(a[:, :2]) * s0 / s1 for a, b in zip(lafs0, lafs1, strict=True)]
+    return match_domain(c.x0[0], c.x1[0], c.lafs0[0], c.lafs1[0]), list(zip(p0, p1, S, strict=True))
+
+
+def test_likelihood_equals_the_definition() -> None:
+    ours, theirs = domain_of(warped(3, 70, 0.4)[0])
+    field = LikelihoodField(centres=15, ridge=0.005, huber=0.1, iterations=300, **WIDTHS)
+    expected = code_reference.likelihood(theirs, WIDTHS, 15, 0.005, 0.1)
+    # float32 normal equations: 1e-5 (the kernel) times their condition, at most 1 / ridge = 200.
+    np.testing.assert_allclose(field(ours, None), expected, atol=2e-3)
+
+
+@pytest.mark.parametrize("frames", [True, False])
+@pytest.mark.parametrize("outliers", [0.0, 0.5, 0.8])
+def test_keeps_a_smooth_motion_and_drops_scattered_matches(outliers: float, frames: bool) -> None:
+    c, right = warped(5, 2000, outliers)
+    if not frames:  # displacements then vary with the place only as far as the motion differs from a translation
+        c = c.replace(x1=c.x1 @ torch.linalg.inv(torch.from_numpy(turn(np.array(0.6), np.array(1.3))).float()).T)
+        c = c.replace(lafs0=None, lafs1=None)
+    kept = run_code(c)
+    # Outliers spread over a square of side sqrt(12): a disc of radius 0.06 (the largest residual) holds 0.1% of them;
+    # twice the radius for where the motion is uncertain, and three standard deviations.
+    count = int((~right).sum())
+    assert int((kept & ~right).sum()) <= 0.004 * count + 3 * (0.004 * count) ** 0.5
+    if frames or outliers < 0.8:
+        assert int((kept & right).sum()) > 0.9 * int(right.sum())
+
+
+def test_matches_that_are_none_are_dropped() -> None:
+    c, _ = warped(11, 400, 0.2)
+    x0, lafs1 = c.x0.clone(), c.lafs1.clone()
+    x0[0, 3, 1], lafs1[0, 5, 0, 0], lafs1[0, 7, :, :2] = torch.nan, torch.inf, 0.0
+    kept = run_code(c.replace(x0=x0, lafs1=lafs1))
+    assert not kept[[3, 5, 7]].any()
+    sound = torch.ones(400, dtype=torch.bool)
+    sound[[3, 5, 7]] = False
+    assert torch.equal(kept, run_code(c.replace(mask=sound[None])))

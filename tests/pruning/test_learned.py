@@ -12,8 +12,9 @@ from torch import Tensor, nn
 from fmtorch.core import Correspondences, NetworkFileError, collate
 from fmtorch.pruning import DFE, LC, LearnedPruner
 from fmtorch.pruning.networks.learned import learned_file
-from fmtorch.runs.fingerprint import configuration, learned
-from fmtorch.training.export import export_onnx, save_weights
+from fmtorch.runs import configuration
+from fmtorch.runs.fingerprint import learned
+from fmtorch.training import export_onnx, save_weights
 from tests.laws import scene
 
 K = torch.tensor([[[800.0, 0, 480], [0, 800, 320], [0, 0, 1]]])

@@ -5,15 +5,12 @@ import itertools
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
 import fmtorch
 from fmtorch import Correspondences, presets
 from fmtorch.pruning import GMS, LPM, Calibration, calibration, gms_support, lpm_cost
 from tests.laws import scene
-from tests.pruning.test_gms import SIZE0, SIZE1
-from tests.pruning.test_gms import moving as moving_on_grids
-from tests.pruning.test_lpm import moving
+from tests.pruning.test_gms import SIZE0, SIZE1, moving, moving_along
 from tests.reference.gms import SCALES, normalised, run, support
 from tests.reference.lpm import passes
 from tests.variants import built
@@ -46,7 +43,7 @@ def test_calibration_uses_the_ratio_where_there_is_one() -> None:
 
 @pytest.mark.parametrize(("angle", "scale"), [(0.0, 1.0), (np.pi / 2, 0.5)])
 def test_gms_support_equals_the_definition(angle: float, scale: float) -> None:
-    x0, x1 = moving_on_grids(0, 400, angle, scale)
+    x0, x1 = moving(0, 400, angle, scale)
     searched = angle != 0
     computed = gms_support(
         x0[None], x1[None], size0=torch.tensor([SIZE0]), size1=torch.tensor([SIZE1]),
@@ -61,13 +58,13 @@ def test_gms_support_equals_the_definition(angle: float, scale: float) -> None:
 
 @pytest.mark.parametrize("n", [0, 1, 9, 40, 160])
 def test_lpm_cost_equals_the_definition(n: int) -> None:
-    x0, x1 = moving(n, n)
+    x0, x1 = moving_along(n, n)
     expected = np.mean(passes(x0.numpy(), x1.numpy())[1], axis=0)
     np.testing.assert_allclose(lpm_cost(x0[None], x1[None])[0], expected, rtol=1e-12)
 
 
 def test_priors_follow_the_right_matches_of_a_common_motion() -> None:
-    x0, x1 = (x[None].float() for x in moving(0, 1000, outliers=0.5))
+    x0, x1 = (x[None].float() for x in moving_along(0, 1000, outliers=0.5))
     turn = torch.tensor([[0.95, 0.2], [-0.2, 0.95]])
     right = (x1 - x0 @ turn - torch.tensor([30.0, 10.0])).norm(dim=-1)[0] < 3
     c = scene(0, 1000).replace(x0=x0, x1=x1, ratio=None, lafs0=None, lafs1=None, prior=None)
@@ -135,9 +132,7 @@ def test_find_fundamental_derives_the_prior(given: tuple[str, ...]) -> None:
 
 
 @pytest.mark.parametrize(("name", "area"), [("frame_consistency", 0.9), ("position_consistency", 0.88)])
-def test_priors_tell_inliers_on_real_pairs(
-    name: str, area: float, real_matches: list[tuple[Correspondences, Tensor]]
-) -> None:
+def test_priors_tell_inliers_on_real_pairs(name, area, real_matches):
     """Area under the ROC curve; 0.95 over all pairs of this scene, where the ratio alone reaches 0.7 to 0.86."""
     areas = []
     for c, right in real_matches:

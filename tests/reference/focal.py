@@ -29,24 +29,6 @@ def fundamental(parameters: np.ndarray, size0: tuple[int, int], size1: tuple[int
     return np.linalg.inv(K1).T @ skew(parameters[3:6]) @ R @ np.linalg.inv(K0)
 
 
-def parameters_of(F: np.ndarray, size0: tuple[int, int], size1: tuple[int, int]) -> np.ndarray:
-    """Parameters whose model is F: focal lengths by Bougnoux's formula (ICCV 1998), one of E's four poses."""
-    C0, C1 = (calibration(1 / max(size), size) for size in (size0, size1))  # f of one pixel
-    G = C1.T @ F @ C0
-    p, D = np.array([0, 0, 1.0]), np.diag([1.0, 1, 0])
-
-    def squared(G: np.ndarray) -> float:
-        e = skew(np.linalg.svd(G.T)[2][2])  # of the epipole in the second image
-        return float(-(p @ e @ D @ G @ p) * (p @ G.T @ p) / (p @ e @ D @ G @ D @ G.T @ p))
-
-    f0, f1 = np.sqrt(squared(G)) / max(size0), np.sqrt(squared(G.T)) / max(size1)
-    E = calibration(f1, size1).T @ F @ calibration(f0, size0)
-    U, _, Vt = np.linalg.svd(E)
-    R = U @ np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]]) @ Vt
-    R = R * np.sign(np.linalg.det(R))
-    return np.concatenate([Rotation.from_matrix(R).as_rotvec(), U[:, 2], np.log([f0, f1])])
-
-
 Measured = tuple[tuple[float, float], tuple[float, float]]
 UNMEASURED = ((0.0, np.inf), (0.0, np.inf))
 
@@ -109,3 +91,24 @@ def optimum(
 
     parameters = least_squares(residuals, start, jac="3-point", max_nfev=1000, xtol=1e-15, ftol=1e-15, gtol=1e-12).x
     return parameters, cost(fundamental(parameters, size0, size1), parameters[6:], x0, x1, weight, scale, same)
+
+
+def share_in_front(
+    E: np.ndarray, rays0: np.ndarray, rays1: np.ndarray, support: np.ndarray, angle: np.ndarray
+) -> float:
+    """E (3, 3), rays (n, 3), support (n); rays whose directions differ by less than the angles (n) count anyway."""
+    U, _, Vt = np.linalg.svd(E)
+    U, Vt = U * np.sign(np.linalg.det(U)), Vt * np.sign(np.linalg.det(Vt))
+    W = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    best = 0.0
+    for R in (U @ W @ Vt, U @ W.T @ Vt):
+        for t in (U[:, 2], -U[:, 2]):
+            total = 0.0
+            for a, b, weight, min_sine in zip(rays0, rays1, support, angle, strict=True):
+                r = R @ a
+                (z0, z1), *_ = np.linalg.lstsq(np.stack([-r, b], 1), t, rcond=None)  # z1 b = z0 r + t
+                sine = np.linalg.norm(np.cross(b, r)) / (np.linalg.norm(b) * np.linalg.norm(r))
+                parallel = sine < min_sine and b @ r > 0
+                total += weight * ((z0 > 0 and z1 > 0) or parallel)
+            best = max(best, total)
+    return best / float(support.sum())

@@ -86,11 +86,7 @@ def pose_error(R: np.ndarray, t: np.ndarray, s: Scene) -> float:
 
 
 def best_cameras(
-    s: Scene,
-    sizes: Sizes,
-    sigma: float,
-    measured: Measured = UNMEASURED,
-    shared: bool = False,
+    s: Scene, sizes: Sizes, sigma: float, measured: Measured = UNMEASURED, shared: bool = False
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """R, t and focal lengths (px) of greatest posterior near the true pose, of images of two sizes (h, w).
 

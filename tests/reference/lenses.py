@@ -1,53 +1,72 @@
-"""Lens models as COLMAP's documentation writes them, one point at a time."""
+"""Lenses of the division model: bent points, F between such photographs, one match and one number at a time."""
 
-from math import atan, hypot, sqrt, tan
+from __future__ import annotations
+
+import numpy as np
+
+Size = tuple[int, int]
 
 
-def distort(model: str, u: float, v: float, c: list[float]) -> tuple[float, float]:
-    """Where a lens with coefficients c puts the normalised point (u, v)."""
-    r = hypot(u, v)
-    theta = atan(r)
-    if model in ("SIMPLE_PINHOLE", "PINHOLE"):
-        return u, v
-    if model in ("SIMPLE_RADIAL", "RADIAL"):
-        k1, k2 = (*c, 0.0)[:2]
-        s = 1 + k1 * r**2 + k2 * r**4
-        return u * s, v * s
-    if model in ("OPENCV", "FULL_OPENCV"):
-        k1, k2, p1, p2, k3, k4, k5, k6 = (*c, 0.0, 0.0, 0.0, 0.0)[:8]
-        s = (1 + k1 * r**2 + k2 * r**4 + k3 * r**6) / (1 + k4 * r**2 + k5 * r**4 + k6 * r**6)
-        return (
-            u * s + 2 * p1 * u * v + p2 * (r**2 + 2 * u**2),
-            v * s + 2 * p2 * u * v + p1 * (r**2 + 2 * v**2),
-        )
-    if model == "FOV":
-        s = atan(2 * r * tan(c[0] / 2)) / (r * c[0])
-        return u * s, v * s
-    if model in ("SIMPLE_DIVISION", "DIVISION"):
-        s = 2 / (1 + sqrt(1 - 4 * c[0] * r**2))
-        return u * s, v * s
-    if model == "EUCM":
-        alpha, beta = c
-        s = 1 / (alpha * sqrt(beta * r**2 + 1) + 1 - alpha)
-        return u * s, v * s
-    u, v = u * theta / r, v * theta / r  # the fish-eyes
-    if model in ("SIMPLE_FISHEYE", "FISHEYE"):
-        return u, v
-    if model == "THIN_PRISM_FISHEYE":
-        k1, k2, p1, p2, k3, k4, sx1, sy1 = c
-        s = k1 * theta**2 + k2 * theta**4 + k3 * theta**6 + k4 * theta**8
-        return (
-            u + u * s + 2 * p1 * u * v + p2 * (theta**2 + 2 * u**2) + sx1 * theta**2,
-            v + v * s + 2 * p2 * u * v + p1 * (theta**2 + 2 * v**2) + sy1 * theta**2,
-        )
-    radial = c[:6] if model == "RAD_TAN_THIN_PRISM_FISHEYE" else c
-    s = 1 + sum(k * theta ** (2 * i + 2) for i, k in enumerate(radial))
-    u, v = u * s, v * s
-    if model != "RAD_TAN_THIN_PRISM_FISHEYE":
-        return u, v
-    p0, p1, s0, s1, s2, s3 = c[6:]
-    q = u**2 + v**2
-    return (
-        u + (2 * u**2 + q) * p0 + 2 * u * v * p1 + s0 * q + s1 * q**2,
-        v + (2 * v**2 + q) * p1 + 2 * u * v * p0 + s2 * q + s3 * q**2,
-    )
+def frame(size: Size) -> tuple[np.ndarray, float]:
+    """The principal point and the half diagonal of an image."""
+    h, w = size
+    return np.array([(w - 1) / 2, (h - 1) / 2]), np.hypot(h, w) / 2
+
+
+def bent(x: np.ndarray, size: Size, lens: float) -> np.ndarray:
+    """Where a lens puts a point (2,) of a pinhole's image: the root of ``lambda r_u r_d^2 - r_d + r_u = 0``."""
+    centre, half = frame(size)
+    ru = np.linalg.norm(x - centre) / half
+    rd = ru if lens == 0 or ru == 0 else (1 - np.sqrt(1 - 4 * lens * ru * ru)) / (2 * lens * ru)
+    return centre + (x - centre) * (rd / ru if ru else 1)
+
+
+def straight(x: np.ndarray, size: Size, lens: float) -> np.ndarray:
+    """Where a pinhole would have put a point (2,) of a photograph."""
+    centre, half = frame(size)
+    r2 = ((x - centre) ** 2).sum() / half**2
+    return centre + (x - centre) / (1 + lens * r2)
+
+
+def constraint(F: np.ndarray, x: np.ndarray, sizes: tuple[Size, Size], lenses: tuple[float, float]) -> float:
+    """``x1^T F x0`` of points (x0, y0, x1, y1) of photographs, times both denominators of the model."""
+    h = []
+    for i in range(2):
+        centre, half = frame(sizes[i])
+        own = x[2 * i : 2 * i + 2] - centre
+        w = 1 + lenses[i] * (own**2).sum() / half**2
+        h.append(np.append(own + centre * w, w))
+    return float(h[1] @ F @ h[0])
+
+
+def sampson(F: np.ndarray, x: np.ndarray, sizes: tuple[Size, Size], lenses: tuple[float, float]) -> float:
+    """The Sampson distance of a match by the photograph's coordinates, px: the gradient by differences."""
+    e = constraint(F, x, sizes, lenses)
+    slope = [
+        (constraint(F, x + d, sizes, lenses) - constraint(F, x - d, sizes, lenses)) / 2e-3 for d in 1e-3 * np.eye(4)
+    ]
+    return float(e / np.linalg.norm(slope))
+
+
+def photographs(
+    seed: int, lenses: tuple[float, float], size: Size = (480, 640), noise: float = 0.3, wrong: float = 0.25
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Matches (n, 2) all over two bent photographs, F of pinholes, and K."""
+    rng, (h, w) = np.random.default_rng(seed), size
+    K = np.array([[0.8 * w, 0, (w - 1) / 2], [0, 0.8 * w, (h - 1) / 2], [0, 0, 1]])
+    X = np.c_[rng.uniform(-5, 5, (1500, 2)), rng.uniform(3, 6, 1500)]
+    turn, t = np.array([[0.995, 0, 0.0998], [0, 1, 0], [-0.0998, 0, 0.995]]), np.array([-0.8, 0.1, 0.3])
+    U, _, V = np.linalg.svd(turn)
+    R = U @ V
+    points = []
+    for Y, lens in ((X, lenses[0]), (X @ R.T + t, lenses[1])):
+        x = Y @ K.T
+        x = x[:, :2] / x[:, 2:]
+        points.append(np.array([bent(each, size, lens) for each in x]) + rng.normal(0, noise, x.shape))
+    inside = np.all([(x >= 0).all(1) & (x < (w, h)).all(1) for x in points], 0)
+    x0, x1 = (x[inside] for x in points)
+    some = slice(int(wrong * len(x1)))
+    x1[some] = rng.permutation(x1[some])
+    cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
+    F = np.linalg.inv(K).T @ cross @ R @ np.linalg.inv(K)
+    return x0, x1, F / np.linalg.norm(F), K

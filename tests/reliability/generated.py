@@ -34,10 +34,9 @@ from torch import Tensor
 
 import fmtorch
 from fmtorch import geometry, matching, metrics, pruning
-from fmtorch.core import Correspondences, Estimate, Features, collate
-from fmtorch.core.annotations import arguments_of, arrays_of
-from fmtorch.pipeline.pipeline import load_pipeline
-from fmtorch.presets.objects import merged
+from fmtorch.core import Correspondences, Estimate, Features, arguments_of, arrays_of, collate
+from fmtorch.pipeline import load_pipeline
+from fmtorch.presets import merged
 from tests.laws import PEERS, calibrated, few, quick_pruner
 from tests.reliability.arguments import KINDS, MISTAKES, NUMBERS, SEQUENCES, Scene, batches, scenes
 from tests.reliability.arguments import given as as_given
@@ -221,8 +220,7 @@ def estimation(name: str, options: dict[str, Any], data: st.DataObject) -> tuple
 def sound_estimate(estimate: Any) -> None:
     """The promises of `Estimate`: of a pair that is ok a finite F of unit norm with support, of another a reason."""
     F, ok, reason = estimate.F.detach().double(), estimate.ok, estimate.reason
-    assert F.shape == (len(ok), 3, 3)
-    assert estimate.inliers.dtype == torch.bool
+    assert (F.shape, estimate.inliers.dtype) == ((len(ok), 3, 3), torch.bool)
     for i in range(len(ok)):
         support = int(estimate.inliers[i].sum())
         if bool(ok[i]):

@@ -9,8 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fmtorch.core import NetworkFileError
-from fmtorch.core.onnx_network import onnx_session
+from fmtorch.core import NetworkFileError, onnx_session
 
 
 def main(source: Path, folder: Path, count: int) -> None:

@@ -12,8 +12,7 @@ import pytest
 
 from fmtorch.core import models_dir, pair_key
 from fmtorch.data import ImageError, read_image
-from fmtorch.runs import PairRow, RunFolder, RunFolderError
-from fmtorch.runs.feature_cache import ArrayCache
+from fmtorch.runs import ArrayCache, PairRow, RunFolder, RunFolderError
 from tests.processes import ONE_THREAD
 from tests.reliability.images import NO_IMAGES, SOUND
 

@@ -6,7 +6,6 @@ read-only, and files that stand in the place of folders. Where nothing may be mo
 
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -39,9 +38,7 @@ def expect_one_line(command: Command, *words: str) -> None:
 
 
 @mounts
-def test_a_full_disk_ends_the_run_which_goes_on_with_more_room(
-    starter: Starter, root: Path, truth: Rows, tmp_path: Path
-) -> None:
+def test_a_full_disk_ends_the_run_which_goes_on_with_more_room(starter, root, truth, tmp_path):
     with small_disk(tmp_path / "disk", 60) as disk:
         full = starter.run(tmp_path, "eval", *evaluation(root, disk / "run"))
         expect_one_line(full, "No space left on device")
@@ -52,15 +49,12 @@ def test_a_full_disk_ends_the_run_which_goes_on_with_more_room(
         remount(disk, "size=4m")
         again = starter.run(tmp_path, "eval", *evaluation(root, disk / "run"))
         assert again.status == 0, again.said()
-        assert results(disk / "run") == truth
-        assert parts(disk / "run") == len(truth)
+        assert (results(disk / "run"), parts(disk / "run")) == (truth, len(truth))
 
 
 @mounts
 @pytest.mark.parametrize("options", ["size=40k", "ro"])
-def test_a_cache_that_cannot_be_written_costs_no_row(
-    options: str, starter: Starter, root: Path, truth: Rows, tmp_path: Path
-) -> None:
+def test_a_cache_that_cannot_be_written_costs_no_row(options, starter, root, truth, tmp_path):
     with small_disk(tmp_path / "disk", 40) as disk:
         remount(disk, options)
         run = starter.run(tmp_path, "eval", *evaluation(root, tmp_path / "run", f"cache={disk / 'features'}"))
@@ -81,9 +75,7 @@ def test_a_read_only_folder_is_named(name: str, starter: Starter, root: Path, tm
 
 @pytest.mark.parametrize("name", ["eval", "match", "train"])
 @pytest.mark.parametrize("below", [False, True])
-def test_a_file_in_the_place_of_a_folder_is_named(
-    name: str, below: bool, starter: Starter, root: Path, tmp_path: Path
-) -> None:
+def test_a_file_in_the_place_of_a_folder_is_named(name, below, starter, root, tmp_path):
     (tmp_path / "file").write_text("mine")
     command = starter.run(tmp_path, name, *arguments(name, root, tmp_path / "file" / ("out" if below else "")))
     expect_one_line(command, str(tmp_path / "file"))
@@ -142,16 +134,12 @@ def fail_at(starter: Starter, root: Path, folder: Path, truth: Rows, number: int
 
 
 @pytest.mark.parametrize("number", [1, 5])
-def test_a_write_that_fails_loses_nothing(
-    number: int, starter: Starter, root: Path, truth: Rows, tmp_path: Path
-) -> None:
+def test_a_write_that_fails_loses_nothing(number, starter, root, truth, tmp_path):
     assert fail_at(starter, root, tmp_path, truth, number)
 
 
 @pytest.mark.reliability
-def test_no_write_that_fails_loses_anything(
-    starter: Starter, root: Path, truth: Rows, tmp_path: Path, record_property: Callable[[str, object], None]
-) -> None:
+def test_no_write_that_fails_loses_anything(starter, root, truth, tmp_path, record_property):
     number = 1
     while fail_at(starter, root, tmp_path, truth, number):
         number += 1
@@ -174,9 +162,7 @@ def test_two_writers(starter: Starter, root: Path, truth: Rows, tmp_path: Path) 
 
 
 @pytest.mark.reliability
-def test_two_writers_often(
-    starter: Starter, root: Path, truth: Rows, tmp_path: Path, record_property: Callable[[str, object], None]
-) -> None:
+def test_two_writers_often(starter, root, truth, tmp_path, record_property):
     for seed in range(1, 11):
         two_writers(starter, root, tmp_path, truth, seed)
     record_property("runs of two writers", 10)

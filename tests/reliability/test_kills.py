@@ -55,9 +55,7 @@ def evaluate_with_kills(
 
 
 @pytest.mark.parametrize("kills", bounded_and_whole(3, EVAL_KILLS))
-def test_an_evaluation_goes_on(
-    kills: int, starter: Starter, root: Path, truth: Rows, tmp_path: Path, record_property: Property
-) -> None:
+def test_an_evaluation_goes_on(kills, starter, root, truth, tmp_path, record_property):
     killed, finished = evaluate_with_kills(starter, root, tmp_path, kills, 0)
     assert killed == kills
     assert all(rows == truth for rows in finished)
@@ -65,9 +63,7 @@ def test_an_evaluation_goes_on(
 
 
 @pytest.mark.reliability
-def test_with_processes_none_is_left_behind(
-    starter: Starter, root: Path, truth: Rows, tmp_path: Path, record_property: Property
-) -> None:
+def test_with_processes_none_is_left_behind(starter, root, truth, tmp_path, record_property):
     extra = ("processes=true", "workers=2", "batch=1")
     killed, finished = evaluate_with_kills(starter, root, tmp_path, PROCESS_KILLS, 2, *extra)
     assert all(rows == truth for rows in finished)
@@ -121,9 +117,7 @@ def match_with_kills(starter: Starter, root: Path, folder: Path, kills: int, see
 
 
 @pytest.mark.parametrize("kills", bounded_and_whole(1, MATCH_KILLS))
-def test_two_photographs_are_matched_again(
-    kills: int, starter: Starter, root: Path, tmp_path: Path, record_property: Property
-) -> None:
+def test_two_photographs_are_matched_again(kills, starter, root, tmp_path, record_property):
     killed = match_with_kills(starter, root, tmp_path, kills, 0)
     assert killed == kills
     record_property("kills of match", killed)

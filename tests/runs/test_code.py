@@ -96,9 +96,7 @@ FOLLOWED = {
 
 
 @pytest.mark.parametrize("module", FOLLOWED)
-def test_a_module_is_all_that_it_imports_of_its_own(
-    module: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_module_is_all_that_it_imports_of_its_own(module, tmp_path, monkeypatch):
     for name, text in OWN.items():
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(text)

@@ -1,8 +1,11 @@
+"""Run folders: identity, rows, parts that are merged as they grow in number, by several writers with readers."""
+
 import dataclasses
 import errno
 import json
 import multiprocessing
 import os
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -10,10 +13,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from fmtorch.core import pair_key
-from fmtorch.core.files import replacing
+from fmtorch.core import pair_key, replacing
 from fmtorch.runs import PAIR_SCHEMA, PairRow, RunFolder, RunFolderError, identity_digest
-from fmtorch.runs.run_folder import content_digest
+from fmtorch.runs import run_folder as parts_module
+from fmtorch.runs.run_folder import MAX_LEVEL, MERGED, content_digest, part_files
 
 CONFIG = {
     "pipeline": {"name": "sift_ratio", "estimator": {"threshold": 0.5, "samples": 2000}, "stages": ["a", "b"]},
@@ -140,8 +143,7 @@ def test_the_order_of_a_list_of_names_is_part_of_the_identity(tmp_path: Path) ->
 def test_load_reads_whatever_the_identity(tmp_path: Path) -> None:
     RunFolder.open(tmp_path, CONFIG).append([row("a")])
     run = RunFolder.load(tmp_path)
-    assert run.config == CONFIG
-    assert run.read().num_rows == 1
+    assert (run.config, run.read().num_rows) == (CONFIG, 1)
     with pytest.raises(RunFolderError, match=r"no run\.json"):
         RunFolder.load(tmp_path / "absent")
 
@@ -264,8 +266,7 @@ def workers(path: Path, *configs: dict[str, object]) -> list[int | None]:
 def test_several_processes_write_one_folder(tmp_path: Path) -> None:
     assert workers(tmp_path / "run", CONFIG, CONFIG, CONFIG) == [0, 0, 0]
     run = RunFolder.load(tmp_path / "run")
-    assert run.read().num_rows == 3 * 10 + 10
-    assert len(run.done()) == 40
+    assert (run.read().num_rows, len(run.done())) == (3 * 10 + 10, 40)
     assert list(tmp_path.rglob("*.tmp")) == []
 
 
@@ -299,5 +300,93 @@ def test_replacing_keeps_the_old_file_on_error(tmp_path: Path) -> None:
 
     with pytest.raises(KeyboardInterrupt):
         interrupted()
-    assert file.read_text() == "old"
-    assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
+    assert (file.read_text(), [p.name for p in tmp_path.iterdir()]) == ("old", ["a.txt"])
+
+
+IDENTITY = {"pipeline": "sift_ratio", "seed": 0}
+
+
+def numbered_row(key: int) -> PairRow:
+    return PairRow(f"scene/{key}", key, "family", "scene", ok=False, reason=f"reason {key}", corrs=key)
+
+
+def keys(folder: RunFolder) -> list[int]:
+    return [int(key) for key in folder.read()["key"].to_numpy()]
+
+
+def test_few_parts_are_left_of_many_batches(tmp_path: Path) -> None:
+    folder = RunFolder.open(tmp_path / "run", IDENTITY)
+    batches = 2 * MERGED**2 + 3 * MERGED + 5
+    for batch in range(batches):
+        folder.append([numbered_row(2 * batch), numbered_row(2 * batch + 1)])
+    assert len(part_files(folder.path / "pairs")) == 2 + 3 + 5
+    assert (keys(folder), folder.done()) == (list(range(2 * batches)), set(range(2 * batches)))
+    assert RunFolder.load(folder.path).read()["reason"][7].as_py() == "reason 7"
+
+
+def test_parts_do_not_grow_without_bound(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(parts_module, "MERGED", 2)
+    folder = RunFolder.open(tmp_path / "run", IDENTITY)
+    for key in range(3 * 2**MAX_LEVEL):
+        folder.append([numbered_row(key)])
+    assert [len(parts_module.read_part(path)) for path in part_files(folder.path / "pairs")] == [2**MAX_LEVEL] * 3
+
+
+def test_the_first_written_row_counts_after_parts_were_merged(tmp_path: Path) -> None:
+    first, second = (RunFolder.open(tmp_path / "run", IDENTITY) for _ in range(2))
+    first.append([PairRow("scene/0", 0, "family", "scene", ok=False, reason="the first")])
+    second.append([PairRow("scene/0", 0, "family", "scene", ok=False, reason="the second")])
+    for key in range(1, MERGED):
+        first.append([numbered_row(key)])
+    assert len(part_files(first.path / "pairs")) == 2
+    assert first.read()["reason"][0].as_py() == "the first"
+
+
+def test_a_damaged_part_is_left_for_the_reader_to_name(tmp_path: Path) -> None:
+    folder = RunFolder.open(tmp_path / "run", IDENTITY)
+    folder.append([numbered_row(0)])
+    (damaged,) = part_files(folder.path / "pairs")
+    damaged.write_bytes(b"PAR1")
+    for key in range(1, MERGED):
+        folder.append([numbered_row(key)])
+    assert len(part_files(folder.path / "pairs")) == MERGED
+    with pytest.raises(ValueError, match=damaged.name):
+        folder.done()
+    damaged.unlink()
+    assert folder.done() == set(range(1, MERGED))
+
+
+def test_a_full_disk_leaves_parts_unmerged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = RunFolder.open(tmp_path / "run", IDENTITY)
+    for key in range(MERGED - 1):
+        folder.append([numbered_row(key)])
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(parts_module.pa, "concat_tables", full)
+    folder.append([numbered_row(MERGED - 1)])
+    monkeypatch.undo()
+    assert len(part_files(folder.path / "pairs")) == MERGED
+    assert folder.done() == set(range(MERGED))
+
+
+def test_readers_lose_no_row_while_parts_are_merged(tmp_path: Path) -> None:
+    folder = RunFolder.open(tmp_path / "run", IDENTITY)
+    written, ended, errors = [0], threading.Event(), list[str]()
+
+    def read() -> None:
+        while not ended.is_set():
+            before = written[0]
+            missing = set(range(before)) - RunFolder.load(folder.path).done()
+            if missing:
+                errors.append(f"{missing} of {before}")
+
+    reader = threading.Thread(target=read)
+    reader.start()
+    for key in range(10 * MERGED):
+        folder.append([numbered_row(key)])
+        written[0] = key + 1
+    ended.set()
+    reader.join()
+    assert errors == []

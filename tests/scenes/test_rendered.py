@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from fmtorch.data.construction import Keypoints
-from fmtorch.scenes import FAMILIES, PICTURES, PLANS, Plan, RenderedPairs, Task, build
+from fmtorch.scenes import FAMILIES, PICTURES, PLANS, Plan, RenderedPairs, StereoPair, Task, build, skimage_file
 from fmtorch.scenes import dataset as generation
 from fmtorch.scenes.dataset import generate, read, recorded_pairs, seeds
 from fmtorch.scenes.light import DrawnScene
@@ -55,8 +55,7 @@ def test_pairs_are_complete_and_consistent(tiny: RenderedPairs, root: Path) -> N
         assert root in pair.image0.path.parents
         assert pair.problem is None
         assert all(value is not None for value in (pair.K0, pair.K1, pair.R, pair.t))
-        assert pair.F.dtype == np.float64
-        assert np.linalg.norm(pair.F) == pytest.approx(1.0)
+        assert (pair.F.dtype, np.linalg.norm(pair.F)) == (np.float64, pytest.approx(1.0))
         F = np.linalg.inv(pair.K1).T @ cross_matrix(pair.t) @ pair.R @ np.linalg.inv(pair.K0)
         np.testing.assert_allclose(F / np.linalg.norm(F), pair.F, atol=1e-12)
         np.testing.assert_allclose(np.linalg.svd(pair.F)[1][2], 0, atol=1e-12)
@@ -65,8 +64,7 @@ def test_pairs_are_complete_and_consistent(tiny: RenderedPairs, root: Path) -> N
 @pytest.mark.slow
 def test_full_scale_sizes_are_those_of_the_sets_they_stand_for() -> None:
     sizes = {f: {s.camera.size for s in built(f, "test").shots} for f in FAMILIES}
-    assert sizes["indoor"] == {(480, 640)}
-    assert sizes["driving"] == {(376, 1241)}
+    assert (sizes["indoor"], sizes["driving"]) == ({(480, 640)}, {(376, 1241)})
     assert sizes["orbit"] == {(540, 960)}
     assert len(sizes["collection"]) > 1
 
@@ -88,8 +86,7 @@ def test_the_same_seed_gives_the_same_bytes_also_from_worker_processes(tmp_path:
     there = RenderedPairs(
         families=["indoor"], root=tmp_path / "b", plan=plan, workers=2, progress=lambda *c: calls.append(c)
     )
-    assert contents(tmp_path / "a") == contents(tmp_path / "b")
-    assert here.digest == there.digest
+    assert (contents(tmp_path / "a"), here.digest) == (contents(tmp_path / "b"), there.digest)
     assert calls == [(0, 2), (1, 2), (2, 2)]
 
 
@@ -173,9 +170,7 @@ def numbered(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 
 @pytest.mark.parametrize("family", FAMILIES)
-def test_a_small_plan_yields_the_planned_pairs_and_draws_no_more_than_it_needs(
-    family: str, numbered: list[int], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_a_small_plan_yields_the_planned_pairs_and_draws_no_more_than_it_needs(family, numbered, monkeypatch, tmp_path):
     """Where the rule keeps everything, a family proposes enough pairs for the plan among its first photographs."""
     monkeypatch.setattr(generation, "matchable", lambda *_: True)
     small = dataclasses.replace(PLANS["small", "test"], scenes=1, scale=0.1)
@@ -226,3 +221,29 @@ def test_recorded_pairs_are_those_of_the_rule(tmp_path: Path, monkeypatch: pytes
     assert sorted(path.name for path in recorded.iterdir()) == names
     for name in names:
         assert (recorded / name).read_bytes() == (judged / name).read_bytes()
+
+
+def test_one_pair_with_the_protocol() -> None:
+    data = StereoPair()
+    assert ((data.name, len(data)), len(data.digest)) == (("stereo", 1), 64)
+    assert [pair.identity for pair in data] == [data[0].identity] == ["stereo/motorcycle/left-right"]
+    with pytest.raises(IndexError):
+        data[1]
+
+
+def test_matches_lie_on_the_epipolar_lines() -> None:
+    data = StereoPair()
+    left, right = data.matches()
+    assert len(left) > 200_000
+    F = data[0].F
+    algebraic = np.einsum("ni,ij,nj->n", np.column_stack([right, np.ones(len(right))]), F,
+                          np.column_stack([left, np.ones(len(left))]))  # fmt: skip
+    # F is a rotation generator over sqrt 2: the distance to the lines is sqrt 2 times the algebraic error.
+    assert np.sqrt(2) * np.abs(algebraic).max() < 1e-9
+
+
+def test_an_absent_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"motorcycle_left\.png"):
+        StereoPair(root=tmp_path)
+    with pytest.raises(FileNotFoundError, match="nothing is downloaded"):
+        skimage_file("kidney.tif")

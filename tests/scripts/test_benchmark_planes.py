@@ -1,17 +1,72 @@
-"""Pairs made of photographs: homographies and kinds of pairs, and their commands."""
+"""Benchmarks with programs of their own: related pairs, planes, cameras, verified databases."""
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
+import pycolmap
 import pytest
 import torch
 from skimage import data as images
 
+from fmtorch.core import Correspondences, Estimate
+from fmtorch.data import ImagePair, ImageSource
 from fmtorch.geometry import homography_transfer
-from fmtorch.two_view.pair_type import classify
-from scripts.benchmark import planes
-from tests.scripts.samples import run
+from fmtorch.scenes import PICTURES, Plan, RenderedPairs
+from fmtorch.two_view import classify
+from scripts.benchmark import cameras, pairs, planes, related, verify
+from scripts.benchmark.cameras import LEVELS, TAKES, CameraMethod
+from scripts.benchmark.methods import read_specs
+from scripts.benchmark.runner import Item, Kept, Row
+from scripts.benchmark.verify import Scene, Truth, accuracy, calibrate, centre_errors, sheets
+from tests.helpers import cross_matrix, draw_set
+from tests.scripts.samples import item as plain_item
+from tests.scripts.samples import pair, read, run
+from tests.verification import databases
+
+
+def seen_pair(scene: str, i: int, j: int) -> ImagePair:
+    images = [ImageSource(f"{scene}/{k}", Path(f"{scene}{k}.png")) for k in (i, j)]
+    return ImagePair(f"family/{scene}/{i}-{j}", "family", scene, *images, np.eye(3))
+
+
+def test_unrelated_pairs_cross_scenes_and_are_chosen_once() -> None:
+    ours = [seen_pair(scene, i, i + 1) for scene in ("a", "b", "c") for i in range(4)]
+    every = pairs.unrelated_pairs(ours, [], 100)
+    assert len(every) == len({frozenset((p.image0.identity, p.image1.identity)) for p in every}) == 3 * 5 * 5
+    assert all(p.image0.identity[0] != p.image1.identity[0] for p in every)
+    some = pairs.unrelated_pairs(ours, [], 7)
+    assert {p.identity for p in some} < {p.identity for p in every}
+    assert len(some) == 3 * 7
+    assert all(p.family.startswith(pairs.UNRELATED) and not p.F.any() for p in every)
+
+
+def test_rendered_scenes_that_show_one_photograph_are_not_paired(tmp_path, monkeypatch):
+    dataset = RenderedPairs("train", families=["indoor"], root=tmp_path, plan=Plan(1, 2, 1, scale=0.2), workers=1)
+    (shown,) = pairs.photographs_shown(dataset).values()
+    assert shown
+    assert shown <= set(PICTURES["train"])
+    shows = {"a": frozenset({"moon"}), "b": frozenset({"moon", "text"}), "c": frozenset({"text"}), "d": frozenset()}
+    monkeypatch.setattr(pairs, "photographs_shown", lambda dataset: shows)
+    monkeypatch.setattr(pairs, "RenderedPairs", list)
+    unrelated = pairs.unrelated_pairs(
+        [*(seen_pair(scene, 0, 1) for scene in "abcd"), seen_pair("real", 0, 1)], [[]], 100
+    )
+    crossed = {p.scene.replace("family/", "") for p in unrelated}
+    assert crossed == {"a | c", "a | d", "b | d", "c | d"}  # neither a | b, b | c, nor a drawn and a real one
+
+
+def test_the_command_tells_pairs_apart(tmp_path, capsys, monkeypatch):
+    rows, pipelines = tmp_path / "rows.jsonl", ["sift_gms", "sift_ratio*"]
+    root = draw_set(tmp_path / "Set", "ab", images=2)
+    run(capsys, monkeypatch, "related", "--root", root, "--unrelated", 3, "--pipelines",
+        *pipelines, "--cache", "off", "--rows", rows, "--figure", tmp_path / "roc.svg")  # fmt: skip
+    own = read(rows)
+    assert len(own) == 2 * (2 + 3)
+    assert all(related.called_related(r) == related.true(r) for r in own)
+    assert "sift_gms" in run(capsys, monkeypatch, "related", "--rows", rows)
+    assert "estimator=lmeds_eight_point" in (tmp_path / "roc.svg").read_text()
 
 
 @pytest.fixture(scope="module")
@@ -61,3 +116,161 @@ def test_an_estimate_is_judged_where_the_plane_is_seen(folder: Path) -> None:
     errors = [planes.Homography("x", lambda c, seed, H=H: H).figures(item, 0)["corner_error"]
               for H in (item.pair.H, shifted, None)]  # fmt: skip
     assert errors == [pytest.approx(0, abs=1e-9), pytest.approx(5), np.inf]
+
+
+SIZES = np.array([[760, 1000], [760, 1000]])
+K = np.array([[950.0, 0, 499.5], [0, 950, 379.5], [0, 0, 1]])
+R = cv2.Rodrigues(np.array([0.05, 0.3, 0.02]))[0]
+T = np.array([-1.0, 0.1, 0.3])
+ROTATION = {"known": 1, "rough": 3, "wrong": 180, "one_sided": 3, "shared": 3, "unknown": 3}  # degrees, at most
+
+
+def item(K0: np.ndarray = K, name: str = "orbit/s/0") -> Item:
+    """A pair of cameras with 200 right matches, of 0.1 px of noise, and 50 wrong ones of larger ratio."""
+    rng = np.random.default_rng(0)
+    X = rng.uniform([-2, -1.5, 4], [2, 1.5, 8], (250, 3))
+    x0, x1 = (Y[:, :2] / Y[:, 2:] + rng.normal(0, 0.1, (250, 2)) for Y in (X @ K0.T, (X @ R.T + T) @ K.T))
+    x1[200:] = rng.uniform(0, 760, (50, 2))
+    of = pair(name, true_f(K0, K, R, T), K0=K0, K1=K, R=R, t=T)
+    ratio = torch.linspace(0.3, 0.8, 250)[None]
+    sizes, frame = torch.from_numpy(SIZES), torch.diag(torch.tensor([4.0, 4])).expand(1, 250, 2, 2)
+    points = [torch.from_numpy(x)[None].float() for x in (x0, x1)]
+    lafs0, lafs1 = (torch.cat([frame, x[..., None]], -1) for x in points)
+    matches = Correspondences(
+        *points, torch.ones(1, 250, dtype=torch.bool), ratio=ratio, lafs0=lafs0, lafs1=lafs1, size0=sizes[:1],
+        size1=sizes[1:], key=torch.tensor([of.key]),
+    )  # fmt: skip
+    return plain_item(of, matches)
+
+
+def true_f(K0: np.ndarray, K1: np.ndarray, R: np.ndarray, t: np.ndarray) -> np.ndarray:
+    return np.linalg.inv(K1).T @ cross_matrix(t) @ R @ np.linalg.inv(K0)
+
+
+@pytest.mark.parametrize(("name", "level"), [(name, level) for name, levels in TAKES.items() for level in levels])
+def test_every_method_solves_an_easy_pair_at_each_level_that_it_takes(name: str, level: str) -> None:
+    kind = name.partition("_")[0]
+    pytest.importorskip({"poselib": "poselib", "colmap": "pycolmap"}.get(kind, "cv2"))
+    ours = kind == "fmtorch"
+    found = CameraMethod.of(f"{name}:{level}" + ("" if ours else ":threshold=1")).figures(item(), 0)
+    assert found["ok"]
+    assert found["flipped"] is False
+    assert ("focal_10" in found) == (level != "known")
+    if ours or level not in ("rough", "wrong"):  # which peers take for exact
+        assert found["rotation_error"] < ROTATION[level]
+        assert found["nsgd"] < 0.01
+        assert found.get("focal_10", 1.0) == 1.0 or level == "wrong"  # the usual focal length is off by a quarter
+
+
+@pytest.mark.parametrize(("text", "message"), [
+    ("poselib", "write NAME:LEVEL"), ("poselib:some", "with a level of known, rough"),
+    ("opencv:shared", "opencv has no estimator for 'shared'"), ("peer:known", "no method 'peer'; there are fmtorch"),
+])  # fmt: skip
+def test_a_method_that_there_is_not_is_refused(text: str, message: str) -> None:
+    with pytest.raises(SystemExit, match=message):
+        CameraMethod.of(text)
+
+
+def test_the_methods_of_the_page_are_methods() -> None:
+    texts = read_specs(Path(cameras.__file__).with_name("cameras.txt"))
+    assert len(set(texts)) == len(texts)
+    assert {CameraMethod.of(text).level for text in texts} == set(LEVELS)
+
+
+def judged(level: str, R: np.ndarray | None, t: np.ndarray = T, focals: tuple[float, float] | None = None) -> Row:
+    """What is said of an answer."""
+    given = item()
+    posed = {} if R is None else {"R": torch.from_numpy(R)[None], "t": torch.from_numpy(t)[None]}
+    posed |= {} if focals is None else {"focals": torch.tensor([focals], dtype=torch.float64)}
+    ok, mask = torch.tensor([R is not None]), given.matches.mask
+    F = torch.from_numpy(given.pair.F / np.linalg.norm(given.pair.F))[None] * ok
+    answer = Estimate(
+        F, mask & ok, ok, ("" if R is not None else "nothing",), torch.zeros(1, dtype=torch.int64), **posed
+    )
+    return CameraMethod("x", level, lambda c, seed: answer, "").figures(given, 0)
+
+
+def test_judgement_of_a_true_a_flipped_and_no_pose() -> None:
+    true = judged("unknown", R, T / np.linalg.norm(T), (950.0, 1000.0))
+    assert [true[key] for key in ("rotation_error", "translation_error", "nsgd")] == pytest.approx([0, 0, 0], abs=1e-5)
+    assert (true["focal_5"], true["focal_10"], true["flipped"]) == (0.5, 1.0, False)
+    flipped = judged("known", R, -T / np.linalg.norm(T))
+    assert flipped["flipped"] is True
+    assert flipped["translation_error"] == pytest.approx(0, abs=1e-5)
+    nothing = judged("shared", None)
+    assert (nothing["rotation_error"], nothing["translation_error"], nothing["nsgd"]) == (180, 90, 1)
+    assert nothing["focal_10"] == 0
+    assert "flipped" not in nothing
+
+
+CALIBRATION = np.array([[700.0, 0, 310], [0, 701, 250], [0, 0, 1]])
+AREAS = [f"{name}{limit}" for name in ("auc", "centre") for limit in (1, 5, 10)]
+
+
+def walk_scene(count: int = 5) -> tuple[Scene, dict[str, Any]]:
+    """Cameras, and their poses in a frame that is turned, moved and twice as large."""
+    cameras = databases.scene(count)
+    names = [f"{i:03d}.jpg" for i in range(count)]
+    truth = Truth(*(dict(zip(names, values, strict=True)) for values in ([CALIBRATION] * count, cameras.R, cameras.t)))
+    turn = databases.scene(2).R[1]
+    poses = {}
+    for name in names:
+        centre = 2 * turn @ (-truth.R[name].T @ truth.t[name]) + np.array([1.0, 2, 3])
+        R = truth.R[name] @ turn.T
+        poses[name] = pycolmap.Rigid3d(pycolmap.Rotation3d(R), -R @ centre)
+    return Scene("walk", Path(), truth, True), poses
+
+
+def test_true_poses_have_no_error_in_any_frame_and_an_image_without_a_pose_counts_as_wrong() -> None:
+    """Without one, four of the ten pairs, and one of the five centres."""
+    walk, poses = walk_scene()
+    figures = accuracy(poses, walk.truth)
+    assert set(figures) == set(AREAS)
+    assert min(figures.values()) > 99.99
+    assert centre_errors(poses, walk.truth).max() < 1e-6
+    del poses["002.jpg"]
+    figures = accuracy(poses, walk.truth)
+    assert figures["auc10"] == pytest.approx(60, abs=0.01)
+    assert figures["centre10"] == pytest.approx(80, abs=0.01)
+    assert accuracy({}, walk.truth)["centre10"] == 0
+
+
+def test_known_cameras_are_the_true_ones(tmp_path: Path) -> None:
+    """In COLMAP's pixels, and with a prior."""
+    path = tmp_path / "database.db"
+    databases.write(path, databases.scene(5), prior=False)
+    calibrate(path, walk_scene()[0].truth)
+    with pycolmap.Database.open(path) as database:
+        (camera,) = database.read_all_cameras()
+    assert (camera.model_name, camera.has_prior_focal_length) == ("PINHOLE", True)
+    assert camera.params.tolist() == [700, 701, 310.5, 250.5]
+
+
+def test_an_interrupted_run_measures_what_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    databases.write(tmp_path / "walk.db", databases.scene(3))
+    mapped: list[str] = []
+
+    def interrupted(mapper: str, *_: Any) -> dict[str, Any]:
+        mapped.append(mapper)
+        if len(mapped) == 2:
+            raise KeyboardInterrupt
+        return {"seconds": 1.0, "registered": 3, "images": 3, **dict.fromkeys(AREAS, 50.0)}
+
+    monkeypatch.setattr(verify, "mapped", interrupted)
+    key = ("walk", "colmap", "known", "ours", 0)
+    walk = walk_scene(3)[0]
+    for _ in range(2):
+        kept = Kept(tmp_path / "rows.jsonl")
+        try:
+            verify.measure(walk, tmp_path / "walk.db", key, ["incremental", "global"], kept)
+        except KeyboardInterrupt:
+            assert [row["mapper"] for row in kept.rows] == ["", "incremental"]
+    assert mapped == ["incremental", "global", "global"]
+    assert [row["mapper"] for row in kept.rows] == ["", "incremental", "global"]
+    assert (kept.rows[0]["pairs"], kept.rows[0]["verified"], kept.rows[0]["poses"]) == (3, 3, 3)
+    assert [path.name for path in tmp_path.glob("*.db*")] == ["walk.db"]
+    means, pairs, models = ([list(line.values()) for line in sheet.records] for sheet in sheets(kept.rows))
+    assert means[0][:4] == ["colmap", "known", "ours", 1]
+    assert means[0][5:9] == ["100.0", "50.0", "50.0", "50.0"]
+    assert pairs[0][3:7] == ["walk", 1, "3", "3"]
+    assert [line[3:7] for line in models] == [[m, "walk", 1, "3.0"] for m in ("incremental", "global")]

@@ -102,9 +102,7 @@ CALLS = {"E:poselib": _poselib_e, "F:poselib": _poselib_f, "E:colmap": _colmap_e
 
 
 @pytest.mark.parametrize("method", CALLS)
-def test_peers_have_the_figures_of_posebenchs_own_protocol(
-    method: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_peers_have_the_figures_of_posebenchs_own_protocol(method, tmp_path, capsys, monkeypatch):
     expected = direct(method)
     rows = tmp_path / "rows.jsonl"
     folder = sample(tmp_path / "relative")
@@ -120,9 +118,7 @@ def test_peers_have_the_figures_of_posebenchs_own_protocol(
     assert [each["reason"] != "" for each in read(rows)] == [False] * (PAIRS - 1) + [True]
 
 
-def test_our_estimators_run_by_the_protocol_and_a_run_goes_on_where_it_stopped(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_our_estimators_run_by_the_protocol_and_a_run_goes_on_where_it_stopped(tmp_path, capsys, monkeypatch):
     rows, methods = tmp_path / "rows.jsonl", ["E:fmtorch", "F:fmtorch", "E:fmtorch:scaled=false"]
     arguments = [sample(tmp_path / "relative").parent, "--methods", *methods, "--rows", rows]
     printed = run(capsys, monkeypatch, "posebench", *arguments, "--every", 3)
@@ -159,9 +155,7 @@ def test_the_protocol_gives_each_estimator_its_options() -> None:
             Protocol.of(wrong)
 
 
-def test_what_is_not_posebenchs_is_named(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_not_posebenchs_is_named(tmp_path, capsys, monkeypatch):
     own = sample(tmp_path / "own", "mine")
     lmeds = ["--methods", "F:opencv:method=lmeds"]
     with pytest.raises(SystemExit, match=r"mine\.h5 is none of PoseBench's sets: give its threshold in pixels"):

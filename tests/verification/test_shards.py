@@ -23,10 +23,8 @@ def test_processes_find_what_threads_find(tmp_path: Path) -> None:
     reports: list[tuple[int, int]] = []
     fmtorch.verify(path)
     result = fmtorch.verify(other, execution=Execution("processes", 2), report=lambda *c: reports.append(c))
-    assert (result.pairs, result.verified) == (10, 10)
-    assert reports[0] == (0, 10)
-    assert reports[-1] == (10, 10)
-    assert plain(read(other)) == plain(read(path))
+    assert ((result.pairs, result.verified), reports[0]) == ((10, 10), (0, 10))
+    assert (reports[-1], plain(read(other))) == ((10, 10), plain(read(path)))
 
 
 @pytest.mark.parametrize("output", [False, True])
@@ -52,10 +50,7 @@ def test_shards_of_other_settings_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "database.db"
     write(path, scene(3))
     fmtorch.verify(path, shard="1/2")
-    with pytest.raises(
-        ValueError,
-        match=r"holds geometries of other settings; .*: seed: 0 -> 1\. Give the same, or",
-    ):
+    with pytest.raises(ValueError, match=r"holds geometries of other settings; .*: seed: 0 -> 1\. Give the same, or"):
         fmtorch.verify(path, shard="2/2", seed=1)
     with pytest.raises(ValueError, match=r"shard=3/2; it must be i/n"):
         fmtorch.verify(path, shard="3/2")

@@ -1,4 +1,6 @@
-"""The posterior of two cameras: its derivatives, its maximum as SciPy finds it, and what the prior costs there."""
+"""Posteriors over cameras and lenses: cheirality, optima, tangents."""
+
+from __future__ import annotations
 
 import math
 
@@ -7,47 +9,50 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from fmtorch.estimators import Pair, SevenPoint
+from fmtorch.core import Correspondences
+from fmtorch.estimators import BITS, Lens, Loss, Pair, SevenPoint, Steps, cheirality
 from fmtorch.estimators.final_fits import PRIOR_CONFLICT_GAIN
-from fmtorch.estimators.models.model import Loss, Steps
-from fmtorch.estimators.models.posterior import (
-    Cameras,
-    Limits,
-    Optimum,
-    centred,
-    images_of,
-    minimise,
-    nearest_cameras,
-    no_cameras,
-    no_optimum,
+from fmtorch.estimators.lens_search import (
+    STRAIGHT,
+    LensFit,
+    LensPrior,
+    fit_with_lenses,
+    lens_prior,
+    squared_px,
+    undistorted,
 )
+from fmtorch.estimators.models import posterior
+from fmtorch.estimators.models.focal_prior import LOG_USUAL
 from fmtorch.estimators.models.with_focals import LOSS_SCALE_PX, FundamentalWithFocals, Refined
 from fmtorch.geometry.levenberg_marquardt import Weighted
-from tests.estimators.models.photographs import TALL, WIDE, Sizes, photographs, with_prior
+from tests.estimators.models.test_focals import TALL, WIDE, Sizes, photographs, with_prior
 from tests.estimators.pairs import apart, in_pixels, pair_of, to_units
 from tests.reference import focal as reference
+from tests.reference import lenses
 from tests.reference.refine import loss as loss_of
 from tests.reference.refine import sampson
 
 FAMILY = FundamentalWithFocals()
 
 
-def start(F: np.ndarray, pair: Pair) -> Cameras:
+def start(F: np.ndarray, pair: Pair) -> posterior.Cameras:
     """The cameras near one model (3, 3) of pixels."""
-    cameras = no_cameras(1)
-    nearest_cameras(to_units(F, pair)[None], images_of(pair), cameras)
+    cameras = posterior.no_cameras(1)
+    posterior.nearest_cameras(to_units(F, pair)[None], posterior.images_of(pair), cameras)
     return cameras
 
 
-def evaluated(cameras: Cameras, pair: Pair, loss: str, scale_px: float, precision: float) -> Optimum:
+def evaluated(
+    cameras: posterior.Cameras, pair: Pair, loss: str, scale_px: float, precision: float
+) -> posterior.Optimum:
     """The posterior at cameras: `minimise` without a step."""
-    matches, out = centred(pair, scale_px), no_optimum(1)
+    matches, out = posterior.centred(pair, scale_px), posterior.no_optimum(1)
     weighted = Weighted.of(matches.points, pair.weight, matches.s2, loss)
-    minimise(cameras.copy(), weighted, images_of(pair), Limits(precision, 0, 0.0), out)
+    posterior.minimise(cameras.copy(), weighted, posterior.images_of(pair), posterior.Limits(precision, 0, 0.0), out)
     return out
 
 
-def moved(cameras: Cameras, by: np.ndarray) -> Cameras:
+def moved(cameras: posterior.Cameras, by: np.ndarray) -> posterior.Cameras:
     """By three rotations of U, two of V, and two logarithms."""
     turned = cameras.copy()
     turned.axes[0, 0] = cameras.axes[0, 0] @ Rotation.from_rotvec(by[:3]).as_matrix()
@@ -66,18 +71,18 @@ def test_cost_and_derivatives(loss: str, sizes: Sizes) -> None:
     cameras = moved(start(truth, pair), np.random.default_rng(1).normal(0, 3e-4, 7))
     precision, scale = 40.0 / 0.3**2 * pair.pixels_per_unit**2, 0.7
     computed = evaluated(cameras, pair, loss, scale, precision)
-    x0, x1 = centred(pair).points[:2].T, centred(pair).points[2:].T
+    x0, x1 = posterior.centred(pair).points[:2].T, posterior.centred(pair).points[2:].T
     s = scale * noise[0].numpy() / pair.pixels_per_unit
 
-    def residuals(cameras: Cameras) -> np.ndarray:
+    def residuals(cameras: posterior.Cameras) -> np.ndarray:
         return sampson(evaluated(cameras, pair, loss, scale, precision).F.reshape(3, 3), x0, x1)
 
-    def data(cameras: Cameras) -> float:
+    def data(cameras: posterior.Cameras) -> float:
         r2 = residuals(cameras) ** 2
         each = [w * loss_of(np.array([r]), b * b, loss)[0] for w, r, b in zip(pair.weight, r2, s, strict=True)]
         return precision / 2 * sum(each)
 
-    def prior(cameras: Cameras) -> float:
+    def prior(cameras: posterior.Cameras) -> float:
         return reference.prior_cost(*cameras.focal[0].tolist(), same_size=sizes[0] == sizes[1])
 
     assert computed.cost[0] == pytest.approx(data(cameras) + prior(cameras), rel=1e-9)
@@ -138,7 +143,7 @@ def test_the_fit_reaches_the_optimum_and_tells_what_the_prior_costs(focal: tuple
     c, truth, _ = photographs(5, (WIDE, WIDE), focal, 150, noise, outliers=0.0)
     pair = pair_of(c)
     precision = (pair.pixels_per_unit / noise) ** 2
-    fit = FAMILY.fit(start(truth, pair), pair, wide, Limits(precision, 50, 0.0))
+    fit = FAMILY.fit(start(truth, pair), pair, wide, posterior.Limits(precision, 50, 0.0))
     end = evaluated(fit.cameras, pair, "truncated", wide, precision)
     assert np.abs(end.gradient).max() < 1e-6 * np.abs(end.hessian).max()
     # What a fit without prior gains from there, in logarithms of the likelihood.
@@ -154,15 +159,15 @@ def test_a_fit_goes_on_after_a_rejected_step() -> None:
     """The first step from this start raises the cost; shorter ones gain more than what ends the fit."""
     c, truth, _ = photographs(2, (WIDE, WIDE), (1.0, 1.0), 150, 0.5, 0.3)
     pair, px = pair_of(c), 1.0
-    precision, matches = (pair.pixels_per_unit / (px / 2)) ** 2, centred(pair_of(c), px)
+    precision, matches = (pair.pixels_per_unit / (px / 2)) ** 2, posterior.centred(pair_of(c), px)
     begin, _ = FAMILY.refine(to_units(truth, pair)[None], pair, 12)
     begin.focal[0] += [0.1, -0.1]
     weighted = Weighted.of(matches.points, pair.weight, matches.s2)
     before = evaluated(begin, pair, "truncated", px, precision)
-    single_step, out = begin.copy(), no_optimum(1)
-    minimise(single_step, weighted, images_of(pair), Limits(precision, 1, 0.05), out)
+    single_step, out = begin.copy(), posterior.no_optimum(1)
+    posterior.minimise(single_step, weighted, posterior.images_of(pair), posterior.Limits(precision, 1, 0.05), out)
     assert out.cost == before.cost
-    fit = FAMILY.fit(begin, pair, px, Limits(precision, 30, 0.05))
+    fit = FAMILY.fit(begin, pair, px, posterior.Limits(precision, 30, 0.05))
     after = evaluated(fit.cameras, pair, "truncated", px, precision)
     assert after.cost < before.cost - 0.05
 
@@ -178,3 +183,214 @@ def test_models_that_are_not_finite_harm_no_other() -> None:
     for single, many in zip(alone, among, strict=True):
         np.testing.assert_array_equal(many[2], single[0])
     assert among.cost[:2].tolist() == [math.inf, math.inf]
+
+
+def factors(seed: int) -> tuple[np.random.Generator, np.ndarray, np.ndarray, np.ndarray]:
+    """A generator, E of random cameras, and factors of it with random signs and a random turn."""
+    rng = np.random.default_rng(seed)
+    t, R = rng.normal(size=3), Rotation.from_rotvec(rng.uniform(-0.5, 0.5, 3)).as_matrix()
+    E = np.cross(np.eye(3), -t / np.linalg.norm(t)) @ R
+    U, _, Vt = np.linalg.svd(E)
+    turn = np.eye(3)
+    angle = rng.uniform(0, 2 * np.pi)
+    turn[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    U, V = U @ turn, Vt.T @ turn  # of a double singular value
+    return rng, E, U * [1, 1, rng.choice([-1, 1])], V * [1, 1, rng.choice([-1, 1])]
+
+
+def share(
+    U: np.ndarray, V: np.ndarray, focal: np.ndarray, points: np.ndarray, support: np.ndarray, tolerance: float
+) -> float:
+    """Of exact points (4, n), whose gain is one."""
+    K0, K1 = (np.diag([1 / f, 1 / f, 1]) for f in focal)
+    F, out = (K1 @ U @ np.diag([1, 1, 0]) @ V.T @ K0).reshape(1, 9), np.empty(1)
+    cameras = posterior.Cameras(np.stack([U, V])[None].copy(), np.log(focal)[None])
+    matches = Weighted.of(points, support, np.full(len(support), 1e4), "geman_mcclure")
+    cheirality(cameras, np.ones(2), F, matches, tolerance, out)
+    return float(out[0])
+
+
+@pytest.mark.parametrize("tolerance", [0.0, 0.02])
+@pytest.mark.parametrize("seed", range(12))
+def test_as_by_triangulation(seed: int, tolerance: float) -> None:
+    rng, E, U, V = factors(seed)
+    assert np.allclose(U @ np.diag([1, 1, 0]) @ V.T, E) or np.allclose(U @ np.diag([1, 1, 0]) @ V.T, -E)
+    n, focal = 80, rng.uniform(0.8, 2, 2)
+    x0 = rng.uniform(-0.8, 0.8, (n, 2))
+    rays0 = np.c_[x0 / focal[0], np.ones(n)]
+    # Points of image 1 on the epipolar lines, anywhere: about a quarter lie in front of each of the four camera pairs.
+    lines = rays0 @ E.T
+    x1 = rng.uniform(-0.8, 0.8, n)
+    rays1 = np.c_[x1 / focal[1], -(lines[:, 0] * x1 / focal[1] + lines[:, 2]) / lines[:, 1], np.ones(n)]
+    support = rng.integers(1, 1 << 10, n) / (1 << 10)  # of few bits: their sums are exact
+    points = np.stack([*x0.T, *(rays1[:, :2] * focal[1]).T])
+    computed = share(U, V, focal, points, support, tolerance)
+    expected = reference.share_in_front(E, rays0, rays1, support, np.full(n, tolerance / focal[1]))
+    # Supports are rounded to BITS, those of gains that rounding leaves a little below one.
+    assert computed == pytest.approx(expected, abs=n * 2.0**-BITS / support.sum())
+    assert 0.25 <= computed < 0.95  # neither all nor none, so that the comparison tells
+
+
+def test_support_is_the_gain_of_geman_and_mcclure() -> None:
+    """Matches off their lines count less, beyond five scales not at all: the rest is that of exact ones."""
+    rng, E, U, V = factors(0)
+    points = rng.uniform(-0.8, 0.8, (4, 60))
+    weight, ones = rng.random(60), np.ones(2)
+    h0, h1 = np.c_[points[:2].T, np.ones(60)], np.c_[points[2:].T, np.ones(60)]
+    l1, l0 = h0 @ E.T, h1 @ E
+    r2 = (h1 * l1).sum(1) ** 2 / (l1[:, :2] ** 2 + l0[:, :2] ** 2).sum(1)
+    scale = 30.0
+    gain = np.maximum(1 / (1 + r2 * scale) - 1 / 26, 0) / (1 - 1 / 26)
+    cameras, out = posterior.Cameras(np.stack([U, V])[None].copy(), np.zeros((1, 2))), np.empty(1)
+    loss, F = "geman_mcclure", (U @ np.diag([1, 1, 0]) @ V.T).reshape(1, 9)
+    cheirality(cameras, ones, F, Weighted.of(points, weight, np.full(60, scale), loss), 0.0, out)
+    computed = out[0]
+    # The same, each match weighted by its gain, with a scale so small that all count fully.
+    cheirality(cameras, ones, F, Weighted.of(points, weight * gain, np.full(60, 1e-12), loss), 0.0, out)
+    assert computed == pytest.approx(out[0], abs=60 * 2.0**-BITS / (weight * gain).sum())
+
+
+def near(F: np.ndarray, pair: Pair) -> posterior.Cameras:
+    """The cameras near models (k, 9) of a pair's points."""
+    cameras = posterior.no_cameras(len(F))
+    posterior.nearest_cameras(F, posterior.images_of(pair), cameras)
+    return cameras
+
+
+def models_of(cameras: posterior.Cameras, pair: Pair) -> np.ndarray:
+    """Their fundamental matrices (k, 9), of a pair's points."""
+    k, images = len(cameras.focal), posterior.images_of(pair)
+    F, moved = np.empty((k, 9)), np.empty((k, 9))
+    posterior.tangents_of(cameras, images.longest, F, np.zeros((k, 9, 8)))
+    posterior.translate(F, images.offset, moved)
+    return moved
+
+
+@pytest.mark.parametrize("sizes", [(WIDE, WIDE), (WIDE, TALL)])
+def test_cameras_of_a_model_are_those_that_made_it(sizes: tuple[tuple[int, int], tuple[int, int]]) -> None:
+    for seed in range(8):
+        focal = tuple(np.random.default_rng(seed).uniform(0.6, 3, 2).tolist())
+        c, truth, _ = photographs(seed, sizes, focal)
+        pair = pair_of(c)
+        F = to_units(truth, pair)
+        cameras = near(F[None], pair)
+        # Bougnoux's formula loses the digits in which the axes' planes differ, 1e3 here at most, and its root half.
+        np.testing.assert_allclose(np.exp(cameras.focal[0]), focal, rtol=1e-8)
+        assert apart(models_of(cameras, pair)[0], F) < 1e-9
+        for axes in cameras.axes[0]:
+            np.testing.assert_allclose(axes.T @ axes, np.eye(3), atol=1e-12)
+
+
+def test_implausible_focal_lengths_are_replaced_by_usual_ones() -> None:
+    c, _, parameters = photographs(0)
+    pair = pair_of(c)
+    for first, second in ((0.2, 1.0), (1.0, 5.5), (0.1, 9.0)):
+        strange = np.concatenate([parameters[:6], np.log([first, second])])
+        cameras = near(to_units(reference.fundamental(strange, WIDE, TALL), pair)[None], pair)
+        assert cameras.focal[0].tolist() == [LOG_USUAL, LOG_USUAL]
+        for axes in cameras.axes[0]:
+            np.testing.assert_allclose(axes.T @ axes, np.eye(3), atol=1e-12)
+    assert pytest.approx(math.log(1.2)) == LOG_USUAL
+
+
+SIZE = (480, 640)
+LENSES = (-0.2, -0.1)
+FREE = LensPrior(np.zeros(2), np.full(2, 1 / 0.15**2), False)
+
+
+def bent_pair(pair_of_lenses: tuple[float, float] = LENSES) -> tuple[Pair, np.ndarray, np.ndarray]:
+    """A pair, its matches (n, 4) in pixels, and F of pinholes."""
+    x0, x1, F, _ = lenses.photographs(0, pair_of_lenses, SIZE, wrong=0)
+    c = Correspondences(
+        torch.from_numpy(x0)[None], torch.from_numpy(x1)[None], torch.ones(1, len(x0), dtype=torch.bool),
+        size0=torch.tensor([SIZE]), size1=torch.tensor([SIZE]),
+    )  # fmt: skip
+    return pair_of(c), np.c_[x0, x1], F
+
+
+def in_units(F: np.ndarray, pair: Pair) -> np.ndarray:
+    """A model of pixels as that (9,) of a pair's points."""
+    T0, T1 = (
+        np.array([[pair.pixels_per_unit, 0, x], [0, pair.pixels_per_unit, y], [0, 0, 1]])
+        for x, y in pair.centre.reshape(2, 2)
+    )
+    G = T1.T @ F @ T0
+    return (G / np.linalg.norm(G)).ravel()
+
+
+def nearly(F: np.ndarray, pair: Pair) -> posterior.Cameras:
+    cameras = posterior.no_cameras(1)
+    posterior.nearest_cameras(in_units(F, pair)[None], posterior.images_of(pair), cameras)
+    return cameras
+
+
+def fitted(
+    cameras: posterior.Cameras, lens: np.ndarray, pair: Pair, iterations: int, prior: LensPrior = FREE
+) -> LensFit:
+    return fit_with_lenses(cameras, lens[None], prior, pair, 2.0, iterations)[0]
+
+
+def test_residuals_are_those_of_the_photographs() -> None:
+    pair, x, F = bent_pair()
+    expected = [lenses.sampson(F, each, (SIZE, SIZE), LENSES) ** 2 for each in x]
+    np.testing.assert_allclose(squared_px(in_units(F, pair), np.array(LENSES), pair), expected, rtol=1e-5, atol=1e-9)
+
+
+def test_noise_grows_as_the_lens_stretches() -> None:
+    pair, x, _ = bent_pair()
+    noise, step = undistorted(pair, np.array(LENSES)).noises, 1e-3
+    for k in range(0, len(x), 40):
+        areas = []
+        for i in range(2):
+            at = x[k, 2 * i : 2 * i + 2]
+            J = [
+                (lenses.straight(at + d, SIZE, LENSES[i]) - lenses.straight(at - d, SIZE, LENSES[i])) / 2 / step
+                for d in step * np.eye(2)
+            ]
+            areas.append(abs(np.linalg.det(J)))
+        assert noise[k] == pytest.approx(np.sqrt(np.mean(areas)), rel=1e-6)
+
+
+def test_derivatives_are_those_of_the_cost() -> None:
+    pair, _, F = bent_pair()
+    cameras, lens, h = nearly(F, pair), np.array([-0.15, -0.13]), 1e-6
+
+    def moved(i: int, by: float) -> float:
+        axes, focal, own = cameras.axes.copy(), cameras.focal.copy(), lens.copy()
+        if i < 5:
+            axes[0, i // 3] = axes[0, i // 3] @ Rotation.from_rotvec(by * np.eye(3)[i % 3]).as_matrix()
+        elif i < 7:
+            focal[0, i - 5] += by
+        else:
+            own[i - 7] += by
+        return fitted(posterior.Cameras(axes, focal), own, pair, 0).cost
+
+    gradient = fitted(cameras, lens, pair, 0).gradient
+    for i in range(9):
+        assert gradient[i] == pytest.approx((moved(i, h) - moved(i, -h)) / (2 * h), rel=1e-3, abs=1e-2)
+
+
+@pytest.mark.parametrize("start", [(0.0, 0.0), (-0.3, -0.3)])
+def test_the_lenses_are_found_from_afar(start: tuple[float, float]) -> None:
+    pair, _, F = bent_pair()
+    wide = fit_with_lenses(nearly(F, pair), np.array([start]), FREE, pair, 20.0, 20)[0]
+    fit = fitted(wide.cameras, wide.lens, pair, 20)
+    assert fit.lens == pytest.approx(np.array(LENSES), abs=0.02)
+    assert (np.abs(fit.lens - LENSES) < 5 * fit.deviation).all()
+    assert abs(fit.F @ in_units(F, pair)) > 1 - 1e-3
+    assert fit.cost < fitted(nearly(F, pair), np.array(LENSES), pair, 0).cost + 1
+    assert np.abs(fitted(fit.cameras, fit.lens, pair, 0).gradient / np.sqrt(np.diag(fit.hessian))).max() < 0.2
+
+
+def test_one_lens_and_straight_ones() -> None:
+    pair, _, F = bent_pair((-0.15, -0.15))
+    shared = lens_prior(Lens((0.0, 0.0), (np.inf, np.inf), True))
+    fit = fitted(nearly(F, pair), np.array([-0.1, -0.1]), pair, 15, shared)
+    assert fit.lens[0] == fit.lens[1] == pytest.approx(-0.15, abs=0.01)
+    straight = fitted(nearly(F, pair), np.zeros(2), pair, 15, lens_prior(STRAIGHT))
+    assert np.abs(straight.lens).max() < 1e-6
+    assert fit.evidence > straight.evidence + 10
+    known = fitted(
+        nearly(F, pair), np.array([-0.15, -0.15]), pair, 15, lens_prior(Lens((-0.15,) * 2, (0.0,) * 2, True))
+    )
+    assert known.evidence > fit.evidence > fitted(nearly(F, pair), np.full(2, -0.15), pair, 15).evidence

@@ -1,13 +1,23 @@
-"""Masked normalisation against its definition; padding and gradients."""
+"""Networks of learned pruners: layers, LC, DFE, their inputs and files."""
 
+import math
+import runpy
+import sys
+from pathlib import Path
+
+import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
-from fmtorch.core import collate
-from fmtorch.pruning import DFE, LC
+from fmtorch.core import Correspondences, collate
+from fmtorch.geometry import eight_point, sampson
+from fmtorch.pruning import DFE, LC, LearnedPruner, MatchInputs
 from fmtorch.pruning.networks.layers import ContextBatchNormReLU, ResidualBlock, Slots
+from scripts.make_models import ngransac_state
+from tests.conftest import oracle, shared_path
 from tests.laws import scene
-from tests.reference.networks import context_batch_norm_relu
+from tests.reference.pruner_losses import context_batch_norm_relu
 
 
 def batch(channels=3, seed=0, dtype=torch.float64):
@@ -95,3 +105,251 @@ def test_padding_and_neighbours_change_a_networks_values_by_rounding_alone(netwo
             torch.testing.assert_close(together.weight[:, i, :n], alone.weight[:, 0], rtol=1e-3, atol=1e-4)
             assert not together.weight[:, i, n:].any()
     assert torch.isfinite(together.logit).all()
+
+
+@pytest.mark.parametrize("model", ["F_r0.80", "F_rs_r0.80", "F_r1.00"])
+def test_outputs_of_neural_guided_ransac(model: str) -> None:
+    """The authors' weights give the authors' sampling probabilities: float32 against float64 differ by up to 2e-4."""
+    weights = {key: torch.from_numpy(value) for key, value in oracle(f"weights_ngransac_{model}.npz").items()}
+    network = LC(side=["ratio"]).eval()
+    network.load_state_dict(ngransac_state(weights))
+    network.double()
+    data = {key: torch.from_numpy(value) for key, value in oracle("ngransac_net.npz").items() if key != "names"}
+    cases = [key[:3] for key in data if key.endswith(f".logprob_{model}")]
+    assert len(cases) == 6
+    for case in cases:
+        x0, x1, ratio, size0, size1 = (data[f"{case}.{name}"][None] for name in ("X1", "X2", "ratio", "size1", "size2"))
+        mask = torch.ones(x0.shape[:2], dtype=torch.bool)
+        x, _ = network.inputs(Correspondences(x0, x1, mask, ratio=ratio, size0=size0, size1=size1))
+        torch.testing.assert_close(x[0].mT, data[f"{case}.inp"], rtol=0, atol=1e-6)  # another order of rounding
+        with torch.no_grad():
+            logit = network.backbone(x.double(), Slots.of(mask, torch.float64))[0, 0]
+        log_probability = torch.nn.functional.logsigmoid(logit).log_softmax(0)
+        torch.testing.assert_close(log_probability, data[f"{case}.logprob_{model}"].double(), rtol=0, atol=2e-4)
+
+
+def matches(counts: tuple[int, ...]) -> Correspondences:
+    """Pairs of several lengths with NaN in their padding."""
+    c = collate([scene(i, count=n) for i, n in enumerate(counts)])
+    return c.replace(x1=torch.where(c.mask[..., None], c.x1, torch.nan))
+
+
+def test_weights_are_those_published() -> None:
+    torch.manual_seed(7)
+    network, c = LC(side=["ratio"], blocks=2, channels=16).eval(), matches((60, 30))
+    logit, weight, F = network(c)
+    expected = torch.where(c.mask, torch.tanh(logit[0].clamp_min(0)), 0)
+    assert (expected > 0).any()
+    assert (expected[c.mask] == 0).any()
+    assert torch.equal(weight[0], expected)
+    assert F is None
+
+
+@pytest.mark.parametrize("network", [LC(side=["ratio"], blocks=2), DFE(side=["ratio"], widths=(32, 16))])
+def test_mixed_precision(network: torch.nn.Module) -> None:
+    """Products in bfloat16, statistics in float32: finite values and gradients close to those of float32."""
+    c = matches((60, 100))
+    losses = []
+    for mixed in (False, True):
+        with torch.autocast("cpu", torch.bfloat16, enabled=mixed):
+            logit = network(c).logit[0]
+        assert logit.dtype == torch.float32
+        losses.append(torch.where(c.mask, logit, 0).square().sum())
+    gradients = [torch.autograd.grad(loss, list(network.parameters()), allow_unused=True)[0] for loss in losses]
+    torch.testing.assert_close(losses[1], losses[0], rtol=0.05, atol=0.05)
+    assert torch.isfinite(gradients[1]).all()
+    cosine = torch.nn.functional.cosine_similarity(*(g.flatten() for g in gradients), dim=0)
+    assert cosine > 0.95
+
+
+K = torch.tensor([[[800.0, 0, 480], [0, 800, 320], [0, 0, 1]]])
+
+
+def small(**options: object) -> DFE:
+    torch.manual_seed(0)
+    return DFE(widths=(16, 32, 8), side=["ratio"], **options)  # type: ignore[arg-type]
+
+
+def robust(x: Tensor, slots: Slots) -> Tensor:
+    """A backbone whose weights fall with the square of the residual, as those of a robust kernel."""
+    return torch.stack([-2 * x[:, -2], -x[:, -2]], 1)
+
+
+def test_each_stage_is_the_fit_with_its_weights() -> None:
+    c = scene(0)
+    prediction = small()(c)
+    assert prediction.logit.shape == prediction.weight.shape == (5, 1, 150)
+    torch.testing.assert_close(prediction.weight.sum(-1), torch.ones(5, 1))
+    for weight, F in zip(prediction.weight, prediction.F, strict=True):
+        expected, valid = eight_point(c.x0.double(), c.x1.double(), weight.double())
+        assert valid.all()
+        torch.testing.assert_close(F, expected, rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize("coordinates", ["size", "K"])
+def test_residuals_are_fed_back(coordinates: str) -> None:
+    """Weights that fall with the residual make the fits those of robust least squares: few outliers are left out."""
+    c = scene(0, outliers=0.05).replace(K0=K, K1=K)
+    prediction = small(coordinates=coordinates).predict(c, robust)
+    first, *_, last = (float(sampson(F, c.x0.double(), c.x1.double()).median()) for F in prediction.F)
+    assert last < 0.3 < 3 < first  # px; the noise of a coordinate is 0.3
+    assert (prediction.weight[-1].log() - prediction.logit[-1] * 2).std() < 1e-4  # both follow the last residual
+
+
+def degenerate() -> Correspondences:
+    """Collinear, coincident, seven, two and no matches, one plane, and a sound pair."""
+    sound = scene(0, count=60)
+    line = torch.linspace(0, 600, 60)[None, :, None] * torch.tensor([1.0, 0.5])
+    seven, two = (torch.arange(60)[None] < n for n in (7, 2))
+    plane = sound.x0 * 1.1 + 3
+    cases = [
+        sound, sound.replace(x0=line, x1=line + 5), sound.replace(x0=torch.full_like(line, 7.0), x1=line * 0),
+        sound.keep(seven), sound.keep(two), sound.keep(two & ~two), sound.replace(x1=plane),
+    ]  # fmt: skip
+    return collate(cases)
+
+
+@pytest.mark.parametrize("network", [small(), small(coordinates="K")])
+def test_gradients_are_finite_on_degenerate_pairs(network: DFE) -> None:
+    """Of weights, log-odds and fits alike, in training mode, and no pair takes the sound one's gradient with it."""
+    c = degenerate().replace(K0=K.expand(7, 3, 3), K1=K.expand(7, 3, 3))
+    prediction = network.train()(c)
+    loss = prediction.F.square()[..., 0, :].sum() + (prediction.logit * c.mask).sum() + prediction.weight.square().sum()
+    gradients = torch.autograd.grad(loss, list(network.parameters()))
+    assert all(torch.isfinite(g).all() for g in gradients)
+    assert any(g.any() for g in gradients)
+    assert torch.isfinite(prediction.logit).all()
+    assert torch.isfinite(prediction.F).all()
+    assert not prediction.F[:, 3:6].any()  # fewer than eight matches fit nothing
+    assert all(torch.isfinite(b).all() for b in network.buffers())
+
+
+SCRIPT = Path(__file__).resolve().parents[3] / "scripts" / "make_models.py"
+
+
+def convert(checkpoint: Path, out: Path) -> None:
+    """Run the script. Raises SystemExit where that fails."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", [str(SCRIPT), "ngransac", str(checkpoint), str(out)])
+        runpy.run_path(str(SCRIPT), run_name="__main__")
+
+
+def test_a_checkpoint_of_neural_guided_ransac_becomes_a_pruner(tmp_path: Path) -> None:
+    """As the authors' .net and as .npz: the same file, whose P(inlier) gives the authors' sampling probabilities."""
+    weights = oracle("weights_ngransac_F_r1.00.npz")
+    net = tmp_path / "weights.net"
+    torch.save({key: torch.from_numpy(value) for key, value in weights.items()}, net)
+    for source in (net, shared_path("oracles/weights_ngransac_F_r1.00.npz")):
+        convert(source, tmp_path / f"{source.suffix[1:]}.safetensors")
+    assert (tmp_path / "net.safetensors").read_bytes() == (tmp_path / "npz.safetensors").read_bytes()
+    data = oracle("ngransac_net.npz")
+    x0, x1, ratio, size0, size1 = (
+        torch.from_numpy(data[f"001.{name}"])[None] for name in ("X1", "X2", "ratio", "size1", "size2")
+    )
+    mask = torch.ones(x0.shape[:2], dtype=torch.bool)
+    c = Correspondences(x0, x1, mask, ratio=ratio.double(), size0=size0, size1=size1)
+    p = LearnedPruner(LC(side=["ratio"]), file=tmp_path / "net.safetensors").probability(c)[0].double()
+    expected = data["001.logprob_F_r1.00"].astype(np.float64)
+    computed = (p / p.sum()).log().numpy()
+    np.testing.assert_allclose(computed, expected, rtol=0, atol=4e-4)  # of both float32 against float64: 2e-4 each
+
+
+def test_what_is_no_such_checkpoint_is_told(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"conv1\.weight is no parameter of a network of neural-guided RANSAC"):
+        ngransac_state({"conv1.weight": torch.zeros(3)})
+    torch.save({"conv1.weight": torch.zeros(3)}, tmp_path / "other.net")
+    with pytest.raises(SystemExit, match=r"error: .*conv1\.weight is no parameter"):
+        convert(tmp_path / "other.net", tmp_path / "out.safetensors")
+    assert not (tmp_path / "out.safetensors").exists()
+
+
+SIDE = ("ratio", "mutual", "scale", "rotation", "agreement")
+
+
+def one_match(**changes: object) -> Correspondences:
+    """A match from (10, 20) to (30, 50); the frame doubles in size and turns by 30 degrees."""
+    c, s = math.cos(math.radians(30)), math.sin(math.radians(30))
+    lafs0 = torch.tensor([[[[3.0, 0, 10], [0, 3, 20]]]])
+    lafs1 = torch.tensor([[[[6 * c, -6 * s, 30], [6 * s, 6 * c, 50]]]])
+    return Correspondences(
+        lafs0[..., 2], lafs1[..., 2], torch.ones(1, 1, dtype=torch.bool), ratio=torch.tensor([[0.7]]),
+        lafs0=lafs0, lafs1=lafs1, size0=torch.tensor([[100, 200]]), size1=torch.tensor([[400, 100]]),
+        K0=torch.tensor([[[100.0, 2, 50], [0, 50, 40], [0, 0, 1]]]), K1=torch.eye(3)[None],
+        mutual=torch.tensor([[False]]),
+    ).replace(**changes)  # fmt: skip
+
+
+def test_coordinates_by_size() -> None:
+    x, mask = MatchInputs("size")(one_match())
+    expected = [(10 - 100) / 200, (20 - 50) / 200, (30 - 50) / 400, (50 - 200) / 400]
+    torch.testing.assert_close(x, torch.tensor(expected)[None, :, None])
+    assert mask.all()
+
+
+def test_coordinates_by_calibration_are_the_inverse_of_K() -> None:
+    c = one_match()
+    x, _ = MatchInputs("K")(c)
+    ray = torch.linalg.inv(c.K0[0]) @ torch.tensor([10.0, 20, 1])
+    torch.testing.assert_close(x[0, :, 0], torch.tensor([float(ray[0]), float(ray[1]), 30, 50]))
+
+
+def test_side_information() -> None:
+    inputs = MatchInputs("size", SIDE)
+    x, _ = inputs(one_match())
+    assert inputs.channels == x.shape[1] == 10
+    expected = [0.7, -1, math.log(2), math.cos(math.radians(30)), math.sin(math.radians(30)), -1]
+    torch.testing.assert_close(x[0, 4:, 0], torch.tensor(expected))
+
+
+@pytest.mark.parametrize("angle", [179.0, 181.0, -1.0, 359.0])
+def test_rotation_has_no_jump(angle: float) -> None:
+    c, s = math.cos(math.radians(angle)), math.sin(math.radians(angle))
+    lafs1 = torch.tensor([[[[c, -s, 30], [s, c, 50]]]])
+    x, _ = MatchInputs("size", ("rotation",))(one_match(lafs1=lafs1))
+    torch.testing.assert_close(x[0, 4:, 0], torch.tensor([c, s]))
+
+
+def test_what_is_not_known_is_zero() -> None:
+    bare = one_match(lafs0=None, lafs1=None, ratio=None, mutual=None)
+    assert not MatchInputs("size", SIDE)(bare)[0][:, 4:].any()
+    flat = one_match(lafs0=torch.zeros(1, 1, 2, 3), ratio=torch.tensor([[torch.nan]]))
+    assert torch.isfinite(MatchInputs("size", SIDE)(flat)[0]).all()
+
+
+@pytest.mark.parametrize("coordinates", ["size", "K"])
+def test_padding_is_zero_and_not_finite_matches_are_masked(coordinates: str) -> None:
+    K = torch.tensor([[[500.0, 0, 480], [0, 500, 320], [0, 0, 1]]])
+    c = scene(1, count=20).replace(K0=K, K1=K)
+    mask = c.mask.clone()
+    mask[0, 15:] = False
+    expected, _ = MatchInputs(coordinates, SIDE)(c.keep(mask).compact())
+    garbage = {
+        "x0": torch.where(mask[..., None], c.x0, torch.nan), "ratio": torch.where(mask, c.ratio, torch.inf),
+        "lafs0": torch.where(mask[..., None, None], c.lafs0, torch.nan),
+    }  # fmt: skip
+    x, input_mask = MatchInputs(coordinates, SIDE)(c.replace(mask=mask, **garbage))
+    assert torch.equal(x[..., :15], expected)
+    assert not x[..., 15:].any()
+    assert torch.equal(input_mask, mask)
+    x, input_mask = MatchInputs(coordinates, SIDE)(c.replace(**garbage))
+    assert torch.equal(input_mask, mask)
+    assert torch.isfinite(x).all()
+
+
+@pytest.mark.parametrize(("coordinates", "missing"), [("size", ("size0", "size1")), ("K", ("K1",))])
+def test_what_is_missing_is_named(coordinates: str, missing: tuple[str, ...]) -> None:
+    with pytest.raises(ValueError, match=f"coordinates={coordinates} needs `{missing[0]}`"):
+        MatchInputs(coordinates)(one_match(**dict.fromkeys(missing)))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"coordinates": "pixels"}, "coordinates=pixels; there are: size, K"),
+        ({"side": ("ratio", "angle")}, "each at most once of ratio"),
+        ({"side": ("ratio", "ratio")}, "each at most once of ratio"),
+    ],
+)
+def test_unknown_options(options: dict[str, object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        MatchInputs(**options)  # type: ignore[arg-type]
