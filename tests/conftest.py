@@ -19,7 +19,7 @@ from fmtorch.jit.cache import kernels_dir
 torch.set_num_threads(1)
 # Where threads import modules at the same time, bytecode with checks can get the name of that without, which other
 # processes then load: it is kept nowhere.
-_JaxtypingLoader.set_data = lambda *_, **__: None
+_JaxtypingLoader.set_data = lambda *_, **__: None  # type: ignore[method-assign]
 
 SHARED = Path(os.environ.get("FMTORCH_TEST_DATA", Path(__file__).resolve().parents[2] / "shared"))
 KERNELS = kernels_dir()  # before any test sets $FMTORCH_CACHE
