@@ -16,6 +16,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
+from fmtorch.core import lazy
 from fmtorch.core.files import models_dir
 from fmtorch.core.options import Within
 from fmtorch.core.types import Features
@@ -190,10 +191,7 @@ def octaves(shape: tuple[int, ...], first: int) -> int:
 
 def _library() -> Any:
     """pycolmap, which says nothing but warnings. Raises ImportError naming the extra where it is not installed."""
-    try:
-        import pycolmap
-    except ImportError as error:
-        raise ImportError("features=sift_vlfeat needs pycolmap: pip install 'fmtorch[colmap]'") from error
+    pycolmap = lazy.imported("pycolmap", "features=sift_vlfeat needs pycolmap: pip install 'fmtorch[colmap]'")
     pycolmap.logging.minloglevel = pycolmap.logging.WARNING.value
     return pycolmap
 

@@ -315,25 +315,18 @@ def forget_origin(model: Any) -> None:
     """Clear the notes and properties of a model's graph, of its nodes and values, and of the graphs within them."""
     _forget(model.graph)
     for function in model.functions:
-        _forget_nodes(function.node)
+        for node in function.node:
+            _forget(node)
 
 
-def _forget(graph: Any) -> None:
-    _clear(graph, *graph.value_info, *graph.input, *graph.output, *graph.initializer)
-    _forget_nodes(graph.node)
-
-
-def _clear(*parts: Any) -> None:
-    for part in parts:
-        part.ClearField("metadata_props")
-        part.ClearField("doc_string")
-
-
-def _forget_nodes(nodes: Any) -> None:
-    _clear(*nodes)
-    for node in nodes:
-        for attribute in node.attribute:
-            for inner in (*attribute.graphs, *([attribute.g] if attribute.HasField("g") else [])):
+def _forget(part: Any) -> None:
+    """Clear those of a message of ONNX and of all messages within it."""
+    for note in ("metadata_props", "doc_string"):
+        if note in part.DESCRIPTOR.fields_by_name:
+            part.ClearField(note)
+    for field, value in part.ListFields():
+        if field.message_type is not None:
+            for inner in [value] if hasattr(value, "ListFields") else value:  # or repeated
                 _forget(inner)
 
 

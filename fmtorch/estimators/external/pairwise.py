@@ -1,7 +1,6 @@
 """Any function of one pair's matches as an estimator of batches, and what the functions of this folder share."""
 
 import dataclasses
-import importlib
 import math
 from collections.abc import Callable
 from typing import Annotated, Any, NamedTuple, TypeVar
@@ -11,6 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from fmtorch.core import lazy
 from fmtorch.core.options import Within
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.estimators.batch import Batch, relative_rounding
@@ -182,10 +182,7 @@ def computed_by(package: str) -> Callable[[Builder], Builder]:
 
 def peer(module: str, name: str, extra: str = "peers") -> Any:
     """The module of a library of an extra. Raises ImportError with a hint where it is not installed."""
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        raise ImportError(f"{name} ({module}) is not installed: pip install 'fmtorch[{extra}]'") from error
+    return lazy.imported(module, f"{name} ({module}) is not installed: pip install 'fmtorch[{extra}]'")
 
 
 def solution(F: Any, inliers: Any) -> Solution:
