@@ -51,10 +51,6 @@ class Evaluation:
     logit: Tensor
     label: Tensor
 
-    def temperature(self) -> float:
-        """The temperature of least log loss."""
-        return temperature(self.logit, self.label)
-
 
 class Validation:
     """Evaluates a network on labelled matches of single pairs.
@@ -348,18 +344,18 @@ def write_result(
     the identity."""
     network = network.to("cpu").eval()
     evaluation = validation(network)
-    temperature = evaluation.temperature()
+    fitted = temperature(evaluation.logit, evaluation.label)
     files = [folder / f"{name}.safetensors"]
-    save_weights(network, files[0], temperature=temperature)
+    save_weights(network, files[0], temperature=fitted)
     if isinstance(network, learned.Exportable) and importlib.util.find_spec("onnxscript") is not None:
         files.append(folder / f"{name}.onnx")
-        export_onnx(network, files[-1], temperature=temperature)
+        export_onnx(network, files[-1], temperature=fitted)
     card = folder / f"{name}.md"
     with replacing(card) as temporary:
-        temporary.write_text(model_card(files, facts, evaluation, temperature), encoding="utf-8")
+        temporary.write_text(model_card(files, facts, evaluation, fitted), encoding="utf-8")
     with replacing(folder / "validation.json") as temporary:
-        temporary.write_text(json.dumps({**evaluation.figures, "temperature": temperature}, indent=2) + "\n")
-    return Result((*files, card), evaluation, temperature)
+        temporary.write_text(json.dumps({**evaluation.figures, "temperature": fitted}, indent=2) + "\n")
+    return Result((*files, card), evaluation, fitted)
 
 
 def model_card(files: Sequence[Path], facts: Mapping[str, Any], evaluation: Evaluation, temperature: float) -> str:
