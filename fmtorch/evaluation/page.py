@@ -96,7 +96,7 @@ def render(
     names = list(dict.fromkeys([*(row[0] for row in runs), *(name for s in sections for name in s.runs)]))
     script = curves.resource("report.js")
     options: dict[str, Any] = {"undefined": jinja2.StrictUndefined, "trim_blocks": True, "lstrip_blocks": True}
-    return jinja2.Environment(autoescape=True, **options).from_string(curves.resource("report.html.j2")).render(
+    page: str = jinja2.Environment(autoescape=True, **options).from_string(curves.resource("report.html.j2")).render(
         title=title, runs=runs, shared=shared, names=names,
         swatches={name: curves.swatch(i) for i, name in enumerate(names)},
         sections=[_context(section, names) for section in sections],
@@ -104,6 +104,7 @@ def render(
         policy="default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-"
         + base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() + "'",
     )  # fmt: skip
+    return page
 
 
 def differing_pairs(runs: Mapping[str, pa.Table], count: int) -> list[str]:

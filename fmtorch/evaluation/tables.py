@@ -387,8 +387,7 @@ def _ahead(a: Values, b: Values, scenes: Sequence[str], of_nsgd: bool) -> list[t
 
 
 def _area(errors: Values, threshold: float) -> Values:
-    area: Values = np.clip(1 - np.nan_to_num(errors, nan=np.inf) / threshold, 0, 1)
-    return area
+    return np.clip(1 - np.nan_to_num(errors, nan=np.inf) / threshold, 0, 1)
 
 
 def _around_zero(i: Interval | None, widest: float) -> Bar | None:

@@ -101,8 +101,7 @@ def keypoints_to_lafs(keypoints: Sequence[cv2.KeyPoint]) -> Float[Tensor, "n 2 3
     if len(table) == 0:
         return torch.zeros(0, 2, 3)
     half_side = FRAME_SIGMAS * size / 2
-    lafs: Tensor = kornia.feature.laf_from_center_scale_ori(xy[None], half_side[None, :, :, None], -angle[None])[0]
-    return lafs
+    return kornia.feature.laf_from_center_scale_ori(xy[None], half_side[None, :, :, None], -angle[None])[0]
 
 
 def root_sift(descriptors: Float[Tensor, "*batch n d"]) -> Float[Tensor, "*batch n d"]:

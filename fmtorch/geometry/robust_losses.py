@@ -39,8 +39,7 @@ def _lower_gamma(s: float, x: Array) -> Array:
         total = (total * x + 1) / (s + n)
         exponential = exponential * x / (n + 1) + 1
     power = x * np.sqrt(x) if s == 1.5 else x * x * np.sqrt(x)
-    gamma: Array = power * total / exponential
-    return gamma
+    return power * total / exponential
 
 
 _u = np.arange(ENTRIES + 1) / ENTRIES

@@ -193,14 +193,12 @@ def solution(F: Any, inliers: Any) -> Solution:
 def within(F: Any, pair: Pair, threshold: float) -> NDArray[np.bool_]:
     """Which matches lie within a Sampson distance of F, in pixels, (N,)."""
     matrix, x0, x1 = (torch.from_numpy(np.asarray(value, np.float64)) for value in (F, pair.x0, pair.x1))
-    inside: NDArray[np.bool_] = (sampson(matrix, x0, x1) <= threshold).numpy()
-    return inside
+    return (sampson(matrix, x0, x1) <= threshold).numpy()
 
 
 def fundamental_of_pose(K0: Points, K1: Points, R: Points, t: Points) -> Points:
     """F of two calibrated cameras, K1^-T [t]x R K0^-1."""
-    F: Points = np.linalg.inv(K1).T @ np.cross(t, np.eye(3)).T @ R @ np.linalg.inv(K0)
-    return F
+    return np.linalg.inv(K1).T @ np.cross(t, np.eye(3)).T @ R @ np.linalg.inv(K0)
 
 
 def _likelihood(c: Correspondences, i: int) -> torch.Tensor:
