@@ -11,6 +11,14 @@ from types import ModuleType
 from typing import Any
 
 
+def imported(library: str, needed: str) -> Any:
+    """A library that is not always there. Raises ImportError, which says what is `needed`, where it is not."""
+    try:
+        return importlib.import_module(library)
+    except ImportError as error:
+        raise ImportError(needed) from error
+
+
 def lazy_exports(package: str, checked: bool = False) -> None:
     """Import the names that a package lists under ``if TYPE_CHECKING:``, and its modules, at their first use.
     checked: exported functions check their arguments, see `fmtorch.core.checks.checked`. The package's own modules

@@ -137,7 +137,10 @@ class FMBenchPairs(HeldPairs):
     def _pair(
         self, line: str, folder: Path, scene: str, row: Matrix, images: dict[str, Path], cameras: list[Camera] | None
     ) -> ImagePair:
-        left, right = (_image_number(line, value) for value in row[:2])
+        for value in row[:2]:
+            if not (np.isfinite(value) and value >= 0 and value == int(value)):
+                raise DataError(f"{line}: image number {value:g}; it must be a whole number from 0")
+        left, right = map(int, row[:2])
         F, problems = _normalized(row[2:].reshape(3, 3))
         sources = list[ImageSource]()
         for stem in (f"{left:08d}", f"{right:08d}"):
@@ -190,9 +193,3 @@ def _images(folder: Path, scene: str) -> dict[str, Path]:
     if not images.is_dir():
         raise DataError(f"{folder / _SUBSETS} names {scene}/, but there is no folder {images}")
     return images_by_stem(images, SUFFIXES)
-
-
-def _image_number(line: str, value: float) -> int:
-    if not (np.isfinite(value) and value >= 0 and value == int(value)):
-        raise DataError(f"{line}: image number {value:g}; it must be a whole number from 0")
-    return int(value)

@@ -32,8 +32,7 @@ class WithinThreshold:
 
     def __call__(self, squared_px: Array, pair: Pair) -> Array:
         """As `InlierRule`."""
-        inside: Array = squared_px <= squared(self.threshold)
-        return inside
+        return squared_px <= squared(self.threshold)
 
 
 FLOOR_PX = 1e-3  # px, of robust deviations, as OpenCV's: those of exact matches are rounding
@@ -44,8 +43,7 @@ class BetterHalf:
 
     def __call__(self, squared_px: Array, pair: Pair) -> Array:
         """As `InlierRule`."""
-        better: Array = squared_px <= max(lower_median(squared_px), squared(FLOOR_PX))
-        return better
+        return squared_px <= max(lower_median(squared_px), squared(FLOOR_PX))
 
 
 class RobustDeviations:
@@ -57,8 +55,7 @@ class RobustDeviations:
         """As `InlierRule`."""
         spare = max(pair.count - self.PARAMETERS, 1)
         sigma = 1.4826 * (1 + 5 / spare) * math.sqrt(lower_median(squared_px))
-        inside: Array = squared_px <= squared(max(2.5 * sigma, FLOOR_PX))
-        return inside
+        return squared_px <= squared(max(2.5 * sigma, FLOOR_PX))
 
 
 class StoppingRule:

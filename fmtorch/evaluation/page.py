@@ -12,6 +12,7 @@ import numpy as np
 import pyarrow as pa
 
 from fmtorch import presets
+from fmtorch.core import lazy
 from fmtorch.core.settings import leaves
 from fmtorch.evaluation import curves, statistics, tables
 from fmtorch.pipeline.photographs import Image
@@ -91,14 +92,11 @@ def render(
 ) -> str:
     """The page: one file that loads nothing, whose script sorts and filters and whose content does without it.
     runs: name, data set, identity, version, seed and folder of each run. shared: settings that all have in common."""
-    try:
-        import jinja2
-    except ImportError as error:
-        raise ImportError("a report needs jinja2: pip install 'fmtorch[report]'") from error
+    jinja2 = lazy.imported("jinja2", "a report needs jinja2: pip install 'fmtorch[report]'")
     names = list(dict.fromkeys([*(row[0] for row in runs), *(name for s in sections for name in s.runs)]))
     script = curves.resource("report.js")
     options: dict[str, Any] = {"undefined": jinja2.StrictUndefined, "trim_blocks": True, "lstrip_blocks": True}
-    return jinja2.Environment(autoescape=True, **options).from_string(curves.resource("report.html.j2")).render(
+    page: str = jinja2.Environment(autoescape=True, **options).from_string(curves.resource("report.html.j2")).render(
         title=title, runs=runs, shared=shared, names=names,
         swatches={name: curves.swatch(i) for i, name in enumerate(names)},
         sections=[_context(section, names) for section in sections],
@@ -106,6 +104,7 @@ def render(
         policy="default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-"
         + base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() + "'",
     )  # fmt: skip
+    return page
 
 
 def differing_pairs(runs: Mapping[str, pa.Table], count: int) -> list[str]:

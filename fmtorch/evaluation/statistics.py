@@ -191,8 +191,7 @@ def unit(scenes: Sequence[str]) -> str:
 def _clusters(scenes: Sequence[str]) -> NDArray[np.int64]:
     if unit(scenes) == "pair":
         return np.arange(len(scenes))
-    numbers: NDArray[np.int64] = np.unique(np.asarray(scenes), return_inverse=True)[1]
-    return numbers
+    return np.unique(np.asarray(scenes), return_inverse=True)[1]
 
 
 def bootstrap_mean(values: Values, scenes: Sequence[str]) -> Interval:

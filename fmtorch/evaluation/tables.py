@@ -45,10 +45,6 @@ def _corrs(group: Group) -> str:
     return f"{_text(group['corrs'], '{:.0f}')} ({_text(group['corrs_before'], '{:.0f}')})"
 
 
-def _failures(group: Group) -> str:
-    return f"{group['failures']} ({_text(group['failure_share'], '{:.1%}')})" if group["failures"] else "0"
-
-
 LEAST_IMPORTANT = ("#Corrs (-m)", "%Inlier (-m)", "Failed")  # where a terminal has no room for all
 TERMINAL_COLUMNS: Columns = {
     "Pairs": _number("pairs"),
@@ -69,7 +65,7 @@ COLUMNS: Columns = {
     "with failures 0": _percent("inlier_rate_failures_0"),
     "%Inlier-m": _percent("inlier_rate_before"),
     "#Corrs (-m)": _corrs,
-    "Failures": _failures,
+    "Failures": lambda group: f"{group['failures']} ({group['failure_share']:.1%})" if group["failures"] else "0",
 }
 INLIERS = (
     "%Inlier: right matches, within 3 px of the true homography, and #Corrs, after estimation, -m: before; means over "
@@ -387,8 +383,7 @@ def _ahead(a: Values, b: Values, scenes: Sequence[str], of_nsgd: bool) -> list[t
 
 
 def _area(errors: Values, threshold: float) -> Values:
-    area: Values = np.clip(1 - np.nan_to_num(errors, nan=np.inf) / threshold, 0, 1)
-    return area
+    return np.clip(1 - np.nan_to_num(errors, nan=np.inf) / threshold, 0, 1)
 
 
 def _around_zero(i: Interval | None, widest: float) -> Bar | None:

@@ -16,6 +16,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
+from fmtorch.core import lazy
 from fmtorch.core.files import models_dir
 from fmtorch.core.options import Within
 from fmtorch.core.types import Features
@@ -100,8 +101,7 @@ def keypoints_to_lafs(keypoints: Sequence[cv2.KeyPoint]) -> Float[Tensor, "n 2 3
     if len(table) == 0:
         return torch.zeros(0, 2, 3)
     half_side = FRAME_SIGMAS * size / 2
-    lafs: Tensor = kornia.feature.laf_from_center_scale_ori(xy[None], half_side[None, :, :, None], -angle[None])[0]
-    return lafs
+    return kornia.feature.laf_from_center_scale_ori(xy[None], half_side[None, :, :, None], -angle[None])[0]
 
 
 def root_sift(descriptors: Float[Tensor, "*batch n d"]) -> Float[Tensor, "*batch n d"]:
@@ -190,10 +190,7 @@ def octaves(shape: tuple[int, ...], first: int) -> int:
 
 def _library() -> Any:
     """pycolmap, which says nothing but warnings. Raises ImportError naming the extra where it is not installed."""
-    try:
-        import pycolmap
-    except ImportError as error:
-        raise ImportError("features=sift_vlfeat needs pycolmap: pip install 'fmtorch[colmap]'") from error
+    pycolmap = lazy.imported("pycolmap", "features=sift_vlfeat needs pycolmap: pip install 'fmtorch[colmap]'")
     pycolmap.logging.minloglevel = pycolmap.logging.WARNING.value
     return pycolmap
 

@@ -272,8 +272,7 @@ def maps(H: Array, x: float, y: float, u: float, v: float, limit: float) -> Any:
     depth = H[6] * x + H[7] * y + H[8]
     du = (H[0] * x + H[1] * y + H[2]) / depth - u
     dv = (H[3] * x + H[4] * y + H[5]) / depth - v
-    within: bool = du * du + dv * dv <= limit
-    return within
+    return du * du + dv * dv <= limit
 
 
 @inner

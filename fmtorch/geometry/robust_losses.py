@@ -39,8 +39,7 @@ def _lower_gamma(s: float, x: Array) -> Array:
         total = (total * x + 1) / (s + n)
         exponential = exponential * x / (n + 1) + 1
     power = x * np.sqrt(x) if s == 1.5 else x * x * np.sqrt(x)
-    gamma: Array = power * total / exponential
-    return gamma
+    return power * total / exponential
 
 
 _u = np.arange(ENTRIES + 1) / ENTRIES
@@ -74,8 +73,8 @@ def huber_weight(r2: Tensor, s2: Tensor) -> Tensor:
     return sqrt(s2 / torch.maximum(r2, s2))
 
 
-def huber_curvature(r2: Tensor, s2: Tensor) -> Tensor:
-    """1 up to the scale, 0 beyond."""
+def within_scale(r2: Tensor, s2: Tensor) -> Tensor:
+    """1 up to the scale, 0 beyond: the curvature of Huber's loss, and both derivatives of the truncated one."""
     return (r2 <= s2).to(r2.dtype)
 
 
@@ -114,11 +113,6 @@ def truncated_loss(r2: Tensor, s2: Tensor) -> Tensor:
     return torch.minimum(r2, s2)
 
 
-def truncated_weight(r2: Tensor, s2: Tensor) -> Tensor:
-    """1 up to the scale, 0 beyond."""
-    return (r2 <= s2).to(r2.dtype)
-
-
 def tabulated_loss(r2: Tensor, s2: Tensor) -> Tensor:
     """That of MAGSAC++ over its slope at zero, from the table; s = k sigma_max."""
     interval, share, weight, step = _look_up(r2, s2)
@@ -150,10 +144,10 @@ def _look_up(r2: Tensor, s2: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 
 
 LOSSES: dict[str, RobustLoss] = {
-    "huber": RobustLoss(huber_loss, huber_weight, huber_curvature),
+    "huber": RobustLoss(huber_loss, huber_weight, within_scale),
     "cauchy": RobustLoss(cauchy_loss, cauchy_weight, cauchy_curvature),
     "geman_mcclure": RobustLoss(geman_mcclure_loss, geman_mcclure_weight, geman_mcclure_curvature),
-    "truncated": RobustLoss(truncated_loss, truncated_weight, truncated_weight),
+    "truncated": RobustLoss(truncated_loss, within_scale, within_scale),
     "magsac": RobustLoss(tabulated_loss, tabulated_weight, tabulated_curvature),
 }
 

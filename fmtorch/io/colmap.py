@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from fmtorch.core import lazy
 from fmtorch.core.files import replacing
 from fmtorch.data.cameras import MODELS, Lens
 from fmtorch.data.files import Array, Indices, Mask, Matrix, Singles
@@ -25,11 +26,7 @@ FOCAL_LENGTH = 1.2  # of the longer side, where it is unknown: COLMAP's own defa
 
 def imported() -> Any:
     """pycolmap. Raises ImportError naming the extra where it is not installed."""
-    try:
-        import pycolmap
-    except ImportError as error:
-        raise ImportError("pycolmap is not installed; pip install 'fmtorch[colmap]' brings it") from error
-    return pycolmap
+    return lazy.imported("pycolmap", "pycolmap is not installed; pip install 'fmtorch[colmap]' brings it")
 
 
 def write_database(

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from fmtorch.data import DataError, FMBenchPairs, GivenMatches, ImagePair, ImageSource, stored_size
+from fmtorch.data import DataError, FMBenchPairs, GivenMatches, ImagePair, ImageSource, Lens, stored_size
 from fmtorch.data.files import Matrix, given_root
 from fmtorch.data.pairs import HeldPairs
 from fmtorch.io import h5, predictions
@@ -223,7 +223,7 @@ def _camera(file: Any, path: Path, key: str, source: ImageSource) -> tuple[Matri
         raise DataError(f"{path}: {key + '/params'!r} holds {parameters}, which are no parameters of {model}")
     if parameters[count + 2 :].any():
         raise DataError(f"{path}: {key + '/params'!r} of {model} has distortion; F needs undistorted points")
-    K = _pinhole(parameters[0], parameters[count - 1], *parameters[count : count + 2])
+    K = Lens(parameters[0], parameters[count - 1], *parameters[count : count + 2]).K
     sides = [_side(file, f"{key}/{name}") for name in ("height", "width")]
     if all(sides):
         return K, (sides[0], sides[1])
@@ -286,11 +286,7 @@ def _calibration(file: Any, key: str, which: int) -> Matrix:
     fx, fy = h5.reshaped(file, f"f{which}s/{key}", 2)
     if fx == 0 or fy == 0:
         raise DataError(f"{file.filename}: 'f{which}s/{key}' holds a focal length of zero")
-    return _pinhole(fx, fy, cx, cy)
-
-
-def _pinhole(fx: float, fy: float, cx: float, cy: float) -> Matrix:
-    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+    return Lens(fx, fy, cx, cy).K
 
 
 CORNER = 0.5  # where glue-factory puts the centre of the first pixel

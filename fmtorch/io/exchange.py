@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from fmtorch.core import lazy
 from fmtorch.core.checks import as_tensor
 from fmtorch.core.types import Estimate, PoseEstimate
 from fmtorch.geometry.cameras import cross_matrix
@@ -179,11 +180,7 @@ def to_poselib(estimate: Estimate) -> Any:
     R, t = _matrix(estimate.R), _matrix(estimate.t)
     if R is None or t is None:
         raise ValueError(f"the estimate has no pose{': ' if estimate.reason[0] else ''}{estimate.reason[0]}")
-    try:
-        import poselib
-    except ImportError as error:
-        raise ImportError("poselib is not installed; pip install 'fmtorch[peers]' brings it") from error
-    pose = poselib.CameraPose()
+    pose = lazy.imported("poselib", "poselib is not installed; pip install 'fmtorch[peers]' brings it").CameraPose()
     pose.R, pose.t = R, t
     return pose
 

@@ -13,7 +13,7 @@ from fmtorch.core.files import replacing
 from fmtorch.io import colmap, h5
 from fmtorch.io.match_file import write_geometry
 from fmtorch.io.match_store import MatchStore, StoredImage
-from fmtorch.io.predictions import pair_key_of
+from fmtorch.io.predictions import hloc_keys
 
 KINDS = ("h5", "colmap")
 FEATURES, MATCHES, DATABASE = "features.h5", "matches.h5", "database.db"
@@ -74,7 +74,7 @@ def write_hloc(
             group["image_size"] = np.array(image.size[::-1])
     with replacing(folder / MATCHES) as temporary, h5py.File(temporary, "w") as file:
         for pair in (journal.pair(*ends) for ends in pairs):
-            group = file.create_group(pair_key_of(pair.name0, pair.name1))
+            group = file.create_group(next(hloc_keys(pair.name0, pair.name1)))
             # By keypoint of the first image, which keeps the best of several: the last one written.
             count, order = counts[pair.name0], np.argsort(pair.scores, kind="stable")
             i, j = pair.matches[order].T

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from fmtorch.core import lazy
 from fmtorch.data.files import Array, DataError, Matrix
 
 HASHED_WHOLE = 1 << 30  # bytes up to which a file is hashed as a whole
@@ -18,11 +19,7 @@ SUFFIXES = (".h5", ".hdf5")
 
 def imported() -> Any:
     """h5py. Raises ImportError naming the extra where it is not installed."""
-    try:
-        import h5py
-    except ImportError as error:
-        raise ImportError("h5py is not installed; pip install 'fmtorch[h5]' brings it") from error
-    return h5py
+    return lazy.imported("h5py", "h5py is not installed; pip install 'fmtorch[h5]' brings it")
 
 
 @contextlib.contextmanager

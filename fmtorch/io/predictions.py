@@ -119,21 +119,11 @@ def pair_keys(pair: ImagePair) -> Iterator[tuple[str, bool]]:
     names0, names1 = names_of(pair.image0), names_of(pair.image1)
     for swapped, names in ((False, (names0, names1)), (True, (names1, names0))):
         for a, b in zip(*names, strict=False):
-            yield from ((key, swapped) for key in _keys(a, b))
+            yield from ((key, swapped) for key in hloc_keys(a, b))
 
 
-def hloc_keys(name0: str, name1: str) -> Iterator[tuple[str, bool]]:
-    """The keys of hloc's matches of two images of these names, and whether the images are in the other order."""
-    yield from ((key, False) for key in _keys(name0, name1))
-    yield from ((key, True) for key in _keys(name1, name0))
-
-
-def pair_key_of(name0: str, name1: str) -> str:
-    """hloc's key of a pair."""
-    return next(_keys(name0, name1))
-
-
-def _keys(name0: str, name1: str) -> Iterator[str]:
+def hloc_keys(name0: str, name1: str) -> Iterator[str]:
+    """hloc's key of a pair of images of these names, in this order, and that of older versions."""
     a, b = name0.replace("/", "-"), name1.replace("/", "-")
     yield f"{a}/{b}"
     yield f"{a}_{b}"
@@ -230,7 +220,9 @@ def hloc_pairs(truth: PairDataset, features: Path, matches: Path, origin: float)
                 yield _without(pair, f"{features}: no keypoints of image {missing[0].identity}")
                 continue
             name0, name1 = (str(name) for name in known)
-            key_and_swap = next(((k, s) for k, s in hloc_keys(name0, name1) if h5.holds(m, f"{k}/matches0")), None)
+            orders = (name0, name1, False), (name1, name0, True)
+            keys = ((key, swapped) for a, b, swapped in orders for key in hloc_keys(a, b))
+            key_and_swap = next(((key, swapped) for key, swapped in keys if h5.holds(m, f"{key}/matches0")), None)
             if key_and_swap is None:
                 yield _without(pair, f"{matches}: no matches0 of the pair {name0}, {name1}")
                 continue

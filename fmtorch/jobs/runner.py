@@ -24,6 +24,7 @@ from typing import Any, Generic, TypeVar, cast
 
 import torch
 
+from fmtorch.core import lazy
 from fmtorch.core.version import __version__
 from fmtorch.jobs.execution import Execution, cores, use_one_thread
 
@@ -160,10 +161,8 @@ class _Cluster:
     """
 
     def __init__(self, address: str | None, workers: int) -> None:
-        try:
-            import distributed
-        except ImportError as error:
-            raise ImportError("executor=dask needs dask and distributed: pip install 'fmtorch[dask]'") from error
+        needed = "executor=dask needs dask and distributed: pip install 'fmtorch[dask]'"
+        distributed = lazy.imported("distributed", needed)
         self._local: Any = None
         if address is None:
             # What workers log of a worker that died, and of their own end, is ours to say.

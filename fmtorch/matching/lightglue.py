@@ -10,12 +10,6 @@ from fmtorch.core.types import Correspondences, Features
 FEATURES = ("aliked", "disk")  # those that need no more than positions and descriptors, and that this project reads
 
 
-def weight_file(features: str) -> str:
-    """The file that kornia's loader looks for in torch's folder of checkpoints; it replaces every dot of the name."""
-    network = kornia.feature.LightGlue
-    return f"{network.features[features]['weights']}_{network.version}.pth".replace(".", "-")
-
-
 class LightGlue:
     """Matches the features of two images by a transformer; the slots of the result are the matches found.
 
@@ -32,12 +26,15 @@ class LightGlue:
             raise ValueError(f"no weights of LightGlue for {features!r}; there are: {', '.join(FEATURES)}")
         automatic = "cuda" if torch.cuda.is_available() else "cpu"
         self.device = torch.device(automatic if device == "auto" else device)
+        kind = kornia.feature.LightGlue
+        # The file that kornia's loader looks for in torch's folder of checkpoints: it replaces every dot of the name
+        kept_as = f"{kind.features[features]['weights']}_{kind.version}.pth".replace(".", "-")
         network = network or pretrained(
-            lambda: kornia.feature.LightGlue(features, filter_threshold=threshold), f"LightGlue ({features})",
-            "github.com/cvg/LightGlue or huggingface.co/kornia", f"{features}_lightglue.pth", weight_file(features),
+            lambda: kind(features, filter_threshold=threshold), f"LightGlue ({features})",
+            "github.com/cvg/LightGlue or huggingface.co/kornia", f"{features}_lightglue.pth", kept_as,
         )  # fmt: skip
         self.network = network.eval().to(self.device)
-        self._length = int(kornia.feature.LightGlue.features[features]["input_dim"])
+        self._length = int(kind.features[features]["input_dim"])
 
     def __call__(self, features0: Features, features1: Features) -> Correspondences:
         """The matches of one pair, a batch of one, on the device of `features0`.

@@ -6,7 +6,6 @@ perhaps ``matched_confidences`` (N,). It downloads the weights of a matcher when
 downloaded here.
 """
 
-import importlib
 import threading
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, ClassVar, NamedTuple, overload
@@ -17,6 +16,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
+from fmtorch.core import lazy
 from fmtorch.core.options import Within, nearest
 from fmtorch.core.types import Correspondences, Features
 
@@ -56,10 +56,7 @@ class VisMatch:
         device: str = "auto",
         options: Mapping[str, Any] | None = None,
     ) -> None:
-        try:
-            vismatch = importlib.import_module("vismatch")
-        except ImportError as error:
-            raise ImportError("matcher=vismatch needs vismatch: pip install 'fmtorch[vismatch]'") from error
+        vismatch = lazy.imported("vismatch", "matcher=vismatch needs vismatch: pip install 'fmtorch[vismatch]'")
         known = [str(each) for each in getattr(vismatch, "available_models", [])]
         if known and name not in known:
             raise ValueError(f"matcher.name={name}: vismatch has no such matcher; there are: {nearest(name, known)}")

@@ -438,8 +438,7 @@ def _product(a: Array, b: Array) -> Array:
 
 def _array(tensor: Tensor) -> Array:
     tensor = tensor.detach().cpu()
-    array: Array = (tensor.to(torch.float64) if tensor.is_floating_point() else tensor).contiguous().numpy()
-    return array
+    return (tensor.to(torch.float64) if tensor.is_floating_point() else tensor).contiguous().numpy()
 
 
 def _finite(*arrays: Array) -> Array:

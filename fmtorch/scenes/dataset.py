@@ -21,7 +21,7 @@ import numpy as np
 
 from fmtorch.core.files import cache_dir, temporary_name
 from fmtorch.data.construction import Keypoints, keypoints, matchable
-from fmtorch.data.pairs import HeldPairs, ImagePair, ImageSource, PairDataset
+from fmtorch.data.pairs import HeldPairs, ImagePair, ImageSource
 from fmtorch.data.scenes import AllPairs, Scene, ScenePairs, View
 from fmtorch.jit.together import compile_together
 from fmtorch.jobs.execution import Execution, cores
@@ -268,7 +268,7 @@ def _truth(camera0: Camera, camera1: Camera) -> tuple[Matrix, Matrix, Matrix, Ma
     return fundamental(camera0, camera1), camera0.K, camera1.K, *relative_pose(camera0, camera1)
 
 
-class RenderedPairs(PairDataset):
+class RenderedPairs(HeldPairs):
     """Image pairs of textured 3-D scenes with exact ground truth, in four families after the paper's four sets.
 
     split: "test" or "train"; they share no scene and no texture. size: "small" (about 20 pairs a family) or "full".
@@ -305,18 +305,14 @@ class RenderedPairs(PairDataset):
         for folder in folders.values():
             folder.mkdir(parents=True, exist_ok=True)
         generate_all([(task, folders[task.family]) for task in tasks], workers, progress)
-        self._pairs: list[tuple[Task, int, int]] = []
+        self._pairs = []
         self._views: dict[str, list[tuple[Path, Camera]]] = {}
         self._tasks = {task.name: task for task in tasks}
         for task in sorted(tasks, key=lambda task: chosen.index(task.family)):
             self._views[task.name], pairs = read(folders[task.family] / task.name)
-            self._pairs += [(task, i, j) for i, j in pairs]
+            self._pairs += [self._pair(task, i, j) for i, j in pairs]
 
-    def __len__(self) -> int:
-        return len(self._pairs)
-
-    def __getitem__(self, index: int) -> ImagePair:
-        task, i, j = self._pairs[index]
+    def _pair(self, task: Task, i: int, j: int) -> ImagePair:
         (path0, camera0), (path1, camera1) = self._views[task.name][i], self._views[task.name][j]
         images = ImageSource(f"{task.name}/{i}", path0), ImageSource(f"{task.name}/{j}", path1)
         identity = f"{self.name}/{task.name}/{i}-{j}"

@@ -86,20 +86,16 @@ def _roadside(surfaces: Surfaces, rng: Rng, length: float, half: float, side: in
         x += rng.uniform(5, 12)
 
 
-def _street(surfaces: Surfaces, rng: Rng, split: str, length: float) -> None:
-    half, walk, gap = rng.uniform(3.4, 4.6), rng.uniform(1.8, 3.0), rng.uniform(0.2, 0.6)
-    _road(surfaces, rng, length, half, walk)
-    for side in (1, -1):
-        _row_of_houses(surfaces, rng, split, length, half + walk + rng.uniform(0, 3), side, gap)
-        _roadside(surfaces, rng, length, half, side)
-
-
 def driving_scene(rng: Rng, split: str, shots: int, scale: Real) -> DrawnScene:
     """A street of `shots` frames; images are scaled by `scale`."""
     surfaces = Surfaces()
     frames = np.concatenate([[0], np.cumsum(rng.integers(1, 5, shots - 1))])
     length = 30.0 + float(frames[-1]) * SPACING
-    _street(surfaces, rng, split, length)
+    half, walk, gap = rng.uniform(3.4, 4.6), rng.uniform(1.8, 3.0), rng.uniform(0.2, 0.6)
+    _road(surfaces, rng, length, half, walk)
+    for side in (1, -1):
+        _row_of_houses(surfaces, rng, split, length, half + walk + rng.uniform(0, 3), side, gap)
+        _roadside(surfaces, rng, length, half, side)
     K, size = scaled_camera(DRIVING_FOCAL, DRIVING_SIZE, scale, DRIVING_CENTRE)
     speed, bend = float(np.exp(rng.uniform(np.log(0.03), np.log(1.2)))) * SPACING, rng.normal(0, 0.6)
     drift = rng.uniform(-1.2, 0.2)

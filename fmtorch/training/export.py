@@ -51,10 +51,6 @@ class Evaluation:
     logit: Tensor
     label: Tensor
 
-    def temperature(self) -> float:
-        """The temperature of least log loss."""
-        return temperature(self.logit, self.label)
-
 
 class Validation:
     """Evaluates a network on labelled matches of single pairs.
@@ -315,25 +311,18 @@ def forget_origin(model: Any) -> None:
     """Clear the notes and properties of a model's graph, of its nodes and values, and of the graphs within them."""
     _forget(model.graph)
     for function in model.functions:
-        _forget_nodes(function.node)
+        for node in function.node:
+            _forget(node)
 
 
-def _forget(graph: Any) -> None:
-    _clear(graph, *graph.value_info, *graph.input, *graph.output, *graph.initializer)
-    _forget_nodes(graph.node)
-
-
-def _clear(*parts: Any) -> None:
-    for part in parts:
-        part.ClearField("metadata_props")
-        part.ClearField("doc_string")
-
-
-def _forget_nodes(nodes: Any) -> None:
-    _clear(*nodes)
-    for node in nodes:
-        for attribute in node.attribute:
-            for inner in (*attribute.graphs, *([attribute.g] if attribute.HasField("g") else [])):
+def _forget(part: Any) -> None:
+    """Clear those of a message of ONNX and of all messages within it."""
+    for note in ("metadata_props", "doc_string"):
+        if note in part.DESCRIPTOR.fields_by_name:
+            part.ClearField(note)
+    for field, value in part.ListFields():
+        if field.message_type is not None:
+            for inner in [value] if hasattr(value, "ListFields") else value:  # or repeated
                 _forget(inner)
 
 
@@ -355,18 +344,18 @@ def write_result(
     the identity."""
     network = network.to("cpu").eval()
     evaluation = validation(network)
-    temperature = evaluation.temperature()
+    fitted = temperature(evaluation.logit, evaluation.label)
     files = [folder / f"{name}.safetensors"]
-    save_weights(network, files[0], temperature=temperature)
+    save_weights(network, files[0], temperature=fitted)
     if isinstance(network, learned.Exportable) and importlib.util.find_spec("onnxscript") is not None:
         files.append(folder / f"{name}.onnx")
-        export_onnx(network, files[-1], temperature=temperature)
+        export_onnx(network, files[-1], temperature=fitted)
     card = folder / f"{name}.md"
     with replacing(card) as temporary:
-        temporary.write_text(model_card(files, facts, evaluation, temperature), encoding="utf-8")
+        temporary.write_text(model_card(files, facts, evaluation, fitted), encoding="utf-8")
     with replacing(folder / "validation.json") as temporary:
-        temporary.write_text(json.dumps({**evaluation.figures, "temperature": temperature}, indent=2) + "\n")
-    return Result((*files, card), evaluation, temperature)
+        temporary.write_text(json.dumps({**evaluation.figures, "temperature": fitted}, indent=2) + "\n")
+    return Result((*files, card), evaluation, fitted)
 
 
 def model_card(files: Sequence[Path], facts: Mapping[str, Any], evaluation: Evaluation, temperature: float) -> str:

@@ -19,8 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fmtorch.core.files import cache_dir, replacing
-from fmtorch.data import ImagePair, ImageSource, PairDataset, read_image
+from fmtorch.data import ImagePair, ImageSource, read_image
 from fmtorch.data.cameras import relative_pose
+from fmtorch.data.pairs import HeldPairs
 from fmtorch.scenes.raycast import Camera, calibration
 from fmtorch.training.options import PlaneViews as PlaneViews
 
@@ -68,7 +69,7 @@ def list_photographs(
     return kept
 
 
-class PlanePairs(PairDataset):
+class PlanePairs(HeldPairs):
     """Pairs of views of photographs, each photograph a plane; a `DepthDataset`. F is zero: none is determined.
     The plane goes on past the photograph's edges as its mirror image. Light, focus, noise and compression of each view
     are changed as by another camera on another day. Views are drawn on first use and kept; a view depends on its
@@ -104,13 +105,9 @@ class PlanePairs(PairDataset):
                     self._cameras[f"{scene}/{i}"], self._paths[f"{scene}/{i}"] = camera, folder / f"{i:02d}.jpg"
                 report(done, len(files))
         ends = list(itertools.combinations(range(self.views.views), 2))
-        self._pairs = [(scene, i, j) for scene in dict.fromkeys(self._scenes) for i, j in ends]
+        self._pairs = [self._pair(scene, i, j) for scene in dict.fromkeys(self._scenes) for i, j in ends]
 
-    def __len__(self) -> int:
-        return len(self._pairs)
-
-    def __getitem__(self, index: int) -> ImagePair:
-        scene, i, j = self._pairs[index]
+    def _pair(self, scene: str, i: int, j: int) -> ImagePair:
         camera0, camera1 = (self._cameras[f"{scene}/{k}"] for k in (i, j))
         R, t = relative_pose(camera0, camera1)
         images = [ImageSource(f"{scene}/{k}", self._paths[f"{scene}/{k}"]) for k in (i, j)]

@@ -1,7 +1,6 @@
 """Any function of one pair's matches as an estimator of batches, and what the functions of this folder share."""
 
 import dataclasses
-import importlib
 import math
 from collections.abc import Callable
 from typing import Annotated, Any, NamedTuple, TypeVar
@@ -11,6 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from fmtorch.core import lazy
 from fmtorch.core.options import Within
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.estimators.batch import Batch, relative_rounding
@@ -182,10 +182,7 @@ def computed_by(package: str) -> Callable[[Builder], Builder]:
 
 def peer(module: str, name: str, extra: str = "peers") -> Any:
     """The module of a library of an extra. Raises ImportError with a hint where it is not installed."""
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        raise ImportError(f"{name} ({module}) is not installed: pip install 'fmtorch[{extra}]'") from error
+    return lazy.imported(module, f"{name} ({module}) is not installed: pip install 'fmtorch[{extra}]'")
 
 
 def solution(F: Any, inliers: Any) -> Solution:
@@ -196,14 +193,12 @@ def solution(F: Any, inliers: Any) -> Solution:
 def within(F: Any, pair: Pair, threshold: float) -> NDArray[np.bool_]:
     """Which matches lie within a Sampson distance of F, in pixels, (N,)."""
     matrix, x0, x1 = (torch.from_numpy(np.asarray(value, np.float64)) for value in (F, pair.x0, pair.x1))
-    inside: NDArray[np.bool_] = (sampson(matrix, x0, x1) <= threshold).numpy()
-    return inside
+    return (sampson(matrix, x0, x1) <= threshold).numpy()
 
 
 def fundamental_of_pose(K0: Points, K1: Points, R: Points, t: Points) -> Points:
     """F of two calibrated cameras, K1^-T [t]x R K0^-1."""
-    F: Points = np.linalg.inv(K1).T @ np.cross(t, np.eye(3)).T @ R @ np.linalg.inv(K0)
-    return F
+    return np.linalg.inv(K1).T @ np.cross(t, np.eye(3)).T @ R @ np.linalg.inv(K0)
 
 
 def _likelihood(c: Correspondences, i: int) -> torch.Tensor:
