@@ -14,6 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.optimize import minimize
+from scipy.special import expit
 
 from fmtorch import Correspondences, presets
 from fmtorch.geometry import sampson
@@ -22,7 +24,6 @@ from scripts.benchmark import pairs
 from scripts.benchmark.tables import Record, Sheet, chance_of_more, show
 
 STAGES = ("ratio_prior", "gms", "lpm", "position_consistency", "frame_consistency", "code")
-NEWTON_STEPS = 30
 Array = NDArray[Any]
 
 
@@ -101,17 +102,16 @@ def features(stage: Any, pair: Pair, kind: str) -> Array:
 
 
 def fit(columns: list[Array], own: list[Pair]) -> Array:
-    """Logistic regression by Newton's method; each pair has weight 1."""
-    X = np.concatenate(columns)
-    y = np.concatenate([pair.right for pair in own]).astype(np.float64)
-    weight = np.concatenate([np.full(len(pair.right), 1 / len(pair.right)) for pair in own])
-    w = np.zeros(X.shape[1])
-    for _ in range(NEWTON_STEPS):
-        p = 1 / (1 + np.exp(-X @ w))
-        curvature = (X * (weight * p * (1 - p))[:, None]).T @ X + 1e-9 * np.eye(len(w))
-        step = np.linalg.solve(curvature, X.T @ (weight * (y - p)))
-        w = w + step * min(1.0, 2.0 / max(float(np.abs(step).max()), 1e-12))
-    return np.asarray(w)
+    """Logistic regression; each pair has weight 1."""
+
+    def total(w: Array) -> tuple[float, Array]:
+        """Log loss, and its gradient."""
+        parts = [(X @ w, X, pair.right) for X, pair in zip(columns, own, strict=True)]
+        gradient = sum((expit(z) - right) @ X / len(right) for z, X, right in parts)
+        return sum(loss(z, right) for z, _, right in parts), np.asarray(gradient)
+
+    start = np.zeros(columns[0].shape[1])
+    return np.asarray(minimize(total, start, jac=True, options={"gtol": 1e-8}).x)
 
 
 def loss(z: Array, right: Array) -> float:

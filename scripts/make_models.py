@@ -79,7 +79,7 @@ def codebooks(arguments: argparse.Namespace) -> None:
         extract = load_pipeline("sift_ratio", overrides=options).extractor
         selected = itertools.islice(images(arguments), 0, None, arguments.every)
         parts = [local_descriptors(extract(image).descriptors, kind) for image in selected]
-        book = learned(parts, arguments.centers, arguments.dimensions)
+        book = learned(parts, CENTERS, DIMENSIONS)
         write(arguments.output / f"vlad_{name}.npz", book._asdict(), parts)
 
 
@@ -152,8 +152,6 @@ def main() -> None:
         command.add_argument("--output", type=Path, default=models_dir())
     command.add_argument("--only", choices=[*FEATURES], nargs="+", default=[*FEATURES])
     command.add_argument("--every", type=int, default=1, help="of the photographs, every so many-th")
-    command.add_argument("--centers", type=int, default=CENTERS)
-    command.add_argument("--dimensions", type=int, default=DIMENSIONS)
     arguments = parser.parse_args()
     torch.set_num_threads(1)  # many small steps: threads would wait for one another
     with exits_with_message():

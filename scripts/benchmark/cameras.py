@@ -30,6 +30,7 @@ from fmtorch.estimators import PairwiseEstimator
 from fmtorch.evaluation.rows import focal_errors
 from fmtorch.pipeline.pipeline import Outcome
 from fmtorch.presets import build
+from fmtorch.scenes.raycast import calibration
 from fmtorch.two_view.known_cameras import KnownCameras
 from scripts.benchmark import pairs
 from scripts.benchmark.changes import sizes_of, taken
@@ -108,11 +109,8 @@ def told(level: str, pair: ImagePair, c: Correspondences, seed: int) -> Correspo
 
 def calibrations(c: Correspondences, focals: Array) -> list[Array]:
     """Those that are given; for others square pixels, these focal lengths (2,) in pixels and the centres of images."""
-    centred = [
-        np.array([[f, 0, (w - 1) / 2], [0, f, (h - 1) / 2], [0, 0, 1]])
-        for f, (h, w) in zip(focals, sizes_of(c), strict=True)
-    ]
-    return [own if K is None else K[0].numpy() for own, K in zip(centred, (c.K0, c.K1), strict=True)]
+    unknown = [calibration(f, (h, w)) for f, (h, w) in zip(focals, sizes_of(c), strict=True)]
+    return [own if K is None else K[0].numpy() for own, K in zip(unknown, (c.K0, c.K1), strict=True)]
 
 
 Solve = Callable[[Correspondences, int], Estimate]

@@ -22,11 +22,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fmtorch.evaluation.statistics import PERCENT
 from scripts.benchmark import pairs, tables
 from scripts.benchmark.methods import NGRANSAC, method, ngransac, read_specs, stages_of
 from scripts.benchmark.runner import Kept, Row, add_command, measure
-from scripts.benchmark.tables import BASELINES, FIGURES, Record, Results, Sheet, show
+from scripts.benchmark.tables import BASELINES, Record, Results, Sheet, show
 
 FOLDER = Path(__file__).parent
 KNEE_TOLERANCE = 0.5  # points of AUC@0.05 below the best of its curve
@@ -125,9 +124,9 @@ def read_curves(lines: Sequence[str]) -> list[Curve]:
 def area_and_cost(results: Results, spec: str) -> tuple[float, float]:
     """AUC@0.05 in percent and milliseconds, averaged over the families."""
     groups = results.groups(results.pairs())
-    own = [results.get(spec, groups[family]) for family in results.families]
-    area = float(np.mean([PERCENT * FIGURES["AUC@0.05"].of(get).mean() for get in own]))
-    return area, float(np.mean([get("ms").mean() for get in own]))
+    families = [groups[family] for family in results.families]
+    area = np.mean([results.percent(spec, own, "AUC@0.05") for own in families])
+    return float(area), float(np.mean([results.get(spec, own)("ms").mean() for own in families]))
 
 
 def knee(figures: Figures) -> str:
@@ -163,7 +162,7 @@ def draw_curves(curves: Sequence[Curve], results: Results, knees: Mapping[str, s
     for group, own in _shown(results).items():
         for curve in curves:
             x = [float(np.median(results.get(spec, own)("ms"))) for spec in curve.specs]
-            y = [PERCENT * float(FIGURES["AUC@0.05"].of(results.get(spec, own)).mean()) for spec in curve.specs]
+            y = [results.percent(spec, own, "AUC@0.05") for spec in curve.specs]
             marked = curve.specs.index(knees[curve.name]) if knees.get(curve.name) in curve.specs else None
             panels.setdefault(group, {})[curve.name] = tables.Line(x, y, marked)
     tables.draw(path, panels, ("ms a pair (median)", "AUC@0.05 [%]"), "log")

@@ -19,7 +19,7 @@ from fmtorch import data, presets
 from fmtorch.core.stages import pruned
 from fmtorch.data import ImagePair, read_image, to_grey
 from fmtorch.features import ImagePyramid, LocalFeature
-from fmtorch.features.vlad import codebook, descriptor_kind, load_codebook, local_descriptors, vlad
+from fmtorch.features.vlad import codebook, descriptor_kind, local_descriptors, vlad
 from fmtorch.pipeline.folder import similar_pairs
 from fmtorch.pipeline.pipeline import STAGES, Pipeline
 from fmtorch.pipeline.two_images import describe
@@ -58,7 +58,6 @@ def add_arguments(commands: Any) -> None:
     parser = add_command(commands, "similar", run_similar, SIMILAR)
     parser.add_argument("--root", type=Path, nargs="+", required=True, help="folders in the layout of fmbench")
     parser.add_argument("--pipeline", default="sift_fmtorch")
-    parser.add_argument("--codebook", type=Path, help="another one than the package's")
     parser.add_argument("--count", type=int, nargs="+", default=[5, 10, 20])
 
 
@@ -149,8 +148,13 @@ def opencv_stages(method: int, threshold: float, image0: Image, image1: Image, f
     kept = [two[0] for two in neighbors if len(two) == 2 and two[0].distance < RATIO * two[1].distance]
     x0 = np.array([k0[match.queryIdx].pt for match in kept], np.float64)
     x1 = np.array([k1[match.trainIdx].pt for match in kept], np.float64)
+    return _estimated(clock, x0, x1, method, threshold)
+
+
+def _estimated(clock: Clock, x0: NDArray[Any], x1: NDArray[Any], method: int, threshold: float) -> Seconds:
+    """The seconds of a peer when it has matches, F included."""
     clock.stage("pruning")
-    if len(kept) >= 8:
+    if len(x0) >= 8:
         cv2.findFundamentalMat(x0, x1, method, threshold, 0.9999, 10000)
     clock.stage("estimation")
     return clock.seconds
@@ -168,11 +172,7 @@ def kornia_stages(image0: Image, image1: Image, features: int) -> Seconds:
     _, matches = KF.match_snn(extracted[0][2][0], extracted[1][2][0], RATIO)
     clock.stage("matching")
     x0, x1 = (extracted[i][0][0, matches[:, i], :, 2].double().numpy() for i in (0, 1))
-    clock.stage("pruning")
-    if len(matches) >= 8:
-        cv2.findFundamentalMat(x0, x1, cv2.FM_LMEDS, 1.0, 0.9999, 10000)
-    clock.stage("estimation")
-    return clock.seconds
+    return _estimated(clock, x0, x1, cv2.FM_LMEDS, 1.0)
 
 
 LMEDS, MAGSAC = (functools.partial(opencv_stages, *of) for of in ((cv2.FM_LMEDS, 1.0), (cv2.USAC_MAGSAC, 0.25)))
@@ -191,7 +191,7 @@ def run_similar(arguments: argparse.Namespace) -> None:
     overlapping = {frozenset((p.image0.path, p.image1.path)): f"{p.family}/{p.scene}" for p in true}
     pipeline = pipeline_of(arguments.pipeline)
     kind = descriptor_kind((presets.pipeline_stages(arguments.pipeline) or {})["features"])
-    book = codebook(kind) if arguments.codebook is None else load_codebook(arguments.codebook)
+    book = codebook(kind)
     described = [describe(pipeline, read_image(path), 1600).features.descriptors for path in paths]
     start = time.process_time()
     vectors = torch.stack([vlad(local_descriptors(descriptors, kind), book) for descriptors in described])

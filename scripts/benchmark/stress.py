@@ -19,7 +19,6 @@ import numpy as np
 
 from fmtorch.data import ImagePair
 from fmtorch.evaluation.run import select
-from fmtorch.evaluation.statistics import PERCENT
 from fmtorch.pipeline.pipeline import Outcome, Pipeline
 from fmtorch.presets.composition import WIDE
 from fmtorch.scenes.dataset import FAMILIES
@@ -27,7 +26,7 @@ from scripts.benchmark import pairs, tables
 from scripts.benchmark.changes import CONDITIONED, MIN_RIGHT, SWEEPS, Case, Change, Level, case_of, on_plane, parallax
 from scripts.benchmark.methods import method, read_specs
 from scripts.benchmark.runner import Item, Kept, Method, Row, add_command, measure
-from scripts.benchmark.tables import FIGURES, Record, Results, Sheet, show
+from scripts.benchmark.tables import Record, Results, Sheet, show
 
 SPECS = Path(__file__).with_name("stress.txt")
 AXES = {"inlier ratio": "inlier ratio", "noise": "added noise [px]", "match count": "matches"}
@@ -166,6 +165,6 @@ def draw(rows: Sequence[Row], sweep: str, path: Path) -> None:
         for (name, own), estimator in itertools.product(families_of(results).items(), results.methods):
             line = panels.setdefault(name, {}).setdefault(estimator, tables.Line([], []))
             line.x.append(float(level))
-            line.y.append(PERCENT * float(FIGURES["AUC@0.05"].of(results.get(estimator, own)).mean()))
+            line.y.append(results.percent(estimator, own, "AUC@0.05"))
     scale = "linear" if sweep == "noise" else "log"
     tables.draw(path, panels, (AXES[sweep], "AUC@0.05 [%]"), scale, [float(x) for x in SWEEPS[sweep]])

@@ -205,6 +205,10 @@ class Results:
             by_family |= dict(zip(BASELINES, (wide, short), strict=True))
         return by_family | ({"all": list(pairs)} if len(by_family) > 1 else {})
 
+    def percent(self, method: str, pairs: Sequence[str], name: str) -> float:
+        """The mean of a figure of a method over some pairs, in percent."""
+        return PERCENT * float(FIGURES[name].of(self.get(method, pairs)).mean())
+
     def cell(self, method: str, pairs: Sequence[str], name: str, intervals: bool = False) -> Span | str:
         """One figure of a method over some pairs, with its interval if asked."""
         if not pairs:

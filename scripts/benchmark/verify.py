@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 import fmtorch
 from fmtorch.estimators.external import colmap
+from fmtorch.io.colmap import remove_database
 from fmtorch.metrics import pose_auc, pose_error
 from scripts.benchmark.runner import Kept, Row, add_command
 from scripts.benchmark.tables import Record, Sheet, show
@@ -118,13 +119,13 @@ def measure(scene: Scene, database: Path, key: tuple[Any, ...], mappers: Sequenc
         return
     _, _, cameras, method, seed = key
     path = database.with_name(f"{database.stem}-{method.replace(':', '-')}-{seed}.db")
-    remove(path)
+    remove_database(path)
     shutil.copy(database, path)
     verified = verified_by(method, path, seed)
     for mapper in missing:
         figures = mapped(mapper, path, scene, cameras, seed) if mapper else verified | pair_poses(path, scene.truth)
         kept.add([dict(zip(FIELDS, (*key, mapper), strict=True)) | figures])
-    remove(path)
+    remove_database(path)
 
 
 _warm: set[Path] = set()
@@ -139,7 +140,7 @@ def verified_by(method: str, path: Path, seed: int) -> Row:
         if path.parent not in _warm:  # what a process loads and compiles is no part of a pair's time
             copy = path.with_suffix(".warm")
             fmtorch.verify(path, output=copy, force=True)
-            remove(copy)
+            remove_database(copy)
             _warm.add(path.parent)
         start = time.process_time()
         fmtorch.verify(path, seed=seed)
@@ -302,12 +303,6 @@ def _mean(values: Sequence[float]) -> float:
 
 def _text(value: float, digits: int) -> str:
     return "" if np.isnan(value) else f"{value:.{digits}f}"
-
-
-def remove(path: Path) -> None:
-    """Remove a database with what lies beside it."""
-    for old in path.parent.glob(f"{path.name}*"):
-        old.unlink()
 
 
 def database_of(scene: Scene, features: str, cameras: str, work: Path) -> Path:
