@@ -60,13 +60,8 @@ def run(arguments: argparse.Namespace) -> None:
 
 def methods_of(specs: Sequence[str]) -> list[Method]:
     """The estimators; those in brackets are measured under conditions alone."""
-    every = [method(spec.strip("()")) for spec in specs]
-    bracketed = {each.name for each, spec in zip(every, specs, strict=True) if spec.startswith("(")}
-    return [dataclasses.replace(each, takes=_conditioned) if each.name in bracketed else each for each in every]
-
-
-def _conditioned(item: Item) -> bool:
-    return bool(item.facts["sweep"] == CONDITIONED)
+    conditioned = functools.partial(dataclasses.replace, takes=lambda item: item.facts["sweep"] == CONDITIONED)
+    return [conditioned(method(spec.strip("()"))) if spec.startswith("(") else method(spec) for spec in specs]
 
 
 def items_of(arguments: argparse.Namespace) -> Iterator[Item]:

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 import fmtorch
 from fmtorch.estimators.external import colmap
-from fmtorch.io.colmap import remove_database
+from fmtorch.io.colmap import imported, remove_database
 from fmtorch.metrics import pose_auc, pose_error
 from scripts.benchmark.runner import Kept, Row, add_command
 from scripts.benchmark.tables import Record, Sheet, show
@@ -133,8 +133,7 @@ _warm: set[Path] = set()
 
 def verified_by(method: str, path: Path, seed: int) -> Row:
     """Verify a database in place: pairs, those with a geometry, and processor seconds."""
-    import pycolmap
-
+    pycolmap = imported()
     kind, _, threshold = method.partition(":")
     if kind == "ours":
         if path.parent not in _warm:  # what a process loads and compiles is no part of a pair's time
@@ -161,8 +160,7 @@ def mapped(mapper: str, path: Path, scene: Scene, cameras: str, seed: int) -> Ro
     Known intrinsics are held fixed. Unknown ones are calibrated from the view graph before the global mapper, as
     COLMAP asks for; that changes the database, so it works on a copy.
     """
-    import pycolmap
-
+    pycolmap = imported()
     output = path.with_suffix(f".{mapper}")
     shutil.rmtree(output, ignore_errors=True)
     output.mkdir()
@@ -188,8 +186,7 @@ def mapped(mapper: str, path: Path, scene: Scene, cameras: str, seed: int) -> Ro
 
 def _options(mapper: str, refined: bool, seed: int) -> Any:
     """Of COLMAP's mappers. refined: whether intrinsics are estimated."""
-    import pycolmap
-
+    pycolmap = imported()
     own: dict[str, Any] = {"min_model_size": MIN_MODEL, "num_threads": 1, "random_seed": seed}
     if mapper == "global":
         options: Any = pycolmap.GlobalPipelineOptions()
@@ -230,8 +227,7 @@ def relative_error(relative: Any, truth: Truth, a: str, b: str) -> float:
 
 def centre_errors(poses: dict[str, Any], truth: Truth) -> Array:
     """Distances from the true centres after the best similarity (Umeyama 1991), per cent of the centres' RMS spread."""
-    import pycolmap
-
+    pycolmap = imported()
     names = sorted(truth.R)
     true = np.array([-truth.R[name].T @ truth.t[name] for name in names])
     size, errors = np.sqrt(((true - true.mean(0)) ** 2).sum(1).mean()), np.full(len(names), np.inf)
@@ -246,8 +242,7 @@ def centre_errors(poses: dict[str, Any], truth: Truth) -> Array:
 
 def pair_poses(path: Path, truth: Truth) -> dict[str, int]:
     """How many pairs have a relative pose, and how many of them are right within 5 degrees, or off by more than 10."""
-    import pycolmap
-
+    pycolmap = imported()
     with pycolmap.Database.open(path) as database:
         names = {image.image_id: image.name for image in database.read_all_images()}
         ends = [pycolmap.pair_id_to_image_pair(pair) for pair in database.read_two_view_geometries()[0]]
@@ -327,8 +322,7 @@ def database_of(scene: Scene, features: str, cameras: str, work: Path) -> Path:
 
 def match(scene: Scene, path: Path, verified: bool) -> None:
     """COLMAP's SIFT of a scene and its matches of all pairs, in a new database; verified: by the true cameras."""
-    import pycolmap
-
+    pycolmap = imported()
     extraction = pycolmap.FeatureExtractionOptions(num_threads=1)
     extraction.sift.max_num_features = FEATURES
     mode = pycolmap.CameraMode.SINGLE if scene.single else pycolmap.CameraMode.PER_IMAGE
@@ -342,8 +336,7 @@ def match(scene: Scene, path: Path, verified: bool) -> None:
 
 def _match_by_ours(scene: Scene, path: Path, work: Path) -> None:
     """`fmtorch match images=`, of which the geometries are removed again."""
-    import pycolmap
-
+    pycolmap = imported()
     output, camera = work / f"{scene.name}-match", "shared" if scene.single else "per_image"
     words = [f"images={scene.images}", "export=colmap", f"camera={camera}", f"output={output}"]
     if subprocess.run([sys.executable, "-m", "fmtorch", "match", *words], check=False).returncode:
@@ -354,8 +347,7 @@ def _match_by_ours(scene: Scene, path: Path, work: Path) -> None:
 
 
 def calibrate(path: Path, truth: Truth) -> None:
-    import pycolmap
-
+    pycolmap = imported()
     with pycolmap.Database.open(path) as database:
         for image in database.read_all_images():
             K, camera = truth.K[image.name], database.read_camera(image.camera_id)
@@ -366,8 +358,7 @@ def calibrate(path: Path, truth: Truth) -> None:
 
 
 def run_known_models(arguments: argparse.Namespace) -> None:
-    import pycolmap
-
+    pycolmap = imported()
     options = pycolmap.IncrementalPipelineOptions(num_threads=1, random_seed=0, extract_colors=False)
     for path in (file.parent for root in arguments.root for file in sorted(root.glob("*/Camera.txt"))):
         target, scene = arguments.folder / path.name, read_scene(path)
@@ -393,8 +384,7 @@ def run_known_models(arguments: argparse.Namespace) -> None:
 
 def posed(scene: Scene, database: Path) -> Any:
     """A reconstruction of the true cameras, with the numbers that images have in a database, and without points."""
-    import pycolmap
-
+    pycolmap = imported()
     model = pycolmap.Reconstruction()
     with pycolmap.Database.open(database) as opened:
         for image in opened.read_all_images():
