@@ -36,7 +36,8 @@ def test_robust_optimum_equals_scipy(loss: str, seed: int) -> None:
     scale = 0.01
     F0 = models(F, 1, 1e-3, seed)
     ones = torch.ones(1, 120, dtype=torch.float64)
-    fitted, cost = refine_components(F0, components(x0, x1), ones, loss, torch.tensor([scale], dtype=torch.float64), 60)
+    s2 = torch.full((1, 1), scale**2, dtype=torch.float64)
+    fitted, cost = refine_components(F0, RobustSum(components(x0, x1), ones, loss, s2), 60)
     # From our optimum SciPy, which knows another parametrisation and numerical gradients, cannot get lower.
     _, min_cost = reference.optimum(fitted[:, 0, 0].reshape(3, 3).numpy(), x0, x1, np.ones(120), loss, scale)
     # The tabulated loss is linear between its entries, whose integral is off by up to 1e-7.
@@ -50,8 +51,8 @@ def test_cost_never_rises(loss: str) -> None:
     F, x0, x1 = unit_scene(7, 90, noise=5e-3, outliers=40)
     F0 = torch.cat([models(F, 10, 0.05), models(F, 10, 1.0)], 2)
     weight = torch.from_numpy(np.random.default_rng(0).uniform(0, 1, (1, 90)))
-    scale = torch.tensor([0.02], dtype=torch.float64)
-    costs = [refine_components(F0, components(x0, x1), weight, loss, scale, i)[1] for i in range(8)]
+    error = RobustSum(components(x0, x1), weight, loss, torch.full((1, 1), 0.02**2, dtype=torch.float64))
+    costs = [refine_components(F0, error, i)[1] for i in range(8)]
     for before, after in itertools.pairwise(costs):
         assert bool((after <= before).all())
     assert bool((costs[-1] < costs[0])[:, :10].any())
