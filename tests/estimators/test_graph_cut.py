@@ -23,8 +23,8 @@ from fmtorch.estimators import (
     scores_of,
 )
 from fmtorch.estimators.inliers import residuals_squared_px
-from fmtorch.jit import Stream
 from fmtorch.jit.kernel import F4x1, F8x1, F8x2, kernel
+from fmtorch.jit.random import Stream
 from tests.conftest import oracle
 from tests.estimators.pairs import REAL, named, pair_of, to_units
 from tests.reference import homography

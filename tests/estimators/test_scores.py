@@ -14,7 +14,7 @@ from fmtorch.estimators.inliers import residuals_squared_px
 from fmtorch.estimators.scores import GRID, fractional_bits, saturated_cells
 from fmtorch.geometry.epipolar import HOMOGRAPHY, SAMPSON
 from fmtorch.geometry.robust_losses import ENTRIES, QUANTILE
-from fmtorch.jit import Stream
+from fmtorch.jit.random import Stream
 from tests.estimators.pairs import FEW, REAL, SCALES, known, models, named, pair_of, residuals
 from tests.laws import scene
 from tests.reference import known_cameras, refine

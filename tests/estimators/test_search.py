@@ -19,7 +19,7 @@ from fmtorch.estimators.preselection import (
     drawn_by_prior,
     shuffled_first,
 )
-from fmtorch.jit import Stream
+from fmtorch.jit.random import Stream
 from tests.estimators.pairs import FEW, SCALES, known, models, named, pair_of
 from tests.laws import scene, with_padding
 from tests.reference import ransac as reference

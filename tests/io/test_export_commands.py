@@ -146,7 +146,7 @@ def test_lists_of_pairs(images: Path, tmp_path: Path) -> None:
     ("words", "said"),
     [
         (["images=nowhere"], "images=nowhere is no folder"),
-        (["images=.", "image0=a.png"], "images takes a folder; image0, image1 and truth are of a single pair"),
+        (["images=.", "image0=a.png"], "images takes a folder; image0, image1, truth and lens are of a single pair"),
         (["image0=a.png", "image1=b.png", "export=h5"], "export and pairs are of a folder of images"),
         (["images=.", "pairs=similar:0"], "pairs=similar:0; it must be similar:N with a whole number N"),
         (["images=.", "pairs=similar:2", "features=l2net"], "no codebook for the descriptors l2net"),

@@ -7,7 +7,7 @@ import torch
 from fmtorch.core import pair_key
 from fmtorch.estimators import uniforms
 from fmtorch.estimators.preselection import shuffle
-from fmtorch.jit import Stream, bits, mixed_seed, uniform
+from fmtorch.jit.random import Stream, bits, mixed_seed, uniform
 from tests.reference import random as reference
 from tests.reference.random import number
 

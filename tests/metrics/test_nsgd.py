@@ -11,7 +11,7 @@ from torch import Tensor
 
 from fmtorch import metrics
 from fmtorch.geometry import cross_matrix, unit_frobenius
-from fmtorch.jit import Stream, uniform
+from fmtorch.jit.random import Stream, uniform
 from fmtorch.metrics.nsgd import COLUMNS
 from tests.conftest import oracle
 from tests.reference import metrics as reference

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from fmtorch import core, presets, training
 from fmtorch.core import Correspondences
 from fmtorch.geometry import eight_point, fundamental_from_calibration, irls, refine, reweighted_fits
-from fmtorch.jit import Stream, uniform
+from fmtorch.jit.random import Stream, uniform
 from fmtorch.pruning import LC
 from fmtorch.pruning.networks.learned import Prediction, predict
 from fmtorch.training.objective import LIMIT_E, LIMIT_F, TRIES

@@ -16,7 +16,7 @@ from fmtorch.estimators.focal_search import FocalSearch, PlausibleCandidates
 from fmtorch.estimators.models import focal_prior
 from fmtorch.estimators.models.posterior import images_of, no_cameras
 from fmtorch.estimators.models.with_focals import FundamentalWithFocals
-from fmtorch.jit import Stream
+from fmtorch.jit.random import Stream
 from fmtorch.metrics import nsgd
 from tests.estimators.pairs import pair_of, to_units
 from tests.laws import scene
