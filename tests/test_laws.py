@@ -8,7 +8,7 @@ import torch
 
 from fmtorch import presets
 from fmtorch.core import Correspondences, Estimate, collate
-from fmtorch.two_view import KnownCameras
+from fmtorch.two_view.known_cameras import KnownCameras
 from tests import laws
 from tests.variants import OTHER_LIBRARIES, variants
 

@@ -13,7 +13,7 @@ from fmtorch import find_essential, geometry, presets
 from fmtorch.core import Correspondences, collate
 from fmtorch.estimators import PairwiseEstimator, Solution
 from fmtorch.estimators.external.pairwise import Pair
-from fmtorch.two_view import KnownCameras
+from fmtorch.two_view.known_cameras import KnownCameras
 from tests.geometry.scenes import scene as matched_scene
 from tests.laws import PEERS, scene
 from tests.variants import OTHER_LIBRARIES, built, variants

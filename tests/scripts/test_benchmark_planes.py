@@ -14,7 +14,7 @@ from fmtorch.core import Correspondences, Estimate
 from fmtorch.data import ImagePair, ImageSource
 from fmtorch.geometry import homography_transfer
 from fmtorch.scenes import PICTURES, Plan, RenderedPairs
-from fmtorch.two_view import classify
+from fmtorch.two_view.pair_type import classify
 from scripts.benchmark import cameras, pairs, planes, related, verify
 from scripts.benchmark.cameras import LEVELS, TAKES, CameraMethod
 from scripts.benchmark.methods import read_specs

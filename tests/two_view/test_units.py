@@ -15,7 +15,8 @@ from fmtorch.core import PAIR_TYPES, Correspondences, Estimate, collate
 from fmtorch.estimators.lens_search import inverted
 from fmtorch.geometry import significance
 from fmtorch.metrics import nsgd
-from fmtorch.two_view import classify, lens_fields
+from fmtorch.two_view.arguments import lens_fields
+from fmtorch.two_view.pair_type import classify
 from tests.geometry.scenes import batch, draw
 from tests.reference import lenses as division
 from tests.reference.known_cameras import K0, K1, SIZE, angle, scene
