@@ -59,10 +59,10 @@ class Scene:
         if name in ("x0", "x1", "x"):
             points = self.x1 if name == "x1" else self.x0
             return points[..., :7, :] if "7" in shape else points
-        if name.startswith("size") or name == "image_size":
-            return np.broadcast_to(np.array(SIZE), full).copy()
         if kind == "Bool":
             return self.rng.random(full) < 0.8
+        if name.startswith("size") or name == "image_size":
+            return np.broadcast_to(np.array(SIZE), full).copy()
         if name in ("index", "reverse"):
             return self.rng.integers(-1, 11 if name == "index" else max(1, self.count), full)
         if kind == "Int":
