@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from fmtorch.estimators import focal_search, inliers, pair, preselection, refinement, sampling, scores, search
+from fmtorch.estimators.lens_search import inverted, minimise_with_lenses
 from fmtorch.estimators.models import focal_prior, fundamental, model, posterior, with_focals
 from fmtorch.geometry import five_point, homography_refine, levenberg_marquardt
 from fmtorch.geometry.homography import four_point
@@ -23,7 +24,7 @@ WITH_FOCALS: tuple[Kernel[..., Any], ...] = (
     # Cameras and fits; `evaluate` is called by `minimise` and `refine`
     posterior.centre, posterior.translate, with_focals.gain_without_prior, with_focals.refine_with_prior,
     model.cheirality, most_significant, posterior.nearest_cameras, levenberg_marquardt.evaluate, refine_kernel,
-    posterior.minimise,
+    posterior.minimise, inverted, minimise_with_lenses,
 )  # fmt: skip
 """Of an estimator of fundamental matrices with the prior on focal lengths."""
 

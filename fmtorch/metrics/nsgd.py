@@ -19,7 +19,8 @@ from jaxtyping import Float, Int, Real
 from torch import Tensor
 
 from fmtorch.core.checks import checked, expect_sizes
-from fmtorch.geometry import arithmetic, epipolar
+from fmtorch.geometry import epipolar
+from fmtorch.geometry.arithmetic import sqrt
 from fmtorch.jit.batches import for_each_pair
 from fmtorch.jit.kernel import Array, F8x1, F8x2, F8x3, I8x1, inner, kernel, vector
 from fmtorch.jit.random import Stream, mixed_seed, stream_state, uniform_kernel
@@ -186,7 +187,7 @@ def _flattened(
 def diagonal(size: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch"]:
     """Length of the image diagonal, in pixels."""
     h, w = size.unbind(-1)
-    return arithmetic.sqrt(h * h + w * w)
+    return sqrt(h * h + w * w)
 
 
 @kernel

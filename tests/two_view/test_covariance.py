@@ -150,7 +150,7 @@ def test_what_was_not_asked_for_is_not_there() -> None:
     s = reference.scene(0)
     e = fmtorch.find_fundamental(s.x0, s.x1, size0="unknown")
     assert e.covariance is None
-    for name, argument in (("pair_type", "pair_type"), ("warning", "pair_type"), ("deviation_degrees", "covariance")):
+    for name, argument in (("pair_type", "pair_type"), ("deviation_degrees", "covariance")):
         with pytest.raises(AttributeError, match=f"{argument}=True"):
             getattr(e, name)
 
