@@ -72,9 +72,9 @@ class Record:
         values = vars(self)
         tensors = {name: value.detach().cpu().clone() for name, value in values.items() if isinstance(value, Tensor)}
         plain = {name: value for name, value in values.items() if not isinstance(value, Tensor | None)}
-        told = {"record": type(self).__name__, "fields": json.dumps(plain)}
+        stored = {"record": type(self).__name__, "fields": json.dumps(plain)}
         with files.replacing(Path(path)) as temporary:
-            save_file({name: value.contiguous() for name, value in tensors.items()}, temporary, told)
+            save_file({name: value.contiguous() for name, value in tensors.items()}, temporary, stored)
 
     @classmethod
     def load(cls: type[AnyRecord], path: Path | str) -> AnyRecord:
@@ -82,14 +82,16 @@ class Record:
         Raises FileNotFoundError, or ValueError for another file."""
         try:
             with safe_open(path, "pt") as file:
-                told = file.metadata() or {}
+                stored = file.metadata() or {}
                 tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         except SafetensorError as error:
             raise ValueError(f"{path} is no file that save() wrote: {error}") from error
         kinds = {kind.__name__ for kind in (cls, *cls.__subclasses__())}
-        if told.get("record") not in kinds:
-            raise ValueError(f"{path} holds {told.get('record', 'no record')}; {cls.__name__}.load reads {min(kinds)}")
-        plain = json.loads(told["fields"])
+        if stored.get("record") not in kinds:
+            raise ValueError(
+                f"{path} holds {stored.get('record', 'no record')}; {cls.__name__}.load reads {min(kinds)}"
+            )
+        plain = json.loads(stored["fields"])
         return cls(**tensors, **{name: tuple(v) if isinstance(v, list) else v for name, v in plain.items()})
 
     def __repr__(self) -> str:

@@ -59,8 +59,8 @@ def build(config: Mapping[str, Any], progress: Progress | None = None) -> PairDa
 
     Raises ValueError, naming the option, where the config does not fit its target, and what this raises itself.
     """
-    told = "progress" in inspect.signature(presets.target_of(config, "dataset")).parameters
-    dataset: PairDataset = presets.instantiate(config, "dataset", **({"progress": progress} if told else {}))
+    reports = "progress" in inspect.signature(presets.target_of(config, "dataset")).parameters
+    dataset: PairDataset = presets.instantiate(config, "dataset", **({"progress": progress} if reports else {}))
     return dataset
 
 

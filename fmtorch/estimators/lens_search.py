@@ -411,8 +411,8 @@ def _round(at: Array, prior: LensPrior, pair: Pair, search: FocalSearch) -> list
     best = best[np.isfinite(candidates.posterior[best])]
     cameras = Cameras(candidates.cameras.axes[best], candidates.cameras.focal[best])
     lenses = np.tile(at, (len(best), 1))
-    found = fit_with_lenses(cameras, lenses, prior, pair, START_SCALE_PX, START_ITERATIONS)
-    return sorted((fit for fit in found if math.isfinite(fit.cost)), key=lambda fit: fit.cost)[:1]
+    fits = fit_with_lenses(cameras, lenses, prior, pair, START_SCALE_PX, START_ITERATIONS)
+    return sorted((fit for fit in fits if math.isfinite(fit.cost)), key=lambda fit: fit.cost)[:1]
 
 
 def _from(fit: LensFit, prior: LensPrior, pair: Pair, scale_px: float, iterations: int) -> LensFit:

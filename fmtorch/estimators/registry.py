@@ -62,9 +62,9 @@ def part(role: str, spec: Any, **context: Any) -> Any:
     if name not in PARTS[role]:
         raise ValueError(f"{role} is {name!r}; it must be one of: {', '.join(PARTS[role])}")
     make = PARTS[role][name]
-    told = {key: value for key, value in context.items() if key in inspect.signature(make).parameters}
-    expect_options(make, options, f"{role}={name}", told)
-    return make(**(told | options))
+    known = {key: value for key, value in context.items() if key in inspect.signature(make).parameters}
+    expect_options(make, options, f"{role}={name}", known)
+    return make(**(known | options))
 
 
 def thresholds(

@@ -92,7 +92,7 @@ def applies(level: str, pair: ImagePair) -> bool:
     return level != "shared" or bool(abs(np.log(f0 / f1)) < ONE_CAMERA)
 
 
-def told(level: str, pair: ImagePair, c: Correspondences, seed: int) -> Correspondences:
+def described(level: str, pair: ImagePair, c: Correspondences, seed: int) -> Correspondences:
     """The matches with what a level tells of their cameras. seed: of roughly known focal lengths."""
     factors, deviation = np.ones(2), 0.0
     if level == "rough":
@@ -144,7 +144,7 @@ class CameraMethod(Measured):
 
     def figures(self, item: Item, seed: int) -> Row:
         """The figures of F and pose, whether t points backwards, and the errors of focal lengths not given exactly."""
-        pair, c = item.pair, told(self.level, item.pair, item.matches, seed)
+        pair, c = item.pair, described(self.level, item.pair, item.matches, seed)
         start = time.process_time()
         estimate = self.solve(c, seed)
         ms = 1e3 * (time.process_time() - start)

@@ -276,8 +276,8 @@ def main(config: DictConfig) -> None:
             spread = torch.from_numpy(train.patches[:: max(1, len(train.patches) // 20000)].copy())
             network.pixel_mean.copy_(objectives.middle(spread).float().mean(0) / 255)  # type: ignore[operator]
         network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        told = ("architecture", "network", "loss", "teacher")
-        description: dict[str, Any] = {key: value for key, value in training.items() if key in told}
+        kept = ("architecture", "network", "loss", "teacher")
+        description: dict[str, Any] = {key: value for key, value in training.items() if key in kept}
         description |= {"validation_data": validation.description, "licences": plain(config.photographs.sources)}
         checkpoint = Path(config.out) / f"{config.name}.pt"
         run = training_of(config, network, train, description, device)
