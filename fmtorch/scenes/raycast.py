@@ -50,7 +50,7 @@ class Camera:
         return x[:, :2] / x[:, 2:], x[:, 2]
 
 
-def calibration(focal: Real, size: tuple[int, int], centre: tuple[float, float] | None = None) -> Matrix:
+def calibration(focal: Real, size: tuple[float, float], centre: tuple[float, float] | None = None) -> Matrix:
     """K of square pixels: focal length in pixels, principal point (x, y), by default the middle of the image."""
     h, w = size
     cx, cy = centre if centre is not None else ((w - 1) / 2, (h - 1) / 2)
