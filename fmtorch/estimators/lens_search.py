@@ -280,9 +280,9 @@ STARTS = ((0.0, 0.0), (-0.12, -0.12), (-0.25, -0.25))  # of both lenses, where t
 OWN_STARTS = (*STARTS, (0.0, -0.2), (-0.2, 0.0))  # where each has its own
 TAIL_DEVIATION = 0.15  # of an unknown lens that is not straight
 LENS = 7  # the first of the lenses among PARAMETERS
-# A Newton step from pinholes that makes these suspicious, also in standard deviations at START_SCALE_PX, and an optimum
-# that is suggested. On castle-P19 and fox these suggest a lens for 1 of 172 pairs where there is none, and where it is
-# -0.1 for 80 of the 101 pairs that have 100 right matches across half of the images.
+# A Newton step and an optimum near pinholes that make these suspicious, also in standard deviations at START_SCALE_PX,
+# and an optimum that is suggested. On castle-P19 and fox these suggest a lens for 1 of 172 pairs where there is none,
+# and where it is -0.1 for 76 of the 101 pairs that have 100 right matches across half of the images.
 SUSPICIOUS_LENS, SUSPICIOUS_DEVIATIONS = 0.02, 0.4
 SUGGESTED_LENS, SUGGESTED_DEVIATIONS, SUGGESTED_GAIN = 0.03, 3.0, 2.0
 CANDIDATES = 4  # of a round, from which lenses are refined
@@ -454,14 +454,20 @@ def suggested_lens(fit: Fit, pair: Pair) -> float:
         posterior.nearest_cameras(fit.F[None], images_of(pair), cameras)
     none, unknown, straight = np.zeros((1, 2)), lens_prior(SHARED), lens_prior(STRAIGHT)
     (pinholes,) = fit_with_lenses(cameras, none, unknown, pair, START_SCALE_PX, 0)
-    step = abs(float((pinholes.inverse[LENS] * pinholes.gradient).sum()))
-    if not step > max(SUSPICIOUS_LENS, SUSPICIOUS_DEVIATIONS * pinholes.deviation[0]):
-        return math.nan
 
     def refined(start: LensFit, prior: LensPrior) -> LensFit:
         return _from(start, prior, pair, START_SCALE_PX, START_ITERATIONS)
 
-    fits = [refined(pinholes._replace(lens=np.array(start)), unknown) for start in STARTS]
+    def suspicious(lens: float, deviation: float) -> bool:
+        return bool(abs(lens) > max(SUSPICIOUS_LENS, SUSPICIOUS_DEVIATIONS * deviation))
+
+    step = float((pinholes.inverse[LENS] * pinholes.gradient).sum())
+    if not suspicious(step, float(pinholes.deviation[0])):
+        return math.nan
+    near = refined(pinholes, unknown)
+    if not suspicious(float(near.lens[0]), float(near.deviation[0])):
+        return math.nan
+    fits = [near, *(refined(pinholes._replace(lens=np.array(start)), unknown) for start in STARTS[1:])]
     scale = noise_scale(min(fits, key=lambda fit: fit.cost), pair)
     best, without = _best(fits, unknown, pair, scale), _best([refined(pinholes, straight)], straight, pair, scale)
     lens, deviation = float(best.lens[0]), float(best.deviation[0])
