@@ -22,11 +22,17 @@ from fmtorch.estimators import (
     largest_weight,
     scores_of,
 )
+from fmtorch.estimators.graph_cut import (
+    HALVINGS,
+    UNIT,
+    label,
+    neighbor_graph,
+)
 from fmtorch.estimators.inliers import residuals_squared_px
 from fmtorch.jit.kernel import F4x1, F8x1, F8x2, kernel
 from fmtorch.jit.random import Stream
 from tests.conftest import oracle
-from tests.estimators.pairs import REAL, named, pair_of, to_units
+from tests.estimators.pairs import FEW, REAL, models, named, pair_of, to_units
 from tests.reference import homography
 from tests.reference import ransac as reference
 from tests.reference.random import number
@@ -404,3 +410,21 @@ def test_a_scene_ruled_by_a_plane() -> None:
 def test_degensac_needs_samples_of_seven() -> None:
     with pytest.raises(ValueError, match="degeneracy=degensac needs solver=seven_point; solver is 'eight_point'"):
         Ransac(solver="eight_point", degeneracy="degensac")
+
+
+def test_the_kernel_is_the_gaussian() -> None:
+    z, K = np.linspace(0, 60, 5001), np.empty(5001, np.float32)
+    gaussian(RECTIFIED, rectified(z), 1.0, K)
+    # exp(-z) - (1 + z / n)^-n is z^2 exp(-z) / (2 n) at most, 0.27 / n; half a unit of rounding, and 1024 roundings.
+    assert np.abs(K - np.exp(-z / 2)).max() < (0.28 / 2**HALVINGS) + UNIT / 2 + 2**HALVINGS * 2.0**-24
+    np.testing.assert_array_equal(K / UNIT, np.round(K / UNIT))
+
+
+@pytest.mark.parametrize("name", FEW)
+def test_a_model_of_all_matches_has_all_labels_and_one_of_none_has_none(name: str) -> None:
+    pair = named(name)
+    graph, labels = neighbor_graph(pair, RADIUS), np.empty(pair.count, np.bool_)
+    label(models(pair, 2)[1], pair.points, 1e-30, graph, 0.1, labels)
+    assert labels.all()
+    label(np.array([0, 0, 0, 0, 0, 0, 0, 0, 1.0]), pair.points, 1.0, graph, 0.1, labels)  # no point is on its line
+    assert not labels.any()

@@ -17,8 +17,9 @@ from fmtorch.estimators.models import with_focals
 from fmtorch.geometry import LOSSES
 from fmtorch.presets import merged
 from tests.estimators.models.test_focals import TALL, WIDE, photographs
-from tests.estimators.pairs import SCALES, known, named, real
+from tests.estimators.pairs import SCALES, known, named, pair_of, real
 from tests.laws import PEERS, degenerate, few, quick, scene, small, with_padding
+from tests.reference.random import number
 from tests.variants import OTHER_LIBRARIES, built, loaded, variants
 
 
@@ -388,3 +389,9 @@ def test_failed_pairs_have_none_and_change_no_other(name: str) -> None:
         for key, alone in differentiated(each)[1].items():
             # Sums over paddings of other lengths are rounded otherwise.
             torch.testing.assert_close(gradients[key][row, : alone.shape[1]], alone[0], rtol=1e-9, atol=1e-15)
+
+
+def test_numbers_of_a_pair_are_those_of_its_seed_key_and_draw() -> None:
+    pair = pair_of(scene(0, 20), seed=5)
+    expected = [[(number(5, pair.key, 1, d, j, 4) >> 10) / 2**53 for j in range(4)] for d in range(100, 130)]
+    assert pair.uniform(100, 30, 4).tolist() == expected

@@ -9,7 +9,14 @@ from scipy import integrate
 
 import fmtorch
 from fmtorch import estimators
-from fmtorch.estimators import BestOfSearch, BestScore, Candidates, Pool, Refinement, scores_of
+from fmtorch.estimators import (
+    BestOfSearch,
+    BestScore,
+    Candidates,
+    Pool,
+    Refinement,
+    scores_of,
+)
 from fmtorch.estimators.inliers import residuals_squared_px
 from fmtorch.estimators.scores import GRID, fractional_bits, saturated_cells
 from fmtorch.geometry.epipolar import HOMOGRAPHY, SAMPSON
@@ -355,3 +362,10 @@ def test_the_first_of_the_pool_or_the_best_score_of_what_is_valid() -> None:
     second = int(np.argmax(np.where(valid, scores, -np.inf)))
     np.testing.assert_array_equal(BestScore(estimators.Msac(50.0))(Candidates(F, valid, pair), pair).F, F[second])
     assert not BestScore(estimators.Msac(50.0))(Candidates(F, np.zeros(6, np.bool_), pair), pair).valid
+
+
+@pytest.mark.parametrize("threshold", [0.0, -1.0, float("nan")])
+def test_a_threshold_must_be_positive(threshold: float) -> None:
+    for kind, _ in SCORES.values():
+        with pytest.raises(ValueError, match=f"threshold is {threshold}; .* must be positive"):
+            kind(threshold)

@@ -19,6 +19,7 @@ from fmtorch.estimators.preselection import (
     drawn_by_prior,
     shuffled_first,
 )
+from fmtorch.estimators.search import merge
 from fmtorch.jit.random import Stream
 from tests.estimators.pairs import FEW, SCALES, known, models, named, pair_of
 from tests.laws import scene, with_padding
@@ -379,3 +380,17 @@ def test_samples_are_a_function_of_seed_key_and_draw(sampler: estimators.Sampler
     np.testing.assert_array_equal(drawn(batch, 1), alone)
     assert not np.array_equal(drawn(scene(1, 150), seed=1), alone)
     assert not np.array_equal(drawn(scene(1, 150).replace(key=torch.tensor([5]))), alone)
+
+
+@pytest.mark.parametrize(("m", "k", "size"), [(1, 1, 1), (300, 96, 12), (40, 40, 100)])
+def test_a_pool_is_a_stable_sort_of_all_that_it_was_offered(m: int, k: int, size: int) -> None:
+    rng = np.random.default_rng(m)
+    F, score = rng.normal(size=(m, 9)).astype(np.float32), rng.integers(-20, 20, m) / 8.0
+    which = np.sort(rng.permutation(m)[:k])
+    pool, pool_score, filled = np.zeros((size, 9), np.float32), np.full(size, -np.inf), 0
+    for part in np.array_split(which, 3):
+        filled = merge(F, part, score[part], filled, pool, pool_score)
+    best = which[np.argsort(-score[which], kind="stable")][:size]
+    assert filled == len(best)
+    np.testing.assert_array_equal(pool[:filled], F[best])
+    np.testing.assert_array_equal(pool_score[:filled], score[best])

@@ -6,6 +6,17 @@ import torch
 
 from fmtorch.estimators.models import focal_prior
 from fmtorch.geometry import arithmetic
+from fmtorch.geometry.arithmetic import (
+    as_components,
+    as_matrices,
+    as_rows,
+    cofactors,
+    component_sum,
+    cross,
+    determinant,
+    product,
+    unit,
+)
 from fmtorch.geometry.significance import LOG_MODELS
 from fmtorch.jit.kernel import F8x2, kernel
 from fmtorch.jit.lanes import LANES, load, store
@@ -146,3 +157,24 @@ def test_gradients_of_first_and_second_order() -> None:
     assert slope.tolist() == [0, 0, 0.25]
     (second,) = torch.autograd.grad(slope.sum(), zero)
     assert second.tolist() == [0, 0, -1 / 32]
+
+
+@pytest.mark.parametrize("n", range(1, 17))
+@pytest.mark.parametrize("dim", [0, 1, -1])
+def test_component_sum(n, dim):
+    x = torch.arange(n**3, dtype=torch.float64).reshape(n, n, n)
+    assert torch.equal(component_sum(x, dim), x.sum(dim))  # integers: exact
+
+
+def test_small_matrices_as_by_numpy() -> None:
+    generator = torch.Generator().manual_seed(0)
+    A, B = torch.randn(2, 4, 5, 3, 3, generator=generator, dtype=torch.float64).unbind(0)
+    a, b = (as_rows(as_components(M)) for M in (A, B))
+    # Some additions of products of numbers of about 1: a few eps of absolute error.
+    tight = {"rtol": 0, "atol": 1e-13}
+    torch.testing.assert_close(as_matrices(product(a, b).flatten(0, 1)), A @ B, **tight)
+    torch.testing.assert_close(determinant(a), torch.linalg.det(A), **tight)
+    expected = torch.linalg.det(A)[..., None, None] * torch.linalg.inv(A).mT
+    torch.testing.assert_close(as_matrices(cofactors(a).flatten(0, 1)), expected, rtol=1e-11, atol=1e-11)
+    torch.testing.assert_close(cross(a[0], b[0]).movedim(0, -1), torch.cross(A[..., 0, :], B[..., 0, :], -1), **tight)
+    torch.testing.assert_close(unit(a.flatten(0, 1)).square().sum(0), torch.ones(4, 5, dtype=torch.float64), **tight)

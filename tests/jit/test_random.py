@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from scipy import stats
 
 from fmtorch.core import pair_key
 from fmtorch.estimators import uniforms
@@ -87,3 +88,47 @@ def test_the_same_bits(seed: int, key: int) -> None:
             index = np.empty(most, np.int64)
             count = shuffle(1000, mixed_seed(seed, stream), key, index)
             assert index[:count].tolist() == order[:most]
+
+
+def test_the_same_in_any_batch_and_any_slice_of_draws() -> None:
+    together = bits(3, KEYS, Stream.SAMPLING, 0, 64, 7)
+    for i, key in enumerate(KEYS):
+        assert torch.equal(bits(3, key[None], Stream.SAMPLING, 0, 64, 7)[0], together[i])
+    assert torch.equal(bits(3, KEYS.flip(0), Stream.SAMPLING, 0, 64, 7).flip(0), together)
+    parts = [bits(3, KEYS, Stream.SAMPLING, start, 16, 7) for start in range(0, 64, 16)]
+    assert torch.equal(torch.cat(parts, 1), together)
+
+
+def test_seeds_keys_streams_and_draws_give_distinct_numbers() -> None:
+    drawn = [bits(seed, KEYS, stream, 0, 500, 4).flatten() for seed in range(4) for stream in Stream]
+    together = torch.cat(drawn)
+    # 144,000 of 2^63 numbers: a chance coincidence has probability 1e-9.
+    assert len(torch.unique(together)) == len(together)
+
+
+LEVEL = 1e-3
+
+
+def _uniformity(u: np.ndarray, bins: int) -> float:
+    counts = np.histogram(u, bins, (0, 1))[0]
+    return float(stats.chisquare(counts).pvalue)
+
+
+@pytest.mark.parametrize("stream", list(Stream))
+@pytest.mark.parametrize("vary", ["draw", "key", "hash"])
+def test_uniform_by_chi_square(stream: Stream, vary: str) -> None:
+    if vary == "draw":
+        u = uniform(0, torch.tensor([0]), stream, 0, 100_000, 1)
+    elif vary == "key":  # consecutive keys, the hardest for a poor hash
+        u = uniform(0, torch.arange(100_000), stream, 0, 1, 1)
+    else:
+        u = uniform(0, torch.tensor([pair_key(str(i)) for i in range(1000)]), stream, 0, 100, 1)
+    assert _uniformity(u.numpy().ravel(), 256) > LEVEL
+
+
+def test_every_bit_is_fair() -> None:
+    drawn = bits(0, torch.arange(100), Stream.SAMPLING, 0, 1000, 1).flatten()
+    ones = torch.stack([(drawn >> bit & 1).sum() for bit in range(63)]).numpy()
+    assert (drawn >= 0).all()
+    # 63 binomials with p = 1/2; 4.5 standard deviations are exceeded by one of them with probability 4e-4.
+    assert np.abs(ones - len(drawn) / 2).max() < 4.5 * np.sqrt(len(drawn) / 4)

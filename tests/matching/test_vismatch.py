@@ -11,7 +11,7 @@ import torch
 
 from fmtorch.data import read_image
 from fmtorch.matching import VisMatch
-from fmtorch.matching.vismatch import relative_noise
+from fmtorch.matching.vismatch import MAX_RATIO, relative_noise
 from fmtorch.pipeline import Pipeline, load_pipeline
 from tests.data import lists
 from tests.helpers import draw, pair
@@ -132,3 +132,11 @@ def test_the_command_evaluates_it(tmp_path: Path) -> None:
     summary = json.loads((folder / "summary.json").read_text())["all"]
     assert (summary["pairs"], summary["failures"], summary["pose"]["pairs"]) == (2, 0, 2)
     assert summary["seconds"]["features"] is None
+
+
+def test_noise_is_bounded_and_one_where_nothing_is_known() -> None:
+    precision = np.stack([np.eye(2) * s for s in (1.0, 1.0, 1.0, 1e-9, 1e9)])
+    assert relative_noise(precision, precision).tolist() == [1, 1, 1, MAX_RATIO, 1 / MAX_RATIO]
+    bad = np.stack([np.full((2, 2), np.nan), -np.eye(2), np.zeros((2, 2))])
+    assert relative_noise(bad, bad).tolist() == [1, 1, 1]
+    assert relative_noise(np.zeros((0, 2, 2)), np.zeros((0, 2, 2))).shape == (0,)

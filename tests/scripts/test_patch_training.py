@@ -1,5 +1,6 @@
 """Training of patch networks: patches, losses, figures, the loop and the command."""
 
+import itertools
 import json
 from pathlib import Path
 from typing import Any
@@ -10,14 +11,32 @@ import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 from PIL import Image
+from torch import Tensor, nn
 
 from fmtorch.core import conf_dir
 from fmtorch.features.networks import GeoDesc, HardNet, build
 from fmtorch.scenes import Camera, Plan, Task, calibration, fundamental, look_at, photograph
 from fmtorch.training import Photograph, PlaneViews, list_photographs
 from scripts.patch_networks import objectives, stores
-from scripts.patch_networks.patches import Tolerance, View, Warps, tracks_of_views, transferred, views_of_plane
+from scripts.patch_networks.objectives import (
+    geodesc,
+    geometric,
+    hardest_triplet,
+    structured,
+)
+from scripts.patch_networks.patches import (
+    Tolerance,
+    View,
+    Warps,
+    patch_similarity,
+    tracks_of_views,
+    transferred,
+    views_of_plane,
+)
+from scripts.patch_networks.stores import Tracks, match_sets
 from scripts.patch_networks.train import MatchSetTraining, PatchTraining, TrainingOptions, cutting_of, training_of
+from tests.reference import geodesc as geodesc_reference
+from tests.reference import patch_losses as reference
 
 
 @pytest.fixture(scope="module")
@@ -251,3 +270,81 @@ def test_tracks_of_a_plane_show_the_same_point_under_its_angles() -> None:
     # The plane is z = 0, seen from z < 0: its normal is (0, 0, -1).
     angles = np.degrees(np.arccos(-columns["rays"][:, 2]))
     np.testing.assert_allclose(columns["incidence"], angles, atol=0.02)  # float32 rays: eps / sin
+
+
+def unit(n: int, d: int, seed: int, noise: float = 0.3) -> tuple[Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    a = torch.randn(n, d, generator=generator, dtype=torch.float64)
+    b = a + noise * torch.randn(n, d, generator=generator, dtype=torch.float64)
+    return nn.functional.normalize(a, dim=1), nn.functional.normalize(b, dim=1)
+
+
+def sets_of(sets: int, n: int, d: int, seed: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Unit descriptors of match sets, alike within noise, and random S_patch."""
+    a, b = unit(sets * n, d, seed, noise=1.0)
+    similarity = torch.rand(sets, n, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    return a.reshape(sets, n, d), b.reshape(sets, n, d), similarity
+
+
+def test_losses_are_their_definitions() -> None:
+    a, b = unit(12, 4, 0)
+    b[3] = a[7]  # the same patch twice is no negative
+    for squared in (False, True):
+        expected = reference.hardest_triplet(a.tolist(), b.tolist(), 1.0, squared)
+        assert float(hardest_triplet(a, b, squared=squared)) == pytest.approx(expected, abs=1e-9)
+
+
+def test_the_loss_of_match_sets_is_its_definition() -> None:
+    a, b, similarity = sets_of(3, 9, 4, 0)
+    sets = list(zip(a.tolist(), b.tolist(), similarity.tolist(), strict=True))
+    first = sum(geodesc_reference.structured(x, y, 0.3) for x, y, _ in sets) / 3
+    second = sum(geodesc_reference.geometric(x, y, s) for x, y, s in sets) / 3
+    assert min(first, second) > 0.02
+    assert float(structured(a, b, ratio=0.3)) == pytest.approx(first, abs=1e-12)
+    assert float(geometric(a, b, similarity)) == pytest.approx(second, abs=1e-12)
+    assert float(geodesc(a, b, similarity, ratio=0.3, geometric_weight=0.2)) == pytest.approx(first + 0.2 * second)
+    alone = [float(geodesc(a[i : i + 1], b[i : i + 1], similarity[i : i + 1])) for i in range(3)]
+    assert float(geodesc(a, b, similarity)) == pytest.approx(sum(alone) / 3)  # sets do not see each other
+    a, b, similarity = sets_of(2, 5, 3, 0)
+    assert torch.autograd.gradcheck(lambda x, y: geodesc(x, y, similarity), (a.requires_grad_(), b.requires_grad_()))
+
+
+def random_tracks(seed: int) -> tuple[Tracks, dict[tuple[int, int], float]]:
+    """Points in up to five views, and S_patch of every two patches of a point."""
+    rng = np.random.default_rng(seed)
+    first, views, names = [0], [], []
+    for point in range(60):
+        shown = rng.permutation(5)[: rng.integers(2, 6)]
+        views += shown.tolist()
+        names += [1000 * int(v) + point for v in shown]
+        first.append(len(views))
+    rays = rng.normal(size=(len(views), 3)) * 0.2 + [0, 0, 1]
+    rays = (rays / np.linalg.norm(rays, axis=1, keepdims=True)).astype(np.float32)
+    incidence = rng.uniform(0, 40, len(views)).astype(np.float32)
+    incidence[rng.random(len(views)) < 0.1] = np.nan
+    similarity = {}
+    for begin, end in itertools.pairwise(first):
+        for i, j in itertools.combinations(range(begin, end), 2):
+            if np.isfinite(incidence[[i, j]]).all():
+                value = patch_similarity(rays[[i]], rays[[j]], incidence[[i]], incidence[[j]])[0]
+                similarity[names[i], names[j]] = float(value)
+    return Tracks(np.array(first), np.array(views), rays, incidence), similarity
+
+
+def test_match_sets_are_their_definition() -> None:
+    tracks, similarity = random_tracks(0)
+    names = 1000 * tracks.view + np.repeat(np.arange(60), np.diff(tracks.first))
+    everything = match_sets(tracks, 2, 1.0)
+    assert len(everything) == 10
+    limit = float(np.median(everything.image_similarity))
+    sets, expected = match_sets(tracks, 15, limit), geodesc_reference.match_sets(similarity, 15, limit)
+    assert 0 < len(sets) < len(everything)
+    assert len(sets) == len(expected)
+    for i, (a, b) in enumerate(itertools.pairwise(sets.first)):
+        patches = names[sets.patches[:, a:b]]
+        members, image = expected[patches[0, 0] // 1000, patches[1, 0] // 1000]
+        assert sorted(zip(*patches.tolist(), strict=True)) == members
+        assert sets.image_similarity[i] == pytest.approx(image)
+        assert sets.similarity[a:b].mean() == pytest.approx(image)
+    with pytest.raises(ValueError, match=r"shares 500 points .* at most 0\.85: lower match_sets\.matches"):
+        match_sets(tracks, 500)

@@ -319,3 +319,33 @@ def test_a_killed_verification_of_files_continues(tmp_path: Path) -> None:
     killed_and_continued(tmp_path, tmp_path / "verified.h5", *FILES)
     fmtorch.verify(features=tmp_path / "features.h5", matches=tmp_path / "matches.h5", output=tmp_path / "truth.h5")
     assert load(tmp_path / "verified.h5") == load(tmp_path / "truth.h5")
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["matches=matches.npz"], "matches alone need an output: matches=FILE.npz output=VERIFIED.npz"),
+        (["matches=no.npz", "output=v.npz"], "there is no file no.npz; give matches alone: matches=FILE.npz"),
+        (["matches=text.npz", "output=v.npz"], "text.npz: is not a valid npz file"),
+        (["matches=array.npz", "output=v.npz"], "array.npz: is a single array; write x0 and x1 by numpy.savez"),
+        (["matches=text.h5", "output=v.npz"], "text.h5: is not a valid HDF5 file"),
+        (["matches=matches.txt", "output=v.npz"], "matches=matches.txt must end in .npz, .h5, .hdf5"),
+        (["matches=matches.npz", "output=v.txt"], "output=v.txt must end in .npz, .h5, .hdf5"),
+        (["matches=matches.npz", "output=matches.npz"], "output=matches.npz is one of the files that are read"),
+        (["matches=other.npz", "output=v.npz"], "other.npz holds no x0 and x1; give matches x0, x1 (n, 2)"),
+        (["a.db", "matches=matches.npz", "output=v.npz"], "hloc's files need"),
+    ],
+)
+def test_what_is_no_file_of_matches(words: list[str], said: str, command: Callable[..., str], tmp_path: Path) -> None:
+    x0, x1 = points()[0]
+    save(tmp_path / "matches.npz", {"x0": x0, "x1": x1})
+    save(tmp_path / "other.npz", {"x0": x0})
+    with (tmp_path / "array.npz").open("wb") as file:
+        np.save(file, x0)
+    for name in ("text.npz", "text.h5", "matches.txt"):
+        (tmp_path / name).write_text("matches")
+    end = command("verify", *words, cwd=tmp_path)
+    assert end.startswith("ended: error: ")
+    assert said in end
+    assert "\n" not in end
+    assert not list(tmp_path.glob("v.*"))

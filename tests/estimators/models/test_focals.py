@@ -14,6 +14,10 @@ from fmtorch.core import Correspondences, collate
 from fmtorch.estimators import Candidates, Focal, Pair, Ransac, Refinement, SaturatedGains, focal_search
 from fmtorch.estimators.focal_search import FocalSearch, PlausibleCandidates
 from fmtorch.estimators.models import focal_prior
+from fmtorch.estimators.models.focal_prior import (
+    QUANTILES,
+    normal_quantiles,
+)
 from fmtorch.estimators.models.posterior import images_of, no_cameras
 from fmtorch.estimators.models.with_focals import FundamentalWithFocals
 from fmtorch.jit.random import Stream
@@ -360,3 +364,9 @@ def test_images_of_two_sizes_are_searched_without_assumptions_too() -> None:
     assert int(presets.build("estimator", "fmtorch")(easy, 0).samples) == 3 * 250
     two = photographs(1, (WIDE, TALL), (1.0, 1.0), 300, 0.5, 0.05).c
     assert int(presets.build("estimator", "fmtorch")(two, 0).samples) > 3 * 250
+
+
+def test_quantiles_are_those_of_the_normal_distribution() -> None:
+    normal = normal_quantiles()
+    shares = [0.5 * math.erfc(-q / math.sqrt(2)) for q in normal.tolist()]
+    np.testing.assert_allclose(shares, (np.arange(QUANTILES) + 0.5) / QUANTILES, atol=2.0**-40)

@@ -1,0 +1,38 @@
+"""Losses and figures of patch descriptors, written from their definitions one pair at a time."""
+
+import math
+from collections.abc import Sequence
+
+Vectors = Sequence[Sequence[float]]
+
+
+def distance(a: Sequence[float], b: Sequence[float]) -> float:
+    return math.sqrt(sum((x - y) ** 2 for x, y in zip(a, b, strict=True)))
+
+
+def hardest_triplet(a: Vectors, b: Vectors, margin: float, squared: bool) -> float:
+    """Mishchuk et al., NIPS 2017, section 3.1: the hardest negative of a_i among b and of b_i among a."""
+    total, n = 0.0, len(a)
+    for i in range(n):
+        negatives = [distance(a[i], b[j]) for j in range(n) if j != i] + [
+            distance(a[j], b[i]) for j in range(n) if j != i
+        ]
+        hinge = max(0.0, margin + distance(a[i], b[i]) - min(d for d in negatives if d >= 0.008))
+        total += hinge**2 if squared else hinge
+    return total / n
+
+
+def fpr_at_recall(positive: Sequence[float], negative: Sequence[float], recall: float) -> float:
+    """The least threshold that accepts the share `recall` of the positives, and what it accepts of the negatives."""
+    for threshold in sorted(positive):
+        if sum(d <= threshold for d in positive) >= recall * len(positive) - 1e-9:
+            return sum(d <= threshold for d in negative) / len(negative)
+    raise ValueError("no positives")
+
+
+def mean_average_precision(a: Vectors, b: Vectors) -> float:
+    """Each a_i asks for b_i: one right answer, so its average precision is one over its rank (ties against it)."""
+    total = 0.0
+    for i in range(len(a)):
+        total += 1 / sum(distance(a[i], other) <= distance(a[i], b[i]) for other in b)
+    return total / len(a)
