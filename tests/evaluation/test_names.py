@@ -3,7 +3,7 @@
 from typing import Any
 
 from fmtorch import presets
-from fmtorch.evaluation.page import run_names
+from fmtorch.evaluation import run_names
 
 
 def config(pipeline: str = "sift_ratio", estimator: str = "ransac", **changes: Any) -> dict[str, Any]:

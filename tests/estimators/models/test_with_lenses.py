@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from fmtorch.core.types import Correspondences
+from fmtorch.core import Correspondences
+from fmtorch.estimators import Pair
 from fmtorch.estimators.lens_search import (
     undistorted,
 )
-from fmtorch.estimators.pair import Pair
 from tests.estimators.pairs import pair_of
 from tests.reference import lenses as reference
 
