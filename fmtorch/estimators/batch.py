@@ -151,8 +151,9 @@ def _straight(row: Row, lens: Array) -> PixelMatches:
 
 
 def with_sqrt_prior(c: Correspondences) -> Correspondences:
-    """The same with the root of P(inlier) in its place for pairs both of whose focal lengths are exactly known."""
-    if c.focal is None or c.prior is None:
+    """The same with the root of P(inlier) in its place for pairs both of whose focal lengths are exactly known.
+    Not of matches with a matcher's score, whose P(inlier) is the better one."""
+    if c.focal is None or c.prior is None or (c.ratio is None and c.score is not None):
         return c
     exact = (c.focal.detach()[..., 1] < EXACT).all(1)[:, None] & (c.prior >= 0)  # others are named as they are
     root = sqrt(torch.where(exact, c.prior, 0))

@@ -1,6 +1,7 @@
 """From a pruner's evidence to P(inlier)."""
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -12,9 +13,11 @@ from torch import Tensor
 from fmtorch.core.types import Correspondences
 from fmtorch.geometry.arithmetic import gradient_wanted
 from fmtorch.jit.batches import for_each_pair
-from fmtorch.jit.kernel import B1x1, F4x1, inner, kernel
+from fmtorch.jit.kernel import B1x1, F4x1, F8x1, inner, kernel
 
 _SQUARINGS = 10
+SCORE_POWER = 0.75  # of the odds of a score, by square roots
+_MIN_SCORE = 1e-3  # and its distance from 1
 _LARGEST = 12.0  # log-odds beyond which P(inlier) is as good as 0 or 1; the logistic function here is 6e-6 off 1 there
 
 
@@ -23,10 +26,17 @@ def logistic(z: Any) -> Any:
     """``o / (1 + o)`` with ``o = (1 + z / 1024)^1024``, the logistic function but for 0.001 at most. Of tensors, too.
     Made of arithmetic alone, whose last bits, unlike those of exp, do not depend on where in memory a number stands. z:
     float64, since the power multiplies a rounding error by 1024; between -1024 and 1024."""
+    odds = odds_of(z)
+    return odds / (odds + 1)
+
+
+@inner
+def odds_of(z: Any) -> Any:
+    """The odds of `logistic`, exp(z) but for what is written there."""
     odds = 1 + z / 2**_SQUARINGS
     for _ in range(_SQUARINGS):
         odds = odds * odds
-    return odds / (odds + 1)
+    return odds
 
 
 @kernel
@@ -40,17 +50,46 @@ def calibrated(evidence: F4x1, ratio: F4x1, mask: B1x1, numbers: F4x1, out: F4x1
         out[i] = logistic(min(max(np.float64(z), -_LARGEST), _LARGEST)) if mask[i] else 0.0
 
 
+@kernel
+def calibrated_by_score(evidence: F4x1, score: F4x1, mask: B1x1, numbers: F8x1, out: F4x1) -> None:
+    """P(inlier) of `Calibration` from evidence and a matcher's score (n,) -> out (n + 1,), zero where masked; the last
+    is 1 where scores are taken for probabilities. numbers: constants and weights of `alone` and of `with_score`, the
+    constant of scores by themselves, and the tolerance."""
+    n, count, expected, agreed = len(mask), 0, 0.0, 0.0
+    alone, scored = np.empty(n), np.empty(n)
+    for i in range(n):
+        if mask[i]:
+            s = min(max(np.float64(score[i]), _MIN_SCORE), 1 - _MIN_SCORE)
+            root = math.sqrt(s / (1 - s))
+            odds = root * math.sqrt(root)  # to the power of SCORE_POWER
+            alone[i] = logistic(min(max(numbers[0] + numbers[1] * evidence[i], -_LARGEST), _LARGEST))
+            scored[i] = odds * odds_of(numbers[2] + numbers[3] * evidence[i])
+            by_score = odds * odds_of(numbers[4])
+            expected, agreed, count = expected + by_score / (by_score + 1), agreed + alone[i], count + 1
+    probable = abs(expected - agreed) < numbers[5] * count
+    for i in range(n):
+        out[i] = (scored[i] / (scored[i] + 1) if probable else alone[i]) if mask[i] else 0.0
+    out[n] = 1.0 if probable else 0.0
+
+
 @dataclasses.dataclass(frozen=True)
 class Calibration:
     """``P(inlier) = logistic(constant + evidence e + ratio q)`` of the evidence e and the distance ratio q.
     with_ratio: {constant, evidence, ratio}, where matches have a `ratio`. alone: {constant, evidence}, where they have
-    none; without it their prior stays as it is. `scripts/calibrate_priors.py` fits these numbers."""
+    none; without it their prior stays as it is. with_score: {constant, evidence, of_score, tolerance}, where they have
+    a matcher's score s and no ratio: ``constant + evidence e + SCORE_POWER log(s / (1 - s))``. That holds of scores
+    that are probabilities, as LightGlue's. Others are ignored: a pair's scores are taken for such only if the mean of
+    ``logistic(of_score + SCORE_POWER log(s / (1 - s)))`` is within the tolerance of the mean P(inlier) by `alone`.
+    `scripts/calibrate_priors.py` fits these numbers."""
 
     with_ratio: Mapping[str, float]
     alone: Mapping[str, float] | None = None
+    with_score: Mapping[str, float] | None = None
 
     def __call__(self, c: Correspondences, evidence: Float[Tensor, "b n"]) -> Correspondences:
         """The same matches with ``prior``, zero where masked. A ratio that is NaN counts as 1. Computed in float32."""
+        if c.ratio is None and c.score is not None and self.with_score is not None and self.alone is not None:
+            return self._by_score(c, evidence, c.score, self.alone, self.with_score)
         ratio = c.ambiguity
         fitted = self.alone if ratio is None else self.with_ratio
         if fitted is None:
@@ -62,10 +101,33 @@ class Calibration:
             z = fitted["constant"] + fitted["evidence"] * torch.where(c.mask, evidence, 0)
             if ratio is not None:
                 z = z + fitted["ratio"] * torch.where(c.mask, ratio, 0).nan_to_num(nan=1.0)
-            z = z.clamp(-_LARGEST, _LARGEST)
-            slope = prior * (1 - prior) / (1 + z.detach() / 2**_SQUARINGS)
-            prior = prior + slope * (z - z.detach())  # adds zeros
+            prior = _with_gradient(prior, z.clamp(-_LARGEST, _LARGEST))
         return c.derived(prior=prior.to(c.x0.dtype))
+
+    @staticmethod
+    def _by_score(
+        c: Correspondences, evidence: Float[Tensor, "b n"], score: Float[Tensor, "b n"],
+        alone: Mapping[str, float], scored: Mapping[str, float],
+    ) -> Correspondences:  # fmt: skip
+        numbers = np.array([
+            alone["constant"], alone["evidence"], scored["constant"], scored["evidence"], scored["of_score"],
+            scored["tolerance"],
+        ])  # fmt: skip
+        out = torch.empty(len(c), c.mask.shape[1] + 1, dtype=torch.float32)
+        prior, probable = for_each_pair(calibrated_by_score, (evidence, score, c.mask), numbers, out=out).split(
+            [c.mask.shape[1], 1], 1
+        )
+        if gradient_wanted(evidence, score):
+            e, s = torch.where(c.mask, evidence, 0), torch.where(c.mask, score, 0.5).clamp(_MIN_SCORE, 1 - _MIN_SCORE)
+            z = scored["constant"] + scored["evidence"] * e + SCORE_POWER * torch.logit(s)
+            prior = _with_gradient(prior, torch.where(probable > 0, z, alone["constant"] + alone["evidence"] * e))
+        return c.derived(prior=prior.to(c.x0.dtype))
+
+
+def _with_gradient(prior: Float[Tensor, "b n"], z: Float[Tensor, "b n"]) -> Float[Tensor, "b n"]:
+    """The prior, attached to its log-odds: adds zeros."""
+    slope = prior * (1 - prior) / (1 + z.detach() / 2**_SQUARINGS)
+    return prior + slope * (z - z.detach())
 
 
 def calibration_of(

@@ -355,7 +355,7 @@ def position_agreement(x0: Points, x1: Points, ratio: PerMatch | None, mask: Boo
 
 
 class PositionConsistency:
-    """Supplies ``prior``: P(inlier) from the agreement of neighbours' motion and, where known, the ratio.
+    """Supplies ``prior``: P(inlier) from the agreement of neighbours' motion and, where known, the ratio or score.
     Needs no frames, no sizes and no ratio. Linear memory: about 600 bytes a match. kernels: worth compiling together
     with those of an estimator."""
 
@@ -369,7 +369,7 @@ class PositionConsistency:
 
     def evidence(self, c: Correspondences) -> Float[Tensor, "b n"]:
         """What the prior is calibrated from."""
-        return position_agreement(c.x0, c.x1, c.ambiguity, c.mask)
+        return position_agreement(c.x0, c.x1, c.ratio, c.mask)
 
 
 @inner

@@ -1,10 +1,10 @@
 """Robust estimators on the same matches, one thread each: recall, AUC@0.05, milliseconds, paired intervals.
 
 An estimator is named as PRESET[:KEY=VALUE,...][@PRUNER+PRUNER...]; the pruners after @ count into its time.
-`find_fundamental[:KEY=VALUE,...]` is the public call with points, ratios and image sizes; `truth` the fit that starts
-from the true matrix, and so what the matches allow. Among the pruners, `ratioless` and `sizeless` take away distance
-ratios and image sizes, `part:left=0,top=0,right=0.5,bottom=0.5` crops both images, and `bent:lens=-0.15` gives them
-lenses. The pruner `ngransac` is the network of --ngransac; without it, estimators that name it are left out.
+`find_fundamental[:KEY=VALUE,...]` is the public call with points, ratios, scores and image sizes; `truth` the fit that
+starts from the true matrix, and so what the matches allow. Among the pruners, `ratioless`, `sizeless`, `scoreless` and
+`priorless` take these away, `part:left=0,top=0,right=0.5,bottom=0.5` crops both images, and `bent:lens=-0.15` gives
+them lenses. The pruner `ngransac` is the network of --ngransac; without it, estimators that name it are left out.
 
 python -m scripts.benchmark estimators --root DATA/Strecha --root DATA/PhotoTourism --seeds 5 \\
     --estimators fmtorch@frame_consistency opencv:method=usac_magsac,threshold=1.0 poselib:threshold=0.5,prosac=true

@@ -1,10 +1,11 @@
 """Methods that are named in one word, PRESET[:KEY=VALUE,...][@PRUNER+PRUNER...], or as a pipeline with overrides.
 
-Pruners may have options, too. In place of a preset `find_fundamental` is the public call, with points, distance ratios
-and image sizes, and options as its arguments; `truth` is the fit that starts from the true matrix, and so what the
-matches allow. Without an estimator, as in `@gms`, pruners alone are meant. Among the pruners may be what changes the
-pair: `sizeless` and `ratioless` (these are not given), `part:left=0,top=0,right=0.5,bottom=0.5` (both images cropped,
-in fractions of their sides) and `bent:lens=-0.15` (points of two such lenses, F of pinholes). The last two come first.
+Pruners may have options, too. In place of a preset `find_fundamental` is the public call, with points, distance ratios,
+scores and image sizes, and options as its arguments; `truth` is the fit that starts from the true matrix, and so what
+the matches allow. Without an estimator, as in `@gms`, pruners alone are meant. Among the pruners may be what changes
+the pair: `sizeless`, `ratioless`, `scoreless` and `priorless` (these are not given; without scores no prior either),
+`part:left=0,top=0,right=0.5,bottom=0.5` (both images cropped, in fractions of their sides) and `bent:lens=-0.15`
+(points of two such lenses, F of pinholes). The last two come first.
 """
 
 import dataclasses
@@ -73,11 +74,11 @@ def build(group: str, word: str) -> Any:
 
 
 def estimate_by_call(options: Mapping[str, Any], c: Correspondences, seed: int) -> Estimate:
-    """What `find_fundamental` makes of points, ratios and image sizes, and of a pruner's prior and noise.
+    """What `find_fundamental` makes of points, ratios, scores and image sizes, and of a pruner's prior and noise.
 
     options: its arguments, which replace these.
     """
-    names = ("mask", "ratio", "prior", "noise", "size0", "size1", "key")
+    names = ("mask", "ratio", "score", "prior", "noise", "size0", "size1", "key")
     given: dict[str, Any] = {**{name: getattr(c, name) for name in names}, "seed": seed, **options}
     return fmtorch.find_fundamental(c.x0, c.x1, **given)
 
@@ -166,6 +167,7 @@ def ngransac(file: Path | None) -> dict[str, Pruner]:
 
 
 WITHHELD: dict[str, Pruner] = {
-    "sizeless": lambda c: c.replace(size0=None, size1=None), "ratioless": lambda c: c.replace(ratio=None)
+    "sizeless": lambda c: c.replace(size0=None, size1=None), "ratioless": lambda c: c.replace(ratio=None),
+    "scoreless": lambda c: c.replace(score=None, prior=None), "priorless": lambda c: c.replace(prior=None),
 }  # fmt: skip
 """Stages that are no presets: what an estimator is not given."""

@@ -41,6 +41,49 @@ def test_calibration_uses_the_ratio_where_there_is_one() -> None:
     assert Calibration(both.with_ratio)(c.replace(ratio=None), evidence).prior is None
 
 
+SCORED = Calibration(
+    {"constant": -1.0, "evidence": 3.0, "ratio": -2.0}, {"constant": -2.0, "evidence": 4.0},
+    {"constant": 0.5, "evidence": 2.0, "of_score": 1.5, "tolerance": 0.25},
+)  # fmt: skip
+
+
+def by_score(evidence: torch.Tensor, score: torch.Tensor) -> torch.Tensor:
+    """P(inlier) of the matches of one pair, as the docstring of `Calibration` has it."""
+    alone = torch.sigmoid(-2 + 4 * evidence.double())
+    odds = torch.logit(score.double().clamp(1e-3, 1 - 1e-3))
+    probable = (torch.sigmoid(1.5 + 0.75 * odds).mean() - alone.mean()).abs() < 0.25
+    return torch.sigmoid(0.5 + 2 * evidence.double() + 0.75 * odds) if probable else alone
+
+
+def test_scores_are_taken_for_probabilities_only_where_their_mean_is_that_of_the_agreement() -> None:
+    generator = torch.Generator().manual_seed(0)
+    evidence, mask = torch.rand(3, 40, generator=generator), torch.ones(3, 40, dtype=torch.bool)
+    score = torch.stack([(evidence[0] / 2).clamp(0.01), torch.linspace(0, 1, 40), torch.full((40,), 1e-4)])
+    mask[1, 25:] = False
+    c = scene(0, 40).replace(prior=None, ratio=None)
+    c = Correspondences(c.x0.expand(3, -1, -1), c.x1.expand(3, -1, -1), mask, score=torch.where(mask, score, torch.nan))
+    expected = torch.stack([by_score(evidence[i], score[i]) for i in (0, 2)])
+    prior = SCORED(c, evidence).prior
+    torch.testing.assert_close(prior[[0, 2]], expected.float(), atol=0.005, rtol=0)  # of `logistic`
+    torch.testing.assert_close(prior[1, :25], by_score(evidence[1, :25], score[1, :25]).float(), atol=0.005, rtol=0)
+    assert torch.equal(prior[2], logistic(-2 + 4 * evidence[2])), "such scores are ignored"
+    assert not torch.allclose(prior[0], logistic(-2 + 4 * evidence[0]), atol=0.05)
+    assert not prior[1, 25:].any()
+    assert torch.equal(SCORED(c[1:2], evidence[1:2]).prior, prior[1:2]), "neighbours are invisible"
+    with_ratio = logistic(-1 + 3 * evidence - 2 * evidence) * mask
+    assert torch.equal(SCORED(c.replace(ratio=evidence), evidence).prior, with_ratio)
+
+
+@pytest.mark.parametrize("share", [0.5, 1e-4])
+def test_gradients_of_a_calibrated_score(share: float) -> None:
+    c = scene(0, 12).replace(prior=None, ratio=None)
+    evidence = torch.rand(1, 12, dtype=torch.float64, generator=torch.Generator().manual_seed(1)).requires_grad_()
+    score = torch.full((1, 12), share, dtype=torch.float64)
+    (slope,) = torch.autograd.grad(SCORED(c.replace(score=score), evidence).prior.sum(), evidence)
+    (expected,) = torch.autograd.grad(by_score(evidence[0], score[0]).sum(), evidence)
+    torch.testing.assert_close(slope, expected.to(slope), atol=0.01, rtol=0.02)
+
+
 @pytest.mark.parametrize(("angle", "scale"), [(0.0, 1.0), (np.pi / 2, 0.5)])
 def test_gms_support_equals_the_definition(angle: float, scale: float) -> None:
     x0, x1 = moving(0, 400, angle, scale)
@@ -121,14 +164,15 @@ def test_gradients_are_finite_beside_padding_and_what_is_no_frame(name: str) -> 
         assert bool((value.grad != 0).any())
 
 
-@pytest.mark.parametrize("given", [("ratio", "lafs0", "lafs1"), ("ratio",), ()])
+@pytest.mark.parametrize("given", [("ratio", "lafs0", "lafs1"), ("ratio",), ("score",), ()])
 def test_find_fundamental_derives_the_prior(given: tuple[str, ...]) -> None:
     c, name = scene(2, 120), "frame_consistency" if "lafs0" in given else "position_consistency"
+    c = c.replace(score=(1 - c.ratio).clamp(0.01, 0.99))
     fields = {field: getattr(c, field) for field in given}
     prior = presets.build("pruner", name)(Correspondences(c.x0, c.x1, c.mask, **fields)).prior
     own = fmtorch.find_fundamental(c.x0, c.x1, **fields)
-    ratio = {"ratio": c.ratio} if given else {}
-    assert torch.equal(own.F, fmtorch.find_fundamental(c.x0, c.x1, prior=prior, **ratio).F)
+    ranked = {key: value for key, value in fields.items() if key in ("ratio", "score")}
+    assert torch.equal(own.F, fmtorch.find_fundamental(c.x0, c.x1, prior=prior, **ranked).F)
 
 
 @pytest.mark.parametrize(("name", "area"), [("frame_consistency", 0.9), ("position_consistency", 0.88)])
