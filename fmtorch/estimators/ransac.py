@@ -7,6 +7,7 @@ verb; `batch` leads from tensors to pairs and back.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
@@ -37,6 +38,7 @@ from fmtorch.jit.together import compile_together
 from fmtorch.jobs.execution import mapped
 
 FOCAL_ROUND = 500  # samples of five matches at a time
+SEARCHED = 2048  # right matches that are expected among those searched
 CALIBRATED_MATCHES = 6  # that a pair of calibrated cameras needs: five of them have up to ten solutions
 DEFAULT_PRESELECT = Preselect()
 Probability = Annotated[float, Within(0, 1, exclusive=True)]
@@ -193,7 +195,7 @@ class Ransac:
         return solution._replace(lens_suggested=suggested_lens(solution.fit, pair))
 
     def _of_pinholes(self, pair: Pair) -> Solution:
-        selection, draws = self.selected(pair)
+        selection, draws = self.selected(searched(pair))
         if not selection.valid:
             return Solution(None, draws, reason=NOT_SOLVED)
         inliers = self.inliers(selection.F, pair)
@@ -245,6 +247,15 @@ class Ransac:
                 "whether each match is an inlier"
             )
         return inliers
+
+
+def searched(pair: Pair) -> Pair:
+    """The matches that are searched: of a pair with a prior as many, evenly along its list, as are expected to hold
+    `SEARCHED` right ones. Of more, as of dense matchers, a model's score says no more; the final fit has them all."""
+    if pair.prior is None or pair.count <= SEARCHED:
+        return pair
+    count = math.ceil(pair.count * SEARCHED / max(float(pair.prior.sum()), 1.0))
+    return pair if count >= pair.count else pair.take(np.arange(count) * pair.count // count)
 
 
 def _focal_search(

@@ -420,3 +420,16 @@ def test_find_fundamental_tells() -> None:
     assert estimate[1:].significance.tolist() == estimate.significance[1:].tolist()
     rng = np.random.default_rng(0)
     assert not bool(fmtorch.find_fundamental(*rng.uniform(0, 500, (2, 20, 2)), estimator="ransac").related[0])
+
+
+def test_of_many_likely_matches_a_part_is_searched_and_all_are_fitted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The median error stays below 0.02 px, at a noise of 0.3 px; where few are likely, all are searched."""
+    c = scene(3, 6000)
+    likely, few_likely = (c.replace(prior=torch.full_like(c.x0[..., 0], p)) for p in (0.9, 0.009))
+    estimator = presets.build("estimator", "fmtorch")
+    part, of_few = estimator(likely), estimator(few_likely)
+    monkeypatch.setattr("fmtorch.estimators.ransac.SEARCHED", 6000)
+    whole = estimator(likely)
+    assert torch.equal(estimator(few_likely).F, of_few.F)
+    assert not torch.equal(whole.F, part.F)
+    assert all(_true_inlier_error(estimate.F[0], 3, 6000) < 0.02 for estimate in (whole, part))
