@@ -16,7 +16,7 @@ from fmtorch.core import Correspondences
 from fmtorch.geometry import eight_point, fundamental_from_calibration, irls, refine, reweighted_fits
 from fmtorch.jit.random import Stream, uniform
 from fmtorch.pruning import LC
-from fmtorch.pruning.networks.learned import Prediction, predict
+from fmtorch.pruning.networks import Prediction, predict
 from fmtorch.training.objective import LIMIT_E, LIMIT_F, TRIES
 from tests import laws
 from tests.metrics.test_nsgd import random_pairs, rows_shifted
