@@ -28,7 +28,7 @@ def normed(layer: Any, x: Tensor) -> Tensor:
 
 
 def context(module: Any, x: Tensor) -> Tensor:
-    """A cluster: the mean of all matches, by softmax over them; a match: that of all clusters, by softmax over these."""
+    """Clusters: means of all matches, by softmax over them; matches: those of all clusters, by softmax over these."""
     score = linear(module.linear0, context_batch_norm_relu(module.norm0, x))
     y = torch.stack([(x * torch.softmax(row, 0)).sum(1) for row in score], 1)
     for each in module.filters:

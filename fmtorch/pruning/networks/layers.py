@@ -20,6 +20,7 @@ from fmtorch.geometry.epipolar import symmetric_squared
 EPS = 1e-5  # added to variances, as torch's instance and batch norms do
 MOMENTUM = 0.1  # of running statistics
 FLAT = 1e-10  # variance in squared means: of equal matches that rounding tells apart, whose gradient would explode
+TABLE = 2**24  # distances between matches that are held at a time
 HIDDEN = 1e9  # taken off the logits of keys that are masked
 MAX_RESIDUAL = 1e6  # squared units of the coordinates: of a match at an epipole, where there is no line
 Running = tuple[Tensor, Tensor] | None  # mean and variance
@@ -255,6 +256,9 @@ def attention(
     """Each query's mean of the values, by softmax of its products with the keys (Vaswani et al., NeurIPS 2017, eq. 1).
     slots: of the keys. scale: of the products; by default that of the paper."""
     q, k, v = (x.unflatten(0, (heads, -1)).permute(2, 0, 3, 1).contiguous() for x in (query, key, value))
+    scale = q.shape[3] ** -0.5 if scale is None else scale
+    if q.shape[3] < v.shape[3]:  # of equal widths torch needs no table of queries and keys
+        q, k = (nn.functional.pad(x, (0, v.shape[3] - q.shape[3])) for x in (q, k))
     hidden = None if slots.mask is None else ((slots.mask - 1) * HIDDEN).to(q.dtype)[:, None, None]
     y = nn.functional.scaled_dot_product_attention(q, k, v, hidden, scale=scale)
     return y.permute(1, 3, 0, 2).flatten(0, 1)
@@ -264,14 +268,18 @@ def attention(
 def nearest(x: Float[Tensor, "c b n"], slots: Slots, count: int) -> Int[Tensor, "b n k"]:
     """The nearest matches of each match by its features, nearest first, itself among them; itself again past the last.
     In full precision also within autocast."""
+    wide = (x if x.dtype == torch.float64 else x.float()).transpose(0, 1)
+    squared, places = wide.square().sum(1, keepdim=True), list[Tensor]()
     with torch.autocast(x.device.type, enabled=False):
-        wide = (x if x.dtype == torch.float64 else x.float()).transpose(0, 1)
-        closeness = 2 * wide.mT @ wide - wide.square().sum(1, keepdim=True)  # |x_i|^2 less the squared distances
-    if slots.mask is not None:
-        closeness = torch.where(slots.mask[:, None] > 0, closeness, -torch.inf)
-    value, index = closeness.topk(min(count, x.shape[2]), -1)
+        for rows in wide.split(max(TABLE // (squared.numel() or 1), 1), 2):
+            closeness = 2 * rows.mT @ wide - squared  # |x_i|^2 less the squared distances
+            if slots.mask is not None:
+                closeness = torch.where(slots.mask[:, None] > 0, closeness, -torch.inf)
+            value, index = closeness.topk(min(count, x.shape[2]), -1)
+            places.append(torch.where(value > -torch.inf, index, -1))
+    index = torch.cat(places, 1)
     itself = torch.arange(x.shape[2], device=x.device)[:, None]
-    index = torch.where(value > -torch.inf, index, itself)
+    index = torch.where(index < 0, itself, index)
     return torch.cat([index, itself.expand(*index.shape[:2], count - index.shape[2])], -1)
 
 

@@ -84,6 +84,13 @@ def test_layers_are_those_of_the_definitions() -> None:
     assert kept == [reference.pruned(logit[i, :n].tolist(), 0.5) for i, n in enumerate((*PAIRS, 0))]
 
 
+def test_neighbors_are_the_same_a_part_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    x, slots = features(8)
+    whole = layers.nearest(x, slots, 6)
+    monkeypatch.setattr(layers, "TABLE", 200)
+    assert torch.equal(layers.nearest(x, slots, 6), whole)
+
+
 def test_batch_norm_is_torchs_over_all_matches() -> None:
     x, slots = features(8)
     ours, theirs = layers.BatchNormReLU(8).double(), nn.BatchNorm1d(8).double()
