@@ -57,7 +57,7 @@ class GridFilter(nn.Module):
     def forward(self, x: Float[Tensor, "c b m"], slots: layers.Slots, side: int) -> Float[Tensor, "c b m"]:
         before = x
         for i, (convolution, norm) in enumerate(zip(self.convolutions, self.norms, strict=True)):
-            grid = convolution(x.transpose(0, 1).unflatten(2, (side, side)))
+            grid = convolution(torch.unflatten(x.transpose(0, 1), 2, (side, side)))
             x = norm(grid.flatten(2).transpose(0, 1), slots)
             if i % 2:
                 x = before = x + before

@@ -255,7 +255,7 @@ def attention(
 ) -> Float[Tensor, "d b n"]:  # fmt: skip
     """Each query's mean of the values, by softmax of its products with the keys (Vaswani et al., NeurIPS 2017, eq. 1).
     slots: of the keys. scale: of the products; by default that of the paper."""
-    q, k, v = (x.unflatten(0, (heads, -1)).permute(2, 0, 3, 1).contiguous() for x in (query, key, value))
+    q, k, v = (torch.unflatten(x, 0, (heads, -1)).permute(2, 0, 3, 1).contiguous() for x in (query, key, value))
     scale = q.shape[3] ** -0.5 if scale is None else scale
     if q.shape[3] < v.shape[3]:  # of equal widths torch needs no table of queries and keys
         q, k = (nn.functional.pad(x, (0, v.shape[3] - q.shape[3])) for x in (q, k))
@@ -271,7 +271,7 @@ def nearest(x: Float[Tensor, "c b n"], slots: Slots, count: int) -> Int[Tensor, 
     wide = (x if x.dtype == torch.float64 else x.float()).transpose(0, 1)
     squared, places = wide.square().sum(1, keepdim=True), list[Tensor]()
     with torch.autocast(x.device.type, enabled=False):
-        for rows in wide.split(max(TABLE // (squared.numel() or 1), 1), 2):
+        for rows in torch.split(wide, max(TABLE // (squared.numel() or 1), 1), 2):
             closeness = 2 * rows.mT @ wide - squared  # |x_i|^2 less the squared distances
             if slots.mask is not None:
                 closeness = torch.where(slots.mask[:, None] > 0, closeness, -torch.inf)
@@ -302,6 +302,7 @@ class AnnularConvolution(nn.Module):
         maps = torch.cat([(own + other).sum(2), *other.unbind(2)])
         own_part, *other_parts = (maps @ x.flatten(1)).view(4, c, b, n)
         rings = neighbors.shape[2] // 3
+        assert self.edges.bias is not None
         y = (own_part + self.edges.bias[:, None, None]).repeat(1, 1, rings)
         for place, part in enumerate(other_parts):
             ring = neighbors[..., place::3].transpose(1, 2).reshape(b, -1)
