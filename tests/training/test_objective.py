@@ -287,6 +287,15 @@ def test_a_pair_that_cannot_be_judged_adds_nothing() -> None:
     assert not bool(together[:, 1].any())
 
 
+def test_matches_that_a_stage_does_not_judge_are_as_unlabelled() -> None:
+    batch, draws = labelled_pair(0), generator(0)
+    logit = torch.randn(2, *batch.label.shape, generator=draws)
+    judged = torch.rand(logit.shape, generator=draws) < 0.5
+    loss = training.Objective(geometric=0)(Prediction(logit, logit[:1].relu(), judged=judged), batch, 0)["loss"]
+    parts = [training.classification_loss(z, torch.where(j, batch.label, -1)) for z, j in zip(logit, judged, strict=True)]
+    assert loss.item() == pytest.approx(sum(float(part) for part in parts) / 2, rel=1e-6)
+
+
 def test_options_that_cannot_be_are_refused() -> None:
     with pytest.raises(ValueError, match="must be one of: size, K"):
         training.Objective(coordinates="pixels")
