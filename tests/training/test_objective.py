@@ -292,7 +292,8 @@ def test_matches_that_a_stage_does_not_judge_are_as_unlabelled() -> None:
     logit = torch.randn(2, *batch.label.shape, generator=draws)
     judged = torch.rand(logit.shape, generator=draws) < 0.5
     loss = training.Objective(geometric=0)(Prediction(logit, logit[:1].relu(), judged=judged), batch, 0)["loss"]
-    parts = [training.classification_loss(z, torch.where(j, batch.label, -1)) for z, j in zip(logit, judged, strict=True)]
+    labels = [torch.where(j, batch.label, -1) for j in judged]
+    parts = [training.classification_loss(z, label) for z, label in zip(logit, labels, strict=True)]
     assert loss.item() == pytest.approx(sum(float(part) for part in parts) / 2, rel=1e-6)
 
 
