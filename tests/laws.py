@@ -58,6 +58,10 @@ def quick(name: str, hypotheses: int = 200, round: int = 100) -> Estimator:
 SMALL_NETWORKS = {
     "fmtorch.pruning.networks.LC": {"channels": 16, "blocks": 2},
     "fmtorch.pruning.networks.DFE": {"widths": [16, 8], "iterations": 3},
+    "fmtorch.pruning.networks.OANet": {"channels": 16, "blocks": 8, "clusters": 10},
+    "fmtorch.pruning.networks.CLNet": {"channels": 16},
+    "fmtorch.pruning.networks.NCMNet": {"channels": 16, "clusters": 10},
+    "fmtorch.pruning.networks.ConvMatch": {"channels": 16, "layers": 2, "grid": 4},
 }
 
 

@@ -19,7 +19,10 @@ OPTIONS = {
         "opencv": [f"method={method}" for method in METHODS],
         "poselib": ["shared_focal=true"],
     },
-    "pruner": {name: ["soft=true"] for name in ("code", "dfe", "gms", "lc", "lc_e", "lc_side", "lpm")},
+    "pruner": {
+        name: ["soft=true"]
+        for name in ("clnet", "code", "convmatch", "dfe", "gms", "lc", "lc_e", "lc_side", "lpm", "ncmnet", "oanet")
+    },
 }
 """By preset, beside what its file says."""
 

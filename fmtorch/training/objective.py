@@ -37,7 +37,9 @@ class Objective(ObjectiveWeights):
         step: optimisation steps done so far. Pairs without labels, or whose fit is not determined, add nothing."""
         terms = {}
         if self.classification:
-            terms["classification"] = classification_loss(prediction.logit, batch.label)
+            judged = prediction.judged
+            label = batch.label if judged is None else torch.where(judged, batch.label, -1)
+            terms["classification"] = classification_loss(prediction.logit, label)
         if step >= self.classification_steps and (self.geometric or self.nsgd):
             F, valid = fits(prediction, batch)
             c = batch.correspondences
@@ -76,7 +78,7 @@ def fits(
 
 
 def classification_loss(
-    logit: Float[Tensor, "*stages b n"], label: Int8[Tensor, "b n"], *, balanced: bool = False
+    logit: Float[Tensor, "*stages b n"], label: Int8[Tensor, "*#stages b n"], *, balanced: bool = False
 ) -> Float[Tensor, ""]:
     """Cross-entropy of labelled matches: the mean over the matches of each pair, then over pairs, then over stages.
 
@@ -86,7 +88,7 @@ def classification_loss(
 
     Args:
         logit: log-odds that a match is an inlier, of one or more stages.
-        label: 1 inlier, 0 outlier, -1 ignored, also in masked slots.
+        label: 1 inlier, 0 outlier, -1 ignored, also in masked slots; the same for all stages, or of each.
         balanced: whether both classes of a pair count equally.
 
     Returns:
@@ -98,12 +100,12 @@ def classification_loss(
     weight = labelled.to(logit.dtype)
     if balanced:
         # One more of each class, in weights and log-odds alike, keeps the optimum and serves pairs of one class.
-        inliers = arithmetic.stable_sum(target)[:, None] + 1
-        outliers = arithmetic.stable_sum(weight - target)[:, None] + 1
+        inliers = arithmetic.stable_sum(target)[..., None] + 1
+        outliers = arithmetic.stable_sum(weight - target)[..., None] + 1
         logit = torch.where(labelled, logit - (inliers / outliers).log(), 0.0)
         weight = weight * torch.where(label > 0, 1 / inliers, 1 / outliers)
     total = arithmetic.stable_sum(weight)
-    weight = weight / torch.where(total > 0, total, 1.0)[:, None]
+    weight = weight / torch.where(total > 0, total, 1.0)[..., None]
     entropy = torch.nn.functional.softplus(logit) - target * logit
     return _mean_over_pairs(arithmetic.stable_sum(weight * entropy), total > 0)
 

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from fmtorch.core import Correspondences, NetworkFileError, collate
 from fmtorch.pruning import DFE, LC, LearnedPruner
-from fmtorch.pruning.networks.learned import learned_file
+from fmtorch.pruning.networks import ConvMatch, learned_file
 from fmtorch.runs import configuration
 from fmtorch.runs.fingerprint import learned
 from fmtorch.training import export_onnx, save_weights
@@ -23,6 +23,7 @@ VARIANTS: dict[str, Callable[[], nn.Module]] = {
     "lc_f": lambda: LC(channels=16, blocks=3, side=["ratio"]),
     "lc_e": lambda: LC(channels=16, blocks=3, coordinates="K", side=SIDE),
     "dfe": lambda: DFE(widths=(16, 32), iterations=3, side=SIDE),
+    "convmatch": lambda: ConvMatch(channels=16, layers=2, grid=4, side=SIDE),
 }
 
 

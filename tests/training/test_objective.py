@@ -16,7 +16,7 @@ from fmtorch.core import Correspondences
 from fmtorch.geometry import eight_point, fundamental_from_calibration, irls, refine, reweighted_fits
 from fmtorch.jit.random import Stream, uniform
 from fmtorch.pruning import LC
-from fmtorch.pruning.networks.learned import Prediction, predict
+from fmtorch.pruning.networks import Prediction, predict
 from fmtorch.training.objective import LIMIT_E, LIMIT_F, TRIES
 from tests import laws
 from tests.metrics.test_nsgd import random_pairs, rows_shifted
@@ -285,6 +285,16 @@ def test_a_pair_that_cannot_be_judged_adds_nothing() -> None:
     assert bool(torch.isfinite(together).all())
     assert torch.allclose(together[:, :1], alone, rtol=1e-9)
     assert not bool(together[:, 1].any())
+
+
+def test_matches_that_a_stage_does_not_judge_are_as_unlabelled() -> None:
+    batch, draws = labelled_pair(0), generator(0)
+    logit = torch.randn(2, *batch.label.shape, generator=draws)
+    judged = torch.rand(logit.shape, generator=draws) < 0.5
+    loss = training.Objective(geometric=0)(Prediction(logit, logit[:1].relu(), judged=judged), batch, 0)["loss"]
+    labels = [torch.where(j, batch.label, -1) for j in judged]
+    parts = [training.classification_loss(z, label) for z, label in zip(logit, labels, strict=True)]
+    assert loss.item() == pytest.approx(sum(float(part) for part in parts) / 2, rel=1e-6)
 
 
 def test_options_that_cannot_be_are_refused() -> None:

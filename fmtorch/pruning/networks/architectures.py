@@ -155,13 +155,17 @@ RESIDUAL_UNIT = 1e-3  # of the image's longest side, or of the focal length: abo
 LARGEST_RESIDUAL = 0.5  # of the same; as published
 
 
-class _OfBackbone(nn.Module):
-    """A network of a `backbone`, with `options` that the run's identity holds."""
+class WithOptions(nn.Module):
+    """A network with `options`, which its files and the run's identity hold."""
 
     options: dict[str, Any]
 
     def extra_repr(self) -> str:
         return ", ".join(f"{key}={value}" for key, value in self.options.items())
+
+
+class OfBackbone(WithOptions):
+    """A network of a `backbone`."""
 
     def forward(self, c: Correspondences) -> learned.Prediction:
         """The prediction of each match. Raises ValueError where image sizes or calibration matrices are missing."""
@@ -186,7 +190,7 @@ class PointCN(nn.Module):
         return self.p_out(y).transpose(0, 1)  # type: ignore[no-any-return]
 
 
-class LC(_OfBackbone):
+class LC(OfBackbone):
     """Classifies all matches of a pair at once.
 
     Yi, Trulls, Ono, Lepetit, Salzmann, Fua, "Learning to find good correspondences", CVPR 2018.
@@ -235,7 +239,7 @@ class PointwiseNetwork(nn.Module):
         return self.p_out(y).transpose(0, 1)  # type: ignore[no-any-return]
 
 
-class DFE(_OfBackbone):
+class DFE(OfBackbone):
     """Iterated weighted 8-point fits; a network predicts the weights, from the second fit on with the last residuals.
 
     Ranftl & Koltun, "Deep fundamental matrix estimation", ECCV 2018, section 4, through `geometry.reweighted_fits`.
@@ -291,14 +295,8 @@ class DFE(_OfBackbone):
                 state = torch.where(mask[:, None], state, 0)
             weight_logit, logit = backbone(torch.cat([x, state], 1), slots).unbind(1)
             logits.append(logit)
-            weights.append(masked_softmax(weight_logit, mask))
+            weights.append(slots.softmax(weight_logit))
             return weights[-1].double()
 
         fits = reweighted_fits(c.x0, c.x1, weigh, self.iterations, mask)
         return learned.Prediction(torch.stack(logits), torch.stack(weights), fits.F)
-
-
-def masked_softmax(logit: Float[Tensor, "b n"], mask: Bool[Tensor, "b n"]) -> Float[Tensor, "b n"]:
-    """Softmax over the matches of each pair; zero where masked, also where all are."""
-    weight = torch.softmax(torch.where(mask, logit, torch.finfo(logit.dtype).min), -1)
-    return torch.where(mask, weight, 0)

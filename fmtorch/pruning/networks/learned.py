@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
@@ -126,13 +126,15 @@ Backbone = Callable[[Tensor, Slots], Tensor]  # (B, channels, N), zero in masked
 class Prediction(NamedTuple):
     """The output of a network over S stages (one, or one for each iteration); the last stage counts.
     logit: log-odds that a match is an inlier, (S, B, N); finite and without meaning in masked slots. weight: of the
-    match in a weighted 8-point fit, (S, B, N); not negative, 0 where masked. F: fundamental matrices that the network
-    fits itself, (S, B, 3, 3), float64, in pixels and of unit Frobenius norm; where a fit is not determined the one of
-    the stage before, or zero; None where the network fits none."""
+    match in a weighted 8-point fit, (T, B, N), of T stages; not negative, 0 where masked. F: fundamental matrices that
+    the network fits itself, (T, B, 3, 3), float64, in pixels and of unit Frobenius norm; where a fit is not determined
+    the one of the stage before, or zero; None where the network fits none. judged: matches whose log-odds a stage is
+    trained on, (S, B, N), as those that are not pruned before it; None: all."""
 
     logit: Float[Tensor, "stages b n"]
-    weight: Float[Tensor, "stages b n"]
-    F: Float[Tensor, "stages b 3 3"] | None = None
+    weight: Float[Tensor, "fits b n"]
+    F: Float[Tensor, "fits b 3 3"] | None = None
+    judged: Bool[Tensor, "stages b n"] | None = None
 
 
 @runtime_checkable

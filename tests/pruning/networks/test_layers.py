@@ -1,5 +1,6 @@
 """Networks of learned pruners: layers, LC, DFE, their inputs and files."""
 
+import copy
 import math
 import runpy
 import sys
@@ -13,6 +14,7 @@ from torch import Tensor
 from fmtorch.core import Correspondences, collate
 from fmtorch.geometry import eight_point, sampson
 from fmtorch.pruning import DFE, LC, LearnedPruner, MatchInputs
+from fmtorch.pruning.networks import CLNet, ConvMatch, NCMNet, OANet
 from fmtorch.pruning.networks.layers import ContextBatchNormReLU, ResidualBlock, Slots
 from scripts.make_models import ngransac_state
 from tests.conftest import oracle, shared_path
@@ -92,7 +94,23 @@ def test_matches_without_variance_have_finite_gradients(count):
     assert torch.isfinite(block.norm0.running_var).all()
 
 
-@pytest.mark.parametrize("network", [LC(side=["ratio"], blocks=4), DFE(side=["ratio"], widths=(16, 32, 8))])
+PUBLISHED = [
+    OANet(side=["ratio"], blocks=4, clusters=20), ConvMatch(side=["ratio"], layers=2),
+    CLNet(side=["ratio"], channels=32), NCMNet(side=["ratio"], channels=32, clusters=20),
+]  # fmt: skip
+
+
+def in_double(network: torch.nn.Module) -> torch.nn.Module:
+    """In which rounding changes neither neighbours nor which matches are pruned, but by chance."""
+    network, inputs = copy.deepcopy(network).double(), network.inputs
+    network.inputs = lambda c: (inputs(c)[0].double(), inputs(c)[1])
+    return network
+
+
+BEFORE = [LC(side=["ratio"], blocks=4), DFE(side=["ratio"], widths=(16, 32, 8))]
+
+
+@pytest.mark.parametrize("network", [*BEFORE, *PUBLISHED[:2], *map(in_double, PUBLISHED[2:])])
 def test_padding_and_neighbours_change_a_networks_values_by_rounding_alone(network):
     """At inference; NaN in masked slots. `LearnedPruner` has the same bits."""
     counts, network = (60, 1, 100, 30), network.eval()
@@ -137,7 +155,7 @@ def matches(counts: tuple[int, ...]) -> Correspondences:
 def test_weights_are_those_published() -> None:
     torch.manual_seed(7)
     network, c = LC(side=["ratio"], blocks=2, channels=16).eval(), matches((60, 30))
-    logit, weight, F = network(c)
+    logit, weight, F, _ = network(c)
     expected = torch.where(c.mask, torch.tanh(logit[0].clamp_min(0)), 0)
     assert (expected > 0).any()
     assert (expected[c.mask] == 0).any()
@@ -145,7 +163,7 @@ def test_weights_are_those_published() -> None:
     assert F is None
 
 
-@pytest.mark.parametrize("network", [LC(side=["ratio"], blocks=2), DFE(side=["ratio"], widths=(32, 16))])
+@pytest.mark.parametrize("network", [*BEFORE, PUBLISHED[0]])
 def test_mixed_precision(network: torch.nn.Module) -> None:
     """Products in bfloat16, statistics in float32: finite values and gradients close to those of float32."""
     c = matches((60, 100))

@@ -1,0 +1,116 @@
+"""CLNet: Zhao et al., "Progressive correspondence pruning by consensus learning", ICCV 2021."""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from fmtorch.core.types import Correspondences
+from fmtorch.pruning.networks import layers, learned
+from fmtorch.pruning.networks.architectures import MatchInputs, WithOptions
+
+LEAST = 1e-6  # residual, in thresholds: bounds the log-odds of verification
+
+
+class Consensus(nn.Module):
+    """Log-odds of each match by its local, then by the global consensus, and the features behind them."""
+
+    def __init__(self, embedding: nn.Module, channels: int) -> None:
+        super().__init__()
+        self.embedding, self.graph = embedding, layers.GlobalGraph(channels)
+        self.block = layers.RectifiedBlock(channels, channels)
+        self.local_logit, self.global_logit = layers.Perceptron(channels, 1), layers.Perceptron(channels, 1)
+
+    def forward(self, x: Float[Tensor, "c b n"], slots: layers.Slots) -> tuple[Tensor, Tensor, Tensor]:
+        y = self.embedding(x, slots)
+        local = self.local_logit(y)[0]
+        y = self.block(y + self.graph(y, local.detach(), slots), slots)
+        return y, local, self.global_logit(y)[0]
+
+
+class Progressive(WithOptions):
+    """Prunes matches in steps, fits what is left, and judges all matches by their residuals.
+    A step keeps the share `ratio` of a pair's matches, those of the largest global log-odds; the next sees both."""
+
+    inputs: MatchInputs
+
+    def __init__(self, steps: Sequence[Consensus], channels: int, ratio: float, threshold: float) -> None:
+        super().__init__()
+        self.steps, self.ratio, self.threshold = nn.ModuleList(steps), ratio, threshold
+        self.block, self.last = layers.RectifiedBlock(channels, channels), layers.Perceptron(channels, 2)
+
+    def forward(self, c: Correspondences) -> learned.Prediction:
+        """Stages: each step's local and global log-odds; those of the last subset, with whose weights
+        ``softmax(w + log sigmoid(logit))`` is fitted; and ``log(threshold / residual)`` of all matches, without
+        gradients, or the first global ones where nothing is fitted.
+        Raises ValueError where image sizes or calibration matrices are missing."""
+        x, mask = self.inputs(c)
+        inputs = x.transpose(0, 1)
+        place, left, seen = torch.arange(x.shape[2], device=x.device).expand(mask.shape), mask, inputs
+        stages: list[tuple[Tensor, Tensor, Tensor]] = []  # places among all matches, which are left there, log-odds
+        for step in self.steps:
+            y, *logits = step(seen, layers.Slots.of(left))
+            stages += [(place, left, logit) for logit in logits]
+            index, left = layers.likeliest(logits[1], left, self.ratio)
+            place, slots = place.gather(1, index), layers.Slots.of(left)
+            weights = torch.relu(torch.tanh(torch.stack(logits).detach()))
+            seen = slots.clean(torch.cat([layers.selected(inputs, place), layers.selected(weights, index)]))
+            y = slots.clean(layers.selected(y, index))
+        logit, weight_logit = self.last(self.block(y, slots)).to(x.dtype)
+        weight = layers.spread(slots.softmax(weight_logit + nn.functional.logsigmoid(logit)), place, mask.shape)
+        residual, determined = layers.fit_residuals(x, weight)
+        verified = -(residual / self.threshold).clamp_min(LEAST).log()
+        verified = torch.where(determined[:, None], verified, stages[1][2].detach())
+        stages.append((place, left, logit))
+        logits = [layers.spread(torch.where(left, logit, 0), place, mask.shape) for place, left, logit in stages]
+        judged = [layers.spread(left, place, mask.shape) for place, left, _ in stages]
+        judged.append(torch.zeros_like(mask))
+        return learned.Prediction(torch.stack([*logits, verified]), weight[None], judged=torch.stack(judged))
+
+
+class LocalEmbedding(nn.Module):
+    """Perceptrons, the neighbourhood by an annular convolution among the nearest features, perceptrons."""
+
+    def __init__(self, inputs: int, channels: int, neighbors: int) -> None:
+        super().__init__()
+        self.neighbors, self.first = neighbors, layers.NormedPerceptron(inputs, channels)
+        self.before = nn.ModuleList(layers.RectifiedBlock(channels, channels) for _ in range(4))
+        self.annular = layers.AnnularConvolution(channels, neighbors // 3)
+        self.after = nn.ModuleList(layers.RectifiedBlock(channels, channels) for _ in range(4))
+
+    def forward(self, x: Float[Tensor, "c b n"], slots: layers.Slots) -> Float[Tensor, "d b n"]:
+        y = self.first(x, slots)
+        for block in self.before:
+            y = block(y, slots)
+        y = self.annular(y, slots, layers.nearest(y, slots, self.neighbors))
+        for block in self.after:
+            y = block(y, slots)
+        return y  # type: ignore[no-any-return]
+
+
+class CLNet(Progressive):
+    """Prunes matches by local and global consensus.
+
+    Args:
+        channels: of each layer.
+        neighbors: of each step, multiples of three.
+        ratio: of the matches that a step keeps.
+        threshold: squared symmetric epipolar distance, in units of the coordinates, at which P(inlier) is one half.
+        coordinates: "size", for the fundamental matrix, or "K", for the essential matrix as published.
+        side: side information, see `MatchInputs`.
+
+    Raises:
+        ValueError: for unknown coordinates or side information.
+    """
+
+    def __init__(
+        self, *, channels: int = 128, neighbors: Sequence[int] = (9, 6), ratio: float = 0.5, threshold: float = 1e-4,
+        coordinates: str = "size", side: Sequence[str] = (),
+    ) -> None:  # fmt: skip
+        inputs = MatchInputs(coordinates, tuple(side))
+        embeddings = (LocalEmbedding(inputs.channels + 2 * (i > 0), channels, k) for i, k in enumerate(neighbors))
+        super().__init__([Consensus(each, channels) for each in embeddings], channels, ratio, threshold)
+        self.inputs = inputs
+        self.options = {"channels": channels, "neighbors": list(neighbors), "ratio": ratio, "threshold": threshold,
+                        "coordinates": coordinates, "side": list(side)}  # fmt: skip
