@@ -37,7 +37,9 @@ from fmtorch.core import settings, terminal
 from fmtorch.core.options import expect_options
 from fmtorch.core.version import __version__
 from fmtorch.data import ImagePair, PairDataset, construction, read_image, subset
+from fmtorch.data.files import given_root
 from fmtorch.evaluation.run import select
+from fmtorch.io import H5Pairs, h5
 from fmtorch.pipeline import pictures, pipeline
 from fmtorch.presets.composition import execution_of, plain, read_fields
 from fmtorch.pruning.networks.learned import predict
@@ -46,6 +48,7 @@ from fmtorch.scenes import RenderedPairs
 from fmtorch.training.export import Evaluation, Result, Use, Validation, quiet, write_result
 from fmtorch.training.labelled import Augmentation, LabelledMatches, keep_ratio
 from fmtorch.training.matched_pairs import MatchedPairs
+from fmtorch.training.oanet_pairs import NamedPairs, OANetPairs
 from fmtorch.training.objective import Objective
 from fmtorch.training.options import Optimisation as Optimisation
 from fmtorch.training.options import TrainOptions
@@ -297,7 +300,8 @@ def run(config: DictConfig, name: str) -> Path:
         terminal.console.print(f"{about}; {folder}", soft_wrap=True)
         if len(matches.training) < FEW:
             terminal.console.print(f"so few pairs show that it runs, and teach little; {MORE}", soft_wrap=True)
-    shown = matches.validation[:: max(1, len(matches.validation) // PICTURES)][:PICTURES]
+    pictured = [(p, m) for p, m in matches.validation if p.image0.path.is_file() and p.image1.path.is_file()]
+    shown = pictured[:: max(1, len(pictured) // PICTURES)][:PICTURES]
     batches = functools.partial(training_batches, matches.training, config.batch, config.seed, workers=config.loaders)
     how: dict[str, Any] = {name: getattr(options.validation, name) for name in ("every", "patience", "monitor")}
     how |= {"checkpoint_every": options.checkpoint_every, "callbacks": (ValidationPictures(shown),)}
@@ -365,7 +369,7 @@ def labelled_matches(config: DictConfig, options: TrainOptions, progress: Progre
     photographs, given, validated = list[Photograph](), config.photographs, options.validation
     if options.planes.photographs is not None:
         photographs = list_photographs(options.planes.photographs, given.sources, given.excluded)
-    dataset = _dataset(config, progress)
+    dataset = _dataset(config, options, progress)
     chosen, held_out = _split(dataset, validated.scenes)
     chosen = _limited(dataset, chosen, config.limit)
     if not chosen:
@@ -373,22 +377,25 @@ def labelled_matches(config: DictConfig, options: TrainOptions, progress: Progre
     front = _front(config)
 
     def matched(source: PairDataset, indices: Sequence[int], what: str) -> StoredMatches:
+        if isinstance(source, NamedPairs):
+            return source.matches.select(indices)
+        labels = "pixels" if isinstance(source, PlanePairs) else options.labels
         return MatchedPairs(
             subset(source, indices) if len(indices) < len(source) else source, front,
             execution=execution_of(config, config.workers).decided(False), build=functools.partial(_front, config),
-            progress=terminal.reporter(progress, f"matches {what}"),
+            progress=terminal.reporter(progress, f"matches {what}"), labels=labels,
         )  # fmt: skip
 
     training = matched(dataset, chosen, "to train on")
-    digests, validation = [training.folder.name], list[tuple[ImagePair, LabelledMatches]]()
+    digests, validation = [training.digest], list[tuple[ImagePair, LabelledMatches]]()
     sets = [(dataset, held_out, "to validate on")]
     for root in validated.roots:
-        real = data.load("fmbench", root=root)
+        real = _validation_set(root, config, options)
         sets.append((real, list(range(len(real))), f"of {root}"))
     for source, indices, what in sets:
         if selected := _limited(source, indices, validated.pairs):
             stored = matched(source, selected, what)
-            digests.append(stored.folder.name)
+            digests.append(stored.digest)
             pairs = {source[i].key: source[i] for i in selected}
             for i, about in enumerate(stored.pairs):
                 validation.append((pairs[about["key"]], keep_ratio(stored.stored(i), validated.ratio).compact()))
@@ -405,19 +412,38 @@ def labelled_matches(config: DictConfig, options: TrainOptions, progress: Progre
         drawn = PlanePairs(photographs, options.planes.limits, options.planes.seed, workers=workers, progress=report)
         planes = matched(drawn, range(len(drawn)), "of photographs")
         planes = planes.select(i for i, about in enumerate(planes.pairs) if about["inliers"] > construction.ENOUGH)
-        digests.append(planes.folder.name)
+        digests.append(planes.digest)
         description["training"] += f" and {len(planes)} pairs of {_scenes(planes)} photographs seen as planes"
         training = training.joined(planes)
     augmented = training.augmented(Augmentation(**dataclasses.asdict(options.augmentation)), config.seed)
     return Matches(augmented, validation, hashlib.sha256(" ".join(digests).encode()).hexdigest(), description)
 
 
-def _dataset(config: DictConfig, progress: Progress) -> PairDataset:
+def _dataset(config: DictConfig, options: TrainOptions, progress: Progress) -> PairDataset:
     """The data set to train on; of the embedded one always the training side."""
-    options = plain(config.dataset)
-    if presets.target_of(options, "dataset") is RenderedPairs:
-        options["split"] = "train"
-    return data.build(options, terminal.reporter(progress, "drawing scenes"))
+    chosen = plain(config.dataset)
+    target = presets.target_of(chosen, "dataset")
+    if target is H5Pairs and chosen["layout"] == "oanet":
+        return _oanet_pairs(given_root(chosen["root"], "h5", "the file, or the folder of the files"), config, options)
+    if target is RenderedPairs:
+        chosen["split"] = "train"
+    return data.build(chosen, terminal.reporter(progress, "drawing scenes"))
+
+
+def _validation_set(root: str, config: DictConfig, options: TrainOptions) -> PairDataset:
+    path = Path(root).expanduser()
+    if path.suffix in h5.SUFFIXES or any(file.suffix in h5.SUFFIXES for file in path.glob("*")):
+        return _oanet_pairs(path, config, options)
+    return data.load("fmbench", root=root)
+
+
+def _oanet_pairs(root: Path, config: DictConfig, options: TrainOptions) -> NamedPairs:
+    """The pairs of OANet's files, without reading them. Raises DataError where they lack ratios that are asked for."""
+    before: list[Any] = [presets.build("pruner", str(name)) for name in config.before]
+    pairs = OANetPairs(root, labels=options.labels, before=before)
+    if options.augmentation.ratio is not None or options.validation.ratio < 1:
+        pairs.expect_ratios("without them give augmentation.ratio=null validation.ratio=1")
+    return NamedPairs(pairs)
 
 
 def _split(dataset: PairDataset, last: int | None) -> tuple[list[int], list[int]]:
