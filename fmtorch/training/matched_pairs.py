@@ -9,13 +9,16 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 import torch
+from omegaconf import DictConfig
 
+from fmtorch import presets
 from fmtorch.core import Correspondences, files, settings
 from fmtorch.data.pairs import DepthDataset, ImagePair, PairDataset
 from fmtorch.jobs.execution import Execution, use_one_thread
 from fmtorch.jobs.runner import Factory, Local, Source, TaskRunner, WorkerPool
 from fmtorch.pipeline.pipeline import Outcome, Pipeline, load_pipeline
-from fmtorch.runs import CachedFeatures, identity_digest
+from fmtorch.presets import plain
+from fmtorch.runs import CachedFeatures, cached, identity_digest
 from fmtorch.runs.fingerprint import configuration, environment
 from fmtorch.training import labelled
 from fmtorch.training.stored_matches import FORMAT, Shard, ShardError, StoredMatches, write_shard
@@ -120,6 +123,19 @@ def _identity(dataset: PairDataset, stages: Pipeline, most: int, rule: labelled.
         "labels": [labelled.VERSION, *rules],
         "stages": parts, "environment": environment(),
     }  # fmt: skip
+
+
+def front(config: DictConfig) -> Pipeline:
+    """The stages before estimation that a config names: features, matcher, and the pruners `before`, if any."""
+    features = presets.instantiate(plain(config.features), "features")
+    extractor = cached(features, config.get("cache"), config.get("cache_limit"))
+    before = {str(name): presets.build("pruner", str(name)) for name in config.get("before") or ()}
+    matcher: Any = presets.instantiate(plain(config.matcher), "matcher")
+    return Pipeline(extractor, matcher, before, _no_estimator)
+
+
+def _no_estimator(c: Any, seed: int = 0) -> Any:
+    raise NotImplementedError("the stages before estimation only")
 
 
 def _sound(path: Path, pairs: int) -> bool:

@@ -2,7 +2,7 @@
 
 import functools
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -149,3 +149,26 @@ class NamedPairs(PairDataset):
         about = self.matches.pairs[index]
         image = predictions.image(about["family"], about["scene"], about["identity"], None)
         return ImagePair(about["identity"], about["family"], about["scene"], image, image, np.zeros((3, 3)))
+
+
+def write_oanet(matches: StoredMatches, pairs: Iterable[ImagePair], folder: Path) -> list[Path]:
+    """Write the matches of pairs of known cameras into a folder, a file of OANet's layout for each scene; the files."""
+    cameras = {pair.key: pair for pair in pairs}
+    scenes: dict[str, list[int]] = {}
+    for i, about in enumerate(matches.pairs):
+        scenes.setdefault(about["scene"], []).append(i)
+    paths = [folder / f"{name.replace('/', '-')}.hdf5" for name in scenes]
+    for path, members in zip(paths, scenes.values(), strict=True):
+        oanet.write(path, (_entry(matches.stored(i), cameras[matches.pairs[i]["key"]]) for i in members))
+    return paths
+
+
+def _entry(matches: LabelledMatches, pair: ImagePair) -> oanet.Entry:
+    c = matches.correspondences
+    values = {name: None if (x := getattr(c, name)) is None else x[0].numpy() for name in ("ratio", "mutual")}
+    x0, x1 = (x[0].numpy().astype(np.float64) for x in (c.x0, c.x1))
+    if c.size0 is None or c.size1 is None or pair.K0 is None or pair.K1 is None or pair.R is None or pair.t is None:
+        raise ValueError(f"OANet's layout needs cameras and image sizes, which pair {pair.identity} does not have")
+    (h0, w0), (h1, w1) = c.size0[0].tolist(), c.size1[0].tolist()
+    cameras = oanet.Cameras((pair.K0, pair.K1), pair.R, pair.t, ((h0, w0), (h1, w1)))
+    return oanet.Entry(cameras, x0, x1, values["ratio"], values["mutual"])

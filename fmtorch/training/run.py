@@ -40,20 +40,20 @@ from fmtorch.data import ImagePair, PairDataset, construction, read_image, subse
 from fmtorch.data.files import given_root
 from fmtorch.evaluation.run import select
 from fmtorch.io import H5Pairs, h5
-from fmtorch.pipeline import pictures, pipeline
+from fmtorch.pipeline import pictures
 from fmtorch.presets.composition import execution_of, plain, read_fields
 from fmtorch.pruning.networks.learned import predict
-from fmtorch.runs import cached, identity_digest
+from fmtorch.runs import identity_digest
 from fmtorch.scenes import RenderedPairs
 from fmtorch.training.export import Evaluation, Result, Use, Validation, quiet, write_result
 from fmtorch.training.labelled import Augmentation, LabelledMatches, keep_ratio
-from fmtorch.training.matched_pairs import MatchedPairs
+from fmtorch.training.matched_pairs import MatchedPairs, front
 from fmtorch.training.oanet_pairs import NamedPairs, OANetPairs
 from fmtorch.training.objective import Objective
 from fmtorch.training.options import Optimisation as Optimisation
 from fmtorch.training.options import TrainOptions
 from fmtorch.training.planes import Photograph, PlanePairs, list_photographs
-from fmtorch.training.stored_matches import StoredMatches, last_scenes, training_batches
+from fmtorch.training.stored_matches import QUARTER, StoredMatches, last_scenes, training_batches
 
 CHECKPOINTS, BEST, LOGS = "checkpoints", "best.ckpt", "logs"
 SMALLER_IS_BETTER = ("log_loss", "calibration_error")  # figures of validation; of the others larger is
@@ -370,19 +370,19 @@ def labelled_matches(config: DictConfig, options: TrainOptions, progress: Progre
     if options.planes.photographs is not None:
         photographs = list_photographs(options.planes.photographs, given.sources, given.excluded)
     dataset = _dataset(config, options, progress)
-    chosen, held_out = _split(dataset, validated.scenes)
+    by_image = not validated.roots and not isinstance(dataset, NamedPairs)
+    chosen, held_out = _split(dataset, validated.scenes, by_image)
     chosen = _limited(dataset, chosen, config.limit)
     if not chosen:
         raise ValueError("no pairs to train on: the scenes are for validation; give a smaller validation.scenes")
-    front = _front(config)
 
     def matched(source: PairDataset, indices: Sequence[int], what: str) -> StoredMatches:
         if isinstance(source, NamedPairs):
             return source.matches.select(indices)
         labels = "pixels" if isinstance(source, PlanePairs) else options.labels
         return MatchedPairs(
-            subset(source, indices) if len(indices) < len(source) else source, front,
-            execution=execution_of(config, config.workers).decided(False), build=functools.partial(_front, config),
+            subset(source, indices) if len(indices) < len(source) else source, front(config),
+            execution=execution_of(config, config.workers).decided(False), build=functools.partial(front, config),
             progress=terminal.reporter(progress, f"matches {what}"), labels=labels,
         )  # fmt: skip
 
@@ -405,7 +405,8 @@ def labelled_matches(config: DictConfig, options: TrainOptions, progress: Progre
     description = {
         "training": f"{len(training)} pairs of {_scenes(training)} scenes of {dataset.name}",
         "validation": ", ".join(f"{count} pairs of {family}" for family, count in families.items())
-        + f" (of {dataset.name} the last scenes of each family, which may share photographs with the training scenes)",
+        + f" (of {dataset.name} the last scenes of each family, which may share photographs with the training scenes; "
+        "of one scene the last images)",
     }
     if photographs:
         workers, report = config.workers or os.cpu_count() or 1, terminal.reporter(progress, "views of photographs")
@@ -446,32 +447,29 @@ def _oanet_pairs(root: Path, config: DictConfig, options: TrainOptions) -> Named
     return NamedPairs(pairs)
 
 
-def _split(dataset: PairDataset, last: int | None) -> tuple[list[int], list[int]]:
-    """Indices of the pairs to train on, and of those in the last scenes of each family."""
+def _split(dataset: PairDataset, last: int | None, by_image: bool) -> tuple[list[int], list[int]]:
+    """Indices of the pairs to train on, and of those in the last scenes of each family.
+    by_image: where each family has one scene, of those among its last quarter of images; pairs that join images of both
+    sides are in neither."""
     pairs = [dataset[i] for i in range(len(dataset))]
-    held = last_scenes(((pair.family, pair.scene) for pair in pairs), last)
-    sides: tuple[list[int], list[int]] = ([], [])
-    for i, pair in enumerate(pairs):
-        sides[(pair.family, pair.scene) in held].append(i)
-    return sides
+    scenes = [(pair.family, pair.scene) for pair in pairs]
+    held = last_scenes(scenes, last)
+    if held or not by_image:
+        sides = [2 * (scene in held) for scene in scenes]
+    else:
+        images = dict[tuple[str, str], set[str]]()
+        ends = [(pair.image0.identity, pair.image1.identity) for pair in pairs]
+        for scene, own in zip(scenes, ends, strict=True):
+            images.setdefault(scene, set()).update(own)
+        late = {name for names in images.values() for name in sorted(names)[-max(1, len(names) // QUARTER) :]}
+        sides = [sum(name in late for name in own) for own in ends]
+    return [i for i, n in enumerate(sides) if n == 0], [i for i, n in enumerate(sides) if n == 2]
 
 
 def _limited(dataset: PairDataset, indices: list[int], limit: int | None) -> list[int]:
     """At most `limit` pairs of each family, chosen by their keys."""
     index = {dataset[i].key: i for i in indices}
     return sorted(index[pair.key] for pair in select([dataset[i] for i in indices], limit))
-
-
-def _front(config: DictConfig) -> pipeline.Pipeline:
-    """Features, matcher and the pruners before the trained one."""
-    extractor = cached(presets.instantiate(plain(config.features), "features"), config.cache, config.cache_limit)
-    before = {str(name): presets.build("pruner", str(name)) for name in config.before}
-    matcher: Any = presets.instantiate(plain(config.matcher), "matcher")
-    return pipeline.Pipeline(extractor, matcher, before, _no_estimator)
-
-
-def _no_estimator(c: Any, seed: int = 0) -> Any:
-    raise NotImplementedError("the stages before estimation only")
 
 
 def _scenes(matches: StoredMatches) -> int:
