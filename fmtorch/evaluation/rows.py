@@ -98,7 +98,8 @@ def _right(pair: ImagePair, c: Correspondences) -> NDArray[np.bool_]:
     K0, K1, R, t = (cast(NDArray[np.float64], value) for value in (pair.K0, pair.K1, pair.R, pair.t))
     ends = ((x[0].double().cpu().numpy() - K[:2, 2], K) for x, K in ((c.x0, K0), (c.x1, K1)))
     distance = geodesic(R, t, *(x / K.diagonal()[:2] for x, K in ends))
-    return (distance < GEODESIC) & c.mask[0].cpu().numpy()
+    right: NDArray[np.bool_] = (distance < GEODESIC) & c.mask[0].cpu().numpy()
+    return right
 
 
 def _of_homographies(outcomes: Sequence[Outcome]) -> list[Figures]:

@@ -15,14 +15,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from fmtorch.core.files import replacing
 from fmtorch.data import DataError, GivenMatches, Lens
 from fmtorch.data.files import Matrix
 from fmtorch.geometry.epipolar import symmetric_squared
 from fmtorch.io import h5, predictions
-from fmtorch.io.predictions import Size
 
 GEODESIC = 1e-4  # of an inlier, squared focal lengths: obj_geod_th of OANet's code
 
@@ -44,7 +42,7 @@ class Cameras:
     K: tuple[Matrix, Matrix]
     R: Matrix
     t: Matrix
-    sizes: tuple[Size, Size]
+    sizes: tuple[predictions.Size, predictions.Size]
 
 
 def keys(file: Any) -> list[str]:
@@ -156,10 +154,10 @@ class Entry:
     cameras: Cameras
     x0: Matrix
     x1: Matrix
-    ratios: NDArray[np.float32] | None = None
-    mutuals: NDArray[np.bool_] | None = None
+    ratios: Matrix | None = None
+    mutuals: Matrix | None = None
 
-    def arrays(self) -> Mapping[str, NDArray[Any] | None]:
+    def arrays(self) -> Mapping[str, Matrix | None]:
         """What a file holds of it, by the names of its groups."""
         (K0, K1), t = self.cameras.K, self.cameras.t / np.linalg.norm(self.cameras.t)
         rays0, rays1 = ((x - K[:2, 2]) / K.diagonal()[:2] for x, K in ((self.x0, K0), (self.x1, K1)))
@@ -167,7 +165,8 @@ class Entry:
         return {
             "xs": np.hstack([rays0, rays1])[None], "ys": geodesic(self.cameras.R, t, rays0, rays1)[:, None],
             "Rs": self.cameras.R, "ts": t[:, None], "ratios": self.ratios, "mutuals": self.mutuals, **known,
-            "f1s": K0.diagonal()[None, :2], "f2s": K1.diagonal()[None, :2], "sizes": np.ravel(self.cameras.sizes),
+            "f1s": K0.diagonal()[None, :2], "f2s": K1.diagonal()[None, :2],
+            "sizes": np.array(self.cameras.sizes, np.float64).ravel(),
         }  # fmt: skip
 
 

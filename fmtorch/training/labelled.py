@@ -29,7 +29,7 @@ from fmtorch.core import Correspondences, records, types
 from fmtorch.data.cameras import line_distance
 from fmtorch.data.pairs import DepthDataset, ImagePair, ImageSource, PairDataset
 from fmtorch.geometry.epipolar import unit_frobenius
-from fmtorch.io.oanet import GEODESIC, geodesic
+from fmtorch.io import oanet
 from fmtorch.jit.random import Stream, bits, uniform
 from fmtorch.training.options import AugmentationOptions, Range
 
@@ -119,7 +119,7 @@ def label(dataset: PairDataset, pair: ImagePair, x0: Points, x1: Points, rule: R
         if any(value is None for value in cameras):
             raise ValueError(f"labels=geodesic needs K, R and t, which pair {pair.identity} does not have")
         K0, K1, R, t = (np.asarray(value) for value in cameras)
-        return by_geodesic(geodesic(R, t, *((x - K[:2, 2]) / K.diagonal()[:2] for x, K in ((x0, K0), (x1, K1)))))
+        return by_geodesic(oanet.geodesic(R, t, *((x - K[:2, 2]) / K.diagonal()[:2] for x, K in ((x0, K0), (x1, K1)))))
     line = line_distance(pair.F, x0, x1)
     if not isinstance(dataset, DepthDataset) or any(value is None for value in cameras):
         return by_line(line)
@@ -136,7 +136,7 @@ def by_line(line: NDArray[np.float64]) -> Labels:
 
 def by_geodesic(distance: NDArray[np.float64]) -> Labels:
     """Labels by OANet's geodesic distance (n,): no match is ignored."""
-    return (distance < GEODESIC).astype(np.int8)
+    return (distance < oanet.GEODESIC).astype(np.int8)
 
 
 def by_transfer(forward: NDArray[np.float64], backward: NDArray[np.float64], line: NDArray[np.float64]) -> Labels:

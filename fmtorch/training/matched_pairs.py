@@ -14,6 +14,7 @@ from omegaconf import DictConfig
 from fmtorch import presets
 from fmtorch.core import Correspondences, files, settings
 from fmtorch.data.pairs import DepthDataset, ImagePair, PairDataset
+from fmtorch.io import oanet
 from fmtorch.jobs.execution import Execution, use_one_thread
 from fmtorch.jobs.runner import Factory, Local, Source, TaskRunner, WorkerPool
 from fmtorch.pipeline.pipeline import Outcome, Pipeline, load_pipeline
@@ -117,7 +118,7 @@ def _identity(dataset: PairDataset, stages: Pipeline, most: int, rule: labelled.
         raise ValueError(f"the matches of this pipeline cannot be kept: {error}") from error
     rules: list[Any] = ["depth" if isinstance(dataset, DepthDataset) else "lines"]
     rules += [labelled.INLIER_PX, labelled.OUTLIER_PX, labelled.EDGE_PX]
-    rules = rules if rule == "pixels" else [rule, labelled.GEODESIC]
+    rules = rules if rule == "pixels" else [rule, oanet.GEODESIC]
     return {
         "format": FORMAT, "dataset": [dataset.name, dataset.digest], "most": most,
         "labels": [labelled.VERSION, *rules],

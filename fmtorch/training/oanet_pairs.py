@@ -10,12 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fmtorch.core.types import Correspondences, pair_key
-from fmtorch.data import DataError, ImagePair
+from fmtorch.data import DataError, ImagePair, PairDataset
 from fmtorch.data.cameras import Camera, fundamental, line_distance
-from fmtorch.data.pairs import PairDataset
 from fmtorch.io import h5, oanet, predictions
 from fmtorch.training import labelled
-from fmtorch.training.labelled import Augmentation, LabelledMatches
 from fmtorch.training.stored_matches import Shard, StoredMatches
 
 _KINDS: dict[str, Any] = {**dict.fromkeys(("x0", "x1", "ratio"), np.float32), "mutual": np.uint8, "label": np.int8}
@@ -91,8 +89,9 @@ class OANetPairs(StoredMatches):
     """
 
     def __init__(
-        self, root: str | Path, *, labels: labelled.Rule = "geodesic", augmentation: Augmentation | None = None,
-        seed: int = 0, before: Sequence[Callable[[Correspondences], Correspondences]] = (),
+        self, root: str | Path, *, labels: labelled.Rule = "geodesic",
+        augmentation: labelled.Augmentation | None = None, seed: int = 0,
+        before: Sequence[Callable[[Correspondences], Correspondences]] = (),
     ) -> None:  # fmt: skip
         self.folder = Path(root).expanduser().resolve()
         self.labels, self.before = labels, list(before)
@@ -124,7 +123,7 @@ class OANetPairs(StoredMatches):
         keys = np.array([about["key"] for about in self.pairs]).tobytes()
         return hashlib.blake2b(self._contents + keys, digest_size=16).hexdigest()
 
-    def stored(self, index: int) -> LabelledMatches:
+    def stored(self, index: int) -> labelled.LabelledMatches:
         matches = super().stored(index)
         if not self.before:
             return matches
@@ -163,7 +162,7 @@ def write_oanet(matches: StoredMatches, pairs: Iterable[ImagePair], folder: Path
     return paths
 
 
-def _entry(matches: LabelledMatches, pair: ImagePair) -> oanet.Entry:
+def _entry(matches: labelled.LabelledMatches, pair: ImagePair) -> oanet.Entry:
     c = matches.correspondences
     values = {name: None if (x := getattr(c, name)) is None else x[0].numpy() for name in ("ratio", "mutual")}
     x0, x1 = (x[0].numpy().astype(np.float64) for x in (c.x0, c.x1))

@@ -37,7 +37,6 @@ from fmtorch.core import settings, terminal
 from fmtorch.core.options import expect_options
 from fmtorch.core.version import __version__
 from fmtorch.data import ImagePair, PairDataset, construction, read_image, subset
-from fmtorch.data.files import given_root
 from fmtorch.evaluation.run import select
 from fmtorch.io import H5Pairs, h5
 from fmtorch.pipeline import pictures
@@ -425,7 +424,9 @@ def _dataset(config: DictConfig, options: TrainOptions, progress: Progress) -> P
     chosen = plain(config.dataset)
     target = presets.target_of(chosen, "dataset")
     if target is H5Pairs and chosen["layout"] == "oanet":
-        return _oanet_pairs(given_root(chosen["root"], "h5", "the file, or the folder of the files"), config, options)
+        return _oanet_pairs(
+            data.files.given_root(chosen["root"], "h5", "the file, or the folder of the files"), config, options
+        )
     if target is RenderedPairs:
         chosen["split"] = "train"
     return data.build(chosen, terminal.reporter(progress, "drawing scenes"))

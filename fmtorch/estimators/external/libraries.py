@@ -62,7 +62,7 @@ def _of_essential(pair: Pair, K: tuple[Points, Points], options: Mapping[str, An
     # Several where a sample is minimal, of which that counts which has most matches in front of both cameras.
     poses = [(each, *cv2.recoverPose(each, *rays, mask=mask.copy())) for each in E.reshape(-1, 3, 3)]
     best, _, R, t, _ = max(poses, key=lambda pose: pose[1])
-    return pairwise.Posed(_of_pixels(best, K), mask.ravel() > 0, None, R, t.ravel())
+    return _posed_by_essential(best, R, t, K, mask.ravel() > 0)
 
 
 def weighted_eight_point(*, best: float = 0.1) -> PairwiseEstimator:
@@ -89,7 +89,7 @@ def weighted_eight_point(*, best: float = 0.1) -> PairwiseEstimator:
         E = np.linalg.eigh((X * weight[:, None]).T @ X)[1][:, 0].reshape(3, 3)
         kept = p >= np.sort(p)[::-1][max(1, int(best * len(p)))]
         _, R, t, _ = cv2.recoverPose(E, rays0[kept], rays1[kept])
-        return pairwise.Posed(_of_pixels(E, K), weight > 0, None, R, t.ravel())
+        return _posed_by_essential(E, R, t, K, weight > 0)
 
     return PairwiseEstimator("the weighted eight-point algorithm", solve)
 
@@ -99,9 +99,9 @@ def _calibrated(pair: Pair, K: tuple[Points, Points]) -> tuple[Points, Points]:
     return rays0, rays1
 
 
-def _of_pixels(E: Points, K: tuple[Points, Points]) -> Points:
-    F: Points = np.linalg.inv(K[1]).T @ E @ np.linalg.inv(K[0])
-    return F
+def _posed_by_essential(E: Any, R: Any, t: Any, K: tuple[Points, Points], inliers: NDArray[np.bool_]) -> pairwise.Posed:
+    F = np.linalg.inv(K[1]).T @ np.asarray(E, np.float64) @ np.linalg.inv(K[0])
+    return pairwise.Posed(F, inliers, None, np.asarray(R, np.float64), np.ravel(t).astype(np.float64))
 
 
 def kornia_ransac(
