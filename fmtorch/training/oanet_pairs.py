@@ -12,10 +12,12 @@ from numpy.typing import NDArray
 from fmtorch.core.types import Correspondences, pair_key
 from fmtorch.data import DataError, ImagePair, PairDataset
 from fmtorch.data.cameras import Camera, fundamental, line_distance
+from fmtorch.data.files import Matrix
 from fmtorch.io import h5, oanet, predictions
 from fmtorch.training import labelled
 from fmtorch.training.stored_matches import Shard, StoredMatches
 
+MAX_CAMERAS = 1 << 16  # pairs of a file whose cameras are kept once they were read, about a kilobyte each
 _KINDS: dict[str, Any] = {**dict.fromkeys(("x0", "x1", "ratio"), np.float32), "mutual": np.uint8, "label": np.int8}
 
 
@@ -26,6 +28,7 @@ class OANetShard(Shard):
         self.path, self.labels, self.family = path, labels, family
         self._access = oanet.RandomAccess(path)
         self._keys = oanet.keys(self._access.file)
+        self._geometry = functools.lru_cache(MAX_CAMERAS)(self._read_geometry)
 
     def __len__(self) -> int:
         return len(self._keys)
@@ -49,12 +52,9 @@ class OANetShard(Shard):
             label = self._geodesic(key, h5.shape(file["xs"], key)[-2:][0])
             ratio = oanet.figures(file, "ratios", key, len(label))
             return {"label": label} if ratio is None else {"label": label, "ratio": ratio.astype(np.float32)}
-        cameras = oanet.cameras(file, key)
-        K0, K1 = cameras.K
+        cameras, F = self._geometry(key)
+        (K0, K1), (size0, size1) = cameras.K, (np.array(size) for size in cameras.sizes)
         x0, x1, ratio, mutual = oanet.arrays(file, key, cameras)
-        if not cameras.t.any():
-            raise DataError(f"{self.path}: 'ts/{key}' is zero, which leaves no F")
-        F = fundamental(Camera(K0, np.eye(3), np.zeros(3)), Camera(K1, cameras.R, cameras.t))
         by_pixels = self.labels == "pixels"
         label = labelled.by_line(line_distance(F, x0, x1)) if by_pixels else self._geodesic(key, len(x0))
         values = {"x0": x0, "x1": x1, "ratio": ratio, "mutual": mutual, "label": label}
@@ -62,8 +62,15 @@ class OANetShard(Shard):
         if not (np.isfinite(x0).all() and np.isfinite(x1).all()):
             inside = np.isfinite(x0).all(1) & np.isfinite(x1).all(1)
             known = {name: x[inside] for name, x in known.items()}
-        size0, size1 = (np.array(size) for size in cameras.sizes)
         return {**known, "F": F, "K0": K0, "K1": K1, "size0": size0, "size1": size1}
+
+    def _read_geometry(self, key: str) -> tuple[oanet.Cameras, Matrix]:
+        """The cameras of a pair and its F. Nine small entries take longer to read than the matches."""
+        cameras = oanet.cameras(self._access.file, key)
+        if not cameras.t.any():
+            raise DataError(f"{self.path}: 'ts/{key}' is zero, which leaves no F")
+        K0, K1 = cameras.K
+        return cameras, fundamental(Camera(K0, np.eye(3), np.zeros(3)), Camera(K1, cameras.R, cameras.t))
 
     def _geodesic(self, key: str, count: int) -> labelled.Labels:
         distance = oanet.figures(self._access.file, "ys", key, count)
