@@ -28,7 +28,7 @@ class OANetShard(Shard):
         self.path, self.labels, self.family = path, labels, family
         self._access = oanet.RandomAccess(path)
         self._keys = oanet.keys(self._access.file)
-        self._geometry = functools.lru_cache(MAX_CAMERAS)(self._read_geometry)
+        self._geometry = functools.lru_cache(MAX_CAMERAS)(functools.partial(_geometry, self._access))
 
     def __len__(self) -> int:
         return len(self._keys)
@@ -64,19 +64,20 @@ class OANetShard(Shard):
             known = {name: x[inside] for name, x in known.items()}
         return {**known, "F": F, "K0": K0, "K1": K1, "size0": size0, "size1": size1}
 
-    def _read_geometry(self, key: str) -> tuple[oanet.Cameras, Matrix]:
-        """The cameras of a pair and its F. Nine small entries take longer to read than the matches."""
-        cameras = oanet.cameras(self._access.file, key)
-        if not cameras.t.any():
-            raise DataError(f"{self.path}: 'ts/{key}' is zero, which leaves no F")
-        K0, K1 = cameras.K
-        return cameras, fundamental(Camera(K0, np.eye(3), np.zeros(3)), Camera(K1, cameras.R, cameras.t))
-
     def _geodesic(self, key: str, count: int) -> labelled.Labels:
         distance = oanet.figures(self._access.file, "ys", key, count)
         if distance is None:
             raise DataError(f"{self.path}: 'ys' is missing, which labels=geodesic needs; give labels=pixels")
         return labelled.by_geodesic(distance)
+
+
+def _geometry(access: oanet.RandomAccess, key: str) -> tuple[oanet.Cameras, Matrix]:
+    """The cameras of a pair and its F. Nine small entries take longer to read than the matches."""
+    cameras = oanet.cameras(access.file, key)
+    if not cameras.t.any():
+        raise DataError(f"{access.path}: 'ts/{key}' is zero, which leaves no F")
+    K0, K1 = cameras.K
+    return cameras, fundamental(Camera(K0, np.eye(3), np.zeros(3)), Camera(K1, cameras.R, cameras.t))
 
 
 class OANetPairs(StoredMatches):

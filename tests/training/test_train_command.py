@@ -1,5 +1,6 @@
 """`fmtorch train`, as a user runs it: from another directory, with a network of one's own."""
 
+import gc
 import itertools
 import json
 import re
@@ -125,6 +126,16 @@ def test_photographs_join_the_training(root: Path, tmp_path: Path, monkeypatch: 
         trained(monkeypatch, tmp_path, *options, "planes.seed=1")
 
 
+def test_one_scene_alone_is_validated_on_its_last_images(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of eight images the last two make one pair, the first six fifteen; the others join both sides."""
+    root = draw_set(tmp_path / "Set", "a", images=8, pairs=list(itertools.combinations(range(8), 2)))
+    small = ["pruner.lc.network.channels=8", "pruner.lc.network.blocks=2", "output=out"]
+    folder = trained(monkeypatch, tmp_path, "dataset=fmbench", f"dataset.root={root}", *SHORT, *small)
+    card = (folder / "lc.md").read_text()
+    assert "| trained on | 15 pairs of 1 scenes of fmbench |" in card
+    assert "| validated on | 1 pairs of Set (" in card
+
+
 def test_oanets_files_are_trained_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Two files, of which the last is for validation, and a further one; the same command goes on."""
     root = writers.write_oanet(tmp_path / "oanet", outliers=20)
@@ -138,6 +149,7 @@ def test_oanets_files_are_trained_on(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert "| trained on | 3 pairs of 1 scenes of h5 |" in card
     trained(monkeypatch, tmp_path, *options)
     assert (folder / "lc.safetensors").read_bytes() == weights
+    gc.collect()  # Lightning's circles hold the open file
     with h5py.File(root / "b.hdf5", "a") as file:
         del file["ratios"]
     with pytest.raises(DataError, match=r"b.hdf5: 'ratios' is missing; without them give augmentation.ratio=null"):
