@@ -18,7 +18,7 @@ import torch
 
 from fmtorch.core.files import replacing
 from fmtorch.data import DataError, GivenMatches, Lens
-from fmtorch.data.files import Matrix
+from fmtorch.data.files import Array, Matrix
 from fmtorch.geometry.epipolar import symmetric_squared
 from fmtorch.io import h5, predictions
 
@@ -154,10 +154,10 @@ class Entry:
     cameras: Cameras
     x0: Matrix
     x1: Matrix
-    ratios: Matrix | None = None
-    mutuals: Matrix | None = None
+    ratios: Array | None = None
+    mutuals: Array | None = None
 
-    def arrays(self) -> Mapping[str, Matrix | None]:
+    def arrays(self) -> Mapping[str, Array | None]:
         """What a file holds of it, by the names of its groups."""
         (K0, K1), t = self.cameras.K, self.cameras.t / np.linalg.norm(self.cameras.t)
         rays0, rays1 = ((x - K[:2, 2]) / K.diagonal()[:2] for x, K in ((self.x0, K0), (self.x1, K1)))
