@@ -129,6 +129,10 @@ class PairsOptions:
         "[0.1,0.4]: the least and the greatest share of one image's pixels with depth, or of its points of a "
         "reconstruction, that the other sees; of the two shares the smaller counts. null: the paper's rule",
     )
+    layout: Literal["fmbench", "oanet"] = option(
+        "fmbench",
+        "fmbench: folders of images; oanet: HDF5 files of all matches, one a scene, by the features and the matcher",
+    )
     workers: Count | None = option(None, "short for executor.workers")
     quality: Annotated[int, Within(1, 100)] = option(
         95, "of the JPEG images that are written because they were undistorted; others are copied"
@@ -219,11 +223,13 @@ MATCH = Command(
 )  # fmt: skip
 PAIRS = Command(
     "pairs",
-    """The set has the layout of FM-Bench, for dataset=fmbench. The rule is the paper's: more than 20 SIFT matches
-within 1 px of the true epipolar lines in both images; or, with overlap, how much of the scene both images show,
-whatever features find. Which pairs are looked at, the data set says (window, candidates); docs/guides/data.md.""",
+    """The set has the layout of FM-Bench, for dataset=fmbench, or OANet's, for dataset=h5. The rule is the
+paper's: more than 20 SIFT matches within 1 px of the true epipolar lines in both images; or, with overlap, how much
+of the scene both images show, whatever features find. Which pairs are looked at, the data set says (window,
+candidates); docs/guides/data.md.""",
     PairsOptions,
-    {"dataset": "cameras", "executor": "auto"},
+    {"features": "sift", "matcher": "nearest", "dataset": "cameras", "executor": "auto"},
+    {"features": "of layout=oanet", "matcher": "of layout=oanet"},
     texts=("dataset.root",),
     interrupted="interrupted; the same command goes on from there",
 )

@@ -2,9 +2,10 @@
 
 import dataclasses
 import functools
+import hashlib
 import itertools
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +17,14 @@ from fmtorch.commands.config import job, run_command
 from fmtorch.commands.options import PAIRS, PairsOptions
 from fmtorch.core.terminal import console, progress_bars, reporter
 from fmtorch.data.construction import BLOCK, Construction, blocks
-from fmtorch.data.scenes import ScenePairs
+from fmtorch.data.pairs import HeldPairs
+from fmtorch.data.scenes import ScenePairs, image_pair
 from fmtorch.jobs.execution import Execution
 from fmtorch.jobs.runner import Factory, Local, Source, WorkerPool, in_order
 from fmtorch.presets.composition import execution_of, plain, read_fields
 from fmtorch.scenes import RenderedPairs
+from fmtorch.training.matched_pairs import MatchedPairs, front
+from fmtorch.training.oanet_pairs import write_oanet
 
 MIN_CANDIDATES_FOR_PROCESSES = 4 * BLOCK + 1  # below which processes are not worth their start
 PRELOADED = (Construction.__module__,)  # by the process that workers are forked of
@@ -34,10 +38,12 @@ def run(config: DictConfig) -> Path:
         raise ValueError("output is missing; it names the folder of the set that is made: output=KITTI")
     dataset = _load(config.dataset)
     overlap = None if fields.overlap is None else (float(fields.overlap[0]), float(fields.overlap[1]))
-    construction = Construction(dataset, fields.output, fields.count, fields.seed, fields.quality, overlap)
+    of_matches = None if fields.layout == "fmbench" else {g: plain(config[g]) for g in ("features", "matcher")}
+    settings = fields.count, fields.seed, fields.quality, overlap, of_matches
+    construction = Construction(dataset, fields.output, *settings)
     construction.begin()
     if construction.complete:
-        console.print(f"{construction.folder} is complete: dataset=fmbench dataset.root={construction.folder}")
+        console.print(f"{construction.folder} is complete: {_use(construction)}")
         return construction.folder
     asked = execution_of(config, fields.workers)
     many = dataset.candidates >= MIN_CANDIDATES_FOR_PROCESSES if asked.workers is None else asked.workers > 1
@@ -48,9 +54,12 @@ def run(config: DictConfig) -> Path:
     with progress_bars() as progress:
         kept, judged, problems = _select(construction, execution, progress)
         images = construction.used(kept)
-        bar = progress.add_task("writing images", total=len(images))
-        for _ in _each(construction, execution, "write_image", images):
-            progress.advance(bar)
+        if of_matches is None:
+            bar = progress.add_task("writing images", total=len(images))
+            for _ in _each(construction, execution, "write_image", images):
+                progress.advance(bar)
+        elif kept:
+            _write_matches(config, construction, kept, asked, progress)
     summary = {"candidates": dataset.candidates, "judged": judged, "kept": len(kept), "images": len(images)}
     if not kept:
         none = f"none of {judged} candidates passes the rule{_first(problems)}"
@@ -122,7 +131,35 @@ def _print_summary(construction: Construction, summary: dict[str, int], problems
         console.print(f"no more pass the rule than these; {construction.count} were asked for")
     if problems:
         console.print(f"{len(problems)} candidates or images cannot be used{_first(problems)}")
-    console.print(f"python -m fmtorch.eval dataset=fmbench dataset.root={construction.folder}", style="dim")
+    console.print(f"python -m fmtorch.eval {_use(construction)}", style="dim")
+
+
+def _use(construction: Construction) -> str:
+    kind = "dataset=fmbench" if construction.matches is None else "dataset=h5 dataset.layout=oanet"
+    return f"{kind} dataset.root={construction.folder}"
+
+
+def _write_matches(
+    config: DictConfig, construction: Construction, ranks: Sequence[int], execution: Execution, progress: Progress
+) -> None:
+    """Match the pairs of these candidates, which is taken up where it was interrupted, and write OANet's files."""
+    chosen = PairsOf(construction, ranks)
+    matches = MatchedPairs(
+        chosen, front(config), root=construction.work / "matched", labels="geodesic",
+        execution=execution.decided(False), build=functools.partial(front, config),
+        progress=reporter(progress, "matching"),
+    )  # fmt: skip
+    write_oanet(matches, chosen, construction.folder)
+
+
+class PairsOf(HeldPairs):
+    """The pairs of some candidates of a construction."""
+
+    def __init__(self, construction: Construction, ranks: Sequence[int]) -> None:
+        places = sorted(construction.dataset.candidate(rank) for rank in ranks)
+        self._pairs = [image_pair(construction.dataset.scenes[scene], i, j) for scene, i, j in places]
+        self.name = construction.dataset.name
+        self.digest = hashlib.blake2b(f"{construction.identity} {places}".encode(), digest_size=16).hexdigest()
 
 
 def _first(problems: list[str]) -> str:

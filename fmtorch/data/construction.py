@@ -200,8 +200,9 @@ class Construction:
 
     dataset: with the candidates. folder: of the set that is made; its name is the set's. count: how many pairs, drawn
     at random by `seed`; None: all. quality: of JPEG images that are written because they were undistorted.
-    overlap: the least and the greatest overlap of pairs (`fmtorch.data.construction`); None: the paper's rule. Raises
-    ValueError, when its `rule` is first asked for, where the data set's overlaps are not known.
+    overlap: the least and the greatest overlap of pairs (`fmtorch.data.construction`); None: the paper's rule.
+    matches: what the matches are computed by that take the place of images; None: images. Raises ValueError, when its
+    `rule` is first asked for, where the data set's overlaps are not known.
     """
 
     dataset: ScenePairs
@@ -210,6 +211,7 @@ class Construction:
     seed: int = 0
     quality: int = 95
     overlap: tuple[float, float] | None = None
+    matches: Mapping[str, Any] | None = None
 
     @functools.cached_property
     def overlaps(self) -> DepthOverlap | PointOverlap:
@@ -224,7 +226,7 @@ class Construction:
         return {
             "version": _VERSION, "opencv": ".".join(cv2.__version__.split(".")[:2]), "dataset": self.dataset.name,
             "cameras": self.dataset.cameras_digest, "rule": self.rule, "count": self.count, "seed": self.seed,
-            "quality": self.quality,
+            "quality": self.quality, **({} if self.matches is None else {"matches": dict(self.matches)}),
         }  # fmt: skip
 
     @property
@@ -234,7 +236,7 @@ class Construction:
 
     @property
     def complete(self) -> bool:
-        return (self.folder / "pairs_with_gt.txt").is_file()
+        return (self.folder / ("pairs_with_gt.txt" if self.matches is None else "summary.json")).is_file()
 
     def begin(self) -> None:
         """Make the folder, or go on with it. Raises ValueError where it holds another set, or anything else."""
@@ -298,20 +300,16 @@ class Construction:
             path.write_bytes(cv2.imencode(".jpg", colour, [cv2.IMWRITE_JPEG_QUALITY, self.quality])[1].tobytes())
 
     def finish(self, ranks: Sequence[int], summary: Mapping[str, Any]) -> None:
-        """Write the set's text files, the list of pairs last, once its images are there; the work folder goes."""
-        pairs, subsets = [], []
-        places = sorted(self.dataset.candidate(rank) for rank in ranks)
-        for number in sorted({scene for scene, _, _ in places}):
-            self._write_scene(number)
-        for number, i, j in places:
-            scene = self.dataset.scenes[number]
-            pairs.append(f"{i} {j} {_numbers(image_pair(scene, i, j).F)}\n")
-            subsets.append(f"{scene.name}/\n")
-        for name, text in (
-            ("summary.json", json.dumps(dict(summary), indent=1) + "\n"),
-            ("pairs_which_dataset.txt", "".join(subsets)),
-            ("pairs_with_gt.txt", "".join(pairs)),
-        ):
+        """Write the set's text files, the list of pairs last, once its images or matches are there, and drop `work`."""
+        files = {"summary.json": json.dumps(dict(summary), indent=1) + "\n"}
+        if self.matches is None:
+            places = sorted(self.dataset.candidate(rank) for rank in ranks)
+            for number in sorted({scene for scene, _, _ in places}):
+                self._write_scene(number)
+            pairs = [(self.dataset.scenes[scene], i, j) for scene, i, j in places]
+            files["pairs_which_dataset.txt"] = "".join(f"{scene.name}/\n" for scene, _, _ in pairs)
+            files["pairs_with_gt.txt"] = "".join(f"{i} {j} {_numbers(image_pair(s, i, j).F)}\n" for s, i, j in pairs)
+        for name, text in files.items():
             with replacing(self.folder / name) as path:
                 path.write_text(text, encoding="utf-8")
         shutil.rmtree(self.work, ignore_errors=True)

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
         opencv,
         poselib,
         superansac_cpp,
+        weighted_eight_point,
     )
     from fmtorch.estimators.external.pairwise import PairwiseEstimator, Solution
     from fmtorch.estimators.graph_cut import GraphCut
@@ -54,8 +55,8 @@ __all__ = [
     "Preselect", "Preselection", "PriorWeighted", "Prosac", "Ransac", "Refine", "Refinement", "RobustDeviations",
     "Sampler", "SaturatedGains", "Score", "Search", "Select", "SevenPoint", "Solution", "Steps", "StoppingRule",
     "SummedGains", "Uniform", "Verified", "WithinThreshold", "bucket", "cheirality", "colmap", "degensac_cpp",
-    "fastpose", "gc_ransac_cpp", "kernel", "kornia_ransac", "largest_weight", "magsac_cpp", "opencv", "part", "poselib",
-    "scores_of", "superansac_cpp", "uniforms",
+    "fastpose", "gc_ransac_cpp", "kernel", "kornia_ransac", "largest_weight", "magsac_cpp", "opencv",
+    "part", "poselib", "scores_of", "superansac_cpp", "uniforms", "weighted_eight_point",
 ]  # fmt: skip
 
 lazy_exports(__name__)

@@ -17,6 +17,7 @@ from torch import Tensor
 from fmtorch import metrics
 from fmtorch.core.types import Correspondences, Estimate, collate
 from fmtorch.data.pairs import ImagePair
+from fmtorch.io.oanet import GEODESIC, geodesic
 from fmtorch.metrics import closest_pose_error, corner_error, fundamental_pose_error, pose_error, right_of_homography
 from fmtorch.metrics.pose import PoseError
 from fmtorch.pipeline.pipeline import STAGES, Outcome
@@ -75,7 +76,30 @@ def _of_fundamental_matrices(outcomes: Sequence[Outcome], seed: int, signed: boo
         rates = metrics.inlier_rate(F, c.x0, c.x1, estimate.inliers, *sizes, mask=c.mask)
         for i, before, after in zip(matched, rates.before.tolist(), rates.after.tolist(), strict=True):
             figures[i] |= {"inlier_rate_before": before, "inlier_rate": after if outcomes[i].solved else math.nan}
-    return [each | pose._asdict() for each, pose in zip(figures, pose_errors(outcomes, signed), strict=True)]
+    poses = pose_errors(outcomes, signed)
+    return [each | p._asdict() | _by_labels(o) for each, p, o in zip(figures, poses, outcomes, strict=True)]
+
+
+def _by_labels(outcome: Outcome) -> Figures:
+    """Precision and recall of the estimator's inliers, of given matches of known cameras, zero where a pair failed.
+    Right are those of a geodesic distance below 1e-4; recall is of all given matches, before pruning."""
+    pair, c, estimate = outcome.pair, outcome.correspondences, outcome.estimate
+    if pair.matches is None or _unknown(pair) is not None:
+        return {}
+    if c is None or estimate is None:
+        return {"match_precision": 0.0, "match_recall": 0.0}
+    kept = (estimate.inliers & c.mask)[0].cpu().numpy()
+    found, total = _right(pair, c)[kept].sum(), _right(pair, pair.matches().correspondences).sum()
+    return {"match_precision": float(found / max(kept.sum(), 1)), "match_recall": float(found / max(total, 1))}
+
+
+def _right(pair: ImagePair, c: Correspondences) -> NDArray[np.bool_]:
+    """Which matches (n,) of a batch of one have a geodesic distance below OANet's threshold."""
+    K0, K1, R, t = (cast(NDArray[np.float64], value) for value in (pair.K0, pair.K1, pair.R, pair.t))
+    ends = ((x[0].double().cpu().numpy() - K[:2, 2], K) for x, K in ((c.x0, K0), (c.x1, K1)))
+    distance = geodesic(R, t, *(x / K.diagonal()[:2] for x, K in ends))
+    right: NDArray[np.bool_] = (distance < GEODESIC) & c.mask[0].cpu().numpy()
+    return right
 
 
 def _of_homographies(outcomes: Sequence[Outcome]) -> list[Figures]:

@@ -104,6 +104,16 @@ def pose_figures(rotation: Values, translation: Values, signed: bool = False) ->
     }  # fmt: skip
 
 
+def label_figures(precision: Values, recall: Values) -> dict[str, float] | None:
+    """Means over pairs, (n,), of the precision, recall and F-score of matches; None where all are NaN."""
+    known = ~(np.isnan(precision) | np.isnan(recall))
+    if not known.any():
+        return None
+    p, r = precision[known], recall[known]
+    f = 2 * p * r / np.maximum(p + r, np.finfo(np.float64).tiny)
+    return {"precision": float(p.mean()), "recall": float(r.mean()), "f_score": float(f.mean())}
+
+
 def focal_figures(errors: Values, log_ratios: Values, ok: NDArray[np.bool_]) -> dict[str, float | int | None] | None:
     """Accuracy of estimated focal lengths, of pairs (n, 2) by image; None where none was estimated.
     errors: relative, infinite where a focal length is not determined; NaN where none was to be estimated. log_ratios:
@@ -287,6 +297,7 @@ def summarize(table: pa.Table, signed: bool = False) -> dict[str, Group]:
     - homography: of the pairs whose true homography is known, which have no NSGD and no recall, see
       `homography_figures`; None where there are none.
     - pose: of the pairs whose cameras are known, see `pose_figures`; None where there are none.
+    - labels: of given matches of pairs with known cameras, see `label_figures`; None where there are none.
     - pair_types: how many pairs are in each of `PAIR_TYPES`; None where none is known.
     - focals: of the focal lengths that were estimated, see `focal_figures`; None where there are none.
     - seconds: median per pair for each stage, and ``total``.
@@ -321,6 +332,7 @@ def _group(table: pa.Table, signed: bool) -> Group:
         group[name] = _of_known(np.mean, _column(table, name)[ok])
 
     group["pose"] = pose_figures(_column(table, "rotation_error"), _column(table, "translation_error"), signed)
+    group["labels"] = label_figures(_column(table, "match_precision"), _column(table, "match_recall"))
     group["homography"] = homography_figures(_column(table, "corner_error"))
     kinds = Counter(kind for kind in table["pair_type"].to_pylist() if kind is not None)
     group["pair_types"] = {name: kinds[name] for name in PAIR_TYPES} if kinds else None

@@ -120,6 +120,18 @@ POSE = {
 }
 """What is said of poses, by whether the sign of a translation counts."""
 BINNED = " mAP: mean of recall at 5°, 10°, ..., as in papers before 2020."
+PROTOCOL = (
+    "As learned pruners are published; failures are misses. mAP: mean of recall at 5°, 10°, ..., beside mAP5° and "
+    "mAP20° of OANet (ICCV 2019) and NCMNet (CVPR 2023), whose code calls them acc_qt_auc. AUC: the exact area, beside "
+    "AUC@5°, 10°, 20° of SuperGlue and ConvMatch (AAAI 2023). P, R, F: the estimator's inliers against geodesic "
+    "distances below 1e-4, beside precision, recall and F-score of OANet and ConvMatch. weighted_eight_point stands "
+    "beside rows without RANSAC, opencv_essential beside those with it; both need cameras=known."
+)
+PROTOCOL_COLUMNS: Columns = {
+    **{f"mAP@{t}°": _percent(f"map_{t}") for t in (5, 20)},
+    **{f"AUC@{t}°": _percent(f"auc_{t}") for t in statistics.POSE_THRESHOLDS},
+    **{heading: _percent(field) for heading, field in (("P", "precision"), ("R", "recall"), ("F", "f_score"))},
+}
 HOMOGRAPHY = (
     "By the mean distance, in image 1, between the corners of image 0 as the true and the estimated homography map "
     "them; failures are misses. AUC: area under the recall curve; corner error: median."
@@ -152,8 +164,10 @@ def parts(groups: Mapping[str, Group], binned: bool = True) -> list[Part]:
     def known(field: str) -> dict[str, Group]:
         return {name: group[field] for name, group in groups.items() if group[field] is not None}
 
+    pruned = {name: groups[name]["pose"] | labels for name, labels in known("labels").items()}
     tables = [
         _poses(known("pose"), binned),
+        Part("Pruning", PROTOCOL, PROTOCOL_COLUMNS, pruned),
         Part("Homography", HOMOGRAPHY, HOMOGRAPHY_COLUMNS, known("homography")),
         Part("Focal lengths", FOCALS, FOCAL_COLUMNS, known("focals")),
         Part("Pair types", KINDS, {name: _number(name) for name in PAIR_TYPES}, known("pair_types")),

@@ -12,17 +12,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from fmtorch.geometry import epipolar
 from fmtorch.geometry.arithmetic import cofactors, determinant, matmul3, stable_sum
 from fmtorch.geometry.eight_point import finite_matches
-from fmtorch.geometry.epipolar import (
-    Matrix,
-    PerMatch,
-    Points,
-    inverse_root,
-    lines_through,
-    unit_frobenius,
-    unit_largest,
-)
+from fmtorch.geometry.epipolar import Matrix, PerMatch, Points, inverse_root, lines_through, unit_largest
 from fmtorch.geometry.homography_refine import linearise_homography
 from fmtorch.geometry.matrices import EPS, smallest_eigenvector, smallest_eigenvector_kernel, unit_kernel
 from fmtorch.geometry.normalize import normalize_points
@@ -73,7 +66,7 @@ def homography(
     s, zero = T1[..., 0, 0], torch.zeros_like(T1[..., 0, 0])
     rows = [torch.ones_like(s), zero, -T1[..., 0, 2], zero, torch.ones_like(s), -T1[..., 1, 2], zero, zero, s]
     back = torch.stack(rows, -1).reshape(T1.shape)  # a multiple of the inverse of [s, 0, tx; 0, s, ty; 0, 0, 1]
-    H = unit_frobenius(matmul3(matmul3(back, linear), T0))
+    H = epipolar.unit_frobenius(matmul3(matmul3(back, linear), T0))
     H = torch.where((side < 0)[..., None, None], -H, H)
     valid = finite & determined & regular
     return torch.where(valid[..., None, None], H, 0.0).to(x0.dtype), valid

@@ -13,18 +13,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from fmtorch.geometry import levenberg_marquardt
 from fmtorch.geometry.arithmetic import component_sum, gradient_wanted, stable_sum
 from fmtorch.geometry.epipolar import TINY
-from fmtorch.geometry.levenberg_marquardt import (
-    FIRST_DAMPING,
-    MATCH,
-    Problem,
-    Schedule,
-    Weighted,
-    in_rows,
-    minimiser,
-    robust,
-)
+from fmtorch.geometry.levenberg_marquardt import MATCH, Problem, Schedule, Weighted, in_rows, minimiser, robust
 from fmtorch.geometry.matrices import assign, assign_rows, unit_kernel
 from fmtorch.geometry.normalize import NormalizedMatches, RobustSum, fitted_by
 from fmtorch.geometry.rank2_manifold import damped_system, eliminate
@@ -320,7 +312,7 @@ def refine_homography(
         >>> bool(((refined / refined[2, 2] - H).abs() < 1e-6).all())
         True
     """
-    schedule, wanted = Schedule(iterations, FIRST_DAMPING, 0.0), gradient_wanted(x0, x1, weight)
+    schedule, wanted = Schedule(iterations, levenberg_marquardt.FIRST_DAMPING, 0.0), gradient_wanted(x0, x1, weight)
 
     def fit(models: Array, matches: Weighted, out: Array, cost: Array) -> None:
         refine_homographies(models, matches, schedule, out, cost)

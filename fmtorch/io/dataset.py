@@ -13,7 +13,7 @@ import numpy as np
 from fmtorch.data import DataError, FMBenchPairs, GivenMatches, ImagePair, ImageSource, Lens, stored_size
 from fmtorch.data.files import Matrix, given_root
 from fmtorch.data.pairs import HeldPairs
-from fmtorch.io import h5, predictions
+from fmtorch.io import h5, oanet, predictions
 from fmtorch.io.predictions import Size
 
 Sources = tuple[ImageSource, ImageSource]
@@ -238,62 +238,16 @@ def _side(file: Any, key: str) -> int:
     return max(0, int(h5.reshaped(file, key, 1)[0])) if h5.holds(file, key) else 0
 
 
-# The files that OANet trains and tests on (Zhang et al., ICCV 2019), of one entry for each pair ``0``, ``1``, ...:
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class OANetMatches:
-    """The matches of one pair; K: its calibrations."""
-
-    path: Path
-    key: str
-    K: tuple[Matrix, Matrix]
-    sizes: tuple[Size, Size]
-
-    def __call__(self) -> GivenMatches:
-        with h5.opened(self.path) as file:
-            rays = h5.numbers(file, f"xs/{self.key}", 1, None, 4)[0]
-            ratios, mutuals = (self._side(file, name, len(rays)) for name in ("ratios", "mutuals"))
-        x0, x1 = (x * K.diagonal()[:2] + K[:2, 2] for x, K in zip((rays[:, :2], rays[:, 2:]), self.K, strict=True))
-        mutual = None if mutuals is None else mutuals.astype(bool)
-        return predictions.given(x0, x1, self.sizes, (len(rays), len(rays)), ratio=ratios, mutual=mutual)
-
-    def _side(self, file: Any, name: str, count: int) -> Matrix | None:
-        if not h5.holds(file, name):
-            return None
-        values = h5.numbers(file, f"{name}/{self.key}").reshape(-1)
-        if len(values) != count:
-            lengths = f"{len(values)} entries, but {f'xs/{self.key}'!r} has {count} matches"
-            raise DataError(f"{self.path}: {f'{name}/{self.key}'!r} has {lengths}")
-        return values
-
-
-def _oanet_keys(file: Any) -> list[str]:
-    if not h5.holds(file, "xs"):
-        raise DataError(f"{file.filename}: 'xs' is missing; it is no file of OANet's layout")
-    return sorted(h5.keys(file["xs"]), key=lambda key: (len(key), key))
-
-
 def _oanet_pair(file: Any, path: Path, key: str, _: Sources) -> Stored:
-    K = _calibration(file, key, 1), _calibration(file, key, 2)
-    R, t = h5.reshaped(file, f"Rs/{key}", 3, 3), h5.reshaped(file, f"ts/{key}", 3)
-    sizes = predictions.size_by_centre(K[0]), predictions.size_by_centre(K[1])
-    return K, R, t, OANetMatches(path, key, K, sizes)
-
-
-def _calibration(file: Any, key: str, which: int) -> Matrix:
-    cx, cy = (h5.reshaped(file, f"{name}{which}s/{key}", 1)[0] for name in ("cx", "cy"))
-    fx, fy = h5.reshaped(file, f"f{which}s/{key}", 2)
-    if fx == 0 or fy == 0:
-        raise DataError(f"{file.filename}: 'f{which}s/{key}' holds a focal length of zero")
-    return Lens(fx, fy, cx, cy).K
+    known = oanet.cameras(file, key)
+    return known.K, known.R, known.t, oanet.OANetMatches(path, key, known)
 
 
 CORNER = 0.5  # where glue-factory puts the centre of the first pixel
 WITH_GEOMETRY: Mapping[str, Callable[[Path, Path | None], Iterator[ImagePair]]] = {
     "ransac_tutorial": tutorial_pairs,
     "posebench": functools.partial(_pairs, keys_of=h5.keys, read=_posebench_pair),
-    "oanet": functools.partial(_pairs, keys_of=_oanet_keys, read=_oanet_pair),
+    "oanet": functools.partial(_pairs, keys_of=oanet.keys, read=_oanet_pair),
 }
 WITHOUT_GEOMETRY = {"hloc": 0.0, "glue_factory": CORNER, "vismatch": 0.0}
 """Layouts that hold matches alone, and where they put the centre of the first pixel."""

@@ -1,6 +1,7 @@
 """HDF5 files of others, read with errors that name file and key."""
 
 import contextlib
+import functools
 import hashlib
 import math
 from collections.abc import Iterator, Sequence
@@ -17,6 +18,7 @@ _BLOCKS, _BLOCK = 4096, 1 << 16  # of larger files: how many blocks of how many 
 SUFFIXES = (".h5", ".hdf5")
 
 
+@functools.cache
 def imported() -> Any:
     """h5py. Raises ImportError naming the extra where it is not installed."""
     return lazy.imported("h5py", "h5py is not installed; pip install 'fmtorch[h5]' brings it")
@@ -97,11 +99,26 @@ def _plain_array(file: Any, key: str) -> Array | None:
         entry = h5py.h5d.open(file.id, key.encode())
     except (OSError, RuntimeError, KeyError, TypeError, ValueError):
         return None
-    if entry.dtype.kind not in "fiub" or entry.shape is None:
+    dtype, shape = entry.dtype, entry.shape
+    if dtype.kind not in "fiub" or shape is None:
         return None
-    values = np.empty(entry.shape, entry.dtype)
-    entry.read(h5py.h5s.ALL, h5py.h5s.ALL, values)
+    values = np.empty(shape, dtype)
+    entry.read(h5py.h5s.ALL, h5py.h5s.ALL, values, _memory_type(dtype))
     return values
+
+
+@functools.cache
+def _memory_type(dtype: Any) -> Any:
+    """HDF5's type of a NumPy type, which takes as long to make as a small array to read."""
+    return imported().h5t.py_create(dtype)
+
+
+def shape(file: Any, key: str) -> tuple[int, ...]:
+    """Of the array under a key, which is not read. Raises DataError where there is none."""
+    try:
+        return tuple(imported().h5d.open(file.id, key.encode()).shape)
+    except (OSError, RuntimeError, KeyError, TypeError, ValueError) as error:
+        raise DataError(f"{_where(file, key)} cannot be read ({_first_line(error)})") from error
 
 
 def numbers(file: Any, key: str, *shape: int | None) -> Matrix:

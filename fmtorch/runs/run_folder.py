@@ -64,6 +64,8 @@ class PairRow:
     lens_suggested: float | None = None  # lambda of both lenses where matches contradict pinholes
     H: Sequence[float] | None = None  # row by row, x1 ~ H x0 in pixels, unit Frobenius norm
     corner_error: float | None = None  # px in image 1, of the corners of image 0; infinite where the pair failed
+    match_precision: float | None = None  # of given matches of known cameras, by OANet's geodesic labels: the share of
+    match_recall: float | None = None  # the estimator's inliers that are right, and of all right ones those it found
 
     def __post_init__(self) -> None:
         if self.corner_error is not None:
@@ -198,7 +200,7 @@ def content_digest(data: bytes) -> str:
     return hashlib.blake2b(data, digest_size=8).hexdigest()
 
 
-FORMAT = 1  # of the folder; to be raised when the schema changes, or what the identity tells
+FORMAT = 2  # of the folder; to be raised when the schema changes, or what the identity tells
 _LISTINGS = 20  # at most, until parts are those that were listed
 
 

@@ -17,6 +17,7 @@ away are masked; `LabelledMatches.compact` takes them out.
 import dataclasses
 import math
 from collections.abc import Sequence
+from typing import Literal
 
 import numpy as np
 import torch
@@ -28,6 +29,7 @@ from fmtorch.core import Correspondences, records, types
 from fmtorch.data.cameras import line_distance
 from fmtorch.data.pairs import DepthDataset, ImagePair, ImageSource, PairDataset
 from fmtorch.geometry.epipolar import unit_frobenius
+from fmtorch.io import oanet
 from fmtorch.jit.random import Stream, bits, uniform
 from fmtorch.training.options import AugmentationOptions, Range
 
@@ -37,6 +39,8 @@ OUTLIER_PX = 6.0  # smallest error of an outlier, pixels
 EDGE_PX = 1.0  # a keypoint on an edge of depth may belong to what is so many pixels beside it
 VERSION = 1  # of these rules, part of a store's identity
 
+Rule = Literal["pixels", "geodesic"]
+"""What labels go by: errors in pixels, or OANet's geodesic distance in calibrated coordinates."""
 Points = NDArray[np.float64]
 Labels = NDArray[np.int8]
 _AROUND = EDGE_PX * np.array([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
@@ -106,11 +110,16 @@ def _padded(label: Tensor, n: int) -> Tensor:
     return torch.nn.functional.pad(label, (0, max(n - label.shape[1], 0)), value=IGNORED)[:, :n]
 
 
-def label(dataset: PairDataset, pair: ImagePair, x0: Points, x1: Points) -> Labels:
+def label(dataset: PairDataset, pair: ImagePair, x0: Points, x1: Points, rule: Rule = "pixels") -> Labels:
     """Labels (n,) of the matches x0, x1 (n, 2) of a pair: by depth where the data set offers it and the pair's cameras
-    are known, else by the epipolar lines.
+    are known, else by the epipolar lines. Raises ValueError for geodesic labels where the cameras are unknown.
     """
     cameras = (pair.K0, pair.K1, pair.R, pair.t)
+    if rule == "geodesic":
+        if any(value is None for value in cameras):
+            raise ValueError(f"labels=geodesic needs K, R and t, which pair {pair.identity} does not have")
+        K0, K1, R, t = (np.asarray(value) for value in cameras)
+        return by_geodesic(oanet.geodesic(R, t, *((x - K[:2, 2]) / K.diagonal()[:2] for x, K in ((x0, K0), (x1, K1)))))
     line = line_distance(pair.F, x0, x1)
     if not isinstance(dataset, DepthDataset) or any(value is None for value in cameras):
         return by_line(line)
@@ -123,6 +132,11 @@ def label(dataset: PairDataset, pair: ImagePair, x0: Points, x1: Points) -> Labe
 def by_line(line: NDArray[np.float64]) -> Labels:
     """Labels of matches whose larger distance (n,) to the epipolar lines, or other error, is given in pixels."""
     return np.select([line <= INLIER_PX, line > OUTLIER_PX], [INLIER, OUTLIER], IGNORED).astype(np.int8)
+
+
+def by_geodesic(distance: NDArray[np.float64]) -> Labels:
+    """Labels by OANet's geodesic distance (n,): no match is ignored."""
+    return (distance < oanet.GEODESIC).astype(np.int8)
 
 
 def by_transfer(forward: NDArray[np.float64], backward: NDArray[np.float64], line: NDArray[np.float64]) -> Labels:

@@ -9,13 +9,17 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 import torch
+from omegaconf import DictConfig
 
+from fmtorch import presets
 from fmtorch.core import Correspondences, files, settings
 from fmtorch.data.pairs import DepthDataset, ImagePair, PairDataset
+from fmtorch.io import oanet
 from fmtorch.jobs.execution import Execution, use_one_thread
 from fmtorch.jobs.runner import Factory, Local, Source, TaskRunner, WorkerPool
 from fmtorch.pipeline.pipeline import Outcome, Pipeline, load_pipeline
-from fmtorch.runs import CachedFeatures, identity_digest
+from fmtorch.presets import plain
+from fmtorch.runs import CachedFeatures, cached, identity_digest
 from fmtorch.runs.fingerprint import configuration, environment
 from fmtorch.training import labelled
 from fmtorch.training.stored_matches import FORMAT, Shard, ShardError, StoredMatches, write_shard
@@ -51,6 +55,7 @@ class MatchedPairs(StoredMatches):
         augmentation, seed: as of `StoredMatches`.
         execution: other workers than these threads. build: makes the pipeline in other processes, where it is given as
             an object; pickled, as is the data set.
+        labels: pixels: by depth or the epipolar lines; geodesic: OANet's, for which the cameras must be known.
 
     Raises ValueError for an unknown pipeline, for one whose stages do not say what defines their results, for an empty
     data set, for `most` below 1, and where every pair fails.
@@ -69,6 +74,7 @@ class MatchedPairs(StoredMatches):
         root: str | Path | None = None, workers: int | None = None, progress: Progress | None = None,
         most: int = MAX_MATCHES, augmentation: labelled.Augmentation | None = None, seed: int = 0,
         execution: Execution | None = None, build: Callable[[], Pipeline] | None = None,
+        labels: labelled.Rule = "pixels",
     ) -> None:  # fmt: skip
         if most < 1:
             raise ValueError(f"most is {most}; at least 1 match of a pair must be kept")
@@ -86,7 +92,7 @@ class MatchedPairs(StoredMatches):
         if build is None and not execution.shared:
             raise ValueError("other processes need to make the pipeline: give its name, or `build`")
         home = Path(root).expanduser() if root is not None else files.cache_dir() / "matched"
-        identity = _identity(dataset, stages, most)
+        identity = _identity(dataset, stages, most, labels)
         folder = home / f"{dataset.name}-{identity_digest(identity)[:16]}"
         settings.claim(folder / "about.json", identity, "matches", "delete the folder", alone=False)
         pairs = [dataset[i] for i in range(len(dataset))]
@@ -96,13 +102,13 @@ class MatchedPairs(StoredMatches):
         done, total = len(pairs) - sum(len(job.pairs) for job in missing), len(pairs)
         report = progress or (lambda done, total: None)
         report(done, total)
-        for count in compute_shards(dataset, stages, build, missing, most=most, execution=execution):
+        for count in compute_shards(dataset, stages, build, missing, rules=Rules(most, labels), execution=execution):
             done += count
             report(done, total)
         super().__init__(folder, augmentation=augmentation, seed=seed)
 
 
-def _identity(dataset: PairDataset, stages: Pipeline, most: int) -> dict[str, Any]:
+def _identity(dataset: PairDataset, stages: Pipeline, most: int, rule: labelled.Rule) -> dict[str, Any]:
     extractor: Any = stages.extractor
     extractor = extractor.extractor if isinstance(extractor, CachedFeatures) else extractor
     families = [stages.families] if stages.families else []
@@ -110,12 +116,27 @@ def _identity(dataset: PairDataset, stages: Pipeline, most: int) -> dict[str, An
         parts = configuration([extractor, stages.matcher, stages.pruners, *families])
     except TypeError as error:
         raise ValueError(f"the matches of this pipeline cannot be kept: {error}") from error
-    rules = [labelled.INLIER_PX, labelled.OUTLIER_PX, labelled.EDGE_PX]
+    rules: list[Any] = ["depth" if isinstance(dataset, DepthDataset) else "lines"]
+    rules += [labelled.INLIER_PX, labelled.OUTLIER_PX, labelled.EDGE_PX]
+    rules = rules if rule == "pixels" else [rule, oanet.GEODESIC]
     return {
         "format": FORMAT, "dataset": [dataset.name, dataset.digest], "most": most,
-        "labels": [labelled.VERSION, "depth" if isinstance(dataset, DepthDataset) else "lines", *rules],
+        "labels": [labelled.VERSION, *rules],
         "stages": parts, "environment": environment(),
     }  # fmt: skip
+
+
+def front(config: DictConfig) -> Pipeline:
+    """The stages before estimation that a config names: features, matcher, and the pruners `before`, if any."""
+    features = presets.instantiate(plain(config.features), "features")
+    extractor = cached(features, config.get("cache"), config.get("cache_limit"))
+    before = {str(name): presets.build("pruner", str(name)) for name in config.get("before") or ()}
+    matcher: Any = presets.instantiate(plain(config.matcher), "matcher")
+    return Pipeline(extractor, matcher, before, _no_estimator)
+
+
+def _no_estimator(c: Any, seed: int = 0) -> Any:
+    raise NotImplementedError("the stages before estimation only")
 
 
 def _sound(path: Path, pairs: int) -> bool:
@@ -143,14 +164,20 @@ def partition(pairs: Sequence[ImagePair]) -> list[list[int]]:
     return shards
 
 
+class Rules(NamedTuple):
+    """How many matches are kept of a pair, the best by ratio, and what their labels go by."""
+
+    most: int
+    labels: labelled.Rule
+
+
 class Matching(NamedTuple):
     """What pairs are matched and labelled by.
-    dataset: where they are from. pipeline: its stages before estimation are run. most: matches kept of a pair, the best
-    by ratio."""
+    dataset: where they are from. pipeline: its stages before estimation are run."""
 
     dataset: PairDataset
     pipeline: Pipeline
-    most: int
+    rules: Rules
 
 
 class Job(NamedTuple):
@@ -160,30 +187,30 @@ class Job(NamedTuple):
     pairs: list[ImagePair]
 
 
-def matching(dataset: PairDataset, build: Callable[[], Pipeline], most: int, images: int = _IMAGES) -> Matching:
+def matching(dataset: PairDataset, build: Callable[[], Pipeline], rules: Rules, images: int = _IMAGES) -> Matching:
     """The matching by the stages of a pipeline that is built, with the features of so many images kept."""
     stages = build()
     pipeline = Pipeline(
         stages.extractor, stages.matcher, stages.pruners, stages.estimator,
         device=stages.device, memory=images, families=stages.families,
     )  # fmt: skip
-    return Matching(dataset, pipeline, most)
+    return Matching(dataset, pipeline, rules)
 
 
 def compute_shards(
-    dataset: PairDataset, stages: Pipeline, build: Callable[[], Pipeline] | None, jobs: Sequence[Job], *, most: int,
+    dataset: PairDataset, stages: Pipeline, build: Callable[[], Pipeline] | None, jobs: Sequence[Job], *, rules: Rules,
     execution: Execution,
 ) -> Iterator[int]:  # fmt: skip
     """Write each job's shard; yields the number of its pairs when it is written.
     stages: the pipeline whose stages before estimation are run by threads; build: makes it in other processes, pickled.
-    most: matches kept of a pair. execution: by which workers, each with one thread of the libraries."""
+    execution: by which workers, each with one thread of the libraries."""
     pool = WorkerPool(execution, PRELOADED)
     source: Source[Matching]
     if execution.shared:
-        source = Local(matching(dataset, lambda: stages, most, _IMAGES * pool.size))
+        source = Local(matching(dataset, lambda: stages, rules, _IMAGES * pool.size))
     else:
         assert build is not None
-        source = Factory(functools.partial(matching, dataset, build, most))
+        source = Factory(functools.partial(matching, dataset, build, rules))
     runner = TaskRunner(pool, source, matched_rows, lambda job, rows: write_shard(job.path, rows))
     threads = torch.get_num_threads(), cv2.getNumThreads()
     use_one_thread()
@@ -198,10 +225,10 @@ def compute_shards(
 
 def matched_rows(how: Matching, job: Job) -> list[dict[str, Any]]:
     """The rows of a shard."""
-    return [_row(how.dataset, how.pipeline.correspondences([pair])[0], how.most) for pair in job.pairs]
+    return [_row(how.dataset, how.pipeline.correspondences([pair])[0], how.rules) for pair in job.pairs]
 
 
-def _row(dataset: PairDataset, outcome: Outcome, most: int) -> dict[str, Any]:
+def _row(dataset: PairDataset, outcome: Outcome, rules: Rules) -> dict[str, Any]:
     """A pair as a row of a shard; a pair that fails has a reason and no matches."""
     pair, c = outcome.pair, outcome.correspondences
     row: dict[str, Any] = {
@@ -210,11 +237,11 @@ def _row(dataset: PairDataset, outcome: Outcome, most: int) -> dict[str, Any]:
     }  # fmt: skip
     if c is None:
         return row
-    c = _best(c.detach().to("cpu").compact(), most)
+    c = _best(c.detach().to("cpu").compact(), rules.most)
     if not len(c.x0[0]):
         return {**row, "reason": "no matches are left"}
     x0, x1 = (x[0].to(torch.float64).numpy() for x in (c.x0.to(torch.float32), c.x1.to(torch.float32)))
-    labels = labelled.label(dataset, pair, x0, x1)
+    labels = labelled.label(dataset, pair, x0, x1, rules.labels)
     norm = np.linalg.norm(pair.F) or 1.0  # zero where the pair determines none
     row |= {
         "matches": len(labels), "inliers": int((labels == 1).sum()), "outliers": int((labels == 0).sum()),

@@ -7,7 +7,7 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from fmtorch.core.options import CACHE, CACHE_LIMIT, Cache, Count, Gigabytes, Seed, Within, option
 
@@ -144,7 +144,7 @@ class ValidationOptions:
     scenes: Count | None = option(
         None, "the last training scenes of each family, not trained on; null: 4, a quarter where it has fewer than 16"
     )
-    roots: list[str] = option([], "further folders in the layout of fmbench")
+    roots: list[str] = option([], "further sets: folders in the layout of fmbench, files of OANet's or folders of some")
     pairs: Count = option(25, "of each family at most")
     ratio: float = option(0.8, "threshold of the ratio test")
     uses: Mapping[str, Any] = option(
@@ -167,6 +167,9 @@ class TrainOptions:
     planes: Planes = option(Planes(), "photographs to train on too, as planes")
     before: list[str] = option(
         ["one_to_one"], "pruners before the trained one, by name; the ratio test is part of the augmentation"
+    )
+    labels: Literal["pixels", "geodesic"] = option(
+        "pixels", "pixels: by depth or the epipolar lines; geodesic: OANet's distance below 1e-4, of known cameras"
     )
     limit: Count | None = option(None, "train on so many pairs of each family")
     seed: Seed = option(0, "of the first weights, of batches and augmentation")

@@ -38,19 +38,21 @@ from fmtorch.core.options import expect_options
 from fmtorch.core.version import __version__
 from fmtorch.data import ImagePair, PairDataset, construction, read_image, subset
 from fmtorch.evaluation.run import select
-from fmtorch.pipeline import pictures, pipeline
+from fmtorch.io import H5Pairs, h5
+from fmtorch.pipeline import pictures
 from fmtorch.presets.composition import execution_of, plain, read_fields
 from fmtorch.pruning.networks.learned import predict
-from fmtorch.runs import cached, identity_digest
+from fmtorch.runs import identity_digest
 from fmtorch.scenes import RenderedPairs
 from fmtorch.training.export import Evaluation, Result, Use, Validation, quiet, write_result
 from fmtorch.training.labelled import Augmentation, LabelledMatches, keep_ratio
-from fmtorch.training.matched_pairs import MatchedPairs
+from fmtorch.training.matched_pairs import MatchedPairs, front
+from fmtorch.training.oanet_pairs import NamedPairs, OANetPairs
 from fmtorch.training.objective import Objective
 from fmtorch.training.options import Optimisation as Optimisation
 from fmtorch.training.options import TrainOptions
 from fmtorch.training.planes import Photograph, PlanePairs, list_photographs
-from fmtorch.training.stored_matches import StoredMatches, last_scenes, training_batches
+from fmtorch.training.stored_matches import QUARTER, StoredMatches, last_scenes, training_batches
 
 CHECKPOINTS, BEST, LOGS = "checkpoints", "best.ckpt", "logs"
 SMALLER_IS_BETTER = ("log_loss", "calibration_error")  # figures of validation; of the others larger is
@@ -297,7 +299,8 @@ def run(config: DictConfig, name: str) -> Path:
         terminal.console.print(f"{about}; {folder}", soft_wrap=True)
         if len(matches.training) < FEW:
             terminal.console.print(f"so few pairs show that it runs, and teach little; {MORE}", soft_wrap=True)
-    shown = matches.validation[:: max(1, len(matches.validation) // PICTURES)][:PICTURES]
+    pictured = [(p, m) for p, m in matches.validation if p.image0.path.is_file() and p.image1.path.is_file()]
+    shown = pictured[:: max(1, len(pictured) // PICTURES)][:PICTURES]
     batches = functools.partial(training_batches, matches.training, config.batch, config.seed, workers=config.loaders)
     how: dict[str, Any] = {name: getattr(options.validation, name) for name in ("every", "patience", "monitor")}
     how |= {"checkpoint_every": options.checkpoint_every, "callbacks": (ValidationPictures(shown),)}
@@ -365,30 +368,33 @@ def labelled_matches(config: DictConfig, options: TrainOptions, progress: Progre
     photographs, given, validated = list[Photograph](), config.photographs, options.validation
     if options.planes.photographs is not None:
         photographs = list_photographs(options.planes.photographs, given.sources, given.excluded)
-    dataset = _dataset(config, progress)
-    chosen, held_out = _split(dataset, validated.scenes)
+    dataset = _dataset(config, options, progress)
+    by_image = not validated.roots and not isinstance(dataset, NamedPairs)
+    chosen, held_out = _split(dataset, validated.scenes, by_image)
     chosen = _limited(dataset, chosen, config.limit)
     if not chosen:
         raise ValueError("no pairs to train on: the scenes are for validation; give a smaller validation.scenes")
-    front = _front(config)
 
     def matched(source: PairDataset, indices: Sequence[int], what: str) -> StoredMatches:
+        if isinstance(source, NamedPairs):
+            return source.matches.select(indices)
+        labels = "pixels" if isinstance(source, PlanePairs) else options.labels
         return MatchedPairs(
-            subset(source, indices) if len(indices) < len(source) else source, front,
-            execution=execution_of(config, config.workers).decided(False), build=functools.partial(_front, config),
-            progress=terminal.reporter(progress, f"matches {what}"),
+            subset(source, indices) if len(indices) < len(source) else source, front(config),
+            execution=execution_of(config, config.workers).decided(False), build=functools.partial(front, config),
+            progress=terminal.reporter(progress, f"matches {what}"), labels=labels,
         )  # fmt: skip
 
     training = matched(dataset, chosen, "to train on")
-    digests, validation = [training.folder.name], list[tuple[ImagePair, LabelledMatches]]()
+    digests, validation = [training.digest], list[tuple[ImagePair, LabelledMatches]]()
     sets = [(dataset, held_out, "to validate on")]
     for root in validated.roots:
-        real = data.load("fmbench", root=root)
+        real = _validation_set(root, config, options)
         sets.append((real, list(range(len(real))), f"of {root}"))
     for source, indices, what in sets:
         if selected := _limited(source, indices, validated.pairs):
             stored = matched(source, selected, what)
-            digests.append(stored.folder.name)
+            digests.append(stored.digest)
             pairs = {source[i].key: source[i] for i in selected}
             for i, about in enumerate(stored.pairs):
                 validation.append((pairs[about["key"]], keep_ratio(stored.stored(i), validated.ratio).compact()))
@@ -398,54 +404,73 @@ def labelled_matches(config: DictConfig, options: TrainOptions, progress: Progre
     description = {
         "training": f"{len(training)} pairs of {_scenes(training)} scenes of {dataset.name}",
         "validation": ", ".join(f"{count} pairs of {family}" for family, count in families.items())
-        + f" (of {dataset.name} the last scenes of each family, which may share photographs with the training scenes)",
+        + f" (of {dataset.name} the last scenes of each family, which may share photographs with the training scenes; "
+        "of one scene the last images)",
     }
     if photographs:
         workers, report = config.workers or os.cpu_count() or 1, terminal.reporter(progress, "views of photographs")
         drawn = PlanePairs(photographs, options.planes.limits, options.planes.seed, workers=workers, progress=report)
         planes = matched(drawn, range(len(drawn)), "of photographs")
         planes = planes.select(i for i, about in enumerate(planes.pairs) if about["inliers"] > construction.ENOUGH)
-        digests.append(planes.folder.name)
+        digests.append(planes.digest)
         description["training"] += f" and {len(planes)} pairs of {_scenes(planes)} photographs seen as planes"
         training = training.joined(planes)
     augmented = training.augmented(Augmentation(**dataclasses.asdict(options.augmentation)), config.seed)
     return Matches(augmented, validation, hashlib.sha256(" ".join(digests).encode()).hexdigest(), description)
 
 
-def _dataset(config: DictConfig, progress: Progress) -> PairDataset:
+def _dataset(config: DictConfig, options: TrainOptions, progress: Progress) -> PairDataset:
     """The data set to train on; of the embedded one always the training side."""
-    options = plain(config.dataset)
-    if presets.target_of(options, "dataset") is RenderedPairs:
-        options["split"] = "train"
-    return data.build(options, terminal.reporter(progress, "drawing scenes"))
+    chosen = plain(config.dataset)
+    target = presets.target_of(chosen, "dataset")
+    if target is H5Pairs and chosen["layout"] == "oanet":
+        return _oanet_pairs(
+            data.files.given_root(chosen["root"], "h5", "the file, or the folder of the files"), config, options
+        )
+    if target is RenderedPairs:
+        chosen["split"] = "train"
+    return data.build(chosen, terminal.reporter(progress, "drawing scenes"))
 
 
-def _split(dataset: PairDataset, last: int | None) -> tuple[list[int], list[int]]:
-    """Indices of the pairs to train on, and of those in the last scenes of each family."""
+def _validation_set(root: str, config: DictConfig, options: TrainOptions) -> PairDataset:
+    path = Path(root).expanduser()
+    if path.suffix in h5.SUFFIXES or any(file.suffix in h5.SUFFIXES for file in path.glob("*")):
+        return _oanet_pairs(path, config, options)
+    return data.load("fmbench", root=root)
+
+
+def _oanet_pairs(root: Path, config: DictConfig, options: TrainOptions) -> NamedPairs:
+    """The pairs of OANet's files, without reading them. Raises DataError where they lack ratios that are asked for."""
+    before: list[Any] = [presets.build("pruner", str(name)) for name in config.before]
+    pairs = OANetPairs(root, labels=options.labels, before=before)
+    if options.augmentation.ratio is not None or options.validation.ratio < 1:
+        pairs.expect_ratios("without them give augmentation.ratio=null validation.ratio=1")
+    return NamedPairs(pairs)
+
+
+def _split(dataset: PairDataset, last: int | None, by_image: bool) -> tuple[list[int], list[int]]:
+    """Indices of the pairs to train on, and of those in the last scenes of each family.
+    by_image: where each family has one scene, of those among its last quarter of images; pairs that join images of both
+    sides are in neither."""
     pairs = [dataset[i] for i in range(len(dataset))]
-    held = last_scenes(((pair.family, pair.scene) for pair in pairs), last)
-    sides: tuple[list[int], list[int]] = ([], [])
-    for i, pair in enumerate(pairs):
-        sides[(pair.family, pair.scene) in held].append(i)
-    return sides
+    scenes = [(pair.family, pair.scene) for pair in pairs]
+    held = last_scenes(scenes, last)
+    if held or not by_image:
+        sides = [2 * (scene in held) for scene in scenes]
+    else:
+        images = dict[tuple[str, str], set[str]]()
+        ends = [(pair.image0.identity, pair.image1.identity) for pair in pairs]
+        for scene, own in zip(scenes, ends, strict=True):
+            images.setdefault(scene, set()).update(own)
+        late = {name for names in images.values() for name in sorted(names)[-max(1, len(names) // QUARTER) :]}
+        sides = [sum(name in late for name in own) for own in ends]
+    return [i for i, n in enumerate(sides) if n == 0], [i for i, n in enumerate(sides) if n == 2]
 
 
 def _limited(dataset: PairDataset, indices: list[int], limit: int | None) -> list[int]:
     """At most `limit` pairs of each family, chosen by their keys."""
     index = {dataset[i].key: i for i in indices}
     return sorted(index[pair.key] for pair in select([dataset[i] for i in indices], limit))
-
-
-def _front(config: DictConfig) -> pipeline.Pipeline:
-    """Features, matcher and the pruners before the trained one."""
-    extractor = cached(presets.instantiate(plain(config.features), "features"), config.cache, config.cache_limit)
-    before = {str(name): presets.build("pruner", str(name)) for name in config.before}
-    matcher: Any = presets.instantiate(plain(config.matcher), "matcher")
-    return pipeline.Pipeline(extractor, matcher, before, _no_estimator)
-
-
-def _no_estimator(c: Any, seed: int = 0) -> Any:
-    raise NotImplementedError("the stages before estimation only")
 
 
 def _scenes(matches: StoredMatches) -> int:

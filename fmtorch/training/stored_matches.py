@@ -142,11 +142,15 @@ class StoredMatches(Dataset[LabelledMatches]):
 
     def __init__(self, folder: str | Path, *, augmentation: Augmentation | None = None, seed: int = 0) -> None:
         self.folder = Path(folder)
-        self.augmentation, self.seed, self.epoch = augmentation, seed, 0
-        self._paths = sorted(self.folder.glob(PATTERN))
-        self._open: dict[int, Shard] = {}
-        if not self._paths:
+        paths = sorted(self.folder.glob(PATTERN))
+        if not paths:
             raise ValueError(f"{folder} holds no labelled matches ({PATTERN}); MatchedPairs computes them")
+        self._read_index(paths, augmentation, seed)
+
+    def _read_index(self, paths: Sequence[Path], augmentation: Augmentation | None, seed: int) -> None:
+        self.augmentation, self.seed, self.epoch = augmentation, seed, 0
+        self._paths = list(paths)
+        self._open: dict[int, Shard] = {}
         self.pairs: list[dict[str, Any]] = []
         self.failures: list[tuple[str, str]] = []
         self._rows: list[tuple[int, int]] = []
@@ -160,6 +164,11 @@ class StoredMatches(Dataset[LabelledMatches]):
                     self._rows.append((number, row))
                     self.pairs.append(about)
         self._tell_failures()
+
+    @property
+    def digest(self) -> str:
+        """Of all that defines the matches."""
+        return self.folder.name
 
     def __len__(self) -> int:
         return len(self._rows)
@@ -222,8 +231,11 @@ class StoredMatches(Dataset[LabelledMatches]):
 
     def _shard(self, number: int) -> Shard:
         if number not in self._open:
-            self._open[number] = Shard(self._paths[number])
+            self._open[number] = self._reader(self._paths[number])
         return self._open[number]
+
+    def _reader(self, path: Path) -> Shard:
+        return Shard(path)
 
     def _tell_failures(self) -> None:
         if not self.failures:

@@ -9,12 +9,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import torch
 
 from fmtorch import presets
 from fmtorch.data import DataError, ImageSource, construction, load, read_image, to_grey
 from fmtorch.data import construction as rule
 from fmtorch.data.scenes import SPLITS, AllPairs, DepthScenePairs, chosen, drawn, following, incidence, sharing_points
+from fmtorch.pipeline import Pipeline, load_pipeline
 from fmtorch.scenes import Plan, RenderedPairs
+from fmtorch.training import OANetPairs
 from tests.conftest import shared_path
 from tests.data.native import write_colmap, write_image, write_kitti
 from tests.helpers import apart, call_command
@@ -155,6 +158,42 @@ def test_a_draw_is_the_same_however_it_is_interrupted(scenes, tmp_path, monkeypa
     assert [p.identity for p in load("fmbench", root=tmp_path / "Made")] == [
         f"Made/{'ab'[scene]}/{i}-{j}" for scene, i, j in places
     ]
+
+
+def test_matches_take_the_place_of_images_in_oanets_layout(scenes, tmp_path, monkeypatch):
+    """Interrupted before they are written, taken up from the matches that are kept, and read back equal."""
+    words = "count=null", "layout=oanet", "workers=1", "features.max_features=500"
+
+    def interrupted(*given: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr("fmtorch.io.oanet.write", interrupted)
+        with pytest.raises(SystemExit):
+            run(tmp_path, patched, *words)
+    assert not (tmp_path / "Made/summary.json").exists()
+    dataset = load("cameras", root=scenes)
+    with monkeypatch.context() as patched:
+        patched.setattr("fmtorch.training.matched_pairs.write_shard", interrupted)
+        run(tmp_path, patched, *words)
+    assert sorted(path.name for path in (tmp_path / "Made").iterdir()) == [
+        "a.hdf5", "b.hdf5", "pairs.json", "summary.json",
+    ]  # fmt: skip
+    written = load("h5", root=tmp_path / "Made", layout="oanet")
+    loaded = load_pipeline("sift_ratio", overrides=["features.max_features=500"])
+    stages = Pipeline(loaded.extractor, loaded.matcher, {}, loaded.estimator)
+    source = {pair.identity: pair for pair in dataset}
+    names = [f"Set/{scene}/{pair}" for scene in "ab" for pair in ("0-1", "1-2")]
+    for pair, outcome in zip(written, stages.correspondences([source[name] for name in names]), strict=True):
+        c, own = pair.matches().correspondences, outcome.correspondences
+        assert apart(pair.F, outcome.pair.F) < 1e-6
+        for name in ("x0", "x1", "ratio"):
+            torch.testing.assert_close(getattr(c, name), getattr(own, name), rtol=1e-6, atol=2e-4)
+        assert torch.equal(c.mutual, own.mutual)
+        assert torch.equal(c.size0, own.size0)
+        np.testing.assert_allclose(pair.t, outcome.pair.t / np.linalg.norm(outcome.pair.t), atol=1e-6)
+    labels = {int(n) for i in range(2) for n in OANetPairs(tmp_path / "Made")[i].label.unique()}
+    assert labels == {0, 1}
 
 
 PLAN = Plan(scenes=1, shots=4, pairs=4, scale=0.15)

@@ -47,6 +47,7 @@ ELSEWHERE = {
     r"dataset=(tum|kitti|colmap|bundler|fmbench dataset\.root=KITTI)": "tests/data runs these on data of their layout",
     r"pipeline=vismatch|(dataset=|runs/)pair_list": "tests/matching/test_vismatch.py runs a stand-in on lists of pairs",
     r"dataset=hpatches": "tests/evaluation/test_poses.py runs these on sequences of its own",
+    r"train .*layout=oanet": "tests/training/test_train_command.py trains on such files",
     r"'overlap=|HARD/": "tests/data/test_construction.py, tests/scripts/test_benchmark_runner.py run these",
     r"benchmark known_models": "needs the images of a scene; tests/scripts/test_benchmark_planes.py has some",
     r"--config-dir my_conf features=": "tests/docs/test_own_parts.py runs this page",

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import fmtorch
-from fmtorch import find_essential, geometry, presets
+from fmtorch import find_essential, geometry, metrics, presets
 from fmtorch.core import Correspondences, collate
 from fmtorch.estimators import PairwiseEstimator, Solution
 from fmtorch.estimators.external.pairwise import Pair
@@ -236,3 +236,48 @@ def test_fastpose_estimates_what_is_asked_for() -> None:
     assert (plane.H[0] / plane.H[0, 2, 2]).numpy() == pytest.approx(H, abs=1e-6)
     with pytest.raises(ValueError, match="focal=shared is of fundamental matrices"):
         presets.build("estimator", "fastpose", model="homography", focal="shared")
+
+
+def calibrated_pair(seed: int, outliers: int) -> tuple[Correspondences, np.ndarray, np.ndarray]:
+    """A pair of known cameras in whose P(inlier) outliers have a tenth, and its rays (n, 2) of both images."""
+    s = matched_scene(100, seed, noise=0.2)
+    x1 = torch.cat([s.x1[:outliers].roll(1, 0), s.x1[outliers:]])
+    prior = torch.where(torch.arange(100) < outliers, 0.1, torch.linspace(0.6, 0.99, 100))
+    mask, size = torch.ones(1, 100, dtype=torch.bool), torch.tensor([[801, 1001]])
+    c = Correspondences(
+        s.x0[None], x1[None], mask, prior=prior[None], size0=size, size1=size, K0=s.K0[None], K1=s.K1[None],
+        focal=torch.tensor([[[1.0, 0.0], [1.0, 0.0]]], dtype=torch.float64),
+    )  # fmt: skip
+    rays = [((x - K[:2, 2]) / K.diagonal()[:2]).numpy() for x, K in ((s.x0, s.K0), (x1, s.K1))]
+    return c, rays[0], rays[1]
+
+
+def test_the_weighted_eight_point_algorithm_is_oanets() -> None:
+    """OANet's weighted_8points: X^T diag(relu(tanh(logit))) X, whose last eigenvector is E."""
+    c, rays0, rays1 = calibrated_pair(3, outliers=40)
+    estimate = KnownCameras(presets.build("estimator", "weighted_eight_point"))(c)
+    p = c.prior[0].double().numpy()
+    weight = np.maximum(np.tanh(np.log(p / (1 - p))), 0)
+    (a, b), (u, v) = rays0.T, rays1.T
+    X = np.stack([u * a, u * b, u, v * a, v * b, v, a, b, np.ones(100)], 1)
+    E = np.linalg.svd(X.T @ np.diag(weight) @ X)[2][-1].reshape(3, 3)
+    F = np.linalg.inv(c.K1[0].numpy()).T @ E @ np.linalg.inv(c.K0[0].numpy())
+    F /= np.linalg.norm(F)
+    assert min(np.abs(sign * estimate.F[0].numpy() - F).max() for sign in (1, -1)) < 1e-7
+    assert estimate.inliers[0].tolist() == [False] * 40 + [True] * 60
+    s = matched_scene(100, 3, noise=0.2)
+    error = metrics.pose_error(estimate.R, estimate.t, s.R[None].double(), s.t[None].double())
+    assert float(error.worst) < 3
+
+
+def test_opencvs_essential_matrix_is_that_of_its_own_call() -> None:
+    c, rays0, rays1 = calibrated_pair(4, outliers=30)
+    estimate = KnownCameras(presets.build("estimator", "opencv_essential"))(c)
+    E, mask = cv2.findEssentialMat(rays0, rays1, np.eye(3), cv2.RANSAC, 0.999, 0.001)
+    _, R, t, _ = cv2.recoverPose(E, rays0, rays1, mask=mask.copy())
+    np.testing.assert_allclose(estimate.R[0], R, atol=1e-3)
+    np.testing.assert_allclose(estimate.t[0], t[:, 0], atol=1e-2)
+    assert np.abs(estimate.inliers[0].numpy() ^ (mask[:, 0] > 0)).sum() <= 3
+    unknown = presets.build("estimator", "opencv_essential")(c.replace(focal=None, K0=None, K1=None))
+    assert unknown.R is None
+    assert bool(unknown.ok)

@@ -382,4 +382,4 @@ def test_summaries_and_reports_show_them() -> None:
     nobody = to_table([dataclasses.replace(row, pair_type=None) for row in rows(pairs[:1], None)])
     assert "Pair types" not in {part.heading for part in evaluation.tables.parts(evaluation.summarize(nobody))}
     alone = evaluation.terminal_tables(evaluation.summarize(to_table(rows(pairs[:1], None))), "t")
-    assert [each.title for each in alone] == ["t", "Relative pose"]  # all general: nothing to say
+    assert [each.title for each in alone] == ["t", "Relative pose", "Pruning"]  # all general: nothing to say

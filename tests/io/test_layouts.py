@@ -17,9 +17,12 @@ from fmtorch import data, presets
 from fmtorch.data import DataError, ImagePair
 from fmtorch.evaluation import evaluate
 from fmtorch.evaluation.gallery import Options, find_dataset
+from fmtorch.evaluation.statistics import summarize
+from fmtorch.evaluation.tables import summary_markdown
 from fmtorch.io import H5Pairs
 from fmtorch.pipeline import Outcome, Pipeline, load_pipeline
 from fmtorch.pruning import ratio_test
+from fmtorch.runs import to_table
 from tests.helpers import unused
 from tests.io import writers
 
@@ -321,3 +324,29 @@ def test_one_file_is_no_image_of_two_scenes(tmp_path: Path) -> None:
         reload("ransac_tutorial", root, images=images)
     with pytest.raises(DataError, match=r"images=.*nowhere: no such folder"):
         reload("ransac_tutorial", root, images=images / "nowhere")
+
+
+def test_pruning_is_judged_as_oanets_test_does(tmp_path: Path) -> None:
+    """Precision and recall by the labels of the file, of all matches in front of pruning; one table with both means."""
+    root = writers.write_oanet(tmp_path / "oanet", outliers=20)
+    dataset = reload("oanet", root)
+    half = {"ratio": lambda c: c.keep((torch.arange(c.mask.shape[1]) % 2 == 0).expand(c.mask.shape))}
+    outcomes = pipeline(**half).run(list(dataset))
+    rows = evaluate(outcomes)
+    with h5py.File(next(root.glob("*"))) as file:
+        labels = [file[f"ys/{i}"][:, 0] < 1e-4 for i in range(writers.PAIRS)]
+    for row, outcome, label in zip(rows, outcomes, labels, strict=True):
+        kept = outcome.estimate.inliers[0, : len(label[::2])].numpy()
+        assert row.match_precision == pytest.approx(label[::2][kept].mean())
+        assert row.match_recall == pytest.approx(label[::2][kept].sum() / label.sum())
+    group = summarize(to_table(rows))["all"]
+    p, r = (np.array([getattr(row, f"match_{name}") for row in rows]) for name in ("precision", "recall"))
+    assert group["labels"] == pytest.approx(
+        {"precision": p.mean(), "recall": r.mean(), "f_score": (2 * p * r / (p + r)).mean()}
+    )
+    page = summary_markdown({"all": group}, "title")
+    heading = "| Pruning | mAP@5° | mAP@20° | AUC@5° | AUC@10° | AUC@20° | P | R | F |"
+    assert heading in page
+    assert "beside mAP5° and mAP20° of OANet" in page
+    failed = evaluate([Outcome(pair, reason="no") for pair in dataset])
+    assert [(row.match_precision, row.match_recall) for row in failed] == [(0.0, 0.0)] * writers.PAIRS

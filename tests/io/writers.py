@@ -152,15 +152,22 @@ def posebench_group(
         camera["params"] = np.array([k[0, 0], k[1, 1], k[0, 2], k[1, 2]])
 
 
-def write_oanet(folder: Path) -> Path:
-    """A file with a group for each kind of entry; matches in calibrated coordinates, t of length one."""
+def write_oanet(folder: Path, outliers: int = 0) -> Path:
+    """A file with a group for each kind of entry; matches in calibrated coordinates, t of length one.
+    outliers: of the first so many matches the points of image 1 change places."""
     folder.mkdir(parents=True)
     with h5py.File(folder / "yfcc-sift-2000-test.hdf5", "w") as file:
         for i, s in enumerate(scenes()):
             K = s.K0.numpy(), s.K1.numpy()
             x = [(p.numpy() - k[:2, 2]) / k.diagonal()[:2] for p, k in zip((s.x0, s.x1), K, strict=True)]
+            x[1][:outliers] = np.roll(x[1][:outliers], 1, axis=0)
+            tx, ty, tz = s.t.tolist()
+            E = np.array([[0, -tz, ty], [tz, 0, -tx], [-ty, tx, 0]]) @ s.R.numpy()
+            h0, h1 = (np.column_stack([p, np.ones(len(p))]) for p in x)
+            lines = h0 @ E.T, h1 @ E
+            ys = (h1 * lines[0]).sum(1) ** 2 * sum(1 / (line[:, :2] ** 2).sum(1) for line in lines)
             entries: dict[str, Any] = {
-                "xs": np.concatenate(x, 1)[None], "ys": np.zeros((len(x[0]), 1)), "Rs": s.R.numpy(),
+                "xs": np.concatenate(x, 1)[None], "ys": ys[:, None], "Rs": s.R.numpy(),
                 "ts": s.t.numpy()[:, None], "ratios": ratios(len(x[0])), "mutuals": np.arange(len(x[0])) % 2,
             }  # fmt: skip
             for which, k in zip("12", K, strict=True):

@@ -9,20 +9,26 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pyarrow as pa
 import pytest
 import torch
 from torch.utils.data import DataLoader
 
-from fmtorch.data import ImagePair, ImageSource
+from fmtorch import presets
+from fmtorch.data import DataError, ImagePair, ImageSource, load
 from fmtorch.pipeline import Pipeline, load_pipeline
+from fmtorch.pruning import LC
+from fmtorch.pruning.networks.learned import predict
 from fmtorch.scenes import FAMILIES, PLANS, RenderedPairs, Task
 from fmtorch.training import (
     Augmentation,
     Draw,
     LabelledMatches,
     MatchedPairs,
+    OANetPairs,
+    Objective,
     SimilarLengthBatches,
     StoredMatches,
     collate,
@@ -31,6 +37,7 @@ from fmtorch.training import (
 )
 from fmtorch.training.labelled import label
 from fmtorch.training.stored_matches import SCHEMA, Shard, ShardError, write_shard
+from tests.io import writers
 from tests.training.conftest import FAMILY, SIFT, TINY, exact
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "guides" / "training.md"
@@ -396,3 +403,75 @@ def test_training_has_no_scene_of_the_test_split(matched: MatchedPairs) -> None:
     assert training
     assert not training & test
     assert all(f"rendered/{about['scene']}/" in about["identity"] for about in matched.pairs)
+
+
+def oanet(tmp_path: Path, **options: Any) -> tuple[OANetPairs, MatchedPairs]:
+    """The pairs of a file read directly, and through the stages of a pipeline and shards."""
+    root = writers.write_oanet(tmp_path / "oanet", outliers=20)
+    overrides, before = ["pruner=[one_to_one]"], [presets.build("pruner", "one_to_one")]
+    given = load("h5", root=root, layout="oanet")
+    stored = MatchedPairs(given, "sift_ratio", overrides=overrides, root=tmp_path / "matched", workers=1, **options)
+    return OANetPairs(root, before=before, **options), stored
+
+
+@pytest.mark.parametrize("labels", ["geodesic", "pixels"])
+def test_oanets_files_train_as_the_same_pairs_matched(labels: str, tmp_path: Path) -> None:
+    direct, stored = oanet(tmp_path, labels=labels)
+    place = {about["key"]: i for i, about in enumerate(stored.pairs)}
+    order = [place[about["key"]] for about in direct.pairs]
+    torch.manual_seed(0)
+    network, objective = LC(channels=8, blocks=1, coordinates="K"), Objective(coordinates="K", classification_steps=0)
+    batches = [collate([direct[i] for i in range(len(direct))]), collate([stored[i] for i in order])]
+    assert torch.equal(batches[0].label, batches[1].label)
+    assert {0, 1} <= set(batches[0].label.unique().tolist())
+    losses = [objective(predict(network, b.correspondences), b, 1)["loss"] for b in batches]
+    torch.testing.assert_close(losses[0], losses[1], rtol=1e-6, atol=0)
+    assert direct.lengths(0) == [float(about["matches"]) for about in direct.pairs]
+    augmented = [each.augmented(Augmentation(), seed=3) for each in (direct, stored)]
+    a, b = augmented[0][1], augmented[1][order[1]]
+    torch.testing.assert_close(a.correspondences.x0, b.correspondences.x0, rtol=0, atol=1e-3)
+    assert [round(n, 9) for n in augmented[1].select(order).lengths(1)] != [0.0] * len(direct)
+
+
+def test_workers_read_oanets_files_for_themselves(tmp_path: Path) -> None:
+    direct, _ = oanet(tmp_path)
+    alone = [direct[i].correspondences.x0 for i in (2, 0, 1)]
+    copies = DataLoader(pickle.loads(pickle.dumps(direct)), sampler=[2, 0, 1], batch_size=None, num_workers=2)
+    for dataset in (copies, DataLoader(direct, sampler=[2, 0, 1], batch_size=None, num_workers=2)):
+        assert all(torch.equal(a, m.correspondences.x0) for a, m in zip(alone, dataset, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("key", "change", "said"),
+    [
+        ("ys", None, "'ys' is missing, which labels=geodesic needs"),
+        ("ys/1", None, "'ys/1' is missing"),
+        ("ys/1", np.zeros((4, 1)), "'ys/1' has 4 entries, but 'xs/1' has 65"),
+        ("ratios", None, "'ratios' is missing; give"),
+        ("ts/1", np.zeros((3, 1)), "'ts/1' is zero"),
+        ("xs/1", np.zeros((1, 0, 4)), ""),
+        ("xs", None, "'xs' is missing; it is no file of OANet's layout"),
+    ],
+)
+def test_what_oanets_files_lack_is_named(key: str, change: Any, said: str, tmp_path: Path) -> None:
+    path = next(writers.write_oanet(tmp_path / "oanet").glob("*"))
+    with h5py.File(path, "a") as file:
+        del file[key]
+        if change is not None:
+            file[key] = change
+    if not said:
+        with pytest.warns(UserWarning, match="1 of 3 pairs have no matches .*'xs/1' is empty"):
+            assert len(OANetPairs(path)) == 2
+        return
+    with pytest.raises(DataError, match=f"{path.name}: {said}"):  # noqa: PT012
+        pairs = OANetPairs(path)
+        pairs.expect_ratios("give")
+        pairs[1]
+
+
+@pytest.mark.parametrize("length", [0, 100])
+def test_truncated_files_of_oanet_are_named(length: int, tmp_path: Path) -> None:
+    path = next(writers.write_oanet(tmp_path / "oanet").glob("*"))
+    path.write_bytes(path.read_bytes()[:length])
+    with pytest.raises(DataError, match="hdf5: is not a valid HDF5 file"):
+        OANetPairs(path)

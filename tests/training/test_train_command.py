@@ -1,23 +1,28 @@
 """`fmtorch train`, as a user runs it: from another directory, with a network of one's own."""
 
+import gc
 import itertools
 import json
 import re
+import shutil
 import signal
 from collections.abc import Iterator
 from pathlib import Path
 
+import h5py
 import pytest
 import torch
 from torch.utils.data import DataLoader
 
 from fmtorch import presets
+from fmtorch.data import DataError
 from fmtorch.pruning import LC
 from fmtorch.training import LabelledMatches, Objective, Use, Validation, collate
 from fmtorch.training import run as loop
 from fmtorch.training.run import Optimisation, PrunerTraining, latest_checkpoint, run
 from tests.conftest import own_cache
 from tests.helpers import compose, draw, draw_set
+from tests.io import writers
 from tests.processes import run_command
 from tests.training.conftest import labelled_pair
 
@@ -119,6 +124,36 @@ def test_photographs_join_the_training(root: Path, tmp_path: Path, monkeypatch: 
     assert (folder / "lc.safetensors").read_bytes() == weights
     with pytest.raises(ValueError, match=r"checkpoints of other settings.*matches: "):
         trained(monkeypatch, tmp_path, *options, "planes.seed=1")
+
+
+def test_one_scene_alone_is_validated_on_its_last_images(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of eight images the last two make one pair, the first six fifteen; the others join both sides."""
+    root = draw_set(tmp_path / "Set", "a", images=8, pairs=list(itertools.combinations(range(8), 2)))
+    small = ["pruner.lc.network.channels=8", "pruner.lc.network.blocks=2", "output=out"]
+    folder = trained(monkeypatch, tmp_path, "dataset=fmbench", f"dataset.root={root}", *SHORT, *small)
+    card = (folder / "lc.md").read_text()
+    assert "| trained on | 15 pairs of 1 scenes of fmbench |" in card
+    assert "| validated on | 1 pairs of Set (" in card
+
+
+def test_oanets_files_are_trained_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two files, of which the last is for validation, and a further one; the same command goes on."""
+    root = writers.write_oanet(tmp_path / "oanet", outliers=20)
+    shutil.copy(next(root.glob("*")), root / "b.hdf5")
+    options = ["dataset=h5", "dataset.layout=oanet", f"dataset.root={root}", "labels=geodesic", *SHORT, "output=out",
+               "pruner=lc_e", "pruner.lc_e.network.channels=8", "pruner.lc_e.network.blocks=2", "loaders=1",
+               "objective.coordinates=K", f"validation.roots=[{root / 'b.hdf5'}]"]  # fmt: skip
+    folder = trained(monkeypatch, tmp_path, *options)
+    weights = (folder / "lc.safetensors").read_bytes()
+    card = (folder / "lc.md").read_text()
+    assert "| trained on | 3 pairs of 1 scenes of h5 |" in card
+    trained(monkeypatch, tmp_path, *options)
+    assert (folder / "lc.safetensors").read_bytes() == weights
+    gc.collect()  # Lightning's circles hold the open file
+    with h5py.File(root / "b.hdf5", "a") as file:
+        del file["ratios"]
+    with pytest.raises(DataError, match=r"b.hdf5: 'ratios' is missing; without them give augmentation.ratio=null"):
+        trained(monkeypatch, tmp_path, *options)
 
 
 @pytest.mark.parametrize(

@@ -10,10 +10,16 @@ from numpy.typing import NDArray
 
 from fmtorch.estimators.external import pairwise
 from fmtorch.estimators.external.pairwise import Confidence, Iterations, Pair, PairwiseEstimator, Points, Solution
+from fmtorch.geometry.eight_point import eight_point
 
 
 def opencv(
-    *, method: str, threshold: float = 1.0, confidence: Confidence = 0.999, iterations: Iterations = 2000
+    *,
+    method: str,
+    threshold: float = 1.0,
+    confidence: Confidence = 0.999,
+    iterations: Iterations = 2000,
+    essential: float | None = None,
 ) -> PairwiseEstimator:
     """`cv2.findFundamentalMat` with one of its robust methods.
 
@@ -24,6 +30,8 @@ def opencv(
         threshold: pixels, point to epipolar line (ransac) or Sampson distance (usac_*).
         confidence: of having drawn a sample without an outlier, at which the search ends.
         iterations: samples at most.
+        essential: focal lengths; with it, where both cameras are known (`find_essential`, cameras=known),
+            `cv2.findEssentialMat` at this threshold and `cv2.recoverPose`, as OANet tests pruners.
 
     Raises:
         ValueError: for a name that is no such constant.
@@ -35,12 +43,65 @@ def opencv(
         raise ValueError(f"method is {method!r}; it must be ransac, lmeds, or one of cv2's constants USAC_* or FM_*")
 
     def solve(pair: Pair) -> Solution:
+        if essential is not None and pair.exact is not None:
+            options = {"method": int(code), "prob": confidence, "threshold": essential, "maxIters": iterations}
+            return _of_essential(pair, pair.exact, options)
         F, mask = cv2.findFundamentalMat(pair.x0, pair.x1, int(code), threshold, confidence, iterations)
         if F is None or mask is None:  # a minimal set may also give several solutions, stacked
             return None, np.zeros(len(pair.x0), dtype=np.bool_)
         return F.astype(np.float64), mask.ravel().astype(np.bool_)
 
     return PairwiseEstimator(f"OpenCV {name}", solve, best_first=name == "USAC_PROSAC")
+
+
+def _of_essential(pair: Pair, K: tuple[Points, Points], options: Mapping[str, Any]) -> Solution:
+    rays = _calibrated(pair, K)
+    E, mask = cv2.findEssentialMat(*rays, np.eye(3), **options)
+    if E is None:
+        return None, np.zeros(len(pair.x0), np.bool_)
+    # Several where a sample is minimal, of which that counts which has most matches in front of both cameras.
+    poses = [(each, *cv2.recoverPose(each, *rays, mask=mask.copy())) for each in E.reshape(-1, 3, 3)]
+    best, _, R, t, _ = max(poses, key=lambda pose: pose[1])
+    return _posed_by_essential(best, R, t, K, mask.ravel() > 0)
+
+
+def weighted_eight_point(*, best: float = 0.1) -> PairwiseEstimator:
+    """The eight-point algorithm on all matches, weighted by P(inlier), without samples.
+
+    So Yi et al. (CVPR 2018) and their successors test pruners without RANSAC: each match has the weight
+    ``relu(tanh(logit P))``, zero where P is at most 1/2. Where both cameras are known (`find_essential`, cameras=known)
+    coordinates are calibrated, and the matrix is not projected onto essential ones.
+
+    Args:
+        best: share of the matches, those of the largest P, by whose depths the pose is chosen.
+    """
+
+    def solve(pair: Pair) -> Solution:
+        p, K = pair.likelihood, pair.exact
+        weight = np.maximum(2 * p - 1, 0) / (p**2 + (1 - p) ** 2)
+        if np.count_nonzero(weight) < pairwise.MIN_MATCHES:
+            return None, weight > 0
+        if K is None:
+            x0, x1, w = (torch.from_numpy(value)[None] for value in (pair.x0, pair.x1, weight))
+            return eight_point(x0, x1, w)[0][0].numpy(), weight > 0
+        rays0, rays1 = _calibrated(pair, K)
+        X = (np.insert(rays1, 2, 1, 1)[:, :, None] * np.insert(rays0, 2, 1, 1)[:, None]).reshape(-1, 9)
+        E = np.linalg.eigh((X * weight[:, None]).T @ X)[1][:, 0].reshape(3, 3)
+        kept = p >= np.sort(p)[::-1][max(1, int(best * len(p)))]
+        _, R, t, _ = cv2.recoverPose(E, rays0[kept], rays1[kept])
+        return _posed_by_essential(E, R, t, K, weight > 0)
+
+    return PairwiseEstimator("the weighted eight-point algorithm", solve)
+
+
+def _calibrated(pair: Pair, K: tuple[Points, Points]) -> tuple[Points, Points]:
+    rays0, rays1 = ((x - k[:2, 2]) / k.diagonal()[:2] for x, k in zip((pair.x0, pair.x1), K, strict=True))
+    return rays0, rays1
+
+
+def _posed_by_essential(E: Any, R: Any, t: Any, K: tuple[Points, Points], inliers: NDArray[np.bool_]) -> pairwise.Posed:
+    F = np.linalg.inv(K[1]).T @ np.asarray(E, np.float64) @ np.linalg.inv(K[0])
+    return pairwise.Posed(F, inliers, None, np.asarray(R, np.float64), np.ravel(t).astype(np.float64))
 
 
 def kornia_ransac(

@@ -1,0 +1,179 @@
+"""Files that OANet and its successors train and test on (Zhang et al., ICCV 2019): HDF5, an entry for each pair.
+
+Of pair ``0``, ``1``, ...: ``xs`` (1, n, 4) calibrated coordinates of matches, ``ys`` (n, k), their geodesic distance in
+the first column, ``Rs`` (3, 3), ``ts`` (3, 1), ``ratios`` and ``mutuals`` (n,), ``cx1s``, ``cy1s``, ``f1s`` and
+those of the other image. OANet ignores what else there is; ``sizes`` (h0, w0, h1, w1) is this project's.
+"""
+
+import contextlib
+import dataclasses
+import os
+import weakref
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from fmtorch.core.files import replacing
+from fmtorch.data import DataError, GivenMatches, Lens
+from fmtorch.data.files import Array, Matrix
+from fmtorch.geometry.epipolar import symmetric_squared
+from fmtorch.io import h5, predictions
+
+GEODESIC = 1e-4  # of an inlier, squared focal lengths: obj_geod_th of OANet's code
+
+
+def geodesic(R: Matrix, t: Matrix, rays0: Matrix, rays1: Matrix) -> Matrix:
+    """OANet's geodesic distance (n,): the two squared distances to the epipolar lines added, in calibrated coordinates.
+
+    R, t: X1 = R X0 + t. rays0, rays1: matches (n, 2), ``(x - c) / f``. It does not depend on the length of t.
+    """
+    E = np.cross(np.eye(3), t / (np.linalg.norm(t) or 1.0)).T @ R
+    values: Matrix = symmetric_squared(*(torch.from_numpy(value) for value in (E, rays0, rays1))).numpy()
+    return values
+
+
+@dataclasses.dataclass(frozen=True)
+class Cameras:
+    """What a file says of a pair beside its matches. K: of both images. R, t: X1 = R X0 + t. sizes: (h, w)."""
+
+    K: tuple[Matrix, Matrix]
+    R: Matrix
+    t: Matrix
+    sizes: tuple[predictions.Size, predictions.Size]
+
+
+def keys(file: Any) -> list[str]:
+    """The names of the pairs. Raises DataError where the file is of another layout."""
+    if not h5.holds(file, "xs"):
+        raise DataError(f"{file.filename}: 'xs' is missing; it is no file of OANet's layout")
+    return sorted(h5.keys(file["xs"]), key=lambda key: (len(key), key))
+
+
+def cameras(file: Any, key: str) -> Cameras:
+    """The cameras of a pair; images of unknown size have their principal point in the middle."""
+    K = _calibration(file, key, 1), _calibration(file, key, 2)
+    R, t = h5.reshaped(file, f"Rs/{key}", 3, 3), h5.reshaped(file, f"ts/{key}", 3)
+    if h5.holds(file, "sizes"):
+        h0, w0, h1, w1 = h5.reshaped(file, f"sizes/{key}", 4).astype(int).tolist()
+        return Cameras(K, R, t, ((h0, w0), (h1, w1)))
+    return Cameras(K, R, t, (predictions.size_by_centre(K[0]), predictions.size_by_centre(K[1])))
+
+
+def _calibration(file: Any, key: str, which: int) -> Matrix:
+    cx, cy = (h5.reshaped(file, f"{name}{which}s/{key}", 1)[0] for name in ("cx", "cy"))
+    fx, fy = h5.reshaped(file, f"f{which}s/{key}", 2)
+    if fx == 0 or fy == 0:
+        raise DataError(f"{file.filename}: 'f{which}s/{key}' holds a focal length of zero")
+    return Lens(fx, fy, cx, cy).K
+
+
+def figures(file: Any, name: str, key: str, count: int) -> Matrix | None:
+    """One number of each of `count` matches, the first column; None where the file has none of that name."""
+    if not h5.holds(file, name):
+        return None
+    values = h5.numbers(file, f"{name}/{key}")
+    values = values.reshape(len(values), -1)[:, 0] if values.ndim else values.reshape(-1)
+    if len(values) != count:
+        lengths = f"{len(values)} entries, but {f'xs/{key}'!r} has {count} matches"
+        raise DataError(f"{file.filename}: {f'{name}/{key}'!r} has {lengths}")
+    return values
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class OANetMatches:
+    """The matches of one pair."""
+
+    path: Path
+    key: str
+    cameras: Cameras
+
+    def __call__(self) -> GivenMatches:
+        with h5.opened(self.path) as file:
+            return matches(file, self.key, self.cameras)
+
+
+def matches(file: Any, key: str, known: Cameras) -> GivenMatches:
+    """The matches of a pair in pixels."""
+    x0, x1, ratios, mutuals = arrays(file, key, known)
+    mutual = None if mutuals is None else mutuals.astype(bool)
+    return predictions.given(x0, x1, known.sizes, (len(x0), len(x0)), ratio=ratios, mutual=mutual)
+
+
+def arrays(file: Any, key: str, known: Cameras) -> tuple[Matrix, Matrix, Matrix | None, Matrix | None]:
+    """The points of the matches (n, 2) in pixels, their ratios and whether they are mutual (n,)."""
+    rays = h5.numbers(file, f"xs/{key}", 1, None, 4)[0]
+    ratios, mutuals = (figures(file, name, key, len(rays)) for name in ("ratios", "mutuals"))
+    x0, x1 = (x * K.diagonal()[:2] + K[:2, 2] for x, K in zip((rays[:, :2], rays[:, 2:]), known.K, strict=True))
+    return x0, x1, ratios, mutuals
+
+
+class RandomAccess:
+    """A file from which pairs are read in any order, by each process for itself; it is closed before a fork."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self._file, self._files = path, None, contextlib.ExitStack()
+        _ACCESSED.add(self)
+
+    @property
+    def file(self) -> Any:
+        """The open file. Raises DataError where it is missing or damaged."""
+        if self._file is None:
+            self._file = self._files.enter_context(h5.opened(self.path))
+        return self._file
+
+    def close(self) -> None:
+        self._files.close()
+        self._file = None
+
+    def __getstate__(self) -> Path:
+        return self.path
+
+    def __setstate__(self, path: Path) -> None:
+        self.__init__(path)  # type: ignore[misc]
+
+
+_ACCESSED: weakref.WeakSet[RandomAccess] = weakref.WeakSet()
+
+
+def _close_all() -> None:
+    for access in _ACCESSED:
+        access.close()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(before=_close_all)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Entry:
+    """A pair to write. x0, x1: matches (n, 2) in pixels. ratios, mutuals: (n,), None where they are not known."""
+
+    cameras: Cameras
+    x0: Matrix
+    x1: Matrix
+    ratios: Array | None = None
+    mutuals: Array | None = None
+
+    def arrays(self) -> Mapping[str, Array | None]:
+        """What a file holds of it, by the names of its groups."""
+        (K0, K1), t = self.cameras.K, self.cameras.t / np.linalg.norm(self.cameras.t)
+        rays0, rays1 = ((x - K[:2, 2]) / K.diagonal()[:2] for x, K in ((self.x0, K0), (self.x1, K1)))
+        known = {f"{name}{i}s": K[[row], [2]] for i, K in ((1, K0), (2, K1)) for row, name in enumerate(("cx", "cy"))}
+        return {
+            "xs": np.hstack([rays0, rays1])[None], "ys": geodesic(self.cameras.R, t, rays0, rays1)[:, None],
+            "Rs": self.cameras.R, "ts": t[:, None], "ratios": self.ratios, "mutuals": self.mutuals, **known,
+            "f1s": K0.diagonal()[None, :2], "f2s": K1.diagonal()[None, :2],
+            "sizes": np.array(self.cameras.sizes, np.float64).ravel(),
+        }  # fmt: skip
+
+
+def write(path: Path, entries: Iterable[Entry]) -> None:
+    """Write pairs as a file of float32, whole or not at all."""
+    with replacing(path) as temporary, h5.imported().File(temporary, "w") as file:
+        for number, entry in enumerate(entries):
+            for name, values in entry.arrays().items():
+                if values is not None:
+                    file.create_dataset(f"{name}/{number}", data=np.asarray(values, np.float32))
