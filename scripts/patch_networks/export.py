@@ -76,7 +76,7 @@ def _training(checkpoint: Mapping[str, Any]) -> dict[str, str]:
         "patches": f"{data['patches']} of {data['points']} points, found independently by DoG and Hessian in "
         f"{data['views']} random views of each photograph ({listed(data['limits'])}) with changes of light, blur, "
         f"noise and JPEG{f', and in as many photographs of each rendered scene ({scenes})' if scenes else ''}",
-        "loss": listed({k: Path(v).name if k == "descriptor" else v for k, v in checkpoint["loss"].items()}),
+        "loss": listed(checkpoint["loss"]),
     }
     if teacher := checkpoint.get("teacher"):
         name = f"{Path(teacher['network']).name} ({teacher['precision']})"
@@ -85,7 +85,7 @@ def _training(checkpoint: Mapping[str, Any]) -> dict[str, str]:
         rows["match sets"] = listed(checkpoint["match_sets"])
     rows["run"] = (
         f"{checkpoint['step']} steps of {o['batch']} points, {checkpoint['seconds'] / 60:.0f} minutes, "
-        f"{o['optimizer']}, learning rate {o['learning_rate']} falling linearly to zero, seed {o['seed']}, "
+        f"adam, learning rate {o['learning_rate']} falling linearly to zero, seed {o['seed']}, "
         f"{'bfloat16 autocast' if o['bf16'] else 'float32'}"
     )
     return {**rows, f"loss of the last {len(losses)} steps": f"{sum(losses) / len(losses):.4f}"}

@@ -7,7 +7,6 @@ authors' released code (lzx551402/tfmatch) has another form, so that none of the
 import dataclasses
 import math
 from collections.abc import Callable
-from typing import Protocol
 
 import torch
 from jaxtyping import Float
@@ -22,6 +21,8 @@ DRAWS = 6  # random numbers in [0, 1) that an objective gets for each point
 SAME_PATCH = 0.008  # a negative nearer than this is the same patch twice, as in the authors' code for HardNet
 MARGINS = ((0.5, 0.7), (0.2, 0.5), (0.0, 0.2))  # GeoDesc: from this S_patch on, the similarity that a match should have
 GALLERY = 1000  # patches among which each asks for its own
+Pairs = Float[Tensor, "2 n 1 h w"]  # of patches with their surroundings
+Draws = Float[Tensor, "n k"]  # all the randomness of a loss beside dropout
 
 
 def distances(a: Float[Tensor, "n d"], b: Float[Tensor, "m d"]) -> Float[Tensor, "n m"]:
@@ -116,50 +117,45 @@ def middle(patches: Float[Tensor, "*b h w"], size: int = 32) -> Float[Tensor, "*
 
 
 @torch.no_grad()
-def evaluate_descriptor(describe: PatchFunction, pairs: Float[Tensor, "2 n 1 h w"]) -> dict[str, float]:
+def evaluate_descriptor(describe: PatchFunction, pairs: Pairs) -> dict[str, float]:
     """`patch_quality` of a descriptor on validation pairs."""
     parts = ([describe(part).float() for part in torch.split(middle(patches), 256)] for patches in pairs)
     return patch_quality(*(functional.normalize(torch.cat(described), dim=1) for described in parts))
-
-
-class Objective(Protocol):
-    """A loss of a network on pairs of patches with their surroundings, and its figures on validation pairs.
-
-    `draws` are all the randomness there is beside dropout. The figures are for the log and the model card.
-    """
-
-    def loss(self, network: nn.Module, pairs: Float[Tensor, "2 n 1 h w"], draws: Float[Tensor, "n k"]) -> Tensor: ...
-
-    def evaluate(self, network: nn.Module, pairs: Float[Tensor, "2 n 1 h w"]) -> dict[str, float]: ...
 
 
 @dataclasses.dataclass(frozen=True)
 class DescriptorObjective:
     """Descriptors of a point's two patches should be nearer than those of different points: `criterion` says how.
 
+    Of match sets it gets the descriptors (s, n, d), twice, and the S_patch (s, n) of their matches.
+
     teacher: a trained network that stays as it is; each descriptor should also be its descriptor of the same patch
     (FitNets' hints on the output, Romero et al., ICLR 2015). weight: of their squared distance in the loss.
     """
 
-    criterion: Callable[[Tensor, Tensor], Tensor]
+    criterion: Callable[..., Tensor]
     teacher: PatchFunction | None = None
     weight: float = 1.0
 
-    def loss(self, network: nn.Module, pairs: Float[Tensor, "2 n 1 h w"], draws: Float[Tensor, "n k"]) -> Tensor:
+    def loss(self, network: nn.Module, pairs: Pairs, draws: Draws, similarity: Tensor | None = None) -> Tensor:
         patches = middle(pairs)
         left, up, over = (draws[:, column, None, None, None] < 0.5 for column in range(3))
         patches = torch.where(left, patches.flip(-1), patches)
         patches = torch.where(up, patches.flip(-2), patches)
         patches = torch.where(over, patches.mT, patches).flatten(0, 1)
         described = network(patches)
-        loss = self.criterion(*described.chunk(2))
+        a, b = described.chunk(2)
+        if similarity is None:
+            loss = self.criterion(a, b)
+        else:
+            loss = self.criterion(*(x.reshape(*similarity.shape, -1) for x in (a, b)), similarity)
         if self.teacher is not None:
             with torch.no_grad():
                 target = self.teacher(patches)
             loss = loss + self.weight * (described - target).square().sum(1).mean()
         return loss
 
-    def evaluate(self, network: nn.Module, pairs: Float[Tensor, "2 n 1 h w"]) -> dict[str, float]:
+    def evaluate(self, network: nn.Module, pairs: Pairs) -> dict[str, float]:
         return evaluate_descriptor(network, pairs)
 
 
@@ -179,7 +175,7 @@ class CovarianceObjective:
     teacher: PatchFunction | None = None
     weight: float = 1.0
 
-    def loss(self, network: nn.Module, pairs: Float[Tensor, "2 n 1 h w"], draws: Float[Tensor, "n k"]) -> Tensor:
+    def loss(self, network: nn.Module, pairs: Pairs, draws: Draws, similarity: Tensor | None = None) -> Tensor:
         """Mean of log((s^2 + s^-2) / 2) for singular values s and 1 / s of what should be a rotation: 0 where it is."""
         T1, T2, seen = self._stretched(pairs.flatten(0, 1), torch.cat([draws, draws]))
         shapes = shape_matrix(network(seen))
@@ -192,7 +188,7 @@ class CovarianceObjective:
         return loss
 
     @torch.no_grad()
-    def evaluate(self, network: nn.Module, pairs: Float[Tensor, "2 n 1 h w"]) -> dict[str, float]:
+    def evaluate(self, network: nn.Module, pairs: Pairs) -> dict[str, float]:
         """Median ratio of axes that is left between the two rectified patches, and without shapes (1: none)."""
         numbers = random.uniform(0, torch.zeros(1, dtype=torch.int64), Stream.TRAINING, 0, len(pairs[0]), DRAWS)[0]
         T1, T2, seen = self._stretched(pairs[0], numbers.to(pairs[0]))
@@ -208,6 +204,9 @@ class CovarianceObjective:
             for i in (0, 3)
         )
         return T1, T2, torch.cat([sample(patches, T1), sample(patches, T2)])
+
+
+Objective = DescriptorObjective | CovarianceObjective
 
 
 def _departure(matrix: Float[Tensor, "n 2 2"]) -> Float[Tensor, ""]:

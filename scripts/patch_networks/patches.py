@@ -1,14 +1,13 @@
 """Training patches: the same points found independently in several views of a photograph or of a rendered scene.
 
-A homography warps a photograph as if it were a plane. In rendered scenes surfaces move against each other, hide each
-other and are lit anew; where a point of one view is in another is known from the scene's geometry. Both give tracks,
-whose viewing angles say how hard it is to match two patches of a point (Luo et al., GeoDesc, ECCV 2018, section 3.3).
+A photograph is seen as a plane. In rendered scenes surfaces move against each other, hide each other and are lit anew.
+Where a point of one view is in another is known from the geometry. Both give tracks, whose viewing angles say how hard
+it is to match two patches of a point (Luo et al., GeoDesc, ECCV 2018, section 3.3).
 """
 
 import dataclasses
-import math
 from collections.abc import Sequence
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -28,8 +27,21 @@ INTERSECTION_SIGMA, INCIDENCE_SIGMA = 15.0, 20.0  # degrees, sigma_1 and sigma_2
 
 Indices = NDArray[np.int64]
 Keypoints = Matrix  # (n, 4): x, y, sigma in pixels, angle in radians, x axis towards y axis
-Part = tuple[NDArray[np.uint8], Indices, dict[str, NDArray[Any]]]
-"""Patches (m, CONTEXT_SIZE, CONTEXT_SIZE), the point (m,) that each shows, ascending, and further columns."""
+
+
+class Part(NamedTuple):
+    """Patches of points that two or more views of a source show, point after point.
+
+    patches: (m, CONTEXT_SIZE, CONTEXT_SIZE). point, view: (m,) the point that each shows, and in which view. rays:
+    (m, 3) unit directions from the surface to the camera, in the world. incidence: (m,) degrees between ray and surface
+    normal, NaN where it is not known.
+    """
+
+    patches: NDArray[np.uint8]
+    point: Indices
+    view: Indices
+    rays: NDArray[np.float32]
+    incidence: NDArray[np.float32]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,24 +57,6 @@ class Tolerance:
 
 
 SAME_PLACE = Tolerance(distance=1.0, scale=1.6, angle=45.0)  # within it two points would be false negatives
-
-
-@dataclasses.dataclass(frozen=True)
-class Warps:
-    """How far warped views may go; each is drawn uniformly, ratios uniformly in their logarithm.
-
-    views: of each photograph, the first one unwarped. tilt: largest ratio of the two scales (ASIFT's absolute tilt).
-    scale: smallest and largest. rotation: degrees either way; any_rotation: share of views turned by any angle.
-    perspective: largest change of scale across the image. longest_side: of a view, pixels.
-    """
-
-    views: int = 12
-    tilt: float = 3.0
-    scale: tuple[float, float] = (0.5, 1.3)
-    rotation: float = 30.0
-    any_rotation: float = 0.25
-    perspective: float = 0.3
-    longest_side: int = 1024
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -126,82 +120,12 @@ def same_point(anchors: Keypoints, detected: Keypoints, tolerance: Tolerance) ->
     return owner
 
 
-def by_point(
-    patches: Sequence[NDArray[np.uint8]], points: Sequence[Indices], **columns: Sequence[NDArray[Any]]
-) -> Part:
-    """The patches of points that have two or more, point after point, the points numbered anew, and their columns."""
-    point = np.concatenate(points)
-    several = np.bincount(point) >= 2
-    kept = np.flatnonzero(several[point])
-    order = kept[np.argsort(point[kept], kind="stable")]
-    more = {name: np.concatenate(parts)[order] for name, parts in columns.items()}
-    return np.concatenate(patches)[order], (np.cumsum(several) - 1)[point[order]], more
-
-
 def moved(keypoints: Keypoints, centre: Matrix, A: Matrix) -> Keypoints:
     """Keypoints at other places (n, 2), with scale and orientation as linear maps (n, 2, 2) change them."""
     direction = A @ np.stack([np.cos(keypoints[:, 3]), np.sin(keypoints[:, 3])], -1)[..., None]
     sigma = keypoints[:, 2] * np.sqrt(np.abs(np.linalg.det(A)))
     there: Keypoints = np.c_[centre, sigma, np.arctan2(direction[:, 1, 0], direction[:, 0, 0])]
     return there
-
-
-def patches_of_warps(
-    image: NDArray[np.uint8], rng: np.random.Generator, warps: Warps, points: int, tolerance: Tolerance
-) -> Part:
-    """The patches of an RGB or grey photograph in random views.
-
-    Keypoints are detected in each view on its own, and those that fall on a keypoint of the first (up to `points` of
-    each detector) become its patches.
-    """
-    patches, owners = [], []
-    anchors: Keypoints = np.zeros((0, 4))
-    for view in range(warps.views):
-        grey, H = planes.grey_of(rng, image), np.eye(3)
-        picture = planes.change_light(rng, grey)
-        if view > 0:
-            H, size = random_homography(rng, grey.shape[:2], warps)
-            picture = planes.change_camera(rng, warp(picture, H, size))
-        detected = detect(picture, 4 * points if view else points)
-        back: Matrix = np.asarray(np.linalg.inv(H), np.float64)
-        in_first = moved(detected, apply(back, detected[:, :2]), planes.local_affine(back, detected[:, :2]))
-        if view == 0:
-            kept = distinct(in_first)
-            anchors, detected, owner = in_first[kept], detected[kept], np.arange(len(kept))
-        else:
-            owner = same_point(anchors, in_first, tolerance)
-        patches.append(cut(picture, detected[owner >= 0]))
-        owners.append(owner[owner >= 0])
-    return by_point(patches, owners)
-
-
-def random_homography(rng: np.random.Generator, size: tuple[int, int], warps: Warps) -> tuple[Matrix, tuple[int, int]]:
-    """A homography from an image of this size (h, w) to a view of it, and the view's size."""
-    h, w = size
-    tilt = math.exp(rng.uniform(0, math.log(warps.tilt)))
-    scale = math.exp(rng.uniform(math.log(warps.scale[0]), math.log(warps.scale[1])))
-    turn = rng.uniform(-180, 180) if rng.random() < warps.any_rotation else rng.uniform(-warps.rotation, warps.rotation)
-    axis = rng.uniform(0, math.pi)
-    H = np.eye(3)
-    # The tilt shrinks one direction by its full amount, as a turned plane is foreshortened.
-    H[:2, :2] = _rotation(math.radians(turn) + axis) @ np.diag([scale, scale / tilt]) @ _rotation(-axis)
-    H[2, :2] = rng.uniform(-warps.perspective, warps.perspective, 2) / np.array([w, h])
-    H[:, 2] -= H[:, :2] @ np.array([w - 1, h - 1]) / 2
-    corners = apply(H, np.array([[0, 0], [w - 1, 0], [0, h - 1], [w - 1, h - 1]], np.float64))
-    low, high = corners.min(0), corners.max(0)
-    shrink = min(1.0, warps.longest_side / (high - low).max())
-    H = np.array([[shrink, 0, -shrink * low[0]], [0, shrink, -shrink * low[1]], [0, 0, 1.0]]) @ H
-    out_w, out_h = np.maximum(np.round((high - low) * shrink), 32).astype(int)
-    return H, (int(out_h), int(out_w))
-
-
-def apply(H: Matrix, points: Matrix) -> Matrix:
-    mapped: Matrix = np.c_[points, np.ones(len(points))] @ H.T
-    return mapped[:, :2] / mapped[:, 2:]
-
-
-def _rotation(angle: float) -> Matrix:
-    return np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
 
 
 def training_scenes(count: int, views: int, seed: int) -> list[Task]:
@@ -231,25 +155,26 @@ def views_of_plane(image: NDArray[np.uint8], rng: np.random.Generator, limits: P
         camera = planes.random_camera(rng, grey.shape[:2], limits)
         picture = warp(planes.change_light(rng, grey), planes.plane_homography(camera, grey.shape[:2]), camera.size)
         picture = planes.change_camera(rng, picture)
-        y, x = np.mgrid[: camera.size[0], : camera.size[1]].astype(np.float64)
-        form = np.linalg.inv(camera.K).T @ camera.R[:, 2] / -camera.centre[2]  # inverse depth of the plane z = 0
-        inverse_depth = np.maximum(0.0, form[0] * x + form[1] * y + form[2])
+        pixels = np.stack(np.indices(camera.size)[::-1], -1).reshape(-1, 2).astype(np.float64)
+        inverse_depth = np.nan_to_num(1 / planes.plane_depth(camera, pixels)).reshape(camera.size)
         views.append(View(picture, camera, inverse_depth, detect(picture, points)))
     return views
 
 
 def tracks_of_views(views: Sequence[View], tolerance: Tolerance) -> Part:
-    """The patches of the points that two or more views show, with `view`, `rays` and `incidence` of each patch."""
-    owners = linked(views, tolerance)
-    shown = [np.flatnonzero(owner >= 0) for owner in owners]
-    patches = [cut(view.image, view.keypoints[mine]) for view, mine in zip(views, shown, strict=True)]
-    angles = [rays_and_incidence(view.keypoints[mine], view) for view, mine in zip(views, shown, strict=True)]
-    return by_point(
-        patches, [owner[mine] for owner, mine in zip(owners, shown, strict=True)],
-        view=[np.full(len(mine), i) for i, mine in enumerate(shown)],
-        rays=[rays.astype(np.float32) for rays, _ in angles],
-        incidence=[incidence.astype(np.float32) for _, incidence in angles],
-    )  # fmt: skip
+    """The patches of the points that two or more views show."""
+    parts = []
+    for i, (view, owner) in enumerate(zip(views, linked(views, tolerance), strict=True)):
+        shown = np.flatnonzero(owner >= 0)
+        keypoints = view.keypoints[shown]
+        rays, incidence = (angles.astype(np.float32) for angles in rays_and_incidence(keypoints, view))
+        parts.append(Part(cut(view.image, keypoints), owner[shown], np.full(len(shown), i), rays, incidence))
+    every = Part(*map(np.concatenate, zip(*parts, strict=True)))
+    several = np.bincount(every.point) >= 2
+    kept = np.flatnonzero(several[every.point])
+    order = kept[np.argsort(every.point[kept], kind="stable")]
+    every = Part(*(column[order] for column in every))
+    return every._replace(point=(np.cumsum(several) - 1)[every.point])
 
 
 def linked(views: Sequence[View], tolerance: Tolerance) -> list[Indices]:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import collections
 import dataclasses
+import functools
 import json
 import multiprocessing
-import os
-import shutil
+import tempfile
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
@@ -26,36 +26,26 @@ from fmtorch.scenes.dataset import Task
 from fmtorch.scenes.surfaces import PICTURES, skimage_file
 from fmtorch.training.planes import Photograph, PlaneViews
 from scripts.patch_networks import patches as patches_module
-from scripts.patch_networks.patches import CONTEXT_SIZE, Part, Tolerance, Warps, patch_similarity
+from scripts.patch_networks.patches import CONTEXT_SIZE, Part, Tolerance, patch_similarity
 
 MAX_SIMILARITY = 0.85  # of the photographs of a pair: GeoDesc's authors leave out those that are more alike
 
 
-class Tracks(NamedTuple):
-    """The geometry of patches of points, sorted by point.
-
-    first: (n + 1,) where each point's patches begin. view: (m,) the photograph of each patch. rays: (m, 3) unit
-    directions from the surface to its camera, in the world. incidence: (m,) degrees between ray and surface normal.
-    """
-
-    first: NDArray[np.int64]
-    view: NDArray[np.int64]
-    rays: NDArray[np.float32]
-    incidence: NDArray[np.float32]
-
-
 @dataclasses.dataclass(frozen=True, eq=False)
 class PatchStore:
-    """Patches of points seen in two or more views.
+    """Patches of points seen in two or more views, sorted by point.
 
-    patches: (m, CONTEXT_SIZE, CONTEXT_SIZE) uint8, sorted by point. first: (n + 1,) where each point's patches begin.
-    description: how they were made, for the model card. tracks: their geometry, where it is known.
+    patches: (m, CONTEXT_SIZE, CONTEXT_SIZE) uint8. first: (n + 1,) where each point's patches begin. view, rays,
+    incidence: (m,), (m, 3), (m,), as of a `Part`, views numbered through. description: how they were made, for the
+    model card.
     """
 
     patches: NDArray[np.uint8]
     first: NDArray[np.int64]
+    view: NDArray[np.int64]
+    rays: NDArray[np.float32]
+    incidence: NDArray[np.float32]
     description: dict[str, Any]
-    tracks: Tracks | None = None
 
     @classmethod
     def open(cls, folder: Path | str) -> PatchStore:
@@ -63,11 +53,9 @@ class PatchStore:
         folder = Path(folder)
         if not (folder / "store.json").is_file():
             raise FileNotFoundError(f"{folder} holds no patches (store.json is absent)")
-        first, description = np.load(folder / "first.npy"), json.loads((folder / "store.json").read_text())
-        tracks = None
-        if (folder / "rays.npy").is_file():
-            tracks = Tracks(first, *(np.load(folder / f"{name}.npy") for name in Tracks._fields[1:]))
-        return cls(np.load(folder / "patches.npy", mmap_mode="r"), first, description, tracks)
+        patches = np.memmap(folder / "patches.raw", np.uint8, "r").reshape(-1, CONTEXT_SIZE, CONTEXT_SIZE)
+        with np.load(folder / "geometry.npz") as geometry:
+            return cls(patches, **geometry, description=json.loads((folder / "store.json").read_text()))
 
     def __len__(self) -> int:
         return len(self.first) - 1
@@ -84,11 +72,16 @@ class PatchStore:
         return from_numpy(np.asarray(self.patches[index.numpy()])).unsqueeze(2).float() / 255
 
 
+@functools.lru_cache(maxsize=32)
+def order(seed: int, key: int, total: int) -> Int[Tensor, " n"]:
+    """The numbers below `total` in a random order of this seed and key."""
+    return random.bits(seed, torch.tensor([key]), Stream.TRAINING, 0, total, 1).flatten().argsort(stable=True)
+
+
 def validation_pairs(store: PatchStore, count: int, seed: int = 0) -> Float[Tensor, "2 n 1 h w"]:
     """Two patches each of up to `count` points of a store, in random order: always the same for one seed."""
-    key = torch.zeros(1, dtype=torch.int64)
-    points = random.bits(seed, key, Stream.TRAINING, 0, len(store), 1).flatten().argsort(stable=True)[:count]
-    return store.views(points, random.uniform(seed + 1, key, Stream.TRAINING, 0, len(points), 2)[0])
+    points = order(seed, 0, len(store))[:count]
+    return store.views(points, random.uniform(seed + 1, torch.tensor([0]), Stream.TRAINING, 0, len(points), 2)[0])
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -110,25 +103,8 @@ class MatchSets:
     def __len__(self) -> int:
         return len(self.first) - 1
 
-    def draw(
-        self, sets: Sequence[int], matches: int, numbers: Float[Tensor, "s n"]
-    ) -> tuple[Int[Tensor, "2 s n"], Float[Tensor, "s n"]]:
-        """n = `matches` different matches of each of the sets, as random numbers in [0, 1) choose them.
 
-        Returns the indices of their patches and their S_patch.
-        """
-        rows = []
-        for i, row in zip(sets, numbers.tolist(), strict=True):
-            left = list(range(int(self.first[i]), int(self.first[i + 1])))
-            for k in range(matches):  # Fisher and Yates
-                other = k + int(row[k] * (len(left) - k))
-                left[k], left[other] = left[other], left[k]
-            rows.append(left[:matches])
-        index = np.array(rows).reshape(len(rows), matches)
-        return from_numpy(self.patches[:, index]), from_numpy(self.similarity[index])
-
-
-def match_sets(tracks: Tracks, matches: int, max_similarity: float = MAX_SIMILARITY) -> MatchSets:
+def match_sets(store: PatchStore, matches: int, max_similarity: float = MAX_SIMILARITY) -> MatchSets:
     """The sets of pairs of photographs that share at least `matches` points and are not more alike than allowed.
 
     S_image, the similarity of two photographs, is the mean S_patch of their shared points (section 3.3). In the order
@@ -137,12 +113,12 @@ def match_sets(tracks: Tracks, matches: int, max_similarity: float = MAX_SIMILAR
 
     Raises ValueError where no pair is left.
     """
-    pairs = _pairs_of_points(tracks.first)
-    pairs = pairs[:, np.isfinite(tracks.incidence)[pairs].all(0)]
-    pairs = np.where(tracks.view[pairs[0]] > tracks.view[pairs[1]], pairs[::-1], pairs)
-    a, b = pairs = pairs[:, np.lexsort((pairs[0], *tracks.view[pairs][::-1]))]
-    similarity = patch_similarity(tracks.rays[a], tracks.rays[b], tracks.incidence[a], tracks.incidence[b])
-    begins = np.flatnonzero(np.r_[True, (np.diff(tracks.view[pairs]) != 0).any(0)][: len(a)])
+    pairs = _pairs_of_points(store.first)
+    pairs = pairs[:, np.isfinite(store.incidence)[pairs].all(0)]
+    pairs = np.where(store.view[pairs[0]] > store.view[pairs[1]], pairs[::-1], pairs)
+    a, b = pairs = pairs[:, np.lexsort((pairs[0], *store.view[pairs][::-1]))]
+    similarity = patch_similarity(store.rays[a], store.rays[b], store.incidence[a], store.incidence[b])
+    begins = np.flatnonzero(np.r_[True, (np.diff(store.view[pairs]) != 0).any(0)][: len(a)])
     counts = np.diff(np.r_[begins, len(a)])
     image = np.add.reduceat(similarity, begins) / counts if len(begins) else np.zeros(0)
     kept = (counts >= matches) & (image <= max_similarity)
@@ -168,12 +144,12 @@ def _pairs_of_points(first: NDArray[np.int64]) -> NDArray[np.int64]:
 
 @dataclasses.dataclass(frozen=True)
 class Cutting:
-    """How patches are cut: of photographs as warps or as planes, whose geometry is kept.
+    """How patches are cut: of photographs as planes and of rendered scenes.
 
     points: strongest of each detector. longest_side: pixels, to which larger photographs are reduced.
     """
 
-    views: Warps | PlaneViews
+    planes: PlaneViews
     points: int
     tolerance: Tolerance = dataclasses.field(default_factory=Tolerance)
     longest_side: int = 1024
@@ -184,16 +160,14 @@ class Cutting:
         cv2.setNumThreads(1)
         rng = np.random.default_rng(seed)
         if isinstance(source, Task):
-            views = patches_module.views_of_scene(source, rng, self.points)
-            patches, point, geometry = patches_module.tracks_of_views(views, self.tolerance)
-            return patches, point, geometry if isinstance(self.views, PlaneViews) else {}
+            return patches_module.tracks_of_views(
+                patches_module.views_of_scene(source, rng, self.points), self.tolerance
+            )
         image = read_image(source.path)
         if (scale := self.longest_side / max(image.shape[:2])) < 1:
             image = np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
-        if isinstance(self.views, PlaneViews):
-            views = patches_module.views_of_plane(image, rng, self.views, self.points)
-            return patches_module.tracks_of_views(views, self.tolerance)
-        return patches_module.patches_of_warps(image, rng, self.views, self.points, self.tolerance)
+        views = patches_module.views_of_plane(image, rng, self.planes, self.points)
+        return patches_module.tracks_of_views(views, self.tolerance)
 
 
 def build_store(
@@ -209,39 +183,32 @@ def build_store(
     description = {
         "photographs": dict(collections.Counter(s.source for s in sources if isinstance(s, Photograph))),
         "scenes": dict(collections.Counter(s.family for s in sources if isinstance(s, Task))), "seed": seed,
-        "views": cutting.views.views, "limits": dataclasses.asdict(cutting.views),
+        "views": cutting.planes.views, "limits": dataclasses.asdict(cutting.planes),
         "tolerance": dataclasses.asdict(cutting.tolerance),
     }  # fmt: skip
-    unfinished = folder.with_name(f"{folder.name}.{os.getpid()}.tmp")
-    unfinished.mkdir(parents=True)
-    try:
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}") as temporary:
+        unfinished = Path(temporary) / folder.name
+        unfinished.mkdir()
         with multiprocessing.get_context("spawn").Pool(workers) as pool:
             jobs = [(source, (seed, i)) for i, source in enumerate(sources)]
             _write(unfinished, pool.imap(cutting.patches_of, jobs), description)
         unfinished.rename(folder)
-    except BaseException:
-        shutil.rmtree(unfinished)
-        raise
     return PatchStore.open(folder)
 
 
 def _write(folder: Path, parts: Iterable[Part], description: dict[str, Any]) -> None:
-    """The files of a store; views are numbered through, the numbers of points and patches told in the description."""
+    """The files of a store; the numbers of points and patches are told in the description."""
     first, total, views = [np.zeros(1, np.int64)], 0, 0
     columns = collections.defaultdict[str, list[NDArray[Any]]](list)
     with open(folder / "patches.raw", "wb") as raw:
-        for patches, point, more in parts:
-            raw.write(patches.tobytes())
-            first.append(total + np.cumsum(np.bincount(point)) if len(point) else np.zeros(0, np.int64))
-            total += len(patches)
-            for name, column in more.items():
-                columns[name].append(column + views if name == "view" else column)
-            views += 1 + more["view"].max(initial=-1) if more else 0
-    for name, column_parts in {"first": first, **columns}.items():
-        np.save(folder / f"{name}.npy", np.concatenate(column_parts))
-    raw_patches = np.memmap(folder / "patches.raw", np.uint8, "r", shape=(total, CONTEXT_SIZE, CONTEXT_SIZE))
-    np.save(folder / "patches.npy", raw_patches)
-    (folder / "patches.raw").unlink()
+        for part in parts:
+            raw.write(part.patches.tobytes())
+            first.append(total + np.cumsum(np.bincount(part.point)))
+            for name, column in (("view", part.view + views), ("rays", part.rays), ("incidence", part.incidence)):
+                columns[name].append(column)
+            total, views = total + len(part.patches), views + 1 + int(part.view.max(initial=-1))
+    np.savez(folder / "geometry.npz", first=np.concatenate(first), **{k: np.concatenate(v) for k, v in columns.items()})
     counts = {"points": sum(map(len, first)) - 1, "patches": total}
     (folder / "store.json").write_text(json.dumps({**counts, **description}, indent=1))
 
