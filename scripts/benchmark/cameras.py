@@ -14,7 +14,6 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import functools
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -27,15 +26,15 @@ from numpy.typing import NDArray
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.data import ImagePair
 from fmtorch.estimators import PairwiseEstimator
-from fmtorch.evaluation.rows import focal_errors
+from fmtorch.geometry import pose_from_fundamental
 from fmtorch.pipeline.pipeline import Outcome
 from fmtorch.presets import build
 from fmtorch.scenes.raycast import calibration
 from fmtorch.two_view.known_cameras import KnownCameras
 from scripts.benchmark import pairs
 from scripts.benchmark.changes import sizes_of, taken
-from scripts.benchmark.methods import options, read_specs
-from scripts.benchmark.runner import Item, Kept, Measured, Row, Stages, add_command, identity, judged, measure
+from scripts.benchmark.methods import options, specs_of
+from scripts.benchmark.runner import Kept, Method, Row, Stages, add_command, identity, measure
 from scripts.benchmark.tables import Record, Results, Sheet, show
 
 Array = NDArray[Any]
@@ -45,7 +44,6 @@ DEVIATION = 0.06  # relative, of such a factor: log(1.1) / sqrt(3), rounded up
 WRONG = 1.5  # factor of a wrong focal length
 USUAL = 1.2  # focal length in units of the longer side where F has no real one: COLMAP's default
 ONE_CAMERA = 1e-3  # relative difference up to which two focal lengths are one
-FOCAL_ERRORS = (0.05, 0.1)  # relative
 PRIOR = ("frame_consistency", "match_noise")  # P(inlier) and noise of each match, before our own estimator
 EXACT = ("known", "rough", "wrong")
 TAKES = {
@@ -65,14 +63,11 @@ def add_arguments(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     def measured_rows(kept: Kept) -> list[Row]:
-        words = [*arguments.methods, *(read_specs(arguments.specs) if arguments.specs else [])]
-        if not words:
-            raise SystemExit("name at least one method: --methods or --specs")
-        matches = pairs.matches_identity(arguments)
+        words, matches = specs_of(arguments.methods, arguments.specs), pairs.matches_identity(arguments)
         items = [item for item in pairs.matched(arguments) if has_cameras(item.pair)]
         if not items:
             raise SystemExit("no pair has cameras; a --root must hold Camera.txt files")
-        return measure([CameraMethod.of(word, matches) for word in words], items, arguments.seeds, kept)
+        return measure([method_of(word, matches) for word in words], items, arguments.seeds, kept)
 
     show([sheet(pairs.rows_of(arguments, measured_rows))], arguments.table)
 
@@ -113,61 +108,38 @@ def calibrations(c: Correspondences, focals: Array) -> list[Array]:
     return [own if K is None else K[0].numpy() for own, K in zip(unknown, (c.K0, c.K1), strict=True)]
 
 
-Solve = Callable[[Correspondences, int], Estimate]
+def viewed(level: str, outcome: Outcome, seed: int) -> Outcome:
+    assert outcome.correspondences is not None
+    return dataclasses.replace(outcome, correspondences=described(level, outcome.pair, outcome.correspondences, seed))
 
 
-@dataclasses.dataclass(frozen=True)
-class CameraMethod(Measured):
-    """An estimator that is given what a level tells of the cameras."""
-
-    name: str
-    level: str
-    solve: Solve
-    identity: str
-
-    @classmethod
-    def of(cls, text: str, matches: str = "") -> CameraMethod:
-        """The method of ``NAME:LEVEL[:KEY=VALUE,...]``. Raises SystemExit for anything else."""
-        name, _, rest = text.partition(":")
-        level, _, settings = rest.partition(":")
-        if level not in LEVELS:
-            raise SystemExit(f"{text}: write NAME:LEVEL[:KEY=VALUE,...] with a level of {', '.join(LEVELS)}")
-        if name not in TAKES:
-            raise SystemExit(f"{text}: no method {name!r}; there are {', '.join(TAKES)}")
-        if level not in TAKES[name]:
-            raise SystemExit(f"{text}: {name} has no estimator for {level!r}; it has: {', '.join(TAKES[name])}")
-        solve, made_with = _solver(name, level, options(settings))
-        return cls(text, level, solve, identity(made_with, text, matches, Path(__file__).read_text()))
-
-    def applies(self, item: Item) -> bool:
-        return applies(self.level, item.pair)
-
-    def figures(self, item: Item, seed: int) -> Row:
-        """The figures of F and pose, whether t points backwards, and the errors of focal lengths not given exactly."""
-        pair, c = item.pair, described(self.level, item.pair, item.matches, seed)
-        start = time.process_time()
-        estimate = self.solve(c, seed)
-        ms = 1e3 * (time.process_time() - start)
-        inliers = estimate.inliers if estimate.inliers.shape == c.mask.shape else c.mask
-        estimate = estimate.replace(inliers=inliers)
-        assert item.outcome is not None
-        outcome = Outcome(pair, item.outcome.features, c, estimate, reason=estimate.reason[0])
-        row = {**judged(outcome, seed), "ms": ms}
-        if estimate.t is not None and pair.t is not None and bool(estimate.ok[0]) and bool(estimate.t.isfinite().all()):
-            row["flipped"] = bool(estimate.t[0].double().numpy() @ pair.t < 0)
-        if errors := [error for error in focal_errors(outcome).error if error is not None]:
-            row |= {f"focal_{round(100 * bound)}": float(np.mean(np.array(errors) <= bound)) for bound in FOCAL_ERRORS}
-        return row
+def method_of(text: str, matches: str = "") -> Method:
+    """The method of ``NAME:LEVEL[:KEY=VALUE,...]``. Raises SystemExit for anything else."""
+    name, _, rest = text.partition(":")
+    level, _, settings = rest.partition(":")
+    if level not in LEVELS:
+        raise SystemExit(f"{text}: write NAME:LEVEL[:KEY=VALUE,...] with a level of {', '.join(LEVELS)}")
+    if name not in TAKES:
+        raise SystemExit(f"{text}: no method {name!r}; there are {', '.join(TAKES)}")
+    if level not in TAKES[name]:
+        raise SystemExit(f"{text}: {name} has no estimator for {level!r}; it has: {', '.join(TAKES[name])}")
+    kind, changed = name.partition("_")[0], options(settings)
+    prior = {word: build("pruner", word) for word in PRIOR} if kind == "fmtorch" else {}
+    solve, made_with = _solver(name, level, changed)
+    made_with = [*made_with, *(("pruner", word, {}) for word in prior)]
+    return Method(
+        text, identity(made_with, text, matches, Path(__file__).read_text()), lambda family: prior,
+        lambda pair, c, seed: solve(c, seed), takes=lambda item: applies(level, item.pair),
+        view=functools.partial(viewed, level),
+    )  # fmt: skip
 
 
-def _solver(name: str, level: str, changed: dict[str, Any]) -> tuple[Solve, Stages]:
-    """What a method computes, and the presets that it is made of."""
+def _solver(name: str, level: str, changed: dict[str, Any]) -> tuple[Callable[..., Estimate], Stages]:
+    """What a method computes, and the preset that it is made of."""
     kind, _, alone = name.partition("_")
     if kind == "fmtorch":
-        prior = [build("pruner", word) for word in PRIOR]
-        own = functools.partial(_decomposed if alone else _with_cameras, build("estimator", kind, **changed))
-        stages: Stages = [("estimator", kind, changed), *(("pruner", word, {}) for word in PRIOR)]
-        return lambda c, seed: own(functools.reduce(lambda given, stage: stage(given), prior, c), seed), stages
+        own = build("estimator", kind, **changed)
+        return functools.partial(_decomposed if alone else _with_cameras, own), [("estimator", kind, changed)]
     if kind in ESSENTIAL:
         return functools.partial(_peer, _with_cameras, _by_essential(kind, changed)), []
     usual: dict[str, Any] = {"iterations": 5000, "prosac": True} if kind == "poselib" else {"two_view": not alone}
@@ -205,16 +177,12 @@ def _decomposed(estimator: Any, c: Correspondences, seed: int) -> Estimate:
 
 def _posed(estimate: Estimate, c: Correspondences) -> Estimate:
     """The estimate with the pose of F, by the given calibrations or else focal lengths by `bougnoux`."""
-    inliers = estimate.inliers[0].numpy()
-    if not bool(estimate.ok[0]) or not inliers.any():
+    if not bool(estimate.ok[0]) or not bool(estimate.inliers.any()):
         return estimate
-    F = estimate.F[0].double().numpy()
-    K0, K1 = calibrations(c, bougnoux(F, c))
-    normalised = [rays(x[0].double().numpy()[inliers], K) for x, K in ((c.x0, K0), (c.x1, K1))]
-    far = 1e9  # baselines: OpenCV's own bound of 50 rejects short ones
-    _, R, t, _, _ = cv2.recoverPose(K1.T @ F @ K0, normalised[0], normalised[1], np.eye(3), distanceThresh=far)
-    pose = {"R": np.asarray(R), "t": np.asarray(t).ravel(), "focals": focals_of(K0, K1)}
-    return estimate.replace(**{name: torch.from_numpy(np.asarray(v, np.float64))[None] for name, v in pose.items()})
+    F, x0, x1 = (value.double() for value in (estimate.F, c.x0, c.x1))
+    K = calibrations(c, bougnoux(F[0].numpy(), c))
+    pose = pose_from_fundamental(F, *(torch.from_numpy(own)[None] for own in K), x0, x1, estimate.inliers)
+    return estimate.replace(R=pose.R, t=pose.t, focals=torch.from_numpy(focals_of(*K))[None])
 
 
 def rays(x: Array, K: Array) -> Array:

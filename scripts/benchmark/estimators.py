@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from scripts.benchmark import pairs, tables
-from scripts.benchmark.methods import NGRANSAC, method, ngransac, read_specs, stages_of
+from scripts.benchmark.methods import NGRANSAC, method, ngransac, read_specs, specs_of, stages_of
 from scripts.benchmark.runner import Kept, Row, add_command, measure
 from scripts.benchmark.tables import BASELINES, Record, Results, Sheet, show
 
@@ -56,7 +56,7 @@ def add_arguments(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     extra = ngransac(arguments.ngransac)
-    specs = [*arguments.estimators, *(read_specs(arguments.specs) if arguments.specs else [])]
+    specs = specs_of(arguments.estimators, arguments.specs) if pairs.named(arguments) else []
     results = measured([spec for spec in specs if extra or NGRANSAC not in stages_of(spec)], arguments, extra)
     show([sheet(results)], arguments.table)
 
@@ -65,8 +65,6 @@ def measured(specs: Sequence[str], arguments: argparse.Namespace, extra: Mapping
     """These estimators on the pairs that are asked for, or where there are none all rows that are kept."""
 
     def measured_rows(kept: Kept) -> list[Row]:
-        if not specs:
-            raise SystemExit("name at least one estimator: --estimators or --specs")
         matches = pairs.matches_identity(arguments)
         methods = [method(spec, matches, extra) for spec in specs]
         return measure(methods, pairs.matched(arguments), arguments.seeds, kept)

@@ -35,6 +35,13 @@ SHARED = frozenset(("ratio", "one_to_one"))  # pruners that nearly all pipelines
 NO_STAGES: Mapping[str, Pruner] = {}
 
 
+def specs_of(words: Sequence[str], file: Path | None) -> list[str]:
+    """The methods that are named, and those of a file. Raises SystemExit for none."""
+    if specs := [*words, *(read_specs(file) if file else [])]:
+        return specs
+    raise SystemExit("name at least one method, or a file of --specs")
+
+
 def read_specs(path: Path) -> list[str]:
     """One method a line, without comments."""
     return [text for line in path.read_text().splitlines() if (text := line.partition("#")[0].strip())]
@@ -102,7 +109,7 @@ def method(spec: str, matches: str = "", extra: Mapping[str, Pruner] = NO_STAGES
     return Method(spec, made_with, lambda family: stages, solve, view=functools.partial(viewed, views))
 
 
-def viewed(views: Sequence[Callable[..., Any]], outcome: Outcome) -> Outcome:
+def viewed(views: Sequence[Callable[..., Any]], outcome: Outcome, seed: int) -> Outcome:
     pair, c = outcome.pair, outcome.correspondences
     if c is None or not views:
         return outcome

@@ -15,7 +15,6 @@ import argparse
 import csv
 import dataclasses
 import functools
-import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -25,16 +24,16 @@ import numpy as np
 import torch
 
 from fmtorch import data, metrics, presets
-from fmtorch.core.types import Correspondences
-from fmtorch.data import DataError
+from fmtorch.core.types import Correspondences, Estimate
+from fmtorch.data import DataError, ImagePair
 from fmtorch.evaluation.statistics import MIN_UNITS, PERCENT, POSE_THRESHOLDS, difference
 from fmtorch.io import h5
 from fmtorch.pipeline.pipeline import Outcome
 from fmtorch.presets.objects import merged
 from scripts.benchmark import pairs
 from scripts.benchmark.cameras import has_cameras
-from scripts.benchmark.methods import estimate_by_call, options
-from scripts.benchmark.runner import Item, Kept, Measured, Row, add_command, console, identity, judged, measure
+from scripts.benchmark.methods import estimate_by_call, split
+from scripts.benchmark.runner import Item, Kept, Method, Row, add_command, console, identity, measure
 from scripts.benchmark.tables import FIGURES, Record, Results, Sheet, Span, show, span
 
 METHODS = ("E:fmtorch", "E:poselib", "E:colmap", "F:fmtorch", "F:poselib", "F:colmap")
@@ -57,13 +56,14 @@ def add_arguments(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     thresholds, published = read_published()
-    methods = installed(arguments.methods)
-    kept = Kept(arguments.rows)
+    words, kept = installed(arguments.methods), Kept(arguments.rows)
     rows: list[Row] = []
-    for name, items, digest in sets_of(arguments, thresholds):
+    for name, threshold, items, digest in sets_of(arguments, thresholds):
         selected = items[:: arguments.every]
         usable = [item for item in selected if item.pair.problem is None]
-        own = measure([dataclasses.replace(each, matches=digest) for each in methods], usable, arguments.seeds, kept)
+        for item in usable:
+            item.facts["threshold"] = threshold
+        own = measure([protocol(word, threshold, digest) for word in words], usable, arguments.seeds, kept)
         say_what_is_missing(name, selected, own)
         rows += [{**row, "family": name} for row in own]
     if not rows:
@@ -71,8 +71,11 @@ def run(arguments: argparse.Namespace) -> None:
     show([sheet(rows, thresholds, published)], arguments.table)
 
 
-def sets_of(arguments: argparse.Namespace, thresholds: Mapping[str, float]) -> Iterator[tuple[str, list[Item], str]]:
-    """Name, pairs and digest of the sets that are asked for. SystemExit where there are none, or for no threshold."""
+Sets = Iterator[tuple[str, float, list[Item], str]]  # name, threshold in pixels, pairs and digest of each
+
+
+def sets_of(arguments: argparse.Namespace, thresholds: Mapping[str, float]) -> Sets:
+    """The sets that are asked for. SystemExit where there are none, or for no threshold."""
     if arguments.files is None and not pairs.named(arguments):
         raise SystemExit("name FILES, the folder `relative` of PoseBench's data, or --root DATA")
     if arguments.files is not None:
@@ -83,10 +86,10 @@ def sets_of(arguments: argparse.Namespace, thresholds: Mapping[str, float]) -> I
         families: dict[str, list[Item]] = {}
         for item in pairs.matched(arguments):
             if has_cameras(item.pair):
-                own = Item(item.pair, functools.partial(_points_of, item), {"threshold": arguments.threshold})
+                own = Item(item.pair, functools.partial(_points_of, item))
                 families.setdefault(item.pair.family, []).append(own)
         digest = pairs.matches_identity(arguments)
-        yield from ((name, items, digest) for name, items in families.items())
+        yield from ((name, arguments.threshold, items, digest) for name, items in families.items())
 
 
 def _points_of(item: Item) -> Outcome | None:
@@ -98,82 +101,59 @@ def _points_of(item: Item) -> Outcome | None:
     return dataclasses.replace(item.outcome, correspondences=plain)
 
 
-def _files(folder: Path, thresholds: Mapping[str, float], px: float | None) -> Iterator[tuple[str, list[Item], str]]:
+def _files(folder: Path, thresholds: Mapping[str, float], px: float | None) -> Sets:
     root = folder / "relative" if (folder / "relative").is_dir() else folder
     try:
         paths = [path for path in h5.files(root) if not path.stem.startswith("fisheye_") or path.stem in thresholds]
-        given = {path: thresholds.get(path.stem, px) for path in paths}
-        for path in (path for path, threshold in given.items() if threshold is None):
-            raise SystemExit(f"{path.name} is none of PoseBench's sets: give its threshold in pixels, --threshold")
-        for path, threshold in given.items():
+        for path in paths:
+            if (threshold := thresholds.get(path.stem, px)) is None:
+                raise SystemExit(f"{path.name} is none of PoseBench's sets: give its threshold in pixels, --threshold")
             dataset = data.load("h5", root=path, layout="posebench")
             items = pairs.items(dataset, pairs.front_of("sift", []))  # which takes the matches that a pair comes with
-            for item in items:
-                item.facts["threshold"] = threshold
-            yield path.stem, items, dataset.digest
+            yield path.stem, threshold, items, dataset.digest
     except DataError as error:
         raise SystemExit(f"{error}; give the folder `relative` of PoseBench's data") from error
 
 
-@dataclasses.dataclass(frozen=True)
-class Protocol(Measured):
-    """An estimator by PoseBench's protocol. changes: options that replace the protocol's; matches: their digest."""
+def protocol(text: str, threshold: float, matches: str = "") -> Method:
+    """``KIND:PRESET[:KEY=VALUE,...]`` by the protocol at so many pixels. Raises SystemExit for anything else."""
+    kind, _, rest = text.partition(":")
+    preset, changes = split(rest)
+    if kind not in KINDS or preset not in presets.available("estimator"):
+        raise SystemExit(f"{text}: write KIND:PRESET[:KEY=VALUE,...], KIND being E or F, PRESET of `fmtorch list`")
+    own = options_of(preset, changes, threshold)
+    solve = functools.partial(_estimated, kind, {"estimator": preset, **own})
+    made_with = identity([("estimator", preset, own)], text, matches)
+    return Method(text, made_with, lambda family: {}, solve, signed=True)
 
-    name: str
-    kind: str
-    preset: str
-    changes: dict[str, Any]
-    matches: str = ""
 
-    @classmethod
-    def of(cls, text: str) -> Protocol:
-        """``KIND:PRESET[:KEY=VALUE,...]``. Raises SystemExit for anything else."""
-        kind, _, rest = text.partition(":")
-        preset, _, settings = rest.partition(":")
-        if kind not in KINDS or preset not in presets.available("estimator"):
-            raise SystemExit(f"{text}: write KIND:PRESET[:KEY=VALUE,...], KIND being E or F, PRESET of `fmtorch list`")
-        return cls(text, kind, preset, options(settings))
+def _estimated(kind: str, given: dict[str, Any], pair: ImagePair, c: Correspondences, seed: int) -> Estimate:
+    try:
+        return estimate_by_call(given | ({"K0": pair.K0, "K1": pair.K1} if kind == "E" else {}), c, seed)
+    except ValueError as error:
+        no, zero = torch.zeros(1, dtype=torch.bool), torch.zeros(1, dtype=torch.int64)
+        return Estimate(torch.zeros(1, 3, 3), torch.zeros_like(c.mask), no, (str(error),), zero)
 
-    @functools.cached_property
-    def identity(self) -> str:  # type: ignore[override]
-        """Of its options at 1 px, code, and versions of peers."""
-        return identity([("estimator", self.preset, self.options(1.0))], self.name, self.matches)
 
-    def options(self, threshold: float) -> dict[str, Any]:
-        """The options of a data set whose threshold is so many pixels.
+def options_of(name: str, changes: dict[str, Any], threshold: float) -> dict[str, Any]:
+    """The options of a preset on a data set whose threshold is so many pixels; changes: replace the protocol's.
 
-        At most 1,000 samples, at least 100, confidence 0.9999. A peer gets the threshold. Our presets, whose distances
-        are of matches that are exact to about a pixel, get them times the threshold, unless ``scaled=false``.
-        """
-        changes = dict(self.changes)
-        scaled = changes.pop("scaled", True)
-        preset = presets.load("estimator", self.preset)
-        if "hypotheses" in preset:  # one of ours
-            own = _distances(preset, threshold) if scaled else {}
-            own |= {"hypotheses": MAX_ITERATIONS, "confidence": CONFIDENCE}
-            if preset.get("focal"):
-                own["focal"] = {**own.get("focal", {}), "rounds": MAX_ITERATIONS // FOCAL_SAMPLES}
-        else:
-            known = {"threshold": threshold, "iterations": MAX_ITERATIONS, "min_iterations": MIN_ITERATIONS}
-            known |= {"confidence": CONFIDENCE, "two_view": False}
-            own = {name: value for name, value in known.items() if name in preset}
-        return merged(own, changes)
-
-    def figures(self, item: Item, seed: int) -> Row:
-        """What it makes of a pair: signed angles in degrees, 180 where it has no pose, and milliseconds."""
-        matched, pair = item.outcome, item.pair
-        assert matched is not None
-        start = time.process_time()
-        if (c := matched.correspondences) is not None:
-            given = {"estimator": self.preset, **self.options(item.facts["threshold"])}
-            given |= {"K0": pair.K0, "K1": pair.K1} if self.kind == "E" else {}
-            try:
-                estimate = estimate_by_call(given, c, seed)
-                matched = dataclasses.replace(matched, estimate=estimate, reason=estimate.reason[0])
-            except ValueError as error:
-                matched = Outcome(pair, reason=str(error))
-        ms = 1e3 * (time.process_time() - start)
-        return {**judged(matched, seed, signed=True), "ms": ms}
+    At most 1,000 samples, at least 100, confidence 0.9999. A peer gets the threshold. Our presets, whose distances are
+    of matches that are exact to about a pixel, get them times the threshold, unless ``scaled=false``.
+    """
+    changes = dict(changes)
+    scaled = changes.pop("scaled", True)
+    preset = presets.load("estimator", name)
+    if "hypotheses" in preset:  # one of ours
+        own = _distances(preset, threshold) if scaled else {}
+        own |= {"hypotheses": MAX_ITERATIONS, "confidence": CONFIDENCE}
+        if preset.get("focal"):
+            own["focal"] = {**own.get("focal", {}), "rounds": MAX_ITERATIONS // FOCAL_SAMPLES}
+    else:
+        known = {"threshold": threshold, "iterations": MAX_ITERATIONS, "min_iterations": MIN_ITERATIONS}
+        known |= {"confidence": CONFIDENCE, "two_view": False}
+        own = {key: value for key, value in known.items() if key in preset}
+    return merged(own, changes)
 
 
 def _distances(preset: Mapping[str, Any], scale: float) -> dict[str, Any]:
@@ -183,17 +163,18 @@ def _distances(preset: Mapping[str, Any], scale: float) -> dict[str, Any]:
     return {**{key: inside for key, inside in levels.items() if inside}, **own}
 
 
-def installed(words: Sequence[str]) -> list[Protocol]:
+def installed(words: Sequence[str]) -> list[str]:
     """The methods whose packages are there; of those that are named, all must be. Raises SystemExit for another."""
     available = []
-    for method in map(Protocol.of, words):
+    for word in words:
         try:
-            presets.build("estimator", method.preset)
-            available.append(method)
+            protocol(word, 1.0)
+            presets.build("estimator", word.split(":")[1])
+            available.append(word)
         except ImportError as error:
             if words is not METHODS:
-                raise SystemExit(f"{method.name}: {error}") from error
-            console.print(f"{method.name} is left out: {error}", highlight=False, markup=False)
+                raise SystemExit(f"{word}: {error}") from error
+            console.print(f"{word} is left out: {error}", highlight=False, markup=False)
     return available
 
 

@@ -36,6 +36,7 @@ KEPT = (
     "ok", "reason", "nsgd", "inlier_rate", "inlier_rate_before", "corrs", "corrs_before", "features0", "features1",
     "significance", "rotation_error", "translation_error",
 )  # fmt: skip
+FOCAL_ERRORS = (5, 10)  # per cent
 NEAR = 2.0  # px from the true epipolar line: matches whose exactness is looked at
 ROWS = "keeps what each method makes of each pair, one line each; shown where no data set is named"
 
@@ -155,7 +156,8 @@ class Method(Measured):
     """Pruners, whose time counts, and an estimator.
 
     stages: of a family's pairs, by name. untimed: the names of those whose time does not count. takes: whether it is
-    measured on an item. view: what is done to a pair and its matches before.
+    measured on an item. view: what is done to a pair and its matches before, by a seed. signed: whether the sign of a
+    translation counts.
     """
 
     name: str
@@ -164,7 +166,8 @@ class Method(Measured):
     estimator: Callable[[ImagePair, Correspondences, int], Estimate]
     untimed: frozenset[str] = frozenset()
     takes: Callable[[Item], bool] = lambda item: True
-    view: Callable[[Outcome], Outcome] = lambda outcome: outcome
+    view: Callable[[Outcome, int], Outcome] = lambda outcome, seed: outcome
+    signed: bool = False
 
     def applies(self, item: Item) -> bool:
         return self.takes(item)
@@ -172,9 +175,9 @@ class Method(Measured):
     def figures(self, item: Item, seed: int) -> Row:
         """`KEPT` of the pair's row, and milliseconds of pruners and of all."""
         assert item.outcome is not None
-        matched = self.view(item.outcome)
+        matched = self.view(item.outcome, seed)
         if matched.correspondences is None:
-            return {**judged(matched, seed), "ms": 0.0, "ms_pruning": 0.0}
+            return {**judged(matched, seed, self.signed), "ms": 0.0, "ms_pruning": 0.0}
         c, pruning = matched.correspondences, 0.0
         for name, stage in self.stages(item.pair.family).items():
             start = time.process_time()
@@ -186,13 +189,21 @@ class Method(Measured):
         estimation = time.process_time() - start
         sized = c.replace(size0=matched.correspondences.size0, size1=matched.correspondences.size1)
         outcome = dataclasses.replace(matched, correspondences=sized, estimate=estimate, reason=estimate.reason[0])
-        return {**judged(outcome, seed), "ms": 1e3 * (pruning + estimation), "ms_pruning": 1e3 * pruning}
+        row = judged(outcome, seed, self.signed)
+        return {**row, "ms": 1e3 * (pruning + estimation), "ms_pruning": 1e3 * pruning}
 
 
 def judged(outcome: Outcome, seed: int, signed: bool = False) -> Row:
-    """The figures of an estimate by the true F and cameras: `KEPT`, and the exactness of the matches."""
+    """The figures of an estimate by the true F and cameras: `KEPT`, the errors of focal lengths that were not given
+    exactly, whether t points backwards, and the exactness of the matches.
+    """
     row = evaluate([outcome], seed, signed)[0]
     figures: Row = {name: getattr(row, name) for name in KEPT}
+    errors = [error for error in (row.focal_error0, row.focal_error1) if error is not None]
+    figures |= {f"focal_{p}": sum(error <= p / 100 for error in errors) / len(errors) for p in FOCAL_ERRORS if errors}
+    t, true = None if outcome.estimate is None else outcome.estimate.t, outcome.pair.t
+    if t is not None and true is not None and row.ok and bool(t.isfinite().all()):
+        figures["flipped"] = bool(t[0].double().numpy() @ true < 0)
     c = outcome.correspondences
     if c is not None:
         r = sampson(torch.from_numpy(outcome.pair.F)[None], c.x0.double(), c.x1.double())[c.mask].abs()

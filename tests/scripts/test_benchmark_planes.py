@@ -1,5 +1,6 @@
 """Benchmarks with programs of their own: related pairs, planes, cameras, verified databases."""
 
+import functools
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +17,9 @@ from fmtorch.geometry import homography_transfer
 from fmtorch.scenes import PICTURES, Plan, RenderedPairs
 from fmtorch.two_view.pair_type import classify
 from scripts.benchmark import cameras, pairs, planes, related, verify
-from scripts.benchmark.cameras import LEVELS, TAKES, CameraMethod
+from scripts.benchmark.cameras import LEVELS, TAKES, applies, bougnoux, calibrations, described
 from scripts.benchmark.methods import read_specs
-from scripts.benchmark.runner import Item, Kept, Row
+from scripts.benchmark.runner import Item, Kept, Method, Row
 from scripts.benchmark.verify import Scene, Truth, accuracy, calibrate, centre_errors, sheets
 from tests.helpers import cross_matrix, draw_set
 from tests.scripts.samples import item as plain_item
@@ -147,12 +148,44 @@ def true_f(K0: np.ndarray, K1: np.ndarray, R: np.ndarray, t: np.ndarray) -> np.n
     return np.linalg.inv(K1).T @ cross_matrix(t) @ R @ np.linalg.inv(K0)
 
 
+def zoomed(factor: float) -> np.ndarray:
+    return K @ np.diag([factor, factor, 1])
+
+
+def test_levels_tell_what_they_say() -> None:
+    own = item()
+    known, wrong, one_sided, shared, unknown = (
+        described(level, own.pair, own.matches, 0) for level in ("known", "wrong", "one_sided", "shared", "unknown")
+    )
+    assert known.focal is not None
+    assert known.K0 is not None
+    assert wrong.K1 is not None
+    assert known.focal[0, :, 1].tolist() == [0, 0]
+    assert np.array_equal(known.K0[0], K)
+    assert np.allclose(wrong.K1[0], zoomed(1.5))
+    given = [k is not None for c in (one_sided, shared, unknown) for k in (c.K0, c.K1)]
+    assert given == [True, False, False, False, False, False]
+    assert [bool(c.shared_focal) for c in (shared, unknown)] == [True, False]
+    assert np.array_equal(calibrations(unknown, np.array([3.0, 4]))[1], [[4, 0, 499.5], [0, 4, 379.5], [0, 0, 1]])
+    assert applies("shared", own.pair)
+    assert not applies("shared", item(zoomed(1.01)).pair)
+    assert applies("unknown", item(zoomed(1.01)).pair)
+
+
+def test_bougnoux_gives_the_focal_lengths_of_a_true_matrix() -> None:
+    own = item(zoomed(1.3))
+    unknown = described("unknown", own.pair, own.matches, 0)
+    assert bougnoux(own.pair.F, unknown) == pytest.approx([1.3 * 950, 950], rel=1e-8)
+    forward = true_f(K, K, np.eye(3), np.array([0, 0, 1.0]))  # axes that are one line determine none
+    assert bougnoux(forward, unknown) == pytest.approx([1200, 1200])
+
+
 @pytest.mark.parametrize(("name", "level"), [(name, level) for name, levels in TAKES.items() for level in levels])
 def test_every_method_solves_an_easy_pair_at_each_level_that_it_takes(name: str, level: str) -> None:
     kind = name.partition("_")[0]
     pytest.importorskip({"poselib": "poselib", "colmap": "pycolmap"}.get(kind, "cv2"))
     ours = kind == "fmtorch"
-    found = CameraMethod.of(f"{name}:{level}" + ("" if ours else ":threshold=1")).figures(item(), 0)
+    found = cameras.method_of(f"{name}:{level}" + ("" if ours else ":threshold=1")).figures(item(), 0)
     assert found["ok"]
     assert found["flipped"] is False
     assert ("focal_10" in found) == (level != "known")
@@ -168,13 +201,13 @@ def test_every_method_solves_an_easy_pair_at_each_level_that_it_takes(name: str,
 ])  # fmt: skip
 def test_a_method_that_there_is_not_is_refused(text: str, message: str) -> None:
     with pytest.raises(SystemExit, match=message):
-        CameraMethod.of(text)
+        cameras.method_of(text)
 
 
 def test_the_methods_of_the_page_are_methods() -> None:
     texts = read_specs(Path(cameras.__file__).with_name("cameras.txt"))
     assert len(set(texts)) == len(texts)
-    assert {CameraMethod.of(text).level for text in texts} == set(LEVELS)
+    assert {cameras.method_of(text).name.split(":")[1] for text in texts} == set(LEVELS)
 
 
 def judged(level: str, R: np.ndarray | None, t: np.ndarray = T, focals: tuple[float, float] | None = None) -> Row:
@@ -187,7 +220,8 @@ def judged(level: str, R: np.ndarray | None, t: np.ndarray = T, focals: tuple[fl
     answer = Estimate(
         F, mask & ok, ok, ("" if R is not None else "nothing",), torch.zeros(1, dtype=torch.int64), **posed
     )
-    return CameraMethod("x", level, lambda c, seed: answer, "").figures(given, 0)
+    view = functools.partial(cameras.viewed, level)
+    return Method("x", "", lambda family: {}, lambda pair, c, seed: answer, view=view).figures(given, 0)
 
 
 def test_judgement_of_a_true_a_flipped_and_no_pose() -> None:
