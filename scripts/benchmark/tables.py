@@ -102,6 +102,14 @@ def show(sheets: Sequence[Sheet], table: Path | None = None) -> None:
             sheet.write(table if alone else table.with_name(f"{table.stem}_{sheet.name}{table.suffix}"))
 
 
+def grouped(rows: Iterable[Row], *fields: str) -> dict[tuple[Any, ...], list[Row]]:
+    """The rows by the values of some fields."""
+    groups: dict[tuple[Any, ...], list[Row]] = {}
+    for row in rows:
+        groups.setdefault(tuple(row[field] for field in fields), []).append(row)
+    return groups
+
+
 def chance_of_more(a: Sequence[float] | Values, b: Sequence[float] | Values) -> float:
     """The area under the ROC curve: the chance that one of `a` exceeds one of `b`, ties count half; NaN of none."""
     if len(a) == 0 or len(b) == 0:
