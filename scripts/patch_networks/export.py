@@ -69,13 +69,12 @@ def _training(checkpoint: Mapping[str, Any]) -> dict[str, str]:
         f"{count} of {source}" + (f" ({licences[source]})" if source in licences else "")
         for source, count in data["photographs"].items()
     )
-    scenes = ", ".join(f"{count} of {family}" for family, count in data.get("scenes", {}).items())
     rows = {
         "origin": "trained by this project from random weights, scripts.patch_networks.train",
         "photographs": "; ".join(photographs),
         "patches": f"{data['patches']} of {data['points']} points, found independently by DoG and Hessian in "
         f"{data['views']} random views of each photograph ({listed(data['limits'])}) with changes of light, blur, "
-        f"noise and JPEG{f', and in as many photographs of each rendered scene ({scenes})' if scenes else ''}",
+        "noise and JPEG",
         "loss": listed(checkpoint["loss"]),
     }
     if teacher := checkpoint.get("teacher"):

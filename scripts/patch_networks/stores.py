@@ -22,10 +22,9 @@ from torch import Tensor, from_numpy
 from fmtorch.data.images import read_image
 from fmtorch.jit import random
 from fmtorch.jit.random import Stream
-from fmtorch.scenes.dataset import Task
 from fmtorch.scenes.surfaces import PICTURES, skimage_file
 from fmtorch.training.planes import Photograph, PlaneViews
-from scripts.patch_networks import patches as patches_module
+from scripts.patch_networks import patches
 from scripts.patch_networks.patches import CONTEXT_SIZE, Part, Tolerance, patch_similarity
 
 MAX_SIMILARITY = 0.85  # of the photographs of a pair: GeoDesc's authors leave out those that are more alike
@@ -53,9 +52,9 @@ class PatchStore:
         folder = Path(folder)
         if not (folder / "store.json").is_file():
             raise FileNotFoundError(f"{folder} holds no patches (store.json is absent)")
-        patches = np.memmap(folder / "patches.raw", np.uint8, "r").reshape(-1, CONTEXT_SIZE, CONTEXT_SIZE)
+        stored = np.memmap(folder / "patches.raw", np.uint8, "r").reshape(-1, CONTEXT_SIZE, CONTEXT_SIZE)
         with np.load(folder / "geometry.npz") as geometry:
-            return cls(patches, **geometry, description=json.loads((folder / "store.json").read_text()))
+            return cls(stored, **geometry, description=json.loads((folder / "store.json").read_text()))
 
     def __len__(self) -> int:
         return len(self.first) - 1
@@ -108,13 +107,11 @@ def match_sets(store: PatchStore, matches: int, max_similarity: float = MAX_SIMI
     """The sets of pairs of photographs that share at least `matches` points and are not more alike than allowed.
 
     S_image, the similarity of two photographs, is the mean S_patch of their shared points (section 3.3). In the order
-    of the first photograph and then of the second; matches in the order of their points. Patches without a known
-    incidence angle match nothing.
+    of the first photograph and then of the second; matches in the order of their points.
 
     Raises ValueError where no pair is left.
     """
     pairs = _pairs_of_points(store.first)
-    pairs = pairs[:, np.isfinite(store.incidence)[pairs].all(0)]
     pairs = np.where(store.view[pairs[0]] > store.view[pairs[1]], pairs[::-1], pairs)
     a, b = pairs = pairs[:, np.lexsort((pairs[0], *store.view[pairs][::-1]))]
     similarity = patch_similarity(store.rays[a], store.rays[b], store.incidence[a], store.incidence[b])
@@ -144,7 +141,7 @@ def _pairs_of_points(first: NDArray[np.int64]) -> NDArray[np.int64]:
 
 @dataclasses.dataclass(frozen=True)
 class Cutting:
-    """How patches are cut: of photographs as planes and of rendered scenes.
+    """How patches are cut of photographs as planes.
 
     points: strongest of each detector. longest_side: pixels, to which larger photographs are reduced.
     """
@@ -154,35 +151,30 @@ class Cutting:
     tolerance: Tolerance = dataclasses.field(default_factory=Tolerance)
     longest_side: int = 1024
 
-    def patches_of(self, job: tuple[Photograph | Task, tuple[int, int]]) -> Part:
-        """The patches of a photograph or of a rendered scene, by a seed."""
-        source, seed = job
+    def patches_of(self, job: tuple[Photograph, tuple[int, int]]) -> Part:
+        """The patches of a photograph, by a seed."""
+        photograph, seed = job
         cv2.setNumThreads(1)
-        rng = np.random.default_rng(seed)
-        if isinstance(source, Task):
-            return patches_module.tracks_of_views(
-                patches_module.views_of_scene(source, rng, self.points), self.tolerance
-            )
-        image = read_image(source.path)
+        image = read_image(photograph.path)
         if (scale := self.longest_side / max(image.shape[:2])) < 1:
             image = np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
-        views = patches_module.views_of_plane(image, rng, self.planes, self.points)
-        return patches_module.tracks_of_views(views, self.tolerance)
+        return patches.tracks(
+            patches.views_of(image, np.random.default_rng(seed), self.planes, self.points), self.tolerance
+        )
 
 
 def build_store(
-    folder: Path, sources: Sequence[Photograph | Task], cutting: Cutting, seed: int, workers: int = 1
+    folder: Path, photographs: Sequence[Photograph], cutting: Cutting, seed: int, workers: int = 1
 ) -> PatchStore:
-    """Cut corresponding patches from photographs and rendered scenes into `folder`, which appears once it is complete.
+    """Cut corresponding patches from photographs into `folder`, which appears once it is complete.
 
-    The patches of a source depend on the seed and its place in the list alone.
+    The patches of a photograph depend on the seed and its place in the list alone.
     Raises FileExistsError if the folder exists.
     """
     if folder.exists():
         raise FileExistsError(f"{folder} exists; delete it to cut the patches again")
     description = {
-        "photographs": dict(collections.Counter(s.source for s in sources if isinstance(s, Photograph))),
-        "scenes": dict(collections.Counter(s.family for s in sources if isinstance(s, Task))), "seed": seed,
+        "photographs": dict(collections.Counter(each.source for each in photographs)), "seed": seed,
         "views": cutting.planes.views, "limits": dataclasses.asdict(cutting.planes),
         "tolerance": dataclasses.asdict(cutting.tolerance),
     }  # fmt: skip
@@ -191,7 +183,7 @@ def build_store(
         unfinished = Path(temporary) / folder.name
         unfinished.mkdir()
         with multiprocessing.get_context("spawn").Pool(workers) as pool:
-            jobs = [(source, (seed, i)) for i, source in enumerate(sources)]
+            jobs = [(photograph, (seed, i)) for i, photograph in enumerate(photographs)]
             _write(unfinished, pool.imap(cutting.patches_of, jobs), description)
         unfinished.rename(folder)
     return PatchStore.open(folder)

@@ -35,7 +35,7 @@ from fmtorch.presets import plain
 from fmtorch.training.planes import PlaneViews, list_photographs
 from scripts.patch_networks import objectives, stores
 from scripts.patch_networks.objectives import DRAWS, CovarianceObjective, DescriptorObjective, Objective
-from scripts.patch_networks.patches import Tolerance, training_scenes
+from scripts.patch_networks.patches import Tolerance
 from scripts.patch_networks.stores import Cutting, MatchSets, PatchStore, match_sets, order
 
 
@@ -178,8 +178,7 @@ def opened_stores(config: DictConfig) -> list[PatchStore]:
             chosen = stores.split(photographs, given.held_out)[side]
             console.print(f"cutting patches of {len(chosen)} photographs into {folder}")
             seed = patches.seed + side
-            scenes = training_scenes(0 if side else patches.scenes, patches.planes.views, seed)
-            stores.build_store(folder, [*chosen, *scenes], cutting_of(config), seed, patches.workers)
+            stores.build_store(folder, chosen, cutting_of(config), seed, patches.workers)
         opened.append(PatchStore.open(folder))
     return opened
 
