@@ -31,9 +31,7 @@ from rich.table import Table
 
 from fmtorch.core.terminal import console, exits_with_message
 
-DEFAULTS = {
-    "weights": None, "dataset": None, "files": None, "sha256": None, "folder": None, "url": None, "timeout": 60,
-}  # fmt: skip
+DEFAULTS = dict.fromkeys(("weights", "dataset", "files", "sha256", "folder", "url")) | {"timeout": 60}
 KNOWN = OmegaConf.load(Path(__file__).with_suffix(".yaml"))
 WEIGHTS, DATASETS = KNOWN.weights, KNOWN.datasets
 
@@ -73,21 +71,6 @@ def expect_digest(url: str, path: Path, sha256: str | None) -> str:
     if sha256 is not None and digest != sha256.lower():
         path.unlink()
         raise ValueError(f"{url} has SHA-256 {digest}, not {sha256}: it was not kept")
-    return digest
-
-
-def download(url: str, path: Path, sha256: str | None, timeout: float | int = 60) -> str:
-    """Fetch `url` into `path`, which appears only when the file is complete and verified; returns its SHA-256.
-
-    sha256: what it must be; None accepts what comes. Raises ConnectionError where the file cannot be fetched,
-    ValueError where it is another one.
-    """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}") as folder:
-        fresh = Path(folder) / path.name
-        resume(url, fresh, timeout)
-        digest = expect_digest(url, fresh, sha256)
-        os.replace(fresh, path)
     return digest
 
 
@@ -167,7 +150,8 @@ def fetch(config: DictConfig) -> Path:
     if expected != "any" and not re.fullmatch(r"[0-9a-fA-F]{64}", expected):
         raise ValueError(f"sha256={expected} is no SHA-256: 64 hexadecimal digits, or any")
     path = Path(config.folder or "weights") / name
-    digest = download(config.url or entry.url, path, None if expected == "any" else expected, config.timeout)
+    resume(config.url or entry.url, path, config.timeout)
+    digest = expect_digest(config.url or entry.url, path, None if expected == "any" else expected)
     state = "not verified" if expected == "any" else "verified"
     console.print(f"{path}  SHA-256 {digest} ({state})  licence: MIT  architecture={entry.architecture}")
     return path

@@ -24,6 +24,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.cluster.vq import kmeans2
 from torch import Tensor
 
 from fmtorch.core.files import models_dir, replacing
@@ -84,25 +85,12 @@ def codebooks(arguments: argparse.Namespace) -> None:
 
 
 def learned(parts: list[Tensor], centers: int, dimensions: int) -> Codebook:
+    """Centres by Lloyd's iterations from k-means++ (Arthur and Vassilvitskii, 2007)."""
     descriptors = torch.cat(parts)
     mean, basis = learn_projection(descriptors, dimensions)
-    return Codebook(mean, basis, k_means((descriptors - mean) @ basis, centers))
-
-
-def k_means(x: Tensor, count: int, seed: int = 0) -> Tensor:
-    """Centres (count, d) of x (n, d) by Lloyd's iterations from k-means++ (Arthur and Vassilvitskii, 2007)."""
-    generator = torch.Generator().manual_seed(seed)
-    centers = x[torch.randint(len(x), (1,), generator=generator)]
-    nearest = (x - centers[0]).square().sum(1)
-    while len(centers) < count:
-        centers = torch.cat([centers, x[torch.multinomial(nearest, 1, generator=generator)]])
-        nearest = torch.minimum(nearest, (x - centers[-1]).square().sum(1))
-    for _ in range(ITERATIONS):
-        assigned = torch.cdist(x, centers).argmin(1)
-        counts = torch.bincount(assigned, minlength=count)
-        sums = torch.zeros_like(centers).index_add_(0, assigned, x)
-        centers = torch.where(counts[:, None] > 0, sums / counts.clamp(min=1)[:, None], centers)
-    return centers
+    projected = ((descriptors - mean) @ basis).numpy()
+    nearest, _ = kmeans2(projected, centers, iter=ITERATIONS, minit="++", seed=0)
+    return Codebook(mean, basis, torch.from_numpy(nearest))
 
 
 def ngransac(arguments: argparse.Namespace) -> None:
