@@ -38,9 +38,7 @@ WEIGHTS, DATASETS = KNOWN.weights, KNOWN.datasets
 
 def resume(url: str, path: Path, timeout: float | int = 60) -> None:
     """Fetch `url` into `path`, beside which an unfinished part is kept, and continued where the server can.
-
-    Raises ConnectionError where it cannot be fetched whole; the same call then goes on.
-    """
+    Raises ConnectionError where it cannot be fetched whole; the same call then goes on."""
     if path.is_file():
         return
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -76,9 +74,7 @@ def expect_digest(url: str, path: Path, sha256: str | None) -> str:
 
 def unpack(archive: Path, folder: Path) -> list[Path]:
     """Unpack a tar archive; its files and folders appear in `folder` when all are there. Returns them.
-
-    Raises ValueError for a damaged archive, for members that would leave the folder, and for links and devices.
-    """
+    Raises ValueError for a damaged archive, for members that would leave the folder, and for links and devices."""
     with tempfile.TemporaryDirectory(dir=folder, prefix=".unpacking") as temporary:
         try:
             with tarfile.open(archive) as tar:
@@ -95,9 +91,7 @@ def unpack(archive: Path, folder: Path) -> list[Path]:
 
 def _extract(tar: tarfile.TarFile, member: tarfile.TarInfo, folder: Path) -> None:
     """Write a file or make a folder below `folder`: what `filter="data"` allows, which Python 3.11.2 has not.
-
-    Raises TarError for anything else, and for a name that leads elsewhere.
-    """
+    Raises TarError for anything else, and for a name that leads elsewhere."""
     name = PurePosixPath(member.name)
     if name.is_absolute() or ".." in name.parts or PureWindowsPath(member.name).drive or "\\" in member.name:
         raise tarfile.TarError(f"{member.name!r} would be outside the folder")

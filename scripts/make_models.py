@@ -107,11 +107,9 @@ def ngransac(arguments: argparse.Namespace) -> None:
 
 def ngransac_state(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """The state of `LC` from that of the network of Brachmann & Rother, "Neural-guided RANSAC", ICCV 2019.
-
     Their network is LC with 12 blocks, coordinates="size" and side=["ratio"]. Its layers are p_in, 0s0 to 11s3 and
-    p_out; the biases of s0 and s2, which context normalisation takes away, are left out.
-    Raises ValueError for a name that is none of these.
-    """
+    p_out; the biases of s0 and s2, which context normalisation takes away, are left out. Raises ValueError for a name
+    that is none of these."""
     state = {}
     for key, value in weights.items():
         layer, _, kind = key.rpartition(".")

@@ -40,10 +40,8 @@ ZOOM = 2.5
 @dataclasses.dataclass(frozen=True)
 class Case:
     """A pair with its matches, the right and the wrong told by its true F.
-
     c: a batch of one, no slot masked. right: (n,), True within RIGHT_PX of the true epipolar lines in both images.
-    wrong: (n,), True beyond WRONG_PX in one of them. spare: wrong nearest neighbours that the ratio test took away.
-    """
+    wrong: (n,), True beyond WRONG_PX in one of them. spare: wrong nearest neighbours that the ratio test took away."""
 
     pair: ImagePair
     c: Correspondences
@@ -108,10 +106,8 @@ def on_plane(case: Case) -> Bool[Tensor, " n"]:
 
 def inlier_ratio(case: Case, ratio: float) -> Case | None:
     """The right matches with as many wrong ones as make this share of inliers; matches that are neither are left out.
-
     Right ones are as many at every ratio, at most MAX_RIGHT. Wrong ones are first the pair's own, then wrong nearest
-    neighbours that the ratio test took away, with distance ratios drawn from those of the pair's own wrong matches.
-    """
+    neighbours that the ratio test took away, with distance ratios drawn from those of the pair's own wrong matches."""
     rng, min_ratio = case.rng("inlier ratio"), min(INLIER_RATIOS)
     right, wrong = (rng.permutation(np.flatnonzero(mask.numpy())) for mask in (case.right, case.wrong))
     spare = rng.permutation(case.spare.mask.shape[1])

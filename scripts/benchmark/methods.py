@@ -49,9 +49,7 @@ def read_specs(path: Path) -> list[str]:
 
 def options(text: str) -> dict[str, Any]:
     """``KEY=VALUE,...``: numbers, true, false or null as in JSON; anything else is text.
-
-    ``PART.KEY=VALUE`` is the option KEY of a part, as on the command line.
-    """
+    ``PART.KEY=VALUE`` is the option KEY of a part, as on the command line."""
     changed: dict[str, Any] = {}
     for key, value in (item.split("=") for item in text.split(",") if item):
         *parts, last = key.split(".")
@@ -81,9 +79,7 @@ def build(group: str, word: str) -> Any:
 
 def estimate_by_call(options: Mapping[str, Any], c: Correspondences, seed: int) -> Estimate:
     """What `find_fundamental` makes of points, ratios and image sizes, and of a pruner's prior and noise.
-
-    options: its arguments, which replace these.
-    """
+    options: its arguments, which replace these."""
     names = ("mask", "ratio", "prior", "noise", "size0", "size1", "key")
     given: dict[str, Any] = {**{name: getattr(c, name) for name in names}, "seed": seed, **options}
     return fmtorch.find_fundamental(c.x0, c.x1, **given)

@@ -102,9 +102,7 @@ def no_estimator(c: Correspondences, seed: int = 0) -> Estimate:
 
 def synthetic_pair(index: int, matches: int, spread: float = 0.5) -> ImagePair:
     """Two views of a cloud of points, with their matches: with outliers, ratios and similarity frames.
-
-    Their number is log-normal about `matches`; 30 to 80 % of them are right, with a noise of 0.5 px.
-    """
+    Their number is log-normal about `matches`; 30 to 80 % of them are right, with a noise of 0.5 px."""
     f, (h, w), rng = 1.2 * SIZE[1], SIZE, np.random.default_rng(index)
     n = max(20, round(matches * np.exp(spread * rng.normal())))
     depth, x0 = rng.uniform(4, 12, n), rng.uniform([0, 0], [w, h], (n, 2))

@@ -137,10 +137,8 @@ def _estimated(kind: str, given: dict[str, Any], pair: ImagePair, c: Corresponde
 
 def options_of(name: str, changes: dict[str, Any], threshold: float) -> dict[str, Any]:
     """The options of a preset on a data set whose threshold is so many pixels; changes: replace the protocol's.
-
     At most 1,000 samples, at least 100, confidence 0.9999. A peer gets the threshold. Our presets, whose distances are
-    of matches that are exact to about a pixel, get them times the threshold, unless ``scaled=false``.
-    """
+    of matches that are exact to about a pixel, get them times the threshold, unless ``scaled=false``."""
     changes = dict(changes)
     scaled = changes.pop("scaled", True)
     preset = presets.load("estimator", name)

@@ -58,10 +58,8 @@ def add_command(
 
 class Kept:
     """The rows of one benchmark, appended to a file of JSON lines as they are made; without a file in memory only.
-
     A last line that was cut off by an interruption is removed. Raises SystemExit where the folder does not exist or the
-    file holds anything else.
-    """
+    file holds anything else."""
 
     def __init__(self, path: Path | None) -> None:
         self.path = path
@@ -93,10 +91,8 @@ class Kept:
 
 def identity(stages: Stages, *others: Any) -> str:
     """The digest of what defines the results of stages: options, code, versions of peers' packages, learned files.
-
     stages: e.g. ``[("estimator", "usac", {"threshold": 1.0})]``. others: configs with a `_target_`, plain values, and
-    objects, of which only the learned files count.
-    """
+    objects, of which only the learned files count."""
     configs: list[Any] = [merged(presets.load(group, name), options) for group, name, options in stages]
     configs += [other for other in others if isinstance(other, Mapping)]
     rest = [other for other in others if not isinstance(other, Mapping)]
@@ -116,9 +112,7 @@ def no_images() -> PairImages:
 @dataclasses.dataclass
 class Item:
     """A pair with its matches, which are made when a method first asks for them.
-
-    facts: parts of its rows, those of `WHICH` from the beginning; `make` may add others.
-    """
+    facts: parts of its rows, those of `WHICH` from the beginning; `make` may add others."""
 
     pair: ImagePair
     make: Callable[[], Outcome | None]
@@ -154,11 +148,9 @@ class Measured:
 @dataclasses.dataclass(frozen=True)
 class Method(Measured):
     """Pruners, whose time counts, and an estimator.
-
     stages: of a family's pairs, by name. untimed: the names of those whose time does not count. takes: whether it is
     measured on an item. view: what is done to a pair and its matches before, by a seed. signed: whether the sign of a
-    translation counts.
-    """
+    translation counts."""
 
     name: str
     identity: str
@@ -195,8 +187,7 @@ class Method(Measured):
 
 def judged(outcome: Outcome, seed: int, signed: bool = False) -> Row:
     """The figures of an estimate by the true F and cameras: `KEPT`, the errors of focal lengths that were not given
-    exactly, whether t points backwards, and the exactness of the matches.
-    """
+    exactly, whether t points backwards, and the exactness of the matches."""
     row = evaluate([outcome], seed, signed)[0]
     figures: Row = {name: getattr(row, name) for name in KEPT}
     errors = [error for error in (row.focal_error0, row.focal_error1) if error is not None]
@@ -216,10 +207,8 @@ def measure(
     methods: Sequence[Measured], items: Iterable[Item], seeds: int, kept: Kept, title: str = "measuring"
 ) -> list[Row]:
     """A row for each item, seed and method, those of an earlier run included.
-
     The methods take turns at each pair, so that what else the machine does slows them down alike. A pair's rows are
-    kept together, seed by seed; rows that are there for the same code and options are not measured again.
-    """
+    kept together, seed by seed; rows that are there for the same code and options are not measured again."""
     known = kept.by(*WHICH)
     started: set[str] = set()
     rows: list[Row] = []

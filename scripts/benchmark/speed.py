@@ -149,10 +149,8 @@ def peak(spec: str, count: int, matches: int) -> tuple[float, float]:
 
 def peak_growth(call: Callable[[], Any]) -> float:
     """MiB, the peak of the resident set during a call beyond what was resident before it.
-
     What the process claimed before, as for compiled kernels, does not hide it. Raises SystemExit where the kernel does
-    not tell peaks anew, as anywhere but on Linux.
-    """
+    not tell peaks anew, as anywhere but on Linux."""
     gc.collect()
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # what was freed is given back, or the call would use it
     if trim is not None:

@@ -251,9 +251,7 @@ class Results:
         self, groups: Groups, columns: Names, label: str, minus: Names = (), against: str = "", intervals: bool = False
     ) -> list[Record]:
         """A line for each group of pairs and method. label: heads the methods; minus: figures less those of `against`.
-
-        Without `against` the first method minus each other one is shown. A method has its own pairs of each group.
-        """
+        Without `against` the first method minus each other one is shown. A method has its own pairs of each group."""
         lines = []
         for group, every in groups.items():
             for method in self.methods:
@@ -321,10 +319,8 @@ def draw(
     path: Path, panels: Panels, labels: tuple[str, str], scale: str = "linear", ticks: Sequence[float] = ()
 ) -> None:
     """Write an SVG: a panel for each group of lines, one legend below.
-
     labels: of x and y. scale: of x; "shares": both axes go from 0 to 100 % and are logarithmic above a tenth of a
-    percent. ticks: of x.
-    """
+    percent. ticks: of x."""
     import matplotlib as mpl
     from matplotlib.figure import Figure as Canvas
     from matplotlib.ticker import FixedLocator

@@ -69,9 +69,7 @@ def add_arguments(commands: Any) -> None:
 
 class Scene(NamedTuple):
     """A folder of photographs with the true calibration and pose, world to camera, of each by name.
-
-    single: whether one camera took them all.
-    """
+    single: whether one camera took them all."""
 
     name: str
     images: Path
@@ -83,9 +81,7 @@ class Scene(NamedTuple):
 
 def read_scene(folder: Path) -> Scene:
     """FM-Bench's layout: `Images`, and `Camera.txt` with K, R and t of each image in a line.
-
-    Raises SystemExit where one of them is missing.
-    """
+    Raises SystemExit where one of them is missing."""
     if not (folder / "Images").is_dir() or not (folder / "Camera.txt").is_file():
         raise SystemExit(f"{folder} holds no Images and Camera.txt; give scenes in FM-Bench's layout")
     lines = np.loadtxt(folder / "Camera.txt").reshape(-1, 21)
@@ -159,10 +155,8 @@ def verified_by(method: str, path: Path, seed: int) -> Row:
 
 def mapped(mapper: str, path: Path, scene: Scene, cameras: str, seed: int) -> Row:
     """The largest model of a mapper on one thread, with its processor seconds.
-
-    Known intrinsics are held fixed. Unknown ones are calibrated from the view graph before the global mapper, as
-    COLMAP asks for; that changes the database, so it works on a copy.
-    """
+    Known intrinsics are held fixed. Unknown ones are calibrated from the view graph before the global mapper, as COLMAP
+    asks for; that changes the database, so it works on a copy."""
     pycolmap = imported()
     output = path.with_suffix(f".{mapper}")
     shutil.rmtree(output, ignore_errors=True)
@@ -293,9 +287,7 @@ def _text(value: float, digits: int) -> str:
 
 def database_of(scene: Scene, features: str, cameras: str, work: Path) -> Path:
     """The database of all pairs' matches without geometries, made at most once in `work`.
-
-    cameras: "unknown", COLMAP's guess of a SIMPLE_RADIAL, or "known", the true PINHOLE with a prior focal length.
-    """
+    cameras: "unknown", COLMAP's guess of a SIMPLE_RADIAL, or "known", the true PINHOLE with a prior focal length."""
     path = work / f"{scene.name}-{features}-{cameras}.db"
     if path.exists():
         return path

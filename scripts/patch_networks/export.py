@@ -43,9 +43,7 @@ FIGURES = {
 
 def model_card(config: DictConfig, path: Path, checkpoint: Mapping[str, Any], figures: Mapping[str, float]) -> str:
     """Markdown for the ONNX file at `path`, from what its checkpoint says beside the weights.
-
-    figures: of the ONNX file itself on the validation patches; empty where it was not measured.
-    """
+    figures: of the ONNX file itself on the validation patches; empty where it was not measured."""
     trained, about = "options" in checkpoint, OmegaConf.load(CARDS)[config.architecture]
     rows = {
         "SHA-256": f"`{sha256(path)}`",

@@ -34,10 +34,8 @@ def hardest_triplet(
     a: Float[Tensor, "n d"], b: Float[Tensor, "n d"], *, margin: float = 1.0, squared: bool = False
 ) -> Float[Tensor, ""]:
     """HardNet's loss (Mishchuk et al., NIPS 2017, eq. 4): max(0, margin + positive - hardest negative), the mean.
-
     The hardest negative in the batch is that of either end of a pair (anchor swap). squared: the hinge squared, which
-    presses less on triplets that are nearly right.
-    """
+    presses less on triplets that are nearly right."""
     d = distances(a, b)
     excluded = torch.eye(len(d), dtype=torch.bool, device=d.device) | (d < SAME_PATCH)
     negative = torch.where(excluded, 10.0, d)
@@ -51,19 +49,15 @@ def geodesc(
     *, ratio: float = 0.4, geometric_weight: float = 0.2,
 ) -> Float[Tensor, ""]:  # fmt: skip
     """GeoDesc's loss E_1 + lambda E_2 of match sets: `structured` plus `geometric_weight` times `geometric`.
-
-    a, b: unit descriptors of the n >= 2 matches of each set. similarity: S_patch of each match, in [0, 1].
-    """
+    a, b: unit descriptors of the n >= 2 matches of each set. similarity: S_patch of each match, in [0, 1]."""
     return structured(a, b, ratio=ratio) + geometric_weight * geometric(a, b, similarity)
 
 
 def structured(a: Float[Tensor, "*s n d"], b: Float[Tensor, "*s n d"], *, ratio: float = 0.4) -> Float[Tensor, ""]:
     """The structured loss E_1 of match sets, the mean over the sets.
-
-    With S = A B^T and L = S - ratio diag(S), the sum over i and j of max(0, l_ij - l_ii) + max(0, l_ij - l_jj) by
-    n (n - 1): no patch of the other photograph should be as similar as 1 - `ratio` (alpha) of its own match. All of
-    them count, not the hardest alone.
-    """
+    With S = A B^T and L = S - ratio diag(S), the sum over i and j of max(0, l_ij - l_ii) + max(0, l_ij - l_jj) by n (n
+    - 1): no patch of the other photograph should be as similar as 1 - `ratio` (alpha) of its own match. All of them
+    count, not the hardest alone."""
     similarity = a @ b.mT
     own = (1 - ratio) * similarity.diagonal(dim1=-2, dim2=-1)
     n = similarity.shape[-1]
@@ -76,10 +70,8 @@ def geometric(
     a: Float[Tensor, "*s n d"], b: Float[Tensor, "*s n d"], similarity: Float[Tensor, "*s n"]
 ) -> Float[Tensor, ""]:
     """The geometric loss E_2: max(0, margin - cosine similarity) of each match, the mean.
-
     Patches that geometry makes hard to match need not be as similar: see `MARGINS`. The mean in place of the sum keeps
-    the weight of the loss independent of n.
-    """
+    the weight of the loss independent of n."""
     margin = torch.zeros_like(similarity)
     for threshold, value in reversed(MARGINS):
         margin = torch.where(similarity >= threshold, value, margin)
@@ -94,11 +86,9 @@ def fpr_at_recall(positive: Float[Tensor, " n"], negative: Float[Tensor, " m"], 
 
 def patch_quality(a: Float[Tensor, "n d"], b: Float[Tensor, "n d"]) -> dict[str, float]:
     """Figures from two unit descriptors of each of n >= 2 points.
-
     fpr95: negatives are each point with the next one's other patch. map: each patch of `a` asks for its own among
     `GALLERY` patches of `b` (its block; the last block may be smaller); with one right answer average precision is the
-    inverse of its rank, where equals count against it. accuracy: how often it ranks first.
-    """
+    inverse of its rank, where equals count against it. accuracy: how often it ranks first."""
     positive = (a - b).square().sum(1).clamp_min(0).sqrt()
     negative = (a - b.roll(1, 0)).square().sum(1).clamp_min(0).sqrt()
     blocks = [distances(x, y) for x, y in zip(torch.split(a, GALLERY), torch.split(b, GALLERY), strict=True)]
@@ -126,12 +116,9 @@ def evaluate_descriptor(describe: PatchFunction, pairs: Pairs) -> dict[str, floa
 @dataclasses.dataclass(frozen=True)
 class DescriptorObjective:
     """Descriptors of a point's two patches should be nearer than those of different points: `criterion` says how.
-
-    Of match sets it gets the descriptors (s, n, d), twice, and the S_patch (s, n) of their matches.
-
-    teacher: a trained network that stays as it is; each descriptor should also be its descriptor of the same patch
-    (FitNets' hints on the output, Romero et al., ICLR 2015). weight: of their squared distance in the loss.
-    """
+    Of match sets it gets the descriptors (s, n, d), twice, and the S_patch (s, n) of their matches. teacher: a trained
+    network that stays as it is; each descriptor should also be its descriptor of the same patch (FitNets' hints on the
+    output, Romero et al., ICLR 2015). weight: of their squared distance in the loss."""
 
     criterion: Callable[..., Tensor]
     teacher: PatchFunction | None = None
@@ -162,14 +149,10 @@ class DescriptorObjective:
 @dataclasses.dataclass(frozen=True)
 class CovarianceObjective:
     """Shapes should follow what is done to a patch (as Lenc and Vedaldi, ECCV Workshops 2016, train detectors).
-
-    A patch is turned and stretched in two ways T1 and T2, up to `tilt` each. With the shapes A1 and A2 found then,
-    T1 A1 and T2 A2 rectify the same patch, so (T1 A1)^-1 T2 A2 should be a rotation. Unlike the loss on descriptors it
-    cannot be met by one shape for all patches, and needs no descriptor.
-
-    teacher: a trained network that stays as it is; each shape should also be its shape of the same patch. weight: of
-    that part of the loss, which is measured alike.
-    """
+    A patch is turned and stretched in two ways T1 and T2, up to `tilt` each. With the shapes A1 and A2 found then, T1
+    A1 and T2 A2 rectify the same patch, so (T1 A1)^-1 T2 A2 should be a rotation. Unlike the loss on descriptors it
+    cannot be met by one shape for all patches, and needs no descriptor. teacher: a trained network that stays as it is;
+    each shape should also be its shape of the same patch. weight: of that part of the loss, which is measured alike."""
 
     tilt: float = 2.5
     teacher: PatchFunction | None = None

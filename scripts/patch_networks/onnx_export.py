@@ -60,9 +60,7 @@ def export(network: nn.Module, path: Path) -> None:
 
 def quantize(source: Path, path: Path, patches: Float[Tensor, "n 1 32 32"]) -> None:
     """An int8 network (QDQ, weights per channel, convolutions with their ReLU) calibrated on real patches.
-
-    Its convolutions are laid out as ONNX Runtime runs them fastest (`lay_out`).
-    """
+    Its convolutions are laid out as ONNX Runtime runs them fastest (`lay_out`)."""
     from onnxruntime.quantization import (
         CalibrationDataReader,
         CalibrationMethod,

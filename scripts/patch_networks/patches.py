@@ -27,10 +27,8 @@ Keypoints = Matrix  # (n, 4): x, y, sigma in pixels, angle in radians, x axis to
 
 class Part(NamedTuple):
     """Patches of points that two or more views of a photograph show, point after point.
-
-    patches: (m, CONTEXT_SIZE, CONTEXT_SIZE). point, view: (m,) the point that each shows, and in which view. rays:
-    (m, 3) unit directions from the plane to the camera, in the world. incidence: (m,) degrees between ray and normal.
-    """
+    patches: (m, CONTEXT_SIZE, CONTEXT_SIZE). point, view: (m,) the point that each shows, and in which view. rays: (m,
+    3) unit directions from the plane to the camera, in the world. incidence: (m,) degrees between ray and normal."""
 
     patches: NDArray[np.uint8]
     point: Indices
@@ -42,9 +40,7 @@ class Part(NamedTuple):
 @dataclasses.dataclass(frozen=True)
 class Tolerance:
     """When keypoints of two views are the same point: distance in sigmas, ratio of scales, angle in degrees.
-
-    Within these bounds a detector's error in position, scale and orientation stays in the patches.
-    """
+    Within these bounds a detector's error in position, scale and orientation stays in the patches."""
 
     distance: float = 0.6
     scale: float = 1.35
@@ -117,9 +113,7 @@ def in_photograph(keypoints: Keypoints, H: Matrix) -> Keypoints:
 
 def views_of(image: NDArray[np.uint8], rng: np.random.Generator, limits: PlaneViews, points: int) -> list[View]:
     """Views of an RGB or grey photograph as a plane, in changed light, with the strongest `points` of each detector.
-
-    Keypoints where the plane shows the mirror image of the photograph, beyond its edges, are left out.
-    """
+    Keypoints where the plane shows the mirror image of the photograph, beyond its edges, are left out."""
     grey = planes.grey_of(rng, image)
     sides = np.array(grey.shape[::-1])
     views = []
@@ -152,10 +146,8 @@ def tracks(views: Sequence[View], tolerance: Tolerance) -> Part:
 
 def linked(views: Sequence[Keypoints], tolerance: Tolerance) -> list[Indices]:
     """For every keypoint of every view, at its place in the photograph, the point that it shows, -1 for none.
-
     A keypoint shows a point of the views before, or where none is near becomes one; those that nearly repeat an earlier
-    one of the same view are left out, since they would be false negatives.
-    """
+    one of the same view are left out, since they would be false negatives."""
     owners, points = [], np.zeros((0, 4))
     for keypoints in views:
         owner = same_point(points, keypoints, tolerance)

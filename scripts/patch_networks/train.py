@@ -42,11 +42,9 @@ from scripts.patch_networks.stores import Cutting, MatchSets, PatchStore, match_
 @dataclasses.dataclass(frozen=True)
 class TrainingOptions:
     """How a patch network is trained, by Adam; the learning rate falls linearly to zero over the run.
-
     batch: points a step, with two patches each. steps: the run's length, or minutes where that is given: wall time that
     this run has spent in all its parts. bf16: autocast to bfloat16. checkpoint_steps, log_steps: how often to save, to
-    log.
-    """
+    log."""
 
     batch: int = 512
     steps: int = 5000
@@ -61,9 +59,7 @@ class TrainingOptions:
 
 class PatchTraining:
     """A network in training: `run` goes on to the end, or until a step; `save` keeps all that is needed.
-
-    sets: where batches are of `options.batch` / `matches` of these, and `matches` of each (N_1 of GeoDesc's paper).
-    """
+    sets: where batches are of `options.batch` / `matches` of these, and `matches` of each (N_1 of GeoDesc's paper)."""
 
     def __init__(
         self, network: nn.Module, objective: Objective, store: PatchStore, options: TrainingOptions,
