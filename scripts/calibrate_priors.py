@@ -3,9 +3,8 @@
 python -m scripts.calibrate_priors --root DATA/Strecha_train --root DATA/TanksLike --rendered small
 
 For each stage that supplies a prior and each scene: the area under the ROC curve and the log loss, in nats a match, as
-its preset stands. Then, with and without the distance ratio, the log loss with the constants of its `calibration`
-fitted here (logistic regression, every pair with the same weight), and with constants fitted to the other scenes; and
-the constants. Inliers are the matches within --threshold px (Sampson) of the true geometry.
+its preset stands; then, with and without the distance ratio, the log loss with the constants of its `calibration`
+fitted here (logistic regression, every pair with the same weight) and to the other scenes; and the constants.
 """
 
 import argparse

@@ -3,15 +3,11 @@
 python scripts/download.py                                        lists what there is
 python scripts/download.py dataset=tum folder=TUM                 the paper's test sequences, unpacked; can be continued
 python scripts/download.py dataset=tum files=[freiburg1_xyz]      others; docs/guides/data.md says what each set is
-python scripts/download.py dataset=kitti                          what to do where a form must be filled in
 python scripts/download.py weights=affnet                         -> weights/AffNet.pth
-python scripts/download.py weights=hardnet++ sha256=HEX           for a file whose SHA-256 is not pinned here
-python scripts/download.py weights=hardnet++ sha256=any           accepts what comes, and prints its SHA-256
+python scripts/download.py weights=hardnet++ sha256=HEX           for a file whose SHA-256 is not pinned here, or any
 
 L2-Net's authors publish MATLAB files only and no stable address of a port is known; a port that you have is converted
 by scripts.patch_networks.export architecture=l2net.
-
-Then: python -m scripts.patch_networks.export checkpoint=weights/AffNet.pth architecture=affnet licence=MIT
 """
 
 import hashlib

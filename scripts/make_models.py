@@ -1,15 +1,13 @@
 """Makes learned files of models/: from photographs, or from weights that others published.
 
-python scripts/make_models.py pca --photos FOLDER
-    models/rootsift_pca.npz: the mean and the 80 principal axes of RootSIFT descriptors at DoG keypoints (Bursuc, Tolias
-    and Jégou, ICMR 2015, section 4, there on patches of Brown et al.)
-python scripts/make_models.py codebooks --photos FOLDER
-    models/vlad_rootsift_pca.npz and models/vlad_hardnet.npz, VLAD's codebooks: mean and principal axes of local
-    descriptors, and centres of the projected ones by k-means
-python scripts/make_models.py ngransac weights_ucn_r1.00.net runs/ngransac.safetensors
-    a learned file of `LC` from a checkpoint of neural-guided RANSAC (Brachmann & Rother, ICCV 2019; BSD 3-clause): the
-    authors' .net, or an .npz of the same parameters; nothing in it is executed. Then: python -m fmtorch.eval
-    pipeline=sift_lc 'pruner.lc.file=runs/ngransac.safetensors' 'pruner.lc.network.side=[ratio]'
+pca --photos FOLDER: models/rootsift_pca.npz, the mean and the 80 principal axes of RootSIFT descriptors at DoG
+keypoints (Bursuc, Tolias and Jégou, ICMR 2015, section 4, there on patches of Brown et al.)
+codebooks --photos FOLDER: models/vlad_rootsift_pca.npz and models/vlad_hardnet.npz, VLAD's codebooks: mean and
+principal axes of local descriptors, and centres of the projected ones by k-means
+ngransac weights_ucn_r1.00.net runs/ngransac.safetensors: a learned file of `LC` from a checkpoint of neural-guided
+RANSAC (Brachmann & Rother, ICCV 2019; BSD 3-clause), the authors' .net, or an .npz of the same parameters; nothing in
+it is executed. Then: fmtorch eval pipeline=sift_lc pruner.lc.file=runs/ngransac.safetensors
+'pruner.lc.network.side=[ratio]'
 
 Photographs: scikit-image's of the train split and, with --photos, a folder whose sources.txt names each file's source;
 only those of --sources are read.

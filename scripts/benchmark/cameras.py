@@ -2,11 +2,8 @@
 
 A method is named as NAME:LEVEL[:KEY=VALUE,...]. Levels: known; rough (each focal length times a log-uniform factor of
 its own, 1/1.1 to 1.1, given with a deviation of 6 %); wrong (1.5 times too long, given as rough); one_sided (K0 alone);
-shared (one unknown focal length; of pairs of one camera alone); unknown. Peers take a calibration for exact. All
-methods get the same SIFT matches; P(inlier) and noise from the keypoints' frames are part of ours, and of its time.
-
-python -m scripts.benchmark cameras --root DATA/Strecha --root DATA/KITTI --specs scripts/benchmark/cameras.txt \\
-    --seeds 3 --rows rows.jsonl --table docs/tables/cameras.csv
+shared (one unknown focal length; of pairs of one camera alone); unknown. Peers take a calibration for exact. P(inlier)
+and noise from the keypoints' frames are part of ours, and of its time.
 """
 
 from __future__ import annotations

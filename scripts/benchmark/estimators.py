@@ -1,17 +1,13 @@
 """Robust estimators on the same matches, one thread each: recall, AUC@0.05, milliseconds, paired intervals.
 
-An estimator is named as PRESET[:KEY=VALUE,...][@PRUNER+PRUNER...]; the pruners after @ count into its time.
-`find_fundamental[:KEY=VALUE,...]` is the public call with points, ratios and image sizes; `truth` the fit that starts
-from the true matrix, and so what the matches allow. Among the pruners, `ratioless` and `sizeless` take away distance
-ratios and image sizes, `part:left=0,top=0,right=0.5,bottom=0.5` crops both images, and `bent:lens=-0.15` gives them
-lenses. The pruner `ngransac` is the network of --ngransac; without it, estimators that name it are left out.
+An estimator is named as PRESET[:KEY=VALUE,...][@PRUNER+PRUNER...]; the pruners after @ count into its time, and
+`find_fundamental`, `truth`, `ratioless`, `sizeless`, `part` and `bent` are as scripts/benchmark/methods.py says. The
+pruner `ngransac` is the network of --ngransac; without it, estimators that name it are left out.
 
-python -m scripts.benchmark estimators --root DATA/Strecha --root DATA/PhotoTourism --seeds 5 \\
+python -m scripts.benchmark estimators --root DATA/Strecha --root DATA/PhotoTourism --seeds 5 --rows rows.jsonl \
     --estimators fmtorch@frame_consistency opencv:method=usac_magsac,threshold=1.0 poselib:threshold=0.5,prosac=true
-python -m scripts.benchmark estimators --rendered full --specs scripts/benchmark/estimators.txt --rows rows.jsonl
 
---rows is appended to pair by pair: started again, the command goes on where it was interrupted, and measures what other
-seeds, pairs and estimators need. A row counts only for the code, options and learned files that it was made with.
+A row of --rows counts only for the code, options and learned files that it was made with.
 """
 
 import argparse

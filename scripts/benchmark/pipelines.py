@@ -5,8 +5,7 @@ the tables, as PRESET NAME=VALUE ..., what is shown of them, and which are compa
 names or patterns such as 'sift*', or others, as 'NAME = PRESET NAME=VALUE ...'; `+ PRUNER` at the end of one adds one.
 The time of pruners is that of all but `ratio` and `one_to_one`, on one thread.
 
-python -m scripts.benchmark pipelines --root DATA/Strecha --root DATA/PhotoTourism --rows features.jsonl
-python -m scripts.benchmark pruning --rendered full --limit 50 --pipelines RATIO 'mine = sift_ratio pruner=[ratio,lpm]'
+python -m scripts.benchmark pruning --rendered full --limit 50 --pipelines RATIO 'mine = sift_ratio pruner=[ratio,lpm]\'
 """
 
 import argparse

@@ -1,14 +1,8 @@
 """Homographies of photographs as planes: errors and milliseconds beside PoseLib and OpenCV, on the same matches.
 
-Warped: each photograph is seen as a plane, tilted by 20 to 55 degrees over another photograph, with blur and noise.
-Hard pairs keep at most 60 of their right matches and 70 % random ones. Views: two pictures of the plane, each rendered
-by a camera and under light of its own (`training.planes`). SIFT, ratio 0.8, one match a location, P(inlier) from frame
-consistency. Every second photograph is for tuning (--tuning), the others for the claim; --warps pairs are made of each.
+docs/benchmarks/homographies.md says what warped and hard pairs and views are. SIFT, ratio 0.8, one match a location,
+P(inlier) from frame consistency. Every second photograph is for tuning (--tuning), the others for the claim.
 
-The error of a pair is the mean distance of the true and the estimated image of the photograph's corners, or, of views,
-of the points of a grid that both see.
-
-python -m scripts.benchmark homography --photographs DATA/photos --seeds 3 --warps 2
 python -m scripts.benchmark homography --photographs DATA/photos --tuning --methods ours:select.scale=0.5 poselib:2
 """
 

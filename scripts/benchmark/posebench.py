@@ -2,10 +2,9 @@
 
 FILES is the folder `relative` of its data, or one file of it; --root judges pairs in FM-Bench's layout in the same way,
 by SIFT matches and --threshold. Of each pair the error is the larger of the angles of rotation and of translation,
-whose sign counts; of a fundamental matrix the best of its four poses is taken. Each set has its threshold; samples are
-100 to 1,000. Sets of other names need --threshold; pairs whose cameras have distortion are left out.
+whose sign counts; of a fundamental matrix the best of its four poses is taken. Sets of other names need --threshold;
+pairs whose cameras have distortion are left out.
 
-python -m scripts.benchmark posebench FILES
 python -m scripts.benchmark posebench FILES --every 10 --methods E:fmtorch E:fmtorch:scaled=false E:poselib E:colmap
 """
 

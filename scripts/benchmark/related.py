@@ -1,10 +1,7 @@
 """The verdict on pairs of one scene and of different scenes: shares accepted and rejected, and ROC.
 
-python -m scripts.benchmark related --root DATA/Strecha --root DATA/PhotoTourism --root DATA/KITTI --root DATA/TUM \\
+python -m scripts.benchmark related --root DATA/Strecha --root DATA/PhotoTourism --root DATA/KITTI --root DATA/TUM \
     --rows related.jsonl --table docs/tables/related.csv --figure docs/concepts/related.svg
-python -m scripts.benchmark related --rows related.jsonl
-
-The second line shows what the file holds: rows are kept pair by pair, and the command goes on where it was interrupted.
 """
 
 import argparse

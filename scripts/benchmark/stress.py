@@ -1,10 +1,7 @@
 """Where estimators fail: sweeps of inlier ratio, noise and number of matches, and conditions that hurt.
 
-python -m scripts.benchmark stress --root DATA/Strecha --root DATA/PhotoTourism --root DATA/KITTI --root DATA/TUM \\
+python -m scripts.benchmark stress --root DATA/Strecha --root DATA/PhotoTourism --root DATA/KITTI --root DATA/TUM \
     --rendered full --rows stress.jsonl --table docs/tables/stress.csv --figures docs/benchmarks
-
---rows is appended to pair by pair: started again, the command goes on where it was interrupted, and measures what more
-seeds need. `sizeless` among an estimator's stages takes the image sizes away, and with them the prior on cameras.
 """
 
 import argparse

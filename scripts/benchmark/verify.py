@@ -4,8 +4,6 @@ Features and matches are those of COLMAP's SIFT, or of our default pipeline, mad
 method begins with the same database without geometries, on one thread, reading and writing included: `colmap:PX` is
 `pycolmap.geometric_verification` at that threshold, `ours` is `fmtorch.verify`. Known cameras are the true ones. Images
 that a mapper does not register count as wrong. Rows are kept in --work: an interrupted run goes on where it stopped.
-
-python -m scripts.benchmark verify --root DATA --work runs/verify --table docs/tables/verify.csv
 """
 
 import argparse
