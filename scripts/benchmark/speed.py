@@ -11,8 +11,6 @@ import ctypes
 import functools
 import gc
 import multiprocessing
-import resource
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
@@ -25,27 +23,21 @@ import torch
 
 from fmtorch import presets
 from fmtorch.core.types import Correspondences, collate
-from fmtorch.data import ImagePair
-from fmtorch.evaluation.run import evaluate_pairs, select
-from fmtorch.evaluation.statistics import summarize
+from fmtorch.evaluation.statistics import STAGES, summarize
 from fmtorch.jobs.execution import Execution
 from fmtorch.jobs.runner import Factory, Local, TaskRunner, WorkerPool
 from fmtorch.runs import PairRow, RunFolder
-from fmtorch.scenes import RenderedPairs
 from scripts.benchmark import pairs
-from scripts.benchmark.methods import call, pipeline_of
+from scripts.benchmark.methods import call
 from scripts.benchmark.runner import add_command, console
 from scripts.benchmark.tables import Record, Sheet, show
 
 SINGLE = 64  # pairs at most that are estimated one a call
 MEMORY = "Peak memory of estimators and pruners: how far one call makes its process grow, each in a process of its own."
-SCALE = "What evaluation costs at any size: stages, workers, bytes and memory."
+SCALE = "What evaluation costs at any size: workers, bytes and memory. Of stages `fmtorch eval` tells the seconds."
 PROC = Path("/proc/self")
 Call = Callable[[Correspondences], Any]
 
-PIPELINES = {"given matches": "given_fmtorch", "SIFT": "sift_fmtorch", "HesAffNet": "hesaffnet_fmtorch"}
-STAGES = ("features", "matching", "pruning", "estimation", "metrics")
-MATCHES = 500  # of a pair of given matches
 WAIT = 0.04  # seconds of a stage that only waits
 BATCH = 64  # rows that are stored at a time where memory is measured
 
@@ -66,12 +58,11 @@ def add_arguments(commands: Any) -> None:
     parser.add_argument("--pairs", type=int, default=64)
     parser.add_argument("--matches", type=int, default=8000)
     parser = add_command(commands, "scale", run_scale, SCALE)
-    parser.add_argument("--pairs", type=int, default=1000, help="of given matches; of the others a tenth")
     parser.add_argument("--workers", type=int, nargs="+", default=[1, 2, 4, 8])
     parser.add_argument("--executors", nargs="+", default=["threads", "processes", "dask"])
     parser.add_argument("--batches", type=int, default=1000, help="that a scheduler is given to do nothing in")
     parser.add_argument("--rows", type=int, nargs="+", default=[10_000, 1_000_000], help="at which memory is measured")
-    parser.add_argument("--parts", nargs="+", default=["workers", "memory", "stages"], help="of the tables")
+    parser.add_argument("--parts", nargs="+", default=["workers", "memory"], help="of the tables")
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -148,20 +139,14 @@ def peak(spec: str, count: int, matches: int) -> tuple[float, float]:
 
 
 def peak_growth(call: Callable[[], Any]) -> float:
-    """MiB, the peak of the resident set during a call beyond what was resident before it.
-    What the process claimed before, as for compiled kernels, does not hide it. Raises SystemExit where the kernel does
-    not tell peaks anew, as anywhere but on Linux."""
+    """MiB, the peak of the resident set during a call beyond what was resident before it, on Linux.
+    What the process claimed before, as for compiled kernels, does not hide it."""
     gc.collect()
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # what was freed is given back, or the call would use it
-    if trim is not None:
-        trim(0)
-    try:
-        (PROC / "clear_refs").write_text("5")  # the peak is counted from here
-        before = _resident("VmRSS")
-        call()
-        return (_resident("VmHWM") - before) / 1024
-    except OSError as error:
-        raise SystemExit(f"peaks of memory can be measured on Linux alone ({error})") from None
+    ctypes.CDLL(None).malloc_trim(0)  # what was freed is given back, or the call would use it
+    (PROC / "clear_refs").write_text("5")  # the peak is counted from here
+    before = _resident("VmRSS")
+    call()
+    return (_resident("VmHWM") - before) / 1024
 
 
 def _resident(field: str) -> int:
@@ -175,42 +160,7 @@ def run_scale(arguments: argparse.Namespace) -> None:
         sheets.append(worker_sheet(arguments.executors, arguments.workers, arguments.batches))
     if "memory" in arguments.parts:
         sheets.append(memory_sheet(arguments.rows))
-    if "stages" in arguments.parts:
-        with tempfile.TemporaryDirectory() as folder:
-            sheets += stage_sheets(Path(folder), arguments.pairs)
     show(sheets, arguments.table)
-
-
-def stage_sheets(folder: Path, count: int) -> list[Sheet]:
-    """Milliseconds of each stage by one worker, and what a million and a billion pairs cost at that speed."""
-    stages: list[Record] = []
-    costs: list[Record] = []
-    size = 0.0  # bytes of a row
-    for name, pipeline in PIPELINES.items():
-        if name == "given matches":
-            every = select([pairs.synthetic_pair(i, MATCHES) for i in range(count)], None)
-        else:
-            every = select(list(RenderedPairs("test", size="small")), None)[: max(count // 10, 1)]
-        stored, built = RunFolder.open(folder / pipeline, {"pipeline": pipeline}), pipeline_of(pipeline)
-        evaluated(built, every[:2], [].extend)  # compiles and loads
-        start = time.perf_counter()
-        evaluated(built, every, stored.append)
-        wall = time.perf_counter() - start
-        rows = stored.read()
-        ms = {s: 1e3 * sum(v or 0.0 for v in rows[f"seconds_{s}"].to_pylist()) / len(every) for s in STAGES}
-        ms["rest"] = max(1e3 * wall / len(every) - sum(ms.values()), 0.0)
-        hours = 1e6 * wall / len(every) / 3600
-        size = size or sum(path.stat().st_size for path in (stored.path / "pairs").iterdir()) / len(every)
-        stages.append({"pipeline": name, "pairs": len(every), **{f"{s}, ms": f"{v:.1f}" for s, v in ms.items()},
-                       "pairs a second and core": f"{len(every) / wall:.1f}"})  # fmt: skip
-        costs.append({"pipeline": name, "core hours of 10^6 pairs": f"{hours:.0f}", "of 10^9": f"{1e3 * hours:.0f}",
-                      "rows of 10^6, GB": f"{size / 1e3:.2f}", "of 10^9, TB": f"{size / 1e3:.2f}"})  # fmt: skip
-    return [Sheet("stages", "Stages, by one worker", stages), Sheet("extrapolated", "Extrapolated", costs)]
-
-
-def evaluated(pipeline: Any, every: Sequence[ImagePair], store: Any) -> None:
-    for _ in evaluate_pairs(pipeline, every, seed=0, batch=16, execution=Execution("threads", 1), store=store):
-        pass
 
 
 def worker_sheet(executors: Sequence[str], workers: Sequence[int], batches: int) -> Sheet:
@@ -251,29 +201,28 @@ def memory_sheet(rows: Sequence[int]) -> Sheet:
     for count in rows:
         with multiprocessing.get_context("spawn").Pool(1) as pool:
             records.append({"rows": count, **{k: f"{v:.0f}" for k, v in pool.apply(stored, (count,)).items()}})
-    return Sheet("memory", "Memory of the caller, each column the peak up to then", records)
+    return Sheet("memory", "Memory of the caller, how far the peak of each step exceeds what it had before", records)
 
 
 def stored(count: int) -> dict[str, float]:
-    """Peaks after imports, storing, finding what is done and the summary; seconds, parts and bytes of storing."""
-    figures: dict[str, float] = {"imports, MB": _peak_mb()}
+    """MiB of storing, finding what is done and the summary; seconds, parts and bytes of storing."""
     with tempfile.TemporaryDirectory() as name:
         folder = RunFolder.open(Path(name) / "run", {"rows": count})
+
+        def store() -> None:
+            with WorkerPool(Execution("threads", 2)) as pool:
+                runner = TaskRunner[range](pool, Local(None), rows_of, lambda task, rows: folder.append(rows))
+                for _ in runner.each(range(i, min(i + BATCH, count)) for i in range(0, count, BATCH)):
+                    pass
+
         start = time.perf_counter()
-        with WorkerPool(Execution("threads", 2)) as pool:
-            runner = TaskRunner[range](pool, Local(None), rows_of, lambda task, rows: folder.append(rows))
-            for _ in runner.each(range(i, min(i + BATCH, count)) for i in range(0, count, BATCH)):
-                pass
+        figures = {"storing, MiB": peak_growth(store)}
         seconds = time.perf_counter() - start
-        figures["storing, MB"] = _peak_mb()
+        figures["finding what is done, MiB"] = peak_growth(folder.done)
+        figures["summary, MiB"] = peak_growth(lambda: summarize(folder.read(without=("pair", "F"))))
         files = list((folder.path / "pairs").iterdir())
-        assert len(folder.done()) == count
-        figures["finding what is done, MB"] = _peak_mb()
-        summarize(folder.read(without=("pair", "F")))
         size = sum(file.stat().st_size for file in files) / count
-        return figures | {
-            "summary, MB": _peak_mb(), "storing, s": seconds, "parts": len(files), "bytes a row on disk": size
-        }  # fmt: skip
+        return figures | {"storing, s": seconds, "parts": len(files), "bytes a row on disk": size}
 
 
 def rows_of(nothing: None, numbers: range) -> list[PairRow]:
@@ -284,7 +233,3 @@ def rows_of(nothing: None, numbers: range) -> list[PairRow]:
         figures: Any = {"nsgd": (i % 997) / 997, "inlier_rate": 0.9, "F": F, "corrs": i % 400, "corrs_before": 500}
         rows.append(PairRow(name, i, "family", f"scene{i // 1000}", ok=True, **figures, **seconds))
     return rows
-
-
-def _peak_mb() -> float:
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
