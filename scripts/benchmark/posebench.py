@@ -55,14 +55,15 @@ def add_arguments(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     thresholds, published = read_published()
-    words, kept = installed(arguments.methods), Kept(arguments.rows)
+    kept = Kept(arguments.rows)
     rows: list[Row] = []
     for name, threshold, items, digest in sets_of(arguments, thresholds):
         selected = items[:: arguments.every]
         usable = [item for item in selected if item.pair.problem is None]
         for item in usable:
             item.facts["threshold"] = threshold
-        own = measure([protocol(word, threshold, digest) for word in words], usable, arguments.seeds, kept)
+        methods = [protocol(word, threshold, digest) for word in arguments.methods]
+        own = measure(methods, usable, arguments.seeds, kept)
         say_what_is_missing(name, selected, own)
         rows += [{**row, "family": name} for row in own]
     if not rows:
@@ -85,19 +86,16 @@ def sets_of(arguments: argparse.Namespace, thresholds: Mapping[str, float]) -> S
         families: dict[str, list[Item]] = {}
         for item in pairs.matched(arguments):
             if has_cameras(item.pair):
-                own = Item(item.pair, functools.partial(_points_of, item))
-                families.setdefault(item.pair.family, []).append(own)
+                families.setdefault(item.pair.family, []).append(item)
         digest = pairs.matches_identity(arguments)
         yield from ((name, arguments.threshold, items, digest) for name, items in families.items())
 
 
-def _points_of(item: Item) -> Outcome | None:
-    """A pair with points alone, as PoseBench has them."""
-    if item.outcome is None or item.outcome.correspondences is None:
-        return item.outcome
-    c = item.matches
-    plain = Correspondences(c.x0, c.x1, c.mask, size0=c.size0, size1=c.size1, key=c.key)
-    return dataclasses.replace(item.outcome, correspondences=plain)
+def _points_alone(outcome: Outcome, seed: int) -> Outcome:
+    """A pair as PoseBench has it."""
+    c = outcome.correspondences
+    plain = None if c is None else Correspondences(c.x0, c.x1, c.mask, size0=c.size0, size1=c.size1, key=c.key)
+    return dataclasses.replace(outcome, correspondences=plain)
 
 
 def _files(folder: Path, thresholds: Mapping[str, float], px: float | None) -> Sets:
@@ -123,7 +121,7 @@ def protocol(text: str, threshold: float, matches: str = "") -> Method:
     own = options_of(preset, changes, threshold)
     solve = functools.partial(_estimated, kind, {"estimator": preset, **own})
     made_with = identity([("estimator", preset, own)], text, matches)
-    return Method(text, made_with, lambda family: {}, solve, signed=True)
+    return Method(text, made_with, lambda family: {}, solve, view=_points_alone, signed=True)
 
 
 def _estimated(kind: str, given: dict[str, Any], pair: ImagePair, c: Correspondences, seed: int) -> Estimate:
@@ -158,21 +156,6 @@ def _distances(preset: Mapping[str, Any], scale: float) -> dict[str, Any]:
     levels = {key: _distances(value, scale) for key, value in preset.items() if isinstance(value, Mapping)}
     own = {key: value * scale for key, value in preset.items() if key in IN_PIXELS and value is not None}
     return {**{key: inside for key, inside in levels.items() if inside}, **own}
-
-
-def installed(words: Sequence[str]) -> list[str]:
-    """The methods whose packages are there; of those that are named, all must be. Raises SystemExit for another."""
-    available = []
-    for word in words:
-        try:
-            protocol(word, 1.0)
-            presets.build("estimator", word.split(":")[1])
-            available.append(word)
-        except ImportError as error:
-            if words is not METHODS:
-                raise SystemExit(f"{word}: {error}") from error
-            console.print(f"{word} is left out: {error}", highlight=False, markup=False)
-    return available
 
 
 def say_what_is_missing(name: str, items: Sequence[Item], rows: Sequence[Row]) -> None:

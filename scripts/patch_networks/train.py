@@ -35,8 +35,7 @@ from fmtorch.presets import plain
 from fmtorch.training.planes import PlaneViews, list_photographs
 from scripts.patch_networks import objectives, stores
 from scripts.patch_networks.objectives import DRAWS, CovarianceObjective, DescriptorObjective, Objective
-from scripts.patch_networks.patches import Tolerance
-from scripts.patch_networks.stores import Cutting, MatchSets, PatchStore, match_sets, order
+from scripts.patch_networks.stores import Cutting, MatchSets, PatchStore, Tolerance, match_sets, order
 
 
 @dataclasses.dataclass(frozen=True)

@@ -16,7 +16,7 @@ from fmtorch.data import ImagePair, ImageSource
 from fmtorch.geometry import homography_transfer
 from fmtorch.scenes import PICTURES, Plan, RenderedPairs
 from fmtorch.two_view.pair_type import classify
-from scripts.benchmark import cameras, pairs, planes, related, verify
+from scripts.benchmark import cameras, pairs, pipelines, planes, verify
 from scripts.benchmark.cameras import LEVELS, TAKES, applies, bougnoux, calibrations, described
 from scripts.benchmark.methods import read_specs
 from scripts.benchmark.runner import Item, Kept, Method, Row
@@ -59,13 +59,13 @@ def test_rendered_scenes_that_show_one_photograph_are_not_paired(tmp_path, monke
 
 
 def test_the_command_tells_pairs_apart(tmp_path, capsys, monkeypatch):
-    rows, pipelines = tmp_path / "rows.jsonl", ["sift_gms", "sift_ratio*"]
+    rows, named = tmp_path / "rows.jsonl", ["sift_gms", "sift_ratio*"]
     root = draw_set(tmp_path / "Set", "ab", images=2)
     run(capsys, monkeypatch, "related", "--root", root, "--unrelated", 3, "--pipelines",
-        *pipelines, "--cache", "off", "--rows", rows, "--figure", tmp_path / "roc.svg")  # fmt: skip
+        *named, "--cache", "off", "--rows", rows, "--figure", tmp_path / "roc.svg")  # fmt: skip
     own = read(rows)
     assert len(own) == 2 * (2 + 3)
-    assert all(related.called_related(r) == related.true(r) for r in own)
+    assert all(r["called"] == r["true"] for each in pipelines.verdicts(own).values() for r in each)
     assert "sift_gms" in run(capsys, monkeypatch, "related", "--rows", rows)
     assert "estimator=lmeds_eight_point" in (tmp_path / "roc.svg").read_text()
 

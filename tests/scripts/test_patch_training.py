@@ -18,15 +18,15 @@ from fmtorch.scenes import photograph
 from fmtorch.training import Photograph, PlaneViews, list_photographs, plane_homography, random_camera
 from scripts.patch_networks import objectives, stores
 from scripts.patch_networks.objectives import geodesc, geometric, hardest_triplet, structured
-from scripts.patch_networks.patches import (
+from scripts.patch_networks.stores import (
     Tolerance,
     in_photograph,
+    match_sets,
     patch_similarity,
     rays_and_incidence,
     tracks,
     views_of,
-)
-from scripts.patch_networks.stores import match_sets
+)  # fmt: skip
 from scripts.patch_networks.train import PatchTraining, TrainingOptions, cutting_of, training_of
 from tests.reference import geodesc as geodesc_reference
 from tests.reference import patch_losses as reference
