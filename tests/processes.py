@@ -94,10 +94,8 @@ class Starter:
         environment: Mapping[str, str] | None = None,
     ) -> Command:
         """``python -m fmtorch <name> arguments`` in a folder; before: Python code that runs first.
-
-        name: of a command, or of a module, or ``-c``, before code to run.
-        log, errors: files for standard output and standard error, which go into one in the folder if not given.
-        """
+        name: of a command, or of a module, or ``-c``, before code to run. log, errors: files for standard output and
+        standard error, which go into one in the folder if not given."""
         self._count += 1
         log = log or cwd / f"{name}-{self._count}.log"
         own = {"FMTORCH_CACHE": str(own_cache(cwd)), "PYTHONPATH": str(SOURCE), **(environment or {})}
@@ -133,10 +131,8 @@ def run_command(
     name: str, *arguments: str, cwd: Path, environment: Mapping[str, str] | None = None, patience: float = 300.0
 ) -> subprocess.CompletedProcess[str]:
     """``python -m fmtorch <name> arguments`` as a user runs it in a folder, to its end (names as of `Starter.start`).
-
     The process is forked from one that has imported the libraries, which saves seconds, and has a cache of its own.
-    Raises TimeoutError.
-    """
+    Raises TimeoutError."""
     with tempfile.TemporaryDirectory() as folder:
         log, errors = (Path(folder) / stream for stream in ("out", "errors"))
         command = starter().start(cwd, name, *arguments, log=log, errors=errors, environment=environment)
