@@ -12,22 +12,29 @@ import argparse
 import fnmatch
 import functools
 import math
+import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 import yaml  # type: ignore[import-untyped]
 
+from fmtorch import data, presets
 from fmtorch.core.types import RELATED
 from fmtorch.data import ImagePair, read_image, to_grey
 from fmtorch.data.construction import keypoints, matchable
 from fmtorch.evaluation.run import select
 from fmtorch.evaluation.statistics import share_interval
 from fmtorch.features import ASIFT
+from fmtorch.features.vlad import codebook, descriptor_kind, local_descriptors, vlad
+from fmtorch.pipeline.folder import similar_pairs
 from fmtorch.pipeline.pipeline import Outcome, Pipeline
+from fmtorch.pipeline.two_images import describe
 from scripts.benchmark import pairs, tables
-from scripts.benchmark.methods import pipeline_method
+from scripts.benchmark.methods import pipeline_method, pipeline_of
 from scripts.benchmark.runner import Item, Kept, Measured, Method, Row, add_command, measure
 from scripts.benchmark.tables import KIN, Record, Results, Sheet, Span, published, show
 
@@ -42,6 +49,7 @@ Settings = Mapping[str, Any]
 RIGHT = 0.05  # NSGD below which an estimate of a related pair is right
 LEVELS = (-2.0, -1.0, 0.0, 1.0, 2.0, 3.0, 5.0, 8.0)
 Rows = dict[str, list[Row]]  # by pipeline
+SIMILAR = "How many of the pairs that can be matched `pairs=similar:N` proposes, all scenes mixed in one folder."
 VERDICT = """The verdict on pairs of one scene and of different scenes: shares accepted and rejected, and ROC.
 
 python -m scripts.benchmark related --root DATA/Strecha --root DATA/PhotoTourism --root DATA/KITTI --root DATA/TUM \
@@ -69,6 +77,10 @@ def add_arguments(commands: Any) -> None:
     add_pipeline_options(parser)
     parser.add_argument("--figure", type=Path, help="draw the ROC curves here, as SVG")
     parser.set_defaults(asift_limit=None)
+    parser = add_command(commands, "similar", run_similar, SIMILAR)
+    parser.add_argument("--root", type=Path, nargs="+", required=True, help="folders in the layout of fmbench")
+    parser.add_argument("--pipeline", default="sift_fmtorch")
+    parser.add_argument("--count", type=int, nargs="+", default=[5, 10, 20])
 
 
 def add_pipeline_options(parser: argparse.ArgumentParser) -> None:
@@ -180,7 +192,7 @@ def differences_sheet(results: Results, settings: Settings) -> Sheet:
     return Sheet("differences", "Paired differences, in points", records)
 
 
-# The verdict on pairs of different scenes
+# Which pairs show one scene: the verdict on them, and the likeness of images
 
 
 def run_related(arguments: argparse.Namespace) -> None:
@@ -288,3 +300,28 @@ def draw(rows: Rows, path: Path) -> None:
             dot = int(np.searchsorted(levels, RELATED)) if figure == "significance" else None
             lines[name + perfect] = tables.Line((100 * accepted).tolist(), (100 * rejected).tolist(), dot)
     tables.draw(path, panels, ("unrelated pairs accepted, %", "right pairs rejected, %"), "shares")
+
+
+def run_similar(arguments: argparse.Namespace) -> None:
+    roots = sorted(arguments.root)
+    paths = [path for root in roots for path in sorted(root.glob("*/Images/*"))]
+    sets = [data.load("fmbench", root=root) for root in roots]  # pairs with a true F, which `fmtorch pairs` would keep
+    true = [pair for own in sets for pair in own]
+    overlapping = {frozenset((p.image0.path, p.image1.path)): f"{p.family}/{p.scene}" for p in true}
+    pipeline = pipeline_of(arguments.pipeline)
+    kind = descriptor_kind((presets.pipeline_stages(arguments.pipeline) or {})["features"])
+    book = codebook(kind)
+    described = [describe(pipeline, read_image(path), 1600).features.descriptors for path in paths]
+    start = time.process_time()
+    vectors = torch.stack([vlad(local_descriptors(descriptors, kind), book) for descriptors in described])
+    seconds = (time.process_time() - start) / len(paths)
+    print(f"{len(paths)} images; {1e3 * seconds:.1f} s for a thousand once described")
+    proposed = {n: {frozenset(pair) for pair in similar_pairs(paths, vectors, n)} for n in arguments.count}
+    records: list[Record] = []
+    for scene, count in [*Counter(overlapping.values()).items(), ("all", len(overlapping))]:
+        line: Record = {"scene": scene, "overlapping pairs": count}
+        for n, chosen in proposed.items():
+            hits = sum(pair in chosen for pair, of in overlapping.items() if scene in (of, "all"))
+            line |= {f"similar:{n}, recall, %": f"{100 * hits / count:.0f}", f"similar:{n}, pairs": len(chosen)}
+        records.append(line)
+    show([Sheet("similar", f"Pairs proposed, of {len(paths) * (len(paths) - 1) // 2}", records)], arguments.table)

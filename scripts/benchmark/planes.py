@@ -85,7 +85,7 @@ def run(arguments: argparse.Namespace) -> None:
     planes = [*(warped(paths, arguments.warps) if {"warped", "hard"} & set(arguments.kinds) else ()),
               *(views(paths, arguments.warps) if "views" in arguments.kinds else ())]  # fmt: skip
     items = [item for item in track(planes, "warping", console=console) if item.pair.family in arguments.kinds]
-    results = Results(measure([Homography.of(word) for word in arguments.methods], items, arguments.seeds, Kept(None)))
+    results = Results(measure([Homography(word) for word in arguments.methods], items, arguments.seeds, Kept(None)))
     groups = {kind: own for kind, own in results.groups(results.all_pairs).items() if kind in results.families}
     records = results.records(groups, [*(f"AUC@{px} px" for px in (1, 3, 5)), "ms"], "method", ["AUC@1 px"])
     show([Sheet("homography", "AUC of the mean distance of points, in %", records)], arguments.table)
@@ -98,21 +98,16 @@ class Plane(Item):
     points: Array = dataclasses.field(default_factory=lambda: np.zeros((0, 2)))
 
 
-@dataclasses.dataclass(frozen=True)
 class Homography(Measured):
-    """An estimator of homographies."""
+    """An estimator of homographies: ``ours:KEY=VALUE,...``, ``poselib:THRESHOLD``, or OpenCV's ``METHOD:THRESHOLD``."""
 
-    name: str
-    solve: Callable[[Correspondences, int], Array | None]
-    identity: str = ""
+    identity = ""
 
-    @classmethod
-    def of(cls, word: str) -> Homography:
-        """``ours:KEY=VALUE,...``, ``poselib:THRESHOLD`` or the name of an OpenCV method with its threshold."""
+    def __init__(self, word: str, solve: Callable[[Correspondences, int], Array | None] | None = None) -> None:
         name, _, setting = word.partition(":")
-        if name == "ours":
-            return cls(word, functools.partial(_ours, options(setting)))
-        return cls(word, functools.partial(_peer, name, float(setting)))
+        if solve is None and name == "ours":
+            solve = functools.partial(_ours, options(setting))
+        self.name, self.solve = word, solve or functools.partial(_peer, name, float(setting))
 
     def figures(self, item: Item, seed: int) -> Row:
         """The mean error in pixels, infinite where there is no homography, and milliseconds."""
@@ -387,8 +382,7 @@ def _compressed(image: Array, quality: int) -> Array:
     return np.asarray(cv2.imdecode(coded, cv2.IMREAD_COLOR))
 
 
-Maker = Callable[[np.random.Generator, Array, Array], tuple[Array, Array, Array | None]]
-MAKERS: dict[str, tuple[str, str, Maker]] = {
+MAKERS: dict[str, tuple[str, str, Callable[..., tuple[Array, Array, Array | None]]]] = {
     "rotations": ("rotations cut from photographs", "rotation", _rotated),
     "copies": ("copies, resized", "identical", _copied),
     "crops": ("crops", "identical", _cropped),

@@ -114,7 +114,7 @@ def test_the_commands(folder: Path, capsys: pytest.CaptureFixture[str], monkeypa
 def test_an_estimate_is_judged_where_the_plane_is_seen(folder: Path) -> None:
     (item,) = planes.warped(sorted(folder.iterdir())[:1], 1, hard_too=False)
     shifted = np.array([[1, 0, 3], [0, 1, 4], [0, 0, 1]]) @ item.pair.H
-    errors = [planes.Homography("x", lambda c, seed, H=H: H).figures(item, 0)["corner_error"]
+    errors = [planes.Homography("x:", lambda c, seed, H=H: H).figures(item, 0)["corner_error"]
               for H in (item.pair.H, shifted, None)]  # fmt: skip
     assert errors == [pytest.approx(0, abs=1e-9), pytest.approx(5), np.inf]
 
