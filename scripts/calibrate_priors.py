@@ -22,6 +22,9 @@ from fmtorch.scenes.dataset import FAMILIES
 from scripts.benchmark import pairs
 from scripts.benchmark.tables import Record, Sheet, chance_of_more, show
 
+RATIO = 0.9  # below which matches take part
+INLIER = 2.0  # px, Sampson distance
+MIN_MATCHES = 20  # of a pair
 STAGES = ("ratio_prior", "gms", "lpm", "position_consistency", "frame_consistency", "code")
 Array = NDArray[Any]
 
@@ -39,9 +42,6 @@ def main() -> None:
     pairs.add_set_options(parser)
     parser.set_defaults(split="train")
     parser.add_argument("--stages", nargs="*", default=list(STAGES))
-    parser.add_argument("--ratio", type=float, default=0.9, help="matches below this distance ratio take part")
-    parser.add_argument("--threshold", type=float, default=2.0, help="px, Sampson distance of an inlier")
-    parser.add_argument("--least", type=int, default=20, help="pairs with fewer matches are left out")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     own = matched(arguments)
@@ -53,15 +53,15 @@ def main() -> None:
 
 def matched(arguments: argparse.Namespace) -> list[Pair]:
     """The pairs of the sets, with the matches of distinct locations below the ratio."""
-    front = pairs.front_of("sift", [f"ratio:threshold={arguments.ratio}", "one_to_one"])
+    front = pairs.front_of("sift", [f"ratio:threshold={RATIO}", "one_to_one"])
     own = []
     for item in pairs.items(sorted(pairs.pairs_of(arguments), key=lambda pair: pair.identity), front):
         c = None if item.outcome is None else item.outcome.correspondences
-        if c is not None and int(c.count()) >= arguments.least:
+        if c is not None and int(c.count()) >= MIN_MATCHES:
             distance = sampson(torch.from_numpy(item.pair.F)[None], c.x0.double(), c.x1.double())[0]
             rendered = item.pair.family in FAMILIES  # whose scenes have but a few pairs each
             scene = item.pair.family if rendered else item.pair.scene
-            own.append(Pair(scene, c, (distance < arguments.threshold).numpy()))
+            own.append(Pair(scene, c, (distance < INLIER).numpy()))
     return own
 
 

@@ -137,22 +137,19 @@ def computed(source: Path, folder: Path, out: Path, arguments: argparse.Namespac
 
 def same(a: torch.Tensor, b: torch.Tensor) -> bool:
     """Bit for bit, any NaN equal to any other."""
-    if a.shape != b.shape or a.dtype != b.dtype:
-        return False
-    signed = (a.signbit() == b.signbit()) if a.is_floating_point() else True
-    return bool((((a == b) & signed) | ((a != a) & (b != b))).all())
+    a, b = (torch.where(x.isnan(), torch.nan, x) if x.is_floating_point() else x for x in (a, b))
+    return (a.dtype, a.shape, a.numpy().tobytes()) == (b.dtype, b.shape, b.numpy().tobytes())
 
 
 def differences(before: dict[str, torch.Tensor], after: dict[str, torch.Tensor]) -> list[str]:
-    lines = []
-    for name in sorted(before.keys() | after.keys()):
-        if name not in before or name not in after:
-            lines.append(f"{name}: only {'before' if name in before else 'after'}")
-        elif not same(before[name], after[name]):
+    lines = [f"{name}: only before" for name in before.keys() - after.keys()]
+    lines += [f"{name}: only after" for name in after.keys() - before.keys()]
+    for name in before.keys() & after.keys():
+        if not same(before[name], after[name]):
             a, b = before[name].double(), after[name].double()
             size = f"by {float((a - b).abs().nan_to_num().max()):.3g}" if a.shape == b.shape else "in shape"
             lines.append(f"{name}: differs {size}")
-    return lines
+    return sorted(lines)
 
 
 def main() -> None:

@@ -61,18 +61,11 @@ def export(network: nn.Module, path: Path) -> None:
 def quantize(source: Path, path: Path, patches: Float[Tensor, "n 1 32 32"]) -> None:
     """An int8 network (QDQ, weights per channel, convolutions with their ReLU) calibrated on real patches.
     Its convolutions are laid out as ONNX Runtime runs them fastest (`lay_out`)."""
-    from onnxruntime.quantization import (
-        CalibrationDataReader,
-        CalibrationMethod,
-        QuantFormat,
-        QuantType,
-        quantize_static,
-    )
+    from onnxruntime import quantization
     from onnxruntime.quantization.shape_inference import quant_pre_process
 
-    class Reader(CalibrationDataReader):  # type: ignore[misc]
-        def __init__(self) -> None:
-            self.parts = iter(torch.split(patches, 256))
+    class Reader(quantization.CalibrationDataReader):  # type: ignore[misc]
+        parts = iter(torch.split(patches, 256))
 
         def get_next(self) -> dict[str, object] | None:
             part = next(self.parts, None)
@@ -82,10 +75,10 @@ def quantize(source: Path, path: Path, patches: Float[Tensor, "n 1 32 32"]) -> N
     with tempfile.TemporaryDirectory() as folder, replacing(path) as unfinished:
         prepared = Path(folder) / "prepared.onnx"
         quant_pre_process(str(source), str(prepared), skip_symbolic_shape=True)
-        quantize_static(
-            str(prepared), str(unfinished), Reader(), quant_format=QuantFormat.QDQ, per_channel=True,
-            activation_type=QuantType.QUInt8, weight_type=QuantType.QInt8, op_types_to_quantize=["Conv", "Relu"],
-            calibrate_method=CalibrationMethod.MinMax,
+        quantization.quantize_static(
+            str(prepared), str(unfinished), Reader(), quant_format=quantization.QuantFormat.QDQ, per_channel=True,
+            activation_type=quantization.QuantType.QUInt8, weight_type=quantization.QuantType.QInt8,
+            op_types_to_quantize=["Conv", "Relu"], calibrate_method=quantization.CalibrationMethod.MinMax,
         )  # fmt: skip
         model = onnx.load(unfinished)
         forget_origin(model)
@@ -94,7 +87,6 @@ def quantize(source: Path, path: Path, patches: Float[Tensor, "n 1 32 32"]) -> N
 
 
 def lay_out(path: Path) -> None:
-    """Write a file's network anew in another layout (`laid_out`)."""
     onnx.save(laid_out(onnx.load(path), PATCH_SHAPE[-1]), path)
 
 

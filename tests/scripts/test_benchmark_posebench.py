@@ -11,9 +11,9 @@ import pytest
 from fmtorch import data, presets
 from fmtorch.core import Correspondences
 from fmtorch.data import ImagePair
-from scripts.benchmark import posebench
+from scripts.benchmark import cameras as posebench
+from scripts.benchmark.cameras import options_of
 from scripts.benchmark.methods import pipeline_of, split
-from scripts.benchmark.posebench import options_of
 from scripts.benchmark.tables import Results
 from tests.conftest import shared_path
 from tests.io.writers import posebench_group
