@@ -200,9 +200,7 @@ def windowed(
     matches, inside = labelled(pair, c.replace(K0=None, K1=None)), c.mask[0]
     for image, (corner, new, scale) in enumerate(windows):
         T = torch.diag(torch.tensor([scale, scale, 1.0], dtype=torch.float64))
-        T[:2, 2] = torch.from_numpy(
-            scale * (0.5 - corner) - 0.5
-        )  # pixel (0, 0) has its centre there, its corner at -0.5
+        T[:2, 2] = torch.from_numpy(scale * (0.5 - corner) - 0.5)  # pixel (0, 0) has its corner at -0.5
         size = torch.from_numpy(new.astype(np.int64))
         matches = transform(matches, image, T[None], size[None])
         x = getattr(matches.correspondences, f"x{image}")[0]

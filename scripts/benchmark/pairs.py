@@ -149,17 +149,9 @@ def _tensor(value: np.ndarray) -> torch.Tensor:
 
 
 def unrelated_pairs(pairs: Sequence[ImagePair], datasets: Sequence[PairDataset], most: int) -> list[ImagePair]:
-    """Pairs of the photographs of different scenes, at most so many of each two scenes, chosen by hash.
-
-    Args:
-        pairs: related ones, whose photographs are taken.
-        datasets: which they are from.
-        most: pairs of each two scenes, each pair once, in one direction.
-
-    Returns:
-        The pairs, with an F of zeros. Rendered scenes are paired with each other where they show no photograph in
-        common, and real ones with each other.
-    """
+    """Pairs of photographs of different scenes, at most `most` of each two, chosen by hash, with an F of zeros.
+    pairs: related ones, whose photographs are taken. Rendered scenes are paired with each other where they show no
+    photograph in common, and real ones with each other."""
     shown: dict[str, frozenset[str]] = {}
     for dataset in datasets:
         shown |= photographs_shown(dataset) if isinstance(dataset, RenderedPairs) else {}

@@ -91,12 +91,8 @@ def lay_out(path: Path) -> None:
 
 
 def laid_out(model: onnx.ModelProto, side: int) -> onnx.ModelProto:
-    """The network in another layout.
-
-    Args:
-        model: a chain of convolutions, in fp32 or as ``onnxruntime.quantization`` quantises it (QDQ); not changed.
-        side: height and width of its input.
-    """
+    """The network in another layout: a chain of convolutions, in fp32 or as ``onnxruntime.quantization`` quantises it
+    (QDQ), which is not changed. side: height and width of its input."""
     changed = onnx.ModelProto()
     changed.CopyFrom(model)
     graph = _Graph(changed.graph)

@@ -188,14 +188,8 @@ def rays_and_incidence(keypoints: Keypoints, camera: Camera) -> tuple[Matrix, Ma
 def patch_similarity(rays0: Matrix, rays1: Matrix, incidence0: Matrix, incidence1: Matrix) -> Matrix:
     """S_patch (section 3.3): g(intersection angle, 15 degrees) g(difference of incidence angles, 20 degrees).
 
-    g(a, s) = exp(-a^2 / (2 s^2)). The intersection angle is that between the two viewing rays at the point.
-
-    Args:
-        rays0, rays1: unit directions (n, 3) from the point to each camera.
-        incidence0, incidence1: degrees (n,) between ray and surface normal.
-
-    Returns similarities (n,) in [0, 1]; 1 for the same viewpoint.
-    """
+    g(a, s) = exp(-a^2 / (2 s^2)). The intersection angle is that between the two viewing rays at the point, unit
+    directions (n, 3) to each camera; incidence: degrees (n,) between ray and surface normal. 1: one viewpoint."""
     cross = np.linalg.norm(np.cross(rays0, rays1), axis=1)
     intersection = np.degrees(np.arctan2(cross, (rays0 * rays1).sum(1))).astype(np.float64)
     difference = (incidence0 - incidence1).astype(np.float64)
