@@ -75,23 +75,22 @@ def dump(pairs: Path, out: Path, presets_: list[str], quick: bool) -> None:
                 values["reasons"] = torch.frombuffer(reasons, dtype=torch.uint8).clone()
                 arrays |= {f"{name} | {label} | seed {seed} | {f}": value for f, value in values.items()}
             if label == "scenes":
-                arrays |= gradients(f"{name} | {label} |", estimator, c)
+                asked = {f: getattr(c, f).double().requires_grad_() for f in ("x0", "x1", "prior", "noise")}
+                arrays |= with_gradients(f"{name} | {label} | F", estimator(c.replace(**asked), 1).F, asked)
                 if unfitted is not None:
                     plain = presets.build("estimator", name, **unfitted)(c, 0)
                     arrays[f"{name} | {label} | before the final fit"] = plain.F
     torch.save(arrays, out)
 
 
-def gradients(what: str, estimator: Any, c: Any) -> dict[str, torch.Tensor]:
-    asked = {f: getattr(c, f).double().requires_grad_() for f in ("x0", "x1", "prior", "noise")}
-    estimate = estimator(c.replace(**asked), 1)
-    weights = torch.linspace(-1, 1, 9, dtype=torch.float64).reshape(3, 3)
-    F = estimate.F
-    if not F.requires_grad:
-        return {f"{what} F with gradients": F}
-    grads = torch.autograd.grad((F * weights).sum(), list(asked.values()), allow_unused=True)
-    named = {f"{what} gradient to {f}": g for f, g in zip(asked, grads, strict=True) if g is not None}
-    return {f"{what} F with gradients": F.detach(), **named}
+def with_gradients(name: str, value: torch.Tensor, asked: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """A value, and the gradients of it, weighted, to what it is a function of."""
+    if not value.requires_grad:
+        return {name: value}
+    weights = torch.linspace(-1, 1, value.numel(), dtype=value.dtype).reshape(value.shape)
+    grads = torch.autograd.grad((value * weights).sum(), list(asked.values()), allow_unused=True)
+    named = {f"{name} | gradient to {f}": g for f, g in zip(asked, grads, strict=True) if g is not None}
+    return {name: value.detach(), **named}
 
 
 def geometry() -> dict[str, torch.Tensor]:
@@ -118,11 +117,8 @@ def geometry() -> dict[str, torch.Tensor]:
         calls[f"irls {loss}"] = lambda a, b, v, how=how: g.irls(a, b, F0, v, mask, **how)
     arrays = {}
     for name, call in calls.items():
-        asked = [x.clone().requires_grad_() for x in (x0, x1, w)]
-        value = call(*asked)
-        arrays[f"geometry | {name}"] = value.detach()
-        grads = torch.autograd.grad(value.sum(), asked, allow_unused=True)
-        arrays |= {f"geometry | {name} | gradient {i}": x for i, x in enumerate(grads) if x is not None}
+        asked = {f: x.clone().requires_grad_() for f, x in (("x0", x0), ("x1", x1), ("weight", w))}
+        arrays |= with_gradients(f"geometry | {name}", call(*asked.values()), asked)
     return arrays
 
 

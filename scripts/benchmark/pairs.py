@@ -89,11 +89,10 @@ def matched(arguments: argparse.Namespace) -> list[Item]:
 
 
 def items(pairs: Iterable[ImagePair], front: Pipeline) -> list[Item]:
-    return [Item(p, functools.partial(_match, front, p), images=functools.partial(front.images, p)) for p in pairs]
+    def matched(pair: ImagePair) -> Outcome:
+        return front.correspondences([pair])[0]
 
-
-def _match(front: Pipeline, pair: ImagePair) -> Outcome:
-    return front.correspondences([pair])[0]
+    return [Item(p, functools.partial(matched, p), images=functools.partial(front.images, p)) for p in pairs]
 
 
 def no_estimator(c: Correspondences, seed: int = 0) -> Estimate:

@@ -105,10 +105,6 @@ def identity(stages: Stages, *others: Any) -> str:
     return identity_digest(made_with)[:DIGITS]
 
 
-def no_images() -> PairImages:
-    raise ValueError("there are no images, which a stage looks at")
-
-
 @dataclasses.dataclass
 class Item:
     """A pair with its matches, which are made when a method first asks for them.
@@ -117,7 +113,7 @@ class Item:
     pair: ImagePair
     make: Callable[[], Outcome | None]
     facts: Row = dataclasses.field(default_factory=dict)
-    images: Callable[[], PairImages] = no_images
+    images: Callable[[], PairImages] | None = None
 
     @functools.cached_property
     def outcome(self) -> Outcome | None:
@@ -173,7 +169,7 @@ class Method(Measured):
         c, pruning = matched.correspondences, 0.0
         for name, stage in self.stages(item.pair.family).items():
             start = time.process_time()
-            c = pruned(stage, c, lambda _: item.images())
+            c = pruned(stage, c, lambda _: item.images())  # type: ignore[misc]
             c = c if bool(c.mask.all()) else c.compact()
             pruning += (time.process_time() - start) * (name not in self.untimed)
         start = time.process_time()

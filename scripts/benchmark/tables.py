@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import mannwhitneyu
 
 from fmtorch.core.files import replacing
 from fmtorch.evaluation.statistics import (
@@ -112,19 +113,13 @@ def grouped(rows: Iterable[Row], *fields: str) -> dict[tuple[Any, ...], list[Row
 
 def chance_of_more(a: Sequence[float] | Values, b: Sequence[float] | Values) -> float:
     """The area under the ROC curve: the chance that one of `a` exceeds one of `b`, ties count half; NaN of none."""
-    if len(a) == 0 or len(b) == 0:
-        return float("nan")
-    ordered = np.sort(b)
-    below, up_to = (np.searchsorted(ordered, a, side) for side in ("left", "right"))
-    return float((below + up_to).mean() / (2 * len(b)))
+    pairs = len(a) * len(b)
+    return float(mannwhitneyu(a, b, method="asymptotic").statistic) / pairs if pairs else float("nan")
 
 
 def _known(values: Values) -> Values:
     """The mean of each pair over the seeds with which a figure is defined, (n,); NaN where there is none."""
-    counts = ~np.isnan(values)
-    total, number = np.where(counts, values, 0.0).sum(0), counts.sum(0)
-    means: Values = np.divide(total, number, out=np.full(values.shape[1], np.nan), where=number > 0)
-    return means
+    return np.asarray(np.ma.masked_invalid(values).mean(0).filled(np.nan))
 
 
 def _solved(get: Get, values: Values) -> Values:
@@ -132,11 +127,13 @@ def _solved(get: Get, values: Values) -> Values:
     return _known(np.where(get("ok") > 0, values, np.nan))
 
 
-def pose_areas(get: Get, threshold: float) -> Values:
-    """What each pair adds to the area under the step curve of pose errors up to a threshold in degrees, (n,)."""
-    worst = np.maximum(get("rotation_error"), get("translation_error"))
-    share: Values = np.clip(1 - worst / threshold, 0, 1).mean(0)
-    return share
+def _below(errors: Values, threshold: float) -> Values:
+    """What each pair adds to the area under the step curve of errors up to a threshold, (n,)."""
+    return np.asarray(np.clip(1 - errors / threshold, 0, 1).mean(0))
+
+
+def _worst(get: Get) -> Values:
+    return np.maximum(get("rotation_error"), get("translation_error"))
 
 
 class Figure(NamedTuple):
@@ -159,13 +156,10 @@ FIGURES: dict[str, Figure] = {
     "kept, %": Figure(lambda get: _solved(get, get("corrs") / get("corrs_before").clip(1)), PERCENT, ".0f"),
     "keypoints": Figure(lambda get: (get("features0") + get("features1")).mean(0) / 2, form=".0f"),
     "distance, px": Figure(lambda get: _known(get("distance")), form=".3f"),
-    **{
-        f"AUC@{px} px": Figure(lambda get, px=px: np.clip(1 - get("corner_error") / px, 0, 1).mean(0), PERCENT)  # type: ignore[misc]
-        for px in (1, 3, 5)
-    },
+    **{f"AUC@{px} px": Figure(lambda get, px=px: _below(get("corner_error"), px), PERCENT) for px in (1, 3, 5)},  # type: ignore[misc]
     "flipped, %": Figure(lambda get: _known(get("flipped")), PERCENT),
     **{f"focal within {p} %, %": Figure(lambda get, p=p: _known(get(f"focal_{p}")), PERCENT) for p in (5, 10)},  # type: ignore[misc]
-    **{f"pose@{t}": Figure(lambda get, t=t: pose_areas(get, t), PERCENT) for t in POSE_THRESHOLDS},  # type: ignore[misc]
+    **{f"pose@{t}": Figure(lambda get, t=t: _below(_worst(get), t), PERCENT) for t in POSE_THRESHOLDS},  # type: ignore[misc]
 }
 MEDIANS = {"ms": "ms", "ms of pruners": "ms_pruning"}
 """Columns that are medians over pairs and seeds, without intervals, and their fields."""
@@ -241,12 +235,6 @@ class Results:
         a, b = (figure.of(self.get(method, both)) for method in (first, second))
         return span(difference(a, b, self.scenes(both), figure.scale, figure.share), "+" + figure.form)
 
-    def time_ratio(self, method: str, first: str, pairs: Sequence[str]) -> str:
-        """Median over pairs of a method's time relative to the first's."""
-        both = [pair for pair in self.pairs(first, method) if pair in set(pairs)]
-        own, reference = (self.get(name, both)("ms").mean(0) for name in (method, first))
-        return f"{np.median(own / reference):.2f}" if both else ""
-
     def records(
         self, groups: Groups, columns: Names, label: str, minus: Names = (), against: str = "", intervals: bool = False
     ) -> list[Record]:
@@ -265,8 +253,10 @@ class Results:
                     a, b = (method, first) if against else (first, method)
                     head = f"{name} minus {against}" if against else f"lead {name}"
                     line[head] = self.difference(a, b, own, name) if first in self.methods else ""
-                if "time ratio" in columns:
-                    line["time ratio"] = self.time_ratio(method, first, own)
+                both = [pair for pair in self.pairs(first, method) if pair in set(own)]
+                if "time ratio" in columns and both:
+                    mine, reference = (self.get(name, both)("ms").mean(0) for name in (method, first))
+                    line["time ratio"] = f"{np.median(mine / reference):.2f}"
                 lines.append(line)
         return lines
 

@@ -134,16 +134,13 @@ def verified_by(method: str, path: Path, seed: int) -> Row:
     """Verify a database in place: pairs, those with a geometry, and processor seconds."""
     pycolmap = imported()
     kind, _, threshold = method.partition(":")
+    start = time.process_time()
     if kind == "ours":
-        call = functools.partial(fmtorch.verify, path, seed=seed)
+        fmtorch.verify(path, seed=seed)
     else:
         options = colmap.two_view_options(float(threshold), seed)
-        verifier = pycolmap.GeometricVerifierOptions(num_threads=1)
-        call = functools.partial(
-            pycolmap.geometric_verification, path, verifier_options=verifier, two_view_geometry_options=options
-        )
-    start = time.process_time()
-    call()
+        one = pycolmap.GeometricVerifierOptions(num_threads=1)
+        pycolmap.geometric_verification(path, verifier_options=one, two_view_geometry_options=options)
     seconds = time.process_time() - start
     with pycolmap.Database.open(path) as database:
         pairs, verified = len(database.read_num_matches()[0]), len(database.read_two_view_geometry_num_inliers()[0])
@@ -156,18 +153,15 @@ def mapped(mapper: str, path: Path, scene: Scene, cameras: str, seed: int) -> Ro
     Known intrinsics are held fixed. Unknown ones are calibrated from the view graph before the global mapper, as COLMAP
     asks for; that changes the database, so it works on a copy."""
     pycolmap = imported()
-    output = path.with_suffix(f".{mapper}")
-    shutil.rmtree(output, ignore_errors=True)
-    output.mkdir()
-    copy = output / "database.db"
-    shutil.copy(path, copy)
-    start = time.process_time()
-    if (mapper, cameras) == ("global", "unknown"):
-        pycolmap.calibrate_view_graph(copy, pycolmap.ViewGraphCalibrationOptions(random_seed=seed))
-    mapping = pycolmap.global_mapping if mapper == "global" else pycolmap.incremental_mapping
-    models = mapping(copy, scene.images, output, _options(mapper, cameras == "unknown", seed))
-    row: Row = {"seconds": time.process_time() - start, "registered": 0, "images": len(scene.R)}
     poses: dict[str, Any] = {}
+    with tempfile.TemporaryDirectory(dir=path.parent) as output:
+        copy = shutil.copy(path, output)
+        start = time.process_time()
+        if (mapper, cameras) == ("global", "unknown"):
+            pycolmap.calibrate_view_graph(copy, pycolmap.ViewGraphCalibrationOptions(random_seed=seed))
+        mapping = pycolmap.global_mapping if mapper == "global" else pycolmap.incremental_mapping
+        models = mapping(copy, scene.images, output, _options(mapper, cameras == "unknown", seed))
+    row: Row = {"seconds": time.process_time() - start, "registered": 0}
     if models:
         model = max(models.values(), key=lambda each: each.num_reg_images())
         row |= {
@@ -175,8 +169,7 @@ def mapped(mapper: str, path: Path, scene: Scene, cameras: str, seed: int) -> Ro
             "track": model.compute_mean_track_length(), "error": model.compute_mean_reprojection_error(),
         }  # fmt: skip
         poses = {image.name: image.cam_from_world() for image in model.images.values() if image.has_pose}
-    shutil.rmtree(output)
-    row["registered, %"] = 100 * row["registered"] / row["images"]
+    row["registered, %"] = 100 * row["registered"] / len(scene.R)
     return row | accuracy(poses, scene)
 
 
@@ -187,15 +180,12 @@ def _options(mapper: str, refined: bool, seed: int) -> Any:
     if mapper == "global":
         options: Any = pycolmap.GlobalPipelineOptions()
         steps: dict[str, Any] = {step: {"random_seed": seed} for step in ("global_positioning", "rotation_averaging")}
-        if not refined:
-            steps["bundle_adjustment"] = {"refine_focal_length": False, "refine_extra_params": False}
+        steps["bundle_adjustment"] = {"refine_focal_length": refined, "refine_extra_params": refined}
         own["mapper"] = {"num_threads": 1, "random_seed": seed, **steps}
     else:
         options = pycolmap.IncrementalPipelineOptions()
-        own["extract_colors"] = False
-        if not refined:
-            own |= {"ba_refine_focal_length": False, "ba_refine_extra_params": False}
-            own["mapper"] = {"abs_pose_refine_focal_length": False, "abs_pose_refine_extra_params": False}
+        own |= {"extract_colors": False, "ba_refine_focal_length": refined, "ba_refine_extra_params": refined}
+        own["mapper"] = {"abs_pose_refine_focal_length": refined, "abs_pose_refine_extra_params": refined}
     options.mergedict(own)
     return options
 

@@ -53,8 +53,7 @@ class Part(NamedTuple):
     incidence: NDArray[np.float32]
 
 
-@dataclasses.dataclass(frozen=True)
-class Tolerance:
+class Tolerance(NamedTuple):
     """When keypoints of two views are the same point: distance in sigmas, ratio of scales, angle in degrees.
     Within these bounds a detector's error in position, scale and orientation stays in the patches."""
 
@@ -298,14 +297,13 @@ def _pairs_of_points(first: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.concatenate(parts, axis=1)
 
 
-@dataclasses.dataclass(frozen=True)
-class Cutting:
+class Cutting(NamedTuple):
     """How patches are cut of photographs as planes.
     points: strongest of each detector. longest_side: pixels, to which larger photographs are reduced."""
 
     planes: PlaneViews
     points: int
-    tolerance: Tolerance = dataclasses.field(default_factory=Tolerance)
+    tolerance: Tolerance = Tolerance()
     longest_side: int = 1024
 
     def patches_of(self, job: tuple[Photograph, tuple[int, int]]) -> Part:
@@ -330,7 +328,7 @@ def build_store(
     description = {
         "photographs": dict(collections.Counter(each.source for each in photographs)), "seed": seed,
         "views": cutting.planes.views, "limits": dataclasses.asdict(cutting.planes),
-        "tolerance": dataclasses.asdict(cutting.tolerance),
+        "tolerance": cutting.tolerance._asdict(),
     }  # fmt: skip
     folder.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}") as temporary:

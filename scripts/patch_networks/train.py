@@ -11,12 +11,11 @@ Every step is a function of the seed and its number, so that a run can be resume
 or matches of pairs of photographs (`training.match_sets`, as GeoDesc is trained).
 """
 
-import dataclasses
 import functools
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import hydra
 import torch
@@ -38,8 +37,7 @@ from scripts.patch_networks.objectives import DRAWS, CovarianceObjective, Descri
 from scripts.patch_networks.stores import Cutting, MatchSets, PatchStore, Tolerance, match_sets, order
 
 
-@dataclasses.dataclass(frozen=True)
-class TrainingOptions:
+class TrainingOptions(NamedTuple):
     """How a patch network is trained, by Adam; the learning rate falls linearly to zero over the run.
     batch: points a step, with two patches each. steps: the run's length, or minutes where that is given: wall time that
     this run has spent in all its parts. bf16: autocast to bfloat16. checkpoint_steps, log_steps: how often to save, to
@@ -80,7 +78,7 @@ class PatchTraining:
     def resume(self, path: Path | str) -> None:
         """Go on from a checkpoint of a run with the same options; ValueError names what differs."""
         content = read_checkpoint(path)
-        mine, theirs = dataclasses.asdict(self.options), content.get("options", {})
+        mine, theirs = self.options._asdict(), content.get("options", {})
         changed = [k for k, v in mine.items() if k not in ("steps", "minutes") and theirs.get(k) != v]
         if content.get("match_sets") != self.description.get("match_sets"):
             changed.append("match_sets")
@@ -125,7 +123,7 @@ class PatchTraining:
         path.parent.mkdir(parents=True, exist_ok=True)
         content = {
             "state_dict": self.network.state_dict(), "optimizer": self.optimizer.state_dict(), "step": self.step,
-            "seconds": self.seconds, "losses": self.losses, "options": dataclasses.asdict(self.options),
+            "seconds": self.seconds, "losses": self.losses, "options": self.options._asdict(),
             "data": self.store.description, **self.description, **more,
         }  # fmt: skip
         with replacing(path) as unfinished:
