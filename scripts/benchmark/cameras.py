@@ -285,14 +285,20 @@ def sheet(rows: Sequence[Row]) -> Sheet:
 
 def run_posebench(arguments: argparse.Namespace) -> None:
     thresholds, published = read_published()
-    kept = Kept(arguments.rows)
+    words, kept = list(arguments.methods), Kept(arguments.rows)
     rows: list[Row] = []
+    for word in METHODS if words == list(METHODS) else ():
+        try:
+            presets.build("estimator", word.split(":")[1])
+        except ImportError as error:
+            words.remove(word)
+            console.print(f"{word} is left out: {error}", highlight=False, markup=False)
     for name, threshold, items, digest in sets_of(arguments, thresholds):
         selected = items[:: arguments.every]
         usable = [item for item in selected if item.pair.problem is None]
         for item in usable:
             item.facts["threshold"] = threshold
-        methods = [protocol(word, threshold, digest) for word in arguments.methods]
+        methods = [protocol(word, threshold, digest) for word in words]
         own = measure(methods, usable, arguments.seeds, kept)
         say_what_is_missing(name, selected, own)
         rows += [{**row, "family": name} for row in own]
@@ -418,8 +424,9 @@ def posebench_sheet(rows: Sequence[Row], thresholds: Mapping[str, float], publis
     means: list[Record] = []
     of_sets: dict[tuple[str, str], Record] = {}
     for m in methods:
-        figures = {name: (areas(results, m, own) if own_pairs[m] else {}) | theirs.get(m, {}).get(name, {})
-                   for name, own in sets.items()}  # fmt: skip
+        figures = {name: dict(theirs.get(m, {}).get(name, {})) for name in sets}
+        for name, own in sets.items() if own_pairs[m] else ():
+            figures[name] = areas(results, m, own) | figures[name]
         heads = [head for head in next(iter(figures.values())) if all(head in of for of in figures.values())]
         line: Record = {"set": "mean of the sets", "method": m}
         line |= {head: f"{np.mean([of[head] for of in figures.values()]):.1f}" for head in heads}
@@ -435,7 +442,7 @@ def posebench_sheet(rows: Sequence[Row], thresholds: Mapping[str, float], publis
 
 
 def areas(results: Results, method: str, own: Sequence[str]) -> dict[str, float]:
-    """AUC in per cent at each of the thresholds."""
+    """AUC in per cent at each of the thresholds, by trapezes as PoseBench has it."""
     get = results.get(method, own)
     worst = torch.from_numpy(np.maximum(get("rotation_error"), get("translation_error")))
     of_seeds = metrics.pose_auc(worst, POSE_THRESHOLDS).mean(0).tolist()

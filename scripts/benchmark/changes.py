@@ -10,6 +10,7 @@ import dataclasses
 import functools
 import math
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -38,8 +39,7 @@ WINDOW = 0.6  # of width and height
 ZOOM = 2.5
 
 
-@dataclasses.dataclass(frozen=True)
-class Case:
+class Case(NamedTuple):
     """A pair with its matches, the right and the wrong told by its true F.
     c: a batch of one, no slot masked. right: (n,), True within RIGHT_PX of the true epipolar lines in both images.
     wrong: (n,), True beyond WRONG_PX in one of them. spare: wrong nearest neighbours that the ratio test took away."""
@@ -52,7 +52,7 @@ class Case:
 
     def subset(self, index: Tensor) -> Case:
         """Some of the matches: a mask or indices."""
-        return dataclasses.replace(self, c=taken(self.c, index), right=self.right[index], wrong=self.wrong[index])
+        return self._replace(c=taken(self.c, index), right=self.right[index], wrong=self.wrong[index])
 
     def rng(self, *names: float | str) -> np.random.Generator:
         """Random numbers that depend on the pair and on what they are for."""
@@ -129,7 +129,7 @@ def noise(case: Case, sigma: float) -> Case | None:
     rng, n = case.rng("noise"), len(case.right)
     case = case.subset(torch.from_numpy(np.sort(rng.permutation(n)[:MAX_MATCHES])))
     steps = [torch.from_numpy(rng.normal(0, 1, tuple(case.c.x0.shape)) * sigma) for _ in range(2)]
-    return dataclasses.replace(case, c=move(labelled(case.pair, case.c), *steps).correspondences)
+    return case._replace(c=move(labelled(case.pair, case.c), *steps).correspondences)
 
 
 def match_count(case: Case, count: float) -> Case | None:
@@ -190,7 +190,7 @@ def seen(case: Case, window0: Window, window1: Window) -> Case | None:
     """The matches inside both windows, in the windows' pixels, with F of these; None: fewer than MIN_RIGHT right."""
     pair, c, inside = windowed(case.pair, case.c, (window0, window1))
     enough = int((case.right & inside).sum()) >= MIN_RIGHT
-    return dataclasses.replace(case, pair=pair, c=c).subset(inside) if enough else None
+    return case._replace(pair=pair, c=c).subset(inside) if enough else None
 
 
 def windowed(

@@ -22,7 +22,7 @@ from fmtorch.scenes.dataset import FAMILIES
 from scripts.benchmark import pairs, tables
 from scripts.benchmark.changes import CONDITIONED, MIN_RIGHT, SWEEPS, Case, Change, Level, case_of, on_plane, parallax
 from scripts.benchmark.methods import method, read_specs
-from scripts.benchmark.runner import Item, Kept, Method, Row, add_command, measure
+from scripts.benchmark.runner import Item, Kept, Row, add_command, measure
 from scripts.benchmark.tables import Record, Results, Sheet, show
 
 SPECS = Path(__file__).with_name("stress.txt")
@@ -38,8 +38,7 @@ NATURAL: dict[Level, Callable[[Row], bool]] = {
 
 def add_arguments(commands: Any) -> None:
     parser = add_command(commands, "stress", run, __doc__, seeds=1)
-    pairs.add_set_options(parser, limit=20)
-    parser.add_argument("--rendered-limit", type=int, default=10, help="pairs of each rendered family at most")
+    pairs.add_set_options(parser, limit=20)  # of rendered families half as many
     parser.add_argument("--specs", type=Path, default=SPECS, help="estimators; those in (...) for conditions only")
     parser.add_argument("--only", nargs="*", default=list(SWEEPS), choices=list(SWEEPS), help="all by default")
     parser.add_argument("--figures", type=Path, help="draw stress_SWEEP.svg into this folder")
@@ -47,7 +46,12 @@ def add_arguments(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     def measured_rows(kept: Kept) -> list[Row]:
-        return measure(methods_of(read_specs(arguments.specs)), items_of(arguments), arguments.seeds, kept)
+        conditioned = functools.partial(dataclasses.replace, takes=lambda item: item.facts["sweep"] == CONDITIONED)
+        methods = [
+            conditioned(method(spec.strip("()"))) if spec.startswith("(") else method(spec)
+            for spec in read_specs(arguments.specs)
+        ]
+        return measure(methods, items_of(arguments), arguments.seeds, kept)
 
     rows = pairs.rows_of(arguments, measured_rows)
     show([accuracy_sheet(rows), time_sheet(rows)], arguments.table)
@@ -55,17 +59,11 @@ def run(arguments: argparse.Namespace) -> None:
         draw(rows, sweep, arguments.figures / f"stress_{sweep.replace(' ', '_')}.svg")
 
 
-def methods_of(specs: Sequence[str]) -> list[Method]:
-    """The estimators; those in brackets are measured under conditions alone."""
-    conditioned = functools.partial(dataclasses.replace, takes=lambda item: item.facts["sweep"] == CONDITIONED)
-    return [conditioned(method(spec.strip("()"))) if spec.startswith("(") else method(spec) for spec in specs]
-
-
 def items_of(arguments: argparse.Namespace) -> Iterator[Item]:
     """The pairs that are asked for, families in turn, with the SIFT matches that pass the ratio test, changed."""
     families: dict[str, list[ImagePair]] = {}
     for dataset in pairs.sets_of(arguments):
-        limit = arguments.rendered_limit if dataset.name == "rendered" else arguments.limit
+        limit = (arguments.limit + 1) // 2 if dataset.name == "rendered" else arguments.limit
         for pair in select([dataset[i] for i in range(len(dataset))], limit):
             families.setdefault(pair.family, []).append(pair)
     front = pairs.front_of("sift", [], memory=IMAGES)

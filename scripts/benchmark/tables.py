@@ -4,7 +4,6 @@ And their curves, drawn as SVG.
 """
 
 import csv
-import dataclasses
 import functools
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -38,8 +37,7 @@ Groups = Mapping[str, Names]  # pairs by what they have in common
 Get = Callable[[str], Values]  # a field of the rows, (seeds, pairs), NaN where there is none
 
 
-@dataclasses.dataclass(frozen=True)
-class Span:
+class Span(NamedTuple):
     """A figure with its 95 % interval, as text."""
 
     value: str
@@ -57,8 +55,7 @@ def span(found: Interval | None, form: str) -> Span | str:
     return "" if found is None else Span(*(f"{value:{form}}" for value in (found.value, found.low, found.high)))
 
 
-@dataclasses.dataclass(frozen=True)
-class Sheet:
+class Sheet(NamedTuple):
     """A table. name: what its file's name ends in, where a command writes several; title: above it in the terminal."""
 
     name: str
