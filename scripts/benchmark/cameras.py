@@ -204,9 +204,9 @@ def _posed(estimate: Estimate, c: Correspondences) -> Estimate:
     if not bool(estimate.ok[0]) or not bool(estimate.inliers.any()):
         return estimate
     F, x0, x1 = (value.double() for value in (estimate.F, c.x0, c.x1))
-    K = calibrations(c, bougnoux(F[0].numpy(), c))
-    pose = pose_from_fundamental(F, *(torch.from_numpy(own)[None] for own in K), x0, x1, estimate.inliers)
-    return estimate.replace(R=pose.R, t=pose.t, focals=torch.from_numpy(focals_of(*K))[None])
+    K0, K1 = (torch.from_numpy(K)[None] for K in calibrations(c, bougnoux(F[0].numpy(), c)))
+    pose = pose_from_fundamental(F, K0, K1, x0, x1, estimate.inliers)
+    return estimate.replace(R=pose.R, t=pose.t, focals=torch.from_numpy(focals_of(K0[0].numpy(), K1[0].numpy()))[None])
 
 
 def rays(x: Array, K: Array) -> Array:

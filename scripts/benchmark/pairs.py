@@ -161,18 +161,14 @@ def unrelated_pairs(pairs: Sequence[ImagePair], datasets: Sequence[PairDataset],
     for a, b in itertools.combinations(scenes, 2):
         drawn = a[1] in shown
         if drawn == (b[1] in shown) and not (drawn and shown[a[1]] & shown[b[1]]):
-            both = itertools.product(scenes[a].values(), scenes[b].values())
-            crossed = [_crossed("/".join(a), "/".join(b), drawn, *images) for images in both]
+            family, names = f"{UNRELATED}, {'rendered' if drawn else 'real'}", ("/".join(a), "/".join(b))
+            crossed = []
+            for ends in itertools.product(scenes[a].values(), scenes[b].values()):
+                identity = " | ".join(f"{name}/{image.identity}" for name, image in zip(names, ends, strict=True))
+                ends = ends[::-1] if pair_key(identity) % 2 else ends  # either scene comes first in half of the pairs
+                crossed.append(ImagePair(identity, family, " | ".join(names), *ends, np.zeros((3, 3))))
             chosen += sorted(crossed, key=lambda pair: pair.key)[:most]
     return chosen
-
-
-def _crossed(a: str, b: str, drawn: bool, image0: ImageSource, image1: ImageSource) -> ImagePair:
-    family = f"{UNRELATED}, {'rendered' if drawn else 'real'}"
-    identity = f"{a}/{image0.identity} | {b}/{image1.identity}"
-    if pair_key(identity) % 2:  # either scene comes first in half of the pairs
-        image0, image1 = image1, image0
-    return ImagePair(identity, family, f"{a} | {b}", image0, image1, np.zeros((3, 3)))
 
 
 def photographs_shown(dataset: RenderedPairs) -> dict[str, frozenset[str]]:

@@ -177,7 +177,11 @@ def run_scale(arguments: argparse.Namespace) -> None:
     if "workers" in arguments.parts:
         sheets.append(worker_sheet(arguments.executors, arguments.workers))
     if "memory" in arguments.parts:
-        sheets.append(memory_sheet(arguments.rows))
+        records: list[Record] = []
+        for count in arguments.rows:
+            with multiprocessing.get_context("spawn").Pool(1) as pool:  # each time in a process of its own
+                records.append({"rows": count, **{k: f"{v:.0f}" for k, v in pool.apply(stored, (count,)).items()}})
+        sheets.append(Sheet("memory", "How far the peak of each step exceeds what the caller had before", records))
     show(sheets, arguments.table)
 
 
@@ -213,17 +217,8 @@ def wait(seconds: float, job: int) -> int:
     return job
 
 
-def memory_sheet(rows: Sequence[int]) -> Sheet:
-    """Peak memory of a caller that stores, lists and sums up rows, each time in a process of its own."""
-    records: list[Record] = []
-    for count in rows:
-        with multiprocessing.get_context("spawn").Pool(1) as pool:
-            records.append({"rows": count, **{k: f"{v:.0f}" for k, v in pool.apply(stored, (count,)).items()}})
-    return Sheet("memory", "Memory of the caller, how far the peak of each step exceeds what it had before", records)
-
-
 def stored(count: int) -> dict[str, float]:
-    """MiB of storing, finding what is done and the summary; seconds, parts and bytes of storing."""
+    """MiB of storing so many rows, finding what is done and the summary; seconds, parts and bytes of storing."""
     with tempfile.TemporaryDirectory() as name:
         folder = RunFolder.open(Path(name) / "run", {"rows": count})
 

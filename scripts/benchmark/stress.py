@@ -16,7 +16,7 @@ import numpy as np
 
 from fmtorch.data import ImagePair
 from fmtorch.evaluation.run import select
-from fmtorch.pipeline.pipeline import Outcome, Pipeline
+from fmtorch.pipeline.pipeline import Outcome
 from fmtorch.presets.composition import WIDE
 from fmtorch.scenes.dataset import FAMILIES
 from scripts.benchmark import pairs, tables
@@ -67,18 +67,17 @@ def items_of(arguments: argparse.Namespace) -> Iterator[Item]:
         for pair in select([dataset[i] for i in range(len(dataset))], limit):
             families.setdefault(pair.family, []).append(pair)
     front = pairs.front_of("sift", [], memory=IMAGES)
+
+    def case_or_none(pair: ImagePair) -> Case | None:
+        c = front.correspondences([pair])[0].correspondences
+        case = None if c is None else case_of(pair, c)
+        return None if case is None or int(case.right.sum()) < MIN_RIGHT else case
+
     for turn in itertools.zip_longest(*families.values()):  # an interrupted run has some of each family
         for pair in (pair for pair in turn if pair is not None):
-            case = functools.cache(functools.partial(_case, front, pair))
+            case = functools.cache(functools.partial(case_or_none, pair))
             for sweep in arguments.only:
                 yield from (item_of(pair, case, sweep, level, change) for level, change in SWEEPS[sweep].items())
-
-
-def _case(front: Pipeline, pair: ImagePair) -> Case | None:
-    """None where there are too few right matches."""
-    c = front.correspondences([pair])[0].correspondences
-    case = None if c is None else case_of(pair, c)
-    return None if case is None or int(case.right.sum()) < MIN_RIGHT else case
 
 
 def item_of(pair: ImagePair, case: Callable[[], Case | None], sweep: str, level: Level, change: Change) -> Item:

@@ -155,7 +155,7 @@ def tracks(views: Sequence[View], tolerance: Tolerance) -> Part:
     several = np.bincount(every.point) >= 2
     kept = np.flatnonzero(several[every.point])
     order = kept[np.argsort(every.point[kept], kind="stable")]
-    every = Part(*(column[order] for column in every))
+    every = Part._make(column[order] for column in every)
     return every._replace(point=(np.cumsum(several) - 1)[every.point])
 
 
@@ -352,7 +352,8 @@ def _write(folder: Path, parts: Iterable[Part], description: dict[str, Any]) -> 
             for name, column in (("view", part.view + views), ("rays", part.rays), ("incidence", part.incidence)):
                 columns[name].append(column)
             total, views = total + len(part.patches), views + 1 + int(part.view.max(initial=-1))
-    np.savez(folder / "geometry.npz", first=np.concatenate(first), **{k: np.concatenate(v) for k, v in columns.items()})
+    geometry: Any = {name: np.concatenate(arrays) for name, arrays in columns.items()}
+    np.savez(folder / "geometry.npz", first=np.concatenate(first), **geometry)
     counts = {"points": sum(map(len, first)) - 1, "patches": total}
     (folder / "store.json").write_text(json.dumps({**counts, **description}, indent=1))
 

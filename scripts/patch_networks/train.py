@@ -71,8 +71,8 @@ class PatchTraining:
             raise ValueError(f"batch={options.batch} is more than the {len(self.units)} {what}")
         self.network, self.objective, self.store, self.options = network.to(device), objective, store, options
         self.sets, self.matches, self.description, self.device = sets, matches, description or {}, torch.device(device)
-        rates = {"lr": options.learning_rate, "weight_decay": options.weight_decay}
-        self.optimizer = torch.optim.Adam(self.network.parameters(), **rates)
+        parameters = self.network.parameters()
+        self.optimizer = torch.optim.Adam(parameters, options.learning_rate, weight_decay=options.weight_decay)
         self.step, self.seconds, self.losses = 0, 0.0, list[float]()
 
     def resume(self, path: Path | str) -> None:
@@ -178,7 +178,7 @@ def opened_stores(config: DictConfig) -> list[PatchStore]:
 
 def cutting_of(config: DictConfig) -> Cutting:
     patches: dict[str, Any] = plain(config.patches)
-    planes = {name: tuple(v) if isinstance(v, list) else v for name, v in patches["planes"].items()}
+    planes: Any = {name: tuple(v) if isinstance(v, list) else v for name, v in patches["planes"].items()}
     return Cutting(PlaneViews(**planes), patches["points"], Tolerance(**patches["tolerance"]), patches["longest_side"])
 
 
@@ -193,7 +193,7 @@ def objective_of(config: DictConfig) -> Objective:
         raise ValueError("training.match_sets needs training.loss.name=geodesc, and that loss match sets")
     if name == "affine_covariance":
         return CovarianceObjective(**loss, **taught)
-    criteria = {"hardest_triplet": objectives.hardest_triplet, "geodesc": objectives.geodesc}
+    criteria: dict[str, Any] = {"hardest_triplet": objectives.hardest_triplet, "geodesc": objectives.geodesc}
     if name not in criteria:
         raise ValueError(f"training.loss.name={name}; there are: affine_covariance, {', '.join(criteria)}")
     return DescriptorObjective(functools.partial(criteria[name], **loss), **taught)
