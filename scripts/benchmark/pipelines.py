@@ -52,7 +52,7 @@ Rows = dict[str, list[Row]]  # by pipeline
 SIMILAR = "How many of the pairs that can be matched `pairs=similar:N` proposes, all scenes mixed in one folder."
 VERDICT = """The verdict on pairs of one scene and of different scenes: shares accepted and rejected, and ROC.
 
-python -m scripts.benchmark related --root DATA/Strecha --root DATA/PhotoTourism --root DATA/KITTI --root DATA/TUM \
+python -m scripts.benchmark related --root DATA/Strecha --root DATA/PhotoTourism --root DATA/KITTI --root DATA/TUM \\
     --rows related.jsonl --table docs/tables/related.csv --figure docs/concepts/related.svg
 """
 
