@@ -24,6 +24,14 @@ ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_
 PATIENCE = 1200.0  # seconds after which a command hangs
 
 
+def alive(pid: int) -> bool:
+    """Whether a process runs; one that has ended and waits to be buried does not."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
 class Command:
     """A command that runs."""
 
@@ -45,11 +53,7 @@ class Command:
 
     def runs(self) -> bool:
         """Whether it has not ended, killed or by itself."""
-        try:
-            state = Path(f"/proc/{self.pid}/stat").read_text().rpartition(")")[2].split()[0]
-        except OSError:
-            return False
-        return state != "Z"
+        return alive(self.pid)
 
     def kill_when(self, reached: Callable[[], bool], later: float = 0.0) -> bool:
         """Kill it `later` seconds after something is so; whether it was still running then."""

@@ -42,9 +42,7 @@ FAMILY = FundamentalWithFocals()
 
 def start(F: np.ndarray, pair: Pair) -> posterior.Cameras:
     """The cameras near one model (3, 3) of pixels."""
-    cameras = posterior.no_cameras(1)
-    posterior.nearest_cameras(to_units(F, pair)[None], posterior.images_of(pair), cameras)
-    return cameras
+    return near(to_units(F, pair)[None], pair)
 
 
 def evaluated(
