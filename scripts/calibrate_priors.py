@@ -3,9 +3,8 @@
 python -m scripts.calibrate_priors --root DATA/Strecha_train --root DATA/TanksLike --rendered small
 
 For each stage that supplies a prior and each scene: the area under the ROC curve and the log loss, in nats a match, as
-its preset stands. Then, with and without the distance ratio, the log loss with the constants of its `calibration`
-fitted here (logistic regression, every pair with the same weight), and with constants fitted to the other scenes; and
-the constants. Inliers are the matches within --threshold px (Sampson) of the true geometry.
+its preset stands; then, with and without the distance ratio, the log loss with the constants of its `calibration`
+fitted here (logistic regression, every pair with the same weight) and to the other scenes; and the constants.
 """
 
 import argparse
@@ -15,7 +14,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.optimize import minimize
-from scipy.special import expit
 
 from fmtorch import Correspondences, presets
 from fmtorch.geometry import sampson
@@ -23,6 +21,9 @@ from fmtorch.scenes.dataset import FAMILIES
 from scripts.benchmark import pairs
 from scripts.benchmark.tables import Record, Sheet, chance_of_more, show
 
+RATIO = 0.9  # below which matches take part
+INLIER = 2.0  # px, Sampson distance
+MIN_MATCHES = 20  # of a pair
 STAGES = ("ratio_prior", "gms", "lpm", "position_consistency", "frame_consistency", "code")
 Array = NDArray[Any]
 
@@ -40,9 +41,6 @@ def main() -> None:
     pairs.add_set_options(parser)
     parser.set_defaults(split="train")
     parser.add_argument("--stages", nargs="*", default=list(STAGES))
-    parser.add_argument("--ratio", type=float, default=0.9, help="matches below this distance ratio take part")
-    parser.add_argument("--threshold", type=float, default=2.0, help="px, Sampson distance of an inlier")
-    parser.add_argument("--least", type=int, default=20, help="pairs with fewer matches are left out")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     own = matched(arguments)
@@ -54,15 +52,15 @@ def main() -> None:
 
 def matched(arguments: argparse.Namespace) -> list[Pair]:
     """The pairs of the sets, with the matches of distinct locations below the ratio."""
-    front = pairs.front_of("sift", [f"ratio:threshold={arguments.ratio}", "one_to_one"])
+    front = pairs.front_of("sift", [f"ratio:threshold={RATIO}", "one_to_one"])
     own = []
     for item in pairs.items(sorted(pairs.pairs_of(arguments), key=lambda pair: pair.identity), front):
         c = None if item.outcome is None else item.outcome.correspondences
-        if c is not None and int(c.count()) >= arguments.least:
+        if c is not None and int(c.count()) >= MIN_MATCHES:
             distance = sampson(torch.from_numpy(item.pair.F)[None], c.x0.double(), c.x1.double())[0]
             rendered = item.pair.family in FAMILIES  # whose scenes have but a few pairs each
             scene = item.pair.family if rendered else item.pair.scene
-            own.append(Pair(scene, c, (distance < arguments.threshold).numpy()))
+            own.append(Pair(scene, c, (distance < INLIER).numpy()))
     return own
 
 
@@ -104,14 +102,10 @@ def features(stage: Any, pair: Pair, kind: str) -> Array:
 def fit(columns: list[Array], own: list[Pair]) -> Array:
     """Logistic regression; each pair has weight 1."""
 
-    def total(w: Array) -> tuple[float, Array]:
-        """Log loss, and its gradient."""
-        parts = [(X @ w, X, pair.right) for X, pair in zip(columns, own, strict=True)]
-        gradient = sum((expit(z) - right) @ X / len(right) for z, X, right in parts)
-        return sum(loss(z, right) for z, _, right in parts), np.asarray(gradient)
+    def total(w: Array) -> float:
+        return sum(loss(X @ w, pair.right) for X, pair in zip(columns, own, strict=True))
 
-    start = np.zeros(columns[0].shape[1])
-    return np.asarray(minimize(total, start, jac=True, options={"gtol": 1e-8}).x)
+    return np.asarray(minimize(total, np.zeros(columns[0].shape[1])).x)
 
 
 def loss(z: Array, right: Array) -> float:

@@ -2,10 +2,9 @@
 
     python scripts/compare_estimates.py BEFORE [AFTER] [--quick] [--presets ransac fmtorch]
 
-BEFORE and AFTER are checkouts; AFTER is this one by default. Every estimator preset of the project runs on the same
-pairs in a process of each checkout: synthetic scenes with and without prior, noise, image sizes, and pairs that are
-degenerate. Compared are F, inliers, ok, reasons, samples, the models before the final fit, and gradients, besides
-public functions of `fmtorch.geometry`. Only public names are used. Exit status 1 where anything differs.
+Every estimator preset of the project runs on the same pairs in a process of each checkout (AFTER: this one). Compared
+are F, inliers, ok, reasons, samples, models before the final fit, and gradients, besides public functions of
+`fmtorch.geometry`. Exit status 1 where anything differs.
 """
 
 import argparse
@@ -76,23 +75,22 @@ def dump(pairs: Path, out: Path, presets_: list[str], quick: bool) -> None:
                 values["reasons"] = torch.frombuffer(reasons, dtype=torch.uint8).clone()
                 arrays |= {f"{name} | {label} | seed {seed} | {f}": value for f, value in values.items()}
             if label == "scenes":
-                arrays |= gradients(f"{name} | {label} |", estimator, c)
+                asked = {f: getattr(c, f).double().requires_grad_() for f in ("x0", "x1", "prior", "noise")}
+                arrays |= with_gradients(f"{name} | {label} | F", estimator(c.replace(**asked), 1).F, asked)
                 if unfitted is not None:
                     plain = presets.build("estimator", name, **unfitted)(c, 0)
                     arrays[f"{name} | {label} | before the final fit"] = plain.F
     torch.save(arrays, out)
 
 
-def gradients(what: str, estimator: Any, c: Any) -> dict[str, torch.Tensor]:
-    asked = {f: getattr(c, f).double().requires_grad_() for f in ("x0", "x1", "prior", "noise")}
-    estimate = estimator(c.replace(**asked), 1)
-    weights = torch.linspace(-1, 1, 9, dtype=torch.float64).reshape(3, 3)
-    F = estimate.F
-    if not F.requires_grad:
-        return {f"{what} F with gradients": F}
-    grads = torch.autograd.grad((F * weights).sum(), list(asked.values()), allow_unused=True)
-    named = {f"{what} gradient to {f}": g for f, g in zip(asked, grads, strict=True) if g is not None}
-    return {f"{what} F with gradients": F.detach(), **named}
+def with_gradients(name: str, value: torch.Tensor, asked: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """A value, and the gradients of it, weighted, to what it is a function of."""
+    if not value.requires_grad:
+        return {name: value}
+    weights = torch.linspace(-1, 1, value.numel(), dtype=value.dtype).reshape(value.shape)
+    grads = torch.autograd.grad((value * weights).sum(), list(asked.values()), allow_unused=True)
+    named = {f"{name} | gradient to {f}": g for f, g in zip(asked, grads, strict=True) if g is not None}
+    return {name: value.detach(), **named}
 
 
 def geometry() -> dict[str, torch.Tensor]:
@@ -111,22 +109,16 @@ def geometry() -> dict[str, torch.Tensor]:
         "pose": lambda a, b, v: g.pose_from_fundamental(g.eight_point(a, b, v)[0], K, K, a, b).R,
         "sampson": lambda a, b, v: g.sampson(F0[:, 0], a, b),
         "calibration": lambda a, b, v: g.fundamental_from_calibration(K, K, K / 700, a[:, 0, :1].expand(5, 3) + 1),
-        **{
-            f"{name} {kind}": lambda a, b, v, f=f, kind=kind: f(
-                *((F0, a, b) if f is g.refine else (a, b, F0)), v, mask, loss=kind, scale=3.0
-            )
-            for name, f in (("refine", g.refine), ("irls", g.irls))
-            for kind in ("cauchy", "truncated", "magsac")
-        },
         "attached step": lambda a, b, v: g.attached_step(F0, a, b, v, mask, loss="huber", scale=3.0),
     }
+    for loss in ("cauchy", "truncated", "magsac"):
+        how: dict[str, Any] = {"loss": loss, "scale": 3.0}
+        calls[f"refine {loss}"] = lambda a, b, v, how=how: g.refine(F0, a, b, v, mask, **how)
+        calls[f"irls {loss}"] = lambda a, b, v, how=how: g.irls(a, b, F0, v, mask, **how)
     arrays = {}
     for name, call in calls.items():
-        asked = [x.clone().requires_grad_() for x in (x0, x1, w)]
-        value = call(*asked)
-        arrays[f"geometry | {name}"] = value.detach()
-        grads = torch.autograd.grad(value.sum(), asked, allow_unused=True)
-        arrays |= {f"geometry | {name} | gradient {i}": x for i, x in enumerate(grads) if x is not None}
+        asked = {f: x.clone().requires_grad_() for f, x in (("x0", x0), ("x1", x1), ("weight", w))}
+        arrays |= with_gradients(f"geometry | {name}", call(*asked.values()), asked)
     return arrays
 
 
@@ -141,22 +133,19 @@ def computed(source: Path, folder: Path, out: Path, arguments: argparse.Namespac
 
 def same(a: torch.Tensor, b: torch.Tensor) -> bool:
     """Bit for bit, any NaN equal to any other."""
-    if a.shape != b.shape or a.dtype != b.dtype:
-        return False
-    signed = (a.signbit() == b.signbit()) if a.is_floating_point() else True
-    return bool((((a == b) & signed) | ((a != a) & (b != b))).all())
+    a, b = (torch.where(x.isnan(), torch.nan, x) if x.is_floating_point() else x for x in (a, b))
+    return (a.dtype, a.shape, a.numpy().tobytes()) == (b.dtype, b.shape, b.numpy().tobytes())
 
 
 def differences(before: dict[str, torch.Tensor], after: dict[str, torch.Tensor]) -> list[str]:
-    lines = []
-    for name in sorted(before.keys() | after.keys()):
-        if name not in before or name not in after:
-            lines.append(f"{name}: only {'before' if name in before else 'after'}")
-        elif not same(before[name], after[name]):
+    lines = [f"{name}: only before" for name in before.keys() - after.keys()]
+    lines += [f"{name}: only after" for name in after.keys() - before.keys()]
+    for name in before.keys() & after.keys():
+        if not same(before[name], after[name]):
             a, b = before[name].double(), after[name].double()
             size = f"by {float((a - b).abs().nan_to_num().max()):.3g}" if a.shape == b.shape else "in shape"
             lines.append(f"{name}: differs {size}")
-    return lines
+    return sorted(lines)
 
 
 def main() -> None:

@@ -3,15 +3,11 @@
 python scripts/download.py                                        lists what there is
 python scripts/download.py dataset=tum folder=TUM                 the paper's test sequences, unpacked; can be continued
 python scripts/download.py dataset=tum files=[freiburg1_xyz]      others; docs/guides/data.md says what each set is
-python scripts/download.py dataset=kitti                          what to do where a form must be filled in
 python scripts/download.py weights=affnet                         -> weights/AffNet.pth
-python scripts/download.py weights=hardnet++ sha256=HEX           for a file whose SHA-256 is not pinned here
-python scripts/download.py weights=hardnet++ sha256=any           accepts what comes, and prints its SHA-256
+python scripts/download.py weights=hardnet++ sha256=HEX           for a file whose SHA-256 is not pinned here, or any
 
 L2-Net's authors publish MATLAB files only and no stable address of a port is known; a port that you have is converted
 by scripts.patch_networks.export architecture=l2net.
-
-Then: python -m scripts.patch_networks.export checkpoint=weights/AffNet.pth architecture=affnet licence=MIT
 """
 
 import hashlib
@@ -31,18 +27,14 @@ from rich.table import Table
 
 from fmtorch.core.terminal import console, exits_with_message
 
-DEFAULTS = {
-    "weights": None, "dataset": None, "files": None, "sha256": None, "folder": None, "url": None, "timeout": 60,
-}  # fmt: skip
+DEFAULTS = dict.fromkeys(("weights", "dataset", "files", "sha256", "folder", "url")) | {"timeout": 60}
 KNOWN = OmegaConf.load(Path(__file__).with_suffix(".yaml"))
 WEIGHTS, DATASETS = KNOWN.weights, KNOWN.datasets
 
 
 def resume(url: str, path: Path, timeout: float | int = 60) -> None:
     """Fetch `url` into `path`, beside which an unfinished part is kept, and continued where the server can.
-
-    Raises ConnectionError where it cannot be fetched whole; the same call then goes on.
-    """
+    Raises ConnectionError where it cannot be fetched whole; the same call then goes on."""
     if path.is_file():
         return
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -76,26 +68,9 @@ def expect_digest(url: str, path: Path, sha256: str | None) -> str:
     return digest
 
 
-def download(url: str, path: Path, sha256: str | None, timeout: float | int = 60) -> str:
-    """Fetch `url` into `path`, which appears only when the file is complete and verified; returns its SHA-256.
-
-    sha256: what it must be; None accepts what comes. Raises ConnectionError where the file cannot be fetched,
-    ValueError where it is another one.
-    """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}") as folder:
-        fresh = Path(folder) / path.name
-        resume(url, fresh, timeout)
-        digest = expect_digest(url, fresh, sha256)
-        os.replace(fresh, path)
-    return digest
-
-
 def unpack(archive: Path, folder: Path) -> list[Path]:
     """Unpack a tar archive; its files and folders appear in `folder` when all are there. Returns them.
-
-    Raises ValueError for a damaged archive, for members that would leave the folder, and for links and devices.
-    """
+    Raises ValueError for a damaged archive, for members that would leave the folder, and for links and devices."""
     with tempfile.TemporaryDirectory(dir=folder, prefix=".unpacking") as temporary:
         try:
             with tarfile.open(archive) as tar:
@@ -112,9 +87,7 @@ def unpack(archive: Path, folder: Path) -> list[Path]:
 
 def _extract(tar: tarfile.TarFile, member: tarfile.TarInfo, folder: Path) -> None:
     """Write a file or make a folder below `folder`: what `filter="data"` allows, which Python 3.11.2 has not.
-
-    Raises TarError for anything else, and for a name that leads elsewhere.
-    """
+    Raises TarError for anything else, and for a name that leads elsewhere."""
     name = PurePosixPath(member.name)
     if name.is_absolute() or ".." in name.parts or PureWindowsPath(member.name).drive or "\\" in member.name:
         raise tarfile.TarError(f"{member.name!r} would be outside the folder")
@@ -167,7 +140,8 @@ def fetch(config: DictConfig) -> Path:
     if expected != "any" and not re.fullmatch(r"[0-9a-fA-F]{64}", expected):
         raise ValueError(f"sha256={expected} is no SHA-256: 64 hexadecimal digits, or any")
     path = Path(config.folder or "weights") / name
-    digest = download(config.url or entry.url, path, None if expected == "any" else expected, config.timeout)
+    resume(config.url or entry.url, path, config.timeout)
+    digest = expect_digest(config.url or entry.url, path, None if expected == "any" else expected)
     state = "not verified" if expected == "any" else "verified"
     console.print(f"{path}  SHA-256 {digest} ({state})  licence: MIT  architecture={entry.architecture}")
     return path

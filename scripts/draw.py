@@ -6,12 +6,12 @@ python scripts/draw.py overview [--output docs/overview.jpg]    that of the READ
 
 import argparse
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from PIL import Image
 
 import fmtorch
 from fmtorch import Correspondences, Estimate, data, metrics, presets
@@ -21,20 +21,10 @@ from fmtorch.pipeline.pipeline import load_pipeline
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 GALLERY_WIDTH, OVERVIEW_WIDTH, HEIGHT, GAP = 1200, 1600, 400, 8  # px
-PIPELINE, PEER = "sift_fmtorch", ("opencv", {"method": "usac_magsac"})
+PIPELINE, METHOD = "sift_fmtorch", "usac_magsac"  # ours; OpenCV's
 OVERVIEW_PAIR = 3  # of each family
 
 Picture = NDArray[np.uint8]
-
-
-class Row(NamedTuple):
-    """A pair, its matches, and what two estimators make of them; errors: NSGD of both."""
-
-    pair: ImagePair
-    matches: Correspondences
-    ours: Estimate
-    theirs: Estimate
-    errors: tuple[float, float]
 
 
 def images_of(pair: ImagePair) -> tuple[Picture, Picture]:
@@ -43,49 +33,45 @@ def images_of(pair: ImagePair) -> tuple[Picture, Picture]:
 
 def points(c: Correspondences, estimate: Estimate) -> tuple[NDArray[Any], NDArray[Any], NDArray[np.bool_]]:
     """Both ends of the matches (N, 2), px, and which are inliers."""
-    mask = c.mask[0]
-    x0, x1 = (x[0][mask].double().numpy() for x in (c.x0, c.x1))
-    return x0, x1, estimate.inliers[0][mask].numpy()
+    x0, x1, inliers = (x[0][c.mask[0]] for x in (c.x0, c.x1, estimate.inliers))
+    return x0.double().numpy(), x1.double().numpy(), inliers.numpy()
 
 
-def resized(picture: Picture, width: int) -> Picture:
+def resized(picture: Picture, width: int) -> Image.Image:
     size = width, round(picture.shape[0] * width / picture.shape[1])
-    return cv2.resize(picture, size, interpolation=cv2.INTER_AREA)  # type: ignore[return-value]
-
-
-def save(path: Path, picture: Picture, quality: int) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    cv2.imwrite(str(path), picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
+    return Image.fromarray(picture).resize(size, Image.Resampling.BOX)
 
 
 def gallery(folder: Path) -> None:
-    pipeline, peer = load_pipeline(PIPELINE), presets.build("estimator", PEER[0], **PEER[1])
+    pipeline, peer = load_pipeline(PIPELINE), presets.build("estimator", "opencv", method=METHOD)
+    rows: list[tuple[ImagePair, Correspondences, list[Estimate], list[float]]] = []  # estimates and NSGD, ours first
     pairs = list(data.load("rendered", families=["orbit", "collection"]))
-    rows = []
-    for pair, outcome in zip(pairs, (pipeline.run([pair])[0] for pair in pairs), strict=True):
+    for pair in pairs:
+        (outcome,) = pipeline.run([pair])
         c, ours = outcome.correspondences, outcome.estimate
         if c is not None and ours is not None:
-            theirs, F = peer(c, 0), torch.as_tensor(pair.F)[None]
-            right, wrong = (float(metrics.nsgd(F, e.F.double(), c.size0, c.size1)) for e in (ours, theirs))
-            rows.append(Row(pair, c, ours, theirs, (right, wrong)))
+            both, F = [ours, peer(c, 0)], torch.as_tensor(pair.F)[None]
+            rows.append((pair, c, both, [float(metrics.nsgd(F, e.F.double(), c.size0, c.size1)) for e in both]))
 
     def keep(name: str, picture: Picture) -> None:
-        save(folder / f"{name}.jpg", resized(picture, GALLERY_WIDTH), 80)
+        folder.mkdir(parents=True, exist_ok=True)
+        resized(picture, GALLERY_WIDTH).save(folder / f"{name}.jpg", quality=80)
 
-    def epipolar(name: str, row: Row, estimate: Estimate) -> None:
+    def epipolar(name: str, row: Any, estimate: Estimate) -> None:
         """The lines of an estimate at inliers of ours; the true lines are dashed."""
-        x0, x1, good = points(row.matches, row.ours)
-        ends = *images_of(row.pair), x0[good], x1[good]
-        keep(name, draw_epipolar_lines(*ends, estimate.F[0].numpy(), truth=row.pair.F, most=10))
+        pair, c, (ours, _), _ = row
+        x0, x1, good = points(c, ours)
+        ends = *images_of(pair), x0[good], x1[good]
+        keep(name, draw_epipolar_lines(*ends, estimate.F[0].numpy(), truth=pair.F, most=10))
 
-    most = max((row for row in rows if row.pair.family == "orbit"), key=lambda row: int(row.matches.count()))
-    keep("matches", draw_matches(*images_of(most.pair), *points(most.matches, most.ours), most=60))
-    epipolar("epipolar", most, most.ours)
-    apart = max(rows, key=lambda row: min(row.errors[1], 0.3) - 5 * row.errors[0])
-    epipolar("wrong", apart, apart.theirs)
-    epipolar("right", apart, apart.ours)
-    errors = "NSGD {:.4f} of fmtorch, {:.4f} of ".format(*apart.errors) + PEER[1]["method"]
-    print(f"{apart.pair.identity}: {int(apart.matches.count())} matches; {errors}")
+    most = max((row for row in rows if row[0].family == "orbit"), key=lambda row: int(row[1].count()))
+    keep("matches", draw_matches(*images_of(most[0]), *points(most[1], most[2][0]), most=60))
+    epipolar("epipolar", most, most[2][0])
+    apart = max(rows, key=lambda row: min(row[3][1], 0.3) - 5 * row[3][0])
+    for name, estimate in zip(("right", "wrong"), apart[2], strict=True):
+        epipolar(name, apart, estimate)
+    errors = "NSGD {:.4f} of fmtorch, {:.4f} of ".format(*apart[3]) + METHOD
+    print(f"{apart[0].identity}: {int(apart[1].count())} matches; {errors}")
 
     orbits = [pair for pair in pairs if pair.family == "orbit"]
     images = read_image(orbits[0].image0), read_image(orbits[-1].image0)
@@ -96,14 +82,14 @@ def gallery(folder: Path) -> None:
 
 
 def overview(path: Path) -> None:
-    """One test pair of each rendered family, its matches classified by LMedS."""
+    """One test pair of each rendered family, its matches classified by LMedS, two in a row."""
     pipeline = load_pipeline("sift_ratio", overrides=["pruner=[ratio,one_to_one]", "estimator=lmeds"])
     families: dict[str, list[ImagePair]] = {}
     for pair in data.load("rendered", "test"):
         families.setdefault(pair.family, []).append(pair)
     strips = []
     for pair in (members[OVERVIEW_PAIR] for members in families.values()):
-        outcome = pipeline.run([pair])[0]
+        (outcome,) = pipeline.run([pair])
         assert outcome.correspondences is not None
         assert outcome.estimate is not None
         matches = points(outcome.correspondences.compact(), outcome.estimate)
@@ -112,8 +98,10 @@ def overview(path: Path) -> None:
     between = np.full((HEIGHT, GAP, 3), 255, np.uint8)
     beside = zip(strips, reversed(strips[len(strips) // 2 :]), strict=False)  # the widest beside the narrowest
     rows = [resized(np.hstack([a, between, b]), OVERVIEW_WIDTH) for a, b in beside]
-    below = np.full((GAP, OVERVIEW_WIDTH, 3), 255, np.uint8)
-    save(path, np.vstack([part for row in rows for part in (row, below)][:-1]), 85)
+    whole = Image.new("RGB", (OVERVIEW_WIDTH, sum(row.height + GAP for row in rows) - GAP), "white")
+    for i, row in enumerate(rows):
+        whole.paste(row, (0, sum(above.height + GAP for above in rows[:i])))
+    whole.save(path, quality=85)
 
 
 def main() -> None:

@@ -1,15 +1,13 @@
 """Makes learned files of models/: from photographs, or from weights that others published.
 
-python scripts/make_models.py pca --photos FOLDER
-    models/rootsift_pca.npz: the mean and the 80 principal axes of RootSIFT descriptors at DoG keypoints (Bursuc, Tolias
-    and Jégou, ICMR 2015, section 4, there on patches of Brown et al.)
-python scripts/make_models.py codebooks --photos FOLDER
-    models/vlad_rootsift_pca.npz and models/vlad_hardnet.npz, VLAD's codebooks: mean and principal axes of local
-    descriptors, and centres of the projected ones by k-means
-python scripts/make_models.py ngransac weights_ucn_r1.00.net runs/ngransac.safetensors
-    a learned file of `LC` from a checkpoint of neural-guided RANSAC (Brachmann & Rother, ICCV 2019; BSD 3-clause): the
-    authors' .net, or an .npz of the same parameters; nothing in it is executed. Then: python -m fmtorch.eval
-    pipeline=sift_lc 'pruner.lc.file=runs/ngransac.safetensors' 'pruner.lc.network.side=[ratio]'
+pca --photos FOLDER: models/rootsift_pca.npz, the mean and the 80 principal axes of RootSIFT descriptors at DoG
+keypoints (Bursuc, Tolias and Jégou, ICMR 2015, section 4, there on patches of Brown et al.)
+codebooks --photos FOLDER: models/vlad_rootsift_pca.npz and models/vlad_hardnet.npz, VLAD's codebooks: mean and
+principal axes of local descriptors, and centres of the projected ones by k-means
+ngransac weights_ucn_r1.00.net runs/ngransac.safetensors: a learned file of `LC` from a checkpoint of neural-guided
+RANSAC (Brachmann & Rother, ICCV 2019; BSD 3-clause), the authors' .net, or an .npz of the same parameters; nothing in
+it is executed. Then: fmtorch eval pipeline=sift_lc pruner.lc.file=runs/ngransac.safetensors
+'pruner.lc.network.side=[ratio]'
 
 Photographs: scikit-image's of the train split and, with --photos, a folder whose sources.txt names each file's source;
 only those of --sources are read.
@@ -24,6 +22,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.cluster.vq import kmeans2
 from torch import Tensor
 
 from fmtorch.core.files import models_dir, replacing
@@ -84,25 +83,12 @@ def codebooks(arguments: argparse.Namespace) -> None:
 
 
 def learned(parts: list[Tensor], centers: int, dimensions: int) -> Codebook:
+    """Centres by Lloyd's iterations from k-means++ (Arthur and Vassilvitskii, 2007)."""
     descriptors = torch.cat(parts)
     mean, basis = learn_projection(descriptors, dimensions)
-    return Codebook(mean, basis, k_means((descriptors - mean) @ basis, centers))
-
-
-def k_means(x: Tensor, count: int, seed: int = 0) -> Tensor:
-    """Centres (count, d) of x (n, d) by Lloyd's iterations from k-means++ (Arthur and Vassilvitskii, 2007)."""
-    generator = torch.Generator().manual_seed(seed)
-    centers = x[torch.randint(len(x), (1,), generator=generator)]
-    nearest = (x - centers[0]).square().sum(1)
-    while len(centers) < count:
-        centers = torch.cat([centers, x[torch.multinomial(nearest, 1, generator=generator)]])
-        nearest = torch.minimum(nearest, (x - centers[-1]).square().sum(1))
-    for _ in range(ITERATIONS):
-        assigned = torch.cdist(x, centers).argmin(1)
-        counts = torch.bincount(assigned, minlength=count)
-        sums = torch.zeros_like(centers).index_add_(0, assigned, x)
-        centers = torch.where(counts[:, None] > 0, sums / counts.clamp(min=1)[:, None], centers)
-    return centers
+    projected = ((descriptors - mean) @ basis).numpy()
+    nearest, _ = kmeans2(projected, centers, iter=ITERATIONS, minit="++", seed=0)
+    return Codebook(mean, basis, torch.from_numpy(nearest))
 
 
 def ngransac(arguments: argparse.Namespace) -> None:
@@ -119,11 +105,9 @@ def ngransac(arguments: argparse.Namespace) -> None:
 
 def ngransac_state(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """The state of `LC` from that of the network of Brachmann & Rother, "Neural-guided RANSAC", ICCV 2019.
-
     Their network is LC with 12 blocks, coordinates="size" and side=["ratio"]. Its layers are p_in, 0s0 to 11s3 and
-    p_out; the biases of s0 and s2, which context normalisation takes away, are left out.
-    Raises ValueError for a name that is none of these.
-    """
+    p_out; the biases of s0 and s2, which context normalisation takes away, are left out. Raises ValueError for a name
+    that is none of these."""
     state = {}
     for key, value in weights.items():
         layer, _, kind = key.rpartition(".")

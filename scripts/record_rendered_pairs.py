@@ -5,22 +5,20 @@
 adds folders of `rendered` to fmtorch/scenes/pairs.json and drops those of other versions.
 """
 
-import argparse
 import json
+import sys
 from pathlib import Path
 
 from fmtorch.scenes.dataset import FAMILIES, PLANS, RECORD, SPLITS, digest, recorded_pairs
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Records which pairs of a drawn data set can be matched.")
-    parser.add_argument("folders", nargs="+", type=Path, metavar="DIR")
     current = {
         (family, split, size): digest(family, split, 0, PLANS[size, split])
         for family in FAMILIES for split in SPLITS for size in ("small", "full")
     }  # fmt: skip
     record = {name: scenes for name, scenes in recorded_pairs().items() if name in current.values()}
-    for folder in parser.parse_args().folders:
+    for folder in map(Path, sys.argv[1:]):
         family, split, size, version = folder.name.split("-")
         name = current[family, split, size]
         if not name.startswith(version):

@@ -24,6 +24,14 @@ ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_
 PATIENCE = 1200.0  # seconds after which a command hangs
 
 
+def alive(pid: int) -> bool:
+    """Whether a process runs; one that has ended and waits to be buried does not."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
 class Command:
     """A command that runs."""
 
@@ -45,11 +53,7 @@ class Command:
 
     def runs(self) -> bool:
         """Whether it has not ended, killed or by itself."""
-        try:
-            state = Path(f"/proc/{self.pid}/stat").read_text().rpartition(")")[2].split()[0]
-        except OSError:
-            return False
-        return state != "Z"
+        return alive(self.pid)
 
     def kill_when(self, reached: Callable[[], bool], later: float = 0.0) -> bool:
         """Kill it `later` seconds after something is so; whether it was still running then."""
@@ -94,10 +98,8 @@ class Starter:
         environment: Mapping[str, str] | None = None,
     ) -> Command:
         """``python -m fmtorch <name> arguments`` in a folder; before: Python code that runs first.
-
-        name: of a command, or of a module, or ``-c``, before code to run.
-        log, errors: files for standard output and standard error, which go into one in the folder if not given.
-        """
+        name: of a command, or of a module, or ``-c``, before code to run. log, errors: files for standard output and
+        standard error, which go into one in the folder if not given."""
         self._count += 1
         log = log or cwd / f"{name}-{self._count}.log"
         own = {"FMTORCH_CACHE": str(own_cache(cwd)), "PYTHONPATH": str(SOURCE), **(environment or {})}
@@ -133,10 +135,8 @@ def run_command(
     name: str, *arguments: str, cwd: Path, environment: Mapping[str, str] | None = None, patience: float = 300.0
 ) -> subprocess.CompletedProcess[str]:
     """``python -m fmtorch <name> arguments`` as a user runs it in a folder, to its end (names as of `Starter.start`).
-
     The process is forked from one that has imported the libraries, which saves seconds, and has a cache of its own.
-    Raises TimeoutError.
-    """
+    Raises TimeoutError."""
     with tempfile.TemporaryDirectory() as folder:
         log, errors = (Path(folder) / stream for stream in ("out", "errors"))
         command = starter().start(cwd, name, *arguments, log=log, errors=errors, environment=environment)

@@ -63,9 +63,7 @@ def run(job: dict[str, Any]) -> None:
 
 def warm_up() -> None:
     """Load what numba needs before its first kernel; read the package's code.
-
-    Without threads, which a fork would lose.
-    """
+    Without threads, which a fork would lose."""
     with contextlib.suppress(ImportError):
         from numba.core.registry import cpu_target
 

@@ -9,7 +9,7 @@ import torch
 if not __package__:
     raise SystemExit("run it in the checkout's folder, as a module: python -m scripts.benchmark COMMAND ...")
 
-MODULES = "cameras estimators images pipelines planes posebench related speed stress verify"
+MODULES = "cameras estimators pipelines planes speed verify"
 
 
 def main() -> None:

@@ -10,10 +10,11 @@ import dataclasses
 import functools
 import math
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -22,6 +23,7 @@ from fmtorch.core.types import Correspondences
 from fmtorch.data import ImagePair
 from fmtorch.geometry import symmetric_max
 from fmtorch.pruning import one_to_one
+from fmtorch.training.labelled import LabelledMatches, move, transform
 
 RATIO = 0.8
 RIGHT_PX, WRONG_PX = 3.0, 10.0  # from the true epipolar lines in both images, and in one of them
@@ -37,13 +39,10 @@ WINDOW = 0.6  # of width and height
 ZOOM = 2.5
 
 
-@dataclasses.dataclass(frozen=True)
-class Case:
+class Case(NamedTuple):
     """A pair with its matches, the right and the wrong told by its true F.
-
     c: a batch of one, no slot masked. right: (n,), True within RIGHT_PX of the true epipolar lines in both images.
-    wrong: (n,), True beyond WRONG_PX in one of them. spare: wrong nearest neighbours that the ratio test took away.
-    """
+    wrong: (n,), True beyond WRONG_PX in one of them. spare: wrong nearest neighbours that the ratio test took away."""
 
     pair: ImagePair
     c: Correspondences
@@ -53,7 +52,7 @@ class Case:
 
     def subset(self, index: Tensor) -> Case:
         """Some of the matches: a mask or indices."""
-        return dataclasses.replace(self, c=taken(self.c, index), right=self.right[index], wrong=self.wrong[index])
+        return self._replace(c=taken(self.c, index), right=self.right[index], wrong=self.wrong[index])
 
     def rng(self, *names: float | str) -> np.random.Generator:
         """Random numbers that depend on the pair and on what they are for."""
@@ -70,7 +69,7 @@ def case_of(pair: ImagePair, c: Correspondences) -> Case:
     passed = c.mask & (c.ratio < RATIO)
     kept = one_to_one(c.x0, c.x1, c.ratio, passed)
     spare = one_to_one(c.x0, c.x1, c.ratio, c.mask & ~passed)
-    distance = distances(pair.F, c)
+    distance = symmetric_max(torch.from_numpy(pair.F)[None], c.x0.double(), c.x1.double())[0]  # the greater, px
     matches, apart = taken(c, kept[0]), distance[kept[0]]
     return Case(pair, matches, apart < RIGHT_PX, apart > WRONG_PX, taken(c, spare[0] & (distance > WRONG_PX)))
 
@@ -79,11 +78,6 @@ def taken(c: Correspondences, index: Tensor) -> Correspondences:
     """Some matches of a batch of one: a mask or indices."""
     slots = {name: getattr(c, name) for name in c.per_slot if getattr(c, name) is not None}
     return c.replace(**{name: value[:, index] for name, value in slots.items()})
-
-
-def distances(F: NDArray[np.float64], c: Correspondences) -> Float[Tensor, " n"]:
-    """The greater distance of each match to its true epipolar lines, in pixels."""
-    return symmetric_max(torch.from_numpy(F)[None], c.x0.double(), c.x1.double())[0]
 
 
 def parallax(case: Case) -> float:
@@ -108,10 +102,8 @@ def on_plane(case: Case) -> Bool[Tensor, " n"]:
 
 def inlier_ratio(case: Case, ratio: float) -> Case | None:
     """The right matches with as many wrong ones as make this share of inliers; matches that are neither are left out.
-
     Right ones are as many at every ratio, at most MAX_RIGHT. Wrong ones are first the pair's own, then wrong nearest
-    neighbours that the ratio test took away, with distance ratios drawn from those of the pair's own wrong matches.
-    """
+    neighbours that the ratio test took away, with distance ratios drawn from those of the pair's own wrong matches."""
     rng, min_ratio = case.rng("inlier ratio"), min(INLIER_RATIOS)
     right, wrong = (rng.permutation(np.flatnonzero(mask.numpy())) for mask in (case.right, case.wrong))
     spare = rng.permutation(case.spare.mask.shape[1])
@@ -136,8 +128,8 @@ def noise(case: Case, sigma: float) -> Case | None:
     """Gaussian noise of so many pixels added to every coordinate of the matches, of which at most MAX_MATCHES."""
     rng, n = case.rng("noise"), len(case.right)
     case = case.subset(torch.from_numpy(np.sort(rng.permutation(n)[:MAX_MATCHES])))
-    shift = [torch.from_numpy(rng.normal(0, 1, tuple(case.c.x0.shape)) * sigma).to(case.c.x0) for _ in range(2)]
-    return dataclasses.replace(case, c=_placed(case.c, case.c.x0 + shift[0], case.c.x1 + shift[1]))
+    steps = [torch.from_numpy(rng.normal(0, 1, tuple(case.c.x0.shape)) * sigma) for _ in range(2)]
+    return case._replace(c=move(labelled(case.pair, case.c), *steps).correspondences)
 
 
 def match_count(case: Case, count: float) -> Case | None:
@@ -198,25 +190,28 @@ def seen(case: Case, window0: Window, window1: Window) -> Case | None:
     """The matches inside both windows, in the windows' pixels, with F of these; None: fewer than MIN_RIGHT right."""
     pair, c, inside = windowed(case.pair, case.c, (window0, window1))
     enough = int((case.right & inside).sum()) >= MIN_RIGHT
-    return dataclasses.replace(case, pair=pair, c=c).subset(inside) if enough else None
+    return case._replace(pair=pair, c=c).subset(inside) if enough else None
 
 
 def windowed(
     pair: ImagePair, c: Correspondences, windows: tuple[Window, Window]
 ) -> tuple[ImagePair, Correspondences, Bool[Tensor, " n"]]:
     """The pair and its matches in the windows' pixels, and which matches are inside both; without cameras."""
-    moved, inverse = [], []
-    inside = torch.ones_like(c.mask[0])
-    for x, (corner, new, scale) in zip((c.x0, c.x1), windows, strict=True):
-        shift = scale * (0.5 - corner) - 0.5  # pixel (0, 0) has its centre there and its corner at -0.5
-        y = scale * x[0].double() + torch.from_numpy(shift)
-        inside &= ((y > -0.5) & (y < torch.from_numpy(new[::-1].copy()) - 0.5)).all(-1)
-        moved.append(y[None])
-        inverse.append(np.array([[1 / scale, 0, -shift[0] / scale], [0, 1 / scale, -shift[1] / scale], [0, 0, 1]]))
-    size0, size1 = (torch.from_numpy(new.astype(np.int64))[None] for _, new, _ in windows)
-    c = _placed(c, moved[0], moved[1], windows[0][2], windows[1][2])
-    pair = dataclasses.replace(pair, F=inverse[1].T @ pair.F @ inverse[0], K0=None, K1=None)
-    return pair, c.replace(size0=size0, size1=size1, K0=None, K1=None), inside
+    matches, inside = labelled(pair, c.replace(K0=None, K1=None)), c.mask[0]
+    for image, (corner, new, scale) in enumerate(windows):
+        T = torch.diag(torch.tensor([scale, scale, 1.0], dtype=torch.float64))
+        T[:2, 2] = torch.from_numpy(scale * (0.5 - corner) - 0.5)  # pixel (0, 0) has its corner at -0.5
+        size = torch.from_numpy(new.astype(np.int64))
+        matches = transform(matches, image, T[None], size[None])
+        x = getattr(matches.correspondences, f"x{image}")[0]
+        inside = inside & ((x > -0.5) & (x < size.flip(0) - 0.5)).all(-1)
+    pair = dataclasses.replace(pair, F=matches.F[0].numpy(), K0=None, K1=None)
+    return pair, matches.correspondences, inside
+
+
+def labelled(pair: ImagePair, c: Correspondences) -> LabelledMatches:
+    """The matches with the true F, in the form that the package changes."""
+    return LabelledMatches(c, torch.zeros(c.mask.shape, dtype=torch.int8), torch.from_numpy(pair.F)[None])
 
 
 def part(
@@ -244,9 +239,8 @@ def bent(pair: ImagePair, c: Correspondences, lens: float) -> tuple[ImagePair, C
         moved[f"x{i}"] = photographed[None].to(c.x0)
         if (lafs := getattr(c, f"lafs{i}")) is not None:
             slope = (2 / (1 + root))[..., None] * torch.eye(2) + 2 * lens * y[:, :, None] * (y / root)[:, None]
-            moved[f"lafs{i}"] = torch.cat([slope @ lafs[0, ..., :2].double(), photographed[..., None]], -1)[None].to(
-                lafs
-            )
+            frames = torch.cat([slope @ lafs[0, ..., :2].double(), photographed[..., None]], -1)
+            moved[f"lafs{i}"] = frames[None].to(lafs)
     return pair, taken(c.replace(**moved), inside)
 
 
@@ -255,15 +249,6 @@ def sizes_of(c: Correspondences) -> list[list[float]]:
     assert c.size0 is not None
     assert c.size1 is not None
     return [c.size0[0].tolist(), c.size1[0].tolist()]
-
-
-def _placed(c: Correspondences, x0: Tensor, x1: Tensor, scale0: float = 1.0, scale1: float = 1.0) -> Correspondences:
-    """The matches at other points, with their frames."""
-    frames = {}
-    for name, x, scale in (("lafs0", x0, scale0), ("lafs1", x1, scale1)):
-        if (lafs := getattr(c, name)) is not None:
-            frames[name] = torch.cat([scale * lafs[..., :2], x[..., None].to(lafs)], -1)
-    return c.replace(x0=x0.to(c.x0), x1=x1.to(c.x1), **frames)
 
 
 Change = Callable[[Case], Case | None]

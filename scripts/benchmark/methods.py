@@ -36,6 +36,13 @@ SHARED = frozenset(("ratio", "one_to_one"))  # pruners that nearly all pipelines
 NO_STAGES: Mapping[str, Pruner] = {}
 
 
+def specs_of(words: Sequence[str], file: Path | None) -> list[str]:
+    """The methods that are named, and those of a file. Raises SystemExit for none."""
+    if specs := [*words, *(read_specs(file) if file else [])]:
+        return specs
+    raise SystemExit("name at least one method, or a file of --specs")
+
+
 def read_specs(path: Path) -> list[str]:
     """One method a line, without comments."""
     return [text for line in path.read_text().splitlines() if (text := line.partition("#")[0].strip())]
@@ -43,9 +50,7 @@ def read_specs(path: Path) -> list[str]:
 
 def options(text: str) -> dict[str, Any]:
     """``KEY=VALUE,...``: numbers, true, false or null as in JSON; anything else is text.
-
-    ``PART.KEY=VALUE`` is the option KEY of a part, as on the command line.
-    """
+    ``PART.KEY=VALUE`` is the option KEY of a part, as on the command line."""
     changed: dict[str, Any] = {}
     for key, value in (item.split("=") for item in text.split(",") if item):
         *parts, last = key.split(".")
@@ -75,9 +80,7 @@ def build(group: str, word: str) -> Any:
 
 def estimate_by_call(options: Mapping[str, Any], c: Correspondences, seed: int) -> Estimate:
     """What `find_fundamental` makes of points, ratios, scores and image sizes, and of a pruner's prior and noise.
-
-    options: its arguments, which replace these.
-    """
+    options: its arguments, which replace these."""
     names = ("mask", "ratio", "score", "prior", "noise", "size0", "size1", "key")
     given: dict[str, Any] = {**{name: getattr(c, name) for name in names}, "seed": seed, **options}
     return fmtorch.find_fundamental(c.x0, c.x1, **given)
@@ -103,7 +106,7 @@ def method(spec: str, matches: str = "", extra: Mapping[str, Pruner] = NO_STAGES
     return Method(spec, made_with, lambda family: stages, solve, view=functools.partial(viewed, views))
 
 
-def viewed(views: Sequence[Callable[..., Any]], outcome: Outcome) -> Outcome:
+def viewed(views: Sequence[Callable[..., Any]], outcome: Outcome, seed: int) -> Outcome:
     pair, c = outcome.pair, outcome.correspondences
     if c is None or not views:
         return outcome

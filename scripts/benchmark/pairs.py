@@ -95,11 +95,10 @@ def matched(arguments: argparse.Namespace) -> list[Item]:
 
 
 def items(pairs: Iterable[ImagePair], front: Pipeline) -> list[Item]:
-    return [Item(p, functools.partial(_match, front, p), images=functools.partial(front.images, p)) for p in pairs]
+    def matched(pair: ImagePair) -> Outcome:
+        return front.correspondences([pair])[0]
 
-
-def _match(front: Pipeline, pair: ImagePair) -> Outcome:
-    return front.correspondences([pair])[0]
+    return [Item(p, functools.partial(matched, p), images=functools.partial(front.images, p)) for p in pairs]
 
 
 def no_estimator(c: Correspondences, seed: int = 0) -> Estimate:
@@ -108,9 +107,7 @@ def no_estimator(c: Correspondences, seed: int = 0) -> Estimate:
 
 def synthetic_pair(index: int, matches: int, spread: float = 0.5) -> ImagePair:
     """Two views of a cloud of points, with their matches: with outliers, ratios and similarity frames.
-
-    Their number is log-normal about `matches`; 30 to 80 % of them are right, with a noise of 0.5 px.
-    """
+    Their number is log-normal about `matches`; 30 to 80 % of them are right, with a noise of 0.5 px."""
     f, (h, w), rng = 1.2 * SIZE[1], SIZE, np.random.default_rng(index)
     n = max(20, round(matches * np.exp(spread * rng.normal())))
     depth, x0 = rng.uniform(4, 12, n), rng.uniform([0, 0], [w, h], (n, 2))
@@ -157,17 +154,9 @@ def _tensor(value: np.ndarray) -> torch.Tensor:
 
 
 def unrelated_pairs(pairs: Sequence[ImagePair], datasets: Sequence[PairDataset], most: int) -> list[ImagePair]:
-    """Pairs of the photographs of different scenes, at most so many of each two scenes, chosen by hash.
-
-    Args:
-        pairs: related ones, whose photographs are taken.
-        datasets: which they are from.
-        most: pairs of each two scenes, each pair once, in one direction.
-
-    Returns:
-        The pairs, with an F of zeros. Rendered scenes are paired with each other where they show no photograph in
-        common, and real ones with each other.
-    """
+    """Pairs of photographs of different scenes, at most `most` of each two, chosen by hash, with an F of zeros.
+    pairs: related ones, whose photographs are taken. Rendered scenes are paired with each other where they show no
+    photograph in common, and real ones with each other."""
     shown: dict[str, frozenset[str]] = {}
     for dataset in datasets:
         shown |= photographs_shown(dataset) if isinstance(dataset, RenderedPairs) else {}
@@ -178,18 +167,14 @@ def unrelated_pairs(pairs: Sequence[ImagePair], datasets: Sequence[PairDataset],
     for a, b in itertools.combinations(scenes, 2):
         drawn = a[1] in shown
         if drawn == (b[1] in shown) and not (drawn and shown[a[1]] & shown[b[1]]):
-            both = itertools.product(scenes[a].values(), scenes[b].values())
-            crossed = [_crossed("/".join(a), "/".join(b), drawn, *images) for images in both]
+            family, names = f"{UNRELATED}, {'rendered' if drawn else 'real'}", ("/".join(a), "/".join(b))
+            crossed = []
+            for ends in itertools.product(scenes[a].values(), scenes[b].values()):
+                identity = " | ".join(f"{name}/{image.identity}" for name, image in zip(names, ends, strict=True))
+                ends = ends[::-1] if pair_key(identity) % 2 else ends  # either scene comes first in half of the pairs
+                crossed.append(ImagePair(identity, family, " | ".join(names), *ends, np.zeros((3, 3))))
             chosen += sorted(crossed, key=lambda pair: pair.key)[:most]
     return chosen
-
-
-def _crossed(a: str, b: str, drawn: bool, image0: ImageSource, image1: ImageSource) -> ImagePair:
-    family = f"{UNRELATED}, {'rendered' if drawn else 'real'}"
-    identity = f"{a}/{image0.identity} | {b}/{image1.identity}"
-    if pair_key(identity) % 2:  # either scene comes first in half of the pairs
-        image0, image1 = image1, image0
-    return ImagePair(identity, family, f"{a} | {b}", image0, image1, np.zeros((3, 3)))
 
 
 def photographs_shown(dataset: RenderedPairs) -> dict[str, frozenset[str]]:

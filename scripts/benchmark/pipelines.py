@@ -5,28 +5,38 @@ the tables, as PRESET NAME=VALUE ..., what is shown of them, and which are compa
 names or patterns such as 'sift*', or others, as 'NAME = PRESET NAME=VALUE ...'; `+ PRUNER` at the end of one adds one.
 The time of pruners is that of all but `ratio` and `one_to_one`, on one thread.
 
-python -m scripts.benchmark pipelines --root DATA/Strecha --root DATA/PhotoTourism --rows features.jsonl
-python -m scripts.benchmark pruning --rendered full --limit 50 --pipelines RATIO 'mine = sift_ratio pruner=[ratio,lpm]'
+python -m scripts.benchmark pruning --rendered full --limit 50 --pipelines RATIO 'mine = sift_ratio pruner=[ratio,lpm]\'
 """
 
 import argparse
 import fnmatch
 import functools
-from collections.abc import Mapping, Sequence
+import math
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import torch
 import yaml  # type: ignore[import-untyped]
 
+from fmtorch import data, presets
+from fmtorch.core.types import RELATED
 from fmtorch.data import ImagePair, read_image, to_grey
 from fmtorch.data.construction import keypoints, matchable
 from fmtorch.evaluation.run import select
+from fmtorch.evaluation.statistics import share_interval
 from fmtorch.features import ASIFT
+from fmtorch.features.vlad import codebook, descriptor_kind, local_descriptors, vlad
+from fmtorch.pipeline.folder import similar_pairs
 from fmtorch.pipeline.pipeline import Outcome, Pipeline
-from scripts.benchmark import pairs
-from scripts.benchmark.methods import pipeline_method
+from fmtorch.pipeline.two_images import describe
+from scripts.benchmark import pairs, tables
+from scripts.benchmark.methods import pipeline_method, pipeline_of
 from scripts.benchmark.runner import Item, Kept, Measured, Method, Row, add_command, measure
-from scripts.benchmark.tables import KIN, Record, Results, Sheet, published, show
+from scripts.benchmark.tables import KIN, Record, Results, Sheet, Span, published, show
 
 FOLDER = Path(__file__).parent
 BENCHMARKS = ("pipelines", "hard", "paper", "pruning", "learned", "refinement", "gc_ransac")
@@ -34,6 +44,17 @@ RULE = "the paper's rule"
 PAPER = {"%Recall": "recall", "%Inlier": "inlier", "%Inlier-m": "inlier_m", "#Corrs": "corrs", "#Corrs-m": "corrs_m"}
 """Columns of the paper's tables, by what they are called here and there."""
 Settings = Mapping[str, Any]
+
+
+RIGHT = 0.05  # NSGD below which an estimate of a related pair is right
+LEVELS = (-2.0, -1.0, 0.0, 1.0, 2.0, 3.0, 5.0, 8.0)
+Rows = dict[str, list[Row]]  # by pipeline
+SIMILAR = "How many of the pairs that can be matched `pairs=similar:N` proposes, all scenes mixed in one folder."
+VERDICT = """The verdict on pairs of one scene and of different scenes: shares accepted and rejected, and ROC.
+
+python -m scripts.benchmark related --root DATA/Strecha --root DATA/PhotoTourism --root DATA/KITTI --root DATA/TUM \\
+    --rows related.jsonl --table docs/tables/related.csv --figure docs/concepts/related.svg
+"""
 
 
 def settings_of(name: str) -> dict[str, Any]:
@@ -50,6 +71,16 @@ def add_arguments(commands: Any) -> None:
         asift = "the same of pipelines with ASIFT, a minute a pair"
         parser.add_argument("--asift-limit", type=int, default=10, help=asift)
         add_pipeline_options(parser)
+    parser = add_command(commands, "related", run_related, VERDICT, seeds=1)
+    pairs.add_set_options(parser)
+    parser.add_argument("--unrelated", type=int, default=300, help="pairs of each two scenes at most, chosen by hash")
+    add_pipeline_options(parser)
+    parser.add_argument("--figure", type=Path, help="draw the ROC curves here, as SVG")
+    parser.set_defaults(asift_limit=None)
+    parser = add_command(commands, "similar", run_similar, SIMILAR)
+    parser.add_argument("--root", type=Path, nargs="+", required=True, help="folders in the layout of fmbench")
+    parser.add_argument("--pipeline", default="sift_fmtorch")
+    parser.add_argument("--count", type=int, nargs="+", default=[5, 10, 20])
 
 
 def add_pipeline_options(parser: argparse.ArgumentParser) -> None:
@@ -159,3 +190,138 @@ def differences_sheet(results: Results, settings: Settings) -> Sheet:
                 line["paper: %Recall"] = f"{float(theirs[0]['recall']) - float(theirs[1]['recall']):+.1f}"
             records.append(line)
     return Sheet("differences", "Paired differences, in points", records)
+
+
+# Which pairs show one scene: the verdict on them, and the likeness of images
+
+
+def run_related(arguments: argparse.Namespace) -> None:
+    def measured_rows(kept: Kept) -> list[Row]:
+        related = [pair for pair in pairs.pairs_of(arguments) if pair.problem is None]
+        unrelated = pairs.unrelated_pairs(related, pairs.sets_of(arguments), arguments.unrelated)
+        every = sorted([*related, *unrelated], key=lambda p: (p.family, p.scene, p.image0.identity, p.image1.identity))
+        return measured(settings_of("related")["methods"], every, arguments, kept)
+
+    rows = verdicts(pairs.rows_of(arguments, measured_rows))
+    show([rates_sheet(rows), levels_sheet(rows), sets_sheet(rows)], arguments.table)
+    if arguments.figure:
+        draw(rows, arguments.figure)
+
+
+def verdicts(rows: Iterable[Row]) -> Rows:
+    """The newest row of each pipeline and pair: whether it shows one scene, is called so, and is estimated right.
+    `significance` is least where there is no F, `inliers` are 0."""
+    judged = []
+    for row in {(row["method"], row["pair"]): row for row in rows}.values():
+        true = not row["family"].startswith(pairs.UNRELATED)
+        significance = -math.inf if row["significance"] is None else float(row["significance"])
+        own = {"true": true, "right": true and row["nsgd"] < RIGHT, "significance": significance}
+        judged.append({**row, **own, "called": significance >= RELATED, "inliers": float(row["corrs"] * row["ok"])})
+    return {name: own for (name,), own in tables.grouped(judged, "method").items()}
+
+
+RULES: dict[str, Callable[[Row], bool]] = {
+    "COLMAP's rule": lambda row: row["inliers"] >= max(15, 0.25 * row["corrs_before"]),
+    "15 inliers": lambda row: row["inliers"] >= 15,
+    "20 inliers": lambda row: row["inliers"] >= 20,
+}
+"""What others accept a pair by. COLMAP's default: 15 inliers that are a quarter of the matches."""
+
+
+def split(rows: Sequence[Row]) -> tuple[list[Row], list[Row]]:
+    """Unrelated pairs, and those whose estimate is right."""
+    return [row for row in rows if not row["true"]], [row for row in rows if row["right"]]
+
+
+def rates_sheet(rows: Rows) -> Sheet:
+    """Each rule: the share of unrelated pairs that it accepts, and of right estimates that it rejects."""
+    records: list[Record] = []
+    for name, own in rows.items():
+        unrelated, good = split(own)
+        line: Record = {"pipeline": name, "unrelated pairs": len(unrelated), "right pairs": len(good)}
+        line["unrelated pairs with an F, %"] = percent([bool(row["ok"]) for row in unrelated])
+        line["accepted, %"] = share(unrelated, lambda row: row["called"])
+        line["rejected, %"] = share(good, lambda row: not row["called"])
+        for rule, accepts in RULES.items():
+            line[f"{rule}: accepted, %"] = percent([accepts(row) for row in unrelated])
+            line[f"{rule}: rejected, %"] = percent([not accepts(row) for row in good])
+        for head, figure in (("area", "significance"), ("area by inliers", "inliers")):
+            line[head] = f"{tables.chance_of_more(*([row[figure] for row in part] for part in (good, unrelated))):.5f}"
+        records.append(line)
+    title = f"At level {RELATED:g}: unrelated pairs accepted and right ones (NSGD < {RIGHT}) rejected"
+    return Sheet("rates", title, records)
+
+
+def levels_sheet(rows: Rows) -> Sheet:
+    """Points of the ROC curve: unrelated pairs accepted and right ones rejected at several levels."""
+    records: list[Record] = []
+    for name, own in rows.items():
+        unrelated, good = ([row["significance"] for row in part] for part in split(own))
+        for level in LEVELS:
+            accepted, rejected = percent([x >= level for x in unrelated]), percent([x < level for x in good])
+            records.append({"pipeline": name, "level": f"{level:g}", "accepted, %": accepted, "rejected, %": rejected})
+    return Sheet("levels", "Points of the ROC curves", records)
+
+
+def sets_sheet(rows: Rows) -> Sheet:
+    """By set: pairs called related, of those whose estimate is right and of others."""
+    records: list[Record] = []
+    every = [row for own in rows.values() for row in own]
+    for (family, name), own in sorted(tables.grouped(every, "family", "method").items(), key=lambda each: each[0][0]):
+        line: Record = {"set": family, "pipeline": name}
+        for head, kind in (("right", True), ("other", False)):
+            called = [row["called"] for row in own if row["right"] == kind]
+            line |= {f"{head} pairs": len(called), f"{head} pairs called related": sum(called)}
+        records.append(line)
+    return Sheet("sets", "Pairs called related", records)
+
+
+def share(rows: Sequence[Row], holds: Callable[[Row], bool]) -> Span | str:
+    """The share of pairs for which something holds, in %, with its interval."""
+    if not rows:
+        return ""
+    i = share_interval(np.array([holds(row) for row in rows]), [f"{row['family']}/{row['scene']}" for row in rows])
+    return Span(*(f"{100 * value:.2f}" for value in (i.value, i.low, i.high)))
+
+
+def percent(values: Sequence[bool]) -> str:
+    return f"{100 * np.mean(values):.2f}" if values else ""
+
+
+def draw(rows: Rows, path: Path) -> None:
+    """The ROC curves: a panel for each way to judge pairs, a line for each pipeline, a dot at the verdict's level."""
+    panels: dict[str, dict[str, tables.Line]] = {"by significance": {}, "by the number of inliers": {}}
+    for name, own in ((name, own) for name, own in rows.items() if all(split(own))):
+        for figure, lines in zip(("significance", "inliers"), panels.values(), strict=True):
+            unrelated, good = (np.array([row[figure] for row in part]) for part in split(own))
+            levels = np.append(np.unique(np.concatenate([unrelated, good])), np.inf)
+            accepted, rejected = (unrelated >= levels[:, None]).mean(1), (good < levels[:, None]).mean(1)
+            perfect = " (along the axes)" if ((accepted == 0) & (rejected == 0)).any() else ""
+            dot = int(np.searchsorted(levels, RELATED)) if figure == "significance" else None
+            lines[name + perfect] = tables.Line((100 * accepted).tolist(), (100 * rejected).tolist(), dot)
+    tables.draw(path, panels, ("unrelated pairs accepted, %", "right pairs rejected, %"), "shares")
+
+
+def run_similar(arguments: argparse.Namespace) -> None:
+    roots = sorted(arguments.root)
+    paths = [path for root in roots for path in sorted(root.glob("*/Images/*"))]
+    sets = [data.load("fmbench", root=root) for root in roots]  # pairs with a true F, which `fmtorch pairs` would keep
+    true = [pair for own in sets for pair in own]
+    overlapping = {frozenset((p.image0.path, p.image1.path)): f"{p.family}/{p.scene}" for p in true}
+    pipeline = pipeline_of(arguments.pipeline)
+    kind = descriptor_kind((presets.pipeline_stages(arguments.pipeline) or {})["features"])
+    book = codebook(kind)
+    described = [describe(pipeline, read_image(path), 1600).features.descriptors for path in paths]
+    start = time.process_time()
+    vectors = torch.stack([vlad(local_descriptors(descriptors, kind), book) for descriptors in described])
+    seconds = (time.process_time() - start) / len(paths)
+    print(f"{len(paths)} images; {1e3 * seconds:.1f} s for a thousand once described")
+    proposed = {n: {frozenset(pair) for pair in similar_pairs(paths, vectors, n)} for n in arguments.count}
+    records: list[Record] = []
+    for scene, count in [*Counter(overlapping.values()).items(), ("all", len(overlapping))]:
+        line: Record = {"scene": scene, "overlapping pairs": count}
+        for n, chosen in proposed.items():
+            hits = sum(pair in chosen for pair, of in overlapping.items() if scene in (of, "all"))
+            line |= {f"similar:{n}, recall, %": f"{100 * hits / count:.0f}", f"similar:{n}, pairs": len(chosen)}
+        records.append(line)
+    show([Sheet("similar", f"Pairs proposed, of {len(paths) * (len(paths) - 1) // 2}", records)], arguments.table)

@@ -1,14 +1,8 @@
 """Homographies of photographs as planes: errors and milliseconds beside PoseLib and OpenCV, on the same matches.
 
-Warped: each photograph is seen as a plane, tilted by 20 to 55 degrees over another photograph, with blur and noise.
-Hard pairs keep at most 60 of their right matches and 70 % random ones. Views: two pictures of the plane, each rendered
-by a camera and under light of its own (`training.planes`). SIFT, ratio 0.8, one match a location, P(inlier) from frame
-consistency. Every second photograph is for tuning (--tuning), the others for the claim; --warps pairs are made of each.
+docs/benchmarks/homographies.md says what warped and hard pairs and views are. SIFT, ratio 0.8, one match a location,
+P(inlier) from frame consistency. Every second photograph is for tuning (--tuning), the others for the claim.
 
-The error of a pair is the mean distance of the true and the estimated image of the photograph's corners, or, of views,
-of the points of a grid that both see.
-
-python -m scripts.benchmark homography --photographs DATA/photos --seeds 3 --warps 2
 python -m scripts.benchmark homography --photographs DATA/photos --tuning --methods ours:select.scale=0.5 poselib:2
 """
 
@@ -34,13 +28,15 @@ from fmtorch.data import ImagePair, ImageSource, read_image
 from fmtorch.estimators.external import colmap
 from fmtorch.geometry import poses_from_homography
 from fmtorch.pipeline.pipeline import Outcome
+from fmtorch.scenes.raycast import calibration
 from fmtorch.training.planes import Photograph, PlanePairs, PlaneViews
 from fmtorch.two_view.known_cameras import KnownCameras
 from fmtorch.two_view.pair_type import classify
 from scripts.benchmark import pairs
+from scripts.benchmark.changes import sizes_of
 from scripts.benchmark.methods import options
 from scripts.benchmark.runner import Item, Kept, Measured, Row, add_command, console, measure
-from scripts.benchmark.tables import Record, Results, Sheet, show
+from scripts.benchmark.tables import Record, Results, Sheet, grouped, show
 
 POSES = ("from F", "from H, the first pose", "from H, the better one")
 KINDS = ("warped", "hard", "views")
@@ -89,7 +85,7 @@ def run(arguments: argparse.Namespace) -> None:
     planes = [*(warped(paths, arguments.warps) if {"warped", "hard"} & set(arguments.kinds) else ()),
               *(views(paths, arguments.warps) if "views" in arguments.kinds else ())]  # fmt: skip
     items = [item for item in track(planes, "warping", console=console) if item.pair.family in arguments.kinds]
-    results = Results(measure([Homography.of(word) for word in arguments.methods], items, arguments.seeds, Kept(None)))
+    results = Results(measure([Homography(word) for word in arguments.methods], items, arguments.seeds, Kept(None)))
     groups = {kind: own for kind, own in results.groups(results.all_pairs).items() if kind in results.families}
     records = results.records(groups, [*(f"AUC@{px} px" for px in (1, 3, 5)), "ms"], "method", ["AUC@1 px"])
     show([Sheet("homography", "AUC of the mean distance of points, in %", records)], arguments.table)
@@ -102,21 +98,16 @@ class Plane(Item):
     points: Array = dataclasses.field(default_factory=lambda: np.zeros((0, 2)))
 
 
-@dataclasses.dataclass(frozen=True)
 class Homography(Measured):
-    """An estimator of homographies."""
+    """An estimator of homographies: ``ours:KEY=VALUE,...``, ``poselib:THRESHOLD``, or OpenCV's ``METHOD:THRESHOLD``."""
 
-    name: str
-    solve: Callable[[Correspondences, int], Array | None]
-    identity: str = ""
+    identity = ""
 
-    @classmethod
-    def of(cls, word: str) -> Homography:
-        """``ours:KEY=VALUE,...``, ``poselib:THRESHOLD`` or the name of an OpenCV method with its threshold."""
+    def __init__(self, word: str, solve: Callable[[Correspondences, int], Array | None] | None = None) -> None:
         name, _, setting = word.partition(":")
-        if name == "ours":
-            return cls(word, functools.partial(_ours, options(setting)))
-        return cls(word, functools.partial(_peer, name, float(setting)))
+        if solve is None and name == "ours":
+            solve = functools.partial(_ours, options(setting))
+        self.name, self.solve = word, solve or functools.partial(_peer, name, float(setting))
 
     def figures(self, item: Item, seed: int) -> Row:
         """The mean error in pixels, infinite where there is no homography, and milliseconds."""
@@ -161,15 +152,17 @@ def run_pair_types(arguments: argparse.Namespace) -> None:
         items += track(list(kinds(paths_of(arguments))), "warping", console=console)
     for item in pairs.matched(arguments) if pairs.named(arguments) else ():
         if item.pair.K0 is not None and item.pair.K1 is not None and item.outcome and item.outcome.correspondences:
-            item.facts["truth"] = "general" if {item.pair.scene, item.pair.family} & GENERAL else ""
+            general = {item.pair.scene, item.pair.family} & GENERAL
+            item.facts |= {"truth": "general" if general else "", "group": f"{item.pair.family}/{item.pair.scene}"}
             items.append(item)
     methods: dict[str, Callable[[Correspondences], str]] = {"fmtorch": Ours(not arguments.unknown)}
     methods |= {f"COLMAP, {px:g} px": functools.partial(by_colmap, px) for px in arguments.colmap}
-    verdicts = {
-        name: [verdict(item.matches) for item in track(items, name, console=console, transient=True)]
+    rows: list[Row] = [
+        {**item.facts, "method": name, "kind": verdict(item.matches), "set": item.pair.family, "item": item}
         for name, verdict in methods.items()
-    }
-    show([kinds_sheet(items, verdicts), pose_sheet(items, verdicts["fmtorch"])], arguments.table)
+        for item in track(items, name, console=console, transient=True)
+    ]
+    show([kinds_sheet(rows), pose_sheet(rows)], arguments.table)
     print(time_line([item.matches for item in items]))
 
 
@@ -197,48 +190,41 @@ def by_colmap(threshold: float, c: Correspondences) -> str:
     return COLMAP[geometry.configuration]
 
 
-def kinds_sheet(items: Sequence[Item], verdicts: dict[str, list[str]]) -> Sheet:
+def kinds_sheet(rows: Sequence[Row]) -> Sheet:
     """How many pairs of each group each method calls what."""
     records: list[Record] = []
-    for name, said in verdicts.items():
-        groups: dict[tuple[str, str], list[str]] = {}
-        for item, kind in zip(items, said, strict=True):
-            scene = "" if isinstance(item, Plane) else f"/{item.pair.scene}"
-            groups.setdefault((item.pair.family + scene, item.facts["truth"]), []).append(kind)
-        for (group, truth), own in groups.items():
-            line: Record = {"method": name, "pairs of": group, "truth": truth, "pairs": len(own)}
-            line |= {kind: own.count(kind) for kind in PAIR_TYPES}
-            records.append(line | {"right, %": f"{100 * own.count(truth) / len(own):.1f}" if truth else ""})
+    for (method, group, truth), own in grouped(rows, "method", "group", "truth").items():
+        kinds = [row["kind"] for row in own]
+        line: Record = {"method": method, "pairs of": group, "truth": truth, "pairs": len(own)}
+        line |= {kind: kinds.count(kind) for kind in PAIR_TYPES}
+        records.append(line | {"right, %": f"{100 * kinds.count(truth) / len(own):.1f}" if truth else ""})
     return Sheet("kinds", "Kinds of pairs", records)
 
 
-def pose_sheet(items: Sequence[Item], said: Sequence[str]) -> Sheet:
+def pose_sheet(rows: Sequence[Row]) -> Sheet:
     """AUC of the pose error with known cameras, of pairs called general and of others, from F and from H."""
-    groups: dict[tuple[str, str], list[Array]] = {}
-    for item, kind in zip(items, said, strict=True):
-        if item.pair.R is not None and item.pair.t is not None:
-            motion = torch.from_numpy(item.pair.R), torch.from_numpy(item.pair.t)
-            groups.setdefault((item.pair.family, kind), []).append(pose_errors(item.matches, *motion))
+    posed = [row for row in rows if row["method"] == "fmtorch" and row["item"].pair.R is not None]
     records: list[Record] = []
-    for (family, kind), errors in groups.items():
-        line: Record = {"set": family, "kind": kind, "pairs": len(errors)}
-        areas = 100 * metrics.pose_auc(torch.from_numpy(np.stack(errors, 1)))
-        for name, own in zip(POSES, areas.tolist(), strict=True):
-            line |= {f"{name} @{t}": f"{area:.1f}" for t, area in zip((5, 10, 20), own, strict=True)}
+    for (family, kind), own in grouped(
+        [{**row, "set": row["item"].pair.family} for row in posed], "set", "kind"
+    ).items():
+        errors = torch.from_numpy(np.stack([pose_errors(row["item"]) for row in own], 1))
+        line: Record = {"set": family, "kind": kind, "pairs": len(own)}
+        for name, areas in zip(POSES, (100 * metrics.pose_auc(errors)).tolist(), strict=True):
+            line |= {f"{name} @{t}": f"{area:.1f}" for t, area in zip((5, 10, 20), areas, strict=True)}
         records.append(line)
     return Sheet("poses", "AUC of the pose error, in %", records)
 
 
-def pose_errors(c: Correspondences, R: torch.Tensor, t: torch.Tensor) -> Array:
+def pose_errors(item: Item) -> Array:
     """Degrees (3,): of F's pose, of the first pose of H, and of the better one of both."""
-    assert c.K0 is not None
-    assert c.K1 is not None
-    estimate = presets.build("estimator", "fmtorch")(c, 0)
-    from_F = metrics.fundamental_pose_error(estimate.F, c.K0, c.K1, c.x0, c.x1, R[None], t[None], estimate.inliers)
-    H = estimated(c)
-    poses = poses_from_homography(H.F, c.K0, c.K1, c.x0.double(), c.x1.double(), H.inliers)
+    c = item.matches
+    R, t, K0, K1 = (torch.from_numpy(getattr(item.pair, name))[None] for name in ("R", "t", "K0", "K1"))
+    x0, x1, estimate, H = c.x0.double(), c.x1.double(), presets.build("estimator", "fmtorch")(c, 0), estimated(c)
+    from_F = metrics.fundamental_pose_error(estimate.F, K0, K1, x0, x1, R, t, estimate.inliers)
+    poses = poses_from_homography(H.F, K0, K1, x0, x1, H.inliers)
     seen = torch.where(poses.valid[..., None, None], poses.R, torch.nan)
-    from_H = metrics.pose_error(seen, poses.t, R[None, None], t[None, None]).worst[0].nan_to_num(180.0)
+    from_H = metrics.pose_error(seen, poses.t, R[:, None], t[:, None]).worst[0].nan_to_num(180.0)
     return np.array([float(from_F.worst), float(from_H[0]), float(from_H.min())])
 
 
@@ -346,32 +332,25 @@ def kinds(paths: Sequence[Path]) -> Iterator[Plane]:
 
 def _with_cameras(group: str, truth: str, path: Path, c: Correspondences, focals: Array | None) -> Plane:
     """Cameras of square pixels; focals: (2,) px."""
-    sizes = [s[0].numpy() for s in (c.size0, c.size1) if s is not None]
-    known = [FOCAL * max(size) for size in sizes] if focals is None else list(focals)
-    K0, K1 = (calibration(f, size) for f, size in zip(known, sizes, strict=True))
-    fields = {name: torch.from_numpy(K)[None] for name, K in (("K0", K0), ("K1", K1))}
-    item = item_of(group, path, 0, c.replace(**fields), K0=K0, K1=K1)
-    item.facts["truth"] = truth
+    sizes = sizes_of(c)
+    known = [FOCAL * max(size) for size in sizes] if focals is None else focals
+    K0, K1 = (calibration(f, (h, w)) for f, (h, w) in zip(known, sizes, strict=True))
+    c = c.replace(K0=torch.from_numpy(K0)[None], K1=torch.from_numpy(K1)[None])
+    item = item_of(group, path, 0, c, K0=K0, K1=K1)
+    item.facts |= {"truth": truth, "group": group}
     return item
-
-
-def calibration(focal: float, size: Array) -> Array:
-    """Of square pixels and a central principal point; size: (h, w)."""
-    h, w = size
-    return np.array([[focal, 0, (w - 1) / 2], [0, focal, (h - 1) / 2], [0, 0, 1.0]])
 
 
 def _rotated(rng: np.random.Generator, photograph: Array, _: Array) -> tuple[Array, Array, Array]:
     """Two views from the centre of a photograph's camera, of different focal lengths, within its field of view."""
     h, w = photograph.shape[:2]
-    K = calibration(WIDE_FOCAL * max(h, w), np.array([h, w]))
-    size = np.array([round(0.7 * h), round(0.7 * w)])
+    K, size = calibration(WIDE_FOCAL * max(h, w), (h, w)), (round(0.7 * h), round(0.7 * w))
     views, focals = [], []
     for side in (-1, 1):
         focal = rng.uniform(0.9, 1.3) * max(size)
         angles = np.radians([rng.uniform(-6, 6), side * rng.uniform(3, 10), rng.uniform(-8, 8)])
         H = calibration(focal, size) @ cv2.Rodrigues(angles)[0] @ np.linalg.inv(K)
-        view = cv2.warpPerspective(photograph, H, (size[1], size[0]), flags=cv2.INTER_AREA)
+        view = cv2.warpPerspective(photograph, H, size[::-1], flags=cv2.INTER_AREA)
         noisy = cv2.GaussianBlur(view.astype(np.float32), (0, 0), 0.6) + rng.normal(0, 3, view.shape)
         views.append(_compressed(np.clip(noisy, 0, 255).astype(np.uint8), 90))
         focals.append(focal)
@@ -400,8 +379,7 @@ def _compressed(image: Array, quality: int) -> Array:
     return np.asarray(cv2.imdecode(coded, cv2.IMREAD_COLOR))
 
 
-Maker = Callable[[np.random.Generator, Array, Array], tuple[Array, Array, Array | None]]
-MAKERS: dict[str, tuple[str, str, Maker]] = {
+MAKERS: dict[str, tuple[str, str, Callable[..., tuple[Array, Array, Array | None]]]] = {
     "rotations": ("rotations cut from photographs", "rotation", _rotated),
     "copies": ("copies, resized", "identical", _copied),
     "crops": ("crops", "identical", _cropped),

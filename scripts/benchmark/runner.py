@@ -36,6 +36,7 @@ KEPT = (
     "ok", "reason", "nsgd", "inlier_rate", "inlier_rate_before", "corrs", "corrs_before", "features0", "features1",
     "significance", "rotation_error", "translation_error",
 )  # fmt: skip
+FOCAL_ERRORS = (5, 10)  # per cent
 NEAR = 2.0  # px from the true epipolar line: matches whose exactness is looked at
 ROWS = "keeps what each method makes of each pair, one line each; shown where no data set is named"
 
@@ -57,10 +58,8 @@ def add_command(
 
 class Kept:
     """The rows of one benchmark, appended to a file of JSON lines as they are made; without a file in memory only.
-
     A last line that was cut off by an interruption is removed. Raises SystemExit where the folder does not exist or the
-    file holds anything else.
-    """
+    file holds anything else."""
 
     def __init__(self, path: Path | None) -> None:
         self.path = path
@@ -92,10 +91,8 @@ class Kept:
 
 def identity(stages: Stages, *others: Any) -> str:
     """The digest of what defines the results of stages: options, code, versions of peers' packages, learned files.
-
     stages: e.g. ``[("estimator", "usac", {"threshold": 1.0})]``. others: configs with a `_target_`, plain values, and
-    objects, of which only the learned files count.
-    """
+    objects, of which only the learned files count."""
     configs: list[Any] = [merged(presets.load(group, name), options) for group, name, options in stages]
     configs += [other for other in others if isinstance(other, Mapping)]
     rest = [other for other in others if not isinstance(other, Mapping)]
@@ -108,21 +105,15 @@ def identity(stages: Stages, *others: Any) -> str:
     return identity_digest(made_with)[:DIGITS]
 
 
-def no_images() -> PairImages:
-    raise ValueError("there are no images, which a stage looks at")
-
-
 @dataclasses.dataclass
 class Item:
     """A pair with its matches, which are made when a method first asks for them.
-
-    facts: parts of its rows, those of `WHICH` from the beginning; `make` may add others.
-    """
+    facts: parts of its rows, those of `WHICH` from the beginning; `make` may add others."""
 
     pair: ImagePair
     make: Callable[[], Outcome | None]
     facts: Row = dataclasses.field(default_factory=dict)
-    images: Callable[[], PairImages] = no_images
+    images: Callable[[], PairImages] | None = None
 
     @functools.cached_property
     def outcome(self) -> Outcome | None:
@@ -153,10 +144,9 @@ class Measured:
 @dataclasses.dataclass(frozen=True)
 class Method(Measured):
     """Pruners, whose time counts, and an estimator.
-
     stages: of a family's pairs, by name. untimed: the names of those whose time does not count. takes: whether it is
-    measured on an item. view: what is done to a pair and its matches before.
-    """
+    measured on an item. view: what is done to a pair and its matches before, by a seed. signed: whether the sign of a
+    translation counts."""
 
     name: str
     identity: str
@@ -164,7 +154,8 @@ class Method(Measured):
     estimator: Callable[[ImagePair, Correspondences, int], Estimate]
     untimed: frozenset[str] = frozenset()
     takes: Callable[[Item], bool] = lambda item: True
-    view: Callable[[Outcome], Outcome] = lambda outcome: outcome
+    view: Callable[[Outcome, int], Outcome] = lambda outcome, seed: outcome
+    signed: bool = False
 
     def applies(self, item: Item) -> bool:
         return self.takes(item)
@@ -172,13 +163,13 @@ class Method(Measured):
     def figures(self, item: Item, seed: int) -> Row:
         """`KEPT` of the pair's row, and milliseconds of pruners and of all."""
         assert item.outcome is not None
-        matched = self.view(item.outcome)
+        matched = self.view(item.outcome, seed)
         if matched.correspondences is None:
-            return {**judged(matched, seed), "ms": 0.0, "ms_pruning": 0.0}
+            return {**judged(matched, seed, self.signed), "ms": 0.0, "ms_pruning": 0.0}
         c, pruning = matched.correspondences, 0.0
         for name, stage in self.stages(item.pair.family).items():
             start = time.process_time()
-            c = pruned(stage, c, lambda _: item.images())
+            c = pruned(stage, c, lambda _: item.images())  # type: ignore[misc]
             c = c if bool(c.mask.all()) else c.compact()
             pruning += (time.process_time() - start) * (name not in self.untimed)
         start = time.process_time()
@@ -186,13 +177,20 @@ class Method(Measured):
         estimation = time.process_time() - start
         sized = c.replace(size0=matched.correspondences.size0, size1=matched.correspondences.size1)
         outcome = dataclasses.replace(matched, correspondences=sized, estimate=estimate, reason=estimate.reason[0])
-        return {**judged(outcome, seed), "ms": 1e3 * (pruning + estimation), "ms_pruning": 1e3 * pruning}
+        row = judged(outcome, seed, self.signed)
+        return {**row, "ms": 1e3 * (pruning + estimation), "ms_pruning": 1e3 * pruning}
 
 
 def judged(outcome: Outcome, seed: int, signed: bool = False) -> Row:
-    """The figures of an estimate by the true F and cameras: `KEPT`, and the exactness of the matches."""
+    """The figures of an estimate by the true F and cameras: `KEPT`, the errors of focal lengths that were not given
+    exactly, whether t points backwards, and the exactness of the matches."""
     row = evaluate([outcome], seed, signed)[0]
     figures: Row = {name: getattr(row, name) for name in KEPT}
+    errors = [error for error in (row.focal_error0, row.focal_error1) if error is not None]
+    figures |= {f"focal_{p}": sum(error <= p / 100 for error in errors) / len(errors) for p in FOCAL_ERRORS if errors}
+    t, true = None if outcome.estimate is None else outcome.estimate.t, outcome.pair.t
+    if t is not None and true is not None and row.ok and bool(t.isfinite().all()):
+        figures["flipped"] = bool(t[0].double().numpy() @ true < 0)
     c = outcome.correspondences
     if c is not None:
         r = sampson(torch.from_numpy(outcome.pair.F)[None], c.x0.double(), c.x1.double())[c.mask].abs()
@@ -205,10 +203,8 @@ def measure(
     methods: Sequence[Measured], items: Iterable[Item], seeds: int, kept: Kept, title: str = "measuring"
 ) -> list[Row]:
     """A row for each item, seed and method, those of an earlier run included.
-
     The methods take turns at each pair, so that what else the machine does slows them down alike. A pair's rows are
-    kept together, seed by seed; rows that are there for the same code and options are not measured again.
-    """
+    kept together, seed by seed; rows that are there for the same code and options are not measured again."""
     known = kept.by(*WHICH)
     started: set[str] = set()
     rows: list[Row] = []

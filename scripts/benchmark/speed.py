@@ -1,7 +1,6 @@
 """Milliseconds a pair of estimators and pruners: one pair a call and many, peers in turn, prior included.
 
 python -m scripts.benchmark speed --estimators fmtorch msac:confidence=null --peers poselib opencv:method=usac_magsac
-python -m scripts.benchmark speed --device cuda --batch 4000 --pairs 4000 --peers --estimators msac:confidence=null
 python -m scripts.benchmark speed --estimators @gms @lpm @code --matches 2000 --peers         # pruners alone
 FMTORCH_CACHE=$(mktemp -d) python -m scripts.benchmark speed --peers    # the first call compiles the kernels
 """
@@ -11,8 +10,6 @@ import ctypes
 import functools
 import gc
 import multiprocessing
-import resource
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
@@ -20,18 +17,23 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import kornia.feature as KF
 import numpy as np
 import torch
+from numpy.typing import NDArray
+from rich.progress import track
 
 from fmtorch import presets
+from fmtorch.core.stages import pruned
 from fmtorch.core.types import Correspondences, collate
-from fmtorch.data import ImagePair
-from fmtorch.evaluation.run import evaluate_pairs, select
-from fmtorch.evaluation.statistics import summarize
+from fmtorch.data import ImagePair, read_image, to_grey
+from fmtorch.evaluation import statistics
+from fmtorch.features import ImagePyramid, LocalFeature
 from fmtorch.jobs.execution import Execution
 from fmtorch.jobs.runner import Factory, Local, TaskRunner, WorkerPool
+from fmtorch.pipeline.pipeline import STAGES, Pipeline
 from fmtorch.runs import PairRow, RunFolder
-from fmtorch.scenes import RenderedPairs
+from fmtorch.scenes.surfaces import photograph
 from scripts.benchmark import pairs
 from scripts.benchmark.methods import call, pipeline_of
 from scripts.benchmark.runner import add_command, console
@@ -39,15 +41,29 @@ from scripts.benchmark.tables import Record, Sheet, show
 
 SINGLE = 64  # pairs at most that are estimated one a call
 MEMORY = "Peak memory of estimators and pruners: how far one call makes its process grow, each in a process of its own."
-SCALE = "What evaluation costs at any size: stages, workers, bytes and memory."
+SCALE = "What evaluation costs at any size: workers, bytes and memory. Of stages `fmtorch eval` tells the seconds."
 PROC = Path("/proc/self")
 Call = Callable[[Correspondences], Any]
 
-PIPELINES = {"given matches": "given_fmtorch", "SIFT": "sift_fmtorch", "HesAffNet": "hesaffnet_fmtorch"}
-STAGES = ("features", "matching", "pruning", "estimation", "metrics")
-MATCHES = 500  # of a pair of given matches
 WAIT = 0.04  # seconds of a stage that only waits
+EMPTY = 1000  # batches that a scheduler is given to do nothing in
 BATCH = 64  # rows that are stored at a time where memory is measured
+
+
+Image = NDArray[np.uint8]
+Seconds = dict[str, float]
+Peer = Callable[[Image, Image, int], Seconds]
+PARTS = ("detection", "shape", "orientation", "description")
+RATIO = 0.8
+FEATURES = """Where the time of an image's features goes: processor milliseconds by stage, of presets that take turns.
+
+python -m scripts.benchmark features --image PHOTOGRAPH --size 1178 1766 --features hesaffnet hesaffnet_fast
+"""
+END_TO_END = """Whole pipelines by stage against the same stages written with OpenCV's and kornia's calls, in turn.
+
+The peer of `hesaffnet_gms` has kornia's Hessian detector, AffNet and HardNet (the same networks with random weights,
+which cost the same) for as many features as ours found, and no GMS, which neither library has.
+"""
 
 
 def add_arguments(commands: Any) -> None:
@@ -55,48 +71,43 @@ def add_arguments(commands: Any) -> None:
     pairs.add_match_options(parser)
     parser.add_argument("--matches", type=int, default=760, help="median of the synthetic pairs, used without --root")
     parser.add_argument("--pairs", type=int, default=64, help="synthetic pairs")
-    parser.add_argument("--batch", type=int, default=64, help="pairs a call; 0: only single calls, 1 pair each")
+    parser.add_argument("--batch", type=int, default=64, help="pairs a call")
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--estimators", nargs="+", default=["fmtorch@frame_consistency"], help="[PRESET][@PRUNER...]")
     parser.add_argument("--peers", nargs="*", default=["poselib", "opencv:method=usac_magsac"], help="of the ratios")
-    parser.add_argument("--device", default="cpu")
-    parser.add_argument("--threads", type=int, default=1)
     parser = add_command(commands, "memory", run_memory, MEMORY)
     parser.add_argument("--estimators", nargs="+", help="[PRESET][@PRUNER...]; default: all our own estimators")
     parser.add_argument("--pairs", type=int, default=64)
     parser.add_argument("--matches", type=int, default=8000)
     parser = add_command(commands, "scale", run_scale, SCALE)
-    parser.add_argument("--pairs", type=int, default=1000, help="of given matches; of the others a tenth")
     parser.add_argument("--workers", type=int, nargs="+", default=[1, 2, 4, 8])
     parser.add_argument("--executors", nargs="+", default=["threads", "processes", "dask"])
-    parser.add_argument("--batches", type=int, default=1000, help="that a scheduler is given to do nothing in")
     parser.add_argument("--rows", type=int, nargs="+", default=[10_000, 1_000_000], help="at which memory is measured")
-    parser.add_argument("--parts", nargs="+", default=["workers", "memory", "stages"], help="of the tables")
+    parser.add_argument("--parts", nargs="+", default=["workers", "memory"], help="of the tables")
+    parser = add_command(commands, "features", run_features, FEATURES)
+    parser.add_argument("--image", type=Path, help="default: a photograph of scikit-image")
+    parser.add_argument("--size", type=int, nargs=2, default=(1024, 1536), help="the image is resized to (h, w)")
+    parser.add_argument("--features", nargs="+", default=["hesaffnet", "hesaffnet_fast"], help="of conf/features")
+    parser.add_argument("--repeats", type=int, default=7)
+    parser = add_command(commands, "end_to_end", run_end_to_end, END_TO_END)
+    pairs.add_set_options(parser)
+    parser.add_argument("--pipelines", nargs="*", default=list(PEERS), choices=list(PEERS))
 
 
 def run(arguments: argparse.Namespace) -> None:
-    torch.set_num_threads(arguments.threads)
-    cv2.setNumThreads(arguments.threads)
-    device = presets.resolve_device(arguments.device)
+    every = [pairs.synthetic_matches(i, arguments.matches) for i in range(arguments.pairs)]
     if pairs.named(arguments):
         every = [item.matches for item in pairs.matched(arguments)]
-    else:
-        every = [pairs.synthetic_matches(i, arguments.matches) for i in range(arguments.pairs)]
-    every = [c.to(device) for c in every]
     methods = {spec: call(spec) for spec in (*arguments.peers, *arguments.estimators)}
     first = {spec: seconds(method, every[0]) for spec, method in methods.items()}  # lazy initialisation
     single = in_turn(methods, every[:SINGLE], arguments.repeats)
     size = arguments.batch
-    batches = [collate(every[i : i + size]) for i in range(0, len(every), size)] if size else []
-    if device.type == "cuda":
-        in_turn(methods, batches[:1], 1)
-    many = in_turn(methods, batches, arguments.repeats)
+    many = in_turn(methods, [collate(every[i : i + size]) for i in range(0, len(every), size)], arguments.repeats)
     records: list[Record] = []
     for spec in methods:
         line: Record = {"estimator": spec, "one pair a call: median ms": f"{1e3 * np.median(single[spec]):.2f}"}
         line["one pair a call: mean ms"] = f"{1e3 * single[spec].mean():.2f}"
-        if batches:
-            line[f"{size} pairs a call: ms"] = f"{1e3 * np.median(many[spec].sum(1)) / len(every):.2f}"
+        line[f"{size} pairs a call: ms"] = f"{1e3 * np.median(many[spec].sum(1)) / len(every):.2f}"
         line["first call, s"] = f"{first[spec]:.1f}"
         for peer in arguments.peers:
             line[f"median / {peer}"] = f"{np.median(single[spec]) / np.median(single[peer]):.2f}"
@@ -106,12 +117,10 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def seconds(method: Call, c: Correspondences) -> float:
-    """The time of one call, until its results are there: of the processor on a CPU, whatever else runs beside it."""
-    clock = time.process_time if c.mask.device.type == "cpu" else time.perf_counter
-    start = clock()
-    made = method(c)
-    (made.mask if isinstance(made, Correspondences) else made.ok).cpu()
-    return clock() - start
+    """Of the processor in one call, whatever else runs beside it."""
+    start = time.process_time()
+    method(c)
+    return time.process_time() - start
 
 
 def in_turn(methods: dict[str, Call], inputs: Sequence[Correspondences], repeats: int) -> dict[str, np.ndarray]:
@@ -148,22 +157,14 @@ def peak(spec: str, count: int, matches: int) -> tuple[float, float]:
 
 
 def peak_growth(call: Callable[[], Any]) -> float:
-    """MiB, the peak of the resident set during a call beyond what was resident before it.
-
-    What the process claimed before, as for compiled kernels, does not hide it. Raises SystemExit where the kernel does
-    not tell peaks anew, as anywhere but on Linux.
-    """
+    """MiB, the peak of the resident set during a call beyond what was resident before it, on Linux.
+    What the process claimed before, as for compiled kernels, does not hide it."""
     gc.collect()
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # what was freed is given back, or the call would use it
-    if trim is not None:
-        trim(0)
-    try:
-        (PROC / "clear_refs").write_text("5")  # the peak is counted from here
-        before = _resident("VmRSS")
-        call()
-        return (_resident("VmHWM") - before) / 1024
-    except OSError as error:
-        raise SystemExit(f"peaks of memory can be measured on Linux alone ({error})") from None
+    ctypes.CDLL(None).malloc_trim(0)  # what was freed is given back, or the call would use it
+    (PROC / "clear_refs").write_text("5")  # the peak is counted from here
+    before = _resident("VmRSS")
+    call()
+    return (_resident("VmHWM") - before) / 1024
 
 
 def _resident(field: str) -> int:
@@ -174,48 +175,17 @@ def _resident(field: str) -> int:
 def run_scale(arguments: argparse.Namespace) -> None:
     sheets = []
     if "workers" in arguments.parts:
-        sheets.append(worker_sheet(arguments.executors, arguments.workers, arguments.batches))
+        sheets.append(worker_sheet(arguments.executors, arguments.workers))
     if "memory" in arguments.parts:
-        sheets.append(memory_sheet(arguments.rows))
-    if "stages" in arguments.parts:
-        with tempfile.TemporaryDirectory() as folder:
-            sheets += stage_sheets(Path(folder), arguments.pairs)
+        records: list[Record] = []
+        for count in arguments.rows:
+            with multiprocessing.get_context("spawn").Pool(1) as pool:  # each time in a process of its own
+                records.append({"rows": count, **{k: f"{v:.0f}" for k, v in pool.apply(stored, (count,)).items()}})
+        sheets.append(Sheet("memory", "How far the peak of each step exceeds what the caller had before", records))
     show(sheets, arguments.table)
 
 
-def stage_sheets(folder: Path, count: int) -> list[Sheet]:
-    """Milliseconds of each stage by one worker, and what a million and a billion pairs cost at that speed."""
-    stages: list[Record] = []
-    costs: list[Record] = []
-    size = 0.0  # bytes of a row
-    for name, pipeline in PIPELINES.items():
-        if name == "given matches":
-            every = select([pairs.synthetic_pair(i, MATCHES) for i in range(count)], None)
-        else:
-            every = select(list(RenderedPairs("test", size="small")), None)[: max(count // 10, 1)]
-        stored, built = RunFolder.open(folder / pipeline, {"pipeline": pipeline}), pipeline_of(pipeline)
-        evaluated(built, every[:2], [].extend)  # compiles and loads
-        start = time.perf_counter()
-        evaluated(built, every, stored.append)
-        wall = time.perf_counter() - start
-        rows = stored.read()
-        ms = {s: 1e3 * sum(v or 0.0 for v in rows[f"seconds_{s}"].to_pylist()) / len(every) for s in STAGES}
-        ms["rest"] = max(1e3 * wall / len(every) - sum(ms.values()), 0.0)
-        hours = 1e6 * wall / len(every) / 3600
-        size = size or sum(path.stat().st_size for path in (stored.path / "pairs").iterdir()) / len(every)
-        stages.append({"pipeline": name, "pairs": len(every), **{f"{s}, ms": f"{v:.1f}" for s, v in ms.items()},
-                       "pairs a second and core": f"{len(every) / wall:.1f}"})  # fmt: skip
-        costs.append({"pipeline": name, "core hours of 10^6 pairs": f"{hours:.0f}", "of 10^9": f"{1e3 * hours:.0f}",
-                      "rows of 10^6, GB": f"{size / 1e3:.2f}", "of 10^9, TB": f"{size / 1e3:.2f}"})  # fmt: skip
-    return [Sheet("stages", "Stages, by one worker", stages), Sheet("extrapolated", "Extrapolated", costs)]
-
-
-def evaluated(pipeline: Any, every: Sequence[ImagePair], store: Any) -> None:
-    for _ in evaluate_pairs(pipeline, every, seed=0, batch=16, execution=Execution("threads", 1), store=store):
-        pass
-
-
-def worker_sheet(executors: Sequence[str], workers: Sequence[int], batches: int) -> Sheet:
+def worker_sheet(executors: Sequence[str], workers: Sequence[int]) -> Sheet:
     """Efficiency of waiting, the time of one worker by their number over that taken; calls a second of nothing."""
     records: list[Record] = []
     for executor in executors:
@@ -223,7 +193,7 @@ def worker_sheet(executors: Sequence[str], workers: Sequence[int], batches: int)
         for count in workers:
             efficiency = 100 * WAIT * 50 / _timed(executor, count, WAIT, 50 * count)
             line[f"{count} worker{'s' * (count > 1)}: efficiency, %"] = f"{efficiency:.0f}"
-        records.append(line | {"batches a second": f"{batches / _timed(executor, workers[-1], 0.0, batches):.0f}"})
+        records.append(line | {"batches a second": f"{EMPTY / _timed(executor, workers[-1], 0.0, EMPTY):.0f}"})
     return Sheet("workers", f"Batches that only wait {1e3 * WAIT:.0f} ms, and such as do nothing", records)
 
 
@@ -247,46 +217,157 @@ def wait(seconds: float, job: int) -> int:
     return job
 
 
-def memory_sheet(rows: Sequence[int]) -> Sheet:
-    """Peak memory of a caller that stores, lists and sums up rows, each time in a process of its own."""
-    records: list[Record] = []
-    for count in rows:
-        with multiprocessing.get_context("spawn").Pool(1) as pool:
-            records.append({"rows": count, **{k: f"{v:.0f}" for k, v in pool.apply(stored, (count,)).items()}})
-    return Sheet("memory", "Memory of the caller, each column the peak up to then", records)
-
-
 def stored(count: int) -> dict[str, float]:
-    """Peaks after imports, storing, finding what is done and the summary; seconds, parts and bytes of storing."""
-    figures: dict[str, float] = {"imports, MB": _peak_mb()}
+    """MiB of storing so many rows, finding what is done and the summary; seconds, parts and bytes of storing."""
     with tempfile.TemporaryDirectory() as name:
         folder = RunFolder.open(Path(name) / "run", {"rows": count})
+
+        def store() -> None:
+            with WorkerPool(Execution("threads", 2)) as pool:
+                runner = TaskRunner[range](pool, Local(None), rows_of, lambda task, rows: folder.append(rows))
+                for _ in runner.each(range(i, min(i + BATCH, count)) for i in range(0, count, BATCH)):
+                    pass
+
         start = time.perf_counter()
-        with WorkerPool(Execution("threads", 2)) as pool:
-            runner = TaskRunner[range](pool, Local(None), rows_of, lambda task, rows: folder.append(rows))
-            for _ in runner.each(range(i, min(i + BATCH, count)) for i in range(0, count, BATCH)):
-                pass
+        figures = {"storing, MiB": peak_growth(store)}
         seconds = time.perf_counter() - start
-        figures["storing, MB"] = _peak_mb()
+        figures["finding what is done, MiB"] = peak_growth(folder.done)
+        figures["summary, MiB"] = peak_growth(lambda: statistics.summarize(folder.read(without=("pair", "F"))))
         files = list((folder.path / "pairs").iterdir())
-        assert len(folder.done()) == count
-        figures["finding what is done, MB"] = _peak_mb()
-        summarize(folder.read(without=("pair", "F")))
         size = sum(file.stat().st_size for file in files) / count
-        return figures | {
-            "summary, MB": _peak_mb(), "storing, s": seconds, "parts": len(files), "bytes a row on disk": size
-        }  # fmt: skip
+        return figures | {"storing, s": seconds, "parts": len(files), "bytes a row on disk": size}
 
 
 def rows_of(nothing: None, numbers: range) -> list[PairRow]:
     rows = []
     for i in numbers:
         name, F = f"family/scene{i // 1000}/im{i:07d}-im{i + 1:07d}", [0.1234567 * k + 1e-9 * i for k in range(1, 10)]
-        seconds: Any = {f"seconds_{stage}": 1e-3 + 1e-9 * i for stage in STAGES}
+        seconds: Any = {f"seconds_{stage}": 1e-3 + 1e-9 * i for stage in statistics.STAGES}
         figures: Any = {"nsgd": (i % 997) / 997, "inlier_rate": 0.9, "F": F, "corrs": i % 400, "corrs_before": 500}
         rows.append(PairRow(name, i, "family", f"scene{i // 1000}", ok=True, **figures, **seconds))
     return rows
 
 
-def _peak_mb() -> float:
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
+# Images, by stage
+
+
+class Clock:
+    """Seconds of processor time between one stage and the next."""
+
+    def __init__(self, stages: tuple[str, ...]) -> None:
+        self.seconds, self.last = dict.fromkeys(stages, 0.0), time.process_time()
+
+    def stage(self, name: str) -> None:
+        """What was computed since the last call belongs to this stage."""
+        self.seconds[name] += time.process_time() - self.last
+        self.last = time.process_time()
+
+
+def medians(seconds: list[Seconds]) -> Record:
+    totals = [{**each, "all": sum(each.values())} for each in seconds]
+    return {f"{stage}, ms": f"{1e3 * np.median([each[stage] for each in totals]):.1f}" for stage in totals[0]}
+
+
+@torch.no_grad()
+def run_features(arguments: argparse.Namespace) -> None:
+    h, w = arguments.size
+    image = photograph("chelsea.png") if arguments.image is None else read_image(arguments.image)
+    image = np.asarray(cv2.resize(image, (w, h), interpolation=cv2.INTER_CUBIC), np.uint8)
+    features = {name: presets.build("features", name) for name in arguments.features}
+    turns = [{name: by_stage(each, image) for name, each in features.items()} for _ in range(arguments.repeats + 1)]
+    records: list[Record] = [{"features": name, **medians([turn[name] for turn in turns[1:]])} for name in features]
+    show([Sheet("stages", f"{w} x {h}", records)], arguments.table)
+
+
+def by_stage(feature: LocalFeature, image: Image) -> Seconds:
+    """Seconds of processor time of each stage, patches included where they are cut; 0 for a stage that is absent."""
+    clock = Clock(PARTS)
+    lafs, _ = feature.detector.detect(image)
+    pyramid = ImagePyramid(to_grey(image))
+    clock.stage("detection")
+    for stage, step in (("shape", feature.shape), ("orientation", feature.orientation)):
+        if step is not None:
+            lafs = step(pyramid, lafs)
+            clock.stage(stage)
+    feature.describe(image, lafs)
+    clock.stage("description")
+    return clock.seconds
+
+
+@torch.no_grad()
+def run_end_to_end(arguments: argparse.Namespace) -> None:
+    every = pairs.pairs_of(arguments)
+    records: list[Record] = []
+    for name in arguments.pipelines:
+        (title, peer), pipeline = PEERS[name], pipeline_of(name, "cache=off")
+        ours: list[Seconds] = []
+        theirs: list[Seconds] = []
+        for pair in track([every[0], *every], name, console=console, transient=True):
+            images = read_image(pair.image0), read_image(pair.image1)
+            seconds, features = own_stages(pipeline, pair, *images)
+            ours.append(seconds)
+            theirs.append(peer(*images, features))
+        ratio = np.median([sum(b.values()) / sum(a.values()) for a, b in zip(ours[1:], theirs[1:], strict=True)])
+        records.append({"pipeline": name, **medians(ours[1:]), "time / ours": "1.0"})
+        records.append({"pipeline": title, **medians(theirs[1:]), "time / ours": f"{ratio:.1f}"})
+    show([Sheet("end_to_end", f"Medians of {len(every)} pairs", records)], arguments.table)
+
+
+def own_stages(pipeline: Pipeline, pair: ImagePair, image0: Image, image1: Image) -> tuple[Seconds, int]:
+    """Of our pipeline; and how many features an image has on average."""
+    clock = Clock(STAGES)
+    features0, features1 = pipeline.extractor(image0), pipeline.extractor(image1)
+    clock.stage("features")
+    c = pipeline.matcher(features0, features1)
+    clock.stage("matching")
+    for pruner in pipeline.pruners_of(pair.family).values():
+        c = pruned(pruner, c, lambda _: pipeline.images(pair)).compact()
+    clock.stage("pruning")
+    pipeline.estimator(c, 0)
+    clock.stage("estimation")
+    return clock.seconds, (len(features0) + len(features1)) // 2
+
+
+def opencv_stages(method: int, threshold: float, image0: Image, image1: Image, features: int) -> Seconds:
+    """SIFT, brute-force matching, ratio test and an estimator of OpenCV's."""
+    clock, sift = Clock(STAGES), cv2.SIFT.create(8000)
+    (k0, d0), (k1, d1) = (sift.detectAndCompute(to_grey(image), None) for image in (image0, image1))
+    clock.stage("features")
+    neighbors = cv2.BFMatcher(cv2.NORM_L2).knnMatch(d0, d1, 2)
+    clock.stage("matching")
+    kept = [two[0] for two in neighbors if len(two) == 2 and two[0].distance < RATIO * two[1].distance]
+    x0 = np.array([k0[match.queryIdx].pt for match in kept], np.float64)
+    x1 = np.array([k1[match.trainIdx].pt for match in kept], np.float64)
+    return _estimated(clock, x0, x1, method, threshold)
+
+
+def _estimated(clock: Clock, x0: NDArray[Any], x1: NDArray[Any], method: int, threshold: float) -> Seconds:
+    """The seconds of a peer when it has matches, F included."""
+    clock.stage("pruning")
+    if len(x0) >= 8:
+        cv2.findFundamentalMat(x0, x1, method, threshold, 0.9999, 10000)
+    clock.stage("estimation")
+    return clock.seconds
+
+
+def kornia_stages(image0: Image, image1: Image, features: int) -> Seconds:
+    """kornia's HesAffNet and matcher with the ratio test, OpenCV's LMedS."""
+    shape = KF.LAFAffNetShapeEstimator(False, preserve_orientation=False)
+    hessian = KF.BlobHessian()
+    detector = KF.ScaleSpaceDetector(features, resp_module=hessian, aff_module=shape, ori_module=KF.LAFOrienter(32))
+    hesaffnet = KF.LocalFeature(detector, KF.LAFDescriptor(KF.HardNet(False))).eval()
+    clock = Clock(STAGES)
+    extracted = [hesaffnet(torch.from_numpy(to_grey(image))[None, None].float() / 255) for image in (image0, image1)]
+    clock.stage("features")
+    _, matches = KF.match_snn(extracted[0][2][0], extracted[1][2][0], RATIO)
+    clock.stage("matching")
+    x0, x1 = (extracted[i][0][0, matches[:, i], :, 2].double().numpy() for i in (0, 1))
+    return _estimated(clock, x0, x1, cv2.FM_LMEDS, 1.0)
+
+
+LMEDS, MAGSAC = (functools.partial(opencv_stages, *of) for of in ((cv2.FM_LMEDS, 1.0), (cv2.USAC_MAGSAC, 0.25)))
+PEERS: dict[str, tuple[str, Peer]] = {
+    "sift_ratio estimator=lmeds_eight_point": ("OpenCV: SIFT, BFMatcher, FM_LMEDS", LMEDS),
+    "sift_fmtorch": ("OpenCV: SIFT, BFMatcher, USAC_MAGSAC", MAGSAC),
+    "hesaffnet_gms": ("kornia: HesAffNet, match_snn; OpenCV: FM_LMEDS", kornia_stages),
+}

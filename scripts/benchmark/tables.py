@@ -4,7 +4,6 @@ And their curves, drawn as SVG.
 """
 
 import csv
-import dataclasses
 import functools
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -13,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import mannwhitneyu
 
 from fmtorch.core.files import replacing
 from fmtorch.evaluation.statistics import (
@@ -37,8 +37,7 @@ Groups = Mapping[str, Names]  # pairs by what they have in common
 Get = Callable[[str], Values]  # a field of the rows, (seeds, pairs), NaN where there is none
 
 
-@dataclasses.dataclass(frozen=True)
-class Span:
+class Span(NamedTuple):
     """A figure with its 95 % interval, as text."""
 
     value: str
@@ -56,8 +55,7 @@ def span(found: Interval | None, form: str) -> Span | str:
     return "" if found is None else Span(*(f"{value:{form}}" for value in (found.value, found.low, found.high)))
 
 
-@dataclasses.dataclass(frozen=True)
-class Sheet:
+class Sheet(NamedTuple):
     """A table. name: what its file's name ends in, where a command writes several; title: above it in the terminal."""
 
     name: str
@@ -102,21 +100,23 @@ def show(sheets: Sequence[Sheet], table: Path | None = None) -> None:
             sheet.write(table if alone else table.with_name(f"{table.stem}_{sheet.name}{table.suffix}"))
 
 
+def grouped(rows: Iterable[Row], *fields: str) -> dict[tuple[Any, ...], list[Row]]:
+    """The rows by the values of some fields."""
+    groups: dict[tuple[Any, ...], list[Row]] = {}
+    for row in rows:
+        groups.setdefault(tuple(row[field] for field in fields), []).append(row)
+    return groups
+
+
 def chance_of_more(a: Sequence[float] | Values, b: Sequence[float] | Values) -> float:
     """The area under the ROC curve: the chance that one of `a` exceeds one of `b`, ties count half; NaN of none."""
-    if len(a) == 0 or len(b) == 0:
-        return float("nan")
-    ordered = np.sort(b)
-    below, up_to = (np.searchsorted(ordered, a, side) for side in ("left", "right"))
-    return float((below + up_to).mean() / (2 * len(b)))
+    pairs = len(a) * len(b)
+    return float(mannwhitneyu(a, b, method="asymptotic").statistic) / pairs if pairs else float("nan")
 
 
 def _known(values: Values) -> Values:
     """The mean of each pair over the seeds with which a figure is defined, (n,); NaN where there is none."""
-    counts = ~np.isnan(values)
-    total, number = np.where(counts, values, 0.0).sum(0), counts.sum(0)
-    means: Values = np.divide(total, number, out=np.full(values.shape[1], np.nan), where=number > 0)
-    return means
+    return np.asarray(np.ma.masked_invalid(values).mean(0).filled(np.nan))
 
 
 def _solved(get: Get, values: Values) -> Values:
@@ -124,11 +124,13 @@ def _solved(get: Get, values: Values) -> Values:
     return _known(np.where(get("ok") > 0, values, np.nan))
 
 
-def pose_areas(get: Get, threshold: float) -> Values:
-    """What each pair adds to the area under the step curve of pose errors up to a threshold in degrees, (n,)."""
-    worst = np.maximum(get("rotation_error"), get("translation_error"))
-    share: Values = np.clip(1 - worst / threshold, 0, 1).mean(0)
-    return share
+def _below(errors: Values, threshold: float) -> Values:
+    """What each pair adds to the area under the step curve of errors up to a threshold, (n,)."""
+    return np.asarray(np.clip(1 - errors / threshold, 0, 1).mean(0))
+
+
+def _worst(get: Get) -> Values:
+    return np.maximum(get("rotation_error"), get("translation_error"))
 
 
 class Figure(NamedTuple):
@@ -151,13 +153,10 @@ FIGURES: dict[str, Figure] = {
     "kept, %": Figure(lambda get: _solved(get, get("corrs") / get("corrs_before").clip(1)), PERCENT, ".0f"),
     "keypoints": Figure(lambda get: (get("features0") + get("features1")).mean(0) / 2, form=".0f"),
     "distance, px": Figure(lambda get: _known(get("distance")), form=".3f"),
-    **{
-        f"AUC@{px} px": Figure(lambda get, px=px: np.clip(1 - get("corner_error") / px, 0, 1).mean(0), PERCENT)  # type: ignore[misc]
-        for px in (1, 3, 5)
-    },
+    **{f"AUC@{px} px": Figure(lambda get, px=px: _below(get("corner_error"), px), PERCENT) for px in (1, 3, 5)},  # type: ignore[misc]
     "flipped, %": Figure(lambda get: _known(get("flipped")), PERCENT),
     **{f"focal within {p} %, %": Figure(lambda get, p=p: _known(get(f"focal_{p}")), PERCENT) for p in (5, 10)},  # type: ignore[misc]
-    **{f"pose@{t}": Figure(lambda get, t=t: pose_areas(get, t), PERCENT) for t in POSE_THRESHOLDS},  # type: ignore[misc]
+    **{f"pose@{t}": Figure(lambda get, t=t: _below(_worst(get), t), PERCENT) for t in POSE_THRESHOLDS},  # type: ignore[misc]
 }
 MEDIANS = {"ms": "ms", "ms of pruners": "ms_pruning"}
 """Columns that are medians over pairs and seeds, without intervals, and their fields."""
@@ -233,19 +232,11 @@ class Results:
         a, b = (figure.of(self.get(method, both)) for method in (first, second))
         return span(difference(a, b, self.scenes(both), figure.scale, figure.share), "+" + figure.form)
 
-    def time_ratio(self, method: str, first: str, pairs: Sequence[str]) -> str:
-        """Median over pairs of a method's time relative to the first's."""
-        both = [pair for pair in self.pairs(first, method) if pair in set(pairs)]
-        own, reference = (self.get(name, both)("ms").mean(0) for name in (method, first))
-        return f"{np.median(own / reference):.2f}" if both else ""
-
     def records(
         self, groups: Groups, columns: Names, label: str, minus: Names = (), against: str = "", intervals: bool = False
     ) -> list[Record]:
         """A line for each group of pairs and method. label: heads the methods; minus: figures less those of `against`.
-
-        Without `against` the first method minus each other one is shown. A method has its own pairs of each group.
-        """
+        Without `against` the first method minus each other one is shown. A method has its own pairs of each group."""
         lines = []
         for group, every in groups.items():
             for method in self.methods:
@@ -259,8 +250,10 @@ class Results:
                     a, b = (method, first) if against else (first, method)
                     head = f"{name} minus {against}" if against else f"lead {name}"
                     line[head] = self.difference(a, b, own, name) if first in self.methods else ""
-                if "time ratio" in columns:
-                    line["time ratio"] = self.time_ratio(method, first, own)
+                both = [pair for pair in self.pairs(first, method) if pair in set(own)]
+                if "time ratio" in columns and both:
+                    mine, reference = (self.get(name, both)("ms").mean(0) for name in (method, first))
+                    line["time ratio"] = f"{np.median(mine / reference):.2f}"
                 lines.append(line)
         return lines
 
@@ -313,10 +306,8 @@ def draw(
     path: Path, panels: Panels, labels: tuple[str, str], scale: str = "linear", ticks: Sequence[float] = ()
 ) -> None:
     """Write an SVG: a panel for each group of lines, one legend below.
-
     labels: of x and y. scale: of x; "shares": both axes go from 0 to 100 % and are logarithmic above a tenth of a
-    percent. ticks: of x.
-    """
+    percent. ticks: of x."""
     import matplotlib as mpl
     from matplotlib.figure import Figure as Canvas
     from matplotlib.ticker import FixedLocator

@@ -4,18 +4,17 @@ Features and matches are those of COLMAP's SIFT, or of our default pipeline, mad
 method begins with the same database without geometries, on one thread, reading and writing included: `colmap:PX` is
 `pycolmap.geometric_verification` at that threshold, `ours` is `fmtorch.verify`. Known cameras are the true ones. Images
 that a mapper does not register count as wrong. Rows are kept in --work: an interrupted run goes on where it stopped.
-
-python -m scripts.benchmark verify --root DATA --work runs/verify --table docs/tables/verify.csv
 """
 
 import argparse
+import functools
 import itertools
 import shutil
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,7 +27,7 @@ from fmtorch.estimators.external import colmap
 from fmtorch.io.colmap import imported, remove_database
 from fmtorch.metrics import pose_auc, pose_error
 from scripts.benchmark.runner import Kept, Row, add_command
-from scripts.benchmark.tables import Record, Sheet, show
+from scripts.benchmark.tables import Record, Sheet, grouped, show
 
 FEATURES = 4096
 ORIGIN = 0.5  # px: COLMAP's coordinates of the first pixel's centre
@@ -66,35 +65,28 @@ def add_arguments(commands: Any) -> None:
     parser.add_argument("--folder", type=Path, default=Path("models"), help="of the models; those there are kept")
 
 
-class Truth(NamedTuple):
-    """Calibration and pose, world to camera, of images by name."""
-
-    K: dict[str, Array]
-    R: dict[str, Array]
-    t: dict[str, Array]
-
-
 class Scene(NamedTuple):
-    """A folder of photographs with true cameras. single: whether one camera took them all."""
+    """A folder of photographs with the true calibration and pose, world to camera, of each by name.
+    single: whether one camera took them all."""
 
     name: str
     images: Path
-    truth: Truth
-    single: bool
+    K: dict[str, Array]
+    R: dict[str, Array]
+    t: dict[str, Array]
+    single: bool = True
 
 
 def read_scene(folder: Path) -> Scene:
     """FM-Bench's layout: `Images`, and `Camera.txt` with K, R and t of each image in a line.
-
-    Raises SystemExit where one of them is missing.
-    """
+    Raises SystemExit where one of them is missing."""
     if not (folder / "Images").is_dir() or not (folder / "Camera.txt").is_file():
         raise SystemExit(f"{folder} holds no Images and Camera.txt; give scenes in FM-Bench's layout")
     lines = np.loadtxt(folder / "Camera.txt").reshape(-1, 21)
-    named = list(zip(sorted(path.name for path in (folder / "Images").iterdir()), lines, strict=True))
-    K, R = ({name: line[i : i + 9].reshape(3, 3) for name, line in named} for i in (0, 9))
-    truth = Truth(K, R, {name: line[18:] for name, line in named})
-    return Scene(folder.name, folder / "Images", truth, bool((lines[:, :9] == lines[0, :9]).all()))
+    named = dict(zip(sorted(path.name for path in (folder / "Images").iterdir()), lines, strict=True))
+    K, R = ({name: line[i : i + 9].reshape(3, 3) for name, line in named.items()} for i in (0, 9))
+    t = {name: line[18:] for name, line in named.items()}
+    return Scene(folder.name, folder / "Images", K, R, t, bool((lines[:, :9] == lines[0, :9]).all()))
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -121,58 +113,55 @@ def measure(scene: Scene, database: Path, key: tuple[Any, ...], mappers: Sequenc
     path = database.with_name(f"{database.stem}-{method.replace(':', '-')}-{seed}.db")
     remove_database(path)
     shutil.copy(database, path)
+    if method == "ours":
+        warm_up(database)
     verified = verified_by(method, path, seed)
     for mapper in missing:
-        figures = mapped(mapper, path, scene, cameras, seed) if mapper else verified | pair_poses(path, scene.truth)
+        figures = mapped(mapper, path, scene, cameras, seed) if mapper else verified | pair_poses(path, scene)
         kept.add([dict(zip(FIELDS, (*key, mapper), strict=True)) | figures])
     remove_database(path)
 
 
-_warm: set[Path] = set()
+@functools.cache
+def warm_up(database: Path) -> None:
+    """Verify a database once and drop the result: what a process loads and compiles is no part of a pair's time."""
+    copy = database.with_suffix(".warm")
+    fmtorch.verify(database, output=copy, force=True)
+    remove_database(copy)
 
 
 def verified_by(method: str, path: Path, seed: int) -> Row:
     """Verify a database in place: pairs, those with a geometry, and processor seconds."""
     pycolmap = imported()
     kind, _, threshold = method.partition(":")
+    start = time.process_time()
     if kind == "ours":
-        if path.parent not in _warm:  # what a process loads and compiles is no part of a pair's time
-            copy = path.with_suffix(".warm")
-            fmtorch.verify(path, output=copy, force=True)
-            remove_database(copy)
-            _warm.add(path.parent)
-        start = time.process_time()
         fmtorch.verify(path, seed=seed)
     else:
         options = colmap.two_view_options(float(threshold), seed)
-        verifier = pycolmap.GeometricVerifierOptions(num_threads=1)
-        start = time.process_time()
-        pycolmap.geometric_verification(path, verifier_options=verifier, two_view_geometry_options=options)
+        one = pycolmap.GeometricVerifierOptions(num_threads=1)
+        pycolmap.geometric_verification(path, verifier_options=one, two_view_geometry_options=options)
     seconds = time.process_time() - start
     with pycolmap.Database.open(path) as database:
         pairs, verified = len(database.read_num_matches()[0]), len(database.read_two_view_geometry_num_inliers()[0])
-    return {"pairs": pairs, "verified": verified, "seconds": seconds}
+    speed = {"ms a pair": 1e3 * seconds / pairs, "pairs a second": pairs / seconds}
+    return {"pairs": pairs, "verified": verified, "seconds": seconds, **speed}
 
 
 def mapped(mapper: str, path: Path, scene: Scene, cameras: str, seed: int) -> Row:
     """The largest model of a mapper on one thread, with its processor seconds.
-
-    Known intrinsics are held fixed. Unknown ones are calibrated from the view graph before the global mapper, as
-    COLMAP asks for; that changes the database, so it works on a copy.
-    """
+    Known intrinsics are held fixed. Unknown ones are calibrated from the view graph before the global mapper, as COLMAP
+    asks for; that changes the database, so it works on a copy."""
     pycolmap = imported()
-    output = path.with_suffix(f".{mapper}")
-    shutil.rmtree(output, ignore_errors=True)
-    output.mkdir()
-    copy = output / "database.db"
-    shutil.copy(path, copy)
-    start = time.process_time()
-    if (mapper, cameras) == ("global", "unknown"):
-        pycolmap.calibrate_view_graph(copy, pycolmap.ViewGraphCalibrationOptions(random_seed=seed))
-    mapping = pycolmap.global_mapping if mapper == "global" else pycolmap.incremental_mapping
-    models = mapping(copy, scene.images, output, _options(mapper, cameras == "unknown", seed))
-    row: Row = {"seconds": time.process_time() - start, "registered": 0, "images": len(scene.truth.R)}
     poses: dict[str, Any] = {}
+    with tempfile.TemporaryDirectory(dir=path.parent) as output:
+        copy = shutil.copy(path, output)
+        start = time.process_time()
+        if (mapper, cameras) == ("global", "unknown"):
+            pycolmap.calibrate_view_graph(copy, pycolmap.ViewGraphCalibrationOptions(random_seed=seed))
+        mapping = pycolmap.global_mapping if mapper == "global" else pycolmap.incremental_mapping
+        models = mapping(copy, scene.images, output, _options(mapper, cameras == "unknown", seed))
+    row: Row = {"seconds": time.process_time() - start, "registered": 0}
     if models:
         model = max(models.values(), key=lambda each: each.num_reg_images())
         row |= {
@@ -180,8 +169,8 @@ def mapped(mapper: str, path: Path, scene: Scene, cameras: str, seed: int) -> Ro
             "track": model.compute_mean_track_length(), "error": model.compute_mean_reprojection_error(),
         }  # fmt: skip
         poses = {image.name: image.cam_from_world() for image in model.images.values() if image.has_pose}
-    shutil.rmtree(output)
-    return row | accuracy(poses, scene.truth)
+    row["registered, %"] = 100 * row["registered"] / len(scene.R)
+    return row | accuracy(poses, scene)
 
 
 def _options(mapper: str, refined: bool, seed: int) -> Any:
@@ -191,56 +180,51 @@ def _options(mapper: str, refined: bool, seed: int) -> Any:
     if mapper == "global":
         options: Any = pycolmap.GlobalPipelineOptions()
         steps: dict[str, Any] = {step: {"random_seed": seed} for step in ("global_positioning", "rotation_averaging")}
-        if not refined:
-            steps["bundle_adjustment"] = {"refine_focal_length": False, "refine_extra_params": False}
+        steps["bundle_adjustment"] = {"refine_focal_length": refined, "refine_extra_params": refined}
         own["mapper"] = {"num_threads": 1, "random_seed": seed, **steps}
     else:
         options = pycolmap.IncrementalPipelineOptions()
-        own["extract_colors"] = False
-        if not refined:
-            own |= {"ba_refine_focal_length": False, "ba_refine_extra_params": False}
-            own["mapper"] = {"abs_pose_refine_focal_length": False, "abs_pose_refine_extra_params": False}
+        own |= {"extract_colors": False, "ba_refine_focal_length": refined, "ba_refine_extra_params": refined}
+        own["mapper"] = {"abs_pose_refine_focal_length": refined, "abs_pose_refine_extra_params": refined}
     options.mergedict(own)
     return options
 
 
-def accuracy(poses: dict[str, Any], truth: Truth) -> dict[str, float]:
+def accuracy(poses: dict[str, Any], scene: Scene) -> dict[str, float]:
     """AUC, per cent, of the errors of all relative poses and of all camera centres; no pose is a wrong one."""
     errors = [
-        relative_error(poses[b] * poses[a].inverse(), truth, a, b) if a in poses and b in poses else 180.0
-        for a, b in itertools.combinations(sorted(truth.R), 2)
+        relative_error(poses[b] * poses[a].inverse(), scene, a, b) if a in poses and b in poses else 180.0
+        for a, b in itertools.combinations(sorted(scene.R), 2)
     ]
     figures: dict[str, float] = {}
-    for name, values in (("auc", np.array(errors)), ("centre", centre_errors(poses, truth))):
+    for name, values in (("auc", np.array(errors)), ("centre", centre_errors(poses, scene))):
         areas = pose_auc(torch.from_numpy(values), THRESHOLDS).tolist()
         figures |= {f"{name}{limit}": 100 * area for limit, area in zip(THRESHOLDS, areas, strict=True)}
     return figures
 
 
-def relative_error(relative: Any, truth: Truth, a: str, b: str) -> float:
+def relative_error(relative: Any, scene: Scene, a: str, b: str) -> float:
     """The larger of the errors of rotation and direction of translation, in degrees."""
-    R = truth.R[b] @ truth.R[a].T
-    t = truth.t[b] - R @ truth.t[a]
+    R = scene.R[b] @ scene.R[a].T
+    t = scene.t[b] - R @ scene.t[a]
     given = [torch.tensor(np.array(value)) for value in (relative.rotation.matrix(), relative.translation, R, t)]
     return float(max(pose_error(*given, up_to_sign=False)))
 
 
-def centre_errors(poses: dict[str, Any], truth: Truth) -> Array:
+def centre_errors(poses: dict[str, Any], scene: Scene) -> Array:
     """Distances from the true centres after the best similarity (Umeyama 1991), per cent of the centres' RMS spread."""
-    pycolmap = imported()
-    names = sorted(truth.R)
-    true = np.array([-truth.R[name].T @ truth.t[name] for name in names])
-    size, errors = np.sqrt(((true - true.mean(0)) ** 2).sum(1).mean()), np.full(len(names), np.inf)
-    here = [i for i, name in enumerate(names) if name in poses]
-    if len(here) >= MIN_MODEL:
-        centres = np.array([poses[names[i]].inverse().translation for i in here])
-        similarity: Any = pycolmap.estimate_sim3d(centres, true[here])
-        moved = np.c_[centres, np.ones(len(here))] @ similarity.matrix().T
-        errors[here] = np.linalg.norm(moved - true[here], axis=1) / size * 100
-    return errors
+    true = {name: -scene.R[name].T @ scene.t[name] for name in sorted(scene.R)}
+    size = np.sqrt(np.var(list(true.values()), 0).sum())
+    errors = dict.fromkeys(true, np.inf)
+    if len(poses) >= MIN_MODEL:
+        there = np.array([true[name] for name in poses])
+        centres = np.array([pose.inverse().translation for pose in poses.values()])
+        moved = np.c_[centres, np.ones(len(poses))] @ imported().estimate_sim3d(centres, there).matrix().T
+        errors |= dict(zip(poses, np.linalg.norm(moved - there, axis=1) / size * 100, strict=True))
+    return np.array(list(errors.values()))
 
 
-def pair_poses(path: Path, truth: Truth) -> dict[str, int]:
+def pair_poses(path: Path, scene: Scene) -> dict[str, int]:
     """How many pairs have a relative pose, and how many of them are right within 5 degrees, or off by more than 10."""
     pycolmap = imported()
     with pycolmap.Database.open(path) as database:
@@ -248,7 +232,7 @@ def pair_poses(path: Path, truth: Truth) -> dict[str, int]:
         ends = [pycolmap.pair_id_to_image_pair(pair) for pair in database.read_two_view_geometries()[0]]
         poses = [database.read_two_view_geometry(*pair).cam2_from_cam1 for pair in ends]
     posed = [(pose, names[a], names[b]) for pose, (a, b) in zip(poses, ends, strict=True) if pose is not None]
-    errors = np.array([relative_error(pose, truth, a, b) for pose, a, b in posed])
+    errors = np.array([relative_error(pose, scene, a, b) for pose, a, b in posed])
     return {"poses": len(errors), "right": int((errors < RIGHT).sum()), "wrong": int((errors > WRONG).sum())}
 
 
@@ -261,38 +245,27 @@ MODEL |= {f"{name}{limit}": 1 for name in ("auc", "centre") for limit in THRESHO
 def sheets(rows: Sequence[Row]) -> list[Sheet]:
     """Means of the scenes; pairs and models of each scene and method, means of the seeds."""
     each: dict[str, list[Record]] = {"means": [], "pairs": [], "models": []}
-    for (*place,), placed in _grouped(map(_with_speed, rows), "features", "cameras", "method"):
+    for place, placed in grouped(rows, "features", "cameras", "method").items():
         about: Record = dict(zip(("features", "intrinsics", "verified by"), place, strict=True))
-        of_scenes: dict[str, list[dict[str, float]]] = {}  # by mapper, means of the seeds
-        for (mapper, scene), own in _grouped(placed, "mapper", "scene"):
-            means = {name: _mean([row[name] for row in own if name in row]) for name in (*own[0], *MODEL)
-                     if name not in FIELDS}  # fmt: skip
-            of_scenes.setdefault(mapper, []).append(means)
+        of_scenes: dict[str, list[Row]] = {mapper: [] for mapper in ("", *MAPPERS)}  # means of the seeds
+        for (mapper, scene), own in grouped(placed, "mapper", "scene").items():
+            digits = MODEL if mapper else VERIFICATION
+            means = {name: _mean(own, name) for name in own[0].keys() | MODEL.keys() if name not in FIELDS}
+            of_scenes[mapper].append(means)
             line: Record = {**about, **({"mapper": mapper} if mapper else {}), "scene": scene, "seeds": len(own)}
-            line |= {name: _text(means[name], digits) for name, digits in (MODEL if mapper else VERIFICATION).items()}
+            line |= {name: _text(means[name], of) for name, of in digits.items()}
             each["models" if mapper else "pairs"].append(line)
-        speed = sum(of["pairs"] for of in of_scenes[""]) / max(sum(of["seconds"] for of in of_scenes[""]), 1e-9)
-        about |= {"scenes": len(of_scenes[""]), "pairs a second": f"{speed:.0f}"}
+        scenes = of_scenes[""]
+        speed = sum(of["pairs"] for of in scenes) / max(sum(of["seconds"] for of in scenes), 1e-9)
+        about |= {"scenes": len(scenes), "pairs a second": f"{speed:.0f}"}
         for mapper, field in itertools.product(MAPPERS, ("registered, %", *(f"auc{n}" for n in THRESHOLDS))):
-            about[f"{mapper}: {field}"] = _text(_mean([of[field] for of in of_scenes.get(mapper, [])]), 1)
+            about[f"{mapper}: {field}"] = _text(_mean(of_scenes[mapper], field), 1)
         each["means"].append(about)
     return [Sheet(name, f"Verified databases: {name}", records) for name, records in each.items()]
 
 
-def _grouped(rows: Iterable[Row], *fields: str) -> list[tuple[tuple[Any, ...], list[Row]]]:
-    groups: dict[tuple[Any, ...], list[Row]] = {}
-    for row in rows:
-        groups.setdefault(tuple(row[field] for field in fields), []).append(row)
-    return list(groups.items())
-
-
-def _with_speed(row: Row) -> Row:
-    if row["mapper"]:
-        return {**row, "registered, %": 100 * row["registered"] / row["images"]}
-    return {**row, "ms a pair": 1e3 * row["seconds"] / row["pairs"], "pairs a second": row["pairs"] / row["seconds"]}
-
-
-def _mean(values: Sequence[float]) -> float:
+def _mean(rows: Sequence[Row], name: str) -> float:
+    values = [row[name] for row in rows if name in row]
     return float(np.mean(values)) if values else float("nan")
 
 
@@ -302,9 +275,7 @@ def _text(value: float, digits: int) -> str:
 
 def database_of(scene: Scene, features: str, cameras: str, work: Path) -> Path:
     """The database of all pairs' matches without geometries, made at most once in `work`.
-
-    cameras: "unknown", COLMAP's guess of a SIMPLE_RADIAL, or "known", the true PINHOLE with a prior focal length.
-    """
+    cameras: "unknown", COLMAP's guess of a SIMPLE_RADIAL, or "known", the true PINHOLE with a prior focal length."""
     path = work / f"{scene.name}-{features}-{cameras}.db"
     if path.exists():
         return path
@@ -312,7 +283,7 @@ def database_of(scene: Scene, features: str, cameras: str, work: Path) -> Path:
     begun.unlink(missing_ok=True)
     if cameras == "known":
         shutil.copy(database_of(scene, features, "unknown", work), begun)
-        calibrate(begun, scene.truth)
+        calibrate(begun, scene)
     elif features == "colmap":
         match(scene, begun, verified=False)
     else:
@@ -329,7 +300,7 @@ def match(scene: Scene, path: Path, verified: bool) -> None:
     cpu = pycolmap.Device.cpu
     pycolmap.extract_features(path, scene.images, camera_mode=mode, extraction_options=extraction, device=cpu)
     if verified:
-        calibrate(path, scene.truth)
+        calibrate(path, scene)
     matching = pycolmap.FeatureMatchingOptions(num_threads=1, skip_geometric_verification=not verified)
     pycolmap.match_exhaustive(path, matching_options=matching, device=cpu)
 
@@ -346,11 +317,11 @@ def _match_by_ours(scene: Scene, path: Path, work: Path) -> None:
         database.clear_two_view_geometries()
 
 
-def calibrate(path: Path, truth: Truth) -> None:
+def calibrate(path: Path, scene: Scene) -> None:
     pycolmap = imported()
     with pycolmap.Database.open(path) as database:
         for image in database.read_all_images():
-            K, camera = truth.K[image.name], database.read_camera(image.camera_id)
+            K, camera = scene.K[image.name], database.read_camera(image.camera_id)
             params: list[Any] = [K[0, 0], K[1, 1], K[0, 2] + ORIGIN, K[1, 2] + ORIGIN]
             known = pycolmap.Camera(model="PINHOLE", width=camera.width, height=camera.height, params=params)
             known.camera_id, known.has_prior_focal_length = image.camera_id, True
@@ -367,15 +338,11 @@ def run_known_models(arguments: argparse.Namespace) -> None:
         target.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=target.parent) as temporary:
             folder, database = Path(temporary) / "scene", Path(temporary) / "database.db"
-            sparse = folder / "sparse"
-            sparse.mkdir(parents=True)
             match(scene, database, verified=True)
-            model = pycolmap.triangulate_points(
-                posed(scene, database), database, scene.images, sparse, refine_intrinsics=False, options=options
-            )
-            for file in sparse.iterdir():
-                file.unlink()
-            model.write_text(sparse)
+            given = posed(scene, database)
+            model = pycolmap.triangulate_points(given, database, scene.images, Path(temporary), options=options)
+            (folder / "sparse").mkdir(parents=True)
+            model.write_text(folder / "sparse")
             shutil.copytree(scene.images, folder / "images")
             folder.rename(target)
         seen = model.compute_mean_observations_per_reg_image()
@@ -390,7 +357,7 @@ def posed(scene: Scene, database: Path) -> Any:
         for image in opened.read_all_images():
             if image.camera_id not in model.cameras:
                 model.add_camera_with_trivial_rig(opened.read_camera(image.camera_id))
-            rotation = pycolmap.Rotation3d(scene.truth.R[image.name])
+            rotation = pycolmap.Rotation3d(scene.R[image.name])
             given = pycolmap.Image(name=image.name, camera_id=image.camera_id, image_id=image.image_id)
-            model.add_image_with_trivial_frame(given, pycolmap.Rigid3d(rotation, scene.truth.t[image.name]))
+            model.add_image_with_trivial_frame(given, pycolmap.Rigid3d(rotation, scene.t[image.name]))
     return model

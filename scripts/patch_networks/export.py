@@ -43,9 +43,7 @@ FIGURES = {
 
 def model_card(config: DictConfig, path: Path, checkpoint: Mapping[str, Any], figures: Mapping[str, float]) -> str:
     """Markdown for the ONNX file at `path`, from what its checkpoint says beside the weights.
-
-    figures: of the ONNX file itself on the validation patches; empty where it was not measured.
-    """
+    figures: of the ONNX file itself on the validation patches; empty where it was not measured."""
     trained, about = "options" in checkpoint, OmegaConf.load(CARDS)[config.architecture]
     rows = {
         "SHA-256": f"`{sha256(path)}`",
@@ -63,31 +61,20 @@ def model_card(config: DictConfig, path: Path, checkpoint: Mapping[str, Any], fi
 
 def _training(checkpoint: Mapping[str, Any]) -> dict[str, str]:
     """Rows of the card: what a network was trained on, and how."""
-    o, data, losses = checkpoint["options"], checkpoint["data"], checkpoint["losses"][-100:]
+    data, losses = checkpoint["data"], checkpoint["losses"][-100:]
     licences = checkpoint.get("licences", {}) | {"scikit-image": "photographs inside the package, BSD-3-Clause"}
     photographs = (
         f"{count} of {source}" + (f" ({licences[source]})" if source in licences else "")
         for source, count in data["photographs"].items()
     )
-    scenes = ", ".join(f"{count} of {family}" for family, count in data.get("scenes", {}).items())
     rows = {
         "origin": "trained by this project from random weights, scripts.patch_networks.train",
         "photographs": "; ".join(photographs),
-        "patches": f"{data['patches']} of {data['points']} points, found independently by DoG and Hessian in "
-        f"{data['views']} random views of each photograph ({listed(data['limits'])}) with changes of light, blur, "
-        f"noise and JPEG{f', and in as many photographs of each rendered scene ({scenes})' if scenes else ''}",
-        "loss": listed({k: Path(v).name if k == "descriptor" else v for k, v in checkpoint["loss"].items()}),
+        "patches": f"{data['patches']} of {data['points']} points, found independently by DoG and Hessian in random "
+        f"views of each photograph ({listed(data['limits'])}) with changes of light, blur, noise and JPEG",
+        "run": f"{checkpoint['step']} steps, {checkpoint['seconds'] / 60:.0f} minutes; {listed(checkpoint['options'])}",
     }
-    if teacher := checkpoint.get("teacher"):
-        name = f"{Path(teacher['network']).name} ({teacher['precision']})"
-        rows["teacher"] = f"{name}, whose outputs for the same patches are imitated with weight {teacher['weight']}"
-    if "match_sets" in checkpoint:
-        rows["match sets"] = listed(checkpoint["match_sets"])
-    rows["run"] = (
-        f"{checkpoint['step']} steps of {o['batch']} points, {checkpoint['seconds'] / 60:.0f} minutes, "
-        f"{o['optimizer']}, learning rate {o['learning_rate']} falling linearly to zero, seed {o['seed']}, "
-        f"{'bfloat16 autocast' if o['bf16'] else 'float32'}"
-    )
+    rows |= {name: listed(checkpoint[name]) for name in ("loss", "teacher", "match_sets") if name in checkpoint}
     return {**rows, f"loss of the last {len(losses)} steps": f"{sum(losses) / len(losses):.4f}"}
 
 

@@ -7,7 +7,6 @@ authors' released code (lzx551402/tfmatch) has another form, so that none of the
 import dataclasses
 import math
 from collections.abc import Callable
-from typing import Protocol
 
 import torch
 from jaxtyping import Float
@@ -22,6 +21,8 @@ DRAWS = 6  # random numbers in [0, 1) that an objective gets for each point
 SAME_PATCH = 0.008  # a negative nearer than this is the same patch twice, as in the authors' code for HardNet
 MARGINS = ((0.5, 0.7), (0.2, 0.5), (0.0, 0.2))  # GeoDesc: from this S_patch on, the similarity that a match should have
 GALLERY = 1000  # patches among which each asks for its own
+Pairs = Float[Tensor, "2 n 1 h w"]  # of patches with their surroundings
+Draws = Float[Tensor, "n k"]  # all the randomness of a loss beside dropout
 
 
 def distances(a: Float[Tensor, "n d"], b: Float[Tensor, "m d"]) -> Float[Tensor, "n m"]:
@@ -33,10 +34,8 @@ def hardest_triplet(
     a: Float[Tensor, "n d"], b: Float[Tensor, "n d"], *, margin: float = 1.0, squared: bool = False
 ) -> Float[Tensor, ""]:
     """HardNet's loss (Mishchuk et al., NIPS 2017, eq. 4): max(0, margin + positive - hardest negative), the mean.
-
     The hardest negative in the batch is that of either end of a pair (anchor swap). squared: the hinge squared, which
-    presses less on triplets that are nearly right.
-    """
+    presses less on triplets that are nearly right."""
     d = distances(a, b)
     excluded = torch.eye(len(d), dtype=torch.bool, device=d.device) | (d < SAME_PATCH)
     negative = torch.where(excluded, 10.0, d)
@@ -50,19 +49,15 @@ def geodesc(
     *, ratio: float = 0.4, geometric_weight: float = 0.2,
 ) -> Float[Tensor, ""]:  # fmt: skip
     """GeoDesc's loss E_1 + lambda E_2 of match sets: `structured` plus `geometric_weight` times `geometric`.
-
-    a, b: unit descriptors of the n >= 2 matches of each set. similarity: S_patch of each match, in [0, 1].
-    """
+    a, b: unit descriptors of the n >= 2 matches of each set. similarity: S_patch of each match, in [0, 1]."""
     return structured(a, b, ratio=ratio) + geometric_weight * geometric(a, b, similarity)
 
 
 def structured(a: Float[Tensor, "*s n d"], b: Float[Tensor, "*s n d"], *, ratio: float = 0.4) -> Float[Tensor, ""]:
     """The structured loss E_1 of match sets, the mean over the sets.
-
-    With S = A B^T and L = S - ratio diag(S), the sum over i and j of max(0, l_ij - l_ii) + max(0, l_ij - l_jj) by
-    n (n - 1): no patch of the other photograph should be as similar as 1 - `ratio` (alpha) of its own match. All of
-    them count, not the hardest alone.
-    """
+    With S = A B^T and L = S - ratio diag(S), the sum over i and j of max(0, l_ij - l_ii) + max(0, l_ij - l_jj) by n (n
+    - 1): no patch of the other photograph should be as similar as 1 - `ratio` (alpha) of its own match. All of them
+    count, not the hardest alone."""
     similarity = a @ b.mT
     own = (1 - ratio) * similarity.diagonal(dim1=-2, dim2=-1)
     n = similarity.shape[-1]
@@ -75,10 +70,8 @@ def geometric(
     a: Float[Tensor, "*s n d"], b: Float[Tensor, "*s n d"], similarity: Float[Tensor, "*s n"]
 ) -> Float[Tensor, ""]:
     """The geometric loss E_2: max(0, margin - cosine similarity) of each match, the mean.
-
     Patches that geometry makes hard to match need not be as similar: see `MARGINS`. The mean in place of the sum keeps
-    the weight of the loss independent of n.
-    """
+    the weight of the loss independent of n."""
     margin = torch.zeros_like(similarity)
     for threshold, value in reversed(MARGINS):
         margin = torch.where(similarity >= threshold, value, margin)
@@ -93,11 +86,9 @@ def fpr_at_recall(positive: Float[Tensor, " n"], negative: Float[Tensor, " m"], 
 
 def patch_quality(a: Float[Tensor, "n d"], b: Float[Tensor, "n d"]) -> dict[str, float]:
     """Figures from two unit descriptors of each of n >= 2 points.
-
     fpr95: negatives are each point with the next one's other patch. map: each patch of `a` asks for its own among
     `GALLERY` patches of `b` (its block; the last block may be smaller); with one right answer average precision is the
-    inverse of its rank, where equals count against it. accuracy: how often it ranks first.
-    """
+    inverse of its rank, where equals count against it. accuracy: how often it ranks first."""
     positive = (a - b).square().sum(1).clamp_min(0).sqrt()
     negative = (a - b.roll(1, 0)).square().sum(1).clamp_min(0).sqrt()
     blocks = [distances(x, y) for x, y in zip(torch.split(a, GALLERY), torch.split(b, GALLERY), strict=True)]
@@ -116,70 +107,58 @@ def middle(patches: Float[Tensor, "*b h w"], size: int = 32) -> Float[Tensor, "*
 
 
 @torch.no_grad()
-def evaluate_descriptor(describe: PatchFunction, pairs: Float[Tensor, "2 n 1 h w"]) -> dict[str, float]:
+def evaluate_descriptor(describe: PatchFunction, pairs: Pairs) -> dict[str, float]:
     """`patch_quality` of a descriptor on validation pairs."""
     parts = ([describe(part).float() for part in torch.split(middle(patches), 256)] for patches in pairs)
     return patch_quality(*(functional.normalize(torch.cat(described), dim=1) for described in parts))
 
 
-class Objective(Protocol):
-    """A loss of a network on pairs of patches with their surroundings, and its figures on validation pairs.
-
-    `draws` are all the randomness there is beside dropout. The figures are for the log and the model card.
-    """
-
-    def loss(self, network: nn.Module, pairs: Float[Tensor, "2 n 1 h w"], draws: Float[Tensor, "n k"]) -> Tensor: ...
-
-    def evaluate(self, network: nn.Module, pairs: Float[Tensor, "2 n 1 h w"]) -> dict[str, float]: ...
-
-
 @dataclasses.dataclass(frozen=True)
 class DescriptorObjective:
     """Descriptors of a point's two patches should be nearer than those of different points: `criterion` says how.
+    Of match sets it gets the descriptors (s, n, d), twice, and the S_patch (s, n) of their matches. teacher: a trained
+    network that stays as it is; each descriptor should also be its descriptor of the same patch (FitNets' hints on the
+    output, Romero et al., ICLR 2015). weight: of their squared distance in the loss."""
 
-    teacher: a trained network that stays as it is; each descriptor should also be its descriptor of the same patch
-    (FitNets' hints on the output, Romero et al., ICLR 2015). weight: of their squared distance in the loss.
-    """
-
-    criterion: Callable[[Tensor, Tensor], Tensor]
+    criterion: Callable[..., Tensor]
     teacher: PatchFunction | None = None
     weight: float = 1.0
 
-    def loss(self, network: nn.Module, pairs: Float[Tensor, "2 n 1 h w"], draws: Float[Tensor, "n k"]) -> Tensor:
+    def loss(self, network: nn.Module, pairs: Pairs, draws: Draws, similarity: Tensor | None = None) -> Tensor:
         patches = middle(pairs)
         left, up, over = (draws[:, column, None, None, None] < 0.5 for column in range(3))
         patches = torch.where(left, patches.flip(-1), patches)
         patches = torch.where(up, patches.flip(-2), patches)
         patches = torch.where(over, patches.mT, patches).flatten(0, 1)
         described = network(patches)
-        loss = self.criterion(*described.chunk(2))
+        a, b = described.chunk(2)
+        if similarity is None:
+            loss = self.criterion(a, b)
+        else:
+            loss = self.criterion(*(x.reshape(*similarity.shape, -1) for x in (a, b)), similarity)
         if self.teacher is not None:
             with torch.no_grad():
                 target = self.teacher(patches)
             loss = loss + self.weight * (described - target).square().sum(1).mean()
         return loss
 
-    def evaluate(self, network: nn.Module, pairs: Float[Tensor, "2 n 1 h w"]) -> dict[str, float]:
+    def evaluate(self, network: nn.Module, pairs: Pairs) -> dict[str, float]:
         return evaluate_descriptor(network, pairs)
 
 
 @dataclasses.dataclass(frozen=True)
 class CovarianceObjective:
     """Shapes should follow what is done to a patch (as Lenc and Vedaldi, ECCV Workshops 2016, train detectors).
-
-    A patch is turned and stretched in two ways T1 and T2, up to `tilt` each. With the shapes A1 and A2 found then,
-    T1 A1 and T2 A2 rectify the same patch, so (T1 A1)^-1 T2 A2 should be a rotation. Unlike the loss on descriptors it
-    cannot be met by one shape for all patches, and needs no descriptor.
-
-    teacher: a trained network that stays as it is; each shape should also be its shape of the same patch. weight: of
-    that part of the loss, which is measured alike.
-    """
+    A patch is turned and stretched in two ways T1 and T2, up to `tilt` each. With the shapes A1 and A2 found then, T1
+    A1 and T2 A2 rectify the same patch, so (T1 A1)^-1 T2 A2 should be a rotation. Unlike the loss on descriptors it
+    cannot be met by one shape for all patches, and needs no descriptor. teacher: a trained network that stays as it is;
+    each shape should also be its shape of the same patch. weight: of that part of the loss, which is measured alike."""
 
     tilt: float = 2.5
     teacher: PatchFunction | None = None
     weight: float = 1.0
 
-    def loss(self, network: nn.Module, pairs: Float[Tensor, "2 n 1 h w"], draws: Float[Tensor, "n k"]) -> Tensor:
+    def loss(self, network: nn.Module, pairs: Pairs, draws: Draws, similarity: Tensor | None = None) -> Tensor:
         """Mean of log((s^2 + s^-2) / 2) for singular values s and 1 / s of what should be a rotation: 0 where it is."""
         T1, T2, seen = self._stretched(pairs.flatten(0, 1), torch.cat([draws, draws]))
         shapes = shape_matrix(network(seen))
@@ -192,7 +171,7 @@ class CovarianceObjective:
         return loss
 
     @torch.no_grad()
-    def evaluate(self, network: nn.Module, pairs: Float[Tensor, "2 n 1 h w"]) -> dict[str, float]:
+    def evaluate(self, network: nn.Module, pairs: Pairs) -> dict[str, float]:
         """Median ratio of axes that is left between the two rectified patches, and without shapes (1: none)."""
         numbers = random.uniform(0, torch.zeros(1, dtype=torch.int64), Stream.TRAINING, 0, len(pairs[0]), DRAWS)[0]
         T1, T2, seen = self._stretched(pairs[0], numbers.to(pairs[0]))
@@ -208,6 +187,9 @@ class CovarianceObjective:
             for i in (0, 3)
         )
         return T1, T2, torch.cat([sample(patches, T1), sample(patches, T2)])
+
+
+Objective = DescriptorObjective | CovarianceObjective
 
 
 def _departure(matrix: Float[Tensor, "n 2 2"]) -> Float[Tensor, ""]:

@@ -60,21 +60,12 @@ def export(network: nn.Module, path: Path) -> None:
 
 def quantize(source: Path, path: Path, patches: Float[Tensor, "n 1 32 32"]) -> None:
     """An int8 network (QDQ, weights per channel, convolutions with their ReLU) calibrated on real patches.
-
-    Its convolutions are laid out as ONNX Runtime runs them fastest (`lay_out`).
-    """
-    from onnxruntime.quantization import (
-        CalibrationDataReader,
-        CalibrationMethod,
-        QuantFormat,
-        QuantType,
-        quantize_static,
-    )
+    Its convolutions are laid out as ONNX Runtime runs them fastest (`lay_out`)."""
+    from onnxruntime import quantization
     from onnxruntime.quantization.shape_inference import quant_pre_process
 
-    class Reader(CalibrationDataReader):  # type: ignore[misc]
-        def __init__(self) -> None:
-            self.parts = iter(torch.split(patches, 256))
+    class Reader(quantization.CalibrationDataReader):  # type: ignore[misc]
+        parts = iter(torch.split(patches, 256))
 
         def get_next(self) -> dict[str, object] | None:
             part = next(self.parts, None)
@@ -84,10 +75,10 @@ def quantize(source: Path, path: Path, patches: Float[Tensor, "n 1 32 32"]) -> N
     with tempfile.TemporaryDirectory() as folder, replacing(path) as unfinished:
         prepared = Path(folder) / "prepared.onnx"
         quant_pre_process(str(source), str(prepared), skip_symbolic_shape=True)
-        quantize_static(
-            str(prepared), str(unfinished), Reader(), quant_format=QuantFormat.QDQ, per_channel=True,
-            activation_type=QuantType.QUInt8, weight_type=QuantType.QInt8, op_types_to_quantize=["Conv", "Relu"],
-            calibrate_method=CalibrationMethod.MinMax,
+        quantization.quantize_static(
+            str(prepared), str(unfinished), Reader(), quant_format=quantization.QuantFormat.QDQ, per_channel=True,
+            activation_type=quantization.QuantType.QUInt8, weight_type=quantization.QuantType.QInt8,
+            op_types_to_quantize=["Conv", "Relu"], calibrate_method=quantization.CalibrationMethod.MinMax,
         )  # fmt: skip
         model = onnx.load(unfinished)
         forget_origin(model)
@@ -96,17 +87,12 @@ def quantize(source: Path, path: Path, patches: Float[Tensor, "n 1 32 32"]) -> N
 
 
 def lay_out(path: Path) -> None:
-    """Write a file's network anew in another layout (`laid_out`)."""
     onnx.save(laid_out(onnx.load(path), PATCH_SHAPE[-1]), path)
 
 
 def laid_out(model: onnx.ModelProto, side: int) -> onnx.ModelProto:
-    """The network in another layout.
-
-    Args:
-        model: a chain of convolutions, in fp32 or as ``onnxruntime.quantization`` quantises it (QDQ); not changed.
-        side: height and width of its input.
-    """
+    """The network in another layout: a chain of convolutions, in fp32 or as ``onnxruntime.quantization`` quantises it
+    (QDQ), which is not changed. side: height and width of its input."""
     changed = onnx.ModelProto()
     changed.CopyFrom(model)
     graph = _Graph(changed.graph)
@@ -167,7 +153,11 @@ class _Graph:
         for name in (*quantised.input[1:], *self.writer[convolution.input[2]].input):
             self._put(name, np.tile(numpy_helper.to_array(self.constants[name]), pixels))
         ways["strides"].ints[1], ways["kernel_shape"].ints[1] = pixels * step, wide.shape[-1]
-        self._split_rows(self._reader(convolution.output[0]).output[0], side, channels)
+        # (n, pixels * channels, side, side / pixels) -> (n, channels, side, side), for whoever reads it
+        reader = self._reader(self._reader(convolution.output[0]).output[0])
+        self._insert(reader, "Transpose", perm=[0, 2, 3, 1])
+        self._insert(reader, "Reshape", [0, side, side, channels])
+        self._insert(reader, "Transpose", perm=[0, 3, 1, 2])
 
     def make_product(self, convolution: Any) -> None:
         """Write a convolution that sees its whole input at once as a matrix product of all patches."""
@@ -177,46 +167,30 @@ class _Graph:
             quantised, before = self.writer[convolution.input[1]], self.writer[convolution.input[0]]
             self._put(quantised.input[0], flat.T)  # (inputs, outputs): what ONNX Runtime has an int8 product for
             quantised.attribute[0].i = 1  # the axis of the outputs
-            self._flatten(before, before.input[0])
+            self._insert(before, "Reshape", [0, -1])  # (n, inputs) for (n, channels, height, width)
             written, ways = self._reader(written).output[0], []
         else:
             self._put(convolution.input[1], flat)
-            self._flatten(convolution, convolution.input[0])
+            self._insert(convolution, "Reshape", [0, -1])
             ways = [helper.make_attribute("transB", 1)]
         convolution.op_type = "Gemm"
         del convolution.attribute[:]
         convolution.attribute.extend(ways)
-        shape = self._constant(f"{written}_shape", [0, len(weights), 1, 1])
-        reader = self._reader(written)
-        self._insert_before(reader, "Reshape", [written, shape], f"{written}_whole")
-        reader.input[0] = f"{written}_whole"
-
-    def _flatten(self, reader: Any, name: str) -> None:
-        """Have a node read (n, inputs) for (n, channels, height, width)."""
-        shape = self._constant(f"{name}_shape", [0, -1])
-        self._insert_before(reader, "Reshape", [name, shape], f"{name}_flat")
-        reader.input[0] = f"{name}_flat"
-
-    def _split_rows(self, name: str, side: int, channels: int) -> None:
-        """(n, pixels * channels, side, side / pixels) -> (n, channels, side, side), for whoever reads it."""
-        reader = self._reader(name)
-        shape = self._constant(f"{name}_shape", [0, side, side, channels])
-        self._insert_before(reader, "Transpose", [name], f"{name}_rows", perm=[0, 2, 3, 1])
-        self._insert_before(reader, "Reshape", [f"{name}_rows", shape], f"{name}_pixels")
-        self._insert_before(reader, "Transpose", [f"{name}_pixels"], f"{name}_channels", perm=[0, 3, 1, 2])
-        reader.input[0] = f"{name}_channels"
+        self._insert(self._reader(written), "Reshape", [0, len(weights), 1, 1])
 
     def _reader(self, name: str) -> Any:
         (reader,) = [node for node in self.graph.node if name in node.input]
         return reader
 
-    def _insert_before(self, node: Any, operator: str, inputs: list[str], output: str, **attributes: Any) -> None:
-        inserted = helper.make_node(operator, inputs, [output], f"{output}_{operator}", **attributes)
-        self.graph.node.insert(list(self.graph.node).index(node), inserted)
-
-    def _constant(self, name: str, values: list[int]) -> str:
-        self.graph.initializer.append(numpy_helper.from_array(np.array(values, np.int64), name))
-        return name
+    def _insert(self, reader: Any, operator: str, *constants: list[int], **attributes: Any) -> None:
+        """Put an operator between a node and what it reads first; constants: what the operator reads beside that."""
+        output = f"{reader.input[0]}_{operator}"
+        inputs = [reader.input[0], *(f"{output}_{i}" for i in range(len(constants)))]
+        for name, values in zip(inputs[1:], constants, strict=True):
+            self.graph.initializer.append(numpy_helper.from_array(np.array(values, np.int64), name))
+        inserted = helper.make_node(operator, inputs, [output], output, **attributes)
+        self.graph.node.insert(list(self.graph.node).index(reader), inserted)
+        reader.input[0] = output
 
     def _put(self, name: str, values: NDArray[Any]) -> None:
         self.constants[name].CopyFrom(numpy_helper.from_array(np.ascontiguousarray(values), name))

@@ -3,24 +3,23 @@
 python -m scripts.patch_networks.train training=hardnet images=FOLDER photographs.held_out=[SUBFOLDER]
 python -m scripts.patch_networks.train training=affnet images=FOLDER photographs=permissive training.options.minutes=20
 
-The patches are cut once into <out>/patches, those of known geometry (training=geodesc) into <out>/tracks; delete that
-folder after a change of photographs, of `patches` or of `training.tracks`. The checkpoint <out>/<name>.pt carries what
-the model card says; resume=true goes on from it; scripts.patch_networks.export makes the ONNX network and the card.
+The patches are cut once into <out>/patches; delete that folder after a change of photographs or of `patches`. The
+checkpoint <out>/<name>.pt carries what the model card says; resume=true goes on from it; scripts.patch_networks.export
+makes the ONNX network and the card.
 
 Every step is a function of the seed and its number, so that a run can be resumed. A batch is points of a whole store,
-or matches of pairs of photographs (`MatchSetTraining`, as GeoDesc is trained).
+or matches of pairs of photographs (`training.match_sets`, as GeoDesc is trained).
 """
 
-import dataclasses
 import functools
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import hydra
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from omegaconf import DictConfig
 from torch import Tensor, nn
 
@@ -35,28 +34,18 @@ from fmtorch.presets import plain
 from fmtorch.training.planes import PlaneViews, list_photographs
 from scripts.patch_networks import objectives, stores
 from scripts.patch_networks.objectives import DRAWS, CovarianceObjective, DescriptorObjective, Objective
-from scripts.patch_networks.patches import Tolerance, Warps, training_scenes
-from scripts.patch_networks.stores import MAX_SIMILARITY, Cutting, PatchStore
-
-OPTIMIZERS: dict[str, Callable[..., torch.optim.Optimizer]] = {
-    "adam": torch.optim.Adam,
-    "sgd": functools.partial(torch.optim.SGD, momentum=0.9, dampening=0.9),  # as the authors of HardNet do
-}
+from scripts.patch_networks.stores import Cutting, MatchSets, PatchStore, Tolerance, match_sets, order
 
 
-@dataclasses.dataclass(frozen=True)
-class TrainingOptions:
-    """How a patch network is trained; the learning rate falls linearly to zero over the run.
-
+class TrainingOptions(NamedTuple):
+    """How a patch network is trained, by Adam; the learning rate falls linearly to zero over the run.
     batch: points a step, with two patches each. steps: the run's length, or minutes where that is given: wall time that
-    this run has spent in all its parts. optimizer: adam or sgd. bf16: autocast to bfloat16. checkpoint_steps,
-    log_steps: how often to save, to log.
-    """
+    this run has spent in all its parts. bf16: autocast to bfloat16. checkpoint_steps, log_steps: how often to save, to
+    log."""
 
     batch: int = 512
     steps: int = 5000
     minutes: float | None = None
-    optimizer: str = "adam"
     learning_rate: float = 3e-3
     weight_decay: float = 1e-4
     seed: int = 0
@@ -66,26 +55,30 @@ class TrainingOptions:
 
 
 class PatchTraining:
-    """A network in training: `run` goes on to the end, or until a step; `save` keeps all that is needed."""
+    """A network in training: `run` goes on to the end, or until a step; `save` keeps all that is needed.
+    sets: where batches are of `options.batch` / `matches` of these, and `matches` of each (N_1 of GeoDesc's paper)."""
 
     def __init__(
         self, network: nn.Module, objective: Objective, store: PatchStore, options: TrainingOptions,
-        description: dict[str, Any] | None = None, device: torch.device | str = "cpu",
+        description: dict[str, Any] | None = None, device: torch.device | str = "cpu", *,
+        sets: MatchSets | None = None, matches: int = 1,
     ) -> None:  # fmt: skip
-        if options.batch > len(store):
-            raise ValueError(f"batch={options.batch} is more than the {len(store)} points there are")
-        if options.optimizer not in OPTIMIZERS:
-            raise ValueError(f"optimizer={options.optimizer}; there are: {', '.join(OPTIMIZERS)}")
+        self.units: PatchStore | MatchSets = store if sets is None else sets
+        if options.batch % matches:
+            raise ValueError(f"batch={options.batch} must be a multiple of match_sets.matches={matches}")
+        if options.batch > matches * len(self.units):
+            what = "points there are" if sets is None else f"sets of {matches} matches"
+            raise ValueError(f"batch={options.batch} is more than the {len(self.units)} {what}")
         self.network, self.objective, self.store, self.options = network.to(device), objective, store, options
-        self.description, self.device = description or {}, torch.device(device)
-        rates = {"lr": options.learning_rate, "weight_decay": options.weight_decay}
-        self.optimizer = OPTIMIZERS[options.optimizer](self.network.parameters(), **rates)
+        self.sets, self.matches, self.description, self.device = sets, matches, description or {}, torch.device(device)
+        parameters = self.network.parameters()
+        self.optimizer = torch.optim.Adam(parameters, options.learning_rate, weight_decay=options.weight_decay)
         self.step, self.seconds, self.losses = 0, 0.0, list[float]()
 
     def resume(self, path: Path | str) -> None:
         """Go on from a checkpoint of a run with the same options; ValueError names what differs."""
         content = read_checkpoint(path)
-        mine, theirs = dataclasses.asdict(self.options), content.get("options", {})
+        mine, theirs = self.options._asdict(), content.get("options", {})
         changed = [k for k, v in mine.items() if k not in ("steps", "minutes") and theirs.get(k) != v]
         if content.get("match_sets") != self.description.get("match_sets"):
             changed.append("match_sets")
@@ -130,107 +123,63 @@ class PatchTraining:
         path.parent.mkdir(parents=True, exist_ok=True)
         content = {
             "state_dict": self.network.state_dict(), "optimizer": self.optimizer.state_dict(), "step": self.step,
-            "seconds": self.seconds, "losses": self.losses, "options": dataclasses.asdict(self.options),
+            "seconds": self.seconds, "losses": self.losses, "options": self.options._asdict(),
             "data": self.store.description, **self.description, **more,
         }  # fmt: skip
         with replacing(path) as unfinished:
             torch.save(content, unfinished)
 
     def _one_step(self) -> Tensor:
+        """The loss of this step's patches, by `DRAWS` random numbers of each point and two more."""
         o = self.options
         key = torch.tensor([self.step])
         draws = random.uniform(o.seed, key, Stream.TRAINING, 0, o.batch, DRAWS + 2)[0].float()
         torch.manual_seed(int(random.bits(o.seed, key, Stream.TRAINING, o.batch, 1, DRAWS + 2)[0, 0, 0]))  # dropout
+        pairs, similarity = self._batch(draws)
+        draws, pairs = draws.to(self.device), pairs.to(self.device)
         with torch.autocast(self.device.type, torch.bfloat16, enabled=o.bf16):
-            loss = self._loss(draws)
+            loss = self.objective.loss(self.network, pairs, draws, similarity)
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
         self.optimizer.step()
         return loss.detach()
 
-    def _loss(self, draws: Float[Tensor, "b k"]) -> Tensor:
-        """The loss of this step's patches; `draws` are `DRAWS` random numbers of each point and two more."""
-        pairs = self.store.views(self._selected(len(self.store), self.options.batch), draws[:, DRAWS:])
-        return self.objective.loss(self.network, pairs.to(self.device), draws.to(self.device))
-
-    def _selected(self, total: int, count: int) -> Int[Tensor, " b"]:
-        """This step's points or match sets: each epoch is a random order of all."""
-        epoch, i = divmod(self.step, total // count)
-        return _order(self.options.seed + 1, epoch, total)[i * count : (i + 1) * count]
-
-
-@functools.lru_cache(maxsize=2)
-def _order(seed: int, epoch: int, total: int) -> Int[Tensor, " n"]:
-    return random.bits(seed, torch.tensor([epoch]), Stream.TRAINING, 0, total, 1).flatten().argsort(stable=True)
-
-
-class MatchSetTraining(PatchTraining):
-    """`PatchTraining` on batches of `options.batch` / `matches` match sets, each epoch a random order of all.
-
-    loss: of the descriptors (s, n, d), twice, of match sets and of the S_patch (s, n) of their matches. matches: of
-    each set, N_1 of the paper; max_similarity: of the photographs of a pair, above which it is left out.
-
-    Raises ValueError where the store has no geometry, and where the batch is no multiple of `matches`, or larger than
-    all sets together.
-    """
-
-    def __init__(
-        self, network: nn.Module, loss: Callable[..., Tensor], store: PatchStore,
-        options: TrainingOptions, description: dict[str, Any] | None = None, device: torch.device | str = "cpu",
-        *, matches: int = 64, max_similarity: float = MAX_SIMILARITY,
-    ) -> None:  # fmt: skip
-        if store.tracks is None:
-            raise ValueError("training.match_sets needs patches with their geometry: training.tracks")
-        if options.batch % matches:
-            raise ValueError(f"batch={options.batch} must be a multiple of match_sets.matches={matches}")
-        self.matches, self.criterion = matches, loss
-        self.sets = stores.match_sets(store.tracks, matches, max_similarity)
-        if options.batch > matches * len(self.sets):
-            raise ValueError(f"batch={options.batch} is more than {matches} matches of the {len(self.sets)} sets")
-        super().__init__(network, DescriptorObjective(loss), store, options, description, device)  # for its figures
-
-    def _loss(self, draws: Float[Tensor, "b k"]) -> Tensor:
+    def _batch(self, draws: Float[Tensor, "b k"]) -> tuple[Float[Tensor, "2 b 1 h w"], Float[Tensor, "s n"] | None]:
+        """This step's pairs of patches, and S_patch of those of match sets; each epoch is a random order of all."""
         seed, count = self.options.seed, self.options.batch // self.matches
-        chosen = self._selected(len(self.sets), count).tolist()
-        numbers = random.uniform(seed + 2, torch.tensor([self.step]), Stream.TRAINING, 0, count, self.matches)[0]
-        patches, similarity = self.sets.draw(chosen, self.matches, numbers)
-        similarity = similarity.float().to(self.device)
-
-        def criterion(a: Tensor, b: Tensor) -> Tensor:
-            a, b = (x.reshape(*similarity.shape, -1) for x in (a, b))
-            return self.criterion(a, b, similarity)
-
-        pairs = self.store.pairs(patches.flatten(1)).to(self.device)
-        return DescriptorObjective(criterion).loss(self.network, pairs, draws.to(self.device))
+        epoch, i = divmod(self.step, len(self.units) // count)
+        chosen = order(seed + 1, epoch, len(self.units))[i * count : (i + 1) * count]
+        if self.sets is None:
+            return self.store.views(chosen, draws[:, DRAWS:]), None
+        index = []
+        for k, unit in enumerate(chosen.tolist()):
+            begin, end = self.sets.first[unit : unit + 2].tolist()
+            index.append(begin + order(seed + 2, self.step * count + k, end - begin)[: self.matches])
+        matches = torch.stack(index).numpy()
+        patches = torch.from_numpy(self.sets.patches[:, matches]).flatten(1)
+        return self.store.pairs(patches), torch.from_numpy(self.sets.similarity[matches]).float().to(self.device)
 
 
 def opened_stores(config: DictConfig) -> list[PatchStore]:
     """Training and validation patches, cut now where they are not there yet."""
-    opened, given = [], config.photographs
+    opened, given, patches = [], config.photographs, config.patches
     for side, name in enumerate(("train", "validation")):
-        tracks = side == 0 and "tracks" in config.training
-        folder = Path(config.out) / ("tracks" if tracks else "patches") / name
+        folder = Path(config.out) / "patches" / name
         if not folder.exists():
             photographs = list_photographs(config.images, given.sources and list(given.sources), given.excluded)
             photographs += stores.package_photographs() if config.package_images else []
             chosen = stores.split(photographs, given.held_out)[side]
             console.print(f"cutting patches of {len(chosen)} photographs into {folder}")
-            patches, cutting = config.patches, cutting_of(config, tracks)
-            count, seed = 0 if side else patches.scenes, patches.seed + side
-            scenes = training_scenes(count, cutting.views.views, seed)
-            stores.build_store(folder, [*chosen, *scenes], cutting, seed, patches.workers)
+            seed = patches.seed + side
+            stores.build_store(folder, chosen, cutting_of(config), seed, patches.workers)
         opened.append(PatchStore.open(folder))
     return opened
 
 
-def cutting_of(config: DictConfig, tracks: bool) -> Cutting:
-    """How a config cuts patches: of warped photographs, or of photographs as planes, with their geometry."""
+def cutting_of(config: DictConfig) -> Cutting:
     patches: dict[str, Any] = plain(config.patches)
-    limits = plain(config.training.tracks)["planes"] if tracks else {**patches["limits"], "views": patches["views"]}
-    limits = {name: tuple(value) if isinstance(value, list) else value for name, value in limits.items()}
-    points = config.training.tracks.points if tracks else patches["points"]
-    views = PlaneViews(**limits) if tracks else Warps(**limits)
-    return Cutting(views, points, Tolerance(**patches["tolerance"]), patches["longest_side"])
+    planes: Any = {name: tuple(v) if isinstance(v, list) else v for name, v in patches["planes"].items()}
+    return Cutting(PlaneViews(**planes), patches["points"], Tolerance(**patches["tolerance"]), patches["longest_side"])
 
 
 def objective_of(config: DictConfig) -> Objective:
@@ -240,27 +189,28 @@ def objective_of(config: DictConfig) -> Objective:
         teacher = config.training.teacher
         taught = {"teacher": PatchNetwork(network_file(teacher.network, teacher.precision)), "weight": teacher.weight}
     name = loss.pop("name")
+    if (name == "geodesc") != ("match_sets" in config.training):
+        raise ValueError("training.match_sets needs training.loss.name=geodesc, and that loss match sets")
     if name == "affine_covariance":
         return CovarianceObjective(**loss, **taught)
-    if name != "hardest_triplet":
-        raise ValueError(f"training.loss.name={name}; there are: hardest_triplet, affine_covariance, geodesc")
-    return DescriptorObjective(functools.partial(objectives.hardest_triplet, **loss), **taught)
+    criteria: dict[str, Any] = {"hardest_triplet": objectives.hardest_triplet, "geodesc": objectives.geodesc}
+    if name not in criteria:
+        raise ValueError(f"training.loss.name={name}; there are: affine_covariance, {', '.join(criteria)}")
+    return DescriptorObjective(functools.partial(criteria[name], **loss), **taught)
 
 
 def training_of(
     config: DictConfig, network: nn.Module, store: PatchStore, description: dict[str, Any], device: torch.device
 ) -> PatchTraining:
     """The training of a config: on points of the whole store, or on match sets."""
-    training = plain(config.training)
-    options = TrainingOptions(**training["options"])
-    if "match_sets" not in training:
-        return PatchTraining(network, objective_of(config), store, options, description, device)
-    loss = training["loss"]
-    if loss.pop("name") != "geodesc":
-        raise ValueError("training.match_sets needs training.loss.name=geodesc")
-    description = {**description, "match_sets": training["match_sets"]}
-    criterion = functools.partial(objectives.geodesc, **loss)
-    return MatchSetTraining(network, criterion, store, options, description, device, **training["match_sets"])
+    training, of_sets = plain(config.training), dict[str, Any]()
+    objective = objective_of(config)
+    if "match_sets" in training:
+        of_sets = {"sets": match_sets(store, **training["match_sets"]), "matches": training["match_sets"]["matches"]}
+        description = {**description, "match_sets": training["match_sets"]}
+    return PatchTraining(
+        network, objective, store, TrainingOptions(**training["options"]), description, device, **of_sets
+    )
 
 
 @hydra.main(version_base=None, config_path=str(conf_dir()), config_name="train_patch_network")

@@ -119,9 +119,7 @@ def write_tum(root: Path, name: str = "rgbd_dataset_freiburg1_test", frames: int
 
 def write_bundler(folder: Path, cameras: int = 5) -> tuple[Path, list[dict[str, np.ndarray]]]:
     """A scene of 1DSfM with points on a sphere, written from Bundler's manual; camera 3 was not registered.
-
-    Returns the folder, and of every camera f, k, R and t as the file has them, and the points.
-    """
+    Returns the folder, and of every camera f, k, R and t as the file has them, and the points."""
     rng = np.random.default_rng(0)
     points = rng.normal(size=(12, 3))
     lines, truth = ["# Bundle file v0.3", f"{cameras} {len(points)}"], []

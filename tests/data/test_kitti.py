@@ -156,10 +156,8 @@ NAME = "rgbd_dataset_freiburg1_test"
 
 def test_robust_inliers_of_real_frames_lie_on_the_lines_as_in_the_fmbench_copy() -> None:
     """No frame is in both; the README of the shared data says what the same check gave for others of this sequence.
-
     There 103 of 200 pairs are verified (20 inliers of MAGSAC, median distance at most 2 px), their median is 1.07 px,
-    and 90 % are below 1.60. With the poses inverted, or the images as they were taken, far fewer pairs pass.
-    """
+    and 90 % are below 1.60. With the poses inverted, or the images as they were taken, far fewer pairs pass."""
     root = shared_path("data/native/tum_rgbd")
     dataset = load("tum", root=root, sequences=["rgbd_dataset_freiburg1_rpy"], pairs=None, window=0.5)
     assert (len(dataset.scenes[0].views), len(dataset)) == (10, 31)

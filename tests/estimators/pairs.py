@@ -106,9 +106,7 @@ class Residuals(NamedTuple):
 
 def residuals(F: Array, pair: Pair, threshold: float, dtype: type[np.floating] = np.float32) -> Residuals:
     """Sampson distances in thresholds (n,) to a model (9,), each match's threshold by its noise.
-
-    dtype: of points and model, and in which the bounds allow to compute.
-    """
+    dtype: of points and model, and in which the bounds allow to compute."""
     points, A = (x.astype(dtype).astype(np.float64) for x in (pair.points, F.reshape(3, 3)))
     scale = pair.pixels_per_noise / threshold
     rounding = np.finfo(dtype).eps / (2 if dtype is np.float32 else 1)  # in float64 what is exact is rounded, too

@@ -123,9 +123,7 @@ def test_sums_are_exact(score: estimators.Score) -> None:
 @pytest.mark.parametrize("r", [0.05, 0.3, 0.6, 0.9])
 def test_the_reference_of_magsac_is_the_integral_over_sigma(r: float) -> None:
     """Barath et al. 2020: w(r) integrates over sigma the chi density of r / sigma, which vanishes beyond k sigma.
-
-    rho is the integral of w(r) r; a constant factor goes where the gain is normalised.
-    """
+    rho is the integral of w(r) r; a constant factor goes where the gain is normalised."""
 
     def weight(r: float) -> float:
         # g(r | sigma) = 2 C(4) sigma^-4 exp(-r^2 / (2 sigma^2)) r^3; the density of r has three dimensions less, r^-3

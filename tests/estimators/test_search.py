@@ -14,6 +14,7 @@ from fmtorch.core import Correspondences, collate
 from fmtorch.estimators import Hypotheses, Pool, Preselection, Search, Verified, largest_weight
 from fmtorch.estimators.preselection import (
     FIRST_LOOK,
+    best,
     degenerate_support,
     draw_by_prior,
     drawn_by_prior,
@@ -394,3 +395,12 @@ def test_a_pool_is_a_stable_sort_of_all_that_it_was_offered(m: int, k: int, size
     assert filled == len(best)
     np.testing.assert_array_equal(pool[:filled], F[best])
     np.testing.assert_array_equal(pool_score[:filled], score[best])
+
+
+@pytest.mark.parametrize(("m", "k"), [(1, 1), (5, 5), (300, 96), (300, 1), (1000, 256)])
+def test_the_best_of_a_round_and_the_first_of_equals(m: int, k: int) -> None:
+    score = np.random.default_rng(m + k).integers(0, 40, m) / 8.0
+    score[::7] = -np.inf
+    which = np.empty(k, np.int64)
+    best(score, which)
+    np.testing.assert_array_equal(which, np.sort(np.argsort(-score, kind="stable")[:k]))

@@ -31,6 +31,7 @@ from fmtorch.pipeline import Pipeline, build_pipeline, load_pipeline
 from fmtorch.runs import PairRow, identity_digest, libraries
 from scripts.benchmark.pairs import synthetic_pair
 from tests.helpers import compose
+from tests.processes import alive
 
 PAIRS = 96
 SLOW_SECONDS = 0.3  # of each batch of a slow pipeline, so that there is time to kill its workers
@@ -245,14 +246,6 @@ def test_a_worker_ends_with_the_process_that_was_killed() -> None:
     while alive(worker) and time.monotonic() < deadline:
         time.sleep(0.02)
     assert not alive(worker)
-
-
-def alive(pid: int) -> bool:
-    """Whether a process runs; one that has ended and waits to be buried does not."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except OSError:
-        return False
 
 
 class Watched:

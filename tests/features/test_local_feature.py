@@ -16,7 +16,7 @@ from fmtorch import features, presets
 from fmtorch.core import models_dir
 from fmtorch.features import vlad
 from fmtorch.runs import ArrayCache, CachedFeatures
-from scripts.make_models import k_means, learned
+from scripts.make_models import learned
 from tests.features.scenes import same, texture
 from tests.reference import local_features as reference
 
@@ -310,7 +310,8 @@ def test_k_means_finds_clusters() -> None:
     generator = torch.Generator().manual_seed(0)
     true = 10 * torch.randn(6, 8, generator=generator)
     x = true.repeat(50, 1) + 0.1 * torch.randn(300, 8, generator=generator)
-    distances = torch.cdist(k_means(x, 6), true)
+    book = learned([x], 6, 8)
+    distances = torch.cdist(book.centers, (true - book.mean) @ book.basis)
     assert distances.min(1).values.max() < 0.1  # 0.1 sqrt(8 / 50) = 0.04 is expected
     assert sorted(distances.argmin(1).tolist()) == list(range(6))
     assert learned([x], 6, 4).basis.shape == (8, 4)

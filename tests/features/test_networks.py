@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from fmtorch import presets
 from fmtorch.core import NetworkFileError, models_dir
 from fmtorch.features import ALIKED, DISK, PatchNetwork
-from fmtorch.features.networks import ARCHITECTURES, DESCRIPTORS, AffNet, HardNet, L2Net, OriNet, build, load_weights
+from fmtorch.features.networks import ARCHITECTURES, DESCRIPTORS, AffNet, HardNet, L2Net, build, load_weights
 from scripts.patch_networks.onnx_export import export, quantize
 from tests.conftest import oracle, shared_path
 from tests.features.scenes import same, texture
@@ -36,25 +36,16 @@ def randomized(network: nn.Module, seed: int = 0) -> nn.Module:
     return network.eval()
 
 
-@pytest.mark.parametrize("file", ["AffNet.pth", "AffNetJIT.pt"])
-def test_affnet_with_the_authors_weights(patches: Tensor, file: str) -> None:
-    network = AffNet().eval()
+@pytest.mark.parametrize("file", ["AffNet.pth", "AffNetJIT.pt", "OriNet.pth", "OriNetJIT.pt"])
+def test_affnet_and_orinet_with_the_authors_weights(patches: Tensor, file: str) -> None:
+    name = file[:3].lower() + "net"
+    network = build(name).eval()
     load_weights(network, shared_path(f"weights/{file}"))
     expected = oracle("affnet_orinet.npz")
     found = network(patches).detach().numpy()
-    np.testing.assert_allclose(found, expected["affnet_features"], atol=RTOL)
-    shape = found + np.array([1, 0, 1])  # (a11, a21, a22)
-    np.testing.assert_allclose(shape, expected["authors_affnet_jit"], atol=RTOL)
-
-
-@pytest.mark.parametrize("file", ["OriNet.pth", "OriNetJIT.pt"])
-def test_orinet_with_the_authors_weights(patches: Tensor, file: str) -> None:
-    network = OriNet().eval()
-    load_weights(network, shared_path(f"weights/{file}"))
-    expected = oracle("affnet_orinet.npz")
-    found = network(patches).detach().numpy()
-    np.testing.assert_allclose(found, expected["orinet_features"], atol=RTOL)
-    np.testing.assert_allclose(found, expected["authors_orinet_jit"], atol=RTOL)
+    np.testing.assert_allclose(found, expected[f"{name}_features"], atol=RTOL)
+    authors = found + np.array([1, 0, 1]) if name == "affnet" else found  # (a11, a21, a22)
+    np.testing.assert_allclose(authors, expected[f"authors_{name}_jit"], atol=RTOL)
 
 
 def test_hardnet_is_kornias(tmp_path: Path, patches: Tensor) -> None:

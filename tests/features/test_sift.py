@@ -7,7 +7,12 @@ import pytest
 import torch
 
 from fmtorch import features
-from fmtorch.features import project
+from fmtorch.features import (
+    SIFT,
+    ImagePyramid,
+    PatchSIFT,
+    project,
+)
 from tests.conftest import oracle
 from tests.features.scenes import random_frames, same, texture
 from tests.reference.local_features import patch, sift
@@ -215,3 +220,24 @@ def test_a_projection_that_is_absent_or_broken(tmp_path: object) -> None:
     for name in ("text", "shape", "names"):
         with pytest.raises(ValueError, match=rf"{name}\.npz.*make_models"):
             features.RootSIFTPCA(model=folder / f"{name}.npz")(pyramid, lafs)
+
+
+def test_pixel_x_of_a_level_is_pixel_2x_of_the_finer_one() -> None:
+    y, x = np.mgrid[0:100, 0:150]
+    ramp = (x + y).astype(np.uint8)
+    for level, image in enumerate(ImagePyramid(ramp).levels):
+        inner = image[3:-3, 3:-3] if min(image.shape) > 8 else image[:0]
+        expected = ramp[:: 2**level, :: 2**level][3:-3, 3:-3][: len(inner)] / 255
+        np.testing.assert_allclose(inner, expected, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("number", ["000", "001"])
+def test_resembles_opencvs_descriptors(number: str) -> None:
+    file = oracle("sift.npz")
+    image = file[f"{number}.image"]
+    found = SIFT()(image)
+    ours = PatchSIFT()(ImagePyramid(image), found.lafs)
+    theirs = found.descriptors / found.descriptors.norm(dim=1, keepdim=True)
+    cosine = (ours * theirs).sum(1)
+    assert cosine.median() > 0.99
+    assert cosine.quantile(0.05) > 0.95

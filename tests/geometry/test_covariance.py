@@ -150,9 +150,7 @@ def test_what_is_not_determined_is_uncertain() -> None:
 @pytest.mark.parametrize("n", [100, 200, 500])
 def test_ellipsoids_hold_simulated_noise(n: int, kind: str) -> None:
     """Of 300 fits at 0.5 px, 95 % ellipsoids of R and t and intervals of log f hold 93 to 97 % of the truths.
-
-    Beyond that range the count must lie where chance has a thousandth.
-    """
+    Beyond that range the count must lie where chance has a thousandth."""
     trials, sigma = 300, 0.5
     known, shared = kind == "known", kind == "shared"
     precision = np.zeros((2, 2)) if known else np.diag([6.25, 6.25])

@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation
 from fmtorch.geometry import canonical, seven_point
 from fmtorch.geometry.eight_point import eight_point_kernel, weighted_eight_point
 from fmtorch.geometry.five_point import five_point
-from fmtorch.geometry.seven_point import cubic_roots, seven_point_kernel
+from fmtorch.geometry.seven_point import cube_root, cubic_roots, seven_point_kernel
+from fmtorch.jit.kernel import F8x1, kernel
 from tests import laws
 from tests.conftest import oracle
 from tests.estimators.pairs import normalized
@@ -307,3 +308,17 @@ def test_never_nan_and_every_root_is_one(coefficients):
         # a double root is known to sqrt(eps), where the polynomial is still of the order of eps
         # (or, for roots near 0: the polynomial with coefficients changed by far less than eps of the largest)
         assert abs((c * powers).sum()) <= ((1e-9 * np.abs(c) + 1e-20) * np.abs(powers)).sum()
+
+
+@kernel
+def cube_roots(x: F8x1, out: F8x1) -> None:
+    for i in range(len(x)):
+        out[i] = cube_root(x[i])
+
+
+def test_cube_roots():
+    x = 10.0 ** np.linspace(-300, 300, 10007)
+    out = np.empty(len(x))
+    cube_roots(x, out)
+    np.testing.assert_allclose(out * out * out, x, rtol=8 * np.finfo(float).eps)
+    assert [cube_root(number) for number in x[::100].tolist()] == out[::100].tolist()

@@ -1,12 +1,18 @@
 """Values of lanes: a kernel compiled does what the same function does to arrays, to the bit."""
 
+import gc
+from collections.abc import Iterator
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from fmtorch.geometry.five_point import five_point
+from fmtorch.jit import cache, linking
 from fmtorch.jit import kernel as switch
 from fmtorch.jit.kernel import B1x2, F4x2, F8x1, F8x2, kernel
 from fmtorch.jit.lanes import LANES, absolute, added, any_lane, copysign, fill, lanes, load, sqrt, store, where
+from tests.jit.test_kernels import load as load_module
 
 pytestmark = pytest.mark.skipif(not switch.available(), reason="kernels are switched off, or numba is not installed")
 SINGLES = 16
@@ -107,3 +113,68 @@ def test_a_solver_called_without_numba_finds_the_same_models() -> None:
     assert results[0][0] > LANES
     for compiled, plain in zip(*results, strict=True):
         np.testing.assert_array_equal(compiled, plain)
+
+
+numba = pytest.importorskip("numba", reason="numba is not installed")
+SOURCE = """
+import gc
+from fmtorch.jit.kernel import F8x1
+from fmtorch.jit.kernel import matrix, vector
+from fmtorch.jit.kernel import inner, kernel
+
+@inner
+def fibonacci(n):
+    return 1 if n < 2 else fibonacci(n - 1) + fibonacci(n - 2)
+
+@inner
+def positive(n):
+    if n < 0:
+        raise ValueError("a negative number")
+    return n
+
+@kernel
+def sums(n: int, out: F8x1) -> int:
+    count = fibonacci(positive(n))
+    room, wide = vector(n), matrix(2, n)
+    for i in range(n):
+        room[i], wide[1, i] = i, 2 * i
+        out[i] = room[i] + wide[1, i]
+    return count
+"""
+
+
+@pytest.fixture(autouse=True)
+def fresh(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.setenv("FMTORCH_CACHE", str(tmp_path / "cache"))
+    cache.folder.cache_clear()
+    linking.inner_compiler.cache_clear()
+    yield
+    cache.folder.cache_clear()
+    linking.inner_compiler.cache_clear()
+
+
+def test_one_is_compiled_into_a_kernel(tmp_path: Path) -> None:
+    """Recursion, exceptions and scratch arrays; from the folder, too."""
+    for _ in range(2):
+        module, out = load_module(tmp_path, SOURCE), np.zeros(10)
+        assert (module.sums(10, out), out.tolist()) == (89, [3 * i for i in range(10)])
+        with pytest.raises(ValueError, match="a negative number"):
+            module.sums(-1, out)
+
+
+def test_the_installed_numba_has_the_private_names(tmp_path: Path) -> None:
+    module = load_module(tmp_path, SOURCE)
+    module.sums(2, np.zeros(2))
+    (result,) = module.positive._dispatcher.overloads.values()
+    assert type(result.library).__name__ == "InnerLibrary"
+    assert result.library.get_pointer_to_function(result.fndesc.llvm_func_name) == 0
+
+
+def test_garbage_is_collected_afterwards_as_before(tmp_path: Path) -> None:
+    for collects in (False, True):
+        (gc.enable if collects else gc.disable)()
+        try:
+            load_module(tmp_path, SOURCE).sums(1, np.zeros(1))
+            assert gc.isenabled() == collects
+        finally:
+            gc.enable()

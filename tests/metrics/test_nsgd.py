@@ -114,11 +114,9 @@ def test_matches_scalar_reference_on_the_published_cases() -> None:
 
 def test_agrees_with_the_published_evaluator() -> None:
     """Mean over 24 keys against the mean over its 24 seeds of 1,000 samples each.
-
-    The difference of two means of n1 and n2 independent runs of standard deviation s has the standard error
-    s sqrt(1/n1 + 1/n2). 4.5 of them: one false alarm in 3,000 repetitions of all 49 cases. Where the figure is a
-    constant, the rounding of 1e-10 / |normal| remains, and s = 0.5 bounds the one case that is a mixture of two values.
-    """
+    The difference of two means of n1 and n2 independent runs of standard deviation s has the standard error s sqrt(1/n1
+    + 1/n2). 4.5 of them: one false alarm in 3,000 repetitions of all 49 cases. Where the figure is a constant, the
+    rounding of 1e-10 / |normal| remains, and s = 0.5 bounds the one case that is a mixture of two values."""
     file = oracle("fmbench_nsgd.npz")
     runs = 24
     cases = [torch.from_numpy(file[k]).expand(runs, *file[k].shape) for k in ("F_gt", "F_est", "size1", "size2")]
@@ -132,13 +130,11 @@ def test_agrees_with_the_published_evaluator() -> None:
 
 def test_agrees_with_the_published_evaluator_without_its_faults() -> None:
     """`nsgd`, mean over 24 keys, against `py_safe`: one run of 50,000 samples, or of what 500,000 tries accept.
-
     The standard deviation of a run of 1,000 samples is taken from our own runs; it falls with the square root of the
     accepted draws. `py_safe` counts pixels from 1 and rounds points to whole pixels: half a pixel, some 1e-3 of the
     variation over the image, is far below the sampling error. It keeps the 1e-10 that the evaluator adds to the length
-    of a normal, which shows for the matrix of norm 1e-8 (fault 6); we are invariant to scale and compare that case
-    with the same matrix of norm 1.
-    """
+    of a normal, which shows for the matrix of norm 1e-8 (fault 6); we are invariant to scale and compare that case with
+    the same matrix of norm 1."""
     file = oracle("fmbench_nsgd.npz")
     runs = 24
     names = [str(name) for name in file["names"]]

@@ -1,14 +1,22 @@
 """Preset files: where they are, how they are read, what they build."""
 
+import functools
 from pathlib import Path
 
+import hydra
+import numpy as np
 import pytest
+import torch
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
 
 import fmtorch
 from fmtorch import presets
-from fmtorch.core import conf_dir
-from fmtorch.pipeline import load_pipeline
-from fmtorch.presets import compose
+from fmtorch.commands import job
+from fmtorch.core import Correspondences, conf_dir
+from fmtorch.data import GivenMatches, ImagePair, ImageSource
+from fmtorch.pipeline import Pipeline, build_pipeline, load_pipeline
+from tests.helpers import compose
 from tests.laws import scene
 
 
@@ -76,3 +84,113 @@ def test_options_of_one_pruner_do_not_hinder_another_in_its_place() -> None:
     config = compose("match", ("pipeline=sift_lc_fmtorch", "pruner=[ratio,lpm]"))
     presets.expect_stages(config)
     assert [next(iter(entry)) for entry in presets.stages(config)["pruner"]] == ["ratio", "lpm"]
+
+
+RATIO = "pruner.ratio.families"
+
+
+def matches(seed: int) -> GivenMatches:
+    """Forty matches whose ratios lie between 0 and 1."""
+    generator = torch.Generator().manual_seed(seed)
+    x0, x1, ratio = (torch.rand(1, 40, *size, generator=generator) for size in ((2,), (2,), ()))
+    size = torch.tensor([[480, 640]])
+    mask = torch.ones(1, 40, dtype=torch.bool)
+    return GivenMatches(Correspondences(600 * x0, 600 * x1, mask, size0=size, size1=size, ratio=ratio), (40, 40))
+
+
+def pairs_of_families(*families: str) -> list[ImagePair]:
+    image = ImageSource("image", Path("image.jpg"))
+    return [
+        ImagePair(str(i), family, "scene", image, image, np.eye(3), matches=functools.partial(matches, i))
+        for i, family in enumerate(families)
+    ]
+
+
+def ratios(pipeline: Pipeline, pairs: list[ImagePair]) -> list[torch.Tensor]:
+    """The ratios of the matches that are left of each pair."""
+    ratios = []
+    for outcome in pipeline.correspondences(pairs):
+        c = outcome.correspondences
+        ratios.append(c.ratio[c.mask])
+    return ratios
+
+
+def test_each_pair_of_a_batch_gets_the_options_of_its_family() -> None:
+    options = ["pruner.ratio.threshold=0.5", f"+{RATIO}.wide.threshold=0.7", f"+{RATIO}.CPC.threshold=0.9"]
+    pipeline = load_pipeline("paper/sift_ratio", overrides=options)
+    pairs = pairs_of_families("KITTI", "orbit", "CPC", "mine", "Strecha")
+    limits = (0.5, 0.7, 0.9, 0.5, 0.7)
+    for pair, kept, limit in zip(pairs, ratios(pipeline, pairs), limits, strict=True):
+        given = matches(int(pair.identity)).correspondences.ratio
+        assert torch.equal(kept, given[given < limit])
+        assert torch.equal(kept, ratios(pipeline, [pair])[0])
+
+
+def test_gms_tries_scales_on_wide_baselines_alone() -> None:
+    for name in ("sift_gms", "paper/hesaffnet_gms"):
+        pipeline = load_pipeline(name, overrides=["+pruner.gms.families.mine.with_scale=true"])
+        scale = {family: pipeline.pruners_of(family)["gms"].with_scale for family in ("TUM", "CPC", "mine", "other")}  # type: ignore[attr-defined]
+        assert scale == {"TUM": False, "CPC": True, "mine": True, "other": False}
+        assert {pruner.threshold_factor for pruner in (pipeline.pruners_of(f)["gms"] for f in scale)} == {4.0}  # type: ignore[attr-defined]
+        usual = load_pipeline(name, overrides=["pruner.gms.families=null"])
+        assert not usual.pruners_of("CPC")["gms"].with_scale  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize(
+    ("overrides", "scale"),
+    [
+        ("pruner.gms.with_scale=false", (False, False, False)),
+        ("pruner.gms={with_scale:false}", (False, False, False)),
+        ("pruner.gms.with_scale=true", (True, True, True)),
+        ("pruner.gms.threshold_factor=6.0", (False, True, True)),
+        ("pruner.gms.with_scale=false +pruner.gms.families.CPC.with_scale=true", (False, False, True)),
+        ("pruner.gms.with_scale=false +pruner.gms.families.CPC={with_scale:true}", (False, False, True)),
+        ("pruner.gms.with_scale=false pruner.gms.families.wide.with_scale=true", (False, True, True)),
+        ("pruner.gms.with_scale=false +pruner.gms.families.wide.threshold_factor=6.0", (False, False, False)),
+        ("pruner.gms.with_scale=true pruner.gms.families=null", (True, True, True)),
+    ],
+)
+def test_an_option_that_is_given_explicitly_holds_for_all_families(overrides, scale, monkeypatch):
+    words = ("pipeline=sift_gms", *overrides.split(" "))
+    expected = dict(zip(("KITTI", "Strecha", "CPC"), scale, strict=True))
+
+    def scales(config: DictConfig) -> dict[str, bool]:
+        pipeline = build_pipeline(config)
+        return {family: pipeline.pruners_of(family)["gms"].with_scale for family in expected}  # type: ignore[attr-defined]
+
+    assert scales(compose("match", words)) == expected
+    with hydra.initialize_config_dir(str(conf_dir()), version_base=None):  # as a command
+        composed = hydra.compose("match", list(words), return_hydra_config=True)
+    monkeypatch.setattr(HydraConfig, "get", lambda: composed.hydra)
+    seen: list[dict[str, bool]] = []
+    job(lambda config: seen.append(scales(config)))(composed)
+    assert seen == [expected]
+
+
+def test_those_of_a_pruner_that_others_replace_go_with_it() -> None:
+    config = compose("match", ("pipeline=sift_gms", "pruner=[ratio]"))
+    presets.expect_stages(config)
+    assert [list(entry) for entry in presets.stages(config)["pruner"]] == [["ratio"]]
+    pipeline = load_pipeline("sift_gms", overrides=["pruner=[lpm,ratio]"])
+    assert list(pipeline.pruners_of("CPC")) == ["lpm", "ratio"]
+
+
+def test_they_are_part_of_the_stages_of_a_run_and_come_back_from_them() -> None:
+    config = compose("match", ("pipeline=paper/sift_gms",))
+    stages = presets.stages(config)
+    assert stages["pruner"][1]["gms"]["families"] == {"wide": {"with_scale": True}}
+    assert presets.composed(stages)["pruner"]["gms"]["families"] == {"wide": {"with_scale": True}}
+
+
+@pytest.mark.parametrize(
+    ("override", "said"),
+    [
+        (f"+{RATIO}.wide.angle=1", r"pruner\.ratio\.families\.wide: no option angle"),
+        (f"+{RATIO}.CPC.threshold=high", r"pruner\.ratio\.families\.CPC.*threshold=high"),
+        (f"+{RATIO}=[CPC]", r"pruner\.ratio\.families=.*must be a mapping of families to options"),
+        (f"+{RATIO}.CPC=0.9", r"pruner\.ratio\.families=.*must be a mapping of families to options"),
+    ],
+)
+def test_what_is_wrong_with_them_is_said(override: str, said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        presets.expect_stages(compose("match", ("pipeline=paper/sift_ratio", override)))

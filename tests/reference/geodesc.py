@@ -29,9 +29,7 @@ def match_sets(
     shown: Mapping[tuple[int, int], float], matches: int, max_similarity: float
 ) -> dict[tuple[int, int], tuple[list[tuple[int, int]], float]]:
     """Sections 3.3 and 3.4: of each pair of views its matches, as patches, and S_image.
-
-    shown: S_patch of each two patches that match, named (view, point) as one integer: 1000 view + point.
-    """
+    shown: S_patch of each two patches that match, named (view, point) as one integer: 1000 view + point."""
     sets: dict[tuple[int, int], list[tuple[tuple[int, int], float]]] = {}
     for (a, b), similarity in shown.items():
         first, second = sorted((a, b), key=lambda patch: patch // 1000)

@@ -58,9 +58,7 @@ LOSSES: dict[str, Callable[[np.ndarray, np.ndarray], np.ndarray]] = {
 
 def equations(h: np.ndarray, match: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """``e = (X - u W, Y - v W)`` of a match x, y, u, v, (X, Y, W) = H (x, y, 1), and its Jacobian (2, 4) by these.
-
-    Two of the three equations ``x1 x (H x0) = 0`` of Chum, Pajdla and Sturm (2005), section 3.
-    """
+    Two of the three equations ``x1 x (H x0) = 0`` of Chum, Pajdla and Sturm (2005), section 3."""
     H, (x, y, u, v) = h.reshape(3, 3), match
     X, Y, W = H @ np.array([x, y, 1.0])
     by_x0 = np.array([H[0, :2] - u * H[2, :2], H[1, :2] - v * H[2, :2]])
@@ -107,10 +105,8 @@ def mapped(h: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 def four_points(match: np.ndarray) -> tuple[np.ndarray | None, float]:
     """H (9,) of matches (4, 4), one a column, and how many roundings of its equations an entry of it may be off.
-
     The DLT by SVD, positive where the first point is seen. None if it maps a point of the sample to the other side of
-    the horizon, or turns the plane over. In general position it is unique; see `collinear`.
-    """
+    the horizon, or turns the plane over. In general position it is unique; see `collinear`."""
     rows = []
     for x, y, u, v in match.T:
         rows.append([x, y, 1, 0, 0, 0, -u * x, -u * y, -u])

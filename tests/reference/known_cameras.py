@@ -89,10 +89,8 @@ def best_cameras(
     s: Scene, sizes: Sizes, sigma: float, measured: Measured = UNMEASURED, shared: bool = False
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """R, t and focal lengths (px) of greatest posterior near the true pose, of images of two sizes (h, w).
-
     sigma: standard deviation of Sampson distances, px. measured: focal lengths, px, and their deviations, of at least
-    0.02. shared: whether both are one in units of the longer sides.
-    """
+    0.02. shared: whether both are one in units of the longer sides."""
     longest = [max(size) for size in sizes]
     a, b = np.linalg.svd(s.t[None])[2][1:]
 

@@ -11,9 +11,7 @@ from fmtorch.scenes.surfaces import Surfaces
 
 def first_hit(surfaces: Surfaces, camera: Camera, x: float, y: float) -> tuple[int, np.ndarray]:
     """The first piece that the ray of an image point meets (-1: none), and depth at which it meets each piece's plane.
-
-    All pieces are taken as opaque. Pieces are met from outside only, unless they have two sides.
-    """
+    All pieces are taken as opaque. Pieces are met from outside only, unless they have two sides."""
     arrays = surfaces.arrays()
     _, triangle, both_sides = surfaces.labels()
     ray = camera.R.T @ np.linalg.inv(camera.K) @ np.array([x, y, 1.0])  # a step of depth 1
@@ -73,9 +71,8 @@ def share(
     step: int, tolerance: float,
 ) -> float:  # fmt: skip
     """The share of the pixels of image 0 with depth whose points image 1 sees at the same depth, to a tolerance.
-
-    A depth is a function of x and y, NaN where there is none. Pixels for which the other image has none do not count.
-    """
+    A depth is a function of x and y, NaN where there is none. Pixels for which the other image has none do not
+    count."""
     (h0, w0), (h1, w1) = sizes
     seen = count = 0
     for y in range(step // 2, h0, step):

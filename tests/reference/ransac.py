@@ -145,10 +145,8 @@ def energy(labels: np.ndarray, kernel: np.ndarray, edges: list[tuple[int, int]],
 
 def least_cut(kernel: np.ndarray, edges: list[tuple[int, int]], coherence: float) -> np.ndarray:
     """The labelling of least energy and fewest inliers: a least cut of a graph whose cuts cost what labellings cost.
-
-    Terminals as Kolmogorov & Zabih (PAMI 2004) place them: a pair's cost [[A, B], [C, D]] is A + (C - A) L_p
-    + (D - C) L_q + (B + C - A - D) (1 - L_p) L_q. Source: label 0; sink: label 1.
-    """
+    Terminals as Kolmogorov & Zabih (PAMI 2004) place them: a pair's cost [[A, B], [C, D]] is A + (C - A) L_p + (D - C)
+    L_q + (B + C - A - D) (1 - L_p) L_q. Source: label 0; sink: label 1."""
     n = len(kernel)
     cost_of_one = 1 - 2 * np.asarray(kernel, dtype=np.float64)
     links = []

@@ -52,9 +52,7 @@ def refined(
     spacing: float, radius: int, iterations: int,
 ) -> tuple[float, Match] | None:  # fmt: skip
     """The correlation at the start, and the match where it is highest; None where the window cannot be fitted.
-
-    Parameters: offset, gain, then gain times the map's four entries and the shift, in steps of image 0.
-    """
+    Parameters: offset, gain, then gain times the map's four entries and the shift, in steps of image 0."""
     k0 = level_for(levels0, spacing)
     k1 = level_for(levels1, spacing * math.sqrt(abs(np.linalg.det(affine))))
     grid = np.array([(u, v) for v in range(-radius, radius + 1) for u in range(-radius, radius + 1)], float)

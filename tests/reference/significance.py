@@ -27,9 +27,8 @@ def density(r: np.ndarray, s: float, dimensions: int, side: float) -> np.ndarray
 
 def log_likelihood(P: np.ndarray, *densities: np.ndarray) -> tuple[float, np.ndarray]:
     """The maximum over the shares w of the components, of the sum of ``log(1 - P + P sum w d)``.
-
-    P (n,): whether a match is right, beforehand; the first component is that of wrong ones all the same, of density 1.
-    """
+    P (n,): whether a match is right, beforehand; the first component is that of wrong ones all the same, of density
+    1."""
     d = np.stack([np.ones(len(densities[0])), *densities], 1)
     w = np.full(d.shape[1], 1 / d.shape[1])
     for _ in range(20):
@@ -80,9 +79,7 @@ def rotation(
     n: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, float]:  # fmt: skip
     """K1 R K0^-1 nearest to H, fitted to the matches by Geman and McClure's loss at LOSS noises; R, the prior's cost.
-
-    precision (2, 2): of the logarithms of both focal lengths about those of K0 and K1; infinite: they are known.
-    """
+    precision (2, 2): of the logarithms of both focal lengths about those of K0 and K1; infinite: they are known."""
     G = np.linalg.inv(K1) @ H @ K0
     U, _, Vt = np.linalg.svd(G * np.sign(np.linalg.det(G)))
     R0 = U @ Vt

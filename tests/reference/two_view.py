@@ -72,10 +72,8 @@ def normals(cameras: Cameras, x0: np.ndarray, x1: np.ndarray) -> tuple[np.ndarra
 
 def linearised(cameras: Cameras, x0: np.ndarray, x1: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Derivatives (n, 7) of the distances by the parameters at the corrected points, and their noise (n, 2, 2).
-
     The noise is that of the derivatives by the direction of t, for points with noise of one pixel, of which the part
-    along the correction is gone.
-    """
+    along the correction is gone."""
     normal, length = normals(cameras, x0, x1)
     x = np.hstack([x0, x1]) - residuals(cameras, x0, x1)[:, None] * normal
 

@@ -1,5 +1,6 @@
 """Benchmarks with programs of their own: related pairs, planes, cameras, verified databases."""
 
+import functools
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +16,11 @@ from fmtorch.data import ImagePair, ImageSource
 from fmtorch.geometry import homography_transfer
 from fmtorch.scenes import PICTURES, Plan, RenderedPairs
 from fmtorch.two_view.pair_type import classify
-from scripts.benchmark import cameras, pairs, planes, related, verify
-from scripts.benchmark.cameras import LEVELS, TAKES, CameraMethod
+from scripts.benchmark import cameras, pairs, pipelines, planes, verify
+from scripts.benchmark.cameras import LEVELS, TAKES, applies, bougnoux, calibrations, described
 from scripts.benchmark.methods import read_specs
-from scripts.benchmark.runner import Item, Kept, Row
-from scripts.benchmark.verify import Scene, Truth, accuracy, calibrate, centre_errors, sheets
+from scripts.benchmark.runner import Item, Kept, Method, Row
+from scripts.benchmark.verify import Scene, accuracy, calibrate, centre_errors, sheets
 from tests.helpers import cross_matrix, draw_set
 from tests.scripts.samples import item as plain_item
 from tests.scripts.samples import pair, read, run
@@ -58,13 +59,13 @@ def test_rendered_scenes_that_show_one_photograph_are_not_paired(tmp_path, monke
 
 
 def test_the_command_tells_pairs_apart(tmp_path, capsys, monkeypatch):
-    rows, pipelines = tmp_path / "rows.jsonl", ["sift_gms", "sift_ratio*"]
+    rows, named = tmp_path / "rows.jsonl", ["sift_gms", "sift_ratio*"]
     root = draw_set(tmp_path / "Set", "ab", images=2)
     run(capsys, monkeypatch, "related", "--root", root, "--unrelated", 3, "--pipelines",
-        *pipelines, "--cache", "off", "--rows", rows, "--figure", tmp_path / "roc.svg")  # fmt: skip
+        *named, "--cache", "off", "--rows", rows, "--figure", tmp_path / "roc.svg")  # fmt: skip
     own = read(rows)
     assert len(own) == 2 * (2 + 3)
-    assert all(related.called_related(r) == related.true(r) for r in own)
+    assert all(r["called"] == r["true"] for each in pipelines.verdicts(own).values() for r in each)
     assert "sift_gms" in run(capsys, monkeypatch, "related", "--rows", rows)
     assert "estimator=lmeds_eight_point" in (tmp_path / "roc.svg").read_text()
 
@@ -113,7 +114,7 @@ def test_the_commands(folder: Path, capsys: pytest.CaptureFixture[str], monkeypa
 def test_an_estimate_is_judged_where_the_plane_is_seen(folder: Path) -> None:
     (item,) = planes.warped(sorted(folder.iterdir())[:1], 1, hard_too=False)
     shifted = np.array([[1, 0, 3], [0, 1, 4], [0, 0, 1]]) @ item.pair.H
-    errors = [planes.Homography("x", lambda c, seed, H=H: H).figures(item, 0)["corner_error"]
+    errors = [planes.Homography("x:", lambda c, seed, H=H: H).figures(item, 0)["corner_error"]
               for H in (item.pair.H, shifted, None)]  # fmt: skip
     assert errors == [pytest.approx(0, abs=1e-9), pytest.approx(5), np.inf]
 
@@ -147,12 +148,44 @@ def true_f(K0: np.ndarray, K1: np.ndarray, R: np.ndarray, t: np.ndarray) -> np.n
     return np.linalg.inv(K1).T @ cross_matrix(t) @ R @ np.linalg.inv(K0)
 
 
+def zoomed(factor: float) -> np.ndarray:
+    return K @ np.diag([factor, factor, 1])
+
+
+def test_levels_tell_what_they_say() -> None:
+    own = item()
+    known, wrong, one_sided, shared, unknown = (
+        described(level, own.pair, own.matches, 0) for level in ("known", "wrong", "one_sided", "shared", "unknown")
+    )
+    assert known.focal is not None
+    assert known.K0 is not None
+    assert wrong.K1 is not None
+    assert known.focal[0, :, 1].tolist() == [0, 0]
+    assert np.array_equal(known.K0[0], K)
+    assert np.allclose(wrong.K1[0], zoomed(1.5))
+    given = [k is not None for c in (one_sided, shared, unknown) for k in (c.K0, c.K1)]
+    assert given == [True, False, False, False, False, False]
+    assert [bool(c.shared_focal) for c in (shared, unknown)] == [True, False]
+    assert np.array_equal(calibrations(unknown, np.array([3.0, 4]))[1], [[4, 0, 499.5], [0, 4, 379.5], [0, 0, 1]])
+    assert applies("shared", own.pair)
+    assert not applies("shared", item(zoomed(1.01)).pair)
+    assert applies("unknown", item(zoomed(1.01)).pair)
+
+
+def test_bougnoux_gives_the_focal_lengths_of_a_true_matrix() -> None:
+    own = item(zoomed(1.3))
+    unknown = described("unknown", own.pair, own.matches, 0)
+    assert bougnoux(own.pair.F, unknown) == pytest.approx([1.3 * 950, 950], rel=1e-8)
+    forward = true_f(K, K, np.eye(3), np.array([0, 0, 1.0]))  # axes that are one line determine none
+    assert bougnoux(forward, unknown) == pytest.approx([1200, 1200])
+
+
 @pytest.mark.parametrize(("name", "level"), [(name, level) for name, levels in TAKES.items() for level in levels])
 def test_every_method_solves_an_easy_pair_at_each_level_that_it_takes(name: str, level: str) -> None:
     kind = name.partition("_")[0]
     pytest.importorskip({"poselib": "poselib", "colmap": "pycolmap"}.get(kind, "cv2"))
     ours = kind == "fmtorch"
-    found = CameraMethod.of(f"{name}:{level}" + ("" if ours else ":threshold=1")).figures(item(), 0)
+    found = cameras.method_of(f"{name}:{level}" + ("" if ours else ":threshold=1")).figures(item(), 0)
     assert found["ok"]
     assert found["flipped"] is False
     assert ("focal_10" in found) == (level != "known")
@@ -168,13 +201,13 @@ def test_every_method_solves_an_easy_pair_at_each_level_that_it_takes(name: str,
 ])  # fmt: skip
 def test_a_method_that_there_is_not_is_refused(text: str, message: str) -> None:
     with pytest.raises(SystemExit, match=message):
-        CameraMethod.of(text)
+        cameras.method_of(text)
 
 
 def test_the_methods_of_the_page_are_methods() -> None:
     texts = read_specs(Path(cameras.__file__).with_name("cameras.txt"))
     assert len(set(texts)) == len(texts)
-    assert {CameraMethod.of(text).level for text in texts} == set(LEVELS)
+    assert {cameras.method_of(text).name.split(":")[1] for text in texts} == set(LEVELS)
 
 
 def judged(level: str, R: np.ndarray | None, t: np.ndarray = T, focals: tuple[float, float] | None = None) -> Row:
@@ -187,7 +220,8 @@ def judged(level: str, R: np.ndarray | None, t: np.ndarray = T, focals: tuple[fl
     answer = Estimate(
         F, mask & ok, ok, ("" if R is not None else "nothing",), torch.zeros(1, dtype=torch.int64), **posed
     )
-    return CameraMethod("x", level, lambda c, seed: answer, "").figures(given, 0)
+    view = functools.partial(cameras.viewed, level)
+    return Method("x", "", lambda family: {}, lambda pair, c, seed: answer, view=view).figures(given, 0)
 
 
 def test_judgement_of_a_true_a_flipped_and_no_pose() -> None:
@@ -211,35 +245,35 @@ def walk_scene(count: int = 5) -> tuple[Scene, dict[str, Any]]:
     """Cameras, and their poses in a frame that is turned, moved and twice as large."""
     cameras = databases.scene(count)
     names = [f"{i:03d}.jpg" for i in range(count)]
-    truth = Truth(*(dict(zip(names, values, strict=True)) for values in ([CALIBRATION] * count, cameras.R, cameras.t)))
+    K, R, t = (dict(zip(names, values, strict=True)) for values in ([CALIBRATION] * count, cameras.R, cameras.t))
     turn = databases.scene(2).R[1]
     poses = {}
     for name in names:
-        centre = 2 * turn @ (-truth.R[name].T @ truth.t[name]) + np.array([1.0, 2, 3])
-        R = truth.R[name] @ turn.T
-        poses[name] = pycolmap.Rigid3d(pycolmap.Rotation3d(R), -R @ centre)
-    return Scene("walk", Path(), truth, True), poses
+        centre = 2 * turn @ (-R[name].T @ t[name]) + np.array([1.0, 2, 3])
+        rotation = R[name] @ turn.T
+        poses[name] = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -rotation @ centre)
+    return Scene("walk", Path(), K, R, t), poses
 
 
 def test_true_poses_have_no_error_in_any_frame_and_an_image_without_a_pose_counts_as_wrong() -> None:
     """Without one, four of the ten pairs, and one of the five centres."""
     walk, poses = walk_scene()
-    figures = accuracy(poses, walk.truth)
+    figures = accuracy(poses, walk)
     assert set(figures) == set(AREAS)
     assert min(figures.values()) > 99.99
-    assert centre_errors(poses, walk.truth).max() < 1e-6
+    assert centre_errors(poses, walk).max() < 1e-6
     del poses["002.jpg"]
-    figures = accuracy(poses, walk.truth)
+    figures = accuracy(poses, walk)
     assert figures["auc10"] == pytest.approx(60, abs=0.01)
     assert figures["centre10"] == pytest.approx(80, abs=0.01)
-    assert accuracy({}, walk.truth)["centre10"] == 0
+    assert accuracy({}, walk)["centre10"] == 0
 
 
 def test_known_cameras_are_the_true_ones(tmp_path: Path) -> None:
     """In COLMAP's pixels, and with a prior."""
     path = tmp_path / "database.db"
     databases.write(path, databases.scene(5), prior=False)
-    calibrate(path, walk_scene()[0].truth)
+    calibrate(path, walk_scene()[0])
     with pycolmap.Database.open(path) as database:
         (camera,) = database.read_all_cameras()
     assert (camera.model_name, camera.has_prior_focal_length) == ("PINHOLE", True)
@@ -254,7 +288,7 @@ def test_an_interrupted_run_measures_what_is_missing(tmp_path: Path, monkeypatch
         mapped.append(mapper)
         if len(mapped) == 2:
             raise KeyboardInterrupt
-        return {"seconds": 1.0, "registered": 3, "images": 3, **dict.fromkeys(AREAS, 50.0)}
+        return {"seconds": 1.0, "registered": 3, "registered, %": 100.0, **dict.fromkeys(AREAS, 50.0)}
 
     monkeypatch.setattr(verify, "mapped", interrupted)
     key = ("walk", "colmap", "known", "ours", 0)

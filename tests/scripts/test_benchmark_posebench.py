@@ -11,9 +11,9 @@ import pytest
 from fmtorch import data, presets
 from fmtorch.core import Correspondences
 from fmtorch.data import ImagePair
-from scripts.benchmark import posebench
-from scripts.benchmark.methods import pipeline_of
-from scripts.benchmark.posebench import Protocol
+from scripts.benchmark import cameras as posebench
+from scripts.benchmark.cameras import options_of
+from scripts.benchmark.methods import pipeline_of, split
 from scripts.benchmark.tables import Results
 from tests.conftest import shared_path
 from tests.io.writers import posebench_group
@@ -135,7 +135,7 @@ def test_our_estimators_run_by_the_protocol_and_a_run_goes_on_where_it_stopped(t
 
 def test_the_protocol_gives_each_estimator_its_options() -> None:
     def protocol(text: str, px: float) -> dict[str, Any]:
-        return Protocol.of(text).options(px)
+        return options_of(*split(text.partition(":")[2]), px)
 
     assert protocol("F:poselib", 2.5) == {
         "threshold": 2.5, "iterations": 1000, "min_iterations": 100, "confidence": 0.9999,
@@ -152,7 +152,7 @@ def test_the_protocol_gives_each_estimator_its_options() -> None:
     presets.build("estimator", "fmtorch", **own)
     for wrong in ("fmtorch", "H:fmtorch", "E:nobody"):
         with pytest.raises(SystemExit, match="write KIND:PRESET"):
-            Protocol.of(wrong)
+            posebench.protocol(wrong, 1.0)
 
 
 def test_what_is_not_posebenchs_is_named(tmp_path, capsys, monkeypatch):

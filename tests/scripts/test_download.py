@@ -68,15 +68,13 @@ def test_a_verified_file_is_kept_and_another_is_not(server: tuple[type[Ranges], 
     assert list(folder.iterdir()) == []
 
 
-def test_a_failed_fetch_leaves_what_was_there(server: tuple[type[Ranges], str], tmp_path: Path) -> None:
-    path = tmp_path / "w.pth"
-    path.write_bytes(b"old")
+def test_a_failed_fetch_leaves_no_file(server: tuple[type[Ranges], str], tmp_path: Path) -> None:
     handler, here = server
     handler.limit -= 5
     for address in (f"{here}/absent.pth", f"{here}/short.pth", "http://127.0.0.1:9/x.pth"):
         with pytest.raises(ConnectionError, match=re.escape(address)):
-            SCRIPT["download"](address, path, None, timeout=5)
-    assert (path.read_bytes(), [p.name for p in tmp_path.iterdir()]) == (b"old", ["w.pth"])
+            SCRIPT["resume"](address, tmp_path / "w.pth", timeout=5)
+    assert [p.name for p in tmp_path.iterdir()] == ["w.pth.part"]
 
 
 def test_a_file_without_a_pinned_hash_needs_a_word(server: tuple[type[Ranges], str], tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """Matches alone verified: what the public function finds, of one pair and of many, in npz and HDF5 files."""
 
 import os
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,8 +12,11 @@ import pytest
 
 import fmtorch
 from fmtorch.core import pair_key
+from fmtorch.jobs import Execution
 from tests.processes import run_command
-from tests.verification.databases import SIZE, Scene, killed_and_continued, matches, scene
+from tests.verification import databases
+from tests.verification import test_matches as alone
+from tests.verification.databases import SIZE, Scene, killed_and_continued, matches, plain, read, scene
 
 K = np.array([[600.0, 0, 319.5], [0, 600, 239.5], [0, 0, 1]])
 SIZES = {"size0": np.array(SIZE), "size1": np.array(SIZE)}
@@ -321,31 +325,67 @@ def test_a_killed_verification_of_files_continues(tmp_path: Path) -> None:
     assert load(tmp_path / "verified.h5") == load(tmp_path / "truth.h5")
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["matches=matches.npz"], "matches alone need an output: matches=FILE.npz output=VERIFIED.npz"),
-        (["matches=no.npz", "output=v.npz"], "there is no file no.npz; give matches alone: matches=FILE.npz"),
-        (["matches=text.npz", "output=v.npz"], "text.npz: is not a valid npz file"),
-        (["matches=array.npz", "output=v.npz"], "array.npz: is a single array; write x0 and x1 by numpy.savez"),
-        (["matches=text.h5", "output=v.npz"], "text.h5: is not a valid HDF5 file"),
-        (["matches=matches.txt", "output=v.npz"], "matches=matches.txt must end in .npz, .h5, .hdf5"),
-        (["matches=matches.npz", "output=v.txt"], "output=v.txt must end in .npz, .h5, .hdf5"),
-        (["matches=matches.npz", "output=matches.npz"], "output=matches.npz is one of the files that are read"),
-        (["matches=other.npz", "output=v.npz"], "other.npz holds no x0 and x1; give matches x0, x1 (n, 2)"),
-        (["a.db", "matches=matches.npz", "output=v.npz"], "hloc's files need"),
-    ],
-)
-def test_what_is_no_file_of_matches(words: list[str], said: str, command: Callable[..., str], tmp_path: Path) -> None:
-    x0, x1 = points()[0]
-    save(tmp_path / "matches.npz", {"x0": x0, "x1": x1})
-    save(tmp_path / "other.npz", {"x0": x0})
-    with (tmp_path / "array.npz").open("wb") as file:
-        np.save(file, x0)
-    for name in ("text.npz", "text.h5", "matches.txt"):
-        (tmp_path / name).write_text("matches")
-    end = command("verify", *words, cwd=tmp_path)
-    assert end.startswith("ended: error: ")
-    assert said in end
-    assert "\n" not in end
-    assert not list(tmp_path.glob("v.*"))
+@pytest.fixture
+def _small_batches(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fmtorch.verification.verify.BATCH", 2)
+
+
+@pytest.mark.usefixtures("_small_batches")
+def test_processes_find_what_threads_find(tmp_path: Path) -> None:
+    path, other = tmp_path / "database.db", tmp_path / "other.db"
+    databases.write(path, scene(5))
+    shutil.copy(path, other)
+    reports: list[tuple[int, int]] = []
+    fmtorch.verify(path)
+    result = fmtorch.verify(other, execution=Execution("processes", 2), report=lambda *c: reports.append(c))
+    assert ((result.pairs, result.verified), reports[0]) == ((10, 10), (0, 10))
+    assert (reports[-1], plain(read(other))) == ((10, 10), plain(read(path)))
+
+
+@pytest.mark.usefixtures("_small_batches")
+@pytest.mark.parametrize("output", [False, True])
+def test_shards_are_merged(output: bool, tmp_path: Path) -> None:
+    path, unsharded = tmp_path / "database.db", tmp_path / "whole.db"
+    databases.write(path, scene(5))
+    shutil.copy(path, unsharded)
+    fmtorch.verify(unsharded)
+    before = path.read_bytes()
+    end = {"output": tmp_path / "verified.db"} if output else {}
+    results = [fmtorch.verify(path, shard=f"{i}/3", **end) for i in (1, 3)]
+    assert [result.pairs for result in results] == [3, 4]
+    assert path.read_bytes() == before  # the database itself is only read
+    again = fmtorch.verify(path, shard="3/3", **end)
+    assert (again.kept, again.verified) == (4, 0)
+    merged = fmtorch.verify(path, **end)  # the second shard was never run
+    assert (merged.pairs, merged.verified, merged.kept) == (10, 10, 7)
+    assert plain(read(merged.path)) == plain(read(unsharded))
+    assert not results[0].path.exists()
+
+
+@pytest.mark.usefixtures("_small_batches")
+def test_shards_of_other_settings_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "database.db"
+    databases.write(path, scene(3))
+    fmtorch.verify(path, shard="1/2")
+    with pytest.raises(ValueError, match=r"holds geometries of other settings; .*: seed: 0 -> 1\. Give the same, or"):
+        fmtorch.verify(path, shard="2/2", seed=1)
+    with pytest.raises(ValueError, match=r"shard=3/2; it must be i/n"):
+        fmtorch.verify(path, shard="3/2")
+
+
+@pytest.mark.usefixtures("_small_batches")
+def test_shards_of_matches_alone(tmp_path: Path) -> None:
+    pairs = enumerate(alone.points(4))
+    arrays = {f"{i}/{key}": x for i, pair in pairs for key, x in zip(("x0", "x1"), pair, strict=True)}
+    path = alone.save(tmp_path / "matches.npz", arrays)
+    unsharded = fmtorch.verify(matches=path, output=tmp_path / "whole.npz")
+    for shard in ("1/2", "2/2"):
+        fmtorch.verify(matches=path, output=tmp_path / "merged.npz", shard=shard)
+    merged = fmtorch.verify(matches=path, output=tmp_path / "merged.npz")
+    assert (merged.pairs, merged.kept) == (6, 6)
+    assert alone.load(merged.path) == alone.load(unsharded.path)
+    alone.save(path, {**arrays, "5/x0": arrays["5/x0"] + 1})
+    fmtorch.verify(matches=path, output=tmp_path / "new.npz", shard="1/2")
+    alone.save(path, arrays)
+    with pytest.raises(ValueError, match=r"holds geometries of other settings; what differs .*: files: "):
+        fmtorch.verify(matches=path, output=tmp_path / "new.npz", shard="2/2")

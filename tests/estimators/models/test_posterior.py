@@ -23,10 +23,15 @@ from fmtorch.estimators.lens_search import (
 )
 from fmtorch.estimators.models import posterior
 from fmtorch.estimators.models.focal_prior import LOG_USUAL
+from fmtorch.estimators.models.posterior import (
+    centred,
+    images_of,
+    translate,
+)
 from fmtorch.estimators.models.with_focals import LOSS_SCALE_PX, FundamentalWithFocals, Refined
 from fmtorch.geometry.levenberg_marquardt import Weighted
 from tests.estimators.models.test_focals import TALL, WIDE, Sizes, photographs, with_prior
-from tests.estimators.pairs import apart, in_pixels, pair_of, to_units
+from tests.estimators.pairs import apart, frames, in_pixels, pair_of, to_units
 from tests.reference import focal as reference
 from tests.reference import lenses
 from tests.reference.refine import loss as loss_of
@@ -37,9 +42,7 @@ FAMILY = FundamentalWithFocals()
 
 def start(F: np.ndarray, pair: Pair) -> posterior.Cameras:
     """The cameras near one model (3, 3) of pixels."""
-    cameras = posterior.no_cameras(1)
-    posterior.nearest_cameras(to_units(F, pair)[None], posterior.images_of(pair), cameras)
-    return cameras
+    return near(to_units(F, pair)[None], pair)
 
 
 def evaluated(
@@ -394,3 +397,32 @@ def test_one_lens_and_straight_ones() -> None:
         nearly(F, pair), np.array([-0.15, -0.15]), pair, 15, lens_prior(Lens((-0.15,) * 2, (0.0,) * 2, True))
     )
     assert known.evidence > fit.evidence > fitted(nearly(F, pair), np.full(2, -0.15), pair, 15).evidence
+
+
+def test_points_from_the_principal_points_and_the_scale_of_a_loss() -> None:
+    c, truth, _ = photographs(1)
+    noise = np.random.default_rng(0).uniform(0.5, 2, (1, 200))
+    pair = pair_of(c.replace(noise=torch.from_numpy(noise)))
+    matches, images = centred(pair, 0.7), images_of(pair)
+    pixels = np.concatenate([c.x0[0].numpy(), c.x1[0].numpy()], 1).T
+    principal = np.array([(WIDE[1] - 1) / 2, (WIDE[0] - 1) / 2, (TALL[1] - 1) / 2, (TALL[0] - 1) / 2])
+    expected = (pixels - principal[:, None]) / pair.pixels_per_unit
+    np.testing.assert_allclose(matches.points, expected, atol=1e-14)
+    np.testing.assert_allclose(matches.s2, (0.7 * noise[0] / pair.pixels_per_unit) ** 2, rtol=1e-14)
+    np.testing.assert_allclose(matches.precision, 1 / matches.s2, rtol=1e-14)
+    np.testing.assert_allclose(images.longest * pair.pixels_per_unit, [960, 1000])
+    # A model of points from the principal points, moved to those from the centre.
+    A0, A1 = frames(pair)
+    shifted = [A.copy() for A in (A0, A1)]
+    shifted[0][:2, 2], shifted[1][:2, 2] = principal[:2], principal[2:]
+    G, moved = (shifted[1].T @ truth @ shifted[0]).reshape(1, 9), np.empty((1, 9))
+    translate(G, images.offset, moved)
+    assert apart(in_pixels(moved[0], pair), truth) < 1e-12
+
+
+def test_undistorted_points_are_the_reference_s() -> None:
+    pair, x, _ = bent_pair()
+    points = undistorted(pair, np.array(LENSES)).points.T * pair.pixels_per_unit + pair.centre
+    for i in range(2):
+        expected = [lenses.straight(each, SIZE, LENSES[i]) for each in x[:, 2 * i : 2 * i + 2]]
+        np.testing.assert_allclose(points[:, 2 * i : 2 * i + 2], expected, atol=1e-9)
