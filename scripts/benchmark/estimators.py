@@ -63,7 +63,7 @@ def add_arguments(commands: Any) -> None:
     pairs.add_match_options(parser)
     parser.add_argument("--estimators", nargs="+", default=[], help="PRESET[:KEY=VALUE,...][@PRUNER+PRUNER...]")
     parser.add_argument("--specs", type=Path, help="a file with one estimator a line; # starts a comment")
-    parser.add_argument("--ngransac", type=Path, help="NG-RANSAC's published weights (scripts/make_models.py ngransac)")
+    parser.add_argument("--ngransac", type=Path, help="NG-RANSAC's published weights (scripts/convert_checkpoint.py)")
     parser = add_command(commands, "curves", run_curves, CURVES, seeds=1)
     pairs.add_match_options(parser)
     parser.add_argument("--specs", type=Path, default=FOLDER / "curves.txt", help="lines: CURVE | ESTIMATOR | VALUES")

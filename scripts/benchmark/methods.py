@@ -164,7 +164,7 @@ def ngransac(file: Path | None) -> dict[str, Pruner]:
     if file is None:
         return {}
     if not file.is_file():
-        raise SystemExit(f"--ngransac {file}: no such file; scripts/make_models.py ngransac makes it")
+        raise SystemExit(f"--ngransac {file}: no such file; scripts/convert_checkpoint.py makes it")
     network = {"_target_": "fmtorch.pruning.networks.LC", "side": ["ratio"]}
     return {NGRANSAC: presets.build("pruner", "lc", soft=True, network=network, file=str(file))}
 
