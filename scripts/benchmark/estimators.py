@@ -4,9 +4,6 @@ An estimator is named as PRESET[:KEY=VALUE,...][@PRUNER+PRUNER...]; the pruners 
 words (`find_fundamental`, `truth`, `sizeless`, `scoreless`, `part`, `bent`, ...) are as scripts/benchmark/methods.py
 says. The pruner `ngransac` is the network of --ngransac; without it, estimators that name it are left out.
 
-python -m scripts.benchmark estimators --root DATA/Strecha --root DATA/PhotoTourism --seeds 5 --rows rows.jsonl \\
-    --estimators fmtorch@frame_consistency opencv:method=usac_magsac,threshold=1.0 poselib:threshold=0.5,prosac=true
-
 A row of --rows counts only for the code, options and learned files that it was made with.
 """
 
@@ -38,16 +35,8 @@ CURVES = """Accuracy against time: estimators at several values of an option, wi
 
 The knee of a curve is its cheapest point within 0.5 points of its best AUC@0.05, averaged over the families. It is
 chosen on tuning data, and marked on the curves of test data.
-
-python -m scripts.benchmark curves --root DATA/Strecha_train --rendered full --split train --limit 60 --table tuning.csv
-python -m scripts.benchmark curves --root DATA/Strecha --root DATA/KITTI --knees tuning.csv --figure curves.svg
-python -m scripts.benchmark curves --root DATA/castle --curves 'PoseLib | poselib:threshold={} | 0.35 0.5 0.75 1'
 """
-STRESS = """Where estimators fail: sweeps of inlier ratio, noise and number of matches, and conditions that hurt.
-
-python -m scripts.benchmark stress --root DATA/Strecha --root DATA/PhotoTourism --root DATA/KITTI --root DATA/TUM \\
-    --rendered full --rows stress.jsonl --table docs/tables/stress.csv --figures docs/benchmarks
-"""
+STRESS = "Where estimators fail: sweeps of inlier ratio, noise and number of matches, and conditions that hurt."
 AXES = {"inlier ratio": "inlier ratio", "noise": "added noise [px]", "match count": "matches"}
 IMAGES = 256  # whose features are kept, some 5 MB each
 PLANE, TURN = 0.8, 0.02

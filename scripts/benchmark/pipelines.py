@@ -4,8 +4,6 @@ Each of these benchmarks is a page of settings, the YAML file of its name in thi
 the tables, as PRESET NAME=VALUE ..., what is shown of them, and which are compared. --pipelines takes some of them, by
 names or patterns such as 'sift*', or others, as 'NAME = PRESET NAME=VALUE ...'; `+ PRUNER` at the end of one adds one.
 The time of pruners is that of all but `ratio` and `one_to_one`, on one thread.
-
-python -m scripts.benchmark pruning --rendered full --limit 50 --pipelines RATIO 'mine = sift_ratio pruner=[ratio,lpm]\'
 """
 
 import argparse
@@ -50,11 +48,7 @@ RIGHT = 0.05  # NSGD below which an estimate of a related pair is right
 LEVELS = (-2.0, -1.0, 0.0, 1.0, 2.0, 3.0, 5.0, 8.0)
 Rows = dict[str, list[Row]]  # by pipeline
 SIMILAR = "How many of the pairs that can be matched `pairs=similar:N` proposes, all scenes mixed in one folder."
-VERDICT = """The verdict on pairs of one scene and of different scenes: shares accepted and rejected, and ROC.
-
-python -m scripts.benchmark related --root DATA/Strecha --root DATA/PhotoTourism --root DATA/KITTI --root DATA/TUM \\
-    --rows related.jsonl --table docs/tables/related.csv --figure docs/concepts/related.svg
-"""
+VERDICT = "The verdict on pairs of one scene and of different scenes: shares accepted and rejected, and ROC."
 
 
 def settings_of(name: str) -> dict[str, Any]:

@@ -2,8 +2,6 @@
 
 docs/benchmarks/homographies.md says what warped and hard pairs and views are. SIFT, ratio 0.8, one match a location,
 P(inlier) from frame consistency. Every second photograph is for tuning (--tuning), the others for the claim.
-
-python -m scripts.benchmark homography --photographs DATA/photos --tuning --methods ours:select.scale=0.5 poselib:2
 """
 
 from __future__ import annotations
@@ -27,6 +25,7 @@ from fmtorch.core.types import PAIR_TYPES, Correspondences, Estimate, collate
 from fmtorch.data import ImagePair, ImageSource, read_image
 from fmtorch.estimators.external import colmap
 from fmtorch.geometry import poses_from_homography
+from fmtorch.pipeline.photographs import reduced_image
 from fmtorch.pipeline.pipeline import Outcome
 from fmtorch.scenes.raycast import calibration
 from fmtorch.training.planes import Photograph, PlanePairs, PlaneViews
@@ -52,8 +51,6 @@ CONFIGURATION = """Kinds of image pairs: confusion tables of `classify` and of C
 Photographs: each as a plane, looked around in, copied, cropped, and beside another one. Every second photograph is for
 tuning (--tuning), the others for the claim. Real and rendered pairs: --root, --rendered. SIFT, ratio 0.8, one match a
 location, P(inlier) from frame consistency, noise of matches.
-
-python -m scripts.benchmark pair_types --photographs DATA/photos --root DATA/Strecha
 """
 # Scenes, and rendered families, whose depth and baseline every pair sees.
 GENERAL = {"castle-P19", "fountain-P11", "Herz-Jesus-P8", "sacre_coeur", "00", "driving", "orbit"}
@@ -389,9 +386,7 @@ MAKERS: dict[str, tuple[str, str, Callable[..., tuple[Array, Array, Array | None
 
 def small(path: Path) -> Array:
     """A photograph whose longer side is SIDE, BGR."""
-    image = np.asarray(read_image(path)[..., ::-1])
-    scale = SIDE / max(image.shape[:2])
-    return np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA))
+    return reduced_image(read_image(path), SIDE)[0][..., ::-1]
 
 
 def matched(image0: Array, image1: Array) -> Correspondences:

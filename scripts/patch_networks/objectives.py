@@ -30,18 +30,14 @@ def distances(a: Float[Tensor, "n d"], b: Float[Tensor, "m d"]) -> Float[Tensor,
     return (2 - 2 * a @ b.mT).clamp_min(1e-6).sqrt()
 
 
-def hardest_triplet(
-    a: Float[Tensor, "n d"], b: Float[Tensor, "n d"], *, margin: float = 1.0, squared: bool = False
-) -> Float[Tensor, ""]:
+def hardest_triplet(a: Float[Tensor, "n d"], b: Float[Tensor, "n d"], *, margin: float = 1.0) -> Float[Tensor, ""]:
     """HardNet's loss (Mishchuk et al., NIPS 2017, eq. 4): max(0, margin + positive - hardest negative), the mean.
-    The hardest negative in the batch is that of either end of a pair (anchor swap). squared: the hinge squared, which
-    presses less on triplets that are nearly right."""
+    The hardest negative in the batch is that of either end of a pair (anchor swap)."""
     d = distances(a, b)
     excluded = torch.eye(len(d), dtype=torch.bool, device=d.device) | (d < SAME_PATCH)
     negative = torch.where(excluded, 10.0, d)
     hardest = torch.minimum(negative.min(1).values, negative.min(0).values)
-    hinge = (margin + d.diagonal() - hardest).clamp_min(0)
-    return (hinge.square() if squared else hinge).mean()
+    return (margin + d.diagonal() - hardest).clamp_min(0).mean()
 
 
 def geodesc(

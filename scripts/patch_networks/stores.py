@@ -28,6 +28,7 @@ from fmtorch.features import SIFT, DominantGradient, HessianDetector, ImagePyram
 from fmtorch.features.frames import FRAME_SIGMAS
 from fmtorch.jit import random
 from fmtorch.jit.random import Stream
+from fmtorch.pipeline.photographs import reduced_image
 from fmtorch.scenes.raycast import Camera
 from fmtorch.scenes.surfaces import PICTURES, skimage_file
 from fmtorch.training import planes
@@ -310,9 +311,7 @@ class Cutting(NamedTuple):
         """The patches of a photograph, by a seed."""
         photograph, seed = job
         cv2.setNumThreads(1)
-        image = read_image(photograph.path)
-        if (scale := self.longest_side / max(image.shape[:2])) < 1:
-            image = np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
+        image, _ = reduced_image(read_image(photograph.path), self.longest_side)
         views = views_of(image, np.random.default_rng(seed), self.planes, self.points)
         return tracks(views, self.tolerance)
 
