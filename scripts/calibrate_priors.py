@@ -40,12 +40,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     pairs.add_set_options(parser)
     parser.set_defaults(split="train")
-    parser.add_argument("--stages", nargs="*", default=list(STAGES))
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     own = matched(arguments)
     print(f"{len(own)} pairs, {np.mean([len(p.right) for p in own]):.0f} matches each on average\n")
-    for name in arguments.stages:
+    for name in STAGES:
         soft = {"soft": True} if "soft" in presets.load("pruner", name) else {}
         report(name, presets.build("pruner", name, **soft), own)
 

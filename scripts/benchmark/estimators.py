@@ -1,10 +1,8 @@
 """Robust estimators on the same matches, one thread each: recall, AUC@0.05, milliseconds, paired intervals.
 
-An estimator is named as PRESET[:KEY=VALUE,...][@PRUNER+PRUNER...]; the pruners after @ count into its time, and other
-words (`find_fundamental`, `truth`, `sizeless`, `scoreless`, `part`, `bent`, ...) are as scripts/benchmark/methods.py
-says. The pruner `ngransac` is the network of --ngransac; without it, estimators that name it are left out.
-
-A row of --rows counts only for the code, options and learned files that it was made with.
+An estimator is named as scripts/benchmark/methods.py says; the pruners after @ count into its time. The pruner
+`ngransac` is the network of --ngransac; without it, estimators that name it are left out. A row of --rows counts only
+for the code, options and learned files that it was made with.
 """
 
 import argparse
@@ -37,7 +35,6 @@ The knee of a curve is its cheapest point within 0.5 points of its best AUC@0.05
 chosen on tuning data, and marked on the curves of test data.
 """
 STRESS = "Where estimators fail: sweeps of inlier ratio, noise and number of matches, and conditions that hurt."
-AXES = {"inlier ratio": "inlier ratio", "noise": "added noise [px]", "match count": "matches"}
 IMAGES = 256  # whose features are kept, some 5 MB each
 PLANE, TURN = 0.8, 0.02
 NATURAL: dict[Level, Callable[[Row], bool]] = {
@@ -63,7 +60,7 @@ def add_arguments(commands: Any) -> None:
     pairs.add_set_options(parser, limit=20)  # of rendered families half as many
     parser.add_argument("--specs", type=Path, default=FOLDER / "stress.txt", help="estimators; (...): conditions only")
     parser.add_argument("--only", nargs="*", default=list(SWEEPS), choices=list(SWEEPS), help="all by default")
-    parser.add_argument("--figures", type=Path, help="draw stress_SWEEP.svg into this folder")
+    parser.add_argument("--figure", type=Path, help="draw the sweep of inlier ratios into this SVG")
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -192,8 +189,8 @@ def run_stress(arguments: argparse.Namespace) -> None:
 
     rows = pairs.rows_of(arguments, measured_rows)
     show([accuracy_sheet(rows), time_sheet(rows)], arguments.table)
-    for sweep in {row["sweep"] for row in rows} & AXES.keys() if arguments.figures else ():
-        draw_stress(rows, sweep, arguments.figures / f"stress_{sweep.replace(' ', '_')}.svg")
+    if arguments.figure:
+        draw_inlier_ratios(rows, arguments.figure)
 
 
 def items_of(arguments: argparse.Namespace) -> Iterator[Item]:
@@ -284,13 +281,12 @@ def time_sheet(rows: Sequence[Row]) -> Sheet:
     return Sheet("times", "Median number of matches, median processor milliseconds a pair", records)
 
 
-def draw_stress(rows: Sequence[Row], sweep: str, path: Path) -> None:
-    """AUC@0.05 against the level, a panel for each set."""
+def draw_inlier_ratios(rows: Sequence[Row], path: Path) -> None:
+    """AUC@0.05 against the inlier ratio, a panel for each set."""
     panels: dict[str, dict[str, tables.Line]] = {}
-    for _, level, results in (each for each in by_level(rows) if each[0] == sweep):
+    for _, level, results in by_level([row for row in rows if row["sweep"] == "inlier ratio"]):
         for (name, own), estimator in itertools.product(families_of(results).items(), results.methods):
             line = panels.setdefault(name, {}).setdefault(estimator, tables.Line([], []))
             line.x.append(float(level))
             line.y.append(results.percent(estimator, own, "AUC@0.05"))
-    scale = "linear" if sweep == "noise" else "log"
-    tables.draw(path, panels, (AXES[sweep], "AUC@0.05 [%]"), scale, [float(x) for x in SWEEPS[sweep]])
+    tables.draw(path, panels, ("inlier ratio", "AUC@0.05 [%]"), "log", [float(x) for x in SWEEPS["inlier ratio"]])

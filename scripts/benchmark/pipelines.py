@@ -74,7 +74,6 @@ def add_arguments(commands: Any) -> None:
     parser = add_command(commands, "similar", run_similar, SIMILAR)
     parser.add_argument("--root", type=Path, nargs="+", required=True, help="folders in the layout of fmbench")
     parser.add_argument("--pipeline", default="sift_fmtorch")
-    parser.add_argument("--count", type=int, nargs="+", default=[5, 10, 20])
 
 
 def add_pipeline_options(parser: argparse.ArgumentParser) -> None:
@@ -310,7 +309,7 @@ def run_similar(arguments: argparse.Namespace) -> None:
     vectors = torch.stack([vlad(local_descriptors(descriptors, kind), book) for descriptors in described])
     seconds = (time.process_time() - start) / len(paths)
     print(f"{len(paths)} images; {1e3 * seconds:.1f} s for a thousand once described")
-    proposed = {n: {frozenset(pair) for pair in similar_pairs(paths, vectors, n)} for n in arguments.count}
+    proposed = {n: {frozenset(pair) for pair in similar_pairs(paths, vectors, n)} for n in (5, 10, 20)}
     records: list[Record] = []
     for scene, count in [*Counter(overlapping.values()).items(), ("all", len(overlapping))]:
         line: Record = {"scene": scene, "overlapping pairs": count}

@@ -25,7 +25,6 @@ from fmtorch.core.types import PAIR_TYPES, Correspondences, Estimate, collate
 from fmtorch.data import ImagePair, ImageSource, read_image
 from fmtorch.estimators.external import colmap
 from fmtorch.geometry import poses_from_homography
-from fmtorch.pipeline.photographs import reduced_image
 from fmtorch.pipeline.pipeline import Outcome
 from fmtorch.scenes.raycast import calibration
 from fmtorch.training.planes import Photograph, PlanePairs, PlaneViews
@@ -152,7 +151,7 @@ def run_pair_types(arguments: argparse.Namespace) -> None:
             general = {item.pair.scene, item.pair.family} & GENERAL
             item.facts |= {"truth": "general" if general else "", "group": f"{item.pair.family}/{item.pair.scene}"}
             items.append(item)
-    methods: dict[str, Callable[[Correspondences], str]] = {"fmtorch": Ours(not arguments.unknown)}
+    methods = {"fmtorch": functools.partial(by_ours, presets.build("estimator", "fmtorch"), not arguments.unknown)}
     methods |= {f"COLMAP, {px:g} px": functools.partial(by_colmap, px) for px in arguments.colmap}
     rows: list[Row] = [
         {**item.facts, "method": name, "kind": verdict(item.matches), "set": item.pair.family, "item": item}
@@ -163,17 +162,11 @@ def run_pair_types(arguments: argparse.Namespace) -> None:
     print(time_line([item.matches for item in items]))
 
 
-class Ours:
+def by_ours(estimator: Any, known: bool, c: Correspondences) -> str:
     """`classify` after F, which has the exact cameras where they are known."""
-
-    def __init__(self, known: bool) -> None:
-        estimator = presets.build("estimator", "fmtorch")
-        self.known, self.estimator = known, KnownCameras(estimator) if known else estimator
-
-    def __call__(self, c: Correspondences) -> str:
-        exact = torch.tensor([[[1.0, 0.0], [1.0, 0.0]]], dtype=torch.float64)
-        c = c.replace(focal=exact) if self.known else c.replace(K0=None, K1=None)
-        return str(classify(c, self.estimator(c, 0), seed=0).names[0])
+    exact = torch.tensor([[[1.0, 0.0], [1.0, 0.0]]], dtype=torch.float64)
+    c = c.replace(focal=exact) if known else c.replace(K0=None, K1=None)
+    return str(classify(c, (KnownCameras(estimator) if known else estimator)(c, 0), seed=0).names[0])
 
 
 def by_colmap(threshold: float, c: Correspondences) -> str:
@@ -386,7 +379,9 @@ MAKERS: dict[str, tuple[str, str, Callable[..., tuple[Array, Array, Array | None
 
 def small(path: Path) -> Array:
     """A photograph whose longer side is SIDE, BGR."""
-    return reduced_image(read_image(path), SIDE)[0][..., ::-1]
+    image = np.asarray(read_image(path)[..., ::-1])
+    scale = SIDE / max(image.shape[:2])
+    return np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA))
 
 
 def matched(image0: Array, image1: Array) -> Correspondences:
