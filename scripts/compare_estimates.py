@@ -120,8 +120,7 @@ def same(a: torch.Tensor, b: torch.Tensor) -> bool:
 
 
 def differences(before: dict[str, torch.Tensor], after: dict[str, torch.Tensor]) -> list[str]:
-    lines = [f"{name}: only before" for name in before.keys() - after.keys()]
-    lines += [f"{name}: only after" for name in after.keys() - before.keys()]
+    lines = [f"{name}: only {'before' if name in before else 'after'}" for name in before.keys() ^ after.keys()]
     for name in before.keys() & after.keys():
         if not same(before[name], after[name]):
             a, b = before[name].double(), after[name].double()

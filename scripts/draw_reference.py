@@ -1,8 +1,6 @@
 """Writes docs/reference/presets.md from the comments in conf/ and command_line.md from the commands' declarations.
 
 What a page says before its first section, and a section's heading and first paragraph, stay.
-
-python scripts/draw_reference.py
 """
 
 import dataclasses

@@ -31,10 +31,8 @@ from fmtorch.scenes.surfaces import PICTURES, photograph
 from fmtorch.training.planes import list_photographs
 
 # Repositories under BSD, MIT or Apache licences.
-SOURCES = (
-    "danini/magsac", "mapillary/OpenSfM", "3DOM-FBK/deep-image-matching", "vbalnt/tfeat", "ducha-aiki/affnet",
-    "cvg/LightGlue",
-)  # fmt: skip
+SOURCES = ["danini/magsac", "mapillary/OpenSfM", "3DOM-FBK/deep-image-matching", "vbalnt/tfeat", "ducha-aiki/affnet"]
+SOURCES += ["cvg/LightGlue"]
 PER_IMAGE = 1500  # descriptors, so that no image weighs more than another
 FEATURES: dict[str, tuple[str, Kind]] = {"rootsift_pca": ("sift", "sift"), "hardnet": ("hesaffnet", "hardnet")}
 CENTERS, DIMENSIONS = 64, 64

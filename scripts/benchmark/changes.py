@@ -252,16 +252,13 @@ def sizes_of(c: Correspondences) -> list[list[float]]:
 Change = Callable[[Case], Case | None]
 Level = float | str
 CONDITIONED = "conditions"
+CONDITIONS: dict[Level, Change] = {"as they are": lambda case: case, "one plane": plane, "crops": crops}
+CONDITIONS["f 1 : 2.5, one size"] = functools.partial(zoomed, reduced=True)
+CONDITIONS["f 1 : 2.5, two sizes"] = functools.partial(zoomed, reduced=False)
+CONDITIONS |= {f"f = {f:g}": functools.partial(focal_length, f=f) for f in (0.4, 2.0, 4.0)}
 SWEEPS: dict[str, dict[Level, Change]] = {
     "inlier ratio": {ratio: functools.partial(inlier_ratio, ratio=ratio) for ratio in INLIER_RATIOS},
     "noise": {sigma: functools.partial(noise, sigma=sigma) for sigma in NOISES},
     "match count": {float(count): functools.partial(match_count, count=count) for count in COUNTS},
-    CONDITIONED: {
-        "as they are": lambda case: case,
-        "one plane": plane,
-        "crops": crops,
-        "f 1 : 2.5, one size": functools.partial(zoomed, reduced=True),
-        "f 1 : 2.5, two sizes": functools.partial(zoomed, reduced=False),
-        **{f"f = {f:g}": functools.partial(focal_length, f=f) for f in (0.4, 2.0, 4.0)},
-    },
+    CONDITIONED: CONDITIONS,
 }

@@ -42,8 +42,6 @@ RULE = "the paper's rule"
 PAPER = {"%Recall": "recall", "%Inlier": "inlier", "%Inlier-m": "inlier_m", "#Corrs": "corrs", "#Corrs-m": "corrs_m"}
 """Columns of the paper's tables, by what they are called here and there."""
 Settings = Mapping[str, Any]
-
-
 RIGHT = 0.05  # NSGD below which an estimate of a related pair is right
 LEVELS = (-2.0, -1.0, 0.0, 1.0, 2.0, 3.0, 5.0, 8.0)
 Rows = dict[str, list[Row]]  # by pipeline

@@ -42,12 +42,9 @@ MEMORY = "Peak memory of estimators and pruners: how far one call makes its proc
 SCALE = "What evaluation costs at any size: workers, bytes and memory. Of stages `fmtorch eval` tells the seconds."
 PROC = Path("/proc/self")
 Call = Callable[[Correspondences], Any]
-
 WAIT = 0.04  # seconds of a stage that only waits
 EMPTY = 1000  # batches that a scheduler is given to do nothing in
 BATCH = 64  # rows that are stored at a time where memory is measured
-
-
 Image = NDArray[np.uint8]
 Seconds = dict[str, float]
 Peer = Callable[[Image, Image, int], Seconds]

@@ -1,7 +1,4 @@
-"""Tables of benchmarks, from their rows: figures and paired differences with intervals; Markdown here, CSV in files.
-
-And their curves, drawn as SVG.
-"""
+"""Tables of benchmarks, from their rows: figures and paired differences with intervals; and their curves, as SVG."""
 
 import csv
 import functools

@@ -33,10 +33,7 @@ FEATURES = 4096
 ORIGIN = 0.5  # px: COLMAP's coordinates of the first pixel's centre
 FEATURE_KINDS = ("colmap", "ours")  # COLMAP's SIFT; our default pipeline
 CAMERA_KINDS = ("unknown", "known")
-KNOWN_MODELS = """COLMAP models of scenes in FM-Bench's layout: SIFT matches triangulated with the known cameras.
-
-A scene becomes ``models/<scene>`` with sparse/ and images/, for dataset=colmap.
-"""
+KNOWN_MODELS = "COLMAP models, for dataset=colmap, of scenes with known cameras in FM-Bench's layout, by SIFT."
 SCENES = (
     "Strecha/Herz-Jesus-P8", "PhotoTourism/sacre_coeur", "Strecha/fountain-P11", "Strecha_train/castle-P19",
     "TanksLike/fox",
