@@ -315,9 +315,9 @@ def kinds(paths: Sequence[Path]) -> Iterator[Plane]:
         path, behind = paths[seed], paths[(seed + min(BEHIND, len(paths) - 1)) % len(paths)]
         yield _with_cameras("warped photographs", "planar", path, plane.matches, None)
         for name, (group, truth, make) in MAKERS.items():
-            rng = np.random.default_rng([seed, len(name)])
-            view0, view1, focals = make(rng, small(path), small(behind))
+            view0, view1, focals = make(np.random.default_rng([seed, len(name)]), small(path))
             yield _with_cameras(group, truth, path, matched(view0, view1), focals)
+        yield _with_cameras("unrelated photographs", "unrelated", path, matched(small(path), small(behind)), None)
 
 
 def _with_cameras(group: str, truth: str, path: Path, c: Correspondences, focals: Array | None) -> Plane:
@@ -331,7 +331,7 @@ def _with_cameras(group: str, truth: str, path: Path, c: Correspondences, focals
     return item
 
 
-def _rotated(rng: np.random.Generator, photograph: Array, _: Array) -> tuple[Array, Array, Array]:
+def _rotated(rng: np.random.Generator, photograph: Array) -> tuple[Array, Array, Array]:
     """Two views from the centre of a photograph's camera, of different focal lengths, within its field of view."""
     h, w = photograph.shape[:2]
     K, size = calibration(WIDE_FOCAL * max(h, w), (h, w)), (round(0.7 * h), round(0.7 * w))
@@ -347,14 +347,14 @@ def _rotated(rng: np.random.Generator, photograph: Array, _: Array) -> tuple[Arr
     return views[0], views[1], np.array(focals)
 
 
-def _copied(rng: np.random.Generator, photograph: Array, _: Array) -> tuple[Array, Array, None]:
+def _copied(rng: np.random.Generator, photograph: Array) -> tuple[Array, Array, None]:
     """The photograph, and a copy of another size and compression."""
     scale = rng.choice([1.0, rng.uniform(0.5, 1.0)])
     copy = cv2.resize(photograph, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     return photograph, _compressed(copy, int(rng.integers(50, 95))), None
 
 
-def _cropped(rng: np.random.Generator, photograph: Array, _: Array) -> tuple[Array, Array, None]:
+def _cropped(rng: np.random.Generator, photograph: Array) -> tuple[Array, Array, None]:
     """The photograph, and a part of 60 to 90 % of its sides."""
     h, w = photograph.shape[:2]
     share = rng.uniform(0.6, 0.9)
@@ -373,7 +373,6 @@ MAKERS: dict[str, tuple[str, str, Callable[..., tuple[Array, Array, Array | None
     "rotations": ("rotations cut from photographs", "rotation", _rotated),
     "copies": ("copies, resized", "identical", _copied),
     "crops": ("crops", "identical", _cropped),
-    "unrelated": ("unrelated photographs", "unrelated", lambda rng, photograph, other: (photograph, other, None)),
 }
 
 
