@@ -40,12 +40,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     pairs.add_set_options(parser)
     parser.set_defaults(split="train")
-    parser.add_argument("--stages", nargs="*", default=list(STAGES))
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     own = matched(arguments)
     print(f"{len(own)} pairs, {np.mean([len(p.right) for p in own]):.0f} matches each on average\n")
-    for name in arguments.stages:
+    for name in STAGES:
         soft = {"soft": True} if "soft" in presets.load("pruner", name) else {}
         report(name, presets.build("pruner", name, **soft), own)
 
@@ -67,8 +66,8 @@ def matched(arguments: argparse.Namespace) -> list[Pair]:
 def report(name: str, stage: Any, own: list[Pair]) -> None:
     """Print the stage's figures for each scene, and the constants where it has a `calibration`."""
     priors = [np.clip(stage(pair.c).prior[0].double().numpy(), 1e-6, 1 - 1e-6) for pair in own]
-    areas = [chance_of_more(p[pair.right], p[~pair.right]) for p, pair in zip(priors, own, strict=True)]
-    losses = [loss(np.log(p / (1 - p)), pair.right) for p, pair in zip(priors, own, strict=True)]
+    areas = np.array([chance_of_more(p[pair.right], p[~pair.right]) for p, pair in zip(priors, own, strict=True)])
+    losses = np.array([loss(np.log(p / (1 - p)), pair.right) for p, pair in zip(priors, own, strict=True)])
     kinds = ("with_ratio", "alone") if hasattr(stage, "evidence") else ()
     evidence = {kind: [features(stage, pair, kind) for pair in own] for kind in kinds}
     fitted = {kind: X for kind, X in evidence.items() if X[0].shape[1] > 1}
@@ -77,9 +76,8 @@ def report(name: str, stage: Any, own: list[Pair]) -> None:
     for scene in dict.fromkeys(pair.scene for pair in own):
         inside = [i for i, pair in enumerate(own) if pair.scene == scene]
         others = [i for i in range(len(own)) if i not in inside] or inside
-        line: Record = {"scene": scene, "pairs": len(inside)}
-        line["AUC of preset"] = f"{np.nanmean([areas[i] for i in inside]):.3f}"
-        line["its log loss"] = f"{np.mean([losses[i] for i in inside]):.3f}"
+        line: Record = {"scene": scene, "pairs": len(inside), "AUC of preset": f"{np.nanmean(areas[inside]):.3f}"}
+        line["its log loss"] = f"{np.mean(losses[inside]):.3f}"
         for kind, X in fitted.items():
             elsewhere = fit([X[i] for i in others], [own[i] for i in others])
             for title, w in (("fitted", constants[kind]), ("scene left out", elsewhere)):

@@ -1,9 +1,9 @@
 """Do two checkouts compute the same estimates, to the bit? Run on one machine, before and after a change.
 
-    python scripts/compare_estimates.py BEFORE [AFTER] [--quick] [--presets ransac fmtorch]
+    python scripts/compare_estimates.py BEFORE [AFTER] [--presets ransac fmtorch]
 
-Every estimator preset of the project runs on the same pairs in a process of each checkout (AFTER: this one). Compared
-are F, inliers, ok, reasons, samples, models before the final fit, and gradients, besides public functions of
+Estimator presets of the project run on the same pairs in a process of each checkout (AFTER: this one). Compared are F,
+inliers, ok, reasons, samples, models before the final fit, and gradients, besides public functions of
 `fmtorch.geometry`. Exit status 1 where anything differs.
 """
 
@@ -23,63 +23,46 @@ OWN = ("Ransac", "IterativelyReweighted", "CoarseToFine")
 FIELDS = ("x0", "x1", "mask", "ratio", "prior", "noise", "size0", "size1", "key", "lafs0", "lafs1")
 
 
-def inputs(quick: bool) -> dict[str, dict[str, torch.Tensor]]:
+def inputs() -> dict[str, dict[str, torch.Tensor]]:
     """Batches of pairs as plain tensors, by name, so that both checkouts read the same."""
     sys.path.insert(0, str(HERE))
     from fmtorch.core.types import collate
     from tests.laws import degenerate, scene, small
 
-    rng = np.random.default_rng(0)
-
-    def noise(c: Any) -> torch.Tensor:
-        return torch.from_numpy(np.exp(rng.normal(0, 0.5, tuple(c.mask.shape))).astype(np.float32))
-
-    scenes = collate([scene(i, n) for i, n in enumerate((150, 40, 333) if quick else (150, 40, 333, 90, 150, 700))])
-    hard = collate([scene(20 + i, 260, outliers=0.7, noise=0.6) for i in range(2 if quick else 6)])
-    other = torch.tensor([[700, 900]]).expand(len(scenes), 2)
+    scenes = collate([scene(i, n) for i, n in enumerate((150, 40, 333))])
+    hard = collate([scene(20 + i, 260, outliers=0.7, noise=0.6) for i in range(2)])
+    noise = np.random.default_rng(0).lognormal(0, 0.5, tuple(scenes.mask.shape)).astype(np.float32)
     batches = {
-        "scenes": scenes.replace(noise=noise(scenes)),
+        "scenes": scenes.replace(noise=torch.from_numpy(noise)),
         "no prior, no sizes": scenes.replace(prior=None, size0=None, size1=None),
-        "two sizes": hard.replace(size1=other[:1].expand(len(hard), 2)),
+        "two sizes": hard.replace(size1=torch.tensor([[700, 900]]).expand(len(hard), 2)),
+        "degenerate": collate([*degenerate().values(), *small().values()][::4]),
     }
-    if not quick:
-        batches |= {
-            "hard": hard,
-            "two sizes, noise, no prior": scenes.replace(size1=other, noise=noise(scenes), prior=None),
-            "no ratio": scenes.replace(ratio=None),
-        }
-    kinds = [*degenerate().values(), *small().values()]
-    batches["degenerate"] = collate(kinds[::4] if quick else kinds)
     return {
         name: {f: v.clone() for f in FIELDS if isinstance(v := getattr(c, f), torch.Tensor)}
         for name, c in batches.items()
     }
 
 
-def dump(pairs: Path, out: Path, presets_: list[str], quick: bool) -> None:
+def dump(pairs: Path, out: Path, names: list[str]) -> None:
     from fmtorch import Correspondences, presets
 
     torch.set_num_threads(1)
     batches = {name: Correspondences(**fields) for name, fields in torch.load(pairs).items()}
     own = [n for n in presets.available("estimator") if str(presets.load("estimator", n)["_target_"]).endswith(OWN)]
     arrays: dict[str, torch.Tensor] = geometry()
-    for name in presets_ or own:
-        estimator = presets.build("estimator", name)
-        config = presets.load("estimator", name)
-        unfitted = {"fine": {"final": "none"}} if "fine" in config else {"final": "none"} if "final" in config else None
+    for name in names or own:
+        estimator, config = presets.build("estimator", name), presets.load("estimator", name)
         for label, c in batches.items():
-            for seed in range(1 if quick else 3):
-                estimate = estimator(c, seed)
-                reasons = bytearray("\n".join(estimate.reason).encode() + b"\n")
-                values = {f: getattr(estimate, f) for f in ("F", "inliers", "ok", "samples")}
-                values["reasons"] = torch.frombuffer(reasons, dtype=torch.uint8).clone()
-                arrays |= {f"{name} | {label} | seed {seed} | {f}": value for f, value in values.items()}
-            if label == "scenes":
-                asked = {f: getattr(c, f).double().requires_grad_() for f in ("x0", "x1", "prior", "noise")}
-                arrays |= with_gradients(f"{name} | {label} | F", estimator(c.replace(**asked), 1).F, asked)
-                if unfitted is not None:
-                    plain = presets.build("estimator", name, **unfitted)(c, 0)
-                    arrays[f"{name} | {label} | before the final fit"] = plain.F
+            estimate = estimator(c, 0)
+            values = {f: getattr(estimate, f) for f in ("F", "inliers", "ok", "samples")}
+            values["reasons"] = torch.tensor(list("\n".join(estimate.reason).encode()), dtype=torch.uint8)
+            arrays |= {f"{name} | {label} | {f}": value for f, value in values.items()}
+        c = batches["scenes"]
+        asked = {f: getattr(c, f).double().requires_grad_() for f in ("x0", "x1", "prior", "noise")}
+        arrays |= with_gradients(f"{name} | F", estimator(c.replace(**asked), 1).F, asked)
+        unfitted = {"fine": {"final": "none"}} if "fine" in config else {"final": "none"} if "final" in config else {}
+        arrays[f"{name} | before the final fit"] = presets.build("estimator", name, **unfitted)(c, 0).F
     torch.save(arrays, out)
 
 
@@ -122,9 +105,8 @@ def geometry() -> dict[str, torch.Tensor]:
     return arrays
 
 
-def computed(source: Path, folder: Path, out: Path, arguments: argparse.Namespace) -> dict[str, torch.Tensor]:
-    command = [sys.executable, str(Path(__file__).resolve()), "--dump", str(folder / "pairs.pt"), str(out), "--presets"]
-    command += [*arguments.presets, *(["--quick"] if arguments.quick else [])]
+def computed(source: Path, pairs: Path, out: Path, names: list[str]) -> dict[str, torch.Tensor]:
+    command = [sys.executable, str(Path(__file__).resolve()), "--dump", str(pairs), str(out), "--presets", *names]
     environment = {**os.environ, "PYTHONPATH": str(source.resolve()), "OMP_NUM_THREADS": "1"}
     subprocess.run(command, check=True, env=environment, cwd=source)
     results: dict[str, torch.Tensor] = torch.load(out)
@@ -138,8 +120,7 @@ def same(a: torch.Tensor, b: torch.Tensor) -> bool:
 
 
 def differences(before: dict[str, torch.Tensor], after: dict[str, torch.Tensor]) -> list[str]:
-    lines = [f"{name}: only before" for name in before.keys() - after.keys()]
-    lines += [f"{name}: only after" for name in after.keys() - before.keys()]
+    lines = [f"{name}: only {'before' if name in before else 'after'}" for name in before.keys() ^ after.keys()]
     for name in before.keys() & after.keys():
         if not same(before[name], after[name]):
             a, b = before[name].double(), after[name].double()
@@ -150,22 +131,21 @@ def differences(before: dict[str, torch.Tensor], after: dict[str, torch.Tensor])
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("before", type=Path, nargs="?")
+    parser.add_argument("before", type=Path, nargs="?", help="a checkout")
     parser.add_argument("after", type=Path, nargs="?", default=HERE)
-    parser.add_argument("--quick", action="store_true", help="fewer pairs, one seed: a minute in place of many")
     parser.add_argument("--presets", nargs="*", default=[], help="of conf/estimator; all by default")
     parser.add_argument("--dump", type=Path, nargs=2, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.dump:
-        dump(*arguments.dump, arguments.presets, arguments.quick)
+        dump(*arguments.dump, arguments.presets)
         return
     if arguments.before is None:
         parser.error("BEFORE is missing: a checkout")
     with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        torch.save(inputs(arguments.quick), folder / "pairs.pt")
-        before = computed(arguments.before, folder, folder / "before.pt", arguments)
-        after = computed(arguments.after, folder, folder / "after.pt", arguments)
+        pairs = Path(name) / "pairs.pt"
+        torch.save(inputs(), pairs)
+        sources = {"before": arguments.before, "after": arguments.after}
+        before, after = (computed(at, pairs, Path(name) / side, arguments.presets) for side, at in sources.items())
     lines = differences(before, after)
     print("\n".join(lines[:60]) + f"\n{len(lines)} of {len(before.keys() | after.keys())} arrays differ")
     sys.exit(bool(lines))

@@ -1,8 +1,6 @@
 """Writes docs/reference/presets.md from the comments in conf/ and command_line.md from the commands' declarations.
 
-What a page says before its first section stays.
-
-python scripts/draw_reference.py
+What a page says before its first section, and a section's heading and first paragraph, stay.
 """
 
 import dataclasses
@@ -20,26 +18,6 @@ from fmtorch.presets.files import available, summary
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = ROOT / "docs" / "reference"
-
-GROUPS = {
-    "pipeline": "Pipelines: features, matcher, pruners and estimator by one name, `pipeline=NAME`.",
-    "features": "Local features, `features=NAME`.",
-    "matcher": "Matchers, `matcher=NAME`.",
-    "pruner": "Pruners and priors, in the order in which they are named: `'pruner=[NAME,NAME]'`.",
-    "estimator": "Robust estimators, `estimator=NAME`, and `find_fundamental(x0, x1, estimator=NAME)`.",
-    "dataset": "Data sets, `dataset=NAME`.",
-    "executor": "Where commands run batches of pairs, `executor=NAME`.",
-    "trainer": "Where `fmtorch train` runs, `trainer=NAME`.",
-    "photographs": "Which photographs `fmtorch train` takes as planes, `photographs=NAME`.",
-}
-USAGES = {
-    "match": "fmtorch match A.jpg B.jpg [NAME=VALUE ...]",
-    "eval": "fmtorch eval [NAME=VALUE ...]",
-    "report": "fmtorch report [RUN ...] [NAME=VALUE ...]",
-    "pairs": "fmtorch pairs dataset=NAME output=FOLDER [NAME=VALUE ...]",
-    "train": "fmtorch train pruner=NAME [NAME=VALUE ...]",
-    "verify": "fmtorch verify DATABASE [NAME=VALUE ...]",
-}
 
 
 def text(comment: str) -> str:
@@ -59,8 +37,10 @@ def rows(options: Any, prefix: str = "") -> Iterator[str]:
             yield f"| `{name}` | `{shown(value)}` | {text(str(field.metadata['about']))} |"
 
 
-def head(page: str) -> str:
-    return (PAGES / page).read_text(encoding="utf-8").partition("\n## ")[0]
+def kept(page: str) -> tuple[str, list[list[str]]]:
+    """What a page says before its first section, and of each section heading and first paragraph."""
+    head, *sections = (PAGES / page).read_text(encoding="utf-8").split("\n## ")
+    return head, [section.split("\n\n")[:2] for section in sections]
 
 
 def table(columns: Sequence[str], lines: Iterable[str]) -> str:
@@ -68,8 +48,9 @@ def table(columns: Sequence[str], lines: Iterable[str]) -> str:
 
 
 def presets_page() -> str:
-    parts = [head("presets.md")]
-    for group, title in GROUPS.items():
+    head, sections = kept("presets.md")
+    parts = [head]
+    for group, title in sections:
         for folder, names in itertools.groupby(available(group), lambda name: name.rpartition("/")[0]):
             parts.append(f"### {group}: {HEADINGS[folder]}\n" if folder else f"## {group}\n\n{title}\n")
             files = ((name, f"conf/{group}/{name}.yaml") for name in names)
@@ -79,11 +60,11 @@ def presets_page() -> str:
 
 
 def commands_page() -> str:
-    parts = [head("command_line.md")]
-    for name, usage in USAGES.items():
+    head, sections = kept("command_line.md")
+    parts = [head]
+    for name, usage in sections:
         words = SUMMARIES[name]
-        about = text(words[0].upper() + words[1:])
-        parts.append(f"## {name}\n\n```text\n{usage}\n```\n\n{about}.\n")
+        parts.append(f"## {name}\n\n{usage}\n\n{text(words[0].upper() + words[1:])}.\n")
         parts.append(table(("option", "default", "what it is"), rows(COMMANDS[name].options())))
     return "\n".join(parts)
 

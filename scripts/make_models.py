@@ -1,13 +1,9 @@
-"""Makes learned files of models/: from photographs, or from weights that others published.
+"""Makes learned files of models/ from photographs.
 
 pca --photos FOLDER: models/rootsift_pca.npz, the mean and the 80 principal axes of RootSIFT descriptors at DoG
 keypoints (Bursuc, Tolias and Jégou, ICMR 2015, section 4, there on patches of Brown et al.)
 codebooks --photos FOLDER: models/vlad_rootsift_pca.npz and models/vlad_hardnet.npz, VLAD's codebooks: mean and
 principal axes of local descriptors, and centres of the projected ones by k-means
-ngransac weights_ucn_r1.00.net runs/ngransac.safetensors: a learned file of `LC` from a checkpoint of neural-guided
-RANSAC (Brachmann & Rother, ICCV 2019; BSD 3-clause), the authors' .net, or an .npz of the same parameters; nothing in
-it is executed. Then: fmtorch eval pipeline=sift_lc pruner.lc.file=runs/ngransac.safetensors
-'pruner.lc.network.side=[ratio]'
 
 Photographs: scikit-image's of the train split and, with --photos, a folder whose sources.txt names each file's source;
 only those of --sources are read.
@@ -31,21 +27,16 @@ from fmtorch.data import read_image
 from fmtorch.features import learn_projection, local_feature
 from fmtorch.features.vlad import Codebook, Kind, local_descriptors
 from fmtorch.pipeline.pipeline import load_pipeline
-from fmtorch.pruning.networks import LC
 from fmtorch.scenes.surfaces import PICTURES, photograph
-from fmtorch.training.export import save_weights
 from fmtorch.training.planes import list_photographs
 
 # Repositories under BSD, MIT or Apache licences.
-SOURCES = (
-    "danini/magsac", "mapillary/OpenSfM", "3DOM-FBK/deep-image-matching", "vbalnt/tfeat", "ducha-aiki/affnet",
-    "cvg/LightGlue",
-)  # fmt: skip
+SOURCES = ["danini/magsac", "mapillary/OpenSfM", "3DOM-FBK/deep-image-matching", "vbalnt/tfeat", "ducha-aiki/affnet"]
+SOURCES += ["cvg/LightGlue"]
 PER_IMAGE = 1500  # descriptors, so that no image weighs more than another
 FEATURES: dict[str, tuple[str, Kind]] = {"rootsift_pca": ("sift", "sift"), "hardnet": ("hesaffnet", "hardnet")}
 CENTERS, DIMENSIONS = 64, 64
 ITERATIONS = 50
-NGRANSAC_LAYERS = {"s0": "linear0", "s1": "norm0", "s2": "linear1", "s3": "norm1"}
 
 
 def images(arguments: argparse.Namespace) -> Iterator[NDArray[np.uint8]]:
@@ -91,43 +82,9 @@ def learned(parts: list[Tensor], centers: int, dimensions: int) -> Codebook:
     return Codebook(mean, basis, torch.from_numpy(nearest))
 
 
-def ngransac(arguments: argparse.Namespace) -> None:
-    if arguments.checkpoint.suffix == ".npz":
-        with np.load(arguments.checkpoint) as file:
-            weights = {key: torch.from_numpy(file[key]) for key in file.files}
-    else:
-        weights = torch.load(arguments.checkpoint, map_location="cpu", weights_only=True)
-    network = LC(side=["ratio"])
-    network.load_state_dict(ngransac_state(weights))
-    save_weights(network, arguments.out, notes={"origin": "vislearn/ngransac, BSD 3-clause"})
-    console.print(f"{arguments.out}: LC with side=[ratio]; log-odds are not calibrated", markup=False)
-
-
-def ngransac_state(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The state of `LC` from that of the network of Brachmann & Rother, "Neural-guided RANSAC", ICCV 2019.
-    Their network is LC with 12 blocks, coordinates="size" and side=["ratio"]. Its layers are p_in, 0s0 to 11s3 and
-    p_out; the biases of s0 and s2, which context normalisation takes away, are left out. Raises ValueError for a name
-    that is none of these."""
-    state = {}
-    for key, value in weights.items():
-        layer, _, kind = key.rpartition(".")
-        block, position = layer[:-2], layer[-2:]
-        if layer not in ("p_in", "p_out") and not (block.isdecimal() and position in NGRANSAC_LAYERS):
-            raise ValueError(f"{key} is no parameter of a network of neural-guided RANSAC")
-        if kind == "num_batches_tracked" or (kind == "bias" and position in ("s0", "s2")):
-            continue
-        name = f"blocks.{block}.{NGRANSAC_LAYERS[position]}" if position in NGRANSAC_LAYERS else layer
-        state[f"backbone.{name}.{kind}"] = value.flatten(1) if value.dim() == 4 else value
-    return state
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(required=True)
-    command = commands.add_parser("ngransac")
-    command.set_defaults(function=ngransac)
-    command.add_argument("checkpoint", type=Path)
-    command.add_argument("out", type=Path, help="a file .safetensors")
     for function in (pca, codebooks):
         command = commands.add_parser(function.__name__)
         command.set_defaults(function=function)

@@ -51,7 +51,7 @@ EXACT = ("known", "rough", "wrong")
 TAKES = {
     "fmtorch": LEVELS, "fmtorch_f": LEVELS, "poselib": (*EXACT, "shared"),
     "poselib_f": (*EXACT, "one_sided", "shared", "unknown"), "colmap": (*EXACT, "one_sided", "shared", "unknown"),
-    "colmap_f": EXACT, "opencv": EXACT, "kornia": EXACT,
+    "opencv": EXACT, "kornia": EXACT,
 }  # fmt: skip
 """The levels that each method takes; ``_f``: a fundamental matrix without cameras, of which the pose is taken."""
 POSEBENCH = """PoseBench's relative poses (github.com/PoseLib/posebench) by its protocol, beside its published figures.
@@ -60,8 +60,6 @@ FILES is the folder `relative` of its data, or one file of it; --root judges pai
 by SIFT matches and --threshold. Of each pair the error is the larger of the angles of rotation and of translation,
 whose sign counts; of a fundamental matrix the best of its four poses is taken. Sets of other names need --threshold;
 pairs whose cameras have distortion are left out.
-
-python -m scripts.benchmark posebench FILES --every 10 --methods E:fmtorch E:fmtorch:scaled=false E:poselib E:colmap
 """
 METHODS = ("E:fmtorch", "E:poselib", "E:colmap", "F:fmtorch", "F:poselib", "F:colmap")
 KINDS = ("E", "F")  # a relative pose of known cameras; a fundamental matrix, of whose four poses the best one counts
@@ -166,7 +164,7 @@ def _solver(name: str, level: str, changed: dict[str, Any]) -> tuple[Callable[..
         return functools.partial(_decomposed if alone else _with_cameras, own), [("estimator", kind, changed)]
     if kind in ESSENTIAL:
         return functools.partial(_peer, _with_cameras, _by_essential(kind, changed)), []
-    usual: dict[str, Any] = {"iterations": 5000, "prosac": True} if kind == "poselib" else {"two_view": not alone}
+    usual: dict[str, Any] = {"iterations": 5000, "prosac": True} if kind == "poselib" else {"two_view": True}
     shared = {"shared_focal": True} if (name, level) == ("poselib", "shared") else {}
     changed = {**usual, **shared, **changed}
     try:

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from fmtorch import find_homography
 from fmtorch.core.types import Correspondences
-from fmtorch.data import ImagePair
+from fmtorch.data import ImagePair, Lens, undistorted_frames
 from fmtorch.geometry import symmetric_max
 from fmtorch.pruning import one_to_one
 from fmtorch.training.labelled import LabelledMatches, move, transform
@@ -228,19 +228,17 @@ def part(
 
 def bent(pair: ImagePair, c: Correspondences, lens: float) -> tuple[ImagePair, Correspondences]:
     """The matches as two lenses of this lambda bend them (`find_fundamental`); F stays that of the pinholes' pixels."""
-    moved, inside = {}, torch.ones_like(c.mask[0])
+    moved, inside = {}, c.mask[0]
     for i, (h, w) in enumerate(sizes_of(c)):
-        centre, half_diagonal = torch.tensor([(w - 1) / 2, (h - 1) / 2]), math.hypot(h, w) / 2
-        x = (getattr(c, f"x{i}")[0].double() - centre) / half_diagonal
-        root = (1 - 4 * lens * x.square().sum(-1, keepdim=True)).sqrt()  # NaN beyond what the lens sees
-        y = x * 2 / (1 + root)
-        photographed = centre + half_diagonal * y
-        inside &= ((photographed > -0.5) & (photographed < torch.tensor([w, h]) - 0.5)).all(-1)
+        half_diagonal = math.hypot(h, w) / 2
+        model = Lens(half_diagonal, half_diagonal, (w - 1) / 2, (h - 1) / 2, "SIMPLE_DIVISION", (lens,))
+        x = getattr(c, f"x{i}")[0].double().numpy()
+        photographed = torch.from_numpy(model.distort(x))  # NaN beyond what the lens sees
+        inside = inside & ((photographed > -0.5) & (photographed < torch.tensor([w, h]) - 0.5)).all(-1)
         moved[f"x{i}"] = photographed[None].to(c.x0)
         if (lafs := getattr(c, f"lafs{i}")) is not None:
-            slope = (2 / (1 + root))[..., None] * torch.eye(2) + 2 * lens * y[:, :, None] * (y / root)[:, None]
-            frames = torch.cat([slope @ lafs[0, ..., :2].double(), photographed[..., None]], -1)
-            moved[f"lafs{i}"] = frames[None].to(lafs)
+            axes = torch.from_numpy(undistorted_frames(model.distort, x, lafs[0, ..., :2].double().numpy()))
+            moved[f"lafs{i}"] = torch.cat([axes, photographed[..., None]], -1)[None].to(lafs)
     return pair, taken(c.replace(**moved), inside)
 
 
@@ -254,16 +252,13 @@ def sizes_of(c: Correspondences) -> list[list[float]]:
 Change = Callable[[Case], Case | None]
 Level = float | str
 CONDITIONED = "conditions"
+CONDITIONS: dict[Level, Change] = {"as they are": lambda case: case, "one plane": plane, "crops": crops}
+CONDITIONS["f 1 : 2.5, one size"] = functools.partial(zoomed, reduced=True)
+CONDITIONS["f 1 : 2.5, two sizes"] = functools.partial(zoomed, reduced=False)
+CONDITIONS |= {f"f = {f:g}": functools.partial(focal_length, f=f) for f in (0.4, 2.0, 4.0)}
 SWEEPS: dict[str, dict[Level, Change]] = {
     "inlier ratio": {ratio: functools.partial(inlier_ratio, ratio=ratio) for ratio in INLIER_RATIOS},
     "noise": {sigma: functools.partial(noise, sigma=sigma) for sigma in NOISES},
     "match count": {float(count): functools.partial(match_count, count=count) for count in COUNTS},
-    CONDITIONED: {
-        "as they are": lambda case: case,
-        "one plane": plane,
-        "crops": crops,
-        "f 1 : 2.5, one size": functools.partial(zoomed, reduced=True),
-        "f 1 : 2.5, two sizes": functools.partial(zoomed, reduced=False),
-        **{f"f = {f:g}": functools.partial(focal_length, f=f) for f in (0.4, 2.0, 4.0)},
-    },
+    CONDITIONED: CONDITIONS,
 }

@@ -1,13 +1,8 @@
 """Robust estimators on the same matches, one thread each: recall, AUC@0.05, milliseconds, paired intervals.
 
-An estimator is named as PRESET[:KEY=VALUE,...][@PRUNER+PRUNER...]; the pruners after @ count into its time, and other
-words (`find_fundamental`, `truth`, `sizeless`, `scoreless`, `part`, `bent`, ...) are as scripts/benchmark/methods.py
-says. The pruner `ngransac` is the network of --ngransac; without it, estimators that name it are left out.
-
-python -m scripts.benchmark estimators --root DATA/Strecha --root DATA/PhotoTourism --seeds 5 --rows rows.jsonl \\
-    --estimators fmtorch@frame_consistency opencv:method=usac_magsac,threshold=1.0 poselib:threshold=0.5,prosac=true
-
-A row of --rows counts only for the code, options and learned files that it was made with.
+An estimator is named as scripts/benchmark/methods.py says; the pruners after @ count into its time. The pruner
+`ngransac` is the network of --ngransac; without it, estimators that name it are left out. A row of --rows counts only
+for the code, options and learned files that it was made with.
 """
 
 import argparse
@@ -38,17 +33,8 @@ CURVES = """Accuracy against time: estimators at several values of an option, wi
 
 The knee of a curve is its cheapest point within 0.5 points of its best AUC@0.05, averaged over the families. It is
 chosen on tuning data, and marked on the curves of test data.
-
-python -m scripts.benchmark curves --root DATA/Strecha_train --rendered full --split train --limit 60 --table tuning.csv
-python -m scripts.benchmark curves --root DATA/Strecha --root DATA/KITTI --knees tuning.csv --figure curves.svg
-python -m scripts.benchmark curves --root DATA/castle --curves 'PoseLib | poselib:threshold={} | 0.35 0.5 0.75 1'
 """
-STRESS = """Where estimators fail: sweeps of inlier ratio, noise and number of matches, and conditions that hurt.
-
-python -m scripts.benchmark stress --root DATA/Strecha --root DATA/PhotoTourism --root DATA/KITTI --root DATA/TUM \\
-    --rendered full --rows stress.jsonl --table docs/tables/stress.csv --figures docs/benchmarks
-"""
-AXES = {"inlier ratio": "inlier ratio", "noise": "added noise [px]", "match count": "matches"}
+STRESS = "Where estimators fail: sweeps of inlier ratio, noise and number of matches, and conditions that hurt."
 IMAGES = 256  # whose features are kept, some 5 MB each
 PLANE, TURN = 0.8, 0.02
 NATURAL: dict[Level, Callable[[Row], bool]] = {
@@ -63,7 +49,7 @@ def add_arguments(commands: Any) -> None:
     pairs.add_match_options(parser)
     parser.add_argument("--estimators", nargs="+", default=[], help="PRESET[:KEY=VALUE,...][@PRUNER+PRUNER...]")
     parser.add_argument("--specs", type=Path, help="a file with one estimator a line; # starts a comment")
-    parser.add_argument("--ngransac", type=Path, help="NG-RANSAC's published weights (scripts/make_models.py ngransac)")
+    parser.add_argument("--ngransac", type=Path, help="NG-RANSAC's published weights (scripts/convert_checkpoint.py)")
     parser = add_command(commands, "curves", run_curves, CURVES, seeds=1)
     pairs.add_match_options(parser)
     parser.add_argument("--specs", type=Path, default=FOLDER / "curves.txt", help="lines: CURVE | ESTIMATOR | VALUES")
@@ -74,7 +60,7 @@ def add_arguments(commands: Any) -> None:
     pairs.add_set_options(parser, limit=20)  # of rendered families half as many
     parser.add_argument("--specs", type=Path, default=FOLDER / "stress.txt", help="estimators; (...): conditions only")
     parser.add_argument("--only", nargs="*", default=list(SWEEPS), choices=list(SWEEPS), help="all by default")
-    parser.add_argument("--figures", type=Path, help="draw stress_SWEEP.svg into this folder")
+    parser.add_argument("--figure", type=Path, help="draw the sweep of inlier ratios into this SVG")
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -203,8 +189,8 @@ def run_stress(arguments: argparse.Namespace) -> None:
 
     rows = pairs.rows_of(arguments, measured_rows)
     show([accuracy_sheet(rows), time_sheet(rows)], arguments.table)
-    for sweep in {row["sweep"] for row in rows} & AXES.keys() if arguments.figures else ():
-        draw_stress(rows, sweep, arguments.figures / f"stress_{sweep.replace(' ', '_')}.svg")
+    if arguments.figure:
+        draw_inlier_ratios(rows, arguments.figure)
 
 
 def items_of(arguments: argparse.Namespace) -> Iterator[Item]:
@@ -295,13 +281,12 @@ def time_sheet(rows: Sequence[Row]) -> Sheet:
     return Sheet("times", "Median number of matches, median processor milliseconds a pair", records)
 
 
-def draw_stress(rows: Sequence[Row], sweep: str, path: Path) -> None:
-    """AUC@0.05 against the level, a panel for each set."""
+def draw_inlier_ratios(rows: Sequence[Row], path: Path) -> None:
+    """AUC@0.05 against the inlier ratio, a panel for each set."""
     panels: dict[str, dict[str, tables.Line]] = {}
-    for _, level, results in (each for each in by_level(rows) if each[0] == sweep):
+    for _, level, results in by_level([row for row in rows if row["sweep"] == "inlier ratio"]):
         for (name, own), estimator in itertools.product(families_of(results).items(), results.methods):
             line = panels.setdefault(name, {}).setdefault(estimator, tables.Line([], []))
             line.x.append(float(level))
             line.y.append(results.percent(estimator, own, "AUC@0.05"))
-    scale = "linear" if sweep == "noise" else "log"
-    tables.draw(path, panels, (AXES[sweep], "AUC@0.05 [%]"), scale, [float(x) for x in SWEEPS[sweep]])
+    tables.draw(path, panels, ("inlier ratio", "AUC@0.05 [%]"), "log", [float(x) for x in SWEEPS["inlier ratio"]])

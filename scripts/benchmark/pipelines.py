@@ -4,8 +4,6 @@ Each of these benchmarks is a page of settings, the YAML file of its name in thi
 the tables, as PRESET NAME=VALUE ..., what is shown of them, and which are compared. --pipelines takes some of them, by
 names or patterns such as 'sift*', or others, as 'NAME = PRESET NAME=VALUE ...'; `+ PRUNER` at the end of one adds one.
 The time of pruners is that of all but `ratio` and `one_to_one`, on one thread.
-
-python -m scripts.benchmark pruning --rendered full --limit 50 --pipelines RATIO 'mine = sift_ratio pruner=[ratio,lpm]\'
 """
 
 import argparse
@@ -44,17 +42,11 @@ RULE = "the paper's rule"
 PAPER = {"%Recall": "recall", "%Inlier": "inlier", "%Inlier-m": "inlier_m", "#Corrs": "corrs", "#Corrs-m": "corrs_m"}
 """Columns of the paper's tables, by what they are called here and there."""
 Settings = Mapping[str, Any]
-
-
 RIGHT = 0.05  # NSGD below which an estimate of a related pair is right
 LEVELS = (-2.0, -1.0, 0.0, 1.0, 2.0, 3.0, 5.0, 8.0)
 Rows = dict[str, list[Row]]  # by pipeline
 SIMILAR = "How many of the pairs that can be matched `pairs=similar:N` proposes, all scenes mixed in one folder."
-VERDICT = """The verdict on pairs of one scene and of different scenes: shares accepted and rejected, and ROC.
-
-python -m scripts.benchmark related --root DATA/Strecha --root DATA/PhotoTourism --root DATA/KITTI --root DATA/TUM \\
-    --rows related.jsonl --table docs/tables/related.csv --figure docs/concepts/related.svg
-"""
+VERDICT = "The verdict on pairs of one scene and of different scenes: shares accepted and rejected, and ROC."
 
 
 def settings_of(name: str) -> dict[str, Any]:
@@ -80,7 +72,6 @@ def add_arguments(commands: Any) -> None:
     parser = add_command(commands, "similar", run_similar, SIMILAR)
     parser.add_argument("--root", type=Path, nargs="+", required=True, help="folders in the layout of fmbench")
     parser.add_argument("--pipeline", default="sift_fmtorch")
-    parser.add_argument("--count", type=int, nargs="+", default=[5, 10, 20])
 
 
 def add_pipeline_options(parser: argparse.ArgumentParser) -> None:
@@ -316,7 +307,7 @@ def run_similar(arguments: argparse.Namespace) -> None:
     vectors = torch.stack([vlad(local_descriptors(descriptors, kind), book) for descriptors in described])
     seconds = (time.process_time() - start) / len(paths)
     print(f"{len(paths)} images; {1e3 * seconds:.1f} s for a thousand once described")
-    proposed = {n: {frozenset(pair) for pair in similar_pairs(paths, vectors, n)} for n in arguments.count}
+    proposed = {n: {frozenset(pair) for pair in similar_pairs(paths, vectors, n)} for n in (5, 10, 20)}
     records: list[Record] = []
     for scene, count in [*Counter(overlapping.values()).items(), ("all", len(overlapping))]:
         line: Record = {"scene": scene, "overlapping pairs": count}

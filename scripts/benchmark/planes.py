@@ -2,8 +2,6 @@
 
 docs/benchmarks/homographies.md says what warped and hard pairs and views are. SIFT, ratio 0.8, one match a location,
 P(inlier) from frame consistency. Every second photograph is for tuning (--tuning), the others for the claim.
-
-python -m scripts.benchmark homography --photographs DATA/photos --tuning --methods ours:select.scale=0.5 poselib:2
 """
 
 from __future__ import annotations
@@ -52,8 +50,6 @@ CONFIGURATION = """Kinds of image pairs: confusion tables of `classify` and of C
 Photographs: each as a plane, looked around in, copied, cropped, and beside another one. Every second photograph is for
 tuning (--tuning), the others for the claim. Real and rendered pairs: --root, --rendered. SIFT, ratio 0.8, one match a
 location, P(inlier) from frame consistency, noise of matches.
-
-python -m scripts.benchmark pair_types --photographs DATA/photos --root DATA/Strecha
 """
 # Scenes, and rendered families, whose depth and baseline every pair sees.
 GENERAL = {"castle-P19", "fountain-P11", "Herz-Jesus-P8", "sacre_coeur", "00", "driving", "orbit"}
@@ -155,7 +151,7 @@ def run_pair_types(arguments: argparse.Namespace) -> None:
             general = {item.pair.scene, item.pair.family} & GENERAL
             item.facts |= {"truth": "general" if general else "", "group": f"{item.pair.family}/{item.pair.scene}"}
             items.append(item)
-    methods: dict[str, Callable[[Correspondences], str]] = {"fmtorch": Ours(not arguments.unknown)}
+    methods = {"fmtorch": functools.partial(by_ours, presets.build("estimator", "fmtorch"), not arguments.unknown)}
     methods |= {f"COLMAP, {px:g} px": functools.partial(by_colmap, px) for px in arguments.colmap}
     rows: list[Row] = [
         {**item.facts, "method": name, "kind": verdict(item.matches), "set": item.pair.family, "item": item}
@@ -166,17 +162,11 @@ def run_pair_types(arguments: argparse.Namespace) -> None:
     print(time_line([item.matches for item in items]))
 
 
-class Ours:
+def by_ours(estimator: Any, known: bool, c: Correspondences) -> str:
     """`classify` after F, which has the exact cameras where they are known."""
-
-    def __init__(self, known: bool) -> None:
-        estimator = presets.build("estimator", "fmtorch")
-        self.known, self.estimator = known, KnownCameras(estimator) if known else estimator
-
-    def __call__(self, c: Correspondences) -> str:
-        exact = torch.tensor([[[1.0, 0.0], [1.0, 0.0]]], dtype=torch.float64)
-        c = c.replace(focal=exact) if self.known else c.replace(K0=None, K1=None)
-        return str(classify(c, self.estimator(c, 0), seed=0).names[0])
+    exact = torch.tensor([[[1.0, 0.0], [1.0, 0.0]]], dtype=torch.float64)
+    c = c.replace(focal=exact) if known else c.replace(K0=None, K1=None)
+    return str(classify(c, (KnownCameras(estimator) if known else estimator)(c, 0), seed=0).names[0])
 
 
 def by_colmap(threshold: float, c: Correspondences) -> str:
@@ -325,9 +315,9 @@ def kinds(paths: Sequence[Path]) -> Iterator[Plane]:
         path, behind = paths[seed], paths[(seed + min(BEHIND, len(paths) - 1)) % len(paths)]
         yield _with_cameras("warped photographs", "planar", path, plane.matches, None)
         for name, (group, truth, make) in MAKERS.items():
-            rng = np.random.default_rng([seed, len(name)])
-            view0, view1, focals = make(rng, small(path), small(behind))
+            view0, view1, focals = make(np.random.default_rng([seed, len(name)]), small(path))
             yield _with_cameras(group, truth, path, matched(view0, view1), focals)
+        yield _with_cameras("unrelated photographs", "unrelated", path, matched(small(path), small(behind)), None)
 
 
 def _with_cameras(group: str, truth: str, path: Path, c: Correspondences, focals: Array | None) -> Plane:
@@ -341,7 +331,7 @@ def _with_cameras(group: str, truth: str, path: Path, c: Correspondences, focals
     return item
 
 
-def _rotated(rng: np.random.Generator, photograph: Array, _: Array) -> tuple[Array, Array, Array]:
+def _rotated(rng: np.random.Generator, photograph: Array) -> tuple[Array, Array, Array]:
     """Two views from the centre of a photograph's camera, of different focal lengths, within its field of view."""
     h, w = photograph.shape[:2]
     K, size = calibration(WIDE_FOCAL * max(h, w), (h, w)), (round(0.7 * h), round(0.7 * w))
@@ -357,14 +347,14 @@ def _rotated(rng: np.random.Generator, photograph: Array, _: Array) -> tuple[Arr
     return views[0], views[1], np.array(focals)
 
 
-def _copied(rng: np.random.Generator, photograph: Array, _: Array) -> tuple[Array, Array, None]:
+def _copied(rng: np.random.Generator, photograph: Array) -> tuple[Array, Array, None]:
     """The photograph, and a copy of another size and compression."""
     scale = rng.choice([1.0, rng.uniform(0.5, 1.0)])
     copy = cv2.resize(photograph, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     return photograph, _compressed(copy, int(rng.integers(50, 95))), None
 
 
-def _cropped(rng: np.random.Generator, photograph: Array, _: Array) -> tuple[Array, Array, None]:
+def _cropped(rng: np.random.Generator, photograph: Array) -> tuple[Array, Array, None]:
     """The photograph, and a part of 60 to 90 % of its sides."""
     h, w = photograph.shape[:2]
     share = rng.uniform(0.6, 0.9)
@@ -383,7 +373,6 @@ MAKERS: dict[str, tuple[str, str, Callable[..., tuple[Array, Array, Array | None
     "rotations": ("rotations cut from photographs", "rotation", _rotated),
     "copies": ("copies, resized", "identical", _copied),
     "crops": ("crops", "identical", _cropped),
-    "unrelated": ("unrelated photographs", "unrelated", lambda rng, photograph, other: (photograph, other, None)),
 }
 
 

@@ -1,7 +1,5 @@
 """Milliseconds a pair of estimators and pruners: one pair a call and many, peers in turn, prior included.
 
-python -m scripts.benchmark speed --estimators fmtorch msac:confidence=null --peers poselib opencv:method=usac_magsac
-python -m scripts.benchmark speed --estimators @gms @lpm @code --matches 2000 --peers         # pruners alone
 FMTORCH_CACHE=$(mktemp -d) python -m scripts.benchmark speed --peers    # the first call compiles the kernels
 """
 
@@ -44,21 +42,15 @@ MEMORY = "Peak memory of estimators and pruners: how far one call makes its proc
 SCALE = "What evaluation costs at any size: workers, bytes and memory. Of stages `fmtorch eval` tells the seconds."
 PROC = Path("/proc/self")
 Call = Callable[[Correspondences], Any]
-
 WAIT = 0.04  # seconds of a stage that only waits
 EMPTY = 1000  # batches that a scheduler is given to do nothing in
 BATCH = 64  # rows that are stored at a time where memory is measured
-
-
 Image = NDArray[np.uint8]
 Seconds = dict[str, float]
 Peer = Callable[[Image, Image, int], Seconds]
 PARTS = ("detection", "shape", "orientation", "description")
 RATIO = 0.8
-FEATURES = """Where the time of an image's features goes: processor milliseconds by stage, of presets that take turns.
-
-python -m scripts.benchmark features --image PHOTOGRAPH --size 1178 1766 --features hesaffnet hesaffnet_fast
-"""
+FEATURES = "Where the time of an image's features goes: processor milliseconds by stage, of presets that take turns."
 END_TO_END = """Whole pipelines by stage against the same stages written with OpenCV's and kornia's calls, in turn.
 
 The peer of `hesaffnet_gms` has kornia's Hessian detector, AffNet and HardNet (the same networks with random weights,

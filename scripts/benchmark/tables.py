@@ -1,7 +1,4 @@
-"""Tables of benchmarks, from their rows: figures and paired differences with intervals; Markdown here, CSV in files.
-
-And their curves, drawn as SVG.
-"""
+"""Tables of benchmarks, from their rows: figures and paired differences with intervals; and their curves, as SVG."""
 
 import csv
 import functools
@@ -15,17 +12,8 @@ from numpy.typing import NDArray
 from scipy.stats import mannwhitneyu
 
 from fmtorch.core.files import replacing
-from fmtorch.evaluation.statistics import (
-    PERCENT,
-    POSE_THRESHOLDS,
-    Interval,
-    areas,
-    described,
-    difference,
-    interval,
-    recalled,
-    scene_names,
-)
+from fmtorch.evaluation import statistics
+from fmtorch.evaluation.statistics import PERCENT, POSE_THRESHOLDS, Interval, areas, recalled, scene_names
 from fmtorch.metrics.recall import FINE_THRESHOLD
 from fmtorch.presets.composition import WIDE
 from scripts.benchmark.runner import Row
@@ -220,7 +208,7 @@ class Results:
         figure = FIGURES[name]
         values = figure.of(get)
         if intervals:
-            return span(interval(values, self.scenes(pairs), figure.scale, figure.share), figure.form)
+            return span(statistics.interval(values, self.scenes(pairs), figure.scale, figure.share), figure.form)
         return "" if np.isnan(values).all() else f"{figure.scale * np.nanmean(values):{figure.form}}"
 
     def difference(self, first: str, second: str, pairs: Sequence[str], name: str) -> Span | str:
@@ -230,7 +218,7 @@ class Results:
             return ""
         figure = FIGURES[name]
         a, b = (figure.of(self.get(method, both)) for method in (first, second))
-        return span(difference(a, b, self.scenes(both), figure.scale, figure.share), "+" + figure.form)
+        return span(statistics.difference(a, b, self.scenes(both), figure.scale, figure.share), "+" + figure.form)
 
     def records(
         self, groups: Groups, columns: Names, label: str, minus: Names = (), against: str = "", intervals: bool = False
@@ -258,7 +246,7 @@ class Results:
         return lines
 
     def described(self, pairs: Sequence[str]) -> str:
-        return described(self.scenes(pairs))
+        return statistics.described(self.scenes(pairs))
 
     def seeds(self, method: str) -> int:
         return min(map(len, self._rows[method].values()), default=0)

@@ -33,10 +33,7 @@ FEATURES = 4096
 ORIGIN = 0.5  # px: COLMAP's coordinates of the first pixel's centre
 FEATURE_KINDS = ("colmap", "ours")  # COLMAP's SIFT; our default pipeline
 CAMERA_KINDS = ("unknown", "known")
-KNOWN_MODELS = """COLMAP models of scenes in FM-Bench's layout: SIFT matches triangulated with the known cameras.
-
-A scene becomes ``models/<scene>`` with sparse/ and images/, for dataset=colmap.
-"""
+KNOWN_MODELS = "COLMAP models, for dataset=colmap, of scenes with known cameras in FM-Bench's layout, by SIFT."
 SCENES = (
     "Strecha/Herz-Jesus-P8", "PhotoTourism/sacre_coeur", "Strecha/fountain-P11", "Strecha_train/castle-P19",
     "TanksLike/fox",
@@ -57,7 +54,6 @@ def add_arguments(commands: Any) -> None:
     parser.add_argument("--work", type=Path, required=True, help="a folder for databases and rows")
     parser.add_argument("--methods", nargs="+", default=METHODS, help="colmap:PX, or ours")
     parser.add_argument("--features", nargs="+", default=FEATURE_KINDS, choices=FEATURE_KINDS)
-    parser.add_argument("--cameras", nargs="+", default=CAMERA_KINDS, choices=CAMERA_KINDS)
     parser.add_argument("--mappers", nargs="*", default=MAPPERS, choices=MAPPERS)
     parser.add_argument("--seeds", type=int, default=3)
     parser = add_command(commands, "known_models", run_known_models, KNOWN_MODELS)
@@ -94,7 +90,7 @@ def run(arguments: argparse.Namespace) -> None:
     kept = Kept(arguments.work / "rows.jsonl")
     for name in arguments.scenes:
         scene = read_scene(arguments.root / name)
-        kinds = itertools.product(arguments.features, arguments.cameras)
+        kinds = itertools.product(arguments.features, CAMERA_KINDS)
         # Our features are shown once, with unknown cameras.
         for features, cameras in ((f, c) for f, c in kinds if f == "colmap" or c == "unknown"):
             database = database_of(scene, features, cameras, arguments.work)

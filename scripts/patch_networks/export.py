@@ -4,9 +4,8 @@ python -m scripts.patch_networks.export checkpoint=runs/patch_networks/hardnet.p
 python -m scripts.patch_networks.export checkpoint=HardNet++.pth architecture=hardnet name=hardnetpp
 python -m scripts.patch_networks.export checkpoint=... precision=int8 calibration=runs/patch_networks/patches/train
 
-checkpoint: of scripts.patch_networks.train, kornia's and the authors' .pth, or TorchScript. Needs the extra `export`.
-precision=int8 quantises weights per channel and activations by what `calibration` patches show.
-validation=FOLDER of patches adds the ONNX file's own figures to the card.
+checkpoint: of scripts.patch_networks.train, kornia's and the authors' .pth, or TorchScript. int8: weights per channel,
+activations by what `calibration` patches show. validation=FOLDER of patches adds the ONNX file's figures to the card.
 """
 
 import tempfile
@@ -33,24 +32,17 @@ DEFAULTS = {
 }  # fmt: skip
 CARDS = Path(__file__).with_name("cards.yaml")
 RATIO = "residual_tilt"
-FIGURES = {
-    "fpr95": "FPR at 95 % recall (%)",
-    "map": "mAP (%)",
-    "accuracy": "nearest is right (%)",
-    RATIO: "ratio of axes left after rectification (median; 1 is best)",
-}
+FIGURES = {"fpr95": "FPR at 95 % recall (%)", "map": "mAP (%)", "accuracy": "nearest is right (%)"}
+FIGURES[RATIO] = "ratio of axes left after rectification (median; 1 is best)"
 
 
 def model_card(config: DictConfig, path: Path, checkpoint: Mapping[str, Any], figures: Mapping[str, float]) -> str:
     """Markdown for the ONNX file at `path`, from what its checkpoint says beside the weights.
     figures: of the ONNX file itself on the validation patches; empty where it was not measured."""
     trained, about = "options" in checkpoint, OmegaConf.load(CARDS)[config.architecture]
-    rows = {
-        "SHA-256": f"`{sha256(path)}`",
-        "bytes": path.stat().st_size,
-        "licence": config.licence or (OWN_LICENCE if trained else "as the checkpoint it was converted from"),
-        **(_training(checkpoint) if trained else {"origin": "converted"}),
-    }
+    licence = config.licence or (OWN_LICENCE if trained else "as the checkpoint it was converted from")
+    rows = {"SHA-256": f"`{sha256(path)}`", "bytes": path.stat().st_size, "licence": licence}
+    rows |= _training(checkpoint) if trained else {"origin": "converted"}
     title = f"{about.title}, {config.precision}: float32 grey patches (N, 1, 32, 32) to (N, D)."
     lines = [f"# {path.name}", "", title, "", "| | |", "| --- | --- |", *(f"| {k} | {v} |" for k, v in rows.items())]
     other_loss = about.get(checkpoint.get("loss", {}).get("name", ""))
@@ -63,10 +55,8 @@ def _training(checkpoint: Mapping[str, Any]) -> dict[str, str]:
     """Rows of the card: what a network was trained on, and how."""
     data, losses = checkpoint["data"], checkpoint["losses"][-100:]
     licences = checkpoint.get("licences", {}) | {"scikit-image": "photographs inside the package, BSD-3-Clause"}
-    photographs = (
-        f"{count} of {source}" + (f" ({licences[source]})" if source in licences else "")
-        for source, count in data["photographs"].items()
-    )
+    under = {source: f" ({licence})" for source, licence in licences.items()}
+    photographs = (f"{count} of {source}{under.get(source, '')}" for source, count in data["photographs"].items())
     rows = {
         "origin": "trained by this project from random weights, scripts.patch_networks.train",
         "photographs": "; ".join(photographs),

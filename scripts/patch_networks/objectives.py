@@ -30,18 +30,14 @@ def distances(a: Float[Tensor, "n d"], b: Float[Tensor, "m d"]) -> Float[Tensor,
     return (2 - 2 * a @ b.mT).clamp_min(1e-6).sqrt()
 
 
-def hardest_triplet(
-    a: Float[Tensor, "n d"], b: Float[Tensor, "n d"], *, margin: float = 1.0, squared: bool = False
-) -> Float[Tensor, ""]:
+def hardest_triplet(a: Float[Tensor, "n d"], b: Float[Tensor, "n d"], *, margin: float = 1.0) -> Float[Tensor, ""]:
     """HardNet's loss (Mishchuk et al., NIPS 2017, eq. 4): max(0, margin + positive - hardest negative), the mean.
-    The hardest negative in the batch is that of either end of a pair (anchor swap). squared: the hinge squared, which
-    presses less on triplets that are nearly right."""
+    The hardest negative in the batch is that of either end of a pair (anchor swap)."""
     d = distances(a, b)
     excluded = torch.eye(len(d), dtype=torch.bool, device=d.device) | (d < SAME_PATCH)
     negative = torch.where(excluded, 10.0, d)
     hardest = torch.minimum(negative.min(1).values, negative.min(0).values)
-    hinge = (margin + d.diagonal() - hardest).clamp_min(0)
-    return (hinge.square() if squared else hinge).mean()
+    return (margin + d.diagonal() - hardest).clamp_min(0).mean()
 
 
 def geodesc(
@@ -54,10 +50,9 @@ def geodesc(
 
 
 def structured(a: Float[Tensor, "*s n d"], b: Float[Tensor, "*s n d"], *, ratio: float = 0.4) -> Float[Tensor, ""]:
-    """The structured loss E_1 of match sets, the mean over the sets.
-    With S = A B^T and L = S - ratio diag(S), the sum over i and j of max(0, l_ij - l_ii) + max(0, l_ij - l_jj) by n (n
-    - 1): no patch of the other photograph should be as similar as 1 - `ratio` (alpha) of its own match. All of them
-    count, not the hardest alone."""
+    """The structured loss E_1: with S = A B^T and L = S - ratio diag(S), the mean over the sets of the sum over i and j
+    of max(0, l_ij - l_ii) + max(0, l_ij - l_jj) by n (n - 1). No patch of the other photograph should be as similar as
+    1 - `ratio` (alpha) of its own match."""
     similarity = a @ b.mT
     own = (1 - ratio) * similarity.diagonal(dim1=-2, dim2=-1)
     n = similarity.shape[-1]
@@ -69,9 +64,8 @@ def structured(a: Float[Tensor, "*s n d"], b: Float[Tensor, "*s n d"], *, ratio:
 def geometric(
     a: Float[Tensor, "*s n d"], b: Float[Tensor, "*s n d"], similarity: Float[Tensor, "*s n"]
 ) -> Float[Tensor, ""]:
-    """The geometric loss E_2: max(0, margin - cosine similarity) of each match, the mean.
-    Patches that geometry makes hard to match need not be as similar: see `MARGINS`. The mean in place of the sum keeps
-    the weight of the loss independent of n."""
+    """The geometric loss E_2: max(0, margin - cosine similarity) of each match, the mean, with `MARGINS`.
+    The mean in place of the sum keeps the weight of the loss independent of n."""
     margin = torch.zeros_like(similarity)
     for threshold, value in reversed(MARGINS):
         margin = torch.where(similarity >= threshold, value, margin)
@@ -93,11 +87,8 @@ def patch_quality(a: Float[Tensor, "n d"], b: Float[Tensor, "n d"]) -> dict[str,
     negative = (a - b.roll(1, 0)).square().sum(1).clamp_min(0).sqrt()
     blocks = [distances(x, y) for x, y in zip(torch.split(a, GALLERY), torch.split(b, GALLERY), strict=True)]
     rank = torch.cat([(d <= d.diagonal()[:, None]).sum(1).double() for d in blocks])
-    return {
-        "fpr95": fpr_at_recall(positive, negative),
-        "map": float((1 / rank).mean()),
-        "accuracy": float((rank == 1).double().mean()),
-    }
+    figures = {"map": float((1 / rank).mean()), "accuracy": float((rank == 1).double().mean())}
+    return {"fpr95": fpr_at_recall(positive, negative), **figures}
 
 
 def middle(patches: Float[Tensor, "*b h w"], size: int = 32) -> Float[Tensor, "*b size size"]:

@@ -1,15 +1,11 @@
 """Patch networks as ONNX files, in float32 or quantised to int8, laid out for ONNX Runtime's CPU kernels.
 
-The layout is another, the network the same, in less time:
-
-- A convolution that sees its whole input at once is a matrix product of one row a patch. As one product of all patches
-  it reads its weights once, not once a patch: a fifth of HardNet's time in fp32.
-- In int8 a convolution is a matrix product of one row a pixel, and each row costs some time of its own, however short
-  it is. Where there are few channels, one row gives the outputs of several pixels beside one another: its kernel is as
-  much wider, with zeros in the columns that a pixel does not see, and steps over them all.
-
-int8 networks keep their outputs to the last bit where the processor sums products of bytes exactly (VNNI; older ones
-saturate), those in fp32 up to the order of a sum.
+The layout is another, the network the same. A convolution that sees its whole input at once becomes one matrix product
+of all patches, which reads its weights once, not once a patch: a fifth of HardNet's time in fp32. In int8 a convolution
+is a product of one row a pixel, each of which costs some time however short it is. Where there are few channels, one
+row gives the outputs of several pixels beside one another: its kernel is as much wider, with zeros in the columns that
+a pixel does not see. Outputs are the same to the last bit in int8 where the processor sums products of bytes exactly
+(VNNI; older ones saturate), in fp32 up to the order of a sum.
 """
 
 import copy

@@ -28,6 +28,7 @@ from fmtorch.features import SIFT, DominantGradient, HessianDetector, ImagePyram
 from fmtorch.features.frames import FRAME_SIGMAS
 from fmtorch.jit import random
 from fmtorch.jit.random import Stream
+from fmtorch.pipeline.photographs import reduced_image
 from fmtorch.scenes.raycast import Camera
 from fmtorch.scenes.surfaces import PICTURES, skimage_file
 from fmtorch.training import planes
@@ -186,7 +187,6 @@ def rays_and_incidence(keypoints: Keypoints, camera: Camera) -> tuple[Matrix, Ma
 
 def patch_similarity(rays0: Matrix, rays1: Matrix, incidence0: Matrix, incidence1: Matrix) -> Matrix:
     """S_patch (section 3.3): g(intersection angle, 15 degrees) g(difference of incidence angles, 20 degrees).
-
     g(a, s) = exp(-a^2 / (2 s^2)). The intersection angle is that between the two viewing rays at the point, unit
     directions (n, 3) to each camera; incidence: degrees (n,) between ray and surface normal. 1: one viewpoint."""
     cross = np.linalg.norm(np.cross(rays0, rays1), axis=1)
@@ -200,8 +200,7 @@ def patch_similarity(rays0: Matrix, rays1: Matrix, incidence0: Matrix, incidence
 class PatchStore:
     """Patches of points seen in two or more views, sorted by point.
     patches: (m, CONTEXT_SIZE, CONTEXT_SIZE) uint8. first: (n + 1,) where each point's patches begin. view, rays,
-    incidence: (m,), (m, 3), (m,), as of a `Part`, views numbered through. description: how they were made, for the
-    model card."""
+    incidence: as of a `Part`, views numbered through. description: how they were made, for the model card."""
 
     patches: NDArray[np.uint8]
     first: NDArray[np.int64]
@@ -250,10 +249,9 @@ def validation_pairs(store: PatchStore, count: int, seed: int = 0) -> Float[Tens
 @dataclasses.dataclass(frozen=True, eq=False)
 class MatchSets:
     """The matches of pairs of photographs, set after set (Luo et al., GeoDesc, ECCV 2018, section 3.4).
-    The patches that a loss compares with each other then come from one pair of photographs, as when a descriptor is
-    used; pairs whose photographs are nearly alike are left out, since they teach little. patches: (2, k) indices of the
-    two patches of each match. similarity: (k,) its S_patch. first: (s + 1,) where each set begins. image_similarity:
-    (s,) the mean of a set's S_patch."""
+    A loss then compares patches of one pair of photographs, as when a descriptor is used. patches: (2, k) indices of
+    the two patches of each match. similarity: (k,) its S_patch. first: (s + 1,) where each set begins.
+    image_similarity: (s,) the mean of a set's S_patch."""
 
     patches: NDArray[np.int64]
     similarity: NDArray[np.float64]
@@ -267,8 +265,7 @@ class MatchSets:
 def match_sets(store: PatchStore, matches: int, max_similarity: float = MAX_SIMILARITY) -> MatchSets:
     """The sets of pairs of photographs that share at least `matches` points and are not more alike than allowed.
     S_image, the similarity of two photographs, is the mean S_patch of their shared points (section 3.3). In the order
-    of the first photograph and then of the second; matches in the order of their points. Raises ValueError where no
-    pair is left."""
+    of the photographs, then of the points. Raises ValueError where no pair is left."""
     pairs = _pairs_of_points(store.first)
     pairs = np.where(store.view[pairs[0]] > store.view[pairs[1]], pairs[::-1], pairs)
     a, b = pairs = pairs[:, np.lexsort((pairs[0], *store.view[pairs][::-1]))]
@@ -310,9 +307,7 @@ class Cutting(NamedTuple):
         """The patches of a photograph, by a seed."""
         photograph, seed = job
         cv2.setNumThreads(1)
-        image = read_image(photograph.path)
-        if (scale := self.longest_side / max(image.shape[:2])) < 1:
-            image = np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
+        image, _ = reduced_image(read_image(photograph.path), self.longest_side)
         views = views_of(image, np.random.default_rng(seed), self.planes, self.points)
         return tracks(views, self.tolerance)
 
@@ -321,8 +316,7 @@ def build_store(
     folder: Path, photographs: Sequence[Photograph], cutting: Cutting, seed: int, workers: int = 1
 ) -> PatchStore:
     """Cut corresponding patches from photographs into `folder`, which appears once it is complete.
-    The patches of a photograph depend on the seed and its place in the list alone. Raises FileExistsError if the folder
-    exists."""
+    Those of a photograph depend on the seed and its place in the list alone. Raises FileExistsError."""
     if folder.exists():
         raise FileExistsError(f"{folder} exists; delete it to cut the patches again")
     description = {

@@ -3,12 +3,10 @@
 python -m scripts.patch_networks.train training=hardnet images=FOLDER photographs.held_out=[SUBFOLDER]
 python -m scripts.patch_networks.train training=affnet images=FOLDER photographs=permissive training.options.minutes=20
 
-The patches are cut once into <out>/patches; delete that folder after a change of photographs or of `patches`. The
-checkpoint <out>/<name>.pt carries what the model card says; resume=true goes on from it; scripts.patch_networks.export
-makes the ONNX network and the card.
-
-Every step is a function of the seed and its number, so that a run can be resumed. A batch is points of a whole store,
-or matches of pairs of photographs (`training.match_sets`, as GeoDesc is trained).
+Patches are cut once into <out>/patches; delete that folder after a change of photographs or of `patches`. resume=true
+goes on from the checkpoint <out>/<name>.pt, of which scripts.patch_networks.export makes the ONNX network and its card:
+every step is a function of the seed and its number. A batch is points of a whole store, or matches of pairs of
+photographs (`training.match_sets`, as GeoDesc is trained).
 """
 
 import functools
@@ -39,9 +37,8 @@ from scripts.patch_networks.stores import Cutting, MatchSets, PatchStore, Tolera
 
 class TrainingOptions(NamedTuple):
     """How a patch network is trained, by Adam; the learning rate falls linearly to zero over the run.
-    batch: points a step, with two patches each. steps: the run's length, or minutes where that is given: wall time that
-    this run has spent in all its parts. bf16: autocast to bfloat16. checkpoint_steps, log_steps: how often to save, to
-    log."""
+    batch: points a step, with two patches each. minutes: the run's length in wall time, in place of steps. bf16:
+    autocast to bfloat16. checkpoint_steps, log_steps: how often to save, to log."""
 
     batch: int = 512
     steps: int = 5000

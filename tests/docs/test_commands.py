@@ -63,7 +63,7 @@ SLOW = (
 
 PEERS = {"poselib": "poselib", "degensac_cpp": "pydegensac",
          "gc_ransac_cpp": "pygcransac", "magsac_cpp": "pymagsac", "superansac_cpp": "pysuperansac",
-         "poselib_f": "poselib", "colmap": "pycolmap", "colmap_f": "pycolmap", "superansac": "pysuperansac",
+         "poselib_f": "poselib", "colmap": "pycolmap", "superansac": "pysuperansac",
 }  # fmt: skip
 
 TINY = ["features.max_features=500"]

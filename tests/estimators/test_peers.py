@@ -2,6 +2,7 @@
 
 import sys
 import types
+from typing import Any
 
 import cv2
 import numpy as np
@@ -12,7 +13,6 @@ import fmtorch
 from fmtorch import find_essential, geometry, metrics, presets
 from fmtorch.core import Correspondences, collate
 from fmtorch.estimators import PairwiseEstimator, Solution
-from fmtorch.estimators.external.pairwise import Pair
 from fmtorch.two_view.known_cameras import KnownCameras
 from tests.geometry.scenes import scene as matched_scene
 from tests.laws import PEERS, scene
@@ -102,9 +102,9 @@ def test_poselib_estimates_the_pose_of_exactly_known_cameras() -> None:
 
 
 def test_roughly_known_cameras_are_not_exact_for_peers() -> None:
-    given: list[Pair] = []
+    given: list[Any] = []
 
-    def solve(pair: Pair) -> Solution:
+    def solve(pair: Any) -> Solution:
         given.append(pair)
         return None, np.zeros(len(pair.x0), np.bool_)
 
@@ -168,9 +168,9 @@ def test_inliers_of_gc_ransac_are_told_from_its_matrix(flags: int, monkeypatch: 
 
 
 def test_the_prior_orders_matches_before_the_quality() -> None:
-    seen: list[Pair] = []
+    seen: list[Any] = []
 
-    def solve(pair: Pair) -> Solution:
+    def solve(pair: Any) -> Solution:
         seen.append(pair)
         return None, torch.zeros(len(pair.x0), dtype=torch.bool).numpy()
 
@@ -186,7 +186,7 @@ def test_the_prior_orders_matches_before_the_quality() -> None:
 
 
 def test_what_another_library_raises_becomes_the_pairs_reason() -> None:
-    def solve(pair: Pair) -> Solution:
+    def solve(pair: Any) -> Solution:
         if len(pair.x0) == 20:
             raise cv2.error("(-215:Assertion failed)\n!model.empty()")
         return np.eye(3), np.ones(len(pair.x0), bool)

@@ -2,6 +2,7 @@
 
 import json
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -117,16 +118,14 @@ def test_what_cannot_be_loaded_is_one_line(monkeypatch: pytest.MonkeyPatch) -> N
         VisMatch("sift-nn")
 
 
-def test_the_command_evaluates_it(tmp_path: Path) -> None:
-    from fmtorch.commands.eval import run
-    from tests.helpers import compose
-
+def test_the_command_evaluates_it(command: Callable[..., str], tmp_path: Path) -> None:
     file = lists.write(tmp_path / "list.txt", [lists.superglue(1, 5), lists.superglue(0, 2)])
     words = (
-        "pipeline=vismatch", "matcher.name=romav2", "dataset=pair_list", f"dataset.root={lists.images()}",
+        "eval", "pipeline=vismatch", "matcher.name=romav2", "dataset=pair_list", f"dataset.root={lists.images()}",
         f"dataset.file={file}", "dataset.resize=640", f"output={tmp_path / 'run'}", "cache=off",
     )  # fmt: skip
-    folder = run(compose("eval", words), "vismatch")
+    command(*words, cwd=tmp_path)
+    folder = tmp_path / "run"
     config = json.loads((folder / "run.json").read_text())["config"]
     assert config["libraries"]["vismatch"] == "9.9"
     summary = json.loads((folder / "summary.json").read_text())["all"]

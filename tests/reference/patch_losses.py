@@ -10,7 +10,7 @@ def distance(a: Sequence[float], b: Sequence[float]) -> float:
     return math.sqrt(sum((x - y) ** 2 for x, y in zip(a, b, strict=True)))
 
 
-def hardest_triplet(a: Vectors, b: Vectors, margin: float, squared: bool) -> float:
+def hardest_triplet(a: Vectors, b: Vectors, margin: float) -> float:
     """Mishchuk et al., NIPS 2017, section 3.1: the hardest negative of a_i among b and of b_i among a."""
     total, n = 0.0, len(a)
     for i in range(n):
@@ -18,7 +18,7 @@ def hardest_triplet(a: Vectors, b: Vectors, margin: float, squared: bool) -> flo
             distance(a[j], b[i]) for j in range(n) if j != i
         ]
         hinge = max(0.0, margin + distance(a[i], b[i]) - min(d for d in negatives if d >= 0.008))
-        total += hinge**2 if squared else hinge
+        total += hinge
     return total / n
 
 

@@ -11,10 +11,12 @@ import pytest
 import torch
 from skimage import data as images
 
+from fmtorch import presets
 from fmtorch.core import Correspondences, Estimate
 from fmtorch.data import ImagePair, ImageSource
 from fmtorch.geometry import homography_transfer
 from fmtorch.scenes import PICTURES, Plan, RenderedPairs
+from fmtorch.two_view.known_cameras import KnownCameras
 from fmtorch.two_view.pair_type import classify
 from scripts.benchmark import cameras, pairs, pipelines, planes, verify
 from scripts.benchmark.cameras import LEVELS, TAKES, applies, bougnoux, calibrations, described
@@ -82,10 +84,10 @@ def test_pairs_are_of_their_kinds(folder: Path) -> None:
     items = list(planes.kinds(sorted(folder.iterdir())[:2]))
     truths = [item.facts["truth"] for item in items]
     assert truths == ["planar", "rotation", "identical", "identical", "unrelated"] * 2
-    verdict = planes.Ours(known=True)
-    assert [verdict(item.matches) for item in items] == truths
+    estimator = presets.build("estimator", "fmtorch")
+    assert [planes.by_ours(estimator, True, item.matches) for item in items] == truths
     c = items[1].matches
-    R = classify(c, verdict.estimator(c, 0), focal_deviation=0).evidence.R
+    R = classify(c, KnownCameras(estimator)(c, 0), focal_deviation=0).evidence.R
     near = homography_transfer(c.K1 @ R @ torch.linalg.inv(c.K0), c.x0.double(), c.x1.double())[1][c.mask] < 2
     assert float(near.double().mean()) > 0.5
 

@@ -2,7 +2,6 @@
 
 import copy
 import math
-import runpy
 import sys
 from pathlib import Path
 
@@ -16,8 +15,8 @@ from fmtorch.geometry import eight_point, sampson
 from fmtorch.pruning import DFE, LC, LearnedPruner, MatchInputs
 from fmtorch.pruning.networks import CLNet, ConvMatch, NCMNet, OANet
 from fmtorch.pruning.networks.layers import ContextBatchNormReLU, ResidualBlock, Slots
-from scripts.make_models import ngransac_state
-from tests.conftest import oracle, shared_path
+from scripts import convert_checkpoint
+from tests.conftest import oracle
 from tests.laws import scene
 from tests.reference.pruner_losses import context_batch_norm_relu
 
@@ -130,7 +129,7 @@ def test_outputs_of_neural_guided_ransac(model: str) -> None:
     """The authors' weights give the authors' sampling probabilities: float32 against float64 differ by up to 2e-4."""
     weights = {key: torch.from_numpy(value) for key, value in oracle(f"weights_ngransac_{model}.npz").items()}
     network = LC(side=["ratio"]).eval()
-    network.load_state_dict(ngransac_state(weights))
+    network.load_state_dict(convert_checkpoint.authors_state("ngransac", network, weights))
     network.double()
     data = {key: torch.from_numpy(value) for key, value in oracle("ngransac_net.npz").items() if key != "names"}
     cases = [key[:3] for key in data if key.endswith(f".logprob_{model}")]
@@ -242,24 +241,18 @@ def test_gradients_are_finite_on_degenerate_pairs(network: DFE) -> None:
     assert all(torch.isfinite(b).all() for b in network.buffers())
 
 
-SCRIPT = Path(__file__).resolve().parents[3] / "scripts" / "make_models.py"
-
-
 def convert(checkpoint: Path, out: Path) -> None:
     """Run the script. Raises SystemExit where that fails."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "argv", [str(SCRIPT), "ngransac", str(checkpoint), str(out)])
-        runpy.run_path(str(SCRIPT), run_name="__main__")
+        patch.setattr(sys, "argv", ["convert_checkpoint.py", "ngransac", str(checkpoint), str(out), "--side", "ratio"])
+        convert_checkpoint.main()
 
 
 def test_a_checkpoint_of_neural_guided_ransac_becomes_a_pruner(tmp_path: Path) -> None:
-    """As the authors' .net and as .npz: the same file, whose P(inlier) gives the authors' sampling probabilities."""
+    """Its P(inlier) gives the authors' sampling probabilities."""
     weights = oracle("weights_ngransac_F_r1.00.npz")
-    net = tmp_path / "weights.net"
-    torch.save({key: torch.from_numpy(value) for key, value in weights.items()}, net)
-    for source in (net, shared_path("oracles/weights_ngransac_F_r1.00.npz")):
-        convert(source, tmp_path / f"{source.suffix[1:]}.safetensors")
-    assert (tmp_path / "net.safetensors").read_bytes() == (tmp_path / "npz.safetensors").read_bytes()
+    torch.save({key: torch.from_numpy(value) for key, value in weights.items()}, tmp_path / "weights.net")
+    convert(tmp_path / "weights.net", tmp_path / "net.safetensors")
     data = oracle("ngransac_net.npz")
     x0, x1, ratio, size0, size1 = (
         torch.from_numpy(data[f"001.{name}"])[None] for name in ("X1", "X2", "ratio", "size1", "size2")
@@ -273,10 +266,8 @@ def test_a_checkpoint_of_neural_guided_ransac_becomes_a_pruner(tmp_path: Path) -
 
 
 def test_what_is_no_such_checkpoint_is_told(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"conv1\.weight is no parameter of a network of neural-guided RANSAC"):
-        ngransac_state({"conv1.weight": torch.zeros(3)})
     torch.save({"conv1.weight": torch.zeros(3)}, tmp_path / "other.net")
-    with pytest.raises(SystemExit, match=r"error: .*conv1\.weight is no parameter"):
+    with pytest.raises(SystemExit, match=r"error: no checkpoint of LC\(.*\): p_in\.weight is missing"):
         convert(tmp_path / "other.net", tmp_path / "out.safetensors")
     assert not (tmp_path / "out.safetensors").exists()
 

@@ -16,7 +16,7 @@ from fmtorch.pruning import LearnedPruner
 from fmtorch.pruning.networks import CLNet, ConvMatch, NCMNet, OANet, layers
 from fmtorch.pruning.networks.layers import Slots
 from fmtorch.training import LabelledMatches, Objective
-from scripts.convert_checkpoint import NETWORKS, UNUSED, joined, main
+from scripts.convert_checkpoint import NETWORKS, UNUSED, authors_key, main
 from tests.laws import degenerate, scene
 from tests.reference import pruner_layers as reference
 from tests.training.conftest import exact
@@ -214,14 +214,13 @@ def listed(name: str) -> set[str]:
 
 def written(name: str, network: nn.Module, file: Path, without: str = "") -> None:
     """A checkpoint as the authors' code writes it on several cards: convolutions are 4-D, a figure is NumPy's."""
-    names = NETWORKS[name][1]()
-    state = {}
-    for key, value in network.state_dict().items():
-        layer, _, kind = key.rpartition(".")
-        state[joined(names[layer], kind)] = value[..., None, None] if value.dim() == 2 else value
+    state = {
+        authors_key(name, key): value[..., None, None] if value.dim() == 2 else value
+        for key, value in network.state_dict().items()
+    }
     unused = listed(name) - state.keys()
     assert state.keys() <= listed(name)
-    assert all(key.endswith("num_batches_tracked") or UNUSED in key for key in unused)
+    assert all(UNUSED.search(key) for key in unused)
     state |= dict.fromkeys(unused, torch.zeros(1))
     state = {f"module.{key}": value for key, value in state.items() if key != without}
     torch.save({"epoch": 3, "state_dict": state, "best_acc": np.float64(0.5), "optimizer": {"state": {}}}, file)
