@@ -114,9 +114,8 @@ class Calibration:
             scored["tolerance"],
         ])  # fmt: skip
         out = torch.empty(len(c), c.mask.shape[1] + 1, dtype=torch.float32)
-        prior, probable = for_each_pair(calibrated_by_score, (evidence, score, c.mask), numbers, out=out).split(
-            [c.mask.shape[1], 1], 1
-        )
+        out = for_each_pair(calibrated_by_score, (evidence, score, c.mask), numbers, out=out)
+        prior, probable = out[:, :-1], out[:, -1:]
         if gradient_wanted(evidence, score):
             e, s = torch.where(c.mask, evidence, 0), torch.where(c.mask, score, 0.5).clamp(_MIN_SCORE, 1 - _MIN_SCORE)
             z = scored["constant"] + scored["evidence"] * e + SCORE_POWER * torch.logit(s)
@@ -126,7 +125,7 @@ class Calibration:
 
 def _with_gradient(prior: Float[Tensor, "b n"], z: Float[Tensor, "b n"]) -> Float[Tensor, "b n"]:
     """The prior, attached to its log-odds: adds zeros."""
-    slope = prior * (1 - prior) / (1 + z.detach() / 2**_SQUARINGS)
+    slope: Tensor = prior * (1 - prior) / (1 + z.detach() / 2**_SQUARINGS)
     return prior + slope * (z - z.detach())
 
 

@@ -3,9 +3,9 @@
 Pruners may have options, too. In place of a preset `find_fundamental` is the public call, with points, distance ratios,
 scores and image sizes, and options as its arguments; `truth` is the fit that starts from the true matrix, and so what
 the matches allow. Without an estimator, as in `@gms`, pruners alone are meant. Among the pruners may be what changes
-the pair: `sizeless` and `ratioless` (these are not given), `part:left=0,top=0,right=0.5,bottom=0.5` (both images
-cropped, in fractions of their sides) and `bent:lens=-0.15` (points of two such lenses, F of pinholes). The last two
-come first.
+the pair: `sizeless`, `ratioless`, `scoreless`, `priorless` (these are not given; without scores no prior either),
+`part:left=0,top=0,right=0.5,bottom=0.5` (both images cropped, in fractions of their sides) and `bent:lens=-0.15`
+(points of two such lenses, F of pinholes). The last two come first.
 """
 
 import dataclasses
@@ -171,5 +171,6 @@ def ngransac(file: Path | None) -> dict[str, Pruner]:
 
 WITHHELD: dict[str, Pruner] = {
     "sizeless": lambda c: c.replace(size0=None, size1=None), "ratioless": lambda c: c.replace(ratio=None),
+    "scoreless": lambda c: c.replace(score=None, prior=None), "priorless": lambda c: c.replace(prior=None),
 }  # fmt: skip
 """Stages that are no presets: what an estimator is not given."""

@@ -30,6 +30,7 @@ UNRELATED = "unrelated"  # what the names of families of pairs of different scen
 
 def add_set_options(parser: argparse.ArgumentParser, limit: int | None = None) -> None:
     parser.add_argument("--root", action="append", default=[], help="a set in the FM-Bench layout; may be repeated")
+    parser.add_argument("--all-pairs", action="store_true", help="of the images of --root, not those that it lists")
     parser.add_argument("--rendered", choices=["small", "full"], help="also the embedded data set, of this size")
     parser.add_argument("--split", default="test", help="of --rendered: test or train; a --root has no splits")
     parser.add_argument("--limit", type=int, default=limit, help="pairs of each family at most, chosen by hash")
@@ -39,13 +40,15 @@ def add_match_options(parser: argparse.ArgumentParser) -> None:
     """Those, and the options that say which matches all methods get."""
     add_set_options(parser)
     parser.add_argument("--features", default="sift")
+    parser.add_argument("--matcher", default="nearest", help="PRESET[:KEY=VALUE,...], as lightglue, without --pruners")
     parser.add_argument("--pruners", nargs="*", default=["ratio", "one_to_one"])
     parser.add_argument("--cache", default="off", help="a folder that keeps features from run to run; off: nowhere")
 
 
 def sets_of(arguments: argparse.Namespace) -> list[PairDataset]:
     """The data sets that these options name, before any limit."""
-    sets = [data.load("fmbench", root=root) for root in arguments.root]
+    layout = "cameras" if arguments.all_pairs else "fmbench"
+    sets = [data.load(layout, root=root) for root in arguments.root]
     if arguments.rendered:
         sets.append(data.load("rendered", arguments.split, size=arguments.rendered))
     return sets
@@ -69,23 +72,26 @@ def rows_of(arguments: argparse.Namespace, measured: Callable[[Kept], list[Row]]
     return rows
 
 
-def front_of(features: str, pruners: Iterable[str], cache: str = "off", memory: int = 64) -> Pipeline:
+def front_of(
+    features: str, pruners: Iterable[str], cache: str = "off", memory: int = 64, matcher: str = "nearest"
+) -> Pipeline:
     """What makes the matches that all methods get."""
     stages = {word: methods.build("pruner", word) for word in pruners}
     extractor = cached(presets.build("features", features), cache)
-    return Pipeline(extractor, presets.build("matcher", "nearest"), stages, no_estimator, memory=memory)
+    return Pipeline(extractor, methods.build("matcher", matcher), stages, no_estimator, memory=memory)
 
 
 def matches_identity(arguments: argparse.Namespace) -> str:
     """The digest of what the matches of `matched` depend on, but for the images."""
-    stages: Stages = [("features", arguments.features, {}), ("matcher", "nearest", {})]
+    stages: Stages = [("features", arguments.features, {}), ("matcher", *methods.split(arguments.matcher))]
     stages += [("pruner", *methods.split(word)) for word in arguments.pruners]
     return identity(stages, *(presets.build(group, name, **changed) for group, name, changed in stages))
 
 
 def matched(arguments: argparse.Namespace) -> list[Item]:
     """Every pair of the sets that are asked for, with its matches."""
-    return items(pairs_of(arguments), front_of(arguments.features, arguments.pruners, arguments.cache))
+    front = front_of(arguments.features, arguments.pruners, arguments.cache, matcher=arguments.matcher)
+    return items(pairs_of(arguments), front)
 
 
 def items(pairs: Iterable[ImagePair], front: Pipeline) -> list[Item]:
