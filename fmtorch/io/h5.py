@@ -18,7 +18,6 @@ _BLOCKS, _BLOCK = 4096, 1 << 16  # of larger files: how many blocks of how many 
 SUFFIXES = (".h5", ".hdf5")
 
 
-@functools.cache
 def imported() -> Any:
     """h5py. Raises ImportError naming the extra where it is not installed."""
     return lazy.imported("h5py", "h5py is not installed; pip install 'fmtorch[h5]' brings it")
