@@ -80,7 +80,7 @@ class Calibration:
     a matcher's score s and no ratio: ``constant + evidence e + SCORE_POWER log(s / (1 - s))``. That holds of scores
     that are probabilities, as LightGlue's. Others are ignored: a pair's scores are taken for such only if the mean of
     ``logistic(of_score + SCORE_POWER log(s / (1 - s)))`` is within the tolerance of the mean P(inlier) by `alone`.
-    `scripts/calibrate_priors.py` fits these numbers."""
+    `scripts/calibrate_priors.py` fits the numbers of `with_ratio` and `alone`."""
 
     with_ratio: Mapping[str, float]
     alone: Mapping[str, float] | None = None
