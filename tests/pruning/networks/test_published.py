@@ -241,7 +241,7 @@ def test_a_checkpoint_of_the_authors_code_becomes_a_pruner(name, tmp_path, monke
     assert torch.equal(read.probability(c), LearnedPruner(network).probability(c))
 
 
-def test_what_is_no_such_checkpoint_is_told_in_a_line(tmp_path, monkeypatch) -> None:
+def test_what_is_no_such_checkpoint_is_refused_in_a_line(tmp_path, monkeypatch) -> None:
     file, out = tmp_path / "model.pth", tmp_path / "out.safetensors"
     written("clnet", CLNet(coordinates="K"), file, without="ds_0.linear_1.bias")
     with pytest.raises(SystemExit, match=r"^error: no checkpoint of CLNet\(.*\): ds_0\.linear_1\.bias is missing"):
