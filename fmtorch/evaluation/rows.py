@@ -89,15 +89,14 @@ def _by_labels(outcome: Outcome) -> Figures:
     if c is None or estimate is None:
         return {"match_precision": 0.0, "match_recall": 0.0}
     kept = (estimate.inliers & c.mask)[0].cpu().numpy()
-    found, total = _right(pair, c)[kept].sum(), _right(pair, pair.matches().correspondences).sum()
-    return {"match_precision": float(found / max(kept.sum(), 1)), "match_recall": float(found / max(total, 1))}
+    right, total = _right(pair, c)[kept].sum(), _right(pair, pair.matches().correspondences).sum()
+    return {"match_precision": float(right / max(kept.sum(), 1)), "match_recall": float(right / max(total, 1))}
 
 
 def _right(pair: ImagePair, c: Correspondences) -> NDArray[np.bool_]:
     """Which matches (n,) of a batch of one have a geodesic distance below OANet's threshold."""
     K0, K1, R, t = (cast(NDArray[np.float64], value) for value in (pair.K0, pair.K1, pair.R, pair.t))
-    ends = ((x[0].double().cpu().numpy() - K[:2, 2], K) for x, K in ((c.x0, K0), (c.x1, K1)))
-    distance = geodesic(R, t, *(x / K.diagonal()[:2] for x, K in ends))
+    distance = geodesic(R, t, K0, K1, *(x[0].double().cpu().numpy() for x in (c.x0, c.x1)))
     right: NDArray[np.bool_] = (distance < GEODESIC) & c.mask[0].cpu().numpy()
     return right
 

@@ -164,6 +164,11 @@ def rays(inverse: Tensor, x: Tensor) -> Tensor:
     return columns[:, 0] * x[..., 0] + columns[:, 1] * x[..., 1] + columns[:, 2]
 
 
+def calibrated(x: Array, K: Array) -> Array:
+    """K^-1 (x, y, 1) of pixels (n, 2) of one image, without the ones: (n, 2)."""
+    return rays(inverse(torch.from_numpy(K))[0], torch.from_numpy(x))[:2].T.contiguous().numpy()
+
+
 def inverse(K: Tensor) -> tuple[Tensor, Tensor]:
     """K^-1 by cofactors, and whether there is one."""
     C = cofactors(K)

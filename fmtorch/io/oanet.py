@@ -20,18 +20,20 @@ from fmtorch.core.files import replacing
 from fmtorch.data import DataError, GivenMatches, Lens
 from fmtorch.data.files import Array, Matrix
 from fmtorch.geometry.epipolar import symmetric_squared
+from fmtorch.geometry.pose import calibrated
 from fmtorch.io import h5, predictions
 
 GEODESIC = 1e-4  # of an inlier, squared focal lengths: obj_geod_th of OANet's code
 
 
-def geodesic(R: Matrix, t: Matrix, rays0: Matrix, rays1: Matrix) -> Matrix:
+def geodesic(R: Matrix, t: Matrix, K0: Matrix, K1: Matrix, x0: Matrix, x1: Matrix) -> Matrix:
     """OANet's geodesic distance (n,): the two squared distances to the epipolar lines added, in calibrated coordinates.
 
-    R, t: X1 = R X0 + t. rays0, rays1: matches (n, 2), ``(x - c) / f``. It does not depend on the length of t.
+    R, t: X1 = R X0 + t; the length of t does not count. x0, x1: matches (n, 2) in pixels.
     """
     E = np.cross(np.eye(3), t / (np.linalg.norm(t) or 1.0)).T @ R
-    values: Matrix = symmetric_squared(*(torch.from_numpy(value) for value in (E, rays0, rays1))).numpy()
+    given = E, calibrated(x0, K0), calibrated(x1, K1)
+    values: Matrix = symmetric_squared(*(torch.from_numpy(value) for value in given)).numpy()
     return values
 
 
@@ -160,10 +162,10 @@ class Entry:
     def arrays(self) -> Mapping[str, Array | None]:
         """What a file holds of it, by the names of its groups."""
         (K0, K1), t = self.cameras.K, self.cameras.t / np.linalg.norm(self.cameras.t)
-        rays0, rays1 = ((x - K[:2, 2]) / K.diagonal()[:2] for x, K in ((self.x0, K0), (self.x1, K1)))
         known = {f"{name}{i}s": K[[row], [2]] for i, K in ((1, K0), (2, K1)) for row, name in enumerate(("cx", "cy"))}
         return {
-            "xs": np.hstack([rays0, rays1])[None], "ys": geodesic(self.cameras.R, t, rays0, rays1)[:, None],
+            "xs": np.hstack([calibrated(self.x0, K0), calibrated(self.x1, K1)])[None],
+            "ys": geodesic(self.cameras.R, t, K0, K1, self.x0, self.x1)[:, None],
             "Rs": self.cameras.R, "ts": t[:, None], "ratios": self.ratios, "mutuals": self.mutuals, **known,
             "f1s": K0.diagonal()[None, :2], "f2s": K1.diagonal()[None, :2],
             "sizes": np.array(self.cameras.sizes, np.float64).ravel(),

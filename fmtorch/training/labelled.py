@@ -119,7 +119,7 @@ def label(dataset: PairDataset, pair: ImagePair, x0: Points, x1: Points, rule: R
         if any(value is None for value in cameras):
             raise ValueError(f"labels=geodesic needs K, R and t, which pair {pair.identity} does not have")
         K0, K1, R, t = (np.asarray(value) for value in cameras)
-        return by_geodesic(oanet.geodesic(R, t, *((x - K[:2, 2]) / K.diagonal()[:2] for x, K in ((x0, K0), (x1, K1)))))
+        return by_geodesic(oanet.geodesic(R, t, K0, K1, x0, x1))
     line = line_distance(pair.F, x0, x1)
     if not isinstance(dataset, DepthDataset) or any(value is None for value in cameras):
         return by_line(line)

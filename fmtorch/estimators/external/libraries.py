@@ -1,16 +1,18 @@
 """Robust estimators of OpenCV, kornia and, in the extra `peers`, of PoseLib, fastpose and the methods' authors."""
 
 from collections.abc import Mapping
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from fmtorch.core.options import Within
 from fmtorch.estimators.external import pairwise
 from fmtorch.estimators.external.pairwise import Confidence, Iterations, Pair, PairwiseEstimator, Points, Solution
 from fmtorch.geometry.eight_point import eight_point
+from fmtorch.geometry.pose import calibrated
 
 
 def opencv(
@@ -55,7 +57,7 @@ def opencv(
 
 
 def _of_essential(pair: Pair, K: tuple[Points, Points], options: Mapping[str, Any]) -> Solution:
-    rays = _calibrated(pair, K)
+    rays = calibrated(pair.x0, K[0]), calibrated(pair.x1, K[1])
     E, mask = cv2.findEssentialMat(*rays, np.eye(3), **options)
     if E is None:
         return None, np.zeros(len(pair.x0), np.bool_)
@@ -65,7 +67,7 @@ def _of_essential(pair: Pair, K: tuple[Points, Points], options: Mapping[str, An
     return _posed_by_essential(best, R, t, K, mask.ravel() > 0)
 
 
-def weighted_eight_point(*, best: float = 0.1) -> PairwiseEstimator:
+def weighted_eight_point(*, best: Annotated[float, Within(0, 1)] = 0.1) -> PairwiseEstimator:
     """The eight-point algorithm on all matches, weighted by P(inlier), without samples.
 
     So Yi et al. (CVPR 2018) and their successors test pruners without RANSAC: each match has the weight
@@ -84,19 +86,14 @@ def weighted_eight_point(*, best: float = 0.1) -> PairwiseEstimator:
         if K is None:
             x0, x1, w = (torch.from_numpy(value)[None] for value in (pair.x0, pair.x1, weight))
             return eight_point(x0, x1, w)[0][0].numpy(), weight > 0
-        rays0, rays1 = _calibrated(pair, K)
+        rays0, rays1 = calibrated(pair.x0, K[0]), calibrated(pair.x1, K[1])
         X = (np.insert(rays1, 2, 1, 1)[:, :, None] * np.insert(rays0, 2, 1, 1)[:, None]).reshape(-1, 9)
         E = np.linalg.eigh((X * weight[:, None]).T @ X)[1][:, 0].reshape(3, 3)
-        kept = p >= np.sort(p)[::-1][max(1, int(best * len(p)))]
+        kept = p >= np.sort(p)[::-1][min(max(1, int(best * len(p))), len(p) - 1)]
         _, R, t, _ = cv2.recoverPose(E, rays0[kept], rays1[kept])
         return _posed_by_essential(E, R, t, K, weight > 0)
 
     return PairwiseEstimator("the weighted eight-point algorithm", solve)
-
-
-def _calibrated(pair: Pair, K: tuple[Points, Points]) -> tuple[Points, Points]:
-    rays0, rays1 = ((x - k[:2, 2]) / k.diagonal()[:2] for x, k in zip((pair.x0, pair.x1), K, strict=True))
-    return rays0, rays1
 
 
 def _posed_by_essential(E: Any, R: Any, t: Any, K: tuple[Points, Points], inliers: NDArray[np.bool_]) -> pairwise.Posed:

@@ -10,7 +10,7 @@ from fmtorch.core.types import Correspondences
 from fmtorch.pruning.networks import layers, learned
 from fmtorch.pruning.networks.architectures import MatchInputs, WithOptions
 
-LEAST = 1e-6  # residual, in thresholds: bounds the log-odds of verification
+MIN_RESIDUAL = 1e-6  # residual, in thresholds: bounds the log-odds of verification
 
 
 class Consensus(nn.Module):
@@ -60,7 +60,7 @@ class Progressive(WithOptions):
         logit, weight_logit = self.last(self.block(y, slots)).to(x.dtype)
         weight = layers.spread(slots.softmax(weight_logit + nn.functional.logsigmoid(logit)), place, mask.shape)
         residual, determined = layers.fit_residuals(x, weight)
-        verified = -(residual / self.threshold).clamp_min(LEAST).log()
+        verified = -(residual / self.threshold).clamp_min(MIN_RESIDUAL).log()
         verified = torch.where(determined[:, None], verified, stages[1][2].detach())
         stages.append((place, left, logit))
         logits = [layers.spread(torch.where(left, logit, 0), place, mask.shape) for place, left, logit in stages]

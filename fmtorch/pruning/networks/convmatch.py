@@ -69,11 +69,8 @@ class Layer(nn.Module):
 
     def __init__(self, channels: int, heads: int) -> None:
         super().__init__()
-        self.align, self.back, self.filter = (
-            Attention(channels, heads),
-            Attention(channels, heads),
-            GridFilter(channels),
-        )
+        self.align, self.back = Attention(channels, heads), Attention(channels, heads)
+        self.filter = GridFilter(channels)
         pairs = list(itertools.pairwise((channels, *WIDTHS)))
         self.hidden = nn.ModuleList(layers.Perceptron(*pair) for pair in pairs)
         self.norms = nn.ModuleList(layers.ContextBatchNormReLU(width, CONTEXT_EPS) for width in WIDTHS)
@@ -108,8 +105,8 @@ class MotionField(nn.Module):
         """x has to be zero in masked slots, where the result means nothing."""
         x0, x1, side = x.transpose(0, 1).tensor_split((2, 4))
         y = self.motion(torch.cat([x1 - x0, side]), slots) + self.position(x0, slots)
-        one = layers.Slots(torch.full_like(slots.matches[:1], self.side**2), None)  # the grid, the same for all pairs
-        grid = self.grid_position(self.centres[:, None].to(x.dtype), one).expand(-1, x.shape[0], -1)
+        alike = layers.Slots(torch.full_like(slots.matches[:1], self.side**2), None)  # the grid, the same for all pairs
+        grid = self.grid_position(self.centres[:, None].to(x.dtype), alike).expand(-1, x.shape[0], -1)
         grid = slots.columns(self.side**2).clean(grid)
         logits = []
         for layer in self.layers:
