@@ -268,6 +268,8 @@ def test_the_weighted_eight_point_algorithm_is_oanets() -> None:
     s = matched_scene(100, 3, noise=0.2)
     error = metrics.pose_error(estimate.R, estimate.t, s.R[None].double(), s.t[None].double())
     assert float(error.worst) < 3
+    every = KnownCameras(presets.build("estimator", "weighted_eight_point", best=1.0))(c)
+    assert torch.equal(every.F, estimate.F)
 
 
 def test_opencvs_essential_matrix_is_that_of_its_own_call() -> None:

@@ -19,7 +19,7 @@ from fmtorch.evaluation import evaluate
 from fmtorch.evaluation.gallery import Options, find_dataset
 from fmtorch.evaluation.statistics import summarize
 from fmtorch.evaluation.tables import summary_markdown
-from fmtorch.io import H5Pairs
+from fmtorch.io import H5Pairs, oanet
 from fmtorch.pipeline import Outcome, Pipeline, load_pipeline
 from fmtorch.pruning import ratio_test
 from fmtorch.runs import to_table
@@ -350,3 +350,22 @@ def test_pruning_is_judged_as_oanets_test_does(tmp_path: Path) -> None:
     assert "beside mAP5° and mAP20° of OANet" in page
     failed = evaluate([Outcome(pair, reason="no") for pair in dataset])
     assert [(row.match_precision, row.match_recall) for row in failed] == [(0.0, 0.0)] * writers.PAIRS
+
+
+def test_geodesic_distances_are_of_calibrated_points_also_of_pixels_that_are_not_square() -> None:
+    generator = np.random.default_rng(0)
+    X, (K0, K1) = (
+        generator.uniform([-1, -1, 4], [1, 1, 8], (30, 3)),
+        np.array([[[700, 9, 320], [0, 650, 240], [0, 0, 1]], [[500, 0, 300], [0, 510, 200], [0, 0, 1]]], np.float64),
+    )
+    R, t = np.array([[0.8, -0.6, 0], [0.6, 0.8, 0], [0, 0, 1]]), np.array([2.0, 0.1, 0.3])
+    x0, x1 = (Y @ K.T / Y[:, 2:] for Y, K in ((X, K0), (X @ R.T + t, K1)))
+    x0, x1 = x0[:, :2], x1[:, :2]
+    assert oanet.geodesic(R, t, K0, K1, x0, x1).max() < 1e-25
+    x1[:, 1] += 5.1  # a hundredth of a focal length
+    E = np.cross(np.eye(3), t / np.linalg.norm(t)).T @ R
+    for i, distance in enumerate(oanet.geodesic(R, t, K0, K1, x0, x1)):
+        a, b = np.linalg.inv(K0) @ [*x0[i], 1], np.linalg.inv(K1) @ [*x1[i], 1]
+        line1, line0 = E @ a, E.T @ b
+        squared = (b @ E @ a) ** 2 * (1 / (line1[:2] @ line1[:2]) + 1 / (line0[:2] @ line0[:2]))
+        assert distance == pytest.approx(squared, rel=1e-9)
