@@ -87,6 +87,8 @@ def main() -> None:
     with exits_with_message():
         config = OmegaConf.merge(OmegaConf.create(DEFAULTS), OmegaConf.from_cli())
         assert isinstance(config, DictConfig)
+        if OmegaConf.is_missing(config, "checkpoint"):
+            raise ValueError("checkpoint is missing; it names the file of the trained network: checkpoint=FILE.pt")
         torch.set_num_threads(config.threads)
         content = read_checkpoint(config.checkpoint)
         config.architecture = architecture = config.architecture or content.get("architecture")
