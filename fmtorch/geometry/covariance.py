@@ -10,12 +10,12 @@ distance (Hartley & Zisserman 2004, 11.4.3), with three corrections:
    expectations are for the truncated square, the information is m / A of J^T W J.
 2. The noise s is estimated anew from the distances below 2.5 s, consistent at normal noise: the scale of a robust fit
    is biased by its own limits and by the parameters that were fitted.
-3. The derivatives by t hold noise, as if it were parallax; its expected share of their squares is taken from the
-   information about the direction of translation. Without that a camera that only turns seems to have one, known to
-   some ten degrees. Where a rotation explains the matches up to their noise, nothing is left. (The bias of matrices
-   of moments: Kanatani 1996, Statistical Optimization for Geometric Computation, chapter 9. The noise itself is not
-   subtracted: where other parameters leave little, the difference of two estimates says that nothing is known where
-   errors are a few degrees.)
+3. The derivatives by t hold noise, as if it were parallax, also once all that rotations and focal lengths explain is
+   taken from them: what is seen, S, is more than what there is, T, by the expected information N of noise alone. The
+   direction of translation is then known to ``T^-1 S T^-1`` (measurement error: Fuller 1987, section 2.2; the bias of
+   matrices of moments: Kanatani 1996, Statistical Optimization for Geometric Computation, chapter 9). Without that a
+   camera that only turns seems to have a direction, known to some ten degrees. Where a rotation explains the matches
+   up to their noise, nothing is left.
 
 Weights that are no inverse variances, such as P(inlier), count by ``sum w / sum w^2`` (Kish 1965). Independent noise
 is assumed; on real pairs neighbours err alike, and deviations come out too small.
@@ -260,12 +260,9 @@ def two_view_covariance(
     used = _directions(known, shared)
     s = noise_of(r.detach(), w, T, used.amax(0).sum(0))
     information, from_noise = information_of(r, J, in_slopes, w, T, s)
-    by_direction = information[3, 3] + information[4, 4]
-    share = (from_noise[0, 0] + from_noise[1, 1]) / torch.where(by_direction > 0, by_direction, 1.0)
     near = (w > 0) & (r < torch.minimum(T, WINDOW * s)[:, None])
     still = explained_by_rotation(a0.to(kind), a1.to(kind), R.movedim(0, -1), f.movedim(0, -1), n * s[:, None], near)
-    share = torch.where(still, 1.0, share)
-    C = _without(_covariance(information, Pi.movedim(0, -1), used), share.clamp(0, 1))
+    C = _without_noise(_covariance(information, Pi.movedim(0, -1), used), from_noise, still)
     V = _of_fundamental(C, F, slopes, p0.movedim(0, -1), p1.movedim(0, -1))
     return TwoViewCovariance(C.movedim(-1, 0), basis.movedim(-1, 0), V.movedim(-1, 0), s, valid)
 
@@ -308,13 +305,15 @@ def _covariance(information: Tensor, Pi: Tensor, used: Tensor) -> Tensor:
     return (C + C.transpose(0, 1)) / 2
 
 
-def _without(C: Tensor, share: Tensor) -> Tensor:
-    """The covariance (7, 7, b) with a share (b,) of the information about the direction of translation taken away.
-    The other parameters keep their distribution given that direction, whose own covariance becomes larger. What
-    `DIFFUSE` knows of it stays."""
+def _without_noise(C: Tensor, noise: Tensor, still: Tensor) -> Tensor:
+    """The covariance (7, 7, b) with that of the direction of translation corrected for what of its information is noise
+    (2, 2, b). The other parameters keep their distribution given that direction. What `DIFFUSE` knows of it stays, and
+    is all where the camera stood `still` (b,)."""
     S, eye = _inverse(C[3:5, 3:5]), torch.eye(2, dtype=C.dtype, device=C.device)[..., None]
-    diffuse_information = eye * DIFFUSE[3] ** -2
-    grown = _inverse(_positive_part(S * (1 - share) - diffuse_information) + diffuse_information)
+    diffuse = eye * DIFFUSE[3] ** -2
+    seen = _positive_part(S - diffuse)
+    left = torch.where(still, 0.0, _positive_part(seen - noise))
+    grown = _inverse(_product(left, _product(_inverse(seen + diffuse), left)) + diffuse)
     by_direction = _product(C[:, 3:5], S)
     C = C + _product(by_direction, _product(grown - C[3:5, 3:5], by_direction.transpose(0, 1)))
     return (C + C.transpose(0, 1)) / 2

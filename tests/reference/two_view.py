@@ -125,6 +125,13 @@ def noise(r: np.ndarray, w: np.ndarray, truncation: float, parameters: int) -> f
     return s
 
 
+def positive_part(A: np.ndarray) -> np.ndarray:
+    """A symmetric matrix with its negative eigenvalues set to zero."""
+    values, vectors = np.linalg.eigh(A)
+    result: np.ndarray = vectors @ np.diag(np.maximum(values, 0)) @ vectors.T
+    return result
+
+
 def covariance(
     cameras: Cameras, x0: np.ndarray, x1: np.ndarray, w: np.ndarray, n: np.ndarray, truncation: float,
     precision: np.ndarray, basis: np.ndarray,
@@ -139,14 +146,33 @@ def covariance(
     information = factor * (J.T * v) @ J / s**2
     information += np.diag(np.array([1.33, 1.33, 1.33, 1.21, 1.21, 2.3, 2.3]) ** -2.0)
     information[5:, 5:] += precision
-    # The marginal information about the direction of t, less the share of its derivatives that is noise, with at least
-    # that of 1.21 radians.
+    # Of the marginal information S about the direction of t noise is taken, which leaves T; known is T S^-1 T, and at
+    # least what 1.21 radians are.
     free = basis.T @ information @ basis
     S = np.linalg.inv(np.linalg.inv(free)[3:5, 3:5])
     diffuse_information = np.eye(2) / 1.21**2
-    share = np.trace(np.einsum("n,nij->ij", v, in_slopes)) / np.trace((J[:, 3:5].T * v) @ J[:, 3:5] / s**2)
-    values, vectors = np.linalg.eigh(S * (1 - min(share, 1)) - diffuse_information)
-    free[3:5, 3:5] += vectors @ np.diag(np.maximum(values, 0)) @ vectors.T + diffuse_information - S
+    seen = positive_part(S - diffuse_information)
+    T = positive_part(seen - factor * np.einsum("n,nij->ij", v, in_slopes))
+    free[3:5, 3:5] += T @ np.linalg.inv(seen + diffuse_information) @ T + diffuse_information - S
     C = basis @ np.linalg.inv(free) @ basis.T
     G = slopes(lambda c: c.fundamental().ravel(), cameras)
     return C, G @ C @ G.T, s
+
+
+def fit(
+    cameras: Cameras, x0: np.ndarray, x1: np.ndarray, truncation: float, basis: np.ndarray, mean: np.ndarray,
+    precision: np.ndarray, sigma: float,
+) -> Cameras:  # fmt: skip
+    """Gauss-Newton of ``sum min(r^2, T^2) / 2 sigma^2`` with a normal prior of the log focal lengths (2,)."""
+    for _ in range(30):
+        r = residuals(cameras, x0, x1)
+        J = slopes(lambda c: residuals(c, x0, x1), cameras)
+        near = np.abs(r) < truncation
+        H, g = J[near].T @ J[near] / sigma**2, J[near].T @ r[near] / sigma**2
+        H[5:, 5:] += precision
+        g[5:] += precision @ (np.log(cameras.focal) - mean)
+        step = basis @ np.linalg.solve(basis.T @ H @ basis, -basis.T @ g)
+        cameras = cameras.moved(step)
+        if np.abs(step).max() < 1e-10:
+            break
+    return cameras
