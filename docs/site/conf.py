@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import re
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,16 @@ version = release = fmtorch.__version__
 
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
 root_doc = "docs/index"  # the source folder is the repository, so that links between pages work there, too
-include_patterns = ["README.md", "CHANGELOG.md", "CONTRIBUTING.md", "docs/*.md", "docs/*/*.md", "models/*.md"]
+include_patterns = [
+    "README.md",
+    "CHANGELOG.md",
+    "CONTRIBUTING.md",
+    "docs/*.md",
+    "docs/*/*.md",
+    "models/*.md",
+    "docs/notebooks/*.ipynb",
+]
+source_suffix = {".md": "markdown", ".ipynb": "markdown"}
 myst_heading_anchors = 3
 myst_enable_extensions = ["colon_fence"]
 suppress_warnings = ["myst.header", "ref.python"]  # a dimension may have the name of a field
@@ -38,6 +48,24 @@ html_js_files = ["copy.js"]
 FRONT = """<!doctype html><meta charset="utf-8"><title>fmtorch</title>
 <meta http-equiv="refresh" content="0; url=docs/index.html"><a href="docs/index.html">fmtorch</a>
 """
+
+
+def _notebook(app: object, docname: str, source: list[str]) -> None:
+    """A notebook as a page: its text, its code, and what that gave when it was last run."""
+    if not docname.startswith("docs/notebooks/"):
+        return
+    parts = []
+    for cell in json.loads(source[0])["cells"]:
+        text = "".join(cell["source"])
+        parts.append(text if cell["cell_type"] == "markdown" else f"```python\n{text}\n```")
+        for output in cell.get("outputs", ()):
+            data = output.get("data", {})
+            pictures = [kind for kind in data if kind.startswith("image/")]
+            if pictures:
+                parts.append(f'<img alt="" src="data:{pictures[0]};base64,{"".join(data[pictures[0]]).strip()}">')
+            elif shown := "".join(output.get("text", data.get("text/plain", ""))).rstrip():
+                parts.append(f"```text\n{shown}\n```")
+    source[0] = "\n\n".join(parts)
 
 
 def _plain_text(app: object, what: str, name: str, obj: object, options: object, lines: list[str]) -> None:
@@ -109,6 +137,7 @@ def _front(app: Any, error: Exception | None) -> None:
 
 def setup(app: Any) -> None:
     """Called by Sphinx."""
+    app.connect("source-read", _notebook)
     app.connect("autodoc-process-docstring", _fields, priority=100)
     app.connect("autodoc-process-signature", _signature)
     app.connect("build-finished", _front)

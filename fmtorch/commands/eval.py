@@ -44,12 +44,13 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
     presets.expect_buildable(dataset_config, "dataset")
     presets.expect_stages(config)
     model = getattr(presets.target_of(dataset_config, "dataset"), "model", "fundamental")
-    if model != "fundamental" and (exports or fields.cameras is not None):
-        raise ValueError(f"the data set has {model} matrices, which take no export= and no cameras=: leave them out")
+    if model != "fundamental" and (exports or fields.cameras is not None or fields.lens is not None):
+        raise ValueError(f"the data set has {model} matrices, which take no export=, cameras=, lens=: leave them out")
     with progress_bars() as progress:
         pipeline: Pipeline = build_pipeline(config, device, model)
         dataset = data.build(dataset_config, reporter(progress, "drawing scenes"))
-        identity = run_identity(config, pipeline_name, pipeline, dataset.digest, fields.cameras, fields.pose.signed)
+        known = fields.cameras, fields.pose.signed, fields.lens
+        identity = run_identity(config, pipeline_name, pipeline, dataset.digest, *known)
         name = f"{pipeline_name.replace('/', '-')}-{identity_digest(identity)[:8]}"
         folder = RunFolder.open(fields.output or Path(f"runs/{dataset.name}/{name}"), identity)
         pairs = select([dataset[i] for i in range(len(dataset))], fields.limit)
@@ -109,11 +110,11 @@ def _evaluated(
     if execution.shared and execution.workers is None and pipeline.device.type != "cpu":
         execution = dataclasses.replace(execution, workers=1)
     build = None if execution.shared else functools.partial(build_pipeline, config, pipeline.device, None)
-    cameras = None
-    if fields.cameras is not None:
-        cameras = cameras_of(pairs, fields.cameras)
-        build = None if build is None else functools.partial(built_with, build, {})
-        pipeline = built_with(lambda: pipeline, cameras)
+    cameras = None if fields.cameras is None else cameras_of(pairs, fields.cameras)
+    if cameras is not None or fields.lens is not None:
+        later = None if cameras is None else {}
+        build = None if build is None else functools.partial(built_with, build, later, fields.lens)
+        pipeline = built_with(lambda: pipeline, cameras, fields.lens)
     return evaluate_pairs(
         pipeline, pairs, seed=fields.seed, batch=fields.batch, execution=execution, store=folder.append, build=build,
         cameras=cameras, journal=journal, signed=fields.pose.signed,

@@ -10,12 +10,28 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from fmtorch.core.files import STAGES
-from fmtorch.core.options import CACHE, CACHE_LIMIT, Cache, Count, Device, Gigabytes, Seed, Within, defaults_of, option
+from fmtorch.core.options import (
+    CACHE,
+    CACHE_LIMIT,
+    DEBUG,
+    Cache,
+    Count,
+    Debug,
+    Device,
+    Gigabytes,
+    Seed,
+    Within,
+    defaults_of,
+    option,
+)
 from fmtorch.training.options import TrainOptions
 
 DEVICE = "auto | cpu | cuda | cuda:1 | mps"
-DEBUG = "true: stop at the first error of a part and show all of its traceback; pdb: and look at it in the debugger"
-Debug = bool | Literal["pdb"]
+BentBy = Literal["shared", "unknown"] | float | None
+LENS = (
+    "how much lenses bend straight lines: shared (one unknown lens), unknown (one of each image), or lambda of the "
+    "division model in half diagonals; null: not at all"
+)
 REPLACED = "Groups are replaced by name (estimator=lmeds), values by path (estimator.threshold=0.5)."
 
 
@@ -49,6 +65,7 @@ class EvalOptions:
         "what the estimator is given of each pair's cameras, whose pose is then evaluated; part of the run's identity: "
         "null (nothing, the pose is that of F with the true calibrations) | known | shared | exif | unknown",
     )
+    lens: BentBy = option(None, f"{LENS}. Part of the run's identity")
     pose: PoseOptions = option(PoseOptions(), "how poses are judged")
     device: Device = option("auto", DEVICE)
     batch: Count = option(16, "pairs that travel together; changes no result")
@@ -92,11 +109,7 @@ class MatchOptions:
     K: str | list[float | int] | None = option(
         None, "fx,fy,cx,cy of all cameras, in pixels of the images as they are shown"
     )
-    lens: Literal["shared", "unknown"] | float | None = option(
-        None,
-        "how much lenses bend straight lines: shared (one unknown lens), unknown (one of each image), or lambda of the "
-        "division model in half diagonals; null: not at all",
-    )
+    lens: BentBy = option(None, LENS)
     truth: Path | None = option(
         None, "a text file with the nine numbers of the true F, row by row, in pixels of the images as they are shown"
     )
@@ -175,6 +188,7 @@ class VerifyOptions:
         "stored",
         "stored | shared | unknown: the database's cameras and priors, one unknown focal length, nothing known",
     )
+    lens: BentBy = option(None, f"{LENS}; of images whose stored camera does not distort")
     force: bool = option(False, "true: estimate pairs that have a geometry as well, and replace an existing output")
     seed: Seed = option(0, "of sampling")
     shard: str | None = option(

@@ -29,7 +29,7 @@ def run(config: DictConfig, estimator: str) -> Verification:
     execution = execution_of(config).decided(False)
     if execution.shared and execution.workers is None:
         execution = ONE_THREAD
-    mode = VerifyMode(fields.cameras, fields.force, fields.seed, execution, shard_of(fields.shard))
+    mode = VerifyMode(fields.cameras, fields.lens, fields.force, fields.seed, execution, shard_of(fields.shard))
     with _begun_by_reports(estimator) as report:
         paths = VerifyPaths(fields.database, fields.features_file, fields.matches, fields.output)
         result = verify_by(make, {"estimator": plain(config.estimator)}, paths, mode, report)

@@ -17,7 +17,7 @@ import typing
 from collections import ChainMap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, TypeVar, cast
+from typing import Annotated, Any, Literal, TypeVar, cast
 
 T = TypeVar("T")
 PLAIN = (bool, int, float, str, type(None), list, tuple, Mapping)  # what a YAML file or a command line can say
@@ -65,6 +65,8 @@ Device = Annotated[str, DeviceName()]
 Cache = Path | bool | None  # false is off
 Gigabytes = Annotated[int | float, Within(0)]
 CACHE = "folder of features computed before; null: features in $FMTORCH_CACHE or ~/.cache/fmtorch; off: none"
+DEBUG = "true: stop at the first error of a part and show all of its traceback; pdb: and look at it in the debugger"
+Debug = bool | Literal["pdb"]
 CACHE_LIMIT = "GB, beyond which the least recently used features go; null: no bound"
 
 

@@ -120,7 +120,7 @@ def _of_homographies(outcomes: Sequence[Outcome]) -> list[Figures]:
 def _row(outcome: Outcome, figures: Figures, planar: bool, seconds: float) -> PairRow:
     pair, c, estimate = outcome.pair, outcome.correspondences, outcome.estimate
     ok, pair_type, focals = outcome.solved, outcome.pair_type, focal_errors(outcome)
-    suggested = None if estimate is None else estimate.lens_suggested
+    lenses = (None, None, None) if estimate is None else _lenses(estimate)
     matrix = estimate.F[0].flatten().tolist() if estimate is not None and ok else None
     figures = figures | {f"seconds_{stage}": outcome.seconds.get(stage, math.nan) for stage in STAGES}
     return PairRow(
@@ -136,8 +136,16 @@ def _row(outcome: Outcome, figures: Figures, planar: bool, seconds: float) -> Pa
         warning=outcome.not_examined or None if pair_type is None else pair_type.warnings[0],
         focal_error0=focals.error[0], focal_error1=focals.error[1],
         focal_log_ratio0=focals.log_ratio[0], focal_log_ratio1=focals.log_ratio[1],
-        lens_suggested=None if suggested is None or bool(suggested.isnan()) else float(suggested),
+        lens_suggested=lenses[0], lens0=lenses[1], lens1=lenses[2],
     )  # fmt: skip
+
+
+def _lenses(estimate: Estimate) -> list[float | None]:
+    """Lambda of the lens that is suggested, and of those that are estimated; None where not determined."""
+    unknown = [math.nan, math.nan]
+    suggested = [math.nan] if estimate.lens_suggested is None else estimate.lens_suggested.tolist()
+    values = suggested + (unknown if estimate.lens is None else estimate.lens[0].tolist())
+    return [None if math.isnan(value) else value for value in values]
 
 
 class PairPose(NamedTuple):

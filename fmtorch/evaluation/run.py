@@ -33,6 +33,8 @@ from fmtorch.presets import plain
 from fmtorch.runs import CachedFeatures, PairRow
 from fmtorch.runs.fingerprint import code_digest, file_digest, fmtorch_version, learned, libraries
 from fmtorch.two_view import known_cameras, pair_type
+from fmtorch.two_view.arguments import Lens, lens_fields
+from fmtorch.two_view.estimation import expect_lenses
 
 PLACES = ("root", "file", "truth", "images")
 """Options of data sets that say where things lie; the digest says what they are."""
@@ -40,20 +42,21 @@ PLACES = ("root", "file", "truth", "images")
 
 def run_identity(
     config: DictConfig, pipeline_name: str, pipeline: Pipeline, dataset_digest: str, cameras: str | None = None,
-    signed: bool = False,
+    signed: bool = False, lens: Lens = None,
 ) -> dict[str, Any]:  # fmt: skip
     """The identity of a run, as plain values.
 
     Args:
         config: a composed config: stages, data set, seed. pipeline_name: the preset that it began with.
         pipeline: what was built of the config. dataset_digest: of the contents of the data set.
-        cameras: what the estimator is given of them; None: nothing. signed: whether the sign of a translation counts.
+        cameras, lens: what the estimator is given of them; None: nothing. signed: whether the sign of a translation
+            counts.
 
     Returns:
         `pipeline`, each stage's config (pruners as a list), `seed`; `version` of fmtorch, in a checkout its commit;
         `libraries`: their versions; `kernels`: by which numba, or off; `learned`: digests of each stage's learned
         files; `code`: digests of the sources of parts of the user's own; `dataset`: its config, without where it lies,
-        and its digest; `cameras`, where they are given; `pose`, where translations are signed.
+        and its digest; `cameras` and `lens`, where they are given; `pose`, where translations are signed.
     """
     stages = presets.stages(config)
     dataset = {key: value for key, value in plain(config.dataset).items() if key not in PLACES}
@@ -63,7 +66,8 @@ def run_identity(
         "libraries": libraries(presets.peer_packages(stages)), "kernels": kernel.identity(),
         "learned": _learned(stages, pipeline),
         "code": _code({"stages": stages, "dataset": dataset}), "dataset": dataset,
-        **({} if cameras is None else {"cameras": cameras}), **({"pose": {"signed": True}} if signed else {}),
+        **({} if cameras is None else {"cameras": cameras}), **({} if lens is None else {"lens": lens}),
+        **({"pose": {"signed": True}} if signed else {}),
     }  # fmt: skip
 
 
@@ -151,32 +155,43 @@ def _two(first: tuple[float, float], second: tuple[float, float]) -> Tensor:
 
 
 class WithPairCameras:
-    """An estimator that is given the cameras of each pair, which it finds by the pairs' keys."""
+    """An estimator that is given the cameras of each pair, which it finds by the pairs' keys, or a lens, or both."""
 
     model = "fundamental"
 
-    def __init__(self, estimator: Estimator, cameras: Mapping[int, PairCameras]) -> None:
-        """cameras: of `cameras_of`, of all pairs that will come; or they are added before their pairs come."""
-        self._estimator, self.cameras = known_cameras.KnownCameras(estimator), dict(cameras)
+    def __init__(self, estimator: Estimator, cameras: Mapping[int, PairCameras] | None, lens: Lens = None) -> None:
+        """cameras: of `cameras_of`, of all pairs that will come; or they are added before their pairs come; None:
+        nothing is given of them. lens: as of `find_fundamental`."""
+        self._estimator = known_cameras.KnownCameras(estimator)
+        self.cameras, self._lens = None if cameras is None else dict(cameras), lens_fields(lens)
 
     def __call__(self, c: Correspondences, seed: int = 0) -> Estimate:
-        return self._estimator(self.given(c), seed)
+        estimator = self._estimator.estimator if self.cameras is None else self._estimator
+        return estimator(self.given(c), seed)
 
     @property
     def kernels(self) -> Sequence[object]:
         return getattr(self._estimator.estimator, "kernels", ())
 
     def given(self, c: Correspondences) -> Correspondences:
+        lens = {name: value.to(c.mask.device).expand(len(c), *value.shape) for name, value in self._lens.items()}
+        c = c.derived(**lens)
+        if self.cameras is None:
+            return c
         K0, K1, focal, shared = zip(*[self.cameras[key] for key in c.keys.tolist()], strict=True)
         stacked = [None if K[0] is None else torch.stack(K).to(c.mask.device) for K in (K0, K1, focal)]  # all, or none
         fields = dict(zip(("K0", "K1", "focal"), stacked, strict=True))
         return c.derived(**fields, shared_focal=torch.tensor(shared, device=c.mask.device))
 
 
-def built_with(build: Callable[[], Pipeline], cameras: Mapping[int, PairCameras]) -> Pipeline:
-    """A pipeline whose estimator is given the cameras of each pair."""
+def built_with(
+    build: Callable[[], Pipeline], cameras: Mapping[int, PairCameras] | None, lens: Lens = None
+) -> Pipeline:  # fmt: skip
+    """A pipeline whose estimator is given the cameras of each pair, and what is known of lenses."""
     pipeline = build()
-    pipeline.estimator = WithPairCameras(pipeline.estimator, cameras)
+    if lens is not None:
+        expect_lenses(pipeline.estimator, type(pipeline.estimator).__name__)
+    pipeline.estimator = WithPairCameras(pipeline.estimator, cameras, lens)
     return pipeline
 
 
@@ -214,17 +229,19 @@ def evaluate_batch(pipeline: Pipeline, batch: Batch) -> Work:
     """The rows of a batch, and what is to be exported of it."""
     cache = pipeline.extractor if batch.counted and isinstance(pipeline.extractor, CachedFeatures) else None
     computed, from_cache = (cache.computed, cache.found) if cache else (0, 0)
+    informed = pipeline.estimator if isinstance(pipeline.estimator, WithPairCameras) else None
     if batch.cameras is not None:
-        assert isinstance(pipeline.estimator, WithPairCameras)
-        pipeline.estimator.cameras |= batch.cameras
+        assert informed is not None
+        assert informed.cameras is not None
+        informed.cameras |= batch.cameras
     pair_type.compile_with([*pipeline.pruners.values(), pipeline.estimator])
-    knowledge = pipeline.estimator.given if isinstance(pipeline.estimator, WithPairCameras) else None
+    knowledge = None if informed is None else informed.given
     outcomes = examined(pipeline, pipeline.run(batch.pairs, batch.seed), batch.seed, knowledge)
     records = match_records(pipeline, outcomes) if batch.export else None
     rows = evaluate(outcomes, batch.seed, batch.signed)
-    if batch.cameras is not None and isinstance(pipeline.estimator, WithPairCameras):
-        for key in batch.cameras:
-            pipeline.estimator.cameras.pop(key, None)
+    if informed is not None and informed.cameras is not None:
+        for key in batch.cameras or ():
+            informed.cameras.pop(key, None)
     counts = (cache.computed - computed, cache.found - from_cache) if cache else (0, 0)
     return Work(rows, *counts, records, dict(pipeline.tracebacks))
 

@@ -399,10 +399,11 @@ def _estimated(
         lenses = photographs.division_lenses(estimate.lens[0], c, scales)
         c = photographs.undistorted_matches(c, lenses, scales).derived(lens=None, shared_lens=None)
     even, F, even_scales = photographs.evenly_reduced(c, estimate.F, scales)
-    pair_type = classify(even, estimate.derived(F=F), seed=seed)
+    of_pinholes = estimate.derived(F=F, lens=None)
+    pair_type = classify(even, of_pinholes, seed=seed)
     clock("pair_type")
     index = np.arange(c.mask.shape[1]).repeat(2).reshape(-1, 2)
-    (geometry,) = pair_geometries([index], even, estimate.derived(F=F), pair_type)
+    (geometry,) = pair_geometries([index], even, of_pinholes, pair_type)
     inliers = estimate.inliers[0]
     cameras = estimate.R, estimate.t, estimate.focals, estimate.lens
     R, t, focals, lens = (None if value is None else value[0] for value in cameras)

@@ -62,6 +62,8 @@ class PairRow:
     focal_log_ratio0: float | None = None  # log(f / f_true); None where it is not determined, too
     focal_log_ratio1: float | None = None
     lens_suggested: float | None = None  # lambda of both lenses where matches contradict pinholes
+    lens0: float | None = None  # lambda of image 0 where lenses are estimated; None where it is not determined
+    lens1: float | None = None
     H: Sequence[float] | None = None  # row by row, x1 ~ H x0 in pixels, unit Frobenius norm
     corner_error: float | None = None  # px in image 1, of the corners of image 0; infinite where the pair failed
     match_precision: float | None = None  # of given matches of known cameras, by OANet's geodesic labels: the share of
@@ -200,7 +202,7 @@ def content_digest(data: bytes) -> str:
     return hashlib.blake2b(data, digest_size=8).hexdigest()
 
 
-FORMAT = 2  # of the folder; to be raised when the schema changes, or what the identity tells
+FORMAT = 3  # of the folder; to be raised when the schema changes, or what the identity tells
 _LISTINGS = 20  # at most, until parts are those that were listed
 
 

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from fmtorch.core.options import CACHE, CACHE_LIMIT, Cache, Count, Gigabytes, Seed, Within, option
+from fmtorch.core.options import CACHE, CACHE_LIMIT, DEBUG, Cache, Count, Debug, Gigabytes, Seed, Within, option
 
 Real = float | int
 Range = Sequence[Real]  # the least and the most
@@ -185,3 +185,4 @@ class TrainOptions:
     augmentation: AugmentationOptions = option(AugmentationOptions(), "of matches; null turns a change off")
     validation: ValidationOptions = option(ValidationOptions(), "through estimators")
     checkpoint_every: Count = option(100, "steps")
+    debug: Debug = option(False, DEBUG)

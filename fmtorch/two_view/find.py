@@ -106,7 +106,7 @@ def find_fundamental(
             at all; "shared": one unknown lambda, "unknown": one for each image; lambda, exactly; (lambda, s) up to a
             standard deviation s; ((lambda0, s0), (lambda1, s1)) or (B, 2, 2) for each image, None in place of an
             unknown one. Points and inliers are of the photographs, F, E and the pose of the pixels of pinholes. With
-            K0 or K1 it needs the image sizes. There are no gradients, covariance or pair type then.
+            K0 or K1 it needs the image sizes. There are no gradients and no covariance then.
         covariance: whether the estimate has its covariance, which needs K0 and K1 or the image sizes. Where nothing is
             said of the cameras these are as of ``focal="unknown"``.
         pair_type: whether it has the type of each pair: general, planar, rotation, identical, unrelated.
@@ -143,7 +143,7 @@ def find_fundamental(
     if covariance and K0 is None and K1 is None and focal is None:
         focal = "unknown"
     if lens is not None:
-        _expect_lens(size0, K0 is not None or K1 is not None, covariance or pair_type)
+        _expect_lens(size0, K0 is not None or K1 is not None, covariance)
     h0w0, h1w1, assume_sizes = given_sizes(size0, size1)
     c = correspondences(
         x0, x1, mask=mask, ratio=ratio, score=score, prior=prior, lafs0=lafs0, lafs1=lafs1, noise=noise, size0=h0w0,
@@ -158,10 +158,10 @@ def find_fundamental(
     return with_pair_type(estimate, c, seed) if pair_type else estimate
 
 
-def _expect_lens(size: Size, calibrated: bool, more: bool) -> None:
+def _expect_lens(size: Size, calibrated: bool, covariance: bool) -> None:
     """Raise ValueError where a lens has no place."""
-    if more:
-        raise ValueError("lens is given: covariance and pair_type are of pinholes; undistort the points for them")
+    if covariance:
+        raise ValueError("lens is given: a covariance is of pinholes; undistort the points for it")
     if isinstance(size, str) or (calibrated and size is None):
         raise ValueError("lens needs the image sizes, in whose half diagonals it is: give size0 and size1")
 

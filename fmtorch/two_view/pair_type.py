@@ -24,6 +24,7 @@ from fmtorch.two_view.known_cameras import calibration
 
 FOCAL_DEVIATION = 0.02
 """Of the focal lengths of a calibration, relative: what zoom and focus change between two days."""
+MIN_DEPTH = 0.1  # of points that a lens is said to bend beyond the horizon
 STILL = 0.1  # px of the images as matched: a median motion below it is none
 USUAL_FOCAL, USUAL_DEVIATION = 1.2, 0.4  # of photographs, in longer sides, and of its logarithm (the estimator's prior)
 SAME_POSE = 1e-3  # radians: two poses of a plane that differ less in rotation are one
@@ -119,6 +120,7 @@ def classify(
         raise ValueError(f"focal_deviation is {focal_deviation}; it must not be negative")
     expect_values(c)
     compile_with(())
+    c = straightened(c, estimate.lens)
     matches = c.detach().derived(K0=None, K1=None, focal=None, shared_focal=None)
     H = estimated(matches, "homography", "homography", None, seed, options)
     K0, K1, precision = _cameras(c, focal_deviation)
@@ -129,6 +131,23 @@ def classify(
     exact = None if precision is None else precision.diagonal(dim1=-2, dim2=-1).isinf().all(-1)
     kind = kinds.classified(evidence, exact)
     return PairTypes(torch.where(estimate.ok | H.ok, kind, kinds.UNRELATED), evidence, H)
+
+
+def straightened(c: Correspondences, lens: Tensor | None) -> Correspondences:
+    """The matches as pinholes have them whose lenses (b, 2) are estimated, straight where these are not determined."""
+    if lens is None:
+        return c
+    fields: dict[str, Any] = {"lens": None, "shared_lens": None}
+    bends = lens.nan_to_num(0).to(c.x0).unbind(1)
+    for i, (x, K, size, bend) in enumerate(zip((c.x0, c.x1), (c.K0, c.K1), (c.size0, c.size1), bends, strict=True)):
+        assert size is not None
+        half = sqrt(component_sum(size.to(torch.float64) ** 2, -1)) / 2
+        A = calibration(half, size) if K is None else K / K[:, 2:, 2:]
+        centre, f = (value[:, None].to(x) for value in (A[:, :2, 2], A.diagonal(dim1=1, dim2=2)[:, :2]))
+        ray = (x - centre) / f * (sqrt(f[..., :1] * f[..., 1:]) / half[:, None, None].to(x))
+        depth = 1 + bend[:, None] * component_sum(ray * ray, -1)
+        fields[f"x{i}"] = centre + (x - centre) / depth.clamp_min(MIN_DEPTH)[..., None]
+    return c.derived(**fields)
 
 
 def _cameras(c: Correspondences, deviation: float | int) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
@@ -168,6 +187,7 @@ def _camera(K: Tensor | None, size: Tensor | None, focal: Tensor, known: Tensor)
 def with_pair_type(estimate: Estimate, c: Correspondences, seed: int, **options: Any) -> Estimate:
     """The estimate with the fields `pair_type_index`, `homography`, `other_R`, `other_t`; c: all its matches."""
     judged = classify(c.detach(), estimate.detach(), seed=seed, **options)
+    c = straightened(c, estimate.lens)
     H, kind, flat = judged.homography, judged.kind, judged.flat
     fields = {"pair_type_index": kind, "homography": torch.where(flat[:, None, None], H.F, 0)}
     if c.K0 is not None and c.K1 is not None and estimate.R is not None:

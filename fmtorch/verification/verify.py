@@ -48,8 +48,9 @@ class DatabasePair(NamedTuple):
     matches: NDArray[np.int64]
 
 
-def as_correspondences(pair: DatabasePair, cameras: Cameras) -> Correspondences:
+def as_correspondences(pair: DatabasePair, cameras: Cameras, lens: arguments.Lens = None) -> Correspondences:
     """The pair as a batch of one, with what is known of its cameras; of pinholes where these are those stored.
+    lens: as of `fmtorch.find_fundamental`, where no stored lens distorts.
     Without image sizes and K nothing is asked of cameras. Raises ValueError where a stored camera is none that there
     can be, and as `fmtorch.find_fundamental` for values, sizes and points that contradict each other."""
     images, stored = (pair.image0, pair.image1), cameras == "stored"
@@ -64,11 +65,14 @@ def as_correspondences(pair: DatabasePair, cameras: Cameras) -> Correspondences:
     key = pair_key(f"{images[0].name} {images[1].name}")
     points = [image.points[pair.matches[:, i]] for i, image in enumerate(images)]
     mask: Any = np.isfinite(points[0]).all(-1) & np.isfinite(points[1]).all(-1)
-    c = arguments.correspondences(*points, mask=mask, focal=focal, key=key, **known)
+    straight = not stored or all(image.pinhole is image.points for image in images)
+    if lens is not None and not all(image.size is not None for image in images):
+        raise ValueError("lens needs the image sizes: size0 and size1")
+    c = arguments.correspondences(*points, mask=mask, focal=focal, lens=lens if straight else None, key=key, **known)
     if sized or with_K:
         same = images[0].camera_id == images[1].camera_id and images[0].deviation > 0
         c = c.derived(shared_focal=torch.tensor([cameras == "shared" or (stored and same)]))
-    if not stored or all(image.pinhole is image.points for image in images):
+    if straight:
         return c
     x0, x1 = (torch.from_numpy(image.pinhole[pair.matches[:, i]])[None] for i, image in enumerate(images))
     return c.derived(x0=x0, x1=x1, mask=torch.isfinite(x0).all(-1) & torch.isfinite(x1).all(-1))
@@ -115,6 +119,7 @@ class GeometryParts:
 
 
 BATCH = 64  # pairs that are read, and kept, at a time
+ONE_THREAD = Execution("threads", 1)  # that calls an estimator, which uses as many as torch may
 PRELOADED = (__name__,)  # by the process that workers are forked of
 
 
@@ -155,11 +160,22 @@ class Verification:
         return sum(count for kind, count in self.configurations.items() if kind != "degenerate")
 
 
+@dataclasses.dataclass(frozen=True)
+class VerifyMode:
+    """How pairs are verified: what is taken for known of cameras and lenses, what is replaced, by whom, which pairs."""
+
+    cameras: str = "stored"
+    lens: arguments.Lens = None
+    force: bool = False
+    seed: int = 0
+    execution: Execution = ONE_THREAD
+    shard: Shard | None = None
+
+
 class Batch(NamedTuple):
     """Pairs that were read, and how to estimate them; the problems of those that could not be read."""
 
-    cameras: Cameras
-    seed: int
+    mode: VerifyMode
     ids: list[_PairIds]
     pairs: list[DatabasePair]
     problems: list[tuple[_PairIds, str]]
@@ -173,7 +189,7 @@ def estimate_batch(estimator: stages.Estimator, batch: Batch) -> Geometries:
     ids, pairs, given, problems = [], [], [], list[tuple[_PairIds, str]]()
     for own, pair in zip(batch.ids, batch.pairs, strict=True):
         try:
-            given.append(as_correspondences(pair, batch.cameras))
+            given.append(as_correspondences(pair, cast(Cameras, batch.mode.cameras), batch.mode.lens))
             ids.append(own)
             pairs.append(pair)
         except Exception as error:  # one pair does not end the work on the others
@@ -181,8 +197,8 @@ def estimate_batch(estimator: stages.Estimator, batch: Batch) -> Geometries:
     results: dict[int, PairGeometry] = {}
     for alike in _alike(given):
         c = collate([given[i] for i in alike])
-        estimate = estimated_by(estimator, c, batch.seed)
-        configuration = pair_type.classify(c, estimate, focal_deviation=0, seed=batch.seed)
+        estimate = estimated_by(estimator, c, batch.mode.seed)
+        configuration = pair_type.classify(c, estimate, focal_deviation=0, seed=batch.mode.seed)
         of_these = pair_geometries([pairs[i].matches for i in alike], c, estimate, configuration)
         results |= zip(alike, of_these, strict=True)
     return [(own, results[i]) for i, own in enumerate(ids)], problems
@@ -205,16 +221,13 @@ def divided(batch: Batch) -> list[Batch]:
 
 class VerificationRun:
     """The pairs of one store of matches.
-    parts: keeps their geometries. shard: only these pairs, which are kept there; None: all, and `write` moves what is
-    kept into the store. force: estimate pairs that have a geometry in the store, too."""
+    parts: keeps their geometries, of a shard of the pairs for good; of all pairs `write` moves them into the store."""
 
-    def __init__(
-        self, store: PairStore, parts: GeometryParts, cameras: Cameras, seed: int, shard: Shard | None, force: bool
-    ) -> None:
-        self.store, self.parts, self.cameras, self.seed = store, parts, cameras, seed
+    def __init__(self, store: PairStore, parts: GeometryParts, mode: VerifyMode) -> None:
+        self.store, self.parts, self.mode = store, parts, mode
         pairs = store.pairs()
-        self.pairs = pairs if shard is None else list(shard.of(pairs))
-        self.todo = [p for p in self.pairs if p not in parts.done and (force or not store.has_geometry(p))]
+        self.pairs = pairs if mode.shard is None else list(mode.shard.of(pairs))
+        self.todo = [p for p in self.pairs if p not in parts.done and (mode.force or not store.has_geometry(p))]
         self.configurations: Counter[str] = Counter()
         self.problems: list[str] = []
         self.warnings: dict[str, None] = {}  # in order
@@ -257,7 +270,7 @@ class VerificationRun:
             yield ids, geometry
 
     def _read(self, pairs: Sequence[_PairIds]) -> Batch:
-        batch = Batch(self.cameras, self.seed, [], [], [])
+        batch = Batch(self.mode, [], [], [])
         for pair in pairs:
             try:
                 matches = self.store.matches(pair)
@@ -283,8 +296,6 @@ def _first_line(error: Exception) -> str:
     return (str(error).splitlines() or [""])[0]
 
 
-ONE_THREAD = Execution("threads", 1)  # that calls an estimator, which uses as many as torch may
-
 HLOC_NEEDS = "hloc's files need features=F.h5 matches=M.h5 output=VERIFIED.h5, and no database"
 MATCHES_NEED = (
     "matches alone need an output: matches=FILE.npz output=VERIFIED.npz, with features=F.h5 where they are hloc's"
@@ -298,6 +309,7 @@ def verify(
     matches: Path | str | None = None,
     output: Path | str | None = None,
     cameras: str = "stored",
+    lens: arguments.Lens = None,
     estimator: str = "fmtorch",
     force: bool = False,
     seed: int = 0,
@@ -326,6 +338,8 @@ def verify(
             5 % where they have a prior and nothing else is known of the camera (EXIF), and unknown where they are
             COLMAP's guess; images of one camera share theirs. "shared": all images have one unknown focal length in
             units of the longer side, without distortion. "unknown": nothing is known.
+        lens: as of `find_fundamental`: how much photographs bend straight lines, where the stored cameras do not. The
+            matrices are then of the images without that, the inliers of the photographs.
         estimator: a preset of conf/estimator.
         force: estimate pairs that have a geometry as well, and replace an existing `output`.
         seed: of the random numbers.
@@ -359,7 +373,7 @@ def verify(
     make = functools.partial(presets.build, "estimator", estimator, config_dir, **options)
     settings = {"estimator": estimator, "options": repr(sorted(options.items()))}
     paths = VerifyPaths(*(None if place is None else Path(place) for place in (path, features, matches, output)))
-    mode = VerifyMode(cameras, force, seed, execution or ONE_THREAD, shard_of(shard))
+    mode = VerifyMode(cameras, lens, force, seed, execution or ONE_THREAD, shard_of(shard))
     return verify_by(make, settings, paths, mode, report)
 
 
@@ -370,17 +384,6 @@ class VerifyPaths(NamedTuple):
     features: Path | None
     matches: Path | None
     output: Path | None
-
-
-@dataclasses.dataclass(frozen=True)
-class VerifyMode:
-    """How pairs are verified: what is taken for known of cameras, what is replaced, by whom, and which pairs."""
-
-    cameras: str = "stored"
-    force: bool = False
-    seed: int = 0
-    execution: Execution = ONE_THREAD
-    shard: Shard | None = None
 
 
 def verify_by(
@@ -399,11 +402,13 @@ def verify_by(
         raise ValueError(f"estimator gives {gives} matrices; verify needs one that gives fundamental matrices")
     make = (lambda: estimator) if mode.execution.shared else make
     known = "unknown" if paths.features is not None and mode.cameras == "stored" else mode.cameras
+    mode = dataclasses.replace(mode, cameras=known, seed=seed)
     settings = {**settings, "version": __version__, "cameras": known, "seed": seed, "force": mode.force}
+    settings |= {} if mode.lens is None else {"lens": repr(mode.lens)}
     whole = mode.shard is None
     with _opened(paths, mode.force, whole) as (store, end):
         parts = GeometryParts(end.with_name(f"{end.name}.parts"), {**settings, **store.identity()})
-        run = VerificationRun(store, parts, cast(Cameras, known), seed, mode.shard, mode.force)
+        run = VerificationRun(store, parts, mode)
         run.each_batch(make, mode.execution, report)
         if whole:
             run.write()

@@ -13,6 +13,7 @@ import torch
 from PIL import ExifTags, Image
 from rich.console import Console
 
+import fmtorch
 from fmtorch import evaluation, presets
 from fmtorch.core import PAIR_TYPES, WARNINGS, Correspondences, Estimate, collate
 from fmtorch.data import GivenMatches, ImagePair, ImageSource, load
@@ -177,7 +178,7 @@ def test_figures_of_known_errors() -> None:
     ("words", "error"),
     [
         ("estimator=lmeds", "gives fundamental matrices; a pipeline needs homography matrices here: estimator=homog"),
-        ("cameras=unknown", "the data set has homography matrices, which take no export= and no cameras="),
+        ("cameras=unknown", "the data set has homography matrices, which take no export=, cameras=, lens="),
         ("export=h5", "take no export="),
     ],
 )
@@ -260,6 +261,22 @@ def test_poses_that_are_not_determined_and_pairs_without_estimates_among_others(
     assert rows[1].rotation_error < 0.5
 
 
+@pytest.mark.parametrize("cameras", [None, "shared"])
+def test_a_lens_is_given_to_the_estimator(cameras: str | None) -> None:
+    """As `find_fundamental` is given it, and rows say what it was taken for."""
+    o = outcome(0, noise=0.1)
+    known = None if cameras is None else evaluation.cameras_of([o.pair], cameras)
+    key, prior = torch.tensor([o.pair.key]), torch.full_like(o.correspondences.mask, 0.5, dtype=torch.float64)
+    c = o.correspondences.replace(key=key, prior=prior)
+    estimate = evaluation.WithPairCameras(presets.build("estimator", "fmtorch"), known, -0.02)(c)
+    given = {name: getattr(c, name) for name in ("mask", "prior", "size0", "size1", "key")}
+    alone = fmtorch.find_fundamental(c.x0, c.x1, **given, focal=cameras, lens=-0.02)
+    assert torch.equal(estimate.F, alone.F)
+    (row,) = evaluation.evaluate([dataclasses.replace(o, correspondences=c, estimate=estimate)])
+    assert (row.lens0, row.lens1) == pytest.approx((-0.02, -0.02), abs=1e-6)
+    assert row.lens_suggested is None
+
+
 def test_a_run_with_cameras_is_another_run(command: Callable[..., str], tmp_path: Path) -> None:
     words = ["eval", "pipeline=sift_fmtorch", "dataset=fmbench", f"dataset.root={shared_path('data/Strecha_train')}"]
     words += ["limit=2", "workers=1"]
@@ -282,6 +299,9 @@ def test_a_run_with_cameras_is_another_run(command: Callable[..., str], tmp_path
         assert "whose sign counts" in spoken
     assert "ended: error: pose.signed=2; it must be true or false" in command(*words, "pose.signed=2", cwd=tmp_path)
     assert "holds another run" in command(*words, "cameras=shared", "output=known", cwd=tmp_path)
+    _, identity, _ = run("bent", "lens=shared")
+    assert identity["lens"] == "shared"
+    assert "ended: error: lens=some" in command(*words, "lens=some", cwd=tmp_path)
     assert "ended: error: cameras=some" in command(*words, "cameras=some", cwd=tmp_path)
 
 

@@ -14,7 +14,7 @@ from fmtorch import presets
 from fmtorch.core import PAIR_TYPES, Correspondences, Estimate, collate
 from fmtorch.estimators.lens_search import inverted
 from fmtorch.geometry import significance
-from fmtorch.metrics import nsgd
+from fmtorch.metrics import corner_error, nsgd
 from fmtorch.two_view.arguments import lens_fields
 from fmtorch.two_view.pair_type import classify
 from tests.geometry.scenes import batch, draw
@@ -414,7 +414,7 @@ def test_sizes_may_be_assumed() -> None:
         ({"lens": -0.6}, "lens of image 0 of pair 0 is [-0.6, 0.0]; it is lambda in half diagonals, from -0.45"),
         ({"lens": (-0.1, -1)}, "lens of image 0 of pair 0 is"),
         ({"lens": (0.1, 0.1, 0.1)}, "lens has shape (3,)"),
-        ({"lens": "shared", "covariance": True}, "covariance and pair_type are of pinholes"),
+        ({"lens": "shared", "covariance": True}, "a covariance is of pinholes"),
         ({"lens": "shared", "size0": "unknown", "size1": "unknown"}, "lens needs the image sizes"),
         ({"lens": "shared", "K0": np.eye(3), "K1": np.eye(3), "size0": None, "size1": None}, "lens needs the image"),
         ({"lens": "shared", "estimator": "ransac"}, "lens needs an estimator with the option focal"),
@@ -424,6 +424,28 @@ def test_what_makes_no_sense_is_refused_by_name(said: dict[str, Any], message: s
     x0, x1, _, _ = division.photographs(1, (0, 0))
     with pytest.raises(ValueError, match=re.escape(message)):
         found(x0, x1, **said)
+
+
+@pytest.mark.parametrize("calibrated", [False, True])
+def test_the_type_of_a_pair_is_that_of_the_undistorted_photographs(calibrated: bool) -> None:
+    """Of a plane, alone and beside a general pair, whose homography is that of pinholes."""
+    rng, lens = np.random.default_rng(0), -0.25
+    H = np.array([[0.95, 0.06, 12], [-0.05, 1.02, -8], [1e-4, -2e-4, 1]])
+    x0, x1, _, K = division.photographs(1, (lens, lens))
+    plane = rng.uniform([20, 20], [620, 460], (len(x0), 2))
+    moved = np.c_[plane, np.ones(len(plane))] @ H.T
+    bent = [[division.bent(x, SIZE, lens) for x in points] for points in (plane, moved[:, :2] / moved[:, 2:])]
+    y0, y1 = (np.array(x) + rng.normal(0, 0.2, (len(x), 2)) for x in bent)
+    cameras = {"K0": K, "K1": K} if calibrated else {}
+    given = {**cameras, "pair_type": True, "seed": 1}
+    together = found([y0, x0], [y1, x1], lens=lens, **given, key=[0, 0])
+    assert together.pair_type == ("planar", "general")
+    alone = found(y0, y1, lens=lens, **given)
+    assert alone.pair_type == ("planar",)
+    torch.testing.assert_close(alone.homography[0], together.homography[0], rtol=0, atol=0)
+    truth = torch.from_numpy(H)[None], torch.tensor([SIZE])
+    as_pinholes = found(y0, y1, **given)
+    assert float(corner_error(alone.homography, *truth)) < 0.5 < 3 < float(corner_error(as_pinholes.homography, *truth))
 
 
 def test_gradients_are_refused() -> None:

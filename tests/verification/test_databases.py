@@ -52,13 +52,14 @@ K = np.array([[600.0, 0, 309.5], [0, 612, 249.5], [0, 0, 1]])
         ("stored", True, {"K0": K, "K1": K}),
         ("shared", True, {"focal": "shared"}),
         ("unknown", True, {"focal": "unknown"}),
+        ("unknown", True, {"focal": "unknown", "lens": -0.02}),
     ],
 )
 def test_geometries_are_those_of_find_fundamental(cameras, prior, known, tmp_path):
     """Bit by bit, whatever the batch."""
     path = tmp_path / "database.db"
     write(path, scene(4), prior=prior)
-    result = fmtorch.verify(path, cameras=cameras)
+    result = fmtorch.verify(path, cameras=cameras, lens=known.get("lens"))
     kind = "calibrated" if known.get("K0") is not None else "uncalibrated"
     assert (result.pairs, result.kept, result.configurations, result.problems) == (6, 0, {kind: 6}, ())
     for pair, geometry in read(path).items():
