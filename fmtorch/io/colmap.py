@@ -33,13 +33,11 @@ def write_database(
     path: Path, images: Iterable[StoredImage], pairs: Iterable[StoredPair], shared_camera: bool = False
 ) -> None:
     """Write a database: keypoints, the matches given to the estimator, and the geometry of each pair with its inliers.
-
     Degenerate geometries are left out; a pair without a geometry has F, with both cameras known E, too, where its
     support is beyond chance. A known K is a PINHOLE camera with a trusted focal length, one with distortion is of its
     lens's model; images of equal cameras and size share it. Otherwise an image has a SIMPLE_RADIAL camera of the focal
     length of EXIF, or COLMAP's default, or shares it with all of its size. Pixels are moved by half of one, as COLMAP
-    counts.
-    """
+    counts."""
     pycolmap = imported()
     cameras: dict[object, int] = {}
     ids: dict[str, int] = {}
@@ -127,14 +125,11 @@ EXIF_DEVIATION = 0.05  # relative, of focal lengths by EXIF (docs/cameras.md)
 @dataclasses.dataclass(frozen=True)
 class DatabaseImage:
     """An image with its keypoints, px, with (0, 0) at the centre of the first pixel.
-
     size: (h, w), and K, None where unknown. points: (n, 2) as stored; pinhole: (n, 2), where a pinhole of calibration K
     would have put them, NaN where it sees nothing. deviation: relative, of the focal length of K: 0 where it was
     calibrated, infinite where it is COLMAP's guess. problem: what is wrong with the camera. warning: what of it is not
-    taken for known.
-
-    Scales, orientations and affine shapes of keypoints are not used: docs/verify.md says what they were worth.
-    """
+    taken for known. Scales, orientations and affine shapes of keypoints are not used: docs/verify.md says what they
+    were worth."""
 
     name: str
     camera_id: int
@@ -195,10 +190,8 @@ Ids = tuple[int, int]
 
 class MatchDatabase(contextlib.AbstractContextManager["MatchDatabase"]):
     """An open database. Its images are read when they are needed, and few of them are kept.
-
     Raises what `expect_database` raises, and ValueError where there are no keypoints or no matches; OSError where the
-    disk is full or another process holds the database.
-    """
+    disk is full or another process holds the database."""
 
     def __init__(self, path: Path) -> None:
         self._pycolmap = imported()
@@ -237,9 +230,7 @@ class MatchDatabase(contextlib.AbstractContextManager["MatchDatabase"]):
 
     def matches(self, pair: Ids) -> Indices:
         """The matches of a pair, keypoints (n, 2) of its images.
-
-        Raises ValueError where there are no such keypoints.
-        """
+        Raises ValueError where there are no such keypoints."""
         matches = np.asarray(self._database.read_matches(*pair)).astype(np.int64).reshape(-1, 2)
         for image_id, index in zip(pair, matches.T, strict=True):
             image = self.image(image_id)

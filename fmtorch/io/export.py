@@ -37,9 +37,7 @@ def write_exports(
     shared_camera: bool = False,
 ) -> list[str]:  # fmt: skip
     """Write the files for the images of these pairs into a folder, whole or not at all; their names.
-
-    shared_camera: in COLMAP's database, one camera for all images of one size whose calibration is unknown.
-    """
+    shared_camera: in COLMAP's database, one camera for all images of one size whose calibration is unknown."""
     images = list(dict.fromkeys(image for pair in pairs for image in pair if journal.has_image(image)))
     done = [pair for pair in pairs if journal.has_pair(*pair)]
     written = []
@@ -59,11 +57,9 @@ def write_hloc(
     folder: Path, images: Iterable[StoredImage], journal: MatchStore, pairs: Iterable[tuple[Path, Path]]
 ) -> None:
     """hloc's features and matches, float32 and int32.
-
     hloc itself writes float16 and int16, of which the second overflows beyond 32,767 keypoints. Each pair holds beside
     ``matches0`` and ``matching_scores0``, which hloc knows, ``inliers0`` (bool), and F, `related` and, where its
-    geometry is known, `configuration`, E, H, R and t as attributes.
-    """
+    geometry is known, `configuration`, E, H, R and t as attributes."""
     h5py = h5.imported()
     counts: dict[str, int] = {}
     with replacing(folder / FEATURES) as temporary, h5py.File(temporary, "w") as file:

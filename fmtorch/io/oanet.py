@@ -28,9 +28,7 @@ GEODESIC = 1e-4  # of an inlier, squared focal lengths: obj_geod_th of OANet's c
 
 def geodesic(R: Matrix, t: Matrix, K0: Matrix, K1: Matrix, x0: Matrix, x1: Matrix) -> Matrix:
     """OANet's geodesic distance (n,): the two squared distances to the epipolar lines added, in calibrated coordinates.
-
-    R, t: X1 = R X0 + t; the length of t does not count. x0, x1: matches (n, 2) in pixels.
-    """
+    R, t: X1 = R X0 + t; the length of t does not count. x0, x1: matches (n, 2) in pixels."""
     E = np.cross(np.eye(3), t / (np.linalg.norm(t) or 1.0)).T @ R
     given = E, calibrated(x0, K0), calibrated(x1, K1)
     values: Matrix = symmetric_squared(*(torch.from_numpy(value) for value in given)).numpy()

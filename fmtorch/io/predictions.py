@@ -24,9 +24,7 @@ def given(
     score: Matrix | None = None, mutual: Mask | None = None,
 ) -> GivenMatches:  # fmt: skip
     """Matches of one pair, (n, 2) in pixels each; those that are not finite do not count.
-
-    ratio, score, mutual: (n,), as of `Correspondences`. features: how many keypoints each image has.
-    """
+    ratio, score, mutual: (n,), as of `Correspondences`. features: how many keypoints each image has."""
     mask = torch.from_numpy(np.isfinite(x0).all(-1) & np.isfinite(x1).all(-1))[None]
     points = (torch.from_numpy(np.ascontiguousarray(x, np.float32))[None] for x in (x0, x1))
     p0, p1 = (torch.where(mask[..., None], x, 0.0) for x in points)
@@ -102,9 +100,7 @@ DEPTH = 4  # parts of a path that a name may hold
 
 def names_of(image: ImageSource) -> list[str]:
     """Under what names others may know an image, the most telling first.
-
-    Its identity, then ever shorter ends of its path; each with the suffix and without.
-    """
+    Its identity, then ever shorter ends of its path; each with the suffix and without."""
     suffix = image.path.suffix
     ends = ["/".join(image.path.parts[-n:]) for n in range(min(DEPTH, len(image.path.parts)), 0, -1)]
     names = [name for end in ends for name in (end, end.removesuffix(suffix))]
@@ -113,9 +109,7 @@ def names_of(image: ImageSource) -> list[str]:
 
 def pair_keys(pair: ImagePair) -> Iterator[tuple[str, bool]]:
     """Under what keys others may have stored a pair, and whether its images are then in the other order.
-
-    ``a/b``, as hloc and glue-factory write it with hyphens for slashes within names, and ``a_b``.
-    """
+    ``a/b``, as hloc and glue-factory write it with hyphens for slashes within names, and ``a_b``."""
     names0, names1 = names_of(pair.image0), names_of(pair.image1)
     for swapped, names in ((False, (names0, names1)), (True, (names1, names0))):
         for a, b in zip(*names, strict=False):
@@ -135,10 +129,8 @@ NO_MATCH = -1
 @dataclasses.dataclass(frozen=True)
 class HLocMatches:
     """hloc's matches of one pair: ``matches0`` and ``matching_scores0`` (n0,) for the keypoints of the first image.
-
-    names: of the images in the features file. key: of the pair in the matches file; swapped: whether its first image
-    is our second. sizes: where the features file does not hold them. origin: where it puts the first pixel's centre.
-    """
+    names: of the images in the features file. key: of the pair in the matches file; swapped: whether its first image is
+    our second. sizes: where the features file does not hold them. origin: where it puts the first pixel's centre."""
 
     features: Path
     matches: Path
@@ -164,10 +156,8 @@ class HLocMatches:
 @dataclasses.dataclass(frozen=True)
 class PairPrediction:
     """glue-factory's or vismatch's prediction for one pair, a group that holds all of it.
-
     Either ``keypoints0``, ``keypoints1``, ``matches0`` and perhaps ``matching_scores0``, or ``matched_kpts0``,
-    ``matched_kpts1`` and perhaps ``matched_confidences``, ``all_kpts0``, ``all_kpts1``.
-    """
+    ``matched_kpts1`` and perhaps ``matched_confidences``, ``all_kpts0``, ``all_kpts1``."""
 
     path: Path
     key: str

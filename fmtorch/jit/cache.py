@@ -39,9 +39,7 @@ FOREIGN = {*sys.stdlib_module_names, "builtins", "numpy"}  # packages whose func
 
 def version(function: Function, *also: str) -> str:
     """The version of a function as hexadecimal digits. also: what decides its machine code besides.
-
-    Raises TypeError where it takes a value of which no version can be told.
-    """
+    Raises TypeError where it takes a value of which no version can be told."""
     reached, parts = [function], []
     for each in reached:  # which grows while it is read
         own, inner = _own(each)
@@ -149,10 +147,8 @@ def _reference(value: Any, reached: list[Function]) -> Any:
 
 def named_by_version(function: Function, version: str) -> Function:
     """The same function by a name that no other one has: numba names machine code by functions' names alone.
-
     Two functions that one function made have one name. Machine code of both, kept by two processes, would be taken for
-    the same by a third.
-    """
+    the same by a third."""
     untyped: Any = function
     name = f"{untyped.__qualname__}_{version[:16]}"
     taken = (untyped.__code__, untyped.__globals__, untyped.__name__, untyped.__defaults__, untyped.__closure__)
@@ -203,9 +199,7 @@ def versions() -> dict[str, str]:
 @functools.cache
 def folder() -> Path | None:
     """The folder for this version, marked as used now; None, with a warning, where there is none and none can be made.
-
-    Folders that were not used for `UNUSED_DAYS` are removed.
-    """
+    Folders that were not used for `UNUSED_DAYS` are removed."""
     about = versions()
     path = kernels_dir() / _hex(json.dumps(about).encode())[:16]
     try:
@@ -242,10 +236,8 @@ def path(function: Callable[..., Any], version: str) -> Path | None:
 
 class KernelFile:
     """The file of one version of a kernel; what numba calls the cache of a function.
-
     missing: called before the function is compiled, with words that say where it will be kept. calls: once loaded or
-    saved, the kernels that the function calls.
-    """
+    saved, the kernels that the function calls."""
 
     def __init__(self, path: Path | None, missing: Callable[[str], None]) -> None:
         self.path, self.missing = path, missing
@@ -333,9 +325,7 @@ def _open_runtime(target_context: Any, machine_code: bytes) -> None:
 
 def _alone(result: Any) -> Any:
     """What numba keeps of a compiled function, without code for others to link, and constants of functions without any.
-
-    A kernel is called by its address alone.
-    """
+    A kernel is called by its address alone."""
     from llvmlite import binding
 
     (library, kind, (code, _)), *rest, environments = result._reduce()

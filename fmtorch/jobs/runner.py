@@ -156,9 +156,7 @@ def end_with_parent() -> None:
 
 class _Cluster:
     """A client of a scheduler of dask.distributed, one that runs or one of this machine.
-
-    Raises ImportError without Dask, and ValueError where nobody answers at the address or no worker comes.
-    """
+    Raises ImportError without Dask, and ValueError where nobody answers at the address or no worker comes."""
 
     def __init__(self, address: str | None, workers: int) -> None:
         needed = "executor=dask needs dask and distributed: pip install 'fmtorch[dask]'"
@@ -300,11 +298,9 @@ class TaskRunner(Generic[Task]):
 
     def each(self, tasks: Iterable[Task | None]) -> Generator[Task, None, None]:
         """Have the tasks done, and yield each once its result is kept.
-
         tasks: taken as workers become free; a None says that none can begin before one under way has ended.
         Interrupted, it waits for what is under way and keeps it. What a task raises is raised here. Raises WorkersLost
-        where the scheduler is gone, or workers die whatever they do.
-        """
+        where the scheduler is gone, or workers die whatever they do."""
         todo = iter(tasks)
         try:
             while True:

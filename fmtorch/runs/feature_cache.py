@@ -31,12 +31,10 @@ ABANDONED = 3600.0  # seconds after which a temporary file is a dead writer's
 
 class ArrayCache:
     """Files ``<folder>/<section>/<name>.npz``, each whole or absent. Safe with several threads and processes.
-
     limit: bytes; when more are kept, the least recently used files go (each process may exceed it by `SLACK`). None: no
     bound. A file that is damaged, or holds other arrays than were written under its name, counts as absent, with a
-    warning; what cannot be written is not kept, with a warning.
-    Raises ValueError where the folder is a file or the limit is not positive.
-    """
+    warning; what cannot be written is not kept, with a warning. Raises ValueError where the folder is a file or the
+    limit is not positive."""
 
     def __init__(self, folder: Path, limit: int | None = None) -> None:
         if folder.exists() and not folder.is_dir():
@@ -135,13 +133,11 @@ OFF = ("off", "none", "")
 
 class CachedFeatures:
     """An extractor that keeps what another one finds, bit-equal, and computes only what it does not have.
-
     A `TwoStepExtractor` is kept in two files, frames under the digest of its `detection` alone; any other in one.
     Results are on the CPU. `timed` gives the seconds that the computation took when it was done, here or in another
     run. found, computed: images so far that needed no computation, and that needed some. For any number of threads.
     Raises TypeError where the extractor does not say what defines it, OSError where a file of it cannot be read (see
-    `configuration`).
-    """
+    `configuration`)."""
 
     def __init__(self, extractor: FeatureExtractor, cache: ArrayCache) -> None:
         self.extractor, self.cache = extractor, cache
@@ -211,10 +207,8 @@ def cached(
     extractor: FeatureExtractor, cache: str | Path | bool | None, limit: int | float | None = None
 ) -> FeatureExtractor:
     """The extractor with a cache in the folder `cache`; None: the user's cache folder; "off" or False: as it is.
-
     limit: GB, see `ArrayCache`. An extractor that does not say what defines it, or whose files cannot be read, stays as
-    it is, with a warning.
-    """
+    it is, with a warning."""
     if cache is False or str(cache) in OFF or not getattr(extractor, "keep", True):
         return extractor
     folder = cache_dir() / "features" if cache is None else Path(str(cache)).expanduser()

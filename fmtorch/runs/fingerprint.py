@@ -28,11 +28,9 @@ GIT_SECONDS = 10  # after which git is taken for absent
 @functools.cache
 def fmtorch_version() -> str:
     """The version of the code that runs; in a checkout with its commit, and what sources were changed since.
-
     ``0.1.0`` installed; ``0.1.0+g5c0279c1d2e3`` in a checkout; ``0.1.0+g5c0279c1d2e3.dirty.0f1e2d3c4b5a``, with the
     digest of the sources, where they are not those of the commit; ``0.1.0+sources.0f1e2d3c4b5a`` where there is no git
-    that tells.
-    """
+    that tells."""
     checkout = PACKAGE.parent
     if not (checkout / "pyproject.toml").is_file():
         return __version__
@@ -58,11 +56,9 @@ def _git(folder: Path, *arguments: str) -> str | None:
 @functools.cache
 def code_digest(module: str) -> str:
     """The digest of an imported module's source and of what it imports from its own code, at any depth.
-
     Its own code is the package for a module of fmtorch; for anybody else's the folder that its imports start from, and
-    the files beside and below it whether it imports them or not; of installed packages only these.
-    Raises TypeError for a module without a file.
-    """
+    the files beside and below it whether it imports them or not; of installed packages only these. Raises TypeError for
+    a module without a file."""
     name = getattr(sys.modules[module], "__file__", None)
     if name is None:
         raise TypeError(f"the code of {module} is in no file, so its changes cannot be noticed")
@@ -77,9 +73,7 @@ def code_digest(module: str) -> str:
 
 def _imported(file: Path, start: Path, own: bool) -> set[Path]:
     """The file, and those below `start` that it imports, and these in turn; of code that does not compile no more.
-
-    own: whether it is of fmtorch, whose imports are followed then, and not those of anybody else.
-    """
+    own: whether it is of fmtorch, whose imports are followed then, and not those of anybody else."""
     files: set[Path] = set()
     todo = [file]
     while todo:
@@ -118,10 +112,8 @@ def _statements(tree: ast.Module) -> list[ast.AST]:
 
 def _files_of(statement: _Import, file: Path, start: Path, own: bool) -> Iterator[Path]:
     """The files below `start` that an import statement of `file` names.
-
     Of anybody's own code with the packages on the way; of fmtorch's, whose packages import all that is in them,
-    without.
-    """
+    without."""
     level, module, imported = statement
     if level is None:
         names = [(start, name) for name in imported]
@@ -155,12 +147,11 @@ VARIANTS = {"onnxruntime": ("onnxruntime-gpu", "onnxruntime-directml")}  # other
 
 def configuration(part: object) -> Any:
     """A part of a pipeline as plain values that JSON can hold; equal values mean equal results.
-
     A dataclass is its class, its code and the code that it imports from its own package (`code_digest`), and its fields
     (not those with ``compare=False``); an object with an attribute `identity` is that attribute in place of the fields;
     a class is its name and code; a `Path` is the digest of the file; tensors and networks are the digests of their
-    values. Raises TypeError for anything that does not say what defines it, and OSError for a file that cannot be read.
-    """
+    values. Raises TypeError for anything that does not say what defines it, and OSError for a file that cannot be
+    read."""
     return _plain(part, code=True)
 
 
@@ -184,9 +175,7 @@ def _plain(part: object, code: bool) -> Any:
 
 def learned(part: object) -> list[str]:
     """Digests of the learned files and networks that a part of a pipeline uses, sorted; of a network's weights one.
-
-    None for a part that does not say what defines it, or whose file cannot be read: it tells so itself when used.
-    """
+    None for a part that does not say what defines it, or whose file cannot be read: it tells so itself when used."""
     try:
         described = _plain(part, code=False)
     except (TypeError, OSError):

@@ -23,11 +23,9 @@ from fmtorch.core.settings import canonical, create, differences, head
 @dataclasses.dataclass(frozen=True)
 class PairRow:
     """The result of one image pair. What could not be computed is None or NaN, and null in the table.
-
     A pair of a known homography has a corner error, infinite where it failed, and H in place of F; its NSGD is NaN.
     Raises ValueError for a row that contradicts itself: a failed pair has a reason, NSGD 1 and no F; a sound one has no
-    reason and nine finite elements of F or H; NSGD is in [0, 1]; there are both angles of a pose error or neither.
-    """
+    reason and nine finite elements of F or H; NSGD is in [0, 1]; there are both angles of a pose error or neither."""
 
     pair: str  # the pair's identity within its data set
     key: int  # the pair's stable 64-bit key, `pair_key(pair)`
@@ -130,9 +128,7 @@ MAX_LEVEL = 3  # 16^3 batches to a part at most: merging needs the memory of one
 
 class PartWriter:
     """Adds parts to a folder, and merges those that it has added itself: any number of writers may do so at once.
-
-    Names sort by the time at which the first rows of a part were written; they end with a digest of the bytes.
-    """
+    Names sort by the time at which the first rows of a part were written; they end with a digest of the bytes."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -154,9 +150,7 @@ class PartWriter:
 
     def _merge(self, parts: Sequence[Path]) -> Path | None:
         """One part in place of several; killed in between, rows are there twice, which readers drop.
-
-        None where one of them is damaged, for a reader to name, or the disk is full: they stay as they are.
-        """
+        None where one of them is damaged, for a reader to name, or the disk is full: they stay as they are."""
         try:
             merged = self._write(pa.concat_tables([read_part(path) for path in parts]), parts[0].name.split("-")[1])
         except (pa.ArrowException, OSError):
@@ -210,10 +204,8 @@ class RunFolderError(ValueError):
 
 def identity_digest(config: Mapping[str, Any]) -> str:
     """The hex digest (blake2b, 128 bits) of what defines a run's results.
-
     config: plain dicts, lists, strings, numbers, booleans and None: the pipeline's configuration, the data set's name
-    and digest, the seed, the digests of learned files, the version. Raises TypeError for anything else.
-    """
+    and digest, the seed, the digests of learned files, the version. Raises TypeError for anything else."""
     return hashlib.blake2b(canonical(config).encode(), digest_size=16).hexdigest()
 
 
@@ -227,10 +219,8 @@ class RunFolder:
     @classmethod
     def open(cls, path: Path | str, config: Mapping[str, Any]) -> "RunFolder":
         """Start a run in `path`, or continue it there when the folder holds a run of the same identity.
-
         Several processes may open the same folder at once. Raises RunFolderError, touching nothing, where the folder
-        holds a run of another identity or files that are no run.
-        """
+        holds a run of another identity or files that are no run."""
         path = Path(path)
         wanted: dict[str, Any] = json.loads(canonical(config))
         if path.exists() and not path.is_dir():
@@ -283,9 +273,8 @@ class RunFolder:
 
     def read(self, keys: Collection[int] | None = None, without: Collection[str] = ()) -> pa.Table:
         """The results, a row of `PAIR_SCHEMA` per pair, without some columns: all, or those of the given keys.
-
-        Of several rows of one pair the first written counts. Raises RunFolderError naming a part that cannot be read.
-        """
+        Of several rows of one pair the first written counts. Raises RunFolderError naming a part that cannot be
+        read."""
         names = [name for name in PAIR_SCHEMA.names if name not in without]
         table = pa.concat_tables([PAIR_SCHEMA.empty_table().select(names), *self._parts(names)])
         stored_keys = table["key"].to_numpy()

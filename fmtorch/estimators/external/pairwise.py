@@ -45,11 +45,9 @@ Solution = tuple[Points | None, NDArray[np.bool_]] | Posed
 @dataclasses.dataclass(frozen=True)
 class Pair:
     """A pair's matches as these libraries take them: x0, x1 (N, 2) in pixels, likelihood (N,), sizes (h, w).
-
     likelihood: the prior where there is one, else 1 - ambiguity, else 1; matches are in its descending order if asked.
     calibrations: where cameras are asked for, K0 and K1 (3, 3), None for an unknown focal length; calibrated: whether
-    both are exact; shared_focal: whether both unknown focal lengths are one.
-    """
+    both are exact; shared_focal: whether both unknown focal lengths are one."""
 
     x0: Points
     x1: Points
