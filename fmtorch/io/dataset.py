@@ -14,33 +14,25 @@ from fmtorch.data import DataError, FMBenchPairs, GivenMatches, ImagePair, Image
 from fmtorch.data.files import Matrix, given_root
 from fmtorch.data.pairs import HeldPairs
 from fmtorch.io import h5, oanet, predictions
-from fmtorch.io.predictions import Size
+from fmtorch.io.predictions import Images, Size
 
-Sources = tuple[ImageSource, ImageSource]
 MATCHES, RATIOS, CALIBRATIONS, ROTATIONS, TRANSLATIONS, TRUTH = (
     f"{name}.h5" for name in ("matches", "match_conf", "K1_K2", "R", "T", "Fgt")
 )
 
 
-@dataclasses.dataclass(frozen=True)
-class TutorialMatches:
+def tutorial_matches(folder: Path, key: str, sizes: tuple[Size, Size]) -> GivenMatches:
     """The matches of one pair."""
-
-    folder: Path
-    key: str
-    sizes: tuple[Size, Size]
-
-    def __call__(self) -> GivenMatches:
-        with h5.opened(self.folder / MATCHES) as file:
-            points = h5.numbers(file, self.key, None, 4)
-        ratios = None
-        if (self.folder / RATIOS).exists():
-            with h5.opened(self.folder / RATIOS) as file:
-                ratios = h5.numbers(file, self.key).reshape(-1)
-            if len(ratios) != len(points):
-                lengths = f"{len(ratios)} entries, but {MATCHES} has {len(points)} matches of that pair"
-                raise DataError(f"{self.folder / RATIOS}: {self.key!r} has {lengths}")
-        return predictions.given(points[:, :2], points[:, 2:], self.sizes, (len(points), len(points)), ratio=ratios)
+    with h5.opened(folder / MATCHES) as file:
+        points = h5.numbers(file, key, None, 4)
+    ratios = None
+    if (folder / RATIOS).exists():
+        with h5.opened(folder / RATIOS) as file:
+            ratios = h5.numbers(file, key).reshape(-1)
+        if len(ratios) != len(points):
+            lengths = f"{len(ratios)} entries, but {MATCHES} has {len(points)} matches of that pair"
+            raise DataError(f"{folder / RATIOS}: {key!r} has {lengths}")
+    return predictions.given(points[:, :2], points[:, 2:], sizes, (len(points), len(points)), ratio=ratios)
 
 
 def tutorial_files(root: Path) -> list[Path]:
@@ -135,7 +127,7 @@ def _size(source: ImageSource, K: Matrix, images: Path | None) -> Size:
 def _pair(root: Path, folder: Path, key: str, cameras: _Cameras, images: Path | None) -> ImagePair:
     family, scene = root.name, folder.name
     identity = key if folder == root else f"{scene}/{key}"  # whatever the folder is called: draws follow from it
-    sources: Sources | None = None
+    sources: Images | None = None
     try:
         name0, name1 = cameras.split(key)
         sources = cameras.image(family, name0, images), cameras.image(family, name1, images)
@@ -144,21 +136,20 @@ def _pair(root: Path, folder: Path, key: str, cameras: _Cameras, images: Path | 
                 raise DataError(cameras.problems[name])
         K0, K1 = cameras.calibration(key)
         sizes = _size(sources[0], K0, images), _size(sources[1], K1, images)
+        matches = functools.partial(tutorial_matches, folder, key, sizes)
         if cameras.by_image:
             (R0, t0), (R1, t1) = cameras.by_image[name0], cameras.by_image[name1]
             R = R1 @ R0.T
-            matches = TutorialMatches(folder, key, sizes)
             pose = R, t1 - R @ t0
             return ImagePair(identity, family, scene, *sources, np.zeros((3, 3)), K0, K1, *pose, matches=matches)
         F = cameras.truth(key)
-        norm = float(np.linalg.norm(F))
-        problem = None if norm else f"{folder / TRUTH}: {key!r} is zero"
-        pair = ImagePair(identity, family, scene, *sources, F / (norm or 1.0), K0, K1, problem=problem)
     except DataError as error:
         unnamed = predictions.image(family, scene, key, images)
         shown = sources or (unnamed, unnamed)
         return ImagePair(identity, family, scene, *shown, np.zeros((3, 3)), problem=str(error))
-    return dataclasses.replace(pair, matches=TutorialMatches(folder, key, sizes))
+    norm = float(np.linalg.norm(F))
+    problem = None if norm else f"{folder / TRUTH}: {key!r} is zero"
+    return ImagePair(identity, family, scene, *sources, F / (norm or 1.0), K0, K1, problem=problem, matches=matches)
 
 
 # PoseBench's files of relative poses: a group for each pair, with ``x1``, ``x2`` (n, 2), ``camera1``, ``camera2``
@@ -168,27 +159,21 @@ FOCAL_LENGTHS = {"SIMPLE_PINHOLE": 1, "PINHOLE": 2, "SIMPLE_RADIAL": 1, "RADIAL"
 """Camera models that are pinholes where their distortion is zero, and how many focal lengths begin their parameters."""
 
 
-@dataclasses.dataclass(frozen=True)
-class PoseBenchMatches:
+def posebench_matches(
+    path: Path, key: str, K: tuple[Matrix, Matrix], sizes: tuple[Size | None, Size | None]
+) -> GivenMatches:
     """The matches of one pair. K: of both cameras. sizes: None where neither file nor image tells."""
-
-    path: Path
-    key: str
-    K: tuple[Matrix, Matrix]
-    sizes: tuple[Size | None, Size | None]
-
-    def __call__(self) -> GivenMatches:
-        with h5.opened(self.path) as file:
-            x0, x1 = (h5.numbers(file, f"{self.key}/{name}", None, 2) for name in ("x1", "x2"))
-        if len(x0) != len(x1):
-            raise DataError(f"{self.path}: {self.key!r} has {len(x0)} points in x1 and {len(x1)} in x2")
-        known = zip(self.sizes, self.K, (x0, x1), strict=True)
-        size0, size1 = (predictions.size_by_points(K, x) if size is None else size for size, K, x in known)
-        return predictions.given(x0, x1, (size0, size1), (len(x0), len(x1)))
+    with h5.opened(path) as file:
+        x0, x1 = (h5.numbers(file, f"{key}/{name}", None, 2) for name in ("x1", "x2"))
+    if len(x0) != len(x1):
+        raise DataError(f"{path}: {key!r} has {len(x0)} points in x1 and {len(x1)} in x2")
+    known = zip(sizes, K, (x0, x1), strict=True)
+    size0, size1 = (predictions.size_by_points(own, x) if size is None else size for size, own, x in known)
+    return predictions.given(x0, x1, (size0, size1), (len(x0), len(x1)))
 
 
 Stored = tuple[tuple[Matrix, Matrix], Matrix, Matrix, Callable[[], GivenMatches]]  # K of both images, R, t, matches
-Read = Callable[[Any, Path, str, Sources], Stored]
+Read = Callable[[Any, Path, str, Images], Stored]
 
 
 def _pairs(root: Path, images: Path | None, keys_of: Callable[[Any], list[str]], read: Read) -> Iterator[ImagePair]:
@@ -207,10 +192,10 @@ def _pairs(root: Path, images: Path | None, keys_of: Callable[[Any], list[str]],
                 yield from predictions.with_fundamentals([pair])
 
 
-def _posebench_pair(file: Any, path: Path, key: str, sources: Sources) -> Stored:
+def _posebench_pair(file: Any, path: Path, key: str, sources: Images) -> Stored:
     (K0, size0), (K1, size1) = (_camera(file, path, f"{key}/camera{i}", s) for i, s in enumerate(sources, start=1))
     R, t = h5.reshaped(file, f"{key}/R", 3, 3), h5.reshaped(file, f"{key}/t", 3)
-    return (K0, K1), R, t, PoseBenchMatches(path, key, (K0, K1), (size0, size1))
+    return (K0, K1), R, t, functools.partial(posebench_matches, path, key, (K0, K1), (size0, size1))
 
 
 def _camera(file: Any, path: Path, key: str, source: ImageSource) -> tuple[Matrix, Size | None]:
@@ -238,9 +223,9 @@ def _side(file: Any, key: str) -> int:
     return max(0, int(h5.reshaped(file, key, 1)[0])) if h5.holds(file, key) else 0
 
 
-def _oanet_pair(file: Any, path: Path, key: str, _: Sources) -> Stored:
+def _oanet_pair(file: Any, path: Path, key: str, _: Images) -> Stored:
     known = oanet.cameras(file, key)
-    return known.K, known.R, known.t, oanet.OANetMatches(path, key, known)
+    return known.K, known.R, known.t, functools.partial(oanet.matches, path, key, known)
 
 
 CORNER = 0.5  # where glue-factory puts the centre of the first pixel

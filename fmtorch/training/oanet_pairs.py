@@ -2,7 +2,7 @@
 
 import functools
 import hashlib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -170,12 +170,12 @@ def write_oanet(matches: StoredMatches, pairs: Iterable[ImagePair], folder: Path
     return paths
 
 
-def _entry(matches: labelled.LabelledMatches, pair: ImagePair) -> oanet.Entry:
+def _entry(matches: labelled.LabelledMatches, pair: ImagePair) -> Mapping[str, NDArray[Any] | None]:
     c = matches.correspondences
-    values = {name: None if (x := getattr(c, name)) is None else x[0].numpy() for name in ("ratio", "mutual")}
+    ratios, mutuals = (None if values is None else values[0].numpy() for values in (c.ratio, c.mutual))
     x0, x1 = (x[0].numpy().astype(np.float64) for x in (c.x0, c.x1))
     if c.size0 is None or c.size1 is None or pair.K0 is None or pair.K1 is None or pair.R is None or pair.t is None:
         raise ValueError(f"OANet's layout needs cameras and image sizes, which pair {pair.identity} does not have")
     (h0, w0), (h1, w1) = c.size0[0].tolist(), c.size1[0].tolist()
     cameras = oanet.Cameras((pair.K0, pair.K1), pair.R, pair.t, ((h0, w0), (h1, w1)))
-    return oanet.Entry(cameras, x0, x1, values["ratio"], values["mutual"])
+    return oanet.entry(cameras, x0, x1, ratios, mutuals)
