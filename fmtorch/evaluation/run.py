@@ -26,10 +26,8 @@ from fmtorch.data import GivenMatches, ImagePair, ImageSource, exif_focal
 from fmtorch.evaluation.rows import evaluate
 from fmtorch.io.match_store import MatchRecords, MatchStore
 from fmtorch.jit import kernel
-from fmtorch.jobs.execution import Execution
-from fmtorch.jobs.runner import Factory, Local, Source, TaskRunner, WorkerPool
+from fmtorch.jobs import Execution, Factory, Local, Source, TaskRunner, WorkerPool
 from fmtorch.pipeline import Outcome, Pipeline, examined, match_records
-from fmtorch.presets import plain
 from fmtorch.runs import CachedFeatures, PairRow
 from fmtorch.runs.fingerprint import code_digest, file_digest, fmtorch_version, learned, libraries
 from fmtorch.two_view import known_cameras, pair_type
@@ -43,20 +41,15 @@ def run_identity(
     signed: bool = False,
 ) -> dict[str, Any]:  # fmt: skip
     """The identity of a run, as plain values.
-
-    Args:
-        config: a composed config: stages, data set, seed. pipeline_name: the preset that it began with.
-        pipeline: what was built of the config. dataset_digest: of the contents of the data set.
-        cameras: what the estimator is given of them; None: nothing. signed: whether the sign of a translation counts.
-
-    Returns:
-        `pipeline`, each stage's config (pruners as a list), `seed`; `version` of fmtorch, in a checkout its commit;
-        `libraries`: their versions; `kernels`: by which numba, or off; `learned`: digests of each stage's learned
-        files; `code`: digests of the sources of parts of the user's own; `dataset`: its config, without where it lies,
-        and its digest; `cameras`, where they are given; `pose`, where translations are signed.
-    """
+    They are `pipeline`, each stage's config (pruners as a list), `seed`; `version` of fmtorch, in a checkout its
+    commit; `libraries`: their versions; `kernels`: by which numba, or off; `learned`: digests of each stage's learned
+    files; `code`: digests of the sources of parts of the user's own; `dataset`: its config, without where it lies, and
+    its digest; `cameras`, where they are given; `pose`, where translations are signed. config: a composed config.
+    pipeline_name: the preset that it began with. pipeline: what was built of the config. dataset_digest: of the
+    contents of the data set. cameras: what the estimator is given of them; None: nothing. signed: whether the sign of a
+    translation counts."""
     stages = presets.stages(config)
-    dataset = {key: value for key, value in plain(config.dataset).items() if key not in PLACES}
+    dataset = {key: value for key, value in presets.plain(config.dataset).items() if key not in PLACES}
     dataset["digest"] = dataset_digest
     return {
         "pipeline": pipeline_name, **stages, "seed": config.seed, "version": fmtorch_version(),
@@ -183,8 +176,7 @@ def built_with(build: Callable[[], Pipeline], cameras: Mapping[int, PairCameras]
 Build = Callable[[], Pipeline]
 
 
-@dataclasses.dataclass(frozen=True)
-class Batch:
+class Batch(NamedTuple):
     """Pairs to evaluate.
     cameras: of their keys, for a pipeline that was built without them. export: whether keypoints, matches and F are to
     be exported. counted: whether the worker counts the images that it computed. signed: of `pose_errors`."""
@@ -197,8 +189,7 @@ class Batch:
     signed: bool = False
 
 
-@dataclasses.dataclass(frozen=True)
-class Work:
+class Work(NamedTuple):
     """The rows of a batch.
     computed, from_cache: images whose features a process computed or took from the cache for it. tracebacks: of
     `Pipeline.tracebacks`."""
@@ -207,7 +198,7 @@ class Work:
     computed: int = 0
     from_cache: int = 0
     records: MatchRecords | None = None
-    tracebacks: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    tracebacks: Mapping[str, str] = {}
 
 
 def evaluate_batch(pipeline: Pipeline, batch: Batch) -> Work:
@@ -231,7 +222,7 @@ def evaluate_batch(pipeline: Pipeline, batch: Batch) -> Work:
 
 def divided(batch: Batch) -> list[Batch]:
     """The pairs of a batch in batches of their own."""
-    return [dataclasses.replace(batch, pairs=[pair]) for pair in batch.pairs]
+    return [batch._replace(pairs=[pair]) for pair in batch.pairs]
 
 
 def failed(batch: Batch, reason: str) -> list[PairRow]:

@@ -89,27 +89,29 @@ def _parameters(image: StoredImage) -> tuple[str, list[float], bool]:
 
 
 def _geometry(pair: StoredPair, matches: Array, known: dict[str, Matrix | None]) -> PairGeometry:
-    written = set(map(tuple, matches.tolist()))
     if pair.geometry is not None:
-        verified = [match for match in pair.geometry.inliers.tolist() if tuple(match) in written]
-        return pair.geometry._replace(inliers=np.array(verified, np.int32).reshape(-1, 2))
+        verified = pair.geometry.inliers[among(pair.geometry.inliers, matches)]
+        return pair.geometry._replace(inliers=verified.astype(np.int32).reshape(-1, 2))
     if not (pair.related and pair.F.any()):
         return PairGeometry("degenerate", matches[:0])
     index = pair.matches[pair.inliers]
-    inliers = index[[tuple(match) in written for match in index.tolist()]]
+    inliers = index[among(index, matches)]
     K0, K1 = known[pair.name0], known[pair.name1]
     if K0 is None or K1 is None:
         return PairGeometry("uncalibrated", inliers, pair.F)
     return PairGeometry("calibrated", inliers, pair.F, K1.T @ pair.F @ K0)
 
 
+def among(rows: Array, others: Array) -> Mask:
+    """Which pairs of keypoints, (n, 2), are among others."""
+    known = set(map(tuple, others.tolist()))
+    return np.array([tuple(row) in known for row in rows.tolist()], bool)
+
+
 def _one_to_one(pair: StoredPair) -> Mask:
     """Matches that share no keypoint with a better one: COLMAP's tracks allow one each; inliers come first."""
     keep, taken0, taken1 = np.zeros(len(pair.matches), bool), set[int](), set[int]()
-    inliers = pair.inliers
-    if pair.geometry is not None:
-        verified = set(map(tuple, pair.geometry.inliers.tolist()))
-        inliers = np.array([tuple(match) in verified for match in pair.matches.tolist()], bool)
+    inliers = pair.inliers if pair.geometry is None else among(pair.matches, pair.geometry.inliers)
     for k in np.lexsort((-pair.scores, ~inliers)):
         i, j = pair.matches[k].tolist()
         if i not in taken0 and j not in taken1:
@@ -201,10 +203,10 @@ class MatchDatabase(contextlib.AbstractContextManager["MatchDatabase"]):
             self._database = self._pycolmap.Database.open(path)
         self.image = functools.lru_cache(maxsize=MEMORY)(self._image)
         lacking = ""
-        if not self._database.num_matched_image_pairs():
-            lacking = "matches; match the images (colmap exhaustive_matcher)"
         if not self._database.num_keypoints():
             lacking = "keypoints; extract features (colmap feature_extractor)"
+        elif not self._database.num_matched_image_pairs():
+            lacking = "matches; match the images (colmap exhaustive_matcher)"
         if lacking:
             self.close()
             raise ValueError(f"{path} holds no {lacking} first")

@@ -47,7 +47,7 @@ def tutorial_pairs(root: Path, images: Path | None) -> Iterator[ImagePair]:
         with h5.opened(folder / MATCHES) as file:
             names = h5.keys(file)
         with contextlib.ExitStack() as files:
-            cameras = _Cameras(folder, files)
+            cameras = _Cameras(root.name, folder, images, files)
             pairs = [_pair(root, folder, key, cameras, images) for key in names]
         yield from predictions.with_fundamentals(pairs) if cameras.by_image else pairs
 
@@ -61,12 +61,14 @@ def scenes(root: Path) -> list[Path]:
 
 
 class _Cameras:
-    """What a scene's files say of its cameras; files: closes those that are read pair by pair."""
+    """What a scene's files say of its cameras; files: closes those that are read pair by pair.
+    image: an image of the scene by its name, the same object for all pairs that show it."""
 
-    def __init__(self, folder: Path, files: contextlib.ExitStack) -> None:
+    def __init__(self, family: str, folder: Path, images: Path | None, files: contextlib.ExitStack) -> None:
         self.folder = folder
-        self._files, self._open = files, dict[str, Any]()
-        self._images: dict[str, ImageSource] = {}
+        # Opened once: opening takes longer than reading a pair, and grows with the file.
+        self._file = functools.cache(lambda name: files.enter_context(h5.opened(folder / name)))
+        self.image = functools.cache(functools.partial(predictions.image, family, folder.name, folder=images))
         self.by_image: dict[str, tuple[Matrix, Matrix]] = {}
         self.problems: dict[str, str] = {}
         rotations, translations = folder / ROTATIONS, folder / TRANSLATIONS
@@ -78,12 +80,6 @@ class _Cameras:
                     except DataError as error:
                         self.problems[name] = str(error)
         self._known = {*self.by_image, *self.problems}
-
-    def image(self, family: str, name: str, images: Path | None) -> ImageSource:
-        """An image of the scene, the same object for all pairs that show it."""
-        if name not in self._images:
-            self._images[name] = predictions.image(family, self.folder.name, name, images)
-        return self._images[name]
 
     def split(self, key: str) -> tuple[str, str]:
         """The two images of a pair; their names may hold hyphens too."""
@@ -109,12 +105,6 @@ class _Cameras:
             raise DataError(f"{self.folder}: {files}: the test split has no ground truth")
         return h5.reshaped(self._file(TRUTH), key, 3, 3)
 
-    def _file(self, name: str) -> Any:
-        """A file of the scene, opened once: opening takes longer than reading a pair, and grows with the file."""
-        if name not in self._open:
-            self._open[name] = self._files.enter_context(h5.opened(self.folder / name))
-        return self._open[name]
-
 
 def _size(source: ImageSource, K: Matrix, images: Path | None) -> Size:
     """(h, w) of an image, by its principal point where there is no file. Raises DataError where the two disagree."""
@@ -130,7 +120,7 @@ def _pair(root: Path, folder: Path, key: str, cameras: _Cameras, images: Path | 
     sources: Images | None = None
     try:
         name0, name1 = cameras.split(key)
-        sources = cameras.image(family, name0, images), cameras.image(family, name1, images)
+        sources = cameras.image(name0), cameras.image(name1)
         for name in (name0, name1):
             if name in cameras.problems:
                 raise DataError(cameras.problems[name])

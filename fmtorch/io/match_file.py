@@ -193,11 +193,9 @@ class MatchFile(_OpenFiles):
         points = self._numbers(image_id, (None, 2)).astype(np.float32)
         wanted = ((f"{pair}K{i}", (3, 3)), (f"{pair}size{i}", (2,)))
         K, size = (self._numbers(key, shape) if key in self._keys else None for key, shape in wanted)
-        known = None
-        if size is not None:
-            if not (np.isfinite(size).all() and (size >= 1).all()):
-                raise DataError(f"size{i} is {size.tolist()}; it must be the height and width of the image")
-            known = int(size[0]), int(size[1])
+        if size is not None and not (np.isfinite(size).all() and (size >= 1).all()):
+            raise DataError(f"size{i} is {size.tolist()}; it must be the height and width of the image")
+        known = None if size is None else (int(size[0]), int(size[1]))
         return DatabaseImage(image_id, i, known, K, np.inf if K is None else 0.0, points, points)
 
     def _numbers(self, key: str, shape: tuple[int | None, ...]) -> Matrix:

@@ -30,7 +30,7 @@ from typing import Any
 
 import numpy as np
 
-from fmtorch.core.files import cache_dir, replacing
+from fmtorch.core.files import cache_dir, write_whole
 from fmtorch.jit import linking
 
 Function = Callable[..., Any]
@@ -236,12 +236,13 @@ def path(function: Callable[..., Any], version: str) -> Path | None:
 
 class KernelFile:
     """The file of one version of a kernel; what numba calls the cache of a function.
-    missing: called before the function is compiled, with words that say where it will be kept. calls: once loaded or
-    saved, the kernels that the function calls."""
+    missing: called before the function is compiled, with words that say where it will be kept. compiled: whether it
+    was. calls: once loaded or saved, the kernels that the function calls."""
 
     def __init__(self, path: Path | None, missing: Callable[[str], None]) -> None:
         self.path, self.missing = path, missing
         self.calls: list[Any] = []
+        self.compiled = False
         self._lock: Any = None  # held while this process compiles; it ends with the process, however that ends
 
     def load_overload(self, signature: Any, target_context: Any) -> Any:
@@ -253,6 +254,7 @@ class KernelFile:
             return loaded  # another process has just compiled it
         kept = "for this process" if self.path is None else f"for this machine, once (kept in {self.path.parent})"
         self.missing(kept)
+        self.compiled = True
         return None
 
     def _loaded(self, signature: Any, target_context: Any) -> Any:
@@ -285,8 +287,7 @@ class KernelFile:
             data = dumps(_alone(result))
             self.calls = linking.called(data)
             if self.path is not None and not result._asdict()["library"].has_dynamic_globals:
-                with replacing(self.path) as temporary:
-                    temporary.write_bytes(_signature(data) + data)
+                write_whole(self.path, _signature(data) + data)
         except OSError as error:
             warnings.warn(f"compiled kernels are not kept: {error}", stacklevel=2)
         finally:

@@ -130,12 +130,6 @@ def begun(name: str, where: str, count: str = "") -> None:
     _state["announced"] = True
 
 
-def ended() -> None:
-    """Take the line back from a terminal."""
-    if sys.stderr.isatty():
-        print(_CLEAR, end="", file=sys.stderr, flush=True)
-
-
 P = ParamSpec("P")
 R = TypeVar("R")
 
@@ -293,12 +287,7 @@ def _compiled(uncompiled: Kernel[P, R], count: str) -> tuple[Callable[P, R], lis
     dispatcher: Any = numba.njit(**how)(cache.named_by_version(function, uncompiled.version))
     if not hasattr(dispatcher, "compile"):
         return function, []  # NUMBA_DISABLE_JIT=1
-    announced: list[str] = []
-
-    def announce(where: str) -> None:
-        begun(function.__name__, where, count)
-        announced.append(where)
-
+    announce = functools.partial(begun, function.__name__, count=count)
     file = dispatcher._cache = cache.KernelFile(cache.path(function, uncompiled.version), announce)
     enabled = gc.isenabled()
     gc.disable()  # numba makes millions of objects, nearly all of which stay
@@ -307,8 +296,8 @@ def _compiled(uncompiled: Kernel[P, R], count: str) -> tuple[Callable[P, R], lis
     finally:
         if enabled:
             gc.enable()
-    if announced:
-        ended()
+    if file.compiled and sys.stderr.isatty():
+        print(_CLEAR, end="", file=sys.stderr, flush=True)  # the line is taken back
     dispatcher.disable_compile()
     (result,) = dispatcher.overloads.values()
     linking.publish(function, result)

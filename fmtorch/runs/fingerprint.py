@@ -74,15 +74,11 @@ def code_digest(module: str) -> str:
 def _imported(file: Path, start: Path, own: bool) -> set[Path]:
     """The file, and those below `start` that it imports, and these in turn; of code that does not compile no more.
     own: whether it is of fmtorch, whose imports are followed then, and not those of anybody else."""
-    files: set[Path] = set()
-    todo = [file]
-    while todo:
-        file = todo.pop()
-        if file in files:
-            continue
-        files.add(file)
-        todo += [path for statement in _imports(file.read_bytes()) for path in _files_of(statement, file, start, own)]
-    return files
+    files = [file]
+    for each in files:  # which grows while it is read
+        named = (path for statement in _imports(each.read_bytes()) for path in _files_of(statement, each, start, own))
+        files += [path for path in dict.fromkeys(named) if path not in files]
+    return set(files)
 
 
 _Import = tuple[int | None, str, list[str]]  # dots that begin it (None: no `from`), module after `from`, names
@@ -94,10 +90,10 @@ def _imports(source: bytes) -> list[_Import]:
         nodes = _statements(ast.parse(source))
     except (SyntaxError, ValueError):
         return []
-    imports = [node for node in nodes if isinstance(node, ast.Import | ast.ImportFrom)]
     return [
         (getattr(node, "level", None), getattr(node, "module", None) or "", [alias.name for alias in node.names])
-        for node in imports
+        for node in nodes
+        if isinstance(node, ast.Import | ast.ImportFrom)
     ]
 
 
@@ -165,22 +161,21 @@ def _plain(part: object, code: bool) -> Any:
         return {str(key): _plain(value, code) for key, value in part.items()}
     if isinstance(part, list | tuple):
         return [_plain(value, code) for value in part]
-    if isinstance(part, type):
-        return _class(part, code)
     if isinstance(part, torch.Tensor):
         values = part.detach().cpu().contiguous()
         return {"tensor": [str(part.dtype), list(part.shape), digest(values.reshape(-1).view(torch.uint8).numpy())]}
-    return {**_options(part, code), **_class(type(part), code)}
+    kind, options = (part, {}) if isinstance(part, type) else (type(part), _options(part, code))
+    digests = {"code": code_digest(kind.__module__)} if code else {}
+    return {**options, "class": f"{kind.__module__}.{kind.__qualname__}", **digests}
 
 
 def learned(part: object) -> list[str]:
     """Digests of the learned files and networks that a part of a pipeline uses, sorted; of a network's weights one.
     None for a part that does not say what defines it, or whose file cannot be read: it tells so itself when used."""
     try:
-        described = _plain(part, code=False)
+        return sorted(set(_learned(_plain(part, code=False))))
     except (TypeError, OSError):
         return []
-    return sorted(set(_learned(described)))
 
 
 def _learned(value: Any) -> Iterator[str]:
@@ -203,11 +198,6 @@ def _options(part: object, code: bool) -> dict[str, Any]:
     remedy = "make it a dataclass, or give it an attribute `identity` of plain values"
     name = f"{type(part).__module__}.{type(part).__qualname__}"
     raise TypeError(f"{name} does not say what defines its results; {remedy}")
-
-
-def _class(kind: type, code: bool) -> dict[str, str]:
-    name = {"class": f"{kind.__module__}.{kind.__qualname__}"}
-    return {**name, "code": code_digest(kind.__module__)} if code else name
 
 
 @functools.cache

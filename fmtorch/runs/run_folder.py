@@ -16,7 +16,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from fmtorch.core.files import replacing
+from fmtorch.core.files import write_whole
 from fmtorch.core.settings import canonical, create, differences, head
 
 
@@ -165,8 +165,7 @@ class PartWriter:
         data = sink.getvalue().to_pybytes()
         # The second word keeps simultaneous writers apart.
         path = self.folder / f"part-{begun}-{uuid.uuid4().hex[:8]}-{content_digest(data)}.parquet"
-        with replacing(path) as temporary:
-            temporary.write_bytes(data)
+        write_whole(path, data)
         return path
 
 
@@ -285,10 +284,8 @@ class RunFolder:
 
     def write_summary(self, summary: Mapping[str, Any], markdown: str) -> None:
         """Write ``summary.json`` and ``summary.md``. Raises ValueError for NaN, which JSON does not have."""
-        text = json.dumps(summary, indent=2, allow_nan=False) + "\n"
-        for name, content in (("summary.json", text), ("summary.md", markdown)):
-            with replacing(self.path / name) as temporary:
-                temporary.write_text(content, encoding="utf-8")
+        write_whole(self.path / "summary.json", json.dumps(summary, indent=2, allow_nan=False) + "\n")
+        write_whole(self.path / "summary.md", markdown)
 
     @functools.cached_property
     def _writer(self) -> PartWriter:
