@@ -11,8 +11,7 @@ import numpy as np
 import pyarrow as pa
 
 from fmtorch import presets
-from fmtorch.core import lazy
-from fmtorch.core.settings import leaves
+from fmtorch.core import lazy, settings
 from fmtorch.evaluation import curves, statistics, tables
 from fmtorch.pipeline.photographs import Image
 from fmtorch.pipeline.pictures import jpeg_url
@@ -177,7 +176,7 @@ def run_names(
 
 def shared_settings(configs: Sequence[Mapping[str, Any]]) -> list[tuple[str, str]]:
     """What all runs have in common, which their names leave out: the pipeline, stages' presets, seed and version."""
-    settings = []
+    common = []
     for group in ("pipeline", *presets.STAGES, "seed", "version"):
         values = [config.get(group) for config in configs]
         if values[0] in (None, {}, []) or any(value != values[0] for value in values):
@@ -185,8 +184,8 @@ def shared_settings(configs: Sequence[Mapping[str, Any]]) -> list[tuple[str, str
         words = [*_pruners(values[0])] if group == "pruner" else [str(values[0])]
         if isinstance(values[0], Mapping):
             words = list(_stage(group, values[0], []))
-        settings.append((group, ", ".join(words)))
-    return settings
+        common.append((group, ", ".join(words)))
+    return common
 
 
 def _details(config: Mapping[str, Any], runs: Sequence[Mapping[str, Any]]) -> Iterator[str]:
@@ -214,7 +213,7 @@ def _stage(group: str, mine: Mapping[str, Any], values: Sequence[Mapping[str, An
     """The name of a stage's preset or class where others have another, and the options that others, or it, have not."""
     kind, changed = _kind(group, mine)
     alike = [value for value in values if _kind(group, value)[0] == kind]
-    others = [dict(leaves(dict(value))) for value in values]
+    others = [dict(settings.leaves(dict(value))) for value in values]
     options = dict(_options(mine, alike)) or {
         key: text for key, text in changed.items() if not others or any(other.get(key) != text for other in others)
     }
@@ -228,7 +227,7 @@ def _kind(group: str, value: Mapping[str, Any]) -> tuple[str, dict[str, str]]:
     close = presets.closest(group, value)
     if close is None:
         return str(value.get("_target_", group)).rpartition(".")[2], {}
-    return close[0], {key: text for key, text in leaves(close[1]) if key}
+    return close[0], {key: text for key, text in settings.leaves(close[1]) if key}
 
 
 def _words(options: Mapping[str, str]) -> list[str]:
@@ -243,7 +242,7 @@ def _pruners(value: Any) -> dict[str, Any]:
 
 def _options(mine: Mapping[str, Any], values: Sequence[Mapping[str, Any]]) -> Iterator[tuple[str, str]]:
     """The options that others have with another value, by their shortest unambiguous names."""
-    own, others = dict(leaves(dict(mine))), [dict(leaves(dict(value))) for value in values]
+    own, others = dict(settings.leaves(dict(mine))), [dict(settings.leaves(dict(value))) for value in values]
     for key, text in own.items():
         if not key.endswith("_target_") and any(other.get(key, text) != text for other in others):
             parts = key.split(".")

@@ -33,8 +33,7 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
 from fmtorch import data, presets
-from fmtorch.core import settings, terminal
-from fmtorch.core.options import expect_options
+from fmtorch.core import expect_options, settings, terminal
 from fmtorch.core.version import __version__
 from fmtorch.data import ImagePair, PairDataset, construction, read_image, subset
 from fmtorch.evaluation.run import select
