@@ -9,8 +9,6 @@ if TYPE_CHECKING:
     from fmtorch.commands.main import help_text
     from fmtorch.commands.options import COMMANDS, MatchOptions
 
-__all__ = [
-    "COMMANDS", "MatchOptions", "help_text", "hydra_arguments", "job",
-]  # fmt: skip
+__all__ = ["COMMANDS", "MatchOptions", "help_text", "hydra_arguments", "job"]
 
 lazy_exports(__name__)

@@ -15,7 +15,7 @@ from fmtorch import data, presets
 from fmtorch.commands.config import chosen_pipeline, job, run_command
 from fmtorch.commands.options import EVAL, EvalOptions
 from fmtorch.commands.report import by_dataset, named
-from fmtorch.core.files import replacing
+from fmtorch.core.files import write_whole
 from fmtorch.core.terminal import console, errors, progress_bars, reporter
 from fmtorch.data import ImagePair
 from fmtorch.evaluation import curves, tables
@@ -127,8 +127,7 @@ def _summarize(table: pa.Table, folder: RunFolder, title: str, signed: bool) -> 
     summary = summarize(table, signed)
     all_rows = summary if len(run_table) == len(table) else summarize(run_table, signed)
     folder.write_summary(all_rows, tables.summary_markdown(all_rows, title=title))
-    with replacing(folder.path / "recall.svg") as path:
-        path.write_text(curves.picture(title.partition(" ")[0], run_table), encoding="utf-8")
+    write_whole(folder.path / "recall.svg", curves.picture(title.partition(" ")[0], run_table))
     part = "" if len(run_table) == len(table) else f", {len(table)} of the {len(run_table)} pairs of the run"
     for each in tables.terminal_tables(summary, f"{title}{part}", console.width):
         console.print(each)

@@ -1,7 +1,6 @@
 """`fmtorch match`: the fundamental matrix of two photographs, with pictures; or the pairs of a folder of images."""
 
 import contextlib
-import dataclasses
 import functools
 import hashlib
 import json
@@ -9,7 +8,7 @@ import math
 import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -20,11 +19,10 @@ from rich.table import Table
 from fmtorch import presets
 from fmtorch.commands.config import chosen_pipeline, job, run_command
 from fmtorch.commands.options import MATCH, MatchOptions
-from fmtorch.core.files import expect_writable, replacing
+from fmtorch.core import RELATED, files
 from fmtorch.core.settings import canonical, head
 from fmtorch.core.stages import ImageMatcher
 from fmtorch.core.terminal import console, errors, progress_bars
-from fmtorch.core.types import RELATED
 from fmtorch.core.version import __version__
 from fmtorch.data.images import read_image, stored_orientation
 from fmtorch.evaluation.curves import view_graph_svg
@@ -32,10 +30,8 @@ from fmtorch.features.vlad import descriptor_kind, image_vector
 from fmtorch.io import export, match_store
 from fmtorch.jobs.execution import MIN_PAIRS_FOR_PROCESSES
 from fmtorch.metrics import nsgd
-from fmtorch.pipeline import MatchResult, Pipeline, build_pipeline, match
+from fmtorch.pipeline import FolderMatches, MatchResult, PhotographCameras, Pipeline, build_pipeline, match
 from fmtorch.pipeline import folder as folders
-from fmtorch.pipeline.folder import EXHAUSTIVE, SIMILAR, FolderMatches
-from fmtorch.pipeline.photographs import Image, PhotographCameras
 from fmtorch.presets.composition import execution_of, read_fields
 from fmtorch.runs import CachedFeatures, cached, fmtorch_version
 
@@ -51,7 +47,7 @@ def match_folder(
     if fields.camera == "shared" and "colmap" not in kinds:
         raise ValueError("camera=shared needs export=colmap; cameras=shared is what is known of the photographs")
     images = folders.images_below(folder)
-    similar = folders.count_of(fields.pairs, SIMILAR)
+    similar = folders.count_of(fields.pairs, folders.SIMILAR)
     pairs = [] if similar else folders.chosen_pairs(folder, images, fields.pairs)
     presets.expect_stages(config)
     stages = presets.stages(config)
@@ -117,8 +113,7 @@ def _say(work: FolderMatches, graph: export.ViewGraph, pairs: int) -> None:
 
 
 def _say_turned(images: Sequence[Path], folder: Path) -> None:
-    turned = [image.relative_to(folder).as_posix() for image in images if stored_orientation(image) != 1]
-    if turned:
+    if turned := [image.relative_to(folder).as_posix() for image in images if stored_orientation(image) != 1]:
         console.print(
             f"turned by their orientation tags: {head(turned)}. Keypoints and cameras in database.db are those of the "
             "turned images, from which COLMAP's mapper works; but COLMAP reads files as they are stored, so that its "
@@ -133,16 +128,14 @@ def _draw_graph(graph: export.ViewGraph, folder: Path, orient: bool, output: Pat
         except (OSError, ValueError):
             return None
 
-    with replacing(output / "graph.svg") as path:
-        path.write_text(view_graph_svg(graph, read), encoding="utf-8")
+    files.write_whole(output / "graph.svg", view_graph_svg(graph, read))
     return "graph.svg"
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Photographs:
+class Photographs(NamedTuple):
     """Two photographs, and what is known of their cameras as `fmtorch.match` takes it; notes: what is said of these."""
 
-    images: tuple[Image, Image]
+    images: tuple[NDArray[np.uint8], NDArray[np.uint8]]
     knowledge: dict[str, Any]
     notes: tuple[str, ...] = ()
 
@@ -196,7 +189,7 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
         return match_folder(config, fields, PhotographCameras(fields.cameras, fields.K), pipeline_name, overrides)
     if (camera := fields.camera) != "per_image":
         raise ValueError(f"camera is of a folder's database; cameras={camera} is what is known of two photographs")
-    if fields.export is not None or str(fields.pairs or EXHAUSTIVE) != EXHAUSTIVE:
+    if fields.export is not None or str(fields.pairs or folders.EXHAUSTIVE) != folders.EXHAUSTIVE:
         raise ValueError("export and pairs are of a folder of images: give images=FOLDER")
     paths = _given(fields.image0, fields.image1)
     presets.expect_stages(config)
@@ -208,7 +201,7 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
         "cameras": PhotographCameras(fields.cameras, fields.K).identity.get("cameras"), "lens": fields.lens,
     }  # fmt: skip
     folder = fields.output or _default_output(paths, settings)
-    expect_writable(folder)
+    files.expect_writable(folder)
     pipeline: Pipeline = build_pipeline(config, presets.resolve_device(fields.device))
     options = {"longest_side": fields.longest_side, "seed": fields.seed, "lens": fields.lens, **given.knowledge}
     result = match(*given.images, pipeline=pipeline, **options)
@@ -254,12 +247,10 @@ def _given(*images: Path | None) -> list[Path]:
     for path in filter(None, images):
         if path.is_dir():
             raise ValueError(f"{path} is a folder; fmtorch match images={path} matches its images with one another")
-    paths = []
-    for name, image in zip(("image0", "image1"), images, strict=True):
-        if image is None:
-            raise ValueError(f"{name} is missing; give two image files: fmtorch match a.jpg b.jpg")
-        paths.append(image)
-    return paths
+    missing = [f"image{i}" for i, image in enumerate(images) if image is None]
+    if missing:
+        raise ValueError(f"{missing[0]} is missing; give two image files: fmtorch match a.jpg b.jpg")
+    return list(filter(None, images))
 
 
 def _default_output(paths: Sequence[Path], settings: Mapping[str, Any]) -> Path:
@@ -304,15 +295,14 @@ def _table(result: MatchResult, cached: bool) -> Table:
     table.add_column("step")
     table.add_column("left", justify="right")
     table.add_column("seconds", justify="right")
-    keypoints = [len(result.keypoints0), len(result.keypoints1)]
     for step, seconds in result.seconds.items():
-        counts = keypoints if step == "features" else [result.counts.get(step, 0)]
-        unit = {"features": "keypoints", "estimation": "inliers"}.get(step, "matches")
-        left = f"{' + '.join(f'{count:,}' for count in counts)} {unit}"
-        table.add_row(
-            step, result.pair_type if step == "pair_type" else left,
-            "cached" if cached and step == "features" else f"{seconds:.3f}",
-        )  # fmt: skip
+        left, taken = f"{result.counts.get(step, 0):,} matches", f"{seconds:.3f}"
+        if step == "features":
+            left = f"{len(result.keypoints0):,} + {len(result.keypoints1):,} keypoints"
+            taken = "cached" if cached else taken
+        elif step in ("estimation", "pair_type"):
+            left = result.pair_type if step == "pair_type" else left.replace("matches", "inliers")
+        table.add_row(step, left, taken)
     return table
 
 

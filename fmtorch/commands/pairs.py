@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import hashlib
 import itertools
 import time
 from collections.abc import Iterable, Iterator, Sequence
@@ -19,9 +18,9 @@ from fmtorch.core.terminal import console, progress_bars, reporter
 from fmtorch.data.construction import BLOCK, Construction, blocks
 from fmtorch.data.pairs import HeldPairs
 from fmtorch.data.scenes import ScenePairs, image_pair
-from fmtorch.jobs.execution import Execution
-from fmtorch.jobs.runner import Factory, Local, Source, WorkerPool, in_order
+from fmtorch.jobs import Execution, Factory, Local, Source, WorkerPool, in_order
 from fmtorch.presets.composition import execution_of, plain, read_fields
+from fmtorch.runs.fingerprint import digest
 from fmtorch.scenes import RenderedPairs
 from fmtorch.training.matched_pairs import MatchedPairs, front
 from fmtorch.training.oanet_pairs import write_oanet
@@ -60,10 +59,10 @@ def run(config: DictConfig) -> Path:
                 progress.advance(bar)
         elif kept:
             _write_matches(config, construction, kept, asked, progress)
-    summary = {"candidates": dataset.candidates, "judged": judged, "kept": len(kept), "images": len(images)}
     if not kept:
         none = f"none of {judged} candidates passes the rule{_first(problems)}"
         raise ValueError(f"{none}; {construction.folder} was not completed")
+    summary = {"candidates": dataset.candidates, "judged": judged, "kept": len(kept), "images": len(images)}
     construction.finish(kept, summary)
     _print_summary(construction, summary, problems, time.monotonic() - start)
     return construction.folder
@@ -158,8 +157,7 @@ class PairsOf(HeldPairs):
     def __init__(self, construction: Construction, ranks: Sequence[int]) -> None:
         places = sorted(construction.dataset.candidate(rank) for rank in ranks)
         self._pairs = [image_pair(construction.dataset.scenes[scene], i, j) for scene, i, j in places]
-        self.name = construction.dataset.name
-        self.digest = hashlib.blake2b(f"{construction.identity} {places}".encode(), digest_size=16).hexdigest()
+        self.name, self.digest = construction.dataset.name, digest(f"{construction.identity} {places}".encode())
 
 
 def _first(problems: list[str]) -> str:

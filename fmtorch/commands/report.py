@@ -25,13 +25,12 @@ def run(config: DictConfig) -> Path:
     fields = read_fields(ReportOptions, config)
     paths = [Path(path) for path in ([fields.runs] if isinstance(fields.runs, str) else fields.runs)]
     runs = named([RunFolder.load(path) for path in run_folders(paths)])
-    if _order(fields.order, paths) == "recall":
+    if _by_recall(fields.order, paths):
         runs.sort(key=lambda r: -_recall(r.table))
     roots = [fields.root] if isinstance(fields.root, str) else fields.root or []
     places, device = [Path(root) for root in roots], presets.resolve_device(fields.device)
     options = Options(fields.pictures, places, fields.own_code, device, config.cache, fields.cache_limit)
-    beside = paths[0].parent if (paths[0] / "run.json").exists() else paths[0]
-    output = fields.output or beside / "report.html"
+    output = fields.output or (paths[0].parent if (paths[0] / "run.json").exists() else paths[0]) / "report.html"
     files.expect_writable(output.parent)
     if output.is_dir():
         raise ValueError(f"output={output} is a folder; it must name a file")
@@ -41,15 +40,13 @@ def run(config: DictConfig) -> Path:
         pairs, notes = gallery(group, options, bar)
         signed = [r.name for r in group if r.folder.config.get("pose") is not None]
         sections.append(Section(heading, {r.name: r.table for r in group}, pairs, notes, signed))
-    ran = [(heading, r.name, r.folder) for heading, group in groups.items() for r in group]
-    settings = [[str(folder.config.get(name)) for name in ("version", "seed")] for _, _, folder in ran]
-    rows = [
-        [name, heading, folder.identity[:8], *own, str(folder.path)]
-        for (heading, name, folder), own in zip(ran, settings, strict=True)
-    ]
+    rows = []
+    for heading, group in groups.items():
+        for r in group:
+            settings = (str(r.folder.config.get(name)) for name in ("version", "seed"))
+            rows.append([r.name, heading, r.folder.identity[:8], *settings, str(r.folder.path)])
     page = render(str(config.title), sections, rows, shared_settings([r.folder.config for r in runs]))
-    with files.replacing(output) as temporary:
-        temporary.write_text(page, encoding="utf-8")
+    files.write_whole(output, page)
     for section in sections:
         for note in section.notes:
             terminal.console.print(f"{section.heading}: {note}")
@@ -59,7 +56,7 @@ def run(config: DictConfig) -> Path:
 
 def _recall(table: pa.Table) -> float:
     axis = axis_of({"": table})
-    return axis.below(table[axis.column].to_numpy().astype(np.float64), axis.mark)
+    return axis.recall(table[axis.column].to_numpy().astype(np.float64))
 
 
 def run_folders(paths: Iterable[Path]) -> list[Path]:
@@ -100,10 +97,10 @@ def _merged(held: Sequence[tuple[RunFolder, pa.Table]]) -> list[tuple[RunFolder,
     return runs
 
 
-def _order(order: str | None, paths: Sequence[Path]) -> str:
+def _by_recall(order: str | None, paths: Sequence[Path]) -> bool:
     if order not in (None, "given", "recall"):
         raise ValueError(f"order={order} must be given or recall")
-    return order or ("given" if all((path / "run.json").exists() for path in paths) else "recall")
+    return order == "recall" or (order is None and not all((path / "run.json").exists() for path in paths))
 
 
 def by_dataset(runs: Sequence[Run]) -> dict[str, list[Run]]:

@@ -6,8 +6,7 @@ import sys
 import time
 
 from fmtorch.core.terminal import console, exits_with_message
-from fmtorch.jit import cache, linking
-from fmtorch.jit import kernel as switch
+from fmtorch.jit import cache, kernel, linking
 from fmtorch.jit.together import HOME, compile_together
 
 USAGE = """fmtorch warm-up: compile all kernels now
@@ -23,14 +22,14 @@ WITH_KERNELS = ("estimators", "geometry", "matching", "metrics", "pruning", "sce
 def warm_up() -> int:
     """Compile the kernels of all modules that this machine has not compiled yet; how many there are.
     Raises ValueError where kernels are switched off or cannot be kept."""
-    if not switch.available():
-        raise ValueError(f"kernels are switched off ({switch.SWITCH}=off), or numba cannot be imported")
+    if not kernel.available():
+        raise ValueError(f"kernels are switched off ({kernel.SWITCH}=off), or numba cannot be imported")
     if cache.folder() is None:
         raise ValueError(f"{cache.kernels_dir()} cannot be written; set FMTORCH_CACHE to a folder that can")
     for module in pkgutil.walk_packages([str(HOME / "fmtorch")], "fmtorch."):
         if module.name.split(".")[1] in WITH_KERNELS:
             importlib.import_module(module.name)
-    kernels = [kernel for (name, _), kernel in sorted(linking.KERNELS.items()) if name.startswith("fmtorch.")]
+    kernels = [each for (name, _), each in sorted(linking.KERNELS.items()) if name.startswith("fmtorch.")]
     compile_together(kernels)
     return len(kernels)
 

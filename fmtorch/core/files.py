@@ -23,6 +23,12 @@ def replacing(path: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
+def write_whole(path: Path, content: str | bytes) -> None:
+    """Write a file of text in UTF-8, or of bytes, whole or not at all: see `replacing`."""
+    with replacing(path) as temporary:
+        temporary.write_bytes(content.encode() if isinstance(content, str) else content)
+
+
 def expect_writable(folder: Path) -> None:
     """Make a folder, and raise OSError where no file can be written to it: before the work, not after."""
     folder.mkdir(parents=True, exist_ok=True)

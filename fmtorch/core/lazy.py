@@ -23,11 +23,12 @@ def lazy_exports(package: str, checked: bool = False) -> None:
     """Import the names that a package lists under ``if TYPE_CHECKING:``, and its modules, at their first use.
     checked: exported functions check their arguments, see `fmtorch.core.checks.checked`. The package's own modules
     import each other's functions unchecked, from where they are defined."""
-    sys.modules[package].__class__ = _CheckedPackage if checked else _LazyPackage
+    vars(sys.modules[package])["_checked"] = checked
+    sys.modules[package].__class__ = _LazyPackage
 
 
 class _LazyPackage(ModuleType):
-    _checked = False
+    _checked: bool
 
     def __getattr__(self, name: str) -> Any:
         source = None if name.startswith("_") else _sources(str(self.__file__)).get(name)
@@ -52,10 +53,6 @@ class _LazyPackage(ModuleType):
 
     def __dir__(self) -> list[str]:
         return sorted({*vars(self), *self.__all__})
-
-
-class _CheckedPackage(_LazyPackage):
-    _checked = True
 
 
 @functools.cache

@@ -35,9 +35,9 @@ class Axis:
     ticks: tuple[float, ...]
     label: str
 
-    def below(self, values: NDArray[np.float64], threshold: float) -> float:
-        """The share of values below a threshold; NaN is above any."""
-        return float((values < threshold).mean()) if len(values) else 0.0
+    def recall(self, values: NDArray[np.float64]) -> float:
+        """The share of values below the mark; NaN is above it."""
+        return float((values < self.mark).mean()) if len(values) else 0.0
 
 
 NSGD = Axis("nsgd", MAXIMUM, THRESHOLD, (0.0, 0.05, 0.1, 0.15, 0.2), "NSGD threshold")
@@ -67,13 +67,6 @@ def style(number: int) -> tuple[str, str]:
     return f"c{number % COLOURS}", DASHES[number // COLOURS % len(DASHES)]
 
 
-def swatch(number: int) -> str:
-    """A short piece of a run's line."""
-    colour, dash = style(number)
-    line = f'<line x1="0" y1="4" x2="26" y2="4" stroke-dasharray="{dash}"/>'
-    return f'<svg class="swatch {colour}" viewBox="0 0 26 8" aria-hidden="true">{line}</svg>'
-
-
 def resource(name: str) -> str:
     """The text of a file beside this one."""
     return resources.files(__package__).joinpath(name).read_text(encoding="utf-8")
@@ -87,8 +80,8 @@ def picture(name: str, table: pa.Table) -> str:
     for i, (title, errors) in enumerate(curves.items()):
         (colour, dash), y = style(i), _TOP + _LINE * (i + 1)
         rows.append(f'<path class="curve {colour}" stroke-dasharray="{dash}" d="M{_WIDTH + 6},{y - 4}h26"/>')
-        recall = f"{100 * axis.below(errors, axis.mark):.1f}"
-        rows.append(f'<text x="{_WIDTH + 38}" y="{y}">{recall} {html.escape(title)}</text>')
+        recall = f"{100 * axis.recall(errors):.1f} {html.escape(title)}"
+        rows.append(f'<text x="{_WIDTH + 38}" y="{y}">{recall}</text>')
     height = max(_HEIGHT, _TOP + _LINE * len(curves)) + _LINE
     colours, _, rules = resource("curves.css").partition("@media")
     light = dict(re.findall(r"(--\w+): (#\w+)", colours))  # by their values: not every viewer knows variables

@@ -4,7 +4,7 @@ import dataclasses
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -17,9 +17,8 @@ from fmtorch.evaluation.page import Picture, Shown, ShownPair, differing_pairs
 from fmtorch.evaluation.run import PLACES
 from fmtorch.io.dataset import WITHOUT_GEOMETRY, H5Pairs
 from fmtorch.metrics import corner_error, nsgd
+from fmtorch.pipeline import Outcome, Pipeline, build_pipeline, pictures
 from fmtorch.pipeline.photographs import Image
-from fmtorch.pipeline.pictures import draw_epipolar_lines, draw_epipolar_lines_of_corners, draw_matches
-from fmtorch.pipeline.pipeline import Outcome, Pipeline, build_pipeline
 from fmtorch.runs import RunFolder
 from fmtorch.scenes import RenderedPairs
 
@@ -58,10 +57,10 @@ def difference(pair: ImagePair, images: Sequence[Image], stored: Row, outcome: O
 
 def _other_homography(pair: ImagePair, images: Sequence[Image], stored: Row, outcome: Outcome) -> str:
     again = outcome.estimate
-    if again is None or not bool(again.ok[0]) or not stored["ok"]:
-        has_homography = again is not None and bool(again.ok[0])
-        said = f"gives {'a' if has_homography else 'no'} homography now, unlike in its run"
-        return "" if has_homography == bool(stored["ok"]) else said
+    if again is None or not bool(again.ok[0]):
+        return "gives no homography now, unlike in its run" if stored["ok"] else ""
+    if not stored["ok"]:
+        return "gives a homography now, unlike in its run"
     size, H = torch.tensor([images[0].shape[:2]]), torch.tensor(stored["H"], dtype=torch.float64).reshape(1, 3, 3)
     apart = float(corner_error(again.F.cpu(), H, size)[0])
     return "" if apart <= SAME_CORNERS else f"gives another homography when it is drawn again, {apart:.2f} px apart"
@@ -75,23 +74,24 @@ def drawn(pair: ImagePair, images: Sequence[Image], stored: Row, outcome: Outcom
         return []
     x0, x1 = (x[0].cpu().numpy().astype(np.float64) for x in (c.x0, c.x1))
     inliers = estimate.inliers[0].cpu().numpy() & bool(stored["ok"])
-    matches = draw_matches(images[0], images[1], x0, x1, inliers)
+    matches = pictures.draw_matches(images[0], images[1], x0, x1, inliers)
     matrix = "F" if pair.H is None else "H"
     said = f"{int(inliers.sum())} inliers of {matrix} (green) of {len(inliers)} matches; a sample of either is drawn"
-    pictures = [Picture(matches, f"matches of {name}", said)]
+    shown = [Picture(matches, f"matches of {name}", said)]
     if stored["ok"] and pair.H is None:
         F = np.array(stored["F"]).reshape(3, 3)
-        lines = draw_epipolar_lines(images[0], images[1], x0[inliers], x1[inliers], F, truth=pair.F)
+        lines = pictures.draw_epipolar_lines(images[0], images[1], x0[inliers], x1[inliers], F, truth=pair.F)
         said = "Epipolar lines of some inliers; the true ones dashed in white"
-        pictures.append(Picture(lines, f"epipolar lines of {name}", said))
-    return pictures
+        shown.append(Picture(lines, f"epipolar lines of {name}", said))
+    return shown
 
 
 def from_stored(pair: ImagePair, images: Sequence[Image], stored: Row, name: str) -> list[Picture]:
     """The epipolar lines of the F that a run stored, of corners of the images; nothing of a pair without F."""
     if not stored["ok"] or pair.H is not None:
         return []
-    lines = draw_epipolar_lines_of_corners(images[0], images[1], np.array(stored["F"]).reshape(3, 3), truth=pair.F)
+    F = np.array(stored["F"]).reshape(3, 3)
+    lines = pictures.draw_epipolar_lines_of_corners(images[0], images[1], F, truth=pair.F)
     said = "Epipolar lines of some corners, each in the other image, by the stored F; the true ones dashed in white"
     return [Picture(lines, f"epipolar lines of {name}", said)]
 
@@ -100,8 +100,7 @@ MAX_RUNS = 8  # whose pictures a pair has: each adds some 0.4 MB to the page
 _NOT_BUILT = (ValueError, TypeError, AttributeError, ImportError, OSError)
 
 
-@dataclasses.dataclass(frozen=True)
-class Run:
+class Run(NamedTuple):
     """A run folder, its results, and how the page calls it."""
 
     name: str
@@ -211,14 +210,13 @@ def shown_pair(pair: ImagePair, runs: Sequence[Run], pipelines: Mapping[str, Pip
     for r in runs:
         stored = next(row for row in r.table.to_pylist() if row["key"] == pair.key)
         pipeline = pipelines[r.name]
-        pictures: list[Picture] = []
+        again: list[Picture] = []
         if pipeline is not None:
             (outcome,) = pipeline.run([pair], int(r.folder.config.get("seed", 0)))
             note = difference(pair, images, stored, outcome)
             notes += [f"{r.name} {note}"] if note else []
-            pictures = drawn(pair, images, stored, outcome, r.name)
-        pictures = pictures or from_stored(pair, images, stored, r.name)
-        nsgd = float(stored["nsgd"]) if stored["ok"] else None
-        kind = stored["pair_type"] or ""
-        seen.append(Shown(r.name, nsgd, str(stored["reason"]), pictures, kind, stored["corner_error"]))
+            again = drawn(pair, images, stored, outcome, r.name)
+        nsgd, kind = float(stored["nsgd"]) if stored["ok"] else None, stored["pair_type"] or ""
+        shown = again or from_stored(pair, images, stored, r.name)
+        seen.append(Shown(r.name, nsgd, str(stored["reason"]), shown, kind, stored["corner_error"]))
     return ShownPair(pair.identity, seen, notes)

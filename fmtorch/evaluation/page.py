@@ -1,19 +1,17 @@
 """The report of several runs: tables, paired differences, curves and pictures on one HTML page."""
 
 import base64
-import dataclasses
 import hashlib
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 import pyarrow as pa
 
 from fmtorch import presets
-from fmtorch.core import lazy
-from fmtorch.core.settings import leaves
+from fmtorch.core import lazy, settings
 from fmtorch.evaluation import curves, statistics, tables
 from fmtorch.pipeline.photographs import Image
 from fmtorch.pipeline.pictures import jpeg_url
@@ -22,8 +20,7 @@ QUALITY, WIDTH = 80, 1280  # of JPEG pictures; px
 DISAGREEMENT = 0.1  # NSGD beyond which a result is as bad as any
 
 
-@dataclasses.dataclass(frozen=True)
-class Picture:
+class Picture(NamedTuple):
     """An RGB picture and what it shows."""
 
     image: Image
@@ -39,8 +36,7 @@ class Picture:
         return jpeg_url(image, QUALITY), image.shape[1], image.shape[0]
 
 
-@dataclasses.dataclass(frozen=True)
-class Shown:
+class Shown(NamedTuple):
     """A pair as one run sees it. nsgd: None where it failed, with the reason. pair_type: empty where unknown.
     corner_error: px, in place of NSGD where the pair has a homography."""
 
@@ -65,8 +61,7 @@ class Shown:
         return f"{result}, {self.pair_type}" if self.pair_type not in ("", "general") else result
 
 
-@dataclasses.dataclass(frozen=True)
-class ShownPair:
+class ShownPair(NamedTuple):
     """A pair of images as each run sees it; notes: what the reader should know of the pictures."""
 
     name: str
@@ -74,8 +69,7 @@ class ShownPair:
     notes: Sequence[str] = ()
 
 
-@dataclasses.dataclass(frozen=True)
-class Section:
+class Section(NamedTuple):
     """The runs on one data set: tables of `PAIR_SCHEMA` by the runs' names, the first is what others differ from.
     notes: what the reader should know of the pictures of pairs, or why there are none. signed: the runs in which the
     sign of a translation counts."""
@@ -98,7 +92,7 @@ def render(
     options: dict[str, Any] = {"undefined": jinja2.StrictUndefined, "trim_blocks": True, "lstrip_blocks": True}
     page: str = jinja2.Environment(autoescape=True, **options).from_string(curves.resource("report.html.j2")).render(
         title=title, runs=runs, shared=shared, names=names,
-        swatches={name: curves.swatch(i) for i, name in enumerate(names)},
+        styles={name: curves.style(i) for i, name in enumerate(names)},
         sections=[_context(section, names) for section in sections],
         style=curves.resource("curves.css") + curves.resource("report.css"), script=script,
         policy="default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-"
@@ -182,7 +176,7 @@ def run_names(
 
 def shared_settings(configs: Sequence[Mapping[str, Any]]) -> list[tuple[str, str]]:
     """What all runs have in common, which their names leave out: the pipeline, stages' presets, seed and version."""
-    settings = []
+    common = []
     for group in ("pipeline", *presets.STAGES, "seed", "version"):
         values = [config.get(group) for config in configs]
         if values[0] in (None, {}, []) or any(value != values[0] for value in values):
@@ -190,8 +184,8 @@ def shared_settings(configs: Sequence[Mapping[str, Any]]) -> list[tuple[str, str
         words = [*_pruners(values[0])] if group == "pruner" else [str(values[0])]
         if isinstance(values[0], Mapping):
             words = list(_stage(group, values[0], []))
-        settings.append((group, ", ".join(words)))
-    return settings
+        common.append((group, ", ".join(words)))
+    return common
 
 
 def _details(config: Mapping[str, Any], runs: Sequence[Mapping[str, Any]]) -> Iterator[str]:
@@ -202,8 +196,11 @@ def _details(config: Mapping[str, Any], runs: Sequence[Mapping[str, Any]]) -> It
         mine = config.get(group)
         if group not in config or all(value == mine for value in values) or mine == usual.get(group):
             continue
-        if group == "pruner":
-            yield from _pruner_words(mine, values)
+        if group == "pruner":  # the names where their order or the choice differs, and options that differ
+            own, others = _pruners(mine), [_pruners(value) for value in values]
+            if any(list(other) != list(own) for other in others):
+                yield "+".join(own) or "no pruner"
+            yield from _words(dict(_options(own, others)))
         elif isinstance(mine, Mapping):
             yield from _stage(group, mine, [value for value in values if isinstance(value, Mapping)])
         elif group == "version":
@@ -216,7 +213,7 @@ def _stage(group: str, mine: Mapping[str, Any], values: Sequence[Mapping[str, An
     """The name of a stage's preset or class where others have another, and the options that others, or it, have not."""
     kind, changed = _kind(group, mine)
     alike = [value for value in values if _kind(group, value)[0] == kind]
-    others = [dict(leaves(dict(value))) for value in values]
+    others = [dict(settings.leaves(dict(value))) for value in values]
     options = dict(_options(mine, alike)) or {
         key: text for key, text in changed.items() if not others or any(other.get(key) != text for other in others)
     }
@@ -230,20 +227,12 @@ def _kind(group: str, value: Mapping[str, Any]) -> tuple[str, dict[str, str]]:
     close = presets.closest(group, value)
     if close is None:
         return str(value.get("_target_", group)).rpartition(".")[2], {}
-    return close[0], {key: text for key, text in leaves(close[1]) if key}
+    return close[0], {key: text for key, text in settings.leaves(close[1]) if key}
 
 
 def _words(options: Mapping[str, str]) -> list[str]:
     words = [f"{key}={text.strip(chr(34))}" for key, text in options.items()]
     return words if len(words) <= MAX_OPTIONS else []
-
-
-def _pruner_words(mine: Any, values: Sequence[Any]) -> Iterator[str]:
-    """The pruners' names in their order where the order or the choice differs, and options that differ."""
-    names = list(_pruners(mine))
-    if any(list(_pruners(value)) != names for value in values):
-        yield "+".join(names) or "no pruner"
-    yield from _words(dict(_options(_pruners(mine), [_pruners(value) for value in values])))
 
 
 def _pruners(value: Any) -> dict[str, Any]:
@@ -253,13 +242,9 @@ def _pruners(value: Any) -> dict[str, Any]:
 
 def _options(mine: Mapping[str, Any], values: Sequence[Mapping[str, Any]]) -> Iterator[tuple[str, str]]:
     """The options that others have with another value, by their shortest unambiguous names."""
-    own, others = dict(leaves(dict(mine))), [dict(leaves(dict(value))) for value in values]
+    own, others = dict(settings.leaves(dict(mine))), [dict(settings.leaves(dict(value))) for value in values]
     for key, text in own.items():
         if not key.endswith("_target_") and any(other.get(key, text) != text for other in others):
             parts = key.split(".")
             endings = [".".join(parts[i:]) for i in range(len(parts) - 1, -1, -1)]
-            yield next(end for end in endings if sum(_ends(other, end) for other in own) == 1), text
-
-
-def _ends(key: str, ending: str) -> bool:
-    return key == ending or key.endswith(f".{ending}")
+            yield next(end for end in endings if sum(f".{other}".endswith(f".{end}") for other in own) == 1), text

@@ -18,8 +18,6 @@ from fmtorch import metrics
 from fmtorch.core.types import Correspondences, Estimate, collate
 from fmtorch.data.pairs import ImagePair
 from fmtorch.io.oanet import GEODESIC, geodesic
-from fmtorch.metrics import closest_pose_error, corner_error, fundamental_pose_error, pose_error, right_of_homography
-from fmtorch.metrics.pose import PoseError
 from fmtorch.pipeline.pipeline import STAGES, Outcome
 from fmtorch.runs import PairRow
 
@@ -108,8 +106,8 @@ def _of_homographies(outcomes: Sequence[Outcome]) -> list[Figures]:
     if matched := _matched(outcomes):
         own = [outcomes[i] for i in matched]
         (c, estimate, (size0, _)), (H,) = _joined(own), _truth(own, "H")
-        errors = torch.where(estimate.ok, corner_error(estimate.F, H, size0), torch.inf)
-        right, kept = right_of_homography(H, c.x0, c.x1, mask=c.mask), estimate.inliers & c.mask
+        errors = torch.where(estimate.ok, metrics.corner_error(estimate.F, H, size0), torch.inf)
+        right, kept = metrics.right_of_homography(H, c.x0, c.x1, mask=c.mask), estimate.inliers & c.mask
         before = right.sum(-1).double() / c.mask.sum(-1)
         after = torch.where(estimate.ok, (right & kept).sum(-1).double() / kept.sum(-1), torch.nan)
         for i, error, a, b in zip(matched, errors.tolist(), before.tolist(), after.tolist(), strict=True):
@@ -161,24 +159,18 @@ def pose_errors(outcomes: Sequence[Outcome], signed: bool = False) -> list[PairP
     See `pose_error` and `fundamental_pose_error`. A pair without F, or without a pose, has the largest errors and a
     reason; one whose calibration or motion is unknown has a reason only. signed: the sign of the translation counts,
     and of the four poses of F the best one: `closest_pose_error`."""
-    poses = [_without_estimate(outcome, signed) for outcome in outcomes]
+    largest = PairPose(LARGEST_ROTATION, LARGEST_ROTATION if signed else LARGEST_TRANSLATION, "no F")
+    missing = ((_unknown(outcome.pair), outcome.solved) for outcome in outcomes)
+    poses = [largest if what is None and not solved else PairPose(None, None, what) for what, solved in missing]
     known = [i for i, pose in enumerate(poses) if pose.pose_reason is None]
     own_pose = functools.partial(_of_pose, up_to_sign=not signed), "the pose is not determined"
     of_F = (_closest, "F has no pose") if signed else (_of_fundamental, "no inlier in front of both cameras")
     for estimated, (error_of, reason) in ((True, own_pose), (False, of_F)):
         own = [i for i in known if (cast(Estimate, outcomes[i].estimate).R is not None) == estimated]
-        error = error_of([outcomes[i] for i in own]) if own else PoseError(torch.zeros(0), torch.zeros(0))
+        error = error_of([outcomes[i] for i in own]) if own else metrics.PoseError(torch.zeros(0), torch.zeros(0))
         for i, rotation, translation in zip(own, error.rotation.tolist(), error.translation.tolist(), strict=True):
             poses[i] = PairPose(rotation, translation, reason if rotation >= LARGEST_ROTATION else None)
     return poses
-
-
-def _without_estimate(outcome: Outcome, signed: bool) -> PairPose:
-    if (missing := _unknown(outcome.pair)) is not None:
-        return PairPose(None, None, missing)
-    if not outcome.solved:
-        return PairPose(LARGEST_ROTATION, LARGEST_ROTATION if signed else LARGEST_TRANSLATION, "no F")
-    return PairPose(None, None, None)
 
 
 def _unknown(pair: ImagePair) -> str | None:
@@ -189,20 +181,20 @@ def _unknown(pair: ImagePair) -> str | None:
     return f"{', '.join(broken)} not finite" if broken else None
 
 
-def _of_pose(outcomes: Sequence[Outcome], up_to_sign: bool) -> PoseError:
+def _of_pose(outcomes: Sequence[Outcome], up_to_sign: bool) -> metrics.PoseError:
     (_, estimate, _), (R, t) = _joined(outcomes), _truth(outcomes, "R", "t")
     own = cast(Tensor, estimate.R).double(), cast(Tensor, estimate.t).double()
-    return pose_error(*own, R, t, up_to_sign=up_to_sign)
+    return metrics.pose_error(*own, R, t, up_to_sign=up_to_sign)
 
 
-def _of_fundamental(outcomes: Sequence[Outcome]) -> PoseError:
+def _of_fundamental(outcomes: Sequence[Outcome]) -> metrics.PoseError:
     (c, estimate, _), (K0, K1, R, t) = _joined(outcomes), _truth(outcomes, "K0", "K1", "R", "t")
-    return fundamental_pose_error(estimate.F.double(), K0, K1, c.x0, c.x1, R, t, estimate.inliers & c.mask)
+    return metrics.fundamental_pose_error(estimate.F.double(), K0, K1, c.x0, c.x1, R, t, estimate.inliers & c.mask)
 
 
-def _closest(outcomes: Sequence[Outcome]) -> PoseError:
+def _closest(outcomes: Sequence[Outcome]) -> metrics.PoseError:
     _, estimate, _ = _joined(outcomes)
-    return closest_pose_error(estimate.F.double(), *_truth(outcomes, "K0", "K1", "R", "t"))
+    return metrics.closest_pose_error(estimate.F.double(), *_truth(outcomes, "K0", "K1", "R", "t"))
 
 
 class FocalErrors(NamedTuple):

@@ -26,10 +26,8 @@ from fmtorch.data import GivenMatches, ImagePair, ImageSource, exif_focal
 from fmtorch.evaluation.rows import evaluate
 from fmtorch.io.match_store import MatchRecords, MatchStore
 from fmtorch.jit import kernel
-from fmtorch.jobs.execution import Execution
-from fmtorch.jobs.runner import Factory, Local, Source, TaskRunner, WorkerPool
+from fmtorch.jobs import Execution, Factory, Local, Source, TaskRunner, WorkerPool
 from fmtorch.pipeline import Outcome, Pipeline, examined, match_records
-from fmtorch.presets import plain
 from fmtorch.runs import CachedFeatures, PairRow
 from fmtorch.runs.fingerprint import code_digest, file_digest, fmtorch_version, learned, libraries
 from fmtorch.two_view import known_cameras, pair_type
@@ -59,7 +57,7 @@ def run_identity(
         and its digest; `cameras` and `lens`, where they are given; `pose`, where translations are signed.
     """
     stages = presets.stages(config)
-    dataset = {key: value for key, value in plain(config.dataset).items() if key not in PLACES}
+    dataset = {key: value for key, value in presets.plain(config.dataset).items() if key not in PLACES}
     dataset["digest"] = dataset_digest
     return {
         "pipeline": pipeline_name, **stages, "seed": config.seed, "version": fmtorch_version(),
@@ -198,8 +196,7 @@ def built_with(
 Build = Callable[[], Pipeline]
 
 
-@dataclasses.dataclass(frozen=True)
-class Batch:
+class Batch(NamedTuple):
     """Pairs to evaluate.
     cameras: of their keys, for a pipeline that was built without them. export: whether keypoints, matches and F are to
     be exported. counted: whether the worker counts the images that it computed. signed: of `pose_errors`."""
@@ -212,8 +209,7 @@ class Batch:
     signed: bool = False
 
 
-@dataclasses.dataclass(frozen=True)
-class Work:
+class Work(NamedTuple):
     """The rows of a batch.
     computed, from_cache: images whose features a process computed or took from the cache for it. tracebacks: of
     `Pipeline.tracebacks`."""
@@ -222,7 +218,7 @@ class Work:
     computed: int = 0
     from_cache: int = 0
     records: MatchRecords | None = None
-    tracebacks: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    tracebacks: Mapping[str, str] = {}
 
 
 def evaluate_batch(pipeline: Pipeline, batch: Batch) -> Work:
@@ -248,7 +244,7 @@ def evaluate_batch(pipeline: Pipeline, batch: Batch) -> Work:
 
 def divided(batch: Batch) -> list[Batch]:
     """The pairs of a batch in batches of their own."""
-    return [dataclasses.replace(batch, pairs=[pair]) for pair in batch.pairs]
+    return [batch._replace(pairs=[pair]) for pair in batch.pairs]
 
 
 def failed(batch: Batch, reason: str) -> list[PairRow]:

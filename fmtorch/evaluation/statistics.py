@@ -300,8 +300,7 @@ def summarize(table: pa.Table, signed: bool = False) -> dict[str, Group]:
     - labels: of given matches of pairs with known cameras, see `label_figures`; None where there are none.
     - pair_types: how many pairs are in each of `PAIR_TYPES`; None where none is known.
     - focals: of the focal lengths that were estimated, see `focal_figures`; None where there are none.
-    - seconds: median per pair for each stage, and ``total``.
-    """
+    - seconds: median per pair for each stage, and ``total``."""
     families = table["family"].to_pylist()
     groups = {name: table.filter(pa.array([f == name for f in families])) for name in dict.fromkeys(families)}
     return {name: _group(part, signed) for name, part in {**groups, ALL: table}.items()}

@@ -1,6 +1,5 @@
 """Summaries as tables: of one run on a terminal and in Markdown, of several runs as cells of a report."""
 
-import dataclasses
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import NamedTuple
 
@@ -267,8 +266,7 @@ def _escape(text: str) -> str:
     return " ".join(text.replace("|", "\\|").split())
 
 
-@dataclasses.dataclass(frozen=True)
-class Bar:
+class Bar(NamedTuple):
     """What a cell draws below its figure, in percent of its width: an interval, its value, and a line at zero."""
 
     low: float
@@ -277,8 +275,7 @@ class Bar:
     zero: float | None = None
 
 
-@dataclasses.dataclass(frozen=True)
-class Cell:
+class Cell(NamedTuple):
     """A figure. best: the best of its column. shares: the parts, in percent, of a stacked bar."""
 
     text: str
@@ -287,8 +284,7 @@ class Cell:
     shares: Sequence[float] = ()
 
 
-@dataclasses.dataclass(frozen=True)
-class Table:
+class Table(NamedTuple):
     """Cells by the runs' names, below their headings; the first heading is that of the names."""
 
     heading: str
@@ -315,7 +311,7 @@ def _merit(overall: Mapping[str, Group]) -> Table:
         return table
     place = list(columns).index(RECALL)
     for name, cells in table.rows.items():
-        cells[place] = dataclasses.replace(cells[place], bar=_share(overall[name]))
+        cells[place] = cells[place]._replace(bar=_share(overall[name]))
     return table
 
 
@@ -415,10 +411,10 @@ def _seconds(overall: Mapping[str, Group]) -> Table:
     for name, seconds in known.items():
         stages = [seconds[stage] or 0.0 for stage in STAGES]
         width = 100 * (seconds["total"] or 0.0) / slowest / sum(stages) if slowest and sum(stages) else 0.0
-        table.rows[name][-1] = dataclasses.replace(table.rows[name][-1], shares=[width * each for each in stages])
+        table.rows[name][-1] = table.rows[name][-1]._replace(shares=[width * each for each in stages])
     failed = [f"{name}: {reason} ({n})" for name, group in overall.items() for reason, n in group["reasons"].items()]
     note = f"Pairs that failed: {'; '.join(failed)}." if failed else ""
-    return dataclasses.replace(table, note=note, stages=True)
+    return table._replace(note=note, stages=True)
 
 
 def shared_keys(runs: Mapping[str, pa.Table]) -> list[int]:

@@ -33,13 +33,11 @@ def write_database(
     path: Path, images: Iterable[StoredImage], pairs: Iterable[StoredPair], shared_camera: bool = False
 ) -> None:
     """Write a database: keypoints, the matches given to the estimator, and the geometry of each pair with its inliers.
-
     Degenerate geometries are left out; a pair without a geometry has F, with both cameras known E, too, where its
     support is beyond chance. A known K is a PINHOLE camera with a trusted focal length, one with distortion is of its
     lens's model; images of equal cameras and size share it. Otherwise an image has a SIMPLE_RADIAL camera of the focal
     length of EXIF, or COLMAP's default, or shares it with all of its size. Pixels are moved by half of one, as COLMAP
-    counts.
-    """
+    counts."""
     pycolmap = imported()
     cameras: dict[object, int] = {}
     ids: dict[str, int] = {}
@@ -91,27 +89,29 @@ def _parameters(image: StoredImage) -> tuple[str, list[float], bool]:
 
 
 def _geometry(pair: StoredPair, matches: Array, known: dict[str, Matrix | None]) -> PairGeometry:
-    written = set(map(tuple, matches.tolist()))
     if pair.geometry is not None:
-        verified = [match for match in pair.geometry.inliers.tolist() if tuple(match) in written]
-        return pair.geometry._replace(inliers=np.array(verified, np.int32).reshape(-1, 2))
+        verified = pair.geometry.inliers[among(pair.geometry.inliers, matches)]
+        return pair.geometry._replace(inliers=verified.astype(np.int32).reshape(-1, 2))
     if not (pair.related and pair.F.any()):
         return PairGeometry("degenerate", matches[:0])
     index = pair.matches[pair.inliers]
-    inliers = index[[tuple(match) in written for match in index.tolist()]]
+    inliers = index[among(index, matches)]
     K0, K1 = known[pair.name0], known[pair.name1]
     if K0 is None or K1 is None:
         return PairGeometry("uncalibrated", inliers, pair.F)
     return PairGeometry("calibrated", inliers, pair.F, K1.T @ pair.F @ K0)
 
 
+def among(rows: Array, others: Array) -> Mask:
+    """Which pairs of keypoints, (n, 2), are among others."""
+    known = set(map(tuple, others.tolist()))
+    return np.array([tuple(row) in known for row in rows.tolist()], bool)
+
+
 def _one_to_one(pair: StoredPair) -> Mask:
     """Matches that share no keypoint with a better one: COLMAP's tracks allow one each; inliers come first."""
     keep, taken0, taken1 = np.zeros(len(pair.matches), bool), set[int](), set[int]()
-    inliers = pair.inliers
-    if pair.geometry is not None:
-        verified = set(map(tuple, pair.geometry.inliers.tolist()))
-        inliers = np.array([tuple(match) in verified for match in pair.matches.tolist()], bool)
+    inliers = pair.inliers if pair.geometry is None else among(pair.matches, pair.geometry.inliers)
     for k in np.lexsort((-pair.scores, ~inliers)):
         i, j = pair.matches[k].tolist()
         if i not in taken0 and j not in taken1:
@@ -127,14 +127,11 @@ EXIF_DEVIATION = 0.05  # relative, of focal lengths by EXIF (docs/cameras.md)
 @dataclasses.dataclass(frozen=True)
 class DatabaseImage:
     """An image with its keypoints, px, with (0, 0) at the centre of the first pixel.
-
     size: (h, w), and K, None where unknown. points: (n, 2) as stored; pinhole: (n, 2), where a pinhole of calibration K
     would have put them, NaN where it sees nothing. deviation: relative, of the focal length of K: 0 where it was
     calibrated, infinite where it is COLMAP's guess. problem: what is wrong with the camera. warning: what of it is not
-    taken for known.
-
-    Scales, orientations and affine shapes of keypoints are not used: docs/verify.md says what they were worth.
-    """
+    taken for known. Scales, orientations and affine shapes of keypoints are not used: docs/verify.md says what they
+    were worth."""
 
     name: str
     camera_id: int
@@ -195,10 +192,8 @@ Ids = tuple[int, int]
 
 class MatchDatabase(contextlib.AbstractContextManager["MatchDatabase"]):
     """An open database. Its images are read when they are needed, and few of them are kept.
-
     Raises what `expect_database` raises, and ValueError where there are no keypoints or no matches; OSError where the
-    disk is full or another process holds the database.
-    """
+    disk is full or another process holds the database."""
 
     def __init__(self, path: Path) -> None:
         self._pycolmap = imported()
@@ -208,10 +203,10 @@ class MatchDatabase(contextlib.AbstractContextManager["MatchDatabase"]):
             self._database = self._pycolmap.Database.open(path)
         self.image = functools.lru_cache(maxsize=MEMORY)(self._image)
         lacking = ""
-        if not self._database.num_matched_image_pairs():
-            lacking = "matches; match the images (colmap exhaustive_matcher)"
         if not self._database.num_keypoints():
             lacking = "keypoints; extract features (colmap feature_extractor)"
+        elif not self._database.num_matched_image_pairs():
+            lacking = "matches; match the images (colmap exhaustive_matcher)"
         if lacking:
             self.close()
             raise ValueError(f"{path} holds no {lacking} first")
@@ -237,9 +232,7 @@ class MatchDatabase(contextlib.AbstractContextManager["MatchDatabase"]):
 
     def matches(self, pair: Ids) -> Indices:
         """The matches of a pair, keypoints (n, 2) of its images.
-
-        Raises ValueError where there are no such keypoints.
-        """
+        Raises ValueError where there are no such keypoints."""
         matches = np.asarray(self._database.read_matches(*pair)).astype(np.int64).reshape(-1, 2)
         for image_id, index in zip(pair, matches.T, strict=True):
             image = self.image(image_id)

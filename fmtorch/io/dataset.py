@@ -14,33 +14,25 @@ from fmtorch.data import DataError, FMBenchPairs, GivenMatches, ImagePair, Image
 from fmtorch.data.files import Matrix, given_root
 from fmtorch.data.pairs import HeldPairs
 from fmtorch.io import h5, oanet, predictions
-from fmtorch.io.predictions import Size
+from fmtorch.io.predictions import Images, Size
 
-Sources = tuple[ImageSource, ImageSource]
 MATCHES, RATIOS, CALIBRATIONS, ROTATIONS, TRANSLATIONS, TRUTH = (
     f"{name}.h5" for name in ("matches", "match_conf", "K1_K2", "R", "T", "Fgt")
 )
 
 
-@dataclasses.dataclass(frozen=True)
-class TutorialMatches:
+def tutorial_matches(folder: Path, key: str, sizes: tuple[Size, Size]) -> GivenMatches:
     """The matches of one pair."""
-
-    folder: Path
-    key: str
-    sizes: tuple[Size, Size]
-
-    def __call__(self) -> GivenMatches:
-        with h5.opened(self.folder / MATCHES) as file:
-            points = h5.numbers(file, self.key, None, 4)
-        ratios = None
-        if (self.folder / RATIOS).exists():
-            with h5.opened(self.folder / RATIOS) as file:
-                ratios = h5.numbers(file, self.key).reshape(-1)
-            if len(ratios) != len(points):
-                lengths = f"{len(ratios)} entries, but {MATCHES} has {len(points)} matches of that pair"
-                raise DataError(f"{self.folder / RATIOS}: {self.key!r} has {lengths}")
-        return predictions.given(points[:, :2], points[:, 2:], self.sizes, (len(points), len(points)), ratio=ratios)
+    with h5.opened(folder / MATCHES) as file:
+        points = h5.numbers(file, key, None, 4)
+    ratios = None
+    if (folder / RATIOS).exists():
+        with h5.opened(folder / RATIOS) as file:
+            ratios = h5.numbers(file, key).reshape(-1)
+        if len(ratios) != len(points):
+            lengths = f"{len(ratios)} entries, but {MATCHES} has {len(points)} matches of that pair"
+            raise DataError(f"{folder / RATIOS}: {key!r} has {lengths}")
+    return predictions.given(points[:, :2], points[:, 2:], sizes, (len(points), len(points)), ratio=ratios)
 
 
 def tutorial_files(root: Path) -> list[Path]:
@@ -55,7 +47,7 @@ def tutorial_pairs(root: Path, images: Path | None) -> Iterator[ImagePair]:
         with h5.opened(folder / MATCHES) as file:
             names = h5.keys(file)
         with contextlib.ExitStack() as files:
-            cameras = _Cameras(folder, files)
+            cameras = _Cameras(root.name, folder, images, files)
             pairs = [_pair(root, folder, key, cameras, images) for key in names]
         yield from predictions.with_fundamentals(pairs) if cameras.by_image else pairs
 
@@ -69,12 +61,14 @@ def scenes(root: Path) -> list[Path]:
 
 
 class _Cameras:
-    """What a scene's files say of its cameras; files: closes those that are read pair by pair."""
+    """What a scene's files say of its cameras; files: closes those that are read pair by pair.
+    image: an image of the scene by its name, the same object for all pairs that show it."""
 
-    def __init__(self, folder: Path, files: contextlib.ExitStack) -> None:
+    def __init__(self, family: str, folder: Path, images: Path | None, files: contextlib.ExitStack) -> None:
         self.folder = folder
-        self._files, self._open = files, dict[str, Any]()
-        self._images: dict[str, ImageSource] = {}
+        # Opened once: opening takes longer than reading a pair, and grows with the file.
+        self._file = functools.cache(lambda name: files.enter_context(h5.opened(folder / name)))
+        self.image = functools.cache(functools.partial(predictions.image, family, folder.name, folder=images))
         self.by_image: dict[str, tuple[Matrix, Matrix]] = {}
         self.problems: dict[str, str] = {}
         rotations, translations = folder / ROTATIONS, folder / TRANSLATIONS
@@ -86,12 +80,6 @@ class _Cameras:
                     except DataError as error:
                         self.problems[name] = str(error)
         self._known = {*self.by_image, *self.problems}
-
-    def image(self, family: str, name: str, images: Path | None) -> ImageSource:
-        """An image of the scene, the same object for all pairs that show it."""
-        if name not in self._images:
-            self._images[name] = predictions.image(family, self.folder.name, name, images)
-        return self._images[name]
 
     def split(self, key: str) -> tuple[str, str]:
         """The two images of a pair; their names may hold hyphens too."""
@@ -117,12 +105,6 @@ class _Cameras:
             raise DataError(f"{self.folder}: {files}: the test split has no ground truth")
         return h5.reshaped(self._file(TRUTH), key, 3, 3)
 
-    def _file(self, name: str) -> Any:
-        """A file of the scene, opened once: opening takes longer than reading a pair, and grows with the file."""
-        if name not in self._open:
-            self._open[name] = self._files.enter_context(h5.opened(self.folder / name))
-        return self._open[name]
-
 
 def _size(source: ImageSource, K: Matrix, images: Path | None) -> Size:
     """(h, w) of an image, by its principal point where there is no file. Raises DataError where the two disagree."""
@@ -135,30 +117,29 @@ def _size(source: ImageSource, K: Matrix, images: Path | None) -> Size:
 def _pair(root: Path, folder: Path, key: str, cameras: _Cameras, images: Path | None) -> ImagePair:
     family, scene = root.name, folder.name
     identity = key if folder == root else f"{scene}/{key}"  # whatever the folder is called: draws follow from it
-    sources: Sources | None = None
+    sources: Images | None = None
     try:
         name0, name1 = cameras.split(key)
-        sources = cameras.image(family, name0, images), cameras.image(family, name1, images)
+        sources = cameras.image(name0), cameras.image(name1)
         for name in (name0, name1):
             if name in cameras.problems:
                 raise DataError(cameras.problems[name])
         K0, K1 = cameras.calibration(key)
         sizes = _size(sources[0], K0, images), _size(sources[1], K1, images)
+        matches = functools.partial(tutorial_matches, folder, key, sizes)
         if cameras.by_image:
             (R0, t0), (R1, t1) = cameras.by_image[name0], cameras.by_image[name1]
             R = R1 @ R0.T
-            matches = TutorialMatches(folder, key, sizes)
             pose = R, t1 - R @ t0
             return ImagePair(identity, family, scene, *sources, np.zeros((3, 3)), K0, K1, *pose, matches=matches)
         F = cameras.truth(key)
-        norm = float(np.linalg.norm(F))
-        problem = None if norm else f"{folder / TRUTH}: {key!r} is zero"
-        pair = ImagePair(identity, family, scene, *sources, F / (norm or 1.0), K0, K1, problem=problem)
     except DataError as error:
         unnamed = predictions.image(family, scene, key, images)
         shown = sources or (unnamed, unnamed)
         return ImagePair(identity, family, scene, *shown, np.zeros((3, 3)), problem=str(error))
-    return dataclasses.replace(pair, matches=TutorialMatches(folder, key, sizes))
+    norm = float(np.linalg.norm(F))
+    problem = None if norm else f"{folder / TRUTH}: {key!r} is zero"
+    return ImagePair(identity, family, scene, *sources, F / (norm or 1.0), K0, K1, problem=problem, matches=matches)
 
 
 # PoseBench's files of relative poses: a group for each pair, with ``x1``, ``x2`` (n, 2), ``camera1``, ``camera2``
@@ -168,27 +149,21 @@ FOCAL_LENGTHS = {"SIMPLE_PINHOLE": 1, "PINHOLE": 2, "SIMPLE_RADIAL": 1, "RADIAL"
 """Camera models that are pinholes where their distortion is zero, and how many focal lengths begin their parameters."""
 
 
-@dataclasses.dataclass(frozen=True)
-class PoseBenchMatches:
+def posebench_matches(
+    path: Path, key: str, K: tuple[Matrix, Matrix], sizes: tuple[Size | None, Size | None]
+) -> GivenMatches:
     """The matches of one pair. K: of both cameras. sizes: None where neither file nor image tells."""
-
-    path: Path
-    key: str
-    K: tuple[Matrix, Matrix]
-    sizes: tuple[Size | None, Size | None]
-
-    def __call__(self) -> GivenMatches:
-        with h5.opened(self.path) as file:
-            x0, x1 = (h5.numbers(file, f"{self.key}/{name}", None, 2) for name in ("x1", "x2"))
-        if len(x0) != len(x1):
-            raise DataError(f"{self.path}: {self.key!r} has {len(x0)} points in x1 and {len(x1)} in x2")
-        known = zip(self.sizes, self.K, (x0, x1), strict=True)
-        size0, size1 = (predictions.size_by_points(K, x) if size is None else size for size, K, x in known)
-        return predictions.given(x0, x1, (size0, size1), (len(x0), len(x1)))
+    with h5.opened(path) as file:
+        x0, x1 = (h5.numbers(file, f"{key}/{name}", None, 2) for name in ("x1", "x2"))
+    if len(x0) != len(x1):
+        raise DataError(f"{path}: {key!r} has {len(x0)} points in x1 and {len(x1)} in x2")
+    known = zip(sizes, K, (x0, x1), strict=True)
+    size0, size1 = (predictions.size_by_points(own, x) if size is None else size for size, own, x in known)
+    return predictions.given(x0, x1, (size0, size1), (len(x0), len(x1)))
 
 
 Stored = tuple[tuple[Matrix, Matrix], Matrix, Matrix, Callable[[], GivenMatches]]  # K of both images, R, t, matches
-Read = Callable[[Any, Path, str, Sources], Stored]
+Read = Callable[[Any, Path, str, Images], Stored]
 
 
 def _pairs(root: Path, images: Path | None, keys_of: Callable[[Any], list[str]], read: Read) -> Iterator[ImagePair]:
@@ -207,10 +182,10 @@ def _pairs(root: Path, images: Path | None, keys_of: Callable[[Any], list[str]],
                 yield from predictions.with_fundamentals([pair])
 
 
-def _posebench_pair(file: Any, path: Path, key: str, sources: Sources) -> Stored:
+def _posebench_pair(file: Any, path: Path, key: str, sources: Images) -> Stored:
     (K0, size0), (K1, size1) = (_camera(file, path, f"{key}/camera{i}", s) for i, s in enumerate(sources, start=1))
     R, t = h5.reshaped(file, f"{key}/R", 3, 3), h5.reshaped(file, f"{key}/t", 3)
-    return (K0, K1), R, t, PoseBenchMatches(path, key, (K0, K1), (size0, size1))
+    return (K0, K1), R, t, functools.partial(posebench_matches, path, key, (K0, K1), (size0, size1))
 
 
 def _camera(file: Any, path: Path, key: str, source: ImageSource) -> tuple[Matrix, Size | None]:
@@ -238,9 +213,9 @@ def _side(file: Any, key: str) -> int:
     return max(0, int(h5.reshaped(file, key, 1)[0])) if h5.holds(file, key) else 0
 
 
-def _oanet_pair(file: Any, path: Path, key: str, _: Sources) -> Stored:
+def _oanet_pair(file: Any, path: Path, key: str, _: Images) -> Stored:
     known = oanet.cameras(file, key)
-    return known.K, known.R, known.t, oanet.OANetMatches(path, key, known)
+    return known.K, known.R, known.t, functools.partial(oanet.matches, path, key, known)
 
 
 CORNER = 0.5  # where glue-factory puts the centre of the first pixel
@@ -256,18 +231,12 @@ LAYOUTS = (*WITHOUT_GEOMETRY, *WITH_GEOMETRY)
 
 class H5Pairs(HeldPairs):
     """Pairs with given matches, which take the place of features and matcher.
-
-    Args:
-        root: the file, or the folder of the files, of the layout.
-        layout: one of `LAYOUTS`.
-        truth: for layouts without geometry, the folder of the `fmbench` set that they were computed on.
-        images: folder of the images, for pictures and sizes, where the layout knows names of images.
-        features, matches: names of hloc's two files in root; looked for when not given.
-        origin: coordinates of the first pixel's centre; of the layout's convention when not given.
-
-    What is wrong with one pair is that pair's `problem`, or its failure when it is read. Raises DataError for what is
-    wrong with files as a whole.
-    """
+    root: the file, or the folder of the files, of the layout. layout: one of `LAYOUTS`. truth: for layouts without
+    geometry, the folder of the `fmbench` set that they were computed on. images: folder of the images, for pictures and
+    sizes, where the layout knows names of images. features, matches: names of hloc's two files in root; looked for when
+    not given. origin: coordinates of the first pixel's centre; of the layout's convention when not given. What is wrong
+    with one pair is that pair's `problem`, or its failure when it is read. Raises DataError for what is wrong with
+    files as a whole."""
 
     name = "h5"
 

@@ -15,7 +15,7 @@ from fmtorch.core.checks import as_tensor
 from fmtorch.core.types import Estimate, PoseEstimate
 from fmtorch.geometry.cameras import cross_matrix
 from fmtorch.geometry.epipolar import unit_frobenius
-from fmtorch.io.colmap import imported
+from fmtorch.io.colmap import among, imported
 from fmtorch.io.match_store import ORIGIN, Kind, PairGeometry, two_view_geometry
 
 KINDS: Mapping[str, Kind] = {
@@ -157,13 +157,12 @@ def from_colmap(geometry: Any, matches: Any) -> Estimate:
     if isinstance(matches, int):
         matches = _same(matches)
     index = as_tensor(matches, "matches").long().cpu().numpy().reshape(-1, 2)
-    verified = set(map(tuple, np.asarray(geometry.inlier_matches).reshape(-1, 2).astype(np.int64).tolist()))
-    inliers = torch.tensor([tuple(match) in verified for match in index.tolist()], dtype=torch.bool)[None]
+    verified = np.asarray(geometry.inlier_matches).reshape(-1, 2).astype(np.int64)
+    inliers = torch.from_numpy(among(index, verified))[None]
     to = np.array([[1.0, 0, ORIGIN], [0, 1, ORIGIN], [0, 0, 1]])
-    model = "homography" if geometry.F is None and geometry.H is not None else "fundamental"
-    value = None if geometry.F is None else to.T @ geometry.F @ to
-    if model == "homography":
-        value = np.linalg.inv(to) @ geometry.H @ to
+    model, value = "fundamental", None if geometry.F is None else to.T @ geometry.F @ to
+    if geometry.F is None and geometry.H is not None:
+        model, value = "homography", np.linalg.inv(to) @ geometry.H @ to
     pose = None if geometry.cam2_from_cam1 is None else np.asarray(geometry.cam2_from_cam1.matrix())
     kind = str(imported().TwoViewGeometryConfiguration(geometry.config).name)
     return _estimate(value, model, inliers, pose, f"COLMAP calls it {kind.lower()}")

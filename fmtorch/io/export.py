@@ -1,19 +1,17 @@
 """A journal's images and pairs as hloc's two files, and as a COLMAP database."""
 
 import csv
-import dataclasses
 import json
 import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
-from fmtorch.core.files import replacing
-from fmtorch.io import colmap, h5
-from fmtorch.io.match_file import write_geometry
+from fmtorch.core.files import replacing, write_whole
+from fmtorch.io import colmap, h5, match_file, predictions
 from fmtorch.io.match_store import MatchStore, StoredImage
-from fmtorch.io.predictions import hloc_keys
 
 KINDS = ("h5", "colmap")
 FEATURES, MATCHES, DATABASE = "features.h5", "matches.h5", "database.db"
@@ -37,9 +35,7 @@ def write_exports(
     shared_camera: bool = False,
 ) -> list[str]:  # fmt: skip
     """Write the files for the images of these pairs into a folder, whole or not at all; their names.
-
-    shared_camera: in COLMAP's database, one camera for all images of one size whose calibration is unknown.
-    """
+    shared_camera: in COLMAP's database, one camera for all images of one size whose calibration is unknown."""
     images = list(dict.fromkeys(image for pair in pairs for image in pair if journal.has_image(image)))
     done = [pair for pair in pairs if journal.has_pair(*pair)]
     written = []
@@ -59,11 +55,9 @@ def write_hloc(
     folder: Path, images: Iterable[StoredImage], journal: MatchStore, pairs: Iterable[tuple[Path, Path]]
 ) -> None:
     """hloc's features and matches, float32 and int32.
-
     hloc itself writes float16 and int16, of which the second overflows beyond 32,767 keypoints. Each pair holds beside
     ``matches0`` and ``matching_scores0``, which hloc knows, ``inliers0`` (bool), and F, `related` and, where its
-    geometry is known, `configuration`, E, H, R and t as attributes.
-    """
+    geometry is known, `configuration`, E, H, R and t as attributes."""
     h5py = h5.imported()
     counts: dict[str, int] = {}
     with replacing(folder / FEATURES) as temporary, h5py.File(temporary, "w") as file:
@@ -74,7 +68,7 @@ def write_hloc(
             group["image_size"] = np.array(image.size[::-1])
     with replacing(folder / MATCHES) as temporary, h5py.File(temporary, "w") as file:
         for pair in (journal.pair(*ends) for ends in pairs):
-            group = file.create_group(next(hloc_keys(pair.name0, pair.name1)))
+            group = file.create_group(next(predictions.hloc_keys(pair.name0, pair.name1)))
             # By keypoint of the first image, which keeps the best of several: the last one written.
             count, order = counts[pair.name0], np.argsort(pair.scores, kind="stable")
             i, j = pair.matches[order].T
@@ -87,14 +81,13 @@ def write_hloc(
                 group[name] = blank
             group.attrs["F"], group.attrs["related"] = pair.F, pair.related
             if pair.geometry is not None:
-                write_geometry(group, pair.geometry)
+                match_file.write_geometry(group, pair.geometry)
 
 
 GRAPH_JSON, GRAPH_CSV = "graph.json", "graph.csv"
 
 
-@dataclasses.dataclass(frozen=True)
-class Edge:
+class Edge(NamedTuple):
     """A pair. matches: those given to the estimator. significance: None where there is no F, or it was not computed."""
 
     image0: str
@@ -106,8 +99,7 @@ class Edge:
     pair_type: str
 
 
-@dataclasses.dataclass(frozen=True)
-class ViewGraph:
+class ViewGraph(NamedTuple):
     """Names of images, in order, and the pairs that were matched; related ones connect their images."""
 
     images: tuple[str, ...]
@@ -141,12 +133,11 @@ def view_graph(journal: MatchStore, images: Sequence[Path], pairs: Sequence[tupl
 
 def write_view_graph(graph: ViewGraph, folder: Path) -> list[str]:
     """Write the graph as JSON, with its connected components, and its pairs as CSV; the names of the files."""
-    pairs = [dataclasses.asdict(edge) for edge in graph.edges]
+    pairs = [edge._asdict() for edge in graph.edges]
     content = {"images": graph.images, "components": graph.components(), "pairs": pairs}
-    with replacing(folder / GRAPH_JSON) as path:
-        path.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    write_whole(folder / GRAPH_JSON, json.dumps(content, indent=1, allow_nan=False) + "\n")
     with replacing(folder / GRAPH_CSV) as path, path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, [field.name for field in dataclasses.fields(Edge)])
+        writer = csv.DictWriter(file, Edge._fields)
         writer.writeheader()
         writer.writerows(pairs)
     return [GRAPH_JSON, GRAPH_CSV]

@@ -64,9 +64,7 @@ def holds(file: Any, key: str) -> bool:
 
 def array(file: Any, key: str, *shape: int | None) -> Array:
     """The array under a key, of this shape; None stands for any length, no shape for any.
-
-    Raises DataError, naming file and key, where it is missing, damaged or of another shape.
-    """
+    Raises DataError, naming file and key, where it is missing, damaged or of another shape."""
     try:
         values = _plain_array(file, key)
         if values is None:

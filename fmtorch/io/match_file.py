@@ -53,9 +53,7 @@ class _OpenFiles:
 
 class HlocMatches(_OpenFiles):
     """The pairs of two files; output: the file of matches that is written.
-
-    Raises DataError where one of the files is no HDF5 file, or holds no keypoints or no matches.
-    """
+    Raises DataError where one of the files is no HDF5 file, or holds no keypoints or no matches."""
 
     def __init__(self, features: Path, matches: Path, output: Path) -> None:
         super().__init__((features, matches), output)
@@ -144,11 +142,9 @@ class ArrayFile(NamedTuple):
 
 class MatchFile(_OpenFiles):
     """The pairs of one file; each has matches of its own. output: the file of geometries that is written.
-
     A file holds ``x0, x1`` (n, 2), pixels with (0, 0) at the centre of the first one, and perhaps ``K0, K1`` (3, 3) and
     ``size0, size1`` (h, w): of one pair, or of each pair below a name of its own (``a/x0``; in HDF5 a group). Raises
-    DataError where the file is of another kind or holds no such pair.
-    """
+    DataError where the file is of another kind or holds no such pair."""
 
     def __init__(self, path: Path, output: Path) -> None:
         super().__init__((path,), output)
@@ -197,11 +193,9 @@ class MatchFile(_OpenFiles):
         points = self._numbers(image_id, (None, 2)).astype(np.float32)
         wanted = ((f"{pair}K{i}", (3, 3)), (f"{pair}size{i}", (2,)))
         K, size = (self._numbers(key, shape) if key in self._keys else None for key, shape in wanted)
-        known = None
-        if size is not None:
-            if not (np.isfinite(size).all() and (size >= 1).all()):
-                raise DataError(f"size{i} is {size.tolist()}; it must be the height and width of the image")
-            known = int(size[0]), int(size[1])
+        if size is not None and not (np.isfinite(size).all() and (size >= 1).all()):
+            raise DataError(f"size{i} is {size.tolist()}; it must be the height and width of the image")
+        known = None if size is None else (int(size[0]), int(size[1]))
         return DatabaseImage(image_id, i, known, K, np.inf if K is None else 0.0, points, points)
 
     def _numbers(self, key: str, shape: tuple[int | None, ...]) -> Matrix:

@@ -29,7 +29,6 @@ MATRICES = ("F", "E", "H", "R", "t")
 
 class PairGeometry(NamedTuple):
     """The geometry of one pair, in pixels with (0, 0) at the centre of the first one.
-
     inliers: keypoints of both images, (n, 2). F, E, H: (3, 3), None where the pair has none; ``x1^T F x0 = 0``,
     ``x1 ~ H x0``. R, t: X1 = R X0 + t. reason: why there is no F. warning: what the matches leave open or contradict.
     """
@@ -79,9 +78,7 @@ _PAIR = ("matches", "scores", "inliers", "F", "related", "significance", "pair_t
 @dataclasses.dataclass(frozen=True, eq=False)
 class StoredImage:
     """An image: points (n, 2) in pixels, (0, 0) at the first pixel's centre; scores (n,); size (h, w).
-
-    K: of an image without distortion; lens: of one with it; focal: of EXIF, px; of all three one at most.
-    """
+    K: of an image without distortion; lens: of one with it; focal: of EXIF, px; of all three one at most."""
 
     name: str
     points: Singles
@@ -95,11 +92,9 @@ class StoredImage:
 @dataclasses.dataclass(frozen=True, eq=False)
 class StoredPair:
     """The matches given to the estimator, (m, 2) indices of points; scores (m,) in [0, 1]; inliers (m,) of F (3, 3).
-
     F is zero where there is none. related: whether its support is beyond chance. significance: how far, -inf without F
     and NaN where it was not computed. pair_type: of the cameras and the scene; empty where it is not known, and
-    geometry, for COLMAP, None.
-    """
+    geometry, for COLMAP, None."""
 
     name0: str
     name1: str
@@ -194,9 +189,7 @@ class MatchStore:
 
 def indices(points: Singles, x: Singles) -> Array:
     """Which of the points, (n, 2), each of x, (m, 2), is: the first at that location.
-
-    Raises ValueError where x holds a point that is none of them: a matcher that moves points cannot be exported so.
-    """
+    Raises ValueError where x holds a point that is none of them: a matcher that moves points cannot be exported so."""
     keys, wanted = _keys(points), _keys(x)
     order = np.argsort(keys, kind="stable")
     place = np.searchsorted(keys, wanted, sorter=order)

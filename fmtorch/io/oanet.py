@@ -28,9 +28,7 @@ GEODESIC = 1e-4  # of an inlier, squared focal lengths: obj_geod_th of OANet's c
 
 def geodesic(R: Matrix, t: Matrix, K0: Matrix, K1: Matrix, x0: Matrix, x1: Matrix) -> Matrix:
     """OANet's geodesic distance (n,): the two squared distances to the epipolar lines added, in calibrated coordinates.
-
-    R, t: X1 = R X0 + t; the length of t does not count. x0, x1: matches (n, 2) in pixels.
-    """
+    R, t: X1 = R X0 + t; the length of t does not count. x0, x1: matches (n, 2) in pixels."""
     E = np.cross(np.eye(3), t / (np.linalg.norm(t) or 1.0)).T @ R
     given = E, calibrated(x0, K0), calibrated(x1, K1)
     values: Matrix = symmetric_squared(*(torch.from_numpy(value) for value in given)).numpy()
@@ -84,22 +82,10 @@ def figures(file: Any, name: str, key: str, count: int) -> Matrix | None:
     return values
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class OANetMatches:
-    """The matches of one pair."""
-
-    path: Path
-    key: str
-    cameras: Cameras
-
-    def __call__(self) -> GivenMatches:
-        with h5.opened(self.path) as file:
-            return matches(file, self.key, self.cameras)
-
-
-def matches(file: Any, key: str, known: Cameras) -> GivenMatches:
+def matches(path: Path, key: str, known: Cameras) -> GivenMatches:
     """The matches of a pair in pixels."""
-    x0, x1, ratios, mutuals = arrays(file, key, known)
+    with h5.opened(path) as file:
+        x0, x1, ratios, mutuals = arrays(file, key, known)
     mutual = None if mutuals is None else mutuals.astype(bool)
     return predictions.given(x0, x1, known.sizes, (len(x0), len(x0)), ratio=ratios, mutual=mutual)
 
@@ -149,33 +135,26 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(before=_close_all)
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Entry:
-    """A pair to write. x0, x1: matches (n, 2) in pixels. ratios, mutuals: (n,), None where they are not known."""
-
-    cameras: Cameras
-    x0: Matrix
-    x1: Matrix
-    ratios: Array | None = None
-    mutuals: Array | None = None
-
-    def arrays(self) -> Mapping[str, Array | None]:
-        """What a file holds of it, by the names of its groups."""
-        (K0, K1), t = self.cameras.K, self.cameras.t / np.linalg.norm(self.cameras.t)
-        known = {f"{name}{i}s": K[[row], [2]] for i, K in ((1, K0), (2, K1)) for row, name in enumerate(("cx", "cy"))}
-        return {
-            "xs": np.hstack([calibrated(self.x0, K0), calibrated(self.x1, K1)])[None],
-            "ys": geodesic(self.cameras.R, t, K0, K1, self.x0, self.x1)[:, None],
-            "Rs": self.cameras.R, "ts": t[:, None], "ratios": self.ratios, "mutuals": self.mutuals, **known,
-            "f1s": K0.diagonal()[None, :2], "f2s": K1.diagonal()[None, :2],
-            "sizes": np.array(self.cameras.sizes, np.float64).ravel(),
-        }  # fmt: skip
+def entry(
+    cameras: Cameras, x0: Matrix, x1: Matrix, ratios: Array | None, mutuals: Array | None
+) -> Mapping[str, Array | None]:
+    """What a file holds of a pair, by the names of its groups.
+    x0, x1: matches (n, 2) in pixels. ratios, mutuals: (n,), None where they are not known."""
+    (K0, K1), t = cameras.K, cameras.t / np.linalg.norm(cameras.t)
+    known = {f"{name}{i}s": K[[row], [2]] for i, K in ((1, K0), (2, K1)) for row, name in enumerate(("cx", "cy"))}
+    return {
+        "xs": np.hstack([calibrated(x0, K0), calibrated(x1, K1)])[None],
+        "ys": geodesic(cameras.R, t, K0, K1, x0, x1)[:, None],
+        "Rs": cameras.R, "ts": t[:, None], "ratios": ratios, "mutuals": mutuals, **known,
+        "f1s": K0.diagonal()[None, :2], "f2s": K1.diagonal()[None, :2],
+        "sizes": np.array(cameras.sizes, np.float64).ravel(),
+    }  # fmt: skip
 
 
-def write(path: Path, entries: Iterable[Entry]) -> None:
-    """Write pairs as a file of float32, whole or not at all."""
+def write(path: Path, entries: Iterable[Mapping[str, Array | None]]) -> None:
+    """Write pairs, each of `entry`, as a file of float32, whole or not at all."""
     with replacing(path) as temporary, h5.imported().File(temporary, "w") as file:
-        for number, entry in enumerate(entries):
-            for name, values in entry.arrays().items():
+        for number, arrays in enumerate(entries):
+            for name, values in arrays.items():
                 if values is not None:
                     file.create_dataset(f"{name}/{number}", data=np.asarray(values, np.float32))

@@ -1,6 +1,7 @@
 """Matches that other programs stored for the pairs of a data set: hloc's, glue-factory's and vismatch's files."""
 
 import dataclasses
+import functools
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from fmtorch.geometry.cameras import fundamental_from_projections
 from fmtorch.io import h5
 
 Size = tuple[int, int]  # (h, w)
+Images = tuple[ImageSource, ImageSource]
 MAX_OFF_CENTRE = 0.1  # of a principal point, in units of the side: those of reduced images are farther off
 _ZERO = np.zeros((3, 3))  # where there is no F
 
@@ -24,9 +26,7 @@ def given(
     score: Matrix | None = None, mutual: Mask | None = None,
 ) -> GivenMatches:  # fmt: skip
     """Matches of one pair, (n, 2) in pixels each; those that are not finite do not count.
-
-    ratio, score, mutual: (n,), as of `Correspondences`. features: how many keypoints each image has.
-    """
+    ratio, score, mutual: (n,), as of `Correspondences`. features: how many keypoints each image has."""
     mask = torch.from_numpy(np.isfinite(x0).all(-1) & np.isfinite(x1).all(-1))[None]
     points = (torch.from_numpy(np.ascontiguousarray(x, np.float32))[None] for x in (x0, x1))
     p0, p1 = (torch.where(mask[..., None], x, 0.0) for x in points)
@@ -102,9 +102,7 @@ DEPTH = 4  # parts of a path that a name may hold
 
 def names_of(image: ImageSource) -> list[str]:
     """Under what names others may know an image, the most telling first.
-
-    Its identity, then ever shorter ends of its path; each with the suffix and without.
-    """
+    Its identity, then ever shorter ends of its path; each with the suffix and without."""
     suffix = image.path.suffix
     ends = ["/".join(image.path.parts[-n:]) for n in range(min(DEPTH, len(image.path.parts)), 0, -1)]
     names = [name for end in ends for name in (end, end.removesuffix(suffix))]
@@ -113,9 +111,7 @@ def names_of(image: ImageSource) -> list[str]:
 
 def pair_keys(pair: ImagePair) -> Iterator[tuple[str, bool]]:
     """Under what keys others may have stored a pair, and whether its images are then in the other order.
-
-    ``a/b``, as hloc and glue-factory write it with hyphens for slashes within names, and ``a_b``.
-    """
+    ``a/b``, as hloc and glue-factory write it with hyphens for slashes within names, and ``a_b``."""
     names0, names1 = names_of(pair.image0), names_of(pair.image1)
     for swapped, names in ((False, (names0, names1)), (True, (names1, names0))):
         for a, b in zip(*names, strict=False):
@@ -132,77 +128,56 @@ def hloc_keys(name0: str, name1: str) -> Iterator[str]:
 NO_MATCH = -1
 
 
-@dataclasses.dataclass(frozen=True)
-class HLocMatches:
+def hloc_matches(
+    features: Path, matches: Path, origin: float, images: Images, names: tuple[str, str], key: str, swapped: bool
+) -> GivenMatches:
     """hloc's matches of one pair: ``matches0`` and ``matching_scores0`` (n0,) for the keypoints of the first image.
-
-    names: of the images in the features file. key: of the pair in the matches file; swapped: whether its first image
-    is our second. sizes: where the features file does not hold them. origin: where it puts the first pixel's centre.
-    """
-
-    features: Path
-    matches: Path
-    names: tuple[str, str]
-    key: str
-    swapped: bool
-    images: tuple[ImageSource, ImageSource]
-    origin: float
-
-    def __call__(self) -> GivenMatches:
-        with h5.opened(self.features) as file:
-            points = [_keypoints(file, self.features, name) - self.origin for name in self.names]
-            ends = zip(self.names, self.images, strict=True)
-            size0, size1 = (_size(file, f"{name}/image_size", image) for name, image in ends)
-        with h5.opened(self.matches) as file:
-            counts = [len(p) for p in (reversed(points) if self.swapped else points)]
-            i, j, score = _read_matches(file, self.matches, self.key, self.key, counts)
-        index = (j, i) if self.swapped else (i, j)
-        x0, x1 = (p[k] for p, k in zip(points, index, strict=True))
-        return given(x0, x1, (size0, size1), (len(points[0]), len(points[1])), score=score)
+    origin: where it puts the first pixel's centre. images: for sizes where the features file does not hold them. names:
+    of the images in the features file. key: of the pair in the matches file; swapped: whether its first image is our
+    second."""
+    with h5.opened(features) as file:
+        points = [_keypoints(file, features, name) - origin for name in names]
+        size0, size1 = (_size(file, f"{n}/image_size", image) for n, image in zip(names, images, strict=True))
+    with h5.opened(matches) as file:
+        counts = [len(p) for p in (reversed(points) if swapped else points)]
+        i, j, score = _read_matches(file, matches, key, key, counts)
+    index = (j, i) if swapped else (i, j)
+    x0, x1 = (p[k] for p, k in zip(points, index, strict=True))
+    return given(x0, x1, (size0, size1), (len(points[0]), len(points[1])), score=score)
 
 
-@dataclasses.dataclass(frozen=True)
-class PairPrediction:
+def predicted_matches(path: Path, origin: float, images: Images, key: str, swapped: bool) -> GivenMatches:
     """glue-factory's or vismatch's prediction for one pair, a group that holds all of it.
-
     Either ``keypoints0``, ``keypoints1``, ``matches0`` and perhaps ``matching_scores0``, or ``matched_kpts0``,
-    ``matched_kpts1`` and perhaps ``matched_confidences``, ``all_kpts0``, ``all_kpts1``.
-    """
+    ``matched_kpts1`` and perhaps ``matched_confidences``, ``all_kpts0``, ``all_kpts1``."""
+    with h5.opened(path) as file:
+        group = file[key]
+        x, counts, score = (_indexed if h5.holds(group, "matches0") else _matched)(group, path, key)
+        suffixes = ("1", "0") if swapped else ("0", "1")
+        sizes = [_size(group, f"image_size{s}", image) for s, image in zip(suffixes, images, strict=True)]
+    order = (1, 0) if swapped else (0, 1)
+    x0, x1 = (x[k] - origin for k in order)
+    return given(x0, x1, (sizes[0], sizes[1]), (counts[order[0]], counts[order[1]]), score=score)
 
-    path: Path
-    key: str
-    swapped: bool
-    images: tuple[ImageSource, ImageSource]
-    origin: float
 
-    def __call__(self) -> GivenMatches:
-        with h5.opened(self.path) as file:
-            group = file[self.key]
-            x, counts, score = (self._indexed if h5.holds(group, "matches0") else self._matched)(group)
-            suffixes = ("1", "0") if self.swapped else ("0", "1")
-            sizes = [_size(group, f"image_size{s}", image) for s, image in zip(suffixes, self.images, strict=True)]
-        order = (1, 0) if self.swapped else (0, 1)
-        x0, x1 = (x[k] - self.origin for k in order)
-        return given(x0, x1, (sizes[0], sizes[1]), (counts[order[0]], counts[order[1]]), score=score)
+def _indexed(group: Any, path: Path, key: str) -> tuple[list[Matrix], list[int], Matrix | None]:
+    points = [h5.numbers(group, f"keypoints{k}", None, 2) for k in (0, 1)]
+    counts = [len(p) for p in points]
+    i, j, score = _read_matches(group, path, "", key, counts)
+    return [points[0][i], points[1][j]], counts, score
 
-    def _indexed(self, group: Any) -> tuple[list[Matrix], list[int], Matrix | None]:
-        points = [h5.numbers(group, f"keypoints{k}", None, 2) for k in (0, 1)]
-        counts = [len(p) for p in points]
-        i, j, score = _read_matches(group, self.path, "", self.key, counts)
-        return [points[0][i], points[1][j]], counts, score
 
-    def _matched(self, group: Any) -> tuple[list[Matrix], list[int], Matrix | None]:
-        x = [h5.numbers(group, f"matched_kpts{k}", None, 2) for k in (0, 1)]
-        if len(x[0]) != len(x[1]):
-            lengths = f"{len(x[0])} points in matched_kpts0 and {len(x[1])} in matched_kpts1"
-            raise DataError(f"{self.path}: {self.key!r} has {lengths}")
-        confident = h5.holds(group, "matched_confidences")
-        score = h5.numbers(group, "matched_confidences", len(x[0])) if confident else None
-        counts = [len(p) for p in x]
-        for k in (0, 1):
-            if h5.holds(group, f"all_kpts{k}"):
-                counts[k] = len(h5.array(group, f"all_kpts{k}", None, 2))
-        return x, counts, score
+def _matched(group: Any, path: Path, key: str) -> tuple[list[Matrix], list[int], Matrix | None]:
+    x = [h5.numbers(group, f"matched_kpts{k}", None, 2) for k in (0, 1)]
+    counts = [len(p) for p in x]
+    if counts[0] != counts[1]:
+        lengths = f"{counts[0]} points in matched_kpts0 and {counts[1]} in matched_kpts1"
+        raise DataError(f"{path}: {key!r} has {lengths}")
+    score = h5.numbers(group, "matched_confidences", counts[0]) if h5.holds(group, "matched_confidences") else None
+    for k in (0, 1):
+        if h5.holds(group, f"all_kpts{k}"):
+            counts[k] = len(h5.array(group, f"all_kpts{k}", None, 2))
+    return x, counts, score
 
 
 def hloc_pairs(truth: PairDataset, features: Path, matches: Path, origin: float) -> Iterator[ImagePair]:
@@ -226,8 +201,8 @@ def hloc_pairs(truth: PairDataset, features: Path, matches: Path, origin: float)
             if key_and_swap is None:
                 yield _without(pair, f"{matches}: no matches0 of the pair {name0}, {name1}")
                 continue
-            stored = HLocMatches(features, matches, (name0, name1), *key_and_swap, images, origin)
-            yield dataclasses.replace(pair, matches=stored)
+            given_by = features, matches, origin, images, (name0, name1), *key_and_swap
+            yield dataclasses.replace(pair, matches=functools.partial(hloc_matches, *given_by))
     _expect_distinct(names, features)
 
 
@@ -241,7 +216,8 @@ def predicted_pairs(truth: PairDataset, path: Path, origin: float) -> Iterator[I
         images = pair.image0, pair.image1
         for key, swapped in (*pair_keys(pair), (pair.identity, False)):
             if key in stored:
-                yield dataclasses.replace(pair, matches=PairPrediction(path, key, swapped, images, origin))
+                matches = functools.partial(predicted_matches, path, origin, images, key, swapped)
+                yield dataclasses.replace(pair, matches=matches)
                 break
         else:
             yield _without(pair, f"{path}: no prediction for the pair {pair.identity}")

@@ -21,11 +21,9 @@ def for_each_pair(
     group: Callable[..., Any] | None = None,
 ) -> Tensor:
     """`out` (B, ...) after function(row of each tensor, constants, row of out) for each of B pairs.
-
     Rows are C-contiguous arrays, floating ones of type `kind`; of what is not known (None) an empty one. group: the
     NamedTuple in which the function takes the rows. Pairs are shared out among threads. What is on another device is
-    copied to the CPU, and `out`, which is there, comes back on the device of the first tensor; it is on no graph.
-    """
+    copied to the CPU, and `out`, which is there, comes back on the device of the first tensor; it is on no graph."""
     results = out.numpy()
     arrays = [_array(t, kind, len(results)) for t in tensors]
 

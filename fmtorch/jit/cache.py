@@ -30,7 +30,7 @@ from typing import Any
 
 import numpy as np
 
-from fmtorch.core.files import cache_dir, replacing
+from fmtorch.core.files import cache_dir, write_whole
 from fmtorch.jit import linking
 
 Function = Callable[..., Any]
@@ -39,9 +39,7 @@ FOREIGN = {*sys.stdlib_module_names, "builtins", "numpy"}  # packages whose func
 
 def version(function: Function, *also: str) -> str:
     """The version of a function as hexadecimal digits. also: what decides its machine code besides.
-
-    Raises TypeError where it takes a value of which no version can be told.
-    """
+    Raises TypeError where it takes a value of which no version can be told."""
     reached, parts = [function], []
     for each in reached:  # which grows while it is read
         own, inner = _own(each)
@@ -149,10 +147,8 @@ def _reference(value: Any, reached: list[Function]) -> Any:
 
 def named_by_version(function: Function, version: str) -> Function:
     """The same function by a name that no other one has: numba names machine code by functions' names alone.
-
     Two functions that one function made have one name. Machine code of both, kept by two processes, would be taken for
-    the same by a third.
-    """
+    the same by a third."""
     untyped: Any = function
     name = f"{untyped.__qualname__}_{version[:16]}"
     taken = (untyped.__code__, untyped.__globals__, untyped.__name__, untyped.__defaults__, untyped.__closure__)
@@ -203,9 +199,7 @@ def versions() -> dict[str, str]:
 @functools.cache
 def folder() -> Path | None:
     """The folder for this version, marked as used now; None, with a warning, where there is none and none can be made.
-
-    Folders that were not used for `UNUSED_DAYS` are removed.
-    """
+    Folders that were not used for `UNUSED_DAYS` are removed."""
     about = versions()
     path = kernels_dir() / _hex(json.dumps(about).encode())[:16]
     try:
@@ -242,14 +236,13 @@ def path(function: Callable[..., Any], version: str) -> Path | None:
 
 class KernelFile:
     """The file of one version of a kernel; what numba calls the cache of a function.
-
-    missing: called before the function is compiled, with words that say where it will be kept. calls: once loaded or
-    saved, the kernels that the function calls.
-    """
+    missing: called before the function is compiled, with words that say where it will be kept. compiled: whether it
+    was. calls: once loaded or saved, the kernels that the function calls."""
 
     def __init__(self, path: Path | None, missing: Callable[[str], None]) -> None:
         self.path, self.missing = path, missing
         self.calls: list[Any] = []
+        self.compiled = False
         self._lock: Any = None  # held while this process compiles; it ends with the process, however that ends
 
     def load_overload(self, signature: Any, target_context: Any) -> Any:
@@ -261,6 +254,7 @@ class KernelFile:
             return loaded  # another process has just compiled it
         kept = "for this process" if self.path is None else f"for this machine, once (kept in {self.path.parent})"
         self.missing(kept)
+        self.compiled = True
         return None
 
     def _loaded(self, signature: Any, target_context: Any) -> Any:
@@ -293,8 +287,7 @@ class KernelFile:
             data = dumps(_alone(result))
             self.calls = linking.called(data)
             if self.path is not None and not result._asdict()["library"].has_dynamic_globals:
-                with replacing(self.path) as temporary:
-                    temporary.write_bytes(_signature(data) + data)
+                write_whole(self.path, _signature(data) + data)
         except OSError as error:
             warnings.warn(f"compiled kernels are not kept: {error}", stacklevel=2)
         finally:
@@ -333,9 +326,7 @@ def _open_runtime(target_context: Any, machine_code: bytes) -> None:
 
 def _alone(result: Any) -> Any:
     """What numba keeps of a compiled function, without code for others to link, and constants of functions without any.
-
-    A kernel is called by its address alone.
-    """
+    A kernel is called by its address alone."""
     from llvmlite import binding
 
     (library, kind, (code, _)), *rest, environments = result._reduce()

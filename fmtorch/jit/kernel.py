@@ -48,10 +48,8 @@ NUMBERS = {int: "int64", float: "float64", bool: "boolean", np.float32: "float32
 
 def signature_of(function: Callable[..., Any]) -> tuple[Any, ...]:
     """The types of a function's arguments, as numba compiles for them, from its annotations.
-
     They are array types of this file, numbers, bool, and groups: NamedTuples of such types. Raises TypeError, naming
-    the argument, for a type that is none of these.
-    """
+    the argument, for a type that is none of these."""
     hints = get_type_hints(function, include_extras=True)
     names = function.__code__.co_varnames[: function.__code__.co_argcount]
     return tuple(_type(hints.get(name), f"{function.__qualname__}: {name}") for name in names)
@@ -97,9 +95,7 @@ def off() -> bool:
 
 def available() -> bool:
     """Whether kernels stand for tensor forms: not switched off, and numba is there; a warning says once that it is not.
-
-    Raises ValueError if $FMTORCH_KERNELS is neither on nor off.
-    """
+    Raises ValueError if $FMTORCH_KERNELS is neither on nor off."""
     return not off() and numba_version() is not None
 
 
@@ -126,20 +122,12 @@ _state = {"announced": False}
 
 def begun(name: str, where: str, count: str = "") -> None:
     """Say that a kernel is compiled, on the error stream: a terminal shows which one, a log gets the first line alone.
-
-    where: it is kept. count: which one of how many it is.
-    """
+    where: it is kept. count: which one of how many it is."""
     if sys.stderr.isatty():
         print(f"{_CLEAR}{count}compiling {name} {where}", end="", file=sys.stderr, flush=True)
     elif not _state["announced"]:
         print(f"{count}compiling {name} and what else is missing {where}", file=sys.stderr, flush=True)
     _state["announced"] = True
-
-
-def ended() -> None:
-    """Take the line back from a terminal."""
-    if sys.stderr.isatty():
-        print(_CLEAR, end="", file=sys.stderr, flush=True)
 
 
 P = ParamSpec("P")
@@ -151,13 +139,11 @@ _lock = threading.RLock()  # numba compiles one function at a time; a kernel may
 
 class Kernel(Generic[P, R]):
     """A function of NumPy arrays and numbers, compiled for one signature when it is first called.
-
     The signature is that of its annotations. Arrays of another dtype, number of axes or memory order are refused with a
     TypeError, never converted, and so are numbers in a group; other numbers are converted. Kernels and inner functions
     may call it, too. It holds no Python lock while it runs, unless it is made with holds_gil=True. With
     FMTORCH_KERNELS=off, for a debugger, the plain function runs, a thousand times slower. Raises ImportError where
-    numba cannot be imported.
-    """
+    numba cannot be imported."""
 
     __slots__ = ("__call__", "__dict__")  # so that to call a kernel is to call what is compiled, with nothing between
     __call__: Callable[P, R]
@@ -194,9 +180,7 @@ class Kernel(Generic[P, R]):
 
     def compiled(self) -> Callable[P, R]:
         """The compiled function, ready to be called: of this process, of the cache folder, or compiled now.
-
-        Raises ImportError where numba cannot be imported.
-        """
+        Raises ImportError where numba cannot be imported."""
         with _lock:
             if not self.ready:
                 function = self.compiled_alone()
@@ -207,10 +191,8 @@ class Kernel(Generic[P, R]):
 
     def compiled_alone(self, count: str = "") -> Callable[P, R]:
         """The compiled function, not to be called before those that it calls are compiled, too.
-
         A message tells where it is compiled now; count: what the message begins with. Raises ImportError where numba
-        cannot be imported.
-        """
+        cannot be imported."""
         with _lock:
             if self._compiled is None:
                 self._compiled, self.calls = _compiled(self, count)
@@ -237,9 +219,7 @@ class Kernel(Generic[P, R]):
 
 class Inner(Generic[P, R]):
     """A function for kernels to call, compiled into each of them for the types that it is called with.
-
-    Called from Python it is the plain function, slow and easy to test.
-    """
+    Called from Python it is the plain function, slow and easy to test."""
 
     def __init__(self, function: Callable[P, R]) -> None:
         self.function: Callable[P, R] = inspect.unwrap(function)
@@ -283,11 +263,9 @@ def kernel(
     function: Callable[P, R] | None = None, *, holds_gil: bool = False, always_compiled: bool = False, name: str = ""
 ) -> Any:
     """Makes a function a `Kernel` of the types of its annotations.
-
     Arrays must be writable. holds_gil: of some microseconds, for which it keeps Python's lock: a thread that waits for
     it would wake too late to use them. always_compiled: also with FMTORCH_KERNELS=off, since Python would take hours.
-    name: of one that a function makes for some other function, unique in its file.
-    """
+    name: of one that a function makes for some other function, unique in its file."""
     if function is not None:
         return Kernel(function)
 
@@ -309,12 +287,7 @@ def _compiled(uncompiled: Kernel[P, R], count: str) -> tuple[Callable[P, R], lis
     dispatcher: Any = numba.njit(**how)(cache.named_by_version(function, uncompiled.version))
     if not hasattr(dispatcher, "compile"):
         return function, []  # NUMBA_DISABLE_JIT=1
-    announced: list[str] = []
-
-    def announce(where: str) -> None:
-        begun(function.__name__, where, count)
-        announced.append(where)
-
+    announce = functools.partial(begun, function.__name__, count=count)
     file = dispatcher._cache = cache.KernelFile(cache.path(function, uncompiled.version), announce)
     enabled = gc.isenabled()
     gc.disable()  # numba makes millions of objects, nearly all of which stay
@@ -323,8 +296,8 @@ def _compiled(uncompiled: Kernel[P, R], count: str) -> tuple[Callable[P, R], lis
     finally:
         if enabled:
             gc.enable()
-    if announced:
-        ended()
+    if file.compiled and sys.stderr.isatty():
+        print(_CLEAR, end="", file=sys.stderr, flush=True)  # the line is taken back
     dispatcher.disable_compile()
     (result,) = dispatcher.overloads.values()
     linking.publish(function, result)

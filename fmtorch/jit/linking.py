@@ -41,9 +41,7 @@ def called(machine_code: bytes) -> list[Any]:
 
 def register(kernel: Any) -> None:
     """Makes a kernel the one of its name, by which its callers find it.
-
-    Raises ValueError where a function has made another one of this name, from other values.
-    """
+    Raises ValueError where a function has made another one of this name, from other values."""
     function = kernel.function
     place = (function.__module__, function.__qualname__)
     if place in KERNELS:
@@ -62,9 +60,7 @@ def kernel_of(module: str, name: str) -> Any:
 
 def callable_type(function: Callable[..., Any], signature: Any) -> Any:
     """What a kernel is to numba where another one calls it: a function of one signature, called by its cell.
-
-    Raises TypeError unless the function says by an annotation that it returns None, bool, int or float.
-    """
+    Raises TypeError unless the function says by an annotation that it returns None, bool, int or float."""
     from llvmlite import ir
     from numba.core import cgutils, registry, sigutils, types, typing
 
@@ -94,9 +90,7 @@ def callable_type(function: Callable[..., Any], signature: Any) -> Any:
 
 def publish(function: Callable[..., Any], result: Any) -> None:
     """Put a compiled function's address into its cell. result: numba's `CompileResult`.
-
-    Raises TypeError where it returns something else than its annotation says to those that call it.
-    """
+    Raises TypeError where it returns something else than its annotation says to those that call it."""
     from numba.core import types
 
     annotation = returned(function)
@@ -116,11 +110,9 @@ def returned(function: Callable[..., Any]) -> str:
 @functools.cache
 def inner_compiler() -> Any:
     """The compiler of inner functions, for numba's `pipeline_class`: neither optimised nor machine code on their own.
-
     numba compiles each function that another calls as if it were called from Python, too. A kernel is optimised as a
     whole after all of its inner functions have been linked in, so that this would be half of compiling's time for
-    nothing. The names used here are numba's own.
-    """
+    nothing. The names used here are numba's own."""
     from numba.core import codegen, compiler
 
     class Codegen:

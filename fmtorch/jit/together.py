@@ -23,10 +23,8 @@ _lock = threading.Lock()
 
 def compile_together(kernels: Sequence[Kernel[..., Any]]) -> None:
     """Have kernels ready to be called; those that this machine has not compiled yet are compiled, with messages.
-
     An inner function is compiled in each process that needs it: kernels that share many should stand side by side, the
-    slowest at both ends. Raises ImportError where numba cannot be imported.
-    """
+    slowest at both ends. Raises ImportError where numba cannot be imported."""
     if off() or all(each.ready for each in kernels):
         return
     with _lock:

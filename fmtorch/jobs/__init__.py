@@ -5,12 +5,12 @@ from typing import TYPE_CHECKING
 from fmtorch.core.lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from fmtorch.jobs.execution import Execution, available, mapped, one_thread
-    from fmtorch.jobs.runner import DEATH, Factory, Local, TaskRunner, WorkerPool, WorkersLost, in_order
+    from fmtorch.jobs.execution import Execution, available, mapped, one_thread, use_one_thread
+    from fmtorch.jobs.runner import DEATH, Factory, Local, Source, TaskRunner, WorkerPool, WorkersLost, in_order
 
 __all__ = [
-    "DEATH", "Execution", "Factory", "Local", "TaskRunner", "WorkerPool", "WorkersLost", "available", "in_order",
-    "mapped", "one_thread",
+    "DEATH", "Execution", "Factory", "Local", "Source", "TaskRunner", "WorkerPool", "WorkersLost", "available",
+    "in_order", "mapped", "one_thread", "use_one_thread",
 ]  # fmt: skip
 
 lazy_exports(__name__)

@@ -26,11 +26,9 @@ def cores() -> int:
 @dataclasses.dataclass(frozen=True)
 class Execution:
     """Where work is done.
-
     kind: one of `KINDS`; of "auto" the caller makes one of the others. workers: how many; None: one a core, those of
     the cluster, or as many as `make` has. address: of a scheduler of Dask; None: a cluster on this machine.
-    send_images: whether images go to the workers as bytes. make: anybody's executor, in place of a kind.
-    """
+    send_images: whether images go to the workers as bytes. make: anybody's executor, in place of a kind."""
 
     kind: str = "threads"
     workers: int | None = None
@@ -87,11 +85,9 @@ _held: ContextVar[int] = ContextVar("_held", default=1)
 @contextlib.contextmanager
 def one_thread(device: torch.device | str) -> Iterator[None]:
     """Within it torch computes with one thread on the CPU; a GPU is left alone.
-
     For stages of many small operations. On a busy machine several threads wait for one another at the end of each: two
     matched 6,892 x 3,461 descriptors in 6 to 16 s where one needs 0.5 s, and estimated twenty times as slowly. What
-    works pair by pair may still use the `available` threads.
-    """
+    works pair by pair may still use the `available` threads."""
     before = torch.get_num_threads()
     if torch.device(device).type != "cpu" or before == 1:
         yield
@@ -128,11 +124,9 @@ def available() -> int:
 
 def mapped(function: Callable[[T], R], items: Sequence[T], *, share: bool = False) -> list[R]:
     """The function of each item, in their order, by as many threads as are `available`.
-
     For functions that leave Python's lock to others most of the time, as compiled ones do. They run as in this thread
     as far as gradients go, and with one thread of torch's own; with share=True torch's threads are shared out evenly.
-    The first error, in the items' order, is raised here once those under way have ended; the others are not begun.
-    """
+    The first error, in the items' order, is raised here once those under way have ended; the others are not begun."""
     threads = min(available(), len(items))
     own = available() // threads if share and threads else 1
     if threads < 2:

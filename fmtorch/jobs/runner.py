@@ -42,12 +42,9 @@ class WorkersLost(ConnectionError):
 
 class WorkerPool(contextlib.AbstractContextManager["WorkerPool"]):
     """The workers of an `Execution`, started at their first task, and replaced where they broke; a context manager.
-
-    Args:
-        execution: which workers. preload: modules that processes import before they are forked. limit: workers at
-            most. needs_main: whether tasks may be of the caller's main module, which processes then import: a script
-            needs ``if __name__ == "__main__"``.
-    """
+    execution: which workers. preload: modules that processes import before they are forked. limit: workers at most.
+    needs_main: whether tasks may be of the caller's main module, which processes then import: a script needs
+    ``if __name__ == "__main__"``."""
 
     def __init__(
         self, execution: Execution, preload: Sequence[str] = (__name__,), limit: int | None = None,
@@ -86,12 +83,11 @@ class WorkerPool(contextlib.AbstractContextManager["WorkerPool"]):
             self._executor.shutdown(wait=True)
         self._executor = self._cluster = None
 
-    def lost(self, error: BaseException) -> WorkersLost | None:
-        """What to say where an error means that the scheduler is gone."""
-        if self._cluster is None or not self._cluster.lost(error):
-            return None
-        lost = f"the scheduler at {self._cluster.address} was lost"
-        return WorkersLost(f"{lost}; with another, the same command goes on from here")
+    def expect_scheduler(self, error: BaseException) -> None:
+        """Raises WorkersLost where an error means that the scheduler is gone."""
+        if self._cluster is not None and self._cluster.lost(error):
+            lost = f"the scheduler at {self._cluster.address} was lost"
+            raise WorkersLost(f"{lost}; with another, the same command goes on from here") from error
 
     def _started(self) -> Executor:
         execution = self.execution
@@ -156,9 +152,7 @@ def end_with_parent() -> None:
 
 class _Cluster:
     """A client of a scheduler of dask.distributed, one that runs or one of this machine.
-
-    Raises ImportError without Dask, and ValueError where nobody answers at the address or no worker comes.
-    """
+    Raises ImportError without Dask, and ValueError where nobody answers at the address or no worker comes."""
 
     def __init__(self, address: str | None, workers: int) -> None:
         needed = "executor=dask needs dask and distributed: pip install 'fmtorch[dask]'"
@@ -278,15 +272,11 @@ def _called(digest: str, factory: bytes | None, function: Callable[[Any, Any], A
 
 class TaskRunner(Generic[Task]):
     """Calls ``function(value, task)`` for each task, several at a time.
-
     Where a worker dies, the tasks that may have been its are done again, one at a time, so that the one that ends its
     worker is known: it is taken apart by `split`, and what ends its worker `MAX_DEATHS` times is told to `give_up`.
-
-    Args:
-        pool: who works; it stays open. source: of `value`. function: known by its module and name.
-        keep: called here with a task and its result. give_up: called with a task and the reason; None: WorkersLost is
-            raised. split: a task as several smaller ones; one alone where it is as small as can be.
-    """
+    pool: who works; it stays open. source: of `value`. function: known by its module and name. keep: called here with a
+    task and its result. give_up: called with a task and the reason; None: WorkersLost is raised. split: a task as
+    several smaller ones; one alone where it is as small as can be."""
 
     def __init__(
         self, pool: WorkerPool, source: Source[Any], function: Callable[[Any, Task], Any],
@@ -300,11 +290,9 @@ class TaskRunner(Generic[Task]):
 
     def each(self, tasks: Iterable[Task | None]) -> Generator[Task, None, None]:
         """Have the tasks done, and yield each once its result is kept.
-
         tasks: taken as workers become free; a None says that none can begin before one under way has ended.
         Interrupted, it waits for what is under way and keeps it. What a task raises is raised here. Raises WorkersLost
-        where the scheduler is gone, or workers die whatever they do.
-        """
+        where the scheduler is gone, or workers die whatever they do."""
         todo = iter(tasks)
         try:
             while True:
@@ -330,8 +318,7 @@ class TaskRunner(Generic[Task]):
             future = Future()
             future.set_exception(BrokenExecutor())
         except Exception as error:
-            if (lost := self.pool.lost(error)) is not None:
-                raise lost from error
+            self.pool.expect_scheduler(error)
             raise
         self.waiting[future] = task
         return future
@@ -405,8 +392,7 @@ class TaskRunner(Generic[Task]):
     def _expect_death(self, error: BaseException) -> None:
         """Raise an error that is not the death of a worker; WorkersLost where the scheduler is gone."""
         if not (isinstance(error, BrokenExecutor) or any(cls.__name__ in _DEATHS for cls in type(error).__mro__)):
-            if (lost := self.pool.lost(error)) is not None:
-                raise lost from error
+            self.pool.expect_scheduler(error)
             raise error
 
     def _end(self) -> None:
@@ -414,10 +400,10 @@ class TaskRunner(Generic[Task]):
         for future in self.waiting:
             future.cancel()
         futures.wait(self.waiting)
-        ended = [(task, future) for future, task in self.waiting.items() if not future.cancelled()]
-        for task, result in [(task, future.result()) for task, future in ended if future.exception() is None]:
-            if not isinstance(result, NeedsFactory):
-                self.keep(task, result)
+        for future, task in self.waiting.items():
+            done = not future.cancelled() and future.exception() is None
+            if done and not isinstance(future.result(), NeedsFactory):
+                self.keep(task, future.result())
         self.waiting.clear()
 
 

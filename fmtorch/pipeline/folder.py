@@ -19,8 +19,8 @@ from torch import Tensor
 from fmtorch.core.settings import claim
 from fmtorch.data import DataError, ImageSource, read_image
 from fmtorch.io.match_store import MatchStore, StoredPair
-from fmtorch.jobs.execution import Execution, available, one_thread
-from fmtorch.jobs.runner import SHARED_BY, Factory, Local, Source, TaskRunner, WorkerPool, in_order
+from fmtorch.jobs import Execution, Factory, Local, Source, TaskRunner, WorkerPool, available, in_order, one_thread
+from fmtorch.jobs.runner import SHARED_BY
 from fmtorch.pipeline.exporting import exported_image, exported_match
 from fmtorch.pipeline.photographs import PhotographCameras
 from fmtorch.pipeline.pipeline import Pipeline

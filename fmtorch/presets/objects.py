@@ -8,8 +8,7 @@ from typing import Any, TypeVar
 
 import torch
 
-from fmtorch.core.failures import own_traceback
-from fmtorch.core.options import expect_options
+from fmtorch.core import expect_options, own_traceback
 from fmtorch.presets.files import load, targets_of
 
 T = TypeVar("T")

@@ -1,7 +1,6 @@
 """Arrays kept on disk by name, one NumPy file each, in a folder of bounded size that several processes may share."""
 
 import contextlib
-import dataclasses
 import hashlib
 import json
 import os
@@ -10,16 +9,15 @@ import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from fmtorch.core.files import cache_dir, replacing
+from fmtorch.core import Features, files
 from fmtorch.core.stages import FeatureExtractor, TwoStepExtractor, output_of
-from fmtorch.core.types import Features
 from fmtorch.runs.fingerprint import configuration, environment
 from fmtorch.runs.run_folder import identity_digest
 
@@ -31,12 +29,10 @@ ABANDONED = 3600.0  # seconds after which a temporary file is a dead writer's
 
 class ArrayCache:
     """Files ``<folder>/<section>/<name>.npz``, each whole or absent. Safe with several threads and processes.
-
     limit: bytes; when more are kept, the least recently used files go (each process may exceed it by `SLACK`). None: no
     bound. A file that is damaged, or holds other arrays than were written under its name, counts as absent, with a
-    warning; what cannot be written is not kept, with a warning.
-    Raises ValueError where the folder is a file or the limit is not positive.
-    """
+    warning; what cannot be written is not kept, with a warning. Raises ValueError where the folder is a file or the
+    limit is not positive."""
 
     def __init__(self, folder: Path, limit: int | None = None) -> None:
         if folder.exists() and not folder.is_dir():
@@ -52,8 +48,7 @@ class ArrayCache:
         if not file.exists():
             with self._excused(file):
                 file.parent.mkdir(parents=True, exist_ok=True)
-                with replacing(file) as temporary:
-                    temporary.write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
+                files.write_whole(file, json.dumps(about, indent=2) + "\n")
 
     def read(self, section: str, name: str) -> Arrays | None:
         """The arrays of that name, or None. Executes nothing that is in the file (no pickle), checks its checksums."""
@@ -76,7 +71,7 @@ class ArrayCache:
         digest = np.frombuffer(self._digest(section, name, arrays), np.uint8)
         with self._excused(path):
             path.parent.mkdir(parents=True, exist_ok=True)
-            with replacing(path) as temporary, temporary.open("wb") as file:
+            with files.replacing(path) as temporary, temporary.open("wb") as file:
                 np.savez(file, **arrays, **{DIGEST: digest})  # type: ignore[arg-type]
             with self._lock:
                 self._unseen += sum(array.nbytes for array in arrays.values())
@@ -135,13 +130,11 @@ OFF = ("off", "none", "")
 
 class CachedFeatures:
     """An extractor that keeps what another one finds, bit-equal, and computes only what it does not have.
-
     A `TwoStepExtractor` is kept in two files, frames under the digest of its `detection` alone; any other in one.
     Results are on the CPU. `timed` gives the seconds that the computation took when it was done, here or in another
     run. found, computed: images so far that needed no computation, and that needed some. For any number of threads.
     Raises TypeError where the extractor does not say what defines it, OSError where a file of it cannot be read (see
-    `configuration`).
-    """
+    `configuration`)."""
 
     def __init__(self, extractor: FeatureExtractor, cache: ArrayCache) -> None:
         self.extractor, self.cache = extractor, cache
@@ -211,13 +204,11 @@ def cached(
     extractor: FeatureExtractor, cache: str | Path | bool | None, limit: int | float | None = None
 ) -> FeatureExtractor:
     """The extractor with a cache in the folder `cache`; None: the user's cache folder; "off" or False: as it is.
-
     limit: GB, see `ArrayCache`. An extractor that does not say what defines it, or whose files cannot be read, stays as
-    it is, with a warning.
-    """
+    it is, with a warning."""
     if cache is False or str(cache) in OFF or not getattr(extractor, "keep", True):
         return extractor
-    folder = cache_dir() / "features" if cache is None else Path(str(cache)).expanduser()
+    folder = files.cache_dir() / "features" if cache is None else Path(str(cache)).expanduser()
     try:
         return CachedFeatures(extractor, ArrayCache(folder, None if limit is None else int(limit * 1e9)))
     except (TypeError, OSError) as error:  # of a learned file that is not there the extractor speaks better
@@ -232,8 +223,7 @@ def image_digest(image: NDArray[np.uint8]) -> str:
     return digest.hexdigest()
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class _Step:
+class _Step(NamedTuple):
     tensors: dict[str, Tensor]
     seconds: float
     computed: bool

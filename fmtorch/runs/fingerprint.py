@@ -28,11 +28,9 @@ GIT_SECONDS = 10  # after which git is taken for absent
 @functools.cache
 def fmtorch_version() -> str:
     """The version of the code that runs; in a checkout with its commit, and what sources were changed since.
-
     ``0.1.0`` installed; ``0.1.0+g5c0279c1d2e3`` in a checkout; ``0.1.0+g5c0279c1d2e3.dirty.0f1e2d3c4b5a``, with the
     digest of the sources, where they are not those of the commit; ``0.1.0+sources.0f1e2d3c4b5a`` where there is no git
-    that tells.
-    """
+    that tells."""
     checkout = PACKAGE.parent
     if not (checkout / "pyproject.toml").is_file():
         return __version__
@@ -58,11 +56,9 @@ def _git(folder: Path, *arguments: str) -> str | None:
 @functools.cache
 def code_digest(module: str) -> str:
     """The digest of an imported module's source and of what it imports from its own code, at any depth.
-
     Its own code is the package for a module of fmtorch; for anybody else's the folder that its imports start from, and
-    the files beside and below it whether it imports them or not; of installed packages only these.
-    Raises TypeError for a module without a file.
-    """
+    the files beside and below it whether it imports them or not; of installed packages only these. Raises TypeError for
+    a module without a file."""
     name = getattr(sys.modules[module], "__file__", None)
     if name is None:
         raise TypeError(f"the code of {module} is in no file, so its changes cannot be noticed")
@@ -77,18 +73,12 @@ def code_digest(module: str) -> str:
 
 def _imported(file: Path, start: Path, own: bool) -> set[Path]:
     """The file, and those below `start` that it imports, and these in turn; of code that does not compile no more.
-
-    own: whether it is of fmtorch, whose imports are followed then, and not those of anybody else.
-    """
-    files: set[Path] = set()
-    todo = [file]
-    while todo:
-        file = todo.pop()
-        if file in files:
-            continue
-        files.add(file)
-        todo += [path for statement in _imports(file.read_bytes()) for path in _files_of(statement, file, start, own)]
-    return files
+    own: whether it is of fmtorch, whose imports are followed then, and not those of anybody else."""
+    files = [file]
+    for each in files:  # which grows while it is read
+        named = (path for statement in _imports(each.read_bytes()) for path in _files_of(statement, each, start, own))
+        files += [path for path in dict.fromkeys(named) if path not in files]
+    return set(files)
 
 
 _Import = tuple[int | None, str, list[str]]  # dots that begin it (None: no `from`), module after `from`, names
@@ -100,10 +90,10 @@ def _imports(source: bytes) -> list[_Import]:
         nodes = _statements(ast.parse(source))
     except (SyntaxError, ValueError):
         return []
-    imports = [node for node in nodes if isinstance(node, ast.Import | ast.ImportFrom)]
     return [
         (getattr(node, "level", None), getattr(node, "module", None) or "", [alias.name for alias in node.names])
-        for node in imports
+        for node in nodes
+        if isinstance(node, ast.Import | ast.ImportFrom)
     ]
 
 
@@ -118,10 +108,8 @@ def _statements(tree: ast.Module) -> list[ast.AST]:
 
 def _files_of(statement: _Import, file: Path, start: Path, own: bool) -> Iterator[Path]:
     """The files below `start` that an import statement of `file` names.
-
     Of anybody's own code with the packages on the way; of fmtorch's, whose packages import all that is in them,
-    without.
-    """
+    without."""
     level, module, imported = statement
     if level is None:
         names = [(start, name) for name in imported]
@@ -155,12 +143,11 @@ VARIANTS = {"onnxruntime": ("onnxruntime-gpu", "onnxruntime-directml")}  # other
 
 def configuration(part: object) -> Any:
     """A part of a pipeline as plain values that JSON can hold; equal values mean equal results.
-
     A dataclass is its class, its code and the code that it imports from its own package (`code_digest`), and its fields
     (not those with ``compare=False``); an object with an attribute `identity` is that attribute in place of the fields;
     a class is its name and code; a `Path` is the digest of the file; tensors and networks are the digests of their
-    values. Raises TypeError for anything that does not say what defines it, and OSError for a file that cannot be read.
-    """
+    values. Raises TypeError for anything that does not say what defines it, and OSError for a file that cannot be
+    read."""
     return _plain(part, code=True)
 
 
@@ -174,24 +161,21 @@ def _plain(part: object, code: bool) -> Any:
         return {str(key): _plain(value, code) for key, value in part.items()}
     if isinstance(part, list | tuple):
         return [_plain(value, code) for value in part]
-    if isinstance(part, type):
-        return _class(part, code)
     if isinstance(part, torch.Tensor):
         values = part.detach().cpu().contiguous()
         return {"tensor": [str(part.dtype), list(part.shape), digest(values.reshape(-1).view(torch.uint8).numpy())]}
-    return {**_options(part, code), **_class(type(part), code)}
+    kind, options = (part, {}) if isinstance(part, type) else (type(part), _options(part, code))
+    digests = {"code": code_digest(kind.__module__)} if code else {}
+    return {**options, "class": f"{kind.__module__}.{kind.__qualname__}", **digests}
 
 
 def learned(part: object) -> list[str]:
     """Digests of the learned files and networks that a part of a pipeline uses, sorted; of a network's weights one.
-
-    None for a part that does not say what defines it, or whose file cannot be read: it tells so itself when used.
-    """
+    None for a part that does not say what defines it, or whose file cannot be read: it tells so itself when used."""
     try:
-        described = _plain(part, code=False)
+        return sorted(set(_learned(_plain(part, code=False))))
     except (TypeError, OSError):
         return []
-    return sorted(set(_learned(described)))
 
 
 def _learned(value: Any) -> Iterator[str]:
@@ -214,11 +198,6 @@ def _options(part: object, code: bool) -> dict[str, Any]:
     remedy = "make it a dataclass, or give it an attribute `identity` of plain values"
     name = f"{type(part).__module__}.{type(part).__qualname__}"
     raise TypeError(f"{name} does not say what defines its results; {remedy}")
-
-
-def _class(kind: type, code: bool) -> dict[str, str]:
-    name = {"class": f"{kind.__module__}.{kind.__qualname__}"}
-    return {**name, "code": code_digest(kind.__module__)} if code else name
 
 
 @functools.cache

@@ -16,18 +16,16 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from fmtorch.core.files import replacing
+from fmtorch.core.files import write_whole
 from fmtorch.core.settings import canonical, create, differences, head
 
 
 @dataclasses.dataclass(frozen=True)
 class PairRow:
     """The result of one image pair. What could not be computed is None or NaN, and null in the table.
-
     A pair of a known homography has a corner error, infinite where it failed, and H in place of F; its NSGD is NaN.
     Raises ValueError for a row that contradicts itself: a failed pair has a reason, NSGD 1 and no F; a sound one has no
-    reason and nine finite elements of F or H; NSGD is in [0, 1]; there are both angles of a pose error or neither.
-    """
+    reason and nine finite elements of F or H; NSGD is in [0, 1]; there are both angles of a pose error or neither."""
 
     pair: str  # the pair's identity within its data set
     key: int  # the pair's stable 64-bit key, `pair_key(pair)`
@@ -132,9 +130,7 @@ MAX_LEVEL = 3  # 16^3 batches to a part at most: merging needs the memory of one
 
 class PartWriter:
     """Adds parts to a folder, and merges those that it has added itself: any number of writers may do so at once.
-
-    Names sort by the time at which the first rows of a part were written; they end with a digest of the bytes.
-    """
+    Names sort by the time at which the first rows of a part were written; they end with a digest of the bytes."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -156,9 +152,7 @@ class PartWriter:
 
     def _merge(self, parts: Sequence[Path]) -> Path | None:
         """One part in place of several; killed in between, rows are there twice, which readers drop.
-
-        None where one of them is damaged, for a reader to name, or the disk is full: they stay as they are.
-        """
+        None where one of them is damaged, for a reader to name, or the disk is full: they stay as they are."""
         try:
             merged = self._write(pa.concat_tables([read_part(path) for path in parts]), parts[0].name.split("-")[1])
         except (pa.ArrowException, OSError):
@@ -173,8 +167,7 @@ class PartWriter:
         data = sink.getvalue().to_pybytes()
         # The second word keeps simultaneous writers apart.
         path = self.folder / f"part-{begun}-{uuid.uuid4().hex[:8]}-{content_digest(data)}.parquet"
-        with replacing(path) as temporary:
-            temporary.write_bytes(data)
+        write_whole(path, data)
         return path
 
 
@@ -212,10 +205,8 @@ class RunFolderError(ValueError):
 
 def identity_digest(config: Mapping[str, Any]) -> str:
     """The hex digest (blake2b, 128 bits) of what defines a run's results.
-
     config: plain dicts, lists, strings, numbers, booleans and None: the pipeline's configuration, the data set's name
-    and digest, the seed, the digests of learned files, the version. Raises TypeError for anything else.
-    """
+    and digest, the seed, the digests of learned files, the version. Raises TypeError for anything else."""
     return hashlib.blake2b(canonical(config).encode(), digest_size=16).hexdigest()
 
 
@@ -229,10 +220,8 @@ class RunFolder:
     @classmethod
     def open(cls, path: Path | str, config: Mapping[str, Any]) -> "RunFolder":
         """Start a run in `path`, or continue it there when the folder holds a run of the same identity.
-
         Several processes may open the same folder at once. Raises RunFolderError, touching nothing, where the folder
-        holds a run of another identity or files that are no run.
-        """
+        holds a run of another identity or files that are no run."""
         path = Path(path)
         wanted: dict[str, Any] = json.loads(canonical(config))
         if path.exists() and not path.is_dir():
@@ -285,9 +274,8 @@ class RunFolder:
 
     def read(self, keys: Collection[int] | None = None, without: Collection[str] = ()) -> pa.Table:
         """The results, a row of `PAIR_SCHEMA` per pair, without some columns: all, or those of the given keys.
-
-        Of several rows of one pair the first written counts. Raises RunFolderError naming a part that cannot be read.
-        """
+        Of several rows of one pair the first written counts. Raises RunFolderError naming a part that cannot be
+        read."""
         names = [name for name in PAIR_SCHEMA.names if name not in without]
         table = pa.concat_tables([PAIR_SCHEMA.empty_table().select(names), *self._parts(names)])
         stored_keys = table["key"].to_numpy()
@@ -298,10 +286,8 @@ class RunFolder:
 
     def write_summary(self, summary: Mapping[str, Any], markdown: str) -> None:
         """Write ``summary.json`` and ``summary.md``. Raises ValueError for NaN, which JSON does not have."""
-        text = json.dumps(summary, indent=2, allow_nan=False) + "\n"
-        for name, content in (("summary.json", text), ("summary.md", markdown)):
-            with replacing(self.path / name) as temporary:
-                temporary.write_text(content, encoding="utf-8")
+        write_whole(self.path / "summary.json", json.dumps(summary, indent=2, allow_nan=False) + "\n")
+        write_whole(self.path / "summary.md", markdown)
 
     @functools.cached_property
     def _writer(self) -> PartWriter:

@@ -112,18 +112,17 @@ def _padded(label: Tensor, n: int) -> Tensor:
 
 def label(dataset: PairDataset, pair: ImagePair, x0: Points, x1: Points, rule: Rule = "pixels") -> Labels:
     """Labels (n,) of the matches x0, x1 (n, 2) of a pair: by depth where the data set offers it and the pair's cameras
-    are known, else by the epipolar lines. Raises ValueError for geodesic labels where the cameras are unknown.
-    """
+    are known, else by the epipolar lines. Raises ValueError for geodesic labels where the cameras are unknown."""
     cameras = (pair.K0, pair.K1, pair.R, pair.t)
+    known = all(value is not None for value in cameras)
+    K0, K1, R, t = (np.asarray(value) for value in cameras)
     if rule == "geodesic":
-        if any(value is None for value in cameras):
+        if not known:
             raise ValueError(f"labels=geodesic needs K, R and t, which pair {pair.identity} does not have")
-        K0, K1, R, t = (np.asarray(value) for value in cameras)
         return by_geodesic(oanet.geodesic(R, t, K0, K1, x0, x1))
     line = line_distance(pair.F, x0, x1)
-    if not isinstance(dataset, DepthDataset) or any(value is None for value in cameras):
+    if not isinstance(dataset, DepthDataset) or not known:
         return by_line(line)
-    K0, K1, R, t = (np.asarray(value) for value in cameras)
     depth0, depth1 = (depths(dataset, image, x) for image, x in ((pair.image0, x0), (pair.image1, x1)))
     forward = transfer_error(x0, depth0, x1, K0, K1, R, t)
     return by_transfer(forward, transfer_error(x1, depth1, x0, K1, K0, R.T, -R.T @ t), line)
@@ -153,9 +152,8 @@ def depths(dataset: DepthDataset, image: ImageSource, x: Points) -> NDArray[np.f
 
 
 def transfer_error(
-    x: Points, depth: NDArray[np.float64], partner: Points, K: NDArray[np.float64], K_other: NDArray[np.float64],
-    R: NDArray[np.float64], t: NDArray[np.float64],
-) -> NDArray[np.float64]:  # fmt: skip
+    x: Points, depth: Points, partner: Points, K: Points, K_other: Points, R: Points, t: Points
+) -> NDArray[np.float64]:
     """How far (n,), in pixels, points are carried past their partners in the other image, at the kindest of k depths.
     NaN where no depth is known, infinity where a point would be behind the other camera. x, partner: matched points (n,
     2) in pixels. depth: candidates (k, n), NaN where unknown. K, K_other: calibrations. R, t: ``X_other = R X + t``."""
@@ -220,10 +218,7 @@ class Augmentation(AugmentationOptions):
         self, ratio: Float[Tensor, " n"] | None, label: Int[Tensor, " n"], *, key: int, seed: int, epoch: int
     ) -> float:
         """About how many matches of a pair are left, for batches of similar length; the effect of crops is a guess.
-
-        Args:
-            ratio, label: of its matches. key, seed, epoch: as of the call. The size of the random subset is left out.
-        """
+        ratio, label: of its matches. key, seed, epoch: as of the call. The size of the random subset is left out."""
         draw = _Draw(self, bits(seed, torch.tensor([key]), Stream.AUGMENTATION, epoch, 1, _COLUMNS)[0, 0])
         if draw.ratio is not None and ratio is not None:
             kept = ratio < draw.ratio
@@ -390,10 +385,7 @@ def transform(
     matches: LabelledMatches, image: int, T: Float[Tensor, "b 3 3"], size: Tensor | None = None
 ) -> LabelledMatches:
     """One of the images mapped by ``x -> T x``, an affine map of pixels that keeps the orientation.
-
-    Args:
-        matches: labelled matches. image: 0 or 1. T: last row (0, 0, 1), float64. size: the new size (h, w), (B, 2).
-    """
+    matches: labelled matches. image: 0 or 1. T: last row (0, 0, 1), float64. size: the new size (h, w), (B, 2)."""
     c = matches.correspondences
     names = {name: f"{name}{image}" for name in ("x", "lafs", "size", "K")}
     changes: dict[str, Tensor] = {names["x"]: _mapped(T, getattr(c, names["x"])[..., None])[..., 0]}

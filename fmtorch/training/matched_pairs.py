@@ -15,25 +15,18 @@ from fmtorch import presets
 from fmtorch.core import Correspondences, files, settings
 from fmtorch.data.pairs import DepthDataset, ImagePair, PairDataset
 from fmtorch.io import oanet
-from fmtorch.jobs.execution import Execution, use_one_thread
-from fmtorch.jobs.runner import Factory, Local, Source, TaskRunner, WorkerPool
+from fmtorch.jobs import Execution, Factory, Local, Source, TaskRunner, WorkerPool, use_one_thread
 from fmtorch.pipeline.pipeline import Outcome, Pipeline, load_pipeline
-from fmtorch.presets import plain
 from fmtorch.runs import CachedFeatures, cached, identity_digest
 from fmtorch.runs.fingerprint import configuration, environment
 from fmtorch.training import labelled
-from fmtorch.training.stored_matches import FORMAT, Shard, ShardError, StoredMatches, write_shard
+from fmtorch.training.stored_matches import ARRAYS, FORMAT, Shard, ShardError, StoredMatches, write_shard
 
 MAX_MATCHES = 4000  # matches kept of a pair
 Progress = Callable[[int, int], None]  # called with (pairs done, pairs in all)
 SHARD = 32  # pairs in a file, all of one scene: what an interruption can cost; a change is one of FORMAT
 PRELOADED = (__name__,)  # by the process that workers are forked of
 _IMAGES = 64  # whose features each worker may need again
-_STORED = {
-    **dict.fromkeys(("x0", "x1", "ratio", "score", "prior", "noise", "lafs0", "lafs1"), torch.float32),
-    "mutual": torch.uint8,
-    **dict.fromkeys(("K0", "K1"), torch.float64), **dict.fromkeys(("size0", "size1"), torch.int64),
-}  # fmt: skip
 
 
 class MatchedPairs(StoredMatches):
@@ -128,10 +121,10 @@ def _identity(dataset: PairDataset, stages: Pipeline, most: int, rule: labelled.
 
 def front(config: DictConfig) -> Pipeline:
     """The stages before estimation that a config names: features, matcher, and the pruners `before`, if any."""
-    features = presets.instantiate(plain(config.features), "features")
+    features = presets.instantiate(presets.plain(config.features), "features")
     extractor = cached(features, config.get("cache"), config.get("cache_limit"))
     before = {str(name): presets.build("pruner", str(name)) for name in config.get("before") or ()}
-    matcher: Any = presets.instantiate(plain(config.matcher), "matcher")
+    matcher: Any = presets.instantiate(presets.plain(config.matcher), "matcher")
     return Pipeline(extractor, matcher, before, _no_estimator)
 
 
@@ -144,12 +137,13 @@ def _sound(path: Path, pairs: int) -> bool:
         return False
     try:
         count = len(Shard(path, verify=True))
-        problem = "" if count == pairs else f"{path} has {count} pairs instead of {pairs}"
+        if count == pairs:
+            return True
+        problem = f"{path} has {count} pairs instead of {pairs}"
     except ShardError as error:
         problem = str(error)
-    if problem:
-        warnings.warn(f"{problem}; it is computed anew", stacklevel=3)
-    return not problem
+    warnings.warn(f"{problem}; it is computed anew", stacklevel=3)
+    return False
 
 
 def partition(pairs: Sequence[ImagePair]) -> list[list[int]]:
@@ -225,10 +219,10 @@ def compute_shards(
 
 def matched_rows(how: Matching, job: Job) -> list[dict[str, Any]]:
     """The rows of a shard."""
-    return [_row(how.dataset, how.pipeline.correspondences([pair])[0], how.rules) for pair in job.pairs]
+    return [_row(how, how.pipeline.correspondences([pair])[0]) for pair in job.pairs]
 
 
-def _row(dataset: PairDataset, outcome: Outcome, rules: Rules) -> dict[str, Any]:
+def _row(how: Matching, outcome: Outcome) -> dict[str, Any]:
     """A pair as a row of a shard; a pair that fails has a reason and no matches."""
     pair, c = outcome.pair, outcome.correspondences
     row: dict[str, Any] = {
@@ -237,18 +231,18 @@ def _row(dataset: PairDataset, outcome: Outcome, rules: Rules) -> dict[str, Any]
     }  # fmt: skip
     if c is None:
         return row
-    c = _best(c.detach().to("cpu").compact(), rules.most)
+    c = _best(c.detach().to("cpu").compact(), how.rules.most)
     if not len(c.x0[0]):
         return {**row, "reason": "no matches are left"}
     x0, x1 = (x[0].to(torch.float64).numpy() for x in (c.x0.to(torch.float32), c.x1.to(torch.float32)))
-    labels = labelled.label(dataset, pair, x0, x1, rules.labels)
+    labels = labelled.label(how.dataset, pair, x0, x1, how.rules.labels)
     norm = np.linalg.norm(pair.F) or 1.0  # zero where the pair determines none
     row |= {
         "matches": len(labels), "inliers": int((labels == 1).sum()), "outliers": int((labels == 0).sum()),
         "label": labels, "F": (pair.F / norm).ravel(),
     }  # fmt: skip
-    tensors = ((name, getattr(c, name), kind) for name, kind in _STORED.items())
-    return row | {name: x.to(kind).reshape(-1).numpy() for name, x, kind in tensors if x is not None}
+    tensors = ((name, getattr(c, name), kind) for name, (kind, _) in ARRAYS.items() if name not in row)
+    return row | {name: x.to(getattr(torch, kind)).reshape(-1).numpy() for name, x, kind in tensors if x is not None}
 
 
 def _best(c: Correspondences, most: int) -> Correspondences:

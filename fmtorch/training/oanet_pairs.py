@@ -2,7 +2,7 @@
 
 import functools
 import hashlib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +15,9 @@ from fmtorch.data.cameras import Camera, fundamental, line_distance
 from fmtorch.data.files import Matrix
 from fmtorch.io import h5, oanet, predictions
 from fmtorch.training import labelled
-from fmtorch.training.stored_matches import Shard, StoredMatches
+from fmtorch.training.stored_matches import ARRAYS, Shard, StoredMatches
 
 MAX_CAMERAS = 1 << 16  # pairs of a file whose cameras are kept once they were read, about a kilobyte each
-_KINDS: dict[str, Any] = {**dict.fromkeys(("x0", "x1", "ratio"), np.float32), "mutual": np.uint8, "label": np.int8}
 
 
 class OANetShard(Shard):
@@ -58,7 +57,7 @@ class OANetShard(Shard):
         by_pixels = self.labels == "pixels"
         label = labelled.by_line(line_distance(F, x0, x1)) if by_pixels else self._geodesic(key, len(x0))
         values = {"x0": x0, "x1": x1, "ratio": ratio, "mutual": mutual, "label": label}
-        known = {name: x.astype(_KINDS[name]) for name, x in values.items() if x is not None}
+        known = {name: x.astype(ARRAYS[name][0]) for name, x in values.items() if x is not None}
         if not (np.isfinite(x0).all() and np.isfinite(x1).all()):
             inside = np.isfinite(x0).all(1) & np.isfinite(x1).all(1)
             known = {name: x[inside] for name, x in known.items()}
@@ -82,19 +81,12 @@ def _geometry(access: oanet.RandomAccess, key: str) -> tuple[oanet.Cameras, Matr
 
 class OANetPairs(StoredMatches):
     """The labelled matches of files of OANet's layout; each item is a batch of one pair, as of `StoredMatches`.
-
     A file is opened by each process for itself, and a pair is read when it is asked for. `pairs` says nothing of how
-    many inliers there are. Coordinates are pixels: networks and losses with coordinates=K have the file's own.
-
-    Args:
-        root: a file, or a folder of some; each is a scene.
-        labels: geodesic: a match is an inlier where the first column of ``ys`` is below 1e-4 (OANet); pixels: by its
-            distance to the epipolar lines, as of `MatchedPairs`.
-        before: pruners whose matches alone are given, each a function of correspondences.
-        augmentation, seed: as of `StoredMatches`.
-
-    Raises DataError, naming the file, for a file that is missing, damaged, empty or of another layout.
-    """
+    many inliers there are. Coordinates are pixels: networks and losses with coordinates=K have the file's own. root: a
+    file, or a folder of some; each is a scene. labels: geodesic: a match is an inlier where the first column of ``ys``
+    is below 1e-4 (OANet); pixels: by its distance to the epipolar lines, as of `MatchedPairs`. before: pruners whose
+    matches alone are given, each a function of correspondences. augmentation, seed: as of `StoredMatches`. Raises
+    DataError, naming the file, for a file that is missing, damaged, empty or of another layout."""
 
     def __init__(
         self, root: str | Path, *, labels: labelled.Rule = "geodesic",
@@ -170,12 +162,12 @@ def write_oanet(matches: StoredMatches, pairs: Iterable[ImagePair], folder: Path
     return paths
 
 
-def _entry(matches: labelled.LabelledMatches, pair: ImagePair) -> oanet.Entry:
+def _entry(matches: labelled.LabelledMatches, pair: ImagePair) -> Mapping[str, NDArray[Any] | None]:
     c = matches.correspondences
-    values = {name: None if (x := getattr(c, name)) is None else x[0].numpy() for name in ("ratio", "mutual")}
+    ratios, mutuals = (None if values is None else values[0].numpy() for values in (c.ratio, c.mutual))
     x0, x1 = (x[0].numpy().astype(np.float64) for x in (c.x0, c.x1))
     if c.size0 is None or c.size1 is None or pair.K0 is None or pair.K1 is None or pair.R is None or pair.t is None:
         raise ValueError(f"OANet's layout needs cameras and image sizes, which pair {pair.identity} does not have")
     (h0, w0), (h1, w1) = c.size0[0].tolist(), c.size1[0].tolist()
     cameras = oanet.Cameras((pair.K0, pair.K1), pair.R, pair.t, ((h0, w0), (h1, w1)))
-    return oanet.Entry(cameras, x0, x1, values["ratio"], values["mutual"])
+    return oanet.entry(cameras, x0, x1, ratios, mutuals)

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fmtorch.core.files import cache_dir, replacing
+from fmtorch.core.files import cache_dir, write_whole
 from fmtorch.data import ImagePair, ImageSource, read_image
 from fmtorch.data.cameras import relative_pose
 from fmtorch.data.pairs import HeldPairs
@@ -26,10 +26,8 @@ from fmtorch.scenes.raycast import Camera, calibration
 from fmtorch.training.options import PlaneViews as PlaneViews
 
 SUFFIXES = {".jpg", ".jpeg", ".png", ".ppm", ".tif", ".tiff"}
-
 VERSION = 1  # of the views: raised by every change that changes one
 _QUALITY = 92  # of the JPEG files; `change_camera` may have compressed the view before
-
 Grey = NDArray[np.uint8]
 Matrix = NDArray[np.float64]
 
@@ -92,20 +90,20 @@ class PlanePairs(HeldPairs):
         digests = [hashlib.sha256(json.dumps(defined).encode() + file.read_bytes()).hexdigest() for file in files]
         self.digest = hashlib.sha256(" ".join(digests).encode()).hexdigest()
         home = Path(root) if root is not None else cache_dir() / "planes"
-        self._scenes = [digest[:16] for digest in digests]
+        scenes = [digest[:16] for digest in digests]
         self._cameras: dict[str, Camera] = {}
         self._paths: dict[str, Path] = {}
         report = progress or (lambda done, total: None)
         report(0, len(files))
         with ThreadPoolExecutor(workers) as executor:
-            folders = [home / scene for scene in self._scenes]
+            folders = [home / scene for scene in scenes]
             drawn = executor.map(self._photograph, files, folders, digests)
-            for done, (scene, folder, cameras) in enumerate(zip(self._scenes, folders, drawn, strict=True), 1):
+            for done, (scene, folder, cameras) in enumerate(zip(scenes, folders, drawn, strict=True), 1):
                 for i, camera in enumerate(cameras):
                     self._cameras[f"{scene}/{i}"], self._paths[f"{scene}/{i}"] = camera, folder / f"{i:02d}.jpg"
                 report(done, len(files))
         ends = list(itertools.combinations(range(self.views.views), 2))
-        self._pairs = [self._pair(scene, i, j) for scene in dict.fromkeys(self._scenes) for i, j in ends]
+        self._pairs = [self._pair(scene, i, j) for scene in dict.fromkeys(scenes) for i, j in ends]
 
     def _pair(self, scene: str, i: int, j: int) -> ImagePair:
         camera0, camera1 = (self._cameras[f"{scene}/{k}"] for k in (i, j))
@@ -141,8 +139,7 @@ class PlanePairs(HeldPairs):
             view = warp(grey_of(rng, picture), plane_homography(cameras[-1], (h, w)), cameras[-1].size)
             view = change_camera(rng, change_light(rng, view))
             coded = cv2.imencode(".jpg", view, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1]
-            with replacing(path) as temporary:
-                temporary.write_bytes(coded.tobytes())
+            write_whole(path, coded.tobytes())
         return cameras
 
 

@@ -18,7 +18,7 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import lightning
 import numpy as np
@@ -33,8 +33,7 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
 from fmtorch import data, presets
-from fmtorch.core import settings, terminal
-from fmtorch.core.options import expect_options
+from fmtorch.core import expect_options, settings, terminal
 from fmtorch.core.version import __version__
 from fmtorch.data import ImagePair, PairDataset, construction, read_image, subset
 from fmtorch.evaluation.run import select
@@ -49,8 +48,7 @@ from fmtorch.training.labelled import Augmentation, LabelledMatches, keep_ratio
 from fmtorch.training.matched_pairs import MatchedPairs, front
 from fmtorch.training.oanet_pairs import NamedPairs, OANetPairs
 from fmtorch.training.objective import Objective
-from fmtorch.training.options import Optimisation as Optimisation
-from fmtorch.training.options import TrainOptions
+from fmtorch.training.options import Optimisation, TrainOptions
 from fmtorch.training.planes import Photograph, PlanePairs, list_photographs
 from fmtorch.training.stored_matches import QUARTER, StoredMatches, last_scenes, training_batches
 
@@ -317,9 +315,8 @@ def report(result: Result, name: str) -> None:
     """Say on the terminal what came out and how to use it."""
     for key, value in result.evaluation.figures.items():
         terminal.console.print(f"{key:32} {value:.4f}")
-    use = use_line(name, result.files[0], sys.argv[1:])
-    for line in (", ".join(str(path) for path in result.files), f"use it: {use}"):
-        terminal.console.print(line, soft_wrap=True)
+    terminal.console.print(", ".join(str(path) for path in result.files), soft_wrap=True)
+    terminal.console.print(f"use it: {use_line(name, result.files[0], sys.argv[1:])}", soft_wrap=True)
 
 
 def use_line(name: str, file: Path, words: Sequence[str]) -> str:
@@ -352,8 +349,7 @@ def use_of(name: str, options: Mapping[str, Any]) -> Use:
     return Use(presets.build("estimator", str(options["estimator"])), options.get("threshold"))
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Matches:
+class Matches(NamedTuple):
     """Labelled matches to train on, and to validate on with their pairs; their digest; what a card says of them."""
 
     training: StoredMatches
@@ -389,7 +385,9 @@ def labelled_matches(config: DictConfig, options: TrainOptions, progress: Progre
     digests, validation = [training.digest], list[tuple[ImagePair, LabelledMatches]]()
     sets = [(dataset, held_out, "to validate on")]
     for root in validated.roots:
-        real = _validation_set(root, config, options)
+        path = Path(root).expanduser()
+        of_matches = path.suffix in h5.SUFFIXES or any(file.suffix in h5.SUFFIXES for file in path.glob("*"))
+        real = _oanet_pairs(path, config, options) if of_matches else data.load("fmbench", root=root)
         sets.append((real, list(range(len(real))), f"of {root}"))
     for source, indices, what in sets:
         if selected := _limited(source, indices, validated.pairs):
@@ -424,19 +422,11 @@ def _dataset(config: DictConfig, options: TrainOptions, progress: Progress) -> P
     chosen = plain(config.dataset)
     target = presets.target_of(chosen, "dataset")
     if target is H5Pairs and chosen["layout"] == "oanet":
-        return _oanet_pairs(
-            data.files.given_root(chosen["root"], "h5", "the file, or the folder of the files"), config, options
-        )
+        root = data.files.given_root(chosen["root"], "h5", "the file, or the folder of the files")
+        return _oanet_pairs(root, config, options)
     if target is RenderedPairs:
         chosen["split"] = "train"
     return data.build(chosen, terminal.reporter(progress, "drawing scenes"))
-
-
-def _validation_set(root: str, config: DictConfig, options: TrainOptions) -> PairDataset:
-    path = Path(root).expanduser()
-    if path.suffix in h5.SUFFIXES or any(file.suffix in h5.SUFFIXES for file in path.glob("*")):
-        return _oanet_pairs(path, config, options)
-    return data.load("fmbench", root=root)
 
 
 def _oanet_pairs(root: Path, config: DictConfig, options: TrainOptions) -> NamedPairs:

@@ -15,30 +15,27 @@ import torch
 from numpy.typing import NDArray
 from torch.utils.data import DataLoader, Dataset, Sampler
 
-from fmtorch.core.files import replacing
-from fmtorch.core.types import Correspondences
+from fmtorch.core import Correspondences, replacing
 from fmtorch.jit.random import Stream, uniform
 from fmtorch.training.labelled import Augmentation, LabelledMatches, collate, subset_size
 
 PATTERN = "shard-*.arrow"
 FORMAT = 1  # of the files; raised when the schema changes
 
-_PER_MATCH = {
+ARRAYS: dict[str, tuple[str, tuple[int, ...]]] = {
+    **dict.fromkeys(("F", "K0", "K1"), ("float64", (3, 3))), **dict.fromkeys(("size0", "size1"), ("int64", (2,))),
     **dict.fromkeys(("x0", "x1"), ("float32", (-1, 2))), "label": ("int8", (-1,)),
     **dict.fromkeys(("ratio", "score", "prior", "noise"), ("float32", (-1,))), "mutual": ("uint8", (-1,)),
     **dict.fromkeys(("lafs0", "lafs1"), ("float32", (-1, 2, 3))),
 }  # fmt: skip
-_PER_PAIR = {
-    **dict.fromkeys(("F", "K0", "K1"), ("float64", (3, 3))), **dict.fromkeys(("size0", "size1"), ("int64", (2,))),
-}  # fmt: skip
-_SHAPES = {name: shape for name, (_, shape) in (_PER_PAIR | _PER_MATCH).items()}
+"""What is stored of a pair and of its matches: types of the numbers, and shapes, -1 for the number of matches."""
 _TEXTS = ("identity", "family", "scene", "reason")
 SCHEMA = pa.schema(
     [
         pa.field("key", pa.int64()),
         *(pa.field(name, pa.string()) for name in _TEXTS),
         *(pa.field(name, pa.int64()) for name in ("matches", "inliers", "outliers")),
-        *(pa.field(name, pa.list_(pa.from_numpy_dtype(kind))) for name, (kind, _) in (_PER_PAIR | _PER_MATCH).items()),
+        *(pa.field(name, pa.list_(pa.from_numpy_dtype(kind))) for name, (kind, _) in ARRAYS.items()),
     ]
 )
 INDEX = ("key", *_TEXTS, "matches", "inliers", "outliers")  # what is known of a pair without its matches
@@ -52,8 +49,7 @@ class ShardError(ValueError):
 
 def write_shard(path: Path, rows: Sequence[Row]) -> None:
     """Write rows of `SCHEMA`: texts, integers, flat arrays, None for what a pair does not have. Whole or absent."""
-    columns = [pa.array([row.get(field.name) for row in rows], field.type) for field in SCHEMA]
-    batch = pa.record_batch(columns, schema=SCHEMA)
+    batch = pa.RecordBatch.from_pylist(rows, schema=SCHEMA)
     batch = batch.replace_schema_metadata({"format": str(FORMAT), "checksum": str(_checksum(batch))})
     with replacing(path) as temporary, pa.ipc.new_file(str(temporary), batch.schema) as writer:
         writer.write_batch(batch)
@@ -85,20 +81,14 @@ class Shard:
 
     def index(self) -> dict[str, list[Any]]:
         """What is known of each pair without its matches: the columns of `INDEX`."""
-        return {name: self.batch.column(name).to_pylist() for name in INDEX}
+        index: dict[str, list[Any]] = self.batch.select(INDEX).to_pydict()
+        return index
 
-    def read(self, row: int, names: Sequence[str] = (*_PER_PAIR, *_PER_MATCH)) -> dict[str, NDArray[Any]]:
+    def read(self, row: int, names: Sequence[str] = tuple(ARRAYS)) -> dict[str, NDArray[Any]]:
         """A pair's arrays, views of the file: points (n, 2), frames (n, 2, 3), F (3, 3), ...; absent ones left out."""
-        columns = ((name, self._list(name, row)) for name in names)
-        return {name: values.reshape(_SHAPES[name]) for name, values in columns if values is not None}
-
-    def _list(self, name: str, row: int) -> NDArray[Any] | None:
-        column = self.batch.column(name)
-        if not column[row].is_valid:
-            return None
-        start, end = (column.offsets[i].as_py() for i in (row, row + 1))
-        values: NDArray[Any] = column.values.slice(start, end - start).to_numpy(zero_copy_only=True)
-        return values
+        lists = ((name, self.batch.column(name)[row].values) for name in names)
+        known = ((name, values.to_numpy(zero_copy_only=True)) for name, values in lists if values is not None)
+        return {name: values.reshape(ARRAYS[name][1]) for name, values in known}
 
 
 def _checksum(batch: pa.RecordBatch) -> int:
@@ -126,19 +116,12 @@ class Draw(NamedTuple):
 
 class StoredMatches(Dataset[LabelledMatches]):
     """The labelled matches in a folder that `MatchedPairs` has filled; each item is a batch of one pair.
-
     Files are mapped into memory and opened by each process for itself, so the data set can be handed to the workers of
     a DataLoader, forked or spawned. Pairs that failed are left out, with a warning; `failures` holds their identities
     and reasons. `pairs` says of each item what its key, identity, family and scene are, and how many matches, inliers
-    and outliers it has on disk.
-
-    Args:
-        folder: holds ``shard-*.arrow``.
-        augmentation: random changes of each item, selected by `seed`, the pair's key and the epoch (`set_epoch`, or an
-            index that is a `Draw`).
-
-    Raises ValueError where the folder has no such files or every pair failed, ShardError for a damaged file.
-    """
+    and outliers it has on disk. folder: holds ``shard-*.arrow``. augmentation: random changes of each item, selected by
+    `seed`, the pair's key and the epoch (`set_epoch`, or an index that is a `Draw`). Raises ValueError where the folder
+    has no such files or every pair failed, ShardError for a damaged file."""
 
     def __init__(self, folder: str | Path, *, augmentation: Augmentation | None = None, seed: int = 0) -> None:
         self.folder = Path(folder)
@@ -156,14 +139,20 @@ class StoredMatches(Dataset[LabelledMatches]):
         self._rows: list[tuple[int, int]] = []
         for number in range(len(self._paths)):
             index = self._shard(number).index()
-            for row in range(len(self._shard(number))):
-                about = {name: column[row] for name, column in index.items()}
+            for row, values in enumerate(zip(*index.values(), strict=True)):
+                about = dict(zip(index, values, strict=True))
                 if about["reason"]:
                     self.failures.append((about["identity"], about["reason"]))
                 else:
                     self._rows.append((number, row))
                     self.pairs.append(about)
-        self._tell_failures()
+        if self.failures:
+            identity, reason = self.failures[0]
+            count = f"{len(self.failures)} of {len(self.failures) + len(self)} pairs"
+            message = f"{count} have no matches and are left out, the first is {identity}: {reason}"
+            if not len(self):
+                raise ValueError(message)
+            warnings.warn(message, stacklevel=3)
 
     @property
     def digest(self) -> str:
@@ -200,10 +189,13 @@ class StoredMatches(Dataset[LabelledMatches]):
         """About how many matches each pair has in an epoch, before it is cut to a random number of them."""
         if self.augmentation is None:
             return [float(about["matches"]) for about in self.pairs]
-        return [
-            self.augmentation.expected(ratio, label, key=about["key"], seed=self.seed, epoch=epoch)
-            for about, (ratio, label) in zip(self.pairs, map(self._figures, self._rows), strict=True)
-        ]
+        lengths = []
+        for about, (number, row) in zip(self.pairs, self._rows, strict=True):
+            arrays = self._shard(number).read(row, ("ratio", "label"))
+            known = {name: torch.from_numpy(values.copy()) for name, values in arrays.items()}
+            given = known.get("ratio"), known["label"]
+            lengths.append(self.augmentation.expected(*given, key=about["key"], seed=self.seed, epoch=epoch))
+        return lengths
 
     def select(self, indices: Iterable[int]) -> "StoredMatches":
         chosen, other = list(indices), copy.copy(self)
@@ -223,12 +215,6 @@ class StoredMatches(Dataset[LabelledMatches]):
         other.augmentation, other.seed = augmentation, seed
         return other
 
-    def _figures(self, where: tuple[int, int]) -> tuple[torch.Tensor | None, torch.Tensor]:
-        number, row = where
-        arrays = self._shard(number).read(row, ("ratio", "label"))
-        ratio = torch.from_numpy(arrays["ratio"].copy()) if "ratio" in arrays else None
-        return ratio, torch.from_numpy(arrays["label"].copy())
-
     def _shard(self, number: int) -> Shard:
         if number not in self._open:
             self._open[number] = self._reader(self._paths[number])
@@ -237,32 +223,15 @@ class StoredMatches(Dataset[LabelledMatches]):
     def _reader(self, path: Path) -> Shard:
         return Shard(path)
 
-    def _tell_failures(self) -> None:
-        if not self.failures:
-            return
-        identity, reason = self.failures[0]
-        total = len(self.failures) + len(self)
-        said = "pairs have no matches and are left out, the first is"
-        message = f"{len(self.failures)} of {total} {said} {identity}: {reason}"
-        if not len(self):
-            raise ValueError(message)
-        warnings.warn(message, stacklevel=3)
-
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_open": {}}
 
 
 def split_scenes(matches: StoredMatches, last: int = 4) -> tuple[StoredMatches, StoredMatches]:
     """Pairs for training, and those of the last scenes of each family, by name, for validation.
-
     The splits of a data set share neither scene nor pair. The rendered training scenes share a few photographs, which
-    hang on walls of both parts.
-
-    Args:
-        matches: of several scenes a family. last: scenes of each family for validation.
-
-    Raises ValueError for a family that has no more scenes than that.
-    """
+    hang on walls of both parts. matches: of several scenes a family. last: scenes of each family for validation. Raises
+    ValueError for a family that has no more scenes than that."""
     scenes = [(about["family"], about["scene"]) for about in matches.pairs]
     for family, count in Counter(family for family, _ in dict.fromkeys(scenes)).items():
         if count <= last:
@@ -295,21 +264,14 @@ _POOL = 8  # batches that are sorted by length together: more make lengths more 
 
 class SimilarLengthBatches(Sampler[list[Draw]]):
     """Each pair once an epoch, in random batches of similar lengths: a ``batch_sampler`` for torch's DataLoader.
-
     Pairs are shuffled, sorted by length within pools of a few batches, and the batches shuffled. Every batch draws one
     number of matches that its pairs are cut to, so that padding is due to shorter pairs only; `collate_trimmed` bounds
     it. All is a function of (seed, epoch): after `set_epoch` the batches are those of an uninterrupted training, and
     `start` leaves out those that it has seen. The epoch travels with each item, so that workers of a DataLoader, also
-    persistent ones, need not be told.
-
-    Args:
-        dataset: `MatchedPairs`. batch: pairs in a batch; the last one of an epoch may be smaller.
-        seed: selects the batches. matches: range of the number of matches, uniform in its logarithm; None: no limit.
-        rank, world_size: of this process in a distributed training; each has as many batches, where need be some of
-            the first ones twice.
-
-    Raises ValueError for a batch below 1, and for a rank that is not below world_size.
-    """
+    persistent ones, need not be told. dataset: `MatchedPairs`. batch: pairs in a batch; the last one of an epoch may be
+    smaller. seed: selects the batches. matches: range of the number of matches, uniform in its logarithm; None: no
+    limit. rank, world_size: of this process in a distributed training; each has as many batches, where need be some of
+    the first ones twice. Raises ValueError for a batch below 1, and for a rank that is not below world_size."""
 
     def __init__(
         self, dataset: StoredMatches, batch: int = 32, *, seed: int = 0, matches: Sequence[int] | None = (50, 4000),
@@ -362,8 +324,7 @@ def collate_trimmed(items: Sequence[LabelledMatches], padding: float = MAX_PADDI
 
 def longest(counts: torch.Tensor, padding: float) -> int:
     """The largest number of slots with at most `padding` of them empty, for pairs with so many matches each."""
-    high = int(counts.max()) if len(counts) else 0
-    low = int(counts.min()) if len(counts) else 0
+    low, high = (int(counts.min()), int(counts.max())) if len(counts) else (0, 0)
     while low < high:  # the share of padding grows with the number of slots
         middle = (low + high + 1) // 2
         filled = int(counts.clamp(max=middle).sum())

@@ -28,6 +28,7 @@ from fmtorch.data import DataError, ImagePair
 from fmtorch.estimators import PairwiseEstimator
 from fmtorch.evaluation.statistics import MIN_UNITS, PERCENT, POSE_THRESHOLDS, difference
 from fmtorch.geometry import pose_from_fundamental
+from fmtorch.geometry.pose import calibrated
 from fmtorch.io import h5
 from fmtorch.pipeline.pipeline import Outcome
 from fmtorch.presets.objects import merged
@@ -207,11 +208,6 @@ def _posed(estimate: Estimate, c: Correspondences) -> Estimate:
     return estimate.replace(R=pose.R, t=pose.t, focals=torch.from_numpy(focals_of(K0[0].numpy(), K1[0].numpy()))[None])
 
 
-def rays(x: Array, K: Array) -> Array:
-    """Pixels (n, 2) in units of the focal length, from the principal point."""
-    return np.ascontiguousarray((np.c_[x, np.ones(len(x))] @ np.linalg.inv(K).T)[:, :2])
-
-
 def bougnoux(F: Array, c: Correspondences) -> Array:
     """Focal lengths (2,) in pixels by Bougnoux's formula (ICCV 1998); usual ones for both where one is not real."""
     centres = calibrations(c.replace(K0=None, K1=None), np.ones(2))
@@ -244,7 +240,7 @@ def _kornia(pair: Any, K0: Array, K1: Array, threshold: float = 1.0, rounds: int
 
     unit = float(np.mean([K0[0, 0], K1[0, 0]]))  # px
     ransac = RANSAC("essential", inl_th=threshold / unit, max_iter=rounds, prosac_sampling=True, seed=pair.seed)
-    E, mask = ransac(*(torch.from_numpy(rays(x, K)) for x, K in ((pair.x0, K0), (pair.x1, K1))))
+    E, mask = ransac(*(torch.from_numpy(calibrated(x, K)) for x, K in ((pair.x0, K0), (pair.x1, K1))))
     return E.double().numpy(), mask.numpy()
 
 

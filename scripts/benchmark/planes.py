@@ -195,9 +195,7 @@ def pose_sheet(rows: Sequence[Row]) -> Sheet:
     """AUC of the pose error with known cameras, of pairs called general and of others, from F and from H."""
     posed = [row for row in rows if row["method"] == "fmtorch" and row["item"].pair.R is not None]
     records: list[Record] = []
-    for (family, kind), own in grouped(
-        [{**row, "set": row["item"].pair.family} for row in posed], "set", "kind"
-    ).items():
+    for (family, kind), own in grouped(posed, "set", "kind").items():
         errors = torch.from_numpy(np.stack([pose_errors(row["item"]) for row in own], 1))
         line: Record = {"set": family, "kind": kind, "pairs": len(own)}
         for name, areas in zip(POSES, (100 * metrics.pose_auc(errors)).tolist(), strict=True):

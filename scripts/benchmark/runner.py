@@ -191,8 +191,7 @@ def judged(outcome: Outcome, seed: int, signed: bool = False) -> Row:
     t, true = None if outcome.estimate is None else outcome.estimate.t, outcome.pair.t
     if t is not None and true is not None and row.ok and bool(t.isfinite().all()):
         figures["flipped"] = bool(t[0].double().numpy() @ true < 0)
-    c = outcome.correspondences
-    if c is not None:
+    if (c := outcome.correspondences) is not None:
         r = sampson(torch.from_numpy(outcome.pair.F)[None], c.x0.double(), c.x1.double())[c.mask].abs()
         near = r[r < NEAR]
         figures["distance"] = float(near.median()) if len(near) else math.nan
@@ -211,9 +210,7 @@ def measure(
     for item in track(items, title, console=console, transient=True):
         for seed in range(seeds):
             new = []
-            for method in methods:
-                if not method.applies(item):
-                    continue
+            for method in (each for each in methods if each.applies(item)):
                 about = {"pair": item.pair.identity, **item.facts, "seed": seed}
                 about |= {"method": method.name, "identity": method.identity}
                 row = known.get(tuple(about.get(field) for field in WHICH))

@@ -165,15 +165,12 @@ def _resident(field: str) -> int:
 
 
 def run_scale(arguments: argparse.Namespace) -> None:
-    sheets = []
-    if "workers" in arguments.parts:
-        sheets.append(worker_sheet(arguments.executors, arguments.workers))
-    if "memory" in arguments.parts:
-        records: list[Record] = []
-        for count in arguments.rows:
-            with multiprocessing.get_context("spawn").Pool(1) as pool:  # each time in a process of its own
-                records.append({"rows": count, **{k: f"{v:.0f}" for k, v in pool.apply(stored, (count,)).items()}})
-        sheets.append(Sheet("memory", "How far the peak of each step exceeds what the caller had before", records))
+    sheets = [worker_sheet(arguments.executors, arguments.workers)] if "workers" in arguments.parts else []
+    records: list[Record] = []
+    for count in arguments.rows if "memory" in arguments.parts else ():
+        with multiprocessing.get_context("spawn").Pool(1) as pool:  # each time in a process of its own
+            records.append({"rows": count, **{k: f"{v:.0f}" for k, v in pool.apply(stored, (count,)).items()}})
+    sheets.append(Sheet("memory", "How far the peak of each step exceeds what the caller had before", records))
     show(sheets, arguments.table)
 
 

@@ -275,10 +275,8 @@ def match_sets(store: PatchStore, matches: int, max_similarity: float = MAX_SIMI
     image = np.add.reduceat(similarity, begins) / counts if len(begins) else np.zeros(0)
     kept = (counts >= matches) & (image <= max_similarity)
     if not kept.any():
-        raise ValueError(
-            f"no pair of photographs shares {matches} points and has a similarity of at most {max_similarity}: "
-            "lower match_sets.matches, or cut more points"
-        )
+        lacking = f"no pair of photographs shares {matches} points and has a similarity of at most {max_similarity}"
+        raise ValueError(f"{lacking}: lower match_sets.matches, or cut more points")
     of_kept = np.repeat(kept, counts)
     return MatchSets(pairs[:, of_kept], similarity[of_kept], np.r_[0, np.cumsum(counts[kept])], image[kept])
 
@@ -362,8 +360,7 @@ def split(photographs: Sequence[Photograph], held_out: Sequence[str]) -> tuple[l
     known = {photograph.source for photograph in photographs}
     if unknown := sorted(set(held_out) - known):
         raise ValueError(f"held_out names {', '.join(unknown)}; the sources are {', '.join(sorted(known))}")
-    train = [p for p in photographs if p.source not in held_out]
-    validation = [p for p in photographs if p.source in held_out]
+    train, validation = ([p for p in photographs if (p.source in held_out) is side] for side in (False, True))
     if not train or not validation:
         raise ValueError("held_out must leave sources on both sides: training and validation")
     return train, validation

@@ -205,9 +205,8 @@ def training_of(
     if "match_sets" in training:
         of_sets = {"sets": match_sets(store, **training["match_sets"]), "matches": training["match_sets"]["matches"]}
         description = {**description, "match_sets": training["match_sets"]}
-    return PatchTraining(
-        network, objective, store, TrainingOptions(**training["options"]), description, device, **of_sets
-    )
+    options = TrainingOptions(**training["options"])
+    return PatchTraining(network, objective, store, options, description, device, **of_sets)
 
 
 @hydra.main(version_base=None, config_path=str(conf_dir()), config_name="train_patch_network")

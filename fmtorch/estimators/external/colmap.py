@@ -80,15 +80,17 @@ def colmap(
             focals = np.array([np.nan if K is None else K[0, 0] for K in (geometry.K0, geometry.K1)])
             return pairwise.Posed(geometry.F, geometry.inliers, focals, geometry.R, geometry.t)
         ransac = settings(pair).ransac
-        if cameras is not None and pair.exact:
-            F, inliers, R, t = essential_matrix(pair.x0, pair.x1, cameras, ransac)
-            return pairwise.Posed(F, inliers, None, R, t)
-        return fundamental_matrix(pair.x0, pair.x1, ransac)
+        if cameras is not None and pair.exact is not None:
+            ends = (_pinhole(library, camera) for camera in cameras)
+            result = library.estimate_essential_matrix(pair.x0, pair.x1, *ends, ransac)
+            return _without(pair) if result is None else _posed(result, *pair.exact)
+        result = library.estimate_fundamental_matrix(pair.x0, pair.x1, ransac)
+        return _without(pair) if result is None else pairwise.solution(result["F"], result["inlier_mask"])
 
     def homography(pair: Pair) -> Solution:
         result = library.estimate_homography_matrix(pair.x0, pair.x1, settings(pair).ransac)
         if result is None:
-            return None, np.zeros(len(pair.x0), np.bool_)
+            return _without(pair)
         H, inliers = np.asarray(result["H"], np.float64), np.asarray(result["inlier_mask"], np.bool_)
         depth = pair.x0[inliers] @ H[2, :2] + H[2, 2]
         return (-H if np.count_nonzero(depth < 0) > np.count_nonzero(depth > 0) else H), inliers
@@ -125,27 +127,16 @@ def two_view_geometry(x0: Points, x1: Points, cameras: tuple[Camera, Camera], op
     return TwoView(configuration, F, R, t, K0, K1, inliers)
 
 
-def essential_matrix(
-    x0: Points, x1: Points, cameras: tuple[Camera, Camera], ransac: Any
-) -> tuple[Points | None, NDArray[np.bool_], Points | None, Points | None]:
-    """F of COLMAP's essential matrix, px, its inliers (n,), R and t; None without. ransac: `pycolmap.RANSACOptions`."""
-    library = pairwise.peer("pycolmap", "COLMAP", extra="colmap")
-    result = library.estimate_essential_matrix(x0, x1, *(_pinhole(library, camera) for camera in cameras), ransac)
-    if result is None:
-        return None, np.zeros(len(x0), np.bool_), None, None
-    K0, K1 = (camera.K for camera in cameras)
+def _posed(result: Any, K0: Points, K1: Points) -> pairwise.Posed:
+    """COLMAP's relative pose with F of its essential matrix, px."""
     F = np.linalg.inv(K1).T @ np.asarray(result["E"]) @ np.linalg.inv(K0)
-    pose = result["cam2_from_cam1"]
-    R, t = np.asarray(pose.rotation.matrix()), np.asarray(pose.translation)
-    return F, np.asarray(result["inlier_mask"], np.bool_), R, t
+    pose, inliers = result["cam2_from_cam1"], np.asarray(result["inlier_mask"], np.bool_)
+    return pairwise.Posed(F, inliers, None, np.asarray(pose.rotation.matrix()), np.asarray(pose.translation))
 
 
-def fundamental_matrix(x0: Points, x1: Points, ransac: Any) -> tuple[Points | None, NDArray[np.bool_]]:
-    """COLMAP's fundamental matrix, px, and its inliers (n,); None without. ransac: `pycolmap.RANSACOptions`."""
-    result = pairwise.peer("pycolmap", "COLMAP", extra="colmap").estimate_fundamental_matrix(x0, x1, ransac)
-    if result is None:
-        return None, np.zeros(len(x0), np.bool_)
-    return np.asarray(result["F"], np.float64), np.asarray(result["inlier_mask"], np.bool_)
+def _without(pair: Pair) -> Solution:
+    """No model, and no inliers."""
+    return None, np.zeros(len(pair.x0), np.bool_)
 
 
 def _cameras(pair: Pair) -> tuple[Camera, Camera]:

@@ -137,10 +137,9 @@ def kornia_ransac(
 
 Part = TypeVar("Part", int, str)
 
-# The numbers of the samplers in the authors' bindings of MAGSAC++ and GC-RANSAC.
 MAX_SEED = 2**31 - 1  # of 32 bits, as DEGENSAC takes them
 SAMPLERS = {"uniform": 0, "prosac": 1, "progressive_napsac": 2, "importance": 3, "adaptive": 4}
-# The names of the parts in the binding of SupeRANSAC.
+"""The numbers of the samplers in the authors' bindings of MAGSAC++ and GC-RANSAC."""
 SUPERANSAC_SAMPLERS = {
     "uniform": "Uniform",
     "prosac": "PROSAC",
@@ -148,6 +147,7 @@ SUPERANSAC_SAMPLERS = {
     "adaptive": "ARSampler",
 }
 SUPERANSAC_SCORES = {"ransac": "RANSAC", "msac": "MSAC", "magsac": "MAGSAC"}
+"""The names of the parts in the binding of SupeRANSAC."""
 
 
 @pairwise.computed_by("pymagsac")
@@ -339,7 +339,10 @@ def poselib(
         if "real_focal_check" not in library.RansacOptions():
             raise ValueError("this version of PoseLib has no real_focal_check; 2.0.4 and later have it")
         options["real_focal_check"] = True
-    refinement = _refinement(loss, loss_scale)
+    if loss is not None and loss not in LOSSES:
+        raise ValueError(f"loss is {loss!r}; it must be one of: {', '.join(LOSSES)}")
+    chosen = {"loss_type": loss and loss.upper(), "loss_scale": loss_scale}
+    refinement = {name: value for name, value in chosen.items() if value is not None}  # else PoseLib's own
 
     def solve(pair: Pair) -> Solution:
         seeded = {**options, "seed": pair.seed}
@@ -365,8 +368,8 @@ def _relative_pose(library: Any, pair: Pair, options: dict[str, Any], refinement
     ]
     pose, info = library.estimate_relative_pose(pair.x0, pair.x1, *cameras, options, refinement)
     R, t = np.asarray(pose.R, np.float64), np.asarray(pose.t, np.float64)
-    inliers = np.asarray(info["inliers"], np.bool_)
-    return pairwise.Posed(pairwise.fundamental_of_pose(*pair.exact, R, t), inliers, None, R, t)
+    F = pairwise.fundamental_of_pose(*pair.exact, R, t)
+    return pairwise.Posed(F, np.asarray(info["inliers"], np.bool_), None, R, t)
 
 
 def _shared_focal(library: Any, pair: Pair, options: dict[str, Any], refinement: dict[str, Any]) -> Solution:
@@ -384,14 +387,6 @@ def _shared_focal(library: Any, pair: Pair, options: dict[str, Any], refinement:
 def _centre(size: tuple[int, int]) -> NDArray[np.float64]:
     """The middle (x, y) of an image of a size (h, w), in pixels."""
     return (np.array(size[::-1], np.float64) - 1) / 2
-
-
-def _refinement(loss: str | None, scale: float | None) -> dict[str, Any]:
-    """PoseLib's options of the non-linear refinement: what is given. Raises ValueError for a loss it does not know."""
-    if loss is not None and loss not in LOSSES:
-        raise ValueError(f"loss is {loss!r}; it must be one of: {', '.join(LOSSES)}")
-    given = {"loss_type": loss and loss.upper(), "loss_scale": scale}
-    return {name: value for name, value in given.items() if value is not None}
 
 
 FOCALS = ("shared", "varying")
@@ -443,14 +438,12 @@ def fastpose(
         kind = focal or (("varying", "shared")[pair.shared_focal] if pair.calibrations == (None, None) else None)
         if kind is not None:
             call = getattr(library, f"estimate_relative_pose_with_{kind}_focal{'s' * (kind == 'varying')}")
-            centres = [(np.array(size[::-1], np.float64) - 1) / 2 for size in (pair.size0, pair.size1)]
+            centres = [_centre(size) for size in (pair.size0, pair.size1)]
             result, info = call(pair.x0, pair.x1, *centres, **own)
-            names = ("f", "f") if kind == "shared" else ("f1", "f2")
-            K0, K1 = (
-                np.array([[result[name], 0, x], [0, result[name], y], [0, 0, 1]])
-                for name, (x, y) in zip(names, centres, strict=True)
-            )
-            return _posed(result, info, K0, K1, np.array([result[name] for name in names]))
+            focals = [result[name] for name in (("f", "f") if kind == "shared" else ("f1", "f2"))]
+            ends = zip(focals, centres, strict=True)
+            K0, K1 = (np.array([[f, 0, x], [0, f, y], [0, 0, 1]]) for f, (x, y) in ends)
+            return _posed(result, info, K0, K1, np.array(focals))
         result, info = library.estimate_fundamental(pair.x0, pair.x1, **own)
         return pairwise.solution(result["F"], info["inliers"])
 

@@ -10,9 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from fmtorch.core import lazy
-from fmtorch.core.options import Within
-from fmtorch.core.types import Correspondences, Estimate
+from fmtorch.core import Correspondences, Estimate, Within, lazy
 from fmtorch.estimators.batch import Batch, relative_rounding
 from fmtorch.estimators.preselection import degenerate_support
 from fmtorch.geometry.epipolar import sampson
@@ -45,11 +43,9 @@ Solution = tuple[Points | None, NDArray[np.bool_]] | Posed
 @dataclasses.dataclass(frozen=True)
 class Pair:
     """A pair's matches as these libraries take them: x0, x1 (N, 2) in pixels, likelihood (N,), sizes (h, w).
-
     likelihood: the prior where there is one, else 1 - ambiguity, else 1; matches are in its descending order if asked.
     calibrations: where cameras are asked for, K0 and K1 (3, 3), None for an unknown focal length; calibrated: whether
-    both are exact; shared_focal: whether both unknown focal lengths are one.
-    """
+    both are exact; shared_focal: whether both unknown focal lengths are one."""
 
     x0: Points
     x1: Points
@@ -139,12 +135,13 @@ def _with_cameras(pair: Pair, batch: Batch, i: int) -> Pair:
     """The pair with what is known of its cameras, where they are asked for."""
     if batch.focal is None or batch.sizes.shape[1] == 0:
         return pair
-    known: list[Points | None] = []
-    for (f, deviation), (h, w) in zip(batch.focal[i], batch.sizes[i].reshape(2, 2), strict=True):
-        K = np.array([[f, 0, (w - 1) / 2], [0, f, (h - 1) / 2], [0, 0, 1]])
-        known.append(K if deviation < np.inf else None)
+    ends = zip(batch.focal[i], batch.sizes[i].reshape(2, 2), strict=True)
+    K0, K1 = (
+        np.array([[f, 0, (w - 1) / 2], [0, f, (h - 1) / 2], [0, 0, 1]]) if deviation < np.inf else None
+        for (f, deviation), (h, w) in ends
+    )
     shared, exact = bool(batch.shared[i]), batch.calibrated(i)
-    return dataclasses.replace(pair, calibrations=(known[0], known[1]), calibrated=exact, shared_focal=shared)
+    return dataclasses.replace(pair, calibrations=(K0, K1), calibrated=exact, shared_focal=shared)
 
 
 def _cameras_found(posed: list[Posed | None]) -> dict[str, torch.Tensor]:
@@ -202,13 +199,8 @@ def fundamental_of_pose(K0: Points, K1: Points, R: Points, t: Points) -> Points:
 
 
 def _likelihood(c: Correspondences, i: int) -> torch.Tensor:
-    if c.prior is not None:
-        value = c.prior[i]
-    elif c.ambiguity is not None:
-        value = 1 - c.ambiguity[i]
-    else:
-        value = torch.ones(c.mask.shape[1])
-    return value.detach().cpu().to(torch.float64)
+    value = torch.ones(c.mask.shape[1]) if c.ambiguity is None else 1 - c.ambiguity[i]
+    return (value if c.prior is None else c.prior[i]).detach().cpu().to(torch.float64)
 
 
 def _size(sizes: torch.Tensor | None, x: Points, i: int) -> tuple[int, int]:
