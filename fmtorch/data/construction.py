@@ -59,9 +59,7 @@ class PointOverlap:
 
 def shared_points(sees: Any, pairs: Indices) -> Matrix:
     """Overlaps (n,) of pairs (n, 2) of images: points that both see, over those of the image that sees more of them.
-
-    sees: which image sees which point, as `incidence` gives it. Zero where an image sees none.
-    """
+    sees: which image sees which point, as `incidence` gives it. Zero where an image sees none."""
     counts = np.diff(sees.indptr)[pairs]
     shared = sees[pairs[:, 0]].multiply(sees[pairs[:, 1]]).sum(1)
     larger = counts.max(1, initial=0)
@@ -166,9 +164,7 @@ def ratio_matches(a: Keypoints, b: Keypoints) -> tuple[Matrix, Matrix]:
 
 def matchable(a: Keypoints, b: Keypoints, F: Matrix) -> bool:
     """Whether more than `ENOUGH` ratio matches lie within `NEAR_LINE` pixels of the true lines in both images.
-
-    Looks at some of the first image's keypoints at a time, until there are enough.
-    """
+    Looks at some of the first image's keypoints at a time, until there are enough."""
     near = 0
     for begin in range(0, len(a[0]), _AT_ONCE):
         block = a[0][begin : begin + _AT_ONCE], a[1][begin : begin + _AT_ONCE]
@@ -197,13 +193,11 @@ class Verdicts:
 @dataclasses.dataclass(frozen=True, eq=False)
 class Construction:
     """The construction of pairs in a folder.
-
     dataset: with the candidates. folder: of the set that is made; its name is the set's. count: how many pairs, drawn
     at random by `seed`; None: all. quality: of JPEG images that are written because they were undistorted.
     overlap: the least and the greatest overlap of pairs (`fmtorch.data.construction`); None: the paper's rule.
     matches: what the matches are computed by that take the place of images; None: images. Raises ValueError, when its
-    `rule` is first asked for, where the data set's overlaps are not known.
-    """
+    `rule` is first asked for, where the data set's overlaps are not known."""
 
     dataset: ScenePairs
     folder: Path

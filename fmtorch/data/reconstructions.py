@@ -135,8 +135,7 @@ class BundlerPairs(ScenePairs):
     ``bundle/bundle.out``. split, sequences, candidates, shared, pairs, seed, family: as in `colmap_pairs`.
 
     Cameras without a focal length, which Bundler did not register, are left out. Radial distortion is taken out when an
-    image is read. The principal point is the middle of each image, whose size is read from its file.
-    """
+    image is read. The principal point is the middle of each image, whose size is read from its file."""
 
     def __init__(
         self, root: str | Path | None = None, split: str = "test", sequences: Sequence[str] | None = None,

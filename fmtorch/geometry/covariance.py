@@ -164,12 +164,10 @@ factor of ten in a focal length. They enter as independent information, which is
 
 class TwoViewCovariance(NamedTuple):
     """Covariances of B pairs.
-
     covariance: of (omega, tau, log f0, log f1), radians and logarithms; rows of known focal lengths are zero.
     tangent: the basis B of the plane across t. fundamental: covariance of F, row by row, at unit Frobenius norm, in
     pixels. noise: s, px. valid: False where R, t, a focal length, the truncation or the prior is not finite or has no
-    meaning; such a pair is as one without matches.
-    """
+    meaning; such a pair is as one without matches."""
 
     covariance: Float[Tensor, "b 7 7"]
     tangent: Float[Tensor, "b 3 2"]

@@ -115,10 +115,8 @@ def homography_transfer(H: Matrix, x0: Points, x1: Points) -> tuple[PerMatch, Pe
 
 def homography_sampson(H: Matrix, x0: Points, x1: Points) -> PerMatch:
     """Sampson distance of a homography in pixels: of both images together (Hartley & Zisserman, section 4.2.6).
-
     The length of the least correction of x0 and x1 that makes ``x1 ~ H x0`` hold to first order: of small errors the
-    distance to the nearest exact match. Arguments as of `homography_transfer`, (..., N).
-    """
+    distance to the nearest exact match. Arguments as of `homography_transfer`, (..., N)."""
     h = unit_largest(H.to(torch.float64)).flatten(-2).movedim(-1, 0)[..., None]
     shape = np.broadcast_shapes(x0.shape, x1.shape)
     points = torch.cat([x0.expand(shape), x1.expand(shape)], -1).movedim(-1, 0)
@@ -292,8 +290,7 @@ def cross_times(e: Array, A: Array, out: Array) -> None:
 def plane_homography(F: Array, e1: Array, points: Array, triplet: Array, H: Array) -> bool:
     """The homography of the plane through the matches (3,) of a triplet that satisfy F -> H; if it is determined.
     ``H = A - e1 (M^-1 b)^T`` with ``A = [e1]_x F``, the rows of M the points in image 0, and
-    ``b_i = (x1_i x (A x0_i)) . (x1_i x e1) / |x1_i x e1|^2`` (result 13.6). e1: the epipole in image 1, ``F^T e1 = 0``.
-    """
+    ``b_i = (x1_i x (A x0_i)) . (x1_i x e1) / |x1_i x e1|^2`` (result 13.6); ``F^T e1 = 0``, the epipole of image 1."""
     A, b, M = vector(9), vector(3), matrix(3, 3)
     cross_times(e1, F, A)
     for k in range(3):

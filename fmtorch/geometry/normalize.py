@@ -85,9 +85,7 @@ def denormalize_fundamental(
 
 def canonical(F: Matrices) -> Matrices:
     """F scaled to unit Frobenius norm with its entry of largest magnitude (the first of equals) positive.
-
-    A zero matrix stays zero, with zero gradient.
-    """
+    A zero matrix stays zero, with zero gradient."""
     flat = F.detach().reshape(*F.shape[:-2], 9)
     peak = torch.gather(flat, -1, flat.abs().argmax(-1, keepdim=True))[..., None]
     return unit_frobenius(F) * torch.copysign(torch.ones_like(peak), peak)

@@ -164,8 +164,7 @@ class LikelihoodField:
     least_seeds, so many of the lowest ratio; where they are more than most_seeds, so many of them, evenly.
     candidates, centres: at most so many seeds are looked at for centres, and so many centres are chosen.
     position, displacement, rotation, scale: widths of the Gaussians, see `predictive_gaussians`; unframed_displacement
-    replaces the second where matches have no frames to predict it by.
-    """
+    replaces the second where matches have no frames to predict it by."""
 
     ratio: float = 0.8
     least_seeds: int = 200

@@ -335,8 +335,7 @@ class RefineMatches:
     least, px. share: the same, of the half side of the match's frame. min_correlation, max_shift (in samples),
     max_deviation (px): see above. floor, slope: the expected distance to the epipolar line of a refined match is
     ``sqrt(floor^2 + (slope s)^2)`` px with s the standard deviation by the normal equations, unexplained: its residuals
-    are not independent. usual: that of an unrefined match of noise one, px. Noise grows with P^(-1/4).
-    """
+    are not independent. usual: that of an unrefined match of noise one, px. Noise grows with P^(-1/4)."""
 
     radius: int
     iterations: int

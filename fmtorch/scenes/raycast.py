@@ -26,9 +26,7 @@ Matrix = NDArray[np.float64]
 @dataclasses.dataclass(frozen=True, eq=False)
 class Camera:
     """A pinhole: ``x ~ K (R X + t)``, pixels (x, y) with (0, 0) at the centre of the first pixel; size (h, w).
-
-    World units are metres with z upwards; camera axes are OpenCV's (x right, y down, z forward).
-    """
+    World units are metres with z upwards; camera axes are OpenCV's (x right, y down, z forward)."""
 
     K: Matrix
     R: Matrix
@@ -93,10 +91,8 @@ _LOW, _HIGH = np.float32(-SEAM), np.float32(1 + SEAM)  # of s and t, exclusive
 
 class Pieces(NamedTuple):
     """n pieces as one camera sees them, and the order (k,) in which rays are cast against some of them, nearest first.
-
     boxes (n, 4): pixels x0, y0, x1, y1, end excluded. forms (n, 3, 3): of a pixel of the box, s z^-1, t z^-1, z^-1.
-    depth (n, 3): along U, along V, at O. closest (n,): no point is nearer. triangle (n,).
-    """
+    depth (n, 3): along U, along V, at O. closest (n,): no point is nearer. triangle (n,)."""
 
     order: I8x1
     boxes: I8x2
@@ -108,10 +104,8 @@ class Pieces(NamedTuple):
 
 class Cutouts(NamedTuple):
     """Where pieces have holes.
-
     place (n, 2): where the picture with holes begins in `opacity`, and its row length; -1: without holes. window
-    (n, 10): u at O, along U, along V; v likewise; the picture's origin x, y and size x, y. opacity: of all pictures.
-    """
+    (n, 10): u at O, along U, along V; v likewise; the picture's origin x, y and size x, y. opacity: of all pictures."""
 
     place: I8x2
     window: F4x2
@@ -239,11 +233,9 @@ class Geometry:
         skip: NDArray[np.bool_] | None = None,
     ) -> Hits:  # fmt: skip
         """Rays of all pixels of a projection P (3, 4), perspective or (last row 0 0 0 1) orthographic.
-
         depth: (4,), the affine function of the world by which the nearer of two pieces is known.
         centre: where a perspective camera stands, for leaving out the backs of pieces; None keeps them.
-        skip: pieces (n,) to look through.
-        """
+        skip: pieces (n,) to look through."""
         h, w = size
         G = np.stack([self.U @ P[:, :3].T, self.V @ P[:, :3].T, self.O @ P[:, :3].T + P[:, 3]], axis=2)
         usable = np.abs(np.linalg.det(G)) > 1e-14
