@@ -249,6 +249,15 @@ class RectifiedBlock(nn.Module):
         return torch.relu(y + slots.clean(self.shortcut(x)))
 
 
+class Blocks(nn.ModuleList):
+    """Blocks in sequence; their parameters have the names of a list's."""
+
+    def forward(self, x: Float[Tensor, "c b n"], slots: Slots) -> Float[Tensor, "d b n"]:
+        for block in self:
+            x = block(x, slots)
+        return x
+
+
 def attention(
     query: Float[Tensor, "c b n"], key: Float[Tensor, "c b m"], value: Float[Tensor, "d b m"], slots: Slots, *,
     heads: int = 1, scale: float | None = None,

@@ -1,5 +1,6 @@
 """NCMNet: Liu & Yang, "Progressive neighbor consistency mining for correspondence pruning", CVPR 2023."""
 
+import functools
 from collections.abc import Sequence
 
 import torch
@@ -7,8 +8,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from fmtorch.pruning.networks import layers
-from fmtorch.pruning.networks.architectures import MatchInputs
-from fmtorch.pruning.networks.clnet import Consensus, Progressive
+from fmtorch.pruning.networks.clnet import Progressive
 from fmtorch.pruning.networks.oanet import OrderAwareContext
 
 
@@ -43,7 +43,7 @@ class NeighborConsistency(nn.Module):
         self.annular = nn.ModuleList(layers.AnnularConvolution(channels, neighbors // 3) for _ in range(3))
         self.interaction = nn.ModuleList(CrossInteraction(channels) for _ in range(3))
         self.context = OrderAwareContext(channels, clusters, 2)
-        self.blocks = nn.ModuleList(layers.RectifiedBlock(channels * (4 if i == 0 else 1), channels) for i in range(3))
+        self.blocks = layers.Blocks(layers.RectifiedBlock(channels * (4 if i == 0 else 1), channels) for i in range(3))
 
     def forward(self, x: Float[Tensor, "c b n"], slots: layers.Slots, spatial: Tensor) -> Float[Tensor, "c b n"]:
         """spatial: neighbours by coordinates."""
@@ -54,10 +54,7 @@ class NeighborConsistency(nn.Module):
         mixed = [
             each(*abc, slots) for each, abc in zip(self.interaction, ((f, g, s), (g, s, f), (s, f, g)), strict=True)
         ]
-        y = torch.cat([*mixed, self.context(x, slots)])
-        for block in self.blocks:
-            y = block(y, slots)
-        return y
+        return self.blocks(torch.cat([*mixed, self.context(x, slots)]), slots)  # type: ignore[no-any-return]
 
 
 class Embedding(nn.Module):
@@ -66,13 +63,11 @@ class Embedding(nn.Module):
     def __init__(self, inputs: int, channels: int, neighbors: int, clusters: int) -> None:
         super().__init__()
         self.neighbors, self.first = neighbors, layers.NormedPerceptron(inputs, channels)
-        self.blocks = nn.ModuleList(layers.RectifiedBlock(channels, channels) for _ in range(3))
+        self.blocks = layers.Blocks(layers.RectifiedBlock(channels, channels) for _ in range(3))
         self.rounds = nn.ModuleList(NeighborConsistency(channels, neighbors, clusters) for _ in range(2))
 
     def forward(self, x: Float[Tensor, "c b n"], slots: layers.Slots) -> Float[Tensor, "d b n"]:
-        spatial, y = layers.nearest(x, slots, self.neighbors), self.first(x, slots)
-        for block in self.blocks:
-            y = block(y, slots)
+        spatial, y = layers.nearest(x, slots, self.neighbors), self.blocks(self.first(x, slots), slots)
         for each in self.rounds:
             y = each(y, slots, spatial)
         return y  # type: ignore[no-any-return]
@@ -93,10 +88,8 @@ class NCMNet(Progressive):
         self, *, channels: int = 128, neighbors: Sequence[int] = (9, 6), clusters: int = 250, ratio: float = 0.5,
         threshold: float = 1e-4, coordinates: str = "size", side: Sequence[str] = (),
     ) -> None:  # fmt: skip
-        inputs = MatchInputs(coordinates, tuple(side))
-        widths = ((inputs.channels + 2 * (i > 0), k) for i, k in enumerate(neighbors))
-        embeddings = (Embedding(width, channels, k, clusters) for width, k in widths)
-        super().__init__([Consensus(each, channels) for each in embeddings], channels, ratio, threshold)
-        self.inputs = inputs
-        self.options = {"channels": channels, "neighbors": list(neighbors), "clusters": clusters, "ratio": ratio,
-                        "threshold": threshold, "coordinates": coordinates, "side": list(side)}  # fmt: skip
+        super().__init__(
+            functools.partial(Embedding, channels=channels, clusters=clusters), channels=channels,
+            neighbors=list(neighbors), clusters=clusters, ratio=ratio, threshold=threshold, coordinates=coordinates,
+            side=side,
+        )  # fmt: skip
