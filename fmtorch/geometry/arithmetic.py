@@ -125,21 +125,19 @@ def as_components(F: Float[Tensor, "p k 3 3"]) -> Float[Tensor, "9 p k"]:
     return F.flatten(2).permute(2, 0, 1).contiguous()
 
 
-def product(A: Float[Tensor, " 3 3 *s"], B: Float[Tensor, " 3 3 *s"]) -> Float[Tensor, " 3 3 *s"]:
-    """``A B`` of component-first matrices."""
+def product(A: Float[Tensor, " a b *#s"], B: Float[Tensor, " b c *#s"]) -> Float[Tensor, " a c *#s"]:
+    """``A B`` of component-first matrices of any size."""
     return component_sum(A[:, :, None] * B[None], 1)
 
 
 def cross(a: Float[Tensor, " 3 *s"], b: Float[Tensor, " 3 *s"]) -> Float[Tensor, " 3 *s"]:
     """The cross product of component-first vectors."""
-    crossed: Tensor = torch.linalg.cross(a, b, dim=0)
-    return crossed
+    return torch.linalg.cross(a, b, dim=0)  # type: ignore[no-any-return]
 
 
 def cofactors(A: Float[Tensor, " 3 3 *s"]) -> Float[Tensor, " 3 3 *s"]:
     """The matrix of cofactors, ``det(A) A^-T`` where A is regular: row i is the cross product of the other two."""
-    crossed: Tensor = torch.linalg.cross(A.roll(-1, 0), A.roll(-2, 0), dim=1)
-    return crossed
+    return torch.linalg.cross(A.roll(-1, 0), A.roll(-2, 0), dim=1)  # type: ignore[no-any-return]
 
 
 def determinant(A: Float[Tensor, " 3 3 *s"]) -> Float[Tensor, "*s"]:

@@ -19,7 +19,7 @@ from fmtorch.geometry.epipolar import Matrix, PerMatch, Points, inverse_root, li
 from fmtorch.geometry.homography_refine import linearise_homography
 from fmtorch.geometry.matrices import EPS, smallest_eigenvector, smallest_eigenvector_kernel, unit_kernel
 from fmtorch.geometry.normalize import normalize_points
-from fmtorch.geometry.null_space import gather
+from fmtorch.geometry.null_space import add_models, gather
 from fmtorch.jit.kernel import Array, F4x2, F8x1, F8x2, I8x1, I8x2, inner, kernel, matrix, vector
 from fmtorch.jit.lanes import LANES, absolute, fill, load, sqrt, store, where
 
@@ -155,17 +155,12 @@ def four_point(points: F8x2, sample: I8x2, H: F4x2, draw: I8x1) -> int:
     points of the sample. A sample gives none if three of its points lie on a line in either image, or if one of the
     four triangles is turned over between the images: then the points would lie on both sides of the plane's horizon, or
     the plane would be seen from behind."""
-    X, h, there = matrix(4 * SIZE, LANES), matrix(9, LANES), np.empty((1, LANES), np.bool_)
+    X, h, there = matrix(4 * SIZE, LANES), np.empty((1, 9, LANES)), np.empty((1, LANES), np.bool_)
     work, models = matrix(6, LANES), 0
     for first in range(0, sample.shape[1], LANES):
         gather(points, sample, first, X)
-        store(there, 0, _homographies(X, work, h))
-        for lane in range(min(LANES, sample.shape[1] - first)):
-            if there[0, lane]:
-                for q in range(9):
-                    H[models, q] = h[q, lane]
-                draw[models] = first + lane
-                models += 1
+        store(there, 0, _homographies(X, work, h[0]))
+        models = add_models(h, there, first, H, draw, models, sample.shape[1])
     return models
 
 
