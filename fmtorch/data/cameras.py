@@ -154,13 +154,8 @@ class Model:
         return Lens(float(fx), float(fy), float(cx), float(cy), name, tuple(map(float, values[self.focals + 2 :])))
 
 
-def pinhole(u: Matrix, v: Matrix) -> tuple[Matrix, Matrix]:
-    """No distortion."""
-    return u, v
-
-
 def radial(u: Matrix, v: Matrix, k1: float = 0.0, k2: float = 0.0) -> tuple[Matrix, Matrix]:
-    """A polynomial in the squared radius."""
+    """A polynomial in the squared radius; without coefficients, a pinhole."""
     r2 = u * u + v * v
     factor = 1 + r2 * (k1 + r2 * k2)
     return u * factor, v * factor
@@ -240,7 +235,7 @@ def _polynomial(x: Matrix, k: tuple[float, ...]) -> Matrix:
 
 
 MODELS = {
-    "SIMPLE_PINHOLE": Model(1, "", pinhole), "PINHOLE": Model(2, "", pinhole),
+    "SIMPLE_PINHOLE": Model(1, "", radial), "PINHOLE": Model(2, "", radial),
     "SIMPLE_RADIAL": Model(1, "k", radial), "RADIAL": Model(1, "k1 k2", radial),
     "OPENCV": Model(2, "k1 k2 p1 p2", rational), "OPENCV_FISHEYE": Model(2, "k1 k2 k3 k4", equidistant, fisheye=True),
     "FULL_OPENCV": Model(2, "k1 k2 p1 p2 k3 k4 k5 k6", rational), "FOV": Model(2, "omega", field_of_view),

@@ -226,6 +226,4 @@ def _plain(value: Any) -> Any:
     """A value with arrays in place of their descriptions, at any depth."""
     if isinstance(value, _Array):
         return value.value()
-    if isinstance(value, list | tuple):
-        return type(value)(_plain(element) for element in value)
-    return value
+    return type(value)(_plain(element) for element in value) if isinstance(value, list | tuple) else value

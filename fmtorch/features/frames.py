@@ -23,8 +23,7 @@ def upright_frames(xy: Float[Tensor, "*n 2"], sigma: Float[Tensor, "*n"]) -> Flo
     """Square frames along the image's axes, of half side `FRAME_SIGMAS` sigma."""
     half_side = FRAME_SIGMAS * sigma
     zero = torch.zeros_like(half_side)
-    columns = (torch.stack([half_side, zero], -1), torch.stack([zero, half_side], -1), xy)
-    return torch.stack(columns, -1)
+    return torch.stack([torch.stack([half_side, zero], -1), torch.stack([zero, half_side], -1), xy], -1)
 
 
 def frame_scale(lafs: Float[Tensor, "*n 2 3"]) -> Float[Tensor, "*n"]:

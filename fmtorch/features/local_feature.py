@@ -41,9 +41,7 @@ class NetworkDescriptor:
 
     def __call__(self, pyramid: ImagePyramid, lafs: Float[Tensor, "n 2 3"]) -> Float[Tensor, "n d"]:
         """Descriptors of the frames."""
-        if len(lafs) == 0:
-            return lafs.new_zeros(0, self.dimensions)
-        return self.network(pyramid.extract(lafs)).to(lafs)
+        return self.network(pyramid.extract(lafs)).to(lafs) if len(lafs) else lafs.new_zeros(0, self.dimensions)
 
 
 @dataclasses.dataclass(frozen=True)

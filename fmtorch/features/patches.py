@@ -81,5 +81,4 @@ def _by_place(lafs: Float[Tensor, "n 2 3"], plan: _Plan) -> Int[Tensor, " m"]:
     finite = torch.nonzero(plan.level >= 0)[:, 0]
     x, y = lafs[finite, 0, 2], lafs[finite, 1, 2]
     by_column = x.argsort()
-    by_band = (y[by_column] / BAND).floor().argsort(stable=True)
-    return finite[by_column[by_band]]
+    return finite[by_column[(y[by_column] / BAND).floor().argsort(stable=True)]]

@@ -126,18 +126,11 @@ class SquarePixels(NamedTuple):
 def square_pixels(
     K: Float[Tensor, "b 3 3"], size: Real[Tensor, "b 2"] | None, valid: Bool[Tensor, " b"]
 ) -> SquarePixels:
-    """Square pixels of the focal length f = sqrt(fx fy) of K; skew is allowed. Float64.
-
-    Args:
-        K: calibration matrices (B, 3, 3), rows (fx, s, cx), (0, fy, cy), (0, 0, 1).
-        size: (B, 2), (h, w) in the unit of K. None: twice the principal point, or where that is none of an image, as of
-            normalised points, a square around it of the usual focal length.
-        valid: (B,), where `calibration_problems` has nothing to say.
-
-    Returns:
-        `SquarePixels`. Where the longer side (or, if that is not known, the focal length) is not within MIN_SIDE_PX and
-        MAX_SIDE_PX, the unit is not a pixel, and points are mapped to an image of a focal length of NOMINAL_FOCAL_PX.
-    """
+    """Square pixels of the focal length f = sqrt(fx fy) of K, rows (fx, s, cx), (0, fy, cy), (0, 0, 1). Float64.
+    size: (h, w) in the unit of K. None: twice the principal point, or where that is none of an image, as of normalised
+    points, a square around it of the usual focal length. valid: where `calibration_problems` has nothing to say. Where
+    the longer side (or, if that is not known, the focal length) is not within MIN_SIDE_PX and MAX_SIDE_PX, the unit is
+    not a pixel, and points are mapped to an image of a focal length of NOMINAL_FOCAL_PX."""
     K = torch.where(valid[:, None, None], K.to(torch.float64), torch.eye(3, dtype=torch.float64, device=K.device))
     K = K / K[:, 2:, 2:]
     fx, skew, cx, fy, cy = K[:, 0, 0], K[:, 0, 1], K[:, 0, 2], K[:, 1, 1], K[:, 1, 2]
@@ -169,13 +162,8 @@ def _image(K: Tensor, size: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
 def calibration_problems(
     K: Float[Tensor, "b 3 3"], size: Real[Tensor, "b 2"] | None, name: str = "K"
 ) -> tuple[str, ...]:
-    """Why each K (B, 3, 3) is no calibration matrix of an image of its size (B, 2); empty where it may be one.
-
-    Args:
-        K: calibration matrices.
-        size: (h, w) in the unit of K, None where unknown.
-        name: of the argument that K is, with which a reason begins.
-    """
+    """Why each K is no calibration matrix of an image of its size (h, w), in its unit; empty where it may be one.
+    name: of the argument that K is, with which a reason begins."""
     sizes = [None] * len(K) if size is None else size.detach().cpu().double().numpy()
     return tuple(_problem(k, s, name) for k, s in zip(K.detach().cpu().double().numpy(), sizes, strict=True))
 

@@ -94,9 +94,7 @@ def canonical(F: Matrices) -> Matrices:
 def _clean(x: Tensor, mask: Tensor | None, weight: Tensor | None) -> tuple[Tensor, Tensor]:
     """Points and weights with zeros in the masked slots."""
     w = torch.ones_like(x[..., 0]) if weight is None else weight
-    if mask is None:
-        return x, w
-    return torch.where(mask[..., None], x, 0.0), torch.where(mask, w, 0.0)
+    return (x, w) if mask is None else (torch.where(mask[..., None], x, 0.0), torch.where(mask, w, 0.0))
 
 
 def _mean(x: Tensor, w: Tensor) -> Tensor:
@@ -128,8 +126,7 @@ def _apply(centred: Tensor, mask: Tensor | None, scale: Tensor) -> Tensor:
 def _similarity(centroid: Tensor, scale: Tensor) -> Tensor:
     zero, ones = torch.zeros_like(scale), torch.ones_like(scale)
     tx, ty = (-scale[..., None] * centroid).unbind(-1)
-    rows = [scale, zero, tx, zero, scale, ty, zero, zero, ones]
-    return torch.stack(rows, -1).reshape(*scale.shape, 3, 3)
+    return torch.stack([scale, zero, tx, zero, scale, ty, zero, zero, ones], -1).reshape(*scale.shape, 3, 3)
 
 
 # The way into the solvers: leading shapes flattened, masked slots moved to the end, coordinates normalised

@@ -162,7 +162,7 @@ def _squared_distance(a: Array, b: Array) -> float:
 BLOCK = 128  # rows whose products with all columns exist at a time: 4 MB at 8,000 columns
 MAX_COMPUTED = 256  # exact distances a descriptor, beyond which rounding does not help: nearly equal ones
 MAX_LENGTH = 1 << 10  # of a descriptor: products stay below 2^24, exact in float32, and squared distances below FAR
-MAX_NORM = 2.0**25  # of a descriptor: differences fit 32 bits
+MAX_NORM = 2.0**25  # of a descriptor: differences fit 32 bits, and squared distances float64
 _RANGE = 255  # between the least and the largest 8-bit integer
 
 
@@ -221,10 +221,8 @@ def _rounded(values: Tensor, center: float, step: float, padded: int) -> tuple[T
     return rounded, Descriptors(exact, norms, error * (1 + 1e-9), float(step))
 
 
-_GROUP = 32  # columns whose minimum is taken together; a group is searched only where it can hold a neighbour
 _FLOAT32_NORM = 2.0**11  # integer vectors no longer than this have squared distances up to 2^24: exact in float32
 _ROUNDING = 1e-9  # relative, of a float64 norm; a generous bound
-_FLOAT64_NORM = 2.0**25  # likewise 2^52 in float64
 
 
 class Neighbors(NamedTuple):
@@ -269,17 +267,11 @@ def nearest_neighbors(
     never the result. Masked and non-finite descriptors neither have neighbours nor are any. Not differentiable."""
     if chunk < 1:
         raise ValueError(f"chunk is {chunk}; it must be at least 1")
-    with one_thread(descriptors0.device):
-        return _nearest_neighbors(descriptors0, descriptors1, mask0, mask1, chunk)
-
-
-def _nearest_neighbors(
-    descriptors0: Tensor, descriptors1: Tensor, mask0: Tensor | None, mask1: Tensor | None, chunk: int
-) -> Neighbors:
     batch, (n0, n1) = descriptors0.shape[:-2], (descriptors0.shape[-2], descriptors1.shape[-2])
     flat0, flat1 = (d.reshape(math.prod(batch), *d.shape[-2:]) for d in (descriptors0, descriptors1))
-    mask0, mask1 = _finite(flat0, mask0), _finite(flat1, mask1)
-    by_pair = [_match_one_pair(*pair, chunk) for pair in zip(flat0, flat1, mask0, mask1, strict=True)]
+    with one_thread(descriptors0.device):
+        masks = _finite(flat0, mask0), _finite(flat1, mask1)
+        by_pair = [_match_one_pair(*pair, chunk) for pair in zip(flat0, flat1, *masks, strict=True)]
     if not by_pair:
         return Neighbors(*(column.expand(*batch, -1) for column in _nothing(descriptors0, n0, n1)))
     columns = [torch.stack(column) for column in zip(*by_pair, strict=True)]
@@ -326,7 +318,7 @@ def _integers(d0: Tensor, d1: Tensor) -> tuple[Tensor, Tensor, float]:
     integral = bool((d0 == d0.round()).all() and (d1 == d1.round()).all())
     if integral and longest <= _FLOAT32_NORM:
         return d0.float(), d1.float(), 1.0
-    ratio = _FLOAT64_NORM / longest if longest > 0 else 1.0  # squares below 1e-323 are zero, and so is all that is left
+    ratio = MAX_NORM / longest if longest > 0 else 1.0  # squares below 1e-323 are zero, and so is all that is left
     exponent = math.frexp(ratio)[1] - 1  # a power of two, so that scaling is exact
     scale = 2.0 ** min(exponent, 1000)
     return (d0.double() * scale).round(), (d1.double() * scale).round(), 1.0 / scale
@@ -344,7 +336,7 @@ def _two_nearest(rows: Tensor, columns: Tensor, chunk: int) -> tuple[list[Tensor
     n1 = len(columns)
     norm0, norm1 = (d.square().sum(-1, keepdim=True) for d in (rows, columns))
     left = torch.cat([rows, norm0, torch.ones_like(norm0)], 1)
-    right = left.new_zeros(-(-n1 // _GROUP) * _GROUP, left.shape[1])
+    right = left.new_zeros(-(-n1 // GROUP) * GROUP, left.shape[1])
     right[:, -1] = math.inf
     right[:n1] = torch.cat([-2 * columns, torch.ones_like(norm1), norm1], 1)
     right = right.T.contiguous()
@@ -366,15 +358,15 @@ def _two_smallest(squared: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Of every row the first index of its smallest value, that value and the second smallest.
     The minima of groups of columns lead to the group with the smallest value; the second smallest is in the same
     group or is the minimum of another one."""
-    groups = squared.reshape(len(squared), -1, _GROUP)
+    groups = squared.reshape(len(squared), -1, GROUP)
     minima = groups.amin(-1)
     group = minima.argmin(1, keepdim=True)
-    members = groups.gather(1, group[..., None].expand(-1, -1, _GROUP))[:, 0]
+    members = groups.gather(1, group[..., None].expand(-1, -1, GROUP))[:, 0]
     member = members.argmin(1, keepdim=True)
     best = members.gather(1, member)
     rest = members.scatter(1, member, math.inf).amin(1, keepdim=True)
     second = minima.scatter(1, group, rest).amin(1)
-    return (group * _GROUP + member)[:, 0], best[:, 0], second
+    return (group * GROUP + member)[:, 0], best[:, 0], second
 
 
 @dataclasses.dataclass(frozen=True)

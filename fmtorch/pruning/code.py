@@ -125,9 +125,7 @@ def spread_centres(kernel: Float[Tensor, "n n"], count: int) -> Int[Tensor, " m"
 
 def evenly(index: Int[Tensor, " n"], count: int) -> Int[Tensor, " m"]:
     """At most `count` of the indices, evenly along their order."""
-    if len(index) <= count:
-        return index
-    return index[torch.arange(count, device=index.device) * len(index) // count]
+    return index if len(index) <= count else index[torch.arange(count, device=index.device) * len(index) // count]
 
 
 def huber_regression(

@@ -408,8 +408,7 @@ class RefineMatches:
         (xx, _, yy), affine = out.covariance[out.refined].T, out.affine[out.refined]
         area = np.abs(affine[:, 0, 0] * affine[:, 1, 1] - affine[:, 0, 1] * affine[:, 1, 0])
         variance = (xx + yy) / (1 + area)
-        noise: Array = np.sqrt(self.floor * self.floor + self.slope * self.slope * variance) / self.usual
-        return noise
+        return np.asarray(np.sqrt(self.floor * self.floor + self.slope * self.slope * variance) / self.usual)
 
     def _doubt(self, prior: Tensor | None, pair: int, index: Tensor) -> Any:
         """P^(-1/4) of these matches."""
@@ -431,8 +430,7 @@ def _frame_maps(lafs0: Array, lafs1: Array) -> tuple[Array, Array]:
 
 def _product(a: Array, b: Array) -> Array:
     """Matrix products (n, 2, 2), in one order of sums."""
-    product: Array = a[:, :, :1] * b[:, :1, :] + a[:, :, 1:] * b[:, 1:, :]
-    return product
+    return a[:, :, :1] * b[:, :1, :] + a[:, :, 1:] * b[:, 1:, :]  # type: ignore[no-any-return]
 
 
 def _array(tensor: Tensor) -> Array:
@@ -441,8 +439,7 @@ def _array(tensor: Tensor) -> Array:
 
 
 def _finite(*arrays: Array) -> Array:
-    finite: Array = np.all([np.isfinite(array).all(tuple(range(1, array.ndim))) for array in arrays], 0)
-    return finite
+    return np.asarray(np.all([np.isfinite(array).all(tuple(range(1, array.ndim))) for array in arrays], 0))
 
 
 def _like(array: Array, tensor: Tensor) -> Tensor:

@@ -92,8 +92,7 @@ def recorded_pairs() -> dict[str, dict[str, dict[str, Any]]]:
     """What the rule for pairs has decided: by digest and scene the number of photographs and the pairs.
     Drawn and judged once by ``scripts/record_rendered_pairs.py``; with other versions of the generator or of OpenCV,
     whose digests are not here, it is judged anew."""
-    record: dict[str, dict[str, dict[str, Any]]] = json.loads(RECORD.read_text(encoding="utf-8"))
-    return record
+    return json.loads(RECORD.read_text(encoding="utf-8"))  # type: ignore[no-any-return]
 
 
 def seeds(task: Task) -> np.random.SeedSequence:

@@ -257,10 +257,9 @@ def _surroundings(surfaces: Surfaces, rng: Rng, split: str, width: Real) -> None
     ground(surfaces, rng, split, 36)
     leaf, bark = buildings.foliage(surfaces, rng)
     for side in (-1, 1):
-        right = vec(1, 0, 0)
-        foot = vec(side * (width / 2 + 3) - (12 if side < 0 else 0), 4, 0)
-        size = (12, 8, rng.uniform(7, 11))
-        buildings.house(surfaces, rng, split, foot, right, size, Style(density=30, same_windows=0.8), sides="plain")
+        foot, size = vec(side * (width / 2 + 3) - (12 if side < 0 else 0), 4, 0), (12, 8, rng.uniform(7, 11))
+        style = Style(density=30, same_windows=0.8)
+        buildings.house(surfaces, rng, split, foot, vec(1, 0, 0), size, style, sides="plain")
         for _ in range(3):
             at = vec(side * rng.uniform(width / 2 - 3, width / 2 + 8), -rng.uniform(2, 10), 0)
             buildings.tree(surfaces, rng, at, rng.uniform(4, 7), leaf, bark)

@@ -60,9 +60,8 @@ def scaled_camera(
 ) -> tuple[Matrix, tuple[int, int]]:
     """K and the size (h, w) of an image of a camera, in pixels, that is scaled."""
     scaled = round(size[0] * scale), round(size[1] * scale)
-    return calibration(
-        focal * scale, scaled, None if centre is None else (centre[0] * scale, centre[1] * scale)
-    ), scaled
+    middle = None if centre is None else (centre[0] * scale, centre[1] * scale)
+    return calibration(focal * scale, scaled, middle), scaled
 
 
 def look_at(
