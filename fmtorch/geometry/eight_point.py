@@ -1,7 +1,5 @@
 """The normalised, weighted eight-point algorithm."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Normalisation of image points before linear estimation, and of fundamental matrices after it."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import NamedTuple
@@ -13,7 +11,7 @@ from torch import Tensor
 
 from fmtorch.geometry.arithmetic import as_components, as_matrices, component_sum, matmul3, sqrt, stable_sum, unit
 from fmtorch.geometry.cameras import PixelFrame
-from fmtorch.geometry.epipolar import unit_frobenius
+from fmtorch.geometry.epipolar import Matrix, unit_frobenius
 from fmtorch.geometry.levenberg_marquardt import Weighted
 from fmtorch.geometry.robust_losses import LOSSES, RobustLoss, named_loss
 from fmtorch.jit.kernel import Array
@@ -67,9 +65,7 @@ def normalize_pair(x0: Points, x1: Points, mask: Mask | None = None) -> tuple[Po
     return _apply(x0, mask, scale), _apply(x1, mask, scale), _similarity(c0, scale), _similarity(c1, scale)
 
 
-def denormalize_fundamental(
-    F: Float[Tensor, "*#batch 3 3"], T0: Float[Tensor, "*#batch 3 3"], T1: Float[Tensor, "*#batch 3 3"]
-) -> Float[Tensor, "*#batch 3 3"]:
+def denormalize_fundamental(F: Matrix, T0: Matrix, T1: Matrix) -> Matrix:
     """The fundamental matrix T1^T F T0 of points x, given F of the normalised points T x; leading shapes broadcast.
 
     Args:
@@ -147,7 +143,7 @@ class RobustSum(NamedTuple):
         """The loss with its derivatives."""
         return LOSSES[self.loss]
 
-    def detached(self) -> RobustSum:
+    def detached(self) -> "RobustSum":
         """The same on no graph."""
         return RobustSum(self.points.detach(), self.weight.detach(), self.loss, self.s2.detach())
 

@@ -3,8 +3,6 @@
 The domain is where a match is, where it goes and how its frame changes.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Mapping
@@ -33,11 +31,11 @@ class MatchDomain(NamedTuple):
     S: Float[Tensor, "n 2 2"]
     shape: Float[Tensor, "n 5"]
 
-    def take(self, index: Int[Tensor, " m"]) -> MatchDomain:
+    def take(self, index: Int[Tensor, " m"]) -> "MatchDomain":
         """The matches at `index`."""
         return MatchDomain(*(value[index] for value in self))
 
-    def blocks(self) -> list[MatchDomain]:
+    def blocks(self) -> "list[MatchDomain]":
         """The matches in their order, at most BLOCK at a time."""
         return [MatchDomain(*part) for part in zip(*(torch.split(value, BLOCK) for value in self), strict=True)]
 

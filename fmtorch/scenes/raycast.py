@@ -286,17 +286,6 @@ class Geometry:
         depth = np.append(camera.R[2], camera.t[2])
         return self.cast(shift @ camera.P, depth, camera.size, camera.centre)
 
-    def depth_map(self, camera: Camera) -> Matrix:
-        """Depth (h, w) along the camera's axis at the pixel centres, in float64, infinite where nothing is hit."""
-        hits = self.look(camera)
-        h, w = camera.size
-        y, x = np.mgrid[:h, :w].astype(np.float64)
-        row = hits.inverse[hits.piece, 2]
-        inverse_depth = np.where(hits.piece >= 0, row[..., 0] * x + row[..., 1] * y + row[..., 2], 0.0)
-        with np.errstate(divide="ignore"):
-            depth: Matrix = 1.0 / inverse_depth
-        return depth
-
     def detail(self, i: int, box: tuple[int, int]) -> float:
         """The pyramid level at which the opacity of a piece is looked up, whose bounding box has these sides."""
         texels = np.abs(self.uv[i, 1:]).max(0) * self.textures[self.texture[i]].size

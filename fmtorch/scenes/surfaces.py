@@ -229,10 +229,8 @@ class Surfaces:
         radius = np.repeat(steps[:, 1:2], sides + 1, axis=1)
         if bumps is not None:
             radius = radius * (1 + np.concatenate([bumps, bumps[:, :1]], axis=1))
-        points = np.zeros((len(steps), sides + 1, 3))
-        points[..., :2] = ring[None] * radius[..., None]
-        points[..., 2] = steps[:, :1]
-        self.grid(points + base, texture, repeat)
+        height = np.repeat(steps[:, :1], sides + 1, axis=1)
+        self.grid(np.dstack([ring[None] * radius[..., None], height]) + base, texture, repeat)
 
     def copy(self) -> "Surfaces":
         """A list of its own with the same pieces and textures, to which more can be added."""
