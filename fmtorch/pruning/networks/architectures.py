@@ -180,12 +180,12 @@ class PointCN(nn.Module):
     def __init__(self, inputs: int, channels: int, blocks: int) -> None:
         super().__init__()
         self.p_in = layers.Perceptron(inputs, channels)
-        self.blocks = layers.Blocks(layers.ResidualBlock(channels) for _ in range(blocks))
+        self.blocks = nn.ModuleList(layers.ResidualBlock(channels) for _ in range(blocks))
         self.p_out = layers.Perceptron(channels, 1)
 
     def forward(self, x: Float[Tensor, "b inputs n"], slots: layers.Slots) -> Float[Tensor, "b 1 n"]:
         """x has to be zero in masked slots, where the result means nothing."""
-        y = self.blocks(slots.clean(torch.relu(self.p_in(x.transpose(0, 1)))), slots)
+        y = layers.through(self.blocks, slots.clean(torch.relu(self.p_in(x.transpose(0, 1)))), slots)
         return self.p_out(y).transpose(0, 1)  # type: ignore[no-any-return]
 
 

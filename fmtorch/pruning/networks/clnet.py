@@ -78,14 +78,14 @@ class LocalEmbedding(nn.Module):
     def __init__(self, inputs: int, channels: int, neighbors: int) -> None:
         super().__init__()
         self.neighbors, self.first = neighbors, layers.NormedPerceptron(inputs, channels)
-        self.before = layers.Blocks(layers.RectifiedBlock(channels, channels) for _ in range(4))
+        self.before = nn.ModuleList(layers.RectifiedBlock(channels, channels) for _ in range(4))
         self.annular = layers.AnnularConvolution(channels, neighbors // 3)
-        self.after = layers.Blocks(layers.RectifiedBlock(channels, channels) for _ in range(4))
+        self.after = nn.ModuleList(layers.RectifiedBlock(channels, channels) for _ in range(4))
 
     def forward(self, x: Float[Tensor, "c b n"], slots: layers.Slots) -> Float[Tensor, "d b n"]:
-        y = self.before(self.first(x, slots), slots)
+        y = layers.through(self.before, self.first(x, slots), slots)
         y = self.annular(y, slots, layers.nearest(y, slots, self.neighbors))
-        return self.after(y, slots)  # type: ignore[no-any-return]
+        return layers.through(self.after, y, slots)
 
 
 class CLNet(Progressive):

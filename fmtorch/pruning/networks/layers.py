@@ -247,13 +247,11 @@ class RectifiedBlock(nn.Module):
         return torch.relu(y + slots.clean(self.shortcut(x)))
 
 
-class Blocks(nn.ModuleList):
-    """Blocks in sequence; their parameters have the names of a list's."""
-
-    def forward(self, x: Float[Tensor, "c b n"], slots: Slots) -> Float[Tensor, "d b n"]:
-        for block in self:
-            x = block(x, slots)
-        return x
+def through(blocks: nn.ModuleList, x: Float[Tensor, "c b n"], slots: Slots) -> Float[Tensor, "d b n"]:
+    """The blocks in sequence."""
+    for block in blocks:
+        x = block(x, slots)
+    return x
 
 
 def attention(

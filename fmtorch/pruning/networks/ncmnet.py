@@ -43,7 +43,7 @@ class NeighborConsistency(nn.Module):
         self.annular = nn.ModuleList(layers.AnnularConvolution(channels, neighbors // 3) for _ in range(3))
         self.interaction = nn.ModuleList(CrossInteraction(channels) for _ in range(3))
         self.context = OrderAwareContext(channels, clusters, 2)
-        self.blocks = layers.Blocks(layers.RectifiedBlock(channels * (4 if i == 0 else 1), channels) for i in range(3))
+        self.blocks = nn.ModuleList(layers.RectifiedBlock(channels * (4 if i == 0 else 1), channels) for i in range(3))
 
     def forward(self, x: Float[Tensor, "c b n"], slots: layers.Slots, spatial: Tensor) -> Float[Tensor, "c b n"]:
         """spatial: neighbours by coordinates."""
@@ -54,7 +54,7 @@ class NeighborConsistency(nn.Module):
         mixed = [
             each(*abc, slots) for each, abc in zip(self.interaction, ((f, g, s), (g, s, f), (s, f, g)), strict=True)
         ]
-        return self.blocks(torch.cat([*mixed, self.context(x, slots)]), slots)  # type: ignore[no-any-return]
+        return layers.through(self.blocks, torch.cat([*mixed, self.context(x, slots)]), slots)
 
 
 class Embedding(nn.Module):
@@ -63,11 +63,11 @@ class Embedding(nn.Module):
     def __init__(self, inputs: int, channels: int, neighbors: int, clusters: int) -> None:
         super().__init__()
         self.neighbors, self.first = neighbors, layers.NormedPerceptron(inputs, channels)
-        self.blocks = layers.Blocks(layers.RectifiedBlock(channels, channels) for _ in range(3))
+        self.blocks = nn.ModuleList(layers.RectifiedBlock(channels, channels) for _ in range(3))
         self.rounds = nn.ModuleList(NeighborConsistency(channels, neighbors, clusters) for _ in range(2))
 
     def forward(self, x: Float[Tensor, "c b n"], slots: layers.Slots) -> Float[Tensor, "d b n"]:
-        spatial, y = layers.nearest(x, slots, self.neighbors), self.blocks(self.first(x, slots), slots)
+        spatial, y = layers.nearest(x, slots, self.neighbors), layers.through(self.blocks, self.first(x, slots), slots)
         for each in self.rounds:
             y = each(y, slots, spatial)
         return y  # type: ignore[no-any-return]

@@ -55,7 +55,7 @@ class OrderAwareContext(nn.Module):
         super().__init__()
         self.norm0 = layers.ContextBatchNormReLU(channels, CONTEXT_EPS)
         self.linear0 = layers.Perceptron(channels, clusters)
-        self.filters = layers.Blocks(OrderAwareFilter(channels, clusters) for _ in range(filters))
+        self.filters = nn.ModuleList(OrderAwareFilter(channels, clusters) for _ in range(filters))
         self.norm1 = layers.ContextBatchNormReLU(channels, CONTEXT_EPS)
         self.linear1 = layers.Perceptron(channels, clusters)
 
@@ -64,7 +64,7 @@ class OrderAwareContext(nn.Module):
         both S from x."""
         share = slots.softmax(self.linear0(self.norm0(x, slots)))
         y, nodes = torch.einsum("cbn,kbn->cbk", x, share), slots.columns(len(share))
-        y = self.filters(y, nodes)
+        y = layers.through(self.filters, y, nodes)
         share = torch.softmax(self.linear1(self.norm1(x, slots)), 0)
         return slots.clean(torch.einsum("cbk,kbn->cbn", y, share))
 
@@ -75,14 +75,14 @@ class Stage(nn.Module):
     def __init__(self, inputs: int, channels: int, blocks: int, clusters: int) -> None:
         super().__init__()
         self.first = layers.Perceptron(inputs, channels)
-        self.before = layers.Blocks(PreNormBlock(channels, channels) for _ in range(blocks))
+        self.before = nn.ModuleList(PreNormBlock(channels, channels) for _ in range(blocks))
         self.context = OrderAwareContext(channels, clusters, blocks)
-        self.after = layers.Blocks(PreNormBlock(channels * (1 + (i == 0)), channels) for i in range(blocks))
+        self.after = nn.ModuleList(PreNormBlock(channels * (1 + (i == 0)), channels) for i in range(blocks))
         self.last = layers.Perceptron(channels, 1)
 
     def forward(self, x: Float[Tensor, "c b n"], slots: layers.Slots) -> Float[Tensor, "b n"]:
-        y = self.before(slots.clean(self.first(x)), slots)
-        return self.last(self.after(torch.cat([y, self.context(y, slots)]), slots))[0]  # type: ignore[no-any-return]
+        y = layers.through(self.before, slots.clean(self.first(x)), slots)
+        return self.last(layers.through(self.after, torch.cat([y, self.context(y, slots)]), slots))[0]  # type: ignore[no-any-return]
 
 
 class OANet(WithOptions):
