@@ -411,4 +411,4 @@ def _agreement(rows: Float[Tensor, "10 b n"], orders: Int[Tensor, "c b n"]) -> F
     votes = component_sum(torch.cat([votes[..., :WINDOW, :], votes[..., WINDOW + 1 :, :]], -2), -2)  # others' alone
     in_slots = torch.zeros_like(votes).scatter(3, orders.expand(2, -1, -1, -1), votes)
     agreement, total = component_sum(in_slots, 1)
-    return agreement / total.clamp_min(torch.finfo(total.dtype).tiny)
+    return agreement / total.clamp_min(torch.finfo(total.dtype).tiny)  # type: ignore[no-any-return]

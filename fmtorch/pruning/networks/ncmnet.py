@@ -70,7 +70,7 @@ class Embedding(nn.Module):
         spatial, y = layers.nearest(x, slots, self.neighbors), layers.through(self.blocks, self.first(x, slots), slots)
         for each in self.rounds:
             y = each(y, slots, spatial)
-        return y  # type: ignore[no-any-return]
+        return y
 
 
 class NCMNet(Progressive):
