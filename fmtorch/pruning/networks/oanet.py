@@ -82,7 +82,8 @@ class Stage(nn.Module):
 
     def forward(self, x: Float[Tensor, "c b n"], slots: layers.Slots) -> Float[Tensor, "b n"]:
         y = layers.through(self.before, slots.clean(self.first(x)), slots)
-        return self.last(layers.through(self.after, torch.cat([y, self.context(y, slots)]), slots))[0]  # type: ignore[no-any-return]
+        y = layers.through(self.after, torch.cat([y, self.context(y, slots)]), slots)
+        return self.last(y)[0]  # type: ignore[no-any-return]
 
 
 class OANet(WithOptions):
