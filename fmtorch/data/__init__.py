@@ -56,9 +56,7 @@ def load(
 
 def build(config: Mapping[str, Any], progress: Progress | None = None) -> PairDataset:
     """The data set of a config with a `_target_`; `progress`: called while it draws its images, if it does.
-
-    Raises ValueError, naming the option, where the config does not fit its target, and what this raises itself.
-    """
+    Raises ValueError, naming the option, where the config does not fit its target, and what this raises itself."""
     reports = "progress" in inspect.signature(presets.target_of(config, "dataset")).parameters
     dataset: PairDataset = presets.instantiate(config, "dataset", **({"progress": progress} if reports else {}))
     return dataset

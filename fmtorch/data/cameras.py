@@ -45,9 +45,7 @@ def relative_pose(camera0: Pinhole, camera1: Pinhole) -> tuple[Matrix, Matrix]:
 
 def fundamental(camera0: Pinhole, camera1: Pinhole) -> Matrix:
     """F with ``x1^T F x0 = 0`` and unit Frobenius norm: ``K1^-T [t]x R K0^-1`` (Hartley and Zisserman, eq. 9.12).
-
-    Equal, up to scale, to ``[P1 C0]x P1 P0^+`` of the projection matrices. NaN where the baseline is exactly zero.
-    """
+    Equal, up to scale, to ``[P1 C0]x P1 P0^+`` of the projection matrices. NaN where the baseline is exactly zero."""
     R, t = relative_pose(camera0, camera1)
     cross = np.array([[0.0, -t[2], t[1]], [t[2], 0.0, -t[0]], [-t[1], t[0], 0.0]])
     F: Matrix = np.linalg.inv(camera1.K).T @ cross @ R @ np.linalg.inv(camera0.K)
@@ -76,9 +74,7 @@ def from_projection(P: Matrix, R: Matrix, t: Matrix) -> Camera:
 
 def nearest_rotation(matrix: Matrix, place: str) -> Matrix:
     """The rotation nearest to a matrix (3, 3) that was one before it was rounded to a text file.
-
-    Raises DataError, which begins with `place`, for a matrix that is no rotation.
-    """
+    Raises DataError, which begins with `place`, for a matrix that is no rotation."""
     u, _, v = np.linalg.svd(matrix)
     rotation: Matrix = u @ v
     if np.linalg.det(rotation) < 0 or np.abs(rotation - matrix).max() > NEARLY_ROTATION:
@@ -109,9 +105,7 @@ _TINY = 1e-12  # squared radius or parameter below which a quotient is replaced 
 @dataclasses.dataclass(frozen=True)
 class Lens:
     """A lens: focal lengths and principal point in pixels, with (0, 0) at the centre of the first pixel, and a model.
-
-    coefficients: of the model, as `MODELS` names them, without focal lengths and principal point.
-    """
+    coefficients: of the model, as `MODELS` names them, without focal lengths and principal point."""
 
     fx: float
     fy: float
@@ -140,10 +134,8 @@ class Lens:
 @dataclasses.dataclass(frozen=True)
 class Model:
     """A lens model.
-
     focals: whether it has one focal length or two. coefficients: names of its parameters after the principal point.
-    fisheye: whether it bends even where all of them are zero.
-    """
+    fisheye: whether it bends even where all of them are zero."""
 
     focals: int
     coefficients: str
@@ -162,13 +154,8 @@ class Model:
         return Lens(float(fx), float(fy), float(cx), float(cy), name, tuple(map(float, values[self.focals + 2 :])))
 
 
-def pinhole(u: Matrix, v: Matrix) -> tuple[Matrix, Matrix]:
-    """No distortion."""
-    return u, v
-
-
 def radial(u: Matrix, v: Matrix, k1: float = 0.0, k2: float = 0.0) -> tuple[Matrix, Matrix]:
-    """A polynomial in the squared radius."""
+    """A polynomial in the squared radius; without coefficients, a pinhole."""
     r2 = u * u + v * v
     factor = 1 + r2 * (k1 + r2 * k2)
     return u * factor, v * factor
@@ -248,7 +235,7 @@ def _polynomial(x: Matrix, k: tuple[float, ...]) -> Matrix:
 
 
 MODELS = {
-    "SIMPLE_PINHOLE": Model(1, "", pinhole), "PINHOLE": Model(2, "", pinhole),
+    "SIMPLE_PINHOLE": Model(1, "", radial), "PINHOLE": Model(2, "", radial),
     "SIMPLE_RADIAL": Model(1, "k", radial), "RADIAL": Model(1, "k1 k2", radial),
     "OPENCV": Model(2, "k1 k2 p1 p2", rational), "OPENCV_FISHEYE": Model(2, "k1 k2 k3 k4", equidistant, fisheye=True),
     "FULL_OPENCV": Model(2, "k1 k2 p1 p2 k3 k4 k5 k6", rational), "FOV": Model(2, "omega", field_of_view),
@@ -274,10 +261,8 @@ FRAME_STEP = 0.5  # px: a frame's columns are moved by the lens as short steps o
 
 def undistorted_points(lens: Lens, photographed: Array) -> Matrix:
     """Pixels (..., 2) of a pinhole of calibration `lens.K` for those of the photograph; NaN where it sees nothing.
-
     The inverse of `Lens.distort` by Newton's method. NaN too where the model folds back between centre and point: there
-    a polynomial has left the range to which it was fitted, as `undistorted` leaves such pixels black.
-    """
+    a polynomial has left the range to which it was fitted, as `undistorted` leaves such pixels black."""
     points: Matrix = np.array(photographed, np.float64)
     if not lens.bends:
         return points
@@ -332,9 +317,7 @@ _KEPT = 2  # maps of which lenses are remembered: frames of one video follow one
 
 def undistorted(image: Pixels, lens: Lens) -> Pixels:
     """The image (H, W) or (H, W, 3) without the distortion of its lens: same size, and `lens.K` is its calibration.
-
-    Interpolated bilinearly. Black where the photograph shows nothing, and where a polynomial model folds back.
-    """
+    Interpolated bilinearly. Black where the photograph shows nothing, and where a polynomial model folds back."""
     if not lens.bends:
         return image
     x, y = _maps(lens, *image.shape[:2])
@@ -344,10 +327,8 @@ def undistorted(image: Pixels, lens: Lens) -> Pixels:
 @functools.lru_cache(maxsize=_KEPT)
 def _maps(lens: Lens, h: int, w: int) -> tuple[Singles, Singles]:
     """For every pixel (h, w) of the undistorted image where in the photograph it is; -2, which is outside, if nowhere.
-
     Where a step outwards no longer leads outwards, a polynomial has left the range to which it was fitted: nothing is
-    taken from there on.
-    """
+    taken from there on."""
     grid = np.stack(np.meshgrid(np.arange(w, dtype=np.float64), np.arange(h, dtype=np.float64)), -1)
     there = lens.distort(grid)
     dx, dy = grid[..., 0] - lens.cx, grid[..., 1] - lens.cy

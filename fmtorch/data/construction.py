@@ -59,14 +59,11 @@ class PointOverlap:
 
 def shared_points(sees: Any, pairs: Indices) -> Matrix:
     """Overlaps (n,) of pairs (n, 2) of images: points that both see, over those of the image that sees more of them.
-
-    sees: which image sees which point, as `incidence` gives it. Zero where an image sees none.
-    """
+    sees: which image sees which point, as `incidence` gives it. Zero where an image sees none."""
     counts = np.diff(sees.indptr)[pairs]
     shared = sees[pairs[:, 0]].multiply(sees[pairs[:, 1]]).sum(1)
     larger = counts.max(1, initial=0)
-    overlaps: Matrix = np.divide(shared, larger, out=np.zeros(len(pairs)), where=larger > 0)
-    return overlaps
+    return np.asarray(np.divide(shared, larger, out=np.zeros(len(pairs)), where=larger > 0))
 
 
 class Seen(NamedTuple):
@@ -106,22 +103,13 @@ class DepthOverlap:
         return Seen(view.K, size, functools.partial(self._depth, view.image))
 
 
-def seen_share(image: Seen, other: Seen, R: Matrix, t: Matrix, step: int = STEP) -> float:
-    """The share of an image's pixels with depth that another image sees.
-
+def seen_share(image: Seen, other: Seen, R: Matrix, t: Matrix) -> float:
+    """The share of an image's pixels with depth that another image sees; 0 where no pixel counts.
     A pixel is seen where its point X, which is ``R X + t`` to the other camera, lies within the other image and has the
-    depth that is known there, to `TOLERANCE`. Pixels for which no depth is known there are left out.
-
-    Args:
-        image, other: calibration, size and depth; both depths in the unit of t.
-        R, t: (3, 3) and (3,), from the camera of the image to the other's.
-        step: px between the pixels that are looked at.
-
-    Returns:
-        The share, 0 where no pixel counts.
-    """
+    depth that is known there, to `TOLERANCE`. Pixels for which no depth is known there are left out. Both depths are in
+    the unit of t (3,); one pixel in `STEP` is looked at, along rows and columns."""
     h, w = image.size
-    rows, columns = np.mgrid[step // 2 : h : step, step // 2 : w : step].reshape(2, -1).astype(np.float64)
+    rows, columns = np.mgrid[STEP // 2 : h : STEP, STEP // 2 : w : STEP].reshape(2, -1).astype(np.float64)
     depth = image.depth(np.stack([columns, rows], 1))
     has = np.isfinite(depth)
     rays = np.stack([columns, rows, np.ones_like(rows)], 1)[has] @ np.linalg.inv(image.K).T
@@ -166,9 +154,7 @@ def ratio_matches(a: Keypoints, b: Keypoints) -> tuple[Matrix, Matrix]:
 
 def matchable(a: Keypoints, b: Keypoints, F: Matrix) -> bool:
     """Whether more than `ENOUGH` ratio matches lie within `NEAR_LINE` pixels of the true lines in both images.
-
-    Looks at some of the first image's keypoints at a time, until there are enough.
-    """
+    Looks at some of the first image's keypoints at a time, until there are enough."""
     near = 0
     for begin in range(0, len(a[0]), _AT_ONCE):
         block = a[0][begin : begin + _AT_ONCE], a[1][begin : begin + _AT_ONCE]
@@ -197,13 +183,11 @@ class Verdicts:
 @dataclasses.dataclass(frozen=True, eq=False)
 class Construction:
     """The construction of pairs in a folder.
-
     dataset: with the candidates. folder: of the set that is made; its name is the set's. count: how many pairs, drawn
     at random by `seed`; None: all. quality: of JPEG images that are written because they were undistorted.
     overlap: the least and the greatest overlap of pairs (`fmtorch.data.construction`); None: the paper's rule.
     matches: what the matches are computed by that take the place of images; None: images. Raises ValueError, when its
-    `rule` is first asked for, where the data set's overlaps are not known.
-    """
+    `rule` is first asked for, where the data set's overlaps are not known."""
 
     dataset: ScenePairs
     folder: Path

@@ -49,9 +49,7 @@ def numbered_again(identity: str, seen: Counter[str]) -> str:
 
 def read_lines(path: Path, hint: str = "") -> list[str]:
     """The lines of a text file without the empty ones at its end.
-
-    hint: what is added where there is no such file. Raises DataError for a file that is missing or no text.
-    """
+    hint: what is added where there is no such file. Raises DataError for a file that is missing or no text."""
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError as error:
@@ -109,10 +107,8 @@ _CONVERT = "load it with allow_pickle=True where you trust it, and write a text 
 
 class NpzArrays:
     """The arrays of one ``.npz`` file by their names, read when asked for.
-
     Raises DataError, naming file and array, for what is no such file, an array that is missing or damaged, and one
-    whose pickle holds anything but arrays, numbers, texts, lists, tuples and None.
-    """
+    whose pickle holds anything but arrays, numbers, texts, lists, tuples and None."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -230,6 +226,4 @@ def _plain(value: Any) -> Any:
     """A value with arrays in place of their descriptions, at any depth."""
     if isinstance(value, _Array):
         return value.value()
-    if isinstance(value, list | tuple):
-        return type(value)(_plain(element) for element in value)
-    return value
+    return type(value)(_plain(element) for element in value) if isinstance(value, list | tuple) else value

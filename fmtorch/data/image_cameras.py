@@ -36,9 +36,7 @@ class ModelCamera:
 @dataclasses.dataclass(frozen=True, eq=False)
 class ModelImage:
     """An image: R, t map the world to the camera; points are the numbers of the 3-D points that it sees.
-
-    place: file and line, or record, with which messages begin.
-    """
+    place: file and line, or record, with which messages begin."""
 
     name: str
     camera: int
@@ -59,9 +57,7 @@ class Model:
 
 def read_model(folder: Path, points: bool = True) -> Model:
     """The model in a folder, of binary files where these are there, else of text files.
-
-    points: read which points each image sees. Raises DataError, naming file and line or record, for damaged files.
-    """
+    points: read which points each image sees. Raises DataError, naming file and line or record, for damaged files."""
     suffix = next((suffix for suffix in (".bin", ".txt") if (folder / f"cameras{suffix}").is_file()), None)
     if suffix is None:
         raise DataError(f"{folder}: neither cameras.bin nor cameras.txt; it must hold a COLMAP model")
@@ -244,10 +240,8 @@ Tag = ExifTags.Base
 
 class ExifFocal(NamedTuple):
     """The focal length of a photograph.
-
     focal: px, NaN where it is not known. deviation: its relative standard deviation, infinite where it is not known.
-    source: the tags that it is from, or why it is not known.
-    """
+    source: the tags that it is from, or why it is not known."""
 
     focal: float
     deviation: float

@@ -208,10 +208,8 @@ def _jpeg_segments(data: bytes) -> Iterator[tuple[int, int]]:
 
 def _jpeg_decodes(data: bytes) -> bool:
     """Whether a JPEG decodes without a warning of libjpeg, which TurboJPEG takes for an error.
-
     True where nobody tells: for frames that it does not convert to RGB, which are neither grey nor of three components,
-    of more than 8 bits, or coded in a rare way.
-    """
+    of more than 8 bits, or coded in a rare way."""
     frame = next((data[at : at + 8] for marker, at in _jpeg_segments(data) if marker in _HUFFMAN_FRAMES), b"")
     if len(frame) < 8 or frame[2] != 8 or frame[7] not in (1, 3):
         return True

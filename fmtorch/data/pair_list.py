@@ -35,12 +35,10 @@ _QUARTERS = 4  # of a full turn
 @dataclasses.dataclass(frozen=True, eq=False)
 class ListedPair:
     """One pair of a list.
-
     place: file and line, or record, with which messages begin. names: of the images, relative to their folder.
     K0, K1: (3, 3), for images of `size` (h, w), None: of the files' own sizes. R, t: ``X1 = R X0 + t``.
     quarter_turns: of both images, counterclockwise; K, R and t are those before the turn.
-    origin: coordinates of the first pixel's centre in the convention of K.
-    """
+    origin: coordinates of the first pixel's centre in the convention of K."""
 
     place: str
     names: tuple[str, str]
@@ -55,10 +53,8 @@ class ListedPair:
 
 def text_pairs(path: Path) -> Iterator[ListedPair]:
     """The pairs of a text file, a line each; empty lines and comments (``#``) are left out.
-
     Raises DataError, naming the line, for a number of columns that is not one of `LAYOUTS`, and for an entry that is no
-    number. Numbers that are not finite pass: they are one pair's fault.
-    """
+    number. Numbers that are not finite pass: they are one pair's fault."""
     for number, line in numbered(path):
         words = line.split()
         if len(words) not in LAYOUTS:
@@ -97,9 +93,7 @@ _COLOUR = "intrinsic/intrinsic_color.txt"  # of a scene's folder: a matrix (4, 4
 
 def npz_pairs(path: Path, root: Path) -> Iterator[ListedPair]:
     """The pairs of one file. root: the folder of the images, in which ScanNet's cameras may lie too.
-
-    Raises DataError for a file of another kind, and for arrays that do not fit.
-    """
+    Raises DataError for a file of another kind, and for arrays that do not fit."""
     arrays = NpzArrays(path)
     if "pair_infos" in arrays:
         yield from _megadepth(arrays)

@@ -19,10 +19,8 @@ Size = tuple[int, int]  # (h, w), px
 @dataclasses.dataclass(frozen=True)
 class Resampling:
     """What happens to an image of a file after it is decoded: first it is resized, then turned.
-
     size: (h, w) to which it is resized, by areas where both sides shrink, bilinearly otherwise; None: its own.
-    quarter_turns: by which it is turned counterclockwise, 0 to 3, as `np.rot90` does and SuperGlue's lists count.
-    """
+    quarter_turns: by which it is turned counterclockwise, 0 to 3, as `np.rot90` does and SuperGlue's lists count."""
 
     size: Size | None = None
     quarter_turns: int = 0
@@ -36,9 +34,7 @@ class Resampling:
 
     def matrix(self, size: Size) -> Matrix:
         """The affine map (3, 3) from pixels of an image of `size` (h, w) to pixels of what is read.
-
-        (0, 0) is the centre of the first pixel of either: resizing by s moves x to ``(x + 0.5) s - 0.5``.
-        """
+        (0, 0) is the centre of the first pixel of either: resizing by s moves x to ``(x + 0.5) s - 0.5``."""
         h, w = self.size or size
         sy, sx = h / size[0], w / size[1]
         resized = np.array([[sx, 0, (sx - 1) / 2], [0, sy, (sy - 1) / 2], [0, 0, 1.0]])
@@ -66,13 +62,11 @@ def scaled_size(size: Size, scale: float) -> Size:
 @dataclasses.dataclass(frozen=True)
 class ImageSource:
     """One image on disk.
-
     identity: names it within its data set.
     size: (h, w) that the file must have, where the data set says so: cameras hold for one size alone.
     lens: whose distortion `read_image` takes out; None for an image without.
     resampling: how `read_image` then resizes and turns it; None: not at all.
-    data: the bytes of the file, for a worker that does not see it; None: they are read from `path`.
-    """
+    data: the bytes of the file, for a worker that does not see it; None: they are read from `path`."""
 
     identity: str
     path: Path
@@ -97,7 +91,6 @@ class GivenMatches(NamedTuple):
 @dataclasses.dataclass(frozen=True, eq=False)
 class ImagePair:
     """Two images of one scene and how they are related.
-
     identity: unique within the data set, e.g. ``Strecha/fountain-P11/3-7``.
     family: what results are grouped by (a data set, or a family of rendered scenes).
     scene: the cluster for the bootstrap, e.g. ``fountain-P11``.
@@ -130,11 +123,9 @@ class ImagePair:
 @runtime_checkable
 class PairDataset(Protocol):
     """A sequence of image pairs.
-
     name: e.g. ``fmbench``. digest: hex digest of what defines the pairs (contents of pairs files, or the generator's
     version and parameters; never an absolute path), part of a run's identity. One whose pairs have homographies in
-    place of F says so by an attribute `model`, "homography".
-    """
+    place of F says so by an attribute `model`, "homography"."""
 
     name: str
     digest: str

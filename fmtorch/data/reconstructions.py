@@ -124,7 +124,6 @@ _LIST = "list.txt"
 _HEADER = "# Bundle file v0.3"
 _FLIP = np.diag([1.0, -1.0, -1.0])  # Bundler's y points up and its camera looks along -z
 _LINES = 5  # a camera: f k1 k2, R in three lines, t
-_COUNTED = ("cameras", "points")
 _COLUMNS = ("f k1 k2", "the first row of R", "the second row of R", "the third row of R", "t")
 
 
@@ -135,8 +134,7 @@ class BundlerPairs(ScenePairs):
     ``bundle/bundle.out``. split, sequences, candidates, shared, pairs, seed, family: as in `colmap_pairs`.
 
     Cameras without a focal length, which Bundler did not register, are left out. Radial distortion is taken out when an
-    image is read. The principal point is the middle of each image, whose size is read from its file.
-    """
+    image is read. The principal point is the middle of each image, whose size is read from its file."""
 
     def __init__(
         self, root: str | Path | None = None, split: str = "test", sequences: Sequence[str] | None = None,
@@ -200,9 +198,8 @@ def _counts(file: Path, lines: list[str]) -> tuple[int, int]:
     words = lines[1].split() if len(lines) > 1 else []
     if len(words) != 2:
         raise DataError(f"{file}, line 2: {len(words)} columns; it must hold the numbers of cameras and of points")
-    return files.to_whole(file, 2, words[0], "the number of cameras"), files.to_whole(
-        file, 2, words[1], "the number of points"
-    )
+    count = functools.partial(files.to_whole, file, 2)
+    return count(words[0], "the number of cameras"), count(words[1], "the number of points")
 
 
 def _view(file: Path, lines: list[str], i: int, source: ImageSource) -> View | None:

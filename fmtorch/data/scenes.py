@@ -70,10 +70,8 @@ def following(times: Sequence[float] | Matrix, window: int | float = WINDOW) -> 
 
 def sharing_points(points: Sequence[Indices], minimum: int = MIN_SHARED) -> ListedPairs:
     """The pairs of images that both see at least `minimum` points; points: of each image the numbers it sees.
-
     Memory is that of the pairs found; a reconstruction of n images with a mean track of m images has, in all, about
-    m / 2 such pairs for each point, most of them the same ones over and over.
-    """
+    m / 2 such pairs for each point, most of them the same ones over and over."""
     sees = incidence(points)
     blocks = []
     for begin in range(0, len(points), _AT_ONCE):
@@ -124,10 +122,8 @@ SPLITS: dict[str, dict[str, tuple[str, ...]]] = {
 
 def chosen(name: str, split: str, sequences: Sequence[str] | None, there: Sequence[str]) -> list[str]:
     """The sequences to read: those asked for, or those of the split.
-
     there: the names of those on disk, among which a split of "all others" chooses. Raises DataError for an unknown
-    split, and where no sequence is left.
-    """
+    split, and where no sequence is left."""
     if split not in ("test", "train"):
         raise DataError(f"split {split!r}; there are test and train")
     if sequences is not None:
@@ -151,11 +147,9 @@ _COLMAP_HEADER = re.compile(rb"(\d{1,6})&(\d{1,6})&1&")
 
 class DepthImages:
     """Depth images by the identity of the photographs, pixel by pixel on the photographs as they were taken.
-
     paths: of the depth images, scene by scene. scale: their values per unit of length; 0 and less is no measurement.
     read: the values (h, w) of a file. reduced: whether they may be smaller than their photographs, of the same
-    proportions.
-    """
+    proportions."""
 
     def __init__(
         self, paths: Iterable[Mapping[str, Path]], scale: float, read: Callable[[Path], Array], reduced: bool = False
@@ -165,10 +159,8 @@ class DepthImages:
 
     def at(self, image: ImageSource, points: Matrix) -> Matrix:
         """Depth (n,) along the optical axis at points (n, 2) of the undistorted image: that of the nearest pixel.
-
         NaN outside, where nothing was measured, and everywhere in a photograph without a depth image. Raises ImageError
-        for a file that cannot be read or does not have the photograph's size.
-        """
+        for a file that cannot be read or does not have the photograph's size."""
         if image.identity not in self.paths:
             return np.full(len(points), np.nan)
         path = self.paths[image.identity]
@@ -200,9 +192,7 @@ def read_grey(path: Path) -> Array:
 @functools.lru_cache(maxsize=_KEPT)
 def read_colmap(path: Path) -> Singles:
     """A depth map of COLMAP's dense reconstruction (h, w): ``width&height&1&``, then float32, row by row.
-
-    Raises ImageError for anything else.
-    """
+    Raises ImageError for anything else."""
     _expect_file(path)
     content = path.read_bytes()
     header = _COLMAP_HEADER.match(content)
@@ -223,9 +213,7 @@ def _expect_file(path: Path) -> None:
 @dataclasses.dataclass(frozen=True, eq=False)
 class View:
     """One image with its camera: K (3, 3), R (3, 3) and t (3,) map the world to pixels of the undistorted image.
-
-    place: the file and line, or the record, that names the image; messages begin with it.
-    """
+    place: the file and line, or the record, that names the image; messages begin with it."""
 
     image: ImageSource
     K: Matrix
@@ -260,8 +248,7 @@ class ScenePairs(PairDataset):
     None where there is no reconstruction.
 
     A pair whose image is missing, or whose two cameras are at one place, has a `problem`. Which pairs can be matched
-    at all is not asked here (`fmtorch pairs`).
-    """
+    at all is not asked here (`fmtorch pairs`)."""
 
     points: Sequence[Callable[[], Sequence[Indices]]] | None = None
 

@@ -26,8 +26,7 @@ class KittiPairs(ScenePairs):
     pairs, seed: as in `ScenePairs`.
 
     The images are rectified: nothing is undistorted. Cameras are ``P_N [R | t]^-1``. Raises DataError, naming file and
-    line, for files that are missing, truncated or contradict one another.
-    """
+    line, for files that are missing, truncated or contradict one another."""
 
     def __init__(
         self, root: str | Path | None = None, split: str = "test", sequences: Sequence[str] | None = None,

@@ -23,8 +23,7 @@ def upright_frames(xy: Float[Tensor, "*n 2"], sigma: Float[Tensor, "*n"]) -> Flo
     """Square frames along the image's axes, of half side `FRAME_SIGMAS` sigma."""
     half_side = FRAME_SIGMAS * sigma
     zero = torch.zeros_like(half_side)
-    columns = (torch.stack([half_side, zero], -1), torch.stack([zero, half_side], -1), xy)
-    return torch.stack(columns, -1)
+    return torch.stack([torch.stack([half_side, zero], -1), torch.stack([zero, half_side], -1), xy], -1)
 
 
 def frame_scale(lafs: Float[Tensor, "*n 2 3"]) -> Float[Tensor, "*n"]:
@@ -42,9 +41,7 @@ def rotate_frames(lafs: Float[Tensor, "*n 2 3"], angle: Float[Tensor, "*n"]) -> 
 
 def make_upright(lafs: Float[Tensor, "*n 2 3"]) -> Float[Tensor, "*n 2 3"]:
     """The frame of the same region and area whose second axis points along the image's y axis.
-
-    ``A = U R`` with U lower triangular (Perdoch et al., CVPR 2009: the gravity vector stays vertical).
-    """
+    ``A = U R`` with U lower triangular (Perdoch et al., CVPR 2009: the gravity vector stays vertical)."""
     (a, b), (c, d) = (row.unbind(-1) for row in lafs[..., :2].unbind(-2))
     width = (a * a + b * b).sqrt()
     shear = (a * c + b * d) / width
@@ -65,9 +62,7 @@ SMOOTHING = 1.6  # bins, sigma of the histogram's blur; kornia's
 @dataclasses.dataclass(frozen=True)
 class DominantGradient:
     """Turns the first axis to the highest peak of the histogram of gradient directions (Lowe, IJCV 2004, section 5).
-
-    One orientation a frame, as kornia's PatchDominantGradientOrientation.
-    """
+    One orientation a frame, as kornia's PatchDominantGradientOrientation."""
 
     def __call__(self, pyramid: ImagePyramid, lafs: Float[Tensor, "n 2 3"]) -> Float[Tensor, "n 2 3"]:
         """The turned frames."""
@@ -77,9 +72,7 @@ class DominantGradient:
 @dataclasses.dataclass(frozen=True)
 class NetworkOrientation:
     """Turns the first axis to the direction that OriNet sees (Mishkin et al., ECCV 2018).
-
-    network: patches (N, 1, 32, 32) -> (N, 2), a vector (y, x).
-    """
+    network: patches (N, 1, 32, 32) -> (N, 2), a vector (y, x)."""
 
     network: PatchFunction
 
@@ -93,10 +86,8 @@ class NetworkOrientation:
 
 def dominant_gradient(patches: Float[Tensor, "n 1 p p"]) -> Float[Tensor, " n"]:
     """The direction of the dominant gradient, towards bright, in radians counter-clockwise on the screen.
-
     Sobel gradients, weighted by a Gaussian window, vote for the two nearest of `BINS` directions; the smoothed
-    histogram's highest peak is refined by a parabola. A patch without gradient gives pi.
-    """
+    histogram's highest peak is refined by a parabola. A patch without gradient gives pi."""
     parts = [_histogram(part) for part in torch.split(patches, CHUNK)]
     histogram = torch.cat(parts) if parts else patches.new_zeros(0, BINS)
     taps = [math.exp(-0.5 * (step / SMOOTHING) ** 2) for step in range(-2, 3)]
@@ -151,17 +142,13 @@ LONGEST = 6.0  # largest ratio of a region's axes; Perdoch et al., CVPR 2009, gi
 @dataclasses.dataclass(frozen=True)
 class NetworkShape:
     """Gives frames the affine shape that a network sees in their upright patches.
-
-    network: patches (N, 1, 32, 32) -> (N, 3), the shape [[1 + x0, 0], [x1, 1 + x2]] in the patch's coordinates.
-    """
+    network: patches (N, 1, 32, 32) -> (N, 3), the shape [[1 + x0, 0], [x1, 1 + x2]] in the patch's coordinates."""
 
     network: PatchFunction
 
     def __call__(self, pyramid: ImagePyramid, lafs: Float[Tensor, "n 2 3"]) -> Float[Tensor, "n 2 3"]:
         """Upright frames of the same centres and areas with the new shape.
-
-        A frame keeps its shape where the new one is singular, not finite, or longer than `LONGEST`.
-        """
+        A frame keeps its shape where the new one is singular, not finite, or longer than `LONGEST`."""
         upright = make_upright(lafs)
         if len(lafs) == 0:
             return upright

@@ -35,12 +35,10 @@ class Peaks(NamedTuple):
 
 def refined_maxima(volume: Float[Tensor, "s h w"], seeds: Int[Tensor, "m 3"], threshold: float) -> Peaks:
     """The maxima among `seeds`, samples (level, y, x), refined to sub-sample positions and values.
-
     A seed is a maximum where it exceeds the neighbours before it in memory and no neighbour after it exceeds it, so
     that of equal neighbours one remains. A maximum moves to the sample nearest to the quadratic's; it is dropped where
     it leaves the volume, does not settle, the quadratic has no maximum, or its value is at most `threshold`. Of those
-    that end at one sample one remains.
-    """
+    that end at one sample one remains."""
     chunks = [_refine(volume, part) for part in torch.split(seeds, CHUNK)] or [_refine(volume, seeds)]
     at, offset, value = (torch.cat(parts) for parts in zip(*chunks, strict=True))
     kept = value > threshold
@@ -94,9 +92,7 @@ def _is_maximum(v: Float[Tensor, "27 m"]) -> Tensor:
 
 def _quadratic(v: Float[Tensor, "27 m"]) -> tuple[Tensor, Tensor, Tensor]:
     """Of the quadratic with the central differences of 27 samples: the maximum (M, 3), its value, whether there is one.
-
-    Cramer's rule on the negative Hessian, which is positive definite at a maximum.
-    """
+    Cramer's rule on the negative Hessian, which is positive definite at a maximum."""
     cube = v.double().reshape(3, 3, 3, -1)
     c = cube[1, 1, 1]
     sides = [cube[::2, 1, 1], cube[1, ::2, 1], cube[1, 1, ::2]]  # before and after the centre along each axis
@@ -175,8 +171,7 @@ class HessianDetector:
 
     max_features: the strongest that are kept, over the whole image and all scales. threshold: least response.
     levels: scales per octave. sigma: blur of the first level of an octave, in its pixels; the smallest keypoint has
-    ``sigma 2^(1 / (2 levels))``. border: a keypoint closer to the image's border than `border` sigma is dropped.
-    """
+    ``sigma 2^(1 / (2 levels))``. border: a keypoint closer to the image's border than `border` sigma is dropped."""
 
     max_features: Annotated[int, Within(1)] = 2048
     threshold: float = 1e-4
@@ -186,10 +181,8 @@ class HessianDetector:
 
     def detect(self, image: Image) -> tuple[Float[Tensor, "n 2 3"], Float[Tensor, " n"]]:
         """Upright frames of half side `FRAME_SIGMAS` sigma and responses, strongest first.
-
         image: grey (H, W) or RGB (H, W, 3) uint8. N = 0 where nothing is found. Memory: about 32 bytes a pixel.
-        Raises ValueError for another type, shape or an empty image.
-        """
+        Raises ValueError for another type, shape or an empty image."""
         grey = torch.from_numpy(as_grey(image))
         height, width = grey.shape
         by_octave = [Peaks(torch.zeros(0, 3).double(), torch.zeros(0))]

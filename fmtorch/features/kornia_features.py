@@ -19,9 +19,7 @@ SMALLEST = 32  # px, the shorter side: the networks reduce the image 16 and 32 t
 
 class _NetworkFeatures:
     """What the two have in common: pixels in, unit-length descriptors out, no frames but positions.
-
-    identity: what defines the results, for caches. For any number of threads.
-    """
+    identity: what defines the results, for caches. For any number of threads."""
 
     def __init__(self, network: nn.Module, device: str, **options: int | float) -> None:
         automatic = "cuda" if torch.cuda.is_available() else "cpu"
@@ -31,11 +29,9 @@ class _NetworkFeatures:
 
     def __call__(self, image: Image) -> Features:
         """The features of a grey (H, W) or RGB (H, W, 3) uint8 image; none, with N = 0, where nothing is found.
-
         lafs: circles of one pixel, which say nothing of scale or orientation: give them to no pruner. scores: the
         network's. descriptors: (N, 128) of unit length. Raises ValueError for an image of another type or shape or
-        with a side below `SMALLEST`.
-        """
+        with a side below `SMALLEST`."""
         keypoints, scores, descriptors = self._run(self._tensor(image))
         lafs = torch.cat([torch.eye(2).to(keypoints).expand(len(keypoints), 2, 2), keypoints[..., None]], -1)
         size = torch.tensor(image.shape[:2], dtype=torch.int64, device=self.device)
@@ -57,11 +53,9 @@ class _NetworkFeatures:
 
 class DISK(_NetworkFeatures):
     """DISK (Tyszkiewicz, Fua, Trulls, NeurIPS 2020): whole-pixel keypoints, descriptors of 128 numbers.
-
     weights: `depth` or `epipolar`, the released models. max_features: the strongest kept. window: side in pixels of the
     non-maximum suppression. score_threshold: least score, a logit. device: auto, cpu, cuda. network: in place of the
-    released one. Raises ConnectionError where the weights cannot be fetched.
-    """
+    released one. Raises ConnectionError where the weights cannot be fetched."""
 
     def __init__(
         self,
@@ -90,12 +84,10 @@ class DISK(_NetworkFeatures):
 
 class ALIKED(_NetworkFeatures):
     """ALIKED (Zhao et al., TIM 2023): sub-pixel keypoints, descriptors of 128 numbers.
-
     weights: `aliked-n16`, `aliked-n16rot`, `aliked-n32` or `aliked-t16` (whose descriptors have 64 numbers).
     max_features: the strongest kept. score_threshold: least score, in (0, 1). radius: of the non-maximum suppression,
     in pixels. device: auto, cpu, cuda. network: in place of the released one. Raises ConnectionError where the weights
-    cannot be fetched.
-    """
+    cannot be fetched."""
 
     def __init__(
         self,

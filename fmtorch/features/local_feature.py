@@ -34,26 +34,20 @@ Descriptor = Callable[[ImagePyramid, Tensor], Tensor]
 @dataclasses.dataclass(frozen=True)
 class NetworkDescriptor:
     """Descriptors of 32 x 32 patches by a network, such as HardNet or L2-Net.
-
-    network: patches (N, 1, 32, 32) -> (N, D). dimensions: D, for images without keypoints.
-    """
+    network: patches (N, 1, 32, 32) -> (N, D). dimensions: D, for images without keypoints."""
 
     network: PatchFunction
     dimensions: int = 128
 
     def __call__(self, pyramid: ImagePyramid, lafs: Float[Tensor, "n 2 3"]) -> Float[Tensor, "n d"]:
         """Descriptors of the frames."""
-        if len(lafs) == 0:
-            return lafs.new_zeros(0, self.dimensions)
-        return self.network(pyramid.extract(lafs)).to(lafs)
+        return self.network(pyramid.extract(lafs)).to(lafs) if len(lafs) else lafs.new_zeros(0, self.dimensions)
 
 
 @dataclasses.dataclass(frozen=True)
 class LocalFeature:
     """Detects frames, gives them shape and orientation, describes them; an instance may be used by several threads.
-
-    shape, orientation: None keeps the detector's. Of two instances with equal `detection` the frames are equal.
-    """
+    shape, orientation: None keeps the detector's. Of two instances with equal `detection` the frames are equal."""
 
     detector: Detector
     descriptor: Descriptor
@@ -62,9 +56,7 @@ class LocalFeature:
 
     def __call__(self, image: Image) -> Features:
         """The features of a grey (H, W) or RGB (H, W, 3) uint8 image; none, with N = 0, where nothing is found.
-
-        Raises ValueError for another type, shape or an empty image, and what a network says of its file.
-        """
+        Raises ValueError for another type, shape or an empty image, and what a network says of its file."""
         lafs, scores = self.detect(image)
         size = torch.tensor(image.shape[:2], dtype=torch.int64)
         return Features(lafs=lafs, scores=scores, descriptors=self.describe(image, lafs), image_size=size)
@@ -105,14 +97,12 @@ def local_feature(
     threads: int = 1,
 ) -> LocalFeature:
     """A `LocalFeature` of named parts.
-
     detector: `dog` (options of `SIFT`) or `hessian` (options of `HessianDetector`), at most `max_features` of them.
     shape: None, `affnet` or `affnet_fast`. orientation: None for the detector's, `dominant_gradient` or `orinet`.
     descriptor: `sift`, `rootsift`, `dspsift` (options of `PatchSIFT`), `rootsiftpca` (of `RootSIFTPCA`), `l2net`,
     `geodesc`, `hardnet` or `hardnet_fast`. A part that is a network takes the option `network`, the path of another
     ONNX file than the shipped one. precision: of the networks, fp32 or int8. threads: of each network. Raises
-    ValueError for an unknown name or option, naming those there are. Networks are read when first used.
-    """
+    ValueError for an unknown name or option, naming those there are. Networks are read when first used."""
     if precision not in ("fp32", "int8"):
         raise ValueError(f"precision={precision}: it must be fp32 or int8")
 

@@ -19,18 +19,14 @@ Layout = Sequence[tuple[int, int]]
 
 def l2net_layout(width: int) -> Layout:
     """L2-Net's six 3 x 3 convolutions (Tian, Fan, Wu, CVPR 2017, fig. 2).
-
     width: channels of the first pair of convolutions; the second has twice, the third four times as many, and each of
-    these two begins with stride 2.
-    """
+    these two begins with stride 2."""
     return (width, 1), (width, 1), (2 * width, 2), (2 * width, 1), (4 * width, 2), (4 * width, 1)
 
 
 def standardize(patches: Float[Tensor, "n 1 h w"], eps: float) -> Float[Tensor, "n 1 h w"]:
     """Each patch with zero mean and unit (sample) standard deviation; a constant patch becomes zero.
-
-    The statistics are constants for the gradient, as in the authors' code: gradients through them are noise.
-    """
+    The statistics are constants for the gradient, as in the authors' code: gradients through them are noise."""
     mean = patches.mean(dim=(1, 2, 3), keepdim=True).detach()
     centred = patches - mean
     count = patches.shape[-1] * patches.shape[-2]
@@ -40,9 +36,7 @@ def standardize(patches: Float[Tensor, "n 1 h w"], eps: float) -> Float[Tensor, 
 
 def trunk(layout: Layout, dropout: float, outputs: int, *, bias: bool = False) -> list[nn.Module]:
     """Convolutions of 3 x 3 with batch norm and ReLU, then one over the whole of what is left.
-
-    Batch norms have no learned scale or shift. bias: of the last convolution.
-    """
+    Batch norms have no learned scale or shift. bias: of the last convolution."""
     layers: list[nn.Module] = []
     channels = 1
     for out, stride in layout:
@@ -75,9 +69,7 @@ def as_float32(features: nn.Module, x: Tensor) -> Tensor:
 
 class HardNet(nn.Module):
     """HardNet (Mishchuk, Mishkin, Radenovic, Matas, NIPS 2017): L2-Net's layout, hardest-in-batch triplets.
-
-    The state_dict is that of the authors' release and of kornia.feature.HardNet. Each patch is standardised inside.
-    """
+    The state_dict is that of the authors' release and of kornia.feature.HardNet. Each patch is standardised inside."""
 
     outputs = 128
     layout: Layout = l2net_layout(32)
@@ -96,16 +88,13 @@ class HardNet(nn.Module):
 
 class HardNetFast(HardNet):
     """HardNet with less than a quarter of its multiplications.
-
-    The first convolution has stride 2 already, the widest has 64 channels.
-    """
+    The first convolution has stride 2 already, the widest has 64 channels."""
 
     layout: Layout = ((32, 2), (32, 1), (64, 2), (64, 1), (64, 1))
 
 
 class L2Net(HardNet):
     """L2-Net (Tian, Fan, Wu, CVPR 2017).
-
     Unlike HardNet's, its input loses the mean patch of the training set (`pixel_mean`) before each patch is
     standardised, and its output passes local response normalisation over all channels, that is division by the length.
     """
@@ -124,10 +113,8 @@ class L2Net(HardNet):
 
 class GeoDesc(HardNet):
     """GeoDesc (Luo et al., ECCV 2018): L2-Net's layout without a batch norm after the last convolution.
-
     Each patch is standardised by itself, as in the authors' training code (lzx551402/tfmatch, cnn_wrapper/descnet.py);
-    there is no dropout.
-    """
+    there is no dropout."""
 
     def __init__(self) -> None:
         super().__init__(dropout=0.0)
@@ -136,7 +123,6 @@ class GeoDesc(HardNet):
 
 class AffNet(nn.Module):
     """AffNet (Mishkin, Radenovic, Matas, ECCV 2018): three numbers of an affine shape, each in (-1, 1).
-
     With x the output, the shape is the lower-triangular [[1 + x0, 0], [x1, 1 + x2]] in the patch's own coordinates, up
     to scale; x = 0 is a circle. The state_dict is that of the authors' release and of kornia's LAFAffNetShapeEstimator.
     """
@@ -161,18 +147,14 @@ class AffNet(nn.Module):
 
 class AffNetFast(AffNet):
     """AffNet with less than a quarter of its multiplications.
-
-    The first convolution has stride 2 already, the widest has 32 channels.
-    """
+    The first convolution has stride 2 already, the widest has 32 channels."""
 
     layout: Layout = ((16, 2), (16, 1), (32, 2), (32, 1), (32, 1))
 
 
 class OriNet(nn.Module):
     """OriNet (Mishkin, Radenovic, Matas, ECCV 2018): a vector (y, x) in (-1, 1)^2 whose atan2 is the orientation.
-
-    The state_dict is that of the authors' release and of kornia.feature.OriNet.
-    """
+    The state_dict is that of the authors' release and of kornia.feature.OriNet."""
 
     outputs = 2
 
@@ -207,10 +189,8 @@ def build(architecture: str, **options: Any) -> nn.Module:
 
 def read_checkpoint(path: Path | str) -> dict[str, Any]:
     """A checkpoint as a dictionary with a ``state_dict``; nothing in the file is executed.
-
     A bare state_dict, TorchScript and {"state_dict": ...} with whatever stands beside it are read.
-    Raises FileNotFoundError, or ValueError naming the file where it is none of these.
-    """
+    Raises FileNotFoundError, or ValueError naming the file where it is none of these."""
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path} does not exist")
@@ -248,10 +228,8 @@ def _script_state(path: Path) -> dict[str, Tensor]:
 
 def load_weights(network: nn.Module, path: Path | str) -> dict[str, Any]:
     """Load a file into a network, strictly; returns what the file says beside the weights.
-
     Convolutions with a bias and batch norms with scale and shift, as ports of L2-Net have them, are folded into batch
-    norms without. Raises ValueError with the keys that do not fit.
-    """
+    norms without. Raises ValueError with the keys that do not fit."""
     content = read_checkpoint(path)
     state = _folded({str(k).removeprefix("module."): v for k, v in content.pop("state_dict").items()}, network)
     try:
@@ -263,10 +241,8 @@ def load_weights(network: nn.Module, path: Path | str) -> dict[str, Any]:
 
 def _folded(state: dict[str, Tensor], network: nn.Module) -> dict[str, Tensor]:
     """The same function in the keys of `network`: b, gamma and beta of a layer move into the running statistics.
-
     gamma (x + b - m) / sqrt(v + e) + beta = (x - m') / sqrt(v' + e') with v' + e' = (v + e) / gamma^2 and
-    m' = m - b - beta sqrt(v + e) / gamma.
-    """
+    m' = m - b - beta sqrt(v + e) / gamma."""
     expected = network.state_dict()
     state = {k: v for k, v in _with_dropout(state).items() if k in expected or not k.endswith("num_batches_tracked")}
     for name, module in network.named_modules():

@@ -21,7 +21,6 @@ HINT_INT8 = (
 
 def network_file(name: str, precision: str = "fp32") -> Path:
     """Where the ONNX file of a network is among the shipped models: name.onnx, or name.int8.onnx.
-
     A name that ends in .onnx is a path of the user's own and stays as it is. Raises ValueError for another precision.
     """
     if precision not in PRECISIONS:
@@ -42,8 +41,7 @@ class PatchNetwork:
     at the first call and is not pickled. batch: patches are processed in portions of exactly this many, the last one
     filled up with zeros, so that a patch's result does not depend on how many or which patches came with it.
 
-    Patches on a GPU are brought to the CPU and the result back; there is no other path.
-    """
+    Patches on a GPU are brought to the CPU and the result back; there is no other path."""
 
     def __init__(self, path: Path | str, *, threads: int = 1, batch: int = 256) -> None:
         if threads < 1 or batch < 1:
@@ -55,10 +53,8 @@ class PatchNetwork:
 
     def __call__(self, patches: Float[torch.Tensor, "n 1 32 32"]) -> Float[torch.Tensor, "n d"]:
         """The network's output for each patch, float32, on the patches' device.
-
         Raises NetworkFileError for a file that is absent, corrupt or takes another shape, ValueError for patches of
-        another shape.
-        """
+        another shape."""
         if patches.ndim != 4 or tuple(patches.shape[1:]) != PATCH_SHAPE:
             raise ValueError(f"patches are {tuple(patches.shape)}; a patch network takes (N, 1, 32, 32)")
         session, name, outputs = _session(self.path, self.threads)

@@ -23,9 +23,7 @@ MAX_SAMPLES = 8  # along an axis for one pixel of a patch
 
 class ImagePyramid:
     """Images in [0, 1] of a grey image (H, W), each half the size of the one before.
-
-    Pixel x of a level is pixel 2x of the finer one.
-    """
+    Pixel x of a level is pixel 2x of the finer one."""
 
     def __init__(self, grey: Image) -> None:
         self.levels = [torch.from_numpy(np.multiply(grey, 1 / 255, dtype=np.float32))]
@@ -35,12 +33,10 @@ class ImagePyramid:
 
     def extract(self, lafs: Float[Tensor, "n 2 3"], size: int = PATCH) -> Float[Tensor, "n 1 size size"]:
         """Patches in [0, 1] whose pixels tile the frames' squares; the image's border is continued outside.
-
         Pixel (i, j) shows ``c + A (u_j, u_i)`` with ``u_k = (2 k + 1) / size - 1``: kornia's convention. Its value is
         interpolated in the level in which pixels along the patch's denser axis are at most `LARGEST_STEP` apart, and
         averaged over as many samples along the other axis as keep them so close. A frame that is not finite gives
-        zeros.
-        """
+        zeros."""
         plan, images = _plan(lafs, len(self.levels), size), [level.numpy() for level in self.levels]
         out = np.zeros((len(lafs), size, size), np.float32)
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
@@ -85,5 +81,4 @@ def _by_place(lafs: Float[Tensor, "n 2 3"], plan: _Plan) -> Int[Tensor, " m"]:
     finite = torch.nonzero(plan.level >= 0)[:, 0]
     x, y = lafs[finite, 0, 2], lafs[finite, 1, 2]
     by_column = x.argsort()
-    by_band = (y[by_column] / BAND).floor().argsort(stable=True)
-    return finite[by_column[by_band]]
+    return finite[by_column[(y[by_column] / BAND).floor().argsort(stable=True)]]

@@ -27,14 +27,12 @@ from fmtorch.features.patches import PATCH, Image, ImagePyramid
 @dataclasses.dataclass(frozen=True)
 class SIFT:
     """Detects DoG keypoints and describes them by SIFT (Lowe, IJCV 2004); an instance may be used by several threads.
-
     max_features: the strongest that are kept; a location with several orientations counts once for each.
     contrast_threshold, edge_threshold, sigma: as OpenCV's, see ``conf/features/sift.yaml``.
     precise_upscale: double the image so that pixel x lands on 2x, without the quarter-pixel shift of plain resizing.
     max_pixels: a larger image is reduced to so many pixels first, which bounds memory: OpenCV needs about 240 bytes a
     pixel of the image that it sees.
-    root: RootSIFT, the square root of the L1-normalised descriptor (Arandjelovic and Zisserman, CVPR 2012).
-    """
+    root: RootSIFT, the square root of the L1-normalised descriptor (Arandjelovic and Zisserman, CVPR 2012)."""
 
     max_features: Annotated[int, Within(1)] = 8000
     contrast_threshold: float = 0.04
@@ -46,7 +44,6 @@ class SIFT:
 
     def __call__(self, image: Image) -> Features:
         """The features of a grey (H, W) or RGB (H, W, 3) uint8 image; none, with N = 0, where nothing is found.
-
         lafs: half side `FRAME_SIGMAS` sigma, kornia's angle (minus OpenCV's). scores: contrast. descriptors: (N, 128)
         float32, whole numbers from 0 to 255 unless `root`. Raises ValueError for another type, shape or an empty image.
         """
@@ -93,9 +90,7 @@ class SIFT:
 
 def keypoints_to_lafs(keypoints: Sequence[cv2.KeyPoint]) -> Float[Tensor, "n 2 3"]:
     """OpenCV's keypoints as local affine frames.
-
-    The half side is `FRAME_SIGMAS` times half of `size`, which is a diameter; kornia's angle is minus OpenCV's.
-    """
+    The half side is `FRAME_SIGMAS` times half of `size`, which is a diameter; kornia's angle is minus OpenCV's."""
     table = np.array([(*k.pt, k.size, k.angle) for k in keypoints], np.float32).reshape(-1, 4)
     xy, size, angle = torch.tensor_split(torch.from_numpy(table), (2, 3), dim=1)
     if len(table) == 0:
@@ -137,8 +132,7 @@ class VLFeatSIFT:
 
     max_features: the keypoints of the largest scales that are kept. first_octave: -1 doubles the image first.
     peak_threshold: least contrast |DoG|, for intensities in [0, 1]; 0 takes every extremum. edge_threshold: largest
-    ratio of principal curvatures. root: RootSIFT instead.
-    """
+    ratio of principal curvatures. root: RootSIFT instead."""
 
     max_features: Annotated[int, Within(1)] = 20000
     first_octave: int = 0
@@ -151,11 +145,9 @@ class VLFeatSIFT:
 
     def __call__(self, image: Image) -> Features:
         """The features of a grey (H, W) or RGB (H, W, 3) uint8 image; none, with N = 0, where nothing is found.
-
         lafs: half side `FRAME_SIGMAS` sigma. scores: sigma in pixels, as VLFeat tells no contrast. descriptors:
         (N, 128) float32, whole numbers from 0 to 255 unless `root`. Raises ValueError for another type, shape or an
-        empty image.
-        """
+        empty image."""
         grey = as_grey(image)
         size = torch.tensor(grey.shape, dtype=torch.int64)
         if min(grey.shape) < SMALLEST:
@@ -207,19 +199,16 @@ class ASIFT(SIFT):
     latitude arccos(1 / t). The tilts are ``t = sqrt(2)^k``, k = 0 ... tilts - 1, at the angles 0, 72 / t, ... below
     180 degrees: 43 views for the paper's six tilts, about 14 times the area of the image. No tilt is plain SIFT.
 
-    max_features: the strongest kept over all views. The other options are those of `SIFT` in each view.
-    """
+    max_features: the strongest kept over all views. The other options are those of `SIFT` in each view."""
 
     max_features: Annotated[int, Within(1)] = 30000
     tilts: int = 6
 
     def __call__(self, image: Image) -> Features:
         """The features of a grey (H, W) or RGB (H, W, 3) uint8 image; none, with N = 0, where nothing is found.
-
         lafs: the frames of the views in the image, full affine. scores, descriptors: as found in the views. Frames that
         leave the image are dropped, except in the view that is the image. Raises ValueError for another type, shape or
-        an empty image.
-        """
+        an empty image."""
         grey = as_grey(image)
         parts = [super().__call__(grey)]
         for tilt, angle in simulated_views(self.tilts)[1:]:
@@ -244,9 +233,7 @@ def simulated_views(tilts: int) -> list[tuple[float, float]]:
 
 def simulate_view(grey: Image, tilt: float, angle: float) -> tuple[Image, np.ndarray]:
     """The view of a grey image rotated by `angle` degrees and reduced `tilt` times along x, and the map to it (2, 3).
-
-    The border of the image is continued where the view shows more. Blurred before it is reduced.
-    """
+    The border of the image is continued where the view shows more. Blurred before it is reduced."""
     h, w = grey.shape
     cosine, sine = math.cos(math.radians(angle)), math.sin(math.radians(angle))
     rotation = np.array([[cosine, -sine], [sine, cosine]])
@@ -292,10 +279,8 @@ CHUNK = 64  # patches worked on together: their histograms fit a core's cache
 @dataclasses.dataclass(frozen=True)
 class PatchSIFT:
     """SIFT descriptors of frames; with several `sizes` the mean over them, DSP-SIFT (Dong and Soatto, CVPR 2015).
-
     root: RootSIFT (Arandjelovic and Zisserman, CVPR 2012) of each. smallest, largest: the range of domain sizes, in
-    units of the frame. sizes: how many are sampled in it, evenly, both ends included.
-    """
+    units of the frame. sizes: how many are sampled in it, evenly, both ends included."""
 
     root: bool = False
     smallest: float = 1.0
@@ -314,7 +299,6 @@ class PatchSIFT:
 
 def sift_of_patches(patches: Float[Tensor, "n 1 32 32"]) -> Float[Tensor, "n 128"]:
     """SIFT of patches that cover `EXTENT` frames: gradients of the blurred patch vote, weighted by a Gaussian window.
-
     Each gradient votes for the two nearest directions and the four nearest cells; the histogram is normalised, clipped
     and normalised again. Entry (4 y + x) 8 + d is cell (x, y), direction 45 d degrees counter-clockwise on the screen.
     """
@@ -370,10 +354,8 @@ DIMENSIONS = 80  # of the paper's RootSIFT-PCA
 @dataclasses.dataclass(frozen=True)
 class RootSIFTPCA:
     """RootSIFT of frames, centred, projected to 80 dimensions, raised to a power, and normalised.
-
     model: the learned file with `mean` (128,) and `basis` (128, 80); None: the one that comes with the package.
-    power: exponent of the entries' absolute values, which keep their signs; the authors' released code has 0.5.
-    """
+    power: exponent of the entries' absolute values, which keep their signs; the authors' released code has 0.5."""
 
     model: Path | str | None = None
     power: float = 0.5
@@ -383,9 +365,7 @@ class RootSIFTPCA:
 
     def __call__(self, pyramid: ImagePyramid, lafs: Float[Tensor, "n 2 3"]) -> Float[Tensor, "n d"]:
         """Descriptors (N, 80) of unit length.
-
-        Raises FileNotFoundError where the learned file is absent, ValueError where it is not what it should be.
-        """
+        Raises FileNotFoundError where the learned file is absent, ValueError where it is not what it should be."""
         mean, basis = load_projection(Path(str(self.model)))
         return project(PatchSIFT(root=True)(pyramid, lafs), mean.to(lafs.device), basis.to(lafs.device), self.power)
 

@@ -73,10 +73,8 @@ def local_descriptors(descriptors: Float[Tensor, "n D"], kind: Kind) -> Float[Te
 
 def vlad(descriptors: Float[Tensor, "n D"], book: Codebook) -> Float[Tensor, " kd"]:
     """The vector of an image, of unit length: sums of residuals from the nearest centres; zeros without descriptors.
-
     Each centre's sum is normalised (Arandjelović and Zisserman, CVPR 2013, section 4), then entries are replaced by
-    their signed square roots. The inner product of two vectors says how similar their images are.
-    """
+    their signed square roots. The inner product of two vectors says how similar their images are."""
     x = (descriptors - book.mean) @ book.basis
     nearest = torch.cdist(x, book.centers).argmin(-1)
     sums = torch.zeros_like(book.centers).index_add_(0, nearest, x)

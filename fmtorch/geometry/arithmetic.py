@@ -125,21 +125,19 @@ def as_components(F: Float[Tensor, "p k 3 3"]) -> Float[Tensor, "9 p k"]:
     return F.flatten(2).permute(2, 0, 1).contiguous()
 
 
-def product(A: Float[Tensor, " 3 3 *s"], B: Float[Tensor, " 3 3 *s"]) -> Float[Tensor, " 3 3 *s"]:
-    """``A B`` of component-first matrices."""
+def product(A: Float[Tensor, " a b *#s"], B: Float[Tensor, " b c *#s"]) -> Float[Tensor, " a c *#s"]:
+    """``A B`` of component-first matrices of any size."""
     return component_sum(A[:, :, None] * B[None], 1)
 
 
 def cross(a: Float[Tensor, " 3 *s"], b: Float[Tensor, " 3 *s"]) -> Float[Tensor, " 3 *s"]:
     """The cross product of component-first vectors."""
-    crossed: Tensor = torch.linalg.cross(a, b, dim=0)
-    return crossed
+    return torch.linalg.cross(a, b, dim=0)  # type: ignore[no-any-return]
 
 
 def cofactors(A: Float[Tensor, " 3 3 *s"]) -> Float[Tensor, " 3 3 *s"]:
     """The matrix of cofactors, ``det(A) A^-T`` where A is regular: row i is the cross product of the other two."""
-    crossed: Tensor = torch.linalg.cross(A.roll(-1, 0), A.roll(-2, 0), dim=1)
-    return crossed
+    return torch.linalg.cross(A.roll(-1, 0), A.roll(-2, 0), dim=1)  # type: ignore[no-any-return]
 
 
 def determinant(A: Float[Tensor, " 3 3 *s"]) -> Float[Tensor, "*s"]:
@@ -149,8 +147,7 @@ def determinant(A: Float[Tensor, " 3 3 *s"]) -> Float[Tensor, "*s"]:
 
 def unit(x: Float[Tensor, " c *s"]) -> Float[Tensor, " c *s"]:
     """Scaled to unit norm over the components; NaN where that is not possible."""
-    norm = sqrt(component_sum(x * x))
-    return x / norm
+    return x / sqrt(component_sum(x * x))
 
 
 def sqrt(x: Tensor) -> Tensor:
@@ -158,9 +155,8 @@ def sqrt(x: Tensor) -> Tensor:
     On a CPU by NumPy, which takes the processor's instruction, as kernels do: `torch.sqrt` asks a vector library, which
     on an AMD EPYC is an ulp off for every fifth float32 and every seventieth float64 number.
     The gradient is that of the root, and 0 instead of infinite where the root is 0."""
-    if torch.is_grad_enabled() and x.requires_grad:
-        return cast(Tensor, _Sqrt.apply(x))  # type: ignore[no-untyped-call]
-    return _sqrt(x)
+    wanted = torch.is_grad_enabled() and x.requires_grad
+    return cast(Tensor, _Sqrt.apply(x)) if wanted else _sqrt(x)  # type: ignore[no-untyped-call]
 
 
 class _Sqrt(torch.autograd.Function):
@@ -190,9 +186,7 @@ def logarithm(x: Tensor) -> Tensor:
     """ln(x) of positive numbers, to rounding, by arithmetic alone: the series of atanh at the mantissa."""
     mantissa, exponent = torch.frexp(x)
     m = mantissa * ROOT2
-    series = twice_atanh((m - 1) / (m + 1))
-    value: Tensor = series + (exponent.to(x.dtype) - 0.5) * LOG2
-    return value
+    return twice_atanh((m - 1) / (m + 1)) + (exponent.to(x.dtype) - 0.5) * LOG2  # type: ignore[no-any-return]
 
 
 def logarithm_1p(x: Tensor) -> Tensor:

@@ -4,8 +4,6 @@ Matrices are of any scale and sign, leading dimensions broadcast, and a result i
 the batch, as in `epipolar`.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from fmtorch.geometry.arithmetic import matmul3, sqrt
-from fmtorch.geometry.epipolar import unit_frobenius, unit_largest
+from fmtorch.geometry.epipolar import Matrix, unit_frobenius, unit_largest
 
 
 def cross_matrix(t: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
@@ -46,12 +44,7 @@ def fundamental_from_projections(
     return unit_frobenius(_matrix([-_determinant(lines0[i], lines1[j]) for j in range(3) for i in range(3)]))
 
 
-def fundamental_from_calibration(
-    K0: Float[Tensor, "*#batch 3 3"],
-    K1: Float[Tensor, "*#batch 3 3"],
-    R: Float[Tensor, "*#batch 3 3"],
-    t: Float[Tensor, "*#batch 3"],
-) -> Float[Tensor, "*#batch 3 3"]:
+def fundamental_from_calibration(K0: Matrix, K1: Matrix, R: Matrix, t: Float[Tensor, "*#batch 3"]) -> Matrix:
     """F = K1^-T [t]_x R K0^-1 of unit Frobenius norm, for ``X1 = R X0 + t`` (Hartley & Zisserman, eq. 9.12).
 
     Args:
@@ -219,7 +212,7 @@ class PixelFrame(NamedTuple):
     pixels_per_unit: Float[Tensor, " p"]
 
     @classmethod
-    def around(cls, pixels: Float[Tensor, "p n 4"], mask: Bool[Tensor, "p n"]) -> PixelFrame:
+    def around(cls, pixels: Float[Tensor, "p n 4"], mask: Bool[Tensor, "p n"]) -> "PixelFrame":
         """The frame of the points in the mask, float64."""
         x, inside = pixels.detach(), mask[..., None]
         if x.shape[1]:

@@ -27,7 +27,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from fmtorch.geometry.arithmetic import cofactors, component_sum, determinant, sqrt, stable_sum
+from fmtorch.geometry.arithmetic import cofactors, component_sum, cross, determinant, product, sqrt, stable_sum
 from fmtorch.geometry.epipolar import inverse_root
 from fmtorch.geometry.matrices import complement
 
@@ -46,22 +46,17 @@ TERMS, WIDEST = 64, 6.0  # of the series of `kept_share`, and from where on it i
 def tangents(R: Tensor, t: Tensor, focal: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """F (3, 3, b) between centred pixels, its derivatives by the parameters (3, 3, 7, b), and the basis (3, 2, b)."""
     basis = torch.stack(complement(t), 1)
-    E = _cross(t, R)
+    E = cross(t[:, None].expand_as(R), R)
     axes = torch.eye(3, dtype=R.dtype, device=R.device)[..., None].expand(3, 3, R.shape[-1])
-    turned = [_cross(t, _cross(axes[k], R)) for k in range(3)]
-    shifted = [_cross(basis[:, k], R) for k in range(2)]
+    spun = (cross(axes[k][:, None].expand_as(R), R) for k in range(3))
+    turned = [cross(t[:, None].expand_as(R), A) for A in spun]
+    shifted = [cross(basis[:, k, None].expand_as(R), R) for k in range(2)]
     scale0, scale1 = (torch.stack([1 / f, 1 / f, torch.ones_like(f)]) for f in focal)
     by0, by1 = (torch.stack([-1 / f, -1 / f, torch.zeros_like(f)]) for f in focal)
     pixels = scale1[:, None] * scale0[None]
     scaled = [A * pixels for A in (*turned, *shifted)]
     slopes = torch.stack([*scaled, E * scale1[:, None] * by0[None], E * by1[:, None] * scale0[None]], 2)
     return E * pixels, slopes, basis
-
-
-def _cross(t: Tensor, A: Tensor) -> Tensor:
-    """``[t]x A`` (3, 3, b)."""
-    crossed: Tensor = torch.linalg.cross(t[:, None].expand_as(A), A, dim=0)
-    return crossed
 
 
 def residual_slopes(F: Tensor, slopes: Tensor, a0: Tensor, a1: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -112,7 +107,7 @@ def explained_by_rotation(a0: Tensor, a1: Tensor, R: Tensor, f: Tensor, s: Tenso
         b = stable_sum((J0 * e0 + J1 * e1) * by)
         determinant_ = determinant(A)
         omega = component_sum(cofactors(A) * b[:, None], 0) / torch.where(determinant_ == 0, 1.0, determinant_)
-        turned = turned + torch.linalg.cross(omega[..., None].expand_as(turned), turned, dim=0)
+        turned = turned + cross(omega[..., None].expand_as(turned), turned)
     ordered = torch.where(near, squared, torch.inf).sort(-1).values
     middle = ((count - 1).clamp_min(0) // 2)[:, None]
     median = ordered.gather(-1, middle)[:, 0] if ordered.shape[-1] else torch.full_like(f[0], torch.inf)
@@ -164,12 +159,10 @@ factor of ten in a focal length. They enter as independent information, which is
 
 class TwoViewCovariance(NamedTuple):
     """Covariances of B pairs.
-
     covariance: of (omega, tau, log f0, log f1), radians and logarithms; rows of known focal lengths are zero.
     tangent: the basis B of the plane across t. fundamental: covariance of F, row by row, at unit Frobenius norm, in
     pixels. noise: s, px. valid: False where R, t, a focal length, the truncation or the prior is not finite or has no
-    meaning; such a pair is as one without matches.
-    """
+    meaning; such a pair is as one without matches."""
 
     covariance: Float[Tensor, "b 7 7"]
     tangent: Float[Tensor, "b 3 2"]
@@ -294,14 +287,14 @@ def _covariance(information: Tensor, Pi: Tensor, used: Tensor) -> Tensor:
     """The inverse (7, 7, b) of information, prior and `DIFFUSE` in the directions that are used; zero in others."""
     total = information + torch.diag(information.new_tensor(DIFFUSE) ** -2)[..., None]
     prior = torch.nn.functional.pad(_positive_part(Pi).movedim(-1, 0), (5, 0, 5, 0)).movedim(0, -1)
-    reduced = _product(used.transpose(0, 1), _product(total + prior, used))
+    reduced = product(used.transpose(0, 1), product(total + prior, used))
     idle = 1 - used.amax(0)
     eye = torch.eye(PARAMETERS, dtype=total.dtype, device=total.device)[..., None]
     M = torch.cat([reduced + eye * idle, eye.expand_as(reduced)], 1)
     for k in range(PARAMETERS):  # Gauss and Jordan, of a positive definite matrix without pivots
         M = M - (M[:, k] - eye[:, k])[:, None] * (M[k] / M[k, k])[None]
     inverse = M[:, PARAMETERS:] * (1 - idle) * (1 - idle)[:, None]
-    C = _product(used, _product(inverse, used.transpose(0, 1)))
+    C = product(used, product(inverse, used.transpose(0, 1)))
     return (C + C.transpose(0, 1)) / 2
 
 
@@ -313,9 +306,9 @@ def _without_noise(C: Tensor, noise: Tensor, still: Tensor) -> Tensor:
     diffuse = eye * DIFFUSE[3] ** -2
     seen = _positive_part(S - diffuse)
     left = torch.where(still, 0.0, _positive_part(seen - noise))
-    grown = _inverse(_product(left, _product(_inverse(seen + diffuse), left)) + diffuse)
-    by_direction = _product(C[:, 3:5], S)
-    C = C + _product(by_direction, _product(grown - C[3:5, 3:5], by_direction.transpose(0, 1)))
+    grown = _inverse(product(left, product(_inverse(seen + diffuse), left)) + diffuse)
+    by_direction = product(C[:, 3:5], S)
+    C = C + product(by_direction, product(grown - C[3:5, 3:5], by_direction.transpose(0, 1)))
     return (C + C.transpose(0, 1)) / 2
 
 
@@ -343,7 +336,7 @@ def _of_fundamental(C: Tensor, F: Tensor, slopes: Tensor, p0: Tensor, p1: Tensor
     f = entries[0] * inverse_root(component_sum(entries[0] * entries[0]))
     J = entries[1:] * inverse_root(component_sum(entries[0] * entries[0]))
     J = J - component_sum(J * f, 1)[:, None] * f
-    V = _product(J.transpose(0, 1), _product(C, J))
+    V = product(J.transpose(0, 1), product(C, J))
     return (V + V.transpose(0, 1)) / 2
 
 
@@ -351,8 +344,3 @@ def _uncentred(A: Tensor, p0: Tensor, p1: Tensor) -> Tensor:
     """``T1^T A T0`` (3, 3, b): a matrix between centred pixels as one between pixels."""
     A = torch.stack([A[:, 0], A[:, 1], A[:, 2] - A[:, 0] * p0[0] - A[:, 1] * p0[1]], 1)
     return torch.stack([A[0], A[1], A[2] - A[0] * p1[0] - A[1] * p1[1]])
-
-
-def _product(A: Tensor, B: Tensor) -> Tensor:
-    """``A B`` of component-first matrices of any size."""
-    return component_sum(A[:, :, None] * B[None], 1)

@@ -1,7 +1,5 @@
 """The normalised, weighted eight-point algorithm."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 
@@ -14,7 +12,7 @@ from fmtorch.geometry import matrices
 from fmtorch.geometry.arithmetic import stable_sum
 from fmtorch.geometry.matrices import EPS, nearest_rank2_kernel, smallest_eigenvector_kernel, unit_kernel
 from fmtorch.geometry.normalize import canonical, denormalize_fundamental, normalize_points
-from fmtorch.geometry.null_space import equations, gather, null_space
+from fmtorch.geometry.null_space import add_models, equations, gather, null_space
 from fmtorch.geometry.pose import consistently_oriented
 from fmtorch.jit.kernel import Array, F4x2, F8x1, F8x2, I8x1, I8x2, inner, kernel, matrix, vector
 from fmtorch.jit.lanes import LANES, absolute, fill, load, sqrt, store, where
@@ -140,12 +138,7 @@ def eight_point_kernel(points: F8x2, sample: I8x2, F: F4x2, draw: I8x1) -> int:
                 B[q, lane] = f[q]
             there[0, lane] &= norm > 0 and math.isfinite(norm)
         store(there, 0, load(there, 0) & consistently_oriented(B, X, 8))
-        for lane in range(min(LANES, sample.shape[1] - first)):
-            if there[0, lane]:
-                for q in range(9):
-                    F[models, q] = B[q, lane]
-                draw[models] = first + lane
-                models += 1
+        models = add_models(B.reshape(1, 9, LANES), there, first, F, draw, models, sample.shape[1])
     return models
 
 

@@ -71,9 +71,7 @@ def algebraic(F: Matrix, x0: Points, x1: Points) -> PerMatch:
 
 def epipolar_distances(F: Matrix, x0: Points, x1: Points) -> tuple[PerMatch, PerMatch]:
     """Point-to-line distances in pixels: of x0 to the line ``F^T x1`` in image 0, of x1 to ``F x0`` in image 1.
-
-    Arguments as of `sampson`. Two tensors (..., N), at least 0: in image 0, in image 1.
-    """
+    Arguments as of `sampson`. Two tensors (..., N), at least 0: in image 0, in image 1."""
     e, squared0, squared1 = residual_and_normals(F, x0, x1)
     return e.abs() * inverse_root(squared0), e.abs() * inverse_root(squared1)
 

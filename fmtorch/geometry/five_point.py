@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fmtorch.geometry.null_space import equations, gather, null_space
+from fmtorch.geometry.null_space import add_models, equations, gather, null_space
 from fmtorch.geometry.pose import consistently_oriented
 from fmtorch.jit.kernel import Array, F4x2, F8x1, F8x2, I8x1, I8x2, inner, kernel, matrix
 from fmtorch.jit.lanes import LANES, absolute, any_lane, fill, load, sqrt, store, where
@@ -55,13 +55,7 @@ def five_point(points: F8x2, sample: I8x2, depth: F8x2, offset: F8x1, F: F4x2, d
             there = load(roots.exists, s) & _essential(B, e, load(roots.far, s), load(roots.z, s), E)
             there &= consistently_oriented(E, X, 5)
             store(right, s, there & _uncalibrated(E, depths, offset, uncalibrated[s]))
-        for i in range(min(LANES, sample.shape[1] - first)):
-            for s in range(rows):
-                if right[s, i]:
-                    for q in range(9):
-                        F[models, q] = uncalibrated[s, q, i]
-                    draw[models] = first + i
-                    models += 1
+        models = add_models(uncalibrated, right[:rows], first, F, draw, models, sample.shape[1])
     return models
 
 

@@ -19,7 +19,7 @@ from fmtorch.geometry.epipolar import Matrix, PerMatch, Points, inverse_root, li
 from fmtorch.geometry.homography_refine import linearise_homography
 from fmtorch.geometry.matrices import EPS, smallest_eigenvector, smallest_eigenvector_kernel, unit_kernel
 from fmtorch.geometry.normalize import normalize_points
-from fmtorch.geometry.null_space import gather
+from fmtorch.geometry.null_space import add_models, gather
 from fmtorch.jit.kernel import Array, F4x2, F8x1, F8x2, I8x1, I8x2, inner, kernel, matrix, vector
 from fmtorch.jit.lanes import LANES, absolute, fill, load, sqrt, store, where
 
@@ -115,10 +115,8 @@ def homography_transfer(H: Matrix, x0: Points, x1: Points) -> tuple[PerMatch, Pe
 
 def homography_sampson(H: Matrix, x0: Points, x1: Points) -> PerMatch:
     """Sampson distance of a homography in pixels: of both images together (Hartley & Zisserman, section 4.2.6).
-
     The length of the least correction of x0 and x1 that makes ``x1 ~ H x0`` hold to first order: of small errors the
-    distance to the nearest exact match. Arguments as of `homography_transfer`, (..., N).
-    """
+    distance to the nearest exact match. Arguments as of `homography_transfer`, (..., N)."""
     h = unit_largest(H.to(torch.float64)).flatten(-2).movedim(-1, 0)[..., None]
     shape = np.broadcast_shapes(x0.shape, x1.shape)
     points = torch.cat([x0.expand(shape), x1.expand(shape)], -1).movedim(-1, 0)
@@ -157,17 +155,12 @@ def four_point(points: F8x2, sample: I8x2, H: F4x2, draw: I8x1) -> int:
     points of the sample. A sample gives none if three of its points lie on a line in either image, or if one of the
     four triangles is turned over between the images: then the points would lie on both sides of the plane's horizon, or
     the plane would be seen from behind."""
-    X, h, there = matrix(4 * SIZE, LANES), matrix(9, LANES), np.empty((1, LANES), np.bool_)
+    X, h, there = matrix(4 * SIZE, LANES), np.empty((1, 9, LANES)), np.empty((1, LANES), np.bool_)
     work, models = matrix(6, LANES), 0
     for first in range(0, sample.shape[1], LANES):
         gather(points, sample, first, X)
-        store(there, 0, _homographies(X, work, h))
-        for lane in range(min(LANES, sample.shape[1] - first)):
-            if there[0, lane]:
-                for q in range(9):
-                    H[models, q] = h[q, lane]
-                draw[models] = first + lane
-                models += 1
+        store(there, 0, _homographies(X, work, h[0]))
+        models = add_models(h, there, first, H, draw, models, sample.shape[1])
     return models
 
 
@@ -292,8 +285,7 @@ def cross_times(e: Array, A: Array, out: Array) -> None:
 def plane_homography(F: Array, e1: Array, points: Array, triplet: Array, H: Array) -> bool:
     """The homography of the plane through the matches (3,) of a triplet that satisfy F -> H; if it is determined.
     ``H = A - e1 (M^-1 b)^T`` with ``A = [e1]_x F``, the rows of M the points in image 0, and
-    ``b_i = (x1_i x (A x0_i)) . (x1_i x e1) / |x1_i x e1|^2`` (result 13.6). e1: the epipole in image 1, ``F^T e1 = 0``.
-    """
+    ``b_i = (x1_i x (A x0_i)) . (x1_i x e1) / |x1_i x e1|^2`` (result 13.6); ``F^T e1 = 0``, the epipole of image 1."""
     A, b, M = vector(9), vector(3), matrix(3, 3)
     cross_times(e1, F, A)
     for k in range(3):

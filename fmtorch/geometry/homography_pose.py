@@ -18,12 +18,10 @@ FLAT = 1e-9  # of S, the squares of the stretch less one, below which there is n
 
 class PlanePoses(NamedTuple):
     """The two poses that explain a plane's homography, ``H ~ K1 (R + t n^T) K0^-1``, that with more points first.
-
     R: rotation, X1 = R X0 + t. t: in distances of camera 0 from the plane. normal: n, unit, n^T X0 = 1 on the plane.
     in_front: share of the points that lie on the plane before both cameras. valid: False where there is no such
     pose; R is then the identity, t and n are zero. Where t is parallel to n the two are one; without translation t is
-    zero and so is n.
-    """
+    zero and so is n."""
 
     R: Float[Tensor, "*batch 2 3 3"]
     t: Float[Tensor, "*batch 2 3"]

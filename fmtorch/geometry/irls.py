@@ -170,14 +170,12 @@ def weighted_fit(
 
 def at_fixed_point(F: Float[Tensor, "9 p k"], step: Callable[[Tensor], Tensor]) -> Float[Tensor, "9 p k"]:
     """F, a fixed point of `step` up to scale and sign, attached to the graph of everything else that `step` reads.
-
     With G(F, theta) the step, scaled to unit norm, and J its Jacobian with respect to F, the fixed point moves by
     ``dF = (I - J)^-1 dG/dtheta dtheta`` (Bai et al., NeurIPS 2019, theorem 1). G maps to the manifold of rank 2 and
     unit norm, so J and dG map to its 7-dimensional tangent space, and dF lies in it. Where the iteration does not
     contract, singular values s of I - J are inverted as ``s / (s^2 + CONTRACTION_GAP^2)``, which bounds the gradient.
     F: on no graph; of rank 2. One that is zero or not finite has a gradient of zero, and so has one that `step`, one
-    iteration of all models, each for itself, leaves as it is. Returns the same values.
-    """
+    iteration of all models, each for itself, leaves as it is. Returns the same values."""
     valid = torch.isfinite(F).all(0) & (F != 0).any(0)
     fixed = unit(torch.where(valid, F, constant(F, RANK_TWO)))
 

@@ -5,8 +5,6 @@ Damped Gauss-Newton steps; each model takes its own where that lowers its cost, 
 call, between whose steps nothing waits for Python.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -38,7 +36,7 @@ class Weighted(NamedTuple):
     table: F8x2
 
     @staticmethod
-    def of(points: Array, weight: Array, s2: Array, loss: str = "truncated") -> Weighted:
+    def of(points: Array, weight: Array, s2: Array, loss: str = "truncated") -> "Weighted":
         """Matches with the loss of this name."""
         return Weighted(points, weight, s2, LOSS_CODES[loss], LOSS_TABLE if loss == "magsac" else NO_TABLE)
 

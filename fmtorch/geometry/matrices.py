@@ -21,11 +21,9 @@ GAP = 1e-6
 
 def nearest_rank2(F: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
     """The rank-two matrix nearest to F in Frobenius norm, F - F v v^T, v being the last right singular vector.
-
     Computed in float64, returned in F's type. Differentiable; where the two smallest singular values meet, v and with
     it the projection jump, and the gradient is held finite by gap / (gap^2 + eps^2) in place of 1 / gap.
-    F must be finite.
-    """
+    F must be finite."""
     rows = F.reshape(*F.shape[:-2], 9).movedim(-1, 0).contiguous().to(torch.float64).reshape(3, 3, *F.shape[:-2])
     v = last_right_singular_vector(rows)
     projected = rows - component_sum(rows * v, 1)[:, None] * v

@@ -1,7 +1,5 @@
 """Normalisation of image points before linear estimation, and of fundamental matrices after it."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import NamedTuple
@@ -13,7 +11,7 @@ from torch import Tensor
 
 from fmtorch.geometry.arithmetic import as_components, as_matrices, component_sum, matmul3, sqrt, stable_sum, unit
 from fmtorch.geometry.cameras import PixelFrame
-from fmtorch.geometry.epipolar import unit_frobenius
+from fmtorch.geometry.epipolar import Matrix, unit_frobenius
 from fmtorch.geometry.levenberg_marquardt import Weighted
 from fmtorch.geometry.robust_losses import LOSSES, RobustLoss, named_loss
 from fmtorch.jit.kernel import Array
@@ -67,9 +65,7 @@ def normalize_pair(x0: Points, x1: Points, mask: Mask | None = None) -> tuple[Po
     return _apply(x0, mask, scale), _apply(x1, mask, scale), _similarity(c0, scale), _similarity(c1, scale)
 
 
-def denormalize_fundamental(
-    F: Float[Tensor, "*#batch 3 3"], T0: Float[Tensor, "*#batch 3 3"], T1: Float[Tensor, "*#batch 3 3"]
-) -> Float[Tensor, "*#batch 3 3"]:
+def denormalize_fundamental(F: Matrix, T0: Matrix, T1: Matrix) -> Matrix:
     """The fundamental matrix T1^T F T0 of points x, given F of the normalised points T x; leading shapes broadcast.
 
     Args:
@@ -85,9 +81,7 @@ def denormalize_fundamental(
 
 def canonical(F: Matrices) -> Matrices:
     """F scaled to unit Frobenius norm with its entry of largest magnitude (the first of equals) positive.
-
-    A zero matrix stays zero, with zero gradient.
-    """
+    A zero matrix stays zero, with zero gradient."""
     flat = F.detach().reshape(*F.shape[:-2], 9)
     peak = torch.gather(flat, -1, flat.abs().argmax(-1, keepdim=True))[..., None]
     return unit_frobenius(F) * torch.copysign(torch.ones_like(peak), peak)
@@ -96,9 +90,7 @@ def canonical(F: Matrices) -> Matrices:
 def _clean(x: Tensor, mask: Tensor | None, weight: Tensor | None) -> tuple[Tensor, Tensor]:
     """Points and weights with zeros in the masked slots."""
     w = torch.ones_like(x[..., 0]) if weight is None else weight
-    if mask is None:
-        return x, w
-    return torch.where(mask[..., None], x, 0.0), torch.where(mask, w, 0.0)
+    return (x, w) if mask is None else (torch.where(mask[..., None], x, 0.0), torch.where(mask, w, 0.0))
 
 
 def _mean(x: Tensor, w: Tensor) -> Tensor:
@@ -130,8 +122,7 @@ def _apply(centred: Tensor, mask: Tensor | None, scale: Tensor) -> Tensor:
 def _similarity(centroid: Tensor, scale: Tensor) -> Tensor:
     zero, ones = torch.zeros_like(scale), torch.ones_like(scale)
     tx, ty = (-scale[..., None] * centroid).unbind(-1)
-    rows = [scale, zero, tx, zero, scale, ty, zero, zero, ones]
-    return torch.stack(rows, -1).reshape(*scale.shape, 3, 3)
+    return torch.stack([scale, zero, tx, zero, scale, ty, zero, zero, ones], -1).reshape(*scale.shape, 3, 3)
 
 
 # The way into the solvers: leading shapes flattened, masked slots moved to the end, coordinates normalised
@@ -152,7 +143,7 @@ class RobustSum(NamedTuple):
         """The loss with its derivatives."""
         return LOSSES[self.loss]
 
-    def detached(self) -> RobustSum:
+    def detached(self) -> "RobustSum":
         """The same on no graph."""
         return RobustSum(self.points.detach(), self.weight.detach(), self.loss, self.s2.detach())
 

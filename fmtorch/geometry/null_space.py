@@ -25,6 +25,20 @@ def gather(points: Array, sample: Array, first: int, X: Array) -> None:
 
 
 @inner
+def add_models(f: Array, there: Array, first: int, F: Array, draw: Array, models: int, samples: int) -> int:
+    """Adds the models f (k, 9, LANES) that are there (k, LANES), of the samples from `first` on, to F and draw.
+    models: in these so far. samples: in all. Returns how many models there are then."""
+    for lane in range(min(LANES, samples - first)):
+        for k in range(len(there)):
+            if there[k, lane]:
+                for q in range(9):
+                    F[models, q] = f[k, q, lane]
+                draw[models] = first + lane
+                models += 1
+    return models
+
+
+@inner
 def equations(X: Array, size: int, A: Array) -> None:
     """The rows a with a . vec(F) = x1^T F x0 of points X (4 size, LANES) -> A (9 size, LANES)."""
     for j in range(size):

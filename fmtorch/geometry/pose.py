@@ -17,9 +17,7 @@ from fmtorch.jit.lanes import fill, load
 
 class Pose(NamedTuple):
     """X1 = R X0 + t with t a unit vector; how many points lie in front of both cameras; False where there is no pose.
-
-    Where `valid` is False, R is the identity and t is zero.
-    """
+    Where `valid` is False, R is the identity and t is zero."""
 
     R: Matrices
     t: Float[Tensor, "*batch 3"]
@@ -29,9 +27,7 @@ class Pose(NamedTuple):
 
 class FourPoses(NamedTuple):
     """The four motions X1 = R X0 + t, t of unit length, that an essential matrix has; False where it has none.
-
-    Where `valid` is False, R is the identity and t is zero.
-    """
+    Where `valid` is False, R is the identity and t is zero."""
 
     R: Float[Tensor, "*batch 4 3 3"]
     t: Float[Tensor, "*batch 4 3"]
@@ -49,10 +45,8 @@ class _Decomposition(NamedTuple):
 
 def poses_from_fundamental(F: Matrices, K0: Matrices, K1: Matrices) -> FourPoses:
     """The four decompositions of E = K1^T F K0, in no order of merit; matches tell which one is right.
-
     Hartley and Zisserman, Multiple View Geometry, 9.6.2. Float64 inside, F's type outside; differentiable. Arguments as
-    of `pose_from_fundamental`.
-    """
+    of `pose_from_fundamental`."""
     R, t, _, valid = _decomposed(F, K0, K1)
     R, t = R.movedim((2, 0, 1), (-3, -2, -1)), t.movedim((1, 0), (-2, -1))
     R = torch.where(valid[..., None, None, None], R, torch.eye(3, dtype=R.dtype, device=R.device))

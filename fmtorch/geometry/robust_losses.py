@@ -26,8 +26,7 @@ END = np.array([QUANTILE**2 / 2])
 def marginal_loss(u: Array) -> Array:
     """rho / sigma_max^2, for u in [0, 1]."""
     x = u * END
-    loss: Array = _lower_gamma(2.5, x) / 2 + x / 2 * (_lower_gamma(1.5, END) - _lower_gamma(1.5, x))
-    return loss
+    return np.asarray(_lower_gamma(2.5, x) / 2 + x / 2 * (_lower_gamma(1.5, END) - _lower_gamma(1.5, x)))
 
 
 def _lower_gamma(s: float, x: Array) -> Array:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from fmtorch.geometry.arithmetic import cofactors
 from fmtorch.geometry.normalize import canonical, denormalize_fundamental, normalize_points
-from fmtorch.geometry.null_space import equations, gather, null_space
+from fmtorch.geometry.null_space import add_models, equations, gather, null_space
 from fmtorch.geometry.pose import consistently_oriented
 from fmtorch.jit.kernel import Array, B1x2, F4x2, F8x2, F8x3, I8x1, I8x2, inner, kernel, matrix, vector
 from fmtorch.jit.lanes import LANES, absolute, load, store
@@ -29,13 +29,7 @@ def seven_point_kernel(points: F8x2, sample: I8x2, F: F4x2, draw: I8x1) -> int:
         _solve(X, work, f, there)
         for k in range(3):
             store(there, k, load(there, k) & consistently_oriented(f[k], X, 7))
-        for lane in range(min(LANES, sample.shape[1] - first)):
-            for k in range(3):
-                if there[k, lane]:
-                    for q in range(9):
-                        F[models, q] = f[k, q, lane]
-                    draw[models] = first + lane
-                    models += 1
+        models = add_models(f, there, first, F, draw, models, sample.shape[1])
     return models
 
 

@@ -231,12 +231,18 @@ LAYOUTS = (*WITHOUT_GEOMETRY, *WITH_GEOMETRY)
 
 class H5Pairs(HeldPairs):
     """Pairs with given matches, which take the place of features and matcher.
-    root: the file, or the folder of the files, of the layout. layout: one of `LAYOUTS`. truth: for layouts without
-    geometry, the folder of the `fmbench` set that they were computed on. images: folder of the images, for pictures and
-    sizes, where the layout knows names of images. features, matches: names of hloc's two files in root; looked for when
-    not given. origin: coordinates of the first pixel's centre; of the layout's convention when not given. What is wrong
-    with one pair is that pair's `problem`, or its failure when it is read. Raises DataError for what is wrong with
-    files as a whole."""
+
+    Args:
+        root: the file, or the folder of the files, of the layout.
+        layout: one of `LAYOUTS`.
+        truth: for layouts without geometry, the folder of the `fmbench` set that they were computed on.
+        images: folder of the images, for pictures and sizes, where the layout knows names of images.
+        features, matches: names of hloc's two files in root; looked for when not given.
+        origin: coordinates of the first pixel's centre; of the layout's convention when not given.
+
+    What is wrong with one pair is that pair's `problem`, or its failure when it is read. Raises DataError for what is
+    wrong with files as a whole.
+    """
 
     name = "h5"
 

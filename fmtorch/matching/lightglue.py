@@ -12,12 +12,10 @@ FEATURES = ("aliked", "disk")  # those that need no more than positions and desc
 
 class LightGlue:
     """Matches the features of two images by a transformer; the slots of the result are the matches found.
-
     score and prior: the network's score, its P(match). Frames are not handed on: the features that it is for have none.
     features: `aliked` or `disk`, what the weights were trained for; threshold: least score. device: auto, cpu, cuda.
     network: in place of the released one. For any number of threads. Raises ConnectionError where the weights cannot be
-    fetched.
-    """
+    fetched."""
 
     def __init__(
         self, features: str = "aliked", threshold: float = 0.1, device: str = "auto", network: nn.Module | None = None
@@ -38,9 +36,7 @@ class LightGlue:
 
     def __call__(self, features0: Features, features1: Features) -> Correspondences:
         """The matches of one pair, a batch of one, on the device of `features0`.
-
-        Raises ValueError for descriptors of a length that the network is not for.
-        """
+        Raises ValueError for descriptors of a length that the network is not for."""
         for features in (features0, features1):
             shape = tuple(features.descriptors.shape)
             if len(shape) != 2 or shape[1] != self._length:

@@ -28,9 +28,7 @@ _MAX_INT32 = 2**31 - 1
 
 class Descriptors(NamedTuple):
     """Descriptors of an image, ``exact = center + step * rounded`` up to a distance of `error`.
-
-    exact: (n, d) integers, at most 2^25 in norm. squared_norms: (n,) of the rounded ones, FAR for padding.
-    """
+    exact: (n, d) integers, at most 2^25 in norm. squared_norms: (n,) of the rounded ones, FAR for padding."""
 
     exact: I4x2
     squared_norms: I4x1
@@ -40,9 +38,7 @@ class Descriptors(NamedTuple):
 
 class Nearest(NamedTuple):
     """Neighbours and exact squared distances so far, (rows,) and (columns,); FAR-fetched ones are infinite.
-
-    limit: (columns + padding,) the largest 8-bit squared distance at which a row may be nearer than `reverse`.
-    """
+    limit: (columns + padding,) the largest 8-bit squared distance at which a row may be nearer than `reverse`."""
 
     nearest: I8x1
     squared: F8x1
@@ -72,10 +68,8 @@ def round_to_8_bits(exact: I4x2, center: float, step: float, rounded: I1x2, squa
 @kernel
 def update(products: I4x2, first: int, rows: Descriptors, columns: Descriptors, neighbors: Nearest) -> int:
     """Takes products of rounded rows, from `first` on, with all rounded columns into what is found; overwrites them.
-
     A distance D and the distance D8 of what was rounded differ by the errors at most (triangle inequality), so that
-    none beyond a bound on D8 needs to be computed. Returns how many were.
-    """
+    none beyond a bound on D8 needs to be computed. Returns how many were."""
     groups = products.shape[1] // GROUP
     minima = np.empty(groups, np.int32)
     error, step = rows.error + columns.error, rows.step
@@ -168,7 +162,7 @@ def _squared_distance(a: Array, b: Array) -> float:
 BLOCK = 128  # rows whose products with all columns exist at a time: 4 MB at 8,000 columns
 MAX_COMPUTED = 256  # exact distances a descriptor, beyond which rounding does not help: nearly equal ones
 MAX_LENGTH = 1 << 10  # of a descriptor: products stay below 2^24, exact in float32, and squared distances below FAR
-MAX_NORM = 2.0**25  # of a descriptor: differences fit 32 bits
+MAX_NORM = 2.0**25  # of a descriptor: differences fit 32 bits, and squared distances float64
 _RANGE = 255  # between the least and the largest 8-bit integer
 
 
@@ -227,19 +221,15 @@ def _rounded(values: Tensor, center: float, step: float, padded: int) -> tuple[T
     return rounded, Descriptors(exact, norms, error * (1 + 1e-9), float(step))
 
 
-_GROUP = 32  # columns whose minimum is taken together; a group is searched only where it can hold a neighbour
 _FLOAT32_NORM = 2.0**11  # integer vectors no longer than this have squared distances up to 2^24: exact in float32
 _ROUNDING = 1e-9  # relative, of a float64 norm; a generous bound
-_FLOAT64_NORM = 2.0**25  # likewise 2^52 in float64
 
 
 class Neighbors(NamedTuple):
     """What `nearest_neighbors` finds, for every descriptor of image 0.
-
     nearest: index of its nearest neighbour in image 1 (lowest index on ties), -1 where there is none.
     distance, second: Euclidean distances to the nearest and the second nearest, infinite where there is none.
-    reverse: for every descriptor of image 1 its nearest neighbour in image 0, -1 where there is none.
-    """
+    reverse: for every descriptor of image 1 its nearest neighbour in image 0, -1 where there is none."""
 
     nearest: Int[Tensor, "*batch n0"]
     distance: Float[Tensor, "*batch n0"]
@@ -271,26 +261,17 @@ def nearest_neighbors(
     chunk: int = 64,
 ) -> Neighbors:
     """The two nearest descriptors of image 1 for each of image 0, and the nearest the other way, in one pass.
-
-    Squared distances are computed as integers, so no rounding can depend on the batch, the block or the device:
-    integer descriptors such as SIFT's are taken as they are (float32), others on a grid of 2^-25 of the longest
-    descriptor of the pair (float64). Only `chunk` rows of the distance matrix exist at a time; `chunk` changes speed
-    and memory, never the result. Masked and non-finite descriptors neither have neighbours nor are any.
-    Not differentiable.
-    """
+    Squared distances are computed as integers, so no rounding can depend on the batch, the block or the device: integer
+    descriptors such as SIFT's are taken as they are (float32), others on a grid of 2^-25 of the longest descriptor of
+    the pair (float64). Only `chunk` rows of the distance matrix exist at a time; `chunk` changes speed and memory,
+    never the result. Masked and non-finite descriptors neither have neighbours nor are any. Not differentiable."""
     if chunk < 1:
         raise ValueError(f"chunk is {chunk}; it must be at least 1")
-    with one_thread(descriptors0.device):
-        return _nearest_neighbors(descriptors0, descriptors1, mask0, mask1, chunk)
-
-
-def _nearest_neighbors(
-    descriptors0: Tensor, descriptors1: Tensor, mask0: Tensor | None, mask1: Tensor | None, chunk: int
-) -> Neighbors:
     batch, (n0, n1) = descriptors0.shape[:-2], (descriptors0.shape[-2], descriptors1.shape[-2])
     flat0, flat1 = (d.reshape(math.prod(batch), *d.shape[-2:]) for d in (descriptors0, descriptors1))
-    mask0, mask1 = _finite(flat0, mask0), _finite(flat1, mask1)
-    by_pair = [_match_one_pair(*pair, chunk) for pair in zip(flat0, flat1, mask0, mask1, strict=True)]
+    with one_thread(descriptors0.device):
+        masks = _finite(flat0, mask0), _finite(flat1, mask1)
+        by_pair = [_match_one_pair(*pair, chunk) for pair in zip(flat0, flat1, *masks, strict=True)]
     if not by_pair:
         return Neighbors(*(column.expand(*batch, -1) for column in _nothing(descriptors0, n0, n1)))
     columns = [torch.stack(column) for column in zip(*by_pair, strict=True)]
@@ -337,7 +318,7 @@ def _integers(d0: Tensor, d1: Tensor) -> tuple[Tensor, Tensor, float]:
     integral = bool((d0 == d0.round()).all() and (d1 == d1.round()).all())
     if integral and longest <= _FLOAT32_NORM:
         return d0.float(), d1.float(), 1.0
-    ratio = _FLOAT64_NORM / longest if longest > 0 else 1.0  # squares below 1e-323 are zero, and so is all that is left
+    ratio = MAX_NORM / longest if longest > 0 else 1.0  # squares below 1e-323 are zero, and so is all that is left
     exponent = math.frexp(ratio)[1] - 1  # a power of two, so that scaling is exact
     scale = 2.0 ** min(exponent, 1000)
     return (d0.double() * scale).round(), (d1.double() * scale).round(), 1.0 / scale
@@ -351,13 +332,11 @@ def _longest(d: Tensor) -> float:
 
 def _two_nearest(rows: Tensor, columns: Tensor, chunk: int) -> tuple[list[Tensor], Tensor]:
     """Of every row the nearest column, its and the second's squared distance; of every column the nearest row. Exact.
-
-    |a - b|^2 = [a, |a|^2, 1] . [-2 b, 1, |b|^2]: one product a block, padded to whole groups with infinite columns.
-    """
+    |a - b|^2 = [a, |a|^2, 1] . [-2 b, 1, |b|^2]: one product a block, padded to whole groups with infinite columns."""
     n1 = len(columns)
     norm0, norm1 = (d.square().sum(-1, keepdim=True) for d in (rows, columns))
     left = torch.cat([rows, norm0, torch.ones_like(norm0)], 1)
-    right = left.new_zeros(-(-n1 // _GROUP) * _GROUP, left.shape[1])
+    right = left.new_zeros(-(-n1 // GROUP) * GROUP, left.shape[1])
     right[:, -1] = math.inf
     right[:n1] = torch.cat([-2 * columns, torch.ones_like(norm1), norm1], 1)
     right = right.T.contiguous()
@@ -377,19 +356,17 @@ def _two_nearest(rows: Tensor, columns: Tensor, chunk: int) -> tuple[list[Tensor
 
 def _two_smallest(squared: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Of every row the first index of its smallest value, that value and the second smallest.
-
     The minima of groups of columns lead to the group with the smallest value; the second smallest is in the same
-    group or is the minimum of another one.
-    """
-    groups = squared.reshape(len(squared), -1, _GROUP)
+    group or is the minimum of another one."""
+    groups = squared.reshape(len(squared), -1, GROUP)
     minima = groups.amin(-1)
     group = minima.argmin(1, keepdim=True)
-    members = groups.gather(1, group[..., None].expand(-1, -1, _GROUP))[:, 0]
+    members = groups.gather(1, group[..., None].expand(-1, -1, GROUP))[:, 0]
     member = members.argmin(1, keepdim=True)
     best = members.gather(1, member)
     rest = members.scatter(1, member, math.inf).amin(1, keepdim=True)
     second = minima.scatter(1, group, rest).amin(1)
-    return (group * _GROUP + member)[:, 0], best[:, 0], second
+    return (group * GROUP + member)[:, 0], best[:, 0], second
 
 
 @dataclasses.dataclass(frozen=True)
@@ -402,17 +379,14 @@ class NearestNeighborMatcher:
 
     mutual: keep only matches whose partner's own nearest neighbour is the feature itself. It costs nothing, both
     directions being found in one pass; without it the result says which matches these are (`Correspondences.mutual`).
-    chunk: rows of the distance matrix that exist at a time; changes speed and memory only.
-    """
+    chunk: rows of the distance matrix that exist at a time; changes speed and memory only."""
 
     mutual: bool = False
     chunk: int = 64
 
     def __call__(self, features0: Features, features1: Features) -> Correspondences:
         """The matches of one pair (a batch of one), or of a batch of pairs when the features have a leading dimension.
-
-        Raises ValueError when the two batches or descriptor lengths differ.
-        """
+        Raises ValueError when the two batches or descriptor lengths differ."""
         shape0, shape1 = features0.descriptors.shape, features1.descriptors.shape
         if shape0[:-2] != shape1[:-2] or shape0[-1] != shape1[-1]:
             both = f"{tuple(shape0)} and {tuple(shape1)}"

@@ -80,9 +80,7 @@ class VisMatch:
 
     def match_images(self, image0: Image, image1: Image) -> Correspondences:
         """The matches of two images (H, W) or RGB (H, W, 3), uint8: a batch of one, on the CPU.
-
-        Raises ValueError, naming the matcher, where it fails or gives something else than it says.
-        """
+        Raises ValueError, naming the matcher, where it fails or gives something else than it says."""
         sizes = [(image.shape[0], image.shape[1]) for image in (image0, image1)]
         with self._turn, torch.random.fork_rng(devices=range(torch.cuda.device_count())):
             torch.manual_seed(0)
@@ -112,7 +110,6 @@ class _Matches(NamedTuple):
 
 def _correspondences(matches: _Matches, origin: float, sizes: Sequence[Size]) -> Correspondences:
     """A batch of one pair; matches that are not finite, or outside of an image, are masked.
-
     origin: coordinates of the first pixel's centre. sizes: (h, w) of the images. Raises ValueError for other lengths.
     """
     lengths = {len(part) for part in matches if part is not None}
@@ -159,10 +156,8 @@ MAX_RATIO = 4.0  # of the noise of a match to the pair's usual one, either way: 
 
 class RecordedSample:
     """The last matches that a RoMa v2 behind vismatch sampled, whose precisions vismatch does not hand on.
-
     ``sample`` of the released model gives matches (N, 4) in [-1, 1], overlaps (N,), and precision matrices (N, 2, 2) in
-    the pixels of both images as the model saw them (Edstedt et al., 2025).
-    """
+    the pixels of both images as the model saw them (Edstedt et al., 2025)."""
 
     def __init__(self, model: Any) -> None:
         self._model, self._sample = model, model.sample
@@ -182,9 +177,7 @@ class RecordedSample:
 
     def take(self, sizes: Sequence[tuple[int, int]]) -> tuple[Array, Array, Array, tuple[Array, Array]]:
         """The last sample: points (N, 2) of both images, overlaps (N,), and precisions (N, 2, 2) in pixels of both.
-
-        sizes: (h, w) of the images. Raises ValueError where nothing was sampled, or without precisions.
-        """
+        sizes: (h, w) of the images. Raises ValueError where nothing was sampled, or without precisions."""
         last, self._last = self._last, None
         if last is None or len(last) != 4 or last[2] is None or last[3] is None:
             raise ValueError("the model sampled no matches with precisions")
@@ -197,12 +190,10 @@ class RecordedSample:
 
 def relative_noise(precision0: Array, precision1: Array) -> Array:
     """The noise of each match, in units of the pair's median, from precision matrices (N, 2, 2), 1 / px^2.
-
     The engine's noise is a standard deviation across an epipolar line. Over all directions n of that line the mean of
     the variance ``n^T C n`` of a covariance C is ``tr(C) / 2``: the noise is the square root of it, averaged over both
     images. (Equal determinants would be too sure of matches along an edge.) Within `MAX_RATIO` of the median; 1 where a
-    precision is no positive matrix.
-    """
+    precision is no positive matrix."""
     variance = (_mean_variance(precision0) + _mean_variance(precision1)) / 2
     valid = np.isfinite(variance)
     if not valid.any():

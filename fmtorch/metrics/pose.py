@@ -10,6 +10,7 @@ from fmtorch.core.checks import checked, expect_sizes
 from fmtorch.geometry.arithmetic import component_sum
 from fmtorch.geometry.epipolar import inverse_root
 from fmtorch.geometry.homography import homography_points
+from fmtorch.geometry.normalize import Matrices
 from fmtorch.geometry.pose import pose_from_fundamental, poses_from_fundamental
 
 Rotations = Float[Tensor, "*#batch 3 3"]
@@ -76,12 +77,12 @@ def pose_error(
 
 @checked
 def fundamental_pose_error(
-    F: Float[Tensor, "*batch 3 3"],
-    K0: Float[Tensor, "*batch 3 3"],
-    K1: Float[Tensor, "*batch 3 3"],
+    F: Matrices,
+    K0: Matrices,
+    K1: Matrices,
     x0: Float[Tensor, "*batch n 2"],
     x1: Float[Tensor, "*batch n 2"],
-    R_gt: Float[Tensor, "*batch 3 3"],
+    R_gt: Matrices,
     t_gt: Float[Tensor, "*batch 3"],
     mask: Bool[Tensor, "*batch n"] | None = None,
     *,
@@ -108,11 +109,7 @@ def fundamental_pose_error(
 
 @checked
 def closest_pose_error(
-    F: Float[Tensor, "*batch 3 3"],
-    K0: Float[Tensor, "*batch 3 3"],
-    K1: Float[Tensor, "*batch 3 3"],
-    R_gt: Float[Tensor, "*batch 3 3"],
-    t_gt: Float[Tensor, "*batch 3"],
+    F: Matrices, K0: Matrices, K1: Matrices, R_gt: Matrices, t_gt: Float[Tensor, "*batch 3"]
 ) -> PoseError:
     """Error of the best of the four poses that F has with known calibrations: that of the smallest sum of both angles.
 

@@ -75,8 +75,7 @@ def mean_recall(nsgd: Float[Tensor, "*batch pairs"], maximum: float = THRESHOLD)
     """
     if not maximum > 0:
         raise ValueError(f"maximum is {maximum}; it must be positive")
-    missed = nsgd.isnan()
-    return (1 - torch.where(missed, maximum, nsgd) / maximum).clamp(0.0, 1.0).mean(-1)
+    return (1 - torch.where(nsgd.isnan(), maximum, nsgd) / maximum).clamp(0.0, 1.0).mean(-1)
 
 
 @checked

@@ -3,8 +3,6 @@
 The domain is where a match is, where it goes and how its frame changes.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Mapping
@@ -33,11 +31,11 @@ class MatchDomain(NamedTuple):
     S: Float[Tensor, "n 2 2"]
     shape: Float[Tensor, "n 5"]
 
-    def take(self, index: Int[Tensor, " m"]) -> MatchDomain:
+    def take(self, index: Int[Tensor, " m"]) -> "MatchDomain":
         """The matches at `index`."""
         return MatchDomain(*(value[index] for value in self))
 
-    def blocks(self) -> list[MatchDomain]:
+    def blocks(self) -> "list[MatchDomain]":
         """The matches in their order, at most BLOCK at a time."""
         return [MatchDomain(*part) for part in zip(*(torch.split(value, BLOCK) for value in self), strict=True)]
 
@@ -125,9 +123,7 @@ def spread_centres(kernel: Float[Tensor, "n n"], count: int) -> Int[Tensor, " m"
 
 def evenly(index: Int[Tensor, " n"], count: int) -> Int[Tensor, " m"]:
     """At most `count` of the indices, evenly along their order."""
-    if len(index) <= count:
-        return index
-    return index[torch.arange(count, device=index.device) * len(index) // count]
+    return index if len(index) <= count else index[torch.arange(count, device=index.device) * len(index) // count]
 
 
 def huber_regression(
@@ -164,8 +160,7 @@ class LikelihoodField:
     least_seeds, so many of the lowest ratio; where they are more than most_seeds, so many of them, evenly.
     candidates, centres: at most so many seeds are looked at for centres, and so many centres are chosen.
     position, displacement, rotation, scale: widths of the Gaussians, see `predictive_gaussians`; unframed_displacement
-    replaces the second where matches have no frames to predict it by.
-    """
+    replaces the second where matches have no frames to predict it by."""
 
     ratio: float = 0.8
     least_seeds: int = 200

@@ -92,9 +92,18 @@ def frame_agreement_kernel(matches: FramedMatches, out: F4x1) -> None:
 
 
 @inner
+def _vote_of(error: Any, length: Any) -> Any:
+    """``(1 + (e / TOLERANCE)^2 / 8)^-8`` of a squared error and what it is relative to."""
+    t = ONE32 + error / (length * length) * SHARPNESS32
+    t = t * t
+    t = t * t
+    return ONE32 / (t * t)
+
+
+@inner
 def _frames_agree(along: Array, k: int, ahead: Array, behind: Array) -> None:
     """For matches i and j = i + k: how well j agrees with i -> ahead[i], i with j -> behind[i]."""
-    noise, sharpness, tiny = NOISE32, SHARPNESS32, MIN_SQUARE32
+    noise, tiny = NOISE32, MIN_SQUARE32
     X0, Y0, X1, Y1, A, B, C, D, S = (
         along[0], along[1], along[2], along[3], along[4], along[5], along[6], along[7], along[8],
     )  # fmt: skip
@@ -106,18 +115,8 @@ def _frames_agree(along: Array, k: int, ahead: Array, behind: Array) -> None:
         own, other = p * p + q * q, r * r + s * s
         error = own if own > other else other
         length0, length1 = math.sqrt(dx * dx + dy * dy + tiny), math.sqrt(ux * ux + uy * uy + tiny)
-        length = length0 * S[i] + length1 + noise
-        t = ONE32 + error / (length * length) * sharpness
-        t = t * t
-        t = t * t
-        t = t * t
-        ahead[i] = ONE32 / t
-        length = length0 * S[j] + length1 + noise
-        t = ONE32 + error / (length * length) * sharpness
-        t = t * t
-        t = t * t
-        t = t * t
-        behind[i] = ONE32 / t
+        ahead[i] = _vote_of(error, length0 * S[i] + length1 + noise)
+        behind[i] = _vote_of(error, length0 * S[j] + length1 + noise)
 
 
 @inner
@@ -276,8 +275,7 @@ def _similarity(rows: Array, orders: Array, along: Array) -> Array:
         index = (IDENTITY - first) % bins
         if merit[index] > best_merit:
             best, best_merit = index, merit[index]
-    similarity: Array = MAPS32[best // turns, best % turns]
-    return similarity
+    return MAPS32[best // turns, best % turns]  # type: ignore[no-any-return]
 
 
 @inner
@@ -325,18 +323,14 @@ def _turn(x: Any, y: Any) -> int:
 @inner
 def _positions_agree(along: Array, k: int, similarity: Array, agree: Array) -> None:
     """How well matches i and i + k agree -> agree[i]."""
-    noise, sharpness, tiny = NOISE32, SHARPNESS32, MIN_SQUARE32
+    noise, tiny = NOISE32, MIN_SQUARE32
     a, b, scale = similarity[0], similarity[1], similarity[2]
     X0, Y0, X1, Y1 = along[0], along[1], along[2], along[3]
     for i in range(along.shape[1] - k):
         dx, dy, ux, uy = X0[i + k] - X0[i], Y0[i + k] - Y0[i], X1[i + k] - X1[i], Y1[i + k] - Y1[i]
         p, q = a * dx - b * dy - ux, b * dx + a * dy - uy
         length = scale * math.sqrt(dx * dx + dy * dy + tiny) + math.sqrt(ux * ux + uy * uy + tiny) + noise
-        t = ONE32 + (p * p + q * q) / (length * length) * sharpness
-        t = t * t
-        t = t * t
-        t = t * t
-        agree[i] = ONE32 / t
+        agree[i] = _vote_of(p * p + q * q, length)
 
 
 def position_agreement(x0: Points, x1: Points, ratio: PerMatch | None, mask: Bool[Tensor, "b n"]) -> PerMatch:
@@ -417,5 +411,4 @@ def _agreement(rows: Float[Tensor, "10 b n"], orders: Int[Tensor, "c b n"]) -> F
     votes = component_sum(torch.cat([votes[..., :WINDOW, :], votes[..., WINDOW + 1 :, :]], -2), -2)  # others' alone
     in_slots = torch.zeros_like(votes).scatter(3, orders.expand(2, -1, -1, -1), votes)
     agreement, total = component_sum(in_slots, 1)
-    share: Tensor = agreement / total.clamp_min(torch.finfo(total.dtype).tiny)
-    return share
+    return agreement / total.clamp_min(torch.finfo(total.dtype).tiny)  # type: ignore[no-any-return]

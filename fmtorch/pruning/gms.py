@@ -208,8 +208,7 @@ def gms(
     x0, x1 in pixels, size0, size1 as (h, w). Matches outside their images' grids are dropped. Masks equal those of
     OpenCV's matchGMS; border="authors" gives those of the authors' code, which drops points in the left and top half
     cells of shifted grids. Time and memory are linear in the number of matches, besides a table of cell pairs. Computed
-    on the CPU. Raises ValueError for sizes that contradict the points of all pairs, such as (w, h).
-    """
+    on the CPU. Raises ValueError for sizes that contradict the points of all pairs, such as (w, h)."""
     options = with_rotation, with_scale, threshold_factor, border
     return _of_each_pair(gms_kernel, torch.bool, (x0, x1), (size0, size1), mask, options)
 

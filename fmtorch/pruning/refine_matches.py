@@ -335,8 +335,7 @@ class RefineMatches:
     least, px. share: the same, of the half side of the match's frame. min_correlation, max_shift (in samples),
     max_deviation (px): see above. floor, slope: the expected distance to the epipolar line of a refined match is
     ``sqrt(floor^2 + (slope s)^2)`` px with s the standard deviation by the normal equations, unexplained: its residuals
-    are not independent. usual: that of an unrefined match of noise one, px. Noise grows with P^(-1/4).
-    """
+    are not independent. usual: that of an unrefined match of noise one, px. Noise grows with P^(-1/4)."""
 
     radius: int
     iterations: int
@@ -409,8 +408,7 @@ class RefineMatches:
         (xx, _, yy), affine = out.covariance[out.refined].T, out.affine[out.refined]
         area = np.abs(affine[:, 0, 0] * affine[:, 1, 1] - affine[:, 0, 1] * affine[:, 1, 0])
         variance = (xx + yy) / (1 + area)
-        noise: Array = np.sqrt(self.floor * self.floor + self.slope * self.slope * variance) / self.usual
-        return noise
+        return np.asarray(np.sqrt(self.floor * self.floor + self.slope * self.slope * variance) / self.usual)
 
     def _doubt(self, prior: Tensor | None, pair: int, index: Tensor) -> Any:
         """P^(-1/4) of these matches."""
@@ -432,8 +430,7 @@ def _frame_maps(lafs0: Array, lafs1: Array) -> tuple[Array, Array]:
 
 def _product(a: Array, b: Array) -> Array:
     """Matrix products (n, 2, 2), in one order of sums."""
-    product: Array = a[:, :, :1] * b[:, :1, :] + a[:, :, 1:] * b[:, 1:, :]
-    return product
+    return a[:, :, :1] * b[:, :1, :] + a[:, :, 1:] * b[:, 1:, :]  # type: ignore[no-any-return]
 
 
 def _array(tensor: Tensor) -> Array:
@@ -442,8 +439,7 @@ def _array(tensor: Tensor) -> Array:
 
 
 def _finite(*arrays: Array) -> Array:
-    finite: Array = np.all([np.isfinite(array).all(tuple(range(1, array.ndim))) for array in arrays], 0)
-    return finite
+    return np.asarray(np.all([np.isfinite(array).all(tuple(range(1, array.ndim))) for array in arrays], 0))
 
 
 def _like(array: Array, tensor: Tensor) -> Tensor:

@@ -198,9 +198,7 @@ def front(
     surfaces: Surfaces, rng: Rng, split: str, foot: Vector, right: Vector, width: Real, height: Real, style: Style
 ) -> int:
     """Builds a front that stands on `foot` (its lower left corner) and returns its texture's number.
-
-    right: horizontal unit vector towards the viewer's right; the front faces right x up, away from the wall.
-    """
+    right: horizontal unit vector towards the viewer's right; the front faces right x up, away from the wall."""
     picture = wall_picture(rng, split, int(height * style.density), int(width * style.density), style.density)
     openings, boards = _paint_openings(picture, rng, width, height, style)
     relief = Relief(surfaces, surfaces.paint(picture), foot, right, width, height)
@@ -292,10 +290,8 @@ def house(
     style: Style, sides: Literal["own", "twin", "same", "plain"] = "own",
 ) -> None:  # fmt: skip
     """A house: `foot` its front left corner, `size` its width, depth and height.
-
     sides: each with a front of its `own`; opposite ones as `twin`s, or all four the `same`, so that they are easily
-    confused; or the last three flat and `plain`, for a house far away.
-    """
+    confused; or the last three flat and `plain`, for a house far away."""
     width, depth, height = size
     back = -np.cross(right, vec(0, 0, 1))
     corners = [foot, foot + right * width, foot + right * width + back * depth, foot + back * depth]

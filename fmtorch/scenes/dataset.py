@@ -48,9 +48,7 @@ KERNELS = (cast_pieces, shade, footprints, affine, group_by_texture)  # that dra
 @dataclasses.dataclass(frozen=True)
 class Plan:
     """How much of a family is drawn: scenes, photographs a scene, pairs a scene, and the images' scale.
-
-    spare: photographs that are drawn too, one at a time, as long as a scene has fewer matchable pairs than wanted.
-    """
+    spare: photographs that are drawn too, one at a time, as long as a scene has fewer matchable pairs than wanted."""
 
     scenes: int
     shots: int
@@ -82,7 +80,6 @@ class Task:
 
 def digest(family: str, split: str, seed: int, plan: Plan) -> str:
     """What defines a family's pictures and pairs, as 64 hex digits.
-
     OpenCV's release is part of it, since it draws the letters on signs and finds the keypoints that choose the pairs.
     """
     release = ".".join(cv2.__version__.split(".")[:2])
@@ -93,12 +90,9 @@ def digest(family: str, split: str, seed: int, plan: Plan) -> str:
 @functools.cache
 def recorded_pairs() -> dict[str, dict[str, dict[str, Any]]]:
     """What the rule for pairs has decided: by digest and scene the number of photographs and the pairs.
-
     Drawn and judged once by ``scripts/record_rendered_pairs.py``; with other versions of the generator or of OpenCV,
-    whose digests are not here, it is judged anew.
-    """
-    record: dict[str, dict[str, dict[str, Any]]] = json.loads(RECORD.read_text(encoding="utf-8"))
-    return record
+    whose digests are not here, it is judged anew."""
+    return json.loads(RECORD.read_text(encoding="utf-8"))  # type: ignore[no-any-return]
 
 
 def seeds(task: Task) -> np.random.SeedSequence:
@@ -128,10 +122,8 @@ def generate_all(
     scenes: Sequence[tuple[Task, Path]], workers: int | None = None, progress: Progress | None = None
 ) -> None:
     """Draws every scene (task, folder) that is missing; `progress` gets (done, total) as scenes are completed.
-
     workers: processes; by default one for each core that this process may use; 1 draws here. Interrupted, it completes
-    the scenes that are being drawn. Raises WorkersLost where workers die.
-    """
+    the scenes that are being drawn. Raises WorkersLost where workers die."""
     missing = [scene for scene in scenes if not (scene[1] / scene[0].name).is_dir()]
     report = progress or (lambda done, total: None)
     done = len(scenes) - len(missing)
@@ -229,11 +221,9 @@ _PHOTOGRAPHS = 48  # whose visible pieces each thread keeps, some 2 MB each
 
 def depth_at(task: Task, number: int, points: Matrix) -> Matrix:
     """Depth (n,) in metres along the axis of photograph `number` of a scene, at points (n, 2) in pixels.
-
     The depth of the plane that the nearest pixel's ray meets first, at the point itself. NaN where that ray meets
     nothing, and outside the photograph. What moves is where it was when this photograph was taken: each shot is cast
-    against the surfaces of its own light. Of a long exposure it is the depth from the camera of the ground truth.
-    """
+    against the surfaces of its own light. Of a long exposure it is the depth from the camera of the ground truth."""
     piece, inverse = _recent.visible(task, number)
     h, w = piece.shape
     column, row = np.round(np.nan_to_num(points, nan=-1.0)).astype(np.int64).T
@@ -278,8 +268,7 @@ class RenderedPairs(HeldPairs):
     plan: replaces the amounts of `size`, for tests.
 
     A pair is kept if more than 20 SIFT matches (ratio 0.8) lie within 1 px of the true epipolar lines in both images,
-    which is the paper's rule. Raises ValueError for an unknown split, size or family.
-    """
+    which is the paper's rule. Raises ValueError for an unknown split, size or family."""
 
     name = "rendered"
 
@@ -320,10 +309,8 @@ class RenderedPairs(HeldPairs):
 
     def depth(self, image: ImageSource, points: Matrix) -> Matrix:
         """Depth (n,) in metres along the optical axis at points (n, 2) of an image; NaN for the sky and outside.
-
         The scene is built anew and its rays are cast, as when it was drawn; the last few images are remembered.
-        Raises KeyError for an image of another data set.
-        """
+        Raises KeyError for an image of another data set."""
         scene, _, number = image.identity.rpartition("/")
         return depth_at(self._tasks[scene], int(number), points)
 
@@ -357,11 +344,9 @@ _FOCAL, _CENTRE, _SHIFT, _BASELINE, _SIZE = 994.978, (311.193, 254.877), 31.086,
 
 class StereoPair(HeldPairs):
     """One rectified pair with dense ground truth: a point (x, y) on the left is (x - disparity, y) on the right.
-
     The three files lie inside scikit-image's wheel, so that nothing is downloaded; FileNotFoundError names the one
     that is absent. root: another folder that holds them.
-    Source: Scharstein et al., High-resolution stereo datasets with subpixel-accurate ground truth, GCPR 2014.
-    """
+    Source: Scharstein et al., High-resolution stereo datasets with subpixel-accurate ground truth, GCPR 2014."""
 
     name = "stereo"
 

@@ -81,10 +81,8 @@ def _structure(surfaces: Surfaces, rng: Rng, split: str) -> float:
     base += 0.6
     if rng.random() < 0.5:  # a dome
         r = 0.36 * min(width, depth)
-        angles = np.linspace(0.1, np.pi / 2, 7)
-        cap = [(0.4 + r * float(np.sin(a)), r * float(np.cos(a)) + 1e-3) for a in angles]
-        profile = [(0.0, r * 1.05), (0.4, r), *cap]
-        surfaces.lathe(vec(0, 0, base), profile, block, sides=16, repeat=(2, 1))
+        cap = [(0.4 + r * float(np.sin(a)), r * float(np.cos(a)) + 1e-3) for a in np.linspace(0.1, np.pi / 2, 7)]
+        surfaces.lathe(vec(0, 0, base), [(0.0, r * 1.05), (0.4, r), *cap], block, sides=16, repeat=(2, 1))
     else:
         buildings.statue(surfaces, rng, vec(0, 0, base), 2.2, stone)
     _boards_and_rocks(surfaces, rng, split, 0.5 * np.hypot(width, depth), block)
@@ -116,9 +114,7 @@ def _mound(surfaces: Surfaces, rng: Rng, texture: int, at: tuple[Real, Real], si
     rim = np.sin(np.linspace(0, np.pi, n))
     z = tall * heights(rng, n, n, 6) * np.outer(rim, rim)
     x, y = np.linspace(-side / 2, side / 2, n) + at[0], np.linspace(side / 2, -side / 2, n) + at[1]
-    points = np.zeros((n, n, 3))
-    points[..., 0], points[..., 1], points[..., 2] = x[None], y[:, None], z
-    surfaces.grid(points, texture, (1, 1))
+    surfaces.grid(np.stack([*np.meshgrid(x, y), z], -1), texture, (1, 1))
 
 
 def surroundings(surfaces: Surfaces, rng: Rng, split: str, near: Real, far: Real, houses: int) -> None:
@@ -257,10 +253,9 @@ def _surroundings(surfaces: Surfaces, rng: Rng, split: str, width: Real) -> None
     ground(surfaces, rng, split, 36)
     leaf, bark = buildings.foliage(surfaces, rng)
     for side in (-1, 1):
-        right = vec(1, 0, 0)
-        foot = vec(side * (width / 2 + 3) - (12 if side < 0 else 0), 4, 0)
-        size = (12, 8, rng.uniform(7, 11))
-        buildings.house(surfaces, rng, split, foot, right, size, Style(density=30, same_windows=0.8), sides="plain")
+        foot, size = vec(side * (width / 2 + 3) - (12 if side < 0 else 0), 4, 0), (12, 8, rng.uniform(7, 11))
+        style = Style(density=30, same_windows=0.8)
+        buildings.house(surfaces, rng, split, foot, vec(1, 0, 0), size, style, sides="plain")
         for _ in range(3):
             at = vec(side * rng.uniform(width / 2 - 3, width / 2 + 8), -rng.uniform(2, 10), 0)
             buildings.tree(surfaces, rng, at, rng.uniform(4, 7), leaf, bark)

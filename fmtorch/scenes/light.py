@@ -21,10 +21,8 @@ _SKY, _UPWARD, _ROOF = np.float32(0.7), np.float32(0.3), np.float32(0.9)
 
 class Seen(NamedTuple):
     """The surfaces that m pixels see: piece (m,), -1 for none, the place s, t (m,) on it, and the pieces' table.
-
     table (n, 3, 8): what is affine in s and t, at the corner and its change along both: texture u, v, shadow map x, y
-    and distance, height, cosine to the sun, upwardness.
-    """
+    and distance, height, cosine to the sun, upwardness."""
 
     piece: I4x1
     s: F4x1
@@ -34,9 +32,7 @@ class Seen(NamedTuple):
 
 class Mapping(NamedTuple):
     """How pictures lie on n pieces: from pixel to texel, homography (n, 7), without the constant column.
-
-    size (n, 2): of the piece's texture in texels. texture (n,): its number.
-    """
+    size (n, 2): of the piece's texture in texels. texture (n,): its number."""
 
     homography: F4x2
     size: F4x2
@@ -45,9 +41,7 @@ class Mapping(NamedTuple):
 
 class Footprints(NamedTuple):
     """Of each pixel (m,) the texels that its filter spans, then their binary logarithm, the pyramid level: `span`.
-
-    foot: -2 x the height above ground, then the exponential of that: how near the ground, from 1 on.
-    """
+    foot: -2 x the height above ground, then the exponential of that: how near the ground, from 1 on."""
 
     span: F4x1
     foot: F4x1
@@ -55,9 +49,7 @@ class Footprints(NamedTuple):
 
 class Picture(NamedTuple):
     """A texture's atlas in a row, see `Texture`, with its width, its channels, the origin and scale (levels, 2).
-
-    Levels end before `coarsest`. to_linear (256,): linear light of 8-bit codes.
-    """
+    Levels end before `coarsest`. to_linear (256,): linear light of 8-bit codes."""
 
     atlas: U1x1
     across: int
@@ -70,10 +62,8 @@ class Picture(NamedTuple):
 
 class Lighting(NamedTuple):
     """Sun and sky: colours (2, 3), and a map of the distances that the sun reaches, shadow.
-
     The map is looked up `shift` pixels beside; what is farther by less than `bias` is lit. ground_shade: how much
-    darker the foot of a wall is.
-    """
+    darker the foot of a wall is."""
 
     colours: F4x2
     shadow: F4x2
@@ -96,9 +86,7 @@ def affine(seen: Seen, column: int, out: F4x1) -> None:
 @kernel(always_compiled=True)
 def footprints(seen: Seen, width: int, mapping: Mapping, out: Footprints, count: I8x1) -> None:
     """What is known of each pixel before transcendental functions are taken -> out.
-
-    width: of the rows of pixels. count: pixels of each texture, added to.
-    """
+    width: of the rows of pixels. count: pixels of each texture, added to."""
     piece, s, t, table = seen
     homography, size, texture = mapping
     side, foot = out
@@ -137,10 +125,8 @@ def group_by_texture(piece: I4x1, texture: I4x1, begin: I8x1, index: I4x1) -> No
 @inner
 def _code(atlas: Pixels, corner: Index, beside: Index, below: Index, right: Number, down: Number) -> np.uint64:
     """One channel of a picture between four texels, rounded to 8 bits, as `cv2.remap` does.
-
     corner: place of the first texel's value; beside, below: how far on the next ones' are. Unsigned, as are colours:
-    numba looks at signed places whether they count from the end.
-    """
+    numba looks at signed places whether they count from the end."""
     a, b = np.float32(atlas[corner]), np.float32(atlas[corner + beside])
     c, d = np.float32(atlas[corner + below]), np.float32(atlas[corner + below + beside])
     left, farther = fused(a, right, b - a), fused(c, right, d - c)
@@ -313,9 +299,7 @@ class Stage:
 
 def expose(stage: Stage, cameras: Sequence[Camera], lens: Lens, rng: np.random.Generator) -> Pixels:
     """The photograph (h, w, 3), or (h, w) if grey: the mean over the rays of a pixel and the exposure time.
-
-    cameras: where the camera is during the exposure, four or more moments; one camera stands still.
-    """
+    cameras: where the camera is during the exposure, four or more moments; one camera stands still."""
     moments = list(cameras) if len(cameras) > 1 else [cameras[0]] * len(SAMPLES)
     linear = np.zeros((*cameras[0].size, 3), dtype=np.float32)
     for i, camera in enumerate(moments):
@@ -364,9 +348,7 @@ class Shot:
 @dataclasses.dataclass(frozen=True, eq=False)
 class DrawnScene:
     """Surfaces (one list for each light: what moves is not in all of them), lights, a sky, shots, candidate pairs.
-
-    pairs: the pairs to try, most wanted first.
-    """
+    pairs: the pairs to try, most wanted first."""
 
     surfaces: Sequence[Surfaces]
     lights: Sequence[Light]

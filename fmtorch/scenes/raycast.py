@@ -26,9 +26,7 @@ Matrix = NDArray[np.float64]
 @dataclasses.dataclass(frozen=True, eq=False)
 class Camera:
     """A pinhole: ``x ~ K (R X + t)``, pixels (x, y) with (0, 0) at the centre of the first pixel; size (h, w).
-
-    World units are metres with z upwards; camera axes are OpenCV's (x right, y down, z forward).
-    """
+    World units are metres with z upwards; camera axes are OpenCV's (x right, y down, z forward)."""
 
     K: Matrix
     R: Matrix
@@ -62,9 +60,8 @@ def scaled_camera(
 ) -> tuple[Matrix, tuple[int, int]]:
     """K and the size (h, w) of an image of a camera, in pixels, that is scaled."""
     scaled = round(size[0] * scale), round(size[1] * scale)
-    return calibration(
-        focal * scale, scaled, None if centre is None else (centre[0] * scale, centre[1] * scale)
-    ), scaled
+    middle = None if centre is None else (centre[0] * scale, centre[1] * scale)
+    return calibration(focal * scale, scaled, middle), scaled
 
 
 def look_at(
@@ -93,10 +90,8 @@ _LOW, _HIGH = np.float32(-SEAM), np.float32(1 + SEAM)  # of s and t, exclusive
 
 class Pieces(NamedTuple):
     """n pieces as one camera sees them, and the order (k,) in which rays are cast against some of them, nearest first.
-
     boxes (n, 4): pixels x0, y0, x1, y1, end excluded. forms (n, 3, 3): of a pixel of the box, s z^-1, t z^-1, z^-1.
-    depth (n, 3): along U, along V, at O. closest (n,): no point is nearer. triangle (n,).
-    """
+    depth (n, 3): along U, along V, at O. closest (n,): no point is nearer. triangle (n,)."""
 
     order: I8x1
     boxes: I8x2
@@ -108,10 +103,8 @@ class Pieces(NamedTuple):
 
 class Cutouts(NamedTuple):
     """Where pieces have holes.
-
     place (n, 2): where the picture with holes begins in `opacity`, and its row length; -1: without holes. window
-    (n, 10): u at O, along U, along V; v likewise; the picture's origin x, y and size x, y. opacity: of all pictures.
-    """
+    (n, 10): u at O, along U, along V; v likewise; the picture's origin x, y and size x, y. opacity: of all pictures."""
 
     place: I8x2
     window: F4x2
@@ -239,11 +232,9 @@ class Geometry:
         skip: NDArray[np.bool_] | None = None,
     ) -> Hits:  # fmt: skip
         """Rays of all pixels of a projection P (3, 4), perspective or (last row 0 0 0 1) orthographic.
-
         depth: (4,), the affine function of the world by which the nearer of two pieces is known.
         centre: where a perspective camera stands, for leaving out the backs of pieces; None keeps them.
-        skip: pieces (n,) to look through.
-        """
+        skip: pieces (n,) to look through."""
         h, w = size
         G = np.stack([self.U @ P[:, :3].T, self.V @ P[:, :3].T, self.O @ P[:, :3].T + P[:, 3]], axis=2)
         usable = np.abs(np.linalg.det(G)) > 1e-14
@@ -294,17 +285,6 @@ class Geometry:
         shift = np.array([[1.0, 0.0, -offset[0]], [0.0, 1.0, -offset[1]], [0.0, 0.0, 1.0]])
         depth = np.append(camera.R[2], camera.t[2])
         return self.cast(shift @ camera.P, depth, camera.size, camera.centre)
-
-    def depth_map(self, camera: Camera) -> Matrix:
-        """Depth (h, w) along the camera's axis at the pixel centres, in float64, infinite where nothing is hit."""
-        hits = self.look(camera)
-        h, w = camera.size
-        y, x = np.mgrid[:h, :w].astype(np.float64)
-        row = hits.inverse[hits.piece, 2]
-        inverse_depth = np.where(hits.piece >= 0, row[..., 0] * x + row[..., 1] * y + row[..., 2], 0.0)
-        with np.errstate(divide="ignore"):
-            depth: Matrix = 1.0 / inverse_depth
-        return depth
 
     def detail(self, i: int, box: tuple[int, int]) -> float:
         """The pyramid level at which the opacity of a piece is looked up, whose bounding box has these sides."""

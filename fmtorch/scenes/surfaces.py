@@ -35,10 +35,8 @@ def to_pixels(picture: Floats) -> Pixels:
 
 class Texture:
     """A picture (h, w, 3) or, with opacity, (h, w, 4), sRGB in 8 bits; it repeats in both directions.
-
     Levels are halved in linear light, so that a surface keeps its brightness with distance; opacity is carried along.
-    Raises ValueError for a picture that cannot be halved.
-    """
+    Raises ValueError for a picture that cannot be halved."""
 
     def __init__(self, picture: Pixels) -> None:
         h, w = picture.shape[:2]
@@ -149,11 +147,9 @@ _FLAT = np.full(9, np.nan)  # stands for the normals of a flat piece until they 
 
 class Surfaces:
     """A growing list of flat pieces: a corner O and edges U, V; their points are ``O + s U + t V``.
-
     s and t are in [0, 1]; in a triangle also s + t <= 1.
     Texture coordinates and normals are affine in (s, t), so that curved shapes can be shaded smoothly. The outside of a
-    piece is where ``V x U`` points: seen from there, U goes right and V down, as in the picture on it.
-    """
+    piece is where ``V x U`` points: seen from there, U goes right and V down, as in the picture on it."""
 
     def __init__(self) -> None:
         self.textures: list[Texture] = []
@@ -233,10 +229,8 @@ class Surfaces:
         radius = np.repeat(steps[:, 1:2], sides + 1, axis=1)
         if bumps is not None:
             radius = radius * (1 + np.concatenate([bumps, bumps[:, :1]], axis=1))
-        points = np.zeros((len(steps), sides + 1, 3))
-        points[..., :2] = ring[None] * radius[..., None]
-        points[..., 2] = steps[:, :1]
-        self.grid(points + base, texture, repeat)
+        height = np.repeat(steps[:, :1], sides + 1, axis=1)
+        self.grid(np.dstack([ring[None] * radius[..., None], height]) + base, texture, repeat)
 
     def copy(self) -> "Surfaces":
         """A list of its own with the same pieces and textures, to which more can be added."""

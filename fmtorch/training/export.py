@@ -6,6 +6,7 @@ comes from and how good it is.
 
 import contextlib
 import copy
+import dataclasses
 import hashlib
 import importlib.util
 import json
@@ -22,7 +23,8 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from fmtorch import metrics
-from fmtorch.core import Estimator, files
+from fmtorch.core.files import replacing
+from fmtorch.core.stages import Estimator
 from fmtorch.metrics.recall import FINE_THRESHOLD
 from fmtorch.pruning.networks import layers, learned
 from fmtorch.training.labelled import LabelledMatches
@@ -30,10 +32,10 @@ from fmtorch.training.objective import classification_loss
 
 MAX_TEMPERATURE = 100.0  # and its inverse: bounds where the labels set none, as when they are perfectly separated
 BISECTIONS = 50  # halvings of the interval of log temperature: 9.2 / 2^50
-BINS = 10  # of predicted probabilities
 
 
-class Use(NamedTuple):
+@dataclasses.dataclass(frozen=True, eq=False)
+class Use:
     """One way of using P(inlier) before an estimator.
     threshold: matches with a smaller P are dropped and no prior is given; None: all are kept, with P as their prior."""
 
@@ -41,7 +43,8 @@ class Use(NamedTuple):
     threshold: float | None = None
 
 
-class Evaluation(NamedTuple):
+@dataclasses.dataclass(frozen=True, eq=False)
+class Evaluation:
     """Figures by name, and the log-odds and labels of all labelled matches, from which a temperature is fitted."""
 
     figures: dict[str, float]
@@ -51,15 +54,21 @@ class Evaluation(NamedTuple):
 
 class Validation:
     """Evaluates a network on labelled matches of single pairs.
-    pairs: batches of one. uses: by name; each gives recall at NSGD 0.05 and 0.01 and AUC@0.05, the area under the
-    recall curve to 0.05. families: of the pairs; where given, AUC@0.05 of each family is a figure of its own."""
+
+    Args:
+        pairs: batches of one.
+        uses: by name; each gives recall at NSGD 0.05 and 0.01 and AUC@0.05, the area under the recall curve to 0.05.
+        families: of the pairs; where given, AUC@0.05 of each family is a figure of its own.
+        seed: of sampling and of NSGD.
+    """
 
     def __init__(
-        self, pairs: Sequence[LabelledMatches], uses: Mapping[str, Use], families: Sequence[str] | None = None
-    ) -> None:
+        self, pairs: Sequence[LabelledMatches], uses: Mapping[str, Use], families: Sequence[str] | None = None,
+        seed: int = 0,
+    ) -> None:  # fmt: skip
         if not pairs:
             raise ValueError("validation needs at least one pair; see validation.scenes and validation.roots")
-        self.pairs, self.uses = list(pairs), dict(uses)
+        self.pairs, self.uses, self.seed = list(pairs), dict(uses), seed
         self.families = list(families) if families is not None else [""] * len(self.pairs)
 
     @torch.no_grad()
@@ -82,7 +91,7 @@ class Validation:
         label = torch.cat([pair.label[mask] for pair, mask in zip(self.pairs, labelled, strict=True)])
         figures = {"log_loss": float(classification_loss(logit[None], label[None])), **_classified(logit, label)}
         for name, values in nsgd.items():
-            figures |= {f"{name}/{figure}": value for figure, value in self._recalls(values).items()}
+            figures |= self._recalls(name, values)
         return Evaluation(figures, logit, label)
 
     def _nsgd(self, use: Use, logits: Sequence[Tensor]) -> Tensor:
@@ -94,20 +103,22 @@ class Validation:
                 c = c.replace(prior=p.to(c.x0.dtype))
             else:
                 c = c.keep(p >= use.threshold).compact()
-            estimate = use.estimator(c)
+            estimate = use.estimator(c, self.seed)
             assert c.size0 is not None
             assert c.size1 is not None
-            error = metrics.nsgd(pair.F, estimate.F.to(torch.float64), c.size0, c.size1, key=c.keys)
+            error = metrics.nsgd(pair.F, estimate.F.to(torch.float64), c.size0, c.size1, seed=self.seed, key=c.keys)
             values.append(torch.where(estimate.ok, error, 1.0))
         return torch.cat(values)
 
-    def _recalls(self, nsgd: Tensor) -> dict[str, float]:
-        fine = float(metrics.recall(nsgd, FINE_THRESHOLD))
-        figures = {"recall@0.05": float(metrics.recall(nsgd)), "recall@0.01": fine}
-        figures["AUC@0.05"] = float(metrics.mean_recall(nsgd))
+    def _recalls(self, name: str, nsgd: Tensor) -> dict[str, float]:
+        figures = {
+            f"{name}/recall@0.05": float(metrics.recall(nsgd)),
+            f"{name}/recall@0.01": float(metrics.recall(nsgd, FINE_THRESHOLD)),
+            f"{name}/AUC@0.05": float(metrics.mean_recall(nsgd)),
+        }
         for family in sorted(set(self.families) - {""}):
             mine = torch.tensor([f == family for f in self.families])
-            figures[f"AUC@0.05/{family}"] = float(metrics.mean_recall(nsgd[mine]))
+            figures[f"{name}/AUC@0.05/{family}"] = float(metrics.mean_recall(nsgd[mine]))
         return figures
 
 
@@ -137,11 +148,18 @@ class Reliability(NamedTuple):
 
 def temperature(logit: Float[Tensor, "*matches"], label: Int8[Tensor, "*matches"]) -> float:
     """The T that minimises the mean cross-entropy of the logits divided by T (Guo et al., ICML 2017, section 4.2).
+
     The loss is convex in 1 / T; the root of its derivative is found by bisection. Nothing else is fitted, so the order
-    of the matches stays as it is, and so does the decision at probability one half. T is between 1 / MAX_TEMPERATURE
-    and MAX_TEMPERATURE: at a bound where the best T lies beyond, as when the logits separate the classes; 1 where there
-    is no labelled match or every logit is zero. logit: predicted log-odds of validation matches, of any shape. label: 1
-    inlier, 0 outlier, -1 ignored."""
+    of the matches stays as it is, and so does the decision at probability one half.
+
+    Args:
+        logit: predicted log-odds of validation matches, of any shape.
+        label: 1 inlier, 0 outlier, -1 ignored.
+
+    Returns:
+        T, between 1 / MAX_TEMPERATURE and MAX_TEMPERATURE: at a bound where the best T lies beyond, as when the logits
+        separate the classes. 1 where there is no labelled match or every logit is zero.
+    """
     labelled = label >= 0
     z = logit.detach()[labelled].to(torch.float64)
     target = (label[labelled] > 0).to(torch.float64)
@@ -162,19 +180,33 @@ def temperature(logit: Float[Tensor, "*matches"], label: Int8[Tensor, "*matches"
     return math.exp((low + high) / 2)
 
 
-def reliability(probability: Float[Tensor, "*matches"], label: Int8[Tensor, "*matches"]) -> Reliability:
-    """Predicted probabilities against observed shares of inliers, over ten bins from 0 to 1, float64.
-    probability: that a match is an inlier, of any shape; 1 falls in the last bin. label: 1 inlier, 0 outlier, -1
-    ignored."""
+def reliability(
+    probability: Float[Tensor, "*matches"], label: Int8[Tensor, "*matches"], *, bins: int = 10
+) -> Reliability:
+    """Predicted probabilities against observed shares of inliers.
+
+    Args:
+        probability: that a match is an inlier, of any shape.
+        label: 1 inlier, 0 outlier, -1 ignored.
+        bins: of equal width from 0 to 1; a probability of 1 falls in the last.
+
+    Returns:
+        The table and the expected calibration error, float64.
+
+    Raises:
+        ValueError: bins is less than 1.
+    """
+    if bins < 1:
+        raise ValueError(f"bins is {bins}; it must be at least 1")
     labelled = label >= 0
     p = probability.detach()[labelled].to(torch.float64)
     target = (label[labelled] > 0).to(torch.float64)
-    index = (p * BINS).long().clamp(0, BINS - 1)
-    count = torch.bincount(index, minlength=BINS)
-    sums = [torch.bincount(index, weights=x, minlength=BINS) for x in (p, target)]
+    index = (p * bins).long().clamp(0, bins - 1)
+    count = torch.bincount(index, minlength=bins)
+    sums = [torch.bincount(index, weights=x, minlength=bins) for x in (p, target)]
     predicted, observed = (s / count for s in sums)
     error = float((sums[0] - sums[1]).abs().sum() / count.sum())
-    edges = torch.linspace(0, 1, BINS + 1, dtype=torch.float64, device=p.device)
+    edges = torch.linspace(0, 1, bins + 1, dtype=torch.float64, device=p.device)
     return Reliability(edges, count, predicted, observed, error)
 
 
@@ -197,7 +229,7 @@ def save_weights(
     inference. notes: what else the file is to say."""
     path.parent.mkdir(parents=True, exist_ok=True)
     state = {key: value.detach().cpu().contiguous() for key, value in network.state_dict().items()}
-    with files.replacing(path) as unfinished:
+    with replacing(path) as unfinished:
         save_file(state, unfinished, metadata=_metadata(network, temperature, notes))
 
 
@@ -218,7 +250,7 @@ def export_onnx(network: nn.Module, path: Path, *, temperature: float = 1.0) -> 
     model = onnx_model(alone, example, learned.INPUT, learned.OUTPUT, free_axis=2)
     onnx.helper.set_model_props(model, _metadata(network, temperature, None))
     path.parent.mkdir(parents=True, exist_ok=True)
-    with files.replacing(path) as unfinished, torch.no_grad():
+    with replacing(path) as unfinished, torch.no_grad():
         onnx.save(model, unfinished)
         x = torch.rand(1, network.input_channels, 3 * EXAMPLE_MATCHES)
         slots = layers.Slots(torch.tensor([float(x.shape[2])]), None)
@@ -277,8 +309,10 @@ def _metadata(network: nn.Module, temperature: float, notes: Mapping[str, str] |
 
 def forget_origin(model: Any) -> None:
     """Clear the notes and properties of a model's graph, of its nodes and values, and of the graphs within them."""
-    for part in (model.graph, *(node for function in model.functions for node in function.node)):
-        _forget(part)
+    _forget(model.graph)
+    for function in model.functions:
+        for node in function.node:
+            _forget(node)
 
 
 def _forget(part: Any) -> None:
@@ -292,7 +326,8 @@ def _forget(part: Any) -> None:
                 _forget(inner)
 
 
-class Result(NamedTuple):
+@dataclasses.dataclass(frozen=True, eq=False)
+class Result:
     """A finished training: files, figures and the temperature of its log-odds."""
 
     files: tuple[Path, ...]
@@ -310,16 +345,17 @@ def write_result(
     network = network.to("cpu").eval()
     evaluation = validation(network)
     fitted = temperature(evaluation.logit, evaluation.label)
-    written = [folder / f"{name}.safetensors"]
-    save_weights(network, written[0], temperature=fitted)
+    files = [folder / f"{name}.safetensors"]
+    save_weights(network, files[0], temperature=fitted)
     if isinstance(network, learned.Exportable) and importlib.util.find_spec("onnxscript") is not None:
-        written.append(folder / f"{name}.onnx")
-        export_onnx(network, written[-1], temperature=fitted)
+        files.append(folder / f"{name}.onnx")
+        export_onnx(network, files[-1], temperature=fitted)
     card = folder / f"{name}.md"
-    files.write_whole(card, model_card(written, facts, evaluation, fitted))
-    figures = {**evaluation.figures, "temperature": fitted}
-    files.write_whole(folder / "validation.json", json.dumps(figures, indent=2) + "\n")
-    return Result((*written, card), evaluation, fitted)
+    with replacing(card) as temporary:
+        temporary.write_text(model_card(files, facts, evaluation, fitted), encoding="utf-8")
+    with replacing(folder / "validation.json") as temporary:
+        temporary.write_text(json.dumps({**evaluation.figures, "temperature": fitted}, indent=2) + "\n")
+    return Result((*files, card), evaluation, fitted)
 
 
 def model_card(files: Sequence[Path], facts: Mapping[str, Any], evaluation: Evaluation, temperature: float) -> str:

@@ -81,12 +81,19 @@ def _geometry(access: oanet.RandomAccess, key: str) -> tuple[oanet.Cameras, Matr
 
 class OANetPairs(StoredMatches):
     """The labelled matches of files of OANet's layout; each item is a batch of one pair, as of `StoredMatches`.
+
     A file is opened by each process for itself, and a pair is read when it is asked for. `pairs` says nothing of how
-    many inliers there are. Coordinates are pixels: networks and losses with coordinates=K have the file's own. root: a
-    file, or a folder of some; each is a scene. labels: geodesic: a match is an inlier where the first column of ``ys``
-    is below 1e-4 (OANet); pixels: by its distance to the epipolar lines, as of `MatchedPairs`. before: pruners whose
-    matches alone are given, each a function of correspondences. augmentation, seed: as of `StoredMatches`. Raises
-    DataError, naming the file, for a file that is missing, damaged, empty or of another layout."""
+    many inliers there are. Coordinates are pixels: networks and losses with coordinates=K have the file's own.
+
+    Args:
+        root: a file, or a folder of some; each is a scene.
+        labels: geodesic: a match is an inlier where the first column of ``ys`` is below 1e-4 (OANet); pixels: by its
+            distance to the epipolar lines, as of `MatchedPairs`.
+        before: pruners whose matches alone are given, each a function of correspondences.
+        augmentation, seed: as of `StoredMatches`.
+
+    Raises DataError, naming the file, for a file that is missing, damaged, empty or of another layout.
+    """
 
     def __init__(
         self, root: str | Path, *, labels: labelled.Rule = "geodesic",

@@ -77,16 +77,33 @@ def fits(
     return eight_point(x0, x1, prediction.weight.to(torch.float64), c.mask.expand(prediction.weight.shape))
 
 
-def classification_loss(logit: Float[Tensor, "*stages b n"], label: Int8[Tensor, "*#stages b n"]) -> Float[Tensor, ""]:
+def classification_loss(
+    logit: Float[Tensor, "*stages b n"], label: Int8[Tensor, "*#stages b n"], *, balanced: bool = False
+) -> Float[Tensor, ""]:
     """Cross-entropy of labelled matches: the mean over the matches of each pair, then over pairs, then over stages.
-    In nats. Without class balance (unlike Yi et al., CVPR 2018) its optimum is the calibrated log-odds that a match is
-    an inlier, under the pair's own mixture of classes. Its gradient with respect to a logit is at most 1; a pair with
-    one class only is judged by it. logit: log-odds that a match is an inlier, of one or more stages. label: 1 inlier, 0
-    outlier, -1 ignored, also in masked slots; the same for all stages, or of each."""
+
+    Without class balance its optimum is the calibrated log-odds that a match is an inlier. With it (Yi et al., CVPR
+    2018) both classes of a pair count equally and the log-odds of its share of inliers are taken off the logit
+    first, so that the optimum is the same: the logit stays the log-odds under the pair's own mixture of classes.
+
+    Args:
+        logit: log-odds that a match is an inlier, of one or more stages.
+        label: 1 inlier, 0 outlier, -1 ignored, also in masked slots; the same for all stages, or of each.
+        balanced: whether both classes of a pair count equally.
+
+    Returns:
+        The loss in nats. Its gradient with respect to a logit is at most 1; a pair with one class only is judged by it.
+    """
     labelled = label >= 0
     logit = torch.where(labelled, logit.to(torch.promote_types(logit.dtype, torch.float32)), 0.0)
     target = (label > 0).to(logit.dtype)
     weight = labelled.to(logit.dtype)
+    if balanced:
+        # One more of each class, in weights and log-odds alike, keeps the optimum and serves pairs of one class.
+        inliers = arithmetic.stable_sum(target)[..., None] + 1
+        outliers = arithmetic.stable_sum(weight - target)[..., None] + 1
+        logit = torch.where(labelled, logit - (inliers / outliers).log(), 0.0)
+        weight = weight * torch.where(label > 0, 1 / inliers, 1 / outliers)
     total = arithmetic.stable_sum(weight)
     weight = weight / torch.where(total > 0, total, 1.0)[..., None]
     entropy = torch.nn.functional.softplus(logit) - target * logit
@@ -108,15 +125,28 @@ def geometric_loss(
     key: Int[Tensor, " b"] | None = None,
 ) -> Float[Tensor, ""]:
     """Squared symmetric epipolar distance of virtual points of the true geometry, clamped, in normalised coordinates.
+
     The sum of the two squared point-to-line distances (Hartley & Zisserman, eq. 11.10) of `virtual_points`, at most
-    `limit`; the mean over the points of each pair, then over pairs, then over stages (Ranftl & Koltun, ECCV 2018,
-    section 3.3; squared and with these limits as in the code of Zhang et al., OANet, ICCV 2019). Beyond the limit a
-    point has no gradient. F_est: estimates in pixels, of any scale, of one or more stages. F_true: true matrices in
-    pixels, of any scale. size0, size1: image sizes as (h, w), pixels. K0, K1: calibrations. With both, distances are in
-    focal lengths; without, in half longer sides of the images. valid: False for estimates to leave out; those that are
-    zero or not finite are left out anyway. limit: clamp, in squared units of the normalised coordinates; by default
-    LIMIT_E with calibration, else LIMIT_F. points: virtual points for each pair. seed, key: the pairs' keys, which
-    select their virtual points. Raises ValueError where only one of K0 and K1 is given, or points is less than 1."""
+    `limit`; the mean over the points of each pair, then over pairs, then over stages (Ranftl & Koltun, ECCV
+    2018, section 3.3; squared and with these limits as in the code of Zhang et al., OANet, ICCV 2019). Beyond the
+    limit a point has no gradient.
+
+    Args:
+        F_est: estimates in pixels, of any scale, of one or more stages.
+        F_true: true fundamental matrices in pixels, of any scale.
+        size0, size1: image sizes as (h, w), pixels.
+        K0, K1: calibrations. With both, distances are in focal lengths; without, in half longer sides of the images.
+        valid: False for estimates to leave out; those that are zero or not finite are left out anyway.
+        limit: clamp, in squared units of the normalised coordinates; by default LIMIT_E with calibration, else LIMIT_F.
+        points: virtual points for each pair.
+        seed, key: the pairs' keys, which select their virtual points.
+
+    Returns:
+        The loss, between 0 and the limit.
+
+    Raises:
+        ValueError: only one of K0 and K1 is given, or points is less than 1.
+    """
     if (K0 is None) != (K1 is None):
         raise ValueError("only one of K0 and K1 is given; the loss needs both, or neither")
     limit = (LIMIT_F if K0 is None else LIMIT_E) if limit is None else limit
@@ -149,11 +179,22 @@ def nsgd_loss(
     key: Int[Tensor, " b"] | None = None,
 ) -> Float[Tensor, ""]:
     """The benchmark's own figure as a loss: NSGD without its cap (`fmtorch.metrics.nsgd`), mean over pairs and stages.
-    In image diagonals. A pair none of whose draws is accepted, since the lines of one matrix miss the image, counts 1
-    and has no gradient: train with another loss beside this one. F_est, F_true, size0, size1, valid: as of
-    `geometric_loss`. limit: clamp of a pair's figure, beyond which it has no gradient; None: no clamp. samples:
-    accepted draws for each pair. seed, key: the pairs' keys, which select their draws. Raises ValueError where samples
-    is less than 1."""
+
+    A pair none of whose draws is accepted, since the lines of one matrix miss the image, counts 1 and has no gradient:
+    train with another loss beside this one.
+
+    Args:
+        F_est, F_true, size0, size1, valid: as of `geometric_loss`.
+        limit: clamp of a pair's figure, in image diagonals, beyond which it has no gradient; None: no clamp.
+        samples: accepted draws for each pair.
+        seed, key: the pairs' keys, which select their draws.
+
+    Returns:
+        The loss in image diagonals.
+
+    Raises:
+        ValueError: samples is less than 1.
+    """
     valid = _valid_models(F_est, valid)
     F = torch.where(valid[..., None, None], F_est.to(torch.float64), 0.0)
     value = nsgd(F_true.to(torch.float64), F, size0, size1, samples=samples, seed=seed, key=key, cap=False)
@@ -179,12 +220,25 @@ def virtual_points(
     key: Int[Tensor, " b"] | None = None,
 ) -> VirtualPoints:
     """Points of image 0 and, on their epipolar lines, points of image 1, each inside its image; without gradients.
+
     A point is drawn uniformly in image 0, its partner uniformly on the part of its line inside image 1, as NSGD draws
     them (see `fmtorch.metrics.nsgd`). Published losses move a regular grid onto the geometry instead (Ranftl & Koltun,
-    ECCV 2018, section 3.3; Zhang et al., OANet, ICCV 2019), which puts some of the points outside the images. F: true
-    matrices in pixels, of any scale. size0, size1: image sizes as (h, w), pixels. count: slots for each pair; there are
-    fewer points where fewer than one in TRIES lines meets image 1, and none where F is zero or not finite. seed, key:
-    select the draws; the pairs' keys, 0 for all where None. Raises ValueError where count is less than 1."""
+    ECCV 2018, section 3.3; Zhang et al., OANet, ICCV 2019), which puts some of the points outside the images.
+
+    Args:
+        F: true fundamental matrices in pixels, of any scale.
+        size0, size1: image sizes as (h, w), pixels.
+        count: points for each pair.
+        seed: of the draws, a function of (seed, key).
+        key: the pairs' keys; 0 for all where None.
+
+    Returns:
+        `count` slots for each pair. There are fewer points where fewer than one in TRIES lines meets image 1, and none
+        where F is zero or not finite.
+
+    Raises:
+        ValueError: count is less than 1.
+    """
     if count < 1:
         raise ValueError(f"count is {count}; it must be at least 1")
     F = F.detach().to(torch.float64)

@@ -116,12 +116,19 @@ class Draw(NamedTuple):
 
 class StoredMatches(Dataset[LabelledMatches]):
     """The labelled matches in a folder that `MatchedPairs` has filled; each item is a batch of one pair.
+
     Files are mapped into memory and opened by each process for itself, so the data set can be handed to the workers of
     a DataLoader, forked or spawned. Pairs that failed are left out, with a warning; `failures` holds their identities
     and reasons. `pairs` says of each item what its key, identity, family and scene are, and how many matches, inliers
-    and outliers it has on disk. folder: holds ``shard-*.arrow``. augmentation: random changes of each item, selected by
-    `seed`, the pair's key and the epoch (`set_epoch`, or an index that is a `Draw`). Raises ValueError where the folder
-    has no such files or every pair failed, ShardError for a damaged file."""
+    and outliers it has on disk.
+
+    Args:
+        folder: holds ``shard-*.arrow``.
+        augmentation: random changes of each item, selected by `seed`, the pair's key and the epoch (`set_epoch`, or an
+            index that is a `Draw`).
+
+    Raises ValueError where the folder has no such files or every pair failed, ShardError for a damaged file.
+    """
 
     def __init__(self, folder: str | Path, *, augmentation: Augmentation | None = None, seed: int = 0) -> None:
         self.folder = Path(folder)
@@ -229,9 +236,15 @@ class StoredMatches(Dataset[LabelledMatches]):
 
 def split_scenes(matches: StoredMatches, last: int = 4) -> tuple[StoredMatches, StoredMatches]:
     """Pairs for training, and those of the last scenes of each family, by name, for validation.
+
     The splits of a data set share neither scene nor pair. The rendered training scenes share a few photographs, which
-    hang on walls of both parts. matches: of several scenes a family. last: scenes of each family for validation. Raises
-    ValueError for a family that has no more scenes than that."""
+    hang on walls of both parts.
+
+    Args:
+        matches: of several scenes a family. last: scenes of each family for validation.
+
+    Raises ValueError for a family that has no more scenes than that.
+    """
     scenes = [(about["family"], about["scene"]) for about in matches.pairs]
     for family, count in Counter(family for family, _ in dict.fromkeys(scenes)).items():
         if count <= last:
@@ -264,14 +277,21 @@ _POOL = 8  # batches that are sorted by length together: more make lengths more 
 
 class SimilarLengthBatches(Sampler[list[Draw]]):
     """Each pair once an epoch, in random batches of similar lengths: a ``batch_sampler`` for torch's DataLoader.
+
     Pairs are shuffled, sorted by length within pools of a few batches, and the batches shuffled. Every batch draws one
     number of matches that its pairs are cut to, so that padding is due to shorter pairs only; `collate_trimmed` bounds
     it. All is a function of (seed, epoch): after `set_epoch` the batches are those of an uninterrupted training, and
     `start` leaves out those that it has seen. The epoch travels with each item, so that workers of a DataLoader, also
-    persistent ones, need not be told. dataset: `MatchedPairs`. batch: pairs in a batch; the last one of an epoch may be
-    smaller. seed: selects the batches. matches: range of the number of matches, uniform in its logarithm; None: no
-    limit. rank, world_size: of this process in a distributed training; each has as many batches, where need be some of
-    the first ones twice. Raises ValueError for a batch below 1, and for a rank that is not below world_size."""
+    persistent ones, need not be told.
+
+    Args:
+        dataset: `MatchedPairs`. batch: pairs in a batch; the last one of an epoch may be smaller.
+        seed: selects the batches. matches: range of the number of matches, uniform in its logarithm; None: no limit.
+        rank, world_size: of this process in a distributed training; each has as many batches, where need be some of
+            the first ones twice.
+
+    Raises ValueError for a batch below 1, and for a rank that is not below world_size.
+    """
 
     def __init__(
         self, dataset: StoredMatches, batch: int = 32, *, seed: int = 0, matches: Sequence[int] | None = (50, 4000),

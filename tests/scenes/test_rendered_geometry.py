@@ -26,11 +26,12 @@ def camera(
 
 def points_seen(geometry: Geometry, camera: scenes.Camera) -> tuple[np.ndarray, np.ndarray]:
     """Pixels (n, 2) whose ray meets a surface, and the world points (n, 3) that they see, exactly."""
-    depth = geometry.depth_map(camera)
-    y, x = np.nonzero(np.isfinite(depth))
-    pixel = np.stack([x, y], -1).astype(np.float64)
-    rays = np.column_stack([pixel, np.ones(len(pixel))]) @ np.linalg.inv(camera.K).T
-    return pixel, (rays * depth[y, x, None] - camera.t) @ camera.R
+    hits = geometry.look(camera)
+    y, x = np.nonzero(hits.piece >= 0)
+    homogeneous = np.column_stack([x, y, np.ones(len(x))])
+    depth = 1 / (hits.inverse[hits.piece[y, x], 2] * homogeneous).sum(1)
+    rays = homogeneous @ np.linalg.inv(camera.K).T
+    return homogeneous[:, :2], (rays * depth[:, None] - camera.t) @ camera.R
 
 
 def test_look_at_is_a_rotation_that_centres_its_target() -> None:

@@ -61,19 +61,19 @@ class MatchInputs:
         coordinates = torch.cat(points, -1).float()
         mask = c.mask & torch.isfinite(coordinates).all(-1)
         channels = [*torch.where(mask[..., None], coordinates, 0).unbind(-1)]
-        for name in self.side:
-            channels += [torch.where(mask & torch.isfinite(value), value.float(), 0) for value in SIDE[name][1](c)]
+        for count, values in (SIDE[name] for name in self.side):
+            known = values(c) or [torch.zeros_like(c.x0[..., 0])] * count
+            channels += [torch.where(mask & torch.isfinite(value), value.float(), 0) for value in known]
         return torch.stack(channels, 1), mask
 
     def unit(self, c: Correspondences) -> Float[Tensor, " b"]:
         """How many pixels one unit of the coordinates is, on average over both images; as `x0` in type.
         Raises ValueError where image sizes or calibration matrices are missing."""
         if self.coordinates == "size":
-            sizes = _known(c.size0, "size0", BY_SIZE), _known(c.size1, "size1", BY_SIZE)
-            unit0, unit1 = (size.amax(-1) for size in sizes)
-            return (unit0 + unit1).to(c.x0.dtype) / 2
-        matrices = _known(c.K0, "K0", BY_CALIBRATION), _known(c.K1, "K1", BY_CALIBRATION)
-        unit0, unit1 = ((K[:, 0, 0].abs() + K[:, 1, 1].abs()) / 2 for K in matrices)
+            unit0, unit1 = (_known(size, f"size{i}", BY_SIZE).amax(-1) for i, size in enumerate((c.size0, c.size1)))
+        else:
+            matrices = (_known(K, f"K{i}", BY_CALIBRATION) for i, K in enumerate((c.K0, c.K1)))
+            unit0, unit1 = ((K[:, 0, 0].abs() + K[:, 1, 1].abs()) / 2 for K in matrices)
         return (unit0 + unit1).to(c.x0.dtype) / 2
 
 
@@ -107,11 +107,11 @@ def _by_calibration(x: Float[Tensor, "b n 2"], K: Tensor | None, name: str) -> F
 
 
 def _ratio(c: Correspondences) -> list[Tensor]:
-    return [torch.zeros_like(c.x0[..., 0]) if c.ambiguity is None else torch.where(c.mask, c.ambiguity, 0)]
+    return [] if c.ambiguity is None else [torch.where(c.mask, c.ambiguity, 0)]
 
 
 def _mutual(c: Correspondences) -> list[Tensor]:
-    return [torch.zeros_like(c.x0[..., 0]) if c.mutual is None else c.mutual.to(c.x0.dtype) * 2 - 1]
+    return [] if c.mutual is None else [c.mutual.to(c.x0.dtype) * 2 - 1]
 
 
 def _frame_map(c: Correspondences) -> Float[Tensor, "b n 2 2"] | None:
@@ -120,16 +120,14 @@ def _frame_map(c: Correspondences) -> Float[Tensor, "b n 2 2"] | None:
 
 
 def _scale(c: Correspondences) -> list[Tensor]:
-    S = _frame_map(c)
-    if S is None:
-        return [torch.zeros_like(c.x0[..., 0])]
+    if (S := _frame_map(c)) is None:
+        return []
     return [(S[..., 0, 0] * S[..., 1, 1] - S[..., 0, 1] * S[..., 1, 0]).abs().clamp_min(MIN_AREA_RATIO).log() / 2]
 
 
 def _rotation(c: Correspondences) -> list[Tensor]:
-    S = _frame_map(c)
-    if S is None:
-        return [torch.zeros_like(c.x0[..., 0])] * 2
+    if (S := _frame_map(c)) is None:
+        return []
     cosine, sine = S[..., 0, 0] + S[..., 1, 1], S[..., 1, 0] - S[..., 0, 1]
     squared = cosine.square() + sine.square()
     inverse = torch.where(squared > 0, torch.where(squared > 0, squared, 1).rsqrt(), 0)
@@ -138,7 +136,7 @@ def _rotation(c: Correspondences) -> list[Tensor]:
 
 def _agreement(c: Correspondences) -> list[Tensor]:
     if c.lafs0 is None or c.lafs1 is None:
-        return [torch.zeros_like(c.x0[..., 0])]
+        return []
     return [2 * frame_agreement(c.x0, c.x1, c.lafs0, c.lafs1, c.ambiguity, c.mask) - 1]
 
 
@@ -148,17 +146,20 @@ SIDE: dict[str, tuple[int, Callable[[Correspondences], list[Tensor]]]] = {
     "scale": (1, _scale),
     "rotation": (2, _rotation),
     "agreement": (1, _agreement),
-}  # name: how many channels, and what they hold
-
+}  # name: how many channels, and what they hold, nothing where that is not known
 
 RESIDUAL_UNIT = 1e-3  # of the image's longest side, or of the focal length: about a pixel
 LARGEST_RESIDUAL = 0.5  # of the same; as published
 
 
 class WithOptions(nn.Module):
-    """A network with `options`, which its files and the run's identity hold."""
+    """A network of `inputs`, with `options`, which its files and the run's identity hold.
+    Raises ValueError for unknown coordinates or side information."""
 
-    options: dict[str, Any]
+    def __init__(self, coordinates: str, side: Sequence[str], **options: Any) -> None:
+        super().__init__()
+        self.inputs = MatchInputs(coordinates, tuple(side))
+        self.options = {**options, "coordinates": coordinates, "side": list(side)}
 
     def extra_repr(self) -> str:
         return ", ".join(f"{key}={value}" for key, value in self.options.items())
@@ -184,9 +185,7 @@ class PointCN(nn.Module):
 
     def forward(self, x: Float[Tensor, "b inputs n"], slots: layers.Slots) -> Float[Tensor, "b 1 n"]:
         """x has to be zero in masked slots, where the result means nothing."""
-        y = slots.clean(torch.relu(self.p_in(x.transpose(0, 1))))
-        for block in self.blocks:
-            y = block(y, slots)
+        y = layers.through(self.blocks, slots.clean(torch.relu(self.p_in(x.transpose(0, 1)))), slots)
         return self.p_out(y).transpose(0, 1)  # type: ignore[no-any-return]
 
 
@@ -208,9 +207,7 @@ class LC(OfBackbone):
     def __init__(
         self, *, channels: int = 128, blocks: int = 12, coordinates: str = "size", side: Sequence[str] = ()
     ) -> None:
-        super().__init__()
-        self.inputs = MatchInputs(coordinates, tuple(side))
-        self.options = {"channels": channels, "blocks": blocks, "coordinates": coordinates, "side": list(side)}
+        super().__init__(coordinates, side, channels=channels, blocks=blocks)
         self.input_channels = self.inputs.channels
         self.backbone = PointCN(self.input_channels, channels, blocks)
 
@@ -268,13 +265,10 @@ class DFE(OfBackbone):
         coordinates: str = "size",
         side: Sequence[str] = (),
     ) -> None:
-        super().__init__()
         if iterations < 1:
             raise ValueError(f"iterations={iterations}: at least one fit")
-        self.inputs, self.iterations = MatchInputs(coordinates, tuple(side)), iterations
-        self.options = {
-            "widths": list(widths), "iterations": iterations, "coordinates": coordinates, "side": list(side),
-        }  # fmt: skip
+        super().__init__(coordinates, side, widths=list(widths), iterations=iterations)
+        self.iterations = iterations
         self.input_channels = self.inputs.channels + 2
         self.backbone = PointwiseNetwork(self.input_channels, tuple(widths), 2)
 

@@ -1,6 +1,8 @@
 """CLNet: Zhao et al., "Progressive correspondence pruning by consensus learning", ICCV 2021."""
 
-from collections.abc import Sequence
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -8,7 +10,7 @@ from torch import Tensor, nn
 
 from fmtorch.core.types import Correspondences
 from fmtorch.pruning.networks import layers, learned
-from fmtorch.pruning.networks.architectures import MatchInputs, WithOptions
+from fmtorch.pruning.networks.architectures import WithOptions
 
 MIN_RESIDUAL = 1e-6  # residual, in thresholds: bounds the log-odds of verification
 
@@ -33,11 +35,12 @@ class Progressive(WithOptions):
     """Prunes matches in steps, fits what is left, and judges all matches by their residuals.
     A step keeps the share `ratio` of a pair's matches, those of the largest global log-odds; the next sees both."""
 
-    inputs: MatchInputs
-
-    def __init__(self, steps: Sequence[Consensus], channels: int, ratio: float, threshold: float) -> None:
-        super().__init__()
-        self.steps, self.ratio, self.threshold = nn.ModuleList(steps), ratio, threshold
+    def __init__(self, embedding: Callable[..., nn.Module], **options: Any) -> None:
+        """embedding: makes that of a step, of so many inputs and neighbors. options: those of `CLNet`, and more."""
+        super().__init__(**options)
+        channels, self.ratio, self.threshold = options["channels"], options["ratio"], options["threshold"]
+        widths = ((self.inputs.channels + 2 * (i > 0), k) for i, k in enumerate(options["neighbors"]))
+        self.steps = nn.ModuleList(Consensus(embedding(width, neighbors=k), channels) for width, k in widths)
         self.block, self.last = layers.RectifiedBlock(channels, channels), layers.Perceptron(channels, 2)
 
     def forward(self, c: Correspondences) -> learned.Prediction:
@@ -80,13 +83,9 @@ class LocalEmbedding(nn.Module):
         self.after = nn.ModuleList(layers.RectifiedBlock(channels, channels) for _ in range(4))
 
     def forward(self, x: Float[Tensor, "c b n"], slots: layers.Slots) -> Float[Tensor, "d b n"]:
-        y = self.first(x, slots)
-        for block in self.before:
-            y = block(y, slots)
+        y = layers.through(self.before, self.first(x, slots), slots)
         y = self.annular(y, slots, layers.nearest(y, slots, self.neighbors))
-        for block in self.after:
-            y = block(y, slots)
-        return y  # type: ignore[no-any-return]
+        return layers.through(self.after, y, slots)
 
 
 class CLNet(Progressive):
@@ -108,9 +107,7 @@ class CLNet(Progressive):
         self, *, channels: int = 128, neighbors: Sequence[int] = (9, 6), ratio: float = 0.5, threshold: float = 1e-4,
         coordinates: str = "size", side: Sequence[str] = (),
     ) -> None:  # fmt: skip
-        inputs = MatchInputs(coordinates, tuple(side))
-        embeddings = (LocalEmbedding(inputs.channels + 2 * (i > 0), channels, k) for i, k in enumerate(neighbors))
-        super().__init__([Consensus(each, channels) for each in embeddings], channels, ratio, threshold)
-        self.inputs = inputs
-        self.options = {"channels": channels, "neighbors": list(neighbors), "ratio": ratio, "threshold": threshold,
-                        "coordinates": coordinates, "side": list(side)}  # fmt: skip
+        super().__init__(
+            functools.partial(LocalEmbedding, channels=channels), channels=channels, neighbors=list(neighbors),
+            ratio=ratio, threshold=threshold, coordinates=coordinates, side=side,
+        )  # fmt: skip

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from fmtorch.core.types import Correspondences
 from fmtorch.pruning.networks import layers, learned
-from fmtorch.pruning.networks.architectures import MatchInputs, OfBackbone
+from fmtorch.pruning.networks.architectures import OfBackbone
 
 EXTENT = {"size": 0.5, "K": 1.0}  # half a side of the grid: the longer side of image 0; one focal length, as published
 WIDTHS = 64, 16, 4  # of the layers that predict log-odds
@@ -132,10 +132,7 @@ class ConvMatch(OfBackbone):
         self, *, channels: int = 128, layers: int = 6, heads: int = 4, grid: int = 16, coordinates: str = "size",
         side: Sequence[str] = (),
     ) -> None:  # fmt: skip
-        super().__init__()
-        self.inputs = MatchInputs(coordinates, tuple(side))
-        self.options = {"channels": channels, "layers": layers, "heads": heads, "grid": grid,
-                        "coordinates": coordinates, "side": list(side)}  # fmt: skip
+        super().__init__(coordinates, side, channels=channels, layers=layers, heads=heads, grid=grid)
         self.input_channels = self.inputs.channels
         self.backbone = MotionField(self.input_channels, channels, layers, heads, grid, EXTENT[coordinates])
 

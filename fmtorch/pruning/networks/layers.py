@@ -4,8 +4,6 @@ Activations are (channels, B, N): one matrix product serves all pairs, and sums 
 contiguous memory. In masked slots they are zero, and so are their gradients.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple
 
@@ -34,7 +32,7 @@ class Slots(NamedTuple):
     mask: Float[Tensor, "b n"] | None
 
     @classmethod
-    def of(cls, mask: Bool[Tensor, "b n"], dtype: torch.dtype = torch.float32) -> Slots:
+    def of(cls, mask: Bool[Tensor, "b n"], dtype: torch.dtype = torch.float32) -> "Slots":
         """Arithmetic on a mask that has no holes is left out (asking for that waits for a GPU, once a batch)."""
         return cls(mask.sum(1).to(dtype), None if bool(mask.all()) else mask.to(dtype))
 
@@ -47,12 +45,12 @@ class Slots(NamedTuple):
         hidden = x if self.mask is None else torch.where(self.mask > 0, x, torch.finfo(x.dtype).min)
         return self.clean(torch.softmax(hidden, -1))
 
-    def columns(self, count: int) -> Slots:
+    def columns(self, count: int) -> "Slots":
         """Slots of so many columns for every pair, masked where the pair has no match."""
         mask = None if self.mask is None else (self.matches > 0).to(self.mask.dtype)[:, None].expand(-1, count)
         return Slots(self.matches * 0 + count if mask is None else mask.sum(1), mask)
 
-    def repeated(self, times: int) -> Slots:
+    def repeated(self, times: int) -> "Slots":
         """Slots of x.repeat(1, 1, times)."""
         return Slots(self.matches * times, None if self.mask is None else self.mask.repeat(1, times))
 
@@ -247,6 +245,13 @@ class RectifiedBlock(nn.Module):
         y = self.norm0(slots.clean(self.linear0(x)), slots)
         y = self.norm1(slots.clean(self.linear1(y)), slots)
         return torch.relu(y + slots.clean(self.shortcut(x)))
+
+
+def through(blocks: nn.ModuleList, x: Float[Tensor, "c b n"], slots: Slots) -> Float[Tensor, "d b n"]:
+    """The blocks in sequence."""
+    for block in blocks:
+        x = block(x, slots)
+    return x
 
 
 def attention(

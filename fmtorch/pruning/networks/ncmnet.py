@@ -1,5 +1,6 @@
 """NCMNet: Liu & Yang, "Progressive neighbor consistency mining for correspondence pruning", CVPR 2023."""
 
+import functools
 from collections.abc import Sequence
 
 import torch
@@ -7,8 +8,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from fmtorch.pruning.networks import layers
-from fmtorch.pruning.networks.architectures import MatchInputs
-from fmtorch.pruning.networks.clnet import Consensus, Progressive
+from fmtorch.pruning.networks.clnet import Progressive
 from fmtorch.pruning.networks.oanet import OrderAwareContext
 
 
@@ -54,10 +54,7 @@ class NeighborConsistency(nn.Module):
         mixed = [
             each(*abc, slots) for each, abc in zip(self.interaction, ((f, g, s), (g, s, f), (s, f, g)), strict=True)
         ]
-        y = torch.cat([*mixed, self.context(x, slots)])
-        for block in self.blocks:
-            y = block(y, slots)
-        return y
+        return layers.through(self.blocks, torch.cat([*mixed, self.context(x, slots)]), slots)
 
 
 class Embedding(nn.Module):
@@ -70,12 +67,10 @@ class Embedding(nn.Module):
         self.rounds = nn.ModuleList(NeighborConsistency(channels, neighbors, clusters) for _ in range(2))
 
     def forward(self, x: Float[Tensor, "c b n"], slots: layers.Slots) -> Float[Tensor, "d b n"]:
-        spatial, y = layers.nearest(x, slots, self.neighbors), self.first(x, slots)
-        for block in self.blocks:
-            y = block(y, slots)
+        spatial, y = layers.nearest(x, slots, self.neighbors), layers.through(self.blocks, self.first(x, slots), slots)
         for each in self.rounds:
             y = each(y, slots, spatial)
-        return y  # type: ignore[no-any-return]
+        return y
 
 
 class NCMNet(Progressive):
@@ -93,10 +88,8 @@ class NCMNet(Progressive):
         self, *, channels: int = 128, neighbors: Sequence[int] = (9, 6), clusters: int = 250, ratio: float = 0.5,
         threshold: float = 1e-4, coordinates: str = "size", side: Sequence[str] = (),
     ) -> None:  # fmt: skip
-        inputs = MatchInputs(coordinates, tuple(side))
-        widths = ((inputs.channels + 2 * (i > 0), k) for i, k in enumerate(neighbors))
-        embeddings = (Embedding(width, channels, k, clusters) for width, k in widths)
-        super().__init__([Consensus(each, channels) for each in embeddings], channels, ratio, threshold)
-        self.inputs = inputs
-        self.options = {"channels": channels, "neighbors": list(neighbors), "clusters": clusters, "ratio": ratio,
-                        "threshold": threshold, "coordinates": coordinates, "side": list(side)}  # fmt: skip
+        super().__init__(
+            functools.partial(Embedding, channels=channels, clusters=clusters), channels=channels,
+            neighbors=list(neighbors), clusters=clusters, ratio=ratio, threshold=threshold, coordinates=coordinates,
+            side=side,
+        )  # fmt: skip

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from fmtorch.core.types import Correspondences
 from fmtorch.pruning.networks import layers, learned
-from fmtorch.pruning.networks.architectures import MatchInputs, WithOptions
+from fmtorch.pruning.networks.architectures import WithOptions
 
 CONTEXT_EPS = 1e-3  # of its context normalisations
 
@@ -64,8 +64,7 @@ class OrderAwareContext(nn.Module):
         both S from x."""
         share = slots.softmax(self.linear0(self.norm0(x, slots)))
         y, nodes = torch.einsum("cbn,kbn->cbk", x, share), slots.columns(len(share))
-        for each in self.filters:
-            y = each(y, nodes)
+        y = layers.through(self.filters, y, nodes)
         share = torch.softmax(self.linear1(self.norm1(x, slots)), 0)
         return slots.clean(torch.einsum("cbk,kbn->cbn", y, share))
 
@@ -82,12 +81,8 @@ class Stage(nn.Module):
         self.last = layers.Perceptron(channels, 1)
 
     def forward(self, x: Float[Tensor, "c b n"], slots: layers.Slots) -> Float[Tensor, "b n"]:
-        y = slots.clean(self.first(x))
-        for block in self.before:
-            y = block(y, slots)
-        y = torch.cat([y, self.context(y, slots)])
-        for block in self.after:
-            y = block(y, slots)
+        y = layers.through(self.before, slots.clean(self.first(x)), slots)
+        y = layers.through(self.after, torch.cat([y, self.context(y, slots)]), slots)
         return self.last(y)[0]  # type: ignore[no-any-return]
 
 
@@ -110,10 +105,7 @@ class OANet(WithOptions):
         self, *, channels: int = 128, blocks: int = 12, clusters: int = 500, stages: int = 2, coordinates: str = "size",
         side: Sequence[str] = (),
     ) -> None:  # fmt: skip
-        super().__init__()
-        self.inputs = MatchInputs(coordinates, tuple(side))
-        self.options = {"channels": channels, "blocks": blocks, "clusters": clusters, "stages": stages,
-                        "coordinates": coordinates, "side": list(side)}  # fmt: skip
+        super().__init__(coordinates, side, channels=channels, blocks=blocks, clusters=clusters, stages=stages)
         inputs, half = self.inputs.channels, blocks // stages // 2
         self.stages = nn.ModuleList(Stage(inputs + 2 * (i > 0), channels, half, clusters) for i in range(stages))
 
