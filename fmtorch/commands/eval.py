@@ -19,7 +19,7 @@ from fmtorch.core.files import write_whole
 from fmtorch.core.terminal import console, errors, progress_bars, reporter
 from fmtorch.data import ImagePair
 from fmtorch.evaluation import curves, tables
-from fmtorch.evaluation.run import built_with, cameras_of, evaluate_pairs, run_identity, select
+from fmtorch.evaluation.run import PairCameras, built_with, cameras_of, evaluate_pairs, run_identity, select
 from fmtorch.evaluation.statistics import ALL, Group, summarize
 from fmtorch.io import MatchStore, export_kinds, write_exports
 from fmtorch.jobs.execution import MIN_PAIRS_FOR_PROCESSES, Execution, shard_of
@@ -112,7 +112,7 @@ def _evaluated(
     build = None if execution.shared else functools.partial(build_pipeline, config, pipeline.device, None)
     cameras = None if fields.cameras is None else cameras_of(pairs, fields.cameras)
     if cameras is not None or fields.lens is not None:
-        later = None if cameras is None else {}
+        later: dict[int, PairCameras] | None = None if cameras is None else {}
         build = None if build is None else functools.partial(built_with, build, later, fields.lens)
         pipeline = built_with(lambda: pipeline, cameras, fields.lens)
     return evaluate_pairs(
