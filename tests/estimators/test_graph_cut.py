@@ -22,12 +22,7 @@ from fmtorch.estimators import (
     largest_weight,
     scores_of,
 )
-from fmtorch.estimators.graph_cut import (
-    HALVINGS,
-    UNIT,
-    label,
-    neighbor_graph,
-)
+from fmtorch.estimators.graph_cut import HALVINGS, UNIT, label, neighbor_graph
 from fmtorch.estimators.inliers import residuals_squared_px
 from fmtorch.jit.kernel import F4x1, F8x1, F8x2, kernel
 from fmtorch.jit.random import Stream

@@ -9,14 +9,7 @@ from scipy import integrate
 
 import fmtorch
 from fmtorch import estimators
-from fmtorch.estimators import (
-    BestOfSearch,
-    BestScore,
-    Candidates,
-    Pool,
-    Refinement,
-    scores_of,
-)
+from fmtorch.estimators import BestOfSearch, BestScore, Candidates, Pool, Refinement, scores_of
 from fmtorch.estimators.inliers import residuals_squared_px
 from fmtorch.estimators.scores import GRID, fractional_bits, saturated_cells
 from fmtorch.geometry.epipolar import HOMOGRAPHY, SAMPSON

@@ -23,11 +23,7 @@ from fmtorch.estimators.lens_search import (
 )
 from fmtorch.estimators.models import posterior
 from fmtorch.estimators.models.focal_prior import LOG_USUAL
-from fmtorch.estimators.models.posterior import (
-    centred,
-    images_of,
-    translate,
-)
+from fmtorch.estimators.models.posterior import centred, images_of, translate
 from fmtorch.estimators.models.with_focals import LOSS_SCALE_PX, FundamentalWithFocals, Refined
 from fmtorch.geometry.levenberg_marquardt import Weighted
 from tests.estimators.models.test_focals import TALL, WIDE, Sizes, photographs, with_prior
