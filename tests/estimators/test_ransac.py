@@ -22,6 +22,7 @@ from fmtorch.jit.kernel import SWITCH, Kernel
 from tests.conftest import oracle
 from tests.laws import few, quick, scene, scenes
 from tests.reference import refine as reference
+from tests.reference.solvers import sampson
 from tests.variants import OTHER_LIBRARIES, built, variants
 
 OTHERS = (*OTHER_LIBRARIES, "homography", "weighted_eight_point")  # the last one is not robust, and has no gradients
@@ -247,7 +248,7 @@ def test_is_a_minimum_of_the_weighted_loss(loss: str) -> None:
     prior = c.prior
 
     def cost(F: torch.Tensor, i: int) -> float:
-        r2 = reference.sampson(F.numpy(), c.x0[i].double().numpy(), c.x1[i].double().numpy()) ** 2
+        r2 = sampson(F.numpy(), c.x0[i].double().numpy(), c.x1[i].double().numpy()) ** 2
         return float((prior[i].double().numpy() * reference.loss(r2, 4.0, loss)).sum())
 
     further = refine(estimate.F, c.x0, c.x1, prior, c.mask, loss=loss, scale=2.0, iterations=50)

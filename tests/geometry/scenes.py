@@ -83,13 +83,8 @@ def near_scene(seed: int, n: int = 24, noise: float = 3e-3, outliers: int = 3) -
 def tolerances(loss: str) -> dict[str, float | bool]:
     """Of `gradcheck`, along random directions. Central differences round 1e-15 times the condition 1e3 over the step.
     The tabulated loss is linear between its entries, 1 / 1000 apart, whose slopes differ by as much."""
-    return {
-        "eps": 1e-6,
-        "atol": 1e-5,
-        "rtol": 1e-3 if loss == "magsac" else 1e-5,
-        "fast_mode": True,
-        "check_undefined_grad": False,
-    }
+    rtol = 1e-3 if loss == "magsac" else 1e-5
+    return {"eps": 1e-6, "atol": 1e-5, "rtol": rtol, "fast_mode": True, "check_undefined_grad": False}
 
 
 K = np.array([[768.0, 0, 319.5], [0, 768, 239.5], [0, 0, 1]])

@@ -215,7 +215,8 @@ def test_nine_tenths_of_the_real_solutions_before_the_cameras_are_found() -> Non
     recovered = total = spurious = 0
     for s in range(SAMPLES):
         x0, x1 = points[:2, 5 * s : 5 * s + 5].T, points[2:, 5 * s : 5 * s + 5].T
-        every = reference.five_point(x0, x1)
+        every, _ = cv2.findEssentialMat(np.ascontiguousarray(x0), np.ascontiguousarray(x1), np.eye(3))
+        every = np.zeros((0, 3, 3)) if every is None else every.reshape(-1, 3, 3)
         expected = np.array([M.ravel() for M in every if consistently_oriented(M, x0, x1)]).reshape(-1, 9)
         distance = apart(E[draw == s], expected)
         recovered += int((distance.min(0, initial=9) < 1e-4).sum())
