@@ -237,7 +237,6 @@ class Found(PlausibleCandidates):
         self.again, self.one_model = again, one_model
 
     def confirmed(self, other: PlausibleCandidates) -> bool:
-        assert isinstance(other, Found)
         return other.again
 
     def joined(self, other: PlausibleCandidates) -> PlausibleCandidates:
