@@ -44,8 +44,12 @@ def scene(n: int, seed: int = 0, noise: float = 0.0, planar: bool = False) -> Sc
 
 def scenes(batch: tuple[int, ...], n: int, seed: int = 0, noise: float = 0.0) -> tuple[Tensor, Tensor, Tensor]:
     """x0, x1, F of independent scenes with any leading shape."""
+    return stacked(batch, n, seed, noise)[:3]
+
+
+def stacked(batch: tuple[int, ...], n: int, seed: int = 0, noise: float = 0.0) -> Scene:
     many = [scene(n, seed * 1000 + i, noise) for i in range(int(np.prod(batch, dtype=int)))]
-    return tuple(torch.stack(list(a)).reshape(*batch, *a[0].shape) for a in list(zip(*many, strict=True))[:3])
+    return Scene(*(torch.stack(list(a)).reshape(*batch, *a[0].shape) for a in zip(*many, strict=True)))
 
 
 def unit_scene(

@@ -327,11 +327,7 @@ def alone(match: np.ndarray) -> np.ndarray:
 
 def quadrilateral(seed: int, kind: str = "seen") -> np.ndarray:
     """Matches (4, 4) of a plane that is seen, or of nothing."""
-    rng = np.random.default_rng(seed)
-    x0 = rng.uniform(-1, 1, (4, 2))
-    H = np.eye(3) + rng.uniform(-0.3, 0.3, (3, 3))
-    x1 = reference.mapped(H.ravel(), x0) if kind == "seen" else rng.uniform(-1, 1, (4, 2))
-    return np.ascontiguousarray(np.c_[x0, x1].T)
+    return planar(seed, 4)[0] if kind == "seen" else np.random.default_rng(seed).uniform(-1, 1, (4, 4))
 
 
 @pytest.mark.parametrize("kind", ["seen", "random"])
