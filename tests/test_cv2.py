@@ -7,7 +7,10 @@ import numpy as np
 import pytest
 
 from fmtorch import cv2
+from tests.estimators.pairs import apart
+from tests.reference.homography import mapped
 from tests.reference.known_cameras import K0, SIZE, angle, scene
+from tests.reference.solvers import homogeneous, sampson, skew
 
 SCENE = scene(3, 200, noise=0.3, cameras=(K0, K0))
 PTS1, PTS2 = SCENE.x0, SCENE.x1
@@ -33,8 +36,7 @@ def homography_points(wrong: float = 0.3) -> tuple[np.ndarray, np.ndarray, np.nd
     rng = np.random.default_rng(5)
     H = np.array([[0.9, -0.1, 40], [0.08, 0.95, -10], [1e-4, -5e-5, 1]])
     x = rng.uniform([0, 0], SIZE[::-1], (120, 2))
-    y = np.c_[x, np.ones(120)] @ H.T
-    y = y[:, :2] / y[:, 2:]
+    y = mapped(H, x)
     bad = rng.random(120) < wrong
     y[bad] = rng.uniform([0, 0], SIZE[::-1], (int(bad.sum()), 2))
     return x, y, H
@@ -73,9 +75,7 @@ def test_ransac_with_threshold_and_confidence() -> None:
 @pytest.mark.parametrize("flag", EPIPOLAR_FLAGS)
 def test_every_flag_gives_the_right_geometry(flag: str) -> None:
     F, mask = cv2.findFundamentalMat(PTS1, PTS2, getattr(cv2, flag))
-    lines = np.c_[PTS1, np.ones(200)] @ F.T
-    distance = np.abs((np.c_[PTS2, np.ones(200)] * lines).sum(1)) / np.linalg.norm(lines[:, :2], axis=1)
-    assert np.median(distance[SCENE.right]) < 0.5
+    assert np.median(np.abs(sampson(F, PTS1, PTS2))[SCENE.right]) < 0.35
     assert float(mask.ravel()[SCENE.right].mean()) > 0.8
     E, inliers = cv2.findEssentialMat(PTS1, PTS2, K0, getattr(cv2, flag))
     R = cv2.recoverPose(E, PTS1, PTS2, K0, mask=inliers)[1]
@@ -155,47 +155,32 @@ def test_normalized_points_with_the_identity() -> None:
 def test_distortion_is_taken_out() -> None:
     bend = np.array([-0.2, 0.05, 0, 0])
     n1, n2 = (cv2.undistortPoints(x[:, None], K0, None)[:, 0] for x in (PTS1, PTS2))
-    straight = [np.c_[n, np.ones(200)] for n in (n1, n2)]
-    x1, x2 = (cv2.projectPoints(X, np.zeros(3), np.zeros(3), K0, bend)[0][:, 0] for X in straight)
+    rays = map(homogeneous, (n1, n2))
+    x1, x2 = (cv2.projectPoints(X, np.zeros(3), np.zeros(3), K0, bend)[0][:, 0] for X in rays)
     E, _ = cv2.findEssentialMat(x1, x2, K0, bend, K0, bend)
     assert angle(cv2.recoverPose(E, n1, n2, np.eye(3))[1], SCENE.R) < 0.5
 
 
-@pytest.mark.parametrize(
-    ("call", "said"),
-    [
-        (lambda: cv2.findFundamentalMat(PTS1, PTS2, 3), "method is 3; it must be one of"),
-        (lambda: cv2.findFundamentalMat(PTS1.ravel(), PTS2), r"points1 has shape \(400,\)"),
-        (lambda: cv2.findFundamentalMat(PTS1 / 1000, PTS2 / 1000), "no pixels"),
-        (lambda: cv2.findFundamentalMat(PTS1, PTS2[:50]), "must be equal"),
-    ],
-)
-def test_wrong_arguments_are_named(call: Any, said: str) -> None:
-    with pytest.raises(ValueError, match=said):
-        call()
-
-
-def test_parameters_of_another_search_are_refused() -> None:
-    with pytest.raises(TypeError, match="UsacParams are of OpenCV's own search"):
-        cv2.findFundamentalMat(PTS1, PTS2, opencv.UsacParams())
+def test_wrong_arguments_are_named() -> None:
+    for arguments, said in (
+        ((PTS1, PTS2, 3), "method is 3; it must be one of"),
+        ((PTS1.ravel(), PTS2), r"points1 has shape \(400,\)"),
+        ((PTS1 / 1000, PTS2 / 1000), "no pixels"),
+        ((PTS1, PTS2[:50]), "must be equal"),
+        ((PTS1, PTS2, opencv.UsacParams()), "UsacParams are of OpenCV's own search"),
+    ):
+        with pytest.raises((ValueError, TypeError), match=said):
+            cv2.findFundamentalMat(*arguments)
     with pytest.raises(TypeError, match="findEssentialMat takes points1, points2, cameraMatrix, method"):
         cv2.findEssentialMat(PTS1, PTS2, K0, focal=3)
 
 
-def straight(n: np.ndarray) -> np.ndarray:
-    return np.c_[n, np.ones(len(n))]
-
-
 def test_points_in_another_unit_with_a_threshold_in_it() -> None:
     """Of a focal length of one, as VIO programs give them: matches are told apart as in pixels."""
-    n1, n2 = ((straight(x) @ np.linalg.inv(K0).T)[:, :2] for x in (PTS1, PTS2))
+    n1, n2 = (mapped(np.linalg.inv(K0), x) for x in (PTS1, PTS2))
     F, mask = cv2.findFundamentalMat(n1, n2, cv2.FM_RANSAC, 1.5 / 510, 0.999)
     assert float((mask.ravel() == SCENE.right).mean()) > 0.9
-    E = F / np.linalg.norm(F)
-    t = SCENE.t
-    expected = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]]) @ SCENE.R
-    expected /= np.linalg.norm(expected)
-    assert min(np.linalg.norm(E - expected), np.linalg.norm(E + expected)) < 0.05
+    assert apart(F, skew(SCENE.t) @ SCENE.R) < 0.05
     x, y, H = homography_points()
     for unit in (1.0, 1e-3):
         u, v = x / 500 * unit, y / 500 * unit
@@ -203,18 +188,18 @@ def test_points_in_another_unit_with_a_threshold_in_it() -> None:
         found, inliers = cv2.findHomography(u, v, cv2.RANSAC, 3 / 500 * unit)
         expected = D @ H @ np.linalg.inv(D)
         corners = np.array([[0, 0], [640, 0], [640, 480], [0, 480.0]])
-        a, b = (straight(corners * unit / 500) @ M.T for M in (found, expected))
-        assert np.abs(a[:, :2] / a[:, 2:] - b[:, :2] / b[:, 2:]).max() < 0.05 * unit / 500
+        a, b = (mapped(M, corners * unit / 500) for M in (found, expected))
+        assert np.abs(a - b).max() < 0.05 * unit / 500
         assert inliers.ravel().tolist() == cv2.findHomography(x, y, cv2.RANSAC, 3.0)[1].ravel().tolist()
     metres, _ = cv2.findHomography(x, y / 40, cv2.RANSAC, 0.1)  # a photograph to a court
-    a = straight(corners) @ metres.T
-    b = straight(corners) @ H.T
-    assert np.abs(40 * a[:, :2] / a[:, 2:] - b[:, :2] / b[:, 2:]).max() < 0.05
+    assert np.abs(40 * mapped(metres, corners) - mapped(H, corners)).max() < 0.05
 
 
 def test_homogeneous_points() -> None:
     F, _ = cv2.findFundamentalMat(PTS1, PTS2)
-    np.testing.assert_allclose(cv2.findFundamentalMat(2 * straight(PTS1), straight(PTS2)[:, None])[0], F, rtol=1e-9)
+    np.testing.assert_allclose(
+        cv2.findFundamentalMat(2 * homogeneous(PTS1), homogeneous(PTS2)[:, None])[0], F, rtol=1e-9
+    )
 
 
 @pytest.mark.parametrize("name", ["findFundamentalMat", "findHomography", "findEssentialMat"])
@@ -249,7 +234,7 @@ def test_poses_of_small_baselines(baseline: float) -> None:
     assert float(direction[:, 0] @ t / np.linalg.norm(t)) > 0.999
     np.testing.assert_array_equal(R, rotation)
     assert cv2.recoverPose(E=E, points1=x1, points2=x2, cameraMatrix=K0)[0] == 120
-    assert cv2.recoverPose(E, *((straight(x) @ np.linalg.inv(K0).T)[:, :2] for x in (x1, x2)))[0] == 120
+    assert cv2.recoverPose(E, *(mapped(np.linalg.inv(K0), x) for x in (x1, x2)))[0] == 120
     assert cv2.recoverPose(x1, x2, K0, None, K0, None)[0] == 120
 
 

@@ -1,8 +1,9 @@
 """The three laws over the batched functions of geometry and metrics, and over their gradients."""
 
 import functools
+from collections import namedtuple
 from collections.abc import Callable
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 import numpy as np
 import pytest
@@ -16,21 +17,8 @@ from tests.geometry.scenes import scene
 SLOTS = 40
 
 
-class Pairs(NamedTuple):
-    """Matches, models and cameras of B pairs."""
-
-    x0: Tensor
-    x1: Tensor
-    weight: Tensor
-    noise: Tensor
-    mask: Tensor
-    F: Tensor
-    H: Tensor
-    K0: Tensor
-    K1: Tensor
-    R: Tensor
-    t: Tensor
-    key: Tensor
+class Pairs(namedtuple("Pairs", "x0 x1 weight noise mask F H K0 K1 R t key")):
+    """Matches, models and cameras of B pairs: tensors."""
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Self:
         return self._make(map(function, self))

@@ -49,11 +49,7 @@ def inputs() -> dict[str, Any]:
     rng = np.random.default_rng(0)
     points, weight, size = rng.uniform(0, 600, (2, 5, 40, 2)), rng.random((5, 40)), torch.full((5, 2), 600.0)
     return {
-        "pairs": {
-            "scenes": scenes(),
-            "wide": scene(21, 260, outliers=0.7, noise=0.6),
-            "plane": degenerate()["one plane"],
-        },
+        "pairs": {"scenes": scenes(), "wide": scene(21, 260, 0.7, 0.6), "plane": degenerate()["one plane"]},
         "many": scene(5, 2000),
         "geometry": (*torch.from_numpy(points), torch.from_numpy(weight), size),
         "descriptors": [torch.from_numpy(rng.normal(size=(n, 32)).astype(np.float32)) for n in (300, 400)],

@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 
 import fmtorch
-from fmtorch import data, presets
+from fmtorch import data
 from fmtorch.core import Correspondences, Estimate
 from fmtorch.data import ImagePair
 from fmtorch.pipeline import load_pipeline
 from tests.conftest import shared_path
-from tests.laws import scene
 
 pycolmap = pytest.importorskip("pycolmap")
 SETS = ("Strecha", "PhotoTourism", "KITTI")
@@ -54,6 +53,12 @@ def cameras(m: Matched, known: bool) -> list[Any]:
     return pinholes
 
 
+def verified(m: Matched, first: Any, second: Any) -> Any:
+    """COLMAP's geometry of a pair with these cameras."""
+    matches = np.repeat(np.arange(len(m.x0), dtype=np.uint32)[:, None], 2, 1)
+    return pycolmap.estimate_two_view_geometry(first, m.x0, second, m.x1, matches, options())
+
+
 def ours(m: Matched, **changes: Any) -> Estimate:
     given = {"mask": m.c.mask, "size0": m.c.size0, "size1": m.c.size1, "estimator": "colmap", "seed": SEED}
     call = fmtorch.find_essential if "K0" in changes else fmtorch.find_fundamental
@@ -71,9 +76,7 @@ def test_fundamental_matrices_are_colmaps_to_the_last_bit(name: str, two_view: b
     alone = pycolmap.estimate_fundamental_matrix(m.x0, m.x1, options().ransac)
     F, inliers = alone["F"], np.flatnonzero(alone["inlier_mask"])
     if two_view:
-        matches = np.repeat(np.arange(len(m.x0), dtype=np.uint32)[:, None], 2, 1)
-        first, second = cameras(m, known=False)
-        geometry = pycolmap.estimate_two_view_geometry(first, m.x0, second, m.x1, matches, options())
+        geometry = verified(m, *cameras(m, known=False))
         F, inliers = geometry.F, np.asarray(geometry.inlier_matches)[:, 0]
     estimate = ours(m, two_view=two_view)
     assert bool(estimate.ok[0])
@@ -99,9 +102,7 @@ def test_poses_of_known_cameras_are_colmaps(name: str) -> None:
 @pytest.mark.parametrize("name", SETS)
 def test_two_view_geometries_of_known_cameras_are_colmaps(name: str) -> None:
     m = matched(name)
-    matches = np.repeat(np.arange(len(m.x0), dtype=np.uint32)[:, None], 2, 1)
-    first, second = cameras(m, known=True)
-    geometry = pycolmap.estimate_two_view_geometry(first, m.x0, second, m.x1, matches, options())
+    geometry = verified(m, *cameras(m, known=True))
     assert pycolmap.TwoViewGeometryConfiguration(geometry.config).name == "CALIBRATED"
     estimate = ours(m, K0=m.pair.K0, K1=m.pair.K1)
     tolerance = 1e-7 + max(abs(K[0, 0] / K[1, 1] - 1) for K in (m.pair.K0, m.pair.K1)) ** 2 / 8
@@ -114,9 +115,8 @@ def test_two_view_geometries_of_known_cameras_are_colmaps(name: str) -> None:
 def test_homographies_are_colmaps_and_positive_where_the_plane_is_seen(name: str) -> None:
     m = matched(name)
     result = pycolmap.estimate_homography_matrix(m.x0, m.x1, options().ransac)
-    estimate = fmtorch.find_homography(
-        m.c.x0, m.c.x1, mask=m.c.mask, estimator="colmap", model="homography", threshold=THRESHOLD, seed=SEED
-    )
+    options_of_ours = {"estimator": "colmap", "model": "homography", "threshold": THRESHOLD, "seed": SEED}
+    estimate = fmtorch.find_homography(m.c.x0, m.c.x1, mask=m.c.mask, **options_of_ours)
     assert bool(estimate.ok[0])
     H = estimate.H[0].numpy()
     assert np.array_equal(H, unit(result["H"])) or np.array_equal(H, -unit(result["H"]))
@@ -129,20 +129,7 @@ def test_homographies_are_colmaps_and_positive_where_the_plane_is_seen(name: str
 def test_a_shared_focal_length_is_that_of_one_camera_of_colmap(index: int) -> None:
     """Which it finds for some pairs, and for the others it leaves both unknown."""
     m = matched("Strecha", index)
-    first, _ = cameras(m, known=False)
-    matches = np.repeat(np.arange(len(m.x0), dtype=np.uint32)[:, None], 2, 1)
-    geometry = pycolmap.estimate_two_view_geometry(first, m.x0, first, m.x1, matches, options())
+    geometry = verified(m, *[cameras(m, known=False)[0]] * 2)
     estimate = ours(m, focal="shared")
     expected = [np.nan, np.nan] if geometry.camera1 is None else [geometry.camera1.params[0]] * 2
     assert estimate.focals[0].tolist() == pytest.approx(expected, nan_ok=True)
-
-
-def test_a_homography_is_not_taken_for_a_fundamental_matrix() -> None:
-    c = scene(0, 100)
-    said = r"colmap gives fundamental matrices; find_homography needs one that gives .* \(here by model=homography\)"
-    with pytest.raises(ValueError, match=said):
-        fmtorch.find_homography(c.x0, c.x1, estimator="colmap")
-    with pytest.raises(ValueError, match="estimator=colmap gives homography matrices"):
-        fmtorch.find_fundamental(c.x0, c.x1, estimator="colmap", model="homography")
-    with pytest.raises(ValueError, match="model=line; it must be one of: fundamental, homography"):
-        presets.build("estimator", "colmap", model="line")

@@ -49,41 +49,21 @@ def test_estimates_are_as_good_as_with_built_in_parts(name: str, preset: str) ->
         assert_same({"F": alone.F, "inliers": alone.inliers}, shared, name)
 
 
-@pytest.mark.parametrize("preset", PRESETS)
-def test_a_compiled_gain_is_that_in_numpy(preset: str) -> None:
-    c = scene(1, 200)
-    interpreted, compiled = (
-        built(preset, {"score": score(1.0)})(c) for score in (own_parts.Triweight, own_parts.CompiledTriweight)
-    )
-    # Gains are rounded to 2^-10, which hides all but the rarest rounding of a float32.
-    assert torch.equal(interpreted.inliers, compiled.inliers)
-    torch.testing.assert_close(interpreted.F, compiled.F, rtol=0, atol=1e-9)
+ALIKE = {
+    "score": own_parts.Squares(1.0),
+    "compiled score": own_parts.CompiledSquares(1.0),
+    "sampler": own_parts.Same(),
+    "inliers": lambda squared_px, pair: squared_px <= 1.0,
+}
 
 
-@pytest.mark.parametrize(
-    "parts",
-    [
-        {"score": own_parts.Squares(1.0)},
-        {"score": own_parts.CompiledSquares(1.0)},
-        {"sampler": own_parts.Same()},
-        {"inliers": lambda squared_px, pair: squared_px <= 1.0},
-        {
-            "score": own_parts.CompiledSquares(1.0),
-            "sampler": own_parts.Same(),
-            "inliers": lambda squared_px, pair: squared_px <= 1.0,
-        },
-    ],
-    ids=["score", "compiled score", "sampler", "rule", "all"],
-)
-def test_parts_that_do_as_the_built_in_ones_give_the_same_bits(parts: dict[str, Any]) -> None:
-    own, builtin = (
-        presets.build("estimator", "msac", **parts)(scenes(), 3),
-        presets.build("estimator", "msac")(scenes(), 3),
-    )
+@pytest.mark.parametrize("names", [*([name] for name in ALIKE), ["compiled score", "sampler", "inliers"]])
+def test_parts_that_do_as_the_built_in_ones_give_the_same_bits(names: list[str]) -> None:
+    parts = {name.removeprefix("compiled "): ALIKE[name] for name in names}
+    own, builtin = (presets.build("estimator", "msac", **given)(scenes(), 3) for given in (parts, {}))
     assert bool(builtin.ok.all())
-    assert_same(
-        *({name: getattr(e, name) for name in ("F", "inliers", "ok", "samples")} for e in (own, builtin)), "msac"
-    )
+    results = ({name: getattr(e, name) for name in ("F", "inliers", "ok", "samples")} for e in (own, builtin))
+    assert_same(*results, "msac")
 
 
 def test_parts_are_named_as_targets() -> None:
@@ -107,33 +87,33 @@ class Gain(SummedGains):
         self.gain = gain
 
 
+def sampled(draw: Any) -> dict[str, Any]:
+    return {"sampler": own_parts.Sampled(draw)}
+
+
+def scored(scores: Any) -> dict[str, Any]:
+    return {"score": own_parts.Scored(scores)}
+
+
+def gained(gain: Any) -> dict[str, Any]:
+    return {"score": Gain(gain)}
+
+
 SAMPLES, GAINS = r"Sampled.draw returns .*", r"; it must be the shape of its argument, \(\d+, 60\): .* of numbers"
 WRONG: list[tuple[dict[str, Any], str]] = [
-    (
-        {"sampler": own_parts.Sampled(lambda m, size: np.zeros((m, size), np.int64))},
-        rf"{SAMPLES}int64 \(100, 7\); .* \(7, 100\)",
-    ),
-    (
-        {"sampler": own_parts.Sampled(lambda m, size: np.zeros((size, m)))},
-        rf"{SAMPLES}float64 \(7, 100\); it must be an array",
-    ),
-    (
-        {"sampler": own_parts.Sampled(lambda m, size: np.full((size, m), 60))},
-        f"{SAMPLES}indices from 60 to 60; .* from 0 to 59",
-    ),
-    ({"sampler": own_parts.Sampled(lambda m, size: np.full((size, m), -1))}, f"{SAMPLES}indices from -1 to -1"),
-    ({"sampler": own_parts.Sampled(None)}, f"{SAMPLES}NoneType; it must be an array of int64"),
-    (
-        {"score": own_parts.Scored(lambda which: np.zeros(len(which) + 1))},
-        r"Scored returns float64 \(\d+,\); it must be an array",
-    ),
-    ({"score": own_parts.Scored(lambda which: np.zeros(len(which), np.float32))}, "Scored returns float32"),
-    ({"score": own_parts.Scored(lambda which: 1.0)}, "Scored returns float; it must be"),
-    ({"score": Gain(lambda squared: squared[:, :3])}, rf"Gain.gain returns shape \(\d+, 3\) of float32{GAINS}"),
-    ({"score": Gain(lambda squared: squared.sum(1))}, rf"Gain.gain returns shape \(\d+,\) of float32{GAINS}"),
-    ({"score": Gain(lambda squared: 1.0)}, rf"shape \(\) of float64{GAINS}"),
-    ({"score": Gain(lambda squared: squared + 0j)}, rf"shape \(\d+, 60\) of complex64{GAINS}"),
-    ({"score": Gain(lambda squared: [["one"] * 60] * len(squared))}, rf"shape \(\d+, 60\) of <U3{GAINS}"),
+    (sampled(lambda m, size: np.zeros((m, size), np.int64)), rf"{SAMPLES}int64 \(100, 7\); .* \(7, 100\)"),
+    (sampled(lambda m, size: np.zeros((size, m))), rf"{SAMPLES}float64 \(7, 100\); it must be an array"),
+    (sampled(lambda m, size: np.full((size, m), 60)), f"{SAMPLES}indices from 60 to 60; .* from 0 to 59"),
+    (sampled(lambda m, size: np.full((size, m), -1)), f"{SAMPLES}indices from -1 to -1"),
+    (sampled(None), f"{SAMPLES}NoneType; it must be an array of int64"),
+    (scored(lambda which: np.zeros(len(which) + 1)), r"Scored returns float64 \(\d+,\); it must be an array"),
+    (scored(lambda which: np.zeros(len(which), np.float32)), "Scored returns float32"),
+    (scored(lambda which: 1.0), "Scored returns float; it must be"),
+    (gained(lambda squared: squared[:, :3]), rf"Gain.gain returns shape \(\d+, 3\) of float32{GAINS}"),
+    (gained(lambda squared: squared.sum(1)), rf"Gain.gain returns shape \(\d+,\) of float32{GAINS}"),
+    (gained(lambda squared: 1.0), rf"shape \(\) of float64{GAINS}"),
+    (gained(lambda squared: squared + 0j), rf"shape \(\d+, 60\) of complex64{GAINS}"),
+    (gained(lambda squared: [["one"] * 60] * len(squared)), rf"shape \(\d+, 60\) of <U3{GAINS}"),
     ({"inliers": lambda r2, pair: r2}, r"function returns float64 \(60,\); it must be an array of bool \(60,\)"),
     ({"inliers": lambda r2, pair: (r2 <= 1)[:9]}, r"function returns bool \(9,\)"),
     ({"inliers": lambda r2, pair: [True] * len(r2)}, "function returns list"),
@@ -156,11 +136,9 @@ def test_a_score_without_a_gain_is_refused_by_name() -> None:
 
 def test_scores_may_be_a_column() -> None:
     """Of a larger array: its memory has gaps."""
-    column = own_parts.Scored(lambda which: np.stack([which * 1.0, which * 0.0], 1)[:, 0])
-    assert torch.equal(
-        built("msac", {"score": column})(scene(1, 600)).F,
-        built("msac", {"score": own_parts.Scored(np.float64)})(scene(1, 600)).F,
-    )
+    forms = (np.float64, lambda which: np.stack([which * 1.0, which * 0.0], 1)[:, 0])
+    plain, column = (built("msac", scored(form))(scene(1, 600)).F for form in forms)
+    assert torch.equal(column, plain)
 
 
 def compared(preset: str) -> None:
@@ -169,9 +147,8 @@ def compared(preset: str) -> None:
     # The gain of `fmtorch` differs, but not the work: as many draws from all matches, as many models preselected.
     score = own_parts.Squares(1.0) if preset == "msac" else own_parts.Welsch(1.5, prior_weighted=True)
     threshold = {} if preset == "msac" else {"threshold": None}
-    own = presets.build(
-        "estimator", preset, score=score, sampler=own_parts.AllAlike(), inliers=own_parts.Within2Px(), **threshold
-    )
+    parts = {"score": score, "sampler": own_parts.AllAlike(), "inliers": own_parts.Within2Px()}
+    own = presets.build("estimator", preset, **parts, **threshold)
     estimators = own, presets.build("estimator", preset)
     draws, fastest = [int(estimator(c).samples) for estimator in estimators], [math.inf, math.inf]
     for _ in range(20):
@@ -221,6 +198,13 @@ MEDIAN = {"score": "median", "inliers": "lmeds", "confidence": None}
         (MEDIAN | {"threshold": 2.0}, "threshold=2.0 has no effect: score=median takes none"),
         (MEDIAN | {"inlier_threshold": 2.0}, "inlier_threshold=2.0 has no effect: inliers=lmeds takes none"),
         ({"local_optimization": "x"}, "local_optimization is 'x'; it must be one of: graph_cut"),
+        ({"solver": "four_point", "degeneracy": "degensac"}, "seven_point"),
+        (
+            {"solver": "eight_point", "degeneracy": "degensac"},
+            "degensac needs solver=seven_point; solver is 'eight",
+        ),
+        ({"solver": "four_point", "local_optimization": "graph_cut"}, "is for fundamental matrices"),
+        ({"solver": "four_point", "focal": {}}, "is for fundamental matrices"),
     ],
 )
 def test_bad_options_are_told(options: dict[str, object], message: str) -> None:
@@ -228,17 +212,10 @@ def test_bad_options_are_told(options: dict[str, object], message: str) -> None:
         Ransac(**options)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"threshold": 2.0, "inliers": "threshold"},
-        {"inlier_threshold": 2.0, "inliers": "threshold"},
-        {"threshold": 2.0, "confidence": 0.99},  # of the stopping rule
-        {"threshold": 2.0, "local_optimization": "graph_cut"},
-    ],
-)
-def test_thresholds_that_something_asks_for_are_taken(options: dict[str, object]) -> None:
-    Ransac(**(MEDIAN | options))  # type: ignore[arg-type]
+def test_thresholds_that_something_asks_for_are_taken() -> None:
+    Ransac(**(MEDIAN | {"inlier_threshold": 2.0, "inliers": "threshold"}))  # type: ignore[arg-type]
+    for asks in ({"inliers": "threshold"}, {"confidence": 0.99}, {"local_optimization": "graph_cut"}):
+        Ransac(**(MEDIAN | {"threshold": 2.0} | asks))  # type: ignore[arg-type]
 
 
 def test_a_part_is_a_name_a_mapping_or_an_object() -> None:

@@ -22,6 +22,7 @@ from fmtorch.jit.kernel import SWITCH, Kernel
 from tests.conftest import oracle
 from tests.laws import few, quick, scene, scenes
 from tests.reference import refine as reference
+from tests.reference.solvers import sampson
 from tests.variants import OTHER_LIBRARIES, built, variants
 
 OTHERS = (*OTHER_LIBRARIES, "homography", "weighted_eight_point")  # the last one is not robust, and has no gradients
@@ -31,10 +32,7 @@ OWN = [n for n in variants("estimator") if not n.startswith(OTHERS)]
 def _true_inlier_error(F: torch.Tensor, index: int, count: int) -> float:
     """Median Sampson distance, px, of the noise-free inliers of a scene."""
     clean = scene(index, count, outliers=0.0, noise=0.0)
-    h0, h1 = (torch.cat([x[0].double(), torch.ones(count, 1, dtype=torch.float64)], 1) for x in (clean.x0, clean.x1))
-    l1, l0 = h0 @ F.T, h1 @ F
-    e = (h1 * l1).sum(1).abs() / (l1[:, 0] ** 2 + l1[:, 1] ** 2 + l0[:, 0] ** 2 + l0[:, 1] ** 2).sqrt()
-    return float(e.median())
+    return float(np.median(np.abs(sampson(F.numpy(), clean.x0[0].double().numpy(), clean.x1[0].double().numpy()))))
 
 
 @pytest.mark.parametrize("name", OWN)
@@ -247,7 +245,7 @@ def test_is_a_minimum_of_the_weighted_loss(loss: str) -> None:
     prior = c.prior
 
     def cost(F: torch.Tensor, i: int) -> float:
-        r2 = reference.sampson(F.numpy(), c.x0[i].double().numpy(), c.x1[i].double().numpy()) ** 2
+        r2 = sampson(F.numpy(), c.x0[i].double().numpy(), c.x1[i].double().numpy()) ** 2
         return float((prior[i].double().numpy() * reference.loss(r2, 4.0, loss)).sum())
 
     further = refine(estimate.F, c.x0, c.x1, prior, c.mask, loss=loss, scale=2.0, iterations=50)
@@ -266,16 +264,11 @@ def test_an_annealed_loss_is_not_caught_where_a_narrow_one_is() -> None:
 
 def test_the_prior_and_the_quality_decide_where_there_are_more_outliers_than_inliers() -> None:
     pairs = collate([scene(i, 150, outliers=0.65) for i in range(16)])
-    inliers = {
-        name: int(IterativelyReweighted(loss="geman_mcclure", threshold=1.0)(c).inliers.sum())
-        for name, c in {
-            "prior": pairs,
-            "ratio": pairs.replace(prior=None),
-            "nothing": pairs.replace(prior=None, ratio=None),
-        }.items()
-    }
-    assert inliers["prior"] > 1.2 * inliers["nothing"]
-    assert inliers["ratio"] > 1.2 * inliers["nothing"]
+    known = (pairs, pairs.replace(prior=None), pairs.replace(prior=None, ratio=None))
+    estimator = IterativelyReweighted(loss="geman_mcclure", threshold=1.0)
+    prior, ratio, nothing = (int(estimator(c).inliers.sum()) for c in known)
+    assert prior > 1.2 * nothing
+    assert ratio > 1.2 * nothing
 
 
 @pytest.mark.parametrize(

@@ -11,23 +11,13 @@ from scipy import stats
 
 from fmtorch import estimators
 from fmtorch.core import Correspondences, collate
-from fmtorch.estimators import Hypotheses, Pool, Preselection, Search, Verified, largest_weight
-from fmtorch.estimators.preselection import (
-    FIRST_LOOK,
-    best,
-    degenerate_support,
-    draw_by_prior,
-    drawn_by_prior,
-    shuffled_first,
-)
-from fmtorch.estimators.search import merge
+from fmtorch.estimators import Hypotheses, Pool, Preselection, Search, Verified, largest_weight, preselection
 from fmtorch.jit.random import Stream
 from tests.estimators.pairs import FEW, SCALES, known, models, named, pair_of
 from tests.laws import scene, with_padding
 from tests.reference import ransac as reference
 from tests.reference import solvers
 from tests.reference.random import number
-from tests.reference.ransac import degenerate_support as expected_support
 
 
 @dataclasses.dataclass
@@ -80,21 +70,19 @@ def test_models_are_those_of_the_samples_of_their_draws(family: Any, sampler: es
 
 
 def test_a_pool_keeps_the_best_and_the_earlier_of_equals() -> None:
+    """What is not finite is no score; beyond that a stable sort of all that it was offered."""
     pool = Pool.empty(3)
     assert pool.models.shape == (1, 9)
     assert not pool.models.any()
     assert pool.valid.tolist() == [False]
-
-    def offer(scores: list[float], first: int) -> None:
+    for scores, first, kept, best in (
+        ([1.0, 3.0], 10, [11, 10], [3, 1]),
+        ([3.0, np.nan, -np.inf, 2.0, 0.0, np.inf], 20, [11, 20, 23], [3, 3, 2]),
+        ([3.0, 2.0], 30, [11, 20, 30], [3, 3, 3]),
+    ):
         F = np.repeat(np.arange(first, first + len(scores), dtype=np.float32)[:, None], 9, 1)
         pool.merge(Verified(F, np.arange(len(scores)), np.array(scores)))
-
-    offer([1.0, 3.0], 10)
-    assert (pool.filled, pool.valid.tolist()) == (2, [True, True])
-    offer([3.0, np.nan, -np.inf, 2.0, 0.0, np.inf], 20)
-    assert (pool.score.tolist(), pool.F[:, 0].tolist()) == ([3.0, 3.0, 2.0], [11, 20, 23])
-    offer([3.0, 2.0], 30)
-    assert pool.F[:, 0].tolist() == [11, 20, 30]
+        assert (pool.F[: pool.filled, 0].tolist(), pool.score[: pool.filled].tolist()) == (kept, best)
 
 
 @pytest.mark.parametrize("preselect", [None, estimators.Preselect(64, 20)])
@@ -150,7 +138,7 @@ def test_few_matches_are_those_of_the_definitions(given: str) -> None:
     pair = named(given, seed=SEED)
     n, words, prior = pair.count, numbers(pair), pair.prior.copy()
     for count in (1, 5, n - 1, n, 2 * n):
-        any_few, likely = shuffled_first(pair, count), drawn_by_prior(pair, count)
+        any_few, likely = preselection.shuffled_first(pair, count), preselection.drawn_by_prior(pair, count)
         np.testing.assert_array_equal(any_few.table, pair.table[:, reference.shuffled(range(n), words, count)])
         drawn = reference.priority_sample(prior.tolist(), words, count)
         np.testing.assert_array_equal(likely.points, pair.points[:, drawn])
@@ -164,26 +152,26 @@ def test_likely_matches_are_drawn_by_their_prior() -> None:
     prior = np.repeat([0.0, 0.2, 0.6], n // 3)
     index = np.empty(k, np.int64)
     for key in range(keys):
-        draw_by_prior(prior, 5, key, index)
+        preselection.draw_by_prior(prior, 5, key, index)
         assert len(set(index.tolist())) == k
         seen += np.bincount(index // (n // 3), minlength=3)
     assert seen[0] == 0
     # 60 of 600 at a time: by their prior up to some 2 % (those drawn are missing later); 5 standard errors of a share.
     assert seen[2] / seen.sum() == pytest.approx(0.75, abs=0.02 + 5 * np.sqrt(0.75 * 0.25 / (k * keys)))
-    draw_by_prior(np.zeros(n), 5, 0, index)
+    preselection.draw_by_prior(np.zeros(n), 5, 0, index)
     np.testing.assert_array_equal(index, np.arange(k))
 
 
-@pytest.mark.parametrize(
-    "score",
-    [estimators.InlierCount(1.5), estimators.Msac(1.5, True), estimators.Magsac(1.5), estimators.SaturatedGains(1.5)],
-)
+@pytest.mark.parametrize("kind", ["InlierCount", "Msac", "Magsac", "SaturatedGains"])
 @pytest.mark.parametrize("given", ["scene 700", "real 7"])
-def test_the_models_that_pass_are_the_best_on_few_matches(given: str, score: Any) -> None:
+def test_the_models_that_pass_are_the_best_on_few_matches(given: str, kind: str) -> None:
+    score = getattr(estimators, kind)(1.5, *([True] if kind == "Msac" else []))
     pair, options = named(given, seed=SEED), estimators.Preselect(matches=64, survivors=20)
     F = models(pair, 120).astype(np.float32)
     which, scores = Preselection(score, options)(F, pair)
-    draw = drawn_by_prior if score.prior_weighted and pair.prior is not None else shuffled_first
+    draw = (
+        preselection.drawn_by_prior if score.prior_weighted and pair.prior is not None else preselection.shuffled_first
+    )
     first = getattr(score, "preselection", score)(F, np.arange(120), draw(pair, 64))
     np.testing.assert_array_equal(which, np.sort(np.argsort(-first, kind="stable")[:20]))
     np.testing.assert_array_equal(scores, score(F, np.arange(120), pair)[which])
@@ -209,7 +197,7 @@ def reason_of(x0: np.ndarray, x1: np.ndarray, inliers: np.ndarray | None = None,
     points = [torch.from_numpy(x.astype(dtype).astype(np.float64))[None] for x in (x0, x1)]
     pair = pair_of(Correspondences(*points, torch.ones(1, len(x0), dtype=torch.bool)))
     inside = np.ones(len(x0), np.bool_) if inliers is None else inliers
-    return degenerate_support(pair, inside, 7, float(np.finfo(dtype).eps))
+    return preselection.degenerate_support(pair, inside, 7, float(np.finfo(dtype).eps))
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
@@ -222,14 +210,11 @@ def test_points_of_a_line_are_told_from_points_near_one(scale: float, shift: flo
         line = start + rng.uniform(-300, 300, (30, 1)) * direction / np.linalg.norm(direction)
         near = line + rng.normal(0, 0.02, (30, 2))  # px: no detector is as exact
         other = rng.uniform(0, 500, (30, 2))
-        for x0, x1, images in (
-            (line, other, "image 0"),
-            (other, line, "image 1"),
-            (line, line[::-1], "image 0 and image 1"),
-            (near, other, ""),
-        ):
-            expected = f"the inliers of the best model lie on one line in {images}" if images else ""
-            assert reason_of(scale * x0, scale * x1, dtype=dtype) == expected
+        lines = {"image 0": (line, other), "image 1": (other, line), "image 0 and image 1": (line, line[::-1])}
+        for images, pair in lines.items():
+            said = f"the inliers of the best model lie on one line in {images}"
+            assert reason_of(*(scale * x for x in pair), dtype=dtype) == said
+        assert reason_of(scale * near, scale * other, dtype=dtype) == ""
 
 
 @pytest.mark.parametrize("count", [0, 6, 7])
@@ -237,7 +222,7 @@ def test_inliers_count_once_at_one_place_and_late_ones_are_seen(count: int) -> N
     rng = np.random.default_rng(1)
     x = rng.uniform(0, 500, (1000, 4))
     few = f"the best model has {count} different inliers; at least 7 are needed" if count < 7 else ""
-    for first in (0, 100, FIRST_LOOK - 3, 900):
+    for first in (0, 100, preselection.FIRST_LOOK - 3, 900):
         inliers = np.zeros(1000, np.bool_)
         inliers[first : first + count] = True
         assert reason_of(x[:, :2], x[:, 2:], inliers) == few
@@ -253,10 +238,10 @@ def test_what_is_said_is_what_the_definition_says(name: str, scale: float) -> No
     pair, rng = named(name, scale), np.random.default_rng(0)
     for share in (0.01, 0.1, 0.5, 1.0):
         inliers = rng.random(pair.count) < share
-        reason = degenerate_support(pair, inliers, 7, EPS32)
+        reason = preselection.degenerate_support(pair, inliers, 7, EPS32)
         inside = pair.points[:, inliers].T
         largest = np.abs(pair.centre).max() / pair.pixels_per_unit + 1
-        assert reason == expected_support(inside, 7, EPS32 * largest)
+        assert reason == reference.degenerate_support(inside, 7, EPS32 * largest)
 
 
 def test_lines_up_to_the_rounding_of_float32_coordinates() -> None:
@@ -269,7 +254,6 @@ def test_lines_up_to_the_rounding_of_float32_coordinates() -> None:
         assert ("line in image 0" in reason_of(line, other)) == on_line
 
 
-SAMPLERS = [estimators.Uniform(), estimators.PriorWeighted(), estimators.Prosac()]
 DRAW_SEED = 3
 
 
@@ -293,18 +277,19 @@ def numbers_of(pair: estimators.Pair, draw: int, columns: int) -> list[int]:
 def test_samples_by_weight_are_those_of_the_definition(count: int, size: int, prior: str) -> None:
     matches = pair(count, prior)
     ones = [1] * count
-    weights = (
-        ones if matches.prior is None else reference.quantised(matches.prior.tolist(), largest_weight(matches.bucket))
-    )
+    largest = largest_weight(matches.bucket)
+    weights = ones if matches.prior is None else reference.quantised(matches.prior.tolist(), largest)
     for sampler, expected in ((estimators.PriorWeighted(), weights), (estimators.Uniform(), ones)):
         assert sampler.weight(matches).tolist() == expected
         assert sum(expected) <= 1 << 30
         for start, draws in ((0, 20), (700, 11)):
             sample = sampler.draw(matches, start, draws, size)
             assert sample.dtype == np.int64
-            assert sample.T.tolist() == [
-                reference.weighted_sample(expected, numbers_of(matches, start + d, size)) for d in range(draws)
+            drawn = [
+                reference.weighted_sample(expected, numbers_of(matches, draw, size))
+                for draw in range(start, start + draws)
             ]
+            assert sample.T.tolist() == drawn
 
 
 @pytest.mark.parametrize("size", [4, 5, 7, 8])
@@ -319,10 +304,8 @@ def test_samples_of_prosac_are_those_of_the_definition(count: int, size: int) ->
     best = np.argsort(matches.ambiguity, kind="stable")
     for start in (0, table[-1] // 2, max(table[-1] - 10, 0)):
         draws = min(20, table[-1] - start)
-        expected = [
-            reference.prosac_sample(table, start + d + 1, numbers_of(matches, start + d, size - 1))
-            for d in range(draws)
-        ]
+        counted = ((d + 1, numbers_of(matches, d, size - 1)) for d in range(start, start + draws))
+        expected = [reference.prosac_sample(table, *each) for each in counted]
         np.testing.assert_array_equal(sampler.draw(matches, start, draws, size).T, best[expected])
 
 
@@ -343,9 +326,8 @@ def test_prosac_is_uniform_after_its_growth_and_where_nothing_is_ranked() -> Non
     np.testing.assert_array_equal(across[:, :30], estimators.Prosac().draw(matches, end - 30, 30, 7))
     np.testing.assert_array_equal(across[:, 30:], estimators.Uniform().draw(matches, end, 30, 7))
     nothing = pair_of(scene(1, 100).replace(ratio=None, prior=None))
-    np.testing.assert_array_equal(
-        estimators.Prosac().draw(nothing, 100, 300, 7), estimators.Uniform().draw(nothing, 100, 300, 7)
-    )
+    drawn, uniform = (sampler.draw(nothing, 100, 300, 7) for sampler in (estimators.Prosac(), estimators.Uniform()))
+    np.testing.assert_array_equal(drawn, uniform)
 
 
 @pytest.mark.parametrize("key", [0, 1, -1, 2**63 - 1, -(2**63)])
@@ -368,7 +350,7 @@ def test_samples_follow_the_prior(sampler: Any) -> None:
         assert stats.chisquare(np.bincount(drawn, minlength=30), draws * expected).pvalue > 1e-4
 
 
-@pytest.mark.parametrize("sampler", SAMPLERS)
+@pytest.mark.parametrize("sampler", [estimators.Uniform(), estimators.PriorWeighted(), estimators.Prosac()])
 def test_samples_are_a_function_of_seed_key_and_draw(sampler: estimators.Sampler) -> None:
     def drawn(c: Correspondences, i: int = 0, start: int = 0, count: int = 400, seed: int = 0) -> Any:
         return sampler.draw(pair_of(c, seed, i), start, count, 7)
@@ -381,26 +363,3 @@ def test_samples_are_a_function_of_seed_key_and_draw(sampler: estimators.Sampler
     np.testing.assert_array_equal(drawn(batch, 1), alone)
     assert not np.array_equal(drawn(scene(1, 150), seed=1), alone)
     assert not np.array_equal(drawn(scene(1, 150).replace(key=torch.tensor([5]))), alone)
-
-
-@pytest.mark.parametrize(("m", "k", "size"), [(1, 1, 1), (300, 96, 12), (40, 40, 100)])
-def test_a_pool_is_a_stable_sort_of_all_that_it_was_offered(m: int, k: int, size: int) -> None:
-    rng = np.random.default_rng(m)
-    F, score = rng.normal(size=(m, 9)).astype(np.float32), rng.integers(-20, 20, m) / 8.0
-    which = np.sort(rng.permutation(m)[:k])
-    pool, pool_score, filled = np.zeros((size, 9), np.float32), np.full(size, -np.inf), 0
-    for part in np.array_split(which, 3):
-        filled = merge(F, part, score[part], filled, pool, pool_score)
-    best = which[np.argsort(-score[which], kind="stable")][:size]
-    assert filled == len(best)
-    np.testing.assert_array_equal(pool[:filled], F[best])
-    np.testing.assert_array_equal(pool_score[:filled], score[best])
-
-
-@pytest.mark.parametrize(("m", "k"), [(1, 1), (5, 5), (300, 96), (300, 1), (1000, 256)])
-def test_the_best_of_a_round_and_the_first_of_equals(m: int, k: int) -> None:
-    score = np.random.default_rng(m + k).integers(0, 40, m) / 8.0
-    score[::7] = -np.inf
-    which = np.empty(k, np.int64)
-    best(score, which)
-    np.testing.assert_array_equal(which, np.sort(np.argsort(-score, kind="stable")[:k]))

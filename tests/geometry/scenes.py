@@ -44,8 +44,12 @@ def scene(n: int, seed: int = 0, noise: float = 0.0, planar: bool = False) -> Sc
 
 def scenes(batch: tuple[int, ...], n: int, seed: int = 0, noise: float = 0.0) -> tuple[Tensor, Tensor, Tensor]:
     """x0, x1, F of independent scenes with any leading shape."""
+    return stacked(batch, n, seed, noise)[:3]
+
+
+def stacked(batch: tuple[int, ...], n: int, seed: int = 0, noise: float = 0.0) -> Scene:
     many = [scene(n, seed * 1000 + i, noise) for i in range(int(np.prod(batch, dtype=int)))]
-    return tuple(torch.stack(list(a)).reshape(*batch, *a[0].shape) for a in list(zip(*many, strict=True))[:3])
+    return Scene(*(torch.stack(list(a)).reshape(*batch, *a[0].shape) for a in zip(*many, strict=True)))
 
 
 def unit_scene(
@@ -83,13 +87,8 @@ def near_scene(seed: int, n: int = 24, noise: float = 3e-3, outliers: int = 3) -
 def tolerances(loss: str) -> dict[str, float | bool]:
     """Of `gradcheck`, along random directions. Central differences round 1e-15 times the condition 1e3 over the step.
     The tabulated loss is linear between its entries, 1 / 1000 apart, whose slopes differ by as much."""
-    return {
-        "eps": 1e-6,
-        "atol": 1e-5,
-        "rtol": 1e-3 if loss == "magsac" else 1e-5,
-        "fast_mode": True,
-        "check_undefined_grad": False,
-    }
+    rtol = 1e-3 if loss == "magsac" else 1e-5
+    return {"eps": 1e-6, "atol": 1e-5, "rtol": rtol, "fast_mode": True, "check_undefined_grad": False}
 
 
 K = np.array([[768.0, 0, 319.5], [0, 768, 239.5], [0, 0, 1]])

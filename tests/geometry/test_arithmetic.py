@@ -6,17 +6,7 @@ import torch
 
 from fmtorch.estimators.models import focal_prior
 from fmtorch.geometry import arithmetic
-from fmtorch.geometry.arithmetic import (
-    as_components,
-    as_matrices,
-    as_rows,
-    cofactors,
-    component_sum,
-    cross,
-    determinant,
-    product,
-    unit,
-)
+from fmtorch.geometry.arithmetic import as_components, as_matrices, as_rows, component_sum
 from fmtorch.geometry.significance import LOG_MODELS
 from fmtorch.jit.kernel import F8x2, kernel
 from fmtorch.jit.lanes import LANES, load, store
@@ -44,15 +34,10 @@ def test_stable_sum_is_a_sum_that_padding_and_neighbours_do_not_change(n, dtype)
 def test_component_sum_has_the_same_bits_in_small_and_in_large_tensors(n, dim):
     x = torch.randn(n, n, 2000, generator=torch.Generator().manual_seed(n), dtype=torch.float64)
     x[..., :50] = -0.0  # of which a sum is 0, not -0, on both ways
-    summed = arithmetic.component_sum(x, dim)
-    assert x[..., 30:130].numel() <= arithmetic.SMALL < x.numel()
-    assert torch.equal(
-        arithmetic.component_sum(x[..., 30:130], dim).view(torch.int64), summed[..., 30:130].view(torch.int64)
-    )
-    turned = x[..., 30:130].transpose(0, 2).contiguous().transpose(0, 2)
-    assert torch.equal(arithmetic.component_sum(turned, dim).view(torch.int64), summed[..., 30:130].view(torch.int64))
-    attached = x[..., 30:130].clone().requires_grad_()
-    assert torch.equal(arithmetic.component_sum(attached, dim).view(torch.int64), summed[..., 30:130].view(torch.int64))
+    expected, small = component_sum(x, dim)[..., 30:130].view(torch.int64), x[..., 30:130]
+    assert small.numel() <= arithmetic.SMALL < x.numel()
+    for same in (small, small.transpose(0, 2).contiguous().transpose(0, 2), small.clone().requires_grad_()):
+        assert torch.equal(component_sum(same, dim).view(torch.int64), expected)
 
 
 def test_exponential_and_logarithm() -> None:
@@ -172,9 +157,10 @@ def test_small_matrices_as_by_numpy() -> None:
     a, b = (as_rows(as_components(M)) for M in (A, B))
     # Some additions of products of numbers of about 1: a few eps of absolute error.
     tight = {"rtol": 0, "atol": 1e-13}
-    torch.testing.assert_close(as_matrices(product(a, b).flatten(0, 1)), A @ B, **tight)
-    torch.testing.assert_close(determinant(a), torch.linalg.det(A), **tight)
+    torch.testing.assert_close(as_matrices(arithmetic.product(a, b).flatten(0, 1)), A @ B, **tight)
+    torch.testing.assert_close(arithmetic.determinant(a), torch.linalg.det(A), **tight)
     expected = torch.linalg.det(A)[..., None, None] * torch.linalg.inv(A).mT
-    torch.testing.assert_close(as_matrices(cofactors(a).flatten(0, 1)), expected, rtol=1e-11, atol=1e-11)
-    torch.testing.assert_close(cross(a[0], b[0]).movedim(0, -1), torch.cross(A[..., 0, :], B[..., 0, :], -1), **tight)
-    torch.testing.assert_close(unit(a.flatten(0, 1)).square().sum(0), torch.ones(4, 5, dtype=torch.float64), **tight)
+    torch.testing.assert_close(as_matrices(arithmetic.cofactors(a).flatten(0, 1)), expected, rtol=1e-11, atol=1e-11)
+    expected = torch.linalg.cross(A[..., 0, :], B[..., 0, :])
+    torch.testing.assert_close(arithmetic.cross(a[0], b[0]).movedim(0, -1), expected, **tight)
+    torch.testing.assert_close(arithmetic.unit(a.flatten(0, 1)).square().sum(0), torch.ones(4, 5).double(), **tight)

@@ -15,13 +15,13 @@ from tests.reference.two_view import Cameras
 
 INF = math.inf
 PRECISIONS = {
-    "unknown": (np.diag([4.0, 9.0]), False),
-    "correlated": (np.array([[6.0, -4.0], [-4.0, 6.0]]), False),
-    "shared": (np.array([[3.0, 0.0], [0.0, 3.0]]), True),
-    "first known": (np.diag([INF, 5.0]), False),
-    "second known": (np.diag([5.0, INF]), False),
-    "both known": (np.diag([INF, INF]), False),
-    "shared and known": (np.diag([INF, 0.0]), True),
+    "unknown": [[4.0, 0], [0, 9]],
+    "correlated": [[6.0, -4], [-4, 6]],
+    "shared": [[3.0, 0], [0, 3]],
+    "first known": [[INF, 0], [0, 5]],
+    "second known": [[5.0, 0], [0, INF]],
+    "both known": [[INF, 0], [0, INF]],
+    "shared and known": [[INF, 0], [0, 0]],
 }
 
 
@@ -35,13 +35,9 @@ def problem(seed: int, n: int = 60, noise: float = 0.5) -> tuple[Cameras, np.nda
 
 
 def arguments(*cameras: Cameras) -> dict[str, Tensor]:
-    return {
-        "R": torch.from_numpy(np.stack([c.R for c in cameras])),
-        "t": torch.from_numpy(np.stack([c.t for c in cameras])),
-        "focal": torch.from_numpy(np.stack([c.focal for c in cameras])),
-        "principal0": torch.from_numpy(np.stack([c.principal[0] for c in cameras])),
-        "principal1": torch.from_numpy(np.stack([c.principal[1] for c in cameras])),
-    }
+    values = {name: np.stack([getattr(c, name) for c in cameras]) for name in ("R", "t", "focal", "principal")}
+    values["principal0"], values["principal1"] = values.pop("principal").swapaxes(0, 1)
+    return {name: torch.from_numpy(value) for name, value in values.items()}
 
 
 def batch(sizes: tuple[int, ...], noise: float = 0.5) -> dict[str, Tensor]:
@@ -68,7 +64,7 @@ def batch(sizes: tuple[int, ...], noise: float = 0.5) -> dict[str, Tensor]:
 
 @pytest.mark.parametrize("kind", PRECISIONS)
 def test_against_the_definitions(kind: str) -> None:
-    precision, shared = PRECISIONS[kind]
+    precision, shared = np.array(PRECISIONS[kind]), "shared" in kind
     given = batch((40, 60, 90)) | {
         "focal_precision": torch.from_numpy(precision).expand(3, 2, 2),
         "shared_focal": torch.tensor([shared]).expand(3),
@@ -82,12 +78,11 @@ def test_against_the_definitions(kind: str) -> None:
         C, V, s = reference.covariance(cameras, x0, x1, w, noise, 4.0, finite, basis)
         turn = np.eye(7)  # tangents are any basis of a plane
         turn[3:5, 3:5] = result.tangent[i].numpy().T @ cameras.basis
-        scale = np.sqrt(np.diag(turn @ C @ turn.T)) + 1e-12
+        expected = turn @ C @ turn.T
+        size = np.outer(*[np.sqrt(np.diag(expected)) + 1e-12] * 2)
         # Central differences of step 1e-6 are good to 1e-9 or so, and the noise ends within a quarter to the tenth.
         np.testing.assert_allclose(result.noise[i], s, rtol=1e-5)
-        np.testing.assert_allclose(
-            result.covariance[i].numpy() / np.outer(scale, scale), turn @ C @ turn.T / np.outer(scale, scale), atol=3e-5
-        )
+        np.testing.assert_allclose(result.covariance[i].numpy() / size, expected / size, atol=3e-5)
         np.testing.assert_allclose(result.fundamental[i].numpy(), V, atol=3e-5 * V.max())
         known = np.isinf(np.diag(precision)) | (shared and np.isinf(precision).any())
         assert not bool(result.covariance[i][5:][known].any())
@@ -98,13 +93,9 @@ def test_against_the_definitions(kind: str) -> None:
 def test_cameras_that_are_none_and_what_matches_leave_open_are_uncertain() -> None:
     given = batch((50,) * 9)
     bad = {k: v.clone() for k, v in given.items()}
-    bad["R"][0, 0, 0] = torch.nan
-    bad["t"][1] = 0
-    bad["focal"][2, 1] = -3
-    bad["truncation"][3] = 0
+    bad["R"][0, 0, 0], bad["t"][1], bad["focal"][2, 1], bad["truncation"][3] = torch.nan, 0, -3, 0
     bad["focal_precision"][4] = torch.tensor([[1.0, torch.nan], [torch.nan, 1.0]])
-    bad["mask"][5] = False
-    bad["x0"][6], bad["x1"][6] = 7.0, 9.0
+    bad["mask"][5], bad["x0"][6], bad["x1"][6] = False, 7.0, 9.0
     bad["focal_precision"][7] = torch.tensor([[-1e9, 0.0], [0.0, -1e9]])  # a prior that is no maximum adds nothing
     result = two_view_covariance(**bad)
     assert result.valid.tolist() == [False] * 5 + [True] * 4

@@ -11,21 +11,14 @@ from torch import Tensor
 from fmtorch.geometry import homography_points, pose_from_fundamental, poses_from_homography, rotation_from_homography
 from fmtorch.geometry.cameras import PixelFrame, calibration_problems, mapped, square_pixels
 from fmtorch.geometry.pose import pose
-from tests.geometry.scenes import scene
+from tests.geometry.scenes import scene, stacked
 from tests.reference import known_cameras, solvers
-from tests.reference import known_cameras as reference
-
-
-def stack(batch, n=20, noise=0.0):
-    many = [scene(n, i, noise) for i in range(int(np.prod(batch, dtype=int)))]
-    columns = (torch.stack(list(a)) for a in zip(*many, strict=True))
-    return [a.reshape(*batch, *a.shape[1:]) for a in columns]
 
 
 @pytest.mark.parametrize("batch", [(), (3,), (2, 3)])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_exact_pose(batch, dtype):
-    x0, x1, F, CAMERA0, CAMERA1, R, t = stack(batch)
+    x0, x1, F, CAMERA0, CAMERA1, R, t = stacked(batch, 20)
     sign = torch.where(torch.rand(*batch, 1, 1) < 0.5, 1, -1)
     pose = pose_from_fundamental(*(a.to(dtype) for a in (sign * F, CAMERA0, CAMERA1, x0, x1)))
     # F in pixels has entries from 1e-6 to 1: rounding it moves E by eps times 1000, the focal length.
@@ -58,7 +51,7 @@ def test_brute_force_opencv_and_kornia():
 
 
 def test_bad_input_is_invalid_and_alone():
-    x0, x1, F, CAMERA0, CAMERA1, R, _ = stack((7,))
+    x0, x1, F, CAMERA0, CAMERA1, R, _ = stacked((7,), 20)
     F[0] = 0
     F[1, 0, 0] = torch.nan
     CAMERA0[2] = 0
@@ -273,7 +266,7 @@ def test_they_are_those_of_the_definition() -> None:
     rng = np.random.default_rng(0)
     for _ in range(10):
         K = np.array([[rng.uniform(300, 900), rng.normal(0, 5), 320], [0, rng.uniform(300, 900), 240], [0, 0, 1]])
-        A, square = reference.square(K, (480, 640))
+        A, square = known_cameras.square(K, (480, 640))
         for scale in (1.0, -2.0):  # K is homogeneous
             square_map = square_pixels(torch.from_numpy(scale * K)[None], SIZE, RIGHT)
             np.testing.assert_allclose(square_map.map[0], A, rtol=1e-12, atol=1e-9)

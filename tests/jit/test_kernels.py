@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 
 from fmtorch.jit import cache as files
-from fmtorch.jit import kernel as messages
 from fmtorch.jit import kernel as switch
 from fmtorch.jit import together
 from fmtorch.jit.kernel import Kernel, kernel
 from fmtorch.jit.lanes import fused
+from tests.helpers import in_threads
 from tests.processes import run_command
 
 SOURCE = """
@@ -62,7 +62,7 @@ numba = pytest.importorskip("numba", reason="numba is not installed")
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     monkeypatch.setenv("FMTORCH_CACHE", str(tmp_path / "cache"))
     monkeypatch.delenv(switch.SWITCH, raising=False)
-    monkeypatch.setitem(messages._state, "announced", False)
+    monkeypatch.setitem(switch._state, "announced", False)
     files.folder.cache_clear()
     yield tmp_path / "cache" / "kernels"
     files.folder.cache_clear()
@@ -160,20 +160,25 @@ def test_two_processes_compile_together(module, tmp_path, monkeypatch, cache, im
     together.compile_together(both)
 
 
+def with_path(folder: Path) -> dict[str, str]:
+    """The environment of a process that imports modules of a folder."""
+    return {**os.environ, "PYTHONPATH": os.pathsep.join([str(REPOSITORY), str(folder)])}
+
+
+def start_helper(folder: Path, kernel: str) -> subprocess.Popen[bytes]:
+    command = [sys.executable, "-m", "fmtorch.jit.together", kernel]
+    return subprocess.Popen(command, stdin=subprocess.PIPE, env=with_path(folder))
+
+
 def test_the_other_process_compiles_what_it_is_told(module: types.ModuleType, tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "fmtorch.jit.together", "some_kernels:rows"]
-    path = os.pathsep.join([str(REPOSITORY), str(tmp_path)])
-    helper = subprocess.Popen(command, stdin=subprocess.PIPE, env={**os.environ, "PYTHONPATH": path})
-    assert helper.wait(300) == 0
+    assert start_helper(tmp_path, "some_kernels:rows").wait(300) == 0
     assert module.rows.kept
     assert not module.scaled_squares.kept
 
 
 def test_the_other_process_ends_with_the_one_that_asked(tmp_path: Path) -> None:
     (tmp_path / "endless.py").write_text("import time\ntime.sleep(300)\n")
-    command = [sys.executable, "-m", "fmtorch.jit.together", "endless:rows"]
-    path = os.pathsep.join([str(REPOSITORY), str(tmp_path)])
-    helper = subprocess.Popen(command, stdin=subprocess.PIPE, env={**os.environ, "PYTHONPATH": path})
+    helper = start_helper(tmp_path, "endless:rows")
     helper.stdin.close()
     assert helper.wait(60) == 1
 
@@ -273,11 +278,7 @@ def test_folders_long_unused_are_removed(cache: Path) -> None:
 
 def test_threads_compile_it_once_and_run_at_the_same_time(module, capsys):
     results: list[list[list[float]]] = []
-    threads = [threading.Thread(target=lambda: results.append(result(module))) for _ in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    in_threads(4, lambda _: results.append(result(module)))
     assert (results, capsys.readouterr().err.count("compiling rows")) == ([EXPECTED] * 4, 1)
 
 
@@ -308,12 +309,8 @@ def test_several_processes_compile_each_kernel_once(tmp_path: Path, cache: Path)
         "KernelFile.save_overload = lambda *arguments: (compiled.append(1), plain(*arguments))\n"
         "x = np.ones((1, 3), 'f4'); k.rows(x, x); print(len(compiled), x.tolist())"
     )
-    path = os.pathsep.join([str(REPOSITORY), str(tmp_path)])
-    environment = {**os.environ, "PYTHONPATH": path}
-    processes = [
-        subprocess.Popen([sys.executable, "-c", code], env=environment, stdout=subprocess.PIPE, text=True)
-        for _ in range(3)
-    ]
+    options = {"env": with_path(tmp_path), "stdout": subprocess.PIPE, "text": True}
+    processes = [subprocess.Popen([sys.executable, "-c", code], **options) for _ in range(3)]
     outputs = [process.communicate(timeout=300)[0].strip().partition(" ") for process in processes]
     assert [values for _, _, values in outputs] == ["[[2.0, 2.0, 2.0]]"] * 3
     assert sum(int(compiled) for compiled, _, _ in outputs) == 2  # rows, and scaled_squares, which it calls

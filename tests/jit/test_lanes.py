@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fmtorch.geometry.five_point import five_point
 from fmtorch.jit import cache, linking
 from fmtorch.jit import kernel as switch
 from fmtorch.jit.kernel import B1x2, F4x2, F8x1, F8x2, kernel
@@ -58,28 +57,28 @@ def _rows(count, dtype):
     return values
 
 
+def same_compiled(kernel, values, *outputs):
+    """The outputs of a kernel, which are those of its function interpreted."""
+    compiled, plain = ([each.copy() for each in outputs] for _ in range(2))
+    kernel(values, *compiled)
+    kernel.function(values, *plain)
+    for a, b in zip(compiled, plain, strict=True):
+        np.testing.assert_array_equal(a, b)
+    return compiled
+
+
 @pytest.mark.filterwarnings("ignore:divide by zero|invalid value:RuntimeWarning")
 def test_compiled_operators_do_to_each_lane_what_they_do_to_arrays() -> None:
-    values, results = _rows(LANES, np.float64), []
-    for each in (in_doubles, in_doubles.function):
-        out, masks, sums = np.zeros((6, LANES)), np.zeros((2, LANES), np.bool_), np.zeros(4)
-        each(values, out, masks, sums)
-        results.append((out, masks, sums))
-    for compiled, plain in zip(*results, strict=True):
-        np.testing.assert_array_equal(compiled, plain)
-    assert results[0][1].any()
-    assert not results[0][1].all()
+    outputs = np.zeros((6, LANES)), np.zeros((2, LANES), np.bool_), np.zeros(4)
+    _, masks, _ = same_compiled(in_doubles, _rows(LANES, np.float64), *outputs)
+    assert masks.any()
+    assert not masks.all()
 
 
 def test_float32_stays_float32() -> None:
-    values, results = _rows(SINGLES, np.float32), []
+    values = _rows(SINGLES, np.float32)
     values[0, :5] = [1, 2, 3, 4, 5]
-    for each in (in_singles, in_singles.function):
-        out, sums = np.zeros((2, SINGLES), np.float32), np.zeros(1)
-        each(values, out, sums)
-        results.append((out, sums))
-    for compiled, plain in zip(*results, strict=True):
-        np.testing.assert_array_equal(compiled, plain)
+    same_compiled(in_singles, values, np.zeros((2, SINGLES), np.float32), np.zeros(1))
 
 
 def test_lanes_of_different_kinds_do_not_mix() -> None:
@@ -98,21 +97,6 @@ def test_an_operator_leaves_other_names_of_a_value_as_they_were() -> None:
     total += 1.0
     total *= 3.0
     assert (start.tolist(), total.tolist()) == ([1.0] * LANES, [6.0] * LANES)
-
-
-@pytest.mark.filterwarnings("ignore:divide by zero|invalid value|overflow:RuntimeWarning")
-def test_a_solver_called_without_numba_finds_the_same_models() -> None:
-    generator = np.random.default_rng(0)
-    points = np.tile(generator.normal(size=(2, 30)), (2, 1)) + 0.1 * generator.normal(size=(4, 30))
-    sample = np.stack([generator.permutation(30)[:5] for _ in range(LANES + 3)], 1)
-    depth, results = np.full((2, LANES + 3), 1.2), []
-    for each in (five_point, five_point.function):
-        F, draw = np.zeros((10 * sample.shape[1], 9), np.float32), np.zeros(10 * sample.shape[1], np.int64)
-        count = each(points, sample, depth, np.zeros(4), F, draw)
-        results.append((count, F, draw))
-    assert results[0][0] > LANES
-    for compiled, plain in zip(*results, strict=True):
-        np.testing.assert_array_equal(compiled, plain)
 
 
 numba = pytest.importorskip("numba", reason="numba is not installed")

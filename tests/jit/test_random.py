@@ -10,7 +10,6 @@ from fmtorch.estimators import uniforms
 from fmtorch.estimators.preselection import shuffle
 from fmtorch.jit.random import Stream, bits, mixed_seed, uniform
 from tests.reference import random as reference
-from tests.reference.random import number
 
 KEYS = torch.tensor([0, 1, -1, 2**63 - 1, -(2**63), pair_key("fountain-P11/3-7")])
 
@@ -79,24 +78,15 @@ def test_the_same_bits(seed: int, key: int) -> None:
         for start in (0, 2**33):
             out = np.empty((50, 3))
             uniforms(mixed_seed(seed, stream), key, start, out)
-            words = [[number(seed, key, stream, start + i, j, 3) for j in range(3)] for i in range(50)]
+            words = [[reference.number(seed, key, stream, start + i, j, 3) for j in range(3)] for i in range(50)]
             assert out.tolist() == [[(word >> 10) / 2**53 for word in row] for row in words]
             tensors = uniform(seed, torch.tensor([key]), stream, start, 50, 3)[0]
             assert out.tolist() == tensors.tolist()
-        order = sorted(range(1000), key=lambda i: number(seed, key, stream, 0, i, 1))
+        order = sorted(range(1000), key=lambda i: reference.number(seed, key, stream, 0, i, 1))
         for most in (1, 17, 1000, 2000):
             index = np.empty(most, np.int64)
             count = shuffle(1000, mixed_seed(seed, stream), key, index)
             assert index[:count].tolist() == order[:most]
-
-
-def test_the_same_in_any_batch_and_any_slice_of_draws() -> None:
-    together = bits(3, KEYS, Stream.SAMPLING, 0, 64, 7)
-    for i, key in enumerate(KEYS):
-        assert torch.equal(bits(3, key[None], Stream.SAMPLING, 0, 64, 7)[0], together[i])
-    assert torch.equal(bits(3, KEYS.flip(0), Stream.SAMPLING, 0, 64, 7).flip(0), together)
-    parts = [bits(3, KEYS, Stream.SAMPLING, start, 16, 7) for start in range(0, 64, 16)]
-    assert torch.equal(torch.cat(parts, 1), together)
 
 
 def test_seeds_keys_streams_and_draws_give_distinct_numbers() -> None:

@@ -78,6 +78,11 @@ def other(x: float) -> float:
 """
 
 
+def run_python(*words: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    env = {**os.environ, "PYTHONPATH": str(REPOSITORY), **environment}
+    return subprocess.run([sys.executable, *words], env=env, capture_output=True, text=True, check=True)
+
+
 def load(folder: Path, source: str) -> types.ModuleType:
     """A module of this source, compiled here: bytecode on disk is only as new as a second and a file's size tell."""
     module = types.ModuleType("kernels_of_a_test")
@@ -159,10 +164,8 @@ def test_names_beyond_the_first_bytes(tmp_path: Path) -> None:
     """A module may have more names than one argument of an instruction can count."""
     names = [f"name{i}" for i in range(400)]
     text = "\n".join(f"{name} = {i}" for i, name in enumerate(names)) + f"\ndef f():\n    return {' + '.join(names)}\n"
-    versions = {
-        version(load(tmp_path, text.replace(f"name{i} = {i}\n", f"name{i} = -1\n")).f) for i in range(0, 399, 7)
-    }
-    assert len(versions) == 57
+    changed = (text.replace(f"name{i} = {i}\n", f"name{i} = -1\n") for i in range(0, 399, 7))
+    assert len({version(load(tmp_path, each).f) for each in changed}) == 57
 
 
 @pytest.mark.parametrize("value", ["object()", "sys.modules['tests.conftest'].oracle"])
@@ -177,13 +180,7 @@ def test_every_process_tells_the_same_versions() -> None:
         "from fmtorch.estimators.precompiled import WITH_FOCALS; import json;"
         "print(json.dumps([each.version for each in WITH_FOCALS]))"
     )
-    printed = [
-        subprocess.run(
-            [sys.executable, "-c", code], env={**os.environ, "PYTHONHASHSEED": seed, "PYTHONPATH": str(REPOSITORY)},
-            capture_output=True, text=True, check=True,
-        ).stdout
-        for seed in ("1", "2")
-    ]  # fmt: skip
+    printed = [run_python("-c", code, PYTHONHASHSEED=seed).stdout for seed in ("1", "2")]
     here = [each.version for each in WITH_FOCALS]  # with the checks that tests wrap around functions
     assert ([json.loads(each) for each in printed], len(set(here))) == ([here, here], len(here))
 
@@ -221,20 +218,14 @@ def of_tens(n: int) -> int:
 def test_functions_of_one_name_kept_by_two_processes_stay_two(tmp_path: Path) -> None:
     """numba tells functions of one name apart by numbers that begin anew in every process."""
     (tmp_path / "clashing.py").write_text(CLASHING)
-    path = os.pathsep.join([str(REPOSITORY), str(tmp_path)])
-    env = {**os.environ, "PYTHONPATH": path, "FMTORCH_CACHE": str(tmp_path / "cache")}
-    printed = [
-        subprocess.run(
-            [sys.executable, "-c", f"from clashing import *; print({calls})"],
-            env=env, capture_output=True, text=True, check=True,
-        ).stdout.split()
-        for calls in ("of_ones(5)", "of_tens(5)", "of_ones(5), of_tens(5)", "of_tens(5), of_ones(5)")
-    ]  # fmt: skip
+    own = {"PYTHONPATH": os.pathsep.join([str(REPOSITORY), str(tmp_path)]), "FMTORCH_CACHE": str(tmp_path / "cache")}
+    calls = ("of_ones(5)", "of_tens(5)", "of_ones(5), of_tens(5)", "of_tens(5), of_ones(5)")
+    codes = [f"from clashing import *; print({each})" for each in calls]
+    printed = [run_python("-c", code, **own).stdout.split() for code in codes]
     assert printed == [["8"], ["80"], ["8", "80"], ["80", "8"]]
 
 
 numba = pytest.importorskip("numba", reason="numba is not installed")
-ROOT = Path(__file__).resolve().parents[2]
 
 
 class Different(NamedTuple):
@@ -298,10 +289,7 @@ def test_an_annotation_that_is_no_type_of_kernels_is_named() -> None:
         signature_of(grouped)
 
 
-def test_a_script_finds_what_it_kept_although_its_groups_are_made_anew(tmp_path: Path) -> None:
-    script = tmp_path / "script.py"
-    script.write_text(
-        """
+SCRIPT = """
 from typing import NamedTuple
 import numpy as np
 from fmtorch.jit.kernel import F8x1
@@ -317,11 +305,10 @@ def end(line: Line) -> float:
 
 print(end(Line(np.arange(4.0), 2.0)))
 """
-    )
-    env = {**os.environ, "PYTHONPATH": str(ROOT), "FMTORCH_CACHE": str(tmp_path / "cache")}
-    compiled = []
-    for _ in range(2):
-        done = subprocess.run([sys.executable, str(script)], env=env, capture_output=True, text=True, check=True)
-        assert done.stdout == "6.0\n"
-        compiled.append("compiling end" in done.stderr)
-    assert compiled == [True, False]
+
+
+def test_a_script_finds_what_it_kept_although_its_groups_are_made_anew(tmp_path: Path) -> None:
+    (tmp_path / "script.py").write_text(SCRIPT)
+    done = [run_python(str(tmp_path / "script.py"), FMTORCH_CACHE=str(tmp_path / "cache")) for _ in range(2)]
+    assert [each.stdout for each in done] == ["6.0\n"] * 2
+    assert ["compiling end" in each.stderr for each in done] == [True, False]

@@ -11,18 +11,19 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from tests.reference.refine import sampson
-from tests.reference.solvers import skew
+from tests.reference.solvers import sampson, skew
+
+Size = tuple[int, int]
 
 
-def calibration(focal: float, size: tuple[int, int]) -> np.ndarray:
+def calibration(focal: float, size: Size) -> np.ndarray:
     """K of a camera with square pixels and central principal point; focal in units of the longer side, size (h, w)."""
     h, w = size
     f = focal * max(h, w)
     return np.array([[f, 0, (w - 1) / 2], [0, f, (h - 1) / 2], [0, 0, 1]])
 
 
-def fundamental(parameters: np.ndarray, size0: tuple[int, int], size1: tuple[int, int]) -> np.ndarray:
+def fundamental(parameters: np.ndarray, size0: Size, size1: Size) -> np.ndarray:
     """F of rotation vector (3), translation (3), log focal lengths (2)."""
     R = Rotation.from_rotvec(parameters[:3]).as_matrix()
     K0, K1 = calibration(np.exp(parameters[6]), size0), calibration(np.exp(parameters[7]), size1)
@@ -46,49 +47,18 @@ def prior_cost(log_f0: float, log_f1: float, same_size: bool = False, measured: 
     return cost + 3 * z2 / (z2 + 6)
 
 
-def loss(r: np.ndarray, scale: float) -> np.ndarray:
-    """Geman & McClure's: ``r^2 s^2 / (s^2 + r^2)``."""
-    return (r * scale) ** 2 / (scale**2 + r**2)
-
-
-def cost(
-    F: np.ndarray,
-    focal: np.ndarray,
-    x0: np.ndarray,
-    x1: np.ndarray,
-    weight: np.ndarray,
-    scale: float,
-    same_size: bool = False,
+def least_cost(
+    start: np.ndarray, x0: np.ndarray, x1: np.ndarray, weight: np.ndarray, scale: float, size0: Size, size1: Size
 ) -> float:
-    """The objective at F with log focal lengths `focal`."""
-    data = (weight * loss(sampson(F, x0, x1), scale)).sum() / (2 * 0.3**2)
-    return float(data) + prior_cost(focal[0], focal[1], same_size)
-
-
-def optimum(
-    start: np.ndarray,
-    x0: np.ndarray,
-    x1: np.ndarray,
-    weight: np.ndarray,
-    scale: float,
-    size0: tuple[int, int],
-    size1: tuple[int, int],
-) -> tuple[np.ndarray, float]:
-    """The parameters of least cost near `start`, and that cost."""
-
-    same = size0 == size1
+    """The least cost near parameters, of images of two sizes."""
 
     def residuals(p: np.ndarray) -> np.ndarray:
         r = sampson(fundamental(p, size0, size1), x0, x1)
         data = np.sqrt(weight) * scale * r / np.sqrt(scale**2 + r**2) / 0.3  # its square is the loss
-        focal = [(p[6] - p[7]) / 0.5, ((p[6] + p[7]) / 2 - np.log(1.2)) / 0.4]
-        if same:  # its square is twice what is missing to the depth of the well
-            focal.append(np.sqrt(10 / (0.01**2 + (p[6] - p[7]) ** 2)) * (p[6] - p[7]))
-        gauge = [np.linalg.norm(p[3:6]) - 1]
-        return np.concatenate([data, focal, gauge])
+        prior = [(p[6] - p[7]) / 0.5, ((p[6] + p[7]) / 2 - np.log(1.2)) / 0.4]
+        return np.concatenate([data, prior, [np.linalg.norm(p[3:6]) - 1]])
 
-    parameters = least_squares(residuals, start, jac="3-point", max_nfev=1000, xtol=1e-15, ftol=1e-15, gtol=1e-12).x
-    return parameters, cost(fundamental(parameters, size0, size1), parameters[6:], x0, x1, weight, scale, same)
+    return float(least_squares(residuals, start, jac="3-point", max_nfev=1000, xtol=1e-15, ftol=1e-15, gtol=1e-12).cost)
 
 
 def share_in_front(

@@ -8,6 +8,7 @@ from typing import cast
 
 import numpy as np
 
+from tests.reference.refine import loss as robust_loss
 from tests.reference.solvers import hartley, homogeneous, skew, unit
 
 
@@ -47,13 +48,6 @@ def plane_and_parallax(H: np.ndarray, x0: np.ndarray, x1: np.ndarray) -> np.ndar
 
 
 STEP = 1e-30  # of complex derivatives
-LOSSES: dict[str, Callable[[np.ndarray, np.ndarray], np.ndarray]] = {
-    "truncated": lambda r2, s2: np.where(r2.real <= s2, r2, s2),
-    "cauchy": lambda r2, s2: s2 * np.log1p(r2 / s2),
-    "geman_mcclure": lambda r2, s2: r2 * s2 / (r2 + s2),
-    "huber": lambda r2, s2: np.where(r2.real <= s2, r2, 2 * np.sqrt(s2 * r2) - s2),
-}
-"""Of squared residuals and squared scales."""
 
 
 def equations(h: np.ndarray, match: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -77,7 +71,7 @@ def robust_sum(h: np.ndarray, points: np.ndarray, weight: np.ndarray, s2: np.nda
     """``sum_i w_i rho(r_i^2)`` over matches (4, n) of positive weight."""
     counted = weight > 0
     r2 = np.array([sampson_squared(h, match) for match in points.T[counted]])
-    return (weight[counted] * LOSSES[loss](r2, s2[counted])).sum()
+    return (weight[counted] * robust_loss(r2, s2[counted], loss)).sum()
 
 
 def gradient(f: Callable[[np.ndarray], complex], h: np.ndarray) -> np.ndarray:

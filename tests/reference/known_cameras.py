@@ -1,14 +1,14 @@
 """Pairs of known cameras: scenes, images of square pixels, and the pose of least error, one pair at a time."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from tests.reference.focal import Measured
-from tests.reference.refine import sampson
-from tests.reference.solvers import skew
+from tests.reference.focal import Measured, calibration
+from tests.reference.solvers import sampson, skew
 
 SIZE = (480, 640)
 Sizes = tuple[tuple[int, int], tuple[int, int]]
@@ -57,21 +57,27 @@ def fundamental(R: np.ndarray, t: np.ndarray, cameras: Cameras = (K0, K1)) -> np
     return F / np.linalg.norm(F)
 
 
+def fitted(s: Scene, error: Callable[..., np.ndarray], focals: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """R, t and so many logarithms of focal lengths of least squared errors, near the true pose."""
+    a, b = np.linalg.svd(s.t[None])[2][1:]
+
+    def unpacked(p: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        t = s.t + p[3] * a + p[4] * b
+        return Rotation.from_rotvec(p[:3]).as_matrix() @ s.R, t / np.linalg.norm(t), p[5:]
+
+    start, exact = np.r_[np.zeros(5), np.full(focals, 0.1)], {"xtol": 1e-15, "ftol": 1e-15, "gtol": 1e-15}
+    return unpacked(least_squares(lambda p: error(*unpacked(p)), start, jac="3-point", max_nfev=1000, **exact).x)
+
+
 def best_pose(s: Scene, weight: np.ndarray, cameras: Cameras = (K0, K1)) -> tuple[np.ndarray, np.ndarray]:
     """R, t of least weighted squared Sampson error in the images of square pixels, near the true ones."""
     (A0, C0), (A1, C1) = (square(K, SIZE) for K in cameras)
     x0, x1 = ((np.c_[x, np.ones(len(x))] @ A.T)[:, :2] for x, A in ((s.x0, A0), (s.x1, A1)))
 
-    def pose(p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        t = s.t + p[3] * a + p[4] * b
-        return Rotation.from_rotvec(p[:3]).as_matrix() @ s.R, t / np.linalg.norm(t)
+    def error(R: np.ndarray, t: np.ndarray, _: np.ndarray) -> np.ndarray:
+        return np.asarray(np.sqrt(weight) * sampson(fundamental(R, t, (C0, C1)), x0, x1))
 
-    a, b = np.linalg.svd(s.t[None])[2][1:]
-    fit = least_squares(
-        lambda p: np.sqrt(weight) * sampson(fundamental(*pose(p), (C0, C1)), x0, x1), np.zeros(5),
-        jac="3-point", xtol=1e-15, ftol=1e-15, gtol=1e-15,
-    )  # fmt: skip
-    return pose(fit.x)
+    return fitted(s, error, 0)[:2]
 
 
 def angle(R: np.ndarray, S: np.ndarray) -> float:
@@ -92,27 +98,15 @@ def best_cameras(
     sigma: standard deviation of Sampson distances, px. measured: focal lengths, px, and their deviations, of at least
     0.02. shared: whether both are one in units of the longer sides."""
     longest = [max(size) for size in sizes]
-    a, b = np.linalg.svd(s.t[None])[2][1:]
 
-    def unpacked(p: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        t = s.t + p[3] * a + p[4] * b
-        phi = np.array([p[5], p[5] if shared else p[6]])
-        return Rotation.from_rotvec(p[:3]).as_matrix() @ s.R, t / np.linalg.norm(t), phi
-
-    def residuals(p: np.ndarray) -> np.ndarray:
-        R, t, phi = unpacked(p)
-        camera0, camera1 = (
-            np.array([[np.exp(f) * side, 0, (w - 1) / 2], [0, np.exp(f) * side, (h - 1) / 2], [0, 0, 1]])
-            for f, side, (h, w) in zip(phi, longest, sizes, strict=True)
-        )
-        prior = [(phi.mean() - np.log(1.2)) / 0.4, 0.0 if shared else (phi[0] - phi[1]) / 0.5]
+    def error(R: np.ndarray, t: np.ndarray, phi: np.ndarray) -> np.ndarray:
+        phi = np.broadcast_to(phi, 2)
+        camera0, camera1 = (calibration(np.exp(f), size) for f, size in zip(phi, sizes, strict=True))
+        prior = [(phi.mean() - np.log(1.2)) / 0.4, (phi[0] - phi[1]) / 0.5]
         z = [(f - np.log(px / side)) / s for f, side, (px, s) in zip(phi, longest, measured, strict=True)]
         z2 = float(np.square(z).sum())
         prior.append(np.sqrt(6 * z2 / (z2 + 6)))  # half its square is the cost of measurements with a tail
         return np.concatenate([sampson(fundamental(R, t, (camera0, camera1)), s.x0, s.x1) / sigma, prior])
 
-    start = np.zeros(7 - shared)
-    start[5:] = 0.1
-    fit = least_squares(residuals, start, jac="3-point", xtol=1e-15, ftol=1e-15, gtol=1e-15, max_nfev=1000)
-    R, t, phi = unpacked(fit.x)
-    return R, t, np.exp(phi) * longest
+    R, t, phi = fitted(s, error, 2 - shared)
+    return R, t, np.exp(np.broadcast_to(phi, 2)) * longest

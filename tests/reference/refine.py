@@ -7,30 +7,21 @@ from scipy.spatial.transform import Rotation
 from scipy.special import gamma, gammainc, gammaincc
 
 from fmtorch.geometry import LOSSES
+from tests.reference.solvers import sampson
 
 
-def sampson(F: np.ndarray, x0: np.ndarray, x1: np.ndarray) -> np.ndarray:
-    """Signed Sampson distances (Hartley & Zisserman 2004, equation 11.9)."""
-    h0 = np.c_[x0, np.ones(len(x0))]
-    h1 = np.c_[x1, np.ones(len(x1))]
-    line1, line0 = h0 @ F.T, h1 @ F
-    return (h1 * line1).sum(1) / np.sqrt((line1[:, :2] ** 2).sum(1) + (line0[:, :2] ** 2).sum(1))
-
-
-def loss(r2: np.ndarray, s2: float, name: str) -> np.ndarray:
-    """The robust losses, point by point."""
-    if name == "huber":
-        return np.array([v if v <= s2 else 2 * np.sqrt(s2 * v) - s2 for v in r2])
+def loss(r2: np.ndarray, s2: float | np.ndarray, name: str) -> np.ndarray:
+    """The robust losses of squared residuals, which may be complex but for MAGSAC++, and of squared scales."""
     if name == "cauchy":
-        return np.array([s2 * np.log(1 + v / s2) for v in r2])
+        return np.asarray(s2 * np.log1p(r2 / s2))
     if name == "geman_mcclure":
-        return np.array([v * s2 / (v + s2) for v in r2])
+        return np.asarray(r2 * s2 / (r2 + s2))
     if name == "magsac":
         return magsac_loss(r2, s2)
-    return np.array([min(v, s2) for v in r2])
+    return np.where(r2.real <= s2, r2, s2 if name == "truncated" else 2 * np.sqrt(s2 * r2) - s2)
 
 
-def magsac_loss(r2: np.ndarray, s2: float) -> np.ndarray:
+def magsac_loss(r2: np.ndarray, s2: float | np.ndarray) -> np.ndarray:
     """Barath et al. (CVPR 2020), section 3.2, for s = k sigma_max, over its slope at zero."""
 
     def upper(a: float, x: np.ndarray) -> np.ndarray:

@@ -1,7 +1,5 @@
 """Epipolar geometry and minimal solvers from the definitions, one problem at a time, by NumPy's SVD and roots."""
 
-import itertools
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -101,38 +99,6 @@ def consistently_oriented(F: Array, x0: Array, x1: Array) -> bool:
     return abs(sum(signs)) == len(signs)
 
 
-_CUBICS = [(3, 0, 0), (2, 1, 0), (2, 0, 1), (1, 2, 0), (1, 1, 1), (1, 0, 2), (0, 3, 0), (0, 2, 1), (0, 1, 2), (0, 0, 3)]
-_OTHERS = [(2, 0, 0), (1, 1, 0), (1, 0, 1), (0, 2, 0), (0, 1, 1), (0, 0, 2), (1, 0, 0), (0, 1, 0), (0, 0, 1), (0, 0, 0)]
-
-
-def five_point(x0: np.ndarray, x1: np.ndarray) -> np.ndarray:
-    """All real essential matrices (m, 3, 3) of unit norm of five matches of rays (x, y, 1), each (5, 2)."""
-    h0, h1 = (np.concatenate([x, np.ones((5, 1))], 1) for x in (x0, x1))
-    A = (h1[:, :, None] * h0[:, None]).reshape(5, 9)
-    basis: np.ndarray = np.linalg.svd(A)[2][5:].reshape(4, 3, 3)
-    place = {m: i for i, m in enumerate(_CUBICS + _OTHERS)}
-    equations: np.ndarray = np.zeros((10, 20))
-    for a, b, c in itertools.product(range(4), repeat=3):
-        X, Y, Z = basis[a], basis[b], basis[c]
-        exponents = ((a, b, c).count(0), (a, b, c).count(1), (a, b, c).count(2))
-        trace = X @ Y.T @ Z - np.trace(X @ Y.T) * Z / 2
-        determinant = X[0] @ np.cross(Y[1], Z[2])
-        equations[:, place[exponents]] += np.append(trace.ravel(), determinant)
-    reduced = -np.linalg.solve(equations[:, :10], equations[:, 10:])
-    action = np.zeros((10, 10))
-    for i, (p, q, r) in enumerate(_OTHERS):
-        target = (p + 1, q, r)
-        if target in _CUBICS:
-            action[i] = reduced[_CUBICS.index(target)]
-        else:
-            action[i, _OTHERS.index(target)] = 1
-    values, vectors = np.linalg.eig(action)
-    real = np.abs(values.imag) < 1e-8 * (1 + np.abs(values))
-    v = vectors[:, real].real
-    E = np.einsum("ks,kij->sij", np.concatenate([v[6:9], v[9:]]) / v[9:], basis)
-    return E / np.linalg.norm(E, axis=(1, 2))[:, None, None]
-
-
 def fundamental_from_projections(P0: np.ndarray, P1: np.ndarray) -> np.ndarray:
     """F = [P1 C]_x P1 P0^+, unit Frobenius norm, sign arbitrary."""
     centre = np.linalg.svd(P0)[2][-1]
@@ -146,18 +112,13 @@ def line(F: np.ndarray, x: np.ndarray) -> np.ndarray:
     return np.array([a, b, c]) / np.hypot(a, b)
 
 
-def distance(x: np.ndarray, l: np.ndarray) -> float:  # noqa: E741
-    """Distance of a point from a line with unit normal."""
-    return float(abs(l[0] * x[0] + l[1] * x[1] + l[2]))
-
-
 def epipolar_distances(F: np.ndarray, x0: np.ndarray, x1: np.ndarray) -> tuple[float, float]:
     """Distance of x0 from the line of x1, and of x1 from the line of x0."""
-    return distance(x0, line(F.T, x1)), distance(x1, line(F, x0))
+    return abs(float(line(F.T, x1) @ [*x0, 1])), abs(float(line(F, x0) @ [*x1, 1]))
 
 
-def sampson(F: np.ndarray, x0: np.ndarray, x1: np.ndarray) -> float:
-    """|e| / |grad e| with the gradient over the four coordinates of the match."""
-    p0, p1 = np.array([*x0, 1.0]), np.array([*x1, 1.0])
-    gradient = np.concatenate([(F.T @ p1)[:2], (F @ p0)[:2]])
-    return float(abs(p1 @ F @ p0) / np.linalg.norm(gradient))
+def sampson(F: np.ndarray, x0: np.ndarray, x1: np.ndarray) -> np.ndarray:
+    """Signed Sampson distances (n,) of matches (n, 2) (Hartley & Zisserman 2004, equation 11.9)."""
+    h0, h1 = homogeneous(x0), homogeneous(x1)
+    line1, line0 = h0 @ F.T, h1 @ F
+    return np.asarray((h1 * line1).sum(1) / np.sqrt((line1[:, :2] ** 2).sum(1) + (line0[:, :2] ** 2).sum(1)))

@@ -14,8 +14,7 @@ from scipy.linalg import null_space
 from scipy.spatial.transform import Rotation
 from scipy.stats import norm
 
-from tests.reference.refine import sampson
-from tests.reference.solvers import skew
+from tests.reference.solvers import sampson, skew
 
 STEP = 1e-6  # of central differences
 
@@ -49,11 +48,6 @@ class Cameras:
             np.array([[f, 0, p[0]], [0, f, p[1]], [0, 0, 1]]) for f, p in zip(self.focal, self.principal, strict=True)
         )
         return np.linalg.inv(K1).T @ skew(self.t) @ self.R @ np.linalg.inv(K0)
-
-    def difference(self, other: Self) -> np.ndarray:
-        """The parameters (7,) that move these to others, to first order in the direction of t."""
-        omega = Rotation.from_matrix(other.R @ self.R.T).as_rotvec()
-        return np.concatenate([omega, self.basis.T @ (other.t - self.t), np.log(other.focal / self.focal)])
 
 
 def residuals(cameras: Cameras, x0: np.ndarray, x1: np.ndarray) -> np.ndarray:

@@ -142,14 +142,8 @@ NUMBERS = (0, -1, -0.5, NAN, float("inf"), 1e30, 1e-30, "3", None, [1], True, np
 
 def scenes(shapes: Sequence[tuple[int, ...]] = ((), (), (1,), (2,), (3, 2), (0,))) -> st.SearchStrategy[Scene]:
     """Scenes of few or no pairs and matches."""
-    return st.builds(
-        Scene,
-        st.sampled_from(shapes),
-        st.sampled_from(COUNTS),
-        st.sampled_from(SCENES),
-        st.sampled_from(SCALES),
-        st.integers(0, 2**31),
-    )
+    choices = map(st.sampled_from, (shapes, COUNTS, SCENES, SCALES))
+    return st.builds(Scene, *choices, st.integers(0, 2**31))
 
 
 def batches() -> st.SearchStrategy[Scene]:

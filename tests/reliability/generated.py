@@ -175,21 +175,8 @@ def fields(data: st.DataObject, scene: Scene, kind: str) -> dict[str, Any]:
     return values
 
 
-FOCALS = (
-    None,
-    None,
-    None,
-    "shared",
-    "unknown",
-    0.05,
-    (0, 0.1),
-    (800.0, 0.1),
-    ((800, 0), None),
-    -1.0,
-    "same",
-    np.nan,
-    [],
-)
+PAIRS_OF_FOCALS = ((0, 0.1), (800.0, 0.1), ((800, 0), None))
+FOCALS = (*[None] * 3, "shared", "unknown", 0.05, *PAIRS_OF_FOCALS, -1.0, "same", np.nan, [])
 """What may be said of focal lengths, and what may not."""
 
 
@@ -283,11 +270,9 @@ def record(kind: type, data: st.DataObject) -> tuple[Call, set[str], Check]:
     if kind is Correspondences:
         arguments = fields(data, scene, library)
     else:
-        arguments = {
-            name: as_given(scene.array(name, want.dtype, want.shape), library)
-            for name, want in arrays_of(kind).items()
-            if not want.optional or data.draw(st.booleans(), label=name)
-        }
+        all_of_them = arrays_of(kind).items()
+        wanted = {n: want for n, want in all_of_them if not want.optional or data.draw(st.booleans(), label=n)}
+        arguments = {n: as_given(scene.array(n, want.dtype, want.shape), library) for n, want in wanted.items()}
         if kind is Estimate:
             arguments["reason"] = ("",) * len(arguments["F"])
     mistaken(data, arguments, {})

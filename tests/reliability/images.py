@@ -21,15 +21,22 @@ def saved(picture: Any, form: str, **options: Any) -> bytes:
     return stream.getvalue()
 
 
-def png(width: int, height: int, rows: bytes, colour: int = 0, depth: int = 8) -> bytes:
-    """A PNG by its specification: a header of any size over any rows."""
+def pages(picture: np.ndarray, form: str, **options: Any) -> bytes:
+    """Several pages or frames, of which the picture is the first."""
+    rest = [Image.fromarray(255 - picture)]
+    return saved(picture, form, save_all=True, append_images=rest, **options)
 
-    def chunk(kind: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
+def png(
+    width: int, height: int, rows: bytes, colour: int = 0, depth: int = 8, compressed: bytes | None = None
+) -> bytes:
+    """A PNG by its specification: a header of any size over any rows, or over those that are compressed already."""
     header = struct.pack(">IIBBBBB", width, height, depth, colour, 0, 0, 0)
-    end = chunk(b"IDAT", zlib.compress(rows, 9)) + chunk(b"IEND", b"")
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + end
+    chunks = {b"IHDR": header, b"IDAT": compressed or zlib.compress(rows, 9), b"IEND": b""}
+    written = (
+        struct.pack(">I", len(d)) + kind + d + struct.pack(">I", zlib.crc32(kind + d)) for kind, d in chunks.items()
+    )
+    return b"\x89PNG\r\n\x1a\n" + b"".join(written)
 
 
 def jpeg_of_size(width: int, height: int) -> bytes:
@@ -45,16 +52,16 @@ def bomb(side: int) -> bytes:
     packer = zlib.compressobj(1)
     rows = bytes((1 + side) * 1000)
     idat = b"".join(packer.compress(rows) for _ in range(side // 1000)) + packer.flush()
-    head = png(side, side, b"")
-    start = head.index(b"IDAT") - 4
-
-    def chunk(kind: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-
-    return head[:start] + chunk(b"IDAT", idat) + chunk(b"IEND", b"")
+    return png(side, side, b"", compressed=idat)
 
 
 GREY = SOFT[..., 0]
+
+
+def half(data: bytes) -> bytes:
+    return data[: len(data) // 2]
+
+
 SOUND: Mapping[str, Callable[[], bytes]] = {
     "cmyk.jpg": lambda: saved(Image.fromarray(SOFT).convert("CMYK"), "JPEG"),
     "ycck.jpg": lambda: saved(Image.fromarray(SOFT).convert("CMYK"), "JPEG", quality=100),
@@ -75,18 +82,10 @@ SOUND: Mapping[str, Callable[[], bytes]] = {
     "65535 px.jpg": lambda: bytes(cv2.imencode(".jpg", np.tile(GREY[:8], (1, 410))[:, :65_500])[1]),
     "JPEG named.png": lambda: saved(SOFT, "JPEG"),
     "PNG named.jpg": lambda: saved(SOFT, "PNG"),
-    "animated.gif": lambda: saved(
-        Image.fromarray(GREY), "GIF", save_all=True, append_images=[Image.fromarray(255 - GREY)]
-    ),
-    "animated.webp": lambda: saved(
-        Image.fromarray(SOFT), "WEBP", save_all=True, append_images=[Image.fromarray(255 - SOFT)], lossless=True
-    ),
-    "animated.png": lambda: saved(
-        Image.fromarray(SOFT), "PNG", save_all=True, append_images=[Image.fromarray(255 - SOFT)]
-    ),
-    "several pages.tiff": lambda: saved(
-        Image.fromarray(SOFT), "TIFF", save_all=True, append_images=[Image.fromarray(255 - SOFT)]
-    ),
+    "animated.gif": lambda: pages(GREY, "GIF"),
+    "animated.webp": lambda: pages(SOFT, "WEBP", lossless=True),
+    "animated.png": lambda: pages(SOFT, "PNG"),
+    "several pages.tiff": lambda: pages(SOFT, "TIFF"),
     "rest after the end.png": lambda: saved(SOFT, "PNG") + b"and more",
 }
 """Files that are images, in whatever form; what was made of the first page or frame is known."""
@@ -108,17 +107,13 @@ NO_IMAGES: Mapping[str, Callable[[], bytes]] = {
     "65535 x 65535.jpg": lambda: jpeg_of_size(65_535, 65_535),
     "20000 x 20000 of 160 x 120.jpg": lambda: jpeg_of_size(20_000, 20_000),
     "a bomb of 17000 x 17000.png": lambda: bomb(17_000),
-    "half.jpg": lambda: _half(saved(SOFT, "JPEG")),
-    "half.png": lambda: _half(saved(SOFT, "PNG")),
-    "half.webp": lambda: _half(saved(SOFT, "WEBP", lossless=True)),
-    "half.tiff": lambda: _half(bytes(cv2.imencode(".tiff", SOFT)[1])),
-    "half.bmp": lambda: _half(saved(SOFT, "BMP")),
-    "half.gif": lambda: _half(saved(GREY, "GIF")),
+    "half.jpg": lambda: half(saved(SOFT, "JPEG")),
+    "half.png": lambda: half(saved(SOFT, "PNG")),
+    "half.webp": lambda: half(saved(SOFT, "WEBP", lossless=True)),
+    "half.tiff": lambda: half(bytes(cv2.imencode(".tiff", SOFT)[1])),
+    "half.bmp": lambda: half(saved(SOFT, "BMP")),
+    "half.gif": lambda: half(saved(GREY, "GIF")),
     "svg.png": lambda: b"<svg xmlns='http://www.w3.org/2000/svg' width='9' height='9'/>",
     "zip.png": lambda: b"PK\x03\x04" + bytes(100),
 }
 """Files that are none, or so large that reading them would take the machine down."""
-
-
-def _half(data: bytes) -> bytes:
-    return data[: len(data) // 2]

@@ -41,6 +41,14 @@ def damages(data: bytes, count: int, seed: int) -> Iterator[bytes]:
             yield data[:at] + bytes(len(data) - int(at))
 
 
+def damaged(file: Path, count: int, seed: int) -> Iterator[bool]:
+    """Damage a file so often; whether it is as it was."""
+    data = file.read_bytes()
+    for damage in damages(data, count, seed):
+        file.write_bytes(damage)
+        yield damage == data
+
+
 def run_folder(path: Path) -> RunFolder:
     """A run with rows."""
     run = RunFolder.open(path, {"pipeline": "sift", "seed": 0, "pruner": [{"ratio": {"threshold": 0.8}}]})
@@ -51,12 +59,10 @@ def run_folder(path: Path) -> RunFolder:
 
 def damaged_parts(path: Path, count: int, seed: int) -> int:
     """Damage a part of a run; it is told every time."""
-    run = run_folder(path)
+    run, reported = run_folder(path), 0
     truth, part = run.read(), next((path / "pairs").iterdir())
-    data, reported = part.read_bytes(), 0
-    for damage in damages(data, count, seed):
-        part.write_bytes(damage)
-        if damage == data:
+    for same in damaged(part, count, seed):
+        if same:
             assert run.read() == truth
             continue
         for use in (run.read, run.done):
@@ -69,10 +75,8 @@ def damaged_parts(path: Path, count: int, seed: int) -> int:
 def damaged_identities(path: Path, count: int, seed: int) -> int:
     """Damage run.json: it is told, or it is of no consequence."""
     run = run_folder(path)
-    file, config = path / "run.json", run.config
-    data, reported = file.read_bytes(), 0
-    for damage in damages(data, count, seed):
-        file.write_bytes(damage)
+    file, config, reported = path / "run.json", run.config, 0
+    for _ in damaged(file, count, seed):
         try:
             assert RunFolder.load(path).config == config
         except RunFolderError as error:
@@ -86,10 +90,8 @@ def damaged_features(path: Path, count: int, seed: int) -> int:
     cache = ArrayCache(path)
     arrays = {"lafs": np.random.default_rng(0).normal(size=(9, 2, 3)), "seconds": np.array(0.5)}
     cache.write("section", "name", arrays)
-    file = next(path.glob("*/*.npz"))
-    data, reported = file.read_bytes(), 0
-    for damage in damages(data, count, seed):
-        file.write_bytes(damage)
+    file, reported = next(path.glob("*/*.npz")), 0
+    for _ in damaged(file, count, seed):
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always")
             cached = cache.read("section", "name")
@@ -160,10 +162,9 @@ def damaged_images(path: Path, count: int, seed: int) -> tuple[int, int]:
     """Damage images: an image of some kind, or an error; how often each. (GIF, TIFF and WebP have no checksums.)"""
     refused = read = 0
     for name in DAMAGED:
-        data = SOUND[name]()
         file = path / name
-        for damage in damages(data, count // len(DAMAGED), seed):
-            file.write_bytes(damage)
+        file.write_bytes(SOUND[name]())
+        for _ in damaged(file, count // len(DAMAGED), seed):
             try:
                 image = read_image(file)
             except ImageError as error:

@@ -114,9 +114,8 @@ def test_masked_complex_and_boolean_points_are_refused() -> None:
 def test_raw_distances_are_no_ratios() -> None:
     """They were taken for ratios, and an easy pair had a wrong F or none; a score beyond 1 is refused by its name."""
     distances = np.where(SCENE.right, 120.0, 310.0)
-    with pytest.raises(
-        ValueError, match=r"^ratio of match 0 of pair 0 is .*within \[0, 1\]\. Of raw distances.*`score`"
-    ):
+    said = r"^ratio of match 0 of pair 0 is .*within \[0, 1\]\. Of raw distances.*`score`"
+    with pytest.raises(ValueError, match=said):
         fmtorch.find_fundamental(SCENE.x0, SCENE.x1, ratio=distances)
     with pytest.raises(ValueError, match=r"^score of match 0 of pair 0 is 310"):
         fmtorch.find_fundamental(SCENE.x0, SCENE.x1, score=np.flip(np.sort(distances)))

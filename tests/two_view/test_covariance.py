@@ -15,7 +15,7 @@ from fmtorch import cv2
 from fmtorch.core import Correspondences, Estimate
 from fmtorch.two_view.assumed_sizes import extents
 from tests.geometry.scenes import batch, draw
-from tests.reference import assumed_sizes, known_cameras
+from tests.reference import assumed_sizes
 from tests.reference import known_cameras as reference
 
 CAMERAS: dict[str, Any] = {"K0": torch.from_numpy(reference.K0), "K1": torch.from_numpy(reference.K1)}
@@ -39,10 +39,8 @@ def test_covariance_of_F_is_that_of_its_parameters(deviation: float) -> None:
     """In pixels that are not square, about a principal point that is not central."""
     s = reference.scene(3, noise=0.5)
     e = fmtorch.find_essential(s.x0, s.x1, **CAMERAS, **SIZES, focal=deviation, covariance=True)
-    K0, K1 = (
-        K * np.array([f / np.sqrt(K[0, 0] * K[1, 1])] * 2 + [1])
-        for K, f in zip((reference.K0, reference.K1), e.focals[0].tolist(), strict=True)
-    )
+    known = zip((reference.K0, reference.K1), e.focals[0].tolist(), strict=True)
+    K0, K1 = (K * np.array([f / np.sqrt(K[0, 0] * K[1, 1])] * 2 + [1]) for K, f in known)
     np.testing.assert_allclose(moved(e, np.zeros(7), K0, K1), e.F[0].numpy().ravel(), atol=1e-7)
     step = 1e-5
     J = np.stack([(moved(e, d, K0, K1) - moved(e, -d, K0, K1)) / (2 * step) for d in step * np.eye(7)], 1)
@@ -86,11 +84,10 @@ def test_more_matches_and_more_knowledge_leave_less_open() -> None:
         return float(e.deviation_degrees.sum())
 
     K = torch.from_numpy(CENTRAL)
-    known, rough, unknown = (
-        deviation(200, **given) for given in ({"K0": K, "K1": K}, {"K0": K, "K1": K, "focal": 0.05}, {})
-    )
+    exactly = {"K0": K, "K1": K}
+    known, rough, unknown = (deviation(200, **given) for given in (exactly, {**exactly, "focal": 0.05}, {}))
     assert known < rough < unknown
-    assert known < deviation(50, K0=K, K1=K)
+    assert known < deviation(50, **exactly)
 
 
 @pytest.mark.parametrize("given", [CAMERAS, {"focal": "shared"}, {}], ids=["known", "shared", "unknown"])
@@ -177,7 +174,7 @@ def test_covariance_needs_a_size_or_a_calibration() -> None:
     assert not bool(fmtorch.find_essential(s.x0, s.x1, **CAMERAS, covariance=True).deviation_degrees.isnan().any())
 
 
-SIZE = known_cameras.SIZE
+SIZE = reference.SIZE
 
 
 def found(x0: Any, x1: Any, **said: Any) -> Estimate:
@@ -220,9 +217,7 @@ def test_extents_are_those_of_the_reference() -> None:
 def test_the_estimate_is_that_of_the_sizes_that_are_assumed() -> None:
     x0, x1 = points(0)
     estimate = found(x0, x1)
-    assert estimate.sizes is not None
     (size, other), said = estimate.sizes[0], assumed_sizes.extents(x0, x1)
-    assert said is not None
     assert size.tolist() == other.tolist() == pytest.approx(assumed_sizes.assumed(said, 0, 0)[0][0])
     assert (size > torch.tensor(SIZE) * 0.9).all()
     assert (size < torch.tensor(SIZE) * 1.1).all()
@@ -236,13 +231,11 @@ def test_images_of_one_size_or_of_two_by_their_significance(scale: float) -> Non
     x0, x1 = points(1, scale)
     x0, x1 = (x0[x0[:, 0] < 320], x1[x0[:, 0] < 320]) if scale == 1 else (x0, x1)
     own = assumed_sizes.extents(x0, x1)
-    assert own is not None
     same = [max(size) for size in zip(*own, strict=True)]
     both = [found(x0, x1, size0=size0, size1=size1) for size0, size1 in ((same, same), own)]
     sizes, doubtful = assumed_sizes.assumed(own, *(float(e.significance[0]) for e in both))
     estimate = found(x0, x1)
     assert doubtful
-    assert estimate.sizes is not None
     assert estimate.sizes[0].tolist() == pytest.approx(np.array(sizes), rel=1e-15)
     assert any(torch.equal(estimate.F, e.F) for e in both)
     assert "give size0 and size1, or 'unknown'" in estimate.warning[0]
@@ -253,12 +246,10 @@ def test_pairs_keep_to_themselves() -> None:
     wide, upright = x0[:, 0] < 320, points(2, 0.6)
     pairs = [(x0, x1), (x0 - 300, x1 - 300), (x0[wide], x1[wide]), upright, (x0[:9], x1[:9])]
     together = found([x for x, _ in pairs], [x for _, x in pairs])
-    assert together.sizes is not None
     for i, pair in enumerate(pairs):
         alone = found(*pair)
         assert torch.equal(together.F[i], alone.F[0])
         assert torch.equal(together.inliers[i, : len(pair[0])], alone.inliers[0])
-        assert alone.sizes is not None
         assert torch.equal(together.sizes[i].nan_to_num(), alone.sizes[0].nan_to_num())
     for i in (1, 4):  # nothing is assumed
         assert together.sizes[i].isnan().all()
@@ -270,7 +261,6 @@ def test_pairs_keep_to_themselves() -> None:
 def test_gradients_are_those_of_the_assumed_sizes() -> None:
     x0, x1 = (torch.from_numpy(x).requires_grad_() for x in points(0))
     estimate = found(x0, x1)
-    assert estimate.sizes is not None
     size, weight = estimate.sizes[0, 0].detach(), torch.arange(9.0, dtype=torch.float64).reshape(3, 3)
     (given,) = torch.autograd.grad((found(x0, x1, size0=size, size1=size).F * weight).sum(), x0)
     (assumed,) = torch.autograd.grad((estimate.F * weight).sum(), x0)
@@ -281,9 +271,7 @@ def test_gradients_are_those_of_the_assumed_sizes() -> None:
 def test_opencv_is_given_them_unasked() -> None:
     x0, x1 = points(0)
     F, _ = cv2.findFundamentalMat(x0, x1, opencv.FM_RANSAC, 3.0)
-    assert F is not None
     expected = fmtorch.find_fundamental(x0, x1, inlier_threshold=3.0)
-    assert expected.sizes is not None
     np.testing.assert_allclose(F / np.linalg.norm(F), expected.F[0].numpy(), atol=1e-12)
 
 

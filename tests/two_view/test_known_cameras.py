@@ -23,11 +23,11 @@ from tests.conftest import shared_path
 from tests.laws import calibrated, degenerate, quick, scene, scenes, small, with_knowledge
 from tests.reference import known_cameras as reference
 from tests.reference import solvers
+from tests.reference.focal import calibration
 
 CAMERAS = {"K0": torch.from_numpy(reference.K0), "K1": torch.from_numpy(reference.K1)}
 SIZES = {"size0": reference.SIZE, "size1": reference.SIZE}
-CENTRAL = tuple(np.array([[f, 0, 319.5], [0, f, 239.5], [0, 0, 1.0]]) for f in (650.0, 650.0))
-ZOOMED = (CENTRAL[0], np.array([[820.0, 0, 319.5], [0, 820, 239.5], [0, 0, 1.0]]))
+CENTRAL, ZOOMED = (tuple(calibration(f / 640, (480, 640)) for f in focals) for focals in ((650, 650), (650, 820)))
 
 
 def error(e: Estimate, s: reference.Scene) -> float:
@@ -117,10 +117,7 @@ def test_the_fit_is_the_maximum_of_the_posterior(known: str, monkeypatch: pytest
     sizes, inf = ((480, 640), (600, 800)), float("inf")
     nothing = (1.0, inf)
     measured = {"rough": ((640.0, 0.05), (900.0, 0.1)), "one": ((660.0, 0.03), nothing)}.get(known, (nothing, nothing))
-    cameras = tuple(
-        np.array([[f, 0, (w - 1) / 2], [0, f, (h - 1) / 2], [0, 0, 1]])
-        for f, (h, w) in zip((650.0, 820.0), sizes, strict=True)
-    )
+    cameras = tuple(calibration(f / max(size), size) for f, size in zip((650.0, 820.0), sizes, strict=True))
     s = reference.scene(3, noise=0.2, outliers=0.0, cameras=cameras)
     focal: Any = known if known in ("shared", "unknown") else torch.tensor(measured, dtype=torch.float64)
     e = fmtorch.find_fundamental(s.x0, s.x1, size0=sizes[0], size1=sizes[1], focal=focal, prior=np.ones(150))
@@ -136,7 +133,7 @@ def test_pose_and_essential_matrix_are_those_of_the_fundamental_matrix(known: di
     for seed in range(4):
         s = reference.scene(seed, noise=0.5)
         e = fmtorch.find_fundamental(s.x0, s.x1, **SIZES, **known)
-        K0, K1 = (np.array([[f, 0, 319.5], [0, f, 239.5], [0, 0, 1]]) for f in e.focals[0].tolist())
+        K0, K1 = (calibration(f / 640, reference.SIZE) for f in e.focals[0].tolist())
         if known is CAMERAS:
             K0, K1 = reference.K0, reference.K1
         right = e.inliers[0].numpy()

@@ -115,15 +115,12 @@ def read(path: Path) -> dict[tuple[int, int], Any]:
 
 def plain(geometries: dict[tuple[int, int], Any]) -> dict[tuple[int, int], tuple[Any, ...]]:
     """The same in values that can be compared."""
-    fields = ("E", "F", "H")
-    return {
-        pair: (
-            int(g.config), g.inlier_matches.tolist(),
-            *(None if getattr(g, name) is None else getattr(g, name).tolist() for name in fields),
-            None if g.cam2_from_cam1 is None else g.cam2_from_cam1.matrix().tolist(),
-        )
-        for pair, g in geometries.items()
-    }  # fmt: skip
+    values = {}
+    for pair, g in geometries.items():
+        matrices = (g.E, g.F, g.H, None if g.cam2_from_cam1 is None else g.cam2_from_cam1.matrix())
+        known = (None if matrix is None else matrix.tolist() for matrix in matrices)
+        values[pair] = (int(g.config), g.inlier_matches.tolist(), *known)
+    return values
 
 
 def killed_and_continued(folder: Path, end: Path, *words: str) -> None:

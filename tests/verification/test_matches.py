@@ -258,10 +258,16 @@ def write(folder: Path, cameras: Scene) -> list[tuple[str, str]]:
     return pairs
 
 
+def hloc(folder: Path) -> dict[str, Path]:
+    """The arguments for what `write` has written."""
+    files = {"features": "features.h5", "matches": "matches.h5", "output": "verified.h5"}
+    return {argument: folder / file for argument, file in files.items()}
+
+
 def test_inliers_and_matrices_are_those_of_find_fundamental(tmp_path: Path) -> None:
     pairs = write(tmp_path, scene(4))
-    features, stored, output = (tmp_path / f"{name}.h5" for name in ("features", "matches", "verified"))
-    result = fmtorch.verify(features=features, matches=stored, output=output)
+    features, stored, output = hloc(tmp_path).values()
+    result = fmtorch.verify(**hloc(tmp_path))
     assert (result.path, result.pairs, result.configurations) == (output, 6, {"uncalibrated": 6})
     with h5py.File(features) as f, h5py.File(stored) as m, h5py.File(output) as v:
         for a, b in pairs:
@@ -270,9 +276,7 @@ def test_inliers_and_matrices_are_those_of_find_fundamental(tmp_path: Path) -> N
             first = np.flatnonzero(second >= 0)
             x0 = f[a]["keypoints"][:].astype(np.float32)[first]
             x1 = f[b]["keypoints"][:].astype(np.float32)[second[first]]
-            estimate = fmtorch.find_fundamental(
-                x0, x1, focal="unknown", size0=SIZE, size1=SIZE, key=pair_key(f"{a} {b}")
-            )
+            estimate = fmtorch.find_fundamental(x0, x1, focal="unknown", **SIZES, key=pair_key(f"{a} {b}"))
             expected = np.full(len(second), -1)
             good = first[estimate.inliers[0].numpy()]
             expected[good] = second[good]
@@ -290,12 +294,11 @@ def test_keys_of_an_older_hloc_are_read(tmp_path: Path) -> None:
         file.move("mapping/000.jpg", "map_1/000_a.jpg")
     with h5py.File(tmp_path / "matches.h5", "a") as file:
         file.move("mapping-000.jpg/mapping-001.jpg", "map_1-000_a.jpg_mapping-001.jpg")
-    paths = {f"{name}": tmp_path / f"{name}.h5" for name in ("features", "matches")}
-    result = fmtorch.verify(**paths, output=tmp_path / "verified.h5")
+    result = fmtorch.verify(**hloc(tmp_path))
     assert (result.configurations, result.problems) == ({"uncalibrated": 1}, ())
     with h5py.File(tmp_path / "verified.h5") as file:
         assert list(file) == ["map_1-000_a.jpg_mapping-001.jpg"]
-    assert fmtorch.verify(**paths, output=tmp_path / "verified.h5").kept == 1
+    assert fmtorch.verify(**hloc(tmp_path)).kept == 1
 
 
 def test_broken_hloc_pairs_are_lines_and_stay_out(tmp_path: Path) -> None:
@@ -308,9 +311,7 @@ def test_broken_hloc_pairs_are_lines_and_stay_out(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "matches.h5", "a") as file:
         file.copy("mapping-000.jpg/mapping-001.jpg", file, "mapping-001.jpg/mapping-000.jpg")
         file["mapping-001.jpg/mapping-000.jpg/matches0"][5] = -1
-    result = fmtorch.verify(
-        features=tmp_path / "features.h5", matches=tmp_path / "matches.h5", output=tmp_path / "verified.h5"
-    )
+    result = fmtorch.verify(**hloc(tmp_path))
     assert (result.pairs, result.verified, len(result.problems)) == (len(pairs) + 1, 1, len(pairs))
     assert any("matches0 holds -1 to 4000, but mapping/001.jpg has 150 keypoints" in line for line in result.problems)
     assert any("'mapping/002.jpg/image_size' is missing" in line for line in result.problems)
@@ -321,7 +322,7 @@ def test_broken_hloc_pairs_are_lines_and_stay_out(tmp_path: Path) -> None:
 def test_a_killed_verification_of_files_continues(tmp_path: Path) -> None:
     write(tmp_path, scene(7))
     killed_and_continued(tmp_path, tmp_path / "verified.h5", *FILES)
-    fmtorch.verify(features=tmp_path / "features.h5", matches=tmp_path / "matches.h5", output=tmp_path / "truth.h5")
+    fmtorch.verify(**hloc(tmp_path) | {"output": tmp_path / "truth.h5"})
     assert load(tmp_path / "verified.h5") == load(tmp_path / "truth.h5")
 
 

@@ -14,10 +14,7 @@ from fmtorch.core import Correspondences, collate
 from fmtorch.estimators import Candidates, Focal, Pair, Ransac, Refinement, SaturatedGains, focal_search
 from fmtorch.estimators.focal_search import FocalSearch, PlausibleCandidates
 from fmtorch.estimators.models import focal_prior
-from fmtorch.estimators.models.focal_prior import (
-    QUANTILES,
-    normal_quantiles,
-)
+from fmtorch.estimators.models.focal_prior import QUANTILES, normal_quantiles
 from fmtorch.estimators.models.posterior import images_of, no_cameras
 from fmtorch.estimators.models.with_focals import FundamentalWithFocals
 from fmtorch.jit.random import Stream
@@ -240,7 +237,6 @@ class Found(PlausibleCandidates):
         self.again, self.one_model = again, one_model
 
     def confirmed(self, other: PlausibleCandidates) -> bool:
-        assert isinstance(other, Found)
         return other.again
 
     def joined(self, other: PlausibleCandidates) -> PlausibleCandidates:

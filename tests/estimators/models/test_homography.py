@@ -9,7 +9,6 @@ import pytest
 import torch
 
 import fmtorch
-from fmtorch.estimators import Ransac
 from fmtorch.pipeline import load_pipeline
 from tests.conftest import shared_path
 from tests.reference import homography as reference
@@ -53,9 +52,8 @@ def expected_error(m: Matches, noise: float) -> float:
     points = np.c_[m.x0, m.x1][m.right].T / unit
     exact = points.copy()
     exact[2:] = reference.mapped(h, points[:2].T).T
-    covariance = (noise / unit) ** 2 * np.linalg.pinv(
-        reference.gauss_newton(h, exact, np.ones(exact.shape[1])), rcond=1e-12
-    )
+    information = reference.gauss_newton(h, exact, np.ones(exact.shape[1]))
+    covariance = (noise / unit) ** 2 * np.linalg.pinv(information, rcond=1e-12)
     moved = [(reference.mapped(h + 1e-6 * v, CORNERS / unit) - reference.mapped(h, CORNERS / unit)) for v in np.eye(9)]
     J = np.stack(moved, -1).reshape(8, 9) / 1e-6 * unit
     return float(np.sqrt(np.trace(J @ covariance @ J.T) / 4))
@@ -148,10 +146,17 @@ def test_gradients_equal_finite_differences() -> None:
 
 def test_another_model_is_refused() -> None:
     m = matches(11)
-    with pytest.raises(ValueError, match="gives fundamental matrices; find_homography needs"):
-        fmtorch.find_homography(m.x0, m.x1, estimator="fmtorch")
-    with pytest.raises(ValueError, match="gives homography matrices; find_fundamental needs"):
-        fmtorch.find_fundamental(m.x0, m.x1, estimator="homography")
+    fundamental, homography = (fmtorch.find_fundamental, fmtorch.find_homography)
+    colmap = {"estimator": "colmap"}
+    for find, options, said in (
+        (homography, {"estimator": "fmtorch"}, "gives fundamental matrices; find_homography needs"),
+        (homography, colmap, r"find_homography needs one that gives .* \(here by model=homography\)"),
+        (fundamental, {"estimator": "homography"}, "gives homography matrices; find_fundamental needs"),
+        (fundamental, colmap | {"model": "homography"}, "estimator=colmap gives homography matrices"),
+        (fundamental, colmap | {"model": "line"}, "model=line; it must be one of: fundamental, homography"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            find(m.x0, m.x1, **options)
     with pytest.raises(AttributeError, match="fundamental"):
         _ = fmtorch.find_fundamental(m.x0, m.x1).H
 
@@ -166,12 +171,6 @@ def test_a_photographed_wall() -> None:
     estimate = fmtorch.find_homography(c.x0, c.x1, mask=c.mask, ratio=c.ratio, prior=c.prior, noise=c.noise)
     assert bool(estimate.ok)
     assert corner_error(estimate.H[0], truth) < 5
-
-
-@pytest.mark.parametrize("options", [{"degeneracy": "degensac"}, {"local_optimization": "graph_cut"}, {"focal": {}}])
-def test_parts_for_fundamental_matrices_are_refused(options: dict[str, object]) -> None:
-    with pytest.raises(ValueError, match=r"seven_point|is for fundamental matrices"):
-        Ransac(solver="four_point", **options)
 
 
 def test_a_pipeline_needs_fundamental_matrices() -> None:

@@ -10,39 +10,28 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from fmtorch.core import Correspondences
-from fmtorch.estimators import BITS, Lens, Loss, Pair, SevenPoint, Steps, cheirality
+from fmtorch.estimators import BITS, Lens, Loss, Pair, SevenPoint, Steps, cheirality, lens_search
 from fmtorch.estimators.final_fits import PRIOR_CONFLICT_GAIN
-from fmtorch.estimators.lens_search import (
-    STRAIGHT,
-    LensFit,
-    LensPrior,
-    fit_with_lenses,
-    lens_prior,
-    squared_px,
-    undistorted,
-)
+from fmtorch.estimators.lens_search import LensFit, LensPrior, fit_with_lenses, lens_prior
 from fmtorch.estimators.models import posterior
 from fmtorch.estimators.models.focal_prior import LOG_USUAL
-from fmtorch.estimators.models.posterior import (
-    centred,
-    images_of,
-    translate,
-)
-from fmtorch.estimators.models.with_focals import LOSS_SCALE_PX, FundamentalWithFocals, Refined
+from fmtorch.estimators.models.with_focals import LOSS_SCALE_PX, FundamentalWithFocals
 from fmtorch.geometry.levenberg_marquardt import Weighted
 from tests.estimators.models.test_focals import TALL, WIDE, Sizes, photographs, with_prior
-from tests.estimators.pairs import apart, frames, in_pixels, pair_of, to_units
+from tests.estimators.pairs import apart, in_pixels, pair_of, to_units
 from tests.reference import focal as reference
 from tests.reference import lenses
 from tests.reference.refine import loss as loss_of
-from tests.reference.refine import sampson
+from tests.reference.solvers import sampson
 
 FAMILY = FundamentalWithFocals()
 
 
-def start(F: np.ndarray, pair: Pair) -> posterior.Cameras:
+def near(F: np.ndarray, pair: Pair) -> posterior.Cameras:
     """The cameras near one model (3, 3) of pixels."""
-    return near(to_units(F, pair)[None], pair)
+    cameras = posterior.no_cameras(1)
+    posterior.nearest_cameras(to_units(F, pair)[None], posterior.images_of(pair), cameras)
+    return cameras
 
 
 def evaluated(
@@ -70,8 +59,7 @@ def test_cost_and_derivatives(loss: str, sizes: Sizes) -> None:
     c, truth, _ = photographs(0, sizes, outliers=0.1)
     noise = torch.from_numpy(np.random.default_rng(0).uniform(0.5, 2, (1, 200)))
     pair = pair_of(with_prior(c.replace(noise=noise)))
-    assert pair.prior is not None
-    cameras = moved(start(truth, pair), np.random.default_rng(1).normal(0, 3e-4, 7))
+    cameras = moved(near(truth, pair), np.random.default_rng(1).normal(0, 3e-4, 7))
     precision, scale = 40.0 / 0.3**2 * pair.pixels_per_unit**2, 0.7
     computed = evaluated(cameras, pair, loss, scale, precision)
     x0, x1 = posterior.centred(pair).points[:2].T, posterior.centred(pair).points[2:].T
@@ -101,9 +89,8 @@ def test_cost_and_derivatives(loss: str, sizes: Sizes) -> None:
         if sizes[0] != sizes[1]:  # the well of one camera is approximated
             k = 1e-3
             for i, j in ((5, 5), (5, 6), (6, 5), (6, 6)):
-                corners = [
-                    a * b * prior(moved(cameras, k * (a * each[i] + b * each[j]))) for a in (-1, 1) for b in (-1, 1)
-                ]
+                signs = ((a, b) for a in (-1, 1) for b in (-1, 1))
+                corners = (a * b * prior(moved(cameras, k * (a * each[i] + b * each[j]))) for a, b in signs)
                 hessian[i, j] += sum(corners) / (4 * k * k)
             size = np.sqrt(np.outer(np.diag(hessian), np.diag(hessian)))
             assert (np.abs(computed.hessian[0] - hessian) < 1e-6 * size).all()
@@ -115,12 +102,12 @@ def test_the_cost_at_the_optimum_is_that_of_scipy(seed: int) -> None:
     c = with_prior(c)
     pair = pair_of(c)
     x0, x1, weight = c.x0[0].numpy(), c.x1[0].numpy(), c.prior[0].numpy()  # type: ignore[index]
-    _, expected = reference.optimum(parameters, x0, x1, weight, LOSS_SCALE_PX, WIDE, TALL)
+    expected = reference.least_cost(parameters, x0, x1, weight, LOSS_SCALE_PX, WIDE, TALL)
     # From the unconstrained optimum, as in the engine: focal lengths there are off, often implausible.
     F = SevenPoint().refine(to_units(truth, pair)[None], pair, Loss("truncated", LOSS_SCALE_PX), Steps(10, 1e-4))
     _, refined = FAMILY.refine(F, pair, 50)
     r = sampson(in_pixels(refined.models[0], pair), x0, x1)
-    computed = (weight * reference.loss(r, LOSS_SCALE_PX)).sum() / (2 * 0.3**2) + refined.cost[0]
+    computed = (weight * loss_of(r**2, LOSS_SCALE_PX**2, "geman_mcclure")).sum() / (2 * 0.3**2) + refined.cost[0]
     # The loss has local minima, but on these pairs both end in the same one, where the cost is flat: an error of the
     # parameters enters squared, and SciPy stops within 1e-7 of the least cost.
     assert computed <= expected * (1 + 1e-9)
@@ -146,7 +133,7 @@ def test_the_fit_reaches_the_optimum_and_tells_what_the_prior_costs(focal: tuple
     c, truth, _ = photographs(5, (WIDE, WIDE), focal, 150, noise, outliers=0.0)
     pair = pair_of(c)
     precision = (pair.pixels_per_unit / noise) ** 2
-    fit = FAMILY.fit(start(truth, pair), pair, wide, posterior.Limits(precision, 50, 0.0))
+    fit = FAMILY.fit(near(truth, pair), pair, wide, posterior.Limits(precision, 50, 0.0))
     end = evaluated(fit.cameras, pair, "truncated", wide, precision)
     assert np.abs(end.gradient).max() < 1e-6 * np.abs(end.hessian).max()
     # What a fit without prior gains from there, in logarithms of the likelihood.
@@ -182,7 +169,6 @@ def test_models_that_are_not_finite_harm_no_other() -> None:
     bad = np.concatenate([np.full_like(good, np.nan), np.zeros_like(good), good])
     _, alone = FAMILY.refine(good, pair, 12)
     _, among = FAMILY.refine(bad, pair, 12)
-    assert isinstance(among, Refined)
     for single, many in zip(alone, among, strict=True):
         np.testing.assert_array_equal(many[2], single[0])
     assert among.cost[:2].tolist() == [math.inf, math.inf]
@@ -253,13 +239,6 @@ def test_support_is_the_gain_of_geman_and_mcclure() -> None:
     assert computed == pytest.approx(out[0], abs=60 * 2.0**-BITS / (weight * gain).sum())
 
 
-def near(F: np.ndarray, pair: Pair) -> posterior.Cameras:
-    """The cameras near models (k, 9) of a pair's points."""
-    cameras = posterior.no_cameras(len(F))
-    posterior.nearest_cameras(F, posterior.images_of(pair), cameras)
-    return cameras
-
-
 def models_of(cameras: posterior.Cameras, pair: Pair) -> np.ndarray:
     """Their fundamental matrices (k, 9), of a pair's points."""
     k, images = len(cameras.focal), posterior.images_of(pair)
@@ -275,11 +254,10 @@ def test_cameras_of_a_model_are_those_that_made_it(sizes: tuple[tuple[int, int],
         focal = tuple(np.random.default_rng(seed).uniform(0.6, 3, 2).tolist())
         c, truth, _ = photographs(seed, sizes, focal)
         pair = pair_of(c)
-        F = to_units(truth, pair)
-        cameras = near(F[None], pair)
+        cameras = near(truth, pair)
         # Bougnoux's formula loses the digits in which the axes' planes differ, 1e3 here at most, and its root half.
         np.testing.assert_allclose(np.exp(cameras.focal[0]), focal, rtol=1e-8)
-        assert apart(models_of(cameras, pair)[0], F) < 1e-9
+        assert apart(models_of(cameras, pair)[0], to_units(truth, pair)) < 1e-9
         for axes in cameras.axes[0]:
             np.testing.assert_allclose(axes.T @ axes, np.eye(3), atol=1e-12)
 
@@ -289,7 +267,7 @@ def test_implausible_focal_lengths_are_replaced_by_usual_ones() -> None:
     pair = pair_of(c)
     for first, second in ((0.2, 1.0), (1.0, 5.5), (0.1, 9.0)):
         strange = np.concatenate([parameters[:6], np.log([first, second])])
-        cameras = near(to_units(reference.fundamental(strange, WIDE, TALL), pair)[None], pair)
+        cameras = near(reference.fundamental(strange, WIDE, TALL), pair)
         assert cameras.focal[0].tolist() == [LOG_USUAL, LOG_USUAL]
         for axes in cameras.axes[0]:
             np.testing.assert_allclose(axes.T @ axes, np.eye(3), atol=1e-12)
@@ -311,22 +289,6 @@ def bent_pair(pair_of_lenses: tuple[float, float] = LENSES) -> tuple[Pair, np.nd
     return pair_of(c), np.c_[x0, x1], F
 
 
-def in_units(F: np.ndarray, pair: Pair) -> np.ndarray:
-    """A model of pixels as that (9,) of a pair's points."""
-    T0, T1 = (
-        np.array([[pair.pixels_per_unit, 0, x], [0, pair.pixels_per_unit, y], [0, 0, 1]])
-        for x, y in pair.centre.reshape(2, 2)
-    )
-    G = T1.T @ F @ T0
-    return (G / np.linalg.norm(G)).ravel()
-
-
-def nearly(F: np.ndarray, pair: Pair) -> posterior.Cameras:
-    cameras = posterior.no_cameras(1)
-    posterior.nearest_cameras(in_units(F, pair)[None], posterior.images_of(pair), cameras)
-    return cameras
-
-
 def fitted(
     cameras: posterior.Cameras, lens: np.ndarray, pair: Pair, iterations: int, prior: LensPrior = FREE
 ) -> LensFit:
@@ -336,27 +298,27 @@ def fitted(
 def test_residuals_are_those_of_the_photographs() -> None:
     pair, x, F = bent_pair()
     expected = [lenses.sampson(F, each, (SIZE, SIZE), LENSES) ** 2 for each in x]
-    np.testing.assert_allclose(squared_px(in_units(F, pair), np.array(LENSES), pair), expected, rtol=1e-5, atol=1e-9)
+    np.testing.assert_allclose(
+        lens_search.squared_px(to_units(F, pair), np.array(LENSES), pair), expected, rtol=1e-5, atol=1e-9
+    )
 
 
 def test_noise_grows_as_the_lens_stretches() -> None:
     pair, x, _ = bent_pair()
-    noise, step = undistorted(pair, np.array(LENSES)).noises, 1e-3
+    noise, step = lens_search.undistorted(pair, np.array(LENSES)).noises, 1e-3
     for k in range(0, len(x), 40):
         areas = []
         for i in range(2):
             at = x[k, 2 * i : 2 * i + 2]
-            J = [
-                (lenses.straight(at + d, SIZE, LENSES[i]) - lenses.straight(at - d, SIZE, LENSES[i])) / 2 / step
-                for d in step * np.eye(2)
-            ]
+            ends = ([lenses.straight(at + sign * d, SIZE, LENSES[i]) for sign in (-1, 1)] for d in step * np.eye(2))
+            J = [(there - back) / 2 / step for back, there in ends]
             areas.append(abs(np.linalg.det(J)))
         assert noise[k] == pytest.approx(np.sqrt(np.mean(areas)), rel=1e-6)
 
 
 def test_derivatives_are_those_of_the_cost() -> None:
     pair, _, F = bent_pair()
-    cameras, lens, h = nearly(F, pair), np.array([-0.15, -0.13]), 1e-6
+    cameras, lens, h = near(F, pair), np.array([-0.15, -0.13]), 1e-6
 
     def moved(i: int, by: float) -> float:
         axes, focal, own = cameras.axes.copy(), cameras.focal.copy(), lens.copy()
@@ -376,53 +338,23 @@ def test_derivatives_are_those_of_the_cost() -> None:
 @pytest.mark.parametrize("start", [(0.0, 0.0), (-0.3, -0.3)])
 def test_the_lenses_are_found_from_afar(start: tuple[float, float]) -> None:
     pair, _, F = bent_pair()
-    wide = fit_with_lenses(nearly(F, pair), np.array([start]), FREE, pair, 20.0, 20)[0]
+    wide = fit_with_lenses(near(F, pair), np.array([start]), FREE, pair, 20.0, 20)[0]
     fit = fitted(wide.cameras, wide.lens, pair, 20)
     assert fit.lens == pytest.approx(np.array(LENSES), abs=0.02)
     assert (np.abs(fit.lens - LENSES) < 5 * fit.deviation).all()
-    assert abs(fit.F @ in_units(F, pair)) > 1 - 1e-3
-    assert fit.cost < fitted(nearly(F, pair), np.array(LENSES), pair, 0).cost + 1
+    assert abs(fit.F @ to_units(F, pair)) > 1 - 1e-3
+    assert fit.cost < fitted(near(F, pair), np.array(LENSES), pair, 0).cost + 1
     assert np.abs(fitted(fit.cameras, fit.lens, pair, 0).gradient / np.sqrt(np.diag(fit.hessian))).max() < 0.2
 
 
 def test_one_lens_and_straight_ones() -> None:
     pair, _, F = bent_pair((-0.15, -0.15))
     shared = lens_prior(Lens((0.0, 0.0), (np.inf, np.inf), True))
-    fit = fitted(nearly(F, pair), np.array([-0.1, -0.1]), pair, 15, shared)
+    fit = fitted(near(F, pair), np.array([-0.1, -0.1]), pair, 15, shared)
     assert fit.lens[0] == fit.lens[1] == pytest.approx(-0.15, abs=0.01)
-    straight = fitted(nearly(F, pair), np.zeros(2), pair, 15, lens_prior(STRAIGHT))
+    straight = fitted(near(F, pair), np.zeros(2), pair, 15, lens_prior(lens_search.STRAIGHT))
     assert np.abs(straight.lens).max() < 1e-6
     assert fit.evidence > straight.evidence + 10
-    known = fitted(
-        nearly(F, pair), np.array([-0.15, -0.15]), pair, 15, lens_prior(Lens((-0.15,) * 2, (0.0,) * 2, True))
-    )
-    assert known.evidence > fit.evidence > fitted(nearly(F, pair), np.full(2, -0.15), pair, 15).evidence
-
-
-def test_points_from_the_principal_points_and_the_scale_of_a_loss() -> None:
-    c, truth, _ = photographs(1)
-    noise = np.random.default_rng(0).uniform(0.5, 2, (1, 200))
-    pair = pair_of(c.replace(noise=torch.from_numpy(noise)))
-    matches, images = centred(pair, 0.7), images_of(pair)
-    pixels = np.concatenate([c.x0[0].numpy(), c.x1[0].numpy()], 1).T
-    principal = np.array([(WIDE[1] - 1) / 2, (WIDE[0] - 1) / 2, (TALL[1] - 1) / 2, (TALL[0] - 1) / 2])
-    expected = (pixels - principal[:, None]) / pair.pixels_per_unit
-    np.testing.assert_allclose(matches.points, expected, atol=1e-14)
-    np.testing.assert_allclose(matches.s2, (0.7 * noise[0] / pair.pixels_per_unit) ** 2, rtol=1e-14)
-    np.testing.assert_allclose(matches.precision, 1 / matches.s2, rtol=1e-14)
-    np.testing.assert_allclose(images.longest * pair.pixels_per_unit, [960, 1000])
-    # A model of points from the principal points, moved to those from the centre.
-    A0, A1 = frames(pair)
-    shifted = [A.copy() for A in (A0, A1)]
-    shifted[0][:2, 2], shifted[1][:2, 2] = principal[:2], principal[2:]
-    G, moved = (shifted[1].T @ truth @ shifted[0]).reshape(1, 9), np.empty((1, 9))
-    translate(G, images.offset, moved)
-    assert apart(in_pixels(moved[0], pair), truth) < 1e-12
-
-
-def test_undistorted_points_are_the_reference_s() -> None:
-    pair, x, _ = bent_pair()
-    points = undistorted(pair, np.array(LENSES)).points.T * pair.pixels_per_unit + pair.centre
-    for i in range(2):
-        expected = [lenses.straight(each, SIZE, LENSES[i]) for each in x[:, 2 * i : 2 * i + 2]]
-        np.testing.assert_allclose(points[:, 2 * i : 2 * i + 2], expected, atol=1e-9)
+    exact, both = lens_prior(Lens((-0.15,) * 2, (0.0,) * 2, True)), np.full(2, -0.15)
+    known, free = (fitted(near(F, pair), both, pair, 15, prior) for prior in (exact, FREE))
+    assert known.evidence > fit.evidence > free.evidence
