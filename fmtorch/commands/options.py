@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+from fmtorch.core import Within
 from fmtorch.core.files import STAGES
 from fmtorch.core.options import (
     CACHE,
@@ -19,9 +20,8 @@ from fmtorch.core.options import (
     Debug,
     Device,
     Gigabytes,
+    Percent,
     Seed,
-    Within,
-    defaults_of,
     option,
 )
 from fmtorch.training.options import TrainOptions
@@ -33,6 +33,18 @@ LENS = (
     "division model in half diagonals; null: not at all"
 )
 REPLACED = "Groups are replaced by name (estimator=lmeds), values by path (estimator.threshold=0.5)."
+
+
+def defaults_of(options: type) -> dict[str, Any]:
+    """The default of each field of a dataclass of options as a config has it: those of a nested one as a mapping."""
+    defaults: dict[str, Any] = _plain(options())
+    return defaults
+
+
+def _plain(value: Any) -> Any:
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {field.name: _plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
+    return list(value) if isinstance(value, tuple) else str(value) if isinstance(value, Path) else value
 
 
 class LeastAndGreatest:
@@ -147,7 +159,7 @@ class PairsOptions:
         "fmbench: folders of images; oanet: HDF5 files of all matches, one a scene, by the features and the matcher",
     )
     workers: Count | None = option(None, "short for executor.workers")
-    quality: Annotated[int, Within(1, 100)] = option(
+    quality: Percent = option(
         95, "of the JPEG images that are written because they were undistorted; others are copied"
     )
 

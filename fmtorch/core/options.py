@@ -63,6 +63,7 @@ Count = Annotated[int, Within(1)]
 Seed = Annotated[int, Within(-(2**63), 2**63 - 1)]
 Device = Annotated[str, DeviceName()]
 Cache = Path | bool | None  # false is off
+Percent = Annotated[int, Within(1, 100)]
 Gigabytes = Annotated[int | float, Within(0)]
 CACHE = "folder of features computed before; null: features in $FMTORCH_CACHE or ~/.cache/fmtorch; off: none"
 DEBUG = "true: stop at the first error of a part and show all of its traceback; pdb: and look at it in the debugger"
@@ -76,17 +77,6 @@ def option(default: T, about: str) -> T:
     if isinstance(default, list | dict):
         return cast(T, dataclasses.field(default_factory=lambda: default.copy(), metadata=metadata))
     return dataclasses.field(default=default, metadata=metadata)
-
-
-def defaults_of(options: type) -> dict[str, Any]:
-    """The default of each field of a dataclass of options as a config has it: those of a nested one as a mapping."""
-    return cast(dict[str, Any], _plain(options()))
-
-
-def _plain(value: Any) -> Any:
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {field.name: _plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
-    return list(value) if isinstance(value, tuple) else str(value) if isinstance(value, Path) else value
 
 
 def expect_options(

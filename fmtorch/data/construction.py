@@ -11,8 +11,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from fmtorch.core.files import replacing
-from fmtorch.core.settings import claim
+from fmtorch.core import claim, replacing
 from fmtorch.data.cameras import line_distance
 from fmtorch.data.files import Indices, Matrix, Pixels, Singles
 from fmtorch.data.fmbench import CAMERAS, IMAGES, SUFFIXES

@@ -8,9 +8,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from fmtorch.core import Features, Within
 from fmtorch.core.onnx_network import pretrained
-from fmtorch.core.options import Within
-from fmtorch.core.types import Features
 from fmtorch.features.patches import Image
 from fmtorch.features.sift import strongest
 

@@ -9,8 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from fmtorch.core.options import Within
-from fmtorch.core.types import Features
+from fmtorch.core import Features, Within
 from fmtorch.features.frames import DominantGradient, NetworkOrientation, NetworkShape, PatchFunction
 from fmtorch.features.hessian import HessianDetector
 from fmtorch.features.onnx_network import PatchNetwork, network_file

@@ -7,8 +7,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from fmtorch.core.files import models_dir
-from fmtorch.core.onnx_network import NetworkFileError, onnx_session
+from fmtorch.core import NetworkFileError, models_dir, onnx_session
 
 PRECISIONS = ("fp32", "int8")
 PATCH_SHAPE = (1, 32, 32)

@@ -16,10 +16,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from fmtorch.core import lazy
-from fmtorch.core.files import models_dir
-from fmtorch.core.options import Within
-from fmtorch.core.types import Features
+from fmtorch.core import Features, Within, lazy, models_dir
 from fmtorch.features.frames import FRAME_SIGMAS
 from fmtorch.features.patches import PATCH, Image, ImagePyramid
 

@@ -13,8 +13,7 @@ from torch import Tensor
 from fmtorch.core import lazy
 from fmtorch.core.checks import as_tensor
 from fmtorch.core.types import Estimate, PoseEstimate
-from fmtorch.geometry.cameras import cross_matrix
-from fmtorch.geometry.epipolar import unit_frobenius
+from fmtorch.geometry import cross_matrix, unit_frobenius
 from fmtorch.io.colmap import among, imported
 from fmtorch.io.match_store import ORIGIN, Kind, PairGeometry, two_view_geometry
 

@@ -7,8 +7,7 @@ from jaxtyping import Bool, Float, Real
 from torch import Tensor
 
 from fmtorch.core.checks import checked, expect_sizes
-from fmtorch.geometry.epipolar import epipolar_distances
-from fmtorch.geometry.homography import homography_transfer
+from fmtorch.geometry import epipolar_distances, homography_transfer
 from fmtorch.metrics.nsgd import diagonal
 
 THRESHOLD = 0.003  # of the image diagonal (Bian et al., BMVC 2019)

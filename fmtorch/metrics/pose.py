@@ -7,11 +7,10 @@ from jaxtyping import Bool, Float, Real
 from torch import Tensor
 
 from fmtorch.core.checks import checked, expect_sizes
+from fmtorch.geometry import homography_points, pose_from_fundamental, poses_from_fundamental
 from fmtorch.geometry.arithmetic import component_sum
 from fmtorch.geometry.epipolar import inverse_root
-from fmtorch.geometry.homography import homography_points
 from fmtorch.geometry.normalize import Matrices
-from fmtorch.geometry.pose import pose_from_fundamental, poses_from_fundamental
 
 Rotations = Float[Tensor, "*#batch 3 3"]
 Translations = Float[Tensor, "*#batch 3"]

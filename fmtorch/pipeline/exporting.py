@@ -10,8 +10,7 @@ from torch import Tensor
 
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.data.pairs import ImagePair, ImageSource
-from fmtorch.geometry.cameras import cross_matrix
-from fmtorch.geometry.pose import pose_from_fundamental
+from fmtorch.geometry import cross_matrix, pose_from_fundamental
 from fmtorch.io.match_store import MatchRecords, PairGeometry, StoredImage, StoredPair, indices
 from fmtorch.pipeline.pair_geometries import pair_geometries
 from fmtorch.pipeline.photographs import PhotographCamera

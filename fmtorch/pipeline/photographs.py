@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from fmtorch.core.types import Correspondences
-from fmtorch.data import ImageCameras, ImageSource, Lens, exif_focal, read_image
-from fmtorch.data.cameras import undistorted_frames, undistorted_points
+from fmtorch.data import ImageCameras, ImageSource, Lens, exif_focal, read_image, undistorted_frames, undistorted_points
 from fmtorch.geometry.cameras import calibration_problems
 from fmtorch.geometry.epipolar import unit_frobenius
 from fmtorch.io.match_store import PairGeometry

@@ -17,8 +17,7 @@ from torch import Tensor
 
 from fmtorch import presets
 from fmtorch.core import RELATED, Correspondences, Features, files, stages
-from fmtorch.data import Lens, to_grey
-from fmtorch.data.cameras import undistorted
+from fmtorch.data import Lens, to_grey, undistorted
 from fmtorch.io.match_store import PairGeometry
 from fmtorch.jobs.execution import mapped, one_thread
 from fmtorch.pipeline import photographs, pictures

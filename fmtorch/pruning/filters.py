@@ -9,8 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from fmtorch.core.options import Within
-from fmtorch.core.types import Correspondences
+from fmtorch.core import Correspondences, Within
 from fmtorch.jit.batches import for_each_pair
 from fmtorch.jit.kernel import Array, B1x1, F8x1, F8x2, inner, kernel, vector
 from fmtorch.jit.random import mix

@@ -23,8 +23,7 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from fmtorch import metrics
-from fmtorch.core.files import replacing
-from fmtorch.core.stages import Estimator
+from fmtorch.core import Estimator, replacing
 from fmtorch.metrics.recall import FINE_THRESHOLD
 from fmtorch.pruning.networks import layers, learned
 from fmtorch.training.labelled import LabelledMatches

@@ -21,9 +21,7 @@ import torch
 from numpy.typing import NDArray
 
 from fmtorch import presets
-from fmtorch.core import checks, stages
-from fmtorch.core.files import replacing
-from fmtorch.core.settings import claim
+from fmtorch.core import checks, claim, replacing, stages
 from fmtorch.core.types import CONTRADICTED, Correspondences, collate, pair_key
 from fmtorch.core.version import __version__
 from fmtorch.io import colmap

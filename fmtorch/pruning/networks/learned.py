@@ -16,8 +16,7 @@ from jaxtyping import Bool, Float
 from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
-from fmtorch.core import Correspondences, models_dir
-from fmtorch.core.onnx_network import NetworkFileError, onnx_session
+from fmtorch.core import Correspondences, NetworkFileError, models_dir, onnx_session
 from fmtorch.pruning.networks.layers import Slots
 
 SUFFIXES = {"torch": ".safetensors", "onnx": ".onnx"}  # of the file that each runtime reads
