@@ -38,10 +38,7 @@ def inputs() -> dict[str, dict[str, torch.Tensor]]:
         "two sizes": hard.replace(size1=torch.tensor([[700, 900]]).expand(len(hard), 2)),
         "degenerate": collate([*degenerate().values(), *small().values()][::4]),
     }
-    return {
-        name: {f: v.clone() for f in FIELDS if isinstance(v := getattr(c, f), torch.Tensor)}
-        for name, c in batches.items()
-    }
+    return {name: {f: v.clone() for f in FIELDS if (v := getattr(c, f)) is not None} for name, c in batches.items()}
 
 
 def dump(pairs: Path, out: Path, names: list[str]) -> None:
@@ -109,8 +106,7 @@ def computed(source: Path, pairs: Path, out: Path, names: list[str]) -> dict[str
     command = [sys.executable, str(Path(__file__).resolve()), "--dump", str(pairs), str(out), "--presets", *names]
     environment = {**os.environ, "PYTHONPATH": str(source.resolve()), "OMP_NUM_THREADS": "1"}
     subprocess.run(command, check=True, env=environment, cwd=source)
-    results: dict[str, torch.Tensor] = torch.load(out)
-    return results
+    return torch.load(out)
 
 
 def same(a: torch.Tensor, b: torch.Tensor) -> bool:

@@ -31,7 +31,6 @@ from fmtorch.geometry import pose_from_fundamental
 from fmtorch.geometry.pose import calibrated
 from fmtorch.io import h5
 from fmtorch.pipeline.pipeline import Outcome
-from fmtorch.presets.objects import merged
 from fmtorch.scenes.raycast import calibration
 from fmtorch.two_view.known_cameras import KnownCameras
 from scripts.benchmark import pairs
@@ -72,13 +71,11 @@ Published = dict[str, dict[str, dict[str, float]]]  # method -> data set -> colu
 
 
 def add_arguments(commands: Any) -> None:
-    parser = add_command(commands, "cameras", run, __doc__, seeds=1)
-    pairs.add_match_options(parser)
+    parser = add_command(commands, "cameras", run, __doc__, pairs.add_match_options, seeds=1)
     parser.add_argument("--methods", nargs="+", default=[], help="NAME:LEVEL[:KEY=VALUE,...]")
     parser.add_argument("--specs", type=Path, help="a file with one method a line; # starts a comment")
-    parser = add_command(commands, "posebench", run_posebench, POSEBENCH, seeds=1)
+    parser = add_command(commands, "posebench", run_posebench, POSEBENCH, pairs.add_match_options, seeds=1)
     parser.add_argument("files", nargs="?", type=Path, help="the folder `relative` of PoseBench's data, or one file")
-    pairs.add_match_options(parser)
     parser.add_argument("--methods", nargs="+", default=METHODS, help="KIND:PRESET[:KEY=VALUE,...], KIND being E or F")
     parser.add_argument("--threshold", type=float, help="px, of sets that are not PoseBench's")
     parser.add_argument("--every", type=int, default=1, help="every so many-th pair of each set; the protocol has all")
@@ -210,9 +207,7 @@ def _posed(estimate: Estimate, c: Correspondences) -> Estimate:
 
 def bougnoux(F: Array, c: Correspondences) -> Array:
     """Focal lengths (2,) in pixels by Bougnoux's formula (ICCV 1998); usual ones for both where one is not real."""
-    centres = calibrations(c.replace(K0=None, K1=None), np.ones(2))
-    for centre, K in zip(centres, calibrations(c, np.ones(2)), strict=True):
-        centre[:2, 2] = K[:2, 2]
+    centres = [np.c_[np.eye(3, 2), K[:, 2]] for K in calibrations(c, np.ones(2))]
     G = centres[1].T @ F @ centres[0]
     squares = np.array([_squared_focal(G), _squared_focal(G.T)])
     usual = USUAL * np.array(sizes_of(c)).max(1)
@@ -378,7 +373,7 @@ def options_of(name: str, changes: dict[str, Any], threshold: float) -> dict[str
         known = {"threshold": threshold, "iterations": MAX_ITERATIONS, "min_iterations": MIN_ITERATIONS}
         known |= {"confidence": CONFIDENCE, "two_view": False}
         own = {key: value for key, value in known.items() if key in preset}
-    return merged(own, changes)
+    return presets.merged(own, changes)
 
 
 def _distances(preset: Mapping[str, Any], scale: float) -> dict[str, Any]:
@@ -400,8 +395,7 @@ def say_what_is_missing(name: str, items: Sequence[Item], rows: Sequence[Row]) -
 def read_published() -> tuple[dict[str, float], Published]:
     """The threshold of each of PoseBench's sets in pixels, and its published figures."""
     figures: Published = {}
-    with PUBLISHED.open(encoding="utf-8") as file:
-        lines = list(csv.DictReader(file))
+    lines = list(csv.DictReader(PUBLISHED.read_text(encoding="utf-8").splitlines()))
     for line in lines:
         areas = {f"published: AUC@{t}": float(line[f"auc{t}"]) for t in POSE_THRESHOLDS}
         figures.setdefault(line["method"], {})[line["dataset"]] = areas
@@ -411,7 +405,7 @@ def read_published() -> tuple[dict[str, float], Published]:
 def posebench_sheet(rows: Sequence[Row], thresholds: Mapping[str, float], published: Published) -> Sheet:
     """Means over the sets, then each set, with published figures, also of methods that were not run."""
     results = Results(rows)
-    sets = {name: own for name, own in results.groups(results.all_pairs).items() if name in results.families}
+    sets = results.by_family(results.all_pairs)
     theirs = {m: {name: of[name] for name in sets if name in of} for m, of in published.items()}
     methods = [*results.methods, *(m for m, of in theirs.items() if of and m not in results.methods)]
     own_pairs = {m: set(results.pairs(m)) if m in results.methods else set() for m in methods}

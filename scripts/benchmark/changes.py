@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from fmtorch import find_homography
-from fmtorch.core.types import Correspondences
+from fmtorch.core import Correspondences, slotted
 from fmtorch.data import ImagePair, Lens, undistorted_frames
 from fmtorch.geometry import symmetric_max
 from fmtorch.pruning import one_to_one
@@ -76,8 +76,7 @@ def case_of(pair: ImagePair, c: Correspondences) -> Case:
 
 def taken(c: Correspondences, index: Tensor) -> Correspondences:
     """Some matches of a batch of one: a mask or indices."""
-    slots = {name: getattr(c, name) for name in c.per_slot if getattr(c, name) is not None}
-    return c.replace(**{name: value[:, index] for name, value in slots.items()})
+    return c.replace(**{name: value[:, index] for name, value in slotted(c).items()})
 
 
 def parallax(case: Case) -> float:
@@ -92,12 +91,9 @@ def parallax(case: Case) -> float:
 
 def on_plane(case: Case) -> Bool[Tensor, " n"]:
     """The right matches of the homography that holds for most of them, (n,)."""
-    index = case.right.nonzero()[:, 0]
-    ends = case.c.x0[0, index].double(), case.c.x1[0, index].double()
-    found = find_homography(*ends, inlier_threshold=PLANE_PX, key=case.pair.key)
-    mask = torch.zeros_like(case.right)
-    mask[index] = found.inliers[0]
-    return mask
+    ends = (x[0, case.right].double() for x in (case.c.x0, case.c.x1))
+    estimate = find_homography(*ends, inlier_threshold=PLANE_PX, key=case.pair.key)
+    return torch.zeros_like(case.right).masked_scatter(case.right, estimate.inliers[0])
 
 
 def inlier_ratio(case: Case, ratio: float) -> Case | None:
@@ -118,10 +114,9 @@ def inlier_ratio(case: Case, ratio: float) -> Case | None:
     drawn = case.c.ratio[:, torch.from_numpy(rng.choice(wrong, len(added)))]
     more = taken(case.spare, torch.from_numpy(added)).replace(ratio=drawn)
     away = torch.zeros(len(added), dtype=torch.bool)
-    slots = [name for name in more.per_slot if getattr(more, name) is not None]
-    joined = kept.c.replace(**{name: torch.cat([getattr(kept.c, name), getattr(more, name)], 1) for name in slots})
+    both = {name: torch.cat([getattr(kept.c, name), value], 1) for name, value in slotted(more).items()}
     labels = torch.cat([kept.right, away]), torch.cat([kept.wrong, ~away])
-    return Case(kept.pair, joined, *labels, kept.spare)
+    return Case(kept.pair, kept.c.replace(**both), *labels, kept.spare)
 
 
 def noise(case: Case, sigma: float) -> Case | None:
@@ -146,9 +141,7 @@ def plane(case: Case) -> Case | None:
     if int(inside.sum()) < MIN_RIGHT:
         return None
     gone = case.rng("plane off").permutation(off)[round(most) :]
-    keep = torch.ones_like(case.right)
-    keep[torch.from_numpy(gone)] = False
-    return case.subset(keep)
+    return case.subset(torch.from_numpy(np.delete(np.arange(len(case.right)), gone)))
 
 
 Window = tuple[NDArray[np.float64], NDArray[np.float64], float]

@@ -45,19 +45,17 @@ NATURAL: dict[Level, Callable[[Row], bool]] = {
 
 
 def add_arguments(commands: Any) -> None:
-    parser = add_command(commands, "estimators", run, __doc__, seeds=1)
-    pairs.add_match_options(parser)
+    parser = add_command(commands, "estimators", run, __doc__, pairs.add_match_options, seeds=1)
     parser.add_argument("--estimators", nargs="+", default=[], help="PRESET[:KEY=VALUE,...][@PRUNER+PRUNER...]")
     parser.add_argument("--specs", type=Path, help="a file with one estimator a line; # starts a comment")
     parser.add_argument("--ngransac", type=Path, help="NG-RANSAC's published weights (scripts/convert_checkpoint.py)")
-    parser = add_command(commands, "curves", run_curves, CURVES, seeds=1)
-    pairs.add_match_options(parser)
+    parser = add_command(commands, "curves", run_curves, CURVES, pairs.add_match_options, seeds=1)
     parser.add_argument("--specs", type=Path, default=FOLDER / "curves.txt", help="lines: CURVE | ESTIMATOR | VALUES")
     parser.add_argument("--curves", nargs="+", default=[], help="such lines, in place of the file")
     parser.add_argument("--knees", type=Path, help="a --table, measured on tuning data, whose knees are marked")
     parser.add_argument("--figure", type=Path, help="draw the curves into this SVG")
-    parser = add_command(commands, "stress", run_stress, STRESS, seeds=1)
-    pairs.add_set_options(parser, limit=20)  # of rendered families half as many
+    parser = add_command(commands, "stress", run_stress, STRESS, pairs.add_set_options, seeds=1)
+    parser.set_defaults(limit=20)  # of rendered families half as many
     parser.add_argument("--specs", type=Path, default=FOLDER / "stress.txt", help="estimators; (...): conditions only")
     parser.add_argument("--only", nargs="*", default=list(SWEEPS), choices=list(SWEEPS), help="all by default")
     parser.add_argument("--figure", type=Path, help="draw the sweep of inlier ratios into this SVG")
@@ -109,8 +107,8 @@ def run_curves(arguments: argparse.Namespace) -> None:
     figures = {spec: area_and_cost(results, spec) for spec in specs}
     knees = {curve.name: knee({spec: figures[spec] for spec in curve.specs}) for curve in curves}
     if arguments.knees:
-        with arguments.knees.open(encoding="utf-8") as file:
-            knees |= {line["curve"]: line["estimator"] for line in csv.DictReader(file) if "knee" in line["mark"]}
+        lines = csv.DictReader(arguments.knees.read_text(encoding="utf-8").splitlines())
+        knees |= {line["curve"]: line["estimator"] for line in lines if "knee" in line["mark"]}
     show([curve_sheet(curves, results, figures, knees)], arguments.table)
     if arguments.figure:
         draw_curves(curves, results, knees, arguments.figure)
@@ -130,8 +128,7 @@ def read_curves(lines: Sequence[str]) -> list[Curve]:
 
 def area_and_cost(results: Results, spec: str) -> tuple[float, float]:
     """AUC@0.05 in percent and milliseconds, averaged over the families."""
-    groups = results.groups(results.pairs())
-    families = [groups[family] for family in results.families]
+    families = results.by_family(results.pairs()).values()
     area = np.mean([results.percent(spec, own, "AUC@0.05") for own in families])
     return float(area), float(np.mean([results.get(spec, own)("ms").mean() for own in families]))
 
@@ -181,10 +178,8 @@ def draw_curves(curves: Sequence[Curve], results: Results, knees: Mapping[str, s
 def run_stress(arguments: argparse.Namespace) -> None:
     def measured_rows(kept: Kept) -> list[Row]:
         conditioned = functools.partial(dataclasses.replace, takes=lambda item: item.facts["sweep"] == CONDITIONED)
-        methods = [
-            conditioned(method(spec.strip("()"))) if spec.startswith("(") else method(spec)
-            for spec in read_specs(arguments.specs)
-        ]
+        specs = read_specs(arguments.specs)
+        methods = [conditioned(method(spec.strip("()"))) if spec[0] == "(" else method(spec) for spec in specs]
         return measure(methods, items_of(arguments), arguments.seeds, kept)
 
     rows = pairs.rows_of(arguments, measured_rows)
@@ -248,11 +243,6 @@ def group(family: str) -> str:
     return "rendered" if family in FAMILIES else "real, wide" if family in WIDE else "real, short"
 
 
-def families_of(results: Results) -> dict[str, list[str]]:
-    """The pairs that all methods have, by `group`."""
-    return {name: own for name, own in results.groups(results.pairs()).items() if name in results.families}
-
-
 def label(spec: str) -> str:
     """An estimator's name in tables: without its stages and the options that all of its kind have."""
     front, _, stages = spec.partition("@")
@@ -265,7 +255,8 @@ def accuracy_sheet(rows: Sequence[Row]) -> Sheet:
     """Recall and AUC@0.05 of each set at each level, of the pairs that all have, and the lead of the first."""
     records: list[Record] = []
     for sweep, level, results in by_level(rows):
-        lines = results.records(families_of(results), ("R.05", "R.01", "AUC@0.05"), "estimator", ["AUC@0.05"])
+        groups = results.by_family(results.pairs())
+        lines = results.records(groups, ("R.05", "R.01", "AUC@0.05"), "estimator", ["AUC@0.05"])
         records += [{"test": sweep, "set": line.pop("set"), "level": level, **line} for line in lines]
     return Sheet("accuracy", "Recall at NSGD 0.05, at 0.01 and AUC@0.05 in %; lead: the first minus this", records)
 
@@ -285,7 +276,7 @@ def draw_inlier_ratios(rows: Sequence[Row], path: Path) -> None:
     """AUC@0.05 against the inlier ratio, a panel for each set."""
     panels: dict[str, dict[str, tables.Line]] = {}
     for _, level, results in by_level([row for row in rows if row["sweep"] == "inlier ratio"]):
-        for (name, own), estimator in itertools.product(families_of(results).items(), results.methods):
+        for (name, own), estimator in itertools.product(results.by_family(results.pairs()).items(), results.methods):
             line = panels.setdefault(name, {}).setdefault(estimator, tables.Line([], []))
             line.x.append(float(level))
             line.y.append(results.percent(estimator, own, "AUC@0.05"))

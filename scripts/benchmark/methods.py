@@ -19,8 +19,7 @@ import torch
 
 import fmtorch
 from fmtorch import presets
-from fmtorch.core.stages import Estimator, Pruner
-from fmtorch.core.types import Correspondences, Estimate
+from fmtorch.core import Correspondences, Estimate, Estimator, Pruner
 from fmtorch.data import ImagePair
 from fmtorch.geometry import refine
 from fmtorch.pipeline.pipeline import Outcome, Pipeline, build_pipeline, load_pipeline

@@ -28,12 +28,12 @@ SIZE = (768, 1024)  # (h, w) of synthetic pairs
 UNRELATED = "unrelated"  # what the names of families of pairs of different scenes begin with
 
 
-def add_set_options(parser: argparse.ArgumentParser, limit: int | None = None) -> None:
+def add_set_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--root", action="append", default=[], help="a set in the FM-Bench layout; may be repeated")
     parser.add_argument("--all-pairs", action="store_true", help="of the images of --root, not those that it lists")
     parser.add_argument("--rendered", choices=["small", "full"], help="also the embedded data set, of this size")
     parser.add_argument("--split", default="test", help="of --rendered: test or train; a --root has no splits")
-    parser.add_argument("--limit", type=int, default=limit, help="pairs of each family at most, chosen by hash")
+    parser.add_argument("--limit", type=int, help="pairs of each family at most, chosen by hash")
 
 
 def add_match_options(parser: argparse.ArgumentParser) -> None:

@@ -25,16 +25,14 @@ from fmtorch.core.types import RELATED
 from fmtorch.data import ImagePair, read_image, to_grey
 from fmtorch.data.construction import keypoints, matchable
 from fmtorch.evaluation.run import select
-from fmtorch.evaluation.statistics import share_interval
+from fmtorch.evaluation.statistics import PERCENT, interval
 from fmtorch.features import ASIFT
 from fmtorch.features.vlad import codebook, descriptor_kind, local_descriptors, vlad
-from fmtorch.pipeline.folder import similar_pairs
-from fmtorch.pipeline.pipeline import Outcome, Pipeline
-from fmtorch.pipeline.two_images import describe
+from fmtorch.pipeline import Outcome, Pipeline, describe, similar_pairs
 from scripts.benchmark import pairs, tables
 from scripts.benchmark.methods import pipeline_method, pipeline_of
 from scripts.benchmark.runner import Item, Kept, Measured, Method, Row, add_command, measure
-from scripts.benchmark.tables import KIN, Record, Results, Sheet, Span, published, show
+from scripts.benchmark.tables import KIN, Record, Results, Sheet, Span, published, show, span
 
 FOLDER = Path(__file__).parent
 BENCHMARKS = ("pipelines", "hard", "paper", "pruning", "learned", "refinement", "gc_ransac")
@@ -58,13 +56,12 @@ def add_arguments(commands: Any) -> None:
     for name in BENCHMARKS:
         settings = settings_of(name)
         about = f"{settings['about']}\n\n{(__doc__ or '').partition(chr(10))[2]}"
-        parser = add_command(commands, name, functools.partial(run, settings), about, seeds=settings.get("seeds", 1))
-        pairs.add_set_options(parser)
+        command, seeds = functools.partial(run, settings), settings.get("seeds", 1)
+        parser = add_command(commands, name, command, about, pairs.add_set_options, seeds)
         asift = "the same of pipelines with ASIFT, a minute a pair"
         parser.add_argument("--asift-limit", type=int, default=10, help=asift)
         add_pipeline_options(parser)
-    parser = add_command(commands, "related", run_related, VERDICT, seeds=1)
-    pairs.add_set_options(parser)
+    parser = add_command(commands, "related", run_related, VERDICT, pairs.add_set_options, seeds=1)
     parser.add_argument("--unrelated", type=int, default=300, help="pairs of each two scenes at most, chosen by hash")
     add_pipeline_options(parser)
     parser.add_argument("--figure", type=Path, help="draw the ROC curves here, as SVG")
@@ -269,10 +266,8 @@ def sets_sheet(rows: Rows) -> Sheet:
 
 def share(rows: Sequence[Row], holds: Callable[[Row], bool]) -> Span | str:
     """The share of pairs for which something holds, in %, with its interval."""
-    if not rows:
-        return ""
-    i = share_interval(np.array([holds(row) for row in rows]), [f"{row['family']}/{row['scene']}" for row in rows])
-    return Span(*(f"{100 * value:.2f}" for value in (i.value, i.low, i.high)))
+    scenes = [f"{row['family']}/{row['scene']}" for row in rows]
+    return span(interval(np.array([float(holds(row)) for row in rows]), scenes, PERCENT, share=True), ".2f")
 
 
 def percent(values: Sequence[bool]) -> str:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import functools
-import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -33,7 +32,7 @@ from fmtorch.two_view.pair_type import classify
 from scripts.benchmark import pairs
 from scripts.benchmark.changes import sizes_of
 from scripts.benchmark.methods import options
-from scripts.benchmark.runner import Item, Kept, Measured, Row, add_command, console, measure
+from scripts.benchmark.runner import Item, Kept, Measured, Row, add_command, console, measure, timed
 from scripts.benchmark.tables import Record, Results, Sheet, grouped, show
 
 POSES = ("from F", "from H, the first pose", "from H, the better one")
@@ -62,7 +61,7 @@ COLMAP = {
 
 def add_arguments(commands: Any) -> None:
     planes = add_command(commands, "homography", run, __doc__, seeds=3)
-    types = add_command(commands, "pair_types", run_pair_types, CONFIGURATION)
+    types = add_command(commands, "pair_types", run_pair_types, CONFIGURATION, pairs.add_match_options)
     for parser in (planes, types):
         parser.add_argument("--photographs", type=Path, required=parser is planes, help="a folder of photographs")
         parser.add_argument("--tuning", action="store_true", help="the photographs for choosing constants")
@@ -70,7 +69,6 @@ def add_arguments(commands: Any) -> None:
     planes.add_argument("--kinds", nargs="+", default=KINDS, choices=KINDS)
     planes.add_argument("--warps", type=int, default=1, help="pairs of each kind and photograph")
     planes.add_argument("--limit", type=int, help="photographs at most")
-    pairs.add_match_options(types)
     types.add_argument("--colmap", nargs="*", type=float, default=[4.0, 1.0], help="COLMAP's thresholds, px")
     types.add_argument("--unknown", action="store_true", help="without calibrations, by image sizes alone")
     types.set_defaults(pruners=["ratio", "one_to_one", "frame_consistency", "match_noise"])
@@ -82,7 +80,7 @@ def run(arguments: argparse.Namespace) -> None:
               *(views(paths, arguments.warps) if "views" in arguments.kinds else ())]  # fmt: skip
     items = [item for item in track(planes, "warping", console=console) if item.pair.family in arguments.kinds]
     results = Results(measure([Homography(word) for word in arguments.methods], items, arguments.seeds, Kept(None)))
-    groups = {kind: own for kind, own in results.groups(results.all_pairs).items() if kind in results.families}
+    groups = results.by_family(results.all_pairs)
     records = results.records(groups, [*(f"AUC@{px} px" for px in (1, 3, 5)), "ms"], "method", ["AUC@1 px"])
     show([Sheet("homography", "AUC of the mean distance of points, in %", records)], arguments.table)
 
@@ -109,9 +107,8 @@ class Homography(Measured):
         """The mean error in pixels, infinite where there is no homography, and milliseconds."""
         assert isinstance(item, Plane)
         assert item.pair.H is not None
-        start = time.process_time()
-        H = self.solve(item.matches, seed)
-        row: Row = {"ms": 1e3 * (time.process_time() - start), "corner_error": np.inf}
+        H, seconds = timed(self.solve, item.matches, seed)
+        row: Row = {"ms": 1e3 * seconds, "corner_error": np.inf}
         if H is not None:
             apart = np.linalg.norm(mapped(H, item.points) - mapped(item.pair.H, item.points), axis=1)
             row["corner_error"] = float(apart.mean())
@@ -223,11 +220,7 @@ def time_line(matches: Sequence[Correspondences]) -> str:
     estimator = presets.build("estimator", "fmtorch")
     estimate = estimator(c, 0)
     classify(c, estimate)
-    times = [time.process_time()]
-    for call in (lambda: estimator(c, 0), lambda: classify(c, estimate)):
-        call()
-        times.append(time.process_time())
-    ms = 1e3 * np.diff(times) / len(c)
+    ms = [1e3 * timed(*call)[1] / len(c) for call in ((estimator, c, 0), (classify, c, estimate))]
     return f"{len(c)} pairs, median {int(c.count().median())} matches: F {ms[0]:.2f} ms, kinds {ms[1]:.2f} ms"
 
 

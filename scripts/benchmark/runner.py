@@ -22,7 +22,6 @@ from fmtorch.data import ImagePair
 from fmtorch.evaluation.rows import evaluate
 from fmtorch.geometry import sampson
 from fmtorch.pipeline.pipeline import Outcome
-from fmtorch.presets.objects import merged
 from fmtorch.runs import identity_digest
 from fmtorch.runs.fingerprint import code_digest, learned, libraries
 
@@ -42,9 +41,10 @@ ROWS = "keeps what each method makes of each pair, one line each; shown where no
 
 
 def add_command(
-    commands: Any, name: str, run: Callable[[argparse.Namespace], None], about: str | None, seeds: int | None = None
-) -> argparse.ArgumentParser:
-    """A command with `--table` and, where `seeds` says how many by default, `--seeds` and `--rows`."""
+    commands: Any, name: str, run: Callable[[argparse.Namespace], None], about: str | None,
+    add_options: Callable[[argparse.ArgumentParser], None] | None = None, seeds: int | None = None,
+) -> argparse.ArgumentParser:  # fmt: skip
+    """A command with `--table`, `--seeds` and `--rows` where `seeds` says how many by default, and further options."""
     raw = argparse.RawDescriptionHelpFormatter
     head = (about or "").partition("\n")[0].replace("%", "%%")
     parser: argparse.ArgumentParser = commands.add_parser(name, help=head, description=about, formatter_class=raw)
@@ -53,7 +53,16 @@ def add_command(
         parser.add_argument("--rows", type=Path, help=ROWS)
     parser.add_argument("--table", type=Path, help="write the table here as CSV; of several each to FILE_NAME.csv")
     parser.set_defaults(run=run)
+    if add_options is not None:
+        add_options(parser)
     return parser
+
+
+def timed(compute: Callable[..., Any], *arguments: Any) -> tuple[Any, float]:
+    """What a call returns, and the seconds of the processor that it takes, whatever else runs beside it."""
+    start = time.process_time()
+    result = compute(*arguments)
+    return result, time.process_time() - start
 
 
 class Kept:
@@ -93,7 +102,7 @@ def identity(stages: Stages, *others: Any) -> str:
     """The digest of what defines the results of stages: options, code, versions of peers' packages, learned files.
     stages: e.g. ``[("estimator", "usac", {"threshold": 1.0})]``. others: configs with a `_target_`, plain values, and
     objects, of which only the learned files count."""
-    configs: list[Any] = [merged(presets.load(group, name), options) for group, name, options in stages]
+    configs: list[Any] = [presets.merged(presets.load(group, name), options) for group, name, options in stages]
     configs += [other for other in others if isinstance(other, Mapping)]
     rest = [other for other in others if not isinstance(other, Mapping)]
     modules = {target: hydra.utils.get_object(target).__module__ for target in sorted(presets.targets_of(configs))}
@@ -172,9 +181,7 @@ class Method(Measured):
             c = pruned(stage, c, lambda _: item.images())  # type: ignore[misc]
             c = c if bool(c.mask.all()) else c.compact()
             pruning += (time.process_time() - start) * (name not in self.untimed)
-        start = time.process_time()
-        estimate = self.estimator(matched.pair, c, seed)
-        estimation = time.process_time() - start
+        estimate, estimation = timed(self.estimator, matched.pair, c, seed)
         sized = c.replace(size0=matched.correspondences.size0, size1=matched.correspondences.size1)
         outcome = dataclasses.replace(matched, correspondences=sized, estimate=estimate, reason=estimate.reason[0])
         row = judged(outcome, seed, self.signed)

@@ -27,14 +27,13 @@ from fmtorch.core.types import Correspondences, collate
 from fmtorch.data import ImagePair, read_image, to_grey
 from fmtorch.evaluation import statistics
 from fmtorch.features import ImagePyramid, LocalFeature
-from fmtorch.jobs.execution import Execution
-from fmtorch.jobs.runner import Factory, Local, TaskRunner, WorkerPool
+from fmtorch.jobs import Execution, Factory, Local, TaskRunner, WorkerPool
 from fmtorch.pipeline.pipeline import STAGES, Pipeline
 from fmtorch.runs import PairRow, RunFolder
 from fmtorch.scenes.surfaces import photograph
 from scripts.benchmark import pairs
 from scripts.benchmark.methods import call, pipeline_of
-from scripts.benchmark.runner import add_command, console
+from scripts.benchmark.runner import add_command, console, timed
 from scripts.benchmark.tables import Record, Sheet, show
 
 SINGLE = 64  # pairs at most that are estimated one a call
@@ -59,8 +58,7 @@ which cost the same) for as many features as ours found, and no GMS, which neith
 
 
 def add_arguments(commands: Any) -> None:
-    parser = add_command(commands, "speed", run, __doc__)
-    pairs.add_match_options(parser)
+    parser = add_command(commands, "speed", run, __doc__, pairs.add_match_options)
     parser.add_argument("--matches", type=int, default=760, help="median of the synthetic pairs, used without --root")
     parser.add_argument("--pairs", type=int, default=64, help="synthetic pairs")
     parser.add_argument("--batch", type=int, default=64, help="pairs a call")
@@ -81,8 +79,7 @@ def add_arguments(commands: Any) -> None:
     parser.add_argument("--size", type=int, nargs=2, default=(1024, 1536), help="the image is resized to (h, w)")
     parser.add_argument("--features", nargs="+", default=["hesaffnet", "hesaffnet_fast"], help="of conf/features")
     parser.add_argument("--repeats", type=int, default=7)
-    parser = add_command(commands, "end_to_end", run_end_to_end, END_TO_END)
-    pairs.add_set_options(parser)
+    parser = add_command(commands, "end_to_end", run_end_to_end, END_TO_END, pairs.add_set_options)
     parser.add_argument("--pipelines", nargs="*", default=list(PEERS), choices=list(PEERS))
 
 
@@ -91,7 +88,7 @@ def run(arguments: argparse.Namespace) -> None:
     if pairs.named(arguments):
         every = [item.matches for item in pairs.matched(arguments)]
     methods = {spec: call(spec) for spec in (*arguments.peers, *arguments.estimators)}
-    first = {spec: seconds(method, every[0]) for spec, method in methods.items()}  # lazy initialisation
+    first = {spec: timed(method, every[0])[1] for spec, method in methods.items()}  # lazy initialisation
     single = in_turn(methods, every[:SINGLE], arguments.repeats)
     size = arguments.batch
     many = in_turn(methods, [collate(every[i : i + size]) for i in range(0, len(every), size)], arguments.repeats)
@@ -108,21 +105,10 @@ def run(arguments: argparse.Namespace) -> None:
     show([Sheet("speed", f"{len(every)} pairs, {count:.0f} matches (median)", records)], arguments.table)
 
 
-def seconds(method: Call, c: Correspondences) -> float:
-    """Of the processor in one call, whatever else runs beside it."""
-    start = time.process_time()
-    method(c)
-    return time.process_time() - start
-
-
 def in_turn(methods: dict[str, Call], inputs: Sequence[Correspondences], repeats: int) -> dict[str, np.ndarray]:
     """Seconds (repeats, inputs) of methods that take turns at each input."""
-    taken = {spec: np.zeros((repeats, len(inputs))) for spec in methods}
-    for repeat in range(repeats):
-        for i, c in enumerate(inputs):
-            for spec, method in methods.items():
-                taken[spec][repeat, i] = seconds(method, c)
-    return taken
+    taken = [[[timed(method, c)[1] for method in methods.values()] for c in inputs] for _ in range(repeats)]
+    return dict(zip(methods, np.array(taken).transpose(2, 0, 1), strict=True))
 
 
 def run_memory(arguments: argparse.Namespace) -> None:

@@ -2,6 +2,7 @@
 
 import csv
 import functools
+import itertools
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -67,16 +68,13 @@ class Sheet(NamedTuple):
     def write(self, path: Path) -> None:
         """As CSV, one value a cell; an interval takes three columns."""
         spans = {c for record in self.records for c, cell in record.items() if isinstance(cell, Span)}
-        heads = [head for c in self.columns for head in ((c, f"{c} low", f"{c} high") if c in spans else (c,))]
+        heads = {c: (c, f"{c} low", f"{c} high") if c in spans else (c,) for c in self.columns}
         with path.open("w", encoding="utf-8", newline="") as file:
-            writer = csv.DictWriter(file, heads, restval="", lineterminator="\n")
+            writer = csv.DictWriter(file, [*itertools.chain(*heads.values())], restval="", lineterminator="\n")
             writer.writeheader()
             for record in self.records:
-                line = dict(record)
-                for c, cell in record.items():
-                    if isinstance(cell, Span):
-                        line |= {c: cell.value, f"{c} low": cell.low, f"{c} high": cell.high}
-                writer.writerow(line)
+                cells = {c: cell if isinstance(cell, Span) else (cell,) for c, cell in record.items()}
+                writer.writerow({head: value for c in cells for head, value in zip(heads[c], cells[c], strict=False)})
 
 
 def show(sheets: Sequence[Sheet], table: Path | None = None) -> None:
@@ -182,10 +180,14 @@ class Results:
         """The scene of each pair, with its family."""
         return scene_names(*zip(*(self._places[pair] for pair in pairs), strict=True)) if pairs else []
 
+    def by_family(self, pairs: Sequence[str]) -> dict[str, list[str]]:
+        """These pairs by family, without those families that have none."""
+        every = {family: [pair for pair in pairs if self._places[pair][0] == family] for family in self.families}
+        return {family: own for family, own in every.items() if own}
+
     def groups(self, pairs: Sequence[str]) -> dict[str, list[str]]:
         """These pairs by family, then those of wide and of short baselines where there are both, and all of several."""
-        by_family = {f: [pair for pair in pairs if self._places[pair][0] == f] for f in self.families}
-        by_family = {family: own for family, own in by_family.items() if own}
+        by_family = self.by_family(pairs)
         wide = [pair for family, own in by_family.items() if family in WIDE for pair in own]
         short = [pair for family, own in by_family.items() if family not in WIDE for pair in own]
         if wide and short:
@@ -263,8 +265,8 @@ Published = Mapping[tuple[str, str], dict[str, str]]
 @functools.cache
 def published(path: Path) -> Published:
     """The figures of Bian et al. (BMVC 2019) from a CSV file, by data set and method."""
-    with path.open(encoding="utf-8") as file:
-        return {(line["dataset"], line["method"]): line for line in csv.DictReader(file)}
+    lines = csv.DictReader(path.read_text(encoding="utf-8").splitlines())
+    return {(line["dataset"], line["method"]): line for line in lines}
 
 
 # Lines in panels that share a legend, as SVG without background, legible on light and dark

@@ -23,6 +23,7 @@ import torch
 from numpy.typing import NDArray
 
 import fmtorch
+from fmtorch.data.cameras import Camera, relative_pose
 from fmtorch.estimators.external import colmap
 from fmtorch.io.colmap import imported, remove_database
 from fmtorch.metrics import pose_auc, pose_error
@@ -62,14 +63,12 @@ def add_arguments(commands: Any) -> None:
 
 
 class Scene(NamedTuple):
-    """A folder of photographs with the true calibration and pose, world to camera, of each by name.
+    """A folder of photographs with the true camera of each by name.
     single: whether one camera took them all."""
 
     name: str
     images: Path
-    K: dict[str, Array]
-    R: dict[str, Array]
-    t: dict[str, Array]
+    cameras: dict[str, Camera]
     single: bool = True
 
 
@@ -80,9 +79,8 @@ def read_scene(folder: Path) -> Scene:
         raise SystemExit(f"{folder} holds no Images and Camera.txt; give scenes in FM-Bench's layout")
     lines = np.loadtxt(folder / "Camera.txt").reshape(-1, 21)
     named = dict(zip(sorted(path.name for path in (folder / "Images").iterdir()), lines, strict=True))
-    K, R = ({name: line[i : i + 9].reshape(3, 3) for name, line in named.items()} for i in (0, 9))
-    t = {name: line[18:] for name, line in named.items()}
-    return Scene(folder.name, folder / "Images", K, R, t, bool((lines[:, :9] == lines[0, :9]).all()))
+    cameras = {name: Camera(row[:9].reshape(3, 3), row[9:18].reshape(3, 3), row[18:]) for name, row in named.items()}
+    return Scene(folder.name, folder / "Images", cameras, bool((lines[:, :9] == lines[0, :9]).all()))
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -165,7 +163,7 @@ def mapped(mapper: str, path: Path, scene: Scene, cameras: str, seed: int) -> Ro
             "track": model.compute_mean_track_length(), "error": model.compute_mean_reprojection_error(),
         }  # fmt: skip
         poses = {image.name: image.cam_from_world() for image in model.images.values() if image.has_pose}
-    row["registered, %"] = 100 * row["registered"] / len(scene.R)
+    row["registered, %"] = 100 * row["registered"] / len(scene.cameras)
     return row | accuracy(poses, scene)
 
 
@@ -190,7 +188,7 @@ def accuracy(poses: dict[str, Any], scene: Scene) -> dict[str, float]:
     """AUC, per cent, of the errors of all relative poses and of all camera centres; no pose is a wrong one."""
     errors = [
         relative_error(poses[b] * poses[a].inverse(), scene, a, b) if a in poses and b in poses else 180.0
-        for a, b in itertools.combinations(sorted(scene.R), 2)
+        for a, b in itertools.combinations(sorted(scene.cameras), 2)
     ]
     figures: dict[str, float] = {}
     for name, values in (("auc", np.array(errors)), ("centre", centre_errors(poses, scene))):
@@ -201,15 +199,14 @@ def accuracy(poses: dict[str, Any], scene: Scene) -> dict[str, float]:
 
 def relative_error(relative: Any, scene: Scene, a: str, b: str) -> float:
     """The larger of the errors of rotation and direction of translation, in degrees."""
-    R = scene.R[b] @ scene.R[a].T
-    t = scene.t[b] - R @ scene.t[a]
-    given = [torch.tensor(np.array(value)) for value in (relative.rotation.matrix(), relative.translation, R, t)]
+    true = relative_pose(scene.cameras[a], scene.cameras[b])
+    given = [torch.tensor(np.array(value)) for value in (relative.rotation.matrix(), relative.translation, *true)]
     return float(max(pose_error(*given, up_to_sign=False)))
 
 
 def centre_errors(poses: dict[str, Any], scene: Scene) -> Array:
     """Distances from the true centres after the best similarity (Umeyama 1991), per cent of the centres' RMS spread."""
-    true = {name: -scene.R[name].T @ scene.t[name] for name in sorted(scene.R)}
+    true = {name: -camera.R.T @ camera.t for name, camera in sorted(scene.cameras.items())}
     size = np.sqrt(np.var(list(true.values()), 0).sum())
     errors = dict.fromkeys(true, np.inf)
     if len(poses) >= MIN_MODEL:
@@ -303,13 +300,12 @@ def match(scene: Scene, path: Path, verified: bool) -> None:
 
 def _match_by_ours(scene: Scene, path: Path, work: Path) -> None:
     """`fmtorch match images=`, of which the geometries are removed again."""
-    pycolmap = imported()
     output, camera = work / f"{scene.name}-match", "shared" if scene.single else "per_image"
     words = [f"images={scene.images}", "export=colmap", f"camera={camera}", f"output={output}"]
     if subprocess.run([sys.executable, "-m", "fmtorch", "match", *words], check=False).returncode:
         raise SystemExit(f"{scene.images} could not be matched; see above")
     shutil.copy(output / "database.db", path)
-    with pycolmap.Database.open(path) as database:
+    with imported().Database.open(path) as database:
         database.clear_two_view_geometries()
 
 
@@ -317,7 +313,7 @@ def calibrate(path: Path, scene: Scene) -> None:
     pycolmap = imported()
     with pycolmap.Database.open(path) as database:
         for image in database.read_all_images():
-            K, camera = scene.K[image.name], database.read_camera(image.camera_id)
+            K, camera = scene.cameras[image.name].K, database.read_camera(image.camera_id)
             params: list[Any] = [K[0, 0], K[1, 1], K[0, 2] + ORIGIN, K[1, 2] + ORIGIN]
             known = pycolmap.Camera(model="PINHOLE", width=camera.width, height=camera.height, params=params)
             known.camera_id, known.has_prior_focal_length = image.camera_id, True
@@ -353,7 +349,7 @@ def posed(scene: Scene, database: Path) -> Any:
         for image in opened.read_all_images():
             if image.camera_id not in model.cameras:
                 model.add_camera_with_trivial_rig(opened.read_camera(image.camera_id))
-            rotation = pycolmap.Rotation3d(scene.R[image.name])
+            camera = scene.cameras[image.name]
             given = pycolmap.Image(name=image.name, camera_id=image.camera_id, image_id=image.image_id)
-            model.add_image_with_trivial_frame(given, pycolmap.Rigid3d(rotation, scene.t[image.name]))
+            model.add_image_with_trivial_frame(given, pycolmap.Rigid3d(pycolmap.Rotation3d(camera.R), camera.t))
     return model

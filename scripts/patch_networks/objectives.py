@@ -14,8 +14,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from fmtorch.features.frames import PatchFunction
-from fmtorch.jit import random
-from fmtorch.jit.random import Stream
+from fmtorch.jit.random import Stream, uniform
 
 DRAWS = 6  # random numbers in [0, 1) that an objective gets for each point
 SAME_PATCH = 0.008  # a negative nearer than this is the same patch twice, as in the authors' code for HardNet
@@ -164,7 +163,7 @@ class CovarianceObjective:
     @torch.no_grad()
     def evaluate(self, network: nn.Module, pairs: Pairs) -> dict[str, float]:
         """Median ratio of axes that is left between the two rectified patches, and without shapes (1: none)."""
-        numbers = random.uniform(0, torch.zeros(1, dtype=torch.int64), Stream.TRAINING, 0, len(pairs[0]), DRAWS)[0]
+        numbers = uniform(0, torch.zeros(1, dtype=torch.int64), Stream.TRAINING, 0, len(pairs[0]), DRAWS)[0]
         T1, T2, seen = self._stretched(pairs[0], numbers.to(pairs[0]))
         A1, A2 = shape_matrix(network(seen)).chunk(2)
         values = [torch.linalg.svdvals(m.cpu()) for m in (_inverse(T1 @ A1) @ T2 @ A2, _inverse(T1) @ T2)]

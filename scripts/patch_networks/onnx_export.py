@@ -99,8 +99,8 @@ def laid_out(model: onnx.ModelProto, side: int) -> onnx.ModelProto:
         side = int(side + around - width) // int(ways["strides"].ints[1]) + 1
         if side == 1 and width == seen:
             graph.make_product(node)
-        elif graph.quantised(node):
-            graph.widen(node, side, _pixels(inputs, channels, side))
+        elif graph.quantised(node) and (pixels := _pixels(inputs, channels, side)) > 1:
+            graph.widen(node, side, pixels)
     del changed.graph.value_info[:]  # shapes within, which were of the layout before
     onnx.checker.check_model(changed)
     return changed
@@ -130,14 +130,11 @@ class _Graph:
     def weights(self, convolution: Any) -> NDArray[Any]:
         """The weights of a convolution as they are kept, (outputs, inputs, height, width)."""
         name = convolution.input[1]
-        return numpy_helper.to_array(
-            self.constants[self.writer[name].input[0] if self.quantised(convolution) else name]
-        )
+        kept = self.writer[name].input[0] if self.quantised(convolution) else name
+        return numpy_helper.to_array(self.constants[kept])
 
     def widen(self, convolution: Any, side: int, pixels: int) -> None:
         """Have each row of a convolution give several pixels beside one another. side: of the convolution's output."""
-        if pixels == 1:
-            return
         ways, weights = _attributes(convolution), self.weights(convolution)
         step = int(ways["strides"].ints[1])
         channels, inputs, height, width = weights.shape

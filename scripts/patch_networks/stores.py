@@ -24,13 +24,10 @@ from numpy.typing import NDArray
 from torch import Tensor, from_numpy
 
 from fmtorch.data.images import read_image
-from fmtorch.features import SIFT, DominantGradient, HessianDetector, ImagePyramid
-from fmtorch.features.frames import FRAME_SIGMAS
-from fmtorch.jit import random
-from fmtorch.jit.random import Stream
+from fmtorch.features import FRAME_SIGMAS, SIFT, DominantGradient, HessianDetector, ImagePyramid
+from fmtorch.jit.random import Stream, bits, uniform
 from fmtorch.pipeline.photographs import reduced_image
-from fmtorch.scenes.raycast import Camera
-from fmtorch.scenes.surfaces import PICTURES, skimage_file
+from fmtorch.scenes import PICTURES, Camera, skimage_file
 from fmtorch.training import planes
 from fmtorch.training.planes import Grey, Matrix, Photograph, PlaneViews
 
@@ -237,13 +234,13 @@ class PatchStore:
 @functools.lru_cache(maxsize=32)
 def order(seed: int, key: int, total: int) -> Int[Tensor, " n"]:
     """The numbers below `total` in a random order of this seed and key."""
-    return random.bits(seed, torch.tensor([key]), Stream.TRAINING, 0, total, 1).flatten().argsort(stable=True)
+    return bits(seed, torch.tensor([key]), Stream.TRAINING, 0, total, 1).flatten().argsort(stable=True)
 
 
 def validation_pairs(store: PatchStore, count: int, seed: int = 0) -> Float[Tensor, "2 n 1 h w"]:
     """Two patches each of up to `count` points of a store, in random order: always the same for one seed."""
     points = order(seed, 0, len(store))[:count]
-    return store.views(points, random.uniform(seed + 1, torch.tensor([0]), Stream.TRAINING, 0, len(points), 2)[0])
+    return store.views(points, uniform(seed + 1, torch.tensor([0]), Stream.TRAINING, 0, len(points), 2)[0])
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -21,14 +21,12 @@ from jaxtyping import Float
 from omegaconf import DictConfig
 from torch import Tensor, nn
 
-from fmtorch import presets
 from fmtorch.core.files import conf_dir, replacing
 from fmtorch.core.terminal import console, exits_with_message
 from fmtorch.features.networks import build, read_checkpoint
 from fmtorch.features.onnx_network import PatchNetwork, network_file
-from fmtorch.jit import random
-from fmtorch.jit.random import Stream
-from fmtorch.presets import plain
+from fmtorch.jit.random import Stream, bits, uniform
+from fmtorch.presets import plain, resolve_device
 from fmtorch.training.planes import PlaneViews, list_photographs
 from scripts.patch_networks import objectives, stores
 from scripts.patch_networks.objectives import DRAWS, CovarianceObjective, DescriptorObjective, Objective
@@ -130,8 +128,8 @@ class PatchTraining:
         """The loss of this step's patches, by `DRAWS` random numbers of each point and two more."""
         o = self.options
         key = torch.tensor([self.step])
-        draws = random.uniform(o.seed, key, Stream.TRAINING, 0, o.batch, DRAWS + 2)[0].float()
-        torch.manual_seed(int(random.bits(o.seed, key, Stream.TRAINING, o.batch, 1, DRAWS + 2)[0, 0, 0]))  # dropout
+        draws = uniform(o.seed, key, Stream.TRAINING, 0, o.batch, DRAWS + 2)[0].float()
+        torch.manual_seed(int(bits(o.seed, key, Stream.TRAINING, o.batch, 1, DRAWS + 2)[0, 0, 0]))  # dropout
         pairs, similarity = self._batch(draws)
         draws, pairs = draws.to(self.device), pairs.to(self.device)
         with torch.autocast(self.device.type, torch.bfloat16, enabled=o.bf16):
@@ -213,7 +211,7 @@ def training_of(
 def main(config: DictConfig) -> None:
     with exits_with_message("interrupted; resume=true goes on from the last checkpoint"):
         torch.set_num_threads(config.threads)
-        device = presets.resolve_device(config.device)
+        device = resolve_device(config.device)
         train, validation = opened_stores(config)
         training = plain(config.training)
         torch.manual_seed(training["options"]["seed"])

@@ -247,14 +247,14 @@ def walk_scene(count: int = 5) -> tuple[Scene, dict[str, Any]]:
     """Cameras, and their poses in a frame that is turned, moved and twice as large."""
     cameras = databases.scene(count)
     names = [f"{i:03d}.jpg" for i in range(count)]
-    K, R, t = (dict(zip(names, values, strict=True)) for values in ([CALIBRATION] * count, cameras.R, cameras.t))
+    true = {name: verify.Camera(CALIBRATION, *pose) for name, *pose in zip(names, cameras.R, cameras.t, strict=True)}
     turn = databases.scene(2).R[1]
     poses = {}
-    for name in names:
-        centre = 2 * turn @ (-R[name].T @ t[name]) + np.array([1.0, 2, 3])
-        rotation = R[name] @ turn.T
+    for name, camera in true.items():
+        centre = 2 * turn @ (-camera.R.T @ camera.t) + np.array([1.0, 2, 3])
+        rotation = camera.R @ turn.T
         poses[name] = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -rotation @ centre)
-    return Scene("walk", Path(), K, R, t), poses
+    return Scene("walk", Path(), true), poses
 
 
 def test_true_poses_have_no_error_in_any_frame_and_an_image_without_a_pose_counts_as_wrong() -> None:
