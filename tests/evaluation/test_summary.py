@@ -16,10 +16,7 @@ from rich.console import Console
 from fmtorch import metrics
 from fmtorch.core import pair_key
 from fmtorch.evaluation import common_reasons, statistics, summarize, summary_markdown, terminal_tables
-from fmtorch.evaluation.statistics import (
-    bootstrap_mean,
-    share_interval,
-)
+from fmtorch.evaluation.statistics import bootstrap_mean, share_interval
 from fmtorch.runs import PairRow, to_table
 from tests.reference.metrics import bootstrap_interval
 

@@ -7,12 +7,7 @@ import pytest
 import torch
 
 from fmtorch import features
-from fmtorch.features import (
-    SIFT,
-    ImagePyramid,
-    PatchSIFT,
-    project,
-)
+from fmtorch.features import SIFT, ImagePyramid, PatchSIFT, project
 from tests.conftest import oracle
 from tests.features.scenes import random_frames, same, texture
 from tests.reference.local_features import patch, sift
