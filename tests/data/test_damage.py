@@ -115,15 +115,11 @@ TUM: list[tuple[str, Edit, str]] = [
     ),
     ("depth.txt", word(5, "1305031236.1"), r"depth\.txt, line 5: .* time stamps must ascend"),
 ]
-CASES = [
-    (kind, *case)
-    for kind, cases in {"colmap": COLMAP, "bundler": BUNDLER, "kitti": KITTI, "tum": TUM}.items()
-    for case in cases
-]
+KINDS = {"colmap": COLMAP, "bundler": BUNDLER, "kitti": KITTI, "tum": TUM}
+CASES = [(kind, *case) for kind, cases in KINDS.items() for case in cases]
 
 
 def written(kind: str, folder: Path, depth: bool) -> tuple[Path, dict[str, object]]:
-    """A set: where its files are, and how it is loaded."""
     if kind == "kitti":
         return write_kitti(folder), {"root": folder, "sequences": ["06"]}
     if kind == "tum":

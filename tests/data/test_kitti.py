@@ -80,9 +80,7 @@ def test_missing_sequences_and_roots_are_told(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="sequences: no such folder; it must hold a folder for each sequence"):
         load("kitti", root=tmp_path)
     root = write_kitti(tmp_path)
-    with pytest.raises(
-        DataError, match=r"no sequence '07'; there are: 06\. dataset\.sequences=\[\.\.\.\] takes others"
-    ):
+    with pytest.raises(DataError, match=r"no sequence '07'; there are: 06\. dataset\.sequences=\[\.\.\.\] takes"):
         load("kitti", root=root)
     with pytest.raises(DataError, match="split 'validation'; there are test and train"):
         load("kitti", split="validation", root=root)
@@ -146,9 +144,8 @@ def test_poses_are_interpolated_to_the_time_of_the_frame(tmp_path: Path) -> None
 def test_the_camera_is_told_by_the_name(tmp_path: Path) -> None:
     for name in ("rgbd_dataset_freiburg2_x", "rgbd_dataset_freiburg3_y", "mine"):
         write_tum(tmp_path, name, frames=2)
-    two, three = (
-        load("tum", root=tmp_path, sequences=[f"rgbd_dataset_{n}"])[0] for n in ("freiburg2_x", "freiburg3_y")
-    )
+    names = ("rgbd_dataset_freiburg2_x", "rgbd_dataset_freiburg3_y")
+    two, three = (load("tum", root=tmp_path, sequences=[name])[0] for name in names)
     assert (two.image0.lens.fx, two.image0.lens.cx) == (520.9, 325.1)
     assert three.image0.lens is None  # published undistorted
     assert three.K0[0, 0] == 535.4
@@ -165,9 +162,7 @@ def test_train_is_all_that_is_there_but_the_test_sequences(tmp_path: Path) -> No
     (tmp_path / "rgbd_dataset_freiburg1_validation/rgb").mkdir(parents=True)
     scenes = [scene.name for scene in load("tum", root=tmp_path, split="train").scenes]
     assert scenes == ["rgbd_dataset_freiburg1_desk", "rgbd_dataset_freiburg2_desk"]
-    with pytest.raises(
-        DataError, match="no sequence 'rgbd_dataset_freiburg3_large_cabinet'; there are: rgbd_dataset_fr"
-    ):
+    with pytest.raises(DataError, match="no sequence 'rgbd_dataset_freiburg3_large_cabinet'; there are: rgbd"):
         load("tum", root=tmp_path)
 
 

@@ -98,9 +98,8 @@ def lens_of(model: str) -> Lens:
 
 
 def grid_of_points(step: int = 16) -> np.ndarray:
-    return np.stack(
-        np.meshgrid(np.arange(0.0, POINTS_SIZE[1], step), np.arange(0.0, POINTS_SIZE[0], step)), -1
-    ).reshape(-1, 2)
+    sides = (np.arange(0.0, side, step) for side in POINTS_SIZE[::-1])
+    return np.stack(np.meshgrid(*sides), -1).reshape(-1, 2)
 
 
 @pytest.mark.parametrize("model", sorted(COEFFICIENTS))
