@@ -56,10 +56,10 @@ def test_every_part_is_evaluated(folder: Path) -> None:
         assert target in identity
 
 
-@pytest.mark.parametrize(
-    ("group", "protocol"),
-    [("features", FeatureExtractor), ("matcher", Matcher), ("pruner", Pruner), ("estimator", Estimator)],
-)
+PROTOCOLS = {"features": FeatureExtractor, "matcher": Matcher, "pruner": Pruner, "estimator": Estimator}
+
+
+@pytest.mark.parametrize(("group", "protocol"), PROTOCOLS.items())
 def test_each_is_built_by_name_in_python(group, protocol, folder, monkeypatch):
     from fmtorch import presets
 
@@ -91,7 +91,6 @@ def code(name: str) -> list[str]:
 
 @pytest.fixture
 def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Runs a notebook as one program; returns its variables."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("FMTORCH_CACHE", str(own_cache(tmp_path)))
     monkeypatch.setattr("fmtorch.scenes.dataset.PLANS", dict.fromkeys((("small", "test"), ("small", "train")), SMALL))
@@ -135,7 +134,6 @@ def test_train_a_pruner(run: Any) -> None:
 def test_a_notebook_is_stored_without_results(path: Path) -> None:
     notebook = json.loads(path.read_text(encoding="utf-8"))
     assert notebook["nbformat"] == 4
-    assert all(
-        c["outputs"] == [] and c["execution_count"] is None for c in notebook["cells"] if c["cell_type"] == "code"
-    )
+    cells = [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    assert all(cell["outputs"] == [] and cell["execution_count"] is None for cell in cells)
     assert len({cell["id"] for cell in notebook["cells"]}) == len(notebook["cells"])

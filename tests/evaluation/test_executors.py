@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import functools
 import os
 import random
 import signal
@@ -11,7 +10,6 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -44,8 +42,6 @@ def build() -> Pipeline:
 
 
 class Slow:
-    """An estimator that waits."""
-
     model = "fundamental"
 
     def __init__(self, estimator: Any) -> None:
@@ -98,11 +94,6 @@ def test_many_pairs_go_to_processes_unless_there_is_a_single_worker(workers, man
     monkeypatch.setattr("fmtorch.jobs.execution.cores", lambda: 2)
     assert Execution("auto", workers).decided(many).kind == kind
     assert Execution("processes", workers).decided(many).kind == "processes"  # as it was asked for
-
-
-def test_rows_of_an_executor_of_ones_own(pairs: list[ImagePair], expected: dict[int, PairRow]) -> None:
-    own = Execution(workers=2, send_images=True, make=functools.partial(ThreadPoolExecutor, 2))
-    assert evaluated(pairs, own) == expected
 
 
 class Cluster:
@@ -181,9 +172,7 @@ def test_a_scheduler_that_is_lost(cluster: Cluster, pairs: list[ImagePair], expe
     cluster.add_workers(1)
     rows: list[PairRow] = []
     execution = Execution("dask", address=cluster.address)
-    counts = evaluate_pairs(
-        build(), pairs, seed=0, batch=2, execution=execution, store=rows.extend, build=build_slow
-    )  # fmt: skip
+    counts = evaluate_pairs(build(), pairs, seed=0, batch=2, execution=execution, store=rows.extend, build=build_slow)
     next(counts)
     cluster.scheduler.kill()
     with pytest.raises(WorkersLost, match=rf"the scheduler at {cluster.address} was lost; .* the same command goes on"):
@@ -216,12 +205,9 @@ def test_a_process_that_ends_is_told() -> None:
     images = [ImageSource(f"scene/{i}", Path(f"{i}.png")) for i in range(3)]
     pairs = [ImagePair(f"scene/0-{i}", "family", "scene", images[0], images[i], np.eye(3)) for i in (1, 2)]
     rows: list[PairRow] = []
-    run = evaluate_pairs(
-        load_pipeline("sift_ratio"), pairs, seed=0, batch=1, execution=Execution("processes", 2),
-        store=rows.extend, build=_ends,
-    )  # fmt: skip
+    options = {"execution": Execution("processes", 2), "store": rows.extend, "build": _ends}
     with pytest.raises(WorkersLost, match="the same command goes on"):
-        list(run)
+        list(evaluate_pairs(load_pipeline("sift_ratio"), pairs, seed=0, batch=1, **options))
     assert rows == []
 
 
@@ -285,16 +271,7 @@ def test_features_are_computed_while_the_first_pair_is_worked_on(tmp_path: Path)
     pairs = [ImagePair(f"scene/0-{i}", "family", "scene", images[0], images[i], np.eye(3)) for i in range(1, 7)]
     pairs.insert(2, ImagePair("scene/0-bad", "family", "scene", images[0], bad, np.eye(3)))
     expected: list[PairRow] = []
-    list(
-        evaluate_pairs(
-            load_pipeline("sift_ratio"),
-            pairs,
-            seed=0,
-            batch=2,
-            execution=Execution("threads", 1),
-            store=expected.extend,
-        )
-    )
+    list(evaluate_pairs(load_pipeline("sift_ratio"), pairs, seed=0, batch=2, execution=ONE, store=expected.extend))
     pipeline, rows = load_pipeline("sift_ratio"), list[PairRow]()
     watched = Watched(pipeline, len(images))
     counts = list(evaluate_pairs(pipeline, pairs, seed=0, batch=2, execution=TWO, store=rows.extend))
@@ -320,8 +297,6 @@ class Learned:
 
 
 class Secretive:
-    """A stage that reads a file and says nothing of it."""
-
     def __init__(self, weights: str) -> None:
         self.values = Path(weights).read_bytes()
 
