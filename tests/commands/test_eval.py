@@ -9,7 +9,11 @@ from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
+import torch
 
+from fmtorch import match
+from fmtorch.pipeline import load_pipeline
+from fmtorch.runs import ArrayCache
 from tests.helpers import draw_set
 from tests.processes import run_command, starter
 
@@ -225,3 +229,30 @@ def test_a_killed_run_continues_with_what_it_had(root: Path, truth: Rows, tmp_pa
     assert computed == IMAGES - had
     assert from_cache > 0
     assert results(tmp_path / "run") == truth
+
+
+def test_two_runs_at_once_share_the_cache(root: Path, truth: Rows, tmp_path: Path) -> None:
+    runs = (arguments(root, tmp_path / name, "workers=2", "batch=3") for name in "ab")
+    processes = [starter().start(tmp_path, "eval", *words) for words in runs]
+    ended, outputs = [process.wait() for process in processes], [process.said() for process in processes]
+    assert ended == [0, 0], outputs
+    assert all("damaged" not in said and "nothing is kept" not in said for said in outputs)
+    assert results(tmp_path / "a") == results(tmp_path / "b") == truth
+    assert len(list(ArrayCache(tmp_path / "cache" / "features").files())) == IMAGES
+    assert not list(tmp_path.glob("cache/features/*/*.tmp"))
+    assert all(sum(counted(said)) == IMAGES for said in outputs)
+
+
+def test_two_photographs(root: Path, tmp_path: Path) -> None:
+    images = [root / "a" / "Images" / f"{i:08d}.png" for i in (0, 1)]
+    kept = [f"cache={tmp_path / 'cache'}"]
+    runs = ([], 1600), (kept, 1600), (kept, 1600), (kept, 200)
+    pipelines = [load_pipeline("sift_gms", overrides=words) for words, _ in runs]
+    results = [match(*images, pipeline=p, longest_side=run[1]) for p, run in zip(pipelines, runs, strict=True)]
+    plain, cold, warm, _ = results
+    _, first, second, reduced = (pipeline.extractor for pipeline in pipelines)
+    assert torch.equal(plain.F, cold.F)
+    assert torch.equal(plain.F, warm.F)
+    assert torch.equal(plain.keypoints0, warm.keypoints0)
+    assert cold.seconds["features"] == warm.seconds["features"]
+    assert (first.computed, second.found, reduced.computed) == (2, 2, 2)  # reduced: other pixels

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import functools
 import os
 import random
 import signal
@@ -10,6 +11,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -94,6 +96,11 @@ def test_many_pairs_go_to_processes_unless_there_is_a_single_worker(workers, man
     monkeypatch.setattr("fmtorch.jobs.execution.cores", lambda: 2)
     assert Execution("auto", workers).decided(many).kind == kind
     assert Execution("processes", workers).decided(many).kind == "processes"  # as it was asked for
+
+
+def test_rows_of_an_executor_of_ones_own(pairs: list[ImagePair], expected: dict[int, PairRow]) -> None:
+    own = Execution(workers=2, send_images=True, make=functools.partial(ThreadPoolExecutor, 2))
+    assert evaluated(pairs, own) == expected
 
 
 class Cluster:

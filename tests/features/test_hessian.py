@@ -1,5 +1,7 @@
 """Detection by the Hessian, and orientation of frames."""
 
+import math
+
 import kornia
 import numpy as np
 import pytest
@@ -8,7 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from fmtorch import features
-from fmtorch.features import hessian
+from fmtorch.features import frames, hessian
 from tests.conftest import oracle, shared_path
 from tests.features.scenes import random_frames, texture
 from tests.reference.local_features import dominant_gradient as reference_orientation
@@ -210,3 +212,26 @@ def test_the_scale_of_a_determinant_is_a_product_afterwards() -> None:
     hessian.hessian_determinant(image, 1.0, out=plain)
     hessian.hessian_determinant(image, scale, out=scaled)
     assert torch.equal(scaled, plain * scale)
+
+
+def plain_histogram(patches: Tensor) -> Tensor:
+    padded = F.pad(patches, (1, 1, 1, 1), mode="replicate")[:, 0]
+    rows = padded[:, :-2] + 2 * padded[:, 1:-1] + padded[:, 2:]
+    columns = padded[:, :, :-2] + 2 * padded[:, :, 1:-1] + padded[:, :, 2:]
+    gy, gx = (columns[:, 2:] - columns[:, :-2]) / 8, (rows[:, :, 2:] - rows[:, :, :-2]) / 8
+    magnitude = (gx * gx + gy * gy).sqrt() * frames._window(patches.shape[-1], patches.device)
+    position = (torch.atan2(gy, gx) + math.pi) * (frames.BINS / (2 * math.pi))
+    upper_weight = (position - position.floor()) * magnitude
+    lower, histogram = position.long().flatten(1), patches.new_zeros(len(patches), frames.BINS + 2)
+    histogram.scatter_add_(1, lower, (magnitude - upper_weight).flatten(1))
+    histogram.scatter_add_(1, lower + 1, upper_weight.flatten(1))
+    histogram[:, :2] += histogram[:, frames.BINS :]
+    return histogram[:, : frames.BINS]
+
+
+def test_histograms_of_directions_are_those_of_the_plain_formulas() -> None:
+    image = texture(2, 200, 200)
+    starts = np.random.default_rng(0).integers(0, 168, (90, 2))
+    patches = torch.from_numpy(np.stack([image[y : y + 32, x : x + 32] for y, x in starts]))[:, None].float() / 255
+    patches = torch.cat([patches, torch.full((1, 1, 32, 32), 0.5), torch.rand(20, 1, 32, 32)])
+    assert torch.equal(frames._histogram(patches), plain_histogram(patches))

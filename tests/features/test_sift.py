@@ -1,5 +1,6 @@
 """SIFT of OpenCV and of VLFeat, ASIFT, patches and SIFT of patches."""
 
+from importlib.util import find_spec
 from pathlib import Path
 
 import cv2
@@ -13,6 +14,9 @@ from fmtorch.features import SIFT, ImagePyramid, PatchSIFT, VLFeatSIFT, project
 from tests.conftest import oracle
 from tests.features.scenes import random_frames, same, texture
 from tests.reference.local_features import patch, sift
+
+needs_vlfeat = pytest.mark.skipif(find_spec("pycolmap") is None, reason="extra colmap is not installed")
+VLFEAT = VLFeatSIFT(peak_threshold=0.01)
 
 
 @pytest.mark.parametrize("number", ["000", "001"])
@@ -38,17 +42,19 @@ def test_equals_stored_keypoints(number: str, case: str) -> None:
     assert np.abs(difference).max() < 1e-3
 
 
-def test_frames_turn_with_the_image() -> None:
+TURNS = [(SIFT(), (160, 200), 0.1, 0.9), pytest.param(VLFEAT, (120, 160), 0.05, 0.95, marks=needs_vlfeat)]
+
+
+@pytest.mark.parametrize(("extract", "size", "gap", "share"), TURNS)
+def test_frames_turn_with_the_image(extract, size, gap, share):
     # Turning an image by 90 degrees maps (x, y) to (y, w - 1 - x); frames must follow. OpenCV rounds the upright
     # direction into 36 bins, which 90 degrees respects; the blurred pyramid is symmetric up to float rounding.
-    vlfeat = VLFeatSIFT(peak_threshold=0.01)
-    for extract, size, gap, share in ((SIFT(), (160, 200), 0.1, 0.9), (vlfeat, (120, 160), 0.05, 0.95)):
-        image = texture(3, *size)
-        expected, turned = torch.tensor([[0.0, 1.0], [-1.0, 0.0]]) @ extract(image).lafs, extract(np.rot90(image)).lafs
-        expected[..., 2] += torch.tensor([0.0, image.shape[1] - 1.0])
-        gaps = (expected[:, None] - turned[None]).abs().amax((2, 3)).amin(1)
-        assert len(expected) > 50
-        assert (gaps < gap).float().mean() > share, extract
+    image = texture(3, *size)
+    expected, turned = torch.tensor([[0.0, 1.0], [-1.0, 0.0]]) @ extract(image).lafs, extract(np.rot90(image)).lafs
+    expected[..., 2] += torch.tensor([0.0, image.shape[1] - 1.0])
+    gaps = (expected[:, None] - turned[None]).abs().amax((2, 3)).amin(1)
+    assert len(expected) > 50
+    assert (gaps < gap).float().mean() > share
 
 
 def test_root_sift_compares_by_hellinger() -> None:
@@ -241,9 +247,10 @@ def blob(x: float, y: float, sigma: float, h: int = 120, w: int = 160) -> np.nda
     return np.rint(30 + 200 * np.exp(-((u - x) ** 2 + (v - y) ** 2) / (2 * sigma**2))).astype(np.uint8)
 
 
+@needs_vlfeat
 @pytest.mark.parametrize(("x", "y", "sigma"), [(80.0, 60.0, 4.0), (71.3, 48.8, 6.0)])
 def test_vlfeat_finds_a_blob_where_it_is(x: float, y: float, sigma: float) -> None:
-    found = VLFeatSIFT(peak_threshold=0.01)(blob(x, y, sigma))
+    found = VLFEAT(blob(x, y, sigma))
     assert len(found.lafs)
     nearest = (found.keypoints - torch.tensor([x, y])).norm(dim=1).argmin()
     assert (found.keypoints[nearest] - torch.tensor([x, y])).abs().max() < 0.1
@@ -253,6 +260,7 @@ def test_vlfeat_finds_a_blob_where_it_is(x: float, y: float, sigma: float) -> No
     assert half_side == pytest.approx(features.FRAME_SIGMAS * found.scores[nearest].item(), rel=1e-5)
 
 
+@needs_vlfeat
 def test_vlfeat_agrees_with_opencv_where_both_find_a_keypoint() -> None:
     image = cv2.resize(texture(5), None, fx=4, fy=4, interpolation=cv2.INTER_CUBIC)
     ours, opencv = VLFeatSIFT(peak_threshold=0.005)(image), SIFT()(image)
@@ -266,5 +274,6 @@ def test_vlfeat_agrees_with_opencv_where_both_find_a_keypoint() -> None:
     assert between.median() < 0.3 * 512  # of vectors of length 512
 
 
+@needs_vlfeat
 def test_the_preset_names_vlfeats() -> None:
     assert presets.build("features", "sift_vlfeat", max_features=50) == VLFeatSIFT(max_features=50)

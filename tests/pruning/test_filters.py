@@ -10,6 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 from torch import Tensor
 
 from fmtorch import find_fundamental, metrics, presets, pruning
@@ -65,14 +68,46 @@ def test_ratio_and_mutual_stages_equal_their_definitions(seed: int) -> None:
     assert torch.equal(pruning.MutualCheck()(order).count(), both.sum()[None])
 
 
-def test_stages_need_their_fields_and_keep_the_rest() -> None:
-    c = scene(0, 20)
-    stages = {pruning.RatioTest(0.5): "ratio", pruning.OneToOne(): "ratio", pruning.MutualCheck(): "mutual"}
-    for stage, field in stages.items():
+@settings(max_examples=80, deadline=None)
+@given(st.data(), st.integers(0, 12))
+def test_one_to_one_equals_the_definition(data: st.DataObject, n: int) -> None:
+    coordinates, ratios = st.sampled_from([0.0, -0.0, 0.1, 1.5]), st.sampled_from([0.25, 0.5, math.inf])
+    x0, x1 = (data.draw(arrays(np.float32, (n, 2), elements=coordinates)) for _ in range(2))
+    ratio = data.draw(arrays(np.float32, (n,), elements=ratios))
+    mask = pruning.one_to_one(*(torch.from_numpy(a)[None] for a in (x0, x1, ratio)))
+    np.testing.assert_array_equal(mask[0], one_to_one_reference(x0, x1, ratio))
+
+
+def duplicated(n: int, dtype: torch.dtype = torch.float32) -> Correspondences:
+    """Points drawn from few locations, so that most locations repeat; no two ratios are equal."""
+    generator = torch.Generator().manual_seed(0)
+    places = 100 * torch.rand(2, n // 3, 2, generator=generator, dtype=dtype)
+    x0, x1 = (at[torch.randint(0, n // 3, (n,), generator=generator)][None] for at in places)
+    ratio = torch.randperm(n, generator=generator).to(dtype)[None] / n
+    return Correspondences(x0, x1, torch.ones(1, n, dtype=torch.bool), ratio, mutual=ratio < 0.5)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_one_to_one_is_symmetric_and_independent_of_order(dtype: torch.dtype) -> None:
+    c = duplicated(200, dtype)
+    kept = pruning.one_to_one(c.x0, c.x1, c.ratio)
+    assert 0 < kept.sum() < 200
+    assert torch.equal(kept, pruning.one_to_one(c.x1, c.x0, c.ratio))
+    order = torch.randperm(200, generator=torch.Generator().manual_seed(1))
+    assert torch.equal(kept[:, order], pruning.one_to_one(*(a[:, order] for a in (c.x0, c.x1, c.ratio))))
+    for x in (c.x0, c.x1):
+        assert len(torch.unique(x[kept], dim=0)) == kept.sum()
+
+
+def test_stages_are_their_functions_need_their_fields_and_keep_the_rest() -> None:
+    c = duplicated(20)
+    ratio, unique = pruning.ratio_test(c.ratio, 0.5), pruning.one_to_one(c.x0, c.x1, c.ratio)
+    stages = [(pruning.RatioTest(0.5), "ratio", ratio), (pruning.OneToOne(), "ratio", unique)]
+    for stage, field, expected in (*stages, (pruning.MutualCheck(), "mutual", c.mutual)):
         out = stage(c)
-        assert int(out.mask.sum()) > 0
+        assert torch.equal(out.mask, expected)
         assert torch.equal(out.x0, c.x0)
-        with pytest.raises(ValueError, match=field):
+        with pytest.raises(ValueError, match=f"needs `{field}`"):
             stage(c.replace(**{field: None}))
 
 

@@ -17,6 +17,7 @@ from tests.pruning.test_filters import turned
 from tests.pruning.test_gms import SIZE0, SIZE1, moving, moving_along
 from tests.reference import consistency as reference
 from tests.reference.gms import SCALES, normalised, run, support
+from tests.reference.lpm import passes
 from tests.variants import built
 
 
@@ -101,6 +102,13 @@ def test_gms_support_equals_the_definition(angle: float, scale: float) -> None:
     winner = max(hypotheses, key=lambda h: run(p0, p1, *h, 2.0, False).sum())  # the first of equals
     z = np.array(support(x0.numpy(), x1.numpy(), SIZE0, SIZE1, *winner))
     np.testing.assert_allclose(computed, z / (z + 1.5), rtol=1e-6)  # float64 rounded to float32
+
+
+@pytest.mark.parametrize("n", [0, 1, 9, 40, 160])
+def test_lpm_cost_equals_the_definition(n: int) -> None:
+    x0, x1 = moving_along(n, n)
+    expected = np.mean(passes(x0.numpy(), x1.numpy())[1], axis=0)
+    np.testing.assert_allclose(fmtorch.pruning.lpm_cost(x0[None], x1[None])[0], expected, rtol=1e-12)
 
 
 def test_priors_follow_the_right_matches_of_a_common_motion() -> None:
