@@ -19,7 +19,6 @@ CHECKOUT = Path(__file__).resolve().parents[2]
 
 
 def python(code: str) -> None:
-    """Run code in a fresh interpreter, which must end well."""
     environment = {**os.environ, "PYTHONPATH": str(CHECKOUT)}
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
@@ -199,7 +198,6 @@ SMALL = ["dataset=fmbench", "dataset.root=Set", "features.max_features=300", "es
 
 @pytest.fixture
 def data_set(tmp_path: Path) -> Path:
-    """A folder with a data set of one pair, ``Set``."""
     return draw_set(tmp_path / "Set", images=2).parent
 
 

@@ -6,17 +6,16 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pyarrow.parquet as pq
 import pytest
 import torch
 
-from fmtorch import MatchResult, match
+from fmtorch import match
 from fmtorch.pipeline import load_pipeline
 from fmtorch.runs import ArrayCache
 from tests.helpers import draw_set
-from tests.processes import Command, run_command, starter
+from tests.processes import run_command, starter
 
 OPTIONS = ["features.max_features=500", "estimator=lmeds", "estimator.hypotheses=200"]
 OWN_PRUNER = """import torch
@@ -48,7 +47,6 @@ def rows(run_dir: Path) -> list[dict[str, object]]:
 
 
 def own(folder: Path, group: str, text: str, name: str = "mine") -> list[str]:
-    """The words that take a preset of one's own."""
     path = folder / "my_conf" / group / f"{name}.yaml"
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(text)
@@ -91,9 +89,8 @@ def test_a_run_from_start_to_end(data: list[str], command: RunCommand, tmp_path:
 
 def test_shards_are_one_run(data: list[str], command: RunCommand, tmp_path: Path) -> None:
     command("eval", *data, "output=whole", cwd=tmp_path)
-    assert "2 of 5 pairs have rows; other shards have the rest" in command(
-        "eval", *data, "output=run", "shard=1/2", cwd=tmp_path
-    )
+    first = command("eval", *data, "output=run", "shard=1/2", cwd=tmp_path)
+    assert "2 of 5 pairs have rows; other shards have the rest" in first
     assert "other shards" not in command("eval", *data, "output=run", "shard=2/2", cwd=tmp_path)
     unsharded, merged = (json.loads((tmp_path / name / "summary.json").read_text()) for name in ("whole", "run"))
     for group in (*unsharded.values(), *merged.values()):
@@ -166,7 +163,6 @@ Rows = list[dict[str, object]]
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A set of pairs of neighbours among `IMAGES` images."""
     return draw_set(tmp_path_factory.mktemp("data") / "Set", "abc", images=IMAGES // 3)
 
 
@@ -184,11 +180,6 @@ def truth(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Rows:
 
 def arguments(root: Path, run_dir: Path, *extra: str) -> list[str]:
     return ["dataset=fmbench", f"dataset.root={root}", *OPTIONS, f"output={run_dir}", *extra]
-
-
-def start(cwd: Path, log: Path, *arguments: str) -> Command:
-    """The command in a process of its own; `log` and `log`.errors are what it writes."""
-    return starter().start(cwd, "eval", *arguments, log=log, errors=log.with_suffix(".errors"))
 
 
 def results(run_dir: Path) -> Rows:
@@ -216,16 +207,15 @@ def test_the_same_rows_with_an_empty_and_with_a_damaged_cache(root: Path, truth:
     assert f"{damaged.name} is damaged" in warm.stderr
     assert counted(warm.stdout) == (1, IMAGES - 1)
     assert results(tmp_path / "cold") == results(tmp_path / "warm") == truth
-    before, after = (
-        {str(row["pair"]): row["seconds_features"] for row in rows(tmp_path / name)} for name in ("cold", "warm")
-    )
+    stored = (rows(tmp_path / name) for name in ("cold", "warm"))
+    before, after = ({str(row["pair"]): row["seconds_features"] for row in each} for each in stored)
     same = sum(before[pair] == after[pair] for pair in before)  # what computing took, not what reading did
     assert same >= len(before) - 2  # one image, of one or two pairs, was computed again
 
 
 def test_a_killed_run_continues_with_what_it_had(root: Path, truth: Rows, tmp_path: Path) -> None:
     these = arguments(root, tmp_path / "run", "batch=1", "workers=1")
-    process = start(tmp_path, tmp_path / "killed", *these)
+    process = starter().start(tmp_path, "eval", *these)
     deadline = time.monotonic() + 120
     while len(list(tmp_path.glob("cache/features/*/*.npz"))) < 5 and time.monotonic() < deadline:
         time.sleep(0.002)
@@ -242,35 +232,27 @@ def test_a_killed_run_continues_with_what_it_had(root: Path, truth: Rows, tmp_pa
 
 
 def test_two_runs_at_once_share_the_cache(root: Path, truth: Rows, tmp_path: Path) -> None:
-    names = ("a", "b")
-    processes = [
-        start(tmp_path, tmp_path / f"{name}.out", *arguments(root, tmp_path / name, "workers=2", "batch=3"))
-        for name in names
-    ]
-    ended = [process.wait() for process in processes]
-    outputs = [(process.log.read_text(), process.log.with_suffix(".errors").read_text()) for process in processes]
+    runs = (arguments(root, tmp_path / name, "workers=2", "batch=3") for name in "ab")
+    processes = [starter().start(tmp_path, "eval", *words) for words in runs]
+    ended, outputs = [process.wait() for process in processes], [process.said() for process in processes]
     assert ended == [0, 0], outputs
-    assert all("damaged" not in err and "nothing is kept" not in err for _, err in outputs)
+    assert all("damaged" not in said and "nothing is kept" not in said for said in outputs)
     assert results(tmp_path / "a") == results(tmp_path / "b") == truth
-    kept = list(ArrayCache(tmp_path / "cache" / "features").files())
-    assert len(kept) == IMAGES
+    assert len(list(ArrayCache(tmp_path / "cache" / "features").files())) == IMAGES
     assert not list(tmp_path.glob("cache/features/*/*.tmp"))
-    assert all(sum(counted(out)) == IMAGES for out, _ in outputs)
+    assert all(sum(counted(said)) == IMAGES for said in outputs)
 
 
 def test_two_photographs(root: Path, tmp_path: Path) -> None:
     images = [root / "a" / "Images" / f"{i:08d}.png" for i in (0, 1)]
-
-    def matched(*overrides: str, longest_side: int = 1600) -> tuple[MatchResult, Any]:
-        pipeline = load_pipeline("sift_gms", overrides=overrides)
-        return match(*images, pipeline=pipeline, longest_side=longest_side), pipeline.extractor
-
-    folder = f"cache={tmp_path / 'cache'}"
-    (plain, _), (cold, first), (warm, second) = matched(), matched(folder), matched(folder)
+    kept = [f"cache={tmp_path / 'cache'}"]
+    runs = ([], 1600), (kept, 1600), (kept, 1600), (kept, 200)
+    pipelines = [load_pipeline("sift_gms", overrides=words) for words, _ in runs]
+    results = [match(*images, pipeline=p, longest_side=run[1]) for p, run in zip(pipelines, runs, strict=True)]
+    plain, cold, warm, _ = results
+    _, first, second, reduced = (pipeline.extractor for pipeline in pipelines)
     assert torch.equal(plain.F, cold.F)
     assert torch.equal(plain.F, warm.F)
     assert torch.equal(plain.keypoints0, warm.keypoints0)
     assert cold.seconds["features"] == warm.seconds["features"]
-    assert (first.computed, second.found) == (2, 2)
-    _, reduced = matched(folder, longest_side=200)
-    assert reduced.computed == 2  # other pixels
+    assert (first.computed, second.found, reduced.computed) == (2, 2, 2)  # reduced: other pixels

@@ -49,7 +49,6 @@ def pipeline() -> fmtorch.Pipeline:
 
 
 def distance(F: torch.Tensor, shape: tuple[int, ...]) -> float:
-    """NSGD to the true F."""
     size = torch.tensor([shape[:2]])
     return float(nsgd(torch.from_numpy(ROWS)[None], F[None], size, size)[0])
 
@@ -99,9 +98,8 @@ def test_reduction_gives_pixels_of_the_originals(pipeline: fmtorch.Pipeline) -> 
     values = [torch.einsum("ni,ij,nj->n", x1, F, x0) for (x0, x1), F in zip(ends, (reduced.F, directly.F), strict=True)]
     ratio = (values[0] @ values[1]) / (values[1] @ values[1])
     # A residual moves by |gradient| * 1e-4 px; 1e-3 px of a gradient near 1 (F scaled so that normals have norm 1).
-    assert (values[0] - ratio * values[1]).abs().max() < 1e-3 * values[0].abs().max() + 1e-3 * float(
-        reduced.F[:2].norm()
-    )
+    limit = 1e-3 * values[0].abs().max() + 1e-3 * float(reduced.F[:2].norm())
+    assert (values[0] - ratio * values[1]).abs().max() < limit
 
 
 def test_photographs_that_cannot_be_related(pipeline: fmtorch.Pipeline) -> None:
@@ -388,7 +386,6 @@ def test_a_lens_that_nobody_calibrated(pair: ImagePair, pipeline_with_cameras: f
 
 
 def with_exif(folder: Path, name: str, **tags: int) -> Path:
-    """A picture of 60 x 40 px with these tags."""
     exif = Image.Exif()
     exif.get_ifd(ExifTags.IFD.Exif).update({ExifTags.Base[key]: value for key, value in tags.items()})
     Image.new("RGB", (60, 40)).save(folder / name, exif=exif)

@@ -34,10 +34,8 @@ SHOWN = Options(count=3, cache="off")
 
 
 def results(nsgd: list[float], scene: str = "scene") -> list[PairRow]:
-    return [
-        PairRow(f"{scene}/{i}", i + 1, "family", f"{scene}{i % 6}", True, nsgd=value, F=[1.0] + [0.0] * 8)
-        for i, value in enumerate(nsgd)
-    ]
+    rows = [(f"{scene}/{i}", i + 1, "family", f"{scene}{i % 6}", True) for i in range(len(nsgd))]
+    return [PairRow(*row, nsgd=value, F=[1.0] + [0.0] * 8) for row, value in zip(rows, nsgd, strict=True)]
 
 
 def test_figures_and_differences_are_those_of_the_rows() -> None:
@@ -113,13 +111,8 @@ def test_runs_keep_the_order_given_and_folders_are_ordered_by_recall(tmp_path, m
 @pytest.mark.parametrize("order", [["ratio", "one_to_one"], ["one_to_one", "ratio"]])
 def test_a_pipeline_is_drawn_again_as_it_was_and_a_difference_is_said(order: list[str], tmp_path: Path) -> None:
     first, second = (pair(name, draw(tmp_path / "a.png", 0), draw(tmp_path / "b.png", 0, shift=12)) for name in "ab")
-    overrides = [
-        "features.max_features=300",
-        "estimator=lmeds",
-        "estimator.hypotheses=100",
-        f"pruner=[{','.join(order)}]",
-    ]
-    config = compose("match", ("pipeline=sift_ratio", "cache=off", *overrides))
+    small = ("features.max_features=300", "estimator=lmeds", "estimator.hypotheses=100")
+    config = compose("match", ("pipeline=sift_ratio", "cache=off", *small, f"pruner=[{','.join(order)}]"))
     rows = evaluate(build_pipeline(config).run([first, second], seed=3), seed=3)
     F = np.array([0, 0, 1, 0, 0, 0, -1, 0, 0]) / np.sqrt(2)  # of a vertical motion; that of the images is horizontal
     rows[1] = dataclasses.replace(rows[1], F=F.tolist(), nsgd=0.0)
@@ -142,13 +135,8 @@ def test_a_result_that_cannot_be_had_again_is_said(tmp_path: Path) -> None:
     images = [read_image(source) for source in (shown.image0, shown.image1)]
     F = np.array([0, 0, 0, 0, 0, -1, 0, 1, 0]) / np.sqrt(2)
     solved, failed = {"ok": True, "nsgd": 0.0, "F": F.tolist()}, {"ok": False, "nsgd": 1.0, "F": None}
-    estimate = Estimate(
-        torch.from_numpy(F.reshape(1, 3, 3)),
-        torch.ones(1, 9).bool(),
-        torch.tensor([True]),
-        ("",),
-        torch.zeros(1).long(),
-    )
+    model, yes = torch.from_numpy(F.reshape(1, 3, 3)), torch.tensor([True])
+    estimate = Estimate(model, yes.expand(1, 9), yes, ("",), torch.zeros(1).long())
     lost, solution = Outcome(shown, reason="no keypoints"), Outcome(shown, estimate=estimate)
     assert "(no keypoints), unlike in its run" in difference(shown, images, solved, lost)
     assert "NSGD 0.0000, unlike in its run" in difference(shown, images, failed, solution)
@@ -162,11 +150,9 @@ def test_the_command_on_two_runs(tmp_path: Path) -> None:
         done = run_command(name, *words, cwd=tmp_path)
         assert done.returncode == 0, done.stderr
 
+    small = ("dataset=fmbench", "dataset.root=Set", "features.max_features=300", "estimator.hypotheses=100")
     for estimator in ("lmeds", "msac"):
-        command(
-            "eval", "dataset=fmbench", "dataset.root=Set", "features.max_features=300",
-            f"estimator={estimator}", "estimator.hypotheses=100",
-        )  # fmt: skip
+        command("eval", *small, f"estimator={estimator}")
     command("report", "root=Set", "pictures=2")
     page = (tmp_path / "runs/report.html").read_text()
     assert "drawn again" not in page  # what is drawn is what was stored
@@ -189,14 +175,12 @@ SIFT = ("pipeline=sift_ratio", "features.max_features=800", "estimator.hypothese
 
 @pytest.fixture
 def photographs(tmp_path: Path) -> Path:
-    """A folder with a.png and b.png."""
     for name, image in zip("ab", stereo(120, 160), strict=True):
         cv2.imwrite(str(tmp_path / f"{name}.png"), image[..., ::-1])
     return tmp_path
 
 
 def refused(monkeypatch: pytest.MonkeyPatch, folder: Path, *words: str) -> str:
-    """What `match a.png b.png` ends with."""
     return ended(monkeypatch, folder, "match", "a.png", "b.png", *SIFT, *words)
 
 

@@ -19,14 +19,7 @@ from omegaconf import OmegaConf
 from torch import Tensor
 
 from fmtorch import geometry, matching, metrics, presets, pruning
-from fmtorch.core import (
-    Within,
-    checked,
-    claim,
-    create,
-    expect_options,
-    fits,
-)
+from fmtorch.core import Within, checked, claim, create, expect_options, fits
 
 Item = TypeVar("Item")
 

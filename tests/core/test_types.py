@@ -15,68 +15,35 @@ PER_MATCH = ("x0", "x1", "mask", "ratio", "score", "prior", "lafs0", "lafs1", "m
 
 def features(n: int = 5, d: int = 3, seed: int = 0) -> Features:
     g = torch.Generator().manual_seed(seed)
-    return Features(
-        lafs=torch.rand(n, 2, 3, generator=g),
-        scores=torch.rand(n, generator=g),
-        descriptors=torch.rand(n, d, generator=g),
-        image_size=torch.tensor([480, 640 + seed]),
-    )
+    lafs, scores, descriptors = (torch.rand(n, *shape, generator=g) for shape in ((2, 3), (), (d,)))
+    return Features(lafs, scores, descriptors, torch.tensor([480, 640 + seed]))
+
+
+def drawn(b: int, seed: int, shapes: dict[str, tuple[int, ...]]) -> tuple[dict[str, torch.Tensor], torch.Generator]:
+    """Random values for fields, which are named with their shape."""
+    g = torch.Generator().manual_seed(seed)
+    return {name: torch.rand(b, *shape, generator=g) for names, shape in shapes.items() for name in names.split()}, g
 
 
 def matches(b: int = 4, n: int = 6, seed: int = 0) -> Correspondences:
-    g = torch.Generator().manual_seed(seed)
-    return Correspondences(
-        x0=torch.rand(b, n, 2, generator=g),
-        x1=torch.rand(b, n, 2, generator=g),
-        mask=torch.rand(b, n, generator=g) < 0.6,
-        ratio=torch.rand(b, n, generator=g),
-        score=torch.rand(b, n, generator=g),
-        prior=torch.rand(b, n, generator=g),
-        lafs0=torch.rand(b, n, 2, 3, generator=g),
-        lafs1=torch.rand(b, n, 2, 3, generator=g),
-        size0=torch.tensor([[480, 640]]).repeat(b, 1),
-        size1=torch.tensor([[240, 320]]).repeat(b, 1),
-        K0=torch.rand(b, 3, 3, generator=g),
-        K1=torch.rand(b, 3, 3, generator=g),
-        key=torch.arange(b) + 100 * seed,
-        mutual=torch.rand(b, n, generator=g) < 0.5,
-        noise=torch.rand(b, n, generator=g),
-        focal=torch.rand(b, 2, 2, generator=g),
-        shared_focal=torch.rand(b, generator=g) < 0.5,
-        lens=torch.rand(b, 2, 2, generator=g),
-        shared_lens=torch.rand(b, generator=g) < 0.5,
-    )
+    shapes = {"x0 x1": (n, 2), "ratio score prior noise": (n,), "lafs0 lafs1": (n, 2, 3)}
+    fields, g = drawn(b, seed, {**shapes, "K0 K1": (3, 3), "focal lens": (2, 2)})
+    mask, mutual = (torch.rand(b, n, generator=g) < share for share in (0.6, 0.5))
+    shared = {name: torch.rand(b, generator=g) < 0.5 for name in ("shared_focal", "shared_lens")}
+    sizes = {"size0": torch.tensor([[480, 640]]).repeat(b, 1), "size1": torch.tensor([[240, 320]]).repeat(b, 1)}
+    return Correspondences(**fields, **shared, **sizes, mask=mask, mutual=mutual, key=torch.arange(b) + 100 * seed)
 
 
 def estimate(b: int = 4, n: int = 6, seed: int = 0) -> Estimate:
-    g = torch.Generator().manual_seed(seed)
+    shapes = {"fit_scale lens_suggested": (), "focals lens": (2,), "t other_t": (3,), "focal_precision sizes": (2, 2)}
+    matrices = {"F E R homography other_R": (3, 3), "tangents": (3, 2), "covariance": (7, 7), "covariance_F": (9, 9)}
+    fields, g = drawn(b, seed, {**shapes, **matrices})
+    flags = {name: torch.rand(b, generator=g) < 0.5 for name in ("contradicted", "sizes_doubtful")}
     ok = torch.arange(b) % 2 == 0
-    return Estimate(
-        F=torch.rand(b, 3, 3, generator=g),
-        inliers=torch.rand(b, n, generator=g) < 0.5,
-        ok=ok,
-        reason=tuple("" if good else f"reason {i}" for i, good in enumerate(ok.tolist())),
-        samples=torch.arange(b) + seed,
-        significance=torch.where(ok, torch.rand(b, generator=g, dtype=torch.float64), -torch.inf),
-        E=torch.rand(b, 3, 3, generator=g),
-        R=torch.rand(b, 3, 3, generator=g),
-        t=torch.rand(b, 3, generator=g),
-        focals=torch.rand(b, 2, generator=g),
-        fit_scale=torch.rand(b, generator=g),
-        focal_precision=torch.rand(b, 2, 2, generator=g),
-        covariance=torch.rand(b, 7, 7, generator=g),
-        tangents=torch.rand(b, 3, 2, generator=g),
-        covariance_F=torch.rand(b, 9, 9, generator=g),
-        pair_type_index=torch.arange(b) % 5,
-        homography=torch.rand(b, 3, 3, generator=g),
-        other_R=torch.rand(b, 3, 3, generator=g),
-        other_t=torch.rand(b, 3, generator=g),
-        contradicted=torch.rand(b, generator=g) < 0.5,
-        lens_suggested=torch.rand(b, generator=g),
-        sizes=torch.rand(b, 2, 2, generator=g),
-        sizes_doubtful=torch.rand(b, generator=g) < 0.5,
-        lens=torch.rand(b, 2, generator=g),
-    )
+    fields["significance"] = torch.where(ok, torch.rand(b, generator=g, dtype=torch.float64), -torch.inf)
+    reason = tuple("" if good else f"reason {i}" for i, good in enumerate(ok.tolist()))
+    numbers = {"samples": torch.arange(b) + seed, "pair_type_index": torch.arange(b) % 5}
+    return Estimate(**fields, **flags, **numbers, inliers=torch.rand(b, n, generator=g) < 0.5, ok=ok, reason=reason)
 
 
 def batched_features(b: int = 4) -> Features:
@@ -84,21 +51,15 @@ def batched_features(b: int = 4) -> Features:
 
 
 def same(a: Any, b: Any) -> bool:
-    """All fields are bit-equal."""
 
     def equal(x: Any, y: Any) -> bool:
         return torch.equal(x, y) if isinstance(x, torch.Tensor) and isinstance(y, torch.Tensor) else x == y
 
-    return type(a) is type(b) and all(
-        equal(getattr(a, f.name), getattr(b, f.name)) for f in dataclasses.fields(type(a))
-    )
+    return type(a) is type(b) and all(equal(getattr(a, f.name), getattr(b, f.name)) for f in dataclasses.fields(a))
 
 
 RECORDS: list[Callable[..., Any]] = [batched_features, matches, estimate]
 records = pytest.mark.parametrize("make", RECORDS, ids=["Features", "Correspondences", "Estimate"])
-
-
-# pair_key
 
 
 def test_pair_key_is_blake2b_and_stable() -> None:
@@ -106,9 +67,6 @@ def test_pair_key_is_blake2b_and_stable() -> None:
     assert pair_key("Strecha/fountain-P11/3-7") == int.from_bytes(digest, "big", signed=True) == 3483045311563998181
     torch.tensor([pair_key(str(i)) for i in range(100)])  # fits int64
     assert any(pair_key(str(i)) < 0 for i in range(100))
-
-
-# what holds for every record
 
 
 @records
@@ -199,9 +157,6 @@ def test_features_of_one_image_are_indexed_by_feature() -> None:
     assert collate([features(n=0)] * 2).lafs.shape == (2, 0, 2, 3)
 
 
-# Correspondences
-
-
 def test_correspondences_defaults() -> None:
     c = Correspondences(torch.zeros(2, 3, 2), torch.zeros(2, 3, 2), torch.ones(2, 3, dtype=torch.bool))
     assert (len(c), c.keys.tolist(), c.keys.dtype) == (2, [0, 0], torch.int64)
@@ -257,16 +212,10 @@ def test_compact_passes_gradients_to_survivors_only() -> None:
     assert torch.equal(x0.grad, c.mask[..., None].expand_as(x0).float())
 
 
-# Estimate
-
-
 def test_estimate_needs_a_reason_slot_for_each_pair() -> None:
     e = estimate()
     with pytest.raises(ValueError, match="reason has 1 entries"):
         e.replace(reason=("",))
-
-
-# collate
 
 
 def test_collate_stacks_and_pads_single_images() -> None:

@@ -18,7 +18,6 @@ def cameras() -> list[Camera]:
 
 
 def images() -> Path:
-    """The folder of the scene's images."""
     return shared_path(f"{SCENE}/Images")
 
 

@@ -10,7 +10,6 @@ SIZE = (24, 32)  # h, w of the images
 
 
 def write_image(path: Path, seed: int = 0, size: tuple[int, int] = SIZE) -> Path:
-    """An image of noise."""
     path.parent.mkdir(parents=True, exist_ok=True)
     pixels = np.random.default_rng(seed).integers(0, 256, size).astype(np.uint8)
     assert cv2.imwrite(str(path), pixels)
@@ -124,12 +123,8 @@ def write_bundler(folder: Path, cameras: int = 5) -> tuple[Path, list[dict[str, 
     points = rng.normal(size=(12, 3))
     lines, truth = ["# Bundle file v0.3", f"{cameras} {len(points)}"], []
     for i in range(cameras):
-        camera = {
-            "f": np.array(40.0 + i),
-            "k": np.array([0.02 * i, -0.01]),
-            "R": turned(0.2 * i),
-            "t": rng.normal(size=3),
-        }
+        camera = {"f": np.array(40.0 + i), "k": np.array([0.02 * i, -0.01]), "R": turned(0.2 * i)}
+        camera["t"] = rng.normal(size=3)
         camera["t"] = camera["t"] - [0, 0, 9.0]
         if i == 3:
             camera = {name: 0 * value for name, value in camera.items()}

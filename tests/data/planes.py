@@ -23,9 +23,8 @@ def view(seed: int, strength: float = 0.15) -> np.ndarray:
 def write_sequence(folder: Path, photograph: str, light: bool, count: int = 6, suffix: str = ".ppm") -> Path:
     """A sequence: image 1, and images 2 to 6 of other light or another viewpoint."""
     folder.mkdir(parents=True)
-    image = cv2.resize(
-        cv2.imread(str(shared_path(f"data/photos/{photograph}"))), SIZE[::-1], interpolation=cv2.INTER_AREA
-    )
+    picture = cv2.imread(str(shared_path(f"data/photos/{photograph}")))
+    image = cv2.resize(picture, SIZE[::-1], interpolation=cv2.INTER_AREA)
     cv2.imwrite(str(folder / f"1{suffix}"), image)
     for k in range(2, count + 1):
         H = np.eye(3) if light else view(k)
@@ -37,7 +36,6 @@ def write_sequence(folder: Path, photograph: str, light: bool, count: int = 6, s
 
 
 def write_hpatches(root: Path, photographs: Sequence[str] = ("0000.jpg", "0003.jpg")) -> Path:
-    """Two sequences, one of light and one of viewpoints."""
     write_sequence(root / "i_light", photographs[0], light=True)
     write_sequence(root / "v_view", photographs[1], light=False)
     return root

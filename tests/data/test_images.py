@@ -66,11 +66,8 @@ def jpeg(*options: int) -> bytes:
     return bytes(cv2.imencode(".jpg", smooth, options)[1])
 
 
-JPEGS = {
-    "baseline": jpeg(),
-    "progressive": jpeg(cv2.IMWRITE_JPEG_PROGRESSIVE, 1),
-    "restarts": jpeg(cv2.IMWRITE_JPEG_RST_INTERVAL, 2),
-}
+PROGRESSIVE, RESTARTS = (cv2.IMWRITE_JPEG_PROGRESSIVE, 1), (cv2.IMWRITE_JPEG_RST_INTERVAL, 2)
+JPEGS = {"baseline": jpeg(), "progressive": jpeg(*PROGRESSIVE), "restarts": jpeg(*RESTARTS)}
 
 
 @pytest.mark.parametrize("kind", JPEGS)
@@ -87,11 +84,8 @@ def test_truncated_jpeg_is_refused(tmp_path: Path, kind: str) -> None:
 @pytest.mark.parametrize("kind", JPEGS)
 def test_a_jpeg_that_libjpeg_warns_of_is_refused(tmp_path: Path, kind: str) -> None:
     path, data, half = tmp_path / "a.jpg", JPEGS[kind], len(JPEGS[kind]) // 2
-    damages = {
-        "cut, with an end": data[:half] + b"\xff\xd9",
-        "zeros": data[:half] + bytes(300) + data[half + 300 :],
-        "a piece missing": data[:half] + data[half + 300 :],
-    }
+    begin, end = data[:half], data[half + 300 :]
+    damages = {"cut, ended": begin + b"\xff\xd9", "zeros": begin + bytes(300) + end, "a piece missing": begin + end}
     if kind == "restarts":
         damages["order of restarts"] = data.replace(b"\xff\xd3", b"\xff\xd5")
     for name, damaged in damages.items():
@@ -135,9 +129,10 @@ def test_truncated_or_corrupt_png_is_refused(tmp_path: Path) -> None:
         read_image(path)
 
 
-@pytest.mark.parametrize(
-    ("content", "message"), [(b"", "empty"), (b"not an image", "no image"), (None, "cannot be read")]
-)
+NO_IMAGES = [(b"", "empty"), (b"not an image", "no image"), (None, "cannot be read")]
+
+
+@pytest.mark.parametrize(("content", "message"), NO_IMAGES)
 def test_what_is_no_image_is_named(tmp_path: Path, content: bytes | None, message: str) -> None:
     path = tmp_path / "x.jpg"
     if content is not None:
@@ -148,9 +143,8 @@ def test_what_is_no_image_is_named(tmp_path: Path, content: bytes | None, messag
         read_image(tmp_path)
 
 
-BLOCKS = np.repeat(
-    np.repeat(np.array([[[250, 20, 20], [20, 250, 20]], [[20, 20, 250], [250, 250, 250]]], np.uint8), 24, 0), 40, 1
-)
+CORNERS = np.array([[[250, 20, 20], [20, 250, 20]], [[20, 20, 250], [250, 250, 250]]], np.uint8)
+BLOCKS = CORNERS.repeat(24, 0).repeat(40, 1)
 
 
 @pytest.mark.parametrize("tag", range(1, 9))
@@ -231,7 +225,6 @@ PILLOWS_WARNINGS = pytest.mark.filterwarnings("ignore::UserWarning:PIL")
 
 
 def with_exif(folder: Path, size: tuple[int, int], name: str = "a.jpg", **tags: object) -> Path:
-    """A file of this size (h, w) with these tags."""
     exif = Image.Exif()
     exif[Tag.Orientation] = 6
     exif.get_ifd(ExifTags.IFD.Exif).update({Tag[key]: value for key, value in tags.items()})
@@ -271,9 +264,8 @@ def test_the_sensor_gives_the_focal_length_where_there_is_no_equivalent(unit, mm
 def test_reduced_and_turned_images(tmp_path: Path) -> None:
     plane = {**PLANE, "ExifImageWidth": 3000, "ExifImageHeight": 2000}
     assert exif_focal(with_exif(tmp_path, (400, 600), **plane)).focal == pytest.approx(700)
-    assert exif_focal(with_exif(tmp_path, (600, 400), **plane)).focal == pytest.approx(
-        700
-    )  # turned when it was reduced
+    turned = with_exif(tmp_path, (600, 400), **plane)  # when it was reduced
+    assert exif_focal(turned).focal == pytest.approx(700)
     path = with_exif(tmp_path, (2000, 3000), **plane, FocalLengthIn35mmFilm=30)
     full_size = exif_focal(path)
     assert exif_focal(path, (3000, 2000)) == full_size

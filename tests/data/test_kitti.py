@@ -1,7 +1,6 @@
 """KITTI and TUM."""
 
 import re
-from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -58,66 +57,6 @@ def test_a_draw_is_of_the_seed_and_part_of_the_digest(tmp_path: Path) -> None:
     assert (len(set(names[0])), {p.scene for p in first}) == (30, {"06", "07"})
 
 
-def rewrite(name: str, change: Callable[[list[str]], list[str]]) -> Callable[[Path], None]:
-    return lambda root: edit_lines(root / name, change)
-
-
-def words(line: int, change: Callable[[list[str]], list[str]]) -> Callable[[list[str]], list[str]]:
-    return lambda lines: [" ".join(change(text.split())) if i == line else text for i, text in enumerate(lines)]
-
-
-POSES, TIMES, CALIB = "poses/06.txt", "sequences/06/times.txt", "sequences/06/calib.txt"
-DAMAGE = {
-    "no poses": (lambda root: (root / "poses/06.txt").unlink(), r"poses/06\.txt: no such file; the layout is"),
-    "truncated poses": (
-        rewrite(POSES, lambda lines: lines[:9]),
-        r"poses/06\.txt ends at line 9 and .*times\.txt at line 14; each must have one line a frame",
-    ),
-    "both truncated": (
-        lambda root: [rewrite(f, lambda lines: lines[:9])(root) for f in (POSES, TIMES)],
-        r"poses/06\.txt ends at line 9 and .*image_0 has 14 images",
-    ),
-    "cut within a line": (
-        rewrite(POSES, words(13, lambda w: w[:5])),
-        r"poses/06\.txt, line 14: 5 columns; it must have 12",
-    ),
-    "no number": (rewrite(POSES, words(2, lambda w: ["x", *w[1:]])), r"poses/06\.txt, line 3: .*'x'"),
-    "nan": (rewrite(POSES, words(2, lambda w: ["nan", *w[1:]])), r"poses/06\.txt, line 3: .*not finite"),
-    "no rotation": (
-        rewrite(POSES, words(4, lambda w: ["2", *w[1:]])),
-        r"poses/06\.txt, line 5: the matrix is no rotation",
-    ),
-    "mirrored": (
-        rewrite(POSES, words(0, lambda w: [str(-float(v)) for v in w])),
-        r"poses/06\.txt, line 1: the matrix is no rotation",
-    ),
-    "times out of order": (
-        rewrite(TIMES, lambda lines: [lines[1], lines[0], *lines[2:]]),
-        r"times\.txt, line 2: 0 s does not come after 0\.1 s; times must ascend",
-    ),
-    "no camera": (rewrite(CALIB, lambda lines: lines[1:]), r"calib\.txt: no line P0; it must hold P0: to P3:"),
-    "short projection": (rewrite(CALIB, words(0, lambda w: w[:7])), r"calib\.txt, line 1: 6 columns; it must have 12"),
-    "no images": (
-        lambda root: (root / "sequences/06/image_0").rename(root / "gone"),
-        r"image_0: no such folder; the layout is sequences/NN",
-    ),
-    "no text": (
-        lambda root: (root / "poses/06.txt").write_bytes(b"\xff\xfe"),
-        r"poses/06\.txt: cannot be read as text",
-    ),
-}
-
-
-@pytest.mark.parametrize("damage", DAMAGE)
-def test_damaged_files_are_named_with_their_lines(damage: str, tmp_path: Path) -> None:
-    root = write_kitti(tmp_path)
-    change, message = DAMAGE[damage]
-    change(root)
-    with pytest.raises(DataError, match=message) as raised:
-        load("kitti", root=root, sequences=["06"])
-    assert "\n" not in str(raised.value)
-
-
 def test_a_missing_image_is_a_problem_of_its_pairs_alone(tmp_path: Path) -> None:
     root = write_kitti(tmp_path)
     (root / "sequences/06/image_0/000003.png").unlink()
@@ -128,7 +67,7 @@ def test_a_missing_image_is_a_problem_of_its_pairs_alone(tmp_path: Path) -> None
 
 def test_a_car_that_stands_still_has_no_f(tmp_path: Path) -> None:
     root = write_kitti(tmp_path)
-    rewrite(POSES, lambda lines: [lines[0], lines[0], *lines[2:]])(root)
+    edit_lines(root / "poses/06.txt", lambda lines: [lines[0], lines[0], *lines[2:]])
     pairs = {p.identity.rpartition("/")[2]: p for p in load("kitti", root=root, sequences=["06"], pairs=None)}
     assert "line 2: both cameras are at one place, hence there is no F" in (pairs["0-1"].problem or "")
     assert not pairs["0-1"].F.any()
@@ -141,9 +80,7 @@ def test_missing_sequences_and_roots_are_told(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="sequences: no such folder; it must hold a folder for each sequence"):
         load("kitti", root=tmp_path)
     root = write_kitti(tmp_path)
-    with pytest.raises(
-        DataError, match=r"no sequence '07'; there are: 06\. dataset\.sequences=\[\.\.\.\] takes others"
-    ):
+    with pytest.raises(DataError, match=r"no sequence '07'; there are: 06\. dataset\.sequences=\[\.\.\.\] takes"):
         load("kitti", root=root)
     with pytest.raises(DataError, match="split 'validation'; there are test and train"):
         load("kitti", split="validation", root=root)
@@ -207,9 +144,8 @@ def test_poses_are_interpolated_to_the_time_of_the_frame(tmp_path: Path) -> None
 def test_the_camera_is_told_by_the_name(tmp_path: Path) -> None:
     for name in ("rgbd_dataset_freiburg2_x", "rgbd_dataset_freiburg3_y", "mine"):
         write_tum(tmp_path, name, frames=2)
-    two, three = (
-        load("tum", root=tmp_path, sequences=[f"rgbd_dataset_{n}"])[0] for n in ("freiburg2_x", "freiburg3_y")
-    )
+    names = ("rgbd_dataset_freiburg2_x", "rgbd_dataset_freiburg3_y")
+    two, three = (load("tum", root=tmp_path, sequences=[name])[0] for name in names)
     assert (two.image0.lens.fx, two.image0.lens.cx) == (520.9, 325.1)
     assert three.image0.lens is None  # published undistorted
     assert three.K0[0, 0] == 535.4
@@ -226,9 +162,7 @@ def test_train_is_all_that_is_there_but_the_test_sequences(tmp_path: Path) -> No
     (tmp_path / "rgbd_dataset_freiburg1_validation/rgb").mkdir(parents=True)
     scenes = [scene.name for scene in load("tum", root=tmp_path, split="train").scenes]
     assert scenes == ["rgbd_dataset_freiburg1_desk", "rgbd_dataset_freiburg2_desk"]
-    with pytest.raises(
-        DataError, match="no sequence 'rgbd_dataset_freiburg3_large_cabinet'; there are: rgbd_dataset_fr"
-    ):
+    with pytest.raises(DataError, match="no sequence 'rgbd_dataset_freiburg3_large_cabinet'; there are: rgbd"):
         load("tum", root=tmp_path)
 
 
@@ -270,61 +204,6 @@ def test_without_depth_nothing_is_said_of_it(tmp_path: Path) -> None:
     write_tum(tmp_path, "rgbd_dataset_freiburg1_other")
     assert not isinstance(load("tum", root=tmp_path, sequences=[NAME], depth=False), DepthDataset)
     assert not isinstance(load("tum", root=tmp_path, split="train"), DepthDataset)
-
-
-def rewrite_tum(name: str, line: int, change: Callable[[str], str]) -> Callable[[Path], None]:
-    return lambda folder: edit_lines(
-        folder / name, lambda lines: [*lines[: line - 1], change(lines[line - 1]), *lines[line:]]
-    )
-
-
-TRUTH = "groundtruth.txt"
-TUM_DAMAGE = {
-    "no list": (lambda f: (f / "rgb.txt").unlink(), r"rgb\.txt: no such file; a sequence holds rgb\.txt"),
-    "no poses": (lambda f: (f / "groundtruth.txt").unlink(), r"groundtruth\.txt: no such file; a sequence holds"),
-    "empty list": (lambda f: (f / "rgb.txt").write_text("# nothing\n"), r"rgb\.txt: no line with timestamp filename"),
-    "one column": (rewrite_tum("rgb.txt", 3, lambda s: s.split()[0]), r"rgb\.txt, line 3: 1 columns; it must hold"),
-    "no number": (rewrite_tum("rgb.txt", 3, lambda s: "x" + s), r"rgb\.txt, line 3: .*could not convert"),
-    "order": (
-        rewrite_tum("rgb.txt", 5, lambda s: "1305031236.1" + s[17:]),
-        r"rgb\.txt, line 5: 1305031236\.1 comes after 1305031236\.203000; time stamps must ascend",
-    ),
-    "poses out of order": (
-        rewrite_tum(TRUTH, 50, lambda s: "1305031236.1" + s[15:]),
-        r"groundtruth\.txt, line 50: 1305031236\.1\d* comes after 1305031236\.47",
-    ),
-    "cut": (
-        rewrite_tum(TRUTH, 123, lambda s: s[:30]),
-        r"groundtruth\.txt, line 123: 5 columns; it must have 8: timestamp tx ty tz qx qy qz qw",
-    ),
-    "nan": (rewrite_tum(TRUTH, 9, lambda s: s.replace(" 0.5 ", " nan ")), r"line 9: a number that is not"),
-    "zero quaternion": (
-        rewrite_tum(TRUTH, 9, lambda s: " ".join([*s.split()[:4], "0 0 0 0"])),
-        r"groundtruth\.txt, line 9: the quaternion is zero",
-    ),
-    "one pose": (
-        lambda f: (f / "groundtruth.txt").write_text("1305031236 0 0 0 0 0 0 1\n"),
-        r"groundtruth\.txt: 1 poses; it must hold lines of",
-    ),
-    "another's": (
-        lambda f: (f / "groundtruth.txt").write_text("5 0 0 0 0 0 0 1\n5.01 0 0 0 0 0 0 1\n"),
-        r"groundtruth\.txt: no pose at the times of rgb\.txt; is it another sequence's\?",
-    ),
-    "depth out of order": (
-        rewrite_tum("depth.txt", 5, lambda s: "1305031236.1" + s[17:]),
-        r"depth\.txt, line 5: .* time stamps must ascend",
-    ),
-}
-
-
-@pytest.mark.parametrize("damage", TUM_DAMAGE)
-def test_damaged_tum_files_are_named_with_their_lines(damage: str, tmp_path: Path) -> None:
-    folder = write_tum(tmp_path, depth="depth" in damage)
-    change, message = TUM_DAMAGE[damage]
-    change(folder)
-    with pytest.raises(DataError, match=message) as raised:
-        load("tum", root=tmp_path, sequences=[NAME])
-    assert "\n" not in str(raised.value)
 
 
 def test_a_repeated_pose_counts_once(tmp_path: Path) -> None:

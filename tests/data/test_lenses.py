@@ -28,6 +28,10 @@ def grid(n: int = 50) -> np.ndarray:
     return np.random.default_rng(1).uniform([0, 0], [SIZE[1], SIZE[0]], (n, 2))
 
 
+def rays(used: Lens, points: np.ndarray) -> np.ndarray:
+    return np.column_stack([(points - [used.cx, used.cy]) / [used.fx, used.fy], np.ones(len(points))])
+
+
 @pytest.mark.parametrize("model", MODELS)
 def test_each_model_is_colmaps(model: str) -> None:
     pycolmap = pytest.importorskip("pycolmap")
@@ -38,16 +42,14 @@ def test_each_model_is_colmaps(model: str) -> None:
     assert [name.strip() for name in camera.params_info.split(",")] == MODELS[model].parameters
     focals = [used.fx, used.fy][: MODELS[model].focals]
     camera.params = [*focals, used.cx, used.cy, *used.coefficients]
-    rays = np.column_stack([(points - [used.cx, used.cy]) / [used.fx, used.fy], np.ones(len(points))])
-    np.testing.assert_allclose(used.distort(points), camera.img_from_cam(rays), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(used.distort(points), camera.img_from_cam(rays(used, points)), rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("model", ["OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE"])
 def test_opencvs_models_are_opencvs(model: str) -> None:
-    used, points = lens(model), grid()
-    rays = np.column_stack([(points - [used.cx, used.cy]) / [used.fx, used.fy], np.ones(len(points))])[:, None]
+    used, points, zero = lens(model), grid(), np.zeros(3)
     project = cv2.fisheye.projectPoints if model == "OPENCV_FISHEYE" else cv2.projectPoints
-    there, _ = project(rays, np.zeros(3), np.zeros(3), used.K, np.array(used.coefficients))
+    there, _ = project(rays(used, points)[:, None], zero, zero, used.K, np.array(used.coefficients))
     np.testing.assert_allclose(used.distort(points), there[:, 0], rtol=0, atol=1e-9)
 
 
@@ -107,9 +109,8 @@ def lens_of(model: str) -> Lens:
 
 
 def grid_of_points(step: int = 16) -> np.ndarray:
-    return np.stack(
-        np.meshgrid(np.arange(0.0, POINTS_SIZE[1], step), np.arange(0.0, POINTS_SIZE[0], step)), -1
-    ).reshape(-1, 2)
+    sides = (np.arange(0.0, side, step) for side in POINTS_SIZE[::-1])
+    return np.stack(np.meshgrid(*sides), -1).reshape(-1, 2)
 
 
 @pytest.mark.parametrize("model", sorted(COEFFICIENTS))

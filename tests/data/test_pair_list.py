@@ -62,11 +62,8 @@ def test_f_relates_the_images_as_they_are_read(turns: tuple[int, int], tmp_path:
         pixels = read_image(image)
         assert (max(pixels.shape[:2]), image.size) == (400, shape)
         assert (pixels.shape[0] > pixels.shape[1]) == ((shape[0] > shape[1]) ^ (turn % 2 == 1))
-    A0, A1 = (
-        image.resampling.matrix(shape)
-        for image, shape in zip((pair.image0, pair.image1), shapes, strict=True)
-        if image.resampling is not None
-    )
+    ends = zip((pair.image0, pair.image1), shapes, strict=True)
+    A0, A1 = (image.resampling.matrix(shape) for image, shape in ends)
     (plain,) = load("pair_list", root=lists.images(), file=lists.write(tmp_path / "plain.txt", [lists.superglue(0, 1)]))
     assert apart(pair.F, unit(np.linalg.inv(A1).T @ plain.F @ np.linalg.inv(A0))) < 1e-9
 
@@ -236,11 +233,8 @@ def test_objects_are_those_that_numpy_loads(tmp_path: Path, protocol: int) -> No
 
 def test_plain_arrays_are_those_that_numpy_loads(tmp_path: Path) -> None:
     path = tmp_path / "a.npz"
-    arrays = {
-        "a": np.arange(12).reshape(3, 4),
-        "b": np.asfortranarray(np.random.default_rng(0).random((3, 2))),
-        "c": np.array(["x", "yz"]),
-    }
+    columns = np.asfortranarray(np.random.default_rng(0).random((3, 2)))
+    arrays = {"a": np.arange(12).reshape(3, 4), "b": columns, "c": np.array(["x", "yz"])}
     np.savez_compressed(path, **arrays)  # type: ignore[arg-type]
     read = NpzArrays(path)
     assert set(read.names) == set(arrays)
@@ -262,9 +256,8 @@ class _Command:
 def test_a_pickle_that_runs_code_is_refused(tmp_path: Path) -> None:
     ran, path = tmp_path / "ran", tmp_path / "a.npz"
     np.savez(path, x=np.array([_Command(ran), None], object))
-    with pytest.raises(
-        DataError, match=r"a\.npz: 'x' holds objects that are not read here \(.*mkdir\).*allow_pickle"
-    ) as error:
+    said = r"a\.npz: 'x' holds objects that are not read here \(.*mkdir\).*allow_pickle"
+    with pytest.raises(DataError, match=said) as error:
         NpzArrays(path)["x"]
     assert not ran.exists()
     assert "\n" not in str(error.value)

@@ -29,11 +29,8 @@ from tests.processes import run_command
 from tests.verification import databases, test_matches
 
 SOURCE = Path(__file__).resolve().parents[2]
-PAGES = [
-    "README.md",
-    "CONTRIBUTING.md",
-    *(path.relative_to(SOURCE).as_posix() for path in sorted((SOURCE / "docs").rglob("*.md"))),
-]
+GUIDES = [path.relative_to(SOURCE).as_posix() for path in sorted((SOURCE / "docs").rglob("*.md"))]
+PAGES = ["README.md", "CONTRIBUTING.md", *GUIDES]
 SETS = ("Strecha", "PhotoTourism", "KITTI", "TUM", "Strecha_train", "TanksLike")
 
 ELSEWHERE = {
@@ -151,7 +148,6 @@ def smaller(command: str) -> list[str]:
 
 
 def _installed(estimator: str) -> bool:
-    """False of the name of an estimator whose library is absent (extra `peers`)."""
     library = PEERS.get(re.split("[:@]", estimator)[0])
     return library is None or importlib.util.find_spec(library) is not None
 
@@ -199,9 +195,8 @@ def workplace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     test_matches.write(folder, databases.scene(3))
     np.savez(folder / "matches.npz", **dict(zip(("x0", "x1"), test_matches.points()[0], strict=True)))
     (folder / "my_conf" / "estimator").mkdir(parents=True)
-    yaml = re.findall(
-        r"```yaml\n# my_conf/estimator/mine.yaml\n(.*?)```", (SOURCE / "README.md").read_text(), re.DOTALL
-    )
+    page = (SOURCE / "README.md").read_text()
+    yaml = re.findall(r"```yaml\n# my_conf/estimator/mine.yaml\n(.*?)```", page, re.DOTALL)
     (folder / "my_conf" / "estimator" / "mine.yaml").write_text(yaml[0] + "hypotheses: 100\n")
     (folder / "my_package.py").write_text(
         "from fmtorch import presets\n\n\n"
@@ -256,7 +251,6 @@ def elsewhere(command: str) -> bool:
 
 
 def parameters(slow: bool) -> list[object]:
-    """Parameters: each page with its commands, in their order."""
     here = {page: [c for c in commands(page) if not elsewhere(c) and is_slow(c) == slow] for page in PAGES}
     return [pytest.param(page_commands, id=page) for page, page_commands in here.items() if page_commands]
 

@@ -56,10 +56,10 @@ def test_every_part_is_evaluated(folder: Path) -> None:
         assert target in identity
 
 
-@pytest.mark.parametrize(
-    ("group", "protocol"),
-    [("features", FeatureExtractor), ("matcher", Matcher), ("pruner", Pruner), ("estimator", Estimator)],
-)
+PROTOCOLS = {"features": FeatureExtractor, "matcher": Matcher, "pruner": Pruner, "estimator": Estimator}
+
+
+@pytest.mark.parametrize(("group", "protocol"), PROTOCOLS.items())
 def test_each_is_built_by_name_in_python(group, protocol, folder, monkeypatch):
     from fmtorch import presets
 
@@ -91,7 +91,6 @@ def code(name: str) -> list[str]:
 
 @pytest.fixture
 def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Runs a notebook as one program; returns its variables."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("FMTORCH_CACHE", str(own_cache(tmp_path)))
     monkeypatch.setattr("fmtorch.scenes.dataset.PLANS", dict.fromkeys((("small", "test"), ("small", "train")), SMALL))

@@ -96,9 +96,8 @@ FOREIGN = {"CompileResult", "DMatch", "Dataset", "KeyPoint", "Path", "Progress",
 """Classes of other libraries."""
 SETS = {"Fgt", "Strecha_train", "TanksLike"}
 DOTTED = re.compile(r"([A-Za-z_]\w*(?:\.[A-Za-z_]\w*)+)(?:\(.*)?")
-FILE = re.compile(
-    r"[\w.]+\.(bin|csv|db|h5|html|json|md|npz|onnx|out|partial|parts|png|py|sh|shards|svg|txt|verification)"
-)
+SUFFIXES = "bin|csv|db|h5|html|json|md|npz|onnx|out|partial|parts|png|py|sh|shards|svg|txt|verification"
+FILE = re.compile(rf"[\w.]+\.({SUFFIXES})")
 
 
 def docstrings(path: Path) -> Iterator[str]:

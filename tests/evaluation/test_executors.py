@@ -44,8 +44,6 @@ def build() -> Pipeline:
 
 
 class Slow:
-    """An estimator that waits."""
-
     model = "fundamental"
 
     def __init__(self, estimator: Any) -> None:
@@ -181,9 +179,7 @@ def test_a_scheduler_that_is_lost(cluster: Cluster, pairs: list[ImagePair], expe
     cluster.add_workers(1)
     rows: list[PairRow] = []
     execution = Execution("dask", address=cluster.address)
-    counts = evaluate_pairs(
-        build(), pairs, seed=0, batch=2, execution=execution, store=rows.extend, build=build_slow
-    )  # fmt: skip
+    counts = evaluate_pairs(build(), pairs, seed=0, batch=2, execution=execution, store=rows.extend, build=build_slow)
     next(counts)
     cluster.scheduler.kill()
     with pytest.raises(WorkersLost, match=rf"the scheduler at {cluster.address} was lost; .* the same command goes on"):
@@ -216,12 +212,9 @@ def test_a_process_that_ends_is_told() -> None:
     images = [ImageSource(f"scene/{i}", Path(f"{i}.png")) for i in range(3)]
     pairs = [ImagePair(f"scene/0-{i}", "family", "scene", images[0], images[i], np.eye(3)) for i in (1, 2)]
     rows: list[PairRow] = []
-    run = evaluate_pairs(
-        load_pipeline("sift_ratio"), pairs, seed=0, batch=1, execution=Execution("processes", 2),
-        store=rows.extend, build=_ends,
-    )  # fmt: skip
+    options = {"execution": Execution("processes", 2), "store": rows.extend, "build": _ends}
     with pytest.raises(WorkersLost, match="the same command goes on"):
-        list(run)
+        list(evaluate_pairs(load_pipeline("sift_ratio"), pairs, seed=0, batch=1, **options))
     assert rows == []
 
 
@@ -285,16 +278,7 @@ def test_features_are_computed_while_the_first_pair_is_worked_on(tmp_path: Path)
     pairs = [ImagePair(f"scene/0-{i}", "family", "scene", images[0], images[i], np.eye(3)) for i in range(1, 7)]
     pairs.insert(2, ImagePair("scene/0-bad", "family", "scene", images[0], bad, np.eye(3)))
     expected: list[PairRow] = []
-    list(
-        evaluate_pairs(
-            load_pipeline("sift_ratio"),
-            pairs,
-            seed=0,
-            batch=2,
-            execution=Execution("threads", 1),
-            store=expected.extend,
-        )
-    )
+    list(evaluate_pairs(load_pipeline("sift_ratio"), pairs, seed=0, batch=2, execution=ONE, store=expected.extend))
     pipeline, rows = load_pipeline("sift_ratio"), list[PairRow]()
     watched = Watched(pipeline, len(images))
     counts = list(evaluate_pairs(pipeline, pairs, seed=0, batch=2, execution=TWO, store=rows.extend))
@@ -320,8 +304,6 @@ class Learned:
 
 
 class Secretive:
-    """A stage that reads a file and says nothing of it."""
-
     def __init__(self, weights: str) -> None:
         self.values = Path(weights).read_bytes()
 

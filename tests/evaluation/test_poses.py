@@ -66,9 +66,8 @@ def test_rows_have_the_pose_errors_of_the_reference() -> None:
 def test_why_a_pair_has_no_pose_error() -> None:
     sound = outcome(0)
     failed = dataclasses.replace(outcome(1), estimate=None, correspondences=None, reason="no keypoints in image 0")
-    nothing = dataclasses.replace(
-        outcome(2), estimate=sound.estimate.replace(inliers=torch.zeros(1, N, dtype=torch.bool))
-    )
+    no_inliers = sound.estimate.replace(inliers=torch.zeros(1, N, dtype=torch.bool))
+    nothing = dataclasses.replace(outcome(2), estimate=no_inliers)
     uncalibrated = without(outcome(3), K0=None, K1=None)
     unposed = without(outcome(4), R=None, t=None)
     broken = without(outcome(5), t=np.full(3, np.nan))
@@ -104,7 +103,6 @@ def test_signed_errors_are_of_the_best_of_four_poses_and_keep_the_sign_of_an_est
 
 
 def run(folder: Path, name: str, *words: str) -> None:
-    """An evaluation of the set in a folder."""
     fixed = ("dataset=hpatches", "dataset.root=hpatches", "dataset.short_side=200", "cache=off", f"output={name}")
     with pytest.MonkeyPatch.context() as patch:
         call_command(patch, folder, "eval", "pipeline=sift_ratio", "estimator=homography", *fixed, *words)
@@ -353,15 +351,12 @@ def test_a_pair_that_cannot_be_examined_harms_no_other() -> None:
     assert second.pair_type == "planar"
 
 
-def estimated_type(
-    c: Correspondences, focals: list[float], true: tuple[np.ndarray | None, np.ndarray | None]
-) -> Outcome:
+def estimated_type(c: Correspondences, focals: list[float], true: tuple[np.ndarray | None, ...]) -> Outcome:
     source = pair("general")
     outcome = pipeline().run([source])[0]
     estimate = outcome.estimate.replace(focals=torch.tensor([focals], dtype=torch.float64))
-    return dataclasses.replace(
-        outcome, pair=dataclasses.replace(source, K0=true[0], K1=true[1]), correspondences=c, estimate=estimate
-    )
+    known = dataclasses.replace(source, K0=true[0], K1=true[1])
+    return dataclasses.replace(outcome, pair=known, correspondences=c, estimate=estimate)
 
 
 def test_errors_of_focal_lengths() -> None:

@@ -25,5 +25,4 @@ def random_frames(seed: int, count: int, h: int, w: int, smallest: float = 4, la
 
 
 def same(a: Features, b: Features) -> bool:
-    """Bit-equal."""
     return all(torch.equal(getattr(a, name), getattr(b, name)) for name in ("lafs", "scores", "descriptors"))

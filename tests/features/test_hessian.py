@@ -74,9 +74,8 @@ def angle_between(a: Tensor, b: Tensor) -> Tensor:
 def test_frame_algebra_is_kornias() -> None:
     lafs = random_frames(0, 50, 100, 100)
     torch.testing.assert_close(features.frame_scale(lafs), kornia.feature.get_laf_scale(lafs[None])[0, :, 0, 0])
-    torch.testing.assert_close(
-        features.make_upright(lafs), kornia.feature.make_upright(lafs[None])[0], rtol=1e-4, atol=1e-4
-    )
+    upright = kornia.feature.make_upright(lafs[None])[0]
+    torch.testing.assert_close(features.make_upright(lafs), upright, rtol=1e-4, atol=1e-4)
     angle = torch.linspace(-3, 3, 50)
     turned = kornia.feature.rotate_laf(lafs[None], torch.rad2deg(angle)[None, :, None])[0]
     torch.testing.assert_close(features.rotate_frames(lafs, angle), turned, rtol=1e-4, atol=1e-4)
@@ -173,9 +172,8 @@ def test_authors_networks_give_the_stored_frames() -> None:
         stored = torch.from_numpy(file["laf_affnet"][chosen]).float()
         turned = torch.from_numpy(file["laf_oriented"][chosen]).float()
         # Through kornia's patches, the stored frames. Entries of up to 100 px in float32 through a network.
-        torch.testing.assert_close(
-            features.NetworkShape(shape)(KorniaPyramid(image), lafs), stored, atol=5e-3, rtol=1e-3
-        )
+        shaped = features.NetworkShape(shape)(KorniaPyramid(image), lafs)
+        torch.testing.assert_close(shaped, stored, atol=5e-3, rtol=1e-3)
         oriented = features.NetworkOrientation(orientation)(KorniaPyramid(image), stored)
         torch.testing.assert_close(oriented, turned, atol=5e-3, rtol=1e-3)
         # Through ours, which are blurred otherwise, nearly so.
@@ -217,20 +215,16 @@ def test_the_scale_of_a_determinant_is_a_product_afterwards() -> None:
 
 
 def plain_histogram(patches: Tensor) -> Tensor:
-    n, size = patches.shape[0], patches.shape[-1]
     padded = F.pad(patches, (1, 1, 1, 1), mode="replicate")[:, 0]
     rows = padded[:, :-2] + 2 * padded[:, 1:-1] + padded[:, 2:]
     columns = padded[:, :, :-2] + 2 * padded[:, :, 1:-1] + padded[:, :, 2:]
     gy, gx = (columns[:, 2:] - columns[:, :-2]) / 8, (rows[:, :, 2:] - rows[:, :, :-2]) / 8
-    magnitude = (gx * gx + gy * gy).sqrt() * frames._window(size, patches.device)
+    magnitude = (gx * gx + gy * gy).sqrt() * frames._window(patches.shape[-1], patches.device)
     position = (torch.atan2(gy, gx) + math.pi) * (frames.BINS / (2 * math.pi))
-    lower = position.floor()
-    upper_weight = (position - lower) * magnitude
-    place = lower.long() + (frames.BINS + 2) * torch.arange(n)[:, None, None]
-    votes = patches.new_zeros(n * (frames.BINS + 2))
-    votes.scatter_add_(0, place.flatten(), (magnitude - upper_weight).flatten())
-    votes.scatter_add_(0, place.flatten() + 1, upper_weight.flatten())
-    histogram = votes.reshape(n, frames.BINS + 2)
+    upper_weight = (position - position.floor()) * magnitude
+    lower, histogram = position.long().flatten(1), patches.new_zeros(len(patches), frames.BINS + 2)
+    histogram.scatter_add_(1, lower, (magnitude - upper_weight).flatten(1))
+    histogram.scatter_add_(1, lower + 1, upper_weight.flatten(1))
     histogram[:, :2] += histogram[:, frames.BINS :]
     return histogram[:, : frames.BINS]
 

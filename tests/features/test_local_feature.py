@@ -111,13 +111,9 @@ def test_hesaffnet_runs_through_onnx(tmp_path: Path) -> None:
             random_network(i, outputs), (torch.zeros(4, 1, 32, 32),), files[name], input_names=["patches"],
             output_names=["values"], dynamo=False, dynamic_axes={"patches": {0: "n"}, "values": {0: "n"}},
         )  # fmt: skip
-    extract = features.local_feature(
-        "hessian",
-        {"name": "hardnet", "network": files["hardnet"]},
-        shape={"name": "affnet", "network": files["affnet"]},
-        orientation={"name": "orinet", "network": files["orinet"]},
-        max_features=50,
-    )
+    parts = {name: {"name": name, "network": file} for name, file in files.items()}
+    shape, descriptor, orientation = (parts[name] for name in ("affnet", "hardnet", "orinet"))
+    extract = features.local_feature("hessian", descriptor, shape=shape, orientation=orientation, max_features=50)
     found = extract(texture(5))
     assert found.descriptors.shape == (50, 128)
     assert torch.isfinite(found.lafs).all()
@@ -257,9 +253,8 @@ def test_descriptors_without_meaning_are_left_out() -> None:
 
 
 def test_sift_of_any_scale_is_one_descriptor() -> None:
-    torch.testing.assert_close(
-        vlad.local_descriptors(sift(0, 9), "sift"), vlad.local_descriptors(sift(0, 9) / 512, "sift")
-    )
+    plain, scaled = (vlad.local_descriptors(values, "sift") for values in (sift(0, 9), sift(0, 9) / 512))
+    torch.testing.assert_close(plain, scaled)
 
 
 @pytest.mark.parametrize(
@@ -294,9 +289,8 @@ def test_the_shipped_codebooks_are_those_of_the_card(name: str, kind: str) -> No
 
 
 def test_files_that_are_no_codebook_are_told(tmp_path: Path) -> None:
-    with pytest.raises(
-        FileNotFoundError, match=r"no such file; make it with `python scripts/make_models\.py codebooks`"
-    ):
+    said = r"no such file; make it with `python scripts/make_models\.py codebooks`"
+    with pytest.raises(FileNotFoundError, match=said):
         vlad.load_codebook(tmp_path / "none.npz")
     (tmp_path / "text.npz").write_text("text")
     with pytest.raises(ValueError, match=r"text\.npz: no file with mean, basis, centers"):

@@ -1,4 +1,7 @@
-"""SIFT, ASIFT, patches and SIFT of patches."""
+"""SIFT of OpenCV and of VLFeat, ASIFT, patches and SIFT of patches."""
+
+from importlib.util import find_spec
+from pathlib import Path
 
 import cv2
 import kornia
@@ -6,16 +9,14 @@ import numpy as np
 import pytest
 import torch
 
-from fmtorch import features
-from fmtorch.features import (
-    SIFT,
-    ImagePyramid,
-    PatchSIFT,
-    project,
-)
+from fmtorch import features, presets
+from fmtorch.features import SIFT, ImagePyramid, PatchSIFT, VLFeatSIFT, project
 from tests.conftest import oracle
 from tests.features.scenes import random_frames, same, texture
 from tests.reference.local_features import patch, sift
+
+needs_vlfeat = pytest.mark.skipif(find_spec("pycolmap") is None, reason="extra colmap is not installed")
+VLFEAT = VLFeatSIFT(peak_threshold=0.01)
 
 
 @pytest.mark.parametrize("number", ["000", "001"])
@@ -41,16 +42,19 @@ def test_equals_stored_keypoints(number: str, case: str) -> None:
     assert np.abs(difference).max() < 1e-3
 
 
-def test_frames_turn_with_the_image() -> None:
+TURNS = [(SIFT(), (160, 200), 0.1, 0.9), pytest.param(VLFEAT, (120, 160), 0.05, 0.95, marks=needs_vlfeat)]
+
+
+@pytest.mark.parametrize(("extract", "size", "gap", "share"), TURNS)
+def test_frames_turn_with_the_image(extract, size, gap, share):
     # Turning an image by 90 degrees maps (x, y) to (y, w - 1 - x); frames must follow. OpenCV rounds the upright
     # direction into 36 bins, which 90 degrees respects; the blurred pyramid is symmetric up to float rounding.
-    image = texture(3)
-    upright, turned = features.SIFT()(image), features.SIFT()(np.rot90(image))
-    matrix, shift = torch.tensor([[0.0, 1.0], [-1.0, 0.0]]), torch.tensor([0.0, image.shape[1] - 1.0])
-    expected = matrix @ upright.lafs
-    expected[..., 2] += shift
-    gaps = (expected[:, None] - turned.lafs[None]).abs().amax((2, 3)).amin(1)
-    assert (gaps < 0.1).float().mean() > 0.9
+    image = texture(3, *size)
+    expected, turned = torch.tensor([[0.0, 1.0], [-1.0, 0.0]]) @ extract(image).lafs, extract(np.rot90(image)).lafs
+    expected[..., 2] += torch.tensor([0.0, image.shape[1] - 1.0])
+    gaps = (expected[:, None] - turned[None]).abs().amax((2, 3)).amin(1)
+    assert len(expected) > 50
+    assert (gaps < gap).float().mean() > share
 
 
 def test_root_sift_compares_by_hellinger() -> None:
@@ -110,7 +114,6 @@ def test_frames_carry_the_view() -> None:
 
 
 def error(found: torch.Tensor, expected: np.ndarray) -> float:
-    """Root mean square difference in grey levels."""
     return float(255 * np.sqrt(np.mean((found.numpy() - expected) ** 2)))
 
 
@@ -125,7 +128,6 @@ def test_sees_what_a_camera_would(side: float) -> None:
     tensor = torch.from_numpy(image)[None, None].float() / 255
     plain = error(kornia.feature.extract_patches_simple(tensor, lafs[None])[0, :, 0], expected)
     peer = error(kornia.feature.extract_patches_from_pyramid(tensor, lafs[None])[0, :, 0], expected)
-    print(f"side {side}: ours {ours:.2f}, kornia's pyramid {peer:.2f}, no pyramid {plain:.2f} grey levels")
     assert ours < 1.05 * peer
     if side > 40:
         assert ours < 0.3 * plain
@@ -207,19 +209,16 @@ def test_projection_keeps_the_variance() -> None:
     torch.testing.assert_close(projected[0].square() / projected[0, 0] ** 2, plain[0].abs() / plain[0, 0].abs())
 
 
-def test_a_projection_that_is_absent_or_broken(tmp_path: object) -> None:
-    from pathlib import Path
-
-    folder = Path(str(tmp_path))
+def test_a_projection_that_is_absent_or_broken(tmp_path: Path) -> None:
     pyramid, lafs = features.ImagePyramid(texture(5)), random_frames(5, 2, 160, 200)
     with pytest.raises(FileNotFoundError, match=r"absent\.npz.*make_models"):
-        features.RootSIFTPCA(model=folder / "absent.npz")(pyramid, lafs)
-    (folder / "text.npz").write_text("no projection")
-    np.savez(folder / "shape.npz", mean=np.zeros(5), basis=np.zeros((128, 80)))
-    np.savez(folder / "names.npz", average=np.zeros(128))
+        features.RootSIFTPCA(model=tmp_path / "absent.npz")(pyramid, lafs)
+    (tmp_path / "text.npz").write_text("no projection")
+    np.savez(tmp_path / "shape.npz", mean=np.zeros(5), basis=np.zeros((128, 80)))
+    np.savez(tmp_path / "names.npz", average=np.zeros(128))
     for name in ("text", "shape", "names"):
         with pytest.raises(ValueError, match=rf"{name}\.npz.*make_models"):
-            features.RootSIFTPCA(model=folder / f"{name}.npz")(pyramid, lafs)
+            features.RootSIFTPCA(model=tmp_path / f"{name}.npz")(pyramid, lafs)
 
 
 def test_pixel_x_of_a_level_is_pixel_2x_of_the_finer_one() -> None:
@@ -241,3 +240,40 @@ def test_resembles_opencvs_descriptors(number: str) -> None:
     cosine = (ours * theirs).sum(1)
     assert cosine.median() > 0.99
     assert cosine.quantile(0.05) > 0.95
+
+
+def blob(x: float, y: float, sigma: float, h: int = 120, w: int = 160) -> np.ndarray:
+    v, u = np.mgrid[:h, :w]
+    return np.rint(30 + 200 * np.exp(-((u - x) ** 2 + (v - y) ** 2) / (2 * sigma**2))).astype(np.uint8)
+
+
+@needs_vlfeat
+@pytest.mark.parametrize(("x", "y", "sigma"), [(80.0, 60.0, 4.0), (71.3, 48.8, 6.0)])
+def test_vlfeat_finds_a_blob_where_it_is(x: float, y: float, sigma: float) -> None:
+    found = VLFEAT(blob(x, y, sigma))
+    assert len(found.lafs)
+    nearest = (found.keypoints - torch.tensor([x, y])).norm(dim=1).argmin()
+    assert (found.keypoints[nearest] - torch.tensor([x, y])).abs().max() < 0.1
+    # A Gaussian's difference of Gaussians, blurred by s and 2^(1/3) s, is largest at s = sigma 2^(-1/6).
+    assert found.scores[nearest].item() == pytest.approx(sigma * 2 ** (-1 / 6), rel=0.1)
+    half_side = found.lafs[nearest, :, 0].norm().item()
+    assert half_side == pytest.approx(features.FRAME_SIGMAS * found.scores[nearest].item(), rel=1e-5)
+
+
+@needs_vlfeat
+def test_vlfeat_agrees_with_opencv_where_both_find_a_keypoint() -> None:
+    image = cv2.resize(texture(5), None, fx=4, fy=4, interpolation=cv2.INTER_CUBIC)
+    ours, opencv = VLFeatSIFT(peak_threshold=0.005)(image), SIFT()(image)
+    distance, i = torch.cdist(opencv.keypoints, ours.keypoints).min(1)
+    near = distance < 0.3
+    assert near.sum() > 30
+    a, b = ours.lafs[i[near]], opencv.lafs[near]
+    assert (a - b)[..., 2].median(0).values.abs().max() < 0.05
+    assert ((a[..., 0] - b[..., 0]).norm(dim=1) / b[..., 0].norm(dim=1)).median() < 0.1
+    between = (ours.descriptors[i[near]] - opencv.descriptors[near]).norm(dim=1)
+    assert between.median() < 0.3 * 512  # of vectors of length 512
+
+
+@needs_vlfeat
+def test_the_preset_names_vlfeats() -> None:
+    assert presets.build("features", "sift_vlfeat", max_features=50) == VLFeatSIFT(max_features=50)

@@ -71,11 +71,8 @@ def test_dictionaries_of_lightglue(points: tuple[Tensor, Tensor], count: int | N
     features0 = {"keypoints": batched(points[0]), "image_size": batched(size)}
     features1 = {"keypoints": batched(points[1][order]), "image_size": batched(size)}
     if listed:
-        pairs, scores = torch.stack([kept, partners[kept]], -1), score[kept]
-        matches = {
-            "matches": pairs if count is None else [pairs] * count,
-            "scores": scores if count is None else [scores] * count,
-        }
+        listed_values = {"matches": torch.stack([kept, partners[kept]], -1), "scores": score[kept]}
+        matches = {name: value if count is None else [value] * count for name, value in listed_values.items()}
     else:
         matches = {"matches0": batched(partners), "matching_scores0": batched(score)}
     given = fmtorch.from_lightglue(features0, features1, matches)

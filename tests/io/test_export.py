@@ -78,11 +78,9 @@ def errors(model: Any, names: list[str], R: list[np.ndarray], centres: np.ndarra
 
 
 def mapped(database: Path, folder: Path, **options: Any) -> Any:
-    """COLMAP's largest model from a database."""
     pycolmap.set_random_seed(0)
-    config = pycolmap.IncrementalPipelineOptions(
-        extract_colors=False, min_model_size=3, random_seed=0, num_threads=1, **options
-    )
+    own = {"extract_colors": False, "min_model_size": 3, "random_seed": 0, "num_threads": 1}
+    config = pycolmap.IncrementalPipelineOptions(**own, **options)
     models = pycolmap.incremental_mapping(database, folder, folder, config)
     return max(models.values(), key=lambda model: model.num_reg_images())
 
@@ -204,11 +202,8 @@ def test_what_a_journal_keeps_comes_back_and_is_of_the_image_it_was_made_of(tmp_
 def test_hloc_files(tmp_path: Path) -> None:
     circle = Circle()
     kept, ends = journal(tmp_path, circle)
-    assert io.write_exports(kept, ends, io.export_kinds("h5,colmap"), tmp_path) == [
-        "features.h5",
-        "matches.h5",
-        io.DATABASE,
-    ]
+    names = io.write_exports(kept, ends, io.export_kinds("h5,colmap"), tmp_path)
+    assert names == ["features.h5", "matches.h5", io.DATABASE]
     pair = circle.pairs[4]
     with h5py.File(tmp_path / "features.h5") as features, h5py.File(tmp_path / "matches.h5") as matches:
         assert features["0.png/keypoints"].dtype == np.float32

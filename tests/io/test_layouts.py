@@ -137,7 +137,6 @@ def test_the_test_split_of_the_tutorial_has_no_cameras(tmp_path: Path) -> None:
 
 
 def edit(root: Path, name: str, key: str, change: Callable[[np.ndarray], Any] | None) -> None:
-    """Change an entry, or take it away."""
     with h5py.File(root / name, "a") as file:
         value = file[key][()]
         del file[key]
@@ -341,9 +340,8 @@ def test_pruning_is_judged_as_oanets_test_does(tmp_path: Path) -> None:
         assert row.match_recall == pytest.approx(label[::2][kept].sum() / label.sum())
     group = summarize(to_table(rows))["all"]
     p, r = (np.array([getattr(row, f"match_{name}") for row in rows]) for name in ("precision", "recall"))
-    assert group["labels"] == pytest.approx(
-        {"precision": p.mean(), "recall": r.mean(), "f_score": (2 * p * r / (p + r)).mean()}
-    )
+    means = {"precision": p.mean(), "recall": r.mean(), "f_score": (2 * p * r / (p + r)).mean()}
+    assert group["labels"] == pytest.approx(means)
     page = summary_markdown({"all": group}, "title")
     heading = "| Pruning | mAP@5° | mAP@20° | AUC@5° | AUC@10° | AUC@20° | P | R | F |"
     assert heading in page

@@ -11,6 +11,7 @@ from typing import Any
 import cv2
 import h5py
 import numpy as np
+import torch
 
 from tests.geometry.scenes import Scene, scene
 
@@ -35,10 +36,8 @@ def truth(folder: Path) -> Path:
         images.mkdir(parents=True)
         for name in ("00000000.png", "00000001.png"):
             cv2.imwrite(str(images / name), np.zeros(SIZE, np.uint8))
-        cameras = [
-            np.concatenate([s.K0.numpy().ravel(), np.eye(3).ravel(), np.zeros(3)]),
-            np.concatenate([s.K1.numpy().ravel(), s.R.numpy().ravel(), s.t.numpy()]),
-        ]
+        motions = (s.K0, torch.eye(3), torch.zeros(3)), (s.K1, s.R, s.t)
+        cameras = [np.concatenate([np.ravel(value) for value in motion]) for motion in motions]
         np.savetxt(folder / f"s{i}" / "Camera.txt", cameras, fmt="%.17g")
         lines.append("0 1 " + " ".join(f"{v:.17g}" for v in s.F.numpy().ravel()))
         subsets.append(f"s{i}/")
@@ -128,7 +127,6 @@ def write_tutorial(folder: Path) -> Path:
 
 
 def write_posebench(folder: Path) -> Path:
-    """A file with a group a pair."""
     folder.mkdir(parents=True)
     with h5py.File(folder / "imc_church.h5", "w") as file:
         for i, s in enumerate(scenes()):

@@ -73,9 +73,8 @@ def test_weights_that_cannot_be_fetched(tmp_path: Path, monkeypatch: pytest.Monk
         raise RuntimeError("Name or service not known")
 
     monkeypatch.setattr(kornia.feature, "LightGlue", type("L", (kornia.feature.LightGlue,), {"__init__": offline}))
-    with pytest.raises(
-        ConnectionError, match=r"LightGlue \(disk\).*Name or service.*github\.com/cvg/LightGlue"
-    ) as error:
+    said = r"LightGlue \(disk\).*Name or service.*github\.com/cvg/LightGlue"
+    with pytest.raises(ConnectionError, match=said) as error:
         presets.build("matcher", "lightglue", features="disk")
     place = re.search(r"copy its disk_lightglue\.pth to (\S+)", str(error.value))
     assert place is not None

@@ -60,12 +60,11 @@ def test_equals_the_definition_on_real_numbers(scale: float) -> None:
     np.testing.assert_allclose(neighbors.second.numpy() / scale, second / scale, atol=5e-7)
 
 
+ROWS = st.lists(st.lists(st.integers(0, 2), min_size=2, max_size=2), max_size=40)
+
+
 @settings(max_examples=60, deadline=None)
-@given(
-    st.lists(st.lists(st.integers(0, 2), min_size=2, max_size=2), max_size=40),
-    st.lists(st.lists(st.integers(0, 2), min_size=2, max_size=2), max_size=40),
-    st.integers(1, 9),
-)
+@given(ROWS, ROWS, st.integers(1, 9))
 def test_ties_go_to_the_lowest_index(rows: list[list[int]], columns: list[list[int]], chunk: int) -> None:
     d0, d1 = torch.tensor(rows).reshape(-1, 2).float(), torch.tensor(columns).reshape(-1, 2).float()
     assert_is_reference(nearest_neighbors(d0, d1, chunk=chunk), d0, d1, 2.0**-23)
@@ -215,12 +214,9 @@ def test_values_whose_squares_overflow_harm_nothing(scale: float, monkeypatch: p
 
 def features(seed: int, n: int) -> Features:
     generator = torch.Generator().manual_seed(seed)
-    return Features(
-        lafs=100 * torch.rand(n, 2, 3, generator=generator),
-        scores=torch.rand(n, generator=generator),
-        descriptors=torch.randint(0, 60, (n, 32), generator=generator).float(),
-        image_size=torch.tensor([100 + seed, 200]),
-    )
+    lafs, scores = 100 * torch.rand(n, 2, 3, generator=generator), torch.rand(n, generator=generator)
+    descriptors = torch.randint(0, 60, (n, 32), generator=generator).float()
+    return Features(lafs, scores, descriptors, torch.tensor([100 + seed, 200]))
 
 
 def test_slots_are_the_features_of_image_0() -> None:

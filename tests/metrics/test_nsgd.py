@@ -37,9 +37,8 @@ def random_pairs(seed: int, *batch: int, spread: float = 0.05) -> tuple[Tensor, 
     inverse = torch.linalg.inv(K)
     angles, t = (torch.randn(*batch, 3, generator=g, dtype=torch.float64) for _ in range(2))
     turned = angles * 0.1 + spread * torch.randn(*batch, 3, generator=g, dtype=torch.float64)
-    F = [
-        inverse.T @ cross_matrix(t) @ torch.linalg.matrix_exp(cross_matrix(a)) @ inverse for a in (angles * 0.1, turned)
-    ]
+    turns = (torch.linalg.matrix_exp(cross_matrix(a)) for a in (angles * 0.1, turned))
+    F = [inverse.T @ cross_matrix(t) @ turn @ inverse for turn in turns]
     return unit_frobenius(F[0]), unit_frobenius(F[1])
 
 
@@ -59,9 +58,8 @@ def test_known_answers() -> None:
     assert rarely.item() == pytest.approx(700 / math.hypot(720, 1280), rel=1e-12)
     # Distances are 6 px in both images, whose diagonals are 800 and 500 px.
     size0, size1 = torch.tensor([480, 640]), torch.tensor([300, 400])
-    assert metrics.nsgd(rows_shifted(0.0), rows_shifted(6.0), size0, size1).item() == pytest.approx(
-        (6 / 800 + 6 / 500) / 2
-    )
+    off = metrics.nsgd(rows_shifted(0.0), rows_shifted(6.0), size0, size1)
+    assert off.item() == pytest.approx((6 / 800 + 6 / 500) / 2)
 
 
 def test_known_answers_of_the_released_evaluator() -> None:
@@ -78,38 +76,36 @@ def test_known_answers_of_the_released_evaluator() -> None:
     assert metrics.nsgd_released(exact * 1e-9, rows_shifted(10.0) * 1e-9, HD, HD).item() < 0.0065
 
 
-@pytest.mark.parametrize("sizes", [(VGA, VGA), (VGA, torch.tensor([400, 220]))])
-@pytest.mark.parametrize("spread", [0.02, 2.0])
-def test_matches_scalar_reference(sizes: tuple[Tensor, Tensor], spread: float) -> None:
-    samples, pairs = 24, 12
-    F_gt, F_est = random_pairs(0, pairs, spread=spread)
-    key = torch.arange(pairs)
-    uniforms = uniform(3, key, Stream.METRIC, 0, 10 * samples, COLUMNS).numpy()
-    options = {"samples": samples, "seed": 3, "key": key}
+def expect_reference(F_gt: Tensor, F_est: Tensor, *sizes: Tensor, samples: int, seed: int) -> None:
+    """All figures of pairs are those of the reference from the same random numbers."""
+    key = torch.arange(len(F_gt))
+    uniforms = uniform(seed, key, Stream.METRIC, 0, 10 * samples, COLUMNS).numpy()
+    options = {"samples": samples, "seed": seed, "key": key}
     loss, pixels = (f(F_gt, F_est, *sizes, **options, cap=False) for f in (metrics.nsgd, metrics.sgd))
     released = metrics.nsgd_released(F_gt, F_est, *sizes, **options)
-    numpy_sizes = [size.numpy() for size in sizes]
-    for i in range(pairs):
-        arguments = F_gt[i].numpy(), F_est[i].numpy(), *numpy_sizes, uniforms[i], samples
+    numpy_sizes = [size.expand(len(F_gt), 2).numpy() for size in sizes]
+    for i in range(len(key)):
+        arguments = F_gt[i].numpy(), F_est[i].numpy(), *(size[i] for size in numpy_sizes), uniforms[i], samples
         expected_pixels, expected, _ = reference.nsgd(*arguments)
         assert loss[i].item() == pytest.approx(expected, rel=1e-9, abs=1e-12)
         assert pixels[i].item() == pytest.approx(expected_pixels, rel=1e-9, abs=1e-9)
         assert released[i].item() == pytest.approx(reference.nsgd_released(*arguments), rel=1e-9, abs=1e-12)
 
 
-def test_matches_scalar_reference_on_the_published_cases() -> None:
+@pytest.mark.parametrize("sizes", [(VGA, VGA), (VGA, torch.tensor([400, 220]))])
+@pytest.mark.parametrize("spread", [0.02, 2.0])
+def test_matches_scalar_reference(sizes: tuple[Tensor, Tensor], spread: float) -> None:
+    expect_reference(*random_pairs(0, 12, spread=spread), *sizes, samples=24, seed=3)
+
+
+def published(runs: int = 1) -> tuple[dict[str, np.ndarray], list[Tensor]]:
+    """The file of the published evaluator's figures, and its matrices and sizes, several times."""
     file = oracle("fmbench_nsgd.npz")
-    samples = 8
-    arrays = [file[k] for k in ("F_gt", "F_est", "size1", "size2")]
-    key = torch.arange(len(file["names"]))
-    uniforms = uniform(0, key, Stream.METRIC, 0, 10 * samples, COLUMNS).numpy()
-    tensors = [torch.from_numpy(a) for a in arrays]
-    value = metrics.nsgd(*tensors, samples=samples, key=key, cap=False)
-    released = metrics.nsgd_released(*tensors, samples=samples, key=key)
-    for i in range(len(key)):
-        arguments = *(a[i] for a in arrays), uniforms[i], samples
-        assert value[i].item() == pytest.approx(reference.nsgd(*arguments)[1], rel=1e-9, abs=1e-12)
-        assert released[i].item() == pytest.approx(reference.nsgd_released(*arguments), rel=1e-9, abs=1e-12)
+    return file, [torch.from_numpy(file[k]).expand(runs, *file[k].shape) for k in ("F_gt", "F_est", "size1", "size2")]
+
+
+def test_matches_scalar_reference_on_the_published_cases() -> None:
+    expect_reference(*(values[0] for values in published()[1]), samples=8, seed=0)
 
 
 def test_agrees_with_the_published_evaluator() -> None:
@@ -117,9 +113,8 @@ def test_agrees_with_the_published_evaluator() -> None:
     The difference of two means of n1 and n2 independent runs of standard deviation s has the standard error s sqrt(1/n1
     + 1/n2). 4.5 of them: one false alarm in 3,000 repetitions of all 49 cases. Where the figure is a constant, the
     rounding of 1e-10 / |normal| remains, and s = 0.5 bounds the one case that is a mixture of two values."""
-    file = oracle("fmbench_nsgd.npz")
     runs = 24
-    cases = [torch.from_numpy(file[k]).expand(runs, *file[k].shape) for k in ("F_gt", "F_est", "size1", "size2")]
+    file, cases = published(runs)
     key = torch.arange(runs * len(file["names"])).reshape(runs, -1)
     released = metrics.nsgd_released(*cases, key=key).mean(0).numpy()
     deviation = np.where(file["nsgd_std"] > 0.1, 0.5, file["nsgd_std"])
@@ -135,17 +130,15 @@ def test_agrees_with_the_published_evaluator_without_its_faults() -> None:
     variation over the image, is far below the sampling error. It keeps the 1e-10 that the evaluator adds to the length
     of a normal, which shows for the matrix of norm 1e-8 (fault 6); we are invariant to scale and compare that case with
     the same matrix of norm 1."""
-    file = oracle("fmbench_nsgd.npz")
     runs = 24
+    file, cases = published(runs)
     names = [str(name) for name in file["names"]]
-    cases = [torch.from_numpy(file[k]).expand(runs, *file[k].shape) for k in ("F_gt", "F_est", "size1", "size2")]
     ours = metrics.nsgd(*cases, key=torch.arange(runs * len(names)).reshape(runs, -1)).numpy()
     expected = file["py_safe"].copy()
     expected[names.index("scale:norm_1e-8")] = expected[names.index("scale:norm_1")]
     theirs = np.minimum(50, 500 * file["py_safe_hit"]).clip(min=1e-9)
-    hit = np.minimum(1, 10 * file["py_safe_hit"]).clip(
-        min=1e-9
-    )  # our runs accept 1,000 samples, or what 10,000 tries do
+    # Our runs accept 1,000 samples, or what 10,000 tries do.
+    hit = np.minimum(1, 10 * file["py_safe_hit"]).clip(min=1e-9)
     error = ours.std(0, ddof=1) * np.sqrt(1 / runs + hit / theirs)
     excess = np.abs(ours.mean(0) - expected) - 4.5 * error - 1e-9
     assert not {names[i]: excess[i] for i in np.flatnonzero(excess > 0)}
@@ -267,9 +260,8 @@ def test_oracle() -> None:
     file = oracle("fmbench_inlier_rate.npz")
     for case in range(len(file["names"])):
         get = {k[4:]: v for k, v in file.items() if k.startswith(f"{case:03d}.")}
-        F, x0, x1, kept, size0, size1 = (
-            torch.from_numpy(get[k]) for k in ("F_gt", "X1", "X2", "mask_in", "size1", "size2")
-        )
+        names = ("F_gt", "X1", "X2", "mask_in", "size1", "size2")
+        F, x0, x1, kept, size0, size1 = (torch.from_numpy(get[name]) for name in names)
         assert np.array_equal(metrics.ground_truth_inliers(F, x0, x1, size0, size1).numpy(), get["mask_gt"])
         rate = metrics.inlier_rate(F, x0, x1, kept, size0, size1)
         # Both are one division of the same two integers.

@@ -149,9 +149,8 @@ def test_without_a_matrix_or_a_match_before_the_cameras_the_error_is_the_worst()
     assert closest.rotation[1].item() == closest.translation[1].item() == 180
 
 
-ERRORS = st.lists(
-    st.floats(0, 40) | st.sampled_from([1.0, 5.0, 10.0, 15.0, 20.0]) | st.just(float("inf")), min_size=1, max_size=20
-)
+ERROR = st.floats(0, 40) | st.sampled_from([1.0, 5.0, 10.0, 15.0, 20.0]) | st.just(float("inf"))
+ERRORS = st.lists(ERROR, min_size=1, max_size=20)
 
 
 def test_auc_known_answers() -> None:
@@ -218,9 +217,8 @@ def test_corner_error_is_the_mean_over_four_corners() -> None:
     np.testing.assert_allclose(errors, expected, rtol=1e-9)
     scaled = metrics.corner_error(-7 * torch.from_numpy(H), torch.from_numpy(true), SIZE)
     torch.testing.assert_close(scaled, errors)
-    alone = torch.stack(
-        [metrics.corner_error(torch.from_numpy(a), torch.from_numpy(b), SIZE) for a, b in zip(H, true, strict=True)]
-    )
+    pairs = zip(torch.from_numpy(H), torch.from_numpy(true), strict=True)
+    alone = torch.stack([metrics.corner_error(a, b, SIZE) for a, b in pairs])
     assert torch.equal(alone, errors)
 
 

@@ -75,7 +75,6 @@ def pipeline() -> Pipeline:
 
 @pytest.fixture
 def images(tmp_path: Path) -> list[Path]:
-    """Six crops of one texture."""
     noise = np.random.default_rng(0).integers(0, 256, (60, 80), dtype=np.uint8)
     texture = cv2.GaussianBlur(cv2.resize(noise, (640, 480), interpolation=cv2.INTER_CUBIC), (0, 0), 1.5)
     (tmp_path / "photos").mkdir()
@@ -94,6 +93,14 @@ def kept(output: Path) -> dict[str, dict[str, Any]]:
     return {path.name: dict(np.load(path)) for path in files}
 
 
+def expect_same(output: Path, other: Path) -> None:
+    stored, expected = kept(output), kept(other)
+    assert stored.keys() == expected.keys()
+    for file, arrays in expected.items():
+        for key, value in arrays.items():
+            np.testing.assert_array_equal(stored[file][key], value)
+
+
 def test_any_number_of_workers_and_any_executor_keep_the_same(pipeline, images, tmp_path):
     pairs = list(itertools.combinations(images, 2))
     executor = Recorded()
@@ -104,14 +111,9 @@ def test_any_number_of_workers_and_any_executor_keep_the_same(pipeline, images, 
             assert len(list(matches.each(pairs))) == matches.done == len(pairs)
             assert matches.troubles == []
     assert Counter(executor.calls) == {"Photograph": 6, "DescribedPair": 15}
-    expected = kept(tmp_path / "one")
-    assert len(expected) == 21
+    assert len(kept(tmp_path / "one")) == 21
     for name in ("three", "own"):
-        stored = kept(tmp_path / name)
-        assert stored.keys() == expected.keys()
-        for file, arrays in expected.items():
-            for key, value in arrays.items():
-                np.testing.assert_array_equal(stored[file][key], value)
+        expect_same(tmp_path / name, tmp_path / "one")
 
 
 @pytest.mark.parametrize("send", [False, True])
@@ -122,11 +124,7 @@ def test_processes_keep_the_same(pipeline: Pipeline, images: list[Path], tmp_pat
         matches = work(pipeline, images, tmp_path / "processes", workers=workers, build=built)
         list(matches.each(pairs))
     assert (matches.done, matches.troubles) == (6, [])
-    expected, stored = kept(tmp_path / "threads"), kept(tmp_path / "processes")
-    assert stored.keys() == expected.keys()
-    for file, arrays in expected.items():
-        for key, value in arrays.items():
-            np.testing.assert_array_equal(stored[file][key], value)
+    expect_same(tmp_path / "processes", tmp_path / "threads")
 
 
 def test_no_image_is_described_twice(pipeline, images, tmp_path, monkeypatch):

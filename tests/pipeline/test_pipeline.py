@@ -97,8 +97,6 @@ def test_match_stops_before_estimation(pairs: list[ImagePair]) -> None:
 
 
 class _Counting:
-    """An extractor that counts its calls, and fails on request."""
-
     def __init__(self) -> None:
         self.calls = 0
         self.inner = presets.build("features", "sift", max_features=500)
@@ -117,8 +115,6 @@ def test_features_of_an_image_are_computed_once(pairs: list[ImagePair]) -> None:
 
 
 class _Raising:
-    """A stage that cannot bear one pair."""
-
     def __init__(self, key: int, inner: Callable[[Correspondences], Correspondences | Estimate]) -> None:
         self.key, self.inner = key, inner
 
@@ -130,9 +126,8 @@ class _Raising:
 
 @pytest.mark.parametrize("stage", ["pruning", "estimation"])
 def test_a_stage_that_raises_fails_only_the_culprit(pairs: list[ImagePair], stage: str) -> None:
-    inner = (
-        presets.build("pruner", "ratio") if stage == "pruning" else presets.build("estimator", "lmeds", hypotheses=200)
-    )
+    named = {"pruning": ("pruner", "ratio"), "estimation": ("estimator", "lmeds")}[stage]
+    inner = presets.build(*named, **({"hypotheses": 200} if stage == "estimation" else {}))
     raising = _Raising(pairs[0].key, inner)
     parts = {"pruners": {"bad": raising}} if stage == "pruning" else {"estimator": raising}
     outcomes = pipeline(**parts).run([pairs[0], pairs[2]])
@@ -179,7 +174,6 @@ def built(cache: str = "off") -> Pipeline:
 
 @pytest.fixture
 def reads(monkeypatch: pytest.MonkeyPatch) -> collections.Counter[Any]:
-    """How often each file is read."""
     counts: collections.Counter[Any] = collections.Counter()
 
     def counted(source: Any) -> Any:
@@ -205,9 +199,8 @@ def test_files_are_read_once_and_matches_are_refined(reads: collections.Counter[
     gains = []
     for old, new in zip(before, outcomes, strict=True):
         F = torch.from_numpy(new.pair.F)[None]
-        first, second = (
-            sampson(F, c.x0.double(), c.x1.double()).abs()[0] for c in (old.correspondences, new.correspondences)
-        )
+        both = (old.correspondences, new.correspondences)
+        first, second = (sampson(F, c.x0.double(), c.x1.double()).abs()[0] for c in both)
         right = first < 1
         gains.append(float(second[right].median() / first[right].median()))
     assert np.median(gains) < 0.85
@@ -245,10 +238,7 @@ def test_refined_matches_are_exported_as_matches_of_keypoints(tmp_path: Path) ->
     journals = []
     for i, overrides in enumerate(([PRUNERS], [])):
         pipeline = load_pipeline("sift_fmtorch", overrides=[*overrides, "cache=off", "features.max_features=500"])
-        run, folder = (
-            MatchStore(tmp_path / f"run{i}", ends[0].parent),
-            MatchStore(tmp_path / f"folder{i}", ends[0].parent),
-        )
+        run, folder = (MatchStore(tmp_path / f"{name}{i}", ends[0].parent) for name in ("run", "folder"))
         run.add(match_records(pipeline, pipeline.run([pair])))
         for _ in FolderMatches(pipeline, folder, 4000, True, 0).each([ends]):
             pass

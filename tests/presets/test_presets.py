@@ -30,15 +30,8 @@ def own(tmp_path: Path) -> Path:
 def test_numbers_dates_and_references_are_read_as_commands_read_them(own: Path) -> None:
     own.write_text("_target_: a.B\na: 1e-3\nb: -2.5E+4\nc: 2024-01-31\nd: 1e\ne: ${a}\nf: {g: .5e1}\n")
     read = presets.load("estimator", "own", own.parents[1])
-    assert read == {
-        "_target_": "a.B",
-        "a": 1e-3,
-        "b": -25000.0,
-        "c": "2024-01-31",
-        "d": "1e",
-        "e": 1e-3,
-        "f": {"g": 5.0},
-    }
+    values = {"a": 1e-3, "b": -25000.0, "c": "2024-01-31", "d": "1e", "e": 1e-3, "f": {"g": 5.0}}
+    assert read == {"_target_": "a.B", **values}
 
 
 @pytest.mark.parametrize(
@@ -80,10 +73,11 @@ def test_preset_files_are_where_their_names_say() -> None:
             assert (conf_dir() / group / f"{name}.yaml").is_file()
 
 
-def test_options_of_one_pruner_do_not_hinder_another_in_its_place() -> None:
-    config = compose("match", ("pipeline=sift_lc_fmtorch", "pruner=[ratio,lpm]"))
+@pytest.mark.parametrize(("pipeline", "pruners"), [("sift_lc_fmtorch", ["ratio", "lpm"]), ("sift_gms", ["ratio"])])
+def test_options_of_a_pruner_that_others_replace_go_with_it(pipeline: str, pruners: list[str]) -> None:
+    config = compose("match", (f"pipeline={pipeline}", f"pruner=[{','.join(pruners)}]"))
     presets.expect_stages(config)
-    assert [next(iter(entry)) for entry in presets.stages(config)["pruner"]] == ["ratio", "lpm"]
+    assert [next(iter(entry)) for entry in presets.stages(config)["pruner"]] == pruners
 
 
 RATIO = "pruner.ratio.families"
@@ -100,10 +94,8 @@ def matches(seed: int) -> GivenMatches:
 
 def pairs_of_families(*families: str) -> list[ImagePair]:
     image = ImageSource("image", Path("image.jpg"))
-    return [
-        ImagePair(str(i), family, "scene", image, image, np.eye(3), matches=functools.partial(matches, i))
-        for i, family in enumerate(families)
-    ]
+    own = [(str(i), family, functools.partial(matches, i)) for i, family in enumerate(families)]
+    return [ImagePair(name, family, "scene", image, image, np.eye(3), matches=given) for name, family, given in own]
 
 
 def ratios(pipeline: Pipeline, pairs: list[ImagePair]) -> list[torch.Tensor]:
@@ -167,10 +159,7 @@ def test_an_option_that_is_given_explicitly_holds_for_all_families(overrides, sc
     assert seen == [expected]
 
 
-def test_those_of_a_pruner_that_others_replace_go_with_it() -> None:
-    config = compose("match", ("pipeline=sift_gms", "pruner=[ratio]"))
-    presets.expect_stages(config)
-    assert [list(entry) for entry in presets.stages(config)["pruner"]] == [["ratio"]]
+def test_options_of_families_go_with_their_pruner() -> None:
     pipeline = load_pipeline("sift_gms", overrides=["pruner=[lpm,ratio]"])
     assert list(pipeline.pruners_of("CPC")) == ["lpm", "ratio"]
 

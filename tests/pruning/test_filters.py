@@ -1,5 +1,6 @@
 """Pruners in general: known answers, edge cases, input of any size, match noise."""
 
+import itertools
 import math
 import subprocess
 import sys
@@ -65,42 +66,49 @@ def test_ratio_and_mutual_stages_equal_their_definitions(seed: int) -> None:
     assert 0 < int(both.sum()) < 30
     order = matches.compact()
     assert torch.equal(pruning.MutualCheck()(order).count(), both.sum()[None])
-    with pytest.raises(ValueError, match="needs `mutual`"):
-        pruning.MutualCheck()(matches.replace(mutual=None))
-
-
-def grid_points(n: int) -> st.SearchStrategy[np.ndarray]:
-    return arrays(np.float32, (n, 2), elements=st.sampled_from([0.0, -0.0, 0.1, 1.5]))
 
 
 @settings(max_examples=80, deadline=None)
 @given(st.data(), st.integers(0, 12))
 def test_one_to_one_equals_the_definition(data: st.DataObject, n: int) -> None:
-    x0, x1 = data.draw(grid_points(n)), data.draw(grid_points(n))
-    ratio = data.draw(arrays(np.float32, (n,), elements=st.sampled_from([0.25, 0.5, math.inf])))
+    coordinates, ratios = st.sampled_from([0.0, -0.0, 0.1, 1.5]), st.sampled_from([0.25, 0.5, math.inf])
+    x0, x1 = (data.draw(arrays(np.float32, (n, 2), elements=coordinates)) for _ in range(2))
+    ratio = data.draw(arrays(np.float32, (n,), elements=ratios))
     mask = pruning.one_to_one(*(torch.from_numpy(a)[None] for a in (x0, x1, ratio)))
     np.testing.assert_array_equal(mask[0], one_to_one_reference(x0, x1, ratio))
 
 
-def duplicated(seed: int, n: int, dtype: torch.dtype = torch.float32) -> tuple[Tensor, Tensor, Tensor]:
+def duplicated(n: int, dtype: torch.dtype = torch.float32) -> Correspondences:
     """Points drawn from few locations, so that most locations repeat; no two ratios are equal."""
-    generator = torch.Generator().manual_seed(seed)
-    places = 100 * torch.rand(2, max(n // 3, 1), 2, generator=generator, dtype=dtype)
-    pick = torch.randint(0, places.shape[1], (2, n), generator=generator)
-    ratio = torch.randperm(n, generator=generator).to(dtype) / max(n, 1)
-    return places[0, pick[0]], places[1, pick[1]], ratio
+    generator = torch.Generator().manual_seed(0)
+    places = 100 * torch.rand(2, n // 3, 2, generator=generator, dtype=dtype)
+    x0, x1 = (at[torch.randint(0, n // 3, (n,), generator=generator)][None] for at in places)
+    ratio = torch.randperm(n, generator=generator).to(dtype)[None] / n
+    return Correspondences(x0, x1, torch.ones(1, n, dtype=torch.bool), ratio, mutual=ratio < 0.5)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_one_to_one_is_symmetric_and_independent_of_order(dtype: torch.dtype) -> None:
-    x0, x1, ratio = (a[None] for a in duplicated(0, 200, dtype))
-    kept = pruning.one_to_one(x0, x1, ratio)
+    c = duplicated(200, dtype)
+    kept = pruning.one_to_one(c.x0, c.x1, c.ratio)
     assert 0 < kept.sum() < 200
-    assert torch.equal(kept, pruning.one_to_one(x1, x0, ratio))
+    assert torch.equal(kept, pruning.one_to_one(c.x1, c.x0, c.ratio))
     order = torch.randperm(200, generator=torch.Generator().manual_seed(1))
-    assert torch.equal(kept[:, order], pruning.one_to_one(x0[:, order], x1[:, order], ratio[:, order]))
-    for x in (x0, x1):
+    assert torch.equal(kept[:, order], pruning.one_to_one(*(a[:, order] for a in (c.x0, c.x1, c.ratio))))
+    for x in (c.x0, c.x1):
         assert len(torch.unique(x[kept], dim=0)) == kept.sum()
+
+
+def test_stages_are_their_functions_need_their_fields_and_keep_the_rest() -> None:
+    c = duplicated(20)
+    ratio, unique = pruning.ratio_test(c.ratio, 0.5), pruning.one_to_one(c.x0, c.x1, c.ratio)
+    stages = [(pruning.RatioTest(0.5), "ratio", ratio), (pruning.OneToOne(), "ratio", unique)]
+    for stage, field, expected in (*stages, (pruning.MutualCheck(), "mutual", c.mutual)):
+        out = stage(c)
+        assert torch.equal(out.mask, expected)
+        assert torch.equal(out.x0, c.x0)
+        with pytest.raises(ValueError, match=f"needs `{field}`"):
+            stage(c.replace(**{field: None}))
 
 
 def test_one_to_one_drops_what_has_no_location_and_ranks_nan_ratio_last() -> None:
@@ -108,20 +116,6 @@ def test_one_to_one_drops_what_has_no_location_and_ranks_nan_ratio_last() -> Non
     x1 = torch.arange(8.0).reshape(1, 4, 2)
     ratio = torch.tensor([[0.0, 0.0, math.nan, 0.9]])
     assert pruning.one_to_one(x0, x1, ratio).tolist() == [[False, False, False, True]]
-
-
-def test_stages_need_a_ratio_and_keep_the_rest() -> None:
-    x0, x1, ratio = (a[None] for a in duplicated(0, 20))
-    mask = torch.ones(1, 20, dtype=torch.bool)
-    for stage, expected in (
-        (pruning.RatioTest(0.5), pruning.ratio_test(ratio, 0.5)),
-        (pruning.OneToOne(), pruning.one_to_one(x0, x1, ratio)),
-    ):
-        out = stage(Correspondences(x0, x1, mask, ratio))
-        assert torch.equal(out.mask, expected)
-        assert torch.equal(out.x0, x0)
-        with pytest.raises(ValueError, match="ratio"):
-            stage(Correspondences(x0, x1, mask))
 
 
 PRUNERS = variants("pruner")
@@ -257,15 +251,20 @@ def test_one_to_one(real_matches: list[tuple[Correspondences, Tensor]]) -> None:
         expect_mask(pruning.one_to_one(c.x0, c.x1, c.ratio, c.mask)[i], slots, expected, what)
 
 
+def turned(c: Correspondences, angle: float, scale: float) -> Correspondences:
+    R = scale * torch.tensor([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+    return c.replace(x1=c.x1 @ R.T)
+
+
 @pytest.mark.parametrize("ratios", [True, False])
-def test_agreement_of_few_matches(ratios: bool) -> None:
-    for what, c in small().items():
+def test_agreement(ratios: bool) -> None:
+    motions = itertools.product((1, 2, 5, 60), ((0.0, 1.0), (2.0, 0.6)))
+    several = [(f"{count}, turned by {turn[0]}", turned(scene(1, count), *turn)) for count, turn in motions]
+    for what, c in (*small().items(), *several):
         ratio = c.ratio if ratios else None
         vote = np.maximum(WORST_RATIO - c.ratio[0].double().numpy(), MIN_VOTE) if ratios else np.ones(len(c.mask[0]))
         x0, x1, A0, A1 = (t[0].double().numpy() for t in (c.x0, c.x1, c.lafs0[..., :2], c.lafs1[..., :2]))
-        by_frames = consistency.agreement(
-            x0, x1, A1 @ np.linalg.inv(A0), vote, CURVES, WINDOW, TOLERANCE, NOISE
-        )  # fmt: skip
+        by_frames = consistency.agreement(x0, x1, A1 @ np.linalg.inv(A0), vote, CURVES, WINDOW, TOLERANCE, NOISE)
         similarity = consistency.similarity(x0, x1, CURVES, TURNS, SCALES)
         by_motion = consistency.agreement_of_positions(x0, x1, similarity, vote, CURVES, WINDOW, TOLERANCE, NOISE)
         frames = pruning.frame_agreement(c.x0, c.x1, c.lafs0, c.lafs1, ratio, c.mask)[0]

@@ -94,17 +94,6 @@ def test_sizes_that_are_width_and_height_are_refused() -> None:
         gms(x0, x1, size0=torch.tensor([SIZE0[::-1]]), size1=torch.tensor([SIZE1]))
 
 
-@kernel
-def search(queries: F8x2, points: F8x2, neighbors: I8x2) -> None:
-    knn_kernels.search(queries, points, neighbors)
-
-
-def nearest_points(queries: np.ndarray, points: np.ndarray, count: int) -> np.ndarray:
-    neighbors = np.empty((len(queries), count), np.int64)
-    search(queries, points, neighbors)
-    return neighbors
-
-
 def moving_along(seed: int, n: int, outliers: float = 0.4) -> tuple[Tensor, Tensor]:
     """Matches that follow a smooth motion; some wrong, some repeated, some that do not move."""
     rng = np.random.default_rng(seed)
@@ -118,15 +107,25 @@ def moving_along(seed: int, n: int, outliers: float = 0.4) -> tuple[Tensor, Tens
     return torch.from_numpy(x0), torch.from_numpy(x1)
 
 
+@kernel
+def search(queries: F8x2, points: F8x2, neighbors: I8x2) -> None:
+    knn_kernels.search(queries, points, neighbors)
+
+
+def nearest_points(queries: np.ndarray, points: np.ndarray, count: int) -> np.ndarray:
+    neighbors = np.empty((len(queries), count), np.int64)
+    search(queries, points, neighbors)
+    return neighbors
+
+
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 10**6), st.integers(0, 60), st.integers(0, 60), st.integers(1, 12), st.booleans())
 def test_nearest_points_equal_the_definition(seed: int, n: int, m: int, count: int, coarse: bool) -> None:
     rng = np.random.default_rng(seed)
-    queries, points = rng.uniform(0, 6, (n, 2)), rng.uniform(0, 6, (m, 2))
+    queries, points = (rng.uniform(0, 6, (size, 2)) for size in (n, m))
     if coarse:  # ties everywhere
         queries, points = queries.round(), points.round()
-    neighbors = nearest_points(queries, points, count)
-    for query, row in zip(queries, neighbors.tolist(), strict=True):
+    for query, row in zip(queries, nearest_points(queries, points, count).tolist(), strict=True):
         expected = nearest(query, points, list(range(m)), count)
         assert row == expected + [-1] * (count - len(expected))
 
@@ -257,9 +256,9 @@ def test_gaussians_equal_the_definition() -> None:
 def test_centres_equal_the_definition_and_go_where_matches_crowd() -> None:
     c, right = warped(1, 60, 0.5)
     ours, _ = domain_of(c)
-    kernel = predictive_gaussians(ours, ours, **WIDTHS).double()
-    chosen = spread_centres(kernel, 12).tolist()
-    assert chosen == code_reference.spread_centres(kernel.numpy(), 12)
+    gaussians = predictive_gaussians(ours, ours, **WIDTHS).double()
+    chosen = spread_centres(gaussians, 12).tolist()
+    assert chosen == code_reference.spread_centres(gaussians.numpy(), 12)
     assert right[chosen[:6]].all()
 
 

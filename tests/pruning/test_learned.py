@@ -42,8 +42,6 @@ def pairs_of_several_lengths() -> list[Correspondences]:
 
 
 class Ratio(nn.Module):
-    """The least that a user's own network is."""
-
     def forward(self, c: Correspondences) -> Tensor:
         return 4 - 8 * c.ratio
 
@@ -131,10 +129,8 @@ def test_auto_takes_onnx_where_there_is_one(files: tuple[nn.Module, Path], tmp_p
     auto, onnx_only = (LearnedPruner(network, file=path, runtime=r).probability(c) for r in ("auto", "onnx"))
     assert torch.equal(auto, onnx_only)
     (tmp_path / "lc.safetensors").write_bytes(path.with_suffix(".safetensors").read_bytes())
-    lone, torch_only = (
-        LearnedPruner(network, file=f, runtime=r).probability(c)
-        for f, r in ((tmp_path / "lc", "auto"), (path.with_suffix(".safetensors"), "torch"))
-    )
+    files = ((tmp_path / "lc", "auto"), (path.with_suffix(".safetensors"), "torch"))
+    lone, torch_only = (LearnedPruner(network, file=f, runtime=r).probability(c) for f, r in files)
     assert torch.equal(lone, torch_only)
 
 

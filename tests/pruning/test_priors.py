@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -9,20 +10,10 @@ import torch
 
 import fmtorch
 from fmtorch import Correspondences, presets
-from fmtorch.pruning import (
-    GMS,
-    LPM,
-    Calibration,
-    calibration,
-    consistency,
-    frame_agreement,
-    gms_support,
-    lpm_cost,
-    position_agreement,
-)
+from fmtorch.pruning import GMS, LPM, Calibration, calibration, frame_agreement, gms_support, position_agreement
 from fmtorch.pruning.consistency import CURVES, MIN_VOTE, NOISE, TOLERANCE, TURNS, WINDOW, WORST_RATIO
 from tests.laws import scene
-from tests.pruning.gradients import expect_gradients
+from tests.pruning.test_filters import turned
 from tests.pruning.test_gms import SIZE0, SIZE1, moving, moving_along
 from tests.reference import consistency as reference
 from tests.reference.gms import SCALES, normalised, run, support
@@ -117,7 +108,7 @@ def test_gms_support_equals_the_definition(angle: float, scale: float) -> None:
 def test_lpm_cost_equals_the_definition(n: int) -> None:
     x0, x1 = moving_along(n, n)
     expected = np.mean(passes(x0.numpy(), x1.numpy())[1], axis=0)
-    np.testing.assert_allclose(lpm_cost(x0[None], x1[None])[0], expected, rtol=1e-12)
+    np.testing.assert_allclose(fmtorch.pruning.lpm_cost(x0[None], x1[None])[0], expected, rtol=1e-12)
 
 
 def test_priors_follow_the_right_matches_of_a_common_motion() -> None:
@@ -213,25 +204,6 @@ def agree(c: Correspondences) -> torch.Tensor:
     return frame_agreement(c.x0, c.x1, c.lafs0, c.lafs1, c.ratio, c.mask)
 
 
-@pytest.mark.parametrize("count", [2, 5, 60])
-def test_equals_the_definition(count: int) -> None:
-    c = scene(1, count)
-    A0, A1 = c.lafs0[0, :, :, :2].double().numpy(), c.lafs1[0, :, :, :2].double().numpy()
-    vote = np.maximum(WORST_RATIO - c.ratio[0].double().numpy(), MIN_VOTE)
-    expected = reference.agreement(
-        c.x0[0].double().numpy(),
-        c.x1[0].double().numpy(),
-        A1 @ np.linalg.inv(A0),
-        vote,
-        CURVES,
-        WINDOW,
-        TOLERANCE,
-        NOISE,
-    )
-    # float32 throughout: a few hundred roundings, amplified by the condition of the frames
-    np.testing.assert_allclose(agree(c)[0].numpy(), expected, rtol=1e-3, atol=1e-5)
-
-
 def test_a_common_motion_agrees_wholly() -> None:
     # The prediction error is rounding alone: 1e-7 of coordinates of 1e3 px against lengths of at least 4 px.
     assert float((1 - agree(common_motion())).abs().max()) < 1e-5
@@ -244,6 +216,21 @@ def test_a_wrong_match_disagrees_and_is_told_from_the_right_ones() -> None:
     w = agree(c.replace(x1=x1))[0]
     assert float(w[7]) < 0.2
     assert float(w[torch.arange(len(w)) != 7].min()) > 0.8
+
+
+def expect_gradients(fields: dict[str, torch.Tensor], defined: Callable[..., float], step: float = 1e-5) -> None:
+    """The gradients of the fields are those of `defined`, a function of their arrays, at some of their entries."""
+    rng = np.random.default_rng(0)
+    for name, tensor in fields.items():
+        for place in rng.choice(tensor.numel(), 3, replace=False):
+            values = []
+            for change in (step, -step):
+                arrays = {other: value.detach().numpy().copy() for other, value in fields.items()}
+                arrays[name].reshape(-1)[place] += change
+                values.append(defined(**arrays))
+            slope = (values[0] - values[1]) / (2 * step)
+            # Orders along curves are constants of both; central differences are of order 2.
+            assert abs(float(tensor.grad.reshape(-1)[place]) - slope) < 1e-6 * max(1.0, abs(slope)), (name, place)
 
 
 def test_gradients_are_those_of_the_definition() -> None:
@@ -271,26 +258,6 @@ def agree_in_position(c: Correspondences) -> torch.Tensor:
     return position_agreement(c.x0, c.x1, c.ratio, c.mask)
 
 
-def turned(c: Correspondences, angle: float, scale: float) -> Correspondences:
-    """The same matches where image 1 is turned and zoomed."""
-    R = scale * torch.tensor([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
-    return c.replace(x1=c.x1 @ R.T)
-
-
-@pytest.mark.parametrize("ratios", [True, False])
-@pytest.mark.parametrize(("angle", "scale"), [(0.0, 1.0), (2.0, 0.6)])
-@pytest.mark.parametrize("count", [1, 2, 5, 60])
-def test_positions_equal_the_definition(count: int, angle: float, scale: float, ratios: bool) -> None:
-    c = turned(scene(1, count), angle, scale)
-    c = c if ratios else c.replace(ratio=None)
-    x0, x1 = c.x0[0].double().numpy(), c.x1[0].double().numpy()
-    S = reference.similarity(x0, x1, CURVES, TURNS, consistency.SCALES)
-    vote = np.ones(count) if c.ratio is None else np.maximum(WORST_RATIO - c.ratio[0].double().numpy(), MIN_VOTE)
-    expected = reference.agreement_of_positions(x0, x1, S, vote, CURVES, WINDOW, TOLERANCE, NOISE)
-    # float32: coordinates of 1e3 px are rounded to 6e-5 px, against lengths of at least 4 px
-    np.testing.assert_allclose(agree_in_position(c)[0].numpy(), expected, rtol=1e-3, atol=1e-5)
-
-
 @pytest.mark.parametrize(("angle", "scale"), [(0.0, 1.0), (math.pi / 2, 1.0), (-2.5, 2.3), (0.3, 0.4)])
 def test_a_common_motion_agrees_and_a_wrong_match_does_not(angle: float, scale: float) -> None:
     c = scene(0, 80)
@@ -310,7 +277,7 @@ def test_gradients_of_positions_are_those_of_the_definition() -> None:
     weight = torch.linspace(-1, 1, 30, dtype=torch.float64)
 
     def defined(x0: np.ndarray, x1: np.ndarray, ratio: np.ndarray) -> float:
-        S = reference.similarity(x0[0], x1[0], CURVES, TURNS, consistency.SCALES)
+        S = reference.similarity(x0[0], x1[0], CURVES, TURNS, fmtorch.pruning.consistency.SCALES)
         vote = np.maximum(WORST_RATIO - ratio[0], MIN_VOTE)
         agreement = reference.agreement_of_positions(x0[0], x1[0], S, vote, CURVES, WINDOW, TOLERANCE, NOISE)
         return float(weight.numpy() @ agreement)

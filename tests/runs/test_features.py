@@ -34,10 +34,8 @@ def picture(seed: int = 0, shape: tuple[int, ...] = (120, 160)) -> NDArray[np.ui
 
 
 def equal(a: Features, b: Features) -> bool:
-    return all(
-        getattr(a, f.name).dtype == getattr(b, f.name).dtype and torch.equal(getattr(a, f.name), getattr(b, f.name))
-        for f in dataclasses.fields(a)
-    )
+    pairs = [(getattr(a, f.name), getattr(b, f.name)) for f in dataclasses.fields(a)]
+    return all(x.dtype == y.dtype and torch.equal(x, y) for x, y in pairs)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,11 +109,8 @@ def test_every_float_survives(tmp_path: Path) -> None:
 def test_extractors_with_the_same_detection_share_it(tmp_path: Path) -> None:
     cache, image = ArrayCache(tmp_path), picture()
     half_gain, double_gain, coarse = TwoSteps(gain=0.5), TwoSteps(gain=2.0), TwoSteps(Detector(step=16))
-    for extractor, expected in (
-        (half_gain, ["detect", "describe"]),
-        (double_gain, ["describe"]),
-        (coarse, ["detect", "describe"]),
-    ):
+    both = ["detect", "describe"]
+    for extractor, expected in ((half_gain, both), (double_gain, ["describe"]), (coarse, both)):
         truth = dataclasses.replace(extractor, log=[])(image)
         for _ in range(2):
             assert equal(CachedFeatures(extractor, cache)(image), truth)
@@ -210,22 +205,14 @@ def test_an_extractor_that_does_not_say_what_it_is_stays_uncached(tmp_path: Path
         def __call__(self, image: NDArray[np.uint8]) -> Features:
             raise NotImplementedError
 
-    mine = Mine()
-    with pytest.warns(UserWarning, match=r"not cached: .*Mine does not say what defines its results"):
-        assert cached(mine, tmp_path) is mine
-
-
-def test_an_extractor_whose_file_is_absent_stays_uncached(tmp_path: Path) -> None:
     @dataclasses.dataclass(frozen=True)
-    class Network:
+    class Network(Mine):
         file: Path
 
-        def __call__(self, image: NDArray[np.uint8]) -> Features:
-            raise FileNotFoundError("a message of its own")
-
-    network = Network(tmp_path / "absent.onnx")
-    with pytest.warns(UserWarning, match=r"not cached: .*absent\.onnx"):
-        assert cached(network, tmp_path / "cache") is network
+    silent, absent = (Mine(), "Mine does not say what defines its results"), (Network(tmp_path / "a.onnx"), "a.onnx")
+    for extractor, said in (silent, absent):
+        with pytest.warns(UserWarning, match=f"not cached: .*{said}"):
+            assert cached(extractor, tmp_path / "cache") is extractor
 
 
 def test_configuration_of_files_tensors_networks_and_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -298,7 +285,6 @@ def write_many(folder: Path, limit: int, count: int) -> None:
 
 
 def writer(folder: Path, limit: int = 0, count: int = 1_000_000) -> BaseProcess:
-    """A process that does so."""
     process = multiprocessing.get_context("fork").Process(target=write_many, args=(folder, limit, count))
     process.start()
     return process

@@ -83,9 +83,8 @@ def test_the_same_seed_gives_the_same_bytes_also_from_worker_processes(tmp_path:
     plan = Plan(2, 3, 2, 0.2)
     calls: list[tuple[int, int]] = []
     here = RenderedPairs(families=["indoor"], root=tmp_path / "a", plan=plan, workers=1)
-    there = RenderedPairs(
-        families=["indoor"], root=tmp_path / "b", plan=plan, workers=2, progress=lambda *c: calls.append(c)
-    )
+    options = {"plan": plan, "workers": 2, "progress": lambda *c: calls.append(c)}
+    there = RenderedPairs(families=["indoor"], root=tmp_path / "b", **options)
     assert (contents(tmp_path / "a"), here.digest) == (contents(tmp_path / "b"), there.digest)
     assert calls == [(0, 2), (1, 2), (2, 2)]
 
@@ -126,12 +125,9 @@ def test_splits_share_no_photograph_and_no_random_stream() -> None:
     assert not set(PICTURES["test"]) & set(PICTURES["train"])
     files = [set(MATERIALS[split].values()) - {""} for split in ("test", "train")]
     assert not files[0] & files[1]
-    streams = {
-        tuple(seeds(Task(family, split, number, 0, PLANS["full", split])).generate_state(4).tolist())
-        for family in FAMILIES
-        for split in ("test", "train")
-        for number in range(PLANS["full", split].scenes)
-    }
+    numbers = [(split, number) for split in ("test", "train") for number in range(PLANS["full", split].scenes)]
+    tasks = [Task(family, split, number, 0, PLANS["full", split]) for family in FAMILIES for split, number in numbers]
+    streams = {tuple(seeds(task).generate_state(4).tolist()) for task in tasks}
     assert len(streams) == len(FAMILIES) * (PLANS["full", "test"].scenes + PLANS["full", "train"].scenes)
 
 

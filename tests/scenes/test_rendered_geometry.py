@@ -85,9 +85,8 @@ def test_a_mark_is_drawn_where_it_projects() -> None:
     disc = 255 * np.exp(-((x - u) ** 2 + (y - v) ** 2) / (2 * 12.0**2))
     number = surfaces.texture(np.repeat((disc + 0.5).astype(np.uint8)[..., None], 3, axis=2))
     surfaces.quad(vec(-2, 0, 3), vec(4, 0, 0), vec(0, 0, -4), number)
-    stage = Stage(
-        Geometry(surfaces), Light((0, -1, 0.1), sun=(0.0, 0.0, 0.0), ground_shade=0), np.zeros((8, 16, 3), np.uint8)
-    )
+    light = Light((0, -1, 0.1), sun=(0.0, 0.0, 0.0), ground_shade=0)
+    stage = Stage(Geometry(surfaces), light, np.zeros((8, 16, 3), np.uint8))
     c = camera(0.0, -5.0, 1.0, (0.0, 0.0, 1.0))  # frontal: no perspective shift of the centroid
     image = stage.radiance(c, (0.0, 0.0))[..., 0].astype(np.float64)
     yy, xx = np.mgrid[: SIZE[0], : SIZE[1]]
@@ -174,9 +173,8 @@ def random_world(rng: np.random.Generator) -> Surfaces:
             U[2] = V[2] = 0.0  # level
         uv = rng.normal(0, 1, (3, 2)) * rng.choice([0.01, 1.0, 40.0])
         normals = rng.normal(0, 1, (3, 3)) if k % 3 == 0 else None
-        surfaces.piece(
-            corner, U, V, numbers[k % 4], uv, triangle=bool(k % 2), normals=normals, both_sides=bool(rng.integers(2))
-        )
+        options = {"triangle": bool(k % 2), "normals": normals, "both_sides": bool(rng.integers(2))}
+        surfaces.piece(corner, U, V, numbers[k % 4], uv, **options)
     return surfaces
 
 
@@ -188,11 +186,8 @@ def test_forms_draw_the_same_random_worlds(seed: int, monkeypatch: pytest.Monkey
     pair = stages(random_world(rng), light, sky, monkeypatch)
     for _ in range(3):
         eye, target = rng.normal(0, 3, (2, 3))
-        assert_equal_views(
-            pair,
-            scenes.look_at(scenes.calibration(80.0, KERNEL_SIZE), KERNEL_SIZE, eye.tolist(), target.tolist()),
-            monkeypatch,
-        )
+        K = scenes.calibration(80.0, KERNEL_SIZE)
+        assert_equal_views(pair, scenes.look_at(K, KERNEL_SIZE, eye.tolist(), target.tolist()), monkeypatch)
 
 
 def test_forms_draw_an_empty_view(monkeypatch: pytest.MonkeyPatch) -> None:

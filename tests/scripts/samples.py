@@ -34,7 +34,6 @@ def row(method: str, pair: str, nsgd: float = 0.01, seed: int = 0, **others: obj
 
 
 def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *arguments: object) -> str:
-    """What a command prints."""
     monkeypatch.setattr(sys, "argv", ["benchmark", *map(str, arguments)])
     __main__.main()
     return capsys.readouterr().out

@@ -53,9 +53,8 @@ def test_rendered_scenes_that_show_one_photograph_are_not_paired(tmp_path, monke
     shows = {"a": frozenset({"moon"}), "b": frozenset({"moon", "text"}), "c": frozenset({"text"}), "d": frozenset()}
     monkeypatch.setattr(pairs, "photographs_shown", lambda dataset: shows)
     monkeypatch.setattr(pairs, "RenderedPairs", list)
-    unrelated = pairs.unrelated_pairs(
-        [*(seen_pair(scene, 0, 1) for scene in "abcd"), seen_pair("real", 0, 1)], [[]], 100
-    )
+    ours = [*(seen_pair(scene, 0, 1) for scene in "abcd"), seen_pair("real", 0, 1)]
+    unrelated = pairs.unrelated_pairs(ours, [[]], 100)
     crossed = {p.scene.replace("family/", "") for p in unrelated}
     assert crossed == {"a | c", "a | d", "b | d", "c | d"}  # neither a | b, b | c, nor a drawn and a real one
 
@@ -93,7 +92,6 @@ def test_pairs_are_of_their_kinds(folder: Path) -> None:
 
 
 def cells(printed: str) -> list[list[str]]:
-    """Of the tables' lines."""
     return [[cell.strip() for cell in line.split("|")] for line in printed.splitlines() if line.startswith("| ")]
 
 
@@ -213,15 +211,13 @@ def test_the_methods_of_the_page_are_methods() -> None:
 
 
 def judged(level: str, R: np.ndarray | None, t: np.ndarray = T, focals: tuple[float, float] | None = None) -> Row:
-    """What is said of an answer."""
     given = item()
     posed = {} if R is None else {"R": torch.from_numpy(R)[None], "t": torch.from_numpy(t)[None]}
     posed |= {} if focals is None else {"focals": torch.tensor([focals], dtype=torch.float64)}
     ok, mask = torch.tensor([R is not None]), given.matches.mask
     F = torch.from_numpy(given.pair.F / np.linalg.norm(given.pair.F))[None] * ok
-    answer = Estimate(
-        F, mask & ok, ok, ("" if R is not None else "nothing",), torch.zeros(1, dtype=torch.int64), **posed
-    )
+    reason, samples = ("" if R is not None else "nothing",), torch.zeros(1, dtype=torch.int64)
+    answer = Estimate(F, mask & ok, ok, reason, samples, **posed)
     view = functools.partial(cameras.viewed, level)
     return Method("x", "", lambda family: {}, lambda pair, c, seed: answer, view=view).figures(given, 0)
 

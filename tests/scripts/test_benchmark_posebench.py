@@ -28,7 +28,6 @@ PROTOCOL = {"max_epipolar_error": THRESHOLD, "max_iterations": 1000, "min_iterat
 
 @functools.cache
 def real() -> list[tuple[ImagePair, Correspondences]]:
-    """Some real pairs and their matches."""
     dataset = data.load("fmbench", root=shared_path("data/PhotoTourism"))
     outcomes = pipeline_of("sift_ratio").correspondences([dataset[i] for i in range(PAIRS)])
     return [(o.pair, o.correspondences) for o in outcomes if o.correspondences is not None]

@@ -45,7 +45,6 @@ class Ranges(http.server.BaseHTTPRequestHandler):
 
 @pytest.fixture
 def server() -> Iterator[tuple[type[Ranges], str]]:
-    """A server of `CONTENT` and its address."""
     handler = type("Handler", (Ranges,), {"content": CONTENT, "limit": len(CONTENT), "asked": []})
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as httpd:
         threading.Thread(target=httpd.serve_forever, args=(0.01,), daemon=True).start()  # ends soon
@@ -82,9 +81,8 @@ def test_a_file_without_a_pinned_hash_needs_a_word(server: tuple[type[Ranges], s
         SCRIPT["fetch"](config(weights="hardnet++"))
     with pytest.raises(ValueError, match="sha256=abc is no SHA-256"):
         SCRIPT["fetch"](config(weights="hardnet++", sha256="abc"))
-    path = SCRIPT["fetch"](
-        config(weights="hardnet++", sha256="any", url=f"{server[1]}/AffNet.pth", folder=str(tmp_path / "w"))
-    )
+    own = {"sha256": "any", "url": f"{server[1]}/AffNet.pth", "folder": str(tmp_path / "w")}
+    path = SCRIPT["fetch"](config(weights="hardnet++", **own))
     assert path.name == "HardNet++.pth"
 
 

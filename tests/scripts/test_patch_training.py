@@ -67,9 +67,8 @@ def training(store: stores.PatchStore, **options: Any) -> PatchTraining:
     torch.manual_seed(0)
     made = TrainingOptions(**{**OPTIONS, **options})
     description = {"architecture": "hardnet", "loss": {"name": "hardest_triplet"}}
-    return PatchTraining(
-        HardNet(dropout=0.3), objectives.DescriptorObjective(objectives.hardest_triplet), store, made, description
-    )
+    objective = objectives.DescriptorObjective(objectives.hardest_triplet)
+    return PatchTraining(HardNet(dropout=0.3), objective, store, made, description)
 
 
 def set_training(store: stores.PatchStore, batch: int = 32) -> PatchTraining:

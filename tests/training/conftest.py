@@ -24,13 +24,11 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def rendered(cache: Path) -> RenderedPairs:
-    """Pairs of two training scenes."""
     return RenderedPairs("train", families=[FAMILY], root=cache / "rendered", plan=TINY, workers=1)
 
 
 @pytest.fixture(scope="session")
 def matched(rendered: RenderedPairs, tmp_path_factory: pytest.TempPathFactory) -> MatchedPairs:
-    """Their matches."""
     return MatchedPairs(rendered, **SIFT, root=tmp_path_factory.mktemp("matched"), workers=1)
 
 
@@ -52,10 +50,7 @@ def labelled_pair(number: int, matches: int = 60, outliers: float = 0.4) -> Labe
 
 def _exact_pair(rng: np.random.Generator, n: int, share: float, ignored: float) -> dict[str, np.ndarray]:
     sizes = [(480, 640), (300, 500)]
-    K0, K1 = (
-        calibration(rng.uniform(300, 900), s, (s[1] * rng.uniform(0.4, 0.6), s[0] * rng.uniform(0.4, 0.6)))
-        for s in sizes
-    )
+    K0, K1 = (calibration(rng.uniform(300, 900), s, tuple(rng.uniform(0.4, 0.6, 2) * s[::-1])) for s in sizes)
     K0[1, 1] *= 1.1  # pixels that are not square
     angle = rng.normal(0, 0.2, 3)
     skew = np.array([[0, -angle[2], angle[1]], [angle[2], 0, -angle[0]], [-angle[1], angle[0], 0]])

@@ -52,11 +52,9 @@ ONLY = Augmentation.none()
 
 def same(a: LabelledMatches, b: LabelledMatches) -> bool:
     fields = [f.name for f in dataclasses.fields(a.correspondences) if getattr(a.correspondences, f.name) is not None]
-    return (
-        torch.equal(a.F, b.F)
-        and torch.equal(a.label, b.label)
-        and all(torch.equal(getattr(a.correspondences, n), getattr(b.correspondences, n)) for n in fields)
-    )
+    pairs = [(a.F, b.F), (a.label, b.label)]
+    pairs += [(getattr(a.correspondences, name), getattr(b.correspondences, name)) for name in fields]
+    return all(torch.equal(x, y) for x, y in pairs)
 
 
 def expect_truth(m: LabelledMatches) -> None:
@@ -200,11 +198,8 @@ def test_ranges_are_kept() -> None:
 
 
 def test_mistakes_are_named() -> None:
-    for options, message in (
-        ({"swap": 2}, "swap is 2"),
-        ({"turn": 0.6, "quarter_turn": 0.6}, "exclude each other"),
-        ({"ratio": (1.0, 0.8)}, "ratio is"),
-    ):
+    turns = {"turn": 0.6, "quarter_turn": 0.6}
+    for options, message in (({"swap": 2}, "swap is 2"), (turns, "exclude"), ({"ratio": (1.0, 0.8)}, "ratio is")):
         with pytest.raises(ValueError, match=message):
             Augmentation(**options)
     with pytest.raises(ValueError, match="batch of 2"):
@@ -357,9 +352,8 @@ def test_a_keypoint_beside_an_edge_of_depth_may_belong_to_either_side() -> None:
 
 def test_a_point_that_would_be_behind_the_other_camera_is_wrong() -> None:
     K = np.eye(3)
-    forward = transfer_error(
-        np.zeros((1, 2)), np.ones((1, 1)), np.zeros((1, 2)), K, K, np.eye(3), np.array([0, 0, -2.0])
-    )
+    origin = np.zeros((1, 2))
+    forward = transfer_error(origin, np.ones((1, 1)), origin, K, K, np.eye(3), np.array([0, 0, -2.0]))
     assert forward == np.inf
     assert by_transfer(forward, np.array([np.nan]), np.zeros(1)).tolist() == [0]
 

@@ -48,8 +48,6 @@ def contents(folder: Path) -> dict[str, str]:
 
 
 class Some(list[ImagePair]):
-    """Some pairs of a data set, changed in part; without depth."""
-
     name, digest = "some", "1"
 
 
@@ -399,9 +397,7 @@ def test_training_has_no_scene_of_the_test_split(matched: MatchedPairs) -> None:
     plans = {plan for (_, split), plan in PLANS.items() if split == "test"}
     test = {Task(family, "test", n, 0, plan).name for plan in plans for family in FAMILIES for n in range(plan.scenes)}
     training = {about["scene"] for about in matched.pairs}
-    assert test
-    assert training
-    assert not training & test
+    assert (bool(test), bool(training), training & test) == (True, True, set())
     assert all(f"rendered/{about['scene']}/" in about["identity"] for about in matched.pairs)
 
 

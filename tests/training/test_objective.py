@@ -151,10 +151,8 @@ def test_losses_of_the_estimate_pass_gradcheck() -> None:
     """On an image of a few pixels, so that finite differences suit all elements of F; no limit, which has a kink."""
     F_true, F_est = (torch.randn(2, 3, 3, generator=generator(s), dtype=torch.float64) for s in (2, 5))
     size = torch.tensor([[3, 4]]).expand(2, 2)
-    for loss in (
-        functools.partial(training.geometric_loss, points=6, limit=1e9),
-        functools.partial(training.nsgd_loss, samples=6),
-    ):
+    geometric = functools.partial(training.geometric_loss, points=6, limit=1e9)
+    for loss in (geometric, functools.partial(training.nsgd_loss, samples=6)):
 
         def of_estimate(F: Tensor, loss: functools.partial[Tensor] = loss) -> Tensor:
             return loss(F, F_true, size, size)
@@ -223,9 +221,8 @@ def test_training_goes_through_degenerate_scenes(fit: Fit) -> None:
     """
     c = core.collate([laws.scene(1), laws.scene(2), *laws.degenerate().values()])
     c = c.replace(x0=c.x0.double(), x1=c.x1.double())
-    E = fundamental_from_calibration(
-        K[None], K[None], torch.eye(3, dtype=torch.float64)[None], torch.tensor([[1.0, 0.0, 0.2]]).double()
-    )
+    R, t = torch.eye(3, dtype=torch.float64)[None], torch.tensor([[1.0, 0.0, 0.2]]).double()
+    E = fundamental_from_calibration(K[None], K[None], R, t)
     shared = (E.expand(len(c.mask), 3, 3), c.size0, c.size1)
     label = torch.where(c.mask, (c.ratio < 0.6).to(torch.int8), -1)
     torch.manual_seed(0)
@@ -237,9 +234,8 @@ def test_training_goes_through_degenerate_scenes(fit: Fit) -> None:
         F, valid = fit(c, torch.where(c.mask, torch.sigmoid(logit), 0.0))
         options = {"valid": valid, "seed": step, "key": c.key}
         judged = training.classification_loss(logit, label)
-        geometry = 0.5 * training.geometric_loss(F, *shared, **options) + 0.1 * training.nsgd_loss(
-            F, *shared, **options
-        )
+        geometry = 0.5 * training.geometric_loss(F, *shared, **options)
+        geometry = geometry + 0.1 * training.nsgd_loss(F, *shared, **options)
         for loss in (geometry, judged + geometry):
             assert bool(loss.isfinite())
             optimiser.zero_grad()
@@ -385,9 +381,8 @@ def test_reliability() -> None:
     expected = reference.expected_calibration_error(p[kept].tolist(), label[kept].tolist(), 7)
     assert table.error == pytest.approx(expected, rel=1e-12)
     assert int(table.matches.sum()) == int(kept.sum())
-    exact = training.reliability(
-        torch.tensor([0.25] * 4 + [0.875] * 8), torch.tensor([1, 0, 0, 0, 0] + [1] * 7).to(torch.int8)
-    )
+    share, right = torch.tensor([0.25] * 4 + [0.875] * 8), torch.tensor([1, 0, 0, 0, 0] + [1] * 7)
+    exact = training.reliability(share, right.to(torch.int8))
     assert (exact.error, exact.observed[[2, 8]].tolist()) == (0, [0.25, 0.875])
     assert bool(exact.predicted[[0, 1, 9]].isnan().all())
     assert math.isnan(training.reliability(p, torch.full_like(label, -1)).error)

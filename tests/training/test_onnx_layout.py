@@ -14,9 +14,8 @@ from fmtorch.features.networks import ARCHITECTURES, build
 from scripts.patch_networks.onnx_export import export, laid_out, quantize
 from tests.features.test_networks import randomized
 
-SHIPPED = [
-    (name, f"{name}{precision}.onnx") for name in ARCHITECTURES for precision in ("", ".int8") if name != "orinet"
-]
+NAMES = [name for name in ARCHITECTURES if name != "orinet"]
+SHIPPED = [(name, f"{name}{precision}.onnx") for name in NAMES for precision in ("", ".int8")]
 
 
 @pytest.fixture(scope="module")

@@ -35,11 +35,11 @@ SHORT = [
     "validation.uses.hard.estimator=ransac", "validation.uses.prior.estimator=msac", "augmentation.crop=0",
     "features.max_features=300",
 ]  # fmt: skip
+SMALL_LC = ["pruner.lc.network.channels=8", "pruner.lc.network.blocks=2", "output=out"]
 
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
-    """A set of two scenes: photographs moved sideways."""
     return draw_set(tmp_path / "Set", "ab", pairs=[(0, 1), (0, 2), (1, 2)])
 
 
@@ -60,18 +60,16 @@ def test_a_network_of_ones_own_is_trained_and_used(root: Path, tmp_path: Path) -
     (here / "my_conf" / "pruner" / "mine.yaml").write_text(preset)
     train, evaluate = (line.removeprefix("fmtorch ").split() for line in commands.strip().splitlines())
     data = ["dataset=fmbench", f"dataset.root={root}"]
-    trained = run_command(
-        *[w.strip("'") for w in train if not w.startswith("dataset")], *data, *SHORT, "output=out", cwd=here
-    )
+    words = [w.strip("'") for w in train if not w.startswith("dataset")]
+    trained = run_command(*words, *data, *SHORT, "output=out", cwd=here)
     assert trained.returncode == 0, trained.stderr
     assert (here / "out" / "mine.safetensors").is_file()
     assert "| trained on | 3 pairs of 1 scenes of fmbench |" in (here / "out" / "mine.md").read_text()
     figures = json.loads((here / "out" / "validation.json").read_text())
     assert 0 <= figures["prior/AUC@0.05"] <= 1
     used = [w.strip("'") for w in evaluate if not w.startswith(("dataset", "pruner.mine.file"))]
-    evaluated = run_command(
-        *used, *data, "pruner.mine.file=out/mine.safetensors", "output=run", "features.max_features=300", cwd=here
-    )
+    used += ["pruner.mine.file=out/mine.safetensors", "output=run", "features.max_features=300"]
+    evaluated = run_command(*used, *data, cwd=here)
     assert evaluated.returncode == 0, evaluated.stderr
     identity = (here / "run" / "run.json").read_text()
     assert "mine" in identity
@@ -79,9 +77,8 @@ def test_a_network_of_ones_own_is_trained_and_used(root: Path, tmp_path: Path) -
 
 def test_two_processes_train_one_network(root: Path, tmp_path: Path) -> None:
     """With gloo, on the CPU: each has batches of its own, and gradients are averaged."""
-    small = ["pruner.lc.network.channels=8", "pruner.lc.network.blocks=2", "output=out"]
     two = ["trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2"]
-    ended = run_command("train", "dataset=fmbench", f"dataset.root={root}", *SHORT, *small, *two, cwd=tmp_path)
+    ended = run_command("train", "dataset=fmbench", f"dataset.root={root}", *SHORT, *SMALL_LC, *two, cwd=tmp_path)
     assert ended.returncode == 0, ended.stderr
     checkpoint = torch.load(tmp_path / "out" / "checkpoints" / "step=6.ckpt", weights_only=True)
     assert checkpoint["global_step"] == 6
@@ -98,8 +95,7 @@ def trained(monkeypatch: pytest.MonkeyPatch, folder: Path, *overrides: str) -> P
 
 
 def test_the_command_goes_on_and_refuses_another_training(root, tmp_path, monkeypatch):
-    small = ["pruner.lc.network.channels=8", "pruner.lc.network.blocks=2", "output=out"]
-    options = ["dataset=fmbench", f"dataset.root={root}", *SHORT, *small]
+    options = ["dataset=fmbench", f"dataset.root={root}", *SHORT, *SMALL_LC]
     folder = trained(monkeypatch, tmp_path, *options)
     weights = (folder / "lc.safetensors").read_bytes()
     assert (folder / "lc.onnx").is_file()
@@ -113,9 +109,8 @@ def test_photographs_join_the_training(root: Path, tmp_path: Path, monkeypatch: 
     """Two photographs seen as planes beside the pairs of a data set; the same command finds its views and matches."""
     for name in ("one", "two"):
         draw(tmp_path / "photographs" / name / "a.png", seed=len(name))
-    options = ["dataset=fmbench", f"dataset.root={root}", *SHORT, "pruner.lc.network.channels=8",
-               "pruner.lc.network.blocks=2", f"planes.photographs={tmp_path / 'photographs'}", "planes.views=3",
-               "planes.tilt=30", "output=out"]  # fmt: skip
+    planes = [f"planes.photographs={tmp_path / 'photographs'}", "planes.views=3", "planes.tilt=30"]
+    options = ["dataset=fmbench", f"dataset.root={root}", *SHORT, *SMALL_LC, *planes]
     folder = trained(monkeypatch, tmp_path, *options)
     weights = (folder / "lc.safetensors").read_bytes()
     card = (folder / "lc.md").read_text()
@@ -129,8 +124,7 @@ def test_photographs_join_the_training(root: Path, tmp_path: Path, monkeypatch: 
 def test_one_scene_alone_is_validated_on_its_last_images(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of eight images the last two make one pair, the first six fifteen; the others join both sides."""
     root = draw_set(tmp_path / "Set", "a", images=8, pairs=list(itertools.combinations(range(8), 2)))
-    small = ["pruner.lc.network.channels=8", "pruner.lc.network.blocks=2", "output=out"]
-    folder = trained(monkeypatch, tmp_path, "dataset=fmbench", f"dataset.root={root}", *SHORT, *small)
+    folder = trained(monkeypatch, tmp_path, "dataset=fmbench", f"dataset.root={root}", *SHORT, *SMALL_LC)
     card = (folder / "lc.md").read_text()
     assert "| trained on | 15 pairs of 1 scenes of fmbench |" in card
     assert "| validated on | 1 pairs of Set (" in card
@@ -181,8 +175,6 @@ PAIRS = [labelled_pair(i) for i in range(24)]
 
 
 class Steps:
-    """The pairs of each step, four for each process."""
-
     def __init__(self, *where: int) -> None:
         self.start, self.rank, self.processes = where
 
@@ -192,7 +184,6 @@ class Steps:
 
 
 def batches(*where: int) -> DataLoader[LabelledMatches]:
-    """Training batches of a process from a step on."""
     return DataLoader(PAIRS, batch_sampler=Steps(*where), collate_fn=collate)  # type: ignore[arg-type]
 
 

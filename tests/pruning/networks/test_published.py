@@ -214,10 +214,8 @@ def listed(name: str) -> set[str]:
 
 def written(name: str, network: nn.Module, file: Path, without: str = "") -> None:
     """A checkpoint as the authors' code writes it on several cards: convolutions are 4-D, a figure is NumPy's."""
-    state = {
-        authors_key(name, key): value[..., None, None] if value.dim() == 2 else value
-        for key, value in network.state_dict().items()
-    }
+    values = {authors_key(name, key): value for key, value in network.state_dict().items()}
+    state = {key: value[..., None, None] if value.dim() == 2 else value for key, value in values.items()}
     unused = listed(name) - state.keys()
     assert state.keys() <= listed(name)
     assert all(UNUSED.search(key) for key in unused)
