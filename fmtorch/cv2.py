@@ -85,6 +85,8 @@ def findFundamentalMat(  # OpenCV's name, as all of this module
             return None, _written(None, mask)
         of_all: Any = opencv.findFundamentalMat(x1, x2, method)
         return of_all[0], _written(of_all[1], mask)
+    if ransacReprojThreshold <= 0:  # as OpenCV
+        ransacReprojThreshold = USUAL_THRESHOLD
     scale = _scale_to_pixels([x1, x2], ransacReprojThreshold)
     name, options = _preset(method, scale * ransacReprojThreshold, confidence, maxIters)
     estimate = find.find_fundamental(scale * x1, scale * x2, estimator=name, **options)
@@ -116,6 +118,8 @@ def findHomography(
     if method == 0 or len(src) < MIN_H:
         of_all: Any = opencv.findHomography(src, dst, method)
         return of_all[0], _written(of_all[1], mask)
+    if ransacReprojThreshold <= 0:  # as OpenCV
+        ransacReprojThreshold = USUAL_THRESHOLD
     scale = _scale_to_pixels([dst], ransacReprojThreshold, src)
     method = opencv.RANSAC if method == opencv.RHO else method
     _, options = _preset(method, scale * ransacReprojThreshold, confidence, maxIters)

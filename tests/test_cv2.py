@@ -68,6 +68,9 @@ def test_ransac_with_threshold_and_confidence() -> None:
     expect_same_kind(*both("findFundamentalMat", PTS1, PTS2, cv2.FM_RANSAC, 3, 0.99, 500))
     by_name = {"method": cv2.USAC_MAGSAC, "ransacReprojThreshold": 1.0, "confidence": 0.999, "maxIters": 500}
     expect_same_kind(*both("findFundamentalMat", PTS1, PTS2, **by_name))
+    for usual in (0, -1):  # is a threshold of 3
+        np.testing.assert_array_equal(cv2.findFundamentalMat(PTS1, PTS2, cv2.FM_RANSAC, usual, 0.99)[0], F)
+        expect_same_kind(*both("findHomography", PTS1, PTS2, cv2.RANSAC, usual))
     few = cv2.findFundamentalMat(PTS1, PTS2, cv2.FM_RANSAC, 0.2)[1]
     assert few.sum() < 0.7 * mask.sum()
 

@@ -17,7 +17,7 @@ from fmtorch.commands.options import EVAL, EvalOptions
 from fmtorch.commands.report import by_dataset, named
 from fmtorch.core.files import write_whole
 from fmtorch.core.terminal import console, errors, progress_bars, reporter
-from fmtorch.data import ImagePair
+from fmtorch.data import ImagePair, PairDataset
 from fmtorch.evaluation import curves, tables
 from fmtorch.evaluation.run import PairCameras, built_with, cameras_of, evaluate_pairs, run_identity, select
 from fmtorch.evaluation.statistics import ALL, Group, summarize
@@ -27,6 +27,7 @@ from fmtorch.pipeline.exporting import exportable
 from fmtorch.pipeline.pipeline import Pipeline, build_pipeline
 from fmtorch.presets.composition import execution_of, plain, read_fields
 from fmtorch.runs import CachedFeatures, RunFolder, identity_digest
+from fmtorch.two_view.arguments import expect_lens
 
 SWEPT = "FMTORCH_SWEPT"  # names the file in which the jobs of a sweep note their run folders
 
@@ -46,6 +47,7 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
     model = getattr(presets.target_of(dataset_config, "dataset"), "model", "fundamental")
     if model != "fundamental" and (exports or fields.cameras is not None or fields.lens is not None):
         raise ValueError(f"the data set has {model} matrices, which take no export=, cameras=, lens=: leave them out")
+    expect_lens(fields.lens)
     with progress_bars() as progress:
         pipeline: Pipeline = build_pipeline(config, device, model)
         dataset = data.build(dataset_config, reporter(progress, "drawing scenes"))
@@ -53,7 +55,7 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
         identity = run_identity(config, pipeline_name, pipeline, dataset.digest, *known)
         name = f"{pipeline_name.replace('/', '-')}-{identity_digest(identity)[:8]}"
         folder = RunFolder.open(fields.output or Path(f"runs/{dataset.name}/{name}"), identity)
-        pairs = select([dataset[i] for i in range(len(dataset))], fields.limit)
+        pairs = select(_pairs_of(dataset), fields.limit)
         journal = _journal(folder.path, pairs) if exports else None
         own = pairs if shard is None else shard.of(pairs)
         todo = _missing(own, folder, journal, again=bool(fields.debug))
@@ -88,6 +90,15 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
             again = f"an edit of your parts makes a new run; mended otherwise, delete {folder.path} to run again"
         raise ValueError(f"every pair failed, the first because: {reason}; {again}")
     return folder.path
+
+
+def _pairs_of(dataset: PairDataset) -> list[ImagePair]:
+    """All pairs of a data set, which may be anybody's. Raises ValueError where one is something else."""
+    pairs = [dataset[i] for i in range(len(dataset))]
+    if wrong := [i for i, pair in enumerate(pairs) if not isinstance(pair, ImagePair)]:
+        kind = type(pairs[wrong[0]]).__name__
+        raise ValueError(f"{type(dataset).__name__}[{wrong[0]}] is a {kind}; the pairs of a data set are ImagePair")
+    return pairs
 
 
 def _missing(pairs: Sequence[ImagePair], folder: RunFolder, journal: MatchStore | None, again: bool) -> list[ImagePair]:

@@ -135,6 +135,10 @@ class NoFeatures:
         return Features(torch.zeros(0, 2, 3), torch.zeros(0), torch.zeros(0, 0), size)
 
 
+class WrongOutput(TypeError, ValueError):
+    """What somebody's part returned is of another kind than its stage: a mistake that its author can put right."""
+
+
 def output_of(
     part: object, value: object, kind: type[Output], given: Correspondences | None = None, like: Tensor | None = None
 ) -> Output:
@@ -147,7 +151,7 @@ def output_of(
     name = f"{named.__module__}.{named.__qualname__}"
     if not isinstance(value, kind):
         what = "None" if value is None else f"a {type(value).__name__}"
-        raise TypeError(f"{name} returned {what}; it must return {kind.__name__}")
+        raise WrongOutput(f"{name} returned {what}; it must return {kind.__name__}")
     first = value.x0 if isinstance(value, Correspondences) else value.F if isinstance(value, Estimate) else value.lafs
     if first.dtype not in (torch.float32, torch.float64):
         raise ValueError(f"{name} returned {kind.__name__} of {first.dtype}; they must be of float32 or float64")

@@ -36,7 +36,7 @@ LENS = Rule(
         (lens[..., 1] == torch.inf)
         | ((lens[..., 1] >= 0) & (lens[..., 0] >= MIN_LENS) & (lens[..., 0] <= MAX_LENS) & (lens[..., 1] < torch.inf))
     ),
-    "it is lambda in half diagonals, from -0.45, below which images fold, to 0.2, and its deviation",
+    "it is lambda in half diagonals, from -0.45 to 0.2, and its deviation",
 )
 
 MAX_ROWS = 20  # of a table in a notebook

@@ -4,7 +4,7 @@ import dataclasses
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from jaxtyping import Float, Int
@@ -58,8 +58,10 @@ def build(config: Mapping[str, Any], progress: Progress | None = None) -> PairDa
     """The data set of a config with a `_target_`; `progress`: called while it draws its images, if it does.
     Raises ValueError, naming the option, where the config does not fit its target, and what this raises itself."""
     reports = "progress" in inspect.signature(presets.target_of(config, "dataset")).parameters
-    dataset: PairDataset = presets.instantiate(config, "dataset", **({"progress": progress} if reports else {}))
-    return dataset
+    dataset: Any = presets.instantiate(config, "dataset", **({"progress": progress} if reports else {}))
+    if missing := [name for name in ("name", "digest") if not hasattr(dataset, name)]:
+        raise ValueError(f"{type(dataset).__name__} has no {' and no '.join(missing)}; a PairDataset has both")
+    return cast(PairDataset, dataset)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

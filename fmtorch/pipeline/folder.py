@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from fmtorch.core import failures
 from fmtorch.core.settings import claim
 from fmtorch.data import DataError, ImageSource, read_image
 from fmtorch.io.match_store import MatchStore, StoredPair
@@ -206,7 +207,8 @@ def described_or_matched(pipeline: Pipeline, task: Photograph | DescribedPair) -
 
 
 def _in_a_line(error: Exception) -> str:
-    return f"{type(error).__name__}: {error}".splitlines()[0]
+    place = failures.place_of(error)
+    return f"{type(error).__name__}: {error}".splitlines()[0] + (f" ({place})" if place else "")
 
 
 def folder_workers(pipeline: Pipeline, execution: Execution | None = None) -> WorkerPool:

@@ -315,6 +315,7 @@ def match(
     K0, K1 = (K if lens is None else lens.K for K, lens in ((K0, lens0), (K1, lens1)))
     if lens is not None:
         expect_lenses(pipeline.estimator, type(pipeline.estimator).__name__)
+        arguments.expect_lens(lens)
     if lens is not None and (lens0 is not None or lens1 is not None):
         raise ValueError("lens and lens0 or lens1 are given; a lens is estimated or calibrated: leave one of them out")
     cameras = arguments.camera_fields(K0, K1, focal, sizes_known=True)

@@ -58,6 +58,10 @@ PICTURE_HEIGHT = 480  # px
 QUIET = ("lightning.pytorch", "lightning.fabric")  # loggers, whose advice does not apply here
 
 
+class Diverged(FloatingPointError, ValueError):
+    """A loss or a gradient that is not finite: the network's output, or too high a learning rate."""
+
+
 class PrunerTraining(lightning.LightningModule):
     """Trains a network that tells P(inlier)."""
 
@@ -86,7 +90,7 @@ class PrunerTraining(lightning.LightningModule):
         terms = self.objective(predict(self.network, batch.correspondences), batch, self.global_step)
         if not bool(torch.isfinite(terms["loss"])):
             values = {name: float(value) for name, value in terms.items()}
-            raise FloatingPointError(f"the loss of step {self.global_step} is not finite: {values}")
+            raise Diverged(f"the loss of step {self.global_step} is not finite: {values}")
         self.log_dict({f"train/{name}": value.detach() for name, value in terms.items()}, batch_size=len(batch))
         return terms["loss"]
 
@@ -95,7 +99,7 @@ class PrunerTraining(lightning.LightningModule):
         total = torch.stack(norms).norm() if norms else torch.zeros(())
         scaler = getattr(self.trainer.precision_plugin, "scaler", None)  # which skips a step that overflowed, as meant
         if not bool(torch.isfinite(total)) and scaler is None:
-            raise FloatingPointError(f"the gradient of step {self.global_step} is not finite")
+            raise Diverged(f"the gradient of step {self.global_step} is not finite")
         self.log("train/gradient_norm", total)
 
     def validation_step(self, batch: Any, index: int) -> None:

@@ -251,6 +251,11 @@ def lens_fields(lens: Lens) -> dict[str, Any]:
     return {"lens": _of_both(lens, "lens", UNKNOWN_LENS, f"it must be {LENS_FORMS}")}
 
 
+def expect_lens(lens: Lens) -> None:
+    """Raise ValueError for a lens that is none, before there are pairs."""
+    correspondences(torch.zeros(1, 0, 2), torch.zeros(1, 0, 2), lens=lens)
+
+
 def _expect_calibrations(c: Correspondences) -> None:
     """Raise ValueError naming K0 or K1 where it is no calibration matrix of the image, of a single pair."""
     if len(c) != 1:

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from fmtorch.core.checks import number
-from fmtorch.core.stages import Estimator, Pruner, model_of
+from fmtorch.core.stages import Estimator, Pruner, model_of, output_of
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.estimators.ransac import Ransac
 from fmtorch.geometry.significance import judged
@@ -57,9 +57,14 @@ def estimated_by(
         c = _with_prior(c, estimator)
         if assume_sizes and c.size0 is None and getattr(estimator, "assumes_cameras", False):
             attempts = attempts_of(c)
-            return better_of(attempts, [judged(estimator(batch, seed), batch) for batch in attempts.batches])
-        return judged(estimator(c, seed), c)
+            return better_of(attempts, [_judged(estimator, batch, seed) for batch in attempts.batches])
+        return _judged(estimator, c, seed)
     return KnownCameras(estimator, functools.partial(_with_prior, estimator=estimator), covariance)(c, seed)
+
+
+def _judged(estimator: Estimator, c: Correspondences, seed: int) -> Estimate:
+    """The estimate of an estimator, which may be anybody's, with its significance."""
+    return judged(output_of(estimator, estimator(c, seed), Estimate, c), c)
 
 
 def _expect_gradients(c: Correspondences, estimator: Estimator, name: str) -> None:

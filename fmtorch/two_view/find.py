@@ -141,6 +141,8 @@ def find_fundamental(
         (True, 60)
     """
     if covariance and K0 is None and K1 is None and focal is None:
+        if size0 is None or isinstance(size0, str):
+            raise ValueError("covariance needs K0 and K1, or the image sizes: give size0 and size1")
         focal = "unknown"
     if lens is not None:
         _expect_lens(size0, K0 is not None or K1 is not None, covariance)

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from fmtorch.core.records import ungraphed
-from fmtorch.core.stages import Estimator, Pruner
+from fmtorch.core.stages import Estimator, Pruner, output_of
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.geometry.arithmetic import cofactors, component_sum, determinant, matmul3, sqrt
 from fmtorch.geometry.cameras import MIN_SIDE_PX, calibration_problems, cross_matrix, mapped, square_pixels
@@ -52,7 +52,7 @@ class KnownCameras:
             images = _images(_completed(c))
             square = _square(c, images)
         square = square if self.pruner is None else self.pruner(square)
-        estimate = judged(self.estimator(square, seed), square)
+        estimate = judged(output_of(self.estimator, self.estimator(square, seed), Estimate, square), square)
         with one_thread(c.mask.device):
             known = _with_cameras(estimate, square, images, self.covariance)
         return known if images.map is None else known.derived(contradicted=self._contradicted(c, known, seed))

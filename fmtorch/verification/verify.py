@@ -21,7 +21,7 @@ import torch
 from numpy.typing import NDArray
 
 from fmtorch import presets
-from fmtorch.core import checks, claim, replacing, stages
+from fmtorch.core import checks, claim, replacing, stages, terminal
 from fmtorch.core.types import CONTRADICTED, Correspondences, collate, pair_key
 from fmtorch.core.version import __version__
 from fmtorch.io import colmap
@@ -193,13 +193,20 @@ def estimate_batch(estimator: stages.Estimator, batch: Batch) -> Geometries:
         except Exception as error:  # one pair does not end the work on the others
             problems.append((own, _first_line(error)))
     results: dict[int, PairGeometry] = {}
-    for alike in _alike(given):
+    groups = _alike(given)
+    while groups:
+        alike = groups.pop(0)
         c = collate([given[i] for i in alike])
-        estimate = estimated_by(estimator, c, batch.mode.seed)
+        try:
+            estimate = estimated_by(estimator, c, batch.mode.seed)
+        except Exception as error:  # of an estimator of the user's own
+            groups += [[i] for i in alike] if len(alike) > 1 else []
+            problems += [(ids[i], terminal.error_line(error)) for i in alike[:1] if len(alike) == 1]
+            continue
         configuration = pair_type.classify(c, estimate, focal_deviation=0, seed=batch.mode.seed)
         of_these = pair_geometries([pairs[i].matches for i in alike], c, estimate, configuration)
         results |= zip(alike, of_these, strict=True)
-    return [(own, results[i]) for i, own in enumerate(ids)], problems
+    return [(own, results[i]) for i, own in enumerate(ids) if i in results], problems
 
 
 def _alike(given: Sequence[Correspondences]) -> list[list[int]]:
@@ -395,6 +402,7 @@ def verify_by(
         raise ValueError(f"cameras is {mode.cameras!r}; it must be one of {', '.join(get_args(Cameras))}")
     if mode.shard is None and not mode.force and (count := _finished(paths)):
         return Verification(paths.output or Path(), count, count, {}, (), time.perf_counter() - begin)
+    arguments.expect_lens(mode.lens)
     estimator = make()
     if (gives := stages.model_of(estimator)) != "fundamental":
         raise ValueError(f"estimator gives {gives} matrices; verify needs one that gives fundamental matrices")
@@ -408,6 +416,9 @@ def verify_by(
         parts = GeometryParts(end.with_name(f"{end.name}.parts"), {**settings, **store.identity()})
         run = VerificationRun(store, parts, mode)
         run.each_batch(make, mode.execution, report)
+        if whole and run.problems and not parts.done and len(run.todo) == len(run.pairs):
+            shutil.rmtree(parts.folder)
+            raise ValueError(f"no pair has a geometry, the first because of {run.problems[0]}")
         if whole:
             run.write()
     if whole:

@@ -127,6 +127,17 @@ def test_a_users_own_pruner_by_config_dir(header: str, data: list[str], command:
     assert all(row["ok"] for row in rows(tmp_path / "run"))
 
 
+def test_a_data_set_that_is_something_else(data: list[str], command: RunCommand, tmp_path: Path) -> None:
+    """Of a class without a digest, and of pairs that are none."""
+    words = [*own(tmp_path, "dataset", "_target_: own_dataset.Numbers\n"), "dataset=mine", *OPTIONS]
+    (tmp_path / "own_dataset.py").write_text("class Numbers(list):\n    name = 'numbers'\n")
+    assert "ended: error: Numbers has no digest; a PairDataset has both" in command("eval", *words, cwd=tmp_path)
+    numbers = "    name = digest = 'numbers'\n    def __init__(self):\n        super().__init__([1, 2])\n"
+    (tmp_path / "own_dataset.py").write_text(f"class Numbers(list):\n{numbers}")
+    sys.modules.pop("own_dataset", None)
+    assert "ended: error: Numbers[0] is a int; the pairs of a data set are Im" in command("eval", *words, cwd=tmp_path)
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -135,6 +146,7 @@ def test_a_users_own_pruner_by_config_dir(header: str, data: list[str], command:
         ("pruner=typo", "pruner.typo: no option threshhold; there are: threshold"),
         ("pruner=lc pruner.lc.file=runs/absent", "absent.safetensors does not exist: fmtorch train pruner=lc"),
         ("dataset.root=nowhere", "nowhere: no such folder"),
+        ("lens=-0.6", "it is lambda in half diagonals, from -0.45 to 0.2"),
         ("device=cuda", "sees no CUDA device"),
         ("estimator.score=psac", "score is 'psac'"),
     ],

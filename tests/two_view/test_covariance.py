@@ -169,7 +169,7 @@ def test_what_was_not_asked_for_is_not_there() -> None:
 
 def test_covariance_needs_a_size_or_a_calibration() -> None:
     s = reference.scene(0)
-    with pytest.raises(ValueError, match="size0 and size1"):
+    with pytest.raises(ValueError, match="covariance needs K0 and K1, or the image sizes"):
         fmtorch.find_fundamental(s.x0, s.x1, covariance=True)
     assert not bool(fmtorch.find_essential(s.x0, s.x1, **CAMERAS, covariance=True).deviation_degrees.isnan().any())
 

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 import fmtorch
-from fmtorch.core import pair_key
+from fmtorch import presets
+from fmtorch.core import Correspondences, Estimate, pair_key
 from fmtorch.jobs import Execution
 from tests.processes import run_command
 from tests.verification import databases
@@ -141,6 +142,37 @@ def test_broken_pairs_are_lines_and_stay_out(tmp_path: Path) -> None:
     assert said[6].startswith("h/x0, h/x1: K0")
     assert said[7].startswith("i/x0, i/x1: i/x0 cannot be read")
     assert {key.partition("/")[0] for key in load(tmp_path / "verified.npz")} == {"a"}
+
+
+class FailsOnFew:
+    """Somebody's estimator, which raises where a pair has fewer matches than these."""
+
+    def __init__(self, least: int) -> None:
+        self.least = least
+
+    def __call__(self, c: Correspondences, seed: int = 0) -> Estimate | None:
+        if int(c.count().min()) < self.least:
+            raise ZeroDivisionError("too few")
+        return presets.build("estimator", "lmeds")(c, seed) if self.least else None
+
+
+def test_what_an_estimator_raises_is_of_its_pair_alone(tmp_path: Path) -> None:
+    (tmp_path / "estimator").mkdir()
+    (tmp_path / "estimator" / "mine.yaml").write_text(f"_target_: {__name__}.FailsOnFew\nleast: 50\n")
+    x0, x1 = points()[0]
+    arrays = {"a/x0": x0, "a/x1": x1, "b/x0": x0[:40], "b/x1": x1[:40]}
+    output = tmp_path / "verified.npz"
+    given: dict[str, Any] = {"output": output, "estimator": "mine", "config_dir": tmp_path}
+    result = fmtorch.verify(matches=save(tmp_path / "matches.npz", arrays), **given)
+    assert result.verified == 1
+    assert [text.partition(" (")[0] for text in result.problems] == ["b/x0, b/x1: ZeroDivisionError: too few"]
+    output.unlink()
+    for least, said in ((1000, "ZeroDivisionError: too few"), (0, "FailsOnFew returned None; it must return Estimate")):
+        with pytest.raises(ValueError, match=f"no pair has a geometry, the first because of .*{said}"):
+            fmtorch.verify(matches=tmp_path / "matches.npz", least=least, **given)
+        assert {path.name for path in tmp_path.iterdir()} == {"estimator", "matches.npz"}
+    with pytest.raises(ValueError, match="it is lambda in half diagonals"):
+        fmtorch.verify(matches=tmp_path / "matches.npz", output=output, lens=-0.6)
 
 
 def test_the_checks_are_those_of_the_functions(tmp_path: Path) -> None:

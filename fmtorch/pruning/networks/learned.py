@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
-from fmtorch.core import Correspondences, NetworkFileError, models_dir, onnx_session
+from fmtorch.core import Correspondences, NetworkFileError, models_dir, onnx_session, stages
 from fmtorch.pruning.networks.layers import Slots
 
 SUFFIXES = {"torch": ".safetensors", "onnx": ".onnx"}  # of the file that each runtime reads
@@ -157,8 +157,8 @@ def predict(network: nn.Module, c: Correspondences) -> Prediction:
     if isinstance(output, Prediction):
         return output
     if not isinstance(output, Tensor):
-        kind = type(output).__name__
-        raise TypeError(f"{type(network).__name__} returns {kind}; a network of matches returns log-odds or Prediction")
+        name, kind = type(network).__name__, type(output).__name__
+        raise stages.WrongOutput(f"{name} returns {kind}; a network of matches returns log-odds or Prediction")
     if output.shape != c.mask.shape:
         of = f"log-odds of shape {tuple(output.shape)} for matches of shape {tuple(c.mask.shape)}"
         raise ValueError(f"{type(network).__name__} returns {of}; there must be one for each match")
