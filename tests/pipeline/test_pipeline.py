@@ -377,15 +377,15 @@ def no_keys(c: Correspondences) -> Correspondences:
 @pytest.mark.parametrize(
     ("stage", "part", "said"),
     [
-        ("features", lambda image: None, r"^features: TypeError: .*<lambda> returned None; it must return Features$"),
-        ("matcher", lambda a, b: (a, b), "^matching: TypeError: .* returned a tuple; it must return Correspondences"),
+        ("features", lambda image: None, r"^features: WrongOutput: .*<lambda> returned None; it must return Features$"),
+        ("matcher", lambda a, b: (a, b), "^matching: WrongOutput: .* returned a tuple; it must return Correspondences"),
         ("matcher", lambda a, b: Correspondences(a.keypoints[None].half(), b.keypoints[None].half(),
          torch.ones(1, 9, dtype=torch.bool)), "Correspondences of torch.float16; they must be of float32 or float64"),
         ("matcher", lambda a, b: matches(a, b).to("meta"), "Correspondences on meta; they must be on cpu"),
-        ("pruners", {"own": lambda c: c.mask}, "^pruning: TypeError: .* returned a Tensor; it must return Correspond"),
+        ("pruners", {"own": lambda c: c.mask}, "^pruning: WrongOutput: .* returned a Tensor; it must return Corresp"),
         ("pruners", {"own": no_keys}, r"no_keys returned matches without their pairs' keys; use c\.keep\(mask\)"),
         ("pruners", {"own": lambda c: c[:0]}, "Correspondences of 0 pairs; they must be of 1"),
-        ("estimator", lambda c, seed: c.x0, "^estimation: TypeError: .* returned a Tensor; it must return Estimate"),
+        ("estimator", lambda c, seed: c.x0, "^estimation: WrongOutput: .* returned a Tensor; it must return Estimate"),
         ("estimator", lambda c, seed: estimate(c, slots=5), r"inliers of shape \(1, 5\); .* of the mask, \(1, 9\)"),
     ],
 )  # fmt: skip

@@ -146,7 +146,8 @@ def test_settings_name_pipelines_columns_and_figures_there_are(name: str) -> Non
     settings = settings_of(name)
     assert {*settings.get("columns", ()), *settings.get("compared", ())} <= {*FIGURES, *MEDIANS, "failed"}
     others = {word for two in settings.get("differences", ()) for word in two} - set(settings["methods"])
-    assert {word.split()[0] for word in others} <= set(presets.available("pipeline"))
+    named = {*presets.available("pipeline"), *(word.split()[0] for word in settings["methods"])}  # on a command line
+    assert {word.split()[0] for word in others} <= named
     if "published" in settings:
         assert published(Path("scripts/benchmark") / settings["published"])
     for words in list(settings["methods"].values())[::8]:  # composing takes a while
