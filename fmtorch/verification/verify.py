@@ -31,7 +31,7 @@ from fmtorch.jobs.execution import Execution, Shard, shard_of
 from fmtorch.jobs.runner import Factory, Local, Source, TaskRunner, WorkerPool
 from fmtorch.pipeline.pair_geometries import pair_geometries
 from fmtorch.two_view import arguments, pair_type
-from fmtorch.two_view.estimation import estimated_by
+from fmtorch.two_view.estimation import estimated_by, expect_lenses
 
 Cameras = Literal["stored", "shared", "unknown"]
 """What is taken for known: the cameras of the database, that both images have one focal length, or nothing."""
@@ -191,7 +191,7 @@ def estimate_batch(estimator: stages.Estimator, batch: Batch) -> Geometries:
             ids.append(own)
             pairs.append(pair)
         except Exception as error:  # one pair does not end the work on the others
-            problems.append((own, _first_line(error)))
+            problems.append((own, terminal.error_line(error)))
     results: dict[int, PairGeometry] = {}
     groups = _alike(given)
     while groups:
@@ -200,8 +200,10 @@ def estimate_batch(estimator: stages.Estimator, batch: Batch) -> Geometries:
         try:
             estimate = estimated_by(estimator, c, batch.mode.seed)
         except Exception as error:  # of an estimator of the user's own
-            groups += [[i] for i in alike] if len(alike) > 1 else []
-            problems += [(ids[i], terminal.error_line(error)) for i in alike[:1] if len(alike) == 1]
+            if len(alike) > 1:
+                groups += [[i] for i in alike]
+            else:
+                problems.append((ids[alike[0]], terminal.error_line(error)))
             continue
         configuration = pair_type.classify(c, estimate, focal_deviation=0, seed=batch.mode.seed)
         of_these = pair_geometries([pairs[i].matches for i in alike], c, estimate, configuration)
@@ -284,7 +286,7 @@ class VerificationRun:
                 batch.pairs.append(DatabasePair(images[0], images[1], matches))
                 batch.ids.append(pair)
             except Exception as error:  # one pair does not end the work on the others
-                batch.problems.append((pair, _first_line(error)))
+                batch.problems.append((pair, terminal.error_line(error)))
         return batch
 
     def _keep(self, batch: Batch, result: Geometries) -> None:
@@ -295,10 +297,6 @@ class VerificationRun:
 
     def _names(self, pair: _PairIds) -> str:
         return ", ".join(self.store.name(image) for image in pair)
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).splitlines() or [""])[0]
 
 
 HLOC_NEEDS = "hloc's files need features=F.h5 matches=M.h5 output=VERIFIED.h5, and no database"
@@ -406,6 +404,8 @@ def verify_by(
     estimator = make()
     if (gives := stages.model_of(estimator)) != "fundamental":
         raise ValueError(f"estimator gives {gives} matrices; verify needs one that gives fundamental matrices")
+    if mode.lens is not None:
+        expect_lenses(estimator, type(estimator).__name__)
     make = (lambda: estimator) if mode.execution.shared else make
     known = "unknown" if paths.features is not None and mode.cameras == "stored" else mode.cameras
     mode = dataclasses.replace(mode, cameras=known, seed=seed)

@@ -147,18 +147,18 @@ def test_broken_pairs_are_lines_and_stay_out(tmp_path: Path) -> None:
 class FailsOnFew:
     """Somebody's estimator, which raises where a pair has fewer matches than these."""
 
-    def __init__(self, least: int) -> None:
-        self.least = least
+    def __init__(self, minimum: int) -> None:
+        self.minimum = minimum
 
     def __call__(self, c: Correspondences, seed: int = 0) -> Estimate | None:
-        if int(c.count().min()) < self.least:
+        if int(c.count().min()) < self.minimum:
             raise ZeroDivisionError("too few")
-        return presets.build("estimator", "lmeds")(c, seed) if self.least else None
+        return presets.build("estimator", "lmeds")(c, seed) if self.minimum else None
 
 
 def test_what_an_estimator_raises_is_of_its_pair_alone(tmp_path: Path) -> None:
     (tmp_path / "estimator").mkdir()
-    (tmp_path / "estimator" / "mine.yaml").write_text(f"_target_: {__name__}.FailsOnFew\nleast: 50\n")
+    (tmp_path / "estimator" / "mine.yaml").write_text(f"_target_: {__name__}.FailsOnFew\nminimum: 50\n")
     x0, x1 = points()[0]
     arrays = {"a/x0": x0, "a/x1": x1, "b/x0": x0[:40], "b/x1": x1[:40]}
     output = tmp_path / "verified.npz"
@@ -167,12 +167,19 @@ def test_what_an_estimator_raises_is_of_its_pair_alone(tmp_path: Path) -> None:
     assert result.verified == 1
     assert [text.partition(" (")[0] for text in result.problems] == ["b/x0, b/x1: ZeroDivisionError: too few"]
     output.unlink()
-    for least, said in ((1000, "ZeroDivisionError: too few"), (0, "FailsOnFew returned None; it must return Estimate")):
+    for minimum, said in (
+        (1000, "ZeroDivisionError: too few"),
+        (0, "FailsOnFew returned None; it must return"),
+    ):
         with pytest.raises(ValueError, match=f"no pair has a geometry, the first because of .*{said}"):
-            fmtorch.verify(matches=tmp_path / "matches.npz", least=least, **given)
+            fmtorch.verify(matches=tmp_path / "matches.npz", minimum=minimum, **given)
         assert {path.name for path in tmp_path.iterdir()} == {"estimator", "matches.npz"}
-    with pytest.raises(ValueError, match="it is lambda in half diagonals"):
-        fmtorch.verify(matches=tmp_path / "matches.npz", output=output, lens=-0.6)
+    for estimator, lens, said in (
+        ("fmtorch", -0.6, "it is lambda in half diagonals"),
+        ("lmeds", -0.1, "lens needs an"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            fmtorch.verify(matches=tmp_path / "matches.npz", output=output, estimator=estimator, lens=lens)
 
 
 def test_the_checks_are_those_of_the_functions(tmp_path: Path) -> None:
