@@ -55,9 +55,7 @@ def test_covariance_of_F_is_that_of_its_parameters(deviation: float) -> None:
 @pytest.mark.parametrize("count", [100, 200, 500])
 def test_ellipsoids_hold_the_truth(knowledge: str, count: int) -> None:
     """95 % ones, of 400 scenes with independent noise: 93 to 97 % and twice the deviation of a share.
-    Of the pose where focal lengths are known; otherwise of the direction of translation and of a focal length. With a
-    focal length that 100 matches leave open to 10 %, rotation and focal length move along a curve, which an ellipsoid
-    of both is not: that of the pose holds 84 % there."""
+    Of the pose where focal lengths are known; otherwise of the direction of translation and of a focal length."""
     scenes = [reference.scene(i, count, 0.5, 0.2, (CENTRAL, CENTRAL)) for i in range(400)]
     K = torch.from_numpy(CENTRAL)
     given: dict[str, Any] = {"K0": K, "K1": K} if knowledge == "known" else {"focal": knowledge}
