@@ -24,6 +24,14 @@ def triweight(squared: F4x2, out: F4x2) -> None:
             out[k, i] = rest * rest * rest
 
 
+class Triweight(SummedGains):
+    """(1 - r^2 / 9)^3 within three thresholds."""
+
+    def gain(self, squared: Array) -> Array:
+        rest = np.maximum(np.float32(1) - squared / np.float32(9), np.float32(0))
+        return rest * rest * rest
+
+
 class CompiledTriweight(SummedGains):
     """(1 - r^2 / 9)^3 within three thresholds."""
 

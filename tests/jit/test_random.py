@@ -122,3 +122,12 @@ def test_every_bit_is_fair() -> None:
     assert (drawn >= 0).all()
     # 63 binomials with p = 1/2; 4.5 standard deviations are exceeded by one of them with probability 4e-4.
     assert np.abs(ones - len(drawn) / 2).max() < 4.5 * np.sqrt(len(drawn) / 4)
+
+
+def test_the_same_in_any_batch_and_any_slice_of_draws() -> None:
+    together = bits(3, KEYS, Stream.SAMPLING, 0, 64, 7)
+    for i, key in enumerate(KEYS):
+        assert torch.equal(bits(3, key[None], Stream.SAMPLING, 0, 64, 7)[0], together[i])
+    assert torch.equal(bits(3, KEYS.flip(0), Stream.SAMPLING, 0, 64, 7).flip(0), together)
+    parts = [bits(3, KEYS, Stream.SAMPLING, start, 16, 7) for start in range(0, 64, 16)]
+    assert torch.equal(torch.cat(parts, 1), together)

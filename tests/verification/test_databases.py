@@ -442,3 +442,9 @@ def test_rigs_and_frames_stay_as_they_are(copied: bool, path: Path, tmp_path: Pa
     assert result.problems == ()
     assert result.verified > 30
     assert (rows(copy if copied else path), rows(path)) == (before, before)
+
+
+def test_pairs_of_few_matches_are_degenerate(tmp_path: Path) -> None:
+    path = tmp_path / "database.db"
+    write(path, scene(2, count=6))
+    assert fmtorch.verify(path).configurations == {"degenerate": 1}
