@@ -7,8 +7,10 @@ import sys
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import hydra
+from hydra._internal.hydra import Hydra
 from hydra._internal.utils import get_args_parser
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
@@ -88,11 +90,17 @@ def run_command(command: Command, task: Task) -> None:
         sys.argv[1:] = hydra_arguments(sys.argv[1:], paths, command.positional)
         if any(word.startswith("hydra/launcher=submitit") for word in sys.argv):
             print(SUBMITTED, flush=True)
+        if not any(word.startswith("hydra.mode=") for word in sys.argv):
+            Hydra.get_mode = _mode_of_flags  # type: ignore[method-assign]
         try:
             with env_override({"HYDRA_FULL_ERROR": "1"}):  # Hydra then leaves errors to us
                 hydra.main(version_base=None, config_path=str(conf_dir()), config_name=command.name)(task)()
         except (HydraException, OmegaConfBaseException) as error:
             sys.exit(f"error: {explained(error, command.name)}")
+
+
+def _mode_of_flags(*_: Any, **__: Any) -> None:
+    """In place of Hydra's question whether the config names a mode, for which it composes all of it once more."""
 
 
 def _expect_known(overrides: Sequence[str]) -> None:

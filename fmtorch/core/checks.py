@@ -7,6 +7,7 @@ import functools
 import inspect
 import math
 import operator
+import sys
 from collections.abc import Callable, Mapping
 from typing import Any, ParamSpec, TypeVar
 
@@ -65,7 +66,7 @@ def as_tensor(value: Any, name: str) -> Tensor:
         value = np.array([keypoint.pt for keypoint in value], np.float32)
     elif hasattr(value, "__dlpack__") and not isinstance(value, np.ndarray | np.generic):  # of CuPy, JAX, ...
         return _real(torch.utils.dlpack.from_dlpack(value), name)
-    if np.ma.is_masked(value):
+    if "numpy.ma" in sys.modules and np.ma.is_masked(value):  # whoever has such an array has imported it
         raise ValueError(f"{name} is a masked array; give its data, and what counts in `mask` (True for a real match)")
     try:
         array = np.asarray(value)
