@@ -68,12 +68,14 @@ class Record:
         return self.unchecked(**{**vars(self), **changes})
 
     def save(self, path: Path | str) -> None:
-        """Write the record to a file in the format of safetensors, which holds numbers and text, never code."""
+        """Write the record to a file in the format of safetensors, which holds numbers and text, never code.
+        Raises OSError where it cannot be written."""
         values = vars(self)
         tensors = {name: value.detach().cpu().clone() for name, value in values.items() if isinstance(value, Tensor)}
         plain = {name: value for name, value in values.items() if not isinstance(value, Tensor | None)}
         stored = {"record": type(self).__name__, "fields": json.dumps(plain)}
         with files.replacing(Path(path)) as temporary:
+            temporary.touch()  # which says what is wrong with a folder; safetensors names its own file
             save_file({name: value.contiguous() for name, value in tensors.items()}, temporary, stored)
 
     @classmethod

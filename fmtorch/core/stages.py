@@ -139,6 +139,12 @@ class WrongOutput(TypeError, ValueError):
     """What somebody's part returned is of another kind than its stage: a mistake that its author can put right."""
 
 
+def name_of(part: object) -> str:
+    """The module and the name of a part's class, or of a function."""
+    named = part if isinstance(part, type) or hasattr(part, "__qualname__") else type(part)
+    return f"{named.__module__}.{named.__qualname__}"
+
+
 def output_of(
     part: object, value: object, kind: type[Output], given: Correspondences | None = None, like: Tensor | None = None
 ) -> Output:
@@ -147,8 +153,7 @@ def output_of(
     that the result must be on, where no matches were given. Raises TypeError for something else, and ValueError for
     another number of pairs or matches, another device, half precision, or pairs that are not those given. The message
     begins with the part's name."""
-    named = part if isinstance(part, type) or hasattr(part, "__qualname__") else type(part)
-    name = f"{named.__module__}.{named.__qualname__}"
+    name = name_of(part)
     if not isinstance(value, kind):
         what = "None" if value is None else f"a {type(value).__name__}"
         raise WrongOutput(f"{name} returned {what}; it must return {kind.__name__}")

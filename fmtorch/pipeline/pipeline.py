@@ -25,6 +25,7 @@ from fmtorch.presets.composition import PIPELINES, build_pruners, compose, plain
 from fmtorch.presets.files import available, unknown
 from fmtorch.presets.objects import instantiate, open_files
 from fmtorch.runs.feature_cache import cached
+from fmtorch.two_view.arguments import expect_possible
 from fmtorch.two_view.pair_type import PairTypes, classify
 
 Key = TypeVar("Key")
@@ -199,8 +200,16 @@ class Pipeline:
         """The matcher's matches of two images, given by their features; by their pixels for an `ImageMatcher`."""
         if isinstance(self.matcher, ImageMatcher):
             c = self.matcher.match_images(image0, image1)
-            return stages.output_of(self.matcher, c, Correspondences).to(self.device)
-        return stages.output_of(self.matcher, self.matcher(image0, image1), Correspondences, like=image0.lafs)
+            c = stages.output_of(self.matcher, c, Correspondences).to(self.device)
+        else:
+            c = stages.output_of(self.matcher, self.matcher(image0, image1), Correspondences, like=image0.lafs)
+        name = stages.name_of(self.matcher)
+        if not name.startswith("fmtorch."):
+            try:
+                expect_possible(c)
+            except ValueError as error:
+                raise ValueError(f"{name} returned matches that cannot be: {error}") from error
+        return c
 
     def estimated(self, c: Correspondences, seed: int = 0, estimator: Estimator | None = None) -> Estimate:
         """The estimate of a batch with its significance; estimator: another one than the pipeline's."""

@@ -80,9 +80,14 @@ def correspondences(
     cameras = camera_fields(K0, K1, focal, fields.get("size0") is not None)
     c = _batch(x0, x1, {**fields, **cameras, **lens_fields(lens)})
     _expect_calibrations(c)
+    expect_possible(c, plane)
+    return c
+
+
+def expect_possible(c: Correspondences, plane: bool = False) -> None:
+    """Raises ValueError for values that cannot be, and for points of no pixels or outside images of their sizes."""
     expect_values(c, ratio=RATIO)
     _expect_pixels(c, plane)
-    return c
 
 
 def _batch(x0: Arrays, x1: Arrays, fields: Mapping[str, Any]) -> Correspondences:

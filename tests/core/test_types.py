@@ -1,5 +1,6 @@
 import dataclasses
 import hashlib
+import inspect
 from collections.abc import Callable
 from typing import Any
 
@@ -170,6 +171,9 @@ def test_keep_only_ever_removes() -> None:
     chosen = torch.rand(4, 6) < 0.5
     assert torch.equal(c.keep(chosen).mask, c.mask & chosen)
     assert same(c.keep(torch.ones_like(chosen)), c)
+    for wrong in (chosen.float(), chosen[:, 1:]):
+        with pytest.raises(ValueError, match=r"mask is .*; it must be booleans of shape"):
+            inspect.unwrap(Correspondences.keep)(c, wrong)
 
 
 def test_compact_known_answer() -> None:

@@ -325,6 +325,8 @@ def test_a_record_is_the_same_after_its_file(tmp_path: Path) -> None:
                 torch.testing.assert_close(getattr(again, name), value, rtol=0, atol=0, equal_nan=True)
     with pytest.raises(ValueError, match=r"holds PoseEstimate; Correspondences\.load reads Correspondences"):
         fmtorch.Correspondences.load(path)
+    with pytest.raises(FileNotFoundError, match=r"nowhere.estimate\.safetensors"):
+        estimate.save(tmp_path / "nowhere" / "estimate.safetensors")
 
 
 def test_a_file_with_code_is_refused(tmp_path: Path) -> None:
@@ -350,7 +352,7 @@ def helper(*given):
 
 
 def features(n: int = 9) -> Features:
-    lafs = torch.eye(2, 3).repeat(n, 1, 1) + torch.arange(n)[:, None, None]
+    lafs = torch.eye(2, 3).repeat(n, 1, 1) + 4 * torch.arange(n)[:, None, None]
     return Features(lafs, torch.ones(n), torch.eye(n), torch.tensor([40, 60]))
 
 
@@ -374,6 +376,11 @@ def no_keys(c: Correspondences) -> Correspondences:
     return Correspondences(c.x0, c.x1, c.mask)
 
 
+def swapped_sizes(a: Features, b: Features) -> Correspondences:
+    sizes = torch.tensor([[600, 10]])
+    return matches(a, b).replace(size0=sizes, size1=sizes)
+
+
 @pytest.mark.parametrize(
     ("stage", "part", "said"),
     [
@@ -382,6 +389,9 @@ def no_keys(c: Correspondences) -> Correspondences:
         ("matcher", lambda a, b: Correspondences(a.keypoints[None].half(), b.keypoints[None].half(),
          torch.ones(1, 9, dtype=torch.bool)), "Correspondences of torch.float16; they must be of float32 or float64"),
         ("matcher", lambda a, b: matches(a, b).to("meta"), "Correspondences on meta; they must be on cpu"),
+        ("matcher", lambda a, b: matches(a, b).replace(score=torch.full((1, 9), 80.0)),
+         r"<lambda> returned matches that cannot be: score .*\[0, 1\]"),
+        ("matcher", swapped_sizes, "swapped_sizes returned matches that cannot be: size0 is .* of x0 lie outside"),
         ("pruners", {"own": lambda c: c.mask}, "^pruning: WrongOutput: .* returned a Tensor; it must return Corresp"),
         ("pruners", {"own": no_keys}, r"no_keys returned matches without their pairs' keys; use c\.keep\(mask\)"),
         ("pruners", {"own": lambda c: c[:0]}, "Correspondences of 0 pairs; they must be of 1"),
