@@ -179,7 +179,7 @@ class Correspondences(Record):
         return self.mask.sum(-1)
 
     def keep(self, mask: Bool[Tensor, "b n"]) -> Correspondences:
-        """The same matches, of which only those also in `mask` survive. Raises ValueError for a mask of another kind."""
+        """The same matches, of which only those also in `mask` survive; ValueError for a mask of another kind."""
         if mask.shape != self.mask.shape or mask.dtype != torch.bool:
             shape = tuple(self.mask.shape)
             raise ValueError(f"mask is {mask.dtype} {tuple(mask.shape)}; it must be booleans of shape {shape}")
