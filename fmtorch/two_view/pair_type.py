@@ -89,7 +89,7 @@ def classify(
 
     Args:
         c: all matches that were given to the estimator.
-        estimate: their fundamental matrices.
+        estimate: their fundamental matrices; where there is none, that of `find_fundamental` is looked for.
         focal_deviation: relative deviation of the focal lengths of `c.K0` and `c.K1`; 0 where they are exact. Where
             `c.focal` has a larger one, that counts, and an infinite one is of an unknown focal length.
         seed: of the homography's random numbers.
@@ -123,14 +123,18 @@ def classify(
     c = straightened(c, estimate.lens)
     matches = c.detach().derived(K0=None, K1=None, focal=None, shared_focal=None)
     H = estimated(matches, "homography", "homography", None, seed, options)
+    F, ok, failed = estimate.F.clone(), estimate.ok.clone(), ~estimate.ok
+    if bool(failed.any()):  # which says nothing of their matches
+        own = estimated(matches[failed], "fundamental", "fmtorch", None, seed, {})
+        F[failed], ok[failed] = own.F.to(F), own.ok
     K0, K1, precision = _cameras(c, focal_deviation)
     with one_thread(c.mask.device):
         evidence = kinds.pair_evidence(
-            estimate.F, H.F, c.x0, c.x1, c.mask, c.prior, c.noise, c.size0, c.size1, K0, K1, precision
+            F, H.F, c.x0, c.x1, c.mask, c.prior, c.noise, c.size0, c.size1, K0, K1, precision
         )
     exact = None if precision is None else precision.diagonal(dim1=-2, dim2=-1).isinf().all(-1)
     kind = kinds.classified(evidence, exact)
-    return PairTypes(torch.where(estimate.ok | H.ok, kind, kinds.UNRELATED), evidence, H)
+    return PairTypes(torch.where(ok | H.ok, kind, kinds.UNRELATED), evidence, H)
 
 
 def straightened(c: Correspondences, lens: Tensor | None) -> Correspondences:

@@ -46,6 +46,9 @@ def test_kinds(kind: str, known: bool) -> None:
     assert torch.equal(classified.determined, torch.tensor([name == "general" for name in classified.names]))
     exact = classify(c, estimate, focal_deviation=0)
     assert exact.names.count(kind) >= 11, exact.names
+    nothing = torch.zeros_like(estimate.F)
+    failed = estimate.derived(F=nothing, ok=nothing[:, 0, 0] > 0)  # as of an estimator that does not work
+    assert classify(c, failed).names.count(kind) >= 11
 
 
 def test_a_focal_length_that_is_not_known_is_that_of_no_calibration() -> None:
