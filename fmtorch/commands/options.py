@@ -208,6 +208,7 @@ class VerifyOptions:
         "i/n: only the i-th of n parts of the pairs, into a folder beside the database (or output), from where the "
         "same command without shard merges all",
     )
+    debug: Debug = option(False, DEBUG)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -29,7 +29,8 @@ def run(config: DictConfig, estimator: str) -> Verification:
     execution = execution_of(config).decided(False)
     if execution.shared and execution.workers is None:
         execution = ONE_THREAD
-    mode = VerifyMode(fields.cameras, fields.lens, fields.force, fields.seed, execution, shard_of(fields.shard))
+    shard, debug = shard_of(fields.shard), bool(fields.debug)
+    mode = VerifyMode(fields.cameras, fields.lens, fields.force, fields.seed, execution, shard, debug)
     with _begun_by_reports(estimator) as report:
         paths = VerifyPaths(fields.database, fields.features_file, fields.matches, fields.output)
         result = verify_by(make, {"estimator": plain(config.estimator)}, paths, mode, report)
@@ -80,7 +81,7 @@ def _table(result: Verification) -> Table:
 @job
 def task(config: DictConfig) -> None:
     """What Hydra runs."""
-    run(config, str(HydraConfig.get().runtime.choices["estimator"]))
+    run(config, str(HydraConfig.get().runtime.choices.get("estimator", "estimator")))
 
 
 def main() -> None:

@@ -160,7 +160,8 @@ class Verification:
 
 @dataclasses.dataclass(frozen=True)
 class VerifyMode:
-    """How pairs are verified: what is taken for known of cameras and lenses, what is replaced, by whom, which pairs."""
+    """How pairs are verified: what is taken for known of cameras and lenses, what is replaced, by whom, which pairs;
+    debug: whether an estimator's error ends the run."""
 
     cameras: str = "stored"
     lens: arguments.Lens = None
@@ -168,6 +169,7 @@ class VerifyMode:
     seed: int = 0
     execution: Execution = ONE_THREAD
     shard: Shard | None = None
+    debug: bool = False
 
 
 class Batch(NamedTuple):
@@ -192,14 +194,15 @@ def estimate_batch(estimator: stages.Estimator, batch: Batch) -> Geometries:
             pairs.append(pair)
         except Exception as error:  # one pair does not end the work on the others
             problems.append((own, terminal.error_line(error)))
-    results: dict[int, PairGeometry] = {}
-    groups = _alike(given)
+    results, groups = dict[int, PairGeometry](), _alike(given)
     while groups:
         alike = groups.pop(0)
         c = collate([given[i] for i in alike])
         try:
             estimate = estimated_by(estimator, c, batch.mode.seed)
         except Exception as error:  # of an estimator of the user's own
+            if batch.mode.debug:
+                raise
             if len(alike) > 1:
                 groups += [[i] for i in alike]
             else:
@@ -300,9 +303,7 @@ class VerificationRun:
 
 
 HLOC_NEEDS = "hloc's files need features=F.h5 matches=M.h5 output=VERIFIED.h5, and no database"
-MATCHES_NEED = (
-    "matches alone need an output: matches=FILE.npz output=VERIFIED.npz, with features=F.h5 where they are hloc's"
-)
+MATCHES_NEED = "matches alone need an output: matches=FILE.npz output=VERIFIED.npz, with features=F.h5 of hloc's files"
 
 
 def verify(

@@ -14,6 +14,7 @@ import fmtorch
 from fmtorch import presets
 from fmtorch.core import Correspondences, Estimate, pair_key
 from fmtorch.jobs import Execution
+from fmtorch.verification import verify as verification
 from tests.processes import run_command
 from tests.verification import databases
 from tests.verification import test_matches as alone
@@ -174,6 +175,9 @@ def test_what_an_estimator_raises_is_of_its_pair_alone(tmp_path: Path) -> None:
         with pytest.raises(ValueError, match=f"no pair has a geometry, the first because of .*{said}"):
             fmtorch.verify(matches=tmp_path / "matches.npz", minimum=minimum, **given)
         assert {path.name for path in tmp_path.iterdir()} == {"estimator", "matches.npz"}
+    paths = verification.VerifyPaths(None, None, tmp_path / "matches.npz", output)
+    with pytest.raises(ZeroDivisionError, match="too few"):
+        verification.verify_by(lambda: FailsOnFew(1000), {}, paths, verification.VerifyMode(debug=True), None)
     for estimator, lens, said in (
         ("fmtorch", -0.6, "it is lambda in half diagonals"),
         ("lmeds", -0.1, "lens needs an"),
