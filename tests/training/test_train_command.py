@@ -76,8 +76,8 @@ def test_a_network_of_ones_own_is_trained_and_used(root: Path, tmp_path: Path) -
 
 
 def test_two_processes_train_one_network(root: Path, tmp_path: Path) -> None:
-    """With gloo, on the CPU: each has batches of its own, and gradients are averaged."""
-    two = ["trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2"]
+    """With gloo and mixed precision, on the CPU: each has batches of its own, and gradients are averaged."""
+    two = ["trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2", "trainer.precision=bf16-mixed"]
     ended = run_command("train", "dataset=fmbench", f"dataset.root={root}", *SHORT, *SMALL_LC, *two, cwd=tmp_path)
     assert ended.returncode == 0, ended.stderr
     checkpoint = torch.load(tmp_path / "out" / "checkpoints" / "step=6.ckpt", weights_only=True)
@@ -103,6 +103,8 @@ def test_the_command_goes_on_and_refuses_another_training(root, tmp_path, monkey
     assert (folder / "lc.safetensors").read_bytes() == weights
     with pytest.raises(ValueError, match=r"holds checkpoints of other settings; what differs .*: seed: "):
         trained(monkeypatch, tmp_path, *options, "seed=1")
+    mixed = trained(monkeypatch, tmp_path, *options, "output=mixed", "trainer.precision=bf16-mixed")
+    assert (mixed / "lc.safetensors").read_bytes() != weights  # it does compute in other numbers
 
 
 def test_photographs_join_the_training(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
