@@ -193,7 +193,7 @@ def from_poselib(pose: Any, inliers: Any, K0: Any = None, K1: Any = None) -> Est
     """
     K0, K1 = (np.eye(3) if K is None else as_tensor(K, "K").double().numpy() for K in (K0, K1))
     R, t = np.asarray(pose.R), np.asarray(pose.t)
-    E = cross_matrix(torch.from_numpy(t)).numpy() @ R
+    E = cross_matrix(torch.tensor(t)).numpy() @ R
     F = np.linalg.inv(K1).T @ E @ np.linalg.inv(K0)
     return _estimate(F, "fundamental", as_tensor(inliers, "inliers").bool()[None], np.c_[R, t], "")
 

@@ -4,7 +4,7 @@ import contextlib
 import functools
 import hashlib
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -62,11 +62,11 @@ def holds(file: Any, key: str) -> bool:
         raise DataError(f"{_where(file, key)} cannot be read ({_first_line(error)})") from error
 
 
-def array(file: Any, key: str, *shape: int | None) -> Array:
-    """The array under a key, of this shape; None stands for any length, no shape for any.
-    Raises DataError, naming file and key, where it is missing, damaged or of another shape."""
+def array(file: Any, key: str, *shape: int | None, floats: bool = False) -> Array:
+    """The array under a key, of this shape; None stands for any length, no shape for any. floats: as float64 where it
+    holds numbers. Raises DataError, naming file and key, where it is missing, damaged or of another shape."""
     try:
-        values = _plain_array(file, key)
+        values = _plain_array(file, key, floats)
         if values is None:
             entry = file[key]
             if not hasattr(entry, "shape"):
@@ -89,18 +89,18 @@ def fits(values: Array, shape: Sequence[int | None]) -> bool:
     return values.ndim == len(shape) and all(n in (None, m) for n, m in zip(shape, values.shape, strict=True))
 
 
-def _plain_array(file: Any, key: str) -> Array | None:
+def _plain_array(file: Any, key: str, floats: bool) -> Array | None:
     """The numbers under a key by HDF5's own calls, in a third of h5py's time; None where it is anything else."""
     h5py = imported()
     try:
         entry = h5py.h5d.open(file.id, key.encode())
+        dtype, shape = np.dtype(np.float64) if floats else entry.dtype, entry.shape
+        if dtype.kind not in "fiub" or shape is None:
+            return None
+        values = np.empty(shape, dtype)
+        entry.read(h5py.h5s.ALL, h5py.h5s.ALL, values, _memory_type(dtype))
     except (OSError, RuntimeError, KeyError, TypeError, ValueError):
         return None
-    dtype, shape = entry.dtype, entry.shape
-    if dtype.kind not in "fiub" or shape is None:
-        return None
-    values = np.empty(shape, dtype)
-    entry.read(h5py.h5s.ALL, h5py.h5s.ALL, values, _memory_type(dtype))
     return values
 
 
@@ -120,10 +120,28 @@ def shape(file: Any, key: str) -> tuple[int, ...]:
 
 def numbers(file: Any, key: str, *shape: int | None) -> Matrix:
     """`array` as float64. Raises DataError where it holds no real numbers."""
-    values = array(file, key, *shape)
+    values = array(file, key, *shape, floats=True)
     if values.dtype.kind not in "fiub":
         raise DataError(f"{_where(file, key)} is of {values.dtype}; it must hold real numbers")
-    return values.astype(np.float64)
+    return values.astype(np.float64, copy=False)
+
+
+def small(file: Any, shapes: Mapping[str, tuple[int, ...]]) -> list[Matrix]:
+    """Arrays of a few numbers, each as by `reshaped`, of their keys and shapes; all of them in a third of the time."""
+    h5py, values, begin, read = imported(), np.empty(sum(map(math.prod, shapes.values()))), 0, []
+    try:
+        for key, shape in shapes.items():
+            entry, part = h5py.h5d.open(file.id, key.encode()), values[begin : begin + math.prod(shape)]
+            if entry.get_space().get_simple_extent_npoints() != len(part):
+                break
+            entry.read(h5py.h5s.ALL, h5py.h5s.ALL, part, h5py.h5t.NATIVE_DOUBLE)
+            read.append(part.reshape(shape))
+            begin += len(part)
+    except (OSError, RuntimeError, KeyError, TypeError, ValueError):
+        read = []
+    if len(read) == len(shapes) and np.isfinite(values).all():
+        return read
+    return [reshaped(file, key, *shape) for key, shape in shapes.items()]  # which names what is wrong
 
 
 def reshaped(file: Any, key: str, *shape: int) -> Matrix:

@@ -52,22 +52,24 @@ def keys(file: Any) -> list[str]:
     return sorted(h5.keys(file["xs"]), key=lambda key: (len(key), key))
 
 
+_SHAPES: dict[str, tuple[int, ...]] = {
+    f"{name}{i}s": (n,) for i in (1, 2) for name, n in (("cx", 1), ("cy", 1), ("f", 2))
+}
+_SHAPES |= {"Rs": (3, 3), "ts": (3,), "sizes": (4,)}
+
+
 def cameras(file: Any, key: str) -> Cameras:
     """The cameras of a pair; images of unknown size have their principal point in the middle."""
-    K = _calibration(file, key, 1), _calibration(file, key, 2)
-    R, t = h5.reshaped(file, f"Rs/{key}", 3, 3), h5.reshaped(file, f"ts/{key}", 3)
-    if h5.holds(file, "sizes"):
-        h0, w0, h1, w1 = h5.reshaped(file, f"sizes/{key}", 4).astype(int).tolist()
-        return Cameras(K, R, t, ((h0, w0), (h1, w1)))
-    return Cameras(K, R, t, (predictions.size_by_centre(K[0]), predictions.size_by_centre(K[1])))
-
-
-def _calibration(file: Any, key: str, which: int) -> Matrix:
-    cx, cy = (h5.reshaped(file, f"{name}{which}s/{key}", 1)[0] for name in ("cx", "cy"))
-    fx, fy = h5.reshaped(file, f"f{which}s/{key}", 2)
-    if fx == 0 or fy == 0:
-        raise DataError(f"{file.filename}: 'f{which}s/{key}' holds a focal length of zero")
-    return Lens(fx, fy, cx, cy).K
+    known = _SHAPES if h5.holds(file, "sizes") else {name: _SHAPES[name] for name in _SHAPES if name != "sizes"}
+    cx0, cy0, f0, cx1, cy1, f1, R, t, *sized = h5.small(file, {f"{name}/{key}": known[name] for name in known})
+    for i, f in ((1, f0), (2, f1)):
+        if not f.all():
+            raise DataError(f"{file.filename}: 'f{i}s/{key}' holds a focal length of zero")
+    K0, K1 = Lens(*f0, *cx0, *cy0).K, Lens(*f1, *cx1, *cy1).K
+    if sized:
+        h0, w0, h1, w1 = sized[0].astype(int).tolist()
+        return Cameras((K0, K1), R, t, ((h0, w0), (h1, w1)))
+    return Cameras((K0, K1), R, t, (predictions.size_by_centre(K0), predictions.size_by_centre(K1)))
 
 
 def figures(file: Any, name: str, key: str, count: int) -> Matrix | None:
