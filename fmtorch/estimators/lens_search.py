@@ -201,18 +201,11 @@ def _linearised(f: Array, lens: Array, diagonal: Array, rows: Array, row: int, J
     c0, c1 = t0 * (2 * l0), t1 * (2 * l1)
     u, v, w = x1 - c * a1, y1 - c * b1, w1 - c * c1
     p, q, s = c * a0, c * b0, c * c0
-    store(J, 0, u * x0 - x1 * p)
-    store(J, 1, u * y0 - x1 * q)
-    store(J, 2, u * w0 - x1 * s)
-    store(J, 3, v * x0 - y1 * p)
-    store(J, 4, v * y0 - y1 * q)
-    store(J, 5, v * w0 - y1 * s)
-    store(J, 6, w * x0 - w1 * p)
-    store(J, 7, w * y0 - w1 * q)
-    store(J, 8, w * w0 - w1 * s)
+    store(J, 0, (u * x0 - x1 * p, u * y0 - x1 * q, u * w0 - x1 * s))
+    store(J, 3, (v * x0 - y1 * p, v * y0 - y1 * q, v * w0 - y1 * s))
+    store(J, 6, (w * x0 - w1 * p, w * y0 - w1 * q, w * w0 - w1 * s))
     store(J, 9, r0 * s1 - c * (2.0 * s1 * t0 + r0 * (a1 * f[2] + b1 * f[5] + c1 * f[8])))
-    store(J, 10, r1 * s0 - c * (2.0 * s0 * t1 + r1 * (a0 * f[6] + b0 * f[7] + c0 * f[8])))
-    store(J, 11, e)
+    store(J, 10, (r1 * s0 - c * (2.0 * s0 * t1 + r1 * (a0 * f[6] + b0 * f[7] + c0 * f[8])), e))
     r2 = e * c
     return inverse, where(r2 == r2, r2, math.nan)
 

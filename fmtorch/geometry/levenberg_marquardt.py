@@ -93,16 +93,8 @@ def linearise_kernel(f: Array, matches: Array, row: int, J: Array) -> tuple[Any,
     inverse = 1.0 / where(slope > TINY, slope, TINY)
     c = e * inverse
     u, v, p, q = x1 - c * a0, y1 - c * b0, -c * a1, -c * b1
-    store(J, 0, u * x0 + x1 * p)
-    store(J, 1, u * y0 + x1 * q)
-    store(J, 2, u)
-    store(J, 3, v * x0 + y1 * p)
-    store(J, 4, v * y0 + y1 * q)
-    store(J, 5, v)
-    store(J, 6, x0 + p)
-    store(J, 7, y0 + q)
-    store(J, 8, fill(1.0))
-    store(J, 9, e)
+    store(J, 0, (u * x0 + x1 * p, u * y0 + x1 * q, u, v * x0 + y1 * p, v * y0 + y1 * q, v))
+    store(J, 6, (x0 + p, y0 + q, fill(1.0), e))
     return inverse, e * c
 
 

@@ -44,15 +44,7 @@ def equations(X: Array, size: int, A: Array) -> None:
     for j in range(size):
         o, p = 9 * j, 4 * j
         x0, y0, x1, y1 = load(X, p), load(X, p + 1), load(X, p + 2), load(X, p + 3)
-        store(A, o, x1 * x0)
-        store(A, o + 1, x1 * y0)
-        store(A, o + 2, x1)
-        store(A, o + 3, y1 * x0)
-        store(A, o + 4, y1 * y0)
-        store(A, o + 5, y1)
-        store(A, o + 6, x0)
-        store(A, o + 7, y0)
-        store(A, o + 8, fill(1.0))
+        store(A, o, (x1 * x0, x1 * y0, x1, y1 * x0, y1 * y0, y1, x0, y0, fill(1.0)))
 
 
 @inner
