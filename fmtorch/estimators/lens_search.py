@@ -21,8 +21,9 @@ from fmtorch.estimators.models.focal_prior import MIN_DEVIATION, focal_cost
 from fmtorch.estimators.models.model import FitScale
 from fmtorch.estimators.models.posterior import Cameras, Images, Limits, centred, images_of, tangents_of, translate
 from fmtorch.estimators.pair import Lens, Pair, squared
+from fmtorch.geometry import levenberg_marquardt
 from fmtorch.geometry.arithmetic import logarithm_kernel
-from fmtorch.geometry.levenberg_marquardt import MATCH, TINY, Weighted, in_rows, minimiser, robust
+from fmtorch.geometry.levenberg_marquardt import MATCH, TINY, Weighted, add_products, assemble, in_rows, robust
 from fmtorch.geometry.matrices import assign
 from fmtorch.geometry.rank2_manifold import eliminate
 from fmtorch.jit.kernel import Array, F8x1, F8x2, F8x3, inner, kernel, matrix, vector
@@ -165,20 +166,9 @@ def _summed(F: Array, lens: Array, data: _Data, derivatives: bool) -> Any:
         share, slope = robust(r2, load(data.rows, row + 5), data.loss, data.table, work)
         costs += share * load(data.rows, row + 4)
         if derivatives:
-            factor, q = inverse * (load(data.rows, row + 4) * slope), 0
-            for r in range(ROWS):
-                store(scaled, r, load(J, r) * factor)
-            for r in range(ROWS):
-                of_row = load(J, r)
-                for c in range(r + 1):
-                    store(sums, q, load(sums, q) + of_row * load(scaled, c))
-                    q += 1
-    q = 0
-    for r in range(ROWS if derivatives else 0):
-        for c in range(r + 1):
-            total = added(load(sums, q))
-            data.products[r, c], data.products[c, r] = total, total
-            q += 1
+            add_products(J, inverse * (load(data.rows, row + 4) * slope), scaled, sums)
+    if derivatives:
+        assemble(sums, data.products)
     return added(costs)
 
 
@@ -266,7 +256,7 @@ def _take(state: _State, trial: _State, k: int) -> None:
     posterior.take_cameras(state, trial, k)
 
 
-_minimise = minimiser(_evaluate, _step, _take, posterior.converged, posterior.MIN_DAMPING)
+_minimise = levenberg_marquardt.minimiser(_evaluate, _step, _take, posterior.converged, posterior.MIN_DAMPING)
 
 
 STARTS = ((0.0, 0.0), (-0.12, -0.12), (-0.25, -0.25))  # of both lenses, where they are one

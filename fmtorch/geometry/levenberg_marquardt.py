@@ -57,12 +57,8 @@ def evaluate(F: F8x2, weighted: Weighted, derivatives: bool, products: F8x3, cos
             if derivatives:
                 add_products(J, inverse * (load(matches, row + 4) * slope), scaled, sums)
         cost[k] = added(costs)
-        q = 0
-        for r in range(10 if derivatives else 0):
-            for c in range(r + 1):
-                total = added(load(sums, q))
-                products[k, r, c], products[k, c, r] = total, total
-                q += 1
+        if derivatives:
+            assemble(sums, products[k])
 
 
 @inner
@@ -139,13 +135,24 @@ def _tabulated(table: Array, work: Array) -> None:
 @inner
 def add_products(J: Array, factor: Any, weighted: Array, sums: Array) -> None:
     """Adds the lower triangle of the weighted products of Jacobian and residual, row by row."""
-    for r in range(10):
+    for r in range(len(J)):
         store(weighted, r, load(J, r) * factor)
     q = 0
-    for r in range(10):
+    for r in range(len(J)):
         of_row = load(J, r)
         for c in range(r + 1):
             store(sums, q, load(sums, q) + of_row * load(weighted, c))
+            q += 1
+
+
+@inner
+def assemble(sums: Array, products: Array) -> None:
+    """The sums of `add_products` -> products, both triangles."""
+    q = 0
+    for r in range(len(products)):
+        for c in range(r + 1):
+            total = added(load(sums, q))
+            products[r, c], products[c, r] = total, total
             q += 1
 
 

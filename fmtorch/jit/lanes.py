@@ -74,7 +74,7 @@ load, fill = lanes(LANES)
 
 @LaneFunction
 def store(A: Array, row: int, value: Any) -> None:
-    """Makes a value row r of an array (rows, lanes), a mask that of an array of booleans; a tuple the rows from r on."""
+    """Makes a value row r of an array (rows, lanes), a mask that of booleans; of a tuple all rows from r on."""
     for k, each in enumerate(value if isinstance(value, tuple) else (value,)):
         A[row + k] = each
 
