@@ -232,8 +232,7 @@ SWAPPED = 0.05  # fraction outside from which on a size is taken for (w, h), if 
 
 def expect_inside(x: Tensor, mask: Tensor, size: Tensor, name: str, size_name: str) -> None:
     """Raise ValueError where the points (b, n, 2) of all pairs contradict the image's size (b, 2), h and w.
-    Points that reach beyond opposite borders are no pixels of another image or unit: a wide lens was undistorted. Fewer
-    than MIN_MATCHES say nothing."""
+    Points that reach beyond opposite borders are no pixels of another image or unit: a wide lens was undistorted."""
     mask = mask & x.isfinite().all(-1)
     enough = mask.sum(1) >= MIN_MATCHES
     if not bool(enough.any()):

@@ -78,8 +78,7 @@ def undistorted(pair: Pair, lens: Array) -> Pair:
 
 
 class _State(NamedTuple):
-    """Of k candidates, as `Cameras` and `LensOptimum`. tied: whether the second focal length, and the second lens, are
-    the first."""
+    """Of k candidates, as `Cameras` and `LensOptimum`. tied: whether second focal length and lens are the first."""
 
     tied: tuple[bool, bool]
     axes: Array

@@ -26,10 +26,9 @@ from fmtorch.estimators.models.model import Refining
 from fmtorch.estimators.models.with_focals import FundamentalWithFocals
 from fmtorch.estimators.options import Count, Focal, Preselect, Refine, Select, stage
 from fmtorch.estimators.pair import Lens, Pair
-from fmtorch.estimators.precompiled import OF_HOMOGRAPHIES, WITH_FOCALS
 from fmtorch.estimators.preselection import Preselection
 from fmtorch.estimators.refinement import BestOfSearch, BestScore, LocalOptimization, Refinement, Selection, Selector
-from fmtorch.estimators.registry import part, thresholds
+from fmtorch.estimators.registry import OF_HOMOGRAPHIES, WITH_FOCALS, part, thresholds
 from fmtorch.estimators.sampling import Sampler
 from fmtorch.estimators.scores import Score
 from fmtorch.estimators.search import Search

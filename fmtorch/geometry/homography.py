@@ -334,8 +334,7 @@ def plane_and_parallax(H: Array, points: Array, i: int, j: int, F: Array) -> boo
 
 @inner
 def least_squares_homography(points: Array, weight: Array, H: Array) -> bool:
-    """The normalised DLT of matches (n,) by their weights, or of those inside -> H; whether it is determined.
-    Hartley & Zisserman (2004), algorithm 4.2."""
+    """The normalised DLT (Hartley & Zisserman, 4.2) of matches (n,) by weights, or those inside -> H; if determined."""
     T, S, M = matrix(2, 3), np.zeros((4, 3, 3)), np.zeros((9, 9))
     for image in range(2):
         if not _similarity(points[2 * image], points[2 * image + 1], weight, T[image]):

@@ -139,8 +139,7 @@ def reweighted_fits(
 
 def reweighted(F: Float[Tensor, "9 p k"], error: RobustSum) -> Float[Tensor, "9 p k"]:
     """One iteration, component by component: the 8-point algorithm with the weights that the residuals under F give.
-    F: k models for each of p pairs, entries row by row. Models of rank 2; one that the weighted matches do not
-    determine is kept as it was."""
+    F: k models for each of p pairs, entries row by row. Models of rank 2; what matches leave open stays as it was."""
     finite = torch.isfinite(F).all(0)
     known = torch.where(finite, F, constant(F, RANK_TWO))
     _, _, inverse, r2 = linearise(known, error.points, derivatives=False)

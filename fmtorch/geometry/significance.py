@@ -269,8 +269,7 @@ def of_one_pair(
 
 @functools.lru_cache(maxsize=8)
 def _log_factorials(count: int) -> Array:
-    """log i! (count,) for i = 0 ... count - 1, in ascending order of summation, so that longer tables begin alike.
-    For few counts, so that it is seldom made."""
+    """log i! (count,) for i = 0 ... count - 1, summed in ascending order, so that longer tables begin alike."""
     logarithms = logarithm(torch.arange(1, count, dtype=torch.float64))
     return np.concatenate([np.zeros(1), np.cumsum(logarithms.numpy())])
 

@@ -33,8 +33,7 @@ OTHER_CAMERA = 0.5  # deviation of the logarithm of the ratio of both focal leng
 
 class PairTypes(NamedTuple):
     """Types of B pairs.
-    kind: indices into `fmtorch.core.types.PAIR_TYPES`. evidence: for the kinds. homography: of the plane, or of
-    the rotation."""
+    kind: indices into `fmtorch.core.types.PAIR_TYPES`. evidence: for the kinds. homography: of plane or rotation."""
 
     kind: Int[Tensor, " b"]
     evidence: Evidence
