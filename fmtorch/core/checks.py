@@ -252,5 +252,4 @@ def expect_inside(x: Tensor, mask: Tensor, size: Tensor, name: str, size_name: s
 
 def _fraction_outside(x: Tensor, mask: Tensor, limit: Tensor) -> Tensor:
     """The fraction (b,) of points beyond the border, of the first pixel's centre and of the last one's, by a pixel."""
-    beyond = ((x < -1) | (x > limit)).any(-1) & mask
-    return beyond.sum(1) / mask.sum(1)
+    return (((x < -1) | (x > limit)).any(-1) & mask).sum(1) / mask.sum(1)

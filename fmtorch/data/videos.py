@@ -117,8 +117,7 @@ def tum_pairs(
     """
     home = given_root(root, "tum", "the folder of the sequences' folders of TUM RGB-D")
     there = sorted(f.parent.name for f in home.glob("*/groundtruth.txt") if (f.parent / "rgb.txt").is_file())
-    names = scenes.chosen("tum", split, sequences, there)
-    folders = scenes.folders(home, names, "a folder for each sequence")
+    folders = scenes.folders(home, scenes.chosen("tum", split, sequences, there), "a folder for each sequence")
     read = [_tum_scene(folder, _lens(folder, camera), window) for folder in folders]
     files = [(folder.name, folder / name) for folder in folders for name in ("rgb.txt", "groundtruth.txt")]
     if not depth or not all((folder / "depth.txt").is_file() for folder in folders):

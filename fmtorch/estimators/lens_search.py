@@ -350,8 +350,7 @@ def squared_px(model: Array, lens: Array, pair: Pair) -> Array:
 def noise_scale(fit: LensFit, pair: Pair) -> float:
     """From which Sampson distance on matches do not count, px, by the noise of those that lie within the start's."""
     r2 = squared_px(fit.F, fit.lens, pair) / np.square(pair.noises)
-    likely = (r2 <= squared(START_SCALE_PX)) & (pair.match_weight > MIN_PRIOR_FOR_NOISE)
-    return fit_distance(r2[likely], FitScale())
+    return fit_distance(r2[(r2 <= squared(START_SCALE_PX)) & (pair.match_weight > MIN_PRIOR_FOR_NOISE)], FitScale())
 
 
 def lens_prior(lens: Lens) -> LensPrior:
@@ -392,8 +391,7 @@ def _round(at: Array, prior: LensPrior, pair: Pair, search: FocalSearch) -> list
     best = np.argsort(-candidates.posterior, kind="stable")[:CANDIDATES]
     best = best[np.isfinite(candidates.posterior[best])]
     cameras = Cameras(candidates.cameras.axes[best], candidates.cameras.focal[best])
-    lenses = np.tile(at, (len(best), 1))
-    fits = fit_with_lenses(cameras, lenses, prior, pair, START_SCALE_PX, START_ITERATIONS)
+    fits = fit_with_lenses(cameras, np.tile(at, (len(best), 1)), prior, pair, START_SCALE_PX, START_ITERATIONS)
     return sorted((fit for fit in fits if math.isfinite(fit.cost)), key=lambda fit: fit.cost)[:1]
 
 

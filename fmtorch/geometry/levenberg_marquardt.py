@@ -65,8 +65,7 @@ def evaluate(F: F8x2, weighted: Weighted, derivatives: bool, products: F8x3, cos
 def in_rows(points: Array, weight: Array, s2: Array) -> Array:
     """Matches (n,), LANES in MATCH rows each; those that fill the last ones have no weight."""
     n = len(weight)
-    count = (n + LANES - 1) // LANES
-    rows = np.zeros((MATCH * count, LANES))
+    rows = np.zeros((MATCH * ((n + LANES - 1) // LANES), LANES))
     for first in range(0, n, LANES):
         row = first // LANES * MATCH
         for i in range(LANES):

@@ -53,8 +53,7 @@ def null_space(A: Array, m: int, B: Array, scale: Array) -> Any:
     The last columns of Q in A^T = Q R (Golub and Van Loan, Matrix Computations, section 5.2); A^T A, whose condition is
     squared, is never formed. Not scaled against overflow: entries should be of about unit size. Returns a mask: whether
     each matrix has rank m, without which its basis is finite but means nothing. scale: (m, LANES), for the work."""
-    zero = fill(0.0)
-    full_rank = zero == 0.0
+    full_rank = fill(0.0) == 0.0
     for k in range(m):
         length2 = _dot(A, 9 * k, A, 9 * k, 9)
         for earlier in range(k):  # the reflections so far

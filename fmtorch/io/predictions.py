@@ -140,8 +140,7 @@ def hloc_matches(
     with h5.opened(matches) as file:
         counts = [len(p) for p in (reversed(points) if swapped else points)]
         i, j, score = _read_matches(file, matches, key, key, counts)
-    index = (j, i) if swapped else (i, j)
-    x0, x1 = (p[k] for p, k in zip(points, index, strict=True))
+    x0, x1 = (p[k] for p, k in zip(points, (j, i) if swapped else (i, j), strict=True))
     return given(x0, x1, (size0, size1), (len(points[0]), len(points[1])), score=score)
 
 

@@ -127,8 +127,7 @@ def default_output(folder: Path) -> Path:
     """``matches/NAME``, with some digits behind where that holds the matches of another folder of this name."""
     output = Path("matches") / folder.absolute().name
     with contextlib.suppress(OSError, ValueError):
-        images = json.loads((output / RECORD).read_text(encoding="utf-8"))["images"]
-        if images != str(folder.absolute()):
+        if json.loads((output / RECORD).read_text(encoding="utf-8"))["images"] != str(folder.absolute()):
             digest = hashlib.blake2b(str(folder.absolute()).encode(), digest_size=4).hexdigest()
             return output.with_name(f"{output.name}-{digest}")
     return output

@@ -294,8 +294,7 @@ class Pipeline:
         try:
             return function([outcome])[0]
         except Exception as error:
-            reason = self._failure(stage, error)
-            return dataclasses.replace(outcome, correspondences=None, images=None, reason=reason)
+            return dataclasses.replace(outcome, correspondences=None, images=None, reason=self._failure(stage, error))
 
     def _failure(self, stage: str, error: Exception) -> str:
         """What a stage raised, as a reason, its traceback kept if it is of a user's own code; raised for `debug`."""

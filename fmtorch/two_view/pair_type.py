@@ -128,8 +128,7 @@ def classify(
             estimate.F, H.F, c.x0, c.x1, c.mask, c.prior, c.noise, c.size0, c.size1, K0, K1, precision
         )
     exact = None if precision is None else precision.diagonal(dim1=-2, dim2=-1).isinf().all(-1)
-    kind = kinds.classified(evidence, exact)
-    return PairTypes(torch.where(estimate.ok | H.ok, kind, kinds.UNRELATED), evidence, H)
+    return PairTypes(torch.where(estimate.ok | H.ok, kinds.classified(evidence, exact), kinds.UNRELATED), evidence, H)
 
 
 def straightened(c: Correspondences, lens: Tensor | None) -> Correspondences:
