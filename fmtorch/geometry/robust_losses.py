@@ -62,6 +62,11 @@ class RobustLoss(NamedTuple):
     curvature: Callable[[Tensor, Tensor], Tensor]
 
 
+def huber_loss(r2: Tensor, s2: Tensor) -> Tensor:
+    """``r^2`` up to the scale s, ``2 s |r| - s^2`` beyond (Huber 1964)."""
+    return torch.where(r2 <= s2, r2, 2 * sqrt(s2 * torch.maximum(r2, s2)) - s2)
+
+
 def huber_weight(r2: Tensor, s2: Tensor) -> Tensor:
     """1 up to the scale s, ``s / |r|`` beyond."""
     return sqrt(s2 / torch.maximum(r2, s2))
@@ -70,6 +75,41 @@ def huber_weight(r2: Tensor, s2: Tensor) -> Tensor:
 def within_scale(r2: Tensor, s2: Tensor) -> Tensor:
     """1 up to the scale, 0 beyond: the curvature of Huber's loss, and both derivatives of the truncated one."""
     return (r2 <= s2).to(r2.dtype)
+
+
+def cauchy_loss(r2: Tensor, s2: Tensor) -> Tensor:
+    """``s^2 log(1 + r^2 / s^2)``."""
+    return s2 * logarithm_1p(r2 / s2)
+
+
+def cauchy_weight(r2: Tensor, s2: Tensor) -> Tensor:
+    """``s^2 / (s^2 + r^2)``."""
+    return s2 / (s2 + r2)
+
+
+def cauchy_curvature(r2: Tensor, s2: Tensor) -> Tensor:
+    """``s^2 (s^2 - r^2) / (s^2 + r^2)^2``, or 0."""
+    return s2 / (s2 + r2) * ((s2 - r2) / (s2 + r2)).clamp_min(0)
+
+
+def geman_mcclure_loss(r2: Tensor, s2: Tensor) -> Tensor:
+    """``r^2 s^2 / (s^2 + r^2)``."""
+    return r2 * (s2 / (s2 + r2))
+
+
+def geman_mcclure_weight(r2: Tensor, s2: Tensor) -> Tensor:
+    """``s^4 / (s^2 + r^2)^2``."""
+    return (s2 / (s2 + r2)).square()
+
+
+def geman_mcclure_curvature(r2: Tensor, s2: Tensor) -> Tensor:
+    """``s^4 (s^2 - 3 r^2) / (s^2 + r^2)^3``, or 0."""
+    return geman_mcclure_weight(r2, s2) * ((s2 - 3 * r2) / (s2 + r2)).clamp_min(0)
+
+
+def truncated_loss(r2: Tensor, s2: Tensor) -> Tensor:
+    """``min(r^2, s^2)``: MSAC. An infinite scale gives plain least squares."""
+    return torch.minimum(r2, s2)
 
 
 def tabulated_loss(r2: Tensor, s2: Tensor) -> Tensor:
@@ -103,21 +143,10 @@ def _look_up(r2: Tensor, s2: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 
 
 LOSSES: dict[str, RobustLoss] = {
-    # ``r^2`` up to the scale s, ``2 s |r| - s^2`` beyond (Huber 1964)
-    "huber": RobustLoss(
-        lambda r2, s2: torch.where(r2 <= s2, r2, 2 * sqrt(s2 * torch.maximum(r2, s2)) - s2), huber_weight, within_scale
-    ),
-    "cauchy": RobustLoss(
-        lambda r2, s2: s2 * logarithm_1p(r2 / s2),
-        lambda r2, s2: s2 / (s2 + r2),
-        lambda r2, s2: s2 / (s2 + r2) * ((s2 - r2) / (s2 + r2)).clamp_min(0),
-    ),
-    "geman_mcclure": RobustLoss(
-        lambda r2, s2: r2 * (s2 / (s2 + r2)),
-        lambda r2, s2: (s2 / (s2 + r2)).square(),
-        lambda r2, s2: (s2 / (s2 + r2)).square() * ((s2 - 3 * r2) / (s2 + r2)).clamp_min(0),
-    ),
-    "truncated": RobustLoss(torch.minimum, within_scale, within_scale),  # MSAC; an infinite scale: plain least squares
+    "huber": RobustLoss(huber_loss, huber_weight, within_scale),
+    "cauchy": RobustLoss(cauchy_loss, cauchy_weight, cauchy_curvature),
+    "geman_mcclure": RobustLoss(geman_mcclure_loss, geman_mcclure_weight, geman_mcclure_curvature),
+    "truncated": RobustLoss(truncated_loss, within_scale, within_scale),
     "magsac": RobustLoss(tabulated_loss, tabulated_weight, tabulated_curvature),
 }
 
