@@ -233,8 +233,7 @@ SWAPPED = 0.05  # fraction outside from which on a size is taken for (w, h), if 
 
 def expect_inside(x: Tensor, mask: Tensor, size: Tensor, name: str, size_name: str) -> None:
     """Raise ValueError where the points (b, n, 2) of all pairs contradict the image's size (b, 2), h and w.
-    Points that reach beyond opposite borders are no pixels of another image or unit: a wide lens was undistorted. Fewer
-    than MIN_MATCHES say nothing."""
+    Points that reach beyond opposite borders are no pixels of another image or unit: a wide lens was undistorted."""
     mask = mask & x.isfinite().all(-1)
     enough = mask.sum(1) >= MIN_MATCHES
     if not bool(enough.any()):
@@ -254,5 +253,4 @@ def expect_inside(x: Tensor, mask: Tensor, size: Tensor, name: str, size_name: s
 
 def _fraction_outside(x: Tensor, mask: Tensor, limit: Tensor) -> Tensor:
     """The fraction (b,) of points beyond the border, of the first pixel's centre and of the last one's, by a pixel."""
-    beyond = ((x < -1) | (x > limit)).any(-1) & mask
-    return beyond.sum(1) / mask.sum(1)
+    return (((x < -1) | (x > limit)).any(-1) & mask).sum(1) / mask.sum(1)

@@ -17,6 +17,12 @@ def place_of(error: BaseException) -> str:
     return f"{Path(own[-1].filename).name}:{own[-1].lineno}, in {own[-1].name}" if own else ""
 
 
+def in_a_line(error: BaseException) -> str:
+    """The kind of an error, its first line, and its `place_of`."""
+    place = place_of(error)
+    return f"{type(error).__name__}: {error}".splitlines()[0] + (f" ({place})" if place else "")
+
+
 def own_traceback(error: BaseException) -> str:
     """The traceback of an error from the user's own code on; empty where none took part."""
     cause = _cause(error)

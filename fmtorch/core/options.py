@@ -85,8 +85,7 @@ def expect_options(
     """Raises ValueError, naming the option, where `values` are no keyword arguments of a class or function.
     Values are compared with the target's annotations as far as these say what a plain value may be; objects, and
     mappings with a `_target_`, are taken on trust. A mapping for a dataclass is checked against its fields. where: the
-    name of the whole, as a user knows it: ``pruner.ratio`` or ``estimator=fmtorch``. given: names of arguments that are
-    added later."""
+    name of the whole, as a user knows it: ``pruner.ratio`` or ``estimator=fmtorch``. given: arguments added later."""
     known = inspect.signature(target).parameters
     named = [name for name, p in known.items() if p.kind not in (p.VAR_KEYWORD, p.VAR_POSITIONAL)]
     if len(named) == len(known):  # else it takes any

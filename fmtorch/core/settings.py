@@ -69,8 +69,7 @@ def differences(old: Any, new: Any) -> str:
 
 def leaves(value: Any, name: str = "") -> Iterator[tuple[str, str]]:
     """Dotted names and JSON texts of all that nested settings hold.
-    A list of mappings of one name each, such as a pipeline's pruners, is that order of names, and what is below
-    each."""
+    A list of mappings of one name each, such as a pipeline's pruners, is their order, and what is below each."""
     if isinstance(value, list) and value and all(isinstance(entry, dict) and len(entry) == 1 for entry in value):
         yield name, f"[{', '.join([key for entry in value for key in entry])}]"
         value = {key: below for entry in value for key, below in entry.items()}

@@ -50,8 +50,7 @@ def load(
         ('stereo', (3, 3))
     """
     config = presets.load("dataset", name)
-    splits = {"split": split} if "split" in config else {}
-    return build({**config, **splits, "root": root, **options}, progress)
+    return build({**config, **({"split": split} if "split" in config else {}), "root": root, **options}, progress)
 
 
 def build(config: Mapping[str, Any], progress: Progress | None = None) -> PairDataset:

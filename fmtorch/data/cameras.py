@@ -67,11 +67,6 @@ def line_distance(F: Matrix, x0: Matrix, x1: Matrix) -> Matrix:
     return np.where(shorter > 0, residual / np.where(shorter > 0, shorter, 1.0), np.inf)
 
 
-def from_projection(P: Matrix, R: Matrix, t: Matrix) -> Camera:
-    """The camera ``P [R | t; 0 1]``, of a projection (3, 4) of an already rectified camera: ``P = K [I | K^-1 p4]``."""
-    return Camera(P[:, :3], R, t + np.linalg.solve(P[:, :3], P[:, 3]))
-
-
 def nearest_rotation(matrix: Matrix, place: str) -> Matrix:
     """The rotation nearest to a matrix (3, 3) that was one before it was rounded to a text file.
     Raises DataError, which begins with `place`, for a matrix that is no rotation."""
@@ -327,8 +322,7 @@ def undistorted(image: Pixels, lens: Lens) -> Pixels:
 @functools.lru_cache(maxsize=_KEPT)
 def _maps(lens: Lens, h: int, w: int) -> tuple[Singles, Singles]:
     """For every pixel (h, w) of the undistorted image where in the photograph it is; -2, which is outside, if nowhere.
-    Where a step outwards no longer leads outwards, a polynomial has left the range to which it was fitted: nothing is
-    taken from there on."""
+    Where a step outwards no longer leads outwards, a polynomial has left its range: nothing is taken from there on."""
     grid = np.stack(np.meshgrid(np.arange(w, dtype=np.float64), np.arange(h, dtype=np.float64)), -1)
     there = lens.distort(grid)
     dx, dy = grid[..., 0] - lens.cx, grid[..., 1] - lens.cy

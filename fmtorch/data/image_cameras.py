@@ -209,8 +209,7 @@ def _binary_cameras(path: Path) -> Iterator[_Camera]:
         key, model, width, height = records.numbers("iiQQ")
         name = names[model] if 0 <= model < len(names) else f"number {model}"
         _expect_known(place, name)
-        parameters = np.array(records.numbers(f"{len(MODELS[name].parameters)}d"))
-        yield place, key, name, width, height, parameters
+        yield place, key, name, width, height, np.array(records.numbers(f"{len(MODELS[name].parameters)}d"))
 
 
 def _binary_images(path: Path, points: bool) -> Iterator[ModelImage]:

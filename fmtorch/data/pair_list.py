@@ -327,8 +327,7 @@ def _resize(resize: int | Sequence[int] | None) -> int | Size | None:
 def _scenes(names: Sequence[str], family: str) -> dict[str, str]:
     """The scene of each image: the first folder in which the names differ, or what stands before ``_frame``."""
     folders = {name: Path(name).parts[:-1] for name in names}
-    levels = zip(*folders.values(), strict=False)
-    shared = len(list(itertools.takewhile(lambda parts: len(set(parts)) == 1, levels)))
+    shared = len(list(itertools.takewhile(lambda parts: len(set(parts)) == 1, zip(*folders.values(), strict=False))))
     scenes = {}
     for name, parts in folders.items():
         frame = _FRAME.match(Path(name).name)

@@ -148,8 +148,7 @@ _COLMAP_HEADER = re.compile(rb"(\d{1,6})&(\d{1,6})&1&")
 class DepthImages:
     """Depth images by the identity of the photographs, pixel by pixel on the photographs as they were taken.
     paths: of the depth images, scene by scene. scale: their values per unit of length; 0 and less is no measurement.
-    read: the values (h, w) of a file. reduced: whether they may be smaller than their photographs, of the same
-    proportions."""
+    read: the values (h, w) of a file. reduced: whether they may be smaller than their photographs, in proportion."""
 
     def __init__(
         self, paths: Iterable[Mapping[str, Path]], scale: float, read: Callable[[Path], Array], reduced: bool = False

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from fmtorch.data import scenes
-from fmtorch.data.cameras import Lens, from_projection, nearest_rotation
+from fmtorch.data.cameras import Lens, nearest_rotation
 from fmtorch.data.files import DataError, Mask, Matrix, given_root, images_by_stem, numbered, to_finite
 from fmtorch.data.pairs import ImageSource
 from fmtorch.data.scenes import WINDOW, Scene, ScenePairs, View, following
@@ -68,15 +68,15 @@ def _kitti_scene(home: Path, folder: Path, camera: int, window: int | float) -> 
     if len(there) > len(lines):
         ends = f"{poses} ends at line {len(lines)} and {images} has {len(there)} images"
         raise DataError(f"{ends}; each must have its line: is the file truncated?")
-    views = []
+    views, P = [], projections[f"P{camera}"]  # K [I | K^-1 p4]
     for frame, (number, line) in enumerate(lines):
         place = f"{poses}, line {number}"
         pose = to_finite(poses, number, line.split(), _POSE, 12).reshape(3, 4)
         R = nearest_rotation(pose[:, :3].T, place)
-        c = from_projection(projections[f"P{camera}"], R, -R @ pose[:, 3])
+        t = -R @ pose[:, 3] + np.linalg.solve(P[:, :3], P[:, 3])
         stem = f"{frame:06d}"
         path = there.get(stem, images / f"{stem}{_SUFFIXES[0]}")
-        views.append(View(ImageSource(f"KITTI/{name}/image_{camera}/{stem}", path), c.K, c.R, c.t, place))
+        views.append(View(ImageSource(f"KITTI/{name}/image_{camera}/{stem}", path), P[:, :3], R, t, place))
     return Scene(name, "KITTI", views, following(times, window))
 
 
@@ -117,8 +117,7 @@ def tum_pairs(
     """
     home = given_root(root, "tum", "the folder of the sequences' folders of TUM RGB-D")
     there = sorted(f.parent.name for f in home.glob("*/groundtruth.txt") if (f.parent / "rgb.txt").is_file())
-    names = scenes.chosen("tum", split, sequences, there)
-    folders = scenes.folders(home, names, "a folder for each sequence")
+    folders = scenes.folders(home, scenes.chosen("tum", split, sequences, there), "a folder for each sequence")
     read = [_tum_scene(folder, _lens(folder, camera), window) for folder in folders]
     files = [(folder.name, folder / name) for folder in folders for name in ("rgb.txt", "groundtruth.txt")]
     if not depth or not all((folder / "depth.txt").is_file() for folder in folders):

@@ -28,11 +28,10 @@ if TYPE_CHECKING:
     from fmtorch.estimators.models.model import BITS, FitScale, Hypotheses, Loss, Steps, cheirality
     from fmtorch.estimators.options import Focal, Preselect, Refine, Select
     from fmtorch.estimators.pair import MAX_NOISE, MIN_NOISE, Lens, Pair, bucket, uniforms
-    from fmtorch.estimators.precompiled import WITH_FOCALS
     from fmtorch.estimators.preselection import Preselection
     from fmtorch.estimators.ransac import Ransac
     from fmtorch.estimators.refinement import BestOfSearch, BestScore, Candidates, Refinement, scores_of
-    from fmtorch.estimators.registry import PARTS, part
+    from fmtorch.estimators.registry import PARTS, WITH_FOCALS, part
     from fmtorch.estimators.sampling import PriorWeighted, Prosac, Sampler, Uniform, largest_weight
     from fmtorch.estimators.scores import (
         GemanMcClure,

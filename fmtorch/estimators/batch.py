@@ -156,8 +156,7 @@ def with_sqrt_prior(c: Correspondences) -> Correspondences:
     if c.focal is None or c.prior is None or (c.ratio is None and c.score is not None):
         return c
     exact = (c.focal.detach()[..., 1] < EXACT).all(1)[:, None] & (c.prior >= 0)  # others are named as they are
-    root = sqrt(torch.where(exact, c.prior, 0))
-    return c.derived(prior=torch.where(exact, root, c.prior))
+    return c.derived(prior=torch.where(exact, sqrt(torch.where(exact, c.prior, 0)), c.prior))
 
 
 def relative_rounding(c: Correspondences) -> float:

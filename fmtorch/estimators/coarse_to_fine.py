@@ -30,8 +30,7 @@ class CoarseToFine:
     @property
     def gradients_reach(self) -> tuple[str, ...]:
         """Those of the fine estimator."""
-        every = ("x0", "x1", "prior", "noise")
-        return tuple(getattr(self.fine, "gradients_reach", every))
+        return tuple(getattr(self.fine, "gradients_reach", ("x0", "x1", "prior", "noise")))
 
     def __call__(self, c: Correspondences, seed: int = 0) -> Estimate:
         """Estimate the fundamental matrices of a batch of pairs."""
@@ -41,5 +40,4 @@ class CoarseToFine:
             f"coarse: {first}" if first else f"fine: {second}" if second else ""
             for first, second in zip(coarse.reason, fine.reason, strict=True)
         )
-        combined = fine.replace(reason=reasons, samples=coarse.samples + fine.samples, significance=None)
-        return judged(combined, c)
+        return judged(fine.replace(reason=reasons, samples=coarse.samples + fine.samples, significance=None), c)

@@ -72,9 +72,10 @@ class Attached:
         self.final, self.family = final, family
         own: Attach | None = getattr(final, "attached", None)
         self.kind = getattr(final, "gradient", "none")
-        kinds: dict[str, Attach] = {"least_squares": self._least_squares, "optimum": self._optimum, "none": self._none}
+        kinds: dict[str, Attach] = {"least_squares": self._least_squares, "optimum": self._optimum}
         if family.model == "homography" and self.kind == "least_squares":
             own = own or self._optimum  # of the Sampson error, near that of least squares
+        kinds["none"] = lambda solved, matches: matches.points.new_zeros(len(solved), 9)
         self.attach = own or kinds[self.kind]
 
     @property
@@ -87,9 +88,6 @@ class Attached:
         if self.kind == "least_squares" and not self.final.weighted:
             return ("x0", "x1")
         return ("x0", "x1", "noise", *(("prior",) if self.family.fit_scale.by_prior else ()))
-
-    def _none(self, solved: list[Solved], matches: GraphedMatches) -> Float[Tensor, "p 9"]:
-        return matches.points.new_zeros(len(solved), 9)
 
     def _least_squares(self, solved: list[Solved], matches: GraphedMatches) -> Float[Tensor, "p 9"]:
         counted = _padded([s.fit.counted for s in solved], matches.mask)

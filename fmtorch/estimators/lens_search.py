@@ -21,8 +21,9 @@ from fmtorch.estimators.models.focal_prior import MIN_DEVIATION, focal_cost
 from fmtorch.estimators.models.model import FitScale
 from fmtorch.estimators.models.posterior import Cameras, Images, Limits, centred, images_of, tangents_of, translate
 from fmtorch.estimators.pair import Lens, Pair, squared
+from fmtorch.geometry import levenberg_marquardt
 from fmtorch.geometry.arithmetic import logarithm_kernel
-from fmtorch.geometry.levenberg_marquardt import MATCH, TINY, Weighted, in_rows, minimiser, robust
+from fmtorch.geometry.levenberg_marquardt import MATCH, TINY, Weighted, add_products, assemble, in_rows, robust
 from fmtorch.geometry.matrices import assign
 from fmtorch.geometry.rank2_manifold import eliminate
 from fmtorch.jit.kernel import Array, F8x1, F8x2, F8x3, inner, kernel, matrix, vector
@@ -77,8 +78,7 @@ def undistorted(pair: Pair, lens: Array) -> Pair:
 
 
 class _State(NamedTuple):
-    """Of k candidates, as `Cameras` and `LensOptimum`. tied: whether the second focal length, and the second lens, are
-    the first."""
+    """Of k candidates, as `Cameras` and `LensOptimum`. tied: whether second focal length and lens are the first."""
 
     tied: tuple[bool, bool]
     axes: Array
@@ -165,20 +165,9 @@ def _summed(F: Array, lens: Array, data: _Data, derivatives: bool) -> Any:
         share, slope = robust(r2, load(data.rows, row + 5), data.loss, data.table, work)
         costs += share * load(data.rows, row + 4)
         if derivatives:
-            factor, q = inverse * (load(data.rows, row + 4) * slope), 0
-            for r in range(ROWS):
-                store(scaled, r, load(J, r) * factor)
-            for r in range(ROWS):
-                of_row = load(J, r)
-                for c in range(r + 1):
-                    store(sums, q, load(sums, q) + of_row * load(scaled, c))
-                    q += 1
-    q = 0
-    for r in range(ROWS if derivatives else 0):
-        for c in range(r + 1):
-            total = added(load(sums, q))
-            data.products[r, c], data.products[c, r] = total, total
-            q += 1
+            add_products(J, inverse * (load(data.rows, row + 4) * slope), scaled, sums)
+    if derivatives:
+        assemble(sums, data.products)
     return added(costs)
 
 
@@ -201,18 +190,11 @@ def _linearised(f: Array, lens: Array, diagonal: Array, rows: Array, row: int, J
     c0, c1 = t0 * (2 * l0), t1 * (2 * l1)
     u, v, w = x1 - c * a1, y1 - c * b1, w1 - c * c1
     p, q, s = c * a0, c * b0, c * c0
-    store(J, 0, u * x0 - x1 * p)
-    store(J, 1, u * y0 - x1 * q)
-    store(J, 2, u * w0 - x1 * s)
-    store(J, 3, v * x0 - y1 * p)
-    store(J, 4, v * y0 - y1 * q)
-    store(J, 5, v * w0 - y1 * s)
-    store(J, 6, w * x0 - w1 * p)
-    store(J, 7, w * y0 - w1 * q)
-    store(J, 8, w * w0 - w1 * s)
+    store(J, 0, (u * x0 - x1 * p, u * y0 - x1 * q, u * w0 - x1 * s))
+    store(J, 3, (v * x0 - y1 * p, v * y0 - y1 * q, v * w0 - y1 * s))
+    store(J, 6, (w * x0 - w1 * p, w * y0 - w1 * q, w * w0 - w1 * s))
     store(J, 9, r0 * s1 - c * (2.0 * s1 * t0 + r0 * (a1 * f[2] + b1 * f[5] + c1 * f[8])))
-    store(J, 10, r1 * s0 - c * (2.0 * s0 * t1 + r1 * (a0 * f[6] + b0 * f[7] + c0 * f[8])))
-    store(J, 11, e)
+    store(J, 10, (r1 * s0 - c * (2.0 * s0 * t1 + r1 * (a0 * f[6] + b0 * f[7] + c0 * f[8])), e))
     r2 = e * c
     return inverse, where(r2 == r2, r2, math.nan)
 
@@ -273,7 +255,7 @@ def _take(state: _State, trial: _State, k: int) -> None:
     posterior.take_cameras(state, trial, k)
 
 
-_minimise = minimiser(_evaluate, _step, _take, posterior.converged, posterior.MIN_DAMPING)
+_minimise = levenberg_marquardt.minimiser(_evaluate, _step, _take, posterior.converged, posterior.MIN_DAMPING)
 
 
 STARTS = ((0.0, 0.0), (-0.12, -0.12), (-0.25, -0.25))  # of both lenses, where they are one
@@ -368,8 +350,7 @@ def squared_px(model: Array, lens: Array, pair: Pair) -> Array:
 def noise_scale(fit: LensFit, pair: Pair) -> float:
     """From which Sampson distance on matches do not count, px, by the noise of those that lie within the start's."""
     r2 = squared_px(fit.F, fit.lens, pair) / np.square(pair.noises)
-    likely = (r2 <= squared(START_SCALE_PX)) & (pair.match_weight > MIN_PRIOR_FOR_NOISE)
-    return fit_distance(r2[likely], FitScale())
+    return fit_distance(r2[(r2 <= squared(START_SCALE_PX)) & (pair.match_weight > MIN_PRIOR_FOR_NOISE)], FitScale())
 
 
 def lens_prior(lens: Lens) -> LensPrior:
@@ -410,8 +391,7 @@ def _round(at: Array, prior: LensPrior, pair: Pair, search: FocalSearch) -> list
     best = np.argsort(-candidates.posterior, kind="stable")[:CANDIDATES]
     best = best[np.isfinite(candidates.posterior[best])]
     cameras = Cameras(candidates.cameras.axes[best], candidates.cameras.focal[best])
-    lenses = np.tile(at, (len(best), 1))
-    fits = fit_with_lenses(cameras, lenses, prior, pair, START_SCALE_PX, START_ITERATIONS)
+    fits = fit_with_lenses(cameras, np.tile(at, (len(best), 1)), prior, pair, START_SCALE_PX, START_ITERATIONS)
     return sorted((fit for fit in fits if math.isfinite(fit.cost)), key=lambda fit: fit.cost)[:1]
 
 

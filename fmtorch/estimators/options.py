@@ -60,8 +60,7 @@ class Select:
 @dataclasses.dataclass(frozen=True)
 class ExactFocals:
     """What is different where both focal lengths are exactly known: fewer models fit by accident.
-    scale: of the selecting score, Sampson distance, px. sqrt_prior: whether the square root of P(inlier)
-    stands for it throughout."""
+    scale: of the selecting score, Sampson distance, px. sqrt_prior: whether the root of P(inlier) stands for it."""
 
     scale: Pixels
     sqrt_prior: bool = False

@@ -26,10 +26,9 @@ from fmtorch.estimators.models.model import Refining
 from fmtorch.estimators.models.with_focals import FundamentalWithFocals
 from fmtorch.estimators.options import Count, Focal, Preselect, Refine, Select, stage
 from fmtorch.estimators.pair import Lens, Pair
-from fmtorch.estimators.precompiled import OF_HOMOGRAPHIES, WITH_FOCALS
 from fmtorch.estimators.preselection import Preselection
 from fmtorch.estimators.refinement import BestOfSearch, BestScore, LocalOptimization, Refinement, Selection, Selector
-from fmtorch.estimators.registry import part, thresholds
+from fmtorch.estimators.registry import OF_HOMOGRAPHIES, WITH_FOCALS, part, thresholds
 from fmtorch.estimators.sampling import Sampler
 from fmtorch.estimators.scores import Score
 from fmtorch.estimators.search import Search
@@ -120,7 +119,10 @@ class Ransac:
         check = part("degeneracy", degeneracy, score=self.score)
         if check is not None and self.family.size != Degensac.SAMPLE:
             raise ValueError(f"degeneracy={degeneracy} needs solver=seven_point; solver is {solver!r}")
-        self._expect_fundamental(degeneracy=check, local_optimization=local_optimization, focal=focal)
+        of_fundamental = {"degeneracy": check, "local_optimization": local_optimization, "focal": focal}
+        wrong = [name for name, value in of_fundamental.items() if value is not None]
+        if wrong and self.family.model != "fundamental":
+            raise ValueError(f"{wrong[0]} is for fundamental matrices; the solver gives {self.family.model} matrices")
         self.search = Search(self.family, self.sampler, preselection, pool, hypotheses, round, stop, check)
         optimization = part("local_optimization", local_optimization, threshold=threshold, score=self.score)
         refinement = Refinement(stage(refine, Refine), optimization)
@@ -131,12 +133,6 @@ class Ransac:
         if choice is not None:
             self.select = BestScore(part("score", choice.score, threshold=choice.scale))
         self.focal = _focal_search(stage(focal, Focal), self.select, self.search, refinement, choice)
-
-    def _expect_fundamental(self, **options: object) -> None:
-        """Raise ValueError for an option that is there and serves fundamental matrices alone."""
-        wrong = [name for name, value in options.items() if value is not None]
-        if wrong and self.family.model != "fundamental":
-            raise ValueError(f"{wrong[0]} is for fundamental matrices; the solver gives {self.family.model} matrices")
 
     @property
     def model(self) -> str:
@@ -206,8 +202,7 @@ class Ransac:
         """The same of bent photographs: searched in images of pinholes, judged as photographed."""
         assert self.focal is not None
         lens = lenses_of(pair, self.focal)
-        straight = undistorted(pair, lens)
-        solution = self._of_pinholes(straight)
+        solution = self._of_pinholes(undistorted(pair, lens))
         if solution.fit is None or solution.inliers is None:
             return solution
         fit, cameras = solution.fit, solution.fit.cameras

@@ -66,8 +66,7 @@ class Refinement:
         if self.local_optimization is not None:
             F = self.local_optimization(F, pair)
         if (options := self.options) is not None:
-            steps = Steps(options.iterations, FIRST_DAMPING)
-            F = family.refine(F, near, Loss(options.loss, options.scale), steps)
+            F = family.refine(F, near, Loss(options.loss, options.scale), Steps(options.iterations, FIRST_DAMPING))
         return Candidates(F, pool.valid, near)
 
 

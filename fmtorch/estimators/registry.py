@@ -11,13 +11,22 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from fmtorch.core.options import expect_options
+from fmtorch.estimators import focal_search, inliers, pair, preselection, refinement, sampling, scores, search
 from fmtorch.estimators.degensac import Degensac
 from fmtorch.estimators.final_fits import Adaptive, GaussNewton, LeastSquares, NoFit, UnweightedLeastSquares
 from fmtorch.estimators.graph_cut import GraphCut
 from fmtorch.estimators.inliers import BetterHalf, RobustDeviations, WithinThreshold
+from fmtorch.estimators.lens_search import inverted, minimise_with_lenses
+from fmtorch.estimators.models import focal_prior, fundamental, model, posterior, with_focals
 from fmtorch.estimators.models.fundamental import EightPoint, Homography, SevenPoint
 from fmtorch.estimators.sampling import PriorWeighted, Prosac, Uniform
 from fmtorch.estimators.scores import InlierCount, Magsac, Median, Msac, SaturatedGains
+from fmtorch.geometry import five_point, homography_refine, levenberg_marquardt
+from fmtorch.geometry.homography import four_point
+from fmtorch.geometry.refine import refine_kernel
+from fmtorch.geometry.seven_point import seven_point_kernel
+from fmtorch.geometry.significance import counted_chances, counted_plane_chances, most_significant
+from fmtorch.jit.kernel import Kernel
 
 DEFAULT_THRESHOLD_PX = 1.0
 
@@ -71,8 +80,7 @@ def thresholds(
     threshold: float | None, inlier_threshold: float | None, score: Any, inliers: Any, stops: bool, optimization: Any
 ) -> tuple[float, float]:
     """The thresholds of score and of inliers, px; ValueError where one is given that nothing asks for.
-    score, inliers, optimization: as options name these parts. stops: whether there is a stopping rule, which counts
-    inliers."""
+    score, inliers, optimization: as options name these parts. stops: whether a rule that counts inliers does."""
     by_distance = stops or takes("inliers", inliers, "threshold")
     if inlier_threshold is not None and not by_distance:
         raise ValueError(f"inlier_threshold={inlier_threshold} has no effect: inliers={inliers} takes none")
@@ -81,3 +89,27 @@ def thresholds(
         raise ValueError(f"threshold={threshold} has no effect: score={score} takes none, nor does anything else")
     of_score = DEFAULT_THRESHOLD_PX if threshold is None else threshold
     return of_score, of_score if inlier_threshold is None else inlier_threshold
+
+
+# Kernels that two processes compile side by side, by what they share, the slowest to compile at both ends
+
+WITH_FOCALS: tuple[Kernel[..., Any], ...] = (
+    # Solvers, samples and scores
+    five_point.five_point, seven_point_kernel, counted_chances, refinement.near, sampling.draw,
+    focal_prior.draw_depths, preselection.draw_by_prior, preselection.best, scores.score_gains, scores.score_saturated,
+    pair.normalize_pair, pair.to_pixels, preselection.support, inliers.residuals_squared, inliers.share_within,
+    search.merge, scores.saturated_cells, scores.pack, focal_search.posteriors,
+    focal_search.distinct_models, focal_search.same_model,
+    # Cameras and fits; `evaluate` is called by `minimise` and `refine`
+    posterior.centre, posterior.translate, with_focals.gain_without_prior, with_focals.refine_with_prior,
+    model.cheirality, most_significant, posterior.nearest_cameras, levenberg_marquardt.evaluate, refine_kernel,
+    posterior.minimise, inverted, minimise_with_lenses,
+)  # fmt: skip
+"""Of an estimator of fundamental matrices with the prior on focal lengths."""
+
+OF_HOMOGRAPHIES: tuple[Kernel[..., Any], ...] = (
+    homography_refine.refine_homographies, homography_refine.evaluate_homographies, four_point,
+    fundamental.homography_to_pixels, inliers.residuals_squared_homography, refinement.near_homography,
+    scores.score_gains_homography, scores.score_saturated_homography, counted_plane_chances,
+)  # fmt: skip
+"""Of an estimator of homographies, beside those that the former has too."""

@@ -82,8 +82,7 @@ class Search:
         pool, end = Pool.empty(self.pool), start + self.hypotheses
         while start < end:
             count = min(self.round, end - start)
-            sample = drawn(self.sampler, pair, start, count, self.family.size)
-            hypotheses = self.family.solve(pair, sample, start)
+            hypotheses = self.family.solve(pair, drawn(self.sampler, pair, start, count, self.family.size), start)
             models = Verified(hypotheses.F, *self.preselection(hypotheses.F, pair))
             if self.degeneracy is not None:
                 models = self.degeneracy(hypotheses, models, float(pool.score[0]), pair)

@@ -413,8 +413,7 @@ def _seconds(overall: Mapping[str, Group]) -> Table:
         width = 100 * (seconds["total"] or 0.0) / slowest / sum(stages) if slowest and sum(stages) else 0.0
         table.rows[name][-1] = table.rows[name][-1]._replace(shares=[width * each for each in stages])
     failed = [f"{name}: {reason} ({n})" for name, group in overall.items() for reason, n in group["reasons"].items()]
-    note = f"Pairs that failed: {'; '.join(failed)}." if failed else ""
-    return table._replace(note=note, stages=True)
+    return table._replace(note=f"Pairs that failed: {'; '.join(failed)}." if failed else "", stages=True)
 
 
 def shared_keys(runs: Mapping[str, pa.Table]) -> list[int]:

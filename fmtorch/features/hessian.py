@@ -50,7 +50,8 @@ def refined_maxima(volume: Float[Tensor, "s h w"], seeds: Int[Tensor, "m 3"], th
 def _refine(volume: Tensor, at: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """The samples (K, 3), offsets (K, 3) and values (K,) of the seeds that are maxima and settle."""
     at = at[_exceeds_levels(volume, at)]
-    at = at[_is_maximum(_samples(volume, at))]
+    v = _samples(volume, at)
+    at = at[(v[CENTRE] > v[:CENTRE]).all(0) & (v[CENTRE] >= v[CENTRE + 1 :]).all(0)]
     last = torch.tensor(volume.shape) - 2
     offset, value, peaked = _quadratic(_samples(volume, at))
     for _ in range(MOVES):
@@ -86,10 +87,6 @@ def _exceeds_levels(volume: Tensor, at: Tensor) -> Tensor:
     return (centre > values[place - h * w]) & (centre >= values[place + h * w])
 
 
-def _is_maximum(v: Float[Tensor, "27 m"]) -> Tensor:
-    return (v[CENTRE] > v[:CENTRE]).all(0) & (v[CENTRE] >= v[CENTRE + 1 :]).all(0)
-
-
 def _quadratic(v: Float[Tensor, "27 m"]) -> tuple[Tensor, Tensor, Tensor]:
     """Of the quadratic with the central differences of 27 samples: the maximum (M, 3), its value, whether there is one.
     Cramer's rule on the negative Hessian, which is positive definite at a maximum."""
@@ -109,8 +106,7 @@ def _quadratic(v: Float[Tensor, "27 m"]) -> tuple[Tensor, Tensor, Tensor]:
     ds = (cofactors[0] * gs + cofactors[1] * gy + cofactors[2] * gx) / safe
     dy = (cofactors[1] * gs + (ss * xx - sx * sx) * gy + (sy * sx - ss * yx) * gx) / safe
     dx = (cofactors[2] * gs + (sy * sx - ss * yx) * gy + minor * gx) / safe
-    value = c + 0.5 * (gs * ds + gy * dy + gx * dx)
-    return torch.stack([ds, dy, dx], 1), value.to(v.dtype), peaked
+    return torch.stack([ds, dy, dx], 1), (c + 0.5 * (gs * ds + gy * dy + gx * dx)).to(v.dtype), peaked
 
 
 KERNEL_SIGMAS = 3.0  # half the length of a sampled Gaussian

@@ -46,8 +46,7 @@ class _NetworkFeatures:
             wanted = f"uint8, (H, W) or RGB (H, W, 3), of at least {SMALLEST} x {SMALLEST} px"
             raise ValueError(f"image is {image.dtype} {image.shape}; it must be {wanted}")
         channels = np.broadcast_to(image if colour else image[..., None], (*image.shape[:2], 3))
-        pixels = torch.from_numpy(channels.transpose(2, 0, 1).copy()).to(self.device)
-        return pixels[None].to(torch.float32) / 255
+        return torch.from_numpy(channels.transpose(2, 0, 1).copy()).to(self.device)[None].to(torch.float32) / 255
 
 
 class DISK(_NetworkFeatures):

@@ -56,11 +56,6 @@ def orthogonal_(features: nn.Module, gain: float = 0.6) -> None:
                 nn.init.constant_(module.bias, 0.01)
 
 
-def unit_length(x: Float[Tensor, "n d"], eps: float = 1e-10) -> Float[Tensor, "n d"]:
-    """Vectors of unit Euclidean length; a zero vector stays zero, with a finite gradient."""
-    return x / (x.square().sum(dim=1, keepdim=True) + eps).sqrt()
-
-
 def as_float32(features: nn.Module, x: Tensor) -> Tensor:
     """The trunk's output as (N, D) float32, whatever the precision of autocast."""
     out: Tensor = features(x.to(memory_format=torch.channels_last))
@@ -82,8 +77,9 @@ class HardNet(nn.Module):
         orthogonal_(self.features)
 
     def forward(self, patches: Float[Tensor, "n 1 32 32"]) -> Float[Tensor, "n 128"]:
-        """Descriptors of unit length; their Euclidean distance lies in [0, 2]."""
-        return unit_length(as_float32(self.features, standardize(patches, self.eps)))
+        """Descriptors of unit length; a zero vector stays zero, with a finite gradient."""
+        x = as_float32(self.features, standardize(patches, self.eps))
+        return x / (x.square().sum(dim=1, keepdim=True) + 1e-10).sqrt()
 
 
 class HardNetFast(HardNet):
@@ -121,28 +117,37 @@ class GeoDesc(HardNet):
         self.features = nn.Sequential(*list(self.features)[:-1])
 
 
-class AffNet(nn.Module):
+class _FrameNetwork(nn.Module):
+    """A few numbers of each patch, each in (-1, 1)."""
+
+    outputs: int
+    layout: Layout = l2net_layout(16)
+    eps = 1e-6
+    padding = 0  # of the last convolution
+
+    def __init__(self, dropout: float = 0.25) -> None:
+        super().__init__()
+        *layers, last = trunk(self.layout, dropout, self.outputs, bias=True)
+        last.padding = (self.padding, self.padding)  # type: ignore[assignment]
+        self.features = nn.Sequential(*layers, last, nn.Tanh(), nn.AdaptiveAvgPool2d(1))
+        orthogonal_(self.features)
+
+    def forward(self, patches: Float[Tensor, "n 1 32 32"]) -> Float[Tensor, "n d"]:
+        """The numbers of each patch."""
+        return as_float32(self.features, standardize(patches, self.eps))
+
+
+class AffNet(_FrameNetwork):
     """AffNet (Mishkin, Radenovic, Matas, ECCV 2018): three numbers of an affine shape, each in (-1, 1).
     With x the output, the shape is the lower-triangular [[1 + x0, 0], [x1, 1 + x2]] in the patch's own coordinates, up
     to scale; x = 0 is a circle. The state_dict is that of the authors' release and of kornia's LAFAffNetShapeEstimator.
     """
 
     outputs = 3
-    layout: Layout = l2net_layout(16)
 
     def __init__(self, dropout: float = 0.25) -> None:
-        super().__init__()
-        tail = (nn.Tanh(), nn.AdaptiveAvgPool2d(1))
-        self.features = nn.Sequential(*trunk(self.layout, dropout, self.outputs, bias=True), *tail)
-        orthogonal_(self.features)
-        last = self.features[-1 - len(tail)]
-        assert isinstance(last, nn.Conv2d)
-        assert last.bias is not None
-        nn.init.zeros_(last.bias)
-
-    def forward(self, patches: Float[Tensor, "n 1 32 32"]) -> Float[Tensor, "n 3"]:
-        """The three numbers of each patch."""
-        return as_float32(self.features, standardize(patches, eps=1e-6))
+        super().__init__(dropout)
+        nn.init.zeros_(self.features[-3].bias)  # type: ignore[arg-type]
 
 
 class AffNetFast(AffNet):
@@ -152,25 +157,13 @@ class AffNetFast(AffNet):
     layout: Layout = ((16, 2), (16, 1), (32, 2), (32, 1), (32, 1))
 
 
-class OriNet(nn.Module):
+class OriNet(_FrameNetwork):
     """OriNet (Mishkin, Radenovic, Matas, ECCV 2018): a vector (y, x) in (-1, 1)^2 whose atan2 is the orientation.
-    The state_dict is that of the authors' release and of kornia.feature.OriNet."""
+    The angle is atan2(first, second) in kornia's convention. The state_dict is that of the authors' release and of
+    kornia.feature.OriNet."""
 
-    outputs = 2
-
-    def __init__(self, dropout: float = 0.25) -> None:
-        super().__init__()
-        tail = (nn.Tanh(), nn.AdaptiveAvgPool2d(1))
-        layers = trunk(l2net_layout(16), dropout, self.outputs, bias=True)
-        last = layers[-1]
-        assert isinstance(last, nn.Conv2d)
-        last.padding = (1, 1)  # nine positions, whose tanh is averaged
-        self.features = nn.Sequential(*layers, *tail)
-        orthogonal_(self.features)
-
-    def forward(self, patches: Float[Tensor, "n 1 32 32"]) -> Float[Tensor, "n 2"]:
-        """The vector of each patch; its angle is atan2(first, second) in kornia's convention."""
-        return as_float32(self.features, standardize(patches, eps=1e-8))
+    outputs, eps = 2, 1e-8
+    padding = 1  # nine positions, whose tanh is averaged
 
 
 ARCHITECTURES: dict[str, type[nn.Module]] = {
@@ -195,7 +188,8 @@ def read_checkpoint(path: Path | str) -> dict[str, Any]:
     if not path.is_file():
         raise FileNotFoundError(f"{path} does not exist")
     try:
-        script = _is_script(path)
+        names = zipfile.ZipFile(path).namelist() if zipfile.is_zipfile(path) else []
+        script = any(name.endswith("/constants.pkl") for name in names)
         content: Any = _script_state(path) if script else torch.load(path, map_location="cpu", weights_only=True)
     except (RuntimeError, pickle.UnpicklingError, EOFError, ValueError, KeyError) as error:
         raise ValueError(f"{path} is neither a state_dict nor TorchScript: {error}") from error
@@ -204,13 +198,6 @@ def read_checkpoint(path: Path | str) -> dict[str, Any]:
     if isinstance(content, Mapping) and content and all(isinstance(value, Tensor) for value in content.values()):
         return {"state_dict": dict(content)}
     raise ValueError(f"{path} holds no state_dict")
-
-
-def _is_script(path: Path) -> bool:
-    if not zipfile.is_zipfile(path):
-        return False
-    with zipfile.ZipFile(path) as archive:
-        return any(name.endswith("/constants.pkl") for name in archive.namelist())
 
 
 def _script_state(path: Path) -> dict[str, Tensor]:

@@ -35,8 +35,7 @@ class ImagePyramid:
         """Patches in [0, 1] whose pixels tile the frames' squares; the image's border is continued outside.
         Pixel (i, j) shows ``c + A (u_j, u_i)`` with ``u_k = (2 k + 1) / size - 1``: kornia's convention. Its value is
         interpolated in the level in which pixels along the patch's denser axis are at most `LARGEST_STEP` apart, and
-        averaged over as many samples along the other axis as keep them so close. A frame that is not finite gives
-        zeros."""
+        averaged over as many samples along the other axis as keep them so close. Frames not finite give zeros."""
         plan, images = _plan(lafs, len(self.levels), size), [level.numpy() for level in self.levels]
         out = np.zeros((len(lafs), size, size), np.float32)
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP

@@ -256,8 +256,7 @@ def _mapped_back(features: Features, to_view: np.ndarray, shape: tuple[int, ...]
     reach = half_side[:, None] * torch.linalg.vector_norm(to_image, dim=1)
     far = torch.tensor([shape[1] - 1, shape[0] - 1], dtype=centre.dtype)
     kept = ((centre >= reach) & (centre <= far - reach)).all(-1)
-    mapped = torch.cat([to_image @ lafs[..., :2], centre[..., None]], -1)
-    return features.replace(lafs=mapped.float())[kept]
+    return features.replace(lafs=torch.cat([to_image @ lafs[..., :2], centre[..., None]], -1).float())[kept]
 
 
 # SIFT of patches, plain, as RootSIFT, and pooled over domain sizes; batched (Lowe, IJCV 2004, section 6)
@@ -383,8 +382,7 @@ def learn_projection(
     mean = x.mean(0)
     _, axes = torch.linalg.eigh((x - mean).T @ (x - mean) / len(x))
     basis = axes.flip(1)[:, :dimensions]
-    sign = basis.gather(0, basis.abs().argmax(0, keepdim=True)).sign()
-    return mean.float(), (basis * sign).float()
+    return mean.float(), (basis * basis.gather(0, basis.abs().argmax(0, keepdim=True)).sign()).float()
 
 
 def read_learned(path: Path, names: Sequence[str], what: str, remedy: str) -> list[Tensor]:

@@ -331,8 +331,7 @@ def _positive_part(Pi: Tensor) -> Tensor:
 
 def _of_fundamental(C: Tensor, F: Tensor, slopes: Tensor, p0: Tensor, p1: Tensor) -> Tensor:
     """The covariance (9, 9, b) of F in pixels at unit norm, of that of the parameters."""
-    pixels = torch.stack([_uncentred(A, p0, p1) for A in (F, *slopes.unbind(2))])
-    entries = pixels.flatten(1, 2)
+    entries = torch.stack([_uncentred(A, p0, p1) for A in (F, *slopes.unbind(2))]).flatten(1, 2)
     f = entries[0] * inverse_root(component_sum(entries[0] * entries[0]))
     J = entries[1:] * inverse_root(component_sum(entries[0] * entries[0]))
     J = J - component_sum(J * f, 1)[:, None] * f

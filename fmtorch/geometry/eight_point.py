@@ -79,8 +79,7 @@ def normal_matrix(
     broadcasts against that of the weights."""
     # a = x1 (x) x0, so M holds the sums of w (x1 x1^T) (x) (x0 x0^T): 6 x 6 different ones, in parts that fit a cache.
     p0, p1 = _products(x0), weight[..., None, :] * _products(x1)
-    rows = [stable_sum(part[..., :, None, :] * p0[..., None, :, :], -1) for part in p1.chunk(3, -2)]
-    sums = torch.cat(rows, -2)
+    sums = torch.cat([stable_sum(part[..., :, None, :] * p0[..., None, :, :], -1) for part in p1.chunk(3, -2)], -2)
     M: Tensor = sums[..., _PRODUCT_INDEX[:, None, :, None], _PRODUCT_INDEX[None, :, None, :]]
     return M.reshape(*sums.shape[:-2], 9, 9)
 
@@ -194,9 +193,7 @@ def weighted_eight_point(points: F8x2, weight: F8x1, F: F8x1) -> bool:
             X[k, i] = points[k, i]
     for image in range(2):
         _similarity(X[2 * image], X[2 * image + 1], w, similarity[image])
-    M = _normal_matrix(X, w)
-    solved = smallest_eigenvector_kernel(M, F)
-    if not solved:
+    if not smallest_eigenvector_kernel(_normal_matrix(X, w), F):
         return False
     nearest_rank2_kernel(F)
     for image in range(2):

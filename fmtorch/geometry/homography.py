@@ -173,8 +173,7 @@ def _homographies(X: Array, work: Array, h: Array) -> Any:
     rows = fill(0.0)
     h00, h01, h10, h11, h20, h21 = rows, rows, rows, rows, rows, rows
     x3, y3, u3, v3 = load(X, 12), load(X, 13), load(X, 14), load(X, 15)
-    E = fill(0.0)
-    D = fill(0.0)
+    D, E = rows, rows
     for i in range(3):
         j, k = (i + 1) % 3, (i + 2) % 3
         d, e = load(work, i), load(work, 3 + i)
@@ -194,15 +193,7 @@ def _homographies(X: Array, work: Array, h: Array) -> Any:
         h00 * h00 + h01 * h01 + h02 * h02 + h10 * h10 + h11 * h11 + h12 * h12 + h20 * h20 + h21 * h21 + h22 * h22
     )
     by = 1.0 / where(E > 0.0, size, 0.0 - size)
-    store(h, 0, h00 * by)
-    store(h, 1, h01 * by)
-    store(h, 2, h02 * by)
-    store(h, 3, h10 * by)
-    store(h, 4, h11 * by)
-    store(h, 5, h12 * by)
-    store(h, 6, h20 * by)
-    store(h, 7, h21 * by)
-    store(h, 8, h22 * by)
+    store(h, 0, (h00 * by, h01 * by, h02 * by, h10 * by, h11 * by, h12 * by, h20 * by, h21 * by, h22 * by))
     return there & (size > 0.0) & (size < math.inf)
 
 

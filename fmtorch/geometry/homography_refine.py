@@ -148,20 +148,10 @@ def _linearise(h: Array, rows: Array, row: int, derivatives: bool, factors: Arra
     l0, l1 = i00 * e - i01 * f, i11 * f - i01 * e
     if derivatives:
         X, Y, du, dv = x - (a * l0 + c * l1), y - (b * l0 + d * l1), w * l0, w * l1
-        store(factors, 0, X)
-        store(factors, 1, Y)
-        store(factors, 2, fill(1.0))
-        store(factors, 3, 0.0 - (u * X + x * du))
-        store(factors, 4, 0.0 - (u * Y + y * du))
-        store(factors, 5, 0.0 - (u + du))
-        store(factors, 6, 0.0 - (v * X + x * dv))
-        store(factors, 7, 0.0 - (v * Y + y * dv))
-        store(factors, 8, 0.0 - (v + dv))
-        store(factors, 9, i00)
-        store(factors, 10, 0.0 - i01)
-        store(factors, 11, i11)
-        store(factors, 12, l0)
-        store(factors, 13, l1)
+        store(factors, 0, (X, Y, fill(1.0)))
+        store(factors, 3, (0.0 - (u * X + x * du), 0.0 - (u * Y + y * du), 0.0 - (u + du)))
+        store(factors, 6, (0.0 - (v * X + x * dv), 0.0 - (v * Y + y * dv), 0.0 - (v + dv)))
+        store(factors, 9, (i00, 0.0 - i01, i11, l0, l1))
     r2 = e * l0 + f * l1
     return where(w > 0.0, r2, where(w == w, BEHIND, r2))  # what is not a number stays none
 

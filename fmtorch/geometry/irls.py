@@ -126,8 +126,7 @@ def reweighted_fits(
     F, residual = (None, None) if F0 is None else (first, distances(first))
     fits, valid = [], []
     for _ in range(iterations):
-        weight = matches.ordered(weigh(F, residual))
-        fitted, determined = weighted_fit(matches.points, weight[:, None])
+        fitted, determined = weighted_fit(matches.points, matches.ordered(weigh(F, residual))[:, None])
         # Of rank 2 instead of what is not determined: `where` alone would not keep NaN out of the gradients.
         pixels = matches.to_pixels(torch.where(determined, fitted, constant(fitted, RANK_TWO)))[:, 0]
         F = torch.where(determined[..., None], canonical(pixels), first if F is None else F)
@@ -139,11 +138,9 @@ def reweighted_fits(
 
 def reweighted(F: Float[Tensor, "9 p k"], error: RobustSum) -> Float[Tensor, "9 p k"]:
     """One iteration, component by component: the 8-point algorithm with the weights that the residuals under F give.
-    F: k models for each of p pairs, entries row by row. Models of rank 2; one that the weighted matches do not
-    determine is kept as it was."""
+    F: k models for each of p pairs, entries row by row. Models of rank 2; what matches leave open stays as it was."""
     finite = torch.isfinite(F).all(0)
-    known = torch.where(finite, F, constant(F, RANK_TWO))
-    _, _, inverse, r2 = linearise(known, error.points, derivatives=False)
+    _, _, inverse, r2 = linearise(torch.where(finite, F, constant(F, RANK_TWO)), error.points, derivatives=False)
     w = error.weight[:, None] * (error.rho.weight(r2, error.s2[:, None]) * inverse)
     fitted, determined = weighted_fit(error.points, w)
     return torch.where(finite & determined, fitted, F)

@@ -57,20 +57,15 @@ def evaluate(F: F8x2, weighted: Weighted, derivatives: bool, products: F8x3, cos
             if derivatives:
                 add_products(J, inverse * (load(matches, row + 4) * slope), scaled, sums)
         cost[k] = added(costs)
-        q = 0
-        for r in range(10 if derivatives else 0):
-            for c in range(r + 1):
-                total = added(load(sums, q))
-                products[k, r, c], products[k, c, r] = total, total
-                q += 1
+        if derivatives:
+            assemble(sums, products[k])
 
 
 @inner
 def in_rows(points: Array, weight: Array, s2: Array) -> Array:
     """Matches (n,), LANES in MATCH rows each; those that fill the last ones have no weight."""
     n = len(weight)
-    count = (n + LANES - 1) // LANES
-    rows = np.zeros((MATCH * count, LANES))
+    rows = np.zeros((MATCH * ((n + LANES - 1) // LANES), LANES))
     for first in range(0, n, LANES):
         row = first // LANES * MATCH
         for i in range(LANES):
@@ -93,16 +88,8 @@ def linearise_kernel(f: Array, matches: Array, row: int, J: Array) -> tuple[Any,
     inverse = 1.0 / where(slope > TINY, slope, TINY)
     c = e * inverse
     u, v, p, q = x1 - c * a0, y1 - c * b0, -c * a1, -c * b1
-    store(J, 0, u * x0 + x1 * p)
-    store(J, 1, u * y0 + x1 * q)
-    store(J, 2, u)
-    store(J, 3, v * x0 + y1 * p)
-    store(J, 4, v * y0 + y1 * q)
-    store(J, 5, v)
-    store(J, 6, x0 + p)
-    store(J, 7, y0 + q)
-    store(J, 8, fill(1.0))
-    store(J, 9, e)
+    store(J, 0, (u * x0 + x1 * p, u * y0 + x1 * q, u, v * x0 + y1 * p, v * y0 + y1 * q, v))
+    store(J, 6, (x0 + p, y0 + q, fill(1.0), e))
     return inverse, e * c
 
 
@@ -147,13 +134,24 @@ def _tabulated(table: Array, work: Array) -> None:
 @inner
 def add_products(J: Array, factor: Any, weighted: Array, sums: Array) -> None:
     """Adds the lower triangle of the weighted products of Jacobian and residual, row by row."""
-    for r in range(10):
+    for r in range(len(J)):
         store(weighted, r, load(J, r) * factor)
     q = 0
-    for r in range(10):
+    for r in range(len(J)):
         of_row = load(J, r)
         for c in range(r + 1):
             store(sums, q, load(sums, q) + of_row * load(weighted, c))
+            q += 1
+
+
+@inner
+def assemble(sums: Array, products: Array) -> None:
+    """The sums of `add_products` -> products, both triangles."""
+    q = 0
+    for r in range(len(products)):
+        for c in range(r + 1):
+            total = added(load(sums, q))
+            products[r, c], products[c, r] = total, total
             q += 1
 
 

@@ -190,8 +190,7 @@ def _inverse_power(M: Tensor) -> tuple[Tensor, Tensor]:
         inverse_of_L[i + 1 :, : i + 1] -= column[:, None] * inverse_of_L[i, : i + 1]
         A = A[1:, 1:] - column[:, None] * A[0, 1:]
         pivots.append(pivot)
-    D = torch.stack(pivots)
-    inverse = outer_sum((inverse_of_L / D[:, None])[:, :, None], inverse_of_L[:, None])
+    inverse = outer_sum((inverse_of_L / torch.stack(pivots)[:, None])[:, :, None], inverse_of_L[:, None])
     size = _trace(inverse)
     X = inverse = inverse / size
     done = torch.zeros_like(nonzero)

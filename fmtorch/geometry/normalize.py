@@ -60,8 +60,7 @@ def normalize_pair(x0: Points, x1: Points, mask: Mask | None = None) -> tuple[Po
     (x0, w), (x1, _) = _clean(x0, mask, None), _clean(x1, mask, None)
     c0, c1 = _mean(x0, w), _mean(x1, w)
     x0, x1 = x0 - c0[..., None, :], x1 - c1[..., None, :]
-    distance = (_mean_distance(x0, w) + _mean_distance(x1, w)) / 2
-    scale = _scale(distance, torch.maximum(c0.abs(), c1.abs()))
+    scale = _scale((_mean_distance(x0, w) + _mean_distance(x1, w)) / 2, torch.maximum(c0.abs(), c1.abs()))
     return _apply(x0, mask, scale), _apply(x1, mask, scale), _similarity(c0, scale), _similarity(c1, scale)
 
 
@@ -184,8 +183,7 @@ class NormalizedMatches:
 
     def ordered(self, weight: PerMatch) -> Float[Tensor, "p n"]:
         """Values of matches in the caller's order in the order of `points`, 0 in padded slots; float64."""
-        flat = weight.to(torch.float64).reshape(self._order.shape)
-        return torch.where(self._mask, flat.gather(1, self._order), 0)
+        return torch.where(self._mask, weight.to(torch.float64).reshape(self._order.shape).gather(1, self._order), 0)
 
     def to_pixels(self, models: Float[Tensor, "9 p k"]) -> Float[Tensor, "p k 3 3"]:
         """Matrices in pixels, of unit norm."""
@@ -203,8 +201,7 @@ def fitted_by(
     scales = error.s2.detach().expand_as(error.weight).cpu().contiguous().numpy()
     out, cost = np.empty_like(start), np.empty(start.shape[:2])
     for p, given in enumerate(start):
-        matches = Weighted.of(columns[p], weights[p], scales[p], error.loss)
-        fit(given, matches, out[p], cost[p])
+        fit(given, Weighted.of(columns[p], weights[p], scales[p], error.loss), out[p], cost[p])
     known = np.isfinite(cost)
     fitted = torch.from_numpy(np.where(known[..., None], out, start)).to(models.device)
     return fitted.permute(2, 0, 1).contiguous(), torch.from_numpy(np.where(known, cost, np.inf)).to(models.device)

@@ -44,15 +44,7 @@ def equations(X: Array, size: int, A: Array) -> None:
     for j in range(size):
         o, p = 9 * j, 4 * j
         x0, y0, x1, y1 = load(X, p), load(X, p + 1), load(X, p + 2), load(X, p + 3)
-        store(A, o, x1 * x0)
-        store(A, o + 1, x1 * y0)
-        store(A, o + 2, x1)
-        store(A, o + 3, y1 * x0)
-        store(A, o + 4, y1 * y0)
-        store(A, o + 5, y1)
-        store(A, o + 6, x0)
-        store(A, o + 7, y0)
-        store(A, o + 8, fill(1.0))
+        store(A, o, (x1 * x0, x1 * y0, x1, y1 * x0, y1 * y0, y1, x0, y0, fill(1.0)))
 
 
 @inner
@@ -61,8 +53,7 @@ def null_space(A: Array, m: int, B: Array, scale: Array) -> Any:
     The last columns of Q in A^T = Q R (Golub and Van Loan, Matrix Computations, section 5.2); A^T A, whose condition is
     squared, is never formed. Not scaled against overflow: entries should be of about unit size. Returns a mask: whether
     each matrix has rank m, without which its basis is finite but means nothing. scale: (m, LANES), for the work."""
-    zero = fill(0.0)
-    full_rank = zero == 0.0
+    full_rank = fill(0.0) == 0.0
     for k in range(m):
         length2 = _dot(A, 9 * k, A, 9 * k, 9)
         for earlier in range(k):  # the reflections so far

@@ -314,8 +314,7 @@ def pair_evidence(
     models = torch.where(models.isfinite().flatten(2).all(2)[..., None, None], models, 0.0)
     sizes = (None if size is None else size.to(torch.float64) for size in (size0, size1))
     given = (x0, x1, mask, prior, noise, models, *sizes, precision)
-    out = torch.empty(len(F), COLUMNS, dtype=torch.float64)
-    rows = for_each_pair(_into, given, out=out, kind=torch.float64)
+    rows = for_each_pair(_into, given, out=torch.empty(len(F), COLUMNS, dtype=torch.float64), kind=torch.float64)
     columns = [rows[:, k] for k in (LINE, PLANE, BOTH, TURN, COPY)]
     columns += [rows[:, k] for k in (NOISE, MATCHES, ON_PLANE, ON_LINE)]
     columns += [rows[:, ROTATION_OF_KERNEL:SCALED].reshape(-1, 3, 3)]
@@ -326,8 +325,7 @@ def pair_evidence(
 def _into(x0: Array, x1: Array, mask: Array, prior: Array, noise: Array, *known: Array) -> None:
     models, size0, size1, precision, out = known
     F, H, K0, K1 = models
-    matches = Matches(x0, x1, mask, prior, noise)
-    weigh(matches, Models(F, H, size0, size1), Cameras(K0, K1, precision), out)
+    weigh(Matches(x0, x1, mask, prior, noise), Models(F, H, size0, size1), Cameras(K0, K1, precision), out)
 
 
 def classified(evidence: Evidence, focal_known: Bool[Tensor, " b"] | None = None) -> Int[Tensor, " b"]:

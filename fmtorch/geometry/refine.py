@@ -165,8 +165,7 @@ def attached_step(
         # Something of rank 2 instead of what is not finite: `where` alone would not keep NaN out of the gradients.
         model = torch.where(valid, model, constant(model, RANK_TWO))
         e0, e1 = (torch.where(valid, e, constant(e, RANK_TWO_EPIPOLE)) for e in (e0, e1))
-    gradient = gradient_of_cost(model, matches.error)
-    step = -component_sum((inverse * gradient).transpose(0, 1))
+    step = -component_sum((inverse * gradient_of_cost(model, matches.error)).transpose(0, 1))
     moved, _, _ = rank2_manifold.retract(model, step, e0, e1)
     return matches.to_pixels(torch.where(valid, moved, matches.models)).reshape(F.shape)
 

@@ -104,8 +104,7 @@ def _transfer(H: Array, u: float, v: float, x: float, y: float) -> Any:
 @inner
 def _area(x: Array, y: Array, size: Array) -> Any:
     """Of an image, or of the box of its points; not zero."""
-    area = size[0] * size[1] if len(size) else (x.max() - x.min()) * (y.max() - y.min())
-    return max(area, TINY)
+    return max(size[0] * size[1] if len(size) else (x.max() - x.min()) * (y.max() - y.min()), TINY)
 
 
 @inner
@@ -269,10 +268,8 @@ def of_one_pair(
 
 @functools.lru_cache(maxsize=8)
 def _log_factorials(count: int) -> Array:
-    """log i! (count,) for i = 0 ... count - 1, in ascending order of summation, so that longer tables begin alike.
-    For few counts, so that it is seldom made."""
-    logarithms = logarithm(torch.arange(1, count, dtype=torch.float64))
-    return np.concatenate([np.zeros(1), np.cumsum(logarithms.numpy())])
+    """log i! (count,) for i = 0 ... count - 1, summed in ascending order, so that longer tables begin alike."""
+    return np.concatenate([np.zeros(1), np.cumsum(logarithm(torch.arange(1, count, dtype=torch.float64)).numpy())])
 
 
 def judged(estimate: Estimate, c: Correspondences) -> Estimate:

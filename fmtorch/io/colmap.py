@@ -36,8 +36,7 @@ def write_database(
     Degenerate geometries are left out; a pair without a geometry has F, with both cameras known E, too, where its
     support is beyond chance. A known K is a PINHOLE camera with a trusted focal length, one with distortion is of its
     lens's model; images of equal cameras and size share it. Otherwise an image has a SIMPLE_RADIAL camera of the focal
-    length of EXIF, or COLMAP's default, or shares it with all of its size. Pixels are moved by half of one, as COLMAP
-    counts."""
+    length of EXIF, or COLMAP's default, or shares it with all of its size. Pixels are moved by half, as COLMAP's."""
     pycolmap = imported()
     cameras: dict[object, int] = {}
     ids: dict[str, int] = {}

@@ -16,7 +16,7 @@ from fmtorch.data.pairs import HeldPairs
 from fmtorch.io import h5, oanet, predictions
 from fmtorch.io.predictions import Images, Size
 
-MATCHES, RATIOS, CALIBRATIONS, ROTATIONS, TRANSLATIONS, TRUTH = (
+MATCHES, RATIOS, CALIBRATIONS, ROTATIONS, TRANSLATIONS, TRUTH = TUTORIAL = tuple(
     f"{name}.h5" for name in ("matches", "match_conf", "K1_K2", "R", "T", "Fgt")
 )
 
@@ -33,12 +33,6 @@ def tutorial_matches(folder: Path, key: str, sizes: tuple[Size, Size]) -> GivenM
             lengths = f"{len(ratios)} entries, but {MATCHES} has {len(points)} matches of that pair"
             raise DataError(f"{folder / RATIOS}: {key!r} has {lengths}")
     return predictions.given(points[:, :2], points[:, 2:], sizes, (len(points), len(points)), ratio=ratios)
-
-
-def tutorial_files(root: Path) -> list[Path]:
-    """All that defines the data set."""
-    names = (MATCHES, RATIOS, CALIBRATIONS, ROTATIONS, TRANSLATIONS, TRUTH)
-    return [path for folder in scenes(root) for name in names if (path := folder / name).exists()]
 
 
 def tutorial_pairs(root: Path, images: Path | None) -> Iterator[ImagePair]:
@@ -266,7 +260,10 @@ class H5Pairs(HeldPairs):
             self._pairs = list(WITH_GEOMETRY[layout](folder, where))
             if where is not None:
                 _expect_distinct(self._pairs, where)
-            files = tutorial_files(folder) if layout == "ransac_tutorial" else h5.files(folder)
+            if layout == "ransac_tutorial":
+                files = [path for scene in scenes(folder) for name in TUTORIAL if (path := scene / name).exists()]
+            else:
+                files = h5.files(folder)
         else:
             _expect_unset(layout, images=images)
             if truth is None:

@@ -193,8 +193,7 @@ def from_poselib(pose: Any, inliers: Any, K0: Any = None, K1: Any = None) -> Est
     """
     K0, K1 = (np.eye(3) if K is None else as_tensor(K, "K").double().numpy() for K in (K0, K1))
     R, t = np.asarray(pose.R), np.asarray(pose.t)
-    E = cross_matrix(torch.tensor(t)).numpy() @ R
-    F = np.linalg.inv(K1).T @ E @ np.linalg.inv(K0)
+    F = np.linalg.inv(K1).T @ (cross_matrix(torch.tensor(t)).numpy() @ R) @ np.linalg.inv(K0)
     return _estimate(F, "fundamental", as_tensor(inliers, "inliers").bool()[None], np.c_[R, t], "")
 
 
@@ -207,8 +206,7 @@ def _estimate(value: Any, model: str, inliers: Tensor, pose: Any, reason: str) -
         R, t = (torch.from_numpy(part.copy())[None] for part in (pose[:, :3], pose[:, 3]))
         fields = {"R": R, "t": t / t.norm(), "E": cross_matrix(t / t.norm()) @ R}
     reasons, samples = ("" if ok else reason or "no model",), torch.zeros(1, dtype=torch.int64)
-    F = unit_frobenius(matrix)
-    return Estimate(F, inliers & ok, torch.tensor([ok]), reasons, samples, model=model, **fields)
+    return Estimate(unit_frobenius(matrix), inliers & ok, torch.tensor([ok]), reasons, samples, model=model, **fields)
 
 
 def _same(count: int) -> np.ndarray:

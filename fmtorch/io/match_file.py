@@ -118,8 +118,7 @@ class HlocMatches(_OpenFiles):
     def _image(self, name: str) -> DatabaseImage:
         points = h5.numbers(self._features, f"{name}/keypoints", None, 2).astype(np.float32)
         width, height = h5.reshaped(self._features, f"{name}/image_size", 2)
-        size = int(height), int(width)
-        return DatabaseImage(name, -1, size, np.eye(3), np.inf, points, points)
+        return DatabaseImage(name, -1, (int(height), int(width)), np.eye(3), np.inf, points, points)
 
 
 def write_geometry(group: Any, geometry: PairGeometry) -> None:
@@ -248,8 +247,7 @@ def _write_npz(path: Path, pairs: Iterable[Mapping[str, Array]]) -> None:
 
 def _write_h5(path: Path, pairs: Iterable[Mapping[str, Array]]) -> None:
     """`inliers` as a data set of each pair's group, the others as its attributes."""
-    h5py = h5.imported()
-    with h5py.File(path, "w") as file:
+    with h5.imported().File(path, "w") as file:
         for entries in pairs:
             for key, value in entries.items():
                 pair, _, name = key.rpartition("/")

@@ -133,16 +133,14 @@ def hloc_matches(
 ) -> GivenMatches:
     """hloc's matches of one pair: ``matches0`` and ``matching_scores0`` (n0,) for the keypoints of the first image.
     origin: where it puts the first pixel's centre. images: for sizes where the features file does not hold them. names:
-    of the images in the features file. key: of the pair in the matches file; swapped: whether its first image is our
-    second."""
+    of the images in the features file. key: of the pair in the matches file; swapped: its first image is our second."""
     with h5.opened(features) as file:
         points = [_keypoints(file, features, name) - origin for name in names]
         size0, size1 = (_size(file, f"{n}/image_size", image) for n, image in zip(names, images, strict=True))
     with h5.opened(matches) as file:
         counts = [len(p) for p in (reversed(points) if swapped else points)]
         i, j, score = _read_matches(file, matches, key, key, counts)
-    index = (j, i) if swapped else (i, j)
-    x0, x1 = (p[k] for p, k in zip(points, index, strict=True))
+    x0, x1 = (p[k] for p, k in zip(points, (j, i) if swapped else (i, j), strict=True))
     return given(x0, x1, (size0, size1), (len(points[0]), len(points[1])), score=score)
 
 

@@ -168,15 +168,17 @@ def fill(count: int) -> Any:
 @intrinsic  # type: ignore[untyped-decorator]
 def store(context: Any, A: Any, row: Any, value: Any) -> Any:
     """`lanes.store`."""
-    if A.dtype != value.dtype:
+    kinds = list(value) if isinstance(value, types.BaseTuple) else [value]
+    if any(A.dtype != kind.dtype for kind in kinds):
         raise numba.TypingError(f"{value} cannot be stored in an array of {A.dtype}")
 
     def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        bits, vector = context.get_data_type(A.dtype), args[2]
-        if A.dtype == types.boolean:
-            vector = builder.zext(vector, ir.VectorType(bits, value.count))
-        place = _place(context, builder, A, args[0], args[1], value.count, bits)
-        builder.store(vector, place, align=_size(A.dtype))
+        bits = context.get_data_type(A.dtype)
+        vectors = cgutils.unpack_tuple(builder, args[2]) if isinstance(value, types.BaseTuple) else [args[2]]
+        for k, (kind, vector) in enumerate(zip(kinds, vectors, strict=True)):
+            wide = builder.zext(vector, ir.VectorType(bits, kind.count)) if A.dtype == types.boolean else vector
+            row = builder.add(args[1], ir.Constant(INDEX, k))
+            builder.store(wide, _place(context, builder, A, args[0], row, kind.count, bits), align=_size(A.dtype))
         return context.get_dummy_value()
 
     return types.void(A, types.int64, value), code

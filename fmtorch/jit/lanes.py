@@ -74,8 +74,9 @@ load, fill = lanes(LANES)
 
 @LaneFunction
 def store(A: Array, row: int, value: Any) -> None:
-    """Makes a value row r of an array (rows, lanes), a mask that of an array of booleans."""
-    A[row] = value
+    """Makes a value row r of an array (rows, lanes), a mask that of booleans; of a tuple all rows from r on."""
+    for k, each in enumerate(value if isinstance(value, tuple) else (value,)):
+        A[row + k] = each
 
 
 @LaneFunction

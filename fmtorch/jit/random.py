@@ -63,8 +63,7 @@ def bits(
     seed: int, key: Int[Tensor, " b"], stream: Stream, start: int, count: int, columns: int
 ) -> Int[Tensor, "b count columns"]:
     """Random 63-bit non-negative integers for the draws start .. start + count - 1, `columns` numbers a draw."""
-    device = key.device
-    counter = torch.arange(start * columns, (start + count) * columns, device=device, dtype=torch.int64)
+    counter = torch.arange(start * columns, (start + count) * columns, device=key.device, dtype=torch.int64)
     state = _mix(key ^ mixed_seed(seed, stream))[:, None] + (counter * _GAMMA)[None]
     return _shift_right(_mix(state), 1).reshape(len(key), count, columns)
 

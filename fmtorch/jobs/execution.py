@@ -48,8 +48,7 @@ class Execution:
 
     def decided(self, processes: bool) -> "Execution":
         """The same with "auto" as processes, or as threads: one worker is a thread in any case."""
-        several = (self.workers or cores()) > 1
-        kind = "processes" if processes and several else "threads"
+        kind = "processes" if processes and (self.workers or cores()) > 1 else "threads"
         return self if self.kind != "auto" else dataclasses.replace(self, kind=kind)
 
 

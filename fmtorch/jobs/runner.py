@@ -112,8 +112,7 @@ class WorkerPool(contextlib.AbstractContextManager["WorkerPool"]):
         if not spawned:
             context.set_forkserver_preload(list(self.preload))
         pool = futures.ProcessPoolExecutor if self.needs_main else _WithoutMain
-        environment = {**os.environ, **_ONE_THREAD}
-        return pool(self.size, context, initializer=_begin, initargs=(environment,))
+        return pool(self.size, context, initializer=_begin, initargs=({**os.environ, **_ONE_THREAD},))
 
 
 class _WithoutMain(futures.ProcessPoolExecutor):

@@ -331,8 +331,7 @@ def segment_in_image(
     a: float, b: float, c: float, size: Array, border: float
 ) -> tuple[float, float, float, float, bool]:
     """x and y of the ends of the part of a line inside the rectangle (border, border + size); whether there is one.
-    The line may have any scale, sign and direction. The first end is the left one, or the upper one of a vertical
-    line."""
+    The line may have any scale, sign and direction. The left end is first, or the upper one of a vertical line."""
     half_h, half_w = size[0] / 2, size[1] / 2
     centre_x, centre_y = half_w + border, half_h + border
     squared = a * a + b * b

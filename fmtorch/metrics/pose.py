@@ -68,8 +68,7 @@ def pose_error(
         minus, plus = torch.minimum(minus, plus), torch.maximum(minus, plus)
     translation = _angle(minus, plus)
 
-    largest = 90.0 if up_to_sign else 180.0
-    translation = torch.where((t_est == 0).all(-1), largest, translation)
+    translation = torch.where((t_est == 0).all(-1), 90.0 if up_to_sign else 180.0, translation)
     translation = torch.where((t_gt == 0).all(-1) & finite, 0.0, translation)
     return PoseError(torch.where(finite, rotation, 180.0), translation)
 

@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from fmtorch.core import failures
+from fmtorch.core.failures import in_a_line
 from fmtorch.core.settings import claim
 from fmtorch.data import DataError, ImageSource, read_image
 from fmtorch.io.match_store import MatchStore, StoredPair
@@ -127,8 +127,7 @@ def default_output(folder: Path) -> Path:
     """``matches/NAME``, with some digits behind where that holds the matches of another folder of this name."""
     output = Path("matches") / folder.absolute().name
     with contextlib.suppress(OSError, ValueError):
-        images = json.loads((output / RECORD).read_text(encoding="utf-8"))["images"]
-        if images != str(folder.absolute()):
+        if json.loads((output / RECORD).read_text(encoding="utf-8"))["images"] != str(folder.absolute()):
             digest = hashlib.blake2b(str(folder.absolute()).encode(), digest_size=4).hexdigest()
             return output.with_name(f"{output.name}-{digest}")
     return output
@@ -203,12 +202,7 @@ def described_or_matched(pipeline: Pipeline, task: Photograph | DescribedPair) -
                 return task.image
             return describe(pipeline, read_image(task.image, orient=task.orient), task.longest_side)
     except Exception as error:  # one image, or one pair, does not end the work on the others
-        return _in_a_line(error)
-
-
-def _in_a_line(error: Exception) -> str:
-    place = failures.place_of(error)
-    return f"{type(error).__name__}: {error}".splitlines()[0] + (f" ({place})" if place else "")
+        return in_a_line(error)
 
 
 def folder_workers(pipeline: Pipeline, execution: Execution | None = None) -> WorkerPool:
@@ -314,7 +308,7 @@ class FolderMatches:
             if pool.execution.send_images:
                 source = dataclasses.replace(source, data=image.read_bytes())  # type: ignore[type-var]
         except (DataError, OSError) as error:  # no camera, or no file
-            source = _in_a_line(error)
+            source = in_a_line(error)
         return Photograph(image, source, self.longest_side, self.orient)
 
     def _described_pair(self, pair: Pair) -> DescribedPair | None:
@@ -326,7 +320,7 @@ class FolderMatches:
         try:
             known = self.cameras.given(pair, [end0.size, end1.size])
         except Exception as error:
-            self._fail(pair, _in_a_line(error))
+            self._fail(pair, in_a_line(error))
             return None
         return DescribedPair(pair, (end0, end1), names, self.seed, known)
 
@@ -338,7 +332,7 @@ class FolderMatches:
             try:
                 self.journal.add_pair(*task.pair, result)
             except Exception as error:
-                result = _in_a_line(error)
+                result = in_a_line(error)
         if isinstance(result, str):
             self._fail(task.pair, result)
         else:
@@ -353,7 +347,7 @@ class FolderMatches:
                     self.journal.add_image(image, exported_image(self.journal.name(image), described, camera))
                 return described
             except Exception as error:
-                described = _in_a_line(error)
+                described = in_a_line(error)
         self._troubles[image,] = described
         return None
 

@@ -70,5 +70,4 @@ def _conflicting(c: Correspondences, estimate: Estimate) -> Tensor:
     if c.K0 is None or c.K1 is None or c.focal is None or estimate.focals is None:
         return torch.zeros_like(estimate.ok)
     stored = torch.stack([torch.sqrt(K[:, 0, 0] * K[:, 1, 1]) for K in (c.K0, c.K1)], 1)
-    apart = (estimate.focals / stored).log().abs()
-    return (apart > MAX_CONFLICT * c.focal[..., 1].clamp_min(FOCAL_DEVIATION)).any(1)
+    return ((estimate.focals / stored).log().abs() > MAX_CONFLICT * c.focal[..., 1].clamp_min(FOCAL_DEVIATION)).any(1)

@@ -123,12 +123,6 @@ def collated(outcomes: Sequence[Outcome]) -> Correspondences:
     return collate([outcome.correspondences for outcome in outcomes if outcome.correspondences is not None])
 
 
-def described(stage: str, error: Exception) -> str:
-    """What a stage raised, as a reason of one line, with the line of a user's own code that did."""
-    place = failures.place_of(error)
-    return f"{stage}: {type(error).__name__}: {error}".splitlines()[0] + (f" ({place})" if place else "")
-
-
 STAGES = ("features", "matching", "pruning", "estimation")
 Stage = Callable[[list[Outcome]], list[Outcome]]
 MAX_TRACEBACKS = 3  # of different failures of a user's own code that are kept
@@ -231,7 +225,7 @@ class Pipeline:
                     raise
                 results = [self._alone(stage, function, outcomes[i]) for i in matched]
                 if all(result.correspondences is not None for result in results):
-                    reason = described(stage, error)
+                    reason = f"{stage}: {failures.in_a_line(error)}"
                     said = f"of a batch of {len(matched)} pairs, though of each alone it does not: {reason}"
                     self.tracebacks.setdefault(said, failures.own_traceback(error))
         synchronise(self.device)
@@ -309,14 +303,13 @@ class Pipeline:
         try:
             return function([outcome])[0]
         except Exception as error:
-            reason = self._failure(stage, error)
-            return dataclasses.replace(outcome, correspondences=None, images=None, reason=reason)
+            return dataclasses.replace(outcome, correspondences=None, images=None, reason=self._failure(stage, error))
 
     def _failure(self, stage: str, error: Exception) -> str:
         """What a stage raised, as a reason, its traceback kept if it is of a user's own code; raised for `debug`."""
         if self.debug:
             raise error
-        reason = described(stage, error)
+        reason = f"{stage}: {failures.in_a_line(error)}"
         if len(self.tracebacks) < MAX_TRACEBACKS and (text := failures.own_traceback(error)):
             self.tracebacks.setdefault(reason, text)
         return reason

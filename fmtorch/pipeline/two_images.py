@@ -402,8 +402,7 @@ def _estimated(
     of_pinholes = estimate.derived(F=F, lens=None)
     pair_type = classify(even, of_pinholes, seed=seed)
     clock("pair_type")
-    index = np.arange(c.mask.shape[1]).repeat(2).reshape(-1, 2)
-    (geometry,) = pair_geometries([index], even, of_pinholes, pair_type)
+    (geometry,) = pair_geometries([np.arange(c.mask.shape[1]).repeat(2).reshape(-1, 2)], even, of_pinholes, pair_type)
     inliers = estimate.inliers[0]
     cameras = estimate.R, estimate.t, estimate.focals, estimate.lens
     R, t, focals, lens = (None if value is None else value[0] for value in cameras)

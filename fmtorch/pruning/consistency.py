@@ -223,8 +223,7 @@ TWO_TANGENT32 = np.float32(math.tan(math.pi / 8))
 
 @kernel
 def position_agreement_kernel(x0: F4x2, x1: F4x2, ratio: F4x1, mask: B1x1, out: F4x1) -> None:
-    """`position_agreement` of x0, x1 (n, 2), mask (n,), and its a, b and s -> out (n + 3,).
-    ratio: (n,), empty where unknown."""
+    """`position_agreement` of x0, x1 (n, 2), mask, ratio (n,), empty if unknown, and its a, b and s -> out (n + 3,)."""
     n, m = len(mask), 0
     out[:] = 0
     rows, match = np.empty((5, n), x0.dtype), np.empty(n, np.int64)

@@ -138,8 +138,7 @@ class CachedFeatures:
 
     def __init__(self, extractor: FeatureExtractor, cache: ArrayCache) -> None:
         self.extractor, self.cache = extractor, cache
-        name = type(extractor).__name__
-        self._extraction = self._section(name, extractor)
+        self._extraction = self._section(type(extractor).__name__, extractor)
         self._detection = ""
         if isinstance(extractor, TwoStepExtractor):
             self._detection = self._section("detection", extractor.detection)

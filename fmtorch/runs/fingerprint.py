@@ -108,8 +108,7 @@ def _statements(tree: ast.Module) -> list[ast.AST]:
 
 def _files_of(statement: _Import, file: Path, start: Path, own: bool) -> Iterator[Path]:
     """The files below `start` that an import statement of `file` names.
-    Of anybody's own code with the packages on the way; of fmtorch's, whose packages import all that is in them,
-    without."""
+    Of anybody's own code with the packages on the way; of fmtorch's, whose packages import all in them, without."""
     level, module, imported = statement
     if level is None:
         names = [(start, name) for name in imported]

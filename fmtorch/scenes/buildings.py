@@ -30,13 +30,11 @@ def card(surfaces: Surfaces, foot: Vector, facing: Real, width: Real, height: Re
 def tree(surfaces: Surfaces, rng: Rng, foot: Vector, height: Real, leaf: int, bark: int) -> None:
     """A trunk and a crown of leafy cards."""
     radius = 0.03 * height
-    profile = [(0.0, radius * 1.3), (0.3 * height, radius), (0.75 * height, radius * 0.5)]
-    surfaces.lathe(foot, profile, bark, sides=6)
+    surfaces.lathe(foot, [(0.0, radius * 1.3), (0.3 * height, radius), (0.75 * height, radius * 0.5)], bark, sides=6)
     for _ in range(11):
         offset = rng.normal(0, [0.13, 0.13, 0.1]) * height
         side = height * rng.uniform(0.32, 0.5)
-        at = foot + vec(0, 0, 0.48 * height) + offset
-        card(surfaces, at, rng.uniform(0, 360), side, side, leaf)
+        card(surfaces, foot + vec(0, 0, 0.48 * height) + offset, rng.uniform(0, 360), side, side, leaf)
 
 
 def foliage(surfaces: Surfaces, rng: Rng) -> tuple[int, int]:

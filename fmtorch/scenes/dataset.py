@@ -82,8 +82,7 @@ def digest(family: str, split: str, seed: int, plan: Plan) -> str:
     """What defines a family's pictures and pairs, as 64 hex digits.
     OpenCV's release is part of it, since it draws the letters on signs and finds the keypoints that choose the pairs.
     """
-    release = ".".join(cv2.__version__.split(".")[:2])
-    parts = [VERSION, release, family, split, seed, dataclasses.asdict(plan)]
+    parts = [VERSION, ".".join(cv2.__version__.split(".")[:2]), family, split, seed, dataclasses.asdict(plan)]
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
 
 
@@ -114,8 +113,7 @@ def draw(scene: DrawnScene, seed: np.random.SeedSequence) -> Iterator[Pixels]:
         if shot.light not in stages:
             surfaces = scene.surfaces[shot.light]
             stages[shot.light] = Stage(Geometry(surfaces), scene.lights[shot.light], scene.sky)
-        cameras = shot.moments or [shot.camera]
-        yield expose(stages[shot.light], cameras, shot.lens, np.random.default_rng(noise))
+        yield expose(stages[shot.light], shot.moments or [shot.camera], shot.lens, np.random.default_rng(noise))
 
 
 def generate_all(

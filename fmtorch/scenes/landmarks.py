@@ -91,8 +91,7 @@ def _structure(surfaces: Surfaces, rng: Rng, split: str) -> float:
 
 def _boards_and_rocks(surfaces: Surfaces, rng: Rng, split: str, reach: Real, back: int) -> None:
     """Painted boards and rocks round a structure that reaches so far; back: texture of the boards' other side."""
-    paintings = [*pictures(split, rng, 2), to_pixels(poster(rng, 384, 288))]
-    for k, picture in enumerate(paintings):
+    for k, picture in enumerate([*pictures(split, rng, 2), to_pixels(poster(rng, 384, 288))]):
         angle = 120 * k + rng.uniform(-30, 30)
         foot = direction(angle) * (reach + rng.uniform(0.8, 2.2))
         right = direction(angle + 90 + rng.uniform(-30, 30))
@@ -162,8 +161,7 @@ def orbit_scene(rng: Rng, split: str, shots: int, scale: Real) -> DrawnScene:
         eye = direction(a) * radius + vec(0, 0, rng.uniform(1.3, 2.6))
         at = vec(*rng.normal(0, 0.7, 2), 0.42 * height + rng.normal(0, 0.3))
         camera = look_at(K, size, eye.tolist(), at.tolist(), roll=float(rng.normal(0, 0.03)))
-        lens = Lens(exposure=float(rng.uniform(0.8, 1.2)), noise=3.0, blur=0.7)
-        taken.append(Shot(camera, lens, jpeg=88))
+        taken.append(Shot(camera, Lens(exposure=float(rng.uniform(0.8, 1.2)), noise=3.0, blur=0.7), jpeg=88))
     light = Light(sun(rng.uniform(0, 360), rng.uniform(30, 65)))
     apart = np.abs((azimuth[:, None] - azimuth[None] + 180) % 360 - 180)
     # Wide before narrow within each round, so that the pairs kept spread evenly over the angles.
@@ -245,8 +243,7 @@ def collection_scene(rng: Rng, split: str, shots: int, scale: Real) -> DrawnScen
     _surroundings(fixed, rng, split, width)
     lights, surfaces = _times_of_day(fixed, rng, width)
     taken = [_photograph(rng, width, scale, light=i % LIGHTS) for i in range(shots)]
-    sky = heaven(rng, rng.uniform(-0.3, 0.7))
-    return DrawnScene(surfaces, lights, sky, taken, shuffled_pairs(rng, shots))
+    return DrawnScene(surfaces, lights, heaven(rng, rng.uniform(-0.3, 0.7)), taken, shuffled_pairs(rng, shots))
 
 
 def _surroundings(surfaces: Surfaces, rng: Rng, split: str, width: Real) -> None:
@@ -278,8 +275,7 @@ def _times_of_day(fixed: Surfaces, rng: Rng, width: Real) -> tuple[list[Light], 
         ))  # fmt: skip
         crowd = fixed.copy()
         for _ in range(22):
-            at = vec(rng.normal(0, width / 3), -rng.uniform(3, 22), 0)
-            buildings.walker(crowd, rng, at, rng.uniform(225, 315))
+            buildings.walker(crowd, rng, vec(rng.normal(0, width / 3), -rng.uniform(3, 22), 0), rng.uniform(225, 315))
         surfaces.append(crowd)
     return lights, surfaces
 

@@ -136,8 +136,7 @@ def meadow(rng: Rng, h: int, w: int, tint: Floats) -> Floats:
     count = h * w // 120
     root = rng.uniform(0, [w, h], (count, 2))
     tip = root + rng.normal(0, 5, (count, 2))
-    shade = rng.normal(1, 0.28, count)
-    for a, b, s in zip(root.astype(int).tolist(), tip.astype(int).tolist(), shade, strict=True):
+    for a, b, s in zip(root.astype(int).tolist(), tip.astype(int).tolist(), rng.normal(1, 0.28, count), strict=True):
         cv2.line(out, a, b, (tint * s).tolist(), 1, cv2.LINE_AA)
     return out
 
@@ -167,8 +166,7 @@ def leaves(rng: Rng, size: int, tint: Floats) -> Pixels:
     count, out = 320, np.zeros((size, size, 4), dtype=np.float32)
     out[..., :3] = tint * 0.5
     radius = size * 0.42 * np.sqrt(rng.random(count))
-    angle = rng.uniform(0, 2 * np.pi, count)
-    for r, a in zip(radius, angle, strict=True):
+    for r, a in zip(radius, rng.uniform(0, 2 * np.pi, count), strict=True):
         at = (int(size / 2 + r * np.cos(a)), int(size / 2 + r * np.sin(a)))
         tone = tint * rng.normal(1, 0.3) * (1.15 - 0.3 * np.sin(a) * r / size)
         axes = (int(rng.uniform(0.025, 0.055) * size), int(rng.uniform(0.012, 0.028) * size))

@@ -283,8 +283,7 @@ class Geometry:
 
     def look(self, camera: Camera, offset: tuple[float, float] = (0.0, 0.0)) -> Hits:
         shift = np.array([[1.0, 0.0, -offset[0]], [0.0, 1.0, -offset[1]], [0.0, 0.0, 1.0]])
-        depth = np.append(camera.R[2], camera.t[2])
-        return self.cast(shift @ camera.P, depth, camera.size, camera.centre)
+        return self.cast(shift @ camera.P, np.append(camera.R[2], camera.t[2]), camera.size, camera.centre)
 
     def detail(self, i: int, box: tuple[int, int]) -> float:
         """The pyramid level at which the opacity of a piece is looked up, whose bounding box has these sides."""

@@ -173,8 +173,7 @@ class Surfaces:
         *, triangle: bool = False, normals: Vector | None = None, both_sides: bool = False,
     ) -> None:  # fmt: skip
         """One piece; `uv` (3, 2) and `normals` (3, 3): values at the corner and their change along U and along V."""
-        flat = _FLAT if normals is None else normals.ravel()
-        self._rows.append(np.concatenate([corner, U, V, uv.ravel(), flat]))
+        self._rows.append(np.concatenate([corner, U, V, uv.ravel(), _FLAT if normals is None else normals.ravel()]))
         self._texture.append(texture)
         self._flags.append((triangle, both_sides))
 

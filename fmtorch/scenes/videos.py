@@ -38,8 +38,7 @@ def _road(surfaces: Surfaces, rng: Rng, length: float, half: float, walk: float)
         for edge in (half + walk, -half):
             surfaces.quad(vec(start, edge, 0.12), along, vec(0, -walk, 0), stones, (0, 0, 3, 1))
         for edge in (half, -half):
-            kerb = (0, 0, 1, 0.1)
-            surfaces.quad(vec(start, edge, 0.12), along, vec(0, 0, -0.12), stones, kerb, both_sides=True)
+            surfaces.quad(vec(start, edge, 0.12), along, vec(0, 0, -0.12), stones, (0, 0, 1, 0.1), both_sides=True)
     surfaces.quad(vec(-60, 90, -0.05), vec(length + 240, 0, 0), vec(0, -180, 0), green, (0, 0, 40, 25))
 
 
@@ -239,8 +238,7 @@ def indoor_scene(rng: Rng, split: str, shots: int, scale: Real) -> DrawnScene:
         _on_wall(surfaces, photos[2], 1, half, rng.uniform(-1.4, -0.9), 1.5, 0.5)
     _on_wall(surfaces, photos[1], 0, half, rng.uniform(-1, 0.5), 1.5, 0.7)
     _on_wall(surfaces, photos[3], 2, half, rng.uniform(-0.5, 1), 1.5, 0.6)
-    style = np.random.SeedSequence(int(rng.integers(2**31)))
-    view = to_pixels(patterns.window(rng, 512, 420, style) * 2.2 + 0.1)
+    view = to_pixels(patterns.window(rng, 512, 420, np.random.SeedSequence(int(rng.integers(2**31)))) * 2.2 + 0.1)
     _on_wall(surfaces, view, 2 * int(rng.integers(2)), half, -1.2, 1.6, 1.1)
     shelf = surfaces.paint(patterns.books(rng, 192, 768))
     board = _flat(surfaces, rng)

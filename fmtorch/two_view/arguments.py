@@ -79,7 +79,9 @@ def correspondences(
     """
     cameras = camera_fields(K0, K1, focal, fields.get("size0") is not None)
     c = _batch(x0, x1, {**fields, **cameras, **lens_fields(lens)})
-    _expect_calibrations(c)
+    for name, K, size in (("K0", c.K0, c.size0), ("K1", c.K1, c.size1)) if len(c) == 1 else ():
+        if K is not None and (problem := calibration_problems(K, size, name)[0]):
+            raise ValueError(problem)
     expect_possible(c, plane)
     return c
 
@@ -259,15 +261,6 @@ def lens_fields(lens: Lens) -> dict[str, Any]:
 def expect_lens(lens: Lens) -> None:
     """Raise ValueError for a lens that is none, before there are pairs."""
     correspondences(torch.zeros(1, 0, 2), torch.zeros(1, 0, 2), lens=lens)
-
-
-def _expect_calibrations(c: Correspondences) -> None:
-    """Raise ValueError naming K0 or K1 where it is no calibration matrix of the image, of a single pair."""
-    if len(c) != 1:
-        return
-    for name, K, size in (("K0", c.K0, c.size0), ("K1", c.K1, c.size1)):
-        if K is not None and (problem := calibration_problems(K, size, name)[0]):
-            raise ValueError(problem)
 
 
 def _unknown(name: str, which: str, unknown: tuple[float, float]) -> dict[str, Any]:

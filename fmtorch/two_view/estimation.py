@@ -90,8 +90,7 @@ def expect_lenses(estimator: Estimator, name: str) -> None:
 def _with_prior(c: Correspondences, estimator: Estimator) -> Correspondences:
     """The matches with a prior of their consistency where the estimator uses one and none is given."""
     if c.prior is None and getattr(estimator, "uses_prior", False):
-        framed = c.lafs0 is not None and c.lafs1 is not None and c.ratio is not None
-        pruner = _consistency(framed)
+        pruner = _consistency(c.lafs0 is not None and c.lafs1 is not None and c.ratio is not None)
         if kernel.available():
             compile_together([*getattr(pruner, "kernels", ()), *getattr(estimator, "kernels", ())])
         with one_thread(c.mask.device):

@@ -89,8 +89,7 @@ def _images(c: Correspondences) -> Images:
         sizes = torch.stack([c.size0, c.size1], 1).double()
     if c.K0 is None or c.K1 is None:
         unknown = torch.full((len(c), 2, 2), torch.inf, dtype=torch.float64, device=device)
-        measured = unknown if c.focal is None else c.focal.detach().double()
-        return Images(None, measured, sizes, None, ("",) * len(c))
+        return Images(None, unknown if c.focal is None else c.focal.detach().double(), sizes, None, ("",) * len(c))
     both = calibration_problems(c.K0, c.size0, "K0"), calibration_problems(c.K1, c.size1, "K1")
     problems = tuple(first or second for first, second in zip(*both, strict=True))
     valid = torch.tensor([not problem for problem in problems], dtype=torch.bool, device=device)

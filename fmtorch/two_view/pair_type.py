@@ -33,8 +33,7 @@ OTHER_CAMERA = 0.5  # deviation of the logarithm of the ratio of both focal leng
 
 class PairTypes(NamedTuple):
     """Types of B pairs.
-    kind: indices into `fmtorch.core.types.PAIR_TYPES`. evidence: for the kinds. homography: of the plane, or of
-    the rotation."""
+    kind: indices into `fmtorch.core.types.PAIR_TYPES`. evidence: for the kinds. homography: of plane or rotation."""
 
     kind: Int[Tensor, " b"]
     evidence: Evidence
@@ -133,8 +132,7 @@ def classify(
             F, H.F, c.x0, c.x1, c.mask, c.prior, c.noise, c.size0, c.size1, K0, K1, precision
         )
     exact = None if precision is None else precision.diagonal(dim1=-2, dim2=-1).isinf().all(-1)
-    kind = kinds.classified(evidence, exact)
-    return PairTypes(torch.where(ok | H.ok, kind, kinds.UNRELATED), evidence, H)
+    return PairTypes(torch.where(ok | H.ok, kinds.classified(evidence, exact), kinds.UNRELATED), evidence, H)
 
 
 def straightened(c: Correspondences, lens: Tensor | None) -> Correspondences:

@@ -104,7 +104,8 @@ class PairwiseEstimator:
                 reasons[i] = normalized
                 continue
             pair, slot = normalized
-            likelihood = _likelihood(c, i)[slot].numpy()
+            value = torch.ones(n) if c.ambiguity is None else 1 - c.ambiguity[i]
+            likelihood = (value if c.prior is None else c.prior[i]).detach().cpu().double()[slot].numpy()
             order = np.argsort(-likelihood, kind="stable") if self._best_first else np.arange(len(slot))
             x0, x1 = matches.x0[slot[order]], matches.x1[slot[order]]
             sizes = _size(c.size0, x0, i), _size(c.size1, x1, i)
@@ -196,11 +197,6 @@ def within(F: Any, pair: Pair, threshold: float) -> NDArray[np.bool_]:
 def fundamental_of_pose(K0: Points, K1: Points, R: Points, t: Points) -> Points:
     """F of two calibrated cameras, K1^-T [t]x R K0^-1."""
     return np.linalg.inv(K1).T @ np.cross(t, np.eye(3)).T @ R @ np.linalg.inv(K0)
-
-
-def _likelihood(c: Correspondences, i: int) -> torch.Tensor:
-    value = torch.ones(c.mask.shape[1]) if c.ambiguity is None else 1 - c.ambiguity[i]
-    return (value if c.prior is None else c.prior[i]).detach().cpu().to(torch.float64)
 
 
 def _size(sizes: torch.Tensor | None, x: Points, i: int) -> tuple[int, int]:

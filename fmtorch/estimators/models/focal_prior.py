@@ -99,8 +99,7 @@ def same_camera_share(difference: float, deviation: Array) -> float:
 @functools.cache
 def normal_quantiles() -> Array:
     """QUANTILES quantiles of the normal distribution, rounded so that the last bits of a library's log do not count."""
-    normal = NormalDist()
-    return np.rint([normal.inv_cdf((i + 0.5) / QUANTILES) * 2.0**40 for i in range(QUANTILES)]) / 2.0**40
+    return np.rint([NormalDist().inv_cdf((i + 0.5) / QUANTILES) * 2.0**40 for i in range(QUANTILES)]) / 2.0**40
 
 
 @inner

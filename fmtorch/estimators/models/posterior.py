@@ -98,8 +98,7 @@ def focal_precision(focals: Array, pair: Pair) -> Array:
     if pair.calibration is not None:
         focals = np.where(np.isnan(focals), pair.calibration.focals, focals)
     f0, f1 = (focals / (images.longest * pair.pixels_per_unit)).tolist()
-    logarithms = np.array([logarithm_kernel(f0), logarithm_kernel(f1)])
-    focal_cost(logarithms, images.prior, work)
+    focal_cost(np.array([logarithm_kernel(f0), logarithm_kernel(f1)]), images.prior, work)
     precision = np.array([[work[2], work[4]], [work[4], 0.0 if images.prior.shared else work[3]]])
     if pair.calibration is not None:
         exact = np.array(pair.calibration.deviations) < EXACT

@@ -95,8 +95,7 @@ def _known(value: Tensor | None, name: str, message: str) -> Tensor:
 
 def _by_size(x: Float[Tensor, "b n 2"], size: Tensor | None, name: str) -> Float[Tensor, "b n 2"]:
     size = _known(size, name, BY_SIZE).to(x.dtype)
-    longest = size.amax(-1)[:, None, None]
-    return (x - size.flip(-1)[:, None] / 2) / longest
+    return (x - size.flip(-1)[:, None] / 2) / size.amax(-1)[:, None, None]
 
 
 def _by_calibration(x: Float[Tensor, "b n 2"], K: Tensor | None, name: str) -> Float[Tensor, "b n 2"]:
@@ -104,14 +103,6 @@ def _by_calibration(x: Float[Tensor, "b n 2"], K: Tensor | None, name: str) -> F
     fx, skew, cx, fy, cy = (K[:, i, j, None].to(x.dtype) for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2)))
     y = (x[..., 1] - cy) / fy
     return torch.stack([(x[..., 0] - cx - skew * y) / fx, y], -1)
-
-
-def _ratio(c: Correspondences) -> list[Tensor]:
-    return [] if c.ambiguity is None else [torch.where(c.mask, c.ambiguity, 0)]
-
-
-def _mutual(c: Correspondences) -> list[Tensor]:
-    return [] if c.mutual is None else [c.mutual.to(c.x0.dtype) * 2 - 1]
 
 
 def _frame_map(c: Correspondences) -> Float[Tensor, "b n 2 2"] | None:
@@ -141,8 +132,8 @@ def _agreement(c: Correspondences) -> list[Tensor]:
 
 
 SIDE: dict[str, tuple[int, Callable[[Correspondences], list[Tensor]]]] = {
-    "ratio": (1, _ratio),
-    "mutual": (1, _mutual),
+    "ratio": (1, lambda c: [] if c.ambiguity is None else [torch.where(c.mask, c.ambiguity, 0)]),
+    "mutual": (1, lambda c: [] if c.mutual is None else [c.mutual.to(c.x0.dtype) * 2 - 1]),
     "scale": (1, _scale),
     "rotation": (2, _rotation),
     "agreement": (1, _agreement),

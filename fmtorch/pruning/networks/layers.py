@@ -265,8 +265,7 @@ def attention(
     if q.shape[3] < v.shape[3]:  # of equal widths torch needs no table of queries and keys
         q, k = (nn.functional.pad(x, (0, v.shape[3] - q.shape[3])) for x in (q, k))
     hidden = None if slots.mask is None else ((slots.mask - 1) * HIDDEN).to(q.dtype)[:, None, None]
-    y = nn.functional.scaled_dot_product_attention(q, k, v, hidden, scale=scale)
-    return y.permute(1, 3, 0, 2).flatten(0, 1)
+    return nn.functional.scaled_dot_product_attention(q, k, v, hidden, scale=scale).permute(1, 3, 0, 2).flatten(0, 1)
 
 
 @torch.no_grad()

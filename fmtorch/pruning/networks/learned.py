@@ -246,8 +246,7 @@ class LearnedPruner:
         """P(inlier) of each match, in the type of x0; zero where masked."""
         mask = c.mask & torch.isfinite(c.x0).all(-1) & torch.isfinite(c.x1).all(-1)
         p = torch.zeros_like(c.x0[..., 0])
-        counts = mask.sum(1).tolist()
-        for i, count in enumerate(counts):
+        for i, count in enumerate(mask.sum(1).tolist()):
             if count:
                 p[i, mask[i]] = self._alone(c[i].keep(mask[i : i + 1]).compact())
         return p
