@@ -6,8 +6,10 @@ import contextlib
 import importlib
 import os
 import pkgutil
+import shutil
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -56,6 +58,13 @@ def pytest_sessionstart(session: pytest.Session) -> None:
         # elsewhere, since here the import hook of the type checker would take longer than the rest
         code = "from tests.conftest import compile_all; compile_all()"
         subprocess.run([sys.executable, "-c", code], cwd=Path(__file__).resolve().parents[1], check=True)
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Bytecode of files in temporary folders is of no use again."""
+    if sys.pycache_prefix == str(KERNELS.with_name("bytecode")) and not hasattr(session.config, "workerinput"):
+        temporary = Path(tempfile.gettempdir()).resolve()
+        shutil.rmtree(Path(sys.pycache_prefix, *temporary.parts[1:]), ignore_errors=True)
 
 
 def compile_all() -> None:
