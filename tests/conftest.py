@@ -6,6 +6,10 @@ import contextlib
 import importlib
 import os
 import pkgutil
+import shutil
+import subprocess
+import sys
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -17,12 +21,14 @@ from jaxtyping._import_hook import _JaxtypingLoader
 from fmtorch.jit.cache import kernels_dir
 
 torch.set_num_threads(1)
-# Where threads import modules at the same time, bytecode with checks can get the name of that without, which other
-# processes then load: it is kept nowhere.
-_JaxtypingLoader.set_data = lambda *_, **__: None  # type: ignore[method-assign]
 
 SHARED = Path(os.environ.get("FMTORCH_TEST_DATA", Path(__file__).resolve().parents[2] / "shared"))
 KERNELS = kernels_dir()  # before any test sets $FMTORCH_CACHE
+if os.environ.pop(
+    "PYTHONDONTWRITEBYTECODE", None
+):  # with which each of many processes would compile all that it imports
+    sys.dont_write_bytecode = False
+    sys.pycache_prefix = os.environ["PYTHONPYCACHEPREFIX"] = str(KERNELS.with_name("bytecode"))
 
 
 LONGEST = (
@@ -38,17 +44,32 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: not item.path.relative_to(here).as_posix().startswith(LONGEST))
 
 
+def pytest_collection_finish() -> None:
+    """From here on bytecode with checks is kept nowhere: where threads import modules at the same time, it can get the
+    name of that without, which other processes then load."""
+    _JaxtypingLoader.set_data = lambda *_, **__: None  # type: ignore[method-assign]
+
+
 def pytest_sessionstart(session: pytest.Session) -> None:
     """Compile every kernel before several processes run the whole suite, each of which would compile them again."""
     config = session.config
     starts_others = getattr(config.option, "numprocesses", None) and not hasattr(config, "workerinput")
     if starts_others and config.args_source is pytest.Config.ArgsSource.TESTPATHS:
-        compile_all()
+        # elsewhere, since here the import hook of the type checker would take longer than the rest
+        code = "from tests.conftest import compile_all; compile_all()"
+        subprocess.run([sys.executable, "-c", code], cwd=Path(__file__).resolve().parents[1], check=True)
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Bytecode of files in temporary folders is of no use again."""
+    if sys.pycache_prefix == str(KERNELS.with_name("bytecode")) and not hasattr(session.config, "workerinput"):
+        temporary = Path(tempfile.gettempdir()).resolve()
+        shutil.rmtree(Path(sys.pycache_prefix, *temporary.parts[1:]), ignore_errors=True)
 
 
 def compile_all() -> None:
     """Compile every kernel of the package that this machine has not compiled yet."""
-    import fmtorch  # not before the import hook of the type checker
+    import fmtorch
     from fmtorch.jit import kernel as switch
     from fmtorch.jit import together
     from fmtorch.jit.kernel import Kernel

@@ -1,7 +1,7 @@
 """The same bits on an older processor: code for one with AVX2 and FMA but without AVX-512, in kernels and libraries.
 
-The other process compiles kernels for Haswell, into a cache of its own, and has torch, MKL and NumPy take their code
-for AVX2. docs/concepts/conventions.md says what is promised.
+The other process compiles kernels for Haswell, which are kept beside those of this processor, and has torch, MKL and
+NumPy take their code for AVX2. docs/concepts/conventions.md says what is promised.
 """
 
 import os
@@ -18,7 +18,7 @@ import torch
 from fmtorch import geometry
 from fmtorch.estimators.models.focal_prior import normal_quantiles
 from fmtorch.geometry.robust_losses import LOSS_TABLE
-from fmtorch.jit import kernel
+from fmtorch.jit import cache, kernel
 from fmtorch.matching import nearest_neighbors
 from fmtorch.metrics import nsgd
 from tests.laws import degenerate, scene, scenes
@@ -38,7 +38,9 @@ HASWELL = (
 """What LLVM knows of that processor."""
 CODE = """
 import sys, numpy, torch
+from fmtorch.jit import cache
 from tests.test_processors import results
+print(cache.folder())
 given = torch.load(sys.argv[1] + "/given.pt", weights_only=False)
 numpy.savez(sys.argv[1] + "/older.npz", **results(given))
 """
@@ -104,9 +106,11 @@ def test_an_older_processor_computes_the_same_bits(tmp_path: Path) -> None:
         pytest.skip("needs kernels, and a processor with AVX2 and FMA")
     given = inputs()
     torch.save(given, tmp_path / "given.pt")
-    environment = {**os.environ, **older_processor(), "FMTORCH_CACHE": str(tmp_path / "cache")}
-    subprocess.run([sys.executable, "-c", CODE, str(tmp_path)], cwd=REPOSITORY, env=environment, check=True)
+    command, environment = [sys.executable, "-c", CODE, str(tmp_path)], {**os.environ, **older_processor()}
+    run = subprocess.run(command, cwd=REPOSITORY, env=environment, check=True, stdout=subprocess.PIPE, text=True)
+    folder = Path(run.stdout.strip())
+    assert folder != cache.folder(), "kernels of this processor were taken"
+    assert any(folder.glob("*.bin"))
     with np.load(tmp_path / "older.npz") as older:
-        assert len(list((tmp_path / "cache" / "kernels").iterdir())) == 1, "kernels of this processor were taken"
         for name, value in results(given).items():
             np.testing.assert_array_equal(older[name], value, err_msg=name)

@@ -10,23 +10,13 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from fmtorch.core import (
-    Correspondences,
-    Estimate,
-    Features,
-    Record,
-    error_line,
-    expect_fields,
-    files,
-    replacing,
-    slotted,
-)
+from fmtorch import core
 from fmtorch.training import LabelledMatches
 
 
 def message(error: BaseException) -> str:
     """What a command says of an error, without the place in this file, which counts as a user's own code."""
-    return error_line(error).partition(f" ({Path(__file__).name}:")[0]
+    return core.error_line(error).partition(f" ({Path(__file__).name}:")[0]
 
 
 INTERRUPTIONS = [OSError(errno.ENOSPC, "No space left on device"), OSError(errno.EIO, "I/O error"), KeyboardInterrupt()]
@@ -38,7 +28,7 @@ def test_a_failed_write_names_the_file_and_leaves_what_was_there(error: BaseExce
     path.write_text("before")
 
     def write() -> None:
-        with replacing(path) as temporary:
+        with core.replacing(path) as temporary:
             temporary.write_text("half")
             raise error
 
@@ -52,14 +42,14 @@ def test_a_failed_write_names_the_file_and_leaves_what_was_there(error: BaseExce
 
 def test_a_folder_that_is_not_there_is_named_by_the_file() -> None:
     path = Path("/nowhere/at/all.txt")
-    with pytest.raises(FileNotFoundError) as caught, replacing(path) as temporary:
+    with pytest.raises(FileNotFoundError) as caught, core.replacing(path) as temporary:
         temporary.write_text("")
     assert message(caught.value) == f"{path}: No such file or directory"
 
 
 def test_another_files_error_stays_its_own(tmp_path: Path) -> None:
     other = tmp_path / "image.png"
-    with pytest.raises(FileNotFoundError) as caught, replacing(tmp_path / "out.json"):
+    with pytest.raises(FileNotFoundError) as caught, core.replacing(tmp_path / "out.json"):
         other.read_bytes()
     assert message(caught.value) == f"{other}: No such file or directory"
 
@@ -70,7 +60,7 @@ def test_a_device_that_is_full(tmp_path: Path) -> None:
     if not full.exists():
         pytest.skip("this system has no /dev/full")
     no_space = pytest.raises(OSError, match="No space left")
-    with no_space as caught, replacing(tmp_path / "out.json"), full.open("wb") as file:
+    with no_space as caught, core.replacing(tmp_path / "out.json"), full.open("wb") as file:
         file.write(b"x" * 100_000)
     assert message(caught.value) == f"{tmp_path / 'out.json'}: No space left on device"
 
@@ -80,36 +70,36 @@ def _installation(root: Path, monkeypatch: pytest.MonkeyPatch, *folders: str) ->
     package.mkdir(parents=True)
     for folder in folders:
         (root / "site-packages" / folder).mkdir(parents=True)
-    monkeypatch.setattr(files, "PACKAGE", package)
+    monkeypatch.setattr(core.files, "PACKAGE", package)
     return package
 
 
 def test_an_installed_wheel_uses_its_own_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     package = _installation(tmp_path, monkeypatch, "fmtorch/conf", "fmtorch/models", "conf", "models")
-    assert (files.conf_dir(), files.models_dir()) == (package / "conf", package / "models")
+    assert (core.files.conf_dir(), core.files.models_dir()) == (package / "conf", package / "models")
 
 
 def test_an_incomplete_installation_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     package = _installation(tmp_path, monkeypatch)
     with pytest.raises(FileNotFoundError, match=f"'conf' in {package}"):
-        files.conf_dir()
+        core.files.conf_dir()
 
 
 def test_cache_dir(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HOME", "/home/someone")
     monkeypatch.setenv("XDG_CACHE_HOME", "/scratch/cache")
     monkeypatch.setenv("FMTORCH_CACHE", "/data/fmtorch")
-    assert files.cache_dir() == Path("/data/fmtorch")
+    assert core.files.cache_dir() == Path("/data/fmtorch")
     monkeypatch.setenv("FMTORCH_CACHE", "~/here")
-    assert files.cache_dir() == Path("/home/someone/here")
+    assert core.files.cache_dir() == Path("/home/someone/here")
     monkeypatch.setenv("FMTORCH_CACHE", "")
-    assert files.cache_dir() == Path("/scratch/cache/fmtorch")
+    assert core.files.cache_dir() == Path("/scratch/cache/fmtorch")
     monkeypatch.delenv("XDG_CACHE_HOME")
-    assert files.cache_dir() == Path("/home/someone/.cache/fmtorch")
+    assert core.files.cache_dir() == Path("/home/someone/.cache/fmtorch")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Sheet(Record):
+class Sheet(core.Record):
     """A record of rows, with or without a batch; the fields are not annotated for the checks of the test suite."""
 
     x: Any
@@ -117,7 +107,7 @@ class Sheet(Record):
     note: Any = None
 
     def __post_init__(self) -> None:
-        expect_fields(self)
+        core.expect_fields(self)
 
 
 Sheet.__annotations__ = {
@@ -129,21 +119,21 @@ Sheet.__init_subclass__.__func__(Sheet)  # type: ignore[attr-defined]  # read th
 @pytest.mark.parametrize(
     ("kind", "fields"),
     [
-        (Features, ("lafs", "scores", "descriptors", "mask")),
-        (Correspondences, ("x0", "x1", "mask", "ratio", "score", "prior", "lafs0", "lafs1", "mutual", "noise")),
-        (Estimate, ("inliers",)),
+        (core.Features, ("lafs", "scores", "descriptors", "mask")),
+        (core.Correspondences, ("x0", "x1", "mask", "ratio", "score", "prior", "lafs0", "lafs1", "mutual", "noise")),
+        (core.Estimate, ("inliers",)),
         (LabelledMatches, ("label",)),
     ],
 )
-def test_fields_with_an_entry_for_each_slot(kind: type[Record], fields: tuple[str, ...]) -> None:
+def test_fields_with_an_entry_for_each_slot(kind: type[core.Record], fields: tuple[str, ...]) -> None:
     assert set(kind.per_slot) == set(fields)
 
 
 @pytest.mark.parametrize("batch", [(), (4,)])
 def test_what_fits_is_taken(batch: tuple[int, ...]) -> None:
     sheet = Sheet(torch.zeros(*batch, 3, 2), torch.ones(*batch, 2, dtype=torch.int32))
-    assert list(slotted(sheet)) == ["x"]
-    assert list(slotted(sheet.replace(note=torch.zeros(*batch, 3)))) == ["x", "note"]
+    assert list(core.slotted(sheet)) == ["x"]
+    assert list(core.slotted(sheet.replace(note=torch.zeros(*batch, 3)))) == ["x", "note"]
 
 
 @pytest.mark.parametrize(

@@ -108,11 +108,7 @@ TUM: list[tuple[str, Edit, str]] = [
     (TRUTH, line(9, lambda s: s.replace(" 0.5 ", " nan ")), r"line 9: a number that is not"),
     (TRUTH, line(9, lambda s: " ".join([*s.split()[:4], "0 0 0 0"])), r"line 9: the quaternion is zero"),
     (TRUTH, lambda _: "1305031236 0 0 0 0 0 0 1\n", r"groundtruth\.txt: 1 poses; it must hold lines of"),
-    (
-        TRUTH,
-        lambda _: "5 0 0 0 0 0 0 1\n6 0 0 0 0 0 0 1\n",
-        r"groundtruth\.txt: no pose at the times of rgb\.txt; is",
-    ),
+    (TRUTH, lambda _: "5 0 0 0 0 0 0 1\n6 0 0 0 0 0 0 1\n", r"groundtruth\.txt: no pose at the times of rgb\.txt; is"),
     ("depth.txt", word(5, "1305031236.1"), r"depth\.txt, line 5: .* time stamps must ascend"),
 ]
 KINDS = {"colmap": COLMAP, "bundler": BUNDLER, "kitti": KITTI, "tum": TUM}

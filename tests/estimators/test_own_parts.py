@@ -199,10 +199,7 @@ MEDIAN = {"score": "median", "inliers": "lmeds", "confidence": None}
         (MEDIAN | {"inlier_threshold": 2.0}, "inlier_threshold=2.0 has no effect: inliers=lmeds takes none"),
         ({"local_optimization": "x"}, "local_optimization is 'x'; it must be one of: graph_cut"),
         ({"solver": "four_point", "degeneracy": "degensac"}, "seven_point"),
-        (
-            {"solver": "eight_point", "degeneracy": "degensac"},
-            "degensac needs solver=seven_point; solver is 'eight",
-        ),
+        ({"solver": "eight_point", "degeneracy": "degensac"}, "degensac needs solver=seven_point; solver is 'eight"),
         ({"solver": "four_point", "local_optimization": "graph_cut"}, "is for fundamental matrices"),
         ({"solver": "four_point", "focal": {}}, "is for fundamental matrices"),
     ],

@@ -151,13 +151,15 @@ def cluster(tmp_path: Path) -> Iterator[Cluster]:
     dask_cluster.close()
 
 
-def test_two_of_four_workers_are_killed(cluster: Cluster, pairs: list[ImagePair], expected: dict[int, PairRow]) -> None:
-    cluster.add_workers(4)
+def test_two_of_three_workers_are_killed(
+    cluster: Cluster, pairs: list[ImagePair], expected: dict[int, PairRow]
+) -> None:
+    cluster.add_workers(3)
     killed: list[int] = []
 
     def kill() -> None:
         with cluster.client() as client:
-            client.wait_for_workers(4, timeout=PATIENCE)
+            client.wait_for_workers(3, timeout=PATIENCE)
             started.set()
             moments = random.Random(0)
             for _ in range(2):

@@ -1,12 +1,9 @@
 """Tasks of workers that share what they need or make it, and of which some die."""
 
 import functools
-import os
-import signal
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -34,30 +31,10 @@ from fmtorch.jobs import (
 )
 from tests.helpers import draw, pair
 from tests.helpers import small_pipeline as pipeline
+from tests.jobs.work import ends, fails, late, make_needs, slow, squares
 from tests.laws import degenerate, scene
 
 PROCESSES = Execution("processes", 2)
-
-
-def make_needs(folder: Path, size: int = 0) -> tuple[Path, bytes]:
-    """What workers need; each process that makes it leaves a file."""
-    (folder / f"made-{os.getpid()}-{time.monotonic_ns()}").touch()
-    return folder, bytes(size)
-
-
-def squares(needed: tuple[Path, bytes], numbers: list[int]) -> list[int]:
-    """The squares; a negative number ends the process, after it has left a file."""
-    folder = needed[0]
-    for number in numbers:
-        if number < 0:
-            (folder / f"died-{time.monotonic_ns()}").touch()
-            os.kill(os.getpid(), signal.SIGKILL)
-    return [number * number for number in numbers]
-
-
-def ends(folder: Path) -> Any:
-    """A factory that ends the process."""
-    os._exit(3)
 
 
 def parts(numbers: list[int]) -> list[list[int]]:
@@ -123,22 +100,12 @@ def test_without_a_reason_to_give_workers_that_die_are_an_error(tmp_path: Path) 
         calls(functools.partial(make_needs, tmp_path), PROCESSES, [[1], [-2]], give_up=None)
 
 
-def fails(needed: object, job: int) -> int:
-    raise ValueError(f"job {job} is wrong")
-
-
 @pytest.mark.parametrize("kind", ["threads", "processes"])
 def test_what_a_call_raises_is_raised_here(kind: str, tmp_path: Path) -> None:
     execution = Execution(kind, 2)
     source: Any = Local(None) if execution.shared else Factory(functools.partial(make_needs, tmp_path))
     with WorkerPool(execution) as pool, pytest.raises(ValueError, match=r"job \d is wrong"):
         list(TaskRunner(pool, source, fails, lambda job, result: None).each([1, 2, 3]))
-
-
-def slow(event: threading.Event, job: int) -> int:
-    if job:
-        event.wait(60)
-    return job
 
 
 def test_interrupted_what_is_under_way_is_kept() -> None:
@@ -151,11 +118,6 @@ def test_interrupted_what_is_under_way_is_kept() -> None:
     assert kept[0] == 0
     assert 1 in kept
     assert len(kept) < 10
-
-
-def late(value: None, job: int) -> int:
-    time.sleep(0.05 if job % 3 == 0 else 0)
-    return -job
 
 
 @pytest.mark.parametrize("kind", ["threads", "processes"])

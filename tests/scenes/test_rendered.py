@@ -80,7 +80,7 @@ def test_what_was_drawn_is_not_drawn_again(tiny: RenderedPairs, root: Path, monk
 
 
 def test_the_same_seed_gives_the_same_bytes_also_from_worker_processes(tmp_path: Path) -> None:
-    plan = Plan(2, 3, 2, 0.2)
+    plan = Plan(2, 2, 1, 0.1)
     calls: list[tuple[int, int]] = []
     here = RenderedPairs(families=["indoor"], root=tmp_path / "a", plan=plan, workers=1)
     options = {"plan": plan, "workers": 2, "progress": lambda *c: calls.append(c)}

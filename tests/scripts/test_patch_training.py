@@ -18,15 +18,7 @@ from fmtorch.scenes import photograph
 from fmtorch.training import Photograph, PlaneViews, list_photographs, plane_homography, random_camera
 from scripts.patch_networks import objectives, stores
 from scripts.patch_networks.objectives import geodesc, geometric, hardest_triplet, structured
-from scripts.patch_networks.stores import (
-    Tolerance,
-    in_photograph,
-    match_sets,
-    patch_similarity,
-    rays_and_incidence,
-    tracks,
-    views_of,
-)  # fmt: skip
+from scripts.patch_networks.stores import tracks
 from scripts.patch_networks.train import PatchTraining, TrainingOptions, cutting_of, training_of
 from tests.reference import geodesc as geodesc_reference
 from tests.reference import patch_losses as reference
@@ -37,8 +29,8 @@ PLANES = PlaneViews(views=4, tilt=15.0, scale=(0.5, 0.6))
 @pytest.fixture(scope="module")
 def store() -> stores.PatchStore:
     """Patches of a photograph as a plane, with their geometry."""
-    views = views_of(photograph("chelsea.png"), np.random.default_rng(0), PLANES, points=150)
-    patches, point, *geometry = tracks(views, Tolerance())
+    views = stores.views_of(photograph("chelsea.png"), np.random.default_rng(0), PLANES, points=150)
+    patches, point, *geometry = tracks(views, stores.Tolerance())
     first = np.r_[0, np.cumsum(np.bincount(point))]
     about = {"photographs": {"scikit-image": 1}, "points": len(first) - 1, "patches": len(patches), "views": 4}
     return stores.PatchStore(patches, first, *geometry, {**about, "limits": {}})
@@ -75,7 +67,7 @@ def set_training(store: stores.PatchStore, batch: int = 32) -> PatchTraining:
     torch.manual_seed(0)
     options = TrainingOptions(batch=batch, steps=20, learning_rate=3e-4, bf16=False, checkpoint_steps=1000)
     description = {"architecture": "geodesc", "loss": {"name": "geodesc"}, "match_sets": {"matches": 16}}
-    objective, sets = objectives.DescriptorObjective(objectives.geodesc), match_sets(store, 16, 1.0)
+    objective, sets = objectives.DescriptorObjective(objectives.geodesc), stores.match_sets(store, 16, 1.0)
     return PatchTraining(GeoDesc(), objective, store, options, description, sets=sets, matches=16)
 
 
@@ -197,7 +189,7 @@ def test_keypoints_are_where_the_plane_puts_them_under_its_angles() -> None:
     camera = random_camera(rng, size, PlaneViews(views=2, tilt=40.0))
     H = plane_homography(camera, size)
     keypoints = np.c_[rng.uniform(60, 160, (50, 2)), np.full(50, 1e-3), rng.uniform(-3, 3, 50)]
-    there = in_photograph(keypoints, H)
+    there = stores.in_photograph(keypoints, H)
 
     def seen(place: np.ndarray) -> np.ndarray:
         """In the view; the photograph's longest side is 1, its centre the origin."""
@@ -213,7 +205,7 @@ def test_keypoints_are_where_the_plane_puts_them_under_its_angles() -> None:
     o, a, b = map(seen, corners)
     area = np.abs(np.linalg.det(np.stack([a - o, b - o], -1))) / 1e-6
     np.testing.assert_allclose(there[:, 2] * np.sqrt(area), keypoints[:, 2], rtol=1e-3)
-    rays, incidence = rays_and_incidence(keypoints, camera)
+    rays, incidence = stores.rays_and_incidence(keypoints, camera)
     world = np.c_[(there[:, :2] - [159.5, 119.5]) / 320, np.zeros(50)]
     np.testing.assert_allclose(rays * np.linalg.norm(camera.centre - world, axis=1)[:, None], camera.centre - world)
     np.testing.assert_allclose(np.cos(np.radians(incidence)), -rays[:, 2])
@@ -275,7 +267,7 @@ def random_tracks(seed: int) -> tuple[stores.PatchStore, dict[tuple[int, int], f
     similarity = {}
     for begin, end in itertools.pairwise(first):
         for i, j in itertools.combinations(range(begin, end), 2):
-            value = patch_similarity(rays[[i]], rays[[j]], incidence[[i]], incidence[[j]])[0]
+            value = stores.patch_similarity(rays[[i]], rays[[j]], incidence[[i]], incidence[[j]])[0]
             similarity[names[i], names[j]] = float(value)
     patches = np.zeros((len(views), 1, 1), np.uint8)
     return stores.PatchStore(patches, np.array(first), np.array(views), rays, incidence, {}), similarity
@@ -284,10 +276,10 @@ def random_tracks(seed: int) -> tuple[stores.PatchStore, dict[tuple[int, int], f
 def test_match_sets_are_their_definition() -> None:
     tracks, similarity = random_tracks(0)
     names = 1000 * tracks.view + np.repeat(np.arange(60), np.diff(tracks.first))
-    everything = match_sets(tracks, 2, 1.0)
+    everything = stores.match_sets(tracks, 2, 1.0)
     assert len(everything) == 10
     limit = float(np.median(everything.image_similarity))
-    sets, expected = match_sets(tracks, 15, limit), geodesc_reference.match_sets(similarity, 15, limit)
+    sets, expected = stores.match_sets(tracks, 15, limit), geodesc_reference.match_sets(similarity, 15, limit)
     assert 0 < len(sets) < len(everything)
     assert len(sets) == len(expected)
     for i, (a, b) in enumerate(itertools.pairwise(sets.first)):
@@ -297,4 +289,4 @@ def test_match_sets_are_their_definition() -> None:
         assert sets.image_similarity[i] == pytest.approx(image)
         assert sets.similarity[a:b].mean() == pytest.approx(image)
     with pytest.raises(ValueError, match=r"shares 500 points .* at most 0\.85: lower match_sets\.matches"):
-        match_sets(tracks, 500)
+        stores.match_sets(tracks, 500)

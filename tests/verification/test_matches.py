@@ -168,10 +168,7 @@ def test_what_an_estimator_raises_is_of_its_pair_alone(tmp_path: Path) -> None:
     assert result.verified == 1
     assert [text.partition(" (")[0] for text in result.problems] == ["b/x0, b/x1: ZeroDivisionError: too few"]
     output.unlink()
-    for minimum, said in (
-        (1000, "ZeroDivisionError: too few"),
-        (0, "FailsOnFew returned None; it must return"),
-    ):
+    for minimum, said in ((1000, "ZeroDivisionError: too few"), (0, "FailsOnFew returned None; it must return")):
         with pytest.raises(ValueError, match=f"no pair has a geometry, the first because of .*{said}"):
             fmtorch.verify(matches=tmp_path / "matches.npz", minimum=minimum, **given)
         assert {path.name for path in tmp_path.iterdir()} == {"estimator", "matches.npz"}
