@@ -1,5 +1,6 @@
 """Networks of features: kornia's, shipped ones, ONNX."""
 
+import os
 from pathlib import Path
 
 import kornia
@@ -322,3 +323,25 @@ def test_weights_that_cannot_be_fetched(name: str, tmp_path: Path, monkeypatch: 
     }[name]
     for word in ("Name or service not known", publisher, f"copy its {file} to {torch_home / 'checkpoints' / file}"):
         assert word in str(told.value)
+
+
+class Runs:
+    def __reduce__(self) -> tuple[object, ...]:
+        return os.mkdir, (os.environ["RUNS"],)
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_weights_of_another_file_are_refused_and_run_nothing(
+    known: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A file in the place of the published one, by its digest, and where no digest is known by its code."""
+    monkeypatch.setenv("RUNS", str(tmp_path / "run"))
+    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
+    file = tmp_path / "checkpoints" / ("aliked-n16.pth" if known else "epipolar-save.pth")
+    file.parent.mkdir()
+    torch.save({"extractor": Runs()}, file)
+    options = {} if known else {"weights": "epipolar"}
+    said = r"aliked-n16\.pth is not the published aliked-n16\.pth: its SHA-256 is \w+; delete it"
+    with pytest.raises((NetworkFileError, ConnectionError), match=said if known else "Weights only load failed"):
+        presets.build("features", "aliked" if known else "disk", **options)
+    assert not (tmp_path / "run").exists()

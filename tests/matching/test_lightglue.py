@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from fmtorch import presets
+from fmtorch.core import onnx_network
 from fmtorch.core import Features
 from fmtorch.matching import LightGlue
 
@@ -84,6 +85,7 @@ def test_weights_that_cannot_be_fetched(tmp_path: Path, monkeypatch: pytest.Monk
     Path(place[1]).parent.mkdir()
     network = kornia.feature.LightGlue(None, input_dim=128)
     torch.save(network.state_dict(), place[1])
+    monkeypatch.delitem(onnx_network.PUBLISHED, "disk_lightglue.pth")
     loaded = LightGlue("disk", device="cpu").network
     assert torch.equal(next(loaded.parameters()), next(network.parameters()))
 
