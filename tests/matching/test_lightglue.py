@@ -11,8 +11,7 @@ import pytest
 import torch
 
 from fmtorch import presets
-from fmtorch.core import onnx_network
-from fmtorch.core import Features
+from fmtorch.core import Features, onnx_network
 from fmtorch.matching import LightGlue
 
 
