@@ -18,6 +18,7 @@ _BLOCKS, _BLOCK = 4096, 1 << 16  # of larger files: how many blocks of how many 
 SUFFIXES = (".h5", ".hdf5")
 
 
+@functools.cache
 def imported() -> Any:
     """h5py. Raises ImportError naming the extra where it is not installed."""
     return lazy.imported("h5py", "h5py is not installed; pip install 'fmtorch[h5]' brings it")
@@ -57,7 +58,7 @@ def groups_with(file: Any, *names: str) -> list[str]:
 def holds(file: Any, key: str) -> bool:
     """Whether a file or group has the key, at any depth."""
     try:
-        return key in file
+        return key.encode() in file.id
     except (OSError, RuntimeError) as error:
         raise DataError(f"{_where(file, key)} cannot be read ({_first_line(error)})") from error
 
