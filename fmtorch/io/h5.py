@@ -18,10 +18,12 @@ _BLOCKS, _BLOCK = 4096, 1 << 16  # of larger files: how many blocks of how many 
 SUFFIXES = (".h5", ".hdf5")
 
 
-@functools.cache
 def imported() -> Any:
     """h5py. Raises ImportError naming the extra where it is not installed."""
     return lazy.imported("h5py", "h5py is not installed; pip install 'fmtorch[h5]' brings it")
+
+
+_library = functools.cache(imported)  # where a file is open
 
 
 @contextlib.contextmanager
@@ -92,7 +94,7 @@ def fits(values: Array, shape: Sequence[int | None]) -> bool:
 
 def _plain_array(file: Any, key: str, floats: bool) -> Array | None:
     """The numbers under a key by HDF5's own calls, in a third of h5py's time; None where it is anything else."""
-    h5py = imported()
+    h5py = _library()
     try:
         entry = h5py.h5d.open(file.id, key.encode())
         dtype, shape = np.dtype(np.float64) if floats else entry.dtype, entry.shape
@@ -129,7 +131,7 @@ def numbers(file: Any, key: str, *shape: int | None) -> Matrix:
 
 def small(file: Any, shapes: Mapping[str, tuple[int, ...]]) -> list[Matrix]:
     """Arrays of a few numbers, each as by `reshaped`, of their keys and shapes; all of them in a third of the time."""
-    h5py, values, begin, read = imported(), np.empty(sum(map(math.prod, shapes.values()))), 0, []
+    h5py, values, begin, read = _library(), np.empty(sum(map(math.prod, shapes.values()))), 0, []
     try:
         for key, shape in shapes.items():
             entry, part = h5py.h5d.open(file.id, key.encode()), values[begin : begin + math.prod(shape)]
