@@ -52,7 +52,7 @@ PUBLISHED = {
     "aliked_lightglue.pth": "d975e965b105311a6143194852297dff4f02aea5cc2e10cecfed966ca0e22503",
     "disk_lightglue.pth": "b5b21d47ea24f2c5e501aec9c91b9716e4c8c3429a4dc1e615c133c4c9378335",
 }
-"""SHA-256 of the publishers' files."""
+"""SHA-256 of the publishers' files; DISK's epipolar-save.pth alone is not checked."""
 
 
 def pretrained(load: Callable[[], Network], name: str, publisher: str, file: str, kept_as: str = "") -> Network:

@@ -27,7 +27,8 @@ FIXED = {"2": 2, "3": 3}  # dimensions that have a size by their names
 
 class Record:
     """Tensors with a common leading batch dimension, moved, indexed and replaced together.
-    declared: what the annotations of a kind's tensors say, by field. per_slot: those with an entry a slot."""
+    declared: what the annotations of a kind's tensors say, by field. per_slot: the fields with an entry for each
+    slot."""
 
     declared: ClassVar[Mapping[str, annotations.Expected]] = {}
     per_slot: ClassVar[tuple[str, ...]] = ()

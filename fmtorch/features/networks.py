@@ -188,8 +188,7 @@ def read_checkpoint(path: Path | str) -> dict[str, Any]:
     if not path.is_file():
         raise FileNotFoundError(f"{path} does not exist")
     try:
-        names = zipfile.ZipFile(path).namelist() if zipfile.is_zipfile(path) else []
-        script = any(name.endswith("/constants.pkl") for name in names)
+        script = _is_script(path)
         content: Any = _script_state(path) if script else torch.load(path, map_location="cpu", weights_only=True)
     except (RuntimeError, pickle.UnpicklingError, EOFError, ValueError, KeyError) as error:
         raise ValueError(f"{path} is neither a state_dict nor TorchScript: {error}") from error
@@ -198,6 +197,13 @@ def read_checkpoint(path: Path | str) -> dict[str, Any]:
     if isinstance(content, Mapping) and content and all(isinstance(value, Tensor) for value in content.values()):
         return {"state_dict": dict(content)}
     raise ValueError(f"{path} holds no state_dict")
+
+
+def _is_script(path: Path) -> bool:
+    if not zipfile.is_zipfile(path):
+        return False
+    with zipfile.ZipFile(path) as archive:
+        return any(name.endswith("/constants.pkl") for name in archive.namelist())
 
 
 def _script_state(path: Path) -> dict[str, Tensor]:
