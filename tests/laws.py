@@ -89,7 +89,7 @@ def _images() -> PairImages:
 
 def calibrated(c: Correspondences) -> Correspondences:
     """The same pairs with the calibration matrices of `scene`, which some learned pruners need."""
-    K = torch.tensor([[800.0, 0, 480], [0, 800, 320], [0, 0, 1]]).expand(len(c), 3, 3)
+    K = torch.tensor([[800.0, 0, 480], [0, 800, 320], [0, 0, 1]], device=c.mask.device).expand(len(c), 3, 3)
     return c.replace(K0=K, K1=K)
 
 
@@ -100,8 +100,8 @@ KNOWLEDGE: dict[str, Any] = {"exact": (0.0, 0.0), "rough": (0.05, 0.05), "one": 
 def with_knowledge(c: Correspondences, known: str) -> Correspondences:
     """The same pairs with the calibration of `scene` as far as it is known."""
     if known == "shared":
-        return c.replace(shared_focal=torch.ones(len(c), dtype=torch.bool))
-    focal = torch.tensor([[[1.0, s] for s in KNOWLEDGE[known]]]).expand(len(c), 2, 2)
+        return c.replace(shared_focal=torch.ones_like(c.mask[:, 0]))
+    focal = torch.tensor([[[1.0, s] for s in KNOWLEDGE[known]]], device=c.mask.device).expand(len(c), 2, 2)
     c = calibrated(c).replace(focal=focal)
     return c.replace(K1=None) if known == "one" else c
 

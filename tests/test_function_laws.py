@@ -39,7 +39,7 @@ def pairs() -> Pairs:
 
 
 def sizes(p: Pairs) -> dict[str, Tensor]:
-    size = torch.tensor([[800, 1000]]).expand(len(p.F), 2)
+    size = torch.tensor([[800, 1000]], device=p.F.device).expand(len(p.F), 2)
     return {"size0": size, "size1": size}
 
 
@@ -52,14 +52,14 @@ def fits(p: Pairs) -> Any:
 
 def covariance(p: Pairs) -> Any:
     focal, principal = torch.stack([p.K0[:, 0, 0], p.K1[:, 0, 0]], 1), (p.K0[:, :2, 2], p.K1[:, :2, 2])
-    cutoff, precision = torch.full((len(p.F),), 4.0, dtype=torch.float64), torch.diag_embed(0 * focal + 4)
+    cutoff, precision = torch.full_like(focal[:, 0], 4.0), torch.diag_embed(0 * focal + 4)
     return geometry.two_view_covariance(
         p.x0, p.x1, p.R, p.t, focal, *principal, cutoff, p.weight, p.noise, p.mask, focal_precision=precision
     )
 
 
 def evidence(p: Pairs) -> Any:
-    precision = torch.diag_embed(torch.full((len(p.F), 2), 2500.0, dtype=torch.float64))
+    precision = torch.diag_embed(torch.full_like(p.F[:, 0, :2], 2500.0))
     cameras = {"K0": p.K0, "K1": p.K1, "focal_precision": precision}
     return pair_evidence(p.F, p.H, p.x0, p.x1, p.mask, noise=p.noise, prior=p.weight, **sizes(p), **cameras)
 
