@@ -11,7 +11,7 @@ from typing import ClassVar, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
-from fmtorch.estimators.inliers import lower_median, residuals_squared_px
+from fmtorch.estimators.inliers import MIN_PRIOR_FOR_NOISE, fit_distance, squared_in_noises
 from fmtorch.estimators.models.model import FitScale, Loss, Refining, Steps
 from fmtorch.estimators.models.posterior import Cameras, Limits
 from fmtorch.estimators.models.with_focals import FundamentalWithFocals
@@ -19,8 +19,6 @@ from fmtorch.estimators.pair import Pair, squared
 from fmtorch.estimators.refinement import Selection
 from fmtorch.jit.kernel import Array
 
-MIN_INLIERS_FOR_NOISE = 15  # matches that tell the noise
-MIN_PRIOR_FOR_NOISE = 0.3  # matches of a smaller prior do not tell the noise
 STEPS = Steps(iterations=8, damping=1e-6, tolerance=1e-4)  # small damping, since the start is near the optimum
 PRIOR_CONFLICT_GAIN = 4.0  # what an optimum without prior may gain, in logarithms of the likelihood, before it is taken
 FOCAL_ITERATIONS = 5  # Levenberg-Marquardt steps where cameras are assumed: these start nearer
@@ -142,18 +140,3 @@ def scale_of(fit: Fit, pair: Pair) -> float:
         return FitScale().scale_sigmas * pair.pixels_per_unit / math.sqrt(fit.precision)
     r2 = squared_in_noises(fit.F, pair)[fit.counted > 0]
     return math.sqrt(float(r2.max())) if len(r2) else math.nan
-
-
-def squared_in_noises(F: Array, pair: Pair) -> Array:
-    """Squared residuals (n,) in squared pixels, of matches of usual noise."""
-    r2 = residuals_squared_px(F, pair)
-    return r2 if pair.noise is None else r2 / np.square(pair.noise)
-
-
-def fit_distance(r2: Array, own: FitScale) -> float:
-    """The scale of the loss in pixels, from the squared residuals of the inliers."""
-    if len(r2) < MIN_INLIERS_FOR_NOISE:
-        return own.default_px
-    return min(
-        max(own.scale_sigmas * own.sigmas_of_median * math.sqrt(lower_median(r2)), own.smallest_px), own.largest_px
-    )

@@ -9,10 +9,10 @@ from typing import NamedTuple
 import numpy as np
 
 from fmtorch.estimators.models.posterior import Cameras
-from fmtorch.estimators.models.with_focals import FundamentalWithFocals
+from fmtorch.estimators.models.with_focals import FundamentalWithFocals, Refined
 from fmtorch.estimators.options import Focal
 from fmtorch.estimators.pair import Pair
-from fmtorch.estimators.refinement import Candidates, Refinement, Selection, scores_of
+from fmtorch.estimators.refinement import BestScore, Candidates, Refinement, Selection, scores_of
 from fmtorch.estimators.scores import Score
 from fmtorch.estimators.search import Search, Stop
 from fmtorch.jit.kernel import Array, B1x1, F8x1, F8x2, kernel
@@ -26,22 +26,31 @@ RIVAL_GAIN_SHARE, SAME_MODEL, SAME_CAMERAS = 0.85, 1e-3, 1e-2
 
 class PlausibleCandidates:
     """Models F (k, 9) of greatest posterior nearby, what that is (k,), minus infinity for none, and their cameras.
-    best: the candidate of the greatest posterior, the first of several. valid: whether there is one."""
+    refined: these models with cost of the prior and share in front of the cameras. best: the candidate of the greatest
+    posterior, the first of several. valid: whether there is one."""
 
-    def __init__(self, F: Array, posterior: Array, cameras: Cameras) -> None:
-        self.F, self.posterior, self.cameras = F, posterior, cameras
-        self.best = int(posterior.argmax())
+    def __init__(self, refined: Refined, posterior: Array, cameras: Cameras) -> None:
+        self.refined, self.posterior, self.cameras = refined, posterior, cameras
+        self.F, self.best = refined.models, int(posterior.argmax())
         self.valid = math.isfinite(posterior[self.best])
 
     def joined(self, other: PlausibleCandidates) -> PlausibleCandidates:
         """The candidates of both."""
-        F, posterior = np.concatenate([self.F, other.F]), np.concatenate([self.posterior, other.posterior])
-        return PlausibleCandidates(F, posterior, self.cameras.joined(other.cameras))
+        refined = Refined(*map(np.concatenate, zip(self.refined, other.refined, strict=True)))
+        posterior = np.concatenate([self.posterior, other.posterior])
+        return PlausibleCandidates(refined, posterior, self.cameras.joined(other.cameras))
 
     def best_alone(self) -> PlausibleCandidates:
         """The candidate of the greatest posterior alone."""
         k = slice(self.best, self.best + 1)
-        return PlausibleCandidates(self.F[k], self.posterior[k], self.cameras.of(self.best))
+        refined = Refined(*(values[k] for values in self.refined))
+        return PlausibleCandidates(refined, self.posterior[k], self.cameras.of(self.best))
+
+    def judged(self, score: Score, pair: Pair) -> PlausibleCandidates:
+        """The same with the posterior by a score."""
+        gain, valid, posterior = scores_of(score, self.F, pair), np.isfinite(self.posterior), np.empty(len(self.F))
+        posteriors(gain, self.refined.share, self.refined.cost, valid, posterior)
+        return PlausibleCandidates(self.refined, posterior, self.cameras)
 
     @property
     def selection(self) -> Selection:
@@ -68,17 +77,15 @@ class SearchResult(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class FocalSearch:
-    """The prior on focal lengths in a search. gain: by which candidates are compared; exact_gain: where both focal
-    lengths are exactly known. search: of one round; None: the prior only selects. stop: the stopping rule for these
-    samples; None: all rounds are made, and never suffice."""
+    """The prior on focal lengths in a search. choice: by which candidates are compared. search: of one round; None: the
+    prior only selects. stop: the stopping rule for these samples; None: all rounds are made, and never suffice."""
 
     options: Focal
     family: FundamentalWithFocals
-    gain: Score
+    choice: BestScore
     refinement: Refinement
     search: Search | None
     stop: Stop | None
-    exact_gain: Score | None = None
 
     def __call__(self, pair: Pair) -> SearchResult:
         """Rounds until good candidates are one model, or enough rounds have confirmed the best one, and the stopping
@@ -100,21 +107,21 @@ class FocalSearch:
             if turn + 1 >= options.min_rounds and agreed and stop:
                 break
         assert candidates is not None
+        if candidates.valid:
+            candidates = candidates.judged(self.choice.of_pair(candidates.F[candidates.best], pair), pair)
         return SearchResult(candidates, pair.calibration is not None or (pair.same_size and stop), draws)
 
     def round(self, pair: Pair, turn: int) -> tuple[PlausibleCandidates, int]:
         """The candidates of a round, and the samples drawn until then."""
         assert self.search is not None
         pool = self.search(pair, turn * self.options.samples)
-        return self.refined(pool.models, pool.valid, pair, self.refinement.near(pool, pair)), pool.samples
+        new = self.refined(pool.models, pool.valid, pair, self.refinement.near(pool, pair))
+        return new.judged(self.choice.score, pair), pool.samples
 
     def refined(self, F: Array, valid: Array, pair: Pair, near: Pair) -> PlausibleCandidates:
-        """Candidates near models (k, 9), refined on some matches and judged on all."""
+        """Candidates near models (k, 9), refined on some matches and not judged yet."""
         cameras, refined = self.family.refine(F, near, self.options.iterations)
-        posterior, exact = np.empty(len(F)), pair.calibration is not None and pair.calibration.exact
-        gain = self.exact_gain if exact and self.exact_gain is not None else self.gain
-        posteriors(scores_of(gain, refined.models, pair), refined.share, refined.cost, valid, posterior)
-        return PlausibleCandidates(refined.models, posterior, cameras)
+        return PlausibleCandidates(refined, np.where(valid, 0.0, -np.inf), cameras)
 
     def select(self, free: Candidates, pair: Pair, plausible: PlausibleCandidates | None) -> Selection:
         """One of the models searched without assumptions, or of plausible cameras near them, or of those before.
@@ -122,7 +129,9 @@ class FocalSearch:
         they are tried where good models differ, or where some were there before. Where anything is known of the cameras
         they are tried and taken."""
         known = pair.calibration is not None
-        gain = np.where(free.valid, scores_of(self.gain, free.F, pair), -np.inf)
+        best = self.choice.first(free, pair).F if plausible is None else plausible.F[plausible.best]
+        score = self.choice.of_pair(best, pair)
+        gain = np.where(free.valid, scores_of(score, free.F, pair), -np.inf)
         order = np.argsort(-gain, kind="stable")
         models, gain = free.F[order], gain[order]
         selection = Selection(models[0], bool(free.valid[0]))
@@ -132,6 +141,7 @@ class FocalSearch:
         candidates = self.refined(models[tried], np.isfinite(gain[tried]), pair, free.near)
         if plausible is not None:
             candidates = candidates.joined(plausible)
+        candidates = candidates.judged(score, pair)
         believed = candidates.posterior[candidates.best] >= MIN_GAIN_SHARE * gain[0]
         if not (believed or (known and candidates.valid)):
             return selection

@@ -8,6 +8,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
+from fmtorch.estimators.models.model import FitScale
 from fmtorch.estimators.pair import Pair, squared
 from fmtorch.estimators.sampling import Sampler
 from fmtorch.geometry.arithmetic import logarithm_1p_kernel
@@ -93,6 +94,33 @@ def lower_median(values: Array) -> float:
     ordered = values.copy()
     ordered.partition(rank)
     return float(ordered[rank])
+
+
+# The noise of a pair
+
+MIN_INLIERS_FOR_NOISE = 15  # matches that tell the noise
+MIN_PRIOR_FOR_NOISE = 0.3  # matches of a smaller prior do not tell the noise
+
+
+def squared_in_noises(F: Array, pair: Pair) -> Array:
+    """Squared residuals (n,) in squared pixels, of matches of usual noise."""
+    r2 = residuals_squared_px(F, pair)
+    return r2 if pair.noise is None else r2 / np.square(pair.noise)
+
+
+def fit_distance(r2: Array, own: FitScale) -> float:
+    """The scale of the loss in pixels, from the squared residuals of the inliers."""
+    if len(r2) < MIN_INLIERS_FOR_NOISE:
+        return own.default_px
+    return min(
+        max(own.scale_sigmas * own.sigmas_of_median * math.sqrt(lower_median(r2)), own.smallest_px), own.largest_px
+    )
+
+
+def noise_scale(F: Array, pair: Pair, own: FitScale) -> float:
+    """The scale of the loss of a fit near a model (9,) in pixels, by the noise of the matches within the largest."""
+    r2 = squared_in_noises(F, pair)
+    return fit_distance(r2[(r2 <= squared(own.largest_px)) & (pair.match_weight > MIN_PRIOR_FOR_NOISE)], own)
 
 
 @functools.cache

@@ -14,8 +14,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fmtorch.core.types import MAX_LENS, MIN_LENS
-from fmtorch.estimators.final_fits import FOCAL_TOLERANCE, MIN_PRIOR_FOR_NOISE, Fit, fit_distance
+from fmtorch.estimators.final_fits import FOCAL_TOLERANCE, Fit
 from fmtorch.estimators.focal_search import FocalSearch
+from fmtorch.estimators.inliers import MIN_PRIOR_FOR_NOISE, fit_distance
 from fmtorch.estimators.models import posterior
 from fmtorch.estimators.models.focal_prior import MIN_DEVIATION, focal_cost
 from fmtorch.estimators.models.model import FitScale

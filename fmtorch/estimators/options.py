@@ -50,20 +50,13 @@ class Refine:
 class Select:
     """Which refined model is the estimate: that of the largest score.
 
-    score: a name of the registry, or a score. scale: of it, Sampson distance, px.
+    score: a name of the registry, or a score. scale: of it, Sampson distance, px. own_noise: whether the estimate is
+    that of the largest score at the noise of the pair, which the inliers of the former tell.
     """
 
     score: Any = "saturated"
     scale: Pixels = 1.0
-
-
-@dataclasses.dataclass(frozen=True)
-class ExactFocals:
-    """What is different where both focal lengths are exactly known: fewer models fit by accident.
-    scale: of the selecting score, Sampson distance, px. sqrt_prior: whether the root of P(inlier) stands for it."""
-
-    scale: Pixels
-    sqrt_prior: bool = False
+    own_noise: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,8 +67,8 @@ class Focal:
     min_rounds: of so many samples, at most and at least; in between a pair goes on while its good candidates differ or
     the stopping rule asks for more. confirmations: rounds that find the best candidate of those before them again,
     after which it does not matter that others differ. pool: the best models of a round, which are refined with the
-    prior. candidates: models of the other search that are, too. iterations: steps of that refinement. exact:
-    `ExactFocals`; None: nothing is different.
+    prior. candidates: models of the other search that are, too. iterations: steps of that refinement. sqrt_prior:
+    whether the root of P(inlier) stands for it where both focal lengths are exactly known.
     """
 
     samples: NonNegative = 250
@@ -85,16 +78,11 @@ class Focal:
     pool: Count = 12
     candidates: Count = 12
     iterations: NonNegative = 12
-    exact: ExactFocals | Mapping[str, Any] | None = None
+    sqrt_prior: bool = False
 
     def __post_init__(self) -> None:
         if self.min_rounds > self.rounds:
             raise ValueError(f"focal.min_rounds is {self.min_rounds}; it must be at most focal.rounds, {self.rounds}")
-
-    @property
-    def exact_focals(self) -> ExactFocals | None:
-        """The options of `exact`."""
-        return stage(self.exact, ExactFocals)
 
 
 def stage(options: Stage | Mapping[str, Any] | None, kind: type[Stage]) -> Stage | None:

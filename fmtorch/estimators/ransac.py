@@ -7,6 +7,7 @@ verb; `batch` leads from tensors to pairs and back.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
@@ -131,7 +132,8 @@ class Ransac:
         changed = refinement.options is not None or optimization is not None
         self.select: Selector = BestScore(self.score) if changed else BestOfSearch()
         if choice is not None:
-            self.select = BestScore(part("score", choice.score, threshold=choice.scale))
+            at = functools.partial(_score_at, choice.score)
+            self.select = BestScore(at(choice.scale), at if choice.own_noise else None, self.family.fit_scale)
         self.focal = _focal_search(stage(focal, Focal), self.select, self.search, refinement, choice)
 
     @property
@@ -164,8 +166,7 @@ class Ransac:
     def __call__(self, c: Correspondences, seed: int = 0) -> Estimate:
         """Estimate the fundamental matrices of a batch of pairs; a pair that cannot be solved is `ok=False`."""
         compile_together(self.kernels)
-        exact = None if self.focal is None else self.focal.options.exact_focals
-        if exact is not None and exact.sqrt_prior:
+        if self.focal is not None and self.focal.options.sqrt_prior:
             c = with_sqrt_prior(c)
         calibrated = None if self.focal is None else CALIBRATED_MATCHES
         estimation = Estimation(c, seed, self.family, self.family.size, calibrated)
@@ -253,6 +254,12 @@ def searched(pair: Pair) -> Pair:
     return pair if count >= pair.count else pair.take(np.arange(count) * pair.count // count)
 
 
+def _score_at(score: Any, scale: float) -> Score:
+    """The selecting score at a scale, px."""
+    made: Score = part("score", score, threshold=scale)
+    return made
+
+
 def _focal_search(
     options: Focal | None, select: Selector, search: Search, refinement: Refinement, choice: Select | None
 ) -> FocalSearch | None:
@@ -264,6 +271,4 @@ def _focal_search(
     family, own = FundamentalWithFocals(), None
     if options.samples:
         own = Search(family, search.sampler, search.preselection, options.pool, options.samples, FOCAL_ROUND)
-    exact = options.exact_focals
-    exact_gain = None if exact is None else part("score", choice.score, threshold=exact.scale)
-    return FocalSearch(options, family, select.score, refinement, own, search.stop, exact_gain)
+    return FocalSearch(options, family, select, refinement, own, search.stop)

@@ -12,7 +12,7 @@ import fmtorch
 from fmtorch import presets
 from fmtorch.core import Correspondences, Estimate, collate
 from fmtorch.data import ImagePair, load
-from fmtorch.estimators import final_fits
+from fmtorch.estimators import final_fits, inliers
 from fmtorch.geometry import cameras as square_pixels
 from fmtorch.geometry import fundamental_from_calibration
 from fmtorch.metrics import pose_error
@@ -99,7 +99,7 @@ def test_focal_lengths_are_recovered(cameras: tuple, known: dict[str, Any], tole
 @pytest.mark.usefixtures("converging")
 def test_the_fit_is_the_optimum(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of the Sampson error of right matches, by SciPy."""
-    monkeypatch.setattr(final_fits, "MIN_INLIERS_FOR_NOISE", 1000)  # the loss is truncated at 1.5 px, five deviations
+    monkeypatch.setattr(inliers, "MIN_INLIERS_FOR_NOISE", 1000)  # the loss is truncated at 1.5 px, five deviations
     s = reference.scene(3, noise=0.3, outliers=0.0)
     prior = np.random.default_rng(0).uniform(0.5, 1, 150)
     e = fmtorch.find_essential(s.x0, s.x1, **CAMERAS, **SIZES, prior=prior)
@@ -113,7 +113,7 @@ def test_the_fit_is_the_optimum(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("known", ["rough", "one", "shared", "unknown"])
 def test_the_fit_is_the_maximum_of_the_posterior(known: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Over pose and focal lengths, by SciPy; of images of two sizes, which the well of one camera is not for."""
-    monkeypatch.setattr(final_fits, "MIN_INLIERS_FOR_NOISE", 1000)  # the loss is truncated at 1.5 px, two deviations
+    monkeypatch.setattr(inliers, "MIN_INLIERS_FOR_NOISE", 1000)  # the loss is truncated at 1.5 px, two deviations
     sizes, inf = ((480, 640), (600, 800)), float("inf")
     nothing = (1.0, inf)
     measured = {"rough": ((640.0, 0.05), (900.0, 0.1)), "one": ((660.0, 0.03), nothing)}.get(known, (nothing, nothing))
