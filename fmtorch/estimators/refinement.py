@@ -22,6 +22,7 @@ from fmtorch.jit.kernel import Array, F4x2, I8x1, Kernel, kernel
 from fmtorch.jit.random import Stream
 
 FIRST_DAMPING = 1e-4  # of Levenberg-Marquardt
+CHOICE_SIGMAS = 1.5  # deviations of the noise of a pair at which a match counts half in the choice
 
 
 @runtime_checkable
@@ -126,13 +127,12 @@ class BestScore:
     """The model of the largest score.
 
     No scale suits all pairs: keypoints of a sharp video lie within a fifth of a pixel of their epipolar lines, those of
-    learned features within one. So with `at`, the score of a scale in pixels, the model is chosen a second time, at the
-    scale `own` of the last fit by the noise of the matches near the first choice. On castle-P19 and fox it raises
-    AUC@0.05 from 73.6 to 75.5 (SIFT) and from 79.8 to 81.9 (ALIKED with LightGlue).
+    learned features within one. So with `at`, the score of a scale in pixels, the model is chosen a second time, by the
+    noise of the matches near the first choice, within the limits `own` of the last fit's scale.
     """
 
     def __init__(self, score: Score, at: Callable[[float], Score] | None = None, own: FitScale | None = None) -> None:
-        self.score, self.at, self.own = score, at, own or FitScale()
+        self.score, self.at, self.own = score, at, (own or FitScale())._replace(scale_sigmas=CHOICE_SIGMAS)
 
     def __call__(self, candidates: Candidates, pair: Pair) -> Selection:
         """The selection."""

@@ -194,7 +194,6 @@ MEDIAN = {"score": "median", "inliers": "lmeds", "confidence": None}
         ({"score": {"prior_weighted": True}}, "score is None; it must be one of"),
         ({"pool": 0}, "pool=0; it must be a whole number of at least 1"),
         ({"confidence": 1.0}, "confidence=1.0; it must be a number between 0 and 1 or null"),
-        ({"select": {}, "focal": {"exact": {"scale": -1}}}, "focal.exact.scale=-1; it must be a number above 0"),
         (MEDIAN | {"threshold": 2.0}, "threshold=2.0 has no effect: score=median takes none"),
         (MEDIAN | {"inlier_threshold": 2.0}, "inlier_threshold=2.0 has no effect: inliers=lmeds takes none"),
         ({"local_optimization": "x"}, "local_optimization is 'x'; it must be one of: graph_cut"),

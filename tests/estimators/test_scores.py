@@ -11,6 +11,7 @@ import fmtorch
 from fmtorch import estimators
 from fmtorch.estimators import BestOfSearch, BestScore, Candidates, Pool, Refinement, scores_of
 from fmtorch.estimators.inliers import residuals_squared_px
+from fmtorch.estimators.models.model import Loss, Steps
 from fmtorch.estimators.scores import GRID, fractional_bits, saturated_cells
 from fmtorch.geometry.epipolar import HOMOGRAPHY, SAMPSON
 from fmtorch.geometry.robust_losses import ENTRIES, QUANTILE
@@ -333,6 +334,28 @@ def test_the_first_of_the_pool_or_the_best_score_of_what_is_valid() -> None:
     second = int(np.argmax(np.where(valid, scores, -np.inf)))
     np.testing.assert_array_equal(BestScore(estimators.Msac(50.0))(Candidates(F, valid, pair), pair).F, F[second])
     assert not BestScore(estimators.Msac(50.0))(Candidates(F, np.zeros(6, np.bool_), pair), pair).valid
+
+
+@pytest.mark.parametrize(("noise", "count"), [(0.01, 300), (0.3, 300), (0.6, 300), (9.0, 300), (0.3, 14)])
+def test_the_second_choice_is_made_at_the_noise_of_the_pair(noise: float, count: int) -> None:
+    """The scale is 1.5 robust deviations of the likely matches within 2 px of the first choice, 0.3 to 2 px, and
+    1.5 px where these are fewer than 15."""
+    pair, asked = pair_of(scene(2, count, outliers=0.1, noise=noise)), list[float]()
+    start, loss = models(pair, 30)[1:], Loss("cauchy", 2.0)
+    F = estimators.SevenPoint().refine(start, pair, loss, Steps(20, 1e-4))
+
+    def at(scale: float) -> estimators.Score:
+        asked.append(scale)
+        return estimators.Msac(scale)
+
+    everything = Candidates(F, np.ones(len(F), np.bool_), pair)
+    chosen = BestScore(estimators.Msac(0.3), at)(everything, pair)
+    first = F[int(np.argmax(scores_of(estimators.Msac(0.3), F, pair)))]
+    r = np.sqrt(residuals_squared_px(first, pair)) / pair.noises
+    r = r[(r <= 2) & (pair.match_weight > 0.3)]
+    expected = 1.5 if len(r) < 15 else np.clip(1.5 * 1.4826 * np.quantile(r, 0.5, method="inverted_cdf"), 0.3, 2.0)
+    np.testing.assert_allclose(asked, [expected], rtol=1e-12)
+    np.testing.assert_array_equal(chosen.F, F[int(np.argmax(scores_of(estimators.Msac(asked[0]), F, pair)))])
 
 
 @pytest.mark.parametrize("threshold", [0.0, -1.0, float("nan")])

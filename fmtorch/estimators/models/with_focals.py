@@ -65,7 +65,7 @@ class FundamentalWithFocals:
         k, precision = len(F), squared(pair.pixels_per_unit / INLIER_SIGMA_PX)
         cameras, refined = posterior.no_cameras(k), Refined(np.empty((k, 9)), np.empty(k), np.empty(k))
         limits, parallel = Limits(precision, iterations, -1.0), PARALLEL_PX / pair.pixels_per_unit
-        refine_with_prior(F, Subset(pair.table, images_of(pair), parallel), limits, cameras, refined)
+        refine_with_prior(F, Subset(pair.table, images_of(pair), parallel, LOSS_SCALE_PX), limits, cameras, refined)
         return cameras, refined
 
     def fit(self, start: Cameras, pair: Pair, truncation: float, limits: Limits) -> FocalFit:
@@ -79,11 +79,13 @@ class FundamentalWithFocals:
 
 
 class Subset(NamedTuple):
-    """Matches on which candidates are refined: table (9, n), of `Pair`; parallel: the tolerance of `cheirality`."""
+    """Matches on which candidates are refined: table (9, n), of `Pair`; parallel: the tolerance of `cheirality`; scale:
+    of the loss, px."""
 
     table: F8x2
     images: Images
     parallel: float
+    scale: float
 
 
 @kernel
@@ -92,7 +94,7 @@ def refine_with_prior(F: F8x2, subset: Subset, limits: Limits, cameras: Cameras,
     table, images, k = subset.table, subset.images, len(F)
     optimum = Optimum(matrix(k, 9), vector(k), matrix(k, 7), np.empty((k, 7, 7)))
     centred_matches = matrix(6, table.shape[1])
-    posterior.centre(table, images.offset, LOSS_SCALE_PX, centred_matches)
+    posterior.centre(table, images.offset, subset.scale, centred_matches)
     points, s2, scale = centred_matches[:4], centred_matches[4], centred_matches[5]
     posterior.nearest_cameras(F, images, cameras)
     posterior.minimise(cameras, Weighted(points, table[4], s2, GEMAN_MCCLURE, matrix(2, 0)), images, limits, optimum)

@@ -11,12 +11,12 @@ from scipy.spatial.transform import Rotation
 
 from fmtorch import presets
 from fmtorch.core import Correspondences, collate
-from fmtorch.estimators import Candidates, Focal, Pair, Ransac, Refinement, SaturatedGains, focal_search
+from fmtorch.estimators import BestScore, Candidates, Focal, Pair, Ransac, Refinement, SaturatedGains, focal_search
 from fmtorch.estimators.focal_search import FocalSearch, PlausibleCandidates
 from fmtorch.estimators.models import focal_prior
 from fmtorch.estimators.models.focal_prior import QUANTILES, normal_quantiles
 from fmtorch.estimators.models.posterior import images_of, no_cameras
-from fmtorch.estimators.models.with_focals import FundamentalWithFocals
+from fmtorch.estimators.models.with_focals import FundamentalWithFocals, Refined
 from fmtorch.jit.random import Stream
 from fmtorch.metrics import nsgd
 from tests.estimators.pairs import pair_of, to_units
@@ -233,7 +233,7 @@ class Found(PlausibleCandidates):
     """A round's candidates, which say what they are told to."""
 
     def __init__(self, again: bool, one_model: bool) -> None:
-        super().__init__(np.ones((1, 9)), np.ones(1), no_cameras(1))
+        super().__init__(Refined(np.ones((1, 9)), np.zeros(1), np.ones(1)), np.ones(1), no_cameras(1))
         self.again, self.one_model = again, one_model
 
     def confirmed(self, other: PlausibleCandidates) -> bool:
@@ -279,7 +279,7 @@ def test_rounds_end_when_enough_of_them_confirm_the_best(min_rounds, confirmatio
 def searching(iterations: int = 12, **options: int) -> FocalSearch:
     """A search that only selects."""
     focal = Focal(iterations=iterations, samples=0, **options)
-    return FocalSearch(focal, FundamentalWithFocals(), SaturatedGains(0.3), Refinement(None), None, None)
+    return FocalSearch(focal, FundamentalWithFocals(), BestScore(SaturatedGains(0.3)), Refinement(None), None, None)
 
 
 def free(F: np.ndarray, pair: Pair, valid: np.ndarray | None = None) -> Candidates:
@@ -292,10 +292,10 @@ def free(F: np.ndarray, pair: Pair, valid: np.ndarray | None = None) -> Candidat
 def test_the_best_candidates_of_two_rounds_are_one_model_or_not(posterior: list[float], same: bool) -> None:
     F = np.linalg.qr(np.random.default_rng(0).normal(size=(9, 2)))[0].T.copy()  # of cosine 0
     models = np.stack([F[0], F[0] if same else F[1]])
-    candidates = PlausibleCandidates(models, np.array(posterior), no_cameras(2))
+    candidates = PlausibleCandidates(Refined(models, np.zeros(2), np.ones(2)), np.array(posterior), no_cameras(2))
     assert candidates.best == int(np.argmax(posterior))
     assert candidates.unique_optimum == (same or min(posterior) < focal_search.RIVAL_GAIN_SHARE * max(posterior))
-    other = PlausibleCandidates(F[1:], np.ones(1), no_cameras(1))
+    other = PlausibleCandidates(Refined(F[1:], np.zeros(1), np.ones(1)), np.ones(1), no_cameras(1))
     assert candidates.confirmed(other) == bool(np.array_equal(models[candidates.best], F[1]))
     assert candidates.joined(other).F.shape == (3, 9)
     assert candidates.best_alone().posterior.tolist() == [max(posterior)]
@@ -303,7 +303,9 @@ def test_the_best_candidates_of_two_rounds_are_one_model_or_not(posterior: list[
 
 def test_rounds_without_candidates_settle_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     """All matches may be inliers of the zero model that stands for none."""
-    nothing = PlausibleCandidates(np.zeros((1, 9)), np.full(1, -np.inf), no_cameras(1))
+    nothing = PlausibleCandidates(
+        Refined(np.zeros((1, 9)), np.zeros(1), np.ones(1)), np.full(1, -np.inf), no_cameras(1)
+    )
     monkeypatch.setattr(FocalSearch, "round", lambda self, pair, turn: (nothing, (turn + 1) * 10))
     search = searching(rounds=3, min_rounds=1)
     object.__setattr__(search, "stop", lambda F, draws, pair, size: True)
