@@ -7,7 +7,7 @@ import sys
 import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, ParamSpec, TypeVar, cast
+from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar, cast
 
 import torch
 from jaxtyping import Float
@@ -16,10 +16,13 @@ from torch import Tensor
 from fmtorch.core.types import CONTRADICTED, Correspondences, Estimate, PoseEstimate
 from fmtorch.geometry.epipolar import unit_frobenius
 from fmtorch.jobs.execution import one_thread
-from fmtorch.two_view.arguments import Arrays, Focal, Lens, correspondences
+from fmtorch.two_view.arguments import Arrays, Focal, Lens, correspondences, is_calibrated
 from fmtorch.two_view.assumed_sizes import Size, given_sizes
 from fmtorch.two_view.estimation import estimated
 from fmtorch.two_view.pair_type import with_pair_type
+
+if TYPE_CHECKING:
+    from fmtorch.two_view.lenses import CalibratedLenses
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -144,7 +147,10 @@ def find_fundamental(
         if size0 is None or isinstance(size0, str):
             raise ValueError("covariance needs K0 and K1, or the image sizes: give size0 and size1")
         focal = "unknown"
-    if lens is not None:
+    lenses = None if lens is None else _lenses(lens, K0, K1)
+    if lenses is not None:
+        (K0, K1), lens = lenses.K, None
+    elif lens is not None:
         _expect_lens(size0, K0 is not None or K1 is not None, covariance)
     h0w0, h1w1, assume_sizes = given_sizes(size0, size1)
     c = correspondences(
@@ -153,11 +159,23 @@ def find_fundamental(
     )  # fmt: skip
     if isinstance(focal, Mapping):
         options["focal"] = focal
-    estimate = estimated(c, "fundamental", estimator, config_dir, seed, options, covariance, assume_sizes)
+    seen = c if lenses is None else lenses.undistorted(c)
+    estimate = estimated(seen, "fundamental", estimator, config_dir, seed, options, covariance, assume_sizes)
+    if lenses is not None:
+        estimate = lenses.with_reasons(estimate, c, seen)
     if estimate.contradicted is not None and bool(estimate.contradicted.any()):
         pairs = estimate.contradicted.nonzero()[:, 0].tolist()
         warnings.warn(f"pair {', '.join(map(str, pairs))}: {CONTRADICTED}", stacklevel=2)
-    return with_pair_type(estimate, c, seed) if pair_type else estimate
+    return with_pair_type(estimate, seen, seed) if pair_type else estimate
+
+
+def _lenses(lens: Lens, K0: Arrays | None = None, K1: Arrays | None = None) -> CalibratedLenses | None:
+    """Calibrated lenses, and K of their images and others; None where lenses are estimated, or lambda is known."""
+    if not is_calibrated(lens):
+        return None
+    from fmtorch.two_view.lenses import CalibratedLenses
+
+    return CalibratedLenses(lens, K0, K1)
 
 
 def _expect_lens(size: Size, calibrated: bool, covariance: bool) -> None:
@@ -172,8 +190,8 @@ def _expect_lens(size: Size, calibrated: bool, covariance: bool) -> None:
 def find_essential(
     x0: Arrays,
     x1: Arrays,
-    K0: Arrays,
-    K1: Arrays,
+    K0: Arrays | None = None,
+    K1: Arrays | None = None,
     *,
     focal: Focal = None,
     lens: Lens = None,
@@ -232,7 +250,8 @@ def find_essential(
         >>> bool(estimate.ok[0]), [round(value, 3) for value in estimate.t[0].tolist()]
         (True, [-0.64, 0.48, 0.6])
     """
-    for name, K in (("K0", K0), ("K1", K1)):
+    lenses = _lenses(lens, K0, K1)
+    for name, K in zip(("K0", "K1"), (K0, K1) if lenses is None else lenses.K, strict=True):
         if K is None:
             raise ValueError(f"{name} is None; find_fundamental estimates pairs of which one camera or none is known")
     estimate = find_fundamental(
