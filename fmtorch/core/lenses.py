@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -181,7 +181,7 @@ TOLERANCE = 1e-10  # of distorted points, likewise: 1e-7 px at a focal length of
 RAY = np.linspace(0.0, 1.0, 33)  # where, from the centre to a point, a lens must lead outwards
 
 
-def division_lens(value: float, size: tuple[float, float]) -> Lens:
+def division_lens(value: float, size: Sequence[float]) -> Lens:
     """The lens of the division model whose lambda in half diagonals of an image (h, w) is this, about its centre."""
     (h, w), half = size, float(np.hypot(*size)) / 2
     return Lens(half, half, (w - 1) / 2, (h - 1) / 2, "SIMPLE_DIVISION", (value,))

@@ -143,14 +143,14 @@ def find_fundamental(
         >>> bool(estimate.ok[0]), int(estimate.inliers[0, 20:].sum())
         (True, 60)
     """
+    lenses = None if lens is None else _lenses(lens, K0, K1)
+    if lenses is not None:
+        (K0, K1), lens = lenses.K, None
     if covariance and K0 is None and K1 is None and focal is None:
         if size0 is None or isinstance(size0, str):
             raise ValueError("covariance needs K0 and K1, or the image sizes: give size0 and size1")
         focal = "unknown"
-    lenses = None if lens is None else _lenses(lens, K0, K1)
-    if lenses is not None:
-        (K0, K1), lens = lenses.K, None
-    elif lens is not None:
+    if lens is not None:
         _expect_lens(size0, K0 is not None or K1 is not None, covariance)
     h0w0, h1w1, assume_sizes = given_sizes(size0, size1)
     c = correspondences(
@@ -276,6 +276,9 @@ def find_homography(
     lafs0: Arrays | None = None,
     lafs1: Arrays | None = None,
     noise: Arrays | None = None,
+    size0: Arrays | None = None,
+    size1: Arrays | None = None,
+    lens: Lens = None,
     key: Arrays | int | None = None,
     seed: int = 0,
     config_dir: Path | str | None = None,
@@ -309,11 +312,27 @@ def find_homography(
         >>> bool(estimate.ok[0]), int(estimate.inliers[0, 20:].sum()), tuple(estimate.H.shape)
         (True, 40, (1, 3, 3))
     """
+    lenses = None if lens is None else _lenses(lens)
+    if lenses is None and lens is not None and size0 is None:
+        raise ValueError("lens needs the image sizes, in whose half diagonals it is: give size0 and size1")
+    plane = lens is None if lenses is None else all(pair[0] is None for pair in lenses.pairs)
     c = correspondences(
-        x0, x1, plane=True, mask=mask, ratio=ratio, score=score, prior=prior, lafs0=lafs0, lafs1=lafs1, noise=noise,
-        key=key,
+        x0, x1, plane=plane, mask=mask, ratio=ratio, score=score, prior=prior, lafs0=lafs0, lafs1=lafs1, noise=noise,
+        size0=size0, size1=size1, lens=None if lenses is not None else lens, key=key,
     )  # fmt: skip
-    return homographies(c, lambda c: estimated(c, "homography", estimator, config_dir, seed, options))
+
+    def find(c: Correspondences) -> Estimate:
+        return homographies(c, lambda c: estimated(c, "homography", estimator, config_dir, seed, options))
+
+    if c.lens is not None:
+        from fmtorch.two_view.lenses import homographies_with_lenses
+
+        return homographies_with_lenses(c, find)
+    c = c.derived(size0=None, size1=None)
+    if lenses is None:
+        return find(c)
+    seen = lenses.undistorted(c)
+    return lenses.with_reasons(find(seen), c, seen)
 
 
 # Homographies of planes in any unit, seen from either side, and whether their support is beyond chance

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, cast
 
 import numpy as np
+import scipy.optimize
 import torch
+from torch import Tensor
 
-from fmtorch.core.lenses import Lens, undistorted_points, undistortion
-from fmtorch.core.types import Correspondences, Estimate
+from fmtorch.core.lenses import MODELS, Lens, Matrix, division_lens, undistorted_points, undistortion
+from fmtorch.core.types import MAX_LENS, MIN_LENS, Correspondences, Estimate, collate
+from fmtorch.estimators.lens_search import STARTS, TAIL_DEVIATION
 from fmtorch.geometry.cameras import calibration_problems
 
 Lenses = tuple[Lens | None, Lens | None]
@@ -41,22 +44,19 @@ class CalibratedLenses:
         if K is not None:
             raise ValueError(f"K{k} and a lens of image {k} are given, and the lens has its own K: leave K{k} out")
         if len(known) < len(lenses):
-            raise ValueError(
-                f"lens has no lens of image {k} for some pairs; a pinhole there is fmtorch.Lens(fx, fy, cx, cy)"
-            )
+            raise ValueError(f"lens has None for image {k} of some pairs; a pinhole is fmtorch.Lens(fx, fy, cx, cy)")
         return np.stack(known) if len(known) > 1 else known[0]
 
     @staticmethod
     def _problem(pair: Lenses) -> str:
+        """Why a lens of a pair is none; empty where both may be."""
+        problems: list[str] = []
         for k, lens in enumerate(pair):
             if lens is not None:
-                if not np.isfinite(lens.coefficients).all():
-                    return f"the lens of image {k} has the coefficients {lens.coefficients}; they must be finite"
-                if problem := calibration_problems(torch.from_numpy(lens.K)[None], None, f"K of the lens of image {k}")[
-                    0
-                ]:
-                    return problem
-        return ""
+                problems += calibration_problems(torch.from_numpy(lens.K)[None], None, f"K of the lens of image {k}")
+                finite = np.isfinite(lens.coefficients).all()
+                problems += [] if finite else [f"the lens of image {k} has coefficients that are not finite"]
+        return next(filter(None, problems), "")
 
     def undistorted(self, c: Correspondences) -> Correspondences:
         """The matches as pinholes would have them; none of a pair whose lens is none."""
@@ -68,14 +68,10 @@ class CalibratedLenses:
 
     def with_reasons(self, estimate: Estimate, c: Correspondences, seen: Correspondences) -> Estimate:
         """The estimate of undistorted matches `seen`, with the reasons why it has none of c."""
-        reasons = list(estimate.reason)
-        for i, (ok, before, after) in enumerate(
-            zip(estimate.ok.tolist(), c.count().tolist(), seen.count().tolist(), strict=True)
-        ):
-            if not ok and 2 * after < before:
-                unseen = (
-                    f"pinholes see {after} of {before} matches: the lens folds, or looks more than 90 degrees aside"
-                )
+        reasons, counts = list(estimate.reason), zip(c.count().tolist(), seen.count().tolist(), strict=True)
+        for i, (before, after) in enumerate(counts):
+            if 2 * after < before and not estimate.ok[i]:
+                unseen = f"pinholes see {after} of {before} matches: the lens folds there, or looks 90 degrees aside"
                 reasons[i] = self.problems[i if len(self.pairs) > 1 else 0] or unseen
         return estimate.derived(reason=tuple(reasons))
 
@@ -84,10 +80,12 @@ def undistorted_matches(c: Correspondences, lenses: Sequence[Lenses]) -> Corresp
     """The matches of a batch as pinholes of the same K would have them; one that a pinhole does not see is masked.
 
     lenses: of each pair. A match's noise grows as its points are stretched, so that its distances count in pixels of
-    the photographs: by the root of the mean over both images of the determinant of the derivatives of its points.
-    Gradients reach the points of the photographs.
+    the photographs: by the root of the determinant of the derivatives of its points, in the geometric mean over both
+    images. On castle-P19 and fox, matched in images bent by three lenses, this raises AUC@0.05 of F by 1.5 points (root
+    of the mean determinant: 1.7) and AUC@5 of poses of two of these by 0.4 (-1.2). Gradients reach the photographs'
+    points.
     """
-    fields, seen, stretch = dict[str, torch.Tensor](), np.ones(c.mask.shape, np.bool_), np.zeros(c.mask.shape)
+    fields, seen, area = dict[str, Tensor](), np.ones(c.mask.shape, np.bool_), np.ones(c.mask.shape)
     for k, (points, lafs) in enumerate(((c.x0, c.lafs0), (c.x1, c.lafs1))):
         x = points.detach().cpu().numpy().astype(np.float64)  # a copy
         J, bends = np.broadcast_to(np.eye(2), (*x.shape, 2)).copy(), False
@@ -98,7 +96,7 @@ def undistorted_matches(c: Correspondences, lenses: Sequence[Lenses]) -> Corresp
                     J[i], bends = undistortion(lens, x[i]), True
                 valid = np.isfinite(x[i]).all(-1) & np.isfinite(J[i]).all((-2, -1))
                 x[i, ~valid], J[i, ~valid], seen[i] = 0, 0, seen[i] & valid
-        stretch += np.abs(np.linalg.det(J)) / 2
+        area *= np.abs(np.linalg.det(J))
         if not bends:
             continue
         there, slope = torch.from_numpy(x).to(points), torch.from_numpy(J).to(points)
@@ -111,5 +109,89 @@ def undistorted_matches(c: Correspondences, lenses: Sequence[Lenses]) -> Corresp
     if not fields:
         return c
     fields["mask"] = c.mask & torch.from_numpy(seen).to(c.mask.device)
-    noise = torch.from_numpy(np.where(seen & (stretch > 0), np.sqrt(stretch), 1)).to(c.x0)
+    noise = torch.from_numpy(np.where(seen & (area > 0), area, 1) ** 0.25).to(c.x0)
     return c.derived(**fields, noise=noise if c.noise is None else c.noise * noise)
+
+
+# Homographies of photographs whose lenses are of the division model, with known or unknown lambdas
+
+MIN_FIT = 12  # inliers; a lens with fewer stays straight
+MAX_STEPS = 30  # of a fit
+EXACT = 1e-9  # half diagonals: noise of matches without any
+UNKNOWN = "of find_homography it must be a calibrated lens, lambda (exactly known), 'shared' or 'unknown'"
+
+
+def homographies_with_lenses(c: Correspondences, find: Callable[[Correspondences], Estimate]) -> Estimate:
+    """Homographies of pinholes, with `lens`. c: with sizes and lens. find: homographies of matches without lenses.
+    Unknown lambdas are those of a fit to the inliers of a few estimates, and zero unless that has greater evidence."""
+    assert c.lens is not None
+    mean, deviation = c.lens.detach().double().unbind(-1)
+    if bool((deviation == 0).all()):
+        return find(_straight(c, mean)).derived(lens=mean)
+    if not bool(deviation.isinf().all()):
+        raise ValueError(f"lens is {c.lens.tolist()}; {UNKNOWN}")
+    if c.requires_grad:
+        raise ValueError("lens is given, and its estimates have no gradients: give points, prior, noise detached")
+    estimates = [find(_straight(c, mean.new_tensor(start).expand_as(mean))) for start in STARTS]
+    inliers, lens = torch.stack([each.inliers for each in estimates]).any(0), torch.zeros_like(mean)
+    for i in (inliers.sum(1) >= MIN_FIT).nonzero()[:, 0].tolist():
+        valid = [(start, each.F[i]) for start, each in zip(STARTS, estimates, strict=True) if each.ok[i]]
+        models = [np.append(H.double().cpu().numpy(), start) for start, H in valid]
+        lens[i] = torch.from_numpy(_PlanePair(c[i], inliers[i]).lenses(models))
+    estimate, bent = estimates[0], lens.any(1)
+    if bool(bent.any()):
+        place = torch.where(bent, len(c) - 1 + bent.cumsum(0), torch.arange(len(c), device=bent.device))
+        estimate = collate([estimate, find(_straight(c[bent], lens[bent]))])[place]
+    return estimate.derived(lens=torch.where(estimate.ok[:, None], lens, torch.nan))
+
+
+def _straight(c: Correspondences, lens: Tensor) -> Correspondences:
+    """The matches, with nothing else, without lenses of these lambdas (b, 2)."""
+    rows = zip(lens.tolist(), *(cast(Tensor, size).tolist() for size in (c.size0, c.size1)), strict=True)
+    pairs = [(division_lens(values[0], size0), division_lens(values[1], size1)) for values, size0, size1 in rows]
+    return undistorted_matches(c.derived(lens=None, shared_lens=None, size0=None, size1=None), pairs)
+
+
+class _PlanePair:
+    """Matches of a plane in a pair (a batch of one), in half diagonals from the centres: x0, x1 (n, 2). Parameters
+    are eight entries of a homography of pinholes whose last is one, and lambdas: none, of both, or of each."""
+
+    def __init__(self, c: Correspondences, inliers: Tensor) -> None:
+        self.K = [division_lens(0.0, cast(Tensor, size)[0].tolist()).K for size in (c.size0, c.size1)]
+        points = (x[0, inliers].double().cpu().numpy() for x in (c.x0, c.x1))
+        self.x0, self.x1 = ((x - K[:2, 2]) / K[0, 0] for x, K in zip(points, self.K, strict=True))
+        self.lenses_apart = c.shared_lens is None or not bool(c.shared_lens[0])
+
+    def residuals(self, parameters: Matrix) -> Matrix:
+        """From the points of image 1 to where the parameters have those of image 0, (2 n,), at most one."""
+        lens0, lens1 = np.broadcast_to(parameters[8:] if len(parameters) > 8 else 0.0, 2).clip(MIN_LENS, MAX_LENS)
+        with np.errstate(all="ignore"):
+            h = np.c_[self.x0, 1 + lens0 * (self.x0**2).sum(1)] @ np.append(parameters[:8], 1.0).reshape(3, 3).T
+            there = np.stack(MODELS["DIVISION"].distort(*(h[:, :2] / h[:, 2:]).T, lens1), -1)
+        return np.nan_to_num(there - self.x1, nan=1.0).clip(-1, 1).ravel()
+
+    def noise(self, parameters: Matrix) -> float:
+        """The standard deviation of the residuals of a fit, robustly."""
+        r = self.residuals(parameters)
+        return float(1.4826 * np.median(np.abs(r)) * (len(r) / (len(r) - len(parameters))) ** 0.5) + EXACT
+
+    def fit(self, start: Matrix, noise: float) -> Any:
+        """The fit near a start; its cost is the negative logarithm of the likelihood, and its J^T J the Hessian."""
+        cauchy: dict[str, Any] = {"loss": "cauchy", "f_scale": 2**0.5, "x_scale": "jac", "max_nfev": MAX_STEPS}
+        return scipy.optimize.least_squares(lambda x: self.residuals(x) / noise, start, **cauchy)
+
+    def lenses(self, models: Sequence[Matrix]) -> Matrix:
+        """The lambdas (2,) of both images. models: (11,), homographies of pinholes with lambdas, px."""
+        count, starts = 1 + self.lenses_apart, []
+        for model in models:
+            H = np.linalg.inv(self.K[1]) @ model[:9].reshape(3, 3) @ self.K[0]
+            starts.append(np.append(H.ravel()[:8] / H[2, 2], model[9 : 9 + count]))
+        start = min(starts, key=self.noise)
+        start = self.fit(start, self.noise(start)).x
+        noise = self.noise(start)
+        bent = self.fit(start, noise)
+        straight = min((self.fit(each[:8], noise) for each in (starts[0], bent.x)), key=lambda fit: fit.cost)
+        A, lens = bent.jac.T @ bent.jac + np.diag([0.0] * 8 + [TAIL_DEVIATION**-2] * count), bent.x[8:]
+        volume = np.linalg.slogdet(A)[1] - np.linalg.slogdet(A[:8, :8])[1] + 2 * count * np.log(TAIL_DEVIATION)
+        gain = straight.cost - bent.cost - (lens**2).sum() / TAIL_DEVIATION**2 / 2 - volume / 2
+        return np.broadcast_to(lens.clip(MIN_LENS, MAX_LENS) if gain > 0 else 0.0, 2).copy()
