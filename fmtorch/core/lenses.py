@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -183,7 +184,7 @@ RAY = np.linspace(0.0, 1.0, 33)  # where, from the centre to a point, a lens mus
 
 def division_lens(value: float, size: Sequence[float]) -> Lens:
     """The lens of the division model whose lambda in half diagonals of an image (h, w) is this, about its centre."""
-    (h, w), half = size, float(np.hypot(*size)) / 2
+    (h, w), half = size, math.hypot(*size) / 2
     return Lens(half, half, (w - 1) / 2, (h - 1) / 2, "SIMPLE_DIVISION", (value,))
 
 

@@ -4,7 +4,7 @@ import functools
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import cv2
 import numpy as np
@@ -14,6 +14,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
+from fmtorch.core.lenses import division_lens
 from fmtorch.core.types import Correspondences
 from fmtorch.data import ImageCameras, ImageSource, Lens, exif_focal, read_image
 from fmtorch.geometry.cameras import calibration_problems
@@ -208,14 +209,11 @@ def division_lenses(
     """
     lenses: list[Lens | None] = []
     for value, K, size, scale in zip(bent.tolist(), (c.K0, c.K1), (c.size0, c.size1), scales, strict=True):
-        assert size is not None
-        half, (h, w) = float(size[0].double().norm()) / 2, size[0].tolist()
-        fx, fy, cx, cy = half, half, (w - 1) / 2, (h - 1) / 2
+        lens = division_lens(value, cast(Tensor, size)[0].tolist())
         if K is not None:
             (fx, _, cx), (_, fy, cy), _ = (K[0] / K[0, 2, 2]).tolist()
-        k, (sx, sy) = value * fx * fy / half**2, scale.tolist()
-        at = fx / sx, fy / sy, (cx + 0.5) / sx - 0.5, (cy + 0.5) / sy - 0.5
-        lenses.append(Lens(*at, "DIVISION", (k,)) if math.isfinite(value) and value else None)
+            lens = Lens(fx, fy, cx, cy, "DIVISION", (value * fx * fy / lens.fx**2,))
+        lenses.append(lens.scaled(*(1 / scale).tolist()) if math.isfinite(value) and value else None)
     return lenses[0], lenses[1]
 
 

@@ -6,11 +6,10 @@ from collections.abc import Callable, Sequence
 from typing import Any, cast
 
 import numpy as np
-import scipy.optimize
 import torch
 from torch import Tensor
 
-from fmtorch.core.lenses import MODELS, Lens, Matrix, division_lens, undistorted_points, undistortion
+from fmtorch.core.lenses import Lens, Matrix, division, division_lens, undistorted_points, undistortion
 from fmtorch.core.types import MAX_LENS, MIN_LENS, Correspondences, Estimate, collate
 from fmtorch.estimators.lens_search import STARTS, TAIL_DEVIATION
 from fmtorch.geometry.cameras import calibration_problems
@@ -116,7 +115,7 @@ def undistorted_matches(c: Correspondences, lenses: Sequence[Lenses]) -> Corresp
 # Homographies of photographs whose lenses are of the division model, with known or unknown lambdas
 
 MIN_FIT = 12  # inliers; a lens with fewer stays straight
-MAX_STEPS = 30  # of a fit
+CAUCHY: dict[str, Any] = {"loss": "cauchy", "f_scale": 2**0.5, "x_scale": "jac", "max_nfev": 30}
 EXACT = 1e-9  # half diagonals: noise of matches without any
 UNKNOWN = "of find_homography it must be a calibrated lens, lambda (exactly known), 'shared' or 'unknown'"
 
@@ -137,7 +136,7 @@ def homographies_with_lenses(c: Correspondences, find: Callable[[Correspondences
     for i in (inliers.sum(1) >= MIN_FIT).nonzero()[:, 0].tolist():
         valid = [(start, each.F[i]) for start, each in zip(STARTS, estimates, strict=True) if each.ok[i]]
         models = [np.append(H.double().cpu().numpy(), start) for start, H in valid]
-        lens[i] = torch.from_numpy(_PlanePair(c[i], inliers[i]).lenses(models))
+        lens[i] = torch.from_numpy(_fitted_lenses(c[i].derived(mask=inliers[i : i + 1]), models))
     estimate, bent = estimates[0], lens.any(1)
     if bool(bent.any()):
         place = torch.where(bent, len(c) - 1 + bent.cumsum(0), torch.arange(len(c), device=bent.device))
@@ -152,46 +151,40 @@ def _straight(c: Correspondences, lens: Tensor) -> Correspondences:
     return undistorted_matches(c.derived(lens=None, shared_lens=None, size0=None, size1=None), pairs)
 
 
-class _PlanePair:
-    """Matches of a plane in a pair (a batch of one), in half diagonals from the centres: x0, x1 (n, 2). Parameters
-    are eight entries of a homography of pinholes whose last is one, and lambdas: none, of both, or of each."""
+def _fitted_lenses(c: Correspondences, models: Sequence[Matrix]) -> Matrix:
+    """The lambdas (2,) of a pair (a batch of one) with matches of a plane. models: (11,), homographies of pinholes with
+    lambdas, px. Parameters of a fit are eight entries of a homography whose last is one, between points in half
+    diagonals from the centres, and lambdas: none, of both images, or of each."""
+    import scipy.optimize  # which takes longer to import than the rest of this file
 
-    def __init__(self, c: Correspondences, inliers: Tensor) -> None:
-        self.K = [division_lens(0.0, cast(Tensor, size)[0].tolist()).K for size in (c.size0, c.size1)]
-        points = (x[0, inliers].double().cpu().numpy() for x in (c.x0, c.x1))
-        self.x0, self.x1 = ((x - K[:2, 2]) / K[0, 0] for x, K in zip(points, self.K, strict=True))
-        self.lenses_apart = c.shared_lens is None or not bool(c.shared_lens[0])
+    K0, K1 = (division_lens(0.0, cast(Tensor, size)[0].tolist()).K for size in (c.size0, c.size1))
+    pixels = (x[c.mask].double().cpu().numpy() for x in (c.x0, c.x1))
+    x0, x1 = ((x - K[:2, 2]) / K[0, 0] for x, K in zip(pixels, (K0, K1), strict=True))
+    count = 1 if c.shared_lens is not None and bool(c.shared_lens[0]) else 2
 
-    def residuals(self, parameters: Matrix) -> Matrix:
-        """From the points of image 1 to where the parameters have those of image 0, (2 n,), at most one."""
+    def residuals(parameters: Matrix) -> Any:  # in image 1, (2 n,), at most one
         lens0, lens1 = np.broadcast_to(parameters[8:] if len(parameters) > 8 else 0.0, 2).clip(MIN_LENS, MAX_LENS)
         with np.errstate(all="ignore"):
-            h = np.c_[self.x0, 1 + lens0 * (self.x0**2).sum(1)] @ np.append(parameters[:8], 1.0).reshape(3, 3).T
-            there = np.stack(MODELS["DIVISION"].distort(*(h[:, :2] / h[:, 2:]).T, lens1), -1)
-        return np.nan_to_num(there - self.x1, nan=1.0).clip(-1, 1).ravel()
+            h = np.c_[x0, 1 + lens0 * (x0**2).sum(1)] @ np.append(parameters[:8], 1.0).reshape(3, 3).T
+            there = np.stack(division(*(h[:, :2] / h[:, 2:]).T, lens1), -1)
+        return np.nan_to_num(there - x1, nan=1.0).clip(-1, 1).ravel()
 
-    def noise(self, parameters: Matrix) -> float:
-        """The standard deviation of the residuals of a fit, robustly."""
-        r = self.residuals(parameters)
+    def noise(parameters: Matrix) -> float:  # of a fit
+        r = residuals(parameters)
         return float(1.4826 * np.median(np.abs(r)) * (len(r) / (len(r) - len(parameters))) ** 0.5) + EXACT
 
-    def fit(self, start: Matrix, noise: float) -> Any:
-        """The fit near a start; its cost is the negative logarithm of the likelihood, and its J^T J the Hessian."""
-        cauchy: dict[str, Any] = {"loss": "cauchy", "f_scale": 2**0.5, "x_scale": "jac", "max_nfev": MAX_STEPS}
-        return scipy.optimize.least_squares(lambda x: self.residuals(x) / noise, start, **cauchy)
+    def fit(start: Matrix, noise: float) -> Any:  # its cost: negative logarithm of the likelihood; J^T J: its Hessian
+        return scipy.optimize.least_squares(lambda x: residuals(x) / noise, start, **CAUCHY)
 
-    def lenses(self, models: Sequence[Matrix]) -> Matrix:
-        """The lambdas (2,) of both images. models: (11,), homographies of pinholes with lambdas, px."""
-        count, starts = 1 + self.lenses_apart, []
-        for model in models:
-            H = np.linalg.inv(self.K[1]) @ model[:9].reshape(3, 3) @ self.K[0]
-            starts.append(np.append(H.ravel()[:8] / H[2, 2], model[9 : 9 + count]))
-        start = min(starts, key=self.noise)
-        start = self.fit(start, self.noise(start)).x
-        noise = self.noise(start)
-        bent = self.fit(start, noise)
-        straight = min((self.fit(each[:8], noise) for each in (starts[0], bent.x)), key=lambda fit: fit.cost)
-        A, lens = bent.jac.T @ bent.jac + np.diag([0.0] * 8 + [TAIL_DEVIATION**-2] * count), bent.x[8:]
-        volume = np.linalg.slogdet(A)[1] - np.linalg.slogdet(A[:8, :8])[1] + 2 * count * np.log(TAIL_DEVIATION)
-        gain = straight.cost - bent.cost - (lens**2).sum() / TAIL_DEVIATION**2 / 2 - volume / 2
-        return np.broadcast_to(lens.clip(MIN_LENS, MAX_LENS) if gain > 0 else 0.0, 2).copy()
+    starts = []
+    for model in models:
+        H = np.linalg.inv(K1) @ model[:9].reshape(3, 3) @ K0
+        starts.append(np.append(H.ravel()[:8] / H[2, 2], model[9 : 9 + count]))
+    start = min(starts, key=noise)
+    start = fit(start, noise(start)).x
+    bent = fit(start, noise(start))
+    straight = min((fit(each[:8], noise(start)) for each in (starts[0], start)), key=lambda fit: fit.cost)
+    A, lens = bent.jac.T @ bent.jac + np.diag([0.0] * 8 + [TAIL_DEVIATION**-2] * count), bent.x[8:]
+    volume = np.linalg.slogdet(A)[1] - np.linalg.slogdet(A[:8, :8])[1] + 2 * count * np.log(TAIL_DEVIATION)
+    evidence = straight.cost - bent.cost - (lens**2).sum() / TAIL_DEVIATION**2 / 2 - volume / 2
+    return np.broadcast_to(lens.clip(MIN_LENS, MAX_LENS) if evidence > 0 else 0.0, 2).copy()
