@@ -109,7 +109,10 @@ def find_fundamental(
             at all; "shared": one unknown lambda, "unknown": one for each image; lambda, exactly; (lambda, s) up to a
             standard deviation s; ((lambda0, s0), (lambda1, s1)) or (B, 2, 2) for each image, None in place of an
             unknown one. Points and inliers are of the photographs, F, E and the pose of the pixels of pinholes. With
-            K0 or K1 it needs the image sizes. There are no gradients and no covariance then.
+            K0 or K1 it needs the image sizes. There are no gradients and no covariance then. Calibrated lenses are
+            `fmtorch.Lens`, for both images, (lens0, lens1) with None for a pinhole, or a list of (lens0, lens1), one
+            for each pair: points are undistorted, and judged in pixels of the photographs; the K of a lens stands for
+            K0 or K1; there are gradients and a covariance.
         covariance: whether the estimate has its covariance, which needs K0 and K1 or the image sizes. Where nothing is
             said of the cameras these are as of ``focal="unknown"``.
         pair_type: whether it has the type of each pair: general, planar, rotation, identical, unrelated.
@@ -129,8 +132,8 @@ def find_fundamental(
     Raises:
         ValueError: for points of another shape, points that are no pixels or outside images of these sizes, a prior
             outside [0, 1], a noise or an image size that is not positive, the size of one image only, an unknown preset
-            or option, and an estimator of another model; for a K that is no calibration matrix of the image, of a
-            single pair (of a batch that pair is ``ok=False``).
+            or option, an estimator of another model, and K0 beside a lens of image 0; for a K that is no calibration
+            matrix of the image and a lens that is not finite, of a single pair (a pair of a batch is ``ok=False``).
         TypeError: for what is no array of numbers.
 
     Example:
@@ -218,7 +221,7 @@ def find_essential(
         x0, x1: matched points in pixels, as of `find_fundamental`; or normalised ones, with K the identity, of which
             thresholds count as pixels of a camera with a focal length of 1000 px.
         K0, K1: calibration matrices in the unit of the points, (3, 3) for all pairs or (B, 3, 3). Pixels need not be
-            square nor principal points central; lenses must not distort.
+            square nor principal points central. None where `lens` has a calibrated one of that image.
         focal: how well the focal lengths of K0 and K1 are known: None for exactly, or their relative standard
             deviation, one number, (s0, s1) or (B, 2); 0.05 suits EXIF; "shared" or "unknown" where K tells principal
             points and the shape of pixels alone. What is not exact is estimated.
@@ -292,12 +295,16 @@ def find_homography(
             the points through the final fit.
         estimator: a preset of conf/estimator whose solver is `four_point`.
         mask, ratio, score, prior, lafs0, lafs1, noise, key, seed, config_dir: as of `find_fundamental`.
+        size0, size1: image sizes (h, w), one for all pairs or (B, 2), in whose half diagonals lambda is.
+        lens: calibrated lenses, "shared", "unknown", or lambda, exactly, as of `find_fundamental`. H is of the pixels
+            of pinholes. What is unknown is zero unless the matches have greater evidence of a lens; then there are no
+            gradients.
         options: replace values of the preset (``inlier_threshold=1.5``).
 
     Returns:
         An `Estimate` whose `H` (B, 3, 3) has unit Frobenius norm and maps points that are seen to positive third
-        coordinates; inliers, ok, reason, significance. Mirrored planes and photographs have theirs, too. Where as many
-        inliers are to be expected by chance, `ok` is False.
+        coordinates; inliers, ok, reason, significance; lens (B, 2), lambdas, where there are any. Mirrored planes and
+        photographs have theirs, too. Where as many inliers are to be expected by chance, `ok` is False.
 
     Raises:
         ValueError, TypeError: as `find_fundamental`.

@@ -166,7 +166,8 @@ def _fitted_lenses(c: Correspondences, models: Sequence[Matrix]) -> Matrix:
         lens0, lens1 = np.broadcast_to(parameters[8:] if len(parameters) > 8 else 0.0, 2).clip(MIN_LENS, MAX_LENS)
         with np.errstate(all="ignore"):
             h = np.c_[x0, 1 + lens0 * (x0**2).sum(1)] @ np.append(parameters[:8], 1.0).reshape(3, 3).T
-            there = np.stack(division(*(h[:, :2] / h[:, 2:]).T, lens1), -1)
+            u, v = (h[:, :2] / h[:, 2:]).T
+            there = np.stack(division(u, v, lens1), -1)
         return np.nan_to_num(there - x1, nan=1.0).clip(-1, 1).ravel()
 
     def noise(parameters: Matrix) -> float:  # of a fit
