@@ -235,3 +235,35 @@ def test_lenses_that_no_homography_has(said: dict[str, Any], message: str) -> No
         fmtorch.find_homography(x0, x1, **said)
     with pytest.raises(ValueError, match="lens is given, and its estimates have no gradients"):
         fmtorch.find_homography(torch.from_numpy(x0).requires_grad_(), x1, lens="shared", **SIZES)
+
+
+@pytest.mark.parametrize("find", [fmtorch.find_fundamental, fmtorch.find_homography])
+@pytest.mark.parametrize("garbage", [np.nan, np.inf, 1e30, 0.0])
+def test_what_stands_in_masked_slots_means_nothing(find: Any, garbage: float) -> None:
+    """Neither for values nor for gradients."""
+    x0, x1 = planes(3, FISHEYE) if find is fmtorch.find_homography else photographs(FISHEYE, FISHEYE)
+    gradients = []
+    for slots in (0, 7):
+        padded = [np.concatenate([x, np.full((slots, 2), garbage)])[None] for x in (x0, x1)]
+        points = [torch.from_numpy(x).requires_grad_() for x in padded]
+        mask = np.arange(len(x0) + slots)[None] < len(x0)
+        estimate = find(*points, mask=mask, lens=FISHEYE)
+        estimate.F.sum().backward()
+        gradients.append((estimate.F.detach(), *(x.grad[:, : len(x0)] for x in points)))
+        assert all(float(x.grad[:, len(x0) :].abs().sum()) == 0 for x in points)
+    assert all(map(torch.equal, *gradients))
+
+
+def test_frames_go_with_their_points() -> None:
+    x0, x1 = photographs(RADIAL, RADIAL)
+    y0, y1, noise = by_hand((RADIAL, RADIAL), x0, x1)
+    axes = np.random.default_rng(0).normal(size=(len(x0), 2, 2)) + 5 * np.eye(2)
+    before, after = [], []
+    for x, y in ((x0, y0), (x1, y1)):
+        before.append(np.concatenate([axes, x[..., None]], -1))
+        straightened = [np.linalg.solve(slope(RADIAL, at), own) for at, own in zip(y, axes, strict=True)]
+        after.append(np.concatenate([straightened, y[..., None]], -1))
+    ratio = np.linspace(0.3, 0.9, len(x0))
+    estimate = fmtorch.find_essential(x0, x1, lens=RADIAL, ratio=ratio, lafs0=before[0], lafs1=before[1])
+    known = fmtorch.find_essential(y0, y1, *[RADIAL.K] * 2, noise=noise, ratio=ratio, lafs0=after[0], lafs1=after[1])
+    torch.testing.assert_close(estimate.F, known.F, rtol=1e-5, atol=1e-7)
