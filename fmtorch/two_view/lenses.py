@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from fmtorch.core.lenses import Lens, Matrix, division, division_lens, undistorted_points, undistortion
-from fmtorch.core.types import MAX_LENS, MIN_LENS, Correspondences, Estimate, collate
+from fmtorch.core.types import MAX_LENS, MIN_LENS, Correspondences, Estimate
 from fmtorch.estimators.lens_search import STARTS, TAIL_DEVIATION
 from fmtorch.geometry.cameras import calibration_problems
 
@@ -115,6 +115,7 @@ def undistorted_matches(c: Correspondences, lenses: Sequence[Lenses]) -> Corresp
 # Homographies of photographs whose lenses are of the division model, with known or unknown lambdas
 
 MIN_FIT = 12  # inliers; a lens with fewer stays straight
+ROUNDS = 2  # of fits; the second has the inliers of the first
 CAUCHY: dict[str, Any] = {"loss": "cauchy", "f_scale": 2**0.5, "x_scale": "jac", "max_nfev": 30}
 EXACT = 1e-9  # half diagonals: noise of matches without any
 UNKNOWN = "of find_homography it must be a calibrated lens, lambda (exactly known), 'shared' or 'unknown'"
@@ -131,17 +132,17 @@ def homographies_with_lenses(c: Correspondences, find: Callable[[Correspondences
         raise ValueError(f"lens is {c.lens.tolist()}; {UNKNOWN}")
     if c.requires_grad:
         raise ValueError("lens is given, and its estimates have no gradients: give points, prior, noise detached")
-    estimates = [find(_straight(c, mean.new_tensor(start).expand_as(mean))) for start in STARTS]
-    inliers, lens = torch.stack([each.inliers for each in estimates]).any(0), torch.zeros_like(mean)
-    for i in (inliers.sum(1) >= MIN_FIT).nonzero()[:, 0].tolist():
-        valid = [(start, each.F[i]) for start, each in zip(STARTS, estimates, strict=True) if each.ok[i]]
-        models = [np.append(H.double().cpu().numpy(), start) for start, H in valid]
-        lens[i] = torch.from_numpy(_fitted_lenses(c[i].derived(mask=inliers[i : i + 1]), models))
-    estimate, bent = estimates[0], lens.any(1)
-    if bool(bent.any()):
-        place = torch.where(bent, len(c) - 1 + bent.cumsum(0), torch.arange(len(c), device=bent.device))
-        estimate = collate([estimate, find(_straight(c[bent], lens[bent]))])[place]
-    return estimate.derived(lens=torch.where(estimate.ok[:, None], lens, torch.nan))
+    tried = [mean.new_tensor(start).expand_as(mean) for start in STARTS]
+    estimates = [find(_straight(c, lens)) for lens in tried]
+    for _ in range(ROUNDS):
+        inliers, lens = torch.stack([each.inliers for each in estimates]).any(0), torch.zeros_like(mean)
+        for i in (inliers.sum(1) >= MIN_FIT).nonzero()[:, 0].tolist():
+            pairs = zip(tried, estimates, strict=True)
+            models = [torch.cat([each.F[i].flatten(), at[i].to(each.F)]) for at, each in pairs if each.ok[i]]
+            matches = c[i].derived(mask=inliers[i : i + 1])
+            lens[i] = torch.from_numpy(_fitted_lenses(matches, torch.stack(models).double().cpu().numpy()))
+        tried, estimates = [tried[0], lens], [estimates[0], find(_straight(c, lens))]
+    return estimates[1].derived(lens=torch.where(estimates[1].ok[:, None], tried[1], torch.nan))
 
 
 def _straight(c: Correspondences, lens: Tensor) -> Correspondences:
@@ -151,9 +152,9 @@ def _straight(c: Correspondences, lens: Tensor) -> Correspondences:
     return undistorted_matches(c.derived(lens=None, shared_lens=None, size0=None, size1=None), pairs)
 
 
-def _fitted_lenses(c: Correspondences, models: Sequence[Matrix]) -> Matrix:
-    """The lambdas (2,) of a pair (a batch of one) with matches of a plane. models: (11,), homographies of pinholes with
-    lambdas, px. Parameters of a fit are eight entries of a homography whose last is one, between points in half
+def _fitted_lenses(c: Correspondences, models: Matrix) -> Matrix:
+    """The lambdas (2,) of a pair (a batch of one) with matches of a plane. models: (k, 11), homographies of pinholes,
+    px, with lambdas. Parameters of a fit are eight entries of a homography whose last is one, between points in half
     diagonals from the centres, and lambdas: none, of both images, or of each."""
     import scipy.optimize  # which takes longer to import than the rest of this file
 
@@ -180,7 +181,7 @@ def _fitted_lenses(c: Correspondences, models: Sequence[Matrix]) -> Matrix:
     starts = []
     for model in models:
         H = np.linalg.inv(K1) @ model[:9].reshape(3, 3) @ K0
-        starts.append(np.append(H.ravel()[:8] / H[2, 2], model[9 : 9 + count]))
+        starts.append(np.append(H.ravel()[:8] / (H[2, 2] or EXACT), model[9 : 9 + count]))
     start = min(starts, key=noise)
     start = fit(start, noise(start)).x
     bent = fit(start, noise(start))
