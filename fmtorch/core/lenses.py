@@ -17,8 +17,9 @@ _TINY = 1e-12  # squared radius or parameter below which a quotient is replaced 
 
 @dataclasses.dataclass(frozen=True)
 class Lens:
-    """A lens: focal lengths and principal point in pixels, with (0, 0) at the centre of the first pixel, and a model.
-    coefficients: of the model, as `MODELS` names them, without focal lengths and principal point."""
+    """A calibrated lens: focal lengths and principal point in pixels, with (0, 0) at the centre of the first pixel.
+    model: its name in COLMAP, of `fmtorch.data.MODELS`. coefficients: as `MODELS` names them, without focal lengths and
+    principal point."""
 
     fx: float
     fy: float

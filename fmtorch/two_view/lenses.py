@@ -115,7 +115,6 @@ def undistorted_matches(c: Correspondences, lenses: Sequence[Lenses]) -> Corresp
 # Homographies of photographs whose lenses are of the division model, with known or unknown lambdas
 
 MIN_FIT = 12  # inliers; a lens with fewer stays straight
-ROUNDS = 2  # of fits; the second has the inliers of the first
 CAUCHY: dict[str, Any] = {"loss": "cauchy", "f_scale": 2**0.5, "x_scale": "jac", "max_nfev": 30}
 EXACT = 1e-9  # half diagonals: noise of matches without any
 UNKNOWN = "of find_homography it must be a calibrated lens, lambda (exactly known), 'shared' or 'unknown'"
@@ -132,17 +131,16 @@ def homographies_with_lenses(c: Correspondences, find: Callable[[Correspondences
         raise ValueError(f"lens is {c.lens.tolist()}; {UNKNOWN}")
     if c.requires_grad:
         raise ValueError("lens is given, and its estimates have no gradients: give points, prior, noise detached")
-    tried = [mean.new_tensor(start).expand_as(mean) for start in STARTS]
-    estimates = [find(_straight(c, lens)) for lens in tried]
-    for _ in range(ROUNDS):
-        inliers, lens = torch.stack([each.inliers for each in estimates]).any(0), torch.zeros_like(mean)
-        for i in (inliers.sum(1) >= MIN_FIT).nonzero()[:, 0].tolist():
-            pairs = zip(tried, estimates, strict=True)
-            models = [torch.cat([each.F[i].flatten(), at[i].to(each.F)]) for at, each in pairs if each.ok[i]]
-            matches = c[i].derived(mask=inliers[i : i + 1])
-            lens[i] = torch.from_numpy(_fitted_lenses(matches, torch.stack(models).double().cpu().numpy()))
-        tried, estimates = [tried[0], lens], [estimates[0], find(_straight(c, lens))]
-    return estimates[1].derived(lens=torch.where(estimates[1].ok[:, None], tried[1], torch.nan))
+    starts, lens = [mean.new_tensor(start).expand_as(mean) for start in STARTS], torch.zeros_like(mean)
+    estimates = [find(_straight(c, start)) for start in starts]
+    inliers = torch.stack([each.inliers for each in estimates]).any(0)
+    for i in (inliers.sum(1) >= MIN_FIT).nonzero()[:, 0].tolist():
+        tried = zip(estimates, starts, strict=True)
+        models = [torch.cat([each.F[i].flatten(), start[i].to(each.F)]) for each, start in tried if each.ok[i]]
+        matches = c[i].derived(mask=inliers[i : i + 1])
+        lens[i] = torch.from_numpy(_fitted_lenses(matches, torch.stack(models).double().cpu().numpy()))
+    estimate = find(_straight(c, lens))
+    return estimate.derived(lens=torch.where(estimate.ok[:, None], lens, torch.nan))
 
 
 def _straight(c: Correspondences, lens: Tensor) -> Correspondences:
