@@ -6,6 +6,7 @@ from fmtorch.core.lazy import lazy_exports
 from fmtorch.core.version import __version__
 
 if TYPE_CHECKING:
+    from fmtorch.core.lenses import Lens
     from fmtorch.core.types import Correspondences, Estimate, Features, PoseEstimate
     from fmtorch.io.exchange import (
         from_colmap,
@@ -26,6 +27,7 @@ __all__ = [
     "Correspondences",
     "Estimate",
     "Features",
+    "Lens",
     "MatchResult",
     "Pipeline",
     "PoseEstimate",

@@ -11,19 +11,7 @@ from typing import Annotated, Any, Literal
 
 from fmtorch.core import Within
 from fmtorch.core.files import STAGES
-from fmtorch.core.options import (
-    CACHE,
-    CACHE_LIMIT,
-    DEBUG,
-    Cache,
-    Count,
-    Debug,
-    Device,
-    Gigabytes,
-    Percent,
-    Seed,
-    option,
-)
+from fmtorch.core.options import CACHE, CACHE_LIMIT, DEBUG, Cache, Count, Debug, Device, Gigabytes, Seed, option
 from fmtorch.training.options import TrainOptions
 
 DEVICE = "auto | cpu | cuda | cuda:1 | mps"
@@ -159,7 +147,7 @@ class PairsOptions:
         "fmbench: folders of images; oanet: HDF5 files of all matches, one a scene, by the features and the matcher",
     )
     workers: Count | None = option(None, "short for executor.workers")
-    quality: Percent = option(
+    quality: Annotated[int, Within(1, 100)] = option(
         95, "of the JPEG images that are written because they were undistorted; others are copied"
     )
 

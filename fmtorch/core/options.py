@@ -63,7 +63,6 @@ Count = Annotated[int, Within(1)]
 Seed = Annotated[int, Within(-(2**63), 2**63 - 1)]
 Device = Annotated[str, DeviceName()]
 Cache = Path | bool | None  # false is off
-Percent = Annotated[int, Within(1, 100)]
 Gigabytes = Annotated[int | float, Within(0)]
 CACHE = "folder of features computed before; null: features in $FMTORCH_CACHE or ~/.cache/fmtorch; off: none"
 DEBUG = "true: stop at the first error of a part and show all of its traceback; pdb: and look at it in the debugger"

@@ -10,7 +10,8 @@ import torch
 from jaxtyping import Float, Int
 
 from fmtorch import presets
-from fmtorch.data.cameras import MODELS, Lens, undistorted, undistorted_frames, undistorted_points
+from fmtorch.core.lenses import MODELS, Lens, undistorted_points
+from fmtorch.data.cameras import undistorted
 from fmtorch.data.files import DataError, NpzArrays
 from fmtorch.data.fmbench import FMBenchPairs
 from fmtorch.data.image_cameras import ExifFocal, ImageCameras, exif_focal, read_model
@@ -21,7 +22,7 @@ __all__ = [
     "MODELS", "DataError", "DepthDataset", "ExifFocal", "FMBenchPairs", "GivenMatches", "ImageCameras", "ImageError",
     "ImagePair", "ImageSource", "Lens", "NpzArrays", "PairBatch", "PairDataset", "build", "collate", "exif_focal",
     "load", "read_image", "read_model", "stored_orientation", "stored_size", "subset", "to_grey", "undistorted",
-    "undistorted_frames", "undistorted_points",
+    "undistorted_points",
 ]  # fmt: skip
 
 Progress = Callable[[int, int], None]

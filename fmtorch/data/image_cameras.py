@@ -13,7 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from PIL import ExifTags, Image
 
-from fmtorch.data.cameras import MODELS, Lens, rotation_of_quaternion
+from fmtorch.core.lenses import MODELS, Lens
+from fmtorch.data.cameras import rotation_of_quaternion
 from fmtorch.data.files import DataError, Indices, Matrix, numbered, read_lines, to_finite, to_whole
 
 HALF_PIXEL = 0.5  # COLMAP puts the centre of the first pixel at (0.5, 0.5)

@@ -9,8 +9,8 @@ from typing import NamedTuple, Protocol, runtime_checkable
 import cv2
 import numpy as np
 
+from fmtorch.core.lenses import Lens
 from fmtorch.core.types import Correspondences, pair_key
-from fmtorch.data.cameras import Lens
 from fmtorch.data.files import Matrix, Pixels
 
 Size = tuple[int, int]  # (h, w), px

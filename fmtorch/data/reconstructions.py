@@ -7,8 +7,9 @@ from typing import Literal
 
 import numpy as np
 
+from fmtorch.core.lenses import Lens
 from fmtorch.data import files, scenes
-from fmtorch.data.cameras import Lens, nearest_rotation
+from fmtorch.data.cameras import nearest_rotation
 from fmtorch.data.files import DataError, Indices, given_root
 from fmtorch.data.image_cameras import Model, read_model
 from fmtorch.data.images import stored_size

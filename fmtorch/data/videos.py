@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
+from fmtorch.core.lenses import Lens
 from fmtorch.data import scenes
-from fmtorch.data.cameras import Lens, nearest_rotation
+from fmtorch.data.cameras import nearest_rotation
 from fmtorch.data.files import DataError, Mask, Matrix, given_root, images_by_stem, numbered, to_finite
 from fmtorch.data.pairs import ImageSource
 from fmtorch.data.scenes import WINDOW, Scene, ScenePairs, View, following

@@ -16,7 +16,7 @@ import torch
 
 from fmtorch.core import lazy
 from fmtorch.core.files import replacing
-from fmtorch.data.cameras import MODELS, Lens
+from fmtorch.core.lenses import MODELS, Lens
 from fmtorch.data.files import Array, Indices, Mask, Matrix, Singles
 from fmtorch.geometry.cameras import MIN_FOCAL, USUAL_FOCAL, calibration_problems
 from fmtorch.io.match_store import ORIGIN, PairGeometry, StoredImage, StoredPair, two_view_geometry

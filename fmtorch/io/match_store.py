@@ -17,7 +17,7 @@ from typing import Any, Literal, NamedTuple, cast
 import numpy as np
 
 from fmtorch.core.files import replacing
-from fmtorch.data.cameras import Lens
+from fmtorch.core.lenses import Lens
 from fmtorch.data.files import Array, Indices, Mask, Matrix, Singles
 
 ORIGIN = 0.5  # px: COLMAP's coordinates of the first pixel's centre

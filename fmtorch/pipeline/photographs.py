@@ -4,7 +4,7 @@ import functools
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import cv2
 import numpy as np
@@ -14,12 +14,14 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
+from fmtorch.core.lenses import division_lens
 from fmtorch.core.types import Correspondences
-from fmtorch.data import ImageCameras, ImageSource, Lens, exif_focal, read_image, undistorted_frames, undistorted_points
+from fmtorch.data import ImageCameras, ImageSource, Lens, exif_focal, read_image
 from fmtorch.geometry.cameras import calibration_problems
 from fmtorch.geometry.epipolar import unit_frobenius
 from fmtorch.io.match_store import PairGeometry
 from fmtorch.runs.fingerprint import file_digest
+from fmtorch.two_view import lenses as two_view
 from fmtorch.two_view.arguments import camera_fields
 
 WORDS = ("unknown", "shared", "exif")
@@ -207,40 +209,21 @@ def division_lenses(
     """
     lenses: list[Lens | None] = []
     for value, K, size, scale in zip(bent.tolist(), (c.K0, c.K1), (c.size0, c.size1), scales, strict=True):
-        assert size is not None
-        half, (h, w) = float(size[0].double().norm()) / 2, size[0].tolist()
-        fx, fy, cx, cy = half, half, (w - 1) / 2, (h - 1) / 2
+        lens = division_lens(value, cast(Tensor, size)[0].tolist())
         if K is not None:
             (fx, _, cx), (_, fy, cy), _ = (K[0] / K[0, 2, 2]).tolist()
-        k, (sx, sy) = value * fx * fy / half**2, scale.tolist()
-        at = fx / sx, fy / sy, (cx + 0.5) / sx - 0.5, (cy + 0.5) / sy - 0.5
-        lenses.append(Lens(*at, "DIVISION", (k,)) if math.isfinite(value) and value else None)
+            lens = Lens(fx, fy, cx, cy, "DIVISION", (value * fx * fy / lens.fx**2,))
+        lenses.append(lens.scaled(*(1 / scale).tolist()) if math.isfinite(value) and value else None)
     return lenses[0], lenses[1]
 
 
 def undistorted_matches(c: Correspondences, lenses: Sequence[Lens | None], scales: Sequence[Tensor]) -> Correspondences:
     """Matches of two reduced photographs as pinholes of the same K would have them, in pixels of the reduced images.
     lenses: of the originals, None where nothing is distorted. A match that a pinhole does not see is masked."""
-    fields: dict[str, Tensor] = {"mask": c.mask}
-    for i, (lens, scale, x, lafs) in enumerate(zip(lenses, scales, (c.x0, c.x1), (c.lafs0, c.lafs1), strict=True)):
-        if lens is None or not lens.bends:
-            continue
-        points = x[0].detach().cpu().double().numpy()
-        to_pinhole = functools.partial(_reduced_pinhole, lens, scale.cpu().numpy())
-        there = torch.from_numpy(to_pinhole(points))
-        seen = there.isfinite().all(-1)
-        fields["mask"] = fields["mask"] & seen.to(c.mask.device)
-        fields[f"x{i}"] = torch.where(seen[:, None], there, 0)[None].to(x)
-        if lafs is not None:
-            frames = undistorted_frames(to_pinhole, points, lafs[0, ..., :2].detach().cpu().double().numpy())
-            moved = torch.cat([torch.from_numpy(frames).nan_to_num(0), there.nan_to_num(0)[..., None]], -1)
-            fields[f"lafs{i}"] = moved[None].to(lafs)
-    return c.replace(**fields)
-
-
-def _reduced_pinhole(lens: Lens, scale: Array, points: Array) -> Array:
-    """Pixels of a reduced photograph (n, 2) in its pinhole's image, reduced likewise."""
-    return (undistorted_points(lens, (points + 0.5) / scale - 0.5) + 0.5) * scale - 0.5
+    first, second = (
+        None if lens is None else lens.scaled(*scale.tolist()) for lens, scale in zip(lenses, scales, strict=True)
+    )
+    return two_view.undistorted_matches(c, [(first, second)]).derived(noise=c.noise)
 
 
 def evenly_reduced(

@@ -30,11 +30,21 @@ class Shared(Protocol):
     def __dlpack__(self, **options: Any) -> Any: ...
 
 
+@runtime_checkable
+class CalibratedLens(Protocol):
+    """`fmtorch.Lens`, which is not imported where there is none."""
+
+    @property
+    def K(self) -> NDArray[Any]: ...
+
+    def distort(self, points: NDArray[Any]) -> NDArray[Any]: ...
+
+
 Array = Tensor | NDArray[Any]
 Arrays = Array | Sequence[Any] | Shared
 """One array, or a list of them: of pairs of different lengths."""
 Focal = Literal["shared", "unknown"] | float | Arrays | Mapping[str, Any] | None
-Lens = Literal["shared", "unknown"] | float | Arrays | None
+Lens = Literal["shared", "unknown"] | float | Arrays | CalibratedLens | None
 
 PER_MATCH = {name: len(Correspondences.declared[name].shape) - 1 for name in Correspondences.per_slot}
 """The dimensions of what has an entry for each match, of one pair."""
@@ -256,6 +266,11 @@ def lens_fields(lens: Lens) -> dict[str, Any]:
     if not isinstance(lens, list | tuple) and (value := _floating(lens, "lens")).numel() == 1:
         lens = torch.cat([value.reshape(1), value.new_zeros(1)])
     return {"lens": _of_both(lens, "lens", UNKNOWN_LENS, f"it must be {LENS_FORMS}")}
+
+
+def is_calibrated(lens: Any) -> bool:
+    """Whether it is a calibrated lens, or holds some."""
+    return isinstance(lens, CalibratedLens) or (isinstance(lens, list | tuple) and any(map(is_calibrated, lens)))
 
 
 def expect_lens(lens: Lens) -> None:

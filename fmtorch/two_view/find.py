@@ -7,7 +7,7 @@ import sys
 import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, ParamSpec, TypeVar, cast
+from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar, cast
 
 import torch
 from jaxtyping import Float
@@ -16,10 +16,13 @@ from torch import Tensor
 from fmtorch.core.types import CONTRADICTED, Correspondences, Estimate, PoseEstimate
 from fmtorch.geometry.epipolar import unit_frobenius
 from fmtorch.jobs.execution import one_thread
-from fmtorch.two_view.arguments import Arrays, Focal, Lens, correspondences
+from fmtorch.two_view.arguments import Arrays, Focal, Lens, correspondences, is_calibrated
 from fmtorch.two_view.assumed_sizes import Size, given_sizes
 from fmtorch.two_view.estimation import estimated
 from fmtorch.two_view.pair_type import with_pair_type
+
+if TYPE_CHECKING:
+    from fmtorch.two_view.lenses import CalibratedLenses
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -106,7 +109,10 @@ def find_fundamental(
             at all; "shared": one unknown lambda, "unknown": one for each image; lambda, exactly; (lambda, s) up to a
             standard deviation s; ((lambda0, s0), (lambda1, s1)) or (B, 2, 2) for each image, None in place of an
             unknown one. Points and inliers are of the photographs, F, E and the pose of the pixels of pinholes. With
-            K0 or K1 it needs the image sizes. There are no gradients and no covariance then.
+            K0 or K1 it needs the image sizes. There are no gradients and no covariance then. Calibrated lenses are
+            `fmtorch.Lens`, for both images, (lens0, lens1) with None for a pinhole, or a list of (lens0, lens1), one
+            for each pair: points are undistorted, and judged in pixels of the photographs; the K of a lens stands for
+            K0 or K1; there are gradients and a covariance.
         covariance: whether the estimate has its covariance, which needs K0 and K1 or the image sizes. Where nothing is
             said of the cameras these are as of ``focal="unknown"``.
         pair_type: whether it has the type of each pair: general, planar, rotation, identical, unrelated.
@@ -126,8 +132,8 @@ def find_fundamental(
     Raises:
         ValueError: for points of another shape, points that are no pixels or outside images of these sizes, a prior
             outside [0, 1], a noise or an image size that is not positive, the size of one image only, an unknown preset
-            or option, and an estimator of another model; for a K that is no calibration matrix of the image, of a
-            single pair (of a batch that pair is ``ok=False``).
+            or option, an estimator of another model, and K0 beside a lens of image 0; for a K that is no calibration
+            matrix of the image and a lens that is not finite, of a single pair (a pair of a batch is ``ok=False``).
         TypeError: for what is no array of numbers.
 
     Example:
@@ -140,6 +146,9 @@ def find_fundamental(
         >>> bool(estimate.ok[0]), int(estimate.inliers[0, 20:].sum())
         (True, 60)
     """
+    lenses = None if lens is None else _lenses(lens, K0, K1)
+    if lenses is not None:
+        (K0, K1), lens = lenses.K, None
     if covariance and K0 is None and K1 is None and focal is None:
         if size0 is None or isinstance(size0, str):
             raise ValueError("covariance needs K0 and K1, or the image sizes: give size0 and size1")
@@ -153,11 +162,23 @@ def find_fundamental(
     )  # fmt: skip
     if isinstance(focal, Mapping):
         options["focal"] = focal
-    estimate = estimated(c, "fundamental", estimator, config_dir, seed, options, covariance, assume_sizes)
+    seen = c if lenses is None else lenses.undistorted(c)
+    estimate = estimated(seen, "fundamental", estimator, config_dir, seed, options, covariance, assume_sizes)
+    if lenses is not None:
+        estimate = lenses.with_reasons(estimate, c, seen)
     if estimate.contradicted is not None and bool(estimate.contradicted.any()):
         pairs = estimate.contradicted.nonzero()[:, 0].tolist()
         warnings.warn(f"pair {', '.join(map(str, pairs))}: {CONTRADICTED}", stacklevel=2)
-    return with_pair_type(estimate, c, seed) if pair_type else estimate
+    return with_pair_type(estimate, seen, seed) if pair_type else estimate
+
+
+def _lenses(lens: Lens, K0: Arrays | None = None, K1: Arrays | None = None) -> CalibratedLenses | None:
+    """Calibrated lenses, and K of their images and others; None where lenses are estimated, or lambda is known."""
+    if not is_calibrated(lens):
+        return None
+    from fmtorch.two_view.lenses import CalibratedLenses
+
+    return CalibratedLenses(lens, K0, K1)
 
 
 def _expect_lens(size: Size, calibrated: bool, covariance: bool) -> None:
@@ -172,8 +193,8 @@ def _expect_lens(size: Size, calibrated: bool, covariance: bool) -> None:
 def find_essential(
     x0: Arrays,
     x1: Arrays,
-    K0: Arrays,
-    K1: Arrays,
+    K0: Arrays | None = None,
+    K1: Arrays | None = None,
     *,
     focal: Focal = None,
     lens: Lens = None,
@@ -200,7 +221,7 @@ def find_essential(
         x0, x1: matched points in pixels, as of `find_fundamental`; or normalised ones, with K the identity, of which
             thresholds count as pixels of a camera with a focal length of 1000 px.
         K0, K1: calibration matrices in the unit of the points, (3, 3) for all pairs or (B, 3, 3). Pixels need not be
-            square nor principal points central; lenses must not distort.
+            square nor principal points central. None where `lens` has a calibrated one of that image.
         focal: how well the focal lengths of K0 and K1 are known: None for exactly, or their relative standard
             deviation, one number, (s0, s1) or (B, 2); 0.05 suits EXIF; "shared" or "unknown" where K tells principal
             points and the shape of pixels alone. What is not exact is estimated.
@@ -232,7 +253,8 @@ def find_essential(
         >>> bool(estimate.ok[0]), [round(value, 3) for value in estimate.t[0].tolist()]
         (True, [-0.64, 0.48, 0.6])
     """
-    for name, K in (("K0", K0), ("K1", K1)):
+    lenses = _lenses(lens, K0, K1)
+    for name, K in zip(("K0", "K1"), (K0, K1) if lenses is None else lenses.K, strict=True):
         if K is None:
             raise ValueError(f"{name} is None; find_fundamental estimates pairs of which one camera or none is known")
     estimate = find_fundamental(
@@ -257,6 +279,9 @@ def find_homography(
     lafs0: Arrays | None = None,
     lafs1: Arrays | None = None,
     noise: Arrays | None = None,
+    size0: Arrays | None = None,
+    size1: Arrays | None = None,
+    lens: Lens = None,
     key: Arrays | int | None = None,
     seed: int = 0,
     config_dir: Path | str | None = None,
@@ -270,12 +295,16 @@ def find_homography(
             the points through the final fit.
         estimator: a preset of conf/estimator whose solver is `four_point`.
         mask, ratio, score, prior, lafs0, lafs1, noise, key, seed, config_dir: as of `find_fundamental`.
+        size0, size1: image sizes (h, w), one for all pairs or (B, 2), in whose half diagonals lambda is.
+        lens: calibrated lenses, "shared", "unknown", or lambda, exactly, as of `find_fundamental`. H is of the pixels
+            of pinholes. What is unknown is zero unless the matches have greater evidence of a lens; then there are no
+            gradients.
         options: replace values of the preset (``inlier_threshold=1.5``).
 
     Returns:
         An `Estimate` whose `H` (B, 3, 3) has unit Frobenius norm and maps points that are seen to positive third
-        coordinates; inliers, ok, reason, significance. Mirrored planes and photographs have theirs, too. Where as many
-        inliers are to be expected by chance, `ok` is False.
+        coordinates; inliers, ok, reason, significance; lens (B, 2), lambdas, where there are any. Mirrored planes and
+        photographs have theirs, too. Where as many inliers are to be expected by chance, `ok` is False.
 
     Raises:
         ValueError, TypeError: as `find_fundamental`.
@@ -290,11 +319,27 @@ def find_homography(
         >>> bool(estimate.ok[0]), int(estimate.inliers[0, 20:].sum()), tuple(estimate.H.shape)
         (True, 40, (1, 3, 3))
     """
+    lenses = None if lens is None else _lenses(lens)
+    if lenses is None and lens is not None and size0 is None:
+        raise ValueError("lens needs the image sizes, in whose half diagonals it is: give size0 and size1")
+    plane = lens is None if lenses is None else all(pair[0] is None for pair in lenses.pairs)
     c = correspondences(
-        x0, x1, plane=True, mask=mask, ratio=ratio, score=score, prior=prior, lafs0=lafs0, lafs1=lafs1, noise=noise,
-        key=key,
+        x0, x1, plane=plane, mask=mask, ratio=ratio, score=score, prior=prior, lafs0=lafs0, lafs1=lafs1, noise=noise,
+        size0=size0, size1=size1, lens=None if lenses is not None else lens, key=key,
     )  # fmt: skip
-    return homographies(c, lambda c: estimated(c, "homography", estimator, config_dir, seed, options))
+
+    def find(c: Correspondences) -> Estimate:
+        return homographies(c, lambda c: estimated(c, "homography", estimator, config_dir, seed, options))
+
+    if c.lens is not None:
+        from fmtorch.two_view.lenses import homographies_with_lenses
+
+        return homographies_with_lenses(c, find)
+    c = c.derived(size0=None, size1=None)
+    if lenses is None:
+        return find(c)
+    seen = lenses.undistorted(c)
+    return lenses.with_reasons(find(seen), c, seen)
 
 
 # Homographies of planes in any unit, seen from either side, and whether their support is beyond chance

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -20,7 +19,8 @@ from torch import Tensor
 
 from fmtorch import find_homography
 from fmtorch.core import Correspondences, slotted
-from fmtorch.data import ImagePair, Lens, undistorted_frames
+from fmtorch.core.lenses import division_lens
+from fmtorch.data import ImagePair
 from fmtorch.geometry import symmetric_max
 from fmtorch.pruning import one_to_one
 from fmtorch.training.labelled import LabelledMatches, move, transform
@@ -223,14 +223,13 @@ def bent(pair: ImagePair, c: Correspondences, lens: float) -> tuple[ImagePair, C
     """The matches as two lenses of this lambda bend them (`find_fundamental`); F stays that of the pinholes' pixels."""
     moved, inside = {}, c.mask[0]
     for i, (h, w) in enumerate(sizes_of(c)):
-        half_diagonal = math.hypot(h, w) / 2
-        model = Lens(half_diagonal, half_diagonal, (w - 1) / 2, (h - 1) / 2, "SIMPLE_DIVISION", (lens,))
+        model = division_lens(lens, (h, w))
         x = getattr(c, f"x{i}")[0].double().numpy()
         photographed = torch.from_numpy(model.distort(x))  # NaN beyond what the lens sees
         inside = inside & ((photographed > -0.5) & (photographed < torch.tensor([w, h]) - 0.5)).all(-1)
         moved[f"x{i}"] = photographed[None].to(c.x0)
         if (lafs := getattr(c, f"lafs{i}")) is not None:
-            axes = torch.from_numpy(undistorted_frames(model.distort, x, lafs[0, ..., :2].double().numpy()))
+            axes = torch.from_numpy(model.derivatives(x) @ lafs[0, ..., :2].double().numpy())
             moved[f"lafs{i}"] = torch.cat([axes, photographed[..., None]], -1)[None].to(lafs)
     return pair, taken(c.replace(**moved), inside)
 

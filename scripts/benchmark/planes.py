@@ -30,7 +30,7 @@ from fmtorch.training.planes import Photograph, PlanePairs, PlaneViews
 from fmtorch.two_view.known_cameras import KnownCameras
 from fmtorch.two_view.pair_type import classify
 from scripts.benchmark import pairs
-from scripts.benchmark.changes import sizes_of
+from scripts.benchmark.changes import bent, sizes_of
 from scripts.benchmark.methods import options
 from scripts.benchmark.runner import Item, Kept, Measured, Row, add_command, console, measure, timed
 from scripts.benchmark.tables import Record, Results, Sheet, grouped, show
@@ -39,6 +39,7 @@ POSES = ("from F", "from H, the first pose", "from H, the better one")
 KINDS = ("warped", "hard", "views")
 METHODS = ("ours", "poselib:1", "poselib:2", "poselib:3", "usac_accurate:1", "usac_magsac:0.5")
 Array = NDArray[Any]
+Solve = Callable[[Correspondences, int], Array | None]
 SIDE = 640  # px, the longer side of the photographs
 HARD_RIGHT, HARD_WRONG_SHARE = 60, 0.7
 GRID = 12  # points along each side of a view
@@ -69,6 +70,7 @@ def add_arguments(commands: Any) -> None:
     planes.add_argument("--kinds", nargs="+", default=KINDS, choices=KINDS)
     planes.add_argument("--warps", type=int, default=1, help="pairs of each kind and photograph")
     planes.add_argument("--limit", type=int, help="photographs at most")
+    planes.add_argument("--bent", type=float, default=0.0, help="lambda of lenses that bend the points of both images")
     types.add_argument("--colmap", nargs="*", type=float, default=[4.0, 1.0], help="COLMAP's thresholds, px")
     types.add_argument("--unknown", action="store_true", help="without calibrations, by image sizes alone")
     types.set_defaults(pruners=["ratio", "one_to_one", "frame_consistency", "match_noise"])
@@ -79,7 +81,8 @@ def run(arguments: argparse.Namespace) -> None:
     planes = [*(warped(paths, arguments.warps) if {"warped", "hard"} & set(arguments.kinds) else ()),
               *(views(paths, arguments.warps) if "views" in arguments.kinds else ())]  # fmt: skip
     items = [item for item in track(planes, "warping", console=console) if item.pair.family in arguments.kinds]
-    results = Results(measure([Homography(word) for word in arguments.methods], items, arguments.seeds, Kept(None)))
+    methods = [Homography(word, bent=arguments.bent) for word in arguments.methods]
+    results = Results(measure(methods, items, arguments.seeds, Kept(None)))
     groups = results.by_family(results.all_pairs)
     records = results.records(groups, [*(f"AUC@{px} px" for px in (1, 3, 5)), "ms"], "method", ["AUC@1 px"])
     show([Sheet("homography", "AUC of the mean distance of points, in %", records)], arguments.table)
@@ -97,17 +100,18 @@ class Homography(Measured):
 
     identity = ""
 
-    def __init__(self, word: str, solve: Callable[[Correspondences, int], Array | None] | None = None) -> None:
+    def __init__(self, word: str, solve: Solve | None = None, bent: float = 0.0) -> None:
         name, _, setting = word.partition(":")
         if solve is None and name == "ours":
             solve = functools.partial(_ours, options(setting))
-        self.name, self.solve = word, solve or functools.partial(_peer, name, float(setting))
+        self.name, self.solve, self.bent = word, solve or functools.partial(_peer, name, float(setting)), bent
 
     def figures(self, item: Item, seed: int) -> Row:
         """The mean error in pixels, infinite where there is no homography, and milliseconds."""
         assert isinstance(item, Plane)
         assert item.pair.H is not None
-        H, seconds = timed(self.solve, item.matches, seed)
+        matches = bent(item.pair, item.matches, self.bent)[1] if self.bent else item.matches
+        H, seconds = timed(self.solve, matches, seed)
         row: Row = {"ms": 1e3 * seconds, "corner_error": np.inf}
         if H is not None:
             apart = np.linalg.norm(mapped(H, item.points) - mapped(item.pair.H, item.points), axis=1)
@@ -116,7 +120,7 @@ class Homography(Measured):
 
 
 def estimated(c: Correspondences, seed: int = 0, **changed: Any) -> Estimate:
-    given: dict[str, Any] = {name: getattr(c, name) for name in ("mask", "ratio", "prior", "noise", "key")}
+    given: dict[str, Any] = {name: getattr(c, name) for name in TIMED_FIELDS[2:-2]}  # without points and K
     return find_homography(c.x0, c.x1, seed=seed, **given, **changed)
 
 
@@ -297,7 +301,8 @@ def hard(c: Correspondences, H: Array, seed: int) -> Correspondences:
     b = np.concatenate([x1[right], rng.uniform(x1.min(0), x1.max(0), (wrong, 2))])
     order = rng.permutation(len(a))
     x = [torch.from_numpy(v[order][None]) for v in (a, b)]
-    return Correspondences(x[0], x[1], torch.ones(x[0].shape[:2], dtype=torch.bool), key=torch.tensor([seed]))
+    mask, key = torch.ones(x[0].shape[:2], dtype=torch.bool), torch.tensor([seed])
+    return Correspondences(x[0], x[1], mask, key=key, size0=c.size0, size1=c.size1)
 
 
 def kinds(paths: Sequence[Path]) -> Iterator[Plane]:

@@ -1,6 +1,5 @@
 """Lenses: images and points without distortion; resampling."""
 
-import functools
 from pathlib import Path
 
 import cv2
@@ -8,7 +7,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from fmtorch.data import MODELS, ImageSource, Lens, read_image, undistorted, undistorted_frames, undistorted_points
+from fmtorch.data import MODELS, ImageSource, Lens, read_image, undistorted, undistorted_points
 from fmtorch.data.pairs import Resampling
 
 SIZE = (120, 160)
@@ -144,16 +143,27 @@ def test_nothing_is_taken_from_beyond_the_fold() -> None:
     assert undistorted_points(Lens(9.0, 9.0, 1.0, 1.0), plain).tolist() == plain.tolist()
 
 
-def test_frames_follow_the_derivatives() -> None:
-    lens = lens_of("OPENCV")
-    points = np.random.default_rng(0).uniform(50, 400, (20, 2))
-    frames = np.random.default_rng(1).normal(size=(20, 2, 2))
-    undistorted = undistorted_frames(functools.partial(undistorted_points, lens), points, frames)
-    pinhole = undistorted_points(lens, points)
-    step = 1e-3
-    for column in (0, 1):  # the lens takes a short step along the frame of the pinhole to one along the photograph's
-        back = lens.distort(pinhole + step * undistorted[..., column])
-        np.testing.assert_allclose((back - points) / step, frames[..., column], atol=5e-3)
+@pytest.mark.parametrize("model", sorted(COEFFICIENTS))
+def test_derivatives_of_every_model(model: str) -> None:
+    lens, points, step = lens_of(model), np.random.default_rng(0).uniform(100, 350, (20, 2)), 0.1 * np.eye(2)
+    inverse = np.linalg.inv(lens.derivatives(undistorted_points(lens, points)))
+    for column, along in enumerate(step):
+        ends = [undistorted_points(lens, points + sign * along) for sign in (1, -1)]
+        np.testing.assert_allclose(inverse[..., column], (ends[0] - ends[1]) / 0.2, atol=1e-5)
+
+
+def test_a_point_is_undistorted_alone_as_among_others() -> None:
+    lens, points = lens_of("OPENCV_FISHEYE"), grid_of_points()
+    together = undistorted_points(lens, points)
+    assert np.array_equal(together[7:9], undistorted_points(lens, points[7:9]), equal_nan=True)
+    assert np.array_equal(together[::3], undistorted_points(lens, points[::3]), equal_nan=True)
+
+
+def test_a_resampled_photograph_has_a_lens_like_its_own() -> None:
+    lens, points = lens_of("OPENCV"), grid_of_points()
+    scale = np.array([0.5, 0.25])
+    reduced = lens.scaled(*scale).distort((points + 0.5) * scale - 0.5)
+    np.testing.assert_allclose((reduced + 0.5) / scale - 0.5, lens.distort(points), atol=1e-9)
 
 
 RESAMPLED_SIZE = (6, 9)

@@ -1,0 +1,236 @@
+"""Calibrated lenses: where they put what a pinhole would have put elsewhere. All of COLMAP's models, by its names."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Matrix = NDArray[np.float64]
+Distortion = Callable[..., tuple[Matrix, Matrix]]
+_TINY = 1e-12  # squared radius or parameter below which a quotient is replaced by its limit
+
+
+@dataclasses.dataclass(frozen=True)
+class Lens:
+    """A calibrated lens: focal lengths and principal point in pixels, with (0, 0) at the centre of the first pixel.
+    model: its name in COLMAP, of `fmtorch.data.MODELS`. coefficients: as `MODELS` names them, without focal lengths and
+    principal point."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    model: str = "PINHOLE"
+    coefficients: tuple[float, ...] = ()
+
+    @property
+    def K(self) -> Matrix:
+        """The calibration (3, 3) of the undistorted image."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    @property
+    def bends(self) -> bool:
+        """Whether the image differs from a pinhole's."""
+        return MODELS[self.model].fisheye or any(self.coefficients)
+
+    def distort(self, points: Matrix) -> Matrix:
+        """Where points (..., 2) of the undistorted image are in the photograph, both in pixels."""
+        u, v = (points[..., 0] - self.cx) / self.fx, (points[..., 1] - self.cy) / self.fy
+        u, v = MODELS[self.model].distort(u, v, *self.coefficients)
+        return np.stack([self.fx * u + self.cx, self.fy * v + self.cy], -1)
+
+    def derivatives(self, points: Matrix) -> Matrix:
+        """The derivatives (..., 2, 2) of `distort` there, by central differences."""
+        steps = STEP * np.diag([self.fx, self.fy])
+        moved = [(self.distort(points + step) - self.distort(points - step)) / (2 * step.sum()) for step in steps]
+        return np.stack(moved, -1)
+
+    def scaled(self, sx: float, sy: float) -> Lens:
+        """The lens of the photograph whose width and height are resampled to so many times theirs."""
+        centre = (self.cx + 0.5) * sx - 0.5, (self.cy + 0.5) * sy - 0.5
+        return Lens(self.fx * sx, self.fy * sy, *centre, self.model, self.coefficients)
+
+
+@dataclasses.dataclass(frozen=True)
+class Model:
+    """A lens model.
+    focals: whether it has one focal length or two. coefficients: names of its parameters after the principal point.
+    fisheye: whether it bends even where all of them are zero."""
+
+    focals: int
+    coefficients: str
+    distort: Distortion
+    fisheye: bool = False
+
+    @property
+    def parameters(self) -> list[str]:
+        """The names of all parameters, in COLMAP's order."""
+        return [*(["f"] if self.focals == 1 else ["fx", "fy"]), "cx", "cy", *self.coefficients.split()]
+
+    def lens(self, name: str, values: Matrix) -> Lens:
+        """The lens of a model's parameters, whose principal point has the origin of the lens."""
+        fx, fy = (values[0], values[0]) if self.focals == 1 else (values[0], values[1])
+        cx, cy = values[self.focals : self.focals + 2]
+        return Lens(float(fx), float(fy), float(cx), float(cy), name, tuple(map(float, values[self.focals + 2 :])))
+
+
+def radial(u: Matrix, v: Matrix, k1: float = 0.0, k2: float = 0.0) -> tuple[Matrix, Matrix]:
+    """A polynomial in the squared radius; without coefficients, a pinhole."""
+    r2 = u * u + v * v
+    factor = 1 + r2 * (k1 + r2 * k2)
+    return u * factor, v * factor
+
+
+def rational(
+    u: Matrix, v: Matrix,
+    k1: float, k2: float, p1: float, p2: float, k3: float = 0.0, k4: float = 0.0, k5: float = 0.0, k6: float = 0.0,
+) -> tuple[Matrix, Matrix]:  # fmt: skip
+    """A quotient of polynomials, and decentring (Brown): OpenCV's model."""
+    r2 = u * u + v * v
+    factor = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+    du, dv = _decentred(u, v, r2, p1, p2)
+    return u * factor + du, v * factor + dv
+
+
+def field_of_view(u: Matrix, v: Matrix, omega: float) -> tuple[Matrix, Matrix]:
+    """The radius is an angle: ``atan(2 r tan(omega / 2)) / omega``."""
+    r = np.hypot(u, v)
+    if omega * omega < _TINY:
+        return u, v
+    slope = 2 * np.tan(omega / 2)
+    factor = np.where(r * r < _TINY, slope / omega, np.arctan(r * slope) / (np.maximum(r, _TINY) * omega))
+    return u * factor, v * factor
+
+
+def equidistant(u: Matrix, v: Matrix, *k: float) -> tuple[Matrix, Matrix]:
+    """The radius is the angle to the axis, times a polynomial in its square with coefficients k."""
+    r = np.hypot(u, v)
+    theta = np.arctan(r)
+    factor = np.where(r * r < _TINY, 1.0, theta / np.maximum(r, _TINY)) * _polynomial(theta * theta, k)
+    return u * factor, v * factor
+
+
+def thin_prism(u: Matrix, v: Matrix, *c: float) -> tuple[Matrix, Matrix]:
+    """A fish-eye whose sensor is tilted (Weng et al., PAMI 1992)."""
+    k1, k2, p1, p2, k3, k4, sx1, sy1 = c
+    u, v = equidistant(u, v)
+    r2 = u * u + v * v
+    du, dv = _decentred(u, v, r2, p1, p2)
+    factor = _polynomial(r2, (k1, k2, k3, k4))
+    return u * factor + du + sx1 * r2, v * factor + dv + sy1 * r2
+
+
+def rad_tan_thin_prism(u: Matrix, v: Matrix, *c: float) -> tuple[Matrix, Matrix]:
+    """The fish-eye of Project Aria's cameras: six radial, two tangential and four thin-prism coefficients."""
+    (p0, p1), (s0, s1, s2, s3) = c[6:8], c[8:]
+    u, v = equidistant(u, v, *c[:6])
+    r2 = u * u + v * v
+    du, dv = _decentred(u, v, r2, p1, p0)
+    return u + du + r2 * (s0 + r2 * s1), v + dv + r2 * (s2 + r2 * s3)
+
+
+def division(u: Matrix, v: Matrix, k: float) -> tuple[Matrix, Matrix]:
+    """The undistorted point is the distorted one divided by ``1 + k r^2``. NaN beyond the largest radius for k > 0."""
+    root = 1 - 4 * k * (u * u + v * v)
+    with np.errstate(invalid="ignore"):
+        factor = 2 / (1 + np.sqrt(root))
+    return u * factor, v * factor
+
+
+def unified(u: Matrix, v: Matrix, alpha: float, beta: float) -> tuple[Matrix, Matrix]:
+    """The enhanced unified camera model (Khomutenko et al., RA-L 2016)."""
+    factor = 1 / (alpha * np.sqrt(beta * (u * u + v * v) + 1) + 1 - alpha)
+    return u * factor, v * factor
+
+
+def _decentred(u: Matrix, v: Matrix, r2: Matrix, p1: float, p2: float) -> tuple[Matrix, Matrix]:
+    return 2 * p1 * u * v + p2 * (r2 + 2 * u * u), 2 * p2 * u * v + p1 * (r2 + 2 * v * v)
+
+
+def _polynomial(x: Matrix, k: tuple[float, ...]) -> Matrix:
+    total = np.zeros_like(x)
+    for coefficient in reversed(k):
+        total = (total + coefficient) * x
+    return 1 + total
+
+
+MODELS = {
+    "SIMPLE_PINHOLE": Model(1, "", radial), "PINHOLE": Model(2, "", radial),
+    "SIMPLE_RADIAL": Model(1, "k", radial), "RADIAL": Model(1, "k1 k2", radial),
+    "OPENCV": Model(2, "k1 k2 p1 p2", rational), "OPENCV_FISHEYE": Model(2, "k1 k2 k3 k4", equidistant, fisheye=True),
+    "FULL_OPENCV": Model(2, "k1 k2 p1 p2 k3 k4 k5 k6", rational), "FOV": Model(2, "omega", field_of_view),
+    "SIMPLE_RADIAL_FISHEYE": Model(1, "k", equidistant, fisheye=True),
+    "RADIAL_FISHEYE": Model(1, "k1 k2", equidistant, fisheye=True),
+    "THIN_PRISM_FISHEYE": Model(2, "k1 k2 p1 p2 k3 k4 sx1 sy1", thin_prism, fisheye=True),
+    "RAD_TAN_THIN_PRISM_FISHEYE": Model(2, "k0 k1 k2 k3 k4 k5 p0 p1 s0 s1 s2 s3", rad_tan_thin_prism, fisheye=True),
+    "SIMPLE_DIVISION": Model(1, "k", division), "DIVISION": Model(2, "k", division),
+    "SIMPLE_FISHEYE": Model(1, "", equidistant, fisheye=True), "FISHEYE": Model(2, "", equidistant, fisheye=True),
+    "EUCM": Model(2, "alpha beta", unified),
+}  # fmt: skip
+"""The models by name, in the order of the numbers that COLMAP's binary files give them."""
+
+
+# Their inverse
+
+ITERATIONS = 50  # at most; most points take four
+STEP = 1e-6  # of the derivatives, in units of the focal length
+TOLERANCE = 1e-10  # of distorted points, likewise: 1e-7 px at a focal length of 1000 px
+RAY = np.linspace(0.0, 1.0, 33)  # where, from the centre to a point, a lens must lead outwards
+
+
+def division_lens(value: float, size: Sequence[float]) -> Lens:
+    """The lens of the division model whose lambda in half diagonals of an image (h, w) is this, about its centre."""
+    (h, w), half = size, math.hypot(*size) / 2
+    return Lens(half, half, (w - 1) / 2, (h - 1) / 2, "SIMPLE_DIVISION", (value,))
+
+
+def undistorted_points(lens: Lens, photographed: NDArray[Any]) -> Matrix:
+    """Pixels (..., 2) of a pinhole of calibration `lens.K` for those of the photograph; NaN where it sees nothing.
+    The inverse of `Lens.distort` by Newton's method. NaN too where the model folds back between centre and point: there
+    a polynomial has left the range to which it was fitted, as `undistorted` leaves such pixels black."""
+    points: Matrix = np.array(photographed, np.float64)
+    if not lens.bends:
+        return points
+    centre, focal = np.array([lens.cx, lens.cy]), np.array([lens.fx, lens.fy])
+    target = (points.reshape(-1, 2) - centre) / focal
+    with np.errstate(all="ignore"):
+        x = _inverted(dataclasses.replace(lens, fx=1.0, fy=1.0, cx=0.0, cy=0.0), target)
+    return np.asarray(x * focal + centre, np.float64).reshape(points.shape)
+
+
+def undistortion(lens: Lens, pinhole: Matrix) -> Matrix:
+    """The derivatives (..., 2, 2) of undistorted points, which these are, by those of the photograph."""
+    (a, c), (b, d) = (np.moveaxis(column, -1, 0) for column in np.moveaxis(lens.derivatives(pinhole), -1, 0))
+    rows = np.stack([d, -b, -c, a], -1) / (a * d - b * c)[..., None]
+    return np.asarray(rows.reshape(*pinhole.shape, 2), np.float64)
+
+
+def _inverted(lens: Lens, target: Matrix) -> Matrix:
+    """Points (n, 2) that the lens puts at the target (n, 2), both in units of the focal length, about the centre.
+    Each is a function of its own target alone."""
+    x = target.copy()
+    if MODELS[lens.model].fisheye:  # whose radius is about the angle to the axis
+        angle = np.hypot(target[:, 0], target[:, 1])
+        x = np.where((angle > 0)[:, None], target * (np.tan(angle) / angle)[:, None], target)
+        x = np.where((angle < np.pi / 2)[:, None], x, target)
+    error = lens.distort(x) - target
+    for _ in range(ITERATIONS):
+        size = np.hypot(error[:, 0], error[:, 1])
+        if not (size > TOLERANCE).any():
+            break
+        move = (undistortion(lens, x) @ error[..., None])[..., 0]
+        for share in (1.0, 0.25, 0.0625):  # shorter where the error would grow
+            trial = x - share * move
+            left = lens.distort(trial) - target
+            better = ((size > TOLERANCE) & (np.hypot(left[:, 0], left[:, 1]) < size))[:, None]
+            x, error = np.where(better, trial, x), np.where(better, left, error)
+            move = np.where(better, 0.0, move)
+    along = lens.distort(RAY[:, None, None] * x)  # from the centre outwards
+    outwards = (np.diff(along, axis=0) * x).sum(-1) > 0
+    valid = (np.hypot(error[:, 0], error[:, 1]) <= TOLERANCE) & (outwards.all(0) | ~x.any(1))
+    return np.where(valid[:, None], x, np.nan)

@@ -1,0 +1,269 @@
+"""Calibrated lenses of the public functions, and lenses of homographies, beside points that are undistorted by hand."""
+
+import re
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import fmtorch
+from fmtorch import Lens
+from fmtorch.metrics import corner_error
+from tests.reference import lenses as division
+
+SIZE = (480, 640)
+SIZES = {"size0": SIZE, "size1": SIZE}
+FISHEYE = Lens(400.0, 410.0, 321.0, 238.0, "OPENCV_FISHEYE", (0.02, -0.01, 0.005, -0.002))
+RADIAL = Lens(512.0, 512.0, 319.5, 239.5, "SIMPLE_RADIAL", (-0.15,))
+PINHOLE = Lens(512.0, 512.0, 319.5, 239.5)
+FOLDED = Lens(512.0, 512.0, 319.5, 239.5, "SIMPLE_RADIAL", (-20.0,))
+NAN = Lens(512.0, 512.0, 319.5, 239.5, "SIMPLE_RADIAL", (np.nan,))
+PLANE = np.array([[0.95, 0.06, 12], [-0.05, 1.02, -8], [1e-4, -2e-4, 1]])
+Array = np.ndarray
+
+
+def photographs(lens0: Lens, lens1: Lens, seed: int = 1) -> tuple[Array, Array]:
+    """Matches of a scene of depth in photographs by two lenses whose K are those of the cameras."""
+    _, _, _, K = division.photographs(seed, (0.0, 0.0))
+    x0, x1, _, _ = division.photographs(seed, (0.0, 0.0), noise=0.0)
+    rng, ends = np.random.default_rng(seed), []
+    for x, lens in ((x0, lens0), (x1, lens1)):
+        x = lens.distort((x - K[:2, 2]) / K[0, 0] * [lens.fx, lens.fy] + [lens.cx, lens.cy])
+        ends.append(x + rng.normal(0, 0.3, x.shape))
+    return ends[0], ends[1]
+
+
+def straight(lens: Lens, x: Array) -> Array:
+    """Where a pinhole of the same K has a point (2,) of the photograph: Newton's method on finite differences."""
+    at = x.copy()
+    for _ in range(60):
+        at = at - 0.5 * np.linalg.solve(slope(lens, at), lens.distort(at[None])[0] - x)
+    return at
+
+
+def slope(lens: Lens, at: Array) -> Array:
+    ends = [lens.distort(at[None] + sign * 1e-3 * np.eye(2)) for sign in (1, -1)]
+    return (ends[0] - ends[1]).T / 2e-3
+
+
+def by_hand(lenses: tuple[Lens | None, Lens | None], x0: Array, x1: Array) -> tuple[Array, Array, Array]:
+    """Undistorted points, and the noise of the matches."""
+    ends, noise = [], np.ones(len(x0))
+    for lens, x in zip(lenses, (x0, x1), strict=True):
+        ends.append(x if lens is None else np.array([straight(lens, each) for each in x]))
+        if lens is not None:
+            noise *= [abs(np.linalg.det(slope(lens, each))) ** -0.25 for each in ends[-1]]
+    return ends[0], ends[1], noise
+
+
+@pytest.mark.parametrize("lenses", [(FISHEYE, FISHEYE), (RADIAL, FISHEYE), (RADIAL, None)])
+def test_points_are_as_undistorted_by_hand(lenses: tuple[Lens, Lens | None]) -> None:
+    x0, x1 = photographs(lenses[0], lenses[1] or PINHOLE)
+    before = x0.copy()
+    second = {"K1": PINHOLE.K} if lenses[1] is None else {}
+    given = fmtorch.find_fundamental(x0, x1, lens=lenses, **second, pair_type=True, covariance=True)
+    assert np.array_equal(x0, before)
+    y0, y1, noise = by_hand(lenses, x0, x1)
+    K = {"K0": lenses[0].K, "K1": (lenses[1] or PINHOLE).K}
+    known = fmtorch.find_fundamental(y0, y1, noise=noise, **K, covariance=True)
+    torch.testing.assert_close(given.inliers, known.inliers)
+    torch.testing.assert_close(given.F, known.F, rtol=1e-5, atol=1e-7)
+    torch.testing.assert_close(given.t, known.t, rtol=1e-5, atol=1e-7)
+    assert given.pair_type == ("general",)
+    truth = torch.nn.functional.normalize(torch.tensor([-0.8, 0.1, 0.3]).double(), dim=0)
+    assert torch.rad2deg(torch.arccos(given.t[0] @ truth)) < 1
+    pose = fmtorch.find_essential(x0, x1, lens=lenses, **second)
+    torch.testing.assert_close(pose.t, given.t, rtol=0, atol=0.02)
+
+
+def test_a_lens_that_does_not_bend_changes_nothing() -> None:
+    x0, x1, _, K = division.photographs(2, (0.0, 0.0))
+    pinhole = Lens(K[0, 0], K[1, 1], K[0, 2], K[1, 2])
+    given, known = fmtorch.find_essential(x0, x1, lens=pinhole), fmtorch.find_essential(x0, x1, K, K)
+    assert torch.equal(given.F, known.F)
+    plane = fmtorch.find_homography(x0, x1, lens=pinhole)
+    assert torch.equal(plane.H, fmtorch.find_homography(x0, x1).H)
+
+
+@pytest.mark.parametrize("find", [fmtorch.find_fundamental, fmtorch.find_homography])
+def test_pairs_keep_to_themselves(find: Any) -> None:
+    """Beside others, padded, in another order, and beside a lens that is none and one that folds."""
+    pairs = [planes(3, RADIAL), photographs(RADIAL, FISHEYE), photographs(FISHEYE, FISHEYE, 5)]
+    lenses: list[Any] = [(RADIAL, RADIAL), (RADIAL, FISHEYE), (FISHEYE, FISHEYE), (FOLDED, RADIAL), (NAN, RADIAL)]
+    pairs = [*pairs, pairs[0], pairs[0]]
+    together = find([x for x, _ in pairs], [x for _, x in pairs], lens=lenses)
+    for i in range(3):
+        alone = find(*pairs[i], lens=lenses[i])
+        assert torch.equal(together.F[i], alone.F[0])
+        assert torch.equal(together.inliers[i, : len(pairs[i][0])], alone.inliers[0])
+    assert together.ok.tolist()[3:] == [False, False]
+    assert re.match(r"pinholes see \d+ of \d+ matches: the lens folds there", together.reason[3])
+    assert together.reason[4] == "the lens of image 0 has coefficients that are not finite"
+    assert not together.inliers[3:].any()
+    assert find(*pairs[0], lens=FOLDED).reason[0].startswith("pinholes see")
+
+
+@pytest.mark.parametrize("find", [fmtorch.find_fundamental, fmtorch.find_homography])
+def test_gradients_reach_the_photographs_points(find: Any) -> None:
+    """By finite differences, with the noise of the matches as it is."""
+    x0, x1 = planes(3, RADIAL) if find is fmtorch.find_homography else photographs(RADIAL, RADIAL)
+    points = [torch.from_numpy(x).requires_grad_() for x in (x0, x1)]
+    direction = torch.from_numpy(np.random.default_rng(0).normal(size=(3, 3)))
+    estimate = find(*points, lens=RADIAL)
+    (estimate.F[0] * direction).sum().backward()
+    inliers = estimate.inliers[0].nonzero()[:, 0].tolist()
+    for image, i, axis in ((0, inliers[3], 0), (1, inliers[8], 1), (0, inliers[11], 1)):
+        values = []
+        for step in (0.05, -0.05):
+            moved = [x0.copy(), x1.copy()]
+            moved[image][i, axis] += step
+            values.append(float((find(*moved, lens=RADIAL).F[0] * direction).sum()))
+        slopes = (values[0] - values[1]) / 0.1, float(points[image].grad[i, axis])
+        assert slopes[1] == pytest.approx(slopes[0], rel=0.05, abs=0.05 * float(points[image].grad.abs().max()))
+
+
+@pytest.mark.parametrize(
+    ("said", "message"),
+    [
+        ({"lens": NAN}, "the lens of image 0 has coefficients that are not finite"),
+        ({"lens": (None, Lens(-1.0, 1.0, 0.0, 0.0))}, "K of the lens of image 1 has focal lengths -1, 1"),
+        (
+            {"lens": (RADIAL, -0.1)},
+            "lens holds a calibrated lens, so it must be a lens for both images",
+        ),
+        ({"lens": [(RADIAL, None), (None, RADIAL)]}, "lens has None for image 0 of some pairs"),
+        ({"lens": RADIAL, "K0": PINHOLE.K}, "K0 and a lens of image 0 are given, and the lens has its own K"),
+        ({"lens": (RADIAL, None)}, "K0 alone needs the image sizes: give size0 and size1"),
+    ],
+)
+def test_what_makes_no_sense_is_refused_by_name(said: dict[str, Any], message: str) -> None:
+    x0, x1 = photographs(RADIAL, RADIAL)
+    with pytest.raises(ValueError, match=re.escape(message)):
+        fmtorch.find_fundamental(x0, x1, **said)
+
+
+def test_normalised_points_have_no_lens() -> None:
+    x0, x1 = photographs(RADIAL, RADIAL)
+    for find in (fmtorch.find_essential, fmtorch.find_homography):
+        with pytest.raises(ValueError, match="x0 runs from"):
+            find(x0 / 500, x1 / 500, lens=RADIAL)
+    with pytest.raises(ValueError, match="K1 is None"):
+        fmtorch.find_essential(x0, x1, lens=(RADIAL, None))
+
+
+def planes(seed: int, lens: Lens | float | tuple[float, float], wrong: float = 0.25) -> tuple[Array, Array]:
+    """Matches of a plane in two photographs, whose homography between pinholes is PLANE."""
+    rng = np.random.default_rng(seed)
+    x0 = rng.uniform([20, 20], [620, 460], (300, 2))
+    x1 = np.c_[x0, np.ones(len(x0))] @ PLANE.T
+    ends = [x0, x1[:, :2] / x1[:, 2:]]
+    for i, x in enumerate(ends):
+        if isinstance(lens, Lens):
+            ends[i] = lens.distort(x)
+        else:
+            ends[i] = np.array([division.bent(each, SIZE, np.broadcast_to(lens, 2)[i]) for each in x])
+        ends[i] = ends[i] + rng.normal(0, 0.3, x.shape)
+    ends[1][: int(wrong * len(x0))] = rng.permutation(ends[1][: int(wrong * len(x0))])
+    inside = np.all([((x >= 0) & (x < (640, 480))).all(1) for x in ends], 0)
+    return ends[0][inside], ends[1][inside]
+
+
+def error(estimate: Any, i: int = 0) -> float:
+    return float(corner_error(estimate.H[i : i + 1], torch.from_numpy(PLANE)[None], torch.tensor([SIZE])))
+
+
+@pytest.mark.parametrize("lens", [-0.05, -0.3, (-0.2, 0.1)])
+def test_a_known_lambda_of_a_plane(lens: Any) -> None:
+    x0, x1 = planes(1, lens)
+    pair = lens if isinstance(lens, tuple) else (lens, lens)
+    known = fmtorch.find_homography(x0, x1, lens=[(value, 0.0) for value in pair], **SIZES)
+    assert error(known) < min(0.5, error(fmtorch.find_homography(x0, x1)) / 4)
+    assert known.lens[0].tolist() == pytest.approx(pair)
+    half = float(np.hypot(*SIZE)) / 2
+    models = [Lens(half, half, 319.5, 239.5, "SIMPLE_DIVISION", (value,)) for value in pair]
+    y0, y1, noise = by_hand((models[0], models[1]), x0, x1)
+    torch.testing.assert_close(known.H, fmtorch.find_homography(y0, y1, noise=noise).H, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize(("lens", "which"), [(-0.1, "shared"), (-0.3, "shared"), ((-0.2, 0.0), "unknown")])
+def test_an_unknown_lens_of_a_plane(lens: Any, which: Any) -> None:
+    x0, x1 = planes(2, lens)
+    estimate = fmtorch.find_homography(x0, x1, lens=which, **SIZES)
+    assert estimate.lens[0].tolist() == pytest.approx(np.broadcast_to(lens, 2), abs=0.02)
+    assert error(estimate) < min(1.5, error(fmtorch.find_homography(x0, x1)) / 2)
+
+
+def test_planes_keep_to_themselves() -> None:
+    """Bent ones, a straight one, which is that without a lens to the bit, and one that shows nothing."""
+    pairs = [planes(1, -0.2), planes(2, 0.0), (np.full((30, 2), 100.0), planes(1, 0.0)[1][:30]), planes(3, -0.1)]
+    together = fmtorch.find_homography([x for x, _ in pairs], [x for _, x in pairs], lens="shared", **SIZES)
+    assert together.ok.tolist() == [True, True, False, True]
+    assert together.lens[1].tolist() == [0, 0]
+    assert together.lens[2].isnan().all()
+    assert torch.equal(together.H[1], fmtorch.find_homography(*pairs[1]).H[0])
+    for i in (0, 3):
+        alone = fmtorch.find_homography(*pairs[i], lens="shared", **SIZES)
+        assert torch.equal(together.H[i], alone.H[0])
+        assert torch.equal(together.lens[i], alone.lens[0])
+
+
+def test_a_lens_of_a_photograph_of_a_map() -> None:
+    """Whose points are in a unit of their own."""
+    x0, x1 = planes(4, RADIAL)
+    board = np.array([straight(RADIAL, each) for each in x0]) / 1000
+    estimate = fmtorch.find_homography(board, x1, lens=(None, RADIAL))
+    estimate = estimate.derived(F=estimate.F @ torch.diag(torch.tensor([1e-3, 1e-3, 1.0])).double())
+    assert error(estimate) < 1
+
+
+@pytest.mark.parametrize(
+    ("said", "message"),
+    [
+        ({"lens": -0.1}, "lens needs the image sizes, in whose half diagonals it is: give size0 and size1"),
+        ({"lens": -0.6, **SIZES}, "lens of image 0 of pair 0 is [-0.6, 0.0]; it is lambda in half diagonals"),
+        ({"lens": "fisheye", **SIZES}, "lens is 'fisheye'; it must be None, 'unknown', 'shared', lambda"),
+        (
+            {"lens": (-0.1, 0.02), **SIZES},
+            "it must be a calibrated lens, lambda (exactly known), 'shared'",
+        ),
+    ],
+)
+def test_lenses_that_no_homography_has(said: dict[str, Any], message: str) -> None:
+    x0, x1 = planes(1, 0.0)
+    with pytest.raises(ValueError, match=re.escape(message)):
+        fmtorch.find_homography(x0, x1, **said)
+    with pytest.raises(ValueError, match="lens is given, and its estimates have no gradients"):
+        fmtorch.find_homography(torch.from_numpy(x0).requires_grad_(), x1, lens="shared", **SIZES)
+
+
+@pytest.mark.parametrize("find", [fmtorch.find_fundamental, fmtorch.find_homography])
+@pytest.mark.parametrize("garbage", [np.nan, np.inf, 1e30, 0.0])
+def test_what_stands_in_masked_slots_means_nothing(find: Any, garbage: float) -> None:
+    """Neither for values nor for gradients."""
+    x0, x1 = planes(3, FISHEYE) if find is fmtorch.find_homography else photographs(FISHEYE, FISHEYE)
+    gradients = []
+    for slots in (0, 7):
+        padded = [np.concatenate([x, np.full((slots, 2), garbage)])[None] for x in (x0, x1)]
+        points = [torch.from_numpy(x).requires_grad_() for x in padded]
+        mask = np.arange(len(x0) + slots)[None] < len(x0)
+        estimate = find(*points, mask=mask, lens=FISHEYE)
+        estimate.F.sum().backward()
+        gradients.append((estimate.F.detach(), *(x.grad[:, : len(x0)] for x in points)))
+        assert all(float(x.grad[:, len(x0) :].abs().sum()) == 0 for x in points)
+    assert all(map(torch.equal, *gradients))
+
+
+def test_frames_go_with_their_points() -> None:
+    x0, x1 = photographs(RADIAL, RADIAL)
+    y0, y1, noise = by_hand((RADIAL, RADIAL), x0, x1)
+    axes = np.random.default_rng(0).normal(size=(len(x0), 2, 2)) + 5 * np.eye(2)
+    before, after = [], []
+    for x, y in ((x0, y0), (x1, y1)):
+        before.append(np.concatenate([axes, x[..., None]], -1))
+        straightened = [np.linalg.solve(slope(RADIAL, at), own) for at, own in zip(y, axes, strict=True)]
+        after.append(np.concatenate([straightened, y[..., None]], -1))
+    ratio = np.linspace(0.3, 0.9, len(x0))
+    estimate = fmtorch.find_essential(x0, x1, lens=RADIAL, ratio=ratio, lafs0=before[0], lafs1=before[1])
+    known = fmtorch.find_essential(y0, y1, *[RADIAL.K] * 2, noise=noise, ratio=ratio, lafs0=after[0], lafs1=after[1])
+    torch.testing.assert_close(estimate.F, known.F, rtol=1e-5, atol=1e-7)
