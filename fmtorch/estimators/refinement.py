@@ -9,8 +9,7 @@ from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
-from fmtorch.estimators.inliers import noise_scale
-from fmtorch.estimators.models.model import FitScale, Loss, Refining, Steps
+from fmtorch.estimators.models.model import Loss, Refining, Steps
 from fmtorch.estimators.models.posterior import Cameras
 from fmtorch.estimators.options import Refine
 from fmtorch.estimators.pair import Pair, squared
@@ -22,7 +21,6 @@ from fmtorch.jit.kernel import Array, F4x2, I8x1, Kernel, kernel
 from fmtorch.jit.random import Stream
 
 FIRST_DAMPING = 1e-4  # of Levenberg-Marquardt
-CHOICE_SIGMAS = 1.5  # deviations of the noise of a pair at which a match counts half in the choice
 
 
 @runtime_checkable
@@ -127,25 +125,25 @@ class BestScore:
     """The model of the largest score.
 
     No scale suits all pairs: keypoints of a sharp video lie within a fifth of a pixel of their epipolar lines, those of
-    learned features within one. So with `at`, the score of a scale in pixels, the model is chosen a second time, by the
-    noise of the matches near the first choice, within the limits `own` of the last fit's scale.
+    learned features within one. So with `at_noise`, the score at the noise of a pair by the matches near a model (9,),
+    the choice is made a second time, at the noise of the first.
     """
 
-    def __init__(self, score: Score, at: Callable[[float], Score] | None = None, own: FitScale | None = None) -> None:
-        self.score, self.at, self.own = score, at, (own or FitScale())._replace(scale_sigmas=CHOICE_SIGMAS)
+    def __init__(self, score: Score, at_noise: Callable[[Array, Pair], Score] | None = None) -> None:
+        self.score, self.at_noise = score, at_noise
 
     def __call__(self, candidates: Candidates, pair: Pair) -> Selection:
         """The selection."""
         first = self.first(candidates, pair)
-        return first if self.at is None else _largest(self.of_pair(first.F, pair), candidates, pair)
+        return first if self.at_noise is None else _largest(self.of_pair(first.F, pair), candidates, pair)
 
     def first(self, candidates: Candidates, pair: Pair) -> Selection:
         """The model of the largest score at its own scale."""
         return _largest(self.score, candidates, pair)
 
     def of_pair(self, F: Array, pair: Pair) -> Score:
-        """The score at the noise of a pair near a model (9,)."""
-        return self.score if self.at is None else self.at(noise_scale(F, pair, self.own))
+        """The score of the second choice, near a model (9,) of the first."""
+        return self.score if self.at_noise is None else self.at_noise(F, pair)
 
 
 def _largest(score: Score, candidates: Candidates, pair: Pair) -> Selection:

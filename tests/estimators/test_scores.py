@@ -11,7 +11,6 @@ import fmtorch
 from fmtorch import estimators
 from fmtorch.estimators import BestOfSearch, BestScore, Candidates, Pool, Refinement, scores_of
 from fmtorch.estimators.inliers import residuals_squared_px
-from fmtorch.estimators.models.model import Loss, Steps
 from fmtorch.estimators.scores import GRID, fractional_bits, saturated_cells
 from fmtorch.geometry.epipolar import HOMOGRAPHY, SAMPSON
 from fmtorch.geometry.robust_losses import ENTRIES, QUANTILE
@@ -340,22 +339,17 @@ def test_the_first_of_the_pool_or_the_best_score_of_what_is_valid() -> None:
 def test_the_second_choice_is_made_at_the_noise_of_the_pair(noise: float, count: int) -> None:
     """The scale is 1.5 robust deviations of the likely matches within 2 px of the first choice, 0.3 to 2 px, and
     1.5 px where these are fewer than 15."""
-    pair, asked = pair_of(scene(2, count, outliers=0.1, noise=noise)), list[float]()
-    start, loss = models(pair, 30)[1:], Loss("cauchy", 2.0)
-    F = estimators.SevenPoint().refine(start, pair, loss, Steps(20, 1e-4))
-
-    def at(scale: float) -> estimators.Score:
-        asked.append(scale)
-        return estimators.Msac(scale)
-
-    everything = Candidates(F, np.ones(len(F), np.bool_), pair)
-    chosen = BestScore(estimators.Msac(0.3), at)(everything, pair)
+    pair = pair_of(scene(2, count, outliers=0.1, noise=noise))
+    start = models(pair, 30)[1:]
+    F = estimators.SevenPoint().refine(start, pair, estimators.Loss("cauchy", 2.0), estimators.Steps(20, 1e-4))
     first = F[int(np.argmax(scores_of(estimators.Msac(0.3), F, pair)))]
     r = np.sqrt(residuals_squared_px(first, pair)) / pair.noises
     r = r[(r <= 2) & (pair.match_weight > 0.3)]
-    expected = 1.5 if len(r) < 15 else np.clip(1.5 * 1.4826 * np.quantile(r, 0.5, method="inverted_cdf"), 0.3, 2.0)
-    np.testing.assert_allclose(asked, [expected], rtol=1e-12)
-    np.testing.assert_array_equal(chosen.F, F[int(np.argmax(scores_of(estimators.Msac(asked[0]), F, pair)))])
+    scale = 1.5 if len(r) < 15 else np.clip(1.5 * 1.4826 * np.quantile(r, 0.5, method="inverted_cdf"), 0.3, 2.0)
+    select: Any = estimators.Ransac(select={"score": "msac", "scale": 0.3, "own_noise": True}).select
+    np.testing.assert_allclose(select.of_pair(first, pair).threshold, scale, rtol=1e-12)
+    best = int(np.argmax(scores_of(estimators.Msac(float(scale)), F, pair)))
+    np.testing.assert_array_equal(select(Candidates(F, np.ones(len(F), np.bool_), pair), pair).F, F[best])
 
 
 @pytest.mark.parametrize("threshold", [0.0, -1.0, float("nan")])
