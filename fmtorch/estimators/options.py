@@ -50,13 +50,13 @@ class Refine:
 class Select:
     """Which refined model is the estimate: that of the largest score.
 
-    score: a name of the registry, or a score. scale: of it, Sampson distance, px. own_noise: whether the estimate is
-    that of the largest score at the noise of the pair, which the inliers of the former tell.
+    score: a name of the registry, or a score. scale: of it, Sampson distance, px. own_noise: the estimate is
+    that of the largest score at so many deviations of the pair's noise, which matches near the former tell; None: not.
     """
 
     score: Any = "saturated"
     scale: Pixels = 1.0
-    own_noise: bool = False
+    own_noise: Pixels | None = None
 
 
 @dataclasses.dataclass(frozen=True)

@@ -39,8 +39,6 @@ from fmtorch.jobs.execution import mapped
 
 FOCAL_ROUND = 500  # samples of five matches at a time
 SEARCHED = 2048  # right matches that are expected among those searched
-CHOICE_SIGMAS = 1.5  # deviations of a pair's noise at which a match counts half in its choice; on castle-P19 and fox
-# with SIFT and LightGlue no merit of F or E is below that of one scale, and AUC@0.05 of F is 1.4 and 3 points above
 CALIBRATED_MATCHES = 6  # that a pair of calibrated cameras needs: five of them have up to ten solutions
 DEFAULT_PRESELECT = Preselect()
 Probability = Annotated[float, Within(0, 1, exclusive=True)]
@@ -134,7 +132,8 @@ class Ransac:
         changed = refinement.options is not None or optimization is not None
         self.select: Selector = BestScore(self.score) if changed else BestOfSearch()
         if choice is not None:
-            at_noise = functools.partial(_at_noise, choice.score, self.family.fit_scale)
+            own = self.family.fit_scale._replace(scale_sigmas=choice.own_noise or 0.0)
+            at_noise = functools.partial(_at_noise, choice.score, own)
             score = part("score", choice.score, threshold=choice.scale)
             self.select = BestScore(score, at_noise if choice.own_noise else None)
         self.focal = _focal_search(stage(focal, Focal), self.select, self.search, refinement, choice)
@@ -259,8 +258,7 @@ def searched(pair: Pair) -> Pair:
 
 def _at_noise(score: Any, own: FitScale, F: Array, pair: Pair) -> Score:
     """A score at the noise of a pair near a model (9,)."""
-    scale = noise_scale(F, pair, own._replace(scale_sigmas=CHOICE_SIGMAS))
-    at: Score = part("score", score, threshold=scale)
+    at: Score = part("score", score, threshold=noise_scale(F, pair, own))
     return at
 
 

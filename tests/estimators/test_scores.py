@@ -346,7 +346,7 @@ def test_the_second_choice_is_made_at_the_noise_of_the_pair(noise: float, count:
     r = np.sqrt(residuals_squared_px(first, pair)) / pair.noises
     r = r[(r <= 2) & (pair.match_weight > 0.3)]
     scale = 1.5 if len(r) < 15 else np.clip(1.5 * 1.4826 * np.quantile(r, 0.5, method="inverted_cdf"), 0.3, 2.0)
-    select: Any = estimators.Ransac(select={"score": "msac", "scale": 0.3, "own_noise": True}).select
+    select: Any = estimators.Ransac(select={"score": "msac", "scale": 0.3, "own_noise": 1.5}).select
     np.testing.assert_allclose(select.of_pair(first, pair).threshold, scale, rtol=1e-12)
     best = int(np.argmax(scores_of(estimators.Msac(float(scale)), F, pair)))
     np.testing.assert_array_equal(select(Candidates(F, np.ones(len(F), np.bool_), pair), pair).F, F[best])
