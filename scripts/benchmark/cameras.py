@@ -54,6 +54,7 @@ TAKES = {
     "opencv": EXACT, "kornia": EXACT, "fastpose": (*EXACT, "shared", "unknown"),
 }  # fmt: skip
 """The levels that each method takes; ``_f``: a fundamental matrix without cameras, of which the pose is taken."""
+PEERS: dict[str, dict[str, Any]] = {"poselib": {"iterations": 5000, "prosac": True}, "colmap": {"two_view": True}}
 POSEBENCH = """PoseBench's relative poses (github.com/PoseLib/posebench) by its protocol, beside its published figures.
 
 FILES is the folder `relative` of its data, or one file of it; --root judges pairs in FM-Bench's layout in the same way,
@@ -158,9 +159,8 @@ def _solver(name: str, level: str, changed: dict[str, Any]) -> tuple[Callable[..
     kind, _, alone = name.partition("_")
     if kind in ESSENTIAL:
         return functools.partial(_peer, functools.partial(_with_cameras, _by_essential(kind, changed))), []
-    usual = {"poselib": {"iterations": 5000, "prosac": True}, "colmap": {"two_view": True}}.get(kind, {})
     shared = {"shared_focal": True} if (name, level) == ("poselib", "shared") else {}
-    changed = {**usual, **shared, **changed}
+    changed = {**PEERS.get(kind, {}), **shared, **changed}
     try:
         estimator = presets.build("estimator", kind, **changed)
     except ImportError as error:
