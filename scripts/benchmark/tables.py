@@ -200,7 +200,7 @@ class Results:
         if wide and short:
             by_family |= dict(zip(BASELINES, (wide, short), strict=True))
         by_family |= {"all": list(pairs)} if len(by_family) > 1 else {}
-        return by_family | (self.by_share(pairs, bounds) if bounds else {})
+        return by_family | (self.by_share(pairs, bounds) if bounds and pairs else {})
 
     def percent(self, method: str, pairs: Sequence[str], name: str) -> float:
         """The mean of a figure of a method over some pairs, in percent."""
