@@ -231,6 +231,7 @@ def test_pairs_are_grouped_by_the_share_of_right_matches() -> None:
         "70 to 100 % right": ["orbit/s/c"],
     }  # fmt: skip
     assert results.groups(results.pairs()) == {"orbit": results.pairs()}
+    assert Results([]).groups([], (0.4, 0.7)) == {}
 
 
 def test_the_public_call_is_a_method_and_gets_what_it_is_given() -> None:
