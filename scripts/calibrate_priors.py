@@ -99,11 +99,8 @@ def features(stage: Any, pair: Pair, kind: str) -> Array:
 
 def fit(columns: list[Array], own: list[Pair]) -> Array:
     """Logistic regression; each pair has weight 1."""
-
-    def total(w: Array) -> float:
-        return sum(loss(X @ w, pair.right) for X, pair in zip(columns, own, strict=True))
-
-    return np.asarray(minimize(total, np.zeros(columns[0].shape[1])).x)
+    start = np.zeros(columns[0].shape[1])
+    return np.asarray(minimize(lambda w: sum(loss(X @ w, p.right) for X, p in zip(columns, own, strict=True)), start).x)
 
 
 def loss(z: Array, right: Array) -> float:

@@ -1,4 +1,4 @@
-"""Pose, focal lengths and F by what is known of the cameras, beside PoseLib, COLMAP, OpenCV and kornia.
+"""Pose, focal lengths and F by what is known of the cameras, beside PoseLib, fastpose, COLMAP, OpenCV and kornia.
 
 A method is named as NAME:LEVEL[:KEY=VALUE,...]. Levels: known; rough (each focal length times a log-uniform factor of
 its own, 1/1.1 to 1.1, given with a deviation of 6 %); wrong (1.5 times too long, given as rough); one_sided (K0 alone);
@@ -51,9 +51,10 @@ EXACT = ("known", "rough", "wrong")
 TAKES = {
     "fmtorch": LEVELS, "fmtorch_f": LEVELS, "poselib": (*EXACT, "shared"),
     "poselib_f": (*EXACT, "one_sided", "shared", "unknown"), "colmap": (*EXACT, "one_sided", "shared", "unknown"),
-    "opencv": EXACT, "kornia": EXACT,
+    "opencv": EXACT, "kornia": EXACT, "fastpose": (*EXACT, "shared", "unknown"),
 }  # fmt: skip
 """The levels that each method takes; ``_f``: a fundamental matrix without cameras, of which the pose is taken."""
+PEERS: dict[str, dict[str, Any]] = {"poselib": {"iterations": 5000, "prosac": True}, "colmap": {"two_view": True}}
 POSEBENCH = """PoseBench's relative poses (github.com/PoseLib/posebench) by its protocol, beside its published figures.
 
 FILES is the folder `relative` of its data, or one file of it; --root judges pairs in FM-Bench's layout in the same way,
@@ -71,9 +72,8 @@ Published = dict[str, dict[str, dict[str, float]]]  # method -> data set -> colu
 
 
 def add_arguments(commands: Any) -> None:
-    parser = add_command(commands, "cameras", run, __doc__, pairs.add_match_options, seeds=1)
+    parser = add_command(commands, "cameras", run, __doc__, pairs.add_method_options, seeds=1)
     parser.add_argument("--methods", nargs="+", default=[], help="NAME:LEVEL[:KEY=VALUE,...]")
-    parser.add_argument("--specs", type=Path, help="a file with one method a line; # starts a comment")
     parser = add_command(commands, "posebench", run_posebench, POSEBENCH, pairs.add_match_options, seeds=1)
     parser.add_argument("files", nargs="?", type=Path, help="the folder `relative` of PoseBench's data, or one file")
     parser.add_argument("--methods", nargs="+", default=METHODS, help="KIND:PRESET[:KEY=VALUE,...], KIND being E or F")
@@ -89,7 +89,7 @@ def run(arguments: argparse.Namespace) -> None:
             raise SystemExit("no pair has cameras; a --root must hold Camera.txt files")
         return measure([method_of(word, matches) for word in words], items, arguments.seeds, kept)
 
-    show([sheet(pairs.rows_of(arguments, measured_rows))], arguments.table)
+    show([sheet(pairs.rows_of(arguments, measured_rows), arguments.shares)], arguments.table)
 
 
 def has_cameras(pair: ImagePair) -> bool:
@@ -157,34 +157,30 @@ def method_of(text: str, matches: str = "") -> Method:
 def _solver(name: str, level: str, changed: dict[str, Any]) -> tuple[Callable[..., Estimate], Stages]:
     """What a method computes, and the preset that it is made of."""
     kind, _, alone = name.partition("_")
-    if kind == "fmtorch":
-        own = presets.build("estimator", kind, **changed)
-        return functools.partial(_decomposed if alone else _with_cameras, own), [("estimator", kind, changed)]
     if kind in ESSENTIAL:
-        return functools.partial(_peer, _with_cameras, _by_essential(kind, changed)), []
-    usual: dict[str, Any] = {"iterations": 5000, "prosac": True} if kind == "poselib" else {"two_view": True}
+        return functools.partial(_peer, functools.partial(_with_cameras, _by_essential(kind, changed))), []
     shared = {"shared_focal": True} if (name, level) == ("poselib", "shared") else {}
-    changed = {**usual, **shared, **changed}
+    changed = {**PEERS.get(kind, {}), **shared, **changed}
     try:
         estimator = presets.build("estimator", kind, **changed)
     except ImportError as error:
         raise SystemExit(f"{name}: {error}") from error
-    call = _decomposed if alone or shared else _with_cameras
-    return functools.partial(_peer, call, estimator), [("estimator", kind, changed)]
+    call = functools.partial(_decomposed if alone or shared else _with_cameras, estimator)
+    return call if kind == "fmtorch" else functools.partial(_peer, call), [("estimator", kind, changed)]
 
 
 def _with_cameras(estimator: Any, c: Correspondences, seed: int) -> Estimate:
     return KnownCameras(estimator)(c, seed).detach()
 
 
-def _peer(call: Callable[..., Estimate], estimator: Any, c: Correspondences, seed: int) -> Estimate:
-    """By another library, which takes what is given for exact, and gets the matches in ascending order of ratios."""
-    assert c.ratio is not None
+def _peer(call: Callable[..., Estimate], c: Correspondences, seed: int) -> Estimate:
+    """By another library, which takes what is given for exact, and gets the matches in ascending order of ambiguity."""
+    assert c.ambiguity is not None
     assert c.focal is not None
-    order = c.ratio[0].argsort(stable=True)
+    order = c.ambiguity[0].argsort(stable=True)
     exact = torch.where(c.focal.isinf(), torch.inf, torch.tensor([1.0, 0.0], dtype=torch.float64))
     best_first = taken(c.replace(focal=exact), order)
-    estimate = call(estimator, best_first, seed)
+    estimate = call(best_first, seed)
     if estimate.t is None or not bool(estimate.t.isfinite().all()):
         estimate = _posed(estimate, best_first)
     return estimate.replace(inliers=estimate.inliers[:, order.argsort()])
@@ -256,17 +252,16 @@ def _by_essential(kind: str, changed: dict[str, Any]) -> PairwiseEstimator:
     return PairwiseEstimator(kind, solve, best_first=True)
 
 
-def sheet(rows: Sequence[Row]) -> Sheet:
+def sheet(rows: Sequence[Row], shares: Sequence[float]) -> Sheet:
     records: list[Record] = []
     columns = [*(f"pose@{t}" for t in (5, 10, 20)), "R.01", "AUC@0.05", "flipped, %"]
     columns += [*(f"focal within {p} %, %" for p in (5, 10)), "ms", "time ratio"]
     for level in LEVELS:
         own = [row for row in rows if row["method"].split(":")[1] == level]
         results = Results(sorted(own, key=lambda row: row["method"].split(":")[0] != "fmtorch"))
-        lines = results.records(results.groups(results.all_pairs), columns, "method", ["pose@5"])
+        lines = results.records(results.groups(results.all_pairs, shares), columns, "method", ["pose@5"])
         records += [{"known": level, "method": line.pop("method"), **line} for line in lines]
-    title = "AUC of the larger pose error at 5, 10 and 20 degrees, recall and AUC@0.05 of F, in %"
-    return Sheet("poses", title, records)
+    return Sheet("poses", "AUC of the larger pose error at 5/10/20 degrees, R.01 and AUC@0.05 of F, in %", records)
 
 
 # PoseBench

@@ -45,9 +45,8 @@ NATURAL: dict[Level, Callable[[Row], bool]] = {
 
 
 def add_arguments(commands: Any) -> None:
-    parser = add_command(commands, "estimators", run, __doc__, pairs.add_match_options, seeds=1)
+    parser = add_command(commands, "estimators", run, __doc__, pairs.add_method_options, seeds=1)
     parser.add_argument("--estimators", nargs="+", default=[], help="PRESET[:KEY=VALUE,...][@PRUNER+PRUNER...]")
-    parser.add_argument("--specs", type=Path, help="a file with one estimator a line; # starts a comment")
     parser.add_argument("--ngransac", type=Path, help="NG-RANSAC's published weights (scripts/convert_checkpoint.py)")
     parser = add_command(commands, "curves", run_curves, CURVES, pairs.add_match_options, seeds=1)
     parser.add_argument("--specs", type=Path, default=FOLDER / "curves.txt", help="lines: CURVE | ESTIMATOR | VALUES")
@@ -65,7 +64,7 @@ def run(arguments: argparse.Namespace) -> None:
     extra = ngransac(arguments.ngransac)
     specs = specs_of(arguments.estimators, arguments.specs) if pairs.named(arguments) else []
     results = measured([spec for spec in specs if extra or NGRANSAC not in stages_of(spec)], arguments, extra)
-    show([sheet(results)], arguments.table)
+    show([sheet(results, arguments.shares)], arguments.table)
 
 
 def measured(specs: Sequence[str], arguments: argparse.Namespace, extra: Mapping[str, Any]) -> Results:
@@ -79,10 +78,10 @@ def measured(specs: Sequence[str], arguments: argparse.Namespace, extra: Mapping
     return Results(pairs.rows_of(arguments, measured_rows))
 
 
-def sheet(results: Results) -> Sheet:
+def sheet(results: Results, shares: Sequence[float]) -> Sheet:
     """Recall, AUC@0.05, the lead of the first estimator over each, and times, of each set."""
     merits = ("R.05", "R.01", "AUC@0.05")
-    groups = results.groups(results.pairs())
+    groups = results.groups(results.pairs(), shares)
     records = results.records(groups, (*merits, "ms", "time ratio"), "estimator", merits[1:])
     seeds, first = min(results.seeds(name) for name in results.methods), results.methods[0]
     title = f"Recall at NSGD 0.05, at 0.01 and AUC@0.05 in %, mean of {seeds} seeds; lead: {first} minus this"

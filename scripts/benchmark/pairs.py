@@ -45,6 +45,13 @@ def add_match_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--cache", default="off", help="a folder that keeps features from run to run; off: nowhere")
 
 
+def add_method_options(parser: argparse.ArgumentParser) -> None:
+    """Those, and the options of tables that compare methods."""
+    add_match_options(parser)
+    parser.add_argument("--specs", type=Path, help="a file with one method a line; # starts a comment")
+    parser.add_argument("--shares", type=float, nargs="*", default=[], help="group pairs by right matches: 0.4 0.7")
+
+
 def sets_of(arguments: argparse.Namespace) -> list[PairDataset]:
     """The data sets that these options name, before any limit."""
     layout = "cameras" if arguments.all_pairs else "fmbench"

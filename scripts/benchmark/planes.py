@@ -1,4 +1,4 @@
-"""Homographies of photographs as planes: errors and milliseconds beside PoseLib and OpenCV, on the same matches.
+"""Homographies of photographs as planes: errors and milliseconds beside other libraries, on the same matches.
 
 docs/benchmarks/homographies.md says what warped and hard pairs and views are. SIFT, ratio 0.8, one match a location,
 P(inlier) from frame consistency. Every second photograph is for tuning (--tuning), the others for the claim.
@@ -37,7 +37,8 @@ from scripts.benchmark.tables import Record, Results, Sheet, grouped, show
 
 POSES = ("from F", "from H, the first pose", "from H, the better one")
 KINDS = ("warped", "hard", "views")
-METHODS = ("ours", "poselib:1", "poselib:2", "poselib:3", "usac_accurate:1", "usac_magsac:0.5")
+METHODS = ["ours", *(f"{name}:{px}" for name in ("poselib", "fastpose") for px in (1, 2, 3))]
+METHODS += ["usac_accurate:1", "usac_magsac:0.5"]
 Array = NDArray[Any]
 Solve = Callable[[Correspondences, int], Array | None]
 SIDE = 640  # px, the longer side of the photographs
@@ -96,15 +97,13 @@ class Plane(Item):
 
 
 class Homography(Measured):
-    """An estimator of homographies: ``ours:KEY=VALUE,...``, ``poselib:THRESHOLD``, or OpenCV's ``METHOD:THRESHOLD``."""
+    """An estimator of homographies: ``ours:KEY=VALUE,...``, or a peer or a method of OpenCV as ``NAME:THRESHOLD``."""
 
     identity = ""
 
     def __init__(self, word: str, solve: Solve | None = None, bent: float = 0.0) -> None:
-        name, _, setting = word.partition(":")
-        if solve is None and name == "ours":
-            solve = functools.partial(_ours, options(setting))
-        self.name, self.solve, self.bent = word, solve or functools.partial(_peer, name, float(setting)), bent
+        self.name, self.solve = word, solve or functools.partial(_solved, *word.partition(":")[::2])
+        self.bent = bent
 
     def figures(self, item: Item, seed: int) -> Row:
         """The mean error in pixels, infinite where there is no homography, and milliseconds."""
@@ -124,21 +123,23 @@ def estimated(c: Correspondences, seed: int = 0, **changed: Any) -> Estimate:
     return find_homography(c.x0, c.x1, seed=seed, **given, **changed)
 
 
-def _ours(changed: dict[str, Any], c: Correspondences, seed: int) -> Array | None:
-    estimate = estimated(c, seed, **changed)
-    return estimate.H[0].numpy() if bool(estimate.ok[0]) else None
-
-
-def _peer(name: str, threshold: float, c: Correspondences, seed: int) -> Array | None:
-    """Of PoseLib, or by a method of OpenCV."""
-    x0, x1 = points(c)
+def _solved(name: str, setting: str, c: Correspondences, seed: int) -> Array | None:
+    """By ours, PoseLib, fastpose or a method of OpenCV."""
+    if name == "ours":
+        estimate = estimated(c, seed, **options(setting))
+        return estimate.H[0].numpy() if bool(estimate.ok[0]) else None
+    (x0, x1), threshold = points(c), float(setting)
     if name == "poselib":
         import poselib
 
         return np.asarray(poselib.estimate_homography(x0, x1, {"max_reproj_error": threshold, "seed": seed}, {})[0])
-    cv2.setRNGSeed(seed)
     if len(x0) < 4:
         return None
+    if name == "fastpose":
+        from fastpose.estimators import estimate_homography
+
+        return np.asarray(estimate_homography(x0, x1, max_error=threshold, seed=seed)[0]["H"])
+    cv2.setRNGSeed(seed)
     H, _ = cv2.findHomography(x0, x1, getattr(cv2, name.upper()), threshold, maxIters=2000, confidence=0.9999)
     return None if H is None else np.asarray(H)
 

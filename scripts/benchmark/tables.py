@@ -185,14 +185,22 @@ class Results:
         every = {family: [pair for pair in pairs if self._places[pair][0] == family] for family in self.families}
         return {family: own for family, own in every.items() if own}
 
-    def groups(self, pairs: Sequence[str]) -> dict[str, list[str]]:
-        """These pairs by family, then those of wide and of short baselines where there are both, and all of several."""
+    def by_share(self, pairs: Sequence[str], bounds: Sequence[float]) -> dict[str, list[str]]:
+        """These pairs by the share of right matches, between ascending bounds; without matches it is 0."""
+        right = np.nan_to_num(self.get(self.methods[0], pairs)("inlier_rate_before").mean(0))
+        places, ends = np.digitize(right, bounds), [0, *bounds, 1]
+        names = [f"{100 * low:g} to {100 * high:g} % right" for low, high in itertools.pairwise(ends)]
+        return {name: [pair for pair, j in zip(pairs, places, strict=True) if j == i] for i, name in enumerate(names)}
+
+    def groups(self, pairs: Sequence[str], bounds: Sequence[float] = ()) -> dict[str, list[str]]:
+        """These pairs by family, of wide and of short baselines where there are both, all of several; `by_share`."""
         by_family = self.by_family(pairs)
         wide = [pair for family, own in by_family.items() if family in WIDE for pair in own]
         short = [pair for family, own in by_family.items() if family not in WIDE for pair in own]
         if wide and short:
             by_family |= dict(zip(BASELINES, (wide, short), strict=True))
-        return by_family | ({"all": list(pairs)} if len(by_family) > 1 else {})
+        by_family |= {"all": list(pairs)} if len(by_family) > 1 else {}
+        return by_family | (self.by_share(pairs, bounds) if bounds and pairs else {})
 
     def percent(self, method: str, pairs: Sequence[str], name: str) -> float:
         """The mean of a figure of a method over some pairs, in percent."""

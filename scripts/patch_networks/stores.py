@@ -247,13 +247,11 @@ def validation_pairs(store: PatchStore, count: int, seed: int = 0) -> Float[Tens
 class MatchSets:
     """The matches of pairs of photographs, set after set (Luo et al., GeoDesc, ECCV 2018, section 3.4).
     A loss then compares patches of one pair of photographs, as when a descriptor is used. patches: (2, k) indices of
-    the two patches of each match. similarity: (k,) its S_patch. first: (s + 1,) where each set begins.
-    image_similarity: (s,) the mean of a set's S_patch."""
+    the two patches of each match. similarity: (k,) its S_patch. first: (s + 1,) where each set begins."""
 
     patches: NDArray[np.int64]
     similarity: NDArray[np.float64]
     first: NDArray[np.int64]
-    image_similarity: NDArray[np.float64]
 
     def __len__(self) -> int:
         return len(self.first) - 1
@@ -275,7 +273,7 @@ def match_sets(store: PatchStore, matches: int, max_similarity: float = MAX_SIMI
         lacking = f"no pair of photographs shares {matches} points and has a similarity of at most {max_similarity}"
         raise ValueError(f"{lacking}: lower match_sets.matches, or cut more points")
     of_kept = np.repeat(kept, counts)
-    return MatchSets(pairs[:, of_kept], similarity[of_kept], np.r_[0, np.cumsum(counts[kept])], image[kept])
+    return MatchSets(pairs[:, of_kept], similarity[of_kept], np.r_[0, np.cumsum(counts[kept])])
 
 
 def _pairs_of_points(first: NDArray[np.int64]) -> NDArray[np.int64]:

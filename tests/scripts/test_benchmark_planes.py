@@ -183,7 +183,7 @@ def test_bougnoux_gives_the_focal_lengths_of_a_true_matrix() -> None:
 @pytest.mark.parametrize(("name", "level"), [(name, level) for name, levels in TAKES.items() for level in levels])
 def test_every_method_solves_an_easy_pair_at_each_level_that_it_takes(name: str, level: str) -> None:
     kind = name.partition("_")[0]
-    pytest.importorskip({"poselib": "poselib", "colmap": "pycolmap"}.get(kind, "cv2"))
+    pytest.importorskip({"poselib": "poselib", "fastpose": "fastpose", "colmap": "pycolmap"}.get(kind, "cv2"))
     ours = kind == "fmtorch"
     found = cameras.method_of(f"{name}:{level}" + ("" if ours else ":threshold=1")).figures(item(), 0)
     assert found["ok"]

@@ -127,10 +127,10 @@ def test_a_table_is_markdown_here_and_one_value_a_cell_in_its_file(tmp_path, cap
 
 def test_the_files_of_estimators_name_estimators_there_are() -> None:
     specs = [spec for curve in estimators.read_curves(read_specs(FOLDER / "curves.txt")) for spec in curve.specs]
-    for name in ("estimators.txt", "ablation.txt", "stress.txt", "unknown_cameras.txt"):
+    for name in ("estimators.txt", "ablation.txt", "stress.txt", "unknown_cameras.txt", "overlap.txt"):
         specs += [spec.strip("()") for spec in read_specs(FOLDER / name)]
     assert len(specs) > 80
-    words = {"ngransac", "sizeless", "ratioless", "part", "bent"}
+    words = {"ngransac", "sizeless", "ratioless", "scoreless", "priorless", "part", "bent"}
     for spec in specs:
         front, changed = split(spec.partition("@")[0])
         known = presets.load("estimator", front) if front not in ("truth", "find_fundamental") else {}
@@ -220,6 +220,18 @@ def exact_pair(size: tuple[int, int] = (480, 640)) -> Item:
 
 def measured(item: Item, *specs: str) -> list[Row]:
     return measure([methods.method(spec) for spec in specs], [item], 1, Kept(None))
+
+
+def test_pairs_are_grouped_by_the_share_of_right_matches() -> None:
+    shares = {"a": 0.39, "b": 0.4, "c": 1.0, "d": np.nan}  # NaN: without matches
+    results = Results(row("m", f"orbit/s/{name}", inlier_rate_before=share) for name, share in shares.items())
+    groups = results.groups(results.pairs(), (0.4, 0.7))
+    assert groups == {
+        "orbit": results.pairs(), "0 to 40 % right": ["orbit/s/a", "orbit/s/d"], "40 to 70 % right": ["orbit/s/b"],
+        "70 to 100 % right": ["orbit/s/c"],
+    }  # fmt: skip
+    assert results.groups(results.pairs()) == {"orbit": results.pairs()}
+    assert Results([]).groups([], (0.4, 0.7)) == {}
 
 
 def test_the_public_call_is_a_method_and_gets_what_it_is_given() -> None:
