@@ -30,9 +30,8 @@ from fmtorch.pipeline.pipeline import load_pipeline
 from fmtorch.scenes.surfaces import PICTURES, photograph
 from fmtorch.training.planes import list_photographs
 
-# Repositories under BSD, MIT or Apache licences.
 SOURCES = ["danini/magsac", "mapillary/OpenSfM", "3DOM-FBK/deep-image-matching", "vbalnt/tfeat", "ducha-aiki/affnet"]
-SOURCES += ["cvg/LightGlue"]
+SOURCES += ["cvg/LightGlue"]  # all under BSD, MIT or Apache licences
 PER_IMAGE = 1500  # descriptors, so that no image weighs more than another
 FEATURES: dict[str, tuple[str, Kind]] = {"rootsift_pca": ("sift", "sift"), "hardnet": ("hesaffnet", "hardnet")}
 CENTERS, DIMENSIONS = 64, 64

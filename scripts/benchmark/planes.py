@@ -52,8 +52,7 @@ Photographs: each as a plane, looked around in, copied, cropped, and beside anot
 tuning (--tuning), the others for the claim. Real and rendered pairs: --root, --rendered. SIFT, ratio 0.8, one match a
 location, P(inlier) from frame consistency, noise of matches.
 """
-# Scenes, and rendered families, whose depth and baseline every pair sees.
-GENERAL = {"castle-P19", "fountain-P11", "Herz-Jesus-P8", "sacre_coeur", "00", "driving", "orbit"}
+GENERAL = {"castle-P19", "fountain-P11", "Herz-Jesus-P8", "sacre_coeur", "00", "driving", "orbit"}  # of depth
 TIMED_FIELDS = ("x0", "x1", "mask", "ratio", "prior", "noise", "key", "size0", "size1", "K0", "K1")
 COLMAP = {
     "CALIBRATED": "general", "UNCALIBRATED": "general", "PLANAR": "planar", "PANORAMIC": "rotation",
@@ -102,8 +101,7 @@ class Homography(Measured):
     identity = ""
 
     def __init__(self, word: str, solve: Solve | None = None, bent: float = 0.0) -> None:
-        self.name, self.solve = word, solve or functools.partial(_solved, *word.partition(":")[::2])
-        self.bent = bent
+        self.name, self.bent, self.solve = word, bent, solve or functools.partial(_solved, *word.partition(":")[::2])
 
     def figures(self, item: Item, seed: int) -> Row:
         """The mean error in pixels, infinite where there is no homography, and milliseconds."""

@@ -89,8 +89,7 @@ def run(arguments: argparse.Namespace) -> None:
     for name in arguments.scenes:
         scene = read_scene(arguments.root / name)
         kinds = itertools.product(arguments.features, CAMERA_KINDS)
-        # Our features are shown once, with unknown cameras.
-        for features, cameras in ((f, c) for f, c in kinds if f == "colmap" or c == "unknown"):
+        for features, cameras in ((f, c) for f, c in kinds if f == "colmap" or c == "unknown"):  # ours are shown once
             database = database_of(scene, features, cameras, arguments.work)
             for seed, method in itertools.product(range(arguments.seeds), arguments.methods):
                 measure(scene, database, (scene.name, features, cameras, method, seed), arguments.mappers, kept)

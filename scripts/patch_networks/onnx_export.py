@@ -146,11 +146,10 @@ class _Graph:
         for name in (*quantised.input[1:], *self.writer[convolution.input[2]].input):
             self._put(name, np.tile(numpy_helper.to_array(self.constants[name]), pixels))
         ways["strides"].ints[1], ways["kernel_shape"].ints[1] = pixels * step, wide.shape[-1]
-        # (n, pixels * channels, side, side / pixels) -> (n, channels, side, side), for whoever reads it
         reader = self._reader(self._reader(convolution.output[0]).output[0])
         self._insert(reader, "Transpose", perm=[0, 2, 3, 1])
         self._insert(reader, "Reshape", [0, side, side, channels])
-        self._insert(reader, "Transpose", perm=[0, 3, 1, 2])
+        self._insert(reader, "Transpose", perm=[0, 3, 1, 2])  # (n, channels, side, side)
 
     def make_product(self, convolution: Any) -> None:
         """Write a convolution that sees its whole input at once as a matrix product of all patches."""
