@@ -50,8 +50,8 @@ class Refine:
 class Select:
     """Which refined model is the estimate: that of the largest score.
 
-    score: a name of the registry, or a score. scale: of it, Sampson distance, px. own_noise: the estimate is
-    that of the largest score at so many deviations of the pair's noise, which matches near the former tell; None: not.
+    score: a name of the registry, or a score. scale: of it, Sampson distance, px. own_noise: the choice is made again
+    with so many standard deviations of the noise of the matches near the first for a scale; None: it is made once.
     """
 
     score: Any = "saturated"
