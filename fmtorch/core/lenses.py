@@ -19,7 +19,7 @@ _TINY = 1e-12  # squared radius or parameter below which a quotient is replaced 
 class Lens:
     """A calibrated lens: focal lengths and principal point in pixels, with (0, 0) at the centre of the first pixel.
     model: its name in COLMAP, of `fmtorch.data.MODELS`. coefficients: as `MODELS` names them, without focal lengths and
-    principal point."""
+    principal point. Raises ValueError for an unknown model and for other coefficients than its own."""
 
     fx: float
     fy: float
@@ -27,6 +27,14 @@ class Lens:
     cy: float
     model: str = "PINHOLE"
     coefficients: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.model not in MODELS:
+            raise ValueError(f"lens model {self.model!r}; there are: {', '.join(MODELS)}")
+        names = MODELS[self.model].coefficients.split()
+        if len(self.coefficients) != len(names):
+            has = f"has coefficients {', '.join(names)}" if names else "has no coefficients"
+            raise ValueError(f"a lens of the model {self.model} {has}; {len(self.coefficients)} are given")
 
     @property
     def K(self) -> Matrix:

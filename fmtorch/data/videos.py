@@ -83,8 +83,8 @@ def _kitti_scene(home: Path, folder: Path, camera: int, window: int | float) -> 
 
 SIZE = (480, 640)  # h, w of all images
 CALIBRATIONS = {
-    "freiburg1": Lens(517.3, 516.5, 318.6, 255.3, "FULL_OPENCV", (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
-    "freiburg2": Lens(520.9, 521.0, 325.1, 249.7, "FULL_OPENCV", (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
+    "freiburg1": Lens(517.3, 516.5, 318.6, 255.3, "FULL_OPENCV", (0.2624, -0.9531, -0.0054, 0.0026, 1.1633, 0, 0, 0)),
+    "freiburg2": Lens(520.9, 521.0, 325.1, 249.7, "FULL_OPENCV", (0.2312, -0.7849, -0.0033, -0.0001, 0.9172, 0, 0, 0)),
     "freiburg3": Lens(535.4, 539.2, 320.1, 247.6),
 }
 """The colour cameras as the set's page gives them, for OpenCV; the images of freiburg3 are undistorted already."""

@@ -146,7 +146,7 @@ def find_fundamental(
         >>> bool(estimate.ok[0]), int(estimate.inliers[0, 20:].sum())
         (True, 60)
     """
-    lenses = None if lens is None else _lenses(lens, K0, K1)
+    lenses = None if lens is None else _lenses(lens, x0, K0, K1)
     if lenses is not None:
         (K0, K1), lens = lenses.K, None
     if covariance and K0 is None and K1 is None and focal is None:
@@ -172,13 +172,13 @@ def find_fundamental(
     return with_pair_type(estimate, seen, seed) if pair_type else estimate
 
 
-def _lenses(lens: Lens, K0: Arrays | None = None, K1: Arrays | None = None) -> CalibratedLenses | None:
+def _lenses(lens: Lens, x0: Arrays, K0: Arrays | None = None, K1: Arrays | None = None) -> CalibratedLenses | None:
     """Calibrated lenses, and K of their images and others; None where lenses are estimated, or lambda is known."""
     if not is_calibrated(lens):
         return None
     from fmtorch.two_view.lenses import CalibratedLenses
 
-    return CalibratedLenses(lens, K0, K1)
+    return CalibratedLenses(lens, x0, K0, K1)
 
 
 def _expect_lens(size: Size, calibrated: bool, covariance: bool) -> None:
@@ -253,7 +253,7 @@ def find_essential(
         >>> bool(estimate.ok[0]), [round(value, 3) for value in estimate.t[0].tolist()]
         (True, [-0.64, 0.48, 0.6])
     """
-    lenses = _lenses(lens, K0, K1)
+    lenses = _lenses(lens, x0, K0, K1)
     for name, K in zip(("K0", "K1"), (K0, K1) if lenses is None else lenses.K, strict=True):
         if K is None:
             raise ValueError(f"{name} is None; find_fundamental estimates pairs of which one camera or none is known")
@@ -319,7 +319,7 @@ def find_homography(
         >>> bool(estimate.ok[0]), int(estimate.inliers[0, 20:].sum()), tuple(estimate.H.shape)
         (True, 40, (1, 3, 3))
     """
-    lenses = None if lens is None else _lenses(lens)
+    lenses = None if lens is None else _lenses(lens, x0)
     if lenses is None and lens is not None and size0 is None:
         raise ValueError("lens needs the image sizes, in whose half diagonals it is: give size0 and size1")
     plane = lens is None if lenses is None else all(pair[0] is None for pair in lenses.pairs)

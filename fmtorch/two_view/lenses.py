@@ -20,15 +20,19 @@ FORMS = "a lens for both images, (lens0, lens1) with None for a pinhole, or a li
 
 
 class CalibratedLenses:
-    """The lenses of a batch. lens: as of `find_fundamental`. K: of the cameras, None without; of images without a lens
-    these may be given. Raises ValueError for other forms, and for the parameters of a lens for all pairs."""
+    """The lenses of a batch. lens: as of `find_fundamental`. x0: its points. K: of the cameras, None without; of images
+    without a lens these may be given. Raises ValueError for other forms, for lenses of another number of pairs, and for
+    the parameters of a lens for all pairs."""
 
-    def __init__(self, lens: Any, K0: Any = None, K1: Any = None) -> None:
+    def __init__(self, lens: Any, x0: Any, K0: Any = None, K1: Any = None) -> None:
         pairs = lens if isinstance(lens, list) and isinstance(lens[0], list | tuple) else [lens]
         self.pairs: list[Lenses] = [tuple(pair) if isinstance(pair, list | tuple) else (pair, pair) for pair in pairs]
         entries = [entry for pair in self.pairs for entry in pair]
         if {len(pair) for pair in self.pairs} != {2} or not all(isinstance(each, Lens | None) for each in entries):
             raise ValueError(f"lens holds a calibrated lens, so it must be {FORMS}")
+        count = len(x0) if isinstance(x0, list) or getattr(x0, "ndim", 2) == 3 else 1
+        if len(self.pairs) not in (1, count):
+            raise ValueError(f"lens has lenses for {len(self.pairs)} pairs of {count}; it must be {FORMS}")
         self.K = self._calibration(0, K0), self._calibration(1, K1)
         self.problems = [self._problem(pair) for pair in self.pairs]
         if len(self.pairs) == 1 and self.problems[0]:
@@ -59,8 +63,6 @@ class CalibratedLenses:
 
     def undistorted(self, c: Correspondences) -> Correspondences:
         """The matches as pinholes would have them; none of a pair whose lens is none."""
-        if len(self.pairs) not in (1, len(c)):
-            raise ValueError(f"lens has lenses for {len(self.pairs)} pairs of {len(c)}; it must be {FORMS}")
         of = range(len(self.pairs)) if len(self.pairs) == len(c) else [0] * len(c)
         valid = torch.tensor([not self.problems[i] for i in of], dtype=torch.bool, device=c.mask.device)
         return undistorted_matches(c.keep(valid[:, None] & c.mask), [self.pairs[i] for i in of])

@@ -128,11 +128,8 @@ def test_gradients_reach_the_photographs_points(find: Any) -> None:
     [
         ({"lens": NAN}, "the lens of image 0 has coefficients that are not finite"),
         ({"lens": (None, Lens(-1.0, 1.0, 0.0, 0.0))}, "K of the lens of image 1 has focal lengths -1, 1"),
-        (
-            {"lens": (RADIAL, -0.1)},
-            "lens holds a calibrated lens, so it must be a lens for both images",
-        ),
-        ({"lens": [(RADIAL, None), (None, RADIAL)]}, "lens has None for image 0 of some pairs"),
+        ({"lens": (RADIAL, -0.1)}, "lens holds a calibrated lens, so it must be a lens for both images"),
+        ({"lens": [(RADIAL, None), (None, RADIAL)]}, "lens has lenses for 2 pairs of 1"),
         ({"lens": RADIAL, "K0": PINHOLE.K}, "K0 and a lens of image 0 are given, and the lens has its own K"),
         ({"lens": (RADIAL, None)}, "K0 alone needs the image sizes: give size0 and size1"),
     ],
@@ -141,6 +138,18 @@ def test_what_makes_no_sense_is_refused_by_name(said: dict[str, Any], message: s
     x0, x1 = photographs(RADIAL, RADIAL)
     with pytest.raises(ValueError, match=re.escape(message)):
         fmtorch.find_fundamental(x0, x1, **said)
+
+
+def test_lenses_are_of_known_models_with_all_coefficients() -> None:
+    with pytest.raises(ValueError, match="lens model 'MAGIC'; there are: SIMPLE_PINHOLE, "):
+        Lens(500.0, 500.0, 320.0, 240.0, "MAGIC")
+    with pytest.raises(ValueError, match="a lens of the model OPENCV has coefficients k1, k2, p1, p2; 1 are given"):
+        Lens(500.0, 500.0, 320.0, 240.0, "OPENCV", (0.1,))
+    with pytest.raises(ValueError, match="of the model PINHOLE has no coefficients; 1 are given"):
+        Lens(500.0, 500.0, 320.0, 240.0, "PINHOLE", (0.1,))
+    x0, x1 = photographs(RADIAL, RADIAL)
+    with pytest.raises(ValueError, match="lens has None for image 0 of some pairs"):
+        fmtorch.find_fundamental(x0[None].repeat(2, 0), x1[None].repeat(2, 0), lens=[(RADIAL, None), (None, RADIAL)])
 
 
 def test_normalised_points_have_no_lens() -> None:
