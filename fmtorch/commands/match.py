@@ -195,6 +195,8 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
     presets.expect_stages(config)
     truth = None if fields.truth is None else read_matrix(fields.truth)
     given = photographs(paths, fields.cameras, fields.K, fields.orient)
+    if fields.lens is not None and "lens" in given.knowledge:
+        raise ValueError(f"lens={fields.lens} and cameras with a calibrated lens are given: leave one of them out")
     settings = {
         "pipeline": pipeline_name, "overrides": list(overrides), "seed": fields.seed, "orient": fields.orient,
         "longest_side": fields.longest_side, "truth": None if fields.truth is None else str(fields.truth),

@@ -31,8 +31,7 @@ from fmtorch.pipeline import Outcome, Pipeline, examined, match_records
 from fmtorch.runs import CachedFeatures, PairRow
 from fmtorch.runs.fingerprint import code_digest, file_digest, fmtorch_version, learned, libraries
 from fmtorch.two_view import known_cameras, pair_type
-from fmtorch.two_view.arguments import Lens, lens_fields
-from fmtorch.two_view.estimation import expect_lenses
+from fmtorch.two_view.arguments import Lens, expect_lenses, lens_fields
 
 PLACES = ("root", "file", "truth", "images")
 """Options of data sets that say where things lie; the digest says what they are."""

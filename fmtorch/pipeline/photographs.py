@@ -88,7 +88,7 @@ class PhotographCameras:
         return PhotographCamera()
 
     def knowledge(self, camera0: PhotographCamera, camera1: PhotographCamera) -> dict[str, Any]:
-        """K0, K1, focal, lens0 and lens1 of a pair, as `fmtorch.match` takes them."""
+        """K0, K1, focal and lens of a pair, as `fmtorch.match` takes them."""
         if self.word in ("unknown", "shared"):
             return {"focal": self.word}
         if self.word == "exif":
@@ -96,11 +96,12 @@ class PhotographCameras:
             return {"focal": "unknown" if measured == [None, None] else measured}
         if self._of_all is None and self._stored is None:
             return {}
-        knowledge: dict[str, Any] = {}
-        for i, camera in enumerate((camera0, camera1)):
-            knowledge[f"K{i}"] = None if camera.lens is None else camera.lens.K
-            if camera.lens is not None and camera.lens.bends:
-                knowledge[f"lens{i}"] = camera.lens
+        given = camera0.lens, camera1.lens
+        knowledge: dict[str, Any] = {
+            f"K{i}": None if lens is None or lens.bends else lens.K for i, lens in enumerate(given)
+        }
+        if any(lens is not None and lens.bends for lens in given):
+            knowledge["lens"] = tuple(lens if lens is not None and lens.bends else None for lens in given)
         if camera0.lens is None and camera1.lens is None:
             knowledge["focal"] = "unknown"
         return knowledge
@@ -108,8 +109,9 @@ class PhotographCameras:
     def given(self, paths: Sequence[Path], sizes: Sequence[tuple[int, int]]) -> dict[str, Any]:
         """What `relate` takes of a pair's cameras."""
         known = self.knowledge(*(self.of(path, size) for path, size in zip(paths, sizes, strict=True)))
-        lenses = known.get("lens0"), known.get("lens1")
-        fields = camera_fields(known.get("K0"), known.get("K1"), known.get("focal"), sizes_known=True)
+        lenses = known.get("lens", (None, None))
+        K0, K1 = (known.get(f"K{i}") if lens is None else lens.K for i, lens in enumerate(lenses))
+        fields = camera_fields(K0, K1, known.get("focal"), sizes_known=True)
         return {"cameras": fields, "lenses": lenses}
 
 

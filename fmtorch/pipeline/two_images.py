@@ -25,7 +25,7 @@ from fmtorch.pipeline.pair_geometries import pair_geometries
 from fmtorch.pipeline.photographs import GivenImage, Image, frames_to_original, given_image, to_original
 from fmtorch.pipeline.pipeline import Clock, Pipeline, load_pipeline
 from fmtorch.two_view import arguments, known_cameras
-from fmtorch.two_view.estimation import expect_lenses
+from fmtorch.two_view.lenses import CalibratedLenses
 from fmtorch.two_view.pair_type import classify, compile_with, still_warning, warnings_of
 
 FLAT = ("planar", "rotation", "identical")  # pair types of which a homography explains all matches
@@ -267,8 +267,6 @@ def match(
     K1: arguments.Arrays | None = None,
     focal: arguments.Focal = None,
     lens: arguments.Lens = None,
-    lens0: Lens | None = None,
-    lens1: Lens | None = None,
 ) -> MatchResult:
     """Match two photographs and estimate their fundamental matrix.
 
@@ -281,10 +279,9 @@ def match(
             the results are always in pixels of the originals.
         seed: of sampling.
         K0, K1, focal: what is known of the cameras, in pixels of the photographs, as of `find_fundamental`.
-        lens: how much lenses bend straight lines that nobody calibrated, as of `find_fundamental`: "shared", "unknown",
-            or lambda. What is estimated is in `lens`, F relates undistorted points, as with lens0 and lens1.
-        lens0, lens1: lenses that distort, whose calibrations stand for K0 and K1. Features are those of the
-            photographs; matches are undistorted before the estimator, and F relates undistorted points.
+        lens: as of `find_fundamental`, of one pair. Features are those of the photographs; matches are undistorted
+            before the estimator where lenses are calibrated, and F relates undistorted points. What is estimated is in
+            `lens`.
 
     Returns:
         Matches, F and inliers in pixels of the originals. Photographs that cannot be related are no error: `related` is
@@ -312,17 +309,18 @@ def match(
     elif device is not None and torch.device(device) != pipeline.device:
         raise ValueError(f"device={device}, but the pipeline was built for {pipeline.device}; leave one of them out")
     images = [photographs.given_image(image, name) for image, name in ((image0, "image0"), (image1, "image1"))]
-    K0, K1 = (K if lens is None else lens.K for K, lens in ((K0, lens0), (K1, lens1)))
+    lenses: Lenses = (None, None)
+    if arguments.is_calibrated(lens):
+        calibrated = CalibratedLenses(lens, None, K0, K1)
+        lenses, lens, (K0, K1) = calibrated.pairs[0], None, calibrated.K
     if lens is not None:
-        expect_lenses(pipeline.estimator, type(pipeline.estimator).__name__)
+        arguments.expect_lenses(pipeline.estimator, type(pipeline.estimator).__name__)
         arguments.expect_lens(lens)
-    if lens is not None and (lens0 is not None or lens1 is not None):
-        raise ValueError("lens and lens0 or lens1 are given; a lens is estimated or calibrated: leave one of them out")
     cameras = arguments.camera_fields(K0, K1, focal, sizes_known=True)
     describing = functools.partial(describe, pipeline, longest_side=longest_side)
     at_once = functools.partial(mapped, share=True) if pipeline.device.type == "cpu" else map
     described0, described1 = at_once(describing, images)
-    result = relate(pipeline, described0, described1, seed, cameras | arguments.lens_fields(lens), (lens0, lens1))
+    result = relate(pipeline, described0, described1, seed, cameras | arguments.lens_fields(lens), lenses)
     return dataclasses.replace(result, photographs=(image0, image1))
 
 

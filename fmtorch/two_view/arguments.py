@@ -273,6 +273,12 @@ def is_calibrated(lens: Any) -> bool:
     return isinstance(lens, CalibratedLens) or (isinstance(lens, list | tuple) and any(map(is_calibrated, lens)))
 
 
+def expect_lenses(estimator: object, name: str) -> None:
+    """Raise ValueError where an estimator of this name estimates no lenses."""
+    if not getattr(estimator, "assumes_cameras", False):
+        raise ValueError(f"lens needs an estimator with the option focal, as fmtorch; {name} has none")
+
+
 def expect_lens(lens: Lens) -> None:
     """Raise ValueError for a lens that is none, before there are pairs."""
     correspondences(torch.zeros(1, 0, 2), torch.zeros(1, 0, 2), lens=lens)

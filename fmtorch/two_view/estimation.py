@@ -22,6 +22,7 @@ from fmtorch.jobs.execution import one_thread
 from fmtorch.presets.files import load
 from fmtorch.presets.objects import construct, instantiate, merged
 from fmtorch.pruning.consistency import FrameConsistency, PositionConsistency
+from fmtorch.two_view.arguments import expect_lenses
 from fmtorch.two_view.assumed_sizes import attempts_of, better_of
 from fmtorch.two_view.known_cameras import KnownCameras
 
@@ -79,12 +80,6 @@ def _expect_gradients(c: Correspondences, estimator: Estimator, name: str) -> No
                 f"{field} requires a gradient, and the final fit of estimator={name} passes none to it: "
                 f"give {field}.detach(), or take another (estimator=fmtorch, or the option final=gauss_newton)"
             )
-
-
-def expect_lenses(estimator: Estimator, name: str) -> None:
-    """Raise ValueError where an estimator of this name estimates no lenses."""
-    if not getattr(estimator, "assumes_cameras", False):
-        raise ValueError(f"lens needs an estimator with the option focal, as fmtorch; {name} has none")
 
 
 def _with_prior(c: Correspondences, estimator: Estimator) -> Correspondences:

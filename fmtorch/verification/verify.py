@@ -31,7 +31,7 @@ from fmtorch.jobs.execution import Execution, Shard, shard_of
 from fmtorch.jobs.runner import Factory, Local, Source, TaskRunner, WorkerPool
 from fmtorch.pipeline.pair_geometries import pair_geometries
 from fmtorch.two_view import arguments, pair_type
-from fmtorch.two_view.estimation import estimated_by, expect_lenses
+from fmtorch.two_view.estimation import estimated_by
 
 Cameras = Literal["stored", "shared", "unknown"]
 """What is taken for known: the cameras of the database, that both images have one focal length, or nothing."""
@@ -406,7 +406,7 @@ def verify_by(
     if (gives := stages.model_of(estimator)) != "fundamental":
         raise ValueError(f"estimator gives {gives} matrices; verify needs one that gives fundamental matrices")
     if mode.lens is not None:
-        expect_lenses(estimator, type(estimator).__name__)
+        arguments.expect_lenses(estimator, type(estimator).__name__)
     make = (lambda: estimator) if mode.execution.shared else make
     known = "unknown" if paths.features is not None and mode.cameras == "stored" else mode.cameras
     mode = dataclasses.replace(mode, cameras=known, seed=seed)

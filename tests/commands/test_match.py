@@ -338,15 +338,14 @@ def test_a_lens_bends_points_and_not_images(pair: ImagePair, pipeline_with_camer
     plain = [fmtorch.data.read_image(image) for image in (pair.image0, pair.image1)]
     bent = [photographed(image, lens) for image, lens in zip(plain, lenses, strict=True)]
     given = {"pipeline": pipeline_with_cameras, "longest_side": SIDE}
-    lens0, lens1 = lenses
-    result = fmtorch.match(*bent, **given, lens0=lens0, lens1=lens1)
+    result = fmtorch.match(*bent, **given, lens=lenses)
     ignored = fmtorch.match(*bent, **given, K0=K0, K1=K1)
     assert torch.equal(result.keypoints0, ignored.keypoints0)  # features are of the photographs
     assert torch.equal(result.correspondences.x0, ignored.correspondences.x0)
     assert ignored.undistorted is None
     assert error(result, pair) < 0.5 < error(ignored, pair)
     x0, x1 = (x[0][result.inliers].double() for x in (result.undistorted.x0, result.undistorted.x1))
-    expected = undistorted_points(lens0, result.correspondences.x0[0][result.inliers].numpy())
+    expected = undistorted_points(lenses[0], result.correspondences.x0[0][result.inliers].numpy())
     np.testing.assert_allclose(x0.numpy(), expected, atol=1e-3)
     assert sampson(result.F[None], x0[None], x1[None]).sqrt().median() < 1
     sizes = torch.tensor([plain[0].shape[:2]])
@@ -379,8 +378,8 @@ def test_a_lens_that_nobody_calibrated(pair: ImagePair, pipeline_with_cameras: f
     straight = fmtorch.match(*plain, **given, lens="shared")
     assert straight.lens.tolist() == [0, 0]
     assert straight.undistorted is None
-    with pytest.raises(ValueError, match="lens and lens0 or lens1 are given"):
-        fmtorch.match(*bent, **given, lens="shared", lens0=division)
+    with pytest.raises(ValueError, match="K0 and a lens of image 0 are given"):
+        fmtorch.match(*bent, **given, lens=division, K0=pair.K0)
     with pytest.raises(ValueError, match="lens needs an estimator with the option focal"):
         fmtorch.match(*bent, pipeline="sift_gms", lens="shared")
 
@@ -420,9 +419,9 @@ def test_distortion_is_taken_out_and_sizes_must_fit(tmp_path: Path) -> None:
     paths = [with_exif(tmp_path, name) for name in ("a.jpg", "b.jpg")]
     (tmp_path / "cameras.txt").write_text("1 SIMPLE_RADIAL 60 40 50 30 20 0.2\n")
     bent = photographs(paths, tmp_path / "cameras.txt", None, True)
-    assert bent.knowledge["K0"].tolist() == [[50, 0, 29.5], [0, 50, 19.5], [0, 0, 1]]
+    assert bent.knowledge["K0"] is None
     assert "b.jpg: F and the pose are of the image without the distortion of its SIMPLE_RADIAL lens" in bent.notes[1]
-    assert bent.knowledge["lens1"].coefficients == (0.2,)
+    assert bent.knowledge["lens"][1] == Lens(50, 50, 29.5, 19.5, "SIMPLE_RADIAL", (0.2,))
     assert np.array_equal(bent.images[0], fmtorch.data.read_image(paths[0]))  # as it was taken
     (tmp_path / "cameras.txt").write_text("1 PINHOLE 50 40 50 50 30 20\n")
     with pytest.raises(ImageError, match=r"a\.jpg: 60 x 40 px, but its camera is of 50 x 40"):
