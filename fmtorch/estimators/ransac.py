@@ -134,8 +134,8 @@ class Ransac:
         if choice is not None:
             own = self.family.fit_scale._replace(scale_sigmas=choice.own_noise or 0.0)
             at_noise = functools.partial(_at_noise, choice.score, own)
-            score = part("score", choice.score, threshold=choice.scale)
-            self.select = BestScore(score, at_noise if choice.own_noise else None)
+            first: Score = part("score", choice.score, threshold=choice.scale)
+            self.select = BestScore(first, at_noise if choice.own_noise else None)
         self.focal = _focal_search(stage(focal, Focal), self.select, self.search, refinement, choice)
 
     @property
