@@ -143,7 +143,6 @@ def test_the_protocol_gives_each_estimator_its_options() -> None:
     preset, own = presets.load("estimator", "fmtorch"), protocol("E:fmtorch", 2.0)
     assert own["threshold"] == 2 * preset["threshold"]
     assert own["select"]["scale"] == 2 * preset["select"]["scale"]
-    assert own["focal"]["exact"]["scale"] == 2 * preset["focal"]["exact"]["scale"]
     assert (own["hypotheses"], own["focal"]["rounds"] * preset["focal"]["samples"]) == (1000, 1000)
     kept = protocol("E:fmtorch:scaled=false,focal.rounds=12", 2.0)
     assert "threshold" not in kept
