@@ -107,7 +107,7 @@ class FocalSearch:
             if turn + 1 >= options.min_rounds and agreed and stop:
                 break
         assert candidates is not None
-        if candidates.valid:
+        if candidates.valid and self.choice.at_noise is not None:
             candidates = candidates.judged(self.choice.of_pair(candidates.F[candidates.best], pair), pair)
         return SearchResult(candidates, pair.calibration is not None or (pair.same_size and stop), draws)
 

@@ -117,10 +117,10 @@ def fit_distance(r2: Array, own: FitScale) -> float:
     )
 
 
-def noise_scale(F: Array, pair: Pair, own: FitScale) -> float:
-    """The scale of the loss of a fit near a model (9,) in pixels, by the noise of the matches within the largest."""
-    r2 = squared_in_noises(F, pair)
-    return fit_distance(r2[(r2 <= squared(own.largest_px)) & (pair.match_weight > MIN_PRIOR_FOR_NOISE)], own)
+def noise_scale(r2: Array, pair: Pair, own: FitScale, within: float) -> float:
+    """The scale of a loss in pixels by the noise of the likely matches within so many pixels of a model.
+    r2: squared residuals (n,), of matches of usual noise, px^2."""
+    return fit_distance(r2[(r2 <= squared(within)) & (pair.match_weight > MIN_PRIOR_FOR_NOISE)], own)
 
 
 @functools.cache

@@ -16,7 +16,7 @@ import numpy as np
 from fmtorch.core.types import MAX_LENS, MIN_LENS
 from fmtorch.estimators.final_fits import FOCAL_TOLERANCE, Fit
 from fmtorch.estimators.focal_search import FocalSearch
-from fmtorch.estimators.inliers import MIN_PRIOR_FOR_NOISE, fit_distance
+from fmtorch.estimators.inliers import MIN_PRIOR_FOR_NOISE, fit_distance, noise_scale
 from fmtorch.estimators.models import posterior
 from fmtorch.estimators.models.focal_prior import MIN_DEVIATION, focal_cost
 from fmtorch.estimators.models.model import FitScale
@@ -348,10 +348,10 @@ def squared_px(model: Array, lens: Array, pair: Pair) -> Array:
     return r2 * squared(pair.pixels_per_unit)
 
 
-def noise_scale(fit: LensFit, pair: Pair) -> float:
+def _noise_scale(fit: LensFit, pair: Pair) -> float:
     """From which Sampson distance on matches do not count, px, by the noise of those that lie within the start's."""
     r2 = squared_px(fit.F, fit.lens, pair) / np.square(pair.noises)
-    return fit_distance(r2[(r2 <= squared(START_SCALE_PX)) & (pair.match_weight > MIN_PRIOR_FOR_NOISE)], FitScale())
+    return noise_scale(r2, pair, FitScale(), START_SCALE_PX)
 
 
 def lens_prior(lens: Lens) -> LensPrior:
@@ -376,7 +376,7 @@ def lenses_of(pair: Pair, search: FocalSearch) -> Array:
         fits += _round(np.where(unknown, start, mean), prior, pair, search)
     if not fits:
         return mean
-    scale = noise_scale(min(fits, key=lambda fit: fit.cost), pair)
+    scale = _noise_scale(min(fits, key=lambda fit: fit.cost), pair)
     best = _best(fits, prior, pair, scale)
     if unknown.all():
         straight, none = lens_prior(STRAIGHT), np.zeros(2)
@@ -449,7 +449,7 @@ def suggested_lens(fit: Fit, pair: Pair) -> float:
     if not suspicious(float(near.lens[0]), float(near.deviation[0])):
         return math.nan
     fits = [near, *(refined(pinholes._replace(lens=np.array(start)), unknown) for start in STARTS[1:])]
-    scale = noise_scale(min(fits, key=lambda fit: fit.cost), pair)
+    scale = _noise_scale(min(fits, key=lambda fit: fit.cost), pair)
     best, without = _best(fits, unknown, pair, scale), _best([refined(pinholes, straight)], straight, pair, scale)
     lens, deviation = float(best.lens[0]), float(best.deviation[0])
     clear = abs(lens) > max(SUGGESTED_LENS, SUGGESTED_DEVIATIONS * deviation)

@@ -21,7 +21,7 @@ from fmtorch.estimators.degensac import Degensac
 from fmtorch.estimators.final_fits import FinalFit, Fit
 from fmtorch.estimators.focal_search import FocalSearch, PlausibleCandidates
 from fmtorch.estimators.gradients import Attached
-from fmtorch.estimators.inliers import InlierRule, StoppingRule, noise_scale, residuals_squared_px
+from fmtorch.estimators.inliers import InlierRule, StoppingRule, noise_scale, residuals_squared_px, squared_in_noises
 from fmtorch.estimators.lens_search import lens_fit, lenses_of, squared_px, suggested_lens, undistorted
 from fmtorch.estimators.models.model import FitScale, Refining
 from fmtorch.estimators.models.with_focals import FundamentalWithFocals
@@ -258,7 +258,7 @@ def searched(pair: Pair) -> Pair:
 
 def _at_noise(score: Any, own: FitScale, F: Array, pair: Pair) -> Score:
     """A score at the noise of a pair near a model (9,)."""
-    at: Score = part("score", score, threshold=noise_scale(F, pair, own))
+    at: Score = part("score", score, threshold=noise_scale(squared_in_noises(F, pair), pair, own, own.largest_px))
     return at
 
 
