@@ -88,6 +88,9 @@ def run_command(command: Command, task: Task) -> None:
     with terminal.exits_with_message(command.interrupted):
         paths = [*composition.path_fields(command.options), *command.texts]
         sys.argv[1:] = hydra_arguments(sys.argv[1:], paths, command.positional)
+        for name, _, value in (word.partition("=") for word in sys.argv):
+            if value.startswith("[") and isinstance(preset := command.groups.get(name), str):
+                raise ValueError(f"{name}={value}; it must be one preset, such as {preset}")
         if any(word.startswith("hydra/launcher=submitit") for word in sys.argv):
             print(SUBMITTED, flush=True)
         if not any(word.startswith("hydra.mode=") for word in sys.argv):

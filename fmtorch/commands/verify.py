@@ -45,6 +45,8 @@ def run(config: DictConfig, estimator: str) -> Verification:
         console.print(f"nothing to do: {said}", soft_wrap=True)
     console.print(_table(result))
     console.print(str(result.path), style="dim")
+    if result.pairs and len(result.problems) == result.pairs:
+        sys.exit("error: no pair has a geometry")
     return result
 
 

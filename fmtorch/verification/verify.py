@@ -417,9 +417,6 @@ def verify_by(
         parts = GeometryParts(end.with_name(f"{end.name}.parts"), {**settings, **store.identity()})
         run = VerificationRun(store, parts, mode)
         run.each_batch(make, mode.execution, report)
-        if whole and run.problems and not parts.done and len(run.todo) == len(run.pairs):
-            shutil.rmtree(parts.folder)
-            raise ValueError(f"no pair has a geometry, the first because of {run.problems[0]}")
         if whole:
             run.write()
     if whole:

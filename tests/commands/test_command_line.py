@@ -98,6 +98,8 @@ COUNT = "it must be a whole number of at least 1"
         ("eval +dataset.sise=full", "dataset: no option sise; there are: size"),
         ("eval estimator._target_=fmtorch.estimators.Magic", "estimator: _target_=fmtorch.estimators.Magic cannot be"),
         ("eval pipeline=sift_magic", "no preset 'sift_magic' in pipeline; there are: sift_"),
+        ("eval estimator=[]", "estimator=[]; it must be one preset, such as ransac"),
+        ("eval dataset=[]", "dataset=[]; it must be one preset, such as rendered"),
         ("eval estimator=ransak", "no preset 'ransak' in estimator; there are: ransac"),
         ("eval pruner=[ratio,gmss]", "no preset 'gmss' in pruner; there are: gms"),
         ("eval estimator.treshold=2", "no option estimator.treshold; there are: threshold"),

@@ -167,11 +167,12 @@ def test_what_an_estimator_raises_is_of_its_pair_alone(tmp_path: Path) -> None:
     result = fmtorch.verify(matches=save(tmp_path / "matches.npz", arrays), **given)
     assert result.verified == 1
     assert [text.partition(" (")[0] for text in result.problems] == ["b/x0, b/x1: ZeroDivisionError: too few"]
-    output.unlink()
     for minimum, said in ((1000, "ZeroDivisionError: too few"), (0, "FailsOnFew returned None; it must return")):
-        with pytest.raises(ValueError, match=f"no pair has a geometry, the first because of .*{said}"):
-            fmtorch.verify(matches=tmp_path / "matches.npz", minimum=minimum, **given)
-        assert {path.name for path in tmp_path.iterdir()} == {"estimator", "matches.npz"}
+        result = fmtorch.verify(matches=tmp_path / "matches.npz", minimum=minimum, force=True, **given)
+        assert [said in line for line in result.problems] == [True, True]
+        assert not load(output)
+        assert {path.name for path in tmp_path.iterdir()} == {"estimator", "matches.npz", output.name}
+    output.unlink()
     paths = verification.VerifyPaths(None, None, tmp_path / "matches.npz", output)
     with pytest.raises(ZeroDivisionError, match="too few"):
         verification.verify_by(lambda: FailsOnFew(1000), {}, paths, verification.VerifyMode(debug=True), None)
@@ -229,6 +230,10 @@ def test_a_complete_output_is_left_as_it_is(ending: str, tmp_path: Path) -> None
     save(path, {"a/x0": x0, "a/x1": x1, "b/x0": x0, "b/x1": x1})
     with pytest.raises(ValueError, match="exists; name another file"):
         fmtorch.verify(matches=path, output=output)
+    save(path, {"a/x0": x0 / 1000, "a/x1": x1 / 1000})
+    done = run_command("verify", f"matches={path.name}", f"output={output.name}", "force=true", cwd=tmp_path)
+    assert (done.returncode, done.stderr.splitlines()[-1]) == (1, "error: no pair has a geometry")
+    assert "a/x0, a/x1: x0 runs from" in done.stderr
 
 
 @pytest.mark.parametrize(
