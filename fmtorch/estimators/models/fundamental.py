@@ -8,7 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from fmtorch.estimators.models.model import FitScale, Hypotheses, Loss, Steps
+from fmtorch.estimators.models.model import FitScale, Hypotheses
 from fmtorch.estimators.pair import Pair, to_pixels
 from fmtorch.geometry.eight_point import eight_point_kernel, weighted_eight_point
 from fmtorch.geometry.epipolar import HOMOGRAPHY, SAMPSON, Residual
@@ -51,12 +51,11 @@ class Matrices:
         """Models (k, 9) of least robust error near F -> out (k, 9), and their costs (k,)."""
         raise NotImplementedError
 
-    def refine(self, F: Array, pair: Pair, loss: Loss, steps: Steps) -> Array:
+    def refine(self, F: Array, pair: Pair, loss: str, scale: float, schedule: Schedule) -> Array:
         """As `Refining.refine`."""
-        s2 = np.square(loss.scale / pair.pixels_per_noise)
-        matches = Weighted.of(pair.points, self.weight(pair), s2, loss.name)
+        matches = Weighted.of(pair.points, self.weight(pair), np.square(scale / pair.pixels_per_noise), loss)
         refined, cost = np.empty_like(F), np.empty(len(F))
-        self.minimise(F, matches, Schedule(steps.iterations, steps.damping, steps.tolerance or 0.0), refined, cost)
+        self.minimise(F, matches, schedule, refined, cost)
         np.copyto(refined, F, where=~np.isfinite(cost)[:, None])
         return refined
 
@@ -86,7 +85,7 @@ class Fundamental(Matrices):
     linear, gauss_newton = weighted_eight_point, gauss_newton
 
     def to_pixels(self, F: Array, pair: Pair, out: Array) -> bool:
-        """As `Estimated.to_pixels`, the entry of largest magnitude positive."""
+        """As `Refining.to_pixels`, the entry of largest magnitude positive."""
         return to_pixels(F, pair.centre, pair.pixels_per_unit, out)
 
     def minimise(self, F: Array, matches: Weighted, schedule: Schedule, out: Array, cost: Array) -> None:
@@ -123,7 +122,7 @@ class Homography(Matrices):
     linear, gauss_newton = weighted_homography, step_of_homography
 
     def to_pixels(self, F: Array, pair: Pair, out: Array) -> bool:
-        """As `Estimated.to_pixels`."""
+        """As `Refining.to_pixels`."""
         return homography_to_pixels(F, pair.centre, pair.pixels_per_unit, out)
 
     def weight(self, pair: Pair) -> Array:

@@ -34,14 +34,6 @@ class Refined(NamedTuple):
     share: F8x1
 
 
-class FocalFit(NamedTuple):
-    """A model (9,), its cameras, and what the logarithm of the likelihood would gain without prior."""
-
-    F: Array
-    cameras: Cameras
-    gain: float
-
-
 class FundamentalWithFocals:
     """Square pixels, central principal points, usual focal lengths, of images whose sizes are known."""
 
@@ -68,14 +60,15 @@ class FundamentalWithFocals:
         refine_with_prior(F, Subset(pair.table, images_of(pair), parallel, LOSS_SCALE_PX), limits, cameras, refined)
         return cameras, refined
 
-    def fit(self, start: Cameras, pair: Pair, truncation: float, limits: Limits) -> FocalFit:
-        """The maximum a posteriori of the truncated Sampson error near one candidate; truncation: px."""
+    def fit(self, start: Cameras, pair: Pair, truncation: float, limits: Limits) -> tuple[Array, Cameras, float]:
+        """The maximum a posteriori of the truncated Sampson error near one candidate: a model (9,), its cameras, and
+        what the logarithm of the likelihood would gain without prior. truncation: px."""
         cameras, images, matches = start.copy(), images_of(pair), centred(pair, truncation)
         out, F, gain = posterior.no_optimum(1), np.empty((1, 9)), np.empty(1)
         posterior.minimise(cameras, Weighted.of(matches.points, pair.weight, matches.s2), images, limits, out)
         posterior.translate(out.F, images.offset, F)
         gain_without_prior(out.hessian[0], out.gradient[0], cameras.focal[0], images.prior, gain)
-        return FocalFit(F[0], cameras, float(gain[0]))
+        return F[0], cameras, float(gain[0])
 
 
 class Subset(NamedTuple):
