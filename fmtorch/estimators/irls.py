@@ -20,8 +20,7 @@ from fmtorch.estimators.pair import Pair, squared
 from fmtorch.geometry import attached_step
 from fmtorch.geometry.eight_point import weighted_eight_point
 from fmtorch.geometry.irls import reweighted_kernel
-from fmtorch.geometry.levenberg_marquardt import FIRST_DAMPING, Schedule, Weighted
-from fmtorch.geometry.rank2_manifold import SQUARINGS
+from fmtorch.geometry.levenberg_marquardt import Schedule, Weighted
 from fmtorch.geometry.refine import refine_kernel
 from fmtorch.geometry.robust_losses import named_loss
 from fmtorch.jit.kernel import Array
@@ -97,8 +96,7 @@ class IterativelyReweighted:
         for i in range(self.iterations):
             reweighted_kernel(F, self._weighted(pair, max(widest * DECAY**i, scale)))
         refined, cost = np.empty_like(F), np.empty(len(F))
-        schedule = Schedule(self.refine_iterations, FIRST_DAMPING, 0.0)
-        refine_kernel(F, SQUARINGS, self._weighted(pair, scale), schedule, refined, cost)
+        refine_kernel(F, self._weighted(pair, scale), Schedule(self.refine_iterations), refined, cost)
         best = int(np.argmin(np.where(np.isfinite(cost), cost, np.inf)))
         if not np.isfinite(cost[best]):
             return Solution(None, 0, reason=NOT_DETERMINED)

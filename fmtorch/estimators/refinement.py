@@ -17,7 +17,7 @@ from fmtorch.estimators.preselection import first_shuffled
 from fmtorch.estimators.scores import Score, scored
 from fmtorch.estimators.search import Pool
 from fmtorch.geometry.epipolar import HOMOGRAPHY, SAMPSON, Residual
-from fmtorch.geometry.levenberg_marquardt import FIRST_DAMPING, Schedule
+from fmtorch.geometry.levenberg_marquardt import Schedule
 from fmtorch.jit.kernel import Array, F4x2, I8x1, Kernel, kernel
 from fmtorch.jit.random import Stream
 
@@ -65,8 +65,7 @@ class Refinement:
         if self.local_optimization is not None:
             F = self.local_optimization(F, pair)
         if (options := self.options) is not None:
-            schedule = Schedule(options.iterations, FIRST_DAMPING, 0.0)
-            F = family.refine(F, near, options.loss, options.scale, schedule)
+            F = family.refine(F, near, options.loss, options.scale, Schedule(options.iterations))
         return Candidates(F, pool.valid, near)
 
 

@@ -155,16 +155,19 @@ def assemble(sums: Array, products: Array) -> None:
             q += 1
 
 
+SQUARINGS = 5  # enough for any matrix whose last two singular values differ by half
 FIRST_DAMPING, MIN_DAMPING, MAX_DAMPING = 1e-4, 1e-12, 1e6  # relative to the greatest curvature
 
 
 class Schedule(NamedTuple):
     """iterations: steps at most. damping: of the first. tolerance: a model is done once a step has lowered its cost by
-    no more than this share of it; 0: none is ever done."""
+    no more than this share of it; 0: none is ever done. squarings: of the start of a fundamental matrix (`start_one`).
+    """
 
     iterations: int
-    damping: float
-    tolerance: float
+    damping: float = FIRST_DAMPING
+    tolerance: float = 0.0
+    squarings: int = SQUARINGS
 
 
 class Problem(NamedTuple):

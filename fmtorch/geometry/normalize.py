@@ -12,9 +12,8 @@ from torch import Tensor
 from fmtorch.geometry.arithmetic import as_components, as_matrices, component_sum, matmul3, sqrt, stable_sum, unit
 from fmtorch.geometry.cameras import PixelFrame
 from fmtorch.geometry.epipolar import Matrix, unit_frobenius
-from fmtorch.geometry.levenberg_marquardt import Weighted
+from fmtorch.geometry.levenberg_marquardt import Schedule, Weighted
 from fmtorch.geometry.robust_losses import LOSSES, RobustLoss, named_loss
-from fmtorch.jit.kernel import Array
 
 Points = Float[Tensor, "*batch n 2"]
 PerMatch = Float[Tensor, "*batch n"]
@@ -192,16 +191,17 @@ class NormalizedMatches:
 
 @torch.no_grad()
 def fitted_by(
-    fit: Callable[[Array, Weighted, Array, Array], None], models: Float[Tensor, "9 p k"], error: RobustSum
+    fit: Callable[..., None], models: Float[Tensor, "9 p k"], error: RobustSum, iterations: int
 ) -> tuple[Float[Tensor, "9 p k"], Float[Tensor, "p k"]]:
-    """Models and costs after fit(models (k, 9), matches, out (k, 9), cost (k,)), a kernel, of each pair, on the CPU.
-    A model that cannot be fitted comes back as it was, with infinite cost."""
+    """Models and costs after so many steps of a kernel, fit(models (k, 9), matches, schedule, out (k, 9), cost (k,)),
+    of each pair, on the CPU. A model that cannot be fitted comes back as it was, with infinite cost."""
     start = as_matrices(models).flatten(2).cpu().contiguous().numpy()
     columns, weights = (t.detach().cpu().contiguous().numpy() for t in (error.points.movedim(1, 0), error.weight))
     scales = error.s2.detach().expand_as(error.weight).cpu().contiguous().numpy()
     out, cost = np.empty_like(start), np.empty(start.shape[:2])
     for p, given in enumerate(start):
-        fit(given, Weighted.of(columns[p], weights[p], scales[p], error.loss), out[p], cost[p])
+        matches = Weighted.of(columns[p], weights[p], scales[p], error.loss)
+        fit(given, matches, Schedule(iterations), out[p], cost[p])
     known = np.isfinite(cost)
     fitted = torch.from_numpy(np.where(known[..., None], out, start)).to(models.device)
     return fitted.permute(2, 0, 1).contiguous(), torch.from_numpy(np.where(known, cost, np.inf)).to(models.device)

@@ -11,13 +11,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from fmtorch.geometry.arithmetic import as_rows, cofactors, component_sum, unit
-from fmtorch.geometry.levenberg_marquardt import Weighted, evaluate
+from fmtorch.geometry.levenberg_marquardt import SQUARINGS, Weighted, evaluate
 from fmtorch.geometry.matrices import assign, cofactors_kernel, unit_kernel
 from fmtorch.jit.kernel import Array, F8x1, F8x2, inner, kernel, matrix, vector
 from fmtorch.jit.lanes import LANES, load, store
 
 RANK_TWO, RANK_TWO_EPIPOLE = (0.5**0.5, 0.0, 0.0, 0.0, 0.5**0.5, 0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 1.0)
-SQUARINGS = 5  # enough for any matrix whose last two singular values differ by half
 
 
 def constrained_solve(
