@@ -73,8 +73,8 @@ def normal_equations(
         rows.append(np.append(slope.ravel(), e[match] / np.sqrt(g2[match])))
     A = np.array(rows)
     r2 = e**2 / g2
-    robust, R2, S2 = LOSSES[name], torch.from_numpy(r2), torch.from_numpy(s2)
-    return A.T @ (A * (weight * robust.weight(R2, S2).numpy())[:, None]), float(weight @ robust.loss(R2, S2).numpy())
+    slope = LOSSES[name].weight(torch.from_numpy(r2), torch.from_numpy(s2)).numpy()
+    return A.T @ (A * (weight * slope)[:, None]), float(weight @ loss(r2, s2, name))
 
 
 def levenberg_marquardt(
