@@ -115,7 +115,7 @@ def test_bad_weights():
 
 def test_gradient():
     s = scene(12, noise=0.5)
-    x0 = (s.x0 / 500).requires_grad_()
+    x0, x1 = (s.x0 / 500).requires_grad_(), (s.x1 / 500).requires_grad_()
     w = torch.rand(12, dtype=torch.float64) + 0.2
     w[3] = 0.0
     w[-1] = 1.5  # the largest stays the largest

@@ -19,8 +19,6 @@ from tests.estimators.pairs import apart
 from tests.geometry.scenes import SCALE, distance, near_scene, tolerances, unit_scene
 from tests.reference import refine as reference
 
-TABULATED = 1e-6  # relative error of a cost by the table: weights are linear between entries
-
 
 def components(x0: np.ndarray, x1: np.ndarray) -> Tensor:
     return torch.from_numpy(np.c_[x0, x1].T.copy())[:, None]
@@ -42,7 +40,8 @@ def test_robust_optimum_equals_scipy(loss: str, seed: int) -> None:
     fitted, cost = fitted_by(refine_kernel, F0, RobustSum(components(x0, x1), ones, loss, s2), 60)
     # From our optimum SciPy, which knows another parametrisation and numerical gradients, cannot get lower.
     _, min_cost = reference.optimum(fitted[:, 0, 0].reshape(3, 3).numpy(), x0, x1, np.ones(120), loss, scale)
-    assert cost.item() == pytest.approx(min_cost, rel=TABULATED if loss == "magsac" else 1e-8)
+    # The tabulated loss is linear between its entries, whose integral is off by up to 1e-7.
+    assert cost.item() == pytest.approx(min_cost, rel=1e-6 if loss == "magsac" else 1e-8)
     if loss in ("geman_mcclure", "truncated"):  # bounded losses; the others let a quarter of outliers move F far
         assert distance(fitted[:, 0, 0], torch.from_numpy(F.flatten())) < 0.05
 
@@ -148,7 +147,7 @@ def test_costs_and_normal_equations(loss: str, n: int) -> None:
     for derivatives in (True, False):
         products, cost = np.zeros((5, 10, 10)), np.empty(5)
         evaluate(F, Weighted.of(points, weight, s2, loss), derivatives, products, cost)
-        np.testing.assert_allclose(cost, expected_cost, rtol=TABULATED if loss == "magsac" else 1e-11)
+        np.testing.assert_allclose(cost, expected_cost, rtol=1e-11)
         if derivatives:
             size = np.sqrt(np.einsum("kii,kjj->kij", normal, normal))  # what the sums of an entry cancel from, at most
             assert (np.abs(products - normal) <= 1e-12 * size + 1e-300).all()
@@ -198,7 +197,7 @@ def expect_refined(F: np.ndarray, *given: Any) -> None:
     fitted, cost = refined(F, *given)
     for i, start in enumerate(F):
         expected, expected_cost = reference.levenberg_marquardt(start, *given[:-1], FIRST_DAMPING, given[-1])
-        assert cost[i] == pytest.approx(expected_cost, rel=TABULATED if given[3] == "magsac" else 1e-9)
+        assert cost[i] == pytest.approx(expected_cost, rel=1e-9)
         assert apart(fitted[i], expected) < 1e-8
     assert np.abs(np.linalg.det(fitted.reshape(-1, 3, 3))).max() < 1e-14
 
