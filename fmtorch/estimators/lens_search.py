@@ -26,7 +26,7 @@ from fmtorch.geometry import levenberg_marquardt
 from fmtorch.geometry.arithmetic import logarithm_kernel
 from fmtorch.geometry.levenberg_marquardt import MATCH, TINY, Weighted, add_products, assemble, in_rows, robust
 from fmtorch.geometry.matrices import assign
-from fmtorch.geometry.rank2_manifold import eliminate
+from fmtorch.geometry.rank2_manifold import damped_step
 from fmtorch.jit.kernel import Array, F8x1, F8x2, F8x3, inner, kernel, matrix, vector
 from fmtorch.jit.lanes import LANES, added, fill, load, store, where
 
@@ -236,14 +236,7 @@ def _derivatives(state: _State, data: _Data, k: int, focal: Array, W: Array) -> 
 def _step(state: _State, damping: Array, trial: _State) -> None:
     Q, x = np.zeros((2 * PARAMETERS, LANES)), vector(PARAMETERS)
     for k in range(len(damping)):
-        for r in range(PARAMETERS):  # two rows of Q for each of the system
-            for c in range(PARAMETERS):
-                Q[2 * r + c // LANES, c % LANES] = state.hessian[k, r, c]
-            Q[2 * r + r // LANES, r % LANES] += state.hessian[k, r, r] * damping[k]
-            Q[2 * r + 1, PARAMETERS - LANES] = -state.gradient[k, r]
-        eliminate(Q, PARAMETERS)
-        for r in range(PARAMETERS):
-            x[r] = Q[2 * r + 1, PARAMETERS - LANES]
+        damped_step(state.hessian[k], state.gradient[k], damping[k], Q, x)
         posterior.move_cameras(state, k, x, state.tied[0], trial)
         for i in range(2):
             step = x[7 if state.tied[1] else 7 + i]

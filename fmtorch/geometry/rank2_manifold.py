@@ -192,6 +192,22 @@ def damped_system(products: Array, x: Array, damping: float, Q: Array) -> None:
 
 
 @inner
+def damped_step(hessian: Array, gradient: Array, damping: float, Q: Array, x: Array) -> None:
+    """Solves ``(H + damping diag H) x = -gradient`` of n parameters -> x (n,). Q: for the work, each row of the system,
+    (n, n + 1), being one or more of LANES numbers."""
+    n = len(x)
+    wide = len(Q) // n
+    for r in range(n):
+        for c in range(n):
+            Q[wide * r + c // LANES, c % LANES] = hessian[r, c]
+        Q[wide * r + r // LANES, r % LANES] += hessian[r, r] * damping
+        Q[wide * r + n // LANES, n % LANES] = -gradient[r]
+    eliminate(Q, n)
+    for r in range(n):
+        x[r] = Q[wide * r + n // LANES, n % LANES]
+
+
+@inner
 def eliminate(Q: Array, n: int) -> None:
     """Gauss-Jordan elimination of (n, n + 1) without pivoting, in place: the solution is the last column.
     Each row of the matrix is one or more of Q's rows of LANES."""

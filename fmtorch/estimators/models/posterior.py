@@ -16,7 +16,7 @@ from fmtorch.geometry.arithmetic import exponential, logarithm_kernel
 from fmtorch.geometry.levenberg_marquardt import Weighted, evaluate, minimiser
 from fmtorch.geometry.matrices import assign, assign_rows
 from fmtorch.geometry.pose import nearest_axes
-from fmtorch.geometry.rank2_manifold import SQUARINGS, eliminate, start_one
+from fmtorch.geometry.rank2_manifold import SQUARINGS, damped_step, start_one
 from fmtorch.jit.kernel import Array, F8x1, F8x2, F8x3, F8x4, inner, kernel, matrix, vector
 from fmtorch.jit.lanes import LANES, fill, load, store
 
@@ -326,9 +326,7 @@ def _derivatives(
 def _step(state: _State, damping: Array, trial: _State) -> None:
     Q, x = matrix(7, LANES), vector(7)
     for k in range(len(damping)):
-        damped_step(state.hessian[k], state.gradient[k], damping[k], Q)
-        for i in range(7):
-            x[i] = Q[i, 7]
+        damped_step(state.hessian[k], state.gradient[k], damping[k], Q, x)
         move_cameras(state, k, x, state.shared, trial)
 
 
@@ -340,17 +338,6 @@ def move_cameras(state: Any, k: int, x: Array, shared: bool, trial: Any) -> None
     for i in range(2):
         step = x[5 if shared else 5 + i]
         trial.focal[k, i] = min(max(state.focal[k, i] + min(max(step, -1.0), 1.0), -3.0), 3.0)
-
-
-@inner
-def damped_step(hessian: Array, gradient: Array, damping: float, Q: Array) -> None:
-    """Solves ``(H + damping diag H) x = -gradient`` -> last column of Q (7, LANES)."""
-    for i in range(7):
-        for j in range(7):
-            Q[i, j] = hessian[i, j]
-        Q[i, i] += hessian[i, i] * damping
-        Q[i, 7] = -gradient[i]
-    eliminate(Q, 7)
 
 
 @inner

@@ -15,6 +15,7 @@ from fmtorch.estimators.pair import Pair, squared
 from fmtorch.geometry.five_point import five_point
 from fmtorch.geometry.levenberg_marquardt import GEMAN_MCCLURE, Weighted
 from fmtorch.geometry.matrices import unit_kernel
+from fmtorch.geometry.rank2_manifold import damped_step
 from fmtorch.geometry.refine import STEP_DAMPING
 from fmtorch.jit.kernel import Array, F8x1, F8x2, kernel, matrix, vector
 from fmtorch.jit.lanes import LANES
@@ -108,7 +109,7 @@ def refine_with_prior(F: F8x2, subset: Subset, limits: Limits, cameras: Cameras,
 @kernel(holds_gil=True)
 def gain_without_prior(hessian: F8x2, gradient: F8x1, focal: F8x1, prior: FocalPrior, out: F8x1) -> None:
     """What the logarithm of the likelihood would rise by at an optimum without prior -> out (1,)."""
-    Q, H, g, work, total = matrix(7, LANES), matrix(7, 7), vector(7), vector(5), 0.0
+    Q, H, g, x, work, total = matrix(7, LANES), matrix(7, 7), vector(7), vector(7), vector(5), 0.0
     focal_cost(focal, prior, work)
     for i in range(7):
         g[i] = gradient[i] - (work[i - 5] if i >= 5 else 0.0)
@@ -117,7 +118,7 @@ def gain_without_prior(hessian: F8x2, gradient: F8x1, focal: F8x1, prior: FocalP
             if i >= 5 and j >= 5:
                 own = work[i - 3] if i == j else work[4]
             H[i, j] = hessian[i, j] - own
-    posterior.damped_step(H, g, STEP_DAMPING, Q)
+    damped_step(H, g, STEP_DAMPING, Q, x)
     for i in range(7):
-        total += g[i] * Q[i, 7]
+        total += g[i] * x[i]
     out[0] = -total / 2
