@@ -236,7 +236,7 @@ def _evaluate(state: _State, problem: Problem, derivatives: bool) -> None:
 
 
 @inner
-def _step(state: _State, damping: Array, trial: _State) -> None:
+def _step(problem: Problem, state: _State, damping: Array, trial: _State) -> None:
     Q = matrix(18, LANES)
     for k in range(len(damping)):
         _stepped(state.products[k], state.H[k], damping[k], Q, trial.H[k])

@@ -52,7 +52,7 @@ def _evaluate(state: _State, problem: Problem, derivatives: bool) -> None:
 
 
 @inner
-def _step(state: _State, damping: Array, trial: _State) -> None:
+def _step(problem: Problem, state: _State, damping: Array, trial: _State) -> None:
     steps(state.products, state.F, state.e0, state.e1, damping, trial.F, trial.e0, trial.e1)
 
 

@@ -65,8 +65,8 @@ class FundamentalWithFocals:
         """The maximum a posteriori of the truncated Sampson error near one candidate: a model (9,), its cameras, and
         what the logarithm of the likelihood would gain without prior. truncation: px."""
         cameras, images, matches = start.copy(), images_of(pair), centred(pair, truncation)
-        out, F, gain = posterior.no_optimum(1), np.empty((1, 9)), np.empty(1)
-        posterior.minimise(cameras, Weighted.of(matches.points, pair.weight, matches.s2), images, limits, out)
+        out, F, gain = posterior.start_at(cameras), np.empty((1, 9)), np.empty(1)
+        posterior.minimise(out, Weighted.of(matches.points, pair.weight, matches.s2), images, limits)
         posterior.translate(out.F, images.offset, F)
         gain_without_prior(out.hessian[0], out.gradient[0], cameras.focal[0], images.prior, gain)
         return F[0], cameras, float(gain[0])
@@ -86,12 +86,13 @@ class Subset(NamedTuple):
 def refine_with_prior(F: F8x2, subset: Subset, limits: Limits, cameras: Cameras, out: Refined) -> None:
     """`FundamentalWithFocals.refine` of models (k, 9) -> cameras, out."""
     table, images, k = subset.table, subset.images, len(F)
-    optimum = Optimum(matrix(k, 9), vector(k), matrix(k, 7), np.empty((k, 7, 7)))
+    axes, focal = cameras.axes, cameras.focal
+    optimum = Optimum(axes, focal, matrix(k, 9), vector(k), matrix(k, 7), np.empty((k, 7, 7)))
     centred_matches = matrix(6, table.shape[1])
     posterior.centre(table, images.offset, subset.scale, centred_matches)
     points, s2, scale = centred_matches[:4], centred_matches[4], centred_matches[5]
     posterior.nearest_cameras(F, images, cameras)
-    posterior.minimise(cameras, Weighted(points, table[4], s2, GEMAN_MCCLURE, matrix(2, 0)), images, limits, optimum)
+    posterior.minimise(optimum, Weighted(points, table[4], s2, GEMAN_MCCLURE, matrix(2, 0)), images, limits)
     posterior.translate(optimum.F, images.offset, out.models)
     work = vector(5)
     for i in range(k):

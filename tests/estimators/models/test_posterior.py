@@ -38,9 +38,9 @@ def evaluated(
     cameras: posterior.Cameras, pair: Pair, loss: str, scale_px: float, precision: float
 ) -> posterior.Optimum:
     """The posterior at cameras: `minimise` without a step."""
-    matches, out = posterior.centred(pair, scale_px), posterior.no_optimum(1)
+    matches, out = posterior.centred(pair, scale_px), posterior.start_at(cameras.copy())
     weighted = Weighted.of(matches.points, pair.weight, matches.s2, loss)
-    posterior.minimise(cameras.copy(), weighted, posterior.images_of(pair), posterior.Limits(precision, 0, 0.0), out)
+    posterior.minimise(out, weighted, posterior.images_of(pair), posterior.Limits(precision, 0, 0.0))
     return out
 
 
@@ -154,8 +154,8 @@ def test_a_fit_goes_on_after_a_rejected_step() -> None:
     begin.focal[0] += [0.1, -0.1]
     weighted = Weighted.of(matches.points, pair.weight, matches.s2)
     before = evaluated(begin, pair, "truncated", px, precision)
-    single_step, out = begin.copy(), posterior.no_optimum(1)
-    posterior.minimise(single_step, weighted, posterior.images_of(pair), posterior.Limits(precision, 1, 0.05), out)
+    out = posterior.start_at(begin.copy())
+    posterior.minimise(out, weighted, posterior.images_of(pair), posterior.Limits(precision, 1, 0.05))
     assert out.cost == before.cost
     _, cameras, _ = FAMILY.fit(begin, pair, px, posterior.Limits(precision, 30, 0.05))
     after = evaluated(cameras, pair, "truncated", px, precision)
