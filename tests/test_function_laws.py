@@ -96,7 +96,6 @@ FUNCTIONS: dict[str, Callable[[Pairs], Any]] = {
     "inlier_rate": lambda p: metrics.inlier_rate(p.F, p.x0, p.x1, p.noise > 0.7, **sizes(p), mask=p.mask),
     "irls": lambda p: geometry.irls(p.x0, p.x1, p.F, p.weight, p.mask, scale=2.0),
     "nearest_rank2": lambda p: geometry.nearest_rank2(p.H),
-    "normalize_pair": lambda p: geometry.normalize_pair(p.x0, p.x1, p.mask),
     "normalize_points": lambda p: geometry.normalize_points(p.x0, p.mask, p.weight),
     "pose_error": lambda p: metrics.pose_error(p.R, p.t, p.R.detach().mT, p.t.detach().flip(-1)),
     "pose_from_fundamental": lambda p: geometry.pose_from_fundamental(p.F, p.K0, p.K1, p.x0, p.x1, p.mask, p.weight),
@@ -105,14 +104,13 @@ FUNCTIONS: dict[str, Callable[[Pairs], Any]] = {
     "refine_homography": lambda p: geometry.refine_homography(p.H, p.x0, p.x1, p.weight, p.mask, scale=20.0),
     "reweighted_fits": fits,
     "right_of_homography": lambda p: metrics.right_of_homography(p.H, p.x0, p.x1, mask=p.mask),
-    "rotation_from_homography": lambda p: geometry.rotation_from_homography(p.H, p.K0, p.K1),
     "seven_point": lambda p: geometry.seven_point(p.x0[:, 1:8], p.x1[:, 1:8]),
     "significance": lambda p: geometry.significance(p.F, p.x0, p.x1, p.mask, **sizes(p)),
     "two_view_covariance": covariance,
 }
 
 
-AS_THEY_ARE = (*DISTANCES, "normalize_pair", "normalize_points", "reweighted_fits")
+AS_THEY_ARE = (*DISTANCES, "normalize_points", "reweighted_fits")
 """Functions of which a gradient is NaN where points or weights are."""
 
 

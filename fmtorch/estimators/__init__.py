@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from fmtorch.estimators.inliers import BetterHalf, InlierRule, RobustDeviations, StoppingRule, WithinThreshold
     from fmtorch.estimators.irls import IterativelyReweighted
     from fmtorch.estimators.models.fundamental import EightPoint, Fundamental, Homography, SevenPoint
-    from fmtorch.estimators.models.model import BITS, FitScale, Hypotheses, Loss, Steps, cheirality
+    from fmtorch.estimators.models.model import BITS, FitScale, Hypotheses, cheirality
     from fmtorch.estimators.options import Focal, Preselect, Refine, Select
     from fmtorch.estimators.pair import MAX_NOISE, MIN_NOISE, Lens, Pair, bucket, uniforms
     from fmtorch.estimators.preselection import Preselection
@@ -50,9 +50,9 @@ __all__ = [
     "BITS", "MAX_NOISE", "MIN_NOISE", "PARTS", "WITH_FOCALS", "Batch", "BestOfSearch", "BestScore", "BetterHalf",
     "Candidates", "CoarseToFine", "Degensac", "EightPoint", "F4x1", "F4x2", "F8x1", "F8x2", "FitScale", "Focal",
     "Fundamental", "GemanMcClure", "GraphCut", "Homography", "Hypotheses", "I8x1", "I8x2", "InlierCount", "InlierRule",
-    "IterativelyReweighted", "Lens", "Loss", "Magsac", "Median", "Msac", "Pair", "PairwiseEstimator", "Pool",
+    "IterativelyReweighted", "Lens", "Magsac", "Median", "Msac", "Pair", "PairwiseEstimator", "Pool",
     "Preselect", "Preselection", "PriorWeighted", "Prosac", "Ransac", "Refine", "Refinement", "RobustDeviations",
-    "Sampler", "SaturatedGains", "Score", "Search", "Select", "SevenPoint", "Solution", "Steps", "StoppingRule",
+    "Sampler", "SaturatedGains", "Score", "Search", "Select", "SevenPoint", "Solution", "StoppingRule",
     "SummedGains", "Uniform", "Verified", "WithinThreshold", "bucket", "cheirality", "colmap", "degensac_cpp",
     "fastpose", "gc_ransac_cpp", "kernel", "kornia_ransac", "largest_weight", "magsac_cpp", "opencv",
     "part", "poselib", "scores_of", "superansac_cpp", "uniforms", "weighted_eight_point",

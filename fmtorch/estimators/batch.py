@@ -7,7 +7,7 @@ changes no result. What stands beside a pair in the batch is never looked at.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +18,7 @@ from fmtorch.core.types import DEVIATION, FOCAL, PROBABILITY, SIZE, Corresponden
 from fmtorch.estimators.final_fits import Fit, scale_of
 from fmtorch.estimators.gradients import Attach, Solved, with_gradients
 from fmtorch.estimators.lens_search import undistorted
-from fmtorch.estimators.models.model import Estimated
+from fmtorch.estimators.models.model import Refining
 from fmtorch.estimators.models.posterior import focal_precision, focals_near, focals_px
 from fmtorch.estimators.pair import EXACT, Lens, Pair, PixelMatches, bucket, calibration_of, normalize_pair
 from fmtorch.estimators.preselection import degenerate_support
@@ -27,7 +27,7 @@ from fmtorch.geometry.epipolar import SAMPSON, Residual
 from fmtorch.geometry.significance import of_one_pair
 from fmtorch.jit.batches import as_array
 from fmtorch.jit.kernel import Array
-from fmtorch.jobs.execution import available
+from fmtorch.jobs.execution import available, mapped
 
 PARTS_OF_A_THREAD = 4  # so that no thread is long alone at the end
 MIN_WORK = 500  # matches: a pair of fewer takes as long as one of these
@@ -51,24 +51,13 @@ class Solution(NamedTuple):
     lens_suggested: float = math.nan
 
 
-class Row(NamedTuple):
-    """A pair of a batch that can be tried: its place there, and its matches as they came.
-    slot: (n,), where the pair's matches are among these. needed: inliers below which a model is none."""
-
-    place: int
-    matches: PixelMatches
-    pair: Pair
-    slot: Array
-    needed: int
-
-
 class Estimation:
     """The estimation of a batch of pairs on the host: the pairs, and the estimates that become of them.
     family: of the models. minimal: matches below which a pair is not tried, and inliers below which a model is none.
     calibrated: the same of a pair whose focal lengths are exactly known; None: cameras make no difference."""
 
     def __init__(
-        self, c: Correspondences, seed: int, family: Estimated, minimal: int, calibrated: int | None = None
+        self, c: Correspondences, seed: int, family: Refining, minimal: int, calibrated: int | None = None
     ) -> None:
         host = c if c.mask.device.type == "cpu" else c.detach().to("cpu")
         b, n = c.mask.shape
@@ -86,32 +75,40 @@ class Estimation:
         self.graphed = torch.is_grad_enabled() and c.requires_grad
         self.solved: dict[int, Solved] = {}
 
-    def rows(self, part: Sequence[int]) -> Iterator[Row]:
-        """Those of a part that can be tried; the others have their reason."""
-        for i in part:
-            matches = self.batch.pair(i)
-            needed = self.calibrated if self.batch.calibrated(i) else self.minimal
-            normalized = self.batch.normalized(matches, i, self.seed, needed, self.family.residual)
-            if isinstance(normalized, str):
-                self.reasons[i] = normalized
-            else:
-                yield Row(i, matches, *normalized, needed)
+    def estimates(self, estimate: Callable[[Pair], Solution], attach: Attach) -> Estimate:
+        """What becomes of the pairs by an estimator of one; attach: of the gradients of its fits."""
 
-    def put(self, row: Row, solution: Solution) -> None:
+        def estimate_part(part: Sequence[int]) -> None:
+            with np.errstate(all="ignore"):  # infinite or NaN beyond the range of a float
+                for i in part:
+                    self._estimate_pair(i, estimate)
+
+        mapped(estimate_part, self.parts)
+        return self._together(attach)
+
+    def _estimate_pair(self, i: int, estimate: Callable[[Pair], Solution]) -> None:
         """The solution of a pair as its estimate, or the reason why there is none."""
-        i, pair = row.place, row.pair
+        matches = self.batch.pair(i)
+        needed = self.calibrated if self.batch.calibrated(i) else self.minimal
+        normalized = self.batch.normalized(matches, i, self.seed, needed, self.family.residual)
+        if isinstance(normalized, str):
+            self.reasons[i] = normalized
+            return
+        pair, slot = normalized
+        solution = estimate(pair)
         self.samples[i] = solution.samples
         if solution.fit is None or solution.inliers is None:
             self.reasons[i] = solution.reason
-        elif degenerate := degenerate_support(pair, solution.inliers, row.needed, relative_rounding(self.c)):
+        elif degenerate := degenerate_support(pair, solution.inliers, needed, relative_rounding(self.c)):
             self.reasons[i] = degenerate
         elif not self.family.to_pixels(solution.fit.F, pair, self.F[i]):
             self.F[i], self.reasons[i] = 0, NOT_FINITE
         else:
             self.ok[i] = True
-            self.inliers[i, row.slot] = solution.inliers
+            self.inliers[i, slot] = solution.inliers
             fundamental = self.family.model == "fundamental"
-            matches = row.matches if solution.lens is None else _straight(row, solution.lens)
+            if solution.lens is not None:
+                matches = _straight(matches, pair, slot, solution.lens)
             given = matches.x0, matches.x1, matches.mask, matches.sizes[:2], matches.sizes[2:]
             self.significance[i] = of_one_pair(self.F[i], *given) if fundamental else np.nan
             if solution.lens is not None:
@@ -125,10 +122,9 @@ class Estimation:
                 for rows, value in zip(self.cameras.values(), known, strict=True):
                     rows[i] = value
             if self.graphed:
-                self.solved[i] = Solved(pair, row.slot, solution.fit)
+                self.solved[i] = Solved(pair, slot, solution.fit)
 
-    def estimates(self, attach: Attach) -> Estimate:
-        """What has become of the pairs."""
+    def _together(self, attach: Attach) -> Estimate:
         arrays = {"F": self.F, "inliers": self.inliers, "ok": self.ok, "samples": self.samples}
         arrays["significance"] = self.significance
         if self.asked_for_cameras:
@@ -142,12 +138,12 @@ class Estimation:
         return with_gradients(estimates, self.c, self.solved, attach) if self.graphed else estimates
 
 
-def _straight(row: Row, lens: Array) -> PixelMatches:
-    """The matches of a pair as pinholes would have them."""
-    pair, x0, x1 = row.pair, row.matches.x0.copy(), row.matches.x1.copy()
+def _straight(matches: PixelMatches, pair: Pair, slot: Array, lens: Array) -> PixelMatches:
+    """The matches of a pair, which stand in these slots, as pinholes would have them."""
+    x0, x1 = matches.x0.copy(), matches.x1.copy()
     points = undistorted(pair, lens).points.T * pair.pixels_per_unit + pair.centre
-    x0[row.slot], x1[row.slot] = points[:, :2], points[:, 2:]
-    return row.matches._replace(x0=x0, x1=x1)
+    x0[slot], x1[slot] = points[:, :2], points[:, 2:]
+    return matches._replace(x0=x0, x1=x1)
 
 
 def with_sqrt_prior(c: Correspondences) -> Correspondences:

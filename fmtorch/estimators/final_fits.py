@@ -12,14 +12,15 @@ from typing import ClassVar, NamedTuple, Protocol, runtime_checkable
 import numpy as np
 
 from fmtorch.estimators.inliers import MIN_PRIOR_FOR_NOISE, fit_distance, squared_in_noises
-from fmtorch.estimators.models.model import FitScale, Loss, Refining, Steps
+from fmtorch.estimators.models.model import FitScale, Refining
 from fmtorch.estimators.models.posterior import Cameras, Limits
 from fmtorch.estimators.models.with_focals import FundamentalWithFocals
 from fmtorch.estimators.pair import Pair, squared
 from fmtorch.estimators.refinement import Selection
+from fmtorch.geometry.levenberg_marquardt import Schedule
 from fmtorch.jit.kernel import Array
 
-STEPS = Steps(iterations=8, damping=1e-6, tolerance=1e-4)  # small damping, since the start is near the optimum
+SCHEDULE = Schedule(iterations=8, damping=1e-6, tolerance=1e-4)  # small damping, since the start is near the optimum
 PRIOR_CONFLICT_GAIN = 4.0  # what an optimum without prior may gain, in logarithms of the likelihood, before it is taken
 FOCAL_ITERATIONS = 5  # Levenberg-Marquardt steps where cameras are assumed: these start nearer
 FOCAL_TOLERANCE = 0.05  # of the logarithm of the posterior: a fifth of a standard deviation more or less
@@ -119,11 +120,11 @@ class Adaptive:
         if selection.cameras is not None:
             precision = squared(pair.pixels_per_unit / (scale / own.scale_sigmas))
             limits = Limits(precision, FOCAL_ITERATIONS, FOCAL_TOLERANCE)
-            fit = FundamentalWithFocals().fit(selection.cameras, pair, scale, limits)
-            agreed = pair.calibration is not None or fit.gain <= PRIOR_CONFLICT_GAIN
-            if agreed and all(map(math.isfinite, fit.F.tolist())):
-                return Fit(fit.F, fit.F, within(fit.F, pair, scale), fit.cameras, precision)
-        (F,) = family.refine(selection.F[None], pair, Loss(own.loss, scale), STEPS)
+            F, cameras, gain = FundamentalWithFocals().fit(selection.cameras, pair, scale, limits)
+            agreed = pair.calibration is not None or gain <= PRIOR_CONFLICT_GAIN
+            if agreed and all(map(math.isfinite, F.tolist())):
+                return Fit(F, F, within(F, pair, scale), cameras, precision)
+        (F,) = family.refine(selection.F[None], pair, own.loss, scale, SCHEDULE)
         if own.loss == "cauchy":
             return Fit(F, F, np.ones(pair.count), s2=np.square(scale / pair.pixels_per_noise))
         return Fit(F, F, within(F, pair, scale))

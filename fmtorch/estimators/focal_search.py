@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import NamedTuple
 
 import numpy as np
 
@@ -67,14 +66,6 @@ class PlausibleCandidates:
         return self.valid and not distinct_models(self.F, self.posterior, self.best, RIVAL_GAIN_SHARE, SAME_CAMERAS)
 
 
-class SearchResult(NamedTuple):
-    """All candidates of the rounds, whether the best of them is the estimate, and the samples drawn."""
-
-    candidates: PlausibleCandidates
-    settled: bool
-    samples: int
-
-
 @dataclasses.dataclass(frozen=True)
 class FocalSearch:
     """The prior on focal lengths in a search. choice: by which candidates are compared. search: of one round; None: the
@@ -87,10 +78,11 @@ class FocalSearch:
     search: Search | None
     stop: Stop | None
 
-    def __call__(self, pair: Pair) -> SearchResult:
-        """Rounds until good candidates are one model, or enough rounds have confirmed the best one, and the stopping
-        rule is content. The pair is settled if that rule is content and its images have one size, or if anything is
-        known of its cameras."""
+    def __call__(self, pair: Pair) -> tuple[PlausibleCandidates, bool, int]:
+        """All candidates of the rounds, whether the best of them is the estimate, and the samples drawn.
+        Rounds are made until good candidates are one model, or enough rounds have confirmed the best one, and the
+        stopping rule is content. The best one is the estimate if that rule is content and the images have one size, or
+        if anything is known of the cameras."""
         options, confirmations, stop = self.options, 0, False
         candidates: PlausibleCandidates | None = None
         draws = 0
@@ -109,7 +101,7 @@ class FocalSearch:
         assert candidates is not None
         if candidates.valid and self.choice.at_noise is not None:
             candidates = candidates.judged(self.choice.of_pair(candidates.F[candidates.best], pair), pair)
-        return SearchResult(candidates, pair.calibration is not None or (pair.same_size and stop), draws)
+        return candidates, pair.calibration is not None or (pair.same_size and stop), draws
 
     def round(self, pair: Pair, turn: int) -> tuple[PlausibleCandidates, int]:
         """The candidates of a round, and the samples drawn until then."""

@@ -186,9 +186,9 @@ def camera_response(cameras: Cameras, pair: Pair, weight: Array, precision: floa
 
     weight: (n,), of the matches that count. precision: one over the variance of an inlier's distance.
     """
-    images, optimum, tangents = images_of(pair), posterior.no_optimum(1), np.zeros((1, 9, LANES))
+    images, optimum, tangents = images_of(pair), posterior.start_at(cameras.copy()), np.zeros((1, 9, LANES))
     matches = Weighted.of(centred(pair).points, weight, np.full(pair.count, np.inf))
-    posterior.minimise(cameras.copy(), matches, images, Limits(precision, 0, 0.0), optimum)
+    posterior.minimise(optimum, matches, images, Limits(precision, 0, 0.0))
     posterior.tangents_of(cameras, images.longest, optimum.F, tangents)
     moves, hessian, by_focal = np.empty((7, 9)), optimum.hessian[0], np.eye(7, 2, -5)
     translate(np.ascontiguousarray(tangents[0, :, :7].T), images.offset, moves)

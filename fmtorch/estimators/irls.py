@@ -20,12 +20,10 @@ from fmtorch.estimators.pair import Pair, squared
 from fmtorch.geometry import attached_step
 from fmtorch.geometry.eight_point import weighted_eight_point
 from fmtorch.geometry.irls import reweighted_kernel
-from fmtorch.geometry.levenberg_marquardt import FIRST_DAMPING, Schedule, Weighted
-from fmtorch.geometry.rank2_manifold import SQUARINGS
+from fmtorch.geometry.levenberg_marquardt import Schedule, Weighted
 from fmtorch.geometry.refine import refine_kernel
 from fmtorch.geometry.robust_losses import named_loss
 from fmtorch.jit.kernel import Array
-from fmtorch.jobs.execution import mapped
 
 DECAY = 0.65  # of the loss's scale, from one iteration to the next, down to the threshold
 NOT_DETERMINED = "the matches do not determine a model"
@@ -86,15 +84,7 @@ class IterativelyReweighted:
 
     def __call__(self, c: Correspondences, seed: int = 0) -> Estimate:
         """Estimate the fundamental matrices of a batch of pairs; a pair that cannot be solved is `ok=False`."""
-        estimation = Estimation(c, seed, SevenPoint(), self.MIN_MATCHES)
-
-        def estimate_part(part: Sequence[int]) -> None:
-            with np.errstate(all="ignore"):  # infinite or NaN beyond the range of a float
-                for row in estimation.rows(part):
-                    estimation.put(row, self.solve(row.pair))
-
-        mapped(estimate_part, estimation.parts)
-        return estimation.estimates(self.attached)
+        return Estimation(c, seed, SevenPoint(), self.MIN_MATCHES).estimates(self.solve, self.attached)
 
     def solve(self, pair: Pair) -> Solution:
         """The model of least cost of one pair."""
@@ -106,8 +96,7 @@ class IterativelyReweighted:
         for i in range(self.iterations):
             reweighted_kernel(F, self._weighted(pair, max(widest * DECAY**i, scale)))
         refined, cost = np.empty_like(F), np.empty(len(F))
-        schedule = Schedule(self.refine_iterations, FIRST_DAMPING, 0.0)
-        refine_kernel(F, SQUARINGS, self._weighted(pair, scale), schedule, refined, cost)
+        refine_kernel(F, self._weighted(pair, scale), Schedule(self.refine_iterations), refined, cost)
         best = int(np.argmin(np.where(np.isfinite(cost), cost, np.inf)))
         if not np.isfinite(cost[best]):
             return Solution(None, 0, reason=NOT_DETERMINED)

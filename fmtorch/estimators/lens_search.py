@@ -26,8 +26,8 @@ from fmtorch.geometry import levenberg_marquardt
 from fmtorch.geometry.arithmetic import logarithm_kernel
 from fmtorch.geometry.levenberg_marquardt import MATCH, TINY, Weighted, add_products, assemble, in_rows, robust
 from fmtorch.geometry.matrices import assign
-from fmtorch.geometry.rank2_manifold import eliminate
-from fmtorch.jit.kernel import Array, F8x1, F8x2, F8x3, inner, kernel, matrix, vector
+from fmtorch.geometry.rank2_manifold import damped_step
+from fmtorch.jit.kernel import Array, F8x1, F8x2, F8x3, F8x4, inner, kernel, matrix, vector
 from fmtorch.jit.lanes import LANES, added, fill, load, store, where
 
 MIN_DEPTH = 0.1  # of a point beyond the corner
@@ -47,8 +47,11 @@ class LensPrior(NamedTuple):
 
 
 class LensOptimum(NamedTuple):
-    """Of k candidates: lens (k, 2), models F (k, 9) from the principal points, costs (k,), and their derivatives."""
+    """Of k candidates, as `Optimum`: cameras, lens (k, 2), models F (k, 9) from the principal points, costs (k,), and
+    their derivatives."""
 
+    axes: F8x4
+    focal: F8x2
     lens: F8x2
     F: F8x2
     cost: F8x1
@@ -78,19 +81,6 @@ def undistorted(pair: Pair, lens: Array) -> Pair:
     return pair.with_table(table, (pair.known[0], True, pair.known[2]), None)
 
 
-class _State(NamedTuple):
-    """Of k candidates, as `Cameras` and `LensOptimum`. tied: whether second focal length and lens are the first."""
-
-    tied: tuple[bool, bool]
-    axes: Array
-    focal: Array
-    lens: Array
-    F: Array
-    cost: Array
-    gradient: Array
-    hessian: Array
-
-
 class _Data(NamedTuple):
     """tangents: (k, 9, LANES), of the cameras; products: (ROWS, ROWS), for the work."""
 
@@ -107,18 +97,13 @@ class _Data(NamedTuple):
 
 @kernel
 def minimise_with_lenses(
-    cameras: Cameras, matches: Weighted, images: Images, prior: LensPrior, limits: Limits,
-    out: LensOptimum,
-) -> None:  # fmt: skip
-    """Cameras and lenses of least negative logarithm of the posterior near these, in place; what it is there -> out.
+    state: LensOptimum, matches: Weighted, images: Images, prior: LensPrior, limits: Limits
+) -> None:
+    """Cameras and lenses of least negative logarithm of the posterior near these, and what it is there, in place.
     matches: of the photographs, from the principal points."""
-    k = len(out.cost)
-    tied = images.prior.shared, prior.shared
-    state = _State(tied, cameras.axes, cameras.focal, out.lens, out.F, out.cost, out.gradient, out.hessian)
-    trial = _State(
-        tied, np.empty((k, 2, 3, 3)), matrix(k, 2), matrix(k, 2), matrix(k, 9), vector(k), matrix(k, PARAMETERS),
-        np.empty((k, PARAMETERS, PARAMETERS)),
-    )  # fmt: skip
+    k = len(state.cost)
+    axes, hessian = np.empty((k, 2, 3, 3)), np.empty((k, PARAMETERS, PARAMETERS))
+    trial = LensOptimum(axes, matrix(k, 2), matrix(k, 2), matrix(k, 9), vector(k), matrix(k, PARAMETERS), hessian)
     rows, products = in_rows(matches.points, matches.weight, matches.s2), matrix(ROWS, ROWS)
     data = _Data(
         rows, matches.loss, matches.table, images, prior.diagonal, prior, limits, np.zeros((k, 9, LANES)), products
@@ -139,12 +124,13 @@ def photograph_residuals(F: F8x1, lens: F8x1, diagonal: F8x1, points: F8x2, out:
 
 
 @inner
-def _evaluate(state: _State, data: _Data, derivatives: bool) -> None:
-    posterior.camera_models(state.axes, state.focal, data.images.longest, state.tied[0], state.F, data.tangents)
+def _evaluate(state: LensOptimum, data: _Data, derivatives: bool) -> None:
+    images = data.images
+    posterior.camera_models(state.axes, state.focal, images.longest, images.prior.shared, state.F, data.tangents)
     work, W = vector(5), np.zeros((ROWS - 1, PARAMETERS))
     for k in range(len(state.cost)):
         cost = _summed(state.F[k], state.lens[k], data, derivatives) * data.limits.precision / 2
-        cost += focal_cost(state.focal[k], data.images.prior, work)
+        cost += focal_cost(state.focal[k], images.prior, work)
         for i in range(1 if data.prior.shared else 2):
             away = state.lens[k, i] - data.prior.mean[i]
             cost += data.prior.precision[i] * away * away / 2
@@ -201,7 +187,7 @@ def _linearised(f: Array, lens: Array, diagonal: Array, rows: Array, row: int, J
 
 
 @inner
-def _derivatives(state: _State, data: _Data, k: int, focal: Array, W: Array) -> None:
+def _derivatives(state: LensOptimum, data: _Data, k: int, focal: Array, W: Array) -> None:
     """Gradient and Hessian of one candidate. focal: (5,), of `focal_cost`; W: (ROWS - 1, PARAMETERS), zeros or this."""
     gradient, hessian, products, prior = state.gradient[k], state.hessian[k], data.products, data.prior
     for q in range(9):
@@ -233,25 +219,18 @@ def _derivatives(state: _State, data: _Data, k: int, focal: Array, W: Array) -> 
 
 
 @inner
-def _step(state: _State, damping: Array, trial: _State) -> None:
+def _step(data: _Data, state: LensOptimum, damping: Array, trial: LensOptimum) -> None:
     Q, x = np.zeros((2 * PARAMETERS, LANES)), vector(PARAMETERS)
     for k in range(len(damping)):
-        for r in range(PARAMETERS):  # two rows of Q for each of the system
-            for c in range(PARAMETERS):
-                Q[2 * r + c // LANES, c % LANES] = state.hessian[k, r, c]
-            Q[2 * r + r // LANES, r % LANES] += state.hessian[k, r, r] * damping[k]
-            Q[2 * r + 1, PARAMETERS - LANES] = -state.gradient[k, r]
-        eliminate(Q, PARAMETERS)
-        for r in range(PARAMETERS):
-            x[r] = Q[2 * r + 1, PARAMETERS - LANES]
-        posterior.move_cameras(state, k, x, state.tied[0], trial)
+        damped_step(state.hessian[k], state.gradient[k], damping[k], Q, x)
+        posterior.move_cameras(state, k, x, data.images.prior.shared, trial)
         for i in range(2):
-            step = x[7 if state.tied[1] else 7 + i]
+            step = x[7 if data.prior.shared else 7 + i]
             trial.lens[k, i] = min(max(state.lens[k, i] + min(max(step, -0.1), 0.1), MIN_LENS), MAX_LENS)
 
 
 @inner
-def _take(state: _State, trial: _State, k: int) -> None:
+def _take(state: LensOptimum, trial: LensOptimum, k: int) -> None:
     assign(state.lens[k], trial.lens[k])
     posterior.take_cameras(state, trial, k)
 
@@ -319,12 +298,11 @@ def fit_with_lenses(
     """The maxima a posteriori of the truncated error near candidates, cameras (k, ...) and lenses (k, 2).
     scale_px: from which on matches do not count; of the pair as it was photographed."""
     k, matches, images, own = len(lens), centred(pair, scale_px), images_of(pair), cameras.copy()
-    out = LensOptimum(
-        lens.copy(), np.empty((k, 9)), np.empty(k), np.empty((k, PARAMETERS)), np.empty((k, PARAMETERS, PARAMETERS))
-    )
+    F, cost, gradient, hessian = (np.empty((k, *[PARAMETERS] * n)) for n in (1, 0, 1, 2))
+    out = LensOptimum(*own, lens.copy(), F, cost, gradient, hessian)
     weighted = Weighted.of(matches.points, pair.weight, matches.s2)
     limits = Limits(squared(pair.pixels_per_unit / (scale_px / FitScale().scale_sigmas)), iterations, FOCAL_TOLERANCE)
-    minimise_with_lenses(own, weighted, images, prior._replace(diagonal=half_diagonals(pair)), limits, out)
+    minimise_with_lenses(out, weighted, images, prior._replace(diagonal=half_diagonals(pair)), limits)
     F = np.empty((k, 9))
     translate(out.F, images.offset, F)
     F /= np.sqrt((F * F).sum(1, keepdims=True))

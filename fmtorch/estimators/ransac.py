@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Annotated, Any
 
 import numpy as np
@@ -35,7 +35,6 @@ from fmtorch.estimators.scores import Score
 from fmtorch.estimators.search import Search
 from fmtorch.jit.kernel import Array, Kernel
 from fmtorch.jit.together import compile_together
-from fmtorch.jobs.execution import mapped
 
 FOCAL_ROUND = 500  # samples of five matches at a time
 SEARCHED = 2048  # right matches that are expected among those searched
@@ -172,17 +171,7 @@ class Ransac:
             c = with_sqrt_prior(c)
         calibrated = None if self.focal is None else CALIBRATED_MATCHES
         estimation = Estimation(c, seed, self.family, self.family.size, calibrated)
-
-        def estimate_part(part: Sequence[int]) -> None:
-            with np.errstate(all="ignore"):  # infinite or NaN beyond the range of a float
-                for row in estimation.rows(part):
-                    estimation.put(row, self.estimate(row.pair))
-
-        if len(estimation.parts) > 1:
-            mapped(estimate_part, estimation.parts)
-        else:
-            estimate_part(estimation.parts[0])
-        return estimation.estimates(Attached(self.final, self.family).attach)
+        return estimation.estimates(self.estimate, Attached(self.final, self.family).attach)
 
     def estimate(self, pair: Pair) -> Solution:
         """Search to fit of one pair."""

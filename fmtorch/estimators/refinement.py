@@ -9,7 +9,7 @@ from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
-from fmtorch.estimators.models.model import Loss, Refining, Steps
+from fmtorch.estimators.models.model import Refining
 from fmtorch.estimators.models.posterior import Cameras
 from fmtorch.estimators.options import Refine
 from fmtorch.estimators.pair import Pair, squared
@@ -17,10 +17,9 @@ from fmtorch.estimators.preselection import first_shuffled
 from fmtorch.estimators.scores import Score, scored
 from fmtorch.estimators.search import Pool
 from fmtorch.geometry.epipolar import HOMOGRAPHY, SAMPSON, Residual
+from fmtorch.geometry.levenberg_marquardt import Schedule
 from fmtorch.jit.kernel import Array, F4x2, I8x1, Kernel, kernel
 from fmtorch.jit.random import Stream
-
-FIRST_DAMPING = 1e-4  # of Levenberg-Marquardt
 
 
 @runtime_checkable
@@ -66,7 +65,7 @@ class Refinement:
         if self.local_optimization is not None:
             F = self.local_optimization(F, pair)
         if (options := self.options) is not None:
-            F = family.refine(F, near, Loss(options.loss, options.scale), Steps(options.iterations, FIRST_DAMPING))
+            F = family.refine(F, near, options.loss, options.scale, Schedule(options.iterations))
         return Candidates(F, pool.valid, near)
 
 

@@ -21,11 +21,11 @@ if TYPE_CHECKING:
         unit_frobenius,
     )
     from fmtorch.geometry.homography import homography, homography_points, homography_sampson, homography_transfer
-    from fmtorch.geometry.homography_pose import PlanePoses, poses_from_homography, rotation_from_homography
+    from fmtorch.geometry.homography_pose import PlanePoses, poses_from_homography
     from fmtorch.geometry.homography_refine import refine_homography
     from fmtorch.geometry.irls import Fits, irls, reweighted_fits
     from fmtorch.geometry.matrices import nearest_rank2
-    from fmtorch.geometry.normalize import canonical, denormalize_fundamental, normalize_pair, normalize_points
+    from fmtorch.geometry.normalize import canonical, denormalize_fundamental, normalize_points
     from fmtorch.geometry.pose import FourPoses, Pose, pose_from_fundamental, poses_from_fundamental
     from fmtorch.geometry.refine import attached_step, refine
     from fmtorch.geometry.robust_losses import LOSSES
@@ -36,9 +36,9 @@ __all__ = [
     "LOSSES", "Fits", "FourPoses", "PlanePoses", "Pose", "TwoViewCovariance", "algebraic", "attached_step",
     "canonical", "cross_matrix", "denormalize_fundamental", "eight_point", "epipolar_distances", "epipolar_lines",
     "fundamental_from_calibration", "fundamental_from_projections", "homography", "homography_points",
-    "homography_sampson", "homography_transfer", "irls", "nearest_rank2", "normalize_pair", "normalize_points",
+    "homography_sampson", "homography_transfer", "irls", "nearest_rank2", "normalize_points",
     "point_to_line", "pose_from_fundamental", "poses_from_fundamental", "poses_from_homography", "refine",
-    "refine_homography", "reweighted_fits", "rotation_from_homography", "sampson", "sampson_squared", "seven_point",
+    "refine_homography", "reweighted_fits", "sampson", "sampson_squared", "seven_point",
     "significance", "symmetric_max", "symmetric_mean", "symmetric_squared", "two_view_covariance", "unit_frobenius",
 ]  # fmt: skip
 

@@ -189,15 +189,6 @@ def logarithm(x: Tensor) -> Tensor:
     return twice_atanh((m - 1) / (m + 1)) + (exponent.to(x.dtype) - 0.5) * LOG2  # type: ignore[no-any-return]
 
 
-def logarithm_1p(x: Tensor) -> Tensor:
-    """ln(1 + x) for x > -1, to rounding also near 0, by arithmetic alone."""
-    near = (x > -0.25) & (x < 0.4)
-    z = torch.where(near, x, 0.0)
-    far = torch.where(near | ~torch.isfinite(x), 0.0, x)
-    value = torch.where(near, twice_atanh(z / (z + 2)), logarithm(1 + far))
-    return torch.where(x < torch.inf, value, x)
-
-
 # Order statistics and sorting, compiled
 
 

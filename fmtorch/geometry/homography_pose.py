@@ -1,4 +1,4 @@
-"""Two calibrated cameras from a homography: the two poses before a plane, and the rotation of a camera that turns."""
+"""The two poses of calibrated cameras before a plane, from its homography."""
 
 from typing import NamedTuple
 
@@ -8,7 +8,6 @@ from torch import Tensor
 
 from fmtorch.geometry.arithmetic import cofactors, component_sum, determinant, product, sqrt
 from fmtorch.geometry.homography import SINGULAR
-from fmtorch.geometry.matrices import smallest_eigenvector
 from fmtorch.geometry.normalize import Mask, Matrices, Points
 from fmtorch.geometry.pose import inverse, rays
 
@@ -85,33 +84,6 @@ def poses_from_homography(
     return PlanePoses(R, t, n, poses[3].movedim(0, -1), valid.movedim(0, -1))
 
 
-def rotation_from_homography(H: Matrices, K0: Matrices, K1: Matrices) -> tuple[Matrices, Bool[Tensor, "*batch"]]:
-    """The rotation nearest to K1^-1 H K0, up to scale: of a camera that only turns ``H = K1 R K0^-1``.
-
-    The unit quaternion that maximises the trace of R^T G is the eigenvector of a 4 x 4 matrix (Davenport 1968; Horn
-    1987, Closed-form solution of absolute orientation using unit quaternions).
-
-    Args:
-        H, K0, K1: as of `poses_from_homography`.
-
-    Returns:
-        R with X1 = R X0, and whether there is one; where H or a calibration is singular or not finite, the identity.
-    """
-    G, _, regular = _calibrated(H, K0, K1)
-    G = torch.where(determinant(G) < 0, -G, G)
-    trace = G[0, 0] + G[1, 1] + G[2, 2]
-    turn = torch.stack([G[2, 1] - G[1, 2], G[0, 2] - G[2, 0], G[1, 0] - G[0, 1]])
-    eye = torch.eye(3, dtype=G.dtype, device=G.device).reshape(3, 3, *[1] * trace.dim())
-    block = G + G.transpose(0, 1) - eye * trace
-    K = torch.cat([torch.cat([trace[None], turn])[None], torch.cat([turn[:, None], block], 1)])
-    bound = 2 * component_sum(component_sum(G.abs()))
-    shifted = (torch.eye(4, dtype=G.dtype, device=G.device).reshape(4, 4, *[1] * trace.dim()) * bound - K).contiguous()
-    q, determined = smallest_eigenvector(shifted.movedim((0, 1), (-2, -1)))
-    R = _of_quaternion(q.movedim(-1, 0))
-    valid = regular & determined
-    return torch.where(valid, R, eye).movedim((0, 1), (-2, -1)).to(H.dtype), valid
-
-
 def _calibrated(H: Tensor, K0: Tensor, K1: Tensor) -> tuple[Tensor, list[Tensor], Tensor]:
     """K1^-1 H K0 at unit second singular value, K0^-1 and K1^-1, and whether all are regular; matrices (3, 3, *s)."""
     H, K0, K1 = (A.to(torch.float64).movedim((-2, -1), (0, 1)) for A in (H, K0, K1))
@@ -175,14 +147,3 @@ def _decomposed(G: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 def _balance(value: Tensor, kept: Tensor) -> Tensor:
     """How many of the kept are more often positive than negative."""
     return torch.where(kept, torch.sign(value), 0.0).sum(-1)
-
-
-def _of_quaternion(q: Tensor) -> Tensor:
-    """The rotations (3, 3, *s) of unit quaternions (4, *s), scalar first."""
-    w, x, y, z = q
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return torch.stack([torch.stack(row) for row in rows])

@@ -13,7 +13,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from fmtorch.geometry import levenberg_marquardt
 from fmtorch.geometry.arithmetic import component_sum, gradient_wanted, stable_sum
 from fmtorch.geometry.epipolar import TINY
 from fmtorch.geometry.levenberg_marquardt import MATCH, Problem, Schedule, Weighted, in_rows, minimiser, robust
@@ -237,7 +236,7 @@ def _evaluate(state: _State, problem: Problem, derivatives: bool) -> None:
 
 
 @inner
-def _step(state: _State, damping: Array, trial: _State) -> None:
+def _step(problem: Problem, state: _State, damping: Array, trial: _State) -> None:
     Q = matrix(18, LANES)
     for k in range(len(damping)):
         _stepped(state.products[k], state.H[k], damping[k], Q, trial.H[k])
@@ -302,14 +301,10 @@ def refine_homography(
         >>> bool(((refined / refined[2, 2] - H).abs() < 1e-6).all())
         True
     """
-    schedule, wanted = Schedule(iterations, levenberg_marquardt.FIRST_DAMPING, 0.0), gradient_wanted(x0, x1, weight)
-
-    def fit(models: Array, matches: Weighted, out: Array, cost: Array) -> None:
-        refine_homographies(models, matches, schedule, out, cost)
-
+    wanted = gradient_wanted(x0, x1, weight)
     with torch.set_grad_enabled(wanted):
         matches = NormalizedMatches(x0, x1, weight, mask, H.detach(), scale, loss, homographies=True)
-        models, _ = fitted_by(fit, _seen_from_the_front(matches), matches.error)
+        models, _ = fitted_by(refine_homographies, _seen_from_the_front(matches), matches.error, iterations)
         if wanted:
             models = homography_at_optimum(models, matches.error)
         return matches.to_pixels(models).reshape(H.shape)

@@ -155,16 +155,19 @@ def assemble(sums: Array, products: Array) -> None:
             q += 1
 
 
+SQUARINGS = 5  # enough for any matrix whose last two singular values differ by half
 FIRST_DAMPING, MIN_DAMPING, MAX_DAMPING = 1e-4, 1e-12, 1e6  # relative to the greatest curvature
 
 
 class Schedule(NamedTuple):
     """iterations: steps at most. damping: of the first. tolerance: a model is done once a step has lowered its cost by
-    no more than this share of it; 0: none is ever done."""
+    no more than this share of it; 0: none is ever done. squarings: of the start of a fundamental matrix (`start_one`).
+    """
 
     iterations: int
-    damping: float
-    tolerance: float
+    damping: float = FIRST_DAMPING
+    tolerance: float = 0.0
+    squarings: int = SQUARINGS
 
 
 class Problem(NamedTuple):
@@ -186,9 +189,9 @@ def minimiser(
 ) -> Callable[[Any, Any, Any, Array, int, bool], None]:  # fmt: skip
     """The loop for an objective: loop(data, state, trial, damping, iterations, ends), in place.
     evaluate(state, data, derivatives): the costs, and the derivatives if asked for, at the state's parameters.
-    step(state, damping, trial): those of a trial. take(state, trial, k): gives the state model k of the trial, but for
-    its cost, where that is lower: such a step divides the damping by 10, another multiplies it. converged(data, before,
-    after): whether a model is done after a step that has lowered its cost so."""
+    step(data, state, damping, trial): those of a trial. take(state, trial, k): gives the state model k of the trial, but
+    for its cost, where that is lower: such a step divides the damping by 10, another multiplies it. converged(data,
+    before, after): whether a model is done after a step that has lowered its cost so."""
 
     @inner
     def accept(state: Any, trial: Any, damping: Array, done: Array, data: Any) -> bool:
@@ -212,7 +215,7 @@ def minimiser(
         done = np.zeros(len(damping), np.bool_)
         evaluate(state, data, iterations > 0 or ends)
         for i in range(iterations):
-            step(state, damping, trial)
+            step(data, state, damping, trial)
             evaluate(trial, data, i + 1 < iterations or ends)
             if accept(state, trial, damping, done, data) and ends:
                 break

@@ -12,9 +12,8 @@ from torch import Tensor
 from fmtorch.geometry.arithmetic import as_components, as_matrices, component_sum, matmul3, sqrt, stable_sum, unit
 from fmtorch.geometry.cameras import PixelFrame
 from fmtorch.geometry.epipolar import Matrix, unit_frobenius
-from fmtorch.geometry.levenberg_marquardt import Weighted
+from fmtorch.geometry.levenberg_marquardt import Schedule, Weighted
 from fmtorch.geometry.robust_losses import LOSSES, RobustLoss, named_loss
-from fmtorch.jit.kernel import Array
 
 Points = Float[Tensor, "*batch n 2"]
 PerMatch = Float[Tensor, "*batch n"]
@@ -36,32 +35,15 @@ def normalize_points(x: Points, mask: Mask | None = None, weight: PerMatch | Non
     Returns:
         The points moved (..., N, 2), and T (..., 3, 3).
     """
-    x, w = _clean(x, mask, weight)
+    w = torch.ones_like(x[..., 0]) if weight is None else weight
+    if mask is not None:
+        x, w = torch.where(mask[..., None], x, 0.0), torch.where(mask, w, 0.0)
     centroid = _mean(x, w)
     centred = x - centroid[..., None, :]
     scale = _scale(_mean_distance(centred, w), centroid)
-    return _apply(centred, mask, scale), _similarity(centroid, scale)
-
-
-def normalize_pair(x0: Points, x1: Points, mask: Mask | None = None) -> tuple[Points, Points, Matrices, Matrices]:
-    """Points of both images centred each on its own, with one common scale: x0_n, x1_n, T0, T1.
-
-    The mean distance to the centroid, over both images, becomes sqrt(2). Distances keep their proportions between the
-    images, so a threshold in pixels stays one number. Masked slots come out zero; coincident points keep their scale.
-
-    Args:
-        x0: points in image 0, (..., N, 2), px.
-        x1: their matches in image 1, (..., N, 2), px.
-        mask: (..., N), True for the matches that count; all by default.
-
-    Returns:
-        The points moved, (..., N, 2) each, and the similarities (..., 3, 3) that move them.
-    """
-    (x0, w), (x1, _) = _clean(x0, mask, None), _clean(x1, mask, None)
-    c0, c1 = _mean(x0, w), _mean(x1, w)
-    x0, x1 = x0 - c0[..., None, :], x1 - c1[..., None, :]
-    scale = _scale((_mean_distance(x0, w) + _mean_distance(x1, w)) / 2, torch.maximum(c0.abs(), c1.abs()))
-    return _apply(x0, mask, scale), _apply(x1, mask, scale), _similarity(c0, scale), _similarity(c1, scale)
+    scaled = centred * scale[..., None, None]
+    scaled = scaled if mask is None else torch.where(mask[..., None], scaled, 0.0)
+    return scaled, _similarity(centroid, scale)
 
 
 def denormalize_fundamental(F: Matrix, T0: Matrix, T1: Matrix) -> Matrix:
@@ -86,12 +68,6 @@ def canonical(F: Matrices) -> Matrices:
     return unit_frobenius(F) * torch.copysign(torch.ones_like(peak), peak)
 
 
-def _clean(x: Tensor, mask: Tensor | None, weight: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Points and weights with zeros in the masked slots."""
-    w = torch.ones_like(x[..., 0]) if weight is None else weight
-    return (x, w) if mask is None else (torch.where(mask[..., None], x, 0.0), torch.where(mask, w, 0.0))
-
-
 def _mean(x: Tensor, w: Tensor) -> Tensor:
     total = stable_sum(w, -1)
     return stable_sum(w[..., None] * x, -2) / torch.where(total > 0, total, 1.0)[..., None]
@@ -111,11 +87,6 @@ def _scale(distance: Tensor, centroid: Tensor) -> Tensor:
     rounding = 4 * torch.finfo(distance.dtype).eps * centroid.detach().abs().amax(-1)
     spread = distance > rounding
     return torch.where(spread, 2**0.5 / torch.where(spread, distance, 1.0), 1.0)
-
-
-def _apply(centred: Tensor, mask: Tensor | None, scale: Tensor) -> Tensor:
-    scaled = centred * scale[..., None, None]
-    return scaled if mask is None else torch.where(mask[..., None], scaled, 0.0)
 
 
 def _similarity(centroid: Tensor, scale: Tensor) -> Tensor:
@@ -192,16 +163,17 @@ class NormalizedMatches:
 
 @torch.no_grad()
 def fitted_by(
-    fit: Callable[[Array, Weighted, Array, Array], None], models: Float[Tensor, "9 p k"], error: RobustSum
+    fit: Callable[..., None], models: Float[Tensor, "9 p k"], error: RobustSum, iterations: int
 ) -> tuple[Float[Tensor, "9 p k"], Float[Tensor, "p k"]]:
-    """Models and costs after fit(models (k, 9), matches, out (k, 9), cost (k,)), a kernel, of each pair, on the CPU.
-    A model that cannot be fitted comes back as it was, with infinite cost."""
+    """Models and costs after so many steps of a kernel, fit(models (k, 9), matches, schedule, out (k, 9), cost (k,)),
+    of each pair, on the CPU. A model that cannot be fitted comes back as it was, with infinite cost."""
     start = as_matrices(models).flatten(2).cpu().contiguous().numpy()
     columns, weights = (t.detach().cpu().contiguous().numpy() for t in (error.points.movedim(1, 0), error.weight))
     scales = error.s2.detach().expand_as(error.weight).cpu().contiguous().numpy()
     out, cost = np.empty_like(start), np.empty(start.shape[:2])
     for p, given in enumerate(start):
-        fit(given, Weighted.of(columns[p], weights[p], scales[p], error.loss), out[p], cost[p])
+        matches = Weighted.of(columns[p], weights[p], scales[p], error.loss)
+        fit(given, matches, Schedule(iterations), out[p], cost[p])
     known = np.isfinite(cost)
     fitted = torch.from_numpy(np.where(known[..., None], out, start)).to(models.device)
     return fitted.permute(2, 0, 1).contiguous(), torch.from_numpy(np.where(known, cost, np.inf)).to(models.device)

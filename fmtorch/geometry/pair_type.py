@@ -25,10 +25,8 @@ NOISE_TOLERANCE, SHARE_TOLERANCE = 0.01, 1e-3  # of the last step: relative, and
 GROUP = 16  # densities of up to 1e10 (by FINEST_SHARE) whose product float64 holds
 HALF = 0.5  # of a match that each component has beforehand
 ROOT2 = math.sqrt(2)
-MATCHES, NOISE, LINE, PLANE, BOTH, TURN, COPY, ON_PLANE, ON_LINE, FOCALS, ROTATION_OF_KERNEL, SCALED = (
-    0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 11, 20,
-)  # fmt: skip
-COLUMNS = 23
+LINE, PLANE, BOTH, TURN, COPY, NOISE, MATCHES, ON_PLANE, ON_LINE, FOCALS = range(10)
+TURNED, SCALED, COLUMNS = FOCALS + 2, FOCALS + 11, FOCALS + 14
 of_line, of_plane = SAMPSON.of_match, HOMOGRAPHY.of_match
 
 
@@ -92,7 +90,7 @@ def weigh(matches: Matches, models: Models, cameras: Cameras, out: F8x1) -> None
     out[COPY] = _log_likelihood(d[:1], prior, share)
     out[TURN] = -math.inf
     if cameras.K0[2, 2] != 0:
-        cost = fit_rotation(points, noise, models.H.ravel(), cameras, s, out[FOCALS : ROTATION_OF_KERNEL + 9], H)
+        cost = fit_rotation(points, noise, models.H.ravel(), cameras, s, out[FOCALS:SCALED], H)
         if math.isfinite(cost):
             _distances(H, points, noise, False, r)
             _densities(r, s, side, 2, d[0])
@@ -315,11 +313,8 @@ def pair_evidence(
     sizes = (None if size is None else size.to(torch.float64) for size in (size0, size1))
     given = (x0, x1, mask, prior, noise, models, *sizes, precision)
     rows = for_each_pair(_into, given, out=torch.empty(len(F), COLUMNS, dtype=torch.float64), kind=torch.float64)
-    columns = [rows[:, k] for k in (LINE, PLANE, BOTH, TURN, COPY)]
-    columns += [rows[:, k] for k in (NOISE, MATCHES, ON_PLANE, ON_LINE)]
-    columns += [rows[:, ROTATION_OF_KERNEL:SCALED].reshape(-1, 3, 3)]
-    columns += [rows[:, FOCALS:ROTATION_OF_KERNEL], rows[:, SCALED:]]
-    return Evidence(*columns)
+    R = rows[:, TURNED:SCALED].reshape(-1, 3, 3)
+    return Evidence(*rows[:, :FOCALS].unbind(1), R, rows[:, FOCALS:TURNED], rows[:, SCALED:])
 
 
 def _into(x0: Array, x1: Array, mask: Array, prior: Array, noise: Array, *known: Array) -> None:

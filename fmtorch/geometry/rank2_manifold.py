@@ -11,13 +11,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from fmtorch.geometry.arithmetic import as_rows, cofactors, component_sum, unit
-from fmtorch.geometry.levenberg_marquardt import Weighted, evaluate
+from fmtorch.geometry.levenberg_marquardt import SQUARINGS, Weighted, evaluate
 from fmtorch.geometry.matrices import assign, cofactors_kernel, unit_kernel
 from fmtorch.jit.kernel import Array, F8x1, F8x2, inner, kernel, matrix, vector
 from fmtorch.jit.lanes import LANES, load, store
 
 RANK_TWO, RANK_TWO_EPIPOLE = (0.5**0.5, 0.0, 0.0, 0.0, 0.5**0.5, 0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 1.0)
-SQUARINGS = 5  # enough for any matrix whose last two singular values differ by half
 
 
 def constrained_solve(
@@ -190,6 +189,22 @@ def damped_system(products: Array, x: Array, damping: float, Q: Array) -> None:
         for c in range(9):
             Q[2 * r + c // LANES, c % LANES] = products[r, c] + curvature * x[r] * x[c]
         Q[2 * r + r // LANES, r % LANES] += curvature * damping
+
+
+@inner
+def damped_step(hessian: Array, gradient: Array, damping: float, Q: Array, x: Array) -> None:
+    """Solves ``(H + damping diag H) x = -gradient`` of n parameters -> x (n,). Q: for the work, each row of the system,
+    (n, n + 1), being one or more of LANES numbers."""
+    n = len(x)
+    wide = len(Q) // n
+    for r in range(n):
+        for c in range(n):
+            Q[wide * r + c // LANES, c % LANES] = hessian[r, c]
+        Q[wide * r + r // LANES, r % LANES] += hessian[r, r] * damping
+        Q[wide * r + n // LANES, n % LANES] = -gradient[r]
+    eliminate(Q, n)
+    for r in range(n):
+        x[r] = Q[wide * r + n // LANES, n % LANES]
 
 
 @inner

@@ -16,10 +16,10 @@ from torch import Tensor
 from fmtorch.geometry import rank2_manifold
 from fmtorch.geometry.arithmetic import as_rows, cofactors, component_sum, gradient_wanted, sqrt, stable_sum, unit
 from fmtorch.geometry.epipolar import linearise
-from fmtorch.geometry.levenberg_marquardt import FIRST_DAMPING, Problem, Schedule, Weighted, evaluate, minimiser
+from fmtorch.geometry.levenberg_marquardt import Problem, Schedule, Weighted, evaluate, minimiser
 from fmtorch.geometry.matrices import assign, assign_rows
 from fmtorch.geometry.normalize import NormalizedMatches, RobustSum, fitted_by
-from fmtorch.geometry.rank2_manifold import RANK_TWO, RANK_TWO_EPIPOLE, SQUARINGS, constant, start_one, steps
+from fmtorch.geometry.rank2_manifold import RANK_TWO, RANK_TWO_EPIPOLE, constant, start_one, steps
 from fmtorch.jit.kernel import Array, F8x1, F8x2, inner, kernel, matrix, vector
 
 
@@ -34,15 +34,15 @@ class _State(NamedTuple):
 
 
 @kernel
-def refine_kernel(F: F8x2, squarings: int, matches: Weighted, schedule: Schedule, out: F8x2, cost: F8x1) -> None:
+def refine_kernel(F: F8x2, matches: Weighted, schedule: Schedule, out: F8x2, cost: F8x1) -> None:
     """Models (k, 9) made rank 2 and refined -> out (k, 9), cost (k,); what cannot be is not finite, nor its cost.
-    squarings: of `start_one`."""
+    The cost of a model never rises above that of its start."""
     k = len(F)
     state = _State(out, matrix(k, 3), matrix(k, 3), np.empty((k, 10, 10)), cost)
     trial = _State(matrix(k, 9), matrix(k, 3), matrix(k, 3), np.empty((k, 10, 10)), vector(k))
     problem = Problem(matches, schedule.tolerance)
     for i in range(k):
-        start_one(F[i], squarings, state.F[i], state.e0[i], state.e1[i])
+        start_one(F[i], schedule.squarings, state.F[i], state.e0[i], state.e1[i])
     _minimise(problem, state, trial, np.full(k, schedule.damping), schedule.iterations, schedule.tolerance > 0)
 
 
@@ -52,7 +52,7 @@ def _evaluate(state: _State, problem: Problem, derivatives: bool) -> None:
 
 
 @inner
-def _step(state: _State, damping: Array, trial: _State) -> None:
+def _step(problem: Problem, state: _State, damping: Array, trial: _State) -> None:
     steps(state.products, state.F, state.e0, state.e1, damping, trial.F, trial.e0, trial.e1)
 
 
@@ -65,21 +65,6 @@ def _take(state: _State, trial: _State, k: int) -> None:
 
 
 _minimise = minimiser(_evaluate, _step, _take)
-
-
-def refine_components(
-    F: Float[Tensor, "9 p k"], error: RobustSum, iterations: int
-) -> tuple[Float[Tensor, "9 p k"], Float[Tensor, "p k"]]:
-    """Refined models and their costs, component by component, without gradients.
-    F: k models for each of p pairs, entries row by row; made rank 2 first where they are not. iterations: at most.
-    The cost of a model never rises above that of its (rank-2) start; a model that cannot be improved is kept, one that
-    is not finite comes back as it was, with infinite cost."""
-    schedule = Schedule(iterations, FIRST_DAMPING, 0.0)
-
-    def fit(models: Array, matches: Weighted, out: Array, cost: Array) -> None:
-        refine_kernel(models, SQUARINGS, matches, schedule, out, cost)
-
-    return fitted_by(fit, F, error)
 
 
 def refine(
@@ -121,7 +106,7 @@ def refine(
     wanted = gradient_wanted(x0, x1, weight)
     with torch.set_grad_enabled(wanted):
         matches = NormalizedMatches(x0, x1, weight, mask, F.detach(), scale, loss)
-        models, _ = refine_components(matches.models, matches.error, iterations)
+        models, _ = fitted_by(refine_kernel, matches.models, matches.error, iterations)
         if wanted:
             models = at_optimum(models, matches.error)
         return matches.to_pixels(models).reshape(F.shape)

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from fmtorch.geometry.arithmetic import logarithm_1p, sqrt
+from fmtorch.geometry.arithmetic import sqrt
 from fmtorch.jit.kernel import Array
 
 QUANTILE = 3.64
@@ -50,36 +50,26 @@ _gain = 1 - marginal_loss((np.arange(ENTRIES) + 0.5) / ENTRIES) / marginal_loss(
 GAIN_TABLE = np.append(_gain, 0.0).astype(np.float32)
 """1 - rho / rho_max in the middle of each interval, and 0 from u = 1 on, (ENTRIES + 1,) float32."""
 
-_WEIGHT, _INTEGRAL = torch.from_numpy(LOSS_TABLE).unbind(0)
+_WEIGHT = torch.from_numpy(LOSS_TABLE[0])
 
 
 class RobustLoss(NamedTuple):
-    """A robust loss, its derivative with respect to r^2, and its curvature, all functions of (r2, s2).
+    """The derivative of a robust loss with respect to r^2, and its curvature, both functions of (r2, s2).
     curvature: half the second derivative with respect to r, ``rho' + 2 r^2 rho''``, and 0 where that is negative."""
 
-    loss: Callable[[Tensor, Tensor], Tensor]
     weight: Callable[[Tensor, Tensor], Tensor]
     curvature: Callable[[Tensor, Tensor], Tensor]
 
 
-def huber_loss(r2: Tensor, s2: Tensor) -> Tensor:
-    """``r^2`` up to the scale s, ``2 s |r| - s^2`` beyond (Huber 1964)."""
-    return torch.where(r2 <= s2, r2, 2 * sqrt(s2 * torch.maximum(r2, s2)) - s2)
-
-
 def huber_weight(r2: Tensor, s2: Tensor) -> Tensor:
-    """1 up to the scale s, ``s / |r|`` beyond."""
+    """1 up to the scale s, ``s / |r|`` beyond (Huber 1964)."""
     return sqrt(s2 / torch.maximum(r2, s2))
 
 
 def within_scale(r2: Tensor, s2: Tensor) -> Tensor:
-    """1 up to the scale, 0 beyond: the curvature of Huber's loss, and both derivatives of the truncated one."""
+    """1 up to the scale, 0 beyond: the curvature of Huber's loss, and both derivatives of the truncated one,
+    ``min(r^2, s^2)``: MSAC. An infinite scale gives plain least squares."""
     return (r2 <= s2).to(r2.dtype)
-
-
-def cauchy_loss(r2: Tensor, s2: Tensor) -> Tensor:
-    """``s^2 log(1 + r^2 / s^2)``."""
-    return s2 * logarithm_1p(r2 / s2)
 
 
 def cauchy_weight(r2: Tensor, s2: Tensor) -> Tensor:
@@ -92,11 +82,6 @@ def cauchy_curvature(r2: Tensor, s2: Tensor) -> Tensor:
     return s2 / (s2 + r2) * ((s2 - r2) / (s2 + r2)).clamp_min(0)
 
 
-def geman_mcclure_loss(r2: Tensor, s2: Tensor) -> Tensor:
-    """``r^2 s^2 / (s^2 + r^2)``."""
-    return r2 * (s2 / (s2 + r2))
-
-
 def geman_mcclure_weight(r2: Tensor, s2: Tensor) -> Tensor:
     """``s^4 / (s^2 + r^2)^2``."""
     return (s2 / (s2 + r2)).square()
@@ -107,21 +92,8 @@ def geman_mcclure_curvature(r2: Tensor, s2: Tensor) -> Tensor:
     return geman_mcclure_weight(r2, s2) * ((s2 - 3 * r2) / (s2 + r2)).clamp_min(0)
 
 
-def truncated_loss(r2: Tensor, s2: Tensor) -> Tensor:
-    """``min(r^2, s^2)``: MSAC. An infinite scale gives plain least squares."""
-    return torch.minimum(r2, s2)
-
-
-def tabulated_loss(r2: Tensor, s2: Tensor) -> Tensor:
-    """That of MAGSAC++ over its slope at zero, from the table; s = k sigma_max."""
-    interval, share, weight, step = _look_up(r2, s2)
-    inside = (weight + share * step / 2) * share / ENTRIES
-    loss: Tensor = s2 * (torch.take(_INTEGRAL.to(r2.device), interval) + inside)
-    return loss.to(r2.dtype)
-
-
 def tabulated_weight(r2: Tensor, s2: Tensor) -> Tensor:
-    """The weight, from the table: 1 at zero, 0 from s on."""
+    """That of MAGSAC++ over its slope at zero, from the table: 1 at zero, 0 from s = k sigma_max on."""
     _, share, weight, step = _look_up(r2, s2)
     return (weight + share * step).to(r2.dtype)
 
@@ -143,11 +115,11 @@ def _look_up(r2: Tensor, s2: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 
 
 LOSSES: dict[str, RobustLoss] = {
-    "huber": RobustLoss(huber_loss, huber_weight, within_scale),
-    "cauchy": RobustLoss(cauchy_loss, cauchy_weight, cauchy_curvature),
-    "geman_mcclure": RobustLoss(geman_mcclure_loss, geman_mcclure_weight, geman_mcclure_curvature),
-    "truncated": RobustLoss(truncated_loss, within_scale, within_scale),
-    "magsac": RobustLoss(tabulated_loss, tabulated_weight, tabulated_curvature),
+    "huber": RobustLoss(huber_weight, within_scale),
+    "cauchy": RobustLoss(cauchy_weight, cauchy_curvature),
+    "geman_mcclure": RobustLoss(geman_mcclure_weight, geman_mcclure_curvature),
+    "truncated": RobustLoss(within_scale, within_scale),
+    "magsac": RobustLoss(tabulated_weight, tabulated_curvature),
 }
 
 

@@ -10,7 +10,9 @@ from fmtorch.geometry.homography import in_pixels
 from fmtorch.geometry.homography_refine import evaluate_homographies
 from fmtorch.geometry.levenberg_marquardt import GEMAN_MCCLURE, Weighted
 from fmtorch.geometry.matrices import assign, invert, multiply, orthogonal_factor
+from fmtorch.geometry.rank2_manifold import eliminate
 from fmtorch.jit.kernel import Array, F8x2, inner, matrix, vector
+from fmtorch.jit.lanes import LANES
 
 PARAMETERS = 5  # three of the rotation, the logarithms of two focal lengths
 LOSS = 3.0  # noises; scale of the loss
@@ -111,7 +113,7 @@ def _step(
     products: Array, T: Array, focal: Array, s: float, prior: Array, free: Array, damping: float, out: Array
 ) -> None:
     """The damped Gauss-Newton step (5,): ``(T^T P T / s^2 + prior) step = -gradient``."""
-    M = matrix(PARAMETERS, PARAMETERS + 1)
+    M = np.zeros((PARAMETERS, LANES))
     for a in range(PARAMETERS):
         for b in range(PARAMETERS + 1):
             total = 0.0
@@ -129,15 +131,7 @@ def _step(
         M[3 + a, 3 + a] += 1 - free[a]
     for a in range(PARAMETERS):
         M[a, a] += damping * M[a, a] + 1e-300
-    for a in range(PARAMETERS):  # Gauss and Jordan, of a positive definite matrix
-        pivot = M[a, a]
-        for b in range(PARAMETERS + 1):
-            M[a, b] /= pivot
-        for r in range(PARAMETERS):
-            factor = M[r, a]
-            if r != a:
-                for b in range(PARAMETERS + 1):
-                    M[r, b] -= factor * M[a, b]
+    eliminate(M, PARAMETERS)
     for a in range(PARAMETERS):
         out[a] = M[a, PARAMETERS]
 

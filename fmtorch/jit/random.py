@@ -1,7 +1,6 @@
 """Random numbers as a stateless function of (seed, pair key, stream, draw): the same in any batch, on any device.
 
-Tensors have `bits` and `uniform`, kernels `random_bits` and `uniform_kernel`: the same integer arithmetic, hence the
-same numbers.
+Kernels have `random_bits` and `uniform_kernel`; tensors have `bits` and `uniform`, the same functions of arrays.
 """
 
 import enum
@@ -31,48 +30,14 @@ class Stream(enum.IntEnum):
     BATCHES = 10
 
 
-def wrap(value: int) -> int:
-    """An unsigned 64-bit constant as the int64 with the same bits."""
-    return value - (1 << 64) if value >= 1 << 63 else value
-
-
 @functools.lru_cache(maxsize=64)
 def mixed_seed(seed: int, stream: Stream) -> int:
     """The seed and the stream, mixed by splitmix64, as an int64."""
     x = ((seed * 2 + 1) * 0x9E3779B97F4A7C15 + int(stream)) % (1 << 64)
     x = (x ^ (x >> 30)) * 0xBF58476D1CE4E5B9 % (1 << 64)
     x = (x ^ (x >> 27)) * 0x94D049BB133111EB % (1 << 64)
-    return wrap(x ^ (x >> 31))
-
-
-_GAMMA, _MIX1, _MIX2 = (wrap(c) for c in (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB))
-
-
-def _shift_right(x: Tensor, n: int) -> Tensor:
-    return (x >> n).bitwise_and_((1 << (64 - n)) - 1)
-
-
-def _mix(x: Int[Tensor, "*shape"]) -> Int[Tensor, "*shape"]:
-    """The finaliser of splitmix64 (Steele, Lea, Flood, OOPSLA 2014): a bijection of 64-bit words."""
-    x = _shift_right(x, 30).bitwise_xor_(x).mul_(_MIX1)
-    x = _shift_right(x, 27).bitwise_xor_(x).mul_(_MIX2)
-    return _shift_right(x, 31).bitwise_xor_(x)
-
-
-def bits(
-    seed: int, key: Int[Tensor, " b"], stream: Stream, start: int, count: int, columns: int
-) -> Int[Tensor, "b count columns"]:
-    """Random 63-bit non-negative integers for the draws start .. start + count - 1, `columns` numbers a draw."""
-    counter = torch.arange(start * columns, (start + count) * columns, device=key.device, dtype=torch.int64)
-    state = _mix(key ^ mixed_seed(seed, stream))[:, None] + (counter * _GAMMA)[None]
-    return _shift_right(_mix(state), 1).reshape(len(key), count, columns)
-
-
-def uniform(
-    seed: int, key: Int[Tensor, " b"], stream: Stream, start: int, count: int, columns: int
-) -> Float[Tensor, "b count columns"]:
-    """Random numbers in [0, 1), float64, with 53 random bits; arguments as `bits`."""
-    return (bits(seed, key, stream, start, count, columns) >> 10).to(torch.float64).mul_(2.0**-53)
+    x ^= x >> 31
+    return x - (1 << 64) if x >= 1 << 63 else x
 
 
 Word = Any  # np.uint64
@@ -102,3 +67,19 @@ def random_bits(state: Word, counter: int) -> Word:
 def uniform_kernel(state: Word, counter: int) -> Any:
     """Number `counter` of a stream in [0, 1), with 53 random bits."""
     return np.float64(random_bits(state, counter) >> np.uint64(10)) * 2.0**-53
+
+
+def bits(
+    seed: int, key: Int[Tensor, " b"], stream: Stream, start: int, count: int, columns: int
+) -> Int[Tensor, "b count columns"]:
+    """Random 63-bit non-negative integers for the draws start .. start + count - 1, `columns` numbers a draw."""
+    state = stream_state(mixed_seed(seed, stream), key.cpu().numpy())[:, None]
+    words = random_bits(state, np.arange(start * columns, (start + count) * columns)).astype(np.int64)
+    return torch.from_numpy(words).reshape(len(key), count, columns).to(key.device)
+
+
+def uniform(
+    seed: int, key: Int[Tensor, " b"], stream: Stream, start: int, count: int, columns: int
+) -> Float[Tensor, "b count columns"]:
+    """Random numbers in [0, 1), float64, with 53 random bits; arguments as `bits`."""
+    return (bits(seed, key, stream, start, count, columns) >> 10).to(torch.float64).mul_(2.0**-53)

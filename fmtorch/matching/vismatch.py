@@ -8,7 +8,7 @@ downloaded here.
 
 import threading
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, ClassVar, NamedTuple, overload
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -120,19 +120,11 @@ def _correspondences(matches: _Matches, origin: float, sizes: Sequence[Size]) ->
     for points, (h, w) in zip(x, sizes, strict=True):
         with np.errstate(invalid="ignore"):  # NaN is in no image
             mask &= ((points >= -EDGE) & (points <= np.array([w, h]) - EDGE)).all(1)
-    x0, x1 = (_batch(np.where(mask[:, None], points, 0)) for points in x)
-    score = None if matches.confidence is None else np.clip(np.nan_to_num(matches.confidence), 0, 1)
+    known = {"x0": np.where(mask[:, None], x[0], 0), "x1": np.where(mask[:, None], x[1], 0), "noise": matches.noise}
+    known["score"] = None if matches.confidence is None else np.clip(np.nan_to_num(matches.confidence), 0, 1)
+    fields = {name: torch.from_numpy(v.astype(np.float32))[None] for name, v in known.items() if v is not None}
     size0, size1 = (torch.tensor([size]) for size in sizes)
-    known = {"score": _batch(score), "noise": _batch(matches.noise), "size0": size0, "size1": size1}
-    return Correspondences(x0, x1, torch.from_numpy(mask)[None], **known)
-
-
-@overload
-def _batch(values: Array) -> Tensor: ...
-@overload
-def _batch(values: Array | None) -> Tensor | None: ...
-def _batch(values: Array | None) -> Tensor | None:
-    return None if values is None else torch.from_numpy(values.astype(np.float32))[None]
+    return Correspondences(**fields, mask=torch.from_numpy(mask)[None], size0=size0, size1=size1)
 
 
 def _tensor(image: Image) -> Float[Tensor, "3 h w"]:

@@ -12,12 +12,12 @@ if TYPE_CHECKING:
     from fmtorch.metrics.inlier_rate import InlierRate, ground_truth_inliers, inlier_rate, right_of_homography
     from fmtorch.metrics.nsgd import nsgd, nsgd_released, sgd
     from fmtorch.metrics.pose import PoseError, closest_pose_error, corner_error, fundamental_pose_error, pose_error
-    from fmtorch.metrics.recall import mean_recall, pose_auc, pose_maa, pose_map, recall, recall_curve
+    from fmtorch.metrics.recall import mean_recall, pose_auc, pose_maa, pose_map, recall
 
 __all__ = [
     "InlierRate", "PoseError", "closest_pose_error", "corner_error", "fundamental_pose_error", "ground_truth_inliers",
     "inlier_rate", "mean_recall", "nsgd", "nsgd_released", "pose_auc", "pose_error", "pose_maa", "pose_map", "recall",
-    "recall_curve", "right_of_homography", "sgd",
+    "right_of_homography", "sgd",
 ]  # fmt: skip
 
 lazy_exports(__name__)

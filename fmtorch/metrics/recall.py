@@ -1,4 +1,4 @@
-"""Recall over a set of pairs at a limit on their NSGD or pose error: its curve, the area under it, means over bins."""
+"""Recall over a set of pairs at a limit on their NSGD or pose error: the area under its curve, means over bins."""
 
 from collections.abc import Sequence
 
@@ -13,7 +13,6 @@ FINE_THRESHOLD = 0.01  # NSGD below which it counts as accurate
 THRESHOLDS = (5, 10, 20)  # degrees, as SuperGlue (Sarlin et al., CVPR 2020)
 MAA_MAXIMUM = 10  # degrees, as the Image Matching Challenge
 BIN = 5  # degrees, as Yi et al. (CVPR 2018) and OANet (Zhang et al., ICCV 2019)
-CURVE = (0.0, 0.2, 20)  # first and last threshold and their number, as in the paper's curves
 
 
 @checked
@@ -35,25 +34,6 @@ def recall(nsgd: Float[Tensor, "*batch pairs"], threshold: float = THRESHOLD) ->
         (0.5, 0.45)
     """
     return (nsgd < threshold).to(nsgd.dtype).mean(-1)
-
-
-@checked
-def recall_curve(
-    nsgd: Float[Tensor, "*batch pairs"], thresholds: Float[Tensor, " t"] | None = None
-) -> Float[Tensor, "*batch t"]:
-    """`recall` at each of several thresholds.
-
-    Args:
-        nsgd: of each pair; NaN counts as a miss.
-        thresholds: in image diagonals; when not given, the paper's: 20 from 0 to 0.2.
-
-    Returns:
-        The share of the pairs below each threshold.
-    """
-    if thresholds is None:
-        first, last, count = CURVE
-        thresholds = torch.linspace(first, last, count, dtype=nsgd.dtype, device=nsgd.device)
-    return (nsgd[..., None, :] < thresholds[:, None]).to(nsgd.dtype).mean(-1)
 
 
 @checked

@@ -3,7 +3,8 @@
 Needs the extra `metrics`: ``pip install 'fmtorch[metrics]'``.
 """
 
-from collections.abc import Sequence
+import functools
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -20,22 +21,24 @@ except ImportError as error:
 
 
 class _MeanOverPairs(Metric):  # type: ignore[misc, unused-ignore]
-    """Sum and number of a figure per pair."""
+    """Sum and number of a figure over pairs. figure: the mean of a batch by the NSGD or pose errors of its pairs."""
 
     full_state_update = False
     is_differentiable, higher_is_better = False, True
     total: Tensor
     pairs: Tensor
 
-    def __init__(self, **options: Any) -> None:
+    def __init__(self, figure: Callable[..., Tensor], **options: Any) -> None:
         super().__init__(**options)
+        self.figure = figure
         self.add_state("total", torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
         self.add_state("pairs", torch.zeros((), dtype=torch.int64), dist_reduce_fx="sum")
 
-    def _add(self, mean: Tensor, pairs: int) -> None:
-        if pairs:
-            self.total = self.total + mean * pairs
-            self.pairs = self.pairs + pairs
+    def update(self, errors: Float[Tensor, " b"]) -> None:
+        """Adds the NSGD of a batch, or its pose errors in degrees, `PoseError.worst`; NaN counts as a miss."""
+        if len(errors):
+            self.total = self.total + self.figure(errors).reshape(()) * len(errors)
+            self.pairs = self.pairs + len(errors)
 
     def compute(self) -> Tensor:
         """The mean over all pairs so far, NaN when there are none."""
@@ -48,10 +51,10 @@ class NSGD(_MeanOverPairs):
     is_differentiable, higher_is_better = True, False
 
     def __init__(self, *, samples: int = 1000, seed: int = 0, **options: Any) -> None:
-        super().__init__(**options)
+        super().__init__(torch.mean, **options)
         self.samples, self.seed = samples, seed
 
-    def update(
+    def update(  # type: ignore[override]
         self,
         F_gt: Float[Tensor, "b 3 3"],
         F_est: Float[Tensor, "b 3 3"],
@@ -60,20 +63,14 @@ class NSGD(_MeanOverPairs):
         key: Int[Tensor, " b"] | None = None,
     ) -> None:
         """Adds a batch; arguments as `fmtorch.metrics.nsgd`."""
-        value = nsgd(F_gt, F_est, size0, size1, samples=self.samples, seed=self.seed, key=key)
-        self._add(value.mean(), len(value))
+        super().update(nsgd(F_gt, F_est, size0, size1, samples=self.samples, seed=self.seed, key=key))
 
 
 class Recall(_MeanOverPairs):
     """`fmtorch.metrics.recall` over all pairs, from their NSGD."""
 
     def __init__(self, *, threshold: float = THRESHOLD, **options: Any) -> None:
-        super().__init__(**options)
-        self.threshold = threshold
-
-    def update(self, nsgd: Float[Tensor, " b"]) -> None:
-        """Adds the NSGD of a batch; NaN counts as a miss."""
-        self._add(recall(nsgd, self.threshold), len(nsgd))
+        super().__init__(functools.partial(recall, threshold=threshold), **options)
 
 
 class MeanRecall(_MeanOverPairs):
@@ -82,36 +79,21 @@ class MeanRecall(_MeanOverPairs):
     is_differentiable = True
 
     def __init__(self, *, maximum: float = THRESHOLD, **options: Any) -> None:
-        super().__init__(**options)
-        self.maximum = maximum
-
-    def update(self, nsgd: Float[Tensor, " b"]) -> None:
-        """Adds the NSGD of a batch; NaN counts as a miss."""
-        self._add(mean_recall(nsgd, self.maximum), len(nsgd))
+        super().__init__(functools.partial(mean_recall, maximum=maximum), **options)
 
 
 class PoseMAA(_MeanOverPairs):
     """mAA(10): `fmtorch.metrics.pose_maa` over all pairs, from their pose errors in degrees."""
 
     def __init__(self, *, maximum: int = MAA_MAXIMUM, **options: Any) -> None:
-        super().__init__(**options)
-        self.maximum = maximum
-
-    def update(self, errors: Float[Tensor, " b"]) -> None:
-        """Adds the pose errors of a batch, `PoseError.worst`; NaN counts as a miss."""
-        self._add(pose_maa(errors, self.maximum), len(errors))
+        super().__init__(functools.partial(pose_maa, maximum=maximum), **options)
 
 
 class PoseMAP(_MeanOverPairs):
     """Binned mAP: `fmtorch.metrics.pose_map` at one threshold over all pairs, from their pose errors in degrees."""
 
     def __init__(self, *, threshold: float | int = THRESHOLDS[1], bin: float | int = BIN, **options: Any) -> None:
-        super().__init__(**options)
-        self.threshold, self.bin = threshold, bin
-
-    def update(self, errors: Float[Tensor, " b"]) -> None:
-        """Adds the pose errors of a batch, `PoseError.worst`; NaN counts as a miss."""
-        self._add(pose_map(errors, (self.threshold,), self.bin)[0], len(errors))
+        super().__init__(functools.partial(pose_map, thresholds=(threshold,), bin=bin), **options)
 
 
 class PoseAUC(Metric):  # type: ignore[misc, unused-ignore]

@@ -6,9 +6,9 @@ from fmtorch.core.lazy import lazy_exports
 
 if TYPE_CHECKING:
     from fmtorch.pruning.calibration import Calibration, MatchNoise, RatioPrior, match_noise
-    from fmtorch.pruning.code import CODE, Coherence, LikelihoodField, SmoothMotion, code, coherence
+    from fmtorch.pruning.code import CODE, Coherence, LikelihoodField, SmoothMotion, coherence
     from fmtorch.pruning.consistency import FrameConsistency, PositionConsistency, frame_agreement, position_agreement
-    from fmtorch.pruning.filters import Likely, MutualCheck, OneToOne, RatioTest, mutual, one_to_one, ratio_test
+    from fmtorch.pruning.filters import Likely, MutualCheck, OneToOne, RatioTest, one_to_one, ratio_test
     from fmtorch.pruning.gms import GMS, gms, gms_support
     from fmtorch.pruning.lpm import LPM, lpm, lpm_cost
     from fmtorch.pruning.networks import DFE, LC, MatchInputs
@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 __all__ = [
     "CODE", "DFE", "GMS", "LC", "LPM", "Calibration", "Coherence", "FrameConsistency", "LearnedPruner",
     "LikelihoodField", "Likely", "MatchInputs", "MatchNoise", "MutualCheck", "OneToOne", "PositionConsistency",
-    "RatioPrior", "RatioTest", "RefineMatches", "SmoothMotion", "code", "coherence", "frame_agreement", "gms",
-    "gms_support", "lpm", "lpm_cost", "match_noise", "mutual", "one_to_one", "position_agreement", "ratio_test",
+    "RatioPrior", "RatioTest", "RefineMatches", "SmoothMotion", "coherence", "frame_agreement", "gms",
+    "gms_support", "lpm", "lpm_cost", "match_noise", "one_to_one", "position_agreement", "ratio_test",
 ]  # fmt: skip
 
 lazy_exports(__name__, checked=True)

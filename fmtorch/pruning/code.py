@@ -269,27 +269,6 @@ class Coherence(NamedTuple):
     residual: Float[Tensor, "b n"]
 
 
-def code(
-    x0: Float[Tensor, "b n 2"],
-    x1: Float[Tensor, "b n 2"],
-    *,
-    mask: Bool[Tensor, "b n"] | None = None,
-    ratio: Float[Tensor, "b n"] | None = None,
-    lafs0: Float[Tensor, "b n 2 3"] | None = None,
-    lafs1: Float[Tensor, "b n 2 3"] | None = None,
-    least_likelihood: float = MIN_LIKELIHOOD,
-    largest_residual: float = LARGEST_RESIDUAL,
-    likelihood: LikelihoodField | None = None,
-    motion: SmoothMotion | None = None,
-) -> Bool[Tensor, "b n"]:
-    """True for matches that are likely and follow the smooth motion of the likely ones; see `coherence`."""
-    result = coherence(
-        x0, x1, mask=mask, ratio=ratio, lafs0=lafs0, lafs1=lafs1,
-        least_likelihood=least_likelihood, likelihood=likelihood, motion=motion,
-    )  # fmt: skip
-    return (result.likelihood > least_likelihood) & (result.residual < largest_residual)
-
-
 @torch.no_grad()
 def coherence(
     x0: Float[Tensor, "b n 2"],
@@ -324,9 +303,9 @@ def coherence(
 
 
 class CODE:
-    """`code` as a stage, which also supplies ``prior``: P(inlier).
-    The odds are ``odds (max(likelihood, 0) + floor)^3 / (1 + (residual / reach)^2)``. soft: True keeps every match and
-    gives the prior only. likelihood, motion: options of `LikelihoodField` and `SmoothMotion`."""
+    """Keeps matches that are likely and follow the smooth motion of the likely ones, and supplies ``prior``: P(inlier).
+    See `coherence`. The odds are ``odds (max(likelihood, 0) + floor)^3 / (1 + (residual / reach)^2)``. soft: True keeps
+    every match and gives the prior only. likelihood, motion: options of `LikelihoodField` and `SmoothMotion`."""
 
     def __init__(
         self,

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from fmtorch.core import Correspondences, Within
@@ -37,20 +37,6 @@ class RatioTest:
             said = "the nearest-neighbour distance ratio of each match"
             raise ValueError(f"the ratio test needs `ratio`, {said}, or `score`")
         return c.keep(ratio_test(c.ambiguity, self.threshold))
-
-
-def mutual(
-    index: Int[Tensor, "b n0"], reverse: Int[Tensor, "b n1"], mask: Bool[Tensor, "b n0"] | None = None
-) -> Bool[Tensor, "b n0"]:
-    """True for a feature i of image 0 whose match j = index[i] is matched back to it, reverse[j] = i.
-    Negative entries are features without a match. Raises ValueError for a feature of image 1 that there is not."""
-    if reverse.shape[-1] == 0:
-        return torch.zeros_like(index, dtype=torch.bool)
-    matched = index >= 0 if mask is None else (index >= 0) & mask
-    if bool((matched & (index >= reverse.shape[-1])).any()):
-        raise ValueError(f"index holds {int(index.max())}, but reverse has {reverse.shape[-1]} features only")
-    back = reverse.gather(-1, torch.where(matched, index, 0))
-    return matched & (back == torch.arange(index.shape[-1], device=index.device))
 
 
 class MutualCheck:

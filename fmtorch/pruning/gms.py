@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -11,8 +11,9 @@ from torch import Tensor
 
 from fmtorch.core.checks import expect_inside
 from fmtorch.core.types import Correspondences
+from fmtorch.geometry.significance import Matches
 from fmtorch.jit.batches import for_each_pair
-from fmtorch.jit.kernel import Array, B1x1, F8x1, F8x2, I8x1, inner, kernel
+from fmtorch.jit.kernel import Array, B1x1, F8x1, I8x1, inner, kernel
 from fmtorch.pruning.calibration import calibration_of
 
 GRID = 20  # cells a side in image 0
@@ -20,16 +21,6 @@ CELLS = GRID * GRID
 HALF_SUPPORT = 1.5  # the score, in square roots of the mean, whose support is one half
 # The cells around a cell as (dx, dy), clockwise from the top left. A rotation by 45 degrees moves the ring on by one.
 RING = np.array(((-1, -1), (0, -1), (1, -1), (1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0)))
-
-
-class Matches(NamedTuple):
-    """The matches of one pair, x0, x1 (n, 2), which are real, mask (n,), and the images' (h, w); all in pixels."""
-
-    x0: F8x2
-    x1: F8x2
-    size0: F8x1
-    size1: F8x1
-    mask: B1x1
 
 
 @kernel
@@ -68,7 +59,7 @@ def gms_support_kernel(matches: Matches, sides: I8x1, turns: int, factor: float,
 @inner
 def _inside(matches: Matches) -> tuple[Array, Array, Array]:
     """The matches inside both images, (m,), and their points in units of the images, (m, 2), as float32 has them."""
-    x0, x1, size0, size1, mask = matches
+    x0, x1, mask, size0, size1 = matches
     n, m = len(mask), 0
     match = np.empty(n, np.int64)
     p0, p1 = np.empty((n, 2), np.float32), np.empty((n, 2), np.float32)
@@ -243,7 +234,7 @@ def _of_each_pair(
     mask = torch.ones_like(x[0][..., 0], dtype=torch.bool) if mask is None else mask
     for i, size in enumerate(sizes):
         expect_inside(x[i], mask, size, f"x{i}", f"size{i}")
-    tensors, out = (*x, sizes[0].float(), sizes[1].float(), mask), torch.empty(mask.shape, dtype=kind)
+    tensors, out = (*x, mask, sizes[0].float(), sizes[1].float()), torch.empty(mask.shape, dtype=kind)
     sides = np.array(GRIDS if with_scale else GRIDS[:1])
     same = sides, 8 if with_rotation else 1, threshold_factor, border == "authors"
     return for_each_pair(of_pair, tensors, *same, out=out, kind=torch.float64, group=Matches)

@@ -11,8 +11,8 @@ size 54.3, 68.1 and 64.6, and upright beside a lying one 53.4, 65.3 and 62.2.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Literal, NamedTuple, cast
+from collections.abc import Callable
+from typing import Literal, cast
 
 import torch
 from jaxtyping import Bool, Float
@@ -46,62 +46,40 @@ def given_sizes(size0: Size, size1: Size) -> tuple[Arrays | None, Arrays | None,
     return size0, size1, size0 is None and size1 is None
 
 
-class Extents(NamedTuple):
-    """Sizes (h, w) of both images by their own points, and of which pairs these tell any."""
-
-    sizes: Float[Tensor, "b 2 2"]
-    known: Bool[Tensor, " b"]
-
-
-def extents(c: Correspondences) -> Extents:
-    """The sizes of images whose points spread evenly up to the border; of pairs whose points look like a photograph's.
-    Centred, normalised and undistorted points have negative coordinates: of these nothing is known."""
+def extents(c: Correspondences) -> tuple[Float[Tensor, "b 2 2"], Bool[Tensor, " b"]]:
+    """Sizes (h, w) of images whose points spread evenly up to the border, and of which pairs these tell any: of those
+    whose points look like a photograph's. Centred, normalised and undistorted points have negative coordinates."""
     x = torch.cat([c.x0, c.x1], -1).detach().double()
     there = (c.mask & x.isfinite().all(-1))[..., None]
     count = there.sum(1).to(x)
     if not x.shape[1]:
-        return Extents(x.new_full((len(c), 2, 2), torch.nan), count[:, 0] > 0)
+        return x.new_full((len(c), 2, 2), torch.nan), count[:, 0] > 0
     first, last = torch.where(there, x, torch.inf).amin(1), torch.where(there, x, -torch.inf).amax(1)
     known = (count >= MIN_MATCHES)[:, 0] & (first > BORDER).all(1) & (last > MIN_PIXELS).all(1)
     sizes = last * (1 + MARGIN / count.clamp_min(1)) + 0.5
-    return Extents(torch.where(known[:, None], sizes, torch.nan).reshape(-1, 2, 2).flip(-1), known)
+    return torch.where(known[:, None], sizes, torch.nan).reshape(-1, 2, 2).flip(-1), known
 
 
-class Attempts(NamedTuple):
-    """Estimates to make of a batch: of its pairs without sizes, of one size, and again of two where that is doubtful.
-    rows: (B,), whether a pair is tried; sizes: (B, 2, 2), those tried, NaN where none are; doubtful: (B,)."""
-
-    rows: list[Bool[Tensor, " b"]]
-    sizes: list[Float[Tensor, "b 2 2"]]
-    batches: list[Correspondences]
-    doubtful: Bool[Tensor, " b"]
-
-
-def attempts_of(c: Correspondences) -> Attempts:
-    """What is tried of pairs whose sizes are not given."""
+def with_assumed_sizes(c: Correspondences, estimate: Callable[[Correspondences], Estimate]) -> Estimate:
+    """The better estimate of each pair, with `sizes` and `sizes_doubtful`. estimate: of a batch, with significance.
+    It is made of pairs without sizes, of pairs of one size, and again of two where that is doubtful."""
     own, known = extents(c)
     same = own.amax(1, keepdim=True).expand(-1, 2, -1)
     doubtful = known & (same > SAME_SIZE * own).flatten(1).any(1)
     kinds = [(known, same), (~known, own), (doubtful, own)]
     tried = [(rows, sizes) for rows, sizes in kinds if bool(rows.any())] or kinds[1:2]
-    rows, sizes = [rows for rows, _ in tried], [sizes for _, sizes in tried]
-    return Attempts(rows, sizes, [_sized(c, *each) for each in tried], doubtful)
+    together = collate([estimate(_sized(c, rows, sizes)) for rows, sizes in tried])
+    row = torch.cat([rows.nonzero()[:, 0] for rows, _ in tried])
+    place = torch.argsort(row[: len(c)])
+    second = torch.arange(len(c), len(row), device=row.device)  # of the doubtful ones, of two sizes
+    significance = cast(Tensor, together.significance)
+    better = together.ok[second] & ~(significance[second] - significance[place[doubtful]] <= TWO_SIZES_GAIN)
+    place = place.masked_scatter(doubtful, torch.where(better, second, place[doubtful]))
+    sizes = torch.cat([sizes[rows] for rows, sizes in tried])
+    return together[place].derived(sizes=sizes[place], sizes_doubtful=doubtful)
 
 
 def _sized(c: Correspondences, rows: Tensor, sizes: Tensor) -> Correspondences:
     """Some pairs of a batch with their sizes, as they are where there are none."""
     c, sizes = (c, sizes) if bool(rows.all()) else (c[rows], sizes[rows])
     return c.derived(size0=sizes[:, 0], size1=sizes[:, 1]) if bool(sizes.isfinite().all()) else c
-
-
-def better_of(attempts: Attempts, estimates: Sequence[Estimate]) -> Estimate:
-    """The estimate of each pair, with `sizes` and `sizes_doubtful`. estimates: of the batches, with significance."""
-    together, doubtful, count = collate(list(estimates)), attempts.doubtful, len(attempts.doubtful)
-    row = torch.cat([rows.nonzero()[:, 0] for rows in attempts.rows])
-    place = torch.argsort(row[:count])
-    second = torch.arange(count, len(row), device=row.device)  # of the doubtful ones, of two sizes
-    significance = cast(Tensor, together.significance)
-    better = together.ok[second] & ~(significance[second] - significance[place[doubtful]] <= TWO_SIZES_GAIN)
-    place = place.masked_scatter(doubtful, torch.where(better, second, place[doubtful]))
-    sizes = torch.cat([sizes[rows] for rows, sizes in zip(attempts.rows, attempts.sizes, strict=True)])
-    return together[place].derived(sizes=sizes[place], sizes_doubtful=doubtful)

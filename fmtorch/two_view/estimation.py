@@ -23,7 +23,7 @@ from fmtorch.presets.files import load
 from fmtorch.presets.objects import construct, instantiate, merged
 from fmtorch.pruning.consistency import FrameConsistency, PositionConsistency
 from fmtorch.two_view.arguments import expect_lenses
-from fmtorch.two_view.assumed_sizes import attempts_of, better_of
+from fmtorch.two_view.assumed_sizes import with_assumed_sizes
 from fmtorch.two_view.known_cameras import KnownCameras
 
 RANSAC = f"fmtorch.estimators.{Ransac.__name__}"  # the `_target_` of presets of this project's own engine
@@ -57,8 +57,7 @@ def estimated_by(
     if not c.asks_for_cameras:
         c = _with_prior(c, estimator)
         if assume_sizes and c.size0 is None and getattr(estimator, "assumes_cameras", False):
-            attempts = attempts_of(c)
-            return better_of(attempts, [_judged(estimator, batch, seed) for batch in attempts.batches])
+            return with_assumed_sizes(c, lambda sized: _judged(estimator, sized, seed))
         return _judged(estimator, c, seed)
     return KnownCameras(estimator, functools.partial(_with_prior, estimator=estimator), covariance)(c, seed)
 

@@ -13,6 +13,7 @@ from fmtorch.estimators import BestOfSearch, BestScore, Candidates, Pool, Refine
 from fmtorch.estimators.inliers import residuals_squared_px
 from fmtorch.estimators.scores import GRID, fractional_bits, saturated_cells
 from fmtorch.geometry.epipolar import HOMOGRAPHY, SAMPSON
+from fmtorch.geometry.levenberg_marquardt import Schedule
 from fmtorch.geometry.robust_losses import ENTRIES, QUANTILE
 from fmtorch.jit.random import Stream
 from tests.estimators.own_parts import Squares
@@ -341,7 +342,7 @@ def test_the_second_choice_is_made_at_the_noise_of_the_pair(noise: float, count:
     1.5 px where these are fewer than 15."""
     pair = pair_of(scene(2, count, outliers=0.1, noise=noise))
     start = models(pair, 30)[1:]
-    F = estimators.SevenPoint().refine(start, pair, estimators.Loss("cauchy", 2.0), estimators.Steps(20, 1e-4))
+    F = estimators.SevenPoint().refine(start, pair, "cauchy", 2.0, Schedule(20, 1e-4, 0.0))
     first = F[int(np.argmax(scores_of(estimators.Msac(0.3), F, pair)))]
     r = np.sqrt(residuals_squared_px(first, pair)) / pair.noises
     r = r[(r <= 2) & (pair.match_weight > 0.3)]

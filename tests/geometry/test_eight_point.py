@@ -152,16 +152,6 @@ def test_hartley_equals_the_definition(batch):
             np.testing.assert_allclose(y[i], (reference.homogeneous(x[i].numpy()) @ expected.T)[:, :2], atol=1e-13)
 
 
-def test_common_scale_is_one_scale():
-    s = scene(30)
-    x1 = 3 * s.x1
-    y0, y1, T0, T1 = geometry.normalize_pair(s.x0, x1)
-    assert torch.equal(T0[0, 0], T1[1, 1])
-    assert y0.mean(0).abs().max() < 1e-14
-    assert y1.mean(0).abs().max() < 1e-14
-    assert ((y0.norm(dim=-1).mean() + y1.norm(dim=-1).mean()) / 2 - 2**0.5).abs() < 1e-14
-
-
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_coincident_and_absent_points_keep_their_scale(dtype):
     same = torch.full((9, 2), 123.4, dtype=dtype, requires_grad=True)
@@ -196,10 +186,9 @@ def test_canonical():
 
 def test_gradients_of_normalisation():
     s = scene(9)
-    x0, x1 = (s.x0 / 500).requires_grad_(), (s.x1 / 500).requires_grad_()
+    x0 = (s.x0 / 500).requires_grad_()
     w = torch.rand(9, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda x, w: geometry.normalize_points(x, weight=w), (x0, w))
-    assert torch.autograd.gradcheck(lambda a, b: geometry.normalize_pair(a, b), (x0, x1))
     assert torch.autograd.gradcheck(
         geometry.canonical, (torch.randn(2, 3, 3, dtype=torch.float64, requires_grad=True),)
     )

@@ -8,7 +8,7 @@ from kornia.geometry.epipolar import motion_from_essential_choose_solution
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from fmtorch.geometry import homography_points, pose_from_fundamental, poses_from_homography, rotation_from_homography
+from fmtorch.geometry import homography_points, pose_from_fundamental, poses_from_homography
 from fmtorch.geometry.cameras import PixelFrame, calibration_problems, mapped, square_pixels
 from fmtorch.geometry.pose import pose
 from tests.geometry.scenes import scene, stacked
@@ -227,23 +227,7 @@ def test_motion_along_the_normal_and_rotations() -> None:
     turned = poses_from_homography(H, k0, k1, x0, homography_points(H, x0))
     assert bool(turned.valid.all())
     assert bool((turned.t.abs() < 1e-9).all())
-    for sign in (1, -3.0):
-        rotation, valid = rotation_from_homography(sign * H, k0, k1)
-        assert bool(valid.all())
-        torch.testing.assert_close(rotation, R, rtol=0, atol=1e-9)
     torch.testing.assert_close(turned.R[:, 0], R, rtol=0, atol=1e-9)
-
-
-def test_the_nearest_rotation() -> None:
-    """Of a matrix that is none: by singular values."""
-    rng = np.random.default_rng(0)
-    for _ in range(20):
-        G = Rotation.random(random_state=rng).as_matrix() + 0.2 * rng.normal(size=(3, 3))
-        U, _, Vt = np.linalg.svd(G)
-        expected = U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt
-        rotation, valid = rotation_from_homography(torch.from_numpy(G), torch.eye(3).double(), torch.eye(3).double())
-        assert bool(valid)
-        np.testing.assert_allclose(rotation.numpy(), expected, atol=1e-7)
 
 
 def test_models_and_cameras_that_are_none_are_not_valid() -> None:
@@ -254,7 +238,6 @@ def test_models_and_cameras_that_are_none_are_not_valid() -> None:
     poses = poses_from_homography(H, k0, k1, x0, x1, mask)
     assert poses.valid.any(-1).tolist() == [False] * 5 + [True]
     assert torch.equal(poses.R[:5], torch.eye(3).double().expand(5, 2, 3, 3))
-    assert rotation_from_homography(H, k0, k1)[1].tolist() == [False] * 4 + [True] * 2
 
 
 SIZE = torch.tensor([[480, 640]])

@@ -13,9 +13,8 @@ from fmtorch.geometry import LOSSES, attached_step, irls, refine
 from fmtorch.geometry.epipolar import linearise
 from fmtorch.geometry.irls import reweighted, reweighted_kernel
 from fmtorch.geometry.levenberg_marquardt import FIRST_DAMPING, LOSS_CODES, Schedule, Weighted, evaluate
-from fmtorch.geometry.normalize import RobustSum
-from fmtorch.geometry.rank2_manifold import SQUARINGS
-from fmtorch.geometry.refine import refine_components, refine_kernel
+from fmtorch.geometry.normalize import RobustSum, fitted_by
+from fmtorch.geometry.refine import refine_kernel
 from tests.estimators.pairs import apart
 from tests.geometry.scenes import SCALE, distance, near_scene, tolerances, unit_scene
 from tests.reference import refine as reference
@@ -38,7 +37,7 @@ def test_robust_optimum_equals_scipy(loss: str, seed: int) -> None:
     F0 = models(F, 1, 1e-3, seed)
     ones = torch.ones(1, 120, dtype=torch.float64)
     s2 = torch.full((1, 1), scale**2, dtype=torch.float64)
-    fitted, cost = refine_components(F0, RobustSum(components(x0, x1), ones, loss, s2), 60)
+    fitted, cost = fitted_by(refine_kernel, F0, RobustSum(components(x0, x1), ones, loss, s2), 60)
     # From our optimum SciPy, which knows another parametrisation and numerical gradients, cannot get lower.
     _, min_cost = reference.optimum(fitted[:, 0, 0].reshape(3, 3).numpy(), x0, x1, np.ones(120), loss, scale)
     # The tabulated loss is linear between its entries, whose integral is off by up to 1e-7.
@@ -53,7 +52,7 @@ def test_cost_never_rises(loss: str) -> None:
     F0 = torch.cat([models(F, 10, 0.05), models(F, 10, 1.0)], 2)
     weight = torch.from_numpy(np.random.default_rng(0).uniform(0, 1, (1, 90)))
     error = RobustSum(components(x0, x1), weight, loss, torch.full((1, 1), 0.02**2, dtype=torch.float64))
-    costs = [refine_components(F0, error, i)[1] for i in range(8)]
+    costs = [fitted_by(refine_kernel, F0, error, i)[1] for i in range(8)]
     for before, after in itertools.pairwise(costs):
         assert bool((after <= before).all())
     assert bool((costs[-1] < costs[0])[:, :10].any())
@@ -181,7 +180,7 @@ def refined(
     """Models and costs by the kernel."""
     fitted, cost = np.empty_like(F), np.empty(len(F))
     weighted = Weighted.of(points, weight, s2, loss)
-    refine_kernel(F, SQUARINGS, weighted, Schedule(iterations, FIRST_DAMPING, tolerance), fitted, cost)
+    refine_kernel(F, weighted, Schedule(iterations, tolerance=tolerance), fitted, cost)
     return fitted, cost
 
 

@@ -260,7 +260,7 @@ SIZES = np.array([[480, 640]] * 4)
 CALLS: dict[str, tuple[Any, ...]] = {
     "sgd": (F0, F1, SIZES, SIZES), "nsgd": (F0, F1, SIZES, SIZES), "nsgd_released": (F0, F1, SIZES, SIZES),
     "inlier_rate": (F0, X0, X1, X0[..., 0] > 9, SIZES, SIZES), "ground_truth_inliers": (F0, X0, X1, SIZES, SIZES),
-    "pose_error": (R, T, R[::-1], T[::-1]), "pose_auc": (T[:, 0],), "recall": (T,), "recall_curve": (T, T[0]),
+    "pose_error": (R, T, R[::-1], T[::-1]), "pose_auc": (T[:, 0],), "recall": (T,),
     "mean_recall": (T,), "pose_map": (T[:, 0],), "pose_maa": (T,),
     "fundamental_pose_error": (F0, np.eye(3) + 0 * R, np.eye(3) + 0 * R, X0, X1, R, T),
     "closest_pose_error": (F0, np.eye(3) + 0 * R, np.eye(3) + 0 * R, R, T),

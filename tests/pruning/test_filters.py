@@ -17,7 +17,7 @@ from torch import Tensor
 
 from fmtorch import find_fundamental, metrics, presets, pruning
 from fmtorch.core import Correspondences, Features
-from fmtorch.matching import NearestNeighborMatcher, nearest_neighbors
+from fmtorch.matching import NearestNeighborMatcher
 from fmtorch.pruning.consistency import CURVES, MIN_VOTE, NOISE, SCALES, TOLERANCE, TURNS, WINDOW, WORST_RATIO
 from tests.geometry.scenes import scene as matched_scene
 from tests.laws import calibrated, degenerate, quick_pruner, scene, scenes, small, with_padding
@@ -33,17 +33,6 @@ def test_ratio_is_strict_and_refuses_nan() -> None:
     ratio = torch.tensor([[0.0, 0.79, 0.8, 1.0, math.nan]])
     assert pruning.ratio_test(ratio, 0.8).tolist() == [[True, True, False, False, False]]
     assert pruning.ratio_test(ratio, 0.8, torch.tensor([[False, True, True, True, True]])).sum() == 1
-
-
-def test_mutual_agrees_with_the_matcher() -> None:
-    generator = torch.Generator().manual_seed(0)
-    d0, d1 = torch.rand(2, 40, 8, generator=generator), torch.rand(2, 30, 8, generator=generator)
-    mask0, mask1 = torch.rand(2, 40, generator=generator) < 0.8, torch.rand(2, 30, generator=generator) < 0.8
-    neighbors = nearest_neighbors(d0, d1, mask0, mask1)
-    assert torch.equal(pruning.mutual(neighbors.nearest, neighbors.reverse), neighbors.mutual)
-    garbage = torch.where(mask0, neighbors.nearest, 10**9)
-    assert torch.equal(pruning.mutual(garbage, neighbors.reverse, mask0), neighbors.mutual)
-    assert not pruning.mutual(neighbors.nearest, neighbors.reverse[:, :0]).any()
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from fmtorch.core import Correspondences
 from fmtorch.jit.kernel import F8x2, I8x2, kernel
-from fmtorch.pruning import GMS, LPM, LikelihoodField, code, gms, lpm
+from fmtorch.pruning import CODE, GMS, LPM, LikelihoodField, gms, lpm
 from fmtorch.pruning import neighbors as knn_kernels
 from fmtorch.pruning.code import huber_regression, match_domain, predictive_gaussians, spread_centres
 from tests.conftest import oracle
@@ -200,7 +200,7 @@ def warped(seed: int, n: int, outliers: float, noise: float = 0.5) -> tuple[Corr
 
 
 def run_code(c: Correspondences) -> Tensor:
-    return code(c.x0, c.x1, mask=c.mask, ratio=c.ratio, lafs0=c.lafs0, lafs1=c.lafs1)[0]
+    return CODE(odds=1.0, floor=1.0, reach=1.0)(c).mask[0]
 
 
 def domain_of(c: Correspondences) -> tuple:

@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import gamma, gammainc, gammaincc
 
 from fmtorch.geometry import LOSSES
+from fmtorch.geometry.robust_losses import LOSS_TABLE
 from tests.reference.solvers import sampson
 
 
@@ -56,6 +57,15 @@ def optimum(
     return matrix(theta), cost(theta)
 
 
+def tabulated(r2: np.ndarray, s2: np.ndarray) -> np.ndarray:
+    """MAGSAC++'s loss by the table of its weights, which are linear between entries."""
+    entries = LOSS_TABLE.shape[1] - 2
+    share, interval = np.modf(np.minimum(r2 / s2, 1) * entries)
+    weight, following = (LOSS_TABLE[0, interval.astype(int) + k] for k in (0, 1))
+    inside = (weight + share * (following - weight) / 2) * share / entries
+    return np.asarray(s2 * (LOSS_TABLE[1, interval.astype(int)] + inside))
+
+
 def normal_equations(
     f: np.ndarray, points: np.ndarray, weight: np.ndarray, s2: np.ndarray, name: str
 ) -> tuple[np.ndarray, float]:
@@ -73,8 +83,9 @@ def normal_equations(
         rows.append(np.append(slope.ravel(), e[match] / np.sqrt(g2[match])))
     A = np.array(rows)
     r2 = e**2 / g2
-    robust, R2, S2 = LOSSES[name], torch.from_numpy(r2), torch.from_numpy(s2)
-    return A.T @ (A * (weight * robust.weight(R2, S2).numpy())[:, None]), float(weight @ robust.loss(R2, S2).numpy())
+    slope = LOSSES[name].weight(torch.from_numpy(r2), torch.from_numpy(s2)).numpy()
+    values = tabulated(r2, s2) if name == "magsac" else loss(r2, s2, name)
+    return A.T @ (A * (weight * slope)[:, None]), float(weight @ values)
 
 
 def levenberg_marquardt(

@@ -113,8 +113,8 @@ def function_call(function: Callable[..., Any], data: st.DataObject) -> tuple[Ca
     return functools.partial(function, **arguments), set(parameters), check
 
 
-UNDEFINED = {"inlier_rate", "recall", "recall_curve", "mean_recall", "pose_auc"}  # NaN of an empty set
-UNIT_INTERVAL = {"nsgd", "nsgd_released", "recall", "recall_curve", "mean_recall", "pose_auc", "inlier_rate"}
+UNDEFINED = {"inlier_rate", "recall", "mean_recall", "pose_auc"}  # NaN of an empty set
+UNIT_INTERVAL = {"nsgd", "nsgd_released", "recall", "mean_recall", "pose_auc", "inlier_rate"}
 NOT_NEGATIVE = {"sampson", "sampson_squared", "epipolar_distances", "symmetric_max", "symmetric_mean", "point_to_line"}
 
 

@@ -83,14 +83,14 @@ def colmap(
         if cameras is not None and pair.exact is not None:
             ends = (_pinhole(library, camera) for camera in cameras)
             result = library.estimate_essential_matrix(pair.x0, pair.x1, *ends, ransac)
-            return _without(pair) if result is None else _posed(result, *pair.exact)
+            return pairwise.without(pair) if result is None else _posed(result, pair.exact)
         result = library.estimate_fundamental_matrix(pair.x0, pair.x1, ransac)
-        return _without(pair) if result is None else pairwise.solution(result["F"], result["inlier_mask"])
+        return pairwise.without(pair) if result is None else pairwise.solution(result["F"], result["inlier_mask"])
 
     def homography(pair: Pair) -> Solution:
         result = library.estimate_homography_matrix(pair.x0, pair.x1, settings(pair).ransac)
         if result is None:
-            return _without(pair)
+            return pairwise.without(pair)
         H, inliers = np.asarray(result["H"], np.float64), np.asarray(result["inlier_mask"], np.bool_)
         depth = pair.x0[inliers] @ H[2, :2] + H[2, 2]
         return (-H if np.count_nonzero(depth < 0) > np.count_nonzero(depth > 0) else H), inliers
@@ -127,16 +127,10 @@ def two_view_geometry(x0: Points, x1: Points, cameras: tuple[Camera, Camera], op
     return TwoView(configuration, F, R, t, K0, K1, inliers)
 
 
-def _posed(result: Any, K0: Points, K1: Points) -> pairwise.Posed:
+def _posed(result: Any, K: tuple[Points, Points]) -> pairwise.Posed:
     """COLMAP's relative pose with F of its essential matrix, px."""
-    F = np.linalg.inv(K1).T @ np.asarray(result["E"]) @ np.linalg.inv(K0)
-    pose, inliers = result["cam2_from_cam1"], np.asarray(result["inlier_mask"], np.bool_)
-    return pairwise.Posed(F, inliers, None, np.asarray(pose.rotation.matrix()), np.asarray(pose.translation))
-
-
-def _without(pair: Pair) -> Solution:
-    """No model, and no inliers."""
-    return None, np.zeros(len(pair.x0), np.bool_)
+    pose = result["cam2_from_cam1"]
+    return pairwise.posed(K, pose.rotation.matrix(), pose.translation, result["inlier_mask"], result["E"])
 
 
 def _cameras(pair: Pair) -> tuple[Camera, Camera]:

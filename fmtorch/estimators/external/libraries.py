@@ -49,9 +49,7 @@ def opencv(
             options = {"method": int(code), "prob": confidence, "threshold": essential, "maxIters": iterations}
             return _of_essential(pair, pair.exact, options)
         F, mask = cv2.findFundamentalMat(pair.x0, pair.x1, int(code), threshold, confidence, iterations)
-        if F is None or mask is None:  # a minimal set may also give several solutions, stacked
-            return None, np.zeros(len(pair.x0), dtype=np.bool_)
-        return F.astype(np.float64), mask.ravel().astype(np.bool_)
+        return pairwise.without(pair) if mask is None else pairwise.solution(F, mask)
 
     return PairwiseEstimator(f"OpenCV {name}", solve, best_first=name == "USAC_PROSAC")
 
@@ -60,11 +58,11 @@ def _of_essential(pair: Pair, K: tuple[Points, Points], options: Mapping[str, An
     rays = calibrated(pair.x0, K[0]), calibrated(pair.x1, K[1])
     E, mask = cv2.findEssentialMat(*rays, np.eye(3), **options)
     if E is None:
-        return None, np.zeros(len(pair.x0), np.bool_)
+        return pairwise.without(pair)
     # Several where a sample is minimal, of which that counts which has most matches in front of both cameras.
     poses = [(each, *cv2.recoverPose(each, *rays, mask=mask.copy())) for each in E.reshape(-1, 3, 3)]
     best, _, R, t, _ = max(poses, key=lambda pose: pose[1])
-    return _posed_by_essential(best, R, t, K, mask.ravel() > 0)
+    return pairwise.posed(K, R, t, mask > 0, best)
 
 
 def weighted_eight_point(*, best: Annotated[float, Within(0, 1)] = 0.1) -> PairwiseEstimator:
@@ -91,14 +89,9 @@ def weighted_eight_point(*, best: Annotated[float, Within(0, 1)] = 0.1) -> Pairw
         E = np.linalg.eigh((X * weight[:, None]).T @ X)[1][:, 0].reshape(3, 3)
         kept = p >= np.sort(p)[::-1][min(max(1, int(best * len(p))), len(p) - 1)]
         _, R, t, _ = cv2.recoverPose(E, rays0[kept], rays1[kept])
-        return _posed_by_essential(E, R, t, K, weight > 0)
+        return pairwise.posed(K, R, t, weight > 0, E)
 
     return PairwiseEstimator("the weighted eight-point algorithm", solve)
-
-
-def _posed_by_essential(E: Any, R: Any, t: Any, K: tuple[Points, Points], inliers: NDArray[np.bool_]) -> pairwise.Posed:
-    F = np.linalg.inv(K[1]).T @ np.asarray(E, np.float64) @ np.linalg.inv(K[0])
-    return pairwise.Posed(F, inliers, None, np.asarray(R, np.float64), np.ravel(t).astype(np.float64))
 
 
 def kornia_ransac(
@@ -127,8 +120,7 @@ def kornia_ransac(
             prosac_sampling=prosac, seed=pair.seed,
         )  # fmt: skip
         x0, x1, weights = (torch.from_numpy(a).to(torch.float32) for a in (pair.x0, pair.x1, pair.likelihood))
-        F, mask = estimator(x0, x1, weights)
-        return F.to(torch.float64).numpy(), mask.numpy().astype(np.bool_)
+        return pairwise.solution(*estimator(x0, x1, weights))
 
     return PairwiseEstimator("kornia", solve, best_first=prosac)
 
@@ -367,9 +359,7 @@ def _relative_pose(library: Any, pair: Pair, options: dict[str, Any], refinement
         for K, (h, w) in zip(pair.exact, (pair.size0, pair.size1), strict=True)
     ]
     pose, info = library.estimate_relative_pose(pair.x0, pair.x1, *cameras, options, refinement)
-    R, t = np.asarray(pose.R, np.float64), np.asarray(pose.t, np.float64)
-    F = pairwise.fundamental_of_pose(*pair.exact, R, t)
-    return pairwise.Posed(F, np.asarray(info["inliers"], np.bool_), None, R, t)
+    return pairwise.posed(pair.exact, pose.R, pose.t, info["inliers"])
 
 
 def _shared_focal(library: Any, pair: Pair, options: dict[str, Any], refinement: dict[str, Any]) -> Solution:
@@ -378,7 +368,7 @@ def _shared_focal(library: Any, pair: Pair, options: dict[str, Any], refinement:
     image_pair, info = library.estimate_shared_focal_relative_pose(pair.x0, pair.x1, centre, options, refinement)
     focal, pose = image_pair.camera1.params[0], image_pair.pose
     if not (np.isfinite(focal) and focal > 0):
-        return None, np.zeros(len(pair.x0), dtype=np.bool_)
+        return pairwise.without(pair)
     to_ray = np.array([[1 / focal, 0, -centre[0] / focal], [0, 1 / focal, -centre[1] / focal], [0, 0, 1]])
     F = to_ray.T @ np.cross(np.eye(3), np.asarray(pose.t)).T @ np.asarray(pose.R) @ to_ray
     return pairwise.solution(F, info["inliers"])
@@ -434,7 +424,7 @@ def fastpose(
             return pairwise.solution(result["H"], info["inliers"])
         if pair.exact is not None:
             result, info = library.estimate_relative_pose(pair.x0, pair.x1, *pair.exact, **own)
-            return _posed(result, info, *pair.exact)
+            return _of_fastpose(pair, result, info, pair.exact)
         kind = focal or (("varying", "shared")[pair.shared_focal] if pair.calibrations == (None, None) else None)
         if kind is not None:
             call = getattr(library, f"estimate_relative_pose_with_{kind}_focal{'s' * (kind == 'varying')}")
@@ -443,17 +433,14 @@ def fastpose(
             focals = [result[name] for name in (("f", "f") if kind == "shared" else ("f1", "f2"))]
             ends = zip(focals, centres, strict=True)
             K0, K1 = (np.array([[f, 0, x], [0, f, y], [0, 0, 1]]) for f, (x, y) in ends)
-            return _posed(result, info, K0, K1, np.array(focals))
+            return _of_fastpose(pair, result, info, (K0, K1), np.array(focals))
         result, info = library.estimate_fundamental(pair.x0, pair.x1, **own)
         return pairwise.solution(result["F"], info["inliers"])
 
     return PairwiseEstimator("fastpose", solve, model=model)
 
 
-def _posed(
-    result: dict[str, Any], info: dict[str, Any], K0: Points, K1: Points, focals: Points | None = None
-) -> pairwise.Posed:
-    """A relative pose with F of its cameras; none where there are no inliers."""
-    inliers = np.asarray(info["inliers"], np.bool_)
-    F = pairwise.fundamental_of_pose(K0, K1, result["R"], result["t"]) if info["num_inliers"] else None
-    return pairwise.Posed(F, inliers, focals, result["R"], result["t"])
+def _of_fastpose(pair: Pair, result: Any, info: Any, K: tuple[Points, Points], focals: Any = None) -> Solution:
+    if not info["num_inliers"]:
+        return pairwise.without(pair)
+    return pairwise.posed(K, result["R"], result["t"], info["inliers"], focals=focals)

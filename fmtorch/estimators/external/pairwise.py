@@ -188,6 +188,18 @@ def solution(F: Any, inliers: Any) -> Solution:
     return None if F is None else np.asarray(F, dtype=np.float64), np.asarray(inliers, dtype=np.bool_).ravel()
 
 
+def without(pair: Pair) -> Solution:
+    """No model, and no inliers."""
+    return None, np.zeros(len(pair.x0), np.bool_)
+
+
+def posed(K: tuple[Points, Points], R: Any, t: Any, inliers: Any, E: Any = None, focals: Points | None = None) -> Posed:
+    """A relative pose with F of its cameras, by E where a library gives another one than that of the pose."""
+    R, t = np.asarray(R, np.float64), np.ravel(t).astype(np.float64)
+    F = fundamental_of_pose(*K, R, t) if E is None else np.linalg.inv(K[1]).T @ np.asarray(E) @ np.linalg.inv(K[0])
+    return Posed(F, np.asarray(inliers, np.bool_).ravel(), focals, R, t)
+
+
 def within(F: Any, pair: Pair, threshold: float) -> NDArray[np.bool_]:
     """Which matches lie within a Sampson distance of F, in pixels, (N,)."""
     matrix, x0, x1 = (torch.from_numpy(np.asarray(value, np.float64)) for value in (F, pair.x0, pair.x1))

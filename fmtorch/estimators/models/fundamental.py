@@ -8,7 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from fmtorch.estimators.models.model import FitScale, Hypotheses, Loss, Steps
+from fmtorch.estimators.models.model import FitScale, Hypotheses
 from fmtorch.estimators.pair import Pair, to_pixels
 from fmtorch.geometry.eight_point import eight_point_kernel, weighted_eight_point
 from fmtorch.geometry.epipolar import HOMOGRAPHY, SAMPSON, Residual
@@ -27,12 +27,14 @@ SQUARINGS = 1  # by which models are made rank 2, whose last singular value is b
 class Matrices:
     """What the families share whose models are matrices of a minimal sample, each by its kernels.
     size, solutions: matches of a minimal sample, and its models at most. minimal: samples -> models. linear: weighted
-    matches -> the model of least squares. gauss_newton: a model -> the model after one step."""
+    matches -> the model of least squares. robust: models -> those of least robust error nearby, and their costs.
+    gauss_newton: a model -> the model after one step."""
 
     size: ClassVar[int]
     solutions: ClassVar[int]
     minimal: ClassVar[Callable[..., int]]
     linear: ClassVar[Callable[..., bool]]
+    robust: ClassVar[Callable[..., None]]
     gauss_newton: ClassVar[Callable[..., None]]
 
     def solve(self, pair: Pair, sample: Array, start: int) -> Hypotheses:
@@ -47,16 +49,11 @@ class Matrices:
         weight: Array = pair.weight
         return weight
 
-    def minimise(self, F: Array, matches: Weighted, schedule: Schedule, out: Array, cost: Array) -> None:
-        """Models (k, 9) of least robust error near F -> out (k, 9), and their costs (k,)."""
-        raise NotImplementedError
-
-    def refine(self, F: Array, pair: Pair, loss: Loss, steps: Steps) -> Array:
+    def refine(self, F: Array, pair: Pair, loss: str, scale: float, schedule: Schedule) -> Array:
         """As `Refining.refine`."""
-        s2 = np.square(loss.scale / pair.pixels_per_noise)
-        matches = Weighted.of(pair.points, self.weight(pair), s2, loss.name)
+        matches = Weighted.of(pair.points, self.weight(pair), np.square(scale / pair.pixels_per_noise), loss)
         refined, cost = np.empty_like(F), np.empty(len(F))
-        self.minimise(F, matches, Schedule(steps.iterations, steps.damping, steps.tolerance or 0.0), refined, cost)
+        self.robust(F, matches, schedule._replace(squarings=SQUARINGS), refined, cost)
         np.copyto(refined, F, where=~np.isfinite(cost)[:, None])
         return refined
 
@@ -83,15 +80,11 @@ class Fundamental(Matrices):
     model: ClassVar[str] = "fundamental"
     residual: ClassVar[Residual] = SAMPSON
     fit_scale: ClassVar[FitScale] = FitScale()
-    linear, gauss_newton = weighted_eight_point, gauss_newton
+    linear, robust, gauss_newton = weighted_eight_point, refine_kernel, gauss_newton
 
     def to_pixels(self, F: Array, pair: Pair, out: Array) -> bool:
-        """As `Estimated.to_pixels`, the entry of largest magnitude positive."""
+        """As `Refining.to_pixels`, the entry of largest magnitude positive."""
         return to_pixels(F, pair.centre, pair.pixels_per_unit, out)
-
-    def minimise(self, F: Array, matches: Weighted, schedule: Schedule, out: Array, cost: Array) -> None:
-        """As `Matrices.minimise`."""
-        refine_kernel(F, SQUARINGS, matches, schedule, out, cost)
 
 
 class SevenPoint(Fundamental):
@@ -120,10 +113,10 @@ class Homography(Matrices):
     residual: ClassVar[Residual] = HOMOGRAPHY
     fit_scale: ClassVar[FitScale] = FitScale("cauchy", 0.8493, 1.5, 0.1, 4.0, 1.0, by_prior=False)
     size, solutions, minimal = 4, 1, four_point
-    linear, gauss_newton = weighted_homography, step_of_homography
+    linear, robust, gauss_newton = weighted_homography, refine_homographies, step_of_homography
 
     def to_pixels(self, F: Array, pair: Pair, out: Array) -> bool:
-        """As `Estimated.to_pixels`."""
+        """As `Refining.to_pixels`."""
         return homography_to_pixels(F, pair.centre, pair.pixels_per_unit, out)
 
     def weight(self, pair: Pair) -> Array:
@@ -132,10 +125,6 @@ class Homography(Matrices):
         known warps AUC of the corner error at 1 px is 66.2 without and 63.2 with them where matches are few, 83.1 and
         83.0 otherwise; by a truncated loss in place of Cauchy's 62.2 and 80.9."""
         return 1 / np.square(pair.noises)
-
-    def minimise(self, F: Array, matches: Weighted, schedule: Schedule, out: Array, cost: Array) -> None:
-        """As `Matrices.minimise`, of the Sampson error."""
-        refine_homographies(F, matches, schedule, out, cost)
 
 
 @kernel(holds_gil=True)

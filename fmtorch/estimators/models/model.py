@@ -13,7 +13,7 @@ from fmtorch.estimators.models.posterior import Cameras
 from fmtorch.estimators.pair import Pair
 from fmtorch.geometry.arithmetic import exponential
 from fmtorch.geometry.epipolar import TINY_OF_KERNEL, Residual, sampson_parts
-from fmtorch.geometry.levenberg_marquardt import MATCH, Weighted, in_rows
+from fmtorch.geometry.levenberg_marquardt import MATCH, Schedule, Weighted, in_rows
 from fmtorch.geometry.pose import handedness
 from fmtorch.jit.kernel import Array, F8x1, F8x2, inner, kernel
 from fmtorch.jit.lanes import absolute, added, fill, load, sqrt, where
@@ -55,45 +55,22 @@ class FitScale(NamedTuple):
     by_prior: bool = True
 
 
-class Loss(NamedTuple):
-    """A robust loss of the Sampson distance. name: of `geometry.LOSSES`. scale: px, of a match of usual noise."""
-
-    name: str
-    scale: float
-
-
-class Steps(NamedTuple):
-    """Of Levenberg-Marquardt. damping: of the first step. tolerance: None, or the share of its cost by which a step
-    must lower it, if the fit is to go on."""
-
-    iterations: int
-    damping: float
-    tolerance: float | None = None
-
-
 @runtime_checkable
-class Estimated(Protocol):
-    """What an estimate is. model: what it is called. residual: by which matches are judged."""
+class Refining(Family, Protocol):
+    """A family whose models can be refined and fitted on their own, and be estimates.
+    model: what an estimate is called. residual: by which matches are judged."""
 
     model: ClassVar[str]
     residual: ClassVar[Residual]
+    fit_scale: ClassVar[FitScale]
 
     def to_pixels(self, F: Array, pair: Pair, out: Array) -> bool:
         """A model (9,) of normalised points as that of pixels, of unit norm -> out (3, 3); whether it is finite."""
         ...
 
-
-@runtime_checkable
-class Refining(Family, Estimated, Protocol):
-    """A family whose models can be refined and fitted on their own."""
-
-    fit_scale: ClassVar[FitScale]
-
-    def refine(self, F: Array, pair: Pair, loss: Loss, steps: Steps) -> Array:
-        """Models (k, 9) of least robust error nearby, on all matches by prior and noise; float64.
-
-        One that cannot be refined is as it was.
-        """
+    def refine(self, F: Array, pair: Pair, loss: str, scale: float, schedule: Schedule) -> Array:
+        """Models (k, 9) of least robust error nearby, on all matches by prior and noise; float64. One that cannot be
+        refined is as it was. loss: of the Sampson distance, of `geometry.LOSSES`. scale: px, of a usual match."""
         ...
 
     def least_squares(self, F: Array, pair: Pair, weight: Array) -> Array:

@@ -16,7 +16,7 @@ from fmtorch.geometry.arithmetic import exponential, logarithm_kernel
 from fmtorch.geometry.levenberg_marquardt import Weighted, evaluate, minimiser
 from fmtorch.geometry.matrices import assign, assign_rows
 from fmtorch.geometry.pose import nearest_axes
-from fmtorch.geometry.rank2_manifold import SQUARINGS, eliminate, start_one
+from fmtorch.geometry.rank2_manifold import SQUARINGS, damped_step, start_one
 from fmtorch.jit.kernel import Array, F8x1, F8x2, F8x3, F8x4, inner, kernel, matrix, vector
 from fmtorch.jit.lanes import LANES, fill, load, store
 
@@ -208,27 +208,15 @@ class Limits(NamedTuple):
 
 
 class Optimum(NamedTuple):
-    """Of k candidates, models F (k, 9), costs (k,), and their derivatives by five rotations and two logarithms,
-    gradient (k, 7), hessian (k, 7, 7)."""
+    """Of k candidates, cameras, models F (k, 9), costs (k,), and derivatives by five rotations and two logarithms,
+    gradient (k, 7), hessian (k, 7, 7). Of one focal length for both the sixth is its logarithm and the seventh none."""
 
+    axes: F8x4
+    focal: F8x2
     F: F8x2
     cost: F8x1
     gradient: F8x2
     hessian: F8x3
-
-
-class _State(NamedTuple):
-    """Of k candidates, cameras, models (k, 9), costs (k,), and their derivatives (k, 7), (k, 7, 7).
-    shared: whether the two focal lengths are one; the sixth parameter is then its logarithm and the seventh has none.
-    """
-
-    axes: Array
-    focal: Array
-    F: Array
-    cost: Array
-    gradient: Array
-    hessian: Array
-    shared: bool
 
 
 class _Data(NamedTuple):
@@ -241,18 +229,18 @@ class _Data(NamedTuple):
     products: Array
 
 
-def no_optimum(k: int) -> Optimum:
-    """Room for the optima of k candidates."""
-    return Optimum(np.empty((k, 9)), np.empty(k), np.empty((k, 7)), np.empty((k, 7, 7)))
+def start_at(cameras: Cameras) -> Optimum:
+    """Room for the optima near cameras, which they take the place of."""
+    k = len(cameras.focal)
+    return Optimum(*cameras, np.empty((k, 9)), np.empty(k), np.empty((k, 7)), np.empty((k, 7, 7)))
 
 
 @kernel
-def minimise(cameras: Cameras, matches: Weighted, images: Images, limits: Limits, out: Optimum) -> None:
-    """Cameras of least negative logarithm of the posterior near these, in place; what it is there -> out."""
-    k, shared = len(out.cost), images.prior.shared
-    state = _State(cameras.axes, cameras.focal, out.F, out.cost, out.gradient, out.hessian, shared)
+def minimise(state: Optimum, matches: Weighted, images: Images, limits: Limits) -> None:
+    """Cameras of least negative logarithm of the posterior near these, and what it is there, in place."""
+    k = len(state.cost)
     axes, hessian = np.empty((k, 2, 3, 3)), np.empty((k, 7, 7))
-    trial = _State(axes, matrix(k, 2), matrix(k, 9), vector(k), matrix(k, 7), hessian, shared)
+    trial = Optimum(axes, matrix(k, 2), matrix(k, 9), vector(k), matrix(k, 7), hessian)
     data = _Data(matches, images, limits, np.zeros((k, 9, LANES)), np.empty((k, 10, 10)))
     _minimise(data, state, trial, np.full(k, FIRST_DAMPING), limits.iterations, limits.tolerance >= 0)
 
@@ -264,12 +252,13 @@ def tangents_of(cameras: Cameras, longest: F8x1, F: F8x2, out: F8x3) -> None:
 
 
 @inner
-def _evaluate(state: _State, data: _Data, derivatives: bool) -> None:
-    camera_models(state.axes, state.focal, data.images.longest, state.shared, state.F, data.tangents)
+def _evaluate(state: Optimum, data: _Data, derivatives: bool) -> None:
+    images = data.images
+    camera_models(state.axes, state.focal, images.longest, images.prior.shared, state.F, data.tangents)
     evaluate(state.F, data.matches, derivatives, data.products, state.cost)
     work = vector(5)
     for k in range(len(state.cost)):
-        prior = focal_cost(state.focal[k], data.images.prior, work)
+        prior = focal_cost(state.focal[k], images.prior, work)
         state.cost[k] = state.cost[k] * data.limits.precision / 2 + prior
         if derivatives:
             _derivatives(
@@ -323,13 +312,11 @@ def _derivatives(
 
 
 @inner
-def _step(state: _State, damping: Array, trial: _State) -> None:
+def _step(data: _Data, state: Optimum, damping: Array, trial: Optimum) -> None:
     Q, x = matrix(7, LANES), vector(7)
     for k in range(len(damping)):
-        damped_step(state.hessian[k], state.gradient[k], damping[k], Q)
-        for i in range(7):
-            x[i] = Q[i, 7]
-        move_cameras(state, k, x, state.shared, trial)
+        damped_step(state.hessian[k], state.gradient[k], damping[k], Q, x)
+        move_cameras(state, k, x, data.images.prior.shared, trial)
 
 
 @inner
@@ -340,17 +327,6 @@ def move_cameras(state: Any, k: int, x: Array, shared: bool, trial: Any) -> None
     for i in range(2):
         step = x[5 if shared else 5 + i]
         trial.focal[k, i] = min(max(state.focal[k, i] + min(max(step, -1.0), 1.0), -3.0), 3.0)
-
-
-@inner
-def damped_step(hessian: Array, gradient: Array, damping: float, Q: Array) -> None:
-    """Solves ``(H + damping diag H) x = -gradient`` -> last column of Q (7, LANES)."""
-    for i in range(7):
-        for j in range(7):
-            Q[i, j] = hessian[i, j]
-        Q[i, i] += hessian[i, i] * damping
-        Q[i, 7] = -gradient[i]
-    eliminate(Q, 7)
 
 
 @inner

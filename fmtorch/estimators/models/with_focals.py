@@ -15,6 +15,7 @@ from fmtorch.estimators.pair import Pair, squared
 from fmtorch.geometry.five_point import five_point
 from fmtorch.geometry.levenberg_marquardt import GEMAN_MCCLURE, Weighted
 from fmtorch.geometry.matrices import unit_kernel
+from fmtorch.geometry.rank2_manifold import damped_step
 from fmtorch.geometry.refine import STEP_DAMPING
 from fmtorch.jit.kernel import Array, F8x1, F8x2, kernel, matrix, vector
 from fmtorch.jit.lanes import LANES
@@ -32,14 +33,6 @@ class Refined(NamedTuple):
     models: F8x2
     cost: F8x1
     share: F8x1
-
-
-class FocalFit(NamedTuple):
-    """A model (9,), its cameras, and what the logarithm of the likelihood would gain without prior."""
-
-    F: Array
-    cameras: Cameras
-    gain: float
 
 
 class FundamentalWithFocals:
@@ -68,14 +61,15 @@ class FundamentalWithFocals:
         refine_with_prior(F, Subset(pair.table, images_of(pair), parallel, LOSS_SCALE_PX), limits, cameras, refined)
         return cameras, refined
 
-    def fit(self, start: Cameras, pair: Pair, truncation: float, limits: Limits) -> FocalFit:
-        """The maximum a posteriori of the truncated Sampson error near one candidate; truncation: px."""
+    def fit(self, start: Cameras, pair: Pair, truncation: float, limits: Limits) -> tuple[Array, Cameras, float]:
+        """The maximum a posteriori of the truncated Sampson error near one candidate: a model (9,), its cameras, and
+        what the logarithm of the likelihood would gain without prior. truncation: px."""
         cameras, images, matches = start.copy(), images_of(pair), centred(pair, truncation)
-        out, F, gain = posterior.no_optimum(1), np.empty((1, 9)), np.empty(1)
-        posterior.minimise(cameras, Weighted.of(matches.points, pair.weight, matches.s2), images, limits, out)
+        out, F, gain = posterior.start_at(cameras), np.empty((1, 9)), np.empty(1)
+        posterior.minimise(out, Weighted.of(matches.points, pair.weight, matches.s2), images, limits)
         posterior.translate(out.F, images.offset, F)
         gain_without_prior(out.hessian[0], out.gradient[0], cameras.focal[0], images.prior, gain)
-        return FocalFit(F[0], cameras, float(gain[0]))
+        return F[0], cameras, float(gain[0])
 
 
 class Subset(NamedTuple):
@@ -92,12 +86,13 @@ class Subset(NamedTuple):
 def refine_with_prior(F: F8x2, subset: Subset, limits: Limits, cameras: Cameras, out: Refined) -> None:
     """`FundamentalWithFocals.refine` of models (k, 9) -> cameras, out."""
     table, images, k = subset.table, subset.images, len(F)
-    optimum = Optimum(matrix(k, 9), vector(k), matrix(k, 7), np.empty((k, 7, 7)))
+    axes, focal = cameras.axes, cameras.focal
+    optimum = Optimum(axes, focal, matrix(k, 9), vector(k), matrix(k, 7), np.empty((k, 7, 7)))
     centred_matches = matrix(6, table.shape[1])
     posterior.centre(table, images.offset, subset.scale, centred_matches)
     points, s2, scale = centred_matches[:4], centred_matches[4], centred_matches[5]
     posterior.nearest_cameras(F, images, cameras)
-    posterior.minimise(cameras, Weighted(points, table[4], s2, GEMAN_MCCLURE, matrix(2, 0)), images, limits, optimum)
+    posterior.minimise(optimum, Weighted(points, table[4], s2, GEMAN_MCCLURE, matrix(2, 0)), images, limits)
     posterior.translate(optimum.F, images.offset, out.models)
     work = vector(5)
     for i in range(k):
@@ -115,7 +110,7 @@ def refine_with_prior(F: F8x2, subset: Subset, limits: Limits, cameras: Cameras,
 @kernel(holds_gil=True)
 def gain_without_prior(hessian: F8x2, gradient: F8x1, focal: F8x1, prior: FocalPrior, out: F8x1) -> None:
     """What the logarithm of the likelihood would rise by at an optimum without prior -> out (1,)."""
-    Q, H, g, work, total = matrix(7, LANES), matrix(7, 7), vector(7), vector(5), 0.0
+    Q, H, g, x, work, total = matrix(7, LANES), matrix(7, 7), vector(7), vector(7), vector(5), 0.0
     focal_cost(focal, prior, work)
     for i in range(7):
         g[i] = gradient[i] - (work[i - 5] if i >= 5 else 0.0)
@@ -124,7 +119,7 @@ def gain_without_prior(hessian: F8x2, gradient: F8x1, focal: F8x1, prior: FocalP
             if i >= 5 and j >= 5:
                 own = work[i - 3] if i == j else work[4]
             H[i, j] = hessian[i, j] - own
-    posterior.damped_step(H, g, STEP_DAMPING, Q)
+    damped_step(H, g, STEP_DAMPING, Q, x)
     for i in range(7):
-        total += g[i] * Q[i, 7]
+        total += g[i] * x[i]
     out[0] = -total / 2

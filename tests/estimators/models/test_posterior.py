@@ -10,13 +10,13 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from fmtorch.core import Correspondences
-from fmtorch.estimators import BITS, Lens, Loss, Pair, SevenPoint, Steps, cheirality, lens_search
+from fmtorch.estimators import BITS, Lens, Pair, SevenPoint, cheirality, lens_search
 from fmtorch.estimators.final_fits import PRIOR_CONFLICT_GAIN
 from fmtorch.estimators.lens_search import LensFit, LensPrior, fit_with_lenses, lens_prior
 from fmtorch.estimators.models import posterior
 from fmtorch.estimators.models.focal_prior import LOG_USUAL
 from fmtorch.estimators.models.with_focals import LOSS_SCALE_PX, FundamentalWithFocals
-from fmtorch.geometry.levenberg_marquardt import Weighted
+from fmtorch.geometry.levenberg_marquardt import Schedule, Weighted
 from tests.estimators.models.test_focals import TALL, WIDE, Sizes, photographs, with_prior
 from tests.estimators.pairs import apart, in_pixels, pair_of, to_units
 from tests.reference import focal as reference
@@ -38,9 +38,9 @@ def evaluated(
     cameras: posterior.Cameras, pair: Pair, loss: str, scale_px: float, precision: float
 ) -> posterior.Optimum:
     """The posterior at cameras: `minimise` without a step."""
-    matches, out = posterior.centred(pair, scale_px), posterior.no_optimum(1)
+    matches, out = posterior.centred(pair, scale_px), posterior.start_at(cameras.copy())
     weighted = Weighted.of(matches.points, pair.weight, matches.s2, loss)
-    posterior.minimise(cameras.copy(), weighted, posterior.images_of(pair), posterior.Limits(precision, 0, 0.0), out)
+    posterior.minimise(out, weighted, posterior.images_of(pair), posterior.Limits(precision, 0, 0.0))
     return out
 
 
@@ -104,7 +104,7 @@ def test_the_cost_at_the_optimum_is_that_of_scipy(seed: int) -> None:
     x0, x1, weight = c.x0[0].numpy(), c.x1[0].numpy(), c.prior[0].numpy()  # type: ignore[index]
     expected = reference.least_cost(parameters, x0, x1, weight, LOSS_SCALE_PX, WIDE, TALL)
     # From the unconstrained optimum, as in the engine: focal lengths there are off, often implausible.
-    F = SevenPoint().refine(to_units(truth, pair)[None], pair, Loss("truncated", LOSS_SCALE_PX), Steps(10, 1e-4))
+    F = SevenPoint().refine(to_units(truth, pair)[None], pair, "truncated", LOSS_SCALE_PX, Schedule(10, 1e-4, 0.0))
     _, refined = FAMILY.refine(F, pair, 50)
     r = sampson(in_pixels(refined.models[0], pair), x0, x1)
     computed = (weight * loss_of(r**2, LOSS_SCALE_PX**2, "geman_mcclure")).sum() / (2 * 0.3**2) + refined.cost[0]
@@ -133,16 +133,16 @@ def test_the_fit_reaches_the_optimum_and_tells_what_the_prior_costs(focal: tuple
     c, truth, _ = photographs(5, (WIDE, WIDE), focal, 150, noise, outliers=0.0)
     pair = pair_of(c)
     precision = (pair.pixels_per_unit / noise) ** 2
-    fit = FAMILY.fit(near(truth, pair), pair, wide, posterior.Limits(precision, 50, 0.0))
-    end = evaluated(fit.cameras, pair, "truncated", wide, precision)
+    fitted, cameras, gain = FAMILY.fit(near(truth, pair), pair, wide, posterior.Limits(precision, 50, 0.0))
+    end = evaluated(cameras, pair, "truncated", wide, precision)
     assert np.abs(end.gradient).max() < 1e-6 * np.abs(end.hessian).max()
     # What a fit without prior gains from there, in logarithms of the likelihood.
     x0, x1 = c.x0[0].numpy(), c.x1[0].numpy()
-    (free,) = SevenPoint().refine(fit.F[None], pair, Loss("truncated", wide), Steps(50, 1e-6))
-    costs = [(sampson(in_pixels(F, pair), x0, x1) ** 2).sum() / (2 * noise**2) for F in (fit.F, free)]
+    (free,) = SevenPoint().refine(fitted[None], pair, "truncated", wide, Schedule(50, 1e-6, 0.0))
+    costs = [(sampson(in_pixels(F, pair), x0, x1) ** 2).sum() / (2 * noise**2) for F in (fitted, free)]
     gained = costs[0] - costs[1]
     assert 0 < gained < PRIOR_CONFLICT_GAIN
-    assert fit.gain == pytest.approx(gained, rel=0.05)  # by a quadratic approximation
+    assert gain == pytest.approx(gained, rel=0.05)  # by a quadratic approximation
 
 
 def test_a_fit_goes_on_after_a_rejected_step() -> None:
@@ -154,11 +154,11 @@ def test_a_fit_goes_on_after_a_rejected_step() -> None:
     begin.focal[0] += [0.1, -0.1]
     weighted = Weighted.of(matches.points, pair.weight, matches.s2)
     before = evaluated(begin, pair, "truncated", px, precision)
-    single_step, out = begin.copy(), posterior.no_optimum(1)
-    posterior.minimise(single_step, weighted, posterior.images_of(pair), posterior.Limits(precision, 1, 0.05), out)
+    out = posterior.start_at(begin.copy())
+    posterior.minimise(out, weighted, posterior.images_of(pair), posterior.Limits(precision, 1, 0.05))
     assert out.cost == before.cost
-    fit = FAMILY.fit(begin, pair, px, posterior.Limits(precision, 30, 0.05))
-    after = evaluated(fit.cameras, pair, "truncated", px, precision)
+    _, cameras, _ = FAMILY.fit(begin, pair, px, posterior.Limits(precision, 30, 0.05))
+    after = evaluated(cameras, pair, "truncated", px, precision)
     assert after.cost < before.cost - 0.05
 
 
