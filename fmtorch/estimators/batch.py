@@ -20,9 +20,8 @@ from fmtorch.estimators.gradients import Attach, Solved, with_gradients
 from fmtorch.estimators.lens_search import undistorted
 from fmtorch.estimators.models.model import Refining
 from fmtorch.estimators.models.posterior import focal_precision, focals_near, focals_px
-from fmtorch.estimators.pair import EXACT, Lens, Pair, PixelMatches, bucket, calibration_of, normalize_pair
+from fmtorch.estimators.pair import Lens, Pair, PixelMatches, bucket, calibration_of, normalize_pair
 from fmtorch.estimators.preselection import degenerate_support
-from fmtorch.geometry.arithmetic import sqrt
 from fmtorch.geometry.epipolar import SAMPSON, Residual
 from fmtorch.geometry.significance import of_one_pair
 from fmtorch.jit.batches import as_array
@@ -144,15 +143,6 @@ def _straight(matches: PixelMatches, pair: Pair, slot: Array, lens: Array) -> Pi
     points = undistorted(pair, lens).points.T * pair.pixels_per_unit + pair.centre
     x0[slot], x1[slot] = points[:, :2], points[:, 2:]
     return matches._replace(x0=x0, x1=x1)
-
-
-def with_sqrt_prior(c: Correspondences) -> Correspondences:
-    """The same with the root of P(inlier) in its place for pairs both of whose focal lengths are exactly known.
-    Not of matches with a matcher's score, whose P(inlier) is the better one."""
-    if c.focal is None or c.prior is None or (c.ratio is None and c.score is not None):
-        return c
-    exact = (c.focal.detach()[..., 1] < EXACT).all(1)[:, None] & (c.prior >= 0)  # others are named as they are
-    return c.derived(prior=torch.where(exact, sqrt(torch.where(exact, c.prior, 0)), c.prior))
 
 
 def relative_rounding(c: Correspondences) -> float:

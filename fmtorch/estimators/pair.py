@@ -18,6 +18,7 @@ T = TypeVar("T")
 MAX_COORDINATE_PX = 1e100  # a match beyond is none: numbers made of its coordinates would overflow
 MIN_NOISE, MAX_NOISE = 0.1, 10.0  # of a match, relative to a usual one; what is beyond is taken for these
 SMALLEST_BUCKET = 128
+MATCH_WEIGHT = 6  # row of a pair's table
 EXACT = 0.02  # relative deviation below which a focal length counts as exactly known
 
 
@@ -87,7 +88,7 @@ class Pair:
         self.calibration, self.lens = calibration, lens
         self.count = table.shape[1]
         self.points, self.weight = table[:4], table[4]
-        self.pixels_per_noise, self.match_weight = table[5], table[6]
+        self.pixels_per_noise, self.match_weight = table[5], table[MATCH_WEIGHT]
         self.prior: Array | None = self.match_weight if known[0] else None
         self.noise: Array | None = table[7] if known[1] else None
         self.ambiguity: Array | None = table[8] if known[2] else None

@@ -16,7 +16,7 @@ import numpy as np
 
 from fmtorch.core.options import Within, expect_options
 from fmtorch.core.types import Correspondences, Estimate
-from fmtorch.estimators.batch import NOT_SOLVED, Estimation, Solution, with_sqrt_prior
+from fmtorch.estimators.batch import NOT_SOLVED, Estimation, Solution
 from fmtorch.estimators.degensac import Degensac
 from fmtorch.estimators.final_fits import FinalFit, Fit
 from fmtorch.estimators.focal_search import FocalSearch, PlausibleCandidates
@@ -26,7 +26,7 @@ from fmtorch.estimators.lens_search import lens_fit, lenses_of, squared_px, sugg
 from fmtorch.estimators.models.model import FitScale, Refining
 from fmtorch.estimators.models.with_focals import FundamentalWithFocals
 from fmtorch.estimators.options import Count, Focal, Preselect, Refine, Select, stage
-from fmtorch.estimators.pair import Lens, Pair
+from fmtorch.estimators.pair import MATCH_WEIGHT, Lens, Pair
 from fmtorch.estimators.preselection import Preselection
 from fmtorch.estimators.refinement import BestOfSearch, BestScore, LocalOptimization, Refinement, Selection, Selector
 from fmtorch.estimators.registry import OF_HOMOGRAPHIES, WITH_FOCALS, part, thresholds
@@ -37,7 +37,7 @@ from fmtorch.jit.kernel import Array, Kernel
 from fmtorch.jit.together import compile_together
 
 FOCAL_ROUND = 500  # samples of five matches at a time
-SEARCHED = 2048  # right matches that are expected among those searched
+SEARCHED = 2048  # right matches that suffice for a search
 CALIBRATED_MATCHES = 6  # that a pair of calibrated cameras needs: five of them have up to ten solutions
 DEFAULT_PRESELECT = Preselect()
 Probability = Annotated[float, Within(0, 1, exclusive=True)]
@@ -167,14 +167,16 @@ class Ransac:
     def __call__(self, c: Correspondences, seed: int = 0) -> Estimate:
         """Estimate the fundamental matrices of a batch of pairs; a pair that cannot be solved is `ok=False`."""
         compile_together(self.kernels)
-        if self.focal is not None and self.focal.options.sqrt_prior:
-            c = with_sqrt_prior(c)
         calibrated = None if self.focal is None else CALIBRATED_MATCHES
         estimation = Estimation(c, seed, self.family, self.family.size, calibrated)
         return estimation.estimates(self.estimate, Attached(self.final, self.family).attach)
 
     def estimate(self, pair: Pair) -> Solution:
         """Search to fit of one pair."""
+        if self.focal is not None and self.focal.options.sqrt_prior:
+            table = pair.table.copy()
+            np.sqrt(pair.match_weight, out=table[MATCH_WEIGHT])
+            pair = pair.with_table(table, pair.known, pair.lens)
         if pair.lens is not None:
             return self._with_lenses(pair, pair.lens)
         solution = self._of_pinholes(pair)
@@ -237,8 +239,8 @@ class Ransac:
 
 
 def searched(pair: Pair) -> Pair:
-    """The matches that are searched: of a pair with a prior as many, evenly along its list, as are expected to hold
-    `SEARCHED` right ones. Of more, as of dense matchers, a model's score says no more; the final fit has them all."""
+    """The matches that are searched: of a pair with a prior as many, evenly along its list, as count like `SEARCHED`
+    right ones. Of more, as of dense matchers, a model's score says no more; the final fit has them all."""
     if pair.prior is None or pair.count <= SEARCHED:
         return pair
     count = math.ceil(pair.count * SEARCHED / max(float(pair.prior.sum()), 1.0))
