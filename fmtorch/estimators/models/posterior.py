@@ -107,12 +107,10 @@ def focal_precision(focals: Array, pair: Pair) -> Array:
 
 
 class CentredMatches(NamedTuple):
-    """Points (4, n) from the principal points; s2 (n,), squared scales of a loss in the unit of the points; precision
-    (n,), one over these."""
+    """Points (4, n) from the principal points; s2 (n,), squared scales of a loss in the unit of the points."""
 
     points: Array
     s2: Array
-    precision: Array
 
 
 def centred(pair: Pair, scale_px: float = 1.0) -> CentredMatches:
@@ -121,7 +119,7 @@ def centred(pair: Pair, scale_px: float = 1.0) -> CentredMatches:
     def compute(pair: Pair) -> CentredMatches:
         out = np.empty((6, pair.count))
         centre(pair.table, images_of(pair).offset, scale_px, out)
-        return CentredMatches(out[:4], out[4], out[5])
+        return CentredMatches(out[:4], out[4])
 
     return pair.cached(("centred", scale_px), compute)
 
