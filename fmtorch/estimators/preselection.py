@@ -16,7 +16,8 @@ from fmtorch.jit.kernel import Array, B1x1, F8x1, F8x2, I8x1, inner, kernel, vec
 from fmtorch.jit.random import Stream, random_bits, stream_state
 
 LAST_WORD = (1 << 63) - 1
-Count, NonNegative = Annotated[int, Within(1)], Annotated[int, Within(0)]
+Count = Annotated[int, Within(1)]
+NonNegative = Annotated[int, Within(0)]
 
 
 @dataclasses.dataclass(frozen=True)

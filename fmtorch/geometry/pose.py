@@ -8,9 +8,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from fmtorch.geometry.arithmetic import cofactors, component_sum, cross, product, sqrt
+from fmtorch.geometry.levenberg_marquardt import SQUARINGS
 from fmtorch.geometry.matrices import complement, complement_kernel, last_right_singular_vector
 from fmtorch.geometry.normalize import Mask, Matrices, PerMatch, Points
-from fmtorch.geometry.rank2_manifold import SQUARINGS, start_one
+from fmtorch.geometry.rank2_manifold import start_one
 from fmtorch.jit.kernel import Array, F8x1, F8x2, inner, kernel, matrix, vector
 from fmtorch.jit.lanes import fill, load
 

@@ -255,7 +255,7 @@ class GMS:
         soft: bool = False,
         calibration: Mapping[str, Mapping[str, float]] | None = None,
     ) -> None:
-        self._options = {"with_rotation": with_rotation, "with_scale": with_scale, "border": border}
+        self._options: dict[str, Any] = {"with_rotation": with_rotation, "with_scale": with_scale, "border": border}
         self._options["threshold_factor"] = threshold_factor
         self.calibration = calibration_of("GMS", soft, calibration)
 

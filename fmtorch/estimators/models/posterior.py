@@ -13,10 +13,10 @@ import numpy as np
 from fmtorch.estimators.models.focal_prior import LOG_USUAL, FocalPrior, focal_cost, focal_prior
 from fmtorch.estimators.pair import EXACT, Pair
 from fmtorch.geometry.arithmetic import exponential, logarithm_kernel
-from fmtorch.geometry.levenberg_marquardt import Weighted, evaluate, minimiser
+from fmtorch.geometry.levenberg_marquardt import SQUARINGS, Weighted, evaluate, minimiser
 from fmtorch.geometry.matrices import assign, assign_rows
 from fmtorch.geometry.pose import nearest_axes
-from fmtorch.geometry.rank2_manifold import SQUARINGS, damped_step, start_one
+from fmtorch.geometry.rank2_manifold import damped_step, start_one
 from fmtorch.jit.kernel import Array, F8x1, F8x2, F8x3, F8x4, inner, kernel, matrix, vector
 from fmtorch.jit.lanes import LANES, fill, load, store
 
