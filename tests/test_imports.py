@@ -31,7 +31,7 @@ MAY_IMPORT = {
 }
 TORCH = {"torch", "torchvision", "torchmetrics", "kornia", "lightning"}  # the last four import the first
 NUMBA = {"numba", "llvmlite"}
-TENSORS_OF_ESTIMATORS = ("batch.py", "gradients.py", "irls.py", "coarse_to_fine.py", "external/")
+TENSORS_OF_ESTIMATORS = ("batch.py", "gradients.py", "irls.py", "external/")
 
 
 def module_name(path: Path) -> str:

@@ -22,8 +22,8 @@ WITH_KERNELS = ("estimators", "geometry", "matching", "metrics", "pruning", "sce
 def warm_up() -> int:
     """Compile the kernels of all modules that this machine has not compiled yet; how many there are.
     Raises ValueError where kernels are switched off or cannot be kept."""
-    if not kernel.available():
-        raise ValueError(f"kernels are switched off ({kernel.SWITCH}=off), or numba cannot be imported")
+    if kernel.off():
+        raise ValueError(f"kernels are switched off ({kernel.SWITCH}=off)")
     if cache.folder() is None:
         raise ValueError(f"{cache.kernels_dir()} cannot be written; set FMTORCH_CACHE to a folder that can")
     for module in pkgutil.walk_packages([str(HOME / "fmtorch")], "fmtorch."):

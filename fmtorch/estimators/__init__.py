@@ -6,7 +6,6 @@ from fmtorch.core.lazy import lazy_exports
 
 if TYPE_CHECKING:
     from fmtorch.estimators.batch import Batch
-    from fmtorch.estimators.coarse_to_fine import CoarseToFine
     from fmtorch.estimators.degensac import Degensac
     from fmtorch.estimators.external.colmap import colmap
     from fmtorch.estimators.external.libraries import (
@@ -21,16 +20,16 @@ if TYPE_CHECKING:
         weighted_eight_point,
     )
     from fmtorch.estimators.external.pairwise import PairwiseEstimator, Solution
+    from fmtorch.estimators.focal_search import Focal
     from fmtorch.estimators.graph_cut import GraphCut
     from fmtorch.estimators.inliers import BetterHalf, InlierRule, RobustDeviations, StoppingRule, WithinThreshold
     from fmtorch.estimators.irls import IterativelyReweighted
     from fmtorch.estimators.models.fundamental import EightPoint, Fundamental, Homography, SevenPoint
     from fmtorch.estimators.models.model import BITS, FitScale, Hypotheses, cheirality
-    from fmtorch.estimators.options import Focal, Preselect, Refine, Select
     from fmtorch.estimators.pair import MAX_NOISE, MIN_NOISE, Lens, Pair, bucket, uniforms
-    from fmtorch.estimators.preselection import Preselection
-    from fmtorch.estimators.ransac import Ransac
-    from fmtorch.estimators.refinement import BestOfSearch, BestScore, Candidates, Refinement, scores_of
+    from fmtorch.estimators.preselection import Preselect, Preselection
+    from fmtorch.estimators.ransac import CoarseToFine, Ransac
+    from fmtorch.estimators.refinement import BestOfSearch, BestScore, Candidates, Refine, Refinement, Select, scores_of
     from fmtorch.estimators.registry import PARTS, WITH_FOCALS, part
     from fmtorch.estimators.sampling import PriorWeighted, Prosac, Sampler, Uniform, largest_weight
     from fmtorch.estimators.scores import (

@@ -7,7 +7,7 @@ changes no result. What stands beside a pair in the batch is never looked at.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -26,7 +26,7 @@ from fmtorch.geometry.epipolar import SAMPSON, Residual
 from fmtorch.geometry.significance import of_one_pair
 from fmtorch.jit.batches import as_array
 from fmtorch.jit.kernel import Array
-from fmtorch.jobs.execution import available, mapped
+from fmtorch.jobs.execution import available
 
 PARTS_OF_A_THREAD = 4  # so that no thread is long alone at the end
 MIN_WORK = 500  # matches: a pair of fewer takes as long as one of these
@@ -48,6 +48,17 @@ class Solution(NamedTuple):
     lens: Array | None = None
     deviation: Array | None = None
     lens_suggested: float = math.nan
+
+
+class Row(NamedTuple):
+    """A pair of a batch that can be tried: its place there, and its matches as they came.
+    slot: (n,), where the pair's matches are among these. needed: inliers below which a model is none."""
+
+    place: int
+    matches: PixelMatches
+    pair: Pair
+    slot: Array
+    needed: int
 
 
 class Estimation:
@@ -74,27 +85,20 @@ class Estimation:
         self.graphed = torch.is_grad_enabled() and c.requires_grad
         self.solved: dict[int, Solved] = {}
 
-    def estimates(self, estimate: Callable[[Pair], Solution], attach: Attach) -> Estimate:
-        """What becomes of the pairs by an estimator of one; attach: of the gradients of its fits."""
+    def rows(self, part: Sequence[int]) -> Iterator[Row]:
+        """Those of a part that can be tried; the others have their reason."""
+        for i in part:
+            matches = self.batch.pair(i)
+            needed = self.calibrated if self.batch.calibrated(i) else self.minimal
+            normalized = self.batch.normalized(matches, i, self.seed, needed, self.family.residual)
+            if isinstance(normalized, str):
+                self.reasons[i] = normalized
+            else:
+                yield Row(i, matches, *normalized, needed)
 
-        def estimate_part(part: Sequence[int]) -> None:
-            with np.errstate(all="ignore"):  # infinite or NaN beyond the range of a float
-                for i in part:
-                    self._estimate_pair(i, estimate)
-
-        mapped(estimate_part, self.parts)
-        return self._together(attach)
-
-    def _estimate_pair(self, i: int, estimate: Callable[[Pair], Solution]) -> None:
+    def put(self, row: Row, solution: Solution) -> None:
         """The solution of a pair as its estimate, or the reason why there is none."""
-        matches = self.batch.pair(i)
-        needed = self.calibrated if self.batch.calibrated(i) else self.minimal
-        normalized = self.batch.normalized(matches, i, self.seed, needed, self.family.residual)
-        if isinstance(normalized, str):
-            self.reasons[i] = normalized
-            return
-        pair, slot = normalized
-        solution = estimate(pair)
+        i, matches, pair, slot, needed = row
         self.samples[i] = solution.samples
         if solution.fit is None or solution.inliers is None:
             self.reasons[i] = solution.reason
@@ -123,7 +127,8 @@ class Estimation:
             if self.graphed:
                 self.solved[i] = Solved(pair, slot, solution.fit)
 
-    def _together(self, attach: Attach) -> Estimate:
+    def estimates(self, attach: Attach) -> Estimate:
+        """What has become of the pairs; attach: of the gradients of their fits."""
         arrays = {"F": self.F, "inliers": self.inliers, "ok": self.ok, "samples": self.samples}
         arrays["significance"] = self.significance
         if self.asked_for_cameras:

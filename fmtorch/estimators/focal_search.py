@@ -9,8 +9,8 @@ import numpy as np
 
 from fmtorch.estimators.models.posterior import Cameras
 from fmtorch.estimators.models.with_focals import FundamentalWithFocals, Refined
-from fmtorch.estimators.options import Focal
 from fmtorch.estimators.pair import Pair
+from fmtorch.estimators.preselection import Count, NonNegative
 from fmtorch.estimators.refinement import BestScore, Candidates, Refinement, Selection, scores_of
 from fmtorch.estimators.scores import Score
 from fmtorch.estimators.search import Search, Stop
@@ -21,6 +21,32 @@ MIN_GAIN_SHARE = 0.85
 # A good candidate has RIVAL_GAIN_SHARE of the best gain; it is another model than the best where 1 - |cosine| of the
 # two as vectors is above SAME_MODEL, or SAME_CAMERAS for candidates of plausible cameras.
 RIVAL_GAIN_SHARE, SAME_MODEL, SAME_CAMERAS = 0.85, 1e-3, 1e-2
+
+
+@dataclasses.dataclass(frozen=True)
+class Focal:
+    """The prior on focal lengths, for whole photographs of known size.
+
+    samples: of five matches, with focal lengths drawn from the prior; 0: none, the prior only selects. rounds,
+    min_rounds: of so many samples, at most and at least; in between a pair goes on while its good candidates differ or
+    the stopping rule asks for more. confirmations: rounds that find the best candidate of those before them again,
+    after which it does not matter that others differ. pool: the best models of a round, which are refined with the
+    prior. candidates: models of the other search that are, too. iterations: steps of that refinement. sqrt_prior:
+    whether the root of P(inlier) stands for it where both focal lengths are exactly known.
+    """
+
+    samples: NonNegative = 250
+    rounds: Count = 1
+    min_rounds: Count = 1
+    confirmations: Count = 1
+    pool: Count = 12
+    candidates: Count = 12
+    iterations: NonNegative = 12
+    sqrt_prior: bool = False
+
+    def __post_init__(self) -> None:
+        if self.min_rounds > self.rounds:
+            raise ValueError(f"focal.min_rounds is {self.min_rounds}; it must be at most focal.rounds, {self.rounds}")
 
 
 class PlausibleCandidates:

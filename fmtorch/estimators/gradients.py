@@ -19,7 +19,6 @@ from fmtorch.estimators.final_fits import FinalFit, Fit
 from fmtorch.estimators.models import posterior
 from fmtorch.estimators.models.fundamental import response_of
 from fmtorch.estimators.models.model import Refining
-from fmtorch.estimators.models.posterior import Cameras, Limits, centred, images_of, translate
 from fmtorch.estimators.pair import MAX_NOISE, MIN_NOISE, Pair
 from fmtorch.geometry import canonical, eight_point, unit_frobenius
 from fmtorch.geometry.cameras import PixelFrame
@@ -180,18 +179,18 @@ def _frame(solved: dict[int, Solved], like: Tensor) -> PixelFrame:
     return PixelFrame(centre, torch.tensor([pair.pixels_per_unit for pair in pairs]).to(like))
 
 
-def camera_response(cameras: Cameras, pair: Pair, weight: Array, precision: float) -> Array:
+def camera_response(cameras: posterior.Cameras, pair: Pair, weight: Array, precision: float) -> Array:
     """How the optimum of the posterior moves with the gradient of its cost by the nine entries, (11, 9): its model and
     the logarithms of its focal lengths.
 
     weight: (n,), of the matches that count. precision: one over the variance of an inlier's distance.
     """
-    images, optimum, tangents = images_of(pair), posterior.start_at(cameras.copy()), np.zeros((1, 9, LANES))
-    matches = Weighted.of(centred(pair).points, weight, np.full(pair.count, np.inf))
-    posterior.minimise(optimum, matches, images, Limits(precision, 0, 0.0))
+    images, optimum, tangents = posterior.images_of(pair), posterior.start_at(cameras.copy()), np.zeros((1, 9, LANES))
+    matches = Weighted.of(posterior.centred(pair).points, weight, np.full(pair.count, np.inf))
+    posterior.minimise(optimum, matches, images, posterior.Limits(precision, 0, 0.0))
     posterior.tangents_of(cameras, images.longest, optimum.F, tangents)
     moves, hessian, by_focal = np.empty((7, 9)), optimum.hessian[0], np.eye(7, 2, -5)
-    translate(np.ascontiguousarray(tangents[0, :, :7].T), images.offset, moves)
+    posterior.translate(np.ascontiguousarray(tangents[0, :, :7].T), images.offset, moves)
     if images.prior.shared:  # one parameter for both
         moves[5], moves[6], by_focal[5], by_focal[6] = moves[5] + moves[6], 0, 1, 0
     try:

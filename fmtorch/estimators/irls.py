@@ -24,6 +24,7 @@ from fmtorch.geometry.levenberg_marquardt import Schedule, Weighted
 from fmtorch.geometry.refine import refine_kernel
 from fmtorch.geometry.robust_losses import named_loss
 from fmtorch.jit.kernel import Array
+from fmtorch.jobs.execution import mapped
 
 DECAY = 0.65  # of the loss's scale, from one iteration to the next, down to the threshold
 NOT_DETERMINED = "the matches do not determine a model"
@@ -84,7 +85,15 @@ class IterativelyReweighted:
 
     def __call__(self, c: Correspondences, seed: int = 0) -> Estimate:
         """Estimate the fundamental matrices of a batch of pairs; a pair that cannot be solved is `ok=False`."""
-        return Estimation(c, seed, SevenPoint(), self.MIN_MATCHES).estimates(self.solve, self.attached)
+        estimation = Estimation(c, seed, SevenPoint(), self.MIN_MATCHES)
+
+        def estimate_part(part: Sequence[int]) -> None:
+            with np.errstate(all="ignore"):  # infinite or NaN beyond the range of a float
+                for row in estimation.rows(part):
+                    estimation.put(row, self.solve(row.pair))
+
+        mapped(estimate_part, estimation.parts)
+        return estimation.estimates(self.attached)
 
     def solve(self, pair: Pair) -> Solution:
         """The model of least cost of one pair."""

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
+from typing import Annotated
 
 import numpy as np
 
-from fmtorch.estimators.options import Preselect
+from fmtorch.core.options import Within
 from fmtorch.estimators.pair import Pair
 from fmtorch.estimators.scores import Score, scored
 from fmtorch.geometry.arithmetic import smallest_but, sort_by
@@ -14,6 +16,20 @@ from fmtorch.jit.kernel import Array, B1x1, F8x1, F8x2, I8x1, inner, kernel, vec
 from fmtorch.jit.random import Stream, random_bits, stream_state
 
 LAST_WORD = (1 << 63) - 1
+Count = Annotated[int, Within(1)]
+NonNegative = Annotated[int, Within(0)]
+
+
+@dataclasses.dataclass(frozen=True)
+class Preselect:
+    """A round's models compared on few matches first.
+
+    matches: any, or for a score that weighs them by their prior such as are drawn by it, each counting as one.
+    survivors: models that are scored on all matches.
+    """
+
+    matches: Count = 128
+    survivors: Count = 256
 
 
 class Preselection:

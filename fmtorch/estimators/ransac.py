@@ -1,40 +1,42 @@
 """Hypothesise and verify: four verbs whose parts make RANSAC, MSAC, LMedS and their descendants.
 
 **search**: rounds of minimal samples, scores, the best models; **refine** these; **select** one; **fit** it. The engine
-is control flow on one pair: `registry` names the parts, which hold the arithmetic, `options` describes those of each
-verb; `batch` leads from tensors to pairs and back.
+is control flow on one pair: `registry` names the parts, which hold the arithmetic, and beside which the options of each
+verb are described; `batch` leads from tensors to pairs and back.
 """
 
 from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
 import numpy as np
 
 from fmtorch.core.options import Within, expect_options
+from fmtorch.core.stages import Estimator
 from fmtorch.core.types import Correspondences, Estimate
+from fmtorch.estimators import refinement
 from fmtorch.estimators.batch import NOT_SOLVED, Estimation, Solution
 from fmtorch.estimators.degensac import Degensac
 from fmtorch.estimators.final_fits import FinalFit, Fit
-from fmtorch.estimators.focal_search import FocalSearch, PlausibleCandidates
+from fmtorch.estimators.focal_search import Focal, FocalSearch, PlausibleCandidates
 from fmtorch.estimators.gradients import Attached
 from fmtorch.estimators.inliers import InlierRule, StoppingRule, noise_scale, residuals_squared_px, squared_in_noises
 from fmtorch.estimators.lens_search import lens_fit, lenses_of, squared_px, suggested_lens, undistorted
 from fmtorch.estimators.models.model import FitScale, Refining
 from fmtorch.estimators.models.with_focals import FundamentalWithFocals
-from fmtorch.estimators.options import Count, Focal, Preselect, Refine, Select, stage
 from fmtorch.estimators.pair import MATCH_WEIGHT, Lens, Pair
-from fmtorch.estimators.preselection import Preselection
-from fmtorch.estimators.refinement import BestOfSearch, BestScore, LocalOptimization, Refinement, Selection, Selector
-from fmtorch.estimators.registry import OF_HOMOGRAPHIES, WITH_FOCALS, part, thresholds
+from fmtorch.estimators.preselection import Count, Preselect, Preselection
+from fmtorch.estimators.registry import OF_HOMOGRAPHIES, WITH_FOCALS, part, stage, thresholds
 from fmtorch.estimators.sampling import Sampler
 from fmtorch.estimators.scores import Score
 from fmtorch.estimators.search import Search
+from fmtorch.geometry.significance import judged
 from fmtorch.jit.kernel import Array, Kernel
 from fmtorch.jit.together import compile_together
+from fmtorch.jobs.execution import mapped
 
 FOCAL_ROUND = 500  # samples of five matches at a time
 SEARCHED = 2048  # right matches that suffice for a search
@@ -46,7 +48,7 @@ Probability = Annotated[float, Within(0, 1, exclusive=True)]
 class Ransac:
     """A robust estimator of fundamental matrices, batched over pairs.
 
-    Parts are named as in `registry`; the options of a stage are those of the class of that name in `options`.
+    Parts are named as in `registry`; the options of a stage are those of the class that is named there.
 
     Args:
         solver: minimal solver, `seven_point` or `eight_point`, and with it the family of models; `four_point` for
@@ -96,9 +98,9 @@ class Ransac:
         preselect: Preselect | Mapping[str, Any] | None = DEFAULT_PRESELECT,
         degeneracy: str | Mapping[str, Any] | None = None,
         pool: Count = 1,
-        local_optimization: str | Mapping[str, Any] | LocalOptimization | None = None,
-        refine: Refine | Mapping[str, Any] | None = None,
-        select: Select | Mapping[str, Any] | None = None,
+        local_optimization: str | Mapping[str, Any] | refinement.LocalOptimization | None = None,
+        refine: refinement.Refine | Mapping[str, Any] | None = None,
+        select: refinement.Select | Mapping[str, Any] | None = None,
         focal: Focal | Mapping[str, Any] | None = None,
         inliers: str | Mapping[str, Any] | InlierRule = "threshold",
         inlier_threshold: float | None = None,
@@ -125,17 +127,27 @@ class Ransac:
             raise ValueError(f"{wrong[0]} is for fundamental matrices; the solver gives {self.family.model} matrices")
         self.search = Search(self.family, self.sampler, preselection, pool, hypotheses, round, stop, check)
         optimization = part("local_optimization", local_optimization, threshold=threshold, score=self.score)
-        refinement = Refinement(stage(refine, Refine), optimization)
-        choice = stage(select, Select)
-        self.refine = refinement
-        changed = refinement.options is not None or optimization is not None
-        self.select: Selector = BestScore(self.score) if changed else BestOfSearch()
+        choice = stage(select, refinement.Select)
+        self.refine = refinement.Refinement(stage(refine, refinement.Refine), optimization)
+        changed = self.refine.options is not None or optimization is not None
+        self.select: refinement.Selector = refinement.BestScore(self.score) if changed else refinement.BestOfSearch()
         if choice is not None:
             own = self.family.fit_scale._replace(scale_sigmas=choice.own_noise or 0.0)
             at_noise = functools.partial(_at_noise, choice.score, own)
             first: Score = part("score", choice.score, threshold=choice.scale)
-            self.select = BestScore(first, at_noise if choice.own_noise else None)
-        self.focal = _focal_search(stage(focal, Focal), self.select, self.search, refinement, choice)
+            self.select = refinement.BestScore(first, at_noise if choice.own_noise else None)
+        self.focal = self._focal_search(stage(focal, Focal), choice)
+
+    def _focal_search(self, options: Focal | None, choice: refinement.Select | None) -> FocalSearch | None:
+        """The search among plausible cameras."""
+        if options is None:
+            return None
+        if choice is None or not isinstance(self.select, refinement.BestScore):
+            raise ValueError("focal needs select: the score by which models with the prior are compared")
+        family, own, search = FundamentalWithFocals(), None, self.search
+        if options.samples:
+            own = Search(family, search.sampler, search.preselection, options.pool, options.samples, FOCAL_ROUND)
+        return FocalSearch(options, family, self.select, self.refine, own, search.stop)
 
     @property
     def model(self) -> str:
@@ -169,7 +181,17 @@ class Ransac:
         compile_together(self.kernels)
         calibrated = None if self.focal is None else CALIBRATED_MATCHES
         estimation = Estimation(c, seed, self.family, self.family.size, calibrated)
-        return estimation.estimates(self.estimate, Attached(self.final, self.family).attach)
+
+        def estimate_part(part: Sequence[int]) -> None:
+            with np.errstate(all="ignore"):  # infinite or NaN beyond the range of a float
+                for row in estimation.rows(part):
+                    estimation.put(row, self.estimate(row.pair))
+
+        if len(estimation.parts) > 1:
+            mapped(estimate_part, estimation.parts)
+        else:
+            estimate_part(estimation.parts[0])
+        return estimation.estimates(Attached(self.final, self.family).attach)
 
     def estimate(self, pair: Pair) -> Solution:
         """Search to fit of one pair."""
@@ -209,7 +231,7 @@ class Ransac:
         own = fit._replace(F=refined.F, at=refined.F, cameras=refined.cameras)
         return Solution(own, solution.samples, inliers, lens=refined.lens, deviation=refined.deviation)
 
-    def selected(self, pair: Pair) -> tuple[Selection, int]:
+    def selected(self, pair: Pair) -> tuple[refinement.Selection, int]:
         """The selected model, and the samples drawn: among plausible cameras first where the image sizes are known."""
         if self.focal is None or not pair.sizes_known:
             pool = self.search(pair)
@@ -253,15 +275,37 @@ def _at_noise(score: Any, own: FitScale, F: Array, pair: Pair) -> Score:
     return at
 
 
-def _focal_search(
-    options: Focal | None, select: Selector, search: Search, refinement: Refinement, choice: Select | None
-) -> FocalSearch | None:
-    """The search among plausible cameras."""
-    if options is None:
-        return None
-    if choice is None or not isinstance(select, BestScore):
-        raise ValueError("focal needs select: the score by which models with the prior are compared")
-    family, own = FundamentalWithFocals(), None
-    if options.samples:
-        own = Search(family, search.sampler, search.preselection, options.pool, options.samples, FOCAL_ROUND)
-    return FocalSearch(options, family, select, refinement, own, search.stop)
+class CoarseToFine:
+    """Coarse-to-Fine RANSAC (Bian et al., BMVC 2019, section 5): the fine estimator sees the inliers of the coarse one.
+
+    A pair that one of them cannot solve is ``ok=False`` with that one's reason; `draws` counts those of both.
+    Its significance is that among all matches, also those which the coarse one dropped.
+    Gradients are the fine estimator's: the coarse one only chooses matches.
+
+    Args:
+        coarse: an estimator that prunes well, GC-RANSAC or USAC in the paper.
+        fine: one that fits well, LMedS in the paper.
+    """
+
+    def __init__(self, *, coarse: Estimator, fine: Estimator) -> None:
+        self.coarse, self.fine = coarse, fine
+
+    @property
+    def uses_prior(self) -> bool:
+        """Whether a prior makes a difference to one of the two."""
+        return any(getattr(stage, "uses_prior", False) for stage in (self.coarse, self.fine))
+
+    @property
+    def gradients_reach(self) -> tuple[str, ...]:
+        """Those of the fine estimator."""
+        return tuple(getattr(self.fine, "gradients_reach", ("x0", "x1", "prior", "noise")))
+
+    def __call__(self, c: Correspondences, seed: int = 0) -> Estimate:
+        """Estimate the fundamental matrices of a batch of pairs."""
+        coarse = self.coarse(c.detach(), seed)
+        fine = self.fine(c.keep(coarse.inliers & coarse.ok[:, None]), seed)
+        reasons = tuple(
+            f"coarse: {first}" if first else f"fine: {second}" if second else ""
+            for first, second in zip(coarse.reason, fine.reason, strict=True)
+        )
+        return judged(fine.replace(reason=reasons, samples=coarse.samples + fine.samples, significance=None), c)

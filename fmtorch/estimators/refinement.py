@@ -5,21 +5,52 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import Annotated, Any, Literal, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
+from fmtorch.core.options import Within
 from fmtorch.estimators.models.model import Refining
 from fmtorch.estimators.models.posterior import Cameras
-from fmtorch.estimators.options import Refine
 from fmtorch.estimators.pair import Pair, squared
-from fmtorch.estimators.preselection import first_shuffled
+from fmtorch.estimators.preselection import Count, NonNegative, first_shuffled
 from fmtorch.estimators.scores import Score, scored
 from fmtorch.estimators.search import Pool
 from fmtorch.geometry.epipolar import HOMOGRAPHY, SAMPSON, Residual
 from fmtorch.geometry.levenberg_marquardt import Schedule
 from fmtorch.jit.kernel import Array, F4x2, I8x1, Kernel, kernel
 from fmtorch.jit.random import Stream
+
+Pixels = Annotated[float, Within(0, exclusive=True)]
+
+
+@dataclasses.dataclass(frozen=True)
+class Refine:
+    """Levenberg-Marquardt of the robust Sampson error, from each model of the pool.
+
+    loss: a name of `geometry.LOSSES`. scale: its scale, Sampson distance, px. iterations: steps. matches: at most so
+    many are looked at, drawn by the pair's key from those within RADIUS scales of a model of the pool; None: all.
+    """
+
+    loss: Literal["huber", "cauchy", "geman_mcclure", "truncated", "magsac"]
+    scale: Pixels = 1.0
+    iterations: NonNegative = 5
+    matches: Count | None = None
+
+    RADIUS = 4.0  # scales: a match farther from all models of the pool is not looked at again
+
+
+@dataclasses.dataclass(frozen=True)
+class Select:
+    """Which refined model is the estimate: that of the largest score.
+
+    score: a name of the registry, or a score. scale: of it, Sampson distance, px. own_noise: the choice is made again
+    with so many standard deviations of the noise of the matches near the first for a scale; None: it is made once.
+    """
+
+    score: Any = "saturated"
+    scale: Pixels = 1.0
+    own_noise: Pixels | None = None
 
 
 @runtime_checkable

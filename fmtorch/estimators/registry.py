@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, TypeVar
 
 from fmtorch.core.options import expect_options
 from fmtorch.estimators import focal_search, inliers, pair, preselection, refinement, sampling, scores, search
@@ -29,6 +29,7 @@ from fmtorch.geometry.significance import counted_chances, counted_plane_chances
 from fmtorch.jit.kernel import Kernel
 
 DEFAULT_THRESHOLD_PX = 1.0
+Stage = TypeVar("Stage")
 
 PARTS: dict[str, dict[str, Callable[..., Any]]] = {
     "solver": {"seven_point": SevenPoint, "eight_point": EightPoint, "four_point": Homography},
@@ -74,6 +75,11 @@ def part(role: str, spec: Any, **context: Any) -> Any:
     known = {key: value for key, value in context.items() if key in inspect.signature(make).parameters}
     expect_options(make, options, f"{role}={name}", known)
     return make(**(known | options))
+
+
+def stage(options: Stage | Mapping[str, Any] | None, kind: type[Stage]) -> Stage | None:
+    """The options of a stage, from a mapping or as they are; None where it is left out."""
+    return kind(**options) if isinstance(options, Mapping) else options
 
 
 def thresholds(

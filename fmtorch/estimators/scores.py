@@ -93,7 +93,8 @@ class SummedGains:
     gain_kernel: ClassVar[Kernel[..., None] | None] = None
 
     def __init__(self, threshold: float, prior_weighted: bool = False) -> None:
-        check_threshold(threshold)
+        if not threshold > 0:
+            raise ValueError(f"threshold is {threshold}; it is a distance in pixels and must be positive")
         self.threshold, self.prior_weighted = float(threshold), prior_weighted
 
     def gain(self, squared: Array) -> Array:
@@ -173,9 +174,6 @@ class Magsac(CodedGains):
 
     CODE, table = TABLE, GAIN_TABLE
 
-    def __init__(self, threshold: float) -> None:
-        super().__init__(threshold)
-
 
 def scored(score: Score, F: Array, which: Array, pair: Pair) -> Array:
     """What a score says of models F[which] (k,), float64; ValueError where that is not one number for each."""
@@ -186,12 +184,6 @@ def scored(score: Score, F: Array, which: Array, pair: Pair) -> Array:
             f"{type(score).__name__} returns {what}; it must be an array of float64 {which.shape}: one number a model"
         )
     return np.ascontiguousarray(scores)
-
-
-def check_threshold(threshold: float) -> None:
-    """Raise ValueError for what is no distance."""
-    if not threshold > 0:
-        raise ValueError(f"threshold is {threshold}; it is a distance in pixels and must be positive")
 
 
 @functools.cache
@@ -287,7 +279,7 @@ GRID = 12  # cells along each side of each image
 CELL_ROWS = 2 * GRID * GRID // SINGLES
 
 
-class SaturatedGains:
+class SaturatedGains(SummedGains):
     """The sum over grid cells of ``sqrt(sum of P g(r))``, over both images; g is the gain of Geman & McClure.
 
     Saturates where matches crowd, so that a model which explains the whole image beats one that explains a single
@@ -298,21 +290,16 @@ class SaturatedGains:
     """
 
     def __init__(self, threshold: float, prior_weighted: bool = True) -> None:
-        check_threshold(threshold)
-        self.threshold, self.prior_weighted = float(threshold), prior_weighted
+        super().__init__(threshold, prior_weighted)
         self.preselection = GemanMcClure(threshold, prior_weighted)
 
     def __call__(self, F: Array, which: Array, pair: Pair) -> Array:
         """As `Score`."""
-        rows, cells, bits = pair.cached(self, self._matches)
+        rows, bits = pair.cached(self, self._matches)
+        cells = pair.cached(("cells", self.prior_weighted), self._cells)
         out = np.empty(len(which))
         score_saturated_of(pair.residual)(F, which, rows, cells, bits, out)
         return out
-
-    def _matches(self, pair: Pair) -> tuple[Array, Array, int]:
-        """What the kernel takes of the matches."""
-        cells = pair.cached(("cells", self.prior_weighted), self._cells)
-        return scored_matches(pair, self.threshold, self.prior_weighted), cells, fractional_bits(pair.count)
 
     def _cells(self, pair: Pair) -> Array:
         cells = np.empty((2, pair.count), np.int32)

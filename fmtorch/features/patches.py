@@ -1,7 +1,6 @@
 """Square patches cut from an image along local affine frames, without aliasing, batched."""
 
 import math
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -39,8 +38,8 @@ class ImagePyramid:
         plan, images = _plan(lafs, len(self.levels), size), [level.numpy() for level in self.levels]
         out = np.zeros((len(lafs), size, size), np.float32)
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        order = _by_place(lafs, plan)
-        maps, places = _maps(lafs, plan, size)[order].numpy(), zip(*(a[order].tolist() for a in plan), strict=True)
+        order = _by_place(lafs, plan[0])
+        maps, places = _maps(lafs, *plan, size)[order].numpy(), zip(*(a[order].tolist() for a in plan), strict=True)
         for i, matrix, (level, (nx, ny)) in zip(order.tolist(), maps, places, strict=True):
             shape, dense = (size * nx, size * ny), out[i] if nx == ny == 1 else None
             samples = cv2.warpAffine(
@@ -51,33 +50,27 @@ class ImagePyramid:
         return torch.from_numpy(out)[:, None]
 
 
-class _Plan(NamedTuple):
-    """Per frame: the pyramid's level, -1 for a frame that is not finite, and the samples along (x, y) of a pixel."""
-
-    level: Int[Tensor, " n"]
-    samples: Int[Tensor, "n 2"]
-
-
-def _plan(lafs: Tensor, levels: int, size: int) -> _Plan:
+def _plan(lafs: Tensor, levels: int, size: int) -> tuple[Int[Tensor, " n"], Int[Tensor, "n 2"]]:
+    """The pyramid's level of each frame, -1 of one that is not finite, and the samples along (x, y) of a pixel."""
     step = torch.linalg.vector_norm(lafs[..., :2], dim=1) * (2 / size)
     finite = torch.isfinite(lafs).all(2).all(1)
     step = torch.where(finite[:, None], step, 1.0)
     level = (step.amin(1) / LARGEST_STEP).clamp(min=1e-6).log2().ceil().clamp(0, levels - 1)
     samples = (step / (LARGEST_STEP * torch.exp2(level))[:, None]).ceil().clamp(1, MAX_SAMPLES)
-    return _Plan(torch.where(finite, level, -1.0).long(), samples.long())
+    return torch.where(finite, level, -1.0).long(), samples.long()
 
 
-def _maps(lafs: Tensor, plan: _Plan, size: int) -> Float[Tensor, "n 2 3"]:
+def _maps(lafs: Tensor, level: Tensor, samples: Tensor, size: int) -> Float[Tensor, "n 2 3"]:
     """From the samples' columns and rows, counted from 0, to pixels of the level (float64)."""
     lafs = lafs.double()
-    step = lafs[..., :2] * (2 / (size * plan.samples))[:, None, :]
+    step = lafs[..., :2] * (2 / (size * samples))[:, None, :]
     first = lafs[..., 2] - lafs[..., :2].sum(-1) + 0.5 * step.sum(-1)
-    return torch.cat([step, first[..., None]], -1) / torch.exp2(plan.level.double())[:, None, None]
+    return torch.cat([step, first[..., None]], -1) / torch.exp2(level.double())[:, None, None]
 
 
-def _by_place(lafs: Float[Tensor, "n 2 3"], plan: _Plan) -> Int[Tensor, " m"]:
+def _by_place(lafs: Float[Tensor, "n 2 3"], level: Int[Tensor, " n"]) -> Int[Tensor, " m"]:
     """The finite frames, neighbours in the image after one another: what they see is then in the cache already."""
-    finite = torch.nonzero(plan.level >= 0)[:, 0]
+    finite = torch.nonzero(level >= 0)[:, 0]
     x, y = lafs[finite, 0, 2], lafs[finite, 1, 2]
     by_column = x.argsort()
     return finite[by_column[(y[by_column] / BAND).floor().argsort(stable=True)]]

@@ -189,7 +189,7 @@ def minimiser(
 ) -> Callable[[Any, Any, Any, Array, int, bool], None]:  # fmt: skip
     """The loop for an objective: loop(data, state, trial, damping, iterations, ends), in place.
     evaluate(state, data, derivatives): the costs, and the derivatives if asked for, at the state's parameters.
-    step(data, state, damping, trial): those of a trial. take(state, trial, k): gives the state model k of the trial, but
+    step(data, state, damping, trial): those of a trial. take(state, trial, k): gives the state model k of the trial but
     for its cost, where that is lower: such a step divides the damping by 10, another multiplies it. converged(data,
     before, after): whether a model is done after a step that has lowered its cost so."""
 

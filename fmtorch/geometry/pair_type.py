@@ -313,8 +313,8 @@ def pair_evidence(
     sizes = (None if size is None else size.to(torch.float64) for size in (size0, size1))
     given = (x0, x1, mask, prior, noise, models, *sizes, precision)
     rows = for_each_pair(_into, given, out=torch.empty(len(F), COLUMNS, dtype=torch.float64), kind=torch.float64)
-    R = rows[:, TURNED:SCALED].reshape(-1, 3, 3)
-    return Evidence(*rows[:, :FOCALS].unbind(1), R, rows[:, FOCALS:TURNED], rows[:, SCALED:])
+    fitted = rows[:, TURNED:SCALED].reshape(-1, 3, 3), rows[:, FOCALS:TURNED], rows[:, SCALED:]
+    return Evidence._make([*rows[:, :FOCALS].unbind(1), *fitted])
 
 
 def _into(x0: Array, x1: Array, mask: Array, prior: Array, noise: Array, *known: Array) -> None:

@@ -8,9 +8,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from fmtorch.geometry.arithmetic import cofactors, component_sum, cross, product, sqrt
+from fmtorch.geometry.levenberg_marquardt import SQUARINGS
 from fmtorch.geometry.matrices import complement, complement_kernel, last_right_singular_vector
 from fmtorch.geometry.normalize import Mask, Matrices, PerMatch, Points
-from fmtorch.geometry.rank2_manifold import SQUARINGS, start_one
+from fmtorch.geometry.rank2_manifold import start_one
 from fmtorch.jit.kernel import Array, F8x1, F8x2, inner, kernel, matrix, vector
 from fmtorch.jit.lanes import fill, load
 
@@ -32,15 +33,6 @@ class FourPoses(NamedTuple):
     R: Float[Tensor, "*batch 4 3 3"]
     t: Float[Tensor, "*batch 4 3"]
     valid: Bool[Tensor, "*batch"]
-
-
-class _Decomposition(NamedTuple):
-    """R (3, 3, 4, *batch), t (3, 4, *batch), the inverse calibrations, and where all of them are determined."""
-
-    R: Tensor
-    t: Tensor
-    inverses: tuple[Tensor, Tensor]
-    valid: Tensor
 
 
 def poses_from_fundamental(F: Matrices, K0: Matrices, K1: Matrices) -> FourPoses:
@@ -103,8 +95,9 @@ def pose_from_fundamental(
     return Pose(R.to(F.dtype), t.to(F.dtype), torch.where(valid, n_in_front, 0), valid)
 
 
-def _decomposed(F: Tensor, K0: Tensor, K1: Tensor) -> _Decomposition:
-    """The four motions of E = K1^T F K0, in float64."""
+def _decomposed(F: Tensor, K0: Tensor, K1: Tensor) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor], Tensor]:
+    """The four motions of E = K1^T F K0: R (3, 3, 4, *batch), t (3, 4, *batch), float64; the inverse calibrations; and
+    where all of them are determined."""
     F_, K0_, K1_ = (A.to(torch.float64).movedim((-2, -1), (0, 1)) for A in (F, K0, K1))
     finite = torch.stack([A.isfinite().all(0).all(0) for A in (F_, K0_, K1_)]).all(0)
     F_, K0_, K1_ = (torch.where(finite, A, 0.0) for A in (F_, K0_, K1_))
@@ -115,7 +108,7 @@ def _decomposed(F: Tensor, K0: Tensor, K1: Tensor) -> _Decomposition:
     straight, turned = cofactors(E), torch.stack([cross(t, E[:, j]) for j in range(3)], 1)
     R = torch.stack([straight - turned, straight + turned, straight - turned, straight + turned], 2)
     t = torch.stack([t, t, -t, -t], 1)
-    return _Decomposition(R, t, (inverse0, inverse1), finite & regular0 & regular1 & two)
+    return R, t, (inverse0, inverse1), finite & regular0 & regular1 & two
 
 
 def _essential(E: Tensor) -> tuple[Tensor, Tensor, Tensor]:

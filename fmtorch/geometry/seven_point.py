@@ -1,7 +1,7 @@
 """The seven-point algorithm."""
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -49,39 +49,28 @@ def all_seven_point(points: F8x2, sample: I8x2, F: F8x3, valid: B1x2) -> None:
                     F[first + lane, k, q] = f[k, q, lane] if there[k, lane] else 0.0
 
 
-class _Work(NamedTuple):
-    """Buffers of `_solve`: equations, null space, its scales, determinants, mixtures, and which samples have rank 7."""
-
-    A: Array
-    B: Array
-    scale: Array
-    p: Array
-    mixed: Array
-    full_rank: Array
-
-
 @inner
 def _room() -> Any:
-    return _Work(
-        matrix(63, LANES), matrix(18, LANES), matrix(7, LANES), matrix(4, LANES), matrix(6, LANES),
-        np.empty((1, LANES), np.bool_),
-    )  # fmt: skip
+    """Buffers of `_solve`: equations, null space, its scales, determinants, mixtures, and which samples have rank 7."""
+    full_rank = np.empty((1, LANES), np.bool_)
+    return matrix(63, LANES), matrix(18, LANES), matrix(7, LANES), matrix(4, LANES), matrix(6, LANES), full_rank
 
 
 @inner
 def _solve(X: Array, work: Any, f: Array, there: Array) -> None:
     """Of LANES samples X (28, LANES) the singular matrices of the null space -> f (3, 9, LANES), there (3, LANES).
     The null space is spanned by F0 and F1; det(a F0 + b F1) = 0 is a cubic (Hartley and Zisserman, 11.1.2)."""
-    equations(X, 7, work.A)
-    store(work.full_rank, 0, null_space(work.A, 7, work.B, work.scale))
-    _determinants(work.B, work.p)
+    A, B, scale, p, mixed, full_rank = work
+    equations(X, 7, A)
+    store(full_rank, 0, null_space(A, 7, B, scale))
+    _determinants(B, p)
     for lane in range(LANES):
-        _mixtures(work.p, lane, work.full_rank[0, lane], work.mixed, there)
+        _mixtures(p, lane, full_rank[0, lane], mixed, there)
     for k in range(3):
-        a, b = load(work.mixed, 2 * k), load(work.mixed, 2 * k + 1)
+        a, b = load(mixed, 2 * k), load(mixed, 2 * k + 1)
         finite = load(there, k)
         for q in range(9):
-            value = a * load(work.B, q) + b * load(work.B, 9 + q)
+            value = a * load(B, q) + b * load(B, 9 + q)
             finite &= absolute(value) < math.inf
             store(f[k], q, value)
         store(there, k, finite)

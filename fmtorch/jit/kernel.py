@@ -13,11 +13,11 @@ Python, all else takes its tensor form.
 
 import functools
 import gc
+import importlib.metadata
 import inspect
 import os
 import sys
 import threading
-import warnings
 from collections.abc import Callable, Iterable
 from typing import Annotated, Any, Generic, ParamSpec, TypeVar, get_args, get_origin, get_type_hints, overload
 
@@ -93,27 +93,9 @@ def off() -> bool:
     return switch == "off"
 
 
-def available() -> bool:
-    """Whether kernels stand for tensor forms: not switched off, and numba is there; a warning says once that it is not.
-    Raises ValueError if $FMTORCH_KERNELS is neither on nor off."""
-    return not off() and numba_version() is not None
-
-
-@functools.cache
-def numba_version() -> str | None:
-    """The version of numba, None, with a warning, where it cannot be imported."""
-    try:
-        import numba
-    except (ImportError, OSError) as error:
-        reason = str(error).partition("\n")[0]
-        warnings.warn(f"without numba ({reason}) the slower tensor and NumPy forms are used", stacklevel=3)
-        return None
-    return str(numba.__version__)
-
-
 def identity() -> str:
     """What a run says of its kernels: ``numba 0.68.1``, or ``off``."""
-    return f"numba {numba_version()}" if available() else "off"
+    return "off" if off() else f"numba {importlib.metadata.version('numba')}"
 
 
 _CLEAR = "\r\x1b[K"
@@ -285,8 +267,6 @@ def _compiled(uncompiled: Kernel[P, R], count: str) -> tuple[Callable[P, R], lis
     function = uncompiled.function
     how = OPTIONS | {"nogil": not uncompiled.holds_gil}
     dispatcher: Any = numba.njit(**how)(cache.named_by_version(function, uncompiled.version))
-    if not hasattr(dispatcher, "compile"):
-        return function, []  # NUMBA_DISABLE_JIT=1
     announce = functools.partial(begun, function.__name__, count=count)
     file = dispatcher._cache = cache.KernelFile(cache.path(function, uncompiled.version), announce)
     enabled = gc.isenabled()

@@ -73,9 +73,10 @@ def bits(
     seed: int, key: Int[Tensor, " b"], stream: Stream, start: int, count: int, columns: int
 ) -> Int[Tensor, "b count columns"]:
     """Random 63-bit non-negative integers for the draws start .. start + count - 1, `columns` numbers a draw."""
-    state = stream_state(mixed_seed(seed, stream), key.cpu().numpy())[:, None]
-    words = random_bits(state, np.arange(start * columns, (start + count) * columns)).astype(np.int64)
-    return torch.from_numpy(words).reshape(len(key), count, columns).to(key.device)
+    keys: Any = key.cpu().numpy()[:, None]
+    counters: Any = np.arange(start * columns, (start + count) * columns)
+    words = random_bits(stream_state(mixed_seed(seed, stream), keys), counters)
+    return torch.from_numpy(words.astype(np.int64)).reshape(len(key), count, columns).to(key.device)
 
 
 def uniform(

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from fmtorch.core.types import Correspondences, Features
 from fmtorch.geometry.arithmetic import sqrt, stable_sum
-from fmtorch.jit.kernel import Array, F8x1, I1x2, I4x1, I4x2, I8x1, available, inner, kernel
+from fmtorch.jit.kernel import Array, F8x1, I1x2, I4x1, I4x2, I8x1, inner, kernel, off
 from fmtorch.jobs.execution import one_thread
 
 # Two nearest neighbours, compiled: products of 8-bit integers leave few candidates, whose distances are exact
@@ -296,20 +296,15 @@ def _match_one_pair(d0: Tensor, d1: Tensor, mask0: Tensor, mask1: Tensor, chunk:
     if len(slots0) == 0 or len(slots1) == 0:
         return result
     rows, columns, unit = _integers(d0[slots0], d1[slots1])
-    (nearest, *squared), reverse = _compiled(rows, columns) or _two_nearest(rows, columns, chunk)
+    neighbors = two_nearest(rows, columns) if rows.device.type == "cpu" and not off() else None
+    if neighbors is None:
+        (nearest, *squared), reverse = _two_nearest(rows, columns, chunk)
+    else:
+        nearest, *squared, reverse = (torch.from_numpy(values) for values in neighbors[:4])
     result.nearest[slots0], result.reverse[slots1] = slots1[nearest], slots0[reverse]
     for distance, values in zip((result.distance, result.second), squared, strict=True):
         distance[slots0] = (sqrt(values.double()) * unit).float()
     return result
-
-
-def _compiled(rows: Tensor, columns: Tensor) -> tuple[list[Tensor], Tensor] | None:
-    """`_two_nearest` by kernels, None where they do not serve."""
-    neighbors = two_nearest(rows, columns) if rows.device.type == "cpu" and available() else None
-    if neighbors is None:
-        return None
-    tensors = [torch.from_numpy(values) for values in neighbors[:4]]
-    return tensors[:3], tensors[3]
 
 
 def _integers(d0: Tensor, d1: Tensor) -> tuple[Tensor, Tensor, float]:

@@ -8,7 +8,7 @@ downloaded here.
 
 import threading
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, ClassVar, NamedTuple
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 import torch
@@ -86,42 +86,38 @@ class VisMatch:
             torch.manual_seed(0)
             try:
                 result = self._matcher(*(_tensor(image).to(self.device) for image in (image0, image1)))
-                return _correspondences(self._matches(result, sizes), self.origin, sizes)
+                return _correspondences(*self._matches(result, sizes), self.origin, sizes)
             except Exception as error:  # anybody's network
                 raise ValueError(f"vismatch {self.name}: {_described(error)}") from error
 
-    def _matches(self, result: Mapping[str, Any], sizes: Sequence[Size]) -> "_Matches":
+    def _matches(
+        self, result: Mapping[str, Any], sizes: Sequence[Size]
+    ) -> tuple[Array, Array, Array | None, Array | None]:
+        """Points (N, 2) of both images, and confidences and noise (N,) where the matcher gives them."""
         if self._sample is not None:
             x0, x1, overlap, precisions = self._sample.take(sizes)
-            return _Matches(x0, x1, overlap, relative_noise(*precisions))
+            return x0, x1, overlap, relative_noise(*precisions)
         x0, x1 = (_numbers(result[f"matched_kpts{k}"]).reshape(-1, 2) for k in (0, 1))
         confidence = result.get("matched_confidences") if len(x0) else []  # those of no matches are known
-        return _Matches(x0, x1, None if confidence is None else _numbers(confidence).reshape(-1))
+        return x0, x1, None if confidence is None else _numbers(confidence).reshape(-1), None
 
 
-class _Matches(NamedTuple):
-    """Points (N, 2) of both images, and confidences and noise (N,) where the matcher gives them."""
-
-    x0: Array
-    x1: Array
-    confidence: Array | None
-    noise: Array | None = None
-
-
-def _correspondences(matches: _Matches, origin: float, sizes: Sequence[Size]) -> Correspondences:
+def _correspondences(
+    x0: Array, x1: Array, confidence: Array | None, noise: Array | None, origin: float, sizes: Sequence[Size]
+) -> Correspondences:
     """A batch of one pair; matches that are not finite, or outside of an image, are masked.
     origin: coordinates of the first pixel's centre. sizes: (h, w) of the images. Raises ValueError for other lengths.
     """
-    lengths = {len(part) for part in matches if part is not None}
+    lengths = {len(part) for part in (x0, x1, confidence, noise) if part is not None}
     if len(lengths) > 1:
         raise ValueError(f"points and confidences of {', '.join(map(str, sorted(lengths)))} matches")
-    x = [matches.x0 - origin, matches.x1 - origin]
+    x = [x0 - origin, x1 - origin]
     mask = np.ones(len(x[0]), bool)
     for points, (h, w) in zip(x, sizes, strict=True):
         with np.errstate(invalid="ignore"):  # NaN is in no image
             mask &= ((points >= -EDGE) & (points <= np.array([w, h]) - EDGE)).all(1)
-    known = {"x0": np.where(mask[:, None], x[0], 0), "x1": np.where(mask[:, None], x[1], 0), "noise": matches.noise}
-    known["score"] = None if matches.confidence is None else np.clip(np.nan_to_num(matches.confidence), 0, 1)
+    known = {"x0": np.where(mask[:, None], x[0], 0), "x1": np.where(mask[:, None], x[1], 0), "noise": noise}
+    known["score"] = None if confidence is None else np.clip(np.nan_to_num(confidence), 0, 1)
     fields = {name: torch.from_numpy(v.astype(np.float32))[None] for name, v in known.items() if v is not None}
     size0, size1 = (torch.tensor([size]) for size in sizes)
     return Correspondences(**fields, mask=torch.from_numpy(mask)[None], size0=size0, size1=size1)

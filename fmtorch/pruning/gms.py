@@ -255,8 +255,8 @@ class GMS:
         soft: bool = False,
         calibration: Mapping[str, Mapping[str, float]] | None = None,
     ) -> None:
-        self.with_rotation, self.with_scale = with_rotation, with_scale
-        self.threshold_factor, self.border = threshold_factor, border
+        self._options: dict[str, Any] = {"with_rotation": with_rotation, "with_scale": with_scale, "border": border}
+        self._options["threshold_factor"] = threshold_factor
         self.calibration = calibration_of("GMS", soft, calibration)
 
     def __call__(self, c: Correspondences) -> Correspondences:
@@ -270,8 +270,4 @@ class GMS:
     def _arguments(self, c: Correspondences) -> dict[str, Any]:
         if c.size0 is None or c.size1 is None:
             raise ValueError("GMS needs `size0` and `size1`: its grids divide the images")
-        return {
-            "x0": c.x0, "x1": c.x1, "size0": c.size0, "size1": c.size1, "mask": c.mask,
-            "with_rotation": self.with_rotation, "with_scale": self.with_scale,
-            "threshold_factor": self.threshold_factor, "border": self.border,
-        }  # fmt: skip
+        return {"x0": c.x0, "x1": c.x1, "size0": c.size0, "size1": c.size1, "mask": c.mask, **self._options}

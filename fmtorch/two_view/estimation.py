@@ -16,7 +16,6 @@ from fmtorch.core.stages import Estimator, Pruner, model_of, output_of
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.estimators.ransac import Ransac
 from fmtorch.geometry.significance import judged
-from fmtorch.jit import kernel
 from fmtorch.jit.together import compile_together
 from fmtorch.jobs.execution import one_thread
 from fmtorch.presets.files import load
@@ -85,8 +84,7 @@ def _with_prior(c: Correspondences, estimator: Estimator) -> Correspondences:
     """The matches with a prior of their consistency where the estimator uses one and none is given."""
     if c.prior is None and getattr(estimator, "uses_prior", False):
         pruner = _consistency(c.lafs0 is not None and c.lafs1 is not None and c.ratio is not None)
-        if kernel.available():
-            compile_together([*getattr(pruner, "kernels", ()), *getattr(estimator, "kernels", ())])
+        compile_together([*getattr(pruner, "kernels", ()), *getattr(estimator, "kernels", ())])
         with one_thread(c.mask.device):
             return pruner(c)
     return c

@@ -15,7 +15,6 @@ from fmtorch.geometry.arithmetic import component_sum, sqrt
 from fmtorch.geometry.epipolar import inverse_root
 from fmtorch.geometry.homography_pose import PlanePoses, poses_from_homography
 from fmtorch.geometry.pair_type import Evidence
-from fmtorch.jit import kernel
 from fmtorch.jit.together import compile_together
 from fmtorch.jobs.execution import one_thread
 from fmtorch.two_view.arguments import expect_values
@@ -67,9 +66,8 @@ class PairTypes(NamedTuple):
 
 def compile_with(stages: Iterable[object]) -> None:
     """Have the kernels of these stages and of `classify` ready; two processes compile those that are new."""
-    if kernel.available():
-        stages = (estimator_of("homography", None, {}), *stages)
-        compile_together([kinds.weigh, *(each for stage in stages for each in getattr(stage, "kernels", ()))])
+    stages = (estimator_of("homography", None, {}), *stages)
+    compile_together([kinds.weigh, *(each for stage in stages for each in getattr(stage, "kernels", ()))])
 
 
 def classify(

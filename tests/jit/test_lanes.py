@@ -14,7 +14,7 @@ from fmtorch.jit.kernel import B1x2, F4x2, F8x1, F8x2, kernel
 from fmtorch.jit.lanes import LANES, absolute, added, any_lane, copysign, fill, lanes, load, sqrt, store, where
 from tests.jit.test_kernels import load as load_module
 
-pytestmark = pytest.mark.skipif(not switch.available(), reason="kernels are switched off, or numba is not installed")
+pytestmark = pytest.mark.skipif(switch.off(), reason="kernels are switched off")
 SINGLES = 16
 load_singles, fill_singles = lanes(SINGLES)
 

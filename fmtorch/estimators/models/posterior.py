@@ -13,10 +13,10 @@ import numpy as np
 from fmtorch.estimators.models.focal_prior import LOG_USUAL, FocalPrior, focal_cost, focal_prior
 from fmtorch.estimators.pair import EXACT, Pair
 from fmtorch.geometry.arithmetic import exponential, logarithm_kernel
-from fmtorch.geometry.levenberg_marquardt import Weighted, evaluate, minimiser
+from fmtorch.geometry.levenberg_marquardt import SQUARINGS, Weighted, evaluate, minimiser
 from fmtorch.geometry.matrices import assign, assign_rows
 from fmtorch.geometry.pose import nearest_axes
-from fmtorch.geometry.rank2_manifold import SQUARINGS, damped_step, start_one
+from fmtorch.geometry.rank2_manifold import damped_step, start_one
 from fmtorch.jit.kernel import Array, F8x1, F8x2, F8x3, F8x4, inner, kernel, matrix, vector
 from fmtorch.jit.lanes import LANES, fill, load, store
 
@@ -107,12 +107,10 @@ def focal_precision(focals: Array, pair: Pair) -> Array:
 
 
 class CentredMatches(NamedTuple):
-    """Points (4, n) from the principal points; s2 (n,), squared scales of a loss in the unit of the points; precision
-    (n,), one over these."""
+    """Points (4, n) from the principal points; s2 (n,), squared scales of a loss in the unit of the points."""
 
     points: Array
     s2: Array
-    precision: Array
 
 
 def centred(pair: Pair, scale_px: float = 1.0) -> CentredMatches:
@@ -121,7 +119,7 @@ def centred(pair: Pair, scale_px: float = 1.0) -> CentredMatches:
     def compute(pair: Pair) -> CentredMatches:
         out = np.empty((6, pair.count))
         centre(pair.table, images_of(pair).offset, scale_px, out)
-        return CentredMatches(out[:4], out[4], out[5])
+        return CentredMatches(out[:4], out[4])
 
     return pair.cached(("centred", scale_px), compute)
 
