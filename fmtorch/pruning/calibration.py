@@ -53,22 +53,21 @@ def calibrated(evidence: F4x1, ratio: F4x1, mask: B1x1, numbers: F4x1, out: F4x1
 @kernel
 def calibrated_by_score(evidence: F4x1, score: F4x1, mask: B1x1, numbers: F8x1, out: F4x1) -> None:
     """P(inlier) of `Calibration` from evidence and a matcher's score (n,) -> out (n + 1,), zero where masked; the last
-    is 1 where scores are taken for probabilities. numbers: constants and weights of `alone` and of `with_score`, the
-    constant of scores by themselves, and the tolerance."""
-    n, count, expected, agreed = len(mask), 0, 0.0, 0.0
+    is 1 where scores are taken for probabilities. numbers: constant and weight of `alone`; constant and tolerance of
+    `with_score`."""
+    n, count, expected, agreed, factor = len(mask), 0, 0.0, 0.0, odds_of(numbers[2])
     alone, scored = np.empty(n), np.empty(n)
     for i in range(n):
         if mask[i]:
             s = min(max(np.float64(score[i]), _MIN_SCORE), 1 - _MIN_SCORE)
             root = math.sqrt(s / (1 - s))
-            odds = root * math.sqrt(root)  # to the power of SCORE_POWER
+            odds = factor * root * math.sqrt(root)  # s / (1 - s) to the power of SCORE_POWER
             alone[i] = logistic(min(max(numbers[0] + numbers[1] * evidence[i], -_LARGEST), _LARGEST))
-            scored[i] = odds * odds_of(numbers[2] + numbers[3] * evidence[i])
-            by_score = odds * odds_of(numbers[4])
-            expected, agreed, count = expected + by_score / (by_score + 1), agreed + alone[i], count + 1
-    probable = abs(expected - agreed) < numbers[5] * count
+            scored[i] = odds / (odds + 1)
+            expected, agreed, count = expected + scored[i], agreed + alone[i], count + 1
+    probable = abs(expected - agreed) < numbers[3] * count
     for i in range(n):
-        out[i] = (scored[i] / (scored[i] + 1) if probable else alone[i]) if mask[i] else 0.0
+        out[i] = (scored[i] if probable else alone[i]) if mask[i] else 0.0
     out[n] = 1.0 if probable else 0.0
 
 
@@ -76,10 +75,10 @@ def calibrated_by_score(evidence: F4x1, score: F4x1, mask: B1x1, numbers: F8x1, 
 class Calibration:
     """``P(inlier) = logistic(constant + evidence e + ratio q)`` of the evidence e and the distance ratio q.
     with_ratio: {constant, evidence, ratio}, where matches have a `ratio`. alone: {constant, evidence}, where they have
-    none; without it their prior stays as it is. with_score: {constant, evidence, of_score, tolerance}, where they have
-    a matcher's score s and no ratio: ``constant + evidence e + SCORE_POWER log(s / (1 - s))``. That holds of scores
-    that are probabilities, as LightGlue's. Others are ignored: a pair's scores are taken for such only if the mean of
-    ``logistic(of_score + SCORE_POWER log(s / (1 - s)))`` is within the tolerance of the mean P(inlier) by `alone`.
+    none; without it their prior stays as it is. with_score: {constant, tolerance}, where they have a matcher's score s
+    and no ratio: ``logistic(constant + SCORE_POWER log(s / (1 - s)))``. That holds of scores that are probabilities, as
+    LightGlue's, which has seen all matches. Others are ignored: a pair's scores are taken for such only if the mean of
+    that is within the tolerance of the mean P(inlier) by `alone`.
     `scripts/calibrate_priors.py` fits the numbers of `with_ratio` and `alone`."""
 
     with_ratio: Mapping[str, float]
@@ -109,16 +108,13 @@ class Calibration:
         c: Correspondences, evidence: Float[Tensor, "b n"], score: Float[Tensor, "b n"],
         alone: Mapping[str, float], scored: Mapping[str, float],
     ) -> Correspondences:  # fmt: skip
-        numbers = np.array([
-            alone["constant"], alone["evidence"], scored["constant"], scored["evidence"], scored["of_score"],
-            scored["tolerance"],
-        ])  # fmt: skip
+        numbers = np.array([alone["constant"], alone["evidence"], scored["constant"], scored["tolerance"]])
         out = torch.empty(len(c), c.mask.shape[1] + 1, dtype=torch.float32)
         out = for_each_pair(calibrated_by_score, (evidence, score, c.mask), numbers, out=out)
         prior, probable = out[:, :-1], out[:, -1:]
         if gradient_wanted(evidence, score):
             e, s = torch.where(c.mask, evidence, 0), torch.where(c.mask, score, 0.5).clamp(_MIN_SCORE, 1 - _MIN_SCORE)
-            z = scored["constant"] + scored["evidence"] * e + SCORE_POWER * torch.logit(s)
+            z = scored["constant"] + SCORE_POWER * torch.logit(s)
             prior = _with_gradient(prior, torch.where(probable > 0, z, alone["constant"] + alone["evidence"] * e))
         return c.derived(prior=prior.to(c.x0.dtype))
 

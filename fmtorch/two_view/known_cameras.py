@@ -218,13 +218,9 @@ def covariance_fields(
         shapes = {"covariance": (7, 7), "tangents": (3, 2), "covariance_F": (9, 9)}
         return {name: focals.new_full((len(c), *shape), torch.nan) for name, shape in shapes.items()}
     centre0, centre1 = ((size.to(focals).flip(-1) - 1) / 2 for size in (c.size0, c.size1))
-    weight, precision = c.prior, estimate.focal_precision
-    if weight is not None and precision is not None:  # as fits with exactly known focal lengths count it
-        exact = precision.diagonal(dim1=-2, dim2=-1).isinf().all(1)[:, None]
-        weight = torch.where(exact, sqrt(weight.double().clamp_min(0)), weight.double())
     computed = two_view_covariance(
-        c.x0, c.x1, R, t, focals, centre0, centre1, scale, weight, c.noise, c.mask & estimate.ok[:, None],
-        precision, c.shared_focal,
+        c.x0, c.x1, R, t, focals, centre0, centre1, scale, c.prior, c.noise, c.mask & estimate.ok[:, None],
+        estimate.focal_precision, c.shared_focal,
     )  # fmt: skip
     of_F = computed.fundamental
     if maps is not None:
