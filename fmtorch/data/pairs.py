@@ -158,11 +158,14 @@ class DepthDataset(PairDataset, Protocol):
 
 
 class PairSubset(PairDataset):
-    """The pairs of these indices, in this order. `subset` keeps what the data set knows of depth."""
+    """The pairs of these indices, in this order, with what the data set knows of depth.
+    Of all of them the digest still differs from that of the data set, as it names the pairs."""
 
     def __init__(self, dataset: PairDataset, indices: Sequence[int]) -> None:
         self.dataset, self.indices = dataset, list(indices)
         self.name = dataset.name
+        if isinstance(dataset, DepthDataset):
+            self.depth = dataset.depth
         self.digest = hashlib.sha256(f"{dataset.digest} {self.indices}".encode()).hexdigest()
 
     def __len__(self) -> int:
@@ -170,15 +173,3 @@ class PairSubset(PairDataset):
 
     def __getitem__(self, index: int) -> ImagePair:
         return self.dataset[self.indices[index]]
-
-
-class _DepthSubset(PairSubset):
-    dataset: DepthDataset
-
-    def depth(self, image: ImageSource, points: Matrix) -> Matrix:
-        return self.dataset.depth(image, points)
-
-
-def subset(dataset: PairDataset, indices: Sequence[int]) -> PairSubset:
-    """Some pairs of a data set; all of them: the data set's digest still changes, as it names the pairs."""
-    return _DepthSubset(dataset, indices) if isinstance(dataset, DepthDataset) else PairSubset(dataset, indices)

@@ -11,14 +11,13 @@ import torch
 
 from fmtorch.core.types import Correspondences
 from fmtorch.data import DataError, GivenMatches, ImagePair, ImageSource, PairDataset, stored_size
+from fmtorch.data.cameras import Camera, fundamental
 from fmtorch.data.files import Indices, Mask, Matrix
-from fmtorch.geometry.cameras import fundamental_from_projections
 from fmtorch.io import h5
 
 Size = tuple[int, int]  # (h, w)
 Images = tuple[ImageSource, ImageSource]
 MAX_OFF_CENTRE = 0.1  # of a principal point, in units of the side: those of reduced images are farther off
-_ZERO = np.zeros((3, 3))  # where there is no F
 
 
 def given(
@@ -40,27 +39,16 @@ def _figure(values: Matrix | None) -> torch.Tensor | None:
     return None if values is None else torch.from_numpy(values.astype(np.float32))[None]
 
 
-def with_fundamentals(pairs: Sequence[ImagePair]) -> list[ImagePair]:
-    """The pairs with the F of their cameras, all at once; those with a problem, or without a pose, as they are."""
-    result = list(pairs)
-    places = [i for i, p in enumerate(pairs) if p.problem is None and p.R is not None]
-    if not places:
-        return result
-    K0, K1, R, t = (np.stack([getattr(pairs[i], name) for i in places]) for name in ("K0", "K1", "R", "t"))
-    wrong = {
-        "the cameras did not move apart (t is zero), which leaves no F": ~t.any(1),
-        "R is no rotation": np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max((1, 2)) > 1e-2,
-        "a calibration matrix is singular": (np.linalg.det(K0) == 0) | (np.linalg.det(K1) == 0),
-    }
-    problems: list[str | None] = [None] * len(places)
-    for problem, where in wrong.items():  # the last that holds counts
-        for i in np.flatnonzero(where):
-            problems[i] = problem
-    P0, P1 = K0 @ np.eye(3, 4), K1 @ np.concatenate([R, t[..., None]], -1)
-    F = fundamental_from_projections(torch.from_numpy(P0), torch.from_numpy(P1)).numpy()
-    for place, own, wrongly in zip(places, F, problems, strict=True):
-        result[place] = dataclasses.replace(pairs[place], F=own if wrongly is None else _ZERO, problem=wrongly)
-    return result
+def with_cameras(pair: ImagePair, K0: Matrix, K1: Matrix, R: Matrix, t: Matrix) -> ImagePair:
+    """The pair with its cameras, ``X1 = R X0 + t``, and their F; with a problem where they leave none."""
+    pair = dataclasses.replace(pair, K0=K0, K1=K1, R=R, t=t)
+    if np.linalg.det(K0) == 0 or np.linalg.det(K1) == 0:
+        return dataclasses.replace(pair, problem="a calibration matrix is singular")
+    if np.abs(R @ R.T - np.eye(3)).max() > 1e-2:
+        return dataclasses.replace(pair, problem="R is no rotation")
+    if not t.any():
+        return dataclasses.replace(pair, problem="the cameras did not move apart (t is zero), which leaves no F")
+    return dataclasses.replace(pair, F=fundamental(Camera(K0, np.eye(3), np.zeros(3)), Camera(K1, R, t)))
 
 
 def image(family: str, scene: str, name: str, folder: Path | None) -> ImageSource:

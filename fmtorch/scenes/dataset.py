@@ -312,7 +312,7 @@ class RenderedPairs(HeldPairs):
         scene, _, number = image.identity.rpartition("/")
         return depth_at(self._tasks[scene], int(number), points)
 
-    def scene_pairs(self) -> "RenderedScenePairs":
+    def scene_pairs(self) -> ScenePairs:
         """All pairs of the photographs of each scene, as candidates to select from."""
         scenes = []
         for name, views in self._views.items():
@@ -321,18 +321,7 @@ class RenderedPairs(HeldPairs):
                 for i, (path, camera) in enumerate(views)
             ]
             scenes.append(Scene(name, self._tasks[name].family, drawn, AllPairs(len(drawn))))
-        return RenderedScenePairs(self, scenes)
-
-
-class RenderedScenePairs(ScenePairs):
-    """All pairs of the photographs of rendered scenes; drawn: these scenes as a data set, which knows the depth."""
-
-    def __init__(self, drawn: RenderedPairs, scenes: Sequence[Scene]) -> None:
-        super().__init__("rendered", scenes, (), (drawn.digest,))
-        self.drawn = drawn
-
-    def depth(self, image: ImageSource, points: Matrix) -> Matrix:
-        return self.drawn.depth(image, points)
+        return ScenePairs("rendered", scenes, (), (self.digest,), depth=self.depth)
 
 
 _FILES = ("motorcycle_left.png", "motorcycle_right.png", "motorcycle_disp.npz")

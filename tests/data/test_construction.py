@@ -14,7 +14,7 @@ import torch
 from fmtorch import presets
 from fmtorch.data import DataError, ImageSource, construction, load, read_image, to_grey
 from fmtorch.data import construction as rule
-from fmtorch.data.scenes import SPLITS, AllPairs, DepthScenePairs, chosen, drawn, following, incidence, sharing_points
+from fmtorch.data.scenes import SPLITS, AllPairs, ScenePairs, chosen, drawn, following, incidence, sharing_points
 from fmtorch.pipeline import Pipeline, load_pipeline
 from fmtorch.scenes import Plan, RenderedPairs
 from fmtorch.training import OANetPairs
@@ -202,14 +202,14 @@ PLAN = Plan(scenes=1, shots=4, pairs=4, scale=0.15)
 
 
 @pytest.fixture(scope="module")
-def rendered(tmp_path_factory: pytest.TempPathFactory) -> DepthScenePairs:
+def rendered(tmp_path_factory: pytest.TempPathFactory) -> ScenePairs:
     """All pairs of four photographs each of two families; cameras of the collection have other sizes."""
     root = tmp_path_factory.mktemp("rendered")
     families = ["indoor", "collection"]
     return RenderedPairs(families=families, root=root, plan=PLAN, workers=1).scene_pairs()
 
 
-def one_by_one(dataset: DepthScenePairs, scene: int, i: int, j: int) -> float:
+def one_by_one(dataset: ScenePairs, scene: int, i: int, j: int) -> float:
     a, b = (dataset.scenes[scene].views[k] for k in (i, j))
 
     def depth(image: ImageSource, x: float, y: float) -> float:
@@ -224,7 +224,7 @@ def one_by_one(dataset: DepthScenePairs, scene: int, i: int, j: int) -> float:
     return min(shares)
 
 
-def test_overlap_of_rendered_pairs_is_that_counted_pixel_by_pixel(rendered: DepthScenePairs) -> None:
+def test_overlap_of_rendered_pairs_is_that_counted_pixel_by_pixel(rendered: ScenePairs) -> None:
     overlaps = construction.overlap_of(rendered)
     assert isinstance(overlaps, construction.DepthOverlap)
     places = [rendered.candidate(rank) for rank in range(rendered.candidates)]
