@@ -2,12 +2,13 @@
 
 import dataclasses
 import hashlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import cv2
 import numpy as np
+import torch
 
 from fmtorch.core.lenses import Lens
 from fmtorch.core.types import Correspondences, pair_key
@@ -99,6 +100,7 @@ class ImagePair:
     problem: why this pair cannot be used (a bad line of a pairs file, say); None for a sound pair.
     matches: reads the matches that come with the pair, in place of features and matcher; can be sent between processes.
     H: (3, 3) float64 with ``x1 ~ H x0`` in pixels, of a data set of homographies, whose F is zero; None for any other.
+    given: what estimators are given of cameras and lenses, fields of `Correspondences` for one pair; None: nothing.
     """
 
     identity: str
@@ -114,6 +116,7 @@ class ImagePair:
     problem: str | None = None
     matches: Callable[[], GivenMatches] | None = None
     H: Matrix | None = None
+    given: Mapping[str, torch.Tensor | None] | None = None
 
     @property
     def key(self) -> int:

@@ -117,7 +117,7 @@ def _of_homographies(outcomes: Sequence[Outcome]) -> list[Figures]:
 
 def _row(outcome: Outcome, figures: Figures, planar: bool, seconds: float) -> PairRow:
     pair, c, estimate = outcome.pair, outcome.correspondences, outcome.estimate
-    ok, pair_type, focals = outcome.solved, outcome.pair_type, focal_errors(outcome)
+    ok, pair_type = outcome.solved, outcome.pair_type
     lenses = (None, None, None) if estimate is None else _lenses(estimate)
     matrix = estimate.F[0].flatten().tolist() if estimate is not None and ok else None
     figures = figures | {f"seconds_{stage}": outcome.seconds.get(stage, math.nan) for stage in STAGES}
@@ -132,9 +132,7 @@ def _row(outcome: Outcome, figures: Figures, planar: bool, seconds: float) -> Pa
         related=bool(estimate.related[0]) if estimate is not None else False,
         pair_type=None if pair_type is None else pair_type.names[0],
         warning=outcome.not_examined or None if pair_type is None else pair_type.warnings[0],
-        focal_error0=focals.error[0], focal_error1=focals.error[1],
-        focal_log_ratio0=focals.log_ratio[0], focal_log_ratio1=focals.log_ratio[1],
-        lens_suggested=lenses[0], lens0=lenses[1], lens1=lenses[2],
+        **focal_errors(outcome), lens_suggested=lenses[0], lens0=lenses[1], lens1=lenses[2],
     )  # fmt: skip
 
 
@@ -197,31 +195,20 @@ def _closest(outcomes: Sequence[Outcome]) -> metrics.PoseError:
     return metrics.closest_pose_error(estimate.F.double(), *_truth(outcomes, "K0", "K1", "R", "t"))
 
 
-class FocalErrors(NamedTuple):
-    """Of both images: ``|f - f_true| / f_true``, and ``log(f / f_true)``.
-    None where no focal length was estimated, since it was given exactly or nobody asked, or the true one is not known.
-    Where it was to be estimated and is not determined the error is infinite and the ratio None."""
-
-    error: tuple[float | None, float | None] = (None, None)
-    log_ratio: tuple[float | None, float | None] = (None, None)
-
-
-def focal_errors(outcome: Outcome) -> FocalErrors:
-    """The errors of one pair, by what its estimator was given (`fmtorch.pipeline.pipeline`)."""
-    c, estimate = outcome.correspondences, outcome.estimate
-    if c is None or c.focal is None or estimate is None:
-        return FocalErrors()
-    errors: list[tuple[float | None, float | None]] = []
+def focal_errors(outcome: Outcome) -> Figures:
+    """Of both images ``|f - f_true| / f_true`` and ``log(f / f_true)``, by what the estimator was given of the pair.
+    None of these where no focal length was estimated, since it was given exactly or nobody asked, or the true one is
+    not known. Where it was to be estimated and is not determined the error is infinite and there is no ratio."""
+    c, estimate, figures = outcome.correspondences, outcome.estimate, Figures()
     for i, K in enumerate((outcome.pair.K0, outcome.pair.K1)):
         true = _focal(K)
-        if true is None or float(c.focal[0, i, 1]) == 0:  # exact
-            errors.append((None, None))
+        if estimate is None or c is None or c.focal is None or true is None or float(c.focal[0, i, 1]) == 0:  # exact
             continue
         focal = math.nan if estimate.focals is None or not outcome.solved else float(estimate.focals[0, i])
-        determined = math.isfinite(focal) and focal > 0
-        errors.append((abs(focal - true) / true, math.log(focal / true)) if determined else (math.inf, None))
-    (error0, ratio0), (error1, ratio1) = errors
-    return FocalErrors((error0, error1), (ratio0, ratio1))
+        figures[f"focal_error{i}"] = math.inf
+        if math.isfinite(focal) and focal > 0:
+            figures |= {f"focal_error{i}": abs(focal - true) / true, f"focal_log_ratio{i}": math.log(focal / true)}
+    return figures
 
 
 def _focal(K: NDArray[np.float64] | None) -> float | None:

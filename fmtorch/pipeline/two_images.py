@@ -24,7 +24,7 @@ from fmtorch.pipeline import photographs, pictures
 from fmtorch.pipeline.pair_geometries import pair_geometries
 from fmtorch.pipeline.photographs import GivenImage, Image, frames_to_original, given_image, to_original
 from fmtorch.pipeline.pipeline import Clock, Pipeline, load_pipeline
-from fmtorch.two_view import arguments, known_cameras
+from fmtorch.two_view import arguments
 from fmtorch.two_view.lenses import CalibratedLenses
 from fmtorch.two_view.pair_type import classify, compile_with, still_warning, warnings_of
 
@@ -389,8 +389,7 @@ def _estimated(
     pipeline: Pipeline, matched: MatchResult, c: Correspondences, scales: list[Tensor], seed: int, clock: Clock
 ) -> MatchResult:
     """The result with an estimate. c: the matches as pinholes have them, with what is known of the cameras."""
-    estimator = known_cameras.KnownCameras(pipeline.estimator) if c.asks_for_cameras else pipeline.estimator
-    estimate = pipeline.estimated(c, seed, estimator)
+    estimate = pipeline.estimated(c, seed)
     clock("estimation")
     lenses = matched.lenses
     if estimate.lens is not None:
