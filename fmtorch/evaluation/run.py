@@ -140,13 +140,11 @@ def _measured(path: Path) -> tuple[float, float]:
 
 class Batch(NamedTuple):
     """Pairs to evaluate.
-    export: whether keypoints, matches and F are to be exported. counted: whether the worker counts the images that it
-    computed. signed: of `pose_errors`."""
+    export: whether keypoints, matches and F are to be exported. signed: of `pose_errors`."""
 
     pairs: list[ImagePair]
     seed: int
     export: bool = False
-    counted: bool = False
     signed: bool = False
 
 
@@ -164,7 +162,7 @@ class Work(NamedTuple):
 
 def evaluate_batch(pipeline: Pipeline, batch: Batch) -> Work:
     """The rows of a batch, and what is to be exported of it."""
-    cache = pipeline.extractor if batch.counted and isinstance(pipeline.extractor, CachedFeatures) else None
+    cache = pipeline.extractor if isinstance(pipeline.extractor, CachedFeatures) else None
     computed, from_cache = (cache.computed, cache.found) if cache else (0, 0)
     outcomes = examined(pipeline, pipeline.run(batch.pairs, batch.seed), batch.seed)
     records = match_records(pipeline, outcomes) if batch.export else None
@@ -234,14 +232,14 @@ def evaluate_pairs(
 
     def given(members: Sequence[ImagePair]) -> Batch:
         sent = with_contents(members) if execution.send_images and not source.shared else list(members)
-        return Batch(sent, seed, journal is not None, not source.shared, signed)
+        return Batch(sent, seed, journal is not None, signed)
 
     def keep(done: Batch, work: Work) -> None:
         if journal is not None and work.records is not None:
             journal.add(work.records)
         store(work.rows)
         pipeline.tracebacks |= work.tracebacks
-        if isinstance(pipeline.extractor, CachedFeatures):
+        if isinstance(pipeline.extractor, CachedFeatures) and not source.shared:
             pipeline.extractor.computed += work.computed
             pipeline.extractor.found += work.from_cache
 

@@ -4,7 +4,7 @@ import contextlib
 import functools
 import hashlib
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -127,24 +127,6 @@ def numbers(file: Any, key: str, *shape: int | None) -> Matrix:
     if values.dtype.kind not in "fiub":
         raise DataError(f"{where(file, key)} is of {values.dtype}; it must hold real numbers")
     return values.astype(np.float64, copy=False)
-
-
-def small(file: Any, shapes: Mapping[str, tuple[int, ...]]) -> list[Matrix]:
-    """Arrays of a few numbers, each as by `reshaped`, of their keys and shapes; all of them in a third of the time."""
-    h5py, values, begin, read = _library(), np.empty(sum(map(math.prod, shapes.values()))), 0, []
-    try:
-        for key, shape in shapes.items():
-            entry, part = h5py.h5d.open(file.id, key.encode()), values[begin : begin + math.prod(shape)]
-            if entry.get_space().get_simple_extent_npoints() != len(part):
-                break
-            entry.read(h5py.h5s.ALL, h5py.h5s.ALL, part, h5py.h5t.NATIVE_DOUBLE)
-            read.append(part.reshape(shape))
-            begin += len(part)
-    except (OSError, RuntimeError, KeyError, TypeError, ValueError):
-        read = []
-    if len(read) == len(shapes) and np.isfinite(values).all():
-        return read
-    return [reshaped(file, key, *shape) for key, shape in shapes.items()]  # which names what is wrong
 
 
 def reshaped(file: Any, key: str, *shape: int) -> Matrix:

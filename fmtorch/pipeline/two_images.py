@@ -132,17 +132,15 @@ class MatchResult:
         folder.mkdir(parents=True, exist_ok=True)
         drawn = {"matches": True, "pruning": bool(self._pruners), "epipolar": self.ok or truth is not None}
         names = [name for name in get_args(Picture) if drawn[name]]
-        with files.replacing(folder / "result.json") as path:
-            path.write_text(json.dumps({**(report or {}), **self.report()}) + "\n")
+        files.write_whole(folder / "result.json", json.dumps({**(report or {}), **self.report()}) + "\n")
         for name in get_args(Picture):
             path = folder / f"{name}.png"
             if name not in names:  # of an earlier run
                 path.unlink(missing_ok=True)
                 continue
-            with files.replacing(path) as temporary:
-                nsgd = (report or {}).get("nsgd")
-                picture = self._epipolar(truth, nsgd) if name == "epipolar" else self.draw(name)
-                temporary.write_bytes(cv2.imencode(".png", picture[..., ::-1])[1].tobytes())
+            nsgd = (report or {}).get("nsgd")
+            picture = self._epipolar(truth, nsgd) if name == "epipolar" else self.draw(name)
+            files.write_whole(path, cv2.imencode(".png", picture[..., ::-1])[1].tobytes())
         return ["result.json", *(f"{name}.png" for name in names)]
 
     def report(self) -> dict[str, Any]:

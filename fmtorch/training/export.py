@@ -23,7 +23,8 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from fmtorch import metrics
-from fmtorch.core import Estimator, replacing
+from fmtorch.core import Estimator
+from fmtorch.core.files import replacing, write_whole
 from fmtorch.metrics.recall import FINE_THRESHOLD
 from fmtorch.pruning.networks import layers, learned
 from fmtorch.training.labelled import LabelledMatches
@@ -350,10 +351,8 @@ def write_result(
         files.append(folder / f"{name}.onnx")
         export_onnx(network, files[-1], temperature=fitted)
     card = folder / f"{name}.md"
-    with replacing(card) as temporary:
-        temporary.write_text(model_card(files, facts, evaluation, fitted), encoding="utf-8")
-    with replacing(folder / "validation.json") as temporary:
-        temporary.write_text(json.dumps({**evaluation.figures, "temperature": fitted}, indent=2) + "\n")
+    write_whole(card, model_card(files, facts, evaluation, fitted))
+    write_whole(folder / "validation.json", json.dumps({**evaluation.figures, "temperature": fitted}, indent=2) + "\n")
     return Result((*files, card), evaluation, fitted)
 
 

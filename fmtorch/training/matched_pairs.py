@@ -95,7 +95,7 @@ class MatchedPairs(StoredMatches):
         done, total = len(pairs) - sum(len(job.pairs) for job in missing), len(pairs)
         report = progress or (lambda done, total: None)
         report(done, total)
-        for count in compute_shards(dataset, stages, build, missing, rules=Rules(most, labels), execution=execution):
+        for count in compute_shards(dataset, stages, build, missing, most, labels, execution):
             done += count
             report(done, total)
         super().__init__(folder, augmentation=augmentation, seed=seed)
@@ -158,20 +158,15 @@ def partition(pairs: Sequence[ImagePair]) -> list[list[int]]:
     return shards
 
 
-class Rules(NamedTuple):
-    """How many matches are kept of a pair, the best by ratio, and what their labels go by."""
-
-    most: int
-    labels: labelled.Rule
-
-
 class Matching(NamedTuple):
     """What pairs are matched and labelled by.
-    dataset: where they are from. pipeline: its stages before estimation are run."""
+    dataset: where they are from. pipeline: its stages before estimation are run. most: matches kept of a pair, the best
+    by ratio. labels: what they go by."""
 
     dataset: PairDataset
     pipeline: Pipeline
-    rules: Rules
+    most: int
+    labels: labelled.Rule
 
 
 class Job(NamedTuple):
@@ -181,19 +176,19 @@ class Job(NamedTuple):
     pairs: list[ImagePair]
 
 
-def matching(dataset: PairDataset, build: Callable[[], Pipeline], rules: Rules, images: int = _IMAGES) -> Matching:
+def matching(
+    dataset: PairDataset, build: Callable[[], Pipeline], most: int, labels: labelled.Rule, images: int = _IMAGES
+) -> Matching:
     """The matching by the stages of a pipeline that is built, with the features of so many images kept."""
     stages = build()
-    pipeline = Pipeline(
-        stages.extractor, stages.matcher, stages.pruners, stages.estimator,
-        device=stages.device, memory=images, families=stages.families,
-    )  # fmt: skip
-    return Matching(dataset, pipeline, rules)
+    parts = stages.extractor, stages.matcher, stages.pruners, stages.estimator
+    pipeline = Pipeline(*parts, device=stages.device, memory=images, families=stages.families)
+    return Matching(dataset, pipeline, most, labels)
 
 
 def compute_shards(
-    dataset: PairDataset, stages: Pipeline, build: Callable[[], Pipeline] | None, jobs: Sequence[Job], *, rules: Rules,
-    execution: Execution,
+    dataset: PairDataset, stages: Pipeline, build: Callable[[], Pipeline] | None, jobs: Sequence[Job], most: int,
+    labels: labelled.Rule, execution: Execution,
 ) -> Iterator[int]:  # fmt: skip
     """Write each job's shard; yields the number of its pairs when it is written.
     stages: the pipeline whose stages before estimation are run by threads; build: makes it in other processes, pickled.
@@ -201,10 +196,10 @@ def compute_shards(
     pool = WorkerPool(execution, PRELOADED)
     source: Source[Matching]
     if execution.shared:
-        source = Local(matching(dataset, lambda: stages, rules, _IMAGES * pool.size))
+        source = Local(matching(dataset, lambda: stages, most, labels, _IMAGES * pool.size))
     else:
         assert build is not None
-        source = Factory(functools.partial(matching, dataset, build, rules))
+        source = Factory(functools.partial(matching, dataset, build, most, labels))
     runner = TaskRunner(pool, source, matched_rows, lambda job, rows: write_shard(job.path, rows))
     threads = torch.get_num_threads(), cv2.getNumThreads()
     use_one_thread()
@@ -231,11 +226,11 @@ def _row(how: Matching, outcome: Outcome) -> dict[str, Any]:
     }  # fmt: skip
     if c is None:
         return row
-    c = _best(c.detach().to("cpu").compact(), how.rules.most)
+    c = _best(c.detach().to("cpu").compact(), how.most)
     if not len(c.x0[0]):
         return {**row, "reason": "no matches are left"}
     x0, x1 = (x[0].to(torch.float64).numpy() for x in (c.x0.to(torch.float32), c.x1.to(torch.float32)))
-    labels = labelled.label(how.dataset, pair, x0, x1, how.rules.labels)
+    labels = labelled.label(how.dataset, pair, x0, x1, how.labels)
     norm = np.linalg.norm(pair.F) or 1.0  # zero where the pair determines none
     row |= {
         "matches": len(labels), "inliers": int((labels == 1).sum()), "outliers": int((labels == 0).sum()),

@@ -146,11 +146,11 @@ def test_a_draw_is_the_same_however_it_is_interrupted(scenes, tmp_path, monkeypa
     assert sorted(uninterrupted.order().tolist()) == list(range(20))
     uninterrupted.begin()
     blocks = construction.blocks(uninterrupted.order())
-    passed = [rank for number, ranks in blocks for rank in ranks if uninterrupted.judge(number, ranks).kept[0]]
+    passed = [rank for number, ranks in blocks for rank in ranks if uninterrupted.judge((number, ranks)).kept[0]]
     assert len(passed) == 4
     broken.begin()
     for number, ranks in list(construction.blocks(broken.order()))[:9]:
-        broken.judge(number, ranks)
+        broken.judge((number, ranks))
     asked, matchable = list[object](), rule.matchable
     monkeypatch.setattr(rule, "matchable", lambda *given: asked.append(given) or matchable(*given))
     run(tmp_path, monkeypatch, "count=3", "seed=5", "workers=1")
