@@ -71,8 +71,7 @@ def match_folder(
     build = None if execution.shared else functools.partial(build_pipeline, config, pipeline.device)
     with folders.folder_workers(pipeline, execution) as workers, progress_bars() as progress:
         work = FolderMatches(
-            pipeline, journal, fields.longest_side, fields.orient, fields.seed,
-            workers=workers, build=build, cameras=cameras,
+            pipeline, journal, workers, fields.longest_side, fields.orient, fields.seed, build=build, cameras=cameras,
         )  # fmt: skip
         if similar and vector is not None:
             seen = progress.track(work.images(images), len(images), description="images")

@@ -3,13 +3,13 @@
 import contextlib
 import io
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import cv2
 import kornia_rs
 import numpy as np
-from PIL import ExifTags, Image, PngImagePlugin, TiffImagePlugin
+from PIL import ExifTags, Image, JpegImagePlugin, PngImagePlugin, TiffImagePlugin
 
 from fmtorch.data.cameras import undistorted
 from fmtorch.data.files import Array, Pixels
@@ -19,7 +19,6 @@ _JPEG, _PNG = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
 _TIFF = (b"II*\0", b"II+\0", b"MM\0*", b"MM\0+")  # the second of each order: BigTIFF
 _JPEG_MARKER = re.compile(rb"\xff+([^\x00\xff\xd0-\xd7])", re.DOTALL)
 _END_OF_IMAGE, _START_OF_IMAGE = 0xD9, 0xD8
-_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # of any coding; the three are tables and an extension
 _HUFFMAN_FRAMES = (0xC0, 0xC1, 0xC2)  # baseline, extended sequential, progressive
 _TurboJpeg = getattr(kornia_rs, "io", kornia_rs).ImageDecoder  # where it is depends on the version
 
@@ -164,22 +163,17 @@ def to_grey(image: Pixels) -> Pixels:
 
 
 def _expect_moderate(path: Path, data: bytes) -> None:
-    if data.startswith(_PNG):
-        sizes = [(data[16:20], data[20:24])]  # IHDR comes first
-    elif data.startswith(_JPEG):
-        frames = (at for marker, at in _jpeg_segments(data) if marker in _FRAMES)
-        sizes = [(data[at + 5 : at + 7], data[at + 3 : at + 5]) for at in frames]
-    else:  # Pillow reads the header; its own limit is 1.8e8 pixels
-        try:
-            Image.open(io.BytesIO(data)).close()
-        except Image.DecompressionBombError as error:
-            raise ImageError(f"{path}: {error}; it must have fewer pixels, reduce it") from error
-        except Exception:  # what is no image to Pillow may be one to OpenCV, which is asked next
-            pass
-        sizes = []
-    for width, height in ((int.from_bytes(w, "big"), int.from_bytes(h, "big")) for w, h in sizes):
-        if width * height > MAX_PIXELS:
-            raise ImageError(f"{path}: {width} x {height} px; it must have at most {MAX_PIXELS} pixels, reduce it")
+    opened: Callable[[io.BytesIO], Image.Image] = Image.open  # with a limit of its own, 1.8e8 pixels
+    if data.startswith((_JPEG, _PNG)):
+        opened = JpegImagePlugin.JpegImageFile if data.startswith(_JPEG) else PngImagePlugin.PngImageFile
+    try:
+        width, height = opened(io.BytesIO(data)).size
+    except Image.DecompressionBombError as error:
+        raise ImageError(f"{path}: {error}; it must have fewer pixels, reduce it") from error
+    except Exception:  # what is no image to Pillow may be one to OpenCV, which is asked next
+        return
+    if width * height > MAX_PIXELS:
+        raise ImageError(f"{path}: {width} x {height} px; it must have at most {MAX_PIXELS} pixels, reduce it")
 
 
 def _jpeg_segments(data: bytes) -> Iterator[tuple[int, int]]:

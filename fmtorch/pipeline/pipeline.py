@@ -24,7 +24,7 @@ from fmtorch.jobs.execution import one_thread
 from fmtorch.presets.composition import PIPELINES, build_pruners, compose, plain
 from fmtorch.presets.files import available, unknown
 from fmtorch.presets.objects import instantiate, open_files
-from fmtorch.runs.feature_cache import cached
+from fmtorch.runs.feature_cache import CachedFeatures, cached
 from fmtorch.two_view.arguments import expect_possible
 from fmtorch.two_view.known_cameras import KnownCameras
 from fmtorch.two_view.pair_type import PairTypes, classify, compile_with
@@ -175,7 +175,7 @@ class Pipeline:
 
     def extract(self, image: NDArray[np.uint8]) -> tuple[Features, float]:
         """The features of pixels on the pipeline's device, and the seconds that computing them takes or took."""
-        if isinstance(self.extractor, stages.TimedExtractor):
+        if isinstance(self.extractor, CachedFeatures):
             features, seconds = self.extractor.timed(image)
             return features.to(self.device), seconds
         start = time.perf_counter()

@@ -27,7 +27,7 @@ from fmtorch.jit.together import compile_together
 from fmtorch.jobs.execution import Execution, cores
 from fmtorch.jobs.runner import MAX_PROCESSES, Local, TaskRunner, WorkerPool
 from fmtorch.scenes import landmarks, videos
-from fmtorch.scenes.light import DrawnScene, Shot, Stage, affine, expose, footprints, group_by_texture, shade
+from fmtorch.scenes.light import DrawnScene, Shot, Stage, expose, footprints, group_by_texture, shade
 from fmtorch.scenes.raycast import Camera, Geometry, Matrix, calibration, cast_pieces, fundamental, relative_pose
 from fmtorch.scenes.surfaces import Pixels, skimage_file
 
@@ -42,7 +42,7 @@ SPLITS = ("test", "train")
 RECORD = Path(__file__).with_name("pairs.json")
 Progress = Callable[[int, int], None]
 
-KERNELS = (cast_pieces, shade, footprints, affine, group_by_texture)  # that drawing calls, slowest first
+KERNELS = (cast_pieces, shade, footprints, group_by_texture)  # that drawing calls, slowest first
 
 
 @dataclasses.dataclass(frozen=True)
@@ -349,14 +349,3 @@ class StereoPair(HeldPairs):
         images = [ImageSource(f"motorcycle/{side}", self._paths[i]) for i, side in enumerate(("left", "right"))]
         identity, truth = f"{self.name}/motorcycle/left-right", _truth(left, right)
         self._pairs = [ImagePair(identity, self.name, "motorcycle", images[0], images[1], *truth)]
-
-    def matches(self) -> tuple[Matrix, Matrix]:
-        """Points (n, 2) on the left and where they are on the right, for every pixel with a measured disparity."""
-        with np.load(self._paths[2]) as file:
-            disparity = file["arr_0"].astype(np.float64)
-        known = np.isfinite(disparity)
-        y, x = np.nonzero(known)
-        left = np.stack([x, y], -1).astype(np.float64)
-        right = left - np.stack([disparity[known], np.zeros(len(left))], -1)
-        inside = (right[:, 0] >= 0) & (right[:, 0] <= disparity.shape[1] - 1)
-        return left[inside], right[inside]

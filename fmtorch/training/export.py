@@ -260,6 +260,8 @@ def export_onnx(network: nn.Module, path: Path, *, temperature: float = 1.0) -> 
 
 def onnx_model(network: nn.Module, example: Tensor, name: str, output: str, *, free_axis: int) -> Any:
     """A module of one input as an ONNX model, one axis of the input of any length, without notes of source lines."""
+    import onnx_ir.passes.common
+
     with quiet(("torch.onnx",), logging.ERROR), warnings.catch_warnings():  # of operators that are not installed
         warnings.simplefilter("ignore", FutureWarning)  # of the exporter's own deprecated calls
         program = torch.onnx.export(
@@ -267,8 +269,8 @@ def onnx_model(network: nn.Module, example: Tensor, name: str, output: str, *, f
             dynamic_shapes=({free_axis: torch.export.Dim("n", min=1)},), verbose=False,
         )  # fmt: skip
     assert program is not None
-    forget_origin(model := program.model_proto)
-    return model
+    onnx_ir.passes.common.ClearMetadataAndDocStringPass()(program.model)
+    return program.model_proto
 
 
 def expect_equal(path: Path, exported: Tensor, expected: Tensor) -> None:
@@ -305,25 +307,6 @@ class _OnePair(nn.Module):
 
 def _metadata(network: nn.Module, temperature: float, notes: Mapping[str, str] | None) -> dict[str, str]:
     return learned.LearnedFile(learned.stated_network(network), float(temperature), dict(notes or {})).metadata()
-
-
-def forget_origin(model: Any) -> None:
-    """Clear the notes and properties of a model's graph, of its nodes and values, and of the graphs within them."""
-    _forget(model.graph)
-    for function in model.functions:
-        for node in function.node:
-            _forget(node)
-
-
-def _forget(part: Any) -> None:
-    """Clear those of a message of ONNX and of all messages within it."""
-    for note in ("metadata_props", "doc_string"):
-        if note in part.DESCRIPTOR.fields_by_name:
-            part.ClearField(note)
-    for field, value in part.ListFields():
-        if field.message_type is not None:
-            for inner in [value] if hasattr(value, "ListFields") else value:  # or repeated
-                _forget(inner)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
