@@ -110,6 +110,7 @@ def _scene(
     views = []
     for image in model.images:
         camera = model.cameras[image.camera]
+        assert camera.lens is not None  # of a model
         lens = camera.lens if camera.lens.bends else None
         source = ImageSource(f"{family}/{folder.name}/{image.name}", folder / images / image.name, camera.size, lens)
         views.append(View(source, camera.lens.K, image.R, image.t, image.place))

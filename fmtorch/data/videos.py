@@ -125,8 +125,8 @@ def tum_pairs(
         return ScenePairs("tum", read, files, (window,), pairs, seed)
     files += [(folder.name, folder / "depth.txt") for folder in folders]
     paths = [_depth_paths(folder, scene) for folder, scene in zip(folders, read, strict=True)]
-    depth = scenes.DepthImages(paths, DEPTH_SCALE, scenes.read_grey).at
-    return ScenePairs("tum", read, files, (window,), pairs, seed, depth)
+    depth_images = scenes.DepthImages(paths, DEPTH_SCALE, scenes.read_grey)
+    return ScenePairs("tum", read, files, (window,), pairs, seed, depth_images.at)
 
 
 def read_listed(path: Path) -> tuple[Matrix, list[str], list[int]]:

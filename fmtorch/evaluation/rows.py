@@ -7,7 +7,7 @@ import functools
 import math
 import time
 from collections.abc import Sequence
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -75,7 +75,7 @@ def _of_fundamental_matrices(outcomes: Sequence[Outcome], seed: int, signed: boo
         for i, before, after in zip(matched, rates.before.tolist(), rates.after.tolist(), strict=True):
             figures[i] |= {"inlier_rate_before": before, "inlier_rate": after if outcomes[i].solved else math.nan}
     poses = pose_errors(outcomes, signed)
-    return [each | p._asdict() | _by_labels(o) for each, p, o in zip(figures, poses, outcomes, strict=True)]
+    return [each | p | _by_labels(o) for each, p, o in zip(figures, poses, outcomes, strict=True)]
 
 
 def _by_labels(outcome: Outcome) -> Figures:
@@ -144,31 +144,25 @@ def _lenses(estimate: Estimate) -> list[float | None]:
     return [None if math.isnan(value) else value for value in values]
 
 
-class PairPose(NamedTuple):
-    """Angles in degrees; None where the true pose is unknown. pose_reason: why there is no error, or no pose."""
-
-    rotation_error: float | None
-    translation_error: float | None
-    pose_reason: str | None
-
-
-def pose_errors(outcomes: Sequence[Outcome], signed: bool = False) -> list[PairPose]:
+def pose_errors(outcomes: Sequence[Outcome], signed: bool = False) -> list[Figures]:
     """The pose error of each pair: of the estimate's R and t, or else of its F, K0, K1 and the estimator's inliers.
     See `pose_error` and `fundamental_pose_error`. A pair without F, or without a pose, has the largest errors and a
     reason; one whose calibration or motion is unknown has a reason only. signed: the sign of the translation counts,
     and of the four poses of F the best one: `closest_pose_error`."""
-    largest = PairPose(LARGEST_ROTATION, LARGEST_ROTATION if signed else LARGEST_TRANSLATION, "no F")
-    missing = ((_unknown(outcome.pair), outcome.solved) for outcome in outcomes)
-    poses = [largest if what is None and not solved else PairPose(None, None, what) for what, solved in missing]
-    known = [i for i, pose in enumerate(poses) if pose.pose_reason is None]
+    poses = [Figures(pose_reason=_unknown(outcome.pair)) for outcome in outcomes]
+    known = [i for i, pose in enumerate(poses) if pose["pose_reason"] is None]
+    solved = [i for i in known if outcomes[i].solved]
     own_pose = functools.partial(_of_pose, up_to_sign=not signed), "the pose is not determined"
     of_F = (_closest, "F has no pose") if signed else (_of_fundamental, "no inlier in front of both cameras")
     for estimated, (error_of, reason) in ((True, own_pose), (False, of_F)):
-        own = [i for i in known if (cast(Estimate, outcomes[i].estimate).R is not None) == estimated]
+        own = [i for i in solved if (cast(Estimate, outcomes[i].estimate).R is not None) == estimated]
         error = error_of([outcomes[i] for i in own]) if own else metrics.PoseError(torch.zeros(0), torch.zeros(0))
         for i, rotation, translation in zip(own, error.rotation.tolist(), error.translation.tolist(), strict=True):
-            poses[i] = PairPose(rotation, translation, reason if rotation >= LARGEST_ROTATION else None)
-    return poses
+            poses[i] |= {"rotation_error": rotation, "translation_error": translation}
+            poses[i]["pose_reason"] = reason if rotation >= LARGEST_ROTATION else None
+    largest = LARGEST_ROTATION if signed else LARGEST_TRANSLATION
+    lost = {"rotation_error": LARGEST_ROTATION, "translation_error": largest, "pose_reason": "no F"}
+    return [lost if i in known and not outcomes[i].solved else pose for i, pose in enumerate(poses)]
 
 
 def _unknown(pair: ImagePair) -> str | None:

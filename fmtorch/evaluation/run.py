@@ -188,8 +188,8 @@ def with_contents(pairs: Sequence[ImagePair]) -> list[ImagePair]:
     def sent(pair: ImagePair) -> ImagePair:
         if pair.matches is not None:
             return dataclasses.replace(pair, matches=functools.partial(GivenMatches._make, pair.matches()))
-        ends = (dataclasses.replace(image, data=held(image.path)) for image in (pair.image0, pair.image1))
-        return dataclasses.replace(pair, **dict(zip(("image0", "image1"), ends, strict=True)))
+        image0, image1 = (dataclasses.replace(i, data=held(i.path)) for i in (pair.image0, pair.image1))
+        return dataclasses.replace(pair, image0=image0, image1=image1)
 
     result = list(pairs)
     for i, pair in enumerate(pairs):

@@ -31,6 +31,7 @@ from fmtorch.training.labelled import LabelledMatches
 from fmtorch.training.objective import classification_loss
 
 MAX_TEMPERATURE = 100.0  # and its inverse: bounds where the labels set none, as when they are perfectly separated
+BINS = 10  # of a table of reliability
 BISECTIONS = 50  # halvings of the interval of log temperature: 9.2 / 2^50
 
 
@@ -180,33 +181,25 @@ def temperature(logit: Float[Tensor, "*matches"], label: Int8[Tensor, "*matches"
     return math.exp((low + high) / 2)
 
 
-def reliability(
-    probability: Float[Tensor, "*matches"], label: Int8[Tensor, "*matches"], *, bins: int = 10
-) -> Reliability:
+def reliability(probability: Float[Tensor, "*matches"], label: Int8[Tensor, "*matches"]) -> Reliability:
     """Predicted probabilities against observed shares of inliers.
 
     Args:
         probability: that a match is an inlier, of any shape.
         label: 1 inlier, 0 outlier, -1 ignored.
-        bins: of equal width from 0 to 1; a probability of 1 falls in the last.
 
     Returns:
-        The table and the expected calibration error, float64.
-
-    Raises:
-        ValueError: bins is less than 1.
+        The table and the expected calibration error, float64; a probability of 1 falls in the last of `BINS`.
     """
-    if bins < 1:
-        raise ValueError(f"bins is {bins}; it must be at least 1")
     labelled = label >= 0
     p = probability.detach()[labelled].to(torch.float64)
     target = (label[labelled] > 0).to(torch.float64)
-    index = (p * bins).long().clamp(0, bins - 1)
-    count = torch.bincount(index, minlength=bins)
-    sums = [torch.bincount(index, weights=x, minlength=bins) for x in (p, target)]
+    index = (p * BINS).long().clamp(0, BINS - 1)
+    count = torch.bincount(index, minlength=BINS)
+    sums = [torch.bincount(index, weights=x, minlength=BINS) for x in (p, target)]
     predicted, observed = (s / count for s in sums)
     error = float((sums[0] - sums[1]).abs().sum() / count.sum())
-    edges = torch.linspace(0, 1, bins + 1, dtype=torch.float64, device=p.device)
+    edges = torch.linspace(0, 1, BINS + 1, dtype=torch.float64, device=p.device)
     return Reliability(edges, count, predicted, observed, error)
 
 
@@ -260,8 +253,6 @@ def export_onnx(network: nn.Module, path: Path, *, temperature: float = 1.0) -> 
 
 def onnx_model(network: nn.Module, example: Tensor, name: str, output: str, *, free_axis: int) -> Any:
     """A module of one input as an ONNX model, one axis of the input of any length, without notes of source lines."""
-    import onnx_ir.passes.common
-
     with quiet(("torch.onnx",), logging.ERROR), warnings.catch_warnings():  # of operators that are not installed
         warnings.simplefilter("ignore", FutureWarning)  # of the exporter's own deprecated calls
         program = torch.onnx.export(
@@ -269,8 +260,15 @@ def onnx_model(network: nn.Module, example: Tensor, name: str, output: str, *, f
             dynamic_shapes=({free_axis: torch.export.Dim("n", min=1)},), verbose=False,
         )  # fmt: skip
     assert program is not None
-    onnx_ir.passes.common.ClearMetadataAndDocStringPass()(program.model)
-    return program.model_proto
+    return without_origin(program.model_proto)
+
+
+def without_origin(model: Any) -> Any:
+    """An ONNX model without the notes and properties of its graph, of nodes and values, and of the graphs within."""
+    import onnx_ir.passes.common
+
+    cleared = onnx_ir.passes.common.ClearMetadataAndDocStringPass()(onnx_ir.from_proto(model))
+    return onnx_ir.to_proto(cleared.model)
 
 
 def expect_equal(path: Path, exported: Tensor, expected: Tensor) -> None:

@@ -118,6 +118,12 @@ class PlanePairs(HeldPairs):
         """Depth (n,), in longest sides of the photograph, at points (n, 2) of a view; NaN outside of it."""
         return plane_depth(self._cameras[image.identity], points)
 
+    def homography(self, pair: ImagePair) -> Matrix:
+        """From pixels of a pair's first view to those of its second; positive where the plane is seen."""
+        there, back = (plane_homography(self._cameras[image.identity], (1, 1)) for image in (pair.image1, pair.image0))
+        H: Matrix = there @ np.linalg.inv(back)
+        return H / np.linalg.norm(H)
+
     def _photograph(self, file: Path, folder: Path, digest: str) -> list[Camera]:
         """The cameras of a photograph's views, which are drawn unless they are there."""
         picture = read_image(file, orient=True)
