@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from fmtorch.core.version import __version__
@@ -57,9 +57,27 @@ def main(words: Sequence[str] | None = None) -> None:
         sys.argv[1:] = rest
         if sys.path[0] != os.getcwd():  # where a user's own parts are found, as by `python -m`
             sys.path.insert(0, os.getcwd())
-        from fmtorch import commands
+        _command(name)()
 
-        getattr(commands, name.replace("-", "_")).main()  # of the module of that name
+
+def _command(name: str) -> Callable[[], None]:
+    if name == "eval":
+        from fmtorch.commands.eval import main
+    elif name == "list":
+        from fmtorch.commands.list import main
+    elif name == "match":
+        from fmtorch.commands.match import main
+    elif name == "pairs":
+        from fmtorch.commands.pairs import main
+    elif name == "report":
+        from fmtorch.commands.report import main
+    elif name == "train":
+        from fmtorch.commands.train import main
+    elif name == "verify":
+        from fmtorch.commands.verify import main
+    else:
+        from fmtorch.commands.warm_up import main
+    return main
 
 
 def help_text(command: Command) -> str:
