@@ -235,9 +235,8 @@ class Stage:
         self.table[..., 7] = geometry.normals[..., 2]
         self.shadow: Floats = np.full((SHADOW_MAP, SHADOW_MAP), np.inf, dtype=np.float32)
         lit = hits.piece >= 0
-        along, across = (x[lit, None] for x in (hits.s, hits.t))
-        corner, right, down = np.moveaxis(self.table[hits.piece[lit]][..., 4:5], 1, 0)
-        self.shadow[lit] = (corner + along * right + across * down)[:, 0]
+        corner, right, down = self.table[..., 4][hits.piece[lit]].T
+        self.shadow[lit] = corner + hits.s[lit] * right + hits.t[lit] * down
 
     def radiance(self, camera: Camera, offset: tuple[Real, Real]) -> Floats:
         hits = self.geometry.look(camera, offset)
