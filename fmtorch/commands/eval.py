@@ -19,7 +19,7 @@ from fmtorch.core.files import write_whole
 from fmtorch.core.terminal import console, errors, progress_bars, reporter
 from fmtorch.data import ImagePair, PairDataset
 from fmtorch.evaluation import curves, tables
-from fmtorch.evaluation.run import PairCameras, built_with, cameras_of, evaluate_pairs, run_identity, select
+from fmtorch.evaluation.run import evaluate_pairs, informed, run_identity, select
 from fmtorch.evaluation.statistics import ALL, Group, summarize
 from fmtorch.io import MatchStore, export_kinds, write_exports
 from fmtorch.jobs.execution import MIN_PAIRS_FOR_PROCESSES, Execution, shard_of
@@ -27,7 +27,7 @@ from fmtorch.pipeline.exporting import exportable
 from fmtorch.pipeline.pipeline import Pipeline, build_pipeline
 from fmtorch.presets.composition import execution_of, plain, read_fields
 from fmtorch.runs import CachedFeatures, RunFolder, identity_digest
-from fmtorch.two_view.arguments import expect_lens
+from fmtorch.two_view.arguments import expect_lens, expect_lenses
 
 SWEPT = "FMTORCH_SWEPT"  # names the file in which the jobs of a sweep note their run folders
 
@@ -50,6 +50,8 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
     expect_lens(fields.lens)
     with progress_bars() as progress:
         pipeline: Pipeline = build_pipeline(config, device, model)
+        if fields.lens is not None:
+            expect_lenses(pipeline.estimator, type(pipeline.estimator).__name__)
         dataset = data.build(dataset_config, reporter(progress, "drawing scenes"))
         known = fields.cameras, fields.pose.signed, fields.lens
         identity = run_identity(config, pipeline_name, pipeline, dataset.digest, *known)
@@ -121,14 +123,9 @@ def _evaluated(
     if execution.shared and execution.workers is None and pipeline.device.type != "cpu":
         execution = dataclasses.replace(execution, workers=1)
     build = None if execution.shared else functools.partial(build_pipeline, config, pipeline.device, None)
-    cameras = None if fields.cameras is None else cameras_of(pairs, fields.cameras)
-    if cameras is not None or fields.lens is not None:
-        later: dict[int, PairCameras] | None = None if cameras is None else {}
-        build = None if build is None else functools.partial(built_with, build, later, fields.lens)
-        pipeline = built_with(lambda: pipeline, cameras, fields.lens)
     return evaluate_pairs(
-        pipeline, pairs, seed=fields.seed, batch=fields.batch, execution=execution, store=folder.append, build=build,
-        cameras=cameras, journal=journal, signed=fields.pose.signed,
+        pipeline, informed(pairs, fields.cameras, fields.lens), seed=fields.seed, batch=fields.batch,
+        execution=execution, store=folder.append, build=build, journal=journal, signed=fields.pose.signed,
     )  # fmt: skip
 
 

@@ -8,7 +8,7 @@ import math
 import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -71,8 +71,7 @@ def match_folder(
     build = None if execution.shared else functools.partial(build_pipeline, config, pipeline.device)
     with folders.folder_workers(pipeline, execution) as workers, progress_bars() as progress:
         work = FolderMatches(
-            pipeline, journal, fields.longest_side, fields.orient, fields.seed,
-            workers=workers, build=build, cameras=cameras,
+            pipeline, journal, workers, fields.longest_side, fields.orient, fields.seed, build=build, cameras=cameras,
         )  # fmt: skip
         if similar and vector is not None:
             seen = progress.track(work.images(images), len(images), description="images")
@@ -132,29 +131,6 @@ def _draw_graph(graph: export.ViewGraph, folder: Path, orient: bool, output: Pat
     return "graph.svg"
 
 
-class Photographs(NamedTuple):
-    """Two photographs, and what is known of their cameras as `fmtorch.match` takes it; notes: what is said of these."""
-
-    images: tuple[NDArray[np.uint8], NDArray[np.uint8]]
-    knowledge: dict[str, Any]
-    notes: tuple[str, ...] = ()
-
-
-def photographs(
-    paths: Sequence[Path], cameras: Path | None, K: str | list[float | int] | None, orient: bool
-) -> Photographs:
-    """Read two photographs with what is known of their cameras, turned as their EXIF orientation says if asked to.
-    cameras: one of `WORDS`, a file of cameras (`ImageCameras`), or None. K: fx, fy, cx, cy of both in pixels, or None.
-    Raises ValueError where both are given, or for what no camera is, and ImageError for a file that is no image, or is
-    not of its camera's size."""
-    known = PhotographCameras(cameras, K)
-    image0, image1 = (read_image(known.source(path), orient=orient) for path in paths)
-    ends = zip(paths, (image0, image1), strict=True)
-    camera0, camera1 = (known.of(path, (image.shape[0], image.shape[1])) for path, image in ends)
-    notes = tuple(filter(None, (camera0.note, camera1.note)))
-    return Photographs((image0, image1), known.knowledge(camera0, camera1), notes)
-
-
 def pose_line(result: MatchResult) -> str:
     """``rotation 12.3°, translation (0.98, -0.10, 0.17), focal lengths 702, 702 px``; empty where nobody asked."""
     if result.R is None or result.t is None or result.focals is None or not result.ok:
@@ -194,19 +170,22 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
     paths = _given(fields.image0, fields.image1)
     presets.expect_stages(config)
     truth = None if fields.truth is None else read_matrix(fields.truth)
-    given = photographs(paths, fields.cameras, fields.K, fields.orient)
-    if fields.lens is not None and "lens" in given.knowledge:
+    cameras = PhotographCameras(fields.cameras, fields.K)
+    images = [read_image(cameras.source(path), orient=fields.orient) for path in paths]
+    ends = [cameras.of(path, image.shape[:2]) for path, image in zip(paths, images, strict=True)]
+    knowledge = cameras.knowledge(*ends)
+    if fields.lens is not None and "lens" in knowledge:
         raise ValueError(f"lens={fields.lens} and cameras with a calibrated lens are given: leave one of them out")
     settings = {
         "pipeline": pipeline_name, "overrides": list(overrides), "seed": fields.seed, "orient": fields.orient,
         "longest_side": fields.longest_side, "truth": None if fields.truth is None else str(fields.truth),
-        "cameras": PhotographCameras(fields.cameras, fields.K).identity.get("cameras"), "lens": fields.lens,
+        "cameras": cameras.identity.get("cameras"), "lens": fields.lens,
     }  # fmt: skip
     folder = fields.output or _default_output(paths, settings)
     files.expect_writable(folder)
     pipeline: Pipeline = build_pipeline(config, presets.resolve_device(fields.device))
-    options = {"longest_side": fields.longest_side, "seed": fields.seed, "lens": fields.lens, **given.knowledge}
-    result = match(*given.images, pipeline=pipeline, **options)
+    options = {"longest_side": fields.longest_side, "seed": fields.seed, "lens": fields.lens, **knowledge}
+    result = match(*images, pipeline=pipeline, **options)
     error = None if truth is None or not result.ok else _nsgd(result, truth)
     report = {"version": __version__, **settings, "image0": str(paths[0]), "image1": str(paths[1])}
     written = result.save(folder, truth=truth, report=report | ({} if error is None else {"nsgd": error}))
@@ -219,7 +198,7 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
         console.print(f"NSGD to the true F: {error:.4f}")
     for line in filter(None, (pose_line(result), lens_line(result))):
         console.print(line)
-    for trouble in (*given.notes, *_troubles(result)):
+    for trouble in (*filter(None, (end.note for end in ends)), *_troubles(result)):
         errors.print(trouble, style="bold", soft_wrap=True)
     console.print(f"{folder}: {', '.join(written)}", style="dim")
     if isinstance(pipeline.extractor, CachedFeatures):

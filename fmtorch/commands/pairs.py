@@ -1,12 +1,13 @@
 """`fmtorch pairs dataset=kitti dataset.root=DIR output=KITTI`: a set of the pairs that can be matched."""
 
+import copy
 import dataclasses
 import functools
 import itertools
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from omegaconf import DictConfig
 from rich.progress import Progress
@@ -27,6 +28,7 @@ from fmtorch.training.oanet_pairs import write_oanet
 
 MIN_CANDIDATES_FOR_PROCESSES = 4 * BLOCK + 1  # below which processes are not worth their start
 PRELOADED = (Construction.__module__,)  # by the process that workers are forked of
+T = TypeVar("T")
 
 
 def run(config: DictConfig) -> Path:
@@ -55,7 +57,7 @@ def run(config: DictConfig) -> Path:
         images = construction.used(kept)
         if of_matches is None:
             bar = progress.add_task("writing images", total=len(images))
-            for _ in _each(construction, execution, "write_image", images):
+            for _ in _each(construction, execution, Construction.write_image, images):
                 progress.advance(bar)
         elif kept:
             _write_matches(config, construction, kept, asked, progress)
@@ -88,7 +90,7 @@ def _select(construction: Construction, execution: Execution, progress: Progress
     bar = progress.add_task("judging candidates" if construction.count is None else "finding pairs", total=total)
     kept, judged, problems = list[int](), 0, dict[str, None]()
     here, there = itertools.tee(blocks(order))
-    for (_, ranks), verdicts in zip(here, _each(construction, execution, "judge", there), strict=False):
+    for (_, ranks), verdicts in zip(here, _each(construction, execution, Construction.judge, there), strict=False):
         kept += [rank for rank, good in zip(ranks, verdicts.kept, strict=True) if good]
         judged += len(ranks)
         problems.update(dict.fromkeys(verdicts.problems))
@@ -99,28 +101,17 @@ def _select(construction: Construction, execution: Execution, progress: Progress
 
 
 def _each(
-    construction: Construction, execution: Execution, method: str, arguments: Iterable[tuple[object, ...]]
+    construction: Construction, execution: Execution, method: Callable[[Construction, T], Any], tasks: Iterable[T]
 ) -> Iterator[Any]:
     """The results of a method of the construction, in order, some of them computed ahead by workers."""
     if execution.shared and execution.workers == 1:  # here, and none ahead
-        for given in arguments:
-            yield getattr(construction, method)(*given)
+        yield from (method(construction, task) for task in tasks)
         return
-    here, elsewhere = Local(construction), Factory(functools.partial(_same, construction))
+    here, elsewhere = Local(construction), Factory(functools.partial(copy.copy, construction))
     source: Source[Construction] = here if execution.shared else elsewhere
-    tasks = ((method, given) for given in arguments)
     with WorkerPool(execution, PRELOADED) as pool:
-        for _, result in in_order(pool, source, _call, tasks):
+        for _, result in in_order(pool, source, method, tasks):
             yield result
-
-
-def _same(construction: Construction) -> Construction:
-    return construction
-
-
-def _call(construction: Construction, task: tuple[str, tuple[object, ...]]) -> Any:
-    method, given = task
-    return getattr(construction, method)(*given)
 
 
 def _print_summary(construction: Construction, summary: dict[str, int], problems: list[str], seconds: float) -> None:

@@ -25,12 +25,12 @@ WIDENED = (torch.float16, torch.bfloat16)  # in which no matrix can be decompose
 MODELS, SETS = "models", "batch"  # leading dimensions of F and of the matches it is fitted to: one F a set, or several
 
 
-def checked(function: Callable[P, R], *, common_type: bool = False) -> Callable[P, R]:
+def checked(function: Callable[P, R]) -> Callable[P, R]:
     """The function, which takes NumPy arrays and lists for tensors and names what does not fit its annotations.
     Whole numbers become float64 where the annotation asks for floating-point ones, and half precision is widened to
     float32. Arrays go to the device of the first tensor. Where everything fits, the function gets what it was given.
-    common_type: bring floating-point tensors of several types to the widest one. Raises (beside what the function
-    itself raises) TypeError for what is no array or number, ValueError for a shape, a type of numbers or a device that
+    Floating-point tensors of several types are brought to the widest one. Raises (beside what the function itself
+    raises) TypeError for what is no array or number, ValueError for a shape, a type of numbers or a device that
     does not fit; the message begins with the argument's name."""
     signature = inspect.signature(function)
     expected = functools.cache(functools.partial(arguments_of, function))
@@ -48,8 +48,7 @@ def checked(function: Callable[P, R], *, common_type: bool = False) -> Callable[
             if want.kind == "array":
                 tensors[name] = value
         _expect_shapes(tensors, expected())
-        if common_type:
-            values.update(_common_type(tensors, expected()))
+        values.update(_common_type(tensors, expected()))
         return function(*call.args, **call.kwargs)
 
     return door

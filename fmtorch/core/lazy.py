@@ -37,7 +37,7 @@ class _LazyPackage(ModuleType):
             if self._checked and inspect.isfunction(value):
                 from fmtorch.core.checks import checked
 
-                value = checked(value, common_type=True)
+                value = checked(value)
                 value.__module__ = self.__name__  # where pickle finds it
         elif not name.startswith("_") and importlib.util.find_spec(f"{self.__name__}.{name}") is not None:
             value = importlib.import_module(f"{self.__name__}.{name}")

@@ -69,14 +69,6 @@ class TwoStepExtractor(FeatureExtractor, Protocol):
 
 
 @runtime_checkable
-class TimedExtractor(FeatureExtractor, Protocol):
-    """An extractor that knows what its result costs, such as one that may have it already."""
-
-    def timed(self, image: NDArray[np.uint8]) -> tuple[Features, float]:
-        """The features, and the seconds that computing them takes or took."""
-
-
-@runtime_checkable
 class Matcher(Protocol):
     """The features of two images -> putative correspondences of that one pair."""
 

@@ -11,7 +11,8 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from fmtorch.core import claim, replacing
+from fmtorch.core import claim
+from fmtorch.core.files import replacing, write_whole
 from fmtorch.data.cameras import line_distance
 from fmtorch.data.files import Indices, Matrix, Pixels, Singles
 from fmtorch.data.fmbench import CAMERAS, IMAGES, SUFFIXES
@@ -232,8 +233,9 @@ class Construction:
             return range(total)
         return rng.permutation(total) if total <= MAX_DRAWN else rng.choice(total, MAX_DRAWN, replace=False)
 
-    def judge(self, block: int, ranks: Sequence[int]) -> Verdicts:
-        """Judge the candidates of a block and keep the verdicts; what was judged before is read."""
+    def judge(self, numbered: tuple[int, Sequence[int]]) -> Verdicts:
+        """Judge the candidates of a block, after its number, and keep the verdicts; what was judged before is read."""
+        block, ranks = numbered
         file = self.work / "verdicts" / f"{block:08d}.json"
         if file.is_file():
             return Verdicts(**json.loads(file.read_text(encoding="utf-8")))
@@ -246,8 +248,7 @@ class Construction:
                 problems.append(str(error))
         verdicts = Verdicts(kept, sorted(set(problems)))
         file.parent.mkdir(exist_ok=True)
-        with replacing(file) as path:
-            path.write_text(json.dumps(dataclasses.asdict(verdicts)), encoding="utf-8")
+        write_whole(file, json.dumps(dataclasses.asdict(verdicts)))
         return verdicts
 
     def _passes(self, place: tuple[int, int, int]) -> bool:
@@ -265,8 +266,9 @@ class Construction:
             read_image(image)
         return True
 
-    def write_image(self, scene: int, number: int) -> None:
-        """Write one image of a scene unless it is there: the file itself, or as JPEG what was undistorted."""
+    def write_image(self, image: tuple[int, int]) -> None:
+        """Write one image (scene, number) unless it is there: the file itself, or as JPEG what was undistorted."""
+        scene, number = image
         drawn = self.dataset.scenes[scene]
         source = drawn.views[number].image
         suffix = source.path.suffix if _as_it_is(source) else SUFFIXES[0]
@@ -278,8 +280,8 @@ class Construction:
             if _as_it_is(source):
                 shutil.copyfile(source.path, path)
                 return
-            image = read_image(source)
-            colour = image if image.ndim == 2 else image[..., ::-1]
+            pixels = read_image(source)
+            colour = pixels if pixels.ndim == 2 else pixels[..., ::-1]
             path.write_bytes(cv2.imencode(".jpg", colour, [cv2.IMWRITE_JPEG_QUALITY, self.quality])[1].tobytes())
 
     def finish(self, ranks: Sequence[int], summary: Mapping[str, Any]) -> None:
@@ -293,8 +295,7 @@ class Construction:
             files["pairs_which_dataset.txt"] = "".join(f"{scene.name}/\n" for scene, _, _ in pairs)
             files["pairs_with_gt.txt"] = "".join(f"{i} {j} {_numbers(image_pair(s, i, j).F)}\n" for s, i, j in pairs)
         for name, text in files.items():
-            with replacing(self.folder / name) as path:
-                path.write_text(text, encoding="utf-8")
+            write_whole(self.folder / name, text)
         shutil.rmtree(self.work, ignore_errors=True)
 
     def used(self, ranks: Sequence[int]) -> list[tuple[int, int]]:
@@ -308,8 +309,7 @@ class Construction:
         lines = [f"{_numbers(view.K)} {_numbers(view.R)} {_numbers(view.t)}\n" for view in scene.views]
         names = [f"{i:08d} {view.image.identity}\n" for i, view in enumerate(scene.views)]
         for name, text in ((CAMERAS, lines), ("names.txt", names)):
-            with replacing(self.folder / scene.name / name) as path:
-                path.write_text("".join(text), encoding="utf-8")
+            write_whole(self.folder / scene.name / name, "".join(text))
 
     def _keypoints(self, image: ImageSource) -> Keypoints:
         """SIFT of an image, from the work folder where it is there; descriptors are whole numbers up to 255."""

@@ -26,12 +26,12 @@ _POINTS = "a line of X Y POINT3D_ID for each point, which may be empty"
 _Camera = tuple[str, int, str, int, int, Matrix]  # place, number, model, width, height, parameters
 
 
-@dataclasses.dataclass(frozen=True)
-class ModelCamera:
-    """A camera: its lens, with the origin at the centre of the first pixel, and the size (h, w) of its images."""
+class ImageCamera(NamedTuple):
+    """The lens of an image, None where it is unknown, with the origin at the centre of the first pixel.
+    size: (h, w) of the image that it is of, where given."""
 
-    lens: Lens
-    size: tuple[int, int]
+    lens: Lens | None
+    size: tuple[int, int] | None = None
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -51,7 +51,7 @@ class ModelImage:
 class Model:
     """A reconstruction: cameras by their numbers, images in the order of their names, and its two files."""
 
-    cameras: dict[int, ModelCamera]
+    cameras: dict[int, ImageCamera]
     images: list[ModelImage]
     files: tuple[Path, ...]
 
@@ -75,9 +75,9 @@ def read_model(folder: Path, points: bool = True) -> Model:
     return Model(cameras, sorted(images.values(), key=lambda image: image.name), files)
 
 
-def read_cameras(path: Path) -> dict[int, ModelCamera]:
+def read_cameras(path: Path) -> dict[int, ImageCamera]:
     """The cameras of a file cameras.txt or cameras.bin by their numbers. Raises DataError as `read_model`."""
-    cameras: dict[int, ModelCamera] = {}
+    cameras: dict[int, ImageCamera] = {}
     records = (_binary_cameras if path.suffix == ".bin" else _text_cameras)(path)
     for place, number, model, width, height, parameters in records:
         if number in cameras:
@@ -86,7 +86,7 @@ def read_cameras(path: Path) -> dict[int, ModelCamera]:
     return cameras
 
 
-def _camera(place: str, model: str, width: int, height: int, parameters: Matrix) -> ModelCamera:
+def _camera(place: str, model: str, width: int, height: int, parameters: Matrix) -> ImageCamera:
     """The camera of one record. Raises DataError for a model, size or numbers that no camera has."""
     kind = MODELS[model]
     names = kind.parameters
@@ -98,7 +98,7 @@ def _camera(place: str, model: str, width: int, height: int, parameters: Matrix)
         raise DataError(f"{place}: {model} {parameters.tolist()}; focal lengths must be positive, all numbers finite")
     shifted = parameters.copy()
     shifted[kind.focals : kind.focals + 2] -= HALF_PIXEL
-    return ModelCamera(kind.lens(model, shifted), (height, width))
+    return ImageCamera(kind.lens(model, shifted), (height, width))
 
 
 def _image(place: str, pose: Matrix, camera: int, name: str, points: Indices) -> ModelImage:
@@ -336,13 +336,6 @@ FORM = '{"a.jpg": [fx, fy, cx, cy], "b.jpg": null}, in pixels with (0, 0) at the
 SHOWN = 5  # names that an error shows
 
 
-class ImageCamera(NamedTuple):
-    """The lens of an image, None where it is unknown, and the size (h, w) of the image that it is of, where given."""
-
-    lens: Lens | None
-    size: tuple[int, int] | None = None
-
-
 class ImageCameras:
     """The cameras of a file, looked up by the paths of images.
 
@@ -364,11 +357,10 @@ class ImageCameras:
             cameras = list(read_cameras(path).values())
             if len(cameras) != 1:
                 raise DataError(f"{path}: {len(cameras)} cameras and no images.txt beside it that says whose they are")
-            self._all = ImageCamera(cameras[0].lens, cameras[0].size)
+            self._all = cameras[0]
         else:
             model = read_model(path if path.is_dir() else path.parent, points=False)
-            by_number = {number: ImageCamera(camera.lens, camera.size) for number, camera in model.cameras.items()}
-            self._named = {image.name: by_number[image.camera] for image in model.images}
+            self._named = {image.name: model.cameras[image.camera] for image in model.images}
 
     def of(self, image: Path) -> ImageCamera:
         """The camera of an image, by the longest name that its path ends in. Raises DataError where there is none."""

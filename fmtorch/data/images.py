@@ -3,24 +3,22 @@
 import contextlib
 import io
 import re
-import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Literal
 
 import cv2
 import kornia_rs
 import numpy as np
-from PIL import ExifTags, Image, TiffImagePlugin
+from PIL import ExifTags, Image, JpegImagePlugin, PngImagePlugin, TiffImagePlugin
 
 from fmtorch.data.cameras import undistorted
 from fmtorch.data.files import Array, Pixels
 from fmtorch.data.pairs import ImageSource
 
 _JPEG, _PNG = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
+_TIFF = (b"II*\0", b"II+\0", b"MM\0*", b"MM\0+")  # the second of each order: BigTIFF
 _JPEG_MARKER = re.compile(rb"\xff+([^\x00\xff\xd0-\xd7])", re.DOTALL)
 _END_OF_IMAGE, _START_OF_IMAGE = 0xD9, 0xD8
-_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # of any coding; the three are tables and an extension
 _HUFFMAN_FRAMES = (0xC0, 0xC1, 0xC2)  # baseline, extended sequential, progressive
 _TurboJpeg = getattr(kornia_rs, "io", kornia_rs).ImageDecoder  # where it is depends on the version
 
@@ -85,6 +83,7 @@ def stored_orientation(file: Path | io.BytesIO) -> int:
 
 _TURNS = {1: (1, 1), 2: (1, -1), 3: (-1, -1), 4: (-1, 1), 5: (1, 1), 6: (-1, 1), 7: (-1, -1), 8: (1, -1)}
 """By EXIF's Orientation (JEITA CP-3451, 4.6.4): steps along rows and columns, which are exchanged then from 5 on."""
+_INVERSE = {6: 8, 8: 6}  # the others are their own
 
 
 def _decoded(path: Path, orient: bool, data: bytes | None = None) -> Pixels:
@@ -98,46 +97,35 @@ def _decoded(path: Path, orient: bool, data: bytes | None = None) -> Pixels:
         raise ImageError(f"{path}: the file is empty; it must be a complete image")
     if data.startswith(_JPEG) and all(marker != _END_OF_IMAGE for marker, _ in _jpeg_segments(data)):
         raise ImageError(f"{path}: truncated JPEG, {len(data)} bytes without end-of-image marker; copy it again")
-    if data.startswith(_PNG) and (fault := _png_fault(data)):
-        raise ImageError(f"{path}: {fault}; copy it again")
+    if data.startswith(_PNG):
+        try:
+            PngImagePlugin.PngImageFile(io.BytesIO(data)).verify()  # the checksums of all chunks
+        except Exception as error:  # Pillow raises what its parts do for damaged files
+            raise ImageError(f"{path}: corrupt or truncated PNG ({error}); copy it again") from error
     _expect_moderate(path, data)
     image = _eight_bits(path, _heic(path, data) if _is_heic(data) else _by_opencv(path, data))
     if data.startswith(_JPEG) and not _jpeg_decodes(data):
         raise ImageError(f"{path}: corrupt JPEG, its compressed data are damaged; copy it again")
-    orientation = stored_orientation(io.BytesIO(data)) if orient and not _is_heic(data) else 1
-    rows, columns = _TURNS[orientation]
+    is_tiff = data[:4] in _TIFF  # which OpenCV turns in any case
+    if orient == is_tiff or _is_heic(data):
+        return np.ascontiguousarray(image)
+    orientation = stored_orientation(io.BytesIO(data))
+    rows, columns = _TURNS[_INVERSE.get(orientation, orientation) if is_tiff else orientation]
     turned = image[::rows, ::columns]
     return np.ascontiguousarray(turned.swapaxes(0, 1) if orientation >= 5 else turned)
 
 
 def _by_opencv(path: Path, data: bytes) -> Array:
-    """The pixels as stored, of any depth, grey or RGB."""
+    """The pixels, of any depth, grey or RGB: as stored, but those of a TIFF file upright."""
     deep = 0 if data[4:8] == b"ftyp" else cv2.IMREAD_ANYDEPTH  # 10 bits of an AVIF are a photograph's
     flags = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION | deep
     try:
-        image = cv2.imdecode(np.frombuffer(_upright_tiff(data), np.uint8), flags)
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error as error:
         raise ImageError(f"{path}: OpenCV refuses it ({error}); it must be a sound image") from error
     if image is None:
         raise ImageError(f"{path}: no image that can be decoded; it must be {FORMATS}")
     return image if image.ndim == 2 else image[..., ::-1]
-
-
-def _upright_tiff(data: bytes) -> bytes:
-    """A TIFF file without the orientation of its first image, by which OpenCV turns it in any case (TIFF 6.0, 2)."""
-    order: Literal["little", "big"] = "little" if data[:2] == b"II" else "big"
-    version = int.from_bytes(data[2:4], order) if data[:2] in (b"II", b"MM") else 0
-    if version not in (42, 43):
-        return data
-    counter, word = (2, 4) if version == 42 else (8, 8)  # 43: BigTIFF
-    at = int.from_bytes(data[word : 2 * word], order)
-    entries = min(int.from_bytes(data[at : at + counter], order), len(data) // 12)
-    size = 4 + 2 * word  # an entry: tag, type, count, value
-    for start in range(at + counter, at + counter + entries * size, size):
-        if int.from_bytes(data[start : start + 2], order) == ExifTags.Base.Orientation:
-            one = [(3).to_bytes(2, order), (1).to_bytes(word, order), (1).to_bytes(2, order)]  # a SHORT that is 1
-            return b"".join([data[: start + 2], *one, data[start + 2 + sum(map(len, one)) :]])
-    return data
 
 
 def _is_heic(data: bytes) -> bool:
@@ -175,22 +163,17 @@ def to_grey(image: Pixels) -> Pixels:
 
 
 def _expect_moderate(path: Path, data: bytes) -> None:
-    if data.startswith(_PNG):
-        sizes = [(data[16:20], data[20:24])]  # IHDR comes first
-    elif data.startswith(_JPEG):
-        frames = (at for marker, at in _jpeg_segments(data) if marker in _FRAMES)
-        sizes = [(data[at + 5 : at + 7], data[at + 3 : at + 5]) for at in frames]
-    else:  # Pillow reads the header; its own limit is 1.8e8 pixels
-        try:
-            Image.open(io.BytesIO(data)).close()
-        except Image.DecompressionBombError as error:
-            raise ImageError(f"{path}: {error}; it must have fewer pixels, reduce it") from error
-        except Exception:  # what is no image to Pillow may be one to OpenCV, which is asked next
-            pass
-        sizes = []
-    for width, height in ((int.from_bytes(w, "big"), int.from_bytes(h, "big")) for w, h in sizes):
-        if width * height > MAX_PIXELS:
-            raise ImageError(f"{path}: {width} x {height} px; it must have at most {MAX_PIXELS} pixels, reduce it")
+    opened: Callable[[io.BytesIO], Image.Image] = Image.open  # with a limit of its own, 1.8e8 pixels
+    if data.startswith((_JPEG, _PNG)):
+        opened = JpegImagePlugin.JpegImageFile if data.startswith(_JPEG) else PngImagePlugin.PngImageFile
+    try:
+        width, height = opened(io.BytesIO(data)).size
+    except Image.DecompressionBombError as error:
+        raise ImageError(f"{path}: {error}; it must have fewer pixels, reduce it") from error
+    except Exception:  # what is no image to Pillow may be one to OpenCV, which is asked next
+        return
+    if width * height > MAX_PIXELS:
+        raise ImageError(f"{path}: {width} x {height} px; it must have at most {MAX_PIXELS} pixels, reduce it")
 
 
 def _jpeg_segments(data: bytes) -> Iterator[tuple[int, int]]:
@@ -223,19 +206,3 @@ def _jpeg_decodes(data: bytes) -> bool:
     except Exception:
         return False
     return True
-
-
-def _png_fault(data: bytes) -> str:
-    """What is wrong with a PNG's chunks, empty when they are sound up to IEND (PNG specification, section 5)."""
-    position = len(_PNG)
-    while position + 12 <= len(data):
-        length = int.from_bytes(data[position : position + 4], "big")
-        kind, end = data[position + 4 : position + 8], position + 12 + length
-        if end > len(data):
-            break
-        if zlib.crc32(data[position + 4 : end - 4]) != int.from_bytes(data[end - 4 : end], "big"):
-            return f"corrupt PNG, wrong checksum of chunk {kind.decode('latin-1')} at byte {position}"
-        if kind == b"IEND":
-            return ""
-        position = end
-    return f"truncated PNG, {len(data)} bytes without IEND chunk"

@@ -2,12 +2,13 @@
 
 import dataclasses
 import hashlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import cv2
 import numpy as np
+import torch
 
 from fmtorch.core.lenses import Lens
 from fmtorch.core.types import Correspondences, pair_key
@@ -99,6 +100,7 @@ class ImagePair:
     problem: why this pair cannot be used (a bad line of a pairs file, say); None for a sound pair.
     matches: reads the matches that come with the pair, in place of features and matcher; can be sent between processes.
     H: (3, 3) float64 with ``x1 ~ H x0`` in pixels, of a data set of homographies, whose F is zero; None for any other.
+    given: what estimators are given of cameras and lenses, fields of `Correspondences` for one pair; None: nothing.
     """
 
     identity: str
@@ -114,6 +116,7 @@ class ImagePair:
     problem: str | None = None
     matches: Callable[[], GivenMatches] | None = None
     H: Matrix | None = None
+    given: Mapping[str, torch.Tensor | None] | None = None
 
     @property
     def key(self) -> int:
@@ -158,11 +161,14 @@ class DepthDataset(PairDataset, Protocol):
 
 
 class PairSubset(PairDataset):
-    """The pairs of these indices, in this order. `subset` keeps what the data set knows of depth."""
+    """The pairs of these indices, in this order, with what the data set knows of depth.
+    Of all of them the digest still differs from that of the data set, as it names the pairs."""
 
     def __init__(self, dataset: PairDataset, indices: Sequence[int]) -> None:
         self.dataset, self.indices = dataset, list(indices)
         self.name = dataset.name
+        if isinstance(dataset, DepthDataset):
+            self.depth = dataset.depth
         self.digest = hashlib.sha256(f"{dataset.digest} {self.indices}".encode()).hexdigest()
 
     def __len__(self) -> int:
@@ -170,15 +176,3 @@ class PairSubset(PairDataset):
 
     def __getitem__(self, index: int) -> ImagePair:
         return self.dataset[self.indices[index]]
-
-
-class _DepthSubset(PairSubset):
-    dataset: DepthDataset
-
-    def depth(self, image: ImageSource, points: Matrix) -> Matrix:
-        return self.dataset.depth(image, points)
-
-
-def subset(dataset: PairDataset, indices: Sequence[int]) -> PairSubset:
-    """Some pairs of a data set; all of them: the data set's digest still changes, as it names the pairs."""
-    return _DepthSubset(dataset, indices) if isinstance(dataset, DepthDataset) else PairSubset(dataset, indices)

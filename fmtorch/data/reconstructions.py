@@ -57,10 +57,9 @@ def colmap_pairs(
         dataset = ScenePairs("colmap", read, sources, options, pairs, seed)
         dataset.points = [functools.partial(_points, folder) for folder in model_folders]
         return dataset
-    with_depth = scenes.DepthScenePairs("colmap", read, sources, (*options, "depth"), pairs, seed)
     paths = [_depth_paths(folder / images, scene) for folder, scene in zip(scene_folders, read, strict=True)]
-    with_depth.depth_images = scenes.DepthImages(paths, 1.0, scenes.read_colmap, reduced=True)
-    return with_depth
+    depth_images = scenes.DepthImages(paths, 1.0, scenes.read_colmap, reduced=True)
+    return ScenePairs("colmap", read, sources, (*options, "depth"), pairs, seed, depth_images.at)
 
 
 def _depth_folder(images: Path) -> Path:
@@ -111,6 +110,7 @@ def _scene(
     views = []
     for image in model.images:
         camera = model.cameras[image.camera]
+        assert camera.lens is not None  # of a model
         lens = camera.lens if camera.lens.bends else None
         source = ImageSource(f"{family}/{folder.name}/{image.name}", folder / images / image.name, camera.size, lens)
         views.append(View(source, camera.lens.K, image.R, image.t, image.place))

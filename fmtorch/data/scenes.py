@@ -242,6 +242,7 @@ class ScenePairs(PairDataset):
     name: of the data set. scenes: read from disk. sources: what defines the cameras, by a name that holds no path.
     options: what else defines them, such as the window of a video.
     pairs: how many, drawn at random from the candidates of all scenes; None: all. seed: of that draw.
+    depth: of points (n, 2) of an image, in the unit of t, where the views have depth: it is a `DepthDataset` then.
 
     points: of each scene a function that reads which points of its reconstruction each view sees, by their numbers;
     None where there is no reconstruction.
@@ -253,9 +254,11 @@ class ScenePairs(PairDataset):
 
     def __init__(
         self, name: str, scenes: Sequence[Scene], sources: Iterable[tuple[str, Path]], options: Sequence[object] = (),
-        pairs: int | None = None, seed: int = 0,
+        pairs: int | None = None, seed: int = 0, depth: Callable[[ImageSource, Matrix], Matrix] | None = None,
     ) -> None:  # fmt: skip
         self.name, self.scenes = name, list(scenes)
+        if depth is not None:
+            self.depth = depth
         self._starts = [0, *itertools.accumulate(len(scene.candidates) for scene in self.scenes)]
         self._ranks = drawn(self._starts[-1], pairs, seed)
         self.cameras_digest = _digest([(s.family, s.name, len(s.candidates)) for s in self.scenes], options, sources)
@@ -277,16 +280,6 @@ class ScenePairs(PairDataset):
         scene = int(np.searchsorted(self._starts, rank, side="right")) - 1
         ((i, j),) = self.scenes[scene].candidates.at(np.array([rank - self._starts[scene]]))
         return scene, int(i), int(j)
-
-
-class DepthScenePairs(ScenePairs):
-    """The same where the views have depth images."""
-
-    depth_images: DepthImages
-
-    def depth(self, image: ImageSource, points: Matrix) -> Matrix:
-        """Depth (n,) along the optical axis at points (n, 2) of an image, in the unit of t; NaN where unknown."""
-        return self.depth_images.at(image, points)
 
 
 def image_pair(scene: Scene, i: int, j: int) -> ImagePair:

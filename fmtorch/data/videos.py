@@ -124,10 +124,9 @@ def tum_pairs(
     if not depth or not all((folder / "depth.txt").is_file() for folder in folders):
         return ScenePairs("tum", read, files, (window,), pairs, seed)
     files += [(folder.name, folder / "depth.txt") for folder in folders]
-    dataset = scenes.DepthScenePairs("tum", read, files, (window,), pairs, seed)
     paths = [_depth_paths(folder, scene) for folder, scene in zip(folders, read, strict=True)]
-    dataset.depth_images = scenes.DepthImages(paths, DEPTH_SCALE, scenes.read_grey)
-    return dataset
+    depth_images = scenes.DepthImages(paths, DEPTH_SCALE, scenes.read_grey)
+    return ScenePairs("tum", read, files, (window,), pairs, seed, depth_images.at)
 
 
 def read_listed(path: Path) -> tuple[Matrix, list[str], list[int]]:

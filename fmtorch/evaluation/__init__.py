@@ -8,14 +8,14 @@ if TYPE_CHECKING:
     from fmtorch.evaluation.curves import MAX_THUMBNAILS, picture, svg, view_graph_svg
     from fmtorch.evaluation.page import Section, ShownPair, differing_pairs, render, run_names
     from fmtorch.evaluation.rows import evaluate, focal_errors
-    from fmtorch.evaluation.run import WithPairCameras, built_with, cameras_of, evaluate_pairs, run_identity
+    from fmtorch.evaluation.run import evaluate_pairs, informed, run_identity
     from fmtorch.evaluation.statistics import common_reasons, summarize
     from fmtorch.evaluation.tables import summary_markdown, terminal_tables
 
 __all__ = [
-    "MAX_THUMBNAILS", "Section", "ShownPair", "WithPairCameras", "built_with", "cameras_of", "common_reasons",
-    "differing_pairs", "evaluate", "evaluate_pairs", "focal_errors", "picture", "render", "run_identity", "run_names",
-    "summarize", "summary_markdown", "svg", "terminal_tables", "view_graph_svg",
+    "MAX_THUMBNAILS", "Section", "ShownPair", "common_reasons", "differing_pairs", "evaluate", "evaluate_pairs",
+    "focal_errors", "informed", "picture", "render", "run_identity", "run_names", "summarize", "summary_markdown",
+    "svg", "terminal_tables", "view_graph_svg",
 ]  # fmt: skip
 
 lazy_exports(__name__)

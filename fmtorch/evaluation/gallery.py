@@ -23,47 +23,31 @@ from fmtorch.runs import RunFolder
 from fmtorch.scenes import RenderedPairs
 
 Row = Mapping[str, Any]  # what a run stored of a pair
-SAME_F = 1e-12  # difference of any element, of unit Frobenius norm, within which two F are the same
 SAME_CORNERS = 0.01  # px, corner error up to which two homographies are the same: what captions show
 SAME_NSGD = 1e-4  # between the F of a run and the one drawn again, up to which they are the same: what captions show
 
 
 def difference(pair: ImagePair, images: Sequence[Image], stored: Row, outcome: Outcome) -> str:
     """What differs between the row of a pair and what its pipeline makes of it now; empty where nothing does."""
-    again, reason = outcome.estimate, outcome.reason
-    if pair.H is not None:
-        return _other_homography(pair, images, stored, outcome)
+    again, planar = outcome.estimate, pair.H is not None
+    name, column = ("homography", "H") if planar else ("F", "F")
     if again is None or not bool(again.ok[0]):
-        return f"gives no F when it is drawn again ({reason}), unlike in its run" if stored["ok"] else ""
-    run = torch.tensor(stored["F"], dtype=torch.float64) if stored["ok"] else None
-    if run is not None and torch.allclose(run, again.F[0].cpu().double().flatten(), rtol=0, atol=SAME_F):
-        return ""
+        return f"gives no {name} when it is drawn again ({outcome.reason}), unlike in its run" if stored["ok"] else ""
+    if not stored["ok"]:
+        return f"gives {'a' if planar else 'an'} {name} when it is drawn again, unlike in its run"
+    now, then = again.F.cpu().double(), torch.tensor(stored[column], dtype=torch.float64).reshape(1, 3, 3)
     sizes = [torch.tensor([image.shape[:2]]) for image in images]
-
-    def distance(F: torch.Tensor) -> float:
-        return float(nsgd(F.reshape(1, 3, 3), again.F.cpu(), *sizes, key=torch.tensor([pair.key]))[0])
-
-    error = distance(torch.from_numpy(pair.F))
-    if run is None:
-        return f"gives an F when it is drawn again, of NSGD {error:.4f}, unlike in its run"
-    apart = distance(run)
+    if planar:
+        apart = float(corner_error(now, then, sizes[0])[0])
+        return "" if apart <= SAME_CORNERS else f"gives another {name} when it is drawn again, {apart:.2f} px apart"
+    F, key = torch.from_numpy(pair.F)[None], torch.tensor([pair.key])
+    apart, error = (float(nsgd(other, now, *sizes, key=key)[0]) for other in (then, F))
     if apart <= SAME_NSGD:
         return ""
     return (
         f"gives another F when it is drawn again: NSGD {error:.4f}, in its run {stored['nsgd']:.4f}; the two are "
         f"{apart:.4f} apart. Its matches below are those of now, its epipolar lines those of the run"
     )
-
-
-def _other_homography(pair: ImagePair, images: Sequence[Image], stored: Row, outcome: Outcome) -> str:
-    again = outcome.estimate
-    if again is None or not bool(again.ok[0]):
-        return "gives no homography now, unlike in its run" if stored["ok"] else ""
-    if not stored["ok"]:
-        return "gives a homography now, unlike in its run"
-    size, H = torch.tensor([images[0].shape[:2]]), torch.tensor(stored["H"], dtype=torch.float64).reshape(1, 3, 3)
-    apart = float(corner_error(again.F.cpu(), H, size)[0])
-    return "" if apart <= SAME_CORNERS else f"gives another homography when it is drawn again, {apart:.2f} px apart"
 
 
 def drawn(pair: ImagePair, images: Sequence[Image], stored: Row, outcome: Outcome, name: str) -> list[Picture]:

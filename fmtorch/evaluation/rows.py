@@ -7,7 +7,7 @@ import functools
 import math
 import time
 from collections.abc import Sequence
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -75,7 +75,7 @@ def _of_fundamental_matrices(outcomes: Sequence[Outcome], seed: int, signed: boo
         for i, before, after in zip(matched, rates.before.tolist(), rates.after.tolist(), strict=True):
             figures[i] |= {"inlier_rate_before": before, "inlier_rate": after if outcomes[i].solved else math.nan}
     poses = pose_errors(outcomes, signed)
-    return [each | p._asdict() | _by_labels(o) for each, p, o in zip(figures, poses, outcomes, strict=True)]
+    return [each | p | _by_labels(o) for each, p, o in zip(figures, poses, outcomes, strict=True)]
 
 
 def _by_labels(outcome: Outcome) -> Figures:
@@ -117,7 +117,7 @@ def _of_homographies(outcomes: Sequence[Outcome]) -> list[Figures]:
 
 def _row(outcome: Outcome, figures: Figures, planar: bool, seconds: float) -> PairRow:
     pair, c, estimate = outcome.pair, outcome.correspondences, outcome.estimate
-    ok, pair_type, focals = outcome.solved, outcome.pair_type, focal_errors(outcome)
+    ok, pair_type = outcome.solved, outcome.pair_type
     lenses = (None, None, None) if estimate is None else _lenses(estimate)
     matrix = estimate.F[0].flatten().tolist() if estimate is not None and ok else None
     figures = figures | {f"seconds_{stage}": outcome.seconds.get(stage, math.nan) for stage in STAGES}
@@ -132,9 +132,7 @@ def _row(outcome: Outcome, figures: Figures, planar: bool, seconds: float) -> Pa
         related=bool(estimate.related[0]) if estimate is not None else False,
         pair_type=None if pair_type is None else pair_type.names[0],
         warning=outcome.not_examined or None if pair_type is None else pair_type.warnings[0],
-        focal_error0=focals.error[0], focal_error1=focals.error[1],
-        focal_log_ratio0=focals.log_ratio[0], focal_log_ratio1=focals.log_ratio[1],
-        lens_suggested=lenses[0], lens0=lenses[1], lens1=lenses[2],
+        **focal_errors(outcome), lens_suggested=lenses[0], lens0=lenses[1], lens1=lenses[2],
     )  # fmt: skip
 
 
@@ -146,31 +144,25 @@ def _lenses(estimate: Estimate) -> list[float | None]:
     return [None if math.isnan(value) else value for value in values]
 
 
-class PairPose(NamedTuple):
-    """Angles in degrees; None where the true pose is unknown. pose_reason: why there is no error, or no pose."""
-
-    rotation_error: float | None
-    translation_error: float | None
-    pose_reason: str | None
-
-
-def pose_errors(outcomes: Sequence[Outcome], signed: bool = False) -> list[PairPose]:
+def pose_errors(outcomes: Sequence[Outcome], signed: bool = False) -> list[Figures]:
     """The pose error of each pair: of the estimate's R and t, or else of its F, K0, K1 and the estimator's inliers.
     See `pose_error` and `fundamental_pose_error`. A pair without F, or without a pose, has the largest errors and a
     reason; one whose calibration or motion is unknown has a reason only. signed: the sign of the translation counts,
     and of the four poses of F the best one: `closest_pose_error`."""
-    largest = PairPose(LARGEST_ROTATION, LARGEST_ROTATION if signed else LARGEST_TRANSLATION, "no F")
-    missing = ((_unknown(outcome.pair), outcome.solved) for outcome in outcomes)
-    poses = [largest if what is None and not solved else PairPose(None, None, what) for what, solved in missing]
-    known = [i for i, pose in enumerate(poses) if pose.pose_reason is None]
+    poses = [Figures(pose_reason=_unknown(outcome.pair)) for outcome in outcomes]
+    known = [i for i, pose in enumerate(poses) if pose["pose_reason"] is None]
+    solved = [i for i in known if outcomes[i].solved]
     own_pose = functools.partial(_of_pose, up_to_sign=not signed), "the pose is not determined"
     of_F = (_closest, "F has no pose") if signed else (_of_fundamental, "no inlier in front of both cameras")
     for estimated, (error_of, reason) in ((True, own_pose), (False, of_F)):
-        own = [i for i in known if (cast(Estimate, outcomes[i].estimate).R is not None) == estimated]
+        own = [i for i in solved if (cast(Estimate, outcomes[i].estimate).R is not None) == estimated]
         error = error_of([outcomes[i] for i in own]) if own else metrics.PoseError(torch.zeros(0), torch.zeros(0))
         for i, rotation, translation in zip(own, error.rotation.tolist(), error.translation.tolist(), strict=True):
-            poses[i] = PairPose(rotation, translation, reason if rotation >= LARGEST_ROTATION else None)
-    return poses
+            poses[i] |= {"rotation_error": rotation, "translation_error": translation}
+            poses[i]["pose_reason"] = reason if rotation >= LARGEST_ROTATION else None
+    largest = LARGEST_ROTATION if signed else LARGEST_TRANSLATION
+    lost = {"rotation_error": LARGEST_ROTATION, "translation_error": largest, "pose_reason": "no F"}
+    return [lost if i in known and not outcomes[i].solved else pose for i, pose in enumerate(poses)]
 
 
 def _unknown(pair: ImagePair) -> str | None:
@@ -197,31 +189,20 @@ def _closest(outcomes: Sequence[Outcome]) -> metrics.PoseError:
     return metrics.closest_pose_error(estimate.F.double(), *_truth(outcomes, "K0", "K1", "R", "t"))
 
 
-class FocalErrors(NamedTuple):
-    """Of both images: ``|f - f_true| / f_true``, and ``log(f / f_true)``.
-    None where no focal length was estimated, since it was given exactly or nobody asked, or the true one is not known.
-    Where it was to be estimated and is not determined the error is infinite and the ratio None."""
-
-    error: tuple[float | None, float | None] = (None, None)
-    log_ratio: tuple[float | None, float | None] = (None, None)
-
-
-def focal_errors(outcome: Outcome) -> FocalErrors:
-    """The errors of one pair, by what its estimator was given (`fmtorch.pipeline.pipeline`)."""
-    c, estimate = outcome.correspondences, outcome.estimate
-    if c is None or c.focal is None or estimate is None:
-        return FocalErrors()
-    errors: list[tuple[float | None, float | None]] = []
+def focal_errors(outcome: Outcome) -> Figures:
+    """Of both images ``|f - f_true| / f_true`` and ``log(f / f_true)``, by what the estimator was given of the pair.
+    None of these where no focal length was estimated, since it was given exactly or nobody asked, or the true one is
+    not known. Where it was to be estimated and is not determined the error is infinite and there is no ratio."""
+    c, estimate, figures = outcome.correspondences, outcome.estimate, Figures()
     for i, K in enumerate((outcome.pair.K0, outcome.pair.K1)):
         true = _focal(K)
-        if true is None or float(c.focal[0, i, 1]) == 0:  # exact
-            errors.append((None, None))
+        if estimate is None or c is None or c.focal is None or true is None or float(c.focal[0, i, 1]) == 0:  # exact
             continue
         focal = math.nan if estimate.focals is None or not outcome.solved else float(estimate.focals[0, i])
-        determined = math.isfinite(focal) and focal > 0
-        errors.append((abs(focal - true) / true, math.log(focal / true)) if determined else (math.inf, None))
-    (error0, ratio0), (error1, ratio1) = errors
-    return FocalErrors((error0, error1), (ratio0, ratio1))
+        figures[f"focal_error{i}"] = math.inf
+        if math.isfinite(focal) and focal > 0:
+            figures |= {f"focal_error{i}": abs(focal - true) / true, f"focal_log_ratio{i}": math.log(focal / true)}
+    return figures
 
 
 def _focal(K: NDArray[np.float64] | None) -> float | None:

@@ -8,10 +8,8 @@ hundred megabytes each. Rows and exports come back to the caller, who alone writ
 import contextlib
 import dataclasses
 import functools
-import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, wait
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -20,9 +18,7 @@ from omegaconf import DictConfig
 from torch import Tensor
 
 from fmtorch import presets
-from fmtorch.core.stages import Estimator, ImageMatcher
-from fmtorch.core.types import Correspondences, Estimate
-from fmtorch.data import GivenMatches, ImagePair, ImageSource, exif_focal
+from fmtorch.data import GivenMatches, ImagePair, exif_focal
 from fmtorch.evaluation.rows import evaluate
 from fmtorch.io.match_store import MatchRecords, MatchStore
 from fmtorch.jit import kernel
@@ -30,8 +26,8 @@ from fmtorch.jobs import Execution, Factory, Local, Source, TaskRunner, WorkerPo
 from fmtorch.pipeline import Outcome, Pipeline, examined, match_records
 from fmtorch.runs import CachedFeatures, PairRow
 from fmtorch.runs.fingerprint import code_digest, file_digest, fmtorch_version, learned, libraries
-from fmtorch.two_view import known_cameras, pair_type
-from fmtorch.two_view.arguments import Lens, expect_lenses, lens_fields
+from fmtorch.two_view import pair_type
+from fmtorch.two_view.arguments import Lens, lens_fields
 
 PLACES = ("root", "file", "truth", "images")
 """Options of data sets that say where things lie; the digest says what they are."""
@@ -111,35 +107,30 @@ Cameras = Literal["known", "shared", "exif", "unknown"]
 UNKNOWN, EXACT = (1.0, math.inf), (1.0, 0.0)  # px, relative deviation; K stands for the pixels of an exact one
 
 
-class PairCameras(NamedTuple):
-    """What an estimator is given of a pair, fields of `Correspondences`: K0, K1 (3, 3), focal (2, 2), shared_focal."""
+def informed(pairs: Sequence[ImagePair], cameras: Cameras | None, lens: Lens = None) -> list[ImagePair]:
+    """The pairs with what estimators are given of their cameras and lenses.
+    cameras: known: their calibrations; exif: the focal lengths in the files of their images, unknown where there are
+    none; shared: that both images of a pair are of one camera; unknown: nothing; None: they are not asked for. lens: as
+    of `find_fundamental`. Raises ValueError for `known` where a pair has no calibration."""
+    of_lens, measured = lens_fields(lens), functools.cache(_measured)
 
-    K0: Tensor | None
-    K1: Tensor | None
-    focal: Tensor
-    shared_focal: bool
+    def fields(pair: ImagePair) -> dict[str, Tensor | None]:
+        if cameras is None:
+            return of_lens
+        K: tuple[Tensor | None, Tensor | None] = (None, None)
+        focals = [UNKNOWN, UNKNOWN]
+        if cameras == "exif":
+            focals = [measured(image.path) for image in (pair.image0, pair.image1)]
+        elif cameras == "known":
+            if pair.K0 is None or pair.K1 is None:
+                lacks = f"the data set has no calibration of pair {pair.identity}"
+                raise ValueError(f"cameras=known, but {lacks}; give another")
+            K, focals = (torch.from_numpy(pair.K0).double(), torch.from_numpy(pair.K1).double()), [EXACT, EXACT]
+        focal, shared = torch.tensor(focals, dtype=torch.float64), torch.tensor(cameras == "shared")
+        return {"K0": K[0], "K1": K[1], "focal": focal, "shared_focal": shared, **of_lens}
 
-
-def cameras_of(pairs: Sequence[ImagePair], cameras: Cameras) -> dict[int, PairCameras]:
-    """What is known of the cameras of pairs, by their keys.
-    known: their calibrations. exif: the focal lengths in the files of their images, unknown where there are none.
-    shared: that both images of a pair are of one camera. unknown: nothing. Raises ValueError for `known` where a pair
-    has no calibration."""
-    if cameras == "known":
-        return {pair.key: _calibrated(pair) for pair in pairs if pair.problem is None}
-    if cameras == "exif":
-        measured = functools.cache(_measured)
-        ends = ((pair.key, [measured(image.path) for image in (pair.image0, pair.image1)]) for pair in pairs)
-        return {key: PairCameras(None, None, _two(*focals), False) for key, focals in ends}
-    nothing = PairCameras(None, None, _two(UNKNOWN, UNKNOWN), cameras == "shared")
-    return {pair.key: nothing for pair in pairs}
-
-
-def _calibrated(pair: ImagePair) -> PairCameras:
-    if pair.K0 is None or pair.K1 is None:
-        raise ValueError(f"cameras=known, but the data set has no calibration of pair {pair.identity}; give another")
-    K0, K1 = (torch.from_numpy(K).to(torch.float64) for K in (pair.K0, pair.K1))
-    return PairCameras(K0, K1, _two(EXACT, EXACT), False)
+    asked = cameras is not None or lens is not None
+    return [dataclasses.replace(p, given=fields(p)) if asked and p.problem is None else p for p in pairs]
 
 
 def _measured(path: Path) -> tuple[float, float]:
@@ -147,64 +138,13 @@ def _measured(path: Path) -> tuple[float, float]:
     return (exif.focal, exif.deviation) if exif.known else UNKNOWN
 
 
-def _two(first: tuple[float, float], second: tuple[float, float]) -> Tensor:
-    return torch.tensor([first, second], dtype=torch.float64)
-
-
-class WithPairCameras:
-    """An estimator that is given the cameras of each pair, which it finds by the pairs' keys, or a lens, or both."""
-
-    model = "fundamental"
-
-    def __init__(self, estimator: Estimator, cameras: Mapping[int, PairCameras] | None, lens: Lens = None) -> None:
-        """cameras: of `cameras_of`, of all pairs that will come; or they are added before their pairs come; None:
-        nothing is given of them. lens: as of `find_fundamental`."""
-        self._estimator = known_cameras.KnownCameras(estimator)
-        self.cameras, self._lens = None if cameras is None else dict(cameras), lens_fields(lens)
-
-    def __call__(self, c: Correspondences, seed: int = 0) -> Estimate:
-        estimator = self._estimator.estimator if self.cameras is None else self._estimator
-        return estimator(self.given(c), seed)
-
-    @property
-    def kernels(self) -> Sequence[object]:
-        return getattr(self._estimator.estimator, "kernels", ())
-
-    def given(self, c: Correspondences) -> Correspondences:
-        lens = {name: value.to(c.mask.device).expand(len(c), *value.shape) for name, value in self._lens.items()}
-        c = c.derived(**lens)
-        if self.cameras is None:
-            return c
-        K0, K1, focal, shared = zip(*[self.cameras[key] for key in c.keys.tolist()], strict=True)
-        stacked = [None if K[0] is None else torch.stack(K).to(c.mask.device) for K in (K0, K1, focal)]  # all, or none
-        fields = dict(zip(("K0", "K1", "focal"), stacked, strict=True))
-        return c.derived(**fields, shared_focal=torch.tensor(shared, device=c.mask.device))
-
-
-def built_with(
-    build: Callable[[], Pipeline], cameras: Mapping[int, PairCameras] | None, lens: Lens = None
-) -> Pipeline:  # fmt: skip
-    """A pipeline whose estimator is given the cameras of each pair, and what is known of lenses."""
-    pipeline = build()
-    if lens is not None:
-        expect_lenses(pipeline.estimator, type(pipeline.estimator).__name__)
-    pipeline.estimator = WithPairCameras(pipeline.estimator, cameras, lens)
-    return pipeline
-
-
-Build = Callable[[], Pipeline]
-
-
 class Batch(NamedTuple):
     """Pairs to evaluate.
-    cameras: of their keys, for a pipeline that was built without them. export: whether keypoints, matches and F are to
-    be exported. counted: whether the worker counts the images that it computed. signed: of `pose_errors`."""
+    export: whether keypoints, matches and F are to be exported. signed: of `pose_errors`."""
 
     pairs: list[ImagePair]
     seed: int
-    cameras: Mapping[int, PairCameras] | None = None
     export: bool = False
-    counted: bool = False
     signed: bool = False
 
 
@@ -222,21 +162,11 @@ class Work(NamedTuple):
 
 def evaluate_batch(pipeline: Pipeline, batch: Batch) -> Work:
     """The rows of a batch, and what is to be exported of it."""
-    cache = pipeline.extractor if batch.counted and isinstance(pipeline.extractor, CachedFeatures) else None
+    cache = pipeline.extractor if isinstance(pipeline.extractor, CachedFeatures) else None
     computed, from_cache = (cache.computed, cache.found) if cache else (0, 0)
-    informed = pipeline.estimator if isinstance(pipeline.estimator, WithPairCameras) else None
-    if batch.cameras is not None:
-        assert informed is not None
-        assert informed.cameras is not None
-        informed.cameras |= batch.cameras
-    pair_type.compile_with([*pipeline.pruners.values(), pipeline.estimator])
-    knowledge = None if informed is None else informed.given
-    outcomes = examined(pipeline, pipeline.run(batch.pairs, batch.seed), batch.seed, knowledge)
+    outcomes = examined(pipeline, pipeline.run(batch.pairs, batch.seed), batch.seed)
     records = match_records(pipeline, outcomes) if batch.export else None
     rows = evaluate(outcomes, batch.seed, batch.signed)
-    if informed is not None and informed.cameras is not None:
-        for key in batch.cameras or ():
-            informed.cameras.pop(key, None)
     counts = (cache.computed - computed, cache.found - from_cache) if cache else (0, 0)
     return Work(rows, *counts, records, dict(pipeline.tracebacks))
 
@@ -251,39 +181,21 @@ def failed(batch: Batch, reason: str) -> list[PairRow]:
     return evaluate([Outcome(pair, reason=reason) for pair in batch.pairs], batch.seed, batch.signed)
 
 
-def compute_features(pipeline: Pipeline, image: ImageSource) -> None:
-    """Have an image's features computed for the pipeline to keep; its pairs will tell what that raises."""
-    with contextlib.suppress(Exception):
-        pipeline.features(image)
+def with_contents(pairs: Sequence[ImagePair]) -> list[ImagePair]:
+    """The pairs with their images as bytes, each read once, or their given matches; what fails the worker will tell."""
+    held = functools.cache(Path.read_bytes)
 
-
-def with_contents(pair: ImagePair) -> ImagePair:
-    """The pair with its images as bytes, or its given matches read; what cannot be read the worker will tell."""
-    if pair.problem is not None:
-        return pair
-    with contextlib.suppress(Exception):
+    def sent(pair: ImagePair) -> ImagePair:
         if pair.matches is not None:
-            return dataclasses.replace(pair, matches=functools.partial(_read, pair.matches()))
-        images = (dataclasses.replace(image, data=image.path.read_bytes()) for image in (pair.image0, pair.image1))
-        return dataclasses.replace(pair, image0=next(images), image1=next(images))
-    return pair
+            return dataclasses.replace(pair, matches=functools.partial(GivenMatches._make, pair.matches()))
+        image0, image1 = (dataclasses.replace(i, data=held(i.path)) for i in (pair.image0, pair.image1))
+        return dataclasses.replace(pair, image0=image0, image1=image1)
 
-
-def _read(matches: GivenMatches) -> GivenMatches:
-    return matches
-
-
-def batch_contents(pairs: list[ImagePair]) -> list[ImagePair]:
-    """`with_contents` of each pair; an image that several show is read, and sent, once."""
-    held: dict[Path, bytes | None] = {}
-    result = []
-    for pair in pairs:
-        own = with_contents(pair)
-        images = [
-            image if image.data is None else dataclasses.replace(image, data=held.setdefault(image.path, image.data))
-            for image in (own.image0, own.image1)
-        ]
-        result.append(dataclasses.replace(own, image0=images[0], image1=images[1]))
+    result = list(pairs)
+    for i, pair in enumerate(pairs):
+        if pair.problem is None:
+            with contextlib.suppress(Exception):
+                result[i] = sent(pair)
     return result
 
 
@@ -305,30 +217,29 @@ def select(pairs: Sequence[ImagePair], limit: int | None) -> list[ImagePair]:
 
 def evaluate_pairs(
     pipeline: Pipeline, pairs: Sequence[ImagePair], *, seed: int, batch: int, execution: Execution,
-    store: Callable[[list[PairRow]], None], build: Build | None = None,
-    cameras: Mapping[int, PairCameras] | None = None, journal: MatchStore | None = None, signed: bool = False,
+    store: Callable[[list[PairRow]], None], build: Callable[[], Pipeline] | None = None,
+    journal: MatchStore | None = None, signed: bool = False,
 ) -> Iterator[int]:  # fmt: skip
     """Run and evaluate the pairs, hand each batch's rows to `store`, and yield how many pairs it held.
-    execution: by which workers. build: makes the same pipeline in another process, where these are no threads. cameras:
-    what a pipeline that `build` makes is given of the pairs' cameras, see `built_with`. journal: keeps keypoints,
-    matches and F for an export. signed: of `pose_errors`. Rows and journal are written here. Results do not depend on
-    `batch` or `execution`. Raises WorkersLost where workers die whatever they do, or a scheduler is gone."""
+    execution: by which workers. build: makes the same pipeline in another process, where these are no threads.
+    journal: keeps keypoints, matches and F for an export. signed: of `pose_errors`. Rows and journal are written here.
+    Results do not depend on `batch` or `execution`. Raises WorkersLost where workers die whatever they do, or a
+    scheduler is gone."""
     pool = WorkerPool(execution, PRELOADED, limit=max(1, len(pairs)))
     if pool.size > 1:  # no one of several workers shall be long alone at the end
         batch = max(1, min(batch, -(-len(pairs) // (BATCHES_OF_A_WORKER * pool.size))))
     source: Source[Pipeline] = Local(pipeline) if execution.shared or build is None else Factory(build)
 
     def given(members: Sequence[ImagePair]) -> Batch:
-        own = None if cameras is None or source.shared else {p.key: cameras[p.key] for p in members if p.key in cameras}
-        sent = batch_contents(list(members)) if execution.send_images and not source.shared else list(members)
-        return Batch(sent, seed, own, journal is not None, not source.shared, signed)
+        sent = with_contents(members) if execution.send_images and not source.shared else list(members)
+        return Batch(sent, seed, journal is not None, signed)
 
     def keep(done: Batch, work: Work) -> None:
         if journal is not None and work.records is not None:
             journal.add(work.records)
         store(work.rows)
         pipeline.tracebacks |= work.tracebacks
-        if isinstance(pipeline.extractor, CachedFeatures):
+        if isinstance(pipeline.extractor, CachedFeatures) and not source.shared:
             pipeline.extractor.computed += work.computed
             pipeline.extractor.found += work.from_cache
 
@@ -337,33 +248,9 @@ def evaluate_pairs(
     torch.set_num_threads(1)
     try:
         with pool:
-            begun = 0
-            if source.shared and pool.size > 1 and pairs and not isinstance(pipeline.matcher, ImageMatcher):
-                begun = 1  # alone: where its stages compile kernels, others would wait for them
-                _features_ahead(pool, pipeline, pairs, runner.begin(given(pairs[:1])))
-            for done in runner.each(given(pairs[i : i + batch]) for i in range(begun, len(pairs), batch)):
+            if execution.shared:  # by one worker, while the others compute features
+                pool.executor.submit(pair_type.compile_with, [*pipeline.pruners.values(), pipeline.estimator])
+            for done in runner.each(given(pairs[i : i + batch]) for i in range(0, len(pairs), batch)):
                 yield len(done.pairs)
     finally:
         torch.set_num_threads(before)
-
-
-def _features_ahead(pool: WorkerPool, pipeline: Pipeline, pairs: Sequence[ImagePair], first: Future[Work]) -> None:
-    """While a worker is at the first pair, the others compute features of those that follow, as many as are kept."""
-    computing: set[Future[None]] = set()
-    for image in itertools.islice(_images_after_the_first(pairs), pipeline.memory):
-        while len(computing) >= pool.size - 1 and not first.done():
-            wait(list[Future[Any]]([first, *computing]), return_when=FIRST_COMPLETED)
-            computing = {future for future in computing if not future.done()}
-        if first.done():
-            return
-        computing.add(pool.executor.submit(compute_features, pipeline, image))
-
-
-def _images_after_the_first(pairs: Sequence[ImagePair]) -> Iterator[ImageSource]:
-    seen = {pairs[0].image0.pixels, pairs[0].image1.pixels}
-    for pair in pairs[1:]:
-        if pair.problem is None and pair.matches is None:
-            for image in (pair.image0, pair.image1):
-                if image.pixels not in seen:
-                    seen.add(image.pixels)
-                    yield image

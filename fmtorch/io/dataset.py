@@ -36,14 +36,13 @@ def tutorial_matches(folder: Path, key: str, sizes: tuple[Size, Size]) -> GivenM
 
 
 def tutorial_pairs(root: Path, images: Path | None) -> Iterator[ImagePair]:
-    """The pairs of every scene; of each file one opening, and one computation of F."""
+    """The pairs of every scene; of each file one opening."""
     for folder in scenes(root):
         with h5.opened(folder / MATCHES) as file:
             names = h5.keys(file)
         with contextlib.ExitStack() as files:
             cameras = _Cameras(root.name, folder, images, files)
-            pairs = [_pair(root, folder, key, cameras, images) for key in names]
-        yield from predictions.with_fundamentals(pairs) if cameras.by_image else pairs
+            yield from [_pair(root, folder, key, cameras, images) for key in names]
 
 
 def scenes(root: Path) -> list[Path]:
@@ -124,8 +123,8 @@ def _pair(root: Path, folder: Path, key: str, cameras: _Cameras, images: Path | 
         if cameras.by_image:
             (R0, t0), (R1, t1) = cameras.by_image[name0], cameras.by_image[name1]
             R = R1 @ R0.T
-            pose = R, t1 - R @ t0
-            return ImagePair(identity, family, scene, *sources, np.zeros((3, 3)), K0, K1, *pose, matches=matches)
+            pair = ImagePair(identity, family, scene, *sources, np.zeros((3, 3)), matches=matches)
+            return predictions.with_cameras(pair, K0, K1, R, t1 - R @ t0)
         F = cameras.truth(key)
     except DataError as error:
         unnamed = predictions.image(family, scene, key, images)
@@ -170,10 +169,9 @@ def _pairs(root: Path, images: Path | None, keys_of: Callable[[Any], list[str]],
                 pair = ImagePair(identity, family, scene, source0, source1, np.zeros((3, 3)))
                 try:
                     K, R, t, matches = read(file, path, key, (source0, source1))
-                    pair = dataclasses.replace(pair, K0=K[0], K1=K[1], R=R, t=t, matches=matches)
+                    yield predictions.with_cameras(dataclasses.replace(pair, matches=matches), *K, R, t)
                 except DataError as error:
-                    pair = dataclasses.replace(pair, problem=str(error))
-                yield from predictions.with_fundamentals([pair])
+                    yield dataclasses.replace(pair, problem=str(error))
 
 
 def _posebench_pair(file: Any, path: Path, key: str, sources: Images) -> Stored:

@@ -4,7 +4,7 @@ import contextlib
 import functools
 import hashlib
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +48,7 @@ def keys(file: Any, deep: bool = False) -> list[str]:
             file.visit(names.append)
         return names if deep else [str(name) for name in file]
     except (OSError, RuntimeError) as error:
-        raise DataError(f"{_where(file)}: its keys cannot be read ({_first_line(error)})") from error
+        raise DataError(f"{where(file)}: its keys cannot be read ({_first_line(error)})") from error
 
 
 def groups_with(file: Any, *names: str) -> list[str]:
@@ -62,7 +62,7 @@ def holds(file: Any, key: str) -> bool:
     try:
         return key.encode() in file.id
     except (OSError, RuntimeError) as error:
-        raise DataError(f"{_where(file, key)} cannot be read ({_first_line(error)})") from error
+        raise DataError(f"{where(file, key)} cannot be read ({_first_line(error)})") from error
 
 
 def array(file: Any, key: str, *shape: int | None, floats: bool = False) -> Array:
@@ -73,17 +73,17 @@ def array(file: Any, key: str, *shape: int | None, floats: bool = False) -> Arra
         if values is None:
             entry = file[key]
             if not hasattr(entry, "shape"):
-                raise DataError(f"{_where(file, key)} is a group; it must be an array")
+                raise DataError(f"{where(file, key)} is a group; it must be an array")
             values = np.asarray(entry[()])
     except (OSError, RuntimeError, KeyError, TypeError, ValueError) as error:
         if isinstance(error, DataError):
             raise
         if not holds(file, key):
-            raise DataError(f"{_where(file, key)} is missing") from None
-        raise DataError(f"{_where(file, key)} cannot be read ({_first_line(error)})") from error
+            raise DataError(f"{where(file, key)} is missing") from None
+        raise DataError(f"{where(file, key)} cannot be read ({_first_line(error)})") from error
     if shape and not fits(values, shape):
         wanted = ", ".join("any" if n is None else str(n) for n in shape)
-        raise DataError(f"{_where(file, key)} has shape {values.shape}; it must be ({wanted})")
+        raise DataError(f"{where(file, key)} has shape {values.shape}; it must be ({wanted})")
     return values
 
 
@@ -118,42 +118,24 @@ def shape(file: Any, key: str) -> tuple[int, ...]:
     try:
         return tuple(imported().h5d.open(file.id, key.encode()).shape)
     except (OSError, RuntimeError, KeyError, TypeError, ValueError) as error:
-        raise DataError(f"{_where(file, key)} cannot be read ({_first_line(error)})") from error
+        raise DataError(f"{where(file, key)} cannot be read ({_first_line(error)})") from error
 
 
 def numbers(file: Any, key: str, *shape: int | None) -> Matrix:
     """`array` as float64. Raises DataError where it holds no real numbers."""
     values = array(file, key, *shape, floats=True)
     if values.dtype.kind not in "fiub":
-        raise DataError(f"{_where(file, key)} is of {values.dtype}; it must hold real numbers")
+        raise DataError(f"{where(file, key)} is of {values.dtype}; it must hold real numbers")
     return values.astype(np.float64, copy=False)
-
-
-def small(file: Any, shapes: Mapping[str, tuple[int, ...]]) -> list[Matrix]:
-    """Arrays of a few numbers, each as by `reshaped`, of their keys and shapes; all of them in a third of the time."""
-    h5py, values, begin, read = _library(), np.empty(sum(map(math.prod, shapes.values()))), 0, []
-    try:
-        for key, shape in shapes.items():
-            entry, part = h5py.h5d.open(file.id, key.encode()), values[begin : begin + math.prod(shape)]
-            if entry.get_space().get_simple_extent_npoints() != len(part):
-                break
-            entry.read(h5py.h5s.ALL, h5py.h5s.ALL, part, h5py.h5t.NATIVE_DOUBLE)
-            read.append(part.reshape(shape))
-            begin += len(part)
-    except (OSError, RuntimeError, KeyError, TypeError, ValueError):
-        read = []
-    if len(read) == len(shapes) and np.isfinite(values).all():
-        return read
-    return [reshaped(file, key, *shape) for key, shape in shapes.items()]  # which names what is wrong
 
 
 def reshaped(file: Any, key: str, *shape: int) -> Matrix:
     """`numbers` of any shape that hold as many as this one, finite. Raises DataError where they do not."""
     values = numbers(file, key)
     if values.size != math.prod(shape):
-        raise DataError(f"{_where(file, key)} has shape {values.shape}; it must hold {math.prod(shape)} numbers")
+        raise DataError(f"{where(file, key)} has shape {values.shape}; it must hold {math.prod(shape)} numbers")
     if not np.isfinite(values).all():
-        raise DataError(f"{_where(file, key)} has an entry that is not finite")
+        raise DataError(f"{where(file, key)} has an entry that is not finite")
     return values.reshape(shape)
 
 
@@ -187,7 +169,8 @@ def files(root: Path) -> list[Path]:
     return paths
 
 
-def _where(file: Any, key: str | None = None) -> str:
+def where(file: Any, key: str | None = None) -> str:
+    """What messages call a key of a file or group: the file's name, and the whole path of the key."""
     group = str(getattr(file, "name", "") or "").strip("/")
     path = "/".join(part for part in (group, key or "") if part)
     return f"{file.file.filename}: {path!r}" if path else str(file.file.filename)

@@ -12,12 +12,11 @@ import numpy as np
 
 from fmtorch.core.files import replacing
 from fmtorch.data.files import Array, DataError, Indices, Matrix
-from fmtorch.io import h5
+from fmtorch.io import h5, predictions
 from fmtorch.io.colmap import DatabaseImage
 from fmtorch.io.match_store import MATRICES, PairGeometry
 
 MEMORY = 256  # images whose keypoints are kept
-NO_MATCH = -1
 Names = tuple[str, str]
 OpenFiles = TypeVar("OpenFiles", bound="_OpenFiles")
 
@@ -78,27 +77,22 @@ class HlocMatches(_OpenFiles):
 
     def matches(self, pair: Names) -> Indices:
         """The matches of a pair, keypoints (n, 2). Raises DataError where there are no such keypoints."""
-        second = self._second(pair)
         counts = [len(self.image(name).points) for name in pair]
-        if len(second) != counts[0]:
-            raise DataError(f"matches0 has {len(second)} entries, but {pair[0]} has {counts[0]} keypoints")
-        if len(second) and not NO_MATCH <= second.min() <= second.max() < counts[1]:
-            raise DataError(f"matches0 holds {second.min()} to {second.max()}, but {pair[1]} has {counts[1]} keypoints")
-        first = np.flatnonzero(second != NO_MATCH)
-        return np.stack([first, second[first]], -1)
+        first, second, _ = predictions.read_matches(self._matches[self._keys[pair]], counts)
+        return np.stack([first, second], -1)
 
     def write(self, geometries: Iterable[tuple[Names, PairGeometry]]) -> None:
         h5py = h5.imported()
         with replacing(self._output) as temporary, h5py.File(temporary, "w") as file:
             for pair, geometry in geometries:
                 group = file.create_group(self._keys[pair])
-                second = np.full(len(self._second(pair)), NO_MATCH, np.int32)
+                second = np.full(len(self.image(pair[0]).points), predictions.NO_MATCH, np.int32)
                 second[geometry.inliers[:, 0]] = geometry.inliers[:, 1]
                 group["matches0"] = second
                 key = f"{self._keys[pair]}/matching_scores0"
                 if h5.holds(self._matches, key):
                     scores = h5.numbers(self._matches, key, None)
-                    group["matching_scores0"] = np.where(second == NO_MATCH, 0, scores).astype(np.float32)
+                    group["matching_scores0"] = np.where(second == predictions.NO_MATCH, 0, scores).astype(np.float32)
                 write_geometry(group, geometry)
 
     def _named(self, key: str) -> Names:
@@ -108,12 +102,6 @@ class HlocMatches(_OpenFiles):
             ends = ((key[:i], key[i + 1 :]) for i, sign in enumerate(key) if sign == "_")
             first, second = next((both for both in ends if self._stored.keys() >= set(both)), (first, second))
         return self._stored.get(first, first), self._stored.get(second, second)
-
-    def _second(self, pair: Names) -> Indices:
-        values = h5.array(self._matches, f"{self._keys[pair]}/matches0", None)
-        if values.dtype.kind not in "iu":
-            raise DataError(f"matches0 is of {values.dtype}; it must hold whole numbers")
-        return values.astype(np.int64)
 
     def _image(self, name: str) -> DatabaseImage:
         points = h5.numbers(self._features, f"{name}/keypoints", None, 2).astype(np.float32)

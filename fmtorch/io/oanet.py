@@ -60,8 +60,8 @@ _SHAPES |= {"Rs": (3, 3), "ts": (3,), "sizes": (4,)}
 
 def cameras(file: Any, key: str) -> Cameras:
     """The cameras of a pair; images of unknown size have their principal point in the middle."""
-    known = _SHAPES if h5.holds(file, "sizes") else {name: _SHAPES[name] for name in _SHAPES if name != "sizes"}
-    cx0, cy0, f0, cx1, cy1, f1, R, t, *sized = h5.small(file, {f"{name}/{key}": known[name] for name in known})
+    names = [name for name in _SHAPES if name != "sizes" or h5.holds(file, name)]
+    cx0, cy0, f0, cx1, cy1, f1, R, t, *sized = (h5.reshaped(file, f"{n}/{key}", *_SHAPES[n]) for n in names)
     for i, f in ((1, f0), (2, f1)):
         if not f.all():
             raise DataError(f"{file.filename}: 'f{i}s/{key}' holds a focal length of zero")

@@ -11,14 +11,13 @@ import torch
 
 from fmtorch.core.types import Correspondences
 from fmtorch.data import DataError, GivenMatches, ImagePair, ImageSource, PairDataset, stored_size
+from fmtorch.data.cameras import Camera, fundamental
 from fmtorch.data.files import Indices, Mask, Matrix
-from fmtorch.geometry.cameras import fundamental_from_projections
 from fmtorch.io import h5
 
 Size = tuple[int, int]  # (h, w)
 Images = tuple[ImageSource, ImageSource]
 MAX_OFF_CENTRE = 0.1  # of a principal point, in units of the side: those of reduced images are farther off
-_ZERO = np.zeros((3, 3))  # where there is no F
 
 
 def given(
@@ -40,27 +39,16 @@ def _figure(values: Matrix | None) -> torch.Tensor | None:
     return None if values is None else torch.from_numpy(values.astype(np.float32))[None]
 
 
-def with_fundamentals(pairs: Sequence[ImagePair]) -> list[ImagePair]:
-    """The pairs with the F of their cameras, all at once; those with a problem, or without a pose, as they are."""
-    result = list(pairs)
-    places = [i for i, p in enumerate(pairs) if p.problem is None and p.R is not None]
-    if not places:
-        return result
-    K0, K1, R, t = (np.stack([getattr(pairs[i], name) for i in places]) for name in ("K0", "K1", "R", "t"))
-    wrong = {
-        "the cameras did not move apart (t is zero), which leaves no F": ~t.any(1),
-        "R is no rotation": np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max((1, 2)) > 1e-2,
-        "a calibration matrix is singular": (np.linalg.det(K0) == 0) | (np.linalg.det(K1) == 0),
-    }
-    problems: list[str | None] = [None] * len(places)
-    for problem, where in wrong.items():  # the last that holds counts
-        for i in np.flatnonzero(where):
-            problems[i] = problem
-    P0, P1 = K0 @ np.eye(3, 4), K1 @ np.concatenate([R, t[..., None]], -1)
-    F = fundamental_from_projections(torch.from_numpy(P0), torch.from_numpy(P1)).numpy()
-    for place, own, wrongly in zip(places, F, problems, strict=True):
-        result[place] = dataclasses.replace(pairs[place], F=own if wrongly is None else _ZERO, problem=wrongly)
-    return result
+def with_cameras(pair: ImagePair, K0: Matrix, K1: Matrix, R: Matrix, t: Matrix) -> ImagePair:
+    """The pair with its cameras, ``X1 = R X0 + t``, and their F; with a problem where they leave none."""
+    pair = dataclasses.replace(pair, K0=K0, K1=K1, R=R, t=t)
+    if np.linalg.det(K0) == 0 or np.linalg.det(K1) == 0:
+        return dataclasses.replace(pair, problem="a calibration matrix is singular")
+    if np.abs(R @ R.T - np.eye(3)).max() > 1e-2:
+        return dataclasses.replace(pair, problem="R is no rotation")
+    if not t.any():
+        return dataclasses.replace(pair, problem="the cameras did not move apart (t is zero), which leaves no F")
+    return dataclasses.replace(pair, F=fundamental(Camera(K0, np.eye(3), np.zeros(3)), Camera(K1, R, t)))
 
 
 def image(family: str, scene: str, name: str, folder: Path | None) -> ImageSource:
@@ -135,11 +123,11 @@ def hloc_matches(
     origin: where it puts the first pixel's centre. images: for sizes where the features file does not hold them. names:
     of the images in the features file. key: of the pair in the matches file; swapped: its first image is our second."""
     with h5.opened(features) as file:
-        points = [_keypoints(file, features, name) - origin for name in names]
+        points = [_keypoints(file, name) - origin for name in names]
         size0, size1 = (_size(file, f"{n}/image_size", image) for n, image in zip(names, images, strict=True))
     with h5.opened(matches) as file:
         counts = [len(p) for p in (reversed(points) if swapped else points)]
-        i, j, score = _read_matches(file, matches, key, key, counts)
+        i, j, score = read_matches(file[key], counts)
     x0, x1 = (p[k] for p, k in zip(points, (j, i) if swapped else (i, j), strict=True))
     return given(x0, x1, (size0, size1), (len(points[0]), len(points[1])), score=score)
 
@@ -150,7 +138,7 @@ def predicted_matches(path: Path, origin: float, images: Images, key: str, swapp
     ``matched_kpts1`` and perhaps ``matched_confidences``, ``all_kpts0``, ``all_kpts1``."""
     with h5.opened(path) as file:
         group = file[key]
-        x, counts, score = (_indexed if h5.holds(group, "matches0") else _matched)(group, path, key)
+        x, counts, score = (_indexed if h5.holds(group, "matches0") else _matched)(group)
         suffixes = ("1", "0") if swapped else ("0", "1")
         sizes = [_size(group, f"image_size{s}", image) for s, image in zip(suffixes, images, strict=True)]
     order = (1, 0) if swapped else (0, 1)
@@ -158,19 +146,19 @@ def predicted_matches(path: Path, origin: float, images: Images, key: str, swapp
     return given(x0, x1, (sizes[0], sizes[1]), (counts[order[0]], counts[order[1]]), score=score)
 
 
-def _indexed(group: Any, path: Path, key: str) -> tuple[list[Matrix], list[int], Matrix | None]:
+def _indexed(group: Any) -> tuple[list[Matrix], list[int], Matrix | None]:
     points = [h5.numbers(group, f"keypoints{k}", None, 2) for k in (0, 1)]
     counts = [len(p) for p in points]
-    i, j, score = _read_matches(group, path, "", key, counts)
+    i, j, score = read_matches(group, counts)
     return [points[0][i], points[1][j]], counts, score
 
 
-def _matched(group: Any, path: Path, key: str) -> tuple[list[Matrix], list[int], Matrix | None]:
+def _matched(group: Any) -> tuple[list[Matrix], list[int], Matrix | None]:
     x = [h5.numbers(group, f"matched_kpts{k}", None, 2) for k in (0, 1)]
     counts = [len(p) for p in x]
     if counts[0] != counts[1]:
         lengths = f"{counts[0]} points in matched_kpts0 and {counts[1]} in matched_kpts1"
-        raise DataError(f"{path}: {key!r} has {lengths}")
+        raise DataError(f"{h5.where(group)} has {lengths}")
     score = h5.numbers(group, "matched_confidences", counts[0]) if h5.holds(group, "matched_confidences") else None
     for k in (0, 1):
         if h5.holds(group, f"all_kpts{k}"):
@@ -233,16 +221,14 @@ def _expect_distinct(names: dict[str, str | None], path: Path) -> None:
             raise DataError(f"{both}; names must tell images apart, such as by their folder")
 
 
-def _read_matches(
-    file: Any, path: Path, key: str, shown: str, counts: Sequence[int]
-) -> tuple[Indices, Indices, Matrix | None]:
-    """The matched keypoints of both images, and scores. Raises DataError for what cannot be of so many keypoints."""
-    prefix, where = f"{key}/" if key else "", f"{path}: {shown + '/matches0'!r}"
-    stored = h5.array(file, f"{prefix}matches0", None)
+def read_matches(group: Any, counts: Sequence[int]) -> tuple[Indices, Indices, Matrix | None]:
+    """The keypoints of both images that the ``matches0`` of a group matches, and their ``matching_scores0``, if any.
+    counts: of keypoints. Raises DataError for what cannot be of so many."""
+    where, stored = h5.where(group, "matches0"), h5.array(group, "matches0", None)
     if stored.dtype.kind not in "iu":
-        raise DataError(f"{path}: {prefix + 'matches0'!r} is of {stored.dtype}; it must hold whole numbers")
-    scored, chosen = h5.holds(file, f"{prefix}matching_scores0"), stored.astype(np.int64)
-    scores = h5.numbers(file, f"{prefix}matching_scores0", len(chosen)) if scored else None
+        raise DataError(f"{where} is of {stored.dtype}; it must hold whole numbers")
+    scored, chosen = h5.holds(group, "matching_scores0"), stored.astype(np.int64)
+    scores = h5.numbers(group, "matching_scores0", len(chosen)) if scored else None
     if len(chosen) != counts[0]:
         raise DataError(f"{where} has {len(chosen)} entries, but the first image has {counts[0]} keypoints")
     if len(chosen) and chosen.min() < NO_MATCH:
@@ -253,10 +239,11 @@ def _read_matches(
     return i, chosen[i], None if scores is None else scores[i]
 
 
-def _keypoints(file: Any, path: Path, name: str) -> Matrix:
+def _keypoints(file: Any, name: str) -> Matrix:
     points = h5.numbers(file, f"{name}/keypoints", None, None)
     if points.shape[1] < 2:
-        raise DataError(f"{path}: {name + '/keypoints'!r} has shape {points.shape}; it must be (n, 2) or wider")
+        where = h5.where(file, f"{name}/keypoints")
+        raise DataError(f"{where} has shape {points.shape}; it must be (n, 2) or wider")
     return points[:, :2]
 
 

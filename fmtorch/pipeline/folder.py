@@ -217,14 +217,13 @@ def folder_workers(pipeline: Pipeline, execution: Execution | None = None) -> Wo
 
 class FolderMatches:
     """Matches pairs of images into a journal, which this process alone writes; what that has already is taken.
-    workers: who does it, not closed at the end; None: those of `folder_workers`. build: makes the pipeline in other
+    workers: who does it, not closed at the end. build: makes the pipeline in other
     processes; None: threads share it. cameras: of the images.
     done, taken, related: pairs matched now, taken from the journal, and of either those that show one scene."""
 
     def __init__(
-        self, pipeline: Pipeline, journal: MatchStore, longest_side: int, orient: bool, seed: int, *,
-        workers: WorkerPool | None = None, build: Callable[[], Pipeline] | None = None,
-        cameras: PhotographCameras | None = None,
+        self, pipeline: Pipeline, journal: MatchStore, workers: WorkerPool, longest_side: int, orient: bool, seed: int,
+        *, build: Callable[[], Pipeline] | None = None, cameras: PhotographCameras | None = None,
     ) -> None:  # fmt: skip
         self.pipeline, self.journal, self.cameras = pipeline, journal, cameras or PhotographCameras()
         self.longest_side, self.orient, self.seed = longest_side, orient, seed
@@ -241,41 +240,31 @@ class FolderMatches:
 
     def images(self, images: Sequence[Path]) -> Iterator[Described | None]:
         """The features of images, in their order; None of one that cannot be read."""
-        with self._pool() as pool:
-            photographs = (self._photograph(image, pool) for image in images)
-            for photograph, result in in_order(pool, self.source, described_or_matched, photographs):
-                self._keep(photograph, result)
-                yield self._described[photograph.path]
-                self._forget(set())
+        photographs = map(self._photograph, images)
+        for photograph, result in in_order(self.workers, self.source, described_or_matched, photographs):
+            self._keep(photograph, result)
+            yield self._described[photograph.path]
+            self._forget(set())
 
     def each(self, pairs: Sequence[Pair]) -> Iterator[None]:
         """Match the pairs, keep what is found of each, and yield after it.
         Raises WorkersLost where workers die whatever they do, or a scheduler is gone."""
         before = self._passed
-        with self._pool() as pool:
-            runner = TaskRunner(pool, self.source, described_or_matched, self._keep, self._keep)
-            for _ in runner.each(self._tasks(pairs, pool)):
-                while before < self._passed:
-                    before += 1
-                    yield
+        runner = TaskRunner(self.workers, self.source, described_or_matched, self._keep, self._keep)
+        for _ in runner.each(self._tasks(pairs)):
+            while before < self._passed:
+                before += 1
+                yield
         yield from [None] * (self._passed - before)
 
     @property
     def _passed(self) -> int:
         return self.done + self.taken + self._failed
 
-    @contextlib.contextmanager
-    def _pool(self) -> Iterator[WorkerPool]:
-        if self.workers is not None:
-            yield self.workers
-            return
-        with folder_workers(self.pipeline) as pool:
-            yield pool
-
-    def _tasks(self, pairs: Sequence[Pair], pool: WorkerPool) -> Iterator[Photograph | DescribedPair | None]:
+    def _tasks(self, pairs: Sequence[Pair]) -> Iterator[Photograph | DescribedPair | None]:
         """Pairs as soon as their images are described, and before them these; None where others must end first."""
         todo = iter(in_blocks(pairs, MEMORY // 2))
-        ahead = max(MEMORY // 2, AHEAD * pool.size)
+        ahead = max(MEMORY // 2, AHEAD * self.workers.size)
         begun, describing = list[Pair](), set[Path]()
         while True:
             ready = next((pair for pair in begun if all(image in self._described for image in pair)), None)
@@ -295,17 +284,17 @@ class FolderMatches:
                         self._described.move_to_end(image)
                     elif image not in describing:
                         describing.add(image)
-                        yield self._photograph(image, pool)
+                        yield self._photograph(image)
                 self._forget({image for pair in begun for image in pair})
             elif begun:
                 yield None
             else:
                 return
 
-    def _photograph(self, image: Path, pool: WorkerPool) -> Photograph:
+    def _photograph(self, image: Path) -> Photograph:
         try:
             source: ImageSource | str = self.cameras.source(image)
-            if pool.execution.send_images:
+            if self.workers.execution.send_images:
                 source = dataclasses.replace(source, data=image.read_bytes())  # type: ignore[type-var]
         except (DataError, OSError) as error:  # no camera, or no file
             source = in_a_line(error)

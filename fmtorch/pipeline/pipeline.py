@@ -24,9 +24,10 @@ from fmtorch.jobs.execution import one_thread
 from fmtorch.presets.composition import PIPELINES, build_pruners, compose, plain
 from fmtorch.presets.files import available, unknown
 from fmtorch.presets.objects import instantiate, open_files
-from fmtorch.runs.feature_cache import cached
+from fmtorch.runs.feature_cache import CachedFeatures, cached
 from fmtorch.two_view.arguments import expect_possible
-from fmtorch.two_view.pair_type import PairTypes, classify
+from fmtorch.two_view.known_cameras import KnownCameras
+from fmtorch.two_view.pair_type import PairTypes, classify, compile_with
 
 Key = TypeVar("Key")
 Value = TypeVar("Value")
@@ -147,7 +148,6 @@ class Pipeline:
             raise ValueError(f"the estimator gives {gives} matrices; a pipeline needs {model} matrices here{hint}")
         self.extractor, self.matcher, self.pruners, self.estimator = features, matcher, dict(pruners), estimator
         self.families = dict(families or {})
-        self.memory = memory
         self.device = torch.device(device)
         self.debug, self.tracebacks = debug, dict[str, str]()
         self._memo: Memo[Hashable, tuple[Features, float]] = Memo(memory)
@@ -175,7 +175,7 @@ class Pipeline:
 
     def extract(self, image: NDArray[np.uint8]) -> tuple[Features, float]:
         """The features of pixels on the pipeline's device, and the seconds that computing them takes or took."""
-        if isinstance(self.extractor, stages.TimedExtractor):
+        if isinstance(self.extractor, CachedFeatures):
             features, seconds = self.extractor.timed(image)
             return features.to(self.device), seconds
         start = time.perf_counter()
@@ -185,7 +185,10 @@ class Pipeline:
 
     def correspondences(self, pairs: Sequence[ImagePair]) -> list[Outcome]:
         """Take pairs through the stages before estimation; a pair that fails has a reason and harms no other."""
-        return self._batched("pruning", self._prune, [self._match(pair) for pair in pairs])
+        return self._pruned([self._match(pair) for pair in pairs])
+
+    def _pruned(self, outcomes: Sequence[Outcome]) -> list[Outcome]:
+        return self._batched("pruning", self._prune, outcomes)
 
     def estimate(self, outcomes: Sequence[Outcome], seed: int = 0) -> list[Outcome]:
         return self._batched("estimation", functools.partial(self._estimate, seed=seed), outcomes)
@@ -205,13 +208,15 @@ class Pipeline:
                 raise ValueError(f"{name} returned matches that cannot be: {error}") from error
         return c
 
-    def estimated(self, c: Correspondences, seed: int = 0, estimator: Estimator | None = None) -> Estimate:
-        """The estimate of a batch with its significance; estimator: another one than the pipeline's."""
-        used = estimator or self.estimator
+    def estimated(self, c: Correspondences, seed: int = 0) -> Estimate:
+        """The estimate of a batch with its significance, and with its cameras where the matches ask for them."""
+        used = KnownCameras(self.estimator) if c.asks_for_cameras else self.estimator
         return judged(expect_finite(stages.output_of(used, used(c, seed), Estimate, c).detach()), c)
 
     def run(self, pairs: Sequence[ImagePair], seed: int = 0) -> list[Outcome]:
-        return self.estimate(self.correspondences(pairs), seed)
+        matched = [self._match(pair) for pair in pairs]
+        compile_with([*self.pruners.values(), self.estimator])  # not before: other threads may be at it
+        return self.estimate(self._pruned(matched), seed)
 
     def _batched(self, stage: str, function: Stage, outcomes: Sequence[Outcome]) -> list[Outcome]:
         """A batched stage over the pairs with matches; where it raises, pair by pair: only the culprit fails."""
@@ -294,9 +299,17 @@ class Pipeline:
         return result
 
     def _estimate(self, outcomes: list[Outcome], seed: int) -> list[Outcome]:
-        estimate = self.estimated(collated(outcomes), seed)
-        each = ((outcome, estimate[i], estimate.reason[i]) for i, outcome in enumerate(outcomes))
-        return [dataclasses.replace(outcome, estimate=own, reason=reason) for outcome, own, reason in each]
+        c = collated(outcomes)
+        given = [outcome.pair.given for outcome in outcomes]
+        for name in given[0] or ():
+            values = [None if each is None else each[name] for each in given]
+            known = [value.to(c.mask.device) for value in values if value is not None]
+            c = c.derived(**{name: torch.stack(known) if known else None})
+        estimate = self.estimated(c, seed)
+        return [
+            dataclasses.replace(outcome, correspondences=c[i], estimate=estimate[i], reason=estimate.reason[i])
+            for i, outcome in enumerate(outcomes)
+        ]
 
     def _alone(self, stage: str, function: Stage, outcome: Outcome) -> Outcome:
         """A stage on a single pair; what it raises becomes the reason for that pair's failure."""
@@ -315,41 +328,34 @@ class Pipeline:
         return reason
 
 
-Knowledge = Callable[[Correspondences], Correspondences]
-
-
-def examined(
-    pipeline: Pipeline, outcomes: Sequence[Outcome], seed: int = 0, knowledge: Knowledge | None = None
-) -> list[Outcome]:
+def examined(pipeline: Pipeline, outcomes: Sequence[Outcome], seed: int = 0) -> list[Outcome]:
     """The outcomes of a run with their pair types; a pair that cannot be examined has none and harms no other.
-    knowledge: gives correspondences what the estimator was given of their cameras; None: nothing, and their K counts
-    for nothing here. Matches of the results have what it gives. Of homographies nothing is asked."""
+    Where the estimator was given nothing of the cameras, K counts for nothing here. Of homographies nothing is asked.
+    """
     if stages.model_of(pipeline.estimator) != "fundamental":
         return list(outcomes)
     matched = [i for i, o in enumerate(outcomes) if o.correspondences is not None and o.estimate is not None]
     results = list(outcomes)
     with one_thread(pipeline.device):
         try:
-            own = _examined([outcomes[i] for i in matched], seed, knowledge) if matched else []
+            own = _examined([outcomes[i] for i in matched], seed) if matched else []
         except Exception:  # whose fault it is shows pair by pair
-            own = [_pair_alone(outcomes[i], seed, knowledge) for i in matched]
+            own = [_pair_alone(outcomes[i], seed) for i in matched]
     for i, outcome in zip(matched, own, strict=True):
         results[i] = outcome
     return results
 
 
-def _examined(outcomes: Sequence[Outcome], seed: int, knowledge: Knowledge | None) -> list[Outcome]:
+def _examined(outcomes: Sequence[Outcome], seed: int) -> list[Outcome]:
     c = collated(outcomes)
     estimate = collate([o.estimate for o in outcomes if o.estimate is not None])
-    c = c if knowledge is None else knowledge(c)
-    pair_type = classify(c.derived(K0=None, K1=None) if knowledge is None else c, estimate, seed=seed)
-    each = ((outcome, c[i], pair_type.of_pair(i)) for i, outcome in enumerate(outcomes))
-    return [dataclasses.replace(outcome, correspondences=own, pair_type=kind) for outcome, own, kind in each]
+    pair_type = classify(c if outcomes[0].pair.given else c.derived(K0=None, K1=None), estimate, seed=seed)
+    return [dataclasses.replace(outcome, pair_type=pair_type.of_pair(i)) for i, outcome in enumerate(outcomes)]
 
 
-def _pair_alone(outcome: Outcome, seed: int, knowledge: Knowledge | None) -> Outcome:
+def _pair_alone(outcome: Outcome, seed: int) -> Outcome:
     try:
-        return _examined([outcome], seed, knowledge)[0]
+        return _examined([outcome], seed)[0]
     except Exception as error:  # what it is in stays unknown, and the row says why
         reason = f"not examined: {type(error).__name__}: {error}".splitlines()[0]
         return dataclasses.replace(outcome, not_examined=reason)

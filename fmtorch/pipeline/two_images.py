@@ -24,7 +24,7 @@ from fmtorch.pipeline import photographs, pictures
 from fmtorch.pipeline.pair_geometries import pair_geometries
 from fmtorch.pipeline.photographs import GivenImage, Image, frames_to_original, given_image, to_original
 from fmtorch.pipeline.pipeline import Clock, Pipeline, load_pipeline
-from fmtorch.two_view import arguments, known_cameras
+from fmtorch.two_view import arguments
 from fmtorch.two_view.lenses import CalibratedLenses
 from fmtorch.two_view.pair_type import classify, compile_with, still_warning, warnings_of
 
@@ -132,17 +132,15 @@ class MatchResult:
         folder.mkdir(parents=True, exist_ok=True)
         drawn = {"matches": True, "pruning": bool(self._pruners), "epipolar": self.ok or truth is not None}
         names = [name for name in get_args(Picture) if drawn[name]]
-        with files.replacing(folder / "result.json") as path:
-            path.write_text(json.dumps({**(report or {}), **self.report()}) + "\n")
+        files.write_whole(folder / "result.json", json.dumps({**(report or {}), **self.report()}) + "\n")
         for name in get_args(Picture):
             path = folder / f"{name}.png"
             if name not in names:  # of an earlier run
                 path.unlink(missing_ok=True)
                 continue
-            with files.replacing(path) as temporary:
-                nsgd = (report or {}).get("nsgd")
-                picture = self._epipolar(truth, nsgd) if name == "epipolar" else self.draw(name)
-                temporary.write_bytes(cv2.imencode(".png", picture[..., ::-1])[1].tobytes())
+            nsgd = (report or {}).get("nsgd")
+            picture = self._epipolar(truth, nsgd) if name == "epipolar" else self.draw(name)
+            files.write_whole(path, cv2.imencode(".png", picture[..., ::-1])[1].tobytes())
         return ["result.json", *(f"{name}.png" for name in names)]
 
     def report(self) -> dict[str, Any]:
@@ -389,8 +387,7 @@ def _estimated(
     pipeline: Pipeline, matched: MatchResult, c: Correspondences, scales: list[Tensor], seed: int, clock: Clock
 ) -> MatchResult:
     """The result with an estimate. c: the matches as pinholes have them, with what is known of the cameras."""
-    estimator = known_cameras.KnownCameras(pipeline.estimator) if c.asks_for_cameras else pipeline.estimator
-    estimate = pipeline.estimated(c, seed, estimator)
+    estimate = pipeline.estimated(c, seed)
     clock("estimation")
     lenses = matched.lenses
     if estimate.lens is not None:

@@ -68,37 +68,25 @@ class PairRow:
     match_recall: float | None = None  # the estimator's inliers that are right, and of all right ones those it found
 
     def __post_init__(self) -> None:
-        if self.corner_error is not None:
-            _expect_homography(self)
-            return
-        if not 0.0 <= self.nsgd <= 1.0:
-            raise ValueError(f"pair {self.pair!r}: nsgd is {self.nsgd}; it must be in [0, 1]")
+        planar = self.corner_error is not None
+        name, matrix = ("H", self.H) if planar else ("F", self.F)
+        error, worst = (self.corner_error, math.inf) if self.corner_error is not None else (self.nsgd, 1.0)
         angles = [a for a in (self.rotation_error, self.translation_error) if a is not None and not math.isnan(a)]
-        if len(angles) == 1 or not all(0.0 <= a <= 180.0 for a in angles):
-            both = f"rotation_error is {self.rotation_error} and translation_error is {self.translation_error}"
-            raise ValueError(f"pair {self.pair!r}: {both}; both must be angles in [0, 180] degrees, or neither known")
-        if self.related and not self.ok:
-            raise ValueError(f"pair {self.pair!r} failed, but is called related")
-        if self.ok:
-            if self.reason:
-                raise ValueError(f"pair {self.pair!r} is ok but has a reason of failure: {self.reason!r}")
-            if self.F is None or len(self.F) != 9 or not all(map(math.isfinite, self.F)):
-                raise ValueError(f"pair {self.pair!r} is ok: F must be nine finite numbers, but is {self.F}")
-        elif not self.reason or self.nsgd != 1.0 or self.F is not None:
-            values = f"reason={self.reason!r}, nsgd={self.nsgd}, F={self.F}"
-            raise ValueError(f"pair {self.pair!r} failed: it needs a reason, nsgd 1 and no F, but has {values}")
-
-
-def _expect_homography(row: PairRow) -> None:
-    error, H = row.corner_error, row.H
-    if error is None or not error >= 0.0 or not math.isnan(row.nsgd) or row.F is not None:
-        needs, has = "a corner error of at least 0, NSGD NaN and no F", f"nsgd={row.nsgd}, F={row.F}"
-        raise ValueError(f"pair {row.pair!r} has a homography: it needs {needs}, but has corner_error={error}, {has}")
-    has_homography = H is not None and len(H) == 9 and all(map(math.isfinite, H))
-    if row.ok != has_homography or row.ok == bool(row.reason) or (not row.ok and math.isfinite(error)):
-        needs = "nine finite numbers of H and no reason, or a reason, no H and an infinite corner error"
-        has = f"H={H}, reason={row.reason!r}, corner_error={error}"
-        raise ValueError(f"pair {row.pair!r} has a homography: it needs {needs}, but has {has}")
+        sound = matrix is not None and len(matrix) == 9 and all(map(math.isfinite, matrix))
+        needs = {
+            "an nsgd in [0, 1]": planar or 0.0 <= error <= 1.0,
+            "a corner error of at least 0, NSGD NaN and no F": not planar
+            or (error >= 0.0 and math.isnan(self.nsgd) and self.F is None),
+            "angles of both pose errors in [0, 180] degrees, or neither": len(angles) != 1
+            and all(0.0 <= a <= 180.0 for a in angles),
+            f"nine finite numbers of {name} and no reason, as it is ok": not self.ok or (sound and not self.reason),
+            f"a reason, no {name} and the largest error ({worst:g}), and not to be related, as it failed": self.ok
+            or (bool(self.reason) and matrix is None and error == worst and not self.related),
+        }
+        if lacking := [what for what, is_so in needs.items() if not is_so]:
+            names = ("ok", "reason", "related", "nsgd", "corner_error", "F", "H", "rotation_error", "translation_error")
+            has = ", ".join(f"{name}={getattr(self, name)}" for name in names)
+            raise ValueError(f"pair {self.pair!r} needs {lacking[0]}, but has {has}")
 
 
 _ARROW: dict[Any, pa.DataType] = {

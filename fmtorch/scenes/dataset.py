@@ -27,7 +27,7 @@ from fmtorch.jit.together import compile_together
 from fmtorch.jobs.execution import Execution, cores
 from fmtorch.jobs.runner import MAX_PROCESSES, Local, TaskRunner, WorkerPool
 from fmtorch.scenes import landmarks, videos
-from fmtorch.scenes.light import DrawnScene, Shot, Stage, affine, expose, footprints, group_by_texture, shade
+from fmtorch.scenes.light import DrawnScene, Shot, Stage, expose, footprints, group_by_texture, shade
 from fmtorch.scenes.raycast import Camera, Geometry, Matrix, calibration, cast_pieces, fundamental, relative_pose
 from fmtorch.scenes.surfaces import Pixels, skimage_file
 
@@ -42,7 +42,7 @@ SPLITS = ("test", "train")
 RECORD = Path(__file__).with_name("pairs.json")
 Progress = Callable[[int, int], None]
 
-KERNELS = (cast_pieces, shade, footprints, affine, group_by_texture)  # that drawing calls, slowest first
+KERNELS = (cast_pieces, shade, footprints, group_by_texture)  # that drawing calls, slowest first
 
 
 @dataclasses.dataclass(frozen=True)
@@ -312,7 +312,7 @@ class RenderedPairs(HeldPairs):
         scene, _, number = image.identity.rpartition("/")
         return depth_at(self._tasks[scene], int(number), points)
 
-    def scene_pairs(self) -> "RenderedScenePairs":
+    def scene_pairs(self) -> ScenePairs:
         """All pairs of the photographs of each scene, as candidates to select from."""
         scenes = []
         for name, views in self._views.items():
@@ -321,18 +321,7 @@ class RenderedPairs(HeldPairs):
                 for i, (path, camera) in enumerate(views)
             ]
             scenes.append(Scene(name, self._tasks[name].family, drawn, AllPairs(len(drawn))))
-        return RenderedScenePairs(self, scenes)
-
-
-class RenderedScenePairs(ScenePairs):
-    """All pairs of the photographs of rendered scenes; drawn: these scenes as a data set, which knows the depth."""
-
-    def __init__(self, drawn: RenderedPairs, scenes: Sequence[Scene]) -> None:
-        super().__init__("rendered", scenes, (), (drawn.digest,))
-        self.drawn = drawn
-
-    def depth(self, image: ImageSource, points: Matrix) -> Matrix:
-        return self.drawn.depth(image, points)
+        return ScenePairs("rendered", scenes, (), (self.digest,), depth=self.depth)
 
 
 _FILES = ("motorcycle_left.png", "motorcycle_right.png", "motorcycle_disp.npz")
@@ -360,14 +349,3 @@ class StereoPair(HeldPairs):
         images = [ImageSource(f"motorcycle/{side}", self._paths[i]) for i, side in enumerate(("left", "right"))]
         identity, truth = f"{self.name}/motorcycle/left-right", _truth(left, right)
         self._pairs = [ImagePair(identity, self.name, "motorcycle", images[0], images[1], *truth)]
-
-    def matches(self) -> tuple[Matrix, Matrix]:
-        """Points (n, 2) on the left and where they are on the right, for every pixel with a measured disparity."""
-        with np.load(self._paths[2]) as file:
-            disparity = file["arr_0"].astype(np.float64)
-        known = np.isfinite(disparity)
-        y, x = np.nonzero(known)
-        left = np.stack([x, y], -1).astype(np.float64)
-        right = left - np.stack([disparity[known], np.zeros(len(left))], -1)
-        inside = (right[:, 0] >= 0) & (right[:, 0] <= disparity.shape[1] - 1)
-        return left[inside], right[inside]

@@ -74,16 +74,6 @@ class Lighting(NamedTuple):
 
 
 @kernel(always_compiled=True)
-def affine(seen: Seen, column: int, out: F4x1) -> None:
-    """One column of the table at each pixel (m,) that sees a surface."""
-    piece, s, t, table = seen
-    for p in range(len(piece)):
-        i = piece[p]
-        if i >= 0:
-            out[p] = table[i, 0, column] + s[p] * table[i, 1, column] + t[p] * table[i, 2, column]
-
-
-@kernel(always_compiled=True)
 def footprints(seen: Seen, width: int, mapping: Mapping, out: Footprints, count: I8x1) -> None:
     """What is known of each pixel before transcendental functions are taken -> out.
     width: of the rows of pixels. count: pixels of each texture, added to."""
@@ -244,7 +234,9 @@ class Stage:
         self.table[..., 6] = geometry.normals @ toward
         self.table[..., 7] = geometry.normals[..., 2]
         self.shadow: Floats = np.full((SHADOW_MAP, SHADOW_MAP), np.inf, dtype=np.float32)
-        affine(Seen(*hits.flat(), self.table), 4, self.shadow.reshape(-1))
+        lit = hits.piece >= 0
+        corner, right, down = self.table[..., 4][hits.piece[lit]].T
+        self.shadow[lit] = corner + hits.s[lit] * right + hits.t[lit] * down
 
     def radiance(self, camera: Camera, offset: tuple[Real, Real]) -> Floats:
         hits = self.geometry.look(camera, offset)

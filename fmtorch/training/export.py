@@ -23,13 +23,15 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from fmtorch import metrics
-from fmtorch.core import Estimator, replacing
+from fmtorch.core import Estimator
+from fmtorch.core.files import replacing, write_whole
 from fmtorch.metrics.recall import FINE_THRESHOLD
 from fmtorch.pruning.networks import layers, learned
 from fmtorch.training.labelled import LabelledMatches
 from fmtorch.training.objective import classification_loss
 
 MAX_TEMPERATURE = 100.0  # and its inverse: bounds where the labels set none, as when they are perfectly separated
+BINS = 10  # of a table of reliability
 BISECTIONS = 50  # halvings of the interval of log temperature: 9.2 / 2^50
 
 
@@ -179,33 +181,25 @@ def temperature(logit: Float[Tensor, "*matches"], label: Int8[Tensor, "*matches"
     return math.exp((low + high) / 2)
 
 
-def reliability(
-    probability: Float[Tensor, "*matches"], label: Int8[Tensor, "*matches"], *, bins: int = 10
-) -> Reliability:
+def reliability(probability: Float[Tensor, "*matches"], label: Int8[Tensor, "*matches"]) -> Reliability:
     """Predicted probabilities against observed shares of inliers.
 
     Args:
         probability: that a match is an inlier, of any shape.
         label: 1 inlier, 0 outlier, -1 ignored.
-        bins: of equal width from 0 to 1; a probability of 1 falls in the last.
 
     Returns:
-        The table and the expected calibration error, float64.
-
-    Raises:
-        ValueError: bins is less than 1.
+        The table and the expected calibration error, float64; a probability of 1 falls in the last of `BINS`.
     """
-    if bins < 1:
-        raise ValueError(f"bins is {bins}; it must be at least 1")
     labelled = label >= 0
     p = probability.detach()[labelled].to(torch.float64)
     target = (label[labelled] > 0).to(torch.float64)
-    index = (p * bins).long().clamp(0, bins - 1)
-    count = torch.bincount(index, minlength=bins)
-    sums = [torch.bincount(index, weights=x, minlength=bins) for x in (p, target)]
+    index = (p * BINS).long().clamp(0, BINS - 1)
+    count = torch.bincount(index, minlength=BINS)
+    sums = [torch.bincount(index, weights=x, minlength=BINS) for x in (p, target)]
     predicted, observed = (s / count for s in sums)
     error = float((sums[0] - sums[1]).abs().sum() / count.sum())
-    edges = torch.linspace(0, 1, bins + 1, dtype=torch.float64, device=p.device)
+    edges = torch.linspace(0, 1, BINS + 1, dtype=torch.float64, device=p.device)
     return Reliability(edges, count, predicted, observed, error)
 
 
@@ -266,8 +260,15 @@ def onnx_model(network: nn.Module, example: Tensor, name: str, output: str, *, f
             dynamic_shapes=({free_axis: torch.export.Dim("n", min=1)},), verbose=False,
         )  # fmt: skip
     assert program is not None
-    forget_origin(model := program.model_proto)
-    return model
+    return without_origin(program.model_proto)
+
+
+def without_origin(model: Any) -> Any:
+    """An ONNX model without the notes and properties of its graph, of nodes and values, and of the graphs within."""
+    import onnx_ir.passes.common
+
+    cleared = onnx_ir.passes.common.ClearMetadataAndDocStringPass()(onnx_ir.from_proto(model))
+    return onnx_ir.to_proto(cleared.model)
 
 
 def expect_equal(path: Path, exported: Tensor, expected: Tensor) -> None:
@@ -306,25 +307,6 @@ def _metadata(network: nn.Module, temperature: float, notes: Mapping[str, str] |
     return learned.LearnedFile(learned.stated_network(network), float(temperature), dict(notes or {})).metadata()
 
 
-def forget_origin(model: Any) -> None:
-    """Clear the notes and properties of a model's graph, of its nodes and values, and of the graphs within them."""
-    _forget(model.graph)
-    for function in model.functions:
-        for node in function.node:
-            _forget(node)
-
-
-def _forget(part: Any) -> None:
-    """Clear those of a message of ONNX and of all messages within it."""
-    for note in ("metadata_props", "doc_string"):
-        if note in part.DESCRIPTOR.fields_by_name:
-            part.ClearField(note)
-    for field, value in part.ListFields():
-        if field.message_type is not None:
-            for inner in [value] if hasattr(value, "ListFields") else value:  # or repeated
-                _forget(inner)
-
-
 @dataclasses.dataclass(frozen=True, eq=False)
 class Result:
     """A finished training: files, figures and the temperature of its log-odds."""
@@ -350,10 +332,8 @@ def write_result(
         files.append(folder / f"{name}.onnx")
         export_onnx(network, files[-1], temperature=fitted)
     card = folder / f"{name}.md"
-    with replacing(card) as temporary:
-        temporary.write_text(model_card(files, facts, evaluation, fitted), encoding="utf-8")
-    with replacing(folder / "validation.json") as temporary:
-        temporary.write_text(json.dumps({**evaluation.figures, "temperature": fitted}, indent=2) + "\n")
+    write_whole(card, model_card(files, facts, evaluation, fitted))
+    write_whole(folder / "validation.json", json.dumps({**evaluation.figures, "temperature": fitted}, indent=2) + "\n")
     return Result((*files, card), evaluation, fitted)
 
 

@@ -22,7 +22,7 @@ from fmtorch.runs.fingerprint import configuration, environment
 from fmtorch.training import labelled
 from fmtorch.training.stored_matches import ARRAYS, FORMAT, Shard, ShardError, StoredMatches, write_shard
 
-MAX_MATCHES = 4000  # matches kept of a pair
+MAX_MATCHES = 4000  # kept of a pair, the least ambiguous
 Progress = Callable[[int, int], None]  # called with (pairs done, pairs in all)
 SHARD = 32  # pairs in a file, all of one scene: what an interruption can cost; a change is one of FORMAT
 PRELOADED = (__name__,)  # by the process that workers are forked of
@@ -44,14 +44,13 @@ class MatchedPairs(StoredMatches):
         overrides: changes of a named pipeline, as on the command line, e.g. ``["pruner=[one_to_one]"]``.
         root: the folder of such folders, by default ``matched`` in the cache folder.
         workers: threads, by default one a core. progress: called with (pairs done, pairs in all).
-        most: matches kept of a pair, the least ambiguous.
         augmentation, seed: as of `StoredMatches`.
         execution: other workers than these threads. build: makes the pipeline in other processes, where it is given as
             an object; pickled, as is the data set.
         labels: pixels: by depth or the epipolar lines; geodesic: OANet's, for which the cameras must be known.
 
     Raises ValueError for an unknown pipeline, for one whose stages do not say what defines their results, for an empty
-    data set, for `most` below 1, and where every pair fails.
+    data set, and where every pair fails.
 
     Example:
         >>> from fmtorch.data import load
@@ -65,12 +64,10 @@ class MatchedPairs(StoredMatches):
     def __init__(
         self, dataset: PairDataset, pipeline: Pipeline | str, *, overrides: Sequence[str] = (),
         root: str | Path | None = None, workers: int | None = None, progress: Progress | None = None,
-        most: int = MAX_MATCHES, augmentation: labelled.Augmentation | None = None, seed: int = 0,
+        augmentation: labelled.Augmentation | None = None, seed: int = 0,
         execution: Execution | None = None, build: Callable[[], Pipeline] | None = None,
         labels: labelled.Rule = "pixels",
     ) -> None:  # fmt: skip
-        if most < 1:
-            raise ValueError(f"most is {most}; at least 1 match of a pair must be kept")
         if not len(dataset):
             raise ValueError(f"the data set {dataset.name} has no pairs")
         if (model := getattr(dataset, "model", "fundamental")) != "fundamental":
@@ -85,7 +82,7 @@ class MatchedPairs(StoredMatches):
         if build is None and not execution.shared:
             raise ValueError("other processes need to make the pipeline: give its name, or `build`")
         home = Path(root).expanduser() if root is not None else files.cache_dir() / "matched"
-        identity = _identity(dataset, stages, most, labels)
+        identity = _identity(dataset, stages, labels)
         folder = home / f"{dataset.name}-{identity_digest(identity)[:16]}"
         settings.claim(folder / "about.json", identity, "matches", "delete the folder", alone=False)
         pairs = [dataset[i] for i in range(len(dataset))]
@@ -95,13 +92,13 @@ class MatchedPairs(StoredMatches):
         done, total = len(pairs) - sum(len(job.pairs) for job in missing), len(pairs)
         report = progress or (lambda done, total: None)
         report(done, total)
-        for count in compute_shards(dataset, stages, build, missing, rules=Rules(most, labels), execution=execution):
+        for count in compute_shards(dataset, stages, build, missing, labels, execution):
             done += count
             report(done, total)
         super().__init__(folder, augmentation=augmentation, seed=seed)
 
 
-def _identity(dataset: PairDataset, stages: Pipeline, most: int, rule: labelled.Rule) -> dict[str, Any]:
+def _identity(dataset: PairDataset, stages: Pipeline, rule: labelled.Rule) -> dict[str, Any]:
     extractor: Any = stages.extractor
     extractor = extractor.extractor if isinstance(extractor, CachedFeatures) else extractor
     families = [stages.families] if stages.families else []
@@ -113,7 +110,7 @@ def _identity(dataset: PairDataset, stages: Pipeline, most: int, rule: labelled.
     rules += [labelled.INLIER_PX, labelled.OUTLIER_PX, labelled.EDGE_PX]
     rules = rules if rule == "pixels" else [rule, oanet.GEODESIC]
     return {
-        "format": FORMAT, "dataset": [dataset.name, dataset.digest], "most": most,
+        "format": FORMAT, "dataset": [dataset.name, dataset.digest], "most": MAX_MATCHES,
         "labels": [labelled.VERSION, *rules],
         "stages": parts, "environment": environment(),
     }  # fmt: skip
@@ -158,20 +155,13 @@ def partition(pairs: Sequence[ImagePair]) -> list[list[int]]:
     return shards
 
 
-class Rules(NamedTuple):
-    """How many matches are kept of a pair, the best by ratio, and what their labels go by."""
-
-    most: int
-    labels: labelled.Rule
-
-
 class Matching(NamedTuple):
     """What pairs are matched and labelled by.
-    dataset: where they are from. pipeline: its stages before estimation are run."""
+    dataset: where they are from. pipeline: its stages before estimation are run. labels: what they go by."""
 
     dataset: PairDataset
     pipeline: Pipeline
-    rules: Rules
+    labels: labelled.Rule
 
 
 class Job(NamedTuple):
@@ -181,19 +171,19 @@ class Job(NamedTuple):
     pairs: list[ImagePair]
 
 
-def matching(dataset: PairDataset, build: Callable[[], Pipeline], rules: Rules, images: int = _IMAGES) -> Matching:
+def matching(
+    dataset: PairDataset, build: Callable[[], Pipeline], labels: labelled.Rule, images: int = _IMAGES
+) -> Matching:
     """The matching by the stages of a pipeline that is built, with the features of so many images kept."""
     stages = build()
-    pipeline = Pipeline(
-        stages.extractor, stages.matcher, stages.pruners, stages.estimator,
-        device=stages.device, memory=images, families=stages.families,
-    )  # fmt: skip
-    return Matching(dataset, pipeline, rules)
+    parts = stages.extractor, stages.matcher, stages.pruners, stages.estimator
+    pipeline = Pipeline(*parts, device=stages.device, memory=images, families=stages.families)
+    return Matching(dataset, pipeline, labels)
 
 
 def compute_shards(
-    dataset: PairDataset, stages: Pipeline, build: Callable[[], Pipeline] | None, jobs: Sequence[Job], *, rules: Rules,
-    execution: Execution,
+    dataset: PairDataset, stages: Pipeline, build: Callable[[], Pipeline] | None, jobs: Sequence[Job],
+    labels: labelled.Rule, execution: Execution,
 ) -> Iterator[int]:  # fmt: skip
     """Write each job's shard; yields the number of its pairs when it is written.
     stages: the pipeline whose stages before estimation are run by threads; build: makes it in other processes, pickled.
@@ -201,10 +191,10 @@ def compute_shards(
     pool = WorkerPool(execution, PRELOADED)
     source: Source[Matching]
     if execution.shared:
-        source = Local(matching(dataset, lambda: stages, rules, _IMAGES * pool.size))
+        source = Local(matching(dataset, lambda: stages, labels, _IMAGES * pool.size))
     else:
         assert build is not None
-        source = Factory(functools.partial(matching, dataset, build, rules))
+        source = Factory(functools.partial(matching, dataset, build, labels))
     runner = TaskRunner(pool, source, matched_rows, lambda job, rows: write_shard(job.path, rows))
     threads = torch.get_num_threads(), cv2.getNumThreads()
     use_one_thread()
@@ -231,11 +221,11 @@ def _row(how: Matching, outcome: Outcome) -> dict[str, Any]:
     }  # fmt: skip
     if c is None:
         return row
-    c = _best(c.detach().to("cpu").compact(), how.rules.most)
+    c = _best(c.detach().to("cpu").compact())
     if not len(c.x0[0]):
         return {**row, "reason": "no matches are left"}
     x0, x1 = (x[0].to(torch.float64).numpy() for x in (c.x0.to(torch.float32), c.x1.to(torch.float32)))
-    labels = labelled.label(how.dataset, pair, x0, x1, how.rules.labels)
+    labels = labelled.label(how.dataset, pair, x0, x1, how.labels)
     norm = np.linalg.norm(pair.F) or 1.0  # zero where the pair determines none
     row |= {
         "matches": len(labels), "inliers": int((labels == 1).sum()), "outliers": int((labels == 0).sum()),
@@ -245,12 +235,12 @@ def _row(how: Matching, outcome: Outcome) -> dict[str, Any]:
     return row | {name: x.to(getattr(torch, kind)).reshape(-1).numpy() for name, x, kind in tensors if x is not None}
 
 
-def _best(c: Correspondences, most: int) -> Correspondences:
-    """The `most` least ambiguous matches of a single pair, in their order (the first ones where nothing ranks them)."""
+def _best(c: Correspondences) -> Correspondences:
+    """The `MAX_MATCHES` least ambiguous matches of a single pair, in their order; the first if nothing ranks them."""
     n = c.x0.shape[1]
-    if n <= most:
+    if n <= MAX_MATCHES:
         return c
     rank = torch.arange(n) if c.ambiguity is None else torch.argsort(c.ambiguity[0], stable=True)
     kept = torch.zeros_like(c.mask)
-    kept[0, rank[:most]] = True
+    kept[0, rank[:MAX_MATCHES]] = True
     return c.keep(kept).compact()

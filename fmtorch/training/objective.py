@@ -77,19 +77,14 @@ def fits(
     return eight_point(x0, x1, prediction.weight.to(torch.float64), c.mask.expand(prediction.weight.shape))
 
 
-def classification_loss(
-    logit: Float[Tensor, "*stages b n"], label: Int8[Tensor, "*#stages b n"], *, balanced: bool = False
-) -> Float[Tensor, ""]:
+def classification_loss(logit: Float[Tensor, "*stages b n"], label: Int8[Tensor, "*#stages b n"]) -> Float[Tensor, ""]:
     """Cross-entropy of labelled matches: the mean over the matches of each pair, then over pairs, then over stages.
 
-    Without class balance its optimum is the calibrated log-odds that a match is an inlier. With it (Yi et al., CVPR
-    2018) both classes of a pair count equally and the log-odds of its share of inliers are taken off the logit
-    first, so that the optimum is the same: the logit stays the log-odds under the pair's own mixture of classes.
+    Classes are not balanced, unlike by Yi et al. (CVPR 2018): the optimum is the log-odds that a match is an inlier.
 
     Args:
         logit: log-odds that a match is an inlier, of one or more stages.
         label: 1 inlier, 0 outlier, -1 ignored, also in masked slots; the same for all stages, or of each.
-        balanced: whether both classes of a pair count equally.
 
     Returns:
         The loss in nats. Its gradient with respect to a logit is at most 1; a pair with one class only is judged by it.
@@ -98,12 +93,6 @@ def classification_loss(
     logit = torch.where(labelled, logit.to(torch.promote_types(logit.dtype, torch.float32)), 0.0)
     target = (label > 0).to(logit.dtype)
     weight = labelled.to(logit.dtype)
-    if balanced:
-        # One more of each class, in weights and log-odds alike, keeps the optimum and serves pairs of one class.
-        inliers = arithmetic.stable_sum(target)[..., None] + 1
-        outliers = arithmetic.stable_sum(weight - target)[..., None] + 1
-        logit = torch.where(labelled, logit - (inliers / outliers).log(), 0.0)
-        weight = weight * torch.where(label > 0, 1 / inliers, 1 / outliers)
     total = arithmetic.stable_sum(weight)
     weight = weight / torch.where(total > 0, total, 1.0)[..., None]
     entropy = torch.nn.functional.softplus(logit) - target * logit

@@ -35,7 +35,8 @@ from torch.utils.data import DataLoader
 from fmtorch import data, presets
 from fmtorch.core import expect_options, settings, terminal
 from fmtorch.core.version import __version__
-from fmtorch.data import ImagePair, PairDataset, construction, read_image, subset
+from fmtorch.data import ImagePair, PairDataset, construction, read_image
+from fmtorch.data.pairs import PairSubset
 from fmtorch.evaluation.run import select
 from fmtorch.io import H5Pairs, h5
 from fmtorch.pipeline import pictures
@@ -380,7 +381,7 @@ def labelled_matches(config: DictConfig, options: TrainOptions, progress: Progre
             return source.matches.select(indices)
         labels = "pixels" if isinstance(source, PlanePairs) else options.labels
         return MatchedPairs(
-            subset(source, indices) if len(indices) < len(source) else source, front(config),
+            PairSubset(source, indices) if len(indices) < len(source) else source, front(config),
             execution=execution_of(config, config.workers).decided(False), build=functools.partial(front, config),
             progress=terminal.reporter(progress, f"matches {what}"), labels=labels,
         )  # fmt: skip

@@ -24,7 +24,7 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from fmtorch.core.files import replacing
 from fmtorch.features.onnx_network import PATCH_SHAPE, PatchNetwork
-from fmtorch.training.export import expect_equal, forget_origin, onnx_model
+from fmtorch.training.export import expect_equal, onnx_model, without_origin
 
 OUTPUTS = 64  # of a row, channels times pixels, where there are fewer channels than `FEW_CHANNELS`
 OUTPUTS_OF_GREY = 128  # where the input has one channel, and a pixel's row is 9 numbers
@@ -76,8 +76,7 @@ def quantize(source: Path, path: Path, patches: Float[Tensor, "n 1 32 32"]) -> N
             activation_type=quantization.QuantType.QUInt8, weight_type=quantization.QuantType.QInt8,
             op_types_to_quantize=["Conv", "Relu"], calibrate_method=quantization.CalibrationMethod.MinMax,
         )  # fmt: skip
-        model = onnx.load(unfinished)
-        forget_origin(model)
+        model = without_origin(onnx.load(unfinished))
         onnx.save(model, unfinished)
         lay_out(unfinished)
 

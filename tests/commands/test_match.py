@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -13,17 +14,18 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
+from numpy.typing import NDArray
 from PIL import ExifTags, Image
 
 import fmtorch
 from fmtorch import presets
 from fmtorch.commands import match as match_command
-from fmtorch.commands.match import photographs, pose_line
+from fmtorch.commands.match import pose_line
 from fmtorch.core import WARNINGS, conf_dir
 from fmtorch.data import ImageError, ImagePair, Lens, load, read_image, undistorted_points
 from fmtorch.geometry import homography_points, sampson
 from fmtorch.metrics import nsgd, pose_error
-from fmtorch.pipeline import load_pipeline
+from fmtorch.pipeline import PhotographCameras, load_pipeline
 from tests.conftest import shared_path
 from tests.helpers import ROWS
 from tests.matching import stand_in
@@ -391,41 +393,55 @@ def with_exif(folder: Path, name: str, **tags: int) -> Path:
     return folder / name
 
 
+class Photographs(NamedTuple):
+    images: list[NDArray[np.uint8]]
+    knowledge: dict[str, Any]
+    notes: list[str]
+
+
+def photographs(paths: list[Path], cameras: Path | None, K: Any) -> Photographs:
+    """As the command reads them."""
+    known = PhotographCameras(cameras, K)
+    images = [fmtorch.data.read_image(known.source(path)) for path in paths]
+    ends = [known.of(path, image.shape[:2]) for path, image in zip(paths, images, strict=True)]
+    return Photographs(images, known.knowledge(*ends), [end.note for end in ends if end.note])
+
+
 def test_words_files_and_numbers_as_arguments(tmp_path: Path) -> None:
     paths = [with_exif(tmp_path, "a.jpg", FocalLengthIn35mmFilm=36), with_exif(tmp_path, "b.jpg")]
-    assert photographs(paths, None, None, True).knowledge == {}
+    assert photographs(paths, None, None).knowledge == {}
     for word in ("shared", "unknown"):
-        assert photographs(paths, Path(word), None, True).knowledge == {"focal": word}
-    exif = photographs(paths, Path("exif"), None, True)
+        assert photographs(paths, Path(word), None).knowledge == {"focal": word}
+    exif = photographs(paths, Path("exif"), None)
     focal, nothing = exif.knowledge["focal"]
     assert focal == pytest.approx((60, math.hypot(0.06, 1 / math.sqrt(12) / 36)))
     assert nothing is None
-    assert exif.notes == ("b.jpg: focal length not known: no EXIF data",)
-    neither = photographs([paths[1], paths[1]], Path("exif"), None, True)
+    assert exif.notes == ["b.jpg: focal length not known: no EXIF data"]
+    neither = photographs([paths[1], paths[1]], Path("exif"), None)
     assert neither.knowledge == {"focal": "unknown"}
     for K in ("70,71,30,20", [70, 71, 30, 20], "[70, 71, 30, 20]"):
-        given = photographs(paths, None, K, True).knowledge
+        given = photographs(paths, None, K).knowledge
         assert given["K0"].tolist() == given["K1"].tolist() == [[70, 0, 30], [0, 71, 20], [0, 0, 1]]
     file = tmp_path / "k.json"
     file.write_text(json.dumps({"a.jpg": [70, 71, 30, 20], "b.jpg": None}))
-    given = photographs(paths, file, None, True).knowledge
+    given = photographs(paths, file, None).knowledge
     assert given["K0"].tolist() == [[70, 0, 30], [0, 71, 20], [0, 0, 1]]
     assert given["K1"] is None
     file.write_text(json.dumps({"a.jpg": None, "b.jpg": None}))
-    assert photographs(paths, file, None, True).knowledge == {"K0": None, "K1": None, "focal": "unknown"}
+    assert photographs(paths, file, None).knowledge == {"K0": None, "K1": None, "focal": "unknown"}
 
 
 def test_distortion_is_taken_out_and_sizes_must_fit(tmp_path: Path) -> None:
     paths = [with_exif(tmp_path, name) for name in ("a.jpg", "b.jpg")]
     (tmp_path / "cameras.txt").write_text("1 SIMPLE_RADIAL 60 40 50 30 20 0.2\n")
-    bent = photographs(paths, tmp_path / "cameras.txt", None, True)
+    bent = photographs(paths, tmp_path / "cameras.txt", None)
     assert bent.knowledge["K0"] is None
     assert "b.jpg: F and the pose are of the image without the distortion of its SIMPLE_RADIAL lens" in bent.notes[1]
     assert bent.knowledge["lens"][1] == Lens(50, 50, 29.5, 19.5, "SIMPLE_RADIAL", (0.2,))
     assert np.array_equal(bent.images[0], fmtorch.data.read_image(paths[0]))  # as it was taken
     (tmp_path / "cameras.txt").write_text("1 PINHOLE 50 40 50 50 30 20\n")
     with pytest.raises(ImageError, match=r"a\.jpg: 60 x 40 px, but its camera is of 50 x 40"):
-        photographs(paths, tmp_path / "cameras.txt", None, True)
+        photographs(paths, tmp_path / "cameras.txt", None)
 
 
 @pytest.mark.parametrize(("cameras", "K", "message"), [
@@ -436,7 +452,7 @@ def test_distortion_is_taken_out_and_sizes_must_fit(tmp_path: Path) -> None:
 def test_what_is_no_camera_of_a_command(cameras: Path | None, K: object, message: str, tmp_path: Path) -> None:
     path = with_exif(tmp_path, "a.jpg")
     with pytest.raises(ValueError, match=message):
-        photographs([path, path], cameras, K, True)  # type: ignore[arg-type]
+        photographs([path, path], cameras, K)
 
 
 def test_a_pose_that_is_not_determined_is_said(pair: ImagePair, pipeline_with_cameras: fmtorch.Pipeline) -> None:

@@ -139,7 +139,7 @@ def test_a_result_that_cannot_be_had_again_is_said(tmp_path: Path) -> None:
     estimate = Estimate(model, yes.expand(1, 9), yes, ("",), torch.zeros(1).long())
     lost, solution = Outcome(shown, reason="no keypoints"), Outcome(shown, estimate=estimate)
     assert "(no keypoints), unlike in its run" in difference(shown, images, solved, lost)
-    assert "NSGD 0.0000, unlike in its run" in difference(shown, images, failed, solution)
+    assert "gives an F when it is drawn again, unlike in its run" in difference(shown, images, failed, solution)
     assert difference(shown, images, solved, solution) == difference(shown, images, failed, lost) == ""
 
 

@@ -14,7 +14,7 @@ import torch
 from fmtorch import presets
 from fmtorch.data import DataError, ImageSource, construction, load, read_image, to_grey
 from fmtorch.data import construction as rule
-from fmtorch.data.scenes import SPLITS, AllPairs, DepthScenePairs, chosen, drawn, following, incidence, sharing_points
+from fmtorch.data.scenes import SPLITS, AllPairs, ScenePairs, chosen, drawn, following, incidence, sharing_points
 from fmtorch.pipeline import Pipeline, load_pipeline
 from fmtorch.scenes import Plan, RenderedPairs
 from fmtorch.training import OANetPairs
@@ -146,11 +146,11 @@ def test_a_draw_is_the_same_however_it_is_interrupted(scenes, tmp_path, monkeypa
     assert sorted(uninterrupted.order().tolist()) == list(range(20))
     uninterrupted.begin()
     blocks = construction.blocks(uninterrupted.order())
-    passed = [rank for number, ranks in blocks for rank in ranks if uninterrupted.judge(number, ranks).kept[0]]
+    passed = [rank for number, ranks in blocks for rank in ranks if uninterrupted.judge((number, ranks)).kept[0]]
     assert len(passed) == 4
     broken.begin()
     for number, ranks in list(construction.blocks(broken.order()))[:9]:
-        broken.judge(number, ranks)
+        broken.judge((number, ranks))
     asked, matchable = list[object](), rule.matchable
     monkeypatch.setattr(rule, "matchable", lambda *given: asked.append(given) or matchable(*given))
     run(tmp_path, monkeypatch, "count=3", "seed=5", "workers=1")
@@ -202,14 +202,14 @@ PLAN = Plan(scenes=1, shots=4, pairs=4, scale=0.15)
 
 
 @pytest.fixture(scope="module")
-def rendered(tmp_path_factory: pytest.TempPathFactory) -> DepthScenePairs:
+def rendered(tmp_path_factory: pytest.TempPathFactory) -> ScenePairs:
     """All pairs of four photographs each of two families; cameras of the collection have other sizes."""
     root = tmp_path_factory.mktemp("rendered")
     families = ["indoor", "collection"]
     return RenderedPairs(families=families, root=root, plan=PLAN, workers=1).scene_pairs()
 
 
-def one_by_one(dataset: DepthScenePairs, scene: int, i: int, j: int) -> float:
+def one_by_one(dataset: ScenePairs, scene: int, i: int, j: int) -> float:
     a, b = (dataset.scenes[scene].views[k] for k in (i, j))
 
     def depth(image: ImageSource, x: float, y: float) -> float:
@@ -224,7 +224,7 @@ def one_by_one(dataset: DepthScenePairs, scene: int, i: int, j: int) -> float:
     return min(shares)
 
 
-def test_overlap_of_rendered_pairs_is_that_counted_pixel_by_pixel(rendered: DepthScenePairs) -> None:
+def test_overlap_of_rendered_pairs_is_that_counted_pixel_by_pixel(rendered: ScenePairs) -> None:
     overlaps = construction.overlap_of(rendered)
     assert isinstance(overlaps, construction.DepthOverlap)
     places = [rendered.candidate(rank) for rank in range(rendered.candidates)]

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from torch.utils.data import DataLoader
 
-from fmtorch.data import DataError, DepthDataset, FMBenchPairs, PairDataset, collate, load, read_image, subset
+from fmtorch.data import DataError, DepthDataset, FMBenchPairs, PairDataset, load, read_image
+from fmtorch.data.pairs import PairSubset
 from tests.conftest import shared_path
 from tests.data import planes
 from tests.data.native import write_tum
@@ -136,9 +137,8 @@ def test_real_sets() -> None:
 
 def test_pairs_go_through_a_data_loader(tmp_path: Path) -> None:
     dataset = FMBenchPairs(small_set(tmp_path / "S"))
-    (batch,) = DataLoader(dataset, batch_size=2, collate_fn=collate)  # type: ignore[arg-type]
-    assert (batch.F.shape, batch.key.tolist()) == ((2, 3, 3), [p.key for p in dataset])
-    assert (batch.pairs, collate([]).F.shape) == (tuple(dataset), (0, 3, 3))
+    (batch,) = DataLoader(dataset, batch_size=2, collate_fn=list)  # type: ignore[arg-type]
+    assert batch == list(dataset)
 
 
 def test_pairs_are_image_1_with_the_others(tmp_path: Path) -> None:
@@ -198,11 +198,11 @@ def test_folders_without_sequences_are_refused(tmp_path: Path) -> None:
 def test_pairs_digest_and_depth(tmp_path: Path) -> None:
     name = write_tum(tmp_path, depth=True).name
     dataset, plain = (load("tum", root=tmp_path, sequences=[name], depth=depth) for depth in (True, False))
-    part = subset(dataset, [len(dataset) - 1])
+    part = PairSubset(dataset, [len(dataset) - 1])
     assert isinstance(part, PairDataset)
     assert isinstance(part, DepthDataset)
     assert [pair.identity for pair in part] == [dataset[len(dataset) - 1].identity]
-    assert len({part.digest, dataset.digest, subset(dataset, [0]).digest}) == 3
+    assert len({part.digest, dataset.digest, PairSubset(dataset, [0]).digest}) == 3
     x = np.array([[40.0, 30.0], [10.0, 70.0]])
     assert np.array_equal(part.depth(part[0].image0, x), dataset.depth(part[0].image0, x), equal_nan=True)
-    assert not isinstance(subset(plain, [3, 1]), DepthDataset)
+    assert not isinstance(PairSubset(plain, [3, 1]), DepthDataset)

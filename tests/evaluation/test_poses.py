@@ -15,7 +15,7 @@ from rich.console import Console
 
 import fmtorch
 from fmtorch import evaluation, presets
-from fmtorch.core import PAIR_TYPES, WARNINGS, Correspondences, Estimate, collate
+from fmtorch.core import PAIR_TYPES, WARNINGS, Correspondences, Estimate
 from fmtorch.data import GivenMatches, ImagePair, ImageSource, load
 from fmtorch.evaluation.statistics import homography_figures
 from fmtorch.metrics import corner_error, pose_auc
@@ -209,33 +209,34 @@ def test_what_each_word_gives(tmp_path: Path) -> None:
     pair = outcome(0).pair
     ends = photograph(tmp_path / "a.jpg", 36), photograph(tmp_path / "b.jpg", None)
     pair = dataclasses.replace(pair, image0=ends[0], image1=ends[1])
-    known = evaluation.cameras_of([pair], "known")[pair.key]
-    assert torch.equal(known.K0, torch.from_numpy(pair.K0))
-    assert known.focal.tolist() == [[1, 0], [1, 0]]
-    exif = evaluation.cameras_of([pair], "exif")[pair.key]
-    assert exif.K0 is exif.K1 is None
-    assert exif.focal[0].tolist() == pytest.approx([60, math.hypot(0.06, 1 / math.sqrt(12) / 36)])
-    assert exif.focal[1].tolist() == [1, math.inf]
-    shared, unknown = (evaluation.cameras_of([pair], word)[pair.key] for word in ("shared", "unknown"))
-    assert (shared.shared_focal, unknown.shared_focal) == (True, False)
-    assert shared.focal[:, 1].tolist() == unknown.focal[:, 1].tolist() == [math.inf, math.inf]
+    known, exif, shared, unknown = (given(pair, word) for word in ("known", "exif", "shared", "unknown"))
+    assert torch.equal(known["K0"], torch.from_numpy(pair.K0))
+    assert known["focal"].tolist() == [[1, 0], [1, 0]]
+    assert exif["K0"] is exif["K1"] is None
+    assert exif["focal"][0].tolist() == pytest.approx([60, math.hypot(0.06, 1 / math.sqrt(12) / 36)])
+    assert exif["focal"][1].tolist() == [1, math.inf]
+    assert (shared["shared_focal"], unknown["shared_focal"]) == (True, False)
+    assert shared["focal"][:, 1].tolist() == unknown["focal"][:, 1].tolist() == [math.inf, math.inf]
+
+
+def given(pair: ImagePair, cameras: str) -> Any:
+    (told,) = evaluation.informed([pair], cameras)  # type: ignore[arg-type]
+    return told.given
 
 
 def test_a_calibration_that_is_missing_is_named() -> None:
     pair = dataclasses.replace(outcome(1).pair, K1=None)
     with pytest.raises(ValueError, match="cameras=known, but the data set has no calibration of pair p1"):
-        evaluation.cameras_of([pair], "known")
-    assert evaluation.cameras_of([dataclasses.replace(pair, problem="no image")], "known") == {}
+        given(pair, "known")
+    assert given(dataclasses.replace(pair, problem="no image"), "known") is None
 
 
-def estimated(outcomes: list[Outcome], cameras: str) -> list[Outcome]:
+def estimated(outcomes: list[Outcome], cameras: str | None, lens: float | None = None) -> list[Outcome]:
     """The outcomes with the estimates of a batch whose estimator is given the cameras."""
-    c = collate([o.correspondences.replace(key=torch.tensor([o.pair.key])) for o in outcomes])
-    estimator = evaluation.WithPairCameras(
-        presets.build("estimator", "fmtorch"), evaluation.cameras_of([o.pair for o in outcomes], cameras)
-    )
-    estimate = estimator(c, 0)
-    return [dataclasses.replace(o, estimate=estimate[i]) for i, o in enumerate(outcomes)]
+    pairs = evaluation.informed([o.pair for o in outcomes], cameras, lens)  # type: ignore[arg-type]
+    keyed = [o.correspondences.replace(key=torch.tensor([o.pair.key])) for o in outcomes]
+    each = zip(outcomes, pairs, keyed, strict=True)
+    return pipeline().estimate([dataclasses.replace(o, pair=p, correspondences=c) for o, p, c in each])
 
 
 def test_rows_have_the_pose_of_the_estimate_and_neighbours_change_nothing() -> None:
@@ -263,14 +264,13 @@ def test_poses_that_are_not_determined_and_pairs_without_estimates_among_others(
 def test_a_lens_is_given_to_the_estimator(cameras: str | None) -> None:
     """As `find_fundamental` is given it, and rows say what it was taken for."""
     o = outcome(0, noise=0.1)
-    known = None if cameras is None else evaluation.cameras_of([o.pair], cameras)
     key, prior = torch.tensor([o.pair.key]), torch.full_like(o.correspondences.mask, 0.5, dtype=torch.float64)
     c = o.correspondences.replace(key=key, prior=prior)
-    estimate = evaluation.WithPairCameras(presets.build("estimator", "fmtorch"), known, -0.02)(c)
+    (lensed,) = estimated([dataclasses.replace(o, correspondences=c)], cameras, -0.02)
     given = {name: getattr(c, name) for name in ("mask", "prior", "size0", "size1", "key")}
     alone = fmtorch.find_fundamental(c.x0, c.x1, **given, focal=cameras, lens=-0.02)
-    assert torch.equal(estimate.F, alone.F)
-    (row,) = evaluation.evaluate([dataclasses.replace(o, correspondences=c, estimate=estimate)])
+    assert torch.equal(lensed.estimate.F, alone.F)
+    (row,) = evaluation.evaluate([lensed])
     assert (row.lens0, row.lens1) == pytest.approx((-0.02, -0.02), abs=1e-6)
     assert row.lens_suggested is None
 
@@ -307,7 +307,7 @@ def pipeline() -> Pipeline:
     return Pipeline(unused, unused, {}, presets.build("estimator", "fmtorch"))
 
 
-def given(c: Correspondences) -> Callable[[], GivenMatches]:
+def given_matches(c: Correspondences) -> Callable[[], GivenMatches]:
     return lambda: GivenMatches(c, (c.mask.shape[1],) * 2)
 
 
@@ -316,15 +316,12 @@ def pair(kind: str, n: int = 150) -> ImagePair:
     fields = batch([drawn])
     c = Correspondences(**{name: fields[name] for name in ("x0", "x1", "mask", "size0", "size1")})
     image = ImageSource(kind, Path(kind))
-    return ImagePair(kind, "family", kind, image, image, drawn.F, K, K, drawn.R, drawn.t, matches=given(c))
+    return ImagePair(kind, "family", kind, image, image, drawn.F, K, K, drawn.R, drawn.t, matches=given_matches(c))
 
 
 def rows(pairs: list[ImagePair], word: str | None) -> list[PairRow]:
     built = pipeline()
-    if word is not None:
-        built = evaluation.built_with(lambda: built, evaluation.cameras_of(pairs, word))  # type: ignore[arg-type]
-    knowledge = built.estimator.given if isinstance(built.estimator, evaluation.WithPairCameras) else None
-    return evaluation.evaluate(examined(built, built.run(pairs), 0, knowledge))
+    return evaluation.evaluate(examined(built, built.run(evaluation.informed(pairs, word))))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("word", [None, "known", "unknown"])
@@ -365,15 +362,15 @@ def test_errors_of_focal_lengths() -> None:
     c, _ = source.matches()
     asked = c.replace(focal=torch.tensor([[[1.0, torch.inf], [1.0, torch.inf]]], dtype=torch.float64))
     focals = evaluation.focal_errors(estimated_type(asked, [1.1 * 768, math.nan], (K, K)))
-    assert focals.error[0] == pytest.approx(0.1)
-    assert focals.log_ratio[0] == pytest.approx(math.log(1.1))
-    assert (focals.error[1], focals.log_ratio[1]) == (math.inf, None)
+    right = {"focal_error0": 0.1, "focal_log_ratio0": math.log(1.1), "focal_error1": math.inf}
+    assert focals == pytest.approx(right)
     exact = asked.replace(focal=torch.tensor([[[768.0, 0.0], [768.0, 0.05]]], dtype=torch.float64))
     wide = np.diag([4.0, 1.0, 1.0]) @ K
     focals = evaluation.focal_errors(estimated_type(exact, [768.0, 768.0], (K, wide)))
-    assert focals.error == (None, pytest.approx(0.5))
-    assert evaluation.focal_errors(estimated_type(asked, [768.0, 768.0], (None, K))).error == (None, 0)
-    assert evaluation.focal_errors(estimated_type(c, [768.0, 768.0], (K, K))).error == (None, None)  # nobody asked
+    assert focals == pytest.approx({"focal_error1": 0.5, "focal_log_ratio1": -math.log(2)})
+    known = evaluation.focal_errors(estimated_type(asked, [768.0, 768.0], (None, K)))
+    assert known == {"focal_error1": 0, "focal_log_ratio1": 0}
+    assert evaluation.focal_errors(estimated_type(c, [768.0, 768.0], (K, K))) == {}  # nobody asked
 
 
 def test_summaries_and_reports_show_them() -> None:

@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from fmtorch import io
 from fmtorch.evaluation import MAX_THUMBNAILS, view_graph_svg
 from fmtorch.io import ORIGIN, write_database
-from fmtorch.pipeline import FolderMatches, chosen_pairs, images_below, load_pipeline
+from fmtorch.pipeline import FolderMatches, chosen_pairs, folder_workers, images_below, load_pipeline
 from tests.conftest import shared_path
 
 K = np.array([[1000.0, 0, 480], [0, 1000, 410], [0, 0, 1]])
@@ -246,7 +246,7 @@ def test_a_real_scene_is_reconstructed(tmp_path: Path) -> None:
     pipeline = load_pipeline("sift_ratio", overrides=options)
     kept = io.MatchStore(tmp_path / "export", images)
     pairs = chosen_pairs(images, images_below(images), None)
-    work = FolderMatches(pipeline, kept, 1600, True, 0)
+    work = FolderMatches(pipeline, kept, folder_workers(pipeline), 1600, True, 0)
     assert len(list(work.each(pairs))) == len(pairs)
     assert not work.troubles
     io.write_exports(kept, pairs, ("colmap",), tmp_path, shared_camera=True)

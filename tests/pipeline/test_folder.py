@@ -84,8 +84,11 @@ def images(tmp_path: Path) -> list[Path]:
     return paths
 
 
-def work(pipeline: Pipeline, images: list[Path], output: Path, **options: Any) -> FolderMatches:
-    return FolderMatches(pipeline, MatchStore(output, images[0].parent), 1600, True, 0, **options)
+def work(
+    pipeline: Pipeline, images: list[Path], output: Path, workers: WorkerPool | None = None, **options: Any
+) -> FolderMatches:
+    workers = workers or folder_workers(pipeline)
+    return FolderMatches(pipeline, MatchStore(output, images[0].parent), workers, 1600, True, 0, **options)
 
 
 def kept(output: Path) -> dict[str, dict[str, Any]]:

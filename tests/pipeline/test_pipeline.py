@@ -24,7 +24,7 @@ from fmtorch.core import Correspondences, Estimate, Features, ImagePruner, own_t
 from fmtorch.data import GivenMatches, ImagePair, ImageSource, read_image
 from fmtorch.geometry import sampson
 from fmtorch.io import MatchStore
-from fmtorch.pipeline import FolderMatches, Memo, Pipeline, load_pipeline, match_records
+from fmtorch.pipeline import FolderMatches, Memo, Pipeline, folder_workers, load_pipeline, match_records
 from fmtorch.presets import build, instantiate
 from tests.conftest import shared_path
 from tests.helpers import draw, pair, small_pipeline
@@ -240,7 +240,7 @@ def test_refined_matches_are_exported_as_matches_of_keypoints(tmp_path: Path) ->
         pipeline = load_pipeline("sift_fmtorch", overrides=[*overrides, "cache=off", "features.max_features=500"])
         run, folder = (MatchStore(tmp_path / f"{name}{i}", ends[0].parent) for name in ("run", "folder"))
         run.add(match_records(pipeline, pipeline.run([pair])))
-        for _ in FolderMatches(pipeline, folder, 4000, True, 0).each([ends]):
+        for _ in FolderMatches(pipeline, folder, folder_workers(pipeline), 4000, True, 0).each([ends]):
             pass
         journals += [run, folder]
     matches = [journal.pair(*ends).matches for journal in journals]

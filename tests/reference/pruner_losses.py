@@ -46,18 +46,6 @@ def cross_entropy(logits: list[float], labels: list[int]) -> float | None:
     return sum(terms) / len(terms) if terms else None
 
 
-def balanced_cross_entropy(logits: list[float], labels: list[int]) -> float | None:
-    """Each class's share of the loss its weight 1 / (n + 1), the log-odds of the classes taken off the logits."""
-    n1, n0 = labels.count(1) + 1, labels.count(0) + 1
-    total = weights = 0.0
-    for z, label in zip(logits, labels, strict=True):
-        if label >= 0:
-            p = 1 / (1 + math.exp(-(z - math.log(n1 / n0))))
-            w = 1 / n1 if label == 1 else 1 / n0
-            total, weights = total - w * math.log(p if label == 1 else 1 - p), weights + w
-    return total / weights if weights else None
-
-
 def virtual_points(
     F: np.ndarray, size0: np.ndarray, size1: np.ndarray, uniforms: np.ndarray, count: int
 ) -> list[tuple[np.ndarray, np.ndarray]]:

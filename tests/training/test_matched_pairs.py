@@ -133,14 +133,13 @@ def test_a_damaged_file_is_computed_anew(rendered, matched, tmp_path, damage):
 def test_what_would_change_the_matches_has_a_folder_of_its_own(rendered, matched, tmp_path, monkeypatch):
     pairs = Some([rendered[0]])
     names = {MatchedPairs(pairs, **SIFT, root=tmp_path).folder.name}
-    names.add(MatchedPairs(pairs, **SIFT, root=tmp_path, most=50).folder.name)
     names.add(MatchedPairs(pairs, "sift_ratio", root=tmp_path).folder.name)
     names.add(MatchedPairs(pairs, "sift_ratio", overrides=["features.max_features=200"], root=tmp_path).folder.name)
     monkeypatch.setattr("fmtorch.training.labelled.VERSION", 99)
     names.add(MatchedPairs(pairs, **SIFT, root=tmp_path).folder.name)
     pairs.digest = "2"
     names.add(MatchedPairs(pairs, **SIFT, root=tmp_path).folder.name)
-    assert len(names) == 6
+    assert len(names) == 5
     assert all((tmp_path / name / "about.json").is_file() for name in names)
 
 
@@ -158,8 +157,6 @@ def test_pairs_that_fail_are_left_out_and_told(rendered: RenderedPairs, tmp_path
         MatchedPairs(Some([unusable]), **SIFT, root=tmp_path / "b")
     with pytest.raises(ValueError, match="no pairs"):
         MatchedPairs(Some([]), **SIFT, root=tmp_path / "c")
-    with pytest.raises(ValueError, match="most is 0"):
-        MatchedPairs(Some([good]), **SIFT, root=tmp_path, most=0)
     with pytest.raises(ValueError, match="no preset 'sift'"):
         MatchedPairs(Some([good]), "sift", root=tmp_path)
     stages = load_pipeline("sift_ratio")

@@ -358,7 +358,7 @@ def test_broken_hloc_pairs_are_lines_and_stay_out(tmp_path: Path) -> None:
         file["mapping-001.jpg/mapping-000.jpg/matches0"][5] = -1
     result = fmtorch.verify(**hloc(tmp_path))
     assert (result.pairs, result.verified, len(result.problems)) == (len(pairs) + 1, 1, len(pairs))
-    assert any("matches0 holds -1 to 4000, but mapping/001.jpg has 150 keypoints" in line for line in result.problems)
+    assert any("matches0' names keypoint 4000, but the second image has 150" in line for line in result.problems)
     assert any("'mapping/002.jpg/image_size' is missing" in line for line in result.problems)
     assert any("003.jpg/keypoints' is missing" in line for line in result.problems)
     assert {key.rpartition("/")[0] for key in load(tmp_path / "verified.h5")} == {"mapping-001.jpg/mapping-000.jpg"}
