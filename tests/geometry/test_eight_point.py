@@ -52,16 +52,6 @@ def test_reference_opencv_and_kornia_live(batch, n):
             assert error.norm() < n * torch.finfo(torch.float64).eps / gap
 
 
-def test_rectified_pair_known_by_heart():
-    x0 = torch.tensor([[0.0, 0], [1, 0], [0, 1], [1, 1], [2, 1], [1, 3], [4, 2], [3, 5], [0, 4]], dtype=torch.float64)
-    disparity = torch.tensor([1.0, 2, 3, 5, 7, 11, 13, 4, 9], dtype=torch.float64)
-    x1 = x0 - torch.stack([disparity, torch.zeros_like(disparity)], 1)
-    F, valid = geometry.eight_point(x0, x1)
-    expected = torch.tensor([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64) / 2**0.5
-    assert valid
-    assert torch.minimum((F - expected).norm(), (F + expected).norm()) < 1e-12
-
-
 def test_weight_zero_is_masked_and_masked_is_absent():
     x0, x1, _ = scenes((3,), 40, noise=0.5)
     mask = torch.ones(3, 40, dtype=torch.bool)
@@ -172,15 +162,6 @@ def test_coincident_and_absent_points_keep_their_scale(dtype):
     y, T = geometry.normalize_points(same, torch.zeros(9, dtype=torch.bool))
     assert torch.equal(T, torch.eye(3, dtype=dtype))
     assert not y.any()
-
-
-def test_denormalised_f_vanishes_where_the_normalised_one_does():
-    s = scene(20)
-    (_, T0), (_, T1) = geometry.normalize_points(s.x0), geometry.normalize_points(s.x1)
-    Fn = torch.linalg.inv(T1).mT @ s.F @ torch.linalg.inv(T0)
-    torch.testing.assert_close(
-        geometry.canonical(geometry.denormalize_fundamental(Fn, T0, T1)), geometry.canonical(s.F)
-    )
 
 
 def test_canonical():

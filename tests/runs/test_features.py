@@ -158,32 +158,6 @@ def test_a_failure_is_not_kept(tmp_path: Path) -> None:
     assert not list(kept.cache.files())
 
 
-def test_a_damaged_file_is_computed_anew(tmp_path: Path) -> None:
-    sift = presets.build("features", "sift")
-    kept = CachedFeatures(sift, ArrayCache(tmp_path))
-    truth = kept(picture())
-    ((path, status),) = kept.cache.files()
-    path.write_bytes(path.read_bytes()[: status.st_size // 2])
-    with pytest.warns(UserWarning, match="damaged"):
-        assert equal(kept(picture()), truth)
-    assert kept.computed == 2
-    assert equal(kept(picture()), truth)
-    assert kept.found == 1
-
-
-def test_threads(tmp_path: Path) -> None:
-    sift = presets.build("features", "sift")
-    kept = CachedFeatures(sift, ArrayCache(tmp_path))
-    truths = [sift(picture(seed)) for seed in range(3)]
-
-    def work(_: int) -> None:
-        assert all(equal(kept(picture(seed)), truths[seed]) for seed in [0, 1, 2] * 4)
-
-    in_threads(4, work)
-    assert kept.found + kept.computed == 48
-    assert kept.found >= 48 - 3 * 4
-
-
 def test_off_and_where(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("FMTORCH_CACHE", str(tmp_path / "home"))
     sift = presets.build("features", "sift")
