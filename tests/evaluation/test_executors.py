@@ -151,9 +151,7 @@ def cluster(tmp_path: Path) -> Iterator[Cluster]:
     dask_cluster.close()
 
 
-def test_workers_are_killed_and_then_the_scheduler(
-    cluster: Cluster, pairs: list[ImagePair], expected: dict[int, PairRow]
-) -> None:
+def test_workers_are_killed(cluster: Cluster, pairs: list[ImagePair], expected: dict[int, PairRow]) -> None:
     cluster.add_workers(2)
     killed: list[int] = []
 
@@ -172,9 +170,13 @@ def test_workers_are_killed_and_then_the_scheduler(
     killer = threading.Thread(target=kill)
     killer.start()
     assert started.wait(PATIENCE)
-    found = evaluated(pairs, Execution("dask", address=cluster.address, send_images=True), build_slow)
+    rows = evaluated(pairs, Execution("dask", address=cluster.address, send_images=True), build_slow)
     killer.join()
-    assert (len(set(killed)), found) == (2, expected)
+    assert (len(set(killed)), rows) == (2, expected)
+
+
+def test_a_scheduler_that_is_lost(cluster: Cluster, pairs: list[ImagePair], expected: dict[int, PairRow]) -> None:
+    cluster.add_workers(1)
     rows: list[PairRow] = []
     execution = Execution("dask", address=cluster.address)
     counts = evaluate_pairs(build(), pairs, seed=0, batch=2, execution=execution, store=rows.extend, build=build_slow)
