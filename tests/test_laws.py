@@ -14,6 +14,10 @@ from tests.variants import OTHER_LIBRARIES, variants
 
 OWN = [n for n in variants("estimator") if not n.startswith(OTHER_LIBRARIES)]
 PER_MATCH = ("inliers", "kept", "prior", "noise")
+SOFT = [n.partition(":")[0] for n in variants("pruner") if n.endswith(":soft=true")]
+HARD = {n for n in SOFT if n != "lc" and "network" in presets.load("pruner", n)}
+"""Whose mask is a threshold on the probabilities of their soft form, as that of `lc` is."""
+PRUNERS = [n for n in variants("pruner") if n not in HARD]
 NOISY = ("fmtorch", "fmtorch_fast", "gc_ransac", "msac")  # are also told the noise of matches
 
 
@@ -59,7 +63,7 @@ def _subjects() -> list[laws.Subject]:
     """Every preset of these groups: a new file in conf/ joins by being there."""
     estimators = [_estimator(n) for n in variants("estimator") if not n.startswith(OTHER_LIBRARIES[1:])]
     cameras = [_calibrated("msac", "exact"), *(_calibrated("fmtorch", known) for known in laws.KNOWLEDGE)]
-    return [*estimators, *cameras, *(_pruner(n) for n in variants("pruner")), *(_noisy(n) for n in NOISY)]
+    return [*estimators, *cameras, *(_pruner(n) for n in PRUNERS), *(_noisy(n) for n in NOISY)]
 
 
 def _row(result: laws.Result, c: Correspondences, i: int) -> laws.Result:

@@ -6,7 +6,6 @@ import dataclasses
 import enum
 import json
 import pickle
-import threading
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, Protocol, TypedDict, TypeVar
@@ -20,6 +19,7 @@ from torch import Tensor
 
 from fmtorch import geometry, matching, metrics, presets, pruning
 from fmtorch.core import Within, checked, claim, create, expect_options, fits
+from tests.helpers import in_threads
 
 Item = TypeVar("Item")
 
@@ -299,10 +299,6 @@ def test_what_a_killed_writer_left_is_nothing(tmp_path: Path) -> None:
 
 
 def test_of_several_writers_the_first_wins(tmp_path: Path) -> None:
-    threads = [threading.Thread(target=create, args=(tmp_path / "file", str(i) * 10_000)) for i in range(8)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    in_threads(8, lambda i: create(tmp_path / "file", str(i) * 10_000))
     (file,) = tmp_path.iterdir()
     assert len(set(file.read_text())) == 1

@@ -44,14 +44,6 @@ def test_each_model_is_colmaps(model: str) -> None:
     np.testing.assert_allclose(used.distort(points), camera.img_from_cam(rays(used, points)), rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("model", ["OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE"])
-def test_opencvs_models_are_opencvs(model: str) -> None:
-    used, points, zero = lens(model), grid(), np.zeros(3)
-    project = cv2.fisheye.projectPoints if model == "OPENCV_FISHEYE" else cv2.projectPoints
-    there, _ = project(rays(used, points)[:, None], zero, zero, used.K, np.array(used.coefficients))
-    np.testing.assert_allclose(used.distort(points), there[:, 0], rtol=0, atol=1e-9)
-
-
 def texture(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return 127 + 60 * np.sin(x / 9) * np.cos(y / 7) + 40 * np.sin((x + 2 * y) / 23)
 

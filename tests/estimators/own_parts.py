@@ -16,28 +16,6 @@ class Welsch(SummedGains):
         return np.exp(-squared)
 
 
-@kernel
-def triweight(squared: F4x2, out: F4x2) -> None:
-    for k in range(len(squared)):
-        for i in range(squared.shape[1]):
-            rest = max(np.float32(1) - squared[k, i] / np.float32(9), np.float32(0))
-            out[k, i] = rest * rest * rest
-
-
-class Triweight(SummedGains):
-    """(1 - r^2 / 9)^3 within three thresholds."""
-
-    def gain(self, squared: Array) -> Array:
-        rest = np.maximum(np.float32(1) - squared / np.float32(9), np.float32(0))
-        return rest * rest * rest
-
-
-class CompiledTriweight(SummedGains):
-    """(1 - r^2 / 9)^3 within three thresholds."""
-
-    gain_kernel = triweight
-
-
 class Squares(SummedGains):
     """The gain of MSAC; what is negative counts nothing."""
 

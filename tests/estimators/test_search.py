@@ -7,14 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from scipy import stats
 
 from fmtorch import estimators
-from fmtorch.core import Correspondences, collate
+from fmtorch.core import Correspondences
 from fmtorch.estimators import Hypotheses, Pool, Preselection, Search, Verified, largest_weight, preselection
 from fmtorch.jit.random import Stream
 from tests.estimators.pairs import FEW, SCALES, known, models, named, pair_of
-from tests.laws import scene, with_padding
+from tests.laws import scene
 from tests.reference import ransac as reference
 from tests.reference import solvers
 from tests.reference.random import number
@@ -101,14 +100,6 @@ def test_a_search_keeps_the_best_models_of_all_rounds(preselect: estimators.Pres
     assert (pool.filled, pool.samples) == (4, 180)
 
 
-def test_rounds_change_nothing_without_preselection() -> None:
-    """Random numbers belong to draws."""
-    pair = named("scene 300")
-    once, often = (search(round=round)(pair) for round in (150, 40))
-    np.testing.assert_array_equal(once.F, often.F)
-    np.testing.assert_array_equal(once.score, often.score)
-
-
 def test_a_search_ends_when_the_stopping_rule_says_so() -> None:
     pair = named("scene 300")
     never, second = Told(lambda draws: False), Told(lambda draws: draws >= 100)
@@ -144,22 +135,9 @@ def test_few_matches_are_those_of_the_definitions(given: str) -> None:
         np.testing.assert_array_equal(likely.points, pair.points[:, drawn])
         np.testing.assert_array_equal(likely.match_weight, prior[drawn] > 0)
     np.testing.assert_array_equal(pair.prior, prior)
-
-
-def test_likely_matches_are_drawn_by_their_prior() -> None:
-    """Three times as many of the kind three times as likely, and none that have no prior."""
-    n, k, seen, keys = 900, 60, np.zeros(3), 300
-    prior = np.repeat([0.0, 0.2, 0.6], n // 3)
-    index = np.empty(k, np.int64)
-    for key in range(keys):
-        preselection.draw_by_prior(prior, 5, key, index)
-        assert len(set(index.tolist())) == k
-        seen += np.bincount(index // (n // 3), minlength=3)
-    assert seen[0] == 0
-    # 60 of 600 at a time: by their prior up to some 2 % (those drawn are missing later); 5 standard errors of a share.
-    assert seen[2] / seen.sum() == pytest.approx(0.75, abs=0.02 + 5 * np.sqrt(0.75 * 0.25 / (k * keys)))
+    index = np.empty(n // 2, np.int64)  # of matches that are all impossible the first
     preselection.draw_by_prior(np.zeros(n), 5, 0, index)
-    np.testing.assert_array_equal(index, np.arange(k))
+    np.testing.assert_array_equal(index, np.arange(n // 2))
 
 
 @pytest.mark.parametrize("kind", ["InlierCount", "Msac", "Magsac", "SaturatedGains"])
@@ -336,30 +314,3 @@ def test_samples_of_any_key_and_seed(seed: int, key: int) -> None:
     matches = pair_of(scene(0, 30).replace(key=torch.tensor([key])), seed=seed)
     expected = [reference.weighted_sample([1] * 30, numbers_of(matches, d, 7)) for d in range(20)]
     assert estimators.Uniform().draw(matches, 0, 20, 7).T.tolist() == expected
-
-
-@pytest.mark.parametrize("sampler", [estimators.Uniform(), estimators.PriorWeighted()])
-def test_samples_follow_the_prior(sampler: Any) -> None:
-    """Chi-square of how often a match is the first, and the second of a sample, at 1e-4."""
-    matches, draws = pair(30), 50_000
-    p = sampler.weight(matches) / sampler.weight(matches).sum()
-    sample = sampler.draw(matches, 0, draws, 2)
-    # Without replacement: the second is j with probability sum_i p_i p_j / (1 - p_i), i != j.
-    second = [sum(p[i] * p[j] / (1 - p[i]) for i in range(30) if i != j) for j in range(30)]
-    for drawn, expected in zip(sample, (p, np.array(second)), strict=True):
-        assert stats.chisquare(np.bincount(drawn, minlength=30), draws * expected).pvalue > 1e-4
-
-
-@pytest.mark.parametrize("sampler", [estimators.Uniform(), estimators.PriorWeighted(), estimators.Prosac()])
-def test_samples_are_a_function_of_seed_key_and_draw(sampler: estimators.Sampler) -> None:
-    def drawn(c: Correspondences, i: int = 0, start: int = 0, count: int = 400, seed: int = 0) -> Any:
-        return sampler.draw(pair_of(c, seed, i), start, count, 7)
-
-    alone = drawn(scene(1, 150))
-    ordered = np.sort(alone, 0)
-    assert (ordered[1:] > ordered[:-1]).all()
-    np.testing.assert_array_equal(drawn(scene(1, 150), start=100, count=300), alone[:, 100:])
-    batch = with_padding(collate([scene(2, 250), scene(1, 150)]), np.random.default_rng(0), float("nan"))
-    np.testing.assert_array_equal(drawn(batch, 1), alone)
-    assert not np.array_equal(drawn(scene(1, 150), seed=1), alone)
-    assert not np.array_equal(drawn(scene(1, 150).replace(key=torch.tensor([5]))), alone)

@@ -16,7 +16,6 @@ from rich.console import Console
 from fmtorch import metrics
 from fmtorch.core import pair_key
 from fmtorch.evaluation import common_reasons, statistics, summarize, summary_markdown, terminal_tables
-from fmtorch.evaluation.statistics import bootstrap_mean, share_interval
 from fmtorch.runs import PairRow, to_table
 from tests.reference.metrics import bootstrap_interval
 
@@ -288,29 +287,3 @@ def test_reasons_that_differ_in_numbers_are_one(reasons: list[str], expected: di
 def test_the_commonest_come_first_and_others_are_left_out() -> None:
     reasons = ["a"] * 2 + ["b"] * 4 + ["c"] + ["d"] * 3
     assert list(common_reasons(reasons, 3).items()) == [("b", 4), ("d", 3), ("a", 2)]
-
-
-def test_coverage_over_scenes() -> None:
-    """Of independent data sets, about 95 % of the intervals hold the true mean, though pairs of a scene are alike."""
-    trials, hold = 200, {"scene": 0, "pair": 0}
-    for seed in range(trials):
-        values, names = correlated(40, 10, seed)
-        for over, clusters in (("scene", names), ("pair", ["one"] * len(names))):
-            result = bootstrap_mean(values, clusters)
-            assert result.over == over
-            hold[over] += result.low <= 0.5 <= result.high
-    # The percentile interval of 40 clusters is known to cover some 94 %; 3.5 standard deviations of a binomial share.
-    assert hold["scene"] / trials > 0.94 - 3.5 * np.sqrt(0.94 * 0.06 / trials)
-    assert hold["pair"] / trials < 0.75  # what ignoring the scenes would claim
-
-
-@pytest.mark.parametrize("n", [3, 10, 40])
-def test_coverage_over_all_shares_is_the_level(n: int) -> None:
-    """The mean coverage over p uniform in (0, 1), by the binomial sum: near 95 % for each n, unlike the bootstrap's."""
-    p = (np.arange(2000) + 0.5) / 2000
-    covered = np.zeros_like(p)
-    for r in range(n + 1):
-        interval = share_interval(successes(r, n), one_scene(n))
-        chance = math.comb(n, r) * p**r * (1 - p) ** (n - r)
-        covered += chance * ((interval.low <= p) & (p <= interval.high))
-    assert 0.94 < covered.mean() < 0.97

@@ -1,7 +1,5 @@
 """Detection by the Hessian, and orientation of frames."""
 
-import math
-
 import kornia
 import numpy as np
 import pytest
@@ -10,7 +8,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from fmtorch import features
-from fmtorch.features import frames, hessian
+from fmtorch.features import hessian
 from tests.conftest import oracle, shared_path
 from tests.features.scenes import random_frames, texture
 from tests.reference.local_features import dominant_gradient as reference_orientation
@@ -33,21 +31,6 @@ def test_equals_the_definition(levels: int) -> None:
     # float32 filters: rounding of 2^-24 of intensities against differences of about 0.01.
     np.testing.assert_allclose(found[:, :3], expected[:, :3], atol=2e-3)
     np.testing.assert_allclose(found[:, 3], expected[:, 3], rtol=1e-3)
-
-
-@pytest.mark.parametrize("sigma", [2.2, 3.5, 6.0, 11.0])
-@pytest.mark.parametrize("sign", [-1, 1])
-def test_a_gaussian_blob_has_its_place_and_size(sigma: float, sign: int) -> None:
-    # sigma^4 det H of a Gaussian of s, blurred to s^2 + sigma^2, is largest at sigma = s; the detector takes the image
-    # to have a blur of 0.5 already.
-    y, x = np.mgrid[0:150, 0:170]
-    centre = np.array([81.3, 70.6])
-    blob = np.exp(-((x - centre[0]) ** 2 + (y - centre[1]) ** 2) / (2 * sigma**2))
-    found = keypoints(features.HessianDetector(max_features=1), (128 + sign * 100 * blob).round().astype(np.uint8))
-    assert len(found) == 1
-    np.testing.assert_allclose(found[0, :2], centre, atol=0.05 * sigma)
-    # A quadratic over steps of 2^(1/3), kernels cut at 3 sigma, and rounding to 8 bits.
-    assert found[0, 2] == pytest.approx(np.hypot(sigma, 0.5), rel=0.06)
 
 
 def test_of_equal_neighbours_one_remains() -> None:
@@ -212,26 +195,3 @@ def test_the_scale_of_a_determinant_is_a_product_afterwards() -> None:
     hessian.hessian_determinant(image, 1.0, out=plain)
     hessian.hessian_determinant(image, scale, out=scaled)
     assert torch.equal(scaled, plain * scale)
-
-
-def plain_histogram(patches: Tensor) -> Tensor:
-    padded = F.pad(patches, (1, 1, 1, 1), mode="replicate")[:, 0]
-    rows = padded[:, :-2] + 2 * padded[:, 1:-1] + padded[:, 2:]
-    columns = padded[:, :, :-2] + 2 * padded[:, :, 1:-1] + padded[:, :, 2:]
-    gy, gx = (columns[:, 2:] - columns[:, :-2]) / 8, (rows[:, :, 2:] - rows[:, :, :-2]) / 8
-    magnitude = (gx * gx + gy * gy).sqrt() * frames._window(patches.shape[-1], patches.device)
-    position = (torch.atan2(gy, gx) + math.pi) * (frames.BINS / (2 * math.pi))
-    upper_weight = (position - position.floor()) * magnitude
-    lower, histogram = position.long().flatten(1), patches.new_zeros(len(patches), frames.BINS + 2)
-    histogram.scatter_add_(1, lower, (magnitude - upper_weight).flatten(1))
-    histogram.scatter_add_(1, lower + 1, upper_weight.flatten(1))
-    histogram[:, :2] += histogram[:, frames.BINS :]
-    return histogram[:, : frames.BINS]
-
-
-def test_histograms_of_directions_are_those_of_the_plain_formulas() -> None:
-    image = texture(2, 200, 200)
-    starts = np.random.default_rng(0).integers(0, 168, (90, 2))
-    patches = torch.from_numpy(np.stack([image[y : y + 32, x : x + 32] for y, x in starts]))[:, None].float() / 255
-    patches = torch.cat([patches, torch.full((1, 1, 32, 32), 0.5), torch.rand(20, 1, 32, 32)])
-    assert torch.equal(frames._histogram(patches), plain_histogram(patches))

@@ -101,31 +101,6 @@ def test_networks_are_read_when_first_used(tmp_path: Path) -> None:
         CachedFeatures(extract, ArrayCache(tmp_path))
 
 
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # the older exporter takes a fraction of the time
-def test_hesaffnet_runs_through_onnx(tmp_path: Path) -> None:
-    pytest.importorskip("onnx")
-    files = {}
-    for i, (name, outputs) in enumerate({"affnet": 3, "hardnet": 128, "orinet": 2}.items()):
-        files[name] = str(tmp_path / f"{name}.onnx")
-        torch.onnx.export(
-            random_network(i, outputs), (torch.zeros(4, 1, 32, 32),), files[name], input_names=["patches"],
-            output_names=["values"], dynamo=False, dynamic_axes={"patches": {0: "n"}, "values": {0: "n"}},
-        )  # fmt: skip
-    parts = {name: {"name": name, "network": file} for name, file in files.items()}
-    shape, descriptor, orientation = (parts[name] for name in ("affnet", "hardnet", "orinet"))
-    extract = features.local_feature("hessian", descriptor, shape=shape, orientation=orientation, max_features=50)
-    found = extract(texture(5))
-    assert found.descriptors.shape == (50, 128)
-    assert torch.isfinite(found.lafs).all()
-    same_in_torch = features.LocalFeature(extract.detector, features.NetworkDescriptor(random_network(1, 128)))
-    described = same_in_torch.describe(texture(5), found.lafs)
-    kept = CachedFeatures(extract, ArrayCache(tmp_path / "cache"))
-    for _ in range(2):  # computed, then found
-        assert same(kept(texture(5)), found)
-    assert (kept.computed, kept.found) == (1, 1)
-    torch.testing.assert_close(found.descriptors, described, atol=1e-4, rtol=0)
-
-
 def test_large_images_are_reduced_for_opencv() -> None:
     image = texture(7, 300, 401)
     full, reduced = features.SIFT(), features.SIFT(max_pixels=300 * 401 // 2)

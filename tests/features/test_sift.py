@@ -221,15 +221,6 @@ def test_a_projection_that_is_absent_or_broken(tmp_path: Path) -> None:
             features.RootSIFTPCA(model=tmp_path / f"{name}.npz")(pyramid, lafs)
 
 
-def test_pixel_x_of_a_level_is_pixel_2x_of_the_finer_one() -> None:
-    y, x = np.mgrid[0:100, 0:150]
-    ramp = (x + y).astype(np.uint8)
-    for level, image in enumerate(ImagePyramid(ramp).levels):
-        inner = image[3:-3, 3:-3] if min(image.shape) > 8 else image[:0]
-        expected = ramp[:: 2**level, :: 2**level][3:-3, 3:-3][: len(inner)] / 255
-        np.testing.assert_allclose(inner, expected, rtol=1e-5, atol=1e-6)
-
-
 @pytest.mark.parametrize("number", ["000", "001"])
 def test_resembles_opencvs_descriptors(number: str) -> None:
     file = oracle("sift.npz")
@@ -245,19 +236,6 @@ def test_resembles_opencvs_descriptors(number: str) -> None:
 def blob(x: float, y: float, sigma: float, h: int = 120, w: int = 160) -> np.ndarray:
     v, u = np.mgrid[:h, :w]
     return np.rint(30 + 200 * np.exp(-((u - x) ** 2 + (v - y) ** 2) / (2 * sigma**2))).astype(np.uint8)
-
-
-@needs_vlfeat
-@pytest.mark.parametrize(("x", "y", "sigma"), [(80.0, 60.0, 4.0), (71.3, 48.8, 6.0)])
-def test_vlfeat_finds_a_blob_where_it_is(x: float, y: float, sigma: float) -> None:
-    found = VLFEAT(blob(x, y, sigma))
-    assert len(found.lafs)
-    nearest = (found.keypoints - torch.tensor([x, y])).norm(dim=1).argmin()
-    assert (found.keypoints[nearest] - torch.tensor([x, y])).abs().max() < 0.1
-    # A Gaussian's difference of Gaussians, blurred by s and 2^(1/3) s, is largest at s = sigma 2^(-1/6).
-    assert found.scores[nearest].item() == pytest.approx(sigma * 2 ** (-1 / 6), rel=0.1)
-    half_side = found.lafs[nearest, :, 0].norm().item()
-    assert half_side == pytest.approx(features.FRAME_SIGMAS * found.scores[nearest].item(), rel=1e-5)
 
 
 @needs_vlfeat

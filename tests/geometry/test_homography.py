@@ -296,19 +296,6 @@ def test_refinement_ends_where_the_gradient_vanishes(loss: str) -> None:
             assert (np.abs(products[9, :9]) <= 1e-6 * size).all()
 
 
-@pytest.mark.parametrize("loss", KINDS)
-def test_gradient_in_tensors_and_its_graph(loss: str) -> None:
-    p = behind(problem(3, n=12))
-    h, error = p.tensors(loss)
-    expected, _ = evaluated(p.h, p.weighted(loss))
-    computed = homography_refine.homography_gradient(h, error)
-    np.testing.assert_allclose(computed[:, 0, 0].numpy(), expected[9, :9], atol=1e-11 * np.abs(expected).max())
-    points = error.points.requires_grad_()
-    assert torch.autograd.gradcheck(
-        lambda x: homography_refine.homography_gradient(h, error._replace(points=x)), points
-    )
-
-
 ROUNDING32, ROUNDING64 = 2.0**-24, 2.0**-53
 
 

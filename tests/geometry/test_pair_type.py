@@ -70,13 +70,6 @@ def test_some_matches_off_the_plane_make_a_pair_general() -> None:
     assert [PAIR_TYPES[i] for i in general.tolist()].count("general") >= 29
 
 
-def test_without_cameras_a_rotation_is_planar() -> None:
-    pairs = batch([draw("rotation", seed) for seed in range(10)])
-    evidence = pair_evidence(**{k: v for k, v in pairs.items() if k not in ("K0", "K1", "focal_precision")})
-    assert bool((evidence.rotation == -torch.inf).all())
-    assert classified(evidence).tolist() == [PAIR_TYPES.index("planar")] * 10
-
-
 def test_no_unit_is_special() -> None:
     """Images twice as large, noise and all, are of the same kinds by the same evidence."""
     pairs = batch([draw(kind, 3, noise=0.5) for kind in PAIR_TYPES if kind != "unrelated"])

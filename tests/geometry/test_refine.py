@@ -1,6 +1,5 @@
 """Refinement on the manifold of rank 2, in tensors and by kernels."""
 
-import itertools
 from collections.abc import Callable
 from typing import Any
 
@@ -46,6 +45,7 @@ def test_robust_optimum_equals_scipy(loss: str, seed: int) -> None:
         assert distance(fitted[:, 0, 0], torch.from_numpy(F.flatten())) < 0.05
 
 
+<<<<<<< HEAD
 @pytest.mark.parametrize("loss", LOSSES)
 def test_cost_never_rises(loss: str) -> None:
     F, x0, x1 = unit_scene(7, 90, noise=5e-3, outliers=40)
@@ -58,6 +58,8 @@ def test_cost_never_rises(loss: str) -> None:
     assert bool((costs[-1] < costs[0])[:, :10].any())
 
 
+=======
+>>>>>>> lt
 def test_empty_and_unknown() -> None:
     F = torch.eye(3, dtype=torch.float64)
     none = torch.zeros(0, 2, dtype=torch.float64)

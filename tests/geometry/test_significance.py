@@ -7,7 +7,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from fmtorch.core import RELATED
 from fmtorch.geometry import significance
 from fmtorch.jit import kernel
 from tests.conftest import oracle
@@ -92,18 +91,6 @@ def test_matches_that_are_repeated_count_once(times: int) -> None:
     assert torch.equal(known, repeated)
 
 
-def test_matches_of_one_spot_are_no_evidence() -> None:
-    """Two hundred matches between two spots, on their lines: as one match."""
-    F, x0, x1 = pair(30, outliers=1.0)
-    known = float(significance(F, x0, x1)[0])
-    rng = np.random.default_rng(1)
-    corner = torch.from_numpy(rng.normal(0, 0.5, (1, 200, 2)))
-    x0 = torch.cat([x0, x0[:, :1] + corner], 1)
-    spot = scene(30, noise=0.5).x1[None, :1]  # where the line of the first point runs
-    x1 = torch.cat([x1, spot + corner.flip(1) * 0.1], 1)
-    assert float(significance(F, x0, x1)[0]) < known + 2  # as many as four cells of each image may meet at a spot
-
-
 @pytest.mark.usefixtures("form")
 @pytest.mark.parametrize(
     "F", [torch.zeros(3, 3), torch.full((3, 3), torch.nan), torch.full((3, 3), torch.inf)], ids=["0", "NaN", "infinite"]
@@ -121,16 +108,6 @@ def test_matches_without_extent_are_not_significant() -> None:
     flat = torch.stack([x0[..., 0], torch.zeros_like(x0[..., 0])], -1)
     assert float(significance(F, flat, x1)[0]) < 0
     assert significance(F, x0 * torch.nan, x1)[0] == -math.inf
-
-
-def test_few_inliers_of_many_are_chance_and_many_are_not() -> None:
-    """Of 100 matches, 60 in a scene's geometry are evidence; of a random model's support there is none."""
-    for seed in range(20):
-        F, x0, x1 = pair(100, seed)
-        size = torch.tensor([SIZE])
-        assert float(significance(F, x0, x1, size0=size, size1=size)[0]) > 10 > RELATED
-        other = scene(100, seed + 50).F[None]
-        assert float(significance(other, x0, x1, size0=size, size1=size)[0]) < 0
 
 
 def assert_same_in_both_forms(monkeypatch: pytest.MonkeyPatch, F: Tensor, *c: Tensor | None) -> None:

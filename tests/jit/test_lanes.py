@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fmtorch.geometry.five_point import five_point
 from fmtorch.jit import cache, linking
 from fmtorch.jit import kernel as switch
 from fmtorch.jit.kernel import B1x2, F4x2, F8x1, F8x2, kernel
@@ -163,18 +162,3 @@ def test_garbage_is_collected_afterwards_as_before(tmp_path: Path) -> None:
             assert gc.isenabled() == collects
         finally:
             gc.enable()
-
-
-@pytest.mark.filterwarnings("ignore:divide by zero|invalid value|overflow:RuntimeWarning")
-def test_a_solver_called_without_numba_finds_the_same_models() -> None:
-    generator = np.random.default_rng(0)
-    points = np.tile(generator.normal(size=(2, 30)), (2, 1)) + 0.1 * generator.normal(size=(4, 30))
-    sample = np.stack([generator.permutation(30)[:5] for _ in range(LANES + 3)], 1)
-    depth, results = np.full((2, LANES + 3), 1.2), []
-    for each in (five_point, five_point.function):
-        F, draw = np.zeros((10 * sample.shape[1], 9), np.float32), np.zeros(10 * sample.shape[1], np.int64)
-        count = each(points, sample, depth, np.zeros(4), F, draw)
-        results.append((count, F, draw))
-    assert results[0][0] > LANES
-    for compiled, plain in zip(*results, strict=True):
-        np.testing.assert_array_equal(compiled, plain)

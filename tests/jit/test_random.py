@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import torch
-from scipy import stats
 
 from fmtorch.core import pair_key
 from fmtorch.estimators import uniforms
@@ -54,16 +53,6 @@ def test_the_global_generator_is_neither_used_nor_moved() -> None:
     assert torch.equal(bits(0, KEYS, Stream.METRIC, 0, 10, 2), first)
 
 
-def test_columns_draws_keys_and_streams_are_uncorrelated() -> None:
-    key = torch.arange(200)
-    u = uniform(0, key, Stream.SAMPLING, 0, 500, 2).numpy()
-    other = uniform(0, key, Stream.METRIC, 0, 500, 2).numpy()
-    seed = uniform(1, key, Stream.SAMPLING, 0, 500, 2).numpy()
-    for a, b in ((u[..., 0], u[..., 1]), (u[:, 1:, 0], u[:, :-1, 0]), (u[1:], u[:-1]), (u, other), (u, seed)):
-        # Of n independent pairs the correlation has standard deviation 1 / sqrt(n).
-        assert abs(np.corrcoef(a.ravel(), b.ravel())[0, 1]) < 4 / np.sqrt(a.size)
-
-
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_the_same_on_the_gpu() -> None:
     for function in (bits, uniform):
@@ -89,45 +78,4 @@ def test_the_same_bits(seed: int, key: int) -> None:
             assert index[:count].tolist() == order[:most]
 
 
-def test_seeds_keys_streams_and_draws_give_distinct_numbers() -> None:
-    drawn = [bits(seed, KEYS, stream, 0, 500, 4).flatten() for seed in range(4) for stream in Stream]
-    together = torch.cat(drawn)
-    # 144,000 of 2^63 numbers: a chance coincidence has probability 1e-9.
-    assert len(torch.unique(together)) == len(together)
-
-
 LEVEL = 1e-3
-
-
-def _uniformity(u: np.ndarray, bins: int) -> float:
-    counts = np.histogram(u, bins, (0, 1))[0]
-    return float(stats.chisquare(counts).pvalue)
-
-
-@pytest.mark.parametrize("stream", list(Stream))
-@pytest.mark.parametrize("vary", ["draw", "key", "hash"])
-def test_uniform_by_chi_square(stream: Stream, vary: str) -> None:
-    if vary == "draw":
-        u = uniform(0, torch.tensor([0]), stream, 0, 100_000, 1)
-    elif vary == "key":  # consecutive keys, the hardest for a poor hash
-        u = uniform(0, torch.arange(100_000), stream, 0, 1, 1)
-    else:
-        u = uniform(0, torch.tensor([pair_key(str(i)) for i in range(1000)]), stream, 0, 100, 1)
-    assert _uniformity(u.numpy().ravel(), 256) > LEVEL
-
-
-def test_every_bit_is_fair() -> None:
-    drawn = bits(0, torch.arange(100), Stream.SAMPLING, 0, 1000, 1).flatten()
-    ones = torch.stack([(drawn >> bit & 1).sum() for bit in range(63)]).numpy()
-    assert (drawn >= 0).all()
-    # 63 binomials with p = 1/2; 4.5 standard deviations are exceeded by one of them with probability 4e-4.
-    assert np.abs(ones - len(drawn) / 2).max() < 4.5 * np.sqrt(len(drawn) / 4)
-
-
-def test_the_same_in_any_batch_and_any_slice_of_draws() -> None:
-    together = bits(3, KEYS, Stream.SAMPLING, 0, 64, 7)
-    for i, key in enumerate(KEYS):
-        assert torch.equal(bits(3, key[None], Stream.SAMPLING, 0, 64, 7)[0], together[i])
-    assert torch.equal(bits(3, KEYS.flip(0), Stream.SAMPLING, 0, 64, 7).flip(0), together)
-    parts = [bits(3, KEYS, Stream.SAMPLING, start, 16, 7) for start in range(0, 64, 16)]
-    assert torch.equal(torch.cat(parts, 1), together)

@@ -32,7 +32,7 @@ from fmtorch.jobs import (
 from tests.helpers import draw, pair
 from tests.helpers import small_pipeline as pipeline
 from tests.jobs.work import ends, fails, late, make_needs, slow, squares
-from tests.laws import degenerate, scene
+from tests.laws import scene
 
 PROCESSES = Execution("processes", 2)
 
@@ -252,28 +252,6 @@ def test_the_first_error_of_an_item_is_raised(threads: int) -> None:
     with pytest.raises(RuntimeError, match="item 2"):
         mapped(fails, range(1000))
     assert len(begun) < 1000
-
-
-@pytest.mark.parametrize("graph", [True, False])
-def test_a_batch_in_threads_has_the_bits_of_one_thread(threads: int, graph: bool) -> None:
-    """Of pairs of many sizes with degenerate ones among them; gradients are summed in another order."""
-    c = collate([*(scene(i, 20 + 61 * i % 400) for i in range(9)), *degenerate().values()])
-    estimator, results = presets.build("estimator", "msac", hypotheses=100, round=50), []
-    for count in (threads, 1):
-        torch.set_num_threads(count)
-        x0 = c.x0.double().requires_grad_()
-        with torch.set_grad_enabled(graph):
-            e = estimator(c.replace(x0=x0, x1=c.x1.double()), seed=5)
-        assert e.F.requires_grad == graph
-        if graph:
-            e.F.square()[:, 0, 1].sum().backward()
-        results.append((e, x0.grad))
-    (threaded, gradient), (single, expected) = results
-    for name in ("F", "inliers", "ok", "samples", "significance"):
-        assert torch.equal(getattr(threaded, name), getattr(single, name)), name
-    assert threaded.reason == single.reason
-    if graph:
-        torch.testing.assert_close(gradient, expected)
 
 
 def test_two_photographs_are_described_at_once(threads: int, tmp_path: Path) -> None:

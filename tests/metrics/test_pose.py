@@ -149,16 +149,8 @@ def test_without_a_matrix_or_a_match_before_the_cameras_the_error_is_the_worst()
     assert closest.rotation[1].item() == closest.translation[1].item() == 180
 
 
-ERROR = st.floats(0, 40) | st.sampled_from([1.0, 5.0, 10.0, 15.0, 20.0]) | st.just(float("inf"))
+ERROR = st.floats(0, 40) | st.sampled_from([1.0, 5.0, 10.0, 15.0, 20.0, float("inf"), float("nan")])
 ERRORS = st.lists(ERROR, min_size=1, max_size=20)
-
-
-def test_auc_known_answers() -> None:
-    errors = torch.tensor([2.0, 12.0], dtype=torch.float64)
-    # To 5: a triangle of base 2 and height 1/2, then 3 at 1/2. To 20: up to 12 it rises from 1/2 to 1, then 8 at 1.
-    expected = [(0.5 + 1.5) / 5, (0.5 + 4) / 10, (0.5 + 7.5 + 8) / 20]
-    assert metrics.pose_auc(errors).tolist() == pytest.approx(expected)
-    assert metrics.pose_auc(torch.tensor([torch.nan, torch.inf])).tolist() == [0, 0, 0]
 
 
 @given(ERRORS)
@@ -166,15 +158,6 @@ def test_auc_as_superglue(values: list[float]) -> None:
     thresholds = (5, 10, 20)
     auc = metrics.pose_auc(torch.tensor(values, dtype=torch.float64), thresholds)
     assert auc.tolist() == pytest.approx(reference.pose_auc(values, thresholds), abs=1e-12)
-
-
-def test_binned_known_answers() -> None:
-    errors = torch.tensor([0.5, 5.0, 7.0, torch.nan], dtype=torch.float64)
-    # Below 5: one of four; below 10, 15 and 20: three.
-    assert metrics.pose_map(errors).tolist() == pytest.approx([1 / 4, (1 + 3) / 8, (1 + 3 + 3 + 3) / 16])
-    # Up to 1, 2, 3, 4: one; up to 5 and 6: two; up to 7, 8, 9, 10: three.
-    assert metrics.pose_maa(errors).item() == pytest.approx((4 * 1 + 2 * 2 + 4 * 3) / 40)
-    assert metrics.pose_maa(torch.tensor([torch.nan, torch.inf])).item() == 0
 
 
 @given(ERRORS)

@@ -187,7 +187,7 @@ def reads(monkeypatch: pytest.MonkeyPatch) -> collections.Counter[Any]:
 def test_files_are_read_once_and_matches_are_refined(reads: collections.Counter[Any], tmp_path: Any) -> None:
     """Also where features are in the cache, and where matches come with the pair."""
     dataset = data.load("fmbench", root=shared_path("data/Strecha_train"))
-    pairs = [dataset[i] for i in range(4)]
+    pairs = [dataset[i] for i in range(2)]
     for _ in range(2):  # the second run finds its features in the cache
         reads.clear()
         pipeline = built(str(tmp_path))
@@ -237,7 +237,8 @@ def test_refined_matches_are_exported_as_matches_of_keypoints(tmp_path: Path) ->
     ends = pair.image0.path, pair.image1.path
     journals = []
     for i, overrides in enumerate(([PRUNERS], [])):
-        pipeline = load_pipeline("sift_fmtorch", overrides=[*overrides, "cache=off", "features.max_features=500"])
+        own = [*overrides, f"cache={tmp_path}", "features.max_features=500"]
+        pipeline = load_pipeline("sift_fmtorch", overrides=own)
         run, folder = (MatchStore(tmp_path / f"{name}{i}", ends[0].parent) for name in ("run", "folder"))
         run.add(match_records(pipeline, pipeline.run([pair])))
         for _ in FolderMatches(pipeline, folder, folder_workers(pipeline), 4000, True, 0).each([ends]):

@@ -76,18 +76,6 @@ def duplicated(n: int, dtype: torch.dtype = torch.float32) -> Correspondences:
     return Correspondences(x0, x1, torch.ones(1, n, dtype=torch.bool), ratio, mutual=ratio < 0.5)
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_one_to_one_is_symmetric_and_independent_of_order(dtype: torch.dtype) -> None:
-    c = duplicated(200, dtype)
-    kept = pruning.one_to_one(c.x0, c.x1, c.ratio)
-    assert 0 < kept.sum() < 200
-    assert torch.equal(kept, pruning.one_to_one(c.x1, c.x0, c.ratio))
-    order = torch.randperm(200, generator=torch.Generator().manual_seed(1))
-    assert torch.equal(kept[:, order], pruning.one_to_one(*(a[:, order] for a in (c.x0, c.x1, c.ratio))))
-    for x in (c.x0, c.x1):
-        assert len(torch.unique(x[kept], dim=0)) == kept.sum()
-
-
 def test_stages_are_their_functions_need_their_fields_and_keep_the_rest() -> None:
     c = duplicated(20)
     ratio, unique = pruning.ratio_test(c.ratio, 0.5), pruning.one_to_one(c.x0, c.x1, c.ratio)
@@ -98,13 +86,6 @@ def test_stages_are_their_functions_need_their_fields_and_keep_the_rest() -> Non
         assert torch.equal(out.x0, c.x0)
         with pytest.raises(ValueError, match=f"needs `{field}`"):
             stage(c.replace(**{field: None}))
-
-
-def test_one_to_one_drops_what_has_no_location_and_ranks_nan_ratio_last() -> None:
-    x0 = torch.tensor([[[math.nan, 0.0], [math.inf, 0.0], [1.0, 1.0], [1.0, 1.0]]])
-    x1 = torch.arange(8.0).reshape(1, 4, 2)
-    ratio = torch.tensor([[0.0, 0.0, math.nan, 0.9]])
-    assert pruning.one_to_one(x0, x1, ratio).tolist() == [[False, False, False, True]]
 
 
 PRUNERS = variants("pruner")

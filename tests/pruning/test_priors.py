@@ -1,8 +1,6 @@
 """The soft form of the pruners: their evidence, its calibration, and the filter that makes it hard again."""
 
 import itertools
-import math
-from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -13,11 +11,9 @@ from fmtorch import Correspondences, presets
 from fmtorch.pruning import GMS, LPM, Calibration, calibration, frame_agreement, gms_support, position_agreement
 from fmtorch.pruning.consistency import CURVES, MIN_VOTE, NOISE, TOLERANCE, TURNS, WINDOW, WORST_RATIO
 from tests.laws import scene
-from tests.pruning.test_filters import turned
 from tests.pruning.test_gms import SIZE0, SIZE1, moving, moving_along
 from tests.reference import consistency as reference
 from tests.reference.gms import SCALES, normalised, run, support
-from tests.reference.lpm import passes
 from tests.variants import built
 
 
@@ -104,13 +100,6 @@ def test_gms_support_equals_the_definition(angle: float, scale: float) -> None:
     np.testing.assert_allclose(computed, z / (z + 1.5), rtol=1e-6)  # float64 rounded to float32
 
 
-@pytest.mark.parametrize("n", [0, 1, 9, 40, 160])
-def test_lpm_cost_equals_the_definition(n: int) -> None:
-    x0, x1 = moving_along(n, n)
-    expected = np.mean(passes(x0.numpy(), x1.numpy())[1], axis=0)
-    np.testing.assert_allclose(fmtorch.pruning.lpm_cost(x0[None], x1[None])[0], expected, rtol=1e-12)
-
-
 def test_priors_follow_the_right_matches_of_a_common_motion() -> None:
     x0, x1 = (x[None].float() for x in moving_along(0, 1000, outliers=0.5))
     turn = torch.tensor([[0.95, 0.2], [-0.2, 0.95]])
@@ -191,36 +180,30 @@ def test_priors_tell_inliers_on_real_pairs(name, area, real_matches):
     assert np.mean(areas) > area
 
 
-def common_motion(count: int = 80) -> Correspondences:
-    """Matches that all obey one affine map, in position and in frame."""
-    c = scene(0, count)
-    A = torch.tensor([[1.2, -0.4], [0.3, 0.9]])
-    x1 = c.x0 @ A.T + torch.tensor([20.0, -5.0])
-    lafs1 = torch.cat([A @ c.lafs0[..., :2], x1[..., None]], -1)
-    return c.replace(x1=x1, lafs1=lafs1)
+def test_without_frames_or_quality_the_prior_is_left_alone() -> None:
+    pruner = presets.build("pruner", "frame_consistency")
+    c = scene(2, 50)
+    assert pruner(c.replace(lafs0=None)).prior is c.prior
+    assert pruner(c.replace(ratio=None)).prior is c.prior
 
 
-def agree(c: Correspondences) -> torch.Tensor:
-    return frame_agreement(c.x0, c.x1, c.lafs0, c.lafs1, c.ratio, c.mask)
+@pytest.mark.parametrize("frames", [True, False])
+def test_gradients_are_those_of_the_definition(frames: bool) -> None:
+    c, function = scene(2, 30), frame_agreement if frames else position_agreement
+    names = ("x0", "x1", "ratio", *(("lafs0", "lafs1") if frames else ()))
+    fields = {name: getattr(c, name).double().requires_grad_() for name in names}
+    weight = torch.linspace(-1, 1, 30, dtype=torch.float64)
 
+    def defined(x0: np.ndarray, x1: np.ndarray, ratio: np.ndarray, **lafs: np.ndarray) -> float:
+        S = reference.similarity(x0[0], x1[0], CURVES, TURNS, fmtorch.pruning.consistency.SCALES)
+        maps = np.tile([[S.real, -S.imag], [S.imag, S.real]], (30, 1, 1))
+        if frames:
+            maps = lafs["lafs1"][0, :, :, :2] @ np.linalg.inv(lafs["lafs0"][0, :, :, :2])
+        vote = np.maximum(WORST_RATIO - ratio[0], MIN_VOTE)
+        return float(weight.numpy() @ reference.agreement(x0[0], x1[0], maps, vote, CURVES, WINDOW, TOLERANCE, NOISE))
 
-def test_a_common_motion_agrees_wholly() -> None:
-    # The prediction error is rounding alone: 1e-7 of coordinates of 1e3 px against lengths of at least 4 px.
-    assert float((1 - agree(common_motion())).abs().max()) < 1e-5
-
-
-def test_a_wrong_match_disagrees_and_is_told_from_the_right_ones() -> None:
-    c = common_motion()
-    x1 = c.x1.clone()
-    x1[0, 7] += 300
-    w = agree(c.replace(x1=x1))[0]
-    assert float(w[7]) < 0.2
-    assert float(w[torch.arange(len(w)) != 7].min()) > 0.8
-
-
-def expect_gradients(fields: dict[str, torch.Tensor], defined: Callable[..., float], step: float = 1e-5) -> None:
-    """The gradients of the fields are those of `defined`, a function of their arrays, at some of their entries."""
-    rng = np.random.default_rng(0)
+    (function(**fields, mask=c.mask)[0] * weight).sum().backward()
+    rng, step = np.random.default_rng(0), 1e-5
     for name, tensor in fields.items():
         for place in rng.choice(tensor.numel(), 3, replace=False):
             values = []
@@ -231,56 +214,3 @@ def expect_gradients(fields: dict[str, torch.Tensor], defined: Callable[..., flo
             slope = (values[0] - values[1]) / (2 * step)
             # Orders along curves are constants of both; central differences are of order 2.
             assert abs(float(tensor.grad.reshape(-1)[place]) - slope) < 1e-6 * max(1.0, abs(slope)), (name, place)
-
-
-def test_gradients_are_those_of_the_definition() -> None:
-    c = scene(2, 30)
-    fields = {name: getattr(c, name).double().requires_grad_() for name in ("x0", "x1", "lafs0", "lafs1", "ratio")}
-    weight = torch.linspace(-1, 1, 30, dtype=torch.float64)
-
-    def defined(x0: np.ndarray, x1: np.ndarray, lafs0: np.ndarray, lafs1: np.ndarray, ratio: np.ndarray) -> float:
-        S, vote = lafs1[0, :, :, :2] @ np.linalg.inv(lafs0[0, :, :, :2]), np.maximum(WORST_RATIO - ratio[0], MIN_VOTE)
-        agreement = reference.agreement(x0[0], x1[0], S, vote, CURVES, WINDOW, TOLERANCE, NOISE)
-        return float(weight.numpy() @ agreement)
-
-    (frame_agreement(**fields, mask=c.mask)[0] * weight).sum().backward()
-    expect_gradients(fields, defined)
-
-
-def test_without_frames_or_quality_the_prior_is_left_alone() -> None:
-    pruner = presets.build("pruner", "frame_consistency")
-    c = scene(2, 50)
-    assert pruner(c.replace(lafs0=None)).prior is c.prior
-    assert pruner(c.replace(ratio=None)).prior is c.prior
-
-
-def agree_in_position(c: Correspondences) -> torch.Tensor:
-    return position_agreement(c.x0, c.x1, c.ratio, c.mask)
-
-
-@pytest.mark.parametrize(("angle", "scale"), [(0.0, 1.0), (math.pi / 2, 1.0), (-2.5, 2.3), (0.3, 0.4)])
-def test_a_common_motion_agrees_and_a_wrong_match_does_not(angle: float, scale: float) -> None:
-    c = scene(0, 80)
-    c = turned(c.replace(x1=c.x0), angle, scale)
-    # Off the nearest hypothesis by at most pi / 16 and 2^(1/4): e is at most half the difference of the two maps.
-    worst = abs(2**0.25 * np.exp(1j * math.pi / 16) - 1) / (1 + 2**0.25)
-    assert float(agree_in_position(c).min()) > (1 + (worst / TOLERANCE) ** 2 / 8) ** -8
-    x1 = c.x1.clone()
-    x1[0, 7] += 700 * scale
-    assert float(agree_in_position(c.replace(x1=x1))[0, 7]) < 0.1
-
-
-def test_gradients_of_positions_are_those_of_the_definition() -> None:
-    c = scene(2, 30)
-    assert c.ratio is not None
-    fields = {name: getattr(c, name).double().requires_grad_() for name in ("x0", "x1", "ratio")}
-    weight = torch.linspace(-1, 1, 30, dtype=torch.float64)
-
-    def defined(x0: np.ndarray, x1: np.ndarray, ratio: np.ndarray) -> float:
-        S = reference.similarity(x0[0], x1[0], CURVES, TURNS, fmtorch.pruning.consistency.SCALES)
-        vote = np.maximum(WORST_RATIO - ratio[0], MIN_VOTE)
-        agreement = reference.agreement_of_positions(x0[0], x1[0], S, vote, CURVES, WINDOW, TOLERANCE, NOISE)
-        return float(weight.numpy() @ agreement)
-
-    (position_agreement(**fields, mask=c.mask)[0] * weight).sum().backward()
-    expect_gradients(fields, defined)

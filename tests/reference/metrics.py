@@ -162,7 +162,7 @@ def closest_pose_error(
 
 def pose_auc(errors: list[float], thresholds: tuple[float, ...]) -> list[float]:
     """The recall curve's area as SuperGlue's published evaluation computes it."""
-    ordered = [0.0, *sorted(errors)]
+    ordered = [0.0, *sorted(math.inf if math.isnan(e) else e for e in errors)]
     curve = [0.0, *((i + 1) / len(errors) for i in range(len(errors)))]
     areas = []
     for t in thresholds:

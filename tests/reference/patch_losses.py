@@ -20,19 +20,3 @@ def hardest_triplet(a: Vectors, b: Vectors, margin: float) -> float:
         hinge = max(0.0, margin + distance(a[i], b[i]) - min(d for d in negatives if d >= 0.008))
         total += hinge
     return total / n
-
-
-def fpr_at_recall(positive: Sequence[float], negative: Sequence[float], recall: float) -> float:
-    """The least threshold that accepts the share `recall` of the positives, and what it accepts of the negatives."""
-    for threshold in sorted(positive):
-        if sum(d <= threshold for d in positive) >= recall * len(positive) - 1e-9:
-            return sum(d <= threshold for d in negative) / len(negative)
-    raise ValueError("no positives")
-
-
-def mean_average_precision(a: Vectors, b: Vectors) -> float:
-    """Each a_i asks for b_i: one right answer, so its average precision is one over its rank (ties against it)."""
-    total = 0.0
-    for i in range(len(a)):
-        total += 1 / sum(distance(a[i], other) <= distance(a[i], b[i]) for other in b)
-    return total / len(a)

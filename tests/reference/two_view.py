@@ -151,22 +151,3 @@ def covariance(
     C = basis @ np.linalg.inv(free) @ basis.T
     G = slopes(lambda c: c.fundamental().ravel(), cameras)
     return C, G @ C @ G.T, s
-
-
-def fit(
-    cameras: Cameras, x0: np.ndarray, x1: np.ndarray, truncation: float, basis: np.ndarray, mean: np.ndarray,
-    precision: np.ndarray, sigma: float,
-) -> Cameras:  # fmt: skip
-    """Gauss-Newton of ``sum min(r^2, T^2) / 2 sigma^2`` with a normal prior of the log focal lengths (2,)."""
-    for _ in range(30):
-        r = residuals(cameras, x0, x1)
-        J = slopes(lambda c: residuals(c, x0, x1), cameras)
-        near = np.abs(r) < truncation
-        H, g = J[near].T @ J[near] / sigma**2, J[near].T @ r[near] / sigma**2
-        H[5:, 5:] += precision
-        g[5:] += precision @ (np.log(cameras.focal) - mean)
-        step = basis @ np.linalg.solve(basis.T @ H @ basis, -basis.T @ g)
-        cameras = cameras.moved(step)
-        if np.abs(step).max() < 1e-10:
-            break
-    return cameras

@@ -19,7 +19,7 @@ EVAL_KILLS, MATCH_KILLS, TRAIN_KILLS, PROCESS_KILLS = (
     int(number) for number in os.environ.get("FMTORCH_KILLS", "40,20,30,10").split(",")
 )
 TRAIN = [
-    "optimisation.steps=12", "objective.classification_steps=2", "batch=2", "threads=1", "workers=1",
+    "optimisation.steps=8", "objective.classification_steps=2", "batch=2", "threads=1", "workers=1",
     "validation.scenes=1", "validation.pairs=2", "validation.every=4", "checkpoint_every=1",
     "validation.uses.hard.estimator=ransac", "validation.uses.prior.estimator=msac", "augmentation.crop=0",
     "features.max_features=300", "pruner.lc.network.channels=8", "pruner.lc.network.blocks=2",

@@ -291,24 +291,6 @@ def test_shapes_are_checked() -> None:
         LabelledMatches(c, torch.zeros(2, 3, dtype=torch.int8), torch.zeros(1, 3, 3).double())
 
 
-def test_known_answers_on_a_wall() -> None:
-    wall = Wall()
-    x0 = np.array([[60.0, 80.0], [100.0, 120.0], [150.0, 200.0]])
-    x1 = wall.partner(x0)
-    line = np.column_stack([x0, np.ones(3)]) @ wall.pair.F.T
-    along = np.stack([line[:, 1], -line[:, 0]], 1) / np.hypot(line[:, 0], line[:, 1])[:, None]
-    for shift, expected in ((0.0, 1), (1.5, 1), (12.0, 0), (-12.0, 0)):
-        moved = x1 + shift * along
-        assert line_distance(wall.pair.F, x0, moved).max() < 1e-6  # no epipolar line can tell
-        assert label(wall, wall.pair, x0, moved).tolist() == [expected] * 3
-    ahead = transfer_error(x0, wall.depth(wall.pair.image0, x0)[None], x1, *_cameras(wall.pair))
-    np.testing.assert_allclose(ahead, 0, atol=1e-9)
-
-
-def _cameras(pair: ImagePair):  # type: ignore[no-untyped-def]
-    return pair.K0, pair.K1, pair.R, pair.t
-
-
 def test_the_sky_is_ignored_near_its_line_and_wrong_far_from_it() -> None:
     wall = Wall()
     x0 = np.array([[250.0, 100.0], [250.0, 100.0]])

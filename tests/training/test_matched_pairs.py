@@ -21,7 +21,7 @@ from fmtorch.data import DataError, ImagePair, ImageSource, load
 from fmtorch.pipeline import Pipeline, load_pipeline
 from fmtorch.pruning import LC
 from fmtorch.pruning.networks.learned import predict
-from fmtorch.scenes import FAMILIES, PLANS, RenderedPairs, Task
+from fmtorch.scenes import FAMILIES, RenderedPairs
 from fmtorch.training import (
     Augmentation,
     Draw,
@@ -387,15 +387,6 @@ def test_mistakes_are_named() -> None:
     with pytest.raises(ValueError, match="rank is 2 of 2"):
         SimilarLengthBatches(Pairs(), rank=2, world_size=2)
     assert Draw(3) == (3, 0, None)
-
-
-def test_training_has_no_scene_of_the_test_split(matched: MatchedPairs) -> None:
-    """What the scenes are made of is compared in tests/scenes/test_rendered.py."""
-    plans = {plan for (_, split), plan in PLANS.items() if split == "test"}
-    test = {Task(family, "test", n, 0, plan).name for plan in plans for family in FAMILIES for n in range(plan.scenes)}
-    training = {about["scene"] for about in matched.pairs}
-    assert (bool(test), bool(training), training & test) == (True, True, set())
-    assert all(f"rendered/{about['scene']}/" in about["identity"] for about in matched.pairs)
 
 
 def oanet(tmp_path: Path, **options: Any) -> tuple[OANetPairs, MatchedPairs]:

@@ -75,19 +75,6 @@ def test_ellipsoids_hold_the_truth(knowledge: str, count: int) -> None:
     assert (share <= 0.97 + 2 * spread).all()
 
 
-def test_more_matches_and_more_knowledge_leave_less_open() -> None:
-    def deviation(count: int, **given: Any) -> float:
-        s = reference.scene(0, count, 0.5, 0.2, (CENTRAL, CENTRAL))
-        e = fmtorch.find_fundamental(s.x0, s.x1, **SIZES, **given, covariance=True)
-        return float(e.deviation_degrees.sum())
-
-    K = torch.from_numpy(CENTRAL)
-    exactly = {"K0": K, "K1": K}
-    known, rough, unknown = (deviation(200, **given) for given in (exactly, {**exactly, "focal": 0.05}, {}))
-    assert known < rough < unknown
-    assert known < deviation(50, **exactly)
-
-
 @pytest.mark.parametrize("given", [CAMERAS, {"focal": "shared"}, {}], ids=["known", "shared", "unknown"])
 def test_laws(given: dict[str, Any]) -> None:
     """Of pairs alone, in a batch, beside one that fails."""

@@ -35,25 +35,25 @@ def photographs(lens0: Lens, lens1: Lens, seed: int = 1) -> tuple[Array, Array]:
 
 
 def straight(lens: Lens, x: Array) -> Array:
-    """Where a pinhole of the same K has a point (2,) of the photograph: Newton's method on finite differences."""
+    """Where a pinhole of the same K has points (n, 2) of the photograph: Newton's method on finite differences."""
     at = x.copy()
     for _ in range(60):
-        at = at - 0.5 * np.linalg.solve(slope(lens, at), lens.distort(at[None])[0] - x)
+        at = at - 0.5 * np.linalg.solve(slope(lens, at), (lens.distort(at) - x)[..., None])[..., 0]
     return at
 
 
 def slope(lens: Lens, at: Array) -> Array:
-    ends = [lens.distort(at[None] + sign * 1e-3 * np.eye(2)) for sign in (1, -1)]
-    return (ends[0] - ends[1]).T / 2e-3
+    ends = [lens.distort((at[:, None] + step).reshape(-1, 2)) for step in (1e-3 * np.eye(2), -1e-3 * np.eye(2))]
+    return (ends[0] - ends[1]).reshape(-1, 2, 2).swapaxes(1, 2) / 2e-3
 
 
 def by_hand(lenses: tuple[Lens | None, Lens | None], x0: Array, x1: Array) -> tuple[Array, Array, Array]:
     """Undistorted points, and the noise of the matches."""
     ends, noise = [], np.ones(len(x0))
     for lens, x in zip(lenses, (x0, x1), strict=True):
-        ends.append(x if lens is None else np.array([straight(lens, each) for each in x]))
+        ends.append(x if lens is None else straight(lens, x))
         if lens is not None:
-            noise *= [abs(np.linalg.det(slope(lens, each))) ** -0.25 for each in ends[-1]]
+            noise *= np.abs(np.linalg.det(slope(lens, ends[-1]))) ** -0.25
     return ends[0], ends[1], noise
 
 
@@ -220,7 +220,7 @@ def test_planes_keep_to_themselves() -> None:
 def test_a_lens_of_a_photograph_of_a_map() -> None:
     """Whose points are in a unit of their own."""
     x0, x1 = planes(4, RADIAL)
-    board = np.array([straight(RADIAL, each) for each in x0]) / 1000
+    board = straight(RADIAL, x0) / 1000
     estimate = fmtorch.find_homography(board, x1, lens=(None, RADIAL))
     estimate = estimate.derived(F=estimate.F @ torch.diag(torch.tensor([1e-3, 1e-3, 1.0])).double())
     assert error(estimate) < 1
@@ -270,7 +270,7 @@ def test_frames_go_with_their_points() -> None:
     before, after = [], []
     for x, y in ((x0, y0), (x1, y1)):
         before.append(np.concatenate([axes, x[..., None]], -1))
-        straightened = [np.linalg.solve(slope(RADIAL, at), own) for at, own in zip(y, axes, strict=True)]
+        straightened = np.linalg.solve(slope(RADIAL, y), axes)
         after.append(np.concatenate([straightened, y[..., None]], -1))
     ratio = np.linspace(0.3, 0.9, len(x0))
     estimate = fmtorch.find_essential(x0, x1, lens=RADIAL, ratio=ratio, lafs0=before[0], lafs1=before[1])

@@ -76,12 +76,12 @@ def error(F: torch.Tensor, pair: Photographs) -> float:
 
 
 @pytest.mark.parametrize("sizes", SIZES)
-def test_drawn_focal_lengths_are_functions_of_the_draw_that_follow_the_prior(sizes: Sizes) -> None:
-    pair, seed, start, count = pair_of(photographs(0, sizes).c, 3), 3, 100, 4000
+def test_drawn_focal_lengths_are_functions_of_the_draw(sizes: Sizes) -> None:
+    pair, seed, start, count = pair_of(photographs(0, sizes).c, 3), 3, 100, 40
     images, depth, normal = images_of(pair), np.empty((2, count)), focal_prior.normal_quantiles()
     focal_prior.draw_depths(images.prior, images.longest, pair.mixed_seed(Stream.FOCAL), pair.key, start, depth)
     ratios = np.log(depth / images.longest[:, None])
-    for d in range(20):
+    for d in range(count):
         words = [random.number(seed, pair.key, Stream.FOCAL, start + d, k, 3) % focal_prior.QUANTILES for k in range(3)]
         half = (
             0.0
@@ -91,14 +91,6 @@ def test_drawn_focal_lengths_are_functions_of_the_draw_that_follow_the_prior(siz
         mean = math.log(focal_prior.USUAL_FOCAL) + focal_prior.FOCAL_DEVIATION * normal[words[0]]
         expected = [mean + focal_prior.RATIO_DEVIATION / 2 * half, mean - focal_prior.RATIO_DEVIATION / 2 * half]
         np.testing.assert_allclose(ratios[:, d], expected, atol=1e-12)
-    # Four standard errors of 4000 draws (of 1200 ratios).
-    mean, difference = ratios.mean(0), ratios[0] - ratios[1]
-    assert mean.mean() == pytest.approx(math.log(1.2), abs=4 * 0.4 / math.sqrt(count))
-    assert mean.std() == pytest.approx(0.4, abs=4 * 0.4 / math.sqrt(2 * count))
-    equal = float((np.abs(difference) < 1e-12).mean())  # of a normal ratio one draw in 1e12
-    assert equal == pytest.approx(0.7 if pair.same_size else 0.0, abs=4 * math.sqrt(0.7 * 0.3 / count))
-    other = difference[np.abs(difference) >= 1e-12]
-    assert other.std() == pytest.approx(0.5, abs=4 * 0.5 / math.sqrt(2 * len(other)))
 
 
 def test_hypotheses_pass_through_their_five_matches() -> None:
@@ -186,7 +178,7 @@ def drawn(known: str, same: bool, shared: bool = False) -> np.ndarray:
     return np.log(depth)
 
 
-@pytest.mark.parametrize("known", ["one", "the other roughly", "both", "both roughly"])
+@pytest.mark.parametrize("known", KNOWN)
 def test_draws_follow_prior_and_measurements(known: str) -> None:
     """The product of both, and where a measurement may be wrong three fifths of the prior alone."""
     deviation, a, b = KNOWN[known], 0.4**2, 0.5**2 / 4

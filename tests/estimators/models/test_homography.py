@@ -99,16 +99,6 @@ def test_what_determines_no_homography_is_not_ok_with_a_reason(kind: str) -> Non
     assert not estimate.inliers.any()
 
 
-def test_matches_that_are_not_finite_are_left_out() -> None:
-    m = matches(2)
-    x0 = m.x0.copy()
-    x0[150:160] = np.nan
-    estimate = fmtorch.find_homography(x0, m.x1)
-    assert bool(estimate.ok)
-    assert not estimate.inliers[0, 150:160].any()
-    assert corner_error(estimate.H[0]) < 4 * expected_error(Matches(m.x0, m.x1, m.right & np.isfinite(x0[:, 0])), 0.5)
-
-
 def test_the_prior_chooses_between_two_planes() -> None:
     other = np.array([[1.1, 0.1, -40.0], [-0.05, 1.0, 30.0], [-1e-4, 1e-4, 1.0]])
     a, b = matches(3, 100, wrong=0), matches(4, 100, wrong=0, truth=other)
