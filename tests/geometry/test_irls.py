@@ -13,11 +13,8 @@ from fmtorch.geometry import LOSSES, irls, reweighted_fits
 from fmtorch.geometry.robust_losses import ENTRIES, GAIN_TABLE, LOSS_TABLE, QUANTILE, named_loss
 from tests import laws
 from tests.geometry.scenes import SCALE, distance, near_scene, tolerances, unit_scene
-<<<<<<< HEAD
-from tests.reference.refine import loss as robust_loss
-=======
 from tests.reference import solvers
->>>>>>> lt
+from tests.reference.refine import loss as robust_loss
 
 
 def pair(seed: int, noise: float, outliers: int = 0) -> tuple[Tensor, Tensor, Tensor]:

@@ -45,21 +45,6 @@ def test_robust_optimum_equals_scipy(loss: str, seed: int) -> None:
         assert distance(fitted[:, 0, 0], torch.from_numpy(F.flatten())) < 0.05
 
 
-<<<<<<< HEAD
-@pytest.mark.parametrize("loss", LOSSES)
-def test_cost_never_rises(loss: str) -> None:
-    F, x0, x1 = unit_scene(7, 90, noise=5e-3, outliers=40)
-    F0 = torch.cat([models(F, 10, 0.05), models(F, 10, 1.0)], 2)
-    weight = torch.from_numpy(np.random.default_rng(0).uniform(0, 1, (1, 90)))
-    error = RobustSum(components(x0, x1), weight, loss, torch.full((1, 1), 0.02**2, dtype=torch.float64))
-    costs = [fitted_by(refine_kernel, F0, error, i)[1] for i in range(8)]
-    for before, after in itertools.pairwise(costs):
-        assert bool((after <= before).all())
-    assert bool((costs[-1] < costs[0])[:, :10].any())
-
-
-=======
->>>>>>> lt
 def test_empty_and_unknown() -> None:
     F = torch.eye(3, dtype=torch.float64)
     none = torch.zeros(0, 2, dtype=torch.float64)

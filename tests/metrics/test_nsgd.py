@@ -243,16 +243,6 @@ def test_oracle() -> None:
 errors = st.lists(st.floats(0, 0.3) | st.just(1.0) | st.just(float("nan")), min_size=1, max_size=30)
 
 
-<<<<<<< HEAD
-def test_known_recalls() -> None:
-    nsgd = torch.tensor([0.0, 0.01, 0.05, 0.2, 1.0, torch.nan], dtype=torch.float64)
-    assert metrics.recall(nsgd).item() == pytest.approx(2 / 6)  # 0.05 itself is a miss, and so is NaN
-    assert metrics.recall(nsgd, 0.06).item() == pytest.approx(3 / 6)
-    assert metrics.mean_recall(nsgd).item() == pytest.approx((1 + 0.8) / 6)
-
-
-=======
->>>>>>> lt
 @given(errors)
 def test_recall_matches_scalar_reference(values: list[float]) -> None:
     nsgd = torch.tensor(values, dtype=torch.float64)
