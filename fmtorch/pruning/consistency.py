@@ -405,7 +405,7 @@ def _agreement(rows: Float[Tensor, "10 b n"], orders: Int[Tensor, "c b n"]) -> F
     )
     length0, length1 = (sqrt(x.square() + y.square() + MIN_SQUARE) for x, y in ((dx, dy), (ux, uy)))
     length = length0 * rows[8] + length1 + NOISE
-    agree = (1 + torch.maximum(own, other) / length.square() * SHARPNESS) ** -8
+    agree = (1 + torch.maximum(own, other) / length.square() * SHARPNESS).square().square().square().reciprocal()
     votes = torch.stack([agree * near[9], near[9].expand_as(agree)])
     votes = component_sum(torch.cat([votes[..., :WINDOW, :], votes[..., WINDOW + 1 :, :]], -2), -2)  # others' alone
     in_slots = torch.zeros_like(votes).scatter(3, orders.expand(2, -1, -1, -1), votes)

@@ -110,7 +110,7 @@ def undistorted_matches(c: Correspondences, lenses: Sequence[Lenses]) -> Corresp
     if not fields:
         return c
     fields["mask"] = c.mask & torch.from_numpy(seen).to(c.mask.device)
-    noise = torch.from_numpy(np.where(seen & (area > 0), area, 1) ** 0.25).to(c.x0)
+    noise = torch.from_numpy(np.sqrt(np.sqrt(np.where(seen & (area > 0), area, 1)))).to(c.x0)
     return c.derived(**fields, noise=noise if c.noise is None else c.noise * noise)
 
 
