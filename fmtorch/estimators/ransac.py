@@ -195,7 +195,7 @@ class Ransac:
 
     def estimate(self, pair: Pair) -> Solution:
         """Search to fit of one pair."""
-        if self.focal is not None and self.focal.options.sqrt_prior:
+        if self.focal is not None and self.focal.options.sqrt_prior and pair.sizes_known:
             table = pair.table.copy()
             np.sqrt(pair.match_weight, out=table[MATCH_WEIGHT])
             pair = pair.with_table(table, pair.known, pair.lens)
