@@ -238,10 +238,13 @@ def expect_inside(x: Tensor, mask: Tensor, size: Tensor, name: str, size_name: s
     if not bool(enough.any()):
         return
     x, mask, size = x.detach()[enough], mask[enough], size.detach().to(x.device)[enough]
-    limit = size.flip(-1)[:, None]
+    limit, points = size.flip(-1)[:, None], mask[..., None]
+    low, high = torch.where(points, x, torch.inf).amin(1), torch.where(points, x, -torch.inf).amax(1)
+    if bool(((low >= -1) & (high <= limit[:, 0])).all(-1).any()):
+        return
     far, turned = _fraction_outside(x, mask, limit), _fraction_outside(x, mask, limit.flip(-1))
     swapped = (far > SWAPPED) & (turned == 0)
-    undistorted = (((x < -1) & mask[..., None]).any(1) & ((x > limit) & mask[..., None]).any(1)).any(-1)
+    undistorted = ((low < -1) & (high > limit[:, 0])).any(-1)
     if not bool((((far > MAX_OUTSIDE) & ~undistorted) | swapped).all()):
         return
     h, w = size[0].tolist()
