@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fmtorch.estimators.models.model import Hypotheses
+from fmtorch.estimators.models.fundamental import Hypotheses
 from fmtorch.estimators.pair import Pair, squared
 from fmtorch.estimators.sampling import PriorWeighted
 from fmtorch.estimators.scores import Score, scored

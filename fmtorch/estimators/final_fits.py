@@ -7,12 +7,12 @@ the same bits whether anybody asks for gradients or not.
 from __future__ import annotations
 
 import math
-from typing import ClassVar, NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple
 
 import numpy as np
 
 from fmtorch.estimators.inliers import MIN_PRIOR_FOR_NOISE, fit_distance, squared_in_noises
-from fmtorch.estimators.models.model import FitScale, Refining
+from fmtorch.estimators.models.fundamental import FitScale, Matrices
 from fmtorch.estimators.models.posterior import Cameras, Limits
 from fmtorch.estimators.models.with_focals import FundamentalWithFocals
 from fmtorch.estimators.pair import Pair, squared
@@ -41,31 +41,20 @@ class Fit(NamedTuple):
     s2: Array | None = None
 
 
-@runtime_checkable
-class FinalFit(Protocol):
-    """Turns the selected model and its inliers into the estimate.
+class NoFit:
+    """The selected model as it is.
     gradient: how gradients reach points, prior and noise: "none", "least_squares" of the matches that count, or
     "optimum", by the implicit function theorem. weighted: whether these matches count by prior and noise."""
 
-    gradient: ClassVar[str]
-    weighted: ClassVar[bool]
+    gradient: str = "none"
+    weighted: bool = False
 
-    def __call__(self, selection: Selection, pair: Pair, inliers: Array, family: Refining) -> Fit:
+    def __call__(self, selection: Selection, pair: Pair, inliers: Array, family: Matrices) -> Fit:
         """The estimate from the selected model and its inliers (n,)."""
-        ...
-
-
-class NoFit:
-    """The selected model as it is."""
-
-    gradient, weighted = "none", False
-
-    def __call__(self, selection: Selection, pair: Pair, inliers: Array, family: Refining) -> Fit:
-        """As `FinalFit`."""
         return Fit(selection.F, selection.F, inliers.astype(np.float64))
 
 
-class LeastSquares:
+class LeastSquares(NoFit):
     """Least squares on the inliers, the normalised 8-point algorithm; the hypothesis where they determine none.
     Where there is a prior, an inlier counts prior / noise^2, as in the other fits, and gradients reach the prior; where
     there is none, all count alike. On 60 pairs of castle-P19 and fox with the prior of frame consistency, three seeds,
@@ -74,8 +63,8 @@ class LeastSquares:
 
     gradient, weighted = "least_squares", True
 
-    def __call__(self, selection: Selection, pair: Pair, inliers: Array, family: Refining) -> Fit:
-        """As `FinalFit`."""
+    def __call__(self, selection: Selection, pair: Pair, inliers: Array, family: Matrices) -> Fit:
+        """As `NoFit`."""
         weighted = self.weighted and pair.prior is not None
         weight = np.where(inliers, pair.weight if weighted else 1.0, 0.0)
         return Fit(family.least_squares(selection.F, pair, weight), selection.F, inliers.astype(np.float64))
@@ -87,18 +76,18 @@ class UnweightedLeastSquares(LeastSquares):
     weighted = False
 
 
-class GaussNewton:
+class GaussNewton(NoFit):
     """One Gauss-Newton step of the Sampson error at the selected model, on its inliers, by prior and noise."""
 
     gradient, weighted = "optimum", True
 
-    def __call__(self, selection: Selection, pair: Pair, inliers: Array, family: Refining) -> Fit:
-        """As `FinalFit`."""
+    def __call__(self, selection: Selection, pair: Pair, inliers: Array, family: Matrices) -> Fit:
+        """As `NoFit`."""
         weight = np.where(inliers, pair.weight, 0.0)
         return Fit(family.step(selection.F, pair, weight), selection.F, inliers.astype(np.float64))
 
 
-class Adaptive:
+class Adaptive(NoFit):
     """Levenberg-Marquardt of the truncated Sampson error at the noise of the inliers.
 
     One threshold does not suit all pairs: keypoints of a sharp video lie within a fifth of a pixel of their epipolar
@@ -112,8 +101,8 @@ class Adaptive:
 
     gradient, weighted = "optimum", True
 
-    def __call__(self, selection: Selection, pair: Pair, inliers: Array, family: Refining) -> Fit:
-        """As `FinalFit`."""
+    def __call__(self, selection: Selection, pair: Pair, inliers: Array, family: Matrices) -> Fit:
+        """As `NoFit`."""
         likely = inliers if pair.prior is None else inliers & (pair.prior > MIN_PRIOR_FOR_NOISE)
         own = family.fit_scale
         scale = fit_distance(squared_in_noises(selection.F, pair)[likely], own)

@@ -15,10 +15,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from fmtorch.core.types import Correspondences, Estimate
-from fmtorch.estimators.final_fits import FinalFit, Fit
+from fmtorch.estimators.final_fits import Fit, NoFit
 from fmtorch.estimators.models import posterior
-from fmtorch.estimators.models.fundamental import response_of
-from fmtorch.estimators.models.model import Refining
+from fmtorch.estimators.models.fundamental import Matrices, response_of
 from fmtorch.estimators.pair import MAX_NOISE, MIN_NOISE, Pair
 from fmtorch.geometry import canonical, eight_point, unit_frobenius
 from fmtorch.geometry.cameras import PixelFrame
@@ -65,26 +64,24 @@ too."""
 
 
 class Attached:
-    """The gradients of a final fit, by its `gradient`; a fit of one's own may have a method `attached` instead."""
+    """The gradients of a final fit, by its `gradient`; of homographies by the Sampson error, near least squares."""
 
-    def __init__(self, final: FinalFit, family: Refining) -> None:
+    def __init__(self, final: NoFit, family: Matrices) -> None:
         self.final, self.family = final, family
-        own: Attach | None = getattr(final, "attached", None)
-        self.kind = getattr(final, "gradient", "none")
-        kinds: dict[str, Attach] = {"least_squares": self._least_squares, "optimum": self._optimum}
-        if family.model == "homography" and self.kind == "least_squares":
-            own = own or self._optimum  # of the Sampson error, near that of least squares
-        kinds["none"] = lambda solved, matches: matches.points.new_zeros(len(solved), 9)
-        self.attach = own or kinds[self.kind]
+
+    def __call__(self, solved: list[Solved], matches: GraphedMatches) -> Float[Tensor, "p m"]:
+        """As `Attach`."""
+        if self.final.gradient == "none":
+            return matches.points.new_zeros(len(solved), 9)
+        linear = self.final.gradient == "least_squares" and self.family.model == "fundamental"
+        return self._least_squares(solved, matches) if linear else self._optimum(solved, matches)
 
     @property
     def reached(self) -> tuple[str, ...]:
-        """The fields of `Correspondences` that gradients reach; all of a fit that has its own `attached`."""
-        if hasattr(self.final, "attached"):
-            return ("x0", "x1", "prior", "noise")
-        if self.kind == "none":
+        """The fields of `Correspondences` that gradients reach."""
+        if self.final.gradient == "none":
             return ()
-        if self.kind == "least_squares" and not self.final.weighted:
+        if self.final.gradient == "least_squares" and not self.final.weighted:
             return ("x0", "x1")
         return ("x0", "x1", "noise", *(("prior",) if self.family.fit_scale.by_prior else ()))
 

@@ -8,7 +8,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from fmtorch.estimators.models.model import FitScale
+from fmtorch.estimators.models.fundamental import FitScale
 from fmtorch.estimators.pair import Pair, squared
 from fmtorch.estimators.sampling import Sampler
 from fmtorch.geometry.arithmetic import logarithm_1p_kernel

@@ -19,7 +19,7 @@ from fmtorch.estimators.focal_search import FocalSearch
 from fmtorch.estimators.inliers import MIN_PRIOR_FOR_NOISE, fit_distance, noise_scale
 from fmtorch.estimators.models import posterior
 from fmtorch.estimators.models.focal_prior import MIN_DEVIATION, focal_cost
-from fmtorch.estimators.models.model import FitScale
+from fmtorch.estimators.models.fundamental import FitScale
 from fmtorch.estimators.models.posterior import Cameras, Images, Limits, centred, images_of, tangents_of, translate
 from fmtorch.estimators.pair import Lens, Pair, squared
 from fmtorch.geometry import levenberg_marquardt

@@ -5,12 +5,12 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Annotated, Any, Literal, NamedTuple, Protocol, runtime_checkable
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 
 from fmtorch.core.options import Within
-from fmtorch.estimators.models.model import Refining
+from fmtorch.estimators.models.fundamental import Matrices
 from fmtorch.estimators.models.posterior import Cameras
 from fmtorch.estimators.pair import Pair, squared
 from fmtorch.estimators.preselection import Count, NonNegative, first_shuffled
@@ -44,7 +44,7 @@ class Refine:
 class Select:
     """Which refined model is the estimate: that of the largest score.
 
-    score: a name of the registry, or a score. scale: of it, Sampson distance, px. own_noise: the choice is made again
+    score: a name of `PARTS`, or a score. scale: of it, Sampson distance, px. own_noise: the choice is made again
     with so many standard deviations of the noise of the matches near the first for a scale; None: it is made once.
     """
 
@@ -53,20 +53,15 @@ class Select:
     own_noise: Pixels | None = None
 
 
-@runtime_checkable
-class LocalOptimization(Protocol):
-    """Improves a small pool of models; none comes back with a lower score than it had."""
-
-    def __call__(self, F: Array, pair: Pair) -> Array:
-        """The improved models (k, 9), float64."""
-        ...
+LocalOptimization = Callable[[Array, Pair], Array]
+"""Improves the models (k, 9) of a small pool, float64; none comes back with a lower score than it had."""
 
 
 class Candidates(NamedTuple):
-    """The models of a pool, refined: F (m, 9) float64; which are there (m,); the matches they were refined on."""
+    """The models of a pool, refined: F (m, 9) float64; whether there are any; the matches they were refined on."""
 
     F: Array
-    valid: Array
+    valid: bool
     near: Pair
 
 
@@ -90,14 +85,14 @@ class Refinement:
             index[: near_of(pair.residual)(pool.F[: pool.filled], pair.points32, limit, seed, pair.key, index)]
         )
 
-    def __call__(self, pool: Pool, pair: Pair, family: Refining) -> Candidates:
+    def __call__(self, pool: Pool, pair: Pair, family: Matrices) -> Candidates:
         """The pool with refined models."""
         F, near = pool.models, self.near(pool, pair)
         if self.local_optimization is not None:
             F = self.local_optimization(F, pair)
         if (options := self.options) is not None:
             F = family.refine(F, near, options.loss, options.scale, Schedule(options.iterations))
-        return Candidates(F, pool.valid, near)
+        return Candidates(F, pool.filled > 0, near)
 
 
 @functools.cache
@@ -139,18 +134,6 @@ class Selection(NamedTuple):
     cameras: Cameras | None = None
 
 
-Selector = Callable[[Candidates, Pair], Selection]
-"""Selects one model from a pool of refined ones."""
-
-
-class BestOfSearch:
-    """The best model of the search, the first of the pool."""
-
-    def __call__(self, candidates: Candidates, pair: Pair) -> Selection:
-        """The selection."""
-        return Selection(candidates.F[0], bool(candidates.valid[0]))
-
-
 class BestScore:
     """The model of the largest score.
 
@@ -177,8 +160,7 @@ class BestScore:
 
 
 def _largest(score: Score, candidates: Candidates, pair: Pair) -> Selection:
-    scores = np.where(candidates.valid, scores_of(score, candidates.F, pair), -np.inf)
-    return Selection(candidates.F[int(np.argmax(scores))], bool(candidates.valid[0]))
+    return Selection(candidates.F[int(np.argmax(scores_of(score, candidates.F, pair)))], candidates.valid)
 
 
 def scores_of(score: Score, F: Array, pair: Pair) -> Array:

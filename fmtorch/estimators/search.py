@@ -9,7 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fmtorch.estimators.models.model import Family, Hypotheses
+from fmtorch.estimators.models.fundamental import Hypotheses, Matrices
+from fmtorch.estimators.models.with_focals import FundamentalWithFocals
 from fmtorch.estimators.pair import Pair
 from fmtorch.estimators.preselection import Preselection
 from fmtorch.estimators.sampling import Sampler, drawn
@@ -40,11 +41,6 @@ class Pool:
         """The models in float64, (m, 9); where there is none one of zeros."""
         return self.F[: max(self.filled, 1)].astype(np.float64)
 
-    @property
-    def valid(self) -> Array:
-        """Which of `models` are there."""
-        return np.full(max(self.filled, 1), self.filled > 0)
-
     def merge(self, models: Verified) -> None:
         """Keep the best of this pool's models and the new ones; the earlier draw wins a tie."""
         self.filled = merge(models.F, models.which, models.score, self.filled, self.F, self.score)
@@ -68,7 +64,7 @@ class Search:
     pool: the best models that are kept. hypotheses: samples drawn at most. round: samples between two looks at the
     stopping rule, None: never before `hypotheses`."""
 
-    family: Family
+    family: Matrices | FundamentalWithFocals
     sampler: Sampler
     preselection: Preselection
     pool: int
