@@ -22,7 +22,6 @@ from fmtorch.estimators.pair import MAX_NOISE, MIN_NOISE, Pair
 from fmtorch.geometry import canonical, eight_point, unit_frobenius
 from fmtorch.geometry.cameras import PixelFrame
 from fmtorch.geometry.homography_refine import homography_at_optimum
-from fmtorch.geometry.levenberg_marquardt import Weighted
 from fmtorch.geometry.normalize import RobustSum
 from fmtorch.geometry.refine import STEP_DAMPING, gradient_of_cost
 from fmtorch.jit.kernel import Array
@@ -183,7 +182,7 @@ def camera_response(cameras: posterior.Cameras, pair: Pair, weight: Array, preci
     weight: (n,), of the matches that count. precision: one over the variance of an inlier's distance.
     """
     images, optimum, tangents = posterior.images_of(pair), posterior.start_at(cameras.copy()), np.zeros((1, 9, LANES))
-    matches = Weighted.of(posterior.centred(pair).points, weight, np.full(pair.count, np.inf))
+    matches = posterior.centred(pair)._replace(weight=weight, s2=np.full(pair.count, np.inf))
     posterior.minimise(optimum, matches, images, posterior.Limits(precision, 0, 0.0))
     posterior.tangents_of(cameras, images.longest, optimum.F, tangents)
     moves, hessian, by_focal = np.empty((7, 9)), optimum.hessian[0], np.eye(7, 2, -5)

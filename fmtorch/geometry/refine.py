@@ -16,7 +16,7 @@ from torch import Tensor
 from fmtorch.geometry import rank2_manifold
 from fmtorch.geometry.arithmetic import as_rows, cofactors, component_sum, gradient_wanted, sqrt, stable_sum, unit
 from fmtorch.geometry.epipolar import linearise
-from fmtorch.geometry.levenberg_marquardt import Problem, Schedule, Weighted, evaluate, minimiser
+from fmtorch.geometry.levenberg_marquardt import Schedule, Weighted, evaluate, minimiser
 from fmtorch.geometry.matrices import assign, assign_rows
 from fmtorch.geometry.normalize import NormalizedMatches, RobustSum, fitted_by
 from fmtorch.geometry.rank2_manifold import RANK_TWO, RANK_TWO_EPIPOLE, constant, start_one, steps
@@ -40,19 +40,18 @@ def refine_kernel(F: F8x2, matches: Weighted, schedule: Schedule, out: F8x2, cos
     k = len(F)
     state = _State(out, matrix(k, 3), matrix(k, 3), np.empty((k, 10, 10)), cost)
     trial = _State(matrix(k, 9), matrix(k, 3), matrix(k, 3), np.empty((k, 10, 10)), vector(k))
-    problem = Problem(matches, schedule.tolerance)
     for i in range(k):
         start_one(F[i], schedule.squarings, state.F[i], state.e0[i], state.e1[i])
-    _minimise(problem, state, trial, np.full(k, schedule.damping), schedule.iterations, schedule.tolerance > 0)
+    _minimise(matches, state, trial, np.full(k, schedule.damping), schedule.iterations, schedule.tolerance)
 
 
 @inner
-def _evaluate(state: _State, problem: Problem, derivatives: bool) -> None:
-    evaluate(state.F, problem.matches, derivatives, state.products, state.cost)
+def _evaluate(state: _State, matches: Weighted, derivatives: bool) -> None:
+    evaluate(state.F, matches, derivatives, state.products, state.cost)
 
 
 @inner
-def _step(problem: Problem, state: _State, damping: Array, trial: _State) -> None:
+def _step(matches: Weighted, state: _State, damping: Array, trial: _State) -> None:
     steps(state.products, state.F, state.e0, state.e1, damping, trial.F, trial.e0, trial.e1)
 
 

@@ -67,9 +67,9 @@ class FundamentalWithFocals:
     def fit(self, start: Cameras, pair: Pair, truncation: float, limits: Limits) -> tuple[Array, Cameras, float]:
         """The maximum a posteriori of the truncated Sampson error near one candidate: a model (9,), its cameras, and
         what the logarithm of the likelihood would gain without prior. truncation: px."""
-        cameras, images, matches = start.copy(), images_of(pair), centred(pair, truncation)
+        cameras, images = start.copy(), images_of(pair)
         out, F, gain = posterior.start_at(cameras), np.empty((1, 9)), np.empty(1)
-        posterior.minimise(out, Weighted.of(matches.points, pair.weight, matches.s2), images, limits)
+        posterior.minimise(out, centred(pair, truncation), images, limits)
         posterior.translate(out.F, images.offset, F)
         gain_without_prior(out.hessian[0], out.gradient[0], cameras.focal[0], images.prior, gain)
         return F[0], cameras, float(gain[0])
