@@ -6,7 +6,6 @@ from fmtorch.core.lazy import lazy_exports
 
 if TYPE_CHECKING:
     from fmtorch.estimators.batch import Batch
-    from fmtorch.estimators.degensac import Degensac
     from fmtorch.estimators.external.colmap import colmap
     from fmtorch.estimators.external.libraries import (
         degensac_cpp,
@@ -48,7 +47,7 @@ if TYPE_CHECKING:
         Score,
         SummedGains,
     )
-    from fmtorch.estimators.search import Pool, Search, Verified
+    from fmtorch.estimators.search import Degensac, Pool, Search, Verified
     from fmtorch.jit.kernel import F4x1, F4x2, F8x1, F8x2, I8x1, I8x2, kernel
 
 __all__ = [

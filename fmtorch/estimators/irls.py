@@ -19,9 +19,8 @@ from fmtorch.estimators.models.fundamental import SevenPoint
 from fmtorch.estimators.pair import Pair, squared
 from fmtorch.geometry import attached_step
 from fmtorch.geometry.eight_point import weighted_eight_point
-from fmtorch.geometry.irls import reweighted_kernel
 from fmtorch.geometry.levenberg_marquardt import Schedule, Weighted
-from fmtorch.geometry.refine import refine_kernel
+from fmtorch.geometry.refine import refine_kernel, reweighted_kernel
 from fmtorch.geometry.robust_losses import named_loss
 from fmtorch.jit.kernel import Array
 from fmtorch.jobs.execution import mapped

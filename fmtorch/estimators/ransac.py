@@ -20,7 +20,6 @@ from fmtorch.core.stages import Estimator
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.estimators import focal_search, inliers, lens_search, preselection, refinement, sampling, scores
 from fmtorch.estimators.batch import NOT_SOLVED, Estimation, Solution
-from fmtorch.estimators.degensac import Degensac
 from fmtorch.estimators.final_fits import Adaptive, Fit, GaussNewton, LeastSquares, NoFit, UnweightedLeastSquares
 from fmtorch.estimators.focal_search import Focal, FocalSearch, PlausibleCandidates
 from fmtorch.estimators.gradients import Attached
@@ -30,7 +29,7 @@ from fmtorch.estimators.models import focal_prior, fundamental, posterior, with_
 from fmtorch.estimators.models.fundamental import EightPoint, FitScale, Homography, Matrices, SevenPoint
 from fmtorch.estimators.pair import MATCH_WEIGHT, Lens, Pair, normalize_pair, to_pixels
 from fmtorch.estimators.preselection import Count, Preselect, Preselection
-from fmtorch.estimators.search import Search, merge
+from fmtorch.estimators.search import Degensac, Search, merge
 from fmtorch.geometry import homography_refine, levenberg_marquardt
 from fmtorch.geometry.five_point import five_point
 from fmtorch.geometry.homography import four_point

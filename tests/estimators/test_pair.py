@@ -149,7 +149,7 @@ EVERY = variants("estimator")
 SCALED = ("x0", "x1", "size0", "size1")
 OWN = [name for name in EVERY if not name.startswith(OTHER_LIBRARIES)]
 PIXELS = [  # what is a distance in pixels and no option
-    (estimators.degensac, "PLANE_THRESHOLD_PX"), (with_focals, "INLIER_SIGMA_PX"), (with_focals, "LOSS_SCALE_PX"),
+    (estimators.search, "PLANE_THRESHOLD_PX"), (with_focals, "INLIER_SIGMA_PX"), (with_focals, "LOSS_SCALE_PX"),
     (with_focals, "PARALLEL_PX"), (estimators.inliers, "FLOOR_PX"), (estimators.GraphCut, "RADIUS_PX"),
     (estimators.Fundamental, "fit_scale"), (estimators.Homography, "fit_scale"),
 ]  # fmt: skip
