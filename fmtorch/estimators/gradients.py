@@ -15,10 +15,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from fmtorch.core.types import Correspondences, Estimate
-from fmtorch.estimators.final_fits import Fit, NoFit
 from fmtorch.estimators.models import posterior
 from fmtorch.estimators.models.fundamental import Matrices, response_of
 from fmtorch.estimators.pair import MAX_NOISE, MIN_NOISE, Pair
+from fmtorch.estimators.refinement import Fit, NoFit
 from fmtorch.geometry import canonical, eight_point, unit_frobenius
 from fmtorch.geometry.cameras import PixelFrame
 from fmtorch.geometry.homography_refine import homography_at_optimum

@@ -12,11 +12,11 @@ from torch import Tensor
 
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.estimators.batch import Estimation, Solution
-from fmtorch.estimators.final_fits import Fit
 from fmtorch.estimators.gradients import GraphedMatches, Solved
 from fmtorch.estimators.inliers import WithinThreshold, lower_median, residuals_squared, residuals_squared_px
 from fmtorch.estimators.models.fundamental import SevenPoint
 from fmtorch.estimators.pair import Pair, squared
+from fmtorch.estimators.refinement import Fit
 from fmtorch.geometry import attached_step
 from fmtorch.geometry.eight_point import weighted_eight_point
 from fmtorch.geometry.levenberg_marquardt import Schedule, Weighted

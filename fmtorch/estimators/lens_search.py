@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fmtorch.core.types import MAX_LENS, MIN_LENS
-from fmtorch.estimators.final_fits import FOCAL_TOLERANCE, Fit
 from fmtorch.estimators.focal_search import FocalSearch
 from fmtorch.estimators.inliers import MIN_PRIOR_FOR_NOISE, fit_distance, noise_scale
 from fmtorch.estimators.models import posterior
@@ -22,6 +21,7 @@ from fmtorch.estimators.models.focal_prior import MIN_DEVIATION, focal_cost
 from fmtorch.estimators.models.fundamental import FitScale
 from fmtorch.estimators.models.posterior import Cameras, Images, Limits, centred, images_of, tangents_of, translate
 from fmtorch.estimators.pair import Lens, Pair, squared
+from fmtorch.estimators.refinement import FOCAL_TOLERANCE, Fit
 from fmtorch.geometry import levenberg_marquardt
 from fmtorch.geometry.arithmetic import logarithm_kernel
 from fmtorch.geometry.levenberg_marquardt import MATCH, TINY, Weighted, add_products, assemble, in_rows, robust

@@ -20,7 +20,6 @@ from fmtorch.core.stages import Estimator
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.estimators import focal_search, inliers, lens_search, preselection, refinement, sampling, scores
 from fmtorch.estimators.batch import NOT_SOLVED, Estimation, Solution
-from fmtorch.estimators.final_fits import Adaptive, Fit, GaussNewton, LeastSquares, NoFit, UnweightedLeastSquares
 from fmtorch.estimators.focal_search import Focal, FocalSearch, PlausibleCandidates
 from fmtorch.estimators.gradients import Attached
 from fmtorch.estimators.graph_cut import GraphCut
@@ -29,13 +28,14 @@ from fmtorch.estimators.models import focal_prior, fundamental, posterior, with_
 from fmtorch.estimators.models.fundamental import EightPoint, FitScale, Homography, Matrices, SevenPoint
 from fmtorch.estimators.pair import MATCH_WEIGHT, Lens, Pair, normalize_pair, to_pixels
 from fmtorch.estimators.preselection import Count, Preselect, Preselection
+from fmtorch.estimators.refinement import Adaptive, Fit, GaussNewton, LeastSquares, NoFit, UnweightedLeastSquares
 from fmtorch.estimators.search import Degensac, Search, merge
 from fmtorch.geometry import homography_refine, levenberg_marquardt
 from fmtorch.geometry.five_point import five_point
 from fmtorch.geometry.homography import four_point
 from fmtorch.geometry.refine import refine_kernel
 from fmtorch.geometry.seven_point import seven_point_kernel
-from fmtorch.geometry.significance import counted_chances, counted_plane_chances, judged, most_significant
+from fmtorch.geometry.significance import counted_chances, judged, most_significant
 from fmtorch.jit.kernel import Array, Kernel
 from fmtorch.jit.together import compile_together
 from fmtorch.jobs.execution import mapped
@@ -404,6 +404,6 @@ WITH_FOCALS: tuple[Kernel[..., Any], ...] = (
 OF_HOMOGRAPHIES: tuple[Kernel[..., Any], ...] = (
     homography_refine.refine_homographies, homography_refine.evaluate_homographies, four_point,
     fundamental.homography_to_pixels, inliers.residuals_squared_homography, refinement.near_homography,
-    scores.score_gains_homography, scores.score_saturated_homography, counted_plane_chances,
+    scores.score_gains_homography, scores.score_saturated_homography,
 )  # fmt: skip
 """Of an estimator of homographies, beside those that the former has too."""

@@ -12,7 +12,7 @@ from fmtorch.geometry.arithmetic import cofactors, component_sum, determinant, e
 from fmtorch.geometry.homography import SINGULAR, in_pixels
 from fmtorch.geometry.homography_refine import evaluate_homographies
 from fmtorch.geometry.levenberg_marquardt import GEMAN_MCCLURE, Weighted
-from fmtorch.geometry.matrices import assign, invert, multiply, orthogonal_factor
+from fmtorch.geometry.matrices import assign, extreme_root, invert, multiply, orthogonal_factor
 from fmtorch.geometry.normalize import Mask, Matrices, Points
 from fmtorch.geometry.pose import inverse, rays
 from fmtorch.geometry.rank2_manifold import eliminate
@@ -110,14 +110,8 @@ def _calibrated(H: Tensor, K0: Tensor, K1: Tensor) -> tuple[Tensor, list[Tensor]
 
 
 def _middle_eigenvalue(A: Tensor) -> Tensor:
-    """Of symmetric matrices (3, 3, *s): the middle root of y^3 - 3 y = det X, with A = mean + m X."""
-    mean = (A[0, 0] + A[1, 1] + A[2, 2]) / 3
-    D = A - mean * torch.eye(3, dtype=A.dtype, device=A.device).reshape(3, 3, *[1] * mean.dim())
-    m = sqrt(component_sum(component_sum(D * D, 1)) / 6)
-    constant = determinant(D / torch.where(m > 0, m, 1.0)).clamp(-2.0, 2.0)
-    outer = torch.full_like(m, 2.0)
-    for _ in range(5):  # Newton's method, quadratic from an error of at most 0.27
-        outer = (2 * outer * outer * outer + constant.abs()) / (3 * (outer * outer - 1))
+    """Of symmetric matrices (3, 3, *s)."""
+    mean, m, _, constant, outer = extreme_root(A)
     middle = (sqrt(3 * (2 - outer).clamp_min(0) * (2 + outer)) - outer) / 2
     return mean + m * torch.where(constant < 0, -middle, middle)
 

@@ -294,9 +294,9 @@ def inputs(seed: int, noise: float, same: bool = False) -> dict[str, Tensor]:
 @pytest.fixture
 def converging(monkeypatch: pytest.MonkeyPatch) -> None:
     """Final fits that go on to the optimum."""
-    schedule = estimators.final_fits.SCHEDULE._replace(iterations=30, tolerance=0.0)
+    schedule = estimators.refinement.SCHEDULE._replace(iterations=30, tolerance=0.0)
     for name, value in {"SCHEDULE": schedule, "FOCAL_ITERATIONS": 30, "FOCAL_TOLERANCE": 0.0}.items():
-        monkeypatch.setattr(estimators.final_fits, name, value)
+        monkeypatch.setattr(estimators.refinement, name, value)
 
 
 @pytest.mark.usefixtures("converging")

@@ -66,7 +66,7 @@ def colmap(
             return pairwise.without(pair)
         H, inliers = np.asarray(result["H"], np.float64), np.asarray(result["inlier_mask"], np.bool_)
         depth = pair.x0[inliers] @ H[2, :2] + H[2, 2]
-        return (-H if np.count_nonzero(depth < 0) > np.count_nonzero(depth > 0) else H), inliers
+        return Solution(-H if np.count_nonzero(depth < 0) > np.count_nonzero(depth > 0) else H, inliers)
 
     return PairwiseEstimator("COLMAP", fundamental if model == "fundamental" else homography, model=model)
 
@@ -88,8 +88,8 @@ def _two_view(library: Any, pair: Pair, options: Any) -> Solution:
         if library.TwoViewGeometryConfiguration(result.config).name != "UNCALIBRATED" and np.any(t):
             F = pairwise.fundamental_of_pose(K0, K1, R, t)
     if pair.calibrations is None:
-        return F, inliers
-    return pairwise.Posed(F, inliers, np.array([np.nan if K is None else K[0, 0] for K in (K0, K1)]), R, t)
+        return Solution(F, inliers)
+    return Solution(F, inliers, np.array([np.nan if K is None else K[0, 0] for K in (K0, K1)]), R, t)
 
 
 def _cameras(library: Any, pair: Pair) -> list[Any]:
