@@ -31,6 +31,7 @@ from fmtorch.estimators.preselection import Count, Preselect, Preselection
 from fmtorch.estimators.refinement import Adaptive, Fit, GaussNewton, LeastSquares, NoFit, UnweightedLeastSquares
 from fmtorch.estimators.search import Degensac, Search, merge
 from fmtorch.geometry import homography_refine, levenberg_marquardt
+from fmtorch.geometry.epipolar import HOMOGRAPHY, SAMPSON
 from fmtorch.geometry.five_point import five_point
 from fmtorch.geometry.homography import four_point
 from fmtorch.geometry.refine import refine_kernel
@@ -388,22 +389,21 @@ class CoarseToFine:
 
 WITH_FOCALS: tuple[Kernel[..., Any], ...] = (
     # Solvers, samples and scores
-    five_point, seven_point_kernel, counted_chances, refinement.near, sampling.draw,
-    focal_prior.draw_depths, preselection.draw_by_prior, preselection.best, scores.score_gains, scores.score_saturated,
-    normalize_pair, to_pixels, preselection.support, inliers.residuals_squared, inliers.share_within,
-    merge, scores.saturated_cells, scores.pack, focal_search.posteriors,
+    five_point, seven_point_kernel, counted_chances, refinement.near_of(SAMPSON), sampling.draw,
+    focal_prior.draw_depths, preselection.draw_by_prior, preselection.best, scores.score_gains_of(SAMPSON),
+    scores.score_saturated_of(SAMPSON), normalize_pair, to_pixels, preselection.support, inliers.residuals_squared,
+    inliers.share_within, merge, scores.saturated_cells, scores.pack, focal_search.posteriors,
     focal_search.distinct_models, focal_search.same_model,
     # Cameras and fits; `evaluate` is called by `minimise` and `refine`
     posterior.centre, posterior.translate, with_focals.gain_without_prior, with_focals.refine_with_prior,
     with_focals.cheirality, most_significant, posterior.nearest_cameras, levenberg_marquardt.evaluate, refine_kernel,
-    posterior.minimise, lens_search.inverted,
-    lens_search.minimise_with_lenses,
+    posterior.minimise, lens_search.inverted, lens_search.minimise_with_lenses,
 )  # fmt: skip
 """Of an estimator of fundamental matrices with the prior on focal lengths."""
 
 OF_HOMOGRAPHIES: tuple[Kernel[..., Any], ...] = (
     homography_refine.refine_homographies, homography_refine.evaluate_homographies, four_point,
-    fundamental.homography_to_pixels, inliers.residuals_squared_homography, refinement.near_homography,
-    scores.score_gains_homography, scores.score_saturated_homography,
+    fundamental.homography_to_pixels, inliers.residuals_squared_of(HOMOGRAPHY), refinement.near_of(HOMOGRAPHY),
+    scores.score_gains_of(HOMOGRAPHY), scores.score_saturated_of(HOMOGRAPHY), counted_chances,
 )  # fmt: skip
 """Of an estimator of homographies, beside those that the former has too."""

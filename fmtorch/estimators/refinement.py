@@ -23,7 +23,7 @@ from fmtorch.estimators.pair import Pair, squared
 from fmtorch.estimators.preselection import Count, NonNegative, first_shuffled
 from fmtorch.estimators.scores import Score, scored
 from fmtorch.estimators.search import Pool
-from fmtorch.geometry.epipolar import HOMOGRAPHY, SAMPSON, Residual
+from fmtorch.geometry.epipolar import Residual
 from fmtorch.geometry.levenberg_marquardt import Schedule
 from fmtorch.jit.kernel import Array, F4x2, I8x1, Kernel, kernel
 from fmtorch.jit.random import Stream
@@ -127,10 +127,6 @@ def near_of(residual: Residual) -> Kernel[..., int]:
         return first_shuffled(index[:count], mixed_seed, key, out)
 
     return near
-
-
-near = near_of(SAMPSON)
-near_homography = near_of(HOMOGRAPHY)
 
 
 class Selection(NamedTuple):
