@@ -6,7 +6,6 @@ from fmtorch.core.lazy import lazy_exports
 
 if TYPE_CHECKING:
     from fmtorch.estimators.batch import Batch
-    from fmtorch.estimators.degensac import Degensac
     from fmtorch.estimators.external.colmap import colmap
     from fmtorch.estimators.external.libraries import (
         degensac_cpp,
@@ -24,13 +23,19 @@ if TYPE_CHECKING:
     from fmtorch.estimators.graph_cut import GraphCut
     from fmtorch.estimators.inliers import BetterHalf, InlierRule, RobustDeviations, StoppingRule, WithinThreshold
     from fmtorch.estimators.irls import IterativelyReweighted
-    from fmtorch.estimators.models.fundamental import EightPoint, Fundamental, Homography, SevenPoint
-    from fmtorch.estimators.models.model import BITS, FitScale, Hypotheses, cheirality
+    from fmtorch.estimators.models.fundamental import (
+        EightPoint,
+        FitScale,
+        Fundamental,
+        Homography,
+        Hypotheses,
+        SevenPoint,
+    )
+    from fmtorch.estimators.models.with_focals import BITS, cheirality
     from fmtorch.estimators.pair import MAX_NOISE, MIN_NOISE, Lens, Pair, bucket, uniforms
     from fmtorch.estimators.preselection import Preselect, Preselection
-    from fmtorch.estimators.ransac import CoarseToFine, Ransac
-    from fmtorch.estimators.refinement import BestOfSearch, BestScore, Candidates, Refine, Refinement, Select, scores_of
-    from fmtorch.estimators.registry import PARTS, WITH_FOCALS, part
+    from fmtorch.estimators.ransac import PARTS, WITH_FOCALS, CoarseToFine, Ransac, part
+    from fmtorch.estimators.refinement import BestScore, Candidates, Refine, Refinement, Select, scores_of
     from fmtorch.estimators.sampling import PriorWeighted, Prosac, Sampler, Uniform, largest_weight
     from fmtorch.estimators.scores import (
         GemanMcClure,
@@ -42,11 +47,11 @@ if TYPE_CHECKING:
         Score,
         SummedGains,
     )
-    from fmtorch.estimators.search import Pool, Search, Verified
+    from fmtorch.estimators.search import Degensac, Pool, Search, Verified
     from fmtorch.jit.kernel import F4x1, F4x2, F8x1, F8x2, I8x1, I8x2, kernel
 
 __all__ = [
-    "BITS", "MAX_NOISE", "MIN_NOISE", "PARTS", "WITH_FOCALS", "Batch", "BestOfSearch", "BestScore", "BetterHalf",
+    "BITS", "MAX_NOISE", "MIN_NOISE", "PARTS", "WITH_FOCALS", "Batch", "BestScore", "BetterHalf",
     "Candidates", "CoarseToFine", "Degensac", "EightPoint", "F4x1", "F4x2", "F8x1", "F8x2", "FitScale", "Focal",
     "Fundamental", "GemanMcClure", "GraphCut", "Homography", "Hypotheses", "I8x1", "I8x2", "InlierCount", "InlierRule",
     "IterativelyReweighted", "Lens", "Magsac", "Median", "Msac", "Pair", "PairwiseEstimator", "Pool",

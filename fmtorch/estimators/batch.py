@@ -15,13 +15,13 @@ import torch
 from torch import Tensor
 
 from fmtorch.core.types import DEVIATION, FOCAL, PROBABILITY, SIZE, Correspondences, Estimate
-from fmtorch.estimators.final_fits import Fit, scale_of
 from fmtorch.estimators.gradients import Attach, Solved, with_gradients
 from fmtorch.estimators.lens_search import undistorted
-from fmtorch.estimators.models.model import Refining
+from fmtorch.estimators.models.fundamental import Matrices
 from fmtorch.estimators.models.posterior import focal_precision, focals_near, focals_px
 from fmtorch.estimators.pair import Lens, Pair, PixelMatches, bucket, calibration_of, normalize_pair
 from fmtorch.estimators.preselection import degenerate_support
+from fmtorch.estimators.refinement import Fit, scale_of
 from fmtorch.geometry.epipolar import SAMPSON, Residual
 from fmtorch.geometry.significance import of_one_pair
 from fmtorch.jit.batches import as_array
@@ -67,7 +67,7 @@ class Estimation:
     calibrated: the same of a pair whose focal lengths are exactly known; None: cameras make no difference."""
 
     def __init__(
-        self, c: Correspondences, seed: int, family: Refining, minimal: int, calibrated: int | None = None
+        self, c: Correspondences, seed: int, family: Matrices, minimal: int, calibrated: int | None = None
     ) -> None:
         host = c if c.mask.device.type == "cpu" else c.detach().to("cpu")
         b, n = c.mask.shape

@@ -133,10 +133,10 @@ class FocalSearch:
         """The candidates of a round, and the samples drawn until then."""
         assert self.search is not None
         pool = self.search(pair, turn * self.options.samples)
-        new = self.refined(pool.models, pool.valid, pair, self.refinement.near(pool, pair))
+        new = self.refined(pool.models, np.full(len(pool.models), pool.filled > 0), self.refinement.near(pool, pair))
         return new.judged(self.choice.score, pair), pool.samples
 
-    def refined(self, F: Array, valid: Array, pair: Pair, near: Pair) -> PlausibleCandidates:
+    def refined(self, F: Array, valid: Array, near: Pair) -> PlausibleCandidates:
         """Candidates near models (k, 9), refined on some matches and not judged yet."""
         cameras, refined = self.family.refine(F, near, self.options.iterations)
         return PlausibleCandidates(refined, np.where(valid, 0.0, -np.inf), cameras)
@@ -152,11 +152,11 @@ class FocalSearch:
         gain = np.where(free.valid, scores_of(score, free.F, pair), -np.inf)
         order = np.argsort(-gain, kind="stable")
         models, gain = free.F[order], gain[order]
-        selection = Selection(models[0], bool(free.valid[0]))
+        selection = Selection(models[0], free.valid)
         if plausible is None and not known and not distinct_models(models, gain, 0, RIVAL_GAIN_SHARE, SAME_MODEL):
             return selection
         tried = slice(self.options.candidates)
-        candidates = self.refined(models[tried], np.isfinite(gain[tried]), pair, free.near)
+        candidates = self.refined(models[tried], np.isfinite(gain[tried]), free.near)
         if plausible is not None:
             candidates = candidates.joined(plausible)
         candidates = candidates.judged(score, pair)

@@ -15,15 +15,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from fmtorch.core.types import Correspondences, Estimate
-from fmtorch.estimators.final_fits import FinalFit, Fit
 from fmtorch.estimators.models import posterior
-from fmtorch.estimators.models.fundamental import response_of
-from fmtorch.estimators.models.model import Refining
+from fmtorch.estimators.models.fundamental import Matrices, response_of
 from fmtorch.estimators.pair import MAX_NOISE, MIN_NOISE, Pair
+from fmtorch.estimators.refinement import Fit, NoFit
 from fmtorch.geometry import canonical, eight_point, unit_frobenius
 from fmtorch.geometry.cameras import PixelFrame
 from fmtorch.geometry.homography_refine import homography_at_optimum
-from fmtorch.geometry.levenberg_marquardt import Weighted
 from fmtorch.geometry.normalize import RobustSum
 from fmtorch.geometry.refine import STEP_DAMPING, gradient_of_cost
 from fmtorch.jit.kernel import Array
@@ -65,26 +63,24 @@ too."""
 
 
 class Attached:
-    """The gradients of a final fit, by its `gradient`; a fit of one's own may have a method `attached` instead."""
+    """The gradients of a final fit, by its `gradient`; of homographies by the Sampson error, near least squares."""
 
-    def __init__(self, final: FinalFit, family: Refining) -> None:
+    def __init__(self, final: NoFit, family: Matrices) -> None:
         self.final, self.family = final, family
-        own: Attach | None = getattr(final, "attached", None)
-        self.kind = getattr(final, "gradient", "none")
-        kinds: dict[str, Attach] = {"least_squares": self._least_squares, "optimum": self._optimum}
-        if family.model == "homography" and self.kind == "least_squares":
-            own = own or self._optimum  # of the Sampson error, near that of least squares
-        kinds["none"] = lambda solved, matches: matches.points.new_zeros(len(solved), 9)
-        self.attach = own or kinds[self.kind]
+
+    def __call__(self, solved: list[Solved], matches: GraphedMatches) -> Float[Tensor, "p m"]:
+        """A zero with the gradients of fits."""
+        if self.final.gradient == "none":
+            return matches.points.new_zeros(len(solved), 9)
+        linear = self.final.gradient == "least_squares" and self.family.model == "fundamental"
+        return self._least_squares(solved, matches) if linear else self._optimum(solved, matches)
 
     @property
     def reached(self) -> tuple[str, ...]:
-        """The fields of `Correspondences` that gradients reach; all of a fit that has its own `attached`."""
-        if hasattr(self.final, "attached"):
-            return ("x0", "x1", "prior", "noise")
-        if self.kind == "none":
+        """The fields of `Correspondences` that gradients reach."""
+        if self.final.gradient == "none":
             return ()
-        if self.kind == "least_squares" and not self.final.weighted:
+        if self.final.gradient == "least_squares" and not self.final.weighted:
             return ("x0", "x1")
         return ("x0", "x1", "noise", *(("prior",) if self.family.fit_scale.by_prior else ()))
 
@@ -186,7 +182,7 @@ def camera_response(cameras: posterior.Cameras, pair: Pair, weight: Array, preci
     weight: (n,), of the matches that count. precision: one over the variance of an inlier's distance.
     """
     images, optimum, tangents = posterior.images_of(pair), posterior.start_at(cameras.copy()), np.zeros((1, 9, LANES))
-    matches = Weighted.of(posterior.centred(pair).points, weight, np.full(pair.count, np.inf))
+    matches = posterior.centred(pair)._replace(weight=weight, s2=np.full(pair.count, np.inf))
     posterior.minimise(optimum, matches, images, posterior.Limits(precision, 0, 0.0))
     posterior.tangents_of(cameras, images.longest, optimum.F, tangents)
     moves, hessian, by_focal = np.empty((7, 9)), optimum.hessian[0], np.eye(7, 2, -5)

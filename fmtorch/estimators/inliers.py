@@ -8,11 +8,11 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from fmtorch.estimators.models.model import FitScale
+from fmtorch.estimators.models.fundamental import FitScale
 from fmtorch.estimators.pair import Pair, squared
 from fmtorch.estimators.sampling import Sampler
 from fmtorch.geometry.arithmetic import logarithm_1p_kernel
-from fmtorch.geometry.epipolar import HOMOGRAPHY, SAMPSON, Residual
+from fmtorch.geometry.epipolar import SAMPSON, Residual
 from fmtorch.jit.kernel import Array, F8x1, F8x2, I8x1, Kernel, kernel
 
 
@@ -150,4 +150,3 @@ def share_within(r2: F8x1, limit: float, weight: I8x1) -> float:
 
 
 residuals_squared = residuals_squared_of(SAMPSON)
-residuals_squared_homography = residuals_squared_of(HOMOGRAPHY)

@@ -12,16 +12,15 @@ from torch import Tensor
 
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.estimators.batch import Estimation, Solution
-from fmtorch.estimators.final_fits import Fit
 from fmtorch.estimators.gradients import GraphedMatches, Solved
 from fmtorch.estimators.inliers import WithinThreshold, lower_median, residuals_squared, residuals_squared_px
 from fmtorch.estimators.models.fundamental import SevenPoint
 from fmtorch.estimators.pair import Pair, squared
+from fmtorch.estimators.refinement import Fit
 from fmtorch.geometry import attached_step
 from fmtorch.geometry.eight_point import weighted_eight_point
-from fmtorch.geometry.irls import reweighted_kernel
 from fmtorch.geometry.levenberg_marquardt import Schedule, Weighted
-from fmtorch.geometry.refine import refine_kernel
+from fmtorch.geometry.refine import refine_kernel, reweighted_kernel
 from fmtorch.geometry.robust_losses import named_loss
 from fmtorch.jit.kernel import Array
 from fmtorch.jobs.execution import mapped

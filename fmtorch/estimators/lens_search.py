@@ -14,14 +14,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fmtorch.core.types import MAX_LENS, MIN_LENS
-from fmtorch.estimators.final_fits import FOCAL_TOLERANCE, Fit
 from fmtorch.estimators.focal_search import FocalSearch
 from fmtorch.estimators.inliers import MIN_PRIOR_FOR_NOISE, fit_distance, noise_scale
 from fmtorch.estimators.models import posterior
 from fmtorch.estimators.models.focal_prior import MIN_DEVIATION, focal_cost
-from fmtorch.estimators.models.model import FitScale
+from fmtorch.estimators.models.fundamental import FitScale
 from fmtorch.estimators.models.posterior import Cameras, Images, Limits, centred, images_of, tangents_of, translate
 from fmtorch.estimators.pair import Lens, Pair, squared
+from fmtorch.estimators.refinement import FOCAL_TOLERANCE, Fit
 from fmtorch.geometry import levenberg_marquardt
 from fmtorch.geometry.arithmetic import logarithm_kernel
 from fmtorch.geometry.levenberg_marquardt import MATCH, TINY, Weighted, add_products, assemble, in_rows, robust
@@ -108,7 +108,7 @@ def minimise_with_lenses(
     data = _Data(
         rows, matches.loss, matches.table, images, prior.diagonal, prior, limits, np.zeros((k, 9, LANES)), products
     )
-    _minimise(data, state, trial, np.full(k, posterior.FIRST_DAMPING), limits.iterations, limits.tolerance >= 0)
+    _minimise(data, state, trial, np.full(k, posterior.FIRST_DAMPING), limits.iterations, limits.tolerance)
 
 
 @kernel(holds_gil=True)
@@ -235,7 +235,7 @@ def _take(state: LensOptimum, trial: LensOptimum, k: int) -> None:
     posterior.take_cameras(state, trial, k)
 
 
-_minimise = levenberg_marquardt.minimiser(_evaluate, _step, _take, posterior.converged, posterior.MIN_DAMPING)
+_minimise = levenberg_marquardt.minimiser(_evaluate, _step, _take, relative=False, min_damping=posterior.MIN_DAMPING)
 
 
 STARTS = ((0.0, 0.0), (-0.12, -0.12), (-0.25, -0.25))  # of both lenses, where they are one
@@ -297,12 +297,12 @@ def fit_with_lenses(
 ) -> list[LensFit]:  # fmt: skip
     """The maxima a posteriori of the truncated error near candidates, cameras (k, ...) and lenses (k, 2).
     scale_px: from which on matches do not count; of the pair as it was photographed."""
-    k, matches, images, own = len(lens), centred(pair, scale_px), images_of(pair), cameras.copy()
+    k, images, own = len(lens), images_of(pair), cameras.copy()
     F, cost, gradient, hessian = (np.empty((k, *[PARAMETERS] * n)) for n in (1, 0, 1, 2))
     out = LensOptimum(*own, lens.copy(), F, cost, gradient, hessian)
-    weighted = Weighted.of(matches.points, pair.weight, matches.s2)
     limits = Limits(squared(pair.pixels_per_unit / (scale_px / FitScale().scale_sigmas)), iterations, FOCAL_TOLERANCE)
-    minimise_with_lenses(out, weighted, images, prior._replace(diagonal=half_diagonals(pair)), limits)
+    prior = prior._replace(diagonal=half_diagonals(pair))
+    minimise_with_lenses(out, centred(pair, scale_px), images, prior, limits)
     F = np.empty((k, 9))
     translate(out.F, images.offset, F)
     F /= np.sqrt((F * F).sum(1, keepdims=True))

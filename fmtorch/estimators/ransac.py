@@ -1,39 +1,42 @@
 """Hypothesise and verify: four verbs whose parts make RANSAC, MSAC, LMedS and their descendants.
 
 **search**: rounds of minimal samples, scores, the best models; **refine** these; **select** one; **fit** it. The engine
-is control flow on one pair: `registry` names the parts, which hold the arithmetic, and beside which the options of each
+is control flow on one pair: `PARTS` names the parts, which hold the arithmetic, and beside which the options of each
 verb are described; `batch` leads from tensors to pairs and back.
 """
 
 from __future__ import annotations
 
 import functools
+import inspect
 import math
-from collections.abc import Mapping, Sequence
-from typing import Annotated, Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 
 from fmtorch.core.options import Within, expect_options
 from fmtorch.core.stages import Estimator
 from fmtorch.core.types import Correspondences, Estimate
-from fmtorch.estimators import refinement
+from fmtorch.estimators import focal_search, inliers, lens_search, preselection, refinement, sampling, scores
 from fmtorch.estimators.batch import NOT_SOLVED, Estimation, Solution
-from fmtorch.estimators.degensac import Degensac
-from fmtorch.estimators.final_fits import FinalFit, Fit
 from fmtorch.estimators.focal_search import Focal, FocalSearch, PlausibleCandidates
 from fmtorch.estimators.gradients import Attached
+from fmtorch.estimators.graph_cut import GraphCut
 from fmtorch.estimators.inliers import InlierRule, StoppingRule, noise_scale, residuals_squared_px, squared_in_noises
-from fmtorch.estimators.lens_search import lens_fit, lenses_of, squared_px, suggested_lens, undistorted
-from fmtorch.estimators.models.model import FitScale, Refining
-from fmtorch.estimators.models.with_focals import FundamentalWithFocals
-from fmtorch.estimators.pair import MATCH_WEIGHT, Lens, Pair
+from fmtorch.estimators.models import focal_prior, fundamental, posterior, with_focals
+from fmtorch.estimators.models.fundamental import EightPoint, FitScale, Homography, Matrices, SevenPoint
+from fmtorch.estimators.pair import MATCH_WEIGHT, Lens, Pair, normalize_pair, to_pixels
 from fmtorch.estimators.preselection import Count, Preselect, Preselection
-from fmtorch.estimators.registry import OF_HOMOGRAPHIES, WITH_FOCALS, part, stage, thresholds
-from fmtorch.estimators.sampling import Sampler
-from fmtorch.estimators.scores import Score
-from fmtorch.estimators.search import Search
-from fmtorch.geometry.significance import judged
+from fmtorch.estimators.refinement import Adaptive, Fit, GaussNewton, LeastSquares, NoFit, UnweightedLeastSquares
+from fmtorch.estimators.search import Degensac, Search, merge
+from fmtorch.geometry import homography_refine, levenberg_marquardt
+from fmtorch.geometry.epipolar import HOMOGRAPHY, SAMPSON
+from fmtorch.geometry.five_point import five_point
+from fmtorch.geometry.homography import four_point
+from fmtorch.geometry.refine import refine_kernel
+from fmtorch.geometry.seven_point import seven_point_kernel
+from fmtorch.geometry.significance import counted_chances, judged, most_significant
 from fmtorch.jit.kernel import Array, Kernel
 from fmtorch.jit.together import compile_together
 from fmtorch.jobs.execution import mapped
@@ -43,12 +46,82 @@ SEARCHED = 2048  # right matches that suffice for a search
 CALIBRATED_MATCHES = 6  # that a pair of calibrated cameras needs: five of them have up to ten solutions
 DEFAULT_PRESELECT = Preselect()
 Probability = Annotated[float, Within(0, 1, exclusive=True)]
+DEFAULT_THRESHOLD_PX = 1.0
+Stage = TypeVar("Stage")
+
+PARTS: dict[str, dict[str, Callable[..., Any]]] = {
+    "solver": {"seven_point": SevenPoint, "eight_point": EightPoint, "four_point": Homography},
+    "sampler": {"uniform": sampling.Uniform, "prosac": sampling.Prosac, "prior": sampling.PriorWeighted},
+    "score": {
+        "inlier_count": scores.InlierCount,
+        "msac": scores.Msac,
+        "saturated": scores.SaturatedGains,
+        "magsac": scores.Magsac,
+        "median": scores.Median,
+    },
+    "degeneracy": {"degensac": Degensac},
+    "local_optimization": {"graph_cut": GraphCut},
+    "inliers": {"threshold": inliers.WithinThreshold, "median": inliers.BetterHalf, "lmeds": inliers.RobustDeviations},
+    "final": {
+        "none": NoFit,
+        "least_squares": LeastSquares,
+        "unweighted_least_squares": UnweightedLeastSquares,
+        "gauss_newton": GaussNewton,
+        "adaptive": Adaptive,
+    },
+}
+"""An option that names a part holds its name (``score: msac``), or a mapping of its name and options of its own
+(``score: {name: msac, prior_weighted: true}``), or an object: that of a user's `_target_`."""
+
+
+def takes(role: str, spec: Any, option: str) -> bool:
+    """Whether a named part asks the engine for this option."""
+    name = spec.get("name") if isinstance(spec, Mapping) else spec
+    make = PARTS[role].get(name) if isinstance(name, str) else None
+    return make is not None and option in inspect.signature(make).parameters
+
+
+def part(role: str, spec: Any, **context: Any) -> Any:
+    """The part that an option describes, None for none.
+    context: what the engine tells its parts; each takes what its constructor names, unless its own options say so.
+    Raises ValueError for an unknown name or option, naming those there are."""
+    if spec is None or not isinstance(spec, str | Mapping):
+        return spec
+    name, options = (spec, {}) if isinstance(spec, str) else (spec.get("name"), dict(spec))
+    options.pop("name", None)
+    if name not in PARTS[role]:
+        raise ValueError(f"{role} is {name!r}; it must be one of: {', '.join(PARTS[role])}")
+    make = PARTS[role][name]
+    known = {key: value for key, value in context.items() if key in inspect.signature(make).parameters}
+    expect_options(make, options, f"{role}={name}", known)
+    return make(**(known | options))
+
+
+def stage(options: Stage | Mapping[str, Any] | None, kind: type[Stage]) -> Stage | None:
+    """The options of a stage, from a mapping or as they are; None where it is left out."""
+    return kind(**options) if isinstance(options, Mapping) else options
+
+
+def thresholds(
+    threshold: float | None, inlier_threshold: float | None, score: Any, inliers: Any, stops: bool, optimization: Any
+) -> tuple[float, float]:
+    """The thresholds of score and of inliers, px; ValueError where one is given that nothing asks for.
+    score, inliers, optimization: as options name these parts. stops: whether there is a stopping rule, which counts
+    inliers."""
+    by_distance = stops or takes("inliers", inliers, "threshold")
+    if inlier_threshold is not None and not by_distance:
+        raise ValueError(f"inlier_threshold={inlier_threshold} has no effect: inliers={inliers} takes none")
+    scored = takes("score", score, "threshold") or optimization is not None
+    if threshold is not None and not scored and (not by_distance or inlier_threshold is not None):
+        raise ValueError(f"threshold={threshold} has no effect: score={score} takes none, nor does anything else")
+    of_score = DEFAULT_THRESHOLD_PX if threshold is None else threshold
+    return of_score, of_score if inlier_threshold is None else inlier_threshold
 
 
 class Ransac:
     """A robust estimator of fundamental matrices, batched over pairs.
 
-    Parts are named as in `registry`; the options of a stage are those of the class that is named there.
+    Parts are named as in `PARTS`; the options of a stage are those of the class that is named there.
 
     Args:
         solver: minimal solver, `seven_point` or `eight_point`, and with it the family of models; `four_point` for
@@ -88,9 +161,9 @@ class Ransac:
     def __init__(
         self,
         *,
-        solver: str | Mapping[str, Any] | Refining = "seven_point",
-        sampler: str | Mapping[str, Any] | Sampler = "uniform",
-        score: str | Mapping[str, Any] | Score = "msac",
+        solver: str | Mapping[str, Any] | Matrices = "seven_point",
+        sampler: str | Mapping[str, Any] | sampling.Sampler = "uniform",
+        score: str | Mapping[str, Any] | scores.Score = "msac",
         threshold: float | None = None,
         hypotheses: Count = 2000,
         round: Count = 500,
@@ -104,17 +177,17 @@ class Ransac:
         focal: Focal | Mapping[str, Any] | None = None,
         inliers: str | Mapping[str, Any] | InlierRule = "threshold",
         inlier_threshold: float | None = None,
-        final: str | Mapping[str, Any] | FinalFit = "least_squares",
+        final: str | Mapping[str, Any] | NoFit = "least_squares",
         refit_inliers: bool = True,
     ) -> None:
         expect_options(Ransac, {name: value for name, value in locals().items() if name != "self"}, "")
         stops = confidence is not None
         threshold, inlier_px = thresholds(threshold, inlier_threshold, score, inliers, stops, local_optimization)
-        self.family: Refining = part("solver", solver)
-        self.sampler: Sampler = part("sampler", sampler)
-        self.score: Score = part("score", score, threshold=threshold)
+        self.family: Matrices = part("solver", solver)
+        self.sampler: sampling.Sampler = part("sampler", sampler)
+        self.score: scores.Score = part("score", score, threshold=threshold)
         self.inlier_rule: InlierRule = part("inliers", inliers, threshold=inlier_px)
-        self.final: FinalFit = part("final", final)
+        self.final: NoFit = part("final", final)
         self.refit_inliers = refit_inliers
         stop = None if confidence is None else StoppingRule(confidence, inlier_px, self.sampler)
         preselection = Preselection(self.score, stage(preselect, Preselect))
@@ -129,12 +202,11 @@ class Ransac:
         optimization = part("local_optimization", local_optimization, threshold=threshold, score=self.score)
         choice = stage(select, refinement.Select)
         self.refine = refinement.Refinement(stage(refine, refinement.Refine), optimization)
-        changed = self.refine.options is not None or optimization is not None
-        self.select: refinement.Selector = refinement.BestScore(self.score) if changed else refinement.BestOfSearch()
+        self.select = refinement.BestScore(self.score)
         if choice is not None:
             own = self.family.fit_scale._replace(scale_sigmas=choice.own_noise or 0.0)
             at_noise = functools.partial(_at_noise, choice.score, own)
-            first: Score = part("score", choice.score, threshold=choice.scale)
+            first: scores.Score = part("score", choice.score, threshold=choice.scale)
             self.select = refinement.BestScore(first, at_noise if choice.own_noise else None)
         self.focal = self._focal_search(stage(focal, Focal), choice)
 
@@ -142,9 +214,9 @@ class Ransac:
         """The search among plausible cameras."""
         if options is None:
             return None
-        if choice is None or not isinstance(self.select, refinement.BestScore):
+        if choice is None:
             raise ValueError("focal needs select: the score by which models with the prior are compared")
-        family, own, search = FundamentalWithFocals(), None, self.search
+        family, own, search = with_focals.FundamentalWithFocals(), None, self.search
         if options.samples:
             own = Search(family, search.sampler, search.preselection, options.pool, options.samples, FOCAL_ROUND)
         return FocalSearch(options, family, self.select, self.refine, own, search.stop)
@@ -191,7 +263,7 @@ class Ransac:
             mapped(estimate_part, estimation.parts)
         else:
             estimate_part(estimation.parts[0])
-        return estimation.estimates(Attached(self.final, self.family).attach)
+        return estimation.estimates(Attached(self.final, self.family))
 
     def estimate(self, pair: Pair) -> Solution:
         """Search to fit of one pair."""
@@ -204,7 +276,7 @@ class Ransac:
         solution = self._of_pinholes(pair)
         if self.focal is None or solution.fit is None or not pair.sizes_known:
             return solution
-        return solution._replace(lens_suggested=suggested_lens(solution.fit, pair))
+        return solution._replace(lens_suggested=lens_search.suggested_lens(solution.fit, pair))
 
     def _of_pinholes(self, pair: Pair) -> Solution:
         selection, draws = self.selected(searched(pair))
@@ -217,17 +289,17 @@ class Ransac:
     def _with_lenses(self, pair: Pair, known: Lens) -> Solution:
         """The same of bent photographs: searched in images of pinholes, judged as photographed."""
         assert self.focal is not None
-        lens = lenses_of(pair, self.focal)
-        solution = self._of_pinholes(undistorted(pair, lens))
+        lens = lens_search.lenses_of(pair, self.focal)
+        solution = self._of_pinholes(lens_search.undistorted(pair, lens))
         if solution.fit is None or solution.inliers is None:
             return solution
         fit, cameras = solution.fit, solution.fit.cameras
         if cameras is None or not (lens.any() or np.isfinite(known.deviations).all()):
             return solution._replace(lens=lens)
-        refined = lens_fit(lens, cameras, pair, solution.inliers)
+        refined = lens_search.lens_fit(lens, cameras, pair, solution.inliers)
         if not np.isfinite(refined.F).all():
             return solution._replace(lens=lens)
-        inliers = self.inlier_rule(squared_px(refined.F, refined.lens, pair), pair)
+        inliers = self.inlier_rule(lens_search.squared_px(refined.F, refined.lens, pair), pair)
         own = fit._replace(F=refined.F, at=refined.F, cameras=refined.cameras)
         return Solution(own, solution.samples, inliers, lens=refined.lens, deviation=refined.deviation)
 
@@ -269,9 +341,11 @@ def searched(pair: Pair) -> Pair:
     return pair if count >= pair.count else pair.take(np.arange(count) * pair.count // count)
 
 
-def _at_noise(score: Any, own: FitScale, F: Array, pair: Pair) -> Score:
+def _at_noise(score: Any, own: FitScale, F: Array, pair: Pair) -> scores.Score:
     """A score at the noise of a pair near a model (9,)."""
-    at: Score = part("score", score, threshold=noise_scale(squared_in_noises(F, pair), pair, own, own.largest_px))
+    at: scores.Score = part(
+        "score", score, threshold=noise_scale(squared_in_noises(F, pair), pair, own, own.largest_px)
+    )
     return at
 
 
@@ -309,3 +383,27 @@ class CoarseToFine:
             for first, second in zip(coarse.reason, fine.reason, strict=True)
         )
         return judged(fine.replace(reason=reasons, samples=coarse.samples + fine.samples, significance=None), c)
+
+
+# Kernels that two processes compile side by side, by what they share, the slowest to compile at both ends
+
+WITH_FOCALS: tuple[Kernel[..., Any], ...] = (
+    # Solvers, samples and scores
+    five_point, seven_point_kernel, counted_chances, refinement.near_of(SAMPSON), sampling.draw,
+    focal_prior.draw_depths, preselection.draw_by_prior, preselection.best, scores.score_gains_of(SAMPSON),
+    scores.score_saturated_of(SAMPSON), normalize_pair, to_pixels, preselection.support, inliers.residuals_squared,
+    inliers.share_within, merge, scores.saturated_cells, scores.pack, focal_search.posteriors,
+    focal_search.distinct_models, focal_search.same_model,
+    # Cameras and fits; `evaluate` is called by `minimise` and `refine`
+    posterior.centre, posterior.translate, with_focals.gain_without_prior, with_focals.refine_with_prior,
+    with_focals.cheirality, most_significant, posterior.nearest_cameras, levenberg_marquardt.evaluate, refine_kernel,
+    posterior.minimise, lens_search.inverted, lens_search.minimise_with_lenses,
+)  # fmt: skip
+"""Of an estimator of fundamental matrices with the prior on focal lengths."""
+
+OF_HOMOGRAPHIES: tuple[Kernel[..., Any], ...] = (
+    homography_refine.refine_homographies, homography_refine.evaluate_homographies, four_point,
+    fundamental.homography_to_pixels, inliers.residuals_squared_of(HOMOGRAPHY), refinement.near_of(HOMOGRAPHY),
+    scores.score_gains_of(HOMOGRAPHY), scores.score_saturated_of(HOMOGRAPHY), counted_chances,
+)  # fmt: skip
+"""Of an estimator of homographies, beside those that the former has too."""

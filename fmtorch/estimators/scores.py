@@ -13,7 +13,7 @@ import numpy as np
 
 from fmtorch.estimators.pair import Pair
 from fmtorch.geometry.arithmetic import smallest_but
-from fmtorch.geometry.epipolar import HOMOGRAPHY, MATCH, SAMPSON, SINGLES, TINY32, Residual, fill, load
+from fmtorch.geometry.epipolar import MATCH, SINGLES, TINY32, Residual, fill, load
 from fmtorch.geometry.robust_losses import GAIN_TABLE
 from fmtorch.jit.kernel import Array, F4x1, F4x2, F8x1, F8x2, I4x2, I8x1, Kernel, inner, kernel
 from fmtorch.jit.lanes import added, sqrt, store, where
@@ -91,6 +91,8 @@ class SummedGains:
     """
 
     gain_kernel: ClassVar[Kernel[..., None] | None] = None
+    CODE: ClassVar[int | None] = None  # of a gain that one kernel computes
+    table = NO_TABLE
 
     def __init__(self, threshold: float, prior_weighted: bool = False) -> None:
         if not threshold > 0:
@@ -103,7 +105,10 @@ class SummedGains:
 
     def __call__(self, F: Array, which: Array, pair: Pair) -> Array:
         """As `Score`."""
-        rows, bits = pair.cached(self, self._matches)
+        (rows, gain), out = pair.cached(self, self._matches), np.empty(len(which))
+        if self.CODE is not None:
+            score_gains_of(pair.residual)(F, which, rows, gain, out)
+            return out
         squared = np.empty((len(which), pair.count), np.float32)
         squared_residuals_of(pair.residual)(F, which, rows, squared)
         if self.gain_kernel is not None:
@@ -116,46 +121,28 @@ class SummedGains:
                 f"{type(self).__name__}.gain returns shape {gains.shape} of {gains.dtype}; it must be the shape of its "
                 f"argument, {squared.shape}: (models, matches), of numbers"
             )
-        out = np.empty(len(which))
-        sum_gains(np.ascontiguousarray(gains, np.float32), rows, bits, out)
+        sum_gains(np.ascontiguousarray(gains, np.float32), rows, gain.bits, out)
         return out
 
-    def _matches(self, pair: Pair) -> tuple[Array, int]:
-        """The matches in rows, and the fractional bits of their gains."""
-        return scored_matches(pair, self.threshold, self.prior_weighted), fractional_bits(pair.count)
+    def _matches(self, pair: Pair) -> tuple[Array, Gain]:
+        """The matches in rows, and their gain."""
+        gain = Gain(self.CODE or 0, fractional_bits(pair.count), self.table)
+        return scored_matches(pair, self.threshold, self.prior_weighted), gain
 
 
-class CodedGains(SummedGains):
-    """A sum of gains that one kernel computes."""
-
-    CODE: ClassVar[int]
-    table = NO_TABLE
-
-    def __call__(self, F: Array, which: Array, pair: Pair) -> Array:
-        """As `Score`."""
-        rows, gain = pair.cached(self, self._coded)
-        out = np.empty(len(which))
-        score_gains_of(pair.residual)(F, which, rows, gain, out)
-        return out
-
-    def _coded(self, pair: Pair) -> tuple[Array, Gain]:
-        rows, bits = self._matches(pair)
-        return rows, Gain(self.CODE, bits, self.table)
-
-
-class InlierCount(CodedGains):
+class InlierCount(SummedGains):
     """RANSAC: the number of matches within the threshold (Fischler & Bolles 1981)."""
 
     CODE = COUNT
 
 
-class Msac(CodedGains):
+class Msac(SummedGains):
     """MSAC: the sum of ``1 - r^2 / t^2`` over the matches within the threshold t (Torr & Zisserman 2000)."""
 
     CODE = TRUNCATED_SQUARES
 
 
-class GemanMcClure(CodedGains):
+class GemanMcClure(SummedGains):
     """The sum over matches of ``1 / (1 + r^2 / s^2)``, shifted and scaled to be 1 at r = 0 and 0 from 5 s on.
 
     Geman & McClure (1987); s is the threshold. A narrow peak with a long tail: exact matches decide, and matches with
@@ -165,7 +152,7 @@ class GemanMcClure(CodedGains):
     CODE = GEMAN_MCCLURE
 
 
-class Magsac(CodedGains):
+class Magsac(SummedGains):
     """MAGSAC++: the likelihood marginalised over the noise scale (Barath et al., CVPR 2020, section 3.2).
 
     The gain is ``1 - rho(r) / rho(k sigma_max)``, rho as in `magsac`, tabulated over r^2 as the authors do.
@@ -269,10 +256,6 @@ def rounded(gain: Any, shift: Any) -> Any:
     return where(gain > ZERO, gain, ZERO) + shift - shift
 
 
-score_gains = score_gains_of(SAMPSON)
-score_gains_homography = score_gains_of(HOMOGRAPHY)
-
-
 # A score that saturates where matches crowd, so that no single textured plane outvotes the rest of the image
 
 GRID = 12  # cells along each side of each image
@@ -295,10 +278,10 @@ class SaturatedGains(SummedGains):
 
     def __call__(self, F: Array, which: Array, pair: Pair) -> Array:
         """As `Score`."""
-        rows, bits = pair.cached(self, self._matches)
+        rows, gain = pair.cached(self, self._matches)
         cells = pair.cached(("cells", self.prior_weighted), self._cells)
         out = np.empty(len(which))
-        score_saturated_of(pair.residual)(F, which, rows, cells, bits, out)
+        score_saturated_of(pair.residual)(F, which, rows, cells, gain.bits, out)
         return out
 
     def _cells(self, pair: Pair) -> Array:
@@ -351,10 +334,6 @@ def saturated_cells(table: F8x2, weighted: bool, out: I4x2) -> None:
                 share = (x[i] - low) / max(high - low, TINY32) * np.float32(GRID)
                 cell = np.int32(min(max(share, ZERO), np.float32(GRID - 1))) if math.isfinite(share) else np.int32(0)
                 out[image, i] += cell * (GRID if axis else 1)
-
-
-score_saturated = score_saturated_of(SAMPSON)
-score_saturated_homography = score_saturated_of(HOMOGRAPHY)
 
 
 BIN_SHIFT, BINS = 21, 1 << 10  # of a float32 the exponent and two bits more

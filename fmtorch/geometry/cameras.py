@@ -234,25 +234,20 @@ class PixelFrame(NamedTuple):
 
     def to_pixels(self, F: Float[Tensor, "p k 3 3"], homographies: bool = False) -> Float[Tensor, "p k 3 3"]:
         """Fundamental matrices, or homographies, of points in the frame as those of pixels, of any scale."""
-        left = self._to_pixels(2) if homographies else self._from_pixels(2).mT
-        return matmul3(matmul3(left, F), self._from_pixels(0))
+        (_, back0), (there1, back1) = self._maps(0), self._maps(2)
+        return matmul3(matmul3(there1 if homographies else back1.mT, F), back0)
 
     def from_pixels(self, F: Float[Tensor, "p k 3 3"], homographies: bool = False) -> Float[Tensor, "p k 3 3"]:
         """Fundamental matrices, or homographies, of pixels as those of points in the frame, of any scale."""
-        left = self._from_pixels(2) if homographies else self._to_pixels(2).mT
-        return matmul3(matmul3(left, F), self._to_pixels(0))
+        (there0, _), (there1, back1) = self._maps(0), self._maps(2)
+        return matmul3(matmul3(back1 if homographies else there1.mT, F), there0)
 
-    def _to_pixels(self, first: int) -> Float[Tensor, "p 1 3 3"]:
-        """Maps the frame's points of one image to pixels."""
-        return self._similarity(self.pixels_per_unit, self.centre[:, first : first + 2])
-
-    def _from_pixels(self, first: int) -> Float[Tensor, "p 1 3 3"]:
-        """Maps pixels of one image to the frame's points."""
-        unit = self.pixels_per_unit
-        return self._similarity(1 / unit, -self.centre[:, first : first + 2] / unit[:, None])
-
-    @staticmethod
-    def _similarity(scale: Tensor, shift: Tensor) -> Float[Tensor, "p 1 3 3"]:
-        A = torch.diag_embed(torch.stack([scale, scale, torch.ones_like(scale)], -1))
-        A[:, :2, 2] = shift
-        return A[:, None]
+    def _maps(self, first: int) -> tuple[Float[Tensor, "p 1 3 3"], Float[Tensor, "p 1 3 3"]]:
+        """Map the frame's points of one image to pixels, and these to the frame's."""
+        unit, shift = self.pixels_per_unit, self.centre[:, first : first + 2]
+        maps = []
+        for scale, moved in ((unit, shift), (1 / unit, -shift / unit[:, None])):
+            A = torch.diag_embed(torch.stack([scale, scale, torch.ones_like(scale)], -1))
+            A[:, :2, 2] = moved
+            maps.append(A[:, None])
+        return maps[0], maps[1]

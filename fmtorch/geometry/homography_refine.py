@@ -15,7 +15,7 @@ from torch import Tensor
 
 from fmtorch.geometry.arithmetic import component_sum, gradient_wanted, stable_sum
 from fmtorch.geometry.epipolar import TINY
-from fmtorch.geometry.levenberg_marquardt import MATCH, Problem, Schedule, Weighted, in_rows, minimiser, robust
+from fmtorch.geometry.levenberg_marquardt import MATCH, Schedule, Weighted, in_rows, minimiser, robust
 from fmtorch.geometry.matrices import assign, assign_rows, unit_kernel
 from fmtorch.geometry.normalize import NormalizedMatches, RobustSum, fitted_by
 from fmtorch.geometry.rank2_manifold import damped_system, eliminate
@@ -216,8 +216,7 @@ def refine_homographies(H: F8x2, matches: Weighted, schedule: Schedule, out: F8x
     for i in range(k):
         assign(out[i], H[i])
         unit_kernel(out[i])
-    problem = Problem(matches, schedule.tolerance)
-    _minimise(problem, state, trial, np.full(k, schedule.damping), schedule.iterations, schedule.tolerance > 0)
+    _minimise(matches, state, trial, np.full(k, schedule.damping), schedule.iterations, schedule.tolerance)
 
 
 @kernel(holds_gil=True)
@@ -231,12 +230,12 @@ def step_of_homography(H: F8x1, matches: Weighted, damping: float, out: F8x1) ->
 
 
 @inner
-def _evaluate(state: _State, problem: Problem, derivatives: bool) -> None:
-    evaluate_homographies(state.H, problem.matches, derivatives, state.products, state.cost)
+def _evaluate(state: _State, matches: Weighted, derivatives: bool) -> None:
+    evaluate_homographies(state.H, matches, derivatives, state.products, state.cost)
 
 
 @inner
-def _step(problem: Problem, state: _State, damping: Array, trial: _State) -> None:
+def _step(matches: Weighted, state: _State, damping: Array, trial: _State) -> None:
     Q = matrix(18, LANES)
     for k in range(len(damping)):
         _stepped(state.products[k], state.H[k], damping[k], Q, trial.H[k])

@@ -170,54 +170,43 @@ class Schedule(NamedTuple):
     squarings: int = SQUARINGS
 
 
-class Problem(NamedTuple):
-    """The matches of a robust error, and the tolerance of the schedule."""
-
-    matches: Weighted
-    tolerance: float
-
-
-@inner
-def _by_share(problem: Problem, before: float, after: float) -> bool:
-    """Whether a step that lowers the cost of a model so far is its last."""
-    return problem.tolerance > 0 and before - after <= problem.tolerance * before
-
-
 def minimiser(
     evaluate: Callable[..., None], step: Callable[..., None], take: Callable[..., None],
-    converged: Callable[..., bool] = _by_share, min_damping: float = MIN_DAMPING,
-) -> Callable[[Any, Any, Any, Array, int, bool], None]:  # fmt: skip
-    """The loop for an objective: loop(data, state, trial, damping, iterations, ends), in place.
+    relative: bool = True, min_damping: float = MIN_DAMPING,
+) -> Callable[[Any, Any, Any, Array, int, float], None]:  # fmt: skip
+    """The loop for an objective: loop(data, state, trial, damping, iterations, tolerance), in place.
     evaluate(state, data, derivatives): the costs, and the derivatives if asked for, at the state's parameters.
     step(data, state, damping, trial): those of a trial. take(state, trial, k): gives the state model k of the trial but
-    for its cost, where that is lower: such a step divides the damping by 10, another multiplies it. converged(data,
-    before, after): whether a model is done after a step that has lowered its cost so."""
+    for its cost, where that is lower: such a step divides the damping by 10, another multiplies it. relative: whether
+    the tolerance is a share of the cost, as of `Schedule`, or a number, of which a negative one ends nothing."""
 
     @inner
-    def accept(state: Any, trial: Any, damping: Array, done: Array, data: Any) -> bool:
+    def accept(state: Any, trial: Any, damping: Array, done: Array, tolerance: float, ends: bool) -> bool:
         """The trial for the models that it improves; whether all are done."""
         everything = True
         for k in range(len(damping)):
             better = trial.cost[k] < state.cost[k] and not done[k]
             damping[k] = min(max(damping[k] / 10 if better else damping[k] * 10, min_damping), MAX_DAMPING)
             if better:
-                done[k] |= converged(data, state.cost[k], trial.cost[k])
+                least = tolerance * state.cost[k] if relative else tolerance
+                done[k] |= ends and state.cost[k] - trial.cost[k] <= least
                 state.cost[k] = trial.cost[k]
                 take(state, trial, k)
             everything = everything and done[k]
         return everything
 
     @inner
-    def loop(data: Any, state: Any, trial: Any, damping: Array, iterations: int, ends: bool) -> None:
+    def loop(data: Any, state: Any, trial: Any, damping: Array, iterations: int, tolerance: float) -> None:
         """The state holds the start, then that of least cost; no cost ever rises.
-        damping: (k,), the first of each model. ends: whether models are ever done; the state then keeps the
-        derivatives at the end."""
+        damping: (k,), the first of each model. tolerance: what a step must lower the cost of a model by, if it is not
+        to be done; where models are ever done the state keeps the derivatives at the end."""
         done = np.zeros(len(damping), np.bool_)
+        ends = tolerance > 0 if relative else tolerance >= 0
         evaluate(state, data, iterations > 0 or ends)
         for i in range(iterations):
             step(data, state, damping, trial)
             evaluate(trial, data, i + 1 < iterations or ends)
-            if accept(state, trial, damping, done, data) and ends:
+            if accept(state, trial, damping, done, tolerance, ends) and ends:
                 break
 
     return loop

@@ -87,19 +87,8 @@ def _unit(x: Tensor, fallback: Tensor) -> Tensor:
 
 def _largest_eigenvector(K: Tensor) -> Tensor:
     """The unit eigenvector of the largest eigenvalue of symmetric 3 x 3 matrices (3, 3, *s); any, where it is multiple.
-    K - mean = m X with X's eigenvalues y the roots of y^3 - 3 y = det X: the extreme root by Newton's method from 2,
-    the others from the quadratic that remains. The eigenvector is the longest cross product of two rows of K - lambda.
-    """
-    mean = (K[0, 0] + K[1, 1] + K[2, 2]) / 3
-    D = K.clone()
-    for i in range(3):
-        D[i, i] = K[i, i] - mean
-    m = sqrt(component_sum(component_sum(D * D, 1)) / 6)
-    X = D / torch.where(m > 0, m, 1.0)
-    constant = determinant(X).clamp(-2.0, 2.0)
-    y = torch.full_like(m, 2.0)
-    for _ in range(5):
-        y = (2 * y * y * y + constant.abs()) / (3 * (y * y - 1))
+    The eigenvector is the longest cross product of two rows of K - lambda."""
+    _, _, X, constant, y = extreme_root(K)
     middle = (sqrt(3 * (2 - y).clamp_min(0) * (2 + y)) + y) / 2
     largest = torch.where(constant >= 0, y, middle)
     for i in range(3):
@@ -113,6 +102,22 @@ def _largest_eigenvector(K: Tensor) -> Tensor:
     across = _across_longest(X)
     distinct = length2.amax(0) > torch.finfo(K.dtype).eps
     return torch.where(distinct, _unit(chosen, across), across)
+
+
+def extreme_root(K: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Of symmetric 3 x 3 matrices mean, m and X, ``K = mean + m X``, det X, and the extreme root of
+    ``y^3 - 3 y = |det X|``; the eigenvalues of X are the roots without the magnitude."""
+    mean = (K[0, 0] + K[1, 1] + K[2, 2]) / 3
+    D = K.clone()
+    for i in range(3):
+        D[i, i] = K[i, i] - mean
+    m = sqrt(component_sum(component_sum(D * D, 1)) / 6)
+    X = D / torch.where(m > 0, m, 1.0)
+    constant = determinant(X).clamp(-2.0, 2.0)
+    y = torch.full_like(m, 2.0)
+    for _ in range(5):  # Newton's method, quadratic from an error of at most 0.27
+        y = (2 * y * y * y + constant.abs()) / (3 * (y * y - 1))
+    return mean, m, X, constant, y
 
 
 def _across_longest(A: Tensor) -> Tensor:

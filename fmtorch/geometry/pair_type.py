@@ -11,9 +11,9 @@ from torch import Tensor
 from fmtorch.core.types import PAIR_TYPES
 from fmtorch.geometry.arithmetic import logarithm, logarithm_kernel
 from fmtorch.geometry.epipolar import HOMOGRAPHY, SAMPSON
-from fmtorch.geometry.rotation import Cameras, fit_rotation
+from fmtorch.geometry.homography_pose import fit_rotation
 from fmtorch.jit.batches import for_each_pair
-from fmtorch.jit.kernel import Array, B1x1, F8x1, F8x2, inner, kernel, matrix, vector
+from fmtorch.jit.kernel import Array, B1x1, F8x1, F8x2, F8x3, inner, kernel, matrix, vector
 
 FREEDOM = 3.0  # degrees, of Student's law: keypoints err by more than the normal one says
 PEAK = 0.36755259694786135  # of that law: 2 / (pi sqrt(3))
@@ -30,29 +30,26 @@ TURNED, SCALED, COLUMNS = FOCALS + 2, FOCALS + 11, FOCALS + 14
 of_line, of_plane = SAMPSON.of_match, HOMOGRAPHY.of_match
 
 
-class Matches(NamedTuple):
-    """x0, x1 (n, 2), which are real, mask (n,); P(inlier) and relative noise (n,), empty where unknown."""
+class Matched(NamedTuple):
+    """A pair: x0, x1 (n, 2), which are real, mask (n,); P(inlier) and relative noise (n,), empty where unknown.
+    models: F, H, K0, K1 (4, 3, 3), zero where there is none. size0, size1: (h, w), empty where unknown. precision:
+    (2, 2), of the logarithms of the focal lengths of K0 and K1, infinite where they are known."""
 
     x0: F8x2
     x1: F8x2
     mask: B1x1
     prior: F8x1
     noise: F8x1
-
-
-class Models(NamedTuple):
-    """F, H (3, 3), zero where there is none; size0, size1: (h, w), empty where unknown."""
-
-    F: F8x2
-    H: F8x2
+    models: F8x3
     size0: F8x1
     size1: F8x1
+    precision: F8x2
 
 
 @kernel
-def weigh(matches: Matches, models: Models, cameras: Cameras, out: F8x1) -> None:
+def weigh(matches: Matched, out: F8x1) -> None:
     """The log likelihoods of the kinds, and what was fitted for them -> out (COLUMNS,), by the names above."""
-    n = len(matches.mask)
+    n, F, given_plane, K0 = len(matches.mask), matches.models[0], matches.models[1], matches.models[2]
     points, prior, noise = matrix(4, n), vector(n), vector(n)
     n = _gather(matches, points, prior, noise)
     points, prior, noise = points[:, :n], prior[:n], noise[:n]
@@ -61,15 +58,15 @@ def weigh(matches: Matches, models: Models, cameras: Cameras, out: F8x1) -> None
     out[MATCHES] = n
     if n == 0:
         return
-    side = _side(points, models.size0, models.size1)
-    has_line, has_plane = np.any(models.F != 0), np.any(models.H != 0)
+    side = _side(points, matches.size0, matches.size1)
+    has_line, has_plane = np.any(F != 0), np.any(given_plane != 0)
     line, plane, r, work = np.full(n, math.inf), np.full(n, math.inf), vector(n), vector(n)
     s = COARSEST * side
     if has_line:
-        _distances(models.F.ravel(), points, noise, True, line)
+        _distances(F.ravel(), points, noise, True, line)
         s = min(s, _noise(line, prior, side, 1, work))
     if has_plane:
-        _distances(models.H.ravel(), points, noise, False, plane)
+        _distances(given_plane.ravel(), points, noise, False, plane)
         s = min(s, _noise(plane, prior, side, 2, work))
     out[NOISE] = s
     d, share = np.zeros((2, n)), np.zeros(3)
@@ -89,8 +86,8 @@ def weigh(matches: Matches, models: Models, cameras: Cameras, out: F8x1) -> None
     _densities(r, s, side, 2, d[0])
     out[COPY] = _log_likelihood(d[:1], prior, share)
     out[TURN] = -math.inf
-    if cameras.K0[2, 2] != 0:
-        cost = fit_rotation(points, noise, models.H.ravel(), cameras, s, out[FOCALS:SCALED], H)
+    if K0[2, 2] != 0:
+        cost = fit_rotation(points, noise, matches.models, matches.precision, s, out[FOCALS:SCALED], H)
         if math.isfinite(cost):
             _distances(H, points, noise, False, r)
             _densities(r, s, side, 2, d[0])
@@ -98,7 +95,7 @@ def weigh(matches: Matches, models: Models, cameras: Cameras, out: F8x1) -> None
 
 
 @inner
-def _gather(matches: Matches, points: Array, prior: Array, noise: Array) -> int:
+def _gather(matches: Matched, points: Array, prior: Array, noise: Array) -> int:
     """The real matches with finite coordinates -> points (4, n), prior, noise (n,); how many."""
     x0, x1, mask = matches.x0, matches.x1, matches.mask
     count = 0
@@ -312,15 +309,10 @@ def pair_evidence(
     models = torch.where(models.isfinite().flatten(2).all(2)[..., None, None], models, 0.0)
     sizes = (None if size is None else size.to(torch.float64) for size in (size0, size1))
     given = (x0, x1, mask, prior, noise, models, *sizes, precision)
-    rows = for_each_pair(_into, given, out=torch.empty(len(F), COLUMNS, dtype=torch.float64), kind=torch.float64)
+    out = torch.empty(len(F), COLUMNS, dtype=torch.float64)
+    rows = for_each_pair(weigh, given, out=out, kind=torch.float64, group=Matched)
     fitted = rows[:, TURNED:SCALED].reshape(-1, 3, 3), rows[:, FOCALS:TURNED], rows[:, SCALED:]
     return Evidence._make([*rows[:, :FOCALS].unbind(1), *fitted])
-
-
-def _into(x0: Array, x1: Array, mask: Array, prior: Array, noise: Array, *known: Array) -> None:
-    models, size0, size1, precision, out = known
-    F, H, K0, K1 = models
-    weigh(Matches(x0, x1, mask, prior, noise), Models(F, H, size0, size1), Cameras(K0, K1, precision), out)
 
 
 def classified(evidence: Evidence, focal_known: Bool[Tensor, " b"] | None = None) -> Int[Tensor, " b"]:

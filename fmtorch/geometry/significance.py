@@ -47,16 +47,19 @@ class Matches(NamedTuple):
 
 
 @kernel
-def counted_chances(F: F8x2, matches: Matches, out: F8x1) -> int:
+def counted_chances(F: F8x2, matches: Matches, plane: bool, out: F8x1) -> int:
     """Of a model F (3, 3) the chances of the matches, the median one of each place, in no order -> out (m,); m.
-    Without a model m is 0."""
+    plane: it is a homography, whose chances are of discs in place of strips. Without a model m is 0."""
     point, peak = matrix(4, len(matches.mask)), _peak(F)
     count = _real(matches, point) if peak > 0 else 0
-    if count <= SAMPLE:
+    if count <= (PLANE_SAMPLE if plane else SAMPLE):
         return 0
     chance, place = np.zeros(count), np.zeros(count, np.int64)
     strip0 = _placed(point[0], point[1], matches.size0, place)
     strip1 = _placed(point[2], point[3], matches.size1, place)
+    if plane:
+        _disc_chances(F.ravel() / peak, point, matches, chance)
+        return _median_of_places(chance, place, out)
     f0, f1, f2 = F[0, 0] / peak, F[0, 1] / peak, F[0, 2] / peak
     f3, f4, f5 = F[1, 0] / peak, F[1, 1] / peak, F[1, 2] / peak
     f6, f7, f8 = F[2, 0] / peak, F[2, 1] / peak, F[2, 2] / peak
@@ -69,26 +72,18 @@ def counted_chances(F: F8x2, matches: Matches, out: F8x1) -> int:
     return _median_of_places(chance, place, out)
 
 
-@kernel
-def counted_plane_chances(H: F8x2, matches: Matches, out: F8x1) -> int:
-    """The same of a homography H (3, 3), whose chances are of discs in place of strips."""
-    point, peak, A = matrix(4, len(matches.mask)), _peak(H), vector(9)
-    count = _real(matches, point) if peak > 0 else 0
-    if count <= PLANE_SAMPLE:
-        return 0
-    chance, place = np.zeros(count), np.zeros(count, np.int64)
-    _placed(point[0], point[1], matches.size0, place)
-    _placed(point[2], point[3], matches.size1, place)
+@inner
+def _disc_chances(h: Array, point: Array, matches: Matches, out: Array) -> None:
+    """The chances of matches to be as near to where a homography (9,) maps them -> out (n,)."""
+    A, count = vector(9), len(out)
     disc0 = math.pi / _area(point[0, :count], point[1, :count], matches.size0)
     disc1 = math.pi / _area(point[2, :count], point[3, :count], matches.size1)
-    h = H.ravel() / peak
     adjugate(h, A)
     for i in range(count):
         u, v, x, y = point[0, i], point[1, i], point[2, i], point[3, i]
         in0, in1 = _transfer(A, x, y, u, v) * disc0, _transfer(h, u, v, x, y) * disc1
         larger = max(in0, in1) if in0 < 1 and in1 < 1 else 1.0  # NaN, too
-        chance[i] = max(larger, LEAST_CHANCE * LEAST_CHANCE)
-    return _median_of_places(chance, place, out)
+        out[i] = max(larger, LEAST_CHANCE * LEAST_CHANCE)
 
 
 @inner
@@ -255,15 +250,12 @@ def of_one_pair(
     F: Array, x0: Array, x1: Array, mask: Array, size0: Array, size1: Array, model: str = "fundamental"
 ) -> float:
     """`significance` of one pair by kernels; float64, sizes empty where unknown."""
-    chance, matches = np.empty(len(mask)), Matches(x0, x1, mask, size0, size1)
+    chance, matches, plane = np.empty(len(mask)), Matches(x0, x1, mask, size0, size1), model == "homography"
     factorials = _log_factorials(1 << max(len(mask), SAMPLE + 1).bit_length())
-    if model == "homography":
-        chance = chance[: counted_plane_chances(F, matches, chance)]
-        chance.sort()
-        return most_significant(chance, factorials, PLANE_SAMPLE, LOG_PLANE_MODELS)
-    chance = chance[: counted_chances(F, matches, chance)]
+    chance = chance[: counted_chances(F, matches, plane, chance)]
     chance.sort()
-    return most_significant(chance, factorials, SAMPLE, LOG_MODELS)
+    sample, log_models = (PLANE_SAMPLE, LOG_PLANE_MODELS) if plane else (SAMPLE, LOG_MODELS)
+    return most_significant(chance, factorials, sample, log_models)
 
 
 @functools.lru_cache(maxsize=8)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal, Protocol, cast, runtime_checkable
+from typing import Any, Literal, Protocol, cast
 
 import numpy as np
 import torch
@@ -18,26 +18,16 @@ from torch import Tensor
 
 from fmtorch.core.annotations import Rule
 from fmtorch.core.checks import MIN_MATCHES, as_tensor, expect_inside, widened
+from fmtorch.core.lenses import Lens as CalibratedLens
 from fmtorch.core.options import nearest
 from fmtorch.core.types import Correspondences, collate
 from fmtorch.geometry.cameras import calibration_problems
 
 
-@runtime_checkable
 class Shared(Protocol):
     """An array of another library, which DLPack shares."""
 
     def __dlpack__(self, **options: Any) -> Any: ...
-
-
-@runtime_checkable
-class CalibratedLens(Protocol):
-    """`fmtorch.Lens`, which is not imported where there is none."""
-
-    @property
-    def K(self) -> NDArray[Any]: ...
-
-    def distort(self, points: NDArray[Any]) -> NDArray[Any]: ...
 
 
 Array = Tensor | NDArray[Any]

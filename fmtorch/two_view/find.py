@@ -17,8 +17,7 @@ from fmtorch.core.types import CONTRADICTED, Correspondences, Estimate, PoseEsti
 from fmtorch.geometry.epipolar import unit_frobenius
 from fmtorch.jobs.execution import one_thread
 from fmtorch.two_view.arguments import Arrays, Focal, Lens, correspondences, is_calibrated
-from fmtorch.two_view.assumed_sizes import Size, given_sizes
-from fmtorch.two_view.estimation import estimated
+from fmtorch.two_view.estimation import Size, estimated, given_sizes
 from fmtorch.two_view.pair_type import with_pair_type
 
 if TYPE_CHECKING:

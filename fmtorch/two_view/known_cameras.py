@@ -11,12 +11,12 @@ from torch import Tensor
 from fmtorch.core.records import ungraphed
 from fmtorch.core.stages import Estimator, Pruner, output_of
 from fmtorch.core.types import Correspondences, Estimate
-from fmtorch.geometry.arithmetic import cofactors, component_sum, determinant, matmul3, sqrt
+from fmtorch.geometry.arithmetic import component_sum, matmul3, sqrt
 from fmtorch.geometry.cameras import MIN_SIDE_PX, calibration_problems, cross_matrix, mapped, square_pixels
 from fmtorch.geometry.covariance import two_view_covariance
 from fmtorch.geometry.epipolar import inverse_root
 from fmtorch.geometry.normalize import canonical
-from fmtorch.geometry.pose import pose, pose_from_fundamental
+from fmtorch.geometry.pose import inverse, pose, pose_from_fundamental
 from fmtorch.geometry.significance import judged
 from fmtorch.jit.batches import for_each_pair
 from fmtorch.jobs.execution import one_thread
@@ -243,8 +243,7 @@ def _covariance_of(
 
 
 def _inverse(A: Float[Tensor, "b 3 3"]) -> Float[Tensor, "b 3 3"]:
-    components = A.movedim((-2, -1), (0, 1))
-    return (cofactors(components) / determinant(components)).movedim((0, 1), (-1, -2))
+    return inverse(A.movedim((-2, -1), (0, 1)))[0].movedim((0, 1), (-2, -1))
 
 
 def _product(A: Float[Tensor, "b k m"], B: Float[Tensor, "b m n"]) -> Float[Tensor, "b k n"]:

@@ -149,7 +149,7 @@ EVERY = variants("estimator")
 SCALED = ("x0", "x1", "size0", "size1")
 OWN = [name for name in EVERY if not name.startswith(OTHER_LIBRARIES)]
 PIXELS = [  # what is a distance in pixels and no option
-    (estimators.degensac, "PLANE_THRESHOLD_PX"), (with_focals, "INLIER_SIGMA_PX"), (with_focals, "LOSS_SCALE_PX"),
+    (estimators.search, "PLANE_THRESHOLD_PX"), (with_focals, "INLIER_SIGMA_PX"), (with_focals, "LOSS_SCALE_PX"),
     (with_focals, "PARALLEL_PX"), (estimators.inliers, "FLOOR_PX"), (estimators.GraphCut, "RADIUS_PX"),
     (estimators.Fundamental, "fit_scale"), (estimators.Homography, "fit_scale"),
 ]  # fmt: skip
@@ -294,9 +294,9 @@ def inputs(seed: int, noise: float, same: bool = False) -> dict[str, Tensor]:
 @pytest.fixture
 def converging(monkeypatch: pytest.MonkeyPatch) -> None:
     """Final fits that go on to the optimum."""
-    schedule = estimators.final_fits.SCHEDULE._replace(iterations=30, tolerance=0.0)
+    schedule = estimators.refinement.SCHEDULE._replace(iterations=30, tolerance=0.0)
     for name, value in {"SCHEDULE": schedule, "FOCAL_ITERATIONS": 30, "FOCAL_TOLERANCE": 0.0}.items():
-        monkeypatch.setattr(estimators.final_fits, name, value)
+        monkeypatch.setattr(estimators.refinement, name, value)
 
 
 @pytest.mark.usefixtures("converging")

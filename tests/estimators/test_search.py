@@ -73,7 +73,7 @@ def test_a_pool_keeps_the_best_and_the_earlier_of_equals() -> None:
     pool = Pool.empty(3)
     assert pool.models.shape == (1, 9)
     assert not pool.models.any()
-    assert pool.valid.tolist() == [False]
+    assert not pool.filled
     for scores, first, kept, best in (
         ([1.0, 3.0], 10, [11, 10], [3, 1]),
         ([3.0, np.nan, -np.inf, 2.0, 0.0, np.inf], 20, [11, 20, 23], [3, 3, 2]),

@@ -10,10 +10,9 @@ from torch import Tensor
 
 from fmtorch.geometry import LOSSES, attached_step, irls, refine
 from fmtorch.geometry.epipolar import linearise
-from fmtorch.geometry.irls import reweighted, reweighted_kernel
 from fmtorch.geometry.levenberg_marquardt import FIRST_DAMPING, LOSS_CODES, Schedule, Weighted, evaluate
 from fmtorch.geometry.normalize import RobustSum, fitted_by
-from fmtorch.geometry.refine import refine_kernel
+from fmtorch.geometry.refine import refine_kernel, reweighted, reweighted_kernel
 from tests.estimators.pairs import apart
 from tests.geometry.scenes import SCALE, distance, near_scene, tolerances, unit_scene
 from tests.reference import refine as reference

@@ -177,7 +177,7 @@ def test_what_has_no_version_is_refused_by_name(tmp_path: Path, value: str) -> N
 
 def test_every_process_tells_the_same_versions() -> None:
     code = (
-        "from fmtorch.estimators.registry import WITH_FOCALS; import json;"
+        "from fmtorch.estimators import WITH_FOCALS; import json;"
         "print(json.dumps([each.version for each in WITH_FOCALS]))"
     )
     printed = [run_python("-c", code, PYTHONHASHSEED=seed).stdout for seed in ("1", "2")]

@@ -13,7 +13,7 @@ from scipy.stats import chi2
 import fmtorch
 from fmtorch import cv2
 from fmtorch.core import Correspondences, Estimate
-from fmtorch.two_view.assumed_sizes import extents
+from fmtorch.two_view.estimation import extents
 from tests.geometry.scenes import batch, draw
 from tests.reference import assumed_sizes
 from tests.reference import known_cameras as reference

@@ -12,7 +12,7 @@ import fmtorch
 from fmtorch import presets
 from fmtorch.core import Correspondences, Estimate, collate
 from fmtorch.data import ImagePair, load
-from fmtorch.estimators import final_fits, inliers
+from fmtorch.estimators import inliers, refinement
 from fmtorch.geometry import cameras as square_pixels
 from fmtorch.geometry import fundamental_from_calibration
 from fmtorch.metrics import pose_error
@@ -38,8 +38,8 @@ def error(e: Estimate, s: reference.Scene) -> float:
 @pytest.fixture
 def converging(monkeypatch: pytest.MonkeyPatch) -> None:
     """Final fits that go on to the optimum."""
-    monkeypatch.setattr(final_fits, "FOCAL_ITERATIONS", 60)
-    monkeypatch.setattr(final_fits, "FOCAL_TOLERANCE", 0.0)
+    monkeypatch.setattr(refinement, "FOCAL_ITERATIONS", 60)
+    monkeypatch.setattr(refinement, "FOCAL_TOLERANCE", 0.0)
 
 
 # Exactness

@@ -80,10 +80,10 @@ def weighted_eight_point(*, best: Annotated[float, Within(0, 1)] = 0.1) -> Pairw
         p, K = pair.likelihood, pair.exact
         weight = np.maximum(2 * p - 1, 0) / (p**2 + (1 - p) ** 2)
         if np.count_nonzero(weight) < pairwise.MIN_MATCHES:
-            return None, weight > 0
+            return Solution(None, weight > 0)
         if K is None:
             x0, x1, w = (torch.from_numpy(value)[None] for value in (pair.x0, pair.x1, weight))
-            return eight_point(x0, x1, w)[0][0].numpy(), weight > 0
+            return Solution(eight_point(x0, x1, w)[0][0].numpy(), weight > 0)
         rays0, rays1 = calibrated(pair.x0, K[0]), calibrated(pair.x1, K[1])
         X = (np.insert(rays1, 2, 1, 1)[:, :, None] * np.insert(rays0, 2, 1, 1)[:, None]).reshape(-1, 9)
         E = np.linalg.eigh((X * weight[:, None]).T @ X)[1][:, 0].reshape(3, 3)

@@ -24,20 +24,16 @@ MINIMAL_SAMPLES = {"fundamental": 7, "homography": 4}  # inliers below which a m
 FAILURES = (cv2.error, RuntimeError, ValueError, TypeError)  # how these libraries say that they cannot solve a pair
 
 
-class Posed(NamedTuple):
-    """A solution of pairs whose cameras are asked for.
-    F: (3, 3), px. inliers: (n,). focals: (2,), px, NaN where unknown. R, t: X1 = R X0 + t, None where the pose is to be
-    taken from F."""
+class Solution(NamedTuple):
+    """What a library says of a pair: a model F (3, 3), px, None where there is none, and its inliers (n,).
+    Of pairs whose cameras are asked for also focals (2,), px, NaN where unknown, and R, t: X1 = R X0 + t, None where
+    the pose is to be taken from F."""
 
     F: Points | None
     inliers: NDArray[np.bool_]
     focals: Points | None = None
     R: Points | None = None
     t: Points | None = None
-
-
-Solution = tuple[Points | None, NDArray[np.bool_]] | Posed
-"""A model (3, 3), None where there is none, and its inliers (n,)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,7 +76,7 @@ class PairwiseEstimator:
     """
 
     def __init__(
-        self, name: str, solve: Callable[[Pair], Solution], best_first: bool = False, model: str = "fundamental"
+        self, name: str, solve: Callable[[Pair], tuple[Any, ...]], best_first: bool = False, model: str = "fundamental"
     ) -> None:
         self.name, self.model, self._solve, self._best_first = name, model, solve, best_first
 
@@ -95,7 +91,7 @@ class PairwiseEstimator:
         b, n = c.mask.shape
         F = torch.zeros(b, 3, 3, dtype=torch.float64)
         inliers = torch.zeros(b, n, dtype=torch.bool)
-        posed: list[Posed | None] = [None] * b
+        solutions: list[Solution | None] = [None] * b
         reasons, batch = [""] * b, Batch.of(c.to("cpu"))
         for i in range(b):
             matches = batch.pair(i)
@@ -125,10 +121,10 @@ class PairwiseEstimator:
                 continue
             F[i] = torch.from_numpy(estimate / np.linalg.norm(estimate))
             inliers[i, torch.from_numpy(slot[inside])] = True
-            posed[i] = solved if isinstance(solved, Posed) else None
+            solutions[i] = Solution(*solved)
         ok = torch.tensor([not reason for reason in reasons], dtype=torch.bool)
         draws = torch.zeros(b, dtype=torch.int64)  # not reported by these libraries
-        batch_estimate = Estimate(F, inliers, ok, tuple(reasons), draws, model=self.model, **_cameras_found(posed))
+        batch_estimate = Estimate(F, inliers, ok, tuple(reasons), draws, model=self.model, **_cameras_found(solutions))
         return judged(batch_estimate.to(c.mask.device), c)
 
 
@@ -145,11 +141,11 @@ def _with_cameras(pair: Pair, batch: Batch, i: int) -> Pair:
     return dataclasses.replace(pair, calibrations=(K0, K1), calibrated=exact, shared_focal=shared)
 
 
-def _cameras_found(posed: list[Posed | None]) -> dict[str, torch.Tensor]:
+def _cameras_found(solutions: list[Solution | None]) -> dict[str, torch.Tensor]:
     """Focal lengths and poses where some were estimated, NaN for those of other pairs; t of unit length."""
     fields = {}
     for name, shape in (("focals", (2,)), ("R", (3, 3)), ("t", (3,))):
-        own = [None if each is None else getattr(each, name) for each in posed]
+        own = [None if each is None else getattr(each, name) for each in solutions]
         if any(value is not None for value in own):
             fields[name] = torch.from_numpy(np.stack([np.full(shape, np.nan) if v is None else v for v in own]))
     if "t" in fields:
@@ -185,19 +181,22 @@ def peer(module: str, name: str, extra: str = "peers") -> Any:
 
 def solution(F: Any, inliers: Any) -> Solution:
     """What a binding returns, as arrays."""
-    return None if F is None else np.asarray(F, dtype=np.float64), np.asarray(inliers, dtype=np.bool_).ravel()
+    F = None if F is None else np.asarray(F, dtype=np.float64)
+    return Solution(F, np.asarray(inliers, dtype=np.bool_).ravel())
 
 
 def without(pair: Pair) -> Solution:
     """No model, and no inliers."""
-    return None, np.zeros(len(pair.x0), np.bool_)
+    return Solution(None, np.zeros(len(pair.x0), np.bool_))
 
 
-def posed(K: tuple[Points, Points], R: Any, t: Any, inliers: Any, E: Any = None, focals: Points | None = None) -> Posed:
+def posed(
+    K: tuple[Points, Points], R: Any, t: Any, inliers: Any, E: Any = None, focals: Points | None = None
+) -> Solution:
     """A relative pose with F of its cameras, by E where a library gives another one than that of the pose."""
     R, t = np.asarray(R, np.float64), np.ravel(t).astype(np.float64)
     F = fundamental_of_pose(*K, R, t) if E is None else np.linalg.inv(K[1]).T @ np.asarray(E) @ np.linalg.inv(K[0])
-    return Posed(F, np.asarray(inliers, np.bool_).ravel(), focals, R, t)
+    return Solution(F, np.asarray(inliers, np.bool_).ravel(), focals, R, t)
 
 
 def within(F: Any, pair: Pair, threshold: float) -> NDArray[np.bool_]:

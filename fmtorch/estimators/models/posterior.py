@@ -106,20 +106,14 @@ def focal_precision(focals: Array, pair: Pair) -> Array:
     return precision
 
 
-class CentredMatches(NamedTuple):
-    """Points (4, n) from the principal points; s2 (n,), squared scales of a loss in the unit of the points."""
+def centred(pair: Pair, scale_px: float = 1.0) -> Weighted:
+    """The matches of a pair whose image sizes are known, from the principal points, computed once.
+    scale_px: from which on they do not count."""
 
-    points: Array
-    s2: Array
-
-
-def centred(pair: Pair, scale_px: float = 1.0) -> CentredMatches:
-    """The matches of a pair whose image sizes are known, computed once. scale_px: of the loss."""
-
-    def compute(pair: Pair) -> CentredMatches:
+    def compute(pair: Pair) -> Weighted:
         out = np.empty((6, pair.count))
         centre(pair.table, images_of(pair).offset, scale_px, out)
-        return CentredMatches(out[:4], out[4])
+        return Weighted.of(out[:4], pair.weight, out[4])
 
     return pair.cached(("centred", scale_px), compute)
 
@@ -240,7 +234,7 @@ def minimise(state: Optimum, matches: Weighted, images: Images, limits: Limits) 
     axes, hessian = np.empty((k, 2, 3, 3)), np.empty((k, 7, 7))
     trial = Optimum(axes, matrix(k, 2), matrix(k, 9), vector(k), matrix(k, 7), hessian)
     data = _Data(matches, images, limits, np.zeros((k, 9, LANES)), np.empty((k, 10, 10)))
-    _minimise(data, state, trial, np.full(k, FIRST_DAMPING), limits.iterations, limits.tolerance >= 0)
+    _minimise(data, state, trial, np.full(k, FIRST_DAMPING), limits.iterations, limits.tolerance)
 
 
 @kernel(holds_gil=True)
@@ -351,10 +345,4 @@ def take_cameras(state: Any, trial: Any, k: int) -> None:
     assign_rows(state.hessian[k], trial.hessian[k])
 
 
-@inner
-def converged(data: Any, before: float, after: float) -> Any:
-    """Whether a step that lowers the cost of a candidate so far is its last."""
-    return data.limits.tolerance >= 0 and before - after <= data.limits.tolerance
-
-
-_minimise = minimiser(_evaluate, _step, take_cameras, converged, MIN_DAMPING)
+_minimise = minimiser(_evaluate, _step, take_cameras, relative=False, min_damping=MIN_DAMPING)

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from fmtorch.core.types import Correspondences
-from fmtorch.geometry.irls import reweighted_fits
+from fmtorch.geometry.refine import reweighted_fits
 from fmtorch.pruning.consistency import frame_agreement, usable_frame_maps
 from fmtorch.pruning.networks import layers, learned
 

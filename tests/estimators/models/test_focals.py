@@ -274,9 +274,9 @@ def searching(iterations: int = 12, **options: int) -> FocalSearch:
     return FocalSearch(focal, FundamentalWithFocals(), BestScore(SaturatedGains(0.3)), Refinement(None), None, None)
 
 
-def free(F: np.ndarray, pair: Pair, valid: np.ndarray | None = None) -> Candidates:
+def free(F: np.ndarray, pair: Pair) -> Candidates:
     """Models (k, 9) that the other search has found."""
-    return Candidates(F, np.ones(len(F), bool) if valid is None else valid, pair)
+    return Candidates(F, True, pair)
 
 
 @pytest.mark.parametrize("posterior", [[5.0, 4.9], [5.0, 1.0], [4.9, 5.0]])

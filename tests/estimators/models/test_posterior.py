@@ -11,11 +11,11 @@ from scipy.spatial.transform import Rotation
 
 from fmtorch.core import Correspondences
 from fmtorch.estimators import BITS, Lens, Pair, SevenPoint, cheirality, lens_search
-from fmtorch.estimators.final_fits import PRIOR_CONFLICT_GAIN
 from fmtorch.estimators.lens_search import LensFit, LensPrior, fit_with_lenses, lens_prior
 from fmtorch.estimators.models import posterior
 from fmtorch.estimators.models.focal_prior import LOG_USUAL
 from fmtorch.estimators.models.with_focals import LOSS_SCALE_PX, FundamentalWithFocals
+from fmtorch.estimators.refinement import PRIOR_CONFLICT_GAIN
 from fmtorch.geometry.levenberg_marquardt import Schedule, Weighted
 from tests.estimators.models.test_focals import TALL, WIDE, Sizes, photographs, with_prior
 from tests.estimators.pairs import apart, in_pixels, pair_of, to_units
