@@ -209,7 +209,7 @@ class Passes(NamedTuple):
 
 @kernel
 def lpm_kernel(x0: F8x2, x1: F8x2, mask: B1x1, passes: Passes, out: F8x2) -> None:
-    """`lpm.lpm` of x0, x1 (n, 2), mask (n,) -> out[0] (n,), 1 for matches that are kept; `lpm.lpm_cost` -> out[1]."""
+    """`lpm` of x0, x1 (n, 2), mask (n,) -> out[0] (n,), 1 for matches that are kept; `lpm_cost` -> out[1]."""
     thresholds, neighbors, taus = passes
     n, m = len(mask), 0
     out[0], out[1] = 0, 1

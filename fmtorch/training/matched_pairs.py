@@ -202,10 +202,10 @@ class Matching:
             "matches": len(labels), "inliers": int((labels == 1).sum()), "outliers": int((labels == 0).sum()),
             "label": labels, "F": (pair.F / norm).ravel(),
         }  # fmt: skip
-        tensors = (
-            (name, getattr(c, name), getattr(torch, kind)) for name, (kind, _) in ARRAYS.items() if name not in row
-        )
-        return row | {name: x.to(kind).reshape(-1).numpy() for name, x, kind in tensors if x is not None}
+        for name, (kind, _) in ARRAYS.items():
+            if name not in row and (x := getattr(c, name)) is not None:
+                row[name] = x.to(getattr(torch, kind)).reshape(-1).numpy()
+        return row
 
 
 def compute_shards(
