@@ -25,7 +25,7 @@ from fmtorch.core.files import models_dir, replacing
 from fmtorch.core.terminal import console, exits_with_message
 from fmtorch.data import read_image
 from fmtorch.features import learn_projection, local_feature
-from fmtorch.features.vlad import Codebook, Kind, local_descriptors
+from fmtorch.features.describe import Codebook, Kind, local_descriptors
 from fmtorch.pipeline.pipeline import load_pipeline
 from fmtorch.scenes.surfaces import PICTURES, photograph
 from fmtorch.training.planes import list_photographs

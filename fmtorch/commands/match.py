@@ -26,7 +26,7 @@ from fmtorch.core.terminal import console, errors, progress_bars
 from fmtorch.core.version import __version__
 from fmtorch.data.images import read_image, stored_orientation
 from fmtorch.evaluation.curves import view_graph_svg
-from fmtorch.features.vlad import descriptor_kind, image_vector
+from fmtorch.features.describe import descriptor_kind, image_vector
 from fmtorch.io import export, match_store
 from fmtorch.jobs.execution import MIN_PAIRS_FOR_PROCESSES
 from fmtorch.metrics import nsgd

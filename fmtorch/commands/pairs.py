@@ -23,8 +23,7 @@ from fmtorch.jobs import Execution, Factory, Local, Source, WorkerPool, in_order
 from fmtorch.presets.composition import execution_of, plain, read_fields
 from fmtorch.runs.fingerprint import digest
 from fmtorch.scenes import RenderedPairs
-from fmtorch.training.matched_pairs import MatchedPairs, front
-from fmtorch.training.oanet_pairs import write_oanet
+from fmtorch.training.matched_pairs import MatchedPairs, front, write_oanet
 
 MIN_CANDIDATES_FOR_PROCESSES = 4 * BLOCK + 1  # below which processes are not worth their start
 PRELOADED = (Construction.__module__,)  # by the process that workers are forked of

@@ -11,8 +11,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from fmtorch.core.options import Within
-from fmtorch.features.frames import upright_frames
-from fmtorch.features.patches import Image
+from fmtorch.features.patches import FRAME_SIGMAS, Image
 from fmtorch.features.sift import as_grey
 
 # Maxima of a scale space: 3 x 3 x 3 neighbourhoods and the quadratic through them (Brown and Lowe, BMVC 2002)
@@ -155,6 +154,13 @@ def maxima(response: Float[Tensor, "h w"], threshold: float) -> Int[Tensor, "m 2
 
 IMAGE_BLUR = 0.5  # pixels: what a camera leaves; Lowe, IJCV 2004, section 3.3
 SMALLEST_OCTAVE = 16  # pixels, the shorter side
+
+
+def upright_frames(xy: Float[Tensor, "*n 2"], sigma: Float[Tensor, "*n"]) -> Float[Tensor, "*n 2 3"]:
+    """Square frames along the image's axes, of half side `FRAME_SIGMAS` sigma."""
+    half_side = FRAME_SIGMAS * sigma
+    zero = torch.zeros_like(half_side)
+    return torch.stack([torch.stack([half_side, zero], -1), torch.stack([zero, half_side], -1), xy], -1)
 
 
 @dataclasses.dataclass(frozen=True)

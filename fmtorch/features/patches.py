@@ -1,4 +1,7 @@
-"""Square patches cut from an image along local affine frames, without aliasing, batched."""
+"""Local affine frames (N, 2, 3) in kornia's convention, and square patches cut along them, without aliasing, batched.
+
+Column 2 of a frame is the centre, columns 0 and 1 are the patch's half axes.
+"""
 
 import math
 
@@ -10,6 +13,38 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 Image = NDArray[np.uint8]
+
+FRAME_SIGMAS = 6.0
+"""Half the side of a local affine frame in units of the keypoint's sigma, which is half of OpenCV's `size`.
+
+The frame is the region from which a 32 x 32 patch is cut for shape, orientation and description (Mishkin et al.,
+ECCV 2018); a ratio of two frames' scales is the ratio of the keypoints' sizes.
+"""
+
+
+def frame_scale(lafs: Float[Tensor, "*n 2 3"]) -> Float[Tensor, "*n"]:
+    """The half side of the square of equal area, in pixels: the square root of the determinant."""
+    determinant: Tensor = lafs[..., 0, 0] * lafs[..., 1, 1] - lafs[..., 0, 1] * lafs[..., 1, 0]
+    return determinant.abs().sqrt()
+
+
+def rotate_frames(lafs: Float[Tensor, "*n 2 3"], angle: Float[Tensor, "*n"]) -> Float[Tensor, "*n 2 3"]:
+    """Frames of the same region whose axes are turned by `angle` radians, counter-clockwise on the screen."""
+    cosine, sine = angle.cos()[..., None], angle.sin()[..., None]
+    first, second, centre = lafs.unbind(-1)
+    return torch.stack([first * cosine - second * sine, first * sine + second * cosine, centre], -1)
+
+
+def make_upright(lafs: Float[Tensor, "*n 2 3"]) -> Float[Tensor, "*n 2 3"]:
+    """The frame of the same region and area whose second axis points along the image's y axis.
+    ``A = U R`` with U lower triangular (Perdoch et al., CVPR 2009: the gravity vector stays vertical)."""
+    (a, b), (c, d) = (row.unbind(-1) for row in lafs[..., :2].unbind(-2))
+    width = (a * a + b * b).sqrt()
+    shear = (a * c + b * d) / width
+    height = (a * d - b * c).abs() / width
+    first, second = torch.stack([width, shear], -1), torch.stack([torch.zeros_like(width), height], -1)
+    return torch.stack([first, second, lafs[..., 2]], -1)
+
 
 PATCH = 32  # pixels, the side that the networks take
 COARSEST = 8  # pixels, the least shorter side of a level

@@ -1,11 +1,8 @@
 """Difference-of-Gaussians keypoints with SIFT descriptors, through OpenCV."""
 
 import dataclasses
-import functools
 import math
-import zipfile
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Annotated, Any
 
 import cv2
@@ -16,9 +13,9 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from fmtorch.core import Features, Within, lazy, models_dir
-from fmtorch.features.frames import FRAME_SIGMAS
-from fmtorch.features.patches import PATCH, Image, ImagePyramid
+from fmtorch.core import Features, Within, lazy
+from fmtorch.features.describe import root_sift
+from fmtorch.features.patches import FRAME_SIGMAS, Image
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,12 +91,6 @@ def keypoints_to_lafs(keypoints: Sequence[cv2.KeyPoint]) -> Float[Tensor, "n 2 3
         return torch.zeros(0, 2, 3)
     half_side = FRAME_SIGMAS * size / 2
     return kornia.feature.laf_from_center_scale_ori(xy[None], half_side[None, :, :, None], -angle[None])[0]
-
-
-def root_sift(descriptors: Float[Tensor, "*batch n d"]) -> Float[Tensor, "*batch n d"]:
-    """Square root of the L1-normalised descriptor: Euclidean distance becomes the Hellinger distance."""
-    total = descriptors.sum(-1, keepdim=True)
-    return (descriptors / torch.where(total > 0, total, 1.0)).sqrt()
 
 
 def strongest(scores: NDArray[np.float32], count: int) -> NDArray[np.int64]:
@@ -257,151 +248,3 @@ def _mapped_back(features: Features, to_view: np.ndarray, shape: tuple[int, ...]
     far = torch.tensor([shape[1] - 1, shape[0] - 1], dtype=centre.dtype)
     kept = ((centre >= reach) & (centre <= far - reach)).all(-1)
     return features.replace(lafs=torch.cat([to_image @ lafs[..., :2], centre[..., None]], -1).float())[kept]
-
-
-# SIFT of patches, plain, as RootSIFT, and pooled over domain sizes; batched (Lowe, IJCV 2004, section 6)
-
-CELLS, DIRECTIONS = 4, 8  # a grid of 4 x 4 histograms of 8 directions
-CELL_SIGMAS = 3.0  # side of a cell in keypoint sigmas: vl_sift's magnification
-EXTENT = CELL_SIGMAS * (CELLS + 1) / 2 / FRAME_SIGMAS  # half side of the patch in frames: votes reach half a cell on
-WINDOW = CELLS / 2  # cells, sigma of the Gaussian window; Lowe, section 6.1
-CLIP = 0.2  # largest entry of the normalised histogram; Lowe, section 6.1
-SMOOTHING = 1.0  # keypoint sigmas, the blur at which gradients are taken: that of the level of detection
-PATCH_BLUR = 0.75  # pixels, the blur that patches have from the pyramid
-FLAT = 1e-6  # gradients below are the rounding of float32 intensities
-CHUNK = 64  # patches worked on together: their histograms fit a core's cache
-
-
-@dataclasses.dataclass(frozen=True)
-class PatchSIFT:
-    """SIFT descriptors of frames; with several `sizes` the mean over them, DSP-SIFT (Dong and Soatto, CVPR 2015).
-    root: RootSIFT (Arandjelovic and Zisserman, CVPR 2012) of each. smallest, largest: the range of domain sizes, in
-    units of the frame. sizes: how many are sampled in it, evenly, both ends included."""
-
-    root: bool = False
-    smallest: float = 1.0
-    largest: float = 1.0
-    sizes: int = 1
-
-    def __call__(self, pyramid: ImagePyramid, lafs: Float[Tensor, "n 2 3"]) -> Float[Tensor, "n 128"]:
-        """Descriptors of unit length; zeros for a frame without gradient. In OpenCV's order."""
-        total = lafs.new_zeros(len(lafs), CELLS * CELLS * DIRECTIONS)
-        for size in torch.linspace(self.smallest, self.largest, self.sizes).tolist():
-            scaled = torch.cat([lafs[..., :2] * (EXTENT * size), lafs[..., 2:]], -1)
-            described = sift_of_patches(pyramid.extract(scaled))
-            total = total + (root_sift(described) if self.root else described)
-        return total if self.sizes == 1 else normalized(total)
-
-
-def sift_of_patches(patches: Float[Tensor, "n 1 32 32"]) -> Float[Tensor, "n 128"]:
-    """SIFT of patches that cover `EXTENT` frames: gradients of the blurred patch vote, weighted by a Gaussian window.
-    Each gradient votes for the two nearest directions and the four nearest cells; the histogram is normalised, clipped
-    and normalised again. Entry (4 y + x) 8 + d is cell (x, y), direction 45 d degrees counter-clockwise on the screen.
-    """
-    pooling, along, across = _matrices(patches.device)
-    parts = []
-    for part in torch.split(patches[:, 0], CHUNK):
-        gx, gy = across @ part @ along.T, along @ part @ across.T
-        squared = (gx * gx + gy * gy).flatten(1)
-        magnitude = torch.where(squared > FLAT * FLAT, squared, 0.0).sqrt()
-        position = (torch.atan2(-gy, gx) * (DIRECTIONS / (2 * math.pi))).flatten(1)
-        lower = position.floor()
-        upper_weight = (position - lower) * magnitude
-        lower_bin = lower.long() & (DIRECTIONS - 1)
-        votes = part.new_zeros(len(part), DIRECTIONS, PATCH * PATCH)
-        votes.scatter_(1, lower_bin[:, None], (magnitude - upper_weight)[:, None])
-        votes.scatter_(1, ((lower_bin + 1) & (DIRECTIONS - 1))[:, None], upper_weight[:, None])
-        parts.append((votes @ pooling).transpose(1, 2).flatten(1))
-    histogram = torch.cat(parts) if parts else patches.new_zeros(0, CELLS * CELLS * DIRECTIONS)
-    return normalized(normalized(histogram).clamp(max=CLIP))
-
-
-def normalized(x: Float[Tensor, "n d"]) -> Float[Tensor, "n d"]:
-    """Rows of unit length; zero rows stay zero."""
-    norm = torch.linalg.vector_norm(x, dim=1, keepdim=True)
-    return x / torch.where(norm > 0, norm, 1.0)
-
-
-@functools.cache
-def _matrices(device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
-    """Pooling (1024, 16) of the pixels' votes; blur with derivative, and blur, along an axis (32, 32)."""
-    sigma_pixels = PATCH / (2 * EXTENT * FRAME_SIGMAS)  # a keypoint sigma
-    x = torch.arange(PATCH, dtype=torch.float64)
-    cell = CELL_SIGMAS * sigma_pixels
-    centred = (x - (PATCH - 1) / 2) / cell
-    centres = torch.arange(CELLS, dtype=torch.float64) - (CELLS - 1) / 2
-    weight = (1 - (centred[:, None] - centres).abs()).clamp(min=0) * torch.exp(-0.5 * (centred / WINDOW) ** 2)[:, None]
-    pooling = torch.einsum("yi,xj->yxij", weight, weight).reshape(PATCH * PATCH, CELLS * CELLS)
-    sigma = math.sqrt(max((SMOOTHING * sigma_pixels) ** 2 - PATCH_BLUR**2, 1e-6))
-    blur = torch.exp(-0.5 * ((x[:, None] - x) / sigma) ** 2)
-    blur = torch.where(blur > 1e-8, blur, 0.0)  # denormal numbers would make the products ten times slower
-    blur = blur / blur.sum(1, keepdim=True)
-    derivative = torch.zeros(PATCH, PATCH, dtype=torch.float64)
-    inner = torch.arange(1, PATCH - 1)
-    derivative[inner, inner + 1], derivative[inner, inner - 1] = 0.5, -0.5
-    return pooling.float().to(device), (derivative @ blur).float().to(device), blur.float().to(device)
-
-
-# RootSIFT-PCA: RootSIFT projected on its principal components (Bursuc, Tolias and Jégou, ICMR 2015)
-
-DIMENSIONS = 80  # of the paper's RootSIFT-PCA
-
-
-@dataclasses.dataclass(frozen=True)
-class RootSIFTPCA:
-    """RootSIFT of frames, centred, projected to 80 dimensions, raised to a power, and normalised.
-    model: the learned file with `mean` (128,) and `basis` (128, 80); None: the one that comes with the package.
-    power: exponent of the entries' absolute values, which keep their signs; the authors' released code has 0.5."""
-
-    model: Path | str | None = None
-    power: float = 0.5
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "model", Path(self.model) if self.model else models_dir() / "rootsift_pca.npz")
-
-    def __call__(self, pyramid: ImagePyramid, lafs: Float[Tensor, "n 2 3"]) -> Float[Tensor, "n d"]:
-        """Descriptors (N, 80) of unit length.
-        Raises FileNotFoundError where the learned file is absent, ValueError where it is not what it should be."""
-        mean, basis = load_projection(Path(str(self.model)))
-        return project(PatchSIFT(root=True)(pyramid, lafs), mean.to(lafs.device), basis.to(lafs.device), self.power)
-
-
-def project(
-    descriptors: Float[Tensor, "n 128"], mean: Float[Tensor, "128"], basis: Float[Tensor, "128 d"], power: float
-) -> Float[Tensor, "n d"]:
-    """Centred, projected, signed power of each entry, unit length."""
-    projected = (descriptors - mean) @ basis
-    return normalized(projected.sign() * projected.abs() ** power)
-
-
-def learn_projection(
-    descriptors: Float[Tensor, "n D"], dimensions: int = DIMENSIONS
-) -> tuple[Float[Tensor, " D"], Float[Tensor, "D d"]]:
-    """Mean and the `dimensions` principal axes of descriptors, largest variance first; the largest entry positive."""
-    x = descriptors.double()
-    mean = x.mean(0)
-    _, axes = torch.linalg.eigh((x - mean).T @ (x - mean) / len(x))
-    basis = axes.flip(1)[:, :dimensions]
-    return mean.float(), (basis * basis.gather(0, basis.abs().argmax(0, keepdim=True)).sign()).float()
-
-
-def read_learned(path: Path, names: Sequence[str], what: str, remedy: str) -> list[Tensor]:
-    """Tensors of a learned file, `what` in messages. Raises FileNotFoundError, ValueError, which end with `remedy`."""
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file; {remedy}")
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            return [torch.from_numpy(file[name].astype(np.float32)) for name in names]
-    except (KeyError, ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
-        raise ValueError(f"{path}: no file with {what} ({error}); {remedy}") from error
-
-
-@functools.lru_cache(maxsize=8)
-def load_projection(path: Path) -> tuple[Float[Tensor, "128"], Float[Tensor, "128 d"]]:
-    """Mean and basis of a learned file. Raises FileNotFoundError and ValueError that say how to make it."""
-    remedy = "make it with `python scripts/make_models.py pca`"
-    mean, basis = read_learned(path, ("mean", "basis"), "`mean` and `basis`", remedy)
-    if mean.shape != (128,) or basis.dim() != 2 or len(basis) != 128:
-        shapes = f"mean {tuple(mean.shape)}, basis {tuple(basis.shape)}"
-        raise ValueError(f"{path}: {shapes} must be (128,), (128, D); {remedy}")
-    return mean, basis

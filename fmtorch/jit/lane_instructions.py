@@ -132,7 +132,7 @@ def _size(dtype: Any) -> int:
 
 
 def load(count: int) -> Any:
-    """`lanes.Lanes.load` of so many lanes."""
+    """`lanes.load` of so many lanes."""
 
     @intrinsic  # type: ignore[untyped-decorator]
     def of_row(context: Any, A: Any, row: Any) -> Any:
@@ -151,7 +151,7 @@ def load(count: int) -> Any:
 
 
 def fill(count: int) -> Any:
-    """`lanes.Lanes.fill` of so many lanes."""
+    """`lanes.fill` of so many lanes."""
 
     @intrinsic  # type: ignore[untyped-decorator]
     def of_number(context: Any, number: Any) -> Any:

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from fmtorch.pruning.consistency import FrameConsistency, PositionConsistency, frame_agreement, position_agreement
     from fmtorch.pruning.filters import Likely, MutualCheck, OneToOne, RatioTest, one_to_one, ratio_test
     from fmtorch.pruning.gms import GMS, gms, gms_support
-    from fmtorch.pruning.lpm import LPM, lpm, lpm_cost
+    from fmtorch.pruning.neighbors import LPM, lpm, lpm_cost
     from fmtorch.pruning.networks import DFE, LC, MatchInputs
     from fmtorch.pruning.networks.learned import LearnedPruner
     from fmtorch.pruning.refine_matches import RefineMatches

@@ -244,13 +244,12 @@ def largest_variance(covariance: Array) -> float:
 
 class Windows(NamedTuple):
     """Of each match: points x0, x1 (n, 2), the affine map between their surroundings (n, 2, 2), the distance of the
-    window's samples in image 0 (n,), all in pixels, and whether to refine it (n,)."""
+    window's samples in image 0 (n,), all in pixels."""
 
     x0: F8x2
     x1: F8x2
     affine: F8x3
     spacing: F8x1
-    mask: B1x1
 
 
 class Fit(NamedTuple):
@@ -284,12 +283,12 @@ def refine_windows(windows: Windows, image0: Pyramid, image1: Pyramid, fit: Fit,
     columns, weighted = matrix(len(weight), PARAMETERS), matrix(len(weight), PARAMETERS)
     template = Template(samples, weight, columns, weighted, matrix(PARAMETERS, PARAMETERS))
     place, best = vector(6), vector(6)
-    for i in range(len(windows.mask)):
+    for i in range(len(windows.spacing)):
         out.x1[i], out.affine[i] = windows.x1[i], windows.affine[i]
         out.covariance[i], out.correlation[i], out.refined[i] = 0.0, 0.0, False
         affine, spacing = windows.affine[i], windows.spacing[i]
         scale = math.sqrt(abs(affine[0, 0] * affine[1, 1] - affine[0, 1] * affine[1, 0]))
-        if not (windows.mask[i] and 0.0 < scale < math.inf and 0.0 < spacing < math.inf):
+        if not (0.0 < scale < math.inf and 0.0 < spacing < math.inf):
             continue
         level0, level1 = level_for(image0, spacing), level_for(image1, spacing * scale)
         size0, size1 = float(1 << level0), float(1 << level1)  # of a level's pixel, px
@@ -394,7 +393,7 @@ class RefineMatches:
         with np.errstate(all="ignore"):  # maps that are none: the kernel leaves what is not finite
             scale = np.sqrt(np.abs(affine[:, 0, 0] * affine[:, 1, 1] - affine[:, 0, 1] * affine[:, 1, 0]))
             spacing = np.maximum(np.maximum(self.spacing, self.spacing / scale), self.share * side)
-        windows = Windows(rows["x0"], rows["x1"], affine, spacing, np.ones(n, np.bool_))
+        windows = Windows(rows["x0"], rows["x1"], affine, spacing)
         limits = map(float, (self.min_correlation, self.max_shift, self.max_deviation))
         fit = Fit(self.radius, self.iterations, *limits)
         out = Refined(np.empty((n, 2)), np.empty((n, 2, 2)), np.empty((n, 3)), np.empty(n), np.empty(n, np.bool_))

@@ -244,8 +244,8 @@ class _Recent(threading.local):
         """Per pixel (h, w) the piece that is met (-1: none), and of each piece (n, 3) the form of its 1 / depth."""
         scene = self.scene(task)
         shot = scene.shots[number]
-        hits = Geometry(scene.surfaces[shot.light]).look(shot.camera)
-        return hits.piece, hits.inverse[:, 2].copy()
+        hits, inverse = Geometry(scene.surfaces[shot.light]).look(shot.camera)
+        return hits.piece, inverse[:, 2].copy()
 
 
 _recent = _Recent()

@@ -10,7 +10,7 @@ import numpy as np
 
 from fmtorch.jit.kernel import F4x1, F4x2, F4x3, I4x1, I8x1, U1x1, inner, kernel
 from fmtorch.jit.lanes import fused
-from fmtorch.scenes.raycast import Camera, Geometry, Hits, Index, Number
+from fmtorch.scenes.raycast import Camera, Geometry, Index, Matrix, Met, Number
 from fmtorch.scenes.surfaces import TO_LINEAR, Floats, Pixels, Real, Surfaces, bilinear, to_srgb
 
 _ZERO, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
@@ -221,7 +221,7 @@ class Stage:
         depth = np.append(axes[2], -low[2])
         lit_from_behind = geometry.normal @ toward <= 0
         skip = lit_from_behind & ~geometry.both_sides if light.through_walls else None
-        hits = geometry.cast(P, depth, (SHADOW_MAP, SHADOW_MAP), None, skip)
+        hits, _ = geometry.cast(P, depth, (SHADOW_MAP, SHADOW_MAP), None, skip)
         # Per piece: texture u v, shadow map x y and depth, height, cosine to the sun, upwardness; affine in (s, t).
         self.table = np.zeros((len(geometry.O), 3, 8), dtype=np.float32)
         self.table[..., :2] = geometry.uv
@@ -239,19 +239,19 @@ class Stage:
         self.shadow[lit] = corner + hits.s[lit] * right + hits.t[lit] * down
 
     def radiance(self, camera: Camera, offset: tuple[Real, Real]) -> Floats:
-        hits = self.geometry.look(camera, offset)
+        hits, inverse = self.geometry.look(camera, offset)
         out = np.empty((*camera.size, 3), dtype=np.float32)
         beyond = np.flatnonzero(hits.piece.reshape(-1) < 0)
         out.reshape(-1, 3)[beyond] = self._background(camera, offset, beyond)
-        self._shade(hits, offset, out.reshape(-1, 3))
+        self._shade(hits, inverse, offset, out.reshape(-1, 3))
         return out
 
-    def _shade(self, hits: Hits, offset: tuple[Real, Real], out: Floats) -> None:
+    def _shade(self, hits: Met, inverse: Matrix, offset: tuple[Real, Real], out: Floats) -> None:
         """Linear colour of the pixels (h w, 3) that see a surface; NumPy takes the transcendental functions."""
-        geometry, seen = self.geometry, Seen(*hits.flat(), self.table)
+        geometry, seen = self.geometry, Seen(*(x.reshape(-1) for x in hits[1:]), self.table)
         footprint = Footprints(np.ones(len(seen.piece), np.float32), np.zeros(len(seen.piece), np.float32))
         count = np.zeros(len(geometry.textures), dtype=np.int64)
-        mapping = Mapping(self.homography(hits), geometry.texture_size.astype(np.float32), geometry.texture)
+        mapping = Mapping(self.homography(inverse), geometry.texture_size.astype(np.float32), geometry.texture)
         footprints(seen, hits.piece.shape[1], mapping, footprint, count)
         np.log2(footprint.span, out=footprint.span)
         np.exp(footprint.foot, out=footprint.foot)
@@ -269,11 +269,11 @@ class Stage:
             picture = Picture(texture.atlas.reshape(-1), width, channels, *levels, TO_LINEAR)
             shade(index[end[i] - count[i] : end[i]], seen, footprint, picture, lighting, out)
 
-    def homography(self, hits: Hits) -> Floats:
+    def homography(self, inverse: Matrix) -> Floats:
         """From pixel to texel, of each piece (n, 7): rows (2, 2) of the numerator, and G^-1's last, the denominator."""
         uv = self.geometry.uv * self.geometry.texture_size[:, None]
-        numerator = np.einsum("nki,nkj->nij", uv[:, [1, 2, 0]], hits.inverse)
-        return np.concatenate([numerator[:, :, :2].reshape(-1, 4), hits.inverse[:, 2]], axis=1).astype(np.float32)
+        numerator = np.einsum("nki,nkj->nij", uv[:, [1, 2, 0]], inverse)
+        return np.concatenate([numerator[:, :, :2].reshape(-1, 4), inverse[:, 2]], axis=1).astype(np.float32)
 
     def _background(self, camera: Camera, offset: tuple[Real, Real], index: np.ndarray) -> Floats:
         """The sky (n, 3) at pixels (n,), at infinity: looked up by azimuth (once round) and elevation."""

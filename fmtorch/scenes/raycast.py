@@ -112,7 +112,7 @@ class Cutouts(NamedTuple):
 
 
 class Met(NamedTuple):
-    """What the ray of each pixel (h, w) meets first so far: its depth, the piece's number, s and t."""
+    """What the ray of each pixel (h, w) meets first so far: its depth, the piece's number (-1: none), s and t."""
 
     depth: F4x2
     piece: I4x2
@@ -200,19 +200,6 @@ def _open_holes(
 NEAR = 0.05  # metres
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Hits:
-    """Per pixel (h, w): the piece met (-1: none), its s and t; `inverse` (n, 3, 3) is G^-1 of every piece."""
-
-    piece: NDArray[np.int32]
-    s: Floats
-    t: Floats
-    inverse: Matrix
-
-    def flat(self) -> tuple[NDArray[np.int32], Floats, Floats]:
-        return self.piece.reshape(-1), self.s.reshape(-1), self.t.reshape(-1)
-
-
 class Geometry:
     """The pieces of a scene as arrays, ready to be cast against any number of cameras."""
 
@@ -230,8 +217,9 @@ class Geometry:
     def cast(
         self, P: Matrix, depth: Matrix, size: tuple[int, int], centre: Matrix | None,
         skip: NDArray[np.bool_] | None = None,
-    ) -> Hits:  # fmt: skip
-        """Rays of all pixels of a projection P (3, 4), perspective or (last row 0 0 0 1) orthographic.
+    ) -> tuple[Met, Matrix]:  # fmt: skip
+        """What the rays of all pixels of a projection P (3, 4) meet, and G^-1 of every piece, (n, 3, 3).
+        P: perspective or (last row 0 0 0 1) orthographic.
         depth: (4,), the affine function of the world by which the nearer of two pieces is known.
         centre: where a perspective camera stands, for leaving out the backs of pieces; None keeps them.
         skip: pieces (n,) to look through."""
@@ -255,12 +243,11 @@ class Geometry:
         z_of = np.stack([self.U @ depth[:3], self.V @ depth[:3], self.O @ depth[:3] + depth[3]], 1).astype(np.float32)
         closest = np.where(nearest.min(1) > NEAR, 0.999 * nearest.min(1), -np.inf).astype(np.float32)
         pieces = Pieces(order, boxes, forms, z_of, closest, self.triangle)
-        s, t = np.zeros((2, h, w), dtype=np.float32)
-        hits = Hits(np.full((h, w), -1, dtype=np.int32), s, t, inverse)
         near = np.float32(-np.inf if centre is None else NEAR)
-        met = Met(np.full(hits.piece.shape, np.inf, dtype=np.float32), hits.piece, hits.s, hits.t)
-        cast_pieces(pieces, self._cutouts(pieces.boxes), near, met)
-        return hits
+        far = np.full((h, w), np.inf, dtype=np.float32)
+        met = Met(far, np.full((h, w), -1, dtype=np.int32), *np.zeros((2, h, w), dtype=np.float32))
+        cast_pieces(pieces, self._cutouts(boxes), near, met)
+        return met, inverse
 
     @functools.cached_property
     def _opacity(self) -> tuple[Pixels, NDArray[np.int64]]:
@@ -281,7 +268,7 @@ class Geometry:
             window[i] = *self.uv[i].T.ravel(), *texture.origin[level], *texture.scale[level]
         return Cutouts(place, window, self._opacity[0])
 
-    def look(self, camera: Camera, offset: tuple[float, float] = (0.0, 0.0)) -> Hits:
+    def look(self, camera: Camera, offset: tuple[float, float] = (0.0, 0.0)) -> tuple[Met, Matrix]:
         shift = np.array([[1.0, 0.0, -offset[0]], [0.0, 1.0, -offset[1]], [0.0, 0.0, 1.0]])
         return self.cast(shift @ camera.P, np.append(camera.R[2], camera.t[2]), camera.size, camera.centre)
 

@@ -10,8 +10,7 @@ from fmtorch.core.lazy import lazy_exports
 if TYPE_CHECKING:
     from fmtorch.training.export import Use, Validation, export_onnx, reliability, save_weights, temperature
     from fmtorch.training.labelled import Augmentation, LabelledMatches, collate, crop, keep_ratio, move, rotate, swap
-    from fmtorch.training.matched_pairs import MatchedPairs
-    from fmtorch.training.oanet_pairs import OANetPairs
+    from fmtorch.training.matched_pairs import MatchedPairs, OANetPairs
     from fmtorch.training.objective import Objective, classification_loss, geometric_loss, nsgd_loss, virtual_points
     from fmtorch.training.options import PlaneViews
     from fmtorch.training.planes import Photograph, PlanePairs, list_photographs, plane_homography, random_camera

@@ -1,20 +1,25 @@
-"""`MatchedPairs`: a data set of image pairs seen through a pipeline's first stages, with labels, kept on disk."""
+"""Labelled matches: `MatchedPairs` of image pairs through a pipeline's first stages, `OANetPairs` of OANet's files."""
 
 import functools
+import hashlib
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from omegaconf import DictConfig
 
 from fmtorch import presets
 from fmtorch.core import Correspondences, files, settings
+from fmtorch.core.types import pair_key
+from fmtorch.data.cameras import Camera, fundamental, line_distance
+from fmtorch.data.files import DataError, Matrix
 from fmtorch.data.pairs import DepthDataset, ImagePair, PairDataset
-from fmtorch.io import oanet
+from fmtorch.io import h5, oanet, predictions
 from fmtorch.jobs import Execution, Factory, Local, Source, TaskRunner, WorkerPool, use_one_thread
 from fmtorch.pipeline.pipeline import Outcome, Pipeline, load_pipeline
 from fmtorch.runs import CachedFeatures, cached, identity_digest
@@ -155,15 +160,6 @@ def partition(pairs: Sequence[ImagePair]) -> list[list[int]]:
     return shards
 
 
-class Matching(NamedTuple):
-    """What pairs are matched and labelled by.
-    dataset: where they are from. pipeline: its stages before estimation are run. labels: what they go by."""
-
-    dataset: PairDataset
-    pipeline: Pipeline
-    labels: labelled.Rule
-
-
 class Job(NamedTuple):
     """A shard to compute: its file and its pairs."""
 
@@ -171,14 +167,45 @@ class Job(NamedTuple):
     pairs: list[ImagePair]
 
 
-def matching(
-    dataset: PairDataset, build: Callable[[], Pipeline], labels: labelled.Rule, images: int = _IMAGES
-) -> Matching:
-    """The matching by the stages of a pipeline that is built, with the features of so many images kept."""
-    stages = build()
-    parts = stages.extractor, stages.matcher, stages.pruners, stages.estimator
-    pipeline = Pipeline(*parts, device=stages.device, memory=images, families=stages.families)
-    return Matching(dataset, pipeline, labels)
+class Matching:
+    """How pairs of a data set are matched, by the stages before estimation of a pipeline that is built, and labelled.
+    labels: what they go by. images: whose features are kept."""
+
+    def __init__(
+        self, dataset: PairDataset, build: Callable[[], Pipeline], labels: labelled.Rule, images: int = _IMAGES
+    ) -> None:
+        stages = build()
+        parts = stages.extractor, stages.matcher, stages.pruners, stages.estimator
+        self.pipeline = Pipeline(*parts, device=stages.device, memory=images, families=stages.families)
+        self.dataset, self.labels = dataset, labels
+
+    def rows(self, job: Job) -> list[dict[str, Any]]:
+        """The rows of a shard."""
+        return [self._row(self.pipeline.correspondences([pair])[0]) for pair in job.pairs]
+
+    def _row(self, outcome: Outcome) -> dict[str, Any]:
+        """A pair as a row of a shard; a pair that fails has a reason and no matches."""
+        pair, c = outcome.pair, outcome.correspondences
+        row: dict[str, Any] = {
+            "key": pair.key, "identity": pair.identity, "family": pair.family, "scene": pair.scene,
+            "reason": outcome.reason, "matches": 0, "inliers": 0, "outliers": 0,
+        }  # fmt: skip
+        if c is None:
+            return row
+        c = _best(c.detach().to("cpu").compact())
+        if not len(c.x0[0]):
+            return {**row, "reason": "no matches are left"}
+        x0, x1 = (x[0].to(torch.float64).numpy() for x in (c.x0.to(torch.float32), c.x1.to(torch.float32)))
+        labels = labelled.label(self.dataset, pair, x0, x1, self.labels)
+        norm = np.linalg.norm(pair.F) or 1.0  # zero where the pair determines none
+        row |= {
+            "matches": len(labels), "inliers": int((labels == 1).sum()), "outliers": int((labels == 0).sum()),
+            "label": labels, "F": (pair.F / norm).ravel(),
+        }  # fmt: skip
+        for name, (kind, _) in ARRAYS.items():
+            if name not in row and (x := getattr(c, name)) is not None:
+                row[name] = x.to(getattr(torch, kind)).reshape(-1).numpy()
+        return row
 
 
 def compute_shards(
@@ -191,11 +218,11 @@ def compute_shards(
     pool = WorkerPool(execution, PRELOADED)
     source: Source[Matching]
     if execution.shared:
-        source = Local(matching(dataset, lambda: stages, labels, _IMAGES * pool.size))
+        source = Local(Matching(dataset, lambda: stages, labels, _IMAGES * pool.size))
     else:
         assert build is not None
-        source = Factory(functools.partial(matching, dataset, build, labels))
-    runner = TaskRunner(pool, source, matched_rows, lambda job, rows: write_shard(job.path, rows))
+        source = Factory(functools.partial(Matching, dataset, build, labels))
+    runner = TaskRunner(pool, source, Matching.rows, lambda job, rows: write_shard(job.path, rows))
     threads = torch.get_num_threads(), cv2.getNumThreads()
     use_one_thread()
     try:
@@ -207,34 +234,6 @@ def compute_shards(
         cv2.setNumThreads(threads[1])
 
 
-def matched_rows(how: Matching, job: Job) -> list[dict[str, Any]]:
-    """The rows of a shard."""
-    return [_row(how, how.pipeline.correspondences([pair])[0]) for pair in job.pairs]
-
-
-def _row(how: Matching, outcome: Outcome) -> dict[str, Any]:
-    """A pair as a row of a shard; a pair that fails has a reason and no matches."""
-    pair, c = outcome.pair, outcome.correspondences
-    row: dict[str, Any] = {
-        "key": pair.key, "identity": pair.identity, "family": pair.family, "scene": pair.scene,
-        "reason": outcome.reason, "matches": 0, "inliers": 0, "outliers": 0,
-    }  # fmt: skip
-    if c is None:
-        return row
-    c = _best(c.detach().to("cpu").compact())
-    if not len(c.x0[0]):
-        return {**row, "reason": "no matches are left"}
-    x0, x1 = (x[0].to(torch.float64).numpy() for x in (c.x0.to(torch.float32), c.x1.to(torch.float32)))
-    labels = labelled.label(how.dataset, pair, x0, x1, how.labels)
-    norm = np.linalg.norm(pair.F) or 1.0  # zero where the pair determines none
-    row |= {
-        "matches": len(labels), "inliers": int((labels == 1).sum()), "outliers": int((labels == 0).sum()),
-        "label": labels, "F": (pair.F / norm).ravel(),
-    }  # fmt: skip
-    tensors = ((name, getattr(c, name), kind) for name, (kind, _) in ARRAYS.items() if name not in row)
-    return row | {name: x.to(getattr(torch, kind)).reshape(-1).numpy() for name, x, kind in tensors if x is not None}
-
-
 def _best(c: Correspondences) -> Correspondences:
     """The `MAX_MATCHES` least ambiguous matches of a single pair, in their order; the first if nothing ranks them."""
     n = c.x0.shape[1]
@@ -244,3 +243,168 @@ def _best(c: Correspondences) -> Correspondences:
     kept = torch.zeros_like(c.mask)
     kept[0, rank[:MAX_MATCHES]] = True
     return c.keep(kept).compact()
+
+
+# Files of OANet's layout
+
+MAX_CAMERAS = 1 << 16  # pairs of a file whose cameras are kept once they were read, about a kilobyte each
+
+
+class OANetShard(Shard):
+    """A file of OANet's layout in the place of a shard."""
+
+    def __init__(self, path: Path, labels: labelled.Rule, family: str) -> None:
+        self.path, self.labels, self.family = path, labels, family
+        self._access = oanet.RandomAccess(path)
+        self._keys = oanet.keys(self._access.file)
+        self._geometry = functools.lru_cache(MAX_CAMERAS)(functools.partial(_geometry, self._access))
+
+    def __len__(self) -> int:
+        return len(self._keys)
+
+    def index(self) -> dict[str, list[Any]]:
+        """As of `Shard`, without the counts of inliers and outliers, for which all would have to be read."""
+        group, count, scene = self._access.file["xs"], len(self), self.path.stem
+        identities = [f"{scene}/{key}" for key in self._keys]
+        matches = [h5.shape(group, key)[-2:][0] for key in self._keys]
+        reasons = ["" if n else f"{self.path}: 'xs/{key}' is empty" for n, key in zip(matches, self._keys, strict=True)]
+        return {
+            "key": [pair_key(identity) for identity in identities], "identity": identities,
+            "family": [self.family] * count, "scene": [scene] * count, "reason": reasons, "matches": matches,
+        }  # fmt: skip
+
+    def read(self, row: int, names: Sequence[str] = ()) -> dict[str, NDArray[Any]]:
+        """The arrays of a pair; of these names alone, where that saves time.
+        Raises DataError, naming file and key, for what is missing or damaged."""
+        file, key = self._access.file, self._keys[row]
+        if names and self.labels == "geodesic":
+            label = self._geodesic(key, h5.shape(file["xs"], key)[-2:][0])
+            ratio = oanet.figures(file, "ratios", key, len(label))
+            return {"label": label} if ratio is None else {"label": label, "ratio": ratio.astype(np.float32)}
+        cameras, F = self._geometry(key)
+        (K0, K1), (size0, size1) = cameras.K, (np.array(size) for size in cameras.sizes)
+        x0, x1, ratio, mutual = oanet.arrays(file, key, cameras)
+        by_pixels = self.labels == "pixels"
+        label = labelled.by_line(line_distance(F, x0, x1)) if by_pixels else self._geodesic(key, len(x0))
+        values = {"x0": x0, "x1": x1, "ratio": ratio, "mutual": mutual, "label": label}
+        known = {name: x.astype(ARRAYS[name][0]) for name, x in values.items() if x is not None}
+        if not (np.isfinite(x0).all() and np.isfinite(x1).all()):
+            inside = np.isfinite(x0).all(1) & np.isfinite(x1).all(1)
+            known = {name: x[inside] for name, x in known.items()}
+        return {**known, "F": F, "K0": K0, "K1": K1, "size0": size0, "size1": size1}
+
+    def _geodesic(self, key: str, count: int) -> labelled.Labels:
+        distance = oanet.figures(self._access.file, "ys", key, count)
+        if distance is None:
+            raise DataError(f"{self.path}: 'ys' is missing, which labels=geodesic needs; give labels=pixels")
+        return labelled.by_geodesic(distance)
+
+
+def _geometry(access: oanet.RandomAccess, key: str) -> tuple[oanet.Cameras, Matrix]:
+    """The cameras of a pair and its F. Nine small entries take longer to read than the matches."""
+    cameras = oanet.cameras(access.file, key)
+    if not cameras.t.any():
+        raise DataError(f"{access.path}: 'ts/{key}' is zero, which leaves no F")
+    K0, K1 = cameras.K
+    return cameras, fundamental(Camera(K0, np.eye(3), np.zeros(3)), Camera(K1, cameras.R, cameras.t))
+
+
+class OANetPairs(StoredMatches):
+    """The labelled matches of files of OANet's layout; each item is a batch of one pair, as of `StoredMatches`.
+
+    A file is opened by each process for itself, and a pair is read when it is asked for. `pairs` says nothing of how
+    many inliers there are. Coordinates are pixels: networks and losses with coordinates=K have the file's own.
+
+    Args:
+        root: a file, or a folder of some; each is a scene.
+        labels: geodesic: a match is an inlier where the first column of ``ys`` is below 1e-4 (OANet); pixels: by its
+            distance to the epipolar lines, as of `MatchedPairs`.
+        before: pruners whose matches alone are given, each a function of correspondences.
+        augmentation, seed: as of `StoredMatches`.
+
+    Raises DataError, naming the file, for a file that is missing, damaged, empty or of another layout.
+    """
+
+    def __init__(
+        self, root: str | Path, *, labels: labelled.Rule = "geodesic",
+        augmentation: labelled.Augmentation | None = None, seed: int = 0,
+        before: Sequence[Callable[[Correspondences], Correspondences]] = (),
+    ) -> None:  # fmt: skip
+        self.folder = Path(root).expanduser().resolve()
+        self.labels, self.before = labels, list(before)
+        self._read_index(h5.files(self.folder), augmentation, seed)
+        if not self.pairs:
+            raise DataError(f"{self.folder}: holds no pairs")
+
+    def expect_ratios(self, remedy: str) -> None:
+        """Raises DataError, naming the file, where one has no ratios."""
+        for path in self._paths:
+            with h5.opened(path) as file:
+                if not h5.holds(file, "ratios"):
+                    raise DataError(f"{path}: 'ratios' is missing; {remedy}")
+
+    def _reader(self, path: Path) -> Shard:
+        oanet_file = path.suffix in h5.SUFFIXES  # or a shard of a data set that was joined
+        return OANetShard(path, self.labels, self.folder.stem) if oanet_file else super()._reader(path)
+
+    @functools.cached_property
+    def _contents(self) -> bytes:
+        digest = hashlib.blake2b(f"{self.labels} {labelled.VERSION}".encode(), digest_size=16)
+        for path in self._paths:
+            h5.add_to_digest(digest, path)
+        return digest.digest()
+
+    @property
+    def digest(self) -> str:
+        """Of the files, the labels and which pairs there are."""
+        keys = np.array([about["key"] for about in self.pairs]).tobytes()
+        return hashlib.blake2b(self._contents + keys, digest_size=16).hexdigest()
+
+    def stored(self, index: int) -> labelled.LabelledMatches:
+        matches = super().stored(index)
+        if not self.before:
+            return matches
+        c = matches.correspondences
+        for pruner in self.before:
+            c = pruner(c)
+        return matches.replace(correspondences=c).compact()
+
+
+class NamedPairs(PairDataset):
+    """The pairs of `OANetPairs` by their names, without geometry."""
+
+    name = "h5"
+
+    def __init__(self, matches: OANetPairs) -> None:
+        self.matches, self.digest = matches, matches.digest
+
+    def __len__(self) -> int:
+        return len(self.matches)
+
+    def __getitem__(self, index: int) -> ImagePair:
+        about = self.matches.pairs[index]
+        image = predictions.image(about["family"], about["scene"], about["identity"], None)
+        return ImagePair(about["identity"], about["family"], about["scene"], image, image, np.zeros((3, 3)))
+
+
+def write_oanet(matches: StoredMatches, pairs: Iterable[ImagePair], folder: Path) -> list[Path]:
+    """Write the matches of pairs of known cameras into a folder, a file of OANet's layout for each scene; the files."""
+    cameras = {pair.key: pair for pair in pairs}
+    scenes: dict[str, list[int]] = {}
+    for i, about in enumerate(matches.pairs):
+        scenes.setdefault(about["scene"], []).append(i)
+    paths = [folder / f"{name.replace('/', '-')}.hdf5" for name in scenes]
+    for path, members in zip(paths, scenes.values(), strict=True):
+        oanet.write(path, (_entry(matches.stored(i), cameras[matches.pairs[i]["key"]]) for i in members))
+    return paths
+
+
+def _entry(matches: labelled.LabelledMatches, pair: ImagePair) -> Mapping[str, NDArray[Any] | None]:
+    c = matches.correspondences
+    ratios, mutuals = (None if values is None else values[0].numpy() for values in (c.ratio, c.mutual))
+    x0, x1 = (x[0].numpy().astype(np.float64) for x in (c.x0, c.x1))
+    if c.size0 is None or c.size1 is None or pair.K0 is None or pair.K1 is None or pair.R is None or pair.t is None:
+        raise ValueError(f"OANet's layout needs cameras and image sizes, which pair {pair.identity} does not have")
+    (h0, w0), (h1, w1) = c.size0[0].tolist(), c.size1[0].tolist()
+    cameras = oanet.Cameras((pair.K0, pair.K1), pair.R, pair.t, ((h0, w0), (h1, w1)))
+    return oanet.entry(cameras, x0, x1, ratios, mutuals)

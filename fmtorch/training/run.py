@@ -46,8 +46,7 @@ from fmtorch.runs import identity_digest
 from fmtorch.scenes import RenderedPairs
 from fmtorch.training.export import Evaluation, Result, Use, Validation, quiet, write_result
 from fmtorch.training.labelled import Augmentation, LabelledMatches, keep_ratio
-from fmtorch.training.matched_pairs import MatchedPairs, front
-from fmtorch.training.oanet_pairs import NamedPairs, OANetPairs
+from fmtorch.training.matched_pairs import MatchedPairs, NamedPairs, OANetPairs, front
 from fmtorch.training.objective import Objective
 from fmtorch.training.options import Optimisation, TrainOptions
 from fmtorch.training.planes import Photograph, PlanePairs, list_photographs

@@ -27,7 +27,7 @@ from fmtorch.data.construction import keypoints, matchable
 from fmtorch.evaluation.run import select
 from fmtorch.evaluation.statistics import PERCENT, interval
 from fmtorch.features import ASIFT
-from fmtorch.features.vlad import codebook, descriptor_kind, local_descriptors, vlad
+from fmtorch.features.describe import codebook, descriptor_kind, local_descriptors, vlad
 from fmtorch.pipeline import Outcome, Pipeline, describe, similar_pairs
 from scripts.benchmark import pairs, tables
 from scripts.benchmark.methods import pipeline_method, pipeline_of

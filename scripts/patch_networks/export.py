@@ -18,8 +18,8 @@ from omegaconf import DictConfig, OmegaConf
 
 from fmtorch.core.files import models_dir
 from fmtorch.core.terminal import console, exits_with_message
+from fmtorch.features.local_feature import PatchNetwork, network_file
 from fmtorch.features.networks import DESCRIPTORS, build, load_weights, read_checkpoint
-from fmtorch.features.onnx_network import PatchNetwork, network_file
 from fmtorch.training.export import OWN_LICENCE, listed, markdown_table, sha256
 from scripts.patch_networks.objectives import evaluate_descriptor, middle
 from scripts.patch_networks.onnx_export import export, lay_out, quantize

@@ -23,7 +23,7 @@ from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from fmtorch.core.files import replacing
-from fmtorch.features.onnx_network import PATCH_SHAPE, PatchNetwork
+from fmtorch.features.local_feature import PATCH_SHAPE, PatchNetwork
 from fmtorch.training.export import expect_equal, onnx_model, without_origin
 
 OUTPUTS = 64  # of a row, channels times pixels, where there are fewer channels than `FEW_CHANNELS`

@@ -23,8 +23,8 @@ from torch import Tensor, nn
 
 from fmtorch.core.files import conf_dir, replacing
 from fmtorch.core.terminal import console, exits_with_message
+from fmtorch.features.local_feature import PatchNetwork, network_file
 from fmtorch.features.networks import build, read_checkpoint
-from fmtorch.features.onnx_network import PatchNetwork, network_file
 from fmtorch.jit.random import Stream, bits, uniform
 from fmtorch.presets import plain, resolve_device
 from fmtorch.training.planes import PlaneViews, list_photographs

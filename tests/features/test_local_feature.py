@@ -14,7 +14,7 @@ from torch import Tensor
 
 from fmtorch import features, presets
 from fmtorch.core import models_dir
-from fmtorch.features import vlad
+from fmtorch.features import describe
 from fmtorch.runs import ArrayCache, CachedFeatures
 from scripts.make_models import learned
 from tests.features.scenes import same, texture
@@ -197,10 +197,10 @@ def test_8k_images_within_the_stated_memory(name: str, bound: float) -> None:
     assert int(result.stdout) < bound, f"{int(result.stdout) / 1e9:.2f} GB"
 
 
-def book(seed: int = 0) -> vlad.Codebook:
+def book(seed: int = 0) -> describe.Codebook:
     generator = torch.Generator().manual_seed(seed)
     basis = torch.linalg.qr(torch.randn(12, 6, generator=generator))[0]
-    return vlad.Codebook(torch.randn(12, generator=generator), basis, torch.randn(5, 6, generator=generator))
+    return describe.Codebook(torch.randn(12, generator=generator), basis, torch.randn(5, 6, generator=generator))
 
 
 def sift(seed: int, n: int) -> Tensor:
@@ -211,7 +211,7 @@ def sift(seed: int, n: int) -> Tensor:
 def test_equals_the_definition(n: int) -> None:
     descriptors = torch.randn(n, 12, generator=torch.Generator().manual_seed(n))
     expected = reference.vlad(descriptors.double().numpy(), *(each.double().numpy() for each in book()))
-    found = vlad.vlad(descriptors, book())
+    found = describe.vlad(descriptors, book())
     # Square roots near zero: an error of 1e-7 in a residual may be one of 3e-4 in its root.
     np.testing.assert_allclose(found.numpy(), expected, atol=1e-3)
     np.testing.assert_allclose((found**2 * found.sign()).numpy(), expected**2 * np.sign(expected), atol=1e-6)
@@ -222,13 +222,13 @@ def test_descriptors_without_meaning_are_left_out() -> None:
     bad = descriptors.clone()
     bad[3], bad[7, 2] = 0, torch.nan
     kept = [i for i in range(40) if i not in (3, 7)]
-    assert torch.equal(vlad.local_descriptors(bad, "sift"), vlad.local_descriptors(descriptors[kept], "sift"))
-    assert torch.equal(vlad.image_vector(bad, "sift"), vlad.image_vector(descriptors[kept], "sift"))
-    assert not vlad.image_vector(torch.zeros(4, 128), "sift").any()
+    assert torch.equal(describe.local_descriptors(bad, "sift"), describe.local_descriptors(descriptors[kept], "sift"))
+    assert torch.equal(describe.image_vector(bad, "sift"), describe.image_vector(descriptors[kept], "sift"))
+    assert not describe.image_vector(torch.zeros(4, 128), "sift").any()
 
 
 def test_sift_of_any_scale_is_one_descriptor() -> None:
-    plain, scaled = (vlad.local_descriptors(values, "sift") for values in (sift(0, 9), sift(0, 9) / 512))
+    plain, scaled = (describe.local_descriptors(values, "sift") for values in (sift(0, 9), sift(0, 9) / 512))
     torch.testing.assert_close(plain, scaled)
 
 
@@ -241,15 +241,15 @@ def test_sift_of_any_scale_is_one_descriptor() -> None:
 )  # fmt: skip
 def test_pipelines_and_their_codebooks(pipeline: str, kind: str) -> None:
     stages = presets.pipeline_stages(pipeline)
-    assert vlad.descriptor_kind(stages["features"]) == kind
+    assert describe.descriptor_kind(stages["features"]) == kind
 
 
 def test_descriptors_without_a_codebook_are_told() -> None:
     stages = presets.pipeline_stages("l2net_ratio")
     with pytest.raises(ValueError, match="no codebook for the descriptors l2net; it must be a pipeline with SIFT"):
-        vlad.descriptor_kind(stages["features"])
+        describe.descriptor_kind(stages["features"])
     with pytest.raises(ValueError, match="no codebook for the descriptors Mine"):
-        vlad.descriptor_kind({"_target_": "mine.Mine"})
+        describe.descriptor_kind({"_target_": "mine.Mine"})
 
 
 @pytest.mark.parametrize(("name", "kind"), [("rootsift_pca", "sift"), ("hardnet", "hardnet")])
@@ -258,7 +258,7 @@ def test_the_shipped_codebooks_are_those_of_the_card(name: str, kind: str) -> No
     card = (models_dir() / f"vlad_{name}.md").read_text()
     assert hashlib.sha256(file.read_bytes()).hexdigest() in card
     assert file.stat().st_size < 2_000_000
-    shipped = vlad.codebook(kind)  # type: ignore[arg-type]
+    shipped = describe.codebook(kind)  # type: ignore[arg-type]
     assert shipped.centers.shape == (64, 64)
     torch.testing.assert_close(shipped.basis.T @ shipped.basis, torch.eye(64), atol=1e-5, rtol=0)
 
@@ -266,13 +266,13 @@ def test_the_shipped_codebooks_are_those_of_the_card(name: str, kind: str) -> No
 def test_files_that_are_no_codebook_are_told(tmp_path: Path) -> None:
     said = r"no such file; make it with `python scripts/make_models\.py codebooks`"
     with pytest.raises(FileNotFoundError, match=said):
-        vlad.load_codebook(tmp_path / "none.npz")
+        describe.load_codebook(tmp_path / "none.npz")
     (tmp_path / "text.npz").write_text("text")
     with pytest.raises(ValueError, match=r"text\.npz: no file with mean, basis, centers"):
-        vlad.load_codebook(tmp_path / "text.npz")
+        describe.load_codebook(tmp_path / "text.npz")
     np.savez(tmp_path / "other.npz", mean=np.zeros(4), basis=np.zeros((5, 2)), centers=np.zeros((3, 2)))
     with pytest.raises(ValueError, match="mean, basis and centers do not fit"):
-        vlad.load_codebook(tmp_path / "other.npz")
+        describe.load_codebook(tmp_path / "other.npz")
 
 
 def test_k_means_finds_clusters() -> None:

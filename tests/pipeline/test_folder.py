@@ -18,7 +18,7 @@ import torch
 
 from fmtorch.core import Features
 from fmtorch.data import ImageSource, read_image
-from fmtorch.features.vlad import image_vector
+from fmtorch.features.describe import image_vector
 from fmtorch.io import MatchStore
 from fmtorch.jobs import DEATH, Execution, WorkerPool, WorkersLost
 from fmtorch.pipeline import (

@@ -80,7 +80,7 @@ def test_kernel_is_the_slow_form(spacing: float, radius: int) -> None:
     x0, x1 = c.x0[0].double().numpy(), c.x1[0].double().numpy()
     x0[:3] = [[2.0, 50.0], [319.0, 100.0], [100.0, 1.5]]
     affine = np.tile(MAP * 1.05, (n, 1, 1))
-    windows = compiled.Windows(x0, x1, affine, np.full(n, spacing), np.ones(n, bool))
+    windows = compiled.Windows(x0, x1, affine, np.full(n, spacing))
     out = compiled.Refined(np.empty((n, 2)), np.empty((n, 2, 2)), np.empty((n, 3)), np.empty(n), np.empty(n, bool))
     groups = Pyramid(*first), Pyramid(*second)
     compiled.refine_windows(windows, *groups, compiled.Fit(radius, 6, 0.8, 2.0, 1.0), out)

@@ -3,7 +3,7 @@
 import numpy as np
 
 from fmtorch.scenes.light import SHADOW_MAP, Stage
-from fmtorch.scenes.raycast import SEAM, Geometry, Hits, Met, Pieces
+from fmtorch.scenes.raycast import SEAM, Geometry, Matrix, Met, Pieces
 from fmtorch.scenes.surfaces import TO_LINEAR, Texture, bilinear
 
 
@@ -64,7 +64,7 @@ def colour(texture: Texture, u: np.ndarray, v: np.ndarray, lod: np.ndarray) -> n
     return fine + (coarse - fine) * (lod - low.astype(np.float32))[:, None]
 
 
-def shade(stage: Stage, hits: Hits, offset: tuple[float, float], out: np.ndarray) -> None:
+def shade(stage: Stage, hits: Met, inverse: Matrix, offset: tuple[float, float], out: np.ndarray) -> None:
     """`Stage._shade`."""
     index = np.flatnonzero(hits.piece.ravel() >= 0)
     piece = hits.piece.ravel()[index]
@@ -74,14 +74,15 @@ def shade(stage: Stage, hits: Hits, offset: tuple[float, float], out: np.ndarray
     value = stage.table[piece, 0]
     value += s[:, None] * stage.table[piece, 1]
     value += t[:, None] * stage.table[piece, 2]
-    out[index] = _albedo(stage, hits, index, piece, value) * _irradiance(stage, value, offset)
+    out[index] = _albedo(stage, inverse, index, piece, value, hits.piece.shape[1]) * _irradiance(stage, value, offset)
 
 
-def _albedo(stage: Stage, hits: Hits, index: np.ndarray, piece: np.ndarray, value: np.ndarray) -> np.ndarray:
+def _albedo(
+    stage: Stage, inverse: Matrix, index: np.ndarray, piece: np.ndarray, value: np.ndarray, w: int
+) -> np.ndarray:
     """Filtered texture colour (n, 3); level of detail from the pixel's footprint in texels."""
     geometry = stage.geometry
-    rows = stage.homography(hits)[piece]
-    w = hits.piece.shape[1]
+    rows = stage.homography(inverse)[piece]
     y, x = (index // w).astype(np.float32), (index % w).astype(np.float32)
     z = 1 / (rows[:, 4] * x + rows[:, 5] * y + rows[:, 6])
     texel = value[:, :2] * geometry.texture_size.astype(np.float32)[piece]
