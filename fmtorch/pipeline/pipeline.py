@@ -21,9 +21,8 @@ from fmtorch.core.stages import Estimator, FeatureExtractor, GreyPyramid, ImageM
 from fmtorch.data import ImagePair, ImageSource, read_image, to_grey
 from fmtorch.geometry.significance import judged
 from fmtorch.jobs.execution import one_thread
-from fmtorch.presets.composition import PIPELINES, build_pruners, compose, plain
-from fmtorch.presets.files import available, unknown
-from fmtorch.presets.objects import instantiate, open_files
+from fmtorch.presets.composition import PIPELINES, build_pruners, compose, open_files, plain
+from fmtorch.presets.files import available, instantiate, unknown
 from fmtorch.runs.feature_cache import CachedFeatures, cached
 from fmtorch.two_view.arguments import expect_possible
 from fmtorch.two_view.known_cameras import KnownCameras

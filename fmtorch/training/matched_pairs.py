@@ -12,7 +12,7 @@ import torch
 from omegaconf import DictConfig
 
 from fmtorch import presets
-from fmtorch.core import Correspondences, files, settings
+from fmtorch.core import Correspondences, files
 from fmtorch.data.pairs import DepthDataset, ImagePair, PairDataset
 from fmtorch.io import oanet
 from fmtorch.jobs import Execution, Factory, Local, Source, TaskRunner, WorkerPool, use_one_thread
@@ -84,7 +84,7 @@ class MatchedPairs(StoredMatches):
         home = Path(root).expanduser() if root is not None else files.cache_dir() / "matched"
         identity = _identity(dataset, stages, labels)
         folder = home / f"{dataset.name}-{identity_digest(identity)[:16]}"
-        settings.claim(folder / "about.json", identity, "matches", "delete the folder", alone=False)
+        files.claim(folder / "about.json", identity, "matches", "delete the folder", alone=False)
         pairs = [dataset[i] for i in range(len(dataset))]
         shards = [[pairs[i] for i in members] for members in partition(pairs)]
         jobs = [Job(folder / f"shard-{number:05d}.arrow", members) for number, members in enumerate(shards)]
