@@ -29,8 +29,7 @@ from fmtorch.geometry import cross_matrix, pose_from_fundamental
 from fmtorch.io.match_store import MatchRecords, MatchStore, PairGeometry, StoredImage, StoredPair, indices
 from fmtorch.jobs import Execution, Factory, Local, Source, TaskRunner, WorkerPool, available, in_order, one_thread
 from fmtorch.jobs.runner import SHARED_BY
-from fmtorch.pipeline.pair_geometries import pair_geometries
-from fmtorch.pipeline.photographs import PhotographCamera, PhotographCameras
+from fmtorch.pipeline.photographs import PhotographCamera, PhotographCameras, pair_geometries
 from fmtorch.pipeline.pipeline import Outcome, Pipeline
 from fmtorch.pipeline.two_images import Described, MatchResult, describe, relate
 from fmtorch.two_view.pair_type import PairTypes
@@ -416,31 +415,27 @@ class FolderMatches:
         return DescribedPair(pair, (end0, end1), names, self.seed, known)
 
     def _keep(self, task: Photograph | DescribedPair, result: Any) -> None:
+        trouble = result if isinstance(result, str) else self._not_stored(task, result)
         if isinstance(task, Photograph):
-            self._described[task.path] = self._keep_image(task.path, result)
-            return
-        if not isinstance(result, str):
-            try:
-                self.journal.add_pair(*task.pair, result)
-            except Exception as error:
-                result = in_a_line(error)
-        if isinstance(result, str):
-            self._fail(task.pair, result)
+            self._described[task.path] = None if trouble else result
+            self._troubles |= {(task.path,): trouble} if trouble else {}
+        elif trouble:
+            self._fail(task.pair, trouble)
         else:
             self.done += 1
             self.related += result.related
 
-    def _keep_image(self, image: Path, described: Described | str) -> Described | None:
-        if not isinstance(described, str):
-            try:
-                if not self.journal.has_image(image):
-                    camera = self.cameras.of(image, described.size)
-                    self.journal.add_image(image, exported_image(self.journal.name(image), described, camera))
-                return described
-            except Exception as error:
-                described = in_a_line(error)
-        self._troubles[image,] = described
-        return None
+    def _not_stored(self, task: Photograph | DescribedPair, result: Any) -> str:
+        """Add an image or a pair to the journal; why it cannot be, else empty."""
+        try:
+            if isinstance(task, DescribedPair):
+                self.journal.add_pair(*task.pair, result)
+            elif not self.journal.has_image(task.path):
+                camera = self.cameras.of(task.path, result.size)
+                self.journal.add_image(task.path, exported_image(self.journal.name(task.path), result, camera))
+        except Exception as error:
+            return in_a_line(error)
+        return ""
 
     def _fail(self, pair: Pair, reason: str) -> None:
         self._failed += 1
