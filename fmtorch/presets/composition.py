@@ -44,12 +44,6 @@ class FileConfigSource(file_config_source.FileConfigSource):
         return result
 
 
-def register() -> None:
-    """Have Hydra read folders by this reader; once is enough for a process."""
-    Plugins.instance()  # registers Hydra's own readers, of which this replaces one
-    SourcesRegistry.instance().types[FileConfigSource.scheme()] = FileConfigSource
-
-
 FAMILIES = "families"  # among a pruner's options: family -> options that its pairs get instead
 OF_PIPELINES = frozenset({FAMILIES, "soft"})  # options that pipelines' presets set, of pruners that may be replaced
 WIDE_FAMILIES = "wide"  # stands there for every family of wide baselines
@@ -150,7 +144,8 @@ def _versions(name: str, config: Any) -> Iterator[tuple[str, Any, tuple[str, ...
 
 
 _composing = threading.Lock()  # Hydra composes through a global
-register()
+Plugins.instance()  # registers Hydra's own readers of folders, of which this replaces one
+SourcesRegistry.instance().types[FileConfigSource.scheme()] = FileConfigSource
 PIPELINES = "pipelines"  # the config that a pipeline alone is composed from
 _DEFAULTS = [*({group: name} for group, name in STAGES.items()), {"pipeline": "sift_ratio"}, "_self_"]
 ConfigStore.instance().store(PIPELINES, {"defaults": _DEFAULTS, "cache": None, "cache_limit": 20})
