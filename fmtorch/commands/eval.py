@@ -23,7 +23,7 @@ from fmtorch.evaluation.run import evaluate_pairs, informed, run_identity, selec
 from fmtorch.evaluation.statistics import ALL, Group, summarize
 from fmtorch.io import MatchStore, export_kinds, write_exports
 from fmtorch.jobs.execution import MIN_PAIRS_FOR_PROCESSES, Execution, shard_of
-from fmtorch.pipeline.exporting import exportable
+from fmtorch.pipeline.folder import exportable
 from fmtorch.pipeline.pipeline import Pipeline, build_pipeline
 from fmtorch.presets.composition import execution_of, plain, read_fields
 from fmtorch.runs import CachedFeatures, RunFolder, identity_digest

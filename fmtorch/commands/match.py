@@ -20,7 +20,6 @@ from fmtorch import presets
 from fmtorch.commands.config import chosen_pipeline, job, run_command
 from fmtorch.commands.options import MATCH, MatchOptions
 from fmtorch.core import RELATED, files
-from fmtorch.core.settings import canonical, head
 from fmtorch.core.stages import ImageMatcher
 from fmtorch.core.terminal import console, errors, progress_bars
 from fmtorch.core.version import __version__
@@ -113,10 +112,11 @@ def _say(work: FolderMatches, graph: export.ViewGraph, pairs: int) -> None:
 
 def _say_turned(images: Sequence[Path], folder: Path) -> None:
     if turned := [image.relative_to(folder).as_posix() for image in images if stored_orientation(image) != 1]:
+        said = files.head(turned)
         console.print(
-            f"turned by their orientation tags: {head(turned)}. Keypoints and cameras in database.db are those of the "
-            "turned images, from which COLMAP's mapper works; but COLMAP reads files as they are stored, so that its "
-            "colours, undistorted images and dense reconstruction will not fit. Turn the files, or use orient=false"
+            f"turned by their orientation tags: {said}. Keypoints and cameras in database.db are those of the turned "
+            "images, from which COLMAP's mapper works; but COLMAP reads files as they are stored, so that "
+            "its colours, undistorted images and dense reconstruction will not fit. Turn the files, or use orient=false"
         )
 
 
@@ -242,7 +242,7 @@ def _default_output(paths: Sequence[Path], settings: Mapping[str, Any]) -> Path:
         images = [str(path.absolute()) for path in paths]
         same = [str(Path(earlier[name]).absolute()) for name in ("image0", "image1")] == images
         if not same or any(earlier.get(name) != value for name, value in settings.items()):
-            identity = canonical({"images": images, **settings})
+            identity = files.canonical({"images": images, **settings})
             return folder.with_name(f"{folder.name}-{hashlib.blake2b(identity.encode(), digest_size=4).hexdigest()}")
     return folder
 

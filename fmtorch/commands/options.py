@@ -23,16 +23,9 @@ LENS = (
 REPLACED = "Groups are replaced by name (estimator=lmeds), values by path (estimator.threshold=0.5)."
 
 
-def defaults_of(options: type) -> dict[str, Any]:
-    """The default of each field of a dataclass of options as a config has it: those of a nested one as a mapping."""
-    defaults: dict[str, Any] = _plain(options())
-    return defaults
-
-
-def _plain(value: Any) -> Any:
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {field.name: _plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
-    return list(value) if isinstance(value, tuple) else str(value) if isinstance(value, Path) else value
+def as_in_configs(fields: list[tuple[str, Any]]) -> dict[str, Any]:
+    """The fields of a dataclass with lists for tuples and texts for paths."""
+    return {name: list(v) if isinstance(v, tuple) else str(v) if isinstance(v, Path) else v for name, v in fields}
 
 
 class LeastAndGreatest:
@@ -220,7 +213,8 @@ class Command:
 
     @property
     def defaults(self) -> dict[str, Any]:
-        return defaults_of(self.options)
+        """The default of each option, those of nested dataclasses as mappings."""
+        return dataclasses.asdict(self.options(), dict_factory=as_in_configs)
 
     @property
     def names(self) -> list[str]:

@@ -14,8 +14,7 @@ from fmtorch.commands.config import job, run_command
 from fmtorch.commands.options import REPORT, ReportOptions
 from fmtorch.core import files, terminal
 from fmtorch.evaluation.curves import axis_of
-from fmtorch.evaluation.gallery import Options, Run, gallery
-from fmtorch.evaluation.page import Section, render, run_names, shared_settings
+from fmtorch.evaluation.report import Options, Run, Section, gallery, render, run_names, shared_settings
 from fmtorch.presets.composition import read_fields
 from fmtorch.runs import RunFolder, RunFolderError
 

@@ -1,10 +1,8 @@
 """`fmtorch verify DATABASE`: two-view geometries of the matches in a COLMAP database."""
 
-import contextlib
 import functools
 import re
 import sys
-from collections.abc import Callable, Iterator
 
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
@@ -31,9 +29,9 @@ def run(config: DictConfig, estimator: str) -> Verification:
         execution = ONE_THREAD
     shard, debug = shard_of(fields.shard), bool(fields.debug)
     mode = VerifyMode(fields.cameras, fields.lens, fields.force, fields.seed, execution, shard, debug)
-    with _begun_by_reports(estimator) as report:
-        paths = VerifyPaths(fields.database, fields.features_file, fields.matches, fields.output)
-        result = verify_by(make, {"estimator": plain(config.estimator)}, paths, mode, report)
+    paths = VerifyPaths(fields.database, fields.features_file, fields.matches, fields.output)
+    with progress_bars() as progress:
+        result = verify_by(make, {"estimator": plain(config.estimator)}, paths, mode, reporter(progress, estimator))
     for problem in result.problems[:MAX_PROBLEMS]:
         errors.print(problem, style="bold", soft_wrap=True)
     if len(result.problems) > MAX_PROBLEMS:
@@ -48,20 +46,6 @@ def run(config: DictConfig, estimator: str) -> Verification:
     if result.pairs and len(result.problems) == result.pairs:
         sys.exit("error: no pair has a geometry")
     return result
-
-
-@contextlib.contextmanager
-def _begun_by_reports(description: str) -> Iterator[Callable[[int, int], None]]:
-    """A function of (done, total) that shows a progress bar from its first call on; errors before it stand alone."""
-    with contextlib.ExitStack() as stack:
-        shown: list[Callable[[int, int], None]] = []
-
-        def report(done: int, total: int) -> None:
-            if not shown:
-                shown.append(reporter(stack.enter_context(progress_bars()), description))
-            shown[0](done, total)
-
-        yield report
 
 
 def _table(result: Verification) -> Table:

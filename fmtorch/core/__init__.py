@@ -5,14 +5,12 @@ from typing import TYPE_CHECKING
 from fmtorch.core.lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from fmtorch.core.annotations import arguments_of, arrays_of
     from fmtorch.core.checks import checked
     from fmtorch.core.failures import own_traceback, place_of
-    from fmtorch.core.files import conf_dir, models_dir, replacing
+    from fmtorch.core.files import claim, conf_dir, create, models_dir, replacing
     from fmtorch.core.onnx_network import NetworkFileError, onnx_session
     from fmtorch.core.options import Within, expect_options, fits
-    from fmtorch.core.records import Record, expect_fields, slotted
-    from fmtorch.core.settings import claim, create
+    from fmtorch.core.records import Record, arguments_of, arrays_of, expect_fields, slotted
     from fmtorch.core.stages import (
         Estimator,
         FeatureExtractor,

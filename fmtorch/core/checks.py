@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from fmtorch.core.annotations import WHOLE, Expected, arguments_of, numbers_of
+from fmtorch.core.records import WHOLE, Expected, arguments_of, numbers_of
 from fmtorch.core.types import SIZE
 
 P = ParamSpec("P")

@@ -19,13 +19,22 @@ MISTAKES = (ValueError, OSError, ImportError)  # what a user can put right
 
 
 class _Bars(bars.Progress):
-    """Bars on a terminal; where there is none, as in a log, a line every `LINE_SECONDS`."""
+    """Bars on a terminal, from the first task on; where there is none, as in a log, a line every `LINE_SECONDS`."""
 
     _said = math.inf
 
     def start(self) -> None:
-        self._said = time.monotonic()
-        super().start()
+        """Nothing yet: an error before the first task stands alone."""
+
+    def stop(self) -> None:
+        if self.live.is_started:
+            super().stop()
+
+    def add_task(self, *about: Any, **options: Any) -> bars.TaskID:
+        if not self.live.is_started:
+            self._said = time.monotonic()
+            super().start()
+        return super().add_task(*about, **options)
 
     def update(self, task_id: bars.TaskID, **changes: Any) -> None:
         super().update(task_id, **changes)

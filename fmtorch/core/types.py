@@ -18,8 +18,7 @@ import torch
 from jaxtyping import Bool, Float, Int, Real
 from torch import Tensor
 
-from fmtorch.core.annotations import Rule
-from fmtorch.core.records import Index, Record, as_index, expect_fields, gathered, padded, slotted
+from fmtorch.core.records import Index, Record, Rule, as_index, expect_fields, gathered, padded, slotted
 
 MIN_LENS, MAX_LENS = -0.45, 0.2  # of lenses that leave an image unfolded and its corners in front of the camera
 PROBABILITY = Rule(lambda prior: (prior >= 0) & (prior <= 1), "it is P(inlier), within [0, 1]")

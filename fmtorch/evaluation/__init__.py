@@ -6,9 +6,8 @@ from fmtorch.core.lazy import lazy_exports
 
 if TYPE_CHECKING:
     from fmtorch.evaluation.curves import MAX_THUMBNAILS, picture, svg, view_graph_svg
-    from fmtorch.evaluation.page import Section, ShownPair, differing_pairs, render, run_names
-    from fmtorch.evaluation.rows import evaluate, focal_errors
-    from fmtorch.evaluation.run import evaluate_pairs, informed, run_identity
+    from fmtorch.evaluation.report import Section, ShownPair, differing_pairs, render, run_names
+    from fmtorch.evaluation.run import evaluate, evaluate_pairs, focal_errors, informed, run_identity
     from fmtorch.evaluation.statistics import common_reasons, summarize
     from fmtorch.evaluation.tables import summary_markdown, terminal_tables
 

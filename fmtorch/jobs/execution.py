@@ -64,9 +64,6 @@ class Shard:
         total = len(items)
         return items[total * (self.number - 1) // self.count : total * self.number // self.count]
 
-    def __str__(self) -> str:
-        return f"{self.number}/{self.count}"
-
 
 def shard_of(text: str | None) -> Shard | None:
     """The shard of a text such as ``2/8``, the second eighth; None of None. Raises ValueError for what is no shard."""

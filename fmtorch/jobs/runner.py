@@ -398,7 +398,7 @@ class TaskRunner(Generic[Task]):
         """Wait for what is under way, and keep it; what has not begun is dropped."""
         for future in self.waiting:
             future.cancel()
-        futures.wait(self.waiting)
+        futures.wait([future for future in self.waiting if not future.cancelled()])  # no lost scheduler tells
         for future, task in self.waiting.items():
             done = not future.cancelled() and future.exception() is None
             if done and not isinstance(future.result(), NeedsFactory):

@@ -5,12 +5,12 @@ from typing import TYPE_CHECKING
 from fmtorch.core.lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from fmtorch.pipeline.exporting import match_records
     from fmtorch.pipeline.folder import (
         FolderMatches,
         chosen_pairs,
         folder_workers,
         images_below,
+        match_records,
         open_folder,
         similar_pairs,
         vectors_of,

@@ -21,9 +21,8 @@ from fmtorch.core.stages import Estimator, FeatureExtractor, GreyPyramid, ImageM
 from fmtorch.data import ImagePair, ImageSource, read_image, to_grey
 from fmtorch.geometry.significance import judged
 from fmtorch.jobs.execution import one_thread
-from fmtorch.presets.composition import PIPELINES, build_pruners, compose, plain
-from fmtorch.presets.files import available, unknown
-from fmtorch.presets.objects import instantiate, open_files
+from fmtorch.presets.composition import PIPELINES, build_pruners, compose, open_files, plain
+from fmtorch.presets.files import available, instantiate, unknown
 from fmtorch.runs.feature_cache import CachedFeatures, cached
 from fmtorch.two_view.arguments import expect_possible
 from fmtorch.two_view.known_cameras import KnownCameras
@@ -334,31 +333,23 @@ def examined(pipeline: Pipeline, outcomes: Sequence[Outcome], seed: int = 0) -> 
     """
     if stages.model_of(pipeline.estimator) != "fundamental":
         return list(outcomes)
-    matched = [i for i, o in enumerate(outcomes) if o.correspondences is not None and o.estimate is not None]
-    results = list(outcomes)
+    matched = {i: o for i, o in enumerate(outcomes) if o.correspondences is not None and o.estimate is not None}
     with one_thread(pipeline.device):
-        try:
-            own = _examined([outcomes[i] for i in matched], seed) if matched else []
-        except Exception:  # whose fault it is shows pair by pair
-            own = [_pair_alone(outcomes[i], seed) for i in matched]
-    for i, outcome in zip(matched, own, strict=True):
-        results[i] = outcome
-    return results
+        own = dict(zip(matched, _examined([*matched.values()], seed), strict=True)) if matched else {}
+    return [own.get(i, outcome) for i, outcome in enumerate(outcomes)]
 
 
 def _examined(outcomes: Sequence[Outcome], seed: int) -> list[Outcome]:
-    c = collated(outcomes)
-    estimate = collate([o.estimate for o in outcomes if o.estimate is not None])
-    pair_type = classify(c if outcomes[0].pair.given else c.derived(K0=None, K1=None), estimate, seed=seed)
-    return [dataclasses.replace(outcome, pair_type=pair_type.of_pair(i)) for i, outcome in enumerate(outcomes)]
-
-
-def _pair_alone(outcome: Outcome, seed: int) -> Outcome:
     try:
-        return _examined([outcome], seed)[0]
-    except Exception as error:  # what it is in stays unknown, and the row says why
+        c = collated(outcomes)
+        estimate = collate([o.estimate for o in outcomes if o.estimate is not None])
+        pair_type = classify(c if outcomes[0].pair.given else c.derived(K0=None, K1=None), estimate, seed=seed)
+        return [dataclasses.replace(outcome, pair_type=pair_type.of_pair(i)) for i, outcome in enumerate(outcomes)]
+    except Exception as error:  # whose fault it is shows pair by pair
+        if len(outcomes) > 1:
+            return [each for outcome in outcomes for each in _examined([outcome], seed)]
         reason = f"not examined: {type(error).__name__}: {error}".splitlines()[0]
-        return dataclasses.replace(outcome, not_examined=reason)
+        return [dataclasses.replace(outcomes[0], not_examined=reason)]
 
 
 def build_pipeline(

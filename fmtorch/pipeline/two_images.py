@@ -21,7 +21,6 @@ from fmtorch.data import Lens, to_grey, undistorted
 from fmtorch.io.match_store import PairGeometry
 from fmtorch.jobs.execution import mapped, one_thread
 from fmtorch.pipeline import photographs, pictures
-from fmtorch.pipeline.pair_geometries import pair_geometries
 from fmtorch.pipeline.photographs import GivenImage, Image, frames_to_original, given_image, to_original
 from fmtorch.pipeline.pipeline import Clock, Pipeline, load_pipeline
 from fmtorch.two_view import arguments
@@ -397,7 +396,8 @@ def _estimated(
     of_pinholes = estimate.derived(F=F, lens=None)
     pair_type = classify(even, of_pinholes, seed=seed)
     clock("pair_type")
-    (geometry,) = pair_geometries([np.arange(c.mask.shape[1]).repeat(2).reshape(-1, 2)], even, of_pinholes, pair_type)
+    index = np.arange(c.mask.shape[1]).repeat(2).reshape(-1, 2)
+    (geometry,) = photographs.pair_geometries([index], even, of_pinholes, pair_type)
     inliers = estimate.inliers[0]
     cameras = estimate.R, estimate.t, estimate.focals, estimate.lens
     R, t, focals, lens = (None if value is None else value[0] for value in cameras)

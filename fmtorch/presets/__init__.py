@@ -1,6 +1,6 @@
 """Presets: the flat YAML files of ``conf/<group>/<name>.yaml``, loaded by name and built into objects.
 
-`files` and `objects` need neither Hydra nor OmegaConf, which compose the configs of commands and pipelines.
+`files` needs neither Hydra nor OmegaConf, which compose the configs of commands and pipelines.
 """
 
 from typing import TYPE_CHECKING
@@ -9,17 +9,28 @@ from fmtorch.core.lazy import lazy_exports
 
 if TYPE_CHECKING:
     from fmtorch.core.files import STAGES
-    from fmtorch.presets.composition import compose, composed, expect_stages, pipeline_stages, plain, stages
-    from fmtorch.presets.files import available, closest, known_targets, load, targets_of
-    from fmtorch.presets.objects import (
+    from fmtorch.presets.composition import (
+        compose,
+        composed,
+        expect_stages,
+        pipeline_stages,
+        plain,
+        resolve_device,
+        stages,
+    )
+    from fmtorch.presets.files import (
+        available,
         build,
+        closest,
         expect_buildable,
         instantiate,
+        known_targets,
+        load,
         merged,
         own_modules,
         peer_packages,
-        resolve_device,
         target_of,
+        targets_of,
     )
 
 __all__ = [

@@ -1,4 +1,4 @@
-"""Configs composed by Hydra from groups of presets, and what is read of them: stages, pruners, executor, options."""
+"""Configs composed by Hydra from groups of presets, and what is read of them: stages, pruners, executor, device."""
 
 import dataclasses
 import functools
@@ -10,6 +10,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any, TypeVar, cast, get_args, get_type_hints
 
 import hydra
+import torch
 from hydra._internal.core_plugins import file_config_source
 from hydra._internal.sources_registry import SourcesRegistry
 from hydra.core.config_store import ConfigStore
@@ -23,7 +24,7 @@ from fmtorch.core.files import STAGES, conf_dir
 from fmtorch.core.options import Count, dataclass_in, expect_options
 from fmtorch.core.stages import Pruner
 from fmtorch.jobs.execution import Execution
-from fmtorch.presets import files, objects
+from fmtorch.presets import files
 
 SEVERAL = ("pruner",)  # groups of which several presets are chosen at once
 
@@ -41,12 +42,6 @@ class FileConfigSource(file_config_source.FileConfigSource):
         if group in SEVERAL and result.header.get("package") in (None, "_group_", group):
             result.header["package"] = f"{group}.{path.name.removesuffix('.yaml')}"
         return result
-
-
-def register() -> None:
-    """Have Hydra read folders by this reader; once is enough for a process."""
-    Plugins.instance()  # registers Hydra's own readers, of which this replaces one
-    SourcesRegistry.instance().types[FileConfigSource.scheme()] = FileConfigSource
 
 
 FAMILIES = "families"  # among a pruner's options: family -> options that its pairs get instead
@@ -83,7 +78,7 @@ def build_pruners(config: DictConfig) -> tuple[dict[str, Pruner], dict[str, dict
     for_families: dict[str, dict[str, Pruner]] = {}
     for name, value in pruner_configs(config).items():
         for where, options, families in _versions(name, value):
-            pruner = objects.instantiate(options, where)
+            pruner = files.instantiate(options, where)
             if not families:
                 usual[name] = pruner
             for family in families:
@@ -149,7 +144,8 @@ def _versions(name: str, config: Any) -> Iterator[tuple[str, Any, tuple[str, ...
 
 
 _composing = threading.Lock()  # Hydra composes through a global
-register()
+Plugins.instance()  # registers Hydra's own readers of folders, of which this replaces one
+SourcesRegistry.instance().types[FileConfigSource.scheme()] = FileConfigSource
 PIPELINES = "pipelines"  # the config that a pipeline alone is composed from
 _DEFAULTS = [*({group: name} for group, name in STAGES.items()), {"pipeline": "sift_ratio"}, "_self_"]
 ConfigStore.instance().store(PIPELINES, {"defaults": _DEFAULTS, "cache": None, "cache_limit": 20})
@@ -186,10 +182,10 @@ def expect_stages(config: DictConfig) -> None:
     """Raises ValueError, naming the option, where a stage of a composed config cannot be built with its options."""
     for group in STAGES:
         if group != "pruner" and group in config:  # a training has no estimator
-            objects.expect_buildable(plain(config[group]), group)
+            files.expect_buildable(plain(config[group]), group)
     for name, value in pruner_configs(config).items():
         for where, options, _ in _versions(name, value):
-            objects.expect_buildable(options, where)
+            files.expect_buildable(options, where)
 
 
 def compose(config_name: str, overrides: Sequence[str], config_dir: Path | None = None) -> DictConfig:
@@ -275,8 +271,8 @@ def execution_of(config: DictConfig, workers: int | None = None, processes: bool
     count = workers or fields.workers
     if "_target_" in options:
         target = {key: value for key, value in options.items() if key not in ExecutorFields.__dataclass_fields__}
-        objects.expect_buildable(target, "executor")
-        make = functools.partial(objects.instantiate, target, "executor")
+        files.expect_buildable(target, "executor")
+        make = functools.partial(files.instantiate, target, "executor")
         return Execution("threads", count, None, fields.send_images, cast("functools.partial[Executor]", make))
     kind = fields.name
     if processes is not None:
@@ -285,3 +281,28 @@ def execution_of(config: DictConfig, workers: int | None = None, processes: bool
             raise ValueError(f"processes={str(processes).lower()} and executor={kind} differ; give one of them")
         kind = wanted
     return Execution(kind, count, fields.address, fields.send_images)
+
+
+def resolve_device(name: str) -> torch.device:
+    """The torch device of a config: `auto` takes a GPU where there is one. Raises ValueError where it is not there."""
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        device = torch.device(name)
+    except RuntimeError as error:
+        raise ValueError(f"device={name}; it must be auto, cpu, cuda, cuda:1 or mps") from error
+    if device.type == "cuda" and not torch.cuda.is_available():
+        raise ValueError(f"device={name}: this installation of torch sees no CUDA device; use device=cpu")
+    return device
+
+
+def open_files(part: Any, device: torch.device) -> None:
+    """Have this project's parts read their learned files now, at any depth, where they have an `open_file`.
+    Raises ValueError, naming the file, where one cannot be used."""
+    if hasattr(part, "open_file"):
+        part.open_file(device)
+    elif isinstance(part, Mapping | list | tuple):
+        for each in part.values() if isinstance(part, Mapping) else part:
+            open_files(each, device)
+    elif type(part).__module__.partition(".")[0] == "fmtorch" and not isinstance(part, torch.nn.Module):
+        open_files(list(getattr(part, "__dict__", {}).values()), device)

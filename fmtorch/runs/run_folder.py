@@ -16,8 +16,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from fmtorch.core.files import write_whole
-from fmtorch.core.settings import canonical, create, differences, head
+from fmtorch.core.files import canonical, create, differences, head, write_whole
 
 
 @dataclasses.dataclass(frozen=True)

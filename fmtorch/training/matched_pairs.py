@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from omegaconf import DictConfig
 
 from fmtorch import presets
-from fmtorch.core import Correspondences, files, settings
+from fmtorch.core import Correspondences, files
 from fmtorch.core.types import pair_key
 from fmtorch.data.cameras import Camera, fundamental, line_distance
 from fmtorch.data.files import DataError, Matrix
@@ -89,7 +89,7 @@ class MatchedPairs(StoredMatches):
         home = Path(root).expanduser() if root is not None else files.cache_dir() / "matched"
         identity = _identity(dataset, stages, labels)
         folder = home / f"{dataset.name}-{identity_digest(identity)[:16]}"
-        settings.claim(folder / "about.json", identity, "matches", "delete the folder", alone=False)
+        files.claim(folder / "about.json", identity, "matches", "delete the folder", alone=False)
         pairs = [dataset[i] for i in range(len(dataset))]
         shards = [[pairs[i] for i in members] for members in partition(pairs)]
         jobs = [Job(folder / f"shard-{number:05d}.arrow", members) for number, members in enumerate(shards)]

@@ -33,7 +33,7 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
 from fmtorch import data, presets
-from fmtorch.core import expect_options, settings, terminal
+from fmtorch.core import expect_options, files, terminal
 from fmtorch.core.version import __version__
 from fmtorch.data import ImagePair, PairDataset, construction, read_image
 from fmtorch.data.pairs import PairSubset
@@ -289,7 +289,7 @@ def run(config: DictConfig, name: str) -> Path:
         "validation": {k: v for k, v in plain(config.validation).items() if k != "roots"},
     }  # fmt: skip
     folder = Path(config.output or f"runs/train/{name}-{identity_digest(identity)[:8]}")
-    settings.claim(folder / "training.json", identity, "checkpoints", "choose another output")
+    files.claim(folder / "training.json", identity, "checkpoints", "choose another output")
     torch.set_num_threads(int(config.threads or os.cpu_count() or 1))
     torch.manual_seed(config.seed)
     network = presets.instantiate(network_config, f"pruner={name}, network")

@@ -16,10 +16,10 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from fmtorch.core.annotations import Rule
 from fmtorch.core.checks import MIN_MATCHES, as_tensor, expect_inside, widened
 from fmtorch.core.lenses import Lens as CalibratedLens
 from fmtorch.core.options import nearest
+from fmtorch.core.records import Rule
 from fmtorch.core.types import Correspondences, collate
 from fmtorch.geometry.cameras import calibration_problems
 

@@ -20,8 +20,7 @@ from fmtorch.estimators.ransac import Ransac
 from fmtorch.geometry.significance import judged
 from fmtorch.jit.together import compile_together
 from fmtorch.jobs.execution import one_thread
-from fmtorch.presets.files import load
-from fmtorch.presets.objects import construct, instantiate, merged
+from fmtorch.presets.files import construct, instantiate, load, merged
 from fmtorch.pruning.consistency import FrameConsistency, PositionConsistency
 from fmtorch.two_view.arguments import MIN_PIXELS, Arrays, expect_lenses
 from fmtorch.two_view.known_cameras import KnownCameras

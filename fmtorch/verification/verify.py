@@ -29,7 +29,7 @@ from fmtorch.io.match_file import HlocMatches, MatchFile, expect_suffix
 from fmtorch.io.match_store import MATRICES, Kind, PairGeometry
 from fmtorch.jobs.execution import Execution, Shard, shard_of
 from fmtorch.jobs.runner import Factory, Local, Source, TaskRunner, WorkerPool
-from fmtorch.pipeline.pair_geometries import pair_geometries
+from fmtorch.pipeline.photographs import pair_geometries
 from fmtorch.two_view import arguments, pair_type
 from fmtorch.two_view.estimation import estimated_by
 

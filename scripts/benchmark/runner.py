@@ -19,7 +19,7 @@ from fmtorch import presets
 from fmtorch.core.stages import PairImages, Pruner, pruned
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.data import ImagePair
-from fmtorch.evaluation.rows import evaluate
+from fmtorch.evaluation.run import evaluate
 from fmtorch.geometry import sampson
 from fmtorch.pipeline.pipeline import Outcome
 from fmtorch.runs import identity_digest

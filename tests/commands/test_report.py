@@ -18,7 +18,7 @@ from fmtorch.commands import report
 from fmtorch.core import Estimate, models_dir
 from fmtorch.data import read_image
 from fmtorch.evaluation import Section, differing_pairs, evaluate, render, summarize, tables
-from fmtorch.evaluation.gallery import Options, difference, rebuilt, shown_pair
+from fmtorch.evaluation.report import Options, difference, rebuilt, shown_pair
 from fmtorch.pipeline import Outcome, build_pipeline
 from fmtorch.runs import PairRow, RunFolder, RunFolderError, to_table
 from tests.commands.test_command_line import ended

@@ -235,8 +235,7 @@ def test_what_can_be_converted_is() -> None:
     assert given["size"].tolist() == [480, 640]
     assert (given["steps"], given["scale"], given["taus"]) == (2, 0.5, (0.5, 0.7))
     assert checked(distance)(F, X.half())["x"].dtype == torch.float32
-    arguments = checked(distance)(F.double(), X)
-    assert arguments["x"].dtype == torch.float64
+    assert checked(distance)(F.double(), X)["x"].dtype == torch.float64
 
 
 def test_models_are_one_a_set_of_matches_or_several() -> None:

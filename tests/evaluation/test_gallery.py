@@ -17,8 +17,8 @@ from fmtorch import data, presets
 from fmtorch.core import pair_key
 from fmtorch.data import DataError
 from fmtorch.evaluation import Section, ShownPair, picture, render, run_names, svg
-from fmtorch.evaluation import gallery as module
-from fmtorch.evaluation.gallery import Options, Run, find_dataset, gallery
+from fmtorch.evaluation import report as module
+from fmtorch.evaluation.report import Options, Run, find_dataset, gallery
 from fmtorch.pipeline.pictures import (
     BAD,
     COLOURS,

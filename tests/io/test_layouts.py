@@ -16,7 +16,7 @@ import fmtorch
 from fmtorch import data, presets
 from fmtorch.data import DataError, ImagePair
 from fmtorch.evaluation import evaluate
-from fmtorch.evaluation.gallery import Options, find_dataset
+from fmtorch.evaluation.report import Options, find_dataset
 from fmtorch.evaluation.statistics import summarize
 from fmtorch.evaluation.tables import summary_markdown
 from fmtorch.io import H5Pairs, oanet
