@@ -27,7 +27,6 @@ from fmtorch.io.dataset import WITHOUT_GEOMETRY, H5Pairs
 from fmtorch.metrics import corner_error, nsgd
 from fmtorch.pipeline import Outcome, Pipeline, build_pipeline, pictures
 from fmtorch.pipeline.photographs import Image
-from fmtorch.pipeline.pictures import jpeg_url
 from fmtorch.runs import RunFolder
 from fmtorch.scenes import RenderedPairs
 
@@ -48,7 +47,7 @@ class Picture(NamedTuple):
         if image.shape[1] > WIDTH:
             height = round(image.shape[0] * WIDTH / image.shape[1])
             image = np.asarray(cv2.resize(image, (WIDTH, height), interpolation=cv2.INTER_AREA), np.uint8)
-        return jpeg_url(image, QUALITY), image.shape[1], image.shape[0]
+        return pictures.jpeg_url(image, QUALITY), image.shape[1], image.shape[0]
 
 
 class Shown(NamedTuple):

@@ -374,11 +374,6 @@ def divided(batch: Batch) -> list[Batch]:
     return [batch._replace(pairs=[pair]) for pair in batch.pairs]
 
 
-def failed(batch: Batch, reason: str) -> list[PairRow]:
-    """The rows of pairs that no worker lives to evaluate."""
-    return evaluate([Outcome(pair, reason=reason) for pair in batch.pairs], batch.seed, batch.signed)
-
-
 def with_contents(pairs: Sequence[ImagePair]) -> list[ImagePair]:
     """The pairs with their images as bytes, each read once, or their given matches; what fails the worker will tell."""
     held = functools.cache(Path.read_bytes)
@@ -441,7 +436,10 @@ def evaluate_pairs(
             pipeline.extractor.computed += work.computed
             pipeline.extractor.found += work.from_cache
 
-    runner = TaskRunner(pool, source, evaluate_batch, keep, lambda done, reason: store(failed(done, reason)), divided)
+    def given_up(done: Batch, reason: str) -> None:
+        store(evaluate([Outcome(pair, reason=reason) for pair in done.pairs], seed, signed))
+
+    runner = TaskRunner(pool, source, evaluate_batch, keep, given_up, divided)
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

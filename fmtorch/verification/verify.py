@@ -186,14 +186,12 @@ Geometries = tuple[list[tuple[_PairIds, PairGeometry]], list[tuple[_PairIds, str
 
 def estimate_batch(estimator: stages.Estimator, batch: Batch) -> Geometries:
     """What a worker does."""
-    ids, pairs, given, problems = [], [], [], list[tuple[_PairIds, str]]()
-    for own, pair in zip(batch.ids, batch.pairs, strict=True):
+    given, problems = dict[int, Correspondences](), list[tuple[_PairIds, str]]()
+    for i, pair in enumerate(batch.pairs):
         try:
-            given.append(as_correspondences(pair, cast(Cameras, batch.mode.cameras), batch.mode.lens))
-            ids.append(own)
-            pairs.append(pair)
+            given[i] = as_correspondences(pair, cast(Cameras, batch.mode.cameras), batch.mode.lens)
         except Exception as error:  # one pair does not end the work on the others
-            problems.append((own, terminal.error_line(error)))
+            problems.append((batch.ids[i], terminal.error_line(error)))
     results, groups = dict[int, PairGeometry](), _alike(given)
     while groups:
         alike = groups.pop(0)
@@ -206,18 +204,18 @@ def estimate_batch(estimator: stages.Estimator, batch: Batch) -> Geometries:
             if len(alike) > 1:
                 groups += [[i] for i in alike]
             else:
-                problems.append((ids[alike[0]], terminal.error_line(error)))
+                problems.append((batch.ids[alike[0]], terminal.error_line(error)))
             continue
         configuration = pair_type.classify(c, estimate, focal_deviation=0, seed=batch.mode.seed)
-        of_these = pair_geometries([pairs[i].matches for i in alike], c, estimate, configuration)
+        of_these = pair_geometries([batch.pairs[i].matches for i in alike], c, estimate, configuration)
         results |= zip(alike, of_these, strict=True)
-    return [(own, results[i]) for i, own in enumerate(ids) if i in results], problems
+    return [(own, results[i]) for i, own in enumerate(batch.ids) if i in results], problems
 
 
-def _alike(given: Sequence[Correspondences]) -> list[list[int]]:
-    """Indices of pairs of which the same is known: in one batch a pair would lose what another lacks."""
+def _alike(given: Mapping[int, Correspondences]) -> list[list[int]]:
+    """Numbers of pairs of which the same is known: in one batch a pair would lose what another lacks."""
     groups: dict[tuple[bool, ...], list[int]] = {}
-    for i, c in enumerate(given):
+    for i, c in given.items():
         known = tuple(getattr(c, field.name) is not None for field in dataclasses.fields(c))
         groups.setdefault(known, []).append(i)
     return list(groups.values())
@@ -242,26 +240,22 @@ class VerificationRun:
         self.problems: list[str] = []
         self.warnings: dict[str, None] = {}  # in order
 
-    def each_batch(
-        self, make: Callable[[], stages.Estimator], execution: Execution, report: Callable[[int, int], None] | None
-    ) -> None:
-        """Estimate and keep the pairs that are not done, batch by batch; `make` is pickled for workers elsewhere."""
+    def each_batch(self, source: Source[stages.Estimator], report: Callable[[int, int], None]) -> None:
+        """Estimate and keep the pairs that are not done, batch by batch."""
         todo = self.todo
-        if report is not None and todo:
+        if todo:
             report(0, len(todo))
 
         def given_up(batch: Batch, reason: str) -> None:
             self._keep(batch, ([], [(ids, reason) for ids in batch.ids]))
 
-        source: Source[stages.Estimator] = Local(make()) if execution.shared else Factory(make)
         batches = (self._read(todo[start : start + BATCH]) for start in range(0, len(todo), BATCH))
         done = 0
-        with WorkerPool(execution, PRELOADED) as pool:
+        with WorkerPool(self.mode.execution, PRELOADED) as pool:
             runner = TaskRunner(pool, source, estimate_batch, self._keep, given_up, divided)
             for batch in runner.each(batches):
                 done += len(batch.ids) + len(batch.problems)
-                if report is not None:
-                    report(done, len(todo))
+                report(done, len(todo))
 
     def write(self) -> None:
         self.configurations.clear()
@@ -378,7 +372,7 @@ def verify(
     settings = {"estimator": estimator, "options": repr(sorted(options.items()))}
     paths = VerifyPaths(*(None if place is None else Path(place) for place in (path, features, matches, output)))
     mode = VerifyMode(cameras, lens, force, seed, execution or ONE_THREAD, shard_of(shard))
-    return verify_by(make, settings, paths, mode, report)
+    return verify_by(make, settings, paths, mode, report or (lambda done, total: None))
 
 
 class VerifyPaths(NamedTuple):
@@ -392,7 +386,7 @@ class VerifyPaths(NamedTuple):
 
 def verify_by(
     make: Callable[[], stages.Estimator], settings: Mapping[str, Any], paths: VerifyPaths, mode: VerifyMode,
-    report: Callable[[int, int], None] | None,
+    report: Callable[[int, int], None],
 ) -> Verification:  # fmt: skip
     """The same by any estimator, which `make` builds; an interrupted run is continued by one of the same `settings`."""
     begin = time.perf_counter()
@@ -407,7 +401,7 @@ def verify_by(
         raise ValueError(f"estimator gives {gives} matrices; verify needs one that gives fundamental matrices")
     if mode.lens is not None:
         arguments.expect_lenses(estimator, type(estimator).__name__)
-    make = (lambda: estimator) if mode.execution.shared else make
+    source: Source[stages.Estimator] = Local(estimator) if mode.execution.shared else Factory(make)
     known = "unknown" if paths.features is not None and mode.cameras == "stored" else mode.cameras
     mode = dataclasses.replace(mode, cameras=known, seed=seed)
     settings = {**settings, "version": __version__, "cameras": known, "seed": seed, "force": mode.force}
@@ -416,7 +410,7 @@ def verify_by(
     with _opened(paths, mode.force, whole) as (store, end):
         parts = GeometryParts(end.with_name(f"{end.name}.parts"), {**settings, **store.identity()})
         run = VerificationRun(store, parts, mode)
-        run.each_batch(make, mode.execution, report)
+        run.each_batch(source, report)
         if whole:
             run.write()
     if whole:

@@ -175,7 +175,9 @@ def test_what_an_estimator_raises_is_of_its_pair_alone(tmp_path: Path) -> None:
     output.unlink()
     paths = verification.VerifyPaths(None, None, tmp_path / "matches.npz", output)
     with pytest.raises(ZeroDivisionError, match="too few"):
-        verification.verify_by(lambda: FailsOnFew(1000), {}, paths, verification.VerifyMode(debug=True), None)
+        verification.verify_by(
+            lambda: FailsOnFew(1000), {}, paths, verification.VerifyMode(debug=True), lambda done, total: None
+        )
     for estimator, lens, said in (
         ("fmtorch", -0.6, "it is lambda in half diagonals"),
         ("lmeds", -0.1, "lens needs an"),
