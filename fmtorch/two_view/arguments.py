@@ -8,7 +8,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal, Protocol, cast
+from typing import Any, Literal, Protocol, cast, runtime_checkable
 
 import numpy as np
 import torch
@@ -24,6 +24,7 @@ from fmtorch.core.types import Correspondences, collate
 from fmtorch.geometry.cameras import calibration_problems
 
 
+@runtime_checkable
 class Shared(Protocol):
     """An array of another library, which DLPack shares."""
 
