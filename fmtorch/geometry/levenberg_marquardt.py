@@ -2,8 +2,8 @@
 
 Losses grow more slowly than the squared residual. Each is scaled so that ``loss ~ r^2`` for small residuals;
 ``weight = d loss / d r^2`` is then 1 at zero, and minimising ``sum weight * r^2`` with the weights held fixed, again
-and again, minimises the sum of losses (IRLS). `r2` is the squared residual, `s2` the squared scale in the same unit; both
-broadcast. Zhang (1997), "Parameter estimation techniques", table 1; Torr & Zisserman (2000) for the truncated one;
+and again, minimises the sum of losses (IRLS). `r2` is the squared residual, `s2` the squared scale in the same unit;
+both broadcast. Zhang (1997), "Parameter estimation techniques", table 1; Torr & Zisserman (2000) for the truncated one;
 Barath et al. (2020) for that of MAGSAC++, whose scale is k sigma_max, the distance from which on nothing counts.
 
 Damped Gauss-Newton steps; each model takes its own where that lowers its cost, and else tries a shorter one (Marquardt
@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from fmtorch.geometry import arithmetic
+from fmtorch.geometry.arithmetic import logarithm_1p_kernel
 from fmtorch.jit.kernel import Array, F8x1, F8x2, F8x3, inner, kernel, matrix
 from fmtorch.jit.lanes import LANES, added, fill, load, sqrt, store, where
 
@@ -229,7 +230,7 @@ def robust(r2: Any, s2: Any, loss: int, table: Array, work: Array) -> tuple[Any,
     elif loss == CAUCHY:
         store(work, 0, r2 / s2)
         for i in range(LANES):
-            work[0, i] = arithmetic.logarithm_1p_kernel(work[0, i])
+            work[0, i] = logarithm_1p_kernel(work[0, i])
         value, slope = s2 * load(work, 0), s2 / (s2 + r2)
     else:
         store(work, 0, r2 / s2)
