@@ -17,7 +17,7 @@ import torch
 
 from fmtorch import geometry
 from fmtorch.estimators.models.focal_prior import normal_quantiles
-from fmtorch.geometry.robust_losses import LOSS_TABLE
+from fmtorch.geometry.levenberg_marquardt import LOSS_TABLE
 from fmtorch.jit import cache, kernel
 from fmtorch.matching import nearest_neighbors
 from fmtorch.metrics import nsgd

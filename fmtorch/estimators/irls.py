@@ -19,9 +19,8 @@ from fmtorch.estimators.pair import Pair, squared
 from fmtorch.estimators.refinement import Fit
 from fmtorch.geometry import attached_step
 from fmtorch.geometry.eight_point import weighted_eight_point
-from fmtorch.geometry.levenberg_marquardt import Schedule, Weighted
+from fmtorch.geometry.levenberg_marquardt import Schedule, Weighted, named_loss
 from fmtorch.geometry.refine import refine_kernel, reweighted_kernel
-from fmtorch.geometry.robust_losses import named_loss
 from fmtorch.jit.kernel import Array
 from fmtorch.jobs.execution import mapped
 

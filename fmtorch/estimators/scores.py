@@ -14,7 +14,7 @@ import numpy as np
 from fmtorch.estimators.pair import Pair
 from fmtorch.geometry.arithmetic import smallest_but
 from fmtorch.geometry.epipolar import MATCH, SINGLES, TINY32, Residual, fill, load
-from fmtorch.geometry.robust_losses import GAIN_TABLE
+from fmtorch.geometry.levenberg_marquardt import GAIN_TABLE
 from fmtorch.jit.kernel import Array, F4x1, F4x2, F8x1, F8x2, I4x2, I8x1, Kernel, inner, kernel
 from fmtorch.jit.lanes import added, sqrt, store, where
 

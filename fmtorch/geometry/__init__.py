@@ -23,11 +23,11 @@ if TYPE_CHECKING:
     from fmtorch.geometry.homography import homography, homography_points, homography_sampson, homography_transfer
     from fmtorch.geometry.homography_pose import PlanePoses, poses_from_homography
     from fmtorch.geometry.homography_refine import refine_homography
+    from fmtorch.geometry.levenberg_marquardt import LOSSES
     from fmtorch.geometry.matrices import nearest_rank2
     from fmtorch.geometry.normalize import canonical, denormalize_fundamental, normalize_points
     from fmtorch.geometry.pose import FourPoses, Pose, pose_from_fundamental, poses_from_fundamental
     from fmtorch.geometry.refine import Fits, attached_step, irls, refine, reweighted_fits
-    from fmtorch.geometry.robust_losses import LOSSES
     from fmtorch.geometry.seven_point import seven_point
     from fmtorch.geometry.significance import significance
 

@@ -12,8 +12,7 @@ from torch import Tensor
 from fmtorch.geometry.arithmetic import as_components, as_matrices, component_sum, matmul3, sqrt, stable_sum, unit
 from fmtorch.geometry.cameras import PixelFrame
 from fmtorch.geometry.epipolar import Matrix, unit_frobenius
-from fmtorch.geometry.levenberg_marquardt import Schedule, Weighted
-from fmtorch.geometry.robust_losses import LOSSES, RobustLoss, named_loss
+from fmtorch.geometry.levenberg_marquardt import LOSSES, RobustLoss, Schedule, Weighted, named_loss
 
 Points = Float[Tensor, "*batch n 2"]
 PerMatch = Float[Tensor, "*batch n"]

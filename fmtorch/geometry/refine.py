@@ -95,7 +95,7 @@ def refine(
         x1: their matches in image 1.
         weight: not negative, 1 by default.
         mask: False in slots to ignore, whatever they hold; a match that is not finite is ignored too.
-        loss: a name of `robust_losses.LOSSES`.
+        loss: a name of `geometry.LOSSES`.
         scale: of the loss, in pixels (a number, or one per set).
         iterations: Levenberg-Marquardt steps.
 

@@ -9,10 +9,19 @@ from typing import TYPE_CHECKING
 from fmtorch.core.lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from fmtorch.metrics.inlier_rate import InlierRate, ground_truth_inliers, inlier_rate, right_of_homography
     from fmtorch.metrics.nsgd import nsgd, nsgd_released, sgd
     from fmtorch.metrics.pose import PoseError, closest_pose_error, corner_error, fundamental_pose_error, pose_error
-    from fmtorch.metrics.recall import mean_recall, pose_auc, pose_maa, pose_map, recall
+    from fmtorch.metrics.recall import (
+        InlierRate,
+        ground_truth_inliers,
+        inlier_rate,
+        mean_recall,
+        pose_auc,
+        pose_maa,
+        pose_map,
+        recall,
+        right_of_homography,
+    )
 
 __all__ = [
     "InlierRate", "PoseError", "closest_pose_error", "corner_error", "fundamental_pose_error", "ground_truth_inliers",

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from fmtorch.core.types import Correspondences
-from fmtorch.geometry.robust_losses import huber_weight
+from fmtorch.geometry.levenberg_marquardt import huber_weight
 from fmtorch.pruning.consistency import frame_map
 
 Frames = Float[Tensor, "n 2 3"]

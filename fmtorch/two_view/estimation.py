@@ -128,8 +128,9 @@ def _plain(value: Any) -> Any:
 @functools.cache
 def _consistency(framed: bool) -> Pruner:
     """The prior of matches with frames and ratios, or of points alone, with the constants of its preset."""
-    kind, name = (FrameConsistency, "frame") if framed else (PositionConsistency, "position")
-    return construct(kind, load("pruner", f"{name}_consistency"), f"pruner={name}_consistency")
+    if framed:
+        return construct(FrameConsistency, load("pruner", "frame_consistency"), "pruner=frame_consistency")
+    return construct(PositionConsistency, load("pruner", "position_consistency"), "pruner=position_consistency")
 
 
 # Sizes of images that nobody gave, assumed from the extent of their matched points

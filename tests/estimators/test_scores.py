@@ -13,8 +13,7 @@ from fmtorch.estimators import BestScore, Candidates, Pool, Refinement, scores_o
 from fmtorch.estimators.inliers import residuals_squared_px
 from fmtorch.estimators.scores import GRID, fractional_bits, saturated_cells
 from fmtorch.geometry.epipolar import HOMOGRAPHY, SAMPSON
-from fmtorch.geometry.levenberg_marquardt import Schedule
-from fmtorch.geometry.robust_losses import ENTRIES, QUANTILE
+from fmtorch.geometry.levenberg_marquardt import ENTRIES, QUANTILE, Schedule
 from fmtorch.jit.random import Stream
 from tests.estimators.own_parts import Squares
 from tests.estimators.pairs import FEW, REAL, SCALES, known, models, named, pair_of, residuals

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from fmtorch.core import collate
 from fmtorch.geometry import LOSSES, irls, reweighted_fits
-from fmtorch.geometry.robust_losses import ENTRIES, GAIN_TABLE, LOSS_TABLE, QUANTILE, named_loss
+from fmtorch.geometry.levenberg_marquardt import ENTRIES, GAIN_TABLE, LOSS_TABLE, QUANTILE, named_loss
 from tests import laws
 from tests.geometry.scenes import SCALE, distance, near_scene, tolerances, unit_scene
 from tests.reference import solvers

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import gamma, gammainc, gammaincc
 
 from fmtorch.geometry import LOSSES
-from fmtorch.geometry.robust_losses import LOSS_TABLE
+from fmtorch.geometry.levenberg_marquardt import LOSS_TABLE
 from tests.reference.solvers import sampson
 
 
