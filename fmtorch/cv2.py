@@ -255,7 +255,7 @@ def _result(estimate: Estimate, matrix: Any, mask: Mask | None) -> tuple[Matrix 
 
 
 def _inliers(estimate: Estimate) -> Mask:
-    return estimate.inliers[0].cpu().numpy().astype(np.uint8)[:, None]  # type: ignore[no-any-return]
+    return estimate.inliers[0].cpu().numpy().astype(np.uint8)[:, None]
 
 
 def _written(mask: Mask | None, out: Mask | None) -> Mask | None:
