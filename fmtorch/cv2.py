@@ -157,7 +157,7 @@ def findEssentialMat(points1: Any, points2: Any, *arguments: Any, **named: Any) 
     valid = bool(estimate.ok[0]) and estimate.E is not None and bool(estimate.E.isfinite().all())
     if not valid or estimate.E is None:
         return None, _written(None, rest.get("mask"))
-    return estimate.E[0].cpu().numpy(), _mask(estimate, rest.get("mask"))
+    return estimate.E[0].cpu().numpy(), _written(_inliers(estimate), rest.get("mask"))
 
 
 def recoverPose(*arguments: Any, **named: Any) -> Any:
@@ -251,14 +251,11 @@ def _result(estimate: Estimate, matrix: Any, mask: Mask | None) -> tuple[Matrix 
         return None, _written(None, mask)
     M = np.asarray(matrix, np.float64).reshape(3, 3)
     last = M[2, 2] if abs(M[2, 2]) > np.finfo(float).eps * np.abs(M).max() else 1.0
-    return M / last, _mask(estimate, mask)
+    return M / last, _written(_inliers(estimate), mask)
 
 
-def _mask(estimate: Estimate, out: Mask | None) -> Mask:
-    """The inliers (N, 1), also written to what the caller gave."""
-    mask = estimate.inliers[0].cpu().numpy().astype(np.uint8)[:, None]
-    _put(mask, out)
-    return mask
+def _inliers(estimate: Estimate) -> Mask:
+    return estimate.inliers[0].cpu().numpy().astype(np.uint8)[:, None]
 
 
 def _written(mask: Mask | None, out: Mask | None) -> Mask | None:

@@ -71,7 +71,7 @@ def warm_up() -> None:
     from fmtorch.runs import code_digest, fmtorch_version
 
     fmtorch_version()
-    for name in ("fmtorch.features.sift", "fmtorch.estimators", "fmtorch.matching", "fmtorch.pruning"):
+    for name in ("fmtorch.features", "fmtorch.estimators", "fmtorch.matching", "fmtorch.pruning"):
         code_digest(name)
 
 

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from typing import Annotated, NamedTuple
+from typing import Annotated
 
 import cv2
 import numpy as np
@@ -25,15 +25,10 @@ NEIGHBOURS = torch.cartesian_prod(*[torch.arange(-1, 2)] * 3)
 CENTRE = 13
 
 
-class Peaks(NamedTuple):
-    """Refined maxima. position: (level, y, x) in samples (M, 3) float64. value: response (M,)."""
-
-    position: Float[Tensor, "m 3"]
-    value: Float[Tensor, " m"]
-
-
-def refined_maxima(volume: Float[Tensor, "s h w"], seeds: Int[Tensor, "m 3"], threshold: float) -> Peaks:
-    """The maxima among `seeds`, samples (level, y, x), refined to sub-sample positions and values.
+def refined_maxima(
+    volume: Float[Tensor, "s h w"], seeds: Int[Tensor, "m 3"], threshold: float
+) -> tuple[Float[Tensor, "p 3"], Float[Tensor, " p"]]:
+    """The maxima among `seeds`, samples (level, y, x), refined to sub-sample positions, float64, and responses.
     A seed is a maximum where it exceeds the neighbours before it in memory and no neighbour after it exceeds it, so
     that of equal neighbours one remains. A maximum moves to the sample nearest to the quadratic's; it is dropped where
     it leaves the volume, does not settle, the quadratic has no maximum, or its value is at most `threshold`. Of those
@@ -43,7 +38,7 @@ def refined_maxima(volume: Float[Tensor, "s h w"], seeds: Int[Tensor, "m 3"], th
     kept = value > threshold
     at, offset, value = at[kept], offset[kept], value[kept]
     first = np.sort(np.unique(_linear(volume, at).numpy(), return_index=True)[1])
-    return Peaks(at[first].double() + offset[first], value[first])
+    return at[first].double() + offset[first], value[first]
 
 
 def _refine(volume: Tensor, at: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -187,17 +182,16 @@ class HessianDetector:
         Raises ValueError for another type, shape or an empty image."""
         grey = torch.from_numpy(as_grey(image))
         height, width = grey.shape
-        by_octave = [Peaks(torch.zeros(0, 3).double(), torch.zeros(0))]
+        by_octave = [(torch.zeros(0, 3).double(), torch.zeros(0))]
         spacing = 1.0  # of the octave's pixels in the image
         level = blur(grey.float() / 255, math.sqrt(self.sigma**2 - IMAGE_BLUR**2))
         while min(level.shape) >= SMALLEST_OCTAVE:
             responses, level = self._octave(level)
             by_level = [maxima(responses[s], self.threshold) for s in range(1, self.levels + 1)]
             seeds = [torch.cat([torch.full_like(p[:, :1], s), p], 1) for s, p in enumerate(by_level, start=1)]
-            peaks = refined_maxima(responses, torch.cat(seeds), self.threshold)
-            sigma = self.sigma * 2 ** (peaks.position[:, :1] / self.levels)
-            position = spacing * torch.cat([sigma, peaks.position[:, 1:]], 1)
-            by_octave.append(Peaks(position, peaks.value))
+            position, value = refined_maxima(responses, torch.cat(seeds), self.threshold)
+            sigma = self.sigma * 2 ** (position[:, :1] / self.levels)
+            by_octave.append((spacing * torch.cat([sigma, position[:, 1:]], 1), value))
             del responses
             spacing *= 2
         position, scores = (torch.cat(parts) for parts in zip(*by_octave, strict=True))

@@ -5,11 +5,10 @@ from typing import TYPE_CHECKING
 from fmtorch.core.lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from fmtorch.pruning.calibration import Calibration, MatchNoise, RatioPrior, match_noise
+    from fmtorch.pruning.calibration import Calibration, Likely, MatchNoise, RatioPrior, match_noise
     from fmtorch.pruning.code import CODE, Coherence, LikelihoodField, SmoothMotion, coherence
     from fmtorch.pruning.consistency import FrameConsistency, PositionConsistency, frame_agreement, position_agreement
-    from fmtorch.pruning.filters import Likely, MutualCheck, OneToOne, RatioTest, one_to_one, ratio_test
-    from fmtorch.pruning.gms import GMS, gms, gms_support
+    from fmtorch.pruning.filters import GMS, MutualCheck, OneToOne, RatioTest, gms, gms_support, one_to_one, ratio_test
     from fmtorch.pruning.neighbors import LPM, lpm, lpm_cost
     from fmtorch.pruning.networks import DFE, LC, MatchInputs
     from fmtorch.pruning.networks.learned import LearnedPruner

@@ -150,6 +150,20 @@ class RatioPrior:
         return torch.zeros_like(c.x0[..., 0])
 
 
+@dataclasses.dataclass(frozen=True)
+class Likely:
+    """Keeps the matches whose ``prior``, P(inlier), is at least `min_probability`.
+    It makes a filter of any stage that supplies a prior. Raises ValueError for correspondences without a prior."""
+
+    min_probability: float = 0.5
+
+    def __call__(self, c: Correspondences) -> Correspondences:
+        """The same matches, of which only likely ones survive; a prior that is NaN fails."""
+        if c.prior is None:
+            raise ValueError("`likely` needs `prior`: put a stage that supplies it before, e.g. frame_consistency")
+        return c.keep(c.prior >= self.min_probability)
+
+
 # How exact is each match? Noise from the keypoint's size, the distance ratio and the prior
 
 MIN_AREA = 1e-12  # square pixels: keeps the gradient of the scale finite

@@ -248,7 +248,8 @@ class Stage:
 
     def _shade(self, hits: Met, inverse: Matrix, offset: tuple[Real, Real], out: Floats) -> None:
         """Linear colour of the pixels (h w, 3) that see a surface; NumPy takes the transcendental functions."""
-        geometry, seen = self.geometry, Seen(*(x.reshape(-1) for x in hits[1:]), self.table)
+        geometry = self.geometry
+        seen = Seen(hits.piece.reshape(-1), hits.s.reshape(-1), hits.t.reshape(-1), self.table)
         footprint = Footprints(np.ones(len(seen.piece), np.float32), np.zeros(len(seen.piece), np.float32))
         count = np.zeros(len(geometry.textures), dtype=np.int64)
         mapping = Mapping(self.homography(inverse), geometry.texture_size.astype(np.float32), geometry.texture)

@@ -204,9 +204,7 @@ class Geometry:
     """The pieces of a scene as arrays, ready to be cast against any number of cameras."""
 
     def __init__(self, surfaces: Surfaces) -> None:
-        arrays = surfaces.arrays()
-        self.O, self.U, self.V = arrays["O"], arrays["U"], arrays["V"]
-        self.uv, self.normals = arrays["uv"], arrays["normals"]
+        self.O, self.U, self.V, self.uv, self.normals = surfaces.arrays()
         self.texture, self.triangle, self.both_sides = surfaces.labels()
         self.textures = surfaces.textures
         self.texture_size = np.array([texture.size for texture in self.textures]).reshape(-1, 2)[self.texture]

@@ -238,17 +238,15 @@ class Surfaces:
             setattr(other, name, list(values))
         return other
 
-    def arrays(self) -> dict[str, Vector]:
+    def arrays(self) -> tuple[Vector, Vector, Vector, Vector, Vector]:
         """All pieces as arrays: O, U, V (n, 3), uv (n, 3, 2), normals (n, 3, 3)."""
         rows = np.array(self._rows).reshape(-1, 24)
         flat = np.isnan(rows[:, 15])
         normal = np.cross(rows[flat, 6:9], rows[flat, 3:6])
         rows[flat, 15:] = 0
         rows[flat, 15:18] = normal / np.linalg.norm(normal, axis=1, keepdims=True)
-        return {
-            "O": rows[:, 0:3], "U": rows[:, 3:6], "V": rows[:, 6:9],
-            "uv": rows[:, 9:15].reshape(-1, 3, 2), "normals": rows[:, 15:24].reshape(-1, 3, 3),
-        }  # fmt: skip
+        uv, normals = rows[:, 9:15].reshape(-1, 3, 2), rows[:, 15:24].reshape(-1, 3, 3)
+        return rows[:, 0:3], rows[:, 3:6], rows[:, 6:9], uv, normals
 
     def labels(self) -> tuple[NDArray[np.int32], NDArray[np.bool_], NDArray[np.bool_]]:
         """Per piece: number of its texture, whether it is a triangle, whether it is seen from both sides."""

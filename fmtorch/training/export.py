@@ -223,7 +223,7 @@ def save_weights(
     path.parent.mkdir(parents=True, exist_ok=True)
     state = {key: value.detach().cpu().contiguous() for key, value in network.state_dict().items()}
     with replacing(path) as unfinished:
-        save_file(state, unfinished, metadata=_metadata(network, temperature, notes))
+        save_file(state, unfinished, metadata=learned.metadata(network, temperature, notes))
 
 
 def export_onnx(network: nn.Module, path: Path, *, temperature: float = 1.0) -> None:
@@ -241,7 +241,7 @@ def export_onnx(network: nn.Module, path: Path, *, temperature: float = 1.0) -> 
     alone = _OnePair(copy.deepcopy(network.backbone)).eval().cpu().float()
     example = torch.rand(1, network.input_channels, EXAMPLE_MATCHES, generator=torch.Generator().manual_seed(0))
     model = onnx_model(alone, example, learned.INPUT, learned.OUTPUT, free_axis=2)
-    onnx.helper.set_model_props(model, _metadata(network, temperature, None))
+    onnx.helper.set_model_props(model, learned.metadata(network, temperature))
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as unfinished, torch.no_grad():
         onnx.save(model, unfinished)
@@ -303,23 +303,10 @@ class _OnePair(nn.Module):
         return self.backbone(x, layers.Slots(torch.ones_like(x[:, 0]).sum(1), None))  # type: ignore[no-any-return]
 
 
-def _metadata(network: nn.Module, temperature: float, notes: Mapping[str, str] | None) -> dict[str, str]:
-    return learned.LearnedFile(learned.stated_network(network), float(temperature), dict(notes or {})).metadata()
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Result:
-    """A finished training: files, figures and the temperature of its log-odds."""
-
-    files: tuple[Path, ...]
-    evaluation: Evaluation
-    temperature: float
-
-
 def write_result(
     folder: Path, name: str, network: nn.Module, validation: Validation, facts: Mapping[str, Any]
-) -> Result:
-    """Evaluate the best weights of a training and write them into its folder.
+) -> tuple[list[Path], dict[str, float]]:
+    """Evaluate the best weights of a training and write them into its folder; the files, and the figures.
     The files are `name` with .safetensors, .md and, where the network can be exported and the extra `export` is
     installed, .onnx. facts: what the card says of the training: `data`, `seconds`, `steps`, `best_step`, `processor`,
     the identity."""
@@ -334,7 +321,7 @@ def write_result(
     card = folder / f"{name}.md"
     write_whole(card, model_card(files, facts, evaluation, fitted))
     write_whole(folder / "validation.json", json.dumps({**evaluation.figures, "temperature": fitted}, indent=2) + "\n")
-    return Result((*files, card), evaluation, fitted)
+    return [*files, card], evaluation.figures
 
 
 def model_card(files: Sequence[Path], facts: Mapping[str, Any], evaluation: Evaluation, temperature: float) -> str:

@@ -334,7 +334,9 @@ def rotate(matches: LabelledMatches, image: int, degrees: float | int) -> Labell
     """One of the images turned in its plane, from its x axis to its y axis; multiples of 90 degrees are exact.
     The new image is the bounding box of the turned one, its sides rounded up, with the same middle. Raises ValueError
     where the size of the image is not known."""
-    size = _size(matches, image)
+    size = matches.correspondences.size1 if image else matches.correspondences.size0
+    if size is None:
+        raise ValueError(f"to turn image {image} its size must be known: size{image}, which this matcher does not give")
     cos, sin = _direction(degrees)
     turn = torch.tensor([[cos, -sin], [sin, cos]], dtype=torch.float64, device=size.device)
     sides = size.flip(-1).to(torch.float64)  # (w, h)
@@ -381,31 +383,22 @@ def move(matches: LabelledMatches, step0: Float[Tensor, "b n 2"], step1: Float[T
     return matches.replace(correspondences=c.replace(**changes))
 
 
-def transform(
-    matches: LabelledMatches, image: int, T: Float[Tensor, "b 3 3"], size: Tensor | None = None
-) -> LabelledMatches:
+def transform(matches: LabelledMatches, image: int, T: Float[Tensor, "b 3 3"], size: Tensor) -> LabelledMatches:
     """One of the images mapped by ``x -> T x``, an affine map of pixels that keeps the orientation.
     matches: labelled matches. image: 0 or 1. T: last row (0, 0, 1), float64. size: the new size (h, w), (B, 2)."""
     c = matches.correspondences
     names = {name: f"{name}{image}" for name in ("x", "lafs", "size", "K")}
-    changes: dict[str, Tensor] = {names["x"]: _mapped(T, getattr(c, names["x"])[..., None])[..., 0]}
+    x = _mapped(T, getattr(c, names["x"])[..., None])[..., 0]
+    changes: dict[str, Tensor] = {names["x"]: x, names["size"]: size}
     lafs, K = getattr(c, names["lafs"]), getattr(c, names["K"])
     if lafs is not None:
-        changes[names["lafs"]] = torch.cat([_linear(T, lafs[..., :2]), _mapped(T, lafs[..., 2:])], -1)
+        axes = (T[:, None, :2, :2] @ lafs[..., :2].to(T)).to(lafs)
+        changes[names["lafs"]] = torch.cat([axes, _mapped(T, lafs[..., 2:])], -1)
     if K is not None:
         changes[names["K"]] = _upper_triangular(T.to(K) @ K)
-    if size is not None:
-        changes[names["size"]] = size
     inverse = torch.linalg.inv(T).to(matches.F)
     F = inverse.mT @ matches.F if image else matches.F @ inverse
     return matches.replace(correspondences=c.replace(**changes), F=unit_frobenius(F))
-
-
-def _size(matches: LabelledMatches, image: int) -> Tensor:
-    size = matches.correspondences.size1 if image else matches.correspondences.size0
-    if size is None:
-        raise ValueError(f"to turn image {image} its size must be known: size{image}, which this matcher does not give")
-    return size
 
 
 def _direction(degrees: float | int) -> tuple[float, float]:
@@ -414,11 +407,6 @@ def _direction(degrees: float | int) -> tuple[float, float]:
     if rest == 0:
         return ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))[int(quarters) % 4]
     return math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
-
-
-def _linear(T: Tensor, columns: Tensor) -> Tensor:
-    """The linear part of T applied to columns (b, n, 2, k), computed in float64."""
-    return (T[:, None, :2, :2] @ columns.to(T)).to(columns)
 
 
 def _mapped(T: Tensor, points: Tensor) -> Tensor:

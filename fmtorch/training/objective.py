@@ -5,8 +5,6 @@ no true geometry) adds zero to loss and gradient; where that holds for all pairs
 the graph. So no training step needs to be skipped.
 """
 
-from typing import NamedTuple
-
 import torch
 from jaxtyping import Bool, Float, Int, Int8, Real
 from torch import Tensor
@@ -191,14 +189,6 @@ def nsgd_loss(
     return _mean_over_pairs(value, valid & _valid_models(F_true)).to(F_est.dtype)
 
 
-class VirtualPoints(NamedTuple):
-    """Exact correspondences in pixels; slots where `mask` is False hold (0, 0)."""
-
-    x0: Float[Tensor, "b n 2"]
-    x1: Float[Tensor, "b n 2"]
-    mask: Bool[Tensor, "b n"]
-
-
 def virtual_points(
     F: Float[Tensor, "b 3 3"],
     size0: Real[Tensor, "b 2"],
@@ -207,7 +197,7 @@ def virtual_points(
     count: int = 256,
     seed: int = 0,
     key: Int[Tensor, " b"] | None = None,
-) -> VirtualPoints:
+) -> tuple[Float[Tensor, "b n 2"], Float[Tensor, "b n 2"], Bool[Tensor, "b n"]]:
     """Points of image 0 and, on their epipolar lines, points of image 1, each inside its image; without gradients.
 
     A point is drawn uniformly in image 0, its partner uniformly on the part of its line inside image 1, as NSGD draws
@@ -222,8 +212,8 @@ def virtual_points(
         key: the pairs' keys; 0 for all where None.
 
     Returns:
-        `count` slots for each pair. There are fewer points where fewer than one in TRIES lines meets image 1, and none
-        where F is zero or not finite.
+        Points x0, x1 in pixels and a mask, `count` slots for each pair, (0, 0) where masked. There are fewer points
+        where fewer than one in TRIES lines meets image 1, and none where F is zero or not finite.
 
     Raises:
         ValueError: count is less than 1.
@@ -236,7 +226,7 @@ def virtual_points(
     key = torch.zeros(len(F), dtype=torch.int64) if key is None else key
     tensors, out = (F, size0.double(), size1.double(), key[:, None]), torch.empty(len(F), count, 5, dtype=torch.float64)
     points = for_each_pair(points_on_lines, tensors, mixed_seed(seed, Stream.TRAINING), out=out, kind=torch.float64)
-    return VirtualPoints(points[..., :2], points[..., 2:4], points[..., 4] > 0)
+    return points[..., :2], points[..., 2:4], points[..., 4] > 0
 
 
 @kernel

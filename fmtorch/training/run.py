@@ -44,7 +44,7 @@ from fmtorch.presets.composition import execution_of, plain, read_fields
 from fmtorch.pruning.networks.learned import predict
 from fmtorch.runs import identity_digest
 from fmtorch.scenes import RenderedPairs
-from fmtorch.training.export import Evaluation, Result, Use, Validation, quiet, write_result
+from fmtorch.training.export import Evaluation, Use, Validation, quiet, write_result
 from fmtorch.training.labelled import Augmentation, LabelledMatches, keep_ratio
 from fmtorch.training.matched_pairs import MatchedPairs, NamedPairs, OANetPairs, front
 from fmtorch.training.objective import Objective
@@ -311,16 +311,16 @@ def run(config: DictConfig, name: str) -> Path:
         processor = f"{os.cpu_count()} cores of {platform.processor() or platform.machine()}"
         facts = {**identity, "steps": steps, "seconds": seconds, "data": matches.description, "processor": processor}
         facts["best_step"] = load_best(folder, module)
-        report(write_result(folder, name, module.network, validation, facts), name)
+        report(name, *write_result(folder, name, module.network, validation, facts))
     return folder
 
 
-def report(result: Result, name: str) -> None:
+def report(name: str, files: Sequence[Path], figures: Mapping[str, float]) -> None:
     """Say on the terminal what came out and how to use it."""
-    for key, value in result.evaluation.figures.items():
+    for key, value in figures.items():
         terminal.console.print(f"{key:32} {value:.4f}")
-    terminal.console.print(", ".join(str(path) for path in result.files), soft_wrap=True)
-    terminal.console.print(f"use it: {use_line(name, result.files[0], sys.argv[1:])}", soft_wrap=True)
+    terminal.console.print(", ".join(str(path) for path in files), soft_wrap=True)
+    terminal.console.print(f"use it: {use_line(name, files[0], sys.argv[1:])}", soft_wrap=True)
 
 
 def use_line(name: str, file: Path, words: Sequence[str]) -> str:

@@ -12,12 +12,11 @@ from fmtorch.scenes.surfaces import Surfaces
 def first_hit(surfaces: Surfaces, camera: Camera, x: float, y: float) -> tuple[int, np.ndarray]:
     """The first piece that the ray of an image point meets (-1: none), and depth at which it meets each piece's plane.
     All pieces are taken as opaque. Pieces are met from outside only, unless they have two sides."""
-    arrays = surfaces.arrays()
     _, triangle, both_sides = surfaces.labels()
     ray = camera.R.T @ np.linalg.inv(camera.K) @ np.array([x, y, 1.0])  # a step of depth 1
     depths = np.full(len(surfaces), math.inf)
     best, nearest = -1, math.inf
-    for i, (corner, U, V) in enumerate(zip(arrays["O"], arrays["U"], arrays["V"], strict=True)):
+    for i, (corner, U, V) in enumerate(zip(*surfaces.arrays()[:3], strict=True)):
         if abs(np.linalg.det(np.stack([U, V, -ray], 1))) < 1e-12:
             continue
         s, t, depth = np.linalg.solve(np.stack([U, V, -ray], 1), camera.centre - corner)

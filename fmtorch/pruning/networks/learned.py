@@ -24,19 +24,6 @@ METADATA = "fmtorch"  # the one key of a file's metadata: several have no fixed 
 INPUT, OUTPUT = "matches", "outputs"  # of an ONNX file: (1, channels, N) and (1, outputs, N)
 
 
-class LearnedFile(NamedTuple):
-    """What a learned file says beside its weights, kept in it as JSON.
-    network: as of `stated_network`. temperature: by which log-odds are divided. notes: anything else."""
-
-    network: Mapping[str, Any]
-    temperature: float
-    notes: Mapping[str, str]
-
-    def metadata(self) -> dict[str, str]:
-        """As a file's metadata; equal contents are equal bytes."""
-        return {METADATA: json.dumps(self._asdict(), sort_keys=True)}
-
-
 def learned_file(name: str | Path, runtime: str) -> Path:
     """Where the file of a name is that a runtime, "torch" or "onnx", reads.
     A name without a folder and a suffix is among the shipped models: "lc_f" is models/lc_f.onnx. Anything else is a
@@ -48,32 +35,35 @@ def learned_file(name: str | Path, runtime: str) -> Path:
 
 
 def stated_network(network: nn.Module) -> dict[str, Any]:
-    """What a file states of its network: its class, and its options where it has an attribute of that name."""
-    return {"class": type(network).__name__, "options": plain(getattr(network, "options", None))}
+    """What a file states of its network, as JSON gives it back: its class, and its `options` where it has them."""
+    said = {"class": type(network).__name__, "options": getattr(network, "options", None)}
+    return json.loads(json.dumps(said))  # type: ignore[no-any-return]
 
 
-def plain(value: Any) -> Any:
-    """A value as JSON gives it back."""
-    return json.loads(json.dumps(value))
+def metadata(network: nn.Module, temperature: float, notes: Mapping[str, str] | None = None) -> dict[str, str]:
+    """What a file says beside its weights, as its metadata; equal contents are equal bytes.
+    temperature: by which log-odds are divided. notes: anything else."""
+    said = {"network": stated_network(network), "temperature": float(temperature), "notes": dict(notes or {})}
+    return {METADATA: json.dumps(said, sort_keys=True)}
 
 
-def load_weights(network: nn.Module, path: Path, hint: str) -> LearnedFile:
-    """Load a safetensors file into a network, which is built as it states, strictly; what else the file says.
-    hint: what makes such a file, for the errors. Raises NetworkFileError where it is absent, unreadable, or of another
-    network."""
+def load_weights(network: nn.Module, path: Path, hint: str) -> float:
+    """Load a safetensors file into a network, which is built as it states, strictly; the temperature by which its
+    log-odds are divided. hint: what makes such a file, for the errors. Raises NetworkFileError where it is absent,
+    unreadable, or of another network."""
     if not path.is_file():
         raise NetworkFileError(f"{path} does not exist: {hint}")
     try:
         with safe_open(path, framework="pt") as file:
-            metadata, state = file.metadata() or {}, {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+            said, state = file.metadata() or {}, {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
     except SafetensorError as error:
         raise NetworkFileError(f"{path} is no safetensors file ({error}): {hint}") from error
-    known = _checked(network, path, metadata)
+    temperature = _checked(network, path, said)
     try:
         network.load_state_dict(state, strict=True)
     except RuntimeError as error:
         raise NetworkFileError(f"{path} does not fit {type(network).__name__}: {error}") from error
-    return known
+    return temperature
 
 
 class OnnxBackbone:
@@ -82,41 +72,39 @@ class OnnxBackbone:
     def __init__(self, network: nn.Module, path: Path, hint: str, threads: int = 1) -> None:
         """Raises NetworkFileError for a file that is absent, cannot be run, or is of another network."""
         self.path, self.hint, self.threads = path, hint, threads
-        session = self._session()
+        session = onnx_session(path, threads, hint)
         by_verb = {"takes": session.get_inputs(), "gives": session.get_outputs()}
         shapes = {verb: [(a.name, a.type, len(a.shape)) for a in arguments] for verb, arguments in by_verb.items()}
         if shapes != {"takes": [(INPUT, "tensor(float)", 3)], "gives": [(OUTPUT, "tensor(float)", 3)]}:
             wanted = f"a pruner's file takes float {INPUT} (1, channels, N) and gives {OUTPUT} (1, K, N): {hint}"
             raise NetworkFileError(f"{path} takes {shapes['takes']} and gives {shapes['gives']}; {wanted}")
-        self.file = _checked(network, path, session.get_modelmeta().custom_metadata_map)
+        self.temperature = _checked(network, path, session.get_modelmeta().custom_metadata_map)
 
     def __call__(self, x: Float[Tensor, "1 channels n"], slots: Slots) -> Float[Tensor, "1 outputs n"]:
         """The backbone's result, on x's device; computed on the CPU."""
         if slots.mask is not None or len(x) != 1:
             raise ValueError("an ONNX backbone takes one pair without padding at a time")
         array = x.detach().to("cpu", torch.float32).contiguous().numpy()
-        return torch.from_numpy(self._session().run([OUTPUT], {INPUT: array})[0]).to(x.device)
-
-    def _session(self) -> Any:
-        return onnx_session(self.path, self.threads, self.hint)
+        session = onnx_session(self.path, self.threads, self.hint)
+        return torch.from_numpy(session.run([OUTPUT], {INPUT: array})[0]).to(x.device)
 
 
-def _checked(network: nn.Module, path: Path, metadata: Mapping[str, str]) -> LearnedFile:
-    """What a file's metadata says. Raises NetworkFileError where it states another network, or none."""
-    if METADATA not in metadata:
+def _checked(network: nn.Module, path: Path, said: Mapping[str, str]) -> float:
+    """The temperature that a file's metadata says. Raises NetworkFileError where it states another network, or none."""
+    if METADATA not in said:
         raise NetworkFileError(f"{path} does not state its network: fmtorch.training.export makes such files")
     try:
-        content = json.loads(metadata[METADATA])
-        stated = LearnedFile(content["network"], float(content["temperature"]), content["notes"])
+        content = json.loads(said[METADATA])
+        stated, temperature, _ = content["network"], float(content["temperature"]), content["notes"]
     except (ValueError, TypeError, KeyError) as error:
         raise NetworkFileError(f"{path}: its metadata cannot be read: {error!r}") from error
-    if not (stated.temperature > 0 and math.isfinite(stated.temperature)):
-        raise NetworkFileError(f"{path}: temperature {stated.temperature}; it has to be positive")
+    if not (temperature > 0 and math.isfinite(temperature)):
+        raise NetworkFileError(f"{path}: temperature {temperature}; it has to be positive")
     expected = stated_network(network)
-    if stated.network != expected:
-        both = f"{path} holds {stated.network}, the preset names {expected}"
+    if stated != expected:
+        both = f"{path} holds {stated}, the preset names {expected}"
         raise NetworkFileError(f"{both}: take the file's options, or train this one")
-    return stated
+    return temperature
 
 
 Backbone = Callable[[Tensor, Slots], Tensor]  # (B, channels, N), zero in masked slots -> (B, outputs, N)
@@ -268,11 +256,11 @@ class LearnedPruner:
             ready: Any = self.network
             if runtime == "onnx":
                 ready = OnnxBackbone(self.network, self._path(runtime), self.command, self.threads)
-                stated = ready.file.temperature
+                stated = ready.temperature
             else:
                 ready = copy.deepcopy(self.network)
                 if self.file is not None:
-                    stated = load_weights(ready, self._path(runtime), self.command).temperature
+                    stated = load_weights(ready, self._path(runtime), self.command)
                 ready = ready.to(device).eval()
             self._ready[key] = ready, stated if self.temperature is None else self.temperature
         return self._ready[key]
