@@ -7,8 +7,7 @@ points (FM_7POINT, FM_8POINT, method 0 of homographies) it computes here, too.
 Thresholds decide which matches the mask holds, as OpenCV's do; by which distances models are searched and fitted is the
 presets' own. `confidence` and `maxIters` where they are not given are the presets', too. Image sizes are assumed from
 the points' extent, as `fmtorch.find_fundamental` does where none are given. Cameras of two kinds, priors and gradients
-have no place in these signatures, but in its own.
-"""
+have no place in these signatures, but in its own."""
 
 from typing import Any
 

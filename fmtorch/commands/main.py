@@ -1,7 +1,6 @@
 """The commands by one name: ``fmtorch eval pipeline=sift_ratio``, also ``python -m fmtorch eval ...``.
 
-Help, and a mistake in the command's name, are answered here, before any library is imported.
-"""
+Help, and a mistake in the command's name, are answered here, before any library is imported."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
 """What each command takes: options with types, defaults and help, and groups of presets with what stands in each.
 
 The one declaration of both: the config that Hydra composes, the checks of its values and ``--help`` are made of it.
-Nothing here imports a library, for which ``--help`` would wait.
-"""
+Nothing here imports a library, for which ``--help`` would wait."""
 
 import dataclasses
 from collections.abc import Mapping

@@ -1,7 +1,6 @@
 """What arguments may be, checked where a user's come in: shapes, types of numbers, devices, values.
 
-Annotations are the source: ``Float[Tensor, "*batch n 2"]`` is both what a reader sees and what is asked for.
-"""
+Annotations are the source: ``Float[Tensor, "*batch n 2"]`` is both what a reader sees and what is asked for."""
 
 import functools
 import inspect

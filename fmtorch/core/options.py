@@ -1,7 +1,6 @@
 """Options that a user sets: declared as fields of a dataclass, and checked against the signature of what takes them.
 
-Nothing here imports more than Python's own library, so that a command's ``--help`` waits for nothing.
-"""
+Nothing here imports more than Python's own library, so that a command's ``--help`` waits for nothing."""
 
 import dataclasses
 import difflib

@@ -2,8 +2,7 @@
 
 The annotation of a field is what is known of it: ``Float[Tensor, "b n 2"]`` is a shape that is checked when the record
 is made, the numbers that it holds, and, by the dimension ``n``, that it has an entry for each slot. Annotations, those
-of functions' arguments too, are read here alone, and only here is jaxtyping's form of them known.
-"""
+of functions' arguments too, are read here alone, and only here is jaxtyping's form of them known."""
 
 import dataclasses
 import inspect

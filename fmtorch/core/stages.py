@@ -1,7 +1,6 @@
 """The protocols of the four stages: what anything must look like to take its place in a pipeline.
 
-Beside them the grey images that pruners look at, and the extractor of matchers that take the images themselves.
-"""
+Beside them the grey images that pruners look at, and the extractor of matchers that take the images themselves."""
 
 import dataclasses
 from collections.abc import Callable

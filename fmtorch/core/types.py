@@ -2,8 +2,7 @@
 
 Conventions (the whole project's):
 points are (x, y) in pixels with (0, 0) at the centre of the first pixel; sizes are (h, w); image 0 comes first and
-``x1^T F x0 = 0``; ``mask`` is True for a real, surviving match, and what stands in a masked slot means nothing.
-"""
+``x1^T F x0 = 0``; ``mask`` is True for a real, surviving match, and what stands in a masked slot means nothing."""
 
 from __future__ import annotations
 
@@ -120,8 +119,7 @@ class Correspondences(Record):
     deviation (0 exact, infinite unknown), for square pixels and central principal points. shared_focal: (B,), whether
     both are one in units of the longer sides. Without these estimates are of F alone, whatever K0 and K1 are.
     lens: what is known of the lenses of both images, (B, 2, 2): lambda of the division model and its standard deviation
-    (0 exact, infinite unknown), see `fmtorch.find_fundamental`. shared_lens: (B,), whether both are one.
-    """
+    (0 exact, infinite unknown), see `fmtorch.find_fundamental`. shared_lens: (B,), whether both are one."""
 
     x0: Float[Tensor, "b n 2"]
     x1: Float[Tensor, "b n 2"]
@@ -222,8 +220,7 @@ class Estimate(Record):
     Where lenses are estimated: lens (B, 2), lambda of both, NaN where they are not determined.
     Where pinholes are assumed: lens_suggested (B,), lambda of one lens for both images with which the matches agree
     where they contradict pinholes, NaN where they do not.
-    Where calibration matrices are known: contradicted (B,), whether far more matches agree without them.
-    """
+    Where calibration matrices are known: contradicted (B,), whether far more matches agree without them."""
 
     F: Float[Tensor, "b 3 3"]
     inliers: Bool[Tensor, "b n"]

@@ -2,8 +2,7 @@
 
 SuperGlue (Sarlin et al., CVPR 2020, match_pairs.py): the names of both images, by how many quarter turns each is turned
 counterclockwise, K0, K1 row by row, and the pose, a matrix (4, 4) that takes points of camera 0 to camera 1. K and pose
-are those of the images before they are turned. glue-factory: names, K0, K1, and either R and t or the matrix.
-"""
+are those of the images before they are turned. glue-factory: names, K0, K1, and either R and t or the matrix."""
 
 import dataclasses
 import hashlib

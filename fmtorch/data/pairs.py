@@ -100,8 +100,7 @@ class ImagePair:
     problem: why this pair cannot be used (a bad line of a pairs file, say); None for a sound pair.
     matches: reads the matches that come with the pair, in place of features and matcher; can be sent between processes.
     H: (3, 3) float64 with ``x1 ~ H x0`` in pixels, of a data set of homographies, whose F is zero; None for any other.
-    given: what estimators are given of cameras and lenses, fields of `Correspondences` for one pair; None: nothing.
-    """
+    given: what estimators are given of cameras and lenses, fields of `Correspondences` for one pair; None: nothing."""
 
     identity: str
     family: str

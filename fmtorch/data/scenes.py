@@ -1,6 +1,5 @@
 """Which pairs of a scene's images are worth a look: of a video those a second apart, of a collection all, or those
-that see the same points of its reconstruction.
-"""
+that see the same points of its reconstruction."""
 
 import dataclasses
 import functools

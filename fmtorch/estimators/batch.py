@@ -1,8 +1,7 @@
 """From a batch of correspondences to one pair after the other, and from their solutions to estimates.
 
 Pairs are estimated on the host, whatever device the caller's tensors are on, and shared out among threads, which
-changes no result. What stands beside a pair in the batch is never looked at.
-"""
+changes no result. What stands beside a pair in the batch is never looked at."""
 
 from __future__ import annotations
 

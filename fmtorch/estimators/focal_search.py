@@ -32,8 +32,7 @@ class Focal:
     the stopping rule asks for more. confirmations: rounds that find the best candidate of those before them again,
     after which it does not matter that others differ. pool: the best models of a round, which are refined with the
     prior. candidates: models of the other search that are, too. iterations: steps of that refinement. sqrt_prior:
-    whether the root of P(inlier) stands for it in samples and scores, but not in fits.
-    """
+    whether the root of P(inlier) stands for it in samples and scores, but not in fits."""
 
     samples: NonNegative = 250
     rounds: Count = 1

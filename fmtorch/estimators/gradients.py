@@ -1,8 +1,7 @@
 """Gradients of estimates to points, prior and noise: the only tensors behind the door of an estimator.
 
 The value of an estimate is computed without a graph; a zero that has its gradients is added to it. So the estimate has
-the same bits whether anybody asks for gradients or not, and gradients are those of the fit, not of the search.
-"""
+the same bits whether anybody asks for gradients or not, and gradients are those of the fit, not of the search."""
 
 from __future__ import annotations
 
@@ -179,8 +178,7 @@ def camera_response(cameras: posterior.Cameras, pair: Pair, weight: Array, preci
     """How the optimum of the posterior moves with the gradient of its cost by the nine entries, (11, 9): its model and
     the logarithms of its focal lengths.
 
-    weight: (n,), of the matches that count. precision: one over the variance of an inlier's distance.
-    """
+    weight: (n,), of the matches that count. precision: one over the variance of an inlier's distance."""
     images, optimum, tangents = posterior.images_of(pair), posterior.start_at(cameras.copy()), np.zeros((1, 9, LANES))
     matches = posterior.centred(pair)._replace(weight=weight, s2=np.full(pair.count, np.inf))
     posterior.minimise(optimum, matches, images, posterior.Limits(precision, 0, 0.0))

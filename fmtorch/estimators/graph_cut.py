@@ -169,8 +169,7 @@ class GraphCut:
     Label the matches with spatial coherence, fit the 8-point algorithm to samples of the inliers and to all of them,
     take the fit of the highest score, and again while the score rises. The samples hold seven times as many matches as
     a minimal one, as in the paper, here drawn with replacement.
-    threshold: epsilon of the labelling, Sampson distance, px. score: what is improved.
-    """
+    threshold: epsilon of the labelling, Sampson distance, px. score: what is improved."""
 
     COHERENCE = 0.1  # lambda; as the radius and the size of samples in section 4 of the paper
     RADIUS_PX = 20.0  # px, of the ball of neighbours in (x0, y0, x1, y1)

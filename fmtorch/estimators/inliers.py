@@ -63,8 +63,7 @@ class StoppingRule:
     """Stop once an all-inlier sample was drawn with this probability (Fischler & Bolles 1981).
 
     threshold: up to which a match is an inlier, Sampson distance, px. sampler: its `weight` says how likely each match
-    is to be drawn, relative to the others; without it all are equally likely.
-    """
+    is to be drawn, relative to the others; without it all are equally likely."""
 
     def __init__(self, probability: float, threshold: float, sampler: Sampler) -> None:
         self.probability, self.threshold = probability, threshold

@@ -3,8 +3,7 @@
 ``x_u = x_d / (1 + lambda |x_d|^2)`` (Fitzgibbon, CVPR 2001), from the principal point, in half diagonals of the image:
 0 of a pinhole, -0.05 of a usual phone, -0.3 of an action camera. In homogeneous coordinates ``h = (x, y, 1 + lambda
 r^2)`` the epipolar constraint is a polynomial, ``h1^T F h0 = 0``, whose Sampson distance by the photograph's own
-coordinates needs no undistorted point (the tangent Sampson error of Terekhov & Larsson, ICCV 2023).
-"""
+coordinates needs no undistorted point (the tangent Sampson error of Terekhov & Larsson, ICCV 2023)."""
 
 from __future__ import annotations
 
@@ -405,8 +404,7 @@ def _model(cameras: Cameras, pair: Pair) -> Array:
 def suggested_lens(fit: Fit, pair: Pair) -> float:
     """One lens for both images with which the matches agree where they contradict the pinholes of a fit, or NaN.
 
-    One Newton step of all unknowns says whether to look for it, in a fraction of a search's time.
-    """
+    One Newton step of all unknowns says whether to look for it, in a fraction of a search's time."""
     cameras = fit.cameras
     if cameras is None:
         cameras = posterior.no_cameras(1)

@@ -74,8 +74,7 @@ class Pair:
     two. centre: (4,), of the points, pixels. sizes: (4,), of the images as h, w, h, w, pixels; empty where unknown.
     key, seed: of every random choice. residual: of the family of models, by which matches are judged. calibration:
     what is known of the focal lengths, of a pair whose sizes are known; lens: of the lenses, None of pinholes. images:
-    what families compute of the images, for all subsets of the matches.
-    """
+    what families compute of the images, for all subsets of the matches."""
 
     def __init__(
         self, table: Array, known: tuple[bool, bool, bool], bucket: int, pixels_per_unit: float, key: int, seed: int,
@@ -176,8 +175,7 @@ def normalize_pair(matches: PixelMatches, slot: I8x1, table: F8x1, frame: F8x1) 
     """Where the usable ones of n matches stand -> slot (m,); what is known of them -> the first 9 m of table; m.
 
     table: (9 n,), the rows of `Pair` one after the other. frame: (6,), the middle of the box around the points of each
-    image; the unit in pixels, 0 where all coincide; and 1 where all priors, noises and sizes are right, otherwise 0.
-    """
+    image; the unit in pixels, 0 where all coincide; and 1 where all priors, noises and sizes are right, otherwise 0."""
     x0, x1, mask, prior, noise, ambiguity, sizes = matches
     count, half, end, right = 0, 0.0, MAX_COORDINATE_PX, True
     for i in range(len(mask)):

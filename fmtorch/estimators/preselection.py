@@ -25,8 +25,7 @@ class Preselect:
     """A round's models compared on few matches first.
 
     matches: any, or for a score that weighs them by their prior such as are drawn by it, each counting as one.
-    survivors: models that are scored on all matches.
-    """
+    survivors: models that are scored on all matches."""
 
     matches: Count = 128
     survivors: Count = 256

@@ -2,8 +2,7 @@
 
 **search**: rounds of minimal samples, scores, the best models; **refine** these; **select** one; **fit** it. The engine
 is control flow on one pair: `PARTS` names the parts, which hold the arithmetic, and beside which the options of each
-verb are described; `batch` leads from tensors to pairs and back.
-"""
+verb are described; `batch` leads from tensors to pairs and back."""
 
 from __future__ import annotations
 

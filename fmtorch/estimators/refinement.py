@@ -1,8 +1,7 @@
 """From the pool to the estimate: its models made better, one of them selected, and fitted to its inliers.
 
 A fit has a value, computed here without a graph, and a gradient, which `gradients` attaches to it: so the estimate has
-the same bits whether anybody asks for gradients or not.
-"""
+the same bits whether anybody asks for gradients or not."""
 
 from __future__ import annotations
 
@@ -36,8 +35,7 @@ class Refine:
     """Levenberg-Marquardt of the robust Sampson error, from each model of the pool.
 
     loss: a name of `geometry.LOSSES`. scale: its scale, Sampson distance, px. iterations: steps. matches: at most so
-    many are looked at, drawn by the pair's key from those within RADIUS scales of a model of the pool; None: all.
-    """
+    many are looked at, drawn by the pair's key from those within RADIUS scales of a model of the pool; None: all."""
 
     loss: Literal["huber", "cauchy", "geman_mcclure", "truncated", "magsac"]
     scale: Pixels = 1.0
@@ -52,8 +50,7 @@ class Select:
     """Which refined model is the estimate: that of the largest score.
 
     score: a name of `PARTS`, or a score. scale: of it, Sampson distance, px. own_noise: the choice is made again
-    with so many standard deviations of the noise of the matches near the first for a scale; None: it is made once.
-    """
+    with so many standard deviations of the noise of the matches near the first for a scale; None: it is made once."""
 
     score: Any = "saturated"
     scale: Pixels = 1.0
@@ -142,8 +139,7 @@ class BestScore:
 
     No scale suits all pairs: keypoints of a sharp video lie within a fifth of a pixel of their epipolar lines, those of
     learned features within one. So with `at_noise`, the score at the noise of a pair by the matches near a model (9,),
-    the choice is made a second time, at the noise of the first.
-    """
+    the choice is made a second time, at the noise of the first."""
 
     def __init__(self, score: Score, at_noise: Callable[[Array, Pair], Score] | None = None) -> None:
         self.score, self.at_noise = score, at_noise
@@ -249,8 +245,7 @@ class Adaptive(NoFit):
     (driving) and changes nothing on castle-P19 and fox.
     Where cameras are assumed it maximises the posterior, unless the matches contradict the prior. The noise is 1.4826
     times the median Sampson distance of the inliers (Rousseeuw & Leroy 1987), the truncation twice that; `FitScale`
-    says what they are of homographies.
-    """
+    says what they are of homographies."""
 
     gradient, weighted = "optimum", True
 

@@ -56,8 +56,7 @@ class Prosac(Uniform):
 
     Matches are ranked by ambiguity, smaller first, or by prior where there is no ambiguity; without either all sets are
     equally likely, since the order of matches means nothing. Draw t takes the n(t)-th match and the others from those
-    before it, n(t) growing as the paper's equation 3 says for T_N draws; after these all sets are equally likely.
-    """
+    before it, n(t) growing as the paper's equation 3 says for T_N draws; after these all sets are equally likely."""
 
     GROWTH = 200_000  # T_N: after so many draws PROSAC is RANSAC; the paper's value
 

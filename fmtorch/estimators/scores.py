@@ -1,7 +1,6 @@
 """How good a hypothesis is: the residual of every match under every model, turned into one number a model.
 
-Per-match gains are rounded to few fractional bits, so that their sums are exact in any order. Larger is better.
-"""
+Per-match gains are rounded to few fractional bits, so that their sums are exact in any order. Larger is better."""
 
 from __future__ import annotations
 
@@ -63,8 +62,7 @@ NO_TABLE = np.empty(0, np.float32)
 class Score(Protocol):
     """Scores models. prior_weighted: each match counts as much as its prior, where it has one.
 
-    One may have a `preselection`, another score by which models are compared on few matches.
-    """
+    One may have a `preselection`, another score by which models are compared on few matches."""
 
     prior_weighted: bool
 
@@ -87,8 +85,7 @@ class SummedGains:
     """The sum over matches of a gain, from 1 at no residual to 0, times P(inlier) if so asked.
 
     A score of one's own overrides `gain` in NumPy, or names a compiled `gain_kernel(squared, out)`; residuals and the
-    exact sum are compiled in any case. threshold: the scale of the residuals, Sampson distance, px.
-    """
+    exact sum are compiled in any case. threshold: the scale of the residuals, Sampson distance, px."""
 
     gain_kernel: ClassVar[Kernel[..., None] | None] = None
     CODE: ClassVar[int | None] = None  # of a gain that one kernel computes
@@ -146,8 +143,7 @@ class GemanMcClure(SummedGains):
     """The sum over matches of ``1 / (1 + r^2 / s^2)``, shifted and scaled to be 1 at r = 0 and 0 from 5 s on.
 
     Geman & McClure (1987); s is the threshold. A narrow peak with a long tail: exact matches decide, and matches with
-    larger noise still count, so that one scale serves scenes of different noise.
-    """
+    larger noise still count, so that one scale serves scenes of different noise."""
 
     CODE = GEMAN_MCCLURE
 
@@ -156,8 +152,7 @@ class Magsac(SummedGains):
     """MAGSAC++: the likelihood marginalised over the noise scale (Barath et al., CVPR 2020, section 3.2).
 
     The gain is ``1 - rho(r) / rho(k sigma_max)``, rho as in `magsac`, tabulated over r^2 as the authors do.
-    threshold: k sigma_max, Sampson distance, px.
-    """
+    threshold: k sigma_max, Sampson distance, px."""
 
     CODE, table = TABLE, GAIN_TABLE
 
@@ -269,8 +264,7 @@ class SaturatedGains(SummedGains):
     textured plane. The narrow peak of g tells exact models from those nearby, and its tail lets one scale serve scenes
     of different noise. The grid is that of the box around the matches of weight.
     threshold: the scale, at which a match counts half, Sampson distance, px. preselection: the plain sum of g, for few
-    matches.
-    """
+    matches."""
 
     def __init__(self, threshold: float, prior_weighted: bool = True) -> None:
         super().__init__(threshold, prior_weighted)

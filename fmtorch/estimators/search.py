@@ -1,7 +1,6 @@
 """The search: rounds of hypotheses, the best of which are kept, until one was all but surely made of inliers alone.
 
-DEGENSAC completes models that fit a plane alone, by the parallax of the rest.
-"""
+DEGENSAC completes models that fit a plane alone, by the parallax of the rest."""
 
 from __future__ import annotations
 
@@ -126,8 +125,7 @@ class Degensac:
     A sample of seven is H-degenerate when at least five of its matches agree with a homography that is compatible with
     the model; five triplets of the sample give all such homographies. The homography of a degenerate model is fitted to
     all its matches, and fundamental matrices of it and two matches off the plane join the models of the round.
-    score: of the engine.
-    """
+    score: of the engine."""
 
     SAMPLE = 7
     ON_PLANE = 5

@@ -1,7 +1,6 @@
 """The report of several runs on one HTML page: tables, paired differences, curves, and pictures of pairs.
 
-Images of pairs are read from wherever they lie; of each run they show its matches again, or the F that it stored.
-"""
+Images of pairs are read from wherever they lie; of each run they show its matches again, or the F that it stored."""
 
 import base64
 import dataclasses

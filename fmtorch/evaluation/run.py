@@ -3,8 +3,7 @@
 Metrics are float64 and computed on the CPU: so little work needs no GPU. Threads share features and networks and start
 at once, but only one of them issues torch operations at a time: enough where detectors, networks and OpenCV do the
 work. Processes use all cores for estimators too, at some seconds and some hundred megabytes each. Rows and exports come
-back to the caller, who alone writes.
-"""
+back to the caller, who alone writes."""
 
 import contextlib
 import dataclasses

@@ -6,8 +6,7 @@ of intervals are scenes, and pairs only where there are fewer than five scenes, 
 right pairs they say [100, 100]. Shares of pairs, such as recall, therefore have the score interval, the usual
 recommendation for a proportion (Brown, Cai and DasGupta, "Interval Estimation for a Binomial Proportion", Statistical
 Science 2001), of the effective number of pairs (Korn and Graubard, "Confidence intervals for proportions with small
-expected number of positive counts estimated from survey data", Survey Methodology 1998).
-"""
+expected number of positive counts estimated from survey data", Survey Methodology 1998)."""
 
 import dataclasses
 import itertools

@@ -1,7 +1,6 @@
 """Local affine frames (N, 2, 3) in kornia's convention, and square patches cut along them, without aliasing, batched.
 
-Column 2 of a frame is the centre, columns 0 and 1 are the patch's half axes.
-"""
+Column 2 of a frame is the centre, columns 0 and 1 are the patch's half axes."""
 
 import math
 

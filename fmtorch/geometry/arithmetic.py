@@ -5,8 +5,7 @@ Library reductions (`sum`, `matmul`, LAPACK) choose their order of summation by 
 fixed, and made of sums, products, quotients and roots only, which are rounded correctly one by one.
 
 Matrices come in two layouts: with the entries last, (*batch, 3, 3), as users have them, and component-first, (3, 3, *s)
-or (9, *s) row by row, over which an operation on one entry runs over all matrices at once.
-"""
+or (9, *s) row by row, over which an operation on one entry runs over all matrices at once."""
 
 import math
 from typing import Any, cast

@@ -1,8 +1,7 @@
 """Fundamental matrices from cameras, ``x1^T F x0 = 0``, image 0 first.
 
 Matrices are of any scale and sign, leading dimensions broadcast, and a result is bit-equal whatever stands beside it in
-the batch, as in `epipolar`.
-"""
+the batch, as in `epipolar`."""
 
 from typing import NamedTuple
 

@@ -18,8 +18,7 @@ distance (Hartley & Zisserman 2004, 11.4.3), with three corrections:
    up to their noise, nothing is left.
 
 Weights that are no inverse variances, such as P(inlier), count by ``sum w / sum w^2`` (Kish 1965). Independent noise
-is assumed; on real pairs neighbours err alike, and deviations come out too small.
-"""
+is assumed; on real pairs neighbours err alike, and deviations come out too small."""
 
 from typing import NamedTuple
 

@@ -3,8 +3,7 @@
 Image 0 comes first: ``x1^T F x0 = 0``. Points are (..., N, 2) in pixels, matrices (..., 3, 3) of any scale and sign;
 leading dimensions broadcast. Only additions, multiplications, divisions and square roots of single elements are used,
 all correctly rounded, so a result is bit-equal whatever stands beside it in the batch. Where an image point falls on
-the epipole its line is undefined: its normal is then zero, and distances and gradients to it are 0, never NaN.
-"""
+the epipole its line is undefined: its normal is then zero, and distances and gradients to it are 0, never NaN."""
 
 import math
 from typing import Any, NamedTuple

@@ -3,8 +3,7 @@
 Nister, "An efficient solution to the five-point relative pose problem" (PAMI 2004). Real roots of the polynomial of
 degree ten are those across which it changes its sign between the points of a grid. Buffers are rows of LANES numbers,
 one a sample.
-E = x X + y Y + z Z + W; a monomial is a sorted triple of 0 to 3 for x, y, z, 1, in the order of the paper.
-"""
+E = x X + y Y + z Z + W; a monomial is a sorted triple of 0 to 3 for x, y, z, 1, in the order of the paper."""
 
 import itertools
 import math

@@ -1,8 +1,7 @@
 """Homographies ``x1 ~ H x0`` in tensors: of four and more matches, and the distances of matches to them.
 
 Points are (..., N, 2) in pixels, matrices (..., 3, 3) of any scale and sign; leading dimensions broadcast. Hartley &
-Zisserman (2004), Multiple View Geometry, chapter 4.
-"""
+Zisserman (2004), Multiple View Geometry, chapter 4."""
 
 import math
 from typing import Any

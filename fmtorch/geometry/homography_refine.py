@@ -1,8 +1,7 @@
 """Non-linear refinement of homographies: Levenberg-Marquardt of the robust Sampson error.
 
 Minimises ``sum_i w_i rho(r_i^2)`` over the sphere of the nine entries, by kernels, and attaches the optimum to the
-graph of points and weights. A model is refined to the same bits in any batch.
-"""
+graph of points and weights. A model is refined to the same bits in any batch."""
 
 import functools
 from collections.abc import Callable

@@ -8,8 +8,7 @@ Barath et al. (2020) for that of MAGSAC++, whose scale is k sigma_max, the dista
 
 Damped Gauss-Newton steps; each model takes its own where that lowers its cost, and else tries a shorter one (Marquardt
 1963; Hartley & Zisserman 2004, appendix 6.2). The objective is a set of inner functions, so that a whole fit is one
-call, between whose steps nothing waits for Python.
-"""
+call, between whose steps nothing waits for Python."""
 
 import math
 from collections.abc import Callable

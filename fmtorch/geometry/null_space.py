@@ -1,7 +1,6 @@
 """The null space of wide matrices by Householder reflections, LANES samples at a time.
 
-Buffers are rows of LANES numbers, one a sample.
-"""
+Buffers are rows of LANES numbers, one a sample."""
 
 from typing import Any
 

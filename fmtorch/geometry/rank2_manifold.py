@@ -2,8 +2,7 @@
 
 The tangent space at F is what is orthogonal, in R^9, to F (scale) and to ``e1 e0^T`` (rank), with ``F e0 = 0`` and
 ``F^T e1 = 0`` the epipoles. This is the orthonormal parametrisation of Bartoli & Sturm (2004) to first order, without
-its rotations, and without its defect where the singular values coincide.
-"""
+its rotations, and without its defect where the singular values coincide."""
 
 import numpy as np
 import torch

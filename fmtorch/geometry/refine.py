@@ -2,8 +2,7 @@
 
 Minimises ``sum_i w_i rho(r_i^2)``, r the Sampson distance, over the 7-dimensional manifold of 3 x 3 matrices of rank 2
 and unit norm (see `rank2_manifold`), by kernels, and attaches the optimum to the graph of points and weights. A model
-is refined to the same bits in any batch.
-"""
+is refined to the same bits in any batch."""
 
 import functools
 from collections.abc import Callable

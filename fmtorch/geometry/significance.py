@@ -3,8 +3,7 @@
 L. Moisan, B. Stival: A probabilistic criterion to detect rigid point matches between two images and estimate the
 fundamental matrix. IJCV 57 (2004). Suppose that the images show nothing in common, so that the matches of a pair are
 independent and their points anywhere. The number of false alarms of a model is how many models with as much support
-are to be expected then, in all that a search could have tried.
-"""
+are to be expected then, in all that a search could have tried."""
 
 import functools
 import math

@@ -1,7 +1,6 @@
 """What other libraries hold in memory: matches as arguments of `find_*`, geometries as estimates, and back.
 
-``fmtorch.find_fundamental(**fmtorch.from_lightglue(features0, features1, matches))``.
-"""
+``fmtorch.find_fundamental(**fmtorch.from_lightglue(features0, features1, matches))``."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any

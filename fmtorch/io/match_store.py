@@ -4,8 +4,7 @@
 
     images/<digest>.npz   keypoints, scores, size, camera of an image; the digest is of its name and its file's bytes
     pairs/<digest>.npz    indices of matched keypoints, their scores, F, its inliers and significance, and the two-view
-                          geometry for COLMAP; the digest is of the two images' digests
-"""
+                          geometry for COLMAP; the digest is of the two images' digests"""
 
 import dataclasses
 import functools

@@ -2,8 +2,7 @@
 
 Of pair ``0``, ``1``, ...: ``xs`` (1, n, 4) calibrated coordinates of matches, ``ys`` (n, k), their geodesic distance in
 the first column, ``Rs`` (3, 3), ``ts`` (3, 1), ``ratios`` and ``mutuals`` (n,), ``cx1s``, ``cy1s``, ``f1s`` and
-those of the other image. OANet ignores what else there is; ``sizes`` (h0, w0, h1, w1) is this project's.
-"""
+those of the other image. OANet ignores what else there is; ``sizes`` (h0, w0, h1, w1) is this project's."""
 
 import contextlib
 import dataclasses

@@ -7,8 +7,7 @@ a file is never stale, and it is written in one step, so that several processes 
 A version is taken from live functions, not from files: bytecode, constants, defaults, and every value that the bytecode
 takes from its module or its closure. An inner function among them is compiled into the one that calls it, so its own
 bytecode and values count as well; of a kernel, which is called through its address, only name and signature do.
-Comments, docstrings, line numbers, and what no kernel reaches count for nothing.
-"""
+Comments, docstrings, line numbers, and what no kernel reaches count for nothing."""
 
 import contextlib
 import dis

@@ -8,8 +8,7 @@ A kernel loops over NumPy arrays where a tensor form would take many small opera
 It is compiled for the types of its annotations: ``F4x2`` is an array of float32 with two axes in C order. Kernels stand
 beside the class that calls them; what they are made of versions the file that keeps them (`fmtorch.jit.cache`). Nothing
 is imported from numba before the first call. With ``FMTORCH_KERNELS=off`` estimators run their kernels interpreted by
-Python, all else takes its tensor form.
-"""
+Python, all else takes its tensor form."""
 
 import functools
 import gc

@@ -1,7 +1,6 @@
 """`lanes` for numba: values of lanes as types, their operators as vector instructions of LLVM.
 
-Imported when the first kernel that uses lanes is compiled.
-"""
+Imported when the first kernel that uses lanes is compiled."""
 
 import operator
 from collections.abc import Callable

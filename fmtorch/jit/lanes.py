@@ -8,8 +8,7 @@
 A value takes ``+ - * /`` and comparisons with another, of as many lanes, or with one number; a mask, which comparisons
 make, takes ``& | ^ ~``. In a kernel these are instructions of the processor on vectors in registers, in the order in
 which they are written; a loop over the lanes would have to ask first whether its arrays overlap, and hold its sums in
-memory. From Python a value is an array that no operator changes.
-"""
+memory. From Python a value is an array that no operator changes."""
 
 import functools
 import inspect

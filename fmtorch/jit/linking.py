@@ -2,8 +2,7 @@
 
 What numba compiles it links with all that it calls, and so compiles a kernel again for each that calls it. Here each
 kernel has a cell of memory that holds its address, and what calls it knows the cell by name. So every kernel is
-compiled once, alone and in any order; before it is first called, those that it calls must have their addresses.
-"""
+compiled once, alone and in any order; before it is first called, those that it calls must have their addresses."""
 
 import ctypes
 import functools

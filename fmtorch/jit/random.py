@@ -1,7 +1,6 @@
 """Random numbers as a stateless function of (seed, pair key, stream, draw): the same in any batch, on any device.
 
-Kernels have `random_bits` and `uniform_kernel`; tensors have `bits` and `uniform`, the same functions of arrays.
-"""
+Kernels have `random_bits` and `uniform_kernel`; tensors have `bits` and `uniform`, the same functions of arrays."""
 
 import enum
 import functools

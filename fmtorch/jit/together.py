@@ -1,8 +1,7 @@
 """Many kernels compiled by two processes: numba compiles one function at a time in each.
 
 The other process goes through the same kernels from the last to the first and leaves out what the cache folder holds.
-Where the two meet, one waits for the other: each kernel's file has a lock.
-"""
+Where the two meet, one waits for the other: each kernel's file has a lock."""
 
 import contextlib
 import os

@@ -2,8 +2,7 @@
 
 What all tasks need is shared by threads (`Local`) or made once in each process (`Factory`). A worker of a cluster, or
 of anybody's executor, has no start of its own in which to make it: each task names it by its digest, and where that
-says nothing to the worker, the task is sent again with how to make it.
-"""
+says nothing to the worker, the task is sent again with how to make it."""
 
 import contextlib
 import functools

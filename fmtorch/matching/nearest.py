@@ -1,8 +1,7 @@
 """Exhaustive two-nearest-neighbour matching in row blocks, exact and reproducible to the bit.
 
 On a CPU, kernels compute the exact distances of the few that may be neighbours by their 8-bit products (`eight_bit`);
-elsewhere, and where those tell too few apart, all distances are computed. The result is the same.
-"""
+elsewhere, and where those tell too few apart, all distances are computed. The result is the same."""
 
 import dataclasses
 import functools

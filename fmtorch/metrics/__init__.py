@@ -1,8 +1,7 @@
 """Figures of merit for fundamental matrices and matches, as plain batched functions of tensors or NumPy arrays.
 
 Their results are tensors; sizes may also be tuples (h, w).
-`fmtorch.metrics.torchmetrics` has thin classes over them that accumulate over batches and processes.
-"""
+`fmtorch.metrics.torchmetrics` has thin classes over them that accumulate over batches and processes."""
 
 from typing import TYPE_CHECKING
 

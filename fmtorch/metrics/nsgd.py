@@ -8,8 +8,7 @@ after Bian et al. (An evaluation of feature matchers for fundamental matrix esti
 3. the same with the roles of the two matrices exchanged (points still in image 0, lines in image 1) and a new m.
 
 A draw is accepted when both lines meet image 1; the figure is the mean of the four distances over accepted draws.
-It is not symmetric under exchanging the images.
-"""
+It is not symmetric under exchanging the images."""
 
 import math
 from typing import Any, NamedTuple
@@ -153,8 +152,7 @@ def nsgd_released(
     - 1e-10 is added to the length of a line's normal, so the figure depends on the scale of very small matrices.
 
     The matrices are used as they are given, in pixels from 0 or from 1. A failed estimate, zero or not finite, gets 1:
-    the evaluator never measures those and counts them as misses. Not differentiable; `nsgd` is.
-    """
+    the evaluator never measures those and counts them as misses. Not differentiable; `nsgd` is."""
     (F_gt, F_est, size0, size1, key), shape = _flattened(F_gt, F_est, size0, size1, samples, key)
     tensors = (F_gt, F_est, size0, size1, torch.stack([diagonal(size) for size in (size0, size1)], 1), key)
     constants = mixed_seed(seed, Stream.METRIC), samples, True

@@ -1,7 +1,6 @@
 """Recall over a set of pairs at a limit on their NSGD or pose error: the area under its curve, means over bins.
 
-And the same of matches: those that agree with the true F or H, and their share before and after estimation.
-"""
+And the same of matches: those that agree with the true F or H, and their share before and after estimation."""
 
 from collections.abc import Sequence
 from typing import NamedTuple

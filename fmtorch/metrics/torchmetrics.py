@@ -1,7 +1,6 @@
 """The figures of a whole evaluation as torchmetrics classes, which accumulate over batches and processes.
 
-Needs the extra `metrics`: ``pip install 'fmtorch[metrics]'``.
-"""
+Needs the extra `metrics`: ``pip install 'fmtorch[metrics]'``."""
 
 import functools
 from collections.abc import Callable, Sequence

@@ -1,7 +1,6 @@
 """A folder of images: its pairs, the work on them by any workers, which can be resumed, and where results go.
 
-Beside it what a pipeline made of pairs is kept for export: keypoints of images, matches, F and inliers of pairs.
-"""
+Beside it what a pipeline made of pairs is kept for export: keypoints of images, matches, F and inliers of pairs."""
 
 import contextlib
 import dataclasses

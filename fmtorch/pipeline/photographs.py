@@ -210,8 +210,7 @@ def division_lenses(
 ) -> tuple[Lens | None, Lens | None]:
     """Lenses of the originals from estimated lambdas (2,), None of images that are straight or not determined.
 
-    c: a batch of one, of the reduced images, whose K have focal lengths and principal points if they are known.
-    """
+    c: a batch of one, of the reduced images, whose K have focal lengths and principal points if they are known."""
     lenses: list[Lens | None] = []
     for value, K, size, scale in zip(bent.tolist(), (c.K0, c.K1), (c.size0, c.size1), scales, strict=True):
         lens = division_lens(value, cast(Tensor, size)[0].tolist())

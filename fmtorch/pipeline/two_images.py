@@ -49,8 +49,7 @@ class MatchResult:
     COLMAP, whose inliers are indices of the kept matches, twice. undistorted: where a lens distorts, the kept matches
     as pinholes would have them, which F and homography relate; points are otherwise those of the photographs.
     lens: (2,), lambda of both lenses as of `Estimate.lens`, where these were estimated.
-    photographs: as they were given, lenses: as they are known or were estimated; for pictures.
-    """
+    photographs: as they were given, lenses: as they are known or were estimated; for pictures."""
 
     keypoints0: Float[Tensor, "n0 2"]
     keypoints1: Float[Tensor, "n1 2"]
@@ -327,8 +326,7 @@ def relate(
 ) -> MatchResult:  # fmt: skip
     """What `match` finds of two photographs that are described already.
 
-    cameras: of `camera_fields` and `lens_fields`. lenses: those that are calibrated.
-    """
+    cameras: of `camera_fields` and `lens_fields`. lenses: those that are calibrated."""
     compile_with([*pipeline.pruners.values(), pipeline.estimator])
     clock = Clock(pipeline.device)
     clock("features", described0.seconds + described1.seconds)

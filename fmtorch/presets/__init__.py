@@ -1,7 +1,6 @@
 """Presets: the flat YAML files of ``conf/<group>/<name>.yaml``, loaded by name and built into objects.
 
-`files` needs neither Hydra nor OmegaConf, which compose the configs of commands and pipelines.
-"""
+`files` needs neither Hydra nor OmegaConf, which compose the configs of commands and pipelines."""
 
 from typing import TYPE_CHECKING
 

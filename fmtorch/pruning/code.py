@@ -1,7 +1,6 @@
 """CODE, coherence-based decision boundaries (Lin et al., TPAMI 2018): two robust regressions over the match domain.
 
-The domain is where a match is, where it goes and how its frame changes.
-"""
+The domain is where a match is, where it goes and how its frame changes."""
 
 import dataclasses
 import math

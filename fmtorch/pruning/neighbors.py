@@ -1,7 +1,6 @@
 """Exact nearest neighbours in the plane, by a balanced k-d tree whose nodes are known by arithmetic; what they tell.
 
-That is the map between the surroundings of a match, and which matches LPM keeps.
-"""
+That is the map between the surroundings of a match, and which matches LPM keeps."""
 
 import math
 from collections.abc import Mapping, Sequence

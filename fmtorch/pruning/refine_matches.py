@@ -2,8 +2,7 @@
 
 Lucas and Kanade (IJCAI 1981) and Gruen (Adaptive least squares correlation, 1985), with an affine map, gain and offset,
 in the inverse compositional form (Baker and Matthews, IJCV 2004, section 3.2): the derivatives are those of image 0,
-made once, and every step samples image 1.
-"""
+made once, and every step samples image 1."""
 
 import dataclasses
 import math

@@ -1,7 +1,6 @@
 """Things that stand about (trees, lamp posts, cars, people, rocks, statues, columns) and house fronts in relief.
 
-A front is one painted picture; windows are set back from it, sills, cornices and signs set off.
-"""
+A front is one painted picture; windows are set back from it, sills, cornices and signs set off."""
 
 import dataclasses
 from typing import Literal, NamedTuple

@@ -1,8 +1,7 @@
 """The embedded data sets: `RenderedPairs`, drawn on first use from known cameras, and `StereoPair`, a real pair.
 
 Every scene is a function of (version, seed, split, family, number) alone and is written to a temporary folder that is
-renamed when complete, so that an interrupted generation goes on where it stopped and two processes never clash.
-"""
+renamed when complete, so that an interrupted generation goes on where it stopped and two processes never clash."""
 
 import dataclasses
 import functools

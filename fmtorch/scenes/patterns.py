@@ -1,7 +1,6 @@
 """Procedural pictures, float32 RGB in [0, 1], sRGB: materials (masonry, wood, ground, leaves, sky), and painted things.
 
-Painted are windows, doors, signs, posters, books, cars and people.
-"""
+Painted are windows, doors, signs, posters, books, cars and people."""
 
 import colorsys
 import string

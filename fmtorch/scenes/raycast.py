@@ -2,8 +2,7 @@
 
 A piece ``X = O + s U + t V`` is seen by a camera P through the homography ``G = P [U V O; 0 0 1]``. Hence the ray of
 pixel x meets its plane at ``(s, t, 1) = z G^-1 (x, y, 1)``: three linear forms and one division for each pixel, and the
-depth z is the reciprocal of the third form. Each piece is intersected with the rays of its bounding box only.
-"""
+depth z is the reciprocal of the third form. Each piece is intersected with the rays of its bounding box only."""
 
 import dataclasses
 import functools

@@ -1,7 +1,6 @@
 """Labelled matches of any data set with ground truth, and the training of learned pruners on them.
 
-The loop needs the extra `train`: `fmtorch.training.run`, run by `fmtorch train`.
-"""
+The loop needs the extra `train`: `fmtorch.training.run`, run by `fmtorch train`."""
 
 from typing import TYPE_CHECKING
 

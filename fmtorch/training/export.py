@@ -1,8 +1,7 @@
 """How good a pruner is, through real estimators on whole pairs; and what its training leaves.
 
 That is the network as safetensors and ONNX, which state the network that they belong to, and a card that says where it
-comes from and how good it is.
-"""
+comes from and how good it is."""
 
 import contextlib
 import copy

@@ -11,8 +11,7 @@ Random changes are a function of (seed, pair key, epoch) alone and leave the tru
 after. Images are transformed without being seen: an affine map T of pixels takes points x to T x, local frames with
 them, the calibration K to T K (a rotation of the pixels becomes one of the camera, so that K stays upper triangular)
 and the fundamental matrix to ``T1^-T F T0^-1``. Labels and the matcher's figures stay as they are. Matches that fall
-away are masked; `LabelledMatches.compact` takes them out.
-"""
+away are masked; `LabelledMatches.compact` takes them out."""
 
 import dataclasses
 import math

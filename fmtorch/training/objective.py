@@ -2,8 +2,7 @@
 
 Each loss is a mean over the pairs that it can judge. A pair that it cannot judge (no labelled match, a fit that failed,
 no true geometry) adds zero to loss and gradient; where that holds for all pairs, the loss is zero and still attached to
-the graph. So no training step needs to be skipped.
-"""
+the graph. So no training step needs to be skipped."""
 
 import torch
 from jaxtyping import Bool, Float, Int, Int8, Real

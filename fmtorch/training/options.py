@@ -1,7 +1,6 @@
 """What `fmtorch train` takes beside groups of presets: each option with its type, default and help, declared once.
 
-Nothing here imports a library, for which ``--help`` would wait.
-"""
+Nothing here imports a library, for which ``--help`` would wait."""
 
 import dataclasses
 import math

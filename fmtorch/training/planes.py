@@ -2,8 +2,7 @@
 
 Rendered scenes show few textures under exact light. A photograph seen as a plane has the texture of the world, and the
 depth of every point of its views is known; but the matches of one plane determine no fundamental matrix (Hartley and
-Zisserman, section 11.9), so that these pairs train the classification of matches alone.
-"""
+Zisserman, section 11.9), so that these pairs train the classification of matches alone."""
 
 import dataclasses
 import hashlib

@@ -1,7 +1,6 @@
 """`fmtorch train`: a composed config -> labelled matches, a network trained by Lightning, its files and its card.
 
-What is already done is taken up again, whatever ended the last attempt.
-"""
+What is already done is taken up again, whatever ended the last attempt."""
 
 import dataclasses
 import functools

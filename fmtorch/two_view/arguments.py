@@ -1,7 +1,6 @@
 """The door: what users say of two views, checked once, as `Correspondences` that need no second look.
 
-NumPy or torch, one pair or a batch, pairs of different lengths as lists.
-"""
+NumPy or torch, one pair or a batch, pairs of different lengths as lists."""
 
 from __future__ import annotations
 

@@ -1,7 +1,6 @@
 """Two-view geometries of a COLMAP database, of hloc's files, or of matches alone, whoever made them.
 
-Pairs are estimated batch by batch; their geometries are kept until all are there.
-"""
+Pairs are estimated batch by batch; their geometries are kept until all are there."""
 
 import contextlib
 import dataclasses

@@ -3,8 +3,7 @@
 Their mean is normal, and so is their difference, with a well at zero for images of one size: these mostly come from one
 camera. A focal length that is measured (a calibration, EXIF) adds a term: quadratic where the measurement is exact,
 else with a heavy tail, since what a file says may be of another crop, zoom or sensor. That mostly concerns both images,
-which have one tail together: ``3 z^2 / (z^2 + 6)``, z^2 the sum of both squares.
-"""
+which have one tail together: ``3 z^2 / (z^2 + 6)``, z^2 the sum of both squares."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
 """The posterior of two cameras given matches, and its maximum near models: refinement with the prior.
 
 axes: (k, 2, 3, 3), U and V of ``E = U diag(1, 1, 0) V^T``, rows first. focal: (k, 2), logarithms of focal lengths in
-units of the longer sides. Points are from the principal points.
-"""
+units of the longer sides. Points are from the principal points."""
 
 from __future__ import annotations
 

@@ -56,8 +56,7 @@ class FundamentalWithFocals:
         """Models of least ``sum P rho(r) / (2 sigma^2) + cost(f0, f1)`` near F (k, 9), and their cameras.
 
         r is the Sampson distance in pixels, sigma INLIER_SIGMA_PX, rho the loss of Geman & McClure at LOSS_SCALE_PX.
-        A model that is not finite comes back as something that is not, with a prior cost of infinity.
-        """
+        A model that is not finite comes back as something that is not, with a prior cost of infinity."""
         k, precision = len(F), squared(pair.pixels_per_unit / INLIER_SIGMA_PX)
         cameras, refined = posterior.no_cameras(k), Refined(np.empty((k, 9)), np.empty(k), np.empty(k))
         limits, parallel = Limits(precision, iterations, -1.0), PARALLEL_PX / pair.pixels_per_unit

@@ -35,8 +35,7 @@ class MatchInputs:
       "rotation": cosine and sine of that map's rotation (of its polar decomposition), so without a jump at any angle.
       "agreement": ``2 a - 1`` with a of `frame_agreement`, in [-1, 1].
 
-    Raises ValueError for unknown names.
-    """
+    Raises ValueError for unknown names."""
 
     coordinates: str = "size"
     side: tuple[str, ...] = ()

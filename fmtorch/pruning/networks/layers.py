@@ -1,8 +1,7 @@
 """The layers that learned pruners share: perceptrons applied to each match, and normalisation over matches with a mask.
 
 Activations are (channels, B, N): one matrix product serves all pairs, and sums over the matches of a pair run along
-contiguous memory. In masked slots they are zero, and so are their gradients.
-"""
+contiguous memory. In masked slots they are zero, and so are their gradients."""
 
 import math
 from typing import Any, NamedTuple

@@ -1,8 +1,7 @@
 """Learned pruners: a network and its learned file as a stage, which drops matches or supplies their prior.
 
 Weights are safetensors, a backbone is ONNX; both state the network they belong to. Reading one executes nothing of it:
-whoever reads the file builds the network, which has to be the one that it states.
-"""
+whoever reads the file builds the network, which has to be the one that it states."""
 
 import copy
 import json

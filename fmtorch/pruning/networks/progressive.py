@@ -2,8 +2,7 @@
 
 OANet: Zhang et al., "Learning two-view correspondences and geometry using order-aware network", ICCV 2019.
 CLNet: Zhao et al., "Progressive correspondence pruning by consensus learning", ICCV 2021.
-NCMNet: Liu & Yang, "Progressive neighbor consistency mining for correspondence pruning", CVPR 2023.
-"""
+NCMNet: Liu & Yang, "Progressive neighbor consistency mining for correspondence pruning", CVPR 2023."""
 
 import functools
 from collections.abc import Callable, Sequence
