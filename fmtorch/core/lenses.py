@@ -1,7 +1,5 @@
 """Calibrated lenses: where they put what a pinhole would have put elsewhere. All of COLMAP's models, by its names."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
@@ -58,7 +56,7 @@ class Lens:
         moved = [(self.distort(points + step) - self.distort(points - step)) / (2 * step.sum()) for step in steps]
         return np.stack(moved, -1)
 
-    def scaled(self, sx: float, sy: float) -> Lens:
+    def scaled(self, sx: float, sy: float) -> "Lens":
         """The lens of the photograph whose width and height are resampled to so many times theirs."""
         centre = (self.cx + 0.5) * sx - 0.5, (self.cy + 0.5) * sy - 0.5
         return Lens(self.fx * sx, self.fy * sy, *centre, self.model, self.coefficients)

@@ -4,8 +4,6 @@ Conventions (the whole project's):
 points are (x, y) in pixels with (0, 0) at the centre of the first pixel; sizes are (h, w); image 0 comes first and
 ``x1^T F x0 = 0``; ``mask`` is True for a real, surviving match, and what stands in a masked slot means nothing."""
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import html
@@ -96,7 +94,7 @@ class Features(Record):
     def __len__(self) -> int:
         return int(self.lafs.shape[-3])
 
-    def __getitem__(self, index: Index) -> Features:
+    def __getitem__(self, index: Index) -> "Features":
         """Of a batch, the selected images (still a batch); of one image, the selected features."""
         i = as_index(index, self.lafs.shape[0])
         size = self.image_size[i] if self.image_size.dim() > 1 else self.image_size
@@ -167,7 +165,7 @@ class Correspondences(Record):
     def __len__(self) -> int:
         return int(self.x0.shape[0])
 
-    def __getitem__(self, index: Index) -> Correspondences:
+    def __getitem__(self, index: Index) -> "Correspondences":
         i = as_index(index, len(self))
         return self._map(lambda value: value[i])
 
@@ -175,14 +173,14 @@ class Correspondences(Record):
         """Number of surviving matches of each pair."""
         return self.mask.sum(-1)
 
-    def keep(self, mask: Bool[Tensor, "b n"]) -> Correspondences:
+    def keep(self, mask: Bool[Tensor, "b n"]) -> "Correspondences":
         """The same matches, of which only those also in `mask` survive; ValueError for a mask of another kind."""
         if mask.shape != self.mask.shape or mask.dtype != torch.bool:
             shape = tuple(self.mask.shape)
             raise ValueError(f"mask is {mask.dtype} {tuple(mask.shape)}; it must be booleans of shape {shape}")
         return self.replace(mask=self.mask & mask)
 
-    def compact(self, multiple: int = 1) -> Correspondences:
+    def compact(self, multiple: int = 1) -> "Correspondences":
         """Survivors moved to the front in their order, padding cut to the longest pair (rounded up to `multiple`)."""
         longest = int(self.count().max()) if self.mask.numel() else 0
         n = -(-longest // multiple) * multiple
@@ -310,7 +308,7 @@ class Estimate(Record):
     def __len__(self) -> int:
         return int(self.F.shape[0])
 
-    def __getitem__(self, index: Index) -> Estimate:
+    def __getitem__(self, index: Index) -> "Estimate":
         i = as_index(index, len(self))
         picked = torch.arange(len(self), device=self.ok.device)[i].tolist()
         return self._map(lambda value: value[i], reason=tuple(self.reason[j] for j in picked))

@@ -3,8 +3,6 @@
 Pairs are estimated on the host, whatever device the caller's tensors are on, and shared out among threads, which
 changes no result. What stands beside a pair in the batch is never looked at."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
@@ -180,7 +178,7 @@ class Batch(NamedTuple):
     one_lens: Array
 
     @staticmethod
-    def of(c: Correspondences) -> Batch:
+    def of(c: Correspondences) -> "Batch":
         """Views where the tensors are of float32 or float64."""
         prior, noise, ambiguity = [None if t is None else _array(t) for t in (c.prior, c.noise, c.ambiguity)]
         keys: list[int] = c.keys.tolist()

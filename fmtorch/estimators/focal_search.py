@@ -1,7 +1,5 @@
 """The search among plausible cameras: rounds of samples of five, each refined with the prior on focal lengths."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 
@@ -58,19 +56,19 @@ class PlausibleCandidates:
         self.F, self.best = refined.models, int(posterior.argmax())
         self.valid = math.isfinite(posterior[self.best])
 
-    def joined(self, other: PlausibleCandidates) -> PlausibleCandidates:
+    def joined(self, other: "PlausibleCandidates") -> "PlausibleCandidates":
         """The candidates of both."""
         refined = Refined(*map(np.concatenate, zip(self.refined, other.refined, strict=True)))
         posterior = np.concatenate([self.posterior, other.posterior])
         return PlausibleCandidates(refined, posterior, self.cameras.joined(other.cameras))
 
-    def best_alone(self) -> PlausibleCandidates:
+    def best_alone(self) -> "PlausibleCandidates":
         """The candidate of the greatest posterior alone."""
         k = slice(self.best, self.best + 1)
         refined = Refined(*(values[k] for values in self.refined))
         return PlausibleCandidates(refined, self.posterior[k], self.cameras.of(self.best))
 
-    def judged(self, score: Score, pair: Pair) -> PlausibleCandidates:
+    def judged(self, score: Score, pair: Pair) -> "PlausibleCandidates":
         """The same with the posterior by a score."""
         gain, valid, posterior = scores_of(score, self.F, pair), np.isfinite(self.posterior), np.empty(len(self.F))
         posteriors(gain, self.refined.share, self.refined.cost, valid, posterior)
@@ -81,7 +79,7 @@ class PlausibleCandidates:
         """The best one."""
         return Selection(self.F[self.best], self.valid, self.cameras.of(self.best) if self.valid else None)
 
-    def confirmed(self, other: PlausibleCandidates) -> bool:
+    def confirmed(self, other: "PlausibleCandidates") -> bool:
         """Whether the best of both are one model."""
         return self.valid and other.valid and same_model(self.F[self.best], other.F[other.best], SAME_CAMERAS)
 

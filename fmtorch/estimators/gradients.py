@@ -3,8 +3,6 @@
 The value of an estimate is computed without a graph; a zero that has its gradients is added to it. So the estimate has
 the same bits whether anybody asks for gradients or not, and gradients are those of the fit, not of the search."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import NamedTuple
 

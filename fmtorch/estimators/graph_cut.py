@@ -1,7 +1,5 @@
 """The local optimisation of Graph-Cut RANSAC: good models made better from their spatially coherent inliers."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

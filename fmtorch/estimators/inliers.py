@@ -1,7 +1,5 @@
 """Which matches are inliers of a model, and whether a model may be taken for the best there is."""
 
-from __future__ import annotations
-
 import functools
 import math
 from typing import Protocol, runtime_checkable

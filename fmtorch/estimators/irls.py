@@ -1,7 +1,5 @@
 """M-estimators of fundamental matrices by iteratively reweighted least squares: no samples, no random numbers."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 

@@ -5,8 +5,6 @@
 r^2)`` the epipolar constraint is a polynomial, ``h1^T F h0 = 0``, whose Sampson distance by the photograph's own
 coordinates needs no undistorted point (the tangent Sampson error of Terekhov & Larsson, ICCV 2023)."""
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple
 

@@ -1,7 +1,5 @@
 """A round's models compared on few matches first, so that only the best of them are scored on all."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from typing import Annotated

@@ -4,8 +4,6 @@
 is control flow on one pair: `PARTS` names the parts, which hold the arithmetic, and beside which the options of each
 verb are described; `batch` leads from tensors to pairs and back."""
 
-from __future__ import annotations
-
 import functools
 import inspect
 import math

@@ -3,8 +3,6 @@
 A fit has a value, computed here without a graph, and a gradient, which `gradients` attaches to it: so the estimate has
 the same bits whether anybody asks for gradients or not."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import math

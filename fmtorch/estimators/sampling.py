@@ -1,7 +1,5 @@
 """Which matches a minimal sample holds: a stateless function of (seed, pair key, draw)."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np

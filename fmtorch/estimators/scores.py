@@ -2,8 +2,6 @@
 
 Per-match gains are rounded to few fractional bits, so that their sums are exact in any order. Larger is better."""
 
-from __future__ import annotations
-
 import functools
 import math
 from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable

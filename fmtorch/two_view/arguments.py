@@ -2,8 +2,6 @@
 
 NumPy or torch, one pair or a batch, pairs of different lengths as lists."""
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Mapping, Sequence

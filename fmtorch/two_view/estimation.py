@@ -1,7 +1,5 @@
 """One estimator call as the public functions make it: preset, prior, cameras, verdict."""
 
-from __future__ import annotations
-
 import functools
 import json
 from collections.abc import Callable, Mapping

@@ -1,7 +1,5 @@
 """Estimates of pairs whose cameras are known, exactly or roughly, by any estimator of fundamental matrices."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

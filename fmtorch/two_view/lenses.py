@@ -1,7 +1,5 @@
 """Matches of photographs whose lenses are calibrated, as pinholes would have them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any, cast
 

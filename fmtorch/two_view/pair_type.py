@@ -1,7 +1,5 @@
 """Of which type each pair of an estimate is: what its fundamental matrix is worth."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
@@ -54,7 +52,7 @@ class PairTypes(NamedTuple):
         flat = (self.kind == kinds.PLANAR) | (self.kind == kinds.ROTATION) | (self.kind == kinds.IDENTICAL)
         return self.homography.ok & flat
 
-    def of_pair(self, i: int) -> PairTypes:
+    def of_pair(self, i: int) -> "PairTypes":
         """That of the i-th pair alone."""
         return PairTypes(self.kind[i : i + 1], Evidence(*(v[i : i + 1] for v in self.evidence)), self.homography[i])
 

@@ -5,8 +5,6 @@ camera. A focal length that is measured (a calibration, EXIF) adds a term: quadr
 else with a heavy tail, since what a file says may be of another crop, zoom or sensor. That mostly concerns both images,
 which have one tail together: ``3 z^2 / (z^2 + 6)``, z^2 the sum of both squares."""
 
-from __future__ import annotations
-
 import functools
 import math
 from statistics import NormalDist

@@ -1,8 +1,6 @@
 """Matrices without assumptions: fundamental ones of seven or eight matches, refined on the manifold of rank 2, and
 homographies, ``x1 ~ H x0``, of four, refined on the sphere of nine entries."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import ClassVar, NamedTuple
 

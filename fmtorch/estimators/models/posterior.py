@@ -3,8 +3,6 @@
 axes: (k, 2, 3, 3), U and V of ``E = U diag(1, 1, 0) V^T``, rows first. focal: (k, 2), logarithms of focal lengths in
 units of the longer sides. Points are from the principal points."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,15 +27,15 @@ class Cameras(NamedTuple):
     axes: F8x4
     focal: F8x2
 
-    def of(self, k: int) -> Cameras:
+    def of(self, k: int) -> "Cameras":
         """Those of one candidate."""
         return Cameras(self.axes[k : k + 1], self.focal[k : k + 1])
 
-    def joined(self, other: Cameras) -> Cameras:
+    def joined(self, other: "Cameras") -> "Cameras":
         """The candidates of both."""
         return Cameras(np.concatenate([self.axes, other.axes]), np.concatenate([self.focal, other.focal]))
 
-    def copy(self) -> Cameras:
+    def copy(self) -> "Cameras":
         """The same in memory of its own."""
         return Cameras(self.axes.copy(), self.focal.copy())
 

@@ -1,7 +1,5 @@
 """Fundamental matrices of cameras with plausible focal lengths: samples of five matches and drawn focal lengths."""
 
-from __future__ import annotations
-
 import math
 from typing import Any, ClassVar, NamedTuple
 
