@@ -109,7 +109,9 @@ def _missing(pairs: Sequence[ImagePair], folder: RunFolder, journal: MatchStore 
     if again and done:
         table = folder.read(done, without=("pair", "F"))
         done = set(table["key"].filter(table["ok"]).to_pylist())
-    return [p for p in pairs if p.key not in done or (journal is not None and _to_export(journal, p))]
+    images = {p.key: (p.image0.path, p.image1.path) for p in pairs if exportable(p)}
+    missing = {k for k, ends in images.items() if journal is not None and not journal.has_pair(*ends)}
+    return [p for p in pairs if p.key not in done or (p.key in missing and all(map(Path.is_file, images[p.key])))]
 
 
 def _evaluated(
@@ -154,12 +156,6 @@ def _journal(folder: Path, pairs: Sequence[ImagePair]) -> MatchStore:
     if not parents:
         raise ValueError("export: no pair has images in which a pipeline finds keypoints, as they are stored")
     return MatchStore(folder / "export", Path(os.path.commonpath(sorted(parents))))
-
-
-def _to_export(journal: MatchStore, pair: ImagePair) -> bool:
-    """Whether a pair's matches are not in the journal yet, and its images are there."""
-    ends = pair.image0.path, pair.image1.path
-    return exportable(pair) and all(path.is_file() for path in ends) and not journal.has_pair(*ends)
 
 
 @job

@@ -2,8 +2,6 @@
 
 Help, and a mistake in the command's name, are answered here, before any library is imported."""
 
-from __future__ import annotations
-
 import os
 import sys
 from collections.abc import Callable, Sequence
@@ -79,7 +77,7 @@ def _command(name: str) -> Callable[[], None]:
     return main
 
 
-def help_text(command: Command) -> str:
+def help_text(command: "Command") -> str:
     """The page of a command: what it does, its groups of presets and its options, each with its default."""
     import dataclasses
 

@@ -85,8 +85,14 @@ def match_folder(
     written += [*export.write_view_graph(graph, output), _draw_graph(graph, folder, fields.orient, output)]
     _say(work, graph, len(pairs))
     console.print(f"{output}: {', '.join(written)}", style="dim")
-    if "colmap" in kinds and fields.orient:
-        _say_turned(images, folder)
+    exported = images if "colmap" in kinds and fields.orient else ()
+    if turned := [image.relative_to(folder).as_posix() for image in exported if stored_orientation(image) != 1]:
+        said = files.head(turned)
+        console.print(
+            f"turned by their orientation tags: {said}. Keypoints and cameras in database.db are those of the turned "
+            "images, from which COLMAP's mapper works; but COLMAP reads files as they are stored, so that "
+            "its colours, undistorted images and dense reconstruction will not fit. Turn the files, or use orient=false"
+        )
     if isinstance(pipeline.extractor, CachedFeatures) and pipeline.extractor.cache.folder != scratch:
         console.print(pipeline.extractor.report(), style="dim")
     return output
@@ -108,16 +114,6 @@ def _say(work: FolderMatches, graph: export.ViewGraph, pairs: int) -> None:
     if sizes:
         others = f"; {apart} images are in no related pair" if apart else ""
         console.print(f"connected images: {', '.join(map(str, sizes))}{others}")
-
-
-def _say_turned(images: Sequence[Path], folder: Path) -> None:
-    if turned := [image.relative_to(folder).as_posix() for image in images if stored_orientation(image) != 1]:
-        said = files.head(turned)
-        console.print(
-            f"turned by their orientation tags: {said}. Keypoints and cameras in database.db are those of the turned "
-            "images, from which COLMAP's mapper works; but COLMAP reads files as they are stored, so that "
-            "its colours, undistorted images and dense reconstruction will not fit. Turn the files, or use orient=false"
-        )
 
 
 def _draw_graph(graph: export.ViewGraph, folder: Path, orient: bool, output: Path) -> str:

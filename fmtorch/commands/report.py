@@ -24,7 +24,10 @@ def run(config: DictConfig) -> Path:
     fields = read_fields(ReportOptions, config)
     paths = [Path(path) for path in ([fields.runs] if isinstance(fields.runs, str) else fields.runs)]
     runs = named([RunFolder.load(path) for path in run_folders(paths)])
-    if _by_recall(fields.order, paths):
+    if fields.order not in (None, "given", "recall"):
+        raise ValueError(f"order={fields.order} must be given or recall")
+    given = fields.order == "given" or all((path / "run.json").exists() for path in paths)
+    if fields.order == "recall" or not given:
         runs.sort(key=lambda r: -_recall(r.table))
     roots = [fields.root] if isinstance(fields.root, str) else fields.root or []
     places, device = [Path(root) for root in roots], presets.resolve_device(fields.device)
@@ -94,12 +97,6 @@ def _merged(held: Sequence[tuple[RunFolder, pa.Table]]) -> list[tuple[RunFolder,
             runs.append((folder, table))
             keys.append(own)
     return runs
-
-
-def _by_recall(order: str | None, paths: Sequence[Path]) -> bool:
-    if order not in (None, "given", "recall"):
-        raise ValueError(f"order={order} must be given or recall")
-    return order == "recall" or (order is None and not all((path / "run.json").exists() for path in paths))
 
 
 def by_dataset(runs: Sequence[Run]) -> dict[str, list[Run]]:

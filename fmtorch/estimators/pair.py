@@ -1,7 +1,5 @@
 """One pair as estimators see it: its usable matches in normalised units, without padding or neighbours."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Hashable
 from typing import Any, NamedTuple, TypeVar
@@ -116,7 +114,7 @@ class Pair:
         """The points as scores take them, float32."""
         return self.cached("points32", lambda pair: pair.points.astype(np.float32))
 
-    def cached(self, name: Hashable, compute: Callable[[Pair], T]) -> T:
+    def cached(self, name: Hashable, compute: Callable[["Pair"], T]) -> T:
         """What a part computes of all these matches, and needs again."""
         value: T | None = self._cache.get(name)
         if value is None:
@@ -134,11 +132,11 @@ class Pair:
         uniforms(self.mixed_seed(Stream.SAMPLING), self.key, start, out)
         return out
 
-    def take(self, index: Array) -> Pair:
+    def take(self, index: Array) -> "Pair":
         """The same pair with the matches of these indices."""
         return self.with_table(self.table.take(index, 1), self.known, self.lens)
 
-    def with_table(self, table: Array, known: tuple[bool, bool, bool], lens: Lens | None) -> Pair:
+    def with_table(self, table: Array, known: tuple[bool, bool, bool], lens: Lens | None) -> "Pair":
         """The same pair with another table."""
         return Pair(
             table, known, self.bucket, self.pixels_per_unit, self.key, self.seed, self.centre, self.sizes,

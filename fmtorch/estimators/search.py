@@ -2,8 +2,6 @@
 
 DEGENSAC completes models that fit a plane alone, by the parallax of the rest."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable
@@ -37,7 +35,7 @@ class Pool:
     samples: int = 0
 
     @staticmethod
-    def empty(size: int) -> Pool:
+    def empty(size: int) -> "Pool":
         """No model yet."""
         return Pool(np.zeros((size, 9), np.float32), np.full(size, -np.inf))
 
@@ -46,7 +44,7 @@ class Pool:
         """The models in float64, (m, 9); where there is none one of zeros."""
         return self.F[: max(self.filled, 1)].astype(np.float64)
 
-    def merge(self, models: Verified) -> None:
+    def merge(self, models: "Verified") -> None:
         """Keep the best of this pool's models and the new ones; the earlier draw wins a tie."""
         self.filled = merge(models.F, models.which, models.score, self.filled, self.F, self.score)
 
@@ -72,7 +70,7 @@ class Search:
     hypotheses: int
     round: int
     stop: Stop | None = None
-    degeneracy: Degensac | None = None
+    degeneracy: "Degensac | None" = None
 
     def __call__(self, pair: Pair, start: int = 0) -> Pool:
         """The best models of a pair. start: draws made before."""

@@ -89,7 +89,14 @@ class Validation:
         labelled = [pair.labelled for pair in self.pairs]
         logit = torch.cat([value[mask] for value, mask in zip(logits, labelled, strict=True)])
         label = torch.cat([pair.label[mask] for pair, mask in zip(self.pairs, labelled, strict=True)])
-        figures = {"log_loss": float(classification_loss(logit[None], label[None])), **_classified(logit, label)}
+        kept, inlier = logit >= 0, label == 1  # P >= 0.5
+        right = float((kept & inlier).sum())
+        figures = {
+            "log_loss": float(classification_loss(logit[None], label[None])),
+            "match_precision": right / max(float(kept.sum()), 1.0),
+            "match_recall": right / max(float(inlier.sum()), 1.0),
+            "calibration_error": reliability(torch.sigmoid(logit), label).error,
+        }
         for name, values in nsgd.items():
             figures |= self._recalls(name, values)
         return Evaluation(figures, logit, label)
@@ -120,17 +127,6 @@ class Validation:
             mine = torch.tensor([f == family for f in self.families])
             figures[f"{name}/AUC@0.05/{family}"] = float(metrics.mean_recall(nsgd[mine]))
         return figures
-
-
-def _classified(logit: Tensor, label: Tensor) -> dict[str, float]:
-    """Precision and recall of the matches with P >= 0.5, and the expected calibration error."""
-    kept, inlier = logit >= 0, label == 1
-    right = float((kept & inlier).sum())
-    return {
-        "match_precision": right / max(float(kept.sum()), 1.0),
-        "match_recall": right / max(float(inlier.sum()), 1.0),
-        "calibration_error": reliability(torch.sigmoid(logit), label).error,
-    }
 
 
 class Reliability(NamedTuple):

@@ -1,7 +1,5 @@
 """The two-line replacements for `cv2.findFundamentalMat`, `cv2.findEssentialMat` and `cv2.findHomography`."""
 
-from __future__ import annotations
-
 import functools
 import sys
 import warnings
@@ -171,7 +169,7 @@ def find_fundamental(
     return with_pair_type(estimate, seen, seed) if pair_type else estimate
 
 
-def _lenses(lens: Lens, x0: Arrays, K0: Arrays | None = None, K1: Arrays | None = None) -> CalibratedLenses | None:
+def _lenses(lens: Lens, x0: Arrays, K0: Arrays | None = None, K1: Arrays | None = None) -> "CalibratedLenses | None":
     """Calibrated lenses, and K of their images and others; None where lenses are estimated, or lambda is known."""
     if not is_calibrated(lens):
         return None

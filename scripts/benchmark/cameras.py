@@ -6,8 +6,6 @@ shared (one unknown focal length; of pairs of one camera alone); unknown. Peers 
 and noise from the keypoints' frames are part of ours, and of its time.
 """
 
-from __future__ import annotations
-
 import argparse
 import csv
 import dataclasses

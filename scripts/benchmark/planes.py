@@ -4,8 +4,6 @@ docs/benchmarks/homographies.md says what warped and hard pairs and views are. S
 P(inlier) from frame consistency. Every second photograph is for tuning (--tuning), the others for the claim.
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import functools
@@ -22,8 +20,8 @@ from rich.progress import track
 from fmtorch import find_homography, match, metrics, presets
 from fmtorch.core.types import PAIR_TYPES, Correspondences, Estimate, collate
 from fmtorch.data import ImagePair, ImageSource, read_image
-from fmtorch.estimators.external import colmap
 from fmtorch.geometry import poses_from_homography
+from fmtorch.io.colmap import imported
 from fmtorch.pipeline.pipeline import Outcome
 from fmtorch.scenes.raycast import calibration
 from fmtorch.training.planes import Photograph, PlanePairs, PlaneViews
@@ -172,12 +170,16 @@ def by_ours(estimator: Any, known: bool, c: Correspondences) -> str:
 def by_colmap(threshold: float, c: Correspondences) -> str:
     """COLMAP's two-view geometry of calibrated cameras at a threshold of so many pixels."""
     known: Any = ((c.K0, c.size0), (c.K1, c.size1))
-    first, second = (
-        colmap.Camera(K[0].double().numpy(), number=number, size=(int(size[0, 0]), int(size[0, 1])))
-        for number, (K, size) in enumerate(known)
-    )
-    geometry = colmap.two_view_geometry(*points(c), (first, second), colmap.two_view_options(threshold, 0))
-    return COLMAP[geometry.configuration]
+    library, (x0, x1) = imported(), points(c)
+    options = library.TwoViewGeometryOptions(compute_relative_pose=True)
+    options.ransac.max_error, options.ransac.random_seed = threshold, 0
+    cameras = [library.Camera(camera_id=i, model="PINHOLE") for i in (1, 2)]
+    for camera, (K, size) in zip(cameras, known, strict=True):
+        (camera.height, camera.width), k = size[0].int().tolist(), K[0].double()
+        camera.params, camera.has_prior_focal_length = [k[0, 0], k[1, 1], k[0, 2], k[1, 2]], True
+    matches = np.repeat(np.arange(len(x0), dtype=np.uint32)[:, None], 2, 1)
+    geometry = library.estimate_two_view_geometry(cameras[0], x0, cameras[1], x1, matches, options)
+    return COLMAP[library.TwoViewGeometryConfiguration(geometry.config).name]
 
 
 def kinds_sheet(rows: Sequence[Row]) -> Sheet:

@@ -24,7 +24,6 @@ from numpy.typing import NDArray
 
 import fmtorch
 from fmtorch.data.cameras import Camera, relative_pose
-from fmtorch.estimators.external import colmap
 from fmtorch.io.colmap import imported, remove_database
 from fmtorch.metrics import pose_auc, pose_error
 from scripts.benchmark.runner import Kept, Row, add_command
@@ -131,7 +130,8 @@ def verified_by(method: str, path: Path, seed: int) -> Row:
     if kind == "ours":
         fmtorch.verify(path, seed=seed)
     else:
-        options = colmap.two_view_options(float(threshold), seed)
+        options = pycolmap.TwoViewGeometryOptions(compute_relative_pose=True)
+        options.ransac.max_error, options.ransac.random_seed = float(threshold), seed
         one = pycolmap.GeometricVerifierOptions(num_threads=1)
         pycolmap.geometric_verification(path, verifier_options=one, two_view_geometry_options=options)
     seconds = time.process_time() - start

@@ -121,11 +121,14 @@ def test_each_pair_of_a_batch_gets_the_options_of_its_family() -> None:
 def test_gms_tries_scales_on_wide_baselines_alone() -> None:
     for name in ("sift_gms", "paper/hesaffnet_gms"):
         pipeline = load_pipeline(name, overrides=["+pruner.gms.families.mine.with_scale=true"])
-        scale = {family: pipeline.pruners_of(family)["gms"].with_scale for family in ("TUM", "CPC", "mine", "other")}  # type: ignore[attr-defined]
+        scale = {
+            family: pipeline.pruners_of(family)["gms"]._options["with_scale"]
+            for family in ("TUM", "CPC", "mine", "other")
+        }  # type: ignore[attr-defined]
         assert scale == {"TUM": False, "CPC": True, "mine": True, "other": False}
         assert {pruner.threshold_factor for pruner in (pipeline.pruners_of(f)["gms"] for f in scale)} == {4.0}  # type: ignore[attr-defined]
         usual = load_pipeline(name, overrides=["pruner.gms.families=null"])
-        assert not usual.pruners_of("CPC")["gms"].with_scale  # type: ignore[attr-defined]
+        assert not usual.pruners_of("CPC")["gms"]._options["with_scale"]  # type: ignore[attr-defined]
 
 
 @pytest.mark.parametrize(
@@ -148,7 +151,7 @@ def test_an_option_that_is_given_explicitly_holds_for_all_families(overrides, sc
 
     def scales(config: DictConfig) -> dict[str, bool]:
         pipeline = build_pipeline(config)
-        return {family: pipeline.pruners_of(family)["gms"].with_scale for family in expected}  # type: ignore[attr-defined]
+        return {family: pipeline.pruners_of(family)["gms"]._options["with_scale"] for family in expected}  # type: ignore[attr-defined]
 
     assert scales(compose("match", words)) == expected
     with hydra.initialize_config_dir(str(conf_dir()), version_base=None):  # as a command

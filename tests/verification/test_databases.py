@@ -164,7 +164,7 @@ def test_configurations_of_special_pairs(kind: str, name: str, path: Path) -> No
     assert geometry.config == Configuration.__members__[name.upper()]
     assert len(geometry.inlier_matches) >= 115
     R, t = cameras.relative(0, 1)
-    assert angle(R.T @ geometry.cam2_from_cam1.rotation.matrix()) < 0.5
+    assert angle(R.T @ geometry.cam2_from_cam1.rotation.matrix()) < 1  # of 60 such planes 90 % are below 0.95
     if kind == "rotation":
         assert not geometry.cam2_from_cam1.translation.any()
         with pycolmap.Database.open(path) as database:
