@@ -121,12 +121,10 @@ def test_each_pair_of_a_batch_gets_the_options_of_its_family() -> None:
 def test_gms_tries_scales_on_wide_baselines_alone() -> None:
     for name in ("sift_gms", "paper/hesaffnet_gms"):
         pipeline = load_pipeline(name, overrides=["+pruner.gms.families.mine.with_scale=true"])
-        scale = {
-            family: pipeline.pruners_of(family)["gms"]._options["with_scale"]
-            for family in ("TUM", "CPC", "mine", "other")
-        }  # type: ignore[attr-defined]
+        options = {f: pipeline.pruners_of(f)["gms"]._options for f in ("TUM", "CPC", "mine", "other")}  # type: ignore[attr-defined]
+        scale = {family: own["with_scale"] for family, own in options.items()}
         assert scale == {"TUM": False, "CPC": True, "mine": True, "other": False}
-        assert {pruner.threshold_factor for pruner in (pipeline.pruners_of(f)["gms"] for f in scale)} == {4.0}  # type: ignore[attr-defined]
+        assert {own["threshold_factor"] for own in options.values()} == {4.0}
         usual = load_pipeline(name, overrides=["pruner.gms.families=null"])
         assert not usual.pruners_of("CPC")["gms"]._options["with_scale"]  # type: ignore[attr-defined]
 
