@@ -18,8 +18,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from fmtorch.geometry import arithmetic
 from fmtorch.geometry.arithmetic import logarithm_1p_kernel
+from fmtorch.geometry.arithmetic import sqrt as exact_sqrt
 from fmtorch.jit.kernel import Array, F8x1, F8x2, F8x3, inner, kernel, matrix
 from fmtorch.jit.lanes import LANES, added, fill, load, sqrt, store, where
 
@@ -69,7 +69,7 @@ class RobustLoss(NamedTuple):
 
 def huber_weight(r2: Tensor, s2: Tensor) -> Tensor:
     """1 up to the scale s, ``s / |r|`` beyond (Huber 1964)."""
-    return arithmetic.sqrt(s2 / torch.maximum(r2, s2))
+    return exact_sqrt(s2 / torch.maximum(r2, s2))
 
 
 def within_scale(r2: Tensor, s2: Tensor) -> Tensor:

@@ -184,8 +184,8 @@ def test_overrides_and_a_callers_own_hydra() -> None:
         assert GlobalHydra.instance().hydra is before
         assert compose("match").longest_side == 1600
     assert list(built.pruners) == ["ratio", "gms"]
-    assert built.pruners["gms"].with_scale  # type: ignore[attr-defined]
-    assert built.pruners["gms"].threshold_factor == 4  # type: ignore[attr-defined]
+    assert built.pruners["gms"]._options["with_scale"]  # type: ignore[attr-defined]
+    assert built.pruners["gms"]._options["threshold_factor"] == 4  # type: ignore[attr-defined]
     assert not GlobalHydra.instance().is_initialized()
     with pytest.raises(ValueError, match=r"pruner\.gms\.angle"):
         load_pipeline("sift_gms", overrides=["pruner.gms.angle=1"])

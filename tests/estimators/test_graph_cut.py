@@ -18,10 +18,10 @@ from fmtorch.estimators import (
     Preselection,
     Ransac,
     Verified,
-    degensac,
     graph_cut,
     scores_of,
 )
+from fmtorch.estimators import search as degensac
 from fmtorch.estimators.inliers import residuals_squared_px
 from fmtorch.jit.kernel import F4x1, F8x1, F8x2, kernel
 from fmtorch.jit.random import Stream
