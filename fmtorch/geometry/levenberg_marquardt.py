@@ -310,8 +310,8 @@ def minimiser(
             better = trial.cost[k] < state.cost[k] and not done[k]
             damping[k] = min(max(damping[k] / 10 if better else damping[k] * 10, min_damping), MAX_DAMPING)
             if better:
-                least = tolerance * state.cost[k] if relative else tolerance
-                done[k] |= ends and state.cost[k] - trial.cost[k] <= least
+                needed = tolerance * state.cost[k] if relative else tolerance
+                done[k] |= ends and state.cost[k] - trial.cost[k] <= needed
                 state.cost[k] = trial.cost[k]
                 take(state, trial, k)
             everything = everything and done[k]
