@@ -1,5 +1,6 @@
 """Refinement on the manifold of rank 2, in tensors and by kernels."""
 
+import itertools
 from collections.abc import Callable
 from typing import Any
 
@@ -227,3 +228,15 @@ def test_jacobian_equals_autograd(seed: int) -> None:
     assert torch.allclose(jacobian, expected, rtol=0, atol=1e-9 * float(expected.abs().max()))
     # r^2 of outliers is of order 1, of relative precision 1e-15
     assert torch.allclose(r2.flatten(), residual(f.flatten()).square(), rtol=1e-12, atol=1e-15)
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_cost_never_rises(loss: str) -> None:
+    F, x0, x1 = unit_scene(7, 90, noise=5e-3, outliers=40)
+    F0 = torch.cat([models(F, 10, 0.05), models(F, 10, 1.0)], 2)
+    weight = torch.from_numpy(np.random.default_rng(0).uniform(0, 1, (1, 90)))
+    error = RobustSum(components(x0, x1), weight, loss, torch.full((1, 1), 0.02**2, dtype=torch.float64))
+    costs = [fitted_by(refine_kernel, F0, error, i)[1] for i in range(8)]
+    for before, after in itertools.pairwise(costs):
+        assert bool((after <= before).all())
+    assert bool((costs[-1] < costs[0])[:, :10].any())

@@ -17,6 +17,7 @@ from fmtorch.geometry.five_point import five_point
 from fmtorch.geometry.seven_point import cube_root, cubic_roots, seven_point_kernel
 from fmtorch.jit.kernel import F8x1, kernel
 from tests import laws
+from tests.conftest import oracle
 from tests.estimators.pairs import normalized
 from tests.geometry.scenes import scene, scenes
 from tests.reference import solvers as reference
@@ -300,3 +301,14 @@ def test_cube_roots():
     cube_roots(x, out)
     np.testing.assert_allclose(out * out * out, x, rtol=8 * np.finfo(float).eps)
     assert [cube_root(number) for number in x[::100].tolist()] == out[::100].tolist()
+
+
+def test_opencv_and_kornia_oracle():
+    data = oracle("epipolar_7pt.npz")
+    for i in range(len(data["names"])):
+        x0, x1 = (torch.from_numpy(data[f"{i:03d}.X{k}"]) for k in (1, 2))
+        F, valid = seven_point(x0, x1)
+        theirs = canonical(torch.from_numpy(data[f"{i:03d}.F_opencv"]))
+        assert valid.sum() == len(theirs)
+        assert distance_to_nearest(F[valid], theirs).max() < 3e-12  # the oracles' own agreement
+        assert not F[~valid].any()

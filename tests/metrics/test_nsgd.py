@@ -256,3 +256,17 @@ def test_mean_recall_is_differentiable() -> None:
     nsgd = torch.tensor([0.0, 0.02, 0.04, 0.3, torch.nan], dtype=torch.float64, requires_grad=True)
     (gradient,) = torch.autograd.grad(metrics.mean_recall(nsgd), nsgd)
     assert gradient.tolist() == pytest.approx([-4.0, -4.0, -4.0, 0.0, 0.0])  # -1 / (0.05 * 5)
+
+
+def test_known_answers_of_the_released_evaluator() -> None:
+    """Its faults: vertical lines score 1 even when exact, lines that never meet the image 0, rare ones too little."""
+    exact = rows_shifted(0.0)
+    assert metrics.nsgd_released(exact, rows_shifted(10.0), HD, HD).item() == pytest.approx(0.006809, abs=1e-6)
+    assert metrics.nsgd_released(columns_shifted(0.0), columns_shifted(0.0), HD, HD).item() == 1
+    assert metrics.nsgd_released(exact, rows_shifted(5000.0), HD, HD).item() == 0
+    # 2.8 % of 10,000 draws are accepted and divided by 1,000: binomial error 4.5 sqrt(10000 * 0.028) draws.
+    rarely = metrics.nsgd_released(exact, rows_shifted(700.0), HD, HD).item()
+    assert rarely == pytest.approx(0.136196, abs=0.476643 * 4.5 * math.sqrt(280) / 1000)
+    for failed in (exact * 0, exact * torch.nan):
+        assert metrics.nsgd_released(exact, failed, HD, HD).item() == 1
+    assert metrics.nsgd_released(exact * 1e-9, rows_shifted(10.0) * 1e-9, HD, HD).item() < 0.0065

@@ -296,3 +296,22 @@ def test_known_noise_makes_estimates_more_exact() -> None:
         errors.append(row)
     without, with_noise = np.median(errors, 0)
     assert with_noise < 0.6 * without
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_one_to_one_is_symmetric_and_independent_of_order(dtype: torch.dtype) -> None:
+    c = duplicated(200, dtype)
+    kept = pruning.one_to_one(c.x0, c.x1, c.ratio)
+    assert 0 < kept.sum() < 200
+    assert torch.equal(kept, pruning.one_to_one(c.x1, c.x0, c.ratio))
+    order = torch.randperm(200, generator=torch.Generator().manual_seed(1))
+    assert torch.equal(kept[:, order], pruning.one_to_one(*(a[:, order] for a in (c.x0, c.x1, c.ratio))))
+    for x in (c.x0, c.x1):
+        assert len(torch.unique(x[kept], dim=0)) == kept.sum()
+
+
+def test_one_to_one_drops_what_has_no_location_and_ranks_nan_ratio_last() -> None:
+    x0 = torch.tensor([[[math.nan, 0.0], [math.inf, 0.0], [1.0, 1.0], [1.0, 1.0]]])
+    x1 = torch.arange(8.0).reshape(1, 4, 2)
+    ratio = torch.tensor([[0.0, 0.0, math.nan, 0.9]])
+    assert pruning.one_to_one(x0, x1, ratio).tolist() == [[False, False, False, True]]

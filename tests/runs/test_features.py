@@ -429,3 +429,29 @@ def test_a_sound_file_of_wrong_content_is_absent(tmp_path: Path, change: str) ->
     cache.write("s", "a", {"x": np.arange(6.0), "seconds": np.array(1.0)})
     again = cache.read("s", "a")
     np.testing.assert_array_equal(again["x"], np.arange(6.0))
+
+
+def test_a_damaged_file_is_computed_anew(tmp_path: Path) -> None:
+    sift = presets.build("features", "sift")
+    kept = CachedFeatures(sift, ArrayCache(tmp_path))
+    truth = kept(picture())
+    ((path, status),) = kept.cache.files()
+    path.write_bytes(path.read_bytes()[: status.st_size // 2])
+    with pytest.warns(UserWarning, match="damaged"):
+        assert equal(kept(picture()), truth)
+    assert kept.computed == 2
+    assert equal(kept(picture()), truth)
+    assert kept.found == 1
+
+
+@pytest.mark.parametrize("keep", [0.0, 0.3, 0.999])
+def test_a_truncated_file_counts_as_absent(tmp_path: Path, keep: float) -> None:
+    cache = ArrayCache(tmp_path)
+    cache.write("some", "name", {"a": np.arange(1000)})
+    path = tmp_path / "some" / "name.npz"
+    path.write_bytes(path.read_bytes()[: int(keep * path.stat().st_size)])
+    with pytest.warns(UserWarning, match=r"name\.npz is damaged"):
+        assert cache.read("some", "name") is None
+    cache.write("some", "name", {"a": np.arange(3)})
+    cached = cache.read("some", "name")
+    assert len(cached["a"]) == 3

@@ -21,7 +21,7 @@ from fmtorch.data import DataError, ImagePair, ImageSource, load
 from fmtorch.pipeline import Pipeline, load_pipeline
 from fmtorch.pruning import LC
 from fmtorch.pruning.networks.learned import predict
-from fmtorch.scenes import FAMILIES, RenderedPairs
+from fmtorch.scenes import FAMILIES, PLANS, RenderedPairs, Task
 from fmtorch.training import (
     Augmentation,
     Draw,
@@ -459,3 +459,12 @@ def test_truncated_files_of_oanet_are_named(length: int, tmp_path: Path) -> None
     path.write_bytes(path.read_bytes()[:length])
     with pytest.raises(DataError, match="hdf5: is not a valid HDF5 file"):
         OANetPairs(path)
+
+
+def test_training_has_no_scene_of_the_test_split(matched: MatchedPairs) -> None:
+    """What the scenes are made of is compared in tests/scenes/test_rendered.py."""
+    plans = {plan for (_, split), plan in PLANS.items() if split == "test"}
+    test = {Task(family, "test", n, 0, plan).name for plan in plans for family in FAMILIES for n in range(plan.scenes)}
+    training = {about["scene"] for about in matched.pairs}
+    assert (bool(test), bool(training), training & test) == (True, True, set())
+    assert all(f"rendered/{about['scene']}/" in about["identity"] for about in matched.pairs)

@@ -164,7 +164,7 @@ def test_configurations_of_special_pairs(kind: str, name: str, path: Path) -> No
     assert geometry.config == Configuration.__members__[name.upper()]
     assert len(geometry.inlier_matches) >= 115
     R, t = cameras.relative(0, 1)
-    assert angle(R.T @ geometry.cam2_from_cam1.rotation.matrix()) < 1  # of 60 such planes 90 % are below 0.95
+    assert angle(R.T @ geometry.cam2_from_cam1.rotation.matrix()) < (1 if kind == "planar" else 0.5)
     if kind == "rotation":
         assert not geometry.cam2_from_cam1.translation.any()
         with pycolmap.Database.open(path) as database:
@@ -173,6 +173,18 @@ def test_configurations_of_special_pairs(kind: str, name: str, path: Path) -> No
         np.testing.assert_allclose(there[:2] / there[2], x1[1, :2], atol=2)  # px
     else:
         assert geometry.cam2_from_cam1.translation @ t > np.cos(np.radians(5))
+
+
+def test_poses_of_planes(tmp_path: Path) -> None:
+    """Errors of the rotation at 0.3 px: of sixty planes the quartiles are 0.16, 0.28 and 0.36 degrees, all below 1."""
+    errors = []
+    for seed in range(5):
+        cameras, path = scene(2, seed=seed, kind="planar"), tmp_path / f"{seed}.db"
+        write(path, cameras)
+        fmtorch.verify(path)
+        (geometry,) = read(path).values()
+        errors.append(angle(cameras.relative(0, 1)[0].T @ geometry.cam2_from_cam1.rotation.matrix()))
+    assert np.median(errors) < 0.4
 
 
 def test_one_photograph_twice_and_two_of_different_places(path: Path) -> None:

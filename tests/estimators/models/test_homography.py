@@ -166,3 +166,13 @@ def test_a_photographed_wall() -> None:
 def test_a_pipeline_needs_fundamental_matrices() -> None:
     with pytest.raises(ValueError, match="the estimator gives homography matrices; a pipeline needs fundamental"):
         load_pipeline("sift_gms", overrides=["estimator=homography"])
+
+
+def test_matches_that_are_not_finite_are_left_out() -> None:
+    m = matches(2)
+    x0 = m.x0.copy()
+    x0[150:160] = np.nan
+    estimate = fmtorch.find_homography(x0, m.x1)
+    assert bool(estimate.ok)
+    assert not estimate.inliers[0, 150:160].any()
+    assert corner_error(estimate.H[0]) < 4 * expected_error(Matches(m.x0, m.x1, m.right & np.isfinite(x0[:, 0])), 0.5)
