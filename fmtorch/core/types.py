@@ -205,8 +205,8 @@ class Estimate(Record):
     infinite on the diagonal where these are exact.
 
     Where the covariance is asked for: covariance (B, 7, 7) of (rotation vector omega of ``exp([omega]x) R``, tau,
-    log f0, log f1), radians and logarithms, where t moves to ``t + tangents tau``; tangents (B, 3, 2);
-    covariance_F (B, 9, 9), of F row by row. See `fmtorch.geometry.covariance`.
+    log f0, log f1), radians and logarithms, where t moves to ``t + tangents tau``, (B, 9, 9) with both lambdas where
+    lenses are estimated; tangents (B, 3, 2); covariance_F (B, 9, 9), F row by row. See `fmtorch.geometry.covariance`.
 
     Where the pair type is asked for: pair_type_index (B,), into `PAIR_TYPES`; homography (B, 3, 3), of the
     plane, the rotation or the copy, zero where there is none; other_R, other_t, the second pose that explains a plane,
@@ -233,7 +233,7 @@ class Estimate(Record):
     focals: Float[Tensor, "b 2"] | None = None
     fit_scale: Float[Tensor, " b"] | None = None
     focal_precision: Float[Tensor, "b 2 2"] | None = None
-    covariance: Float[Tensor, "b 7 7"] | None = None
+    covariance: Float[Tensor, "b m m"] | None = None
     tangents: Float[Tensor, "b 3 2"] | None = None
     covariance_F: Float[Tensor, "b 9 9"] | None = None
     pair_type_index: Int[Tensor, " b"] | None = None

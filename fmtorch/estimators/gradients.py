@@ -3,6 +3,7 @@
 The value of an estimate is computed without a graph; a zero that has its gradients is added to it. So the estimate has
 the same bits whether anybody asks for gradients or not, and gradients are those of the fit, not of the search."""
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -12,11 +13,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from fmtorch.core.types import Correspondences, Estimate
+from fmtorch.estimators.lens_search import half_diagonals
 from fmtorch.estimators.models import posterior
 from fmtorch.estimators.models.fundamental import Matrices, response_of
 from fmtorch.estimators.pair import MAX_NOISE, MIN_NOISE, Pair
 from fmtorch.estimators.refinement import Fit, NoFit
 from fmtorch.geometry import canonical, eight_point, unit_frobenius
+from fmtorch.geometry.arithmetic import component_sum, weighted_sum
 from fmtorch.geometry.cameras import PixelFrame
 from fmtorch.geometry.homography_refine import homography_at_optimum
 from fmtorch.geometry.normalize import RobustSum
@@ -55,8 +58,8 @@ class GraphedMatches(NamedTuple):
 
 
 Attach = Callable[[list[Solved], GraphedMatches], Float[Tensor, "p m"]]
-"""A zero with the gradients of fits, models (9) of normalised points; perhaps of the logarithms of two focal lengths,
-too."""
+"""A zero with the gradients of fits, models (9) of normalised points; perhaps of the logarithms of two focal lengths
+and of two lenses, too."""
 
 
 class Attached:
@@ -101,7 +104,11 @@ class Attached:
         error = RobustSum(matches.points, weight, "truncated", torch.full_like(at[:, :1], torch.inf))
         gradient = gradient_of_cost(at.T[..., None], error)[..., 0].T
         response = torch.from_numpy(np.stack([_response(s) for s in solved])).to(device)
-        return (response * (gradient - gradient.detach())[:, None]).sum(-1)
+        zero = _zero_with(response, gradient)
+        if bent := [i for i, s in enumerate(solved) if s.fit.lens is not None]:
+            own = _bent_at_optimum([solved[i] for i in bent], matches.points[:, bent], weight[bent])
+            zero = torch.nn.functional.pad(zero, (0, 2)).index_add(0, torch.tensor(bent, device=device), own)
+        return zero
 
 
 def _homographies_at_optimum(
@@ -117,9 +124,42 @@ def _homographies_at_optimum(
     return attached - attached.detach()
 
 
+def _bent_at_optimum(
+    solved: list[Solved], points: Float[Tensor, "4 p n"], weight: Float[Tensor, "p n"]
+) -> Float[Tensor, "p 13"]:
+    """Zeros with the gradients of fits of bent photographs, whose cost is that of `lens_search`."""
+    known = zip(*(lens_response(s.fit, s.pair) for s in solved), strict=True)
+    at, offset, response = (torch.from_numpy(np.stack(each)).to(weight.device) for each in known)
+    points = points + offset.T[..., None]
+    a0, a1 = points[:2], points[2:]
+    F, bend0, bend1 = at[:, :9].T.reshape(3, 3, -1, 1), at[:, 9:10], at[:, 10:]
+    h0, h1 = (torch.cat([a, 1 + bend * component_sum(a * a)[None]]) for a, bend in ((a0, bend0), (a1, bend1)))
+    line1, line0 = component_sum(F * h0[None], 1), component_sum(F * h1[:, None], 0)
+    slope0, slope1 = line0[:2] + 2 * bend0 * a0 * line0[2], line1[:2] + 2 * bend1 * a1 * line1[2]
+    square = component_sum(slope0 * slope0) + component_sum(slope1 * slope1)
+    c = component_sum(h1 * line1) / torch.where(square > 0, square, 1)
+    along0, along1 = component_sum(a0 * slope0), component_sum(a1 * slope1)
+    d0, d1 = (torch.cat([s, 2 * b * t[None]]) for s, b, t in ((slope0, bend0, along0), (slope1, bend1, along1)))
+    by_entry = (h1 - c * d1)[:, None] * h0[None] - h1[:, None] * (c * d0)[None]
+    by_bend = [
+        component_sum(a * a) * (line[2] - c * component_sum(d * column)) - 2 * c * line[2] * along
+        for a, line, d, column, along in ((a0, line0, d1, F[:, 2], along0), (a1, line1, d0, F[2], along1))
+    ]
+    gradient = weighted_sum([*by_entry.flatten(0, 1), *by_bend], weight * c).T
+    return _zero_with(response, gradient)
+
+
+def _zero_with(response: Float[Tensor, "p k m"], gradient: Float[Tensor, "p m"]) -> Float[Tensor, "p k"]:
+    """A zero that moves with the gradients of costs; summed one after the other, in any batch and both ways."""
+    change = gradient - gradient.detach()
+    return torch.stack([component_sum(row * change, -1) for row in response.unbind(1)], 1)
+
+
 def _response(solved: Solved) -> Array:
     """How the fit of a pair, and the logarithms of its focal lengths, move with the gradient of its cost, (11, 9)."""
     pair, fit = solved.pair, solved.fit
+    if fit.lens is not None:
+        return np.zeros((11, 9))
     weight = fit.counted * pair.weight
     if fit.cameras is not None:
         return camera_response(fit.cameras, pair, weight, fit.precision)
@@ -138,7 +178,9 @@ def with_gradients(estimate: Estimate, c: Correspondences, solved: dict[int, Sol
     G = unit_frobenius(models) if homographies else canonical(models)
     attached = {"F": estimate.F.index_add(0, rows, G - G.detach())}
     if estimate.focals is not None and zero.shape[1] > 9:
-        attached["focals"] = estimate.focals.index_add(0, rows, estimate.focals.detach()[rows] * zero[:, 9:])
+        attached["focals"] = estimate.focals.index_add(0, rows, estimate.focals.detach()[rows] * zero[:, 9:11])
+    if estimate.lens is not None and zero.shape[1] > 11:
+        attached["lens"] = estimate.lens.index_add(0, rows, zero[:, 11:].to(estimate.lens))
     return estimate.derived(**attached)
 
 
@@ -181,16 +223,41 @@ def camera_response(cameras: posterior.Cameras, pair: Pair, weight: Array, preci
     matches = posterior.centred(pair)._replace(weight=weight, s2=np.full(pair.count, np.inf))
     posterior.minimise(optimum, matches, images, posterior.Limits(precision, 0, 0.0))
     posterior.tangents_of(cameras, images.longest, optimum.F, tangents)
-    moves, hessian, by_focal = np.empty((7, 9)), optimum.hessian[0], np.eye(7, 2, -5)
+    moves, by_focal = np.empty((7, 9)), np.eye(7, 2, -5)
     posterior.translate(np.ascontiguousarray(tangents[0, :, :7].T), images.offset, moves)
     if images.prior.shared:  # one parameter for both
         moves[5], moves[6], by_focal[5], by_focal[6] = moves[5] + moves[6], 0, 1, 0
+    return _moved(optimum.hessian[0], moves, np.concatenate([moves, by_focal], 1), precision)
+
+
+def _moved(hessian: Array, by_cost: Array, by_estimate: Array, precision: float) -> Array:
+    """How an estimate (k,) moves with the gradient (m,) of a cost, (k, m), by its parameters' derivatives of both."""
     try:
-        steps = np.linalg.solve(hessian + STEP_DAMPING * np.diag(np.diag(hessian)), moves)
+        steps = np.linalg.solve(hessian + STEP_DAMPING * np.diag(np.diag(hessian)), by_cost)
     except np.linalg.LinAlgError:
-        return np.zeros((11, 9))
-    response: Array = -precision * np.concatenate([moves, by_focal], 1).T @ steps
-    return response if np.isfinite(response).all() else np.zeros((11, 9))
+        return np.zeros((by_estimate.shape[1], by_cost.shape[1]))
+    response: Array = -precision * by_estimate.T @ steps
+    return response if np.isfinite(response).all() else np.zeros_like(response)
+
+
+def lens_response(fit: Fit, pair: Pair) -> tuple[Array, Array, Array]:
+    """Of a fit of bent photographs, its model and bends (11,) for points from the principal points, the offset (4,) of
+    these, and how model, logarithms of focal lengths and lenses move with the gradient by the former, (13, 11)."""
+    assert fit.lens is not None
+    assert pair.lens is not None
+    images, area, lens = posterior.images_of(pair), half_diagonals(pair) ** -2.0, fit.lens
+    F, tangents, by_cost, by_estimate = np.empty((2, 9)), np.zeros((1, 9, LANES)), np.zeros((9, 11)), np.eye(9, 13, 4)
+    posterior.tangents_of(lens.cameras, images.longest, F[:1], tangents)
+    by_cost[:7, :9], by_cost[7, 9], by_cost[8, 10] = tangents[0, :, :7].T, *area
+    posterior.translate(F[:1], images.offset, F[1:])
+    moves = np.empty((7, 9))
+    posterior.translate(np.ascontiguousarray(by_cost[:7, :9]), images.offset, moves)
+    by_estimate[:7, :9] = moves / math.sqrt((F[1] * F[1]).sum())
+    for first, shared in ((5, images.prior.shared), (7, pair.lens.shared)):
+        for moved in (by_cost, by_estimate) if shared else ():
+            moved[first], moved[first + 1] = moved[first] + moved[first + 1], 0
+    at = np.concatenate([F[0], lens.lens * area])
+    return at, images.offset, _moved(lens.hessian, by_cost, by_estimate, fit.precision)
 
 
 def _nothing(c: Correspondences) -> Tensor:

@@ -18,7 +18,7 @@ from fmtorch.estimators.models.focal_prior import MIN_DEVIATION, focal_cost
 from fmtorch.estimators.models.fundamental import FitScale
 from fmtorch.estimators.models.posterior import Cameras, Images, Limits, centred, images_of, tangents_of, translate
 from fmtorch.estimators.pair import Lens, Pair, squared
-from fmtorch.estimators.refinement import FOCAL_TOLERANCE, Fit
+from fmtorch.estimators.refinement import FOCAL_TOLERANCE, Fit, LensFit
 from fmtorch.geometry import levenberg_marquardt
 from fmtorch.geometry.arithmetic import logarithm_kernel
 from fmtorch.geometry.levenberg_marquardt import MATCH, TINY, Weighted, add_products, assemble, in_rows, robust
@@ -249,21 +249,6 @@ START_SCALE_PX = 3.0  # beyond which matches do not count where the lens may be 
 START_ITERATIONS, ITERATIONS = 12, 8
 
 
-class LensFit(NamedTuple):
-    """Cameras (1, ...), their lenses (2,) and the model (9,), its cost with derivatives by PARAMETERS, the logarithm of
-    its evidence up to a constant, the inverse of the Hessian, and the standard deviations (2,) of the lenses."""
-
-    cameras: Cameras
-    lens: Array
-    F: Array
-    cost: float
-    gradient: Array
-    hessian: Array
-    evidence: float
-    inverse: Array
-    deviation: Array
-
-
 @kernel(holds_gil=True)
 def inverted(A: F8x2, out: F8x2) -> float:
     """The inverse of A (n, n) -> out, and log |det A|; infinite and not a number where there is none."""
@@ -297,7 +282,7 @@ def fit_with_lenses(
     k, images, own = len(lens), images_of(pair), cameras.copy()
     F, cost, gradient, hessian = (np.empty((k, *[PARAMETERS] * n)) for n in (1, 0, 1, 2))
     out = LensOptimum(*own, lens.copy(), F, cost, gradient, hessian)
-    limits = Limits(squared(pair.pixels_per_unit / (scale_px / FitScale().scale_sigmas)), iterations, FOCAL_TOLERANCE)
+    limits = Limits(_precision(scale_px, pair), iterations, FOCAL_TOLERANCE)
     prior = prior._replace(diagonal=half_diagonals(pair))
     minimise_with_lenses(out, centred(pair, scale_px), images, prior, limits)
     F = np.empty((k, 9))
@@ -381,13 +366,20 @@ def _best(fits: list[LensFit], prior: LensPrior, pair: Pair, scale: float) -> Le
     return max((_from(fit, prior, pair, scale, ITERATIONS) for fit in fits), key=lambda fit: fit.evidence)
 
 
-def lens_fit(lens: Array, cameras: Cameras, pair: Pair, inliers: Array) -> LensFit:
+def lens_fit(lens: Array, cameras: Cameras, pair: Pair, inliers: Array) -> Fit:
     """The last fit of a selected model's cameras (1, ...) and lenses (2,), at the noise of its inliers (n,)."""
     assert pair.lens is not None
     likely = inliers & (pair.match_weight > MIN_PRIOR_FOR_NOISE)
     r2 = (squared_px(_model(cameras, pair), lens, pair) / np.square(pair.noises))[likely]
-    (fit,) = fit_with_lenses(cameras, lens[None], lens_prior(pair.lens), pair, fit_distance(r2, FitScale()), ITERATIONS)
-    return fit
+    scale = fit_distance(r2, FitScale())
+    (fit,) = fit_with_lenses(cameras, lens[None], lens_prior(pair.lens), pair, scale, ITERATIONS)
+    counted = (squared_px(fit.F, fit.lens, pair) <= np.square(scale * pair.noises)).astype(np.float64)
+    return Fit(fit.F, fit.F, counted, fit.cameras, _precision(scale, pair), lens=fit)
+
+
+def _precision(scale_px: float, pair: Pair) -> float:
+    """One over the variance of an inlier's distance, where matches do not count from this distance on."""
+    return squared(pair.pixels_per_unit / (scale_px / FitScale().scale_sigmas))
 
 
 def _model(cameras: Cameras, pair: Pair) -> Array:

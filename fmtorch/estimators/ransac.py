@@ -290,15 +290,16 @@ class Ransac:
         solution = self._of_pinholes(lens_search.undistorted(pair, lens))
         if solution.fit is None or solution.inliers is None:
             return solution
-        fit, cameras = solution.fit, solution.fit.cameras
-        if cameras is None or not (lens.any() or np.isfinite(known.deviations).all()):
+        cameras = solution.fit.cameras
+        if not lens.any() and (cameras is None or not np.isfinite(known.deviations).all()):
             return solution._replace(lens=lens)
-        refined = lens_search.lens_fit(lens, cameras, pair, solution.inliers)
-        if not np.isfinite(refined.F).all():
-            return solution._replace(lens=lens)
-        inliers = self.inlier_rule(lens_search.squared_px(refined.F, refined.lens, pair), pair)
-        own = fit._replace(F=refined.F, at=refined.F, cameras=refined.cameras)
-        return Solution(own, solution.samples, inliers, lens=refined.lens, deviation=refined.deviation)
+        if cameras is not None:
+            fit = lens_search.lens_fit(lens, cameras, pair, solution.inliers)
+            if fit.lens is not None and np.isfinite(fit.F).all():
+                inliers = self.inlier_rule(lens_search.squared_px(fit.F, fit.lens.lens, pair), pair)
+                return Solution(fit, solution.samples, inliers, lens=fit.lens.lens, deviation=fit.lens.deviation)
+        nothing = np.zeros(pair.count)  # has gradients where no cameras are assumed
+        return solution._replace(lens=lens, fit=solution.fit._replace(counted=nothing))
 
     def selected(self, pair: Pair) -> tuple[refinement.Selection, int]:
         """The selected model, and the samples drawn: among plausible cameras first where the image sizes are known."""

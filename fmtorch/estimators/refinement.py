@@ -173,12 +173,28 @@ FOCAL_ITERATIONS = 5  # Levenberg-Marquardt steps where cameras are assumed: the
 FOCAL_TOLERANCE = 0.05  # of the logarithm of the posterior: a fifth of a standard deviation more or less
 
 
+class LensFit(NamedTuple):
+    """Cameras (1, ...), their lenses (2,) and the model (9,), its cost with derivatives by five rotations, two focal
+    lengths and two lenses, the logarithm of its evidence up to a constant, the inverse of the Hessian, and the standard
+    deviations (2,) of the lenses."""
+
+    cameras: Cameras
+    lens: Array
+    F: Array
+    cost: float
+    gradient: Array
+    hessian: Array
+    evidence: float
+    inverse: Array
+    deviation: Array
+
+
 class Fit(NamedTuple):
     """A fit's value, and what its gradient depends on.
     F: (9,), the estimate. at: (9,), the model at which the gradient is taken. counted: (n,), how much each match counts
     there: 1, or 0 beyond a truncated loss. cameras: those assumed at the optimum. precision: one over the variance of
     an inlier's distance, in the unit of the points, where cameras are assumed. s2: (n,), squared scales of Cauchy's
-    loss in that unit, where it is the fit's."""
+    loss in that unit, where it is the fit's. lens: of photographs that are bent, its last fit."""
 
     F: Array
     at: Array
@@ -186,6 +202,7 @@ class Fit(NamedTuple):
     cameras: Cameras | None = None
     precision: float = 0.0
     s2: Array | None = None
+    lens: LensFit | None = None
 
 
 class NoFit:

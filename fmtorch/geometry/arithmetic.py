@@ -8,6 +8,7 @@ Matrices come in two layouts: with the entries last, (*batch, 3, 3), as users ha
 or (9, *s) row by row, over which an operation on one entry runs over all matrices at once."""
 
 import math
+from collections.abc import Sequence
 from typing import Any, cast
 
 import numpy as np
@@ -61,6 +62,11 @@ def twice_atanh(z: Any) -> Any:
 def gradient_wanted(*inputs: object) -> bool:
     """Whether a graph is being recorded and one of the inputs is on it."""
     return torch.is_grad_enabled() and any(isinstance(x, Tensor) and x.requires_grad for x in inputs)
+
+
+def weighted_sum(rows: Sequence[Tensor], weight: Tensor) -> Tensor:
+    """The `stable_sum` of each row times the weight, whose gradient is summed row by row, in any batch alike."""
+    return stable_sum(torch.stack([row * weight for row in rows]))
 
 
 def stable_sum(x: Tensor, dim: int = -1) -> Tensor:

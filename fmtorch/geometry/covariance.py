@@ -1,9 +1,10 @@
-"""Covariance of a two-view estimate: of its pose, its focal lengths and its fundamental matrix.
+"""Covariance of a two-view estimate: of its pose, its focal lengths, its lenses and its fundamental matrix.
 
-The parameters of a pair are (omega, tau, log f0, log f1): R is ``exp([omega]x) R``, the direction of translation moves
-along two unit tangents, ``t + B tau``, so that both are in radians. The information of a fit that minimises the robust
-sum of w rho(r^2) with a loss truncated at T is J^T W J over the matches within T, J being the derivative of the Sampson
-distance (Hartley & Zisserman 2004, 11.4.3), with three corrections:
+The parameters of a pair are (omega, tau, log f0, log f1, lambda0, lambda1): R is ``exp([omega]x) R``, the direction of
+translation moves along two unit tangents, ``t + B tau``, so that both are in radians; lambda is of the division model.
+The information of a fit that minimises the robust sum of w rho(r^2) with a loss truncated at T is J^T W J over the
+matches within T, J being the derivative of the Sampson distance in the photograph (Hartley & Zisserman 2004, 11.4.3),
+with three corrections:
 
 1. A truncated fit does not use all that its inliers know: its variance is E[psi^2] / E[psi']^2 of that of one match
    (Huber 1981, Robust Statistics, chapter 7). With c = T / s, A = P(|z| < c) and m = A - 2 c phi(c), which both
@@ -30,7 +31,7 @@ from fmtorch.geometry.arithmetic import cofactors, component_sum, cross, determi
 from fmtorch.geometry.epipolar import inverse_root
 from fmtorch.geometry.matrices import complement
 
-PARAMETERS = 7
+PINHOLES, PARAMETERS = 7, 9  # without and with two lenses
 WINDOW = 2.5  # noises within which distances are taken to be those of right matches
 WINDOW_SHARE = 0.911256360935392  # `kept_share` of WINDOW
 ITERATIONS = 8  # of the noise; each leaves a quarter of the error (by the slope of `kept_share` at WINDOW)
@@ -58,24 +59,36 @@ def tangents(R: Tensor, t: Tensor, focal: Tensor) -> tuple[Tensor, Tensor, Tenso
     return E * pixels, slopes, basis
 
 
-def residual_slopes(F: Tensor, slopes: Tensor, a0: Tensor, a1: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Signed Sampson distances (b, n), their derivatives (7, b, n) by the parameters, and the noise in two of these.
-    With e = a1^T F a0 and q the sum of the squares of both lines' normals, r = e / sqrt(q), and ``dr = de / sqrt(q)``
-    at the points corrected to first order, where e is zero. Zero where a point is the epipole. The last are the
-    covariances (2, 2, b, n) of the derivatives by the direction of translation, in squared noises of a point: where the
-    images have no parallax these derivatives are nothing but noise, in the three directions that are not corrected."""
-    ones = torch.ones_like(a0[:1])
-    line1 = component_sum(F[..., None] * torch.cat([a0, ones])[None], 1)
-    line0 = component_sum(F[..., None] * torch.cat([a1, ones])[:, None], 0)
-    root = inverse_root(component_sum(line1[:2] * line1[:2]) + component_sum(line0[:2] * line0[:2]))
-    r = component_sum(torch.cat([a1, ones]) * line1) * root
-    normal = torch.cat([line0[:2], line1[:2]]) * root
-    h0, h1 = torch.cat([a0 - r * normal[:2], ones]), torch.cat([a1 - r * normal[2:], ones])
+def lifted(a: Tensor, bend: Tensor) -> Tensor:
+    """Homogeneous points (3, b, n) of pinholes from those (2, b, n) that lenses bend; bend: (b, 1), lambda by px^2."""
+    return torch.cat([a, 1 + bend * component_sum(a * a)[None]])
+
+
+def residual_slopes(
+    F: Tensor, slopes: Tensor, a0: Tensor, a1: Tensor, bend0: Tensor, bend1: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Signed Sampson distances (b, n), their derivatives (9, b, n) by the parameters, and the noise in two of these.
+    With h = (a, 1 + bend |a|^2), e = h1^T F h0 and q the sum of the squares of its derivatives by both points, r = e /
+    sqrt(q), and ``dr = de / sqrt(q)`` at the points corrected to first order, where e is zero; those by the lenses are
+    by their bend. Zero where a point is the epipole. The last are the covariances (2, 2, b, n) of the derivatives by
+    the direction of translation, in squared noises of a point: where the images have no parallax these derivatives are
+    nothing but noise, in the three directions that are not corrected."""
+    h0, h1 = lifted(a0, bend0), lifted(a1, bend1)
+    line1, line0 = component_sum(F[..., None] * h0[None], 1), component_sum(F[..., None] * h1[:, None], 0)
+    normal = torch.cat([line0[:2] + 2 * bend0 * a0 * line0[2], line1[:2] + 2 * bend1 * a1 * line1[2]])
+    root = inverse_root(component_sum(normal[2:] * normal[2:]) + component_sum(normal[:2] * normal[:2]))
+    r = component_sum(h1 * line1) * root
+    normal = normal * root
+    a0, a1 = a0 - r * normal[:2], a1 - r * normal[2:]
+    h0, h1 = lifted(a0, bend0), lifted(a1, bend1)
     by_entry = h1[:, None] * h0[None] * root
     J = component_sum((by_entry[:, :, None] * slopes[..., None]).flatten(0, 1))
+    by_depth = torch.stack([component_sum(F[:, 2, :, None] * h1), component_sum(F[2, ..., None] * h0)]) * root
+    J = torch.cat([J, by_depth * torch.stack([component_sum(a0 * a0), component_sum(a1 * a1)])])
     shifted = slopes[:, :, 3:5, :, None]
     by_h0, by_h1 = component_sum(shifted * h1[:, None, None], 0), component_sum(shifted * h0[None, :, None], 1)
-    by_point = torch.cat([by_h0[:2], by_h1[:2]]) * root
+    bent0, bent1 = 2 * bend0 * a0[:, None] * by_h0[2], 2 * bend1 * a1[:, None] * by_h1[2]
+    by_point = torch.cat([by_h0[:2] + bent0, by_h1[:2] + bent1]) * root
     corrected = component_sum(normal[:, None] * by_point)
     noise = component_sum(by_point[:, :, None] * by_point[:, None]) - corrected[:, None] * corrected[None]
     return r, J, noise
@@ -111,7 +124,7 @@ def explained_by_rotation(a0: Tensor, a1: Tensor, R: Tensor, f: Tensor, s: Tenso
     middle = ((count - 1).clamp_min(0) // 2)[:, None]
     median = ordered.gather(-1, middle)[:, 0] if ordered.shape[-1] else torch.full_like(f[0], torch.inf)
     limit = CHI_MEDIAN * (1 + MEDIAN_DEVIATIONS * MEDIAN_DEVIATION / sqrt(count.to(f).clamp_min(1)))
-    return (count > PARAMETERS) & (median < limit)
+    return (count > PINHOLES) & (median < limit)
 
 
 def kept_share(c: Tensor) -> Tensor:
@@ -140,7 +153,7 @@ def noise_of(r: Tensor, w: Tensor, T: Tensor, parameters: Tensor) -> Tensor:
 
 
 def information_of(r: Tensor, J: Tensor, noise: Tensor, w: Tensor, T: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-    """Of the matches, (7, 7, b), and what of it noise alone gives about the direction of translation, (2, 2, b)."""
+    """Of the matches, (9, 9, b), and what of it noise alone gives about the direction of translation, (2, 2, b)."""
     w = torch.where(r < T[:, None], w, 0.0)
     squares = stable_sum(w * w)
     factor = kept_share(T / s) * (stable_sum(w) / torch.where(squares > 0, squares, 1.0))
@@ -151,19 +164,31 @@ def information_of(r: Tensor, J: Tensor, noise: Tensor, w: Tensor, T: Tensor, s:
     return sums[torch.maximum(index, index.mT)], stable_sum(noise * w) * factor
 
 
-DIFFUSE = (1.33, 1.33, 1.33, 1.21, 1.21, 2.3, 2.3)
-"""Deviations that no parameter exceeds: of a rotation and a direction drawn uniformly (radians, each axis), and a
-factor of ten in a focal length. They enter as independent information, which is nothing beside that of matches."""
+DIFFUSE = (1.33, 1.33, 1.33, 1.21, 1.21, 2.3, 2.3, 0.5, 0.5)
+"""Deviations that no parameter exceeds: of a rotation and a direction drawn uniformly (radians, each axis), a factor of
+ten in a focal length, and of lambda. They enter as independent information, which is nothing beside that of matches."""
+
+
+class LensesInPixels(NamedTuple):
+    """Lenses of B pairs: ``x_u = x_d / (1 + value |x_d|^2 / half^2)`` from the principal points.
+    value: lambda. half: the half diagonals, px. precision: of their prior, one over the variance, infinite where known.
+    shared: where both are one parameter."""
+
+    value: Float[Tensor, "b 2"]
+    half: Float[Tensor, "b 2"]
+    precision: Float[Tensor, "b 2"]
+    shared: Bool[Tensor, " b"]
 
 
 class TwoViewCovariance(NamedTuple):
     """Covariances of B pairs.
-    covariance: of (omega, tau, log f0, log f1), radians and logarithms; rows of known focal lengths are zero.
+    covariance: of (omega, tau, log f0, log f1), radians and logarithms, and both lambdas if lenses are given; rows of
+    what is known are zero.
     tangent: the basis B of the plane across t. fundamental: covariance of F, row by row, at unit Frobenius norm, in
     pixels. noise: s, px. valid: False where R, t, a focal length, the truncation or the prior is not finite or has no
     meaning; such a pair is as one without matches."""
 
-    covariance: Float[Tensor, "b 7 7"]
+    covariance: Float[Tensor, "b m m"]
     tangent: Float[Tensor, "b 3 2"]
     fundamental: Float[Tensor, "b 9 9"]
     noise: Float[Tensor, " b"]
@@ -192,8 +217,9 @@ def two_view_covariance(
     mask: Bool[Tensor, "b n"] | None = None,
     focal_precision: Float[Tensor, "b 2 2"] | None = None,
     shared_focal: Bool[Tensor, " b"] | None = None,
+    lens: LensesInPixels | None = None,
 ) -> TwoViewCovariance:
-    """The covariance of pose, focal lengths and F at the optimum of a robust fit, in closed form.
+    """The covariance of pose, focal lengths, lenses and F at the optimum of a robust fit, in closed form.
 
     Nothing is NaN: what the matches leave open has a deviation of up to `DIFFUSE`. A local covariance knows nothing of
     another optimum: see `significance`. Float64.
@@ -215,6 +241,7 @@ def two_view_covariance(
             had, of which the positive part counts; infinite on the diagonal where a focal length is known exactly. Zero
             by default.
         shared_focal: where the two focal lengths are one parameter; nowhere by default.
+        lens: of photographs that are bent; pinholes by default.
 
     Returns:
         A `TwoViewCovariance`. The result has the same bits in any batch and with any padding.
@@ -237,9 +264,12 @@ def two_view_covariance(
     open_prior = torch.zeros(len(R), 2, 2, dtype=kind, device=R.device)
     Pi = open_prior if focal_precision is None else focal_precision.to(kind)
     shared = torch.zeros_like(Pi[:, 0, 0], dtype=torch.bool) if shared_focal is None else shared_focal
-    known = Pi.diagonal(dim1=-2, dim2=-1) == torch.inf
-    Pi = torch.where(known[:, :, None] | known[:, None, :], 0.0, Pi)
+    pinholes = LensesInPixels(open_prior[:, 0], open_prior[:, 0] + 1, open_prior[:, 0] + torch.inf, shared)
+    lenses = pinholes if lens is None else lens
+    known = torch.cat([Pi.diagonal(dim1=-2, dim2=-1), lenses.precision.to(kind)], 1) == torch.inf
+    Pi = torch.where(known[:, :2, None] | known[:, None, :2], 0.0, Pi)
     valid, (R, t, f, p0, p1, T, Pi) = _valid(R, t, focal, principal0, principal1, truncation, Pi)
+    valid = valid & lenses.value.isfinite().all(1)
     t = t * inverse_root(component_sum(t * t, -1))[:, None]
     real = torch.ones_like(x0[..., 0], dtype=torch.bool) if mask is None else mask
     w, n = (torch.ones_like(x0[..., 0]) if a is None else a for a in (weight, noise))
@@ -247,15 +277,20 @@ def two_view_covariance(
     a0, a1 = (torch.where(real[..., None], x - p[:, None], 0.0).movedim(-1, 0) for x, p in ((x0, p0), (x1, p1)))
     w, n = torch.where(real, w, 0.0).to(kind), torch.where(real, n, 1.0).to(kind)
     F, slopes, basis = tangents(R.movedim(0, -1), t.movedim(0, -1), f.movedim(0, -1))
-    r, J, in_slopes = residual_slopes(F, slopes, a0, a1)
-    r, J = (r / n).abs(), J / n
-    used = _directions(known, shared)
+    area = lenses.half.to(kind).square().T[..., None]
+    bend0, bend1 = torch.where(valid, lenses.value.to(kind).T, 0.0)[..., None] / area
+    r, J, in_slopes = residual_slopes(F, slopes, a0, a1, bend0, bend1)
+    r, J = (r / n).abs(), torch.cat([J[:PINHOLES], J[PINHOLES:] / area]) / n
+    used = _directions(known, shared, lenses.shared)
     s = noise_of(r.detach(), w, T, used.amax(0).sum(0))
     information, from_noise = information_of(r, J, in_slopes, w, T, s)
     near = (w > 0) & (r < torch.minimum(T, WINDOW * s)[:, None])
-    still = explained_by_rotation(a0.to(kind), a1.to(kind), R.movedim(0, -1), f.movedim(0, -1), n * s[:, None], near)
-    C = _without_noise(_covariance(information, Pi.movedim(0, -1), used), from_noise, still)
-    V = _of_fundamental(C, F, slopes, p0.movedim(0, -1), p1.movedim(0, -1))
+    straight0, straight1 = ((h[:2] / h[2]).to(kind) for h in (lifted(a0, bend0), lifted(a1, bend1)))
+    still = explained_by_rotation(straight0, straight1, R.movedim(0, -1), f.movedim(0, -1), n * s[:, None], near)
+    precision = torch.where(known[:, 2:], 0.0, lenses.precision.to(kind))
+    C = _without_noise(_covariance(information, Pi.movedim(0, -1), precision.T, used), from_noise, still)
+    V = _of_fundamental(C[:PINHOLES, :PINHOLES], F, slopes, p0.movedim(0, -1), p1.movedim(0, -1))
+    C = C[:PINHOLES, :PINHOLES] if lens is None else C
     return TwoViewCovariance(C.movedim(-1, 0), basis.movedim(-1, 0), V.movedim(-1, 0), s, valid)
 
 
@@ -271,21 +306,24 @@ def _valid(*given: Tensor) -> tuple[Tensor, list[Tensor]]:
     return valid, [torch.where(keep, a, place) for keep, a, place in zip(kept, given, places, strict=True)]
 
 
-def _directions(known: Tensor, shared: Tensor) -> Tensor:
-    """How the parameters move (7, 7, b), by the columns: a known one never, shared ones together by the first's."""
-    b = len(known)
-    used = torch.eye(PARAMETERS, dtype=torch.float64, device=known.device)[..., None].repeat(1, 1, b)
-    any_known, together = known.any(-1), shared & ~known.any(-1)
-    used[5, 5] = (~(known[:, 0] | (shared & any_known))).to(used.dtype)
-    used[6, 6] = (~(known[:, 1] | shared)).to(used.dtype)
-    used[6, 5] = together.to(used.dtype)
+def _directions(known: Tensor, shared_focal: Tensor, shared_lens: Tensor) -> Tensor:
+    """How the parameters move (9, 9, b), by the columns: a known one never, shared ones together by the first's.
+    known: (b, 4), focal lengths and lenses."""
+    used = torch.eye(PARAMETERS, dtype=torch.float64, device=known.device)[..., None].repeat(1, 1, len(known))
+    for first, shared, (known0, known1) in ((5, shared_focal, known[:, :2].T), (7, shared_lens, known[:, 2:].T)):
+        any_known = known0 | known1
+        used[first, first] = (~(known0 | (shared & any_known))).to(used.dtype)
+        used[first + 1, first + 1] = (~(known1 | shared)).to(used.dtype)
+        used[first + 1, first] = (shared & ~any_known).to(used.dtype)
     return used
 
 
-def _covariance(information: Tensor, Pi: Tensor, used: Tensor) -> Tensor:
-    """The inverse (7, 7, b) of information, prior and `DIFFUSE` in the directions that are used; zero in others."""
+def _covariance(information: Tensor, Pi: Tensor, lenses: Tensor, used: Tensor) -> Tensor:
+    """The inverse (9, 9, b) of information, priors and `DIFFUSE` in the directions that are used; zero in others.
+    Pi: (2, 2, b), by the focal lengths. lenses: (2, b), precisions."""
     total = information + torch.diag(information.new_tensor(DIFFUSE) ** -2)[..., None]
-    prior = torch.nn.functional.pad(_positive_part(Pi).movedim(-1, 0), (5, 0, 5, 0)).movedim(0, -1)
+    prior = torch.nn.functional.pad(_positive_part(Pi).movedim(-1, 0), (5, 2, 5, 2)).movedim(0, -1)
+    prior = prior + torch.diag_embed(torch.nn.functional.pad(lenses.T, (PINHOLES, 0))).movedim(0, -1)
     reduced = product(used.transpose(0, 1), product(total + prior, used))
     idle = 1 - used.amax(0)
     eye = torch.eye(PARAMETERS, dtype=total.dtype, device=total.device)[..., None]
@@ -298,7 +336,7 @@ def _covariance(information: Tensor, Pi: Tensor, used: Tensor) -> Tensor:
 
 
 def _without_noise(C: Tensor, noise: Tensor, still: Tensor) -> Tensor:
-    """The covariance (7, 7, b) with that of the direction of translation corrected for what of its information is noise
+    """The covariance (9, 9, b) with that of the direction of translation corrected for what of its information is noise
     (2, 2, b). The other parameters keep their distribution given that direction. What `DIFFUSE` knows of it stays, and
     is all where the camera stood `still` (b,)."""
     S, eye = _inverse(C[3:5, 3:5]), torch.eye(2, dtype=C.dtype, device=C.device)[..., None]

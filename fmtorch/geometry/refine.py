@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from fmtorch.geometry import levenberg_marquardt, normalize, rank2_manifold
+from fmtorch.geometry import arithmetic, levenberg_marquardt, normalize, rank2_manifold
 from fmtorch.geometry.arithmetic import as_rows, cofactors, component_sum, gradient_wanted, sqrt, stable_sum, unit
 from fmtorch.geometry.eight_point import linear_fundamental, weighted_eight_point
 from fmtorch.geometry.epipolar import linearise, sampson
@@ -165,7 +165,7 @@ def gradient_of_cost(F: Float[Tensor, "9 p k"], error: RobustSum) -> Float[Tenso
     """Half the gradient of the cost with respect to F, ``sum_i w_i rho'(r_i^2) r_i dr_i``; attached to all inputs."""
     J, e, inverse, r2 = linearise(F, error.points)
     influence = error.weight[:, None] * error.rho.weight(r2, error.s2[:, None]) * inverse * e
-    return stable_sum(J.flatten(0, 1) * influence)
+    return arithmetic.weighted_sum([*J.flatten(0, 1)], influence)
 
 
 def curvature_of_cost(F: Float[Tensor, "9 p k"], error: RobustSum) -> Float[Tensor, "9 9 p k"]:

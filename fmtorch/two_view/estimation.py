@@ -42,8 +42,6 @@ def estimated(
         raise ValueError(f"estimator={name} gives {gives} matrices; {needed}")
     if c.lens is not None:
         expect_lenses(estimator, f"estimator={name}")
-        if c.requires_grad:
-            raise ValueError("lens is given, and its estimates have no gradients: give points, prior, noise detached")
     return estimated_by(estimator, c, seed, covariance, assume_sizes)
 
 

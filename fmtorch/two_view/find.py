@@ -106,10 +106,9 @@ def find_fundamental(
             at all; "shared": one unknown lambda, "unknown": one for each image; lambda, exactly; (lambda, s) up to a
             standard deviation s; ((lambda0, s0), (lambda1, s1)) or (B, 2, 2) for each image, None in place of an
             unknown one. Points and inliers are of the photographs, F, E and the pose of the pixels of pinholes. With
-            K0 or K1 it needs the image sizes. There are no gradients and no covariance then. Calibrated lenses are
-            `fmtorch.Lens`, for both images, (lens0, lens1) with None for a pinhole, or a list of (lens0, lens1), one
-            for each pair: points are undistorted, and judged in pixels of the photographs; the K of a lens stands for
-            K0 or K1; there are gradients and a covariance.
+            K0 or K1 it needs the image sizes. Calibrated lenses are `fmtorch.Lens`, for both images, (lens0, lens1)
+            with None for a pinhole, or a list of (lens0, lens1), one for each pair: points are undistorted, and judged
+            in pixels of the photographs; the K of a lens stands for K0 or K1.
         covariance: whether the estimate has its covariance, which needs K0 and K1 or the image sizes. Where nothing is
             said of the cameras these are as of ``focal="unknown"``.
         pair_type: whether it has the type of each pair: general, planar, rotation, identical, unrelated.
@@ -151,7 +150,7 @@ def find_fundamental(
             raise ValueError("covariance needs K0 and K1, or the image sizes: give size0 and size1")
         focal = "unknown"
     if lens is not None:
-        _expect_lens(size0, K0 is not None or K1 is not None, covariance)
+        _expect_lens(size0, K0 is not None or K1 is not None)
     h0w0, h1w1, assume_sizes = given_sizes(size0, size1)
     c = correspondences(
         x0, x1, mask=mask, ratio=ratio, score=score, prior=prior, lafs0=lafs0, lafs1=lafs1, noise=noise, size0=h0w0,
@@ -178,10 +177,8 @@ def _lenses(lens: Lens, x0: Arrays, K0: Arrays | None = None, K1: Arrays | None 
     return CalibratedLenses(lens, x0, K0, K1)
 
 
-def _expect_lens(size: Size, calibrated: bool, covariance: bool) -> None:
+def _expect_lens(size: Size, calibrated: bool) -> None:
     """Raise ValueError where a lens has no place."""
-    if covariance:
-        raise ValueError("lens is given: a covariance is of pinholes; undistort the points for it")
     if isinstance(size, str) or (calibrated and size is None):
         raise ValueError("lens needs the image sizes, in whose half diagonals it is: give size0 and size1")
 
@@ -329,6 +326,10 @@ def find_homography(
         return homographies(c, lambda c: estimated(c, "homography", estimator, config_dir, seed, options))
 
     if c.lens is not None:
+        if c.requires_grad:
+            raise ValueError(
+                "lens is given, and a homography has no gradients then: give points, prior, noise detached"
+            )
         from fmtorch.two_view.lenses import homographies_with_lenses
 
         return homographies_with_lenses(c, find)

@@ -9,9 +9,10 @@ from torch import Tensor
 from fmtorch.core.records import ungraphed
 from fmtorch.core.stages import Estimator, Pruner, output_of
 from fmtorch.core.types import Correspondences, Estimate
+from fmtorch.estimators.lens_search import TAIL_DEVIATION
 from fmtorch.geometry.arithmetic import component_sum, matmul3, sqrt
 from fmtorch.geometry.cameras import MIN_SIDE_PX, calibration_problems, cross_matrix, mapped, square_pixels
-from fmtorch.geometry.covariance import two_view_covariance
+from fmtorch.geometry.covariance import LensesInPixels, two_view_covariance
 from fmtorch.geometry.epipolar import inverse_root
 from fmtorch.geometry.normalize import canonical
 from fmtorch.geometry.pose import inverse, pose, pose_from_fundamental
@@ -170,9 +171,11 @@ def _with_cameras(estimate: Estimate, square: Correspondences, images: Images, c
         F = torch.where(ok[:, None, None], canonical(matmul3(matmul3(A[:, 1].mT, F), A[:, 0])), 0)
         focals = focals * images.unit
     fields = {}
+    if estimate.lens is not None and images.unit is not None:  # half diagonals are of the images as they were
+        fields["lens"] = estimate.lens * (images.unit.detach() / images.unit) ** 2
     if covariance:
         at = estimate.derived(F=F, R=R, t=t).detach()
-        fields = covariance_fields(at, square, images.map, torch.where(known, square_focals, torch.nan).detach())
+        fields |= covariance_fields(at, square, images.map, torch.where(known, square_focals, torch.nan).detach())
     reasons = tuple(problem or reason for problem, reason in zip(images.problems, estimate.reason, strict=True))
     focals = torch.where(known, focals, torch.nan)
     return estimate.derived(F=F, E=matmul3(cross_matrix(t), R), R=R, t=t, focals=focals, reason=reasons, **fields)
@@ -217,7 +220,7 @@ def covariance_fields(
     centre0, centre1 = ((size.to(focals).flip(-1) - 1) / 2 for size in (c.size0, c.size1))
     computed = two_view_covariance(
         c.x0, c.x1, R, t, focals, centre0, centre1, scale, c.prior, c.noise, c.mask & estimate.ok[:, None],
-        estimate.focal_precision, c.shared_focal,
+        estimate.focal_precision, c.shared_focal, _lenses(c, estimate.lens),
     )  # fmt: skip
     of_F = computed.fundamental
     if maps is not None:
@@ -225,6 +228,18 @@ def covariance_fields(
     fields = {"covariance": computed.covariance, "tangents": computed.tangent, "covariance_F": of_F}
     valid = (estimate.ok & computed.valid)[:, None, None]
     return {name: torch.where(valid, value, torch.nan) for name, value in fields.items()}
+
+
+def _lenses(c: Correspondences, lens: Tensor | None) -> LensesInPixels | None:
+    """Estimated lenses (b, 2) and what was known of them; unknown ones that came out straight are so."""
+    if lens is None or c.lens is None:
+        return None
+    deviation = c.lens[..., 1].double()
+    straight = (deviation.isinf() & (lens == 0)).all(1, keepdim=True)
+    precision = torch.where(straight, torch.inf, deviation.clamp_max(TAIL_DEVIATION) ** -2)
+    sizes = torch.stack([size for size in (c.size0, c.size1) if size is not None], 1).double()
+    shared = torch.zeros_like(straight[:, 0]) if c.shared_lens is None else c.shared_lens
+    return LensesInPixels(lens.double(), sqrt(component_sum(sizes * sizes, -1)) / 2, precision, shared)
 
 
 def _covariance_of(

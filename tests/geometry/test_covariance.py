@@ -7,8 +7,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from fmtorch.geometry import two_view_covariance
+from fmtorch.geometry import pose_from_fundamental, two_view_covariance
+from fmtorch.geometry.covariance import LensesInPixels
 from tests.geometry.scenes import scene
+from tests.reference import lenses as division
 from tests.reference import two_view as reference
 from tests.reference.two_view import Cameras
 
@@ -87,6 +89,37 @@ def test_against_the_definitions(kind: str) -> None:
         assert not bool(result.covariance[i][5:][known].any())
     degrees = torch.rad2deg(result.covariance.diagonal(dim1=1, dim2=2)[:, :5].split([3, 2], 1)[0].sum(1).sqrt())
     torch.testing.assert_close(result.deviation_degrees[:, 0], degrees)
+
+
+@pytest.mark.parametrize("shared", [False, True])
+def test_lenses_against_differences(shared: bool) -> None:
+    """Of Sampson distances in photographs, by all nine parameters; with a noise that is nothing beside the parallax."""
+    lens, size = (-0.15, -0.15 if shared else -0.05), (480, 640)
+    x0, x1, F, K = division.photographs(1, lens, noise=0.05, wrong=0)
+    straight = [np.array([division.straight(x, size, own) for x in a]) for a, own in zip((x0, x1), lens, strict=True)]
+    pose = pose_from_fundamental(*map(torch.from_numpy, (F, K, K, *straight)))
+    centre, half = division.frame(size)
+    cameras = Cameras.of(pose.R.numpy(), pose.t.numpy(), np.array([K[0, 0]] * 2), np.stack([centre, centre]))
+    open_lens = torch.full((1, 2), 0.15**-2)
+    result = two_view_covariance(
+        torch.from_numpy(x0)[None], torch.from_numpy(x1)[None], **arguments(cameras), truncation=torch.tensor([INF]),
+        focal_precision=torch.diag_embed(torch.tensor([[4.0, 9.0]])),
+        lens=LensesInPixels(torch.tensor([lens]), torch.full((1, 2), half), open_lens, torch.tensor([shared])),
+    )  # fmt: skip
+
+    def distances(by: np.ndarray) -> np.ndarray:
+        moved, bent = cameras.moved(by[:7]).fundamental(), (lens[0] + by[7], lens[1] + by[7 if shared else 8])
+        return np.array([division.sampson(moved, x, (size, size), bent) for x in np.c_[x0, x1]])
+
+    step, used = 1e-4, 8 if shared else 9
+    J = np.stack([(distances(d) - distances(-d)) / (2 * step) for d in step * np.eye(9)[:used]], 1)
+    C = np.linalg.inv(J.T @ J / float(result.noise) ** 2 + np.diag([0.0] * 5 + [4, 9] + [0.15**-2] * (used - 7)))
+    own = result.covariance[0].numpy()
+    np.testing.assert_allclose(own.diagonal()[5:used], C.diagonal()[5:], rtol=0.01)
+    np.testing.assert_allclose(own[7, 5], C[7, 5], rtol=0.01)
+    assert np.trace(own[:3, :3]) == pytest.approx(np.trace(C[:3, :3]), rel=0.01)
+    assert np.trace(own[3:5, 3:5]) == pytest.approx(np.trace(C[3:5, 3:5]), rel=0.01)
+    np.testing.assert_array_equal(own[8], own[7] if shared else own[:, 8])
 
 
 def test_cameras_that_are_none_and_what_matches_leave_open_are_uncertain() -> None:

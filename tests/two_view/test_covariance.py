@@ -13,6 +13,7 @@ from scipy.stats import chi2
 import fmtorch
 from fmtorch import cv2
 from fmtorch.core import Correspondences, Estimate
+from fmtorch.core.lenses import division_lens
 from fmtorch.two_view.estimation import extents
 from tests.geometry.scenes import batch, draw
 from tests.reference import assumed_sizes
@@ -51,22 +52,29 @@ def test_covariance_of_F_is_that_of_its_parameters(deviation: float) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("lens", [None, "shared"])
 @pytest.mark.parametrize("knowledge", ["known", "shared", "unknown"])
-@pytest.mark.parametrize("count", [100, 200, 500])
-def test_ellipsoids_hold_the_truth(knowledge: str, count: int) -> None:
+@pytest.mark.parametrize("count", [150, 250, 500])
+def test_ellipsoids_hold_the_truth(knowledge: str, count: int, lens: str | None) -> None:
     """95 % ones, of 400 scenes with independent noise: 93 to 97 % and twice the deviation of a share.
-    Of the pose where focal lengths are known; otherwise of the direction of translation and of a focal length."""
-    scenes = [reference.scene(i, count, 0.5, 0.2, (CENTRAL, CENTRAL)) for i in range(400)]
-    K = torch.from_numpy(CENTRAL)
+    Of the pose where focal lengths are known; otherwise of the direction of translation and of a focal length; of a
+    lens of -0.15, too."""
+    scenes, points = [reference.scene(i, count, 0.0, 0.2, (CENTRAL, CENTRAL)) for i in range(400)], []
+    K, rng, bent = torch.from_numpy(CENTRAL), np.random.default_rng(0), division_lens(-0.15, reference.SIZE)
+    for s in scenes:
+        ends = (x if lens is None else bent.distort(x) for x in (s.x0, s.x1))
+        points.append([x + rng.normal(0, 0.5, x.shape) for x in ends])
     given: dict[str, Any] = {"K0": K, "K1": K} if knowledge == "known" else {"focal": knowledge}
-    e = fmtorch.find_fundamental([s.x0 for s in scenes], [s.x1 for s in scenes], **SIZES, **given, covariance=True)
+    given |= {**SIZES, "covariance": True, "lens": lens}
+    e = fmtorch.find_fundamental([x0 for x0, _ in points], [x1 for _, x1 in points], **given)
     assert bool(e.ok.all())
-    parts = {"known": [slice(0, 5)]}.get(knowledge, [slice(3, 5), slice(5, 6)])
+    parts = {"known": [slice(0, 5)]}.get(knowledge, [slice(3, 5), slice(5, 6)]) + [slice(7, 8)] * (lens is not None)
     inside = np.zeros(len(parts))
     for i, s in enumerate(scenes):
         R, t, B, C = (value[i].numpy() for value in (e.R, e.t, e.tangents, e.covariance))
         log_focal = np.log(CENTRAL[0, 0] / e.focals[i].numpy())
         off = np.r_[Rotation.from_matrix(s.R @ R.T).as_rotvec(), B.T @ (s.t / (s.t @ t)), log_focal]
+        off = off if e.lens is None else np.r_[off, -0.15 - e.lens[i].numpy()]
         for k, part in enumerate(parts):
             inside[k] += off[part] @ np.linalg.solve(C[part, part], off[part]) < chi2.ppf(0.95, len(off[part]))
     share, spread = inside / len(scenes), np.sqrt(0.95 * 0.05 / len(scenes))
@@ -75,7 +83,9 @@ def test_ellipsoids_hold_the_truth(knowledge: str, count: int) -> None:
     assert (share <= 0.97 + 2 * spread).all()
 
 
-@pytest.mark.parametrize("given", [CAMERAS, {"focal": "shared"}, {}], ids=["known", "shared", "unknown"])
+@pytest.mark.parametrize(
+    "given", [CAMERAS, {"focal": "shared"}, {}, {**CAMERAS, "lens": (-0.05, 0.05)}, {"lens": "unknown"}]
+)
 def test_laws(given: dict[str, Any]) -> None:
     """Of pairs alone, in a batch, beside one that fails."""
     scenes = [reference.scene(i, n, 0.5) for i, n in enumerate((150, 60, 4, 90))]

@@ -242,7 +242,7 @@ def test_lenses_that_no_homography_has(said: dict[str, Any], message: str) -> No
     x0, x1 = planes(1, 0.0)
     with pytest.raises(ValueError, match=re.escape(message)):
         fmtorch.find_homography(x0, x1, **said)
-    with pytest.raises(ValueError, match="lens is given, and its estimates have no gradients"):
+    with pytest.raises(ValueError, match="lens is given, and a homography has no gradients"):
         fmtorch.find_homography(torch.from_numpy(x0).requires_grad_(), x1, lens="shared", **SIZES)
 
 

@@ -12,6 +12,7 @@ import torch
 import fmtorch
 from fmtorch import presets
 from fmtorch.core import PAIR_TYPES, Correspondences, Estimate, collate
+from fmtorch.estimators import lens_search
 from fmtorch.estimators.lens_search import inverted
 from fmtorch.geometry import significance
 from fmtorch.metrics import corner_error, nsgd
@@ -392,7 +393,6 @@ def test_sizes_may_be_assumed() -> None:
         ({"lens": -0.6}, "lens of image 0 of pair 0 is [-0.6, 0.0]; it is lambda in half diagonals, from -0.45"),
         ({"lens": (-0.1, -1)}, "lens of image 0 of pair 0 is"),
         ({"lens": (0.1, 0.1, 0.1)}, "lens has shape (3,)"),
-        ({"lens": "shared", "covariance": True}, "a covariance is of pinholes"),
         ({"lens": "shared", "size0": "unknown", "size1": "unknown"}, "lens needs the image sizes"),
         ({"lens": "shared", "K0": np.eye(3), "K1": np.eye(3), "size0": None, "size1": None}, "lens needs the image"),
         ({"lens": "shared", "estimator": "ransac"}, "lens needs an estimator with the option focal"),
@@ -426,10 +426,47 @@ def test_the_type_of_a_pair_is_that_of_the_undistorted_photographs(calibrated: b
     assert float(corner_error(alone.homography, *truth)) < 0.5 < 3 < float(corner_error(as_pinholes.homography, *truth))
 
 
-def test_gradients_are_refused() -> None:
-    x0, x1, _, _ = division.photographs(1, (0, 0))
-    with pytest.raises(ValueError, match="lens is given, and its estimates have no gradients"):
-        found(torch.from_numpy(x0).requires_grad_(), torch.from_numpy(x1), lens="shared")
+@pytest.mark.parametrize(
+    ("lens", "cameras"),
+    [("shared", "nothing"), ("unknown", "unknown"), ("shared", "known"), (((-0.15, 0.03), None), "shared")],
+)
+def test_gradients_of_lenses_are_differences_of_optima(lens: Any, cameras: str, monkeypatch: Any) -> None:
+    """Of F, lenses, focal lengths and pose to points, noise, prior and K: of converged fits to all matches, since the
+    Hessian is Gauss and Newton's; the same bits alone and beside another pair."""
+    monkeypatch.setattr(lens_search, "fit_distance", lambda r2, own: 1.0)
+    monkeypatch.setattr(lens_search, "FOCAL_TOLERANCE", 0.0)
+    monkeypatch.setattr(lens_search, "ITERATIONS", 40)
+    *points, _, K = division.photographs(1, (-0.15, -0.15), noise=0.02, wrong=0)
+    generator, n = torch.Generator().manual_seed(0), len(points[0])
+    given = {"x0": torch.from_numpy(points[0]), "x1": torch.from_numpy(points[1])}
+    given |= {"noise": torch.ones(n, dtype=torch.float64), "prior": torch.full((n,), 0.9, dtype=torch.float64)}
+    given |= {"K0": torch.from_numpy(K), "K1": torch.from_numpy(K)} if cameras == "known" else {}
+    focal = {"focal": cameras} if cameras in ("unknown", "shared") else {}
+    ways = {k: torch.randn(v.shape, generator=generator, dtype=torch.float64) * 0.03 for k, v in given.items()}
+    ways |= {f"K{i}": torch.diag(torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64)) for i in range(2)}
+    weight = torch.randn(3, 3, generator=generator, dtype=torch.float64)
+
+    def figures(e: Estimate) -> dict[str, torch.Tensor]:
+        by_field = {"F": 1e3 * e.F[0] * weight, "lens": e.lens[0] * weight[0, :2]}
+        return by_field if e.R is None else {**by_field, "focals": e.focals[0].log(), "R": e.R[0] * weight}
+
+    leaves = {name: value.clone().requires_grad_() for name, value in given.items()}
+    estimate = found(**leaves, **focal, lens=lens)
+    for name, figure in figures(estimate).items():
+        slopes = torch.autograd.grad(figure.sum(), list(leaves.values()), retain_graph=True)
+        ends = []
+        for step in (1e-3, -1e-3):
+            moved = {k: v + step * ways[k] for k, v in given.items()}
+            ends.append(float(figures(found(**moved, **focal, lens=lens))[name].sum()))
+        slope = sum(float((g * ways[k]).sum()) for g, k in zip(slopes, leaves, strict=True))
+        scale = sum(float((g * ways[k]).norm()) for g, k in zip(slopes, leaves, strict=True))
+        assert slope == pytest.approx((ends[0] - ends[1]) / 2e-3, abs=0.02 * scale), name
+    batch = {k: torch.stack([v.detach(), v.detach()]).requires_grad_() for k, v in leaves.items()}
+    together = found(**batch, **focal, lens=lens, key=[0, 1])
+    for e, of in ((estimate, leaves), (together, batch)):
+        e.F[0].sum().backward(inputs=list(of.values()))
+    for name, leaf in leaves.items():
+        torch.testing.assert_close(batch[name].grad[0], leaf.grad, rtol=0, atol=0)
 
 
 def test_matches_that_contradict_pinholes_suggest_a_lens() -> None:
