@@ -76,7 +76,8 @@ def test_ellipsoids_hold_the_truth(knowledge: str, count: int, lens: str | None)
         off = np.r_[Rotation.from_matrix(s.R @ R.T).as_rotvec(), B.T @ (s.t / (s.t @ t)), log_focal]
         off = off if e.lens is None else np.r_[off, -0.15 - e.lens[i].numpy()]
         for k, part in enumerate(parts):
-            inside[k] += off[part] @ np.linalg.solve(C[part, part], off[part]) < chi2.ppf(0.95, len(off[part]))
+            if C[part, part].any():  # not of a lens that came out straight
+                inside[k] += off[part] @ np.linalg.solve(C[part, part], off[part]) < chi2.ppf(0.95, len(off[part]))
     share, spread = inside / len(scenes), np.sqrt(0.95 * 0.05 / len(scenes))
     print(f"{knowledge}, {count} matches: {np.round(100 * share, 1)} %")
     assert (share >= 0.93 - 2 * spread).all()
