@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy.linalg
 
 Size = tuple[int, int]
 
@@ -46,6 +47,26 @@ def sampson(F: np.ndarray, x: np.ndarray, sizes: tuple[Size, Size], lenses: tupl
         (constraint(F, x + d, sizes, lenses) - constraint(F, x - d, sizes, lenses)) / 2e-3 for d in 1e-3 * np.eye(4)
     ]
     return float(e / np.linalg.norm(slope))
+
+
+def nine_points(x0: np.ndarray, x1: np.ndarray, size: Size) -> list[tuple[float, np.ndarray]]:
+    """Each lambda of one lens with the F of pinholes for nine matches (9, 2) of photographs of one size.
+
+    Fitzgibbon, "Simultaneous linear estimation of multiple view geometry and lens distortion" (CVPR 2001): the
+    constraint is (D1 + lambda D2 + lambda^2 D3) f = 0, a quadratic eigenvalue problem."""
+    centre, half = frame(size)
+    h0, h1 = (np.c_[(x - centre) / half, np.ones(9)] for x in (x0, x1))
+    e0, e1 = (np.c_[np.zeros((9, 2)), (h[:, :2] ** 2).sum(1)] for h in (h0, h1))
+    D1, D2, D3 = (
+        sum(np.einsum("ni,nj->nij", b, a).reshape(9, 9) for b, a in terms)
+        for terms in ([(h1, h0)], [(h1, e0), (e1, h0)], [(e1, e0)])
+    )
+    zero, eye = np.zeros((9, 9)), np.eye(9)
+    values, vectors = scipy.linalg.eig(np.block([[zero, eye], [-D1, -D2]]), np.block([[eye, zero], [zero, D3]]))
+    real = [i for i in range(18) if abs(values[i].imag) < 1e-6 and abs(values[i]) < 1]
+    A = np.array([[1 / half, 0, -centre[0] / half], [0, 1 / half, -centre[1] / half], [0, 0, 1]])
+    models = [A.T @ vectors[:9, i].real.reshape(3, 3) @ A for i in real]
+    return [(values[i].real, F / np.linalg.norm(F)) for i, F in zip(real, models, strict=True)]
 
 
 def photographs(

@@ -338,6 +338,21 @@ def test_one_unknown_lens(lens: float) -> None:
     assert all(abs(division.sampson(F, x, (SIZE, SIZE), (lens, lens))) < 2.5 for x in np.c_[x0, x1][inliers])
 
 
+def test_nine_exact_matches_have_the_lens_that_is_found() -> None:
+    """Fitzgibbon's solver, on samples of the same matches: exact ones tell lambda, those with noise far worse than the
+    fit to all."""
+    rng, nearest, own = np.random.default_rng(0), [], []
+    for noise in (0.0, 0.3):
+        x0, x1, _, _ = division.photographs(1, (-0.15, -0.15), noise=noise, wrong=0)
+        own.append(abs(lenses(found(x0, x1, lens="shared"))[0] + 0.15))
+        samples = [rng.choice(len(x0), 9, replace=False) for _ in range(10)]
+        solutions = [division.nine_points(x0[each], x1[each], SIZE) for each in samples]
+        nearest.append(np.median([min((abs(value + 0.15) for value, _ in s), default=1.0) for s in solutions]))
+    assert nearest[0] < 1e-6
+    assert own[0] < 1e-3
+    assert own[1] < min(0.02, nearest[1] / 2)
+
+
 def test_a_straight_lens_costs_nothing() -> None:
     x0, x1, _, _ = division.photographs(2, (0, 0))
     estimate = found(x0, x1, lens="shared")
