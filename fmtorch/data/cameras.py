@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-from typing import Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -14,36 +13,22 @@ SAME_CENTRE = 1e-9  # baseline below which there is no F, relative to the camera
 NEARLY_ROTATION = 0.05  # change of an entry up to which a matrix is taken for a rotation that was rounded
 
 
-@runtime_checkable
-class Pinhole(Protocol):
-    """Anything with a calibration K (3, 3), and R (3, 3), t (3,) that map the world to the camera."""
-
-    @property
-    def K(self) -> Matrix: ...
-
-    @property
-    def R(self) -> Matrix: ...
-
-    @property
-    def t(self) -> Matrix: ...
-
-
 @dataclasses.dataclass(frozen=True, eq=False)
 class Camera:
-    """A camera and nothing else."""
+    """A pinhole: its calibration K (3, 3), and R (3, 3), t (3,) that map the world to the camera."""
 
     K: Matrix
     R: Matrix
     t: Matrix
 
 
-def relative_pose(camera0: Pinhole, camera1: Pinhole) -> tuple[Matrix, Matrix]:
+def relative_pose(camera0: Camera, camera1: Camera) -> tuple[Matrix, Matrix]:
     """R and t of ``X1 = R X0 + t``, with X0 and X1 in the two cameras' coordinates."""
     R = camera1.R @ camera0.R.T
     return R, camera1.t - R @ camera0.t
 
 
-def fundamental(camera0: Pinhole, camera1: Pinhole) -> Matrix:
+def fundamental(camera0: Camera, camera1: Camera) -> Matrix:
     """F with ``x1^T F x0 = 0`` and unit Frobenius norm: ``K1^-T [t]x R K0^-1`` (Hartley and Zisserman, eq. 9.12).
     Equal, up to scale, to ``[P1 C0]x P1 P0^+`` of the projection matrices. NaN where the baseline is exactly zero."""
     R, t = relative_pose(camera0, camera1)
@@ -52,7 +37,7 @@ def fundamental(camera0: Pinhole, camera1: Pinhole) -> Matrix:
     return F / np.linalg.norm(F)
 
 
-def share_centre(camera0: Pinhole, camera1: Pinhole) -> bool:
+def share_centre(camera0: Camera, camera1: Camera) -> bool:
     """Whether two cameras are at one place, as far as float64 tells: a pure rotation has no F."""
     centres = [-camera.R.T @ camera.t for camera in (camera0, camera1)]
     return bool(np.linalg.norm(centres[0] - centres[1]) <= SAME_CENTRE * max(map(np.linalg.norm, centres)))

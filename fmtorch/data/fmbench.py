@@ -56,7 +56,7 @@ def _scene(folder: Path, fps: int | float | None, window: int | float) -> Scene:
         stem, values = f"{len(views):08d}", files.to_finite(folder / CAMERAS, number, line.split(), COLUMNS, 21)
         source = ImageSource(f"{family}/{folder.name}/{stem}", there.get(stem, images / f"{stem}{SUFFIXES[0]}"))
         place = f"{folder / CAMERAS}, line {number}"
-        views.append(View(source, values[:9].reshape(3, 3), values[9:18].reshape(3, 3), values[18:], place))
+        views.append(View(values[:9].reshape(3, 3), values[9:18].reshape(3, 3), values[18:], source, place))
     count = len(views)
     pairs: Candidates = AllPairs(count) if fps is None else following(np.arange(count) / fps, window)
     return Scene(folder.name, family, views, pairs)

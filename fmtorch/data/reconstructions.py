@@ -113,7 +113,7 @@ def _scene(
         assert camera.lens is not None  # of a model
         lens = camera.lens if camera.lens.bends else None
         source = ImageSource(f"{family}/{folder.name}/{image.name}", folder / images / image.name, camera.size, lens)
-        views.append(View(source, camera.lens.K, image.R, image.t, image.place))
+        views.append(View(camera.lens.K, image.R, image.t, source, image.place))
     points = [image.points for image in model.images] if candidates == "points" else None
     return Scene(folder.name, family, views, scenes.collection_pairs(len(views), points, shared))
 
@@ -217,7 +217,7 @@ def _view(file: Path, lines: list[str], i: int, source: ImageSource) -> View | N
     lens = Lens(focal, focal, (w - 1) / 2, (h - 1) / 2, "RADIAL", (k1, k2))
     R = _FLIP @ nearest_rotation(np.stack(rows[1:4]), place)
     image = ImageSource(source.identity, source.path, (h, w), lens if lens.bends else None)
-    return View(image, lens.K, R, _FLIP @ rows[4], place)
+    return View(lens.K, R, _FLIP @ rows[4], image, place)
 
 
 def _seen(file: Path, lines: list[str], cameras: int, points: int, numbers: dict[int, int]) -> list[Indices]:

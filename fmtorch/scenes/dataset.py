@@ -316,7 +316,7 @@ class RenderedPairs(HeldPairs):
         scenes = []
         for name, views in self._views.items():
             drawn = [
-                View(ImageSource(f"{name}/{i}", path, camera.size), camera.K, camera.R, camera.t, f"{name}/{path.name}")
+                View(camera.K, camera.R, camera.t, ImageSource(f"{name}/{i}", path, camera.size), f"{name}/{path.name}")
                 for i, (path, camera) in enumerate(views)
             ]
             scenes.append(Scene(name, self._tasks[name].family, drawn, AllPairs(len(drawn))))
