@@ -10,9 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from fmtorch.data import files
-from fmtorch.data.cameras import Camera, relative_pose
 from fmtorch.data.files import DataError, Matrix, given_root, images_by_stem, read_numbers
-from fmtorch.data.pairs import HeldPairs, ImagePair, ImageSource
+from fmtorch.data.pairs import Camera, HeldPairs, ImagePair, ImageSource, relative_pose
 from fmtorch.data.scenes import WINDOW, AllPairs, Candidates, Scene, ScenePairs, View, folders, following
 
 CAMERAS, IMAGES, SUFFIXES = "Camera.txt", "Images", (".jpg", ".png")

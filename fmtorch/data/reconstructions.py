@@ -9,11 +9,10 @@ import numpy as np
 
 from fmtorch.core.lenses import Lens
 from fmtorch.data import files, scenes
-from fmtorch.data.cameras import nearest_rotation
 from fmtorch.data.files import DataError, Indices, given_root
 from fmtorch.data.image_cameras import Model, read_model
 from fmtorch.data.images import stored_size
-from fmtorch.data.pairs import ImageSource
+from fmtorch.data.pairs import ImageSource, nearest_rotation
 from fmtorch.data.scenes import MIN_SHARED, Scene, ScenePairs, View
 
 _MODELS = ("sparse/0", "sparse", "dense/sparse", ".")  # below a scene's folder, in the order in which they are tried
@@ -42,8 +41,8 @@ def colmap_pairs(
             in ``stereo/depth_maps`` beside the folder of the images; geometric ones, or else photometric.
 
     Images with lens distortion are undistorted when they are read, to a pinhole of the same focal lengths, principal
-    point and size (`fmtorch.data.cameras`). Principal points are lowered by COLMAP's half pixel. An image of another
-    size than its camera's is refused when it is read. Raises DataError for a missing or damaged model.
+    point and size (`undistorted`). Principal points are lowered by COLMAP's half pixel. An image of another size than
+    its camera's is refused when it is read. Raises DataError for a missing or damaged model.
     """
     home, scene_folders = _scene_folders(root, split, sequences, model)
     model_folders = [_model_folder(folder, model) for folder in scene_folders]

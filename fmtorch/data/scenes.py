@@ -13,10 +13,9 @@ from typing import Any
 import cv2
 import numpy as np
 
-from fmtorch.data.cameras import Camera, fundamental, relative_pose, share_centre
 from fmtorch.data.files import Array, DataError, Indices, Matrix, Singles
 from fmtorch.data.images import ImageError
-from fmtorch.data.pairs import ImagePair, ImageSource, PairDataset
+from fmtorch.data.pairs import Camera, ImagePair, ImageSource, PairDataset, fundamental, relative_pose, share_centre
 
 WINDOW = 1.0  # s: a frame is paired with those of the following second (Bian et al., BMVC 2019, Section 3)
 MIN_SHARED = 1  # points of a reconstruction that two images must both see

@@ -8,9 +8,8 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from fmtorch.core.lenses import Lens
 from fmtorch.data import scenes
-from fmtorch.data.cameras import nearest_rotation
 from fmtorch.data.files import DataError, Mask, Matrix, given_root, images_by_stem, numbered, to_finite
-from fmtorch.data.pairs import ImageSource
+from fmtorch.data.pairs import ImageSource, nearest_rotation
 from fmtorch.data.scenes import WINDOW, Scene, ScenePairs, View, following
 
 _SUFFIXES = (".png", ".jpg")
