@@ -20,8 +20,7 @@ from torch import Tensor
 
 from fmtorch.core.types import Correspondences
 from fmtorch.geometry.arithmetic import component_sum, gradient_wanted, sqrt
-from fmtorch.jit.batches import for_each_pair
-from fmtorch.jit.kernel import Array, B1x1, F4x1, F4x2, F4x3, inner, kernel
+from fmtorch.jit.kernel import Array, B1x1, F4x1, F4x2, F4x3, for_each_pair, inner, kernel
 from fmtorch.pruning.calibration import Calibration, calibrated
 from fmtorch.pruning.curves import CURVES, CURVES32, curve_orders, put_in_order, slots_along_curves
 

@@ -13,8 +13,7 @@ from torch import Tensor
 
 from fmtorch.core.types import Correspondences
 from fmtorch.geometry.arithmetic import smallest_but
-from fmtorch.jit.batches import for_each_pair
-from fmtorch.jit.kernel import Array, B1x1, F8x1, F8x2, F8x3, I8x1, inner, kernel, matrix, vector
+from fmtorch.jit.kernel import Array, B1x1, F8x1, F8x2, F8x3, I8x1, for_each_pair, inner, kernel, matrix, vector
 from fmtorch.pruning.calibration import calibration_of
 
 _LEAF = 8  # points a leaf, at most

@@ -22,7 +22,7 @@ from fmtorch.core.files import cache_dir, temporary_name
 from fmtorch.data.construction import Keypoints, keypoints, matchable
 from fmtorch.data.pairs import HeldPairs, ImagePair, ImageSource
 from fmtorch.data.scenes import AllPairs, Scene, ScenePairs, View
-from fmtorch.jit.together import compile_together
+from fmtorch.jit.kernel import compile_together
 from fmtorch.jobs.execution import Execution, cores
 from fmtorch.jobs.runner import MAX_PROCESSES, Local, TaskRunner, WorkerPool
 from fmtorch.scenes import landmarks, videos
