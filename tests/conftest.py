@@ -71,15 +71,14 @@ def compile_all() -> None:
     """Compile every kernel of the package that this machine has not compiled yet."""
     import fmtorch
     from fmtorch.jit import kernel as switch
-    from fmtorch.jit import together
-    from fmtorch.jit.kernel import Kernel
+    from fmtorch.jit.kernel import Kernel, compile_together
 
     if switch.off():
         return
     names = [each.name for each in pkgutil.walk_packages(fmtorch.__path__, "fmtorch.") if "__main__" not in each.name]
     modules = [importlib.import_module(name) for name in names]
     kernels = [value for module in modules for value in vars(module).values() if isinstance(value, Kernel)]
-    together.compile_together(list({id(each): each for each in kernels}.values()))
+    compile_together(list({id(each): each for each in kernels}.values()))
 
 
 def own_cache(folder: Path) -> Path:

@@ -18,7 +18,7 @@ import fmtorch.commands.config  # the commands' configs, by their names
 from fmtorch import presets
 from fmtorch.data import ImagePair, ImageSource
 from fmtorch.pipeline import Pipeline
-from fmtorch.presets import compose as compose
+from fmtorch.presets.composition import compose as compose
 
 ROWS = np.array([[0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])  # F of a sideways camera: epipolar lines are rows
 

@@ -17,11 +17,14 @@ import torch
 from torch import Tensor
 
 from fmtorch import presets
-from fmtorch.core import Correspondences, Estimator, ImagePruner, PairImages, Pruner, collate, grey_pyramid
+from fmtorch.core import Correspondences, Estimator, ImagePruner, PairImages, Pruner, collate
+from fmtorch.core.stages import grey_pyramid
 from tests.variants import built, loaded, variants
 
 PEERS = {
-    name: package for name in variants("estimator") for package in presets.peer_packages(loaded("estimator", name))
+    name: package
+    for name in variants("estimator")
+    for package in presets.files.peer_packages(loaded("estimator", name))
 }
 """The packages of the extra `peers` that presets of estimators need, by the presets' names."""
 SMALL_KINDS = ("collinear", "collinear in image 1", "planar", "coincident", "half coincident")

@@ -7,7 +7,6 @@ import sys
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import hydra
 from hydra._internal.hydra import Hydra
@@ -33,10 +32,6 @@ Task = Callable[[DictConfig], None]
 SUBMITTED = "jobs run in other processes; what each prints: .submitit/JOB/JOB_0_log.out below hydra.sweep.dir (runs)"
 OVERRIDE = re.compile(r"(?P<key>(?:\+\+|\+)?[A-Za-z_][\w./@:-]*)=(?P<value>.*)", re.DOTALL)
 LITERAL = re.compile(r"null|true|false|\?\?\?|'.*'|\".*\"", re.IGNORECASE | re.DOTALL)  # what a path field may hold
-
-
-class Mistake(ValueError):
-    """A user's mistake in one job of a sweep, error_line by its message: it can be sent between processes."""
 
 
 for each in COMMANDS.values():
@@ -65,7 +60,7 @@ def job(task: Task) -> Task:
             if not (trace or isinstance(error, terminal.MISTAKES)):
                 raise
             if HydraConfig.get().mode == RunMode.MULTIRUN:
-                raise Mistake(terminal.error_line(error)) from None
+                raise ValueError(terminal.error_line(error)) from None  # which can be sent between processes
             sys.exit(f"error: {terminal.error_line(error)}")
 
     return wrapped
@@ -94,16 +89,12 @@ def run_command(command: Command, task: Task) -> None:
         if any(word.startswith("hydra/launcher=submitit") for word in sys.argv):
             print(SUBMITTED, flush=True)
         if not any(word.startswith("hydra.mode=") for word in sys.argv):
-            Hydra.get_mode = _mode_of_flags  # type: ignore[method-assign]
+            Hydra.get_mode = lambda *_, **__: None  # type: ignore[method-assign]  # it would compose the config again
         try:
             with env_override({"HYDRA_FULL_ERROR": "1"}):  # Hydra then leaves errors to us
                 hydra.main(version_base=None, config_path=str(conf_dir()), config_name=command.name)(task)()
         except (HydraException, OmegaConfBaseException) as error:
             sys.exit(f"error: {explained(error, command.name)}")
-
-
-def _mode_of_flags(*_: Any, **__: Any) -> None:
-    """In place of Hydra's question whether the config names a mode, for which it composes all of it once more."""
 
 
 def _expect_known(overrides: Sequence[str]) -> None:

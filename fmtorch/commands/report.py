@@ -118,7 +118,7 @@ def _dataset(folder: RunFolder) -> str:
 
 def _heading(runs: Sequence[Run]) -> str:
     options = {key: value for key, value in (runs[0].folder.config.get("dataset") or {}).items() if key != "digest"}
-    preset = presets.closest("dataset", options)
+    preset = presets.files.closest("dataset", options)
     words = [] if preset is None else [preset[0]]
     words += [value for key, value in options.items() if key != "_target_" and isinstance(value, str)]
     families = dict.fromkeys(name for r in runs for name in r.table["family"].to_pylist())

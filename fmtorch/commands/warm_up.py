@@ -7,7 +7,7 @@ import time
 
 from fmtorch.core.terminal import console, exits_with_message
 from fmtorch.jit import cache, kernel, linking
-from fmtorch.jit.together import HOME, compile_together
+from fmtorch.jit.kernel import HOME, compile_together
 
 USAGE = """fmtorch warm-up: compile all kernels now
 

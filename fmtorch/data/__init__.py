@@ -7,12 +7,11 @@ from typing import Any, cast
 
 from fmtorch import presets
 from fmtorch.core.lenses import MODELS, Lens, undistorted_points
-from fmtorch.data.cameras import undistorted
 from fmtorch.data.files import DataError, NpzArrays
 from fmtorch.data.fmbench import FMBenchPairs
 from fmtorch.data.image_cameras import ExifFocal, ImageCameras, exif_focal, read_model
 from fmtorch.data.images import ImageError, read_image, stored_orientation, stored_size, to_grey
-from fmtorch.data.pairs import DepthDataset, GivenMatches, ImagePair, ImageSource, PairDataset
+from fmtorch.data.pairs import DepthDataset, GivenMatches, ImagePair, ImageSource, PairDataset, undistorted
 
 __all__ = [
     "MODELS", "DataError", "DepthDataset", "ExifFocal", "FMBenchPairs", "GivenMatches", "ImageCameras", "ImageError",

@@ -13,11 +13,10 @@ import numpy as np
 
 from fmtorch.core import claim
 from fmtorch.core.files import replacing, write_whole
-from fmtorch.data.cameras import line_distance
 from fmtorch.data.files import Indices, Matrix, Pixels, Singles
 from fmtorch.data.fmbench import CAMERAS, IMAGES, SUFFIXES
 from fmtorch.data.images import ImageError, read_image, to_grey
-from fmtorch.data.pairs import DepthDataset, ImageSource
+from fmtorch.data.pairs import DepthDataset, ImageSource, line_distance
 from fmtorch.data.scenes import ScenePairs, View, image_pair, incidence
 
 STEP = 4  # px between the pixels of which depth is asked, along rows and columns

@@ -10,9 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from fmtorch.data import files
-from fmtorch.data.cameras import Camera, relative_pose
 from fmtorch.data.files import DataError, Matrix, given_root, images_by_stem, read_numbers
-from fmtorch.data.pairs import HeldPairs, ImagePair, ImageSource
+from fmtorch.data.pairs import Camera, HeldPairs, ImagePair, ImageSource, relative_pose
 from fmtorch.data.scenes import WINDOW, AllPairs, Candidates, Scene, ScenePairs, View, folders, following
 
 CAMERAS, IMAGES, SUFFIXES = "Camera.txt", "Images", (".jpg", ".png")
@@ -56,7 +55,7 @@ def _scene(folder: Path, fps: int | float | None, window: int | float) -> Scene:
         stem, values = f"{len(views):08d}", files.to_finite(folder / CAMERAS, number, line.split(), COLUMNS, 21)
         source = ImageSource(f"{family}/{folder.name}/{stem}", there.get(stem, images / f"{stem}{SUFFIXES[0]}"))
         place = f"{folder / CAMERAS}, line {number}"
-        views.append(View(source, values[:9].reshape(3, 3), values[9:18].reshape(3, 3), values[18:], place))
+        views.append(View(values[:9].reshape(3, 3), values[9:18].reshape(3, 3), values[18:], source, place))
     count = len(views)
     pairs: Candidates = AllPairs(count) if fps is None else following(np.arange(count) / fps, window)
     return Scene(folder.name, family, views, pairs)

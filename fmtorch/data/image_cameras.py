@@ -14,8 +14,8 @@ import numpy as np
 from PIL import ExifTags, Image
 
 from fmtorch.core.lenses import MODELS, Lens
-from fmtorch.data.cameras import rotation_of_quaternion
 from fmtorch.data.files import DataError, Indices, Matrix, numbered, read_lines, to_finite, to_whole
+from fmtorch.data.pairs import rotation_of_quaternion
 
 HALF_PIXEL = 0.5  # COLMAP puts the centre of the first pixel at (0.5, 0.5)
 _POINT = np.dtype([("xy", "<f8", 2), ("point", "<i8")])

@@ -11,9 +11,8 @@ import kornia_rs
 import numpy as np
 from PIL import ExifTags, Image, JpegImagePlugin, PngImagePlugin, TiffImagePlugin
 
-from fmtorch.data.cameras import undistorted
 from fmtorch.data.files import Array, Pixels
-from fmtorch.data.pairs import ImageSource
+from fmtorch.data.pairs import ImageSource, undistorted
 
 _JPEG, _PNG = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
 _TIFF = (b"II*\0", b"II+\0", b"MM\0*", b"MM\0+")  # the second of each order: BigTIFF

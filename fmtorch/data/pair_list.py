@@ -15,11 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from fmtorch.data import files
-from fmtorch.data.cameras import Camera, fundamental, nearest_rotation, relative_pose
+from fmtorch.data import files, pairs
 from fmtorch.data.files import DataError, Matrix, NpzArrays, given_root, numbered, read_numbers
 from fmtorch.data.images import stored_size
-from fmtorch.data.pairs import HeldPairs, ImagePair, ImageSource, Resampling, Size, scaled_size
+from fmtorch.data.pairs import Camera, HeldPairs, ImagePair, ImageSource, Resampling, Size, fundamental, relative_pose
 
 SUPERGLUE, GLUE_FACTORY, GLUE_FACTORY_4X4 = 38, 32, 36  # columns of a line
 LAYOUTS = {
@@ -267,7 +266,7 @@ class PairList(HeldPairs):
             return ImageSource(identity, path)
         target = size if self._resize is None else self._resize
         if isinstance(target, int):
-            target = scaled_size(own, target / max(own))
+            target = pairs.scaled_size(own, target / max(own))
         return ImageSource(identity, path, own, resampling=Resampling(target, turns))
 
     def _size(self, path: Path) -> Size | None:
@@ -293,7 +292,7 @@ def _motion(listed: ListedPair) -> tuple[Matrix, Matrix]:
         raise DataError(f"{listed.place}: the pose is not finite")
     if not listed.t.any():
         raise DataError(f"{listed.place}: t is zero, the cameras did not move apart, which leaves no F")
-    return nearest_rotation(listed.R, listed.place), listed.t
+    return pairs.nearest_rotation(listed.R, listed.place), listed.t
 
 
 def _listed(path: Path, home: Path) -> tuple[list[ListedPair], list[tuple[str, Path]]]:
@@ -309,8 +308,8 @@ def _listed(path: Path, home: Path) -> tuple[list[ListedPair], list[tuple[str, P
         member = path.parent / line.strip()
         if member.suffix != NPZ or not member.is_file():
             raise DataError(f"{path}, line {number}: no file {member}; each line must name an .npz beside the list")
-        pairs, own = _listed(member, home)
-        listed, files = [*listed, *pairs], [*files, *own]
+        more, own = _listed(member, home)
+        listed, files = [*listed, *more], [*files, *own]
     return listed, files
 
 

@@ -9,11 +9,10 @@ import numpy as np
 
 from fmtorch.core.lenses import Lens
 from fmtorch.data import files, scenes
-from fmtorch.data.cameras import nearest_rotation
 from fmtorch.data.files import DataError, Indices, given_root
 from fmtorch.data.image_cameras import Model, read_model
 from fmtorch.data.images import stored_size
-from fmtorch.data.pairs import ImageSource
+from fmtorch.data.pairs import ImageSource, nearest_rotation
 from fmtorch.data.scenes import MIN_SHARED, Scene, ScenePairs, View
 
 _MODELS = ("sparse/0", "sparse", "dense/sparse", ".")  # below a scene's folder, in the order in which they are tried
@@ -42,8 +41,8 @@ def colmap_pairs(
             in ``stereo/depth_maps`` beside the folder of the images; geometric ones, or else photometric.
 
     Images with lens distortion are undistorted when they are read, to a pinhole of the same focal lengths, principal
-    point and size (`fmtorch.data.cameras`). Principal points are lowered by COLMAP's half pixel. An image of another
-    size than its camera's is refused when it is read. Raises DataError for a missing or damaged model.
+    point and size (`undistorted`). Principal points are lowered by COLMAP's half pixel. An image of another size than
+    its camera's is refused when it is read. Raises DataError for a missing or damaged model.
     """
     home, scene_folders = _scene_folders(root, split, sequences, model)
     model_folders = [_model_folder(folder, model) for folder in scene_folders]
@@ -113,7 +112,7 @@ def _scene(
         assert camera.lens is not None  # of a model
         lens = camera.lens if camera.lens.bends else None
         source = ImageSource(f"{family}/{folder.name}/{image.name}", folder / images / image.name, camera.size, lens)
-        views.append(View(source, camera.lens.K, image.R, image.t, image.place))
+        views.append(View(camera.lens.K, image.R, image.t, source, image.place))
     points = [image.points for image in model.images] if candidates == "points" else None
     return Scene(folder.name, family, views, scenes.collection_pairs(len(views), points, shared))
 
@@ -217,7 +216,7 @@ def _view(file: Path, lines: list[str], i: int, source: ImageSource) -> View | N
     lens = Lens(focal, focal, (w - 1) / 2, (h - 1) / 2, "RADIAL", (k1, k2))
     R = _FLIP @ nearest_rotation(np.stack(rows[1:4]), place)
     image = ImageSource(source.identity, source.path, (h, w), lens if lens.bends else None)
-    return View(image, lens.K, R, _FLIP @ rows[4], place)
+    return View(lens.K, R, _FLIP @ rows[4], image, place)
 
 
 def _seen(file: Path, lines: list[str], cameras: int, points: int, numbers: dict[int, int]) -> list[Indices]:

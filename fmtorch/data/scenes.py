@@ -13,10 +13,9 @@ from typing import Any
 import cv2
 import numpy as np
 
-from fmtorch.data.cameras import fundamental, relative_pose, share_centre
 from fmtorch.data.files import Array, DataError, Indices, Matrix, Singles
 from fmtorch.data.images import ImageError
-from fmtorch.data.pairs import ImagePair, ImageSource, PairDataset
+from fmtorch.data.pairs import Camera, ImagePair, ImageSource, PairDataset, fundamental, relative_pose, share_centre
 
 WINDOW = 1.0  # s: a frame is paired with those of the following second (Bian et al., BMVC 2019, Section 3)
 MIN_SHARED = 1  # points of a reconstruction that two images must both see
@@ -209,14 +208,11 @@ def _expect_file(path: Path) -> None:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class View:
+class View(Camera):
     """One image with its camera: K (3, 3), R (3, 3) and t (3,) map the world to pixels of the undistorted image.
     place: the file and line, or the record, that names the image; messages begin with it."""
 
     image: ImageSource
-    K: Matrix
-    R: Matrix
-    t: Matrix
     place: str
 
     @property

@@ -8,9 +8,8 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from fmtorch.core.lenses import Lens
 from fmtorch.data import scenes
-from fmtorch.data.cameras import nearest_rotation
 from fmtorch.data.files import DataError, Mask, Matrix, given_root, images_by_stem, numbered, to_finite
-from fmtorch.data.pairs import ImageSource
+from fmtorch.data.pairs import ImageSource, nearest_rotation
 from fmtorch.data.scenes import WINDOW, Scene, ScenePairs, View, following
 
 _SUFFIXES = (".png", ".jpg")
@@ -77,7 +76,7 @@ def _kitti_scene(home: Path, folder: Path, camera: int, window: int | float) -> 
         t = -R @ pose[:, 3] + np.linalg.solve(P[:, :3], P[:, 3])
         stem = f"{frame:06d}"
         path = there.get(stem, images / f"{stem}{_SUFFIXES[0]}")
-        views.append(View(ImageSource(f"KITTI/{name}/image_{camera}/{stem}", path), P[:, :3], R, t, place))
+        views.append(View(P[:, :3], R, t, ImageSource(f"KITTI/{name}/image_{camera}/{stem}", path), place))
     return Scene(name, "KITTI", views, following(times, window))
 
 
@@ -199,7 +198,7 @@ def _tum_scene(folder: Path, lens: Lens, window: int | float) -> Scene:
     for frame, to_world, position in zip(np.flatnonzero(has).tolist(), rotations, positions, strict=True):
         key = f"TUM/{folder.name}/{names[frame]}"
         source = ImageSource(key, folder / names[frame], SIZE, lens if lens.bends else None)
-        views.append(View(source, lens.K, to_world.T, -to_world.T @ position, f"{listed}, line {lines[frame]}"))
+        views.append(View(lens.K, to_world.T, -to_world.T @ position, source, f"{listed}, line {lines[frame]}"))
     return Scene(folder.name, "TUM", views, following(times[has], window))
 
 

@@ -21,8 +21,7 @@ from fmtorch.estimators.preselection import degenerate_support
 from fmtorch.estimators.refinement import Fit, scale_of
 from fmtorch.geometry.epipolar import SAMPSON, Residual
 from fmtorch.geometry.significance import of_one_pair
-from fmtorch.jit.batches import as_array
-from fmtorch.jit.kernel import Array
+from fmtorch.jit.kernel import Array, as_array
 from fmtorch.jobs.execution import available
 
 PARTS_OF_A_THREAD = 4  # so that no thread is long alone at the end

@@ -34,8 +34,7 @@ from fmtorch.geometry.homography import four_point
 from fmtorch.geometry.refine import refine_kernel
 from fmtorch.geometry.seven_point import seven_point_kernel
 from fmtorch.geometry.significance import counted_chances, judged, most_significant
-from fmtorch.jit.kernel import Array, Kernel
-from fmtorch.jit.together import compile_together
+from fmtorch.jit.kernel import Array, Kernel, compile_together
 from fmtorch.jobs.execution import mapped
 
 FOCAL_ROUND = 500  # samples of five matches at a time

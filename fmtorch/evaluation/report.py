@@ -237,7 +237,7 @@ def _stage(group: str, mine: Mapping[str, Any], values: Sequence[Mapping[str, An
 
 def _kind(group: str, value: Mapping[str, Any]) -> tuple[str, dict[str, str]]:
     """The preset from which a stage differs least, and the options in which it does; without one its class."""
-    close = presets.closest(group, value)
+    close = presets.files.closest(group, value)
     if close is None:
         return str(value.get("_target_", group)).rpartition(".")[2], {}
     return close[0], {key: text for key, text in files.leaves(close[1]) if key}
@@ -380,7 +380,7 @@ def find_dataset(stored: Row, options: Options) -> PairDataset:
     known = {key: value for key, value in stored.items() if key != "digest"}
     if "_target_" not in known:
         known = presets.load("dataset", "fmbench")
-    if known["_target_"] not in presets.known_targets() and not options.own_code:
+    if known["_target_"] not in presets.files.known_targets() and not options.own_code:
         raise DataError("the data set is one of your own, which a report loads with own_code=true")
     reasons = []
     for place in _places(known, options.roots):
@@ -417,7 +417,7 @@ def rebuilt(r: Run, options: Options) -> Pipeline:
     stages = {group: r.folder.config[group] for group in presets.STAGES if group in r.folder.config}
     if not stages:
         raise ValueError("its folder does not say what its pipeline was")
-    foreign = presets.targets_of(stages) - presets.known_targets()
+    foreign = presets.files.targets_of(stages) - presets.files.known_targets()
     if foreign and not options.own_code:
         own = ", ".join(sorted(foreign))
         raise ValueError(f"it has parts of your own ({own}), which a report loads with own_code=true")

@@ -253,7 +253,7 @@ def run_identity(
     dataset["digest"] = dataset_digest
     return {
         "pipeline": pipeline_name, **stages, "seed": config.seed, "version": fmtorch_version(),
-        "libraries": libraries(presets.peer_packages(stages)), "kernels": kernel.identity(),
+        "libraries": libraries(presets.files.peer_packages(stages)), "kernels": kernel.identity(),
         "learned": _learned(stages, pipeline),
         "code": _code({"stages": stages, "dataset": dataset}), "dataset": dataset,
         **({} if cameras is None else {"cameras": cameras}), **({} if lens is None else {"lens": lens}),
@@ -292,7 +292,7 @@ def _files(config: object, option: str = "") -> Iterator[str]:
 
 def _code(config: object) -> dict[str, str]:
     digests = {}
-    for target, module in presets.own_modules(config).items():
+    for target, module in presets.files.own_modules(config).items():
         try:
             digests[target] = code_digest(module)
         except (TypeError, KeyError, OSError):

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fmtorch.geometry.null_space import add_models, equations, gather, null_space
+from fmtorch.geometry.eight_point import add_models, equations, gather, null_space
 from fmtorch.geometry.pose import consistently_oriented
 from fmtorch.jit.kernel import Array, F4x2, F8x1, F8x2, I8x1, I8x2, inner, kernel, matrix
 from fmtorch.jit.lanes import LANES, absolute, any_lane, fill, load, sqrt, store, where

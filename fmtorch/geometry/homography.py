@@ -13,12 +13,11 @@ from torch import Tensor
 
 from fmtorch.geometry import epipolar
 from fmtorch.geometry.arithmetic import cofactors, determinant, matmul3, stable_sum
-from fmtorch.geometry.eight_point import finite_matches
+from fmtorch.geometry.eight_point import add_models, finite_matches, gather
 from fmtorch.geometry.epipolar import Matrix, PerMatch, Points, inverse_root, lines_through, unit_largest
 from fmtorch.geometry.homography_refine import linearise_homography
 from fmtorch.geometry.matrices import EPS, smallest_eigenvector, smallest_eigenvector_kernel, unit_kernel
 from fmtorch.geometry.normalize import normalize_points
-from fmtorch.geometry.null_space import add_models, gather
 from fmtorch.jit.kernel import Array, F4x2, F8x1, F8x2, I8x1, I8x2, inner, kernel, matrix, vector
 from fmtorch.jit.lanes import LANES, absolute, fill, load, sqrt, store, where
 

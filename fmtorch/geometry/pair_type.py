@@ -12,8 +12,7 @@ from fmtorch.core.types import PAIR_TYPES
 from fmtorch.geometry.arithmetic import logarithm, logarithm_kernel
 from fmtorch.geometry.epipolar import HOMOGRAPHY, SAMPSON
 from fmtorch.geometry.homography_pose import fit_rotation
-from fmtorch.jit.batches import for_each_pair
-from fmtorch.jit.kernel import Array, B1x1, F8x1, F8x2, F8x3, inner, kernel, matrix, vector
+from fmtorch.jit.kernel import Array, B1x1, F8x1, F8x2, F8x3, for_each_pair, inner, kernel, matrix, vector
 
 FREEDOM = 3.0  # degrees, of Student's law: keypoints err by more than the normal one says
 PEAK = 0.36755259694786135  # of that law: 2 / (pi sqrt(3))

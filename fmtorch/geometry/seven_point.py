@@ -9,8 +9,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from fmtorch.geometry.arithmetic import cofactors
+from fmtorch.geometry.eight_point import add_models, equations, gather, null_space
 from fmtorch.geometry.normalize import canonical, denormalize_fundamental, normalize_points
-from fmtorch.geometry.null_space import add_models, equations, gather, null_space
 from fmtorch.geometry.pose import consistently_oriented
 from fmtorch.jit.kernel import Array, B1x2, F4x2, F8x2, F8x3, I8x1, I8x2, inner, kernel, matrix, vector
 from fmtorch.jit.lanes import LANES, absolute, load, store

@@ -17,8 +17,7 @@ from torch import Tensor
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.geometry.arithmetic import LOG10, logarithm, logarithm_kernel, smallest_but
 from fmtorch.geometry.homography import adjugate
-from fmtorch.jit.batches import for_each_pair
-from fmtorch.jit.kernel import Array, B1x1, F8x1, F8x2, inner, kernel, matrix, vector
+from fmtorch.jit.kernel import Array, B1x1, F8x1, F8x2, for_each_pair, inner, kernel, matrix, vector
 from fmtorch.jobs.execution import one_thread
 
 SAMPLE = 7  # matches that determine a model

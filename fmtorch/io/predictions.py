@@ -11,8 +11,8 @@ import torch
 
 from fmtorch.core.types import Correspondences
 from fmtorch.data import DataError, GivenMatches, ImagePair, ImageSource, PairDataset, stored_size
-from fmtorch.data.cameras import Camera, fundamental
 from fmtorch.data.files import Indices, Mask, Matrix
+from fmtorch.data.pairs import Camera, fundamental
 from fmtorch.io import h5
 
 Size = tuple[int, int]  # (h, w)

@@ -10,20 +10,26 @@ beside the class that calls them; what they are made of versions the file that k
 is imported from numba before the first call. With ``FMTORCH_KERNELS=off`` estimators run their kernels interpreted by
 Python, all else takes its tensor form."""
 
+import contextlib
 import functools
 import gc
 import importlib.metadata
 import inspect
 import os
+import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
 from typing import Annotated, Any, Generic, ParamSpec, TypeVar, get_args, get_origin, get_type_hints, overload
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from fmtorch.jit import cache, linking
+from fmtorch.jobs.execution import available, cores, mapped
 
 Array = NDArray[Any]
 F8x1 = Annotated[NDArray[np.float64], "f8[::1]"]
@@ -294,3 +300,110 @@ def vector(n: int) -> Array:
 def matrix(rows: int, columns: int) -> Array:
     """(rows, columns) float64, not initialised."""
     return np.empty((rows, columns))
+
+
+# The door from batched tensors to kernels, which see the arrays of one pair
+
+PAIRS_OF_A_THREAD = 8  # at least; a thread takes as long to begin as a kernel for a pair
+
+
+def for_each_pair(
+    function: Callable[..., None],
+    tensors: Sequence[Tensor | None],
+    *constants: Any,
+    out: Tensor,
+    kind: torch.dtype = torch.float32,
+    group: Callable[..., Any] | None = None,
+) -> Tensor:
+    """`out` (B, ...) after function(row of each tensor, constants, row of out) for each of B pairs.
+    Rows are C-contiguous arrays, floating ones of type `kind`; of what is not known (None) an empty one. group: the
+    NamedTuple in which the function takes the rows. Pairs are shared out among threads. What is on another device is
+    copied to the CPU, and `out`, which is there, comes back on the device of the first tensor; it is on no graph."""
+    results = out.numpy()
+    arrays = [_array(t, kind, len(results)) for t in tensors]
+
+    def run_pairs(pairs: range) -> None:
+        for pair in pairs:
+            rows = [array[pair] for array in arrays]
+            function(*(rows if group is None else [group(*rows)]), *constants, results[pair])
+
+    parts = max(1, min(available(), len(results) // PAIRS_OF_A_THREAD))
+    mapped(run_pairs, [range(first, len(results), parts) for first in range(parts)])
+    return out.to(next(t.device for t in tensors if t is not None))
+
+
+def _array(tensor: Tensor | None, kind: torch.dtype, pairs: int) -> np.ndarray:
+    if tensor is None:
+        return np.empty((pairs, 0), torch.empty(0, dtype=kind).numpy().dtype)
+    if tensor.is_floating_point() and tensor.dtype != kind:
+        tensor = tensor.to(kind)
+    return as_array(tensor.cpu().contiguous())
+
+
+def as_array(tensor: Tensor) -> np.ndarray:
+    """A tensor on the CPU as an array, a view, on no graph."""
+    return (tensor.detach() if tensor.requires_grad else tensor).numpy()
+
+
+# Many kernels compiled by two processes, since numba compiles one function at a time in each. The other process goes
+# through the same kernels from the last to the first and leaves out what the cache folder holds. Where the two meet,
+# one waits for the other: each kernel's file has a lock.
+
+HOME = Path(__file__).resolve().parents[2]
+_together = threading.Lock()
+
+
+def compile_together(kernels: Sequence[Kernel[..., Any]]) -> None:
+    """Have kernels ready to be called; those that this machine has not compiled yet are compiled, with messages.
+    An inner function is compiled in each process that needs it: kernels that share many should stand side by side, the
+    slowest at both ends. Raises ImportError where numba cannot be imported."""
+    if off() or all(each.ready for each in kernels):
+        return
+    with _together:
+        absent = [each for each in kernels if not (each.ready or each.kept)]
+        with _helped([*reversed(absent)]):
+            for number, each in enumerate(absent, start=1):
+                each.compiled_alone(f"{number} of {len(absent)}: ")
+        for each in kernels:
+            each.compiled()
+
+
+@contextlib.contextmanager
+def _helped(kernels: Sequence[Kernel[..., Any]]) -> Iterator[None]:
+    """Within it another process compiles these kernels, too, where that can be started and is of use."""
+    if len(kernels) < 2 or cores() < 2 or cache.folder() is None:
+        yield
+        return
+    names = [f"{each.function.__module__}:{each.function.__qualname__}" for each in kernels]
+    path = os.pathsep.join([str(HOME), *filter(None, [os.environ.get("PYTHONPATH")])])
+    try:
+        helper = subprocess.Popen(
+            [sys.executable, "-m", __name__, *names], env={**os.environ, "PYTHONPATH": path},
+            stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        )  # fmt: skip
+    except OSError:
+        yield
+        return
+    with helper:
+        try:
+            yield
+        finally:
+            helper.terminate()
+
+
+def main() -> None:
+    """Compile the kernels that the arguments name, ``module:function``; end with the process that asked for it."""
+    threading.Thread(target=_end_with_input, daemon=True).start()
+    for name in sys.argv[1:]:
+        kernel = linking.kernel_of(*name.split(":"))
+        if not kernel.kept:
+            kernel.compiled_alone()
+
+
+def _end_with_input() -> None:
+    sys.stdin.read()
+    os._exit(1)
+
+
+if __name__ == "__main__":
+    main()

@@ -242,10 +242,6 @@ class NeedsFactory:
     """The answer of a worker that does not have the factory."""
 
 
-class VersionError(ValueError):
-    """Workers of another version of fmtorch, whose results would differ."""
-
-
 _values: OrderedDict[str, Any] = OrderedDict()
 _lock = threading.Lock()
 
@@ -259,7 +255,7 @@ def _called(digest: str, factory: bytes | None, function: Callable[[Any, Any], A
             version, make = pickle.loads(factory)
             if version != __version__:
                 both = f"a worker has fmtorch {__version__}, the command {version}"
-                raise VersionError(f"{both}; install the same on both")
+                raise ValueError(f"{both}; install the same on both")  # results would differ
             _values[digest] = make()
         _values.move_to_end(digest)
         while len(_values) > KEPT:

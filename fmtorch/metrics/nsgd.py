@@ -20,8 +20,7 @@ from torch import Tensor
 from fmtorch.core.checks import checked, expect_sizes
 from fmtorch.geometry import epipolar
 from fmtorch.geometry.arithmetic import sqrt
-from fmtorch.jit.batches import for_each_pair
-from fmtorch.jit.kernel import Array, F8x1, F8x2, F8x3, I8x1, inner, kernel, vector
+from fmtorch.jit.kernel import Array, F8x1, F8x2, F8x3, I8x1, for_each_pair, inner, kernel, vector
 from fmtorch.jit.random import Stream, mixed_seed, stream_state, uniform_kernel
 
 COLUMNS = 6  # random numbers of a draw: for each of its two halves a point (x, y) and a place on its line

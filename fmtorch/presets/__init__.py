@@ -8,34 +8,12 @@ from fmtorch.core.lazy import lazy_exports
 
 if TYPE_CHECKING:
     from fmtorch.core.files import STAGES
-    from fmtorch.presets.composition import (
-        compose,
-        composed,
-        expect_stages,
-        pipeline_stages,
-        plain,
-        resolve_device,
-        stages,
-    )
-    from fmtorch.presets.files import (
-        available,
-        build,
-        closest,
-        expect_buildable,
-        instantiate,
-        known_targets,
-        load,
-        merged,
-        own_modules,
-        peer_packages,
-        target_of,
-        targets_of,
-    )
+    from fmtorch.presets.composition import composed, expect_stages, pipeline_stages, plain, resolve_device, stages
+    from fmtorch.presets.files import available, build, expect_buildable, instantiate, load, merged, target_of
 
 __all__ = [
-    "STAGES", "available", "build", "closest", "compose", "composed", "expect_buildable", "expect_stages",
-    "instantiate", "known_targets", "load", "merged", "own_modules", "peer_packages", "pipeline_stages", "plain",
-    "resolve_device", "stages", "target_of", "targets_of",
+    "STAGES", "available", "build", "composed", "expect_buildable", "expect_stages", "instantiate", "load", "merged",
+    "pipeline_stages", "plain", "resolve_device", "stages", "target_of",
 ]  # fmt: skip
 
 lazy_exports(__name__)

@@ -12,8 +12,7 @@ from torch import Tensor
 
 from fmtorch.core.types import Correspondences
 from fmtorch.geometry.arithmetic import gradient_wanted, sqrt
-from fmtorch.jit.batches import for_each_pair
-from fmtorch.jit.kernel import Array, B1x1, F4x1, F4x3, F8x1, F8x3, inner, kernel
+from fmtorch.jit.kernel import Array, B1x1, F4x1, F4x3, F8x1, F8x3, for_each_pair, inner, kernel
 
 _SQUARINGS = 10
 SCORE_POWER = 0.75  # of the odds of a score, by square roots

@@ -20,10 +20,9 @@ from torch import Tensor
 
 from fmtorch.core.types import Correspondences
 from fmtorch.geometry.arithmetic import component_sum, gradient_wanted, sqrt
-from fmtorch.jit.batches import for_each_pair
-from fmtorch.jit.kernel import Array, B1x1, F4x1, F4x2, F4x3, inner, kernel
+from fmtorch.jit.kernel import Array, B1x1, F4x1, F4x2, F4x3, I8x2, for_each_pair, inner, kernel
 from fmtorch.pruning.calibration import Calibration, calibrated
-from fmtorch.pruning.curves import CURVES, CURVES32, curve_orders, put_in_order, slots_along_curves
+from fmtorch.pruning.neighbors import CURVES, CURVES32, curve_orders, put_in_order
 
 WINDOW = 8  # neighbours before and after each match along each curve
 TOLERANCE = 0.25  # relative prediction error at which agreement falls to about 1/e
@@ -376,6 +375,26 @@ def add_products(agree: Array, vote: Array, count: int, total: Array, votes: Arr
 def votes_of(ratio: Float[Tensor, "b n"] | None, like: Float[Tensor, "b n"]) -> Float[Tensor, "b n"]:
     """What the vote of each match counts."""
     return torch.ones_like(like) if ratio is None else (WORST_RATIO - ratio).clamp_min(MIN_VOTE)
+
+
+@kernel
+def slots_along_curves(x0: F4x2, x1: F4x2, mask: B1x1, out: I8x2) -> None:
+    """The slots of the matches in the mask along each curve, those of the others last -> out (c, n)."""
+    n, m, last = len(mask), 0, len(mask)
+    rows, slot = np.empty((4, n), x0.dtype), np.empty(n, np.int64)
+    for i in range(n):
+        if mask[i]:
+            rows[0, m], rows[1, m], rows[2, m], rows[3, m], slot[m] = x0[i, 0], x0[i, 1], x1[i, 0], x1[i, 1], i
+            m += 1
+        else:
+            last -= 1
+            for o in range(len(out)):
+                out[o, last] = i
+    orders = np.empty((len(out), m), np.int64)
+    curve_orders(rows, orders)
+    for o in range(len(out)):
+        for k in range(m):
+            out[o, k] = slot[orders[o, k]]
 
 
 def with_gradient(

@@ -13,8 +13,7 @@ from torch import Tensor
 from fmtorch.core import Correspondences, Within
 from fmtorch.core.checks import expect_inside
 from fmtorch.geometry.significance import Matches
-from fmtorch.jit.batches import for_each_pair
-from fmtorch.jit.kernel import Array, B1x1, F8x1, F8x2, I8x1, inner, kernel, vector
+from fmtorch.jit.kernel import Array, B1x1, F8x1, F8x2, I8x1, for_each_pair, inner, kernel, vector
 from fmtorch.jit.random import mix
 from fmtorch.pruning.calibration import calibration_of
 

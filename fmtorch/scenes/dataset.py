@@ -22,7 +22,7 @@ from fmtorch.core.files import cache_dir, temporary_name
 from fmtorch.data.construction import Keypoints, keypoints, matchable
 from fmtorch.data.pairs import HeldPairs, ImagePair, ImageSource
 from fmtorch.data.scenes import AllPairs, Scene, ScenePairs, View
-from fmtorch.jit.together import compile_together
+from fmtorch.jit.kernel import compile_together
 from fmtorch.jobs.execution import Execution, cores
 from fmtorch.jobs.runner import MAX_PROCESSES, Local, TaskRunner, WorkerPool
 from fmtorch.scenes import landmarks, videos
@@ -316,7 +316,7 @@ class RenderedPairs(HeldPairs):
         scenes = []
         for name, views in self._views.items():
             drawn = [
-                View(ImageSource(f"{name}/{i}", path, camera.size), camera.K, camera.R, camera.t, f"{name}/{path.name}")
+                View(camera.K, camera.R, camera.t, ImageSource(f"{name}/{i}", path, camera.size), f"{name}/{path.name}")
                 for i, (path, camera) in enumerate(views)
             ]
             scenes.append(Scene(name, self._tasks[name].family, drawn, AllPairs(len(drawn))))

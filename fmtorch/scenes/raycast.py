@@ -12,7 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fmtorch.data.cameras import fundamental, relative_pose
+from fmtorch.data import pairs
+from fmtorch.data.pairs import fundamental, relative_pose
 from fmtorch.jit.kernel import B1x1, F4x1, F4x2, F4x3, I4x2, I8x1, I8x2, U1x1, inner, kernel
 from fmtorch.jit.lanes import fused
 from fmtorch.scenes.surfaces import Floats, Pixels, Real, Surfaces
@@ -23,13 +24,10 @@ Matrix = NDArray[np.float64]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Camera:
+class Camera(pairs.Camera):
     """A pinhole: ``x ~ K (R X + t)``, pixels (x, y) with (0, 0) at the centre of the first pixel; size (h, w).
     World units are metres with z upwards; camera axes are OpenCV's (x right, y down, z forward)."""
 
-    K: Matrix
-    R: Matrix
-    t: Matrix
     size: tuple[int, int]
 
     @property

@@ -25,8 +25,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from fmtorch.core import Correspondences, records, types
-from fmtorch.data.cameras import line_distance
-from fmtorch.data.pairs import DepthDataset, ImagePair, ImageSource, PairDataset
+from fmtorch.data.pairs import DepthDataset, ImagePair, ImageSource, PairDataset, line_distance
 from fmtorch.geometry.epipolar import unit_frobenius
 from fmtorch.io import oanet
 from fmtorch.jit.random import Stream, bits, uniform

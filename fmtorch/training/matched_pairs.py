@@ -16,9 +16,8 @@ from omegaconf import DictConfig
 from fmtorch import presets
 from fmtorch.core import Correspondences, files
 from fmtorch.core.types import pair_key
-from fmtorch.data.cameras import Camera, fundamental, line_distance
 from fmtorch.data.files import DataError, Matrix
-from fmtorch.data.pairs import DepthDataset, ImagePair, PairDataset
+from fmtorch.data.pairs import Camera, DepthDataset, ImagePair, PairDataset, fundamental, line_distance
 from fmtorch.io import h5, oanet, predictions
 from fmtorch.jobs import Execution, Factory, Local, Source, TaskRunner, WorkerPool, use_one_thread
 from fmtorch.pipeline.pipeline import Outcome, Pipeline, load_pipeline

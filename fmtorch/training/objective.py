@@ -10,8 +10,7 @@ from torch import Tensor
 
 from fmtorch.geometry import arithmetic, epipolar
 from fmtorch.geometry.eight_point import eight_point
-from fmtorch.jit.batches import for_each_pair
-from fmtorch.jit.kernel import F8x1, F8x2, I8x1, kernel
+from fmtorch.jit.kernel import F8x1, F8x2, I8x1, for_each_pair, kernel
 from fmtorch.jit.random import Stream, mixed_seed, stream_state, uniform_kernel
 from fmtorch.metrics import nsgd
 from fmtorch.metrics.nsgd import BORDER, line_of, segment_in_image

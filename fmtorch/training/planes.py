@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 
 from fmtorch.core.files import cache_dir, write_whole
 from fmtorch.data import ImagePair, ImageSource, read_image
-from fmtorch.data.cameras import relative_pose
-from fmtorch.data.pairs import HeldPairs
+from fmtorch.data.pairs import HeldPairs, relative_pose
 from fmtorch.scenes.raycast import Camera, calibration
 from fmtorch.training.options import PlaneViews as PlaneViews
 

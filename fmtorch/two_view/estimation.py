@@ -16,7 +16,7 @@ from fmtorch.core.stages import Estimator, Pruner, model_of, output_of
 from fmtorch.core.types import Correspondences, Estimate, collate
 from fmtorch.estimators.ransac import Ransac
 from fmtorch.geometry.significance import judged
-from fmtorch.jit.together import compile_together
+from fmtorch.jit.kernel import compile_together
 from fmtorch.jobs.execution import one_thread
 from fmtorch.presets.files import construct, instantiate, load, merged
 from fmtorch.pruning.consistency import FrameConsistency, PositionConsistency

@@ -17,7 +17,7 @@ from fmtorch.geometry.epipolar import inverse_root
 from fmtorch.geometry.normalize import canonical
 from fmtorch.geometry.pose import inverse, pose, pose_from_fundamental
 from fmtorch.geometry.significance import judged
-from fmtorch.jit.batches import for_each_pair
+from fmtorch.jit.kernel import for_each_pair
 from fmtorch.jobs.execution import one_thread
 
 OFF_CENTRE = 0.1  # of a principal point, in units of the side, or beyond twice it a point: K may be of another image

@@ -13,7 +13,7 @@ from fmtorch.geometry.arithmetic import component_sum, sqrt
 from fmtorch.geometry.epipolar import inverse_root
 from fmtorch.geometry.homography_pose import PlanePoses, poses_from_homography
 from fmtorch.geometry.pair_type import Evidence
-from fmtorch.jit.together import compile_together
+from fmtorch.jit.kernel import compile_together
 from fmtorch.jobs.execution import one_thread
 from fmtorch.two_view.arguments import expect_values
 from fmtorch.two_view.estimation import estimated, estimator_of

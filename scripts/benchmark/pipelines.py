@@ -28,7 +28,8 @@ from fmtorch.evaluation.run import select
 from fmtorch.evaluation.statistics import PERCENT, interval
 from fmtorch.features import ASIFT
 from fmtorch.features.describe import codebook, descriptor_kind, local_descriptors, vlad
-from fmtorch.pipeline import Outcome, Pipeline, describe, similar_pairs
+from fmtorch.pipeline import Outcome, Pipeline, describe
+from fmtorch.pipeline.folder import similar_pairs
 from scripts.benchmark import pairs, tables
 from scripts.benchmark.methods import pipeline_method, pipeline_of
 from scripts.benchmark.runner import Item, Kept, Measured, Method, Row, add_command, measure

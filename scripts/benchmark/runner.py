@@ -105,10 +105,10 @@ def identity(stages: Stages, *others: Any) -> str:
     configs: list[Any] = [presets.merged(presets.load(group, name), options) for group, name, options in stages]
     configs += [other for other in others if isinstance(other, Mapping)]
     rest = [other for other in others if not isinstance(other, Mapping)]
-    modules = {target: hydra.utils.get_object(target).__module__ for target in sorted(presets.targets_of(configs))}
+    modules = {name: hydra.utils.get_object(name).__module__ for name in sorted(presets.files.targets_of(configs))}
     made_with = {
         "stages": configs, "code": {target: code_digest(module) for target, module in modules.items()},
-        "libraries": libraries(presets.peer_packages(configs)),
+        "libraries": libraries(presets.files.peer_packages(configs)),
         "others": [each if isinstance(each, bool | int | float | str | None) else learned(each) for each in rest],
     }  # fmt: skip
     return identity_digest(made_with)[:DIGITS]

@@ -23,7 +23,7 @@ import torch
 from numpy.typing import NDArray
 
 import fmtorch
-from fmtorch.data.cameras import Camera, relative_pose
+from fmtorch.data.pairs import Camera, relative_pose
 from fmtorch.io.colmap import imported, remove_database
 from fmtorch.metrics import pose_auc, pose_error
 from scripts.benchmark.runner import Kept, Row, add_command

@@ -21,9 +21,11 @@ import fmtorch
 from fmtorch import data
 from fmtorch.commands import match as match_command
 from fmtorch.data import Lens, load, read_image
-from fmtorch.io import DATABASE, FEATURES, MATCHES
+from fmtorch.io import DATABASE
+from fmtorch.io.export import FEATURES, MATCHES
 from fmtorch.metrics import pose_error
-from fmtorch.pipeline import chosen_pairs, images_below, open_folder
+from fmtorch.pipeline import chosen_pairs, images_below
+from fmtorch.pipeline.folder import open_folder
 from fmtorch.runs import RunFolder
 from tests.commands.test_match import BENT, photographed
 from tests.conftest import shared_path

@@ -15,7 +15,6 @@ import pytest
 
 from fmtorch.jit import cache as files
 from fmtorch.jit import kernel as switch
-from fmtorch.jit import together
 from fmtorch.jit.kernel import Kernel, kernel
 from fmtorch.jit.lanes import fused
 from tests.helpers import in_threads
@@ -150,14 +149,14 @@ def test_what_was_compiled_is_kept_and_told_once(tmp_path, cache, capsys):
 def test_two_processes_compile_together(module, tmp_path, monkeypatch, cache, importable):
     """What the other process cannot compile is compiled here."""
     monkeypatch.setenv("PYTHONPATH", str(tmp_path) if importable else "")
-    monkeypatch.setattr(together, "cores", lambda: 2)
+    monkeypatch.setattr(switch, "cores", lambda: 2)
     both = [module.rows, module.scaled_squares]
     assert not any(each.ready or each.kept for each in both)
-    together.compile_together(both)
+    switch.compile_together(both)
     assert all(each.ready and each.kept for each in both)
     assert (len(list(cache.rglob("*.bin"))), result(module)) == (2, EXPECTED)
-    monkeypatch.setattr(together, "_helped", None)  # is not asked again
-    together.compile_together(both)
+    monkeypatch.setattr(switch, "_helped", None)  # is not asked again
+    switch.compile_together(both)
 
 
 def with_path(folder: Path) -> dict[str, str]:
@@ -166,7 +165,7 @@ def with_path(folder: Path) -> dict[str, str]:
 
 
 def start_helper(folder: Path, kernel: str) -> subprocess.Popen[bytes]:
-    command = [sys.executable, "-m", "fmtorch.jit.together", kernel]
+    command = [sys.executable, "-m", "fmtorch.jit.kernel", kernel]
     return subprocess.Popen(command, stdin=subprocess.PIPE, env=with_path(folder))
 
 

@@ -32,11 +32,9 @@ from fmtorch.pipeline import (
     folder_workers,
     images_below,
     load_pipeline,
-    similar_pairs,
-    vectors_of,
 )
 from fmtorch.pipeline import folder as similar
-from fmtorch.pipeline.folder import default_output
+from fmtorch.pipeline.folder import default_output, similar_pairs, vectors_of
 from tests.conftest import shared_path
 
 

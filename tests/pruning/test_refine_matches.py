@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from fmtorch import presets
-from fmtorch.core import Correspondences, GreyPyramid, ImagePruner, grey_pyramid
+from fmtorch.core import Correspondences, GreyPyramid, ImagePruner
+from fmtorch.core.stages import grey_pyramid
 from fmtorch.pruning import refine_matches as compiled
 from fmtorch.pruning.neighbors import neighbour_maps
 from fmtorch.pruning.refine_matches import Pyramid
