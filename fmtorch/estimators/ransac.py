@@ -297,8 +297,8 @@ class Ransac:
             if fit.lens is not None and np.isfinite(fit.F).all():
                 inliers = self.inlier_rule(lens_search.squared_px(fit.F, fit.lens.lens, pair), pair)
                 return Solution(fit, solution.samples, inliers, lens=fit.lens.lens, deviation=fit.lens.deviation)
-        nothing = np.zeros(pair.count)  # has gradients where no cameras are assumed
-        return solution._replace(lens=lens, fit=solution.fit._replace(counted=nothing))
+        free = solution.fit._replace(counted=np.zeros(pair.count))  # without cameras there are no gradients
+        return solution._replace(lens=lens, fit=free)
 
     def selected(self, pair: Pair) -> tuple[refinement.Selection, int]:
         """The selected model, and the samples drawn: among plausible cameras first where the image sizes are known."""

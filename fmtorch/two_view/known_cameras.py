@@ -170,9 +170,8 @@ def _with_cameras(estimate: Estimate, square: Correspondences, images: Images, c
         A = images.map.to(F)
         F = torch.where(ok[:, None, None], canonical(matmul3(matmul3(A[:, 1].mT, F), A[:, 0])), 0)
         focals = focals * images.unit
-    fields = {}
-    if estimate.lens is not None and images.unit is not None:  # half diagonals are of the images as they were
-        fields["lens"] = estimate.lens * (images.unit.detach() / images.unit) ** 2
+    lens, unit = estimate.lens, images.unit  # half diagonals are of the images as they were
+    fields = {} if lens is None or unit is None else {"lens": lens * (unit.detach() / unit) ** 2}
     if covariance:
         at = estimate.derived(F=F, R=R, t=t).detach()
         fields |= covariance_fields(at, square, images.map, torch.where(known, square_focals, torch.nan).detach())
