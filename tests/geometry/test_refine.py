@@ -1,6 +1,5 @@
 """Refinement on the manifold of rank 2, in tensors and by kernels."""
 
-import itertools
 from collections.abc import Callable
 from typing import Any
 
@@ -10,7 +9,6 @@ import torch
 from torch import Tensor
 
 from fmtorch.geometry import LOSSES, attached_step, irls, refine
-from fmtorch.geometry.epipolar import linearise
 from fmtorch.geometry.levenberg_marquardt import FIRST_DAMPING, LOSS_CODES, Schedule, Weighted, evaluate
 from fmtorch.geometry.normalize import RobustSum, fitted_by
 from fmtorch.geometry.refine import refine_kernel, reweighted, reweighted_kernel
@@ -208,35 +206,3 @@ def test_what_cannot_be_refined_is_told() -> None:
     alone, alone_cost = refined(F[3:4].copy(), points, weight, s2, "truncated", 3, 0.0)
     np.testing.assert_array_equal(alone[0], fitted[3])
     assert alone_cost[0] == cost[3]
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_jacobian_equals_autograd(seed: int) -> None:
-    F, x0, x1 = unit_scene(seed, 40, noise=0.05)
-    f = models(F, 1, 0.1, seed)
-
-    def residual(f: Tensor) -> Tensor:
-        h0 = torch.from_numpy(np.c_[x0, np.ones(len(x0))])
-        h1 = torch.from_numpy(np.c_[x1, np.ones(len(x1))])
-        line1, line0 = h0 @ f.reshape(3, 3).T, h1 @ f.reshape(3, 3)
-        return (h1 * line1).sum(1) / (line1[:, :2].square().sum(1) + line0[:, :2].square().sum(1)).sqrt()
-
-    J, e, inverse, r2 = linearise(f, components(x0, x1))
-    jacobian = (J.flatten(0, 1) * inverse.sqrt())[:, 0, 0].T
-    assert torch.allclose(e * e * inverse, r2)
-    expected = torch.autograd.functional.jacobian(residual, f.flatten())
-    assert torch.allclose(jacobian, expected, rtol=0, atol=1e-9 * float(expected.abs().max()))
-    # r^2 of outliers is of order 1, of relative precision 1e-15
-    assert torch.allclose(r2.flatten(), residual(f.flatten()).square(), rtol=1e-12, atol=1e-15)
-
-
-@pytest.mark.parametrize("loss", LOSSES)
-def test_cost_never_rises(loss: str) -> None:
-    F, x0, x1 = unit_scene(7, 90, noise=5e-3, outliers=40)
-    F0 = torch.cat([models(F, 10, 0.05), models(F, 10, 1.0)], 2)
-    weight = torch.from_numpy(np.random.default_rng(0).uniform(0, 1, (1, 90)))
-    error = RobustSum(components(x0, x1), weight, loss, torch.full((1, 1), 0.02**2, dtype=torch.float64))
-    costs = [fitted_by(refine_kernel, F0, error, i)[1] for i in range(8)]
-    for before, after in itertools.pairwise(costs):
-        assert bool((after <= before).all())
-    assert bool((costs[-1] < costs[0])[:, :10].any())
