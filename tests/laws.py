@@ -106,6 +106,7 @@ def with_knowledge(c: Correspondences, known: str) -> Correspondences:
     return c.replace(K1=None) if known == "one" else c
 
 
+@functools.cache
 def scene(index: int, count: int = 150, outliers: float = 0.4, noise: float = 0.3) -> Correspondences:
     """One synthetic pair: a cloud of points before two cameras, with noise, outliers, ratios, frames and a key."""
     rng = np.random.default_rng(index)
@@ -137,6 +138,7 @@ def scene(index: int, count: int = 150, outliers: float = 0.4, noise: float = 0.
     )  # fmt: skip
 
 
+@functools.cache
 def scenes() -> Correspondences:
     """A batch of pairs of different sizes."""
     return collate([scene(i, count) for i, count in enumerate((150, 40, 333, 90, 150))])
@@ -166,6 +168,7 @@ def live_values(result: Result, c: Correspondences) -> Result:
     return {**rest, **{k: v[c.mask] for k, v in per_match.items()}}
 
 
+@functools.cache
 def degenerate() -> dict[str, Correspondences]:
     """Pairs that no estimator can solve, or only by luck."""
     good = scene(3)
@@ -193,6 +196,7 @@ def degenerate() -> dict[str, Correspondences]:
     }
 
 
+@functools.cache
 def small() -> dict[str, Correspondences]:
     """Pairs of few matches, from a minimal sample to 20: random ones, and those that determine no model."""
 
