@@ -10,7 +10,6 @@ import pytest
 import torch
 
 import fmtorch
-from fmtorch import presets
 from fmtorch.core import PAIR_TYPES, Correspondences, Estimate, collate
 from fmtorch.estimators.lens_search import inverted
 from fmtorch.geometry import significance
@@ -18,6 +17,7 @@ from fmtorch.metrics import corner_error, nsgd
 from fmtorch.two_view.arguments import lens_fields
 from fmtorch.two_view.pair_type import classify
 from tests.geometry.scenes import batch, draw
+from tests.laws import quick
 from tests.reference import lenses as division
 from tests.reference.homography import mapped
 from tests.reference.known_cameras import K0, K1, SIZE, angle, scene
@@ -30,8 +30,7 @@ def pair(kind: str, seed: int, n: int = 150, **options: float) -> Correspondence
 
 
 def estimated(c: Correspondences) -> Estimate:
-    estimate: Estimate = presets.build("estimator", "fmtorch")(c, 0)
-    return estimate
+    return quick("fmtorch")(c, 0)
 
 
 @pytest.mark.parametrize("known", [True, False])
@@ -113,18 +112,17 @@ def error(H: torch.Tensor, truth: np.ndarray, court: np.ndarray, unit: np.ndarra
 @pytest.mark.parametrize("shift", [0.0, 1e5])
 def test_the_unit_of_a_plane_and_its_orientation_change_nothing(up: bool, shift: float) -> None:
     """From kilometres to centimetres, in units of the plane, and on a map far from its origin."""
-    for seed in range(3):
-        court, y, H = pitch(seed, up)
-        for scale in (1e-3, 1 / 28, 1.0, 50.0, 100.0, 1e4):
-            unit = np.array([[scale, 0, shift * scale], [0, scale, -3 * shift * scale], [0, 0, 1]])
-            e = fmtorch.find_homography(mapped(unit, court), y)
-            assert bool(e.ok)
-            assert int(e.inliers[0, 18:].sum()) >= 40
-            assert error(e.H[0], H, court, unit) < 0.6  # by 8 parameters of 42 matches some 0.3
-            assert float(e.significance) > 50
-            assert bool(e.related)
-            seen = torch.from_numpy(np.c_[mapped(unit, court), np.ones(60)]) @ e.H[0, 2]
-            assert bool((seen[e.inliers[0]] > 0).all())
+    court, y, H = pitch(0, up)
+    for scale in (1e-3, 1 / 28, 1.0, 100.0, 1e4):
+        unit = np.array([[scale, 0, shift * scale], [0, scale, -3 * shift * scale], [0, 0, 1]])
+        e = fmtorch.find_homography(mapped(unit, court), y)
+        assert bool(e.ok)
+        assert int(e.inliers[0, 18:].sum()) >= 40
+        assert error(e.H[0], H, court, unit) < 0.6  # by 8 parameters of 42 matches some 0.3
+        assert float(e.significance) > 50
+        assert bool(e.related)
+        seen = torch.from_numpy(np.c_[mapped(unit, court), np.ones(60)]) @ e.H[0, 2]
+        assert bool((seen[e.inliers[0]] > 0).all())
 
 
 def test_a_mirrored_photograph_is_the_mirror_of_it() -> None:
@@ -144,9 +142,8 @@ def test_a_mirrored_photograph_is_the_mirror_of_it() -> None:
 
 def test_matches_of_nothing_have_no_homography() -> None:
     """Any four have one, and of a hundred some agree by chance."""
-    for seed in range(20):
-        rng = np.random.default_rng(seed)
-        x0, x1 = rng.uniform([0, 0], [640, 480], (2, 100, 2))
+    for seed in range(8):
+        x0, x1 = np.random.default_rng(seed).uniform([0, 0], [640, 480], (2, 100, 2))
         e = fmtorch.find_homography(x0, x1)
         assert not bool(e.ok), seed
         assert "no more than by chance" in e.reason[0]
