@@ -26,6 +26,7 @@ PEERS = {
 """The packages of the extra `peers` that presets of estimators need, by the presets' names."""
 SMALL_KINDS = ("collinear", "collinear in image 1", "planar", "coincident", "half coincident")
 
+FEW_OF_PEERS = {"iterations": 1000, "min_iterations": 100, "rounds": 2}
 Result = dict[str, Tensor]  # every value has the batch as its first dimension; masks (B, N) may be padded on the right
 
 
@@ -46,7 +47,8 @@ def few(config: Mapping[str, Any], hypotheses: int = 200, round: int = 100) -> d
         return options | ({"focal": {"samples": 60, "rounds": 2, "min_rounds": 1}} if config.get("focal") else {})
     if config["_target_"] == "fmtorch.estimators.IterativelyReweighted":
         return {"starts": [0, 2], "iterations": 5, "refine_iterations": 5}
-    return {key: few(value, hypotheses, round) for key, value in config.items() if isinstance(value, dict)}
+    own = {name: most for name, most in FEW_OF_PEERS.items() if name in config}
+    return own | {key: few(value, hypotheses, round) for key, value in config.items() if isinstance(value, dict)}
 
 
 def quick(name: str, hypotheses: int = 200, round: int = 100) -> Estimator:
