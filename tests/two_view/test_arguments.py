@@ -194,26 +194,25 @@ def test_presets_of_ones_own(tmp_path: Path) -> None:
         fmtorch.find_fundamental(x0, x1, estimator="mine")
 
 
-@pytest.mark.parametrize("shape", [(0, 5), (0, 0), (2, 0)])
-def test_an_empty_batch_gives_an_empty_result(shape: tuple[int, int]) -> None:
-    b, n = shape
-    numbers, frames, sizes = torch.zeros(b, n), torch.zeros(b, n, 2, 3), torch.ones(b, 2, dtype=torch.int64)
-    yes = torch.ones(b, n, dtype=torch.bool)
-    c = Correspondences(
-        torch.zeros(b, n, 2), torch.zeros(b, n, 2), yes, ratio=numbers, prior=numbers, lafs0=frames, lafs1=frames,
-        size0=sizes, size1=sizes, mutual=yes, noise=numbers,
-    )  # fmt: skip
-    for name in EVERY:
-        estimate = (quick(name) if "opencv" not in name else built("estimator", name))(c)
-        assert estimate.F.shape == (b, 3, 3), name
-        assert not bool(estimate.ok.any()), name
-    for name in variants("pruner"):
-        assert shown(built("pruner", name))(c).compact().mask.shape == (b, 0), name
-    assert len(fmtorch.find_fundamental(c.x0, c.x1)) == b
+def test_an_empty_batch_gives_an_empty_result() -> None:
+    estimators = {name: quick(name) for name in EVERY}
+    pruners = {name: shown(built("pruner", name)) for name in variants("pruner")}
+    for b, n in ((0, 5), (0, 0), (2, 0)):
+        numbers, frames, sizes = torch.zeros(b, n), torch.zeros(b, n, 2, 3), torch.ones(b, 2, dtype=torch.int64)
+        yes, x = torch.ones(b, n, dtype=torch.bool), torch.zeros(b, n, 2)
+        known = {"size0": sizes, "size1": sizes, "mutual": yes, "noise": numbers}
+        c = Correspondences(x, x, yes, ratio=numbers, prior=numbers, lafs0=frames, lafs1=frames, **known)
+        for name, estimator in estimators.items():
+            estimate = estimator(c)
+            assert estimate.F.shape == (b, 3, 3), name
+            assert not bool(estimate.ok.any()), name
+        for name, pruner in pruners.items():
+            assert pruner(c).compact().mask.shape == (b, 0), name
+        assert len(fmtorch.find_fundamental(x, x)) == b
+        F = torch.zeros(b, 3, 3)
+        assert metrics.nsgd(F, F, sizes, sizes).shape == metrics.nsgd_released(F, F, sizes, sizes).shape == (b,)
+        assert metrics.inlier_rate(F, x, x, yes, sizes, sizes).after.shape == (b,)
     assert len(fmtorch.find_fundamental([], [])) == 0
-    F = torch.zeros(b, 3, 3)
-    assert metrics.nsgd(F, F, sizes, sizes).shape == metrics.nsgd_released(F, F, sizes, sizes).shape == (b,)
-    assert metrics.inlier_rate(F, c.x0, c.x1, yes, sizes, sizes).after.shape == (b,)
 
 
 @pytest.mark.parametrize("name", [n for n in variants("estimator") if n.startswith(("opencv", "kornia"))])
