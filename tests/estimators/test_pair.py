@@ -71,17 +71,6 @@ def test_a_pair_holds_its_usable_matches_in_order(kind: str, scale: float) -> No
         assert pair.table.dtype == np.float64
 
 
-def test_the_unit_is_the_next_power_of_two() -> None:
-    exact = [math.ldexp(1.0, e) for e in range(-300, 300, 7)]
-    for unit in exact:
-        below, above = math.nextafter(unit, 0), math.nextafter(unit, math.inf)
-        for half, expected in ((below, unit), (unit, unit), (above, 2 * unit)):
-            x0 = torch.zeros(1, 8, 2, dtype=torch.float64)
-            x0[0, 0, 0], x0[0, 1, 0] = half, -half
-            result = normalized(Correspondences(x0, torch.zeros_like(x0), torch.ones(1, 8, dtype=torch.bool)))
-            assert result[0].pixels_per_unit == expected
-
-
 WRONG = {
     "prior": ((1.5, -0.1, math.nan), "prior of 1 match is wrong: it is P(inlier), within [0, 1]"),
     "noise": ((0.0, -1.0, math.nan), "noise of 1 match is wrong: it is a standard deviation, positive"),
@@ -123,14 +112,6 @@ def test_pairs_that_cannot_be_estimated_are_told_why() -> None:
         "8 coincident": "all matches coincide",
         "20 coincident": "all matches coincide",
     }
-
-
-def test_a_pair_is_a_copy() -> None:
-    batch = Batch.of(padded_pairs())
-    matches = batch.pair(3)
-    pair, before = batch.normalized(matches, 3, 0, 7)[0], matches.x0.copy()
-    pair.table[:] = 0
-    np.testing.assert_array_equal(matches.x0, before)
 
 
 def test_a_part_of_a_pair_keeps_its_frame() -> None:

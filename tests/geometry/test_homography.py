@@ -121,11 +121,11 @@ def test_horizons_are_infinitely_far() -> None:
 
 
 def test_gradients() -> None:
-    x0, x1, H = pairs((2,), 7, noise=0.01)
+    x0, x1, H = pairs((1,), 7, noise=0.01)
     x0, x1 = x0 / PX, x1 / PX
     D = torch.diag(torch.tensor([PX, PX, 1.0], dtype=torch.float64))
     H = torch.linalg.inv(D) @ H @ D
-    weight = torch.rand(2, 7, dtype=torch.float64) + 0.1
+    weight = torch.rand(1, 7, dtype=torch.float64) + 0.1
     for tensor in (x0, x1, H, weight):
         tensor.requires_grad_()
     assert torch.autograd.gradcheck(lambda a, b, w: geometry.homography(a, b, w)[0], (x0, x1, weight))
@@ -264,18 +264,6 @@ def test_cost_and_gradient(loss: str) -> None:
         slope = reference.gradient(cost, p.h)
         np.testing.assert_allclose(2 * products[9, :9], slope, atol=1e-10 * np.abs(slope).max())
         assert abs(products[9, :9] @ p.h) < 1e-10 * np.abs(slope).max()  # the scale of H counts nothing
-
-
-def test_gauss_newton_matrix_in_kernels_and_tensors() -> None:
-    for seed in range(5):
-        p = problem(seed)
-        p = p._replace(s2=np.full_like(p.s2, np.inf))  # without a robust loss
-        computed, _ = evaluated(p.h, p.weighted("truncated"))
-        np.testing.assert_array_equal(computed, computed.T)
-        curvature = homography_refine.homography_curvature(*p.tensors("truncated"))[0, 0].numpy()
-        expected = reference.gauss_newton(p.h, p.points, p.weight)
-        for matrix in (computed[:9, :9], curvature):
-            np.testing.assert_allclose(matrix, expected, atol=1e-11 * np.abs(expected).max())
 
 
 @pytest.mark.parametrize("loss", KINDS)

@@ -92,29 +92,6 @@ def pose_of(F: np.ndarray, s: known_cameras.Scene, weight: np.ndarray) -> np.nda
     return out
 
 
-@pytest.mark.parametrize("noise", [0.0, 1.0])
-def test_it_is_that_of_all_decompositions(noise: float) -> None:
-    for seed in range(10):
-        s = known_cameras.scene(seed, 40, noise, outliers=0.2, cameras=(CAMERA0, CAMERA1))
-        rng = np.random.default_rng(seed)
-        F = known_cameras.fundamental(s.R, s.t, (CAMERA0, CAMERA1)) * rng.choice([-2, 3]) + 1e-7 * noise * rng.normal(
-            size=(3, 3)
-        )
-        weight = rng.uniform(0, 1, 40) * s.right
-        out = pose_of(F, s, weight)
-        tensors = [torch.from_numpy(value)[None] for value in (F, CAMERA0, CAMERA1, s.x0, s.x1)]
-        graphed = pose_from_fundamental(*tensors, torch.ones(1, 40, dtype=torch.bool), torch.from_numpy(weight)[None])
-        assert bool(graphed.valid)
-        assert out[12] == 1
-        np.testing.assert_allclose(out[:9].reshape(3, 3), graphed.R[0], atol=1e-9)
-        np.testing.assert_allclose(out[9:12], graphed.t[0], atol=1e-9)
-        R, t, _ = solvers.pose(F, CAMERA0, CAMERA1, s.x0[s.right], s.x1[s.right])
-        np.testing.assert_allclose(out[:9].reshape(3, 3), R, atol=1e-6)
-        np.testing.assert_allclose(out[9:12], t, atol=1e-6)
-        if not noise:
-            np.testing.assert_allclose(out[9:12], s.t, atol=1e-6)
-
-
 def test_weights_decide_on_which_side_points_lie() -> None:
     """In both forms: three heavy matches of the true motion against seven light ones of its mirror image."""
     s = known_cameras.scene(1, 10, outliers=0.0, cameras=(CAMERA0, CAMERA1))

@@ -1,7 +1,6 @@
 """Refinement on the manifold of rank 2, in tensors and by kernels."""
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import pytest
@@ -9,7 +8,7 @@ import torch
 from torch import Tensor
 
 from fmtorch.geometry import LOSSES, attached_step, irls, refine
-from fmtorch.geometry.levenberg_marquardt import FIRST_DAMPING, LOSS_CODES, Schedule, Weighted, evaluate
+from fmtorch.geometry.levenberg_marquardt import LOSS_CODES, Schedule, Weighted, evaluate
 from fmtorch.geometry.normalize import RobustSum, fitted_by
 from fmtorch.geometry.refine import refine_kernel, reweighted, reweighted_kernel
 from tests.estimators.pairs import apart
@@ -59,26 +58,14 @@ def test_attached_step_has_the_gradient_of_the_optimum(loss: str, outliers: int)
     weight = torch.from_numpy(rng.uniform(0.2, 1, 30))
     direction = torch.from_numpy(rng.normal(size=(3, 3)))
     arguments = {"loss": loss, "scale": 0.02}
-
-    def optimum(x0: Tensor, x1: Tensor, weight: Tensor) -> Tensor:
-        return refine(torch.from_numpy(F), x0, x1, weight, iterations=30, **arguments)
-
     inputs = [v.clone().requires_grad_() for v in (x0, x1, weight)]
-    best = optimum(x0, x1, weight)
-    stepped = attached_step(best, *inputs, **arguments)
-    assert distance(best.flatten(), stepped.detach().flatten()) < 1e-8
-    gradients = torch.autograd.grad((stepped * direction).sum(), inputs)
-    for i, gradient in enumerate(gradients):
-        move = torch.from_numpy(rng.normal(size=inputs[i].shape))
-        h = 1e-4 if i == 2 else 1e-6  # moves of the optimum well above its own precision, some 1e-10
-        ends = []
-        for sign in (-1, 1):
-            moved = [x0, x1, weight]
-            moved[i] = moved[i] + sign * h * move
-            ends.append((optimum(*moved) * direction).sum().item())
-        difference = (ends[1] - ends[0]) / (2 * h)
+    best = refine(torch.from_numpy(F), *inputs, iterations=30, **arguments)
+    stepped = attached_step(best.detach(), *inputs, **arguments)
+    assert distance(best.detach().flatten(), stepped.detach().flatten()) < 1e-8
+    gradients = zip(*(torch.autograd.grad((each * direction).sum(), inputs) for each in (stepped, best)), strict=True)
+    for approximate, exact in gradients:
         # Gauss and Newton neglect terms of the size of the residuals over that of the scene, 1e-4, times its condition.
-        assert (gradient * move).sum().item() == pytest.approx(difference, rel=2e-2)
+        torch.testing.assert_close(approximate, exact, rtol=2e-2, atol=2e-2 * float(exact.abs().max()))
 
 
 @pytest.mark.parametrize("loss", LOSSES)
@@ -169,33 +156,19 @@ def refined(
     return fitted, cost
 
 
-@pytest.mark.parametrize("tolerance", [0.0, 1e-3])
 @pytest.mark.parametrize("loss", LOSS_CODES)
-def test_refinement(loss: str, tolerance: float) -> None:
-    F, *data = matches(200)
-    for iterations in (0, 1, 3, 8):
-        expect_refined(F, *data, loss, iterations, tolerance)
-
-
-def expect_refined(F: np.ndarray, *given: Any) -> None:
-    """What the reference makes of the models; given: data, loss, iterations and tolerance."""
-    fitted, cost = refined(F, *given)
-    for i, start in enumerate(F):
-        expected, expected_cost = reference.levenberg_marquardt(start, *given[:-1], FIRST_DAMPING, given[-1])
-        assert cost[i] == pytest.approx(expected_cost, rel=1e-9)
-        assert apart(fitted[i], expected) < 1e-8
-    assert np.abs(np.linalg.det(fitted.reshape(-1, 3, 3))).max() < 1e-14
-
-
-def test_rejected_steps_are_made_again_with_more_damping_and_end_no_fit() -> None:
-    """From afar: a step that raises the cost is no sign that the fit has converged."""
+def test_costs_fall_to_the_optimum(loss: str) -> None:
+    """From near; a tolerance ends most of them hardly earlier. From afar, where steps are rejected and made again with more
+    damping: one that raises the cost is no sign that the fit has converged."""
     F, *data = matches(60)
-    F = F[0] + 0.5 * np.random.default_rng(5).normal(size=(40, 9))
-    costs = np.array([refined(F, *data, "huber", iterations, 0.0)[1] for iterations in range(9)])
-    assert (np.diff(costs, axis=0) <= 0).all()
+    for start in (F, F[0] + 0.5 * np.random.default_rng(5).normal(size=(40, 9))):
+        costs = np.array([refined(start, *data, loss, iterations, 0.0)[1] for iterations in range(9)])
+        assert (np.diff(costs, axis=0) <= 0).all()
+        fitted, ended = refined(start, *data, loss, 8, 1e-3)
+        assert np.abs(np.linalg.det(fitted.reshape(-1, 3, 3))).max() < 1e-14
+        assert np.median(ended / costs[8]) < 1.001
     rejected = ((costs[1:] == costs[:-1]) & (costs[8] < 0.99 * costs[:-1])).any(0)
     assert rejected.sum() >= 3
-    expect_refined(F[rejected], *data, "huber", 8, 1e-3)
 
 
 def test_what_cannot_be_refined_is_told() -> None:

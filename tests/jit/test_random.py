@@ -76,6 +76,3 @@ def test_the_same_bits(seed: int, key: int) -> None:
             index = np.empty(most, np.int64)
             count = shuffle(1000, mixed_seed(seed, stream), key, index)
             assert index[:count].tolist() == order[:most]
-
-
-LEVEL = 1e-3

@@ -180,9 +180,9 @@ def test_every_process_tells_the_same_versions() -> None:
         "from fmtorch.estimators import WITH_FOCALS; import json;"
         "print(json.dumps([each.version for each in WITH_FOCALS]))"
     )
-    printed = [run_python("-c", code, PYTHONHASHSEED=seed).stdout for seed in ("1", "2")]
+    printed = run_python("-c", code, PYTHONHASHSEED="1").stdout  # here it is another
     here = [each.version for each in WITH_FOCALS]  # with the checks that tests wrap around functions
-    assert ([json.loads(each) for each in printed], len(set(here))) == ([here, here], len(here))
+    assert (json.loads(printed), len(set(here))) == (here, len(here))
 
 
 CLASHING = """

@@ -8,10 +8,9 @@ size less ``A / (1 + (ln f0 - ln f1)^2 / s3^2)``; for each measured focal length
 """
 
 import numpy as np
-from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from tests.reference.solvers import poses, sampson, skew
+from tests.reference.solvers import poses, skew
 
 Size = tuple[int, int]
 
@@ -45,20 +44,6 @@ def prior_cost(log_f0: float, log_f1: float, same_size: bool = False, measured: 
         squared = ((log_f - mean) / max(deviation, 1e-5)) ** 2
         cost, z2 = (cost + squared / 2, z2) if deviation < 0.02 else (cost, z2 + squared)
     return cost + 3 * z2 / (z2 + 6)
-
-
-def least_cost(
-    start: np.ndarray, x0: np.ndarray, x1: np.ndarray, weight: np.ndarray, scale: float, size0: Size, size1: Size
-) -> float:
-    """The least cost near parameters, of images of two sizes."""
-
-    def residuals(p: np.ndarray) -> np.ndarray:
-        r = sampson(fundamental(p, size0, size1), x0, x1)
-        data = np.sqrt(weight) * scale * r / np.sqrt(scale**2 + r**2) / 0.3  # its square is the loss
-        prior = [(p[6] - p[7]) / 0.5, ((p[6] + p[7]) / 2 - np.log(1.2)) / 0.4]
-        return np.concatenate([data, prior, [np.linalg.norm(p[3:6]) - 1]])
-
-    return float(least_squares(residuals, start, jac="3-point", max_nfev=1000, xtol=1e-15, ftol=1e-15, gtol=1e-12).cost)
 
 
 def share_in_front(

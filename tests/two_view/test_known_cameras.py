@@ -242,9 +242,8 @@ def test_gradients_are_the_differences_of_estimates(focal, monkeypatch):
 
     attached = {name: given[name].clone().requires_grad_() for name in names}
     computed = outputs(given | attached)
-    gradients = [
-        torch.autograd.grad(o, list(attached.values()), retain_graph=True, allow_unused=True) for o in computed
-    ]
+    leaves, graph = list(attached.values()), {"retain_graph": True, "allow_unused": True}
+    gradients = [torch.autograd.grad(output, leaves, **graph) for output in computed]
     for name, own in zip(names, zip(*gradients, strict=True), strict=True):
         step = torch.from_numpy(rng.normal(size=tuple(given[name].shape)))
         if name in ("K0", "K1"):
