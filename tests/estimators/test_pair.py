@@ -12,21 +12,15 @@ from torch import Tensor
 
 from fmtorch import estimators, find_fundamental
 from fmtorch.core import Correspondences, Estimate, collate
-from fmtorch.estimators import MAX_NOISE, MIN_NOISE, Batch, FitScale, bucket
+from fmtorch.estimators import MAX_NOISE, MIN_NOISE, FitScale, bucket
 from fmtorch.estimators.models import with_focals
 from fmtorch.geometry import LOSSES
 from fmtorch.presets import merged
 from tests.estimators.models.test_focals import TALL, WIDE, photographs
-from tests.estimators.pairs import SCALES, known, named, pair_of, real
+from tests.estimators.pairs import SCALES, known, named, normalized, pair_of, real
 from tests.laws import PEERS, degenerate, few, quick, scene, small, with_padding
 from tests.reference.random import number
 from tests.variants import OTHER_LIBRARIES, built, loaded, variants
-
-
-def normalized(c: Correspondences, i: int = 0, minimal: int = 7) -> tuple[estimators.Pair, Any] | str:
-    batch = Batch.of(c)
-    with np.errstate(all="raise"):  # what overflows is no error of the caller's
-        return batch.normalized(batch.pair(i), i, 0, minimal)
 
 
 def padded_pairs() -> Correspondences:
@@ -43,8 +37,7 @@ def test_a_pair_holds_its_usable_matches_in_order(kind: str, scale: float) -> No
     c = c if kind == "all" else c.replace(prior=None, noise=None, ratio=None, size0=None, size1=None)
     c = c.replace(x0=scale * c.x0.double(), x1=scale * c.x1.double())
     for i in range(len(c)):
-        result = normalized(c, i)
-        pair, slot = result
+        pair, slot = normalized(c, i=i)
         mask = c.mask[i].numpy()
         np.testing.assert_array_equal(slot, np.flatnonzero(mask))
         pixels = torch.cat([c.x0, c.x1], -1)[i].numpy()[mask].T

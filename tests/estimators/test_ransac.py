@@ -132,30 +132,14 @@ def file() -> dict[str, np.ndarray]:
     return oracle("robust.npz")
 
 
-@pytest.fixture(scope="module")
-def batch(file: dict[str, np.ndarray]) -> dict[str, torch.Tensor]:
-    """The pairs' matches as one batch, which changes no result; padded with zeros."""
-    count = len(file["names"])
-    n = max(len(file[f"{i:03d}.X1"]) for i in range(count))
-    x0, x1 = np.zeros((2, count, n, 2))
-    mask, ratio = np.zeros((count, n), bool), np.zeros((count, n))
-    for i in range(count):
-        live = slice(len(file[f"{i:03d}.X1"]))
-        x0[i, live], x1[i, live] = file[f"{i:03d}.X1"], file[f"{i:03d}.X2"]
-        mask[i, live], ratio[i, live] = True, file[f"{i:03d}.score"]
-    return {k: torch.from_numpy(v) for k, v in {"x0": x0, "x1": x1, "mask": mask, "ratio": ratio}.items()}
-
-
 @pytest.mark.parametrize("name", NAMESAKES)
-def test_solves_as_many_pairs_as_its_namesake(name, file, batch):
-    count = len(file["names"])
-    F_true, *sizes = (
-        torch.from_numpy(np.stack([file[f"{i:03d}.{field}"] for i in range(count)]))
-        for field in ("F_gt", "size1", "size2")
-    )
+def test_solves_as_many_pairs_as_its_namesake(name, file):
+    count, fields = len(file["names"]), ("X1", "X2", "score", "F_gt", "size1", "size2")
+    x0, x1, ratio, *truth = ([file[f"{i:03d}.{field}"] for i in range(count)] for field in fields)
+    F_true, *sizes = (torch.from_numpy(np.stack(each)) for each in truth)
     nsgd = np.ones((count, SEEDS))
     for seed in range(SEEDS):
-        estimate = fmtorch.find_fundamental(**batch, estimator=name, seed=seed)
+        estimate = fmtorch.find_fundamental(x0, x1, ratio=ratio, estimator=name, seed=seed)
         ok = estimate.ok.numpy()
         nsgd[ok, seed] = metrics.nsgd(F_true, estimate.F, *(size.long() for size in sizes)).numpy()[ok]
     stored = file["nsgd"][:, file["estimators"].tolist().index(NAMESAKES[name])]

@@ -158,8 +158,8 @@ def refined(
 
 @pytest.mark.parametrize("loss", LOSS_CODES)
 def test_costs_fall_to_the_optimum(loss: str) -> None:
-    """From near; a tolerance ends most of them hardly earlier. From afar, where steps are rejected and made again with more
-    damping: one that raises the cost is no sign that the fit has converged."""
+    """From near; a tolerance ends most of them hardly earlier. From afar, where steps are rejected and made again with
+    more damping: one that raises the cost is no sign that the fit has converged."""
     F, *data = matches(60)
     for start in (F, F[0] + 0.5 * np.random.default_rng(5).normal(size=(40, 9))):
         costs = np.array([refined(start, *data, loss, iterations, 0.0)[1] for iterations in range(9)])

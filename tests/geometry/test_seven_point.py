@@ -90,7 +90,7 @@ def points_of() -> dict[str, np.ndarray]:
         **laws.small(),
     }
     pairs = {name: normalized(c) for name, c in given.items()}
-    return {name: pair.points for name, pair in pairs.items() if pair is not None}
+    return {name: pair[0].points for name, pair in pairs.items() if not isinstance(pair, str)}
 
 
 def solved_by(solver: str, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -130,44 +130,38 @@ def test_a_list_of_single_points_is_one_pair() -> None:
         assert torch.equal(fmtorch.find_fundamental(x0, x1, **EASY).F, expected.F)
 
 
-# Wrong types are tried in a process of their own: the tests' import hook would refuse them before we do.
-WRONG_TYPES = """
-import numpy as np, torch, fmtorch
+NUMBERS, IMAGE = (
+    "it must be an array or tensor of numbers",
+    "it must be a file's path, a Pillow image or a uint8 array of NumPy",
+)
+WRONG_TYPES = {
+    "find_fundamental(None, None)": f"TypeError: x0 is a NoneType of object; {NUMBERS}",
+    "find_fundamental('ab', 'ab')": f"TypeError: x0 is a str of <U2; {NUMBERS}",
+    "find_fundamental([[1, 2], [3]], x)": "TypeError: x0 is a list of uneven rows; it must be an array or a tensor",
+    "find_fundamental(x, x, ratio=object())": f"TypeError: ratio is a object of object; {NUMBERS}",
+    "find_fundamental([x], [x], prior=0.5)": "ValueError: prior must be a list of 1 arrays, one for each pair of x0",
+    "match(None, image)": f"TypeError: image0 is a NoneType; {IMAGE}",
+    "match(image, [1, 2])": f"TypeError: image1 is a list; {IMAGE}",
+    "match(b'a.jpg', b'b.jpg')": f"TypeError: image0 is a bytes; {IMAGE}",
+    "match(torch.zeros(4, 4), image)": f"TypeError: image0 is a Tensor; {IMAGE}",
+    "match(image, image, pipeline=None)": "TypeError: pipeline is a NoneType; it must be the name of a preset or a Pipeline",
+}
+CALLS = """
+import sys, numpy as np, torch
+from fmtorch import find_fundamental, match
 x, image = np.zeros((9, 2)), np.zeros((9, 9), np.uint8)
-for call in (
-    lambda: fmtorch.find_fundamental(None, None),
-    lambda: fmtorch.find_fundamental("ab", "ab"),
-    lambda: fmtorch.find_fundamental([[1, 2], [3]], [[1, 2], [3]]),
-    lambda: fmtorch.find_fundamental(x, x, ratio=object()),
-    lambda: fmtorch.find_fundamental([x], [x], prior=0.5),
-    lambda: fmtorch.match(None, image),
-    lambda: fmtorch.match(image, [1, 2]),
-    lambda: fmtorch.match(b"a.jpg", b"b.jpg"),
-    lambda: fmtorch.match(torch.zeros(4, 4), image),
-    lambda: fmtorch.match(image, image, pipeline=None),
-):
+for call in sys.argv[1:]:
     try:
-        print("taken", call())
+        print("taken", eval(call))
     except Exception as error:
         print(f"{type(error).__name__}: {error}")
-"""
-TOLD = """\
-TypeError: x0 is a NoneType of object; it must be an array or tensor of numbers
-TypeError: x0 is a str of <U2; it must be an array or tensor of numbers
-TypeError: x0 is a list of uneven rows; it must be an array or a tensor
-TypeError: ratio is a object of object; it must be an array or tensor of numbers
-ValueError: prior must be a list of 1 arrays, one for each pair of x0
-TypeError: image0 is a NoneType; it must be a file's path, a Pillow image or a uint8 array of NumPy
-TypeError: image1 is a list; it must be a file's path, a Pillow image or a uint8 array of NumPy
-TypeError: image0 is a bytes; it must be a file's path, a Pillow image or a uint8 array of NumPy
-TypeError: image0 is a Tensor; it must be a file's path, a Pillow image or a uint8 array of NumPy
-TypeError: pipeline is a NoneType; it must be the name of a preset or a Pipeline
 """
 
 
 def test_wrong_types_are_named(tmp_path: Path) -> None:
-    done = run_command("-c", WRONG_TYPES, cwd=tmp_path)
-    assert done.stdout == TOLD, done.stderr
+    """In a process of its own: the tests' import hook would refuse them before we do."""
+    done = run_command("-c", CALLS, *WRONG_TYPES, cwd=tmp_path)
+    assert done.stdout.splitlines() == list(WRONG_TYPES.values()), done.stderr
 
 
 def test_presets_of_ones_own(tmp_path: Path) -> None:
@@ -362,9 +356,12 @@ def test_a_compiled_model_may_estimate() -> None:
         assert torch.equal(torch.autograd.grad(compiled(c.x0, x1), x1)[0], expected)
 
 
-def test_the_compiler_is_not_imported_for_those_who_do_not_compile() -> None:
-    program = "import sys, fmtorch; fmtorch.find_fundamental; assert 'torch._dynamo' not in sys.modules"
-    subprocess.run([sys.executable, "-c", program], check=True)
+def test_compilers_are_not_imported_before_they_are_needed() -> None:
+    """Neither torch's nor numba, by those who have not estimated yet."""
+    code = (
+        "import sys, fmtorch; fmtorch.find_fundamental; print({'torch._dynamo', 'numba', 'llvmlite'} & {*sys.modules})"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.PIPE).stdout == b"set()\n"
 
 
 def test_a_list_of_pairs_computes_with_one_thread_of_torch(monkeypatch: pytest.MonkeyPatch) -> None:
