@@ -11,7 +11,7 @@ from torch import Tensor
 from fmtorch.geometry import homography_points, pose_from_fundamental, poses_from_homography
 from fmtorch.geometry.cameras import PixelFrame, calibration_problems, mapped, square_pixels
 from fmtorch.geometry.pose import pose
-from tests.geometry.scenes import scene, stacked
+from tests.geometry.scenes import scene, stacked, unit_scene
 from tests.reference import known_cameras, solvers
 
 
@@ -67,19 +67,14 @@ def test_bad_input_is_invalid_and_alone():
 
 
 def test_gradient():
-    s = scene(20, 1, noise=1.0)
-    pixels = torch.diag(torch.tensor([500.0, 500, 1], dtype=torch.float64))
-    F = pixels @ s.F @ pixels
-    scale = torch.tensor([500.0, 500.0], dtype=torch.float64)
-    CAMERA0, CAMERA1 = (
-        torch.diag(torch.tensor([1 / 500, 1 / 500, 1.0], dtype=torch.float64)) @ K for K in (s.K0, s.K1)
-    )
-    F = (F / F.norm()).requires_grad_()
+    F, x0, x1 = (torch.from_numpy(value) for value in unit_scene(1, 20, 1e-3))
+    K = torch.eye(3, dtype=torch.float64)
 
-    def pose(F, CAMERA0, CAMERA1):
-        return pose_from_fundamental(F, CAMERA0, CAMERA1, s.x0 / scale, s.x1 / scale)[:2]
+    def pose(F, K0, K1):
+        return pose_from_fundamental(F, K0, K1, x0, x1)[:2]
 
-    assert torch.autograd.gradcheck(pose, (F, CAMERA0.requires_grad_(), CAMERA1.requires_grad_()))
+    inputs = [value.clone().requires_grad_() for value in (F, K, K)]
+    assert torch.autograd.gradcheck(pose, inputs)
 
 
 CAMERAS = np.array([650.0, 319.5, 239.5, 820, 300.5, 249.5])
@@ -173,22 +168,13 @@ def test_opencv(seed: int) -> None:
     x1 = homography_points(*tensors(H, x0)).numpy()
     G = np.linalg.inv(K1) @ H @ K0
     _, rotations, translations, normals = cv2.decomposeHomographyMat(G, np.eye(3))
-    rays = [
-        (np.c_[x, np.ones(len(x))] @ np.linalg.inv(K).T)[:, None, :2].astype(np.float32)
-        for x, K in ((x0, K0), (x1, K1))
-    ]
-    possible = cv2.filterHomographyDecompByVisibleRefpoints(rotations, normals, *rays)
+    rays = [solvers.homogeneous(x) @ np.linalg.inv(K).T for x, K in ((x0, K0), (x1, K1))]
+    ends = [ray[:, None, :2].astype(np.float32) for ray in rays]
+    possible = cv2.filterHomographyDecompByVisibleRefpoints(rotations, normals, *ends).ravel()
     poses = poses_from_homography(*tensors(H, K0, K1, x0, x1))
-    computed = [
-        np.concatenate([R.ravel(), t, n])
-        for R, t, n, valid in zip(
-            poses.R.numpy(), poses.t.numpy(), poses.normal.numpy(), poses.in_front == 1, strict=True
-        )
-        if valid
-    ]
-    expected = [
-        np.concatenate([rotations[i].ravel(), translations[i][:, 0], normals[i][:, 0]]) for i in possible.ravel()
-    ]
+    every = torch.cat([poses.R.flatten(-2), poses.t, poses.normal], -1)
+    computed = every[poses.in_front == 1].numpy()
+    expected = [np.concatenate([each[i].ravel() for each in (rotations, translations, normals)]) for i in possible]
     assert len(computed) == len(expected)
     for solution in expected:
         assert min(np.abs(solution - ours).max() for ours in computed) < 1e-6

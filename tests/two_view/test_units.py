@@ -1,7 +1,6 @@
 """Pair types, homographies, units and lenses of the public functions."""
 
 import math
-import re
 import warnings
 from typing import Any
 
@@ -382,25 +381,6 @@ def test_sizes_may_be_assumed() -> None:
     assert centred.reason == ("a lens needs the image sizes",)
 
 
-@pytest.mark.parametrize(
-    ("said", "message"),
-    [
-        ({"lens": "fisheye"}, "lens is 'fisheye'; it must be None, 'unknown', 'shared', lambda"),
-        ({"lens": -0.6}, "lens of image 0 of pair 0 is [-0.6, 0.0]; it is lambda in half diagonals, from -0.45"),
-        ({"lens": (-0.1, -1)}, "lens of image 0 of pair 0 is"),
-        ({"lens": (0.1, 0.1, 0.1)}, "lens has shape (3,)"),
-        ({"lens": "shared", "covariance": True}, "a covariance is of pinholes"),
-        ({"lens": "shared", "size0": "unknown", "size1": "unknown"}, "lens needs the image sizes"),
-        ({"lens": "shared", "K0": np.eye(3), "K1": np.eye(3), "size0": None, "size1": None}, "lens needs the image"),
-        ({"lens": "shared", "estimator": "ransac"}, "lens needs an estimator with the option focal"),
-    ],
-)
-def test_what_makes_no_sense_is_refused_by_name(said: dict[str, Any], message: str) -> None:
-    x0, x1, _, _ = division.photographs(1, (0, 0))
-    with pytest.raises(ValueError, match=re.escape(message)):
-        found(x0, x1, **said)
-
-
 @pytest.mark.parametrize("calibrated", [False, True])
 def test_the_type_of_a_pair_is_that_of_the_undistorted_photographs(calibrated: bool) -> None:
     """Of a plane, alone and beside a general pair, whose homography is that of pinholes."""
@@ -421,12 +401,6 @@ def test_the_type_of_a_pair_is_that_of_the_undistorted_photographs(calibrated: b
     truth = torch.from_numpy(H)[None], torch.tensor([SIZE])
     as_pinholes = found(y0, y1, **given)
     assert float(corner_error(alone.homography, *truth)) < 0.5 < 3 < float(corner_error(as_pinholes.homography, *truth))
-
-
-def test_gradients_are_refused() -> None:
-    x0, x1, _, _ = division.photographs(1, (0, 0))
-    with pytest.raises(ValueError, match="lens is given, and its estimates have no gradients"):
-        found(torch.from_numpy(x0).requires_grad_(), torch.from_numpy(x1), lens="shared")
 
 
 def test_matches_that_contradict_pinholes_suggest_a_lens() -> None:
