@@ -12,7 +12,6 @@ from fmtorch.geometry import homography_refine
 from fmtorch.geometry.epipolar import HOMOGRAPHY
 from fmtorch.geometry.homography import four_point
 from fmtorch.geometry.levenberg_marquardt import Schedule, Weighted
-from fmtorch.geometry.normalize import RobustSum
 from tests.reference import homography as reference
 from tests.reference.homography import mapped, sampson_squared
 
@@ -203,11 +202,6 @@ class Problem(NamedTuple):
 
     def weighted(self, loss: str) -> Weighted:
         return Weighted.of(self.points, self.weight, self.s2, loss)
-
-    def tensors(self, loss: str) -> tuple[torch.Tensor, RobustSum]:
-        data = (self.h[:, None, None], self.points[:, None].copy(), self.weight[None], self.s2[None])
-        h, points, weight, s2 = map(torch.from_numpy, data)
-        return h, RobustSum(points, weight, loss, s2)
 
 
 def problem(seed: int, n: int = 30, noise: float = 0.02) -> Problem:

@@ -300,15 +300,8 @@ def test_metrics_refuse_sizes_of_no_image(metric: str, wrong: list[float]) -> No
             function(*points, *given)
 
 
-def says_what_gradients_reach(name: str) -> bool:
-    """Whether a preset is of our own; peers may not be installed."""
-    try:
-        return hasattr(built("estimator", name), "gradients_reach")
-    except ImportError:
-        return False
-
-
-OWN = [name for name in variants("estimator") if says_what_gradients_reach(name) and name != "homography"]
+WITHOUT = (*OTHER_LIBRARIES, "homography", "weighted_eight_point")
+OWN = [name for name in variants("estimator") if not name.startswith(WITHOUT)]
 C = scene(1, 60, outliers=0.2)
 
 

@@ -64,9 +64,6 @@ def with_prior(c: Correspondences, seed: int = 0) -> Correspondences:
     return c.replace(prior=torch.from_numpy(prior))
 
 
-SIZES = [(WIDE, WIDE), (WIDE, TALL)]
-
-
 def error(F: torch.Tensor, pair: Photographs) -> float:
     """NSGD of the estimate (1, 3, 3)."""
     return float(nsgd(torch.from_numpy(pair.F)[None], F, pair.c.size0, pair.c.size1, key=pair.c.keys))
@@ -196,7 +193,6 @@ def test_how_likely_one_camera_is() -> None:
     assert focal_prior.same_camera_share(0.0, np.array([0.0, math.inf])) == 0.7
 
 
-ROUNDS = 6
 FOCAL = {"sampler": "prior", "select": {"scale": 1.0}, "threshold": 1.5}
 
 
@@ -204,11 +200,6 @@ def searching(iterations: int = 12, **options: int) -> FocalSearch:
     """A search that only selects."""
     focal = Focal(iterations=iterations, samples=0, **options)
     return FocalSearch(focal, FundamentalWithFocals(), BestScore(SaturatedGains(0.3)), Refinement(None), None, None)
-
-
-def free(F: np.ndarray, pair: Pair) -> Candidates:
-    """Models (k, 9) that the other search has found."""
-    return Candidates(F, True, pair)
 
 
 def test_rounds_without_candidates_settle_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -235,13 +226,13 @@ def test_the_prior_is_asked_only_where_good_candidates_differ(monkeypatch: pytes
     pair, right, other = models(0.3)
     same, different, search = np.stack([right, right]), np.stack([right, other]), searching()
     monkeypatch.setattr(focal_search, "RIVAL_GAIN_SHARE", 0.0)  # every candidate is a good one
-    assert np.array_equal(search.select(free(same, pair), pair, None).F, right)
+    assert np.array_equal(search.select(Candidates(same, True, pair), pair, None).F, right)
     _, refined = FundamentalWithFocals().refine(different, pair, 12)
-    selection = search.select(free(different, pair), pair, None)
+    selection = search.select(Candidates(different, True, pair), pair, None)
     assert any(np.array_equal(selection.F, refined.models[k]) for k in (0, 1))
     assert selection.cameras is not None
     monkeypatch.setattr(focal_search, "RIVAL_GAIN_SHARE", 2.0)  # none is
-    selection = search.select(free(different, pair), pair, None)
+    selection = search.select(Candidates(different, True, pair), pair, None)
     assert np.array_equal(selection.F, right)
     assert selection.cameras is None
 
@@ -252,7 +243,7 @@ def test_a_crop_keeps_the_model_without_prior() -> None:
     pair = pair_of(c.replace(x0=c.x0 + torch.tensor([4000.0, 0])))
     F = to_units(truth @ T, pair)
     rival = to_units(truth @ T + 0.01 * truth.T, pair)
-    selection = searching().select(free(np.stack([F, rival]), pair), pair, None)
+    selection = searching().select(Candidates(np.stack([F, rival]), True, pair), pair, None)
     assert np.array_equal(selection.F, F)
     assert selection.cameras is None
 
