@@ -10,7 +10,6 @@ import torch
 
 import fmtorch
 from fmtorch.core import PAIR_TYPES, Correspondences, Estimate, collate
-from fmtorch.estimators.lens_search import inverted
 from fmtorch.geometry import significance
 from fmtorch.metrics import corner_error, nsgd
 from fmtorch.two_view.arguments import lens_fields
@@ -414,13 +413,3 @@ def test_matches_that_contradict_pinholes_suggest_a_lens() -> None:
     alone = found(bent[0], bent[1]).lens_suggested
     assert torch.equal(alone, estimate.lens_suggested[:1])
     assert found(bent[0], bent[1], lens="shared").lens_suggested is None
-
-
-def test_an_inverse_and_its_determinant() -> None:
-    A = np.random.default_rng(0).normal(size=(9, 9))
-    A, out = A @ A.T, np.empty((9, 9))
-    logarithm = inverted(A, out)
-    assert out @ A == pytest.approx(np.eye(9), abs=1e-9)
-    assert logarithm == pytest.approx(np.linalg.slogdet(A)[1], abs=1e-9)
-    assert np.isnan(inverted(np.zeros((9, 9)), out))
-    assert np.isinf(out).all()
