@@ -29,6 +29,7 @@ PEERS = {
 """The packages of the extra `peers` that presets of estimators need, by the presets' names."""
 SMALL_KINDS = ("collinear", "collinear in image 1", "planar", "coincident", "half coincident")
 
+FEW_OF_PEERS = {"iterations": 1000, "min_iterations": 100, "rounds": 2}
 Result = dict[str, Tensor]  # every value has the batch as its first dimension; masks (B, N) may be padded on the right
 
 
@@ -49,7 +50,8 @@ def few(config: Mapping[str, Any], hypotheses: int = 200, round: int = 100) -> d
         return options | ({"focal": {"samples": 60, "rounds": 2, "min_rounds": 1}} if config.get("focal") else {})
     if config["_target_"] == "fmtorch.estimators.IterativelyReweighted":
         return {"starts": [0, 2], "iterations": 5, "refine_iterations": 5}
-    return {key: few(value, hypotheses, round) for key, value in config.items() if isinstance(value, dict)}
+    own = {name: most for name, most in FEW_OF_PEERS.items() if name in config}
+    return own | {key: few(value, hypotheses, round) for key, value in config.items() if isinstance(value, dict)}
 
 
 def quick(name: str, hypotheses: int = 200, round: int = 100) -> Estimator:
@@ -109,6 +111,7 @@ def with_knowledge(c: Correspondences, known: str) -> Correspondences:
     return c.replace(K1=None) if known == "one" else c
 
 
+@functools.cache
 def scene(index: int, count: int = 150, outliers: float = 0.4, noise: float = 0.3) -> Correspondences:
     """One synthetic pair: a cloud of points before two cameras, with noise, outliers, ratios, frames and a key."""
     rng = np.random.default_rng(index)
@@ -140,6 +143,7 @@ def scene(index: int, count: int = 150, outliers: float = 0.4, noise: float = 0.
     )  # fmt: skip
 
 
+@functools.cache
 def scenes() -> Correspondences:
     """A batch of pairs of different sizes."""
     return collate([scene(i, count) for i, count in enumerate((150, 40, 333, 90, 150))])
@@ -169,6 +173,7 @@ def live_values(result: Result, c: Correspondences) -> Result:
     return {**rest, **{k: v[c.mask] for k, v in per_match.items()}}
 
 
+@functools.cache
 def degenerate() -> dict[str, Correspondences]:
     """Pairs that no estimator can solve, or only by luck."""
     good = scene(3)
@@ -196,6 +201,7 @@ def degenerate() -> dict[str, Correspondences]:
     }
 
 
+@functools.cache
 def small() -> dict[str, Correspondences]:
     """Pairs of few matches, from a minimal sample to 20: random ones, and those that determine no model."""
 

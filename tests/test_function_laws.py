@@ -94,7 +94,7 @@ FUNCTIONS: dict[str, Callable[[Pairs], Any]] = {
     "fundamental_pose_error": lambda p: metrics.fundamental_pose_error(p.F, p.K0, p.K1, p.x0, p.x1, p.R, p.t, p.mask),
     "homography": lambda p: geometry.homography(p.x0, p.x1, p.weight, p.mask),
     "inlier_rate": lambda p: metrics.inlier_rate(p.F, p.x0, p.x1, p.noise > 0.7, **sizes(p), mask=p.mask),
-    "irls": lambda p: geometry.irls(p.x0, p.x1, p.F, p.weight, p.mask, scale=2.0),
+    "irls": lambda p: geometry.irls(p.x0, p.x1, p.F, p.weight, p.mask, scale=2.0, iterations=4),
     "nearest_rank2": lambda p: geometry.nearest_rank2(p.H),
     "normalize_points": lambda p: geometry.normalize_points(p.x0, p.mask, p.weight),
     "pose_error": lambda p: metrics.pose_error(p.R, p.t, p.R.detach().mT, p.t.detach().flip(-1)),

@@ -20,18 +20,16 @@ FEW = tuple(name for name in small() if not name.endswith(" coincident") or "hal
 REAL = ("real 0", "real 7", "real 13")
 
 
-def normalized(c: Correspondences, seed: int = 0, minimal: int = 7, i: int = 0) -> Pair | None:
-    """A pair of a batch in normalised units; None where it cannot be estimated."""
+def normalized(c: Correspondences, seed: int = 0, minimal: int = 7, i: int = 0) -> tuple[Pair, Array] | str:
+    """A pair of a batch in normalised units and its slots, or why it cannot be estimated."""
     batch = Batch.of(c.detach())
-    with np.errstate(all="ignore"):  # as an estimate of a batch does
-        result = batch.normalized(batch.pair(i), i, seed, minimal)
-    return None if isinstance(result, str) else result[0]
+    with np.errstate(all="raise"):  # what overflows is no error of the caller's
+        return batch.normalized(batch.pair(i), i, seed, minimal)
 
 
 def pair_of(c: Correspondences, seed: int = 0, i: int = 0) -> Pair:
     """A pair of a batch, which can be estimated."""
-    pair = normalized(c, seed, i=i)
-    return pair
+    return normalized(c, seed, i=i)[0]
 
 
 def named(name: str, scale: float = 1.0, seed: int = 0) -> Pair:

@@ -306,11 +306,3 @@ def test_prosac_is_uniform_after_its_growth_and_where_nothing_is_ranked() -> Non
     nothing = pair_of(scene(1, 100).replace(ratio=None, prior=None))
     drawn, uniform = (sampler.draw(nothing, 100, 300, 7) for sampler in (estimators.Prosac(), estimators.Uniform()))
     np.testing.assert_array_equal(drawn, uniform)
-
-
-@pytest.mark.parametrize("key", [0, 1, -1, 2**63 - 1, -(2**63)])
-@pytest.mark.parametrize("seed", [0, -3, 2**62])
-def test_samples_of_any_key_and_seed(seed: int, key: int) -> None:
-    matches = pair_of(scene(0, 30).replace(key=torch.tensor([key])), seed=seed)
-    expected = [reference.weighted_sample([1] * 30, numbers_of(matches, d, 7)) for d in range(20)]
-    assert estimators.Uniform().draw(matches, 0, 20, 7).T.tolist() == expected

@@ -58,9 +58,7 @@ def unit_scene(
     """F and matches of about unit scale before two cameras."""
     rng = np.random.default_rng(seed)
     X = np.c_[rng.uniform(-2, 2, (n, 2)), rng.uniform(3, 7, n)]
-    a, b = rng.uniform(-0.3, 0.3, 2)
-    R = np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]])
-    R = R @ np.array([[1, 0, 0], [0, np.cos(b), -np.sin(b)], [0, np.sin(b), np.cos(b)]])
+    R = Rotation.from_euler("YX", rng.uniform(-0.3, 0.3, 2)).as_matrix()
     t = rng.normal(size=3)
     t /= np.linalg.norm(t)
     F = skew(t) @ R

@@ -316,11 +316,6 @@ def test_several_processes_compile_each_kernel_once(tmp_path: Path, cache: Path)
     assert not list(cache.rglob("*.lock"))
 
 
-def test_numba_is_not_imported_before_a_kernel_is_called() -> None:
-    code = "import sys, fmtorch.jit.kernel, fmtorch; sys.exit('numba' in sys.modules or 'llvmlite' in sys.modules)"
-    subprocess.run([sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": str(REPOSITORY)}, check=True)
-
-
 def test_kernels_can_be_switched_off(monkeypatch: pytest.MonkeyPatch) -> None:
     assert not switch.off()
     assert switch.identity() == f"numba {numba.__version__}"

@@ -19,17 +19,6 @@ def test_reference_is_splitmix64() -> None:
     assert [reference.mix((1234567 + i * reference.GAMMA) % reference.WORD) for i in range(1, 5)] == published
 
 
-@pytest.mark.parametrize("seed", [0, 1, 12345, 2**31, 2**62 + 3, -1])
-@pytest.mark.parametrize("stream", list(Stream))
-def test_equals_the_reference(seed: int, stream: Stream) -> None:
-    drawn = bits(seed, KEYS, stream, 5, 4, 3)
-    expected = [
-        [[reference.number(seed, key, int(stream), draw, column, 3) for column in range(3)] for draw in range(5, 9)]
-        for key in KEYS.tolist()
-    ]
-    assert (drawn.dtype, drawn.tolist()) == (torch.int64, expected)
-
-
 def test_known_figures() -> None:
     """Results of old must stay reproducible: a change of these figures changes every run."""
     key = torch.tensor([0, 42])
@@ -63,7 +52,7 @@ def test_the_same_on_the_gpu() -> None:
 @pytest.mark.parametrize("key", [0, 1, -1, 2**63 - 1, -(2**63)])
 @pytest.mark.parametrize("seed", [0, 5, -3, 2**62])
 def test_the_same_bits(seed: int, key: int) -> None:
-    for stream in (Stream.SAMPLING, Stream.REFINEMENT):
+    for stream in Stream:
         for start in (0, 2**33):
             out = np.empty((50, 3))
             uniforms(mixed_seed(seed, stream), key, start, out)
@@ -76,6 +65,3 @@ def test_the_same_bits(seed: int, key: int) -> None:
             index = np.empty(most, np.int64)
             count = shuffle(1000, mixed_seed(seed, stream), key, index)
             assert index[:count].tolist() == order[:most]
-
-
-LEVEL = 1e-3

@@ -14,6 +14,7 @@ import pytest
 from fmtorch.estimators import WITH_FOCALS
 from fmtorch.jit.cache import version
 from fmtorch.jit.kernel import F4x1, F8x1, F8x2, U1x1, kernel, signature_of
+from tests.processes import run_command
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 
@@ -76,11 +77,6 @@ def all_of_them(x: float, rows: F8x2) -> float:
 def other(x: float) -> float:
     return x + 5
 """
-
-
-def run_python(*words: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    env = {**os.environ, "PYTHONPATH": str(REPOSITORY), **environment}
-    return subprocess.run([sys.executable, *words], env=env, capture_output=True, text=True, check=True)
 
 
 def load(folder: Path, source: str) -> types.ModuleType:
@@ -175,14 +171,14 @@ def test_what_has_no_version_is_refused_by_name(tmp_path: Path, value: str) -> N
         version(module.f)
 
 
-def test_every_process_tells_the_same_versions() -> None:
+def test_every_process_tells_the_same_versions(tmp_path: Path) -> None:
     code = (
         "from fmtorch.estimators import WITH_FOCALS; import json;"
         "print(json.dumps([each.version for each in WITH_FOCALS]))"
     )
-    printed = [run_python("-c", code, PYTHONHASHSEED=seed).stdout for seed in ("1", "2")]
+    printed = run_command("-c", code, cwd=tmp_path).stdout  # whose hashes of strings are others
     here = [each.version for each in WITH_FOCALS]  # with the checks that tests wrap around functions
-    assert ([json.loads(each) for each in printed], len(set(here))) == ([here, here], len(here))
+    assert (json.loads(printed), len(set(here))) == (here, len(here))
 
 
 CLASHING = """
@@ -218,10 +214,10 @@ def of_tens(n: int) -> int:
 def test_functions_of_one_name_kept_by_two_processes_stay_two(tmp_path: Path) -> None:
     """numba tells functions of one name apart by numbers that begin anew in every process."""
     (tmp_path / "clashing.py").write_text(CLASHING)
-    own = {"PYTHONPATH": os.pathsep.join([str(REPOSITORY), str(tmp_path)]), "FMTORCH_CACHE": str(tmp_path / "cache")}
+    own = {"FMTORCH_CACHE": str(tmp_path / "own")}
     calls = ("of_ones(5)", "of_tens(5)", "of_ones(5), of_tens(5)", "of_tens(5), of_ones(5)")
     codes = [f"from clashing import *; print({each})" for each in calls]
-    printed = [run_python("-c", code, **own).stdout.split() for code in codes]
+    printed = [run_command("-c", code, cwd=tmp_path, environment=own).stdout.split() for code in codes]
     assert printed == [["8"], ["80"], ["8", "80"], ["80", "8"]]
 
 
@@ -309,6 +305,8 @@ print(end(Line(np.arange(4.0), 2.0)))
 
 def test_a_script_finds_what_it_kept_although_its_groups_are_made_anew(tmp_path: Path) -> None:
     (tmp_path / "script.py").write_text(SCRIPT)
-    done = [run_python(str(tmp_path / "script.py"), FMTORCH_CACHE=str(tmp_path / "cache")) for _ in range(2)]
+    env = {**os.environ, "PYTHONPATH": str(REPOSITORY), "FMTORCH_CACHE": str(tmp_path / "cache")}
+    command, told = [sys.executable, str(tmp_path / "script.py")], {"env": env, "capture_output": True, "text": True}
+    done = [subprocess.run(command, check=True, **told) for _ in range(2)]
     assert [each.stdout for each in done] == ["6.0\n"] * 2
     assert ["compiling end" in each.stderr for each in done] == [True, False]

@@ -8,10 +8,9 @@ size less ``A / (1 + (ln f0 - ln f1)^2 / s3^2)``; for each measured focal length
 """
 
 import numpy as np
-from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from tests.reference.solvers import sampson, skew
+from tests.reference.solvers import poses, skew
 
 Size = tuple[int, int]
 
@@ -47,36 +46,18 @@ def prior_cost(log_f0: float, log_f1: float, same_size: bool = False, measured: 
     return cost + 3 * z2 / (z2 + 6)
 
 
-def least_cost(
-    start: np.ndarray, x0: np.ndarray, x1: np.ndarray, weight: np.ndarray, scale: float, size0: Size, size1: Size
-) -> float:
-    """The least cost near parameters, of images of two sizes."""
-
-    def residuals(p: np.ndarray) -> np.ndarray:
-        r = sampson(fundamental(p, size0, size1), x0, x1)
-        data = np.sqrt(weight) * scale * r / np.sqrt(scale**2 + r**2) / 0.3  # its square is the loss
-        prior = [(p[6] - p[7]) / 0.5, ((p[6] + p[7]) / 2 - np.log(1.2)) / 0.4]
-        return np.concatenate([data, prior, [np.linalg.norm(p[3:6]) - 1]])
-
-    return float(least_squares(residuals, start, jac="3-point", max_nfev=1000, xtol=1e-15, ftol=1e-15, gtol=1e-12).cost)
-
-
 def share_in_front(
     E: np.ndarray, rays0: np.ndarray, rays1: np.ndarray, support: np.ndarray, angle: np.ndarray
 ) -> float:
     """E (3, 3), rays (n, 3), support (n); rays whose directions differ by less than the angles (n) count anyway."""
-    U, _, Vt = np.linalg.svd(E)
-    U, Vt = U * np.sign(np.linalg.det(U)), Vt * np.sign(np.linalg.det(Vt))
-    W = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]])
     best = 0.0
-    for R in (U @ W @ Vt, U @ W.T @ Vt):
-        for t in (U[:, 2], -U[:, 2]):
-            total = 0.0
-            for a, b, weight, min_sine in zip(rays0, rays1, support, angle, strict=True):
-                r = R @ a
-                (z0, z1), *_ = np.linalg.lstsq(np.stack([-r, b], 1), t, rcond=None)  # z1 b = z0 r + t
-                sine = np.linalg.norm(np.cross(b, r)) / (np.linalg.norm(b) * np.linalg.norm(r))
-                parallel = sine < min_sine and b @ r > 0
-                total += weight * ((z0 > 0 and z1 > 0) or parallel)
-            best = max(best, total)
+    for R, t in poses(E):
+        total = 0.0
+        for a, b, weight, min_sine in zip(rays0, rays1, support, angle, strict=True):
+            r = R @ a
+            (z0, z1), *_ = np.linalg.lstsq(np.stack([-r, b], 1), t, rcond=None)  # z1 b = z0 r + t
+            sine = np.linalg.norm(np.cross(b, r)) / (np.linalg.norm(b) * np.linalg.norm(r))
+            parallel = sine < min_sine and b @ r > 0
+            total += weight * ((z0 > 0 and z1 > 0) or parallel)
+        best = max(best, total)
     return best / float(support.sum())

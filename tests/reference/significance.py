@@ -9,7 +9,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from scipy.stats import multivariate_t, t
 
-from tests.reference.homography import equations
+from tests.reference.homography import equations, sampson_squared
 from tests.reference.solvers import epipolar_distances
 
 FREEDOM = 3.0
@@ -57,12 +57,7 @@ def noise(P: np.ndarray, r: np.ndarray, dimensions: int, side: float) -> float:
 
 def plane_distances(H: np.ndarray, x0: np.ndarray, x1: np.ndarray) -> np.ndarray:
     """Sampson distances (n,) of a homography, infinite behind its horizon."""
-    out = np.full(len(x0), np.inf)
-    for i, match in enumerate(np.hstack([x0, x1])):
-        if H[2] @ [*match[:2], 1.0] > 0:
-            e, J = equations(H.ravel(), match)
-            out[i] = np.sqrt(e @ np.linalg.solve(J @ J.T, e))
-    return out
+    return np.sqrt([sampson_squared(H.ravel(), match) for match in np.hstack([x0, x1])])
 
 
 def whitened(H: np.ndarray, x0: np.ndarray, x1: np.ndarray) -> np.ndarray:

@@ -219,9 +219,8 @@ VARIABLES = ("x0", "x1", "prior", "noise", "K0", "K1")
 
 
 @pytest.mark.usefixtures("converging")
-@pytest.mark.parametrize("field", ["F", "E", "R", "t", "focals"])
 @pytest.mark.parametrize("focal", [(0.0, 0.0), (0.05, 0.05), "shared"], ids=["exact", "rough", "shared"])
-def test_gradients_are_the_differences_of_estimates(field, focal, monkeypatch):
+def test_gradients_are_the_differences_of_estimates(focal, monkeypatch):
     """At a converged fit of 14 inliers, too few to tell the noise, of which the scale of the fit would depend. The
     image of square pixels is a constant. Focal lengths are usual and equal ones, so that the prior does not pull: Gauss
     and Newton's Hessian leaves out the curvature of residuals."""
@@ -229,30 +228,30 @@ def test_gradients_are_the_differences_of_estimates(field, focal, monkeypatch):
     fixed = square_pixels._image(torch.cat([given["K0"], given["K1"]]), torch.tensor([reference.SIZE] * 2))
     monkeypatch.setattr(square_pixels, "_image", lambda K, size: fixed)
     rng, names = np.random.default_rng(0), VARIABLES if focal != "shared" else VARIABLES[:4]
-    weights = torch.from_numpy(rng.normal(size=(3, 3)))
+    weights = torch.from_numpy(rng.normal(size=9))
 
-    def value(values: dict[str, Tensor]) -> Tensor:
+    def outputs(values: dict[str, Tensor]) -> Tensor:
+        """A number of each field."""
         known = {"focal": focal} | ({name: values[name] for name in ("K0", "K1")} if focal != "shared" else {})
         rest = {name: values[name] for name in VARIABLES[:4]}
         e = fmtorch.find_fundamental(**rest, **known, **SIZES, inlier_threshold=3.0)  # type: ignore[arg-type]
-        output = getattr(e, field)[0]
-        if field == "F":
-            D = torch.diag(torch.tensor([300.0, 300, 1]).double())
-            output = D @ output @ D
-            output = output / output.norm()
-        return (output * weights.flatten()[: output.numel()].reshape(output.shape)).sum()
+        D = torch.diag(torch.tensor([300.0, 300, 1]).double())
+        F = D @ e.F[0] @ D
+        fields = (F / F.norm(), e.E[0], e.R[0], e.t[0], e.focals[0])
+        return torch.stack([each.flatten() @ weights[: each.numel()] for each in fields])
 
     attached = {name: given[name].clone().requires_grad_() for name in names}
-    gradients = torch.autograd.grad(value(given | attached), list(attached.values()), allow_unused=True)
-    for name, gradient in zip(names, gradients, strict=True):
+    computed = outputs(given | attached)
+    leaves, graph = list(attached.values()), {"retain_graph": True, "allow_unused": True}
+    gradients = [torch.autograd.grad(output, leaves, **graph) for output in computed]
+    for name, own in zip(names, zip(*gradients, strict=True), strict=True):
         step = torch.from_numpy(rng.normal(size=tuple(given[name].shape)))
         if name in ("K0", "K1"):
             step = step * torch.tensor([[1.0, 1, 1], [0, 1, 1], [0, 0, 0]])
         h = {"x0": 1e-4, "x1": 1e-4, "K0": 1e-3, "K1": 1e-3}.get(name, 1e-2)  # px, or of numbers about one
-        ends = [float(value(given | {name: given[name] + sign * h * step})) for sign in (-1, 1)]
-        numeric = (ends[1] - ends[0]) / (2 * h)
-        slope = 0.0 if gradient is None else float((gradient * step).sum())
-        assert slope == pytest.approx(numeric, rel=1e-2, abs=1e-7), name
+        ends = [outputs(given | {name: given[name] + sign * h * step}) for sign in (-1, 1)]
+        slopes = [0.0 if gradient is None else float((gradient * step).sum()) for gradient in own]
+        assert slopes == pytest.approx(((ends[1] - ends[0]) / (2 * h)).tolist(), rel=1e-2, abs=1e-7), name
 
 
 def _differentiable() -> dict[str, Tensor]:
@@ -271,13 +270,13 @@ def _differentiable() -> dict[str, Tensor]:
 
 @functools.cache
 def castle() -> list[tuple[ImagePair, Correspondences]]:
-    """Four pairs of castle-P19 with SIFT matches, P(inlier) and noise."""
+    """Two pairs of castle-P19 with SIFT matches, P(inlier) and noise."""
     pairs = load("fmbench", root=shared_path("data/Strecha_train"))
     pruners = {
         name: presets.build("pruner", name) for name in ("ratio", "one_to_one", "frame_consistency", "match_noise")
     }
     front = Pipeline(presets.build("features", "sift"), presets.build("matcher", "nearest"), pruners, quick("msac"))
-    chosen = sorted((pairs[i] for i in range(len(pairs))), key=lambda pair: pair.identity)[::20]
+    chosen = sorted((pairs[i] for i in range(len(pairs))), key=lambda pair: pair.identity)[::40]
     return [(pair, c) for pair in chosen if (c := front.correspondences([pair])[0].correspondences) is not None]
 
 
@@ -291,7 +290,7 @@ def test_real_pairs_keep_the_order_of_knowledge() -> None:
         for name, known in knowledge.items():
             e = fmtorch.find_fundamental(c.x0, c.x1, **given, **known)
             errors[name].append(float(pose_error(e.R, e.t, pair.R[None], pair.t[None]).worst))  # type: ignore[arg-type]
-    assert len(errors["exact"]) == 4
+    assert len(errors["exact"]) == 2
     assert max(errors["exact"]) < 2  # degrees
     assert np.mean(errors["exact"]) < np.mean(errors["rough"]) < np.mean(errors["unknown"])
 
@@ -331,6 +330,7 @@ def test_forms_of_what_is_known(arguments: dict[str, Any], focal: list[Any]) -> 
     ("arguments", "said"),
     [
         ({"focal": "same"}, "focal is 'same'; it must be None, 'unknown', 'shared'"),
+        ({"focal": "shraed"}, "did you mean 'shared'?"),
         ({"focal": 800.0}, "focal has shape"),
         ({"focal": (-800.0, 0.1)}, "focal of image 0 of pair 0 is"),
         ({"focal": ((800.0, 0.1), (800.0, -0.1))}, "focal of image 1 of pair 0 is"),
@@ -348,11 +348,6 @@ def test_wrong_arguments_are_named(arguments: dict[str, Any], said: str) -> None
     with pytest.raises(ValueError, match=r"^") as error:
         fmtorch.find_fundamental(SCENE.x0, SCENE.x1, **(SIZES | arguments))
     assert str(error.value).startswith(said) or said in str(error.value)
-
-
-def test_a_name_that_is_none_has_a_near_one() -> None:
-    with pytest.raises(ValueError, match=r"^focal is 'shraed'; it must be .*; did you mean 'shared'\?"):
-        fmtorch.find_fundamental(SCENE.x0, SCENE.x1, focal="shraed")
 
 
 def test_homographies_have_no_essential_matrix() -> None:

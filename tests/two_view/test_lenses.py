@@ -123,30 +123,52 @@ def test_gradients_reach_the_photographs_points(find: Any) -> None:
         assert slopes[1] == pytest.approx(slopes[0], rel=0.05, abs=0.05 * float(points[image].grad.abs().max()))
 
 
+FUNDAMENTAL, HOMOGRAPHY = fmtorch.find_fundamental, fmtorch.find_homography
+UNKNOWN, KNOWN = {"lens": "shared"} | SIZES, {"K0": PINHOLE.K, "K1": PINHOLE.K}
+
+
 @pytest.mark.parametrize(
-    ("said", "message"),
+    ("find", "said", "message"),
     [
-        ({"lens": NAN}, "the lens of image 0 has coefficients that are not finite"),
-        ({"lens": (None, Lens(-1.0, 1.0, 0.0, 0.0))}, "K of the lens of image 1 has focal lengths -1, 1"),
-        ({"lens": (RADIAL, -0.1)}, "lens holds a calibrated lens, so it must be a lens for both images"),
-        ({"lens": [(RADIAL, None), (None, RADIAL)]}, "lens has lenses for 2 pairs of 1"),
-        ({"lens": RADIAL, "K0": PINHOLE.K}, "K0 and a lens of image 0 are given, and the lens has its own K"),
-        ({"lens": (RADIAL, None)}, "K0 alone needs the image sizes: give size0 and size1"),
+        (FUNDAMENTAL, {"lens": NAN}, "the lens of image 0 has coefficients that are not finite"),
+        (FUNDAMENTAL, {"lens": (None, Lens(-1.0, 1.0, 0.0, 0.0))}, "K of the lens of image 1 has focal lengths -1, 1"),
+        (FUNDAMENTAL, {"lens": (RADIAL, -0.1)}, "holds a calibrated lens, so it must be a lens for both images"),
+        (FUNDAMENTAL, {"lens": [(RADIAL, None), (None, RADIAL)]}, "lens has lenses for 2 pairs of 1"),
+        (
+            FUNDAMENTAL,
+            {"lens": RADIAL, "K0": PINHOLE.K},
+            "K0 and a lens of image 0 are given, and the lens has",
+        ),
+        (FUNDAMENTAL, {"lens": (RADIAL, None)}, "K0 alone needs the image sizes: give size0 and size1"),
+        (FUNDAMENTAL, {"lens": "fisheye"} | SIZES, "lens is 'fisheye'; it must be None, 'unknown', 'shared', lambda"),
+        (FUNDAMENTAL, {"lens": -0.6} | SIZES, "lens of image 0 of pair 0 is [-0.6, 0.0]; it is lambda in half diag"),
+        (FUNDAMENTAL, {"lens": (-0.1, -1)} | SIZES, "lens of image 0 of pair 0 is"),
+        (FUNDAMENTAL, {"lens": (0.1, 0.1, 0.1)} | SIZES, "lens has shape (3,)"),
+        (FUNDAMENTAL, {"lens": "shared", "size0": "unknown", "size1": "unknown"}, "lens needs the image sizes"),
+        (FUNDAMENTAL, {"lens": "shared"} | KNOWN, "lens needs the image"),
+        (FUNDAMENTAL, UNKNOWN | {"estimator": "ransac"}, "lens needs an estimator with the option focal"),
+        (HOMOGRAPHY, {"lens": -0.1}, "lens needs the image sizes, in whose half diagonals it is: give size0 and size1"),
+        (HOMOGRAPHY, {"lens": -0.6} | SIZES, "lens of image 0 of pair 0 is [-0.6, 0.0]; it is lambda in half diag"),
+        (HOMOGRAPHY, {"lens": "fisheye"} | SIZES, "lens is 'fisheye'; it must be None, 'unknown', 'shared', lambda"),
+        (HOMOGRAPHY, {"lens": (-0.1, 0.02)} | SIZES, "must be a calibrated lens, lambda (exactly known), 'shared'"),
     ],
 )
-def test_what_makes_no_sense_is_refused_by_name(said: dict[str, Any], message: str) -> None:
+def test_what_makes_no_sense_is_refused_by_name(find: Any, said: dict[str, Any], message: str) -> None:
     x0, x1 = photographs(RADIAL, RADIAL)
     with pytest.raises(ValueError, match=re.escape(message)):
-        fmtorch.find_fundamental(x0, x1, **said)
+        find(x0, x1, **said)
+    with pytest.raises(ValueError, match="lens is given, and a homography has no gradients"):
+        fmtorch.find_homography(torch.from_numpy(x0).requires_grad_(), x1, **UNKNOWN)
 
 
 def test_lenses_are_of_known_models_with_all_coefficients() -> None:
-    with pytest.raises(ValueError, match="lens model 'MAGIC'; there are: SIMPLE_PINHOLE, "):
-        Lens(500.0, 500.0, 320.0, 240.0, "MAGIC")
-    with pytest.raises(ValueError, match="a lens of the model OPENCV has coefficients k1, k2, p1, p2; 1 are given"):
-        Lens(500.0, 500.0, 320.0, 240.0, "OPENCV", (0.1,))
-    with pytest.raises(ValueError, match="of the model PINHOLE has no coefficients; 1 are given"):
-        Lens(500.0, 500.0, 320.0, 240.0, "PINHOLE", (0.1,))
+    for model, coefficients, said in (
+        ("MAGIC", (), "lens model 'MAGIC'; there are: SIMPLE_PINHOLE, "),
+        ("OPENCV", (0.1,), "a lens of the model OPENCV has coefficients k1, k2, p1, p2; 1 are given"),
+        ("PINHOLE", (0.1,), "of the model PINHOLE has no coefficients; 1 are given"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            Lens(500.0, 500.0, 320.0, 240.0, model, coefficients)
     x0, x1 = photographs(RADIAL, RADIAL)
     with pytest.raises(ValueError, match="lens has None for image 0 of some pairs"):
         fmtorch.find_fundamental(x0[None].repeat(2, 0), x1[None].repeat(2, 0), lens=[(RADIAL, None), (None, RADIAL)])
@@ -224,26 +246,6 @@ def test_a_lens_of_a_photograph_of_a_map() -> None:
     estimate = fmtorch.find_homography(board, x1, lens=(None, RADIAL))
     estimate = estimate.derived(F=estimate.F @ torch.diag(torch.tensor([1e-3, 1e-3, 1.0])).double())
     assert error(estimate) < 1
-
-
-@pytest.mark.parametrize(
-    ("said", "message"),
-    [
-        ({"lens": -0.1}, "lens needs the image sizes, in whose half diagonals it is: give size0 and size1"),
-        ({"lens": -0.6, **SIZES}, "lens of image 0 of pair 0 is [-0.6, 0.0]; it is lambda in half diagonals"),
-        ({"lens": "fisheye", **SIZES}, "lens is 'fisheye'; it must be None, 'unknown', 'shared', lambda"),
-        (
-            {"lens": (-0.1, 0.02), **SIZES},
-            "it must be a calibrated lens, lambda (exactly known), 'shared'",
-        ),
-    ],
-)
-def test_lenses_that_no_homography_has(said: dict[str, Any], message: str) -> None:
-    x0, x1 = planes(1, 0.0)
-    with pytest.raises(ValueError, match=re.escape(message)):
-        fmtorch.find_homography(x0, x1, **said)
-    with pytest.raises(ValueError, match="lens is given, and a homography has no gradients"):
-        fmtorch.find_homography(torch.from_numpy(x0).requires_grad_(), x1, lens="shared", **SIZES)
 
 
 @pytest.mark.parametrize("find", [fmtorch.find_fundamental, fmtorch.find_homography])

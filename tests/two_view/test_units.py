@@ -1,7 +1,6 @@
 """Pair types, homographies, units and lenses of the public functions."""
 
 import math
-import re
 import warnings
 from typing import Any
 
@@ -10,15 +9,14 @@ import pytest
 import torch
 
 import fmtorch
-from fmtorch import presets
 from fmtorch.core import PAIR_TYPES, Correspondences, Estimate, collate
 from fmtorch.estimators import lens_search
-from fmtorch.estimators.lens_search import inverted
 from fmtorch.geometry import significance
 from fmtorch.metrics import corner_error, nsgd
 from fmtorch.two_view.arguments import lens_fields
 from fmtorch.two_view.pair_type import classify
 from tests.geometry.scenes import batch, draw
+from tests.laws import quick
 from tests.reference import lenses as division
 from tests.reference.homography import mapped
 from tests.reference.known_cameras import K0, K1, SIZE, angle, scene
@@ -31,8 +29,7 @@ def pair(kind: str, seed: int, n: int = 150, **options: float) -> Correspondence
 
 
 def estimated(c: Correspondences) -> Estimate:
-    estimate: Estimate = presets.build("estimator", "fmtorch")(c, 0)
-    return estimate
+    return quick("fmtorch")(c, 0)
 
 
 @pytest.mark.parametrize("known", [True, False])
@@ -114,18 +111,17 @@ def error(H: torch.Tensor, truth: np.ndarray, court: np.ndarray, unit: np.ndarra
 @pytest.mark.parametrize("shift", [0.0, 1e5])
 def test_the_unit_of_a_plane_and_its_orientation_change_nothing(up: bool, shift: float) -> None:
     """From kilometres to centimetres, in units of the plane, and on a map far from its origin."""
-    for seed in range(3):
-        court, y, H = pitch(seed, up)
-        for scale in (1e-3, 1 / 28, 1.0, 50.0, 100.0, 1e4):
-            unit = np.array([[scale, 0, shift * scale], [0, scale, -3 * shift * scale], [0, 0, 1]])
-            e = fmtorch.find_homography(mapped(unit, court), y)
-            assert bool(e.ok)
-            assert int(e.inliers[0, 18:].sum()) >= 40
-            assert error(e.H[0], H, court, unit) < 0.6  # by 8 parameters of 42 matches some 0.3
-            assert float(e.significance) > 50
-            assert bool(e.related)
-            seen = torch.from_numpy(np.c_[mapped(unit, court), np.ones(60)]) @ e.H[0, 2]
-            assert bool((seen[e.inliers[0]] > 0).all())
+    court, y, H = pitch(0, up)
+    for scale in (1e-3, 1 / 28, 1.0, 100.0, 1e4):
+        unit = np.array([[scale, 0, shift * scale], [0, scale, -3 * shift * scale], [0, 0, 1]])
+        e = fmtorch.find_homography(mapped(unit, court), y)
+        assert bool(e.ok)
+        assert int(e.inliers[0, 18:].sum()) >= 40
+        assert error(e.H[0], H, court, unit) < 0.6  # by 8 parameters of 42 matches some 0.3
+        assert float(e.significance) > 50
+        assert bool(e.related)
+        seen = torch.from_numpy(np.c_[mapped(unit, court), np.ones(60)]) @ e.H[0, 2]
+        assert bool((seen[e.inliers[0]] > 0).all())
 
 
 def test_a_mirrored_photograph_is_the_mirror_of_it() -> None:
@@ -145,9 +141,8 @@ def test_a_mirrored_photograph_is_the_mirror_of_it() -> None:
 
 def test_matches_of_nothing_have_no_homography() -> None:
     """Any four have one, and of a hundred some agree by chance."""
-    for seed in range(20):
-        rng = np.random.default_rng(seed)
-        x0, x1 = rng.uniform([0, 0], [640, 480], (2, 100, 2))
+    for seed in range(8):
+        x0, x1 = np.random.default_rng(seed).uniform([0, 0], [640, 480], (2, 100, 2))
         e = fmtorch.find_homography(x0, x1)
         assert not bool(e.ok), seed
         assert "no more than by chance" in e.reason[0]
@@ -401,24 +396,6 @@ def test_sizes_may_be_assumed() -> None:
     assert centred.reason == ("a lens needs the image sizes",)
 
 
-@pytest.mark.parametrize(
-    ("said", "message"),
-    [
-        ({"lens": "fisheye"}, "lens is 'fisheye'; it must be None, 'unknown', 'shared', lambda"),
-        ({"lens": -0.6}, "lens of image 0 of pair 0 is [-0.6, 0.0]; it is lambda in half diagonals, from -0.45"),
-        ({"lens": (-0.1, -1)}, "lens of image 0 of pair 0 is"),
-        ({"lens": (0.1, 0.1, 0.1)}, "lens has shape (3,)"),
-        ({"lens": "shared", "size0": "unknown", "size1": "unknown"}, "lens needs the image sizes"),
-        ({"lens": "shared", "K0": np.eye(3), "K1": np.eye(3), "size0": None, "size1": None}, "lens needs the image"),
-        ({"lens": "shared", "estimator": "ransac"}, "lens needs an estimator with the option focal"),
-    ],
-)
-def test_what_makes_no_sense_is_refused_by_name(said: dict[str, Any], message: str) -> None:
-    x0, x1, _, _ = division.photographs(1, (0, 0))
-    with pytest.raises(ValueError, match=re.escape(message)):
-        found(x0, x1, **said)
-
-
 @pytest.mark.parametrize("calibrated", [False, True])
 def test_the_type_of_a_pair_is_that_of_the_undistorted_photographs(calibrated: bool) -> None:
     """Of a plane, alone and beside a general pair, whose homography is that of pinholes."""
@@ -495,13 +472,3 @@ def test_matches_that_contradict_pinholes_suggest_a_lens() -> None:
     alone = found(bent[0], bent[1]).lens_suggested
     assert torch.equal(alone, estimate.lens_suggested[:1])
     assert found(bent[0], bent[1], lens="shared").lens_suggested is None
-
-
-def test_an_inverse_and_its_determinant() -> None:
-    A = np.random.default_rng(0).normal(size=(9, 9))
-    A, out = A @ A.T, np.empty((9, 9))
-    logarithm = inverted(A, out)
-    assert out @ A == pytest.approx(np.eye(9), abs=1e-9)
-    assert logarithm == pytest.approx(np.linalg.slogdet(A)[1], abs=1e-9)
-    assert np.isnan(inverted(np.zeros((9, 9)), out))
-    assert np.isinf(out).all()

@@ -10,11 +10,11 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from fmtorch.core import Correspondences
-from fmtorch.estimators import BITS, Lens, Pair, SevenPoint, cheirality, lens_search
-from fmtorch.estimators.lens_search import LensFit, LensPrior, fit_with_lenses, lens_prior
+from fmtorch.estimators import BITS, Pair, SevenPoint, cheirality, lens_search
+from fmtorch.estimators.lens_search import LensFit, LensPrior, fit_with_lenses
 from fmtorch.estimators.models import posterior
 from fmtorch.estimators.models.focal_prior import LOG_USUAL
-from fmtorch.estimators.models.with_focals import LOSS_SCALE_PX, FundamentalWithFocals
+from fmtorch.estimators.models.with_focals import FundamentalWithFocals
 from fmtorch.estimators.refinement import PRIOR_CONFLICT_GAIN
 from fmtorch.geometry.levenberg_marquardt import Schedule, Weighted
 from tests.estimators.models.test_focals import TALL, WIDE, Sizes, photographs, with_prior
@@ -94,24 +94,6 @@ def test_cost_and_derivatives(loss: str, sizes: Sizes) -> None:
                 hessian[i, j] += sum(corners) / (4 * k * k)
             size = np.sqrt(np.outer(np.diag(hessian), np.diag(hessian)))
             assert (np.abs(computed.hessian[0] - hessian) < 1e-6 * size).all()
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_the_cost_at_the_optimum_is_that_of_scipy(seed: int) -> None:
-    c, truth, parameters = photographs(seed)
-    c = with_prior(c)
-    pair = pair_of(c)
-    x0, x1, weight = c.x0[0].numpy(), c.x1[0].numpy(), c.prior[0].numpy()  # type: ignore[index]
-    expected = reference.least_cost(parameters, x0, x1, weight, LOSS_SCALE_PX, WIDE, TALL)
-    # From the unconstrained optimum, as in the engine: focal lengths there are off, often implausible.
-    F = SevenPoint().refine(to_units(truth, pair)[None], pair, "truncated", LOSS_SCALE_PX, Schedule(10, 1e-4, 0.0))
-    _, refined = FAMILY.refine(F, pair, 50)
-    r = sampson(in_pixels(refined.models[0], pair), x0, x1)
-    computed = (weight * loss_of(r**2, LOSS_SCALE_PX**2, "geman_mcclure")).sum() / (2 * 0.3**2) + refined.cost[0]
-    # The loss has local minima, but on these pairs both end in the same one, where the cost is flat: an error of the
-    # parameters enters squared, and SciPy stops within 1e-7 of the least cost.
-    assert computed <= expected * (1 + 1e-9)
-    assert computed == pytest.approx(expected, rel=1e-7)
 
 
 def test_without_noise_a_model_stays_and_strange_focal_lengths_cost() -> None:
@@ -279,20 +261,14 @@ LENSES = (-0.2, -0.1)
 FREE = LensPrior(np.zeros(2), np.full(2, 1 / 0.15**2), False)
 
 
-def bent_pair(pair_of_lenses: tuple[float, float] = LENSES) -> tuple[Pair, np.ndarray, np.ndarray]:
+def bent_pair() -> tuple[Pair, np.ndarray, np.ndarray]:
     """A pair, its matches (n, 4) in pixels, and F of pinholes."""
-    x0, x1, F, _ = lenses.photographs(0, pair_of_lenses, SIZE, wrong=0)
+    x0, x1, F, _ = lenses.photographs(0, LENSES, SIZE, wrong=0)
     c = Correspondences(
         torch.from_numpy(x0)[None], torch.from_numpy(x1)[None], torch.ones(1, len(x0), dtype=torch.bool),
         size0=torch.tensor([SIZE]), size1=torch.tensor([SIZE]),
     )  # fmt: skip
     return pair_of(c), np.c_[x0, x1], F
-
-
-def fitted(
-    cameras: posterior.Cameras, lens: np.ndarray, pair: Pair, iterations: int, prior: LensPrior = FREE
-) -> LensFit:
-    return fit_with_lenses(cameras, lens[None], prior, pair, 2.0, iterations)[0]
 
 
 def test_residuals_are_those_of_the_photographs() -> None:
@@ -320,41 +296,9 @@ def test_derivatives_are_those_of_the_cost() -> None:
     pair, _, F = bent_pair()
     cameras, lens, h = near(F, pair), np.array([-0.15, -0.13]), 1e-6
 
-    def moved(i: int, by: float) -> float:
-        axes, focal, own = cameras.axes.copy(), cameras.focal.copy(), lens.copy()
-        if i < 5:
-            axes[0, i // 3] = axes[0, i // 3] @ Rotation.from_rotvec(by * np.eye(3)[i % 3]).as_matrix()
-        elif i < 7:
-            focal[0, i - 5] += by
-        else:
-            own[i - 7] += by
-        return fitted(posterior.Cameras(axes, focal), own, pair, 0).cost
+    def start(by: np.ndarray) -> LensFit:
+        return fit_with_lenses(moved(cameras, by[:7]), (lens + by[7:])[None], FREE, pair, 2.0, 0)[0]
 
-    gradient = fitted(cameras, lens, pair, 0).gradient
-    for i in range(9):
-        assert gradient[i] == pytest.approx((moved(i, h) - moved(i, -h)) / (2 * h), rel=1e-3, abs=1e-2)
-
-
-@pytest.mark.parametrize("start", [(0.0, 0.0), (-0.3, -0.3)])
-def test_the_lenses_are_found_from_afar(start: tuple[float, float]) -> None:
-    pair, _, F = bent_pair()
-    wide = fit_with_lenses(near(F, pair), np.array([start]), FREE, pair, 20.0, 20)[0]
-    fit = fitted(wide.cameras, wide.lens, pair, 20)
-    assert fit.lens == pytest.approx(np.array(LENSES), abs=0.02)
-    assert (np.abs(fit.lens - LENSES) < 5 * fit.deviation).all()
-    assert abs(fit.F @ to_units(F, pair)) > 1 - 1e-3
-    assert fit.cost < fitted(near(F, pair), np.array(LENSES), pair, 0).cost + 1
-    assert np.abs(fitted(fit.cameras, fit.lens, pair, 0).gradient / np.sqrt(np.diag(fit.hessian))).max() < 0.2
-
-
-def test_one_lens_and_straight_ones() -> None:
-    pair, _, F = bent_pair((-0.15, -0.15))
-    shared = lens_prior(Lens((0.0, 0.0), (np.inf, np.inf), True))
-    fit = fitted(near(F, pair), np.array([-0.1, -0.1]), pair, 15, shared)
-    assert fit.lens[0] == fit.lens[1] == pytest.approx(-0.15, abs=0.01)
-    straight = fitted(near(F, pair), np.zeros(2), pair, 15, lens_prior(lens_search.STRAIGHT))
-    assert np.abs(straight.lens).max() < 1e-6
-    assert fit.evidence > straight.evidence + 10
-    exact, both = lens_prior(Lens((-0.15,) * 2, (0.0,) * 2, True)), np.full(2, -0.15)
-    known, free = (fitted(near(F, pair), both, pair, 15, prior) for prior in (exact, FREE))
-    assert known.evidence > fit.evidence > free.evidence
+    gradient = start(np.zeros(9)).gradient
+    for slope, step in zip(gradient, h * np.eye(9), strict=True):
+        assert slope == pytest.approx((start(step).cost - start(-step).cost) / (2 * h), rel=1e-3, abs=1e-2)
