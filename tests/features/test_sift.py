@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from fmtorch import features, presets
+from fmtorch import features
 from fmtorch.features import SIFT, ImagePyramid, PatchSIFT, VLFeatSIFT, project
 from tests.conftest import oracle
 from tests.features.scenes import random_frames, same, texture
@@ -250,8 +250,3 @@ def test_vlfeat_agrees_with_opencv_where_both_find_a_keypoint() -> None:
     assert ((a[..., 0] - b[..., 0]).norm(dim=1) / b[..., 0].norm(dim=1)).median() < 0.1
     between = (ours.descriptors[i[near]] - opencv.descriptors[near]).norm(dim=1)
     assert between.median() < 0.3 * 512  # of vectors of length 512
-
-
-@needs_vlfeat
-def test_the_preset_names_vlfeats() -> None:
-    assert presets.build("features", "sift_vlfeat", max_features=50) == VLFeatSIFT(max_features=50)

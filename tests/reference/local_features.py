@@ -4,27 +4,20 @@ import itertools
 import math
 
 import numpy as np
+from scipy import ndimage
+from scipy.spatial.distance import cdist
 
 
 def blur(image: np.ndarray, sigma: float) -> np.ndarray:
     """Gaussian of 3 sigma half length, borders continued."""
-    radius = math.ceil(3 * sigma)
-    kernel = np.exp(-0.5 * (np.arange(-radius, radius + 1) / sigma) ** 2)
-    kernel /= kernel.sum()
-    for axis in (0, 1):
-        padded = np.pad(image, [(radius, radius) if a == axis else (0, 0) for a in (0, 1)], mode="edge")
-        image = np.apply_along_axis(lambda line: np.convolve(line, kernel, mode="valid"), axis, padded)
-    return image
+    return ndimage.gaussian_filter(image, sigma, mode="nearest", radius=math.ceil(3 * sigma))
 
 
 def hessian_determinant(image: np.ndarray) -> np.ndarray:
-    out = np.zeros_like(image)
-    for y in range(1, image.shape[0] - 1):
-        for x in range(1, image.shape[1] - 1):
-            p = image[y - 1 : y + 2, x - 1 : x + 2]
-            xy = (p[2, 2] - p[2, 0] - p[0, 2] + p[0, 0]) / 4
-            out[y, x] = (p[1, 2] - 2 * p[1, 1] + p[1, 0]) * (p[2, 1] - 2 * p[1, 1] + p[0, 1]) - xy**2
-    return out
+    """Of differences of neighbours; 0 at the border."""
+    yy, xx = (ndimage.correlate1d(image, [1, -2, 1], axis) for axis in (0, 1))
+    xy = ndimage.correlate1d(ndimage.correlate1d(image, [-0.5, 0, 0.5], 0), [-0.5, 0, 0.5], 1)
+    return np.pad((xx * yy - xy**2)[1:-1, 1:-1], 1)
 
 
 def hessian_keypoints(image: np.ndarray, threshold: float, levels: int = 3, sigma: float = 1.6) -> np.ndarray:
@@ -102,36 +95,22 @@ def patch(image: np.ndarray, laf: np.ndarray, size: int = 32, blur_pixels: float
     for i, j in itertools.product(range(size), repeat=2):
         u, v = np.meshgrid((2 * (j + steps) + 1) / size - 1, (2 * (i + steps) + 1) / size - 1)
         points = np.stack([u, v], -1) @ laf[:, :2].T + laf[:, 2]
-        out[i, j] = weight @ bilinear(image, points[..., 0], points[..., 1]) @ weight
+        out[i, j] = weight @ ndimage.map_coordinates(image, points[..., ::-1].T, order=1, mode="nearest").T @ weight
     return out
-
-
-def bilinear(image: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    h, w = image.shape
-    x, y = np.clip(x, 0, w - 1), np.clip(y, 0, h - 1)
-    x0, y0 = np.minimum(x.astype(int), max(w - 2, 0)), np.minimum(y.astype(int), max(h - 2, 0))
-    x1, y1 = np.minimum(x0 + 1, w - 1), np.minimum(y0 + 1, h - 1)
-    fx, fy = x - x0, y - y0
-    top = image[y0, x0] * (1 - fx) + image[y0, x1] * fx
-    return top * (1 - fy) + (image[y1, x0] * (1 - fx) + image[y1, x1] * fx) * fy
 
 
 def dominant_gradient(pixels: np.ndarray, bins: int = 36) -> float:
     """Direction of the dominant gradient, counter-clockwise on the screen."""
     size = len(pixels)
-    padded = np.pad(pixels, 1, mode="edge")
+    gx, gy = (ndimage.sobel(pixels, axis, mode="nearest") / 8 for axis in (1, 0))
     histogram = np.zeros(bins)
     for i, j in itertools.product(range(size), repeat=2):
-        p = padded[i : i + 3, j : j + 3]
-        gx = (p[0, 2] + 2 * p[1, 2] + p[2, 2] - p[0, 0] - 2 * p[1, 0] - p[2, 0]) / 8
-        gy = (p[2, 0] + 2 * p[2, 1] + p[2, 2] - p[0, 0] - 2 * p[0, 1] - p[0, 2]) / 8
         window = math.exp(-((i - (size - 1) / 2) ** 2 + (j - (size - 1) / 2) ** 2) / (2 * (size / 6) ** 2))
-        place = (math.atan2(-gy, gx) % (2 * math.pi)) * bins / (2 * math.pi)
-        low = math.floor(place)
-        histogram[low % bins] += window * math.hypot(gx, gy) * (1 - place + low)
-        histogram[(low + 1) % bins] += window * math.hypot(gx, gy) * (place - low)
-    taps = np.exp(-0.5 * (np.arange(-2, 3) / 1.6) ** 2)
-    smooth = sum(t * np.roll(histogram, k) for k, t in zip(range(-2, 3), taps / taps.sum(), strict=True))
+        place = (math.atan2(-gy[i, j], gx[i, j]) % (2 * math.pi)) * bins / (2 * math.pi)
+        low, vote = math.floor(place), window * math.hypot(gx[i, j], gy[i, j])
+        histogram[low % bins] += vote * (1 - place + low)
+        histogram[(low + 1) % bins] += vote * (place - low)
+    smooth = ndimage.gaussian_filter1d(histogram, 1.6, mode="wrap", radius=2)
     k = int(np.argmax(smooth))
     left, middle, right = smooth[k - 1], smooth[k], smooth[(k + 1) % bins]
     return (k + 0.5 * (left - right) / (left + right - 2 * middle)) * 2 * math.pi / bins
@@ -178,27 +157,22 @@ def vlad(descriptors: np.ndarray, mean: np.ndarray, basis: np.ndarray, centers: 
 
 def two_nearest(descriptors0: np.ndarray, descriptors1: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """For every descriptor of image 0: index of the nearest (lowest on ties), distance to it and to the second."""
-    index, first, second = [], [], []
-    for descriptor in descriptors0.astype(np.float64):
-        distances = [float(np.linalg.norm(descriptor - other)) for other in descriptors1.astype(np.float64)]
-        order = sorted(range(len(distances)), key=lambda j: (distances[j], j))
-        index.append(order[0] if order else -1)
-        first.append(distances[order[0]] if order else np.inf)
-        second.append(distances[order[1]] if len(order) > 1 else np.inf)
-    return np.array(index, int), np.array(first), np.array(second)
+    distances = cdist(descriptors0.astype(np.float64), descriptors1.astype(np.float64))
+    ordered = np.sort(np.pad(distances, ((0, 0), (0, 2)), constant_values=np.inf))
+    index = distances.argmin(1) if len(descriptors1) else np.full(len(descriptors0), -1)
+    return index, ordered[:, 0], ordered[:, 1]
 
 
 def ratio_test(descriptors0: np.ndarray, descriptors1: np.ndarray, threshold: float) -> np.ndarray:
     """Which descriptors of image 0 are clearly nearer to their nearest one than to any other."""
     _, first, second = two_nearest(descriptors0, descriptors1)
-    return np.array([a < threshold * b for a, b in zip(first, second, strict=True)], bool)
+    return first < threshold * second
 
 
 def mutual(descriptors0: np.ndarray, descriptors1: np.ndarray) -> np.ndarray:
     """Which descriptors of image 0 are the nearest ones of their nearest ones."""
-    forward, _, _ = two_nearest(descriptors0, descriptors1)
-    backward, _, _ = two_nearest(descriptors1, descriptors0)
-    return np.array([backward[j] == i for i, j in enumerate(forward)], bool)
+    forward, backward = two_nearest(descriptors0, descriptors1)[0], two_nearest(descriptors1, descriptors0)[0]
+    return backward[forward] == np.arange(len(forward))
 
 
 def one_to_one(x0: np.ndarray, x1: np.ndarray, ratio: np.ndarray) -> np.ndarray:
