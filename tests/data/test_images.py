@@ -15,19 +15,8 @@ import tifffile
 from PIL import ExifTags, Image, ImageOps
 from PIL.TiffImagePlugin import IFDRational
 
-from fmtorch.data import (
-    DataError,
-    ExifFocal,
-    ImageCameras,
-    ImageError,
-    ImageSource,
-    Lens,
-    exif_focal,
-    read_image,
-    stored_orientation,
-    stored_size,
-    to_grey,
-)
+import fmtorch
+from fmtorch.data import DataError, ExifFocal, ImageCameras, ImageError, ImageSource, Lens, exif_focal, read_image
 from tests.data.native import SIZE, to_binary, write_colmap
 
 COLOUR = np.random.default_rng(0).integers(0, 256, (37, 53, 3), dtype=np.uint8)
@@ -54,11 +43,12 @@ def test_depth_and_transparency_are_reduced(tmp_path: Path) -> None:
 
 
 def test_to_grey_is_opencvs() -> None:
-    np.testing.assert_array_equal(to_grey(COLOUR), cv2.cvtColor(COLOUR[..., ::-1].copy(), cv2.COLOR_BGR2GRAY))
+    np.testing.assert_array_equal(
+        fmtorch.data.to_grey(COLOUR), cv2.cvtColor(COLOUR[..., ::-1].copy(), cv2.COLOR_BGR2GRAY)
+    )
     exact = COLOUR @ np.array([0.299, 0.587, 0.114])
-    assert np.abs(to_grey(COLOUR) - exact).max() <= 0.5 + 255 * 2.0**-14  # weights rounded to 15 bits
-    assert to_grey(COLOUR[..., 0]) is not None
-    np.testing.assert_array_equal(to_grey(COLOUR[..., 0]), COLOUR[..., 0])
+    assert np.abs(fmtorch.data.to_grey(COLOUR) - exact).max() <= 0.5 + 255 * 2.0**-14  # weights rounded to 15 bits
+    np.testing.assert_array_equal(fmtorch.data.to_grey(COLOUR[..., 0]), COLOUR[..., 0])
 
 
 def jpeg(*options: int) -> bytes:
@@ -160,7 +150,7 @@ def test_orientation_tags_turn_on_demand_alone(tmp_path: Path, suffix: str, tag:
         read = read_image(path, orient=orient)
         assert read.shape == right.shape
         assert np.abs(read.astype(int) - right).mean() < 8  # coding with losses; a turned image is beyond 60
-    assert (stored_size(path), stored_orientation(path)) == (BLOCKS.shape[:2], tag)
+    assert (fmtorch.data.stored_size(path), fmtorch.data.stored_orientation(path)) == (BLOCKS.shape[:2], tag)
 
 
 @pytest.mark.parametrize(
