@@ -72,11 +72,11 @@ K = np.array([[600.0, 0, 309.5], [0, 612, 249.5], [0, 0, 1]])
 )
 def test_geometries_are_those_of_find_fundamental(cameras, lens, path):
     """Bit by bit, whatever the batch."""
-    write(path, scene(4))
+    write(path, scene(3))
     result = fmtorch.verify(path, cameras=cameras, lens=lens)
     known: dict[str, Any] = {"K0": K, "K1": K} if cameras == "stored" else {"focal": cameras, "lens": lens}
     kind = "calibrated" if cameras == "stored" else "uncalibrated"
-    assert (result.pairs, result.kept, result.configurations, result.problems) == (6, 0, {kind: 6}, ())
+    assert (result.pairs, result.kept, result.configurations, result.problems) == (3, 0, {kind: 3}, ())
     for pair, geometry in read(path).items():
         x0, x1, matches, fields = given(path, pair)
         estimate = fmtorch.find_fundamental(x0, x1, **fields, **known)
@@ -381,7 +381,7 @@ def test_keypoints_are_read_for_many_images_in_blocks(path, tmp_path, monkeypatc
 def test_a_killed_verification_continues(way: str, tmp_path: Path) -> None:
     """kill -9 after some batches: the database can be read, and the same command ends with the same geometries."""
     source, truth = tmp_path / "database.db", tmp_path / "truth.db"
-    write(source, scene(8))
+    write(source, scene(6))
     fmtorch.verify(source, output=truth)
     extra = {"in place": [], "copy": ["output=copy.db"], "forced": ["force=true"]}
     arguments = extra.get(way, ["output=copy.db", "force=true"])
@@ -439,17 +439,17 @@ def rows(path: Path) -> dict[str, list[Any]]:
 
 @pytest.mark.parametrize("copied", [False, True])
 def test_rigs_and_frames_stay_as_they_are(copied: bool, path: Path, tmp_path: Path) -> None:
-    """Two rigs of two cameras each, moved to three places."""
+    """Two rigs of two cameras each, moved to two places."""
     copy = tmp_path / "verified.db"
-    options = pycolmap.SyntheticDatasetOptions(num_rigs=2, num_cameras_per_rig=2, num_frames_per_rig=3)
+    options = pycolmap.SyntheticDatasetOptions(num_rigs=2, num_cameras_per_rig=2, num_frames_per_rig=2)
     with pycolmap.Database.open(path) as database:
         pycolmap.synthesize_dataset(options, database)
         database.clear_two_view_geometries()
-        assert (database.num_rigs(), database.num_frames(), database.num_images()) == (2, 6, 12)
+        assert (database.num_rigs(), database.num_frames(), database.num_images()) == (2, 4, 8)
     before = rows(path)
     assert len(before["rig_sensors"]) == 2  # one camera of each rig is its reference
-    assert len(before["frame_data"]) == 12
+    assert len(before["frame_data"]) == 8
     result = fmtorch.verify(path, output=copy if copied else None)
     assert result.problems == ()
-    assert result.verified > 30
+    assert result.verified > 12
     assert (rows(copy if copied else path), rows(path)) == (before, before)

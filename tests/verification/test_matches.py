@@ -275,7 +275,7 @@ def test_what_are_no_files_to_verify(words: list[str], said: str, command: Calla
 
 @pytest.mark.parametrize("ending", [".npz", ".h5"])
 def test_a_killed_verification_of_matches_continues(ending: str, tmp_path: Path) -> None:
-    arrays = {f"{i}/{key}": x for i, pair in enumerate(points(7)) for key, x in zip(("x0", "x1"), pair, strict=True)}
+    arrays = {f"{i}/{key}": x for i, pair in enumerate(points(6)) for key, x in zip(("x0", "x1"), pair, strict=True)}
     save(tmp_path / f"matches{ending}", arrays)
     words = [f"matches=matches{ending}", f"output=verified{ending}"]
     killed_and_continued(tmp_path, tmp_path / f"verified{ending}", *words)
@@ -309,10 +309,10 @@ def hloc(folder: Path) -> dict[str, Path]:
 
 
 def test_inliers_and_matrices_are_those_of_find_fundamental(tmp_path: Path) -> None:
-    pairs = write(tmp_path, scene(4))
+    pairs = write(tmp_path, scene(3))
     features, stored, output = hloc(tmp_path).values()
     result = fmtorch.verify(**hloc(tmp_path))
-    assert (result.path, result.pairs, result.configurations) == (output, 6, {"uncalibrated": 6})
+    assert (result.path, result.pairs, result.configurations) == (output, 3, {"uncalibrated": 3})
     with h5py.File(features) as f, h5py.File(stored) as m, h5py.File(output) as v:
         for a, b in pairs:
             key = f"{a.replace('/', '-')}/{b.replace('/', '-')}"
@@ -364,7 +364,7 @@ def test_broken_hloc_pairs_are_lines_and_stay_out(tmp_path: Path) -> None:
 
 
 def test_a_killed_verification_of_files_continues(tmp_path: Path) -> None:
-    write(tmp_path, scene(7))
+    write(tmp_path, scene(6))
     killed_and_continued(tmp_path, tmp_path / "verified.h5", *FILES)
     fmtorch.verify(**hloc(tmp_path) | {"output": tmp_path / "truth.h5"})
     assert load(tmp_path / "verified.h5") == load(tmp_path / "truth.h5")
