@@ -125,13 +125,9 @@ def test_a_resampled_photograph_has_a_lens_like_its_own() -> None:
 RESAMPLED_SIZE = (6, 9)
 
 
-def numbered_pixels(size: tuple[int, int] = RESAMPLED_SIZE) -> np.ndarray:
-    return np.arange(size[0] * size[1], dtype=np.uint8).reshape(size)
-
-
 @pytest.mark.parametrize("turns", [0, 1, 2, 3])
 def test_turned_pixels_are_where_the_matrix_says(turns: int) -> None:
-    image, turn = numbered_pixels(), Resampling(None, turns)
+    image, turn = np.arange(54, dtype=np.uint8).reshape(RESAMPLED_SIZE), Resampling(None, turns)
     turned = turn(image)
     np.testing.assert_array_equal(turned, np.rot90(image, turns))
     for y in range(RESAMPLED_SIZE[0]):

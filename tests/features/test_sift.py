@@ -233,11 +233,6 @@ def test_resembles_opencvs_descriptors(number: str) -> None:
     assert cosine.quantile(0.05) > 0.95
 
 
-def blob(x: float, y: float, sigma: float, h: int = 120, w: int = 160) -> np.ndarray:
-    v, u = np.mgrid[:h, :w]
-    return np.rint(30 + 200 * np.exp(-((u - x) ** 2 + (v - y) ** 2) / (2 * sigma**2))).astype(np.uint8)
-
-
 @needs_vlfeat
 def test_vlfeat_agrees_with_opencv_where_both_find_a_keypoint() -> None:
     image = cv2.resize(texture(5), None, fx=4, fy=4, interpolation=cv2.INTER_CUBIC)

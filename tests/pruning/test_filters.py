@@ -234,7 +234,7 @@ def test_agreement(ratios: bool) -> None:
         x0, x1, A0, A1 = (t[0].double().numpy() for t in (c.x0, c.x1, c.lafs0[..., :2], c.lafs1[..., :2]))
         by_frames = consistency.agreement(x0, x1, A1 @ np.linalg.inv(A0), vote, CURVES, WINDOW, TOLERANCE, NOISE)
         similarity = consistency.similarity(x0, x1, CURVES, TURNS, SCALES)
-        by_motion = consistency.agreement_of_positions(x0, x1, similarity, vote, CURVES, WINDOW, TOLERANCE, NOISE)
+        by_motion = consistency.agreement(x0, x1, similarity, vote, CURVES, WINDOW, TOLERANCE, NOISE)
         frames = pruning.frame_agreement(c.x0, c.x1, c.lafs0, c.lafs1, ratio, c.mask)[0]
         # float32: coordinates of 1e3 px are rounded to 6e-5 px, against lengths of at least 4 px
         np.testing.assert_allclose(frames, by_frames, rtol=1e-3, atol=1e-5, err_msg=what)

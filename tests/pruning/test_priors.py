@@ -190,8 +190,7 @@ def test_gradients_are_those_of_the_definition(frames: bool) -> None:
     weight = torch.linspace(-1, 1, 30, dtype=torch.float64)
 
     def defined(x0: np.ndarray, x1: np.ndarray, ratio: np.ndarray, **lafs: np.ndarray) -> float:
-        S = reference.similarity(x0[0], x1[0], CURVES, TURNS, fmtorch.pruning.consistency.SCALES)
-        maps = np.tile([[S.real, -S.imag], [S.imag, S.real]], (30, 1, 1))
+        maps = reference.similarity(x0[0], x1[0], CURVES, TURNS, fmtorch.pruning.consistency.SCALES)
         if frames:
             maps = lafs["lafs1"][0, :, :, :2] @ np.linalg.inv(lafs["lafs0"][0, :, :, :2])
         vote = np.maximum(WORST_RATIO - ratio[0], MIN_VOTE)

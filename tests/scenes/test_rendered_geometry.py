@@ -9,6 +9,7 @@ import pytest
 
 from fmtorch import scenes
 from fmtorch.data import DepthDataset, load
+from fmtorch.geometry import symmetric_max
 from fmtorch.scenes.light import DrawnScene, Lens, Light, Shot, Stage, expose
 from fmtorch.scenes.raycast import Geometry
 from fmtorch.scenes.surfaces import Surfaces, Texture, vec
@@ -55,15 +56,7 @@ def test_relative_pose_and_fundamental_agree_with_projected_points() -> None:
     np.testing.assert_allclose(X0 @ R.T + t, X1, atol=1e-12)
     F = scenes.fundamental(c0, c1)
     assert np.linalg.norm(F) == pytest.approx(1.0)
-    assert line_distance(F, c0.project(X)[0], c1.project(X)[0]).max() < 1e-9
-
-
-def line_distance(F: np.ndarray, x0: np.ndarray, x1: np.ndarray) -> np.ndarray:
-    """Larger distance in pixels of the points to the epipolar lines of each other."""
-    h0, h1 = np.column_stack([x0, np.ones(len(x0))]), np.column_stack([x1, np.ones(len(x1))])
-    l1, l0 = h0 @ F.T, h1 @ F
-    error = np.abs((h1 * l1).sum(1))
-    return np.maximum(error / np.hypot(l1[:, 0], l1[:, 1]), error / np.hypot(l0[:, 0], l0[:, 1]))
+    assert symmetric_max(F, c0.project(X)[0], c1.project(X)[0]).max() < 1e-9
 
 
 @functools.cache
@@ -79,7 +72,7 @@ def test_what_a_pixel_sees_lies_on_its_epipolar_line(family: str) -> None:
     assert len(pixel) > 0.3 * c0.size[0] * c0.size[1]
     np.testing.assert_allclose(c0.project(X)[0], pixel, atol=1e-8)
     ahead = X @ c1.R[2] + c1.t[2] > 0.1
-    assert line_distance(scenes.fundamental(c0, c1), pixel[ahead], c1.project(X[ahead])[0]).max() < 1e-6
+    assert symmetric_max(scenes.fundamental(c0, c1), pixel[ahead], c1.project(X[ahead])[0]).max() < 1e-6
 
 
 def test_a_mark_is_drawn_where_it_projects() -> None:
