@@ -90,7 +90,7 @@ def expect_same(output: Path, other: Path) -> None:
 
 
 def test_any_number_of_workers_and_any_executor_keep_the_same(pipeline, images, tmp_path):
-    pairs = list(itertools.combinations(images, 2))
+    pairs = list(itertools.combinations(images[:4], 2))
     executor = Recorded()
     own = Execution(workers=1, make=lambda: executor)
     for name, execution in {"one": threads(1), "three": threads(3), "own": own}.items():
@@ -98,8 +98,8 @@ def test_any_number_of_workers_and_any_executor_keep_the_same(pipeline, images, 
             matches = work(pipeline, images, tmp_path / name, workers=workers)
             assert len(list(matches.each(pairs))) == matches.done == len(pairs)
             assert matches.troubles == []
-    assert Counter(executor.calls) == {"Photograph": 6, "DescribedPair": 15}
-    assert len(kept(tmp_path / "one")) == 21
+    assert Counter(executor.calls) == {"Photograph": 4, "DescribedPair": 6}
+    assert len(kept(tmp_path / "one")) == 10
     for name in ("three", "own"):
         expect_same(tmp_path / name, tmp_path / "one")
 

@@ -188,9 +188,8 @@ def test_files_are_read_once_and_matches_are_refined(reads: collections.Counter[
     c = before[0].correspondences
     given = dataclasses.replace(pairs[0], matches=lambda: GivenMatches(c, (1500, 1500)))
     reads.clear()
-    fresh = Pipeline(
-        pipeline.extractor, pipeline.matcher, {"refine": presets.build("pruner", "refine_matches")}, pipeline.estimator
-    )
+    refine = {"refine": presets.build("pruner", "refine_matches")}
+    fresh = Pipeline(pipeline.extractor, pipeline.matcher, refine, pipeline.estimator)
     refined = fresh.correspondences([given])[0].correspondences
     expected = outcomes[0].correspondences
     assert reads == {pairs[0].image0.path: 1, pairs[0].image1.path: 1}
@@ -258,9 +257,8 @@ def test_a_result_is_saved_as_the_command_saves_it(result: fmtorch.MatchResult, 
 
 def test_pillow_images_are_arrays(result: fmtorch.MatchResult) -> None:
     pair = data.load("stereo")[0]
-    again = fmtorch.match(
-        *(data.read_image(image) for image in (pair.image0, pair.image1)), pipeline="sift_fmtorch", longest_side=400
-    )
+    images = [data.read_image(image) for image in (pair.image0, pair.image1)]
+    again = fmtorch.match(*images, pipeline="sift_fmtorch", longest_side=400)
     assert torch.equal(again.F, result.F)
     with pytest.raises(ValueError, match="image0 is a Pillow image of mode F; it must be of 8 bits"):
         fmtorch.match(PIL.Image.new("F", (9, 9)), PIL.Image.new("L", (9, 9)))

@@ -4,6 +4,7 @@ import itertools
 import math
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -170,9 +171,7 @@ def inputs() -> Iterator[tuple[str, Correspondences]]:
     yield "double precision", scene(3, 300).replace(x0=scene(3, 300).x0.double() + 1e-9, x1=scene(3, 300).x1.double())
 
 
-def pairs(
-    real_matches: list[tuple[Correspondences, Tensor]],
-) -> Iterator[tuple[str, Correspondences, int, np.ndarray, np.ndarray, np.ndarray]]:
+def pairs(real_matches: list[tuple[Correspondences, Tensor]]) -> Iterator[Any]:
     """Every pair of the inputs: its name, its batch and place there, and slots, x0, x1 of its finite matches."""
     for what, c in [*inputs(), *((f"real pair {i}", c) for i, (c, _) in enumerate(real_matches))]:
         finite = c.mask & torch.isfinite(c.x0).all(-1) & torch.isfinite(c.x1).all(-1)
