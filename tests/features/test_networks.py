@@ -330,9 +330,7 @@ class Runs:
 
 
 @pytest.mark.parametrize("known", [True, False])
-def test_weights_of_another_file_are_refused_and_run_nothing(
-    known: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_weights_of_another_file_are_refused_and_run_nothing(known, tmp_path, monkeypatch):
     """A file in the place of the published one, by its digest, and where no digest is known by its code."""
     monkeypatch.setenv("RUNS", str(tmp_path / "run"))
     monkeypatch.setattr("time.sleep", lambda seconds: None)  # between kornia's attempts

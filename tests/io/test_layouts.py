@@ -14,7 +14,7 @@ import torch
 
 import fmtorch
 from fmtorch import data, presets
-from fmtorch.data import DataError, ImagePair
+from fmtorch.data import DataError
 from fmtorch.evaluation import evaluate
 from fmtorch.evaluation.report import Options, find_dataset
 from fmtorch.evaluation.statistics import summarize
@@ -99,14 +99,10 @@ def test_estimators_pruners_and_metrics_work_on_it(layout: str, tmp_path: Path) 
         assert (row.seconds_features is None) or np.isnan(row.seconds_features)
 
 
-def given(pair: ImagePair) -> Any:
-    return pair.matches()
-
-
 def test_the_origin_can_be_told(tmp_path: Path) -> None:
     root = writers.write_glue_factory(tmp_path / "glue_factory")
     usual, other = reload("glue_factory", root), reload("glue_factory", root, origin=0.0)
-    torch.testing.assert_close(given(other[0])[0].x0, given(usual[0])[0].x0 + 0.5)
+    torch.testing.assert_close(other[0].matches()[0].x0, usual[0].matches()[0].x0 + 0.5)
     assert usual.digest != other.digest
 
 
@@ -206,7 +202,7 @@ def test_a_camera_without_a_size_has_that_of_its_image_or_of_principal_point_and
     edit(root, POSE, "pair1/x2", lambda v: np.where(np.arange(len(v))[:, None] == 0, [1200.25, 3], v))
     s = writers.scenes()[1]
     centre = [tuple(round(2 * float(v) + 1) for v in K[[1, 0], 2]) for K in (s.K0, s.K1)]
-    known, unknown = given(reload("posebench", root)[0])[0], given(reload("posebench", root)[1])[0]
+    known, unknown = reload("posebench", root)[0].matches()[0], reload("posebench", root)[1].matches()[0]
     assert tuple(known.size0[0].tolist()) == writers.SIZE
     farthest = [int(np.ceil(bound)) + 1 for bound in s.x0.max(0).values.tolist()[::-1]]
     assert unknown.size0[0].tolist() == [max(sides) for sides in zip(centre[0], farthest, strict=True)]
@@ -216,7 +212,7 @@ def test_a_camera_without_a_size_has_that_of_its_image_or_of_principal_point_and
     cv2.imwrite(str(images / "1.png"), np.zeros((810, 1010), np.uint8))
     shown = images / "1"
     (images / "1.png").rename(shown)
-    beside = given(reload("posebench", root, images=tmp_path / "images")[1])[0]
+    beside = reload("posebench", root, images=tmp_path / "images")[1].matches()[0]
     assert tuple(beside.size0[0].tolist()) == (810, 1010)
     assert torch.equal(beside.size1, unknown.size1)
     cv2.imwrite(str(images / "1.png"), np.zeros((81, 101), np.uint8))

@@ -23,6 +23,7 @@ from fmtorch.io import MatchStore
 from fmtorch.jobs import DEATH, Execution, WorkerPool, WorkersLost
 from fmtorch.pipeline import FolderMatches, Pipeline, chosen_pairs, folder, folder_workers, images_below, load_pipeline
 from tests.conftest import shared_path
+from tests.helpers import draw
 
 
 class Recorded(Executor):
@@ -60,18 +61,10 @@ def pipeline() -> Pipeline:
 
 @pytest.fixture
 def images(tmp_path: Path) -> list[Path]:
-    noise = np.random.default_rng(0).integers(0, 256, (60, 80), dtype=np.uint8)
-    texture = cv2.GaussianBlur(cv2.resize(noise, (640, 480), interpolation=cv2.INTER_CUBIC), (0, 0), 1.5)
-    (tmp_path / "photos").mkdir()
-    paths = [tmp_path / "photos" / f"{i}.png" for i in range(6)]
-    for i, path in enumerate(paths):
-        assert cv2.imwrite(str(path), texture[8 * i : 8 * i + 240, 16 * i : 16 * i + 320])
-    return paths
+    return [draw(tmp_path / "photos" / f"{i}.png", 0, shift=16 * i).path for i in range(6)]
 
 
-def work(
-    pipeline: Pipeline, images: list[Path], output: Path, workers: WorkerPool | None = None, **options: Any
-) -> FolderMatches:
+def work(pipeline, images, output, workers=None, **options) -> FolderMatches:
     workers = workers or folder_workers(pipeline)
     return FolderMatches(pipeline, MatchStore(output, images[0].parent), workers, 1600, True, 0, **options)
 

@@ -182,10 +182,7 @@ def test_a_small_plan_yields_the_planned_pairs_and_draws_no_more_than_it_needs(f
         (Plan(1, 2, 2, 0.1, spare=2), set(), 4, 0),
     ],
 )
-def test_spare_photographs_are_drawn_until_there_are_pairs_enough(
-    plan: Plan, wanted: set[tuple[int, int]], drawn: int, kept: int,
-    numbered: list[int], monkeypatch: pytest.MonkeyPatch, tmp_path: Path,
-) -> None:  # fmt: skip
+def test_spare_photographs_are_drawn_until_pairs_suffice(plan, wanted, drawn, kept, numbered, monkeypatch, tmp_path):
     monkeypatch.setattr(generation, "matchable", rule(wanted))
     views, pairs = read(generate(Task("indoor", "test", 0, 0, plan), tmp_path))
     assert len(views) == len(numbered) == drawn

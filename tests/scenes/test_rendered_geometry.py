@@ -20,9 +20,7 @@ from tests.reference.rendering import colour
 SIZE = (120, 160)
 
 
-def camera(
-    x: float, y: float, z: float, target: tuple[float, float, float] = (0.0, 0.0, 1.0), focal: float = 150.0
-) -> scenes.Camera:
+def camera(x: float, y: float, z: float, target=(0.0, 0.0, 1.0), focal: float = 150.0) -> scenes.Camera:
     return scenes.look_at(scenes.calibration(focal, SIZE), SIZE, (x, y, z), target, roll=0.1 * x)
 
 
