@@ -70,19 +70,23 @@ def run(p0: np.ndarray, p1: np.ndarray, scale: float, turn: int, factor: float, 
 Sizes = tuple[tuple[int, int], tuple[int, int]]
 
 
+def hypotheses(searched: bool) -> list[tuple[float, int]]:
+    """Scales and turns."""
+    return list(itertools.product(SCALES, range(8))) if searched else [(1.0, 0)]
+
+
 def gms(x0: np.ndarray, x1: np.ndarray, sizes: Sizes, searched: bool, factor: float, authors: bool) -> np.ndarray:
     """The mask with most matches over the hypotheses, the first of equals; searched: over turns and scales."""
     p0, p1 = normalised(x0, sizes[0]), normalised(x1, sizes[1])
-    hypotheses = itertools.product(SCALES, range(8)) if searched else [(1.0, 0)]
-    return max((run(p0, p1, *hypothesis, factor, authors) for hypothesis in hypotheses), key=np.sum)
+    masks = [run(p0, p1, scale, turn, factor, authors) for scale, turn in hypotheses(searched)]
+    return max(masks, key=lambda kept: int(kept.sum()))
 
 
 def support(x0: np.ndarray, x1: np.ndarray, sizes: Sizes, searched: bool, factor: float) -> list[float]:
     """The mean over the shifted grids of (score - 1) / sqrt(mean, at least 1) at each match's own cells, for the
     hypothesis whose mask has most matches."""
     p0, p1 = normalised(x0, sizes[0]), normalised(x1, sizes[1])
-    hypotheses = itertools.product(SCALES, range(8)) if searched else [(1.0, 0)]
-    scale, turn = max(hypotheses, key=lambda h: run(p0, p1, *h, factor, False).sum())
+    scale, turn = max(hypotheses(searched), key=lambda h: int(run(p0, p1, h[0], h[1], factor, False).sum()))
     total = [0.0] * len(x0)
     for shift in SHIFTS:
         motion = Motion(p0, p1, scale, shift, False)
