@@ -65,24 +65,14 @@ def test_a_device_that_is_full(tmp_path: Path) -> None:
     assert message(caught.value) == f"{tmp_path / 'out.json'}: No space left on device"
 
 
-def _installation(root: Path, monkeypatch: pytest.MonkeyPatch, *folders: str) -> Path:
-    package = root / "site-packages" / "fmtorch"
-    package.mkdir(parents=True)
-    for folder in folders:
-        (root / "site-packages" / folder).mkdir(parents=True)
+def test_an_installed_wheel_uses_its_own_folders_and_an_incomplete_one_is_named(tmp_path, monkeypatch):
+    package = tmp_path / "site-packages" / "fmtorch"
     monkeypatch.setattr(core.files, "PACKAGE", package)
-    return package
-
-
-def test_an_installed_wheel_uses_its_own_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    package = _installation(tmp_path, monkeypatch, "fmtorch/conf", "fmtorch/models", "conf", "models")
-    assert (core.files.conf_dir(), core.files.models_dir()) == (package / "conf", package / "models")
-
-
-def test_an_incomplete_installation_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    package = _installation(tmp_path, monkeypatch)
     with pytest.raises(FileNotFoundError, match=f"'conf' in {package}"):
         core.files.conf_dir()
+    for folder in ("fmtorch/conf", "fmtorch/models", "conf", "models"):
+        (package.parent / folder).mkdir(parents=True)
+    assert (core.files.conf_dir(), core.files.models_dir()) == (package / "conf", package / "models")
 
 
 def test_cache_dir(monkeypatch: pytest.MonkeyPatch) -> None:

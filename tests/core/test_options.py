@@ -124,13 +124,11 @@ def test_every_preset_fits_what_it_builds(group: str) -> None:
 
 
 def test_a_wrong_option_is_refused_before_anything_within_is_built() -> None:
-    config = {
-        "_target_": "fmtorch.pruning.LearnedPruner",
-        "network": {"_target_": "torch.nn.Linear", "in_features": "x"},
-    }
+    network = {"_target_": "torch.nn.Linear", "in_features": "x"}
+    config = {"_target_": "fmtorch.pruning.LearnedPruner", "network": network}
     with pytest.raises(ValueError, match=r"pruner\.mine\.network: out_features is missing"):
         presets.instantiate(config, "pruner.mine")
-    config["network"] = {"_target_": "torch.nn.Linear", "in_features": "x", "out_features": 2}
+    config["network"] = {**network, "out_features": 2}
     with pytest.raises(ValueError, match=r"pruner\.mine\.network\.in_features=x; it must be a whole number"):
         presets.instantiate(OmegaConf.create(config), "pruner.mine")
     with pytest.raises(ValueError, match="estimator=fmtorch: hypotheses=many; it must be a whole number"):
@@ -180,11 +178,7 @@ def distance(
     [
         ({"x": X[:, :1]}, ValueError, r"x has shape \(5, 1\); it must be \(\.\.\., N, 2\)"),
         ({"x": X[0]}, ValueError, r"x has shape \(2,\); it must be \(\.\.\., N, 2\)"),
-        (
-            {"mask": torch.ones(4) > 0},
-            ValueError,
-            r"mask has shape \(4,\); it must be \(\.\.\., N\) with n = 5, as of x",
-        ),
+        ({"mask": torch.ones(4) > 0}, ValueError, r"mask has shape \(4,\); it must be \(.*, N\) with n = 5, as of x"),
         ({"F": F.expand(2, 3, 3), "x": X.expand(3, 5, 2)}, ValueError, r"x .* broadcast with \(2,\), as of F"),
         ({"mask": torch.ones(5)}, ValueError, "mask is of torch.float32; it must hold booleans"),
         ({"key": torch.tensor(0.5)}, ValueError, "key is of torch.float32; it must hold whole numbers"),

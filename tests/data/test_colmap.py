@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fmtorch.data import DataError, DepthDataset, ImageError, Lens, load, read_image, read_model
+from fmtorch.data import DataError, DepthDataset, ImageError, load, read_image, read_model
 from tests.conftest import shared_path
 from tests.data.native import SIZE, to_binary, write_bundler, write_colmap, write_image
 from tests.helpers import apart
@@ -44,16 +44,6 @@ def test_real_model_is_that_of_pycolmap(tmp_path: Path) -> None:
 
 def _real() -> Path:
     return shared_path("data/native/colmap_sacre_coeur")
-
-
-def test_the_pixel_origin_is_half_a_pixel_lower(tmp_path: Path) -> None:
-    """COLMAP's (16, 12) is the middle of a 32 x 24 image; here that middle is (15.5, 11.5)."""
-    model = read_model(write_colmap(tmp_path / "scene") / "sparse/0")
-    assert model.cameras[7].lens == Lens(40.0, 40.0, 15.5, 11.5, "SIMPLE_PINHOLE")
-    assert model.cameras[8].lens == Lens(40.0, 41.0, 15.5, 11.5, "PINHOLE")
-    assert model.cameras[9].lens == Lens(40.0, 41.0, 15.5, 11.5, "OPENCV", (0.1, -0.02, 0.001, 0.002))
-    assert model.cameras[9].size == SIZE
-    assert [image.name for image in model.images] == ["00.png", "02.png", "night walk/01.png"]
 
 
 def test_text_and_binary_are_one_model(tmp_path: Path) -> None:

@@ -6,7 +6,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from torch.utils.data import DataLoader
 
 from fmtorch.data import DataError, DepthDataset, FMBenchPairs, PairDataset, load, read_image
 from fmtorch.data.pairs import PairSubset
@@ -133,12 +132,6 @@ def test_real_sets() -> None:
     for pair in list(dataset)[::25]:
         F = np.linalg.inv(pair.K1).T @ cross_matrix(pair.t) @ pair.R @ np.linalg.inv(pair.K0)
         assert apart(F / np.linalg.norm(F), pair.F) < 1e-12
-
-
-def test_pairs_go_through_a_data_loader(tmp_path: Path) -> None:
-    dataset = FMBenchPairs(small_set(tmp_path / "S"))
-    (batch,) = DataLoader(dataset, batch_size=2, collate_fn=list)  # type: ignore[arg-type]
-    assert batch == list(dataset)
 
 
 def test_pairs_are_image_1_with_the_others(tmp_path: Path) -> None:

@@ -172,24 +172,24 @@ def test_lines_that_cannot_be_read_are_named(line: str, error: str, tmp_path: Pa
 
 
 def test_lists_of_another_kind_are_refused(tmp_path: Path) -> None:
-    root, other = lists.images(), tmp_path / "pairs.h5"
-    other.write_text("x")
+    root = lists.images()
+    (tmp_path / "pairs.h5").write_text("x")
     np.savez(tmp_path / "other.npz", x=np.zeros(3))
     np.savez(tmp_path / "wide.npz", name=np.zeros((3, 5), int))
     lists.write(tmp_path / "several.txt", ["absent.npz"])
     lists.write(tmp_path / "empty.txt", ["# nothing"])
-    for file, error in {
-        other: r"pairs\.h5: a list must be a text file \(\.txt\) or an \.npz; this one ends in \.h5",
-        tmp_path
-        / "other.npz": r"other\.npz: neither pair_infos \(MegaDepth\) nor name \(ScanNet\) among its arrays, x",
-        tmp_path / "wide.npz": r"wide\.npz: 'name' is int64 \(3, 5\); it must hold four whole numbers a pair",
-        tmp_path / "several.txt": r"several\.txt, line 1: no file .*absent\.npz",
-        tmp_path / "empty.txt": r"empty\.txt: holds no pairs",
-        tmp_path / "absent.txt": r"absent\.txt: no such file; dataset\.file must be the list of pairs",
-        None: r"pair_list needs file: dataset\.file=FILE",
+    for name, error in {
+        "pairs.h5": r"pairs\.h5: a list must be a text file \(\.txt\) or an \.npz; this one ends in \.h5",
+        "other.npz": r"other\.npz: neither pair_infos \(MegaDepth\) nor name \(ScanNet\) among its arrays, x",
+        "wide.npz": r"wide\.npz: 'name' is int64 \(3, 5\); it must hold four whole numbers a pair",
+        "several.txt": r"several\.txt, line 1: no file .*absent\.npz",
+        "empty.txt": r"empty\.txt: holds no pairs",
+        "absent.txt": r"absent\.txt: no such file; dataset\.file must be the list of pairs",
     }.items():
         with pytest.raises(DataError, match=error):
-            load("pair_list", root=root, file=file)
+            load("pair_list", root=root, file=tmp_path / name)
+    with pytest.raises(DataError, match=r"pair_list needs file: dataset\.file=FILE"):
+        load("pair_list", root=root, file=None)
     with pytest.raises(DataError, match=r"no such folder; dataset\.root must be the folder of the images"):
         load("pair_list", root=tmp_path / "absent", file=lists.write(tmp_path / "a.txt", [lists.superglue(0, 1)]))
     with pytest.raises(DataError, match=r"resize=\[1, 2, 3\]; it must be one length of the longer side, or"):

@@ -4,11 +4,10 @@ import kornia
 import numpy as np
 import pytest
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from fmtorch import features
-from fmtorch.features import hessian
+from fmtorch.features import hessian, networks
 from tests.conftest import oracle, shared_path
 from tests.features.scenes import random_frames, texture
 from tests.reference.local_features import dominant_gradient as reference_orientation
@@ -23,7 +22,7 @@ def keypoints(detector: features.HessianDetector, image: np.ndarray) -> np.ndarr
 
 @pytest.mark.parametrize("levels", [2, 3])
 def test_equals_the_definition(levels: int) -> None:
-    image = texture(0, 50, 61)
+    image = texture(0, hessian.STRIP + 11, 61)  # worked on in two strips
     expected = hessian_keypoints(image / 255, 1e-4, levels)
     found = keypoints(features.HessianDetector(levels=levels, border=0.0), image)
     assert len(found) == len(expected) > 15
@@ -93,21 +92,13 @@ def test_shape_is_composed_as_kornias() -> None:
     lafs = random_frames(5, 64, 160, 200)
     numbers = torch.empty(64, 3).uniform_(-0.4, 0.4, generator=torch.Generator().manual_seed(0))
     peer = kornia.feature.LAFAffNetShapeEstimator(False, preserve_orientation=False).eval()
-    peer.features = torch.nn.Sequential(Constant(numbers))
+    del peer.features
+    peer.features = lambda patches: numbers
     image = texture(5)
     expected = peer(lafs[None], torch.from_numpy(image)[None, None].float() / 255)[0]
     found = features.NetworkShape(lambda patches: numbers)(features.ImagePyramid(image), lafs)
     torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-3)
     torch.testing.assert_close(features.frame_scale(found), features.frame_scale(lafs), rtol=1e-4, atol=1e-4)
-
-
-class Constant(torch.nn.Module):
-    def __init__(self, value: Tensor) -> None:
-        super().__init__()
-        self.value = value
-
-    def forward(self, patches: Tensor) -> Tensor:
-        return self.value[: len(patches)]
 
 
 def test_impossible_shapes_keep_the_frame() -> None:
@@ -126,27 +117,12 @@ def test_orientation_network_turns_by_its_vector() -> None:
     torch.testing.assert_close(found, expected, atol=1e-4, rtol=1e-4)
 
 
-def authors(name: str) -> torch.nn.Module:
-    weights = torch.load(shared_path(f"weights/{name}.pth"), weights_only=True, map_location="cpu")["state_dict"]
-    kinds = {"AffNet": kornia.feature.LAFAffNetShapeEstimator, "OriNet": kornia.feature.OriNet}
-    module = kinds[name](False).eval()
-    module.load_state_dict(weights)
-    return module
-
-
 def test_authors_networks_give_the_stored_frames() -> None:
     file = oracle("affnet_orinet.npz")
     images = oracle("sift.npz")
-    affnet, orinet = authors("AffNet"), authors("OriNet")
-
-    @torch.no_grad()
-    def shape(patches: Tensor) -> Tensor:
-        return affnet.features(affnet._normalize_input(patches)).flatten(1)
-
-    @torch.no_grad()
-    def orientation(patches: Tensor) -> Tensor:
-        return orinet.features(orinet._normalize_input(patches)).flatten(1)
-
+    shape, orientation = (networks.build(name).eval() for name in ("affnet", "orinet"))
+    networks.load_weights(shape, shared_path("weights/AffNet.pth"))
+    networks.load_weights(orientation, shared_path("weights/OriNet.pth"))
     gaps = []
     for number in (0, 1):
         chosen = file["keypoints"][:, 4] == number
@@ -168,30 +144,3 @@ def test_authors_networks_give_the_stored_frames() -> None:
 class KorniaPyramid(features.ImagePyramid):
     def extract(self, lafs: Tensor, size: int = 32) -> Tensor:
         return kornia.feature.extract_patches_from_pyramid(self.levels[0][None, None], lafs[None], size)[0]
-
-
-THRESHOLD = 1e-3
-
-
-def response() -> Tensor:
-    """(h, w) determinants of a texture, rounded so that neighbours are often equal; more rows than a strip."""
-    image = torch.from_numpy(texture(0, 2 * hessian.STRIP + 11, 170)).float() / 255
-    out = torch.empty_like(image)
-    hessian.hessian_determinant(image, 2.0, out=out)
-    return (out * 1024).round() / 1024
-
-
-def test_maxima_are_those_of_the_plain_comparison() -> None:
-    values = response()
-    largest = F.max_pool2d(values[None], 3, stride=1, padding=1)[0]
-    expected = torch.nonzero((values >= largest) & (values > THRESHOLD))
-    assert len(expected) > 100
-    assert torch.equal(hessian.maxima(values, THRESHOLD), expected)
-
-
-def test_the_scale_of_a_determinant_is_a_product_afterwards() -> None:
-    image, scale = torch.from_numpy(texture(1, hessian.STRIP + 30, 90)).float() / 255, 1.25 * 2 ** (1 / 3)
-    plain, scaled = (torch.empty_like(image) for _ in range(2))
-    hessian.hessian_determinant(image, 1.0, out=plain)
-    hessian.hessian_determinant(image, scale, out=scaled)
-    assert torch.equal(scaled, plain * scale)

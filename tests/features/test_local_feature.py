@@ -1,8 +1,6 @@
 """Features of parts, presets of them, large images, image vectors."""
 
 import hashlib
-import subprocess
-import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -18,6 +16,7 @@ from fmtorch.features import describe
 from fmtorch.runs import ArrayCache, CachedFeatures
 from scripts.make_models import learned
 from tests.features.scenes import same, texture
+from tests.processes import run_command
 from tests.reference import local_features as reference
 
 WITHOUT_NETWORK = ("rootsift", "dspsift", "rootsiftpca")
@@ -190,9 +189,9 @@ print(peak() - before)
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="peak memory is read from /proc")
 @pytest.mark.parametrize(("name", "bound"), [("sift", 4.0e9), pytest.param("hesaffnet", 2.5e9, marks=pytest.mark.slow)])
-def test_8k_images_within_the_stated_memory(name: str, bound: float) -> None:
+def test_8k_images_within_the_stated_memory(name: str, bound: float, tmp_path: Path) -> None:
     """As docs/benchmarks/features.md states: SIFT sees at most 16 million pixels, the Hessian all 67 million."""
-    result = subprocess.run([sys.executable, "-c", GROWTH, name], capture_output=True, text=True, check=False)
+    result = run_command("-c", GROWTH, name, cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     assert int(result.stdout) < bound, f"{int(result.stdout) / 1e9:.2f} GB"
 

@@ -127,11 +127,12 @@ NEIGHBOURS = 1e-5  # what design allows a descriptor to change with its batch
 @pytest.fixture(scope="module")
 def hardnet(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("onnx") / "hardnet.onnx"
+    torch.manual_seed(0)
     export(randomized(build("hardnet")), path)
     return path
 
 
-@pytest.mark.parametrize("name", ARCHITECTURES)
+@pytest.mark.parametrize("name", ["l2net", "affnet_fast", "orinet"])  # HardNet's is used below; all others are theirs
 def test_onnx_agrees_with_torch_on_real_patches(name: str, tmp_path: Path, patches: Tensor) -> None:
     network = randomized(build(name))
     if name == "l2net":
@@ -145,6 +146,8 @@ def test_onnx_agrees_with_torch_on_real_patches(name: str, tmp_path: Path, patch
 
 def test_neighbours_and_batch_size_are_invisible(hardnet: Path, patches: Tensor) -> None:
     expected = PatchNetwork(hardnet)(patches)
+    torch.manual_seed(0)
+    torch.testing.assert_close(expected, randomized(build("hardnet"))(patches).detach(), atol=1e-4, rtol=0)
     for batch in (1, 7, 64, 300):
         found = PatchNetwork(hardnet, batch=batch)(patches)
         torch.testing.assert_close(found, expected, atol=NEIGHBOURS, rtol=0)
@@ -229,8 +232,10 @@ both = pytest.mark.parametrize("name", ["disk", "aliked"])
 @both
 @pytest.mark.parametrize("colour", [False, True])
 def test_shapes_and_ranges(name: str, colour: bool) -> None:
-    image = texture(0, *SIZE)
-    found = untrained(name)(np.stack([image, image[::-1], image], -1) if colour else image)
+    image, extractor = texture(0, *SIZE), untrained(name)
+    found = extractor(np.stack([image, image[::-1], image], -1) if colour else image)
+    if not colour:
+        assert same(found, extractor(np.stack([image] * 3, -1)))
     assert 10 < len(found) <= 50
     assert found.image_size.tolist() == list(SIZE)
     assert found.descriptors.shape == (len(found), 128)
@@ -242,12 +247,6 @@ def test_shapes_and_ranges(name: str, colour: bool) -> None:
     for value in (found.lafs, found.scores, found.descriptors):
         value.add_(0)  # an inference tensor could not be changed, nor trained on
         assert not value.requires_grad
-
-
-@both
-def test_grey_is_the_same_as_equal_channels(name: str) -> None:
-    image, extractor = texture(1, *SIZE), untrained(name)
-    assert same(extractor(image), extractor(np.stack([image] * 3, -1)))
 
 
 class Probe(nn.Module):
@@ -331,11 +330,10 @@ class Runs:
 
 
 @pytest.mark.parametrize("known", [True, False])
-def test_weights_of_another_file_are_refused_and_run_nothing(
-    known: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_weights_of_another_file_are_refused_and_run_nothing(known, tmp_path, monkeypatch):
     """A file in the place of the published one, by its digest, and where no digest is known by its code."""
     monkeypatch.setenv("RUNS", str(tmp_path / "run"))
+    monkeypatch.setattr("time.sleep", lambda seconds: None)  # between kornia's attempts
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
     file = tmp_path / "checkpoints" / ("aliked-n16.pth" if known else "epipolar-save.pth")
     file.parent.mkdir()

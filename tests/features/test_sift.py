@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from fmtorch import features, presets
+from fmtorch import features
 from fmtorch.features import SIFT, ImagePyramid, PatchSIFT, VLFeatSIFT, project
 from tests.conftest import oracle
 from tests.features.scenes import random_frames, same, texture
@@ -233,11 +233,6 @@ def test_resembles_opencvs_descriptors(number: str) -> None:
     assert cosine.quantile(0.05) > 0.95
 
 
-def blob(x: float, y: float, sigma: float, h: int = 120, w: int = 160) -> np.ndarray:
-    v, u = np.mgrid[:h, :w]
-    return np.rint(30 + 200 * np.exp(-((u - x) ** 2 + (v - y) ** 2) / (2 * sigma**2))).astype(np.uint8)
-
-
 @needs_vlfeat
 def test_vlfeat_agrees_with_opencv_where_both_find_a_keypoint() -> None:
     image = cv2.resize(texture(5), None, fx=4, fy=4, interpolation=cv2.INTER_CUBIC)
@@ -250,8 +245,3 @@ def test_vlfeat_agrees_with_opencv_where_both_find_a_keypoint() -> None:
     assert ((a[..., 0] - b[..., 0]).norm(dim=1) / b[..., 0].norm(dim=1)).median() < 0.1
     between = (ours.descriptors[i[near]] - opencv.descriptors[near]).norm(dim=1)
     assert between.median() < 0.3 * 512  # of vectors of length 512
-
-
-@needs_vlfeat
-def test_the_preset_names_vlfeats() -> None:
-    assert presets.build("features", "sift_vlfeat", max_features=50) == VLFeatSIFT(max_features=50)

@@ -25,7 +25,6 @@ from fmtorch.io import DATABASE
 from fmtorch.io.export import FEATURES, MATCHES
 from fmtorch.metrics import pose_error
 from fmtorch.pipeline import chosen_pairs, images_below
-from fmtorch.pipeline.folder import open_folder
 from fmtorch.runs import RunFolder
 from tests.commands.test_match import BENT, photographed
 from tests.conftest import shared_path
@@ -157,12 +156,6 @@ def test_mistakes_are_told(words: list[str], said: str, images: Path, monkeypatc
     monkeypatch.chdir(images)
     with pytest.raises(ValueError, match=said):
         match_command.run(config("match", *words), "sift_ratio")
-
-
-def test_settings_that_cannot_be_read(tmp_path: Path) -> None:
-    (tmp_path / "export.json").write_text("{")
-    with pytest.raises(ValueError, match=r"export\.json is not valid JSON .* delete"):
-        open_folder(tmp_path, {"seed": 0})
 
 
 def test_an_evaluation_and_its_way_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,7 +14,7 @@ import torch
 
 import fmtorch
 from fmtorch import data, presets
-from fmtorch.data import DataError, ImagePair
+from fmtorch.data import DataError
 from fmtorch.evaluation import evaluate
 from fmtorch.evaluation.report import Options, find_dataset
 from fmtorch.evaluation.statistics import summarize
@@ -23,6 +23,7 @@ from fmtorch.io import H5Pairs, oanet
 from fmtorch.pipeline import Outcome, Pipeline, load_pipeline
 from fmtorch.pruning import ratio_test
 from fmtorch.runs import to_table
+from tests.geometry.scenes import scene
 from tests.helpers import unused
 from tests.io import writers
 
@@ -30,9 +31,8 @@ NEEDS_TRUTH = ("hloc", "glue_factory", "vismatch")
 WITH_RATIOS = ("ransac_tutorial", "oanet")
 
 
-def load(layout: str, tmp_path: Path, write: Callable[[Path], Path] | None = None) -> H5Pairs:
-    root = (write or writers.WRITERS[layout])(tmp_path / layout)
-    return reload(layout, root)
+def load(layout: str, tmp_path: Path) -> H5Pairs:
+    return reload(layout, writers.WRITERS[layout](tmp_path / layout))
 
 
 def reload(layout: str, root: Path, **options: Any) -> H5Pairs:
@@ -50,9 +50,11 @@ def pipeline(**pruners: Any) -> Pipeline:
     return Pipeline(unused, unused, pruners, estimator)
 
 
-@pytest.mark.parametrize("layout", writers.WRITERS)
-def test_what_was_written_is_read(layout: str, tmp_path: Path) -> None:
-    dataset = load(layout, tmp_path)
+@pytest.mark.parametrize(("layout", "swapped"), [*((layout, False) for layout in writers.WRITERS), ("hloc", True)])
+def test_what_was_written_is_read(layout: str, swapped: bool, tmp_path: Path) -> None:
+    """swapped: hloc's pairs in the other order."""
+    root = writers.WRITERS[layout](tmp_path / layout, **({"swapped": True} if swapped else {}))
+    dataset = reload(layout, root)
     assert len(dataset) == writers.PAIRS
     for pair, s in zip(dataset, writers.scenes(), strict=True):
         assert pair.problem is None
@@ -61,10 +63,10 @@ def test_what_was_written_is_read(layout: str, tmp_path: Path) -> None:
         for got, expected in ((pair.K0, s.K0), (pair.K1, s.K1), (pair.R, s.R), (pair.t, s.t)):
             np.testing.assert_allclose(got, expected.numpy(), atol=1e-12)
         c, counts = pickle.loads(pickle.dumps(pair.matches))()
-        order = torch.arange(len(s.x0))
+        order, expected = (torch.argsort(x[:, 0]) if swapped else torch.arange(len(x)) for x in (c.x0[0], s.x0))
         tolerance = 1e-4 if layout != "oanet" else 1e-3  # float32 at 1000 px; from calibrated coordinates and back
-        torch.testing.assert_close(c.x0[0], s.x0[order].float(), rtol=0, atol=tolerance)
-        torch.testing.assert_close(c.x1[0], s.x1[order].float(), rtol=0, atol=tolerance)
+        torch.testing.assert_close(c.x0[0][order], s.x0[expected].float(), rtol=0, atol=tolerance)
+        torch.testing.assert_close(c.x1[0][order], s.x1[expected].float(), rtol=0, atol=tolerance)
         assert c.mask.all()
         assert counts[0] == len(s.x0) + (2 if layout in NEEDS_TRUTH else 0)
         if layout in WITH_RATIOS:
@@ -97,24 +99,10 @@ def test_estimators_pruners_and_metrics_work_on_it(layout: str, tmp_path: Path) 
         assert (row.seconds_features is None) or np.isnan(row.seconds_features)
 
 
-def test_hloc_pairs_in_the_other_order(tmp_path: Path) -> None:
-    dataset = load("hloc", tmp_path, lambda folder: writers.write_hloc(folder, swapped=True))
-    for pair, s in zip(dataset, writers.scenes(), strict=True):
-        c, _ = given(pair)
-        order = torch.argsort(c.x0[0, :, 0])
-        expected = torch.argsort(s.x0[:, 0])
-        torch.testing.assert_close(c.x0[0][order], s.x0[expected].float(), rtol=0, atol=1e-4)
-        torch.testing.assert_close(c.x1[0][order], s.x1[expected].float(), rtol=0, atol=1e-4)
-
-
-def given(pair: ImagePair) -> Any:
-    return pair.matches()
-
-
 def test_the_origin_can_be_told(tmp_path: Path) -> None:
     root = writers.write_glue_factory(tmp_path / "glue_factory")
     usual, other = reload("glue_factory", root), reload("glue_factory", root, origin=0.0)
-    torch.testing.assert_close(given(other[0])[0].x0, given(usual[0])[0].x0 + 0.5)
+    torch.testing.assert_close(other[0].matches()[0].x0, usual[0].matches()[0].x0 + 0.5)
     assert usual.digest != other.digest
 
 
@@ -122,12 +110,9 @@ def test_the_test_split_of_the_tutorial_has_no_cameras(tmp_path: Path) -> None:
     root = writers.write_tutorial(tmp_path / "ransac_tutorial")
     for name in ("R", "T"):
         (root / "church" / f"{name}.h5").unlink()
-    with h5py.File(root / "church" / "matches.h5", "a") as file:
-        file.move("img_0a-img_0b-1", "img_0a-img_0b")  # now that nothing tells the names apart
-    with h5py.File(root / "church" / "Fgt.h5", "a") as file:
-        file.move("img_0a-img_0b-1", "img_0a-img_0b")
-    with h5py.File(root / "church" / "K1_K2.h5", "a") as file:
-        file.move("img_0a-img_0b-1", "img_0a-img_0b")
+    for name in ("matches", "Fgt", "K1_K2"):
+        with h5py.File(root / "church" / f"{name}.h5", "a") as file:
+            file.move("img_0a-img_0b-1", "img_0a-img_0b")  # now that nothing tells the names apart
     first, second, _ = reload("ransac_tutorial", root)
     np.testing.assert_allclose(first.F, writers.scenes()[0].F.numpy(), atol=1e-12)
     assert first.R is None
@@ -189,7 +174,7 @@ DAMAGE: list[tuple[str, str, str, Callable[[np.ndarray], Any] | None, str]] = [
 def test_a_damaged_entry_is_named_and_harms_no_other(layout, name, key, change, said, tmp_path):
     root = writers.WRITERS[layout](tmp_path / layout)
     edit(root, name, key, change)
-    first, second, third = outcomes(reload(layout, root))
+    first, second, third = pipeline().correspondences(list(reload(layout, root)))
     assert second.correspondences is None
     assert second.reason
     with pytest.raises(AssertionError, match=said):
@@ -197,10 +182,6 @@ def test_a_damaged_entry_is_named_and_harms_no_other(layout, name, key, change, 
     assert ".h5" in second.reason or ".hdf5" in second.reason or "no rotation" in said or "move apart" in said
     assert first.correspondences is not None
     assert third.correspondences is not None
-
-
-def outcomes(dataset: H5Pairs) -> list[Outcome]:
-    return pipeline().correspondences(list(dataset))
 
 
 @pytest.mark.parametrize("layout", writers.WRITERS)
@@ -221,7 +202,7 @@ def test_a_camera_without_a_size_has_that_of_its_image_or_of_principal_point_and
     edit(root, POSE, "pair1/x2", lambda v: np.where(np.arange(len(v))[:, None] == 0, [1200.25, 3], v))
     s = writers.scenes()[1]
     centre = [tuple(round(2 * float(v) + 1) for v in K[[1, 0], 2]) for K in (s.K0, s.K1)]
-    known, unknown = given(reload("posebench", root)[0])[0], given(reload("posebench", root)[1])[0]
+    known, unknown = reload("posebench", root)[0].matches()[0], reload("posebench", root)[1].matches()[0]
     assert tuple(known.size0[0].tolist()) == writers.SIZE
     farthest = [int(np.ceil(bound)) + 1 for bound in s.x0.max(0).values.tolist()[::-1]]
     assert unknown.size0[0].tolist() == [max(sides) for sides in zip(centre[0], farthest, strict=True)]
@@ -231,7 +212,7 @@ def test_a_camera_without_a_size_has_that_of_its_image_or_of_principal_point_and
     cv2.imwrite(str(images / "1.png"), np.zeros((810, 1010), np.uint8))
     shown = images / "1"
     (images / "1.png").rename(shown)
-    beside = given(reload("posebench", root, images=tmp_path / "images")[1])[0]
+    beside = reload("posebench", root, images=tmp_path / "images")[1].matches()[0]
     assert tuple(beside.size0[0].tolist()) == (810, 1010)
     assert torch.equal(beside.size1, unknown.size1)
     cv2.imwrite(str(images / "1.png"), np.zeros((81, 101), np.uint8))
@@ -351,18 +332,10 @@ def test_pruning_is_judged_as_oanets_test_does(tmp_path: Path) -> None:
 
 
 def test_geodesic_distances_are_of_calibrated_points_also_of_pixels_that_are_not_square() -> None:
-    generator = np.random.default_rng(0)
-    X, (K0, K1) = (
-        generator.uniform([-1, -1, 4], [1, 1, 8], (30, 3)),
-        np.array([[[700, 9, 320], [0, 650, 240], [0, 0, 1]], [[500, 0, 300], [0, 510, 200], [0, 0, 1]]], np.float64),
-    )
-    R, t = np.array([[0.8, -0.6, 0], [0.6, 0.8, 0], [0, 0, 1]]), np.array([2.0, 0.1, 0.3])
-    x0, x1 = (Y @ K.T / Y[:, 2:] for Y, K in ((X, K0), (X @ R.T + t, K1)))
-    x0, x1 = x0[:, :2], x1[:, :2]
-    assert oanet.geodesic(R, t, K0, K1, x0, x1).max() < 1e-25
-    x1[:, 1] += 5.1  # a hundredth of a focal length
-    E = np.cross(np.eye(3), t / np.linalg.norm(t)).T @ R
-    for i, distance in enumerate(oanet.geodesic(R, t, K0, K1, x0, x1)):
+    x0, x1, _, K0, K1, R, t = (value.numpy() for value in scene(30, noise=5.0))
+    K0[0, 1] = 9
+    E = np.cross(np.eye(3), t).T @ R
+    for i, distance in enumerate(oanet.geodesic(R, 3 * t, K0, K1, x0, x1)):
         a, b = np.linalg.inv(K0) @ [*x0[i], 1], np.linalg.inv(K1) @ [*x1[i], 1]
         line1, line0 = E @ a, E.T @ b
         squared = (b @ E @ a) ** 2 * (1 / (line1[:2] @ line1[:2]) + 1 / (line0[:2] @ line0[:2]))

@@ -135,11 +135,9 @@ def write_posebench(folder: Path) -> Path:
     return folder
 
 
-def posebench_group(
-    file: h5py.File, key: str, x: tuple[np.ndarray, np.ndarray], K: tuple[np.ndarray, np.ndarray],
-    motion: tuple[np.ndarray, np.ndarray], sizes: tuple[tuple[int, int], tuple[int, int]],
-) -> None:  # fmt: skip
-    """A pair of PINHOLE cameras; each entry of a camera is an array, also what is a single value."""
+def posebench_group(file: h5py.File, key: str, x, K, motion, sizes) -> None:
+    """A pair of PINHOLE cameras; each entry of a camera is an array, also what is a single value.
+    x, K, sizes: of both images. motion: R and t."""
     group = file.create_group(key)
     group["x1"], group["x2"] = x
     group["R"], group["t"] = motion

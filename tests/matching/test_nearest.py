@@ -78,6 +78,8 @@ def test_chunk_batch_and_padding_are_invisible(make: object) -> None:
     for (d0, d1), expected in zip(pairs, alone, strict=True):
         for chunk in (1, 7, 1000):
             assert_same(nearest_neighbors(d0, d1, chunk=chunk), expected)
+    with pytest.raises(ValueError, match="chunk"):
+        nearest_neighbors(*pairs[0], chunk=0)
 
     garbage = [math.nan, math.inf, 1e30]
     batch0, batch1 = torch.empty(len(pairs), 100, 128), torch.empty(len(pairs), 100, 128)
@@ -133,11 +135,6 @@ def test_equals_opencv_on_real_descriptors() -> None:
     np.testing.assert_array_equal(neighbors.second, np.float32([m[1].distance for m in expected]))
     crossed = {(m.queryIdx, m.trainIdx) for m in cv2.BFMatcher(cv2.NORM_L2, crossCheck=True).match(d0, d1)}
     assert crossed == {(i, int(neighbors.nearest[i])) for i in neighbors.mutual.nonzero()[:, 0].tolist()}
-
-
-def test_chunk_must_be_positive() -> None:
-    with pytest.raises(ValueError, match="chunk"):
-        nearest_neighbors(unit(1, 3), unit(2, 3), chunk=0)
 
 
 def skewed(seed: int, n: int, d: int = 128) -> Tensor:

@@ -21,21 +21,9 @@ from fmtorch.data import ImageSource, read_image
 from fmtorch.features.describe import image_vector
 from fmtorch.io import MatchStore
 from fmtorch.jobs import DEATH, Execution, WorkerPool, WorkersLost
-from fmtorch.pipeline import (
-    Described,
-    FolderMatches,
-    PhotographCameras,
-    Pipeline,
-    chosen_pairs,
-    describe,
-    folder,
-    folder_workers,
-    images_below,
-    load_pipeline,
-)
-from fmtorch.pipeline import folder as similar
-from fmtorch.pipeline.folder import default_output, similar_pairs, vectors_of
+from fmtorch.pipeline import FolderMatches, Pipeline, chosen_pairs, folder, folder_workers, images_below, load_pipeline
 from tests.conftest import shared_path
+from tests.helpers import draw
 
 
 class Recorded(Executor):
@@ -73,18 +61,10 @@ def pipeline() -> Pipeline:
 
 @pytest.fixture
 def images(tmp_path: Path) -> list[Path]:
-    noise = np.random.default_rng(0).integers(0, 256, (60, 80), dtype=np.uint8)
-    texture = cv2.GaussianBlur(cv2.resize(noise, (640, 480), interpolation=cv2.INTER_CUBIC), (0, 0), 1.5)
-    (tmp_path / "photos").mkdir()
-    paths = [tmp_path / "photos" / f"{i}.png" for i in range(6)]
-    for i, path in enumerate(paths):
-        assert cv2.imwrite(str(path), texture[8 * i : 8 * i + 240, 16 * i : 16 * i + 320])
-    return paths
+    return [draw(tmp_path / "photos" / f"{i}.png", 0, shift=16 * i).path for i in range(6)]
 
 
-def work(
-    pipeline: Pipeline, images: list[Path], output: Path, workers: WorkerPool | None = None, **options: Any
-) -> FolderMatches:
+def work(pipeline, images, output, workers=None, **options) -> FolderMatches:
     workers = workers or folder_workers(pipeline)
     return FolderMatches(pipeline, MatchStore(output, images[0].parent), workers, 1600, True, 0, **options)
 
@@ -103,7 +83,7 @@ def expect_same(output: Path, other: Path) -> None:
 
 
 def test_any_number_of_workers_and_any_executor_keep_the_same(pipeline, images, tmp_path):
-    pairs = list(itertools.combinations(images, 2))
+    pairs = list(itertools.combinations(images[:4], 2))
     executor = Recorded()
     own = Execution(workers=1, make=lambda: executor)
     for name, execution in {"one": threads(1), "three": threads(3), "own": own}.items():
@@ -111,8 +91,8 @@ def test_any_number_of_workers_and_any_executor_keep_the_same(pipeline, images, 
             matches = work(pipeline, images, tmp_path / name, workers=workers)
             assert len(list(matches.each(pairs))) == matches.done == len(pairs)
             assert matches.troubles == []
-    assert Counter(executor.calls) == {"Photograph": 6, "DescribedPair": 15}
-    assert len(kept(tmp_path / "one")) == 21
+    assert Counter(executor.calls) == {"Photograph": 4, "DescribedPair": 6}
+    assert len(kept(tmp_path / "one")) == 10
     for name in ("three", "own"):
         expect_same(tmp_path / name, tmp_path / "one")
 
@@ -148,7 +128,7 @@ def test_no_image_is_described_twice(pipeline, images, tmp_path, monkeypatch):
 def test_an_image_or_a_pair_that_fails_harms_no_other(pipeline: Pipeline, images: list[Path], tmp_path: Path) -> None:
     images[1].write_bytes(b"no image")
 
-    class Damaged(PhotographCameras):
+    class Damaged(folder.PhotographCameras):
         def given(self, paths: Sequence[Path], sizes: Sequence[tuple[int, int]]) -> dict[str, Any]:
             return {"cameras": {"focal": torch.ones(7)} if paths[1] == images[5] else {}}
 
@@ -270,12 +250,12 @@ def test_a_wrong_number_of_neighbours_is_told(pairs: str, tmp_path: Path) -> Non
 
 def test_folders_of_one_name_have_outputs_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    assert default_output(tmp_path / "x/photos") == Path("matches/photos")
+    assert folder.default_output(tmp_path / "x/photos") == Path("matches/photos")
     text(tmp_path / "matches/photos/export.json", json.dumps({"images": str(tmp_path / "x/photos")}))
-    assert default_output(Path("x/photos")) == Path("matches/photos")
-    other = default_output(tmp_path / "y/photos")
+    assert folder.default_output(Path("x/photos")) == Path("matches/photos")
+    other = folder.default_output(tmp_path / "y/photos")
     assert other.name.startswith("photos-")
-    assert other != default_output(tmp_path / "z/photos")
+    assert other != folder.default_output(tmp_path / "z/photos")
 
 
 def paths(n: int) -> list[Path]:
@@ -285,7 +265,7 @@ def paths(n: int) -> list[Path]:
 @pytest.mark.parametrize("rows", [1, 3, 1024])
 @pytest.mark.parametrize("count", [1, 2, 50])
 def test_each_image_with_its_most_similar_ones(count: int, rows: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(similar, "ROWS", rows)
+    monkeypatch.setattr(folder, "ROWS", rows)
     generator = torch.Generator().manual_seed(0)
     vectors = torch.nn.functional.normalize(torch.randn(9, 5, generator=generator).double(), dim=1)
     vectors[4] = 0  # an image that could not be read
@@ -295,28 +275,28 @@ def test_each_image_with_its_most_similar_ones(count: int, rows: int, monkeypatc
         others.sort(key=lambda j: (-float(np.dot(vectors[i].numpy(), vectors[j].numpy())), j))
         expected |= {(min(i, j), max(i, j)) for j in others[:count]}
     images = paths(9)
-    assert similar_pairs(images, vectors, count) == [(images[i], images[j]) for i, j in sorted(expected)]
+    assert folder.similar_pairs(images, vectors, count) == [(images[i], images[j]) for i, j in sorted(expected)]
 
 
 def test_equally_similar_images_come_by_number() -> None:
-    assert similar_pairs(paths(4), torch.ones(4, 1), 1) == [(Path("0.jpg"), Path(f"{i}.jpg")) for i in (1, 2, 3)]
+    assert folder.similar_pairs(paths(4), torch.ones(4, 1), 1) == [(Path("0.jpg"), Path(f"{i}.jpg")) for i in (1, 2, 3)]
 
 
 def test_an_image_that_cannot_be_read_has_no_vector() -> None:
     features = Features(torch.zeros(2, 2, 3), torch.zeros(2), torch.ones(2, 7), torch.tensor([4, 4]))
-    described = Described(features, torch.ones(2), (4, 4), 0.0)
-    vectors = vectors_of([None, described], lambda descriptors: descriptors[0])
+    described = folder.Described(features, torch.ones(2), (4, 4), 0.0)
+    vectors = folder.vectors_of([None, described], lambda descriptors: descriptors[0])
     assert vectors.tolist() == [[0.0] * 7, [1.0] * 7]
-    assert vectors_of([None], lambda descriptors: descriptors[0]).shape == (1, 1)
+    assert folder.vectors_of([None], lambda descriptors: descriptors[0]).shape == (1, 1)
 
 
 def test_scenes_are_told_apart() -> None:
     """Four images of each of three real scenes: none is most like an image of another scene."""
     folders = [shared_path(f"data/{name}/Images") for name in ("Strecha/fountain-P11", "KITTI/00", "TUM/fr1_rpy")]
-    images = [path for folder in folders for path in sorted(folder.iterdir())[:4]]
+    images = [path for place in folders for path in sorted(place.iterdir())[:4]]
     sift = load_pipeline("sift_ratio", overrides=["features.max_features=1500"])
-    described = [describe(sift, read_image(image), 800) for image in images]
-    vectors = vectors_of(described, lambda descriptors: image_vector(descriptors, "sift"))
-    pairs = similar_pairs(images, vectors, 1)
+    described = [folder.describe(sift, read_image(image), 800) for image in images]
+    vectors = folder.vectors_of(described, lambda descriptors: image_vector(descriptors, "sift"))
+    pairs = folder.similar_pairs(images, vectors, 1)
     assert len(pairs) >= 6
     assert all(a.parent == b.parent for a, b in pairs)

@@ -8,7 +8,6 @@ import json
 import pickle
 import re
 import threading
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,14 +19,14 @@ import torch
 
 import fmtorch
 from fmtorch import data, match, presets
-from fmtorch.core import Correspondences, Estimate, Features, ImagePruner, own_traceback, place_of
+from fmtorch.core import Correspondences, Estimate, Features, own_traceback, place_of
 from fmtorch.data import GivenMatches, ImagePair, ImageSource, read_image
 from fmtorch.geometry import sampson
 from fmtorch.io import MatchStore
 from fmtorch.pipeline import FolderMatches, Memo, Pipeline, folder_workers, load_pipeline, match_records
-from fmtorch.presets import build, instantiate
+from fmtorch.presets import instantiate
 from tests.conftest import shared_path
-from tests.helpers import draw, pair, small_pipeline
+from tests.helpers import draw, pair
 from tests.helpers import small_pipeline as pipeline
 from tests.laws import scene
 from tests.processes import run_command
@@ -96,39 +95,23 @@ def test_match_stops_before_estimation(pairs: list[ImagePair]) -> None:
     assert int(outcome.correspondences.keys[0]) == pairs[0].key
 
 
-class _Counting:
-    def __init__(self) -> None:
-        self.calls = 0
-        self.inner = presets.build("features", "sift", max_features=500)
-
-    def __call__(self, image: np.ndarray) -> Features:
-        self.calls += 1
-        result: Features = self.inner(image)
-        return result
-
-
 def test_features_of_an_image_are_computed_once(pairs: list[ImagePair]) -> None:
-    counting = _Counting()
-    shared = pipeline(features=counting)
+    inner, calls = presets.build("features", "sift", max_features=500), list[int]()
+    shared = pipeline(features=lambda image: calls.append(0) or inner(image))
     shared.run([pairs[0], pairs[0], pairs[5]])
-    assert counting.calls == 2
-
-
-class _Raising:
-    def __init__(self, key: int, inner: Callable[[Correspondences], Correspondences | Estimate]) -> None:
-        self.key, self.inner = key, inner
-
-    def __call__(self, c: Correspondences, seed: int = 0) -> Correspondences | Estimate:
-        if self.key in c.keys.tolist():
-            raise RuntimeError("no, not this one")
-        return self.inner(c)
+    assert len(calls) == 2
 
 
 @pytest.mark.parametrize("stage", ["pruning", "estimation"])
 def test_a_stage_that_raises_fails_only_the_culprit(pairs: list[ImagePair], stage: str) -> None:
     named = {"pruning": ("pruner", "ratio"), "estimation": ("estimator", "lmeds")}[stage]
     inner = presets.build(*named, **({"hypotheses": 200} if stage == "estimation" else {}))
-    raising = _Raising(pairs[0].key, inner)
+
+    def raising(c: Correspondences, seed: int = 0) -> Any:
+        if pairs[0].key in c.keys.tolist():
+            raise RuntimeError("no, not this one")
+        return inner(c)
+
     parts = {"pruners": {"bad": raising}} if stage == "pruning" else {"estimator": raising}
     outcomes = pipeline(**parts).run([pairs[0], pairs[2]])
     assert outcomes[0].reason.startswith(f"{stage}: RuntimeError: no, not this one (test_pipeline.py:")
@@ -166,10 +149,8 @@ PRUNERS = "pruner=[ratio,one_to_one,frame_consistency,match_noise,refine_matches
 
 
 def built(cache: str = "off") -> Pipeline:
-    pipeline: Pipeline = load_pipeline(
-        "sift_fmtorch", overrides=[PRUNERS, f"cache={cache}", "features.max_features=1500"]
-    )
-    return pipeline
+    overrides = [PRUNERS, f"cache={cache}", "features.max_features=1500"]
+    return load_pipeline("sift_fmtorch", overrides=overrides)
 
 
 @pytest.fixture
@@ -207,16 +188,12 @@ def test_files_are_read_once_and_matches_are_refined(reads: collections.Counter[
     c = before[0].correspondences
     given = dataclasses.replace(pairs[0], matches=lambda: GivenMatches(c, (1500, 1500)))
     reads.clear()
-    fresh = Pipeline(pipeline.extractor, pipeline.matcher, {"refine": refiner()}, pipeline.estimator)
+    refine = {"refine": presets.build("pruner", "refine_matches")}
+    fresh = Pipeline(pipeline.extractor, pipeline.matcher, refine, pipeline.estimator)
     refined = fresh.correspondences([given])[0].correspondences
     expected = outcomes[0].correspondences
     assert reads == {pairs[0].image0.path: 1, pairs[0].image1.path: 1}
     assert bool((refined.x1 == expected.x1).all())
-
-
-def refiner() -> ImagePruner:
-    stage: ImagePruner = presets.build("pruner", "refine_matches")
-    return stage
 
 
 def test_two_photographs_are_refined_in_their_reduced_pixels() -> None:
@@ -280,9 +257,8 @@ def test_a_result_is_saved_as_the_command_saves_it(result: fmtorch.MatchResult, 
 
 def test_pillow_images_are_arrays(result: fmtorch.MatchResult) -> None:
     pair = data.load("stereo")[0]
-    again = fmtorch.match(
-        *(data.read_image(image) for image in (pair.image0, pair.image1)), pipeline="sift_fmtorch", longest_side=400
-    )
+    images = [data.read_image(image) for image in (pair.image0, pair.image1)]
+    again = fmtorch.match(*images, pipeline="sift_fmtorch", longest_side=400)
     assert torch.equal(again.F, result.F)
     with pytest.raises(ValueError, match="image0 is a Pillow image of mode F; it must be of 8 bits"):
         fmtorch.match(PIL.Image.new("F", (9, 9)), PIL.Image.new("L", (9, 9)))
@@ -368,9 +344,9 @@ def estimate(c: Correspondences, seed: int = 0, slots: int | None = None) -> Est
 
 def outcomes(tmp_path: Path, count: int = 2, **parts: object) -> tuple[Any, list[Any]]:
     given: dict[str, object] = {"features": lambda image: features(), "matcher": matches, "pruners": {}}
-    pipeline = small_pipeline(**{**given, "estimator": estimate, **parts})
+    stages = pipeline(**{**given, "estimator": estimate, **parts})
     images = [draw(tmp_path / f"{i}.png", i) for i in range(2 * count)]
-    return pipeline, pipeline.run([pair(f"{i}", images[2 * i], images[2 * i + 1]) for i in range(count)])
+    return stages, stages.run([pair(f"{i}", images[2 * i], images[2 * i + 1]) for i in range(count)])
 
 
 def no_keys(c: Correspondences) -> Correspondences:
@@ -436,7 +412,7 @@ def test_tracebacks_are_those_of_the_users_code(tmp_path: Path, monkeypatch: pyt
 
 def test_errors_of_the_projects_own_have_no_place() -> None:
     with pytest.raises(ValueError, match="no preset") as refusal:
-        build("estimator", "ransca")
+        presets.build("estimator", "ransca")
     assert place_of(refusal.value) == own_traceback(refusal.value) == ""
 
 

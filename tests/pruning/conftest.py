@@ -19,7 +19,7 @@ def real_matches() -> list[tuple[Correspondences, Tensor]]:
     sift = presets.build("features", "sift", max_features=2000)
     front = Pipeline(sift, presets.build("matcher", "nearest"), pruners, presets.build("estimator", "ransac"))
     matches = []
-    for i in range(0, 60, 12):
+    for i in range(0, 60, 24):
         c = front.correspondences([dataset[i]])[0].correspondences
         F = torch.from_numpy(dataset[i].F)[None]
         matches.append((c, sampson(F, c.x0.double(), c.x1.double()) < 2))

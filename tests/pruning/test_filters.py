@@ -2,10 +2,9 @@
 
 import itertools
 import math
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,12 +20,13 @@ from fmtorch.matching import NearestNeighborMatcher
 from fmtorch.pruning.consistency import CURVES, MIN_VOTE, NOISE, SCALES, TOLERANCE, TURNS, WINDOW, WORST_RATIO
 from tests.geometry.scenes import scene as matched_scene
 from tests.laws import calibrated, degenerate, quick_pruner, scene, scenes, small, with_padding
+from tests.processes import run_command
 from tests.reference import consistency
 from tests.reference import local_features as matching_reference
 from tests.reference.gms import gms as gms_reference
 from tests.reference.local_features import one_to_one as one_to_one_reference
 from tests.reference.lpm import passes
-from tests.variants import built, variants
+from tests.variants import built, loaded, variants
 
 
 def test_ratio_is_strict_and_refuses_nan() -> None:
@@ -35,7 +35,7 @@ def test_ratio_is_strict_and_refuses_nan() -> None:
     assert pruning.ratio_test(ratio, 0.8, torch.tensor([[False, True, True, True, True]])).sum() == 1
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_ratio_and_mutual_stages_equal_their_definitions(seed: int) -> None:
     rng = np.random.default_rng(seed)
     d0, d1 = rng.random((30, 8), np.float32), rng.random((24 + seed, 8), np.float32)
@@ -67,17 +67,9 @@ def test_one_to_one_equals_the_definition(data: st.DataObject, n: int) -> None:
     np.testing.assert_array_equal(mask[0], one_to_one_reference(x0, x1, ratio))
 
 
-def duplicated(n: int, dtype: torch.dtype = torch.float32) -> Correspondences:
-    """Points drawn from few locations, so that most locations repeat; no two ratios are equal."""
-    generator = torch.Generator().manual_seed(0)
-    places = 100 * torch.rand(2, n // 3, 2, generator=generator, dtype=dtype)
-    x0, x1 = (at[torch.randint(0, n // 3, (n,), generator=generator)][None] for at in places)
-    ratio = torch.randperm(n, generator=generator).to(dtype)[None] / n
-    return Correspondences(x0, x1, torch.ones(1, n, dtype=torch.bool), ratio, mutual=ratio < 0.5)
-
-
 def test_stages_are_their_functions_need_their_fields_and_keep_the_rest() -> None:
-    c = duplicated(20)
+    c = scene(0, 20)
+    c = c.replace(x0=c.x0.flip(1).where(c.mutual[..., None], c.x0[:, :1]))  # several matches at one place
     ratio, unique = pruning.ratio_test(c.ratio, 0.5), pruning.one_to_one(c.x0, c.x1, c.ratio)
     stages = [(pruning.RatioTest(0.5), "ratio", ratio), (pruning.OneToOne(), "ratio", unique)]
     for stage, field, expected in (*stages, (pruning.MutualCheck(), "mutual", c.mutual)):
@@ -88,7 +80,10 @@ def test_stages_are_their_functions_need_their_fields_and_keep_the_rest() -> Non
             stage(c.replace(**{field: None}))
 
 
-PRUNERS = variants("pruner")
+SOFT = [name for name in variants("pruner") if name.endswith(":soft=true")]
+HARD = {name.partition(":")[0] for name in SOFT if "network" in loaded("pruner", name)}
+"""Learned ones, whose mask is a threshold on the probabilities of their soft form."""
+PRUNERS = [name for name in variants("pruner") if name not in HARD or name == "lc"]
 PER_MATCH = ("x0", "x1", "ratio", "prior", "lafs0", "lafs1", "mutual")
 H, W = 640, 960
 
@@ -132,28 +127,32 @@ def test_matches_that_all_move_alike_in_one_cell_are_kept(name: str) -> None:
 MOST = [name for name in PRUNERS if name != "code" and not name.startswith(("clnet", "ncmnet"))]
 MANY = """
 import sys, torch
+from tests.processes import run_command
 from tests.laws import calibrated, quick_pruner, scene
+
+def peak():  # not ru_maxrss, which a process inherits from the one that started it
+    return 1024 * int(next(line.split()[1] for line in open("/proc/self/status") if line.startswith("VmHWM")))
+
 torch.set_num_threads(1)
-many = calibrated(scene(1, 50_000))
+many, before = calibrated(scene(1, 50_000)), peak()
 for name in sys.argv[1:]:
     stage = quick_pruner(name)
     framed = {} if name == "frame_consistency" else {"lafs0": None, "lafs1": None}  # the scene's frames are random
     pruned = stage(many.replace(**framed))
     assert 0 < int(pruned.mask.sum()) <= 50_000, name
     assert pruned.prior is None or bool(torch.isfinite(pruned.prior).all()), name
-    # Not ru_maxrss, which a process inherits from the one that started it.
-    print(name, next(line.split()[1] for line in open("/proc/self/status") if line.startswith("VmHWM")))
+    print(name, peak() - before)
 """
 
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="peak memory is read from /proc")
-def test_many_matches_in_bounded_memory() -> None:
+def test_many_matches_in_bounded_memory(tmp_path: Path) -> None:
     """50,000 matches: a table of pairs of matches would take 2.5 GB even at a byte each."""
-    result = subprocess.run([sys.executable, "-c", MANY, *MOST], capture_output=True, text=True, check=False)
+    result = run_command("-c", MANY, *MOST, cwd=tmp_path)
     assert result.returncode == 0, result.stderr
-    peaks = {line.split()[0]: int(line.split()[1]) * 1024 for line in result.stdout.splitlines()}
-    assert list(peaks) == MOST
-    assert max(peaks.values()) < 1.5e9, peaks
+    growth = {line.split()[0]: int(line.split()[1]) for line in result.stdout.splitlines()}
+    assert list(growth) == MOST
+    assert max(growth.values()) < 0.8e9, growth
 
 
 SIZE = (640, 960)  # of the images of a scene
@@ -172,9 +171,7 @@ def inputs() -> Iterator[tuple[str, Correspondences]]:
     yield "double precision", scene(3, 300).replace(x0=scene(3, 300).x0.double() + 1e-9, x1=scene(3, 300).x1.double())
 
 
-def pairs(
-    real_matches: list[tuple[Correspondences, Tensor]],
-) -> Iterator[tuple[str, Correspondences, int, np.ndarray, np.ndarray, np.ndarray]]:
+def pairs(real_matches: list[tuple[Correspondences, Tensor]]) -> Iterator[Any]:
     """Every pair of the inputs: its name, its batch and place there, and slots, x0, x1 of its finite matches."""
     for what, c in [*inputs(), *((f"real pair {i}", c) for i, (c, _) in enumerate(real_matches))]:
         finite = c.mask & torch.isfinite(c.x0).all(-1) & torch.isfinite(c.x1).all(-1)
@@ -200,7 +197,7 @@ def test_gms(real_matches: list[tuple[Correspondences, Tensor]]) -> None:
             c.x0, c.x1, size0=c.size0, size1=c.size1, mask=c.mask, threshold_factor=3.0, with_rotation=searched,
             with_scale=searched, border="authors" if searched else "opencv",
         )[i]  # fmt: skip
-        expected = gms_reference(x0, x1, *sizes, searched, searched, 3.0, authors=searched)  # type: ignore[arg-type]
+        expected = gms_reference(x0, x1, sizes, searched, 3.0, authors=searched)  # type: ignore[arg-type]
         expect_mask(mask, slots, expected, what)
 
 
@@ -236,7 +233,7 @@ def test_agreement(ratios: bool) -> None:
         x0, x1, A0, A1 = (t[0].double().numpy() for t in (c.x0, c.x1, c.lafs0[..., :2], c.lafs1[..., :2]))
         by_frames = consistency.agreement(x0, x1, A1 @ np.linalg.inv(A0), vote, CURVES, WINDOW, TOLERANCE, NOISE)
         similarity = consistency.similarity(x0, x1, CURVES, TURNS, SCALES)
-        by_motion = consistency.agreement_of_positions(x0, x1, similarity, vote, CURVES, WINDOW, TOLERANCE, NOISE)
+        by_motion = consistency.agreement(x0, x1, similarity, vote, CURVES, WINDOW, TOLERANCE, NOISE)
         frames = pruning.frame_agreement(c.x0, c.x1, c.lafs0, c.lafs1, ratio, c.mask)[0]
         # float32: coordinates of 1e3 px are rounded to 6e-5 px, against lengths of at least 4 px
         np.testing.assert_allclose(frames, by_frames, rtol=1e-3, atol=1e-5, err_msg=what)
@@ -252,12 +249,9 @@ def test_is_its_formula() -> None:
     lafs0, lafs1 = (torch.from_numpy(rng.normal(size=(2, 50, 2, 3)) * 20) for _ in range(2))
     ratio, prior = (torch.from_numpy(rng.random((2, 50))) for _ in range(2))
     noise = pruning.match_noise(lafs0, lafs1, ratio, prior, **NUMBERS)
-    for b in range(2):
-        for i in range(50):
-            scales = [math.sqrt(abs(np.linalg.det(lafs[b, i, :, :2].numpy()))) for lafs in (lafs0, lafs1)]
-            r, P = float(ratio[b, i]), max(float(prior[b, i]), 0.02)
-            expected = (1 + max(scales) / 15) * (1 + 0.65 * r) ** 2 * P**-0.25 / 4.06
-            assert float(noise[b, i]) == pytest.approx(expected, rel=1e-9)
+    scales = torch.stack([lafs[..., :2].det().abs().sqrt() for lafs in (lafs0, lafs1)])
+    expected = (1 + scales.amax(0) / 15) * (1 + 0.65 * ratio) ** 2 * prior.clamp(0.02) ** -0.25 / 4.06
+    torch.testing.assert_close(noise, expected, rtol=1e-9, atol=0)
     inputs = [x[:1, :8].clone().requires_grad_() for x in (lafs0, lafs1, ratio, prior)]
     assert torch.autograd.gradcheck(lambda *x: pruning.match_noise(*x, **NUMBERS), inputs)
 
@@ -286,7 +280,7 @@ def _noisy_pair(seed: int) -> tuple[torch.Tensor, ...]:
 def test_known_noise_makes_estimates_more_exact() -> None:
     size = torch.tensor([[800, 1000]])
     errors = []
-    for seed in range(12):
+    for seed in range(6):
         x0, x1, F, noise = _noisy_pair(seed)
         row = []
         for given_noise in (None, noise):
@@ -296,22 +290,3 @@ def test_known_noise_makes_estimates_more_exact() -> None:
         errors.append(row)
     without, with_noise = np.median(errors, 0)
     assert with_noise < 0.6 * without
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_one_to_one_is_symmetric_and_independent_of_order(dtype: torch.dtype) -> None:
-    c = duplicated(200, dtype)
-    kept = pruning.one_to_one(c.x0, c.x1, c.ratio)
-    assert 0 < kept.sum() < 200
-    assert torch.equal(kept, pruning.one_to_one(c.x1, c.x0, c.ratio))
-    order = torch.randperm(200, generator=torch.Generator().manual_seed(1))
-    assert torch.equal(kept[:, order], pruning.one_to_one(*(a[:, order] for a in (c.x0, c.x1, c.ratio))))
-    for x in (c.x0, c.x1):
-        assert len(torch.unique(x[kept], dim=0)) == kept.sum()
-
-
-def test_one_to_one_drops_what_has_no_location_and_ranks_nan_ratio_last() -> None:
-    x0 = torch.tensor([[[math.nan, 0.0], [math.inf, 0.0], [1.0, 1.0], [1.0, 1.0]]])
-    x1 = torch.arange(8.0).reshape(1, 4, 2)
-    ratio = torch.tensor([[0.0, 0.0, math.nan, 0.9]])
-    assert pruning.one_to_one(x0, x1, ratio).tolist() == [[False, False, False, True]]

@@ -20,9 +20,9 @@ from tests.laws import scene
 K = torch.tensor([[[800.0, 0, 480], [0, 800, 320], [0, 0, 1]]])
 SIDE = ["ratio", "mutual", "scale", "rotation", "agreement"]
 VARIANTS: dict[str, Callable[[], nn.Module]] = {
-    "lc": lambda: LC(channels=16, blocks=3, coordinates="K", side=SIDE),
-    "dfe": lambda: DFE(widths=(16, 32), iterations=3, side=SIDE),
-    "convmatch": lambda: ConvMatch(channels=16, layers=2, grid=4, side=SIDE),
+    "lc": lambda: LC(channels=16, blocks=2, coordinates="K", side=SIDE),
+    "dfe": lambda: DFE(widths=(16, 32), iterations=2, side=SIDE),
+    "convmatch": lambda: ConvMatch(channels=16, layers=1, grid=4, side=SIDE),
 }
 
 
@@ -143,7 +143,7 @@ def test_a_missing_file_says_what_makes_it(tmp_path: Path, runtime: str) -> None
 
 def test_a_file_of_another_network_or_of_none(files: tuple[nn.Module, Path], tmp_path: Path) -> None:
     _, path = files
-    wide = LC(channels=32, blocks=3)
+    wide = LC(channels=32, blocks=2)
     for runtime in ("torch", "onnx"):
         with pytest.raises(NetworkFileError, match=r"holds .*\[?(16|3).*names .*'channels': 32"):
             LearnedPruner(wide, file=path, runtime=runtime)(scene(0))
@@ -208,7 +208,7 @@ def test_identity_is_the_file_and_the_options(files: tuple[nn.Module, Path], tmp
     assert configuration(pruner) == configuration(LearnedPruner(small(path.name, seed=5), file=path))
     assert configuration(pruner) != configuration(LearnedPruner(network, file=path, threshold=0.5))
     assert len(learned(pruner)) == 2  # both files
-    other = LC(channels=16, blocks=3, coordinates="K", side=["rotation"])
+    other = LC(channels=16, blocks=2, coordinates="K", side=["rotation"])
     assert configuration(pruner) != configuration(LearnedPruner(other, file=path))
     for suffix in (".onnx", ".safetensors"):
         (tmp_path / path.name).with_suffix(suffix).write_bytes(path.with_suffix(suffix).read_bytes() + b" ")

@@ -1,7 +1,5 @@
 """The soft form of the pruners: their evidence, its calibration, and the filter that makes it hard again."""
 
-import itertools
-
 import numpy as np
 import pytest
 import torch
@@ -13,7 +11,7 @@ from fmtorch.pruning.consistency import CURVES, MIN_VOTE, NOISE, TOLERANCE, TURN
 from tests.laws import scene
 from tests.pruning.test_gms import SIZE0, SIZE1, moving, moving_along
 from tests.reference import consistency as reference
-from tests.reference.gms import SCALES, normalised, run, support
+from tests.reference.gms import support
 from tests.variants import built
 
 
@@ -87,16 +85,13 @@ def test_gradients_of_a_calibrated_score(share: float) -> None:
 
 @pytest.mark.parametrize(("angle", "scale"), [(0.0, 1.0), (np.pi / 2, 0.5)])
 def test_gms_support_equals_the_definition(angle: float, scale: float) -> None:
-    x0, x1 = moving(0, 400, angle, scale)
+    x0, x1 = moving(0, 150, angle, scale)
     searched = angle != 0
     computed = gms_support(
         x0[None], x1[None], size0=torch.tensor([SIZE0]), size1=torch.tensor([SIZE1]),
         with_rotation=searched, with_scale=searched, threshold_factor=2.0,
     )[0]  # fmt: skip
-    p0, p1 = normalised(x0.numpy(), SIZE0), normalised(x1.numpy(), SIZE1)
-    hypotheses = list(itertools.product(SCALES, range(8))) if searched else [(1.0, 0)]
-    winner = max(hypotheses, key=lambda h: run(p0, p1, *h, 2.0, False).sum())  # the first of equals
-    z = np.array(support(x0.numpy(), x1.numpy(), SIZE0, SIZE1, *winner))
+    z = np.array(support(x0.numpy(), x1.numpy(), (SIZE0, SIZE1), searched, 2.0))
     np.testing.assert_allclose(computed, z / (z + 1.5), rtol=1e-6)  # float64 rounded to float32
 
 
@@ -137,11 +132,7 @@ def test_a_stage_that_would_do_nothing_is_refused() -> None:
             stage(soft=True)
 
 
-PRIORS = {
-    "frame_consistency": ("x0", "x1", "lafs0"),
-    "position_consistency": ("x0",),
-    "match_noise": ("lafs0", "prior"),
-}
+PRIORS = {"frame_consistency": "x0 x1 lafs0", "position_consistency": "x0", "match_noise": "lafs0 prior"}
 
 
 @pytest.mark.parametrize("name", PRIORS)
@@ -150,7 +141,7 @@ def test_gradients_are_finite_beside_padding_and_what_is_no_frame(name: str) -> 
     lafs0, mask = c.lafs0.clone(), c.mask.clone()
     lafs0[:, 3], lafs0[:, 4], mask[:, 5:9] = torch.nan, 0.0, False
     c = c.replace(lafs0=lafs0, mask=mask)
-    fields = {field: getattr(c, field).clone().requires_grad_() for field in PRIORS[name]}
+    fields = {field: getattr(c, field).clone().requires_grad_() for field in PRIORS[name].split()}
     pruned = presets.build("pruner", name)(c.replace(**fields))
     (pruned.noise if name == "match_noise" else pruned.prior).sum().backward()
     for value in fields.values():
@@ -195,8 +186,7 @@ def test_gradients_are_those_of_the_definition(frames: bool) -> None:
     weight = torch.linspace(-1, 1, 30, dtype=torch.float64)
 
     def defined(x0: np.ndarray, x1: np.ndarray, ratio: np.ndarray, **lafs: np.ndarray) -> float:
-        S = reference.similarity(x0[0], x1[0], CURVES, TURNS, fmtorch.pruning.consistency.SCALES)
-        maps = np.tile([[S.real, -S.imag], [S.imag, S.real]], (30, 1, 1))
+        maps = reference.similarity(x0[0], x1[0], CURVES, TURNS, fmtorch.pruning.consistency.SCALES)
         if frames:
             maps = lafs["lafs1"][0, :, :, :2] @ np.linalg.inv(lafs["lafs0"][0, :, :, :2])
         vote = np.maximum(WORST_RATIO - ratio[0], MIN_VOTE)
@@ -205,7 +195,7 @@ def test_gradients_are_those_of_the_definition(frames: bool) -> None:
     (function(**fields, mask=c.mask)[0] * weight).sum().backward()
     rng, step = np.random.default_rng(0), 1e-5
     for name, tensor in fields.items():
-        for place in rng.choice(tensor.numel(), 3, replace=False):
+        for place in rng.choice(tensor.numel(), 2, replace=False):
             values = []
             for change in (step, -step):
                 arrays = {other: value.detach().numpy().copy() for other, value in fields.items()}

@@ -47,8 +47,8 @@ def agreement(
     return total / np.maximum(votes, np.finfo(float).tiny)
 
 
-def similarity(p0: np.ndarray, p1: np.ndarray, curves: Sequence[Any], turns: int, scales: Any) -> complex:
-    """The common turn and scale, a complex number: the best bin of the product of both images' smoothed histograms."""
+def similarity(p0: np.ndarray, p1: np.ndarray, curves: Sequence[Any], turns: int, scales: Any) -> np.ndarray:
+    """The common turn and scale as maps (N, 2, 2): the best bin of the product of both images' smoothed histograms."""
     product = np.ones((len(scales), turns))
     for points in (p0, p1):
         order = morton_order(points, *curves[0])
@@ -67,13 +67,5 @@ def similarity(p0: np.ndarray, p1: np.ndarray, curves: Sequence[Any], turns: int
         product *= smooth
     bins, identity = product.size, len(scales) // 2 * turns
     best = max(range(bins), key=lambda i: (product.flat[i], -((identity - i) % bins)))  # the identity, of equals
-    return scales[best // turns] * np.exp(2j * np.pi * (best % turns) / turns)
-
-
-def agreement_of_positions(
-    x0: np.ndarray, x1: np.ndarray, S: complex, vote: np.ndarray, curves: Sequence[Any],
-    window: int, tolerance: float, noise: float,
-) -> np.ndarray:  # fmt: skip
-    """The weighted share of neighbours along the curves whose displacement the similarity S predicts."""
-    maps = np.tile([[S.real, -S.imag], [S.imag, S.real]], (len(x0), 1, 1))
-    return agreement(x0, x1, maps, vote, curves, window, tolerance, noise)
+    S = scales[best // turns] * np.exp(2j * np.pi * (best % turns) / turns)
+    return np.tile([[S.real, -S.imag], [S.imag, S.real]], (len(p0), 1, 1))

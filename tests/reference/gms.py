@@ -1,5 +1,6 @@
 """Grid-based motion statistics (Bian et al., CVPR 2017), one cell at a time, for one pair."""
 
+import itertools
 import math
 from collections import Counter
 
@@ -28,75 +29,68 @@ def cell(point: np.ndarray, grid: int, shift: tuple[float, float], drop_half_cel
     return place[0], place[1]
 
 
+class Motion:
+    """The cells of all matches for one scale and one shift of the first grid, and the counts of matches in them."""
+
+    def __init__(self, p0: np.ndarray, p1: np.ndarray, scale: float, shift: tuple[float, float], authors: bool) -> None:
+        self.side = int(GRID * scale)  # of the second grid
+        left = [cell(p, GRID, shift, authors) for p in p0]
+        right = [cell(p, self.side, (0.0, 0.0), False) for p in p1]
+        self.cells = {i: (a, b) for i, (a, b) in enumerate(zip(left, right, strict=True)) if a and b}
+        self.moves, self.filled = Counter(self.cells.values()), Counter(a for a, _ in self.cells.values())
+
+    def support(self, a: tuple[int, int], b: tuple[int, int], turn: int) -> tuple[int, float]:
+        """The matches that move from the cells around a to those around b, turned; the mean number in the former."""
+        score, total, pairs = 0, 0, 0
+        for j, (dx, dy) in enumerate((*RING, (0, 0))):
+            ex, ey = RING[(j - turn) % 8] if j < 8 else (0, 0)
+            na, nb = (a[0] + dx, a[1] + dy), (b[0] + ex, b[1] + ey)
+            if min(*na, *nb) >= 0 and max(na) < GRID and max(nb) < self.side:
+                score, total, pairs = score + self.moves[na, nb], total + self.filled[na], pairs + 1
+        return score, total / pairs
+
+
 def run(p0: np.ndarray, p1: np.ndarray, scale: float, turn: int, factor: float, authors: bool) -> np.ndarray:
     """The mask for one scale and one rotation (in steps of 45 degrees)."""
     kept = np.zeros(len(p0), bool)
-    grid1 = int(GRID * scale)
     for shift in SHIFTS:
-        left = [cell(p, GRID, shift, authors) for p in p0]
-        right = [cell(p, grid1, (0.0, 0.0), False) for p in p1]
-        both = [(a, b) for a, b in zip(left, right, strict=True) if a is not None and b is not None]
-        moves, filled = Counter(both), Counter(a for a, _ in both)
+        motion = Motion(p0, p1, scale, shift, authors)
         partner = {}
-        for a in filled:
-            counts = {b: n for (start, b), n in moves.items() if start == a}
-            best = min(counts, key=lambda b: (-counts[b], b[1] * grid1 + b[0]))
-            score, total, pairs = 0, 0, 0
-            for j, (dx, dy) in enumerate((*RING, (0, 0))):
-                ex, ey = RING[(j - turn) % 8] if j < 8 else (0, 0)
-                na, nb = (a[0] + dx, a[1] + dy), (best[0] + ex, best[1] + ey)
-                if min(*na, *nb) < 0 or max(na) >= GRID or max(nb) >= grid1:
-                    continue
-                score, total, pairs = score + moves[na, nb], total + filled[na], pairs + 1
-            if score >= factor * math.sqrt(total / pairs):
+        for a in motion.filled:
+            counts = {b: n for (start, b), n in motion.moves.items() if start == a}
+            best = min(counts, key=lambda b: (-counts[b], b[1] * motion.side + b[0]))
+            score, mean = motion.support(a, best, turn)
+            if score >= factor * math.sqrt(mean):
                 partner[a] = best
-        for i, (start, end) in enumerate(zip(left, right, strict=True)):
-            if start is not None and end is not None and partner.get(start) == end:
-                kept[i] = True
+        for i, (start, end) in motion.cells.items():
+            kept[i] |= partner.get(start) == end
     return kept
 
 
-def gms(
-    x0: np.ndarray,
-    x1: np.ndarray,
-    size0: tuple[int, int],
-    size1: tuple[int, int],
-    with_rotation: bool,
-    with_scale: bool,
-    factor: float,
-    authors: bool,
-) -> np.ndarray:
-    """The mask with most matches over the hypotheses, the first of equals."""
-    p0, p1 = normalised(x0, size0), normalised(x1, size1)
-    best = np.zeros(len(x0), bool)
-    for scale in SCALES if with_scale else SCALES[:1]:
-        for turn in range(8 if with_rotation else 1):
-            kept = run(p0, p1, scale, turn, factor, authors)
-            if kept.sum() > best.sum():
-                best = kept
-    return best
+Sizes = tuple[tuple[int, int], tuple[int, int]]
 
 
-def support(
-    x0: np.ndarray, x1: np.ndarray, size0: tuple[int, int], size1: tuple[int, int], scale: float, turn: int
-) -> list[float]:
-    """The mean over the shifted grids of (score - 1) / sqrt(mean, at least 1) at each match's own cells."""
-    p0, p1 = normalised(x0, size0), normalised(x1, size1)
-    grid1 = int(GRID * scale)
+def hypotheses(searched: bool) -> list[tuple[float, int]]:
+    """Scales and turns."""
+    return list(itertools.product(SCALES, range(8))) if searched else [(1.0, 0)]
+
+
+def gms(x0: np.ndarray, x1: np.ndarray, sizes: Sizes, searched: bool, factor: float, authors: bool) -> np.ndarray:
+    """The mask with most matches over the hypotheses, the first of equals; searched: over turns and scales."""
+    p0, p1 = normalised(x0, sizes[0]), normalised(x1, sizes[1])
+    masks = [run(p0, p1, scale, turn, factor, authors) for scale, turn in hypotheses(searched)]
+    return max(masks, key=lambda kept: int(kept.sum()))
+
+
+def support(x0: np.ndarray, x1: np.ndarray, sizes: Sizes, searched: bool, factor: float) -> list[float]:
+    """The mean over the shifted grids of (score - 1) / sqrt(mean, at least 1) at each match's own cells, for the
+    hypothesis whose mask has most matches."""
+    p0, p1 = normalised(x0, sizes[0]), normalised(x1, sizes[1])
+    scale, turn = max(hypotheses(searched), key=lambda h: int(run(p0, p1, h[0], h[1], factor, False).sum()))
     total = [0.0] * len(x0)
     for shift in SHIFTS:
-        left = [cell(p, GRID, shift, False) for p in p0]
-        right = [cell(p, grid1, (0.0, 0.0), False) for p in p1]
-        both = [(a, b) for a, b in zip(left, right, strict=True) if a is not None and b is not None]
-        moves, filled = Counter(both), Counter(a for a, _ in both)
-        for i, (a, b) in enumerate(zip(left, right, strict=True)):
-            if a is None or b is None:
-                continue
-            score, count, pairs = 0, 0, 0
-            for j, (dx, dy) in enumerate((*RING, (0, 0))):
-                ex, ey = RING[(j - turn) % 8] if j < 8 else (0, 0)
-                na, nb = (a[0] + dx, a[1] + dy), (b[0] + ex, b[1] + ey)
-                if min(*na, *nb) >= 0 and max(na) < GRID and max(nb) < grid1:
-                    score, count, pairs = score + moves[na, nb], count + filled[na], pairs + 1
-            total[i] += (score - 1) / math.sqrt(max(count / pairs, 1)) / 4
+        motion = Motion(p0, p1, scale, shift, False)
+        for i, (a, b) in motion.cells.items():
+            score, mean = motion.support(a, b, turn)
+            total[i] += (score - 1) / math.sqrt(max(mean, 1)) / 4
     return total

@@ -4,19 +4,20 @@ import itertools
 import math
 
 import numpy as np
-from scipy.ndimage import correlate, correlate1d, gaussian_filter, map_coordinates, sobel
+from scipy import ndimage
 from scipy.spatial.distance import cdist
 
 
 def blur(image: np.ndarray, sigma: float) -> np.ndarray:
     """Gaussian of 3 sigma half length, borders continued."""
-    return np.asarray(gaussian_filter(image, sigma, mode="nearest", radius=math.ceil(3 * sigma)))
+    return ndimage.gaussian_filter(image, sigma, mode="nearest", radius=math.ceil(3 * sigma))
 
 
 def hessian_determinant(image: np.ndarray) -> np.ndarray:
-    yy, xx = (correlate1d(image, [1, -2, 1], axis) for axis in (0, 1))
-    xy = correlate(image, np.outer([-1, 0, 1], [-1, 0, 1]) / 4)
-    return np.pad((yy * xx - xy**2)[1:-1, 1:-1], 1)
+    """Of differences of neighbours; 0 at the border."""
+    yy, xx = (ndimage.correlate1d(image, [1, -2, 1], axis) for axis in (0, 1))
+    xy = ndimage.correlate1d(ndimage.correlate1d(image, [-0.5, 0, 0.5], 0), [-0.5, 0, 0.5], 1)
+    return np.pad((xx * yy - xy**2)[1:-1, 1:-1], 1)
 
 
 def hessian_keypoints(image: np.ndarray, threshold: float, levels: int = 3, sigma: float = 1.6) -> np.ndarray:
@@ -32,8 +33,7 @@ def hessian_keypoints(image: np.ndarray, threshold: float, levels: int = 3, sigm
         volume = np.stack([b**4 * hessian_determinant(layer) for b, layer in zip(blurs, stack, strict=True)])
         ended = {}
         for at in itertools.product(*(range(1, n - 1) for n in volume.shape)):
-            around = volume[tuple(slice(i - 1, i + 2) for i in at)]
-            if volume[at] > threshold and around.argmax() == around.size // 2:  # the first of equals
+            if volume[at] > threshold and _is_maximum(volume, at):
                 refined = _refine(volume, at)
                 if refined is not None and refined[2] > threshold:
                     ended[refined[0]] = refined[1:]
@@ -43,6 +43,18 @@ def hessian_keypoints(image: np.ndarray, threshold: float, levels: int = 3, sigm
         level = stack[levels][::2, ::2]
         spacing *= 2
     return np.array(keypoints).reshape(-1, 4)
+
+
+def _is_maximum(volume: np.ndarray, at: tuple[int, ...]) -> bool:
+    before = True
+    for step in itertools.product((-1, 0, 1), repeat=3):
+        if step == (0, 0, 0):
+            before = False
+            continue
+        other = volume[tuple(a + d for a, d in zip(at, step, strict=True))]
+        if other > volume[at] or (before and other == volume[at]):
+            return False
+    return True
 
 
 def _refine(volume: np.ndarray, at: tuple[int, ...]) -> tuple[tuple[int, ...], np.ndarray, float] | None:
@@ -83,25 +95,22 @@ def patch(image: np.ndarray, laf: np.ndarray, size: int = 32, blur_pixels: float
     for i, j in itertools.product(range(size), repeat=2):
         u, v = np.meshgrid((2 * (j + steps) + 1) / size - 1, (2 * (i + steps) + 1) / size - 1)
         points = np.stack([u, v], -1) @ laf[:, :2].T + laf[:, 2]
-        samples = map_coordinates(image, [points[..., 1], points[..., 0]], order=1, mode="nearest")
-        out[i, j] = weight @ samples @ weight
+        out[i, j] = weight @ ndimage.map_coordinates(image, points[..., ::-1].T, order=1, mode="nearest").T @ weight
     return out
 
 
 def dominant_gradient(pixels: np.ndarray, bins: int = 36) -> float:
     """Direction of the dominant gradient, counter-clockwise on the screen."""
     size = len(pixels)
-    gradient_y, gradient_x = (sobel(pixels, axis, mode="nearest") / 8 for axis in (0, 1))
+    gx, gy = (ndimage.sobel(pixels, axis, mode="nearest") / 8 for axis in (1, 0))
     histogram = np.zeros(bins)
     for i, j in itertools.product(range(size), repeat=2):
-        gx, gy = gradient_x[i, j], gradient_y[i, j]
         window = math.exp(-((i - (size - 1) / 2) ** 2 + (j - (size - 1) / 2) ** 2) / (2 * (size / 6) ** 2))
-        place = (math.atan2(-gy, gx) % (2 * math.pi)) * bins / (2 * math.pi)
-        low = math.floor(place)
-        histogram[low % bins] += window * math.hypot(gx, gy) * (1 - place + low)
-        histogram[(low + 1) % bins] += window * math.hypot(gx, gy) * (place - low)
-    taps = np.exp(-0.5 * (np.arange(-2, 3) / 1.6) ** 2)
-    smooth = sum(t * np.roll(histogram, k) for k, t in zip(range(-2, 3), taps / taps.sum(), strict=True))
+        place = (math.atan2(-gy[i, j], gx[i, j]) % (2 * math.pi)) * bins / (2 * math.pi)
+        low, vote = math.floor(place), window * math.hypot(gx[i, j], gy[i, j])
+        histogram[low % bins] += vote * (1 - place + low)
+        histogram[(low + 1) % bins] += vote * (place - low)
+    smooth = ndimage.gaussian_filter1d(histogram, 1.6, mode="wrap", radius=2)
     k = int(np.argmax(smooth))
     left, middle, right = smooth[k - 1], smooth[k], smooth[(k + 1) % bins]
     return (k + 0.5 * (left - right) / (left + right - 2 * middle)) * 2 * math.pi / bins
@@ -148,23 +157,22 @@ def vlad(descriptors: np.ndarray, mean: np.ndarray, basis: np.ndarray, centers: 
 
 def two_nearest(descriptors0: np.ndarray, descriptors1: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """For every descriptor of image 0: index of the nearest (lowest on ties), distance to it and to the second."""
-    distances = np.pad(cdist(descriptors0, descriptors1), [(0, 0), (0, 2)], constant_values=np.inf)
-    order = np.argsort(distances, 1, kind="stable")
-    first, second = np.take_along_axis(distances, order[:, :2], 1).T
-    return np.where(np.isinf(first), -1, order[:, 0]), first, second
+    distances = cdist(descriptors0.astype(np.float64), descriptors1.astype(np.float64))
+    ordered = np.sort(np.pad(distances, ((0, 0), (0, 2)), constant_values=np.inf))
+    index = distances.argmin(1) if len(descriptors1) else np.full(len(descriptors0), -1)
+    return index, ordered[:, 0], ordered[:, 1]
 
 
 def ratio_test(descriptors0: np.ndarray, descriptors1: np.ndarray, threshold: float) -> np.ndarray:
     """Which descriptors of image 0 are clearly nearer to their nearest one than to any other."""
     _, first, second = two_nearest(descriptors0, descriptors1)
-    return np.asarray(first < threshold * second)
+    return first < threshold * second
 
 
 def mutual(descriptors0: np.ndarray, descriptors1: np.ndarray) -> np.ndarray:
     """Which descriptors of image 0 are the nearest ones of their nearest ones."""
-    forward, _, _ = two_nearest(descriptors0, descriptors1)
-    backward, _, _ = two_nearest(descriptors1, descriptors0)
-    return np.asarray(backward[forward] == np.arange(len(forward)))
+    forward, backward = two_nearest(descriptors0, descriptors1)[0], two_nearest(descriptors1, descriptors0)[0]
+    return backward[forward] == np.arange(len(forward))
 
 
 def one_to_one(x0: np.ndarray, x1: np.ndarray, ratio: np.ndarray) -> np.ndarray:

@@ -19,7 +19,7 @@ def cost(i: int, x: np.ndarray, y: np.ndarray, members: list[int], K: int, tau: 
     total = 0.0
     for scale, size in enumerate((K + 2, K, K - 2)):
         near_x, near_y = around_x[1 + scale : K + 3 - scale], around_y[1 + scale : K + 3 - scale]
-        common = [j for j in near_x if j in near_y]
+        common = set(near_x) & set(near_y)
         total += (size - len(common) + sum(differs(y[i] - x[i], y[j] - x[j], tau) for j in common)) / size
     return total
 

@@ -8,18 +8,20 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.integrate import trapezoid
 
+Array = np.ndarray
 
-def homogeneous(x: np.ndarray) -> np.ndarray:
+
+def homogeneous(x: Array) -> Array:
     return np.array([x[0], x[1], 1.0])
 
 
-def distance(x: np.ndarray, line: np.ndarray, offset: float = 0.0) -> float:
+def distance(x: Array, line: Array, offset: float = 0.0) -> float:
     """Distance of a point from a line; `offset` is what the released evaluator adds to the length of the normal."""
     with np.errstate(all="ignore"):
         return float(abs(line @ homogeneous(x)) / (math.sqrt(line[0] ** 2 + line[1] ** 2) + offset))
 
 
-def border_points(line: np.ndarray, size: np.ndarray, origin: float) -> tuple[np.ndarray, np.ndarray] | None:
+def border_points(line: Array, size: Array, origin: float) -> tuple[Array, Array] | None:
     """Where a line enters and leaves an image, from left to right (a vertical one downwards); None where it misses."""
     a, b, c = line
     low, high = origin, origin + np.array([size[1], size[0]])
@@ -33,9 +35,7 @@ def border_points(line: np.ndarray, size: np.ndarray, origin: float) -> tuple[np
     return points[0], points[-1]
 
 
-def half_draw(
-    F: np.ndarray, F_other: np.ndarray, size0: np.ndarray, size1: np.ndarray, u: np.ndarray
-) -> tuple[float, float] | None:
+def half_draw(F: Array, F_other: Array, size0: Array, size1: Array, u: Array) -> tuple[float, float] | None:
     """A match exact for F and its distances from the lines of F_other in images 0 and 1."""
     m = np.array([u[0] * size0[1] - 0.5, u[1] * size0[0] - 0.5])
     ends = border_points(F @ homogeneous(m), size1, -0.5)
@@ -46,7 +46,7 @@ def half_draw(
 
 
 def nsgd(
-    F_gt: np.ndarray, F_est: np.ndarray, size0: np.ndarray, size1: np.ndarray, uniforms: np.ndarray, samples: int
+    F_gt: Array, F_est: Array, size0: Array, size1: Array, uniforms: Array, samples: int
 ) -> tuple[float, float, int]:
     """SGD, NSGD (both uncapped) and the number of draws accepted, from uniform numbers (tries, 6)."""
     pixels, diagonals = [], []
@@ -65,9 +65,7 @@ def nsgd(
     return float(np.mean(pixels)), float(np.mean(diagonals)), len(pixels)
 
 
-def half_draw_released(
-    F: np.ndarray, F_other: np.ndarray, size0: np.ndarray, size1: np.ndarray, u: np.ndarray
-) -> float | None:
+def half_draw_released(F: Array, F_other: Array, size0: Array, size1: Array, u: Array) -> float | None:
     m = np.array([np.round(u[0] * size0[1]), np.round(u[1] * size0[0])])
     a, b, c = line = np.array([row[0] * m[0] + row[1] * m[1] + row[2] for row in F])
     ends = border_points(line, size1, 0.5)
@@ -81,9 +79,7 @@ def half_draw_released(
     return (d0 + d1) / 2
 
 
-def nsgd_released(
-    F_gt: np.ndarray, F_est: np.ndarray, size0: np.ndarray, size1: np.ndarray, uniforms: np.ndarray, samples: int
-) -> float:
+def nsgd_released(F_gt: Array, F_est: Array, size0: Array, size1: Array, uniforms: Array, samples: int) -> float:
     """The released evaluator: sizes exchanged with the matrices, the sum divided by `samples`, NaN capped to 1."""
     total, accepted = 0.0, 0
     for u in uniforms:
@@ -98,14 +94,7 @@ def nsgd_released(
 
 
 def inlier_rate(
-    F_gt: np.ndarray,
-    x0: np.ndarray,
-    x1: np.ndarray,
-    inliers: np.ndarray,
-    mask: np.ndarray,
-    size0: np.ndarray,
-    size1: np.ndarray,
-    threshold: float = 0.003,
+    F_gt: Array, x0: Array, x1: Array, inliers: Array, mask: Array, size0: Array, size1: Array, threshold: float = 0.003
 ) -> tuple[float, float]:
     """Shares of ground-truth inliers among the matches, and among those kept."""
     before, after = [], []
@@ -121,35 +110,33 @@ def inlier_rate(
     return tuple(sum(s) / len(s) if s else math.nan for s in (before, after))  # type: ignore[return-value]
 
 
-def recall(nsgd: np.ndarray, threshold: float) -> float:
+def recall(nsgd: Array, threshold: float) -> float:
     return sum(1 for e in nsgd if e < threshold) / len(nsgd)
 
 
-def mean_recall(nsgd: np.ndarray, maximum: float) -> float:
+def mean_recall(nsgd: Array, maximum: float) -> float:
     """Area under the step curve of recall, piece by piece between the sorted errors."""
     edges = [0.0, *sorted(e for e in nsgd if e < maximum), maximum]
     return sum(recall(nsgd, high) * (high - low) for low, high in itertools.pairwise(edges)) / maximum
 
 
-def rotation_angle(R0: np.ndarray, R1: np.ndarray) -> float:
+def rotation_angle(R0: Array, R1: Array) -> float:
     """Degrees, as SuperGlue and LoFTR compute it."""
     return float(np.rad2deg(np.abs(np.arccos(np.clip((np.trace(R0.T @ R1) - 1) / 2, -1.0, 1.0)))))
 
 
-def direction_angle(t0: np.ndarray, t1: np.ndarray) -> float:
+def direction_angle(t0: Array, t1: Array) -> float:
     """Degrees up to the sign of t, as SuperGlue and LoFTR compute it."""
     angle = signed_direction_angle(t0, t1)
     return min(angle, 180 - angle)
 
 
-def signed_direction_angle(t0: np.ndarray, t1: np.ndarray) -> float:
+def signed_direction_angle(t0: Array, t1: Array) -> float:
     """Degrees, at most 180, as PoseBench computes it."""
     return float(np.rad2deg(np.arccos(np.clip(t0 @ t1 / (np.linalg.norm(t0) * np.linalg.norm(t1)), -1.0, 1.0))))
 
 
-def closest_pose_error(
-    poses: list[tuple[np.ndarray, np.ndarray]], R_gt: np.ndarray, t_gt: np.ndarray
-) -> tuple[float, float]:
+def closest_pose_error(poses: list[tuple[Array, Array]], R_gt: Array, t_gt: Array) -> tuple[float, float]:
     """Angles of the pose with the smallest sum of both, as PoseBench judges fundamental matrices; 180 each at most."""
     best = 180.0, 180.0
     for R, t in poses:

@@ -2,10 +2,8 @@
 
 import copy
 import math
-import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -18,6 +16,7 @@ from fmtorch.pruning.networks.layers import ContextBatchNormReLU, ResidualBlock,
 from scripts import convert_checkpoint
 from tests.conftest import oracle
 from tests.laws import scene
+from tests.pruning.networks.test_published import convert
 from tests.reference.pruner_losses import context_batch_norm_relu
 
 
@@ -125,8 +124,9 @@ def test_padding_and_neighbours_change_a_networks_values_by_rounding_alone(netwo
 
 
 @pytest.mark.parametrize("model", ["F_r0.80", "F_rs_r0.80", "F_r1.00"])
-def test_outputs_of_neural_guided_ransac(model: str) -> None:
-    """The authors' weights give the authors' sampling probabilities: float32 against float64 differ by up to 2e-4."""
+def test_outputs_of_neural_guided_ransac(model: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The authors' weights give the authors' sampling probabilities: float32 against float64 differ by up to 2e-4.
+    So do those of their checkpoint, converted: of both in float32."""
     weights = {key: torch.from_numpy(value) for key, value in oracle(f"weights_ngransac_{model}.npz").items()}
     network = LC(side=["ratio"]).eval()
     network.load_state_dict(convert_checkpoint.authors_state("ngransac", network, weights))
@@ -137,12 +137,17 @@ def test_outputs_of_neural_guided_ransac(model: str) -> None:
     for case in cases:
         x0, x1, ratio, size0, size1 = (data[f"{case}.{name}"][None] for name in ("X1", "X2", "ratio", "size1", "size2"))
         mask = torch.ones(x0.shape[:2], dtype=torch.bool)
-        x, _ = network.inputs(Correspondences(x0, x1, mask, ratio=ratio, size0=size0, size1=size1))
+        c = Correspondences(x0, x1, mask, ratio=ratio, size0=size0, size1=size1)
+        x, _ = network.inputs(c)
         torch.testing.assert_close(x[0].mT, data[f"{case}.inp"], rtol=0, atol=1e-6)  # another order of rounding
         with torch.no_grad():
             logit = network.backbone(x.double(), Slots.of(mask, torch.float64))[0, 0]
-        log_probability = torch.nn.functional.logsigmoid(logit).log_softmax(0)
-        torch.testing.assert_close(log_probability, data[f"{case}.logprob_{model}"].double(), rtol=0, atol=2e-4)
+        log_probability, expected = logit.sigmoid().log().log_softmax(0), data[f"{case}.logprob_{model}"].double()
+        torch.testing.assert_close(log_probability, expected, rtol=0, atol=2e-4)
+    torch.save(weights, tmp_path / "weights.net")
+    convert(monkeypatch, "ngransac", tmp_path / "weights.net", tmp_path / "net.safetensors", "--side", "ratio")
+    p = LearnedPruner(LC(side=["ratio"]), file=tmp_path / "net.safetensors").probability(c)[0].double()
+    torch.testing.assert_close((p / p.sum()).log(), expected, rtol=0, atol=4e-4)
 
 
 def matches(counts: tuple[int, ...]) -> Correspondences:
@@ -241,33 +246,10 @@ def test_gradients_are_finite_on_degenerate_pairs(network: DFE) -> None:
     assert all(torch.isfinite(b).all() for b in network.buffers())
 
 
-def convert(checkpoint: Path, out: Path) -> None:
-    """Run the script. Raises SystemExit where that fails."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "argv", ["convert_checkpoint.py", "ngransac", str(checkpoint), str(out), "--side", "ratio"])
-        convert_checkpoint.main()
-
-
-def test_a_checkpoint_of_neural_guided_ransac_becomes_a_pruner(tmp_path: Path) -> None:
-    """Its P(inlier) gives the authors' sampling probabilities."""
-    weights = oracle("weights_ngransac_F_r1.00.npz")
-    torch.save({key: torch.from_numpy(value) for key, value in weights.items()}, tmp_path / "weights.net")
-    convert(tmp_path / "weights.net", tmp_path / "net.safetensors")
-    data = oracle("ngransac_net.npz")
-    names = ("X1", "X2", "ratio", "size1", "size2")
-    x0, x1, ratio, size0, size1 = (torch.from_numpy(data[f"001.{name}"])[None] for name in names)
-    mask = torch.ones(x0.shape[:2], dtype=torch.bool)
-    c = Correspondences(x0, x1, mask, ratio=ratio.double(), size0=size0, size1=size1)
-    p = LearnedPruner(LC(side=["ratio"]), file=tmp_path / "net.safetensors").probability(c)[0].double()
-    expected = data["001.logprob_F_r1.00"].astype(np.float64)
-    computed = (p / p.sum()).log().numpy()
-    np.testing.assert_allclose(computed, expected, rtol=0, atol=4e-4)  # of both float32 against float64: 2e-4 each
-
-
-def test_what_is_no_such_checkpoint_is_told(tmp_path: Path) -> None:
+def test_what_is_no_such_checkpoint_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     torch.save({"conv1.weight": torch.zeros(3)}, tmp_path / "other.net")
     with pytest.raises(SystemExit, match=r"error: no checkpoint of LC\(.*\): p_in\.weight is missing"):
-        convert(tmp_path / "other.net", tmp_path / "out.safetensors")
+        convert(monkeypatch, "ngransac", tmp_path / "other.net", tmp_path / "out.safetensors", "--side", "ratio")
     assert not (tmp_path / "out.safetensors").exists()
 
 
@@ -287,23 +269,17 @@ def one_match(**changes: object) -> Correspondences:
     ).replace(**changes)  # fmt: skip
 
 
-def test_coordinates_by_size() -> None:
-    x, mask = MatchInputs("size")(one_match())
+def test_coordinates_by_size_and_by_the_inverse_of_K_and_side_information() -> None:
+    c = one_match()
+    x, mask = MatchInputs("size")(c)
     expected = [(10 - 100) / 200, (20 - 50) / 200, (30 - 50) / 400, (50 - 200) / 400]
     torch.testing.assert_close(x, torch.tensor(expected)[None, :, None])
     assert mask.all()
-
-
-def test_coordinates_by_calibration_are_the_inverse_of_K() -> None:
-    c = one_match()
-    x, _ = MatchInputs("K")(c)
     ray = torch.linalg.inv(c.K0[0]) @ torch.tensor([10.0, 20, 1])
-    torch.testing.assert_close(x[0, :, 0], torch.tensor([float(ray[0]), float(ray[1]), 30, 50]))
-
-
-def test_side_information() -> None:
+    by_calibration = torch.tensor([float(ray[0]), float(ray[1]), 30, 50])
+    torch.testing.assert_close(MatchInputs("K")(c)[0][0, :, 0], by_calibration)
     inputs = MatchInputs("size", SIDE)
-    x, _ = inputs(one_match())
+    x, _ = inputs(c)
     assert inputs.channels == x.shape[1] == 10
     expected = [0.7, -1, math.log(2), math.cos(math.radians(30)), math.sin(math.radians(30)), -1]
     torch.testing.assert_close(x[0, 4:, 0], torch.tensor(expected))

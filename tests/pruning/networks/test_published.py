@@ -119,8 +119,7 @@ def test_a_step_of_training_has_finite_gradients_and_repeats(name: str) -> None:
     """With pairs of 7 to 20 matches, degenerate ones and none, under the whole objective, also in mixed precision."""
     sound = exact(0, 40, pairs=1).correspondences
     few = [exact(n, n).correspondences for n in (7, 8, 13, 20)]
-    strange = [pair.replace(**sizes(pair)) for pair in degenerate().values()]
-    c = collate([plain(pair) for pair in (sound, *few, *strange)])
+    c = collate([plain(pair) for pair in (sound, *few, *degenerate().values())])
     label = torch.where(c.mask, torch.arange(c.mask.shape[1]) % 2, -1).to(torch.int8)
     batch = LabelledMatches(c, label, exact(0, 40).F.expand(len(c.mask), 3, 3))
     for mixed in (False, True):
@@ -136,11 +135,6 @@ def test_a_step_of_training_has_finite_gradients_and_repeats(name: str) -> None:
         assert all(torch.isfinite(value).all() for value in outcomes[0] if value is not None)
         assert sum(value is None for value in outcomes[0]) == 0
         assert all(torch.equal(a, b) for a, b in zip(*outcomes, strict=True))
-
-
-def sizes(c: Correspondences) -> dict[str, Tensor]:
-    size = torch.tensor([[480, 640]]).expand(len(c.mask), 2)
-    return {"size0": size, "size1": size}
 
 
 def plain(c: Correspondences) -> Correspondences:
@@ -170,30 +164,20 @@ AUTHORS = {
         "{weights_init,weights_iter.0}.l2.{0,1,2}.{conv1.1,conv2.0,conv3.2}.N",
     ],
     "clnet": [
-        "ds_{0,1}.conv.{0.weight,0.bias,1.N}",
-        "ds_{0,1}.gcn.conv.{0.weight,0.bias,1.N}",
-        "ds_{0,1}.embed_{0.0,0.1,0.2,0.3,0.5,0.6,0.7,0.8,1.0}.{right.0,left.0,left.4}.{weight,bias}",
-        "ds_{0,1}.embed_{0.0,0.1,0.2,0.3,0.5,0.6,0.7,0.8,1.0}.left.{2,6}.N",
+        "ds_{0,1}.{conv,gcn.conv}.{0.weight,0.bias,1.N}",
+        "ds_{0,1}.embed_{0.{0,1,2,3,5,6,7,8},1.0}.{{right.0,left.0,left.4}.{weight,bias},left.{2,6}.N}",
         "ds_{0,1}.embed_0.4.conv.{0.weight,0.bias,1.N,3.weight,3.bias,4.N}",
-        "ds_{0,1}.linear_{0,1}.{weight,bias}",
-        "ds_1.embed_2.{left.0,left.4,right.0}.{weight,bias}",
-        "ds_1.embed_2.left.{2,6}.N",
-        "ds_1.linear_2.{weight,bias}",
+        "ds_1.embed_2.{{left.0,left.4,right.0}.{weight,bias},left.{2,6}.N}",
+        "{ds_0.linear_{0,1},ds_1.linear_{0,1,2}}.{weight,bias}",
     ],
     "ncmnet": [
         "ds_{0,1}.{conv,gcn1.conv,gcn2.conv,gs.conv}.{0.weight,0.bias,1.N}",
         "ds_{0,1}.sce{1,2,3,11,22,33}.conv.{0.weight,0.bias,1.N,3.weight,3.bias,4.N}",
-        "ds_{0,1}.cci{1,2,3,11,22,33}.{attq,attk,attv,conv}.{0.weight,0.bias,1.N}",
-        "ds_{0,1}.cci{1,2,3,11,22,33}.gamma",
+        "ds_{0,1}.cci{1,2,3,11,22,33}.{{attq,attk,attv,conv}.{0.weight,0.bias,1.N},gamma}",
         "ds_{0,1}.{down1,up1,down2,up2}.conv.{1.N,3.weight,3.bias}",
-        "ds_{0,1}.{l1,l2}.{0,1}.{conv1.3,conv2.2,conv3.4}.{weight,bias}",
-        "ds_{0,1}.{l1,l2}.{0,1}.{conv1.1,conv2.0,conv3.2}.N",
-        "ds_{0,1}.embed_{00.0,00.1,00.2,01.0,01.1,01.2,02.0,02.1,02.2,1.0}.{left.0,left.4,right.0}.{weight,bias}",
-        "ds_{0,1}.embed_{00.0,00.1,00.2,01.0,01.1,01.2,02.0,02.1,02.2,1.0}.left.{2,6}.N",
-        "ds_{0,1}.{mlp1,mlp2,linear_0,linear_1}.{weight,bias}",
-        "ds_1.embed_2.{left.0,left.4,right.0}.{weight,bias}",
-        "ds_1.embed_2.left.{2,6}.N",
-        "ds_1.linear_2.{weight,bias}",
+        "ds_{0,1}.{l1,l2}.{0,1}.{{conv1.3,conv2.2,conv3.4}.{weight,bias},{conv1.1,conv2.0,conv3.2}.N}",
+        "{ds_{0,1}.embed_{0{0,1,2}.{0,1,2},1.0},ds_1.embed_2}.{{left.0,left.4,right.0}.{weight,bias},left.{2,6}.N}",
+        "{ds_{0,1}.{mlp1,mlp2,linear_0,linear_1},ds_1.linear_2}.{weight,bias}",
     ],
     "convmatch": [
         "{pos_embed.position_encoder,grid_pos_embed.position_encoder,init_project.init_project}.{0,3,6}.{weight,bias}",
