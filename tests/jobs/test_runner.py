@@ -86,10 +86,6 @@ def test_what_ends_its_workers_is_known_and_others_are_done(tmp_path: Path) -> N
     assert len(list(tmp_path.glob("died-*"))) <= 2 * (3 + 2)  # bounded: with its neighbours, its batch, alone
 
 
-def test_a_lone_job_that_ends_its_workers(tmp_path: Path) -> None:
-    assert calls(functools.partial(make_needs, tmp_path), PROCESSES, [[-1]])[:2] == ({}, {-1: DEATH})
-
-
 def test_workers_that_cannot_begin_are_no_pairs_fault(tmp_path: Path) -> None:
     with pytest.raises(WorkersLost, match="the same command goes on"):
         calls(functools.partial(ends, tmp_path), PROCESSES, [[1], [2], [3]])
