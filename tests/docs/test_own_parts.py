@@ -94,6 +94,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("FMTORCH_CACHE", str(own_cache(tmp_path)))
     monkeypatch.setattr("fmtorch.scenes.dataset.PLANS", dict.fromkeys((("small", "test"), ("small", "train")), SMALL))
+    monkeypatch.setattr("fmtorch.jobs.execution.cores", lambda: 1)  # processes would take longer than the work
     monkeypatch.setattr(plt, "show", lambda: plt.close("all"))
     monkeypatch.setitem(mpl.rcParams, "backend", "agg")
 
