@@ -16,7 +16,7 @@ import torch
 
 from fmtorch import data
 from fmtorch.core import Estimator, FeatureExtractor, Matcher, Pruner
-from fmtorch.scenes import Plan
+from fmtorch.scenes import FAMILIES, Plan
 from tests.conftest import own_cache
 from tests.laws import scene
 from tests.processes import run_command
@@ -90,10 +90,12 @@ def code(name: str) -> list[str]:
 
 
 @pytest.fixture
-def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+def run(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Any:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("FMTORCH_CACHE", str(own_cache(tmp_path)))
+    monkeypatch.setenv("FMTORCH_CACHE", str(own_cache(tmp_path_factory.getbasetemp() / "notebooks")))  # scenes of all
     monkeypatch.setattr("fmtorch.scenes.dataset.PLANS", dict.fromkeys((("small", "test"), ("small", "train")), SMALL))
+    two = {name: FAMILIES[name] for name in ("indoor", "driving")}  # others have no pairs in so small a plan
+    monkeypatch.setattr("fmtorch.scenes.dataset.FAMILIES", two)
     monkeypatch.setattr("fmtorch.jobs.execution.cores", lambda: 1)  # processes would take longer than the work
     monkeypatch.setattr(plt, "show", lambda: plt.close("all"))
     monkeypatch.setitem(mpl.rcParams, "backend", "agg")
