@@ -266,6 +266,8 @@ def run_all(page_commands: list[str], workplace: Path, monkeypatch: pytest.Monke
         if words not in RUN:
             run(words, workplace)
             RUN.append(words)
+
+
 @pytest.mark.parametrize("page_commands", parameters(slow=False))
 def test_the_commands_of_a_page_run(page_commands: list[str], workplace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run_all(page_commands, workplace, monkeypatch)
