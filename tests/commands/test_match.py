@@ -6,7 +6,8 @@ import math
 import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -14,7 +15,6 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
-from numpy.typing import NDArray
 from PIL import ExifTags, Image
 
 import fmtorch
@@ -310,7 +310,7 @@ def test_the_pose_of_reduced_photographs_by_what_is_known(pair, pipeline_with_ca
 
 def test_calibrations_follow_the_reduction(pair: ImagePair, pipeline_with_cameras: fmtorch.Pipeline) -> None:
     """Reduced by hand, with K scaled by hand, everything is the same."""
-    images = [fmtorch.data.read_image(image) for image in (pair.image0, pair.image1)]
+    images = [read_image(image) for image in (pair.image0, pair.image1)]
     small = [cv2.resize(image, (768, 512), interpolation=cv2.INTER_AREA) for image in images]
     half = np.array([[0.5, 0, -0.25], [0, 0.5, -0.25], [0, 0, 1]])
     by_hand = fmtorch.match(*small, pipeline=pipeline_with_cameras, K0=half @ pair.K0, K1=half @ pair.K1)
@@ -337,7 +337,7 @@ def test_a_lens_bends_points_and_not_images(pair: ImagePair, pipeline_with_camer
     """Photographs through a lens that distorts: F and the pose are those of pinholes, points those of photographs."""
     K0, K1 = pair.K0, pair.K1
     lenses = [Lens(K[0, 0], K[1, 1], K[0, 2], K[1, 2], "OPENCV", BENT) for K in (K0, K1)]
-    plain = [fmtorch.data.read_image(image) for image in (pair.image0, pair.image1)]
+    plain = [read_image(image) for image in (pair.image0, pair.image1)]
     bent = [photographed(image, lens) for image, lens in zip(plain, lenses, strict=True)]
     given = {"pipeline": pipeline_with_cameras, "longest_side": SIDE}
     result = fmtorch.match(*bent, **given, lens=lenses)
@@ -357,7 +357,7 @@ def test_a_lens_bends_points_and_not_images(pair: ImagePair, pipeline_with_camer
 
 def test_a_lens_that_nobody_calibrated(pair: ImagePair, pipeline_with_cameras: fmtorch.Pipeline) -> None:
     """It is suggested of bent photographs, and estimated; F is then of undistorted points, and pictures straight."""
-    plain = [fmtorch.data.read_image(image) for image in (pair.image0, pair.image1)]
+    plain = [read_image(image) for image in (pair.image0, pair.image1)]
     h, w = plain[0].shape[:2]
     half = math.hypot(h, w) / 2
     division = Lens(half, half, (w - 1) / 2, (h - 1) / 2, "SIMPLE_DIVISION", (-0.1,))
@@ -393,18 +393,13 @@ def with_exif(folder: Path, name: str, **tags: int) -> Path:
     return folder / name
 
 
-class Photographs(NamedTuple):
-    images: list[NDArray[np.uint8]]
-    knowledge: dict[str, Any]
-    notes: list[str]
-
-
-def photographs(paths: list[Path], cameras: Path | None, K: Any) -> Photographs:
+def photographs(paths: list[Path], cameras: Path | None, K: Any) -> SimpleNamespace:
     """As the command reads them."""
     known = PhotographCameras(cameras, K)
-    images = [fmtorch.data.read_image(known.source(path)) for path in paths]
+    images = [read_image(known.source(path)) for path in paths]
     ends = [known.of(path, image.shape[:2]) for path, image in zip(paths, images, strict=True)]
-    return Photographs(images, known.knowledge(*ends), [end.note for end in ends if end.note])
+    notes = [end.note for end in ends if end.note]
+    return SimpleNamespace(images=images, knowledge=known.knowledge(*ends), notes=notes)
 
 
 def test_words_files_and_numbers_as_arguments(tmp_path: Path) -> None:
@@ -438,7 +433,7 @@ def test_distortion_is_taken_out_and_sizes_must_fit(tmp_path: Path) -> None:
     assert bent.knowledge["K0"] is None
     assert "b.jpg: F and the pose are of the image without the distortion of its SIMPLE_RADIAL lens" in bent.notes[1]
     assert bent.knowledge["lens"][1] == Lens(50, 50, 29.5, 19.5, "SIMPLE_RADIAL", (0.2,))
-    assert np.array_equal(bent.images[0], fmtorch.data.read_image(paths[0]))  # as it was taken
+    assert np.array_equal(bent.images[0], read_image(paths[0]))  # as it was taken
     (tmp_path / "cameras.txt").write_text("1 PINHOLE 50 40 50 50 30 20\n")
     with pytest.raises(ImageError, match=r"a\.jpg: 60 x 40 px, but its camera is of 50 x 40"):
         photographs(paths, tmp_path / "cameras.txt", None)

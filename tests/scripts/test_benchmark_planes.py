@@ -81,9 +81,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_pairs_are_of_their_kinds(folder: Path) -> None:
-    items = list(planes.kinds(sorted(folder.iterdir())[:2]))
+    items = list(planes.kinds(sorted(folder.iterdir())[:2]))[:5]
     truths = [item.facts["truth"] for item in items]
-    assert truths == ["planar", "rotation", "identical", "identical", "unrelated"] * 2
+    assert truths == ["planar", "rotation", "identical", "identical", "unrelated"]
     estimator = presets.build("estimator", "fmtorch")
     assert [planes.by_ours(estimator, True, item.matches) for item in items] == truths
     c = items[1].matches
