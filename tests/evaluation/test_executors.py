@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import functools
 import os
 import signal
 import subprocess
@@ -10,7 +9,6 @@ import sys
 import threading
 import time
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -95,11 +93,6 @@ def test_many_pairs_go_to_processes_unless_there_is_a_single_worker(workers, man
     monkeypatch.setattr("fmtorch.jobs.execution.cores", lambda: 2)
     assert Execution("auto", workers).decided(many).kind == kind
     assert Execution("processes", workers).decided(many).kind == "processes"  # as it was asked for
-
-
-def test_rows_of_an_executor_of_ones_own(pairs: list[ImagePair], expected: dict[int, PairRow]) -> None:
-    own = Execution(workers=2, send_images=True, make=functools.partial(ThreadPoolExecutor, 2))
-    assert evaluated(pairs, own) == expected
 
 
 class Cluster:

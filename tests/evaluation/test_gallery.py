@@ -136,18 +136,13 @@ def test_no_pictures_are_explained(tmp_path: Path) -> None:
 
 
 def config(pipeline: str = "sift_ratio", estimator: str = "ransac", **changes: Any) -> dict[str, Any]:
-    ratio, unique = {"_target_": "a.Ratio", "threshold": 0.8}, {"_target_": "a.OneToOne"}
-    stages = {"features": presets.load("features", "sift"), "pruner": [{"ratio": ratio}, {"one_to_one": unique}]}
+    stages = {"features": presets.load("features", "sift"), "pruner": ratio(0.8)}
     stages["estimator"] = presets.load("estimator", estimator)
     return {"pipeline": pipeline, **stages, "seed": 0, "version": "1", **changes}
 
 
 def names(*configs: dict[str, Any]) -> list[str]:
     return run_names(configs, [f"{i}abcdefgh" for i in range(len(configs))])
-
-
-def with_options(estimator: str, **options: Any) -> dict[str, Any]:
-    return {**presets.load("estimator", estimator), **options}
 
 
 def ratio(threshold: float) -> list[dict[str, Any]]:
@@ -178,7 +173,8 @@ def test_names_tell_what_differs() -> None:
 
 
 def test_names_tell_options_of_one_preset_and_classes_of_ones_own() -> None:
-    two = [{**config(), "estimator": with_options("lmeds", hypotheses=n)} for n in (100, 200)]
+    lmeds = presets.load("estimator", "lmeds")
+    two = [{**config(), "estimator": {**lmeds, "hypotheses": n}} for n in (100, 200)]
     assert names(*two) == ["hypotheses=100", "hypotheses=200"]
     assert names(*two, config()) == ["lmeds hypotheses=100", "lmeds hypotheses=200", "ransac"]
     # Unlike its preset, though no other run has that preset.

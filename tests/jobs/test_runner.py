@@ -159,12 +159,8 @@ def test_another_version_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         factory.call(squares, with_factory=True)([1])
 
 
-class Own(ThreadPoolExecutor):
-    """Anybody's executor, which breaks off after some calls."""
-
-
 def test_an_executor_of_ones_own(tmp_path: Path) -> None:
-    execution = Execution(make=functools.partial(Own, 3))
+    execution = Execution(make=functools.partial(ThreadPoolExecutor, 3))
     results: list[int] = []
     source = Factory(functools.partial(make_needs, tmp_path))
     with WorkerPool(execution) as pool:

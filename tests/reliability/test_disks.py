@@ -147,22 +147,12 @@ def test_no_write_that_fails_loses_anything(starter, root, truth, tmp_path, reco
     record_property("writes that failed", number - 1)
 
 
-def two_writers(starter: Starter, root: Path, folder: Path, truth: Rows, seed: int) -> None:
+@pytest.mark.parametrize("runs", [1, pytest.param(10, marks=pytest.mark.reliability)])
+def test_two_writers(runs: int, starter: Starter, root: Path, truth: Rows, tmp_path: Path) -> None:
     """Two evaluations of one run at the same time, which share the work or do it twice."""
-    extra = ["workers=2", "batch=2"] if seed % 2 else []
-    run_dir = folder / f"run{seed}"
-    both = [starter.start(folder, "eval", *evaluation(root, run_dir, *extra)) for _ in range(2)]
-    assert [command.wait() for command in both] == [0, 0], [command.said() for command in both]
-    assert results(run_dir) == truth
-    assert not list(run_dir.glob("**/*.tmp"))
-
-
-def test_two_writers(starter: Starter, root: Path, truth: Rows, tmp_path: Path) -> None:
-    two_writers(starter, root, tmp_path, truth, 0)
-
-
-@pytest.mark.reliability
-def test_two_writers_often(starter, root, truth, tmp_path, record_property):
-    for seed in range(1, 11):
-        two_writers(starter, root, tmp_path, truth, seed)
-    record_property("runs of two writers", 10)
+    for number in range(runs):
+        words = evaluation(root, tmp_path / f"run{number}", *(["workers=2", "batch=2"] if number % 2 else []))
+        both = [starter.start(tmp_path, "eval", *words) for _ in range(2)]
+        assert [command.wait() for command in both] == [0, 0], [command.said() for command in both]
+        assert results(tmp_path / f"run{number}") == truth
+        assert not list(tmp_path.glob("**/*.tmp"))
