@@ -4,16 +4,17 @@ Rights do not bind an administrator, as whom tests often run; so folders that ca
 read-only, and files that stand in the place of folders. Where nothing may be mounted those tests are skipped.
 """
 
+import contextlib
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from tests.helpers import draw_set
 from tests.processes import Command, Starter
-from tests.reliability.commands import evaluation, parts, remount, results, small_disk
-from tests.reliability.conftest import Rows
+from tests.reliability.conftest import Rows, evaluation, parts, results
 
 
 def may_mount() -> bool:
@@ -25,6 +26,26 @@ def may_mount() -> bool:
 
 
 mounts = pytest.mark.skipif(not may_mount(), reason="file systems may not be mounted here")
+
+
+@contextlib.contextmanager
+def small_disk(folder: Path, kilobytes: int) -> Iterator[Path]:
+    """A file system of so many kilobytes, mounted on the folder. Raises OSError where that is not allowed."""
+    folder.mkdir(parents=True, exist_ok=True)
+    done = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", f"size={kilobytes}k", "tmpfs", str(folder)], capture_output=True, check=False
+    )
+    if done.returncode:
+        raise OSError(done.stderr.decode().strip())
+    try:
+        yield folder
+    finally:
+        subprocess.run(["umount", "-l", str(folder)], check=True)
+
+
+def remount(folder: Path, options: str) -> None:
+    """Change a mounted file system: ``size=9m``, ``ro``, ``rw``."""
+    subprocess.run(["mount", "-o", f"remount,{options}", str(folder)], check=True)
 
 
 def expect_one_line(command: Command, *words: str) -> None:

@@ -3,16 +3,16 @@
 import json
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from tests.helpers import draw_set
 from tests.processes import Command, Starter
-from tests.reliability.commands import delays, evaluation, parts, results
-from tests.reliability.conftest import Rows
+from tests.reliability.conftest import Rows, evaluation, parts, results
 
 EVAL_KILLS, MATCH_KILLS, TRAIN_KILLS, PROCESS_KILLS = (
     int(number) for number in os.environ.get("FMTORCH_KILLS", "40,20,30,10").split(",")
@@ -23,6 +23,13 @@ TRAIN = [
     "validation.uses.hard.estimator=ransac", "validation.uses.prior.estimator=msac", "augmentation.crop=0",
     "features.max_features=300", "pruner.lc.network.channels=8", "pruner.lc.network.blocks=2",
 ]  # fmt: skip
+
+
+def delays(seed: int) -> Iterator[float]:
+    """Seconds between what is waited for and the kill: none at all, within a pair's time, and beyond."""
+    rng = np.random.default_rng(seed)
+    while True:
+        yield float(rng.choice([0.0, 0.0, rng.uniform(0, 0.02), rng.uniform(0, 0.2)]))
 
 
 def bounded_and_whole(bounded: int, whole: int) -> list[Any]:

@@ -95,13 +95,19 @@ def trained(monkeypatch: pytest.MonkeyPatch, folder: Path, *overrides: str, onnx
     return run(compose("train", overrides), "lc")
 
 
+def trained_twice(monkeypatch: pytest.MonkeyPatch, folder: Path, *overrides: str) -> Path:
+    """The same, and once more, which goes on where the first one ended: with the same weights."""
+    output = trained(monkeypatch, folder, *overrides)
+    weights = (output / "lc.safetensors").read_bytes()
+    trained(monkeypatch, folder, *overrides)
+    assert (output / "lc.safetensors").read_bytes() == weights
+    return output
+
+
 def test_the_command_goes_on_and_refuses_another_training(root, tmp_path, monkeypatch):
     options = ["dataset=fmbench", f"dataset.root={root}", *SHORT, *SMALL_LC]
     folder = trained(monkeypatch, tmp_path, *options, onnx=True)
-    weights = (folder / "lc.safetensors").read_bytes()
     assert (folder / "lc.onnx").stat().st_size > 1000
-    trained(monkeypatch, tmp_path, *options)
-    assert (folder / "lc.safetensors").read_bytes() == weights
     with pytest.raises(ValueError, match=r"holds checkpoints of other settings; what differs .*: seed: "):
         trained(monkeypatch, tmp_path, *options, "seed=1")
 
@@ -112,12 +118,8 @@ def test_photographs_join_the_training(root: Path, tmp_path: Path, monkeypatch: 
         draw(tmp_path / "photographs" / name / "a.png", seed=len(name))
     planes = [f"planes.photographs={tmp_path / 'photographs'}", "planes.views=3", "planes.tilt=30"]
     options = ["dataset=fmbench", f"dataset.root={root}", *SHORT, *SMALL_LC, *planes]
-    folder = trained(monkeypatch, tmp_path, *options)
-    weights = (folder / "lc.safetensors").read_bytes()
-    card = (folder / "lc.md").read_text()
+    card = (trained_twice(monkeypatch, tmp_path, *options) / "lc.md").read_text()
     assert re.search(r"3 pairs of 1 scenes of fmbench and [1-6] pairs of [12] photographs seen as planes", card)
-    trained(monkeypatch, tmp_path, *options)
-    assert (folder / "lc.safetensors").read_bytes() == weights
     with pytest.raises(ValueError, match=r"checkpoints of other settings.*matches: "):
         trained(monkeypatch, tmp_path, *options, "planes.seed=1")
 
@@ -138,12 +140,8 @@ def test_oanets_files_are_trained_on(tmp_path: Path, monkeypatch: pytest.MonkeyP
     options = ["dataset=h5", "dataset.layout=oanet", f"dataset.root={root}", "labels=geodesic", *SHORT, "output=out",
                "pruner=lc_e", "pruner.lc_e.network.channels=8", "pruner.lc_e.network.blocks=2", "loaders=1",
                "objective.coordinates=K", f"validation.roots=[{root / 'b.hdf5'}]"]  # fmt: skip
-    folder = trained(monkeypatch, tmp_path, *options)
-    weights = (folder / "lc.safetensors").read_bytes()
-    card = (folder / "lc.md").read_text()
+    card = (trained_twice(monkeypatch, tmp_path, *options) / "lc.md").read_text()
     assert "| trained on | 3 pairs of 1 scenes of h5 |" in card
-    trained(monkeypatch, tmp_path, *options)
-    assert (folder / "lc.safetensors").read_bytes() == weights
     gc.collect()  # Lightning's circles hold the open file
     with h5py.File(root / "b.hdf5", "a") as file:
         del file["ratios"]
