@@ -48,15 +48,15 @@ FILES = {module_name(path): path for path in sorted(PACKAGE.rglob("*.py"))}
 
 
 @functools.cache
-def tree(module: str) -> ast.Module:
-    return ast.parse(FILES[module].read_bytes())
+def nodes(path: Path) -> list[ast.AST]:
+    return list(ast.walk(ast.parse(path.read_bytes())))
 
 
 @functools.cache
 def imported(module: str) -> frozenset[str]:
     """What a file imports, modules of fmtorch by their full names; not the packages on the way to them."""
     names: set[str] = set()
-    for node in ast.walk(tree(module)):
+    for node in nodes(FILES[module]):
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
@@ -116,8 +116,8 @@ MAX_ARGUMENTS = 6  # of a kernel
 
 
 def functions() -> Iterator[tuple[str, ast.FunctionDef]]:
-    for module in FILES:
-        yield from ((f"{module}.{n.name}", n) for n in ast.walk(tree(module)) if isinstance(n, ast.FunctionDef))
+    for module, path in FILES.items():
+        yield from ((f"{module}.{n.name}", n) for n in nodes(path) if isinstance(n, ast.FunctionDef))
 
 
 def test_files_fit_in_the_head_and_functions_on_a_screen() -> None:

@@ -14,6 +14,7 @@ from fmtorch import match
 from fmtorch.pipeline import load_pipeline
 from tests.helpers import draw_set
 from tests.processes import run_command, starter
+from tests.reliability.conftest import Rows, results
 
 OPTIONS = ["features.max_features=500", "estimator=lmeds", "estimator.hypotheses=200"]
 OWN_PRUNER = """import torch
@@ -168,7 +169,6 @@ def test_a_run_in_which_nothing_succeeds_is_told(data: list[str], command: RunCo
 
 
 IMAGES = 15
-Rows = list[dict[str, object]]
 
 
 @pytest.fixture(scope="module")
@@ -190,12 +190,6 @@ def truth(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Rows:
 
 def arguments(root: Path, run_dir: Path, *extra: str) -> list[str]:
     return ["dataset=fmbench", f"dataset.root={root}", *OPTIONS, f"output={run_dir}", *extra]
-
-
-def results(run_dir: Path) -> Rows:
-    """The rows without what depends on the time."""
-    plain = [{k: v for k, v in row.items() if not k.startswith("seconds")} for row in rows(run_dir)]
-    return sorted(plain, key=lambda row: str(row["pair"]))
 
 
 def counted(stdout: str) -> tuple[int, int]:

@@ -168,6 +168,7 @@ def test_the_command_on_two_runs(tmp_path: Path, command: Callable[..., str]) ->
 
 
 SIFT = ("pipeline=sift_ratio", "features.max_features=800", "estimator.hypotheses=100")
+MATCH = ("match", "a.png", "b.png", *SIFT)
 
 
 @pytest.fixture
@@ -177,13 +178,9 @@ def photographs(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def refused(monkeypatch: pytest.MonkeyPatch, folder: Path, *words: str) -> str:
-    return ended(monkeypatch, folder, "match", "a.png", "b.png", *SIFT, *words)
-
-
 def test_paths_with_brackets_are_printed_as_they_are_and_cached_features_take_no_seconds(photographs, command):
     """Brackets are the markup of the library that prints: `[/x]` would end a style, `[red]` begin one."""
-    first, second = (command("match", "a.png", "b.png", *SIFT, "output=m[/x] [red]", cwd=photographs) for _ in range(2))
+    first, second = (command(*MATCH, "output=m[/x] [red]", cwd=photographs) for _ in range(2))
     assert "m[/x] [red]: result.json" in first
     assert (photographs / "m[/x] [red]" / "result.json").is_file()
     keypoints = [next(line for line in said.splitlines() if "keypoints" in line) for said in (first, second)]
@@ -202,7 +199,7 @@ def test_a_broken_preset_is_named(monkeypatch, photographs, content, said):
     preset = photographs / "conf" / "estimator" / "mine.yaml"
     preset.parent.mkdir(parents=True)
     preset.write_bytes(content)
-    end = refused(monkeypatch, photographs, "--config-dir", "conf", "estimator=mine")
+    end = ended(monkeypatch, photographs, *MATCH, "--config-dir", "conf", "estimator=mine")
     assert end.startswith(f"error: {preset}: {said}")
 
 
@@ -228,7 +225,7 @@ def test_before_any_work(monkeypatch: pytest.MonkeyPatch, photographs: Path, wor
     (photographs / "F.txt").write_text("1 2 3")
     (photographs / "bad.onnx").write_bytes((models_dir() / "lc_f.onnx").read_bytes()[:5000])
     monkeypatch.setattr("fmtorch.commands.match.match", lambda *_, **__: pytest.fail("the work was begun"))
-    end = refused(monkeypatch, photographs, *words.split())
+    end = ended(monkeypatch, photographs, *MATCH, *words.split())
     assert end.startswith("error: ")
     assert said in end
     assert "\n" not in end

@@ -14,7 +14,7 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 
-from fmtorch import data
+from fmtorch import data, find_fundamental, presets
 from fmtorch.core import Estimator, FeatureExtractor, Matcher, Pruner
 from fmtorch.scenes import FAMILIES, Plan
 from tests.conftest import own_cache
@@ -61,16 +61,12 @@ PROTOCOLS = {"features": FeatureExtractor, "matcher": Matcher, "pruner": Pruner,
 
 @pytest.mark.parametrize(("group", "protocol"), PROTOCOLS.items())
 def test_each_is_built_by_name_in_python(group, protocol, folder, monkeypatch):
-    from fmtorch import presets
-
     monkeypatch.syspath_prepend(str(folder))
     assert isinstance(presets.build(group, "mine", config_dir=folder / "my_conf"), protocol)
 
 
 @pytest.mark.parametrize("score", ["Welsch", "Triweight"])
 def test_a_score_a_sampler_and_a_rule(score: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from fmtorch import find_fundamental
-
     monkeypatch.syspath_prepend(str(folder))
     preset = folder / "my_conf" / "estimator" / "robust.yaml"
     preset.write_text(preset.read_text().replace("my_robust.Welsch", f"my_robust.{score}"))

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from scripts import draw_reference
-from tests.test_imports import GROUND, MAY_IMPORT
+from tests.test_imports import GROUND, MAY_IMPORT, nodes
 
 SOURCE = Path(__file__).resolve().parents[2]
 DOCS = SOURCE / "docs"
@@ -89,11 +89,6 @@ SETS = {"Fgt", "Strecha_train", "TanksLike"}
 DOTTED = re.compile(r"([A-Za-z_]\w*(?:\.[A-Za-z_]\w*)+)(?:\(.*)?")
 SUFFIXES = "bin|csv|db|h5|html|json|md|npz|onnx|out|partial|parts|png|py|sh|shards|svg|txt|verification"
 FILE = re.compile(rf"[\w.]+\.({SUFFIXES})")
-
-
-@functools.cache
-def nodes(path: Path) -> list[ast.AST]:
-    return list(ast.walk(ast.parse(path.read_bytes())))
 
 
 def docstrings(path: Path) -> Iterator[str]:

@@ -41,13 +41,11 @@ def distribution(root: Path, name: str = "Set", images: int = 3) -> Path:
     return draw_set(root / name, images=images, pairs=[(0, i) for i in range(1, images)])
 
 
-def rows(root: Path, **changes: Any) -> pa.Table:
-    dataset = data.load("fmbench", root=root)
-    pairs = [dataset[i] for i in range(len(dataset))]
-    places = [(p.identity, p.key, p.family, p.scene) for p in pairs]
+def rows(root: Path, failed: bool = False) -> pa.Table:
+    """Of the pairs of a set; failed: the last one is."""
+    places = [(p.identity, p.key, p.family, p.scene) for p in data.load("fmbench", root=root)]
     rows = [PairRow(*place, True, nsgd=0.01 * i, F=F.tolist()) for i, place in enumerate(places)]
-    failed = PairRow(pairs[-1].identity, pairs[-1].key, "Set", "scene", False, "no keypoints in image 1")
-    return to_table([*rows[:-1], failed] if changes.get("failed") else rows)
+    return to_table([*rows[:-1], PairRow(*places[-1], False, "no keypoints in image 1")] if failed else rows)
 
 
 def run(name: str, config: dict[str, Any], table: pa.Table) -> Run:
