@@ -62,6 +62,8 @@ def test_ransac_with_threshold_and_confidence() -> None:
     assert float((mask.ravel() == SCENE.right).mean()) > 0.9
     for form in (PTS1[:, None], PTS1[None], PTS1.tolist(), np.asfortranarray(PTS1)):
         np.testing.assert_array_equal(cv2.findFundamentalMat(form, PTS2, cv2.FM_RANSAC, 3, 0.99)[0], F)
+    scaled, plain = 2 * homogeneous(PTS1), homogeneous(PTS2)[:, None]
+    np.testing.assert_allclose(cv2.findFundamentalMat(scaled, plain, cv2.FM_RANSAC, 3, 0.99)[0], F, rtol=1e-9)
     out = np.zeros((200, 1), np.uint8)
     cv2.findFundamentalMat(PTS1, PTS2, cv2.FM_RANSAC, 3, 0.99, out)
     np.testing.assert_array_equal(out, mask)
@@ -117,16 +119,6 @@ def test_feature_homography_tutorial() -> None:
     assert np.abs(cv2.perspectiveTransform(corners, ours[0]) - cv2.perspectiveTransform(corners, H)).max() < 0.05
     for method in (cv2.LMEDS, cv2.RHO, cv2.USAC_MAGSAC):
         np.testing.assert_allclose(cv2.findHomography(x, y, method)[0], H, rtol=1e-3, atol=1e-5)
-
-
-def test_a_plane_in_metres() -> None:
-    """Homographies map boards in metres to pixels, too; the threshold is in pixels."""
-    x, y, H = homography_points()
-    D = np.diag([1000, 1000, 1])
-    homography, mask = cv2.findHomography(x / 1000, y, cv2.RANSAC, 3.0)
-    expected = H @ D
-    np.testing.assert_allclose(homography, expected / expected[2, 2], rtol=1e-3, atol=1e-4)
-    assert mask.ravel().tolist() == cv2.findHomography(x, y, cv2.RANSAC, 3.0)[1].ravel().tolist()
 
 
 def test_essential_matrices_in_all_forms() -> None:
@@ -185,24 +177,12 @@ def test_points_in_another_unit_with_a_threshold_in_it() -> None:
     assert float((mask.ravel() == SCENE.right).mean()) > 0.9
     assert apart(F, skew(SCENE.t) @ SCENE.R) < 0.05
     x, y, H = homography_points()
-    for unit in (1.0, 1e-3):
-        u, v = x / 500 * unit, y / 500 * unit
-        D = np.diag([unit / 500, unit / 500, 1])
-        found, inliers = cv2.findHomography(u, v, cv2.RANSAC, 3 / 500 * unit)
-        expected = D @ H @ np.linalg.inv(D)
-        corners = np.array([[0, 0], [640, 0], [640, 480], [0, 480.0]])
-        a, b = (mapped(M, corners * unit / 500) for M in (found, expected))
-        assert np.abs(a - b).max() < 0.05 * unit / 500
-        assert inliers.ravel().tolist() == cv2.findHomography(x, y, cv2.RANSAC, 3.0)[1].ravel().tolist()
-    metres, _ = cv2.findHomography(x, y / 40, cv2.RANSAC, 0.1)  # a photograph to a court
-    assert np.abs(40 * mapped(metres, corners) - mapped(H, corners)).max() < 0.05
-
-
-def test_homogeneous_points() -> None:
-    F, _ = cv2.findFundamentalMat(PTS1, PTS2)
-    np.testing.assert_allclose(
-        cv2.findFundamentalMat(2 * homogeneous(PTS1), homogeneous(PTS2)[:, None])[0], F, rtol=1e-9
-    )
+    right = cv2.findHomography(x, y, cv2.RANSAC, 3.0)[1].ravel().tolist()
+    corners = np.array([[0, 0], [640, 0], [640, 480], [0, 480.0]])
+    for u, v in ((500, 500), (5e5, 5e5), (1000, 1), (1, 40)):  # a board in metres to pixels, pixels to a court
+        homography, inliers = cv2.findHomography(x / u, y / v, cv2.RANSAC, 3 / v)
+        assert np.abs(v * mapped(homography, corners / u) - mapped(H, corners)).max() < 0.05
+        assert inliers.ravel().tolist() == right
 
 
 @pytest.mark.parametrize("name", ["findFundamentalMat", "findHomography", "findEssentialMat"])
@@ -256,12 +236,13 @@ def test_undistortion_runs_to_its_end() -> None:
 FORMS = (np.float32, np.float64, np.int32, lambda x: x[:, None], lambda x: x[None], np.ndarray.tolist)
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("name", ["findFundamentalMat", "findHomography", "findEssentialMat"])
 def test_generated_calls_return_what_opencv_returns(name: str, seed: int) -> None:
     """Kinds, shapes and types of values for any form, count and arrangement; the differences are in the guide."""
     rng = np.random.default_rng(seed)
-    for kind in ("sound", "few", "minimal", "collinear", "coincident"):
+    forms = FORMS[: len(FORMS) - (name == "findEssentialMat")]
+    for k, kind in enumerate(("sound", "few", "minimal", "collinear", "coincident")):
         count = {"few": 3, "minimal": 8}.get(kind, 60)
         at = rng.permutation(200)[:count]
         x1, x2 = PTS1[at], PTS2[at]
@@ -269,7 +250,7 @@ def test_generated_calls_return_what_opencv_returns(name: str, seed: int) -> Non
             x1, x2 = (np.outer(np.arange(60), [7.0, 3]) + shift for shift in ([5, 9], [30, 2]))
         if kind == "coincident":
             x1, x2 = (np.tile(x[:1], (60, 1)) for x in (x1, x2))
-        form = FORMS[rng.integers(len(FORMS) - (name == "findEssentialMat"))]
+        form = forms[(k + 5 * seed) % len(forms)]
         a, b = form(x1), form(x2)
         given = (a, b, K0) if name == "findEssentialMat" else (a, b)
         method = int(rng.choice([cv2.RANSAC, cv2.LMEDS, cv2.USAC_MAGSAC]))

@@ -1,12 +1,16 @@
-"""Which room may import which, read from the syntax tree of every file, wherever in it an import stands."""
+"""Which room may import which, read from the syntax tree of every file, wherever in it an import stands; the road of a
+pair: few files from `find_fundamental` to the solver, and little else in the process."""
 
 import ast
 import functools
 import graphlib
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+
+from scripts import house
 
 PACKAGE = Path(__file__).resolve().parents[1] / "fmtorch"
 ROOMS = sorted(path.parent.name for path in PACKAGE.glob("*/__init__.py"))
@@ -44,15 +48,15 @@ FILES = {module_name(path): path for path in sorted(PACKAGE.rglob("*.py"))}
 
 
 @functools.cache
-def tree(module: str) -> ast.Module:
-    return ast.parse(FILES[module].read_bytes())
+def nodes(path: Path) -> list[ast.AST]:
+    return list(ast.walk(ast.parse(path.read_bytes())))
 
 
 @functools.cache
 def imported(module: str) -> frozenset[str]:
     """What a file imports, modules of fmtorch by their full names; not the packages on the way to them."""
     names: set[str] = set()
-    for node in ast.walk(tree(module)):
+    for node in nodes(FILES[module]):
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
@@ -112,8 +116,8 @@ MAX_ARGUMENTS = 6  # of a kernel
 
 
 def functions() -> Iterator[tuple[str, ast.FunctionDef]]:
-    for module in FILES:
-        yield from ((f"{module}.{n.name}", n) for n in ast.walk(tree(module)) if isinstance(n, ast.FunctionDef))
+    for module, path in FILES.items():
+        yield from ((f"{module}.{n.name}", n) for n in nodes(path) if isinstance(n, ast.FunctionDef))
 
 
 def test_files_fit_in_the_head_and_functions_on_a_screen() -> None:
@@ -146,3 +150,23 @@ def _length(function: ast.FunctionDef) -> int:
     docstring = ast.get_docstring(function, clean=False)
     lines = (function.end_lineno or 0) - function.lineno + 1
     return lines - (len(docstring.splitlines()) if docstring else 0)
+
+
+PAGE = Path(house.ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+MAX_FILES, MAX_MODULES = 6, 92
+ELSEWHERE = (
+    "PIL", "cv2", "hydra", "kornia", "matplotlib", "omegaconf", "onnxruntime", "pyarrow", "scipy.sparse", "skimage"
+)  # fmt: skip
+
+
+def test_the_road_of_a_pair_is_the_files_that_the_page_names() -> None:
+    paragraph = PAGE[PAGE.index("**The road of a pair**") :].split("\n\n")[0]
+    road = [file.removeprefix("fmtorch/") for file in house.road()]
+    assert road == re.findall(r"`([\w/]+\.py)`", paragraph)
+    assert len(road) <= MAX_FILES
+
+
+def test_a_process_that_estimates_loads_what_that_needs() -> None:
+    modules = house.loaded()
+    assert [name for name in ELSEWHERE if name in modules] == []
+    assert len([name for name in modules if name.partition(".")[0] == "fmtorch"]) <= MAX_MODULES

@@ -49,8 +49,7 @@ def test_a_subcommand_runs_as_its_module_does(tmp_path: Path, monkeypatch: pytes
     fmtorch.__main__.main()
     assert called == [(["/usr/bin/fmtorch", "-m", "seed=1,2"], str(tmp_path))]
     monkeypatch.setattr(sys, "argv", ["fmtorch", "evaluate"])
-    there = "eval, "
-    with pytest.raises(SystemExit, match=f"error: no command 'evaluate'; there are: {there}"):
+    with pytest.raises(SystemExit, match="error: no command 'evaluate'; there are: eval, "):
         fmtorch.__main__.main()
 
 
@@ -180,9 +179,8 @@ def test_without_a_terminal_progress_is_a_line_now_and_then(monkeypatch, capsys)
         bar = progress.add_task("sift_gms", total=1200)
         progress.update(bar, completed=1100)
         progress.advance(bar, 4)
-    lines = capsys.readouterr().err.splitlines()
-    assert "sift_gms: 1,100 of 1,200 after 0 min" in lines
-    assert "sift_gms: 1,104 of 1,200 after 0 min" in lines
+    lines = {f"sift_gms: {done} of 1,200 after 0 min" for done in ("1,100", "1,104")}
+    assert lines <= set(capsys.readouterr().err.splitlines())
 
 
 SMALL = ["dataset=fmbench", "dataset.root=Set", "features.max_features=300", "estimator.hypotheses=100"]

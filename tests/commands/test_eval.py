@@ -3,7 +3,6 @@
 import json
 import re
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,9 +12,9 @@ import torch
 
 from fmtorch import match
 from fmtorch.pipeline import load_pipeline
-from fmtorch.runs import ArrayCache
 from tests.helpers import draw_set
 from tests.processes import run_command, starter
+from tests.reliability.conftest import Rows, results
 
 OPTIONS = ["features.max_features=500", "estimator=lmeds", "estimator.hypotheses=200"]
 OWN_PRUNER = """import torch
@@ -169,8 +168,7 @@ def test_a_run_in_which_nothing_succeeds_is_told(data: list[str], command: RunCo
     assert len(rows(tmp_path / "run")) == 5
 
 
-IMAGES = 24
-Rows = list[dict[str, object]]
+IMAGES = 15
 
 
 @pytest.fixture(scope="module")
@@ -194,12 +192,6 @@ def arguments(root: Path, run_dir: Path, *extra: str) -> list[str]:
     return ["dataset=fmbench", f"dataset.root={root}", *OPTIONS, f"output={run_dir}", *extra]
 
 
-def results(run_dir: Path) -> Rows:
-    """The rows without what depends on the time."""
-    plain = [{k: v for k, v in row.items() if not k.startswith("seconds")} for row in rows(run_dir)]
-    return sorted(plain, key=lambda row: str(row["pair"]))
-
-
 def counted(stdout: str) -> tuple[int, int]:
     """Images computed and found, as the run tells."""
     match = re.search(r"features of (\d+) images computed(?:, of (\d+) taken)?", stdout)
@@ -207,12 +199,23 @@ def counted(stdout: str) -> tuple[int, int]:
     return int(match[1]), int(match[2] or 0)
 
 
-def test_the_same_rows_with_an_empty_and_with_a_damaged_cache(root: Path, truth: Rows, tmp_path: Path) -> None:
-    cold = run_command("eval", *arguments(root, tmp_path / "cold"), cwd=tmp_path)
-    assert cold.returncode == 0, cold.stderr
-    assert counted(cold.stdout) == (IMAGES, 0)
+def test_a_killed_run_continues_with_what_the_cache_had_and_a_damaged_file_is_computed_anew(root, truth, tmp_path):
+    """A run that is killed and started again, then another one with a damaged cache: the rows of a run without it."""
+
+    def files() -> list[Path]:
+        return sorted(tmp_path.glob("cache/features/*/*.npz"))
+
+    these = arguments(root, tmp_path / "cold", "batch=1", "workers=1")
+    assert starter().start(tmp_path, "eval", *these).kill_when(lambda: len(files()) >= 5)
+    had = len(files())
+    assert 5 <= had < IMAGES
+    cold = run_command("eval", *these, cwd=tmp_path)
+    assert (cold.returncode, "damaged" in cold.stderr) == (0, False), cold.stderr
+    computed, from_cache = counted(cold.stdout)
+    assert computed == IMAGES - had
+    assert from_cache > 0
     assert f"{IMAGES} files" in cold.stdout
-    damaged = sorted(tmp_path.glob("cache/features/*/*.npz"))[0]
+    damaged = files()[0]
     damaged.write_bytes(damaged.read_bytes()[:1000])
     warm = run_command("eval", *arguments(root, tmp_path / "warm"), cwd=tmp_path)
     assert warm.returncode == 0, warm.stderr
@@ -223,36 +226,7 @@ def test_the_same_rows_with_an_empty_and_with_a_damaged_cache(root: Path, truth:
     before, after = ({str(row["pair"]): row["seconds_features"] for row in each} for each in stored)
     same = sum(before[pair] == after[pair] for pair in before)  # what computing took, not what reading did
     assert same >= len(before) - 2  # one image, of one or two pairs, was computed again
-
-
-def test_a_killed_run_continues_with_what_it_had(root: Path, truth: Rows, tmp_path: Path) -> None:
-    these = arguments(root, tmp_path / "run", "batch=1", "workers=1")
-    process = starter().start(tmp_path, "eval", *these)
-    deadline = time.monotonic() + 120
-    while len(list(tmp_path.glob("cache/features/*/*.npz"))) < 5 and time.monotonic() < deadline:
-        time.sleep(0.002)
-    assert process.kill()
-    had = len(list(tmp_path.glob("cache/features/*/*.npz")))
-    assert 5 <= had < IMAGES
-    again = run_command("eval", *these, cwd=tmp_path)
-    assert again.returncode == 0, again.stderr
-    assert "damaged" not in again.stderr
-    computed, from_cache = counted(again.stdout)
-    assert computed == IMAGES - had
-    assert from_cache > 0
-    assert results(tmp_path / "run") == truth
-
-
-def test_two_runs_at_once_share_the_cache(root: Path, truth: Rows, tmp_path: Path) -> None:
-    runs = (arguments(root, tmp_path / name, "workers=2", "batch=3") for name in "ab")
-    processes = [starter().start(tmp_path, "eval", *words) for words in runs]
-    ended, outputs = [process.wait() for process in processes], [process.said() for process in processes]
-    assert ended == [0, 0], outputs
-    assert all("damaged" not in said and "nothing is kept" not in said for said in outputs)
-    assert results(tmp_path / "a") == results(tmp_path / "b") == truth
-    assert len(list(ArrayCache(tmp_path / "cache" / "features").files())) == IMAGES
     assert not list(tmp_path.glob("cache/features/*/*.tmp"))
-    assert all(sum(counted(said)) == IMAGES for said in outputs)
 
 
 def test_two_photographs(root: Path, tmp_path: Path) -> None:

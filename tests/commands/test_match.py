@@ -6,7 +6,8 @@ import math
 import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -14,7 +15,6 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
-from numpy.typing import NDArray
 from PIL import ExifTags, Image
 
 import fmtorch
@@ -107,10 +107,10 @@ def test_reduction_gives_pixels_of_the_originals(pipeline: fmtorch.Pipeline) -> 
 def test_photographs_that_cannot_be_related(pipeline: fmtorch.Pipeline) -> None:
     image = stereo()[0]
     flat = np.full((100, 120, 3), 90, np.uint8)
-    for other, reason in ((flat, "no keypoints in image1"), (image[:1], "no keypoints in image1")):
+    for other in (flat, image[:1]):
         result = fmtorch.match(image, other, pipeline=pipeline)
         assert not result.ok
-        assert reason in result.reason
+        assert "no keypoints in image1" in result.reason
         assert not result.F.any()
         assert len(result.kept) == len(result.inliers) == 0
         assert result.correspondences.mask.shape == (1, 0)
@@ -128,8 +128,7 @@ def test_photographs_that_determine_no_f(pipeline: fmtorch.Pipeline) -> None:
     h, w = image.shape[:2]
     f, angle = 1.2 * w, math.radians(6)
     K = np.array([[f, 0, (w - 1) / 2], [0, f, (h - 1) / 2], [0, 0, 1]])
-    R = np.array([[math.cos(angle), 0, math.sin(angle)], [0, 1, 0], [-math.sin(angle), 0, math.cos(angle)]])
-    R = R @ np.array([[1, 0, 0], [0, math.cos(angle), -math.sin(angle)], [0, math.sin(angle), math.cos(angle)]])
+    R = cv2.Rodrigues(np.array([0, angle, 0]))[0] @ cv2.Rodrigues(np.array([angle, 0, 0]))[0]
     turned = K @ R @ np.linalg.inv(K)
     leaning = K @ (R + np.outer([0.4, 0.1, 0.2], [0.3, 0.1, 1])) @ np.linalg.inv(K)  # of a plane, seen from elsewhere
     crop = np.array([[1.0, 0, -100], [0, 1, -60], [0, 0, 1]])
@@ -249,19 +248,16 @@ def test_others_of_the_same_names_overwrite_nothing(tmp_path: Path, monkeypatch:
     paths = [Path("x/a.jpg"), Path("x/b.jpg")]
     others = [Path("y/a.jpg"), Path("y/b.jpg")]
     settings = {"pipeline": "sift_gms", "seed": 0, "cameras": None}
-    folder = match_command._default_output(paths, settings)
-    assert folder == Path("matches/a-b")
+    output, folder = match_command._default_output, Path("matches/a-b")
+    assert output(paths, settings) == folder
     folder.mkdir(parents=True)
     (folder / "result.json").write_text(json.dumps({"image0": "x/a.jpg", "image1": "x/b.jpg", **settings}))
-    assert match_command._default_output(paths, settings) == folder
-    assert match_command._default_output([path.absolute() for path in paths], settings) == folder
-    elsewhere = match_command._default_output(others, settings)
-    assert re.fullmatch(r"a-b-[0-9a-f]{8}", elsewhere.name)
-    assert match_command._default_output(others, settings) == elsewhere
-    for changed in ({"seed": 1}, {"pipeline": "sift_lpm"}, {"cameras": "unknown"}):
-        other = match_command._default_output(paths, settings | changed)
-        assert other not in (folder, elsewhere)
-        assert other == match_command._default_output(paths, settings | changed)
+    assert output(paths, settings) == output([path.absolute() for path in paths], settings) == folder
+    changes = ({"seed": 1}, {"pipeline": "sift_lpm"}, {"cameras": "unknown"})
+    calls = [(others, settings), *((paths, settings | changed) for changed in changes)]
+    elsewhere = [output(*call) for call in calls]
+    assert all(re.fullmatch(r"a-b-[0-9a-f]{8}", other.name) for other in elsewhere)
+    assert (len(set(elsewhere)), [output(*call) for call in calls]) == (len(calls), elsewhere)
 
 
 SIDE = 768  # px, to which photographs are reduced for matching
@@ -277,10 +273,8 @@ def pipeline_with_cameras() -> fmtorch.Pipeline:
     return load_pipeline("sift_fmtorch")
 
 
-def matched(pair: ImagePair, pipeline_with_cameras: fmtorch.Pipeline, **cameras: object) -> fmtorch.MatchResult:
-    return fmtorch.match(
-        pair.image0.path, pair.image1.path, pipeline=pipeline_with_cameras, longest_side=SIDE, **cameras
-    )
+def matched(pair: ImagePair, pipeline: fmtorch.Pipeline, **cameras: object) -> fmtorch.MatchResult:
+    return fmtorch.match(pair.image0.path, pair.image1.path, pipeline=pipeline, longest_side=SIDE, **cameras)
 
 
 def error(result: fmtorch.MatchResult, pair: ImagePair) -> float:
@@ -310,7 +304,7 @@ def test_the_pose_of_reduced_photographs_by_what_is_known(pair, pipeline_with_ca
 
 def test_calibrations_follow_the_reduction(pair: ImagePair, pipeline_with_cameras: fmtorch.Pipeline) -> None:
     """Reduced by hand, with K scaled by hand, everything is the same."""
-    images = [fmtorch.data.read_image(image) for image in (pair.image0, pair.image1)]
+    images = [read_image(image) for image in (pair.image0, pair.image1)]
     small = [cv2.resize(image, (768, 512), interpolation=cv2.INTER_AREA) for image in images]
     half = np.array([[0.5, 0, -0.25], [0, 0.5, -0.25], [0, 0, 1]])
     by_hand = fmtorch.match(*small, pipeline=pipeline_with_cameras, K0=half @ pair.K0, K1=half @ pair.K1)
@@ -337,7 +331,7 @@ def test_a_lens_bends_points_and_not_images(pair: ImagePair, pipeline_with_camer
     """Photographs through a lens that distorts: F and the pose are those of pinholes, points those of photographs."""
     K0, K1 = pair.K0, pair.K1
     lenses = [Lens(K[0, 0], K[1, 1], K[0, 2], K[1, 2], "OPENCV", BENT) for K in (K0, K1)]
-    plain = [fmtorch.data.read_image(image) for image in (pair.image0, pair.image1)]
+    plain = [read_image(image) for image in (pair.image0, pair.image1)]
     bent = [photographed(image, lens) for image, lens in zip(plain, lenses, strict=True)]
     given = {"pipeline": pipeline_with_cameras, "longest_side": SIDE}
     result = fmtorch.match(*bent, **given, lens=lenses)
@@ -357,7 +351,7 @@ def test_a_lens_bends_points_and_not_images(pair: ImagePair, pipeline_with_camer
 
 def test_a_lens_that_nobody_calibrated(pair: ImagePair, pipeline_with_cameras: fmtorch.Pipeline) -> None:
     """It is suggested of bent photographs, and estimated; F is then of undistorted points, and pictures straight."""
-    plain = [fmtorch.data.read_image(image) for image in (pair.image0, pair.image1)]
+    plain = [read_image(image) for image in (pair.image0, pair.image1)]
     h, w = plain[0].shape[:2]
     half = math.hypot(h, w) / 2
     division = Lens(half, half, (w - 1) / 2, (h - 1) / 2, "SIMPLE_DIVISION", (-0.1,))
@@ -393,18 +387,13 @@ def with_exif(folder: Path, name: str, **tags: int) -> Path:
     return folder / name
 
 
-class Photographs(NamedTuple):
-    images: list[NDArray[np.uint8]]
-    knowledge: dict[str, Any]
-    notes: list[str]
-
-
-def photographs(paths: list[Path], cameras: Path | None, K: Any) -> Photographs:
+def photographs(paths: list[Path], cameras: Path | None, K: Any) -> SimpleNamespace:
     """As the command reads them."""
     known = PhotographCameras(cameras, K)
-    images = [fmtorch.data.read_image(known.source(path)) for path in paths]
+    images = [read_image(known.source(path)) for path in paths]
     ends = [known.of(path, image.shape[:2]) for path, image in zip(paths, images, strict=True)]
-    return Photographs(images, known.knowledge(*ends), [end.note for end in ends if end.note])
+    notes = [end.note for end in ends if end.note]
+    return SimpleNamespace(images=images, knowledge=known.knowledge(*ends), notes=notes)
 
 
 def test_words_files_and_numbers_as_arguments(tmp_path: Path) -> None:
@@ -438,7 +427,7 @@ def test_distortion_is_taken_out_and_sizes_must_fit(tmp_path: Path) -> None:
     assert bent.knowledge["K0"] is None
     assert "b.jpg: F and the pose are of the image without the distortion of its SIMPLE_RADIAL lens" in bent.notes[1]
     assert bent.knowledge["lens"][1] == Lens(50, 50, 29.5, 19.5, "SIMPLE_RADIAL", (0.2,))
-    assert np.array_equal(bent.images[0], fmtorch.data.read_image(paths[0]))  # as it was taken
+    assert np.array_equal(bent.images[0], read_image(paths[0]))  # as it was taken
     (tmp_path / "cameras.txt").write_text("1 PINHOLE 50 40 50 50 30 20\n")
     with pytest.raises(ImageError, match=r"a\.jpg: 60 x 40 px, but its camera is of 50 x 40"):
         photographs(paths, tmp_path / "cameras.txt", None)

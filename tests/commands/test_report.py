@@ -5,6 +5,7 @@ import json
 import os
 import re
 import shlex
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -143,17 +144,13 @@ def test_a_result_that_cannot_be_had_again_is_said(tmp_path: Path) -> None:
     assert difference(shown, images, solved, solution) == difference(shown, images, failed, lost) == ""
 
 
-def test_the_command_on_two_runs(tmp_path: Path) -> None:
+def test_the_command_on_two_runs(tmp_path: Path, command: Callable[..., str]) -> None:
     draw_set(tmp_path / "Set", pairs=[(0, 1), (0, 2)])
-
-    def command(name: str, *words: str) -> None:
-        done = run_command(name, *words, cwd=tmp_path)
-        assert done.returncode == 0, done.stderr
-
     small = ("dataset=fmbench", "dataset.root=Set", "features.max_features=300", "estimator.hypotheses=100")
     for estimator in ("lmeds", "msac"):
-        command("eval", *small, f"estimator={estimator}")
-    command("report", "root=Set", "pictures=2")
+        command("eval", *small, f"estimator={estimator}", cwd=tmp_path)
+    done = run_command("report", "root=Set", "pictures=2", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
     page = (tmp_path / "runs/report.html").read_text()
     assert "drawn again" not in page  # what is drawn is what was stored
     assert page.count("data:image/jpeg") == 2 * 2 * 2  # pairs, runs, pictures
@@ -162,7 +159,7 @@ def test_the_command_on_two_runs(tmp_path: Path) -> None:
     assert set(re.findall(r'<tr data-run="([^"]*)"', page)) == {"lmeds", "msac"}  # what they share is said once
     assert "estimator" not in re.sub(r"<style>.*</style>", "", page, flags=re.S).split("<h2>")[0]
     # Without the images there are figures, and why there are no pictures.
-    command("report", "output=bare.html")
+    command("report", "output=bare.html", cwd=tmp_path)
     bare = (tmp_path / "bare.html").read_text()
     assert "No pictures: fmbench needs root" in bare
     assert "data:image/jpeg" not in bare
@@ -171,6 +168,7 @@ def test_the_command_on_two_runs(tmp_path: Path) -> None:
 
 
 SIFT = ("pipeline=sift_ratio", "features.max_features=800", "estimator.hypotheses=100")
+MATCH = ("match", "a.png", "b.png", *SIFT)
 
 
 @pytest.fixture
@@ -180,16 +178,14 @@ def photographs(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def refused(monkeypatch: pytest.MonkeyPatch, folder: Path, *words: str) -> str:
-    return ended(monkeypatch, folder, "match", "a.png", "b.png", *SIFT, *words)
-
-
-def test_paths_with_brackets_are_printed_as_they_are(photographs: Path) -> None:
+def test_paths_with_brackets_are_printed_as_they_are_and_cached_features_take_no_seconds(photographs, command):
     """Brackets are the markup of the library that prints: `[/x]` would end a style, `[red]` begin one."""
-    done = run_command("match", "a.png", "b.png", *SIFT, "output=m[/x] [red]", cwd=photographs)
-    assert done.returncode == 0, done.stderr
-    assert "m[/x] [red]: result.json" in done.stdout
+    first, second = (command(*MATCH, "output=m[/x] [red]", cwd=photographs) for _ in range(2))
+    assert "m[/x] [red]: result.json" in first
     assert (photographs / "m[/x] [red]" / "result.json").is_file()
+    keypoints = [next(line for line in said.splitlines() if "keypoints" in line) for said in (first, second)]
+    assert ["cached" in line for line in keypoints] == [False, True]
+    assert "estimator.hypotheses=100" in second.splitlines()[0]
 
 
 @pytest.mark.parametrize(
@@ -203,7 +199,7 @@ def test_a_broken_preset_is_named(monkeypatch, photographs, content, said):
     preset = photographs / "conf" / "estimator" / "mine.yaml"
     preset.parent.mkdir(parents=True)
     preset.write_bytes(content)
-    end = refused(monkeypatch, photographs, "--config-dir", "conf", "estimator=mine")
+    end = ended(monkeypatch, photographs, *MATCH, "--config-dir", "conf", "estimator=mine")
     assert end.startswith(f"error: {preset}: {said}")
 
 
@@ -229,7 +225,7 @@ def test_before_any_work(monkeypatch: pytest.MonkeyPatch, photographs: Path, wor
     (photographs / "F.txt").write_text("1 2 3")
     (photographs / "bad.onnx").write_bytes((models_dir() / "lc_f.onnx").read_bytes()[:5000])
     monkeypatch.setattr("fmtorch.commands.match.match", lambda *_, **__: pytest.fail("the work was begun"))
-    end = refused(monkeypatch, photographs, *words.split())
+    end = ended(monkeypatch, photographs, *MATCH, *words.split())
     assert end.startswith("error: ")
     assert said in end
     assert "\n" not in end
@@ -251,14 +247,6 @@ def test_the_report_is_refused_before_it_is_drawn(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr("fmtorch.commands.report.named", lambda _: [])
     end = ended(monkeypatch, tmp_path, "report", "runs=run", "output=run")
     assert end == "error: output=run is a folder; it must name a file"
-
-
-def test_cached_features_take_no_seconds_and_changed_stages_are_named(photographs: Path) -> None:
-    first, second = (run_command("match", "a.png", "b.png", *SIFT, cwd=photographs) for _ in range(2))
-    rows = [next(line for line in done.stdout.splitlines() if "keypoints" in line) for done in (first, second)]
-    assert "cached" not in rows[0]
-    assert "cached" in rows[1]
-    assert "estimator.hypotheses=100" in second.stdout.splitlines()[0]
 
 
 @pytest.mark.parametrize("words", [("--config-dir", "my conf"), ("--config-dir=my conf",)])

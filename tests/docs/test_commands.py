@@ -23,6 +23,7 @@ from hydra.core.global_hydra import GlobalHydra
 
 from fmtorch import data
 from fmtorch.data import read_image
+from scripts.benchmark.methods import read_specs
 from tests.conftest import own_cache
 from tests.io import writers
 from tests.processes import run_command
@@ -44,7 +45,7 @@ ELSEWHERE = {
     r"--config-dir my_conf (pruner|pipeline)=": "tests/training/test_train_command.py runs these files and commands",
     r"dataset=(tum|kitti|colmap|bundler|fmbench dataset\.root=KITTI)": "tests/data runs these on data of their layout",
     r"pipeline=vismatch|(dataset=|runs/)pair_list": "tests/matching/test_vismatch.py runs a stand-in on lists of pairs",
-    r"dataset=hpatches": "tests/evaluation/test_poses.py runs these on sequences of its own",
+    r"dataset=hpatches|executor=processes": "tests/evaluation/test_poses.py runs these on sequences of its own",
     r"train .*layout=oanet": "tests/training/test_train_command.py trains on such files",
     r"'overlap=|HARD/": "tests/data/test_construction.py, tests/scripts/test_benchmark_runner.py run these",
     r"benchmark known_models": "needs the images of a scene; tests/scripts/test_benchmark_planes.py has some",
@@ -73,23 +74,17 @@ TRAINED = [
 APPENDED = {
     "fmtorch match": ["pipeline=sift_gms", *TINY],
     "fmtorch eval": [*DATASET, *TINY, "workers=1"],
-    "fmtorch train": [
-        "dataset=fmbench",
-        "dataset.root=DATA",
-        "dataset.sets=[Strecha_train,TanksLike]",
-        *TRAINED,
-        *TINY,
-    ],
+    "fmtorch train": ["dataset=fmbench", "dataset.root=DATA", "dataset.sets=[Strecha_train,TanksLike]", *TRAINED],
     "fmtorch pairs": ["dataset.root=DATA/Strecha", "workers=1"],
     "fmtorch verify": ["estimator.focal.rounds=3"],
     "fmtorch report": ["pictures=1", "root=DATA/Strecha"],
     "estimators": ["--limit", "1", "--seeds", "1"],
     "cameras": ["--limit", "1", "--seeds", "1"],
     "curves": ["--limit", "1", "--curves", "samples | msac:hypotheses={} | 50 100"],
-    "pipelines": ["--limit", "1", "--seeds", "1", "--cache", "kept"],
+    "pipelines": ["--limit", "1", "--seeds", "1", "--cache", "kept", "--pipelines", "rootsiftpca_*"],
     "paper": ["--limit", "1", "--seeds", "1", "--cache", "kept"],
     "gc_ransac": ["--limit", "1", "--cache", "kept", "--pipelines", "paper/*"],
-    "pruning": ["--limit", "1", "--asift-limit", "0", "--cache", "kept"],
+    "pruning": ["--limit", "1", "--asift-limit", "0", "--cache", "kept", "--pipelines", "RATIO", "GMS*"],
     "refinement": ["--limit", "1", "--seeds", "1", "--cache", "kept", "--pipelines", "sift_fmtorch, fmtorch*"],
     "posebench": ["--threshold", "1", "--methods", "E:fmtorch", "F:fmtorch"],
     "related": ["--limit", "1", "--unrelated", "1", "--cache", "kept", "--pipelines", "sift_gms"],
@@ -155,14 +150,15 @@ def _installed(estimator: str) -> bool:
 
 @pytest.fixture(scope="module")
 def workplace(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder like a checkout's, with the data that the pages leave to the reader."""
+    """A folder like a checkout's, with the data that the pages leave to the reader; of the files of methods, all lines
+    of which tests/scripts/test_benchmark_runner.py reads, every eighth."""
     folder = tmp_path_factory.mktemp("workplace")
     shutil.copytree(SOURCE / "docs", folder / "docs", ignore=shutil.ignore_patterns("site"))
     shutil.copy(SOURCE / "README.md", folder)
     (folder / "scripts" / "benchmark").mkdir(parents=True)
     for specs in (SOURCE / "scripts" / "benchmark").glob("*.txt"):
-        lines = [line for line in specs.read_text().splitlines() if _installed(line.split(" ")[0])]
-        (folder / "scripts" / "benchmark" / specs.name).write_text("\n".join(lines))
+        lines = [line for line in read_specs(specs) if _installed(line.split(" ")[0])]
+        (folder / "scripts" / "benchmark" / specs.name).write_text("\n".join(lines[::8]))
     pair = data.load("stereo")[0]
     images = [_half(read_image(source)) for source in (pair.image0, pair.image1)]
     halved = np.diag([2.0, 2.0, 1.0])
@@ -185,8 +181,8 @@ def workplace(tmp_path_factory: pytest.TempPathFactory) -> Path:
         shutil.copy(SOURCE / "models" / "lc_f.safetensors", folder / training / "lc.safetensors")
     (folder / "PLANES_SIDE").mkdir()
     shutil.copy(SOURCE / "models" / "lc_side.safetensors", folder / "PLANES_SIDE")
-    (folder / "PHOTOS").mkdir()
     for name in ("a.jpg", "b.jpg"):
+        (folder / "PHOTOS").mkdir(exist_ok=True)
         shutil.copy(folder / name, folder / "PHOTOS")
     (folder / "list.txt").write_text("a.jpg b.jpg\n")
     for layout in ("posebench", "hloc", "oanet"):
@@ -270,10 +266,6 @@ def run_all(page_commands: list[str], workplace: Path, monkeypatch: pytest.Monke
         if words not in RUN:
             run(words, workplace)
             RUN.append(words)
-        if "--specs" in words:  # all lines of a file are run once
-            specs = workplace / words[words.index("--specs") + 1]
-            lines = [line for line in specs.read_text().splitlines() if line and not line.startswith("#")]
-            specs.write_text("\n".join(lines[:4]))
 
 
 @pytest.mark.parametrize("page_commands", parameters(slow=False))

@@ -14,9 +14,9 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 
-from fmtorch import data
+from fmtorch import data, find_fundamental, presets
 from fmtorch.core import Estimator, FeatureExtractor, Matcher, Pruner
-from fmtorch.scenes import Plan
+from fmtorch.scenes import FAMILIES, Plan
 from tests.conftest import own_cache
 from tests.laws import scene
 from tests.processes import run_command
@@ -61,16 +61,12 @@ PROTOCOLS = {"features": FeatureExtractor, "matcher": Matcher, "pruner": Pruner,
 
 @pytest.mark.parametrize(("group", "protocol"), PROTOCOLS.items())
 def test_each_is_built_by_name_in_python(group, protocol, folder, monkeypatch):
-    from fmtorch import presets
-
     monkeypatch.syspath_prepend(str(folder))
     assert isinstance(presets.build(group, "mine", config_dir=folder / "my_conf"), protocol)
 
 
 @pytest.mark.parametrize("score", ["Welsch", "Triweight"])
 def test_a_score_a_sampler_and_a_rule(score: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from fmtorch import find_fundamental
-
     monkeypatch.syspath_prepend(str(folder))
     preset = folder / "my_conf" / "estimator" / "robust.yaml"
     preset.write_text(preset.read_text().replace("my_robust.Welsch", f"my_robust.{score}"))
@@ -90,10 +86,13 @@ def code(name: str) -> list[str]:
 
 
 @pytest.fixture
-def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+def run(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Any:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("FMTORCH_CACHE", str(own_cache(tmp_path)))
+    monkeypatch.setenv("FMTORCH_CACHE", str(own_cache(tmp_path_factory.getbasetemp() / "notebooks")))  # scenes of all
     monkeypatch.setattr("fmtorch.scenes.dataset.PLANS", dict.fromkeys((("small", "test"), ("small", "train")), SMALL))
+    two = {name: FAMILIES[name] for name in ("indoor", "driving")}  # others have no pairs in so small a plan
+    monkeypatch.setattr("fmtorch.scenes.dataset.FAMILIES", two)
+    monkeypatch.setattr("fmtorch.jobs.execution.cores", lambda: 1)  # processes would take longer than the work
     monkeypatch.setattr(plt, "show", lambda: plt.close("all"))
     monkeypatch.setitem(mpl.rcParams, "backend", "agg")
 

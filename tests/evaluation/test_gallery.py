@@ -41,13 +41,11 @@ def distribution(root: Path, name: str = "Set", images: int = 3) -> Path:
     return draw_set(root / name, images=images, pairs=[(0, i) for i in range(1, images)])
 
 
-def rows(root: Path, **changes: Any) -> pa.Table:
-    dataset = data.load("fmbench", root=root)
-    pairs = [dataset[i] for i in range(len(dataset))]
-    places = [(p.identity, p.key, p.family, p.scene) for p in pairs]
+def rows(root: Path, failed: bool = False) -> pa.Table:
+    """Of the pairs of a set; failed: the last one is."""
+    places = [(p.identity, p.key, p.family, p.scene) for p in data.load("fmbench", root=root)]
     rows = [PairRow(*place, True, nsgd=0.01 * i, F=F.tolist()) for i, place in enumerate(places)]
-    failed = PairRow(pairs[-1].identity, pairs[-1].key, "Set", "scene", False, "no keypoints in image 1")
-    return to_table([*rows[:-1], failed] if changes.get("failed") else rows)
+    return to_table([*rows[:-1], PairRow(*places[-1], False, "no keypoints in image 1")] if failed else rows)
 
 
 def run(name: str, config: dict[str, Any], table: pa.Table) -> Run:
@@ -136,18 +134,13 @@ def test_no_pictures_are_explained(tmp_path: Path) -> None:
 
 
 def config(pipeline: str = "sift_ratio", estimator: str = "ransac", **changes: Any) -> dict[str, Any]:
-    ratio, unique = {"_target_": "a.Ratio", "threshold": 0.8}, {"_target_": "a.OneToOne"}
-    stages = {"features": presets.load("features", "sift"), "pruner": [{"ratio": ratio}, {"one_to_one": unique}]}
+    stages = {"features": presets.load("features", "sift"), "pruner": ratio(0.8)}
     stages["estimator"] = presets.load("estimator", estimator)
     return {"pipeline": pipeline, **stages, "seed": 0, "version": "1", **changes}
 
 
 def names(*configs: dict[str, Any]) -> list[str]:
     return run_names(configs, [f"{i}abcdefgh" for i in range(len(configs))])
-
-
-def with_options(estimator: str, **options: Any) -> dict[str, Any]:
-    return {**presets.load("estimator", estimator), **options}
 
 
 def ratio(threshold: float) -> list[dict[str, Any]]:
@@ -178,7 +171,8 @@ def test_names_tell_what_differs() -> None:
 
 
 def test_names_tell_options_of_one_preset_and_classes_of_ones_own() -> None:
-    two = [{**config(), "estimator": with_options("lmeds", hypotheses=n)} for n in (100, 200)]
+    lmeds = presets.load("estimator", "lmeds")
+    two = [{**config(), "estimator": {**lmeds, "hypotheses": n}} for n in (100, 200)]
     assert names(*two) == ["hypotheses=100", "hypotheses=200"]
     assert names(*two, config()) == ["lmeds hypotheses=100", "lmeds hypotheses=200", "ransac"]
     # Unlike its preset, though no other run has that preset.

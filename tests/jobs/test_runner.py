@@ -86,10 +86,6 @@ def test_what_ends_its_workers_is_known_and_others_are_done(tmp_path: Path) -> N
     assert len(list(tmp_path.glob("died-*"))) <= 2 * (3 + 2)  # bounded: with its neighbours, its batch, alone
 
 
-def test_a_lone_job_that_ends_its_workers(tmp_path: Path) -> None:
-    assert calls(functools.partial(make_needs, tmp_path), PROCESSES, [[-1]])[:2] == ({}, {-1: DEATH})
-
-
 def test_workers_that_cannot_begin_are_no_pairs_fault(tmp_path: Path) -> None:
     with pytest.raises(WorkersLost, match="the same command goes on"):
         calls(functools.partial(ends, tmp_path), PROCESSES, [[1], [2], [3]])
@@ -163,12 +159,8 @@ def test_another_version_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         factory.call(squares, with_factory=True)([1])
 
 
-class Own(ThreadPoolExecutor):
-    """Anybody's executor, which breaks off after some calls."""
-
-
 def test_an_executor_of_ones_own(tmp_path: Path) -> None:
-    execution = Execution(make=functools.partial(Own, 3))
+    execution = Execution(make=functools.partial(ThreadPoolExecutor, 3))
     results: list[int] = []
     source = Factory(functools.partial(make_needs, tmp_path))
     with WorkerPool(execution) as pool:

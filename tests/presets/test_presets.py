@@ -67,12 +67,6 @@ def test_a_users_own_preset_comes_before_the_projects(own: Path) -> None:
     assert pipeline.estimator.name == "OpenCV FM_LMEDS"
 
 
-def test_preset_files_are_where_their_names_say() -> None:
-    for group in presets.STAGES:
-        for name in presets.available(group):
-            assert (conf_dir() / group / f"{name}.yaml").is_file()
-
-
 @pytest.mark.parametrize(("pipeline", "pruners"), [("sift_lc_fmtorch", ["ratio", "lpm"]), ("sift_gms", ["ratio"])])
 def test_options_of_a_pruner_that_others_replace_go_with_it(pipeline: str, pruners: list[str]) -> None:
     config = compose("match", (f"pipeline={pipeline}", f"pruner=[{','.join(pruners)}]"))
@@ -100,11 +94,8 @@ def pairs_of_families(*families: str) -> list[ImagePair]:
 
 def ratios(pipeline: Pipeline, pairs: list[ImagePair]) -> list[torch.Tensor]:
     """The ratios of the matches that are left of each pair."""
-    ratios = []
-    for outcome in pipeline.correspondences(pairs):
-        c = outcome.correspondences
-        ratios.append(c.ratio[c.mask])
-    return ratios
+    left = [outcome.correspondences for outcome in pipeline.correspondences(pairs)]
+    return [c.ratio[c.mask] for c in left]
 
 
 def test_each_pair_of_a_batch_gets_the_options_of_its_family() -> None:
@@ -158,11 +149,6 @@ def test_an_option_that_is_given_explicitly_holds_for_all_families(overrides, sc
     seen: list[dict[str, bool]] = []
     job(lambda config: seen.append(scales(config)))(composed)
     assert seen == [expected]
-
-
-def test_options_of_families_go_with_their_pruner() -> None:
-    pipeline = load_pipeline("sift_gms", overrides=["pruner=[lpm,ratio]"])
-    assert list(pipeline.pruners_of("CPC")) == ["lpm", "ratio"]
 
 
 def test_they_are_part_of_the_stages_of_a_run_and_come_back_from_them() -> None:

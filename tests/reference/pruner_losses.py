@@ -1,7 +1,5 @@
 """Losses and layers of learned pruners from the definitions: one pair, match and point at a time."""
 
-import math
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -36,16 +34,6 @@ def context_batch_norm_relu(
     return padded
 
 
-def cross_entropy(logits: list[float], labels: list[int]) -> float | None:
-    """Mean of -log P(label) over labelled matches; None without any."""
-    terms = []
-    for z, label in zip(logits, labels, strict=True):
-        if label >= 0:
-            p = 1 / (1 + math.exp(-z))
-            terms.append(-math.log(p if label == 1 else 1 - p))
-    return sum(terms) / len(terms) if terms else None
-
-
 def virtual_points(
     F: np.ndarray, size0: np.ndarray, size1: np.ndarray, uniforms: np.ndarray, count: int
 ) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -76,14 +64,3 @@ def geometric_loss(
         squared = distance(y1, F @ y0) ** 2 + distance(y0, F.T @ y1) ** 2
         total += min(squared, limit)
     return total / len(points)
-
-
-def expected_calibration_error(p: list[float], labels: list[int], bins: int) -> float:
-    """Naeini et al., AAAI 2015."""
-    error, total = 0.0, len(p)
-    for b in range(bins):
-        inside = [i for i in range(total) if min(int(p[i] * bins), bins - 1) == b]
-        if inside:
-            gap = sum(p[i] for i in inside) / len(inside) - sum(labels[i] for i in inside) / len(inside)
-            error += len(inside) / total * abs(gap)
-    return error

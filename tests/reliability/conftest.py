@@ -1,15 +1,33 @@
-"""What the trials share: the process that starts commands, a data set, the runs that nothing disturbs."""
+"""What the trials share: commands on a small data set, the process that starts them, the run that nothing disturbs."""
 
 from pathlib import Path
 
 import pytest
 
+from fmtorch.runs import RunFolder
 from tests import processes
 from tests.helpers import draw_set
 from tests.processes import Starter
-from tests.reliability.commands import evaluation, results
 
 Rows = list[dict[str, object]]
+EVAL = ["features.max_features=400", "estimator=lmeds", "estimator.hypotheses=200", "batch=1", "workers=1"]
+
+
+def evaluation(root: Path, run_dir: Path, *extra: str) -> list[str]:
+    """Arguments of an evaluation."""
+    return ["dataset=fmbench", f"dataset.root={root}", *EVAL, f"output={run_dir}", *extra]
+
+
+def results(run_dir: Path) -> Rows:
+    """The rows of a run, in the order of pairs, without what depends on the time."""
+    rows = RunFolder.load(run_dir).read().to_pylist()
+    kept = [{k: v for k, v in row.items() if not k.startswith("seconds")} for row in rows]
+    return sorted(kept, key=lambda row: str(row["pair"]))
+
+
+def parts(run_dir: Path) -> int:
+    """How many parts a run has on disk."""
+    return len(list((run_dir / "pairs").glob("part-*.parquet")))
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

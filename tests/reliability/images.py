@@ -1,5 +1,6 @@
 """Image files that are damaged, rare or hostile, made from nothing but the formats' definitions and Pillow."""
 
+import functools
 import io
 import struct
 import zlib
@@ -27,16 +28,13 @@ def pages(picture: np.ndarray, form: str, **options: Any) -> bytes:
     return saved(picture, form, save_all=True, append_images=rest, **options)
 
 
-def png(
-    width: int, height: int, rows: bytes, colour: int = 0, depth: int = 8, compressed: bytes | None = None
-) -> bytes:
+def png(width: int, height: int, rows: bytes, colour: int = 0, depth: int = 8, packed: bytes = b"") -> bytes:
     """A PNG by its specification: a header of any size over any rows, or over those that are compressed already."""
     header = struct.pack(">IIBBBBB", width, height, depth, colour, 0, 0, 0)
-    chunks = {b"IHDR": header, b"IDAT": compressed or zlib.compress(rows, 9), b"IEND": b""}
-    written = (
-        struct.pack(">I", len(d)) + kind + d + struct.pack(">I", zlib.crc32(kind + d)) for kind, d in chunks.items()
-    )
-    return b"\x89PNG\r\n\x1a\n" + b"".join(written)
+    written = b"\x89PNG\r\n\x1a\n"
+    for kind, data in ((b"IHDR", header), (b"IDAT", packed or zlib.compress(rows, 9)), (b"IEND", b"")):
+        written += struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+    return written
 
 
 def jpeg_of_size(width: int, height: int) -> bytes:
@@ -47,21 +45,25 @@ def jpeg_of_size(width: int, height: int) -> bytes:
     return bytes(data)
 
 
+def half(form: str) -> bytes:
+    """The first half of a sound file; of a TIFF by OpenCV, whose rows are compressed."""
+    data = (
+        bytes(cv2.imencode(".tiff", SOFT)[1])
+        if form == "tiff"
+        else saved(SOFT, Image.registered_extensions()[f".{form}"])
+    )
+    return data[: len(data) // 2]
+
+
 def bomb(side: int) -> bytes:
     """A sound PNG of side x side black pixels in some hundredth of the bytes; side: thousands."""
     packer = zlib.compressobj(1)
     rows = bytes((1 + side) * 1000)
     idat = b"".join(packer.compress(rows) for _ in range(side // 1000)) + packer.flush()
-    return png(side, side, b"", compressed=idat)
+    return png(side, side, b"", packed=idat)
 
 
 GREY = SOFT[..., 0]
-
-
-def half(data: bytes) -> bytes:
-    return data[: len(data) // 2]
-
-
 SOUND: Mapping[str, Callable[[], bytes]] = {
     "cmyk.jpg": lambda: saved(Image.fromarray(SOFT).convert("CMYK"), "JPEG"),
     "ycck.jpg": lambda: saved(Image.fromarray(SOFT).convert("CMYK"), "JPEG", quality=100),
@@ -107,12 +109,7 @@ NO_IMAGES: Mapping[str, Callable[[], bytes]] = {
     "65535 x 65535.jpg": lambda: jpeg_of_size(65_535, 65_535),
     "20000 x 20000 of 160 x 120.jpg": lambda: jpeg_of_size(20_000, 20_000),
     "a bomb of 17000 x 17000.png": lambda: bomb(17_000),
-    "half.jpg": lambda: half(saved(SOFT, "JPEG")),
-    "half.png": lambda: half(saved(SOFT, "PNG")),
-    "half.webp": lambda: half(saved(SOFT, "WEBP", lossless=True)),
-    "half.tiff": lambda: half(bytes(cv2.imencode(".tiff", SOFT)[1])),
-    "half.bmp": lambda: half(saved(SOFT, "BMP")),
-    "half.gif": lambda: half(saved(GREY, "GIF")),
+    **{f"half.{form}": functools.partial(half, form) for form in ("jpg", "png", "webp", "tiff", "bmp", "gif")},
     "svg.png": lambda: b"<svg xmlns='http://www.w3.org/2000/svg' width='9' height='9'/>",
     "zip.png": lambda: b"PK\x03\x04" + bytes(100),
 }

@@ -4,16 +4,17 @@ Rights do not bind an administrator, as whom tests often run; so folders that ca
 read-only, and files that stand in the place of folders. Where nothing may be mounted those tests are skipped.
 """
 
+import contextlib
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from tests.helpers import draw_set
 from tests.processes import Command, Starter
-from tests.reliability.commands import evaluation, parts, remount, results, small_disk
-from tests.reliability.conftest import Rows
+from tests.reliability.conftest import Rows, evaluation, parts, results
 
 
 def may_mount() -> bool:
@@ -25,6 +26,26 @@ def may_mount() -> bool:
 
 
 mounts = pytest.mark.skipif(not may_mount(), reason="file systems may not be mounted here")
+
+
+@contextlib.contextmanager
+def small_disk(folder: Path, kilobytes: int) -> Iterator[Path]:
+    """A file system of so many kilobytes, mounted on the folder. Raises OSError where that is not allowed."""
+    folder.mkdir(parents=True, exist_ok=True)
+    done = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", f"size={kilobytes}k", "tmpfs", str(folder)], capture_output=True, check=False
+    )
+    if done.returncode:
+        raise OSError(done.stderr.decode().strip())
+    try:
+        yield folder
+    finally:
+        subprocess.run(["umount", "-l", str(folder)], check=True)
+
+
+def remount(folder: Path, options: str) -> None:
+    """Change a mounted file system: ``size=9m``, ``ro``, ``rw``."""
+    subprocess.run(["mount", "-o", f"remount,{options}", str(folder)], check=True)
 
 
 def expect_one_line(command: Command, *words: str) -> None:
@@ -147,22 +168,12 @@ def test_no_write_that_fails_loses_anything(starter, root, truth, tmp_path, reco
     record_property("writes that failed", number - 1)
 
 
-def two_writers(starter: Starter, root: Path, folder: Path, truth: Rows, seed: int) -> None:
+@pytest.mark.parametrize("runs", [1, pytest.param(10, marks=pytest.mark.reliability)])
+def test_two_writers(runs: int, starter: Starter, root: Path, truth: Rows, tmp_path: Path) -> None:
     """Two evaluations of one run at the same time, which share the work or do it twice."""
-    extra = ["workers=2", "batch=2"] if seed % 2 else []
-    run_dir = folder / f"run{seed}"
-    both = [starter.start(folder, "eval", *evaluation(root, run_dir, *extra)) for _ in range(2)]
-    assert [command.wait() for command in both] == [0, 0], [command.said() for command in both]
-    assert results(run_dir) == truth
-    assert not list(run_dir.glob("**/*.tmp"))
-
-
-def test_two_writers(starter: Starter, root: Path, truth: Rows, tmp_path: Path) -> None:
-    two_writers(starter, root, tmp_path, truth, 0)
-
-
-@pytest.mark.reliability
-def test_two_writers_often(starter, root, truth, tmp_path, record_property):
-    for seed in range(1, 11):
-        two_writers(starter, root, tmp_path, truth, seed)
-    record_property("runs of two writers", 10)
+    for number in range(runs):
+        words = evaluation(root, tmp_path / f"run{number}", *(["workers=2", "batch=2"] if number % 2 else []))
+        both = [starter.start(tmp_path, "eval", *words) for _ in range(2)]
+        assert [command.wait() for command in both] == [0, 0], [command.said() for command in both]
+        assert results(tmp_path / f"run{number}") == truth
+        assert not list(tmp_path.glob("**/*.tmp"))

@@ -3,17 +3,16 @@
 import json
 import os
 import time
-from collections.abc import Callable
-from itertools import islice
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from tests.helpers import draw_set
-from tests.processes import Starter
-from tests.reliability.commands import delays, evaluation, parts, results
-from tests.reliability.conftest import Rows
+from tests.processes import Command, Starter
+from tests.reliability.conftest import Rows, evaluation, parts, results
 
 EVAL_KILLS, MATCH_KILLS, TRAIN_KILLS, PROCESS_KILLS = (
     int(number) for number in os.environ.get("FMTORCH_KILLS", "40,20,30,10").split(",")
@@ -26,7 +25,11 @@ TRAIN = [
 ]  # fmt: skip
 
 
-Property = Callable[[str, object], None]
+def delays(seed: int) -> Iterator[float]:
+    """Seconds between what is waited for and the kill: none at all, within a pair's time, and beyond."""
+    rng = np.random.default_rng(seed)
+    while True:
+        yield float(rng.choice([0.0, 0.0, rng.uniform(0, 0.02), rng.uniform(0, 0.2)]))
 
 
 def bounded_and_whole(bounded: int, whole: int) -> list[Any]:
@@ -34,44 +37,46 @@ def bounded_and_whole(bounded: int, whole: int) -> list[Any]:
     return [bounded, pytest.param(whole, marks=pytest.mark.reliability)]
 
 
-def evaluate_with_kills(
-    starter: Starter, root: Path, folder: Path, kills: int, seed: int, *extra: str
-) -> tuple[int, list[Rows]]:
-    """Evaluate, killed once more rows than before are on disk, and again, until that many kills; the runs' rows."""
-    killed, finished, wait = 0, [], delays(seed)
+def with_kills(
+    start: Callable[[Path], Command], progress: Callable[[Path], int], folder: Path, kills: int, seed: int = 0
+) -> list[Path]:
+    """Start a command, killed once it has left more than before, and again, until that many kills; its folders."""
+    killed, outputs, wait = 0, list[Path](), delays(seed)
     while killed < kills:
-        run_dir = folder / f"run{len(finished)}"
+        assert len(outputs) < 10 * kills
+        output = folder / f"out{len(outputs)}"
+        outputs.append(output)
         while True:
-            before = parts(run_dir)
-            command = starter.start(folder, "eval", *evaluation(root, run_dir, *extra))
-            if killed < kills and command.kill_when(lambda: parts(run_dir) > before, next(wait)):  # noqa: B023
-                killed += 1
-                assert parts(run_dir) >= min(before + 1, 9)
-                continue
-            assert command.wait() == 0, command.said()
-            break
-        finished.append(results(run_dir))
-    return killed, finished
+            before = progress(output)
+            command = start(output)
+            if killed == kills or not command.kill_when(lambda: progress(output) > before, next(wait)):  # noqa: B023
+                assert command.wait() == 0, command.said()
+                break
+            killed += 1
+            assert progress(output) > before
+    return outputs
 
 
 @pytest.mark.parametrize("kills", bounded_and_whole(3, EVAL_KILLS))
-def test_an_evaluation_goes_on(kills, starter, root, truth, tmp_path, record_property):
-    killed, finished = evaluate_with_kills(starter, root, tmp_path, kills, 0)
-    assert killed == kills
-    assert all(rows == truth for rows in finished)
-    record_property("kills of eval", killed)
+def test_an_evaluation_goes_on(kills: int, starter: Starter, root: Path, truth: Rows, tmp_path: Path) -> None:
+    outputs = with_kills(
+        lambda output: starter.start(tmp_path, "eval", *evaluation(root, output)), parts, tmp_path, kills
+    )
+    assert all(results(output) == truth for output in outputs)
 
 
 @pytest.mark.reliability
-def test_with_processes_none_is_left_behind(starter, root, truth, tmp_path, record_property):
+def test_with_processes_none_is_left_behind(starter: Starter, root: Path, truth: Rows, tmp_path: Path) -> None:
     extra = ("processes=true", "workers=2", "batch=1")
-    killed, finished = evaluate_with_kills(starter, root, tmp_path, PROCESS_KILLS, 2, *extra)
-    assert all(rows == truth for rows in finished)
+    outputs = with_kills(
+        lambda output: starter.start(tmp_path, "eval", *evaluation(root, output, *extra)),
+        parts, tmp_path, PROCESS_KILLS, seed=2,
+    )  # fmt: skip
+    assert all(results(output) == truth for output in outputs)
     deadline = time.monotonic() + 60
     while (left := running(str(tmp_path))) and time.monotonic() < deadline:
         time.sleep(0.5)
     assert left == []
-    record_property("kills of eval with processes", killed)
 
 
 def running(cwd: str) -> list[str]:
@@ -93,34 +98,21 @@ def match_result(folder: Path) -> dict[str, object]:
     return {**{k: v for k, v in result.items() if k != "seconds"}, **pictures}
 
 
-def match_with_kills(starter: Starter, root: Path, folder: Path, kills: int, seed: int) -> int:
-    """Match two photographs, killed once the result is on disk, then to the end; checks that nothing is different."""
-    images = [f"image{i}={root}/scene0/Images/{i:08d}.png" for i in (0, 1)]
-    arguments = ["pipeline=sift_gms", *images]
-    done = starter.run(folder, "match", *arguments, "output=undisturbed")
-    assert done.status == 0, done.said()
-    truth, killed = match_result(folder / "undisturbed"), 0
-    for i, later in enumerate(islice(delays(seed), 10 * kills)):
-        output = folder / f"out{i}"
-        command = starter.start(folder, "match", *arguments, f"output={output}")
-        if not command.kill_when((output / "result.json").exists, later):
-            assert command.wait() == 0, command.said()
-            continue
-        killed += 1
-        json.loads((output / "result.json").read_text())  # whole
-        again = starter.run(folder, "match", *arguments, f"output={output}")
-        assert again.status == 0, again.said()
-        assert match_result(output) == truth
-        if killed == kills:
-            break
-    return killed
-
-
 @pytest.mark.parametrize("kills", bounded_and_whole(1, MATCH_KILLS))
-def test_two_photographs_are_matched_again(kills, starter, root, tmp_path, record_property):
-    killed = match_with_kills(starter, root, tmp_path, kills, 0)
-    assert killed == kills
-    record_property("kills of match", killed)
+def test_two_photographs_are_matched_again(kills: int, starter: Starter, root: Path, tmp_path: Path) -> None:
+    """Killed once the result is on disk, whole."""
+    images = [f"image{i}={root}/scene0/Images/{i:08d}.png" for i in (0, 1)]
+
+    def start(output: Path) -> Command:
+        return starter.start(tmp_path, "match", "pipeline=sift_gms", *images, f"output={output}")
+
+    def progress(output: Path) -> int:
+        file = output / "result.json"
+        return len(json.loads(file.read_text())) if file.exists() else 0
+
+    assert start(tmp_path / "undisturbed").wait() == 0
+    truth = match_result(tmp_path / "undisturbed")
+    assert all(match_result(output) == truth for output in with_kills(start, progress, tmp_path, kills))
 
 
 def trained(folder: Path) -> dict[str, bytes]:
@@ -133,31 +125,24 @@ def newest(folder: Path) -> int:
     return max((int(path.stem.removeprefix("step=")) for path in folder.glob("checkpoints/step=*.ckpt")), default=-1)
 
 
-def train_with_kills(starter: Starter, folder: Path, kills: int, seed: int) -> int:
-    """Train, killed once a later checkpoint is on disk, and again; checks that the weights are no others."""
-    pytest.importorskip("lightning", reason="training needs the extra `train`")
-    root = draw_set(folder / "Set", ["scene0", "scene1"], images=4)
-    arguments = ["dataset=fmbench", f"dataset.root={root}", *TRAIN]
-    done = starter.run(folder, "train", *arguments, "output=undisturbed")
-    assert done.status == 0, done.said()
-    truth, killed, wait, count = trained(folder / "undisturbed"), 0, delays(seed), 0
-    while killed < kills:
-        output = folder / f"out{count}"
-        count += 1
-        while True:
-            before = newest(output)
-            command = starter.start(folder, "train", *arguments, f"output={output}")
-            if killed < kills and command.kill_when(lambda: newest(output) > before, next(wait)):  # noqa: B023
-                killed += 1
-                continue
-            assert command.wait() == 0, command.said()
-            break
-        assert trained(output) == truth
-    return killed
+QUICK = """
+import fmtorch.training.export
+fmtorch.training.export.export_onnx = lambda network, path, **_: path.touch()
+"""
+"""Run before a training: an export of the network, which takes seconds, changes nothing here."""
 
 
 @pytest.mark.parametrize("kills", bounded_and_whole(1, TRAIN_KILLS))
-def test_a_training_goes_on(kills: int, starter: Starter, tmp_path: Path, record_property: Property) -> None:
-    killed = train_with_kills(starter, tmp_path, kills, 0)
-    assert killed == kills
-    record_property("kills of train", killed)
+def test_a_training_goes_on(kills: int, starter: Starter, tmp_path: Path) -> None:
+    """Killed once a later checkpoint is on disk."""
+    pytest.importorskip("lightning", reason="training needs the extra `train`")
+    root = draw_set(tmp_path / "Set", ["scene0", "scene1"], images=4)
+
+    def start(output: Path) -> Command:
+        words = ["dataset=fmbench", f"dataset.root={root}", *TRAIN, f"output={output}"]
+        return starter.start(tmp_path, "train", *words, before=QUICK)
+
+    undisturbed = start(tmp_path / "undisturbed")
+    assert undisturbed.wait() == 0, undisturbed.said()
+    truth = trained(tmp_path / "undisturbed")
+    assert all(trained(output) == truth for output in with_kills(start, newest, tmp_path, kills))

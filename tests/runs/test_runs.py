@@ -1,11 +1,17 @@
-"""Run folders: identity, rows, parts that are merged as they grow in number, by several writers with readers."""
+"""Run folders: identity, rows, parts that are merged as they grow in number, by several writers with readers; the code
+that makes a result: commits, changed sources, the modules of a user's own parts and what they import."""
 
 import dataclasses
 import errno
+import importlib
 import json
 import multiprocessing
 import os
+import shutil
+import subprocess
+import sys
 import threading
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +19,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from fmtorch import __version__
 from fmtorch.core import pair_key
-from fmtorch.runs import PAIR_SCHEMA, PairRow, RunFolder, RunFolderError, identity_digest
+from fmtorch.runs import PAIR_SCHEMA, PairRow, RunFolder, RunFolderError, fingerprint, identity_digest
 from fmtorch.runs import run_folder as parts_module
 from fmtorch.runs.run_folder import MAX_LEVEL, MERGED, content_digest, part_files
 
@@ -38,24 +45,17 @@ def failed(name: str) -> PairRow:
     return PairRow(name, pair_key(name), family="indoor", scene="s", ok=False, reason="too few matches: 5, needs 8")
 
 
-def test_identity_ignores_order_and_container_types() -> None:
+PIPELINE = {**CONFIG["pipeline"], "estimator": {"threshold": 0.5 + 2**-53, "samples": 2000}}
+
+
+def test_identity_changes_with_any_field_and_ignores_order_and_container_types() -> None:
     swapped = {key: CONFIG[key] for key in reversed(CONFIG)}
     swapped["pipeline"] = {**CONFIG["pipeline"], "stages": ("a", "b")}
     assert identity_digest(swapped) == identity_digest(CONFIG)
-
-
-def test_identity_is_the_same_in_every_version() -> None:
+    for change in ({"seed": 1}, {"version": "0.1.1"}, {"pipeline": PIPELINE}, {"extra": None}):
+        assert identity_digest({**CONFIG, **change}) != identity_digest(CONFIG), change
     # blake2b of the canonical text, computed apart; run folders of old must stay valid.
     assert identity_digest({"b": 0.1, "a": [1, None, True, "ü"]}) == "2087b63ed2736b65dc1c72eed6e2b183"
-
-
-PIPELINE = {**CONFIG["pipeline"], "estimator": {"threshold": 0.5 + 2**-53, "samples": 2000}}
-CHANGES = [{"seed": 1}, {"version": "0.1.1"}, {"pipeline": PIPELINE}, {"extra": None}]
-
-
-@pytest.mark.parametrize("change", CHANGES)
-def test_identity_changes_with_any_field(change: dict[str, object]) -> None:
-    assert identity_digest({**CONFIG, **change}) != identity_digest(CONFIG)
 
 
 def test_open_writes_the_identity_and_continues(tmp_path: Path) -> None:
@@ -66,8 +66,11 @@ def test_open_writes_the_identity_and_continues(tmp_path: Path) -> None:
     assert stored["identity"] == identity_digest(CONFIG) == run.identity
     before = (path / "run.json").read_bytes(), (path / "run.json").stat().st_mtime_ns
     run.append([row("a")])
-    assert RunFolder.open(path, CONFIG).done() == {pair_key("a")}
+    for again in (RunFolder.open(path, CONFIG), RunFolder.load(path)):
+        assert (again.done(), again.config, again.read().num_rows) == ({pair_key("a")}, CONFIG, 1)
     assert ((path / "run.json").read_bytes(), (path / "run.json").stat().st_mtime_ns) == before
+    with pytest.raises(RunFolderError, match=r"no run\.json"):
+        RunFolder.load(tmp_path)
 
 
 def test_open_refuses_another_identity_and_says_what_differs(tmp_path: Path) -> None:
@@ -124,14 +127,6 @@ def test_the_order_of_a_list_of_names_is_part_of_the_identity(tmp_path: Path) ->
         RunFolder.open(tmp_path, {"pruner": stages[::-1]})
     with pytest.raises(RunFolderError, match=r"\): pruner\.ratio\.threshold: 0\.8 -> 0\.9\. "):
         RunFolder.open(tmp_path, {"pruner": [{"ratio": {"threshold": 0.9}}, stages[1]]})
-
-
-def test_load_reads_whatever_the_identity(tmp_path: Path) -> None:
-    RunFolder.open(tmp_path, CONFIG).append([row("a")])
-    run = RunFolder.load(tmp_path)
-    assert (run.config, run.read().num_rows) == (CONFIG, 1)
-    with pytest.raises(RunFolderError, match=r"no run\.json"):
-        RunFolder.load(tmp_path / "absent")
 
 
 def test_a_file_system_without_hard_links(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -203,20 +198,6 @@ def test_of_duplicates_the_first_written_counts_and_order_is_kept(tmp_path: Path
     assert run.read(set()).num_rows == 0
 
 
-@pytest.mark.parametrize("length", [100, 0])
-def test_a_broken_part_is_named_and_the_remedy_works(tmp_path: Path, length: int) -> None:
-    run = RunFolder.open(tmp_path, CONFIG)
-    run.append([row("a")])
-    run.append([row("b")])
-    part = sorted((tmp_path / "pairs").iterdir())[0]
-    part.write_bytes(part.read_bytes()[:length])
-    for use in (run.read, run.done):
-        with pytest.raises(RunFolderError, match=rf"{part.name}.*delete it"):
-            use()
-    part.unlink()
-    assert run.done() == {pair_key("b")}
-
-
 def test_an_error_while_writing_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run = RunFolder.open(tmp_path, CONFIG)
 
@@ -232,33 +213,32 @@ def test_an_error_while_writing_leaves_nothing(tmp_path: Path, monkeypatch: pyte
     assert list((tmp_path / "pairs").iterdir()) == []
 
 
-def _worker(path: Path, number: int, config: dict[str, object]) -> None:
-    run = RunFolder.open(path, config)
+def _write(path: Path, number: int, config: dict[str, object]) -> bool:
+    """Whether rows were written: of a folder of the same identity."""
+    try:
+        run = RunFolder.open(path, config)
+    except RunFolderError:
+        return False
     for i in range(10):
         run.append([row(f"{number}-{i}"), row(f"shared-{i}", corrs=number)])
+    return True
 
 
-def workers(path: Path, *configs: dict[str, object]) -> list[int | None]:
-    """The exit codes of processes that write one folder."""
-    context = multiprocessing.get_context("fork")
-    processes = [context.Process(target=_worker, args=(path, n, config)) for n, config in enumerate(configs)]
-    for process in processes:
-        process.start()
-    for process in processes:
-        process.join()
-    return [process.exitcode for process in processes]
+def written(path: Path, *configs: dict[str, object]) -> list[bool]:
+    """Of processes that write one folder at once, whether they did."""
+    with multiprocessing.get_context("fork").Pool(len(configs)) as pool:
+        return pool.starmap(_write, [(path, n, config) for n, config in enumerate(configs)], chunksize=1)
 
 
 def test_several_processes_write_one_folder(tmp_path: Path) -> None:
-    assert workers(tmp_path / "run", CONFIG, CONFIG, CONFIG) == [0, 0, 0]
+    assert written(tmp_path / "run", CONFIG, CONFIG, CONFIG) == [True] * 3
     run = RunFolder.load(tmp_path / "run")
     assert (run.read().num_rows, len(run.done())) == (3 * 10 + 10, 40)
     assert list(tmp_path.rglob("*.tmp")) == []
 
 
 def test_of_processes_with_different_identities_one_wins(tmp_path: Path) -> None:
-    ended = workers(tmp_path / "run", *({"seed": n} for n in range(3)))
-    assert sorted(code != 0 for code in ended) == [False, True, True]
+    assert sorted(written(tmp_path / "run", *({"seed": n} for n in range(3)))) == [False, False, True]
     run = RunFolder.load(tmp_path / "run")
     corrs = np.unique(run.read()["corrs"].to_numpy()[1::2])
     assert corrs.tolist() == [run.config["seed"]]
@@ -286,9 +266,10 @@ def keys(folder: RunFolder) -> list[int]:
     return [int(key) for key in folder.read()["key"].to_numpy()]
 
 
-def test_few_parts_are_left_of_many_batches(tmp_path: Path) -> None:
+def test_few_parts_are_left_of_many_batches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(parts_module, "MERGED", 6)
     folder = RunFolder.open(tmp_path / "run", IDENTITY)
-    batches = 2 * MERGED**2 + 3 * MERGED + 5
+    batches = 2 * 6**2 + 3 * 6 + 5
     for batch in range(batches):
         folder.append([numbered_row(2 * batch), numbered_row(2 * batch + 1)])
     assert len(part_files(folder.path / "pairs")) == 2 + 3 + 5
@@ -314,7 +295,7 @@ def test_the_first_written_row_counts_after_parts_were_merged(tmp_path: Path) ->
     assert first.read()["reason"][0].as_py() == "the first"
 
 
-def test_a_damaged_part_is_left_for_the_reader_to_name(tmp_path: Path) -> None:
+def test_a_damaged_part_is_left_for_the_reader_to_name_and_the_remedy_works(tmp_path: Path) -> None:
     folder = RunFolder.open(tmp_path / "run", IDENTITY)
     folder.append([numbered_row(0)])
     (damaged,) = part_files(folder.path / "pairs")
@@ -322,8 +303,9 @@ def test_a_damaged_part_is_left_for_the_reader_to_name(tmp_path: Path) -> None:
     for key in range(1, MERGED):
         folder.append([numbered_row(key)])
     assert len(part_files(folder.path / "pairs")) == MERGED
-    with pytest.raises(ValueError, match=damaged.name):
-        folder.done()
+    for use in (folder.read, folder.done):
+        with pytest.raises(RunFolderError, match=rf"{damaged.name}.*delete it"):
+            use()
     damaged.unlink()
     assert folder.done() == set(range(1, MERGED))
 
@@ -343,7 +325,8 @@ def test_a_full_disk_leaves_parts_unmerged(tmp_path: Path, monkeypatch: pytest.M
     assert folder.done() == set(range(MERGED))
 
 
-def test_readers_lose_no_row_while_parts_are_merged(tmp_path: Path) -> None:
+def test_readers_lose_no_row_while_parts_are_merged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(parts_module, "MERGED", 4)  # often
     folder = RunFolder.open(tmp_path / "run", IDENTITY)
     written, ended, errors = [0], threading.Event(), list[str]()
 
@@ -356,9 +339,125 @@ def test_readers_lose_no_row_while_parts_are_merged(tmp_path: Path) -> None:
 
     reader = threading.Thread(target=read)
     reader.start()
-    for key in range(10 * MERGED):
+    for key in range(80):
         folder.append([numbered_row(key)])
         written[0] = key + 1
     ended.set()
     reader.join()
     assert errors == []
+
+
+@pytest.fixture
+def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A checkout of another program, taken for this one."""
+    folder = tmp_path / "checkout" / "fmtorch"
+    folder.mkdir(parents=True)
+    (folder / "a.py").write_text("one")
+    (folder.parent / "pyproject.toml").write_text("")
+    monkeypatch.setattr(fingerprint, "PACKAGE", folder)
+    fingerprint.fmtorch_version.cache_clear()
+    yield folder
+    fingerprint.fmtorch_version.cache_clear()
+
+
+def version() -> str:
+    fingerprint.fmtorch_version.cache_clear()
+    return fingerprint.fmtorch_version()
+
+
+def git(folder: Path, *arguments: str) -> str:
+    who = ["-c", "user.name=A", "-c", "user.email=a@b"]
+    command = ["git", "-C", str(folder), *who, *arguments]
+    return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
+
+
+@pytest.mark.skipif(shutil.which("git") is None, reason="git is not installed")
+def test_a_checkout_is_its_commit_and_what_was_changed_since(package: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    checkout = package.parent
+    git(checkout, "init", "-q")
+    assert version().startswith(f"{__version__}+sources.")  # nothing is committed yet
+    git(checkout, "add", ".")
+    git(checkout, "commit", "-qm", "first")
+    commit = git(checkout, "rev-parse", "HEAD")
+    clean = f"{__version__}+g{commit[: fingerprint.DIGITS]}"
+    assert version() == clean
+    (checkout / "notes.md").write_text("decides nothing")
+    monkeypatch.setenv("GIT_DIR", str(checkout / "elsewhere"))  # as within a hook of another repository
+    assert version() == clean
+    monkeypatch.delenv("GIT_DIR")
+    (package / "a.py").write_text("two")
+    dirty = version()
+    assert dirty.startswith(f"{clean}.dirty.")
+    (package / "a.py").write_text("three")
+    assert dirty != version() != clean
+    (package / "a.py").write_text("one")
+    assert version() == clean
+    (package / "b.py").write_text("new")
+    assert version().startswith(f"{clean}.dirty.")
+
+
+def test_without_git_the_sources_tell(package: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (package.parent / ".git").mkdir()  # which git refuses, were it there
+    monkeypatch.setenv("PATH", "")
+    first = version()
+    assert first.startswith(f"{__version__}+sources.")
+    (package / "a.py").write_text("two")
+    assert version() != first
+    (package.parent / "pyproject.toml").unlink()  # installed: the version says it all
+    assert version() == __version__
+
+
+OWN = {
+    "lone.py": "import helper\nfrom folder import inner\nimport json, numpy",
+    "helper.py": "from folder.inner import x",
+    "folder/inner.py": "x = 1",
+    "folder/unused.py": "",
+    "other.py": "",
+    "parts/__init__.py": "",
+    "parts/common.py": "import lone",
+    "parts/deep/stage.py": "from ..common import lone\nfrom . import near\nimport fmtorch.core.types",
+    "parts/deep/near.py": "",
+    "parts/deep/below/far.py": "",
+    "parts/broken.py": "",
+}
+FOLLOWED = {
+    "lone": {"lone.py", "helper.py", "folder/inner.py"},
+    "parts.deep.stage": {
+        *("parts/deep/stage.py", "parts/deep/near.py", "parts/deep/below/far.py", "parts/common.py"),
+        *("lone.py", "helper.py", "folder/inner.py"),
+    },
+}
+
+
+@pytest.mark.parametrize("module", FOLLOWED)
+def test_a_module_is_all_that_it_imports_of_its_own(module, tmp_path, monkeypatch):
+    for name, text in OWN.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    names = [name.removesuffix(".py").replace("/", ".") for name in OWN]
+    for name in ("parts", "parts.deep", "folder", *names):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    importlib.import_module(module)
+
+    def of() -> str:
+        fingerprint.code_digest.cache_clear()
+        return fingerprint.code_digest(module)
+
+    before = of()
+    assert of() == before
+    changing = set()
+    for name, text in OWN.items():
+        (tmp_path / name).write_text(f"{text}\n# edited")
+        changing |= {name} if of() != before else set()
+        (tmp_path / name).write_text(text)
+    assert changing == FOLLOWED[module]
+    (tmp_path / "helper.py").write_text("not python")  # what does not compile is told by its text, and follows nothing
+    assert of() != before
+    for name in names:
+        sys.modules.pop(name, None)
+
+
+def test_a_module_without_a_file_is_refused() -> None:
+    with pytest.raises(TypeError, match="sys is in no file"):
+        fingerprint.code_digest("sys")

@@ -22,8 +22,9 @@ from tests.reference import solvers
 from tests.scripts.samples import read, run
 
 SET, THRESHOLD = "imc_london_bridge", 0.75
-PAIRS = 6
+PAIRS = 4
 PROTOCOL = {"max_epipolar_error": THRESHOLD, "max_iterations": 1000, "min_iterations": 100, "success_prob": 0.9999}
+COLMAP = {"max_error": THRESHOLD, "max_num_trials": 1000, "min_num_trials": 100, "confidence": 0.9999, "random_seed": 0}
 
 
 @functools.cache
@@ -53,18 +54,13 @@ def direct(method: str) -> list[float]:
     """The larger angle of each pair: the libraries called as PoseBench calls them, judged by its definitions."""
     errors = []
     for pair, c in real()[:-1]:
-        x, motion = matched(c), (pair.R, pair.t)
-        cameras = [
-            {"model": "PINHOLE", "width": int(s[0, 1]), "height": int(s[0, 0]),
-             "params": [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]}
-            for K, s in ((pair.K0, c.size0), (pair.K1, c.size1))
-        ]  # fmt: skip
-        F, R, t = CALLS[method](x, cameras)
-        if F is not None:
-            angles = reference.closest_pose_error(solvers.poses(pair.K1.T @ F @ pair.K0), *motion)
-        else:
-            angles = reference.rotation_angle(R, pair.R), reference.signed_direction_angle(t, pair.t)
-        errors.append(max(angles))
+        cameras = []
+        for K, ((height, width),) in ((pair.K0, c.size0.tolist()), (pair.K1, c.size1.tolist())):
+            params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
+            cameras.append({"model": "PINHOLE", "width": width, "height": height, "params": params})
+        F, R, t = CALLS[method](matched(c), cameras)
+        poses = [(R, t)] if F is None else solvers.poses(pair.K1.T @ F @ pair.K0)
+        errors.append(max(reference.closest_pose_error(poses, pair.R, pair.t)))
     return [*errors, 180.0]  # three matches
 
 
@@ -79,22 +75,16 @@ def _poselib_f(x: Any, cameras: Any) -> Any:
     return np.asarray(poselib.estimate_fundamental(*x, {**PROTOCOL, "seed": 0}, {})[0]), None, None
 
 
-def _colmap_options() -> Any:
-    pycolmap = pytest.importorskip("pycolmap")
-    return pycolmap, pycolmap.RANSACOptions(
-        max_error=THRESHOLD, max_num_trials=1000, min_num_trials=100, confidence=0.9999, random_seed=0
-    )
-
-
 def _colmap_e(x: Any, cameras: Any) -> Any:
-    pycolmap, options = _colmap_options()
-    result = pycolmap.estimate_essential_matrix(*x, *(pycolmap.Camera(camera) for camera in cameras), options)
+    pycolmap = pytest.importorskip("pycolmap")
+    own = pycolmap.RANSACOptions(**COLMAP)
+    result = pycolmap.estimate_essential_matrix(*x, *(pycolmap.Camera(camera) for camera in cameras), own)
     return None, result["cam2_from_cam1"].rotation.matrix(), result["cam2_from_cam1"].translation
 
 
 def _colmap_f(x: Any, cameras: Any) -> Any:
-    pycolmap, options = _colmap_options()
-    return np.asarray(pycolmap.estimate_fundamental_matrix(*x, options)["F"]), None, None
+    pycolmap = pytest.importorskip("pycolmap")
+    return pycolmap.estimate_fundamental_matrix(*x, pycolmap.RANSACOptions(**COLMAP))["F"], None, None
 
 
 CALLS = {"E:poselib": _poselib_e, "F:poselib": _poselib_f, "E:colmap": _colmap_e, "F:colmap": _colmap_f}

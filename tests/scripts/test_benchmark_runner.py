@@ -20,7 +20,7 @@ from scripts.benchmark.pipelines import BENCHMARKS, RULE, differences_sheet, fig
 from scripts.benchmark.runner import Item, Kept, Measured, Row, measure
 from scripts.benchmark.tables import FIGURES, MEDIANS, Results, Sheet, Span, published, show
 from tests.helpers import draw_set
-from tests.laws import scene
+from tests.laws import PEERS, scene
 from tests.reference import lenses as division
 from tests.scripts.samples import item, pair, read, row, run
 
@@ -137,6 +137,8 @@ def test_the_files_of_estimators_name_estimators_there_are() -> None:
         known |= inspect.signature(fmtorch.find_fundamental).parameters if front == "find_fundamental" else {}
         assert set(changed) <= {*known, "focal"}, spec
         assert {split(stage)[0] for stage in stages_of(spec)} <= {*presets.available("pruner"), *words}, spec
+        if front not in PEERS and "ngransac" not in spec:
+            assert methods.method(spec).name == spec
     with pytest.raises(SystemExit, match=r"'other \| ransac \| 10' is not CURVE"):
         estimators.read_curves(["other | ransac | 10"])
 

@@ -1,10 +1,16 @@
-"""Training of patch networks: patches, losses, figures, the loop and the command."""
+"""Training of patch networks: patches, losses, figures, the loop and the command; their files in the layout that ONNX
+Runtime runs fastest: the same outputs."""
 
 import itertools
+import multiprocessing.dummy
+import pickle
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import onnx
+import onnxruntime
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
@@ -12,18 +18,27 @@ from omegaconf import DictConfig
 from PIL import Image
 from torch import Tensor, nn
 
-from fmtorch.core import conf_dir
-from fmtorch.features.networks import GeoDesc, HardNet, build
+from fmtorch.core import conf_dir, models_dir
+from fmtorch.features import PatchNetwork
+from fmtorch.features.networks import ARCHITECTURES, GeoDesc, HardNet, build
 from fmtorch.scenes import photograph
 from fmtorch.training import Photograph, PlaneViews, list_photographs, plane_homography, random_camera
 from scripts.patch_networks import objectives, stores
 from scripts.patch_networks.objectives import geodesc, geometric, hardest_triplet, structured
+from scripts.patch_networks.onnx_export import export, laid_out, quantize
 from scripts.patch_networks.stores import tracks
 from scripts.patch_networks.train import PatchTraining, TrainingOptions, cutting_of, training_of
+from tests.features.test_networks import randomized
 from tests.reference import geodesc as geodesc_reference
 from tests.reference import patch_losses as reference
 
 PLANES = PlaneViews(views=4, tilt=15.0, scale=(0.5, 0.6))
+
+
+@pytest.fixture
+def in_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Photographs are cut by threads in place of processes, which take seconds to start."""
+    monkeypatch.setattr(stores, "multiprocessing", SimpleNamespace(get_context=lambda _: multiprocessing.dummy))
 
 
 @pytest.fixture(scope="module")
@@ -34,16 +49,6 @@ def store() -> stores.PatchStore:
     first = np.r_[0, np.cumsum(np.bincount(point))]
     about = {"photographs": {"scikit-image": 1}, "points": len(first) - 1, "patches": len(patches), "views": 4}
     return stores.PatchStore(patches, first, *geometry, {**about, "limits": {}})
-
-
-def test_the_margins_of_match_sets_are_those_of_the_paper() -> None:
-    zero, one = torch.tensor([[0.0, 1]]), torch.tensor([[1.0, 0]])  # of cosine 0: the loss is the margin
-    margins = [float(objectives.geometric(zero, one, torch.tensor([s]))) for s in (1.0, 0.5, 0.4999, 0.2, 0.1999, 0.0)]
-    assert margins == pytest.approx([0.7, 0.7, 0.5, 0.5, 0.2, 0.2])
-    # Two matches of similarity s whose patches are else of similarity c: no loss while c <= (1 - ratio) s.
-    for c, s, expected in ((0.54, 0.9, 0.0), (0.64, 0.9, 0.2), (0.34, 0.4, 0.2)):
-        found = objectives.structured(torch.eye(2), torch.tensor([[s, c], [c, s]]).mT, ratio=0.4)
-        assert float(found) == pytest.approx(expected, abs=1e-6)
 
 
 def test_figures_of_known_answers() -> None:
@@ -65,7 +70,7 @@ def training(store: stores.PatchStore, **options: Any) -> PatchTraining:
 
 def set_training(store: stores.PatchStore, batch: int = 32) -> PatchTraining:
     torch.manual_seed(0)
-    options = TrainingOptions(batch=batch, steps=20, learning_rate=3e-4, bf16=False, checkpoint_steps=1000)
+    options = TrainingOptions(**{**OPTIONS, "batch": batch, "learning_rate": 3e-4})
     description = {"architecture": "geodesc", "loss": {"name": "geodesc"}, "match_sets": {"matches": 16}}
     objective, sets = objectives.DescriptorObjective(objectives.geodesc), stores.match_sets(store, 16, 1.0)
     return PatchTraining(GeoDesc(), objective, store, options, description, sets=sets, matches=16)
@@ -74,12 +79,12 @@ def set_training(store: stores.PatchStore, batch: int = 32) -> PatchTraining:
 @pytest.mark.parametrize("make", [training, set_training])
 def test_a_resumed_run_is_the_uninterrupted_run(make, store, tmp_path):
     whole, first, second = make(store), make(store), make(store)
-    whole.run(until=6)
-    first.run(until=3, checkpoint=tmp_path / "run.pt")
+    whole.run(until=4)
+    first.run(until=2, checkpoint=tmp_path / "run.pt")
     second.resume(tmp_path / "run.pt")
-    assert second.step == 3
+    assert second.step == 2
     torch.manual_seed(99)  # what else draws random numbers does not matter
-    second.run(until=6)
+    second.run(until=4)
     assert second.losses == whole.losses
     for name, value in whole.network.state_dict().items():
         assert torch.equal(value, second.network.state_dict()[name]), name
@@ -106,6 +111,7 @@ def config(*overrides: str) -> DictConfig:
         return compose("train_patch_network", overrides=["training=geodesc", "images=.", *overrides])
 
 
+@pytest.mark.usefixtures("in_threads")
 def test_photographs_become_tracks_and_a_step_of_training(tmp_path: Path) -> None:
     """The preset has the values of the paper."""
     training = config().training
@@ -136,10 +142,11 @@ def correlations(patches: np.ndarray, point: np.ndarray) -> tuple[float, float]:
     return float(np.median((a * b).mean(1))), float(np.median((a * np.roll(b, 1, 0)).mean(1)))
 
 
-def test_a_store_is_complete_deterministic_and_gives_two_different_views(tmp_path: Path) -> None:
+def test_a_store_is_complete_deterministic_and_gives_two_different_views(tmp_path, request):
     names, cutting = stores.package_photographs()[:2], stores.Cutting(PLANES, 40, longest_side=300)
-    store = stores.build_store(tmp_path / "a", names, cutting, seed=5)
     again = stores.build_store(tmp_path / "b", names, cutting, seed=5, workers=2)
+    request.getfixturevalue("in_threads")
+    store = stores.build_store(tmp_path / "a", names, cutting, seed=5)
     np.testing.assert_array_equal(store.patches, again.patches)
     np.testing.assert_array_equal(store.first, again.first)
     assert store.first[-1] == len(store.patches)
@@ -157,10 +164,12 @@ def test_a_store_is_complete_deterministic_and_gives_two_different_views(tmp_pat
         assert shown[0] != shown[1]
 
 
+@pytest.mark.usefixtures("in_threads")
 def test_an_unreadable_photograph_leaves_no_store(tmp_path: Path) -> None:
     (tmp_path / "bad.jpg").write_bytes(b"no image")
-    with pytest.raises(ValueError, match=r"bad\.jpg"):
+    with pytest.raises(ValueError, match=r"bad\.jpg") as refused:
         stores.build_store(tmp_path / "s", [Photograph(tmp_path / "bad.jpg", "x")], stores.Cutting(PLANES, 10), seed=0)
+    assert str(pickle.loads(pickle.dumps(refused.value))) == str(refused.value)  # as it comes from a process
     assert [p.name for p in tmp_path.iterdir()] == ["bad.jpg"]
     with pytest.raises(FileNotFoundError, match="holds no patches"):
         stores.PatchStore.open(tmp_path / "s")
@@ -289,3 +298,64 @@ def test_match_sets_are_their_definition() -> None:
         assert sets.similarity[a:b].mean() == pytest.approx(image)
     with pytest.raises(ValueError, match=r"shares 500 points .* at most 0\.85: lower match_sets\.matches"):
         stores.match_sets(tracks, 500)
+
+
+NAMES = [name for name in ARCHITECTURES if name != "orinet"]
+SHIPPED = [(name, f"{name}{precision}.onnx") for name in NAMES for precision in ("", ".int8")]
+
+
+@pytest.fixture(scope="module")
+def patches() -> Tensor:
+    """Noise, ramps, a constant patch and one of extreme values."""
+    generator = torch.Generator().manual_seed(3)
+    noise = torch.rand(40, 1, 32, 32, generator=generator)
+    ramp = torch.linspace(0, 1, 32).expand(1, 1, 32, 32)
+    extreme = (torch.rand(20, 1, 32, 32, generator=generator) > 0.5).float()
+    return torch.cat([noise, ramp, ramp.transpose(2, 3), torch.full((1, 1, 32, 32), 0.5), extreme])
+
+
+@pytest.fixture
+def exact_int8(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Sums of int8 products in 32 bits on every processor.
+
+    Without VNNI, ONNX Runtime otherwise adds them in pairs in 16 bits, where they saturate; which are pairs depends on
+    the layout.
+    """
+
+    class Exact(onnxruntime.SessionOptions):  # type: ignore[misc, unused-ignore]
+        def __init__(self) -> None:
+            super().__init__()
+            self.add_session_config_entry("session.x64quantprecision", "1")
+
+    monkeypatch.setattr(onnxruntime, "SessionOptions", Exact)
+
+
+def exported(name: str, folder: Path, patches: Tensor) -> tuple[Path, Path]:
+    """A network of random weights in fp32 and int8, in the layouts that torch and the quantisation leave."""
+    fp32, int8 = folder / "fp32.onnx", folder / "int8.onnx"
+    export(randomized(build(name)), fp32)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("scripts.patch_networks.onnx_export.lay_out", lambda path: None)
+        quantize(fp32, int8, patches)
+    return fp32, int8
+
+
+@pytest.mark.usefixtures("exact_int8")
+@pytest.mark.parametrize("name", ["l2net", "affnet"])  # one that ends in a normalisation, one in Tanh
+def test_the_outputs_are_the_same(name: str, tmp_path: Path, patches: Tensor) -> None:
+    for path, atol in zip(exported(name, tmp_path, patches), (1e-5, 0.0), strict=True):
+        model = onnx.load(path)
+        onnx.save(laid_out(model, 32), tmp_path / "laid_out.onnx")
+        assert model == onnx.load(path)  # what was given is not changed
+        for batch in (1, 64):
+            expected = PatchNetwork(path, batch=batch)(patches)
+            found = PatchNetwork(tmp_path / "laid_out.onnx", batch=batch)(patches)
+            assert float(expected.nan_to_num().std()) > 0
+            torch.testing.assert_close(found, expected, atol=atol, rtol=0, equal_nan=True)  # L2-Net of constant patches
+
+
+@pytest.mark.parametrize(("name", "file"), SHIPPED)
+def test_shipped_networks_are_laid_out(name: str, file: str) -> None:
+    convolutions = sum(isinstance(layer, torch.nn.Conv2d) for layer in build(name).modules())
+    operators = [node.op_type for node in onnx.load(models_dir() / file).graph.node]
+    assert (operators.count("Gemm"), operators.count("Conv")) == (1, convolutions - 1)

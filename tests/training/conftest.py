@@ -5,11 +5,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from fmtorch.core import Correspondences, pair_key
 from fmtorch.scenes import Plan, RenderedPairs, calibration
 from fmtorch.training import LabelledMatches, MatchedPairs
 from tests.conftest import own_cache
+from tests.helpers import cross_matrix
 
 TINY = Plan(scenes=2, shots=4, pairs=4, scale=0.25)
 FAMILY = "indoor"  # the quickest to draw
@@ -52,11 +54,7 @@ def _exact_pair(rng: np.random.Generator, n: int, share: float, ignored: float) 
     sizes = [(480, 640), (300, 500)]
     K0, K1 = (calibration(rng.uniform(300, 900), s, tuple(rng.uniform(0.4, 0.6, 2) * s[::-1])) for s in sizes)
     K0[1, 1] *= 1.1  # pixels that are not square
-    angle = rng.normal(0, 0.2, 3)
-    skew = np.array([[0, -angle[2], angle[1]], [angle[2], 0, -angle[0]], [-angle[1], angle[0], 0]])
-    R, _ = np.linalg.qr(np.eye(3) + skew)
-    R *= np.sign(np.diag(R))
-    t = rng.normal(size=3)
+    R, t = Rotation.from_rotvec(rng.normal(0, 0.2, 3)).as_matrix(), rng.normal(size=3)
     x0 = rng.uniform(0, [639, 479], (n, 2))
     depth = rng.uniform(5, 20, (n, 1))
     X = np.column_stack([x0, np.ones(n)]) @ np.linalg.inv(K0).T * depth
@@ -65,8 +63,7 @@ def _exact_pair(rng: np.random.Generator, n: int, share: float, ignored: float) 
     label = (rng.random(n) < share).astype(np.int8)
     label[rng.random(n) < ignored] = -1
     x1 = np.where(label[:, None] == 0, rng.uniform(0, [499, 299], (n, 2)), x1)
-    cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
-    F = np.linalg.inv(K1).T @ cross @ R @ np.linalg.inv(K0)
+    F = np.linalg.inv(K1).T @ cross_matrix(t) @ R @ np.linalg.inv(K0)
     frames = [np.concatenate([rng.normal(0, 3, (n, 2, 2)), x[..., None]], -1) for x in (x0, x1)]
     return {
         "x0": x0, "x1": x1, "ratio": rng.uniform(0.3, 1, n), "mutual": rng.random(n) < 0.5,

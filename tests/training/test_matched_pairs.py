@@ -5,6 +5,7 @@ import hashlib
 import pickle
 import re
 import runpy
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -57,7 +58,8 @@ def test_items_are_the_pipelines_matches_with_labels(rendered: RenderedPairs, ma
     assert not matched.failures
     by_identity = {pair.identity: pair for pair in rendered}
     for index in range(0, len(matched), 2):
-        pair = by_identity[matched.pairs[index]["identity"]]
+        about = matched.pairs[index]
+        pair = by_identity[about["identity"]]
         expected = pipeline.correspondences([pair])[0].correspondences
         item = matched[index]
         c = item.correspondences
@@ -67,7 +69,6 @@ def test_items_are_the_pipelines_matches_with_labels(rendered: RenderedPairs, ma
         np.testing.assert_allclose(item.F[0].numpy(), pair.F, atol=1e-15)
         x0, x1 = (x[0].double().numpy() for x in (c.x0, c.x1))
         assert item.label[0].tolist() == label(rendered, pair, x0, x1).tolist()
-        about = matched.pairs[index]
         assert about["inliers"] == int(item.inlier.sum())
         assert about["inliers"] + about["outliers"] == int(item.labelled.sum())
         assert about["scene"] == pair.scene
@@ -88,23 +89,20 @@ def test_computed_once_by_any_number_of_workers(rendered: RenderedPairs, matched
 
 
 def test_an_interrupted_computation_goes_on(rendered, matched, tmp_path, monkeypatch):
-    written: list[Path] = []
+    written, interrupts = list[Path](), [False, True]  # at the second file, once
 
-    def interrupted(path: Path, rows: Any) -> None:
-        if len(written) == 1:
+    def write(path: Path, rows: Any) -> None:
+        if interrupts and interrupts.pop(0):
             raise KeyboardInterrupt
         written.append(path)
         write_shard(path, rows)
 
-    monkeypatch.setattr("fmtorch.training.matched_pairs.write_shard", interrupted)
+    monkeypatch.setattr("fmtorch.training.matched_pairs.write_shard", write)
     with pytest.raises(KeyboardInterrupt):
         MatchedPairs(rendered, **SIFT, root=tmp_path, workers=1)
     folder = tmp_path / matched.folder.name
     assert set(contents(folder)) == {path.name for path in written}
     assert len(contents(matched.folder)) > 1
-    monkeypatch.setattr(
-        "fmtorch.training.matched_pairs.write_shard", lambda path, rows: (written.append(path), write_shard(path, rows))
-    )
     calls: list[tuple[int, int]] = []
     MatchedPairs(rendered, **SIFT, root=tmp_path, workers=1, progress=lambda *c: calls.append(c))
     assert 0 < calls[0][0] < len(rendered) == calls[-1][0]
@@ -114,14 +112,10 @@ def test_an_interrupted_computation_goes_on(rendered, matched, tmp_path, monkeyp
 
 @pytest.mark.parametrize("damage", ["changed", "cut", "fewer pairs"])
 def test_a_damaged_file_is_computed_anew(rendered, matched, tmp_path, damage):
-    folder = tmp_path / matched.folder.name
-    folder.mkdir()
-    for file in matched.folder.iterdir():
-        (folder / file.name).write_bytes(file.read_bytes())
+    folder = shutil.copytree(matched.folder, tmp_path / matched.folder.name)
     victim = folder / "shard-00001.arrow"
     data = bytearray(victim.read_bytes())
-    if damage == "changed":
-        data[len(data) // 2] ^= 1
+    data[len(data) // 2] ^= damage == "changed"
     victim.write_bytes(data[:-100] if damage == "cut" else data)
     if damage == "fewer pairs":
         write_shard(victim, [])
@@ -187,8 +181,8 @@ def test_workers_of_a_loader_read_what_this_process_reads(matched: MatchedPairs)
 def test_validation_scenes_are_the_last_of_each_family(matched: MatchedPairs) -> None:
     training, validation = split_scenes(matched, last=1)
     assert len(training) + len(validation) == len(matched)
-    assert {about["scene"] for about in validation.pairs} == {"indoor-train-001"}
-    assert {about["scene"] for about in training.pairs} == {"indoor-train-000"}
+    parts = [{about["scene"] for about in part.pairs} for part in (training, validation)]
+    assert parts == [{"indoor-train-000"}, {"indoor-train-001"}]
     where = [about["identity"] for about in matched.pairs].index(validation.pairs[0]["identity"])
     assert torch.equal(validation[0].label, matched[where].label)
     with pytest.raises(ValueError, match="2 scenes"):
@@ -197,27 +191,16 @@ def test_validation_scenes_are_the_last_of_each_family(matched: MatchedPairs) ->
 
 def rows(n: int = 5) -> list[dict[str, Any]]:
     rng = np.random.default_rng(0)
+    of = {"family": "set", "scene": "s", "reason": "", "F": rng.normal(size=9), "size0": np.array([480, 640])}
     drawn = []
-    for i in range(n):
-        count = int(rng.integers(1, 50))
-        arrays = {
-            "x0": (count, 2), "x1": (count, 2), "ratio": (count,), "lafs0": (count, 2, 3), "lafs1": (count, 2, 3)
-        }  # fmt: skip
-        drawn.append(
-            {
-                "key": int(rng.integers(-(2**62), 2**62)), "identity": f"set/scene/{i}", "family": "set", "scene": "s",
-                "reason": "", "matches": count, "inliers": 1, "outliers": count - 1,
-                "label": rng.integers(-1, 2, count).astype(np.int8),
-                "mutual": rng.integers(0, 2, count).astype(np.uint8),
-                "F": rng.normal(size=9), "size0": np.array([480, 640]), "size1": np.array([300, 500]),
-                **{name: rng.normal(size=shape).astype(np.float32).ravel() for name, shape in arrays.items()},
-            }
-        )  # fmt: skip
-    drawn.append({
-        "key": 7, "identity": "set/scene/failed", "family": "set", "scene": "s", "reason": "no keypoints in image 0",
-        "matches": 0, "inliers": 0, "outliers": 0,
-    })  # fmt: skip
-    return drawn
+    for count in rng.integers(1, 50, n).tolist():
+        numbers = {"x0": 2, "x1": 2, "ratio": 1, "lafs0": 6, "lafs1": 6}  # of each match
+        arrays = {name: rng.normal(size=count * size).astype(np.float32) for name, size in numbers.items()}
+        arrays |= {"label": rng.integers(-1, 2, count).astype(np.int8), "mutual": np.ones(count, np.uint8)}
+        about = {"key": int(rng.integers(-(2**62), 2**62)), "identity": f"{count}", "matches": count, "inliers": 1}
+        drawn.append({**of, **about, "outliers": count - 1, "size1": np.array([300, 500]), **arrays})
+    none = dict.fromkeys(("matches", "inliers", "outliers"), 0)
+    return [*drawn, {"key": 7, "identity": "failed", "family": "set", "scene": "s", "reason": "no keypoints", **none}]
 
 
 def test_what_is_written_is_read(tmp_path: Path) -> None:
@@ -269,21 +252,18 @@ def test_any_changed_byte_of_the_values_is_noticed(tmp_path: Path) -> None:
     assert noticed > 20
 
 
-@pytest.mark.parametrize("content", ["missing", "empty", "truncated", "pickle", "other schema"])
-def test_what_is_no_such_file_is_refused(tmp_path: Path, content: str) -> None:
-    path = tmp_path / "shard.arrow"
-    write_shard(path, rows())
-    intact = path.read_bytes()
-    if content == "missing":
-        path.unlink()
-    elif content == "other schema":
-        batch = pa.record_batch({"a": [1]})
-        with pa.ipc.new_file(str(path), batch.schema) as writer:
-            writer.write_batch(batch)
-    else:
-        path.write_bytes({"empty": b"", "truncated": intact[: len(intact) // 2], "pickle": pickle.dumps([1])}[content])
+def test_what_is_no_such_file_is_refused(tmp_path: Path) -> None:
+    path, batch = tmp_path / "shard.arrow", pa.record_batch({"a": [1]})
     with pytest.raises(ShardError, match=r"shard\.arrow"):
         Shard(path)
+    write_shard(path, rows())
+    intact = path.read_bytes()
+    with pa.ipc.new_file(str(path), batch.schema) as writer:  # other columns
+        writer.write_batch(batch)
+    for content in (path.read_bytes(), b"", intact[: len(intact) // 2], pickle.dumps([1])):
+        path.write_bytes(content)
+        with pytest.raises(ShardError, match=r"shard\.arrow"):
+            Shard(path)
 
 
 @pytest.mark.skipif(not PAGE.is_file(), reason="the documentation is in a checkout only")
@@ -342,15 +322,11 @@ def test_every_pair_comes_once_an_epoch_in_other_batches_each_time() -> None:
 
 
 def test_batches_are_a_function_of_seed_and_epoch_and_go_on_where_they_stopped() -> None:
-    batches = SimilarLengthBatches(Pairs(), 16, seed=2)
-    batches.set_epoch(7)
+    batches, again, other = (SimilarLengthBatches(Pairs(), 16, seed=seed) for seed in (2, 2, 3))
+    for each, start in ((batches, 0), (again, 5), (other, 0)):
+        each.set_epoch(7, start=start)
     epoch = list(batches)
-    again = SimilarLengthBatches(Pairs(), 16, seed=2)
-    again.set_epoch(7, start=5)
-    assert list(again) == epoch[5:]
-    assert len(again) == len(epoch) - 5
-    other = SimilarLengthBatches(Pairs(), 16, seed=3)
-    other.set_epoch(7)
+    assert (list(again), len(again)) == (epoch[5:], len(epoch) - 5)
     assert list(other) != epoch
 
 
@@ -420,9 +396,9 @@ def test_oanets_files_train_as_the_same_pairs_matched(labels: str, tmp_path: Pat
 def test_workers_read_oanets_files_for_themselves(tmp_path: Path) -> None:
     direct, _ = oanet(tmp_path)
     alone = [direct[i].correspondences.x0 for i in (2, 0, 1)]
-    copies = DataLoader(pickle.loads(pickle.dumps(direct)), sampler=[2, 0, 1], batch_size=None, num_workers=2)
-    for dataset in (copies, DataLoader(direct, sampler=[2, 0, 1], batch_size=None, num_workers=2)):
-        assert all(torch.equal(a, m.correspondences.x0) for a, m in zip(alone, dataset, strict=True))
+    for pairs in (direct, pickle.loads(pickle.dumps(direct))):
+        loaded = DataLoader(pairs, sampler=[2, 0, 1], batch_size=None, num_workers=2)
+        assert all(torch.equal(a, m.correspondences.x0) for a, m in zip(alone, loaded, strict=True))
 
 
 @pytest.mark.parametrize(
@@ -453,12 +429,12 @@ def test_what_oanets_files_lack_is_named(key: str, change: Any, said: str, tmp_p
         pairs[1]
 
 
-@pytest.mark.parametrize("length", [0, 100])
-def test_truncated_files_of_oanet_are_named(length: int, tmp_path: Path) -> None:
+def test_truncated_files_of_oanet_are_named(tmp_path: Path) -> None:
     path = next(writers.write_oanet(tmp_path / "oanet").glob("*"))
-    path.write_bytes(path.read_bytes()[:length])
-    with pytest.raises(DataError, match="hdf5: is not a valid HDF5 file"):
-        OANetPairs(path)
+    for length in (100, 0):
+        path.write_bytes(path.read_bytes()[:length])
+        with pytest.raises(DataError, match="hdf5: is not a valid HDF5 file"):
+            OANetPairs(path)
 
 
 def test_training_has_no_scene_of_the_test_split(matched: MatchedPairs) -> None:

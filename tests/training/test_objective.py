@@ -4,7 +4,6 @@ import functools
 import math
 from collections.abc import Callable
 
-import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
@@ -37,20 +36,14 @@ def labels(seed: int, b: int, n: int) -> Tensor:
     return torch.randint(-1, 2, (b, n), generator=generator(seed), dtype=torch.int8)
 
 
-def test_classification_matches_scalar_reference() -> None:
+def test_classification_is_the_mean_over_matches_then_pairs_then_stages() -> None:
     logit = 3 * torch.randn(2, 5, 40, generator=generator(0), dtype=torch.float64)
     label = labels(1, 5, 40)
     label[1], label[2], label[3, :20] = -1, 1, -1
-    stages = []
-    for stage in logit:
-        pairs = [reference.cross_entropy(z.tolist(), y.tolist()) for z, y in zip(stage, label, strict=True)]
-        counted = [value for value in pairs if value is not None]
-        assert len(counted) == 4
-        stages.append(sum(counted) / 4)
-    found = training.classification_loss(logit, label)
-    assert found.item() == pytest.approx(sum(stages) / 2, rel=1e-12)
-    first = training.classification_loss(logit[0], label)
-    assert first.item() == pytest.approx(stages[0], rel=1e-12)
+    p = torch.where(label == 1, torch.sigmoid(logit), 1 - torch.sigmoid(logit))
+    stages = torch.where(label < 0, torch.nan, -p.log()).nanmean(-1).nanmean(-1)  # a pair without labels is none
+    assert training.classification_loss(logit, label).item() == pytest.approx(stages.mean().item(), rel=1e-12)
+    assert training.classification_loss(logit[0], label).item() == pytest.approx(stages[0].item(), rel=1e-12)
 
 
 @settings(max_examples=20, deadline=None)
@@ -89,35 +82,21 @@ def test_classification_of_degenerate_pairs() -> None:
     assert training.classification_loss(logit.half().clamp(-1e4, 1e4), label).dtype == torch.float32
 
 
-def test_virtual_points_match_scalar_reference() -> None:
-    F, _ = random_pairs(3, 4, spread=2.0)
-    size0, size1 = sizes(4)
-    key = torch.arange(4)
-    x0, x1, mask = training.virtual_points(F, size0, size1, count=20, seed=5, key=key)
-    uniforms = uniform(5, key, Stream.TRAINING, 0, TRIES * 20, 3).numpy()
-    for i in range(4):
-        points = reference.virtual_points(F[i].numpy(), size0[i].numpy(), size1[i].numpy(), uniforms[i], 20)
-        assert int(mask[i].sum()) == len(points)
-        for j, (m0, m1) in enumerate(points):
-            np.testing.assert_allclose(x0[i, j], m0, rtol=1e-12)
-            np.testing.assert_allclose(x1[i, j], m1, rtol=1e-9, atol=1e-9)  # as in the tests of NSGD
-
-
 K = torch.tensor([[500.0, 1.0, 310.0], [0.0, 520.0, 250.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
 
 
 @pytest.mark.parametrize("calibrated", [False, True])
 def test_geometric_loss_matches_scalar_reference(calibrated: bool) -> None:
     F_true, F_est = random_pairs(2, 3, spread=0.2)
-    size0, size1 = sizes(3)
-    limit = LIMIT_E if calibrated else LIMIT_F
-    K0 = K.expand(3, 3, 3) if calibrated else None
-    found = training.geometric_loss(torch.stack([F_est, F_true]), F_true, size0, size1, K0=K0, K1=K0, points=25, seed=4)
-    uniforms = uniform(4, torch.zeros(1, dtype=torch.int64), Stream.TRAINING, 0, TRIES * 25, 3)[0].numpy()
+    (size0, size1), key, limit = sizes(3), torch.arange(3), LIMIT_E if calibrated else LIMIT_F
+    known = {"K0": K.expand(3, 3, 3), "K1": K.expand(3, 3, 3)} if calibrated else {}
+    both = torch.stack([F_est, F_true])
+    found = training.geometric_loss(both, F_true, size0, size1, points=25, seed=4, key=key, **known)
+    uniforms = uniform(4, key, Stream.TRAINING, 0, TRIES * 25, 3).numpy()
     values, clamped = [], 0
     for i in range(3):
         s0, s1 = size0[i].numpy(), size1[i].numpy()
-        points = reference.virtual_points(F_true[i].numpy(), s0, s1, uniforms, 25)
+        points = reference.virtual_points(F_true[i].numpy(), s0, s1, uniforms[i], 25)
         A0, A1 = (K.numpy(), K.numpy()) if calibrated else (reference.by_size(s0), reference.by_size(s1))
         values.append(reference.geometric_loss(F_est[i].numpy(), points, A0, A1, limit))
         clamped += values[-1] != reference.geometric_loss(F_est[i].numpy(), points, A0, A1, 1e9)
@@ -148,16 +127,13 @@ def test_losses_of_the_estimate_pass_gradcheck() -> None:
 
 
 @pytest.mark.parametrize("loss", [training.geometric_loss, training.nsgd_loss])
-def test_failed_fits_add_nothing(loss: object) -> None:
+def test_failed_fits_add_nothing(loss: Callable[..., Tensor]) -> None:
     """Estimates that are zero, not finite, of rank 1, or whose lines miss the image; truths that are not known."""
-    assert callable(loss)
-    F_true, F_est = random_pairs(6, 8)
+    (F_true, F_est), (size0, size1), key = random_pairs(6, 8), sizes(8), torch.arange(8)
     F_est[1], F_est[2], F_est[3, 0, 0] = torch.nan, 0.0, torch.inf
     F_est[4] = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
     F_est[5] = rows_shifted(1e5)
     F_true[6], F_true[7] = torch.nan, 0.0
-    size0, size1 = sizes(8)
-    key = torch.arange(8)
     F_est.requires_grad_()
     value = loss(F_est, F_true, size0, size1, key=key)
     assert bool(value.isfinite())
@@ -306,8 +282,8 @@ def test_reliability() -> None:
     label = labels(1, 1, 500)[0]
     table = training.reliability(p, label)
     kept = label >= 0
-    expected = reference.expected_calibration_error(p[kept].tolist(), label[kept].tolist(), 10)
-    assert table.error == pytest.approx(expected, rel=1e-12)
+    gaps = torch.bincount((10 * p[kept]).long().clamp(max=9), p[kept] - label[kept]).abs()  # Naeini et al., AAAI 2015
+    assert table.error == pytest.approx(float(gaps.sum()) / int(kept.sum()), rel=1e-12)
     assert int(table.matches.sum()) == int(kept.sum())
     share, right = torch.tensor([0.25] * 4 + [0.875] * 8), torch.tensor([1, 0, 0, 0, 0] + [1] * 7)
     exact = training.reliability(share, right.to(torch.int8))
