@@ -11,7 +11,7 @@ from torch import Tensor
 from fmtorch.geometry import homography_points, pose_from_fundamental, poses_from_homography
 from fmtorch.geometry.cameras import PixelFrame, calibration_problems, mapped, square_pixels
 from fmtorch.geometry.pose import pose
-from tests.geometry.scenes import scene, stacked, unit_scene
+from tests.geometry.scenes import scene, stacked
 from tests.reference import known_cameras, solvers
 
 
@@ -67,14 +67,19 @@ def test_bad_input_is_invalid_and_alone():
 
 
 def test_gradient():
-    F, x0, x1 = (torch.from_numpy(value) for value in unit_scene(1, 20, 1e-3))
-    K = torch.eye(3, dtype=torch.float64)
+    s = scene(20, 1, noise=1.0)
+    pixels = torch.diag(torch.tensor([500.0, 500, 1], dtype=torch.float64))
+    F = pixels @ s.F @ pixels
+    scale = torch.tensor([500.0, 500.0], dtype=torch.float64)
+    CAMERA0, CAMERA1 = (
+        torch.diag(torch.tensor([1 / 500, 1 / 500, 1.0], dtype=torch.float64)) @ K for K in (s.K0, s.K1)
+    )
+    F = (F / F.norm()).requires_grad_()
 
-    def pose(F, K0, K1):
-        return pose_from_fundamental(F, K0, K1, x0, x1)[:2]
+    def pose(F, CAMERA0, CAMERA1):
+        return pose_from_fundamental(F, CAMERA0, CAMERA1, s.x0 / scale, s.x1 / scale)[:2]
 
-    inputs = [value.clone().requires_grad_() for value in (F, K, K)]
-    assert torch.autograd.gradcheck(pose, inputs)
+    assert torch.autograd.gradcheck(pose, (F, CAMERA0.requires_grad_(), CAMERA1.requires_grad_()))
 
 
 CAMERAS = np.array([650.0, 319.5, 239.5, 820, 300.5, 249.5])
@@ -85,6 +90,29 @@ def pose_of(F: np.ndarray, s: known_cameras.Scene, weight: np.ndarray) -> np.nda
     out = np.full(13, np.nan)
     pose(np.ascontiguousarray(F), CAMERAS, s.x0, s.x1, weight, out)
     return out
+
+
+@pytest.mark.parametrize("noise", [0.0, 1.0])
+def test_it_is_that_of_all_decompositions(noise: float) -> None:
+    for seed in range(10):
+        s = known_cameras.scene(seed, 40, noise, outliers=0.2, cameras=(CAMERA0, CAMERA1))
+        rng = np.random.default_rng(seed)
+        F = known_cameras.fundamental(s.R, s.t, (CAMERA0, CAMERA1)) * rng.choice([-2, 3]) + 1e-7 * noise * rng.normal(
+            size=(3, 3)
+        )
+        weight = rng.uniform(0, 1, 40) * s.right
+        out = pose_of(F, s, weight)
+        tensors = [torch.from_numpy(value)[None] for value in (F, CAMERA0, CAMERA1, s.x0, s.x1)]
+        graphed = pose_from_fundamental(*tensors, torch.ones(1, 40, dtype=torch.bool), torch.from_numpy(weight)[None])
+        assert bool(graphed.valid)
+        assert out[12] == 1
+        np.testing.assert_allclose(out[:9].reshape(3, 3), graphed.R[0], atol=1e-9)
+        np.testing.assert_allclose(out[9:12], graphed.t[0], atol=1e-9)
+        R, t, _ = solvers.pose(F, CAMERA0, CAMERA1, s.x0[s.right], s.x1[s.right])
+        np.testing.assert_allclose(out[:9].reshape(3, 3), R, atol=1e-6)
+        np.testing.assert_allclose(out[9:12], t, atol=1e-6)
+        if not noise:
+            np.testing.assert_allclose(out[9:12], s.t, atol=1e-6)
 
 
 def test_weights_decide_on_which_side_points_lie() -> None:
@@ -168,13 +196,22 @@ def test_opencv(seed: int) -> None:
     x1 = homography_points(*tensors(H, x0)).numpy()
     G = np.linalg.inv(K1) @ H @ K0
     _, rotations, translations, normals = cv2.decomposeHomographyMat(G, np.eye(3))
-    rays = [solvers.homogeneous(x) @ np.linalg.inv(K).T for x, K in ((x0, K0), (x1, K1))]
-    ends = [ray[:, None, :2].astype(np.float32) for ray in rays]
-    possible = cv2.filterHomographyDecompByVisibleRefpoints(rotations, normals, *ends).ravel()
+    rays = [
+        (np.c_[x, np.ones(len(x))] @ np.linalg.inv(K).T)[:, None, :2].astype(np.float32)
+        for x, K in ((x0, K0), (x1, K1))
+    ]
+    possible = cv2.filterHomographyDecompByVisibleRefpoints(rotations, normals, *rays)
     poses = poses_from_homography(*tensors(H, K0, K1, x0, x1))
-    every = torch.cat([poses.R.flatten(-2), poses.t, poses.normal], -1)
-    computed = every[poses.in_front == 1].numpy()
-    expected = [np.concatenate([each[i].ravel() for each in (rotations, translations, normals)]) for i in possible]
+    computed = [
+        np.concatenate([R.ravel(), t, n])
+        for R, t, n, valid in zip(
+            poses.R.numpy(), poses.t.numpy(), poses.normal.numpy(), poses.in_front == 1, strict=True
+        )
+        if valid
+    ]
+    expected = [
+        np.concatenate([rotations[i].ravel(), translations[i][:, 0], normals[i][:, 0]]) for i in possible.ravel()
+    ]
     assert len(computed) == len(expected)
     for solution in expected:
         assert min(np.abs(solution - ours).max() for ours in computed) < 1e-6

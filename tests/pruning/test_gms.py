@@ -11,7 +11,7 @@ from fmtorch.core import Correspondences
 from fmtorch.jit.kernel import F8x2, I8x2, kernel
 from fmtorch.pruning import CODE, GMS, LPM, LikelihoodField, gms, lpm
 from fmtorch.pruning import neighbors as knn_kernels
-from fmtorch.pruning.code import huber_regression, match_domain
+from fmtorch.pruning.code import huber_regression, match_domain, predictive_gaussians, spread_centres
 from tests.conftest import oracle
 from tests.reference import code as code_reference
 from tests.reference.lpm import lpm as reference
@@ -143,10 +143,10 @@ def test_masks_equal_the_original() -> None:
 
 
 def test_neighbourhoods_may_be_large() -> None:
-    x0, x1 = moving_along(3, 270)
+    x0, x1 = moving_along(3, 300)
     expected = reference(x0.numpy(), x1.numpy(), (0.8, 0.8), (260, 6), (0.2, 0.2))
     mask = lpm(x0[None], x1[None], neighbors=(260, 6), thresholds=(0.8, 0.8))
-    assert 0 < expected.sum() < 270
+    assert 0 < expected.sum() < 300
     np.testing.assert_array_equal(mask[0], expected)
 
 
@@ -245,12 +245,29 @@ def test_matches_that_are_none_are_dropped() -> None:
     assert torch.equal(kept, run_code(c.replace(mask=sound[None])))
 
 
-def test_regression_finds_the_minimum() -> None:
-    """Of two columns, as of motions; of one it is in the likelihood."""
+def test_gaussians_equal_the_definition() -> None:
+    ours, theirs = domain_of(warped(0, 40, 0.3)[0])
+    computed = predictive_gaussians(ours, ours.take(torch.arange(0, 40, 3)), **WIDTHS)
+    expected = [[code_reference.predictive_gaussian(a, b, WIDTHS) for b in theirs[::3]] for a in theirs]
+    # Exponents are differences of float32 terms up to about 100: 100 * 2^-23 = 1e-5.
+    np.testing.assert_allclose(computed, expected, atol=1e-4)
+
+
+def test_centres_equal_the_definition_and_go_where_matches_crowd() -> None:
+    c, right = warped(1, 60, 0.5)
+    ours, _ = domain_of(c)
+    gaussians = predictive_gaussians(ours, ours, **WIDTHS).double()
+    chosen = spread_centres(gaussians, 12).tolist()
+    assert chosen == code_reference.spread_centres(gaussians.numpy(), 12)
+    assert right[chosen[:6]].all()
+
+
+@pytest.mark.parametrize("columns", [1, 2])
+def test_regression_finds_the_minimum(columns: int) -> None:
     rng = np.random.default_rng(2)
     basis = rng.normal(size=(60, 5))
-    target = basis @ rng.normal(size=(5, 2)) + 0.05 * rng.normal(size=(60, 2))
-    target[::4] += rng.normal(size=(15, 2)) * 5
+    target = basis @ rng.normal(size=(5, columns)) + 0.05 * rng.normal(size=(60, columns))
+    target[::4] += rng.normal(size=(15, columns)) * 5
     ridge = np.diag(rng.uniform(0.1, 2, 5))
     expected = code_reference.huber_regression(basis, target, ridge, 0.1)
     fitted = huber_regression(*(torch.from_numpy(v) for v in (basis, target, ridge)), scale=0.1, iterations=200)

@@ -86,3 +86,31 @@ def normal_equations(
     slope = LOSSES[name].weight(torch.from_numpy(r2), torch.from_numpy(s2)).numpy()
     values = tabulated(r2, s2) if name == "magsac" else loss(r2, s2, name)
     return A.T @ (A * (weight * slope)[:, None]), float(weight @ values)
+
+
+def levenberg_marquardt(
+    f: np.ndarray, points: np.ndarray, weight: np.ndarray, s2: np.ndarray, name: str, iterations: int, damping: float,
+    tolerance: float,
+) -> tuple[np.ndarray, float]:  # fmt: skip
+    """The model (9,) and its cost after damped steps across F and ``e1 e0^T``, each made rank 2 along the second."""
+    U, s, Vt = np.linalg.svd(f.reshape(3, 3))
+    F = U @ np.diag([s[0], s[1], 0]) @ Vt / np.hypot(s[0], s[1])
+    products, cost = normal_equations(F.ravel(), points, weight, s2, name)
+    for _ in range(iterations):
+        U, _, Vt = np.linalg.svd(F)
+        normal = np.outer(U[:, 2], Vt[2])
+        frame = np.linalg.svd(np.stack([F.ravel(), normal.ravel()]))[2][2:]  # (7, 9), an orthonormal tangent basis
+        H = frame @ (products[:9, :9] + damping * products[:9, :9].diagonal().max() * np.eye(9)) @ frame.T
+        G = F - (frame.T @ np.linalg.solve(H, frame @ products[:9, 9])).reshape(3, 3)
+        cofactors = np.stack([np.cross(G[1], G[2]), np.cross(G[2], G[0]), np.cross(G[0], G[1])])
+        G = G - np.linalg.det(G) / (cofactors * normal).sum() * normal
+        G /= np.linalg.norm(G)
+        trial, trial_cost = normal_equations(G.ravel(), points, weight, s2, name)
+        better, gain = trial_cost < cost, cost - trial_cost
+        damping = min(max(damping / 10 if better else damping * 10, 1e-12), 1e6)
+        if better:
+            done = gain <= tolerance * cost and tolerance > 0
+            F, products, cost = G, trial, trial_cost
+            if done:
+                break
+    return F.ravel(), cost

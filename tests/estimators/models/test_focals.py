@@ -1,6 +1,7 @@
 """Models with focal lengths: priors, samples, plausible cameras, the search over them."""
 
 import math
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -14,12 +15,14 @@ from fmtorch.estimators import BestScore, Candidates, Focal, Pair, Ransac, Refin
 from fmtorch.estimators.focal_search import FocalSearch, PlausibleCandidates
 from fmtorch.estimators.models import focal_prior
 from fmtorch.estimators.models.focal_prior import QUANTILES, normal_quantiles
-from fmtorch.estimators.models.posterior import no_cameras
+from fmtorch.estimators.models.posterior import images_of, no_cameras
 from fmtorch.estimators.models.with_focals import FundamentalWithFocals, Refined
+from fmtorch.jit.random import Stream
 from fmtorch.metrics import nsgd
 from tests.estimators.pairs import pair_of, to_units
 from tests.laws import scene
 from tests.reference import focal as reference
+from tests.reference import random
 from tests.reference.solvers import skew
 
 WIDE, TALL = (640, 960), (1000, 700)  # (h, w)
@@ -64,9 +67,30 @@ def with_prior(c: Correspondences, seed: int = 0) -> Correspondences:
     return c.replace(prior=torch.from_numpy(prior))
 
 
+SIZES = [(WIDE, WIDE), (WIDE, TALL)]
+
+
 def error(F: torch.Tensor, pair: Photographs) -> float:
     """NSGD of the estimate (1, 3, 3)."""
     return float(nsgd(torch.from_numpy(pair.F)[None], F, pair.c.size0, pair.c.size1, key=pair.c.keys))
+
+
+@pytest.mark.parametrize("sizes", SIZES)
+def test_drawn_focal_lengths_are_functions_of_the_draw(sizes: Sizes) -> None:
+    pair, seed, start, count = pair_of(photographs(0, sizes).c, 3), 3, 100, 40
+    images, depth, normal = images_of(pair), np.empty((2, count)), focal_prior.normal_quantiles()
+    focal_prior.draw_depths(images.prior, images.longest, pair.mixed_seed(Stream.FOCAL), pair.key, start, depth)
+    ratios = np.log(depth / images.longest[:, None])
+    for d in range(count):
+        words = [random.number(seed, pair.key, Stream.FOCAL, start + d, k, 3) % focal_prior.QUANTILES for k in range(3)]
+        half = (
+            0.0
+            if pair.same_size and words[2] < focal_prior.SAME_CAMERA_SHARE * focal_prior.QUANTILES
+            else normal[words[1]]
+        )
+        mean = math.log(focal_prior.USUAL_FOCAL) + focal_prior.FOCAL_DEVIATION * normal[words[0]]
+        expected = [mean + focal_prior.RATIO_DEVIATION / 2 * half, mean - focal_prior.RATIO_DEVIATION / 2 * half]
+        np.testing.assert_allclose(ratios[:, d], expected, atol=1e-12)
 
 
 def test_hypotheses_pass_through_their_five_matches() -> None:
@@ -193,13 +217,80 @@ def test_how_likely_one_camera_is() -> None:
     assert focal_prior.same_camera_share(0.0, np.array([0.0, math.inf])) == 0.7
 
 
+ROUNDS = 6
 FOCAL = {"sampler": "prior", "select": {"scale": 1.0}, "threshold": 1.5}
+
+
+class Found(PlausibleCandidates):
+    """A round's candidates, which say what they are told to."""
+
+    def __init__(self, again: bool, one_model: bool) -> None:
+        super().__init__(Refined(np.ones((1, 9)), np.zeros(1), np.ones(1)), np.ones(1), no_cameras(1))
+        self.again, self.one_model = again, one_model
+
+    def confirmed(self, other: PlausibleCandidates) -> bool:
+        return other.again
+
+    def joined(self, other: PlausibleCandidates) -> PlausibleCandidates:
+        return other
+
+    @property
+    def unique_optimum(self) -> bool:
+        return self.one_model
+
+
+@pytest.mark.parametrize("confirmations", [1, 2, 3])
+@pytest.mark.parametrize("min_rounds", [1, 3])
+def test_rounds_end_when_enough_of_them_confirm_the_best(min_rounds, confirmations, monkeypatch):
+    rng = np.random.default_rng(confirmations)
+    again, one_model = rng.random((200, ROUNDS)) < 0.4, rng.random((200, ROUNDS)) < 0.05
+    content = rng.random((200, ROUNDS)) < 0.8  # the stopping rule
+    pair, draw_counts = pair_of(scene(0)), set()
+
+    def expected(i: int) -> int:
+        confirmed = 0
+        for turn in range(ROUNDS):
+            confirmed += bool(turn and again[i, turn])
+            agreed = one_model[i, turn] or confirmed >= confirmations
+            if turn + 1 >= min_rounds and agreed and content[i, turn]:
+                return turn + 1
+        return ROUNDS
+
+    for i in range(200):
+        rounds: Iterator[Found] = (Found(bool(a), bool(o)) for a, o in zip(again[i], one_model[i], strict=True))
+        monkeypatch.setattr(FocalSearch, "round", lambda self, pair, turn, r=rounds: (next(r), (turn + 1) * 10))
+        search = searching(rounds=ROUNDS, min_rounds=min_rounds, confirmations=confirmations)
+        object.__setattr__(search, "stop", lambda F, draws, pair, size, i=i: bool(content[i, draws // 10 - 1]))
+        _, settled, samples = search(pair)
+        assert samples == 10 * expected(i)
+        assert settled == content[i, expected(i) - 1]  # the images have one size
+        draw_counts.add(samples)
+    assert len(draw_counts) > 2
 
 
 def searching(iterations: int = 12, **options: int) -> FocalSearch:
     """A search that only selects."""
     focal = Focal(iterations=iterations, samples=0, **options)
     return FocalSearch(focal, FundamentalWithFocals(), BestScore(SaturatedGains(0.3)), Refinement(None), None, None)
+
+
+def free(F: np.ndarray, pair: Pair) -> Candidates:
+    """Models (k, 9) that the other search has found."""
+    return Candidates(F, True, pair)
+
+
+@pytest.mark.parametrize("posterior", [[5.0, 4.9], [5.0, 1.0], [4.9, 5.0]])
+@pytest.mark.parametrize("same", [False, True])
+def test_the_best_candidates_of_two_rounds_are_one_model_or_not(posterior: list[float], same: bool) -> None:
+    F = np.linalg.qr(np.random.default_rng(0).normal(size=(9, 2)))[0].T.copy()  # of cosine 0
+    models = np.stack([F[0], F[0] if same else F[1]])
+    candidates = PlausibleCandidates(Refined(models, np.zeros(2), np.ones(2)), np.array(posterior), no_cameras(2))
+    assert candidates.best == int(np.argmax(posterior))
+    assert candidates.unique_optimum == (same or min(posterior) < focal_search.RIVAL_GAIN_SHARE * max(posterior))
+    other = PlausibleCandidates(Refined(F[1:], np.zeros(1), np.ones(1)), np.ones(1), no_cameras(1))
+    assert candidates.confirmed(other) == bool(np.array_equal(models[candidates.best], F[1]))
+    assert candidates.joined(other).F.shape == (3, 9)
+    assert candidates.best_alone().posterior.tolist() == [max(posterior)]
 
 
 def test_rounds_without_candidates_settle_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -226,13 +317,13 @@ def test_the_prior_is_asked_only_where_good_candidates_differ(monkeypatch: pytes
     pair, right, other = models(0.3)
     same, different, search = np.stack([right, right]), np.stack([right, other]), searching()
     monkeypatch.setattr(focal_search, "RIVAL_GAIN_SHARE", 0.0)  # every candidate is a good one
-    assert np.array_equal(search.select(Candidates(same, True, pair), pair, None).F, right)
+    assert np.array_equal(search.select(free(same, pair), pair, None).F, right)
     _, refined = FundamentalWithFocals().refine(different, pair, 12)
-    selection = search.select(Candidates(different, True, pair), pair, None)
+    selection = search.select(free(different, pair), pair, None)
     assert any(np.array_equal(selection.F, refined.models[k]) for k in (0, 1))
     assert selection.cameras is not None
     monkeypatch.setattr(focal_search, "RIVAL_GAIN_SHARE", 2.0)  # none is
-    selection = search.select(Candidates(different, True, pair), pair, None)
+    selection = search.select(free(different, pair), pair, None)
     assert np.array_equal(selection.F, right)
     assert selection.cameras is None
 
@@ -243,7 +334,7 @@ def test_a_crop_keeps_the_model_without_prior() -> None:
     pair = pair_of(c.replace(x0=c.x0 + torch.tensor([4000.0, 0])))
     F = to_units(truth @ T, pair)
     rival = to_units(truth @ T + 0.01 * truth.T, pair)
-    selection = searching().select(Candidates(np.stack([F, rival]), True, pair), pair, None)
+    selection = searching().select(free(np.stack([F, rival]), pair), pair, None)
     assert np.array_equal(selection.F, F)
     assert selection.cameras is None
 
