@@ -326,10 +326,6 @@ def find_homography(
         return homographies(c, lambda c: estimated(c, "homography", estimator, config_dir, seed, options))
 
     if c.lens is not None:
-        if c.requires_grad:
-            raise ValueError(
-                "lens is given, and a homography has no gradients then: give points, prior, noise detached"
-            )
         from fmtorch.two_view.lenses import homographies_with_lenses
 
         return homographies_with_lenses(c, find)
