@@ -211,6 +211,20 @@ def test_a_worker_ends_with_the_process_that_was_killed() -> None:
     assert not alive(worker)
 
 
+def _ends() -> Pipeline:
+    os._exit(3)
+
+
+def test_a_process_that_ends_is_told() -> None:
+    """After the pairs of its batch were tried alone."""
+    images = [ImageSource(f"{i}", Path(f"{i}.png")) for i in range(3)]
+    pairs, rows = [pair(f"0-{i}", images[0], images[i]) for i in (1, 2)], list[PairRow]()
+    options: dict[str, Any] = {"execution": Execution("processes", 2), "store": rows.extend, "build": _ends}
+    with pytest.raises(WorkersLost, match="the same command goes on"):
+        list(evaluate_pairs(load_pipeline("sift_ratio"), pairs, seed=0, batch=2, **options))
+    assert rows == []
+
+
 def test_features_are_computed_while_kernels_are_compiled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     images = [draw(tmp_path / f"{i}.png", i) for i in range(7)]
     pairs = [pair(f"0-{i}", images[0], image) for i, image in enumerate(images)][1:]
