@@ -108,7 +108,8 @@ def find_fundamental(
             unknown one. Points and inliers are of the photographs, F, E and the pose of the pixels of pinholes. With
             K0 or K1 it needs the image sizes. Calibrated lenses are `fmtorch.Lens`, for both images, (lens0, lens1)
             with None for a pinhole, or a list of (lens0, lens1), one for each pair: points are undistorted, and judged
-            in pixels of the photographs; the K of a lens stands for K0 or K1.
+            in pixels of the photographs; the K of a lens stands for K0 or K1. Gradients are zero where an estimated or
+            exact lambda is not zero and no plausible cameras agree with the matches.
         covariance: whether the estimate has its covariance, which needs K0 and K1 or the image sizes. Where nothing is
             said of the cameras these are as of ``focal="unknown"``.
         pair_type: whether it has the type of each pair: general, planar, rotation, identical, unrelated.

@@ -10,7 +10,7 @@ import torch
 
 import fmtorch
 from fmtorch.core import PAIR_TYPES, Correspondences, Estimate, collate
-from fmtorch.estimators import lens_search
+from fmtorch.estimators import Ransac, lens_search
 from fmtorch.geometry import significance
 from fmtorch.metrics import corner_error, nsgd
 from fmtorch.two_view.arguments import lens_fields
@@ -459,6 +459,23 @@ def test_gradients_of_lenses_are_differences_of_optima(lens: Any, cameras: str, 
         e.F[0].sum().backward(inputs=list(of.values()))
     for name, leaf in leaves.items():
         torch.testing.assert_close(batch[name].grad[0], leaf.grad, rtol=0, atol=0)
+
+
+def test_a_lens_without_plausible_cameras_has_no_gradients(monkeypatch: Any) -> None:
+    """As of crops, whose points would have to be undistorted in the graph."""
+    selected = Ransac.selected
+
+    def free(self: Ransac, pair: Any) -> Any:
+        selection, draws = selected(self, pair)
+        return selection._replace(cameras=None), draws
+
+    monkeypatch.setattr(Ransac, "selected", free)
+    x0, x1, F, _ = division.photographs(1, (-0.15, -0.15))
+    attached = torch.from_numpy(x0).requires_grad_()
+    estimate = found(attached, x1, lens=-0.15)
+    estimate.F.sum().backward()
+    assert error_of_lens(estimate.detach(), F) < 0.02
+    assert not bool(attached.grad.any())
 
 
 def test_matches_that_contradict_pinholes_suggest_a_lens() -> None:
