@@ -124,7 +124,7 @@ def findHomography(
     _, options = _preset(method, scale * ransacReprojThreshold, confidence, maxIters)
     options["inlier_threshold"] = scale * ransacReprojThreshold
     estimate = find.find_homography(src, scale * dst, **options)
-    H, inliers = _result(estimate, np.diag([1 / scale, 1 / scale, 1.0]) @ estimate.F[0].cpu().numpy(), mask)
+    H, inliers = _result(estimate, np.diag([1 / scale, 1 / scale, 1.0]) @ estimate.H[0].cpu().numpy(), mask)
     return H, np.zeros((len(src), 1), np.uint8) if inliers is None else inliers
 
 

@@ -22,7 +22,7 @@ NOISY = ("fmtorch", "fmtorch_fast", "gc_ransac", "msac")  # are also told the no
 
 
 def _results(e: Estimate) -> laws.Result:
-    values = {"F": e.F, "inliers": e.inliers, "ok": e.ok, "samples": e.samples}
+    values = {"F": e.matrix, "inliers": e.inliers, "ok": e.ok, "samples": e.samples}
     return {**values, "significance": e.significance} if e.model == "fundamental" else values
 
 

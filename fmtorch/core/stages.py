@@ -148,16 +148,16 @@ def output_of(
     if not isinstance(value, kind):
         what = "None" if value is None else f"a {type(value).__name__}"
         raise WrongOutput(f"{name} returned {what}; it must return {kind.__name__}")
-    first = value.x0 if isinstance(value, Correspondences) else value.F if isinstance(value, Estimate) else value.lafs
-    if first.dtype not in (torch.float32, torch.float64):
-        raise ValueError(f"{name} returned {kind.__name__} of {first.dtype}; they must be of float32 or float64")
+    main = getattr(value, "lafs" if kind is Features else "x0" if kind is Correspondences else "matrix")
+    if main.dtype not in (torch.float32, torch.float64):
+        raise ValueError(f"{name} returned {kind.__name__} of {main.dtype}; they must be of float32 or float64")
     if isinstance(value, Features):
         if value.lafs.dim() != 3:
             raise ValueError(f"{name} returned features of a batch of images; they must be of one, lafs (N, 2, 3)")
         return value
     like = like if given is None else given.x0
-    if like is not None and first.device != like.device:
-        raise ValueError(f"{name} returned {kind.__name__} on {first.device}; they must be on {like.device}")
+    if like is not None and main.device != like.device:
+        raise ValueError(f"{name} returned {kind.__name__} on {main.device}; they must be on {like.device}")
     pairs = 1 if given is None else len(given)
     if len(value) != pairs:
         raise ValueError(f"{name} returned {kind.__name__} of {len(value)} pairs; they must be of {pairs}")

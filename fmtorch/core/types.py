@@ -190,14 +190,14 @@ class Correspondences(Record):
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Estimate(Record):
-    """Fundamental matrices of B pairs.
+    """Fundamental matrices, or homographies, of B pairs.
 
-    F: (B, 3, 3) with unit Frobenius norm, zero where `ok` is False. inliers: (B, N), within the mask; none where `ok`
-    is False. ok: (B,). reason: why a pair failed, empty where it did not. samples: minimal samples drawn, (B,).
-    significance: (B,), how far the support of F is beyond chance, see `fmtorch.geometry.significance`: -log10 of the
-    number of models with as much support that are expected among images that show nothing in common; -inf where `ok`
-    is False, NaN where nobody has computed it; never None. model: what `F` is, "fundamental", or "homography" for
-    `x1 ~ F x0`, which is positive where the plane is seen; then `H` is another name for it.
+    matrix: (B, 3, 3) with unit Frobenius norm, zero where `ok` is False; `F` or `H` by its name. inliers: (B, N),
+    within the mask; none where `ok` is False. ok: (B,). reason: why a pair failed, empty where it did not. samples:
+    minimal samples drawn, (B,). significance: (B,), how far the support of the model is beyond chance, see
+    `fmtorch.geometry.significance`: -log10 of the number of models with as much support that are expected among images
+    that show nothing in common; -inf where `ok` is False, NaN where nobody has computed it; never None. model:
+    "fundamental", or "homography" for `x1 ~ H x0`, which is positive where the plane is seen.
 
     Where cameras are known or asked for, NaN if not determined: focals (B, 2), px; X1 = R X0 + t, t of unit length;
     E = [t]_x R. fit_scale: (B,), the Sampson distance of a usual match from which on it did not count in the final fit,
@@ -220,7 +220,7 @@ class Estimate(Record):
     where they contradict pinholes, NaN where they do not.
     Where calibration matrices are known: contradicted (B,), whether far more matches agree without them."""
 
-    F: Float[Tensor, "b 3 3"]
+    matrix: Float[Tensor, "b 3 3"]
     inliers: Bool[Tensor, "b n"]
     ok: Bool[Tensor, " b"]
     reason: tuple[str, ...]
@@ -250,8 +250,7 @@ class Estimate(Record):
         expect_fields(self)
         b = len(self)
         if self.significance is None:
-            unknown = torch.full((b,), torch.nan, dtype=torch.float64, device=self.F.device)
-            object.__setattr__(self, "significance", unknown)
+            object.__setattr__(self, "significance", self.ok.new_full((b,), torch.nan, dtype=torch.float64))
         if not isinstance(self.reason, tuple | list) or not all(isinstance(entry, str) for entry in self.reason):
             raise TypeError(f"reason is a {type(self.reason).__name__}; it must be a tuple of strings")
         object.__setattr__(self, "reason", tuple(self.reason))
@@ -259,11 +258,18 @@ class Estimate(Record):
             raise ValueError(f"reason has {len(self.reason)} entries; it must have one for each of the {b} pairs")
 
     @property
-    def H(self) -> Float[Tensor, "b 3 3"]:
-        """The homographies. Raises AttributeError where the estimate is of another model."""
+    def F(self) -> Tensor:
+        """The fundamental matrices (B, 3, 3). Raises AttributeError where the estimate is of homographies."""
+        if self.model != "fundamental":
+            raise AttributeError("these are homographies: take `H`; find_fundamental gives fundamental matrices")
+        return self.matrix
+
+    @property
+    def H(self) -> Tensor:
+        """The homographies (B, 3, 3). Raises AttributeError where the estimate is of fundamental matrices."""
         if self.model != "homography":
-            raise AttributeError(f"these are {self.model} matrices; find_homography gives homographies")
-        return self.F
+            raise AttributeError("these are fundamental matrices: take `F`; find_homography gives homographies")
+        return self.matrix
 
     @property
     def related(self) -> Bool[Tensor, " b"]:
@@ -306,7 +312,7 @@ class Estimate(Record):
         return torch.rad2deg(torch.stack([variances[:, :3].sum(-1), variances[:, 3:5].sum(-1)], -1).sqrt())
 
     def __len__(self) -> int:
-        return int(self.F.shape[0])
+        return int(self.matrix.shape[0])
 
     def __getitem__(self, index: Index) -> "Estimate":
         i = as_index(index, len(self))

@@ -125,7 +125,7 @@ class Estimation:
 
     def estimates(self, attach: Attach) -> Estimate:
         """What has become of the pairs; attach: of the gradients of their fits."""
-        arrays = {"F": self.F, "inliers": self.inliers, "ok": self.ok, "samples": self.samples}
+        arrays = {"matrix": self.F, "inliers": self.inliers, "ok": self.ok, "samples": self.samples}
         arrays["significance"] = self.significance
         if self.asked_for_cameras:
             arrays |= self.cameras

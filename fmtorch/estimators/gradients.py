@@ -169,14 +169,14 @@ def _response(solved: Solved) -> Array:
 def with_gradients(estimate: Estimate, c: Correspondences, solved: dict[int, Solved], attach: Attach) -> Estimate:
     """The estimate of a batch with the gradients of the pairs that are solved, zero of others; the same values."""
     if not solved:
-        return estimate.derived(F=estimate.F + _nothing(c).to(estimate.F))
+        return estimate.derived(matrix=estimate.matrix + _nothing(c).to(estimate.matrix))
     rows = torch.tensor(list(solved), device=c.mask.device)
     zero = attach(list(solved.values()), graphed_matches(c, solved))
     F = torch.from_numpy(np.stack([s.fit.F for s in solved.values()])).to(zero)
     homographies = estimate.model == "homography"
     models = _frame(solved, zero).to_pixels((F + zero[:, :9]).reshape(-1, 1, 3, 3), homographies)[:, 0]
     G = unit_frobenius(models) if homographies else canonical(models)
-    attached = {"F": estimate.F.index_add(0, rows, G - G.detach())}
+    attached = {"matrix": estimate.matrix.index_add(0, rows, G - G.detach())}
     if estimate.focals is not None and zero.shape[1] > 9:
         attached["focals"] = estimate.focals.index_add(0, rows, estimate.focals.detach()[rows] * zero[:, 9:11])
     if estimate.lens is not None and zero.shape[1] > 11:

@@ -276,7 +276,7 @@ def difference(pair: ImagePair, images: Sequence[Image], stored: Row, outcome: O
         return f"gives no {name} when it is drawn again ({outcome.reason}), unlike in its run" if stored["ok"] else ""
     if not stored["ok"]:
         return f"gives {'a' if planar else 'an'} {name} when it is drawn again, unlike in its run"
-    now, then = again.F.cpu().double(), torch.tensor(stored[column], dtype=torch.float64).reshape(1, 3, 3)
+    now, then = again.matrix.cpu().double(), torch.tensor(stored[column], dtype=torch.float64).reshape(1, 3, 3)
     sizes = [torch.tensor([image.shape[:2]]) for image in images]
     if planar:
         apart = float(corner_error(now, then, sizes[0])[0])

@@ -119,7 +119,7 @@ def _of_homographies(outcomes: Sequence[Outcome]) -> list[Figures]:
     if matched := _matched(outcomes):
         own = [outcomes[i] for i in matched]
         (c, estimate, (size0, _)), (H,) = _joined(own), _truth(own, "H")
-        errors = torch.where(estimate.ok, metrics.corner_error(estimate.F, H, size0), torch.inf)
+        errors = torch.where(estimate.ok, metrics.corner_error(estimate.H, H, size0), torch.inf)
         right, kept = metrics.right_of_homography(H, c.x0, c.x1, mask=c.mask), estimate.inliers & c.mask
         before = right.sum(-1).double() / c.mask.sum(-1)
         after = torch.where(estimate.ok, (right & kept).sum(-1).double() / kept.sum(-1), torch.nan)
@@ -132,7 +132,7 @@ def _row(outcome: Outcome, figures: Figures, planar: bool, seconds: float) -> Pa
     pair, c, estimate = outcome.pair, outcome.correspondences, outcome.estimate
     ok, pair_type = outcome.solved, outcome.pair_type
     lenses = (None, None, None) if estimate is None else _lenses(estimate)
-    matrix = estimate.F[0].flatten().tolist() if estimate is not None and ok else None
+    matrix = estimate.matrix[0].flatten().tolist() if estimate is not None and ok else None
     figures = figures | {f"seconds_{stage}": outcome.seconds.get(stage, math.nan) for stage in STAGES}
     return PairRow(
         pair=pair.identity, key=pair.key, family=pair.family, scene=pair.scene, ok=ok, reason=outcome.reason,

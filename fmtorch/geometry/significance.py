@@ -277,7 +277,7 @@ def judged(estimate: Estimate, c: Correspondences) -> Estimate:
     if not bool(unknown.any()):
         return estimate
     with one_thread(c.mask.device):
-        F, x0, x1 = estimate.F.detach(), c.x0.detach(), c.x1.detach()
+        F, x0, x1 = estimate.matrix.detach(), c.x0.detach(), c.x1.detach()
         computed = significance(F, x0, x1, c.mask, c.size0, c.size1, model=estimate.model)
     computed = torch.where(estimate.ok, computed, -torch.inf)
     return estimate.derived(significance=torch.where(unknown, computed, given))

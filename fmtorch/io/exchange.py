@@ -129,7 +129,7 @@ def to_colmap(estimate: Estimate, matches: Any = None) -> Any:
     kind: Kind = "calibrated" if isinstance(estimate, PoseEstimate) and values["R"] is not None else "uncalibrated"
     H = _matrix(estimate.homography)
     if estimate.model == "homography":
-        kind, H = "planar_or_panoramic", _matrix(estimate.F)
+        kind, H = "planar_or_panoramic", _matrix(estimate.H)
     elif not estimate.related[0]:
         kind = "degenerate"
     elif estimate.pair_type_index is not None:

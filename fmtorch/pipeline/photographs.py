@@ -283,7 +283,7 @@ def pair_geometries(
     for i, (index, what) in enumerate(zip(matches, kinds, strict=True)):
         of_lines = what == GENERAL or (what == PLANAR and bool(calibrated[i]))
         inliers = index[(estimate if of_lines else homography).inliers[i, : len(index)].cpu().numpy()]
-        H = _known(homography.F[i], homography.ok[i])
+        H = _known(homography.H[i], homography.ok[i])
         if what == GENERAL:
             results.append(_with_lines("calibrated" if calibrated[i] else "uncalibrated", inliers, estimate, i, H))
         elif of_lines:

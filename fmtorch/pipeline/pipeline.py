@@ -107,15 +107,15 @@ class Outcome:
 
 def expect_finite(estimate: Estimate) -> Estimate:
     """The estimate, whose pairs are not ok where F is no matrix: anybody's estimator may have made it."""
-    valid = torch.isfinite(estimate.F).flatten(1).all(1) & (estimate.F != 0).flatten(1).any(1)
+    valid = torch.isfinite(estimate.matrix).flatten(1).all(1) & (estimate.matrix != 0).flatten(1).any(1)
     wrong = (estimate.ok & ~valid).tolist()
     if not any(wrong):
         return estimate
     said = "estimation: F is zero or not finite, though the estimator calls it ok"
     reason = tuple(said if bad else old for bad, old in zip(wrong, estimate.reason, strict=True))
     keep = valid[:, None]
-    F, inliers = torch.where(keep[..., None], estimate.F, 0), estimate.inliers & keep
-    return estimate.replace(F=F, inliers=inliers, ok=estimate.ok & valid, reason=reason, significance=None)
+    F, inliers = torch.where(keep[..., None], estimate.matrix, 0), estimate.inliers & keep
+    return estimate.replace(matrix=F, inliers=inliers, ok=estimate.ok & valid, reason=reason, significance=None)
 
 
 def collated(outcomes: Sequence[Outcome]) -> Correspondences:

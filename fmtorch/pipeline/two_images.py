@@ -391,7 +391,7 @@ def _estimated(
         lenses = photographs.division_lenses(estimate.lens[0], c, scales)
         c = photographs.undistorted_matches(c, lenses, scales).derived(lens=None, shared_lens=None)
     even, F, even_scales = photographs.evenly_reduced(c, estimate.F, scales)
-    of_pinholes = estimate.derived(F=F, lens=None)
+    of_pinholes = estimate.derived(matrix=F, lens=None)
     pair_type = classify(even, of_pinholes, seed=seed)
     clock("pair_type")
     index = np.arange(c.mask.shape[1]).repeat(2).reshape(-1, 2)

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from fmtorch.core.types import CONTRADICTED, Correspondences, Estimate, PoseEstimate
+from fmtorch.core.types import CONTRADICTED, Correspondences, Estimate, PoseEstimate, collate
 from fmtorch.geometry.epipolar import unit_frobenius
 from fmtorch.jobs.execution import one_thread
 from fmtorch.two_view.arguments import Arrays, Focal, Lens, correspondences, is_calibrated
@@ -361,10 +361,10 @@ def homographies(c: Correspondences, find: Callable[[Correspondences], Estimate]
     estimate = _beyond_chance(estimate, c)
     if not bool(changed.any()):
         return estimate
-    s, (x, y) = scale.to(estimate.F)[:, None], middle.to(estimate.F).unbind(1)
-    a, b, d = estimate.F.unbind(2)
+    s, (x, y) = scale.to(estimate.H)[:, None], middle.to(estimate.H).unbind(1)
+    a, b, d = estimate.H.unbind(2)
     H = unit_frobenius(torch.stack([a * s, b * s, d - s * (a * x[:, None] + b * y[:, None])], 2))
-    return estimate.derived(F=torch.where(changed[:, None, None], H, estimate.F))
+    return estimate.derived(matrix=torch.where(changed[:, None, None], H, estimate.H))
 
 
 def _unit_of_plane(c: Correspondences) -> tuple[Float[Tensor, " b"], Float[Tensor, "b 2"]]:
@@ -387,25 +387,19 @@ def _unit_of_plane(c: Correspondences) -> tuple[Float[Tensor, " b"], Float[Tenso
 def _moved(c: Correspondences, scale: Tensor, middle: Tensor) -> Correspondences:
     """The matches with x0 from its middle, scaled."""
     x0 = (c.x0 - middle[:, None]) * scale[:, None, None]
-    lafs = c.lafs0
-    if lafs is not None:
-        shift = torch.stack([torch.zeros_like(middle), torch.zeros_like(middle), middle], -1)
-        lafs = ((lafs - shift[:, None]) * scale[:, None, None, None]).to(lafs)
+    if (lafs := c.lafs0) is not None:
+        shift = torch.nn.functional.pad(middle[:, None, :, None], (2, 0))  # of centres alone
+        lafs = ((lafs - shift) * scale[:, None, None, None]).to(lafs)
     return c.derived(x0=x0, lafs0=lafs)
 
 
 def _better(estimate: Estimate, mirrored: Estimate, rows: Tensor) -> Estimate:
     """The estimates, of these rows the mirrored one where that has more inliers."""
     better = mirrored.inliers.sum(1) > estimate.inliers[rows].sum(1)
-    taken, of = rows[better], mirrored[better]
-    fields = {"samples": estimate.samples.index_add(0, rows, mirrored.samples)}
-    for name in ("inliers", "ok", "significance"):
-        fields[name] = getattr(estimate, name).index_copy(0, taken, getattr(of, name))
-    turned = of.F * of.F.new_tensor([1.0, -1.0, 1.0])
-    reasons = list(estimate.reason)
-    for i, reason in zip(taken.tolist(), of.reason, strict=True):
-        reasons[i] = reason
-    return estimate.derived(F=estimate.F.index_copy(0, taken, turned), reason=tuple(reasons), **fields)
+    both = collate([estimate, mirrored.derived(matrix=mirrored.H * mirrored.H.new_tensor([1.0, -1.0, 1.0]))])
+    place = torch.arange(len(estimate), device=rows.device)
+    place[rows[better]] = len(estimate) + better.nonzero()[:, 0]
+    return both[place].derived(samples=estimate.samples.index_add(0, rows, mirrored.samples))
 
 
 def _beyond_chance(estimate: Estimate, c: Correspondences) -> Estimate:
@@ -418,6 +412,6 @@ def _beyond_chance(estimate: Estimate, c: Correspondences) -> Estimate:
     for i in chance.nonzero()[:, 0].tolist():
         agree, matches = int(estimate.inliers[i].sum()), int(c.mask[i].sum())
         reasons[i] = f"{agree} of {matches} matches agree with a homography, no more than by chance"
-    F, inliers = torch.where(chance[:, None, None], 0, estimate.F), estimate.inliers & ~chance[:, None]
-    value = torch.where(chance, -torch.inf, estimate.significance)
-    return estimate.derived(F=F, inliers=inliers, ok=estimate.ok & ~chance, significance=value, reason=tuple(reasons))
+    H, value = torch.where(chance[:, None, None], 0, estimate.H), torch.where(chance, -torch.inf, estimate.significance)
+    fields = {"inliers": estimate.inliers & ~chance[:, None], "ok": estimate.ok & ~chance, "reason": tuple(reasons)}
+    return estimate.derived(matrix=H, significance=value, **fields)

@@ -173,11 +173,11 @@ def _with_cameras(estimate: Estimate, square: Correspondences, images: Images, c
     lens, unit = estimate.lens, images.unit  # half diagonals are of the images as they were
     fields = {} if lens is None or unit is None else {"lens": lens * (unit.detach() / unit) ** 2}
     if covariance:
-        at = estimate.derived(F=F, R=R, t=t).detach()
+        at = estimate.derived(matrix=F, R=R, t=t).detach()
         fields |= covariance_fields(at, square, images.map, torch.where(known, square_focals, torch.nan).detach())
     reasons = tuple(problem or reason for problem, reason in zip(images.problems, estimate.reason, strict=True))
     focals = torch.where(known, focals, torch.nan)
-    return estimate.derived(F=F, E=matmul3(cross_matrix(t), R), R=R, t=t, focals=focals, reason=reasons, **fields)
+    return estimate.derived(matrix=F, E=matmul3(cross_matrix(t), R), R=R, t=t, focals=focals, reason=reasons, **fields)
 
 
 def _pose(estimate: Estimate, square: Correspondences, focals: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:

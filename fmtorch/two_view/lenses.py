@@ -135,7 +135,7 @@ def homographies_with_lenses(c: Correspondences, find: Callable[[Correspondences
     inliers = torch.stack([each.inliers for each in estimates]).any(0)
     for i in (inliers.sum(1) >= MIN_FIT).nonzero()[:, 0].tolist():
         tried = zip(estimates, starts, strict=True)
-        models = [torch.cat([each.F[i].flatten(), start[i].to(each.F)]) for each, start in tried if each.ok[i]]
+        models = [torch.cat([e.matrix[i].flatten(), start[i].to(e.matrix)]) for e, start in tried if e.ok[i]]
         matches = c[i].derived(mask=inliers[i : i + 1])
         lens[i] = torch.from_numpy(_fitted_lenses(matches, torch.stack(models).double().cpu().numpy()))
     estimate = find(_straight(c, lens))

@@ -125,7 +125,7 @@ def classify(
     K0, K1, precision = _cameras(c, focal_deviation)
     with one_thread(c.mask.device):
         evidence = kinds.pair_evidence(
-            F, H.F, c.x0, c.x1, c.mask, c.prior, c.noise, c.size0, c.size1, K0, K1, precision
+            F, H.H, c.x0, c.x1, c.mask, c.prior, c.noise, c.size0, c.size1, K0, K1, precision
         )
     exact = None if precision is None else precision.diagonal(dim1=-2, dim2=-1).isinf().all(-1)
     return PairTypes(torch.where(ok | H.ok, kinds.classified(evidence, exact), kinds.UNRELATED), evidence, H)
@@ -187,10 +187,10 @@ def with_pair_type(estimate: Estimate, c: Correspondences, seed: int, **options:
     judged = classify(c.detach(), estimate.detach(), seed=seed, **options)
     c = straightened(c, estimate.lens)
     H, kind, flat = judged.homography, judged.kind, judged.flat
-    fields = {"pair_type_index": kind, "homography": torch.where(flat[:, None, None], H.F, 0)}
+    fields = {"pair_type_index": kind, "homography": torch.where(flat[:, None, None], H.H, 0)}
     if c.K0 is not None and c.K1 is not None and estimate.R is not None:
         with one_thread(c.mask.device):
-            poses = poses_from_homography(H.F, c.K0, c.K1, c.x0, c.x1, H.inliers)
+            poses = poses_from_homography(H.H, c.K0, c.K1, c.x0, c.x1, H.inliers)
             fields |= _other_pose(estimate.R, poses, flat & (kind == kinds.PLANAR))
     return estimate.derived(**fields)
 

@@ -212,7 +212,7 @@ def pose_errors(item: Item) -> Array:
     R, t, K0, K1 = (torch.from_numpy(getattr(item.pair, name))[None] for name in ("R", "t", "K0", "K1"))
     x0, x1, estimate, H = c.x0.double(), c.x1.double(), presets.build("estimator", "fmtorch")(c, 0), estimated(c)
     from_F = metrics.fundamental_pose_error(estimate.F, K0, K1, x0, x1, R, t, estimate.inliers)
-    poses = poses_from_homography(H.F, K0, K1, x0, x1, H.inliers)
+    poses = poses_from_homography(H.H, K0, K1, x0, x1, H.inliers)
     seen = torch.where(poses.valid[..., None, None], poses.R, torch.nan)
     from_H = metrics.pose_error(seen, poses.t, R[:, None], t[:, None]).worst[0].nan_to_num(180.0)
     return np.array([float(from_F.worst), float(from_H[0]), float(from_H.min())])

@@ -38,7 +38,12 @@ def matches(b: int = 4, n: int = 6, seed: int = 0) -> Correspondences:
 
 def estimate(b: int = 4, n: int = 6, seed: int = 0) -> Estimate:
     shapes = {"fit_scale lens_suggested": (), "focals lens": (2,), "t other_t": (3,), "focal_precision sizes": (2, 2)}
-    matrices = {"F E R homography other_R": (3, 3), "tangents": (3, 2), "covariance": (7, 7), "covariance_F": (9, 9)}
+    matrices = {
+        "matrix E R homography other_R": (3, 3),
+        "tangents": (3, 2),
+        "covariance": (7, 7),
+        "covariance_F": (9, 9),
+    }
     fields, g = drawn(b, seed, {**shapes, **matrices})
     flags = {name: torch.rand(b, generator=g) < 0.5 for name in ("contradicted", "sizes_doubtful")}
     ok = torch.arange(b) % 2 == 0

@@ -191,7 +191,7 @@ def estimation(name: str, data: st.DataObject) -> tuple[Call, set[str], Check]:
 
 def sound_estimate(estimate: Any) -> None:
     """The promises of `Estimate`: of a pair that is ok a finite F of unit norm with support, of another a reason."""
-    F, ok, reason = estimate.F.detach().double(), estimate.ok, estimate.reason
+    F, ok, reason = estimate.matrix.detach().double(), estimate.ok, estimate.reason
     assert (F.shape, estimate.inliers.dtype) == ((len(ok), 3, 3), torch.bool)
     for i in range(len(ok)):
         support = int(estimate.inliers[i].sum())

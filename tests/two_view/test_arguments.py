@@ -197,7 +197,7 @@ def test_an_empty_batch_gives_an_empty_result() -> None:
         c = Correspondences(x, x, yes, ratio=numbers, prior=numbers, lafs0=frames, lafs1=frames, **known)
         for name, estimator in estimators.items():
             estimate = estimator(c)
-            assert estimate.F.shape == (b, 3, 3), name
+            assert estimate.matrix.shape == (b, 3, 3), name
             assert not bool(estimate.ok.any()), name
         for name, pruner in pruners.items():
             assert pruner(c).compact().mask.shape == (b, 0), name
@@ -228,7 +228,7 @@ def test_an_estimator_that_gives_no_matrix_makes_failed_rows(wrong: float, tmp_p
         estimate = sound(c, seed)
         F = estimate.F.clone()
         F[0] = wrong if wrong != wrong or wrong else 0
-        return estimate.replace(F=F)
+        return estimate.replace(matrix=F)
 
     built.estimator = spoiled
     pairs = [pair(name, images[0], ImageSource(name, image.path)) for name, image in zip("ab", images[1:], strict=True)]

@@ -95,7 +95,7 @@ def test_pairs_keep_to_themselves(find: Any) -> None:
     together = find([x for x, _ in pairs], [x for _, x in pairs], lens=lenses)
     for i in range(3):
         alone = find(*pairs[i], lens=lenses[i])
-        assert torch.equal(together.F[i], alone.F[0])
+        assert torch.equal(together.matrix[i], alone.matrix[0])
         assert torch.equal(together.inliers[i, : len(pairs[i][0])], alone.inliers[0])
     assert together.ok.tolist()[3:] == [False, False]
     assert re.match(r"pinholes see \d+ of \d+ matches: the lens folds there", together.reason[3])
@@ -111,14 +111,14 @@ def test_gradients_reach_the_photographs_points(find: Any) -> None:
     points = [torch.from_numpy(x).requires_grad_() for x in (x0, x1)]
     direction = torch.from_numpy(np.random.default_rng(0).normal(size=(3, 3)))
     estimate = find(*points, lens=RADIAL)
-    (estimate.F[0] * direction).sum().backward()
+    (estimate.matrix[0] * direction).sum().backward()
     inliers = estimate.inliers[0].nonzero()[:, 0].tolist()
     for image, i, axis in ((0, inliers[3], 0), (1, inliers[8], 1), (0, inliers[11], 1)):
         values = []
         for step in (0.05, -0.05):
             moved = [x0.copy(), x1.copy()]
             moved[image][i, axis] += step
-            values.append(float((find(*moved, lens=RADIAL).F[0] * direction).sum()))
+            values.append(float((find(*moved, lens=RADIAL).matrix[0] * direction).sum()))
         slopes = (values[0] - values[1]) / 0.1, float(points[image].grad[i, axis])
         assert slopes[1] == pytest.approx(slopes[0], rel=0.05, abs=0.05 * float(points[image].grad.abs().max()))
 
@@ -248,7 +248,7 @@ def test_a_lens_of_a_photograph_of_a_map() -> None:
     x0, x1 = planes(4, RADIAL)
     board = straight(RADIAL, x0) / 1000
     estimate = fmtorch.find_homography(board, x1, lens=(None, RADIAL))
-    estimate = estimate.derived(F=estimate.F @ torch.diag(torch.tensor([1e-3, 1e-3, 1.0])).double())
+    estimate = estimate.derived(matrix=estimate.H @ torch.diag(torch.tensor([1e-3, 1e-3, 1.0])).double())
     assert error(estimate) < 1
 
 
@@ -263,8 +263,8 @@ def test_what_stands_in_masked_slots_means_nothing(find: Any, garbage: float) ->
         points = [torch.from_numpy(x).requires_grad_() for x in padded]
         mask = np.arange(len(x0) + slots)[None] < len(x0)
         estimate = find(*points, mask=mask, lens=FISHEYE)
-        estimate.F.sum().backward()
-        gradients.append((estimate.F.detach(), *(x.grad[:, : len(x0)] for x in points)))
+        estimate.matrix.sum().backward()
+        gradients.append((estimate.matrix.detach(), *(x.grad[:, : len(x0)] for x in points)))
         assert all(float(x.grad[:, len(x0) :].abs().sum()) == 0 for x in points)
     assert all(map(torch.equal, *gradients))
 

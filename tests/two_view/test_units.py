@@ -45,7 +45,7 @@ def test_kinds(kind: str, known: bool) -> None:
     exact = classify(c, estimate, focal_deviation=0)
     assert exact.names.count(kind) >= 11, exact.names
     nothing = torch.zeros_like(estimate.F)
-    failed = estimate.derived(F=nothing, ok=nothing[:, 0, 0] > 0)  # as of an estimator that does not work
+    failed = estimate.derived(matrix=nothing, ok=nothing[:, 0, 0] > 0)  # as of an estimator that does not work
     assert classify(c, failed).names.count(kind) >= 11
 
 
