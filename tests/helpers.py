@@ -1,7 +1,5 @@
 """What several tests share: pictures, pairs and data sets on disk, a small pipeline, commands in this process."""
 
-from __future__ import annotations
-
 import sys
 import threading
 from collections.abc import Callable, Iterable, Sequence

@@ -5,8 +5,6 @@
 3. No pair can take its batch down: degenerate pairs are told apart and leave the others alone.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from collections.abc import Callable, Mapping

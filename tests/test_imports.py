@@ -122,7 +122,7 @@ def functions() -> Iterator[tuple[str, ast.FunctionDef]]:
 
 def test_files_fit_in_the_head_and_functions_on_a_screen() -> None:
     assert [module for module, path in FILES.items() if path.read_bytes().count(b"\n") > MAX_FILE] == []
-    assert [name for name, function in functions() if _length(function) > MAX_FUNCTION] == []
+    assert [name for name, function in functions() if house.span(function) > MAX_FUNCTION] == []
 
 
 def test_kernels_take_few_arguments_whose_types_are_annotated() -> None:
@@ -145,13 +145,6 @@ def _is_kernel(function: ast.FunctionDef) -> bool:
     return any(isinstance(each, ast.Name) and each.id == "kernel" for each in decorators)
 
 
-def _length(function: ast.FunctionDef) -> int:
-    """Lines of a function, its signature included and its docstring not."""
-    docstring = ast.get_docstring(function, clean=False)
-    lines = (function.end_lineno or 0) - function.lineno + 1
-    return lines - (len(docstring.splitlines()) if docstring else 0)
-
-
 PAGE = Path(house.ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
 MAX_FILES, MAX_MODULES = 6, 92
 ELSEWHERE = (
@@ -166,7 +159,11 @@ def test_the_road_of_a_pair_is_the_files_that_the_page_names() -> None:
     assert len(road) <= MAX_FILES
 
 
-def test_a_process_that_estimates_loads_what_that_needs() -> None:
-    modules = house.loaded()
+def test_a_process_loads_what_it_needs() -> None:
+    """Compilers, torch's and numba, no earlier than the first estimate."""
+    names = "print(*sys.modules, '|')\n"
+    words = house.printed(f"import sys, fmtorch; fmtorch.find_fundamental; {names}{house.ESTIMATE}{names}")
+    before, modules, _ = (each.split() for each in " ".join(words).split("|"))
+    assert not {"torch._dynamo", "numba"} & {*before}
     assert [name for name in ELSEWHERE if name in modules] == []
     assert len([name for name in modules if name.partition(".")[0] == "fmtorch"]) <= MAX_MODULES

@@ -37,14 +37,6 @@ def test_reference_opencv_and_kornia_live(batch, n):
             assert error.norm() < n * torch.finfo(torch.float64).eps / gap
 
 
-def test_weight_zero_is_masked():
-    x0, x1, _ = scenes((3,), 40, noise=0.5)
-    mask = torch.arange(40).expand(3, 40) < 30
-    F, valid = geometry.eight_point(x0, x1, mask=mask)
-    assert torch.equal(F, geometry.eight_point(x0, x1, weight=mask.double())[0])
-    assert valid.all()
-
-
 def degenerate(n, dtype=torch.float64):
     """Two sound sets, then ten that are not, and their names' verdict."""
     x0, x1, _ = (a.to(dtype).clone() for a in scenes((12,), n, noise=0.5))

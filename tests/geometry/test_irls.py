@@ -47,7 +47,7 @@ def test_gradients_are_those_of_the_fixed_point(loss: str) -> None:
     converged = irls(x0, x1, F0, weight, loss=loss, scale=SCALE, iterations=60)
 
     def function(x0: Tensor, x1: Tensor, w: Tensor) -> Tensor:
-        return irls(x0, x1, converged, w, loss=loss, scale=SCALE, iterations=15)
+        return irls(x0, x1, converged, w, loss=loss, scale=SCALE, iterations=10)
 
     attached = [v.clone().requires_grad_() for v in (x0, x1, weight)]
     assert torch.autograd.gradcheck(function, attached, **tolerances(loss))
@@ -128,16 +128,6 @@ def test_curvature_is_half_the_second_derivative_or_zero(name: str) -> None:
     influence = [(r + d) * LOSSES[name].weight((r + d).square(), S2) for d in (-h, h)]
     second = ((influence[1] - influence[0]) / (2 * h)).clamp_min(0)
     assert torch.allclose(LOSSES[name].curvature(r.square(), S2), second, rtol=1e-7, atol=1e-9)
-
-
-@pytest.mark.parametrize("name", LOSSES)
-def test_weights_fall_from_one(name: str) -> None:
-    zero = torch.zeros((), dtype=torch.float64)
-    assert LOSSES[name].weight(zero, S2) == 1
-    r2 = torch.logspace(-6, 6, 50, dtype=torch.float64)
-    weight = LOSSES[name].weight(r2, S2)
-    assert bool(((weight >= 0) & (weight <= 1)).all())
-    assert bool((weight.diff() <= 0).all())
 
 
 def test_unknown_name_lists_the_known_ones() -> None:

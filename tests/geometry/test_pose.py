@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from fmtorch.geometry import homography_points, pose_from_fundamental, poses_from_homography
-from fmtorch.geometry.cameras import PixelFrame, calibration_problems, mapped, square_pixels
+from fmtorch.geometry.cameras import calibration_problems, mapped, square_pixels
 from fmtorch.geometry.pose import pose
 from tests.geometry.scenes import scene, stacked
 from tests.reference import known_cameras, solvers
@@ -306,21 +306,3 @@ def test_what_is_no_calibration_is_named(entries: list[tuple[int, int, float]], 
     square = square_pixels(K, SIZE.expand(3, 2), torch.tensor([True, False, True]))
     assert bool(square.map.isfinite().all())
     assert torch.equal(square.map[1], torch.eye(3, dtype=torch.float64))
-
-
-GENERATOR = torch.Generator().manual_seed(0)
-PIXELS = torch.rand(3, 50, 4, generator=GENERATOR, dtype=torch.float64) * torch.tensor([[[900.0]], [[30.0]], [[4e5]]])
-
-
-def test_matrices_follow_the_points() -> None:
-    frame = PixelFrame.around(PIXELS, torch.ones(3, 50, dtype=torch.bool))
-    F = torch.randn(3, 2, 3, 3, generator=GENERATOR, dtype=torch.float64)
-    x = frame.normalized(PIXELS)
-
-    def errors(matrices: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
-        x0, x1 = (torch.nn.functional.pad(p, (0, 1), value=1.0) for p in points.split(2, -1))
-        return torch.einsum("pni,pkij,pnj->pkn", x1, matrices, x0)
-
-    # Cancellation of terms up to (coordinate / unit)^2, which is below 10: a few hundred eps.
-    torch.testing.assert_close(errors(frame.to_pixels(F), PIXELS), errors(F, x), rtol=0, atol=1e-12)
-    torch.testing.assert_close(frame.from_pixels(frame.to_pixels(F)), F, rtol=0, atol=1e-12)

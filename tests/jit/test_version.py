@@ -1,8 +1,6 @@
 """Versions of compiled functions: what they depend on, what not, and that every process tells the same."""
 
 import json
-import os
-import subprocess
 import sys
 import types
 from pathlib import Path
@@ -15,8 +13,6 @@ from fmtorch.estimators import WITH_FOCALS
 from fmtorch.jit.cache import version
 from fmtorch.jit.kernel import F4x1, F8x1, F8x2, U1x1, kernel, signature_of
 from tests.processes import run_command
-
-REPOSITORY = Path(__file__).resolve().parents[2]
 
 SOURCE = """
 import enum
@@ -305,8 +301,7 @@ print(end(Line(np.arange(4.0), 2.0)))
 
 def test_a_script_finds_what_it_kept_although_its_groups_are_made_anew(tmp_path: Path) -> None:
     (tmp_path / "script.py").write_text(SCRIPT)
-    env = {**os.environ, "PYTHONPATH": str(REPOSITORY), "FMTORCH_CACHE": str(tmp_path / "cache")}
-    command, told = [sys.executable, str(tmp_path / "script.py")], {"env": env, "capture_output": True, "text": True}
-    done = [subprocess.run(command, check=True, **told) for _ in range(2)]
+    own, code = {"FMTORCH_CACHE": str(tmp_path)}, "import runpy; runpy.run_path('script.py', run_name='__main__')"
+    done = [run_command("-c", code, cwd=tmp_path, environment=own) for _ in range(2)]
     assert [each.stdout for each in done] == ["6.0\n"] * 2
     assert ["compiling end" in each.stderr for each in done] == [True, False]

@@ -1,7 +1,5 @@
 """LightGlue behind the project's conventions, with an untrained network."""
 
-from __future__ import annotations
-
 import re
 import urllib.request
 from pathlib import Path

@@ -14,11 +14,10 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from torch import Tensor
 
-from fmtorch import find_fundamental, metrics, presets, pruning
+from fmtorch import presets, pruning
 from fmtorch.core import Correspondences, Features
 from fmtorch.matching import NearestNeighborMatcher
 from fmtorch.pruning.consistency import CURVES, MIN_VOTE, NOISE, SCALES, TOLERANCE, TURNS, WINDOW, WORST_RATIO
-from tests.geometry.scenes import scene as matched_scene
 from tests.laws import calibrated, degenerate, quick_pruner, scene, scenes, small, with_padding
 from tests.processes import run_command
 from tests.reference import consistency
@@ -267,26 +266,3 @@ def test_matches_without_frames_are_left_as_they_are_and_what_cannot_be_told_is_
     assert bool(torch.isfinite(noise).all())
     alone = stage(c.replace(ratio=None, prior=None)).noise
     assert bool((alone[c.mask] > 0).all())
-
-
-def _noisy_pair(seed: int) -> tuple[torch.Tensor, ...]:
-    """Points of two views whose noise differs tenfold from match to match, the true F, and that noise."""
-    rng, exact = np.random.default_rng(seed), matched_scene(120, seed)
-    noise = torch.from_numpy(np.where(rng.random(120) < 0.5, 0.3, 3.0))
-    errors = torch.from_numpy(rng.normal(size=(2, 120, 2))) * 0.3 * noise[:, None]
-    return exact.x0 + errors[0], exact.x1 + errors[1], exact.F, noise
-
-
-def test_known_noise_makes_estimates_more_exact() -> None:
-    size = torch.tensor([[800, 1000]])
-    errors = []
-    for seed in range(6):
-        x0, x1, F, noise = _noisy_pair(seed)
-        row = []
-        for given_noise in (None, noise):
-            estimate = find_fundamental(x0, x1, noise=given_noise)  # with sizes, what is known of cameras helps both
-            assert bool(estimate.ok[0])
-            row.append(float(metrics.nsgd(F[None], estimate.F, size, size)))
-        errors.append(row)
-    without, with_noise = np.median(errors, 0)
-    assert with_noise < 0.6 * without

@@ -1,7 +1,5 @@
 """Sizes of images as their matched points tell them, one pair and one number at a time."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Lenses of the division model: bent points, F between such photographs, one match and one number at a time."""
 
-from __future__ import annotations
-
 import numpy as np
 import scipy.linalg
 

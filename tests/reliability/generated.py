@@ -48,9 +48,6 @@ Draw = Callable[[st.DataObject], tuple[Call, set[str], Check]]
 """Makes a call, the names that an error may name, and a check of the result."""
 
 
-# Arguments ------------------------------------------------------------------------------------------------------------
-
-
 def mistaken(data: st.DataObject, arguments: dict[str, Any], numbers: dict[str, Any], *, movable: bool = True) -> bool:
     """Spoil some arguments in place, often none; whether any is. movable: devices differ, too."""
     spoiled = []
@@ -135,9 +132,6 @@ def sound_result(name: str, clean: bool, result: Any) -> None:
             assert bool((known >= 0).all()), f"{name} is negative"
         if clean and name not in UNDEFINED:
             assert not bool(value.isnan().any()), f"{name} is NaN for finite arguments"
-
-
-# Subjects -------------------------------------------------------------------------------------------------------------
 
 
 FIELDS: Mapping[str, tuple[str, tuple[str, ...]]] = {
@@ -328,9 +322,6 @@ def subjects() -> dict[str, Draw]:
     draws |= {f"find_fundamental.{name}": functools.partial(estimation, name) for name in installed_estimators()}
     draws |= {f"pruner.{name}": functools.partial(pruned, name) for name in variants("pruner")}
     return {**draws, "fmtorch.match": photographs}
-
-
-# Outcomes -------------------------------------------------------------------------------------------------------------
 
 
 class Unclear(AssertionError):

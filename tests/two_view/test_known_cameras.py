@@ -42,9 +42,6 @@ def converging(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(refinement, "FOCAL_TOLERANCE", 0.0)
 
 
-# Exactness
-
-
 @pytest.mark.usefixtures("converging")
 @pytest.mark.parametrize("estimator", ["fmtorch", "msac"])
 @pytest.mark.parametrize("sizes", [{}, SIZES], ids=["sizes unknown", "sizes known"])
@@ -146,17 +143,11 @@ def test_pose_and_essential_matrix_are_those_of_the_fundamental_matrix(known: di
         assert min(float((e.F - sign * F).abs().max()) for sign in (-1, 1)) < 1e-6
 
 
-# Knowledge helps
-
-
 def test_a_wrong_measurement_is_not_believed_for_long() -> None:
     """It has a tail: far from where the matches are, it no longer pulls."""
     s = reference.scene(5, 300, noise=0.1, outliers=0.1, cameras=CENTRAL)
     e = fmtorch.find_fundamental(s.x0, s.x1, **SIZES, focal=((2000.0, 0.02), (2000.0, 0.02)))
     np.testing.assert_allclose(e.focals[0], [650, 650], rtol=0.05)
-
-
-# Laws
 
 
 @functools.cache
@@ -212,9 +203,6 @@ def test_without_cameras_nothing_changes() -> None:
     assert plain.E is None
 
 
-# Gradients
-
-
 VARIABLES = ("x0", "x1", "prior", "noise", "K0", "K1")
 
 
@@ -263,9 +251,6 @@ def _differentiable() -> dict[str, Tensor]:
     return {name: torch.from_numpy(value)[None] for name, value in values.items()} | {
         name: torch.from_numpy(K)[None] for name, K in zip(("K0", "K1"), cameras, strict=True)
     }
-
-
-# Real pairs
 
 
 @functools.cache

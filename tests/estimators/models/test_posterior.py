@@ -1,7 +1,5 @@
 """Posteriors over cameras and lenses: cheirality, optima, tangents."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

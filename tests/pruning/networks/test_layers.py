@@ -246,13 +246,6 @@ def test_gradients_are_finite_on_degenerate_pairs(network: DFE) -> None:
     assert all(torch.isfinite(b).all() for b in network.buffers())
 
 
-def test_what_is_no_such_checkpoint_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    torch.save({"conv1.weight": torch.zeros(3)}, tmp_path / "other.net")
-    with pytest.raises(SystemExit, match=r"error: no checkpoint of LC\(.*\): p_in\.weight is missing"):
-        convert(monkeypatch, "ngransac", tmp_path / "other.net", tmp_path / "out.safetensors", "--side", "ratio")
-    assert not (tmp_path / "out.safetensors").exists()
-
-
 SIDE = ("ratio", "mutual", "scale", "rotation", "agreement")
 
 
