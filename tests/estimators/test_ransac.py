@@ -334,16 +334,6 @@ def test_what_an_estimator_does_not_say_is_said_by_the_caller() -> None:
     assert judged(own, c) is own
 
 
-def test_find_fundamental_tells() -> None:
-    c = collate([scene(1, 100, 0.3), scene(2, 40, 1.0)])
-    estimate = fmtorch.find_fundamental(c.x0, c.x1, mask=c.mask, ratio=c.ratio, size0=(640, 960), size1=(640, 960))
-    assert estimate.ok[0]
-    assert estimate.related.tolist() == [True, False]
-    assert estimate[1:].significance.tolist() == estimate.significance[1:].tolist()
-    rng = np.random.default_rng(0)
-    assert not bool(fmtorch.find_fundamental(*rng.uniform(0, 500, (2, 20, 2)), estimator="ransac").related[0])
-
-
 def test_of_many_likely_matches_a_part_is_searched_and_all_are_fitted(monkeypatch: pytest.MonkeyPatch) -> None:
     """The median error stays below 0.02 px, at a noise of 0.3 px; where few are likely, all are searched."""
     c = scene(3, 6000)

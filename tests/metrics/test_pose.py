@@ -20,6 +20,7 @@ from tests.geometry.scenes import scene
 from tests.metrics.test_nsgd import VGA, random_pairs
 from tests.reference import metrics as reference
 from tests.reference import solvers
+from tests.reference.homography import mapped
 
 
 def rotation(axis_angle: Tensor) -> Tensor:
@@ -176,13 +177,7 @@ def test_thresholds_that_are_no_multiples_are_refused(thresholds: tuple[float, .
 
 
 SIZE = torch.tensor([480, 640])
-
-
 CORNERS = np.array([[0, 0], [639, 0], [639, 479], [0, 479]], np.float64)
-
-
-def mapped(H: np.ndarray, points: np.ndarray) -> np.ndarray:
-    return cv2.perspectiveTransform(points[None], H)[0]
 
 
 def homographies(count: int) -> np.ndarray:

@@ -3,6 +3,8 @@
 import numpy as np
 import scipy.linalg
 
+from tests.reference.solvers import skew
+
 Size = tuple[int, int]
 
 
@@ -86,6 +88,5 @@ def photographs(
     x0, x1 = (x[inside] for x in points)
     some = slice(int(wrong * len(x1)))
     x1[some] = rng.permutation(x1[some])
-    cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
-    F = np.linalg.inv(K).T @ cross @ R @ np.linalg.inv(K)
+    F = np.linalg.inv(K).T @ skew(t) @ R @ np.linalg.inv(K)
     return x0, x1, F / np.linalg.norm(F), K

@@ -1,13 +1,9 @@
 """Losses and figures of patch descriptors, written from their definitions one pair at a time."""
 
-import math
 from collections.abc import Sequence
+from math import dist as distance
 
 Vectors = Sequence[Sequence[float]]
-
-
-def distance(a: Sequence[float], b: Sequence[float]) -> float:
-    return math.sqrt(sum((x - y) ** 2 for x, y in zip(a, b, strict=True)))
 
 
 def hardest_triplet(a: Vectors, b: Vectors, margin: float) -> float:
