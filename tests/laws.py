@@ -29,6 +29,8 @@ SMALL_KINDS = ("collinear", "collinear in image 1", "planar", "coincident", "hal
 
 FEW_OF_PEERS = {"iterations": 1000, "min_iterations": 100, "rounds": 2}
 Result = dict[str, Tensor]  # every value has the batch as its first dimension; masks (B, N) may be padded on the right
+KNOWLEDGE: dict[str, Any] = {"exact": (0.0, 0.0), "rough": (0.05, 0.05), "one": (0.0, float("inf")), "shared": None}
+"""Deviations of the two focal lengths, as parts of them; None: unknown and equal."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,10 +96,6 @@ def calibrated(c: Correspondences) -> Correspondences:
     """The same pairs with the calibration matrices of `scene`, which some learned pruners need."""
     K = torch.tensor([[800.0, 0, 480], [0, 800, 320], [0, 0, 1]], device=c.mask.device).expand(len(c), 3, 3)
     return c.replace(K0=K, K1=K)
-
-
-KNOWLEDGE: dict[str, Any] = {"exact": (0.0, 0.0), "rough": (0.05, 0.05), "one": (0.0, float("inf")), "shared": None}
-"""Deviations of the two focal lengths, as parts of them; None: unknown and equal."""
 
 
 def with_knowledge(c: Correspondences, known: str) -> Correspondences:

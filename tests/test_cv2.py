@@ -15,6 +15,7 @@ from tests.reference.solvers import homogeneous, sampson, skew
 SCENE = scene(3, 200, noise=0.3, cameras=(K0, K0))
 PTS1, PTS2 = SCENE.x0, SCENE.x1
 EPIPOLAR_FLAGS = ("FM_RANSAC", "FM_LMEDS", "USAC_DEFAULT", "USAC_FAST", "USAC_ACCURATE", "USAC_PROSAC", "USAC_MAGSAC")
+FORMS = (np.float32, np.float64, np.int32, lambda x: x[:, None], lambda x: x[None], np.ndarray.tolist)
 
 
 def both(name: str, *arguments: Any, **named: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
@@ -224,9 +225,6 @@ def test_undistortion_runs_to_its_end() -> None:
     assert angle(R, SCENE.R) < 0.005
     E, _ = cv2.findEssentialMat(x1, x2, K, bend, K, bend)
     assert angle(cv2.recoverPose(E, *(Z[:, :2] / Z[:, 2:] for Z in (X, Y)), np.eye(3))[1], SCENE.R) < 0.01
-
-
-FORMS = (np.float32, np.float64, np.int32, lambda x: x[:, None], lambda x: x[None], np.ndarray.tolist)
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -36,6 +36,13 @@ MAY_IMPORT = {
 TORCH = {"torch", "torchvision", "torchmetrics", "kornia", "lightning"}  # the last four import the first
 NUMBA = {"numba", "llvmlite"}
 TENSORS_OF_ESTIMATORS = ("batch.py", "gradients.py", "irls.py", "external/")
+MAX_FILE, MAX_FUNCTION = 500, 60  # lines, lines without the docstring
+MAX_ARGUMENTS = 6  # of a kernel
+PAGE = Path(house.ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+MAX_FILES, MAX_MODULES = 6, 92
+ELSEWHERE = (
+    "PIL", "cv2", "hydra", "kornia", "matplotlib", "omegaconf", "onnxruntime", "pyarrow", "scipy.sparse", "skimage"
+)  # fmt: skip
 
 
 def module_name(path: Path) -> str:
@@ -111,10 +118,6 @@ def test_estimators_take_tensors_at_their_edges_alone() -> None:
     assert [path for path in tensors if not path.startswith(TENSORS_OF_ESTIMATORS)] == []
 
 
-MAX_FILE, MAX_FUNCTION = 500, 60  # lines, lines without the docstring
-MAX_ARGUMENTS = 6  # of a kernel
-
-
 def functions() -> Iterator[tuple[str, ast.FunctionDef]]:
     for module, path in FILES.items():
         yield from ((f"{module}.{n.name}", n) for n in nodes(path) if isinstance(n, ast.FunctionDef))
@@ -143,13 +146,6 @@ def _is_kernel(function: ast.FunctionDef) -> bool:
     """Whether it is decorated by ``@kernel`` or ``@kernel(...)``."""
     decorators = [each.func if isinstance(each, ast.Call) else each for each in function.decorator_list]
     return any(isinstance(each, ast.Name) and each.id == "kernel" for each in decorators)
-
-
-PAGE = Path(house.ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
-MAX_FILES, MAX_MODULES = 6, 92
-ELSEWHERE = (
-    "PIL", "cv2", "hydra", "kornia", "matplotlib", "omegaconf", "onnxruntime", "pyarrow", "scipy.sparse", "skimage"
-)  # fmt: skip
 
 
 def test_the_road_of_a_pair_is_the_files_that_the_page_names() -> None:

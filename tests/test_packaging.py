@@ -15,6 +15,8 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 CHECKOUT = Path(__file__).resolve().parents[1]
+PYTHONS = [f"python3.{minor}" for minor in range(11, 15)]
+RELEASED = ("pyproject.toml", "fmtorch/core/version.py", "CITATION.cff", "CHANGELOG.md", "scripts/release")
 
 
 def _project() -> dict[str, object]:
@@ -124,9 +126,6 @@ def test_constraints_pin_every_declared_dependency_within_its_range() -> None:
             assert pins[canonicalize_name(requirement.name)] in requirement.specifier, text
 
 
-PYTHONS = [f"python3.{minor}" for minor in range(11, 15)]
-
-
 def _interpreter(name: str) -> str | None:
     """An interpreter of this version on this machine that has venv."""
     folders = [*map(str, Path.home().glob(".pyenv/versions/*/bin")), os.environ.get("PATH", "")]
@@ -150,9 +149,6 @@ def test_the_wheel_is_installed_on_every_python_that_is_here(wheel: Path, python
         command = [tmp_path / "venv/bin/fmtorch", *words]
         done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
         assert (done.returncode, done.stderr) == (0, ""), words
-
-
-RELEASED = ("pyproject.toml", "fmtorch/core/version.py", "CITATION.cff", "CHANGELOG.md", "scripts/release")
 
 
 @pytest.fixture

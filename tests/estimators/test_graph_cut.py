@@ -23,6 +23,13 @@ from tests.reference.random import number
 from tests.reference.solvers import eight_point, normalised_equations, unit
 
 NAMES = ("scene 40", "scene 300", *REAL)
+RADIUS = 20.0
+RECTIFIED = np.array([0, 0, 0, 0, 0, 1.0, 0, -1, 0])  # r^2 = (y1 - y0)^2 / 2
+PAIRS = 64
+COUNT = 200
+OPTIONS = {
+    "threshold": 1.0, "hypotheses": 200, "round": 100, "confidence": None, "pool": 4, "refine": {"loss": "truncated"},
+}  # fmt: skip
 
 
 def searched(pair: Pair) -> np.ndarray:
@@ -74,10 +81,6 @@ def test_a_model_is_its_best_fit_as_long_as_the_score_rises() -> None:
             rounds.append(len(rising) - 1)
             np.testing.assert_array_equal(improved, rising[min(part.ITERATIONS, rounds[-1])])
     assert min(rounds) < GraphCut.ITERATIONS < max(rounds)  # some stop by themselves, others could go on
-
-
-RADIUS = 20.0
-RECTIFIED = np.array([0, 0, 0, 0, 0, 1.0, 0, -1, 0])  # r^2 = (y1 - y0)^2 / 2
 
 
 @kernel
@@ -167,13 +170,6 @@ def test_labels_are_almost_those_of_the_exact_cut_on_real_pairs(epsilon: float, 
     assert np.mean(same) > 0.999
     assert min(same) > 0.995
     assert np.mean(excess) < 1e-3
-
-
-PAIRS = 64
-COUNT = 200
-OPTIONS = {
-    "threshold": 1.0, "hypotheses": 200, "round": 100, "confidence": None, "pool": 4, "refine": {"loss": "truncated"},
-}  # fmt: skip
 
 
 @functools.cache

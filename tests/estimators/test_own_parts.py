@@ -25,6 +25,7 @@ REPLACED: dict[str, dict[str, Any]] = {
 }
 PRESETS = ("msac", "fmtorch")
 OWN_PARTS = "tests.estimators.own_parts"
+MEDIAN = {"score": "median", "inliers": "lmeds", "confidence": None}
 
 
 def built(preset: str, parts: dict[str, Any], **options: Any) -> Any:
@@ -169,9 +170,6 @@ def test_parts_in_numpy_take_at_most_three_times_as_long(preset: str, tmp_path: 
     print(f"{preset}: {1000 * builtin:.2f} ms, with parts in NumPy {1000 * seconds:.2f} ms")
     assert draws == builtin_draws
     assert seconds < 3 * builtin
-
-
-MEDIAN = {"score": "median", "inliers": "lmeds", "confidence": None}
 
 
 @pytest.mark.parametrize(

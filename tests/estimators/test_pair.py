@@ -22,6 +22,15 @@ from tests.laws import PEERS, degenerate, few, quick, scene, small, with_padding
 from tests.reference.random import number
 from tests.variants import OTHER_LIBRARIES, built, loaded, variants
 
+WRONG = {
+    "prior": ((1.5, -0.1, math.nan), "prior of 1 match is wrong: it is P(inlier), within [0, 1]"),
+    "noise": ((0.0, -1.0, math.nan), "noise of 1 match is wrong: it is a standard deviation, positive"),
+    "size0": ((0.0, -3.0, math.nan, math.inf), "size0 is wrong: image sizes (h, w) are positive"),
+}
+HOPELESS = ("empty", "one match", "all points equal", "NaN", "infinite")
+RANK_TWO = (*small(), "one plane", "identity", "all outliers", "all points equal")
+"""Pairs of usual coordinates, of which an F of unit norm in pixels has rank two to rounding."""
+
 
 def padded_pairs() -> Correspondences:
     """Pairs of many sizes, with priors and noise on and beyond their bounds, with garbage in masked slots."""
@@ -62,13 +71,6 @@ def test_a_pair_holds_its_usable_matches_in_order(kind: str, scale: float) -> No
         assert pair.sizes_known == (kind == "all")
         assert pair.table.flags.c_contiguous
         assert pair.table.dtype == np.float64
-
-
-WRONG = {
-    "prior": ((1.5, -0.1, math.nan), "prior of 1 match is wrong: it is P(inlier), within [0, 1]"),
-    "noise": ((0.0, -1.0, math.nan), "noise of 1 match is wrong: it is a standard deviation, positive"),
-    "size0": ((0.0, -3.0, math.nan, math.inf), "size0 is wrong: image sizes (h, w) are positive"),
-}
 
 
 @pytest.mark.parametrize("name", WRONG)
@@ -153,11 +155,6 @@ def assert_supported(estimate: Estimate, c: Correspondences, what: str) -> None:
             spread = np.linalg.svd(image - image.mean(0), compute_uv=False)
             assert spread[1] > 1e-9 * spread[0], f"{what}, pair {i}"
         assert float(estimate.F[i].norm()) == pytest.approx(1), f"{what}, pair {i}"
-
-
-HOPELESS = ("empty", "one match", "all points equal", "NaN", "infinite")
-RANK_TWO = (*small(), "one plane", "identity", "all outliers", "all points equal")
-"""Pairs of usual coordinates, of which an F of unit norm in pixels has rank two to rounding."""
 
 
 @pytest.mark.parametrize("name", EVERY)

@@ -23,6 +23,10 @@ from tests.variants import OTHER_LIBRARIES, built, variants
 
 OTHERS = (*OTHER_LIBRARIES, "homography", "weighted_eight_point")  # the last one is not robust, and has no gradients
 OWN = [n for n in variants("estimator") if not n.startswith(OTHERS)]
+COARSE = Ransac(hypotheses=200, threshold=2.0)
+FINE = Ransac(hypotheses=100, solver="eight_point", score="median", confidence=None, inliers="lmeds")
+ESTIMATORS = [n for n in variants("estimator") if "_cpp" not in n and n != "homography"]
+NOT_ROBUST = ("irls:loss=huber", "irls:loss=cauchy")  # against three wrong matches in ten
 
 
 def _true_inlier_error(F: torch.Tensor, index: int, count: int) -> float:
@@ -150,10 +154,6 @@ def test_solves_as_many_pairs_as_its_namesake(name, file):
     assert ours.mean() >= theirs.mean() - margin
 
 
-COARSE = Ransac(hypotheses=200, threshold=2.0)
-FINE = Ransac(hypotheses=100, solver="eight_point", score="median", confidence=None, inliers="lmeds")
-
-
 def test_equals_the_two_by_hand() -> None:
     c = collate([scene(i, n) for i, n in enumerate((150, 90, 200))])
     coarse = COARSE(c, 3)
@@ -271,10 +271,6 @@ def test_the_paper_s_presets_ignore_the_prior(name: str) -> None:
     F = estimator(c, seed=5).F
     assert torch.equal(F, estimator(c.replace(prior=None), seed=5).F)
     assert not F.requires_grad
-
-
-ESTIMATORS = [n for n in variants("estimator") if "_cpp" not in n and n != "homography"]
-NOT_ROBUST = ("irls:loss=huber", "irls:loss=cauchy")  # against three wrong matches in ten
 
 
 @functools.cache

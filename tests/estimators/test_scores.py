@@ -30,6 +30,7 @@ SCORES: dict[str, tuple[Any, Any]] = {
     "saturated": (estimators.SaturatedGains, reference.geman_mcclure),
 }
 GAIN_ROUNDING = 2.0**-21  # of a gain of about one: eight operations in float32
+RECTIFIED = np.array([[0, 0, 0, 0, 0, 1, 0, -1, 0]], np.float32)  # x1' F x0 = y0 - y1: r^2 = (y1 - y0)^2 / 2
 
 
 def bounds(
@@ -145,9 +146,6 @@ def test_cells_are_those_of_the_grid_over_the_matches_of_weight(given: str, weig
             assert given in FEW or certain.mean() > 0.99
             x, y = cell[2 * image, certain], cell[2 * image + 1, certain]
             np.testing.assert_array_equal(cells[image, certain], x + GRID * y)
-
-
-RECTIFIED = np.array([[0, 0, 0, 0, 0, 1, 0, -1, 0]], np.float32)  # x1' F x0 = y0 - y1: r^2 = (y1 - y0)^2 / 2
 
 
 @pytest.mark.parametrize("given", ["scene 40", "scene 151", "scene 700", "real 7", *FEW])

@@ -18,6 +18,10 @@ from tests.reference import ransac as reference
 from tests.reference import solvers
 from tests.reference.random import number
 
+SEED = 3
+EPS32 = 2.0**-23
+DRAW_SEED = 3
+
 
 @dataclasses.dataclass
 class Told(estimators.StoppingRule):
@@ -117,9 +121,6 @@ def test_a_search_goes_on_while_no_sample_gave_a_model() -> None:
     assert pool.samples == 150
 
 
-SEED = 3
-
-
 def numbers(pair: estimators.Pair) -> list[int]:
     return [number(pair.seed, pair.key, Stream.PRESELECTION, 0, i, 1) for i in range(pair.count)]
 
@@ -165,9 +166,6 @@ def test_all_models_are_scored_where_there_is_little_to_gain(given: str) -> None
         which, scores = Preselection(score, options)(F, pair)
         np.testing.assert_array_equal(which, np.arange(30))
         np.testing.assert_array_equal(scores, score(F, np.arange(30), pair))
-
-
-EPS32 = 2.0**-23
 
 
 def reason_of(x0: np.ndarray, x1: np.ndarray, inliers: np.ndarray | None = None, dtype: type = np.float64) -> str:
@@ -230,9 +228,6 @@ def test_lines_up_to_the_rounding_of_float32_coordinates() -> None:
     for off, on_line in ((EPS32 / 16, True), (4 * EPS32, False)):  # of 600; the first point is as near as 300
         line = np.stack([along, 600 * off * rng.choice([-1, 1], 30)], 1)
         assert ("line in image 0" in reason_of(line, other)) == on_line
-
-
-DRAW_SEED = 3
 
 
 def pair(count: int, prior: str = "given") -> estimators.Pair:

@@ -11,6 +11,8 @@ from fmtorch.core import PAIR_TYPES
 from tests.reference.solvers import skew
 
 SCALE = 0.02  # of losses at `near_scene`
+K = np.array([[768.0, 0, 319.5], [0, 768, 239.5], [0, 0, 1]])
+SIZE = (480, 640)
 
 
 class Scene(NamedTuple):
@@ -87,10 +89,6 @@ def tolerances(loss: str) -> dict[str, float | bool]:
     The tabulated loss is linear between its entries, 1 / 1000 apart, whose slopes differ by as much."""
     rtol = 1e-3 if loss == "magsac" else 1e-5
     return {"eps": 1e-6, "atol": 1e-5, "rtol": rtol, "fast_mode": True, "check_undefined_grad": False}
-
-
-K = np.array([[768.0, 0, 319.5], [0, 768, 239.5], [0, 0, 1]])
-SIZE = (480, 640)
 
 
 class Drawn(NamedTuple):

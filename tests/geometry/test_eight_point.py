@@ -11,6 +11,8 @@ from tests.conftest import oracle
 from tests.geometry.scenes import scene, scenes
 from tests.reference import solvers as reference
 
+EPS = torch.finfo(torch.float64).eps
+
 
 @pytest.mark.parametrize("batch", [(), (3,), (2, 3)])
 @pytest.mark.parametrize("n", [8, 9, 50])
@@ -142,9 +144,6 @@ def test_gradients_of_normalisation():
     assert torch.autograd.gradcheck(
         geometry.canonical, (torch.randn(2, 3, 3, dtype=torch.float64, requires_grad=True),)
     )
-
-
-EPS = torch.finfo(torch.float64).eps
 
 
 def random_matrices(batch, singular_values=None, seed=0):

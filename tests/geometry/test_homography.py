@@ -15,6 +15,11 @@ from fmtorch.geometry.levenberg_marquardt import Schedule, Weighted
 from tests.reference import homography as reference
 from tests.reference.homography import mapped, sampson_squared
 
+PX = 400.0  # of a unit of the points
+EPS = 2.0**-52
+KINDS = ("cauchy", "geman_mcclure", "huber", "truncated")
+ROUNDING32, ROUNDING64 = 2.0**-24, 2.0**-53
+
 
 def planar(seed: int, n: int, noise: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     """Matches (4, n) of about unit scale on a plane, and their homography."""
@@ -22,9 +27,6 @@ def planar(seed: int, n: int, noise: float = 0.0) -> tuple[np.ndarray, np.ndarra
     H = np.eye(3) + rng.uniform(-0.3, 0.3, (3, 3))
     x0 = rng.uniform(-1, 1, (n, 2))
     return np.ascontiguousarray(np.c_[x0, mapped(H, x0) + noise * rng.normal(size=x0.shape)].T), H
-
-
-PX = 400.0  # of a unit of the points
 
 
 def pairs(batch: tuple[int, ...], n: int, noise: float = 0.0) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -188,10 +190,6 @@ def test_refined_homographies() -> None:
         geometry.refine_homography(truth, x0, x1, loss="welsch")
 
 
-EPS = 2.0**-52
-KINDS = ("cauchy", "geman_mcclure", "huber", "truncated")
-
-
 class Problem(NamedTuple):
     """A model (9,) of unit norm, noisy matches (4, n) of it, weights (n,) and squared scales (n,)."""
 
@@ -272,9 +270,6 @@ def test_refinement_ends_where_the_gradient_vanishes(loss: str) -> None:
             # A step is refused once it lowers the cost by less than its rounding, EPS: gradients of sqrt(EPS) stay.
             size = np.sqrt(np.diagonal(products)[:9] * after)
             assert (np.abs(products[9, :9]) <= 1e-6 * size).all()
-
-
-ROUNDING32, ROUNDING64 = 2.0**-24, 2.0**-53
 
 
 def solved(points: np.ndarray, sample: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

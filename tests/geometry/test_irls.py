@@ -16,6 +16,9 @@ from tests.geometry.scenes import SCALE, distance, near_scene, tolerances, unit_
 from tests.reference import solvers
 from tests.reference.refine import loss as robust_loss
 
+S2 = torch.tensor(4.0, dtype=torch.float64)
+END = QUANTILE**2 / 2
+
 
 def pair(seed: int, noise: float, outliers: int = 0) -> tuple[Tensor, Tensor, Tensor]:
     F, x0, x1 = (torch.from_numpy(v) for v in unit_scene(seed, 120, noise, outliers))
@@ -105,9 +108,6 @@ def test_fits_of_hopeless_pairs() -> None:
     assert torch.equal(alone.F[0, 0], fits.F[0, 0])
 
 
-S2 = torch.tensor(4.0, dtype=torch.float64)
-
-
 @pytest.mark.parametrize("name", LOSSES)
 def test_weight_is_the_derivative_of_the_loss(name: str) -> None:
     r2 = torch.tensor([1e-3, 0.5, 3.9, 4.1, 7.0, 1e3], dtype=torch.float64)
@@ -133,9 +133,6 @@ def test_curvature_is_half_the_second_derivative_or_zero(name: str) -> None:
 def test_unknown_name_lists_the_known_ones() -> None:
     with pytest.raises(ValueError, match="huber, cauchy, geman_mcclure, truncated, magsac"):
         named_loss("tukey")
-
-
-END = QUANTILE**2 / 2
 
 
 def lower(s: float, x: np.ndarray | float) -> np.ndarray:

@@ -14,6 +14,14 @@ from fmtorch.geometry.pose import pose
 from tests.geometry.scenes import scene, stacked
 from tests.reference import known_cameras, solvers
 
+CAMERAS = np.array([650.0, 319.5, 239.5, 820, 300.5, 249.5])
+CAMERA0, CAMERA1 = (np.array([[f, 0, x], [0, f, y], [0, 0, 1]]) for f, x, y in (CAMERAS[:3], CAMERAS[3:]))
+K0 = np.array([[900.0, 0, 500], [0, 920, 400], [0, 0, 1]])
+K1 = np.array([[1100.0, 0, 520], [0, 1080, 380], [0, 0, 1]])
+SIZE = torch.tensor([[480, 640]])
+GOOD = torch.tensor([[[500.0, 2, 310], [0, 520, 250], [0, 0, 1]]], dtype=torch.float64)
+RIGHT = torch.tensor([True])
+
 
 @pytest.mark.parametrize("batch", [(), (3,), (2, 3)])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -82,10 +90,6 @@ def test_gradient():
     assert torch.autograd.gradcheck(pose, (F, CAMERA0.requires_grad_(), CAMERA1.requires_grad_()))
 
 
-CAMERAS = np.array([650.0, 319.5, 239.5, 820, 300.5, 249.5])
-CAMERA0, CAMERA1 = (np.array([[f, 0, x], [0, f, y], [0, 0, 1]]) for f, x, y in (CAMERAS[:3], CAMERAS[3:]))
-
-
 def pose_of(F: np.ndarray, s: known_cameras.Scene, weight: np.ndarray) -> np.ndarray:
     out = np.full(13, np.nan)
     pose(np.ascontiguousarray(F), CAMERAS, s.x0, s.x1, weight, out)
@@ -141,10 +145,6 @@ def test_where_there_is_none_all_is_zero(kind: str) -> None:
     F = known_cameras.fundamental(s.R, s.t, (CAMERA0, CAMERA1))
     F = {"zero": 0 * F, "NaN": np.nan * F, "rank 1": np.outer(F[0], F[1]), "no matches": F}[kind]
     assert not pose_of(F, s, np.full(10, 0.0 if kind == "no matches" else 1.0)).any()
-
-
-K0 = np.array([[900.0, 0, 500], [0, 920, 400], [0, 0, 1]])
-K1 = np.array([[1100.0, 0, 520], [0, 1080, 380], [0, 0, 1]])
 
 
 def plane(seed: int, n: int = 30, parallel: bool = False, length: float = 0.4) -> tuple[np.ndarray, ...]:
@@ -238,11 +238,6 @@ def test_models_and_cameras_that_are_none_are_not_valid() -> None:
     poses = poses_from_homography(H, k0, k1, x0, x1, mask)
     assert poses.valid.any(-1).tolist() == [False] * 5 + [True]
     assert torch.equal(poses.R[:5], torch.eye(3).double().expand(5, 2, 3, 3))
-
-
-SIZE = torch.tensor([[480, 640]])
-GOOD = torch.tensor([[[500.0, 2, 310], [0, 520, 250], [0, 0, 1]]], dtype=torch.float64)
-RIGHT = torch.tensor([True])
 
 
 def test_they_are_those_of_the_definition() -> None:

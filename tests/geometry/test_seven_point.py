@@ -22,6 +22,11 @@ from tests.estimators.pairs import normalized
 from tests.geometry.scenes import scene, scenes
 from tests.reference import solvers as reference
 
+Kernel = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], int]
+SOLVERS: dict[str, tuple[Kernel, int, int]] = {"seven": (seven_point_kernel, 7, 3), "eight": (eight_point_kernel, 8, 1)}
+DRAWS = 203  # not whole lanes
+SAMPLES = 203  # not whole lanes
+
 
 def distance_to_nearest(F, solutions):
     """For each of the solutions the distance to the nearest row of F, all of unit norm and sign."""
@@ -76,11 +81,6 @@ def test_gradient():
     assert torch.autograd.gradcheck(invariant, (x0, x1))
 
 
-Kernel = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], int]
-SOLVERS: dict[str, tuple[Kernel, int, int]] = {"seven": (seven_point_kernel, 7, 3), "eight": (eight_point_kernel, 8, 1)}
-DRAWS = 203  # not whole lanes
-
-
 def points_of() -> dict[str, np.ndarray]:
     """Points (4, n) of pairs of many kinds, in normalised units."""
     given = {
@@ -132,9 +132,6 @@ def test_weighted_fits_are_those_of_the_definition(kind: str) -> None:
                 theirs = reference.eight_point(points[:2].T, points[2:].T, weight).ravel()
                 # The sums of 300 products, each rounded, over the gap of the eigenvalues, some 1e-5.
                 np.testing.assert_allclose(F * np.sign(F @ theirs), theirs, atol=1e-8, err_msg=name)
-
-
-SAMPLES = 203  # not whole lanes
 
 
 def rays(seed: int, noise: float = 0.0, plane: bool = False) -> tuple[np.ndarray, np.ndarray]:

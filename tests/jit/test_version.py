@@ -73,6 +73,9 @@ def all_of_them(x: float, rows: F8x2) -> float:
 def other(x: float) -> float:
     return x + 5
 """
+CONSTANTS = ["{0.5, 1, 1.0, True}", "frozenset({'a', 'b', 'c'})", "{'b': 1, 'a': (2, None)}", "np.float32(2)", "2",
+             "2.0", "1j", "True", "b'2'", "'2'", "np.zeros(2)", "np.zeros((2, 1))", "np.zeros((1, 2), order='F')",
+             "np.dtype('f4')", "np.float64", "[2]", "(2,)", "np.sqrt", "np", "len", "math.inf"]  # fmt: skip
 
 
 def load(folder: Path, source: str) -> types.ModuleType:
@@ -131,11 +134,6 @@ def test_it_changes_with_what_is_named_by_its_module(tmp_path: Path) -> None:
         versions[scale, other] = version(module.f)
     assert versions["2.0", "1"] != versions["3.0", "1"]
     assert versions["2.0", "1"] == versions["2.0", "2"]
-
-
-CONSTANTS = ["{0.5, 1, 1.0, True}", "frozenset({'a', 'b', 'c'})", "{'b': 1, 'a': (2, None)}", "np.float32(2)", "2",
-             "2.0", "1j", "True", "b'2'", "'2'", "np.zeros(2)", "np.zeros((2, 1))", "np.zeros((1, 2), order='F')",
-             "np.dtype('f4')", "np.float64", "[2]", "(2,)", "np.sqrt", "np", "len", "math.inf"]  # fmt: skip
 
 
 def of_constants(folder: Path) -> dict[str, str]:

@@ -27,6 +27,9 @@ from tests.reference.local_features import one_to_one as one_to_one_reference
 from tests.reference.lpm import passes
 from tests.variants import built, loaded, variants
 
+SIZE = (640, 960)  # of the images of a scene
+NUMBERS = {"usual": 4.06, "radius": 15.0, "slope": 0.65}
+
 
 def test_ratio_is_strict_and_refuses_nan() -> None:
     ratio = torch.tensor([[0.0, 0.79, 0.8, 1.0, math.nan]])
@@ -154,9 +157,6 @@ def test_many_matches_in_bounded_memory(tmp_path: Path) -> None:
     assert max(growth.values()) < 0.8e9, growth
 
 
-SIZE = (640, 960)  # of the images of a scene
-
-
 def inputs() -> Iterator[tuple[str, Correspondences]]:
     yield "a batch", scenes()
     yield "padding", with_padding(scenes(), np.random.default_rng(0), float("nan"))
@@ -238,9 +238,6 @@ def test_agreement(ratios: bool) -> None:
         np.testing.assert_allclose(frames, by_frames, rtol=1e-3, atol=1e-5, err_msg=what)
         motion = pruning.position_agreement(c.x0, c.x1, ratio, c.mask)[0]
         np.testing.assert_allclose(motion, by_motion, rtol=1e-3, atol=1e-5, err_msg=what)
-
-
-NUMBERS = {"usual": 4.06, "radius": 15.0, "slope": 0.65}
 
 
 def test_is_its_formula() -> None:

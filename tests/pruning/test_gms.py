@@ -14,6 +14,7 @@ from tests.reference.lpm import lpm as reference
 
 MODES = [(False, False), (True, False), (False, True), (True, True)]  # (rotation, scale), the oracle's order
 SIZE0, SIZE1 = (480, 640), (300, 500)
+WIDTHS = {"position": 0.5, "displacement": 0.2, "rotation": 0.8, "scale": 0.5}
 
 
 def moving(seed: int, n: int, angle: float = 0.0, scale: float = 1.0, outliers: float = 0.3) -> tuple[Tensor, Tensor]:
@@ -129,9 +130,6 @@ def test_stage_and_bad_input() -> None:
     assert not kept[0, 7]
     with pytest.raises(ValueError, match="at least 4"):
         lpm(x0, x1, neighbors=(3, 6))
-
-
-WIDTHS = {"position": 0.5, "displacement": 0.2, "rotation": 0.8, "scale": 0.5}
 
 
 def frames(x: np.ndarray, S: np.ndarray) -> np.ndarray:

@@ -13,6 +13,8 @@ from scipy.spatial.transform import Rotation
 from tests.reference.solvers import poses, skew
 
 Size = tuple[int, int]
+Measured = tuple[tuple[float, float], tuple[float, float]]
+UNMEASURED = ((0.0, np.inf), (0.0, np.inf))
 
 
 def calibration(focal: float, size: Size) -> np.ndarray:
@@ -27,10 +29,6 @@ def fundamental(parameters: np.ndarray, size0: Size, size1: Size) -> np.ndarray:
     R = Rotation.from_rotvec(parameters[:3]).as_matrix()
     K0, K1 = calibration(np.exp(parameters[6]), size0), calibration(np.exp(parameters[7]), size1)
     return np.linalg.inv(K1).T @ skew(parameters[3:6]) @ R @ np.linalg.inv(K0)
-
-
-Measured = tuple[tuple[float, float], tuple[float, float]]
-UNMEASURED = ((0.0, np.inf), (0.0, np.inf))
 
 
 def prior_cost(log_f0: float, log_f1: float, same_size: bool = False, measured: Measured = UNMEASURED) -> float:

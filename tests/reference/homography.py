@@ -11,6 +11,8 @@ import numpy as np
 from tests.reference.refine import loss as robust_loss
 from tests.reference.solvers import hartley, homogeneous, skew, unit
 
+STEP = 1e-30  # of complex derivatives
+
 
 def dlt(x0: np.ndarray, x1: np.ndarray, weight: np.ndarray | None = None) -> np.ndarray:
     """The normalised direct linear transform (Hartley & Zisserman 2004, algorithm 4.2)."""
@@ -45,9 +47,6 @@ def plane_and_parallax(H: np.ndarray, x0: np.ndarray, x1: np.ndarray) -> np.ndar
     lines = [np.cross(b, H @ a) for a, b in zip(homogeneous(x0), homogeneous(x1), strict=True)]
     e = np.cross(lines[0], lines[1])
     return unit(skew(e) @ H)
-
-
-STEP = 1e-30  # of complex derivatives
 
 
 def equations(h: np.ndarray, match: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -11,6 +11,7 @@ from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 from tests.reference.refine import magsac_loss
 
 REACH = 5  # scales, from which on the gain of Geman & McClure is zero
+CAPACITY_UNIT = 2.0**-16  # capacities are rounded to multiples of it, because the flow is one of integers
 
 
 def inlier(r: float) -> float:
@@ -129,9 +130,6 @@ def on_line(x: np.ndarray, rounding: float) -> bool:
     """Whether points (n, 2) are no farther from their best line than rounding explains."""
     across, along = np.linalg.svd(x - x.mean(0), compute_uv=False)[::-1]
     return bool(across <= np.sqrt(len(x)) * max(4 * rounding, 2.0**-22 * along))
-
-
-CAPACITY_UNIT = 2.0**-16  # capacities are rounded to multiples of it, because the flow is one of integers
 
 
 def energy(labels: np.ndarray, kernel: np.ndarray, edges: list[tuple[int, int]], coherence: float) -> float:

@@ -15,6 +15,11 @@ from tests.reference.solvers import epipolar_distances
 FREEDOM = 3.0
 START, FINEST, COARSEST = 1 / 1500, 0.1, 1 / 300  # of side, px, of side
 LOSS = 3.0
+Points = NDArray[np.float64]
+CELLS = 64  # of a side of the grid in which places are told apart, to the diagonal of the image
+SAMPLE = 7
+MODELS = 3  # of a sample
+MIN_CHANCE = 2.0**-13
 
 
 def density(r: np.ndarray, s: float, dimensions: int, side: float) -> np.ndarray:
@@ -109,13 +114,6 @@ def copy(r: np.ndarray, x0: np.ndarray, x1: np.ndarray, s: float, n: np.ndarray)
         H = np.array([[a, 0, (c1 - a * c0)[0]], [0, a, (c1 - a * c0)[1]], [0, 0, 1]])
         r = plane_distances(H, x0, x1) / n
     return H
-
-
-Points = NDArray[np.float64]
-CELLS = 64  # of a side of the grid in which places are told apart, to the diagonal of the image
-SAMPLE = 7
-MODELS = 3  # of a sample
-MIN_CHANCE = 2.0**-13
 
 
 def significance(

@@ -46,6 +46,13 @@ Call = Callable[[], Any]
 Check = Callable[[Any], None]
 Draw = Callable[[st.DataObject], tuple[Call, set[str], Check]]
 """Makes a call, the names that an error may name, and a check of the result."""
+UNDEFINED = {"inlier_rate", "recall", "mean_recall", "pose_auc"}  # NaN of an empty set
+UNIT_INTERVAL = {"nsgd", "nsgd_released", "recall", "mean_recall", "pose_auc", "inlier_rate"}
+NOT_NEGATIVE = {"sampson", "sampson_squared", "epipolar_distances", "symmetric_max", "symmetric_mean", "point_to_line"}
+PAIRS_OF_FOCALS = ((0, 0.1), (800.0, 0.1), ((800, 0), None))
+FOCALS = (*[None] * 3, "shared", "unknown", 0.05, *PAIRS_OF_FOCALS, -1.0, "same", np.nan, [])
+"""What may be said of focal lengths, and what may not."""
+pruner = functools.cache(quick_pruner)
 
 
 def mistaken(data: st.DataObject, arguments: dict[str, Any], numbers: dict[str, Any], *, movable: bool = True) -> bool:
@@ -101,11 +108,6 @@ def function_call(function: Callable[..., Any], data: st.DataObject) -> tuple[Ca
     return functools.partial(function, **arguments), set(parameters), check
 
 
-UNDEFINED = {"inlier_rate", "recall", "mean_recall", "pose_auc"}  # NaN of an empty set
-UNIT_INTERVAL = {"nsgd", "nsgd_released", "recall", "mean_recall", "pose_auc", "inlier_rate"}
-NOT_NEGATIVE = {"sampson", "sampson_squared", "epipolar_distances", "symmetric_max", "symmetric_mean", "point_to_line"}
-
-
 def _alike(shape: tuple[int, ...], F: Tensor | None, residual: Tensor | None) -> Tensor:
     """Equal weights for all matches."""
     return torch.ones(shape)
@@ -152,11 +154,6 @@ def fields(data: st.DataObject, scene: Scene, kind: str) -> dict[str, Any]:
         if wanted:
             values[name] = as_given(scene.array(name, numbers, shape), kind)
     return values
-
-
-PAIRS_OF_FOCALS = ((0, 0.1), (800.0, 0.1), ((800, 0), None))
-FOCALS = (*[None] * 3, "shared", "unknown", 0.05, *PAIRS_OF_FOCALS, -1.0, "same", np.nan, [])
-"""What may be said of focal lengths, and what may not."""
 
 
 def estimation(name: str, data: st.DataObject) -> tuple[Call, set[str], Check]:
@@ -213,9 +210,6 @@ def sound_pose(R: Tensor, t: Tensor, E: Tensor) -> None:
         assert float(torch.linalg.det(R)) > 0, "a reflection for a rotation"
         assert math.isclose(float(t.norm()), 1, rel_tol=1e-9)
         torch.testing.assert_close(E, torch.linalg.cross(t.expand(3, 3), R.mT).mT, rtol=0, atol=1e-9)
-
-
-pruner = functools.cache(quick_pruner)
 
 
 def pruned(name: str, data: st.DataObject) -> tuple[Call, set[str], Check]:

@@ -23,6 +23,11 @@ TRAIN = [
     "validation.uses.hard.estimator=ransac", "validation.uses.prior.estimator=msac", "augmentation.crop=0",
     "features.max_features=300", "pruner.lc.network.channels=8", "pruner.lc.network.blocks=2",
 ]  # fmt: skip
+QUICK = """
+import fmtorch.training.export
+fmtorch.training.export.export_onnx = lambda network, path, **_: path.touch()
+"""
+"""Run before a training: an export of the network, which takes seconds, changes nothing here."""
 
 
 def delays(seed: int) -> Iterator[float]:
@@ -123,13 +128,6 @@ def trained(folder: Path) -> dict[str, bytes]:
 def newest(folder: Path) -> int:
     """The steps of the last checkpoint, -1 where there is none."""
     return max((int(path.stem.removeprefix("step=")) for path in folder.glob("checkpoints/step=*.ckpt")), default=-1)
-
-
-QUICK = """
-import fmtorch.training.export
-fmtorch.training.export.export_onnx = lambda network, path, **_: path.touch()
-"""
-"""Run before a training: an export of the network, which takes seconds, changes nothing here."""
 
 
 @pytest.mark.parametrize("kills", bounded_and_whole(1, TRAIN_KILLS))

@@ -20,6 +20,7 @@ from fmtorch.scenes.surfaces import MATERIALS
 from tests.helpers import cross_matrix, in_threads
 
 TINY = Plan(scenes=1, shots=3, pairs=2, scale=0.2)
+known = functools.cache(build)
 
 
 def contents(folder: Path) -> dict[str, str]:
@@ -35,9 +36,6 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def tiny(root: Path) -> RenderedPairs:
     return RenderedPairs(families=["indoor", "collection"], root=root, plan=TINY, workers=1)
-
-
-known = functools.cache(build)
 
 
 def built(family: str, split: str, number: int = 0) -> DrawnScene:

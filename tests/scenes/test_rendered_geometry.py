@@ -18,6 +18,10 @@ from tests.reference.labels import first_hit
 from tests.reference.rendering import colour
 
 SIZE = (120, 160)
+KERNEL_SIZE = (90, 120)
+DEPTH_SIZE = (60, 80)
+WALL, SCREEN = 4.0, 2.5  # metres
+SMALL = scenes.Plan(scenes=1, shots=2, pairs=1, scale=0.15)
 
 
 def camera(x: float, y: float, z: float, target=(0.0, 0.0, 1.0), focal: float = 150.0) -> scenes.Camera:
@@ -91,9 +95,6 @@ def test_textures_keep_their_mean_when_they_shrink_and_do_not_alias() -> None:
     far = colour(texture, u, u[::-1].copy(), np.full(500, 5.0, np.float32))
     assert far.mean() == pytest.approx(0.5, abs=0.01)
     assert far.std() < 0.01
-
-
-KERNEL_SIZE = (90, 120)
 
 
 def take_reference(patch: pytest.MonkeyPatch) -> None:
@@ -189,11 +190,6 @@ def test_forms_draw_an_empty_view(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_textures_too_small_to_shrink_are_refused() -> None:
     with pytest.raises(ValueError, match="4 x 9 pixels; each side must have at least 5"):
         Surfaces().texture(np.zeros((9, 4, 3), np.uint8))
-
-
-DEPTH_SIZE = (60, 80)
-WALL, SCREEN = 4.0, 2.5  # metres
-SMALL = scenes.Plan(scenes=1, shots=2, pairs=1, scale=0.15)
 
 
 def wall_and_screen(with_screen: bool) -> Surfaces:

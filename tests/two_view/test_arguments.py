@@ -25,6 +25,8 @@ from tests.variants import OTHER_LIBRARIES, built, keywords, variants
 EVERY = [n for n in variants("estimator") if not n.startswith(OTHER_LIBRARIES[1:])]
 PAIRS = [scene(i, count) for i, count in enumerate((60, 90, 40))]
 FAST = {"estimator": "msac", "hypotheses": 100}
+SCENE = known_cameras.scene(7, 200, noise=0.2)
+EASY = {"estimator": "msac", "hypotheses": 300}
 
 
 def test_a_list_of_pairs_is_a_padded_batch() -> None:
@@ -72,10 +74,6 @@ def test_one_size_is_that_of_all_pairs() -> None:
 def test_what_does_not_fit_is_named(x0: object, x1: object, options: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         fmtorch.find_fundamental(x0, x1, **options)  # type: ignore[arg-type]
-
-
-SCENE = known_cameras.scene(7, 200, noise=0.2)
-EASY = {"estimator": "msac", "hypotheses": 300}
 
 
 @pytest.mark.parametrize("kind", [torch.float16, torch.bfloat16, torch.uint8, torch.int16, torch.uint16, torch.int64])

@@ -23,6 +23,7 @@ CAMERAS: dict[str, Any] = {"K0": torch.from_numpy(reference.K0), "K1": torch.fro
 SIZES: dict[str, Any] = {"size0": reference.SIZE, "size1": reference.SIZE}
 FIELDS = ("covariance", "tangents", "covariance_F", "pair_type_index", "homography", "other_R", "other_t")
 CENTRAL = np.array([[650.0, 0, 319.5], [0, 650, 239.5], [0, 0, 1]])
+SIZE = reference.SIZE
 
 
 def moved(e: Estimate, by: np.ndarray, K0: np.ndarray, K1: np.ndarray) -> np.ndarray:
@@ -153,9 +154,6 @@ def test_covariance_needs_a_size_or_a_calibration() -> None:
     with pytest.raises(ValueError, match="covariance needs K0 and K1, or the image sizes"):
         fmtorch.find_fundamental(s.x0, s.x1, covariance=True)
     assert not bool(fmtorch.find_essential(s.x0, s.x1, **CAMERAS, covariance=True).deviation_degrees.isnan().any())
-
-
-SIZE = reference.SIZE
 
 
 def found(x0: Any, x1: Any, **said: Any) -> Estimate:

@@ -28,6 +28,10 @@ from tests.reference.focal import calibration
 CAMERAS = {"K0": torch.from_numpy(reference.K0), "K1": torch.from_numpy(reference.K1)}
 SIZES = {"size0": reference.SIZE, "size1": reference.SIZE}
 CENTRAL, ZOOMED = (tuple(calibration(f / 640, (480, 640)) for f in focals) for focals in ((650, 650), (650, 820)))
+VARIABLES = ("x0", "x1", "prior", "noise", "K0", "K1")
+INF = float("inf")
+K = torch.from_numpy(reference.K0)
+SCENE = reference.scene(0)
 
 
 def error(e: Estimate, s: reference.Scene) -> float:
@@ -203,9 +207,6 @@ def test_without_cameras_nothing_changes() -> None:
     assert plain.E is None
 
 
-VARIABLES = ("x0", "x1", "prior", "noise", "K0", "K1")
-
-
 @pytest.mark.usefixtures("converging")
 @pytest.mark.parametrize("focal", [(0.0, 0.0), (0.05, 0.05), "shared"], ids=["exact", "rough", "shared"])
 def test_gradients_are_the_differences_of_estimates(focal, monkeypatch):
@@ -278,11 +279,6 @@ def test_real_pairs_keep_the_order_of_knowledge() -> None:
     assert len(errors["exact"]) == 2
     assert max(errors["exact"]) < 2  # degrees
     assert np.mean(errors["exact"]) < np.mean(errors["rough"]) < np.mean(errors["unknown"])
-
-
-INF = float("inf")
-K = torch.from_numpy(reference.K0)
-SCENE = reference.scene(0)
 
 
 @pytest.mark.parametrize(

@@ -21,6 +21,13 @@ from tests.reference import lenses as division
 from tests.reference.homography import mapped
 from tests.reference.known_cameras import K0, K1, SIZE, angle, scene
 
+K = np.array([[900.0, 0, 639.5], [0, 900, 359.5], [0, 0, 1]])
+SCENE = scene(0)
+X0, X1 = SCENE.x0, SCENE.x1
+FROM_CENTRE = [x - (319.5, 239.5) for x in (X0, X1)]
+SIZES = {"size0": SIZE, "size1": SIZE}
+INF = float("inf")
+
 
 def pair(kind: str, seed: int, n: int = 150, **options: float) -> Correspondences:
     given = batch([draw(kind, seed, n, **options)])  # type: ignore[arg-type]
@@ -81,9 +88,6 @@ def test_wrong_arguments() -> None:
     ):
         with pytest.raises(ValueError, match=said):
             classify(c, given, focal_deviation=deviation)
-
-
-K = np.array([[900.0, 0, 639.5], [0, 900, 359.5], [0, 0, 1]])
 
 
 def pitch(seed: int, up: bool, count: int = 60, wrong: float = 0.3) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -167,10 +171,6 @@ def test_significance_is_that_of_its_definition() -> None:
     assert float(got) == pytest.approx(expected, rel=1e-9)
 
 
-SCENE = scene(0)
-X0, X1 = SCENE.x0, SCENE.x1
-
-
 def normalized(x: np.ndarray, K: np.ndarray) -> np.ndarray:
     """Points by their calibration matrix."""
     return mapped(np.linalg.inv(K), x)
@@ -204,9 +204,6 @@ def test_normalized_points_have_the_identity_for_their_camera() -> None:
         fmtorch.find_essential(x0, x1, K0, K1)
     with pytest.raises(ValueError, match=r"^x1 runs from"):  # one image may be the wrong one
         fmtorch.find_fundamental(X0, x1)
-
-
-FROM_CENTRE = [x - (319.5, 239.5) for x in (X0, X1)]
 
 
 @pytest.mark.parametrize(
@@ -283,10 +280,6 @@ def test_what_says_nothing_is_no_mistake() -> None:
         estimate = fmtorch.find_fundamental(x, x)
         assert not bool(estimate.ok)
         assert estimate.reason[0]
-
-
-SIZES = {"size0": SIZE, "size1": SIZE}
-INF = float("inf")
 
 
 def found(x0: Any, x1: Any, **said: Any) -> Estimate:

@@ -27,6 +27,9 @@ from tests.reference.solvers import skew
 
 WIDE, TALL = (640, 960), (1000, 700)  # (h, w)
 Sizes = tuple[tuple[int, int], tuple[int, int]]
+SIZES = [(WIDE, WIDE), (WIDE, TALL)]
+ROUNDS = 6
+FOCAL = {"sampler": "prior", "select": {"scale": 1.0}, "threshold": 1.5}
 
 
 class Photographs(NamedTuple):
@@ -65,9 +68,6 @@ def with_prior(c: Correspondences, seed: int = 0) -> Correspondences:
     """Random priors."""
     prior = np.random.default_rng(seed).uniform(0.1, 1, tuple(c.mask.shape))
     return c.replace(prior=torch.from_numpy(prior))
-
-
-SIZES = [(WIDE, WIDE), (WIDE, TALL)]
 
 
 def error(F: torch.Tensor, pair: Photographs) -> float:
@@ -215,10 +215,6 @@ def test_how_likely_one_camera_is() -> None:
         expected = 0.7 * same / (0.7 * same + 0.3 * different)
         assert focal_prior.same_camera_share(difference, s) == pytest.approx(expected, rel=1e-12)
     assert focal_prior.same_camera_share(0.0, np.array([0.0, math.inf])) == 0.7
-
-
-ROUNDS = 6
-FOCAL = {"sampler": "prior", "select": {"scale": 1.0}, "threshold": 1.5}
 
 
 class Found(PlausibleCandidates):

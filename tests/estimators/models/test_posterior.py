@@ -23,6 +23,9 @@ from tests.reference.refine import loss as loss_of
 from tests.reference.solvers import sampson
 
 FAMILY = FundamentalWithFocals()
+SIZE = (480, 640)
+LENSES = (-0.2, -0.1)
+FREE = LensPrior(np.zeros(2), np.full(2, 1 / 0.15**2), False)
 
 
 def near(F: np.ndarray, pair: Pair) -> posterior.Cameras:
@@ -252,11 +255,6 @@ def test_implausible_focal_lengths_are_replaced_by_usual_ones() -> None:
         for axes in cameras.axes[0]:
             np.testing.assert_allclose(axes.T @ axes, np.eye(3), atol=1e-12)
     assert pytest.approx(math.log(1.2)) == LOG_USUAL
-
-
-SIZE = (480, 640)
-LENSES = (-0.2, -0.1)
-FREE = LensPrior(np.zeros(2), np.full(2, 1 / 0.15**2), False)
 
 
 def bent_pair() -> tuple[Pair, np.ndarray, np.ndarray]:

@@ -19,6 +19,9 @@ from tests.laws import scene
 from tests.pruning.networks.test_published import convert
 from tests.reference.pruner_losses import context_batch_norm_relu
 
+K = torch.tensor([[[800.0, 0, 480], [0, 800, 320], [0, 0, 1]]])
+SIDE = ("ratio", "mutual", "scale", "rotation", "agreement")
+
 
 def batch(channels=3, seed=0, dtype=torch.float64):
     generator = torch.Generator().manual_seed(seed)
@@ -184,9 +187,6 @@ def test_mixed_precision(network: torch.nn.Module) -> None:
     assert cosine > 0.95
 
 
-K = torch.tensor([[[800.0, 0, 480], [0, 800, 320], [0, 0, 1]]])
-
-
 def small(**options: object) -> DFE:
     torch.manual_seed(0)
     return DFE(widths=(16, 32, 8), side=["ratio"], **options)  # type: ignore[arg-type]
@@ -244,9 +244,6 @@ def test_gradients_are_finite_on_degenerate_pairs(network: DFE) -> None:
     assert torch.isfinite(prediction.F).all()
     assert not prediction.F[:, 3:6].any()  # fewer than eight matches fit nothing
     assert all(torch.isfinite(b).all() for b in network.buffers())
-
-
-SIDE = ("ratio", "mutual", "scale", "rotation", "agreement")
 
 
 def one_match(**changes: object) -> Correspondences:

@@ -29,6 +29,7 @@ SMALL = {
 }
 every = pytest.mark.parametrize("name", SMALL)
 K = torch.tensor([[[800.0, 0, 480], [0, 800, 320], [0, 0, 1]]])
+PAIRS = (9, 4, 23)  # matches: more and fewer than neighbours
 
 
 def randomized(module: nn.Module, seed: int = 0) -> nn.Module:
@@ -46,9 +47,6 @@ def test_parameters_are_as_many_as_the_authors(network: type[nn.Module], count: 
     """By their code; of CLNet and NCMNet without 313,728 and 280,704 of perceptrons that it has and never calls."""
     with torch.device("meta"):
         assert sum(p.numel() for p in network().parameters()) == count
-
-
-PAIRS = (9, 4, 23)  # matches: more and fewer than neighbours
 
 
 def features(channels: int) -> tuple[Tensor, Slots]:
