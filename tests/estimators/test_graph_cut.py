@@ -312,10 +312,8 @@ def test_the_kernel_is_the_gaussian() -> None:
     z, K = np.linspace(0, 60, 5001), np.empty(5001, np.float32)
     gaussian(RECTIFIED, rectified(z), 1.0, K)
     # exp(-z) - (1 + z / n)^-n is z^2 exp(-z) / (2 n) at most, 0.27 / n; half a unit of rounding, and 1024 roundings.
-    assert (
-        np.abs(K - np.exp(-z / 2)).max()
-        < (0.28 / 2**graph_cut.HALVINGS) + graph_cut.UNIT / 2 + 2**graph_cut.HALVINGS * 2.0**-24
-    )
+    rounding = graph_cut.UNIT / 2 + 2**graph_cut.HALVINGS * 2.0**-24
+    assert np.abs(K - np.exp(-z / 2)).max() < 0.28 / 2**graph_cut.HALVINGS + rounding
     np.testing.assert_array_equal(K / graph_cut.UNIT, np.round(K / graph_cut.UNIT))
 
 
@@ -325,7 +323,5 @@ def test_a_model_of_all_matches_has_all_labels_and_one_of_none_has_none(name: st
     graph, labels = graph_cut.neighbor_graph(pair, RADIUS), np.empty(pair.count, np.bool_)
     graph_cut.label(models(pair, 2)[1], pair.points, 1e-30, graph, 0.1, labels)
     assert labels.all()
-    graph_cut.label(
-        np.array([0, 0, 0, 0, 0, 0, 0, 0, 1.0]), pair.points, 1.0, graph, 0.1, labels
-    )  # no point is on its line
+    graph_cut.label(np.eye(9)[8], pair.points, 1.0, graph, 0.1, labels)  # no point is on its line
     assert not labels.any()

@@ -60,9 +60,8 @@ def test_a_pair_holds_its_usable_matches_in_order(kind: str, scale: float) -> No
         values = {name: getattr(c, name) for name in ("prior", "noise", "ambiguity")}
         for name, value in values.items():
             assert (getattr(pair, name) is None) == (value is None) == (kind != "all")
-        prior, noise, _ = (
-            np.ones(pair.count) if value is None else value[i].double().numpy()[mask] for value in values.values()
-        )
+        usual = np.ones(pair.count)
+        prior, noise, _ = (usual if v is None else v[i].double().numpy()[mask] for v in values.values())
         noise = np.clip(noise, MIN_NOISE, MAX_NOISE)
         np.testing.assert_array_equal(pair.match_weight, prior)
         np.testing.assert_array_equal(pair.weight, prior / (noise * noise))

@@ -33,10 +33,8 @@ GAIN_ROUNDING = 2.0**-21  # of a gain of about one: eight operations in float32
 RECTIFIED = np.array([[0, 0, 0, 0, 0, 1, 0, -1, 0]], np.float32)  # x1' F x0 = y0 - y1: r^2 = (y1 - y0)^2 / 2
 
 
-def bounds(
-    gain: Any, F: Any, pair: estimators.Pair, threshold: float, weighted: bool, saturated: bool = False
-) -> tuple[float, float]:
-    """Between what a sum of gains is, which fall with the residual, summed in float32."""
+def bounds(gain: Any, F: Any, pair: Any, threshold: float, weighted: bool, saturated: bool = False) -> Any:
+    """Between which two numbers a sum of gains is, which fall with the residual, summed in float32."""
     weight = pair.prior.astype(np.float32).tolist() if weighted and pair.prior is not None else [1.0] * pair.count
     r, bits = residuals(F, pair, threshold), fractional_bits(pair.count)
     low, high = r.low, r.high
@@ -44,10 +42,8 @@ def bounds(
         low, high = (np.sqrt(np.maximum(x**2 + d, 0)) for x, d in ((low, -0.5 / ENTRIES), (high, 0.5 / ENTRIES)))
     gains = [max(gain(x) - GAIN_ROUNDING, 0) for x in high], [gain(x) + GAIN_ROUNDING for x in low]
     if saturated:
-        lower, most = (reference.saturated(each, weight, cells_of(pair, weighted), bits) for each in gains)
-    else:
-        lower, most = (reference.summed(each, weight, bits) for each in gains)
-    return lower, most
+        return [reference.saturated(each, weight, cells_of(pair, weighted), bits) for each in gains]
+    return [reference.summed(each, weight, bits) for each in gains]
 
 
 @pytest.mark.parametrize("weighted", [False, True])

@@ -54,9 +54,7 @@ def stacked(batch: tuple[int, ...], n: int, seed: int = 0, noise: float = 0.0) -
     return Scene(*(torch.stack(list(a)).reshape(*batch, *a[0].shape) for a in zip(*many, strict=True)))
 
 
-def unit_scene(
-    seed: int, n: int = 100, noise: float = 0.0, outliers: int = 0
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def unit_scene(seed: int, n: int = 100, noise: float = 0.0, outliers: int = 0) -> tuple[np.ndarray, ...]:
     """F and matches of about unit scale before two cameras."""
     rng = np.random.default_rng(seed)
     X = np.c_[rng.uniform(-2, 2, (n, 2)), rng.uniform(3, 7, n)]

@@ -66,10 +66,8 @@ def batch(sizes: tuple[int, ...], noise: float = 0.5) -> dict[str, Tensor]:
 @pytest.mark.parametrize("kind", PRECISIONS)
 def test_against_the_definitions(kind: str) -> None:
     precision, shared = np.array(PRECISIONS[kind]), "shared" in kind
-    given = batch((40, 60, 90)) | {
-        "focal_precision": torch.from_numpy(precision).expand(3, 2, 2),
-        "shared_focal": torch.tensor([shared]).expand(3),
-    }
+    given = batch((40, 60, 90)) | {"focal_precision": torch.from_numpy(precision).expand(3, 2, 2)}
+    given["shared_focal"] = torch.tensor([shared]).expand(3)
     result = two_view_covariance(**given)
     finite = np.where(np.isinf(precision), 0, precision)
     basis = reference.directions(np.isinf(np.diag(precision)), shared)

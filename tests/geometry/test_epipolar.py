@@ -45,13 +45,11 @@ def test_projections_match_scalar_reference(batch: tuple[int, ...], dtype: torch
     F = geometry.fundamental_from_projections(P0, P1)
     assert F.dtype == dtype
     for index in np.ndindex(*batch):
-        expected = torch.from_numpy(
-            reference.fundamental_from_projections(*(P[index].double().numpy() for P in (P0, P1)))
-        )
+        matrices = (P[index].double().numpy() for P in (P0, P1))
+        expected = torch.from_numpy(reference.fundamental_from_projections(*matrices))
         # 24 products of four numbers of size one, over a norm of size one.
-        torch.testing.assert_close(
-            up_to_sign(F[index].double(), expected), expected, atol=100 * torch.finfo(dtype).eps, rtol=0
-        )
+        atol = 100 * torch.finfo(dtype).eps
+        torch.testing.assert_close(up_to_sign(F[index].double(), expected), expected, atol=atol, rtol=0)
 
 
 def test_calibration_and_projections_agree_in_sign_too() -> None:

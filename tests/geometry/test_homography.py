@@ -172,17 +172,16 @@ def test_gradients_of_refined_homographies_are_those_of_the_optimum(loss: str) -
 def test_refined_homographies() -> None:
     x0, x1, truth = pairs((2,), 40, noise=0.003)
     many = torch.stack([truth, -3 * truth, torch.zeros_like(truth), torch.full_like(truth, torch.nan)], 1)
-    refined = geometry.refine_homography(many, x0, x1, loss="cauchy", scale=3.0, iterations=20)
+    options = {"loss": "cauchy", "scale": 3.0, "iterations": 20}
+    refined = geometry.refine_homography(many, x0, x1, **options)
     assert refined.shape == many.shape
-    assert torch.equal(
-        refined[:, 0], geometry.refine_homography(truth, x0, x1, loss="cauchy", scale=3.0, iterations=20)
-    )
+    assert torch.equal(refined[:, 0], geometry.refine_homography(truth, x0, x1, **options))
     torch.testing.assert_close(refined[:, 0], refined[:, 1], rtol=0, atol=1e-9)
     assert not bool(torch.isfinite(refined[:, 2:]).all(-1).any())
     costs = [(1 + geometry.homography_sampson(H, x0, x1).square() / 9).log().sum(-1) for H in (truth, refined[:, 0])]
     assert bool((costs[1] < costs[0]).all())
     x0.requires_grad_()
-    attached = geometry.refine_homography(many, x0, x1, loss="cauchy", scale=3.0, iterations=20)
+    attached = geometry.refine_homography(many, x0, x1, **options)
     assert torch.equal(attached.detach().nan_to_num(7), refined.nan_to_num(7))
     attached[:, :2].sum().backward()
     assert bool(torch.isfinite(x0.grad).all())

@@ -1,6 +1,7 @@
 """Minimal solvers, the oriented constraint and weighted fits, against definitions, OpenCV and kornia."""
 
 from collections.abc import Callable
+from typing import Any
 
 import cv2
 import numpy as np
@@ -24,7 +25,6 @@ from tests.reference import solvers as reference
 
 Kernel = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], int]
 SOLVERS: dict[str, tuple[Kernel, int, int]] = {"seven": (seven_point_kernel, 7, 3), "eight": (eight_point_kernel, 8, 1)}
-DRAWS = 203  # not whole lanes
 SAMPLES = 203  # not whole lanes
 
 
@@ -83,22 +83,18 @@ def test_gradient():
 
 def points_of() -> dict[str, np.ndarray]:
     """Points (4, n) of pairs of many kinds, in normalised units."""
-    given = {
-        "random": laws.scene(1, 300),
-        "right": laws.scene(1, 300, outliers=0, noise=0),
-        **laws.degenerate(),
-        **laws.small(),
-    }
+    given = {"random": laws.scene(1, 300), "right": laws.scene(1, 300, outliers=0, noise=0)}
+    given |= laws.degenerate() | laws.small()
     pairs = {name: normalized(c) for name, c in given.items()}
     return {name: pair[0].points for name, pair in pairs.items() if not isinstance(pair, str)}
 
 
 def solved_by(solver: str, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Models (m, 9) of random samples, of which draw each is, and the samples (size, DRAWS)."""
+    """Models (m, 9) of random samples, of which draw each is, and the samples (size, SAMPLES)."""
     kernel, size, most = SOLVERS[solver]
     rng, n = np.random.default_rng(0), points.shape[1]
-    sample = np.stack([rng.permutation(max(n, size))[:size] % n for _ in range(DRAWS)], 1)
-    F, draw = np.empty((most * DRAWS, 9), np.float32), np.empty(most * DRAWS, np.int64)
+    sample = np.stack([rng.permutation(max(n, size))[:size] % n for _ in range(SAMPLES)], 1)
+    F, draw = np.empty((most * SAMPLES, 9), np.float32), np.empty(most * SAMPLES, np.int64)
     count = kernel(points, sample, F, draw)
     return F[:count].astype(np.float64), draw[:count], sample
 
@@ -148,9 +144,7 @@ def rays(seed: int, noise: float = 0.0, plane: bool = False) -> tuple[np.ndarray
     return np.ascontiguousarray(rays.reshape(-1, 4).T), E / np.linalg.norm(E, axis=1)[:, None]
 
 
-def solved(
-    points: np.ndarray, depth: np.ndarray | None = None, offset: np.ndarray | None = None
-) -> tuple[np.ndarray, np.ndarray]:
+def solved(points: np.ndarray, depth: Any = None, offset: Any = None) -> tuple[np.ndarray, np.ndarray]:
     """Models (m, 9) of every five points, and of which sample each is; depth, offset: the kernel's."""
     s = points.shape[1] // 5
     sample = np.arange(5 * s).reshape(s, 5).T.copy()
@@ -194,10 +188,8 @@ def test_focal_lengths_and_the_centre_of_coordinates() -> None:
     F, same = solved(scaled, depth, offset)
     np.testing.assert_array_equal(draw, same)
     for model, essential, s in zip(F, E, draw, strict=True):
-        K0, K1 = (
-            np.array([[f, 0, -x], [0, f, -y], [0, 0, 1]])
-            for f, (x, y) in zip(depth[:, s], offset.reshape(2, 2), strict=True)
-        )
+        cameras = zip(depth[:, s], offset.reshape(2, 2), strict=True)
+        K0, K1 = (np.array([[f, 0, -x], [0, f, -y], [0, 0, 1]]) for f, (x, y) in cameras)
         expected = K1.T @ model.reshape(3, 3) @ K0
         # Twice float32, through calibrations of condition 4; dividing scaled points rounds, which roots magnify.
         assert apart(expected.reshape(1, 9), essential[None])[0, 0] < 1e-4

@@ -83,11 +83,8 @@ def test_drawn_focal_lengths_are_functions_of_the_draw(sizes: Sizes) -> None:
     ratios = np.log(depth / images.longest[:, None])
     for d in range(count):
         words = [random.number(seed, pair.key, Stream.FOCAL, start + d, k, 3) % focal_prior.QUANTILES for k in range(3)]
-        half = (
-            0.0
-            if pair.same_size and words[2] < focal_prior.SAME_CAMERA_SHARE * focal_prior.QUANTILES
-            else normal[words[1]]
-        )
+        one_camera = pair.same_size and words[2] < focal_prior.SAME_CAMERA_SHARE * focal_prior.QUANTILES
+        half = 0.0 if one_camera else normal[words[1]]
         mean = math.log(focal_prior.USUAL_FOCAL) + focal_prior.FOCAL_DEVIATION * normal[words[0]]
         expected = [mean + focal_prior.RATIO_DEVIATION / 2 * half, mean - focal_prior.RATIO_DEVIATION / 2 * half]
         np.testing.assert_allclose(ratios[:, d], expected, atol=1e-12)
@@ -209,9 +206,8 @@ def test_how_likely_one_camera_is() -> None:
     """By Bayes' rule, of two normal densities of the difference of what is measured."""
     s = np.array([0.05, 0.1])
     for difference in (0.0, 0.1, 0.5):
-        same, different = (
-            math.exp(-(difference**2) / 2 / v) / math.sqrt(v) for v in (0.0125 + 0.01**2, 0.0125 + 0.5**2)
-        )
+        variances = 0.0125 + 0.01**2, 0.0125 + 0.5**2
+        same, different = (math.exp(-(difference**2) / 2 / v) / math.sqrt(v) for v in variances)
         expected = 0.7 * same / (0.7 * same + 0.3 * different)
         assert focal_prior.same_camera_share(difference, s) == pytest.approx(expected, rel=1e-12)
     assert focal_prior.same_camera_share(0.0, np.array([0.0, math.inf])) == 0.7
@@ -291,9 +287,8 @@ def test_the_best_candidates_of_two_rounds_are_one_model_or_not(posterior: list[
 
 def test_rounds_without_candidates_settle_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     """All matches may be inliers of the zero model that stands for none."""
-    nothing = PlausibleCandidates(
-        Refined(np.zeros((1, 9)), np.zeros(1), np.ones(1)), np.full(1, -np.inf), no_cameras(1)
-    )
+    refined = Refined(np.zeros((1, 9)), np.zeros(1), np.ones(1))
+    nothing = PlausibleCandidates(refined, np.full(1, -np.inf), no_cameras(1))
     monkeypatch.setattr(FocalSearch, "round", lambda self, pair, turn: (nothing, (turn + 1) * 10))
     search = searching(rounds=3, min_rounds=1)
     object.__setattr__(search, "stop", lambda F, draws, pair, size: True)
