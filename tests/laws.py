@@ -19,11 +19,8 @@ from fmtorch.core import Correspondences, Estimator, ImagePruner, PairImages, Pr
 from fmtorch.core.stages import grey_pyramid
 from tests.variants import built, loaded, variants
 
-PEERS = {
-    name: package
-    for name in variants("estimator")
-    for package in presets.files.peer_packages(loaded("estimator", name))
-}
+NEEDED = {name: presets.files.peer_packages(loaded("estimator", name)) for name in variants("estimator")}
+PEERS = {name: package for name, packages in NEEDED.items() for package in packages}
 """The packages of the extra `peers` that presets of estimators need, by the presets' names."""
 SMALL_KINDS = ("collinear", "collinear in image 1", "planar", "coincident", "half coincident")
 

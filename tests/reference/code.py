@@ -63,9 +63,7 @@ def huber_regression(basis: np.ndarray, target: np.ndarray, ridge: np.ndarray, s
     return result.x.reshape(m, k)
 
 
-def likelihood(
-    matches: list[tuple[Any, ...]], widths: dict[str, float], centres: int, ridge: float, scale: float
-) -> np.ndarray:
+def likelihood(matches: list[Any], widths: dict[str, float], centres: int, ridge: float, scale: float) -> np.ndarray:
     """Likelihood of every match, all of them distinctive."""
     kernel = np.array([[predictive_gaussian(a, b, widths) for b in matches] for a in matches])
     basis = kernel[:, spread_centres(kernel, centres)]

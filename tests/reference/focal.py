@@ -10,7 +10,7 @@ size less ``A / (1 + (ln f0 - ln f1)^2 / s3^2)``; for each measured focal length
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from tests.reference.solvers import poses, skew
+from tests.reference.solvers import Array, poses, skew
 
 Size = tuple[int, int]
 Measured = tuple[tuple[float, float], tuple[float, float]]
@@ -44,9 +44,7 @@ def prior_cost(log_f0: float, log_f1: float, same_size: bool = False, measured: 
     return cost + 3 * z2 / (z2 + 6)
 
 
-def share_in_front(
-    E: np.ndarray, rays0: np.ndarray, rays1: np.ndarray, support: np.ndarray, angle: np.ndarray
-) -> float:
+def share_in_front(E: Array, rays0: Array, rays1: Array, support: Array, angle: Array) -> float:
     """E (3, 3), rays (n, 3), support (n); rays whose directions differ by less than the angles (n) count anyway."""
     best = 0.0
     for R, t in poses(E):

@@ -77,9 +77,7 @@ def shade(stage: Stage, hits: Met, inverse: Matrix, offset: tuple[float, float],
     out[index] = _albedo(stage, inverse, index, piece, value, hits.piece.shape[1]) * _irradiance(stage, value, offset)
 
 
-def _albedo(
-    stage: Stage, inverse: Matrix, index: np.ndarray, piece: np.ndarray, value: np.ndarray, w: int
-) -> np.ndarray:
+def _albedo(stage: Stage, inverse: Matrix, index: Matrix, piece: Matrix, value: Matrix, w: int) -> np.ndarray:
     """Filtered texture colour (n, 3); level of detail from the pixel's footprint in texels."""
     geometry = stage.geometry
     rows = stage.homography(inverse)[piece]

@@ -14,9 +14,8 @@ from tests.helpers import draw_set
 from tests.processes import Command, Starter
 from tests.reliability.conftest import Rows, evaluation, parts, results
 
-EVAL_KILLS, MATCH_KILLS, TRAIN_KILLS, PROCESS_KILLS = (
-    int(number) for number in os.environ.get("FMTORCH_KILLS", "40,20,30,10").split(",")
-)
+KILLS = os.environ.get("FMTORCH_KILLS", "40,20,30,10")
+EVAL_KILLS, MATCH_KILLS, TRAIN_KILLS, PROCESS_KILLS = map(int, KILLS.split(","))
 TRAIN = [
     "optimisation.steps=8", "objective.classification_steps=2", "batch=2", "threads=1", "workers=1",
     "validation.scenes=1", "validation.pairs=2", "validation.every=4", "checkpoint_every=1",

@@ -298,10 +298,7 @@ OWN = [name for name in variants("estimator") if not name.startswith(WITHOUT)]
 C = scene(1, 60, outliers=0.2)
 
 
-REFUSED = {
-    "paper/usac": ("x0", "prior"),
-    **dict.fromkeys((name for name in OWN if name.startswith("paper/") and name != "paper/usac"), ("prior",)),
-}
+REFUSED = {name: ("prior",) for name in OWN if name.startswith("paper/")} | {"paper/usac": ("x0", "prior")}
 """Gradients that the final fit takes no account of: that of paper/usac is none, those of the others are unweighted."""
 
 

@@ -258,9 +258,8 @@ def _differentiable() -> dict[str, Tensor]:
 def castle() -> list[tuple[ImagePair, Correspondences]]:
     """Two pairs of castle-P19 with SIFT matches, P(inlier) and noise."""
     pairs = load("fmbench", root=shared_path("data/Strecha_train"))
-    pruners = {
-        name: presets.build("pruner", name) for name in ("ratio", "one_to_one", "frame_consistency", "match_noise")
-    }
+    names = ("ratio", "one_to_one", "frame_consistency", "match_noise")
+    pruners = {name: presets.build("pruner", name) for name in names}
     front = Pipeline(presets.build("features", "sift"), presets.build("matcher", "nearest"), pruners, quick("msac"))
     chosen = sorted((pairs[i] for i in range(len(pairs))), key=lambda pair: pair.identity)[::40]
     return [(pair, c) for pair in chosen if (c := front.correspondences([pair])[0].correspondences) is not None]
