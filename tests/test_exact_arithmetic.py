@@ -10,7 +10,7 @@ from collections.abc import Iterable
 
 import pytest
 
-from tests.test_imports import FILES, PACKAGE, libraries, nodes
+from tests.test_imports import FILES, PACKAGE, last_name, libraries, nodes
 
 DECORATORS = {"kernel", "inner", "njit", "jit"}
 INEXACT = {
@@ -38,13 +38,6 @@ def kernels(file: Iterable[ast.AST]) -> list[ast.FunctionDef]:
     """The functions that are decorated as kernels, or as ones for kernels to call."""
     functions = [node for node in file if isinstance(node, ast.FunctionDef)]
     return [f for f in functions if any(last_name(decorator) in DECORATORS for decorator in f.decorator_list)]
-
-
-def last_name(node: ast.expr) -> str:
-    """``inner`` of ``@inner``, ``@numba.inner`` and ``@inner(inline=True)``."""
-    if isinstance(node, ast.Call):
-        node = node.func
-    return node.attr if isinstance(node, ast.Attribute) else node.id if isinstance(node, ast.Name) else ""
 
 
 def inexact(part: Iterable[ast.AST]) -> list[tuple[int, str]]:

@@ -45,13 +45,9 @@ ELSEWHERE = (
 )  # fmt: skip
 
 
-def module_name(path: Path) -> str:
-    """``fmtorch.core.types`` of ``fmtorch/core/types.py``, ``fmtorch.data`` of ``fmtorch/data/__init__.py``."""
-    parts = path.relative_to(PACKAGE.parent).with_suffix("").parts
-    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
-
-
-FILES = {module_name(path): path for path in sorted(PACKAGE.rglob("*.py"))}
+PATHS = [path.relative_to(PACKAGE.parent) for path in sorted(PACKAGE.rglob("*.py"))]
+FILES = {".".join(path.with_suffix("").parts).removesuffix(".__init__"): PACKAGE.parent / path for path in PATHS}
+"""By modules' names: fmtorch.core.types, fmtorch.data."""
 
 
 @functools.cache
@@ -118,6 +114,13 @@ def test_estimators_take_tensors_at_their_edges_alone() -> None:
     assert [path for path in tensors if not path.startswith(TENSORS_OF_ESTIMATORS)] == []
 
 
+def last_name(node: ast.expr) -> str:
+    """``inner`` of ``@inner``, ``@numba.inner`` and ``@inner(inline=True)``."""
+    if isinstance(node, ast.Call):
+        node = node.func
+    return node.attr if isinstance(node, ast.Attribute) else node.id if isinstance(node, ast.Name) else ""
+
+
 def functions() -> Iterator[tuple[str, ast.FunctionDef]]:
     for module, path in FILES.items():
         yield from ((f"{module}.{n.name}", n) for n in nodes(path) if isinstance(n, ast.FunctionDef))
@@ -131,7 +134,7 @@ def test_files_fit_in_the_head_and_functions_on_a_screen() -> None:
 def test_kernels_take_few_arguments_whose_types_are_annotated() -> None:
     kernels, wrong = 0, []
     for name, function in functions():
-        if _is_kernel(function):
+        if any(last_name(decorator) == "kernel" for decorator in function.decorator_list):
             arguments = function.args
             right = len(arguments.args) <= MAX_ARGUMENTS and all(each.annotation for each in arguments.args)
             other = [*arguments.posonlyargs, *arguments.kwonlyargs, *arguments.defaults]
@@ -140,12 +143,6 @@ def test_kernels_take_few_arguments_whose_types_are_annotated() -> None:
                 wrong.append(name)
     assert kernels > 50
     assert wrong == []
-
-
-def _is_kernel(function: ast.FunctionDef) -> bool:
-    """Whether it is decorated by ``@kernel`` or ``@kernel(...)``."""
-    decorators = [each.func if isinstance(each, ast.Call) else each for each in function.decorator_list]
-    return any(isinstance(each, ast.Name) and each.id == "kernel" for each in decorators)
 
 
 def test_the_road_of_a_pair_is_the_files_that_the_page_names() -> None:

@@ -98,23 +98,14 @@ def test_unpacked_wheel_finds_its_folders_from_any_directory(wheel: Path, tmp_pa
     assert [Path(line) for line in done.stdout.split()] == expected
 
 
-def _pins() -> dict[str, str]:
-    lines = (CHECKOUT / "constraints.txt").read_text().splitlines()
-    pins = [line.split("==") for line in lines if line and not line.startswith("#")]
-    return {canonicalize_name(name): version for name, version in pins}
-
-
-def test_constraints_are_exact_and_portable() -> None:
-    for line in (CHECKOUT / "constraints.txt").read_text().splitlines():
-        # no local versions (2.13.0+cpu), which only some package indexes have
-        assert line.startswith("#") or re.fullmatch(r"[a-z0-9-]+==[0-9][0-9a-z.]*", line), line
-
-
-def test_constraints_pin_every_declared_dependency_within_its_range() -> None:
+def test_constraints_pin_every_declared_dependency_within_its_range_exactly_and_portably() -> None:
+    lines = [line for line in (CHECKOUT / "constraints.txt").read_text().splitlines() if not line.startswith("#")]
+    for line in lines:  # no local versions (2.13.0+cpu), which only some package indexes have
+        assert re.fullmatch(r"[a-z0-9-]+==[0-9][0-9a-z.]*", line), line
+    pins = {canonicalize_name(name): version for name, version in (line.split("==") for line in lines)}
     project = _project()
     extras = project["optional-dependencies"]
     declared = [*project["dependencies"], *extras["test"], *extras["dev"]]  # type: ignore[index,misc]
-    pins = _pins()
     for text in declared:
         requirement = Requirement(text)
         if requirement.name != "fmtorch":

@@ -39,8 +39,10 @@ def test_reference_opencv_and_kornia_live(batch, n):
             assert error.norm() < n * torch.finfo(torch.float64).eps / gap
 
 
-def degenerate(n, dtype=torch.float64):
-    """Two sound sets, then ten that are not, and their names' verdict."""
+@pytest.mark.parametrize("n", [8, 20])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_degenerate_sets_are_invalid_and_alone(n, dtype):
+    """Two sound sets, then ten that are not."""
     x0, x1, _ = (a.to(dtype).clone() for a in scenes((12,), n, noise=0.5))
     line = torch.arange(n, dtype=dtype)[:, None]
     x0[2], x1[2] = x0[2, :1], x1[2, :1]  # all equal
@@ -54,13 +56,6 @@ def degenerate(n, dtype=torch.float64):
     x0[9] = x0[9, :1]  # coincident in image 0 only
     x1[10] = x0[10]  # no motion
     x0[11] = torch.nan
-    return x0, x1
-
-
-@pytest.mark.parametrize("n", [8, 20])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_degenerate_sets_are_invalid_and_alone(n, dtype):
-    x0, x1 = degenerate(n, dtype)
     F, valid = geometry.eight_point(x0, x1)
     assert valid.tolist() == [True] * 2 + [False] * 10
     assert not F[2:].any()

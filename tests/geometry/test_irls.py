@@ -20,11 +20,6 @@ S2 = torch.tensor(4.0, dtype=torch.float64)
 END = QUANTILE**2 / 2
 
 
-def pair(seed: int, noise: float, outliers: int = 0) -> tuple[Tensor, Tensor, Tensor]:
-    F, x0, x1 = (torch.from_numpy(v) for v in unit_scene(seed, 120, noise, outliers))
-    return F, x0, x1
-
-
 def eight_point_once(F: np.ndarray, x0: np.ndarray, x1: np.ndarray, scale: float) -> np.ndarray:
     """One reweighted fit with the Cauchy loss, from the definition."""
     line1, line0 = np.c_[x0, np.ones(len(x0))] @ F.T, np.c_[x1, np.ones(len(x1))] @ F
@@ -34,11 +29,10 @@ def eight_point_once(F: np.ndarray, x0: np.ndarray, x1: np.ndarray, scale: float
 
 @pytest.mark.parametrize("seed", range(4))
 def test_two_iterations_equal_the_definition(seed: int) -> None:
-    F, x0, x1 = pair(seed, 2e-3, 20)
-    fitted = irls(x0, x1, F, loss="cauchy", scale=0.01, iterations=2)
-    expected = F.numpy()
+    expected, x0, x1 = unit_scene(seed, 120, 2e-3, 20)
+    fitted = irls(*map(torch.from_numpy, (x0, x1, expected)), loss="cauchy", scale=0.01, iterations=2)
     for _ in range(2):
-        expected = eight_point_once(expected, x0.numpy(), x1.numpy(), 0.01)
+        expected = eight_point_once(expected, x0, x1, 0.01)
     # The sums of products square the condition of the equations (some 1e3): 1e-16 * 1e6, and a little room.
     assert distance(fitted.flatten(), torch.from_numpy(expected.flatten())) < 1e-9
 
@@ -158,16 +152,13 @@ def test_the_table_of_gains() -> None:
 
 
 def test_the_tables_have_the_same_bits_everywhere() -> None:
-    assert (digest(LOSS_TABLE), digest(GAIN_TABLE)) == ("deeedca20dc708b5", "e7fdff710ef5cc3d")
-
-
-def digest(table: np.ndarray) -> str:
-    return hashlib.sha256(table.tobytes()).hexdigest()[:16]
+    digests = [hashlib.sha256(table.tobytes()).hexdigest()[:16] for table in (LOSS_TABLE, GAIN_TABLE)]
+    assert digests == ["deeedca20dc708b5", "e7fdff710ef5cc3d"]
 
 
 @pytest.mark.parametrize("loss", LOSSES)
 def test_exact_matches_keep_the_exact_matrix(loss: str) -> None:
-    F, x0, x1 = pair(5, 0.0)
+    F, x0, x1 = map(torch.from_numpy, unit_scene(5, 120))
     near = F + 1e-3 * torch.from_numpy(np.random.default_rng(0).normal(size=(3, 3)))
     fitted = irls(x0, x1, near, loss=loss, scale=1.0)
     assert distance(fitted.flatten(), F.flatten()) < 1e-9  # as above

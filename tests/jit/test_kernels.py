@@ -93,6 +93,10 @@ def result(module: types.ModuleType) -> list[list[float]]:
 EXPECTED = [[2, 8], [18, 32]]
 
 
+def refused(*_: object, **options: object) -> int:
+    raise OSError("no space left on device")
+
+
 RETURNING = """
 from fmtorch.jit.kernel import kernel
 
@@ -235,9 +239,6 @@ def test_a_cache_that_can_only_be_read_is_used(tmp_path, monkeypatch, capsys):
     capsys.readouterr()
     files.folder.cache_clear()
 
-    def refused(*args: object, **options: object) -> int:
-        raise PermissionError("read-only file system")
-
     monkeypatch.setattr(Path, "write_text", refused)
     monkeypatch.setattr(Path, "write_bytes", refused)
     assert files.folder() is not None
@@ -247,9 +248,6 @@ def test_a_cache_that_can_only_be_read_is_used(tmp_path, monkeypatch, capsys):
 
 
 def test_a_full_disk_costs_the_file_and_not_the_result(module, cache, monkeypatch):
-    def refused(*args: object) -> int:
-        raise OSError("no space left on device")
-
     monkeypatch.setattr(Path, "write_bytes", refused)
     with pytest.warns(UserWarning, match="no space left"):
         assert result(module) == EXPECTED

@@ -20,11 +20,7 @@ from fmtorch.matching import NearestNeighborMatcher
 from fmtorch.pruning.consistency import CURVES, MIN_VOTE, NOISE, SCALES, TOLERANCE, TURNS, WINDOW, WORST_RATIO
 from tests.laws import calibrated, degenerate, quick_pruner, scene, scenes, small, with_padding
 from tests.processes import run_command
-from tests.reference import consistency
-from tests.reference import local_features as matching_reference
-from tests.reference.gms import gms as gms_reference
-from tests.reference.local_features import one_to_one as one_to_one_reference
-from tests.reference.lpm import passes
+from tests.reference import consistency, gms, local_features, lpm
 from tests.variants import built, loaded, variants
 
 SIZE = (640, 960)  # of the images of a scene
@@ -51,8 +47,8 @@ def test_ratio_and_mutual_stages_equal_their_definitions(seed: int) -> None:
 
     matches = NearestNeighborMatcher()(features(d0), features(d1))
     ratio, both = pruning.RatioTest(0.8)(matches).mask[0], pruning.MutualCheck()(matches).mask[0]
-    np.testing.assert_array_equal(ratio, matching_reference.ratio_test(d0, d1, 0.8))
-    np.testing.assert_array_equal(both, matching_reference.mutual(d0, d1))
+    np.testing.assert_array_equal(ratio, local_features.ratio_test(d0, d1, 0.8))
+    np.testing.assert_array_equal(both, local_features.mutual(d0, d1))
     assert 0 < int(ratio.sum()) < 30
     assert 0 < int(both.sum()) < 30
     order = matches.compact()
@@ -66,7 +62,7 @@ def test_one_to_one_equals_the_definition(data: st.DataObject, n: int) -> None:
     x0, x1 = (data.draw(arrays(np.float32, (n, 2), elements=coordinates)) for _ in range(2))
     ratio = data.draw(arrays(np.float32, (n,), elements=ratios))
     mask = pruning.one_to_one(*(torch.from_numpy(a)[None] for a in (x0, x1, ratio)))
-    np.testing.assert_array_equal(mask[0], one_to_one_reference(x0, x1, ratio))
+    np.testing.assert_array_equal(mask[0], local_features.one_to_one(x0, x1, ratio))
 
 
 def test_stages_are_their_functions_need_their_fields_and_keep_the_rest() -> None:
@@ -87,12 +83,11 @@ HARD = {name.partition(":")[0] for name in SOFT if "network" in loaded("pruner",
 """Learned ones, whose mask is a threshold on the probabilities of their soft form."""
 PRUNERS = [name for name in variants("pruner") if name not in HARD or name == "lc"]
 PER_MATCH = ("x0", "x1", "ratio", "prior", "lafs0", "lafs1", "mutual")
-H, W = 640, 960
 
 
 def edge_cases() -> dict[str, Correspondences]:
     c, single = scene(0, 300), scene(0, 1)
-    right, bottom = float(W - 1), float(H - 1)
+    right, bottom = float(SIZE[1] - 1), float(SIZE[0] - 1)
     inside = [[0.0, 0.0], [right, 0.0], [0.0, bottom], [right, bottom]]
     border = torch.tensor([*inside, [right + 1, bottom + 1], [-0.5, -0.5], [right + 50, 7.0], [3.0, -90.0]])
     on_border = border.repeat(40, 1)[:300][None]
@@ -196,13 +191,13 @@ def test_gms(real_matches: list[tuple[Correspondences, Tensor]]) -> None:
             c.x0, c.x1, size0=c.size0, size1=c.size1, mask=c.mask, threshold_factor=3.0, with_rotation=searched,
             with_scale=searched, border="authors" if searched else "opencv",
         )[i]  # fmt: skip
-        expected = gms_reference(x0, x1, sizes, searched, 3.0, authors=searched)  # type: ignore[arg-type]
+        expected = gms.gms(x0, x1, sizes, searched, 3.0, authors=searched)  # type: ignore[arg-type]
         expect_mask(mask, slots, expected, what)
 
 
 def test_lpm(real_matches: list[tuple[Correspondences, Tensor]]) -> None:
     for what, c, i, slots, x0, x1 in pairs(real_matches):
-        survivors, costs = passes(x0.astype(np.float64), x1.astype(np.float64))
+        survivors, costs = lpm.passes(x0.astype(np.float64), x1.astype(np.float64))
         expect_mask(pruning.lpm(c.x0, c.x1, mask=c.mask)[i], slots, np.isin(np.arange(len(slots)), survivors), what)
         expected = np.ones(c.mask.shape[1])
         expected[slots] = np.mean(costs, 0)
@@ -213,7 +208,7 @@ def test_lpm(real_matches: list[tuple[Correspondences, Tensor]]) -> None:
 def test_one_to_one(real_matches: list[tuple[Correspondences, Tensor]]) -> None:
     for what, c, i, slots, x0, x1 in pairs(real_matches):
         ratio = c.ratio[i].numpy()[slots]
-        expected = one_to_one_reference(x0, x1, np.where(np.isnan(ratio), np.inf, ratio))
+        expected = local_features.one_to_one(x0, x1, np.where(np.isnan(ratio), np.inf, ratio))
         expect_mask(pruning.one_to_one(c.x0, c.x1, c.ratio, c.mask)[i], slots, expected, what)
 
 

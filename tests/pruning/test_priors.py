@@ -11,7 +11,7 @@ from fmtorch.pruning.consistency import CURVES, MIN_VOTE, NOISE, TOLERANCE, TURN
 from tests.laws import scene
 from tests.pruning.test_gms import SIZE0, SIZE1, moving, moving_along
 from tests.reference import consistency as reference
-from tests.reference.gms import support
+from tests.reference import gms
 from tests.variants import built
 
 SCORED = Calibration(
@@ -91,7 +91,7 @@ def test_gms_support_equals_the_definition(angle: float, scale: float) -> None:
         x0[None], x1[None], size0=torch.tensor([SIZE0]), size1=torch.tensor([SIZE1]),
         with_rotation=searched, with_scale=searched, threshold_factor=2.0,
     )[0]  # fmt: skip
-    z = np.array(support(x0.numpy(), x1.numpy(), (SIZE0, SIZE1), searched, 2.0))
+    z = np.array(gms.support(x0.numpy(), x1.numpy(), (SIZE0, SIZE1), searched, 2.0))
     np.testing.assert_allclose(computed, z / (z + 1.5), rtol=1e-6)  # float64 rounded to float32
 
 

@@ -20,6 +20,7 @@ from tests.laws import quick
 from tests.reference import lenses as division
 from tests.reference.homography import mapped
 from tests.reference.known_cameras import K0, K1, SIZE, angle, scene
+from tests.two_view.test_lenses import PLANE, planes
 
 K = np.array([[900.0, 0, 639.5], [0, 900, 359.5], [0, 0, 1]])
 SCENE = scene(0)
@@ -389,13 +390,9 @@ def test_sizes_may_be_assumed() -> None:
 @pytest.mark.parametrize("calibrated", [False, True])
 def test_the_type_of_a_pair_is_that_of_the_undistorted_photographs(calibrated: bool) -> None:
     """Of a plane, alone and beside a general pair, whose homography is that of pinholes."""
-    rng, lens = np.random.default_rng(0), -0.25
-    H = np.array([[0.95, 0.06, 12], [-0.05, 1.02, -8], [1e-4, -2e-4, 1]])
+    lens = -0.25
     x0, x1, _, K = division.photographs(1, (lens, lens))
-    plane = rng.uniform([20, 20], [620, 460], (len(x0), 2))
-    moved = np.c_[plane, np.ones(len(plane))] @ H.T
-    bent = [[division.bent(x, SIZE, lens) for x in points] for points in (plane, moved[:, :2] / moved[:, 2:])]
-    y0, y1 = (np.array(x) + rng.normal(0, 0.2, (len(x), 2)) for x in bent)
+    y0, y1 = planes(0, lens, wrong=0.0)
     cameras = {"K0": K, "K1": K} if calibrated else {}
     given = {**cameras, "pair_type": True, "seed": 1}
     together = found([y0, x0], [y1, x1], lens=lens, **given, key=[0, 0])
@@ -403,7 +400,7 @@ def test_the_type_of_a_pair_is_that_of_the_undistorted_photographs(calibrated: b
     alone = found(y0, y1, lens=lens, **given)
     assert alone.pair_type == ("planar",)
     torch.testing.assert_close(alone.homography[0], together.homography[0], rtol=0, atol=0)
-    truth = torch.from_numpy(H)[None], torch.tensor([SIZE])
+    truth = torch.from_numpy(PLANE)[None], torch.tensor([SIZE])
     as_pinholes = found(y0, y1, **given)
     assert float(corner_error(alone.homography, *truth)) < 0.5 < 3 < float(corner_error(as_pinholes.homography, *truth))
 

@@ -15,11 +15,10 @@ from fmtorch.pruning.networks import CLNet, ConvMatch, NCMNet, OANet
 from fmtorch.pruning.networks.layers import ContextBatchNormReLU, ResidualBlock, Slots
 from scripts import convert_checkpoint
 from tests.conftest import oracle
-from tests.laws import scene
+from tests.laws import calibrated, scene
 from tests.pruning.networks.test_published import convert
 from tests.reference.pruner_losses import context_batch_norm_relu
 
-K = torch.tensor([[[800.0, 0, 480], [0, 800, 320], [0, 0, 1]]])
 SIDE = ("ratio", "mutual", "scale", "rotation", "agreement")
 
 
@@ -211,7 +210,7 @@ def test_each_stage_is_the_fit_with_its_weights() -> None:
 @pytest.mark.parametrize("coordinates", ["size", "K"])
 def test_residuals_are_fed_back(coordinates: str) -> None:
     """Weights that fall with the residual make the fits those of robust least squares: few outliers are left out."""
-    c = scene(0, outliers=0.05).replace(K0=K, K1=K)
+    c = calibrated(scene(0, outliers=0.05))
     prediction = small(coordinates=coordinates).predict(c, robust)
     first, *_, last = (float(sampson(F, c.x0.double(), c.x1.double()).median()) for F in prediction.F)
     assert last < 0.3 < 3 < first  # px; the noise of a coordinate is 0.3
@@ -234,7 +233,7 @@ def degenerate() -> Correspondences:
 @pytest.mark.parametrize("network", [small(), small(coordinates="K")])
 def test_gradients_are_finite_on_degenerate_pairs(network: DFE) -> None:
     """Of weights, log-odds and fits alike, in training mode, and no pair takes the sound one's gradient with it."""
-    c = degenerate().replace(K0=K.expand(7, 3, 3), K1=K.expand(7, 3, 3))
+    c = calibrated(degenerate())
     prediction = network.train()(c)
     loss = prediction.F.square()[..., 0, :].sum() + (prediction.logit * c.mask).sum() + prediction.weight.square().sum()
     gradients = torch.autograd.grad(loss, list(network.parameters()))
@@ -292,8 +291,7 @@ def test_what_is_not_known_is_zero() -> None:
 
 @pytest.mark.parametrize("coordinates", ["size", "K"])
 def test_padding_is_zero_and_not_finite_matches_are_masked(coordinates: str) -> None:
-    K = torch.tensor([[[500.0, 0, 480], [0, 500, 320], [0, 0, 1]]])
-    c = scene(1, count=20).replace(K0=K, K1=K)
+    c = calibrated(scene(1, count=20))
     mask = c.mask.clone()
     mask[0, 15:] = False
     expected, _ = MatchInputs(coordinates, SIDE)(c.keep(mask).compact())

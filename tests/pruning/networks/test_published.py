@@ -17,7 +17,7 @@ from fmtorch.pruning.networks import CLNet, ConvMatch, NCMNet, OANet, layers
 from fmtorch.pruning.networks.layers import Slots
 from fmtorch.training import LabelledMatches, Objective
 from scripts.convert_checkpoint import NETWORKS, UNUSED, authors_key, main
-from tests.laws import degenerate, scene
+from tests.laws import calibrated, degenerate, scene
 from tests.reference import pruner_layers as reference
 from tests.training.conftest import exact
 
@@ -28,7 +28,6 @@ SMALL = {
     "convmatch": lambda: ConvMatch(channels=16, layers=2, grid=4),
 }
 every = pytest.mark.parametrize("name", SMALL)
-K = torch.tensor([[[800.0, 0, 480], [0, 800, 320], [0, 0, 1]]])
 PAIRS = (9, 4, 23)  # matches: more and fewer than neighbours
 
 
@@ -215,7 +214,7 @@ def convert(monkeypatch: pytest.MonkeyPatch, *words: object) -> None:
 @every
 def test_a_checkpoint_of_the_authors_code_becomes_a_pruner(name, tmp_path, monkeypatch) -> None:
     torch.manual_seed(2)
-    network, c = NETWORKS[name][0](coordinates="K", side=["ratio"]), scene(0).replace(K0=K, K1=K)
+    network, c = NETWORKS[name][0](coordinates="K", side=["ratio"]), calibrated(scene(0))
     written(name, network, tmp_path / "model_best.pth")
     convert(monkeypatch, name, tmp_path / "model_best.pth", tmp_path / "out.safetensors", "--side", "ratio")
     read = LearnedPruner(NETWORKS[name][0](coordinates="K", side=["ratio"]), file=tmp_path / "out.safetensors")
