@@ -92,12 +92,8 @@ def sampled(draw: Any) -> dict[str, Any]:
     return {"sampler": own_parts.Sampled(draw)}
 
 
-def scored(scores: Any) -> dict[str, Any]:
-    return {"score": own_parts.Scored(scores)}
-
-
-def gained(gain: Any) -> dict[str, Any]:
-    return {"score": Gain(gain)}
+def scored(scores: Any, part: Any = own_parts.Scored) -> dict[str, Any]:
+    return {"score": part(scores)}
 
 
 SAMPLES, GAINS = r"Sampled.draw returns .*", r"; it must be the shape of its argument, \(\d+, 60\): .* of numbers"
@@ -110,11 +106,11 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     (scored(lambda which: np.zeros(len(which) + 1)), r"Scored returns float64 \(\d+,\); it must be an array"),
     (scored(lambda which: np.zeros(len(which), np.float32)), "Scored returns float32"),
     (scored(lambda which: 1.0), "Scored returns float; it must be"),
-    (gained(lambda squared: squared[:, :3]), rf"Gain.gain returns shape \(\d+, 3\) of float32{GAINS}"),
-    (gained(lambda squared: squared.sum(1)), rf"Gain.gain returns shape \(\d+,\) of float32{GAINS}"),
-    (gained(lambda squared: 1.0), rf"shape \(\) of float64{GAINS}"),
-    (gained(lambda squared: squared + 0j), rf"shape \(\d+, 60\) of complex64{GAINS}"),
-    (gained(lambda squared: [["one"] * 60] * len(squared)), rf"shape \(\d+, 60\) of <U3{GAINS}"),
+    (scored(lambda squared: squared[:, :3], Gain), rf"Gain.gain returns shape \(\d+, 3\) of float32{GAINS}"),
+    (scored(lambda squared: squared.sum(1), Gain), rf"Gain.gain returns shape \(\d+,\) of float32{GAINS}"),
+    (scored(lambda squared: 1.0, Gain), rf"shape \(\) of float64{GAINS}"),
+    (scored(lambda squared: squared + 0j, Gain), rf"shape \(\d+, 60\) of complex64{GAINS}"),
+    (scored(lambda squared: [["one"] * 60] * len(squared), Gain), rf"shape \(\d+, 60\) of <U3{GAINS}"),
     ({"inliers": lambda r2, pair: r2}, r"function returns float64 \(60,\); it must be an array of bool \(60,\)"),
     ({"inliers": lambda r2, pair: (r2 <= 1)[:9]}, r"function returns bool \(9,\)"),
     ({"inliers": lambda r2, pair: [True] * len(r2)}, "function returns list"),

@@ -21,7 +21,8 @@ from fmtorch.pruning.consistency import CURVES, MIN_VOTE, NOISE, SCALES, TOLERAN
 from tests.laws import calibrated, degenerate, quick_pruner, scene, scenes, small, with_padding
 from tests.processes import run_command
 from tests.reference import consistency, gms, local_features, lpm
-from tests.variants import built, loaded, variants
+from tests.test_laws import PRUNERS
+from tests.variants import built
 
 SIZE = (640, 960)  # of the images of a scene
 NUMBERS = {"usual": 4.06, "radius": 15.0, "slope": 0.65}
@@ -78,10 +79,6 @@ def test_stages_are_their_functions_need_their_fields_and_keep_the_rest() -> Non
             stage(c.replace(**{field: None}))
 
 
-SOFT = [name for name in variants("pruner") if name.endswith(":soft=true")]
-HARD = {name.partition(":")[0] for name in SOFT if "network" in loaded("pruner", name)}
-"""Learned ones, whose mask is a threshold on the probabilities of their soft form."""
-PRUNERS = [name for name in variants("pruner") if name not in HARD or name == "lc"]
 PER_MATCH = ("x0", "x1", "ratio", "prior", "lafs0", "lafs1", "mutual")
 
 

@@ -1,5 +1,6 @@
 """Pair types, homographies, units and lenses of the public functions."""
 
+import functools
 import math
 import warnings
 from typing import Any
@@ -40,13 +41,19 @@ def estimated(c: Correspondences) -> Estimate:
     return quick("fmtorch")(c, 0)
 
 
+@functools.cache
+def twelve(kind: str) -> tuple[Correspondences, Estimate]:
+    """Pairs, and their estimates, for which K0 and K1 do not count."""
+    c = collate([pair(kind, seed) for seed in range(12)])
+    return c, estimated(c)
+
+
 @pytest.mark.parametrize("known", [True, False])
 @pytest.mark.parametrize("kind", PAIR_TYPES)
 def test_kinds(kind: str, known: bool) -> None:
     """Of estimated models, with calibrations and by image sizes alone, the cameras being usual ones."""
-    c = collate([pair(kind, seed) for seed in range(12)])
+    c, estimate = twelve(kind)
     c = c if known else c.replace(K0=None, K1=None)
-    estimate = estimated(c)
     classified = classify(c, estimate)
     assert classified.names.count(kind) >= 11, classified.names
     assert torch.equal(classified.determined, torch.tensor([name == "general" for name in classified.names]))
