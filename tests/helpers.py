@@ -79,7 +79,6 @@ def cross_matrix(t: np.ndarray) -> np.ndarray:
 
 
 def edit_lines(path: Path, change: Callable[[list[str]], list[str]]) -> None:
-    """Change the lines of a text file."""
     path.write_text("\n".join(change(path.read_text().splitlines())) + "\n")
 
 

@@ -28,6 +28,14 @@ FEW_OF_PEERS = {"iterations": 1000, "min_iterations": 100, "rounds": 2}
 Result = dict[str, Tensor]  # every value has the batch as its first dimension; masks (B, N) may be padded on the right
 KNOWLEDGE: dict[str, Any] = {"exact": (0.0, 0.0), "rough": (0.05, 0.05), "one": (0.0, float("inf")), "shared": None}
 """Deviations of the two focal lengths, as parts of them; None: unknown and equal."""
+SMALL_NETWORKS = {
+    "fmtorch.pruning.networks.LC": {"channels": 16, "blocks": 2},
+    "fmtorch.pruning.networks.DFE": {"widths": [16, 8], "iterations": 3},
+    "fmtorch.pruning.networks.OANet": {"channels": 16, "blocks": 8, "clusters": 10},
+    "fmtorch.pruning.networks.CLNet": {"channels": 16},
+    "fmtorch.pruning.networks.NCMNet": {"channels": 16, "clusters": 10},
+    "fmtorch.pruning.networks.ConvMatch": {"channels": 16, "layers": 2, "grid": 4},
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,16 +63,6 @@ def quick(name: str, hypotheses: int = 200, round: int = 100) -> Estimator:
     """An estimator preset that does little in each of its stages: the laws do not depend on how much."""
     estimator: Estimator = built("estimator", name, **few(loaded("estimator", name), hypotheses, round))
     return estimator
-
-
-SMALL_NETWORKS = {
-    "fmtorch.pruning.networks.LC": {"channels": 16, "blocks": 2},
-    "fmtorch.pruning.networks.DFE": {"widths": [16, 8], "iterations": 3},
-    "fmtorch.pruning.networks.OANet": {"channels": 16, "blocks": 8, "clusters": 10},
-    "fmtorch.pruning.networks.CLNet": {"channels": 16},
-    "fmtorch.pruning.networks.NCMNet": {"channels": 16, "clusters": 10},
-    "fmtorch.pruning.networks.ConvMatch": {"channels": 16, "layers": 2, "grid": 4},
-}
 
 
 def quick_pruner(name: str) -> Pruner:

@@ -26,6 +26,12 @@ REPLACED: dict[str, dict[str, Any]] = {
 PRESETS = ("msac", "fmtorch")
 OWN_PARTS = "tests.estimators.own_parts"
 MEDIAN = {"score": "median", "inliers": "lmeds", "confidence": None}
+ALIKE = {
+    "score": own_parts.Squares(1.0),
+    "compiled score": own_parts.CompiledSquares(1.0),
+    "sampler": own_parts.Same(),
+    "inliers": lambda squared_px, pair: squared_px <= 1.0,
+}
 
 
 def built(preset: str, parts: dict[str, Any], **options: Any) -> Any:
@@ -48,14 +54,6 @@ def test_estimates_are_as_good_as_with_built_in_parts(name: str, preset: str) ->
         alone = estimator(pairs[i])
         shared = {"F": own.F[i : i + 1], "inliers": own.inliers[i : i + 1]}
         assert_same({"F": alone.F, "inliers": alone.inliers}, shared, name)
-
-
-ALIKE = {
-    "score": own_parts.Squares(1.0),
-    "compiled score": own_parts.CompiledSquares(1.0),
-    "sampler": own_parts.Same(),
-    "inliers": lambda squared_px, pair: squared_px <= 1.0,
-}
 
 
 @pytest.mark.parametrize("names", [*([name] for name in ALIKE), ["compiled score", "sampler", "inliers"]])

@@ -30,6 +30,16 @@ WRONG = {
 HOPELESS = ("empty", "one match", "all points equal", "NaN", "infinite")
 RANK_TWO = (*small(), "one plane", "identity", "all outliers", "all points equal")
 """Pairs of usual coordinates, of which an F of unit norm in pixels has rank two to rounding."""
+EVERY = variants("estimator")
+SCALED = ("x0", "x1", "size0", "size1")
+OWN = [name for name in EVERY if not name.startswith(OTHER_LIBRARIES)]
+PARTS = [name for name in OWN if not name.startswith("paper/") or name in ("paper/ransac", "paper/usac")]
+"""Presets in which every part stands: those of the paper differ from their namesakes by the final fit alone."""
+PIXELS = [  # what is a distance in pixels and no option
+    (estimators.search, "PLANE_THRESHOLD_PX"), (with_focals, "INLIER_SIGMA_PX"), (with_focals, "LOSS_SCALE_PX"),
+    (with_focals, "PARALLEL_PX"), (estimators.inliers, "FLOOR_PX"), (estimators.GraphCut, "RADIUS_PX"),
+    (estimators.Fundamental, "fit_scale"), (estimators.Homography, "fit_scale"),
+]  # fmt: skip
 
 
 def padded_pairs() -> Correspondences:
@@ -118,18 +128,6 @@ def test_a_part_of_a_pair_keeps_its_frame() -> None:
     assert pair.cached("sum", lambda pair: float(pair.points.sum())) == pair.points.sum()
     assert pair.cached("sum", lambda pair: pytest.fail("computed again")) == pair.points.sum()
     assert part.cached("sum", lambda pair: float(pair.points.sum())) == part.points.sum()
-
-
-EVERY = variants("estimator")
-SCALED = ("x0", "x1", "size0", "size1")
-OWN = [name for name in EVERY if not name.startswith(OTHER_LIBRARIES)]
-PARTS = [name for name in OWN if not name.startswith("paper/") or name in ("paper/ransac", "paper/usac")]
-"""Presets in which every part stands: those of the paper differ from their namesakes by the final fit alone."""
-PIXELS = [  # what is a distance in pixels and no option
-    (estimators.search, "PLANE_THRESHOLD_PX"), (with_focals, "INLIER_SIGMA_PX"), (with_focals, "LOSS_SCALE_PX"),
-    (with_focals, "PARALLEL_PX"), (estimators.inliers, "FLOOR_PX"), (estimators.GraphCut, "RADIUS_PX"),
-    (estimators.Fundamental, "fit_scale"), (estimators.Homography, "fit_scale"),
-]  # fmt: skip
 
 
 def estimator(name: str) -> Any:

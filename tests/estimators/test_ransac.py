@@ -27,6 +27,15 @@ COARSE = Ransac(hypotheses=200, threshold=2.0)
 FINE = Ransac(hypotheses=100, solver="eight_point", score="median", confidence=None, inliers="lmeds")
 ESTIMATORS = [n for n in variants("estimator") if "_cpp" not in n and n != "homography"]
 NOT_ROBUST = ("irls:loss=huber", "irls:loss=cauchy")  # against three wrong matches in ten
+NAMESAKES = {
+    "ransac": "cv2_FM_RANSAC",
+    "lmeds": "cv2_FM_LMEDS",
+    "msac": "cv2_FM_RANSAC",
+    "usac": "cv2_USAC_DEFAULT",
+    "magsac": "cv2_USAC_MAGSAC",
+    "fmtorch": "poselib",
+}
+SEEDS = 2
 
 
 def _true_inlier_error(F: torch.Tensor, index: int, count: int) -> float:
@@ -90,7 +99,6 @@ def test_the_kernels_that_are_compiled_together_are_those_that_are_called(monkey
 
 
 def with_callees(kernels: set[Kernel[..., Any]]) -> set[Kernel[..., Any]]:
-    """Kernels, and those that they call."""
     reached, new = set[Kernel[..., Any]](), kernels
     while new:
         reached |= new
@@ -118,17 +126,6 @@ def test_the_same_without_compiling(monkeypatch: pytest.MonkeyPatch) -> None:
     for name, interpreted in estimates().items():
         # Fused products round differently in the last bits, which refinement to convergence does not carry on.
         np.testing.assert_allclose(interpreted, compiled[name], rtol=0, atol=1e-9, err_msg=name)
-
-
-NAMESAKES = {
-    "ransac": "cv2_FM_RANSAC",
-    "lmeds": "cv2_FM_LMEDS",
-    "msac": "cv2_FM_RANSAC",
-    "usac": "cv2_USAC_DEFAULT",
-    "magsac": "cv2_USAC_MAGSAC",
-    "fmtorch": "poselib",
-}
-SEEDS = 2
 
 
 @pytest.fixture(scope="module")

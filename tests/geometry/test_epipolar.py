@@ -13,6 +13,14 @@ from tests.geometry.scenes import scenes, stacked
 from tests.reference import solvers as reference
 
 DISTANCES = ["symmetric_mean", "symmetric_max", "symmetric_squared", "sampson", "sampson_squared"]
+MATRIX, POINTS = (2, 3, 3), (2, 3, 2)
+SHAPES = {
+    **dict.fromkeys([*DISTANCES, "algebraic"], (MATRIX, POINTS, POINTS)),
+    "epipolar_lines": (MATRIX, POINTS),
+    "point_to_line": (POINTS, MATRIX),
+    "fundamental_from_calibration": (MATRIX, MATRIX, MATRIX, (2, 3)),
+    "fundamental_from_projections": ((2, 3, 4), (2, 3, 4)),
+}
 
 
 def up_to_sign(F: Tensor, like: Tensor) -> Tensor:
@@ -111,16 +119,6 @@ def random_inputs(*shapes: tuple[int, ...]) -> list[Tensor]:
     """Numbers of size one, for finite differences."""
     g = torch.Generator().manual_seed(0)
     return [torch.randn(*shape, generator=g, dtype=torch.float64).requires_grad_() for shape in shapes]
-
-
-MATRIX, POINTS = (2, 3, 3), (2, 3, 2)
-SHAPES = {
-    **dict.fromkeys([*DISTANCES, "algebraic"], (MATRIX, POINTS, POINTS)),
-    "epipolar_lines": (MATRIX, POINTS),
-    "point_to_line": (POINTS, MATRIX),
-    "fundamental_from_calibration": (MATRIX, MATRIX, MATRIX, (2, 3)),
-    "fundamental_from_projections": ((2, 3, 4), (2, 3, 4)),
-}
 
 
 @pytest.mark.parametrize("name", SHAPES)

@@ -26,6 +26,13 @@ from tests.reference import solvers as reference
 Kernel = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], int]
 SOLVERS: dict[str, tuple[Kernel, int, int]] = {"seven": (seven_point_kernel, 7, 3), "eight": (eight_point_kernel, 8, 1)}
 SAMPLES = 203  # not whole lanes
+DIFFERENT = [((1, -6, 11, -6), [1, 2, 3]), ((1, 0, 0, -8), [2]), ((1, 0, 1, 0), [0])]
+EQUAL = [((1, -3, 3, -1), [1, 1, 1]), ((1, 0, 0, 0), [0, 0, 0]), ((2, 0, 0, 0), [0, 0, 0]), ((0, 1, 0, 0), [0, 0])]
+QUADRATIC = [((0, 1, -3, 2), [1, 2]), ((0, 1, 0, 1), []), ((1e-12, 1, -3, 2), [-1e12 - 3, 1 + 1e-12, 2 - 8e-12])]
+LINEAR = [((0, 0, 2, -3), [1.5]), ((0, 0, 1, 0), [0]), ((0, 0, 0, 1), []), ((0, 0, 0, 0), [])]
+LARGE = ((1, -1e8, -1e8, 1), [-1, 1e-8 - 1e-16, 1e8 + 1 - 1e-8])
+SMALL = ((1e-9, 1e-9, -1, -1), [-31622.7766016838, -1, 31622.7766016838])
+NOT_FINITE = [((float("nan"), 1, 1, 1), []), ((float("inf"), 1, 1, 1), [])]
 
 
 def distance_to_nearest(F, solutions):
@@ -216,15 +223,6 @@ def roots_of(*coefficients):
     roots, valid = np.zeros(3), np.zeros(3, np.bool_)
     cubic_roots(np.array(coefficients, dtype=np.float64), roots, valid)
     return sorted(roots[valid].tolist())
-
-
-DIFFERENT = [((1, -6, 11, -6), [1, 2, 3]), ((1, 0, 0, -8), [2]), ((1, 0, 1, 0), [0])]
-EQUAL = [((1, -3, 3, -1), [1, 1, 1]), ((1, 0, 0, 0), [0, 0, 0]), ((2, 0, 0, 0), [0, 0, 0]), ((0, 1, 0, 0), [0, 0])]
-QUADRATIC = [((0, 1, -3, 2), [1, 2]), ((0, 1, 0, 1), []), ((1e-12, 1, -3, 2), [-1e12 - 3, 1 + 1e-12, 2 - 8e-12])]
-LINEAR = [((0, 0, 2, -3), [1.5]), ((0, 0, 1, 0), [0]), ((0, 0, 0, 1), []), ((0, 0, 0, 0), [])]
-LARGE = ((1, -1e8, -1e8, 1), [-1, 1e-8 - 1e-16, 1e8 + 1 - 1e-8])
-SMALL = ((1e-9, 1e-9, -1, -1), [-31622.7766016838, -1, 31622.7766016838])
-NOT_FINITE = [((float("nan"), 1, 1, 1), []), ((float("inf"), 1, 1, 1), [])]
 
 
 @pytest.mark.parametrize(

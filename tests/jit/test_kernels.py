@@ -55,6 +55,7 @@ def answered(flags: I8x1, rounds: int):
 """
 REPOSITORY = Path(__file__).resolve().parents[2]
 numba = pytest.importorskip("numba", reason="numba is not installed")
+EXPECTED = [[2, 8], [18, 32]]
 
 
 @pytest.fixture(autouse=True)
@@ -88,9 +89,6 @@ def result(module: types.ModuleType) -> list[list[float]]:
     out = np.zeros_like(x)
     module.rows(x, out)
     return out.tolist()
-
-
-EXPECTED = [[2, 8], [18, 32]]
 
 
 def refused(*_: object, **options: object) -> int:

@@ -24,7 +24,6 @@ RATIO = "pruner.ratio.families"
 
 @pytest.fixture
 def own(tmp_path: Path) -> Path:
-    """A file of a user's own."""
     (tmp_path / "estimator").mkdir()
     return tmp_path / "estimator" / "own.yaml"
 

@@ -26,6 +26,7 @@ from tests.variants import built
 
 SIZE = (640, 960)  # of the images of a scene
 NUMBERS = {"usual": 4.06, "radius": 15.0, "slope": 0.65}
+PER_MATCH = ("x0", "x1", "ratio", "prior", "lafs0", "lafs1", "mutual")
 
 
 def test_ratio_is_strict_and_refuses_nan() -> None:
@@ -77,9 +78,6 @@ def test_stages_are_their_functions_need_their_fields_and_keep_the_rest() -> Non
         assert torch.equal(out.x0, c.x0)
         with pytest.raises(ValueError, match=f"needs `{field}`"):
             stage(c.replace(**{field: None}))
-
-
-PER_MATCH = ("x0", "x1", "ratio", "prior", "lafs0", "lafs1", "mutual")
 
 
 def edge_cases() -> dict[str, Correspondences]:

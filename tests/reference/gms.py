@@ -69,7 +69,6 @@ def run(p0: np.ndarray, p1: np.ndarray, scale: float, turn: int, factor: float, 
 
 
 def hypotheses(searched: bool) -> list[tuple[float, int]]:
-    """Scales and turns."""
     return list(itertools.product(SCALES, range(8))) if searched else [(1.0, 0)]
 
 

@@ -50,7 +50,6 @@ class Cameras:
 
 
 def residuals(cameras: Cameras, x0: np.ndarray, x1: np.ndarray) -> np.ndarray:
-    """Signed Sampson distances (n,) in pixels."""
     return sampson(cameras.fundamental(), x0, x1)
 
 

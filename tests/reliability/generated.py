@@ -53,6 +53,13 @@ PAIRS_OF_FOCALS = ((0, 0.1), (800.0, 0.1), ((800, 0), None))
 FOCALS = (*[None] * 3, "shared", "unknown", 0.05, *PAIRS_OF_FOCALS, -1.0, "same", np.nan, [])
 """What may be said of focal lengths, and what may not."""
 pruner = functools.cache(quick_pruner)
+FIELDS: Mapping[str, tuple[str, tuple[str, ...]]] = {
+    "x0": ("Float", ("b", "n", "2")), "x1": ("Float", ("b", "n", "2")), "mask": ("Bool", ("b", "n")),
+    "ratio": ("Float", ("b", "n")), "prior": ("Float", ("b", "n")), "noise": ("Float", ("b", "n")),
+    "lafs0": ("Float", ("b", "n", "2", "3")), "lafs1": ("Float", ("b", "n", "2", "3")),
+    "size0": ("Real", ("b", "2")), "size1": ("Real", ("b", "2")), "key": ("Int", ("b",)),
+}  # fmt: skip
+REQUIRED = ("x0", "x1", "mask")
 
 
 def mistaken(data: st.DataObject, arguments: dict[str, Any], numbers: dict[str, Any], *, movable: bool = True) -> bool:
@@ -134,15 +141,6 @@ def sound_result(name: str, clean: bool, result: Any) -> None:
             assert bool((known >= 0).all()), f"{name} is negative"
         if clean and name not in UNDEFINED:
             assert not bool(value.isnan().any()), f"{name} is NaN for finite arguments"
-
-
-FIELDS: Mapping[str, tuple[str, tuple[str, ...]]] = {
-    "x0": ("Float", ("b", "n", "2")), "x1": ("Float", ("b", "n", "2")), "mask": ("Bool", ("b", "n")),
-    "ratio": ("Float", ("b", "n")), "prior": ("Float", ("b", "n")), "noise": ("Float", ("b", "n")),
-    "lafs0": ("Float", ("b", "n", "2", "3")), "lafs1": ("Float", ("b", "n", "2", "3")),
-    "size0": ("Real", ("b", "2")), "size1": ("Real", ("b", "2")), "key": ("Int", ("b",)),
-}  # fmt: skip
-REQUIRED = ("x0", "x1", "mask")
 
 
 def fields(data: st.DataObject, scene: Scene, kind: str) -> dict[str, Any]:

@@ -50,7 +50,6 @@ def damaged(file: Path, count: int) -> Iterator[bool]:
 
 
 def run_folder(path: Path) -> RunFolder:
-    """A run with rows."""
     run = RunFolder.open(path, {"pipeline": "sift", "seed": 0, "pruner": [{"ratio": {"threshold": 0.8}}]})
     names = [f"a/{i}" for i in range(8)]
     run.append([PairRow(n, pair_key(n), "a", "b", True, nsgd=0.01 * i, F=[0.1 * i] * 9) for i, n in enumerate(names)])

@@ -18,7 +18,6 @@ from tests.reliability.conftest import Rows, evaluation, parts, results
 
 
 def may_mount() -> bool:
-    """Whether this process may mount a file system."""
     if not sys.platform.startswith("linux"):
         return False
     probe = "mount -t tmpfs -o size=4k tmpfs /mnt"  # in a name space of its own

@@ -27,6 +27,23 @@ PAIRS = [scene(i, count) for i, count in enumerate((60, 90, 40))]
 FAST = {"estimator": "msac", "hypotheses": 100}
 SCENE = known_cameras.scene(7, 200, noise=0.2)
 EASY = {"estimator": "msac", "hypotheses": 300}
+WRONG = [
+    ("prior", 1.5, r"prior of match 3 of pair 1 is 1\.5; it is P\(inlier\), within \[0, 1\]"),
+    ("prior", -0.1, "prior of match 3 of pair 1 is -0.1"),
+    ("prior", float("nan"), "prior of match 3 of pair 1 is nan"),
+    ("noise", 0.0, r"noise of match 3 of pair 1 is 0\.0; it is a standard deviation, positive"),
+    ("noise", -1.0, "noise of match 3 of pair 1 is -1"),
+    ("noise", float("nan"), "noise of match 3 of pair 1 is nan"),
+    ("size0", 0, r"size0 is \(640, 0\); image sizes \(h, w\) are positive"),
+    ("size1", -960, r"size1 is \(640, -960\); image sizes"),
+]
+WITHOUT = (*OTHER_LIBRARIES, "homography", "weighted_eight_point")
+OWN = [name for name in variants("estimator") if not name.startswith(WITHOUT)]
+C = scene(1, 60, outliers=0.2)
+
+
+REFUSED = {name: ("prior",) for name in OWN if name.startswith("paper/")} | {"paper/usac": ("x0", "prior")}
+"""Gradients that the final fit takes no account of: that of paper/usac is none, those of the others are unweighted."""
 
 
 def test_a_list_of_pairs_is_a_padded_batch() -> None:
@@ -231,18 +248,6 @@ def test_an_estimator_that_gives_no_matrix_makes_failed_rows(wrong: float, tmp_p
     assert first.corrs == 0
 
 
-WRONG = [
-    ("prior", 1.5, r"prior of match 3 of pair 1 is 1\.5; it is P\(inlier\), within \[0, 1\]"),
-    ("prior", -0.1, "prior of match 3 of pair 1 is -0.1"),
-    ("prior", float("nan"), "prior of match 3 of pair 1 is nan"),
-    ("noise", 0.0, r"noise of match 3 of pair 1 is 0\.0; it is a standard deviation, positive"),
-    ("noise", -1.0, "noise of match 3 of pair 1 is -1"),
-    ("noise", float("nan"), "noise of match 3 of pair 1 is nan"),
-    ("size0", 0, r"size0 is \(640, 0\); image sizes \(h, w\) are positive"),
-    ("size1", -960, r"size1 is \(640, -960\); image sizes"),
-]
-
-
 def with_wrong(name: str, value: float) -> Correspondences:
     """Two pairs, of which the second has a wrong value of the field."""
     c = collate([scene(0, 60), scene(1, 60)]).replace(noise=torch.ones(2, 60))
@@ -291,15 +296,6 @@ def test_metrics_refuse_sizes_of_no_image(metric: str, wrong: list[float]) -> No
     for name, given in (("size0", (sizes, sound)), ("size1", (sound, sizes))):
         with pytest.raises(ValueError, match=rf"{name} is \(.*\); image sizes \(h, w\) are positive"):
             function(*points, *given)
-
-
-WITHOUT = (*OTHER_LIBRARIES, "homography", "weighted_eight_point")
-OWN = [name for name in variants("estimator") if not name.startswith(WITHOUT)]
-C = scene(1, 60, outliers=0.2)
-
-
-REFUSED = {name: ("prior",) for name in OWN if name.startswith("paper/")} | {"paper/usac": ("x0", "prior")}
-"""Gradients that the final fit takes no account of: that of paper/usac is none, those of the others are unweighted."""
 
 
 @pytest.mark.parametrize("name", OWN)

@@ -30,6 +30,14 @@ Sizes = tuple[tuple[int, int], tuple[int, int]]
 SIZES = [(WIDE, WIDE), (WIDE, TALL)]
 ROUNDS = 6
 FOCAL = {"sampler": "prior", "select": {"scale": 1.0}, "threshold": 1.5}
+KNOWN = {
+    "nothing": (math.inf, math.inf), "one": (0.0, math.inf), "the other roughly": (math.inf, 0.1),
+    "both": (0.001, 0.01), "both roughly": (0.06, 0.06),
+}  # fmt: skip
+"""Deviations of measured focal lengths."""
+EXACT = 1e-5  # deviation that stands for 0
+COUNT = 4000
+STANDARD_ERROR = 0.5 / math.sqrt(COUNT)  # of a share of the draws, at most
 
 
 class Photographs(NamedTuple):
@@ -65,7 +73,6 @@ def photographs(
 
 
 def with_prior(c: Correspondences, seed: int = 0) -> Correspondences:
-    """Random priors."""
     prior = np.random.default_rng(seed).uniform(0.1, 1, tuple(c.mask.shape))
     return c.replace(prior=torch.from_numpy(prior))
 
@@ -123,16 +130,6 @@ def test_unknown_sizes_are_searched_without_assumptions() -> None:
     assert bool(estimate.ok[0])
     assert torch.equal(estimate.F, presets.build("estimator", "fmtorch", focal=None)(bare, 0).F)
     assert error(estimate.F, pair) < 0.05
-
-
-KNOWN = {
-    "nothing": (math.inf, math.inf), "one": (0.0, math.inf), "the other roughly": (math.inf, 0.1),
-    "both": (0.001, 0.01), "both roughly": (0.06, 0.06),
-}  # fmt: skip
-"""Deviations of measured focal lengths."""
-EXACT = 1e-5  # deviation that stands for 0
-COUNT = 4000
-STANDARD_ERROR = 0.5 / math.sqrt(COUNT)  # of a share of the draws, at most
 
 
 @pytest.mark.parametrize("same", [True, False])

@@ -114,9 +114,8 @@ BEFORE = [LC(side=["ratio"], blocks=4), DFE(side=["ratio"], widths=(16, 32, 8))]
 def test_padding_and_neighbours_change_a_networks_values_by_rounding_alone(network):
     """At inference; NaN in masked slots. `LearnedPruner` has the same bits."""
     counts, network = (60, 1, 100, 30), network.eval()
-    c = collate([scene(i, count=n) for i, n in enumerate(counts)])
     with torch.no_grad():
-        together = network(c.replace(x1=torch.where(c.mask[..., None], c.x1, torch.nan)))
+        together = network(matches(counts))
         for i, n in enumerate(counts):
             alone = network(scene(i, count=n))
             torch.testing.assert_close(together.logit[:, i, :n], alone.logit[:, 0], rtol=1e-4, atol=1e-4)

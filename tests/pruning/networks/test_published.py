@@ -117,7 +117,8 @@ def test_a_step_of_training_has_finite_gradients_and_repeats(name: str) -> None:
     """With pairs of 7 to 20 matches, degenerate ones and none, under the whole objective, also in mixed precision."""
     sound = exact(0, 40, pairs=1).correspondences
     few = [exact(n, n).correspondences for n in (7, 8, 13, 20)]
-    c = collate([plain(pair) for pair in (sound, *few, *degenerate().values())])
+    pairs = (sound, *few, *degenerate().values())
+    c = collate([Correspondences(p.x0.float(), p.x1.float(), p.mask, size0=p.size0, size1=p.size1) for p in pairs])
     label = torch.where(c.mask, torch.arange(c.mask.shape[1]) % 2, -1).to(torch.int8)
     batch = LabelledMatches(c, label, exact(0, 40).F.expand(len(c.mask), 3, 3))
     for mixed in (False, True):
@@ -133,11 +134,6 @@ def test_a_step_of_training_has_finite_gradients_and_repeats(name: str) -> None:
         assert all(torch.isfinite(value).all() for value in outcomes[0] if value is not None)
         assert sum(value is None for value in outcomes[0]) == 0
         assert all(torch.equal(a, b) for a, b in zip(*outcomes, strict=True))
-
-
-def plain(c: Correspondences) -> Correspondences:
-    """Points and sizes alone, in single precision."""
-    return Correspondences(c.x0.float(), c.x1.float(), c.mask, size0=c.size0, size1=c.size1)
 
 
 def expanded(pattern: str) -> Iterator[str]:
