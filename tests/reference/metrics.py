@@ -25,9 +25,9 @@ def border_points(line: Array, size: Array, origin: float) -> tuple[Array, Array
     """Where a line enters and leaves an image, from left to right (a vertical one downwards); None where it misses."""
     a, b, c = line
     low, high = origin, origin + np.array([size[1], size[0]])
-    points = [(x, -(a * x + c) / b) for x in (low, high[0]) if b != 0]
-    points += [(-(b * y + c) / a, y) for y in (low, high[1]) if a != 0]
-    points = [np.array(p) for p in points if low <= p[0] <= high[0] and low <= p[1] <= high[1]]
+    ends = [(x, -(a * x + c) / b) for x in (low, high[0]) if b != 0]
+    ends += [(-(b * y + c) / a, y) for y in (low, high[1]) if a != 0]
+    points = [np.array(p) for p in ends if low <= p[0] <= high[0] and low <= p[1] <= high[1]]
     if len(points) < 2:
         return None
     points.sort(key=tuple)

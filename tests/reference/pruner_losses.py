@@ -17,7 +17,8 @@ def context_batch_norm_relu(x: Tensor, mask: Tensor, weight: Tensor, bias: Tenso
     Yi et al., CVPR 2018, equations 2 and 3."""
     alone = torch.cat([instance_norm(x[None, :, b, mask[b]], eps=EPS)[0] for b in range(x.shape[1])], 1)
     # by columns of matches in the order of pairs, as the mask picks them
-    normal = batch_norm(alone.T, *(running or (None, None)), weight, bias, training=running is None, eps=EPS)
+    mean, variance = running or (None, None)
+    normal = batch_norm(alone.T, mean, variance, weight, bias, training=running is None, eps=EPS)
     padded = torch.zeros_like(x)
     padded[:, mask] = torch.relu(normal.T)
     return padded
