@@ -1,7 +1,5 @@
 """Where the tests find shared data: $FMTORCH_TEST_DATA, by default the folder `shared` beside the checkout."""
 
-from __future__ import annotations
-
 import contextlib
 import importlib
 import os

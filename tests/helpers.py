@@ -1,7 +1,5 @@
 """What several tests share: pictures, pairs and data sets on disk, a small pipeline, commands in this process."""
 
-from __future__ import annotations
-
 import sys
 import threading
 from collections.abc import Callable, Iterable, Sequence
@@ -81,7 +79,6 @@ def cross_matrix(t: np.ndarray) -> np.ndarray:
 
 
 def edit_lines(path: Path, change: Callable[[list[str]], list[str]]) -> None:
-    """Change the lines of a text file."""
     path.write_text("\n".join(change(path.read_text().splitlines())) + "\n")
 
 

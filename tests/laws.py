@@ -5,8 +5,6 @@
 3. No pair can take its batch down: degenerate pairs are told apart and leave the others alone.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from collections.abc import Callable, Mapping
@@ -21,16 +19,23 @@ from fmtorch.core import Correspondences, Estimator, ImagePruner, PairImages, Pr
 from fmtorch.core.stages import grey_pyramid
 from tests.variants import built, loaded, variants
 
-PEERS = {
-    name: package
-    for name in variants("estimator")
-    for package in presets.files.peer_packages(loaded("estimator", name))
-}
+NEEDED = {name: presets.files.peer_packages(loaded("estimator", name)) for name in variants("estimator")}
+PEERS = {name: package for name, packages in NEEDED.items() for package in packages}
 """The packages of the extra `peers` that presets of estimators need, by the presets' names."""
 SMALL_KINDS = ("collinear", "collinear in image 1", "planar", "coincident", "half coincident")
 
 FEW_OF_PEERS = {"iterations": 1000, "min_iterations": 100, "rounds": 2}
 Result = dict[str, Tensor]  # every value has the batch as its first dimension; masks (B, N) may be padded on the right
+KNOWLEDGE: dict[str, Any] = {"exact": (0.0, 0.0), "rough": (0.05, 0.05), "one": (0.0, float("inf")), "shared": None}
+"""Deviations of the two focal lengths, as parts of them; None: unknown and equal."""
+SMALL_NETWORKS = {
+    "fmtorch.pruning.networks.LC": {"channels": 16, "blocks": 2},
+    "fmtorch.pruning.networks.DFE": {"widths": [16, 8], "iterations": 3},
+    "fmtorch.pruning.networks.OANet": {"channels": 16, "blocks": 8, "clusters": 10},
+    "fmtorch.pruning.networks.CLNet": {"channels": 16},
+    "fmtorch.pruning.networks.NCMNet": {"channels": 16, "clusters": 10},
+    "fmtorch.pruning.networks.ConvMatch": {"channels": 16, "layers": 2, "grid": 4},
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,16 +65,6 @@ def quick(name: str, hypotheses: int = 200, round: int = 100) -> Estimator:
     return estimator
 
 
-SMALL_NETWORKS = {
-    "fmtorch.pruning.networks.LC": {"channels": 16, "blocks": 2},
-    "fmtorch.pruning.networks.DFE": {"widths": [16, 8], "iterations": 3},
-    "fmtorch.pruning.networks.OANet": {"channels": 16, "blocks": 8, "clusters": 10},
-    "fmtorch.pruning.networks.CLNet": {"channels": 16},
-    "fmtorch.pruning.networks.NCMNet": {"channels": 16, "clusters": 10},
-    "fmtorch.pruning.networks.ConvMatch": {"channels": 16, "layers": 2, "grid": 4},
-}
-
-
 def quick_pruner(name: str) -> Pruner:
     """A pruner preset; a learned one with a small untrained network, on which the laws do not depend."""
     network = loaded("pruner", name).get("network")
@@ -96,10 +91,6 @@ def calibrated(c: Correspondences) -> Correspondences:
     """The same pairs with the calibration matrices of `scene`, which some learned pruners need."""
     K = torch.tensor([[800.0, 0, 480], [0, 800, 320], [0, 0, 1]], device=c.mask.device).expand(len(c), 3, 3)
     return c.replace(K0=K, K1=K)
-
-
-KNOWLEDGE: dict[str, Any] = {"exact": (0.0, 0.0), "rough": (0.05, 0.05), "one": (0.0, float("inf")), "shared": None}
-"""Deviations of the two focal lengths, as parts of them; None: unknown and equal."""
 
 
 def with_knowledge(c: Correspondences, known: str) -> Correspondences:

@@ -33,8 +33,6 @@ def alive(pid: int) -> bool:
 
 
 class Command:
-    """A command that runs."""
-
     def __init__(self, starter: Starter, pid: int, log: Path) -> None:
         self._starter, self.pid, self.log = starter, pid, log
         self.status: int | None = None
@@ -46,7 +44,6 @@ class Command:
         return self.wait() == -signal.SIGKILL
 
     def wait(self) -> int:
-        """The exit status."""
         if self.status is None:
             self.status = self._starter.ask({"wait": self.pid})
         return self.status
@@ -117,7 +114,6 @@ class Starter:
         return command
 
     def close(self) -> None:
-        """End the process."""
         assert self._process.stdin is not None
         self._process.stdin.close()
         self._process.wait()

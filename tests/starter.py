@@ -7,8 +7,6 @@ Lines of JSON come in on standard input: ``{"start": [module or -c, arguments ..
 status. What is forked runs a module as ``python -m`` does, or what follows ``-c``, after the code.
 """
 
-from __future__ import annotations
-
 import contextlib
 import importlib
 import json

@@ -6,13 +6,12 @@ stand for them.
 """
 
 import ast
-import functools
-from pathlib import Path
+from collections.abc import Iterable
 
 import pytest
 
-REPOSITORY = Path(__file__).resolve().parents[1]
-PACKAGE = REPOSITORY / "fmtorch"
+from tests.test_imports import FILES, PACKAGE, last_name, libraries, nodes
+
 DECORATORS = {"kernel", "inner", "njit", "jit"}
 INEXACT = {
     "acos", "acosh", "arccos", "arccosh", "arcsin", "arcsinh", "arctan", "arctan2", "arctanh", "asin", "asinh", "atan",
@@ -27,37 +26,25 @@ ROOMS = ("estimators", "geometry", "matching", "metrics", "pruning")
 NETWORKS = ("pruning/networks/", "pruning/code.py")  # values that agree to rounding only, docs/concepts/conventions.md
 
 
-@functools.cache
-def trees() -> dict[str, ast.Module]:
-    """The files of the package."""
-    return {path.relative_to(PACKAGE).as_posix(): ast.parse(path.read_text()) for path in PACKAGE.rglob("*.py")}
+NAMES = {module: path.relative_to(PACKAGE).as_posix() for module, path in FILES.items()}
+REFUSED = (
+    "from math import log;math.exp(x);np.log1p(x);np.einsum('ij,j', x, y);np.linalg.norm(x);"
+    "x @ y;x.dot(y);x**y;x**3;2.5**x;pow(x, y)"
+)
+TAKEN = "math.sqrt(x);x * y + np.abs(z);x**2;2**0.5;2.0**x;np.square(x);math.frexp(x)"
 
 
-def kernels(tree: ast.Module) -> list[ast.AST]:
+def kernels(file: Iterable[ast.AST]) -> list[ast.FunctionDef]:
     """The functions that are decorated as kernels, or as ones for kernels to call."""
-    functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
+    functions = [node for node in file if isinstance(node, ast.FunctionDef)]
     return [f for f in functions if any(last_name(decorator) in DECORATORS for decorator in f.decorator_list)]
 
 
-def imports_torch(tree: ast.Module) -> bool:
-    imports = [node for node in ast.walk(tree) if isinstance(node, ast.Import | ast.ImportFrom)]
-    names = [alias.name for node in imports if isinstance(node, ast.Import) for alias in node.names]
-    names += [node.module or "" for node in imports if isinstance(node, ast.ImportFrom)]
-    return any(name.split(".")[0] == "torch" for name in names)
-
-
-def last_name(node: ast.expr) -> str:
-    """``inner`` of ``@inner``, ``@numba.inner`` and ``@inner(inline=True)``."""
-    if isinstance(node, ast.Call):
-        node = node.func
-    return node.attr if isinstance(node, ast.Attribute) else node.id if isinstance(node, ast.Name) else ""
-
-
-def inexact(tree: ast.AST) -> list[tuple[int, str]]:
+def inexact(part: Iterable[ast.AST]) -> list[tuple[int, str]]:
     """The lines and names of what processors round differently."""
     modules = {"math", "np", "numpy", "linalg", "fft"}
     operations = []
-    for node in ast.walk(tree):
+    for node in part:
         if isinstance(node, ast.Attribute):
             of_library = isinstance(node.value, ast.Name | ast.Attribute) and last_name(node.value) in modules
             if (of_library and node.attr in INEXACT | SUMS | {"linalg", "fft"}) or node.attr in ("dot", "matmul"):
@@ -81,11 +68,11 @@ def exact_power(node: ast.BinOp) -> bool:
     return of_base == 2 or of_exponent == 2 or None not in (of_base, of_exponent)
 
 
-def roots(tree: ast.Module) -> list[int]:
+def roots(file: Iterable[ast.AST]) -> list[int]:
     """The lines of `torch.sqrt`, ``x.sqrt()`` and ``x.norm()`` of tensors."""
     return [
         node.lineno
-        for node in ast.walk(tree)
+        for node in file
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute)
         and node.func.attr in ("sqrt", "sqrt_", "norm", "hypot", "cdist")
         and not (isinstance(node.func.value, ast.Name) and node.func.value.id in ("math", "np"))
@@ -94,34 +81,28 @@ def roots(tree: ast.Module) -> list[int]:
 
 def test_kernels_and_what_calls_them_take_exact_operations() -> None:
     violations = []
-    for name, tree in trees().items():
-        whole = name.startswith("estimators/") and not (imports_torch(tree) or PEERS in name)
-        for part in [tree] if whole else kernels(tree):
+    for module, name in NAMES.items():
+        file = nodes(FILES[module])
+        whole = name.startswith("estimators/") and not ("torch" in libraries(module) or PEERS in name)
+        for part in [file] if whole else map(ast.walk, kernels(file)):
             violations += [f"{name}:{line}: {what}" for line, what in inexact(part)]
     assert not violations, "see fmtorch/geometry/arithmetic.py"
 
 
 def test_tensors_of_values_take_the_exact_root() -> None:
     others = (*NETWORKS, PEERS, "geometry/arithmetic.py")
-    held = ((name, tree) for name, tree in trees().items() if name.startswith(ROOMS) and not name.startswith(others))
-    violations = [f"{name}:{line}" for name, tree in held for line in roots(tree)]
+    held = ((m, name) for m, name in NAMES.items() if name.startswith(ROOMS) and not name.startswith(others))
+    violations = [f"{name}:{line}" for module, name in held for line in roots(nodes(FILES[module]))]
     assert not violations, "take fmtorch.geometry.arithmetic.sqrt"
-
-
-REFUSED = (
-    "from math import log;math.exp(x);np.log1p(x);np.einsum('ij,j', x, y);np.linalg.norm(x);"
-    "x @ y;x.dot(y);x**y;x**3;2.5**x;pow(x, y)"
-)
-TAKEN = "math.sqrt(x);x * y + np.abs(z);x**2;2**0.5;2.0**x;np.square(x);math.frexp(x)"
 
 
 def test_what_is_refused() -> None:
     for lines, refused in ((REFUSED, True), (TAKEN, False)):
         for line in lines.split(";"):
-            assert bool(inexact(ast.parse(line))) == refused, line
+            assert bool(inexact(ast.walk(ast.parse(line)))) == refused, line
 
 
 @pytest.mark.parametrize("line", ["@kernel('f8')", "@inner", "@inner(inline=True)", "@numba.njit"])
 def test_kernels_are_found_by_their_decorators(line: str) -> None:
-    assert kernels(ast.parse(f"{line}\ndef f(x): ..."))
-    assert not kernels(ast.parse("@functools.cache\ndef f(x): ..."))
+    assert kernels(ast.parse(f"{line}\ndef f(x): ...").body)
+    assert not kernels(ast.parse("@functools.cache\ndef f(x): ...").body)

@@ -15,6 +15,7 @@ from fmtorch.geometry.pair_type import pair_evidence
 from tests.geometry.scenes import scene
 
 SLOTS = 40
+PER_MATCH = ("x0", "x1", "weight", "noise", "mask")
 
 
 class Pairs(namedtuple("Pairs", "x0 x1 weight noise mask F H K0 K1 R t key")):
@@ -22,9 +23,6 @@ class Pairs(namedtuple("Pairs", "x0 x1 weight noise mask F H K0 K1 R t key")):
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Self:
         return self._make(map(function, self))
-
-
-PER_MATCH = ("x0", "x1", "weight", "noise", "mask")
 
 
 @functools.cache

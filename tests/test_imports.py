@@ -36,15 +36,18 @@ MAY_IMPORT = {
 TORCH = {"torch", "torchvision", "torchmetrics", "kornia", "lightning"}  # the last four import the first
 NUMBA = {"numba", "llvmlite"}
 TENSORS_OF_ESTIMATORS = ("batch.py", "gradients.py", "irls.py", "external/")
+MAX_FILE, MAX_FUNCTION = 500, 60  # lines, lines without the docstring
+MAX_ARGUMENTS = 6  # of a kernel
+PAGE = Path(house.ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+MAX_FILES, MAX_MODULES = 6, 92
+ELSEWHERE = (
+    "PIL", "cv2", "hydra", "kornia", "matplotlib", "omegaconf", "onnxruntime", "pyarrow", "scipy.sparse", "skimage"
+)  # fmt: skip
 
 
-def module_name(path: Path) -> str:
-    """``fmtorch.core.types`` of ``fmtorch/core/types.py``, ``fmtorch.data`` of ``fmtorch/data/__init__.py``."""
-    parts = path.relative_to(PACKAGE.parent).with_suffix("").parts
-    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
-
-
-FILES = {module_name(path): path for path in sorted(PACKAGE.rglob("*.py"))}
+PATHS = [path.relative_to(PACKAGE.parent) for path in sorted(PACKAGE.rglob("*.py"))]
+FILES = {".".join(path.with_suffix("").parts).removesuffix(".__init__"): PACKAGE.parent / path for path in PATHS}
+"""By modules' names: fmtorch.core.types, fmtorch.data."""
 
 
 @functools.cache
@@ -111,8 +114,11 @@ def test_estimators_take_tensors_at_their_edges_alone() -> None:
     assert [path for path in tensors if not path.startswith(TENSORS_OF_ESTIMATORS)] == []
 
 
-MAX_FILE, MAX_FUNCTION = 500, 60  # lines, lines without the docstring
-MAX_ARGUMENTS = 6  # of a kernel
+def last_name(node: ast.expr) -> str:
+    """``inner`` of ``@inner``, ``@numba.inner`` and ``@inner(inline=True)``."""
+    if isinstance(node, ast.Call):
+        node = node.func
+    return node.attr if isinstance(node, ast.Attribute) else node.id if isinstance(node, ast.Name) else ""
 
 
 def functions() -> Iterator[tuple[str, ast.FunctionDef]]:
@@ -122,13 +128,13 @@ def functions() -> Iterator[tuple[str, ast.FunctionDef]]:
 
 def test_files_fit_in_the_head_and_functions_on_a_screen() -> None:
     assert [module for module, path in FILES.items() if path.read_bytes().count(b"\n") > MAX_FILE] == []
-    assert [name for name, function in functions() if _length(function) > MAX_FUNCTION] == []
+    assert [name for name, function in functions() if house.span(function) > MAX_FUNCTION] == []
 
 
 def test_kernels_take_few_arguments_whose_types_are_annotated() -> None:
     kernels, wrong = 0, []
     for name, function in functions():
-        if _is_kernel(function):
+        if any(last_name(decorator) == "kernel" for decorator in function.decorator_list):
             arguments = function.args
             right = len(arguments.args) <= MAX_ARGUMENTS and all(each.annotation for each in arguments.args)
             other = [*arguments.posonlyargs, *arguments.kwonlyargs, *arguments.defaults]
@@ -139,26 +145,6 @@ def test_kernels_take_few_arguments_whose_types_are_annotated() -> None:
     assert wrong == []
 
 
-def _is_kernel(function: ast.FunctionDef) -> bool:
-    """Whether it is decorated by ``@kernel`` or ``@kernel(...)``."""
-    decorators = [each.func if isinstance(each, ast.Call) else each for each in function.decorator_list]
-    return any(isinstance(each, ast.Name) and each.id == "kernel" for each in decorators)
-
-
-def _length(function: ast.FunctionDef) -> int:
-    """Lines of a function, its signature included and its docstring not."""
-    docstring = ast.get_docstring(function, clean=False)
-    lines = (function.end_lineno or 0) - function.lineno + 1
-    return lines - (len(docstring.splitlines()) if docstring else 0)
-
-
-PAGE = Path(house.ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
-MAX_FILES, MAX_MODULES = 6, 92
-ELSEWHERE = (
-    "PIL", "cv2", "hydra", "kornia", "matplotlib", "omegaconf", "onnxruntime", "pyarrow", "scipy.sparse", "skimage"
-)  # fmt: skip
-
-
 def test_the_road_of_a_pair_is_the_files_that_the_page_names() -> None:
     paragraph = PAGE[PAGE.index("**The road of a pair**") :].split("\n\n")[0]
     road = [file.removeprefix("fmtorch/") for file in house.road()]
@@ -166,7 +152,11 @@ def test_the_road_of_a_pair_is_the_files_that_the_page_names() -> None:
     assert len(road) <= MAX_FILES
 
 
-def test_a_process_that_estimates_loads_what_that_needs() -> None:
-    modules = house.loaded()
+def test_a_process_loads_what_it_needs() -> None:
+    """Compilers, torch's and numba, no earlier than the first estimate."""
+    names = "print(*sys.modules, '|')\n"
+    words = house.printed(f"import sys, fmtorch; fmtorch.find_fundamental; {names}{house.ESTIMATE}{names}")
+    before, modules, _ = (each.split() for each in " ".join(words).split("|"))
+    assert not {"torch._dynamo", "numba"} & {*before}
     assert [name for name in ELSEWHERE if name in modules] == []
     assert len([name for name in modules if name.partition(".")[0] == "fmtorch"]) <= MAX_MODULES

@@ -87,12 +87,11 @@ everything = pytest.mark.parametrize("subject", SUBJECTS, ids=[s.name for s in S
 def test_padding_is_invisible(subject: laws.Subject) -> None:
     """Garbage of three kinds in one batch, of one kind in each pair."""
     garbage = (float("nan"), 1e30, -7.0, float("nan"), 1e30)
-    padded = collate(
-        [laws.with_padding(laws.scenes()[i], np.random.default_rng(i), kind) for i, kind in enumerate(garbage)]
-    )
-    padded_result, expected = subject.run(padded), subject.run(laws.scenes())
+    plain = laws.scenes()
+    padded = collate([laws.with_padding(plain[i], np.random.default_rng(i), kind) for i, kind in enumerate(garbage)])
+    padded_result, expected = subject.run(padded), subject.run(plain)
     for i, kind in enumerate(garbage):
-        alone, unpadded = _row(padded_result, padded, i), _row(expected, laws.scenes(), i)
+        alone, unpadded = _row(padded_result, padded, i), _row(expected, plain, i)
         laws.assert_same(unpadded, alone, f"{subject.name}, pair {i} with {kind} in masked slots")
 
 
@@ -151,9 +150,8 @@ def test_batch_workers_and_threads_change_nothing(name: str) -> None:
         threaded = run(pairs)
     finally:
         torch.set_num_threads(threads)
-    laws.assert_same(
-        run(pairs[:5]), _part(threaded, list(range(5)), collate(pairs[:5])), f"{name}: 5, and 8 in threads"
-    )
+    five = _part(threaded, list(range(5)), collate(pairs[:5]))
+    laws.assert_same(run(pairs[:5]), five, f"{name}: 5, and 8 in threads")
     with ThreadPoolExecutor(4) as workers:
         for i, alone in enumerate(workers.map(lambda pair: run([pair]), pairs)):
             laws.assert_same(alone, _part(threaded, [i], pairs[i]), f"{name}: pair {i} alone, in one of four workers")

@@ -14,7 +14,11 @@ import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
+import fmtorch
+
 CHECKOUT = Path(__file__).resolve().parents[1]
+PYTHONS = [f"python3.{minor}" for minor in range(11, 15)]
+RELEASED = ("pyproject.toml", "fmtorch/core/version.py", "CITATION.cff", "CHANGELOG.md", "scripts/release")
 
 
 def _project() -> dict[str, object]:
@@ -58,18 +62,13 @@ def test_wheel_carries_the_package_with_its_folders(wheel: Path) -> None:
         assert files <= names
 
 
-def test_wheel_carries_the_licence(wheel: Path) -> None:
+def test_wheel_carries_the_licence_and_the_version(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         metadata = next(name for name in archive.namelist() if name.endswith(".dist-info/METADATA"))
         text = archive.read(metadata).decode()
         assert any(name.endswith("/LICENSE") for name in archive.namelist())
     assert "License-Expression: Apache-2.0" in text
-    assert f"Version: {_project()['version']}" in text
-
-
-def test_version_is_stated_once_more_and_the_same() -> None:
-    import fmtorch
-
+    assert f"Version: {fmtorch.__version__}" in text
     assert fmtorch.__version__ == _project()["version"]
 
 
@@ -89,42 +88,28 @@ def test_unpacked_wheel_finds_its_folders_from_any_directory(wheel: Path, tmp_pa
         archive.extractall(root)
     elsewhere = tmp_path / "elsewhere"
     (elsewhere / "conf").mkdir(parents=True)  # a user's own folder of that name must not be taken
-    code = (
-        "import fmtorch; from fmtorch.core import files; print(fmtorch.__file__, files.conf_dir(), files.models_dir())"
-    )
+    code = "import fmtorch.core.files as files; print(files.__file__, files.conf_dir(), files.models_dir())"
     done = subprocess.run(
         [sys.executable, "-c", code], cwd=elsewhere, env={**os.environ, "PYTHONPATH": str(root)},
         capture_output=True, text=True, check=True,
     )  # fmt: skip
     package = (root / "fmtorch").resolve()
-    expected = [package / "__init__.py", package / "conf", package / "models"]
+    expected = [package / "core" / "files.py", package / "conf", package / "models"]
     assert [Path(line) for line in done.stdout.split()] == expected
 
 
-def _pins() -> dict[str, str]:
-    lines = (CHECKOUT / "constraints.txt").read_text().splitlines()
-    pins = [line.split("==") for line in lines if line and not line.startswith("#")]
-    return {canonicalize_name(name): version for name, version in pins}
-
-
-def test_constraints_are_exact_and_portable() -> None:
-    for line in (CHECKOUT / "constraints.txt").read_text().splitlines():
-        # no local versions (2.13.0+cpu), which only some package indexes have
-        assert line.startswith("#") or re.fullmatch(r"[a-z0-9-]+==[0-9][0-9a-z.]*", line), line
-
-
-def test_constraints_pin_every_declared_dependency_within_its_range() -> None:
+def test_constraints_pin_every_declared_dependency_within_its_range_exactly_and_portably() -> None:
+    lines = [line for line in (CHECKOUT / "constraints.txt").read_text().splitlines() if not line.startswith("#")]
+    for line in lines:  # no local versions (2.13.0+cpu), which only some package indexes have
+        assert re.fullmatch(r"[a-z0-9-]+==[0-9][0-9a-z.]*", line), line
+    pins = {canonicalize_name(name): version for name, version in (line.split("==") for line in lines)}
     project = _project()
     extras = project["optional-dependencies"]
     declared = [*project["dependencies"], *extras["test"], *extras["dev"]]  # type: ignore[index,misc]
-    pins = _pins()
     for text in declared:
         requirement = Requirement(text)
         if requirement.name != "fmtorch":
             assert pins[canonicalize_name(requirement.name)] in requirement.specifier, text
-
-
-PYTHONS = [f"python3.{minor}" for minor in range(11, 15)]
 
 
 def _interpreter(name: str) -> str | None:
@@ -150,9 +135,6 @@ def test_the_wheel_is_installed_on_every_python_that_is_here(wheel: Path, python
         command = [tmp_path / "venv/bin/fmtorch", *words]
         done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
         assert (done.returncode, done.stderr) == (0, ""), words
-
-
-RELEASED = ("pyproject.toml", "fmtorch/core/version.py", "CITATION.cff", "CHANGELOG.md", "scripts/release")
 
 
 @pytest.fixture

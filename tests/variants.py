@@ -34,7 +34,6 @@ def variants(group: str) -> list[str]:
 
 
 def loaded(group: str, word: str) -> dict[str, Any]:
-    """The config of a preset or variant."""
     name, _, rest = word.partition(":")
     return merged(presets.load(group, name), options(rest))
 
@@ -46,5 +45,4 @@ def keywords(word: str) -> dict[str, Any]:
 
 
 def built(group: str, word: str, **changed: Any) -> Any:
-    """What it builds, with further options."""
     return instantiate(merged(loaded(group, word), changed), f"{group}={word}")

@@ -76,8 +76,6 @@ class Within2Px:
 
 
 class Sampled:
-    """Samples as they are."""
-
     uses_prior = False
 
     def __init__(self, sample: Any) -> None:
@@ -88,8 +86,6 @@ class Sampled:
 
 
 class Scored:
-    """Scores as they are."""
-
     prior_weighted = False
 
     def __init__(self, scores: Any) -> None:

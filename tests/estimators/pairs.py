@@ -18,6 +18,8 @@ SCALES = (1e-9, 1.0, 1e9)
 FEW = tuple(name for name in small() if not name.endswith(" coincident") or "half" in name)
 """Names of pairs of 7 to 20 matches, those included that determine no model, but not those refused unseen."""
 REAL = ("real 0", "real 7", "real 13")
+SUMS, ROW, LAST = 8, 3, 16
+"""Roundings of a term of x1' F x0; of one of F x0 or F' x1; of squares, their sum, a quotient and a product."""
 
 
 def normalized(c: Correspondences, seed: int = 0, minimal: int = 7, i: int = 0) -> tuple[Pair, Array] | str:
@@ -88,10 +90,6 @@ def apart(F: np.ndarray, G: np.ndarray) -> float:
     """The distance of two models (9,), of unit norm up to sign."""
     F, G = F.ravel() / np.linalg.norm(F), G.ravel() / np.linalg.norm(G)
     return float(min(np.linalg.norm(F - G), np.linalg.norm(F + G)))
-
-
-SUMS, ROW, LAST = 8, 3, 16
-"""Roundings of a term of x1' F x0; of one of F x0 or F' x1; of squares, their sum, a quotient and a product."""
 
 
 class Residuals(NamedTuple):

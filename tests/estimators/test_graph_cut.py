@@ -5,6 +5,7 @@ import functools
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.distance import cdist
 
 from fmtorch import estimators
 from fmtorch.core import Correspondences, collate
@@ -23,6 +24,13 @@ from tests.reference.random import number
 from tests.reference.solvers import eight_point, normalised_equations, unit
 
 NAMES = ("scene 40", "scene 300", *REAL)
+RADIUS = 20.0
+RECTIFIED = np.array([0, 0, 0, 0, 0, 1.0, 0, -1, 0])  # r^2 = (y1 - y0)^2 / 2
+PAIRS = 64
+COUNT = 200
+OPTIONS = {
+    "threshold": 1.0, "hypotheses": 200, "round": 100, "confidence": None, "pool": 4, "refine": {"loss": "truncated"},
+}  # fmt: skip
 
 
 def searched(pair: Pair) -> np.ndarray:
@@ -76,10 +84,6 @@ def test_a_model_is_its_best_fit_as_long_as_the_score_rises() -> None:
     assert min(rounds) < GraphCut.ITERATIONS < max(rounds)  # some stop by themselves, others could go on
 
 
-RADIUS = 20.0
-RECTIFIED = np.array([0, 0, 0, 0, 0, 1.0, 0, -1, 0])  # r^2 = (y1 - y0)^2 / 2
-
-
 @kernel
 def gaussian(F: F8x1, points: F8x2, scale: float, K: F4x1) -> None:
     """The kernel of residuals."""
@@ -114,15 +118,11 @@ def given(name: str) -> tuple[Pair, np.ndarray]:
     return pair, to_units(F, pair)
 
 
-def distances(pair: Pair) -> np.ndarray:
-    """Between all matches in (x0, y0, x1, y1), px."""
-    return np.linalg.norm((pair.points[:, :, None] - pair.points[:, None]) * pair.pixels_per_unit, axis=0)
-
-
 @pytest.mark.parametrize("name", REAL)
 def test_neighbours_are_within_the_radius_and_nearly_all_of_those(name: str) -> None:
     pair, _ = given(name)
-    edges, apart = edges_of(graph_cut.neighbor_graph(pair, RADIUS)), distances(pair)
+    edges = edges_of(graph_cut.neighbor_graph(pair, RADIUS))
+    apart = cdist(*[pair.points.T * pair.pixels_per_unit] * 2)
     assert all(apart[p, q] <= RADIUS * (1 + 1e-12) for p, q in edges)
     assert len(edges) > 0.95 * np.count_nonzero(np.triu(apart <= RADIUS, 1))  # SHIFTS: the two curves find 97 %
 
@@ -169,13 +169,6 @@ def test_labels_are_almost_those_of_the_exact_cut_on_real_pairs(epsilon: float, 
     assert np.mean(excess) < 1e-3
 
 
-PAIRS = 64
-COUNT = 200
-OPTIONS = {
-    "threshold": 1.0, "hypotheses": 200, "round": 100, "confidence": None, "pool": 4, "refine": {"loss": "truncated"},
-}  # fmt: skip
-
-
 @functools.cache
 def scene(index: int, off_plane: int = 20) -> tuple[Correspondences, np.ndarray]:
     """A pair with 25 % outliers and so many of its matches off a plane, and its F."""
@@ -199,9 +192,8 @@ def limit(pair: Pair) -> float:
 
 def transfers(H: np.ndarray, pair: Pair) -> np.ndarray:
     """Of all matches, in thresholds of a plane."""
-    x = pair.points.T
-    apart = [homography.transfer(H.reshape(3, 3), a[:2], a[2:]) for a in x]
-    return np.array(apart) * pair.pixels_per_unit / degensac.PLANE_THRESHOLD_PX
+    apart = homography.transfer(H.reshape(3, 3), pair.points[:2].T, pair.points[2:].T)
+    return apart * pair.pixels_per_unit / degensac.PLANE_THRESHOLD_PX
 
 
 def round_of(pair: Pair, count: int = 100) -> tuple[Hypotheses, Verified]:
@@ -316,10 +308,8 @@ def test_the_kernel_is_the_gaussian() -> None:
     z, K = np.linspace(0, 60, 5001), np.empty(5001, np.float32)
     gaussian(RECTIFIED, rectified(z), 1.0, K)
     # exp(-z) - (1 + z / n)^-n is z^2 exp(-z) / (2 n) at most, 0.27 / n; half a unit of rounding, and 1024 roundings.
-    assert (
-        np.abs(K - np.exp(-z / 2)).max()
-        < (0.28 / 2**graph_cut.HALVINGS) + graph_cut.UNIT / 2 + 2**graph_cut.HALVINGS * 2.0**-24
-    )
+    rounding = graph_cut.UNIT / 2 + 2**graph_cut.HALVINGS * 2.0**-24
+    assert np.abs(K - np.exp(-z / 2)).max() < 0.28 / 2**graph_cut.HALVINGS + rounding
     np.testing.assert_array_equal(K / graph_cut.UNIT, np.round(K / graph_cut.UNIT))
 
 
@@ -329,7 +319,5 @@ def test_a_model_of_all_matches_has_all_labels_and_one_of_none_has_none(name: st
     graph, labels = graph_cut.neighbor_graph(pair, RADIUS), np.empty(pair.count, np.bool_)
     graph_cut.label(models(pair, 2)[1], pair.points, 1e-30, graph, 0.1, labels)
     assert labels.all()
-    graph_cut.label(
-        np.array([0, 0, 0, 0, 0, 0, 0, 0, 1.0]), pair.points, 1.0, graph, 0.1, labels
-    )  # no point is on its line
+    graph_cut.label(np.eye(9)[8], pair.points, 1.0, graph, 0.1, labels)  # no point is on its line
     assert not labels.any()

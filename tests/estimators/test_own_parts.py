@@ -25,6 +25,13 @@ REPLACED: dict[str, dict[str, Any]] = {
 }
 PRESETS = ("msac", "fmtorch")
 OWN_PARTS = "tests.estimators.own_parts"
+MEDIAN = {"score": "median", "inliers": "lmeds", "confidence": None}
+ALIKE = {
+    "score": own_parts.Squares(1.0),
+    "compiled score": own_parts.CompiledSquares(1.0),
+    "sampler": own_parts.Same(),
+    "inliers": lambda squared_px, pair: squared_px <= 1.0,
+}
 
 
 def built(preset: str, parts: dict[str, Any], **options: Any) -> Any:
@@ -47,14 +54,6 @@ def test_estimates_are_as_good_as_with_built_in_parts(name: str, preset: str) ->
         alone = estimator(pairs[i])
         shared = {"F": own.F[i : i + 1], "inliers": own.inliers[i : i + 1]}
         assert_same({"F": alone.F, "inliers": alone.inliers}, shared, name)
-
-
-ALIKE = {
-    "score": own_parts.Squares(1.0),
-    "compiled score": own_parts.CompiledSquares(1.0),
-    "sampler": own_parts.Same(),
-    "inliers": lambda squared_px, pair: squared_px <= 1.0,
-}
 
 
 @pytest.mark.parametrize("names", [*([name] for name in ALIKE), ["compiled score", "sampler", "inliers"]])
@@ -91,12 +90,8 @@ def sampled(draw: Any) -> dict[str, Any]:
     return {"sampler": own_parts.Sampled(draw)}
 
 
-def scored(scores: Any) -> dict[str, Any]:
-    return {"score": own_parts.Scored(scores)}
-
-
-def gained(gain: Any) -> dict[str, Any]:
-    return {"score": Gain(gain)}
+def scored(scores: Any, part: Any = own_parts.Scored) -> dict[str, Any]:
+    return {"score": part(scores)}
 
 
 SAMPLES, GAINS = r"Sampled.draw returns .*", r"; it must be the shape of its argument, \(\d+, 60\): .* of numbers"
@@ -109,11 +104,11 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     (scored(lambda which: np.zeros(len(which) + 1)), r"Scored returns float64 \(\d+,\); it must be an array"),
     (scored(lambda which: np.zeros(len(which), np.float32)), "Scored returns float32"),
     (scored(lambda which: 1.0), "Scored returns float; it must be"),
-    (gained(lambda squared: squared[:, :3]), rf"Gain.gain returns shape \(\d+, 3\) of float32{GAINS}"),
-    (gained(lambda squared: squared.sum(1)), rf"Gain.gain returns shape \(\d+,\) of float32{GAINS}"),
-    (gained(lambda squared: 1.0), rf"shape \(\) of float64{GAINS}"),
-    (gained(lambda squared: squared + 0j), rf"shape \(\d+, 60\) of complex64{GAINS}"),
-    (gained(lambda squared: [["one"] * 60] * len(squared)), rf"shape \(\d+, 60\) of <U3{GAINS}"),
+    (scored(lambda squared: squared[:, :3], Gain), rf"Gain.gain returns shape \(\d+, 3\) of float32{GAINS}"),
+    (scored(lambda squared: squared.sum(1), Gain), rf"Gain.gain returns shape \(\d+,\) of float32{GAINS}"),
+    (scored(lambda squared: 1.0, Gain), rf"shape \(\) of float64{GAINS}"),
+    (scored(lambda squared: squared + 0j, Gain), rf"shape \(\d+, 60\) of complex64{GAINS}"),
+    (scored(lambda squared: [["one"] * 60] * len(squared), Gain), rf"shape \(\d+, 60\) of <U3{GAINS}"),
     ({"inliers": lambda r2, pair: r2}, r"function returns float64 \(60,\); it must be an array of bool \(60,\)"),
     ({"inliers": lambda r2, pair: (r2 <= 1)[:9]}, r"function returns bool \(9,\)"),
     ({"inliers": lambda r2, pair: [True] * len(r2)}, "function returns list"),
@@ -169,9 +164,6 @@ def test_parts_in_numpy_take_at_most_three_times_as_long(preset: str, tmp_path: 
     print(f"{preset}: {1000 * builtin:.2f} ms, with parts in NumPy {1000 * seconds:.2f} ms")
     assert draws == builtin_draws
     assert seconds < 3 * builtin
-
-
-MEDIAN = {"score": "median", "inliers": "lmeds", "confidence": None}
 
 
 @pytest.mark.parametrize(

@@ -22,6 +22,25 @@ from tests.laws import PEERS, degenerate, few, quick, scene, small, with_padding
 from tests.reference.random import number
 from tests.variants import OTHER_LIBRARIES, built, loaded, variants
 
+WRONG = {
+    "prior": ((1.5, -0.1, math.nan), "prior of 1 match is wrong: it is P(inlier), within [0, 1]"),
+    "noise": ((0.0, -1.0, math.nan), "noise of 1 match is wrong: it is a standard deviation, positive"),
+    "size0": ((0.0, -3.0, math.nan, math.inf), "size0 is wrong: image sizes (h, w) are positive"),
+}
+HOPELESS = ("empty", "one match", "all points equal", "NaN", "infinite")
+RANK_TWO = (*small(), "one plane", "identity", "all outliers", "all points equal")
+"""Pairs of usual coordinates, of which an F of unit norm in pixels has rank two to rounding."""
+EVERY = variants("estimator")
+SCALED = ("x0", "x1", "size0", "size1")
+OWN = [name for name in EVERY if not name.startswith(OTHER_LIBRARIES)]
+PARTS = [name for name in OWN if not name.startswith("paper/") or name in ("paper/ransac", "paper/usac")]
+"""Presets in which every part stands: those of the paper differ from their namesakes by the final fit alone."""
+PIXELS = [  # what is a distance in pixels and no option
+    (estimators.search, "PLANE_THRESHOLD_PX"), (with_focals, "INLIER_SIGMA_PX"), (with_focals, "LOSS_SCALE_PX"),
+    (with_focals, "PARALLEL_PX"), (estimators.inliers, "FLOOR_PX"), (estimators.GraphCut, "RADIUS_PX"),
+    (estimators.Fundamental, "fit_scale"), (estimators.Homography, "fit_scale"),
+]  # fmt: skip
+
 
 def padded_pairs() -> Correspondences:
     """Pairs of many sizes, with priors and noise on and beyond their bounds, with garbage in masked slots."""
@@ -51,9 +70,8 @@ def test_a_pair_holds_its_usable_matches_in_order(kind: str, scale: float) -> No
         values = {name: getattr(c, name) for name in ("prior", "noise", "ambiguity")}
         for name, value in values.items():
             assert (getattr(pair, name) is None) == (value is None) == (kind != "all")
-        prior, noise, _ = (
-            np.ones(pair.count) if value is None else value[i].double().numpy()[mask] for value in values.values()
-        )
+        usual = np.ones(pair.count)
+        prior, noise, _ = (usual if v is None else v[i].double().numpy()[mask] for v in values.values())
         noise = np.clip(noise, MIN_NOISE, MAX_NOISE)
         np.testing.assert_array_equal(pair.match_weight, prior)
         np.testing.assert_array_equal(pair.weight, prior / (noise * noise))
@@ -62,13 +80,6 @@ def test_a_pair_holds_its_usable_matches_in_order(kind: str, scale: float) -> No
         assert pair.sizes_known == (kind == "all")
         assert pair.table.flags.c_contiguous
         assert pair.table.dtype == np.float64
-
-
-WRONG = {
-    "prior": ((1.5, -0.1, math.nan), "prior of 1 match is wrong: it is P(inlier), within [0, 1]"),
-    "noise": ((0.0, -1.0, math.nan), "noise of 1 match is wrong: it is a standard deviation, positive"),
-    "size0": ((0.0, -3.0, math.nan, math.inf), "size0 is wrong: image sizes (h, w) are positive"),
-}
 
 
 @pytest.mark.parametrize("name", WRONG)
@@ -119,18 +130,6 @@ def test_a_part_of_a_pair_keeps_its_frame() -> None:
     assert part.cached("sum", lambda pair: float(pair.points.sum())) == part.points.sum()
 
 
-EVERY = variants("estimator")
-SCALED = ("x0", "x1", "size0", "size1")
-OWN = [name for name in EVERY if not name.startswith(OTHER_LIBRARIES)]
-PARTS = [name for name in OWN if not name.startswith("paper/") or name in ("paper/ransac", "paper/usac")]
-"""Presets in which every part stands: those of the paper differ from their namesakes by the final fit alone."""
-PIXELS = [  # what is a distance in pixels and no option
-    (estimators.search, "PLANE_THRESHOLD_PX"), (with_focals, "INLIER_SIGMA_PX"), (with_focals, "LOSS_SCALE_PX"),
-    (with_focals, "PARALLEL_PX"), (estimators.inliers, "FLOOR_PX"), (estimators.GraphCut, "RADIUS_PX"),
-    (estimators.Fundamental, "fit_scale"), (estimators.Homography, "fit_scale"),
-]  # fmt: skip
-
-
 def estimator(name: str) -> Any:
     if name in PEERS and importlib.util.find_spec(PEERS[name]) is None:
         pytest.skip(f"{PEERS[name]} (extra `peers`) is not installed")
@@ -153,11 +152,6 @@ def assert_supported(estimate: Estimate, c: Correspondences, what: str) -> None:
             spread = np.linalg.svd(image - image.mean(0), compute_uv=False)
             assert spread[1] > 1e-9 * spread[0], f"{what}, pair {i}"
         assert float(estimate.F[i].norm()) == pytest.approx(1), f"{what}, pair {i}"
-
-
-HOPELESS = ("empty", "one match", "all points equal", "NaN", "infinite")
-RANK_TWO = (*small(), "one plane", "identity", "all outliers", "all points equal")
-"""Pairs of usual coordinates, of which an F of unit norm in pixels has rank two to rounding."""
 
 
 @pytest.mark.parametrize("name", EVERY)

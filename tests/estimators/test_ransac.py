@@ -23,6 +23,19 @@ from tests.variants import OTHER_LIBRARIES, built, variants
 
 OTHERS = (*OTHER_LIBRARIES, "homography", "weighted_eight_point")  # the last one is not robust, and has no gradients
 OWN = [n for n in variants("estimator") if not n.startswith(OTHERS)]
+COARSE = Ransac(hypotheses=200, threshold=2.0)
+FINE = Ransac(hypotheses=100, solver="eight_point", score="median", confidence=None, inliers="lmeds")
+ESTIMATORS = [n for n in variants("estimator") if "_cpp" not in n and n != "homography"]
+NOT_ROBUST = ("irls:loss=huber", "irls:loss=cauchy")  # against three wrong matches in ten
+NAMESAKES = {
+    "ransac": "cv2_FM_RANSAC",
+    "lmeds": "cv2_FM_LMEDS",
+    "msac": "cv2_FM_RANSAC",
+    "usac": "cv2_USAC_DEFAULT",
+    "magsac": "cv2_USAC_MAGSAC",
+    "fmtorch": "poselib",
+}
+SEEDS = 2
 
 
 def _true_inlier_error(F: torch.Tensor, index: int, count: int) -> float:
@@ -86,7 +99,6 @@ def test_the_kernels_that_are_compiled_together_are_those_that_are_called(monkey
 
 
 def with_callees(kernels: set[Kernel[..., Any]]) -> set[Kernel[..., Any]]:
-    """Kernels, and those that they call."""
     reached, new = set[Kernel[..., Any]](), kernels
     while new:
         reached |= new
@@ -116,17 +128,6 @@ def test_the_same_without_compiling(monkeypatch: pytest.MonkeyPatch) -> None:
         np.testing.assert_allclose(interpreted, compiled[name], rtol=0, atol=1e-9, err_msg=name)
 
 
-NAMESAKES = {
-    "ransac": "cv2_FM_RANSAC",
-    "lmeds": "cv2_FM_LMEDS",
-    "msac": "cv2_FM_RANSAC",
-    "usac": "cv2_USAC_DEFAULT",
-    "magsac": "cv2_USAC_MAGSAC",
-    "fmtorch": "poselib",
-}
-SEEDS = 2
-
-
 @pytest.fixture(scope="module")
 def file() -> dict[str, np.ndarray]:
     return oracle("robust.npz")
@@ -148,10 +149,6 @@ def test_solves_as_many_pairs_as_its_namesake(name, file):
     # the sample shows no spread.
     margin = 2 * np.std(ours - theirs, ddof=1) / np.sqrt(count) + 1 / count
     assert ours.mean() >= theirs.mean() - margin
-
-
-COARSE = Ransac(hypotheses=200, threshold=2.0)
-FINE = Ransac(hypotheses=100, solver="eight_point", score="median", confidence=None, inliers="lmeds")
 
 
 def test_equals_the_two_by_hand() -> None:
@@ -273,10 +270,6 @@ def test_the_paper_s_presets_ignore_the_prior(name: str) -> None:
     assert not F.requires_grad
 
 
-ESTIMATORS = [n for n in variants("estimator") if "_cpp" not in n and n != "homography"]
-NOT_ROBUST = ("irls:loss=huber", "irls:loss=cauchy")  # against three wrong matches in ten
-
-
 @functools.cache
 def chance() -> Correspondences:
     """Pairs that show nothing in common: as many matches as unrelated photographs have, with ratios of wrong ones."""
@@ -307,41 +300,17 @@ def test_every_estimator_tells_scenes_from_chance(name: str) -> None:
         assert int(estimate.related[chances:].sum()) >= len(common()) - 1, estimate.significance[chances:]
 
 
-def test_coarse_to_fine_is_judged_by_all_matches() -> None:
-    """The inliers of a first estimator agree by selection, and are no evidence for the second one."""
-    c = chance()
-    coarse = quick("ransac", 400, 200)
-    fine = quick("lmeds", 200, 100)
-    kept = c.keep(coarse(c).inliers)
-    assert float(fine(kept).significance.max()) > float(quick("cf_ransac", 400, 200)(c).significance.max())
-
-
-def silent(c: Correspondences, seed: int = 0) -> Estimate:
-    """An estimator of a user's own, which knows nothing of significance."""
-    known = quick("ransac", 200, 100)(c, seed)
-    return Estimate(known.F, known.inliers, known.ok, known.reason, known.samples)
-
-
 def test_what_an_estimator_does_not_say_is_said_by_the_caller() -> None:
     c = common()
-    without = silent(c)
+    known = quick("ransac", 200, 100)(c)
+    without = Estimate(known.F, known.inliers, known.ok, known.reason, known.samples)
     assert bool(without.significance.isnan().all())
     assert not bool(without.related.any())
     with_significance = judged(without, c)
-    assert torch.equal(with_significance.significance, quick("ransac", 200, 100)(c).significance)
+    assert torch.equal(with_significance.significance, known.significance)
     assert bool(with_significance.related.all())
     own = without.replace(significance=torch.full((len(c),), 7.0, dtype=torch.float64))
     assert judged(own, c) is own
-
-
-def test_find_fundamental_tells() -> None:
-    c = collate([scene(1, 100, 0.3), scene(2, 40, 1.0)])
-    estimate = fmtorch.find_fundamental(c.x0, c.x1, mask=c.mask, ratio=c.ratio, size0=(640, 960), size1=(640, 960))
-    assert estimate.ok[0]
-    assert estimate.related.tolist() == [True, False]
-    assert estimate[1:].significance.tolist() == estimate.significance[1:].tolist()
-    rng = np.random.default_rng(0)
-    assert not bool(fmtorch.find_fundamental(*rng.uniform(0, 500, (2, 20, 2)), estimator="ransac").related[0])
 
 
 def test_of_many_likely_matches_a_part_is_searched_and_all_are_fitted(monkeypatch: pytest.MonkeyPatch) -> None:

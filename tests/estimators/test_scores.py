@@ -30,12 +30,11 @@ SCORES: dict[str, tuple[Any, Any]] = {
     "saturated": (estimators.SaturatedGains, reference.geman_mcclure),
 }
 GAIN_ROUNDING = 2.0**-21  # of a gain of about one: eight operations in float32
+RECTIFIED = np.array([[0, 0, 0, 0, 0, 1, 0, -1, 0]], np.float32)  # x1' F x0 = y0 - y1: r^2 = (y1 - y0)^2 / 2
 
 
-def bounds(
-    gain: Any, F: Any, pair: estimators.Pair, threshold: float, weighted: bool, saturated: bool = False
-) -> tuple[float, float]:
-    """Between what a sum of gains is, which fall with the residual, summed in float32."""
+def bounds(gain: Any, F: Any, pair: Any, threshold: float, weighted: bool, saturated: bool = False) -> Any:
+    """Between which two numbers a sum of gains is, which fall with the residual, summed in float32."""
     weight = pair.prior.astype(np.float32).tolist() if weighted and pair.prior is not None else [1.0] * pair.count
     r, bits = residuals(F, pair, threshold), fractional_bits(pair.count)
     low, high = r.low, r.high
@@ -43,10 +42,8 @@ def bounds(
         low, high = (np.sqrt(np.maximum(x**2 + d, 0)) for x, d in ((low, -0.5 / ENTRIES), (high, 0.5 / ENTRIES)))
     gains = [max(gain(x) - GAIN_ROUNDING, 0) for x in high], [gain(x) + GAIN_ROUNDING for x in low]
     if saturated:
-        lower, most = (reference.saturated(each, weight, cells_of(pair, weighted), bits) for each in gains)
-    else:
-        lower, most = (reference.summed(each, weight, bits) for each in gains)
-    return lower, most
+        return [reference.saturated(each, weight, cells_of(pair, weighted), bits) for each in gains]
+    return [reference.summed(each, weight, bits) for each in gains]
 
 
 @pytest.mark.parametrize("weighted", [False, True])
@@ -145,9 +142,6 @@ def test_cells_are_those_of_the_grid_over_the_matches_of_weight(given: str, weig
             assert given in FEW or certain.mean() > 0.99
             x, y = cell[2 * image, certain], cell[2 * image + 1, certain]
             np.testing.assert_array_equal(cells[image, certain], x + GRID * y)
-
-
-RECTIFIED = np.array([[0, 0, 0, 0, 0, 1, 0, -1, 0]], np.float32)  # x1' F x0 = y0 - y1: r^2 = (y1 - y0)^2 / 2
 
 
 @pytest.mark.parametrize("given", ["scene 40", "scene 151", "scene 700", "real 7", *FEW])

@@ -18,6 +18,9 @@ from tests.reference import ransac as reference
 from tests.reference import solvers
 from tests.reference.random import number
 
+SEED = 3
+EPS32 = 2.0**-23
+
 
 @dataclasses.dataclass
 class Told(estimators.StoppingRule):
@@ -117,17 +120,11 @@ def test_a_search_goes_on_while_no_sample_gave_a_model() -> None:
     assert pool.samples == 150
 
 
-SEED = 3
-
-
-def numbers(pair: estimators.Pair) -> list[int]:
-    return [number(pair.seed, pair.key, Stream.PRESELECTION, 0, i, 1) for i in range(pair.count)]
-
-
 @pytest.mark.parametrize("given", ["scene 40", "scene 129", "scene 700", "7 random", "20 collinear"])
 def test_few_matches_are_those_of_the_definitions(given: str) -> None:
     pair = named(given, seed=SEED)
-    n, words, prior = pair.count, numbers(pair), pair.prior.copy()
+    n, prior = pair.count, pair.prior.copy()
+    words = [number(SEED, pair.key, Stream.PRESELECTION, 0, i, 1) for i in range(n)]
     for count in (1, 5, n - 1, n, 2 * n):
         any_few, likely = preselection.shuffled_first(pair, count), preselection.drawn_by_prior(pair, count)
         np.testing.assert_array_equal(any_few.table, pair.table[:, reference.shuffled(range(n), words, count)])
@@ -147,9 +144,8 @@ def test_the_models_that_pass_are_the_best_on_few_matches(given: str, kind: str)
     pair, options = named(given, seed=SEED), estimators.Preselect(matches=64, survivors=20)
     F = models(pair, 120).astype(np.float32)
     which, scores = Preselection(score, options)(F, pair)
-    draw = (
-        preselection.drawn_by_prior if score.prior_weighted and pair.prior is not None else preselection.shuffled_first
-    )
+    by_prior = score.prior_weighted and pair.prior is not None
+    draw = preselection.drawn_by_prior if by_prior else preselection.shuffled_first
     first = getattr(score, "preselection", score)(F, np.arange(120), draw(pair, 64))
     np.testing.assert_array_equal(which, np.sort(np.argsort(-first, kind="stable")[:20]))
     np.testing.assert_array_equal(scores, score(F, np.arange(120), pair)[which])
@@ -165,9 +161,6 @@ def test_all_models_are_scored_where_there_is_little_to_gain(given: str) -> None
         which, scores = Preselection(score, options)(F, pair)
         np.testing.assert_array_equal(which, np.arange(30))
         np.testing.assert_array_equal(scores, score(F, np.arange(30), pair))
-
-
-EPS32 = 2.0**-23
 
 
 def reason_of(x0: np.ndarray, x1: np.ndarray, inliers: np.ndarray | None = None, dtype: type = np.float64) -> str:
@@ -232,9 +225,6 @@ def test_lines_up_to_the_rounding_of_float32_coordinates() -> None:
         assert ("line in image 0" in reason_of(line, other)) == on_line
 
 
-DRAW_SEED = 3
-
-
 def pair(count: int, prior: str = "given") -> estimators.Pair:
     c = known(count)
     index = torch.arange(count)[None]
@@ -242,7 +232,7 @@ def pair(count: int, prior: str = "given") -> estimators.Pair:
         "none": None, "zero": torch.zeros(1, count), "one certain": (index == count // 2).float(),
         "small": torch.logspace(-12, 0, count)[None], "given": c.prior,
     }  # fmt: skip
-    return pair_of(c.replace(prior=priors[prior]), seed=DRAW_SEED)
+    return pair_of(c.replace(prior=priors[prior]), seed=SEED)
 
 
 def numbers_of(pair: estimators.Pair, draw: int, columns: int) -> list[int]:
@@ -263,11 +253,8 @@ def test_samples_by_weight_are_those_of_the_definition(count: int, size: int, pr
         for start, draws in ((0, 20), (700, 11)):
             sample = sampler.draw(matches, start, draws, size)
             assert sample.dtype == np.int64
-            drawn = [
-                reference.weighted_sample(expected, numbers_of(matches, draw, size))
-                for draw in range(start, start + draws)
-            ]
-            assert sample.T.tolist() == drawn
+            numbers = (numbers_of(matches, draw, size) for draw in range(start, start + draws))
+            assert sample.T.tolist() == [reference.weighted_sample(expected, each) for each in numbers]
 
 
 @pytest.mark.parametrize("size", [4, 5, 7, 8])

@@ -11,6 +11,8 @@ from fmtorch.core import PAIR_TYPES
 from tests.reference.solvers import skew
 
 SCALE = 0.02  # of losses at `near_scene`
+K = np.array([[768.0, 0, 319.5], [0, 768, 239.5], [0, 0, 1]])
+SIZE = (480, 640)
 
 
 class Scene(NamedTuple):
@@ -52,9 +54,7 @@ def stacked(batch: tuple[int, ...], n: int, seed: int = 0, noise: float = 0.0) -
     return Scene(*(torch.stack(list(a)).reshape(*batch, *a[0].shape) for a in zip(*many, strict=True)))
 
 
-def unit_scene(
-    seed: int, n: int = 100, noise: float = 0.0, outliers: int = 0
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def unit_scene(seed: int, n: int = 100, noise: float = 0.0, outliers: int = 0) -> tuple[np.ndarray, ...]:
     """F and matches of about unit scale before two cameras."""
     rng = np.random.default_rng(seed)
     X = np.c_[rng.uniform(-2, 2, (n, 2)), rng.uniform(3, 7, n)]
@@ -87,10 +87,6 @@ def tolerances(loss: str) -> dict[str, float | bool]:
     The tabulated loss is linear between its entries, 1 / 1000 apart, whose slopes differ by as much."""
     rtol = 1e-3 if loss == "magsac" else 1e-5
     return {"eps": 1e-6, "atol": 1e-5, "rtol": rtol, "fast_mode": True, "check_undefined_grad": False}
-
-
-K = np.array([[768.0, 0, 319.5], [0, 768, 239.5], [0, 0, 1]])
-SIZE = (480, 640)
 
 
 class Drawn(NamedTuple):

@@ -11,6 +11,8 @@ from tests.conftest import oracle
 from tests.geometry.scenes import scene, scenes
 from tests.reference import solvers as reference
 
+EPS = torch.finfo(torch.float64).eps
+
 
 @pytest.mark.parametrize("batch", [(), (3,), (2, 3)])
 @pytest.mark.parametrize("n", [8, 9, 50])
@@ -37,16 +39,10 @@ def test_reference_opencv_and_kornia_live(batch, n):
             assert error.norm() < n * torch.finfo(torch.float64).eps / gap
 
 
-def test_weight_zero_is_masked():
-    x0, x1, _ = scenes((3,), 40, noise=0.5)
-    mask = torch.arange(40).expand(3, 40) < 30
-    F, valid = geometry.eight_point(x0, x1, mask=mask)
-    assert torch.equal(F, geometry.eight_point(x0, x1, weight=mask.double())[0])
-    assert valid.all()
-
-
-def degenerate(n, dtype=torch.float64):
-    """Two sound sets, then ten that are not, and their names' verdict."""
+@pytest.mark.parametrize("n", [8, 20])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_degenerate_sets_are_invalid_and_alone(n, dtype):
+    """Two sound sets, then ten that are not."""
     x0, x1, _ = (a.to(dtype).clone() for a in scenes((12,), n, noise=0.5))
     line = torch.arange(n, dtype=dtype)[:, None]
     x0[2], x1[2] = x0[2, :1], x1[2, :1]  # all equal
@@ -60,13 +56,6 @@ def degenerate(n, dtype=torch.float64):
     x0[9] = x0[9, :1]  # coincident in image 0 only
     x1[10] = x0[10]  # no motion
     x0[11] = torch.nan
-    return x0, x1
-
-
-@pytest.mark.parametrize("n", [8, 20])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_degenerate_sets_are_invalid_and_alone(n, dtype):
-    x0, x1 = degenerate(n, dtype)
     F, valid = geometry.eight_point(x0, x1)
     assert valid.tolist() == [True] * 2 + [False] * 10
     assert not F[2:].any()
@@ -147,12 +136,9 @@ def test_gradients_of_normalisation():
     x0 = (s.x0 / 500).requires_grad_()
     w = torch.rand(9, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda x, w: geometry.normalize_points(x, weight=w), (x0, w))
-    assert torch.autograd.gradcheck(
-        geometry.canonical, (torch.randn(2, 3, 3, dtype=torch.float64, requires_grad=True),)
-    )
-
-
-EPS = torch.finfo(torch.float64).eps
+    F = torch.randn(2, 3, 3, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(geometry.canonical, (F,))
+    assert torch.autograd.gradcheck(geometry.nearest_rank2, (random_matrices((2, 3)).requires_grad_(),))
 
 
 def random_matrices(batch, singular_values=None, seed=0):
@@ -191,10 +177,6 @@ def test_nearest_even_where_the_singular_vector_is_not_unique(s):
 def test_float32_is_the_rounded_float64():
     F = random_matrices((50,)).float()
     assert torch.equal(geometry.nearest_rank2(F), geometry.nearest_rank2(F.double()).float())
-
-
-def test_gradient_of_rank2():
-    assert torch.autograd.gradcheck(geometry.nearest_rank2, (random_matrices((2, 3)).requires_grad_(),))
 
 
 @pytest.mark.parametrize("s", [(1, 1, 1), (1, 0.5, 0.5), (1, 0.5, 0.5 - 1e-9), (1, 0, 0), (0, 0, 0)])

@@ -13,6 +13,14 @@ from tests.geometry.scenes import scenes, stacked
 from tests.reference import solvers as reference
 
 DISTANCES = ["symmetric_mean", "symmetric_max", "symmetric_squared", "sampson", "sampson_squared"]
+MATRIX, POINTS = (2, 3, 3), (2, 3, 2)
+SHAPES = {
+    **dict.fromkeys([*DISTANCES, "algebraic"], (MATRIX, POINTS, POINTS)),
+    "epipolar_lines": (MATRIX, POINTS),
+    "point_to_line": (POINTS, MATRIX),
+    "fundamental_from_calibration": (MATRIX, MATRIX, MATRIX, (2, 3)),
+    "fundamental_from_projections": ((2, 3, 4), (2, 3, 4)),
+}
 
 
 def up_to_sign(F: Tensor, like: Tensor) -> Tensor:
@@ -45,13 +53,11 @@ def test_projections_match_scalar_reference(batch: tuple[int, ...], dtype: torch
     F = geometry.fundamental_from_projections(P0, P1)
     assert F.dtype == dtype
     for index in np.ndindex(*batch):
-        expected = torch.from_numpy(
-            reference.fundamental_from_projections(*(P[index].double().numpy() for P in (P0, P1)))
-        )
+        matrices = (P[index].double().numpy() for P in (P0, P1))
+        expected = torch.from_numpy(reference.fundamental_from_projections(*matrices))
         # 24 products of four numbers of size one, over a norm of size one.
-        torch.testing.assert_close(
-            up_to_sign(F[index].double(), expected), expected, atol=100 * torch.finfo(dtype).eps, rtol=0
-        )
+        atol = 100 * torch.finfo(dtype).eps
+        torch.testing.assert_close(up_to_sign(F[index].double(), expected), expected, atol=atol, rtol=0)
 
 
 def test_calibration_and_projections_agree_in_sign_too() -> None:
@@ -113,16 +119,6 @@ def random_inputs(*shapes: tuple[int, ...]) -> list[Tensor]:
     """Numbers of size one, for finite differences."""
     g = torch.Generator().manual_seed(0)
     return [torch.randn(*shape, generator=g, dtype=torch.float64).requires_grad_() for shape in shapes]
-
-
-MATRIX, POINTS = (2, 3, 3), (2, 3, 2)
-SHAPES = {
-    **dict.fromkeys([*DISTANCES, "algebraic"], (MATRIX, POINTS, POINTS)),
-    "epipolar_lines": (MATRIX, POINTS),
-    "point_to_line": (POINTS, MATRIX),
-    "fundamental_from_calibration": (MATRIX, MATRIX, MATRIX, (2, 3)),
-    "fundamental_from_projections": ((2, 3, 4), (2, 3, 4)),
-}
 
 
 @pytest.mark.parametrize("name", SHAPES)

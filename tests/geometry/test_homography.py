@@ -15,6 +15,11 @@ from fmtorch.geometry.levenberg_marquardt import Schedule, Weighted
 from tests.reference import homography as reference
 from tests.reference.homography import mapped, sampson_squared
 
+PX = 400.0  # of a unit of the points
+EPS = 2.0**-52
+KINDS = ("cauchy", "geman_mcclure", "huber", "truncated")
+ROUNDING32, ROUNDING64 = 2.0**-24, 2.0**-53
+
 
 def planar(seed: int, n: int, noise: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     """Matches (4, n) of about unit scale on a plane, and their homography."""
@@ -22,9 +27,6 @@ def planar(seed: int, n: int, noise: float = 0.0) -> tuple[np.ndarray, np.ndarra
     H = np.eye(3) + rng.uniform(-0.3, 0.3, (3, 3))
     x0 = rng.uniform(-1, 1, (n, 2))
     return np.ascontiguousarray(np.c_[x0, mapped(H, x0) + noise * rng.normal(size=x0.shape)].T), H
-
-
-PX = 400.0  # of a unit of the points
 
 
 def pairs(batch: tuple[int, ...], n: int, noise: float = 0.0) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -92,8 +94,7 @@ def test_distances() -> None:
     sampson = geometry.homography_sampson(H, x0, x1)
     for i in range(3):
         a, b, h = x0[i].numpy(), x1[i].numpy(), H[i].numpy()
-        expected = [reference.transfer(h, p, q) for p, q in zip(a, b, strict=True)]
-        np.testing.assert_allclose(torch.maximum(d0, d1)[i].numpy(), expected, rtol=1e-9)
+        np.testing.assert_allclose(torch.maximum(d0, d1)[i].numpy(), reference.transfer(h, a, b), rtol=1e-9)
         np.testing.assert_allclose(d1[i].numpy(), np.linalg.norm(mapped(h, a) - b, axis=1), rtol=1e-9)
         expected = [np.sqrt(sampson_squared(h, np.append(p, q))) for p, q in zip(a, b, strict=True)]
         np.testing.assert_allclose(sampson[i].numpy(), expected, rtol=1e-8)
@@ -170,26 +171,21 @@ def test_gradients_of_refined_homographies_are_those_of_the_optimum(loss: str) -
 def test_refined_homographies() -> None:
     x0, x1, truth = pairs((2,), 40, noise=0.003)
     many = torch.stack([truth, -3 * truth, torch.zeros_like(truth), torch.full_like(truth, torch.nan)], 1)
-    refined = geometry.refine_homography(many, x0, x1, loss="cauchy", scale=3.0, iterations=20)
+    options = {"loss": "cauchy", "scale": 3.0, "iterations": 20}
+    refined = geometry.refine_homography(many, x0, x1, **options)
     assert refined.shape == many.shape
-    assert torch.equal(
-        refined[:, 0], geometry.refine_homography(truth, x0, x1, loss="cauchy", scale=3.0, iterations=20)
-    )
+    assert torch.equal(refined[:, 0], geometry.refine_homography(truth, x0, x1, **options))
     torch.testing.assert_close(refined[:, 0], refined[:, 1], rtol=0, atol=1e-9)
     assert not bool(torch.isfinite(refined[:, 2:]).all(-1).any())
     costs = [(1 + geometry.homography_sampson(H, x0, x1).square() / 9).log().sum(-1) for H in (truth, refined[:, 0])]
     assert bool((costs[1] < costs[0]).all())
     x0.requires_grad_()
-    attached = geometry.refine_homography(many, x0, x1, loss="cauchy", scale=3.0, iterations=20)
+    attached = geometry.refine_homography(many, x0, x1, **options)
     assert torch.equal(attached.detach().nan_to_num(7), refined.nan_to_num(7))
     attached[:, :2].sum().backward()
     assert bool(torch.isfinite(x0.grad).all())
     with pytest.raises(ValueError, match="welsch"):
         geometry.refine_homography(truth, x0, x1, loss="welsch")
-
-
-EPS = 2.0**-52
-KINDS = ("cauchy", "geman_mcclure", "huber", "truncated")
 
 
 class Problem(NamedTuple):
@@ -272,9 +268,6 @@ def test_refinement_ends_where_the_gradient_vanishes(loss: str) -> None:
             # A step is refused once it lowers the cost by less than its rounding, EPS: gradients of sqrt(EPS) stay.
             size = np.sqrt(np.diagonal(products)[:9] * after)
             assert (np.abs(products[9, :9]) <= 1e-6 * size).all()
-
-
-ROUNDING32, ROUNDING64 = 2.0**-24, 2.0**-53
 
 
 def solved(points: np.ndarray, sample: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -9,10 +9,18 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from fmtorch.geometry import homography_points, pose_from_fundamental, poses_from_homography
-from fmtorch.geometry.cameras import PixelFrame, calibration_problems, mapped, square_pixels
+from fmtorch.geometry.cameras import calibration_problems, mapped, square_pixels
 from fmtorch.geometry.pose import pose
 from tests.geometry.scenes import scene, stacked
 from tests.reference import known_cameras, solvers
+
+CAMERAS = np.array([650.0, 319.5, 239.5, 820, 300.5, 249.5])
+CAMERA0, CAMERA1 = (np.array([[f, 0, x], [0, f, y], [0, 0, 1]]) for f, x, y in (CAMERAS[:3], CAMERAS[3:]))
+K0 = np.array([[900.0, 0, 500], [0, 920, 400], [0, 0, 1]])
+K1 = np.array([[1100.0, 0, 520], [0, 1080, 380], [0, 0, 1]])
+SIZE = torch.tensor([[480, 640]])
+GOOD = torch.tensor([[[500.0, 2, 310], [0, 520, 250], [0, 0, 1]]], dtype=torch.float64)
+RIGHT = torch.tensor([True])
 
 
 @pytest.mark.parametrize("batch", [(), (3,), (2, 3)])
@@ -71,19 +79,13 @@ def test_gradient():
     pixels = torch.diag(torch.tensor([500.0, 500, 1], dtype=torch.float64))
     F = pixels @ s.F @ pixels
     scale = torch.tensor([500.0, 500.0], dtype=torch.float64)
-    CAMERA0, CAMERA1 = (
-        torch.diag(torch.tensor([1 / 500, 1 / 500, 1.0], dtype=torch.float64)) @ K for K in (s.K0, s.K1)
-    )
+    CAMERA0, CAMERA1 = (torch.linalg.inv(pixels) @ K for K in (s.K0, s.K1))
     F = (F / F.norm()).requires_grad_()
 
     def pose(F, CAMERA0, CAMERA1):
         return pose_from_fundamental(F, CAMERA0, CAMERA1, s.x0 / scale, s.x1 / scale)[:2]
 
     assert torch.autograd.gradcheck(pose, (F, CAMERA0.requires_grad_(), CAMERA1.requires_grad_()))
-
-
-CAMERAS = np.array([650.0, 319.5, 239.5, 820, 300.5, 249.5])
-CAMERA0, CAMERA1 = (np.array([[f, 0, x], [0, f, y], [0, 0, 1]]) for f, x, y in (CAMERAS[:3], CAMERAS[3:]))
 
 
 def pose_of(F: np.ndarray, s: known_cameras.Scene, weight: np.ndarray) -> np.ndarray:
@@ -97,9 +99,8 @@ def test_it_is_that_of_all_decompositions(noise: float) -> None:
     for seed in range(10):
         s = known_cameras.scene(seed, 40, noise, outliers=0.2, cameras=(CAMERA0, CAMERA1))
         rng = np.random.default_rng(seed)
-        F = known_cameras.fundamental(s.R, s.t, (CAMERA0, CAMERA1)) * rng.choice([-2, 3]) + 1e-7 * noise * rng.normal(
-            size=(3, 3)
-        )
+        F = known_cameras.fundamental(s.R, s.t, (CAMERA0, CAMERA1)) * rng.choice([-2, 3])
+        F += 1e-7 * noise * rng.normal(size=(3, 3))
         weight = rng.uniform(0, 1, 40) * s.right
         out = pose_of(F, s, weight)
         tensors = [torch.from_numpy(value)[None] for value in (F, CAMERA0, CAMERA1, s.x0, s.x1)]
@@ -141,10 +142,6 @@ def test_where_there_is_none_all_is_zero(kind: str) -> None:
     F = known_cameras.fundamental(s.R, s.t, (CAMERA0, CAMERA1))
     F = {"zero": 0 * F, "NaN": np.nan * F, "rank 1": np.outer(F[0], F[1]), "no matches": F}[kind]
     assert not pose_of(F, s, np.full(10, 0.0 if kind == "no matches" else 1.0)).any()
-
-
-K0 = np.array([[900.0, 0, 500], [0, 920, 400], [0, 0, 1]])
-K1 = np.array([[1100.0, 0, 520], [0, 1080, 380], [0, 0, 1]])
 
 
 def plane(seed: int, n: int = 30, parallel: bool = False, length: float = 0.4) -> tuple[np.ndarray, ...]:
@@ -196,22 +193,11 @@ def test_opencv(seed: int) -> None:
     x1 = homography_points(*tensors(H, x0)).numpy()
     G = np.linalg.inv(K1) @ H @ K0
     _, rotations, translations, normals = cv2.decomposeHomographyMat(G, np.eye(3))
-    rays = [
-        (np.c_[x, np.ones(len(x))] @ np.linalg.inv(K).T)[:, None, :2].astype(np.float32)
-        for x, K in ((x0, K0), (x1, K1))
-    ]
+    rays = [np.float32(cv2.undistortPoints(x, K, None)) for x, K in ((x0, K0), (x1, K1))]
     possible = cv2.filterHomographyDecompByVisibleRefpoints(rotations, normals, *rays)
     poses = poses_from_homography(*tensors(H, K0, K1, x0, x1))
-    computed = [
-        np.concatenate([R.ravel(), t, n])
-        for R, t, n, valid in zip(
-            poses.R.numpy(), poses.t.numpy(), poses.normal.numpy(), poses.in_front == 1, strict=True
-        )
-        if valid
-    ]
-    expected = [
-        np.concatenate([rotations[i].ravel(), translations[i][:, 0], normals[i][:, 0]]) for i in possible.ravel()
-    ]
+    computed = torch.cat([poses.R.flatten(1), poses.t, poses.normal], 1)[poses.in_front == 1].numpy()
+    expected = [np.r_[rotations[i].ravel(), translations[i][:, 0], normals[i][:, 0]] for i in possible.ravel()]
     assert len(computed) == len(expected)
     for solution in expected:
         assert min(np.abs(solution - ours).max() for ours in computed) < 1e-6
@@ -238,11 +224,6 @@ def test_models_and_cameras_that_are_none_are_not_valid() -> None:
     poses = poses_from_homography(H, k0, k1, x0, x1, mask)
     assert poses.valid.any(-1).tolist() == [False] * 5 + [True]
     assert torch.equal(poses.R[:5], torch.eye(3).double().expand(5, 2, 3, 3))
-
-
-SIZE = torch.tensor([[480, 640]])
-GOOD = torch.tensor([[[500.0, 2, 310], [0, 520, 250], [0, 0, 1]]], dtype=torch.float64)
-RIGHT = torch.tensor([True])
 
 
 def test_they_are_those_of_the_definition() -> None:
@@ -306,21 +287,3 @@ def test_what_is_no_calibration_is_named(entries: list[tuple[int, int, float]], 
     square = square_pixels(K, SIZE.expand(3, 2), torch.tensor([True, False, True]))
     assert bool(square.map.isfinite().all())
     assert torch.equal(square.map[1], torch.eye(3, dtype=torch.float64))
-
-
-GENERATOR = torch.Generator().manual_seed(0)
-PIXELS = torch.rand(3, 50, 4, generator=GENERATOR, dtype=torch.float64) * torch.tensor([[[900.0]], [[30.0]], [[4e5]]])
-
-
-def test_matrices_follow_the_points() -> None:
-    frame = PixelFrame.around(PIXELS, torch.ones(3, 50, dtype=torch.bool))
-    F = torch.randn(3, 2, 3, 3, generator=GENERATOR, dtype=torch.float64)
-    x = frame.normalized(PIXELS)
-
-    def errors(matrices: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
-        x0, x1 = (torch.nn.functional.pad(p, (0, 1), value=1.0) for p in points.split(2, -1))
-        return torch.einsum("pni,pkij,pnj->pkn", x1, matrices, x0)
-
-    # Cancellation of terms up to (coordinate / unit)^2, which is below 10: a few hundred eps.
-    torch.testing.assert_close(errors(frame.to_pixels(F), PIXELS), errors(F, x), rtol=0, atol=1e-12)
-    torch.testing.assert_close(frame.from_pixels(frame.to_pixels(F)), F, rtol=0, atol=1e-12)

@@ -164,7 +164,6 @@ def test_one_reweighted_fit(loss: str, n: int) -> None:
 def refined(
     F: np.ndarray, points: np.ndarray, weight: np.ndarray, s2: np.ndarray, loss: str, iterations: int, tolerance: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Models and costs by the kernel."""
     fitted, cost = np.empty_like(F), np.empty(len(F))
     weighted = Weighted.of(points, weight, s2, loss)
     refine_kernel(F, weighted, Schedule(iterations, tolerance=tolerance), fitted, cost)

@@ -1,6 +1,7 @@
 """Minimal solvers, the oriented constraint and weighted fits, against definitions, OpenCV and kornia."""
 
 from collections.abc import Callable
+from typing import Any
 
 import cv2
 import numpy as np
@@ -21,6 +22,17 @@ from tests.conftest import oracle
 from tests.estimators.pairs import normalized
 from tests.geometry.scenes import scene, scenes
 from tests.reference import solvers as reference
+
+Kernel = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], int]
+SOLVERS: dict[str, tuple[Kernel, int, int]] = {"seven": (seven_point_kernel, 7, 3), "eight": (eight_point_kernel, 8, 1)}
+SAMPLES = 203  # not whole lanes
+DIFFERENT = [((1, -6, 11, -6), [1, 2, 3]), ((1, 0, 0, -8), [2]), ((1, 0, 1, 0), [0])]
+EQUAL = [((1, -3, 3, -1), [1, 1, 1]), ((1, 0, 0, 0), [0, 0, 0]), ((2, 0, 0, 0), [0, 0, 0]), ((0, 1, 0, 0), [0, 0])]
+QUADRATIC = [((0, 1, -3, 2), [1, 2]), ((0, 1, 0, 1), []), ((1e-12, 1, -3, 2), [-1e12 - 3, 1 + 1e-12, 2 - 8e-12])]
+LINEAR = [((0, 0, 2, -3), [1.5]), ((0, 0, 1, 0), [0]), ((0, 0, 0, 1), []), ((0, 0, 0, 0), [])]
+LARGE = ((1, -1e8, -1e8, 1), [-1, 1e-8 - 1e-16, 1e8 + 1 - 1e-8])
+SMALL = ((1e-9, 1e-9, -1, -1), [-31622.7766016838, -1, 31622.7766016838])
+NOT_FINITE = [((float("nan"), 1, 1, 1), []), ((float("inf"), 1, 1, 1), [])]
 
 
 def distance_to_nearest(F, solutions):
@@ -76,29 +88,20 @@ def test_gradient():
     assert torch.autograd.gradcheck(invariant, (x0, x1))
 
 
-Kernel = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], int]
-SOLVERS: dict[str, tuple[Kernel, int, int]] = {"seven": (seven_point_kernel, 7, 3), "eight": (eight_point_kernel, 8, 1)}
-DRAWS = 203  # not whole lanes
-
-
 def points_of() -> dict[str, np.ndarray]:
     """Points (4, n) of pairs of many kinds, in normalised units."""
-    given = {
-        "random": laws.scene(1, 300),
-        "right": laws.scene(1, 300, outliers=0, noise=0),
-        **laws.degenerate(),
-        **laws.small(),
-    }
+    given = {"random": laws.scene(1, 300), "right": laws.scene(1, 300, outliers=0, noise=0)}
+    given |= laws.degenerate() | laws.small()
     pairs = {name: normalized(c) for name, c in given.items()}
     return {name: pair[0].points for name, pair in pairs.items() if not isinstance(pair, str)}
 
 
 def solved_by(solver: str, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Models (m, 9) of random samples, of which draw each is, and the samples (size, DRAWS)."""
+    """Models (m, 9) of random samples, of which draw each is, and the samples (size, SAMPLES)."""
     kernel, size, most = SOLVERS[solver]
     rng, n = np.random.default_rng(0), points.shape[1]
-    sample = np.stack([rng.permutation(max(n, size))[:size] % n for _ in range(DRAWS)], 1)
-    F, draw = np.empty((most * DRAWS, 9), np.float32), np.empty(most * DRAWS, np.int64)
+    sample = np.stack([rng.permutation(max(n, size))[:size] % n for _ in range(SAMPLES)], 1)
+    F, draw = np.empty((most * SAMPLES, 9), np.float32), np.empty(most * SAMPLES, np.int64)
     count = kernel(points, sample, F, draw)
     return F[:count].astype(np.float64), draw[:count], sample
 
@@ -134,9 +137,6 @@ def test_weighted_fits_are_those_of_the_definition(kind: str) -> None:
                 np.testing.assert_allclose(F * np.sign(F @ theirs), theirs, atol=1e-8, err_msg=name)
 
 
-SAMPLES = 203  # not whole lanes
-
-
 def rays(seed: int, noise: float = 0.0, plane: bool = False) -> tuple[np.ndarray, np.ndarray]:
     """Rays (4, 5 SAMPLES) and the true essential matrices (SAMPLES, 9), every five of another pair of cameras."""
     rng = np.random.default_rng(seed)
@@ -151,9 +151,7 @@ def rays(seed: int, noise: float = 0.0, plane: bool = False) -> tuple[np.ndarray
     return np.ascontiguousarray(rays.reshape(-1, 4).T), E / np.linalg.norm(E, axis=1)[:, None]
 
 
-def solved(
-    points: np.ndarray, depth: np.ndarray | None = None, offset: np.ndarray | None = None
-) -> tuple[np.ndarray, np.ndarray]:
+def solved(points: np.ndarray, depth: Any = None, offset: Any = None) -> tuple[np.ndarray, np.ndarray]:
     """Models (m, 9) of every five points, and of which sample each is; depth, offset: the kernel's."""
     s = points.shape[1] // 5
     sample = np.arange(5 * s).reshape(s, 5).T.copy()
@@ -197,10 +195,8 @@ def test_focal_lengths_and_the_centre_of_coordinates() -> None:
     F, same = solved(scaled, depth, offset)
     np.testing.assert_array_equal(draw, same)
     for model, essential, s in zip(F, E, draw, strict=True):
-        K0, K1 = (
-            np.array([[f, 0, -x], [0, f, -y], [0, 0, 1]])
-            for f, (x, y) in zip(depth[:, s], offset.reshape(2, 2), strict=True)
-        )
+        cameras = zip(depth[:, s], offset.reshape(2, 2), strict=True)
+        K0, K1 = (np.array([[f, 0, -x], [0, f, -y], [0, 0, 1]]) for f, (x, y) in cameras)
         expected = K1.T @ model.reshape(3, 3) @ K0
         # Twice float32, through calibrations of condition 4; dividing scaled points rounds, which roots magnify.
         assert apart(expected.reshape(1, 9), essential[None])[0, 0] < 1e-4
@@ -227,15 +223,6 @@ def roots_of(*coefficients):
     roots, valid = np.zeros(3), np.zeros(3, np.bool_)
     cubic_roots(np.array(coefficients, dtype=np.float64), roots, valid)
     return sorted(roots[valid].tolist())
-
-
-DIFFERENT = [((1, -6, 11, -6), [1, 2, 3]), ((1, 0, 0, -8), [2]), ((1, 0, 1, 0), [0])]
-EQUAL = [((1, -3, 3, -1), [1, 1, 1]), ((1, 0, 0, 0), [0, 0, 0]), ((2, 0, 0, 0), [0, 0, 0]), ((0, 1, 0, 0), [0, 0])]
-QUADRATIC = [((0, 1, -3, 2), [1, 2]), ((0, 1, 0, 1), []), ((1e-12, 1, -3, 2), [-1e12 - 3, 1 + 1e-12, 2 - 8e-12])]
-LINEAR = [((0, 0, 2, -3), [1.5]), ((0, 0, 1, 0), [0]), ((0, 0, 0, 1), []), ((0, 0, 0, 0), [])]
-LARGE = ((1, -1e8, -1e8, 1), [-1, 1e-8 - 1e-16, 1e8 + 1 - 1e-8])
-SMALL = ((1e-9, 1e-9, -1, -1), [-31622.7766016838, -1, 31622.7766016838])
-NOT_FINITE = [((float("nan"), 1, 1, 1), []), ((float("inf"), 1, 1, 1), [])]
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from fmtorch.jit import kernel as switch
 from fmtorch.jit.kernel import Kernel, kernel
 from fmtorch.jit.lanes import fused
 from tests.helpers import in_threads
-from tests.processes import run_command
+from tests.processes import run_command, starter
 
 SOURCE = """
 import numpy as np
@@ -55,6 +55,7 @@ def answered(flags: I8x1, rounds: int):
 """
 REPOSITORY = Path(__file__).resolve().parents[2]
 numba = pytest.importorskip("numba", reason="numba is not installed")
+EXPECTED = [[2, 8], [18, 32]]
 
 
 @pytest.fixture(autouse=True)
@@ -90,12 +91,8 @@ def result(module: types.ModuleType) -> list[list[float]]:
     return out.tolist()
 
 
-EXPECTED = [[2, 8], [18, 32]]
-
-
-def test_a_kernel_calls_kernels_and_inner_functions(module: types.ModuleType) -> None:
-    assert result(module) == EXPECTED
-    assert module.square(3) == 9  # an inner function is also a plain one
+def refused(*_: object, **options: object) -> int:
+    raise OSError("no space left on device")
 
 
 RETURNING = """
@@ -133,6 +130,7 @@ def test_what_does_not_fit_the_signature_is_refused(module: types.ModuleType) ->
         with pytest.raises(TypeError):
             module.rows(wrong, x)
     assert len(module.scaled_squares.compiled().signatures) == 1
+    assert module.square(3) == 9  # an inner function is also a plain one
 
 
 def test_what_was_compiled_is_kept_and_told_once(tmp_path, cache, capsys):
@@ -159,14 +157,10 @@ def test_two_processes_compile_together(module, tmp_path, monkeypatch, cache, im
     switch.compile_together(both)
 
 
-def with_path(folder: Path) -> dict[str, str]:
-    """The environment of a process that imports modules of a folder."""
-    return {**os.environ, "PYTHONPATH": os.pathsep.join([str(REPOSITORY), str(folder)])}
-
-
 def start_helper(folder: Path, kernel: str) -> subprocess.Popen[bytes]:
     command = [sys.executable, "-m", "fmtorch.jit.kernel", kernel]
-    return subprocess.Popen(command, stdin=subprocess.PIPE, env=with_path(folder))
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(REPOSITORY), str(folder)])}
+    return subprocess.Popen(command, stdin=subprocess.PIPE, env=environment)
 
 
 def test_the_other_process_compiles_what_it_is_told(module: types.ModuleType, tmp_path: Path) -> None:
@@ -243,9 +237,6 @@ def test_a_cache_that_can_only_be_read_is_used(tmp_path, monkeypatch, capsys):
     capsys.readouterr()
     files.folder.cache_clear()
 
-    def refused(*args: object, **options: object) -> int:
-        raise PermissionError("read-only file system")
-
     monkeypatch.setattr(Path, "write_text", refused)
     monkeypatch.setattr(Path, "write_bytes", refused)
     assert files.folder() is not None
@@ -255,9 +246,6 @@ def test_a_cache_that_can_only_be_read_is_used(tmp_path, monkeypatch, capsys):
 
 
 def test_a_full_disk_costs_the_file_and_not_the_result(module, cache, monkeypatch):
-    def refused(*args: object) -> int:
-        raise OSError("no space left on device")
-
     monkeypatch.setattr(Path, "write_bytes", refused)
     with pytest.warns(UserWarning, match="no space left"):
         assert result(module) == EXPECTED
@@ -300,7 +288,9 @@ def test_a_kernel_may_keep_the_lock_that_others_leave_to_other_threads(tmp_path:
 
 
 def test_several_processes_compile_each_kernel_once(tmp_path: Path, cache: Path) -> None:
-    (tmp_path / "some_kernels.py").write_text(SOURCE)
+    here = tmp_path / "here"
+    here.mkdir()
+    (here / "some_kernels.py").write_text(SOURCE)
     code = (
         "import numpy as np, some_kernels as k\n"
         "from fmtorch.jit.cache import KernelFile\n"
@@ -308,9 +298,10 @@ def test_several_processes_compile_each_kernel_once(tmp_path: Path, cache: Path)
         "KernelFile.save_overload = lambda *arguments: (compiled.append(1), plain(*arguments))\n"
         "x = np.ones((1, 3), 'f4'); k.rows(x, x); print(len(compiled), x.tolist())"
     )
-    options = {"env": with_path(tmp_path), "stdout": subprocess.PIPE, "text": True}
-    processes = [subprocess.Popen([sys.executable, "-c", code], **options) for _ in range(3)]
-    outputs = [process.communicate(timeout=300)[0].strip().partition(" ") for process in processes]
+    told = {"environment": {"FMTORCH_CACHE": str(cache.parent)}, "errors": here / "errors"}
+    commands = [starter().start(here, "-c", code, log=here / f"{i}.log", **told) for i in range(3)]
+    assert [command.wait() for command in commands] == [0] * 3, told["errors"].read_text()
+    outputs = [command.said().strip().partition(" ") for command in commands]
     assert [values for _, _, values in outputs] == ["[[2.0, 2.0, 2.0]]"] * 3
     assert sum(int(compiled) for compiled, _, _ in outputs) == 2  # rows, and scaled_squares, which it calls
     assert not list(cache.rglob("*.lock"))

@@ -1,8 +1,5 @@
 """Versions of compiled functions: what they depend on, what not, and that every process tells the same."""
 
-import json
-import os
-import subprocess
 import sys
 import types
 from pathlib import Path
@@ -15,8 +12,6 @@ from fmtorch.estimators import WITH_FOCALS
 from fmtorch.jit.cache import version
 from fmtorch.jit.kernel import F4x1, F8x1, F8x2, U1x1, kernel, signature_of
 from tests.processes import run_command
-
-REPOSITORY = Path(__file__).resolve().parents[2]
 
 SOURCE = """
 import enum
@@ -77,6 +72,9 @@ def all_of_them(x: float, rows: F8x2) -> float:
 def other(x: float) -> float:
     return x + 5
 """
+CONSTANTS = ["{0.5, 1, 1.0, True}", "frozenset({'a', 'b', 'c'})", "{'b': 1, 'a': (2, None)}", "np.float32(2)", "2",
+             "2.0", "1j", "True", "b'2'", "'2'", "np.zeros(2)", "np.zeros((2, 1))", "np.zeros((1, 2), order='F')",
+             "np.dtype('f4')", "np.float64", "[2]", "(2,)", "np.sqrt", "np", "len", "math.inf"]  # fmt: skip
 
 
 def load(folder: Path, source: str) -> types.ModuleType:
@@ -137,11 +135,6 @@ def test_it_changes_with_what_is_named_by_its_module(tmp_path: Path) -> None:
     assert versions["2.0", "1"] == versions["2.0", "2"]
 
 
-CONSTANTS = ["{0.5, 1, 1.0, True}", "frozenset({'a', 'b', 'c'})", "{'b': 1, 'a': (2, None)}", "np.float32(2)", "2",
-             "2.0", "1j", "True", "b'2'", "'2'", "np.zeros(2)", "np.zeros((2, 1))", "np.zeros((1, 2), order='F')",
-             "np.dtype('f4')", "np.float64", "[2]", "(2,)", "np.sqrt", "np", "len", "math.inf"]  # fmt: skip
-
-
 def of_constants(folder: Path) -> dict[str, str]:
     text = "import math, numpy as np\n" + "".join(
         f"\nV{i} = {value}\ndef f{i}():\n    return V\nf{i} = type(f{i})(f{i}.__code__, dict(V=V{i}, __name__='m'))\n"
@@ -172,13 +165,10 @@ def test_what_has_no_version_is_refused_by_name(tmp_path: Path, value: str) -> N
 
 
 def test_every_process_tells_the_same_versions(tmp_path: Path) -> None:
-    code = (
-        "from fmtorch.estimators import WITH_FOCALS; import json;"
-        "print(json.dumps([each.version for each in WITH_FOCALS]))"
-    )
+    code = "from fmtorch.estimators import WITH_FOCALS; print(*(each.version for each in WITH_FOCALS))"
     printed = run_command("-c", code, cwd=tmp_path).stdout  # whose hashes of strings are others
     here = [each.version for each in WITH_FOCALS]  # with the checks that tests wrap around functions
-    assert (json.loads(printed), len(set(here))) == (here, len(here))
+    assert (printed.split(), len(set(here))) == (here, len(here))
 
 
 CLASHING = """
@@ -305,8 +295,7 @@ print(end(Line(np.arange(4.0), 2.0)))
 
 def test_a_script_finds_what_it_kept_although_its_groups_are_made_anew(tmp_path: Path) -> None:
     (tmp_path / "script.py").write_text(SCRIPT)
-    env = {**os.environ, "PYTHONPATH": str(REPOSITORY), "FMTORCH_CACHE": str(tmp_path / "cache")}
-    command, told = [sys.executable, str(tmp_path / "script.py")], {"env": env, "capture_output": True, "text": True}
-    done = [subprocess.run(command, check=True, **told) for _ in range(2)]
+    own, code = {"FMTORCH_CACHE": str(tmp_path)}, "import runpy; runpy.run_path('script.py', run_name='__main__')"
+    done = [run_command("-c", code, cwd=tmp_path, environment=own) for _ in range(2)]
     assert [each.stdout for each in done] == ["6.0\n"] * 2
     assert ["compiling end" in each.stderr for each in done] == [True, False]

@@ -1,7 +1,5 @@
 """LightGlue behind the project's conventions, with an untrained network."""
 
-from __future__ import annotations
-
 import re
 import urllib.request
 from pathlib import Path
@@ -61,9 +59,11 @@ def test_too_few_features_give_no_match(counts: tuple[int, int]) -> None:
     assert c.x0.shape == (1, 0, 2)
 
 
-def test_descriptors_of_another_length_are_told() -> None:
+def test_descriptors_of_another_length_and_unknown_features_are_told() -> None:
     with pytest.raises(ValueError, match=r"descriptors are \(5, 64\).*\(N, 128\)"):
         matcher()(features(0, 5), features(1, 5, length=64))
+    with pytest.raises(ValueError, match="aliked, disk"):
+        presets.build("matcher", "lightglue", features="sift")
 
 
 def test_weights_that_cannot_be_fetched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -87,8 +87,3 @@ def test_weights_that_cannot_be_fetched(tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.delitem(onnx_network.PUBLISHED, "disk_lightglue.pth")
     loaded = LightGlue("disk", device="cpu").network
     assert torch.equal(next(loaded.parameters()), next(network.parameters()))
-
-
-def test_unknown_features_are_told() -> None:
-    with pytest.raises(ValueError, match="aliked, disk"):
-        presets.build("matcher", "lightglue", features="sift")

@@ -17,6 +17,8 @@ from fmtorch.matching.nearest import GROUP
 from tests.conftest import oracle
 from tests.reference.local_features import two_nearest
 
+ROWS = st.lists(st.lists(st.integers(0, 2), min_size=2, max_size=2), max_size=40)
+
 
 def sift_like(seed: int, n: int, d: int = 128, top: int = 60) -> Tensor:
     generator = torch.Generator().manual_seed(seed)
@@ -58,9 +60,6 @@ def test_equals_the_definition_on_real_numbers(scale: float) -> None:
     np.testing.assert_array_equal(neighbors.nearest.numpy(), index)
     np.testing.assert_allclose(neighbors.distance.numpy() / scale, first / scale, atol=5e-7)
     np.testing.assert_allclose(neighbors.second.numpy() / scale, second / scale, atol=5e-7)
-
-
-ROWS = st.lists(st.lists(st.integers(0, 2), min_size=2, max_size=2), max_size=40)
 
 
 @settings(max_examples=60, deadline=None)

@@ -20,6 +20,12 @@ from tests.geometry.scenes import scene
 from tests.metrics.test_nsgd import VGA, random_pairs
 from tests.reference import metrics as reference
 from tests.reference import solvers
+from tests.reference.homography import mapped
+
+ERROR = st.floats(0, 40) | st.sampled_from([1.0, 5.0, 10.0, 15.0, 20.0, float("inf"), float("nan")])
+ERRORS = st.lists(ERROR, min_size=1, max_size=20)
+SIZE = torch.tensor([480, 640])
+CORNERS = np.array([[0, 0], [639, 0], [639, 479], [0, 479]], np.float64)
 
 
 def rotation(axis_angle: Tensor) -> Tensor:
@@ -149,10 +155,6 @@ def test_without_a_matrix_or_a_match_before_the_cameras_the_error_is_the_worst()
     assert closest.rotation[1].item() == closest.translation[1].item() == 180
 
 
-ERROR = st.floats(0, 40) | st.sampled_from([1.0, 5.0, 10.0, 15.0, 20.0, float("inf"), float("nan")])
-ERRORS = st.lists(ERROR, min_size=1, max_size=20)
-
-
 @given(ERRORS)
 def test_auc_as_superglue(values: list[float]) -> None:
     thresholds = (5, 10, 20)
@@ -173,16 +175,6 @@ def test_thresholds_that_are_no_multiples_are_refused(thresholds: tuple[float, .
         metrics.pose_map(torch.zeros(3), thresholds)
     with pytest.raises(ValueError, match="maximum is 0"):
         metrics.pose_maa(torch.zeros(3), 0)
-
-
-SIZE = torch.tensor([480, 640])
-
-
-CORNERS = np.array([[0, 0], [639, 0], [639, 479], [0, 479]], np.float64)
-
-
-def mapped(H: np.ndarray, points: np.ndarray) -> np.ndarray:
-    return cv2.perspectiveTransform(points[None], H)[0]
 
 
 def homographies(count: int) -> np.ndarray:

@@ -19,10 +19,11 @@ from fmtorch.pipeline import Pipeline, build_pipeline, load_pipeline
 from tests.helpers import compose
 from tests.laws import scene
 
+RATIO = "pruner.ratio.families"
+
 
 @pytest.fixture
 def own(tmp_path: Path) -> Path:
-    """A file of a user's own."""
     (tmp_path / "estimator").mkdir()
     return tmp_path / "estimator" / "own.yaml"
 
@@ -72,9 +73,6 @@ def test_options_of_a_pruner_that_others_replace_go_with_it(pipeline: str, prune
     config = compose("match", (f"pipeline={pipeline}", f"pruner=[{','.join(pruners)}]"))
     presets.expect_stages(config)
     assert [next(iter(entry)) for entry in presets.stages(config)["pruner"]] == pruners
-
-
-RATIO = "pruner.ratio.families"
 
 
 def matches(seed: int) -> GivenMatches:

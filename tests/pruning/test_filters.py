@@ -14,19 +14,19 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from torch import Tensor
 
-from fmtorch import find_fundamental, metrics, presets, pruning
+from fmtorch import presets, pruning
 from fmtorch.core import Correspondences, Features
 from fmtorch.matching import NearestNeighborMatcher
 from fmtorch.pruning.consistency import CURVES, MIN_VOTE, NOISE, SCALES, TOLERANCE, TURNS, WINDOW, WORST_RATIO
-from tests.geometry.scenes import scene as matched_scene
 from tests.laws import calibrated, degenerate, quick_pruner, scene, scenes, small, with_padding
 from tests.processes import run_command
-from tests.reference import consistency
-from tests.reference import local_features as matching_reference
-from tests.reference.gms import gms as gms_reference
-from tests.reference.local_features import one_to_one as one_to_one_reference
-from tests.reference.lpm import passes
-from tests.variants import built, loaded, variants
+from tests.reference import consistency, gms, local_features, lpm
+from tests.test_laws import PRUNERS
+from tests.variants import built
+
+SIZE = (640, 960)  # of the images of a scene
+NUMBERS = {"usual": 4.06, "radius": 15.0, "slope": 0.65}
+PER_MATCH = ("x0", "x1", "ratio", "prior", "lafs0", "lafs1", "mutual")
 
 
 def test_ratio_is_strict_and_refuses_nan() -> None:
@@ -49,8 +49,8 @@ def test_ratio_and_mutual_stages_equal_their_definitions(seed: int) -> None:
 
     matches = NearestNeighborMatcher()(features(d0), features(d1))
     ratio, both = pruning.RatioTest(0.8)(matches).mask[0], pruning.MutualCheck()(matches).mask[0]
-    np.testing.assert_array_equal(ratio, matching_reference.ratio_test(d0, d1, 0.8))
-    np.testing.assert_array_equal(both, matching_reference.mutual(d0, d1))
+    np.testing.assert_array_equal(ratio, local_features.ratio_test(d0, d1, 0.8))
+    np.testing.assert_array_equal(both, local_features.mutual(d0, d1))
     assert 0 < int(ratio.sum()) < 30
     assert 0 < int(both.sum()) < 30
     order = matches.compact()
@@ -64,7 +64,7 @@ def test_one_to_one_equals_the_definition(data: st.DataObject, n: int) -> None:
     x0, x1 = (data.draw(arrays(np.float32, (n, 2), elements=coordinates)) for _ in range(2))
     ratio = data.draw(arrays(np.float32, (n,), elements=ratios))
     mask = pruning.one_to_one(*(torch.from_numpy(a)[None] for a in (x0, x1, ratio)))
-    np.testing.assert_array_equal(mask[0], one_to_one_reference(x0, x1, ratio))
+    np.testing.assert_array_equal(mask[0], local_features.one_to_one(x0, x1, ratio))
 
 
 def test_stages_are_their_functions_need_their_fields_and_keep_the_rest() -> None:
@@ -80,17 +80,9 @@ def test_stages_are_their_functions_need_their_fields_and_keep_the_rest() -> Non
             stage(c.replace(**{field: None}))
 
 
-SOFT = [name for name in variants("pruner") if name.endswith(":soft=true")]
-HARD = {name.partition(":")[0] for name in SOFT if "network" in loaded("pruner", name)}
-"""Learned ones, whose mask is a threshold on the probabilities of their soft form."""
-PRUNERS = [name for name in variants("pruner") if name not in HARD or name == "lc"]
-PER_MATCH = ("x0", "x1", "ratio", "prior", "lafs0", "lafs1", "mutual")
-H, W = 640, 960
-
-
 def edge_cases() -> dict[str, Correspondences]:
     c, single = scene(0, 300), scene(0, 1)
-    right, bottom = float(W - 1), float(H - 1)
+    right, bottom = float(SIZE[1] - 1), float(SIZE[0] - 1)
     inside = [[0.0, 0.0], [right, 0.0], [0.0, bottom], [right, bottom]]
     border = torch.tensor([*inside, [right + 1, bottom + 1], [-0.5, -0.5], [right + 50, 7.0], [3.0, -90.0]])
     on_border = border.repeat(40, 1)[:300][None]
@@ -155,9 +147,6 @@ def test_many_matches_in_bounded_memory(tmp_path: Path) -> None:
     assert max(growth.values()) < 0.8e9, growth
 
 
-SIZE = (640, 960)  # of the images of a scene
-
-
 def inputs() -> Iterator[tuple[str, Correspondences]]:
     yield "a batch", scenes()
     yield "padding", with_padding(scenes(), np.random.default_rng(0), float("nan"))
@@ -197,13 +186,13 @@ def test_gms(real_matches: list[tuple[Correspondences, Tensor]]) -> None:
             c.x0, c.x1, size0=c.size0, size1=c.size1, mask=c.mask, threshold_factor=3.0, with_rotation=searched,
             with_scale=searched, border="authors" if searched else "opencv",
         )[i]  # fmt: skip
-        expected = gms_reference(x0, x1, sizes, searched, 3.0, authors=searched)  # type: ignore[arg-type]
+        expected = gms.gms(x0, x1, sizes, searched, 3.0, authors=searched)  # type: ignore[arg-type]
         expect_mask(mask, slots, expected, what)
 
 
 def test_lpm(real_matches: list[tuple[Correspondences, Tensor]]) -> None:
     for what, c, i, slots, x0, x1 in pairs(real_matches):
-        survivors, costs = passes(x0.astype(np.float64), x1.astype(np.float64))
+        survivors, costs = lpm.passes(x0.astype(np.float64), x1.astype(np.float64))
         expect_mask(pruning.lpm(c.x0, c.x1, mask=c.mask)[i], slots, np.isin(np.arange(len(slots)), survivors), what)
         expected = np.ones(c.mask.shape[1])
         expected[slots] = np.mean(costs, 0)
@@ -214,7 +203,7 @@ def test_lpm(real_matches: list[tuple[Correspondences, Tensor]]) -> None:
 def test_one_to_one(real_matches: list[tuple[Correspondences, Tensor]]) -> None:
     for what, c, i, slots, x0, x1 in pairs(real_matches):
         ratio = c.ratio[i].numpy()[slots]
-        expected = one_to_one_reference(x0, x1, np.where(np.isnan(ratio), np.inf, ratio))
+        expected = local_features.one_to_one(x0, x1, np.where(np.isnan(ratio), np.inf, ratio))
         expect_mask(pruning.one_to_one(c.x0, c.x1, c.ratio, c.mask)[i], slots, expected, what)
 
 
@@ -241,9 +230,6 @@ def test_agreement(ratios: bool) -> None:
         np.testing.assert_allclose(motion, by_motion, rtol=1e-3, atol=1e-5, err_msg=what)
 
 
-NUMBERS = {"usual": 4.06, "radius": 15.0, "slope": 0.65}
-
-
 def test_is_its_formula() -> None:
     rng = np.random.default_rng(0)
     lafs0, lafs1 = (torch.from_numpy(rng.normal(size=(2, 50, 2, 3)) * 20) for _ in range(2))
@@ -267,26 +253,3 @@ def test_matches_without_frames_are_left_as_they_are_and_what_cannot_be_told_is_
     assert bool(torch.isfinite(noise).all())
     alone = stage(c.replace(ratio=None, prior=None)).noise
     assert bool((alone[c.mask] > 0).all())
-
-
-def _noisy_pair(seed: int) -> tuple[torch.Tensor, ...]:
-    """Points of two views whose noise differs tenfold from match to match, the true F, and that noise."""
-    rng, exact = np.random.default_rng(seed), matched_scene(120, seed)
-    noise = torch.from_numpy(np.where(rng.random(120) < 0.5, 0.3, 3.0))
-    errors = torch.from_numpy(rng.normal(size=(2, 120, 2))) * 0.3 * noise[:, None]
-    return exact.x0 + errors[0], exact.x1 + errors[1], exact.F, noise
-
-
-def test_known_noise_makes_estimates_more_exact() -> None:
-    size = torch.tensor([[800, 1000]])
-    errors = []
-    for seed in range(6):
-        x0, x1, F, noise = _noisy_pair(seed)
-        row = []
-        for given_noise in (None, noise):
-            estimate = find_fundamental(x0, x1, noise=given_noise)  # with sizes, what is known of cameras helps both
-            assert bool(estimate.ok[0])
-            row.append(float(metrics.nsgd(F[None], estimate.F, size, size)))
-        errors.append(row)
-    without, with_noise = np.median(errors, 0)
-    assert with_noise < 0.6 * without

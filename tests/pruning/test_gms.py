@@ -3,22 +3,18 @@
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from torch import Tensor
 
 from fmtorch.core import Correspondences
-from fmtorch.jit.kernel import F8x2, I8x2, kernel
 from fmtorch.pruning import CODE, GMS, LPM, LikelihoodField, gms, lpm
-from fmtorch.pruning import neighbors as knn_kernels
 from fmtorch.pruning.code import huber_regression, match_domain, predictive_gaussians, spread_centres
 from tests.conftest import oracle
 from tests.reference import code as code_reference
 from tests.reference.lpm import lpm as reference
-from tests.reference.lpm import nearest
 
 MODES = [(False, False), (True, False), (False, True), (True, True)]  # (rotation, scale), the oracle's order
 SIZE0, SIZE1 = (480, 640), (300, 500)
+WIDTHS = {"position": 0.5, "displacement": 0.2, "rotation": 0.8, "scale": 0.5}
 
 
 def moving(seed: int, n: int, angle: float = 0.0, scale: float = 1.0, outliers: float = 0.3) -> tuple[Tensor, Tensor]:
@@ -107,29 +103,6 @@ def moving_along(seed: int, n: int, outliers: float = 0.4) -> tuple[Tensor, Tens
     return torch.from_numpy(x0), torch.from_numpy(x1)
 
 
-@kernel
-def search(queries: F8x2, points: F8x2, neighbors: I8x2) -> None:
-    knn_kernels.search(queries, points, neighbors)
-
-
-def nearest_points(queries: np.ndarray, points: np.ndarray, count: int) -> np.ndarray:
-    neighbors = np.empty((len(queries), count), np.int64)
-    search(queries, points, neighbors)
-    return neighbors
-
-
-@settings(max_examples=60, deadline=None)
-@given(st.integers(0, 10**6), st.integers(0, 60), st.integers(0, 60), st.integers(1, 12), st.booleans())
-def test_nearest_points_equal_the_definition(seed: int, n: int, m: int, count: int, coarse: bool) -> None:
-    rng = np.random.default_rng(seed)
-    queries, points = (rng.uniform(0, 6, (size, 2)) for size in (n, m))
-    if coarse:  # ties everywhere
-        queries, points = queries.round(), points.round()
-    for query, row in zip(queries, nearest_points(queries, points, count).tolist(), strict=True):
-        expected = nearest(query, points, list(range(m)), count)
-        assert row == expected + [-1] * (count - len(expected))
-
-
 def test_masks_equal_the_original() -> None:
     file = oracle("lpm.npz")
     for i, name in enumerate(file["names"]):
@@ -138,8 +111,6 @@ def test_masks_equal_the_original() -> None:
         x0, x1 = torch.from_numpy(case["X"]), torch.from_numpy(case["Y"])
         mask = lpm(x0[None], x1[None], thresholds=(lambda1, lambda2), neighbors=(int(K1), int(K2)), taus=(tau1, tau2))
         np.testing.assert_array_equal(mask[0], case["mask"], str(name))
-        for x, key in ((case["X"], "nX1"), (case["Y"], "nY1")):
-            np.testing.assert_array_equal(nearest_points(x, x, int(K1) + 3), case[key], str(name))
 
 
 def test_neighbourhoods_may_be_large() -> None:
@@ -159,9 +130,6 @@ def test_stage_and_bad_input() -> None:
     assert not kept[0, 7]
     with pytest.raises(ValueError, match="at least 4"):
         lpm(x0, x1, neighbors=(3, 6))
-
-
-WIDTHS = {"position": 0.5, "displacement": 0.2, "rotation": 0.8, "scale": 0.5}
 
 
 def frames(x: np.ndarray, S: np.ndarray) -> np.ndarray:

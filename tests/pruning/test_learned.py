@@ -15,9 +15,8 @@ from fmtorch.pruning.networks import ConvMatch, learned_file
 from fmtorch.runs import configuration
 from fmtorch.runs.fingerprint import learned
 from fmtorch.training import export_onnx, save_weights
-from tests.laws import scene
+from tests.laws import calibrated, scene
 
-K = torch.tensor([[[800.0, 0, 480], [0, 800, 320], [0, 0, 1]]])
 SIDE = ["ratio", "mutual", "scale", "rotation", "agreement"]
 VARIANTS: dict[str, Callable[[], nn.Module]] = {
     "lc": lambda: LC(channels=16, blocks=2, coordinates="K", side=SIDE),
@@ -37,7 +36,7 @@ def small(variant: str = "lc", seed: int = 0) -> nn.Module:
 
 def pairs_of_several_lengths() -> list[Correspondences]:
     """Pairs of several lengths, among them less than a minimal sample and none."""
-    return [scene(i, count=n).replace(K0=K, K1=K) for i, n in enumerate((150, 3, 40, 1, 0, 97))]
+    return [calibrated(scene(i, count=n)) for i, n in enumerate((150, 3, 40, 1, 0, 97))]
 
 
 class Ratio(nn.Module):
@@ -105,7 +104,7 @@ def test_prior_and_threshold() -> None:
 
 
 def test_a_match_that_is_not_finite_has_no_chance() -> None:
-    c = scene(0).replace(K0=K, K1=K)
+    c = calibrated(scene(0))
     x1 = c.x1.clone()
     x1[0, 3, 1] = torch.inf
     p = LearnedPruner(small()).probability(c.replace(x1=x1))

@@ -11,8 +11,14 @@ from fmtorch.pruning.consistency import CURVES, MIN_VOTE, NOISE, TOLERANCE, TURN
 from tests.laws import scene
 from tests.pruning.test_gms import SIZE0, SIZE1, moving, moving_along
 from tests.reference import consistency as reference
-from tests.reference.gms import support
+from tests.reference import gms
 from tests.variants import built
+
+SCORED = Calibration(
+    {"constant": -1.0, "evidence": 3.0, "ratio": -2.0}, {"constant": -2.0, "evidence": 4.0},
+    {"constant": 1.5, "tolerance": 0.25},
+)  # fmt: skip
+PRIORS = {"frame_consistency": "x0 x1 lafs0", "position_consistency": "x0", "match_noise": "lafs0 prior"}
 
 
 def logistic(z: torch.Tensor) -> torch.Tensor:
@@ -38,12 +44,6 @@ def test_calibration_uses_the_ratio_where_there_is_one() -> None:
     unknown[0, 3] = torch.nan
     assert both(c.replace(ratio=unknown), evidence).prior[0, 3] == logistic(-3 + 3 * evidence[0, 3])
     assert Calibration(both.with_ratio)(c.replace(ratio=None), evidence).prior is None
-
-
-SCORED = Calibration(
-    {"constant": -1.0, "evidence": 3.0, "ratio": -2.0}, {"constant": -2.0, "evidence": 4.0},
-    {"constant": 1.5, "tolerance": 0.25},
-)  # fmt: skip
 
 
 def by_score(evidence: torch.Tensor, score: torch.Tensor) -> torch.Tensor:
@@ -91,7 +91,7 @@ def test_gms_support_equals_the_definition(angle: float, scale: float) -> None:
         x0[None], x1[None], size0=torch.tensor([SIZE0]), size1=torch.tensor([SIZE1]),
         with_rotation=searched, with_scale=searched, threshold_factor=2.0,
     )[0]  # fmt: skip
-    z = np.array(support(x0.numpy(), x1.numpy(), (SIZE0, SIZE1), searched, 2.0))
+    z = np.array(gms.support(x0.numpy(), x1.numpy(), (SIZE0, SIZE1), searched, 2.0))
     np.testing.assert_allclose(computed, z / (z + 1.5), rtol=1e-6)  # float64 rounded to float32
 
 
@@ -130,9 +130,6 @@ def test_a_stage_that_would_do_nothing_is_refused() -> None:
     for stage in (GMS, LPM):
         with pytest.raises(ValueError, match="calibration"):
             stage(soft=True)
-
-
-PRIORS = {"frame_consistency": "x0 x1 lafs0", "position_consistency": "x0", "match_noise": "lafs0 prior"}
 
 
 @pytest.mark.parametrize("name", PRIORS)

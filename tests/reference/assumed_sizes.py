@@ -1,13 +1,13 @@
 """Sizes of images as their matched points tell them, one pair and one number at a time."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
 
+Sizes = list[tuple[float, float]]
 
-def extents(x0: np.ndarray, x1: np.ndarray) -> list[tuple[float, float]] | None:
+
+def extents(x0: np.ndarray, x1: np.ndarray) -> Sizes | None:
     """The sizes (h, w) of both images; None where the points (n, 2) tell none."""
     there = [(a, b) for a, b in zip(x0.tolist(), x1.tolist(), strict=True) if all(map(math.isfinite, a + b))]
     n, sizes = len(there), []
@@ -19,9 +19,7 @@ def extents(x0: np.ndarray, x1: np.ndarray) -> list[tuple[float, float]] | None:
     return sizes
 
 
-def assumed(
-    sizes: list[tuple[float, float]], one_size: float, two_sizes: float
-) -> tuple[list[tuple[float, float]], bool]:
+def assumed(sizes: Sizes, one_size: float, two_sizes: float) -> tuple[Sizes, bool]:
     """The sizes that are taken, and whether they are doubtful; of the significance of estimates of one size and two."""
     (h0, w0), (h1, w1) = sizes
     h, w = max(h0, h1), max(w0, w1)

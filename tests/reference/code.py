@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize
+from scipy.special import huber
 
 
 def normalised(x: np.ndarray) -> tuple[np.ndarray, float]:
@@ -44,10 +45,6 @@ def spread_centres(kernel: np.ndarray, count: int) -> list[int]:
     return chosen
 
 
-def huber(r: float, scale: float) -> float:
-    return r * r if r <= scale else 2 * scale * r - scale * scale
-
-
 def huber_regression(basis: np.ndarray, target: np.ndarray, ridge: np.ndarray, scale: float) -> np.ndarray:
     """The minimiser by a general optimiser; the objective is convex, so there is one."""
     m, k = basis.shape[1], target.shape[1]
@@ -58,7 +55,7 @@ def huber_regression(basis: np.ndarray, target: np.ndarray, ridge: np.ndarray, s
         for row, wanted in zip(basis, target, strict=True):
             residual = wanted - row @ C
             r = float(np.linalg.norm(residual))
-            value += huber(r, scale)
+            value += 2 * huber(scale, r)  # r^2 up to the scale
             gradient -= 2 * np.outer(row, residual) * min(1.0, scale / r if r > 0 else 1.0)
         return value, gradient.ravel()
 
@@ -66,9 +63,7 @@ def huber_regression(basis: np.ndarray, target: np.ndarray, ridge: np.ndarray, s
     return result.x.reshape(m, k)
 
 
-def likelihood(
-    matches: list[tuple[Any, ...]], widths: dict[str, float], centres: int, ridge: float, scale: float
-) -> np.ndarray:
+def likelihood(matches: list[Any], widths: dict[str, float], centres: int, ridge: float, scale: float) -> np.ndarray:
     """Likelihood of every match, all of them distinctive."""
     kernel = np.array([[predictive_gaussian(a, b, widths) for b in matches] for a in matches])
     basis = kernel[:, spread_centres(kernel, centres)]

@@ -10,9 +10,11 @@ size less ``A / (1 + (ln f0 - ln f1)^2 / s3^2)``; for each measured focal length
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from tests.reference.solvers import poses, skew
+from tests.reference.solvers import Array, poses, skew
 
 Size = tuple[int, int]
+Measured = tuple[tuple[float, float], tuple[float, float]]
+UNMEASURED = ((0.0, np.inf), (0.0, np.inf))
 
 
 def calibration(focal: float, size: Size) -> np.ndarray:
@@ -29,10 +31,6 @@ def fundamental(parameters: np.ndarray, size0: Size, size1: Size) -> np.ndarray:
     return np.linalg.inv(K1).T @ skew(parameters[3:6]) @ R @ np.linalg.inv(K0)
 
 
-Measured = tuple[tuple[float, float], tuple[float, float]]
-UNMEASURED = ((0.0, np.inf), (0.0, np.inf))
-
-
 def prior_cost(log_f0: float, log_f1: float, same_size: bool = False, measured: Measured = UNMEASURED) -> float:
     """What the two focal lengths cost; less where images of equal size may be of one camera.
     measured: logarithm and deviation of each; an infinite deviation is no measurement."""
@@ -46,9 +44,7 @@ def prior_cost(log_f0: float, log_f1: float, same_size: bool = False, measured: 
     return cost + 3 * z2 / (z2 + 6)
 
 
-def share_in_front(
-    E: np.ndarray, rays0: np.ndarray, rays1: np.ndarray, support: np.ndarray, angle: np.ndarray
-) -> float:
+def share_in_front(E: Array, rays0: Array, rays1: Array, support: Array, angle: Array) -> float:
     """E (3, 3), rays (n, 3), support (n); rays whose directions differ by less than the angles (n) count anyway."""
     best = 0.0
     for R, t in poses(E):

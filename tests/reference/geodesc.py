@@ -3,12 +3,10 @@
 import math
 from collections.abc import Mapping, Sequence
 
+from numpy import dot
+
 Vector = Sequence[float]
 Vectors = Sequence[Sequence[float]]
-
-
-def dot(a: Vector, b: Vector) -> float:
-    return sum(x * y for x, y in zip(a, b, strict=True))
 
 
 def angle(a: Vector, b: Vector) -> float:

@@ -10,6 +10,7 @@ GRID = 20
 SCALES = (1.0, 1 / 2, 1 / math.sqrt(2), math.sqrt(2), 2.0)
 SHIFTS = ((0.0, 0.0), (0.5, 0.0), (0.0, 0.5), (0.5, 0.5))
 RING = ((-1, -1), (0, -1), (1, -1), (1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0))  # (x, y), clockwise from the top left
+Sizes = tuple[tuple[int, int], tuple[int, int]]
 
 
 def normalised(x: np.ndarray, size: tuple[int, int]) -> np.ndarray:
@@ -67,11 +68,7 @@ def run(p0: np.ndarray, p1: np.ndarray, scale: float, turn: int, factor: float, 
     return kept
 
 
-Sizes = tuple[tuple[int, int], tuple[int, int]]
-
-
 def hypotheses(searched: bool) -> list[tuple[float, int]]:
-    """Scales and turns."""
     return list(itertools.product(SCALES, range(8))) if searched else [(1.0, 0)]
 
 

@@ -11,6 +11,8 @@ import numpy as np
 from tests.reference.refine import loss as robust_loss
 from tests.reference.solvers import hartley, homogeneous, skew, unit
 
+STEP = 1e-30  # of complex derivatives
+
 
 def dlt(x0: np.ndarray, x1: np.ndarray, weight: np.ndarray | None = None) -> np.ndarray:
     """The normalised direct linear transform (Hartley & Zisserman 2004, algorithm 4.2)."""
@@ -24,10 +26,10 @@ def dlt(x0: np.ndarray, x1: np.ndarray, weight: np.ndarray | None = None) -> np.
     return unit(np.linalg.inv(T1) @ H @ T0)
 
 
-def transfer(H: np.ndarray, x0: np.ndarray, x1: np.ndarray) -> float:
-    """The greater of the distances from H x0 to x1 and from H^-1 x1 to x0."""
-    there, back = H @ np.append(x0, 1), np.linalg.inv(H) @ np.append(x1, 1)
-    return float(max(np.linalg.norm(there[:2] / there[2] - x1), np.linalg.norm(back[:2] / back[2] - x0)))
+def transfer(H: np.ndarray, x0: np.ndarray, x1: np.ndarray) -> np.ndarray:
+    """The greater of the distances (n,) from H x0 to x1 and from H^-1 x1 to x0."""
+    ends = mapped(H, x0) - x1, mapped(np.linalg.inv(H), x1) - x0
+    return np.asarray(np.linalg.norm(ends, axis=2).max(0))
 
 
 def through_plane(F: np.ndarray, x0: np.ndarray, x1: np.ndarray) -> np.ndarray:
@@ -45,9 +47,6 @@ def plane_and_parallax(H: np.ndarray, x0: np.ndarray, x1: np.ndarray) -> np.ndar
     lines = [np.cross(b, H @ a) for a, b in zip(homogeneous(x0), homogeneous(x1), strict=True)]
     e = np.cross(lines[0], lines[1])
     return unit(skew(e) @ H)
-
-
-STEP = 1e-30  # of complex derivatives
 
 
 def equations(h: np.ndarray, match: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -1,9 +1,9 @@
 """Lenses of the division model: bent points, F between such photographs, one match and one number at a time."""
 
-from __future__ import annotations
-
 import numpy as np
 import scipy.linalg
+
+from tests.reference.solvers import skew
 
 Size = tuple[int, int]
 
@@ -43,10 +43,8 @@ def constraint(F: np.ndarray, x: np.ndarray, sizes: tuple[Size, Size], lenses: t
 def sampson(F: np.ndarray, x: np.ndarray, sizes: tuple[Size, Size], lenses: tuple[float, float]) -> float:
     """The Sampson distance of a match by the photograph's coordinates, px: the gradient by differences."""
     e = constraint(F, x, sizes, lenses)
-    slope = [
-        (constraint(F, x + d, sizes, lenses) - constraint(F, x - d, sizes, lenses)) / 2e-3 for d in 1e-3 * np.eye(4)
-    ]
-    return float(e / np.linalg.norm(slope))
+    ends = ((constraint(F, x + d, sizes, lenses), constraint(F, x - d, sizes, lenses)) for d in 1e-3 * np.eye(4))
+    return float(e / np.linalg.norm([(there - back) / 2e-3 for there, back in ends]))
 
 
 def nine_points(x0: np.ndarray, x1: np.ndarray, size: Size) -> list[tuple[float, np.ndarray]]:
@@ -57,10 +55,8 @@ def nine_points(x0: np.ndarray, x1: np.ndarray, size: Size) -> list[tuple[float,
     centre, half = frame(size)
     h0, h1 = (np.c_[(x - centre) / half, np.ones(9)] for x in (x0, x1))
     e0, e1 = (np.c_[np.zeros((9, 2)), (h[:, :2] ** 2).sum(1)] for h in (h0, h1))
-    D1, D2, D3 = (
-        sum(np.einsum("ni,nj->nij", b, a).reshape(9, 9) for b, a in terms)
-        for terms in ([(h1, h0)], [(h1, e0), (e1, h0)], [(e1, e0)])
-    )
+    sums = ([(h1, h0)], [(h1, e0), (e1, h0)], [(e1, e0)])
+    D1, D2, D3 = (sum(np.einsum("ni,nj->nij", b, a).reshape(9, 9) for b, a in terms) for terms in sums)
     zero, eye = np.zeros((9, 9)), np.eye(9)
     values, vectors = scipy.linalg.eig(np.block([[zero, eye], [-D1, -D2]]), np.block([[eye, zero], [zero, D3]]))
     real = [i for i in range(18) if abs(values[i].imag) < 1e-6 and abs(values[i]) < 1]
@@ -88,6 +84,5 @@ def photographs(
     x0, x1 = (x[inside] for x in points)
     some = slice(int(wrong * len(x1)))
     x1[some] = rng.permutation(x1[some])
-    cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
-    F = np.linalg.inv(K).T @ cross @ R @ np.linalg.inv(K)
+    F = np.linalg.inv(K).T @ skew(t) @ R @ np.linalg.inv(K)
     return x0, x1, F / np.linalg.norm(F), K

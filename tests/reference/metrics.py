@@ -25,10 +25,9 @@ def border_points(line: Array, size: Array, origin: float) -> tuple[Array, Array
     """Where a line enters and leaves an image, from left to right (a vertical one downwards); None where it misses."""
     a, b, c = line
     low, high = origin, origin + np.array([size[1], size[0]])
-    points = [(x, -(a * x + c) / b) for x in (low, high[0]) if b != 0] + [
-        (-(b * y + c) / a, y) for y in (low, high[1]) if a != 0
-    ]
-    points = [np.array(p) for p in points if low <= p[0] <= high[0] and low <= p[1] <= high[1]]
+    ends = [(x, -(a * x + c) / b) for x in (low, high[0]) if b != 0]
+    ends += [(-(b * y + c) / a, y) for y in (low, high[1]) if a != 0]
+    points = [np.array(p) for p in ends if low <= p[0] <= high[0] and low <= p[1] <= high[1]]
     if len(points) < 2:
         return None
     points.sort(key=tuple)
@@ -45,10 +44,8 @@ def half_draw(F: Array, F_other: Array, size0: Array, size1: Array, u: Array) ->
     return distance(m, F_other.T @ homogeneous(m1)), distance(m1, F_other @ homogeneous(m))
 
 
-def nsgd(
-    F_gt: Array, F_est: Array, size0: Array, size1: Array, uniforms: Array, samples: int
-) -> tuple[float, float, int]:
-    """SGD, NSGD (both uncapped) and the number of draws accepted, from uniform numbers (tries, 6)."""
+def nsgd(F_gt: Array, F_est: Array, size0: Array, size1: Array, uniforms: Array, samples: int) -> tuple[float, float]:
+    """SGD and NSGD, both uncapped, from uniform numbers (tries, 6)."""
     pixels, diagonals = [], []
     for u in uniforms:
         first = half_draw(F_gt, F_est, size0, size1, u[:3])
@@ -61,8 +58,8 @@ def nsgd(
         if len(pixels) == samples:
             break
     if not pixels:
-        return (math.hypot(*size0) + math.hypot(*size1)) / 2, 1.0, 0
-    return float(np.mean(pixels)), float(np.mean(diagonals)), len(pixels)
+        return (math.hypot(*size0) + math.hypot(*size1)) / 2, 1.0
+    return float(np.mean(pixels)), float(np.mean(diagonals))
 
 
 def half_draw_released(F: Array, F_other: Array, size0: Array, size1: Array, u: Array) -> float | None:

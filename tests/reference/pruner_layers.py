@@ -1,10 +1,10 @@
 """Layers of OANet, CLNet and NCMNet from the definitions, at inference: one pair, no padding, features (C, n)."""
 
-import math
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn.functional import batch_norm, instance_norm, scaled_dot_product_attention
 
 from tests.reference.pruner_losses import EPS
 
@@ -14,13 +14,12 @@ def linear(layer: Any, x: Tensor) -> Tensor:
 
 
 def batch_norm_relu(layer: Any, x: Tensor) -> Tensor:
-    normal = (x - layer.running_mean[:, None]) / (layer.running_var + EPS).sqrt()[:, None]
-    return torch.relu(layer.weight[:, None] * normal + layer.bias[:, None])
+    known = layer.running_mean, layer.running_var, layer.weight, layer.bias
+    return torch.relu(batch_norm(x.T, *known, eps=EPS).T)
 
 
 def context_batch_norm_relu(layer: Any, x: Tensor) -> Tensor:
-    centred = x - x.mean(1, keepdim=True)
-    return batch_norm_relu(layer, centred / (centred.square().mean(1, keepdim=True) + 1e-3).sqrt())
+    return batch_norm_relu(layer, instance_norm(x[None], eps=1e-3)[0])
 
 
 def normed(layer: Any, x: Tensor) -> Tensor:
@@ -41,11 +40,8 @@ def context(module: Any, x: Tensor) -> Tensor:
 
 def neighbors(x: Tensor, count: int) -> list[list[int]]:
     """Of each match the nearest by distance, itself first; then itself again."""
-    nearest = []
-    for i in range(x.shape[1]):
-        order = sorted(range(x.shape[1]), key=lambda j: float((x[:, i] - x[:, j]).square().sum()))
-        nearest.append((order + [i] * count)[:count])
-    return nearest
+    order = torch.cdist(x.T, x.T).argsort(stable=True).tolist()
+    return [(nearest + [i] * count)[:count] for i, nearest in enumerate(order)]
 
 
 def annular(module: Any, x: Tensor, nearest: list[list[int]]) -> Tensor:
@@ -68,11 +64,8 @@ def graph(module: Any, x: Tensor, logit: Tensor) -> Tensor:
 
 
 def attention(query: Tensor, key: Tensor, value: Tensor, heads: int) -> Tensor:
-    parts = []
-    for q, k, v in zip(query.chunk(heads), key.chunk(heads), value.chunk(heads), strict=True):
-        columns = [v @ torch.softmax(k.T @ column / math.sqrt(len(q)), 0) for column in q.T]
-        parts.append(torch.stack(columns, 1))
-    return torch.cat(parts)
+    parts = zip(query.chunk(heads), key.chunk(heads), value.chunk(heads), strict=True)
+    return torch.cat([scaled_dot_product_attention(q.T[None], k.T[None], v.T[None])[0].T for q, k, v in parts])
 
 
 def pruned(logit: list[float], ratio: float) -> list[int]:

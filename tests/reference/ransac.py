@@ -10,7 +10,9 @@ from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
 from tests.reference.refine import magsac_loss
 
+Edges = list[tuple[int, int]]
 REACH = 5  # scales, from which on the gain of Geman & McClure is zero
+CAPACITY_UNIT = 2.0**-16  # capacities are rounded to multiples of it, because the flow is one of integers
 
 
 def inlier(r: float) -> float:
@@ -86,10 +88,8 @@ def quantised(prior: Sequence[float], largest: int) -> list[int]:
 
 def prosac_growth(total: int, size: int, draws: int) -> tuple[list[int], list[Fraction]]:
     """T'_n for n = 1 .. N, and what T_n grew by (Chum & Matas, CVPR 2005, equations 3 and 4); T_N: `draws`."""
-    T = [
-        draws * math.prod((Fraction(max(n - i, 0), total - i) for i in range(size)), start=Fraction(1))
-        for n in range(total + 1)
-    ]
+    shares = ((Fraction(max(n - i, 0), total - i) for i in range(size)) for n in range(total + 1))
+    T = [draws * math.prod(each, start=Fraction(1)) for each in shares]
     grown = [T[n] - T[n - 1] for n in range(1, total + 1)]
     table: list[int] = []
     for n in range(1, total + 1):
@@ -131,10 +131,7 @@ def on_line(x: np.ndarray, rounding: float) -> bool:
     return bool(across <= np.sqrt(len(x)) * max(4 * rounding, 2.0**-22 * along))
 
 
-CAPACITY_UNIT = 2.0**-16  # capacities are rounded to multiples of it, because the flow is one of integers
-
-
-def energy(labels: np.ndarray, kernel: np.ndarray, edges: list[tuple[int, int]], coherence: float) -> float:
+def energy(labels: np.ndarray, kernel: np.ndarray, edges: Edges, coherence: float) -> float:
     """E(L) of Barath & Matas (CVPR 2018), section 3, term by term; labels are 1 for inliers."""
     total = sum(1 - K if label else K for label, K in zip(labels, kernel, strict=True))
     for p, q in edges:
@@ -143,7 +140,7 @@ def energy(labels: np.ndarray, kernel: np.ndarray, edges: list[tuple[int, int]],
     return float(total)
 
 
-def least_cut(kernel: np.ndarray, edges: list[tuple[int, int]], coherence: float) -> np.ndarray:
+def least_cut(kernel: np.ndarray, edges: Edges, coherence: float) -> np.ndarray:
     """The labelling of least energy and fewest inliers: a least cut of a graph whose cuts cost what labellings cost.
     Terminals as Kolmogorov & Zabih (PAMI 2004) place them: a pair's cost [[A, B], [C, D]] is A + (C - A) L_p + (D - C)
     L_q + (B + C - A - D) (1 - L_p) L_q. Source: label 0; sink: label 1."""
@@ -172,9 +169,7 @@ def least_cut(kernel: np.ndarray, edges: list[tuple[int, int]], coherence: float
     return labels
 
 
-def fixed_point(
-    kernel: np.ndarray, edges: list[tuple[int, int]], coherence: float, label: int, sweeps: int
-) -> np.ndarray:
+def fixed_point(kernel: np.ndarray, edges: Edges, coherence: float, label: int, sweeps: int) -> np.ndarray:
     """Labels of one kind, then, all at once, the best given their neighbours', an outlier where both are as good."""
     n = len(kernel)
     labels = np.full(n, label)

@@ -8,7 +8,7 @@ from scipy.special import gamma, gammainc, gammaincc
 
 from fmtorch.geometry import LOSSES
 from fmtorch.geometry.levenberg_marquardt import LOSS_TABLE
-from tests.reference.solvers import sampson
+from tests.reference.solvers import Array, sampson
 
 
 def loss(r2: np.ndarray, s2: float | np.ndarray, name: str) -> np.ndarray:
@@ -36,9 +36,7 @@ def magsac_loss(r2: np.ndarray, s2: float | np.ndarray) -> np.ndarray:
     return rho / slope
 
 
-def optimum(
-    F: np.ndarray, x0: np.ndarray, x1: np.ndarray, weight: np.ndarray, name: str, scale: float
-) -> tuple[np.ndarray, float]:
+def optimum(F: Array, x0: Array, x1: Array, weight: Array, name: str, scale: float) -> tuple[Array, float]:
     """The local minimum near F of ``sum w rho(r^2)``, and its cost; points of about unit scale."""
     U, s, Vt = np.linalg.svd(F)
 
@@ -66,9 +64,7 @@ def tabulated(r2: np.ndarray, s2: np.ndarray) -> np.ndarray:
     return np.asarray(s2 * (LOSS_TABLE[1, interval.astype(int)] + inside))
 
 
-def normal_equations(
-    f: np.ndarray, points: np.ndarray, weight: np.ndarray, s2: np.ndarray, name: str
-) -> tuple[np.ndarray, float]:
+def normal_equations(f: Array, points: Array, weight: Array, s2: Array, name: str) -> tuple[Array, float]:
     """``[J r]^T W [J r]`` (10, 10) of a model (9,), by the derivative of the residual, and the cost; points (4, n)."""
     x0, x1 = points[:2].T, points[2:].T
     h0, h1 = np.c_[x0, np.ones(len(x0))], np.c_[x1, np.ones(len(x1))]
@@ -89,9 +85,8 @@ def normal_equations(
 
 
 def levenberg_marquardt(
-    f: np.ndarray, points: np.ndarray, weight: np.ndarray, s2: np.ndarray, name: str, iterations: int, damping: float,
-    tolerance: float,
-) -> tuple[np.ndarray, float]:  # fmt: skip
+    f: Array, points: Array, weight: Array, s2: Array, name: str, iterations: int, damping: float, tolerance: float
+) -> tuple[Array, float]:
     """The model (9,) and its cost after damped steps across F and ``e1 e0^T``, each made rank 2 along the second."""
     U, s, Vt = np.linalg.svd(f.reshape(3, 3))
     F = U @ np.diag([s[0], s[1], 0]) @ Vt / np.hypot(s[0], s[1])

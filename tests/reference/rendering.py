@@ -6,6 +6,8 @@ from fmtorch.scenes.light import SHADOW_MAP, Stage
 from fmtorch.scenes.raycast import SEAM, Geometry, Matrix, Met, Pieces
 from fmtorch.scenes.surfaces import TO_LINEAR, Texture, bilinear
 
+Array = np.ndarray
+
 
 def cast(geometry: Geometry, pieces: Pieces, near: np.float32, met: Met) -> None:
     """`raycast_kernels.cast_pieces`."""
@@ -77,9 +79,7 @@ def shade(stage: Stage, hits: Met, inverse: Matrix, offset: tuple[float, float],
     out[index] = _albedo(stage, inverse, index, piece, value, hits.piece.shape[1]) * _irradiance(stage, value, offset)
 
 
-def _albedo(
-    stage: Stage, inverse: Matrix, index: np.ndarray, piece: np.ndarray, value: np.ndarray, w: int
-) -> np.ndarray:
+def _albedo(stage: Stage, inverse: Matrix, index: Array, piece: Array, value: Array, w: int) -> Array:
     """Filtered texture colour (n, 3); level of detail from the pixel's footprint in texels."""
     geometry = stage.geometry
     rows = stage.homography(inverse)[piece]

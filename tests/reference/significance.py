@@ -1,7 +1,7 @@
 """Significance, and evidence for kinds of image pairs, from the definitions, one pair at a time."""
 
 import math
-from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,11 @@ from tests.reference.solvers import epipolar_distances
 FREEDOM = 3.0
 START, FINEST, COARSEST = 1 / 1500, 0.1, 1 / 300  # of side, px, of side
 LOSS = 3.0
+Points = NDArray[np.float64]
+CELLS = 64  # of a side of the grid in which places are told apart, to the diagonal of the image
+SAMPLE = 7
+MODELS = 3  # of a sample
+MIN_CHANCE = 2.0**-13
 
 
 def density(r: np.ndarray, s: float, dimensions: int, side: float) -> np.ndarray:
@@ -111,16 +116,7 @@ def copy(r: np.ndarray, x0: np.ndarray, x1: np.ndarray, s: float, n: np.ndarray)
     return H
 
 
-Points = NDArray[np.float64]
-CELLS = 64  # of a side of the grid in which places are told apart, to the diagonal of the image
-SAMPLE = 7
-MODELS = 3  # of a sample
-MIN_CHANCE = 2.0**-13
-
-
-def significance(
-    F: Points, x0: Points, x1: Points, size0: Sequence[float] | None = None, size1: Sequence[float] | None = None
-) -> float:
+def significance(F: Points, x0: Points, x1: Points, size0: Any = None, size1: Any = None) -> float:
     """-log10 of the least number of false alarms over the numbers k of matches that may be meant.
 
     NFA(k) = 3 (n - 7) C(n, k) C(k, 7) alpha_k^(k - 7), alpha_k the k-th smallest chance that a point at random is as

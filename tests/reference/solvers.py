@@ -1,5 +1,6 @@
 """Epipolar geometry and minimal solvers from the definitions, one problem at a time, by NumPy's SVD and roots."""
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -69,13 +70,6 @@ def poses(E: Array) -> list[tuple[Array, Array]]:
     return [(R * np.linalg.det(R), sign * U[:, 2]) for R in rotations for sign in (1, -1)]
 
 
-def triangulate(P0: Array, P1: Array, x0: Array, x1: Array) -> Array:
-    """A homogeneous point by the direct linear transformation."""
-    A = np.array([x0[0] * P0[2] - P0[0], x0[1] * P0[2] - P0[1], x1[0] * P1[2] - P1[0], x1[1] * P1[2] - P1[1]])
-    X = np.linalg.svd(A)[2][-1]
-    return X / X[3]
-
-
 def pose(F: Array, K0: Array, K1: Array, x0: Array, x1: Array) -> tuple[Array, Array, int]:
     """Brute force: every decomposition, every point triangulated, depths counted."""
     best: tuple[Array, Array, int] | None = None
@@ -84,8 +78,8 @@ def pose(F: Array, K0: Array, K1: Array, x0: Array, x1: Array) -> tuple[Array, A
     P0 = np.eye(3, 4)
     for R, t in poses(K1.T @ F @ K0):
         P1 = np.column_stack([R, t])
-        points = [triangulate(P0, P1, a, b) for a, b in zip(n0, n1, strict=True)]
-        count = sum(bool(X[2] > 0 and (P1 @ X)[2] > 0) for X in points)
+        X = cv2.triangulatePoints(P0, P1, n0[:, :2].T, n1[:, :2].T)
+        count = int(((X[2] / X[3] > 0) & ((P1 @ X)[2] / X[3] > 0)).sum())
         if best is None or count > best[2]:
             best = (R, t, count)
     assert best is not None

@@ -44,14 +44,12 @@ class Cameras:
 
     def unscaled(self) -> np.ndarray:
         """``K1^-T [t]x R K0^-1``."""
-        K0, K1 = (
-            np.array([[f, 0, p[0]], [0, f, p[1]], [0, 0, 1]]) for f, p in zip(self.focal, self.principal, strict=True)
-        )
+        known = zip(self.focal, self.principal, strict=True)
+        K0, K1 = (np.array([[f, 0, p[0]], [0, f, p[1]], [0, 0, 1]]) for f, p in known)
         return np.linalg.inv(K1).T @ skew(self.t) @ self.R @ np.linalg.inv(K0)
 
 
 def residuals(cameras: Cameras, x0: np.ndarray, x1: np.ndarray) -> np.ndarray:
-    """Signed Sampson distances (n,) in pixels."""
     return sampson(cameras.fundamental(), x0, x1)
 
 

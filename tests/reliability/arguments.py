@@ -12,6 +12,7 @@ COUNTS = (0, 1, 5, 7, 8, 9, 12, 16, 20, 60)
 SCALES = (1.0, 1.0, 1.0, 1e-9, 1e-3, 1e6, 1e9, 1e150, 1e-150)
 SIZE = (640, 960)
 Draw = Callable[[Any], Any]
+KINDS = ("torch.float32", "torch.float64", "numpy.float32", "numpy.float64")
 
 
 def points(kind: str, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -78,9 +79,6 @@ class Scene:
         if name in ("weight", "ratio", "prior", "noise", "nsgd", "errors", "thresholds"):
             return self.rng.uniform(0.01, 1, full)
         return self.rng.normal(size=full)
-
-
-KINDS = ("torch.float32", "torch.float64", "numpy.float32", "numpy.float64")
 
 
 def given(array: np.ndarray, kind: str) -> Any:

@@ -14,7 +14,6 @@ EVAL = ["features.max_features=400", "estimator=lmeds", "estimator.hypotheses=20
 
 
 def evaluation(root: Path, run_dir: Path, *extra: str) -> list[str]:
-    """Arguments of an evaluation."""
     return ["dataset=fmbench", f"dataset.root={root}", *EVAL, f"output={run_dir}", *extra]
 
 
@@ -26,7 +25,6 @@ def results(run_dir: Path) -> Rows:
 
 
 def parts(run_dir: Path) -> int:
-    """How many parts a run has on disk."""
     return len(list((run_dir / "pairs").glob("part-*.parquet")))
 
 
@@ -40,7 +38,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(scope="package")
 def starter() -> Starter:
-    """Starts commands."""
     return processes.starter()
 
 

@@ -46,9 +46,20 @@ Call = Callable[[], Any]
 Check = Callable[[Any], None]
 Draw = Callable[[st.DataObject], tuple[Call, set[str], Check]]
 """Makes a call, the names that an error may name, and a check of the result."""
-
-
-# Arguments ------------------------------------------------------------------------------------------------------------
+UNDEFINED = {"inlier_rate", "recall", "mean_recall", "pose_auc"}  # NaN of an empty set
+UNIT_INTERVAL = {"nsgd", "nsgd_released", "recall", "mean_recall", "pose_auc", "inlier_rate"}
+NOT_NEGATIVE = {"sampson", "sampson_squared", "epipolar_distances", "symmetric_max", "symmetric_mean", "point_to_line"}
+PAIRS_OF_FOCALS = ((0, 0.1), (800.0, 0.1), ((800, 0), None))
+FOCALS = (*[None] * 3, "shared", "unknown", 0.05, *PAIRS_OF_FOCALS, -1.0, "same", np.nan, [])
+"""What may be said of focal lengths, and what may not."""
+pruner = functools.cache(quick_pruner)
+FIELDS: Mapping[str, tuple[str, tuple[str, ...]]] = {
+    "x0": ("Float", ("b", "n", "2")), "x1": ("Float", ("b", "n", "2")), "mask": ("Bool", ("b", "n")),
+    "ratio": ("Float", ("b", "n")), "prior": ("Float", ("b", "n")), "noise": ("Float", ("b", "n")),
+    "lafs0": ("Float", ("b", "n", "2", "3")), "lafs1": ("Float", ("b", "n", "2", "3")),
+    "size0": ("Real", ("b", "2")), "size1": ("Real", ("b", "2")), "key": ("Int", ("b",)),
+}  # fmt: skip
+REQUIRED = ("x0", "x1", "mask")
 
 
 def mistaken(data: st.DataObject, arguments: dict[str, Any], numbers: dict[str, Any], *, movable: bool = True) -> bool:
@@ -104,11 +115,6 @@ def function_call(function: Callable[..., Any], data: st.DataObject) -> tuple[Ca
     return functools.partial(function, **arguments), set(parameters), check
 
 
-UNDEFINED = {"inlier_rate", "recall", "mean_recall", "pose_auc"}  # NaN of an empty set
-UNIT_INTERVAL = {"nsgd", "nsgd_released", "recall", "mean_recall", "pose_auc", "inlier_rate"}
-NOT_NEGATIVE = {"sampson", "sampson_squared", "epipolar_distances", "symmetric_max", "symmetric_mean", "point_to_line"}
-
-
 def _alike(shape: tuple[int, ...], F: Tensor | None, residual: Tensor | None) -> Tensor:
     """Equal weights for all matches."""
     return torch.ones(shape)
@@ -137,18 +143,6 @@ def sound_result(name: str, clean: bool, result: Any) -> None:
             assert not bool(value.isnan().any()), f"{name} is NaN for finite arguments"
 
 
-# Subjects -------------------------------------------------------------------------------------------------------------
-
-
-FIELDS: Mapping[str, tuple[str, tuple[str, ...]]] = {
-    "x0": ("Float", ("b", "n", "2")), "x1": ("Float", ("b", "n", "2")), "mask": ("Bool", ("b", "n")),
-    "ratio": ("Float", ("b", "n")), "prior": ("Float", ("b", "n")), "noise": ("Float", ("b", "n")),
-    "lafs0": ("Float", ("b", "n", "2", "3")), "lafs1": ("Float", ("b", "n", "2", "3")),
-    "size0": ("Real", ("b", "2")), "size1": ("Real", ("b", "2")), "key": ("Int", ("b",)),
-}  # fmt: skip
-REQUIRED = ("x0", "x1", "mask")
-
-
 def fields(data: st.DataObject, scene: Scene, kind: str) -> dict[str, Any]:
     """Some fields of a batch of correspondences."""
     values = {}
@@ -158,11 +152,6 @@ def fields(data: st.DataObject, scene: Scene, kind: str) -> dict[str, Any]:
         if wanted:
             values[name] = as_given(scene.array(name, numbers, shape), kind)
     return values
-
-
-PAIRS_OF_FOCALS = ((0, 0.1), (800.0, 0.1), ((800, 0), None))
-FOCALS = (*[None] * 3, "shared", "unknown", 0.05, *PAIRS_OF_FOCALS, -1.0, "same", np.nan, [])
-"""What may be said of focal lengths, and what may not."""
 
 
 def estimation(name: str, data: st.DataObject) -> tuple[Call, set[str], Check]:
@@ -219,9 +208,6 @@ def sound_pose(R: Tensor, t: Tensor, E: Tensor) -> None:
         assert float(torch.linalg.det(R)) > 0, "a reflection for a rotation"
         assert math.isclose(float(t.norm()), 1, rel_tol=1e-9)
         torch.testing.assert_close(E, torch.linalg.cross(t.expand(3, 3), R.mT).mT, rtol=0, atol=1e-9)
-
-
-pruner = functools.cache(quick_pruner)
 
 
 def pruned(name: str, data: st.DataObject) -> tuple[Call, set[str], Check]:
@@ -328,9 +314,6 @@ def subjects() -> dict[str, Draw]:
     draws |= {f"find_fundamental.{name}": functools.partial(estimation, name) for name in installed_estimators()}
     draws |= {f"pruner.{name}": functools.partial(pruned, name) for name in variants("pruner")}
     return {**draws, "fmtorch.match": photographs}
-
-
-# Outcomes -------------------------------------------------------------------------------------------------------------
 
 
 class Unclear(AssertionError):

@@ -47,11 +47,8 @@ def jpeg_of_size(width: int, height: int) -> bytes:
 
 def half(form: str) -> bytes:
     """The first half of a sound file; of a TIFF by OpenCV, whose rows are compressed."""
-    data = (
-        bytes(cv2.imencode(".tiff", SOFT)[1])
-        if form == "tiff"
-        else saved(SOFT, Image.registered_extensions()[f".{form}"])
-    )
+    form = "" if form == "tiff" else Image.registered_extensions()[f".{form}"]
+    data = saved(SOFT, form) if form else bytes(cv2.imencode(".tiff", SOFT)[1])
     return data[: len(data) // 2]
 
 

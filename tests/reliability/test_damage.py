@@ -16,6 +16,8 @@ from tests.reliability.images import NO_IMAGES, SOUND
 
 BOUNDED, WHOLE = 40, 2000  # damages to each kind of file
 Property = Callable[[str, object], None]
+PILLOWS_WARNINGS = pytest.mark.filterwarnings("ignore:Corrupt EXIF data|Tag data larger than file:UserWarning")
+DAMAGED = ("grey.jpg", "progressive.jpg", "16 bit.png", "palette.png", "alpha.webp", "16 bit.tiff", "animated.gif")
 
 
 def damages(data: bytes, count: int) -> Iterator[bytes]:
@@ -48,7 +50,6 @@ def damaged(file: Path, count: int) -> Iterator[bool]:
 
 
 def run_folder(path: Path) -> RunFolder:
-    """A run with rows."""
     run = RunFolder.open(path, {"pipeline": "sift", "seed": 0, "pruner": [{"ratio": {"threshold": 0.8}}]})
     names = [f"a/{i}" for i in range(8)]
     run.append([PairRow(n, pair_key(n), "a", "b", True, nsgd=0.01 * i, F=[0.1 * i] * 9) for i, n in enumerate(names)])
@@ -155,9 +156,6 @@ def test_images_of_any_kind(name: str, tmp_path: Path) -> None:
     assert image.std() > 10 or image.shape[0] == 1  # it is the picture
 
 
-PILLOWS_WARNINGS = pytest.mark.filterwarnings("ignore:Corrupt EXIF data|Tag data larger than file:UserWarning")
-
-
 @PILLOWS_WARNINGS
 @pytest.mark.parametrize("name", NO_IMAGES)
 def test_files_that_are_no_image(name: str, tmp_path: Path) -> None:
@@ -165,9 +163,6 @@ def test_files_that_are_no_image(name: str, tmp_path: Path) -> None:
     path.write_bytes(NO_IMAGES[name]())
     with pytest.raises(ImageError, match=rf"{path}: .*(it must|copy it again)"):
         read_image(path)
-
-
-DAMAGED = ("grey.jpg", "progressive.jpg", "16 bit.png", "palette.png", "alpha.webp", "16 bit.tiff", "animated.gif")
 
 
 @PILLOWS_WARNINGS

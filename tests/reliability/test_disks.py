@@ -18,7 +18,6 @@ from tests.reliability.conftest import Rows, evaluation, parts, results
 
 
 def may_mount() -> bool:
-    """Whether this process may mount a file system."""
     if not sys.platform.startswith("linux"):
         return False
     probe = "mount -t tmpfs -o size=4k tmpfs /mnt"  # in a name space of its own
@@ -32,9 +31,8 @@ mounts = pytest.mark.skipif(not may_mount(), reason="file systems may not be mou
 def small_disk(folder: Path, kilobytes: int) -> Iterator[Path]:
     """A file system of so many kilobytes, mounted on the folder. Raises OSError where that is not allowed."""
     folder.mkdir(parents=True, exist_ok=True)
-    done = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", f"size={kilobytes}k", "tmpfs", str(folder)], capture_output=True, check=False
-    )
+    command = ["mount", "-t", "tmpfs", "-o", f"size={kilobytes}k", "tmpfs", str(folder)]
+    done = subprocess.run(command, capture_output=True, check=False)
     if done.returncode:
         raise OSError(done.stderr.decode().strip())
     try:

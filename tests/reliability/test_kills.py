@@ -14,15 +14,19 @@ from tests.helpers import draw_set
 from tests.processes import Command, Starter
 from tests.reliability.conftest import Rows, evaluation, parts, results
 
-EVAL_KILLS, MATCH_KILLS, TRAIN_KILLS, PROCESS_KILLS = (
-    int(number) for number in os.environ.get("FMTORCH_KILLS", "40,20,30,10").split(",")
-)
+KILLS = os.environ.get("FMTORCH_KILLS", "40,20,30,10")
+EVAL_KILLS, MATCH_KILLS, TRAIN_KILLS, PROCESS_KILLS = map(int, KILLS.split(","))
 TRAIN = [
     "optimisation.steps=8", "objective.classification_steps=2", "batch=2", "threads=1", "workers=1",
     "validation.scenes=1", "validation.pairs=2", "validation.every=4", "checkpoint_every=1",
     "validation.uses.hard.estimator=ransac", "validation.uses.prior.estimator=msac", "augmentation.crop=0",
     "features.max_features=300", "pruner.lc.network.channels=8", "pruner.lc.network.blocks=2",
 ]  # fmt: skip
+QUICK = """
+import fmtorch.training.export
+fmtorch.training.export.export_onnx = lambda network, path, **_: path.touch()
+"""
+"""Run before a training: an export of the network, which takes seconds, changes nothing here."""
 
 
 def delays(seed: int) -> Iterator[float]:
@@ -123,13 +127,6 @@ def trained(folder: Path) -> dict[str, bytes]:
 def newest(folder: Path) -> int:
     """The steps of the last checkpoint, -1 where there is none."""
     return max((int(path.stem.removeprefix("step=")) for path in folder.glob("checkpoints/step=*.ckpt")), default=-1)
-
-
-QUICK = """
-import fmtorch.training.export
-fmtorch.training.export.export_onnx = lambda network, path, **_: path.touch()
-"""
-"""Run before a training: an export of the network, which takes seconds, changes nothing here."""
 
 
 @pytest.mark.parametrize("kills", bounded_and_whole(1, TRAIN_KILLS))

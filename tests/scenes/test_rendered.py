@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import hashlib
+import itertools
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,9 +17,10 @@ from fmtorch.scenes import dataset as generation
 from fmtorch.scenes.dataset import generate, read, recorded_pairs, seeds
 from fmtorch.scenes.light import DrawnScene
 from fmtorch.scenes.surfaces import MATERIALS
-from tests.helpers import cross_matrix, in_threads
+from tests.helpers import cross_matrix, in_threads, unused
 
 TINY = Plan(scenes=1, shots=3, pairs=2, scale=0.2)
+known = functools.cache(build)
 
 
 def contents(folder: Path) -> dict[str, str]:
@@ -36,10 +38,15 @@ def tiny(root: Path) -> RenderedPairs:
     return RenderedPairs(families=["indoor", "collection"], root=root, plan=TINY, workers=1)
 
 
-@functools.cache
 def built(family: str, split: str, number: int = 0) -> DrawnScene:
     """A scene at full scale, not drawn."""
-    return build(Task(family, split, number, 0, Plan(1, 6, 1)))
+    return known(Task(family, split, number, 0, Plan(1, 6, 1)))
+
+
+@pytest.fixture
+def _built_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Scenes of a task are the same every time: see `test_the_same_seed_gives_the_same_bytes...`."""
+    monkeypatch.setattr(generation, "build", known)
 
 
 def test_pairs_are_complete_and_consistent(tiny: RenderedPairs, root: Path) -> None:
@@ -70,22 +77,17 @@ def test_full_scale_sizes_are_those_of_the_sets_they_stand_for() -> None:
 
 
 def test_what_was_drawn_is_not_drawn_again(tiny: RenderedPairs, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*_: object) -> None:
-        raise AssertionError("drawn again")
-
-    monkeypatch.setattr(generation, "build", refuse)
+    monkeypatch.setattr(generation, "build", unused)
     again = RenderedPairs(families=["indoor", "collection"], root=root, plan=TINY, workers=1)
     assert [pair.identity for pair in again] == [pair.identity for pair in tiny]
     assert again.digest == tiny.digest
 
 
-def test_the_same_seed_gives_the_same_bytes_also_from_worker_processes(tmp_path: Path) -> None:
-    plan = Plan(2, 2, 1, 0.1)
+def test_the_same_seed_gives_the_same_bytes_also_from_worker_processes(tiny, root, tmp_path) -> None:
     calls: list[tuple[int, int]] = []
-    here = RenderedPairs(families=["indoor"], root=tmp_path / "a", plan=plan, workers=1)
-    options = {"plan": plan, "workers": 2, "progress": lambda *c: calls.append(c)}
-    there = RenderedPairs(families=["indoor"], root=tmp_path / "b", **options)
-    assert (contents(tmp_path / "a"), here.digest) == (contents(tmp_path / "b"), there.digest)
+    options = {"plan": TINY, "workers": 2, "progress": lambda *c: calls.append(c)}
+    there = RenderedPairs(families=["indoor", "collection"], root=tmp_path, **options)
+    assert (contents(tmp_path), there.digest) == (contents(root), tiny.digest)
     assert calls == [(0, 2), (1, 2), (2, 2)]
 
 
@@ -101,22 +103,16 @@ def test_digest_depends_on_what_defines_the_pairs_and_not_on_the_folder(root: Pa
     assert str(root) not in "".join(digests)
 
 
+@pytest.mark.usefixtures("_built_once")
 def test_an_interrupted_generation_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     task = Task("indoor", "test", 0, 0, Plan(1, 2, 1, 0.1))
     uninterrupted = contents(generate(task, tmp_path / "whole"))
-    original = cv2.imwrite
-    count = 0
-
-    def fail(*arguments: object) -> bool:
-        nonlocal count
-        count += 1
-        return False if count == 2 else original(*arguments)  # type: ignore[call-overload]
-
-    monkeypatch.setattr(cv2, "imwrite", fail)
-    with pytest.raises(OSError, match="could not be written"):
-        generate(task, tmp_path / "broken")
+    original, written = cv2.imwrite, itertools.count(1)
+    with monkeypatch.context() as patch:
+        patch.setattr(cv2, "imwrite", lambda *given: next(written) != 2 and original(*given))
+        with pytest.raises(OSError, match="could not be written"):
+            generate(task, tmp_path / "broken")
     assert contents(tmp_path / "broken") == {}  # no half a scene
-    monkeypatch.undo()
     assert contents(generate(task, tmp_path / "broken")) == uninterrupted
 
 
@@ -190,6 +186,7 @@ def test_spare_photographs_are_drawn_until_pairs_suffice(plan, wanted, drawn, ke
     assert set(pairs) <= wanted
 
 
+@pytest.mark.usefixtures("_built_once")
 def test_two_at_once_do_not_clash(tmp_path: Path) -> None:
     task = Task("indoor", "test", 0, 0, Plan(1, 2, 1, 0.1))
     in_threads(2, lambda _: generate(task, tmp_path))
@@ -203,6 +200,7 @@ def test_unknown_names_are_refused(tmp_path: Path) -> None:
         RenderedPairs("validation", root=tmp_path)
 
 
+@pytest.mark.usefixtures("_built_once")
 def test_recorded_pairs_are_those_of_the_rule(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     task = Task("indoor", "test", 0, 0, PLANS["small", "test"])
     if generation.digest(task.family, task.split, task.seed, task.plan) not in recorded_pairs():
@@ -210,10 +208,7 @@ def test_recorded_pairs_are_those_of_the_rule(tmp_path: Path, monkeypatch: pytes
     recorded = generate(task, tmp_path / "recorded")
     monkeypatch.setattr(generation, "recorded_pairs", dict)
     judged = generate(task, tmp_path / "judged")
-    names = sorted(path.name for path in judged.iterdir())
-    assert sorted(path.name for path in recorded.iterdir()) == names
-    for name in names:
-        assert (recorded / name).read_bytes() == (judged / name).read_bytes()
+    assert contents(recorded) == contents(judged)
 
 
 def test_one_pair_with_the_protocol() -> None:

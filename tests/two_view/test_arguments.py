@@ -1,9 +1,5 @@
 """What users hand over: lists of pairs, sizes for all, NumPy everywhere, presets of their own, empty batches."""
 
-from __future__ import annotations
-
-import subprocess
-import sys
 import typing
 from pathlib import Path
 
@@ -20,8 +16,7 @@ from fmtorch.data import ImageSource
 from fmtorch.evaluation import evaluate
 from fmtorch.pipeline import load_pipeline
 from fmtorch.two_view import estimation
-from tests.helpers import draw, pair
-from tests.helpers import small_pipeline as pipeline
+from tests.helpers import draw, pair, small_pipeline
 from tests.laws import quick, scene, shown
 from tests.processes import run_command
 from tests.reference import known_cameras
@@ -30,6 +25,25 @@ from tests.variants import OTHER_LIBRARIES, built, keywords, variants
 EVERY = [n for n in variants("estimator") if not n.startswith(OTHER_LIBRARIES[1:])]
 PAIRS = [scene(i, count) for i, count in enumerate((60, 90, 40))]
 FAST = {"estimator": "msac", "hypotheses": 100}
+SCENE = known_cameras.scene(7, 200, noise=0.2)
+EASY = {"estimator": "msac", "hypotheses": 300}
+WRONG = [
+    ("prior", 1.5, r"prior of match 3 of pair 1 is 1\.5; it is P\(inlier\), within \[0, 1\]"),
+    ("prior", -0.1, "prior of match 3 of pair 1 is -0.1"),
+    ("prior", float("nan"), "prior of match 3 of pair 1 is nan"),
+    ("noise", 0.0, r"noise of match 3 of pair 1 is 0\.0; it is a standard deviation, positive"),
+    ("noise", -1.0, "noise of match 3 of pair 1 is -1"),
+    ("noise", float("nan"), "noise of match 3 of pair 1 is nan"),
+    ("size0", 0, r"size0 is \(640, 0\); image sizes \(h, w\) are positive"),
+    ("size1", -960, r"size1 is \(640, -960\); image sizes"),
+]
+WITHOUT = (*OTHER_LIBRARIES, "homography", "weighted_eight_point")
+OWN = [name for name in variants("estimator") if not name.startswith(WITHOUT)]
+C = scene(1, 60, outliers=0.2)
+
+
+REFUSED = {name: ("prior",) for name in OWN if name.startswith("paper/")} | {"paper/usac": ("x0", "prior")}
+"""Gradients that the final fit takes no account of: that of paper/usac is none, those of the others are unweighted."""
 
 
 def test_a_list_of_pairs_is_a_padded_batch() -> None:
@@ -77,10 +91,6 @@ def test_one_size_is_that_of_all_pairs() -> None:
 def test_what_does_not_fit_is_named(x0: object, x1: object, options: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         fmtorch.find_fundamental(x0, x1, **options)  # type: ignore[arg-type]
-
-
-SCENE = known_cameras.scene(7, 200, noise=0.2)
-EASY = {"estimator": "msac", "hypotheses": 300}
 
 
 @pytest.mark.parametrize("kind", [torch.float16, torch.bfloat16, torch.uint8, torch.int16, torch.uint16, torch.int64])
@@ -221,7 +231,7 @@ def test_estimators_without_gradients_say_so(name: str) -> None:
 @pytest.mark.parametrize("wrong", [float("nan"), float("inf"), 0.0])
 def test_an_estimator_that_gives_no_matrix_makes_failed_rows(wrong: float, tmp_path: Path) -> None:
     images = [draw(tmp_path / f"{i}.png", seed=0, shift=9 * i) for i in range(3)]
-    built = pipeline()
+    built = small_pipeline()
     sound = built.estimator
 
     def spoiled(c: Correspondences, seed: int = 0) -> Estimate:
@@ -236,18 +246,6 @@ def test_an_estimator_that_gives_no_matrix_makes_failed_rows(wrong: float, tmp_p
     assert (first.ok, second.ok) == (False, True)
     assert first.reason == "estimation: F is zero or not finite, though the estimator calls it ok"
     assert first.corrs == 0
-
-
-WRONG = [
-    ("prior", 1.5, r"prior of match 3 of pair 1 is 1\.5; it is P\(inlier\), within \[0, 1\]"),
-    ("prior", -0.1, "prior of match 3 of pair 1 is -0.1"),
-    ("prior", float("nan"), "prior of match 3 of pair 1 is nan"),
-    ("noise", 0.0, r"noise of match 3 of pair 1 is 0\.0; it is a standard deviation, positive"),
-    ("noise", -1.0, "noise of match 3 of pair 1 is -1"),
-    ("noise", float("nan"), "noise of match 3 of pair 1 is nan"),
-    ("size0", 0, r"size0 is \(640, 0\); image sizes \(h, w\) are positive"),
-    ("size1", -960, r"size1 is \(640, -960\); image sizes"),
-]
 
 
 def with_wrong(name: str, value: float) -> Correspondences:
@@ -300,18 +298,6 @@ def test_metrics_refuse_sizes_of_no_image(metric: str, wrong: list[float]) -> No
             function(*points, *given)
 
 
-WITHOUT = (*OTHER_LIBRARIES, "homography", "weighted_eight_point")
-OWN = [name for name in variants("estimator") if not name.startswith(WITHOUT)]
-C = scene(1, 60, outliers=0.2)
-
-
-REFUSED = {
-    "paper/usac": ("x0", "prior"),
-    **dict.fromkeys((name for name in OWN if name.startswith("paper/") and name != "paper/usac"), ("prior",)),
-}
-"""Gradients that the final fit takes no account of: that of paper/usac is none, those of the others are unweighted."""
-
-
 @pytest.mark.parametrize("name", OWN)
 def test_gradients_arrive_or_are_refused_and_change_no_estimate(name: str) -> None:
     def find(attached: str) -> tuple[Tensor, Estimate]:
@@ -346,12 +332,6 @@ def test_a_compiled_model_may_estimate() -> None:
     compiled = torch.compile(loss, backend="eager")
     for _ in range(2):
         assert torch.equal(torch.autograd.grad(compiled(c.x0, x1), x1)[0], expected)
-
-
-def test_compilers_are_not_imported_before_they_are_needed() -> None:
-    """Neither torch's nor numba, by those who have not estimated yet."""
-    code = "import sys, fmtorch; fmtorch.find_fundamental; assert not {'torch._dynamo', 'numba'} & {*sys.modules}"
-    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_a_list_of_pairs_computes_with_one_thread_of_torch(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -28,6 +28,10 @@ from tests.reference.focal import calibration
 CAMERAS = {"K0": torch.from_numpy(reference.K0), "K1": torch.from_numpy(reference.K1)}
 SIZES = {"size0": reference.SIZE, "size1": reference.SIZE}
 CENTRAL, ZOOMED = (tuple(calibration(f / 640, (480, 640)) for f in focals) for focals in ((650, 650), (650, 820)))
+VARIABLES = ("x0", "x1", "prior", "noise", "K0", "K1")
+INF = float("inf")
+K = torch.from_numpy(reference.K0)
+SCENE = reference.scene(0)
 
 
 def error(e: Estimate, s: reference.Scene) -> float:
@@ -40,9 +44,6 @@ def converging(monkeypatch: pytest.MonkeyPatch) -> None:
     """Final fits that go on to the optimum."""
     monkeypatch.setattr(refinement, "FOCAL_ITERATIONS", 60)
     monkeypatch.setattr(refinement, "FOCAL_TOLERANCE", 0.0)
-
-
-# Exactness
 
 
 @pytest.mark.usefixtures("converging")
@@ -146,17 +147,11 @@ def test_pose_and_essential_matrix_are_those_of_the_fundamental_matrix(known: di
         assert min(float((e.F - sign * F).abs().max()) for sign in (-1, 1)) < 1e-6
 
 
-# Knowledge helps
-
-
 def test_a_wrong_measurement_is_not_believed_for_long() -> None:
     """It has a tail: far from where the matches are, it no longer pulls."""
     s = reference.scene(5, 300, noise=0.1, outliers=0.1, cameras=CENTRAL)
     e = fmtorch.find_fundamental(s.x0, s.x1, **SIZES, focal=((2000.0, 0.02), (2000.0, 0.02)))
     np.testing.assert_allclose(e.focals[0], [650, 650], rtol=0.05)
-
-
-# Laws
 
 
 @functools.cache
@@ -212,12 +207,6 @@ def test_without_cameras_nothing_changes() -> None:
     assert plain.E is None
 
 
-# Gradients
-
-
-VARIABLES = ("x0", "x1", "prior", "noise", "K0", "K1")
-
-
 @pytest.mark.usefixtures("converging")
 @pytest.mark.parametrize("focal", [(0.0, 0.0), (0.05, 0.05), "shared"], ids=["exact", "rough", "shared"])
 def test_gradients_are_the_differences_of_estimates(focal, monkeypatch):
@@ -265,16 +254,12 @@ def _differentiable() -> dict[str, Tensor]:
     }
 
 
-# Real pairs
-
-
 @functools.cache
 def castle() -> list[tuple[ImagePair, Correspondences]]:
     """Two pairs of castle-P19 with SIFT matches, P(inlier) and noise."""
     pairs = load("fmbench", root=shared_path("data/Strecha_train"))
-    pruners = {
-        name: presets.build("pruner", name) for name in ("ratio", "one_to_one", "frame_consistency", "match_noise")
-    }
+    names = ("ratio", "one_to_one", "frame_consistency", "match_noise")
+    pruners = {name: presets.build("pruner", name) for name in names}
     front = Pipeline(presets.build("features", "sift"), presets.build("matcher", "nearest"), pruners, quick("msac"))
     chosen = sorted((pairs[i] for i in range(len(pairs))), key=lambda pair: pair.identity)[::40]
     return [(pair, c) for pair in chosen if (c := front.correspondences([pair])[0].correspondences) is not None]
@@ -293,11 +278,6 @@ def test_real_pairs_keep_the_order_of_knowledge() -> None:
     assert len(errors["exact"]) == 2
     assert max(errors["exact"]) < 2  # degrees
     assert np.mean(errors["exact"]) < np.mean(errors["rough"]) < np.mean(errors["unknown"])
-
-
-INF = float("inf")
-K = torch.from_numpy(reference.K0)
-SCENE = reference.scene(0)
 
 
 @pytest.mark.parametrize(

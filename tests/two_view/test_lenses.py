@@ -21,6 +21,8 @@ FOLDED = Lens(512.0, 512.0, 319.5, 239.5, "SIMPLE_RADIAL", (-20.0,))
 NAN = Lens(512.0, 512.0, 319.5, 239.5, "SIMPLE_RADIAL", (np.nan,))
 PLANE = np.array([[0.95, 0.06, 12], [-0.05, 1.02, -8], [1e-4, -2e-4, 1]])
 Array = np.ndarray
+FUNDAMENTAL, HOMOGRAPHY = fmtorch.find_fundamental, fmtorch.find_homography
+UNKNOWN, KNOWN = {"lens": "shared"} | SIZES, {"K0": PINHOLE.K, "K1": PINHOLE.K}
 
 
 def photographs(lens0: Lens, lens1: Lens, seed: int = 1) -> tuple[Array, Array]:
@@ -121,10 +123,6 @@ def test_gradients_reach_the_photographs_points(find: Any) -> None:
             values.append(float((find(*moved, lens=RADIAL).matrix[0] * direction).sum()))
         slopes = (values[0] - values[1]) / 0.1, float(points[image].grad[i, axis])
         assert slopes[1] == pytest.approx(slopes[0], rel=0.05, abs=0.05 * float(points[image].grad.abs().max()))
-
-
-FUNDAMENTAL, HOMOGRAPHY = fmtorch.find_fundamental, fmtorch.find_homography
-UNKNOWN, KNOWN = {"lens": "shared"} | SIZES, {"K0": PINHOLE.K, "K1": PINHOLE.K}
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """Pair types, homographies, units and lenses of the public functions."""
 
+import functools
 import math
 import warnings
 from typing import Any
@@ -20,6 +21,14 @@ from tests.laws import quick
 from tests.reference import lenses as division
 from tests.reference.homography import mapped
 from tests.reference.known_cameras import K0, K1, SIZE, angle, scene
+from tests.two_view.test_lenses import PLANE, planes
+
+K = np.array([[900.0, 0, 639.5], [0, 900, 359.5], [0, 0, 1]])
+SCENE = scene(0)
+X0, X1 = SCENE.x0, SCENE.x1
+FROM_CENTRE = [x - (319.5, 239.5) for x in (X0, X1)]
+SIZES = {"size0": SIZE, "size1": SIZE}
+INF = float("inf")
 
 
 def pair(kind: str, seed: int, n: int = 150, **options: float) -> Correspondences:
@@ -32,13 +41,19 @@ def estimated(c: Correspondences) -> Estimate:
     return quick("fmtorch")(c, 0)
 
 
+@functools.cache
+def twelve(kind: str) -> tuple[Correspondences, Estimate]:
+    """Pairs, and their estimates, for which K0 and K1 do not count."""
+    c = collate([pair(kind, seed) for seed in range(12)])
+    return c, estimated(c)
+
+
 @pytest.mark.parametrize("known", [True, False])
 @pytest.mark.parametrize("kind", PAIR_TYPES)
 def test_kinds(kind: str, known: bool) -> None:
     """Of estimated models, with calibrations and by image sizes alone, the cameras being usual ones."""
-    c = collate([pair(kind, seed) for seed in range(12)])
+    c, estimate = twelve(kind)
     c = c if known else c.replace(K0=None, K1=None)
-    estimate = estimated(c)
     classified = classify(c, estimate)
     assert classified.names.count(kind) >= 11, classified.names
     assert torch.equal(classified.determined, torch.tensor([name == "general" for name in classified.names]))
@@ -81,9 +96,6 @@ def test_wrong_arguments() -> None:
     ):
         with pytest.raises(ValueError, match=said):
             classify(c, given, focal_deviation=deviation)
-
-
-K = np.array([[900.0, 0, 639.5], [0, 900, 359.5], [0, 0, 1]])
 
 
 def pitch(seed: int, up: bool, count: int = 60, wrong: float = 0.3) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -167,10 +179,6 @@ def test_significance_is_that_of_its_definition() -> None:
     assert float(got) == pytest.approx(expected, rel=1e-9)
 
 
-SCENE = scene(0)
-X0, X1 = SCENE.x0, SCENE.x1
-
-
 def normalized(x: np.ndarray, K: np.ndarray) -> np.ndarray:
     """Points by their calibration matrix."""
     return mapped(np.linalg.inv(K), x)
@@ -198,15 +206,11 @@ def test_normalized_points_have_the_identity_for_their_camera() -> None:
     assert int(estimate.inliers.sum()) < 0.8 * len(x0)
     with_pair_type = fmtorch.find_essential(x0, x1, np.eye(3), np.eye(3), pair_type=True)
     assert with_pair_type.pair_type == ("general",)
-    with pytest.raises(
-        ValueError, match=r"x0 runs from .*, as normalised points do, but K0 is in pixels; give points in"
-    ):
+    said = r"x0 runs from .*, as normalised points do, but K0 is in pixels; give points in"
+    with pytest.raises(ValueError, match=said):
         fmtorch.find_essential(x0, x1, K0, K1)
     with pytest.raises(ValueError, match=r"^x1 runs from"):  # one image may be the wrong one
         fmtorch.find_fundamental(X0, x1)
-
-
-FROM_CENTRE = [x - (319.5, 239.5) for x in (X0, X1)]
 
 
 @pytest.mark.parametrize(
@@ -283,10 +287,6 @@ def test_what_says_nothing_is_no_mistake() -> None:
         estimate = fmtorch.find_fundamental(x, x)
         assert not bool(estimate.ok)
         assert estimate.reason[0]
-
-
-SIZES = {"size0": SIZE, "size1": SIZE}
-INF = float("inf")
 
 
 def found(x0: Any, x1: Any, **said: Any) -> Estimate:
@@ -366,10 +366,8 @@ def test_two_lenses_one_of_them_straight() -> None:
 
 def test_a_pose_through_a_lens() -> None:
     x0, x1, _, K = division.photographs(4, (-0.2, -0.2))
-    for estimate, most in (
-        (fmtorch.find_essential(x0, x1, K, K, lens="shared", **SIZES), 1.0),
-        (found(x0, x1, lens="shared", focal="shared"), 3.0),
-    ):
+    posed = fmtorch.find_essential(x0, x1, K, K, lens="shared", **SIZES)
+    for estimate, most in ((posed, 1.0), (found(x0, x1, lens="shared", focal="shared"), 3.0)):
         assert lenses(estimate) == pytest.approx([-0.2, -0.2], abs=0.03)
         cosine = float(estimate.t[0] @ torch.nn.functional.normalize(torch.tensor([-0.8, 0.1, 0.3]).double(), dim=0))
         assert np.degrees(np.arccos(min(cosine, 1))) < most
@@ -399,13 +397,9 @@ def test_sizes_may_be_assumed() -> None:
 @pytest.mark.parametrize("calibrated", [False, True])
 def test_the_type_of_a_pair_is_that_of_the_undistorted_photographs(calibrated: bool) -> None:
     """Of a plane, alone and beside a general pair, whose homography is that of pinholes."""
-    rng, lens = np.random.default_rng(0), -0.25
-    H = np.array([[0.95, 0.06, 12], [-0.05, 1.02, -8], [1e-4, -2e-4, 1]])
+    lens = -0.25
     x0, x1, _, K = division.photographs(1, (lens, lens))
-    plane = rng.uniform([20, 20], [620, 460], (len(x0), 2))
-    moved = np.c_[plane, np.ones(len(plane))] @ H.T
-    bent = [[division.bent(x, SIZE, lens) for x in points] for points in (plane, moved[:, :2] / moved[:, 2:])]
-    y0, y1 = (np.array(x) + rng.normal(0, 0.2, (len(x), 2)) for x in bent)
+    y0, y1 = planes(0, lens, wrong=0.0)
     cameras = {"K0": K, "K1": K} if calibrated else {}
     given = {**cameras, "pair_type": True, "seed": 1}
     together = found([y0, x0], [y1, x1], lens=lens, **given, key=[0, 0])
@@ -413,7 +407,7 @@ def test_the_type_of_a_pair_is_that_of_the_undistorted_photographs(calibrated: b
     alone = found(y0, y1, lens=lens, **given)
     assert alone.pair_type == ("planar",)
     torch.testing.assert_close(alone.homography[0], together.homography[0], rtol=0, atol=0)
-    truth = torch.from_numpy(H)[None], torch.tensor([SIZE])
+    truth = torch.from_numpy(PLANE)[None], torch.tensor([SIZE])
     as_pinholes = found(y0, y1, **given)
     assert float(corner_error(alone.homography, *truth)) < 0.5 < 3 < float(corner_error(as_pinholes.homography, *truth))
 

@@ -27,6 +27,17 @@ from tests.reference.solvers import skew
 
 WIDE, TALL = (640, 960), (1000, 700)  # (h, w)
 Sizes = tuple[tuple[int, int], tuple[int, int]]
+SIZES = [(WIDE, WIDE), (WIDE, TALL)]
+ROUNDS = 6
+FOCAL = {"sampler": "prior", "select": {"scale": 1.0}, "threshold": 1.5}
+KNOWN = {
+    "nothing": (math.inf, math.inf), "one": (0.0, math.inf), "the other roughly": (math.inf, 0.1),
+    "both": (0.001, 0.01), "both roughly": (0.06, 0.06),
+}  # fmt: skip
+"""Deviations of measured focal lengths."""
+EXACT = 1e-5  # deviation that stands for 0
+COUNT = 4000
+STANDARD_ERROR = 0.5 / math.sqrt(COUNT)  # of a share of the draws, at most
 
 
 class Photographs(NamedTuple):
@@ -62,12 +73,8 @@ def photographs(
 
 
 def with_prior(c: Correspondences, seed: int = 0) -> Correspondences:
-    """Random priors."""
     prior = np.random.default_rng(seed).uniform(0.1, 1, tuple(c.mask.shape))
     return c.replace(prior=torch.from_numpy(prior))
-
-
-SIZES = [(WIDE, WIDE), (WIDE, TALL)]
 
 
 def error(F: torch.Tensor, pair: Photographs) -> float:
@@ -83,11 +90,8 @@ def test_drawn_focal_lengths_are_functions_of_the_draw(sizes: Sizes) -> None:
     ratios = np.log(depth / images.longest[:, None])
     for d in range(count):
         words = [random.number(seed, pair.key, Stream.FOCAL, start + d, k, 3) % focal_prior.QUANTILES for k in range(3)]
-        half = (
-            0.0
-            if pair.same_size and words[2] < focal_prior.SAME_CAMERA_SHARE * focal_prior.QUANTILES
-            else normal[words[1]]
-        )
+        one_camera = pair.same_size and words[2] < focal_prior.SAME_CAMERA_SHARE * focal_prior.QUANTILES
+        half = 0.0 if one_camera else normal[words[1]]
         mean = math.log(focal_prior.USUAL_FOCAL) + focal_prior.FOCAL_DEVIATION * normal[words[0]]
         expected = [mean + focal_prior.RATIO_DEVIATION / 2 * half, mean - focal_prior.RATIO_DEVIATION / 2 * half]
         np.testing.assert_allclose(ratios[:, d], expected, atol=1e-12)
@@ -126,16 +130,6 @@ def test_unknown_sizes_are_searched_without_assumptions() -> None:
     assert bool(estimate.ok[0])
     assert torch.equal(estimate.F, presets.build("estimator", "fmtorch", focal=None)(bare, 0).F)
     assert error(estimate.F, pair) < 0.05
-
-
-KNOWN = {
-    "nothing": (math.inf, math.inf), "one": (0.0, math.inf), "the other roughly": (math.inf, 0.1),
-    "both": (0.001, 0.01), "both roughly": (0.06, 0.06),
-}  # fmt: skip
-"""Deviations of measured focal lengths."""
-EXACT = 1e-5  # deviation that stands for 0
-COUNT = 4000
-STANDARD_ERROR = 0.5 / math.sqrt(COUNT)  # of a share of the draws, at most
 
 
 @pytest.mark.parametrize("same", [True, False])
@@ -209,16 +203,11 @@ def test_how_likely_one_camera_is() -> None:
     """By Bayes' rule, of two normal densities of the difference of what is measured."""
     s = np.array([0.05, 0.1])
     for difference in (0.0, 0.1, 0.5):
-        same, different = (
-            math.exp(-(difference**2) / 2 / v) / math.sqrt(v) for v in (0.0125 + 0.01**2, 0.0125 + 0.5**2)
-        )
+        variances = 0.0125 + 0.01**2, 0.0125 + 0.5**2
+        same, different = (math.exp(-(difference**2) / 2 / v) / math.sqrt(v) for v in variances)
         expected = 0.7 * same / (0.7 * same + 0.3 * different)
         assert focal_prior.same_camera_share(difference, s) == pytest.approx(expected, rel=1e-12)
     assert focal_prior.same_camera_share(0.0, np.array([0.0, math.inf])) == 0.7
-
-
-ROUNDS = 6
-FOCAL = {"sampler": "prior", "select": {"scale": 1.0}, "threshold": 1.5}
 
 
 class Found(PlausibleCandidates):
@@ -295,9 +284,8 @@ def test_the_best_candidates_of_two_rounds_are_one_model_or_not(posterior: list[
 
 def test_rounds_without_candidates_settle_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     """All matches may be inliers of the zero model that stands for none."""
-    nothing = PlausibleCandidates(
-        Refined(np.zeros((1, 9)), np.zeros(1), np.ones(1)), np.full(1, -np.inf), no_cameras(1)
-    )
+    refined = Refined(np.zeros((1, 9)), np.zeros(1), np.ones(1))
+    nothing = PlausibleCandidates(refined, np.full(1, -np.inf), no_cameras(1))
     monkeypatch.setattr(FocalSearch, "round", lambda self, pair, turn: (nothing, (turn + 1) * 10))
     search = searching(rounds=3, min_rounds=1)
     object.__setattr__(search, "stop", lambda F, draws, pair, size: True)
