@@ -138,3 +138,30 @@ def test_cameras_that_are_none_and_what_matches_leave_open_are_uncertain() -> No
     torch.testing.assert_close(result.deviation_degrees[:6], nothing_known.expand(6, 2))
     assert bool((result.deviation_degrees[6] > 60).all())
     assert bool((result.covariance.diagonal(dim1=1, dim2=2) >= 0).all())
+
+
+def test_what_is_not_determined_is_uncertain() -> None:
+    """A camera that turns has no direction of translation, one that moves along its axis no focal length."""
+    rng = np.random.default_rng(0)
+    X = np.c_[rng.uniform(-2, 2, (300, 2)), rng.uniform(4, 8, 300)]
+    principal = np.array([[500.0, 400], [500, 400]])
+
+    def deviations(R: np.ndarray, t: np.ndarray, precision: np.ndarray) -> tuple[Tensor, Tensor]:
+        Y = X @ R.T + t
+        x0, x1 = (900 * Z[:, :2] / Z[:, 2:] + principal[0] + rng.normal(0, 0.5, (300, 2)) for Z in (X, Y))
+        assumed = Cameras.of(R, t if t.any() else np.array([1.0, 0, 0]), np.array([900.0, 900]), principal)
+        result = two_view_covariance(
+            torch.from_numpy(x0)[None], torch.from_numpy(x1)[None], **arguments(assumed),
+            truncation=torch.tensor([1.5]), focal_precision=torch.from_numpy(precision)[None],
+        )  # fmt: skip
+        return result.deviation_degrees[0], result.covariance[0].diagonal()[5:].sqrt()
+
+    turned = reference.Rotation.from_rotvec([0.05, 0.2, 0.02]).as_matrix()
+    known = np.diag([INF, INF])
+    assert float(deviations(turned, np.zeros(3), known)[0][1]) > 20
+    assert float(deviations(turned, np.array([1.0, 0.1, 0]), known)[0][1]) < 1
+    prior = np.diag([6.25, 6.25])  # of a deviation of 0.4
+    along = deviations(np.eye(3), np.array([0, 0, 1.0]), prior)[1]
+    across = deviations(turned, np.array([1.0, 0.1, 0.3]), prior)[1]
+    assert bool((along > 0.2).all())
+    assert bool((across < 0.1).all())
