@@ -315,7 +315,7 @@ def dense(seed: int, width: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, 
 
 @pytest.mark.parametrize("width", [0, 6])
 def test_ellipsoids_of_dense_matches_hold_the_truth(width: float) -> None:
-    """95 % ones of 40 poses, within twice the deviation of that share; by independent errors half of them would."""
+    """95 % ones of 40 poses, within twice the deviation of that share; if their errors counted as independent, one would."""
     scenes, inside = [dense(seed, width) for seed in range(40)], 0
     e = fmtorch.find_essential(
         [s[0] for s in scenes], [s[1] for s in scenes], CENTRAL, CENTRAL, **SIZES, covariance=True
