@@ -4,7 +4,7 @@ The parameters of a pair are (omega, tau, log f0, log f1, lambda0, lambda1): R i
 translation moves along two unit tangents, ``t + B tau``, so that both are in radians; lambda is of the division model.
 The information of a fit that minimises the robust sum of w rho(r^2) with a loss truncated at T is J^T W J over the
 matches within T, J being the derivative of the Sampson distance in the photograph (Hartley & Zisserman 2004, 11.4.3),
-with three corrections:
+with four corrections:
 
 1. A truncated fit does not use all that its inliers know: its variance is E[psi^2] / E[psi']^2 of that of one match
    (Huber 1981, Robust Statistics, chapter 7). With c = T / s, A = P(|z| < c) and m = A - 2 c phi(c), which both
@@ -17,12 +17,14 @@ with three corrections:
    matrices of moments: Kanatani 1996, Statistical Optimization for Geometric Computation, chapter 9). Without that a
    camera that only turns seems to have a direction, known to some ten degrees. Where a rotation explains the matches
    up to their noise, nothing is left.
+4. Where neighbours err alike, as in dense matches, so many tell less: see `noise_inflation`.
 
-Weights that are no inverse variances, such as P(inlier), count by ``sum w / sum w^2`` (Kish 1965). Independent noise
-is assumed; on real pairs neighbours err alike, and deviations come out too small."""
+Weights that are no inverse variances, such as P(inlier), count by ``sum w / sum w^2`` (Kish 1965)."""
 
+import math
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -30,6 +32,7 @@ from torch import Tensor
 from fmtorch.geometry.arithmetic import cofactors, component_sum, cross, determinant, product, sqrt, stable_sum
 from fmtorch.geometry.epipolar import inverse_root
 from fmtorch.geometry.matrices import complement
+from fmtorch.jit.kernel import F8x1, F8x2, for_each_pair, kernel
 
 PINHOLES, PARAMETERS = 7, 9  # without and with two lenses
 WINDOW = 2.5  # noises within which distances are taken to be those of right matches
@@ -40,6 +43,8 @@ MIN_SPARE_MATCHES = 3  # beyond the parameters, from which on the noise is estim
 ROTATION_STEPS, ROTATION_SCALE = 6, 9.0  # of the fit of a rotation, and of its loss (Cauchy's), in variances
 CHI_MEDIAN, MEDIAN_DEVIATION = 1.3862943611198906, 1.4426950408889634  # of chi squared of two degrees, ln 4; relative,
 MEDIAN_DEVIATIONS = 4.0  # of the median of n, times sqrt(n)
+CELLS = 24  # to the longer side of the box of matches, of a grid that tells how neighbours err
+INDEPENDENT = 1.2  # inflation of one in 40 pairs with 100 to 20,000 independent errors
 TERMS, WIDEST = 64, 6.0  # of the series of `kept_share`, and from where on it is one to 1e-7
 
 
@@ -152,11 +157,45 @@ def noise_of(r: Tensor, w: Tensor, T: Tensor, parameters: Tensor) -> Tensor:
     return s
 
 
-def information_of(r: Tensor, J: Tensor, noise: Tensor, w: Tensor, T: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+@kernel
+def noise_inflation(x: F8x2, error: F8x1, out: F8x1) -> None:
+    """How much more the sums of errors (n,) vary than those of independent ones -> out (1,), 1 up to `INDEPENDENT`.
+
+    If neighbours err alike, sums over regions have D times the variance of independent summands, and so has a fit
+    (T. Conley: GMM estimation with cross sectional dependence. J. Econometrics 92, 1999). Sums over square cells of
+    side L miss neighbours in the next cell: they see D (1 - a / L)^2, a being the mean offset of what errs alike along
+    an axis; those over all blocks of 2 x 2 cells see D (1 - a / 2L)^2. So ``sqrt D`` is twice the root of the latter
+    less that of the former. x: points (n, 2) of one image, any unit. Those without an error do not count."""
+    left, top, right, bottom, squares = math.inf, math.inf, -math.inf, -math.inf, 0.0
+    for i in range(len(error)):
+        if error[i] != 0:
+            left, right, top, bottom = min(left, x[i, 0]), max(right, x[i, 0]), min(top, x[i, 1]), max(bottom, x[i, 1])
+            squares += error[i] * error[i]
+    side = max(right - left, bottom - top) / CELLS
+    out[0] = 1
+    if not (squares > 0 and side > 0):
+        return
+    cell = np.zeros((CELLS + 2, CELLS + 2))
+    for i in range(len(error)):
+        if error[i] != 0:
+            row, column = min(int((x[i, 1] - top) / side), CELLS - 1), min(int((x[i, 0] - left) / side), CELLS - 1)
+            cell[row + 1, column + 1] += error[i]
+    of_cells, of_blocks = 0.0, 0.0
+    for row in range(CELLS + 1):
+        for column in range(CELLS + 1):
+            block = cell[row, column] + cell[row, column + 1] + cell[row + 1, column] + cell[row + 1, column + 1]
+            of_cells, of_blocks = of_cells + cell[row, column] * cell[row, column], of_blocks + block * block / 4
+    root = 2 * math.sqrt(of_blocks / squares) - math.sqrt(of_cells / squares)
+    if root > 0 and root * root > INDEPENDENT:
+        out[0] = root * root
+
+
+def information_of(
+    r: Tensor, J: Tensor, noise: Tensor, w: Tensor, T: Tensor, s: Tensor, inflation: Tensor
+) -> tuple[Tensor, Tensor]:
     """Of the matches, (9, 9, b), and what of it noise alone gives about the direction of translation, (2, 2, b)."""
-    w = torch.where(r < T[:, None], w, 0.0)
     squares = stable_sum(w * w)
-    factor = kept_share(T / s) * (stable_sum(w) / torch.where(squares > 0, squares, 1.0))
+    factor = kept_share(T / s) * (stable_sum(w) / torch.where(squares > 0, squares, 1.0)) / inflation
     rows, columns = torch.triu_indices(PARAMETERS, PARAMETERS, device=r.device)
     sums = stable_sum(J[rows] * J[columns] * w) * (factor / (s * s))
     index = torch.zeros_like(rows).new_zeros(PARAMETERS, PARAMETERS)
@@ -280,11 +319,15 @@ def two_view_covariance(
     area = lenses.half.to(kind).square().T[..., None]
     bend0, bend1 = torch.where(valid, lenses.value.to(kind).T, 0.0)[..., None] / area
     r, J, in_slopes = residual_slopes(F, slopes, a0, a1, bend0, bend1)
-    r, J = (r / n).abs(), torch.cat([J[:PINHOLES], J[PINHOLES:] / area]) / n
+    error, J = r / n, torch.cat([J[:PINHOLES], J[PINHOLES:] / area]) / n
+    r = error.abs()
     used = _directions(known, shared, lenses.shared)
     s = noise_of(r.detach(), w, T, used.amax(0).sum(0))
-    information, from_noise = information_of(r, J, in_slopes, w, T, s)
     near = (w > 0) & (r < torch.minimum(T, WINDOW * s)[:, None])
+    w = torch.where(r < T[:, None], w, 0.0)
+    inflation = torch.empty(len(w), 1, dtype=kind)
+    inflation = for_each_pair(noise_inflation, (x0.to(kind), w * error), out=inflation, kind=kind)[:, 0]
+    information, from_noise = information_of(r, J, in_slopes, w, T, s, inflation)
     straight0, straight1 = ((h[:2] / h[2]).to(kind) for h in (lifted(a0, bend0), lifted(a1, bend1)))
     still = explained_by_rotation(straight0, straight1, R.movedim(0, -1), f.movedim(0, -1), n * s[:, None], near)
     precision = torch.where(known[:, 2:], 0.0, lenses.precision.to(kind))

@@ -4,11 +4,12 @@ import math
 
 import numpy as np
 import pytest
+import scipy.ndimage
 import torch
 from torch import Tensor
 
 from fmtorch.geometry import pose_from_fundamental, two_view_covariance
-from fmtorch.geometry.covariance import LensesInPixels
+from fmtorch.geometry.covariance import LensesInPixels, noise_inflation
 from tests.geometry.scenes import scene
 from tests.reference import lenses as division
 from tests.reference import two_view as reference
@@ -112,7 +113,8 @@ def test_lenses_against_differences(shared: bool) -> None:
 
     step, used = 1e-4, 8 if shared else 9
     J = np.stack([(distances(d) - distances(-d)) / (2 * step) for d in step * np.eye(9)[:used]], 1)
-    C = np.linalg.inv(J.T @ J / float(result.noise) ** 2 + np.diag([0.0] * 5 + [4, 9] + [0.15**-2] * (used - 7)))
+    variance = float(result.noise) ** 2 * reference.inflation(x0, distances(np.zeros(9)))
+    C = np.linalg.inv(J.T @ J / variance + np.diag([0.0] * 5 + [4, 9] + [0.15**-2] * (used - 7)))
     own = result.covariance[0].numpy()
     np.testing.assert_allclose(own.diagonal()[5:used], C.diagonal()[5:], rtol=0.01)
     np.testing.assert_allclose(own[7, 5], C[7, 5], rtol=0.01)
@@ -165,3 +167,22 @@ def test_what_is_not_determined_is_uncertain() -> None:
     across = deviations(turned, np.array([1.0, 0.1, 0.3]), prior)[1]
     assert bool((along > 0.2).all())
     assert bool((across < 0.1).all())
+
+
+@pytest.mark.parametrize(("width", "apart"), [(0, 6), (4, 6), (8, 6), (8, 3)])
+def test_errors_that_neighbours_share(width: float, apart: int) -> None:
+    """White noise smoothed by a Gaussian, on a grid: the sum of its correlations is 4 pi width^2 / apart^2."""
+    y, x = np.mgrid[0:768:apart, 0:1024:apart].reshape(2, -1)
+    inflation = []
+    for seed in range(12):
+        field = np.random.default_rng(seed).normal(size=(768, 1024))
+        error = (scipy.ndimage.gaussian_filter(field, width, mode="wrap") if width else field)[y, x]
+        out = np.empty(1)
+        noise_inflation(np.stack([x, y], 1).astype(float), error, out)
+        inflation.append(out[0])
+        if apart == 6 and seed == 0:
+            near = np.hypot(x, y) < 500
+            noise_inflation(np.stack([x, y], 1).astype(float), np.where(near, error, 0), out)
+            assert out[0] == pytest.approx(reference.inflation(np.stack([x, y], 1)[near], error[near]), rel=1e-9)
+    # Each is of some 400 blocks, which overlap.
+    assert np.mean(inflation) == pytest.approx(max(4 * np.pi * width**2 / apart**2, 1), rel=0.1)

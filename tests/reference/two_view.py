@@ -124,6 +124,18 @@ def positive_part(A: np.ndarray) -> np.ndarray:
     return result
 
 
+def inflation(x: np.ndarray, error: np.ndarray) -> float:
+    """Of the variance of sums of errors, by all pairs of them: sums over cells have those within one, over blocks of
+    2 x 2 cells half of those in cells beside one another, and the root grows by as much again towards large regions."""
+    x, error = x[error != 0], error[error != 0]
+    cell = np.minimum((x - x.min(0)) / (np.ptp(x, 0).max() / 24), 23).astype(int)
+    apart = np.abs(cell[:, None] - cell[None])
+    small, large = (np.clip(1 - apart / cells, 0, None).prod(-1) for cells in (1, 2))
+    roots = [np.sqrt(error @ by @ error / (error @ error)) for by in (small, large)]
+    inflation = float(max(2 * roots[1] - roots[0], 0) ** 2)
+    return inflation if inflation > 1.2 else 1.0
+
+
 def covariance(
     cameras: Cameras, x0: np.ndarray, x1: np.ndarray, w: np.ndarray, n: np.ndarray, truncation: float,
     precision: np.ndarray, basis: np.ndarray,
@@ -134,7 +146,7 @@ def covariance(
     J = J / n[:, None]
     s = noise(r, w, truncation, basis.shape[1])
     v = np.where(np.abs(r) < truncation, w, 0)
-    factor = left(truncation / s) * v.sum() / (v**2).sum()
+    factor = left(truncation / s) * v.sum() / (v**2).sum() / inflation(x0, v * r)
     information = factor * (J.T * v) @ J / s**2
     information += np.diag(np.array([1.33, 1.33, 1.33, 1.21, 1.21, 2.3, 2.3]) ** -2.0)
     information[5:, 5:] += precision

@@ -6,6 +6,7 @@ from typing import Any
 import cv2 as opencv
 import numpy as np
 import pytest
+import scipy.ndimage
 import torch
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
@@ -283,3 +284,37 @@ def test_parallax_of_a_few_noises_is_known_as_well_as_it_is_estimated() -> None:
     error = np.degrees(np.arccos((e.t.numpy() * t).sum(1) / np.linalg.norm(t, axis=1)))
     assert np.median(error / deviation) < 1.1
     assert np.median(deviation) < 20
+
+
+def dense(seed: int, width: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Every sixth pixel of planes in a mosaic, matched with errors of 0.5 px that Gaussian patches share; R, t."""
+    rng, (h, w) = np.random.default_rng(seed), reference.SIZE
+    x0 = np.stack(np.meshgrid(np.arange(3, w, 6), np.arange(3, h, 6)), -1).reshape(-1, 2)
+    seeds, tilts, depths = (
+        rng.uniform([0, 0], [w, h], (20, 2)),
+        rng.uniform(-5e-4, 5e-4, (20, 2)),
+        rng.uniform(4, 9, 20),
+    )
+    piece = ((x0[:, None] - seeds) ** 2).sum(-1).argmin(1)
+    depth = depths[piece] * (1 + ((x0 - seeds[piece]) * tilts[piece]).sum(1))
+    R, t = Rotation.from_rotvec(rng.normal(0, 0.08, 3)).as_matrix(), rng.normal(size=3)
+    X = np.c_[x0, np.ones(len(x0))] @ np.linalg.inv(CENTRAL).T * depth[:, None] @ R.T + 0.7 * t / np.linalg.norm(t)
+    errors = scipy.ndimage.gaussian_filter(rng.normal(size=(h, w, 2)), (width, width, 0), mode="wrap")
+    x1 = (X @ CENTRAL.T)[:, :2] / X[:, 2:] + (0.5 * errors / errors.std())[x0[:, 1], x0[:, 0]]
+    inside = ((x1 >= 0) & (x1 <= [w - 1, h - 1])).all(1)
+    return x0[inside], x1[inside], R, t
+
+
+@pytest.mark.parametrize("width", [0, 6])
+def test_ellipsoids_of_dense_matches_hold_the_truth(width: float) -> None:
+    """95 % ones of 40 poses, to twice the deviation of that share; of errors taken for independent one would."""
+    scenes, inside = [dense(seed, width) for seed in range(40)], 0
+    e = fmtorch.find_essential(
+        [s[0] for s in scenes], [s[1] for s in scenes], CENTRAL, CENTRAL, **SIZES, covariance=True
+    )
+    for (_, _, R, t), *of in zip(
+        scenes, e.R.numpy(), e.t.numpy(), e.tangents.numpy(), e.covariance.numpy(), strict=True
+    ):
+        off = np.r_[Rotation.from_matrix(R @ of[0].T).as_rotvec(), of[2].T @ (t / (t @ of[1]))]
+        inside += off @ np.linalg.solve(of[3][:5, :5], off) < chi2.ppf(0.95, 5)
+    assert inside >= 40 * 0.95 - 2 * np.sqrt(40 * 0.95 * 0.05)
