@@ -8,10 +8,7 @@ from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
-import torch
 
-from fmtorch import match
-from fmtorch.pipeline import load_pipeline
 from tests.helpers import draw_set
 from tests.processes import run_command, starter
 from tests.reliability.conftest import Rows, results
@@ -227,18 +224,3 @@ def test_a_killed_run_continues_with_what_the_cache_had_and_a_damaged_file_is_co
     same = sum(before[pair] == after[pair] for pair in before)  # what computing took, not what reading did
     assert same >= len(before) - 2  # one image, of one or two pairs, was computed again
     assert not list(tmp_path.glob("cache/features/*/*.tmp"))
-
-
-def test_two_photographs(root: Path, tmp_path: Path) -> None:
-    images = [root / "a" / "Images" / f"{i:08d}.png" for i in (0, 1)]
-    kept = [f"cache={tmp_path / 'cache'}"]
-    runs = ([], 1600), (kept, 1600), (kept, 1600), (kept, 200)
-    pipelines = [load_pipeline("sift_gms", overrides=words) for words, _ in runs]
-    results = [match(*images, pipeline=p, longest_side=run[1]) for p, run in zip(pipelines, runs, strict=True)]
-    plain, cold, warm, _ = results
-    _, first, second, reduced = (pipeline.extractor for pipeline in pipelines)
-    assert torch.equal(plain.F, cold.F)
-    assert torch.equal(plain.F, warm.F)
-    assert torch.equal(plain.keypoints0, warm.keypoints0)
-    assert cold.seconds["features"] == warm.seconds["features"]
-    assert (first.computed, second.found, reduced.computed) == (2, 2, 2)  # reduced: other pixels

@@ -54,17 +54,6 @@ def test_another_files_error_stays_its_own(tmp_path: Path) -> None:
     assert message(caught.value) == f"{other}: No such file or directory"
 
 
-def test_a_device_that_is_full(tmp_path: Path) -> None:
-    """The kernel's own error, which names no file."""
-    full = Path("/dev/full")
-    if not full.exists():
-        pytest.skip("this system has no /dev/full")
-    no_space = pytest.raises(OSError, match="No space left")
-    with no_space as caught, core.replacing(tmp_path / "out.json"), full.open("wb") as file:
-        file.write(b"x" * 100_000)
-    assert message(caught.value) == f"{tmp_path / 'out.json'}: No space left on device"
-
-
 def test_an_installed_wheel_uses_its_own_folders_and_an_incomplete_one_is_named(tmp_path, monkeypatch):
     package = tmp_path / "site-packages" / "fmtorch"
     monkeypatch.setattr(core.files, "PACKAGE", package)

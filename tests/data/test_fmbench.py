@@ -112,13 +112,6 @@ def test_cameras_must_fit(tmp_path: Path) -> None:
     assert len(FMBenchPairs(root, cameras=False)) == 2
 
 
-def test_load_names_what_there_is() -> None:
-    with pytest.raises(ValueError, match="no preset 'kity' in conf/dataset; there are: kitti, "):
-        load("kity")
-    with pytest.raises(DataError, match="fmbench needs root"):
-        load("fmbench")
-
-
 def test_real_sets() -> None:
     dataset = load("fmbench", root=shared_path("data"))
     counts = {family: sum(p.family == family for p in dataset) for family in {p.family for p in dataset}}

@@ -21,7 +21,6 @@ from fmtorch.evaluation.statistics import summarize
 from fmtorch.evaluation.tables import summary_markdown
 from fmtorch.io import H5Pairs, oanet
 from fmtorch.pipeline import Outcome, Pipeline, load_pipeline
-from fmtorch.pruning import ratio_test
 from fmtorch.runs import to_table
 from tests.geometry.scenes import scene
 from tests.helpers import unused
@@ -80,23 +79,6 @@ def test_what_was_written_is_read(layout: str, swapped: bool, tmp_path: Path) ->
         else:
             assert c.size0.tolist() == [list(writers.SIZE)]
     assert (c.mutual is not None) == (layout == "oanet")
-
-
-@pytest.mark.parametrize("layout", writers.WRITERS)
-def test_estimators_pruners_and_metrics_work_on_it(layout: str, tmp_path: Path) -> None:
-    dataset = load(layout, tmp_path)
-    pruner: dict[str, Any] = {}
-    if layout != "posebench":  # which says nothing of how good a match is
-        pruner["one_to_one"] = presets.build("pruner", "one_to_one")
-    if layout in WITH_RATIOS:
-        pruner["ratio"] = lambda c: c.keep(ratio_test(c.ambiguity, 0.8))
-    for row in evaluate(pipeline(**pruner).run(list(dataset))):
-        assert row.ok, row.reason
-        assert row.nsgd < 0.02
-        assert row.rotation_error is not None
-        assert row.rotation_error < 2
-        assert row.corrs_before <= writers.N + 10
-        assert (row.seconds_features is None) or np.isnan(row.seconds_features)
 
 
 def test_the_origin_can_be_told(tmp_path: Path) -> None:

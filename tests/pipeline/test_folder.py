@@ -3,7 +3,6 @@
 import itertools
 import json
 import os
-import signal
 import threading
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -24,6 +23,7 @@ from fmtorch.jobs import DEATH, Execution, WorkerPool, WorkersLost
 from fmtorch.pipeline import FolderMatches, Pipeline, chosen_pairs, folder, folder_workers, images_below, load_pipeline
 from tests.conftest import shared_path
 from tests.helpers import draw
+from tests.jobs.work import fatal_pipeline, sift_pipeline
 
 
 class Recorded(Executor):
@@ -49,14 +49,10 @@ def threads(count: int) -> Execution:
     return Execution("threads", count)
 
 
-def built() -> Pipeline:
-    options = ["features.max_features=300", "estimator=lmeds", "estimator.hypotheses=30"]
-    return load_pipeline("sift_ratio", overrides=options)
-
-
 @pytest.fixture
 def pipeline() -> Pipeline:
-    return built()
+    built: Pipeline = sift_pipeline()
+    return built
 
 
 @pytest.fixture
@@ -102,7 +98,7 @@ def test_processes_keep_the_same(pipeline: Pipeline, images: list[Path], tmp_pat
     pairs = list(itertools.combinations(images[:4], 2))
     list(work(pipeline, images, tmp_path / "threads").each(pairs))
     with folder_workers(pipeline, Execution("processes", 2, send_images=send)) as workers:
-        matches = work(pipeline, images, tmp_path / "processes", workers=workers, build=built)
+        matches = work(pipeline, images, tmp_path / "processes", workers=workers, build=sift_pipeline)
         list(matches.each(pairs))
     assert (matches.done, matches.troubles) == (6, [])
     expect_same(tmp_path / "processes", tmp_path / "threads")
@@ -146,28 +142,10 @@ def test_workers_that_died_end_the_work(pipeline: Pipeline, images: list[Path], 
     assert kept(tmp_path / "out") == {}
 
 
-class Fatal:
-    """An extractor that ends its process at the darkest image."""
-
-    def __init__(self, extractor: Any) -> None:
-        self.extractor = extractor
-
-    def __call__(self, image: Any) -> Any:
-        if not image.any():
-            os.kill(os.getpid(), signal.SIGKILL)
-        return self.extractor(image)
-
-
-def fatal() -> Pipeline:
-    pipeline = built()
-    pipeline.extractor = Fatal(pipeline.extractor)
-    return pipeline
-
-
 def test_an_image_that_ends_its_workers_is_told_and_the_others_are_matched(pipeline, images, tmp_path):
     assert cv2.imwrite(str(images[1]), np.zeros((240, 320), np.uint8))
-    with folder_workers(pipeline, Execution("processes", 2)) as workers:
-        matches = work(pipeline, images[:4], tmp_path / "out", workers=workers, build=fatal)
+    with folder_workers(pipeline, Execution("processes", 1)) as workers:
+        matches = work(pipeline, images[:4], tmp_path / "out", workers=workers, build=fatal_pipeline)
         assert len(list(matches.each(list(itertools.combinations(images[:4], 2))))) == 6
     assert (matches.done, matches.troubles) == (3, [DEATH])
 

@@ -88,20 +88,6 @@ def test_batches_change_nothing(pairs: list[ImagePair]) -> None:
             assert int(alone.estimate.inliers.sum()) == int(outcome.estimate.inliers.sum())
 
 
-def test_match_stops_before_estimation(pairs: list[ImagePair]) -> None:
-    outcome = pipeline().correspondences(pairs[:1])[0]
-    assert outcome.estimate is None
-    assert int(outcome.correspondences.count()) > 50
-    assert int(outcome.correspondences.keys[0]) == pairs[0].key
-
-
-def test_features_of_an_image_are_computed_once(pairs: list[ImagePair]) -> None:
-    inner, calls = presets.build("features", "sift", max_features=500), list[int]()
-    shared = pipeline(features=lambda image: calls.append(0) or inner(image))
-    shared.run([pairs[0], pairs[0], pairs[5]])
-    assert len(calls) == 2
-
-
 @pytest.mark.parametrize("stage", ["pruning", "estimation"])
 def test_a_stage_that_raises_fails_only_the_culprit(pairs: list[ImagePair], stage: str) -> None:
     named = {"pruning": ("pruner", "ratio"), "estimation": ("estimator", "lmeds")}[stage]
