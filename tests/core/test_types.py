@@ -157,15 +157,6 @@ def test_keep_only_ever_removes() -> None:
             inspect.unwrap(Correspondences.keep)(c, wrong)
 
 
-def test_compact_known_answer() -> None:
-    x = torch.arange(8.0).reshape(2, 4, 1).expand(-1, -1, 2)
-    mask = torch.tensor([[False, True, False, True], [False, False, True, False]])
-    c = Correspondences(x, -x, mask, ratio=x[..., 0]).compact()
-    assert (c.x0.shape, c.mask.tolist()) == ((2, 2, 2), [[True, True], [True, False]])
-    assert (c.x0[0, :, 0].tolist(), c.x0[1, 0].tolist()) == ([1, 3], [6, 6])
-    assert (c.x1[0, :, 1].tolist(), c.ratio[0].tolist()) == ([-1, -3], [1, 3])
-
-
 def _survivors(c: Correspondences) -> list[dict[str, torch.Tensor]]:
     """Per pair, the surviving matches of every per-match field, in order."""
     return [{f: getattr(c, f)[i][c.mask[i]] for f in PER_MATCH} for i in range(len(c))]

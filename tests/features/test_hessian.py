@@ -49,10 +49,6 @@ def test_border() -> None:
         assert len(room) > 10
 
 
-def angle_between(a: Tensor, b: Tensor) -> Tensor:
-    return ((a - b + np.pi) % (2 * np.pi) - np.pi).abs()
-
-
 def test_frame_algebra_is_kornias() -> None:
     lafs = random_frames(0, 50, 100, 100)
     torch.testing.assert_close(features.frame_scale(lafs), kornia.feature.get_laf_scale(lafs[None])[0, :, 0, 0])
@@ -67,15 +63,9 @@ def test_frame_algebra_is_kornias() -> None:
 def test_orientation_equals_the_definition() -> None:
     patches = features.ImagePyramid(texture(0)).extract(random_frames(0, 25, 160, 200))
     expected = torch.tensor([reference_orientation(p[0].double().numpy()) for p in patches])
-    assert angle_between(features.dominant_gradient(patches), expected).max() < 1e-4
-
-
-def test_orientation_turns_with_the_patch() -> None:
-    patches = features.ImagePyramid(texture(2)).extract(random_frames(2, 100, 160, 200))
-    turned = features.dominant_gradient(patches.rot90(1, (2, 3)))  # counter-clockwise
-    assert (angle_between(turned, features.dominant_gradient(patches) + np.pi / 2) < 1e-3).float().mean() > 0.97
-    flat = features.dominant_gradient(torch.full((2, 1, 32, 32), 0.3))
-    assert torch.isfinite(flat).all()
+    differences = (features.dominant_gradient(patches) - expected + np.pi) % (2 * np.pi) - np.pi
+    assert differences.abs().max() < 1e-4
+    assert torch.isfinite(features.dominant_gradient(torch.full((2, 1, 32, 32), 0.3))).all()
 
 
 @pytest.mark.parametrize("part", [features.NetworkShape, features.NetworkOrientation])

@@ -222,15 +222,10 @@ def test_hloc_files(tmp_path: Path) -> None:
         assert file.execute("SELECT COUNT(*) FROM two_view_geometries").fetchone() == (len(circle.pairs),)
 
 
-def test_kinds() -> None:
-    assert (io.export_kinds(None), io.export_kinds("colmap, h5")) == ((), ("colmap", "h5"))
-    assert io.export_kinds(["h5"]) == ("h5",)
-    with pytest.raises(ValueError, match=r"export=h5,bundler: 'bundler' is none of h5, colmap"):
-        io.export_kinds("h5,bundler")
-
-
 @pytest.mark.parametrize(("library", "kind"), [("h5py", "h5"), ("pycolmap", "colmap")])
-def test_says_which_extra_is_missing(library: str, kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_kinds_are_words_and_a_missing_extra_is_named(library: str, kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    kinds = [io.export_kinds(given) for given in (None, "colmap, h5", [kind])]
+    assert kinds == [(), ("colmap", "h5"), (kind,)]
     monkeypatch.setitem(sys.modules, library, None)
     with pytest.raises(ImportError, match=rf"pip install 'fmtorch\[{kind}\]'"):
         io.export_kinds(kind)

@@ -16,19 +16,7 @@ import fmtorch
 from fmtorch import presets
 from fmtorch.core import collate
 from fmtorch.data import read_image
-from fmtorch.jobs import (
-    DEATH,
-    Execution,
-    Factory,
-    Local,
-    TaskRunner,
-    WorkerPool,
-    WorkersLost,
-    available,
-    in_order,
-    mapped,
-    one_thread,
-)
+from fmtorch.jobs import DEATH, Execution, Factory, Local, TaskRunner, WorkerPool, WorkersLost, in_order, mapped
 from tests.helpers import draw, pair
 from tests.helpers import small_pipeline as pipeline
 from tests.jobs.work import ends, fails, late, make_needs, slow, squares
@@ -224,9 +212,9 @@ def test_items_are_mapped_in_order_by_threads_that_share_no_more(threads: int) -
 
     def meet(item: int) -> tuple[int, int, int]:
         together.wait()  # for as many as there are threads
-        return item, torch.get_num_threads(), available()
+        return item, torch.get_num_threads(), fmtorch.jobs.available()
 
-    with one_thread("cpu"):
+    with fmtorch.jobs.one_thread("cpu"):
         assert mapped(meet, range(6)) == [(i, 1, 1) for i in range(6)]
     torch.set_num_threads(1)
     here = threading.get_ident()

@@ -134,16 +134,6 @@ def test_another_option_image_or_shape_is_another_file(tmp_path: Path) -> None:
     assert other.computed == 1
 
 
-def test_seconds_are_those_of_the_computation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    sift = presets.build("features", "sift")
-    first, second = (CachedFeatures(sift, ArrayCache(tmp_path)) for _ in range(2))
-    seconds = first.timed(picture())[1]
-    assert seconds > 0
-    assert second.timed(picture())[1] == seconds
-    assert "of 1 taken" in second.report()
-    assert "1 files" in second.report()
-
-
 def test_a_failure_is_not_kept(tmp_path: Path) -> None:
     kept = CachedFeatures(presets.build("features", "sift"), ArrayCache(tmp_path))
     for _ in range(2):

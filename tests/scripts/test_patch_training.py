@@ -16,6 +16,7 @@ import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 from PIL import Image
+from scipy.spatial.distance import cdist
 from torch import Tensor, nn
 
 from fmtorch.core import conf_dir, models_dir
@@ -30,7 +31,6 @@ from scripts.patch_networks.stores import tracks
 from scripts.patch_networks.train import PatchTraining, TrainingOptions, cutting_of, training_of
 from tests.features.test_networks import randomized
 from tests.reference import geodesc as geodesc_reference
-from tests.reference import patch_losses as reference
 
 PLANES = PlaneViews(views=4, tilt=15.0, scale=(0.5, 0.6))
 
@@ -242,8 +242,11 @@ def sets_of(sets: int, n: int, d: int, seed: int) -> tuple[Tensor, Tensor, Tenso
 def test_losses_are_their_definitions() -> None:
     a, b = unit(12, 4, 0)
     b[3] = a[7]  # the same patch twice is no negative
-    expected = reference.hardest_triplet(a.tolist(), b.tolist(), 1.0)
-    assert float(hardest_triplet(a, b)) == pytest.approx(expected, abs=1e-9)
+    # Mishchuk et al., NIPS 2017, section 3.1: the hardest negative of a_i among b and of b_i among a
+    distances = cdist(a, b)
+    others = np.where(np.eye(12, dtype=bool) | (distances < 0.008), np.inf, distances)
+    hinges = np.maximum(0, 1 + distances.diagonal() - np.minimum(others.min(0), others.min(1)))
+    assert float(hardest_triplet(a, b)) == pytest.approx(hinges.mean(), abs=1e-9)
 
 
 def test_the_loss_of_match_sets_is_its_definition() -> None:
@@ -272,12 +275,12 @@ def random_tracks(seed: int) -> tuple[stores.PatchStore, dict[tuple[int, int], f
         first.append(len(views))
     rays = rng.normal(size=(len(views), 3)) * 0.2 + [0, 0, 1]
     rays = (rays / np.linalg.norm(rays, axis=1, keepdims=True)).astype(np.float32)
-    incidence = rng.uniform(0, 40, len(views)).astype(np.float32)
+    incidence = np.degrees(np.arccos(rays[:, 2])).astype(np.float32)  # of a surface that faces z
     similarity = {}
     for begin, end in itertools.pairwise(first):
         for i, j in itertools.combinations(range(begin, end), 2):
-            value = stores.patch_similarity(rays[[i]], rays[[j]], incidence[[i]], incidence[[j]])[0]
-            similarity[names[i], names[j]] = float(value)
+            seen = geodesc_reference.patch_similarity((0, 0, 0), (0, 0, 1), rays[i].tolist(), rays[j].tolist())
+            similarity[names[i], names[j]] = seen
     patches = np.zeros((len(views), 1, 1), np.uint8)
     return stores.PatchStore(patches, np.array(first), np.array(views), rays, incidence, {}), similarity
 

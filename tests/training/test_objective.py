@@ -198,8 +198,6 @@ def test_matches_that_a_stage_does_not_judge_are_as_unlabelled() -> None:
 
 
 def test_options_that_cannot_be_are_refused() -> None:
-    with pytest.raises(ValueError, match="must be one of: size, K"):
-        training.Objective(coordinates="pixels")
     with pytest.raises(ValueError, match="at least one of"):
         training.Objective(classification=0.0, geometric=0.0)
     batch = labelled_pair(0)

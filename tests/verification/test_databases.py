@@ -130,12 +130,6 @@ def test_scales_and_shapes_of_keypoints_change_nothing(columns: int, tmp_path: P
     assert plain(read(path)) == plain(read(points))
 
 
-def test_keypoints_of_other_columns() -> None:
-    camera = pycolmap.Camera(model="PINHOLE", width=640, height=480, params=databases.PARAMS["PINHOLE"])
-    with pytest.raises(ValueError, match="the keypoints of a have 3 columns; they must have 2, 4 or 6"):
-        database_image("a", camera, np.zeros((3, 3), np.float32))
-
-
 def test_what_a_camera_is_known_for() -> None:
     """A calibration exactly, a focal length of EXIF within 5 %, COLMAP's guess not at all."""
     keypoints = np.zeros((1, 2), np.float32)
@@ -150,6 +144,8 @@ def test_what_a_camera_is_known_for() -> None:
         camera = pycolmap.Camera(model=model, width=640, height=480, params=params)
         camera.has_prior_focal_length = deviation < np.inf
         assert database_image("a", camera, keypoints).deviation == deviation, (model, params)
+    with pytest.raises(ValueError, match="the keypoints of a have 3 columns; they must have 2, 4 or 6"):
+        database_image("a", camera, np.zeros((3, 3), np.float32))
 
 
 @pytest.mark.parametrize(("kind", "name"), [("planar", "planar"), ("rotation", "panoramic")])
