@@ -40,14 +40,11 @@ def test_a_failed_write_names_the_file_and_leaves_what_was_there(error: BaseExce
     assert (path.read_text(), list(tmp_path.iterdir())) == ("before", [path])
 
 
-def test_a_folder_that_is_not_there_is_named_by_the_file() -> None:
+def test_a_missing_folder_is_named_by_the_file_and_another_files_error_stays_its_own(tmp_path: Path) -> None:
     path = Path("/nowhere/at/all.txt")
     with pytest.raises(FileNotFoundError) as caught, core.replacing(path) as temporary:
         temporary.write_text("")
     assert message(caught.value) == f"{path}: No such file or directory"
-
-
-def test_another_files_error_stays_its_own(tmp_path: Path) -> None:
     other = tmp_path / "image.png"
     with pytest.raises(FileNotFoundError) as caught, core.replacing(tmp_path / "out.json"):
         other.read_bytes()

@@ -219,13 +219,10 @@ def result() -> fmtorch.MatchResult:
     return fmtorch.match(*images, pipeline="sift_fmtorch", longest_side=400)
 
 
-def test_a_result_is_one_line_and_a_picture_in_a_notebook(result: fmtorch.MatchResult) -> None:
+def test_a_result_is_one_line_or_a_picture(result: fmtorch.MatchResult) -> None:
     assert repr(result).startswith(f"MatchResult({len(result.inliers)} matches, {int(result.inliers.sum())} inliers")
     assert len(repr(result)) < 120
     assert "data:image/jpeg;base64," in result._repr_html_()
-
-
-def test_a_result_draws_itself(result: fmtorch.MatchResult) -> None:
     pictures = [result.draw(what) for what in ("matches", "pruning", "epipolar")]
     assert all(picture.dtype == np.uint8 and picture.shape[2] == 3 for picture in pictures)
     assert not np.array_equal(pictures[0], pictures[1])
@@ -394,10 +391,7 @@ def test_tracebacks_are_those_of_the_users_code(tmp_path: Path, monkeypatch: pyt
     with pytest.raises(ValueError, match="estimator: KeyError: 'weights'") as refusal:
         instantiate({"_target_": "failing_part.Part", "broken": True}, "estimator")
     assert place_of(refusal.value) == "failing_part.py:5, in __init__"
-
-
-def test_errors_of_the_projects_own_have_no_place() -> None:
-    with pytest.raises(ValueError, match="no preset") as refusal:
+    with pytest.raises(ValueError, match="no preset") as refusal:  # errors of the project's own have no place
         presets.build("estimator", "ransca")
     assert place_of(refusal.value) == own_traceback(refusal.value) == ""
 

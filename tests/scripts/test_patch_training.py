@@ -334,9 +334,12 @@ def exact_int8(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def exported(name: str, folder: Path, patches: Tensor) -> tuple[Path, Path]:
-    """A network of random weights in fp32 and int8, in the layouts that torch and the quantisation leave."""
-    fp32, int8 = folder / "fp32.onnx", folder / "int8.onnx"
-    export(randomized(build(name)), fp32)
+    """A network of random weights in fp32, which is torch's, and int8, as torch and the quantisation lay them out."""
+    fp32, int8, network = folder / "fp32.onnx", folder / "int8.onnx", randomized(build(name))
+    if name == "l2net":
+        network.pixel_mean.copy_(patches.mean(0, keepdim=True))
+    export(network, fp32)
+    torch.testing.assert_close(PatchNetwork(fp32, batch=40)(patches), network(patches).detach(), atol=1e-4, rtol=0)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("scripts.patch_networks.onnx_export.lay_out", lambda path: None)
         quantize(fp32, int8, patches)

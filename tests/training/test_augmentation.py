@@ -183,15 +183,6 @@ def test_ranges_are_kept() -> None:
     assert ONLY(m, seed=0, count=7000).label.shape[1] == 600
 
 
-def test_mistakes_are_named() -> None:
-    turns = {"turn": 0.6, "quarter_turn": 0.6}
-    for options, message in (({"swap": 2}, "swap is 2"), (turns, "exclude"), ({"ratio": (1.0, 0.8)}, "ratio is")):
-        with pytest.raises(ValueError, match=message):
-            Augmentation(**options)
-    with pytest.raises(ValueError, match="batch of 2"):
-        Augmentation()(exact(pairs=2), seed=0)
-
-
 SIZE = (240, 320)
 WALL = 4.0  # metres in front of the first camera
 SKY = 200  # columns from which on nothing is there
@@ -422,7 +413,13 @@ def test_views_are_drawn_once_and_depend_on_what_defines_them(photographs, tmp_p
     assert other.digest != first.digest
 
 
-def test_mistakes_in_planes_are_named(tmp_path: Path) -> None:
+def test_mistakes_are_named(tmp_path: Path) -> None:
+    turns = {"turn": 0.6, "quarter_turn": 0.6}
+    for options, message in (({"swap": 2}, "swap is 2"), (turns, "exclude"), ({"ratio": (1.0, 0.8)}, "ratio is")):
+        with pytest.raises(ValueError, match=message):
+            Augmentation(**options)
+    with pytest.raises(ValueError, match="batch of 2"):
+        Augmentation()(exact(pairs=2), seed=0)
     with pytest.raises(ValueError, match="no photographs"):
         PlanePairs([], root=tmp_path)
     (tmp_path / "notes.jpg").write_text("not an image")
