@@ -124,7 +124,6 @@ def test_a_users_own_pruner_by_config_dir(header: str, data: list[str], command:
 
 
 def test_a_data_set_that_is_something_else(data: list[str], command: RunCommand, tmp_path: Path) -> None:
-    """Of a class without a digest, and of pairs that are none."""
     words = [*own(tmp_path, "dataset", "_target_: own_dataset.Numbers\n"), "dataset=mine", *OPTIONS]
     (tmp_path / "own_dataset.py").write_text("class Numbers(list):\n    name = 'numbers'\n")
     assert "ended: error: Numbers has no digest; a PairDataset has both" in command("eval", *words, cwd=tmp_path)
@@ -197,7 +196,6 @@ def counted(stdout: str) -> tuple[int, int]:
 
 
 def test_a_killed_run_continues_with_what_the_cache_had_and_a_damaged_file_is_computed_anew(root, truth, tmp_path):
-    """A run that is killed and started again, then another one with a damaged cache: the rows of a run without it."""
 
     def files() -> list[Path]:
         return sorted(tmp_path.glob("cache/features/*/*.npz"))

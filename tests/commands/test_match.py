@@ -15,7 +15,7 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
-from PIL import ExifTags, Image
+from PIL import Image
 
 import fmtorch
 from fmtorch import presets
@@ -27,6 +27,7 @@ from fmtorch.geometry import homography_points, sampson
 from fmtorch.metrics import nsgd, pose_error
 from fmtorch.pipeline import PhotographCameras, load_pipeline
 from tests.conftest import shared_path
+from tests.data.test_images import with_exif
 from tests.helpers import ROWS
 from tests.matching import stand_in
 
@@ -387,15 +388,7 @@ def test_a_lens_that_nobody_calibrated(pair: ImagePair, pipeline_with_cameras: f
         fmtorch.match(*bent, pipeline="sift_gms", lens="shared")
 
 
-def with_exif(folder: Path, name: str, **tags: int) -> Path:
-    exif = Image.Exif()
-    exif.get_ifd(ExifTags.IFD.Exif).update({ExifTags.Base[key]: value for key, value in tags.items()})
-    Image.new("RGB", (60, 40)).save(folder / name, exif=exif)
-    return folder / name
-
-
 def photographs(paths: list[Path], cameras: Path | None, K: Any) -> SimpleNamespace:
-    """As the command reads them."""
     known = PhotographCameras(cameras, K)
     images = [read_image(known.source(path)) for path in paths]
     ends = [known.of(path, image.shape[:2]) for path, image in zip(paths, images, strict=True)]
@@ -404,7 +397,7 @@ def photographs(paths: list[Path], cameras: Path | None, K: Any) -> SimpleNamesp
 
 
 def test_words_files_and_numbers_as_arguments(tmp_path: Path) -> None:
-    paths = [with_exif(tmp_path, "a.jpg", FocalLengthIn35mmFilm=36), with_exif(tmp_path, "b.jpg")]
+    paths = [with_exif(tmp_path, (40, 60), "a.jpg", FocalLengthIn35mmFilm=36), with_exif(tmp_path, (40, 60), "b.jpg")]
     assert photographs(paths, None, None).knowledge == {}
     for word in ("shared", "unknown"):
         assert photographs(paths, Path(word), None).knowledge == {"focal": word}
@@ -428,7 +421,7 @@ def test_words_files_and_numbers_as_arguments(tmp_path: Path) -> None:
 
 
 def test_distortion_is_taken_out_and_sizes_must_fit(tmp_path: Path) -> None:
-    paths = [with_exif(tmp_path, name) for name in ("a.jpg", "b.jpg")]
+    paths = [with_exif(tmp_path, (40, 60), name) for name in ("a.jpg", "b.jpg")]
     (tmp_path / "cameras.txt").write_text("1 SIMPLE_RADIAL 60 40 50 30 20 0.2\n")
     bent = photographs(paths, tmp_path / "cameras.txt", None)
     assert bent.knowledge["K0"] is None
@@ -446,7 +439,7 @@ def test_distortion_is_taken_out_and_sizes_must_fit(tmp_path: Path) -> None:
     (None, "0,1,2,3", "it must be fx"), (None, "a,b,c,d", "it must be fx"),
 ])  # fmt: skip
 def test_what_is_no_camera_of_a_command(cameras: Path | None, K: object, message: str, tmp_path: Path) -> None:
-    path = with_exif(tmp_path, "a.jpg")
+    path = with_exif(tmp_path, (40, 60), "a.jpg")
     with pytest.raises(ValueError, match=message):
         photographs([path, path], cameras, K)
 

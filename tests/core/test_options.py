@@ -163,7 +163,6 @@ def distance(
     cap: bool = True,
     weigh: Callable[[Tensor], Tensor] | None = None,
 ) -> Any:
-    """What it was given."""
     return dict(locals())
 
 

@@ -83,7 +83,6 @@ def test_the_model_is_looked_for_where_colmap_puts_it(tmp_path: Path) -> None:
 
 
 def test_binary_files_cut_anywhere_are_refused(tmp_path: Path) -> None:
-    """Every shorter file is refused with its record, and so is every longer one; none makes a traceback."""
     sparse = write_colmap(tmp_path / "scene") / "sparse/0"
     to_binary(sparse)
     for name, record in (("cameras.bin", "camera 3 of 3"), ("images.bin", "image 3 of 3")):
@@ -99,7 +98,6 @@ def test_binary_files_cut_anywhere_are_refused(tmp_path: Path) -> None:
 
 
 def test_damaged_bytes_never_make_a_traceback(tmp_path: Path) -> None:
-    """Random bytes are overwritten: the model is read, or refused by a DataError."""
     sparse = write_colmap(tmp_path / "scene") / "sparse/0"
     to_binary(sparse)
     rng = np.random.default_rng(0)

@@ -142,7 +142,6 @@ def test_pairs_are_image_1_with_the_others(tmp_path: Path) -> None:
 
 
 def test_homographies_are_of_the_images_as_they_are_read(tmp_path: Path) -> None:
-    """Image 0, resized and mapped by H, is image 1, resized."""
     dataset = load("hpatches", root=planes.write_hpatches(tmp_path), sequences=["v_view"], short_side=200)
     for pair in dataset:
         a, b = (read_image(image) for image in (pair.image0, pair.image1))

@@ -14,8 +14,7 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 
-from fmtorch import data, find_fundamental, presets
-from fmtorch.core import Estimator, FeatureExtractor, Matcher, Pruner
+from fmtorch import data, find_fundamental
 from fmtorch.scenes import FAMILIES, Plan
 from tests.conftest import own_cache
 from tests.laws import scene
@@ -54,15 +53,6 @@ def test_every_part_is_evaluated(folder: Path) -> None:
     identity = (folder / "run" / "run.json").read_text()
     for target in ("my_features.ORB", "my_matcher.MutualMatcher", "my_pruner.UsualMotion", "my_estimator.Refitted"):
         assert target in identity
-
-
-PROTOCOLS = {"features": FeatureExtractor, "matcher": Matcher, "pruner": Pruner, "estimator": Estimator}
-
-
-@pytest.mark.parametrize(("group", "protocol"), PROTOCOLS.items())
-def test_each_is_built_by_name_in_python(group, protocol, folder, monkeypatch):
-    monkeypatch.syspath_prepend(str(folder))
-    assert isinstance(presets.build(group, "mine", config_dir=folder / "my_conf"), protocol)
 
 
 @pytest.mark.parametrize("score", ["Welsch", "Triweight"])

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from PIL import ExifTags, Image
 from rich.console import Console
 
 import fmtorch
@@ -25,6 +24,7 @@ from fmtorch.runs import PairRow, RunFolder, to_table
 from fmtorch.training import MatchedPairs
 from tests.conftest import shared_path
 from tests.data import planes
+from tests.data.test_images import with_exif
 from tests.geometry.scenes import K, batch, draw, scene
 from tests.helpers import call_command, unused
 from tests.reference import metrics as reference
@@ -194,19 +194,11 @@ def test_homographies_need_a_set_that_has_them_and_label_no_matches(monkeypatch,
         MatchedPairs(load("hpatches", root=runs / "hpatches"), "sift_ratio", root=tmp_path)
 
 
-def photograph(path: Path, equivalent: int | None) -> ImageSource:
-    """A picture of 60 x 40 px with a focal length in 35 mm."""
-    exif = Image.Exif()
-    if equivalent:
-        exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm] = equivalent
-    Image.new("RGB", (60, 40)).save(path, exif=exif)
-    return ImageSource(path.stem, path)
-
-
 def test_what_each_word_gives(tmp_path: Path) -> None:
     pair = outcome(0).pair
-    ends = photograph(tmp_path / "a.jpg", 36), photograph(tmp_path / "b.jpg", None)
-    pair = dataclasses.replace(pair, image0=ends[0], image1=ends[1])
+    paths = with_exif(tmp_path, (40, 60), FocalLengthIn35mmFilm=36), with_exif(tmp_path, (40, 60), "b.jpg")
+    image0, image1 = (ImageSource(path.stem, path) for path in paths)
+    pair = dataclasses.replace(pair, image0=image0, image1=image1)
     known, exif, shared, unknown = (given(pair, word) for word in ("known", "exif", "shared", "unknown"))
     assert torch.equal(known["K0"], torch.from_numpy(pair.K0))
     assert known["focal"].tolist() == [[1, 0], [1, 0]]

@@ -22,8 +22,6 @@ from scipy.spatial.transform import Rotation
 from fmtorch import io
 from fmtorch.evaluation import MAX_THUMBNAILS, view_graph_svg
 from fmtorch.io import ORIGIN, write_database
-from fmtorch.pipeline import FolderMatches, chosen_pairs, folder_workers, images_below, load_pipeline
-from tests.conftest import shared_path
 from tests.helpers import cross_matrix
 
 K = np.array([[1000.0, 0, 480], [0, 1000, 410], [0, 0, 1]])
@@ -229,33 +227,6 @@ def test_kinds_are_words_and_a_missing_extra_is_named(library: str, kind: str, m
     monkeypatch.setitem(sys.modules, library, None)
     with pytest.raises(ImportError, match=rf"pip install 'fmtorch\[{kind}\]'"):
         io.export_kinds(kind)
-
-
-def test_a_real_scene_is_reconstructed(tmp_path: Path) -> None:
-    """Five images of fountain-P11: photographs -> matches and F -> COLMAP's cameras, against the laser scan's."""
-    source = shared_path("data/Strecha/fountain-P11")
-    images = tmp_path / "images"
-    images.mkdir()
-    for path in sorted((source / "Images").iterdir())[2:7]:
-        (images / path.name).symlink_to(path)
-    options = ["features.max_features=2500", "estimator=lmeds", "estimator.hypotheses=300"]
-    pipeline = load_pipeline("sift_ratio", overrides=options)
-    kept = io.MatchStore(tmp_path / "export", images)
-    pairs = chosen_pairs(images, images_below(images), None)
-    work = FolderMatches(pipeline, kept, folder_workers(pipeline), 1600, True, 0)
-    assert len(list(work.each(pairs))) == len(pairs)
-    assert not work.troubles
-    io.write_exports(kept, pairs, ("colmap",), tmp_path, shared_camera=True)
-    model = mapped(tmp_path / io.DATABASE, tmp_path)
-    cameras = np.loadtxt(source / "Camera.txt")
-    names = [f"{i:08d}.jpg" for i in range(len(cameras))]
-    R, t = cameras[:, 9:18].reshape(-1, 3, 3), cameras[:, 18:]
-    turn, shift = errors(model, names, list(R), np.einsum("nji,nj->ni", -R, t))
-    assert model.num_reg_images() == 5
-    (camera,) = model.cameras.values()
-    assert camera.focal_length == pytest.approx((cameras[0, 0] + cameras[0, 4]) / 2, rel=0.02)
-    assert shift < 0.01
-    assert turn < 1.5  # the principal point, which stays in the middle, is off by 10 px of 1380
 
 
 SVG = "{http://www.w3.org/2000/svg}"

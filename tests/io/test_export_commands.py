@@ -159,7 +159,6 @@ def test_mistakes_are_told(words: list[str], said: str, images: Path, monkeypatc
 
 
 def test_an_evaluation_and_its_way_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What an evaluation exports, also after it has ended, and what that is as a data set."""
     root = draw_set(tmp_path / "Set", pairs=[(0, 1), (0, 2), (1, 2)])
     camera = np.concatenate([[300, 0, 160, 0, 300, 120, 0, 0, 1], np.eye(3).ravel()])
     np.savetxt(root / "scene" / "Camera.txt", [np.concatenate([camera, [-i, 0, 0]]) for i in range(3)])

@@ -16,12 +16,10 @@ import pytest
 import torch
 
 from fmtorch.core import Features
-from fmtorch.data import ImageSource, read_image
-from fmtorch.features.describe import image_vector
+from fmtorch.data import ImageSource
 from fmtorch.io import MatchStore
 from fmtorch.jobs import DEATH, Execution, WorkerPool, WorkersLost
-from fmtorch.pipeline import FolderMatches, Pipeline, chosen_pairs, folder, folder_workers, images_below, load_pipeline
-from tests.conftest import shared_path
+from fmtorch.pipeline import FolderMatches, Pipeline, chosen_pairs, folder, folder_workers, images_below
 from tests.helpers import draw
 from tests.jobs.work import fatal_pipeline, sift_pipeline
 
@@ -266,15 +264,3 @@ def test_an_image_that_cannot_be_read_has_no_vector() -> None:
     vectors = folder.vectors_of([None, described], lambda descriptors: descriptors[0])
     assert vectors.tolist() == [[0.0] * 7, [1.0] * 7]
     assert folder.vectors_of([None], lambda descriptors: descriptors[0]).shape == (1, 1)
-
-
-def test_scenes_are_told_apart() -> None:
-    """Four images of each of three real scenes: none is most like an image of another scene."""
-    folders = [shared_path(f"data/{name}/Images") for name in ("Strecha/fountain-P11", "KITTI/00", "TUM/fr1_rpy")]
-    images = [path for place in folders for path in sorted(place.iterdir())[:4]]
-    sift = load_pipeline("sift_ratio", overrides=["features.max_features=1500"])
-    described = [folder.describe(sift, read_image(image), 800) for image in images]
-    vectors = folder.vectors_of(described, lambda descriptors: image_vector(descriptors, "sift"))
-    pairs = folder.similar_pairs(images, vectors, 1)
-    assert len(pairs) >= 6
-    assert all(a.parent == b.parent for a, b in pairs)

@@ -369,7 +369,6 @@ def test_the_homography_is_the_cameras_projection() -> None:
 
 
 def test_matches_are_judged_by_the_homography(planes: PlanePairs, tmp_path: Path) -> None:
-    """Labels by depth are those of the map between the views, and SIFT finds enough right matches."""
     assert isinstance(planes, DepthDataset)
     assert len(planes) == 2 * 3
     matched = training.MatchedPairs(planes, **SIFT, root=tmp_path, workers=1)

@@ -28,7 +28,6 @@ BACK = np.array([[1.0, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])
 
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
-    """Where a test writes its database."""
     return tmp_path / "database.db"
 
 
@@ -66,7 +65,6 @@ K = np.array([[600.0, 0, 309.5], [0, 612, 249.5], [0, 0, 1]])
     ("cameras", "lens"), [("stored", None), ("shared", None), ("unknown", None), ("unknown", -0.02)]
 )
 def test_geometries_are_those_of_find_fundamental(cameras, lens, path):
-    """Bit by bit, whatever the batch."""
     write(path, scene(3))
     result = fmtorch.verify(path, cameras=cameras, lens=lens)
     known: dict[str, Any] = {"K0": K, "K1": K} if cameras == "stored" else {"focal": cameras, "lens": lens}
@@ -353,7 +351,6 @@ def test_a_database_of_colmap_3(path: Path) -> None:
 
 
 def test_keypoints_are_read_for_many_images_in_blocks(path, tmp_path, monkeypatch):
-    """Batches and the images that are kept change nothing."""
     other = tmp_path / "other.db"
     write(path, scene(6))
     write(other, scene(6))

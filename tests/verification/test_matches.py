@@ -25,7 +25,6 @@ FILES = ("features=features.h5", "matches=matches.h5", "output=verified.h5")
 
 
 def points(count: int = 2, kind: str = "general") -> list[tuple[np.ndarray, np.ndarray]]:
-    """x0 and x1 of all pairs of a scene."""
     rng, cameras = np.random.default_rng(0), scene(count, kind=kind)
     images = []
     for R, t in zip(cameras.R, cameras.t, strict=True):
@@ -37,7 +36,6 @@ def points(count: int = 2, kind: str = "general") -> list[tuple[np.ndarray, np.n
 
 
 def save(path: Path, arrays: dict[str, Any]) -> Path:
-    """By numpy or h5py."""
     if path.suffix == ".npz":
         np.savez(path, **arrays)
     else:
