@@ -209,7 +209,6 @@ def test_a_broken_preset_is_named(monkeypatch, photographs, content, said):
         ("pruner.ratio.threshold=nan", "pruner.ratio.threshold=nan; it must be a number of at least 0"),
         ("pruner.ratio.threshold=-1", "pruner.ratio.threshold=-1; it must be a number of at least 0"),
         ("features.max_features=-5", "features.max_features=-5; it must be a whole number of at least 1"),
-        ("+foo=1", "no option foo; there are: "),
         ("truth=F.txt", "F.txt: holds 3 numbers"),
         ("truth=I.txt", "I.txt: a matrix of rank three (its determinant is not 0); F has rank two"),
         ("output=a.png", "a.png: File exists"),

@@ -23,7 +23,7 @@ from fmtorch.pipeline import Outcome, Pipeline, examined
 from fmtorch.runs import PairRow, RunFolder, to_table
 from fmtorch.training import MatchedPairs
 from tests.conftest import shared_path
-from tests.data import planes
+from tests.data import native
 from tests.data.test_images import with_exif
 from tests.geometry.scenes import K, batch, draw, scene
 from tests.helpers import call_command, unused
@@ -113,7 +113,7 @@ def run(folder: Path, name: str, *words: str) -> None:
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two runs on two sequences, one image of which is missing."""
     folder = tmp_path_factory.mktemp("runs")
-    root = planes.write_hpatches(folder / "hpatches")
+    root = native.write_hpatches(folder / "hpatches")
     (root / "v_view/6.ppm").unlink()
     run(folder, "runs/a")
     run(folder, "runs/b", "estimator.hypotheses=250", "executor=processes", "workers=2")
