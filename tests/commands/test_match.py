@@ -150,9 +150,6 @@ def test_photographs_that_determine_no_f(pipeline: fmtorch.Pipeline) -> None:
     assert (general.pair_type, general.warning, general.homography) == ("general", "", None)
 
 
-LMEDS = ("estimator=lmeds_eight_point",)
-
-
 @pytest.mark.parametrize(
     ("arguments", "options", "error", "message"),
     [
@@ -233,8 +230,8 @@ def test_the_command(command: Callable[..., str], tmp_path: Path) -> None:
 
     # With F, of photographs that show nothing in common; and of one photograph twice.
     Image.fromarray(stereo(240, 320, seed=1)[0]).save(tmp_path / "other.png")
-    other = ("image1=other.png", f"output={folder}", "pipeline=sift_ratio", *LMEDS, "pruner.ratio.threshold=0.95")
-    said = command("match", "image0=a.png", *other, cwd=tmp_path)
+    stages = ("pipeline=sift_ratio", "estimator=lmeds_eight_point", "pruner.ratio.threshold=0.95")
+    said = command("match", "image0=a.png", "image1=other.png", f"output={folder}", *stages, cwd=tmp_path)
     assert "probably not the same scene" in said
     assert "nothing in common" not in said  # which is said already
     report = json.loads((folder / "result.json").read_text())

@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fmtorch.core import Correspondences, Estimate, Features, collate, pair_key
+from tests.helpers import same
 
 PER_MATCH = ("x0", "x1", "mask", "ratio", "score", "prior", "lafs0", "lafs1", "mutual", "noise")
 
@@ -50,14 +51,6 @@ def estimate(b: int = 4, n: int = 6, seed: int = 0) -> Estimate:
 
 def batched_features(b: int = 4) -> Features:
     return collate([features(n=5, seed=i) for i in range(b)])
-
-
-def same(a: Any, b: Any) -> bool:
-
-    def equal(x: Any, y: Any) -> bool:
-        return torch.equal(x, y) if isinstance(x, torch.Tensor) and isinstance(y, torch.Tensor) else x == y
-
-    return type(a) is type(b) and all(equal(getattr(a, f.name), getattr(b, f.name)) for f in dataclasses.fields(a))
 
 
 RECORDS: list[Callable[..., Any]] = [batched_features, matches, estimate]

@@ -116,7 +116,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = native.write_hpatches(folder / "hpatches")
     (root / "v_view/6.ppm").unlink()
     run(folder, "runs/a")
-    run(folder, "runs/b", "estimator.hypotheses=250", "executor=processes", "workers=2")
+    run(folder, "runs/b", "estimator.hypotheses=250", "executor=processes", "workers=1")
     return folder
 
 
@@ -266,7 +266,7 @@ def test_a_lens_is_given_to_the_estimator(cameras: str | None) -> None:
 
 def test_a_run_with_cameras_is_another_run(command: Callable[..., str], tmp_path: Path) -> None:
     words = ["eval", "pipeline=sift_fmtorch", "dataset=fmbench", f"dataset.root={shared_path('data/Strecha_train')}"]
-    words += ["limit=1", "workers=1"]
+    words += ["limit=1", "workers=1", "features.max_features=2000"]
 
     def run(name: str, *more: str) -> tuple[str, dict[str, Any], dict[str, Any]]:
         said = command(*words, *more, f"output={name}", cwd=tmp_path)

@@ -15,7 +15,8 @@ from fmtorch.core import models_dir
 from fmtorch.features import describe
 from fmtorch.runs import ArrayCache, CachedFeatures
 from scripts.make_models import learned
-from tests.features.scenes import same, texture
+from tests.features.scenes import texture
+from tests.helpers import same
 from tests.processes import run_command
 from tests.reference import local_features as reference
 

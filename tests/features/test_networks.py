@@ -17,7 +17,8 @@ from fmtorch.features import ALIKED, DISK, PatchNetwork
 from fmtorch.features.networks import ARCHITECTURES, DESCRIPTORS, AffNet, HardNet, L2Net, build, load_weights
 from scripts.patch_networks.onnx_export import export, quantize
 from tests.conftest import oracle, shared_path
-from tests.features.scenes import same, texture
+from tests.features.scenes import texture
+from tests.helpers import same
 
 RTOL = 1e-4  # of unit outputs: float32 sums of up to 8,192 terms in another order
 

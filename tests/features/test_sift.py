@@ -13,7 +13,8 @@ from torch import Tensor
 from fmtorch import features
 from fmtorch.features import SIFT, ImagePyramid, PatchSIFT, VLFeatSIFT, hessian, networks, project
 from tests.conftest import oracle, shared_path
-from tests.features.scenes import random_frames, same, texture
+from tests.features.scenes import random_frames, texture
+from tests.helpers import same
 from tests.reference.local_features import dominant_gradient as reference_orientation
 from tests.reference.local_features import hessian_keypoints, patch, sift
 

@@ -267,21 +267,13 @@ def test_the_pipeline_of_given_matches_estimates_as_the_function_does(tmp_path: 
     assert torch.equal(outcome.estimate.F, alone.F)
 
 
-def tutorial_with_images(tmp_path: Path, shape: tuple[int, ...], *, flat: bool) -> tuple[Path, Path]:
-    """A data set of two scenes with the same names of images, and a folder of images of all names."""
-    root, images = writers.WRITERS["ransac_tutorial"](tmp_path / "ransac_tutorial"), tmp_path / "images"
-    shutil.copytree(root / "church", root / "temple")
-    names = {image.path.name for pair in reload("ransac_tutorial", root) for image in (pair.image0, pair.image1)}
-    for folder in (images,) if flat else (images / "church", images / "temple"):
-        folder.mkdir(parents=True)
-        for name in names:
-            cv2.imwrite(str(folder / f"{name}.png"), np.zeros(shape, np.uint8))
-            (folder / f"{name}.png").rename(folder / name)
-    return root, images
-
-
 def test_one_file_is_no_image_of_two_scenes(tmp_path: Path) -> None:
-    root, images = tutorial_with_images(tmp_path, writers.SIZE, flat=True)
+    root, images = writers.write_tutorial(tmp_path / "ransac_tutorial"), tmp_path / "images"
+    shutil.copytree(root / "church", root / "temple")  # with the same names of images
+    images.mkdir()
+    for name in {image.path.name for pair in reload("ransac_tutorial", root) for image in (pair.image0, pair.image1)}:
+        cv2.imwrite(str(images / f"{name}.png"), np.zeros(writers.SIZE, np.uint8))
+        (images / f"{name}.png").rename(images / name)
     with pytest.raises(DataError, match="would stand for images of the scenes church and temple: give each a folder"):
         reload("ransac_tutorial", root, images=images)
     with pytest.raises(DataError, match=r"images=.*nowhere: no such folder"):

@@ -25,10 +25,6 @@ from tests.laws import scene
 PROCESSES = Execution("processes", 2)
 
 
-def parts(numbers: list[int]) -> list[list[int]]:
-    return [[number] for number in numbers]
-
-
 def calls(
     make: Callable[[], Any], execution: Execution, jobs: list[list[int]], **options: Any
 ) -> tuple[dict[int, int], dict[int, str], list[list[int]]]:
@@ -42,7 +38,7 @@ def calls(
         reasons.update(dict.fromkeys(job, reason))
 
     source: Any = Local(make()) if execution.shared else Factory(make)
-    options = {"give_up": give_up, "split": parts, **options}
+    options = {"give_up": give_up, "split": lambda numbers: [[number] for number in numbers], **options}
     with WorkerPool(execution) as pool:
         yielded = list(TaskRunner(pool, source, squares, keep, **options).each(jobs))
     return results, reasons, yielded

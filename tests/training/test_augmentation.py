@@ -19,6 +19,7 @@ from fmtorch.geometry import symmetric_max
 from fmtorch.scenes import RenderedPairs, calibration, fundamental, look_at, relative_pose, skimage_file
 from fmtorch.training import Augmentation, LabelledMatches, PlanePairs, PlaneViews, crop, keep_ratio, rotate, swap
 from fmtorch.training.labelled import EDGE_PX, by_line, by_transfer, depths, label, line_distance, transfer_error
+from tests.helpers import same
 from tests.reference import labels as reference
 from tests.training.conftest import SIFT, exact
 
@@ -34,13 +35,6 @@ CHANGES: dict[str, Callable[[LabelledMatches], LabelledMatches]] = {
 NOISELESS = Augmentation(noise=None, matches=None)
 ALWAYS = Augmentation(swap=1, quarter_turn=0.5, turn=0.5, angle=180, crop=1, thin=1, noise=(1, 2), matches=(50, 60))
 ONLY = Augmentation.none()
-
-
-def same(a: LabelledMatches, b: LabelledMatches) -> bool:
-    fields = [f.name for f in dataclasses.fields(a.correspondences) if getattr(a.correspondences, f.name) is not None]
-    pairs = [(a.F, b.F), (a.label, b.label)]
-    pairs += [(getattr(a.correspondences, name), getattr(b.correspondences, name)) for name in fields]
-    return all(torch.equal(x, y) for x, y in pairs)
 
 
 def expect_truth(m: LabelledMatches) -> None:
@@ -342,12 +336,6 @@ def test_rendered_labels_equal_the_scalar_reference(rendered: RenderedPairs) -> 
 PLANE_SIZE = (300, 400)
 
 
-def on_plane(x: np.ndarray) -> np.ndarray:
-    """Points of the photograph in the world: its longest side is 1, its middle the origin."""
-    h, w = PLANE_SIZE
-    return np.column_stack([(x - np.array([(w - 1) / 2, (h - 1) / 2])) / max(h, w), np.zeros(len(x))])
-
-
 @pytest.fixture(scope="module")
 def photographs() -> list[training.Photograph]:
     return [training.Photograph(skimage_file(name), "scikit-image") for name in ("chelsea.png", "rocket.jpg")]
@@ -362,7 +350,9 @@ def test_the_homography_is_the_cameras_projection() -> None:
     x = np.random.default_rng(0).uniform(0, 299, (50, 2))
     for seed in range(20):
         camera = training.random_camera(np.random.default_rng(seed), PLANE_SIZE, PlaneViews())
-        there, depth = camera.project(on_plane(x))
+        # Its longest side is 1, its middle the origin.
+        plane = np.c_[(x - (np.array(PLANE_SIZE[::-1]) - 1) / 2) / max(PLANE_SIZE), np.zeros(len(x))]
+        there, depth = camera.project(plane)
         by_homography = cv2.perspectiveTransform(x[None], training.plane_homography(camera, PLANE_SIZE))[0]
         assert np.allclose(there, by_homography, atol=1e-8)
         assert (depth > 0).all()

@@ -21,7 +21,6 @@ from tests.reference import pruner_losses as reference
 from tests.training.conftest import labelled_pair
 
 VGA = torch.tensor([480, 640])
-Fit = Callable[[Correspondences, Tensor], tuple[Tensor, Tensor]]
 
 
 def generator(seed: int) -> torch.Generator:

@@ -50,18 +50,12 @@ def load(path: Path) -> dict[str, Any]:
     if path.suffix == ".npz":
         with np.load(path) as file:
             return {key: value.tolist() for key, value in file.items()}
-    entries: dict[str, Any] = {}
-
-    def visit(name: str, entry: h5py.HLObject) -> None:
-        start = f"{name}/" if name else ""
-        entries.update({f"{start}{key}": np.asarray(value).tolist() for key, value in entry.attrs.items()})
-        if isinstance(entry, h5py.Dataset):
-            entries[name] = entry[()].tolist()
-
     with h5py.File(path) as file:
-        visit("", file)
-        file.visititems(visit)
-    return entries
+        found = [file]
+        file.visititems(lambda _, entry: found.append(entry))
+        attributes = {f"{e.name}/{key}": np.asarray(value).tolist() for e in found for key, value in e.attrs.items()}
+        arrays = {entry.name: entry[()].tolist() for entry in found if isinstance(entry, h5py.Dataset)}
+    return {name.lstrip("/"): value for name, value in {**attributes, **arrays}.items()}
 
 
 @pytest.mark.parametrize(
