@@ -12,7 +12,7 @@ import runpy
 import shlex
 import shutil
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import cv2
@@ -239,16 +239,12 @@ def run(words: list[str], folder: Path) -> None:
                 raise AssertionError(f"{shlex.join(words)} ended with: {end.code}") from end
 
 
-def is_slow(command: str) -> bool:
-    return any(re.search(pattern, command) for pattern in SLOW)
-
-
-def elsewhere(command: str) -> bool:
-    return any(re.search(pattern, command) for pattern in ELSEWHERE)
+def is_of(command: str, patterns: Iterable[str]) -> bool:
+    return any(re.search(pattern, command) for pattern in patterns)
 
 
 def parameters(slow: bool) -> list[object]:
-    here = {page: [c for c in commands(page) if not elsewhere(c) and is_slow(c) == slow] for page in PAGES}
+    here = {page: [c for c in commands(page) if not is_of(c, ELSEWHERE) and is_of(c, SLOW) == slow] for page in PAGES}
     return [pytest.param(page_commands, id=page) for page, page_commands in here.items() if page_commands]
 
 
