@@ -136,6 +136,7 @@ def test_a_data_set_that_is_something_else(data: list[str], command: RunCommand,
 @pytest.mark.parametrize(
     ("words", "message"),
     [
+        ("pruner=binary", "binary.yaml: no text in UTF-8; a preset is a mapping in YAML"),
         ("pruner=empty", "pruner.empty: a preset is a mapping with a `_target_`"),
         ("pruner=elsewhere", "must be `# @package pruner.<name>`, or be left out"),
         ("pruner=typo", "pruner.typo: no option threshhold; there are: threshold"),
@@ -149,6 +150,7 @@ def test_a_data_set_that_is_something_else(data: list[str], command: RunCommand,
 def test_what_cannot_be_run_is_told(words, message, data, command, tmp_path, monkeypatch):
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     own(tmp_path, "pruner", "threshold: 0.5\n", "empty")
+    (tmp_path / "my_conf" / "pruner" / "binary.yaml").write_bytes(b"\xb5\xff\x00 binary")
     own(tmp_path, "pruner", "# @package _global_\npruner: {_target_: fmtorch.pruning.OneToOne}\n", "elsewhere")
     folder = own(tmp_path, "pruner", "_target_: fmtorch.pruning.RatioTest\nthreshhold: 0.5\n", "typo")
     end = command("eval", *folder, *data, "output=run", "limit=1", *words.split(), cwd=tmp_path)

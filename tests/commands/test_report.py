@@ -189,21 +189,6 @@ def test_paths_with_brackets_are_printed_as_they_are_and_cached_features_take_no
 
 
 @pytest.mark.parametrize(
-    ("content", "said"),
-    [
-        (b"_target_: x\n  foo: [1\n", "line 2, column 6: mapping values are not allowed here"),
-        (b"\xb5\xff\x00 binary", "no text in UTF-8; a preset is a mapping in YAML"),
-    ],
-)
-def test_a_broken_preset_is_named(monkeypatch, photographs, content, said):
-    preset = photographs / "conf" / "estimator" / "mine.yaml"
-    preset.parent.mkdir(parents=True)
-    preset.write_bytes(content)
-    end = ended(monkeypatch, photographs, *MATCH, "--config-dir", "conf", "estimator=mine")
-    assert end.startswith(f"error: {preset}: {said}")
-
-
-@pytest.mark.parametrize(
     ("words", "said"),
     [
         ("pruner.ratio.threshold=nan", "pruner.ratio.threshold=nan; it must be a number of at least 0"),

@@ -160,7 +160,8 @@ def workplace(tmp_path_factory: pytest.TempPathFactory) -> Path:
         lines = [line for line in read_specs(specs) if _installed(line.split(" ")[0])]
         (folder / "scripts" / "benchmark" / specs.name).write_text("\n".join(lines[::8]))
     pair = data.load("stereo")[0]
-    images = [_half(read_image(source)) for source in (pair.image0, pair.image1)]
+    whole = [read_image(source) for source in (pair.image0, pair.image1)]
+    images = [cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) for image in whole]
     halved = np.diag([2.0, 2.0, 1.0])
     F = halved.T @ pair.F @ halved
     for name, scenes in SETS.items():
@@ -201,10 +202,6 @@ def workplace(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "    return presets.build('estimator', 'ransac', threshold=threshold, hypotheses=hypotheses)\n"
     )
     return folder
-
-
-def _half(image: np.ndarray) -> np.ndarray:
-    return cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
 
 
 @contextlib.contextmanager

@@ -30,16 +30,6 @@ def random_network(seed: int, outputs: int) -> torch.nn.Module:
     ).requires_grad_(False)
 
 
-def composed() -> features.LocalFeature:
-    shape = random_network(0, 3)
-    return features.LocalFeature(
-        features.HessianDetector(300),
-        features.NetworkDescriptor(random_network(1, 128)),
-        features.NetworkShape(lambda patches: 0.2 * torch.tanh(shape(patches))),
-        features.DominantGradient(),
-    )
-
-
 @pytest.mark.parametrize("name", WITHOUT_NETWORK)
 def test_presets_describe_the_keypoints_of_sift(name: str) -> None:
     image = texture(0)
@@ -51,7 +41,10 @@ def test_presets_describe_the_keypoints_of_sift(name: str) -> None:
 
 
 def test_a_call_is_detection_and_description() -> None:
-    extract, image = composed(), texture(1)
+    shape, image = random_network(0, 3), texture(1)
+    shaped = features.NetworkShape(lambda patches: 0.2 * torch.tanh(shape(patches)))
+    parts = features.NetworkDescriptor(random_network(1, 128)), shaped, features.DominantGradient()
+    extract = features.LocalFeature(features.HessianDetector(300), *parts)
     lafs, scores = extract.detect(image)
     found = extract(image)
     assert len(found) > 100

@@ -49,15 +49,6 @@ def set_focal(path: Path, focal: float) -> None:
         database.update_camera(camera)
 
 
-def given(path: Path, pair: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-    """Matched points, matches and key of a pair, as a user of `find_fundamental` has them."""
-    with pycolmap.Database.open(path) as database:
-        matches = database.read_matches(*pair).astype(int)
-        x0, x1 = (database.read_keypoints(i)[:, :2] - np.float32(0.5) for i in pair)
-        key = pair_key(" ".join(database.read_image(i).name for i in pair))
-    return x0[matches[:, 0]], x1[matches[:, 1]], matches, {"key": key, "size0": SIZE, "size1": SIZE}
-
-
 K = np.array([[600.0, 0, 309.5], [0, 612, 249.5], [0, 0, 1]])
 
 
@@ -71,8 +62,12 @@ def test_geometries_are_those_of_find_fundamental(cameras, lens, path):
     kind = "calibrated" if cameras == "stored" else "uncalibrated"
     assert (result.pairs, result.kept, result.configurations, result.problems) == (3, 0, {kind: 3}, ())
     for pair, geometry in read(path).items():
-        x0, x1, matches, fields = given(path, pair)
-        estimate = fmtorch.find_fundamental(x0, x1, **fields, **known)
+        with pycolmap.Database.open(path) as database:
+            matches = database.read_matches(*pair).astype(int)
+            points = (database.read_keypoints(i)[:, :2] - np.float32(0.5) for i in pair)
+            key = pair_key(" ".join(database.read_image(i).name for i in pair))
+            x0, x1 = (x[indices] for x, indices in zip(points, matches.T, strict=True))
+        estimate = fmtorch.find_fundamental(x0, x1, key=key, size0=SIZE, size1=SIZE, **known)
         np.testing.assert_array_equal(geometry.F, BACK.T @ estimate.F[0].double().numpy() @ BACK)
         np.testing.assert_array_equal(geometry.inlier_matches, matches[estimate.inliers[0].numpy()])
         assert geometry.config == Configuration.__members__[kind.upper()]
