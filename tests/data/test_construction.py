@@ -257,13 +257,6 @@ def test_the_command_selects_by_overlap(tmp_path: Path, monkeypatch: pytest.Monk
     assert [pair.identity for pair in load("fmbench", root=tmp_path / "Other")] == ["Other/a/0-1"]
 
 
-def test_a_damaged_image_loses_its_own_pairs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write_colmap(tmp_path / "Set/a")
-    (tmp_path / "Set/a/images/00.png").write_text("no image")
-    run(tmp_path, monkeypatch, *COLMAP, "overlap=[0.1,1]")
-    assert [pair.identity for pair in load("fmbench", root=tmp_path / "Made")] == ["Made/a/1-2"]
-
-
 @pytest.mark.parametrize("n", [0, 1, 2, 7])
 def test_all_pairs_are_all_combinations_in_order(n: int) -> None:
     pairs = AllPairs(n)

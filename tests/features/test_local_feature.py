@@ -225,22 +225,15 @@ def test_sift_of_any_scale_is_one_descriptor() -> None:
     torch.testing.assert_close(plain, scaled)
 
 
-@pytest.mark.parametrize(
-    ("pipeline", "kind"),
-    [
-        ("sift_fmtorch", "sift"), ("dspsift_ratio", "sift"), ("rootsiftpca_gms", "rootsiftpca"),
-        ("hesaffnet_fmtorch", "hardnet"), ("hesaffnet_fast_fmtorch", "hardnet"), ("hardnet_gms", "hardnet"),
-    ],
-)  # fmt: skip
-def test_pipelines_and_their_codebooks(pipeline: str, kind: str) -> None:
-    stages = presets.pipeline_stages(pipeline)
-    assert describe.descriptor_kind(stages["features"]) == kind
-
-
-def test_descriptors_without_a_codebook_are_told() -> None:
-    stages = presets.pipeline_stages("l2net_ratio")
+def test_pipelines_and_their_codebooks() -> None:
+    kinds = {
+        "sift_fmtorch": "sift", "dspsift_ratio": "sift", "rootsiftpca_gms": "rootsiftpca", "hardnet_gms": "hardnet",
+        "hesaffnet_fmtorch": "hardnet", "hesaffnet_fast_fmtorch": "hardnet",
+    }  # fmt: skip
+    stages = {name: presets.pipeline_stages(name)["features"] for name in (*kinds, "l2net_ratio")}
+    assert {name: describe.descriptor_kind(stages[name]) for name in kinds} == kinds
     with pytest.raises(ValueError, match="no codebook for the descriptors l2net; it must be a pipeline with SIFT"):
-        describe.descriptor_kind(stages["features"])
+        describe.descriptor_kind(stages["l2net_ratio"])
     with pytest.raises(ValueError, match="no codebook for the descriptors Mine"):
         describe.descriptor_kind({"_target_": "mine.Mine"})
 
