@@ -255,6 +255,9 @@ def test_the_command_selects_by_overlap(tmp_path: Path, monkeypatch: pytest.Monk
         run(tmp_path, monkeypatch, *COLMAP, "overlap=[0.6,0.9]")
     run(tmp_path, monkeypatch, *COLMAP, "overlap=[0.6,0.6]", "output=Other")
     assert [pair.identity for pair in load("fmbench", root=tmp_path / "Other")] == ["Other/a/0-1"]
+    (tmp_path / "Set/a/images/00.png").write_text("no image")  # which loses its own pairs
+    run(tmp_path, monkeypatch, *COLMAP, "overlap=[0.1,1]", "output=Third")
+    assert [pair.identity for pair in load("fmbench", root=tmp_path / "Third")] == ["Third/a/1-2"]
 
 
 @pytest.mark.parametrize("n", [0, 1, 2, 7])
