@@ -160,7 +160,7 @@ def test_files_are_read_once_and_matches_are_refined(reads: collections.Counter[
         pipeline = built(str(tmp_path))
         outcomes = pipeline.correspondences(pairs)
         assert set(reads.values()) == {1}
-        assert all(outcome.images is None for outcome in outcomes)
+        assert all(kept is None for outcome in outcomes for kept in (outcome.images, outcome.estimate))
     plain = load_pipeline("sift_fmtorch", overrides=[f"cache={tmp_path}", "features.max_features=1500"])
     before = plain.correspondences(pairs)
     gains = []
