@@ -1,5 +1,6 @@
 """What several tests share: pictures, pairs and data sets on disk, a small pipeline, commands in this process."""
 
+import dataclasses
 import sys
 import threading
 from collections.abc import Callable, Iterable, Sequence
@@ -9,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import torch
 from hydra.core.global_hydra import GlobalHydra
 
 import fmtorch.__main__
@@ -70,6 +72,15 @@ def unused(*_: object) -> Any:
 def apart(F: np.ndarray, G: np.ndarray) -> float:
     """The largest difference of two matrices of unknown sign."""
     return float(min(np.abs(F - G).max(), np.abs(F + G).max()))
+
+
+def same(a: Any, b: Any) -> bool:
+    """Whether two records, or what is in them, are of one kind and equal to the bit."""
+    if isinstance(a, torch.Tensor):
+        return isinstance(b, torch.Tensor) and a.dtype == b.dtype and torch.equal(a, b)
+    if dataclasses.is_dataclass(a):
+        return type(a) is type(b) and all(same(getattr(a, f.name), getattr(b, f.name)) for f in dataclasses.fields(a))
+    return bool(a == b)
 
 
 def cross_matrix(t: np.ndarray) -> np.ndarray:

@@ -8,10 +8,7 @@ from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
-import torch
 
-from fmtorch import match
-from fmtorch.pipeline import load_pipeline
 from tests.helpers import draw_set
 from tests.processes import run_command, starter
 from tests.reliability.conftest import Rows, results
@@ -127,7 +124,6 @@ def test_a_users_own_pruner_by_config_dir(header: str, data: list[str], command:
 
 
 def test_a_data_set_that_is_something_else(data: list[str], command: RunCommand, tmp_path: Path) -> None:
-    """Of a class without a digest, and of pairs that are none."""
     words = [*own(tmp_path, "dataset", "_target_: own_dataset.Numbers\n"), "dataset=mine", *OPTIONS]
     (tmp_path / "own_dataset.py").write_text("class Numbers(list):\n    name = 'numbers'\n")
     assert "ended: error: Numbers has no digest; a PairDataset has both" in command("eval", *words, cwd=tmp_path)
@@ -140,6 +136,7 @@ def test_a_data_set_that_is_something_else(data: list[str], command: RunCommand,
 @pytest.mark.parametrize(
     ("words", "message"),
     [
+        ("pruner=binary", "binary.yaml: no text in UTF-8; a preset is a mapping in YAML"),
         ("pruner=empty", "pruner.empty: a preset is a mapping with a `_target_`"),
         ("pruner=elsewhere", "must be `# @package pruner.<name>`, or be left out"),
         ("pruner=typo", "pruner.typo: no option threshhold; there are: threshold"),
@@ -153,6 +150,7 @@ def test_a_data_set_that_is_something_else(data: list[str], command: RunCommand,
 def test_what_cannot_be_run_is_told(words, message, data, command, tmp_path, monkeypatch):
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     own(tmp_path, "pruner", "threshold: 0.5\n", "empty")
+    (tmp_path / "my_conf" / "pruner" / "binary.yaml").write_bytes(b"\xb5\xff\x00 binary")
     own(tmp_path, "pruner", "# @package _global_\npruner: {_target_: fmtorch.pruning.OneToOne}\n", "elsewhere")
     folder = own(tmp_path, "pruner", "_target_: fmtorch.pruning.RatioTest\nthreshhold: 0.5\n", "typo")
     end = command("eval", *folder, *data, "output=run", "limit=1", *words.split(), cwd=tmp_path)
@@ -200,7 +198,6 @@ def counted(stdout: str) -> tuple[int, int]:
 
 
 def test_a_killed_run_continues_with_what_the_cache_had_and_a_damaged_file_is_computed_anew(root, truth, tmp_path):
-    """A run that is killed and started again, then another one with a damaged cache: the rows of a run without it."""
 
     def files() -> list[Path]:
         return sorted(tmp_path.glob("cache/features/*/*.npz"))
@@ -227,18 +224,3 @@ def test_a_killed_run_continues_with_what_the_cache_had_and_a_damaged_file_is_co
     same = sum(before[pair] == after[pair] for pair in before)  # what computing took, not what reading did
     assert same >= len(before) - 2  # one image, of one or two pairs, was computed again
     assert not list(tmp_path.glob("cache/features/*/*.tmp"))
-
-
-def test_two_photographs(root: Path, tmp_path: Path) -> None:
-    images = [root / "a" / "Images" / f"{i:08d}.png" for i in (0, 1)]
-    kept = [f"cache={tmp_path / 'cache'}"]
-    runs = ([], 1600), (kept, 1600), (kept, 1600), (kept, 200)
-    pipelines = [load_pipeline("sift_gms", overrides=words) for words, _ in runs]
-    results = [match(*images, pipeline=p, longest_side=run[1]) for p, run in zip(pipelines, runs, strict=True)]
-    plain, cold, warm, _ = results
-    _, first, second, reduced = (pipeline.extractor for pipeline in pipelines)
-    assert torch.equal(plain.F, cold.F)
-    assert torch.equal(plain.F, warm.F)
-    assert torch.equal(plain.keypoints0, warm.keypoints0)
-    assert cold.seconds["features"] == warm.seconds["features"]
-    assert (first.computed, second.found, reduced.computed) == (2, 2, 2)  # reduced: other pixels

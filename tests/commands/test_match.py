@@ -15,7 +15,7 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
-from PIL import ExifTags, Image
+from PIL import Image
 
 import fmtorch
 from fmtorch import presets
@@ -27,6 +27,7 @@ from fmtorch.geometry import homography_points, sampson
 from fmtorch.metrics import nsgd, pose_error
 from fmtorch.pipeline import PhotographCameras, load_pipeline
 from tests.conftest import shared_path
+from tests.data.test_images import with_exif
 from tests.helpers import ROWS
 from tests.matching import stand_in
 
@@ -149,9 +150,6 @@ def test_photographs_that_determine_no_f(pipeline: fmtorch.Pipeline) -> None:
     assert (general.pair_type, general.warning, general.homography) == ("general", "", None)
 
 
-LMEDS = ("estimator=lmeds_eight_point",)
-
-
 @pytest.mark.parametrize(
     ("arguments", "options", "error", "message"),
     [
@@ -232,8 +230,8 @@ def test_the_command(command: Callable[..., str], tmp_path: Path) -> None:
 
     # With F, of photographs that show nothing in common; and of one photograph twice.
     Image.fromarray(stereo(240, 320, seed=1)[0]).save(tmp_path / "other.png")
-    other = ("image1=other.png", f"output={folder}", "pipeline=sift_ratio", *LMEDS, "pruner.ratio.threshold=0.95")
-    said = command("match", "image0=a.png", *other, cwd=tmp_path)
+    stages = ("pipeline=sift_ratio", "estimator=lmeds_eight_point", "pruner.ratio.threshold=0.95")
+    said = command("match", "image0=a.png", "image1=other.png", f"output={folder}", *stages, cwd=tmp_path)
     assert "probably not the same scene" in said
     assert "nothing in common" not in said  # which is said already
     report = json.loads((folder / "result.json").read_text())
@@ -269,8 +267,8 @@ def pair() -> ImagePair:
 
 
 @pytest.fixture(scope="module")
-def pipeline_with_cameras() -> fmtorch.Pipeline:
-    return load_pipeline("sift_fmtorch")
+def pipeline_with_cameras(tmp_path_factory: pytest.TempPathFactory) -> fmtorch.Pipeline:
+    return load_pipeline("sift_fmtorch", overrides=[f"cache={tmp_path_factory.mktemp('features')}"])
 
 
 def matched(pair: ImagePair, pipeline: fmtorch.Pipeline, **cameras: object) -> fmtorch.MatchResult:
@@ -300,6 +298,13 @@ def test_the_pose_of_reduced_photographs_by_what_is_known(pair, pipeline_with_ca
         assert result.focals.tolist() == pytest.approx([focal, focal], rel=0.1), cameras
     unknown = matched(pair, pipeline_with_cameras, focal="unknown")
     assert torch.equal(unknown.F, plain.F)
+    assert known.report()["R"] == known.R.tolist()
+    angle, shown = math.degrees(math.acos((np.trace(pair.R) - 1) / 2)), pose_line(known)
+    assert float(shown.split()[1].rstrip("°,")) == pytest.approx(angle, abs=0.5)
+    assert "focal lengths 1381, 1381 px" in shown
+    flat = np.full((300, 400, 3), 9, np.uint8)
+    nothing = fmtorch.match(flat, flat, pipeline=pipeline_with_cameras, K0=pair.K0 / 4, K1=pair.K1 / 4)
+    assert (nothing.ok, pose_line(nothing), "R" in nothing.report()) == (False, "", False)
 
 
 def test_calibrations_follow_the_reduction(pair: ImagePair, pipeline_with_cameras: fmtorch.Pipeline) -> None:
@@ -380,15 +385,7 @@ def test_a_lens_that_nobody_calibrated(pair: ImagePair, pipeline_with_cameras: f
         fmtorch.match(*bent, pipeline="sift_gms", lens="shared")
 
 
-def with_exif(folder: Path, name: str, **tags: int) -> Path:
-    exif = Image.Exif()
-    exif.get_ifd(ExifTags.IFD.Exif).update({ExifTags.Base[key]: value for key, value in tags.items()})
-    Image.new("RGB", (60, 40)).save(folder / name, exif=exif)
-    return folder / name
-
-
 def photographs(paths: list[Path], cameras: Path | None, K: Any) -> SimpleNamespace:
-    """As the command reads them."""
     known = PhotographCameras(cameras, K)
     images = [read_image(known.source(path)) for path in paths]
     ends = [known.of(path, image.shape[:2]) for path, image in zip(paths, images, strict=True)]
@@ -397,7 +394,7 @@ def photographs(paths: list[Path], cameras: Path | None, K: Any) -> SimpleNamesp
 
 
 def test_words_files_and_numbers_as_arguments(tmp_path: Path) -> None:
-    paths = [with_exif(tmp_path, "a.jpg", FocalLengthIn35mmFilm=36), with_exif(tmp_path, "b.jpg")]
+    paths = [with_exif(tmp_path, (40, 60), "a.jpg", FocalLengthIn35mmFilm=36), with_exif(tmp_path, (40, 60), "b.jpg")]
     assert photographs(paths, None, None).knowledge == {}
     for word in ("shared", "unknown"):
         assert photographs(paths, Path(word), None).knowledge == {"focal": word}
@@ -421,7 +418,7 @@ def test_words_files_and_numbers_as_arguments(tmp_path: Path) -> None:
 
 
 def test_distortion_is_taken_out_and_sizes_must_fit(tmp_path: Path) -> None:
-    paths = [with_exif(tmp_path, name) for name in ("a.jpg", "b.jpg")]
+    paths = [with_exif(tmp_path, (40, 60), name) for name in ("a.jpg", "b.jpg")]
     (tmp_path / "cameras.txt").write_text("1 SIMPLE_RADIAL 60 40 50 30 20 0.2\n")
     bent = photographs(paths, tmp_path / "cameras.txt", None)
     assert bent.knowledge["K0"] is None
@@ -439,24 +436,9 @@ def test_distortion_is_taken_out_and_sizes_must_fit(tmp_path: Path) -> None:
     (None, "0,1,2,3", "it must be fx"), (None, "a,b,c,d", "it must be fx"),
 ])  # fmt: skip
 def test_what_is_no_camera_of_a_command(cameras: Path | None, K: object, message: str, tmp_path: Path) -> None:
-    path = with_exif(tmp_path, "a.jpg")
+    path = with_exif(tmp_path, (40, 60), "a.jpg")
     with pytest.raises(ValueError, match=message):
         photographs([path, path], cameras, K)
-
-
-def test_a_pose_that_is_not_determined_is_said(pair: ImagePair, pipeline_with_cameras: fmtorch.Pipeline) -> None:
-    image = np.random.default_rng(0).integers(0, 255, (300, 400, 3)).astype(np.uint8)
-    K = np.array([[400.0, 0, 199.5], [0, 400, 149.5], [0, 0, 1]])
-    nothing = fmtorch.match(image, np.full((300, 400, 3), 9, np.uint8), pipeline=pipeline_with_cameras, K0=K, K1=K)
-    assert not nothing.ok
-    assert pose_line(nothing) == ""
-    assert "R" not in nothing.report()
-    known = matched(pair, pipeline_with_cameras, K0=pair.K0, K1=pair.K1)
-    assert known.report()["R"] == known.R.tolist()
-    angle = math.degrees(math.acos((np.trace(pair.R) - 1) / 2))
-    shown = pose_line(known)
-    assert float(shown.split()[1].rstrip("°,")) == pytest.approx(angle, abs=0.5)
-    assert "focal lengths 1381, 1381 px" in shown
 
 
 def test_the_command_with_cameras(pair: ImagePair, command: Callable[..., str], tmp_path: Path) -> None:

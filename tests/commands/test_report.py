@@ -189,27 +189,11 @@ def test_paths_with_brackets_are_printed_as_they_are_and_cached_features_take_no
 
 
 @pytest.mark.parametrize(
-    ("content", "said"),
-    [
-        (b"_target_: x\n  foo: [1\n", "line 2, column 6: mapping values are not allowed here"),
-        (b"\xb5\xff\x00 binary", "no text in UTF-8; a preset is a mapping in YAML"),
-    ],
-)
-def test_a_broken_preset_is_named(monkeypatch, photographs, content, said):
-    preset = photographs / "conf" / "estimator" / "mine.yaml"
-    preset.parent.mkdir(parents=True)
-    preset.write_bytes(content)
-    end = ended(monkeypatch, photographs, *MATCH, "--config-dir", "conf", "estimator=mine")
-    assert end.startswith(f"error: {preset}: {said}")
-
-
-@pytest.mark.parametrize(
     ("words", "said"),
     [
         ("pruner.ratio.threshold=nan", "pruner.ratio.threshold=nan; it must be a number of at least 0"),
         ("pruner.ratio.threshold=-1", "pruner.ratio.threshold=-1; it must be a number of at least 0"),
         ("features.max_features=-5", "features.max_features=-5; it must be a whole number of at least 1"),
-        ("+foo=1", "no option foo; there are: "),
         ("truth=F.txt", "F.txt: holds 3 numbers"),
         ("truth=I.txt", "I.txt: a matrix of rank three (its determinant is not 0); F has rank two"),
         ("output=a.png", "a.png: File exists"),

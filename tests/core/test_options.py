@@ -117,12 +117,6 @@ def test_what_cannot_be_known_is_taken_on_trust() -> None:
     expect_options(Wide, {"threshold": 1, "first": OBJECT}, "here")
 
 
-@pytest.mark.parametrize("group", ["features", "matcher", "pruner", "estimator"])
-def test_every_preset_fits_what_it_builds(group: str) -> None:
-    for name in presets.available(group):
-        presets.expect_buildable(presets.load(group, name), f"{group}={name}")
-
-
 def test_a_wrong_option_is_refused_before_anything_within_is_built() -> None:
     network = {"_target_": "torch.nn.Linear", "in_features": "x"}
     config = {"_target_": "fmtorch.pruning.LearnedPruner", "network": network}
@@ -169,7 +163,6 @@ def distance(
     cap: bool = True,
     weigh: Callable[[Tensor], Tensor] | None = None,
 ) -> Any:
-    """What it was given."""
     return dict(locals())
 
 
@@ -258,18 +251,13 @@ def claimed(folder: Path, settings: dict[str, object], alone: bool = True) -> No
 
 def test_a_folder_is_made_and_found_again(tmp_path: Path) -> None:
     folder = tmp_path / "new" / "folder"
+    folder.mkdir(parents=True)
+    (folder / "settings.json.0123.tmp").write_text("{")  # what a killed writer left is nothing
     for _ in range(2):
         claimed(folder, {"seed": 0, "network": {"blocks": 2}})
     (folder / "sketch").write_text("done")
     claimed(folder, {"network": {"blocks": 2}, "seed": 0})
     assert json.loads((folder / "settings.json").read_text()) == {"seed": 0, "network": {"blocks": 2}}
-
-
-def test_other_settings_are_refused(tmp_path: Path) -> None:
-    claimed(tmp_path, {"seed": 0, "network": {"blocks": 2, "size": 3}})
-    message = r"holds sketches of other .*: network\.blocks: 2 -> 4; network\.size: 3 -> \(absent\)\. Choose an"
-    with pytest.raises(ValueError, match=message):
-        claimed(tmp_path, {"seed": 0, "network": {"blocks": 4}})
 
 
 def test_anything_else_is_refused(tmp_path: Path) -> None:
@@ -283,11 +271,6 @@ def test_anything_else_is_refused(tmp_path: Path) -> None:
         claimed(tmp_path, {})
     with pytest.raises(ValueError, match=r"notes\.txt is a file; choose another output"):
         claimed(tmp_path / "notes.txt", {})
-
-
-def test_what_a_killed_writer_left_is_nothing(tmp_path: Path) -> None:
-    (tmp_path / "settings.json.0123.tmp").write_text("{")
-    claimed(tmp_path, {"seed": 0})
 
 
 def test_of_several_writers_the_first_wins(tmp_path: Path) -> None:

@@ -1,10 +1,13 @@
-"""Small native data sets for the tests: cameras on a path, images of noise, files as the sources describe them."""
+"""Small native data sets: cameras on a path, planes, images of noise, files as the sources describe them."""
 
-import struct
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
 import numpy as np
+import pycolmap
+
+from tests.conftest import shared_path
 
 SIZE = (24, 32)  # h, w of the images
 
@@ -40,9 +43,7 @@ def write_kitti(root: Path, names: tuple[str, ...] = ("06",), frames: int = 14) 
 COLMAP_LINES = {
     "SIMPLE_PINHOLE": "40 16 12",
     "PINHOLE": "40 41 16 12",
-    "SIMPLE_RADIAL": "40 16 12 0.1",
     "OPENCV": "40 41 16 12 0.1 -0.02 0.001 0.002",
-    "OPENCV_FISHEYE": "40 41 16 12 0.01 0.01 0 0",
 }
 """Parameters of cameras for images of `SIZE`."""
 
@@ -66,28 +67,13 @@ def write_colmap(folder: Path, models: tuple[str, ...] = ("SIMPLE_PINHOLE", "PIN
 
 
 def to_binary(sparse: Path) -> None:
-    """Replace a text model by a binary one, written from the format's description."""
-    cameras, images = b"", b""
-    lines = [line for line in (sparse / "cameras.txt").read_text().splitlines() if not line.startswith("#")]
-    for line in lines:
-        key, model, width, height, *values = line.split()
-        number = list(COLMAP_NUMBERS).index(model)
-        cameras += struct.pack(f"<iiQQ{len(values)}d", int(key), number, int(width), int(height), *map(float, values))
-    (sparse / "cameras.bin").write_bytes(struct.pack("<Q", len(lines)) + cameras)
-    lines = [line for line in (sparse / "images.txt").read_text().splitlines() if not line.startswith("#")]
-    for line, points in zip(lines[::2], lines[1::2], strict=True):
-        key, *pose, camera, name = line.split(maxsplit=9)
-        images += struct.pack("<i7di", int(key), *map(float, pose), int(camera)) + name.encode() + b"\0"
-        words = points.split()
-        images += struct.pack("<Q", len(words) // 3)
-        for x, y, point in zip(words[::3], words[1::3], words[2::3], strict=True):
-            images += struct.pack("<ddq", float(x), float(y), int(point))
-    (sparse / "images.bin").write_bytes(struct.pack("<Q", len(lines) // 2) + images)
-    (sparse / "cameras.txt").unlink()
-    (sparse / "images.txt").unlink()
-
-
-COLMAP_NUMBERS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE")
+    """Replace a text model by the binary one that COLMAP writes of it; its own reader ends names at spaces."""
+    (sparse / "points3D.txt").write_text("".join(f"{p} 0 0 0 0 0 0 0\n" for p in range(20)))
+    pycolmap.Reconstruction(str(sparse)).write_binary(str(sparse))
+    images = sparse / "images.bin"
+    images.write_bytes(images.read_bytes().replace(b"night\0", b"night walk/01.png\0"))
+    for name in ("cameras", "images"):
+        (sparse / f"{name}.txt").unlink()
 
 
 def write_tum(root: Path, name: str = "rgbd_dataset_freiburg1_test", frames: int = 12, depth: bool = False) -> Path:
@@ -140,3 +126,36 @@ def write_bundler(folder: Path, cameras: int = 5) -> tuple[Path, list[dict[str, 
     listed = [f"images/{i}.png" + (" 0 40.5" if i % 2 else "") for i in range(cameras)]
     (folder / "list.txt").write_text("\n".join(listed) + "\n")
     return folder, [{**camera, "points": points} for camera in truth]
+
+
+VIEW = (320, 480)  # (h, w) of image 1
+
+
+def view(seed: int, strength: float = 0.15) -> np.ndarray:
+    """A homography that moves each corner by up to a share of the sides."""
+    rng = np.random.default_rng(seed)
+    h, w = VIEW
+    corners = np.array([[0, 0], [w, 0], [w, h], [0, h]], np.float32)
+    moved = corners + rng.uniform(-strength, strength, (4, 2)).astype(np.float32) * [w, h]
+    return cv2.getPerspectiveTransform(corners, moved.astype(np.float32))
+
+
+def write_sequence(folder: Path, photograph: str, light: bool, count: int = 6, suffix: str = ".ppm") -> Path:
+    """A sequence: image 1, and images 2 to 6 of other light or another viewpoint."""
+    folder.mkdir(parents=True)
+    picture = cv2.imread(str(shared_path(f"data/photos/{photograph}")))
+    image = cv2.resize(picture, VIEW[::-1], interpolation=cv2.INTER_AREA)
+    cv2.imwrite(str(folder / f"1{suffix}"), image)
+    for k in range(2, count + 1):
+        H = np.eye(3) if light else view(k)
+        seen = np.clip(image * (1.1 - 0.1 * k) + 5 * k, 0, 255).astype(np.uint8) if light else image
+        cv2.imwrite(str(folder / f"{k}{suffix}"), cv2.warpPerspective(seen, H, VIEW[::-1]))
+        rows = (" ".join(f"{value:.10g}" for value in row) for row in H)
+        (folder / f"H_1_{k}").write_text("\n".join(rows) + "\n")
+    return folder
+
+
+def write_hpatches(root: Path, photographs: Sequence[str] = ("0000.jpg", "0003.jpg")) -> Path:
+    write_sequence(root / "i_light", photographs[0], light=True)
+    write_sequence(root / "v_view", photographs[1], light=False)
+    return root

@@ -255,13 +255,9 @@ def test_the_command_selects_by_overlap(tmp_path: Path, monkeypatch: pytest.Monk
         run(tmp_path, monkeypatch, *COLMAP, "overlap=[0.6,0.9]")
     run(tmp_path, monkeypatch, *COLMAP, "overlap=[0.6,0.6]", "output=Other")
     assert [pair.identity for pair in load("fmbench", root=tmp_path / "Other")] == ["Other/a/0-1"]
-
-
-def test_a_damaged_image_loses_its_own_pairs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write_colmap(tmp_path / "Set/a")
-    (tmp_path / "Set/a/images/00.png").write_text("no image")
-    run(tmp_path, monkeypatch, *COLMAP, "overlap=[0.1,1]")
-    assert [pair.identity for pair in load("fmbench", root=tmp_path / "Made")] == ["Made/a/1-2"]
+    (tmp_path / "Set/a/images/00.png").write_text("no image")  # which loses its own pairs
+    run(tmp_path, monkeypatch, *COLMAP, "overlap=[0.1,1]", "output=Third")
+    assert [pair.identity for pair in load("fmbench", root=tmp_path / "Third")] == ["Third/a/1-2"]
 
 
 @pytest.mark.parametrize("n", [0, 1, 2, 7])
@@ -305,27 +301,18 @@ def test_images_that_share_points_are_those_counted_one_by_one(minimum: int) -> 
 THERE = ["06", "rgbd_dataset_freiburg1_xyz", "rgbd_dataset_freiburg3_teddy", "Horse", "Train"]
 
 
-@pytest.mark.parametrize("name", SPLITS)
-def test_no_sequence_is_in_both_splits(name: str) -> None:
-    train, test = (set(chosen(name, split, None, THERE)) for split in ("train", "test"))
-    assert train
-    assert test
-    assert not train & test
-    assert chosen(name, "test", ["other"], THERE) == ["other"]
-
-
-def test_the_splits_are_the_papers() -> None:
+def test_the_splits_are_the_papers_and_share_no_sequence() -> None:
     assert SPLITS["kitti"] == {"test": ("06", "07", "08", "09", "10"), "train": ("00", "01", "02", "03", "04", "05")}
     short = [name.removeprefix("rgbd_dataset_freiburg3_") for name in SPLITS["tum"]["test"]]
     assert short == ["teddy", "large_cabinet", "long_office_household"]
+    for name in SPLITS:
+        train, test = (set(chosen(name, split, None, THERE)) for split in ("train", "test"))
+        assert (bool(train), bool(test), train & test) == (True, True, set())
+        assert chosen(name, "test", ["other"], THERE) == ["other"]
     assert chosen("tum", "train", None, THERE) == ["06", "Horse", "Train", "rgbd_dataset_freiburg1_xyz"]
-
-
-def test_what_no_split_holds_is_told() -> None:
-    with pytest.raises(DataError, match="tum: no sequence in split 'train'"):
-        chosen("tum", "train", None, [])
-    with pytest.raises(DataError, match="kitti: no sequence in split 'test'"):
-        chosen("kitti", "test", [], [])
+    for name, split, sequences in (("tum", "train", None), ("kitti", "test", [])):
+        with pytest.raises(DataError, match=f"{name}: no sequence in split '{split}'"):
+            chosen(name, split, sequences, [])
 
 
 @pytest.mark.parametrize("name", presets.available("dataset"))

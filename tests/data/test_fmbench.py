@@ -10,8 +10,7 @@ import pytest
 from fmtorch.data import DataError, DepthDataset, FMBenchPairs, PairDataset, load, read_image
 from fmtorch.data.pairs import PairSubset
 from tests.conftest import shared_path
-from tests.data import planes
-from tests.data.native import write_tum
+from tests.data import native
 from tests.helpers import apart, cross_matrix
 
 LINE = "0 1 0 0 0 0 0 -2 0 2 0"
@@ -112,13 +111,6 @@ def test_cameras_must_fit(tmp_path: Path) -> None:
     assert len(FMBenchPairs(root, cameras=False)) == 2
 
 
-def test_load_names_what_there_is() -> None:
-    with pytest.raises(ValueError, match="no preset 'kity' in conf/dataset; there are: kitti, "):
-        load("kity")
-    with pytest.raises(DataError, match="fmbench needs root"):
-        load("fmbench")
-
-
 def test_real_sets() -> None:
     dataset = load("fmbench", root=shared_path("data"))
     counts = {family: sum(p.family == family for p in dataset) for family in {p.family for p in dataset}}
@@ -135,22 +127,21 @@ def test_real_sets() -> None:
 
 
 def test_pairs_are_image_1_with_the_others(tmp_path: Path) -> None:
-    dataset = load("hpatches", root=planes.write_hpatches(tmp_path), short_side=None)
+    dataset = load("hpatches", root=native.write_hpatches(tmp_path), short_side=None)
     assert [pair.identity for pair in dataset][:2] == ["HPatches/i_light/1-2", "HPatches/i_light/1-3"]
     assert [(pair.family, pair.scene) for pair in dataset][4:6] == [
         ("illumination", "i_light"), ("viewpoint", "v_view"),
     ]  # fmt: skip
     assert (len(dataset), dataset.model) == (10, "homography")
     for k, pair in enumerate(list(dataset)[5:], start=2):
-        H = planes.view(k) / np.linalg.norm(planes.view(k))
+        H = native.view(k) / np.linalg.norm(native.view(k))
         np.testing.assert_allclose(pair.H, H, atol=1e-8)
         assert not pair.F.any()
-        assert read_image(pair.image0).shape == (*planes.SIZE, 3)
+        assert read_image(pair.image0).shape == (*native.VIEW, 3)
 
 
 def test_homographies_are_of_the_images_as_they_are_read(tmp_path: Path) -> None:
-    """Image 0, resized and mapped by H, is image 1, resized."""
-    dataset = load("hpatches", root=planes.write_hpatches(tmp_path), sequences=["v_view"], short_side=200)
+    dataset = load("hpatches", root=native.write_hpatches(tmp_path), sequences=["v_view"], short_side=200)
     for pair in dataset:
         a, b = (read_image(image) for image in (pair.image0, pair.image1))
         assert a.shape[:2] == b.shape[:2] == (200, 300)
@@ -171,7 +162,7 @@ def test_homographies_are_of_the_images_as_they_are_read(tmp_path: Path) -> None
     ],
 )
 def test_one_bad_pair_has_a_problem(damage: object, problem: str, tmp_path: Path) -> None:
-    planes.write_sequence(tmp_path / "v_view", "0000.jpg", light=False)
+    native.write_sequence(tmp_path / "v_view", "0000.jpg", light=False)
     damage(tmp_path / "v_view")  # type: ignore[operator]
     first, second, *_ = load("hpatches", root=tmp_path)
     assert first.problem is None
@@ -183,13 +174,13 @@ def test_one_bad_pair_has_a_problem(damage: object, problem: str, tmp_path: Path
 def test_folders_without_sequences_are_refused(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"no sequences; it must hold folders i_\* and v_\*"):
         load("hpatches", root=tmp_path)
-    planes.write_sequence(tmp_path / "v_view", "0000.jpg", light=False)
+    native.write_sequence(tmp_path / "v_view", "0000.jpg", light=False)
     with pytest.raises(DataError, match="no sequence 'v_other'; there are: v_view"):
         load("hpatches", root=tmp_path, sequences=["v_other"])
 
 
 def test_pairs_digest_and_depth(tmp_path: Path) -> None:
-    name = write_tum(tmp_path, depth=True).name
+    name = native.write_tum(tmp_path, depth=True).name
     dataset, plain = (load("tum", root=tmp_path, sequences=[name], depth=depth) for depth in (True, False))
     part = PairSubset(dataset, [len(dataset) - 1])
     assert isinstance(part, PairDataset)

@@ -368,6 +368,8 @@ def test_names_within_folders_win_over_shorter_ones(tmp_path: Path) -> None:
 
 
 def test_one_camera_without_images_is_that_of_all(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"neither cameras\.bin nor cameras\.txt"):
+        ImageCameras(tmp_path)
     (tmp_path / "cameras.txt").write_text("# one\n1 PINHOLE 32 24 40 41 16 12\n")
     assert ImageCameras(tmp_path / "cameras.txt").of(Path("any.jpg")) == (Lens(40.0, 41.0, 15.5, 11.5), (24, 32))
     (tmp_path / "cameras.txt").write_text("1 PINHOLE 32 24 40 41 16 12\n2 PINHOLE 32 24 40 41 16 12\n")
@@ -383,8 +385,3 @@ def test_json_of_anything_else_is_refused(content: str, tmp_path: Path) -> None:
     (tmp_path / "k.json").write_text(content)
     with pytest.raises(DataError, match=r"k\.json.*it must be .*\[?fx, fy, cx, cy"):
         ImageCameras(tmp_path / "k.json")
-
-
-def test_no_such_model(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"neither cameras\.bin nor cameras\.txt"):
-        ImageCameras(tmp_path)

@@ -134,11 +134,7 @@ def test_turned_pixels_are_where_the_matrix_says(turns: int) -> None:
         for x in range(RESAMPLED_SIZE[1]):
             u, v, _ = turn.matrix(RESAMPLED_SIZE) @ [x, y, 1]
             assert turned[round(v), round(u)] == image[y, x]
-
-
-@pytest.mark.parametrize("turns", [0, 1, 2, 3])
-def test_a_point_is_seen_at_the_same_place_of_the_image(turns: int) -> None:
-    """K' (R X) is where the matrix puts K X; K' is upper triangular with positive focal lengths."""
+    # K' (R X) is where the matrix puts K X; K' is upper triangular with positive focal lengths.
     change = Resampling((12, 12), turns)
     K, X = np.array([[30, 0, 4.2], [0, 31, 2.9], [0, 0, 1.0]]), np.array([0.3, -0.2, 2.5])
     K_read = change.calibration(K, RESAMPLED_SIZE)

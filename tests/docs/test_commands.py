@@ -12,7 +12,7 @@ import runpy
 import shlex
 import shutil
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import cv2
@@ -160,7 +160,8 @@ def workplace(tmp_path_factory: pytest.TempPathFactory) -> Path:
         lines = [line for line in read_specs(specs) if _installed(line.split(" ")[0])]
         (folder / "scripts" / "benchmark" / specs.name).write_text("\n".join(lines[::8]))
     pair = data.load("stereo")[0]
-    images = [_half(read_image(source)) for source in (pair.image0, pair.image1)]
+    whole = [read_image(source) for source in (pair.image0, pair.image1)]
+    images = [cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) for image in whole]
     halved = np.diag([2.0, 2.0, 1.0])
     F = halved.T @ pair.F @ halved
     for name, scenes in SETS.items():
@@ -203,10 +204,6 @@ def workplace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def _half(image: np.ndarray) -> np.ndarray:
-    return cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-
-
 @contextlib.contextmanager
 def as_a_command(words: list[str], folder: Path) -> Iterator[None]:
     """The state of a process of its own, as far as the commands change it."""
@@ -239,16 +236,12 @@ def run(words: list[str], folder: Path) -> None:
                 raise AssertionError(f"{shlex.join(words)} ended with: {end.code}") from end
 
 
-def is_slow(command: str) -> bool:
-    return any(re.search(pattern, command) for pattern in SLOW)
-
-
-def elsewhere(command: str) -> bool:
-    return any(re.search(pattern, command) for pattern in ELSEWHERE)
+def is_of(command: str, patterns: Iterable[str]) -> bool:
+    return any(re.search(pattern, command) for pattern in patterns)
 
 
 def parameters(slow: bool) -> list[object]:
-    here = {page: [c for c in commands(page) if not elsewhere(c) and is_slow(c) == slow] for page in PAGES}
+    here = {page: [c for c in commands(page) if not is_of(c, ELSEWHERE) and is_of(c, SLOW) == slow] for page in PAGES}
     return [pytest.param(page_commands, id=page) for page, page_commands in here.items() if page_commands]
 
 

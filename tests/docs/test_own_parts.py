@@ -14,8 +14,7 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 
-from fmtorch import data, find_fundamental, presets
-from fmtorch.core import Estimator, FeatureExtractor, Matcher, Pruner
+from fmtorch import data, find_fundamental
 from fmtorch.scenes import FAMILIES, Plan
 from tests.conftest import own_cache
 from tests.laws import scene
@@ -56,15 +55,6 @@ def test_every_part_is_evaluated(folder: Path) -> None:
         assert target in identity
 
 
-PROTOCOLS = {"features": FeatureExtractor, "matcher": Matcher, "pruner": Pruner, "estimator": Estimator}
-
-
-@pytest.mark.parametrize(("group", "protocol"), PROTOCOLS.items())
-def test_each_is_built_by_name_in_python(group, protocol, folder, monkeypatch):
-    monkeypatch.syspath_prepend(str(folder))
-    assert isinstance(presets.build(group, "mine", config_dir=folder / "my_conf"), protocol)
-
-
 @pytest.mark.parametrize("score", ["Welsch", "Triweight"])
 def test_a_score_a_sampler_and_a_rule(score: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(folder))
@@ -90,8 +80,8 @@ def run(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: p
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("FMTORCH_CACHE", str(own_cache(tmp_path_factory.getbasetemp() / "notebooks")))  # scenes of all
     monkeypatch.setattr("fmtorch.scenes.dataset.PLANS", dict.fromkeys((("small", "test"), ("small", "train")), SMALL))
-    two = {name: FAMILIES[name] for name in ("indoor", "driving")}  # others have no pairs in so small a plan
-    monkeypatch.setattr("fmtorch.scenes.dataset.FAMILIES", two)
+    drawn = {"indoor": FAMILIES["indoor"]}  # the quickest to draw
+    monkeypatch.setattr("fmtorch.scenes.dataset.FAMILIES", drawn)
     monkeypatch.setattr("fmtorch.jobs.execution.cores", lambda: 1)  # processes would take longer than the work
     monkeypatch.setattr(plt, "show", lambda: plt.close("all"))
     monkeypatch.setitem(mpl.rcParams, "backend", "agg")
@@ -125,7 +115,7 @@ def test_train_a_pruner(run: Any) -> None:
     assert len(losses) == 20
     assert losses[-5:].mean() < 0.8 * losses[:2].mean()
     assert set(names["errors"]) == {"no prior", "the default prior", "the network's"}
-    assert all(len(errors) == len(names["scenes"]) == 16 for errors in names["errors"].values())
+    assert all(len(errors) == len(names["scenes"]) == 8 for errors in names["errors"].values())
     assert all(values.mean() > 20 for values in names["auc"].values())
 
 

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import functools
 import os
 import signal
 import subprocess
@@ -28,33 +29,11 @@ from fmtorch.pipeline import Pipeline, build_pipeline, load_pipeline
 from fmtorch.runs import PairRow, identity_digest, libraries
 from scripts.benchmark.pairs import synthetic_pair
 from tests.helpers import compose, draw, pair
+from tests.jobs.work import ends, given_pipeline, slow_pipeline
 from tests.processes import alive
 
 PAIRS = 24
-SLOW_SECONDS = 0.3  # of each batch of a slow pipeline, so that there is time to kill its workers
 PATIENCE = 240.0  # seconds for a scheduler to answer, or workers to come
-
-
-def build() -> Pipeline:
-    built: Pipeline = load_pipeline("given_fmtorch")
-    return built
-
-
-class Slow:
-    model = "fundamental"
-
-    def __init__(self, estimator: Any) -> None:
-        self.estimator = estimator
-
-    def __call__(self, c: Any, seed: int = 0) -> Any:
-        time.sleep(SLOW_SECONDS)
-        return self.estimator(c, seed)
-
-
-def build_slow() -> Pipeline:
-    pipeline = build()
-    pipeline.estimator = Slow(pipeline.estimator)
-    return pipeline
 
 
 @pytest.fixture(scope="module")
@@ -67,11 +46,11 @@ def expected(pairs: list[ImagePair]) -> dict[int, PairRow]:
     return evaluated(pairs, Execution("threads", 1))
 
 
-def evaluated(pairs: list[ImagePair], execution: Execution, make: Any = build) -> dict[int, PairRow]:
+def evaluated(pairs: list[ImagePair], execution: Execution, make: Any = given_pipeline) -> dict[int, PairRow]:
     """The rows by key, without seconds. Fails where a pair has several."""
     rows: list[PairRow] = []
-    for _ in evaluate_pairs(build(), pairs, seed=0, batch=2, execution=execution, store=rows.extend, build=make):
-        pass
+    options: dict[str, Any] = {"execution": execution, "store": rows.extend, "build": make}
+    list(evaluate_pairs(given_pipeline(), pairs, seed=0, batch=2, **options))
     assert len(rows) == len({row.key for row in rows})
     return timeless(rows)
 
@@ -158,15 +137,15 @@ def test_workers_are_killed(cluster: Cluster, pairs: list[ImagePair], expected: 
     killer = threading.Thread(target=kill)
     killer.start()
     assert started.wait(PATIENCE)
-    rows = evaluated(pairs, Execution("dask", address=cluster.address, send_images=True), build_slow)
+    rows = evaluated(pairs, Execution("dask", address=cluster.address, send_images=True), slow_pipeline)
     killer.join()
     assert (len(set(killed)), rows) == (2, expected)
 
 
 def test_a_scheduler_that_is_lost(cluster: Cluster, pairs: list[ImagePair], expected: dict[int, PairRow]) -> None:
-    rows: list[PairRow] = []
-    execution = Execution("dask", address=cluster.address)
-    counts = evaluate_pairs(build(), pairs, seed=0, batch=2, execution=execution, store=rows.extend, build=build_slow)
+    rows, execution = list[PairRow](), Execution("dask", address=cluster.address)
+    options: dict[str, Any] = {"execution": execution, "store": rows.extend, "build": slow_pipeline}
+    counts = evaluate_pairs(given_pipeline(), pairs, seed=0, batch=2, **options)
     next(counts)
     cluster.scheduler.kill()
     with pytest.raises(WorkersLost, match=rf"the scheduler at {cluster.address} was lost; .* the same command goes on"):
@@ -185,7 +164,7 @@ def test_an_address_that_nobody_answers(pairs: list[ImagePair], monkeypatch: pyt
 
 def test_a_cluster_of_this_machine(pairs: list[ImagePair], expected: dict[int, PairRow]) -> None:
     pytest.importorskip("distributed", reason="dask.distributed is not installed")
-    assert evaluated(pairs, Execution("dask", 2)) == expected
+    assert evaluated(pairs, Execution("dask", 1)) == expected
 
 
 WORKER = """
@@ -211,15 +190,12 @@ def test_a_worker_ends_with_the_process_that_was_killed() -> None:
     assert not alive(worker)
 
 
-def _ends() -> Pipeline:
-    os._exit(3)
-
-
 def test_a_process_that_ends_is_told() -> None:
     """After the pairs of its batch were tried alone."""
     images = [ImageSource(f"{i}", Path(f"{i}.png")) for i in range(3)]
     pairs, rows = [pair(f"0-{i}", images[0], images[i]) for i in (1, 2)], list[PairRow]()
-    options: dict[str, Any] = {"execution": Execution("processes", 2), "store": rows.extend, "build": _ends}
+    build = functools.partial(ends, Path())
+    options: dict[str, Any] = {"execution": Execution("processes", 2), "store": rows.extend, "build": build}
     with pytest.raises(WorkersLost, match="the same command goes on"):
         list(evaluate_pairs(load_pipeline("sift_ratio"), pairs, seed=0, batch=2, **options))
     assert rows == []

@@ -19,17 +19,8 @@ from fmtorch.data import DataError
 from fmtorch.evaluation import Section, ShownPair, picture, render, run_names, svg
 from fmtorch.evaluation import report as module
 from fmtorch.evaluation.report import Options, Run, find_dataset, gallery
-from fmtorch.pipeline.pictures import (
-    BAD,
-    COLOURS,
-    GOOD,
-    HEIGHT,
-    WIDTH,
-    Place,
-    draw_epipolar_lines,
-    draw_epipolar_lines_of_corners,
-    draw_matches,
-)
+from fmtorch.pipeline import pictures
+from fmtorch.pipeline.pictures import BAD, COLOURS, GOOD, draw_epipolar_lines, draw_matches
 from fmtorch.runs import PairRow, RunFolder, to_table
 from tests.helpers import ROWS, compose, draw_set
 
@@ -52,7 +43,7 @@ def run(name: str, config: dict[str, Any], table: pa.Table) -> Run:
     return Run(name, RunFolder(Path(name), config), table)
 
 
-def pictures(shown: list[ShownPair]) -> dict[str, list[str]]:
+def captioned(shown: list[ShownPair]) -> dict[str, list[str]]:
     return {f"{s.run} {pair.name}": [p.caption for p in s.pictures] for pair in shown for s in pair.runs}
 
 
@@ -62,7 +53,7 @@ def test_results_of_others_are_drawn_from_their_stored_F(tmp_path: Path) -> None
     shown, notes = gallery([theirs], Options(5, [root]))
     (note,) = notes
     assert note.startswith("theirs is shown by the F that it stored, without its matches: its folder does not say what")
-    captions = pictures(shown)
+    captions = captioned(shown)
     assert len(captions["theirs Set/scene/0-1"]) == 1
     assert "by the stored F" in captions["theirs Set/scene/0-1"][0]
     assert captions["theirs Set/scene/0-2"] == []  # it has no F
@@ -81,7 +72,7 @@ def test_results_of_others_become_a_run_as_documented(tmp_path: Path, monkeypatc
     folder = RunFolder.load("runs/theirs")
     assert folder.read()["nsgd"].to_pylist() == pytest.approx([0, 0], abs=1e-6)
     shown, _ = gallery([Run("theirs", folder, folder.read())], Options(5, [tmp_path / "Set"]))
-    assert [len(captions) for captions in pictures(shown).values()] == [1, 1]
+    assert [len(captions) for captions in captioned(shown).values()] == [1, 1]
 
 
 def test_own_methods_keep_their_pictures_and_run_only_where_that_is_asked_for(tmp_path, monkeypatch):
@@ -96,10 +87,10 @@ def test_own_methods_keep_their_pictures_and_run_only_where_that_is_asked_for(tm
     shown, notes = gallery([mine], Options(1, [root], cache="off"))
     assert "own_estimator_of_a_test" not in sys.modules
     assert "parts of your own (own_estimator_of_a_test.Mine), which a report loads with own_code=true" in notes[0]
-    assert [len(captions) for captions in pictures(shown).values()] == [1]
+    assert [len(captions) for captions in captioned(shown).values()] == [1]
     shown, notes = gallery([mine], Options(1, [root], own_code=True, cache="off"))
     assert notes == []
-    assert [len(captions) for captions in pictures(shown).values()] == [2]  # matches too
+    assert [len(captions) for captions in captioned(shown).values()] == [2]  # matches too
     del sys.modules["own_estimator_of_a_test"]
 
 
@@ -242,9 +233,9 @@ def test_any_two_images_fit(shape0: tuple[int, int], shape1: tuple[int, int]) ->
     image0, image1 = grey(*shape0), grey(*shape1)[..., 0]  # one in colour, one grey
     for drawn in (draw_matches(image0, image1, *NONE), draw_epipolar_lines(image0, image1, *NONE[:2], ROWS)):
         assert drawn.dtype == np.uint8
-        assert drawn.shape[0] <= HEIGHT + 1  # each of two sizes is rounded
-        assert drawn.shape[1] <= WIDTH + 1
-        assert drawn.shape[0] >= HEIGHT - 1 or drawn.shape[1] >= WIDTH - 1
+        assert drawn.shape[0] <= pictures.HEIGHT + 1  # each of two sizes is rounded
+        assert drawn.shape[1] <= pictures.WIDTH + 1
+        assert drawn.shape[0] >= pictures.HEIGHT - 1 or drawn.shape[1] >= pictures.WIDTH - 1
         assert (drawn == 128).any()
 
 
@@ -287,7 +278,7 @@ def test_corners_have_their_lines_in_the_other_image() -> None:
     for k in range(4):  # dots, no two of one height
         images[0, 12 + 16 * k : 14 + 16 * k, 20 * k + 10 : 20 * k + 12] = 255
         images[1, 20 + 16 * k : 22 + 16 * k, 80 - 20 * k : 82 - 20 * k] = 255
-    picture = draw_epipolar_lines_of_corners(images[0], images[1], ROWS)
+    picture = pictures.draw_epipolar_lines_of_corners(images[0], images[1], ROWS)
     half = picture.shape[1] // 2
     sides = picture[:, : half - 10], picture[:, half + 10 :]
     heights = set()
@@ -299,10 +290,10 @@ def test_corners_have_their_lines_in_the_other_image() -> None:
         assert abs(own.mean() - row) < 5  # px of the picture, of eleven to one of the images
         heights.add(row)
     assert len(heights) == 7
-    blank = draw_epipolar_lines_of_corners(grey(50, 60), grey(50, 60), ROWS)  # without corners there is nothing to draw
+    blank = pictures.draw_epipolar_lines_of_corners(grey(50, 60), grey(50, 60), ROWS)  # no corners, nothing to draw
     assert (blank[10:-10, 10:50] == 128).all()
     for shape in ((1, 1), (1, 500), (8, 8)):
-        assert draw_epipolar_lines_of_corners(grey(*shape), grey(480, 640)[..., 0], ROWS).size
+        assert pictures.draw_epipolar_lines_of_corners(grey(*shape), grey(480, 640)[..., 0], ROWS).size
 
 
 finite = st.floats(-100, 100)
@@ -310,7 +301,7 @@ finite = st.floats(-100, 100)
 
 @given(finite, finite, st.floats(-5000, 5000), st.integers(1, 60), st.integers(1, 60))
 def test_lines_end_at_the_border(a: float, b: float, c: float, h: int, w: int) -> None:
-    place = Place((h, w), (0, 0), (w, h))  # drawn as large as the image is
+    place = pictures.Place((h, w), (0, 0), (w, h))  # drawn as large as the image is
     ends = place.clip(np.array([a, b, c]))
     norm = float(np.hypot(a, b))
     if norm < 1e-3:  # its distance from the image is beyond float64

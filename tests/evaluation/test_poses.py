@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from PIL import ExifTags, Image
 from rich.console import Console
 
 import fmtorch
@@ -24,7 +23,8 @@ from fmtorch.pipeline import Outcome, Pipeline, examined
 from fmtorch.runs import PairRow, RunFolder, to_table
 from fmtorch.training import MatchedPairs
 from tests.conftest import shared_path
-from tests.data import planes
+from tests.data import native
+from tests.data.test_images import with_exif
 from tests.geometry.scenes import K, batch, draw, scene
 from tests.helpers import call_command, unused
 from tests.reference import metrics as reference
@@ -115,10 +115,10 @@ def run(folder: Path, name: str, *words: str) -> None:
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two runs on two sequences, one image of which is missing."""
     folder = tmp_path_factory.mktemp("runs")
-    root = planes.write_hpatches(folder / "hpatches")
+    root = native.write_hpatches(folder / "hpatches")
     (root / "v_view/6.ppm").unlink()
     run(folder, "runs/a")
-    run(folder, "runs/b", "estimator.hypotheses=250", "executor=processes", "workers=2")
+    run(folder, "runs/b", "estimator.hypotheses=250", "executor=processes", "workers=1")
     return folder
 
 
@@ -196,19 +196,11 @@ def test_homographies_need_a_set_that_has_them_and_label_no_matches(monkeypatch,
         MatchedPairs(load("hpatches", root=runs / "hpatches"), "sift_ratio", root=tmp_path)
 
 
-def photograph(path: Path, equivalent: int | None) -> ImageSource:
-    """A picture of 60 x 40 px with a focal length in 35 mm."""
-    exif = Image.Exif()
-    if equivalent:
-        exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm] = equivalent
-    Image.new("RGB", (60, 40)).save(path, exif=exif)
-    return ImageSource(path.stem, path)
-
-
 def test_what_each_word_gives(tmp_path: Path) -> None:
     pair = outcome(0).pair
-    ends = photograph(tmp_path / "a.jpg", 36), photograph(tmp_path / "b.jpg", None)
-    pair = dataclasses.replace(pair, image0=ends[0], image1=ends[1])
+    paths = with_exif(tmp_path, (40, 60), FocalLengthIn35mmFilm=36), with_exif(tmp_path, (40, 60), "b.jpg")
+    image0, image1 = (ImageSource(path.stem, path) for path in paths)
+    pair = dataclasses.replace(pair, image0=image0, image1=image1)
     known, exif, shared, unknown = (given(pair, word) for word in ("known", "exif", "shared", "unknown"))
     assert torch.equal(known["K0"], torch.from_numpy(pair.K0))
     assert known["focal"].tolist() == [[1, 0], [1, 0]]
@@ -276,7 +268,7 @@ def test_a_lens_is_given_to_the_estimator(cameras: str | None) -> None:
 
 def test_a_run_with_cameras_is_another_run(command: Callable[..., str], tmp_path: Path) -> None:
     words = ["eval", "pipeline=sift_fmtorch", "dataset=fmbench", f"dataset.root={shared_path('data/Strecha_train')}"]
-    words += ["limit=1", "workers=1"]
+    words += ["limit=1", "workers=1", "features.max_features=2000"]
 
     def run(name: str, *more: str) -> tuple[str, dict[str, Any], dict[str, Any]]:
         said = command(*words, *more, f"output={name}", cwd=tmp_path)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pytest
+import scipy
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
@@ -17,7 +18,6 @@ from fmtorch import metrics
 from fmtorch.core import pair_key
 from fmtorch.evaluation import common_reasons, statistics, summarize, summary_markdown, terminal_tables
 from fmtorch.runs import PairRow, to_table
-from tests.reference.metrics import bootstrap_interval
 
 F = (0.0, -0.5, 0.1, 0.5, 0.0, -0.1, 0.2, 0.3, 0.59)
 
@@ -147,11 +147,11 @@ def correlated(scenes: int, pairs: int, seed: int = 0) -> tuple[np.ndarray, list
     return (rng.random(scenes * pairs) < chance.repeat(pairs)).astype(np.float64), names
 
 
-def quantile_error(values: np.ndarray, clusters: int, resamples: int) -> float:
+def quantile_error(means: np.ndarray, resamples: int) -> float:
     """4.5 standard deviations of the difference of two estimates of a 2.5 % quantile of a normal variable."""
     density = 0.0585  # of the standard normal at its 2.5 % quantile
-    means = values.reshape(clusters, -1).mean(1).std() / np.sqrt(clusters)
-    return float(4.5 * np.sqrt(2) * means * np.sqrt(0.025 * 0.975 / resamples) / density)
+    deviation = means.std() / np.sqrt(len(means))
+    return float(4.5 * np.sqrt(2) * deviation * np.sqrt(0.025 * 0.975 / resamples) / density)
 
 
 @pytest.mark.parametrize("scenes", [statistics.MIN_SCENES - 1, 40])
@@ -159,10 +159,12 @@ def test_equals_the_reference(scenes: int) -> None:
     values, names = correlated(scenes, 12)
     result = statistics.bootstrap_mean(values, names)
     over_scenes = scenes >= statistics.MIN_SCENES
-    clusters = names if over_scenes else [str(i) for i in range(len(names))]
-    low, high = bootstrap_interval(values.tolist(), clusters, statistics.RESAMPLES)
+    clusters = scenes if over_scenes else len(names)
+    means = values.reshape(clusters, -1).mean(1)  # of clusters of one size, whose mean is that of all values
+    options = {"n_resamples": statistics.RESAMPLES, "method": "percentile", "random_state": 0}
+    low, high = scipy.stats.bootstrap((means,), np.mean, **options).confidence_interval
     # Monte-Carlo error of both, and one step of the mean of 0/1 values, on which quantiles of few values lie.
-    tolerance = quantile_error(values, len(set(clusters)), statistics.RESAMPLES) + 1 / len(values)
+    tolerance = quantile_error(means, statistics.RESAMPLES) + 1 / len(values)
     assert (result.over, result.value) == ("scene" if over_scenes else "pair", values.mean())
     assert result.low == pytest.approx(low, abs=tolerance)
     assert result.high == pytest.approx(high, abs=tolerance)

@@ -3,7 +3,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from fmtorch import Features
 from fmtorch.features import rotate_frames, upright_frames
 
 
@@ -22,7 +21,3 @@ def random_frames(seed: int, count: int, h: int, w: int, smallest: float = 4, la
     lafs = rotate_frames(upright_frames(xy, sigma), torch.from_numpy(rng.uniform(-np.pi, np.pi, count)).float())
     stretch = torch.from_numpy(np.exp(rng.uniform(-0.6, 0.6, count))).float()[:, None]
     return torch.stack([lafs[..., 0] * stretch, lafs[..., 1] / stretch, lafs[..., 2]], -1)
-
-
-def same(a: Features, b: Features) -> bool:
-    return all(torch.equal(getattr(a, name), getattr(b, name)) for name in ("lafs", "scores", "descriptors"))

@@ -15,7 +15,8 @@ from fmtorch.core import models_dir
 from fmtorch.features import describe
 from fmtorch.runs import ArrayCache, CachedFeatures
 from scripts.make_models import learned
-from tests.features.scenes import same, texture
+from tests.features.scenes import texture
+from tests.helpers import same
 from tests.processes import run_command
 from tests.reference import local_features as reference
 
@@ -29,16 +30,6 @@ def random_network(seed: int, outputs: int) -> torch.nn.Module:
     ).requires_grad_(False)
 
 
-def composed() -> features.LocalFeature:
-    shape = random_network(0, 3)
-    return features.LocalFeature(
-        features.HessianDetector(300),
-        features.NetworkDescriptor(random_network(1, 128)),
-        features.NetworkShape(lambda patches: 0.2 * torch.tanh(shape(patches))),
-        features.DominantGradient(),
-    )
-
-
 @pytest.mark.parametrize("name", WITHOUT_NETWORK)
 def test_presets_describe_the_keypoints_of_sift(name: str) -> None:
     image = texture(0)
@@ -50,7 +41,10 @@ def test_presets_describe_the_keypoints_of_sift(name: str) -> None:
 
 
 def test_a_call_is_detection_and_description() -> None:
-    extract, image = composed(), texture(1)
+    shape, image = random_network(0, 3), texture(1)
+    shaped = features.NetworkShape(lambda patches: 0.2 * torch.tanh(shape(patches)))
+    parts = features.NetworkDescriptor(random_network(1, 128)), shaped, features.DominantGradient()
+    extract = features.LocalFeature(features.HessianDetector(300), *parts)
     lafs, scores = extract.detect(image)
     found = extract(image)
     assert len(found) > 100
@@ -231,22 +225,15 @@ def test_sift_of_any_scale_is_one_descriptor() -> None:
     torch.testing.assert_close(plain, scaled)
 
 
-@pytest.mark.parametrize(
-    ("pipeline", "kind"),
-    [
-        ("sift_fmtorch", "sift"), ("dspsift_ratio", "sift"), ("rootsiftpca_gms", "rootsiftpca"),
-        ("hesaffnet_fmtorch", "hardnet"), ("hesaffnet_fast_fmtorch", "hardnet"), ("hardnet_gms", "hardnet"),
-    ],
-)  # fmt: skip
-def test_pipelines_and_their_codebooks(pipeline: str, kind: str) -> None:
-    stages = presets.pipeline_stages(pipeline)
-    assert describe.descriptor_kind(stages["features"]) == kind
-
-
-def test_descriptors_without_a_codebook_are_told() -> None:
-    stages = presets.pipeline_stages("l2net_ratio")
+def test_pipelines_and_their_codebooks() -> None:
+    kinds = {
+        "sift_fmtorch": "sift", "dspsift_ratio": "sift", "rootsiftpca_gms": "rootsiftpca", "hardnet_gms": "hardnet",
+        "hesaffnet_fmtorch": "hardnet", "hesaffnet_fast_fmtorch": "hardnet",
+    }  # fmt: skip
+    stages = {name: presets.pipeline_stages(name)["features"] for name in (*kinds, "l2net_ratio")}
+    assert {name: describe.descriptor_kind(stages[name]) for name in kinds} == kinds
     with pytest.raises(ValueError, match="no codebook for the descriptors l2net; it must be a pipeline with SIFT"):
-        describe.descriptor_kind(stages["features"])
+        describe.descriptor_kind(stages["l2net_ratio"])
     with pytest.raises(ValueError, match="no codebook for the descriptors Mine"):
         describe.descriptor_kind({"_target_": "mine.Mine"})
 

@@ -17,7 +17,8 @@ from fmtorch.features import ALIKED, DISK, PatchNetwork
 from fmtorch.features.networks import ARCHITECTURES, DESCRIPTORS, AffNet, HardNet, L2Net, build, load_weights
 from scripts.patch_networks.onnx_export import export, quantize
 from tests.conftest import oracle, shared_path
-from tests.features.scenes import same, texture
+from tests.features.scenes import texture
+from tests.helpers import same
 
 RTOL = 1e-4  # of unit outputs: float32 sums of up to 8,192 terms in another order
 
@@ -132,11 +133,9 @@ def hardnet(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.mark.parametrize("name", ["l2net", "affnet_fast", "orinet"])  # HardNet's is used below; all others are theirs
+@pytest.mark.parametrize("name", ["affnet_fast", "orinet"])  # HardNet's is used below, L2-Net's by test_patch_training
 def test_onnx_agrees_with_torch_on_real_patches(name: str, tmp_path: Path, patches: Tensor) -> None:
     network = randomized(build(name))
-    if name == "l2net":
-        network.pixel_mean.copy_(patches.mean(0, keepdim=True))
     export(network, tmp_path / "network.onnx")
     found = PatchNetwork(tmp_path / "network.onnx", batch=40)(patches)
     assert found.shape == (64, network.outputs)
@@ -273,6 +272,8 @@ def test_disk_keypoints_count_from_the_centre_of_the_first_pixel() -> None:
     assert dict(zip(points, (255 * found.scores).round().int().tolist(), strict=True)) == DOTS
     few = DISK(network=kornia.feature.DISK(unet=Probe()), device="cpu", max_features=2)(dots())
     assert sorted(round(255 * s) for s in few.scores.tolist()) == [200, 255]
+    nothing = DISK(network=kornia.feature.DISK(unet=Probe()), device="cpu")(np.zeros(SIZE, np.uint8))
+    assert (nothing.lafs.shape, nothing.descriptors.shape) == ((0, 2, 3), (0, 128))
 
 
 def test_aliked_keypoints_count_from_the_centre_of_the_first_pixel(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -287,11 +288,6 @@ def test_aliked_keypoints_count_from_the_centre_of_the_first_pixel(monkeypatch: 
     few = ALIKED(network=network, device="cpu", max_features=2)(dots())
     assert len(few) == 2
     assert few.scores.min() > 0.7
-
-
-def test_nothing_found() -> None:
-    found = DISK(network=kornia.feature.DISK(unet=Probe()), device="cpu")(np.zeros(SIZE, np.uint8))
-    assert (found.lafs.shape, found.descriptors.shape) == ((0, 2, 3), (0, 128))
 
 
 @both

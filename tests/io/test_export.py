@@ -1,4 +1,5 @@
-"""Export: pycolmap reads the database, verifies the same matches and finds the cameras; hloc's files come back."""
+"""Export: pycolmap reads the database, verifies the same matches and finds the cameras; hloc's files come back.
+Exchange: keypoints, matches and geometries of other libraries are taken, and given back the same."""
 
 import csv
 import dataclasses
@@ -16,15 +17,19 @@ import h5py
 import numpy as np
 import pycolmap
 import pytest
+import torch
 from scipy.spatial.distance import pdist
 from scipy.spatial.transform import Rotation
+from torch import Tensor
 
+import fmtorch
 from fmtorch import io
 from fmtorch.evaluation import MAX_THUMBNAILS, view_graph_svg
+from fmtorch.features import keypoints_to_lafs
+from fmtorch.geometry import sampson
 from fmtorch.io import ORIGIN, write_database
-from fmtorch.pipeline import FolderMatches, chosen_pairs, folder_workers, images_below, load_pipeline
-from tests.conftest import shared_path
 from tests.helpers import cross_matrix
+from tests.laws import scene
 
 K = np.array([[1000.0, 0, 480], [0, 1000, 410], [0, 0, 1]])
 SIZE, POINTS, IMAGES, WRONG = (800, 1000), 250, 6, 25
@@ -222,45 +227,13 @@ def test_hloc_files(tmp_path: Path) -> None:
         assert file.execute("SELECT COUNT(*) FROM two_view_geometries").fetchone() == (len(circle.pairs),)
 
 
-def test_kinds() -> None:
-    assert (io.export_kinds(None), io.export_kinds("colmap, h5")) == ((), ("colmap", "h5"))
-    assert io.export_kinds(["h5"]) == ("h5",)
-    with pytest.raises(ValueError, match=r"export=h5,bundler: 'bundler' is none of h5, colmap"):
-        io.export_kinds("h5,bundler")
-
-
 @pytest.mark.parametrize(("library", "kind"), [("h5py", "h5"), ("pycolmap", "colmap")])
-def test_says_which_extra_is_missing(library: str, kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_kinds_are_words_and_a_missing_extra_is_named(library: str, kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    kinds = [io.export_kinds(given) for given in (None, "colmap, h5", [kind])]
+    assert kinds == [(), ("colmap", "h5"), (kind,)]
     monkeypatch.setitem(sys.modules, library, None)
     with pytest.raises(ImportError, match=rf"pip install 'fmtorch\[{kind}\]'"):
         io.export_kinds(kind)
-
-
-def test_a_real_scene_is_reconstructed(tmp_path: Path) -> None:
-    """Five images of fountain-P11: photographs -> matches and F -> COLMAP's cameras, against the laser scan's."""
-    source = shared_path("data/Strecha/fountain-P11")
-    images = tmp_path / "images"
-    images.mkdir()
-    for path in sorted((source / "Images").iterdir())[2:7]:
-        (images / path.name).symlink_to(path)
-    options = ["features.max_features=2500", "estimator=lmeds", "estimator.hypotheses=300"]
-    pipeline = load_pipeline("sift_ratio", overrides=options)
-    kept = io.MatchStore(tmp_path / "export", images)
-    pairs = chosen_pairs(images, images_below(images), None)
-    work = FolderMatches(pipeline, kept, folder_workers(pipeline), 1600, True, 0)
-    assert len(list(work.each(pairs))) == len(pairs)
-    assert not work.troubles
-    io.write_exports(kept, pairs, ("colmap",), tmp_path, shared_camera=True)
-    model = mapped(tmp_path / io.DATABASE, tmp_path)
-    cameras = np.loadtxt(source / "Camera.txt")
-    names = [f"{i:08d}.jpg" for i in range(len(cameras))]
-    R, t = cameras[:, 9:18].reshape(-1, 3, 3), cameras[:, 18:]
-    turn, shift = errors(model, names, list(R), np.einsum("nji,nj->ni", -R, t))
-    assert model.num_reg_images() == 5
-    (camera,) = model.cameras.values()
-    assert camera.focal_length == pytest.approx((cameras[0, 0] + cameras[0, 4]) / 2, rel=0.02)
-    assert shift < 0.01
-    assert turn < 1.5  # the principal point, which stays in the middle, is off by 10 px of 1380
 
 
 SVG = "{http://www.w3.org/2000/svg}"
@@ -322,3 +295,158 @@ def test_a_picture_of_any_number_of_images(count: int) -> None:
     for node in root.findall(f"{SVG}circle"):
         assert 0 < float(node.get("cx", "nan")) < 900
         assert 0 < float(node.get("cy", "nan")) < 900
+
+
+CALIBRATION = torch.tensor([[800.0, 0, 479.5], [0, 800, 319.5], [0, 0, 1]], dtype=torch.float64)
+
+
+@pytest.fixture(scope="module")
+def points() -> tuple[Tensor, Tensor]:
+    c = scene(0, 60)
+    return c.x0[0], c.x1[0]
+
+
+@pytest.fixture(scope="module")
+def pose(points: tuple[Tensor, Tensor]) -> fmtorch.PoseEstimate:
+    return fmtorch.find_essential(*points, CALIBRATION, CALIBRATION)
+
+
+def keypoints(x: Tensor, turn: float) -> list[cv2.KeyPoint]:
+    return [cv2.KeyPoint(float(a), float(b), 4.0 + i % 5, (10 * i + turn) % 360) for i, (a, b) in enumerate(x.tolist())]
+
+
+def test_keypoints_and_matches_of_opencv(points: tuple[Tensor, Tensor]) -> None:
+    keypoints0, keypoints1 = keypoints(points[0], 0), keypoints(points[1], 20)[::-1]
+    n = len(keypoints0)
+    best = [cv2.DMatch(i, n - 1 - i, 30.0 + i) for i in range(n)]
+    given = fmtorch.from_opencv(keypoints0, keypoints1, best)
+    assert given.keys() == {"x0", "x1", "lafs0", "lafs1"}
+    torch.testing.assert_close(given["x1"], points[1].float())
+    frames = keypoints_to_lafs(keypoints0)
+    scale = frames[0, :, :2].det().sqrt() / given["lafs0"][0, :, :2].det().sqrt()
+    torch.testing.assert_close(given["lafs0"][..., :2] * scale, frames[..., :2], atol=1e-4, rtol=1e-4)
+    knn = [(match, cv2.DMatch(i, 0, 100.0)) for i, match in enumerate(best)] + [()]
+    torch.testing.assert_close(fmtorch.from_opencv(keypoints0, keypoints1, knn)["ratio"][3], torch.tensor(0.33))
+    assert fmtorch.find_fundamental(**given).inliers.shape == (1, n)
+    assert fmtorch.from_opencv([], [], [])["x0"].shape == (0, 2)
+
+
+def test_keypoints_without_orientation_have_no_frames(points: tuple[Tensor, Tensor]) -> None:
+    ends = [[cv2.KeyPoint(float(a), float(b), 7.0) for a, b in x.tolist()] for x in points]
+    given = fmtorch.from_opencv(*ends, [cv2.DMatch(i, i, 1.0) for i in range(len(ends[0]))])
+    assert given.keys() == {"x0", "x1"}
+
+
+@pytest.mark.parametrize("count", [None, 1, 2])
+@pytest.mark.parametrize("listed", [False, True])
+def test_dictionaries_of_lightglue(points: tuple[Tensor, Tensor], count: int | None, listed: bool) -> None:
+    n = len(points[0])
+    order = torch.randperm(n, generator=torch.Generator().manual_seed(0))
+    partners = torch.argsort(order)
+    partners[5] = -1
+    kept = (partners > -1).nonzero()[:, 0]
+    score = torch.linspace(0.1, 0.9, n)
+    size = torch.tensor([960, 640])
+
+    def batched(value: Tensor) -> Tensor:
+        return value if count is None else value.expand(count, *value.shape)
+
+    features0 = {"keypoints": batched(points[0]), "image_size": batched(size)}
+    features1 = {"keypoints": batched(points[1][order]), "image_size": batched(size)}
+    if listed:
+        listed_values = {"matches": torch.stack([kept, partners[kept]], -1), "scores": score[kept]}
+        matches = {name: value if count is None else [value] * count for name, value in listed_values.items()}
+    else:
+        matches = {"matches0": batched(partners), "matching_scores0": batched(score)}
+    given = fmtorch.from_lightglue(features0, features1, matches)
+    x0, x1 = (given[name][0] if count == 2 else given[name] for name in ("x0", "x1"))
+    assert torch.equal(x0, points[0][kept])
+    assert torch.equal(x1, points[1][kept])
+    estimate = fmtorch.find_fundamental(**given)
+    assert len(estimate) == (count or 1)
+    assert bool(estimate.ok.all())
+    assert given["size0"].reshape(-1).tolist()[:2] == [640, 960]
+
+
+def test_dictionaries_of_kornia(points: tuple[Tensor, Tensor]) -> None:
+    n = len(points[0])
+    one = {"keypoints0": points[0], "keypoints1": points[1], "confidence": torch.full((n,), 0.7)}
+    two = {name: torch.cat([value, value]) for name, value in one.items()}
+    two["batch_indexes"] = torch.arange(2).repeat_interleave(n)
+    first = fmtorch.find_fundamental(**fmtorch.from_kornia(one))
+    both = fmtorch.find_fundamental(**fmtorch.from_kornia(two))
+    assert torch.equal(both.F[1], first.F[0])
+
+
+def test_a_geometry_of_colmap_and_back(points: tuple[Tensor, Tensor], pose: fmtorch.PoseEstimate) -> None:
+    geometry = fmtorch.to_colmap(pose)
+    assert geometry.config == pycolmap.TwoViewGeometryConfiguration.CALIBRATED
+    shifted = sampson(torch.tensor(geometry.F)[None], points[0] + 0.5, points[1] + 0.5)
+    torch.testing.assert_close(shifted, sampson(pose.F, *points), atol=1e-4, rtol=1e-4)
+    again = fmtorch.from_colmap(geometry, len(points[0]))
+    torch.testing.assert_close(sampson(again.F, *points), sampson(pose.F, *points), atol=1e-4, rtol=1e-4)
+    assert torch.equal(again.inliers, pose.inliers)
+    assert again.R is not None
+    assert again.t is not None
+    torch.testing.assert_close(again.R, pose.R.double())
+    torch.testing.assert_close(again.t, pose.t.double())
+
+
+def test_a_homography_of_colmap_and_back(points: tuple[Tensor, Tensor]) -> None:
+    H = torch.tensor([[0.9, 0.1, 20], [-0.1, 0.9, 5], [1e-5, 0, 1]], dtype=torch.float64)
+    x0 = points[0].double()
+    x1 = torch.cat([x0, torch.ones(len(x0), 1)], 1) @ H.T
+    estimate = fmtorch.find_homography(x0, x1[:, :2] / x1[:, 2:])
+    geometry = fmtorch.to_colmap(estimate)
+    assert geometry.F is None
+    again = fmtorch.from_colmap(geometry, len(x0))
+    torch.testing.assert_close(again.H / again.H[..., 2:, 2:], H[None], atol=1e-6, rtol=1e-6)
+
+
+def test_what_is_no_geometry_is_degenerate_and_says_why(points: tuple[Tensor, Tensor]) -> None:
+    geometry = fmtorch.to_colmap(fmtorch.find_fundamental(points[0][:5], points[1][:5]))
+    assert geometry.config == pycolmap.TwoViewGeometryConfiguration.DEGENERATE
+    again = fmtorch.from_colmap(geometry, 5)
+    assert not bool(again.ok[0])
+    assert again.reason == ("COLMAP calls it degenerate",)
+    with pytest.raises(ValueError, match="to_colmap takes one pair, not 2"):
+        fmtorch.to_colmap(fmtorch.find_fundamental([points[0]] * 2, [points[1]] * 2))
+
+
+def test_a_pose_of_poselib_and_back(points: tuple[Tensor, Tensor], pose: fmtorch.PoseEstimate) -> None:
+    pytest.importorskip("poselib")
+    given = fmtorch.to_poselib(pose)
+    np.testing.assert_allclose(given.R, pose.R[0].numpy(), atol=1e-12)
+    again = fmtorch.from_poselib(given, pose.inliers[0].tolist(), CALIBRATION, CALIBRATION)
+    torch.testing.assert_close(again.R, pose.R.double())
+    exact = sampson(pose.F.double(), *points)[pose.inliers]
+    torch.testing.assert_close(sampson(again.F, *points)[pose.inliers], exact, atol=1e-3, rtol=1e-3)
+    with pytest.raises(ValueError, match="the estimate has no pose"):
+        fmtorch.to_poselib(fmtorch.find_fundamental(*points))
+
+
+def test_a_real_scene_is_reconstructed(tmp_path: Path) -> None:
+    """Five images of fountain-P11: photographs -> matches and F -> COLMAP's cameras, against the laser scan's."""
+    source = shared_path("data/Strecha/fountain-P11")
+    images = tmp_path / "images"
+    images.mkdir()
+    for path in sorted((source / "Images").iterdir())[2:7]:
+        (images / path.name).symlink_to(path)
+    options = ["features.max_features=2500", "estimator=lmeds", "estimator.hypotheses=300"]
+    pipeline = load_pipeline("sift_ratio", overrides=options)
+    kept = io.MatchStore(tmp_path / "export", images)
+    pairs = chosen_pairs(images, images_below(images), None)
+    work = FolderMatches(pipeline, kept, folder_workers(pipeline), 1600, True, 0)
+    assert len(list(work.each(pairs))) == len(pairs)
+    assert not work.troubles
+    io.write_exports(kept, pairs, ("colmap",), tmp_path, shared_camera=True)
+    model = mapped(tmp_path / io.DATABASE, tmp_path)
+    cameras = np.loadtxt(source / "Camera.txt")
+    names = [f"{i:08d}.jpg" for i in range(len(cameras))]
+    R, t = cameras[:, 9:18].reshape(-1, 3, 3), cameras[:, 18:]
+    turn, shift = errors(model, names, list(R), np.einsum("nji,nj->ni", -R, t))
+    assert model.num_reg_images() == 5
+    (camera,) = model.cameras.values()
+    assert camera.focal_length == pytest.approx((cameras[0, 0] + cameras[0, 4]) / 2, rel=0.02)
+    assert shift < 0.01
+    assert turn < 1.5  # the principal point, which stays in the middle, is off by 10 px of 1380

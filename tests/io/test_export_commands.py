@@ -114,21 +114,6 @@ def test_pairs_that_look_alike(images: Path, tmp_path: Path, capsys: pytest.Capt
     assert re.search("[234] of 4 pairs taken from an earlier run", capsys.readouterr().out)
 
 
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("a.png\n", "line 1: 'a.png'; it must be the names of two images"),
-        ("# two\n\na.png a.png\n", "line 3: 'a.png a.png'; it must be"),
-        ("a.png nowhere.png\n", "line 1: no image nowhere.png in "),
-        ("\n", "names no pair"),
-    ],
-)
-def test_lists_of_pairs_that_are_none(text: str, said: str, images: Path, tmp_path: Path) -> None:
-    (tmp_path / "pairs.txt").write_text(text)
-    with pytest.raises(ValueError, match=said):
-        chosen_pairs(images, images_below(images), tmp_path / "pairs.txt")
-
-
 def test_lists_of_pairs(images: Path, tmp_path: Path) -> None:
     paths = images_below(images)
     assert [path.relative_to(images).as_posix() for path in paths] == ["a.png", "b.png", "more/c.png", "other.png"]
@@ -138,6 +123,15 @@ def test_lists_of_pairs(images: Path, tmp_path: Path) -> None:
     assert [(a.name, b.name) for a, b in chosen] == [("b.png", "a.png"), ("a.png", "other.png")]
     with pytest.raises(ValueError, match=r"list\.txt: no such file; it must be exhaustive, sequential:N, .* file"):
         chosen_pairs(images, paths, tmp_path / "list.txt")
+    for text, said in {
+        "a.png\n": "line 1: 'a.png'; it must be the names of two images",
+        "# two\n\na.png a.png\n": "line 3: 'a.png a.png'; it must be",
+        "a.png nowhere.png\n": "line 1: no image nowhere.png in ",
+        "\n": "names no pair",
+    }.items():
+        (tmp_path / "pairs.txt").write_text(text)
+        with pytest.raises(ValueError, match=said):
+            chosen_pairs(images, paths, tmp_path / "pairs.txt")
 
 
 @pytest.mark.parametrize(
@@ -159,7 +153,6 @@ def test_mistakes_are_told(words: list[str], said: str, images: Path, monkeypatc
 
 
 def test_an_evaluation_and_its_way_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What an evaluation exports, also after it has ended, and what that is as a data set."""
     root = draw_set(tmp_path / "Set", pairs=[(0, 1), (0, 2), (1, 2)])
     camera = np.concatenate([[300, 0, 160, 0, 300, 120, 0, 0, 1], np.eye(3).ravel()])
     np.savetxt(root / "scene" / "Camera.txt", [np.concatenate([camera, [-i, 0, 0]]) for i in range(3)])

@@ -21,7 +21,6 @@ from fmtorch.evaluation.statistics import summarize
 from fmtorch.evaluation.tables import summary_markdown
 from fmtorch.io import H5Pairs, oanet
 from fmtorch.pipeline import Outcome, Pipeline, load_pipeline
-from fmtorch.pruning import ratio_test
 from fmtorch.runs import to_table
 from tests.geometry.scenes import scene
 from tests.helpers import unused
@@ -80,23 +79,6 @@ def test_what_was_written_is_read(layout: str, swapped: bool, tmp_path: Path) ->
         else:
             assert c.size0.tolist() == [list(writers.SIZE)]
     assert (c.mutual is not None) == (layout == "oanet")
-
-
-@pytest.mark.parametrize("layout", writers.WRITERS)
-def test_estimators_pruners_and_metrics_work_on_it(layout: str, tmp_path: Path) -> None:
-    dataset = load(layout, tmp_path)
-    pruner: dict[str, Any] = {}
-    if layout != "posebench":  # which says nothing of how good a match is
-        pruner["one_to_one"] = presets.build("pruner", "one_to_one")
-    if layout in WITH_RATIOS:
-        pruner["ratio"] = lambda c: c.keep(ratio_test(c.ambiguity, 0.8))
-    for row in evaluate(pipeline(**pruner).run(list(dataset))):
-        assert row.ok, row.reason
-        assert row.nsgd < 0.02
-        assert row.rotation_error is not None
-        assert row.rotation_error < 2
-        assert row.corrs_before <= writers.N + 10
-        assert (row.seconds_features is None) or np.isnan(row.seconds_features)
 
 
 def test_the_origin_can_be_told(tmp_path: Path) -> None:
@@ -285,21 +267,13 @@ def test_the_pipeline_of_given_matches_estimates_as_the_function_does(tmp_path: 
     assert torch.equal(outcome.estimate.F, alone.F)
 
 
-def tutorial_with_images(tmp_path: Path, shape: tuple[int, ...], *, flat: bool) -> tuple[Path, Path]:
-    """A data set of two scenes with the same names of images, and a folder of images of all names."""
-    root, images = writers.WRITERS["ransac_tutorial"](tmp_path / "ransac_tutorial"), tmp_path / "images"
-    shutil.copytree(root / "church", root / "temple")
-    names = {image.path.name for pair in reload("ransac_tutorial", root) for image in (pair.image0, pair.image1)}
-    for folder in (images,) if flat else (images / "church", images / "temple"):
-        folder.mkdir(parents=True)
-        for name in names:
-            cv2.imwrite(str(folder / f"{name}.png"), np.zeros(shape, np.uint8))
-            (folder / f"{name}.png").rename(folder / name)
-    return root, images
-
-
 def test_one_file_is_no_image_of_two_scenes(tmp_path: Path) -> None:
-    root, images = tutorial_with_images(tmp_path, writers.SIZE, flat=True)
+    root, images = writers.write_tutorial(tmp_path / "ransac_tutorial"), tmp_path / "images"
+    shutil.copytree(root / "church", root / "temple")  # with the same names of images
+    images.mkdir()
+    for name in {image.path.name for pair in reload("ransac_tutorial", root) for image in (pair.image0, pair.image1)}:
+        cv2.imwrite(str(images / f"{name}.png"), np.zeros(writers.SIZE, np.uint8))
+        (images / f"{name}.png").rename(images / name)
     with pytest.raises(DataError, match="would stand for images of the scenes church and temple: give each a folder"):
         reload("ransac_tutorial", root, images=images)
     with pytest.raises(DataError, match=r"images=.*nowhere: no such folder"):

@@ -20,7 +20,6 @@ SIZE = (800, 1000)  # (h, w)
 
 
 def scenes() -> list[Scene]:
-    """Some pairs, each of another number of matches."""
     return [scene(N + 5 * i, i, noise=0.3) for i in range(PAIRS)]
 
 

@@ -16,29 +16,13 @@ import fmtorch
 from fmtorch import presets
 from fmtorch.core import collate
 from fmtorch.data import read_image
-from fmtorch.jobs import (
-    DEATH,
-    Execution,
-    Factory,
-    Local,
-    TaskRunner,
-    WorkerPool,
-    WorkersLost,
-    available,
-    in_order,
-    mapped,
-    one_thread,
-)
+from fmtorch.jobs import DEATH, Execution, Factory, Local, TaskRunner, WorkerPool, WorkersLost, in_order, mapped
 from tests.helpers import draw, pair
 from tests.helpers import small_pipeline as pipeline
 from tests.jobs.work import ends, fails, late, make_needs, slow, squares
 from tests.laws import scene
 
 PROCESSES = Execution("processes", 2)
-
-
-def parts(numbers: list[int]) -> list[list[int]]:
-    return [[number] for number in numbers]
 
 
 def calls(
@@ -54,7 +38,7 @@ def calls(
         reasons.update(dict.fromkeys(job, reason))
 
     source: Any = Local(make()) if execution.shared else Factory(make)
-    options = {"give_up": give_up, "split": parts, **options}
+    options = {"give_up": give_up, "split": lambda numbers: [[number] for number in numbers], **options}
     with WorkerPool(execution) as pool:
         yielded = list(TaskRunner(pool, source, squares, keep, **options).each(jobs))
     return results, reasons, yielded
@@ -224,9 +208,9 @@ def test_items_are_mapped_in_order_by_threads_that_share_no_more(threads: int) -
 
     def meet(item: int) -> tuple[int, int, int]:
         together.wait()  # for as many as there are threads
-        return item, torch.get_num_threads(), available()
+        return item, torch.get_num_threads(), fmtorch.jobs.available()
 
-    with one_thread("cpu"):
+    with fmtorch.jobs.one_thread("cpu"):
         assert mapped(meet, range(6)) == [(i, 1, 1) for i in range(6)]
     torch.set_num_threads(1)
     here = threading.get_ident()

@@ -7,6 +7,8 @@ import time
 from pathlib import Path
 from typing import Any
 
+SLOW_SECONDS = 0.3  # of each batch of a slow pipeline, so that there is time to kill its workers
+
 
 def make_needs(folder: Path, size: int = 0) -> tuple[Path, bytes]:
     """What workers need; each process that makes it leaves a file."""
@@ -42,3 +44,51 @@ def slow(event: threading.Event, job: int) -> int:
 def late(value: None, job: int) -> int:
     time.sleep(0.05 if job % 3 == 0 else 0)
     return -job
+
+
+def given_pipeline() -> Any:
+    from fmtorch.pipeline import load_pipeline
+
+    return load_pipeline("given_fmtorch")
+
+
+class Slow:
+    model = "fundamental"
+
+    def __init__(self, estimator: Any) -> None:
+        self.estimator = estimator
+
+    def __call__(self, c: Any, seed: int = 0) -> Any:
+        time.sleep(SLOW_SECONDS)
+        return self.estimator(c, seed)
+
+
+def slow_pipeline() -> Any:
+    pipeline = given_pipeline()
+    pipeline.estimator = Slow(pipeline.estimator)
+    return pipeline
+
+
+def sift_pipeline() -> Any:
+    from fmtorch.pipeline import load_pipeline
+
+    options = ["features.max_features=300", "estimator=lmeds", "estimator.hypotheses=30"]
+    return load_pipeline("sift_ratio", overrides=options)
+
+
+class Fatal:
+    """An extractor that ends its process at the darkest image."""
+
+    def __init__(self, extractor: Any) -> None:
+        self.extractor = extractor
+
+    def __call__(self, image: Any) -> Any:
+        if not image.any():
+            os.kill(os.getpid(), signal.SIGKILL)
+        return self.extractor(image)
+
+
+def fatal_pipeline() -> Any:
+    pipeline = sift_pipeline()
+    pipeline.extractor = Fatal(pipeline.extractor)
+    return pipeline

@@ -3,7 +3,6 @@
 import itertools
 import json
 import os
-import signal
 import threading
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -17,13 +16,12 @@ import pytest
 import torch
 
 from fmtorch.core import Features
-from fmtorch.data import ImageSource, read_image
-from fmtorch.features.describe import image_vector
+from fmtorch.data import ImageSource
 from fmtorch.io import MatchStore
 from fmtorch.jobs import DEATH, Execution, WorkerPool, WorkersLost
-from fmtorch.pipeline import FolderMatches, Pipeline, chosen_pairs, folder, folder_workers, images_below, load_pipeline
-from tests.conftest import shared_path
+from fmtorch.pipeline import FolderMatches, Pipeline, chosen_pairs, folder, folder_workers, images_below
 from tests.helpers import draw
+from tests.jobs.work import fatal_pipeline, sift_pipeline
 
 
 class Recorded(Executor):
@@ -49,14 +47,10 @@ def threads(count: int) -> Execution:
     return Execution("threads", count)
 
 
-def built() -> Pipeline:
-    options = ["features.max_features=300", "estimator=lmeds", "estimator.hypotheses=30"]
-    return load_pipeline("sift_ratio", overrides=options)
-
-
 @pytest.fixture
 def pipeline() -> Pipeline:
-    return built()
+    built: Pipeline = sift_pipeline()
+    return built
 
 
 @pytest.fixture
@@ -74,14 +68,6 @@ def kept(output: Path) -> dict[str, dict[str, Any]]:
     return {path.name: dict(np.load(path)) for path in files}
 
 
-def expect_same(output: Path, other: Path) -> None:
-    stored, expected = kept(output), kept(other)
-    assert stored.keys() == expected.keys()
-    for file, arrays in expected.items():
-        for key, value in arrays.items():
-            np.testing.assert_array_equal(stored[file][key], value)
-
-
 def test_any_number_of_workers_and_any_executor_keep_the_same(pipeline, images, tmp_path):
     pairs = list(itertools.combinations(images[:4], 2))
     executor = Recorded()
@@ -94,7 +80,7 @@ def test_any_number_of_workers_and_any_executor_keep_the_same(pipeline, images, 
     assert Counter(executor.calls) == {"Photograph": 4, "DescribedPair": 6}
     assert len(kept(tmp_path / "one")) == 10
     for name in ("three", "own"):
-        expect_same(tmp_path / name, tmp_path / "one")
+        np.testing.assert_equal(kept(tmp_path / name), kept(tmp_path / "one"))
 
 
 @pytest.mark.parametrize("send", [False, True])
@@ -102,10 +88,10 @@ def test_processes_keep_the_same(pipeline: Pipeline, images: list[Path], tmp_pat
     pairs = list(itertools.combinations(images[:4], 2))
     list(work(pipeline, images, tmp_path / "threads").each(pairs))
     with folder_workers(pipeline, Execution("processes", 2, send_images=send)) as workers:
-        matches = work(pipeline, images, tmp_path / "processes", workers=workers, build=built)
+        matches = work(pipeline, images, tmp_path / "processes", workers=workers, build=sift_pipeline)
         list(matches.each(pairs))
     assert (matches.done, matches.troubles) == (6, [])
-    expect_same(tmp_path / "processes", tmp_path / "threads")
+    np.testing.assert_equal(kept(tmp_path / "processes"), kept(tmp_path / "threads"))
 
 
 def test_no_image_is_described_twice(pipeline, images, tmp_path, monkeypatch):
@@ -146,28 +132,10 @@ def test_workers_that_died_end_the_work(pipeline: Pipeline, images: list[Path], 
     assert kept(tmp_path / "out") == {}
 
 
-class Fatal:
-    """An extractor that ends its process at the darkest image."""
-
-    def __init__(self, extractor: Any) -> None:
-        self.extractor = extractor
-
-    def __call__(self, image: Any) -> Any:
-        if not image.any():
-            os.kill(os.getpid(), signal.SIGKILL)
-        return self.extractor(image)
-
-
-def fatal() -> Pipeline:
-    pipeline = built()
-    pipeline.extractor = Fatal(pipeline.extractor)
-    return pipeline
-
-
 def test_an_image_that_ends_its_workers_is_told_and_the_others_are_matched(pipeline, images, tmp_path):
     assert cv2.imwrite(str(images[1]), np.zeros((240, 320), np.uint8))
-    with folder_workers(pipeline, Execution("processes", 2)) as workers:
-        matches = work(pipeline, images[:4], tmp_path / "out", workers=workers, build=fatal)
+    with folder_workers(pipeline, Execution("processes", 1)) as workers:
+        matches = work(pipeline, images[:4], tmp_path / "out", workers=workers, build=fatal_pipeline)
         assert len(list(matches.each(list(itertools.combinations(images[:4], 2))))) == 6
     assert (matches.done, matches.troubles) == (3, [DEATH])
 
@@ -239,13 +207,9 @@ def test_sequential_pairs_follow_the_natural_order_of_names(tmp_path: Path) -> N
     numbers = [tuple(int(image.stem.removeprefix("frame")) for image in pair) for pair in pairs]
     assert numbers == [(1, 2), (1, 9), (2, 9), (2, 10), (9, 10), (9, 11), (10, 11)]
     assert len(chosen_pairs(tmp_path, images, Path("sequential:100"))) == 10
-
-
-@pytest.mark.parametrize("pairs", ["sequential", "sequential:0", "sequential:-1", "sequential:x", "sequential:1.5"])
-def test_a_wrong_number_of_neighbours_is_told(pairs: str, tmp_path: Path) -> None:
-    images = [picture(tmp_path / "a.jpg"), picture(tmp_path / "b.jpg")]
-    with pytest.raises(ValueError, match="it must be sequential:N with a whole number N of at least 1"):
-        chosen_pairs(tmp_path, images, Path(pairs))
+    for wrong in ("", ":0", ":-1", ":x", ":1.5"):
+        with pytest.raises(ValueError, match="it must be sequential:N with a whole number N of at least 1"):
+            chosen_pairs(tmp_path, images, Path(f"sequential{wrong}"))
 
 
 def test_folders_of_one_name_have_outputs_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -288,15 +252,3 @@ def test_an_image_that_cannot_be_read_has_no_vector() -> None:
     vectors = folder.vectors_of([None, described], lambda descriptors: descriptors[0])
     assert vectors.tolist() == [[0.0] * 7, [1.0] * 7]
     assert folder.vectors_of([None], lambda descriptors: descriptors[0]).shape == (1, 1)
-
-
-def test_scenes_are_told_apart() -> None:
-    """Four images of each of three real scenes: none is most like an image of another scene."""
-    folders = [shared_path(f"data/{name}/Images") for name in ("Strecha/fountain-P11", "KITTI/00", "TUM/fr1_rpy")]
-    images = [path for place in folders for path in sorted(place.iterdir())[:4]]
-    sift = load_pipeline("sift_ratio", overrides=["features.max_features=1500"])
-    described = [folder.describe(sift, read_image(image), 800) for image in images]
-    vectors = folder.vectors_of(described, lambda descriptors: image_vector(descriptors, "sift"))
-    pairs = folder.similar_pairs(images, vectors, 1)
-    assert len(pairs) >= 6
-    assert all(a.parent == b.parent for a, b in pairs)

@@ -2,8 +2,6 @@
 
 import itertools
 import math
-import random
-from collections.abc import Sequence
 
 import numpy as np
 from scipy.integrate import trapezoid
@@ -165,17 +163,3 @@ def pose_map(errors: list[float], thresholds: tuple[float, ...]) -> list[float]:
 def pose_maa(errors: list[float]) -> float:
     """Mean average accuracy to 10 degrees as the RANSAC tutorial (CVPR 2020) computes it."""
     return float(np.mean([np.mean([e <= t for e in errors]) for t in np.linspace(1.0, 10, 10)]))
-
-
-def bootstrap_interval(values: Sequence[float], clusters: Sequence[str], resamples: int) -> tuple[float, float]:
-    """The 2.5 % and 97.5 % points of the mean over resampled clusters."""
-    members: dict[str, list[float]] = {}
-    for value, cluster in zip(values, clusters, strict=True):
-        members.setdefault(cluster, []).append(value)
-    rng = random.Random(0)
-    names, means = list(members), []
-    for _ in range(resamples):
-        drawn = [value for name in rng.choices(names, k=len(names)) for value in members[name]]
-        means.append(sum(drawn) / len(drawn))
-    means.sort()
-    return means[int(0.025 * resamples)], means[int(0.975 * resamples)]

@@ -262,10 +262,6 @@ def numbered_row(key: int) -> PairRow:
     return PairRow(f"scene/{key}", key, "family", "scene", ok=False, reason=f"reason {key}", corrs=key)
 
 
-def keys(folder: RunFolder) -> list[int]:
-    return [int(key) for key in folder.read()["key"].to_numpy()]
-
-
 def test_few_parts_are_left_of_many_batches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(parts_module, "MERGED", 6)
     folder = RunFolder.open(tmp_path / "run", IDENTITY)
@@ -273,7 +269,7 @@ def test_few_parts_are_left_of_many_batches(tmp_path: Path, monkeypatch: pytest.
     for batch in range(batches):
         folder.append([numbered_row(2 * batch), numbered_row(2 * batch + 1)])
     assert len(part_files(folder.path / "pairs")) == 2 + 3 + 5
-    assert (keys(folder), folder.done()) == (list(range(2 * batches)), set(range(2 * batches)))
+    assert (folder.read()["key"].to_pylist(), folder.done()) == (list(range(2 * batches)), set(range(2 * batches)))
     assert RunFolder.load(folder.path).read()["reason"][7].as_py() == "reason 7"
 
 

@@ -1,17 +1,19 @@
-"""Benchmarks with programs of their own: related pairs, planes, cameras, verified databases."""
+"""Benchmarks with programs of their own: related pairs, planes, cameras, verified databases; PoseBench by its protocol,
+on samples of its layout from real matches, beside a run written from its definitions."""
 
 import functools
 from pathlib import Path
 from typing import Any
 
 import cv2
+import h5py
 import numpy as np
 import pycolmap
 import pytest
 import torch
 from skimage import data as images
 
-from fmtorch import presets
+from fmtorch import data, presets
 from fmtorch.core import Correspondences, Estimate
 from fmtorch.data import ImagePair, ImageSource
 from fmtorch.geometry import homography_transfer
@@ -19,11 +21,15 @@ from fmtorch.scenes import PICTURES, Plan, RenderedPairs
 from fmtorch.two_view.known_cameras import KnownCameras
 from fmtorch.two_view.pair_type import classify
 from scripts.benchmark import cameras, pairs, pipelines, planes, verify
-from scripts.benchmark.cameras import LEVELS, TAKES, applies, bougnoux, calibrations, described
-from scripts.benchmark.methods import read_specs
+from scripts.benchmark.cameras import LEVELS, TAKES, applies, bougnoux, calibrations, described, options_of
+from scripts.benchmark.methods import pipeline_of, read_specs, split
 from scripts.benchmark.runner import Item, Kept, Method, Row
+from scripts.benchmark.tables import Results
 from scripts.benchmark.verify import Scene, accuracy, calibrate, centre_errors, sheets
+from tests.conftest import shared_path
 from tests.helpers import draw_set
+from tests.io.writers import posebench_group
+from tests.reference import metrics, solvers
 from tests.reference.known_cameras import fundamental
 from tests.scripts.samples import item as plain_item
 from tests.scripts.samples import pair, read, run
@@ -295,3 +301,130 @@ def test_an_interrupted_run_measures_what_is_missing(tmp_path: Path, monkeypatch
     assert means[0][5:9] == ["100.0", "50.0", "50.0", "50.0"]
     assert pairs[0][3:7] == ["walk", 1, "3", "3"]
     assert [line[3:7] for line in models] == [[m, "walk", 1, "3.0"] for m in ("incremental", "global")]
+
+
+SET, THRESHOLD = "imc_london_bridge", 0.75
+SAMPLES = 4
+PROTOCOL = {"max_epipolar_error": THRESHOLD, "max_iterations": 1000, "min_iterations": 100, "success_prob": 0.9999}
+COLMAP = {"max_error": THRESHOLD, "max_num_trials": 1000, "min_num_trials": 100, "confidence": 0.9999, "random_seed": 0}
+
+
+@functools.cache
+def real() -> list[tuple[ImagePair, Correspondences]]:
+    dataset = data.load("fmbench", root=shared_path("data/PhotoTourism"))
+    outcomes = pipeline_of("sift_ratio").correspondences([dataset[i] for i in range(SAMPLES)])
+    return [(o.pair, o.correspondences) for o in outcomes if o.correspondences is not None]
+
+
+def matched(c: Correspondences) -> tuple[np.ndarray, np.ndarray]:
+    x0, x1 = (np.ascontiguousarray(x[0][c.mask[0]].double().numpy()) for x in (c.x0, c.x1))
+    return x0, x1
+
+
+def sample(folder: Path, name: str = SET) -> Path:
+    """The real pairs as one of PoseBench's files, the last of them with three matches."""
+    folder.mkdir(parents=True)
+    with h5py.File(folder / f"{name}.h5", "w") as file:
+        for i, (pair, c) in enumerate(real()):
+            x = matched(c) if i < SAMPLES - 1 else tuple(v[:3] for v in matched(c))
+            sizes = [tuple(int(v) for v in s[0]) for s in (c.size0, c.size1)]
+            posebench_group(file, f"{i:03d}", x, (pair.K0, pair.K1), (pair.R, pair.t), tuple(sizes))
+    return folder
+
+
+def direct(method: str) -> list[float]:
+    """The larger angle of each pair: the libraries called as PoseBench calls them, judged by its definitions."""
+    errors = []
+    for true, c in real()[:-1]:
+        known = []
+        for K, ((height, width),) in ((true.K0, c.size0.tolist()), (true.K1, c.size1.tolist())):
+            params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
+            known.append({"model": "PINHOLE", "width": width, "height": height, "params": params})
+        F, R, t = called(method, matched(c), known)
+        poses = [(R, t)] if F is None else solvers.poses(true.K1.T @ F @ true.K0)
+        errors.append(max(metrics.closest_pose_error(poses, true.R, true.t)))
+    return [*errors, 180.0]  # three matches
+
+
+def called(method: str, x: Any, cameras: Any) -> Any:
+    """F or None, and R and t or None."""
+    peer = pytest.importorskip({"poselib": "poselib", "colmap": "pycolmap"}[method.partition(":")[2]])
+    if method == "E:poselib":
+        pose, _ = peer.estimate_relative_pose(*x, *cameras, {**PROTOCOL, "seed": 0}, {})
+        return None, np.asarray(pose.R), np.asarray(pose.t)
+    if method == "F:poselib":
+        return np.asarray(peer.estimate_fundamental(*x, {**PROTOCOL, "seed": 0}, {})[0]), None, None
+    own = peer.RANSACOptions(**COLMAP)
+    if method == "F:colmap":
+        return peer.estimate_fundamental_matrix(*x, own)["F"], None, None
+    pose = peer.estimate_essential_matrix(*x, *map(peer.Camera, cameras), own)["cam2_from_cam1"]
+    return None, pose.rotation.matrix(), pose.translation
+
+
+@pytest.mark.parametrize("method", ["E:poselib", "F:poselib", "E:colmap", "F:colmap"])
+def test_peers_have_the_figures_of_posebenchs_own_protocol(method, tmp_path, capsys, monkeypatch):
+    expected = direct(method)
+    rows = tmp_path / "rows.jsonl"
+    folder = sample(tmp_path / "relative")
+    printed = run(capsys, monkeypatch, "posebench", folder, "--methods", method, "--rows", rows)
+    errors = [max(each["rotation_error"], each["translation_error"]) for each in read(rows)]
+    # arccos at a cosine near 1 is exact to the root of its rounding; pixels with a central principal point, to 1e-7
+    assert errors == pytest.approx(expected, abs=1e-3)
+    areas = [100 * area for area in metrics.pose_auc(expected, (5.0, 10.0, 20.0))]
+    results = Results(read(rows))
+    assert list(cameras.areas(results, method, results.all_pairs).values()) == pytest.approx(areas, abs=0.02)
+    published = {"E:poselib": "56.6", "F:colmap": "33.0"}  # of the whole set
+    assert published.get(method, "") in printed
+    assert [each["reason"] != "" for each in read(rows)] == [False] * (SAMPLES - 1) + [True]
+
+
+def test_our_estimators_run_by_the_protocol_and_a_run_goes_on_where_it_stopped(tmp_path, capsys, monkeypatch):
+    rows, methods = tmp_path / "rows.jsonl", ["E:fmtorch", "F:fmtorch", "E:fmtorch:scaled=false"]
+    arguments = [sample(tmp_path / "relative").parent, "--methods", *methods, "--rows", rows]
+    printed = run(capsys, monkeypatch, "posebench", *arguments, "--every", 3)
+    assert "1 sets, 1 of its 20; 2 pairs" in printed
+    assert [line.split("|")[2].strip() for line in printed.splitlines() if "E:colmap" in line] == ["E:colmap"] * 2
+    first = read(rows)
+    assert len(first) == 2 * len(methods)
+    run(capsys, monkeypatch, "posebench", *arguments)
+    assert read(rows)[: len(first)] == first
+    posed = [each for each in read(rows) if not each["reason"]]
+    assert SAMPLES * len(methods) >= len(posed) >= (SAMPLES - 1) * len(methods) - 1
+    assert np.median([max(each["rotation_error"], each["translation_error"]) for each in posed]) < 5
+
+
+def test_the_protocol_gives_each_estimator_its_options() -> None:
+    def protocol(text: str, px: float) -> dict[str, Any]:
+        return options_of(*split(text.partition(":")[2]), px)
+
+    assert protocol("F:poselib", 2.5) == {
+        "threshold": 2.5, "iterations": 1000, "min_iterations": 100, "confidence": 0.9999,
+    }  # fmt: skip
+    assert [protocol(f"E:colmap{o}", 1.5)["two_view"] for o in ("", ":two_view=true")] == [False, True]
+    preset, own = presets.load("estimator", "fmtorch"), protocol("E:fmtorch", 2.0)
+    assert own["threshold"] == 2 * preset["threshold"]
+    assert own["select"]["scale"] == 2 * preset["select"]["scale"]
+    assert (own["hypotheses"], own["focal"]["rounds"] * preset["focal"]["samples"]) == (1000, 1000)
+    kept = protocol("E:fmtorch:scaled=false,focal.rounds=12", 2.0)
+    assert "threshold" not in kept
+    assert kept["focal"] == {"rounds": 12}
+    presets.build("estimator", "fmtorch", **own)
+    for wrong in ("fmtorch", "H:fmtorch", "E:nobody"):
+        with pytest.raises(SystemExit, match="write KIND:PRESET"):
+            cameras.protocol(wrong, 1.0)
+
+
+def test_what_is_not_posebenchs_is_named(tmp_path, capsys, monkeypatch):
+    own = sample(tmp_path / "own", "mine")
+    lmeds = ["--methods", "F:opencv:method=lmeds"]
+    with pytest.raises(SystemExit, match=r"mine\.h5 is none of PoseBench's sets: give its threshold in pixels"):
+        run(capsys, monkeypatch, "posebench", own)
+    assert "published" not in run(capsys, monkeypatch, "posebench", own, "--threshold", 1, *lmeds).splitlines()[2]
+    with pytest.raises(SystemExit, match=r"holds no file \.h5 or \.hdf5; give the folder `relative`"):
+        run(capsys, monkeypatch, "posebench", tmp_path)
+    with h5py.File(own / "mine.h5", "r+") as file:
+        del file["001/camera1/model"]
+        file["001/camera1/model"] = np.array(["OPENCV_FISHEYE"], dtype=h5py.string_dtype())
+    assert f" {SAMPLES - 1} pairs" in run(capsys, monkeypatch, "posebench", own, "--threshold", 1, *lmeds)
+    with pytest.raises(SystemExit, match="--root: give the threshold in pixels"):
+        run(capsys, monkeypatch, "posebench", "--root", shared_path("data/PhotoTourism"))

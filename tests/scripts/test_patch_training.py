@@ -16,6 +16,7 @@ import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 from PIL import Image
+from scipy.spatial.distance import cdist
 from torch import Tensor, nn
 
 from fmtorch.core import conf_dir, models_dir
@@ -30,7 +31,6 @@ from scripts.patch_networks.stores import tracks
 from scripts.patch_networks.train import PatchTraining, TrainingOptions, cutting_of, training_of
 from tests.features.test_networks import randomized
 from tests.reference import geodesc as geodesc_reference
-from tests.reference import patch_losses as reference
 
 PLANES = PlaneViews(views=4, tilt=15.0, scale=(0.5, 0.6))
 
@@ -133,37 +133,6 @@ def test_photographs_become_tracks_and_a_step_of_training(tmp_path: Path) -> Non
         training_of(config(*small, "training.loss.name=hardest_triplet"), network, store, {}, cpu)
 
 
-def correlations(patches: np.ndarray, point: np.ndarray) -> tuple[float, float]:
-    """Median correlation of two patches of a point, and of patches of different points."""
-    flat = patches[:, 16:48, 16:48].reshape(len(patches), -1).astype(float)
-    flat = (flat - flat.mean(1, keepdims=True)) / (flat.std(1, keepdims=True) + 1e-6)
-    first = np.searchsorted(point, np.arange(point.max() + 1))
-    a, b = flat[first], flat[first + 1]
-    return float(np.median((a * b).mean(1))), float(np.median((a * np.roll(b, 1, 0)).mean(1)))
-
-
-def test_a_store_is_complete_deterministic_and_gives_two_different_views(tmp_path, request):
-    names, cutting = stores.package_photographs()[:2], stores.Cutting(PLANES, 40, longest_side=300)
-    again = stores.build_store(tmp_path / "b", names, cutting, seed=5, workers=2)
-    request.getfixturevalue("in_threads")
-    store = stores.build_store(tmp_path / "a", names, cutting, seed=5)
-    np.testing.assert_array_equal(store.patches, again.patches)
-    np.testing.assert_array_equal(store.first, again.first)
-    assert store.first[-1] == len(store.patches)
-    assert store.description["photographs"] == {"scikit-image": 2}
-    with pytest.raises(FileExistsError, match="delete it"):
-        stores.build_store(tmp_path / "a", names, cutting, seed=5)
-    assert {p.name for p in tmp_path.iterdir()} == {"a", "b"}
-    points = torch.arange(len(store)).repeat_interleave(20)
-    draws = torch.rand(len(points), 2, generator=torch.Generator().manual_seed(0))
-    for i, (a, b) in enumerate(zip(*store.views(points, draws), strict=True)):
-        mine = torch.from_numpy(store.patches[store.first[points[i]] : store.first[points[i] + 1]].copy()).float() / 255
-        shown = [int((mine - x).abs().sum((1, 2)).argmin()) for x in (a, b)]
-        assert torch.equal(mine[shown[0]], a[0])
-        assert torch.equal(mine[shown[1]], b[0])
-        assert shown[0] != shown[1]
-
-
 @pytest.mark.usefixtures("in_threads")
 def test_an_unreadable_photograph_leaves_no_store(tmp_path: Path) -> None:
     (tmp_path / "bad.jpg").write_bytes(b"no image")
@@ -221,8 +190,11 @@ def test_keypoints_are_where_the_plane_puts_them_under_its_angles() -> None:
 
 
 def test_tracks_show_the_same_point(store: stores.PatchStore) -> None:
-    same, other = correlations(store.patches, np.repeat(np.arange(len(store)), np.diff(store.first)))
-    assert same > 0.6 > 0.3 > other
+    """By the median correlation of two patches of a point, and of patches of different points."""
+    flat = store.patches[:, 16:48, 16:48].reshape(len(store.patches), -1).astype(float)
+    flat = (flat - flat.mean(1, keepdims=True)) / (flat.std(1, keepdims=True) + 1e-6)
+    a, b = flat[store.first[:-1]], flat[store.first[:-1] + 1]
+    assert np.median((a * b).mean(1)) > 0.6 > 0.3 > np.median((a * np.roll(b, 1, 0)).mean(1))
 
 
 def unit(n: int, d: int, seed: int, noise: float = 0.3) -> tuple[Tensor, Tensor]:
@@ -242,8 +214,11 @@ def sets_of(sets: int, n: int, d: int, seed: int) -> tuple[Tensor, Tensor, Tenso
 def test_losses_are_their_definitions() -> None:
     a, b = unit(12, 4, 0)
     b[3] = a[7]  # the same patch twice is no negative
-    expected = reference.hardest_triplet(a.tolist(), b.tolist(), 1.0)
-    assert float(hardest_triplet(a, b)) == pytest.approx(expected, abs=1e-9)
+    # Mishchuk et al., NIPS 2017, section 3.1: the hardest negative of a_i among b and of b_i among a
+    distances = cdist(a, b)
+    others = np.where(np.eye(12, dtype=bool) | (distances < 0.008), np.inf, distances)
+    hinges = np.maximum(0, 1 + distances.diagonal() - np.minimum(others.min(0), others.min(1)))
+    assert float(hardest_triplet(a, b)) == pytest.approx(hinges.mean(), abs=1e-9)
 
 
 def test_the_loss_of_match_sets_is_its_definition() -> None:
@@ -272,12 +247,12 @@ def random_tracks(seed: int) -> tuple[stores.PatchStore, dict[tuple[int, int], f
         first.append(len(views))
     rays = rng.normal(size=(len(views), 3)) * 0.2 + [0, 0, 1]
     rays = (rays / np.linalg.norm(rays, axis=1, keepdims=True)).astype(np.float32)
-    incidence = rng.uniform(0, 40, len(views)).astype(np.float32)
+    incidence = np.degrees(np.arccos(rays[:, 2])).astype(np.float32)  # of a surface that faces z
     similarity = {}
     for begin, end in itertools.pairwise(first):
         for i, j in itertools.combinations(range(begin, end), 2):
-            value = stores.patch_similarity(rays[[i]], rays[[j]], incidence[[i]], incidence[[j]])[0]
-            similarity[names[i], names[j]] = float(value)
+            seen = geodesc_reference.patch_similarity((0, 0, 0), (0, 0, 1), rays[i].tolist(), rays[j].tolist())
+            similarity[names[i], names[j]] = seen
     patches = np.zeros((len(views), 1, 1), np.uint8)
     return stores.PatchStore(patches, np.array(first), np.array(views), rays, incidence, {}), similarity
 
@@ -331,9 +306,12 @@ def exact_int8(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def exported(name: str, folder: Path, patches: Tensor) -> tuple[Path, Path]:
-    """A network of random weights in fp32 and int8, in the layouts that torch and the quantisation leave."""
-    fp32, int8 = folder / "fp32.onnx", folder / "int8.onnx"
-    export(randomized(build(name)), fp32)
+    """A network of random weights in fp32, which is torch's, and int8, as torch and the quantisation lay them out."""
+    fp32, int8, network = folder / "fp32.onnx", folder / "int8.onnx", randomized(build(name))
+    if name == "l2net":
+        network.pixel_mean.copy_(patches.mean(0, keepdim=True))
+    export(network, fp32)
+    torch.testing.assert_close(PatchNetwork(fp32, batch=40)(patches), network(patches).detach(), atol=1e-4, rtol=0)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("scripts.patch_networks.onnx_export.lay_out", lambda path: None)
         quantize(fp32, int8, patches)

@@ -12,27 +12,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from jaxtyping import TypeCheckError
 
+from fmtorch import training
 from fmtorch.core import Correspondences
 from fmtorch.data import DepthDataset, ImageError, ImagePair, ImageSource
 from fmtorch.geometry import symmetric_max
-from fmtorch.scenes import Camera, RenderedPairs, calibration, fundamental, look_at, relative_pose, skimage_file
-from fmtorch.training import (
-    Augmentation,
-    LabelledMatches,
-    MatchedPairs,
-    Photograph,
-    PlanePairs,
-    PlaneViews,
-    collate,
-    crop,
-    keep_ratio,
-    move,
-    plane_homography,
-    random_camera,
-    rotate,
-    swap,
-)
+from fmtorch.scenes import RenderedPairs, calibration, fundamental, look_at, relative_pose, skimage_file
+from fmtorch.training import Augmentation, LabelledMatches, PlanePairs, PlaneViews, crop, keep_ratio, rotate, swap
 from fmtorch.training.labelled import EDGE_PX, by_line, by_transfer, depths, label, line_distance, transfer_error
+from tests.helpers import same
 from tests.reference import labels as reference
 from tests.training.conftest import SIFT, exact
 
@@ -48,13 +35,6 @@ CHANGES: dict[str, Callable[[LabelledMatches], LabelledMatches]] = {
 NOISELESS = Augmentation(noise=None, matches=None)
 ALWAYS = Augmentation(swap=1, quarter_turn=0.5, turn=0.5, angle=180, crop=1, thin=1, noise=(1, 2), matches=(50, 60))
 ONLY = Augmentation.none()
-
-
-def same(a: LabelledMatches, b: LabelledMatches) -> bool:
-    fields = [f.name for f in dataclasses.fields(a.correspondences) if getattr(a.correspondences, f.name) is not None]
-    pairs = [(a.F, b.F), (a.label, b.label)]
-    pairs += [(getattr(a.correspondences, name), getattr(b.correspondences, name)) for name in fields]
-    return all(torch.equal(x, y) for x, y in pairs)
 
 
 def expect_truth(m: LabelledMatches) -> None:
@@ -150,7 +130,7 @@ def test_ratio_noise_and_two_swaps() -> None:
     with pytest.raises(ValueError, match="ratio"):
         keep_ratio(m.replace(correspondences=c.replace(ratio=None)), 0.8)
     step0, step1 = torch.full_like(c.x0, 0.5), torch.full_like(c.x1, -2.0)
-    moved = move(m, step0, step1).correspondences
+    moved = training.move(m, step0, step1).correspondences
     torch.testing.assert_close(moved.x0 - c.x0, step0)
     torch.testing.assert_close(moved.lafs1[..., 2] - c.lafs1[..., 2], step1)
     assert torch.equal(moved.lafs1[..., :2], c.lafs1[..., :2])
@@ -195,15 +175,6 @@ def test_ranges_are_kept() -> None:
         assert abs(float(steps.mean())) < 4 * 0.5 / np.sqrt(len(steps))
     assert ONLY(m, seed=0, count=70).label.shape[1] == 70
     assert ONLY(m, seed=0, count=7000).label.shape[1] == 600
-
-
-def test_mistakes_are_named() -> None:
-    turns = {"turn": 0.6, "quarter_turn": 0.6}
-    for options, message in (({"swap": 2}, "swap is 2"), (turns, "exclude"), ({"ratio": (1.0, 0.8)}, "ratio is")):
-        with pytest.raises(ValueError, match=message):
-            Augmentation(**options)
-    with pytest.raises(ValueError, match="batch of 2"):
-        Augmentation()(exact(pairs=2), seed=0)
 
 
 SIZE = (240, 320)
@@ -268,7 +239,7 @@ def test_masked_slots_have_no_label_and_labels_move_with_their_matches() -> None
 
 def test_collate_pads_and_indexing_takes_apart() -> None:
     items = [exact(seed, n=n) for seed, n in enumerate((7, 3, 5))]
-    batch = collate(items)
+    batch = training.collate(items)
     assert (batch.label.shape, batch.correspondences.count().tolist()) == ((3, 7), [7, 3, 5])
     assert (batch.label[1, 3:] == -1).all()
     for mine, item in zip(batch, items, strict=True):
@@ -277,9 +248,9 @@ def test_collate_pads_and_indexing_takes_apart() -> None:
         assert torch.equal(mine.F, item.F)
         assert torch.equal(mine.correspondences.lafs1, item.correspondences.lafs1)
     assert len(batch[torch.tensor([True, False, True])]) == 2
-    assert len(collate([batch, items[0]])) == 4
+    assert len(training.collate([batch, items[0]])) == 4
     with pytest.raises(ValueError, match="at least one"):
-        collate([])
+        training.collate([])
 
 
 def test_shapes_are_checked() -> None:
@@ -365,40 +336,32 @@ def test_rendered_labels_equal_the_scalar_reference(rendered: RenderedPairs) -> 
 PLANE_SIZE = (300, 400)
 
 
-def cameras(count: int, limits: PlaneViews | None = None) -> list[Camera]:
-    return [random_camera(np.random.default_rng(seed), PLANE_SIZE, limits or PlaneViews()) for seed in range(count)]
-
-
-def on_plane(x: np.ndarray) -> np.ndarray:
-    """Points of the photograph in the world: its longest side is 1, its middle the origin."""
-    h, w = PLANE_SIZE
-    return np.column_stack([(x - np.array([(w - 1) / 2, (h - 1) / 2])) / max(h, w), np.zeros(len(x))])
+@pytest.fixture(scope="module")
+def photographs() -> list[training.Photograph]:
+    return [training.Photograph(skimage_file(name), "scikit-image") for name in ("chelsea.png", "rocket.jpg")]
 
 
 @pytest.fixture(scope="module")
-def photographs() -> list[Photograph]:
-    return [Photograph(skimage_file(name), "scikit-image") for name in ("chelsea.png", "rocket.jpg")]
-
-
-@pytest.fixture(scope="module")
-def planes(photographs: list[Photograph], tmp_path_factory: pytest.TempPathFactory) -> PlanePairs:
+def planes(photographs: list[training.Photograph], tmp_path_factory: pytest.TempPathFactory) -> PlanePairs:
     return PlanePairs(photographs, PlaneViews(views=3), root=tmp_path_factory.mktemp("planes"))
 
 
 def test_the_homography_is_the_cameras_projection() -> None:
     x = np.random.default_rng(0).uniform(0, 299, (50, 2))
-    for camera in cameras(20):
-        there, depth = camera.project(on_plane(x))
-        by_homography = cv2.perspectiveTransform(x[None], plane_homography(camera, PLANE_SIZE))[0]
+    for seed in range(20):
+        camera = training.random_camera(np.random.default_rng(seed), PLANE_SIZE, PlaneViews())
+        # Its longest side is 1, its middle the origin.
+        plane = np.c_[(x - (np.array(PLANE_SIZE[::-1]) - 1) / 2) / max(PLANE_SIZE), np.zeros(len(x))]
+        there, depth = camera.project(plane)
+        by_homography = cv2.perspectiveTransform(x[None], training.plane_homography(camera, PLANE_SIZE))[0]
         assert np.allclose(there, by_homography, atol=1e-8)
         assert (depth > 0).all()
 
 
 def test_matches_are_judged_by_the_homography(planes: PlanePairs, tmp_path: Path) -> None:
-    """Labels by depth are those of the map between the views, and SIFT finds enough right matches."""
     assert isinstance(planes, DepthDataset)
     assert len(planes) == 2 * 3
-    matched = MatchedPairs(planes, **SIFT, root=tmp_path, workers=1)
+    matched = training.MatchedPairs(planes, **SIFT, root=tmp_path, workers=1)
     by_key = {pair.key: pair for pair in planes}
     right = 0
     for i, about in enumerate(matched.pairs):
@@ -423,7 +386,7 @@ def between_views(planes: PlanePairs, pair: ImagePair) -> np.ndarray:
     return cv2.getPerspectiveTransform(x.astype(np.float32), (there[:, :2] / there[:, 2:]).astype(np.float32))
 
 
-def test_views_are_drawn_once_and_depend_on_what_defines_them(photographs: list[Photograph], tmp_path: Path) -> None:
+def test_views_are_drawn_once_and_depend_on_what_defines_them(photographs, tmp_path):
     def views(root: Path) -> dict[str, bytes]:
         return {str(path.relative_to(root)): path.read_bytes() for path in root.rglob("*.jpg")}
 
@@ -439,13 +402,17 @@ def test_views_are_drawn_once_and_depend_on_what_defines_them(photographs: list[
     assert other.digest != first.digest
 
 
-def test_mistakes_in_planes_are_named(tmp_path: Path) -> None:
+def test_mistakes_are_named(tmp_path: Path) -> None:
+    turns = {"turn": 0.6, "quarter_turn": 0.6}
+    for options, message in (({"swap": 2}, "swap is 2"), (turns, "exclude"), ({"ratio": (1.0, 0.8)}, "ratio is")):
+        with pytest.raises(ValueError, match=message):
+            Augmentation(**options)
+    with pytest.raises(ValueError, match="batch of 2"):
+        Augmentation()(exact(pairs=2), seed=0)
     with pytest.raises(ValueError, match="no photographs"):
         PlanePairs([], root=tmp_path)
     (tmp_path / "notes.jpg").write_text("not an image")
     with pytest.raises(ImageError, match=r"notes\.jpg"):
-        PlanePairs([Photograph(tmp_path / "notes.jpg", "x")], root=tmp_path)
-    with pytest.raises(ValueError, match=r"planes\.views=1; a pair needs 2"):
-        PlaneViews(views=1)
+        PlanePairs([training.Photograph(tmp_path / "notes.jpg", "x")], root=tmp_path)
     with pytest.raises(ValueError, match=r"planes\.part=\[1\.0, 0\.5\]"):
         PlaneViews(part=(1.0, 0.5))

@@ -17,25 +17,13 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
-from fmtorch import presets
+from fmtorch import presets, training
 from fmtorch.data import DataError, ImagePair, ImageSource, load
 from fmtorch.pipeline import Pipeline, load_pipeline
 from fmtorch.pruning import LC
 from fmtorch.pruning.networks.learned import predict
-from fmtorch.scenes import FAMILIES, PLANS, RenderedPairs, Task
-from fmtorch.training import (
-    Augmentation,
-    Draw,
-    LabelledMatches,
-    MatchedPairs,
-    OANetPairs,
-    Objective,
-    SimilarLengthBatches,
-    StoredMatches,
-    collate,
-    collate_trimmed,
-    split_scenes,
-)
+from fmtorch.scenes import FAMILIES, RenderedPairs
+from fmtorch.training import MatchedPairs, OANetPairs, SimilarLengthBatches, collate, collate_trimmed
 from fmtorch.training.labelled import label
 from fmtorch.training.stored_matches import SCHEMA, Shard, ShardError, write_shard
 from tests.io import writers
@@ -162,14 +150,13 @@ def test_pairs_that_fail_are_left_out_and_told(rendered: RenderedPairs, tmp_path
 
 
 def test_workers_of_a_loader_read_what_this_process_reads(matched: MatchedPairs) -> None:
-    pairs = StoredMatches(matched.folder, augmentation=Augmentation(), seed=5)
+    pairs = training.StoredMatches(matched.folder, augmentation=training.Augmentation(), seed=5)
     assert torch.equal(pairs[0].label, pairs[0].label)  # files are open when the workers start
     assert len(pickle.dumps(pairs)) < 1000 * len(pairs) + 5000
     batches = SimilarLengthBatches(pairs, 3, seed=1)
     batches.set_epoch(2)
-    options: dict[str, Any] = {"num_workers": 1, "multiprocessing_context": "spawn"}
-    loader = DataLoader(pairs, batch_sampler=batches, collate_fn=collate_trimmed, **options)
-    loaded = list(loader)
+    sent = pickle.loads(pickle.dumps(pairs))  # as processes get them that are not forked
+    loaded = list(DataLoader(sent, batch_sampler=batches, collate_fn=collate_trimmed, num_workers=1))
     assert len(loaded) == len(batches)
     for draws, batch in zip(batches, loaded, strict=True):
         expected = collate_trimmed([pairs[draw] for draw in draws])
@@ -179,14 +166,14 @@ def test_workers_of_a_loader_read_what_this_process_reads(matched: MatchedPairs)
 
 
 def test_validation_scenes_are_the_last_of_each_family(matched: MatchedPairs) -> None:
-    training, validation = split_scenes(matched, last=1)
-    assert len(training) + len(validation) == len(matched)
-    parts = [{about["scene"] for about in part.pairs} for part in (training, validation)]
+    first, validation = training.split_scenes(matched, last=1)
+    assert len(first) + len(validation) == len(matched)
+    parts = [{about["scene"] for about in part.pairs} for part in (first, validation)]
     assert parts == [{"indoor-train-000"}, {"indoor-train-001"}]
     where = [about["identity"] for about in matched.pairs].index(validation.pairs[0]["identity"])
     assert torch.equal(validation[0].label, matched[where].label)
     with pytest.raises(ValueError, match="2 scenes"):
-        split_scenes(matched)
+        training.split_scenes(matched)
 
 
 def rows(n: int = 5) -> list[dict[str, Any]]:
@@ -286,7 +273,7 @@ def test_the_training_loop_of_the_page_runs(rendered, cache, tmp_path, monkeypat
     assert first.label.shape == first.correspondences.mask.shape
 
 
-class Pairs(StoredMatches):
+class Pairs(training.StoredMatches):
     """Pairs of which only the lengths are known, as various as those of the rendered scenes."""
 
     def __init__(self, n: int = 300) -> None:
@@ -299,7 +286,7 @@ class Pairs(StoredMatches):
         return self.counts.tolist()
 
 
-def padding(m: LabelledMatches) -> float:
+def padding(m: training.LabelledMatches) -> float:
     return 1 - float(m.correspondences.mask.double().mean())
 
 
@@ -362,7 +349,7 @@ def test_mistakes_are_named() -> None:
         SimilarLengthBatches(Pairs(), 0)
     with pytest.raises(ValueError, match="rank is 2 of 2"):
         SimilarLengthBatches(Pairs(), rank=2, world_size=2)
-    assert Draw(3) == (3, 0, None)
+    assert training.Draw(3) == (3, 0, None)
 
 
 def oanet(tmp_path: Path, **options: Any) -> tuple[OANetPairs, MatchedPairs]:
@@ -380,14 +367,17 @@ def test_oanets_files_train_as_the_same_pairs_matched(labels: str, tmp_path: Pat
     place = {about["key"]: i for i, about in enumerate(stored.pairs)}
     order = [place[about["key"]] for about in direct.pairs]
     torch.manual_seed(0)
-    network, objective = LC(channels=8, blocks=1, coordinates="K"), Objective(coordinates="K", classification_steps=0)
+    network, objective = (
+        LC(channels=8, blocks=1, coordinates="K"),
+        training.Objective(coordinates="K", classification_steps=0),
+    )
     batches = [collate([direct[i] for i in range(len(direct))]), collate([stored[i] for i in order])]
     assert torch.equal(batches[0].label, batches[1].label)
     assert {0, 1} <= set(batches[0].label.unique().tolist())
     losses = [objective(predict(network, b.correspondences), b, 1)["loss"] for b in batches]
     torch.testing.assert_close(losses[0], losses[1], rtol=1e-6, atol=0)
     assert direct.lengths(0) == [float(about["matches"]) for about in direct.pairs]
-    augmented = [each.augmented(Augmentation(), seed=3) for each in (direct, stored)]
+    augmented = [each.augmented(training.Augmentation(), seed=3) for each in (direct, stored)]
     a, b = augmented[0][1], augmented[1][order[1]]
     torch.testing.assert_close(a.correspondences.x0, b.correspondences.x0, rtol=0, atol=1e-3)
     assert [round(n, 9) for n in augmented[1].select(order).lengths(1)] != [0.0] * len(direct)

@@ -21,7 +21,6 @@ from tests.reference import pruner_losses as reference
 from tests.training.conftest import labelled_pair
 
 VGA = torch.tensor([480, 640])
-Fit = Callable[[Correspondences, Tensor], tuple[Tensor, Tensor]]
 
 
 def generator(seed: int) -> torch.Generator:
@@ -198,8 +197,6 @@ def test_matches_that_a_stage_does_not_judge_are_as_unlabelled() -> None:
 
 
 def test_options_that_cannot_be_are_refused() -> None:
-    with pytest.raises(ValueError, match="must be one of: size, K"):
-        training.Objective(coordinates="pixels")
     with pytest.raises(ValueError, match="at least one of"):
         training.Objective(classification=0.0, geometric=0.0)
     batch = labelled_pair(0)

@@ -10,22 +10,19 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import Rotation
 
+from fmtorch.data import MODELS
+from tests.data.test_lenses import COEFFICIENTS
 from tests.processes import starter
 
 SIZE = (480, 640)  # h, w
 F = 600.0
-PARAMS = {
-    "SIMPLE_PINHOLE": [F, 320, 240], "PINHOLE": [F, 1.02 * F, 310, 250], "SIMPLE_RADIAL": [F, 320, 240, -0.1],
-    "RADIAL": [F, 320, 240, -0.1, 0.02], "OPENCV": [F, F, 320, 240, -0.1, 0.02, 1e-3, -1e-3],
-    "OPENCV_FISHEYE": [F, F, 320, 240, 0.02, -0.01, 0, 0],
-    "FULL_OPENCV": [F, F, 320, 240, -0.1, 0, 0, 0, 0, 0.01, 0, 0], "FOV": [F, F, 320, 240, 0.5],
-    "SIMPLE_RADIAL_FISHEYE": [F, 320, 240, 0.02], "RADIAL_FISHEYE": [F, 320, 240, 0.02, -0.01],
-    "THIN_PRISM_FISHEYE": [F, F, 320, 240, 0.02, 0, 0, 0, 0, 0, 1e-3, 0],
-    "RAD_TAN_THIN_PRISM_FISHEYE": [F, F, 320, 240, 0.02, 0, 0, 0, 0, 0, 1e-3, 0, 1e-3, 0, 0, 0],
-    "SIMPLE_DIVISION": [F, 320, 240, -0.05], "DIVISION": [F, F, 320, 240, -0.05], "SIMPLE_FISHEYE": [F, 320, 240],
-    "FISHEYE": [F, F, 320, 240], "EUCM": [F, F, 320, 240, 0.6, 1.1],
-}  # fmt: skip
-"""A camera of each model."""
+
+
+def parameters(model: str) -> list[float]:
+    """Of a camera of a model."""
+    if model == "PINHOLE":
+        return [F, 1.02 * F, 310, 250]
+    return [*[F] * MODELS[model].focals, 320, 240, *COEFFICIENTS.get(model, ())]
 
 
 @dataclasses.dataclass
@@ -64,7 +61,7 @@ def write(
     path.unlink(missing_ok=True)
     rng = np.random.default_rng(1)
     with pycolmap.Database.open(path) as database:
-        camera = pycolmap.Camera(model=model, width=SIZE[1], height=SIZE[0], params=params or PARAMS[model])
+        camera = pycolmap.Camera(model=model, width=SIZE[1], height=SIZE[0], params=params or parameters(model))
         camera.has_prior_focal_length = prior
         camera.camera_id = database.write_camera(camera)
         rig = rig_of(database, camera)
@@ -91,7 +88,6 @@ def write(
 
 
 def rig_of(database: Any, camera: Any) -> int:
-    """A rig of one camera."""
     rig = pycolmap.Rig(rig_id=camera.camera_id)
     rig.add_ref_sensor(camera.sensor_id)
     return int(database.write_rig(rig, use_rig_id=True))

@@ -25,7 +25,6 @@ FILES = ("features=features.h5", "matches=matches.h5", "output=verified.h5")
 
 
 def points(count: int = 2, kind: str = "general") -> list[tuple[np.ndarray, np.ndarray]]:
-    """x0 and x1 of all pairs of a scene."""
     rng, cameras = np.random.default_rng(0), scene(count, kind=kind)
     images = []
     for R, t in zip(cameras.R, cameras.t, strict=True):
@@ -37,7 +36,6 @@ def points(count: int = 2, kind: str = "general") -> list[tuple[np.ndarray, np.n
 
 
 def save(path: Path, arrays: dict[str, Any]) -> Path:
-    """By numpy or h5py."""
     if path.suffix == ".npz":
         np.savez(path, **arrays)
     else:
@@ -52,18 +50,12 @@ def load(path: Path) -> dict[str, Any]:
     if path.suffix == ".npz":
         with np.load(path) as file:
             return {key: value.tolist() for key, value in file.items()}
-    entries: dict[str, Any] = {}
-
-    def visit(name: str, entry: h5py.HLObject) -> None:
-        start = f"{name}/" if name else ""
-        entries.update({f"{start}{key}": np.asarray(value).tolist() for key, value in entry.attrs.items()})
-        if isinstance(entry, h5py.Dataset):
-            entries[name] = entry[()].tolist()
-
     with h5py.File(path) as file:
-        visit("", file)
-        file.visititems(visit)
-    return entries
+        found = [file]
+        file.visititems(lambda _, entry: found.append(entry))
+        attributes = {f"{e.name}/{key}": np.asarray(value).tolist() for e in found for key, value in e.attrs.items()}
+        arrays = {entry.name: entry[()].tolist() for entry in found if isinstance(entry, h5py.Dataset)}
+    return {name.lstrip("/"): value for name, value in {**attributes, **arrays}.items()}
 
 
 @pytest.mark.parametrize(
