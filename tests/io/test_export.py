@@ -28,6 +28,8 @@ from fmtorch.evaluation import MAX_THUMBNAILS, view_graph_svg
 from fmtorch.features import keypoints_to_lafs
 from fmtorch.geometry import sampson
 from fmtorch.io import ORIGIN, write_database
+from fmtorch.pipeline import FolderMatches, chosen_pairs, folder_workers, images_below, load_pipeline
+from tests.conftest import shared_path
 from tests.helpers import cross_matrix
 from tests.laws import scene
 

@@ -22,7 +22,7 @@ from fmtorch.data import DataError, ImagePair, ImageSource, load
 from fmtorch.pipeline import Pipeline, load_pipeline
 from fmtorch.pruning import LC
 from fmtorch.pruning.networks.learned import predict
-from fmtorch.scenes import FAMILIES, RenderedPairs
+from fmtorch.scenes import FAMILIES, PLANS, RenderedPairs, Task
 from fmtorch.training import MatchedPairs, OANetPairs, SimilarLengthBatches, collate, collate_trimmed
 from fmtorch.training.labelled import label
 from fmtorch.training.stored_matches import SCHEMA, Shard, ShardError, write_shard
