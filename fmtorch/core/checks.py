@@ -8,10 +8,11 @@ import math
 import operator
 import sys
 from collections.abc import Callable, Mapping
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, NamedTuple, ParamSpec, TypeVar
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from fmtorch.core.records import WHOLE, Expected, arguments_of, numbers_of
@@ -229,24 +230,45 @@ MAX_OUTSIDE = 0.5  # fraction of points outside an image of the given size: some
 SWAPPED = 0.05  # fraction outside from which on a size is taken for (w, h), if all points are inside then
 
 
-def expect_inside(x: Tensor, mask: Tensor, size: Tensor, name: str, size_name: str) -> None:
+class Box(NamedTuple):
+    """Of points of B pairs: which are real and finite, and the ends of the box around these, infinite around none."""
+
+    real: Bool[Tensor, "b n"]
+    low: Float[Tensor, "b 2"]
+    high: Float[Tensor, "b 2"]
+
+    @property
+    def enough(self) -> Bool[Tensor, " b"]:
+        """Of which pairs the points tell of their unit and image."""
+        return self.real.sum(1) >= MIN_MATCHES
+
+
+def box_of(x: Float[Tensor, "b n 2"], mask: Bool[Tensor, "b n"]) -> Box:
+    """The box of points, on no graph."""
+    x = x.detach()
+    real = mask & x[..., 0].isfinite() & x[..., 1].isfinite()
+    if not x.shape[1]:
+        return Box(real, x.new_full((len(x), 2), torch.inf), x.new_full((len(x), 2), -torch.inf))
+    if bool(real.all()):
+        return Box(real, *x.aminmax(dim=1))
+    each = real[..., None]
+    return Box(real, torch.where(each, x, torch.inf).amin(1), torch.where(each, x, -torch.inf).amax(1))
+
+
+def expect_inside(x: Tensor, box: Box, size: Tensor, name: str, size_name: str) -> None:
     """Raise ValueError where the points (b, n, 2) of all pairs contradict the image's size (b, 2), h and w.
     Points that reach beyond opposite borders are no pixels of another image or unit: a wide lens was undistorted."""
-    mask = mask & x.isfinite().all(-1)
-    enough = mask.sum(1) >= MIN_MATCHES
-    if not bool(enough.any()):
+    enough, size = box.enough, size.detach().to(x.device)
+    low, high, limit = box.low, box.high, size.flip(-1)
+    if not bool(enough.any()) or bool((((low >= -1) & (high <= limit)).all(-1) & enough).any()):
         return
-    x, mask, size = x.detach()[enough], mask[enough], size.detach().to(x.device)[enough]
-    limit, points = size.flip(-1)[:, None], mask[..., None]
-    low, high = torch.where(points, x, torch.inf).amin(1), torch.where(points, x, -torch.inf).amax(1)
-    if bool(((low >= -1) & (high <= limit[:, 0])).all(-1).any()):
-        return
-    far, turned = _fraction_outside(x, mask, limit), _fraction_outside(x, mask, limit.flip(-1))
+    x, real, limit = x.detach()[enough], box.real[enough], limit[enough][:, None]
+    far, turned = _fraction_outside(x, real, limit), _fraction_outside(x, real, limit.flip(-1))
     swapped = (far > SWAPPED) & (turned == 0)
-    undistorted = ((low < -1) & (high > limit[:, 0])).any(-1)
+    undistorted = ((low[enough] < -1) & (high[enough] > limit[:, 0])).any(-1)
     if not bool((((far > MAX_OUTSIDE) & ~undistorted) | swapped).all()):
         return
-    h, w = size[0].tolist()
+    h, w = size[enough][0].tolist()
     hint = "sizes are (h, w), and it looks like (w, h)" if bool(swapped[0]) else "sizes are (h, w) in pixels"
     outside = f"{100 * float(far[0]):.0f} % of {name} lie outside such an image"
     raise ValueError(f"{size_name} is ({h:g}, {w:g}), but {outside}; {hint}")

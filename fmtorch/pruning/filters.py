@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from fmtorch.core import Correspondences, Within
-from fmtorch.core.checks import expect_inside
+from fmtorch.core.checks import box_of, expect_inside
 from fmtorch.geometry.significance import Matches
 from fmtorch.jit.kernel import Array, B1x1, F8x1, F8x2, I8x1, for_each_pair, inner, kernel, vector
 from fmtorch.jit.random import mix
@@ -330,7 +330,7 @@ def _of_each_pair(
     with_rotation, with_scale, threshold_factor, border = options
     mask = torch.ones_like(x[0][..., 0], dtype=torch.bool) if mask is None else mask
     for i, size in enumerate(sizes):
-        expect_inside(x[i], mask, size, f"x{i}", f"size{i}")
+        expect_inside(x[i], box_of(x[i], mask), size, f"x{i}", f"size{i}")
     tensors, out = (*x, mask, sizes[0].float(), sizes[1].float()), torch.empty(mask.shape, dtype=kind)
     sides = np.array(GRIDS if with_scale else GRIDS[:1])
     same = sides, 8 if with_rotation else 1, threshold_factor, border == "authors"

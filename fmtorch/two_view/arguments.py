@@ -9,11 +9,10 @@ from typing import Any, Literal, Protocol, cast, runtime_checkable
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from fmtorch.core.checks import MIN_MATCHES, as_tensor, expect_inside, widened
+from fmtorch.core.checks import Box, as_tensor, box_of, expect_inside, widened
 from fmtorch.core.lenses import Lens as CalibratedLens
 from fmtorch.core.options import nearest
 from fmtorch.core.records import Rule
@@ -310,39 +309,29 @@ def _expect_pixels(c: Correspondences, plane: bool) -> None:
     """Raise ValueError where the points of all pairs are obviously not in pixels, or contradict the image sizes.
     Of a batch in which some pairs are sound none is refused: no pair can take its batch down. Points of an image with a
     calibration matrix may be in its unit, whatever that is, and those of a plane, too, if the others are in pixels."""
-    images = []
-    for i, (x, K, size) in enumerate(((c.x0, c.K0, c.size0), (c.x1, c.K1, c.size1))):
-        x = x.detach()
-        mask = c.mask & torch.isfinite(x).all(-1)
-        enough = mask.sum(1) >= MIN_MATCHES
-        if bool(enough.any()):
-            images.append(
-                (i, x[enough], mask[enough], None if K is None else K[enough], None if size is None else size[enough])
-            )
-    strange = [bool(_normalized(x, mask, K).all()) for _, x, mask, K, _ in images]
+    boxes = box_of(c.x0, c.mask), box_of(c.x1, c.mask)
+    strange = [_normalized(box, K) for box, K in zip(boxes, (c.K0, c.K1), strict=True)]
     if plane and strange == [True, False]:
         return
-    for (i, x, mask, K, size), normalized in zip(images, strange, strict=True):
-        if normalized:
-            _refuse(x, mask, i, K is not None)
+    for i, (x, size) in enumerate(((c.x0, c.size0), (c.x1, c.size1))):
+        if strange[i]:
+            _refuse(boxes[i], i, (c.K0, c.K1)[i] is not None)
         if size is not None:
-            expect_inside(x, mask, size, f"x{i}", f"size{i}")
+            expect_inside(x, boxes[i], size, f"x{i}", f"size{i}")
 
 
-def _normalized(x: Float[Tensor, "b n 2"], mask: Bool[Tensor, "b n"], K: Tensor | None) -> Bool[Tensor, " b"]:
-    """Whether all coordinates of a pair are too small for pixels, and not all are zero."""
-    reach = torch.where(mask[..., None], x.abs(), 0).flatten(1).amax(1)
+def _normalized(box: Box, K: Tensor | None) -> bool:
+    """Whether all coordinates of the pairs are too small for pixels, and not all of a pair zero."""
+    reach = torch.maximum(-box.low, box.high).amax(1)
     small = (reach > 0) & (reach < MIN_PIXELS)
-    if K is None:
-        return small
-    focal = K.detach().to(reach.device)[:, (0, 1), (0, 1)].abs().amax(1)
-    return small & (focal > 10 * MIN_PIXELS)
+    if K is not None:
+        small &= K.detach().to(reach.device)[:, (0, 1), (0, 1)].abs().amax(1) > 10 * MIN_PIXELS
+    return bool(box.enough.any()) and bool((small | ~box.enough).all())
 
 
-def _refuse(x: Tensor, mask: Tensor, i: int, calibrated: bool) -> None:
+def _refuse(box: Box, i: int, calibrated: bool) -> None:
     """Raise ValueError that says what the points are and what to do."""
-    inside = x[mask]
-    span = f"from {inside.min():.3g} to {inside.max():.3g}"
+    span = f"from {box.low[box.enough].min():.3g} to {box.high[box.enough].max():.3g}"
     if calibrated:
         raise ValueError(
             f"x{i} runs {span}, as normalised points do, but K{i} is in pixels; give points in pixels, or normalised "

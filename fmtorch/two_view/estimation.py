@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from fmtorch.core.checks import number
+from fmtorch.core.checks import box_of, number
 from fmtorch.core.stages import Estimator, Pruner, model_of, output_of
 from fmtorch.core.types import Correspondences, Estimate, collate
 from fmtorch.estimators.ransac import Ransac
@@ -159,12 +159,10 @@ def given_sizes(size0: Size, size1: Size) -> tuple[Arrays | None, Arrays | None,
 def extents(c: Correspondences) -> tuple[Float[Tensor, "b 2 2"], Bool[Tensor, " b"]]:
     """Sizes (h, w) of images whose points spread evenly up to the border, and of which pairs these tell any: of those
     whose points look like a photograph's. Centred, normalised and undistorted points have negative coordinates."""
-    x = torch.cat([c.x0, c.x1], -1).detach().double()
-    there = (c.mask & x.isfinite().all(-1))[..., None]
-    count = there.sum(1).to(x)
-    if not x.shape[1]:
-        return x.new_full((len(c), 2, 2), torch.nan), count[:, 0] > 0
-    first, last = torch.where(there, x, torch.inf).amin(1), torch.where(there, x, -torch.inf).amax(1)
+    both = c.mask & c.x0.isfinite().all(-1) & c.x1.isfinite().all(-1)
+    boxes = box_of(c.x0, both), box_of(c.x1, both)
+    first, last = (torch.cat(ends, 1).double() for ends in zip(*(box[1:] for box in boxes), strict=True))
+    count = both.sum(1, keepdim=True).to(last)
     known = (count >= MIN_MATCHES)[:, 0] & (first > BORDER).all(1) & (last > MIN_PIXELS).all(1)
     sizes = last * (1 + MARGIN / count.clamp_min(1)) + 0.5
     return torch.where(known[:, None], sizes, torch.nan).reshape(-1, 2, 2).flip(-1), known

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from fmtorch.core.checks import box_of
 from fmtorch.core.types import CONTRADICTED, Correspondences, Estimate, PoseEstimate, collate
 from fmtorch.geometry.epipolar import unit_frobenius
 from fmtorch.jobs.execution import one_thread
@@ -369,17 +370,12 @@ def homographies(c: Correspondences, find: Callable[[Correspondences], Estimate]
 
 def _unit_of_plane(c: Correspondences) -> tuple[Float[Tensor, " b"], Float[Tensor, "b 2"]]:
     """What x0 is multiplied by, after its middle is the origin; 1 and zero where both are as of two images."""
-    boxes = []
-    for x in (c.x0.detach(), c.x1.detach()):
-        real = (c.mask & x.isfinite().all(-1))[..., None] & torch.ones_like(x, dtype=torch.bool)
-        if not x.shape[1]:
-            return x.new_ones(len(x)), x.new_zeros(len(x), 2)
-        boxes.append((torch.where(real, x, torch.inf).amin(1), torch.where(real, x, -torch.inf).amax(1)))
-    extents = [(high - low).amax(1) for low, high in boxes]
+    boxes = box_of(c.x0, c.mask), box_of(c.x1, c.mask)
+    extents = [(box.high - box.low).amax(1) for box in boxes]
     ratio = extents[1] / extents[0]
     sound = ratio.isfinite() & (ratio > 0)
     plane = sound & ((ratio > COMPARABLE) | (ratio < 1 / COMPARABLE))
-    middle = (boxes[0][0] + boxes[0][1]) / 2
+    middle = (boxes[0].low + boxes[0].high) / 2
     far = sound & (middle.abs().amax(1) > FAR * extents[0])
     return torch.where(plane, ratio, 1.0), torch.where((plane | far)[:, None], middle, 0.0)
 

@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from fmtorch.core.checks import box_of
 from fmtorch.core.records import ungraphed
 from fmtorch.core.stages import Estimator, Pruner, output_of
 from fmtorch.core.types import Correspondences, Estimate
@@ -108,8 +109,7 @@ def _off_centre(c: Correspondences) -> Bool[Tensor, " b"]:
         if size is not None:
             off |= (((centre + 0.5) / size.flip(-1) - 0.5).abs() > OFF_CENTRE).any(1)
             continue
-        real = (c.mask & x.isfinite().all(-1))[..., None]
-        low, high = torch.where(real, x.detach(), torch.inf).amin(1), torch.where(real, x.detach(), -torch.inf).amax(1)
+        _, low, high = box_of(x, c.mask)
         beyond = (centre < low) | (centre > high) | (high > (1 + OFF_CENTRE) * (2 * centre + 1))
         off |= beyond.any(1) & (K[:, 0, 0].detach() >= MIN_SIDE_PX * K[:, 2, 2].detach())
     return off

@@ -248,7 +248,7 @@ def record(kind: type, data: st.DataObject) -> tuple[Call, set[str], Check]:
         wanted = {n: want for n, want in all_of_them if not want.optional or data.draw(st.booleans(), label=n)}
         arguments = {n: as_given(scene.array(n, want.dtype, want.shape), library) for n, want in wanted.items()}
         if kind is Estimate:
-            arguments["reason"] = ("",) * len(arguments["F"])
+            arguments["reason"] = ("",) * len(arguments["matrix"])
     mistaken(data, arguments, {})
 
     def call() -> Any:
