@@ -5,6 +5,7 @@ Nothing here imports more than Python's own library, so that a command's ``--hel
 import dataclasses
 import difflib
 import enum
+import functools
 import inspect
 import math
 import numbers
@@ -77,6 +78,12 @@ def option(default: T, about: str) -> T:
     return dataclasses.field(default=default, metadata=metadata)
 
 
+@functools.lru_cache(maxsize=256)
+def parameters_of(target: Callable[..., Any]) -> Mapping[str, inspect.Parameter]:
+    """The parameters of a class or function, by name."""
+    return inspect.signature(target).parameters
+
+
 def expect_options(
     target: Callable[..., Any], values: Mapping[str, Any], where: str, given: Iterable[str] = ()
 ) -> None:
@@ -84,7 +91,7 @@ def expect_options(
     Values are compared with the target's annotations as far as these say what a plain value may be; objects, and
     mappings with a `_target_`, are taken on trust. A mapping for a dataclass is checked against its fields. where: the
     name of the whole, as a user knows it: ``pruner.ratio`` or ``estimator=fmtorch``. given: arguments added later."""
-    known = inspect.signature(target).parameters
+    known = parameters_of(target)
     named = [name for name, p in known.items() if p.kind not in (p.VAR_KEYWORD, p.VAR_POSITIONAL)]
     if len(named) == len(known):  # else it takes any
         for key in values:

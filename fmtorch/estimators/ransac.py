@@ -5,14 +5,13 @@ is control flow on one pair: `PARTS` names the parts, which hold the arithmetic,
 verb are described; `batch` leads from tensors to pairs and back."""
 
 import functools
-import inspect
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Any, TypeVar
 
 import numpy as np
 
-from fmtorch.core.options import Within, expect_options
+from fmtorch.core.options import Within, expect_options, parameters_of
 from fmtorch.core.stages import Estimator
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.estimators import focal_search, inliers, lens_search, preselection, refinement, sampling, scores
@@ -74,7 +73,7 @@ def takes(role: str, spec: Any, option: str) -> bool:
     """Whether a named part asks the engine for this option."""
     name = spec.get("name") if isinstance(spec, Mapping) else spec
     make = PARTS[role].get(name) if isinstance(name, str) else None
-    return make is not None and option in inspect.signature(make).parameters
+    return make is not None and option in parameters_of(make)
 
 
 def part(role: str, spec: Any, **context: Any) -> Any:
@@ -88,7 +87,7 @@ def part(role: str, spec: Any, **context: Any) -> Any:
     if name not in PARTS[role]:
         raise ValueError(f"{role} is {name!r}; it must be one of: {', '.join(PARTS[role])}")
     make = PARTS[role][name]
-    known = {key: value for key, value in context.items() if key in inspect.signature(make).parameters}
+    known = {key: value for key, value in context.items() if key in parameters_of(make)}
     expect_options(make, options, f"{role}={name}", known)
     return make(**(known | options))
 
