@@ -39,8 +39,7 @@ class SIFT:
     def __call__(self, image: Image) -> Features:
         """The features of a grey (H, W) or RGB (H, W, 3) uint8 image; none, with N = 0, where nothing is found.
         lafs: half side `FRAME_SIGMAS` sigma, kornia's angle (minus OpenCV's). scores: contrast. descriptors: (N, 128)
-        float32, whole numbers from 0 to 255 unless `root`. Raises ValueError for another type, shape or an empty image.
-        """
+        float32, whole numbers 0 to 255 unless `root`. Raises ValueError for another type, shape or an empty image."""
         grey = as_grey(image)
         seen = self._reduced(grey)
         keypoints, computed = self._opencv().detectAndCompute(seen, None)

@@ -329,8 +329,7 @@ class Pipeline:
 
 def examined(pipeline: Pipeline, outcomes: Sequence[Outcome], seed: int = 0) -> list[Outcome]:
     """The outcomes of a run with their pair types; a pair that cannot be examined has none and harms no other.
-    Where the estimator was given nothing of the cameras, K counts for nothing here. Of homographies nothing is asked.
-    """
+    Where the estimator was given nothing of the cameras, K does not count here. Of homographies nothing is asked."""
     if stages.model_of(pipeline.estimator) != "fundamental":
         return list(outcomes)
     matched = {i: o for i, o in enumerate(outcomes) if o.correspondences is not None and o.estimate is not None}

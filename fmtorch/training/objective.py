@@ -67,8 +67,7 @@ def fits(
     """The fundamental matrices of each stage in pixels, and which are valid: the network's own, or weighted 8-point."""
     c = batch.correspondences
     if prediction.F is not None:
-        F = prediction.F
-        return F, torch.isfinite(F.detach()).flatten(-2).all(-1) & (F.detach() != 0).flatten(-2).any(-1)
+        return prediction.F, _valid_models(prediction.F)
     x0, x1 = (x.to(torch.float64).expand(len(prediction.weight), *x.shape) for x in (c.x0, c.x1))
     return eight_point(x0, x1, prediction.weight.to(torch.float64), c.mask.expand(prediction.weight.shape))
 
@@ -135,10 +134,11 @@ def geometric_loss(
     if (K0 is None) != (K1 is None):
         raise ValueError("only one of K0 and K1 is given; the loss needs both, or neither")
     limit = (LIMIT_F if K0 is None else LIMIT_E) if limit is None else limit
-    A0, A1 = (_by_size(s) if K is None else K.to(torch.float64) for K, s in ((K0, size0), (K1, size1)))
+    A = torch.stack([_by_size(s) if K is None else K.to(torch.float64) for K, s in ((K0, size0), (K1, size1))])
     x0, x1, mask = virtual_points(F_true, size0, size1, count=points, seed=seed, key=key)
-    calibrated = (A0.isfinite() & A1.isfinite()).all(-1).all(-1) & _diagonal(A0) & _diagonal(A1)
-    A0, A1 = (torch.where(calibrated[:, None, None], A, torch.eye(3, dtype=A.dtype, device=A.device)) for A in (A0, A1))
+    finite, regular = A.isfinite().all(-1).all(-1), (A.diagonal(dim1=-2, dim2=-1) != 0).all(-1)  # upper triangular
+    calibrated = (finite & regular).all(0)
+    A0, A1 = torch.where(calibrated[:, None, None], A, torch.eye(3, dtype=A.dtype, device=A.device))
     mask = mask & calibrated[:, None]
     valid = _valid_models(F_est, valid)
     F = epipolar.unit_largest(torch.where(valid[..., None, None], F_est.to(torch.float64), 0.0))
@@ -265,11 +265,6 @@ def _by_size(size: Real[Tensor, "b 2"]) -> Float[Tensor, "b 3 3"]:
     half = torch.maximum(h, w) / 2
     zero, ones = torch.zeros_like(h), torch.ones_like(h)
     return torch.stack([half, zero, (w - 1) / 2, zero, half, (h - 1) / 2, zero, zero, ones], -1).reshape(-1, 3, 3)
-
-
-def _diagonal(A: Float[Tensor, "b 3 3"]) -> Bool[Tensor, " b"]:
-    """Whether upper triangular matrices are regular."""
-    return (A.diagonal(dim1=-2, dim2=-1) != 0).all(-1)
 
 
 def _normalised(x: Float[Tensor, "b n 2"], A: Float[Tensor, "b 3 3"]) -> Float[Tensor, "b n 2"]:

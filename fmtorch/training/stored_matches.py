@@ -127,8 +127,7 @@ class StoredMatches(Dataset[LabelledMatches]):
         augmentation: random changes of each item, selected by `seed`, the pair's key and the epoch (`set_epoch`, or an
             index that is a `Draw`).
 
-    Raises ValueError where the folder has no such files or every pair failed, ShardError for a damaged file.
-    """
+    Raises ValueError where the folder has no such files or every pair failed, ShardError for a damaged file."""
 
     def __init__(self, folder: str | Path, *, augmentation: Augmentation | None = None, seed: int = 0) -> None:
         self.folder = Path(folder)
@@ -243,8 +242,7 @@ def split_scenes(matches: StoredMatches, last: int = 4) -> tuple[StoredMatches, 
     Args:
         matches: of several scenes a family. last: scenes of each family for validation.
 
-    Raises ValueError for a family that has no more scenes than that.
-    """
+    Raises ValueError for a family that has no more scenes than that."""
     scenes = [(about["family"], about["scene"]) for about in matches.pairs]
     for family, count in Counter(family for family, _ in dict.fromkeys(scenes)).items():
         if count <= last:
@@ -290,8 +288,7 @@ class SimilarLengthBatches(Sampler[list[Draw]]):
         rank, world_size: of this process in a distributed training; each has as many batches, where need be some of
             the first ones twice.
 
-    Raises ValueError for a batch below 1, and for a rank that is not below world_size.
-    """
+    Raises ValueError for a batch below 1, and for a rank that is not below world_size."""
 
     def __init__(
         self, dataset: StoredMatches, batch: int = 32, *, seed: int = 0, matches: Sequence[int] | None = (50, 4000),
