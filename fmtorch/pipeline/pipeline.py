@@ -43,10 +43,8 @@ class Memo(Generic[Key, Value]):
     def get(self, key: Key, compute: Callable[[], Value]) -> Value:
         """The value of `key`, computed if it is not there; an exception is kept and raised again."""
         with self._lock:
-            future = self._futures.get(key)
-            mine = future is None
-            if future is None:
-                future = self._futures[key] = Future()
+            mine = key not in self._futures
+            future = self._futures.setdefault(key, Future())
             self._futures.move_to_end(key)
             while len(self._futures) > self._capacity:
                 self._futures.popitem(last=False)

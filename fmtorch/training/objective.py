@@ -4,6 +4,8 @@ Each loss is a mean over the pairs that it can judge. A pair that it cannot judg
 no true geometry) adds zero to loss and gradient; where that holds for all pairs, the loss is zero and still attached to
 the graph. So no training step needs to be skipped."""
 
+from typing import Any
+
 import torch
 from jaxtyping import Bool, Float, Int, Int8, Real
 from torch import Tensor
@@ -41,23 +43,17 @@ class Objective(ObjectiveWeights):
             c = batch.correspondences
             if c.size0 is None or c.size1 is None:
                 raise ValueError("the geometric losses need image sizes (size0, size1) of every pair")
+            models, options = (F, batch.F, c.size0, c.size1), dict[str, Any](valid=valid, seed=step, key=c.keys)
             if self.geometric:
-                calibrated = self.coordinates == "K"
-                if calibrated and (c.K0 is None or c.K1 is None):
+                K0, K1 = (c.K0, c.K1) if self.coordinates == "K" else (None, None)
+                if self.coordinates == "K" and (K0 is None or K1 is None):
                     raise ValueError("objective.coordinates=K needs calibration matrices; the data set has none")
-                terms["geometric"] = geometric_loss(
-                    F, batch.F, c.size0, c.size1, K0=c.K0 if calibrated else None, K1=c.K1 if calibrated else None,
-                    valid=valid, points=self.points, seed=step, key=c.keys,
-                )  # fmt: skip
+                terms["geometric"] = geometric_loss(*models, K0=K0, K1=K1, points=self.points, **options)
             if self.nsgd:
-                terms["nsgd"] = nsgd_loss(
-                    F, batch.F, c.size0, c.size1, valid=valid, limit=self.nsgd_limit, samples=self.points, seed=step,
-                    key=c.keys,
-                )  # fmt: skip
-        weights = {"classification": self.classification, "geometric": self.geometric, "nsgd": self.nsgd}
+                terms["nsgd"] = nsgd_loss(*models, limit=self.nsgd_limit, samples=self.points, **options)
         total = 0 * prediction.logit.sum()
         for name, value in terms.items():
-            total = total + weights[name] * value.to(total.dtype)
+            total = total + getattr(self, name) * value.to(total.dtype)
         return {**terms, "loss": total}
 
 

@@ -29,16 +29,10 @@ ARRAYS: dict[str, tuple[str, tuple[int, ...]]] = {
     **dict.fromkeys(("lafs0", "lafs1"), ("float32", (-1, 2, 3))),
 }  # fmt: skip
 """What is stored of a pair and of its matches: types of the numbers, and shapes, -1 for the number of matches."""
-_TEXTS = ("identity", "family", "scene", "reason")
-SCHEMA = pa.schema(
-    [
-        pa.field("key", pa.int64()),
-        *(pa.field(name, pa.string()) for name in _TEXTS),
-        *(pa.field(name, pa.int64()) for name in ("matches", "inliers", "outliers")),
-        *(pa.field(name, pa.list_(pa.from_numpy_dtype(kind))) for name, (kind, _) in ARRAYS.items()),
-    ]
-)
-INDEX = ("key", *_TEXTS, "matches", "inliers", "outliers")  # what is known of a pair without its matches
+_TEXTS, _COUNTS = ("identity", "family", "scene", "reason"), ("matches", "inliers", "outliers")
+INDEX = {"key": pa.int64(), **dict.fromkeys(_TEXTS, pa.string()), **dict.fromkeys(_COUNTS, pa.int64())}
+"""What is known of a pair without its matches, and types."""
+SCHEMA = pa.schema(INDEX | {name: pa.list_(pa.from_numpy_dtype(kind)) for name, (kind, _) in ARRAYS.items()})
 
 Row = Mapping[str, Any]
 
@@ -81,7 +75,7 @@ class Shard:
 
     def index(self) -> dict[str, list[Any]]:
         """What is known of each pair without its matches: the columns of `INDEX`."""
-        index: dict[str, list[Any]] = self.batch.select(INDEX).to_pydict()
+        index: dict[str, list[Any]] = self.batch.select(list(INDEX)).to_pydict()
         return index
 
     def read(self, row: int, names: Sequence[str] = tuple(ARRAYS)) -> dict[str, NDArray[Any]]:
