@@ -153,9 +153,7 @@ def _context(section: Section, names: Sequence[str]) -> dict[str, Any]:
         "tables": tables.report_tables(section.runs, summaries),
         "names": list(section.runs),
         "axis": axis.label,
-        "curves": [
-            (title, curves.svg(title, panel, names, axis)) for title, panel in curves.panels(section.runs).items()
-        ],
+        "curves": [(name, curves.svg(name, panel, names, axis)) for name, panel in curves.panels(section.runs).items()],
         "pairs": section.pairs,
         "notes": section.notes,
     }

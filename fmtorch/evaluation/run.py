@@ -165,12 +165,11 @@ def pose_errors(outcomes: Sequence[Outcome], signed: bool = False) -> list[Figur
     poses = [Figures(pose_reason=_unknown(outcome.pair)) for outcome in outcomes]
     known = [i for i, pose in enumerate(poses) if pose["pose_reason"] is None]
     solved = [i for i in known if outcomes[i].solved]
-    own_pose = functools.partial(_of_pose, up_to_sign=not signed), "the pose is not determined"
-    of_F = (_closest, "F has no pose") if signed else (_of_fundamental, "no inlier in front of both cameras")
-    for estimated, (error_of, reason) in ((True, own_pose), (False, of_F)):
+    of_F = "F has no pose" if signed else "no inlier in front of both cameras"
+    for estimated, reason in ((True, "the pose is not determined"), (False, of_F)):
         own = [i for i in solved if (cast(Estimate, outcomes[i].estimate).R is not None) == estimated]
-        error = error_of([outcomes[i] for i in own]) if own else metrics.PoseError(torch.zeros(0), torch.zeros(0))
-        for i, rotation, translation in zip(own, error.rotation.tolist(), error.translation.tolist(), strict=True):
+        error = _pose_error([outcomes[i] for i in own], signed) if own else ([], [])
+        for i, rotation, translation in zip(own, *error, strict=True):
             poses[i] |= {"rotation_error": rotation, "translation_error": translation}
             poses[i]["pose_reason"] = reason if rotation >= LARGEST_ROTATION else None
     largest = LARGEST_ROTATION if signed else LARGEST_TRANSLATION
@@ -186,20 +185,17 @@ def _unknown(pair: ImagePair) -> str | None:
     return f"{', '.join(broken)} not finite" if broken else None
 
 
-def _of_pose(outcomes: Sequence[Outcome], up_to_sign: bool) -> metrics.PoseError:
-    (_, estimate, _), (R, t) = _joined(outcomes), _truth(outcomes, "R", "t")
-    own = cast(Tensor, estimate.R).double(), cast(Tensor, estimate.t).double()
-    return metrics.pose_error(*own, R, t, up_to_sign=up_to_sign)
-
-
-def _of_fundamental(outcomes: Sequence[Outcome]) -> metrics.PoseError:
+def _pose_error(outcomes: Sequence[Outcome], signed: bool) -> tuple[list[float], list[float]]:
+    """Rotation and translation errors: of the estimates' R and t where they have some, else of their F."""
     (c, estimate, _), (K0, K1, R, t) = _joined(outcomes), _truth(outcomes, "K0", "K1", "R", "t")
-    return metrics.fundamental_pose_error(estimate.F.double(), K0, K1, c.x0, c.x1, R, t, estimate.inliers & c.mask)
-
-
-def _closest(outcomes: Sequence[Outcome]) -> metrics.PoseError:
-    _, estimate, _ = _joined(outcomes)
-    return metrics.closest_pose_error(estimate.F.double(), *_truth(outcomes, "K0", "K1", "R", "t"))
+    if estimate.R is not None and estimate.t is not None:
+        error = metrics.pose_error(estimate.R.double(), estimate.t.double(), R, t, up_to_sign=not signed)
+    elif signed:
+        error = metrics.closest_pose_error(estimate.F.double(), K0, K1, R, t)
+    else:
+        inliers = estimate.inliers & c.mask
+        error = metrics.fundamental_pose_error(estimate.F.double(), K0, K1, c.x0, c.x1, R, t, inliers)
+    return error.rotation.tolist(), error.translation.tolist()
 
 
 def focal_errors(outcome: Outcome) -> Figures:

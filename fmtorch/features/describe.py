@@ -59,8 +59,7 @@ class PatchSIFT:
 def sift_of_patches(patches: Float[Tensor, "n 1 32 32"]) -> Float[Tensor, "n 128"]:
     """SIFT of patches that cover `EXTENT` frames: gradients of the blurred patch vote, weighted by a Gaussian window.
     Each gradient votes for the two nearest directions and the four nearest cells; the histogram is normalised, clipped
-    and normalised again. Entry (4 y + x) 8 + d is cell (x, y), direction 45 d degrees counter-clockwise on the screen.
-    """
+    and normalised again. Entry (4 y + x) 8 + d: cell (x, y), direction 45 d degrees counter-clockwise on the screen."""
     pooling, along, across = _matrices(patches.device)
     parts = []
     for part in torch.split(patches[:, 0], CHUNK):

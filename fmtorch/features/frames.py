@@ -26,7 +26,6 @@ class DominantGradient:
     One orientation a frame, as kornia's PatchDominantGradientOrientation."""
 
     def __call__(self, pyramid: ImagePyramid, lafs: Float[Tensor, "n 2 3"]) -> Float[Tensor, "n 2 3"]:
-        """The turned frames."""
         return rotate_frames(lafs, dominant_gradient(pyramid.extract(lafs)))
 
 
@@ -38,7 +37,6 @@ class NetworkOrientation:
     network: PatchFunction
 
     def __call__(self, pyramid: ImagePyramid, lafs: Float[Tensor, "n 2 3"]) -> Float[Tensor, "n 2 3"]:
-        """The turned frames."""
         if len(lafs) == 0:
             return lafs
         y, x = self.network(pyramid.extract(lafs)).to(lafs).unbind(1)

@@ -29,8 +29,7 @@ HINT_INT8 = (
 
 def network_file(name: str, precision: str = "fp32") -> Path:
     """Where the ONNX file of a network is among the shipped models: name.onnx, or name.int8.onnx.
-    A name that ends in .onnx is a path of the user's own and stays as it is. Raises ValueError for another precision.
-    """
+    A name that ends in .onnx is a path of the user's own, left as it is. Raises ValueError for another precision."""
     if precision not in PRECISIONS:
         raise ValueError(f"precision={precision}; there are: {', '.join(PRECISIONS)}")
     if name.endswith(".onnx"):
@@ -129,7 +128,6 @@ class NetworkDescriptor:
     dimensions: int = 128
 
     def __call__(self, pyramid: ImagePyramid, lafs: Float[Tensor, "n 2 3"]) -> Float[Tensor, "n d"]:
-        """Descriptors of the frames."""
         return self.network(pyramid.extract(lafs)).to(lafs) if len(lafs) else lafs.new_zeros(0, self.dimensions)
 
 
@@ -166,7 +164,6 @@ class LocalFeature:
         return lafs, scores
 
     def describe(self, image: Image, lafs: Float[Tensor, "n 2 3"]) -> Float[Tensor, "n d"]:
-        """A descriptor of each frame."""
         return self.descriptor(ImagePyramid(as_grey(image)), lafs)
 
 

@@ -92,8 +92,7 @@ class HardNetFast(HardNet):
 class L2Net(HardNet):
     """L2-Net (Tian, Fan, Wu, CVPR 2017).
     Unlike HardNet's, its input loses the mean patch of the training set (`pixel_mean`) before each patch is
-    standardised, and its output passes local response normalisation over all channels, that is division by the length.
-    """
+    standardised, and its output passes local response normalisation over all channels: division by the length."""
 
     eps = 1e-12
     pixel_mean: Tensor
@@ -133,15 +132,13 @@ class _FrameNetwork(nn.Module):
         orthogonal_(self.features)
 
     def forward(self, patches: Float[Tensor, "n 1 32 32"]) -> Float[Tensor, "n d"]:
-        """The numbers of each patch."""
         return as_float32(self.features, standardize(patches, self.eps))
 
 
 class AffNet(_FrameNetwork):
     """AffNet (Mishkin, Radenovic, Matas, ECCV 2018): three numbers of an affine shape, each in (-1, 1).
-    With x the output, the shape is the lower-triangular [[1 + x0, 0], [x1, 1 + x2]] in the patch's own coordinates, up
-    to scale; x = 0 is a circle. The state_dict is that of the authors' release and of kornia's LAFAffNetShapeEstimator.
-    """
+    The shape of an output x is the lower-triangular [[1 + x0, 0], [x1, 1 + x2]] in the patch's own coordinates, up to
+    scale; x = 0 is a circle. The state_dict is that of the authors' release and of kornia's LAFAffNetShapeEstimator."""
 
     outputs = 3
 
@@ -266,9 +263,3 @@ def _with_dropout(state: dict[str, Tensor]) -> dict[str, Tensor]:
     moved = {"18": "19", "19": "20"}
     parts = ((name.split("."), value) for name, value in state.items())
     return {".".join([stem, moved.get(index, index), *rest]): value for (stem, index, *rest), value in parts}
-
-
-__all__ = [
-    "ARCHITECTURES", "DESCRIPTORS", "AffNet", "AffNetFast", "GeoDesc", "HardNet", "HardNetFast", "L2Net", "OriNet",
-    "build", "load_weights",
-]  # fmt: skip

@@ -71,14 +71,12 @@ class ImagePyramid:
         averaged over as many samples along the other axis as keep them so close. Frames not finite give zeros."""
         plan, images = _plan(lafs, len(self.levels), size), [level.numpy() for level in self.levels]
         out = np.zeros((len(lafs), size, size), np.float32)
-        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        flags, border = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, cv2.BORDER_REPLICATE
         order = _by_place(lafs, plan[0])
         maps, places = _maps(lafs, *plan, size)[order].numpy(), zip(*(a[order].tolist() for a in plan), strict=True)
         for i, matrix, (level, (nx, ny)) in zip(order.tolist(), maps, places, strict=True):
             shape, dense = (size * nx, size * ny), out[i] if nx == ny == 1 else None
-            samples = cv2.warpAffine(
-                images[level], matrix, shape, dst=dense, flags=flags, borderMode=cv2.BORDER_REPLICATE
-            )
+            samples = cv2.warpAffine(images[level], matrix, shape, dst=dense, flags=flags, borderMode=border)
             if dense is None:
                 cv2.resize(samples, (size, size), dst=out[i], interpolation=cv2.INTER_AREA)
         return torch.from_numpy(out)[:, None]

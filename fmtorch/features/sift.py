@@ -39,8 +39,7 @@ class SIFT:
     def __call__(self, image: Image) -> Features:
         """The features of a grey (H, W) or RGB (H, W, 3) uint8 image; none, with N = 0, where nothing is found.
         lafs: half side `FRAME_SIGMAS` sigma, kornia's angle (minus OpenCV's). scores: contrast. descriptors: (N, 128)
-        float32, whole numbers from 0 to 255 unless `root`. Raises ValueError for another type, shape or an empty image.
-        """
+        float32, whole numbers 0 to 255 unless `root`. Raises ValueError for another type, shape or an empty image."""
         grey = as_grey(image)
         seen = self._reduced(grey)
         keypoints, computed = self._opencv().detectAndCompute(seen, None)
@@ -132,10 +131,8 @@ class VLFeatSIFT:
         _library()
 
     def __call__(self, image: Image) -> Features:
-        """The features of a grey (H, W) or RGB (H, W, 3) uint8 image; none, with N = 0, where nothing is found.
-        lafs: half side `FRAME_SIGMAS` sigma. scores: sigma in pixels, as VLFeat tells no contrast. descriptors:
-        (N, 128) float32, whole numbers from 0 to 255 unless `root`. Raises ValueError for another type, shape or an
-        empty image."""
+        """The features of a grey (H, W) or RGB (H, W, 3) uint8 image, as of `SIFT` but for angles and scores.
+        scores: sigma in pixels, as VLFeat tells no contrast. Raises ValueError as `SIFT` does."""
         grey = as_grey(image)
         size = torch.tensor(grey.shape, dtype=torch.int64)
         if min(grey.shape) < SMALLEST:
@@ -193,10 +190,9 @@ class ASIFT(SIFT):
     tilts: int = 6
 
     def __call__(self, image: Image) -> Features:
-        """The features of a grey (H, W) or RGB (H, W, 3) uint8 image; none, with N = 0, where nothing is found.
+        """The features of an image, and what is raised for another, as of `SIFT`.
         lafs: the frames of the views in the image, full affine. scores, descriptors: as found in the views. Frames that
-        leave the image are dropped, except in the view that is the image. Raises ValueError for another type, shape or
-        an empty image."""
+        leave the image are dropped, except in the view that is the image."""
         grey = as_grey(image)
         parts = [super().__call__(grey)]
         for tilt, angle in simulated_views(self.tilts)[1:]:

@@ -4,13 +4,13 @@ import contextlib
 import dataclasses
 import functools
 import hashlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from fmtorch.data import DataError, FMBenchPairs, GivenMatches, ImagePair, ImageSource, Lens, stored_size
+from fmtorch.data import DataError, FMBenchPairs, GivenMatches, ImagePair, ImageSource, Lens
 from fmtorch.data.files import Matrix, given_root
 from fmtorch.data.pairs import HeldPairs
 from fmtorch.io import h5, oanet, predictions
@@ -101,10 +101,8 @@ class _Cameras:
 
 def _size(source: ImageSource, K: Matrix, images: Path | None) -> Size:
     """(h, w) of an image, by its principal point where there is no file. Raises DataError where the two disagree."""
-    by_centre, size = predictions.size_by_centre(K), stored_size(source.path) if images else None
-    if size is not None:
-        predictions.expect_size(source, size, K)
-    return size or by_centre
+    by_centre = predictions.size_by_centre(K)
+    return (predictions.size_by_file(source, K) if images else None) or by_centre
 
 
 def _pair(root: Path, folder: Path, key: str, cameras: _Cameras, images: Path | None) -> ImagePair:
@@ -142,9 +140,7 @@ FOCAL_LENGTHS = {"SIMPLE_PINHOLE": 1, "PINHOLE": 2, "SIMPLE_RADIAL": 1, "RADIAL"
 """Camera models that are pinholes where their distortion is zero, and how many focal lengths begin their parameters."""
 
 
-def posebench_matches(
-    path: Path, key: str, K: tuple[Matrix, Matrix], sizes: tuple[Size | None, Size | None]
-) -> GivenMatches:
+def posebench_matches(path: Path, key: str, K: tuple[Matrix, Matrix], sizes: Sequence[Size | None]) -> GivenMatches:
     """The matches of one pair. K: of both cameras. sizes: None where neither file nor image tells."""
     with h5.opened(path) as file:
         x0, x1 = (h5.numbers(file, f"{key}/{name}", None, 2) for name in ("x1", "x2"))
@@ -194,10 +190,7 @@ def _camera(file: Any, path: Path, key: str, source: ImageSource) -> tuple[Matri
     sides = [_side(file, f"{key}/{name}") for name in ("height", "width")]
     if all(sides):
         return K, (sides[0], sides[1])
-    size = stored_size(source.path)
-    if size is not None:
-        predictions.expect_size(source, size, K)
-    return K, size
+    return K, predictions.size_by_file(source, K)
 
 
 def _side(file: Any, key: str) -> int:
@@ -233,8 +226,7 @@ class H5Pairs(HeldPairs):
         origin: coordinates of the first pixel's centre; of the layout's convention when not given.
 
     What is wrong with one pair is that pair's `problem`, or its failure when it is read. Raises DataError for what is
-    wrong with files as a whole.
-    """
+    wrong with files as a whole."""
 
     name = "h5"
 

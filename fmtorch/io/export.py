@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fmtorch.core.files import replacing, write_whole
-from fmtorch.io import colmap, h5, match_file, predictions
+from fmtorch.io import colmap, h5, predictions
 from fmtorch.io.match_store import MatchStore, StoredImage
 
 KINDS = ("h5", "colmap")
@@ -81,7 +81,7 @@ def write_hloc(
                 group[name] = blank
             group.attrs["F"], group.attrs["related"] = pair.F, pair.related
             if pair.geometry is not None:
-                match_file.write_geometry(group, pair.geometry)
+                group.attrs.update({**pair.geometry.texts, **pair.geometry.matrices})
 
 
 GRAPH_JSON, GRAPH_CSV = "graph.json", "graph.csv"

@@ -93,7 +93,7 @@ class HlocMatches(_OpenFiles):
                 if h5.holds(self._matches, key):
                     scores = h5.numbers(self._matches, key, None)
                     group["matching_scores0"] = np.where(second == predictions.NO_MATCH, 0, scores).astype(np.float32)
-                write_geometry(group, geometry)
+                group.attrs.update({**geometry.texts, **geometry.matrices})
 
     def _named(self, key: str) -> Names:
         """The names of a pair's images; of an image without features that in the key."""
@@ -107,11 +107,6 @@ class HlocMatches(_OpenFiles):
         points = h5.numbers(self._features, f"{name}/keypoints", None, 2).astype(np.float32)
         width, height = h5.reshaped(self._features, f"{name}/image_size", 2)
         return DatabaseImage(name, -1, (int(height), int(width)), np.eye(3), np.inf, points, points)
-
-
-def write_geometry(group: Any, geometry: PairGeometry) -> None:
-    """Words and matrices of a pair as attributes of its group."""
-    group.attrs.update({**geometry.texts, **geometry.matrices})
 
 
 NPZ = ".npz"

@@ -28,9 +28,8 @@ MATRICES = ("F", "E", "H", "R", "t")
 
 class PairGeometry(NamedTuple):
     """The geometry of one pair, in pixels with (0, 0) at the centre of the first one.
-    inliers: keypoints of both images, (n, 2). F, E, H: (3, 3), None where the pair has none; ``x1^T F x0 = 0``,
-    ``x1 ~ H x0``. R, t: X1 = R X0 + t. reason: why there is no F. warning: what the matches leave open or contradict.
-    """
+    inliers: keypoints of both images, (n, 2). F, E, H: (3, 3), None where there is none; ``x1^T F x0 = 0``,
+    ``x1 ~ H x0``. R, t: X1 = R X0 + t. reason: why there is no F. warning: what matches leave open or contradict."""
 
     kind: Kind
     inliers: Array

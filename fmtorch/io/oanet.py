@@ -51,9 +51,7 @@ def keys(file: Any) -> list[str]:
     return sorted(h5.keys(file["xs"]), key=lambda key: (len(key), key))
 
 
-_SHAPES: dict[str, tuple[int, ...]] = {
-    f"{name}{i}s": (n,) for i in (1, 2) for name, n in (("cx", 1), ("cy", 1), ("f", 2))
-}
+_SHAPES: dict[str, tuple[int, ...]] = {f"{k}{i}s": (n,) for i in (1, 2) for k, n in (("cx", 1), ("cy", 1), ("f", 2))}
 _SHAPES |= {"Rs": (3, 3), "ts": (3,), "sizes": (4,)}
 
 

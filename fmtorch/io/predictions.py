@@ -59,13 +59,17 @@ def image(family: str, scene: str, name: str, folder: Path | None) -> ImageSourc
     return ImageSource(f"{family}/{scene}/{name}", path)
 
 
-def expect_size(source: ImageSource, size: Size, K: Matrix) -> None:
-    """Raises DataError where an image's size (h, w) contradicts its camera: a copy that was reduced or cropped."""
+def size_by_file(source: ImageSource, K: Matrix) -> Size | None:
+    """(h, w) of an image by its file, None where there is none.
+    Raises DataError where it contradicts the image's camera: a copy that was reduced or cropped."""
+    if (size := stored_size(source.path)) is None:
+        return None
     h, w = size
     if max(abs(K[0, 2] / w - 0.5), abs(K[1, 2] / h - 0.5)) > MAX_OFF_CENTRE:
         centre = f"its camera's principal point is ({K[0, 2]:g}, {K[1, 2]:g})"
         wanted = "the image as it was when its camera was determined"
         raise DataError(f"{source.path}: {w} x {h} px, but {centre}; it must be {wanted}")
+    return size
 
 
 def size_by_points(K: Matrix, x: Matrix) -> Size:

@@ -324,13 +324,11 @@ def line_of(F: Array, x: float, y: float) -> tuple[float, float, float]:
 
 
 @inner
-def segment_in_image(
-    a: float, b: float, c: float, size: Array, border: float
-) -> tuple[float, float, float, float, bool]:
-    """x and y of the ends of the part of a line inside the rectangle (border, border + size); whether there is one.
+def segment_in_image(a: float, b: float, c: float, size: Array, edge: float) -> tuple[float, float, float, float, bool]:
+    """x and y of the ends of the part of a line inside the rectangle (edge, edge + size); whether there is one.
     The line may have any scale, sign and direction. The left end is first, or the upper one of a vertical line."""
     half_h, half_w = size[0] / 2, size[1] / 2
-    centre_x, centre_y = half_w + border, half_h + border
+    centre_x, centre_y = half_w + edge, half_h + edge
     squared = a * a + b * b
     scale = 1 / math.sqrt(squared) if squared != 0 else 0.0
     if a > 0 if abs(b * scale) < PARALLEL else b < 0:

@@ -213,10 +213,7 @@ def _listed_pairs(folder: Path, images: Sequence[Path], pairs: Path) -> list[Pai
 
 def in_blocks(pairs: Sequence[Pair], block: int) -> list[Pair]:
     """The pairs in an order that needs few images at a time: `block` first ones meet one second image after another."""
-    number: dict[Path, int] = {}
-    for pair in pairs:
-        for image in pair:
-            number.setdefault(image, len(number))
+    number = {image: i for i, image in enumerate(dict.fromkeys(itertools.chain.from_iterable(pairs)))}
     return sorted(pairs, key=lambda pair: (number[pair[0]] // block, number[pair[1]], number[pair[0]]))
 
 

@@ -99,15 +99,13 @@ class PhotographCameras:
             return {"focal": "unknown" if measured == [None, None] else measured}
         if self._of_all is None and self._stored is None:
             return {}
-        given = camera0.lens, camera1.lens
-        knowledge: dict[str, Any] = {
-            f"K{i}": None if lens is None or lens.bends else lens.K for i, lens in enumerate(given)
-        }
-        if any(lens is not None and lens.bends for lens in given):
-            knowledge["lens"] = tuple(lens if lens is not None and lens.bends else None for lens in given)
-        if camera0.lens is None and camera1.lens is None:
-            knowledge["focal"] = "unknown"
-        return knowledge
+        both = camera0.lens, camera1.lens
+        known: dict[str, Any] = {f"K{i}": None if lens is None or lens.bends else lens.K for i, lens in enumerate(both)}
+        if any(lens is not None and lens.bends for lens in both):
+            known["lens"] = tuple(lens if lens is not None and lens.bends else None for lens in both)
+        if both == (None, None):
+            known["focal"] = "unknown"
+        return known
 
     def given(self, paths: Sequence[Path], sizes: Sequence[tuple[int, int]]) -> dict[str, Any]:
         """What `relate` takes of a pair's cameras."""
@@ -224,9 +222,8 @@ def division_lenses(
 def undistorted_matches(c: Correspondences, lenses: Sequence[Lens | None], scales: Sequence[Tensor]) -> Correspondences:
     """Matches of two reduced photographs as pinholes of the same K would have them, in pixels of the reduced images.
     lenses: of the originals, None where nothing is distorted. A match that a pinhole does not see is masked."""
-    first, second = (
-        None if lens is None else lens.scaled(*scale.tolist()) for lens, scale in zip(lenses, scales, strict=True)
-    )
+    both = zip(lenses, scales, strict=True)
+    first, second = (None if lens is None else lens.scaled(*scale.tolist()) for lens, scale in both)
     return two_view.undistorted_matches(c, [(first, second)]).derived(noise=c.noise)
 
 
@@ -299,10 +296,16 @@ def pair_geometries(
 
 
 def _calibrated(c: Correspondences, estimate: Estimate) -> Tensor:
-    """Whether both focal lengths of a pair are known, and the pose with them: (b,)."""
+    """Whether both focal lengths of a pair are known, the pose with them, and no estimated one contradicts K: (b,)."""
     if c.focal is None or estimate.R is None:
         return torch.zeros_like(estimate.ok)
-    return c.focal[..., 1].isfinite().all(1) & estimate.R.isfinite().flatten(1).all(1) & ~_conflicting(c, estimate)
+    deviation = c.focal[..., 1]
+    known = deviation.isfinite().all(1) & estimate.R.isfinite().flatten(1).all(1)
+    if c.K0 is None or c.K1 is None or estimate.focals is None:
+        return known
+    stored = torch.stack([torch.sqrt(K[:, 0, 0] * K[:, 1, 1]) for K in (c.K0, c.K1)], 1)
+    conflict = (estimate.focals / stored).log().abs() > MAX_CONFLICT * deviation.clamp_min(FOCAL_DEVIATION)
+    return known & ~conflict.any(1)
 
 
 def _with_lines(kind: Kind, inliers: NDArray[np.integer[Any]], estimate: Estimate, i: int, H: Any) -> PairGeometry:
@@ -313,11 +316,3 @@ def _with_lines(kind: Kind, inliers: NDArray[np.integer[Any]], estimate: Estimat
 
 def _known(value: Tensor, known: Tensor) -> NDArray[np.float64] | None:
     return value.detach().cpu().double().numpy() if known else None
-
-
-def _conflicting(c: Correspondences, estimate: Estimate) -> Tensor:
-    """Whether an estimated focal length contradicts the known one of K: (b,)."""
-    if c.K0 is None or c.K1 is None or c.focal is None or estimate.focals is None:
-        return torch.zeros_like(estimate.ok)
-    stored = torch.stack([torch.sqrt(K[:, 0, 0] * K[:, 1, 1]) for K in (c.K0, c.K1)], 1)
-    return ((estimate.focals / stored).log().abs() > MAX_CONFLICT * c.focal[..., 1].clamp_min(FOCAL_DEVIATION)).any(1)

@@ -43,10 +43,8 @@ class Memo(Generic[Key, Value]):
     def get(self, key: Key, compute: Callable[[], Value]) -> Value:
         """The value of `key`, computed if it is not there; an exception is kept and raised again."""
         with self._lock:
-            future = self._futures.get(key)
-            mine = future is None
-            if future is None:
-                future = self._futures[key] = Future()
+            mine = key not in self._futures
+            future = self._futures.setdefault(key, Future())
             self._futures.move_to_end(key)
             while len(self._futures) > self._capacity:
                 self._futures.popitem(last=False)
@@ -329,8 +327,7 @@ class Pipeline:
 
 def examined(pipeline: Pipeline, outcomes: Sequence[Outcome], seed: int = 0) -> list[Outcome]:
     """The outcomes of a run with their pair types; a pair that cannot be examined has none and harms no other.
-    Where the estimator was given nothing of the cameras, K counts for nothing here. Of homographies nothing is asked.
-    """
+    Where the estimator was given nothing of the cameras, K does not count here. Of homographies nothing is asked."""
     if stages.model_of(pipeline.estimator) != "fundamental":
         return list(outcomes)
     matched = {i: o for i, o in enumerate(outcomes) if o.correspondences is not None and o.estimate is not None}

@@ -160,9 +160,7 @@ class CachedFeatures:
             steps = [frames, described]
             size = {"image_size": torch.tensor(image.shape[:2], dtype=torch.int64)}
         else:
-            whole = self._kept(
-                self._extraction, digest, lambda: dict(vars(output_of(extractor, extractor(image), Features)))
-            )
+            whole = self._kept(self._extraction, digest, lambda: vars(output_of(extractor, extractor(image), Features)))
             steps, size = [whole], {}
         with self._lock:
             computed = any(step.computed for step in steps)

@@ -79,8 +79,7 @@ class Task:
 
 def digest(family: str, split: str, seed: int, plan: Plan) -> str:
     """What defines a family's pictures and pairs, as 64 hex digits.
-    OpenCV's release is part of it, since it draws the letters on signs and finds the keypoints that choose the pairs.
-    """
+    OpenCV's release is part of it: it draws the letters on signs and finds the keypoints that choose the pairs."""
     parts = [VERSION, ".".join(cv2.__version__.split(".")[:2]), family, split, seed, dataclasses.asdict(plan)]
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
 
@@ -115,12 +114,10 @@ def draw(scene: DrawnScene, seed: np.random.SeedSequence) -> Iterator[Pixels]:
         yield expose(stages[shot.light], shot.moments or [shot.camera], shot.lens, np.random.default_rng(noise))
 
 
-def generate_all(
-    scenes: Sequence[tuple[Task, Path]], workers: int | None = None, progress: Progress | None = None
-) -> None:
+def generate_all(scenes: Sequence[tuple[Task, Path]], workers: int | None, progress: Progress | None) -> None:
     """Draws every scene (task, folder) that is missing; `progress` gets (done, total) as scenes are completed.
-    workers: processes; by default one for each core that this process may use; 1 draws here. Interrupted, it completes
-    the scenes that are being drawn. Raises WorkersLost where workers die."""
+    workers: processes; None: one for each core that this process may use; 1 draws here. Interrupted, it completes the
+    scenes that are being drawn. Raises WorkersLost where workers die."""
     missing = [scene for scene in scenes if not (scene[1] / scene[0].name).is_dir()]
     report = progress or (lambda done, total: None)
     done = len(scenes) - len(missing)

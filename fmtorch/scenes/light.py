@@ -214,10 +214,7 @@ class Stage:
         low, high = (points @ axes.T).min(0), (points @ axes.T).max(0)
         scale = (SHADOW_MAP - 1) / (high - low)[:2].max()
         self.bias = 2.0 / scale + 0.01
-        P = np.zeros((3, 4))
-        P[:2, :3] = axes[:2] * scale
-        P[:2, 3] = -low[:2] * scale
-        P[2, 3] = 1.0
+        P = np.vstack([np.column_stack([axes[:2], -low[:2]]) * scale, [0.0, 0.0, 0.0, 1.0]])
         depth = np.append(axes[2], -low[2])
         lit_from_behind = geometry.normal @ toward <= 0
         skip = lit_from_behind & ~geometry.both_sides if light.through_walls else None

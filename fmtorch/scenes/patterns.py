@@ -130,8 +130,7 @@ def asphalt(rng: Rng, h: int, w: int) -> Floats:
 
 def meadow(rng: Rng, h: int, w: int, tint: Floats) -> Floats:
     """Grass from above: short strokes of many greens over soft patches."""
-    out = tint * (0.8 + 0.12 * fractal(rng, h, w, 256, 4))[..., None]
-    out = np.ascontiguousarray(out, dtype=np.float32)
+    out = np.ascontiguousarray(tint * (0.8 + 0.12 * fractal(rng, h, w, 256, 4))[..., None], dtype=np.float32)
     count = h * w // 120
     root = rng.uniform(0, [w, h], (count, 2))
     tip = root + rng.normal(0, 5, (count, 2))
@@ -143,8 +142,7 @@ def meadow(rng: Rng, h: int, w: int, tint: Floats) -> Floats:
 def cloth(rng: Rng, h: int, w: int) -> Floats:
     """A carpet: a border and mirrored ornaments in a few colours."""
     palette = [colour(rng, (0, 1), (0.3, 0.8), (0.25, 0.85)) for _ in range(5)]
-    quarter = np.empty((h // 2, w // 2, 3), dtype=np.float32)
-    quarter[:] = palette[0]
+    quarter = blank(h // 2, w // 2, palette[0])
     for _ in range(45):
         p = rng.uniform(0, [w // 2, h // 2], (3, 2))
         tone = palette[int(rng.integers(1, 5))].tolist()
@@ -196,9 +194,7 @@ _FONTS = (cv2.FONT_HERSHEY_SIMPLEX, cv2.FONT_HERSHEY_DUPLEX, cv2.FONT_HERSHEY_CO
 
 def blank(h: int, w: int, tone: Floats) -> Floats:
     """A picture of one colour."""
-    out = np.empty((h, w, 3), dtype=np.float32)
-    out[:] = tone
-    return out
+    return np.full((h, w, 3), tone, dtype=np.float32)
 
 
 def word(rng: Rng, low: int = 3, high: int = 9) -> str:
@@ -251,8 +247,7 @@ def window(rng: Rng, h: int, w: int, style: np.random.SeedSequence) -> Floats:
 def door(rng: Rng, h: int, w: int) -> Floats:
     """A panelled door."""
     tone = colour(rng, (0, 1), (0.2, 0.7), (0.2, 0.6))
-    out = tone * (1 + 0.05 * fractal(rng, h, w, 64, 1))[..., None]
-    out = np.ascontiguousarray(out, dtype=np.float32)
+    out = np.ascontiguousarray(tone * (1 + 0.05 * fractal(rng, h, w, 64, 1))[..., None], dtype=np.float32)
     for i in range(2):
         for j in range(3):
             x, y = int(w * (0.08 + 0.46 * i)), int(h * (0.05 + 0.32 * j))

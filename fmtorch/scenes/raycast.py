@@ -61,9 +61,7 @@ def scaled_camera(
     return calibration(focal * scale, scaled, middle), scaled
 
 
-def look_at(
-    K: Matrix, size: tuple[int, int], centre: Sequence[Real], target: Sequence[Real], roll: Real = 0.0
-) -> Camera:
+def look_at(K: Matrix, size: tuple[int, int], centre: Sequence[Real], target: Sequence[Real], roll: Real = 0) -> Camera:
     """A camera at `centre` that looks at `target`, upright but for a roll about its axis in radians."""
     c = np.asarray(centre, dtype=np.float64)
     forward = np.asarray(target, dtype=np.float64) - c

@@ -321,8 +321,7 @@ class OANetPairs(StoredMatches):
         before: pruners whose matches alone are given, each a function of correspondences.
         augmentation, seed: as of `StoredMatches`.
 
-    Raises DataError, naming the file, for a file that is missing, damaged, empty or of another layout.
-    """
+    Raises DataError, naming the file, for a file that is missing, damaged, empty or of another layout."""
 
     def __init__(
         self, root: str | Path, *, labels: labelled.Rule = "geodesic",

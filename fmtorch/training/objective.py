@@ -4,6 +4,8 @@ Each loss is a mean over the pairs that it can judge. A pair that it cannot judg
 no true geometry) adds zero to loss and gradient; where that holds for all pairs, the loss is zero and still attached to
 the graph. So no training step needs to be skipped."""
 
+from typing import Any
+
 import torch
 from jaxtyping import Bool, Float, Int, Int8, Real
 from torch import Tensor
@@ -41,23 +43,17 @@ class Objective(ObjectiveWeights):
             c = batch.correspondences
             if c.size0 is None or c.size1 is None:
                 raise ValueError("the geometric losses need image sizes (size0, size1) of every pair")
+            models, options = (F, batch.F, c.size0, c.size1), dict[str, Any](valid=valid, seed=step, key=c.keys)
             if self.geometric:
-                calibrated = self.coordinates == "K"
-                if calibrated and (c.K0 is None or c.K1 is None):
+                K0, K1 = (c.K0, c.K1) if self.coordinates == "K" else (None, None)
+                if self.coordinates == "K" and (K0 is None or K1 is None):
                     raise ValueError("objective.coordinates=K needs calibration matrices; the data set has none")
-                terms["geometric"] = geometric_loss(
-                    F, batch.F, c.size0, c.size1, K0=c.K0 if calibrated else None, K1=c.K1 if calibrated else None,
-                    valid=valid, points=self.points, seed=step, key=c.keys,
-                )  # fmt: skip
+                terms["geometric"] = geometric_loss(*models, K0=K0, K1=K1, points=self.points, **options)
             if self.nsgd:
-                terms["nsgd"] = nsgd_loss(
-                    F, batch.F, c.size0, c.size1, valid=valid, limit=self.nsgd_limit, samples=self.points, seed=step,
-                    key=c.keys,
-                )  # fmt: skip
-        weights = {"classification": self.classification, "geometric": self.geometric, "nsgd": self.nsgd}
+                terms["nsgd"] = nsgd_loss(*models, limit=self.nsgd_limit, samples=self.points, **options)
         total = 0 * prediction.logit.sum()
         for name, value in terms.items():
-            total = total + weights[name] * value.to(total.dtype)
+            total = total + getattr(self, name) * value.to(total.dtype)
         return {**terms, "loss": total}
 
 
@@ -67,8 +63,7 @@ def fits(
     """The fundamental matrices of each stage in pixels, and which are valid: the network's own, or weighted 8-point."""
     c = batch.correspondences
     if prediction.F is not None:
-        F = prediction.F
-        return F, torch.isfinite(F.detach()).flatten(-2).all(-1) & (F.detach() != 0).flatten(-2).any(-1)
+        return prediction.F, _valid_models(prediction.F)
     x0, x1 = (x.to(torch.float64).expand(len(prediction.weight), *x.shape) for x in (c.x0, c.x1))
     return eight_point(x0, x1, prediction.weight.to(torch.float64), c.mask.expand(prediction.weight.shape))
 
@@ -135,10 +130,11 @@ def geometric_loss(
     if (K0 is None) != (K1 is None):
         raise ValueError("only one of K0 and K1 is given; the loss needs both, or neither")
     limit = (LIMIT_F if K0 is None else LIMIT_E) if limit is None else limit
-    A0, A1 = (_by_size(s) if K is None else K.to(torch.float64) for K, s in ((K0, size0), (K1, size1)))
+    A = torch.stack([_by_size(s) if K is None else K.to(torch.float64) for K, s in ((K0, size0), (K1, size1))])
     x0, x1, mask = virtual_points(F_true, size0, size1, count=points, seed=seed, key=key)
-    calibrated = (A0.isfinite() & A1.isfinite()).all(-1).all(-1) & _diagonal(A0) & _diagonal(A1)
-    A0, A1 = (torch.where(calibrated[:, None, None], A, torch.eye(3, dtype=A.dtype, device=A.device)) for A in (A0, A1))
+    finite, regular = A.isfinite().all(-1).all(-1), (A.diagonal(dim1=-2, dim2=-1) != 0).all(-1)  # upper triangular
+    calibrated = (finite & regular).all(0)
+    A0, A1 = torch.where(calibrated[:, None, None], A, torch.eye(3, dtype=A.dtype, device=A.device))
     mask = mask & calibrated[:, None]
     valid = _valid_models(F_est, valid)
     F = epipolar.unit_largest(torch.where(valid[..., None, None], F_est.to(torch.float64), 0.0))
@@ -265,11 +261,6 @@ def _by_size(size: Real[Tensor, "b 2"]) -> Float[Tensor, "b 3 3"]:
     half = torch.maximum(h, w) / 2
     zero, ones = torch.zeros_like(h), torch.ones_like(h)
     return torch.stack([half, zero, (w - 1) / 2, zero, half, (h - 1) / 2, zero, zero, ones], -1).reshape(-1, 3, 3)
-
-
-def _diagonal(A: Float[Tensor, "b 3 3"]) -> Bool[Tensor, " b"]:
-    """Whether upper triangular matrices are regular."""
-    return (A.diagonal(dim1=-2, dim2=-1) != 0).all(-1)
 
 
 def _normalised(x: Float[Tensor, "b n 2"], A: Float[Tensor, "b 3 3"]) -> Float[Tensor, "b n 2"]:

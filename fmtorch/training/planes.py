@@ -105,12 +105,9 @@ class PlanePairs(HeldPairs):
 
     def _pair(self, scene: str, i: int, j: int) -> ImagePair:
         camera0, camera1 = (self._cameras[f"{scene}/{k}"] for k in (i, j))
-        R, t = relative_pose(camera0, camera1)
         images = [ImageSource(f"{scene}/{k}", self._paths[f"{scene}/{k}"]) for k in (i, j)]
-        return ImagePair(
-            identity=f"{self.name}/{scene}/{i}-{j}", family=self.name, scene=scene, image0=images[0], image1=images[1],
-            F=np.zeros((3, 3)), K0=camera0.K, K1=camera1.K, R=R, t=t,
-        )  # fmt: skip
+        identity, truth = f"{self.name}/{scene}/{i}-{j}", (camera0.K, camera1.K, *relative_pose(camera0, camera1))
+        return ImagePair(identity, self.name, scene, images[0], images[1], np.zeros((3, 3)), *truth)
 
     def depth(self, image: ImageSource, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Depth (n,), in longest sides of the photograph, at points (n, 2) of a view; NaN outside of it."""

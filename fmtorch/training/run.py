@@ -22,12 +22,11 @@ from typing import Any, NamedTuple
 import lightning
 import numpy as np
 import torch
-from lightning import Trainer
 from lightning.pytorch.callbacks import Callback, EarlyStopping, ModelCheckpoint
 from lightning.pytorch.loggers import TensorBoardLogger
 from numpy.typing import NDArray
 from omegaconf import DictConfig
-from rich.progress import Progress, TaskID
+from rich.progress import Progress
 from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
@@ -199,24 +198,20 @@ class _TrainingBar(Callback):
     total: steps in all. monitor: the figure of validation that is shown."""
 
     def __init__(self, total: int, monitor: str) -> None:
-        self.total, self.monitor = total, monitor
+        self.total, self.monitor, self._figure = total, monitor, ""
         self._progress: Progress | None = None
-        self._bar: TaskID | None = None
-        self._figure = ""
 
     def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         if trainer.is_global_zero:
             self._progress = terminal.progress_bars()
             self._progress.start()
-            self._bar = self._progress.add_task("training", total=self.total, completed=trainer.global_step)
+            self._progress.add_task("training", total=self.total, completed=trainer.global_step)
 
-    def on_train_batch_end(
-        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, outputs: Any, batch: Any, batch_idx: int
-    ) -> None:
-        if self._progress is not None and self._bar is not None:
+    def on_train_batch_end(self, trainer: lightning.Trainer, pl_module: Any, outputs: Any, *_: Any) -> None:
+        if self._progress is not None:
             loss = outputs["loss"] if isinstance(outputs, dict) else outputs
             text = f"training: loss {float(loss):.3f}{self._figure}"
-            self._progress.update(self._bar, completed=trainer.global_step, description=text)
+            self._progress.update(self._progress.task_ids[0], completed=trainer.global_step, description=text)
 
     def on_validation_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         value = trainer.callback_metrics.get(f"validation/{self.monitor}")
@@ -273,7 +268,7 @@ def run(config: DictConfig, name: str) -> Path:
     Started again, it goes on from the last checkpoint; a finished training only writes its files anew. name: of the
     pruner's preset, e.g. ``lc``. Raises ValueError for options that cannot be."""
     options = read_fields(TrainOptions, config)
-    expect_options(Trainer, plain(config.trainer), "trainer")
+    expect_options(lightning.Trainer, plain(config.trainer), "trainer")
     presets.expect_buildable(plain(config.dataset), "dataset")
     presets.expect_stages(config)
     network_config = network_of(config, name)

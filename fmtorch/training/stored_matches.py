@@ -29,16 +29,10 @@ ARRAYS: dict[str, tuple[str, tuple[int, ...]]] = {
     **dict.fromkeys(("lafs0", "lafs1"), ("float32", (-1, 2, 3))),
 }  # fmt: skip
 """What is stored of a pair and of its matches: types of the numbers, and shapes, -1 for the number of matches."""
-_TEXTS = ("identity", "family", "scene", "reason")
-SCHEMA = pa.schema(
-    [
-        pa.field("key", pa.int64()),
-        *(pa.field(name, pa.string()) for name in _TEXTS),
-        *(pa.field(name, pa.int64()) for name in ("matches", "inliers", "outliers")),
-        *(pa.field(name, pa.list_(pa.from_numpy_dtype(kind))) for name, (kind, _) in ARRAYS.items()),
-    ]
-)
-INDEX = ("key", *_TEXTS, "matches", "inliers", "outliers")  # what is known of a pair without its matches
+_TEXTS, _COUNTS = ("identity", "family", "scene", "reason"), ("matches", "inliers", "outliers")
+INDEX = {"key": pa.int64(), **dict.fromkeys(_TEXTS, pa.string()), **dict.fromkeys(_COUNTS, pa.int64())}
+"""What is known of a pair without its matches, and types."""
+SCHEMA = pa.schema(INDEX | {name: pa.list_(pa.from_numpy_dtype(kind)) for name, (kind, _) in ARRAYS.items()})
 
 Row = Mapping[str, Any]
 
@@ -81,7 +75,7 @@ class Shard:
 
     def index(self) -> dict[str, list[Any]]:
         """What is known of each pair without its matches: the columns of `INDEX`."""
-        index: dict[str, list[Any]] = self.batch.select(INDEX).to_pydict()
+        index: dict[str, list[Any]] = self.batch.select(list(INDEX)).to_pydict()
         return index
 
     def read(self, row: int, names: Sequence[str] = tuple(ARRAYS)) -> dict[str, NDArray[Any]]:
@@ -127,8 +121,7 @@ class StoredMatches(Dataset[LabelledMatches]):
         augmentation: random changes of each item, selected by `seed`, the pair's key and the epoch (`set_epoch`, or an
             index that is a `Draw`).
 
-    Raises ValueError where the folder has no such files or every pair failed, ShardError for a damaged file.
-    """
+    Raises ValueError where the folder has no such files or every pair failed, ShardError for a damaged file."""
 
     def __init__(self, folder: str | Path, *, augmentation: Augmentation | None = None, seed: int = 0) -> None:
         self.folder = Path(folder)
@@ -243,8 +236,7 @@ def split_scenes(matches: StoredMatches, last: int = 4) -> tuple[StoredMatches, 
     Args:
         matches: of several scenes a family. last: scenes of each family for validation.
 
-    Raises ValueError for a family that has no more scenes than that.
-    """
+    Raises ValueError for a family that has no more scenes than that."""
     scenes = [(about["family"], about["scene"]) for about in matches.pairs]
     for family, count in Counter(family for family, _ in dict.fromkeys(scenes)).items():
         if count <= last:
@@ -290,8 +282,7 @@ class SimilarLengthBatches(Sampler[list[Draw]]):
         rank, world_size: of this process in a distributed training; each has as many batches, where need be some of
             the first ones twice.
 
-    Raises ValueError for a batch below 1, and for a rank that is not below world_size.
-    """
+    Raises ValueError for a batch below 1, and for a rank that is not below world_size."""
 
     def __init__(
         self, dataset: StoredMatches, batch: int = 32, *, seed: int = 0, matches: Sequence[int] | None = (50, 4000),
