@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import os
 import re
 import shlex
 from collections.abc import Callable
@@ -213,15 +212,6 @@ def test_before_any_work(monkeypatch: pytest.MonkeyPatch, photographs: Path, wor
     assert end.startswith("error: ")
     assert said in end
     assert "\n" not in end
-
-
-def test_only_regular_files_are_read(monkeypatch: pytest.MonkeyPatch, photographs: Path) -> None:
-    """A pipe would block for ever, a device fill the memory."""
-    os.mkfifo(photographs / "pipe.jpg")
-    (photographs / "zero.jpg").symlink_to("/dev/zero")
-    for name in ("pipe.jpg", "zero.jpg"):
-        end = ended(monkeypatch, photographs, "match", "a.png", name, *SIFT)
-        assert end == f"error: {name}: no regular file; it must be an image file"
 
 
 def test_the_report_is_refused_before_it_is_drawn(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
