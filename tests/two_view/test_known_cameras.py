@@ -317,6 +317,11 @@ def test_forms_of_what_is_known(arguments: dict[str, Any], focal: list[Any]) -> 
         ({"focal": (800.0, float("nan"))}, "focal of image 0"),
         ({"focal": (800.0, 0.1), "size0": None, "size1": None}, "focal needs the image sizes"),
         ({"K0": K, "size0": None, "size1": None}, "K0 alone needs the image sizes"),
+        ({"covariance": True, "size0": None, "size1": None}, "covariance needs K0 and K1, or the image sizes"),
+        ({"size0": "guess"}, "size0 is 'guess'; it must be (h, w), 'unknown' or None"),
+        ({"size1": "unknown"}, "size0 is given and the other is 'unknown'"),
+        ({"size0": "unknown"}, "size1 is given and the other is 'unknown'"),
+        ({"size0": "unknown", "size1": None, "focal": "shared"}, "focal needs the image sizes"),
         ({"K0": K, "K1": K, "focal": (800, 0.1, 2)}, "focal has shape"),
         ({"K0": K, "K1": K, "focal": -0.1}, "a relative deviation is not negative"),
         ({"K0": torch.eye(2), "K1": K}, "K0 has shape"),
@@ -328,11 +333,6 @@ def test_wrong_arguments_are_named(arguments: dict[str, Any], said: str) -> None
     with pytest.raises(ValueError, match=r"^") as error:
         fmtorch.find_fundamental(SCENE.x0, SCENE.x1, **(SIZES | arguments))
     assert str(error.value).startswith(said) or said in str(error.value)
-
-
-def test_homographies_have_no_essential_matrix() -> None:
-    with pytest.raises(ValueError, match="needs one that gives fundamental matrices"):
-        fmtorch.find_essential(SCENE.x0, SCENE.x1, K, K, estimator="homography")
 
 
 def test_calibrations_come_in_any_form() -> None:
