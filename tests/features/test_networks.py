@@ -166,11 +166,13 @@ def test_other_shapes_of_patches_are_refused(hardnet: Path) -> None:
 
 
 def test_an_absent_file_is_named_with_what_makes_it(tmp_path: Path) -> None:
-    with pytest.raises(NetworkFileError, match=r"absent\.onnx does not exist: scripts\.patch_networks\.export"):
-        PatchNetwork(tmp_path / "absent.onnx")(torch.zeros(1, 1, 32, 32))
+    """When it is first used, or asked for what it is."""
+    plain, int8 = (PatchNetwork(tmp_path / f"absent{precision}.onnx") for precision in ("", ".int8"))
     for use in (lambda n: n(torch.zeros(1, 1, 32, 32)), lambda n: n.identity):
+        with pytest.raises(NetworkFileError, match=r"absent\.onnx does not exist: scripts\.patch_networks\.export"):
+            use(plain)
         with pytest.raises(NetworkFileError, match=r"absent\.int8\.onnx does not exist: .*=int8.*calibration="):
-            use(PatchNetwork(tmp_path / "absent.int8.onnx"))
+            use(int8)
 
 
 def test_a_corrupt_file_is_named(hardnet: Path, tmp_path: Path) -> None:
