@@ -154,14 +154,9 @@ def test_a_wrong_measurement_is_not_believed_for_long() -> None:
     np.testing.assert_allclose(e.focals[0], [650, 650], rtol=0.05)
 
 
-@functools.cache
-def _quick(name: str) -> KnownCameras:
-    return KnownCameras(quick(name))
-
-
 def test_poses_are_there_as_a_whole_or_not_at_all() -> None:
     pairs = [scene(1), *degenerate().values(), *small().values()]
-    e = _quick("fmtorch")(with_knowledge(collate(pairs), "exact"), seed=5)
+    e = KnownCameras(quick("fmtorch"))(with_knowledge(collate(pairs), "exact"), seed=5)
     for value in (e.E, e.R, e.t):
         finite = value.flatten(1).isfinite()
         assert bool((finite.all(1) | ~finite.any(1)).all())
@@ -174,8 +169,8 @@ def test_a_wrong_calibration_is_a_reason_and_no_more() -> None:
     K0, K1 = c.K0.clone(), c.K1.clone()
     K0[1], K1[2, 0, 0], K0[3, :2] = torch.nan, 0.0, K0[3, :2] / 800
     K0.requires_grad_()
-    e = _quick("fmtorch")(c.replace(K0=K0, K1=K1), seed=5)
-    alone = _quick("fmtorch")(c[[0, 4]], seed=5)
+    e = KnownCameras(quick("fmtorch"))(c.replace(K0=K0, K1=K1), seed=5)
+    alone = KnownCameras(quick("fmtorch"))(c[[0, 4]], seed=5)
     assert e.ok.tolist() == [True, False, False, False, True]
     assert [reason.split(" ")[0] for reason in e.reason] == ["", "K0", "K1", "K0", ""]
     assert torch.equal(e.F[[0, 4]], alone.F)
