@@ -17,6 +17,7 @@ from tests.helpers import draw, draw_set
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 COUNT = "it must be a whole number of at least 1"
+NAMES = [("my photo (1).png", "b=2,[x].png"), ("it's {a}.png", "c#d%.png"), ("null.png", "3")]
 SMALL = ["dataset=fmbench", "dataset.root=Set", "features.max_features=300", "estimator.hypotheses=100"]
 
 
@@ -102,6 +103,7 @@ def ended(monkeypatch: pytest.MonkeyPatch, folder: Path, command: str, *words: s
         ("eval sift_gms", "sift_gms is not of the form NAME=VALUE"),
         ("match a.png", "image1 is missing; give two image files: fmtorch match a.jpg b.jpg"),
         ("match a.png b.png c.png", "c.png: only image0, image1 may stand without NAME="),
+        ("match /dev/zero /dev/zero", "/dev/zero: no regular file; it must be an image file"),  # nor read for ever
         ("report nowhere", "nowhere holds no run"),
         ("verify", "database is missing; give the database of a COLMAP project: fmtorch verify database.db"),
         ("verify no.db", "there is no file no.db; give the database of a COLMAP project"),
@@ -119,9 +121,6 @@ def test_a_mistake_is_told_in_one_line_and_nothing_written(words, message, tmp_p
     assert "\n" not in line
     assert [path.name for path in tmp_path.rglob("*")] == ["cache", "kernels"]  # put there by `own_cache`
     assert capfd.readouterr() == ("", "")
-
-
-NAMES = [("my photo (1).png", "b=2,[x].png"), ("it's {a}.png", "c#d%.png"), ("null.png", "3")]
 
 
 @pytest.mark.parametrize("names", NAMES)

@@ -11,7 +11,6 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from omegaconf import OmegaConf
 
 from fmtorch import presets
 from fmtorch.commands import report
@@ -26,11 +25,9 @@ from tests.commands.test_match import stereo
 from tests.helpers import compose, draw, draw_set, pair
 from tests.processes import run_command
 
-OPTIONS = {
-    "output": "deep/report.html", "title": "Runs", "pictures": 3, "order": None, "root": None, "own_code": False,
-    "device": "cpu", "cache": "off", "cache_limit": None,
-}  # fmt: skip
 SHOWN = Options(count=3, cache="off")
+SIFT = ("pipeline=sift_ratio", "features.max_features=800", "estimator.hypotheses=100")
+MATCH = ("match", "a.png", "b.png", *SIFT)
 
 
 def results(nsgd: list[float], scene: str = "scene") -> list[PairRow]:
@@ -89,7 +86,7 @@ def test_folders_of_runs_are_found_and_missed(tmp_path: Path) -> None:
     with pytest.raises(RunFolderError, match="holds no run"):
         report.run_folders([tmp_path / "nowhere"])
     with pytest.raises(RunFolderError, match="no run holds results yet"):
-        report.run(OmegaConf.create({**OPTIONS, "runs": [str(tmp_path)]}))
+        report.run(compose("report", (f"runs=[{tmp_path}]",)))
 
 
 def test_runs_keep_the_order_given_and_folders_are_ordered_by_recall(tmp_path, monkeypatch):
@@ -97,15 +94,16 @@ def test_runs_keep_the_order_given_and_folders_are_ordered_by_recall(tmp_path, m
     for name, nsgd in (("a", 0.2), ("b", 0.01), ("c", 0.2)):
         RunFolder.open(tmp_path / "runs" / name, {"pipeline": name}).append(results([nsgd, 0.3]))
 
-    def order(*runs: str, **options: str) -> list[str]:
-        output = report.run(OmegaConf.create({**OPTIONS, "runs": list(runs), **options}))
+    def order(*runs: str, by: str = "null") -> list[str]:
+        words = (f"runs=[{','.join(runs)}]", f"order={by}", "output=deep/report.html", "cache=off")
+        output = report.run(compose("report", words))
         return re.findall(r'<li data-run="(\w)"', output.read_text())
 
-    assert order("runs") == order("runs/c", "runs/b", order="recall", runs=["runs"]) == ["b", "a", "c"]
+    assert order("runs") == order("runs/a", "runs/b", "runs/c", by="recall") == ["b", "a", "c"]
     assert order("runs/c", "runs/b", "runs/a") == ["c", "b", "a"]
-    assert order("runs", order="given") == ["a", "b", "c"]
+    assert order("runs", by="given") == ["a", "b", "c"]
     with pytest.raises(ValueError, match="order=best must be given or recall"):
-        order("runs", order="best")
+        order("runs", by="best")
 
 
 @pytest.mark.parametrize("order", [["ratio", "one_to_one"], ["one_to_one", "ratio"]])
@@ -164,10 +162,6 @@ def test_the_command_on_two_runs(tmp_path: Path, command: Callable[..., str]) ->
     assert "data:image/jpeg" not in bare
     stored = next(tmp_path.glob("runs/*/*/run.json"))
     assert json.loads(stored.read_text())["config"]["pipeline"] == "sift_ratio"
-
-
-SIFT = ("pipeline=sift_ratio", "features.max_features=800", "estimator.hypotheses=100")
-MATCH = ("match", "a.png", "b.png", *SIFT)
 
 
 @pytest.fixture

@@ -21,6 +21,11 @@ from fmtorch.data import DataError, ExifFocal, ImageCameras, ImageError, ImageSo
 from tests.data.native import SIZE, to_binary, write_colmap
 
 COLOUR = np.random.default_rng(0).integers(0, 256, (37, 53, 3), dtype=np.uint8)
+CORNERS = np.array([[[250, 20, 20], [20, 250, 20]], [[20, 20, 250], [250, 250, 250]]], np.uint8)
+BLOCKS = CORNERS.repeat(24, 0).repeat(40, 1)
+Tag = ExifTags.Base
+PLANE = {"FocalLength": IFDRational(35), "FocalPlaneXResolution": IFDRational(2540)}  # 100 px/mm
+PILLOWS_WARNINGS = pytest.mark.filterwarnings("ignore::UserWarning:PIL")
 
 
 def written(path: Path, image: np.ndarray, *options: int) -> Path:
@@ -119,10 +124,6 @@ def test_only_regular_files_are_read(tmp_path: Path) -> None:
             read_image(tmp_path / name)
 
 
-CORNERS = np.array([[[250, 20, 20], [20, 250, 20]], [[20, 20, 250], [250, 250, 250]]], np.uint8)
-BLOCKS = CORNERS.repeat(24, 0).repeat(40, 1)
-
-
 @pytest.mark.parametrize("tag", range(1, 9))
 @pytest.mark.parametrize("suffix", ["jpg", "png", "webp", "tif", "avif"])
 def test_orientation_tags_turn_on_demand_alone(tmp_path: Path, suffix: str, tag: int) -> None:
@@ -191,11 +192,6 @@ def test_heic_is_read_by_pillow_heif_alone(tmp_path: Path, monkeypatch: pytest.M
     opened = SimpleNamespace(to_pillow=lambda: Image.fromarray(BLOCKS).convert("RGBA"))
     monkeypatch.setitem(sys.modules, "pillow_heif", SimpleNamespace(open_heif=lambda file: opened))
     np.testing.assert_array_equal(read_image(path, orient=True), BLOCKS)
-
-
-Tag = ExifTags.Base
-PLANE = {"FocalLength": IFDRational(35), "FocalPlaneXResolution": IFDRational(2540)}  # 100 px/mm
-PILLOWS_WARNINGS = pytest.mark.filterwarnings("ignore::UserWarning:PIL")
 
 
 def with_exif(folder: Path, size: tuple[int, int], name: str = "a.jpg", **tags: object) -> Path:

@@ -71,10 +71,8 @@ def test_an_evaluation_goes_on(kills: int, starter: Starter, root: Path, truth: 
     assert all(results(output) == truth for output in outputs)
 
 
-def test_a_killed_evaluation_takes_what_the_cache_had_and_a_damaged_file_is_computed_anew(
-    starter: Starter, root: Path, truth: Rows, tmp_path: Path
-) -> None:
-    """Of ten images; without the cache nothing is kept."""
+def test_features_that_a_killed_evaluation_kept_are_taken(starter, root, truth, tmp_path):
+    """Of ten images; a damaged file is computed anew, and without the cache nothing is kept."""
 
     def files() -> list[Path]:
         return sorted(tmp_path.glob("cache/features/*/*.npz"))
