@@ -9,13 +9,16 @@ from pathlib import Path
 import pytest
 
 import fmtorch.__main__
-from fmtorch.commands import COMMANDS, help_text, hydra_arguments
+from fmtorch.commands import COMMANDS, hydra_arguments
 from fmtorch.core import exits_with_message, terminal
 from fmtorch.presets import available
 from tests.conftest import own_cache
 from tests.helpers import draw, draw_set
 
 CHECKOUT = Path(__file__).resolve().parents[2]
+COUNT = "it must be a whole number of at least 1"
+NAMES = [("my photo (1).png", "b=2,[x].png"), ("it's {a}.png", "c#d%.png"), ("null.png", "3")]
+SMALL = ["dataset=fmbench", "dataset.root=Set", "features.max_features=300", "estimator.hypotheses=100"]
 
 
 def python(code: str) -> None:
@@ -75,9 +78,6 @@ def ended(monkeypatch: pytest.MonkeyPatch, folder: Path, command: str, *words: s
     return str(end.value.code)
 
 
-COUNT = "it must be a whole number of at least 1"
-
-
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -103,6 +103,7 @@ COUNT = "it must be a whole number of at least 1"
         ("eval sift_gms", "sift_gms is not of the form NAME=VALUE"),
         ("match a.png", "image1 is missing; give two image files: fmtorch match a.jpg b.jpg"),
         ("match a.png b.png c.png", "c.png: only image0, image1 may stand without NAME="),
+        ("match /dev/zero /dev/zero", "/dev/zero: no regular file; it must be an image file"),  # nor read for ever
         ("report nowhere", "nowhere holds no run"),
         ("verify", "database is missing; give the database of a COLMAP project: fmtorch verify database.db"),
         ("verify no.db", "there is no file no.db; give the database of a COLMAP project"),
@@ -120,9 +121,6 @@ def test_a_mistake_is_told_in_one_line_and_nothing_written(words, message, tmp_p
     assert "\n" not in line
     assert [path.name for path in tmp_path.rglob("*")] == ["cache", "kernels"]  # put there by `own_cache`
     assert capfd.readouterr() == ("", "")
-
-
-NAMES = [("my photo (1).png", "b=2,[x].png"), ("it's {a}.png", "c#d%.png"), ("null.png", "3")]
 
 
 @pytest.mark.parametrize("names", NAMES)
@@ -156,13 +154,6 @@ def test_flags_and_sweeps_stay_what_they_are() -> None:
     assert hydra_arguments(["runs/a (1)", "b"], [], ["runs..."]) == ["runs=['runs/a (1)','b']"]
 
 
-def test_help_names_what_runs() -> None:
-    text = help_text(COMMANDS["match"])
-    assert "features=hesaffnet_fast\n" in text
-    assert "pruner=[ratio, one_to_one, frame_consistency]\n" in text
-    assert "features=sift\n" not in text
-
-
 def test_an_interrupted_command_says_what_is_kept(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as end, exits_with_message("interrupted; the same command continues"):
         raise KeyboardInterrupt("3 of 8 pairs are kept in runs/a")
@@ -180,9 +171,6 @@ def test_without_a_terminal_progress_is_a_line_now_and_then(monkeypatch, capsys)
     assert lines <= set(capsys.readouterr().err.splitlines())
 
 
-SMALL = ["dataset=fmbench", "dataset.root=Set", "features.max_features=300", "estimator.hypotheses=100"]
-
-
 @pytest.fixture
 def data_set(tmp_path: Path) -> Path:
     return draw_set(tmp_path / "Set", images=2).parent
@@ -193,11 +181,13 @@ def test_a_sweep_runs_all_jobs_and_tells_the_first_mistake(data_set, monkeypatch
     assert ended(monkeypatch, data_set, "eval", *words) == f"error: limit=0; {COUNT} or null"
     assert (data_set / "out" / "summary.md").is_file()
     assert "Traceback" not in capfd.readouterr().err
-    monkeypatch.setattr(sys, "argv", ["eval", "-m", *SMALL, "limit=1", "estimator=ransac,lmeds"])
+    pipelines = ["sift_ratio", "paper/sift_ratio"]
+    monkeypatch.setattr(sys, "argv", ["eval", "-m", *SMALL[:2], "limit=1", f"pipeline={','.join(pipelines)}"])
     importlib.import_module("fmtorch.commands.eval").main()
     words = [line.split() for line in capfd.readouterr().out.partition("2 runs on ")[2].splitlines()]
-    rows = [row[:2] for row in words if row[:1] in (["ransac"], ["lmeds"])]
-    assert rows[:2] == [["ransac", "1"], ["lmeds", "1"]]
+    assert [row[:2] for row in words if row and row[0] in pipelines][:2] == [[name, "1"] for name in pipelines]
+    folders = sorted(path.parent.name.rpartition("-")[0] for path in data_set.glob("runs/*/*/run.json"))
+    assert folders == ["paper-sift_ratio", "sift_ratio"]
 
 
 @pytest.mark.parametrize("launcher", ["joblib", "submitit_local"])
@@ -227,6 +217,9 @@ def test_help_is_ours_and_fits_a_page(command: str, capsys: pytest.CaptureFixtur
     assert len(lines) < 60
     told = {line.split("=")[0].strip().removesuffix(".NAME") for line in lines if "=" in line}
     assert told >= set(COMMANDS[command].names)
+    if command == "match":
+        runs = [line.strip() for line in lines if line.strip().startswith(("features=", "pruner="))]
+        assert runs == ["features=hesaffnet_fast", "pruner=[ratio, one_to_one, frame_consistency]"]
     fmtorch.__main__.main([command, "--version"])
     assert capsys.readouterr().out.strip() == fmtorch.__version__
 

@@ -1,4 +1,4 @@
-"""`fmtorch eval`: a run folder, continued and refused; failures as rows; errors; runs with the feature cache."""
+"""`fmtorch eval`: a run folder, continued and refused; failures as rows; errors."""
 
 import json
 import re
@@ -9,9 +9,7 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 
-from tests.helpers import draw_set
-from tests.processes import run_command, starter
-from tests.reliability.conftest import Rows, results
+from tests.helpers import draw_set, edit_lines
 
 OPTIONS = ["features.max_features=500", "estimator=lmeds", "estimator.hypotheses=200"]
 OWN_PRUNER = """import torch
@@ -33,8 +31,7 @@ def data(tmp_path: Path) -> list[str]:
     """A set in the FM-Bench layout: three sound pairs, one whose image is broken, one with NaN in F."""
     root = draw_set(tmp_path / "Set", images=5, pairs=[(0, 1), (0, 2), (1, 3), (0, 4), (2, 3)])
     (root / "scene" / "Images" / "00000004.png").write_bytes(b"\x89PNG\r\n\x1a\n and no more")
-    lines = (root / "pairs_with_gt.txt").read_text().splitlines()
-    (root / "pairs_with_gt.txt").write_text("\n".join([*lines[:4], lines[4].replace("-1", "nan")]) + "\n")
+    edit_lines(root / "pairs_with_gt.txt", lambda lines: [*lines[:4], lines[4].replace("-1", "nan")])
     return ["dataset=fmbench", "dataset.root=Set", *OPTIONS]
 
 
@@ -102,12 +99,6 @@ def test_an_executor_of_ones_own_by_config_dir(data: list[str], command: RunComm
     assert "ended: error: executor: it cannot be made (TypeError: " in wrong
 
 
-def test_sweep_gives_each_job_a_folder(data: list[str], command: RunCommand, tmp_path: Path) -> None:
-    command("eval", "-m", "pipeline=sift_ratio,paper/sift_ratio", *data[:2], "limit=1", cwd=tmp_path)
-    folders = sorted(path.parent.name for path in (tmp_path / "runs").glob("*/*/run.json"))
-    assert [name.rsplit("-", 1)[0] for name in folders] == ["paper-sift_ratio", "sift_ratio"]
-
-
 @pytest.mark.parametrize("header", ["", "# @package pruner.mine\n"])
 def test_a_users_own_pruner_by_config_dir(header: str, data: list[str], command: RunCommand, tmp_path: Path) -> None:
     """With or without a `@package` line it goes under its file's name, in its place, and takes options by that name."""
@@ -164,63 +155,3 @@ def test_a_run_in_which_nothing_succeeds_is_told(data: list[str], command: RunCo
         image.write_bytes(b"no picture")
     assert "every pair failed" in command("eval", *data, "output=run", cwd=tmp_path)
     assert len(rows(tmp_path / "run")) == 5
-
-
-IMAGES = 15
-
-
-@pytest.fixture(scope="module")
-def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return draw_set(tmp_path_factory.mktemp("data") / "Set", "abc", images=IMAGES // 3)
-
-
-@pytest.fixture(scope="module")
-def truth(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Rows:
-    """The rows of a run without the cache, which leaves none."""
-    folder = tmp_path_factory.mktemp("off")
-    run = run_command("eval", *arguments(root, folder / "run", "cache=off"), cwd=folder)
-    assert run.returncode == 0, run.stderr
-    assert "images computed" not in run.stdout
-    kept = {path.relative_to(folder).as_posix() for path in (*folder.iterdir(), *folder.glob("cache/*"))}
-    assert kept <= {"run", "cache", "cache/kernels"}  # compiled kernels are no features
-    return results(folder / "run")
-
-
-def arguments(root: Path, run_dir: Path, *extra: str) -> list[str]:
-    return ["dataset=fmbench", f"dataset.root={root}", *OPTIONS, f"output={run_dir}", *extra]
-
-
-def counted(stdout: str) -> tuple[int, int]:
-    """Images computed and found, as the run tells."""
-    match = re.search(r"features of (\d+) images computed(?:, of (\d+) taken)?", stdout)
-    assert match is not None, stdout
-    return int(match[1]), int(match[2] or 0)
-
-
-def test_a_killed_run_continues_with_what_the_cache_had_and_a_damaged_file_is_computed_anew(root, truth, tmp_path):
-
-    def files() -> list[Path]:
-        return sorted(tmp_path.glob("cache/features/*/*.npz"))
-
-    these = arguments(root, tmp_path / "cold", "batch=1", "workers=1")
-    assert starter().start(tmp_path, "eval", *these).kill_when(lambda: len(files()) >= 5)
-    had = len(files())
-    assert 5 <= had < IMAGES
-    cold = run_command("eval", *these, cwd=tmp_path)
-    assert (cold.returncode, "damaged" in cold.stderr) == (0, False), cold.stderr
-    computed, from_cache = counted(cold.stdout)
-    assert computed == IMAGES - had
-    assert from_cache > 0
-    assert f"{IMAGES} files" in cold.stdout
-    damaged = files()[0]
-    damaged.write_bytes(damaged.read_bytes()[:1000])
-    warm = run_command("eval", *arguments(root, tmp_path / "warm"), cwd=tmp_path)
-    assert warm.returncode == 0, warm.stderr
-    assert f"{damaged.name} is damaged" in warm.stderr
-    assert counted(warm.stdout) == (1, IMAGES - 1)
-    assert results(tmp_path / "cold") == results(tmp_path / "warm") == truth
-    stored = (rows(tmp_path / name) for name in ("cold", "warm"))
-    before, after = ({str(row["pair"]): row["seconds_features"] for row in each} for each in stored)
-    same = sum(before[pair] == after[pair] for pair in before)  # what computing took, not what reading did
-    assert same >= len(before) - 2  # one image, of one or two pairs, was computed again
-    assert not list(tmp_path.glob("cache/features/*/*.tmp"))

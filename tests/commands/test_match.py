@@ -32,6 +32,8 @@ from tests.helpers import ROWS
 from tests.matching import stand_in
 
 BANDS = (30, 5, 42, 18, 36, 11)  # disparities of bands of the picture, from the top, in 1/640 of its width
+SIDE = 768  # px, to which photographs are reduced for matching
+BENT = (-0.25, 0.06, 1e-3, -1e-3)  # OPENCV's coefficients: corners of these photographs move by some 50 px
 
 
 def stereo(h: int = 480, w: int = 640, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -95,14 +97,12 @@ def test_reduction_gives_pixels_of_the_originals(pipeline: fmtorch.Pipeline) -> 
     lafs = reduced.correspondences.lafs0
     assert torch.equal(lafs[..., 2], reduced.correspondences.x0)
     torch.testing.assert_close(lafs[..., :2] * scale[:, None], directly.correspondences.lafs0[..., :2])
-    # The same F: the same residuals x1^T F x0 up to scale and rounding of the points.
-    both = [r.correspondences for r in (reduced, directly)]
-    ends = [(torch.cat([x.double(), torch.ones_like(x[..., :1])], -1)[0] for x in (c.x0, c.x1)) for c in both]
-    values = [torch.einsum("ni,ij,nj->n", x1, F, x0) for (x0, x1), F in zip(ends, (reduced.F, directly.F), strict=True)]
-    ratio = (values[0] @ values[1]) / (values[1] @ values[1])
-    # A residual moves by |gradient| * 1e-4 px; 1e-3 px of a gradient near 1 (F scaled so that normals have norm 1).
-    limit = 1e-3 * values[0].abs().max() + 1e-3 * float(reduced.F[:2].norm())
-    assert (values[0] - ratio * values[1]).abs().max() < limit
+    # The same F, by the distances of the matches from it, up to the rounding of the points.
+    A = torch.diag(torch.tensor([*scale, 1.0], dtype=torch.float64))
+    A[:2, 2] = (scale - 1) / 2
+    points = [getattr(reduced.correspondences, name).double() for name in ("x0", "x1")]
+    ours, theirs = (sampson(F[None].double(), *points).abs() for F in (reduced.F, A.T @ directly.F.double() @ A))
+    torch.testing.assert_close(ours, theirs, rtol=1e-3, atol=1e-3)
 
 
 def test_photographs_that_cannot_be_related(pipeline: fmtorch.Pipeline) -> None:
@@ -258,9 +258,6 @@ def test_others_of_the_same_names_overwrite_nothing(tmp_path: Path, monkeypatch:
     assert (len(set(elsewhere)), [output(*call) for call in calls]) == (len(calls), elsewhere)
 
 
-SIDE = 768  # px, to which photographs are reduced for matching
-
-
 @pytest.fixture(scope="module")
 def pair() -> ImagePair:
     return load("fmbench", root=shared_path("data/Strecha_train"))[0]
@@ -317,9 +314,6 @@ def test_calibrations_follow_the_reduction(pair: ImagePair, pipeline_with_camera
     assert torch.equal(by_hand.R, reduced.R)
     assert torch.equal(by_hand.t, reduced.t)
     assert (2 * by_hand.focals).tolist() == pytest.approx(reduced.focals.tolist(), rel=1e-9)
-
-
-BENT = (-0.25, 0.06, 1e-3, -1e-3)  # OPENCV's coefficients: corners of these photographs move by some 50 px
 
 
 def photographed(image: np.ndarray, lens: Lens) -> np.ndarray:

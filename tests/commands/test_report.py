@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import os
 import re
 import shlex
 from collections.abc import Callable
@@ -12,7 +11,6 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from omegaconf import OmegaConf
 
 from fmtorch import presets
 from fmtorch.commands import report
@@ -27,11 +25,9 @@ from tests.commands.test_match import stereo
 from tests.helpers import compose, draw, draw_set, pair
 from tests.processes import run_command
 
-OPTIONS = {
-    "output": "deep/report.html", "title": "Runs", "pictures": 3, "order": None, "root": None, "own_code": False,
-    "device": "cpu", "cache": "off", "cache_limit": None,
-}  # fmt: skip
 SHOWN = Options(count=3, cache="off")
+SIFT = ("pipeline=sift_ratio", "features.max_features=800", "estimator.hypotheses=100")
+MATCH = ("match", "a.png", "b.png", *SIFT)
 
 
 def results(nsgd: list[float], scene: str = "scene") -> list[PairRow]:
@@ -90,7 +86,7 @@ def test_folders_of_runs_are_found_and_missed(tmp_path: Path) -> None:
     with pytest.raises(RunFolderError, match="holds no run"):
         report.run_folders([tmp_path / "nowhere"])
     with pytest.raises(RunFolderError, match="no run holds results yet"):
-        report.run(OmegaConf.create({**OPTIONS, "runs": [str(tmp_path)]}))
+        report.run(compose("report", (f"runs=[{tmp_path}]",)))
 
 
 def test_runs_keep_the_order_given_and_folders_are_ordered_by_recall(tmp_path, monkeypatch):
@@ -98,15 +94,16 @@ def test_runs_keep_the_order_given_and_folders_are_ordered_by_recall(tmp_path, m
     for name, nsgd in (("a", 0.2), ("b", 0.01), ("c", 0.2)):
         RunFolder.open(tmp_path / "runs" / name, {"pipeline": name}).append(results([nsgd, 0.3]))
 
-    def order(*runs: str, **options: str) -> list[str]:
-        output = report.run(OmegaConf.create({**OPTIONS, "runs": list(runs), **options}))
+    def order(*runs: str, by: str = "null") -> list[str]:
+        words = (f"runs=[{','.join(runs)}]", f"order={by}", "output=deep/report.html", "cache=off")
+        output = report.run(compose("report", words))
         return re.findall(r'<li data-run="(\w)"', output.read_text())
 
-    assert order("runs") == order("runs/c", "runs/b", order="recall", runs=["runs"]) == ["b", "a", "c"]
+    assert order("runs") == order("runs/a", "runs/b", "runs/c", by="recall") == ["b", "a", "c"]
     assert order("runs/c", "runs/b", "runs/a") == ["c", "b", "a"]
-    assert order("runs", order="given") == ["a", "b", "c"]
+    assert order("runs", by="given") == ["a", "b", "c"]
     with pytest.raises(ValueError, match="order=best must be given or recall"):
-        order("runs", order="best")
+        order("runs", by="best")
 
 
 @pytest.mark.parametrize("order", [["ratio", "one_to_one"], ["one_to_one", "ratio"]])
@@ -167,10 +164,6 @@ def test_the_command_on_two_runs(tmp_path: Path, command: Callable[..., str]) ->
     assert json.loads(stored.read_text())["config"]["pipeline"] == "sift_ratio"
 
 
-SIFT = ("pipeline=sift_ratio", "features.max_features=800", "estimator.hypotheses=100")
-MATCH = ("match", "a.png", "b.png", *SIFT)
-
-
 @pytest.fixture
 def photographs(tmp_path: Path) -> Path:
     for name, image in zip("ab", stereo(120, 160), strict=True):
@@ -213,15 +206,6 @@ def test_before_any_work(monkeypatch: pytest.MonkeyPatch, photographs: Path, wor
     assert end.startswith("error: ")
     assert said in end
     assert "\n" not in end
-
-
-def test_only_regular_files_are_read(monkeypatch: pytest.MonkeyPatch, photographs: Path) -> None:
-    """A pipe would block for ever, a device fill the memory."""
-    os.mkfifo(photographs / "pipe.jpg")
-    (photographs / "zero.jpg").symlink_to("/dev/zero")
-    for name in ("pipe.jpg", "zero.jpg"):
-        end = ended(monkeypatch, photographs, "match", "a.png", name, *SIFT)
-        assert end == f"error: {name}: no regular file; it must be an image file"
 
 
 def test_the_report_is_refused_before_it_is_drawn(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

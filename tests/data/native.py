@@ -40,11 +40,7 @@ def write_kitti(root: Path, names: tuple[str, ...] = ("06",), frames: int = 14) 
     return root
 
 
-COLMAP_LINES = {
-    "SIMPLE_PINHOLE": "40 16 12",
-    "PINHOLE": "40 41 16 12",
-    "OPENCV": "40 41 16 12 0.1 -0.02 0.001 0.002",
-}
+COLMAP_LINES = {"SIMPLE_PINHOLE": "40 16 12", "PINHOLE": "40 41 16 12", "OPENCV": "40 41 16 12 0.1 -0.02 0.001 0.002"}
 """Parameters of cameras for images of `SIZE`."""
 
 

@@ -22,6 +22,11 @@ from tests.data.native import write_colmap, write_image, write_kitti
 from tests.helpers import apart, call_command
 from tests.reference import labels as reference
 
+RANGE = "it must be a list, each a number from 0 to 1: least and greatest"
+PLAN = Plan(scenes=1, shots=4, pairs=4, scale=0.1)
+COLMAP = ("count=null", "workers=1", "dataset=colmap", "dataset.sequences=[a]")
+THERE = ["06", "rgbd_dataset_freiburg1_xyz", "rgbd_dataset_freiburg3_teddy", "Horse", "Train"]
+
 
 def test_kept_pairs_of_a_real_scene_are_selected_again() -> None:
     """The column `selected` of the README of the shared data; of this scene all pairs were candidates."""
@@ -100,9 +105,6 @@ def test_a_finished_set_is_not_made_again_and_another_is_refused(scenes, tmp_pat
     assert (tmp_path / "Made/pairs_with_gt.txt").stat().st_mtime_ns == before
     with pytest.raises(SystemExit, match=r"Made holds pairs of other settings; .*: count: 1 -> 2\. Name another"):
         run(tmp_path, monkeypatch, "count=2")
-
-
-RANGE = "it must be a list, each a number from 0 to 1: least and greatest"
 
 
 @pytest.mark.parametrize(
@@ -194,9 +196,6 @@ def test_matches_take_the_place_of_images_in_oanets_layout(scenes, tmp_path, mon
     assert labels == {0, 1}
 
 
-PLAN = Plan(scenes=1, shots=4, pairs=4, scale=0.1)
-
-
 @pytest.fixture(scope="module")
 def rendered(tmp_path_factory: pytest.TempPathFactory) -> ScenePairs:
     """All pairs of four photographs each of two families; cameras of the collection have other sizes."""
@@ -228,19 +227,6 @@ def test_overlap_of_rendered_pairs_is_that_counted_pixel_by_pixel(rendered: Scen
     shares = [overlaps.of(place) for place in places]
     assert shares[::4] == [one_by_one(rendered, *place) for place in places[::4]]
     assert min(shares) < 0.4 < 0.6 < max(shares)
-
-
-def test_overlap_by_points_is_that_counted_point_by_point() -> None:
-    rng = np.random.default_rng(2)
-    points = [rng.integers(0, 60, rng.integers(0, 40)) for _ in range(30)]
-    points[3] = np.zeros(0, np.int64)
-    pairs = np.array(list(itertools.combinations(range(30), 2)))
-    expected = [reference.by_points(points[i].tolist(), points[j].tolist()) for i, j in pairs]
-    np.testing.assert_allclose(construction.shared_points(incidence(points), pairs), expected, rtol=0, atol=1e-15)
-    assert len(construction.shared_points(incidence(points), pairs[:0])) == 0
-
-
-COLMAP = ("count=null", "workers=1", "dataset=colmap", "dataset.sequences=[a]")
 
 
 def test_the_command_selects_by_overlap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -285,20 +271,19 @@ def test_following_frames_are_those_within_the_window(window: float) -> None:
     assert [tuple(p) for p in pairs.at(np.arange(len(pairs)))] == expected
 
 
-@pytest.mark.parametrize("minimum", [1, 5])
-def test_images_that_share_points_are_those_counted_one_by_one(minimum: int) -> None:
+def test_points_that_images_share_are_those_counted_one_by_one() -> None:
     rng = np.random.default_rng(1)
-    points = [rng.integers(0, 60, rng.integers(0, 25)) for _ in range(40)]
+    points = [rng.integers(0, 60, rng.integers(0, 40)) for _ in range(40)]
     points[4], points[7] = rng.integers(0, 2**40, 3).repeat(2), np.zeros(0, np.int64)
-    seen = [set(values.tolist()) for values in points]
-    expected = [(i, j) for i, j in itertools.combinations(range(40), 2) if len(seen[i] & seen[j]) >= minimum]
-    pairs = sharing_points(points, minimum)
-    assert [tuple(p) for p in pairs.pairs.tolist()] == expected
-    assert len(expected) > 50
+    pairs, seen = np.array(list(itertools.combinations(range(40), 2))), incidence(points)
+    shares = [reference.by_points(points[i].tolist(), points[j].tolist()) for i, j in pairs]
+    np.testing.assert_allclose(construction.shared_points(seen, pairs), shares, rtol=0, atol=1e-15)
+    assert len(construction.shared_points(seen, pairs[:0])) == 0
+    counts = np.array([len({*points[i].tolist()} & {*points[j].tolist()}) for i, j in pairs])
+    for minimum in (1, 5):
+        np.testing.assert_array_equal(sharing_points(points, minimum).pairs, pairs[counts >= minimum])
+        assert 50 < (counts >= minimum).sum() < len(pairs)
     assert len(sharing_points([])) == 0
-
-
-THERE = ["06", "rgbd_dataset_freiburg1_xyz", "rgbd_dataset_freiburg3_teddy", "Horse", "Train"]
 
 
 def test_the_splits_are_the_papers_and_share_no_sequence() -> None:

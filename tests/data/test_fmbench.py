@@ -14,6 +14,8 @@ from tests.data import native
 from tests.helpers import apart, cross_matrix
 
 LINE = "0 1 0 0 0 0 0 -2 0 2 0"
+NO_IMAGE = ("0 7 0 0 0 0 0 -2 0 2 0", r"no image .*a/Images/00000007\.jpg \(or \.png\)")
+NUMBERS = {"nan 0 0 0 0 -2 0 2 0": "not finite", "inf 0 0 0 0 -2 0 2 0": "not finite", "0 0 0 0 0 0 0 0 0": "F is zero"}
 
 
 def write_set(folder: Path, lines: list[str], subsets: list[str], images: dict[str, list[str]]) -> Path:
@@ -51,10 +53,6 @@ def test_a_folder_of_sets(tmp_path: Path) -> None:
         load("fmbench", root=tmp_path, sets=["C"])
     with pytest.raises(DataError, match="no pairs of subset 'c'; it has a, b"):
         load("fmbench", root=tmp_path, subset=["a", "c"])
-
-
-NO_IMAGE = ("0 7 0 0 0 0 0 -2 0 2 0", r"no image .*a/Images/00000007\.jpg \(or \.png\)")
-NUMBERS = {"nan 0 0 0 0 -2 0 2 0": "not finite", "inf 0 0 0 0 -2 0 2 0": "not finite", "0 0 0 0 0 0 0 0 0": "F is zero"}
 
 
 @pytest.mark.parametrize(("line", "reason"), [*((f"0 1 {F}", reason) for F, reason in NUMBERS.items()), NO_IMAGE])

@@ -11,6 +11,7 @@ from fmtorch.data import MODELS, ImageSource, Lens, read_image, undistorted, und
 from fmtorch.data.pairs import Resampling
 
 SIZE = (120, 160)
+RESAMPLED_SIZE = (6, 9)
 COEFFICIENTS = {
     "SIMPLE_RADIAL": (-0.15,), "RADIAL": (0.1, -0.05), "OPENCV": (-0.2, 0.05, 1e-3, -2e-3),
     "OPENCV_FISHEYE": (0.02, -0.01, 0.005, -0.002), "FULL_OPENCV": (-0.2, 0.05, 1e-3, -2e-3, 0.01, 0.02, 0.01, 0.001),
@@ -120,9 +121,6 @@ def test_a_resampled_photograph_has_a_lens_like_its_own() -> None:
     used, points, scale = lens("OPENCV"), grid(), np.array([0.5, 0.25])
     reduced = used.scaled(*scale).distort((points + 0.5) * scale - 0.5)
     np.testing.assert_allclose((reduced + 0.5) / scale - 0.5, used.distort(points), atol=1e-9)
-
-
-RESAMPLED_SIZE = (6, 9)
 
 
 @pytest.mark.parametrize("turns", [0, 1, 2, 3])

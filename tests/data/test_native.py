@@ -158,9 +158,7 @@ def test_train_is_all_that_is_there_but_the_test_sequences(tmp_path: Path) -> No
 def test_frames_without_a_pose_nearby_are_left_out(tmp_path: Path) -> None:
     """The motion capture lost the camera for 0.2 s, and began after the video."""
     folder = write_tum(tmp_path)
-    lines = (folder / "groundtruth.txt").read_text().splitlines()
-    kept = [lines[0], *lines[6:48], *lines[68:]]
-    (folder / "groundtruth.txt").write_text("\n".join(kept) + "\n")
+    edit_lines(folder / "groundtruth.txt", lambda lines: [lines[0], *lines[6:48], *lines[68:]])
     dataset = load("tum", root=tmp_path, sequences=[NAME], pairs=None)
     frames = [round((float(view.image.path.stem) - 1305031236) * 10) for view in dataset.scenes[0].views]
     assert frames == [1, 2, 3, 4, 7, 8, 9, 10, 11]

@@ -13,7 +13,6 @@ from torch import Tensor
 from fmtorch import features, presets
 from fmtorch.core import models_dir
 from fmtorch.features import describe
-from fmtorch.runs import ArrayCache, CachedFeatures
 from scripts.make_models import learned
 from tests.features.scenes import texture
 from tests.helpers import same
@@ -83,15 +82,6 @@ def test_equal_parts_define_equal_detection() -> None:
 def test_unknown_parts_and_options(options: dict[str, object], told: str) -> None:
     with pytest.raises(ValueError, match=told):
         features.local_feature(**options)  # type: ignore[arg-type]
-
-
-def test_networks_are_read_when_first_used(tmp_path: Path) -> None:
-    missing = tmp_path / "mine.onnx"
-    extract = features.local_feature("hessian", {"name": "hardnet", "network": str(missing)}, shape=None)
-    with pytest.raises(ValueError, match=r"mine\.onnx.*patch_networks.export"):
-        extract(texture(4))
-    with pytest.raises(ValueError, match=r"mine\.onnx.*patch_networks.export"):
-        CachedFeatures(extract, ArrayCache(tmp_path))
 
 
 def test_large_images_are_reduced_for_opencv() -> None:

@@ -21,6 +21,8 @@ from tests.features.scenes import texture
 from tests.helpers import same
 
 RTOL = 1e-4  # of unit outputs: float32 sums of up to 8,192 terms in another order
+NEIGHBOURS = 1e-5  # what design allows a descriptor to change with its batch
+SIZE = (90, 131)  # no multiple of 16
 
 
 @pytest.fixture(scope="module")
@@ -122,9 +124,6 @@ def test_files_that_do_not_fit_are_named(tmp_path: Path) -> None:
         build("siftnet")
 
 
-NEIGHBOURS = 1e-5  # what design allows a descriptor to change with its batch
-
-
 @pytest.fixture(scope="module")
 def hardnet(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("onnx") / "hardnet.onnx"
@@ -166,11 +165,13 @@ def test_other_shapes_of_patches_are_refused(hardnet: Path) -> None:
 
 
 def test_an_absent_file_is_named_with_what_makes_it(tmp_path: Path) -> None:
-    with pytest.raises(NetworkFileError, match=r"absent\.onnx does not exist: scripts\.patch_networks\.export"):
-        PatchNetwork(tmp_path / "absent.onnx")(torch.zeros(1, 1, 32, 32))
+    """When it is first used, or asked for what it is."""
+    plain, int8 = (PatchNetwork(tmp_path / f"absent{precision}.onnx") for precision in ("", ".int8"))
     for use in (lambda n: n(torch.zeros(1, 1, 32, 32)), lambda n: n.identity):
+        with pytest.raises(NetworkFileError, match=r"absent\.onnx does not exist: scripts\.patch_networks\.export"):
+            use(plain)
         with pytest.raises(NetworkFileError, match=r"absent\.int8\.onnx does not exist: .*=int8.*calibration="):
-            use(PatchNetwork(tmp_path / "absent.int8.onnx"))
+            use(int8)
 
 
 def test_a_corrupt_file_is_named(hardnet: Path, tmp_path: Path) -> None:
@@ -213,9 +214,6 @@ def test_files_tell_nothing_of_where_they_were_made(hardnet: Path) -> None:
     for file in files:
         content = file.read_bytes()
         assert not [word for word in (b'.py", line ', b"/home/", b"/root/") if word in content], file
-
-
-SIZE = (90, 131)  # no multiple of 16
 
 
 def untrained(name: str) -> DISK | ALIKED:
@@ -299,9 +297,11 @@ def test_images_that_cannot_be(name: str, shape: tuple[int, ...]) -> None:
 
 @both
 def test_weights_that_cannot_be_fetched(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    torch_home = tmp_path / "hub"
-    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(torch_home))
-    cls = {"disk": kornia.feature.DISK, "aliked": kornia.feature.ALIKED}[name]
+    cls, file, publisher = {
+        "disk": (kornia.feature.DISK, "depth-save.pth", "github.com/cvlab-epfl/disk"),
+        "aliked": (kornia.feature.ALIKED, "aliked-n16.pth", "github.com/Shiaoming/ALIKED"),
+    }[name]
+    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
 
     def offline(*_: object, **__: object) -> None:
         try:
@@ -312,11 +312,7 @@ def test_weights_that_cannot_be_fetched(name: str, tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(cls, "from_pretrained", offline)
     with pytest.raises(ConnectionError) as told:
         presets.build("features", name)
-    file, publisher = {
-        "disk": ("depth-save.pth", "github.com/cvlab-epfl/disk"),
-        "aliked": ("aliked-n16.pth", "github.com/Shiaoming/ALIKED"),
-    }[name]
-    for word in ("Name or service not known", publisher, f"copy its {file} to {torch_home / 'checkpoints' / file}"):
+    for word in ("Name or service not known", publisher, f"copy its {file} to {tmp_path / 'checkpoints' / file}"):
         assert word in str(told.value)
 
 

@@ -20,6 +20,7 @@ from tests.reference.local_features import hessian_keypoints, patch, sift
 
 needs_vlfeat = pytest.mark.skipif(find_spec("pycolmap") is None, reason="extra colmap is not installed")
 VLFEAT = VLFeatSIFT(peak_threshold=0.01)
+TURNS = [(SIFT(), (160, 200), 0.1, 0.9), pytest.param(VLFEAT, (120, 160), 0.05, 0.95, marks=needs_vlfeat)]
 
 
 @pytest.mark.parametrize("number", ["000", "001"])
@@ -43,9 +44,6 @@ def test_equals_stored_keypoints(number: str, case: str) -> None:
     angle = kornia.feature.get_laf_orientation(found.lafs[None])[0, :, 0]
     difference = (angle.numpy() + expected["angle"] + 180) % 360 - 180
     assert np.abs(difference).max() < 1e-3
-
-
-TURNS = [(SIFT(), (160, 200), 0.1, 0.9), pytest.param(VLFEAT, (120, 160), 0.05, 0.95, marks=needs_vlfeat)]
 
 
 @pytest.mark.parametrize(("extract", "size", "gap", "share"), TURNS)

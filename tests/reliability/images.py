@@ -64,7 +64,8 @@ GREY = SOFT[..., 0]
 SOUND: Mapping[str, Callable[[], bytes]] = {
     "cmyk.jpg": lambda: saved(Image.fromarray(SOFT).convert("CMYK"), "JPEG"),
     "ycck.jpg": lambda: saved(Image.fromarray(SOFT).convert("CMYK"), "JPEG", quality=100),
-    "progressive.jpg": lambda: saved(SOFT, "JPEG", progressive=True),
+    "progressive.jpg": lambda: saved(SOFT, "JPEG", progressive=True, subsampling=0),
+    "411.jpg": lambda: saved(SOFT, "JPEG", subsampling="4:1:1"),
     "grey.jpg": lambda: saved(GREY, "JPEG"),
     "16 bit.png": lambda: bytes(cv2.imencode(".png", SOFT.astype(np.uint16) * 257)[1]),
     "16 bit grey.png": lambda: bytes(cv2.imencode(".png", GREY.astype(np.uint16) * 257)[1]),

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fmtorch.runs import RunFolder
 from tests.helpers import draw_set
 from tests.processes import Command, Starter
 from tests.reliability.conftest import Rows, evaluation, parts, results
@@ -67,6 +69,38 @@ def test_an_evaluation_goes_on(kills: int, starter: Starter, root: Path, truth: 
         lambda output: starter.start(tmp_path, "eval", *evaluation(root, output)), parts, tmp_path, kills
     )
     assert all(results(output) == truth for output in outputs)
+
+
+def test_features_that_a_killed_evaluation_kept_are_taken(starter, root, truth, tmp_path):
+    """Of ten images; a damaged file is computed anew, and without the cache nothing is kept."""
+
+    def files() -> list[Path]:
+        return sorted(tmp_path.glob("cache/features/*/*.npz"))
+
+    def evaluated(name: str, *extra: str) -> tuple[str, list[str]]:
+        """What it says, and the numbers of images computed and taken."""
+        done = starter.run(tmp_path, "eval", *evaluation(root, tmp_path / name, *extra))
+        assert done.status == 0, done.said()
+        return done.said(), re.findall(r"features of (\d+) images computed(?:, of (\d+) taken)?", done.said())
+
+    _, numbers = evaluated("off", "cache=off")
+    assert (numbers, files()) == ([], [])
+    killed = starter.start(tmp_path, "eval", *evaluation(root, tmp_path / "cold"))
+    assert killed.kill_when(lambda: len(files()) >= 3), killed.said()
+    had = len(files())
+    assert 3 <= had < 10
+    said, ((computed, taken),) = evaluated("cold")
+    assert (int(computed), int(taken) > 0, "damaged" in said, "10 files" in said) == (10 - had, True, False, True)
+    damaged = files()[0]
+    damaged.write_bytes(damaged.read_bytes()[:1000])
+    said, numbers = evaluated("warm")
+    assert (numbers, f"{damaged.name} is damaged" in said) == ([("1", "9")], True)
+    assert results(tmp_path / "off") == results(tmp_path / "cold") == results(tmp_path / "warm") == truth
+    stored = (RunFolder.load(tmp_path / name).read().to_pylist() for name in ("cold", "warm"))
+    before, after = ({row["pair"]: row["seconds_features"] for row in each} for each in stored)
+    same = sum(before[pair] == after[pair] for pair in before)  # what computing took, not what reading did
+    assert same >= len(before) - 2  # one image, of one or two pairs, was computed again
+    assert not list(tmp_path.glob("cache/features/*/*.tmp"))
 
 
 @pytest.mark.reliability

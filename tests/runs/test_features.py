@@ -227,18 +227,18 @@ def test_the_command_tells_what_is_there(tmp_path, monkeypatch, capsys):
     assert "TwoSteps-" in output
 
 
-def write_many(folder: Path, limit: int, count: int) -> None:
+def write_many(cache: ArrayCache, count: int, start: int = 0) -> None:
     """Write files of 40 kB in a row, and read others back."""
     warnings.simplefilter("error")
-    cache = ArrayCache(folder, limit or None)
-    for i in range(count):
+    for i in range(start, start + count):
         cache.write("some", f"{i % 50}", {"a": np.full(5_000, i % 50)})
         found = cache.read("some", f"{(i * 7) % 50}")
         assert found is None or (found["a"] == (i * 7) % 50).all()
 
 
 def writer(folder: Path, limit: int = 0, count: int = 1_000_000) -> BaseProcess:
-    process = multiprocessing.get_context("fork").Process(target=write_many, args=(folder, limit, count))
+    cache = ArrayCache(folder, limit or None)
+    process = multiprocessing.get_context("fork").Process(target=write_many, args=(cache, count))
     process.start()
     return process
 
@@ -338,15 +338,8 @@ def test_processes_share_a_cache(tmp_path: Path, limit: int) -> None:
 
 
 def test_threads_share_a_cache(tmp_path: Path) -> None:
-    cache = ArrayCache(tmp_path, limit=30 * 8000)
-
-    def work(start: int) -> None:
-        for i in range(start, start + 60):
-            cache.write("some", f"{i % 40}", {"a": np.full(1000, i % 40)})
-            cached = cache.read("some", f"{(i * 3) % 40}")
-            assert cached is None or (cached["a"] == (i * 3) % 40).all()
-
-    in_threads(4, work)
+    cache = ArrayCache(tmp_path, limit=500_000)
+    in_threads(4, lambda number: write_many(cache, 60, 7 * number))
 
 
 def test_what_cannot_be_written_is_told_and_harms_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -34,6 +34,8 @@ CONFIG = {
 }
 NAN = float("nan")
 F = (0.0, -0.5, 0.1, 0.5, 0.0, -0.1, 0.2, 0.3, 0.59)
+PIPELINE = {**CONFIG["pipeline"], "estimator": {"threshold": 0.5 + 2**-53, "samples": 2000}}
+IDENTITY = {"pipeline": "sift_ratio", "seed": 0}
 
 
 def row(name: str, **changes: object) -> PairRow:
@@ -43,9 +45,6 @@ def row(name: str, **changes: object) -> PairRow:
 
 def failed(name: str) -> PairRow:
     return PairRow(name, pair_key(name), family="indoor", scene="s", ok=False, reason="too few matches: 5, needs 8")
-
-
-PIPELINE = {**CONFIG["pipeline"], "estimator": {"threshold": 0.5 + 2**-53, "samples": 2000}}
 
 
 def test_identity_changes_with_any_field_and_ignores_order_and_container_types() -> None:
@@ -253,9 +252,6 @@ def test_summary_files(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="JSON"):
         run.write_summary({"recall": NAN}, "")
     assert list(tmp_path.rglob("*.tmp")) == []
-
-
-IDENTITY = {"pipeline": "sift_ratio", "seed": 0}
 
 
 def numbered_row(key: int) -> PairRow:

@@ -175,14 +175,10 @@ def test_keypoints_are_where_the_plane_puts_them_under_its_angles() -> None:
         return camera.project(world)[0]
 
     np.testing.assert_allclose(seen(there[:, :2]), keypoints[:, :2], atol=1e-8)
-    ahead = there[:, :2] + 1e-4 * np.c_[np.cos(there[:, 3]), np.sin(there[:, 3])]
-    step = seen(ahead) - keypoints[:, :2]
-    turned = np.arctan2(step[:, 1], step[:, 0]) - keypoints[:, 3]
-    np.testing.assert_allclose(np.exp(1j * turned), 1, atol=1e-3)
-    corners = [there[:, :2] + 1e-3 * np.array(c) for c in ((0, 0), (1, 0), (0, 1))]
-    o, a, b = map(seen, corners)
-    area = np.abs(np.linalg.det(np.stack([a - o, b - o], -1))) / 1e-6
-    np.testing.assert_allclose(there[:, 2] * np.sqrt(area), keypoints[:, 2], rtol=1e-3)
+    J = np.stack([seen(there[:, :2] + 1e-3 * axis) - keypoints[:, :2] for axis in np.eye(2)], -1) / 1e-3
+    x, y = np.einsum("nij,jn->in", J, [np.cos(there[:, 3]), np.sin(there[:, 3])])
+    np.testing.assert_allclose(np.exp(1j * (np.arctan2(y, x) - keypoints[:, 3])), 1, atol=1e-3)
+    np.testing.assert_allclose(there[:, 2] * np.sqrt(np.abs(np.linalg.det(J))), keypoints[:, 2], rtol=1e-3)
     rays, incidence = stores.rays_and_incidence(keypoints, camera)
     world = np.c_[(there[:, :2] - [159.5, 119.5]) / 320, np.zeros(50)]
     np.testing.assert_allclose(rays * np.linalg.norm(camera.centre - world, axis=1)[:, None], camera.centre - world)

@@ -26,6 +26,7 @@ EVERY = [n for n in variants("estimator") if not n.startswith(OTHER_LIBRARIES[1:
 PAIRS = [scene(i, count) for i, count in enumerate((60, 90, 40))]
 FAST = {"estimator": "msac", "hypotheses": 100}
 SCENE = known_cameras.scene(7, 200, noise=0.2)
+FROM_CENTRE = [x - (319.5, 239.5) for x in SCENE[:2]]  # outside on one side, and never beyond the other
 EASY = {"estimator": "msac", "hypotheses": 300}
 WRONG = [
     ("prior", 1.5, r"prior of match 3 of pair 1 is 1\.5; it is P\(inlier\), within \[0, 1\]"),
@@ -86,6 +87,9 @@ def test_one_size_is_that_of_all_pairs() -> None:
         ([np.zeros((9, 3))], [np.zeros((9, 3))], {}, "pair 0: x0 has shape .9, 3.; it must be"),
         ([np.zeros((9, 2))], [np.zeros((9, 2))], {"prior": np.zeros((2, 9))}, "prior must be a list of 1 arrays"),
         (np.zeros((9, 2)), np.zeros((9, 2)), {"key": np.array(0.5)}, "key is of torch.float64; it must be whole"),
+        (*SCENE[:2], {"size0": (640, 480), "size1": (640, 480)}, r"size1 is \(640, 480\), but .* looks like \(w, h\)"),
+        (*SCENE[:2], {"size0": (480, 640), "size1": (48, 64)}, r"size1 is \(48, 64\), but .* of x1 lie outside such"),
+        (*FROM_CENTRE, {"size0": (480, 640), "size1": (480, 640)}, r"size0 is .*640\), but .* of x0 lie outside such"),
     ],
 )
 def test_what_does_not_fit_is_named(x0: object, x1: object, options: dict[str, object], message: str) -> None:

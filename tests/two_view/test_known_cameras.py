@@ -154,14 +154,9 @@ def test_a_wrong_measurement_is_not_believed_for_long() -> None:
     np.testing.assert_allclose(e.focals[0], [650, 650], rtol=0.05)
 
 
-@functools.cache
-def _quick(name: str) -> KnownCameras:
-    return KnownCameras(quick(name))
-
-
 def test_poses_are_there_as_a_whole_or_not_at_all() -> None:
     pairs = [scene(1), *degenerate().values(), *small().values()]
-    e = _quick("fmtorch")(with_knowledge(collate(pairs), "exact"), seed=5)
+    e = KnownCameras(quick("fmtorch"))(with_knowledge(collate(pairs), "exact"), seed=5)
     for value in (e.E, e.R, e.t):
         finite = value.flatten(1).isfinite()
         assert bool((finite.all(1) | ~finite.any(1)).all())
@@ -174,8 +169,8 @@ def test_a_wrong_calibration_is_a_reason_and_no_more() -> None:
     K0, K1 = c.K0.clone(), c.K1.clone()
     K0[1], K1[2, 0, 0], K0[3, :2] = torch.nan, 0.0, K0[3, :2] / 800
     K0.requires_grad_()
-    e = _quick("fmtorch")(c.replace(K0=K0, K1=K1), seed=5)
-    alone = _quick("fmtorch")(c[[0, 4]], seed=5)
+    e = KnownCameras(quick("fmtorch"))(c.replace(K0=K0, K1=K1), seed=5)
+    alone = KnownCameras(quick("fmtorch"))(c[[0, 4]], seed=5)
     assert e.ok.tolist() == [True, False, False, False, True]
     assert [reason.split(" ")[0] for reason in e.reason] == ["", "K0", "K1", "K0", ""]
     assert torch.equal(e.F[[0, 4]], alone.F)
@@ -317,6 +312,11 @@ def test_forms_of_what_is_known(arguments: dict[str, Any], focal: list[Any]) -> 
         ({"focal": (800.0, float("nan"))}, "focal of image 0"),
         ({"focal": (800.0, 0.1), "size0": None, "size1": None}, "focal needs the image sizes"),
         ({"K0": K, "size0": None, "size1": None}, "K0 alone needs the image sizes"),
+        ({"covariance": True, "size0": None, "size1": None}, "covariance needs K0 and K1, or the image sizes"),
+        ({"size0": "guess"}, "size0 is 'guess'; it must be (h, w), 'unknown' or None"),
+        ({"size1": "unknown"}, "size0 is given and the other is 'unknown'"),
+        ({"size0": "unknown"}, "size1 is given and the other is 'unknown'"),
+        ({"size0": "unknown", "size1": None, "focal": "shared"}, "focal needs the image sizes"),
         ({"K0": K, "K1": K, "focal": (800, 0.1, 2)}, "focal has shape"),
         ({"K0": K, "K1": K, "focal": -0.1}, "a relative deviation is not negative"),
         ({"K0": torch.eye(2), "K1": K}, "K0 has shape"),
@@ -328,11 +328,6 @@ def test_wrong_arguments_are_named(arguments: dict[str, Any], said: str) -> None
     with pytest.raises(ValueError, match=r"^") as error:
         fmtorch.find_fundamental(SCENE.x0, SCENE.x1, **(SIZES | arguments))
     assert str(error.value).startswith(said) or said in str(error.value)
-
-
-def test_homographies_have_no_essential_matrix() -> None:
-    with pytest.raises(ValueError, match="needs one that gives fundamental matrices"):
-        fmtorch.find_essential(SCENE.x0, SCENE.x1, K, K, estimator="homography")
 
 
 def test_calibrations_come_in_any_form() -> None:

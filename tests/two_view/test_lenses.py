@@ -9,6 +9,7 @@ import torch
 
 import fmtorch
 from fmtorch import Lens
+from fmtorch.data import undistorted_points
 from fmtorch.metrics import corner_error
 from tests.reference import lenses as division
 
@@ -36,26 +37,13 @@ def photographs(lens0: Lens, lens1: Lens, seed: int = 1) -> tuple[Array, Array]:
     return ends[0], ends[1]
 
 
-def straight(lens: Lens, x: Array) -> Array:
-    """Where a pinhole of the same K has points (n, 2) of the photograph: Newton's method on finite differences."""
-    at = x.copy()
-    for _ in range(60):
-        at = at - 0.5 * np.linalg.solve(slope(lens, at), (lens.distort(at) - x)[..., None])[..., 0]
-    return at
-
-
-def slope(lens: Lens, at: Array) -> Array:
-    ends = [lens.distort((at[:, None] + step).reshape(-1, 2)) for step in (1e-3 * np.eye(2), -1e-3 * np.eye(2))]
-    return (ends[0] - ends[1]).reshape(-1, 2, 2).swapaxes(1, 2) / 2e-3
-
-
 def by_hand(lenses: tuple[Lens | None, Lens | None], x0: Array, x1: Array) -> tuple[Array, Array, Array]:
     """Undistorted points, and the noise of the matches."""
-    ends, noise = [], np.ones(len(x0))
-    for lens, x in zip(lenses, (x0, x1), strict=True):
-        ends.append(x if lens is None else straight(lens, x))
+    ends, noise = [x0, x1], np.ones(len(x0))
+    for i, lens in enumerate(lenses):
         if lens is not None:
-            noise *= np.abs(np.linalg.det(slope(lens, ends[-1]))) ** -0.25
+            ends[i] = undistorted_points(lens, ends[i])
+            noise *= np.abs(np.linalg.det(lens.derivatives(ends[i]))) ** -0.25
     return ends[0], ends[1], noise
 
 
@@ -132,11 +120,7 @@ def test_gradients_reach_the_photographs_points(find: Any) -> None:
         (FUNDAMENTAL, {"lens": (None, Lens(-1.0, 1.0, 0.0, 0.0))}, "K of the lens of image 1 has focal lengths -1, 1"),
         (FUNDAMENTAL, {"lens": (RADIAL, -0.1)}, "holds a calibrated lens, so it must be a lens for both images"),
         (FUNDAMENTAL, {"lens": [(RADIAL, None), (None, RADIAL)]}, "lens has lenses for 2 pairs of 1"),
-        (
-            FUNDAMENTAL,
-            {"lens": RADIAL, "K0": PINHOLE.K},
-            "K0 and a lens of image 0 are given, and the lens has",
-        ),
+        (FUNDAMENTAL, {"lens": RADIAL, "K0": PINHOLE.K}, "K0 and a lens of image 0 are given, and the lens has"),
         (FUNDAMENTAL, {"lens": (RADIAL, None)}, "K0 alone needs the image sizes: give size0 and size1"),
         (FUNDAMENTAL, {"lens": "fisheye"} | SIZES, "lens is 'fisheye'; it must be None, 'unknown', 'shared', lambda"),
         (FUNDAMENTAL, {"lens": -0.6} | SIZES, "lens of image 0 of pair 0 is [-0.6, 0.0]; it is lambda in half diag"),
@@ -145,6 +129,7 @@ def test_gradients_reach_the_photographs_points(find: Any) -> None:
         (FUNDAMENTAL, {"lens": "shared", "size0": "unknown", "size1": "unknown"}, "lens needs the image sizes"),
         (FUNDAMENTAL, {"lens": "shared"} | KNOWN, "lens needs the image"),
         (FUNDAMENTAL, UNKNOWN | {"estimator": "ransac"}, "lens needs an estimator with the option focal"),
+        (fmtorch.find_essential, KNOWN | {"estimator": "homography"}, "needs one that gives fundamental matrices"),
         (HOMOGRAPHY, {"lens": -0.1}, "lens needs the image sizes, in whose half diagonals it is: give size0 and size1"),
         (HOMOGRAPHY, {"lens": -0.6} | SIZES, "lens of image 0 of pair 0 is [-0.6, 0.0]; it is lambda in half diag"),
         (HOMOGRAPHY, {"lens": "fisheye"} | SIZES, "lens is 'fisheye'; it must be None, 'unknown', 'shared', lambda"),
@@ -244,7 +229,7 @@ def test_planes_keep_to_themselves() -> None:
 def test_a_lens_of_a_photograph_of_a_map() -> None:
     """Whose points are in a unit of their own."""
     x0, x1 = planes(4, RADIAL)
-    board = straight(RADIAL, x0) / 1000
+    board = undistorted_points(RADIAL, x0) / 1000
     estimate = fmtorch.find_homography(board, x1, lens=(None, RADIAL))
     estimate = estimate.derived(matrix=estimate.H @ torch.diag(torch.tensor([1e-3, 1e-3, 1.0])).double())
     assert error(estimate) < 1
@@ -274,7 +259,7 @@ def test_frames_go_with_their_points() -> None:
     before, after = [], []
     for x, y in ((x0, y0), (x1, y1)):
         before.append(np.concatenate([axes, x[..., None]], -1))
-        straightened = np.linalg.solve(slope(RADIAL, y), axes)
+        straightened = np.linalg.solve(RADIAL.derivatives(y), axes)
         after.append(np.concatenate([straightened, y[..., None]], -1))
     ratio = np.linspace(0.3, 0.9, len(x0))
     estimate = fmtorch.find_essential(x0, x1, lens=RADIAL, ratio=ratio, lafs0=before[0], lafs1=before[1])

@@ -35,10 +35,16 @@ def angle(R: np.ndarray) -> float:
     return float(np.degrees(np.arccos(np.clip((np.trace(R) - 1) / 2, -1, 1))))
 
 
-def rotated(path: Path, cameras: databases.Scene) -> float:
-    """Degrees between the rotation of the one geometry of a database and the true one."""
-    (geometry,) = read(path).values()
-    return angle(cameras.relative(0, 1)[0].T @ geometry.cam2_from_cam1.rotation.matrix())
+def off(geometry: Any, cameras: databases.Scene, i: int = 0, j: int = 1) -> tuple[float, float]:
+    """Degrees between the rotation of a geometry and the true one, and between the directions of translation."""
+    (R, t), pose = cameras.relative(i, j), geometry.cam2_from_cam1
+    return angle(R.T @ pose.rotation.matrix()), float(np.degrees(np.arccos(np.clip(pose.translation @ t, -1, 1))))
+
+
+def keypoints(path: Path, *images: int) -> list[np.ndarray]:
+    """Homogeneous ones, in COLMAP's pixels."""
+    with pycolmap.Database.open(path) as database:
+        return [np.c_[database.read_keypoints(i)[:, :2], np.ones(150)] for i in images]
 
 
 K = np.array([[600.0, 0, 309.5], [0, 612, 249.5], [0, 0, 1]])
@@ -74,18 +80,16 @@ def test_calibrated_poses_are_the_true_ones(path: Path) -> None:
     ids = write(path, cameras, noise=0.0)
     fmtorch.verify(path)
     for (first, second), geometry in read(path).items():
-        R, t = cameras.relative(ids.index(first), ids.index(second))
-        assert angle(R.T @ geometry.cam2_from_cam1.rotation.matrix()) < 0.01
-        assert geometry.cam2_from_cam1.translation @ t > np.cos(np.radians(0.05))
-        with pycolmap.Database.open(path) as database:
-            camera = database.read_camera(1)
-            x0, x1 = (np.c_[database.read_keypoints(i)[:, :2], np.ones(150)] for i in (first, second))
+        rotation, translation = off(geometry, cameras, ids.index(first), ids.index(second))
+        assert rotation < 0.01
+        assert translation < 0.05
+        x0, x1 = keypoints(path, first, second)
         good = geometry.inlier_matches[geometry.inlier_matches[:, 0] == geometry.inlier_matches[:, 1]]
         lines = x0[good[:, 0]] @ geometry.F.T
         distance = np.abs((x1[good[:, 1]] * lines).sum(1)) / np.hypot(lines[:, 0], lines[:, 1])
         assert distance.max() < 0.01
-        K = camera.calibration_matrix()
-        E = K.T @ geometry.F @ K
+        colmaps = np.linalg.inv(BACK) @ K
+        E = colmaps.T @ geometry.F @ colmaps
         np.testing.assert_allclose(E / np.linalg.norm(E), geometry.E * np.sign((E * geometry.E).sum()), atol=1e-6)
 
 
@@ -95,9 +99,9 @@ def test_points_are_undistorted_by_every_lens(model: str, path: Path) -> None:
     write(path, cameras, model, noise=0.05)
     assert fmtorch.verify(path).configurations == {"calibrated": 1}
     (geometry,) = read(path).values()
-    R, t = cameras.relative(0, 1)
-    assert angle(R.T @ geometry.cam2_from_cam1.rotation.matrix()) < 0.2
-    assert geometry.cam2_from_cam1.translation @ t > np.cos(np.radians(2))
+    rotation, translation = off(geometry, cameras)
+    assert rotation < 0.2
+    assert translation < 2
     right = np.arange(150) % 5 != 0
     assert set(np.flatnonzero(right)) <= set(geometry.inlier_matches[:, 0].tolist())
 
@@ -141,16 +145,15 @@ def test_configurations_of_special_pairs(kind: str, name: str, path: Path) -> No
     (geometry,) = read(path).values()
     assert geometry.config == Configuration.__members__[name.upper()]
     assert len(geometry.inlier_matches) >= 115
-    R, t = cameras.relative(0, 1)
-    assert angle(R.T @ geometry.cam2_from_cam1.rotation.matrix()) < (1 if kind == "planar" else 0.5)
+    rotation, translation = off(geometry, cameras)
+    assert rotation < (1 if kind == "planar" else 0.5)
     if kind == "rotation":
         assert not geometry.cam2_from_cam1.translation.any()
-        with pycolmap.Database.open(path) as database:
-            x0, x1 = (np.c_[database.read_keypoints(i)[:, :2], np.ones(150)] for i in (1, 2))
+        x0, x1 = keypoints(path, 1, 2)
         there = x0[1] @ geometry.H.T
         np.testing.assert_allclose(there[:2] / there[2], x1[1, :2], atol=2)  # px
     else:
-        assert geometry.cam2_from_cam1.translation @ t > np.cos(np.radians(5))
+        assert translation < 5
 
 
 def test_poses_of_planes(tmp_path: Path) -> None:
@@ -160,8 +163,7 @@ def test_poses_of_planes(tmp_path: Path) -> None:
         cameras, path = scene(2, seed=seed, kind="planar"), tmp_path / f"{seed}.db"
         write(path, cameras)
         fmtorch.verify(path)
-        (geometry,) = read(path).values()
-        errors.append(angle(cameras.relative(0, 1)[0].T @ geometry.cam2_from_cam1.rotation.matrix()))
+        errors.append(off(*read(path).values(), cameras)[0])
     assert np.median(errors) < 0.4
 
 
@@ -246,10 +248,8 @@ def test_a_copy_is_whole_while_somebody_reads_it(path: Path, tmp_path: Path) -> 
 
 def test_broken_pairs_are_lines_with_reasons(path: Path) -> None:
     write(path, scene(5), pairs=[(0, 1), (0, 2), (1, 3), (0, 4), (1, 2)], shared=False)
-    with sqlite3.connect(path) as connection:
-        connection.execute("DELETE FROM keypoints WHERE image_id = 3")
-        sides = np.array([640.0, 320.0]).tobytes()
-        connection.execute("UPDATE cameras SET model = 17, params = ? WHERE camera_id = 5", (sides,))
+    sql(path, "DELETE FROM keypoints WHERE image_id = 3")
+    sql(path, "UPDATE cameras SET model = 17, params = ? WHERE camera_id = 5", np.array([640.0, 320.0]).tobytes())
     with pycolmap.Database.open(path) as database:
         database.update_keypoints(4, np.zeros((7, 2), np.float32))
     result = fmtorch.verify(path)
@@ -263,9 +263,9 @@ def test_broken_pairs_are_lines_with_reasons(path: Path) -> None:
     assert (list(read(path)), fmtorch.verify(path).kept) == ([(1, 2)], 1)
 
 
-def sql(path: Path, statement: str) -> None:
+def sql(path: Path, statement: str, *values: object) -> None:
     with sqlite3.connect(path) as connection:
-        connection.execute(statement)
+        connection.execute(statement, values)
 
 
 @pytest.mark.parametrize(
@@ -314,15 +314,11 @@ def test_wrong_arguments(path: Path) -> None:
 def test_a_database_of_colmap_3(path: Path) -> None:
     """Without rigs and frames, which pycolmap adds when it opens one."""
     write(path, scene(3))
-    with sqlite3.connect(path) as connection:
-        for table in ("frame_data", "frames", "rig_sensors", "rigs"):
-            connection.execute(f"DROP TABLE {table}")
-        connection.execute("DROP TABLE two_view_geometries")
-        connection.execute(
-            "CREATE TABLE two_view_geometries (pair_id INTEGER PRIMARY KEY NOT NULL, rows INTEGER NOT NULL, "
-            "cols INTEGER NOT NULL, data BLOB, config INTEGER NOT NULL, F BLOB, E BLOB, H BLOB)"
-        )
-        connection.execute("PRAGMA user_version = 3600")
+    for table in ("frame_data", "frames", "rig_sensors", "rigs", "two_view_geometries"):
+        sql(path, f"DROP TABLE {table}")
+    columns = "pair_id INTEGER PRIMARY KEY NOT NULL, rows INTEGER NOT NULL, cols INTEGER NOT NULL, data BLOB"
+    sql(path, f"CREATE TABLE two_view_geometries ({columns}, config INTEGER NOT NULL, F BLOB, E BLOB, H BLOB)")
+    sql(path, "PRAGMA user_version = 3600")
     assert fmtorch.verify(path).configurations == {"calibrated": 3}
     assert all(geometry.cam2_from_cam1 is not None for geometry in read(path).values())
 
@@ -385,7 +381,7 @@ def test_a_focal_length_that_matches_contradict_or_that_is_absurd_is_no_calibrat
     assert (result.configurations, result.problems) == ({"uncalibrated": 1}, ())
     absurd = f"a focal length of {focal:g} px for 640 x 480 pixels counts as unknown"
     assert any(absurd in line for line in result.warnings) == (focal != 1500), result.warnings
-    assert rotated(path, cameras) < 1
+    assert off(*read(path).values(), cameras)[0] < 1
 
 
 def test_a_crop_of_a_database_is_calibrated(path: Path) -> None:
@@ -393,7 +389,7 @@ def test_a_crop_of_a_database_is_calibrated(path: Path) -> None:
     cameras.X[:, 0] += 4
     write(path, cameras, "PINHOLE", params=[600, 600, -20, 240])
     assert fmtorch.verify(path).configurations == {"calibrated": 1}
-    assert rotated(path, cameras) < 0.5
+    assert off(*read(path).values(), cameras)[0] < 0.5
 
 
 def rows(path: Path) -> dict[str, list[Any]]:
