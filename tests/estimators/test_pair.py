@@ -144,14 +144,14 @@ def assert_supported(estimate: Estimate, c: Correspondences, what: str) -> None:
         assert ok == (estimate.reason[i] == ""), what
         if not ok:
             assert not len(inside), what
-            assert not bool(estimate.F[i].any()), what
+            assert not bool(estimate.matrix[i].any()), what
             continue
         minimal = 7 if estimate.model == "fundamental" else 4
         assert len(np.unique(inside, axis=0)) >= minimal, f"{what}, pair {i}"
         for image in (inside[:, :2], inside[:, 2:]):
             spread = np.linalg.svd(image - image.mean(0), compute_uv=False)
             assert spread[1] > 1e-9 * spread[0], f"{what}, pair {i}"
-        assert float(estimate.F[i].norm()) == pytest.approx(1), f"{what}, pair {i}"
+        assert float(estimate.matrix[i].norm()) == pytest.approx(1), f"{what}, pair {i}"
 
 
 @pytest.mark.parametrize("name", EVERY)
