@@ -271,7 +271,7 @@ class Ransac:
         solution = self._of_pinholes(pair)
         if self.focal is None or solution.fit is None or not pair.sizes_known:
             return solution
-        return solution._replace(lens_suggested=lens_search.suggested_lens(solution.fit, pair))
+        return solution._replace(lens_suggested=lens_search.suggested_lens(solution.fit, searched(pair)))
 
     def _of_pinholes(self, pair: Pair) -> Solution:
         selection, draws = self.selected(searched(pair))
