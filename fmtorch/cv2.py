@@ -15,6 +15,7 @@ import cv2 as opencv
 import numpy as np
 from numpy.typing import NDArray
 
+from fmtorch.core.checks import as_tensor
 from fmtorch.core.types import Estimate
 from fmtorch.two_view import find
 from fmtorch.two_view.arguments import MIN_PIXELS
@@ -36,8 +37,8 @@ PRESETS = {
 """The presets of fundamental and essential matrices by OpenCV's flags (FM_RANSAC is RANSAC, FM_LMEDS is LMEDS)."""
 OF_ALL_POINTS = (opencv.FM_7POINT, opencv.FM_8POINT)
 UNIT_FOCAL = 1000.0  # px, of the camera that normalised points are scaled to
-REACH_PX = 1000.0  # of points in another unit, as they are scaled
-SUBPIXEL, USUAL_THRESHOLD = 0.5, 3.0  # px: below which a threshold may be of a larger unit; OpenCV's usual one
+REACH_PX, MAX_REACH_PX = 1000.0, 1e5  # of points in another unit, as they are scaled; of pixels, at most
+MIN_THRESHOLD, USUAL_THRESHOLD, MAX_THRESHOLD = 0.5, 3.0, 10.0  # px: OpenCV's usual one; others may be of another unit
 RANK = 1e-6  # of the eighth singular value, in the first, below which equations determine no F
 FARTHEST = 1e9  # baselines
 TO_THE_END = (opencv.TERM_CRITERIA_COUNT + opencv.TERM_CRITERIA_EPS, 100, 1e-12)
@@ -80,14 +81,12 @@ def findFundamentalMat(  # OpenCV's name, as all of this module
         maxIters, mask = None, maxIters
     x1, x2 = _points_of(points1, "points1"), _points_of(points2, "points2")
     if method in OF_ALL_POINTS:
-        if method == opencv.FM_8POINT and _deficient(x1, x2):
+        if not np.isfinite(np.r_[x1, x2]).all() or (method == opencv.FM_8POINT and _deficient(x1, x2)):
             return None, _written(None, mask)
         of_all: Any = opencv.findFundamentalMat(x1, x2, method)
         return of_all[0], _written(of_all[1], mask)
-    if ransacReprojThreshold <= 0:  # as OpenCV
-        ransacReprojThreshold = USUAL_THRESHOLD
-    scale = _scale_to_pixels([x1, x2], ransacReprojThreshold)
-    name, options = _preset(method, scale * ransacReprojThreshold, confidence, maxIters)
+    scale, threshold = _in_pixels([x1, x2], ransacReprojThreshold, method)
+    name, options = _preset(method, threshold, confidence, maxIters)
     estimate = find.find_fundamental(scale * x1, scale * x2, estimator=name, **options)
     S = np.diag([scale, scale, 1.0])
     return _result(estimate, S @ estimate.F[0].cpu().numpy() @ S, mask)
@@ -115,14 +114,13 @@ def findHomography(
     """
     src, dst = _points_of(srcPoints, "srcPoints"), _points_of(dstPoints, "dstPoints")
     if method == 0 or len(src) < MIN_H:
-        of_all: Any = opencv.findHomography(src, dst, method)
-        return of_all[0], _written(of_all[1], mask)
-    if ransacReprojThreshold <= 0:  # as OpenCV
-        ransacReprojThreshold = USUAL_THRESHOLD
-    scale = _scale_to_pixels([dst], ransacReprojThreshold, src)
+        of_all: Any = opencv.findHomography(src, dst, method) if np.isfinite(np.r_[src, dst]).all() else (None, None)
+        inliers = _written(of_all[1], mask)
+        return of_all[0], np.zeros((len(src), 1), np.uint8) if inliers is None else inliers
+    scale, threshold = _in_pixels([dst], ransacReprojThreshold, method, src)
     method = opencv.RANSAC if method == opencv.RHO else method
-    _, options = _preset(method, scale * ransacReprojThreshold, confidence, maxIters)
-    options["inlier_threshold"] = scale * ransacReprojThreshold
+    _, options = _preset(method, threshold, confidence, maxIters)
+    options["inlier_threshold"] = threshold
     estimate = find.find_homography(src, scale * dst, **options)
     H, inliers = _result(estimate, np.diag([1 / scale, 1 / scale, 1.0]) @ estimate.H[0].cpu().numpy(), mask)
     return H, np.zeros((len(src), 1), np.uint8) if inliers is None else inliers
@@ -148,15 +146,15 @@ def findEssentialMat(points1: Any, points2: Any, *arguments: Any, **named: Any) 
     """
     x1, x2, K1, K2, rest = _calibrated(points1, points2, arguments, named)
     focal = float(np.abs([K1[0, 0], K1[1, 1], K2[0, 0], K2[1, 1]]).max())
-    scale = UNIT_FOCAL / focal if focal < MIN_PIXELS else 1.0  # thresholds are in the unit of the points
-    S = np.diag([scale, scale, 1])
-    prob, threshold = rest.get("prob"), rest.get("threshold", 1.0)
-    name, options = _preset(rest.get("method", opencv.RANSAC), scale * threshold, prob, rest.get("maxIters"))
+    prob, threshold, method = rest.get("prob"), rest.get("threshold", 1.0), rest.get("method", opencv.RANSAC)
+    scale = UNIT_FOCAL / focal if focal < MIN_PIXELS else min(_in_pixels([x1, x2], threshold, method)[0], 1.0)
+    S = np.diag([scale, scale, 1])  # thresholds are in the unit of the points
+    name, options = _preset(method, scale * threshold, prob, rest.get("maxIters"))
     estimate = find.find_essential(scale * x1, scale * x2, S @ K1, S @ K2, estimator=name, **options)
-    valid = bool(estimate.ok[0]) and estimate.E is not None and bool(estimate.E.isfinite().all())
-    if not valid or estimate.E is None:
+    if estimate.E is None or not bool(estimate.ok[0] & estimate.E.isfinite().all()):
         return None, _written(None, rest.get("mask"))
-    return estimate.E[0].cpu().numpy(), _written(_inliers(estimate), rest.get("mask"))
+    inliers = estimate.inliers[0].cpu().numpy().astype(np.uint8)[:, None]
+    return estimate.E[0].cpu().numpy(), _written(inliers, rest.get("mask"))
 
 
 def recoverPose(*arguments: Any, **named: Any) -> Any:
@@ -177,7 +175,7 @@ def recoverPose(*arguments: Any, **named: Any) -> Any:
         _written(None, given.get("mask"))
         raise ValueError("no essential matrix agrees with the points")
     x1, x2, *_ = _calibrated(given["points1"], given["points2"], tuple(given[name] for name in names[2:6]), {})
-    matrices = (np.asarray(given[name], float) for name in ("cameraMatrix1", "cameraMatrix2"))
+    matrices = (_array(given[name], name) for name in ("cameraMatrix1", "cameraMatrix2"))
     y1, y2 = (opencv.undistortPoints(x[:, None], K, None) for x, K in zip((x1, x2), matrices, strict=True))
     retval, R, t, mask, _ = opencv.recoverPose(E, y1, y2, np.eye(3), distanceThresh=FARTHEST, mask=inliers)
     for name, value in (("E", E), ("R", R), ("t", t), ("mask", mask)):
@@ -195,7 +193,7 @@ def _pose_of_matrix(arguments: tuple[Any, ...], named: dict[str, Any]) -> Any:
     if missing := [name for name in ("E", "points1", "points2") if name not in given]:
         raise TypeError(f"recoverPose needs {', '.join(missing)}")
     (cx, cy), f = given.get("pp", (0.0, 0.0)), float(given.get("focal", 1.0))
-    K = np.asarray(given.get("cameraMatrix", [[f, 0, cx], [0, f, cy], [0, 0, 1]]), np.float64)
+    K = _array(given.get("cameraMatrix", [[f, 0, cx], [0, f, cy], [0, 0, 1]]), "cameraMatrix")
     x1, x2 = (_points_of(given[name], name) for name in ("points1", "points2"))
     retval, R, t, mask, _ = opencv.recoverPose(given["E"], x1, x2, K, distanceThresh=FARTHEST, mask=given.get("mask"))
     _put(R, given.get("R"))
@@ -221,19 +219,23 @@ def _preset(
     return PRESETS[method], options
 
 
-def _scale_to_pixels(points: list[Matrix], threshold: float | int, src: Matrix | None = None) -> float:
-    """What makes pixels, in which presets search, of points in another unit, as of a camera of a focal length of 1.
-    1 for pixels, and where the threshold is so wide that it is not of this unit. src: the other points of a homography,
-    beside which a threshold below a pixel shows that the unit is a larger one."""
-    finite = [x[np.isfinite(x).all(1)] for x in points]
-    reach = max((float(np.abs(x).max()) for x in finite if len(x)), default=0.0)
-    if 0 < reach < MIN_PIXELS:
-        return REACH_PX / reach if threshold < reach / 10 else 1.0
-    if src is None or not 0 < threshold < SUBPIXEL or len(src) < 2:
-        return 1.0
-    extents = [float(np.ptp(x[np.isfinite(x).all(1)], axis=0).max(initial=0.0)) for x in (src, points[0])]
-    comparable = extents[0] < find.COMPARABLE * extents[1] and extents[1] < find.COMPARABLE * extents[0]
-    return 1.0 if comparable else USUAL_THRESHOLD / threshold
+def _in_pixels(points: list[Matrix], threshold: float, method: Any, src: Matrix | None = None) -> tuple[float, float]:
+    """What makes pixels, in which presets search, of points in another unit, as of a camera of a focal length of 1, and
+    the threshold in them, the usual one of LMedS, which takes none. 1 for pixels, and where the threshold is so wide
+    that it is not of this unit. src: the other points of a homography, of another extent where these are in the unit of
+    a plane: beside it a threshold that is unusual in pixels shows that unit."""
+    lmeds = method == opencv.LMEDS
+    threshold = USUAL_THRESHOLD if lmeds or threshold <= 0 else float(threshold)  # as OpenCV
+    finite = [x[np.isfinite(x).all(1)] for x in (*points, *([] if src is None else [src]))]
+    reach = max((float(np.abs(x).max()) for x in finite[: len(points)] if len(x)), default=0.0)
+    scale = 1.0
+    if reach > 0 and not MIN_PIXELS <= reach <= MAX_REACH_PX:
+        scale = REACH_PX / reach if lmeds or threshold < reach / 10 else 1.0
+    elif src is not None and all(map(len, finite)) and (lmeds or not MIN_THRESHOLD <= threshold <= MAX_THRESHOLD):
+        to, of = (float(np.ptp(x, axis=0).max()) for x in finite)
+        comparable = of < find.COMPARABLE * to and to < find.COMPARABLE * of
+        scale = 1.0 if comparable else REACH_PX / reach if lmeds else USUAL_THRESHOLD / threshold
+    return scale, threshold if lmeds else scale * threshold
 
 
 def _deficient(x1: Matrix, x2: Matrix) -> bool:
@@ -250,11 +252,7 @@ def _result(estimate: Estimate, matrix: Any, mask: Mask | None) -> tuple[Matrix 
         return None, _written(None, mask)
     M = np.asarray(matrix, np.float64).reshape(3, 3)
     last = M[2, 2] if abs(M[2, 2]) > np.finfo(float).eps * np.abs(M).max() else 1.0
-    return M / last, _written(_inliers(estimate), mask)
-
-
-def _inliers(estimate: Estimate) -> Mask:
-    return estimate.inliers[0].cpu().numpy().astype(np.uint8)[:, None]
+    return M / last, _written(estimate.inliers[0].cpu().numpy().astype(np.uint8)[:, None], mask)
 
 
 def _written(mask: Mask | None, out: Mask | None) -> Mask | None:
@@ -296,13 +294,13 @@ def _calibrated(
         K = np.array([[f, 0, cx], [0, f, cy], [0, 0, 1]])
         return x1, x2, K, K, given
     if not two:
-        K = np.asarray(given["cameraMatrix"], np.float64)
+        K = _array(given["cameraMatrix"], "cameraMatrix")
         return x1, x2, K, K, given
-    Ks = [np.asarray(given[f"cameraMatrix{i}"], np.float64) for i in (1, 2)]
+    Ks = [_array(given[name], name) for name in ("cameraMatrix1", "cameraMatrix2")]
     for i, x in enumerate((x1, x2), start=1):
         bent = given.get(f"distCoeffs{i}")
         if bent is not None and np.any(bent):
-            x[:] = _undistorted(x[:, None], Ks[i - 1], np.asarray(bent, np.float64))[:, 0]
+            x[:] = _undistorted(x[:, None], Ks[i - 1], _array(bent, f"distCoeffs{i}"))[:, 0]
     return x1, x2, Ks[0], Ks[1], given
 
 
@@ -313,9 +311,14 @@ def _undistorted(x: Any, K: Matrix, bent: Matrix) -> Any:
     return opencv.undistortPoints(x, K, bent, None, None, K, TO_THE_END)
 
 
+def _array(value: Any, name: str) -> Matrix:
+    """A copy in float64 of real numbers. Raises TypeError or ValueError, naming the argument, for anything else."""
+    return as_tensor(value, name).detach().cpu().double().clone().numpy()
+
+
 def _points_of(points: Any, name: str) -> Matrix:
     """Points (N, 2) of any form that OpenCV takes, a copy in float64. Raises ValueError for another."""
-    array = np.array(points, np.float64)
+    array = _array(points, name)
     if array.ndim == 3 and 1 in array.shape[:2]:
         array = array.reshape(-1, array.shape[2])
     if array.ndim != 2 or array.shape[1] not in (2, 3):

@@ -95,6 +95,10 @@ def test_methods_of_all_points_are_opencvs() -> None:
     x, y, _ = homography_points(wrong=0.0)
     theirs, ours = both("findHomography", x, y)
     np.testing.assert_array_equal(theirs[0], ours[0])
+    x[3, 0] = np.nan
+    of_F, of_H = cv2.findFundamentalMat, cv2.findHomography
+    for count, function, method in ((7, of_F, cv2.FM_7POINT), (60, of_F, cv2.FM_8POINT), (60, of_H, 0)):
+        assert function(x[:count], y[:count], method)[0] is None
 
 
 def test_nothing_where_opencv_has_nothing() -> None:
@@ -146,6 +150,8 @@ def test_wrong_arguments_are_named() -> None:
         ((PTS1.ravel(), PTS2), r"points1 has shape \(400,\)"),
         ((PTS1 / 1000, PTS2 / 1000), "no pixels"),
         ((PTS1, PTS2[:50]), "must be equal"),
+        ((PTS1, PTS2.astype(str)), "points2 is a ndarray of <U32; it must be an array or tensor of numbers"),
+        ((np.ma.masked_less(PTS1, 300), PTS2), "points1 is a masked array; give its data"),
         ((PTS1, PTS2, opencv.UsacParams()), "UsacParams are of OpenCV's own search"),
     ):
         with pytest.raises((ValueError, TypeError), match=said):
@@ -156,17 +162,20 @@ def test_wrong_arguments_are_named() -> None:
 
 def test_points_in_another_unit_with_a_threshold_in_it() -> None:
     """Of a focal length of one, as VIO programs give them: matches are told apart as in pixels."""
-    n1, n2 = (mapped(np.linalg.inv(K0), x) for x in (PTS1, PTS2))
-    F, mask = cv2.findFundamentalMat(n1, n2, cv2.FM_RANSAC, 1.5 / 510, 0.999)
-    assert float((mask.ravel() == SCENE.right).mean()) > 0.9
-    assert apart(F, skew(SCENE.t) @ SCENE.R) < 0.05
-    E, mask = cv2.findEssentialMat(n1, n2, np.eye(3), cv2.RANSAC, 0.999, 1.0 / 510)
-    assert angle(cv2.recoverPose(E, n1, n2, np.eye(3))[1], SCENE.R) < 0.5
-    assert float((mask.ravel() == SCENE.right).mean()) > 0.9
+    for unit in (1.0, 1e7):
+        n1, n2 = (unit * mapped(np.linalg.inv(K0), x) for x in (PTS1, PTS2))
+        F, mask = cv2.findFundamentalMat(n1, n2, cv2.FM_RANSAC, unit * 1.5 / 510, 0.999)
+        assert float((mask.ravel() == SCENE.right).mean()) > 0.9
+        S = np.diag([unit, unit, 1])
+        assert apart(S @ F @ S, skew(SCENE.t) @ SCENE.R) < 0.05
+        assert float((cv2.findFundamentalMat(n1, n2, cv2.FM_LMEDS)[1].ravel() == SCENE.right).mean()) > 0.9
+        E, mask = cv2.findEssentialMat(n1, n2, S, cv2.RANSAC, 0.999, unit / 510)
+        assert angle(cv2.recoverPose(E, n1, n2, S)[1], SCENE.R) < 0.5
+        assert float((mask.ravel() == SCENE.right).mean()) > 0.9
     x, y, H = homography_points()
     right = cv2.findHomography(x, y, cv2.RANSAC, 3.0)[1].ravel().tolist()
     corners = np.array([[0, 0], [640, 0], [640, 480], [0, 480.0]])
-    for u, v in ((500, 500), (5e5, 5e5), (1000, 1), (1, 40)):  # a board in metres to pixels, pixels to a court
+    for u, v in ((500, 500), (5e5, 5e5), (1000, 1), (1, 40), (1, 0.025), (1, 2e-4)):  # a board in m, a court in m, mm
         homography, inliers = cv2.findHomography(x / u, y / v, cv2.RANSAC, 3 / v)
         assert np.abs(v * mapped(homography, corners / u) - mapped(H, corners)).max() < 0.05
         assert inliers.ravel().tolist() == right

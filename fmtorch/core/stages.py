@@ -2,8 +2,11 @@
 
 Beside them the grey images that pruners look at, and the extractor of matchers that take the images themselves."""
 
+import contextlib
 import dataclasses
-from collections.abc import Callable
+import inspect
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any, NamedTuple, Protocol, TypeAlias, TypeVar, runtime_checkable
 
 import numpy as np
@@ -99,8 +102,9 @@ class ImagePruner(Pruner, Protocol):
 
 def pruned(pruner: Pruner, c: Correspondences, images: Callable[[int], PairImages]) -> Correspondences:
     """What a pruner makes of correspondences, with the images where it looks at them."""
-    result = pruner.with_images(c, images) if isinstance(pruner, ImagePruner) else pruner(c)
-    return output_of(pruner, result, Correspondences, c)
+    if isinstance(pruner, ImagePruner):
+        return output_of(pruner, called("c, images", pruner.with_images, c, images), Correspondences, c)
+    return output_of(pruner, called("c", pruner, c), Correspondences, c)
 
 
 @runtime_checkable
@@ -128,6 +132,33 @@ class NoFeatures:
 
 class WrongOutput(TypeError, ValueError):
     """What somebody's part returned is of another kind than its stage: a mistake that its author can put right."""
+
+
+def called(wanted: str, part: Any, *given: Any) -> Any:
+    """What a part returns, see `calling`."""
+    with calling(wanted, part, *given):
+        return part(*given)
+
+
+@contextlib.contextmanager
+def calling(wanted: str, part: Any, *given: Any) -> Iterator[None]:
+    """Around a call of a part, which may be anybody's code. wanted: the parameters that a part of this kind takes.
+    Raises TypeError naming the place of one that takes others, RuntimeError for one that ends the program."""
+    try:
+        yield
+    except SystemExit as error:
+        raise RuntimeError(f"{name_of(part)} ended the program: sys.exit({error.code!r})") from error
+    except TypeError as error:
+        function: Any = part if hasattr(part, "__code__") else getattr(part, "forward", part.__call__)
+        if name_of(part).startswith("fmtorch.") or not hasattr(function, "__code__"):
+            raise
+        try:
+            inspect.signature(function).bind(*given)
+        except TypeError:
+            where = f"{Path(function.__code__.co_filename).name}:{function.__code__.co_firstlineno}"
+            takes = f"takes {inspect.signature(function)}; it is called with ({wanted})"
+            raise TypeError(f"{name_of(part)} ({where}) {takes}") from error
+        raise
 
 
 def name_of(part: object) -> str:

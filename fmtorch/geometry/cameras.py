@@ -98,6 +98,7 @@ def _determinant(line0: list[Tensor], line1: list[Tensor]) -> Tensor:
 # Images of known calibration as those of a camera with square pixels and a central principal point
 
 MIN_FOCAL, MAX_FOCAL = 0.1, 10.0  # in units of the longer side; K of other focal lengths is of another unit or image
+MAX_KNOWN_FOCAL = 1000.0  # in units of the longer side, of a camera of any kind
 MAX_OFF = 1000.0  # in units of the longer side; the principal point of a crop may lie outside it, if not so far
 MIN_SIDE_PX, MAX_SIDE_PX = 16.0, 1e6  # longer sides, or focal lengths, of coordinates that are pixels
 NOMINAL_FOCAL_PX = 1000.0  # of the image that points of another unit, such as normalised ones, are mapped to
@@ -184,9 +185,9 @@ def _problem(K: NDArray[np.float64], size: NDArray[np.float64] | None, name: str
         return f"{name} has focal lengths {K[0, 0]:g}, {K[1, 1]:g}; they must be positive"
     if size is None or not (size > 0).all():
         return ""
-    (h, w), focal = size.tolist(), float(np.sqrt(K[0, 0]) * np.sqrt(K[1, 1]))
-    if not MIN_FOCAL * max(h, w) <= focal:
-        return f"{name} has a focal length of {focal:g} for an image of {w:g} x {h:g} pixels; it must be in pixels"
+    h, w = size.tolist()
+    if absurd := [f for f in (K[0, 0], K[1, 1]) if not MIN_FOCAL * max(h, w) <= f <= MAX_KNOWN_FOCAL * max(h, w)]:
+        return f"{name} has a focal length of {absurd[0]:g} for an image of {w:g} x {h:g} pixels; it must be in pixels"
     if max(abs(K[0, 2]), abs(K[1, 2])) > MAX_OFF * max(h, w):
         return f"{name} has the principal point ({K[0, 2]:g}, {K[1, 2]:g}), far outside an image of {w:g} x {h:g} px"
     return ""

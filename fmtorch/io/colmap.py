@@ -16,9 +16,9 @@ import torch
 
 from fmtorch.core import lazy
 from fmtorch.core.files import replacing
-from fmtorch.core.lenses import MODELS, Lens
+from fmtorch.core.lenses import MODELS, Lens, undistorted_points
 from fmtorch.data.files import Array, Indices, Mask, Matrix, Singles
-from fmtorch.geometry.cameras import MIN_FOCAL, USUAL_FOCAL, calibration_problems
+from fmtorch.geometry.cameras import MAX_KNOWN_FOCAL, MIN_FOCAL, USUAL_FOCAL, calibration_problems
 from fmtorch.io.match_store import ORIGIN, PairGeometry, StoredImage, StoredPair, two_view_geometry
 
 FOCAL_LENGTH = 1.2  # of the longer side, where it is unknown: COLMAP's own default
@@ -121,6 +121,7 @@ def _one_to_one(pair: StoredPair) -> Mask:
 
 
 EXIF_DEVIATION = 0.05  # relative, of focal lengths by EXIF (docs/cameras.md)
+JUDGED, MIN_SPREAD = 500, 0.05  # keypoints that tell of a lens; median distance from its centre without it, to with it
 
 
 @dataclasses.dataclass(frozen=True)
@@ -155,30 +156,32 @@ def database_image(name: str, camera: Any, keypoints: Singles) -> DatabaseImage:
         return DatabaseImage(name, camera.camera_id, size, np.eye(3), math.inf, points, points, problem)
     lens = MODELS[model].lens(model, np.asarray(camera.params, np.float64))
     K = lens.K - np.array([[0, 0, ORIGIN], [0, 0, ORIGIN], [0, 0, 0]])
-    deviation, whose, warning = _deviation(camera, lens, K), f"camera {camera.camera_id} of {name}", ""
-    longest = max(size)
-    absurd = not (MIN_FOCAL * longest <= min(lens.fx, lens.fy) < math.inf and max(lens.fx, lens.fy) < math.inf)
+    whose, warning, centre = f"camera {camera.camera_id} of {name}", "", ((size[1] - 1) / 2, (size[0] - 1) / 2)
+    exif = lens.fx == lens.fy and tuple(K[:2, 2]) == centre and not any(lens.coefficients)  # nothing else is known
+    deviation = (EXIF_DEVIATION if exif else 0.0) if camera.has_prior_focal_length else math.inf
+    absurd = [f for f in (lens.fx, lens.fy) if not MIN_FOCAL * max(size) <= f <= MAX_KNOWN_FOCAL * max(size)]
     if absurd:
-        warning = f"{whose}: a focal length of {lens.fx:g} px for {size[1]} x {size[0]} pixels counts as unknown"
-        K[0, 0] = K[1, 1] = USUAL_FOCAL * longest
+        warning = f"{whose}: a focal length of {absurd[0]:g} px for {size[1]} x {size[0]} pixels counts as unknown"
+        K[0, 0] = K[1, 1] = USUAL_FOCAL * max(size)
         deviation = math.inf
     wrong = calibration_problems(torch.from_numpy(K)[None], torch.tensor([size]), "its calibration")[0]
-    pinhole = points
-    if lens.bends and not (absurd or wrong):
-        pixels = np.ascontiguousarray(keypoints[:, :2], np.float64)
+    pinhole, pixels = points, np.ascontiguousarray(keypoints[:, :2], np.float64)
+    if lens.bends and not (absurd or wrong) and (wrong := _folded(lens, pixels)) == "":
         rays = np.asarray(camera.cam_from_img(pixels), np.float64).reshape(-1, 2)
         pinhole = (rays @ K[:2, :2].T + K[:2, 2]).astype(np.float32)
     problem = f"{whose}: {wrong}" if wrong else ""
     return DatabaseImage(name, camera.camera_id, size, K, deviation, points, pinhole, problem, warning)
 
 
-def _deviation(camera: Any, lens: Lens, K: Matrix) -> float:
-    """Relative, of the focal length: that of EXIF where nothing else of the camera is known, else of a calibration."""
-    if not camera.has_prior_focal_length:
-        return math.inf
-    centre = ((camera.width - 1) / 2, (camera.height - 1) / 2)
-    usual = lens.fx == lens.fy and tuple(K[:2, 2]) == centre and not any(lens.coefficients)
-    return EXIF_DEVIATION if usual else 0.0
+def _folded(lens: Lens, pixels: Matrix) -> str:
+    """What is wrong with a lens that leaves most keypoints (n, 2) no place, or one at its centre; else nothing."""
+    pixels, centre = pixels[:: max(1, len(pixels) // JUDGED)], lens.K[:2, 2]
+    there, here = (np.linalg.norm(x - centre, axis=1) for x in (undistorted_points(lens, pixels), pixels))
+    if not len(pixels) or np.median(np.where(np.isnan(there), 0, there) / np.maximum(here, 1)) >= MIN_SPREAD:
+        return ""
+    values = " ".join(f"{value:g}" for value in lens.coefficients)
+    names = MODELS[lens.model].coefficients
+    return f"its lens folds the image or shrinks it to a point ({names} = {values}); calibrate it again"
 
 
 MAGIC = b"SQLite format 3\0"

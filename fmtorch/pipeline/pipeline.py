@@ -176,16 +176,14 @@ class Pipeline:
             features, seconds = self.extractor.timed(image)
             return features.to(self.device), seconds
         start = time.perf_counter()
-        features = stages.output_of(self.extractor, self.extractor(image), Features).to(self.device)
+        features = stages.output_of(self.extractor, stages.called("image", self.extractor, image), Features)
+        features = features.to(self.device)
         synchronise(self.device)
         return features, time.perf_counter() - start
 
     def correspondences(self, pairs: Sequence[ImagePair]) -> list[Outcome]:
         """Take pairs through the stages before estimation; a pair that fails has a reason and harms no other."""
-        return self._pruned([self._match(pair) for pair in pairs])
-
-    def _pruned(self, outcomes: Sequence[Outcome]) -> list[Outcome]:
-        return self._batched("pruning", self._prune, outcomes)
+        return self._batched("pruning", self._prune, [self._match(pair) for pair in pairs])
 
     def estimate(self, outcomes: Sequence[Outcome], seed: int = 0) -> list[Outcome]:
         return self._batched("estimation", functools.partial(self._estimate, seed=seed), outcomes)
@@ -193,10 +191,11 @@ class Pipeline:
     def matched(self, image0: Any, image1: Any) -> Correspondences:
         """The matcher's matches of two images, given by their features; by their pixels for an `ImageMatcher`."""
         if isinstance(self.matcher, ImageMatcher):
-            c = self.matcher.match_images(image0, image1)
+            c = stages.called("image0, image1", self.matcher.match_images, image0, image1)
             c = stages.output_of(self.matcher, c, Correspondences).to(self.device)
         else:
-            c = stages.output_of(self.matcher, self.matcher(image0, image1), Correspondences, like=image0.lafs)
+            c = stages.called("features0, features1", self.matcher, image0, image1)
+            c = stages.output_of(self.matcher, c, Correspondences, like=image0.lafs)
         name = stages.name_of(self.matcher)
         if not name.startswith("fmtorch."):
             try:
@@ -208,12 +207,13 @@ class Pipeline:
     def estimated(self, c: Correspondences, seed: int = 0) -> Estimate:
         """The estimate of a batch with its significance, and with its cameras where the matches ask for them."""
         used = KnownCameras(self.estimator) if c.asks_for_cameras else self.estimator
-        return judged(expect_finite(stages.output_of(used, used(c, seed), Estimate, c).detach()), c)
+        estimate = stages.output_of(used, stages.called("c, seed=0", used, c, seed), Estimate, c)
+        return judged(expect_finite(estimate.detach()), c)
 
     def run(self, pairs: Sequence[ImagePair], seed: int = 0) -> list[Outcome]:
         matched = [self._match(pair) for pair in pairs]
         compile_with([*self.pruners.values(), self.estimator])  # not before: other threads may be at it
-        return self.estimate(self._pruned(matched), seed)
+        return self.estimate(self._batched("pruning", self._prune, matched), seed)
 
     def _batched(self, stage: str, function: Stage, outcomes: Sequence[Outcome]) -> list[Outcome]:
         """A batched stage over the pairs with matches; where it raises, pair by pair: only the culprit fails."""

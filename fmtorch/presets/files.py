@@ -187,7 +187,7 @@ def _constructed(make: Callable[..., T], config: Mapping[str, Any], where: str, 
     }
     try:
         return make(**built, **extra)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         if own_traceback(error) and not isinstance(error, ValueError | TypeError | OSError | ImportError):
             raise ValueError(f"{where}: {type(error).__name__}: {error}") from error
         raise
@@ -204,7 +204,7 @@ def target_of(config: Mapping[str, Any], where: str) -> Callable[..., Any]:
     name = str(config["_target_"])
     try:
         target: Callable[..., Any] = _located(name)
-    except Exception as error:  # what a module of a user's raises while it is imported
+    except (Exception, SystemExit) as error:  # what a module of a user's raises while it is imported
         raise ValueError(f"{where}: _target_={name} cannot be imported: {' '.join(str(error).split())}") from error
     return target
 

@@ -1,6 +1,7 @@
 """Arrays kept on disk by name, one NumPy file each, in a folder of bounded size that several processes may share."""
 
 import contextlib
+import functools
 import hashlib
 import json
 import os
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from fmtorch.core import Features, files
-from fmtorch.core.stages import FeatureExtractor, TwoStepExtractor, output_of
+from fmtorch.core.stages import FeatureExtractor, TwoStepExtractor, called, output_of
 from fmtorch.runs.fingerprint import configuration, environment
 from fmtorch.runs.run_folder import identity_digest
 
@@ -153,14 +154,18 @@ class CachedFeatures:
         digest = image_digest(image)
         extractor = self.extractor
         if isinstance(extractor, TwoStepExtractor):
-            names = ("lafs", "scores")
-            frames = self._kept(self._detection, digest, lambda: dict(zip(names, extractor.detect(image), strict=True)))
-            lafs = frames.tensors["lafs"]
-            described = self._kept(self._extraction, digest, lambda: {"descriptors": extractor.describe(image, lafs)})
+            names, detect = ("lafs", "scores"), functools.partial(called, "image", extractor.detect, image)
+            frames = self._kept(self._detection, digest, lambda: dict(zip(names, detect(), strict=True)))
+            describe = functools.partial(called, "image, lafs", extractor.describe, image, frames.tensors["lafs"])
+            described = self._kept(self._extraction, digest, lambda: {"descriptors": describe()})
             steps = [frames, described]
             size = {"image_size": torch.tensor(image.shape[:2], dtype=torch.int64)}
         else:
-            whole = self._kept(self._extraction, digest, lambda: vars(output_of(extractor, extractor(image), Features)))
+            whole = self._kept(
+                self._extraction,
+                digest,
+                lambda: vars(output_of(extractor, called("image", extractor, image), Features)),
+            )
             steps, size = [whole], {}
         with self._lock:
             computed = any(step.computed for step in steps)

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from fmtorch.core.checks import Box, as_tensor, box_of, expect_inside, widened
+from fmtorch.core.checks import MIN_MATCHES, Box, as_tensor, box_of, expect_inside, widened
 from fmtorch.core.lenses import Lens as CalibratedLens
 from fmtorch.core.options import nearest
 from fmtorch.core.records import Rule
@@ -45,6 +45,7 @@ RATIO = Rule(
 UNKNOWN = (1.0, math.inf)  # px, relative deviation
 LENS_FORMS = "None, 'unknown', 'shared', lambda, (lambda, deviation) or ((lambda, deviation), (lambda, deviation))"
 UNKNOWN_LENS = (0.0, math.inf)  # lambda, deviation
+NEAR, FAR = 2e-4, 10.0  # focal lengths from the principal point that half of the points can be
 MIN_PIXELS = 10.0  # a photograph's points reach farther from its first pixel
 FOCAL_NAMES = ("shared", "unknown")
 
@@ -76,17 +77,43 @@ def correspondences(
     """
     cameras = camera_fields(K0, K1, focal, fields.get("size0") is not None)
     c = _batch(x0, x1, {**fields, **cameras, **lens_fields(lens)})
-    for name, K, size in (("K0", c.K0, c.size0), ("K1", c.K1, c.size1)) if len(c) == 1 else ():
-        if K is not None and (problem := calibration_problems(K, size, name)[0]):
-            raise ValueError(problem)
+    if len(c) == 1 and (problem := camera_problems(c)[0]):
+        raise ValueError(problem)
     expect_possible(c, plane)
     return c
 
 
+def camera_problems(c: Correspondences) -> tuple[str, ...]:
+    """What is wrong with K0 or K1 of each pair by its image, or where no size is known by its points; mostly empty."""
+    problems = [("",) * len(c)]
+    for i, (K, x, size) in enumerate(((c.K0, c.x0, c.size0), (c.K1, c.x1, c.size1))):
+        if K is None:
+            continue
+        problems.append(calibration_problems(K, size, f"K{i}"))
+        if size is None and x.shape[1] >= MIN_MATCHES:
+            known = c.mask if c.focal is None else c.mask & c.focal[:, i, 1:].isfinite()
+            off = ((x * K[:, 2:, 2:] - K[:, None, :2, 2]) / K[:, None, (0, 1), (0, 1)]).detach().norm(dim=-1)
+            off = torch.where(known & (known.sum(1, keepdim=True) >= MIN_MATCHES), off, torch.nan).nanmedian(1).values
+            wrong = ((off > FAR) | ((off < NEAR) & (off > 0))).tolist()
+            said = f"K{i} has points {{:.2g}} focal lengths off its principal point; both must be in one unit"
+            problems.append(tuple(said.format(each) * bad for each, bad in zip(off.tolist(), wrong, strict=True)))
+    return tuple(next(filter(None, each), "") for each in zip(*problems, strict=True))
+
+
 def expect_possible(c: Correspondences, plane: bool = False) -> None:
-    """Raises ValueError for values that cannot be, and for points of no pixels or outside images of their sizes."""
+    """Raises ValueError for values that cannot be, and for points of no pixels or outside images of their sizes.
+    Of a batch in which some pairs are sound none is refused: no pair can take its batch down. Points of an image with a
+    calibration matrix may be in its unit, whatever that is, and those of a plane, too, if the others are in pixels."""
     expect_values(c, ratio=RATIO)
-    _expect_pixels(c, plane)
+    boxes = box_of(c.x0, c.mask), box_of(c.x1, c.mask)
+    strange = [_normalized(box, K) for box, K in zip(boxes, (c.K0, c.K1), strict=True)]
+    if plane and strange == [True, False]:
+        return
+    for i, (x, size) in enumerate(((c.x0, c.size0), (c.x1, c.size1))):
+        if strange[i]:
+            _refuse(boxes[i], i, (c.K0, c.K1)[i] is not None)
+        if size is not None:
+            expect_inside(x, boxes[i], size, f"x{i}", f"size{i}")
 
 
 def _batch(x0: Arrays, x1: Arrays, fields: Mapping[str, Any]) -> Correspondences:
@@ -303,21 +330,6 @@ def _deviations(focal: Any, known0: bool, known1: bool) -> Tensor:
 
 def _floating(value: Any, name: str) -> Tensor:
     return widened(as_tensor(value, name))
-
-
-def _expect_pixels(c: Correspondences, plane: bool) -> None:
-    """Raise ValueError where the points of all pairs are obviously not in pixels, or contradict the image sizes.
-    Of a batch in which some pairs are sound none is refused: no pair can take its batch down. Points of an image with a
-    calibration matrix may be in its unit, whatever that is, and those of a plane, too, if the others are in pixels."""
-    boxes = box_of(c.x0, c.mask), box_of(c.x1, c.mask)
-    strange = [_normalized(box, K) for box, K in zip(boxes, (c.K0, c.K1), strict=True)]
-    if plane and strange == [True, False]:
-        return
-    for i, (x, size) in enumerate(((c.x0, c.size0), (c.x1, c.size1))):
-        if strange[i]:
-            _refuse(boxes[i], i, (c.K0, c.K1)[i] is not None)
-        if size is not None:
-            expect_inside(x, boxes[i], size, f"x{i}", f"size{i}")
 
 
 def _normalized(box: Box, K: Tensor | None) -> bool:

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from fmtorch.core.checks import box_of
 from fmtorch.core.records import ungraphed
-from fmtorch.core.stages import Estimator, Pruner, output_of
+from fmtorch.core.stages import Estimator, Pruner, called, output_of
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.estimators.lens_search import TAIL_DEVIATION
 from fmtorch.geometry.arithmetic import component_sum, matmul3, sqrt
@@ -20,6 +20,7 @@ from fmtorch.geometry.pose import inverse, pose, pose_from_fundamental
 from fmtorch.geometry.significance import judged
 from fmtorch.jit.kernel import for_each_pair
 from fmtorch.jobs.execution import one_thread
+from fmtorch.two_view.arguments import camera_problems
 
 OFF_CENTRE = 0.1  # of a principal point, in units of the side, or beyond twice it a point: K may be of another image
 MORE, MORE_MATCHES = 1.1, 8  # inliers without K, times those with it and beyond, from which on it is contradicted
@@ -51,7 +52,8 @@ class KnownCameras:
             images = _images(_completed(c))
             square = _square(c, images)
         square = square if self.pruner is None else self.pruner(square)
-        estimate = judged(output_of(self.estimator, self.estimator(square, seed), Estimate, square), square)
+        estimate = called("c, seed=0", self.estimator, square, seed)
+        estimate = judged(output_of(self.estimator, estimate, Estimate, square), square)
         with one_thread(c.mask.device):
             known = _with_cameras(estimate, square, images, self.covariance)
         return known if images.map is None else known.derived(contradicted=self._contradicted(c, known, seed))
@@ -89,8 +91,7 @@ def _images(c: Correspondences) -> Images:
     if c.K0 is None or c.K1 is None:
         unknown = torch.full((len(c), 2, 2), torch.inf, dtype=torch.float64, device=device)
         return Images(None, unknown if c.focal is None else c.focal.detach().double(), sizes, None, ("",) * len(c))
-    both = calibration_problems(c.K0, c.size0, "K0"), calibration_problems(c.K1, c.size1, "K1")
-    problems = tuple(first or second for first, second in zip(*both, strict=True))
+    problems = camera_problems(c)
     valid = torch.tensor([not problem for problem in problems], dtype=torch.bool, device=device)
     K = torch.stack([c.K0.double(), c.K1.double()], 1).reshape(-1, 3, 3)
     square = square_pixels(K, None if sizes is None else sizes.reshape(-1, 2), valid.repeat_interleave(2))

@@ -7,6 +7,7 @@ import dataclasses
 import json
 import pickle
 import re
+import sys
 import threading
 from pathlib import Path
 from typing import Any
@@ -356,6 +357,10 @@ def swapped_sizes(a: Features, b: Features) -> Correspondences:
         ("pruners", {"own": no_keys}, r"no_keys returned matches without their pairs' keys; use c\.keep\(mask\)"),
         ("pruners", {"own": lambda c: c[:0]}, "Correspondences of 0 pairs; they must be of 1"),
         ("estimator", lambda c, seed: c.x0, "^estimation: WrongOutput: .* returned a Tensor; it must return Estimate"),
+        ("features", lambda: None, r"TypeError: .*<lambda> \(test_pipeline.py:\d+\) takes \(\); .* with \(image\)$"),
+        ("matcher", lambda a: a, r"\(test_pipeline.py:\d+\) takes \(a\); it is called with \(features0, features1\)$"),
+        ("estimator", lambda c: estimate(c), r"\(test_pipeline.py:\d+\) takes \(c\); it is called with \(c, seed=0\)$"),
+        ("estimator", lambda c, seed: sys.exit(4), r"ended the program: sys.exit\(4\) \(test_pipeline.py:\d+, in "),
         ("estimator", lambda c, seed: estimate(c, slots=5), r"inliers of shape \(1, 5\); .* of the mask, \(1, 9\)"),
     ],
 )  # fmt: skip

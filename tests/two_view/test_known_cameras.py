@@ -321,7 +321,9 @@ def test_forms_of_what_is_known(arguments: dict[str, Any], focal: list[Any]) -> 
         ({"K0": K, "K1": K, "focal": -0.1}, "a relative deviation is not negative"),
         ({"K0": torch.eye(2), "K1": K}, "K0 has shape"),
         ({"K0": K, "K1": 0 * K}, "K1 is singular"),
-        ({"K0": K / torch.tensor([[100.0], [100], [1]]), "K1": K}, "K0 has a focal length of 5.09902"),
+        ({"K0": K / torch.tensor([[100.0], [100], [1]]), "K1": K}, "K0 has a focal length of 5 for an"),
+        ({"K0": K, "K1": K * torch.tensor([[1e5], [1e5], [1]])}, "K1 has a focal length of 5e+07 for"),
+        ({"K0": K, "K1": K / torch.tensor([[51], [51], [1]]), "size0": None, "size1": None}, "K1 has points"),
     ],
 )
 def test_wrong_arguments_are_named(arguments: dict[str, Any], said: str) -> None:

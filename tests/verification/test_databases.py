@@ -247,16 +247,20 @@ def test_a_copy_is_whole_while_somebody_reads_it(path: Path, tmp_path: Path) -> 
 
 
 def test_broken_pairs_are_lines_with_reasons(path: Path) -> None:
-    write(path, scene(5), pairs=[(0, 1), (0, 2), (1, 3), (0, 4), (1, 2)], shared=False)
+    write(path, scene(6), pairs=[(0, 1), (0, 2), (1, 3), (0, 4), (1, 2), (0, 5)], shared=False)
     sql(path, "DELETE FROM keypoints WHERE image_id = 3")
     sql(path, "UPDATE cameras SET model = 17, params = ? WHERE camera_id = 5", np.array([640.0, 320.0]).tobytes())
+    opencv = np.array([600.0, 600, 320, 240, 1e6, 0, 0, 0]).tobytes()
+    sql(path, "UPDATE cameras SET model = 4, params = ? WHERE camera_id = 6", opencv)
     with pycolmap.Database.open(path) as database:
         database.update_keypoints(4, np.zeros((7, 2), np.float32))
     result = fmtorch.verify(path)
-    assert (result.pairs, result.verified) == (5, 1)
-    assert sorted(result.problems)[:3] == [
+    assert (result.pairs, result.verified) == (6, 1)
+    assert sorted(result.problems)[:4] == [
         "000.jpg, 002.jpg: 002.jpg has no keypoints",
         "000.jpg, 004.jpg: camera 5 of 004.jpg is EQUIRECTANGULAR, which is no pinhole behind a lens",
+        "000.jpg, 005.jpg: camera 6 of 005.jpg: its lens folds the image or shrinks it to a point "
+        "(k1 k2 p1 p2 = 1e+06 0 0 0); calibrate it again",
         "001.jpg, 002.jpg: 002.jpg has no keypoints",
     ]
     assert "001.jpg, 003.jpg: a match is of keypoint 149, 003.jpg has 7 of them" in result.problems
@@ -367,7 +371,7 @@ def test_the_command_and_without_pycolmap_an_extra_that_it_needs(command, tmp_pa
     assert said == "ended: error: pycolmap is not installed; pip install 'fmtorch[colmap]' brings it"
 
 
-@pytest.mark.parametrize("focal", [1500.0, 10.0, 0.0, -600.0, np.inf])
+@pytest.mark.parametrize("focal", [1500.0, 10.0, 0.0, -600.0, 1e10, np.inf])
 def test_a_focal_length_that_matches_contradict_or_that_is_absurd_is_no_calibration(focal: float, path: Path) -> None:
     """1500: EXIF of another lens. The pose is that of the focal length that the matches show."""
     cameras = scene(2, count=400)
