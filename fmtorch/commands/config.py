@@ -50,7 +50,7 @@ def job(task: Task) -> Task:
             _expect_known(HydraConfig.get().overrides.task)
             task(composition.with_explicit(config, HydraConfig.get().overrides.task))
         except Exception as error:
-            if config.get("debug"):  # show all of the traceback, and what it leads to
+            if config.get("debug") is True or config.get("debug") == "pdb":  # show all of the traceback
                 traceback.print_exception(error)
                 if config.debug == "pdb":
                     pdb.post_mortem(error.__traceback__)
