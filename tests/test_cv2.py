@@ -200,7 +200,6 @@ def test_eight_points_that_determine_no_matrix_have_none() -> None:
 
 @pytest.mark.parametrize("baseline", [0.004, 0.04])
 def test_poses_of_small_baselines(baseline: float) -> None:
-    """Points beyond 50 baselines vote, too."""
     rng = np.random.default_rng(1)
     X = np.c_[rng.uniform(-2, 2, (120, 2)), rng.uniform(3, 9, 120)]
     t = np.array([0.8, 0.1, 0.59])

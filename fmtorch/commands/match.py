@@ -102,7 +102,7 @@ def _expect_some(work: FolderMatches, pairs: int) -> None:
     for trouble in work.troubles:
         errors.print(trouble, style="bold", soft_wrap=True)
     if work.taken:
-        console.print(f"{work.taken} of {pairs} pairs taken from an earlier run")
+        console.print(f"{work.taken} of {pairs} pair{'s' * (pairs != 1)} taken from an earlier run")
     if work.troubles and not work.done + work.taken:
         raise ValueError(f"no pair could be matched, the first because: {work.troubles[0]}")
 
@@ -112,7 +112,7 @@ def _say(work: FolderMatches, graph: export.ViewGraph, pairs: int) -> None:
     apart = len(graph.images) - sum(sizes)
     console.print(f"{work.related} of {pairs} pairs show one scene")
     if sizes:
-        others = f"; {apart} images are in no related pair" if apart else ""
+        others = f"; {apart} image{'s are' if apart > 1 else ' is'} in no related pair" if apart else ""
         console.print(f"connected images: {', '.join(map(str, sizes))}{others}")
 
 

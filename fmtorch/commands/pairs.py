@@ -115,7 +115,7 @@ def _each(
 
 def _print_summary(construction: Construction, summary: dict[str, int], problems: list[str], seconds: float) -> None:
     judged = f"{summary['judged']} of {summary['candidates']} candidates were judged in {seconds:.0f} s"
-    console.print(f"{summary['kept']} pairs of {summary['images']} images; {judged}")
+    console.print(f"{summary['kept']} pair{'s' * (summary['kept'] != 1)} of {summary['images']} images; {judged}")
     if construction.count is not None and summary["kept"] < construction.count:
         console.print(f"no more pass the rule than these; {construction.count} were asked for")
     if problems:

@@ -52,7 +52,10 @@ def run(config: DictConfig) -> Path:
     for section in sections:
         for note in section.notes:
             terminal.console.print(f"{section.heading}: {note}")
-    terminal.console.print(f"{output}: {len(runs)} runs, {output.stat().st_size / 2**20:.1f} MB", style="dim")
+    if fields.output is None and not (ignoring := output.with_name(".gitignore")).exists():
+        files.write_whole(ignoring, f"{output.name}\n{ignoring.name}\n")
+    size, plural = output.stat().st_size / 2**20, "s" * (len(runs) != 1)
+    terminal.console.print(f"{output}: {len(runs)} run{plural}, {size:.1f} MB", style="dim")
     return output
 
 

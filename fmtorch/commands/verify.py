@@ -39,7 +39,7 @@ def run(config: DictConfig, estimator: str) -> Verification:
     for warning in result.warnings[:MAX_PROBLEMS]:
         errors.print(f"warning: {warning}", soft_wrap=True)
     if result.kept == result.pairs and not result.configurations:
-        said = f"{result.path} has a geometry of each of {result.pairs:,} pairs; force=true replaces them"
+        said = f"{result.path} has a geometry of each pair ({result.pairs:,}); force=true replaces them"
         console.print(f"nothing to do: {said}", soft_wrap=True)
     console.print(_table(result))
     console.print(str(result.path), style="dim")

@@ -21,7 +21,7 @@ from fmtorch.core.types import SIZE
 P = ParamSpec("P")
 R = TypeVar("R")
 
-WIDENED = (torch.float16, torch.bfloat16)  # in which no matrix can be decomposed
+WIDENED = (torch.float16, torch.bfloat16, torch.float8_e4m3fn, torch.float8_e5m2)  # too narrow to decompose matrices
 MODELS, SETS = "models", "batch"  # leading dimensions of F and of the matches it is fitted to: one F a set, or several
 
 
@@ -92,7 +92,7 @@ def _real(tensor: Tensor, name: str) -> Tensor:
 
 
 def widened(tensor: Tensor) -> Tensor:
-    """In a type that estimators compute in: whole numbers as float64, half precision as float32."""
+    """In a type that estimators compute in: whole numbers as float64, less than 32 bits as float32."""
     if not tensor.is_floating_point():
         return tensor.to(torch.float64)
     return tensor.to(torch.float32) if tensor.dtype in WIDENED else tensor

@@ -23,6 +23,7 @@ from fmtorch.core.options import UNIONS
 
 FLOATING, WHOLE, REAL, BOOLEAN = "floating-point numbers", "whole numbers", "real numbers", "booleans"
 NUMBERS = {"Float": FLOATING, "Int": WHOLE, "Int8": WHOLE, "Real": REAL, "Bool": BOOLEAN}
+FOREIGN = (".h5", ".json", ".npy", ".npz", ".pkl", ".pt", ".pth")  # which `Record.save` does not write
 
 
 class Rule(NamedTuple):
@@ -150,7 +151,9 @@ class Record:
 
     def save(self, path: Path | str) -> None:
         """Write the record to a file in the format of safetensors, which holds numbers and text, never code.
-        Raises OSError where it cannot be written."""
+        Raises OSError where it cannot be written, ValueError for the name of another format."""
+        if Path(path).suffix.lower() in FOREIGN:
+            raise ValueError(f"{path}: save() writes the format of safetensors; the name must end with .safetensors")
         values = vars(self)
         tensors = {name: value.detach().cpu().clone() for name, value in values.items() if isinstance(value, Tensor)}
         plain = {name: value for name, value in values.items() if not isinstance(value, Tensor | None)}

@@ -47,8 +47,7 @@ def read_image(source: ImageSource | Path | str, *, orient: bool = False) -> Pix
 
     Raises:
         ImageError: for a file that is missing, empty, truncated, corrupt, no image, of more than `MAX_PIXELS`, or of
-            another size than its source says: OpenCV alone makes up what is missing or damaged and says nothing, or but
-            a line on the standard error output.
+            another size than its source says: OpenCV alone makes up what is missing or damaged.
     """
     if not isinstance(source, ImageSource):
         return _decoded(Path(source), orient)
@@ -74,15 +73,36 @@ def stored_size(path: Path) -> tuple[int, int] | None:
 
 def stored_orientation(file: Path | io.BytesIO) -> int:
     """How an image file is to be turned to be upright, 1 (not at all) to 8 as in EXIF; 1 where it does not tell."""
-    with contextlib.suppress(Exception), Image.open(file) as image:  # damaged tags raise nearly anything
-        value = image.getexif().get(ExifTags.Base.Orientation, 1)
-        return value if value in _TURNS else 1
+    with contextlib.suppress(Exception):  # damaged tags raise nearly anything
+        data = np.memmap(file, mode="r").data if isinstance(file, Path) else file.getbuffer()
+        if data[:4] in _TIFF:
+            return _tiff_orientation(data)[0]
+        with Image.open(file) as image:
+            value = image.getexif().get(ExifTags.Base.Orientation, 1)
+            return value if value in _TURNS else 1
     return 1
 
 
 _TURNS = {1: (1, 1), 2: (1, -1), 3: (-1, -1), 4: (-1, 1), 5: (1, 1), 6: (-1, 1), 7: (-1, -1), 8: (1, -1)}
 """By EXIF's Orientation (JEITA CP-3451, 4.6.4): steps along rows and columns, which are exchanged then from 5 on."""
-_INVERSE = {6: 8, 8: 6}  # the others are their own
+
+
+def _tiff_orientation(data: bytes | memoryview) -> tuple[int, slice, bytes]:
+    """What `stored_orientation` tells of a TIFF file (TIFF 6.0, section 2), where, and what 1 is there.
+    Pillow opens not all kinds; OpenCV turns all of these, tile by tile those of tiles with 8 bits."""
+    order = -1 if data[:1] == b"I" else 1  # of bytes, by that of the largest one first
+    width, step, offset = (8, 20, 8) if data[:4] in _TIFF[1::2] else (2, 12, 4)
+
+    def number(at: int, size: int) -> int:
+        return int.from_bytes(data[at : at + size][::order], "big")  # 0 beyond the end
+
+    first = number(offset, offset) + width
+    for at in range(first, first + step * min(number(first - width, width), 2**16), step):
+        if number(at, 2) == ExifTags.Base.Orientation:
+            size, place = (2 if number(at + 2, 2) == 3 else 4), at + step - offset
+            value = number(place, size)
+            return (value if value in _TURNS else 1), slice(place, place + size), (1).to_bytes(size, "big")[::order]
+    return 1, slice(0, 0), b""
 
 
 def _decoded(path: Path, orient: bool, data: bytes | None = None) -> Pixels:
@@ -102,28 +122,33 @@ def _decoded(path: Path, orient: bool, data: bytes | None = None) -> Pixels:
         except Exception as error:  # Pillow raises what its parts do for damaged files
             raise ImageError(f"{path}: corrupt or truncated PNG ({error}); copy it again") from error
     _expect_moderate(path, data)
+    orientation = stored_orientation(io.BytesIO(data)) if orient and not _is_heic(data) else 1
+    if data[:4] in _TIFF:
+        place, upright = _tiff_orientation(data)[1:]
+        data = data[: place.start] + upright + data[place.stop :]  # nothing for OpenCV to turn
     image = _eight_bits(path, _heic(path, data) if _is_heic(data) else _by_opencv(path, data))
     if data.startswith(_JPEG) and not _jpeg_decodes(data):
         raise ImageError(f"{path}: corrupt JPEG, its compressed data are damaged; copy it again")
-    is_tiff = data[:4] in _TIFF  # which OpenCV turns in any case
-    if orient == is_tiff or _is_heic(data):
-        return np.ascontiguousarray(image)
-    orientation = stored_orientation(io.BytesIO(data))
-    rows, columns = _TURNS[_INVERSE.get(orientation, orientation) if is_tiff else orientation]
+    rows, columns = _TURNS[orientation]
     turned = image[::rows, ::columns]
     return np.ascontiguousarray(turned.swapaxes(0, 1) if orientation >= 5 else turned)
 
 
 def _by_opencv(path: Path, data: bytes) -> Array:
-    """The pixels, of any depth, grey or RGB: as stored, but those of a TIFF file upright."""
+    """The pixels, of any depth, grey or RGB; a TIFF file with an orientation is turned."""
     deep = 0 if data[4:8] == b"ftyp" else cv2.IMREAD_ANYDEPTH  # 10 bits of an AVIF are a photograph's
     flags = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION | deep
+    level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error as error:
-        raise ImageError(f"{path}: OpenCV refuses it ({error}); it must be a sound image") from error
+        raise ImageError(f"{path}: OpenCV refuses it ({error.err}); it must be a sound image") from error
+    finally:
+        if level != cv2.utils.logging.LOG_LEVEL_SILENT:  # as another thread may have set it
+            cv2.utils.logging.setLogLevel(level)
     if image is None:
-        raise ImageError(f"{path}: no image that can be decoded; it must be {FORMATS}")
+        right = "a sound TIFF of 8 or 16 bits or float32, best in strips" if data[:4] in _TIFF else FORMATS
+        raise ImageError(f"{path}: no image that can be decoded; it must be {right}")
     return image if image.ndim == 2 else image[..., ::-1]
 
 
@@ -151,8 +176,9 @@ def _eight_bits(path: Path, image: Array) -> Pixels:
     known = np.isfinite(values)
     if not known.any():
         raise ImageError(f"{path}: none of its values is a finite number; it must be an image")
+    values *= 2.0 ** -np.clip(np.frexp(np.abs(values[known]).max())[1], -1000, 1000)  # whose differences are finite
     low, high = values[known].min(), values[known].max()
-    scaled = np.where(known, (values - low) * (255 / max(high - low, np.finfo(np.float64).tiny)), 0)
+    scaled = np.where(known, values - low, 0) * float(255 / (high - low) if high > low else 0)
     return np.rint(scaled).astype(np.uint8)
 
 
@@ -190,8 +216,7 @@ def _jpeg_segments(data: bytes) -> Iterator[tuple[int, int]]:
 
 def _jpeg_decodes(data: bytes) -> bool:
     """Whether a JPEG decodes without a warning of libjpeg, which TurboJPEG takes for an error.
-    True where nobody tells: for frames that it does not convert to RGB, which are neither grey nor of three components,
-    of more than 8 bits, or coded in a rare way."""
+    True where it does not tell: for other frames than grey or of three components, of 8 bits, coded in a usual way."""
     frame = next((data[at : at + 8] for marker, at in _jpeg_segments(data) if marker in _HUFFMAN_FRAMES), b"")
     if len(frame) < 8 or frame[2] != 8 or frame[7] not in (1, 3):
         return True

@@ -284,20 +284,6 @@ def two_view_covariance(
 
     Returns:
         A `TwoViewCovariance`. The result has the same bits in any batch and with any padding.
-
-    Example:
-        >>> import torch
-        >>> from fmtorch.geometry import two_view_covariance
-        >>> X = torch.rand(200, 3, generator=torch.Generator().manual_seed(0)) * 4 + torch.tensor([-2.0, -2.0, 4.0])
-        >>> x0, x1 = (600 * Y[:, :2] / Y[:, 2:] for Y in (X, X + torch.tensor([-1.0, 0, 0])))
-        >>> x1 = x1 + 0.5 * torch.randn(x1.shape, generator=torch.Generator().manual_seed(1))
-        >>> known = torch.diag(torch.full((2,), torch.inf))[None]
-        >>> result = two_view_covariance(
-        ...     x0[None], x1[None], torch.eye(3)[None], torch.tensor([[-1.0, 0, 0]]), torch.full((1, 2), 600.0),
-        ...     torch.zeros(1, 2), torch.zeros(1, 2), torch.tensor([1.0]), focal_precision=known,
-        ... )
-        >>> bool((result.deviation_degrees < 0.5).all()), round(float(result.noise[0]), 1)
-        (True, 0.4)
     """
     kind = torch.float64
     open_prior = torch.zeros(len(R), 2, 2, dtype=kind, device=R.device)

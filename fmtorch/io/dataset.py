@@ -187,15 +187,11 @@ def _camera(file: Any, path: Path, key: str, source: ImageSource) -> tuple[Matri
     if parameters[count + 2 :].any():
         raise DataError(f"{path}: {key + '/params'!r} of {model} has distortion; F needs undistorted points")
     K = Lens(parameters[0], parameters[count - 1], *parameters[count : count + 2]).K
-    sides = [_side(file, f"{key}/{name}") for name in ("height", "width")]
+    known = [f"{key}/{name}" for name in ("height", "width")]  # which some of PoseBench's cameras have not
+    sides = [max(0, int(h5.reshaped(file, name, 1)[0])) if h5.holds(file, name) else 0 for name in known]
     if all(sides):
         return K, (sides[0], sides[1])
     return K, predictions.size_by_file(source, K)
-
-
-def _side(file: Any, key: str) -> int:
-    """A side of an image in pixels, 0 where it is not known: some of PoseBench's cameras have none."""
-    return max(0, int(h5.reshaped(file, key, 1)[0])) if h5.holds(file, key) else 0
 
 
 def _oanet_pair(file: Any, path: Path, key: str, _: Images) -> Stored:

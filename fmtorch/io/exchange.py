@@ -36,7 +36,8 @@ def from_opencv(keypoints0: Sequence[Any], keypoints1: Sequence[Any], matches: S
     rows = [row for row in rows if row]
     fields = {}
     for i, (keypoints, index) in enumerate(((keypoints0, "queryIdx"), (keypoints1, "trainIdx"))):
-        matched = [keypoints[getattr(row[0], index)] for row in rows]
+        numbered = dict(enumerate(keypoints))  # in which -1 is not the last one
+        matched = [numbered[getattr(row[0], index)] for row in rows]
         table = torch.tensor([(*k.pt, k.size, k.angle) for k in matched], dtype=torch.float32).reshape(-1, 4)
         fields[f"x{i}"] = table[:, :2]
         if bool((table[:, 3] >= 0).all() & (table[:, 2] > 0).all()):

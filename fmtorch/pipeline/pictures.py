@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fmtorch.core.checks import as_tensor
+from fmtorch.core.checks import as_tensor, checked
 from fmtorch.pipeline.photographs import GivenImage, Image, given_image
 from fmtorch.two_view.arguments import Arrays
 
@@ -152,8 +152,8 @@ def dashes(ends: Points, length: float) -> Iterator[Points]:
 
 
 def fixed(points: Points) -> list[tuple[int, int]]:
-    """Points (N, 2) as OpenCV takes them with `SUBPIXEL` fractional bits."""
-    return [(int(x), int(y)) for x, y in np.round(points * (1 << SUBPIXEL)).astype(int)]
+    """Points (N, 2) as OpenCV takes them with `SUBPIXEL` fractional bits, in 32 bits."""
+    return [(int(x), int(y)) for x, y in np.round((points * (1 << SUBPIXEL)).clip(-(2**30), 2**30)).astype(int)]
 
 
 # RGB; told apart by all kinds of colour vision (Okabe & Ito), lightened.
@@ -164,6 +164,7 @@ _CORNERS = 200  # among which to choose
 _RIM = 0.06  # share of an image at either side without corners
 
 
+@checked
 def draw_matches(
     image0: GivenImage, image1: GivenImage, x0: Arrays, x1: Arrays, inliers: Arrays | None = None,
     *, height: int | None = None, most: int = 90, most_bad: int = 50, names: tuple[str, str] | None = None,
@@ -208,6 +209,7 @@ def draw_matches(
     return captioned(canvas, names, counts, (min(counts[0], most), min(counts[1], most_bad)))
 
 
+@checked
 def draw_epipolar_lines(
     image0: GivenImage, image1: GivenImage, x0: Arrays, x1: Arrays, F: Arrays,
     *, truth: Arrays | None = None, most: int = 14,
@@ -247,9 +249,9 @@ def _array(values: Arrays, name: str) -> NDArray[np.float64]:
 
 
 def _points(x: Arrays, name: str) -> NDArray[np.float64]:
-    """Points (N, 2) of an array, a tensor, or a batch of one. Raises ValueError for another shape."""
+    """Points (N, 2) of an array, a tensor, a batch of one, or OpenCV's (N, 1, 2). Raises ValueError for others."""
     points = _array(x, name)
-    points = points[0] if points.ndim == 3 and len(points) == 1 else points
+    points = points.reshape(-1, 2) if points.ndim == 3 and 1 in points.shape[:2] and points.shape[2] == 2 else points
     if points.ndim != 2 or points.shape[1] != 2:
         raise ValueError(f"{name} has shape {points.shape}; it must be (N, 2)")
     return points

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from fmtorch import presets
-from fmtorch.core import RELATED, Correspondences, Features, files, stages
+from fmtorch.core import RELATED, Correspondences, Features, checks, files, stages
 from fmtorch.data import Lens, to_grey, undistorted
 from fmtorch.io.match_store import PairGeometry
 from fmtorch.jobs.execution import mapped, one_thread
@@ -164,7 +164,7 @@ class MatchResult:
         return report
 
     def __repr__(self) -> str:
-        found = [f"{len(self.inliers)} matches"]
+        found = [f"{len(self.inliers)} match{'es' * (len(self.inliers) != 1)}"]
         if not self.ok:
             return f"MatchResult({found[0]}, no F: {self.reason})"
         verdict = "related" if self.related else "not related"
@@ -296,7 +296,7 @@ def match(
         >>> result.ok, result.related, tuple(result.F.shape)
         (True, True, (3, 3))
     """
-    if longest_side < 1:
+    if checks.number("longest_side", longest_side, integer=True) < 1:
         raise ValueError(f"longest_side is {longest_side}; it must be at least 1 px")
     if isinstance(pipeline, str):
         pipeline = _pipeline(pipeline, str(presets.resolve_device("auto" if device is None else str(device))))

@@ -367,7 +367,8 @@ class RefineMatches:
 
         def refine(pair: int) -> None:
             arrays = {name: _array(tensor[pair]) for name, tensor in fields.items()}
-            live = np.flatnonzero(_array(c.mask[pair]) & _finite(*arrays.values()))
+            finite = [np.isfinite(array).all(tuple(range(1, array.ndim))) for array in arrays.values()]
+            live = np.flatnonzero(_array(c.mask[pair]) & np.all(finite, 0))
             if not len(live):
                 return
             rows = {name: array[live] for name, array in arrays.items()}
@@ -434,10 +435,6 @@ def _product(a: Array, b: Array) -> Array:
 def _array(tensor: Tensor) -> Array:
     tensor = tensor.detach().cpu()
     return (tensor.to(torch.float64) if tensor.is_floating_point() else tensor).contiguous().numpy()
-
-
-def _finite(*arrays: Array) -> Array:
-    return np.asarray(np.all([np.isfinite(array).all(tuple(range(1, array.ndim))) for array in arrays], 0))
 
 
 def _like(array: Array, tensor: Tensor) -> Tensor:

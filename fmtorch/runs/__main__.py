@@ -33,12 +33,9 @@ def main() -> None:
         features.setdefault(path.parent.name, []).append(status.st_size)
     _show(options.folder, "configuration", features)
     _show(kernels_dir(), "version of the compiled kernels", _kernels())
-    others = {f"{name}: {what}": _below(cache_dir() / name) for name, what in OTHERS.items()}
+    files = {f"{name}: {what}": (cache_dir() / name).rglob("*") for name, what in OTHERS.items()}
+    others = {name: [file.stat().st_size for file in below if file.is_file()] for name, below in files.items()}
     _show(cache_dir(), "other folders", {name: sizes for name, sizes in others.items() if sizes})
-
-
-def _below(folder: Path) -> list[int]:
-    return [file.stat().st_size for file in folder.rglob("*") if file.is_file()]
 
 
 def _kernels() -> Sizes:

@@ -161,11 +161,8 @@ class CachedFeatures:
             steps = [frames, described]
             size = {"image_size": torch.tensor(image.shape[:2], dtype=torch.int64)}
         else:
-            whole = self._kept(
-                self._extraction,
-                digest,
-                lambda: vars(output_of(extractor, called("image", extractor, image), Features)),
-            )
+            extract = functools.partial(called, "image", extractor, image)
+            whole = self._kept(self._extraction, digest, lambda: vars(output_of(extractor, extract(), Features)))
             steps, size = [whole], {}
         with self._lock:
             computed = any(step.computed for step in steps)
@@ -176,11 +173,11 @@ class CachedFeatures:
     def report(self) -> str:
         """One line: what was computed and found so far, and the size of the cache."""
         sizes = [status.st_size for _, status in self.cache.files()]
-        kept = f"{self.cache.folder}: {len(sizes)} files, {sum(sizes) / 1e6:.1f} MB"
+        kept = f"{self.cache.folder}: {len(sizes)} file{'s' * (len(sizes) != 1)}, {sum(sizes) / 1e6:.1f} MB"
         if not self.computed + self.found:  # nothing was to be done, or workers elsewhere did it
             return f"features are kept in {kept}"
-        taken = f", of {self.found} taken from the cache with the seconds they took then" if self.found else ""
-        return f"features of {self.computed} images computed{taken}; {kept}"
+        taken = f", of {self.found} taken from the cache" if self.found else ""
+        return f"features of {self.computed} image{'s' * (self.computed != 1)} computed{taken}; {kept}"
 
     def _section(self, name: str, part: object) -> str:
         identity = {"configuration": configuration(part), "environment": environment()}

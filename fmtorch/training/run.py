@@ -291,7 +291,7 @@ def run(config: DictConfig, name: str) -> Path:
     module = PrunerTraining(network, objective, options.optimisation, validation)
     first = int(os.environ.get("LOCAL_RANK", "0")) == 0  # of several processes the one that reports
     if first:
-        about = f"{len(matches.training)} pairs to train on, {len(matches.validation)} to validate on"
+        about = f"pairs to train on: {len(matches.training)}, to validate on: {len(matches.validation)}"
         terminal.console.print(f"{about}; {folder}", soft_wrap=True)
         if len(matches.training) < FEW:
             terminal.console.print(f"so few pairs show that it runs, and teach little; {MORE}", soft_wrap=True)

@@ -187,30 +187,13 @@ def _expect_lens(size: Size, calibrated: bool) -> None:
 
 @eager
 def find_essential(
-    x0: Arrays,
-    x1: Arrays,
-    K0: Arrays | None = None,
-    K1: Arrays | None = None,
-    *,
-    focal: Focal = None,
-    lens: Lens = None,
-    estimator: str = "fmtorch",
-    mask: Arrays | None = None,
-    ratio: Arrays | None = None,
-    score: Arrays | None = None,
-    prior: Arrays | None = None,
-    lafs0: Arrays | None = None,
-    lafs1: Arrays | None = None,
-    noise: Arrays | None = None,
-    size0: Size = None,
-    size1: Size = None,
-    covariance: bool = False,
-    pair_type: bool = False,
-    key: Arrays | int | None = None,
-    seed: int = 0,
-    config_dir: Path | str | None = None,
+    x0: Arrays, x1: Arrays, K0: Arrays | None = None, K1: Arrays | None = None, *, focal: Focal = None,
+    lens: Lens = None, estimator: str = "fmtorch", mask: Arrays | None = None, ratio: Arrays | None = None,
+    score: Arrays | None = None, prior: Arrays | None = None, lafs0: Arrays | None = None, lafs1: Arrays | None = None,
+    noise: Arrays | None = None, size0: Size = None, size1: Size = None, covariance: bool = False,
+    pair_type: bool = False, key: Arrays | int | None = None, seed: int = 0, config_dir: Path | str | None = None,
     **options: Any,
-) -> PoseEstimate:
+) -> PoseEstimate:  # fmt: skip
     """Robustly estimate the relative pose of two calibrated cameras: ``X1 = R X0 + t`` and ``E = [t]_x R``.
 
     Args:

@@ -34,8 +34,7 @@ class KnownCameras:
     The focal length of K stands for that in `focal`, with the deviation there, or 0 where `focal` is not given.
 
     Where one K is missing and the images have one size, which mostly come from one camera, that image has the principal
-    point and the shape of pixels of the other. On castle-P19 and fox, whose principal points lie 8 px off the centre,
-    this raises the AUC of pose errors at 5 degrees from 64 to 75."""
+    point and the shape of pixels of the other."""
 
     model = "fundamental"
 

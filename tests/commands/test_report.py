@@ -149,6 +149,7 @@ def test_the_command_on_two_runs(tmp_path: Path, command: Callable[..., str]) ->
     done = run_command("report", "root=Set", "pictures=2", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     page = (tmp_path / "runs/report.html").read_text()
+    assert (tmp_path / "runs/.gitignore").read_text().split() == ["report.html", ".gitignore"]
     assert "drawn again" not in page  # what is drawn is what was stored
     assert page.count("data:image/jpeg") == 2 * 2 * 2  # pairs, runs, pictures
     assert "fmbench, test: Set" in page

@@ -140,13 +140,23 @@ def test_orientation_tags_turn_on_demand_alone(tmp_path: Path, suffix: str, tag:
     assert (fmtorch.data.stored_size(path), fmtorch.data.stored_orientation(path)) == (BLOCKS.shape[:2], tag)
 
 
-@pytest.mark.parametrize("options", [{"bigtiff": True}, {"byteorder": ">"}, {"dtype": "u2"}, {"dtype": "f4"}])
-def test_tiff_of_any_kind_is_read_as_stored(tmp_path: Path, options: dict[str, Any]) -> None:
-    image = BLOCKS[..., 0].astype(options.pop("dtype", np.uint8))
-    tifffile.imwrite(tmp_path / "a.tif", image, extratags=[(274, "H", 1, 6, True)], **options)
+TILED, RGB = {"tile": (32, 32)}, {"photometric": "rgb"}
+TIFFS: list[dict[str, Any]] = [
+    {"bigtiff": True}, {"byteorder": ">"}, {"dtype": "u2"}, {"dtype": "f4"}, RGB | {"dtype": "f4"}, TILED | RGB,
+    RGB | {"dtype": "i2"}, TILED | {"bigtiff": True, "byteorder": ">"}, TILED | {"compression": "zlib"},
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("tag", [3, 6])
+@pytest.mark.parametrize("options", TIFFS)
+def test_tiff_of_any_kind_is_read_as_stored(tmp_path: Path, options: dict[str, Any], tag: int) -> None:
+    image, written = BLOCKS if "photometric" in options else BLOCKS[..., 0], {"dtype": "u1"} | options
+    image = image.astype(written.pop("dtype"))
+    tifffile.imwrite(tmp_path / "a.tif", image, extratags=[(274, "H", 1, tag, True)], **written)
     stored = read_image(tmp_path / "a.tif")
     np.testing.assert_array_equal(stored > 128, tifffile.imread(tmp_path / "a.tif") > 128)
-    np.testing.assert_array_equal(read_image(tmp_path / "a.tif", orient=True), np.rot90(stored, -1))
+    np.testing.assert_array_equal(read_image(tmp_path / "a.tif", orient=True), np.rot90(stored, {3: 2, 6: -1}[tag]))
+    assert fmtorch.data.stored_orientation(tmp_path / "a.tif") == tag
 
 
 @pytest.mark.parametrize(
@@ -162,13 +172,24 @@ def test_deep_images_are_scaled_by_their_range(tmp_path: Path, dtype: type, low:
     assert np.abs(read_image(tmp_path / "a.tif") - exact).max() <= 0.5 + 1e-9
 
 
-def test_values_that_are_no_numbers_are_dark(tmp_path: Path) -> None:
-    values = np.array([[np.nan, 1.0], [np.inf, 3.0]], np.float32)
-    tifffile.imwrite(tmp_path / "a.tif", values)
-    np.testing.assert_array_equal(read_image(tmp_path / "a.tif"), [[0, 0], [0, 255]])
+def test_values_that_are_no_numbers_or_all_alike_are_dark(tmp_path: Path) -> None:
+    values = np.array([[np.nan, 1.0], [np.inf, 3.0]])
+    constant = np.array([[500.0, 500.0], [np.inf, 500.0]])
+    wide, narrow = np.array([[-1.7e308, 1.7e308]]), np.array([[0.0, 5e-324]])
+    for image, read in ((values, [[0, 0], [0, 255]]), (constant, 0), (wide, [[0, 255]]), (narrow, [[0, 255]])):
+        tifffile.imwrite(tmp_path / "a.tif", image)
+        with np.errstate(all="raise"):
+            np.testing.assert_array_equal(read_image(tmp_path / "a.tif"), read)
     tifffile.imwrite(tmp_path / "a.tif", values * np.nan)
     with pytest.raises(ImageError, match=r"a\.tif: none of its values is a finite number"):
         read_image(tmp_path / "a.tif")
+
+
+def test_a_tiff_that_opencv_does_not_decode_is_refused_in_a_line(tmp_path: Path, capfd: Any) -> None:
+    tifffile.imwrite(tmp_path / "a.tif", BLOCKS[..., 0].astype(np.float16))
+    with pytest.raises(ImageError, match=r"a\.tif: no image.*; it must be a sound TIFF of 8 or 16 bits or float32"):
+        read_image(tmp_path / "a.tif")
+    assert capfd.readouterr() == ("", "")
 
 
 def test_the_formats_of_the_message_are_read(tmp_path: Path) -> None:

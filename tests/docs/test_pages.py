@@ -29,7 +29,6 @@ def relative(path: Path) -> str:
 
 @pytest.mark.parametrize("page", PAGES, ids=relative)
 def test_a_page_is_short_and_on_the_map_and_its_links_lead_somewhere(page: Path) -> None:
-    """docs/index.md is the map."""
     text = page.read_text(encoding="utf-8")
     assert len(text.split()) <= LIMITS.get(relative(page), LIMITS.get(relative(page.parent), MAX_WORDS))
     text = re.sub(r"```.*?```|`[^`]*`", "", text, flags=re.DOTALL)

@@ -156,7 +156,6 @@ def assert_supported(estimate: Estimate, c: Correspondences, what: str) -> None:
 
 @pytest.mark.parametrize("name", EVERY)
 def test_few_and_degenerate_matches_of_any_scale_give_a_supported_model_or_a_reason(name: str) -> None:
-    """Sizes are scaled alike."""
     kinds = small() | degenerate() | {str(i): scene(100 + i, 20, outliers=1.0) for i in range(3)}
     usual, built = torch.tensor([kind in RANK_TWO for kind in kinds]), estimator(name)
     for scale in (1e-9, 1.0, 1e9) if name in PARTS else (1.0,):
@@ -307,7 +306,6 @@ def with_noise(c: Correspondences) -> Correspondences:
 
 @pytest.mark.parametrize("name", [*FITS, "irls cauchy", "irls magsac"])
 def test_failed_pairs_have_none_and_change_no_other(name: str) -> None:
-    """Among degenerate pairs, as alone."""
     good, built = [with_noise(scene(1)), with_noise(scene(2, 60))], attached_estimator(name)
 
     def differentiated(c: Correspondences) -> tuple[Tensor, dict[str, Tensor]]:

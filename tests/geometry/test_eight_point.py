@@ -42,7 +42,6 @@ def test_reference_opencv_and_kornia_live(batch, n):
 @pytest.mark.parametrize("n", [8, 20])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_degenerate_sets_are_invalid_and_alone(n, dtype):
-    """Two sound sets, then ten that are not."""
     x0, x1, _ = (a.to(dtype).clone() for a in scenes((12,), n, noise=0.5))
     line = torch.arange(n, dtype=dtype)[:, None]
     x0[2], x1[2] = x0[2, :1], x1[2, :1]  # all equal

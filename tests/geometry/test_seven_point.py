@@ -186,7 +186,6 @@ def test_nine_tenths_of_the_real_solutions_before_the_cameras_are_found() -> Non
 
 
 def test_focal_lengths_and_the_centre_of_coordinates() -> None:
-    """F acts on pixels as E acts on rays."""
     points, _ = rays(3)
     rng = np.random.default_rng(0)
     depth, offset = rng.uniform(0.5, 2, (2, SAMPLES)), rng.uniform(-0.3, 0.3, 4)

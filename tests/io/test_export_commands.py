@@ -69,7 +69,7 @@ def test_a_folder_of_images(images: Path, tmp_path: Path, capsys: pytest.Capture
     graph = json.loads((output / "graph.json").read_text())
     assert graph["components"] == [["a.png", "b.png", "more/c.png"], ["other.png"]]
     assert sum(pair["related"] for pair in graph["pairs"]) == 3
-    assert "connected images: 3; 1 images are in no related pair" in said
+    assert "connected images: 3; 1 image is in no related pair" in said
     assert len((output / "graph.csv").read_text().splitlines()) == 7
     assert (output / "graph.svg").read_text().count("<line") == 3
 

@@ -255,11 +255,16 @@ def test_matches_and_epipolar_lines_are_drawn_of_what_find_fundamental_takes_and
     estimate = fmtorch.find_fundamental(c.x0, c.x1)
     image = np.zeros((640, 960), np.uint8)
     drawn = fmtorch.draw_matches(path, image, c.x0, c.x1, estimate.inliers)
+    of_opencv = [list(x[0].numpy()[:, None]) for x in (c.x0, c.x1)]  # as a loop over its points makes them
+    assert np.array_equal(drawn, fmtorch.draw_matches(image, image, *of_opencv, estimate.inliers))
     assert np.array_equal(drawn, fmtorch.draw_matches(image, image, c.x0[0].numpy(), c.x1[0], estimate.inliers[0]))
     lines = fmtorch.draw_epipolar_lines(path, image, c.x0[0], c.x1[0], estimate.F)
     assert lines.any()
     with pytest.raises(ValueError, match=r"x0 has shape \(3, 60\); it must be \(N, 2\)"):
         fmtorch.draw_matches(image, image, np.zeros((3, 60)), c.x1[0])
+    assert fmtorch.draw_matches(image, image, c.x0 * 1e9, c.x1).any()
+    with pytest.raises(TypeError, match="height is 'x'; it must be a whole number"):
+        fmtorch.draw_matches(image, image, c.x0, c.x1, height="x")
 
 
 def test_estimates_are_one_line_and_a_table_of_pairs() -> None:
@@ -288,6 +293,8 @@ def test_a_record_is_the_same_after_its_file(tmp_path: Path) -> None:
         fmtorch.Correspondences.load(path)
     with pytest.raises(FileNotFoundError, match=r"nowhere.estimate\.safetensors"):
         estimate.save(tmp_path / "nowhere" / "estimate.safetensors")
+    with pytest.raises(ValueError, match=r"e\.npz: save\(\) writes the format of safetensors; the name must end with"):
+        estimate.save(tmp_path / "e.npz")
 
 
 def test_a_file_with_code_is_refused(tmp_path: Path) -> None:

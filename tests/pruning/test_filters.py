@@ -258,7 +258,6 @@ def test_matches_without_frames_are_left_as_they_are_and_what_cannot_be_told_is_
 
 
 def test_known_noise_makes_estimates_more_exact() -> None:
-    """Of matches whose noise differs tenfold."""
     size, errors = torch.tensor([[800, 1000]]), []
     for seed in range(6):
         rng, exact = np.random.default_rng(seed), matched_scene(120, seed)

@@ -81,7 +81,7 @@ def test_features_that_a_killed_evaluation_kept_are_taken(starter, root, truth, 
         """What it says, and the numbers of images computed and taken."""
         done = starter.run(tmp_path, "eval", *evaluation(root, tmp_path / name, *extra))
         assert done.status == 0, done.said()
-        return done.said(), re.findall(r"features of (\d+) images computed(?:, of (\d+) taken)?", done.said())
+        return done.said(), re.findall(r"features of (\d+) images? computed(?:, of (\d+) taken)?", done.said())
 
     _, numbers = evaluated("off", "cache=off")
     assert (numbers, files()) == ([], [])

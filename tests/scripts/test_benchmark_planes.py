@@ -263,7 +263,6 @@ def test_true_poses_have_no_error_in_any_frame_and_an_image_without_a_pose_count
 
 
 def test_known_cameras_are_the_true_ones(tmp_path: Path) -> None:
-    """In COLMAP's pixels, and with a prior."""
     path = tmp_path / "database.db"
     databases.write(path, databases.scene(5), prior=False)
     calibrate(path, walk_scene()[0])

@@ -108,6 +108,8 @@ def test_numbers_of_any_type_are_those_of_float64(kind: torch.dtype) -> None:
     expected = fmtorch.find_essential(*wide, prior=prior, **EASY)
     assert torch.equal(given.inliers, expected.inliers)
     torch.testing.assert_close(given.F.double(), expected.F.double(), rtol=0, atol=1e-6)
+    small = [x.to(torch.float8_e5m2) for x in (x0, x1)]
+    assert torch.equal(fmtorch.find_fundamental(*small).F, fmtorch.find_fundamental(*[x.float() for x in small]).F)
     if kind == torch.uint16:
         assert torch.equal(fmtorch.find_essential(x0.numpy(), x1.numpy(), K0, K1, prior=prior, **EASY).F, expected.F)
 

@@ -238,7 +238,6 @@ def test_a_lens_of_a_photograph_of_a_map() -> None:
 @pytest.mark.parametrize("find", [fmtorch.find_fundamental, fmtorch.find_homography])
 @pytest.mark.parametrize("garbage", [np.nan, np.inf, 1e30, 0.0])
 def test_what_stands_in_masked_slots_means_nothing(find: Any, garbage: float) -> None:
-    """Neither for values nor for gradients."""
     x0, x1 = planes(3, FISHEYE) if find is fmtorch.find_homography else photographs(FISHEYE, FISHEYE)
     gradients = []
     for slots in (0, 7):

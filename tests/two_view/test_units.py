@@ -348,7 +348,6 @@ def test_a_pose_through_a_lens() -> None:
 
 
 def test_pairs_keep_to_themselves() -> None:
-    """A straight lens costs nothing."""
     pairs = [division.photographs(5, (-0.2, -0.2))[:2], division.photographs(6, (0, 0))[:2]]
     pairs.append((pairs[0][0][:30], np.full((30, 2), 100.0)))
     together = found([x for x, _ in pairs], [x for _, x in pairs], lens="shared")

@@ -219,7 +219,7 @@ def test_a_complete_output_is_left_as_it_is(ending: str, command: Callable[..., 
     assert (again.path, again.pairs, again.kept, dict(again.configurations)) == (output, 1, 1, {})
     assert output.read_bytes() == before
     said = command("verify", f"matches={path.name}", f"output={output.name}", cwd=tmp_path)
-    assert f"nothing to do: {output.name} has a geometry of each of 1 pairs" in said
+    assert f"nothing to do: {output.name} has a geometry of each pair (1);" in said
     save(path, {"a/x0": x0, "a/x1": x1, "b/x0": x0, "b/x1": x1})
     with pytest.raises(ValueError, match="exists; name another file"):
         fmtorch.verify(matches=path, output=output)
