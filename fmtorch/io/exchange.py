@@ -2,7 +2,8 @@
 
 ``fmtorch.find_fundamental(**fmtorch.from_lightglue(features0, features1, matches))``."""
 
-from collections.abc import Mapping, Sequence
+import contextlib
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,16 @@ KINDS: Mapping[str, Kind] = {
 """COLMAP's configurations by the pair types that are not general."""
 
 
+@contextlib.contextmanager
+def _taking(what: str) -> Iterator[None]:
+    try:
+        yield
+    except (AttributeError, IndexError, KeyError, TypeError) as error:
+        kind = TypeError if isinstance(error, AttributeError | TypeError) else ValueError
+        raise kind(f"what is given does not fit ({type(error).__name__}: {error}); it must be {what}") from error
+
+
+@_taking("keypoints0 and keypoints1 of cv2.KeyPoint, then matches of cv2.DMatch, whose indices are of these")
 def from_opencv(keypoints0: Sequence[Any], keypoints1: Sequence[Any], matches: Sequence[Any]) -> dict[str, Tensor]:
     """Arguments of `find_*` for matches of OpenCV: points, frames, and where two neighbours are given the ratio.
 
@@ -51,6 +62,7 @@ def from_opencv(keypoints0: Sequence[Any], keypoints1: Sequence[Any], matches: S
     return fields
 
 
+@_taking("features0 and features1 with keypoints, and matches with matches0 and matching_scores0 or matches and scores")
 def from_lightglue(
     features0: Mapping[str, Any], features1: Mapping[str, Any], matches: Mapping[str, Any]
 ) -> dict[str, Any]:
@@ -92,6 +104,7 @@ def _lightglue_matches(matches: Mapping[str, Any], b: int | None) -> tuple[Tenso
     return of_pair("matches").long(), of_pair("scores")
 
 
+@_taking("a dictionary with keypoints0, keypoints1 and, if known, confidence and batch_indexes")
 def from_kornia(matches: Mapping[str, Any]) -> dict[str, Any]:
     """Arguments of `find_*` for the dictionary of a detector-free matcher of kornia, such as `kornia.feature.LoFTR`.
 
@@ -102,7 +115,7 @@ def from_kornia(matches: Mapping[str, Any]) -> dict[str, Any]:
         x0, x1 and score of one pair, or lists of them.
     """
     names = {"x0": "keypoints0", "x1": "keypoints1", "score": "confidence"}
-    fields = {name: as_tensor(matches[key], key) for name, key in names.items() if key in matches}
+    fields = {name: as_tensor(matches[key], key) for name, key in names.items() if key in matches or name != "score"}
     pair = as_tensor(matches.get("batch_indexes", torch.zeros(len(fields["x0"]))), "batch_indexes")
     count = int(pair.max()) + 1 if len(pair) else 1
     if count == 1:
@@ -142,6 +155,7 @@ def to_colmap(estimate: Estimate, matches: Any = None) -> Any:
     return two_view_geometry(imported(), PairGeometry(kind, inliers, F, H=H, **values))
 
 
+@_taking("a pycolmap.TwoViewGeometry, then matches (N, 2) or their number")
 def from_colmap(geometry: Any, matches: Any) -> Estimate:
     """The estimate that a `pycolmap.TwoViewGeometry` describes, in pixels with (0, 0) at the first pixel's centre.
 
@@ -183,6 +197,7 @@ def to_poselib(estimate: Estimate) -> Any:
     return pose
 
 
+@_taking("a poselib.CameraPose with R and t, then the inliers (N,)")
 def from_poselib(pose: Any, inliers: Any, K0: Any = None, K1: Any = None) -> Estimate:
     """The estimate that a `poselib.CameraPose` describes.
 

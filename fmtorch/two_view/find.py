@@ -43,30 +43,13 @@ def eager(function: Callable[P, R]) -> Callable[P, R]:
 @eager
 @one_thread("cpu")
 def find_fundamental(
-    x0: Arrays,
-    x1: Arrays,
-    *,
-    estimator: str = "fmtorch",
-    mask: Arrays | None = None,
-    ratio: Arrays | None = None,
-    score: Arrays | None = None,
-    prior: Arrays | None = None,
-    lafs0: Arrays | None = None,
-    lafs1: Arrays | None = None,
-    noise: Arrays | None = None,
-    size0: Size = None,
-    size1: Size = None,
-    K0: Arrays | None = None,
-    K1: Arrays | None = None,
-    focal: Focal = None,
-    lens: Lens = None,
-    covariance: bool = False,
-    pair_type: bool = False,
-    key: Arrays | int | None = None,
-    seed: int = 0,
-    config_dir: Path | str | None = None,
+    x0: Arrays, x1: Arrays, *, estimator: str = "fmtorch", mask: Arrays | None = None, ratio: Arrays | None = None,
+    score: Arrays | None = None, prior: Arrays | None = None, lafs0: Arrays | None = None, lafs1: Arrays | None = None,
+    noise: Arrays | None = None, size0: Size = None, size1: Size = None, K0: Arrays | None = None,
+    K1: Arrays | None = None, focal: Focal = None, lens: Lens = None, covariance: bool = False,
+    pair_type: bool = False, key: Arrays | int | None = None, seed: int = 0, config_dir: Path | str | None = None,
     **options: Any,
-) -> Estimate:
+) -> Estimate:  # fmt: skip
     """Robustly estimate fundamental matrices from matched points, ``x1^T F x0 = 0``.
 
     Args:

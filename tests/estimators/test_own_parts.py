@@ -130,7 +130,6 @@ def test_a_score_without_a_gain_is_refused_by_name() -> None:
 
 
 def test_scores_may_be_a_column() -> None:
-    """Of a larger array: its memory has gaps."""
     forms = (np.float64, lambda which: np.stack([which * 1.0, which * 0.0], 1)[:, 0])
     plain, column = (built("msac", scored(form))(scene(1, 600)).F for form in forms)
     assert torch.equal(column, plain)

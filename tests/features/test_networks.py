@@ -165,7 +165,6 @@ def test_other_shapes_of_patches_are_refused(hardnet: Path) -> None:
 
 
 def test_an_absent_file_is_named_with_what_makes_it(tmp_path: Path) -> None:
-    """When it is first used, or asked for what it is."""
     plain, int8 = (PatchNetwork(tmp_path / f"absent{precision}.onnx") for precision in ("", ".int8"))
     for use in (lambda n: n(torch.zeros(1, 1, 32, 32)), lambda n: n.identity):
         with pytest.raises(NetworkFileError, match=r"absent\.onnx does not exist: scripts\.patch_networks\.export"):

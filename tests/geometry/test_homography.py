@@ -140,7 +140,6 @@ def test_gradients() -> None:
 
 @pytest.mark.parametrize("loss", ["truncated", "cauchy", "geman_mcclure", "huber", "magsac"])
 def test_gradients_of_refined_homographies_are_those_of_the_optimum(loss: str) -> None:
-    """By differences of optima, each found anew."""
     x0, x1, truth = pairs((2,), 25, noise=0.003)  # 1.2 px
     x1[:, 0] += 30  # a wrong match
     weight = torch.rand(2, 25, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) + 0.1
@@ -325,7 +324,6 @@ def test_a_mirrored_plane_gives_no_model() -> None:
 
 @pytest.mark.parametrize("scale", [1e-9, 1e9])
 def test_points_of_any_unit(scale: float) -> None:
-    """Also which samples are degenerate does not depend on it."""
     for seed in range(20):
         match = quadrilateral(seed)
         h, D = reference.four_points(match)[0], np.diag([scale, scale, 1])

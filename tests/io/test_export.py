@@ -380,6 +380,16 @@ def test_dictionaries_of_kornia(points: tuple[Tensor, Tensor]) -> None:
     assert torch.equal(both.F[1], first.F[0])
 
 
+@pytest.mark.parametrize(("function", "values", "right"), [
+    (fmtorch.from_opencv, ([cv2.KeyPoint()], [cv2.KeyPoint()], [cv2.DMatch(0, 9, 1.0)]), "matches of cv2.DMatch"),
+    (fmtorch.from_lightglue, ({}, {}, {}), "features0 and features1 with keypoints"),
+    (fmtorch.from_kornia, ({},), "with keypoints0"), (fmtorch.from_poselib, (None, 5), r"a poselib\."),
+])  # fmt: skip
+def test_what_another_library_does_not_make_is_refused(function: Any, values: tuple[Any, ...], right: str) -> None:
+    with pytest.raises((TypeError, ValueError), match=rf"^what is given does not fit \(.*it must be .*{right}"):
+        function(*values)
+
+
 def test_a_geometry_of_colmap_and_back(points: tuple[Tensor, Tensor], pose: fmtorch.PoseEstimate) -> None:
     geometry = fmtorch.to_colmap(pose)
     assert geometry.config == pycolmap.TwoViewGeometryConfiguration.CALIBRATED

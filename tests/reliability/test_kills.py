@@ -138,7 +138,6 @@ def match_result(folder: Path) -> dict[str, object]:
 
 @pytest.mark.parametrize("kills", bounded_and_whole(1, MATCH_KILLS))
 def test_two_photographs_are_matched_again(kills: int, starter: Starter, root: Path, tmp_path: Path) -> None:
-    """Killed once the result is on disk, whole."""
     images = [f"image{i}={root}/scene0/Images/{i:08d}.png" for i in (0, 1)]
 
     def start(output: Path) -> Command:
@@ -165,7 +164,6 @@ def newest(folder: Path) -> int:
 
 @pytest.mark.parametrize("kills", bounded_and_whole(1, TRAIN_KILLS))
 def test_a_training_goes_on(kills: int, starter: Starter, tmp_path: Path) -> None:
-    """Killed once a later checkpoint is on disk."""
     pytest.importorskip("lightning", reason="training needs the extra `train`")
     root = draw_set(tmp_path / "Set", ["scene0", "scene1"], images=4)
 

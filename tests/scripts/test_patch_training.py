@@ -113,7 +113,6 @@ def config(*overrides: str) -> DictConfig:
 
 @pytest.mark.usefixtures("in_threads")
 def test_photographs_become_tracks_and_a_step_of_training(tmp_path: Path) -> None:
-    """The preset has the values of the paper."""
     training = config().training
     assert training.match_sets == {"matches": 64, "max_similarity": 0.85}
     assert training.loss == {"name": "geodesc", "ratio": 0.4, "geometric_weight": 0.2}

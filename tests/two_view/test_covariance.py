@@ -96,7 +96,6 @@ def test_ellipsoids_hold_the_truth(knowledge: str, count: int, lens: str | None)
     "given", [CAMERAS, {"focal": "shared"}, {}, {**CAMERAS, "lens": (-0.05, 0.05)}, {"lens": "unknown"}]
 )
 def test_laws(given: dict[str, Any]) -> None:
-    """Of pairs alone, in a batch, beside one that fails."""
     scenes = [reference.scene(i, n, 0.5) for i, n in enumerate((150, 60, 4, 90))]
     arguments: dict[str, Any] = {**SIZES, **given, "covariance": True, "pair_type": True, "hypotheses": 200}
     together = fmtorch.find_fundamental([s.x0 for s in scenes], [s.x1 for s in scenes], **arguments, key=[0] * 4)

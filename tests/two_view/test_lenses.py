@@ -227,7 +227,6 @@ def test_planes_keep_to_themselves() -> None:
 
 
 def test_a_lens_of_a_photograph_of_a_map() -> None:
-    """Whose points are in a unit of their own."""
     x0, x1 = planes(4, RADIAL)
     board = undistorted_points(RADIAL, x0) / 1000
     estimate = fmtorch.find_homography(board, x1, lens=(None, RADIAL))

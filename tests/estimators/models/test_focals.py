@@ -152,7 +152,6 @@ def test_its_cost_and_gradient(same: bool, known: str) -> None:
 
 
 def test_a_shared_focal_length_is_one_parameter() -> None:
-    """The first; what does not depend on it is left out."""
     prior, out, h = focal_prior.focal_prior(True, True, (0.3, 0.0), (0.05, math.inf)), np.empty(5), 1e-6
 
     def cost(at: float) -> float:
