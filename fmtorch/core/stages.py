@@ -130,8 +130,8 @@ class NoFeatures:
         return Features(torch.zeros(0, 2, 3), torch.zeros(0), torch.zeros(0, 0), size)
 
 
-class WrongOutput(TypeError, ValueError):
-    """What somebody's part returned is of another kind than its stage: a mistake that its author can put right."""
+class WrongPart(TypeError, ValueError):
+    """What somebody's part takes or returned is of another kind than its stage's: its author can put it right."""
 
 
 def called(wanted: str, part: Any, *given: Any) -> Any:
@@ -143,7 +143,7 @@ def called(wanted: str, part: Any, *given: Any) -> Any:
 @contextlib.contextmanager
 def calling(wanted: str, part: Any, *given: Any) -> Iterator[None]:
     """Around a call of a part, which may be anybody's code. wanted: the parameters that a part of this kind takes.
-    Raises TypeError naming the place of one that takes others, RuntimeError for one that ends the program."""
+    Raises WrongPart naming the place of one that takes others, RuntimeError for one that ends the program."""
     try:
         yield
     except SystemExit as error:
@@ -157,7 +157,7 @@ def calling(wanted: str, part: Any, *given: Any) -> Iterator[None]:
         except TypeError:
             where = f"{Path(function.__code__.co_filename).name}:{function.__code__.co_firstlineno}"
             takes = f"takes {inspect.signature(function)}; it is called with ({wanted})"
-            raise TypeError(f"{name_of(part)} ({where}) {takes}") from error
+            raise WrongPart(f"{name_of(part)} ({where}) {takes}") from error
         raise
 
 
@@ -178,7 +178,7 @@ def output_of(
     name = name_of(part)
     if not isinstance(value, kind):
         what = "None" if value is None else f"a {type(value).__name__}"
-        raise WrongOutput(f"{name} returned {what}; it must return {kind.__name__}")
+        raise WrongPart(f"{name} returned {what}; it must return {kind.__name__}")
     main = getattr(value, "lafs" if kind is Features else "x0" if kind is Correspondences else "matrix")
     if main.dtype not in (torch.float32, torch.float64):
         raise ValueError(f"{name} returned {kind.__name__} of {main.dtype}; they must be of float32 or float64")

@@ -145,7 +145,7 @@ def predict(network: nn.Module, c: Correspondences) -> Prediction:
         return output
     if not isinstance(output, Tensor):
         name, kind = type(network).__name__, type(output).__name__
-        raise stages.WrongOutput(f"{name} returns {kind}; a network of matches returns log-odds or Prediction")
+        raise stages.WrongPart(f"{name} returns {kind}; a network of matches returns log-odds or Prediction")
     if output.shape != c.mask.shape:
         of = f"log-odds of shape {tuple(output.shape)} for matches of shape {tuple(c.mask.shape)}"
         raise ValueError(f"{type(network).__name__} returns {of}; there must be one for each match")
