@@ -227,7 +227,10 @@ def _in_pixels(points: list[Matrix], threshold: float, method: Any, src: Matrix 
     lmeds = method == opencv.LMEDS
     threshold = USUAL_THRESHOLD if lmeds or threshold <= 0 else float(threshold)  # as OpenCV
     finite = [x[np.isfinite(x).all(1)] for x in (*points, *([] if src is None else [src]))]
-    reach = max((float(np.abs(x).max()) for x in finite[: len(points)] if len(x)), default=0.0)
+    there = [x for x in finite[: len(points)] if len(x)]
+    reach = max((float(np.abs(x).max()) for x in there), default=0.0)
+    if reach > MAX_REACH_PX:  # also on a map, far from its origin
+        reach = max(float(np.ptp(x, axis=0).max()) for x in there)
     scale = 1.0
     if reach > 0 and not MIN_PIXELS <= reach <= MAX_REACH_PX:
         scale = REACH_PX / reach if lmeds or threshold < reach / 10 else 1.0

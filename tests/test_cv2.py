@@ -175,9 +175,11 @@ def test_points_in_another_unit_with_a_threshold_in_it() -> None:
     x, y, H = homography_points()
     right = cv2.findHomography(x, y, cv2.RANSAC, 3.0)[1].ravel().tolist()
     corners = np.array([[0, 0], [640, 0], [640, 480], [0, 480.0]])
-    for u, v in ((500, 500), (5e5, 5e5), (1000, 1), (1, 40), (1, 0.025), (1, 2e-4)):  # a board in m, a court in m, mm
-        homography, inliers = cv2.findHomography(x / u, y / v, cv2.RANSAC, 3 / v)
-        assert np.abs(v * mapped(homography, corners / u) - mapped(H, corners)).max() < 0.05
+    far = np.array([5e5, 4.2e6])  # on a map, in m; without it a board in m, a court in m, mm
+    units = [(500, 500, 0), (5e5, 5e5, 0), (1000, 1, 0), (1, 40, 0), (1, 0.025, 0), (1, 2e-4, 0)]
+    for u, v, at in (*units, (1, 1, far), (1, 40, far), (1, 0.025, far)):
+        homography, inliers = cv2.findHomography(x / u, y / v + at, cv2.RANSAC, 3 / v)
+        assert np.abs(v * (mapped(homography, corners / u) - at) - mapped(H, corners)).max() < 0.05
         assert inliers.ravel().tolist() == right
 
 

@@ -238,7 +238,6 @@ def test_mistakes_are_told(options: dict[str, Any], said: str, tmp_path: Path, m
 
 @pytest.mark.parametrize("layout", ["ransac_tutorial", "oanet", "posebench"])
 def test_the_name_of_the_folder_decides_nothing(layout: str, tmp_path: Path) -> None:
-    """Draws follow from a pair's key."""
     roots = [writers.WRITERS[layout](tmp_path / name) for name in ("first", "second")]
     if layout == "ransac_tutorial":  # its scene alone, under another name
         roots = [root / "church" for root in roots]

@@ -132,8 +132,8 @@ def inflation(x: np.ndarray, error: np.ndarray) -> float:
     apart = np.abs(cell[:, None] - cell[None])
     small, large = (np.clip(1 - apart / cells, 0, None).prod(-1) for cells in (1, 2))
     roots = [np.sqrt(error @ by @ error / (error @ error)) for by in (small, large)]
-    inflation = float(max(2 * roots[1] - roots[0], 0) ** 2)
-    return inflation if inflation > 1.2 else 1.0
+    D = float(max(2 * roots[1] - roots[0], 0) ** 2)
+    return D if D > 1.2 else 1.0
 
 
 def covariance(
